@@ -1,0 +1,87 @@
+#pragma once
+
+#include <cmath>
+#include <cstdint>
+
+#include "math/bspline.h"
+
+// The node lattice of one scene: node i of an axis lies at lower + (i - padding) dx. Blocks are 4 nodes wide.
+namespace mpm {
+
+constexpr int kPadding = 3;     // nodes below `lower`, so that a particle on the boundary has its whole support
+constexpr int kBlockWidth = 4;  // nodes per block and axis
+template <int D>
+constexpr int kBlockNodes = D == 2 ? 16 : 64;
+
+// dx and lower are kept as a leading part in T and its remainder, so that the distance from the base node is exact to
+// rounding of the position itself, however far the node is from the corner.
+template <class T, int D>
+struct Geometry {
+  T inverse_dx, dx, dx_remainder;
+  T lower[D], lower_remainder[D];
+  int blocks[D];         // blocks per axis of one scene
+  int blocks_per_scene;  // their product
+
+  static Geometry make(double dx, const double* lower, const int64_t* blocks) {
+    Geometry g;
+    g.dx = T(dx);
+    g.dx_remainder = T(dx - double(g.dx));
+    g.inverse_dx = T(1 / dx);
+    g.blocks_per_scene = 1;
+    for (int i = 0; i < D; i++) {
+      g.lower[i] = T(lower[i]);
+      g.lower_remainder[i] = T(lower[i] - double(g.lower[i]));
+      g.blocks[i] = int(blocks[i]);
+      g.blocks_per_scene *= int(blocks[i]);
+    }
+    return g;
+  }
+};
+
+inline namespace TORCH_MPM_ISA {
+
+// Base node and distance from it in cells. False for a particle that is not finite or whose support leaves the lattice.
+template <int Order, class T, int D>
+MPM_HD bool locate(const Geometry<T, D>& g, const T x[D], int base[D], T f[D]) {
+  MPM_UNROLL
+  for (int i = 0; i < D; i++) {
+    const T cell =
+        std::floor((x[i] - g.lower[i]) * g.inverse_dx + T(kPadding - BSpline<Order>::base_offset));
+    if (!(cell >= T(0) && cell < T(g.blocks[i] * kBlockWidth - Order))) return false;  // also false for NaN
+    base[i] = int(cell);
+    const T k = T(base[i] - kPadding);
+    f[i] = ((std::fma(-k, g.dx, x[i]) - g.lower[i]) - std::fma(k, g.dx_remainder, g.lower_remainder[i])) * g.inverse_dx;
+  }
+  return true;
+}
+
+template <class T, int D>
+MPM_HD int block_index(const Geometry<T, D>& g, int scene, const int block[D]) {
+  int r = scene;
+  MPM_UNROLL
+  for (int i = 0; i < D; i++) r = r * g.blocks[i] + block[i];
+  return r;
+}
+
+// Scene and block coordinates of an entry of the block table.
+template <class T, int D>
+MPM_HD int block_coordinates(const Geometry<T, D>& g, int index, int block[D]) {
+  MPM_UNROLL
+  for (int i = D - 1; i >= 0; i--) {
+    block[i] = index % g.blocks[i];
+    index /= g.blocks[i];
+  }
+  return index;
+}
+
+// Position of a node inside its block, z fastest.
+template <int D>
+MPM_HD int node_in_block(const int node[D]) {
+  int r = 0;
+  MPM_UNROLL
+  for (int i = 0; i < D; i++) r = r * kBlockWidth + (node[i] & (kBlockWidth - 1));
+  return r;
+}
+
+}  // namespace TORCH_MPM_ISA
+}  // namespace mpm

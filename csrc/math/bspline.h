@@ -1,0 +1,75 @@
+#pragma once
+
+#include "math/host_device.h"
+
+// Quadratic and cubic B-spline weights of the nodes base, base + 1, ... in terms of f = X - base, the distance of the
+// particle from its base node in cells (Steffen, Kirby and Berzins 2008).
+namespace mpm {
+inline namespace TORCH_MPM_ISA {
+
+template <int Order>
+struct BSpline;
+
+// f in [1/2, 3/2).
+template <>
+struct BSpline<2> {
+  static constexpr int support = 3;
+  static constexpr double base_offset = 0.5;  // base = floor(X - base_offset)
+  static constexpr double inverse_inertia = 4;  // dx² D⁻¹, from D = Σ N_i r rᵀ = dx²/4 I
+
+  template <class T>
+  MPM_HD static void weights(const T& f, T w[3]) {
+    const T a = T(1.5) - f, b = f - T(1), c = f - T(0.5);
+    w[0] = T(0.5) * a * a;
+    w[1] = T(0.75) - b * b;
+    w[2] = T(0.5) * c * c;
+  }
+  template <class T>
+  MPM_HD static void first_derivatives(const T& f, T w[3]) {
+    w[0] = f - T(1.5);
+    w[1] = T(2) - T(2) * f;
+    w[2] = f - T(0.5);
+  }
+  template <class T>
+  MPM_HD static void second_derivatives(const T&, T w[3]) {
+    w[0] = T(1);
+    w[1] = T(-2);
+    w[2] = T(1);
+  }
+};
+
+// f in [1, 2).
+template <>
+struct BSpline<3> {
+  static constexpr int support = 4;
+  static constexpr double base_offset = 1.0;
+  static constexpr double inverse_inertia = 3;  // D = dx²/3 I
+
+  template <class T>
+  MPM_HD static void weights(const T& f, T w[4]) {
+    const T a = T(2) - f, b = f - T(1);  // distances from the two nodes around the particle, a + b = 1
+    w[0] = T(1.0 / 6) * a * a * a;
+    w[1] = T(2.0 / 3) - b * b * (T(1) - T(0.5) * b);
+    w[2] = T(2.0 / 3) - a * a * (T(1) - T(0.5) * a);
+    w[3] = T(1.0 / 6) * b * b * b;
+  }
+  template <class T>
+  MPM_HD static void first_derivatives(const T& f, T w[4]) {
+    const T a = T(2) - f, b = f - T(1);
+    w[0] = T(-0.5) * a * a;
+    w[1] = b * (T(1.5) * b - T(2));
+    w[2] = a * (T(2) - T(1.5) * a);
+    w[3] = T(0.5) * b * b;
+  }
+  template <class T>
+  MPM_HD static void second_derivatives(const T& f, T w[4]) {
+    const T a = T(2) - f, b = f - T(1);
+    w[0] = a;
+    w[1] = T(3) * b - T(2);
+    w[2] = T(3) * a - T(2);
+    w[3] = b;
+  }
+};
+
+}  // namespace TORCH_MPM_ISA
+}  // namespace mpm

@@ -1,0 +1,69 @@
+#include "ops/backend.h"
+
+// Finds the blocks that particles touch and groups the particles by the block of their base node.
+namespace mpm {
+namespace {
+
+std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> activate(const Tensor& x, const OptionalTensor& scene,
+                                                                    const OptionalTensor& previous_status,
+                                                                    int64_t scenes, double dx,
+                                                                    std::vector<double> lower,
+                                                                    std::vector<int64_t> blocks, int64_t order,
+                                                                    int64_t capacity, bool deterministic) {
+  STD_TORCH_CHECK(scenes >= 0 && capacity >= 0, "scenes and capacity must not be negative");
+  STD_TORCH_CHECK(x.size(0) < INT32_MAX, "x must have fewer than 2^31 particles");
+  int64_t table_size = scenes;
+  for (int64_t b : blocks) {
+    STD_TORCH_CHECK(b > 0 && table_size <= INT32_MAX / b, "scenes times blocks must stay below 2^31");
+    table_size *= b;
+  }
+  STD_TORCH_CHECK(capacity <= INT32_MAX / (x.size(1) == 2 ? kBlockNodes<2> : kBlockNodes<3>),
+                  "capacity times nodes per block must stay below 2^31");
+  Tensor table = empty_int(x, {table_size}), block = empty_int(x, {capacity}), offsets = empty_int(x, {capacity + 1}),
+         index = empty_int(x, {x.size(0)}), status = empty_int(x, {kStatusSize}), schedule;
+  const DeviceScope device(x);
+  dispatch(x, order, [&]<class T, int D, int Order>() {
+    ActivateArguments<T, D> a;
+    a.geometry = geometry<T, D>(dx, lower, blocks);
+    a.scenes = int(scenes);
+    a.capacity = int(capacity);
+    a.particles = x.size(0);
+    a.deterministic = deterministic;
+    a.x = input<T>(x, "x", x, {x.size(0), D});
+    if (has(scene)) {
+      check_shape(*scene, "scene", {x.size(0)});
+      STD_TORCH_CHECK(scene->scalar_type() == ScalarType::Int && scene->device() == x.device(),
+                      "scene must be an int32 tensor on the device of x");
+      a.scene = static_cast<const int*>(scene->data_ptr());
+      a.scene_stride = scene->stride(0);
+    }
+    if (has(previous_status)) a.previous_status = int_pointer(*previous_status, "previous_status", x, kStatusSize);
+    a.schedule_size = backend::schedule_size(a);
+    schedule = empty_int(x, {a.schedule_size});
+    a.workspace_size = backend::activate_workspace(a);
+    const Tensor workspace = torch::stable::new_empty(x, Shape{a.workspace_size}, ScalarType::Byte);
+    a.workspace = workspace.data_ptr();
+    a.table = static_cast<int*>(table.data_ptr());
+    a.block = static_cast<int*>(block.data_ptr());
+    a.offsets = static_cast<int*>(offsets.data_ptr());
+    a.index = static_cast<int*>(index.data_ptr());
+    a.schedule = static_cast<int*>(schedule.data_ptr());
+    a.status = static_cast<int*>(status.data_ptr());
+    backend::activate<Order>(a, device.stream());
+  });
+  return {table, block, offsets, index, schedule, status};
+}
+
+}  // namespace
+}  // namespace mpm
+
+#if MPM_BACKEND == MPM_BACKEND_IS_cpu
+STABLE_TORCH_LIBRARY_FRAGMENT(torch_mpm, m) {
+  m.def(
+      "activate(Tensor x, Tensor? scene, Tensor? previous_status, int scenes, float dx, float[] lower, int[] blocks, "
+      "int order, int capacity, bool deterministic) -> (Tensor table, Tensor block, Tensor offsets, Tensor index, "
+      "Tensor schedule, Tensor status)");
+}
+#endif
+
+MPM_LIBRARY_IMPL(m) { m.impl("activate", TORCH_BOX(&mpm::activate)); }
