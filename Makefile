@@ -1,0 +1,74 @@
+# Targets: build, test, check, demo, examples, bench, study, sanitize, gpu, clean (see CONTRIBUTING.md).
+# PYTHON makes the virtual environment; TORCH is installed there unless torch is already present.
+PYTHON ?= python3
+TORCH ?= 2.13.0
+VENV ?= .venv
+PY := $(VENV)/bin/python
+STAMP := $(VENV)/.torch_mpm
+QUICK := -q -m "not slow"
+# Parallel callers of make queue here instead of racing in the same build directory.
+BUILD := mkdir -p build && flock build/.lock
+
+SOURCES := $(shell find csrc -name '*.h' -o -name '*.cuh' -o -name '*.cpp' -o -name '*.cu')
+
+.PHONY: build build-cpu build-cuda test check format demo examples bench study sanitize gpu clean
+
+build: $(STAMP)
+	$(BUILD) $(PY) setup.py -q build_ext --inplace
+
+build-cpu: $(STAMP)
+	$(BUILD) $(PY) setup.py -q build_ext --inplace --targets=cpu,math
+
+build-cuda: $(STAMP)
+	$(BUILD) $(PY) setup.py -q build_ext --inplace --targets=cuda
+
+# The environment is only linked to the sources here; `build` compiles, with its progress in sight.
+$(STAMP): pyproject.toml
+	test -x $(PY) || $(PYTHON) -m venv $(VENV)
+	$(PY) -c "import torch" 2>/dev/null || $(PY) -m pip install -q torch==$(TORCH)
+	$(PY) -m pip install -q "setuptools>=77" ninja "pybind11>=2.12"
+	TORCH_MPM_SKIP_BUILD=1 $(PY) -m pip install -q --no-build-isolation -e '.[dev]'
+	touch $@
+
+test: build
+	$(PY) -m pytest $(QUICK)
+
+check: $(STAMP)
+	$(PY) -m ruff check .
+	$(PY) -m ruff format --check .
+	$(VENV)/bin/clang-format --dry-run -Werror $(SOURCES)
+	$(PY) -m mypy
+
+format: $(STAMP)
+	$(PY) -m ruff check --fix -q .
+	$(PY) -m ruff format .
+	$(VENV)/bin/clang-format -i $(SOURCES)
+
+demo: build
+	$(PY) -m torch_mpm run examples/demo.toml -o out/demo
+
+examples: build
+	$(PY) -m torch_mpm run examples/demo.toml -o out/demo
+
+bench: build
+	$(PY) -m benchmarks
+
+study: build
+	$(PY) -m pytest -q -m slow
+
+# The CPU library with the address and undefined-behaviour sanitizers, in a package tree of its own.
+SANITIZED := build/sanitized
+ASAN = $(shell $(or $(CXX),g++) -print-file-name=libasan.so)
+sanitize: $(STAMP)
+	$(BUILD) env TORCH_MPM_SANITIZE=address,undefined TORCH_MPM_CUDA=0 $(PY) setup.py -q build --build-lib $(SANITIZED)
+	LD_PRELOAD=$(ASAN) ASAN_OPTIONS=detect_leaks=0 UBSAN_OPTIONS=halt_on_error=1:print_stacktrace=1 \
+	  PYTHONPATH=$(SANITIZED) $(VENV)/bin/pytest $(QUICK)
+
+# On a GPU machine whose Python already has torch, ninja and pytest: no virtual environment and no network.
+gpu:
+	$(BUILD) env TORCH_MPM_CUDA=1 $(PYTHON) setup.py -q build_ext --inplace
+	PYTHONPATH=. $(PYTHON) -m pytest $(QUICK)
+	PYTHONPATH=. $(PYTHON) -m benchmarks
+
+clean:
+	rm -rf build dist out torch_mpm/lib torch_mpm/_math*.so

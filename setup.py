@@ -1,0 +1,273 @@
+"""Builds the native libraries of torch_mpm with ninja.
+
+torch is located but never imported, so metadata phases (egg_info, dist_info, sdist) work without it, and a CPU build of
+torch is enough to compile the CUDA library: both libraries use the LibTorch stable ABI and link nothing of torch.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import functools
+import importlib.util
+import json
+import os
+import platform
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+import sysconfig
+from dataclasses import dataclass
+from pathlib import Path
+
+from setuptools import Extension, setup
+from setuptools.command.bdist_wheel import bdist_wheel
+from setuptools.command.build_ext import build_ext
+
+ROOT = Path(__file__).resolve().parent
+CSRC = ROOT / "csrc"
+
+# The oldest torch whose stable ABI the libraries ask for: 2.11.
+TORCH_TARGET_VERSION = "0x020b000000000000"
+
+# No option here gives up the value of an expression, unlike -ffast-math: errno and the floating-point exception flags
+# are never read, and contraction only replaces a product and a sum by one fused, more exact operation (nvcc does the
+# same by default). NaN, infinity, signed zero and the order of operations are kept.
+CPU_FLAGS = ["-O3", "-fno-math-errno", "-fno-trapping-math", "-ffp-contract=fast"]
+COMMON_FLAGS = ["-std=c++20", f"-DTORCH_TARGET_VERSION={TORCH_TARGET_VERSION}"]
+HOST_FLAGS = ["-fPIC", "-fvisibility=hidden", "-Wall"]
+# One thread of nvcc per architecture (--threads); template kernels make large fat binaries, so they are compressed.
+NVCC_FLAGS = ["-O3", "--expt-relaxed-constexpr", "--threads=2", "-Xfatbin=-compress-all"]
+
+# Files csrc/cpu/*_kernels.cpp are compiled once per level, in the namespace named by TORCH_MPM_ISA.
+X86_LEVELS = {"baseline": "x86-64", "avx2": "x86-64-v3", "avx512": "x86-64-v4"}
+
+
+def isa_levels() -> dict[str, list[str]]:
+    """Compiler options of each instruction-set level of this machine's architecture."""
+    if platform.machine().lower() in ("x86_64", "amd64"):
+        return {name: [f"-march={march}"] for name, march in X86_LEVELS.items()}
+    return {"baseline": []}
+
+
+def package_directory(name: str) -> Path:
+    """Directory of an installed package, found without importing it."""
+    spec = importlib.util.find_spec(name)
+    if spec is None or not spec.submodule_search_locations:
+        raise SystemExit(
+            f"building torch_mpm needs the headers of {name}, which {sys.executable} does not have: "
+            f"install {name} first, or build with the dependencies named in CONTRIBUTING.md"
+        )
+    return Path(spec.submodule_search_locations[0])
+
+
+def cuda_wanted() -> bool:
+    """TORCH_MPM_CUDA=1 forces the CUDA library, 0 leaves it out; by default it is built where nvcc is found."""
+    choice = os.environ.get("TORCH_MPM_CUDA", "")
+    if choice not in ("", "0", "1"):
+        raise SystemExit(f"TORCH_MPM_CUDA must be 0, 1 or unset, got {choice!r}")
+    if choice == "1" and nvcc() is None:
+        raise SystemExit("TORCH_MPM_CUDA=1, but nvcc is neither in CUDA_HOME/bin nor in PATH")
+    return choice != "0" and nvcc() is not None
+
+
+def nvcc() -> str | None:
+    home = os.environ.get("CUDA_HOME")
+    return (shutil.which("nvcc", path=f"{home}/bin") if home else None) or shutil.which("nvcc")
+
+
+def cuda_archs() -> list[str]:
+    return [arch.strip() for arch in os.environ.get("TORCH_MPM_CUDA_ARCHS", "8.0;9.0").split(";") if arch.strip()]
+
+
+def gencode() -> list[str]:
+    """Machine code for every architecture, and PTX of the newest for the GPUs after it."""
+    numbers = [arch.replace(".", "") for arch in cuda_archs()]
+    options = [f"-gencode=arch=compute_{n},code=sm_{n}" for n in numbers]
+    return [*options, f"-gencode=arch=compute_{numbers[-1]},code=compute_{numbers[-1]}"]
+
+
+def max_jobs() -> int:
+    return int(os.environ.get("MAX_JOBS") or len(os.sched_getaffinity(0)))
+
+
+@functools.cache
+def compiler_version(compiler: str) -> str:
+    """The line of `compiler --version` that holds its version number."""
+    lines = subprocess.run([compiler, "--version"], check=True, capture_output=True, text=True).stdout.splitlines()
+    return next((line for line in lines if "release" in line), lines[0]).strip()
+
+
+@dataclass
+class Library:
+    """One linked file: `objects` are (source, rule, extra flags) in link order."""
+
+    output: str
+    objects: list[tuple[Path, str, list[str]]]
+    rule: str
+
+    @property
+    def name(self) -> str:
+        return Path(self.output).name
+
+
+class Ninja:
+    """The text of a build.ninja: one rule per compiler, one edge per object file and per library."""
+
+    def __init__(self, directory: Path, includes: list[str], sanitize: str) -> None:
+        self.directory = directory
+        self.lines = ["ninja_required_version = 1.5", f"pool nvcc\n  depth = {max(1, max_jobs() // 2)}"]
+        cxx = os.environ.get("CXX", "g++")
+        sanitizer = [f"-fsanitize={sanitize}", "-fno-omit-frame-pointer", "-g"] if sanitize else []
+        host = [*COMMON_FLAGS, *CPU_FLAGS, *HOST_FLAGS, "-Wextra", *sanitizer, *includes]
+        self.rule("cxx", [cxx, *host, "$flags", "-MMD", "-MF", "$out.d", "-c", "$in", "-o", "$out"], depfile=True)
+        self.rule("link_cxx", [cxx, "-shared", *sanitizer, "$in", "-o", "$out"])
+        if nvcc() is not None:
+            device = [*COMMON_FLAGS, *NVCC_FLAGS, f"-Xcompiler={','.join(HOST_FLAGS)}", "-DUSE_CUDA", *includes]
+            compile_device = [str(nvcc()), f"-ccbin={cxx}", *gencode(), *device, "$flags"]
+            self.rule("nvcc", [*compile_device, "-MD", "-MF", "$out.d", "-c", "$in", "-o", "$out"], depfile=True)
+            self.lines[-1] += "\n  pool = nvcc"
+            # cudart is linked statically (the default), so the library does not depend on the CUDA runtime of torch.
+            self.rule("link_nvcc", [str(nvcc()), f"-ccbin={cxx}", *gencode(), "-shared", "$in", "-o", "$out"])
+
+    def rule(self, name: str, command: list[str], depfile: bool = False) -> None:
+        text = f"rule {name}\n  command = {' '.join(command)}\n  description = {name} $out"
+        self.lines.append(text + ("\n  depfile = $out.d\n  deps = gcc" if depfile else ""))
+
+    def library(self, library: Library) -> None:
+        objects = []
+        for source, rule, flags in library.objects:
+            level = next((f.partition("=")[2] for f in flags if f.startswith("-DTORCH_MPM_ISA=")), "")
+            target = f"{library.name}.obj/{source.relative_to(CSRC)}{level and '.' + level}.o"
+            self.lines.append(f"build {target}: {rule} {source}\n  flags = {shlex.join(flags)}")
+            objects.append(target)
+        self.lines.append(f"build {library.name}: {library.rule} {' '.join(objects)}")
+
+    def run(self, targets: list[str]) -> None:
+        self.directory.mkdir(parents=True, exist_ok=True)
+        (self.directory / "build.ninja").write_text("\n".join(self.lines) + "\n")
+        ninja = [sys.executable, "-m", "ninja"] if importlib.util.find_spec("ninja") else ["ninja"]
+        result = subprocess.run([*ninja, "-C", str(self.directory), f"-j{max_jobs()}", *targets])
+        if result.returncode:
+            raise SystemExit(f"the build of {', '.join(targets)} failed (see the compiler's messages above)")
+
+
+def cpu_library() -> Library:
+    flags = ["-DTORCH_MPM_BACKEND=cpu"]
+    levels = isa_levels()
+    kernels = sorted((CSRC / "cpu").glob("*_kernels.cpp"))
+    plain = sorted({*(CSRC / "ops").glob("*.cpp"), *(CSRC / "cpu").glob("*.cpp")} - set(kernels))
+    objects = [(source, "cxx", [*flags, *levels["baseline"]]) for source in plain]
+    # The baseline comes first: of an inline function that several objects define, the linker keeps the first, and that
+    # one must run on every machine.
+    for level, options in levels.items():
+        objects += [(source, "cxx", [*flags, *options, f"-DTORCH_MPM_ISA={level}"]) for source in kernels]
+    return Library("torch_mpm/lib/libtorch_mpm_cpu.so", objects, "link_cxx")
+
+
+def cuda_library() -> Library:
+    sources = [*sorted((CSRC / "ops").glob("*.cpp")), *sorted((CSRC / "cuda").glob("*.cu"))]
+    objects = [(source, "nvcc", ["-DTORCH_MPM_BACKEND=cuda"]) for source in sources]
+    return Library("torch_mpm/lib/libtorch_mpm_cuda.so", objects, "link_nvcc")
+
+
+def math_library(version: str) -> Library:
+    """The pybind11 module torch_mpm._math. It serves one Python version only and is meant for tests."""
+    python = sysconfig.get_paths()["include"]
+    flags = ["-isystem", python, "-isystem", str(package_directory("pybind11") / "include")]
+    flags += [f'-DTORCH_MPM_VERSION="{version}"', *isa_levels()["baseline"]]
+    suffix = sysconfig.get_config_var("EXT_SUFFIX")
+    objects = [(CSRC / "math" / "python_module.cpp", "cxx", flags)]
+    return Library(f"torch_mpm/_math{suffix}", objects, "link_cxx")
+
+
+def torch_version(include: Path) -> str:
+    text = (include / "torch/headeronly/version.h").read_text()
+    return re.search(r'#define TORCH_VERSION \\\s*"([^"]+)"', text)[1]  # type: ignore[index]
+
+
+def replace(source: Path, target: Path) -> None:
+    """Copy by renaming, so that a process which has loaded the old file keeps it."""
+    if target.exists() and target.stat().st_mtime_ns == source.stat().st_mtime_ns:
+        return
+    target.parent.mkdir(parents=True, exist_ok=True)
+    temporary = target.with_name(target.name + ".new")
+    shutil.copy2(source, temporary)
+    temporary.replace(target)
+
+
+class Build(build_ext):
+    """build_ext that builds the libraries named by --targets (cpu, cuda, math) through one build.ninja."""
+
+    user_options = [*build_ext.user_options, ("targets=", None, "what to build: cpu, cuda, math (default: all)")]
+
+    def initialize_options(self) -> None:
+        super().initialize_options()
+        self.targets = None
+
+    def run(self) -> None:
+        if os.environ.get("TORCH_MPM_SKIP_BUILD") == "1":
+            return
+        destination = ROOT if self.inplace or self.editable_mode else Path(self.build_lib)
+        sanitize = os.environ.get("TORCH_MPM_SANITIZE", "")
+        directory = (ROOT / self.build_temp).with_name(Path(self.build_temp).name + ("-sanitize" if sanitize else ""))
+        directory.mkdir(parents=True, exist_ok=True)
+        with open(directory / "lock", "w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            self.build(directory, destination, sanitize)
+
+    def build(self, directory: Path, destination: Path, sanitize: str) -> None:
+        include = package_directory("torch") / "include"
+        ninja = Ninja(directory, [f"-I{CSRC}", "-isystem", str(include)], sanitize)
+        libraries = self.libraries_to_build()
+        for library in libraries.values():
+            ninja.library(library)
+        ninja.run([library.name for library in libraries.values()])
+        for library in libraries.values():
+            replace(directory / library.name, destination / library.output)
+        self.describe(destination / "torch_mpm/lib/build.json", list(libraries), torch_version(include), sanitize)
+
+    def libraries_to_build(self) -> dict[str, Library]:
+        """Every target asked for that this machine can build and that has sources."""
+        wanted = self.targets.split(",") if self.targets else ["cpu", "cuda", "math"]
+        if unknown := set(wanted) - {"cpu", "cuda", "math"}:
+            raise SystemExit(f"--targets must be of cpu, cuda, math, got {sorted(unknown)}")
+        libraries = {}
+        if "cpu" in wanted:
+            libraries["cpu"] = cpu_library()
+        if "cuda" in wanted and cuda_wanted():
+            libraries["cuda"] = cuda_library()
+        if "math" in wanted:
+            if Path(sysconfig.get_paths()["include"], "Python.h").exists():
+                libraries["math"] = math_library(self.distribution.get_version())
+            else:
+                print(f"torch_mpm._math is left out: {sys.executable} has no Python.h")
+        return {name: library for name, library in libraries.items() if library.objects}
+
+    def describe(self, path: Path, built: list[str], torch: str, sanitize: str) -> None:
+        """Write what `python -m torch_mpm info` shows; targets not built this time keep their entry."""
+        record = json.loads(path.read_text()) if path.exists() else {}
+        record |= {"version": self.distribution.get_version(), "torch_headers": torch}
+        record["torch_target"] = "2.11"
+        if "cpu" in built:
+            compiler = compiler_version(os.environ.get("CXX", "g++"))
+            record["cpu"] = {"compiler": compiler, "flags": CPU_FLAGS, "isa": list(isa_levels()), "sanitize": sanitize}
+        if "cuda" in built:
+            compiler = compiler_version(str(nvcc()))
+            record["cuda"] = {"compiler": compiler, "flags": NVCC_FLAGS, "archs": cuda_archs()}
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps(record, indent=2) + "\n")
+
+
+class Wheel(bdist_wheel):
+    """One wheel for every Python 3: the libraries do not touch the Python C API (torch_mpm._math is optional)."""
+
+    def get_tag(self) -> tuple[str, str, str]:
+        return "py3", "none", super().get_tag()[2]
+
+
+setup(
+    ext_modules=[Extension("torch_mpm._math", ["csrc/math/python_module.cpp"], optional=True)],
+    cmdclass={"build_ext": Build, "bdist_wheel": Wheel},
+)

@@ -1,0 +1,3 @@
+"""torch_mpm: differentiable Material Point Method operators for PyTorch."""
+
+from . import _library as _library

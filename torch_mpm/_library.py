@@ -1,0 +1,51 @@
+"""Loads the native libraries beside this file into torch.ops.torch_mpm when torch_mpm is imported."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import torch
+
+DIRECTORY = Path(__file__).parent / "lib"
+CPU_LIBRARY = DIRECTORY / "libtorch_mpm_cpu.so"
+CUDA_LIBRARY = DIRECTORY / "libtorch_mpm_cuda.so"
+
+cuda_error: str | None = None
+"""Why the CUDA library is not in use, or None if it is loaded."""
+
+
+def _load(path: Path) -> None:
+    # Newer drivers of torch.ops.load_library print the whole stack; OSError already names the missing symbol or file.
+    torch.ops.load_library(os.fspath(path))
+
+
+def _load_cpu() -> None:
+    if not CPU_LIBRARY.exists():
+        raise ImportError(
+            f"torch_mpm is not built: {CPU_LIBRARY} does not exist. Run `make build` in the source tree, "
+            "or install the package with `pip install .`"
+        )
+    try:
+        _load(CPU_LIBRARY)
+    except OSError as error:
+        raise ImportError(
+            f"torch_mpm cannot load {CPU_LIBRARY} with torch {torch.__version__} (2.11 or newer is needed): {error}"
+        ) from error
+
+
+def _load_cuda() -> str | None:
+    """Load the CUDA library if it can be used; return the reason why not."""
+    if not CUDA_LIBRARY.exists():
+        return "torch_mpm was built without its CUDA library (build with TORCH_MPM_CUDA=1 where nvcc is installed)"
+    if torch.version.cuda is None:
+        return f"torch {torch.__version__} was built without CUDA"
+    try:
+        _load(CUDA_LIBRARY)
+    except OSError as error:
+        return f"{CUDA_LIBRARY} cannot be loaded: {error}"
+    return None
+
+
+_load_cpu()
+cuda_error = _load_cuda()
