@@ -1,7 +1,7 @@
 """Builds the native libraries of torch_mpm with ninja.
 
-torch is located but never imported, so metadata phases (egg_info, dist_info, sdist) work without it, and a CPU build of
-torch is enough to compile the CUDA library: both libraries use the LibTorch stable ABI and link nothing of torch.
+torch is located but never imported, so metadata phases (egg_info, dist_info, sdist) work without it. Both libraries use
+the LibTorch stable ABI, so a CPU build of torch is enough to compile the CUDA library.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ import sys
 import sysconfig
 from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar
 
 from setuptools import Extension, setup
 from setuptools.command.bdist_wheel import bdist_wheel
@@ -36,7 +37,8 @@ TORCH_TARGET_VERSION = "0x020b000000000000"
 # same by default). NaN, infinity, signed zero and the order of operations are kept.
 CPU_FLAGS = ["-O3", "-fno-math-errno", "-fno-trapping-math", "-ffp-contract=fast"]
 COMMON_FLAGS = ["-std=c++20", f"-DTORCH_TARGET_VERSION={TORCH_TARGET_VERSION}"]
-HOST_FLAGS = ["-fPIC", "-fvisibility=hidden", "-Wall"]
+# Checks report __FILE__: relative to the source tree.
+HOST_FLAGS = ["-fPIC", "-fvisibility=hidden", "-Wall", f"-ffile-prefix-map={ROOT}/="]
 # One thread of nvcc per architecture (--threads); template kernels make large fat binaries, so they are compressed.
 NVCC_FLAGS = ["-O3", "--expt-relaxed-constexpr", "--threads=2", "-Xfatbin=-compress-all"]
 
@@ -115,21 +117,28 @@ class Library:
 class Ninja:
     """The text of a build.ninja: one rule per compiler, one edge per object file and per library."""
 
-    def __init__(self, directory: Path, includes: list[str], sanitize: str) -> None:
+    def __init__(self, directory: Path, torch: Path, sanitize: str) -> None:
         self.directory = directory
+        includes = [f"-I{CSRC}", "-isystem", str(torch / "include")]
+        # torch loads its libraries privately, so ours must name libtorch.so, the umbrella of whatever torch is running
+        # (CPU or CUDA), to find its symbols. The process has it loaded: no path to it is recorded.
+        libtorch = [f"-L{torch / 'lib'}", "-Xlinker", "--no-as-needed", "-ltorch"]
         self.lines = ["ninja_required_version = 1.5", f"pool nvcc\n  depth = {max(1, max_jobs() // 2)}"]
         cxx = os.environ.get("CXX", "g++")
         sanitizer = [f"-fsanitize={sanitize}", "-fno-omit-frame-pointer", "-g"] if sanitize else []
         host = [*COMMON_FLAGS, *CPU_FLAGS, *HOST_FLAGS, "-Wextra", *sanitizer, *includes]
         self.rule("cxx", [cxx, *host, "$flags", "-MMD", "-MF", "$out.d", "-c", "$in", "-o", "$out"], depfile=True)
-        self.rule("link_cxx", [cxx, "-shared", *sanitizer, "$in", "-o", "$out"])
+        self.rule("link_cpu", [cxx, "-shared", *sanitizer, "$in", "-o", "$out", *libtorch])
+        self.rule("link_module", [cxx, "-shared", *sanitizer, "$in", "-o", "$out"])
         if nvcc() is not None:
             device = [*COMMON_FLAGS, *NVCC_FLAGS, f"-Xcompiler={','.join(HOST_FLAGS)}", "-DUSE_CUDA", *includes]
             compile_device = [str(nvcc()), f"-ccbin={cxx}", *gencode(), *device, "$flags"]
             self.rule("nvcc", [*compile_device, "-MD", "-MF", "$out.d", "-c", "$in", "-o", "$out"], depfile=True)
             self.lines[-1] += "\n  pool = nvcc"
             # cudart is linked statically (the default), so the library does not depend on the CUDA runtime of torch.
-            self.rule("link_nvcc", [str(nvcc()), f"-ccbin={cxx}", *gencode(), "-shared", "$in", "-o", "$out"])
+            self.rule(
+                "link_cuda", [str(nvcc()), f"-ccbin={cxx}", *gencode(), "-shared", "$in", "-o", "$out", *libtorch]
+            )
 
     def rule(self, name: str, command: list[str], depfile: bool = False) -> None:
         text = f"rule {name}\n  command = {' '.join(command)}\n  description = {name} $out"
@@ -163,13 +172,13 @@ def cpu_library() -> Library:
     # one must run on every machine.
     for level, options in levels.items():
         objects += [(source, "cxx", [*flags, *options, f"-DTORCH_MPM_ISA={level}"]) for source in kernels]
-    return Library("torch_mpm/lib/libtorch_mpm_cpu.so", objects, "link_cxx")
+    return Library("torch_mpm/lib/libtorch_mpm_cpu.so", objects, "link_cpu")
 
 
 def cuda_library() -> Library:
     sources = [*sorted((CSRC / "ops").glob("*.cpp")), *sorted((CSRC / "cuda").glob("*.cu"))]
     objects = [(source, "nvcc", ["-DTORCH_MPM_BACKEND=cuda"]) for source in sources]
-    return Library("torch_mpm/lib/libtorch_mpm_cuda.so", objects, "link_nvcc")
+    return Library("torch_mpm/lib/libtorch_mpm_cuda.so", objects, "link_cuda")
 
 
 def math_library(version: str) -> Library:
@@ -179,11 +188,11 @@ def math_library(version: str) -> Library:
     flags += [f'-DTORCH_MPM_VERSION="{version}"', *isa_levels()["baseline"]]
     suffix = sysconfig.get_config_var("EXT_SUFFIX")
     objects = [(CSRC / "math" / "python_module.cpp", "cxx", flags)]
-    return Library(f"torch_mpm/_math{suffix}", objects, "link_cxx")
+    return Library(f"torch_mpm/_math{suffix}", objects, "link_module")
 
 
-def torch_version(include: Path) -> str:
-    text = (include / "torch/headeronly/version.h").read_text()
+def torch_version(torch: Path) -> str:
+    text = (torch / "include/torch/headeronly/version.h").read_text()
     return re.search(r'#define TORCH_VERSION \\\s*"([^"]+)"', text)[1]  # type: ignore[index]
 
 
@@ -200,7 +209,10 @@ def replace(source: Path, target: Path) -> None:
 class Build(build_ext):
     """build_ext that builds the libraries named by --targets (cpu, cuda, math) through one build.ninja."""
 
-    user_options = [*build_ext.user_options, ("targets=", None, "what to build: cpu, cuda, math (default: all)")]
+    user_options: ClassVar = [
+        *build_ext.user_options,
+        ("targets=", None, "what to build: cpu, cuda, math (default: all)"),
+    ]
 
     def initialize_options(self) -> None:
         super().initialize_options()
@@ -218,15 +230,15 @@ class Build(build_ext):
             self.build(directory, destination, sanitize)
 
     def build(self, directory: Path, destination: Path, sanitize: str) -> None:
-        include = package_directory("torch") / "include"
-        ninja = Ninja(directory, [f"-I{CSRC}", "-isystem", str(include)], sanitize)
+        torch = package_directory("torch")
+        ninja = Ninja(directory, torch, sanitize)
         libraries = self.libraries_to_build()
         for library in libraries.values():
             ninja.library(library)
         ninja.run([library.name for library in libraries.values()])
         for library in libraries.values():
             replace(directory / library.name, destination / library.output)
-        self.describe(destination / "torch_mpm/lib/build.json", list(libraries), torch_version(include), sanitize)
+        self.describe(destination / "torch_mpm/lib/build.json", list(libraries), torch_version(torch), sanitize)
 
     def libraries_to_build(self) -> dict[str, Library]:
         """Every target asked for that this machine can build and that has sources."""

@@ -15,9 +15,9 @@ def info() -> dict[str, Any]:
     """Describe the installation.
 
     Returns:
-        ``version`` of torch_mpm, ``python``, ``torch``, ``build`` (compilers, options, architectures and torch headers of
-        the libraries, as the build recorded them), ``cpu`` (instruction set in use, threads) and ``cuda`` (``usable``,
-        and the ``devices`` or the ``reason`` why none can be used).
+        ``version`` of torch_mpm, ``python``, ``torch``, ``build`` (compilers, options, architectures and torch headers,
+        as the build recorded them), ``cpu`` (instruction set of the processor, threads) and ``cuda`` (``usable``, and
+        the ``devices`` or the ``reason`` why none can be used).
     """
     record = _library.DIRECTORY / "build.json"
     build = json.loads(record.read_text()) if record.exists() else {}
