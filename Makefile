@@ -11,16 +11,14 @@ BUILD := mkdir -p build && flock build/.lock
 
 SOURCES := $(shell find csrc -name '*.h' -o -name '*.cuh' -o -name '*.cpp' -o -name '*.cu')
 
-.PHONY: build build-cpu build-cuda test check format demo examples bench study sanitize gpu clean
+.PHONY: build test check format demo examples bench study sanitize gpu clean
 
 build: $(STAMP)
 	$(BUILD) $(PY) setup.py -q build_ext --inplace
 
-build-cpu: $(STAMP)
-	$(BUILD) $(PY) setup.py -q build_ext --inplace --targets=cpu,math
-
-build-cuda: $(STAMP)
-	$(BUILD) $(PY) setup.py -q build_ext --inplace --targets=cuda
+# One library alone: cpu, cuda or math (the pybind11 module of the tests).
+build-%: $(STAMP)
+	$(BUILD) $(PY) setup.py -q build_ext --inplace --targets=$*
 
 # The environment is only linked to the sources here; `build` compiles, with its progress in sight.
 $(STAMP): pyproject.toml

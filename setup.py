@@ -37,8 +37,9 @@ TORCH_TARGET_VERSION = "0x020b000000000000"
 # same by default). NaN, infinity, signed zero and the order of operations are kept.
 CPU_FLAGS = ["-O3", "-fno-math-errno", "-fno-trapping-math", "-ffp-contract=fast"]
 COMMON_FLAGS = ["-std=c++20", f"-DTORCH_TARGET_VERSION={TORCH_TARGET_VERSION}"]
-# Checks report __FILE__: relative to the source tree.
-HOST_FLAGS = ["-fPIC", "-fvisibility=hidden", "-Wall", f"-ffile-prefix-map={ROOT}/="]
+# Objects are made in build/<platform>; checks report __FILE__ relative to the source tree.
+UP = "../../"
+HOST_FLAGS = ["-fPIC", "-fvisibility=hidden", "-Wall", f"-ffile-prefix-map={UP}="]
 # One thread of nvcc per architecture (--threads); template kernels make large fat binaries, so they are compressed.
 NVCC_FLAGS = ["-O3", "--expt-relaxed-constexpr", "--threads=2", "-Xfatbin=-compress-all"]
 
@@ -119,16 +120,20 @@ class Ninja:
 
     def __init__(self, directory: Path, torch: Path, sanitize: str) -> None:
         self.directory = directory
-        includes = [f"-I{CSRC}", "-isystem", str(torch / "include")]
+        includes = [f"-I{UP}csrc", "-isystem", str(torch / "include")]
         # torch loads its libraries privately, so ours must name libtorch.so, the umbrella of whatever torch is running
         # (CPU or CUDA), to find its symbols. The process has it loaded: no path to it is recorded.
         libtorch = [f"-L{torch / 'lib'}", "-Xlinker", "--no-as-needed", "-ltorch"]
+        # Functions that nobody defines fail the link, except in the CUDA library: a CPU torch has no CUDA functions.
+        defined = ["-Xlinker", "--no-undefined", "-ltorch_cpu"]
         self.lines = ["ninja_required_version = 1.5", f"pool nvcc\n  depth = {max(1, max_jobs() // 2)}"]
         cxx = os.environ.get("CXX", "g++")
         sanitizer = [f"-fsanitize={sanitize}", "-fno-omit-frame-pointer", "-g"] if sanitize else []
         host = [*COMMON_FLAGS, *CPU_FLAGS, *HOST_FLAGS, "-Wextra", *sanitizer, *includes]
         self.rule("cxx", [cxx, *host, "$flags", "-MMD", "-MF", "$out.d", "-c", "$in", "-o", "$out"], depfile=True)
-        self.rule("link_cpu", [cxx, "-shared", *sanitizer, "$in", "-o", "$out", *libtorch])
+        self.rule(
+            "link_cpu", [cxx, "-shared", *sanitizer, "$in", "-o", "$out", *libtorch, *([] if sanitize else defined)]
+        )
         self.rule("link_module", [cxx, "-shared", *sanitizer, "$in", "-o", "$out"])
         if nvcc() is not None:
             device = [*COMMON_FLAGS, *NVCC_FLAGS, f"-Xcompiler={','.join(HOST_FLAGS)}", "-DUSE_CUDA", *includes]
@@ -136,20 +141,21 @@ class Ninja:
             self.rule("nvcc", [*compile_device, "-MD", "-MF", "$out.d", "-c", "$in", "-o", "$out"], depfile=True)
             self.lines[-1] += "\n  pool = nvcc"
             # cudart is linked statically (the default), so the library does not depend on the CUDA runtime of torch.
-            self.rule(
-                "link_cuda", [str(nvcc()), f"-ccbin={cxx}", *gencode(), "-shared", "$in", "-o", "$out", *libtorch]
-            )
+            link_device = [str(nvcc()), f"-ccbin={cxx}", *gencode(), "-shared"]
+            self.rule("link_cuda", [*link_device, "$in", "-o", "$out", *libtorch])
 
     def rule(self, name: str, command: list[str], depfile: bool = False) -> None:
-        text = f"rule {name}\n  command = {' '.join(command)}\n  description = {name} $out"
+        quoted = " ".join(word if word.startswith("$") else shlex.quote(word) for word in command)
+        text = f"rule {name}\n  command = {quoted}\n  description = {name} $out"
         self.lines.append(text + ("\n  depfile = $out.d\n  deps = gcc" if depfile else ""))
 
     def library(self, library: Library) -> None:
         objects = []
         for source, rule, flags in library.objects:
             level = next((f.partition("=")[2] for f in flags if f.startswith("-DTORCH_MPM_ISA=")), "")
-            target = f"{library.name}.obj/{source.relative_to(CSRC)}{level and '.' + level}.o"
-            self.lines.append(f"build {target}: {rule} {source}\n  flags = {shlex.join(flags)}")
+            relative = source.relative_to(ROOT)
+            target = f"{library.name}.obj/{relative}{level and '.' + level}.o"
+            self.lines.append(f"build {target}: {rule} {UP}{relative}\n  flags = {shlex.join(flags)}")
             objects.append(target)
         self.lines.append(f"build {library.name}: {library.rule} {' '.join(objects)}")
 
@@ -223,7 +229,9 @@ class Build(build_ext):
             return
         destination = ROOT if self.inplace or self.editable_mode else Path(self.build_lib)
         sanitize = os.environ.get("TORCH_MPM_SANITIZE", "")
-        directory = (ROOT / self.build_temp).with_name(Path(self.build_temp).name + ("-sanitize" if sanitize else ""))
+        # One place for in-place, editable and wheel builds, so that each reuses the objects of the others.
+        name = f"{sysconfig.get_platform()}-{sys.implementation.cache_tag}"
+        directory = ROOT / "build" / (f"{name}-sanitize" if sanitize else name)
         directory.mkdir(parents=True, exist_ok=True)
         with open(directory / "lock", "w") as lock:
             fcntl.flock(lock, fcntl.LOCK_EX)
