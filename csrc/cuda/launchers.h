@@ -11,8 +11,6 @@ namespace mpm::cuda {
 using Stream = cudaStream_t;
 
 template <class T, int D>
-int64_t schedule_size(const ActivateArguments<T, D>&);
-template <class T, int D>
 int64_t activate_workspace(const ActivateArguments<T, D>&);
 template <int Order, class T, int D>
 void activate(const ActivateArguments<T, D>&, Stream);

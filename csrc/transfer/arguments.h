@@ -89,6 +89,10 @@ struct PositionGradientArguments {
   Field<T> position_gradient;  // [P, D], zero for particles outside
 };
 
+// Entries of the schedule tensor: room for four ints per work item of both backends (the fake kernel in
+// torch_mpm/ops/activation.py has the same formula).
+inline int64_t schedule_size(int64_t capacity, int64_t particles) { return 16 + 4 * (capacity + particles / 128); }
+
 template <class T, int D>
 struct ActivateArguments {
   Geometry<T, D> geometry;

@@ -1,0 +1,255 @@
+"""The node lattice of a simulation, and its blocks that particles touch."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from .errors import GridOverflowError, check_positions
+
+PADDING = 3
+"""Nodes outside `lower` and `upper`, so that a particle on the boundary has its whole support (csrc/grid/geometry.h)."""
+BLOCK_WIDTH = 4
+INT32_MAX = 2**31 - 1
+
+KERNEL_ORDERS = {"quadratic": 2, "cubic": 3}
+
+
+class Grid:
+    """A regular lattice with node i of an axis at `lower + (i - 3) dx`, shared by all scenes of a batch.
+
+    Memory is taken only for blocks of 4^D nodes that particles touch, from a pool of `capacity` blocks.
+
+    Args:
+        dx: node distance [m].
+        lower, upper: corners of the domain [m], 2 or 3 numbers. Particles between them have their whole support; a
+            particle more than a cell outside is left out of the transfers and reported.
+        scenes: number of scenes B in a batch; each has the whole lattice to itself.
+        kernel: "quadratic" or "cubic" B-spline.
+        capacity: blocks in the pool. None measures it from the positions of the first activation, and lets it grow with
+            the scene: at once on the CPU; on CUDA, without synchronising, when less than a quarter is left.
+        deterministic: bit-identical results from run to run on CUDA too (the CPU always is).
+
+    Raises:
+        ValueError: for a wrong argument, or a lattice of 2^31 blocks or more.
+    """
+
+    def __init__(
+        self,
+        dx: float,
+        lower: Sequence[float],
+        upper: Sequence[float],
+        scenes: int = 1,
+        kernel: str = "quadratic",
+        capacity: int | None = None,
+        deterministic: bool = False,
+    ) -> None:
+        self.dx = float(dx)
+        self.lower = tuple(float(a) for a in lower)
+        self.upper = tuple(float(a) for a in upper)
+        if not (self.dx > 0 and math.isfinite(self.dx)):
+            raise ValueError(f"dx must be a positive number, got {dx}")
+        if len(self.lower) not in (2, 3) or len(self.upper) != len(self.lower):
+            raise ValueError(f"lower and upper must both have 2 or 3 numbers, got {lower} and {upper}")
+        if not all(math.isfinite(a) and math.isfinite(b) and a < b for a, b in zip(self.lower, self.upper, strict=True)):
+            raise ValueError(f"upper must be above lower on every axis, got lower {lower} and upper {upper}")
+        if scenes < 0:
+            raise ValueError(f"scenes must not be negative, got {scenes}")
+        if kernel not in KERNEL_ORDERS:
+            raise ValueError(f"kernel must be one of {sorted(KERNEL_ORDERS)}, got {kernel!r}")
+        self.scenes = int(scenes)
+        self.kernel = kernel
+        self.order = KERNEL_ORDERS[kernel]
+        self.dim = len(self.lower)
+        self.deterministic = bool(deterministic)
+        # A node on `upper` exists even when the extent is a multiple of dx only up to rounding.
+        cells = [math.ceil((b - a) / self.dx - 1e-6) for a, b in zip(self.lower, self.upper, strict=True)]
+        self.nodes = tuple(n + 1 + 2 * PADDING for n in cells)
+        self.blocks = tuple(-(-n // BLOCK_WIDTH) for n in self.nodes)
+        self.block_count = max(self.scenes, 1) * math.prod(self.blocks)
+        if self.block_count > INT32_MAX:
+            raise ValueError(
+                f"the grid has {self.block_count} blocks over {self.scenes} scenes; fewer than 2^31 are possible: "
+                "enlarge dx or split the domain or the batch"
+            )
+        self.nodes_per_block = BLOCK_WIDTH**self.dim
+        self._max_capacity = min(self.block_count, INT32_MAX // self.nodes_per_block)
+        if capacity is not None and not 0 <= capacity <= self._max_capacity:
+            raise ValueError(f"capacity must be between 0 and {self._max_capacity} blocks, got {capacity}")
+        self.capacity = capacity
+        self._grows = capacity is None
+        self._pending: tuple[Tensor, torch.cuda.Event] | None = None
+
+    def __repr__(self) -> str:
+        return (
+            f"Grid(dx={self.dx}, lower={self.lower}, upper={self.upper}, scenes={self.scenes}, kernel={self.kernel!r}, "
+            f"capacity={self.capacity})"
+        )
+
+    @property
+    def inverse_inertia(self) -> float:
+        """D⁻¹ = 4/dx² (quadratic) or 3/dx² (cubic) [1/m²] of the APIC affine field (Jiang et al. 2015)."""
+        return (4.0 if self.order == 2 else 3.0) / self.dx**2
+
+    def activate(self, x: Tensor, scene: Tensor | None = None, previous: Tensor | None = None) -> Blocks:
+        """Find the blocks that particles touch.
+
+        Args:
+            x: positions [P, D] [m], float32 or float64.
+            scene: scene of each particle, int32 [P]; None where the grid has one scene.
+            previous: status of the activation before, to be carried on.
+
+        Returns:
+            The active blocks. On CUDA nothing is synchronised, except at the very first call without a `capacity`.
+
+        Raises:
+            ValueError, TypeError: for wrong shapes, dtypes or devices.
+            GridOverflowError: on the CPU, where a fixed capacity is too small. On CUDA the status tells (see `Blocks.check`).
+        """
+        check_positions(x, self.dim, scene, self.scenes)
+        if self._grows:
+            self._grow(x, scene)
+        assert self.capacity is not None
+        blocks = self._activate(x, scene, previous, self.capacity)
+        if x.device.type == "cpu" and not torch.compiler.is_compiling() and not _is_fake(x):
+            wanted = int(blocks.status[7])
+            if wanted > self.capacity:
+                if not self._grows:
+                    raise GridOverflowError(
+                        f"{wanted} blocks are active but the grid has a capacity of {self.capacity}: "
+                        f"pass capacity={_with_headroom(wanted)} or more, or None to let it grow"
+                    )
+                self.capacity = min(_with_headroom(wanted), self._max_capacity)
+                blocks = self._activate(x, scene, previous, self.capacity)
+        return blocks
+
+    def _activate(self, x: Tensor, scene: Tensor | None, previous: Tensor | None, capacity: int) -> Blocks:
+        table, block, offsets, index, schedule, status = torch.ops.torch_mpm.activate(
+            x.detach(), scene, previous, self.scenes, self.dx, self.lower, self.blocks, self.order, capacity,
+            self.deterministic,
+        )  # fmt: skip
+        return Blocks(self, table, block, offsets, index, schedule, status, scene)
+
+    def _grow(self, x: Tensor, scene: Tensor | None) -> None:
+        """Keep the capacity ahead of the blocks wanted; reads the device only at the first call."""
+        if self.capacity is None:
+            if torch.compiler.is_compiling() or _is_fake(x):
+                raise ValueError("a grid used under torch.compile needs a capacity: pass capacity= or activate it once before")
+            wanted = int(self._activate(x, scene, None, 0).status[7])
+            self.capacity = min(_with_headroom(wanted), self._max_capacity)
+        elif self._pending is not None and not torch.compiler.is_compiling() and self._pending[1].query():
+            wanted = int(self._pending[0][7])
+            if wanted * 4 > self.capacity * 3:
+                self.capacity = min(_with_headroom(wanted), self._max_capacity)
+            self._pending = None
+
+    def watch(self, status: Tensor) -> None:
+        """Let the capacity follow `status`, an activation's, without waiting for the device."""
+        if not self._grows or self._pending is not None or status.device.type != "cuda":
+            return
+        if torch.compiler.is_compiling() or _is_fake(status) or torch.cuda.is_current_stream_capturing():
+            return
+        host = torch.empty(status.shape, dtype=status.dtype, pin_memory=True)
+        host.copy_(status, non_blocking=True)
+        event = torch.cuda.Event()
+        event.record()
+        self._pending = (host, event)
+
+
+def _with_headroom(blocks: int) -> int:
+    return blocks + blocks // 2 + 16
+
+
+def _is_fake(x: Tensor) -> bool:
+    return isinstance(x, torch._subclasses.FakeTensor)
+
+
+@dataclasses.dataclass(eq=False)
+class Blocks:
+    """The active blocks of one activation: N = capacity * 4^D node rows, of which those of unused blocks stay zero.
+
+    Attributes:
+        table: slot of every block of every scene, int32 [B * blocks], -1 where inactive.
+        block: table index of every slot, int32 [capacity], -1 where unused.
+        offsets, index: particles `index[offsets[s]:offsets[s + 1]]` have their base node in the block of slot s, int32.
+        schedule: order of work of the kernels.
+        status: int32 [8], see `check`.
+        scene: the scene of each particle, or None.
+    """
+
+    grid: Grid
+    table: Tensor
+    block: Tensor
+    offsets: Tensor
+    index: Tensor
+    schedule: Tensor
+    status: Tensor
+    scene: Tensor | None
+
+    @property
+    def topology(self) -> tuple[Any, ...]:
+        """The trailing arguments of every transfer op."""
+        grid = self.grid
+        return (
+            self.table, self.block, self.offsets, self.index, self.schedule, grid.dx, grid.lower, grid.blocks, grid.order,
+        )  # fmt: skip
+
+    @property
+    def node_count(self) -> int:
+        """Rows N of a node tensor."""
+        return self.block.shape[0] * self.grid.nodes_per_block
+
+    def active_nodes(self) -> Tensor:
+        """Which node rows belong to an active block, bool [N]."""
+        return (self.block >= 0).repeat_interleave(self.grid.nodes_per_block)
+
+    def node_scene(self) -> Tensor:
+        """Scene of each node, int32 [N]; -1 for unused rows."""
+        scene = torch.where(self.block >= 0, self.block // math.prod(self.grid.blocks), -1)
+        return scene.repeat_interleave(self.grid.nodes_per_block)
+
+    def node_indices(self) -> Tensor:
+        """Lattice indices of each node, int64 [N, D]; those of block 0 for unused rows."""
+        grid = self.grid
+        block = self.block.clamp_min(0).long() % math.prod(grid.blocks)
+        corner = torch.stack(torch.unravel_index(block, grid.blocks), -1) * BLOCK_WIDTH
+        inside = torch.arange(grid.nodes_per_block, device=block.device)
+        offset = torch.stack(torch.unravel_index(inside, (BLOCK_WIDTH,) * grid.dim), -1)
+        return (corner[:, None] + offset).reshape(-1, grid.dim)
+
+    def node_positions(self, dtype: torch.dtype | None = None) -> Tensor:
+        """Position of each node [m], [N, D]."""
+        lower = torch.tensor(self.grid.lower, dtype=torch.float64, device=self.block.device)
+        positions = lower + (self.node_indices() - PADDING) * self.grid.dx
+        return positions.to(dtype or torch.get_default_dtype())
+
+    def to_dense(self, nodes: Tensor) -> Tensor:
+        """Node rows [N, K] as a dense tensor [B, X, Y, (Z), K] over the whole lattice, zero where inactive; differentiable."""
+        grid = self.grid
+        blocks = nodes.reshape(self.block.shape[0], *(BLOCK_WIDTH,) * grid.dim, nodes.shape[-1])
+        blocks = torch.cat([blocks, blocks.new_zeros(1, *blocks.shape[1:])])
+        dense = blocks[self.table.long()].reshape(grid.scenes, *grid.blocks, *blocks.shape[1:])
+        return dense.permute(*_interleaved(grid.dim)).reshape(
+            grid.scenes, *(b * BLOCK_WIDTH for b in grid.blocks), nodes.shape[-1]
+        )
+
+    def from_dense(self, dense: Tensor) -> Tensor:
+        """The inverse of `to_dense` on the active blocks; differentiable."""
+        grid = self.grid
+        split = [size for b in grid.blocks for size in (b, BLOCK_WIDTH)]
+        blocks = dense.reshape(grid.scenes, *split, dense.shape[-1])
+        order = _interleaved(grid.dim)
+        blocks = blocks.permute(*sorted(range(len(order)), key=order.__getitem__))
+        blocks = blocks.reshape(-1, grid.nodes_per_block, dense.shape[-1])
+        rows = blocks[self.block.clamp_min(0).long()]
+        return torch.where((self.block >= 0)[:, None, None], rows, 0).reshape(-1, dense.shape[-1])
+
+
+def _interleaved(dim: int) -> list[int]:
+    """Axes that take [B, blocks..., width..., K] to [B, (block, width)..., K]."""
+    return [0] + [axis for i in range(dim) for axis in (1 + i, 1 + dim + i)] + [1 + 2 * dim]

@@ -1,0 +1,34 @@
+"""The fake kernel of `activate`; its Python face is `Grid.activate`."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from .arguments import refuse_vmap
+
+
+@torch.library.register_fake("torch_mpm::activate")
+def _activate_fake(
+    x: Tensor,
+    scene: Tensor | None,
+    previous_status: Tensor | None,
+    scenes: int,
+    dx: float,
+    lower: Sequence[float],
+    blocks: Sequence[int],
+    order: int,
+    capacity: int,
+    deterministic: bool,
+) -> tuple[Tensor, ...]:
+    def ints(n: int) -> Tensor:
+        return x.new_empty(n, dtype=torch.int32)
+
+    schedule = 16 + 4 * (capacity + x.shape[0] // 128)  # csrc/transfer/arguments.h
+    return ints(scenes * math.prod(blocks)), ints(capacity), ints(capacity + 1), ints(x.shape[0]), ints(schedule), ints(8)
+
+
+refuse_vmap("activate")

@@ -1,0 +1,86 @@
+"""Argument forms and autograd helpers that the op families share."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ..errors import shape_of
+
+
+def split_dt(dt: float | Tensor, scenes: int, x: Tensor) -> tuple[float, Tensor | None]:
+    """A time step [s] as the ops take it: a number times an optional tensor [B].
+
+    Args:
+        dt: number, or tensor of shape [], [1] or [B].
+
+    Raises:
+        ValueError: for a number that is not positive and finite, or a wrong shape or device. Values of a tensor are not
+            read, so that the device is not synchronised.
+    """
+    if not isinstance(dt, Tensor):
+        if not 0 < dt < float("inf"):
+            raise ValueError(f"dt must be a positive number of seconds, got {dt}")
+        return float(dt), None
+    if dt.dim() > 1 or (dt.dim() == 1 and dt.shape[0] not in (1, scenes)):
+        raise ValueError(f"dt must be a number or have shape [], [1] or [B] = [{scenes}], got {shape_of(dt)}")
+    if dt.device != x.device:
+        raise ValueError(f"dt must be on the device of x, {x.device}, got {dt.device}")
+    return 1.0, dt.to(x.dtype).expand(scenes)
+
+
+def per_particle(value: Tensor, scene: Tensor | None, particles: int) -> Tensor:
+    """A per-scene tensor [B, ...] as one row per particle."""
+    if value.shape[0] == 1:
+        return value.expand(particles, *value.shape[1:])
+    assert scene is not None
+    return value.index_select(0, scene)
+
+
+def sum_by_scene(value: Tensor, scene: Tensor | None, scenes: int) -> Tensor:
+    """Sum of a per-particle tensor [P, ...] over the particles of each scene, [B, ...]."""
+    if scene is None:
+        return value.sum(0, keepdim=True)
+    return value.new_zeros(scenes, *value.shape[1:]).index_add_(0, scene, value)
+
+
+def soa_empty(like: Tensor, shape: Sequence[int]) -> Tensor:
+    """An empty [P, ...] tensor with the particle index contiguous, as the ops return them."""
+    return like.new_empty((*shape[1:], shape[0])).permute(len(shape) - 1, *range(len(shape) - 1))
+
+
+def differentiate(
+    function: Callable[..., Tensor | tuple[Tensor, ...]],
+    inputs: Sequence[Tensor | None],
+    grad_outputs: Sequence[Tensor | None],
+) -> list[Tensor | None]:
+    """Gradients of a composition of differentiable ops with respect to its tensor inputs; itself differentiable."""
+    differentiable = torch.is_grad_enabled()
+    with torch.enable_grad():
+        leaves = [t if t is None or t.requires_grad else t.detach().requires_grad_() for t in inputs]
+        outputs = function(*leaves)
+        outputs = outputs if isinstance(outputs, tuple) else (outputs,)
+        pairs = [(y, g) for y, g in zip(outputs, grad_outputs, strict=True) if g is not None and y.requires_grad]
+        wanted = [t for t in leaves if t is not None]
+        if not pairs or not wanted:
+            return [None] * len(leaves)
+        grads = torch.autograd.grad(
+            [y for y, _ in pairs], wanted, [g for _, g in pairs], create_graph=differentiable, allow_unused=True
+        )
+    result = iter(grads)
+    return [None if t is None else next(result) for t in leaves]
+
+
+def refuse_vmap(name: str) -> None:
+    """Make `torch.vmap` over an op say what to do instead."""
+
+    def vmap(info: Any, in_dims: Any, *args: Any, **kwargs: Any) -> Any:
+        raise NotImplementedError(
+            f"torch.vmap over torch_mpm::{name} is not supported: pack the scenes into one call with `scene` and "
+            "Grid(scenes=B)"
+        )
+
+    torch.library.register_vmap(f"torch_mpm::{name}", vmap)
