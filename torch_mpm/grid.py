@@ -197,6 +197,7 @@ class Blocks:
         grid = self.grid
         return (
             self.table, self.block, self.offsets, self.index, self.schedule, grid.dx, grid.lower, grid.blocks, grid.order,
+            grid.deterministic,
         )  # fmt: skip
 
     @property

@@ -29,7 +29,7 @@ P2GArguments<T, D> p2g_arguments(const Tensor& x, const Tensor& mass, const Tens
 
 Tensor p2g(const Tensor& x, const Tensor& mass, const Tensor& v, const OptionalTensor& C, const OptionalTensor& stress,
            const OptionalTensor& volume, const OptionalTensor& scene_dt, double dt, int64_t stress_form,
-           bool deterministic, MPM_TOPOLOGY_PARAMETERS) {
+           MPM_TOPOLOGY_PARAMETERS) {
   Tensor nodes;
   const DeviceScope device(x);
   dispatch(x, order, [&]<class T, int D, int Order>() {
@@ -79,7 +79,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> p2g_backward(
 }
 
 Tensor scatter(const Tensor& x, const Tensor& value, const OptionalTensor& moment, const OptionalTensor& gradient,
-               double moment_scale, bool deterministic, MPM_TOPOLOGY_PARAMETERS) {
+               double moment_scale, MPM_TOPOLOGY_PARAMETERS) {
   Tensor nodes;
   const DeviceScope device(x);
   dispatch(x, order, [&]<class T, int D, int Order>() {
@@ -125,7 +125,7 @@ std::tuple<Tensor, Tensor, Tensor> g2p(const Tensor& x, const Tensor& velocity, 
                                        MPM_TOPOLOGY_PARAMETERS) {
   STD_TORCH_CHECK(velocity.dim() == 2 && velocity.size(1) == x.size(1), "velocity must have shape [N, D]");
   const double inverse_inertia = (order == 2 ? BSpline<2>::inverse_inertia : BSpline<3>::inverse_inertia) / (dx * dx);
-  return gather(x, velocity, inverse_inertia, affine, gradient, MPM_TOPOLOGY_ARGUMENTS, order);
+  return gather(x, velocity, inverse_inertia, affine, gradient, MPM_TOPOLOGY_ARGUMENTS, order, deterministic);
 }
 
 Tensor position_gradient(const Tensor& x, const Tensor& value, const OptionalTensor& moment,
@@ -156,12 +156,12 @@ Tensor position_gradient(const Tensor& x, const Tensor& value, const OptionalTen
 STABLE_TORCH_LIBRARY_FRAGMENT(torch_mpm, m) {
   m.def(
       "p2g(Tensor x, Tensor mass, Tensor v, Tensor? C, Tensor? stress, Tensor? volume, Tensor? scene_dt, float dt, "
-      "int stress_form, bool deterministic, " MPM_TOPOLOGY_SCHEMA ") -> Tensor");
+      "int stress_form, " MPM_TOPOLOGY_SCHEMA ") -> Tensor");
   m.def(
       "p2g_backward(Tensor grad_nodes, Tensor x, Tensor mass, Tensor v, Tensor? C, Tensor? stress, Tensor? volume, "
       "Tensor? scene_dt, float dt, int stress_form, int needs, " MPM_TOPOLOGY_SCHEMA
       ") -> (Tensor x, Tensor mass, Tensor v, Tensor C, Tensor stress, Tensor volume, Tensor dt)");
-  m.def("scatter(Tensor x, Tensor value, Tensor? moment, Tensor? gradient, float moment_scale, bool deterministic, "
+  m.def("scatter(Tensor x, Tensor value, Tensor? moment, Tensor? gradient, float moment_scale, "
         MPM_TOPOLOGY_SCHEMA ") -> Tensor");
   m.def("gather(Tensor x, Tensor nodes, float moment_scale, bool moment, bool gradient, " MPM_TOPOLOGY_SCHEMA
         ") -> (Tensor value, Tensor moment, Tensor gradient)");

@@ -1,0 +1,353 @@
+"""Particle seeding: shapes filled with points whose volumes add up to the volume of the shape.
+
+Every function takes ``grid`` (a :class:`torch_mpm.Grid` or a node spacing dx [m]) and ``per_cell``, the mean number of particles in
+a grid cell, and returns :class:`Points`. ``method="lattice"`` places points on a regular lattice of spacing
+``dx / per_cell**(1/D)``, stretched to fit the bounding box of the shape; ``method="poisson"`` draws a Poisson-disk sample of the same
+mean density, which has no preferred direction. Both depend on nothing but their arguments.
+"""
+
+from __future__ import annotations
+
+import csv
+import itertools
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol, Sequence
+
+import torch
+from torch import Tensor
+
+Vector = Sequence[float] | Tensor
+
+# Edge length of the cube (square) per point of the sample over its least distance, measured for _poisson_disk: a sample of least
+# distance r has about (_POISSON_SPACING * r)^-D points per unit of volume.
+_POISSON_SPACING = {2: 1.245, 3: 1.147}
+_POISSON_TRIALS = 12
+
+
+@dataclass(frozen=True)
+class Points:
+    """Seeded points: ``x`` [P, D] positions [m], ``volume`` [P] rest volumes [m^3] (areas [m^2] in 2-D), ``scene`` int32 [P] or None."""
+
+    x: Tensor
+    volume: Tensor
+    scene: Tensor | None = None
+
+    def __len__(self) -> int:
+        return self.x.shape[0]
+
+
+class Shape(Protocol):
+    """A closed region: bounding box [D], [D], exact volume, and membership of points [P, D]."""
+
+    lower: Tensor
+    upper: Tensor
+    volume: float
+
+    def inside(self, x: Tensor) -> Tensor: ...
+
+
+def _vector(name: str, value: Vector, dim: int | None = None) -> Tensor:
+    v = torch.as_tensor(value, dtype=torch.float64).cpu()
+    if v.dim() != 1 or v.numel() not in ((2, 3) if dim is None else (dim,)):
+        raise ValueError(f"{name} must have {dim or '2 or 3'} numbers, got {list(v.shape)}: {value}")
+    if not bool(torch.isfinite(v).all()):
+        raise ValueError(f"{name} must be finite, got {value}")
+    return v
+
+
+def _positive(name: str, value: float) -> float:
+    if not (math.isfinite(value) and value > 0):
+        raise ValueError(f"{name} must be positive, got {value}")
+    return float(value)
+
+
+class Box:
+    """Axis-aligned box (rectangle in 2-D) from ``lower`` to ``upper`` [m]."""
+
+    def __init__(self, lower: Vector, upper: Vector):
+        self.lower = _vector("lower", lower)
+        self.upper = _vector("upper", upper, len(self.lower))
+        if not bool((self.lower < self.upper).all()):
+            raise ValueError(f"lower must be below upper on every axis, got {self.lower.tolist()} and {self.upper.tolist()}")
+        self.volume = float((self.upper - self.lower).prod())
+
+    def inside(self, x: Tensor) -> Tensor:
+        return ((x >= self.lower) & (x <= self.upper)).all(1)
+
+
+class Sphere:
+    """Ball (disc in 2-D) around ``center`` with ``radius`` [m]."""
+
+    def __init__(self, center: Vector, radius: float):
+        self.center, self.radius = _vector("center", center), _positive("radius", radius)
+        self.lower, self.upper = self.center - self.radius, self.center + self.radius
+        self.volume = _ball_volume(len(self.center), self.radius)
+
+    def inside(self, x: Tensor) -> Tensor:
+        return (x - self.center).square().sum(1) <= self.radius**2
+
+
+class _Axial:
+    def __init__(self, start: Vector, end: Vector, radius: float):
+        self.start, self.radius = _vector("start", start), _positive("radius", radius)
+        self.end = _vector("end", end, len(self.start))
+        self.length = _positive("the distance from start to end", float((self.end - self.start).norm()))
+        self.axis = (self.end - self.start) / self.length
+
+    def _along_and_away(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Coordinate along the axis and squared distance from it."""
+        r = x - self.start
+        along = r @ self.axis
+        return along, r.square().sum(1) - along.square()
+
+
+class Cylinder(_Axial):
+    """Solid cylinder with flat ends between ``start`` and ``end`` [m]; 3-D only."""
+
+    def __init__(self, start: Vector, end: Vector, radius: float):
+        super().__init__(start, end, radius)
+        if len(self.start) != 3:
+            raise ValueError("a cylinder needs three dimensions; in 2-D use a sphere (a disc) or a box")
+        reach = self.radius * (1 - self.axis.square()).clamp(min=0).sqrt()
+        self.lower, self.upper = torch.minimum(self.start, self.end) - reach, torch.maximum(self.start, self.end) + reach
+        self.volume = math.pi * self.radius**2 * self.length
+
+    def inside(self, x: Tensor) -> Tensor:
+        along, away = self._along_and_away(x)
+        return (along >= 0) & (along <= self.length) & (away <= self.radius**2)
+
+
+class Capsule(_Axial):
+    """All points within ``radius`` of the segment from ``start`` to ``end`` [m]."""
+
+    def __init__(self, start: Vector, end: Vector, radius: float):
+        super().__init__(start, end, radius)
+        self.lower, self.upper = torch.minimum(self.start, self.end) - self.radius, torch.maximum(self.start, self.end) + self.radius
+        dim = len(self.start)
+        self.volume = _ball_volume(dim - 1, self.radius) * self.length + _ball_volume(dim, self.radius)
+
+    def inside(self, x: Tensor) -> Tensor:
+        along, away = self._along_and_away(x)
+        beyond = along - along.clamp(0, self.length)
+        return away + beyond.square() <= self.radius**2
+
+
+class Mesh:
+    """The inside of a closed triangle mesh: a file that trimesh reads (.obj, .ply, .stl, ...) or a ``trimesh.Trimesh``.
+
+    The mesh is scaled about its origin, then moved by ``offset`` [m]. Raises ValueError for a mesh that is not closed.
+    """
+
+    def __init__(self, source: str | Path | Any, scale: float = 1.0, offset: Vector = (0.0, 0.0, 0.0)):
+        mesh = _load_mesh(source)
+        if not mesh.is_watertight:
+            raise ValueError(
+                f"mesh {source} is not closed: {_open_edges(mesh)} of its edges do not join two triangles; "
+                "close the holes (trimesh.repair.fill_holes, or a modelling program) before filling it"
+            )
+        vertices = torch.as_tensor(mesh.vertices.copy(), dtype=torch.float64) * _positive("scale", scale) + _vector("offset", offset, 3)
+        self.triangles = vertices[torch.as_tensor(mesh.faces.copy(), dtype=torch.int64)]
+        self.lower, self.upper = vertices.amin(0), vertices.amax(0)
+        self.volume = _positive(f"the volume of mesh {source}", abs(float(mesh.volume)) * scale**3)
+
+    def inside(self, x: Tensor) -> Tensor:
+        """Winding number above 1/2 (Jacobson et al. 2013), from the solid angles of the triangles (Van Oosterom and Strackee 1983)."""
+        chunk = max(1, 2**22 // len(self.triangles))
+        return torch.cat([self._winding(part).abs() > 0.5 for part in x.split(chunk)])
+
+    def _winding(self, x: Tensor) -> Tensor:
+        a, b, c = (self.triangles[None, :, k] - x[:, None] for k in range(3))
+        la, lb, lc = a.norm(dim=-1), b.norm(dim=-1), c.norm(dim=-1)
+        determinant = (a * torch.linalg.cross(b, c)).sum(-1)
+        denominator = la * lb * lc + (a * b).sum(-1) * lc + (b * c).sum(-1) * la + (c * a).sum(-1) * lb
+        return torch.atan2(determinant, denominator).sum(1) / (2 * math.pi)
+
+
+def _load_mesh(source: str | Path | Any) -> Any:
+    try:
+        import trimesh
+    except ImportError as error:
+        raise ImportError("a mesh shape needs trimesh: pip install torch-mpm[mesh]") from error
+    if isinstance(source, trimesh.Trimesh):
+        return source
+    if not Path(source).is_file():
+        raise FileNotFoundError(f"mesh file {source} does not exist")
+    mesh = trimesh.load(source, force="mesh")
+    if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
+        raise ValueError(f"mesh file {source} holds no triangles")
+    return mesh
+
+
+def _open_edges(mesh: Any) -> int:
+    _, uses = torch.as_tensor(mesh.edges_sorted.copy()).unique(dim=0, return_counts=True)
+    return int((uses != 2).sum())
+
+
+def _ball_volume(dim: int, radius: float) -> float:
+    return {1: 2 * radius, 2: math.pi * radius**2, 3: 4 / 3 * math.pi * radius**3}[dim]
+
+
+def fill(
+    shape: Shape,
+    grid: Any,
+    per_cell: float = 8,
+    *,
+    method: str = "lattice",
+    seed: int = 0,
+    dtype: torch.dtype | None = None,
+    device: torch.device | str | None = None,
+) -> Points:
+    """Points inside ``shape``, all of the volume ``shape.volume / P``.
+
+    Args:
+        shape: region to fill; any object with ``lower`` [D], ``upper`` [D], ``volume`` and ``inside(x [P, D]) -> bool [P]``.
+        grid: a grid or its node spacing dx [m].
+        per_cell: mean number of particles in a cell of volume dx^D.
+        method: "lattice" or "poisson".
+        seed: seed of the Poisson-disk sample.
+        dtype, device: of the result; by default torch's.
+
+    Raises:
+        ValueError: for an unknown method, or a shape too small to hold a point.
+    """
+    dx = _positive("dx", float(getattr(grid, "dx", grid)))
+    dim = len(shape.lower)
+    spacing = dx / _positive("per_cell", per_cell) ** (1 / dim)
+    if method == "lattice":
+        x = _lattice(shape.lower, shape.upper, spacing)
+    elif method == "poisson":
+        x = _poisson_disk(shape.lower, shape.upper, spacing, seed)
+    else:
+        raise ValueError(f'method must be "lattice" or "poisson", got {method!r}')
+    x = x[shape.inside(x)]
+    if len(x) == 0:
+        raise ValueError(f"the shape is too small for its particles: spacing {spacing:g} m; use a finer grid or a larger per_cell")
+    dtype = dtype or torch.get_default_dtype()
+    volume = torch.full((len(x),), shape.volume / len(x), dtype=dtype, device=device)
+    return Points(x.to(device=device, dtype=dtype), volume)
+
+
+def _lattice(lower: Tensor, upper: Tensor, spacing: float) -> Tensor:
+    """Centres of equal cells that tile the box, as near to ``spacing`` as a whole number per axis allows."""
+    counts = ((upper - lower) / spacing).round().clamp(min=1)
+    axes = [lo + (torch.arange(int(n), dtype=torch.float64) + 0.5) * (hi - lo) / n for lo, hi, n in zip(lower, upper, counts)]
+    return torch.cartesian_prod(*axes)
+
+
+def _poisson_disk(lower: Tensor, upper: Tensor, spacing: float, seed: int) -> Tensor:
+    """Poisson-disk sample of a box by phased dart throwing on a grid with at most one point per cell (Wei 2008).
+
+    Cells three apart cannot conflict, so all cells of one of the 3^D phases try a dart at once.
+    """
+    dim = len(lower)
+    radius = spacing / _POISSON_SPACING[dim]
+    cell = radius / math.sqrt(dim)
+    shape = [int(n) + 4 for n in ((upper - lower) / cell).ceil()]  # two empty cells outside each side
+    taken = torch.full((math.prod(shape), dim), math.inf, dtype=torch.float64)
+    strides = torch.tensor([math.prod(shape[k + 1 :]) for k in range(dim)])
+    offsets = torch.cartesian_prod(*[torch.arange(-2, 3)] * dim)
+    offsets = offsets[offsets.square().sum(1).argsort(stable=True)]  # the nearest reject most darts
+    neighbours = (offsets @ strides).split(3**dim)
+    index = torch.cartesian_prod(*[torch.arange(2, n - 2) for n in shape])
+    phases = [index[(index % 3 == torch.tensor(phase)).all(1)] for phase in itertools.product(range(3), repeat=dim)]
+    generator = torch.Generator().manual_seed(seed)
+    for _ in range(_POISSON_TRIALS):
+        for k, phase in enumerate(phases):
+            phase = phases[k] = phase[torch.isinf(taken[phase @ strides, 0])]
+            dart = lower + (phase - 2 + torch.rand(phase.shape, generator=generator, dtype=torch.float64)) * cell
+            flat = phase @ strides
+            free = (dart <= upper).all(1)
+            for near in neighbours:
+                flat, dart = flat[free], dart[free]
+                free = (taken[flat[:, None] + near] - dart[:, None]).square().sum(2).amin(1) >= radius**2
+            taken[flat[free]] = dart[free]
+    return taken[torch.isfinite(taken[:, 0])]
+
+
+def box(lower: Vector, upper: Vector, grid: Any, per_cell: float = 8, **options: Any) -> Points:
+    """Points in the box from ``lower`` to ``upper`` [m]; ``options`` as in :func:`fill`."""
+    return fill(Box(lower, upper), grid, per_cell, **options)
+
+
+def sphere(center: Vector, radius: float, grid: Any, per_cell: float = 8, **options: Any) -> Points:
+    """Points in a ball (a disc in 2-D); ``options`` as in :func:`fill`."""
+    return fill(Sphere(center, radius), grid, per_cell, **options)
+
+
+def cylinder(start: Vector, end: Vector, radius: float, grid: Any, per_cell: float = 8, **options: Any) -> Points:
+    """Points in a cylinder between ``start`` and ``end`` [m] (3-D); ``options`` as in :func:`fill`."""
+    return fill(Cylinder(start, end, radius), grid, per_cell, **options)
+
+
+def capsule(start: Vector, end: Vector, radius: float, grid: Any, per_cell: float = 8, **options: Any) -> Points:
+    """Points within ``radius`` of the segment from ``start`` to ``end`` [m]; ``options`` as in :func:`fill`."""
+    return fill(Capsule(start, end, radius), grid, per_cell, **options)
+
+
+def mesh(
+    source: str | Path | Any, grid: Any, per_cell: float = 8, *, scale: float = 1.0, offset: Vector = (0.0, 0.0, 0.0), **options: Any
+) -> Points:
+    """Points inside a closed triangle mesh (see :class:`Mesh`); ``options`` as in :func:`fill`."""
+    return fill(Mesh(source, scale, offset), grid, per_cell, **options)
+
+
+def file(
+    path: str | Path,
+    volume: float | None = None,
+    *,
+    dtype: torch.dtype | None = None,
+    device: torch.device | str | None = None,
+) -> Points:
+    """Points from a file: .npy [P, D], .npz with ``x`` [P, D] and perhaps ``volume`` [P], or .csv with columns x, y, (z,) (volume).
+
+    ``volume`` is the total volume [m^3], shared evenly; needed where the file has no volumes.
+
+    Raises:
+        FileNotFoundError: when there is no such file.
+        ValueError: for an unknown format, a wrong shape, numbers that are not finite, or a volume that is missing or not positive.
+    """
+    x, volumes = _read_points(Path(path))
+    if x.dim() != 2 or x.shape[1] not in (2, 3) or len(x) == 0:
+        raise ValueError(f"points in {path} must have shape [P, 2] or [P, 3] with P > 0, got {list(x.shape)}")
+    if volume is not None:
+        volumes = torch.full((len(x),), _positive("volume", volume) / len(x), dtype=torch.float64)
+    if volumes is None:
+        raise ValueError(f"{path} has no particle volumes; give the total volume of the points")
+    if volumes.shape != x.shape[:1] or not bool((volumes > 0).all()):
+        raise ValueError(f"volumes in {path} must be positive with shape [{len(x)}], got {list(volumes.shape)}")
+    if not bool(torch.isfinite(x).all() and torch.isfinite(volumes).all()):
+        raise ValueError(f"points in {path} must be finite")
+    dtype = dtype or torch.get_default_dtype()
+    return Points(x.to(device=device, dtype=dtype), volumes.to(device=device, dtype=dtype))
+
+
+def _read_points(path: Path) -> tuple[Tensor, Tensor | None]:
+    import numpy as np
+
+    if not path.is_file():
+        raise FileNotFoundError(f"points file {path} does not exist")
+    if path.suffix == ".npy":
+        return torch.as_tensor(np.load(path, allow_pickle=False)).double(), None
+    if path.suffix == ".npz":
+        with np.load(path, allow_pickle=False) as arrays:
+            if "x" not in arrays:
+                raise ValueError(f"{path} must hold an array 'x' of positions, got {sorted(arrays)}")
+            volume = torch.as_tensor(arrays["volume"]).double() if "volume" in arrays else None
+            return torch.as_tensor(arrays["x"]).double(), volume
+    if path.suffix == ".csv":
+        return _read_csv(path)
+    raise ValueError(f"points file must end in .npy, .npz or .csv, got {path}")
+
+
+def _read_csv(path: Path) -> tuple[Tensor, Tensor | None]:
+    with path.open(newline="") as handle:
+        rows = csv.DictReader(handle)
+        names = rows.fieldnames or []
+        axes = [name for name in ("x", "y", "z") if name in names]
+        if axes[:2] != ["x", "y"]:
+            raise ValueError(f"{path} must have a first line naming the columns x, y, (z,) (volume), got {names}")
+        table = [[float(row[name]) for name in [*axes, *(["volume"] if "volume" in names else [])]] for row in rows]
+    values = torch.tensor(table, dtype=torch.float64).reshape(len(table), -1)
+    return values[:, : len(axes)], values[:, len(axes)] if "volume" in names else None
