@@ -1,0 +1,412 @@
+"""P2G and G2P, and the channel-wise scatter and gather below them: Python faces, fake kernels and autograd.
+
+All of them are derivatives of one trilinear form of positions, particle values and node values,
+
+    Φ = Σ_p Σ_i g_i · [N_i(x_p) (a_p + s B_p (x_i − x_p)) + G_p ∇N_i(x_p)],
+
+`scatter` = ∂Φ/∂g, `gather` = ∂Φ/∂(a, B, G), `position_gradient` = ∂Φ/∂x. So they are each other's backward.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ..errors import check_like, check_positions, shape_of
+from ..grid import Blocks, Grid
+from ..reference import transfer as reference
+from .arguments import differentiate, per_particle, refuse_vmap, soa_empty, split_dt, sum_by_scene
+
+STRESS_FORMS = {"mls": 0, "gradient": 1}
+TOPOLOGY = 10
+"""Trailing arguments of every op: five tensors of `Blocks`, then dx, lower, blocks, order, deterministic."""
+
+
+def p2g(
+    blocks: Blocks,
+    x: Tensor,
+    mass: Tensor,
+    v: Tensor,
+    C: Tensor | None = None,
+    stress: Tensor | None = None,
+    volume: Tensor | None = None,
+    dt: float | Tensor | None = None,
+    stress_form: str = "mls",
+) -> Tensor:
+    """Mass and momentum of the nodes from the particles.
+
+    m_i = Σ N_i m_p and (mv)_i = Σ N_i [m_p v_p + Q_p (x_i − x_p)] with Q = m C (APIC, Jiang et al. 2015). Stress adds the
+    impulse of a step: Q −= dt V D⁻¹ τ (MLS-MPM, Hu et al. 2018, eq. 18), or −dt V τ ∇N_i (stress_form="gradient").
+
+    Args:
+        blocks: active blocks of these positions.
+        x: positions [P, D] [m].
+        mass: [P] [kg].
+        v: velocities [P, D] [m/s].
+        C: affine velocity field [P, D, D] [1/s]; None for PIC.
+        stress: Kirchhoff stress τ [P, D, D] [Pa]; needs `volume` and `dt`.
+        volume: rest volume [P] [m³].
+        dt: time step [s]: a number, or a tensor of shape [], [1] or [B].
+        stress_form: "mls" or "gradient".
+
+    Returns:
+        Node mass and momentum [N, 1 + D] [kg, kg m/s]. Particles outside the grid give nothing.
+
+    Raises:
+        ValueError, TypeError: for wrong shapes, dtypes, devices or values.
+
+    Differentiable with respect to every floating tensor, twice in eager mode.
+    """
+    check_positions(x, blocks.grid.dim, blocks.scene, blocks.grid.scenes)
+    P, D = x.shape
+    check_like("mass", mass, x, (P,), "[P]")
+    check_like("v", v, x, (P, D), "[P, D]")
+    check_like("C", C, x, (P, D, D), "[P, D, D]")
+    check_like("stress", stress, x, (P, D, D), "[P, D, D]")
+    check_like("volume", volume, x, (P,), "[P]")
+    if stress_form not in STRESS_FORMS:
+        raise ValueError(f"stress_form must be one of {sorted(STRESS_FORMS)}, got {stress_form!r}")
+    scene_dt = None
+    if stress is None:
+        dt = 0.0
+    elif volume is None or dt is None:
+        raise ValueError("stress needs volume and dt")
+    else:
+        dt, scene_dt = split_dt(dt, blocks.grid.scenes, x)
+    return torch.ops.torch_mpm.p2g(
+        x, mass, v, C, stress, volume, scene_dt, dt, STRESS_FORMS[stress_form], *blocks.topology
+    )
+
+
+def g2p(
+    blocks: Blocks, x: Tensor, velocity: Tensor, affine: bool = True, gradient: bool = False
+) -> tuple[Tensor, Tensor | None, Tensor | None]:
+    """Velocity, affine field and velocity gradient of the particles from the nodes.
+
+    v_p = Σ N_i v_i, C_p = D⁻¹ Σ N_i v_i (x_i − x_p)ᵀ (Jiang et al. 2015) and (∇v)_p = Σ v_i ∇N_iᵀ.
+
+    Args:
+        blocks: active blocks of these positions.
+        x: positions [P, D] [m].
+        velocity: node velocities [N, D] [m/s]; rows may be apart (a view [:, 1:] of mass and velocity is fastest).
+        affine: whether C is wanted.
+        gradient: whether ∇v is wanted.
+
+    Returns:
+        v [P, D] [m/s], C [P, D, D] [1/s] or None, ∇v [P, D, D] [1/s] or None; zero for particles outside the grid.
+
+    Raises:
+        ValueError, TypeError: for wrong shapes, dtypes or devices.
+
+    Differentiable with respect to x and velocity, twice in eager mode.
+    """
+    check_positions(x, blocks.grid.dim, blocks.scene, blocks.grid.scenes)
+    velocity = _check_nodes("velocity", velocity, blocks, x, blocks.grid.dim)
+    v, C, grad_v = torch.ops.torch_mpm.g2p(x, velocity, affine, gradient, *blocks.topology)
+    return v, C if affine else None, grad_v if gradient else None
+
+
+def scatter(
+    blocks: Blocks,
+    x: Tensor,
+    value: Tensor,
+    moment: Tensor | None = None,
+    gradient: Tensor | None = None,
+    moment_scale: float = 1.0,
+) -> Tensor:
+    """Any particle features to the nodes: Σ_p N_i (value_p + s moment_p (x_i − x_p)) + gradient_p ∇N_i.
+
+    Args:
+        blocks: active blocks of these positions.
+        x: positions [P, D] [m].
+        value: features [P, K], in any unit u.
+        moment: their affine field [P, K, D] [u/m] (for s = 1), or None.
+        gradient: [P, K, D] [u m], or None.
+        moment_scale: s.
+
+    Returns:
+        Sums on the nodes [N, K] [u]. Multiply features by mass and divide by the node mass of `p2g` for an average.
+
+    Raises:
+        ValueError, TypeError: for wrong shapes, dtypes or devices.
+
+    Differentiable with respect to every tensor, twice in eager mode.
+    """
+    check_positions(x, blocks.grid.dim, blocks.scene, blocks.grid.scenes)
+    P, D = x.shape
+    if not isinstance(value, Tensor) or value.dim() != 2:
+        raise ValueError(f"value must have shape [P, K] = [{P}, K], got {shape_of(value)}")
+    K = value.shape[1]
+    check_like("value", value, x, (P, K), "[P, K]")
+    check_like("moment", moment, x, (P, K, D), "[P, K, D]")
+    check_like("gradient", gradient, x, (P, K, D), "[P, K, D]")
+    return torch.ops.torch_mpm.scatter(
+        x, value, moment, gradient, moment_scale, *blocks.topology
+    )
+
+
+def gather(
+    blocks: Blocks, x: Tensor, nodes: Tensor, moment: bool = False, gradient: bool = False, moment_scale: float = 1.0
+) -> tuple[Tensor, Tensor | None, Tensor | None]:
+    """Any node features to the particles: Σ_i N_i g_i, s Σ_i N_i g_i (x_i − x_p)ᵀ and Σ_i g_i ∇N_iᵀ.
+
+    Args:
+        blocks: active blocks of these positions.
+        x: positions [P, D] [m].
+        nodes: features g [N, K], in any unit u.
+        moment, gradient: which sums are wanted.
+        moment_scale: s; `grid.inverse_inertia` makes the moment the APIC affine field.
+
+    Returns:
+        value [P, K] [u], moment [P, K, D] [s u m] or None, gradient [P, K, D] [u/m] or None.
+
+    Raises:
+        ValueError, TypeError: for wrong shapes, dtypes or devices.
+
+    Differentiable with respect to x and nodes, twice in eager mode.
+    """
+    check_positions(x, blocks.grid.dim, blocks.scene, blocks.grid.scenes)
+    nodes = _check_nodes("nodes", nodes, blocks, x, None)
+    a, b, c = torch.ops.torch_mpm.gather(x, nodes, moment_scale, moment, gradient, *blocks.topology)
+    return a, b if moment else None, c if gradient else None
+
+
+def _check_nodes(name: str, nodes: Tensor, blocks: Blocks, x: Tensor, channels: int | None) -> Tensor:
+    if not isinstance(nodes, Tensor) or nodes.dim() != 2:
+        raise ValueError(f"{name} must have shape [N, {channels or 'K'}], got {shape_of(nodes)}")
+    K = channels or nodes.shape[1]
+    check_like(name, nodes, x, (blocks.node_count, K), f"[N, {channels or 'K'}]")
+    return nodes if nodes.shape[1] <= 1 or nodes.stride(1) == 1 else nodes.contiguous()
+
+
+# ---- fake kernels: shapes and strides only
+
+_Topology = Any
+
+
+def _node_rows(topology: Sequence[Any], dim: int) -> int:
+    return topology[1].shape[0] * 4**dim
+
+
+@torch.library.register_fake("torch_mpm::p2g")
+def _p2g_fake(x, mass, v, C, stress, volume, scene_dt, dt, stress_form, *topology):  # type: ignore[no-untyped-def]
+    return x.new_empty(_node_rows(topology, x.shape[1]), 1 + x.shape[1])
+
+
+@torch.library.register_fake("torch_mpm::p2g_backward")
+def _p2g_backward_fake(  # type: ignore[no-untyped-def]
+    grad_nodes, x, mass, v, C, stress, volume, scene_dt, dt, stress_form, needs, *topology
+):
+    P, D = x.shape
+    shapes = ((P, D), (P,), (P, D), (P, D, D), (P, D, D), (P,), (P,))
+    present = (True, True, True, C is not None) + 3 * (stress is not None,)
+    return tuple(
+        soa_empty(x, shape) if needs >> i & 1 and here else x.new_empty(0)
+        for i, (shape, here) in enumerate(zip(shapes, present, strict=True))
+    )
+
+
+@torch.library.register_fake("torch_mpm::scatter")
+def _scatter_fake(x, value, moment, gradient, moment_scale, *topology):  # type: ignore[no-untyped-def]
+    return x.new_empty(_node_rows(topology, x.shape[1]), value.shape[1])
+
+
+@torch.library.register_fake("torch_mpm::gather")
+def _gather_fake(x, nodes, moment_scale, moment, gradient, *topology):  # type: ignore[no-untyped-def]
+    (P, D), K = x.shape, nodes.shape[1]
+    sums = [soa_empty(x, (P, K, D)) if wanted else x.new_empty(0) for wanted in (moment, gradient)]
+    return soa_empty(x, (P, K)), *sums
+
+
+@torch.library.register_fake("torch_mpm::g2p")
+def _g2p_fake(x, velocity, affine, gradient, *topology):  # type: ignore[no-untyped-def]
+    return _gather_fake(x, velocity, 1.0, affine, gradient, *topology)
+
+
+@torch.library.register_fake("torch_mpm::position_gradient")
+def _position_gradient_fake(x, value, moment, gradient, nodes, moment_scale, *topology):  # type: ignore[no-untyped-def]
+    return soa_empty(x, tuple(x.shape))
+
+
+# ---- autograd
+
+
+def _save(ctx: Any, tensors: Sequence[Tensor | None], topology: Sequence[Any], **attributes: Any) -> None:
+    ctx.save_for_backward(*tensors, *topology[:5])
+    ctx.geometry = topology[5:]
+    for name, value in attributes.items():
+        setattr(ctx, name, value)
+
+
+def _saved(ctx: Any) -> tuple[list[Tensor | None], tuple[Any, ...]]:
+    return list(ctx.saved_tensors[:-5]), (*ctx.saved_tensors[-5:], *ctx.geometry)
+
+
+def _scatter_setup(ctx, inputs, output):  # type: ignore[no-untyped-def]
+    x, value, moment, gradient, scale, *topology = inputs
+    _save(ctx, (x, value, moment, gradient), topology, scale=scale)
+
+
+def _scatter_backward(ctx, grad):  # type: ignore[no-untyped-def]
+    (x, value, moment, gradient), topology = _saved(ctx)
+    need = ctx.needs_input_grad
+    grad_x = grad_value = grad_moment = grad_gradient = None
+    grad = grad.contiguous()
+    if need[1] or need[2] or need[3]:
+        grad_value, grad_moment, grad_gradient = torch.ops.torch_mpm.gather(
+            x, grad, ctx.scale, bool(need[2]), bool(need[3]), *topology
+        )
+    if need[0]:
+        grad_x = torch.ops.torch_mpm.position_gradient(x, value, moment, gradient, grad, ctx.scale, *topology)
+    return (grad_x, grad_value, grad_moment if need[2] else None, grad_gradient if need[3] else None) + (None,) * (
+        1 + TOPOLOGY
+    )
+
+
+def _gather_setup(ctx, inputs, output):  # type: ignore[no-untyped-def]
+    x, nodes, scale, moment, gradient, *topology = inputs
+    _save(ctx, (x, nodes), topology, scale=scale, moment=moment, gradient=gradient)
+
+
+def _gather_backward(ctx, grad_value, grad_moment, grad_gradient):  # type: ignore[no-untyped-def]
+    grad_x, grad_nodes = _gather_adjoint(ctx, grad_value, grad_moment, grad_gradient)
+    return (grad_x, grad_nodes) + (None,) * (3 + TOPOLOGY)
+
+
+def _gather_adjoint(ctx, grad_value, grad_moment, grad_gradient):  # type: ignore[no-untyped-def]
+    (x, nodes), topology = _saved(ctx)
+    moment = grad_moment if ctx.moment else None
+    gradient = grad_gradient if ctx.gradient else None
+    grad_x = grad_nodes = None
+    if ctx.needs_input_grad[0]:
+        grad_x = torch.ops.torch_mpm.position_gradient(x, grad_value, moment, gradient, nodes, ctx.scale, *topology)
+    if ctx.needs_input_grad[1]:
+        grad_nodes = torch.ops.torch_mpm.scatter(x, grad_value, moment, gradient, ctx.scale, *topology)
+    return grad_x, grad_nodes
+
+
+def _g2p_setup(ctx, inputs, output):  # type: ignore[no-untyped-def]
+    x, velocity, affine, gradient, *topology = inputs
+    inverse_inertia = (4.0 if topology[8] == 2 else 3.0) / topology[5] ** 2
+    _save(ctx, (x, velocity), topology, scale=inverse_inertia, moment=affine, gradient=gradient)
+
+
+def _g2p_backward(ctx, grad_v, grad_C, grad_gradient):  # type: ignore[no-untyped-def]
+    grad_x, grad_velocity = _gather_adjoint(ctx, grad_v, grad_C, grad_gradient)
+    return (grad_x, grad_velocity) + (None,) * (2 + TOPOLOGY)
+
+
+def _position_gradient_setup(ctx, inputs, output):  # type: ignore[no-untyped-def]
+    x, value, moment, gradient, nodes, scale, *topology = inputs
+    _save(ctx, (x, value, moment, gradient, nodes), topology, scale=scale)
+
+
+def _position_gradient_backward(ctx, grad):  # type: ignore[no-untyped-def]
+    tensors, topology = _saved(ctx)
+    blocks = _blocks_of(topology, tensors[0])
+
+    def function(x, value, moment, gradient, nodes):  # type: ignore[no-untyped-def]
+        return reference.position_gradient(blocks, x, value, moment, gradient, nodes, ctx.scale)
+
+    return (*differentiate(function, tensors, [grad]),) + (None,) * (1 + TOPOLOGY)
+
+
+def _blocks_of(topology: Sequence[Any], x: Tensor) -> Blocks:
+    """The `Blocks` that a topology came from, with the scene of each particle found again from its block."""
+    table, block, offsets, index, schedule, dx, lower, blocks, order, _ = topology
+    grid = Grid.__new__(Grid)
+    grid.dx, grid.lower, grid.blocks, grid.order, grid.dim = dx, tuple(lower), tuple(blocks), order, len(lower)
+    grid.nodes_per_block = 4**grid.dim
+    per_scene = 1
+    for n in blocks:
+        per_scene *= n
+    grid.scenes = table.shape[0] // per_scene
+    position = torch.arange(x.shape[0], device=x.device, dtype=offsets.dtype)
+    slot = torch.searchsorted(offsets[1:].contiguous(), position, right=True).clamp_max(block.shape[0] - 1)
+    scene = torch.zeros_like(index)
+    scene[index.long()] = (block[slot] // per_scene).clamp_min(0)
+    return Blocks(grid, table, block, offsets, index, schedule, table, scene)
+
+
+def _p2g_setup(ctx, inputs, output):  # type: ignore[no-untyped-def]
+    x, mass, v, C, stress, volume, scene_dt, dt, form, *topology = inputs
+    _save(ctx, (x, mass, v, C, stress, volume, scene_dt), topology, dt=dt, form=form)
+
+
+def _p2g_backward(ctx, grad):  # type: ignore[no-untyped-def]
+    tensors, topology = _saved(ctx)
+    needs = sum(1 << i for i, needed in enumerate(ctx.needs_input_grad[:7]) if needed)
+    grads = list(torch.ops.torch_mpm.p2g_backward(grad.contiguous(), *tensors, ctx.dt, ctx.form, needs, *topology))
+    if ctx.needs_input_grad[6] and tensors[4] is not None:
+        blocks = _blocks_of(topology, tensors[0])
+        grads[6] = ctx.dt * sum_by_scene(grads[6], blocks.scene, blocks.grid.scenes)
+    grads = [g if needed and t is not None else None for g, t, needed in zip(grads, tensors, ctx.needs_input_grad[:7], strict=True)]
+    return (*grads,) + (None,) * (2 + TOPOLOGY)
+
+
+def _p2g_backward_setup(ctx, inputs, output):  # type: ignore[no-untyped-def]
+    tensors, (dt, form, needs), topology = inputs[:8], inputs[8:11], inputs[11:]
+    _save(ctx, tensors, topology, dt=dt, form=form, needs=needs)
+
+
+def _p2g_double_backward(ctx, *grads):  # type: ignore[no-untyped-def]
+    tensors, topology = _saved(ctx)
+    has_stress = tensors[5] is not None
+    present = [True, True, True, tensors[4] is not None] + 3 * [has_stress]
+    wanted = [bool(ctx.needs >> i & 1) and here for i, here in enumerate(present)]
+
+    def function(*inputs):  # type: ignore[no-untyped-def]
+        outputs = _composed_p2g_backward(inputs, ctx.dt, ctx.form, topology)
+        return tuple(o for o, w in zip(outputs, wanted, strict=True) if w)
+
+    given = [g for g, w in zip(grads, wanted, strict=True) if w]
+    return (*differentiate(function, tensors, given),) + (None,) * (3 + TOPOLOGY)
+
+
+def _composed_p2g_backward(inputs, dt, form, topology):  # type: ignore[no-untyped-def]
+    """`p2g_backward` from differentiable ops: `adjoint` of csrc/transfer/momentum.h once more, in plain torch."""
+    grad, x, mass, v, C, stress, volume, scene_dt = inputs
+    D = x.shape[1]
+    mls = form == STRESS_FORMS["mls"]
+    dx, order = topology[5], topology[8]
+    inverse_inertia = (4.0 if order == 2 else 3.0) / dx**2
+    blocks = _blocks_of(topology, x)
+    value, moment, gradient = torch.ops.torch_mpm.gather(x, grad, 1.0, True, True, *topology)
+    mass_sum, momentum_sum, moment_sum = value[:, 0], value[:, 1:], moment[:, 1:]
+    grad_mass = mass_sum + (v * momentum_sum).sum(1)
+    grad_v = mass[:, None] * momentum_sum
+    a = torch.cat([mass[:, None], mass[:, None] * v], 1)
+    B = x.new_zeros(x.shape[0], 1 + D, D)
+    G = grad_C = grad_stress = grad_volume = grad_dt = None
+    if C is not None:
+        grad_mass = grad_mass + (C * moment_sum).sum((1, 2))
+        grad_C = mass[:, None, None] * moment_sum
+        B = B + torch.nn.functional.pad(mass[:, None, None] * C, (0, 0, 1, 0))
+    if stress is not None:
+        step = dt if scene_dt is None else dt * per_particle(scene_dt, blocks.scene, x.shape[0])
+        scale = -inverse_inertia if mls else -1.0
+        total = moment_sum if mls else gradient[:, 1:]
+        work = scale * (stress * total).sum((1, 2))
+        impulse = scale * step * volume
+        grad_stress = impulse[:, None, None] * total
+        grad_volume = step * work
+        grad_dt = volume * work
+        padded = torch.nn.functional.pad(impulse[:, None, None] * stress, (0, 0, 1, 0))
+        B, G = (B + padded, None) if mls else (B, padded)
+    grad_x = torch.ops.torch_mpm.position_gradient(x, a, B, G, grad, 1.0, *topology)
+    return grad_x, grad_mass, grad_v, grad_C, grad_stress, grad_volume, grad_dt
+
+
+for _name, _backward, _setup in (
+    ("scatter", _scatter_backward, _scatter_setup),
+    ("gather", _gather_backward, _gather_setup),
+    ("g2p", _g2p_backward, _g2p_setup),
+    ("position_gradient", _position_gradient_backward, _position_gradient_setup),
+    ("p2g", _p2g_backward, _p2g_setup),
+    ("p2g_backward", _p2g_double_backward, _p2g_backward_setup),
+):
+    torch.library.register_autograd(f"torch_mpm::{_name}", _backward, setup_context=_setup)
+    refuse_vmap(_name)
