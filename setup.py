@@ -26,6 +26,8 @@ from setuptools import Extension, setup
 from setuptools.command.bdist_wheel import bdist_wheel
 from setuptools.command.build_ext import build_ext
 
+from build_backend import torch_directory
+
 ROOT = Path(__file__).resolve().parent
 CSRC = ROOT / "csrc"
 
@@ -52,17 +54,6 @@ def isa_levels() -> dict[str, list[str]]:
     if platform.machine().lower() in ("x86_64", "amd64"):
         return {name: [f"-march={march}"] for name, march in X86_LEVELS.items()}
     return {"baseline": []}
-
-
-def package_directory(name: str) -> Path:
-    """Directory of an installed package, found without importing it."""
-    spec = importlib.util.find_spec(name)
-    if spec is None or not spec.submodule_search_locations:
-        raise SystemExit(
-            f"building torch_mpm needs the headers of {name}, which {sys.executable} does not have: "
-            f"install {name} first, or build with the dependencies named in CONTRIBUTING.md"
-        )
-    return Path(spec.submodule_search_locations[0])
 
 
 def cuda_wanted() -> bool:
@@ -187,10 +178,14 @@ def cuda_library() -> Library:
     return Library("torch_mpm/lib/libtorch_mpm_cuda.so", objects, "link_cuda")
 
 
-def math_library(version: str) -> Library:
+def math_library(version: str) -> Library | None:
     """The pybind11 module torch_mpm._math. It serves one Python version only and is meant for tests."""
-    python = sysconfig.get_paths()["include"]
-    flags = ["-isystem", python, "-isystem", str(package_directory("pybind11") / "include")]
+    pybind11 = importlib.util.find_spec("pybind11")
+    python = Path(sysconfig.get_path("include"))
+    if pybind11 is None or not pybind11.origin or not (python / "Python.h").exists():
+        print(f"torch_mpm._math is left out: {sys.executable} has no pybind11 or no Python.h")
+        return None
+    flags = [f"-isystem{python}", f"-isystem{Path(pybind11.origin).parent / 'include'}"]
     flags += [f'-DTORCH_MPM_VERSION="{version}"', *isa_levels()["baseline"]]
     suffix = sysconfig.get_config_var("EXT_SUFFIX")
     objects = [(CSRC / "math" / "python_module.cpp", "cxx", flags)]
@@ -238,7 +233,9 @@ class Build(build_ext):
             self.build(directory, destination, sanitize)
 
     def build(self, directory: Path, destination: Path, sanitize: str) -> None:
-        torch = package_directory("torch")
+        torch = torch_directory()
+        if torch is None:
+            raise SystemExit(f"building torch_mpm needs torch 2.11 or newer, which {sys.executable} does not have")
         ninja = Ninja(directory, torch, sanitize)
         libraries = self.libraries_to_build()
         for library in libraries.values():
@@ -249,7 +246,7 @@ class Build(build_ext):
         self.describe(destination / "torch_mpm/lib/build.json", list(libraries), torch_version(torch), sanitize)
 
     def libraries_to_build(self) -> dict[str, Library]:
-        """Every target asked for that this machine can build and that has sources."""
+        """Every target asked for that this machine can build."""
         wanted = self.targets.split(",") if self.targets else ["cpu", "cuda", "math"]
         if unknown := set(wanted) - {"cpu", "cuda", "math"}:
             raise SystemExit(f"--targets must be of cpu, cuda, math, got {sorted(unknown)}")
@@ -258,12 +255,9 @@ class Build(build_ext):
             libraries["cpu"] = cpu_library()
         if "cuda" in wanted and cuda_wanted():
             libraries["cuda"] = cuda_library()
-        if "math" in wanted:
-            if Path(sysconfig.get_paths()["include"], "Python.h").exists():
-                libraries["math"] = math_library(self.distribution.get_version())
-            else:
-                print(f"torch_mpm._math is left out: {sys.executable} has no Python.h")
-        return {name: library for name, library in libraries.items() if library.objects}
+        if "math" in wanted and (library := math_library(self.distribution.get_version())):
+            libraries["math"] = library
+        return libraries
 
     def describe(self, path: Path, built: list[str], torch: str, sanitize: str) -> None:
         """Write what `python -m torch_mpm info` shows; targets not built this time keep their entry."""

@@ -15,9 +15,13 @@ cuda_error: str | None = None
 """Why the CUDA library is not in use, or None if it is loaded."""
 
 
-def _load(path: Path) -> None:
-    # Newer drivers of torch.ops.load_library print the whole stack; OSError already names the missing symbol or file.
-    torch.ops.load_library(os.fspath(path))
+def _load(path: Path) -> str | None:
+    """Register the ops of a library; return why it cannot be loaded."""
+    try:
+        torch.ops.load_library(os.fspath(path))
+    except OSError as error:
+        return str(error.__cause__ or error)  # torch wraps the loader's message in one that leaves the reason out
+    return None
 
 
 def _load_cpu() -> None:
@@ -26,12 +30,10 @@ def _load_cpu() -> None:
             f"torch_mpm is not built: {CPU_LIBRARY} does not exist. Run `make build` in the source tree, "
             "or install the package with `pip install .`"
         )
-    try:
-        _load(CPU_LIBRARY)
-    except OSError as error:
+    if reason := _load(CPU_LIBRARY):
         raise ImportError(
-            f"torch_mpm cannot load {CPU_LIBRARY} with torch {torch.__version__} (2.11 or newer is needed): {error}"
-        ) from error
+            f"torch_mpm cannot load {CPU_LIBRARY} with torch {torch.__version__} (2.11 or newer is needed): {reason}"
+        )
 
 
 def _load_cuda() -> str | None:
@@ -40,11 +42,7 @@ def _load_cuda() -> str | None:
         return "torch_mpm was built without its CUDA library (build with TORCH_MPM_CUDA=1 where nvcc is installed)"
     if torch.version.cuda is None:
         return f"torch {torch.__version__} was built without CUDA"
-    try:
-        _load(CUDA_LIBRARY)
-    except OSError as error:
-        return f"{CUDA_LIBRARY} cannot be loaded: {error}"
-    return None
+    return _load(CUDA_LIBRARY)
 
 
 _load_cpu()

@@ -1,0 +1,85 @@
+"""The built package: its libraries, what they need from torch, and what `info` says about them."""
+
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+import torch_mpm
+from torch_mpm import _library
+from torch_mpm.info import info
+
+LIBRARIES = [path for path in (_library.CPU_LIBRARY, _library.CUDA_LIBRARY) if path.exists()]
+
+
+def symbols(library: Path, which: str) -> list[str]:
+    if shutil.which("nm") is None:
+        pytest.skip("nm is not installed")
+    command = ["nm", "--dynamic", "--demangle", which, str(library)]
+    lines = subprocess.run(command, check=True, capture_output=True, text=True).stdout.splitlines()
+    return [line.split(maxsplit=1)[1] if which == "--undefined-only" else line for line in lines]
+
+
+@pytest.mark.parametrize("library", LIBRARIES, ids=lambda path: path.stem)
+def test_library_uses_only_the_stable_abi_of_torch(library: Path) -> None:
+    unstable = [name for name in symbols(library, "--undefined-only") if "c10::" in name or "at::" in name]
+    assert unstable == []
+
+
+@pytest.mark.parametrize("library", LIBRARIES, ids=lambda path: path.stem)
+def test_library_defines_all_functions_of_its_own(library: Path) -> None:
+    assert [name for name in symbols(library, "--undefined-only") if "mpm::" in name] == []
+
+
+@pytest.mark.parametrize("library", LIBRARIES, ids=lambda path: path.stem)
+def test_library_exports_none_of_its_functions(library: Path) -> None:
+    assert [name for name in symbols(library, "--defined-only") if "mpm::" in name] == []
+
+
+def test_info_describes_build_and_devices() -> None:
+    values = info()
+    assert values["torch"] == torch.__version__
+    assert values["build"]["cpu"]["isa"][0] == "baseline"
+    assert values["cuda"]["usable"] or values["cuda"]["reason"]
+    assert values["cuda"]["usable"] == (torch.cuda.is_available() and _library.cuda_error is None)
+
+
+def test_command_line_prints_info() -> None:
+    command = [sys.executable, "-m", "torch_mpm", "info"]
+    output = subprocess.run(command, check=True, capture_output=True, text=True).stdout
+    assert f"torch: {torch.__version__}" in output
+
+
+def copy_package(directory: Path, *left_out: str) -> None:
+    package = Path(torch_mpm.__file__).parent
+    shutil.copytree(package, directory / "torch_mpm", ignore=shutil.ignore_patterns("__pycache__", *left_out))
+
+
+def run_python(directory: Path, script: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([sys.executable, "-c", script], cwd=directory, capture_output=True, text=True)
+
+
+def test_import_without_libraries_says_how_to_build(tmp_path: Path) -> None:
+    copy_package(tmp_path, "*.so")
+    result = run_python(tmp_path, "import torch_mpm")
+    assert "ImportError: torch_mpm is not built" in result.stderr
+    assert "make build" in result.stderr
+
+
+def test_import_of_a_foreign_library_names_the_file(tmp_path: Path) -> None:
+    copy_package(tmp_path, "*.so")
+    library = tmp_path / "torch_mpm" / "lib" / _library.CPU_LIBRARY.name
+    library.write_bytes(b"not a shared library")
+    result = run_python(tmp_path, "import torch_mpm")
+    assert f"ImportError: torch_mpm cannot load {library}" in result.stderr
+
+
+def test_info_says_that_the_cuda_library_is_missing(tmp_path: Path) -> None:
+    copy_package(tmp_path, _library.CUDA_LIBRARY.name)
+    result = run_python(tmp_path, "import json; from torch_mpm.info import info; print(json.dumps(info()['cuda']))")
+    assert json.loads(result.stdout)["usable"] is False, result.stderr
+    assert "built without its CUDA library" in json.loads(result.stdout)["reason"]
