@@ -70,7 +70,9 @@ class Box:
         self.lower = _vector("lower", lower)
         self.upper = _vector("upper", upper, len(self.lower))
         if not bool((self.lower < self.upper).all()):
-            raise ValueError(f"lower must be below upper on every axis, got {self.lower.tolist()} and {self.upper.tolist()}")
+            raise ValueError(
+                f"lower must be below upper on every axis, got {self.lower.tolist()} and {self.upper.tolist()}"
+            )
         self.volume = float((self.upper - self.lower).prod())
 
     def inside(self, x: Tensor) -> Tensor:
@@ -111,7 +113,10 @@ class Cylinder(_Axial):
         if len(self.start) != 3:
             raise ValueError("a cylinder needs three dimensions; in 2-D use a sphere (a disc) or a box")
         reach = self.radius * (1 - self.axis.square()).clamp(min=0).sqrt()
-        self.lower, self.upper = torch.minimum(self.start, self.end) - reach, torch.maximum(self.start, self.end) + reach
+        self.lower, self.upper = (
+            torch.minimum(self.start, self.end) - reach,
+            torch.maximum(self.start, self.end) + reach,
+        )
         self.volume = math.pi * self.radius**2 * self.length
 
     def inside(self, x: Tensor) -> Tensor:
@@ -124,7 +129,10 @@ class Capsule(_Axial):
 
     def __init__(self, start: Vector, end: Vector, radius: float):
         super().__init__(start, end, radius)
-        self.lower, self.upper = torch.minimum(self.start, self.end) - self.radius, torch.maximum(self.start, self.end) + self.radius
+        self.lower, self.upper = (
+            torch.minimum(self.start, self.end) - self.radius,
+            torch.maximum(self.start, self.end) + self.radius,
+        )
         dim = len(self.start)
         self.volume = _ball_volume(dim - 1, self.radius) * self.length + _ball_volume(dim, self.radius)
 
@@ -147,7 +155,9 @@ class Mesh:
                 f"mesh {source} is not closed: {_open_edges(mesh)} of its edges do not join two triangles; "
                 "close the holes (trimesh.repair.fill_holes, or a modelling program) before filling it"
             )
-        vertices = torch.as_tensor(mesh.vertices.copy(), dtype=torch.float64) * _positive("scale", scale) + _vector("offset", offset, 3)
+        vertices = torch.as_tensor(mesh.vertices.copy(), dtype=torch.float64) * _positive("scale", scale) + _vector(
+            "offset", offset, 3
+        )
         self.triangles = vertices[torch.as_tensor(mesh.faces.copy(), dtype=torch.int64)]
         self.lower, self.upper = vertices.amin(0), vertices.amax(0)
         self.volume = _positive(f"the volume of mesh {source}", abs(float(mesh.volume)) * scale**3)
@@ -223,7 +233,9 @@ def fill(
         raise ValueError(f'method must be "lattice" or "poisson", got {method!r}')
     x = x[shape.inside(x)]
     if len(x) == 0:
-        raise ValueError(f"the shape is too small for its particles: spacing {spacing:g} m; use a finer grid or a larger per_cell")
+        raise ValueError(
+            f"the shape is too small for its particles: spacing {spacing:g} m; use a finer grid or a larger per_cell"
+        )
     dtype = dtype or torch.get_default_dtype()
     volume = torch.full((len(x),), shape.volume / len(x), dtype=dtype, device=device)
     return Points(x.to(device=device, dtype=dtype), volume)
@@ -232,7 +244,10 @@ def fill(
 def _lattice(lower: Tensor, upper: Tensor, spacing: float) -> Tensor:
     """Centres of equal cells that tile the box, as near to ``spacing`` as a whole number per axis allows."""
     counts = ((upper - lower) / spacing).round().clamp(min=1)
-    axes = [lo + (torch.arange(int(n), dtype=torch.float64) + 0.5) * (hi - lo) / n for lo, hi, n in zip(lower, upper, counts)]
+    axes = [
+        lo + (torch.arange(int(n), dtype=torch.float64) + 0.5) * (hi - lo) / n
+        for lo, hi, n in zip(lower, upper, counts)
+    ]
     return torch.cartesian_prod(*axes)
 
 
@@ -287,7 +302,13 @@ def capsule(start: Vector, end: Vector, radius: float, grid: Any, per_cell: floa
 
 
 def mesh(
-    source: str | Path | Any, grid: Any, per_cell: float = 8, *, scale: float = 1.0, offset: Vector = (0.0, 0.0, 0.0), **options: Any
+    source: str | Path | Any,
+    grid: Any,
+    per_cell: float = 8,
+    *,
+    scale: float = 1.0,
+    offset: Vector = (0.0, 0.0, 0.0),
+    **options: Any,
 ) -> Points:
     """Points inside a closed triangle mesh (see :class:`Mesh`); ``options`` as in :func:`fill`."""
     return fill(Mesh(source, scale, offset), grid, per_cell, **options)
