@@ -40,17 +40,37 @@ struct Geometry {
 
 inline namespace TORCH_MPM_ISA {
 
+// Index of the base node along an axis, not yet rounded to an integer type: it may lie outside the lattice or be NaN.
+// S is T or a pack of T.
+template <int Order, class S, class T, int D>
+MPM_HD S base_node(const Geometry<T, D>& g, int axis, const S& x) {
+  using std::floor;
+  return floor((x - S(g.lower[axis])) * S(g.inverse_dx) + S(T(kPadding - BSpline<Order>::base_offset)));
+}
+
+template <int Order, class T, int D>
+MPM_HD bool on_lattice(const Geometry<T, D>& g, int axis, const T& base) {
+  return base >= T(0) && base < T(g.blocks[axis] * kBlockWidth - Order);  // false for NaN
+}
+
+// Distance of x from a node along an axis, in cells.
+template <class S, class T, int D>
+MPM_HD S distance_in_cells(const Geometry<T, D>& g, int axis, const S& x, const S& node) {
+  using std::fma;
+  const S k = node - S(T(kPadding));
+  return ((fma(S(T(0)) - k, S(g.dx), x) - S(g.lower[axis])) - fma(k, S(g.dx_remainder), S(g.lower_remainder[axis]))) *
+         S(g.inverse_dx);
+}
+
 // Base node and distance from it in cells. False for a particle that is not finite or whose support leaves the lattice.
 template <int Order, class T, int D>
 MPM_HD bool locate(const Geometry<T, D>& g, const T x[D], int base[D], T f[D]) {
   MPM_UNROLL
   for (int i = 0; i < D; i++) {
-    const T cell =
-        std::floor((x[i] - g.lower[i]) * g.inverse_dx + T(kPadding - BSpline<Order>::base_offset));
-    if (!(cell >= T(0) && cell < T(g.blocks[i] * kBlockWidth - Order))) return false;  // also false for NaN
-    base[i] = int(cell);
-    const T k = T(base[i] - kPadding);
-    f[i] = ((std::fma(-k, g.dx, x[i]) - g.lower[i]) - std::fma(k, g.dx_remainder, g.lower_remainder[i])) * g.inverse_dx;
+    const T node = base_node<Order>(g, i, x[i]);
+    if (!on_lattice<Order>(g, i, node)) return false;
+    base[i] = int(node);
+    f[i] = distance_in_cells(g, i, x[i], node);
   }
   return true;
 }

@@ -1,0 +1,333 @@
+#include "cpu/activate_layout.h"
+#include "cpu/kernels.h"
+#include "cpu/parallel.h"
+#include "cpu/schedule.h"
+
+// Finds the active blocks, numbers them in the order of the table, groups the particles by home block with a stable
+// counting sort, and writes the schedule. Every result is the same for any number of threads.
+namespace mpm::cpu {
+inline namespace TORCH_MPM_ISA {
+
+using W = ActivateWorkspace;
+
+// Calls f(part, begin, end) for `parts` nearly equal parts of [0, count), in parallel.
+template <class F>
+void for_parts(int parts, int64_t count, const F& f) {
+  parallel_ranges(parts, 1, [&](int64_t first, int64_t last) {
+    for (int64_t part = first; part < last; part++) f(int(part), count * part / parts, count * (part + 1) / parts);
+  });
+}
+
+// Blocks touched from a home whose particle has its base node at `local` inside it: bit o for the neighbour that lies
+// one block further along the axes of o, the last axis being bit 0 of o.
+template <int Order, int D>
+MPM_HD unsigned touched_blocks(const int local[D]) {
+  unsigned blocks = 1;
+  MPM_UNROLL
+  for (int i = D - 1, bit = 1; i >= 0; i--, bit *= 2)
+    if (local[i] + Order >= kBlockWidth) blocks |= blocks << bit;
+  return blocks;
+}
+
+template <class T, int D>
+struct Activation {
+  const ActivateArguments<T, D>& a;
+  W w;
+  Schedule<int> schedule;
+  int64_t table_size;
+  int64_t neighbour[kColours<D>];  // distance of neighbour o in the table
+
+  explicit Activation(const ActivateArguments<T, D>& arguments)
+      : a(arguments),
+        w(activate_layout(a, static_cast<char*>(a.workspace))),
+        schedule(schedule_layout<D>(a.schedule, a.capacity, a.particles)),
+        table_size(int64_t(a.scenes) * a.geometry.blocks_per_scene) {
+    for (int o = 0; o < kColours<D>; o++) {
+      neighbour[o] = 0;
+      for (int i = 0; i < D; i++) neighbour[o] = neighbour[o] * a.geometry.blocks[i] + (o >> (D - 1 - i) & 1);
+    }
+  }
+
+  int64_t* totals(int slice) const { return w.totals + slice * W::kTotals; }
+
+  int64_t sum(int which) const {
+    int64_t s = 0;
+    for (int k = 0; k < w.slices; k++) s += totals(k)[which];
+    return s;
+  }
+
+  // Replaces an entry of the totals by the sum over the slices before; returns the sum over all.
+  int64_t scan(int which) const {
+    int64_t s = 0;
+    for (int k = 0; k < w.slices; k++) {
+      const int64_t n = totals(k)[which];
+      totals(k)[which] = s;
+      s += n;
+    }
+    return s;
+  }
+};
+
+template <class T>
+MPM_HD bool is_finite(T x) {
+  return x - x == T(0);
+}
+
+// Home block and cell of each particle of a slice.
+template <int Order, class T, int D>
+void classify(const Activation<T, D>& s, int slice, int64_t begin, int64_t end) {
+  const ActivateArguments<T, D>& a = s.a;
+  int64_t* totals = s.totals(slice);
+  for (int i = 0; i < W::kTotals; i++) totals[i] = 0;
+  for (int64_t p = begin; p < end; p++) {
+    const int scene = a.scene ? a.scene[p * a.scene_stride] : 0;
+    T x[D], f[D];
+    int base[D], block[D], local[D];
+    bool finite = true;
+    for (int i = 0; i < D; i++) {
+      x[i] = a.x.pointer[p * a.x.stride[0] + i * a.x.stride[1]];
+      finite = finite && is_finite(x[i]);
+    }
+    if (!finite || scene < 0 || scene >= a.scenes || !locate<Order>(a.geometry, x, base, f)) {
+      const int which = finite ? W::kOutside : W::kNonFinite;
+      if (totals[which]++ == 0) totals[which + 1] = p;
+      s.w.key[p] = -1;
+      continue;
+    }
+    for (int i = 0; i < D; i++) {
+      block[i] = base[i] / kBlockWidth;
+      local[i] = base[i] % kBlockWidth;
+    }
+    s.w.key[p] = block_index(a.geometry, scene, block);
+    s.w.cell[p] = uint8_t(node_in_block<D>(base));
+  }
+}
+
+template <int Order, int D>
+MPM_HD unsigned touched_blocks_of_cell(int cell) {
+  int local[D];
+  MPM_UNROLL
+  for (int i = D - 1; i >= 0; i--) {
+    local[i] = cell % kBlockWidth;
+    cell /= kBlockWidth;
+  }
+  return touched_blocks<Order, D>(local);
+}
+
+// Particles of each home block in a slice, and the blocks they touch.
+template <int Order, class T, int D>
+void count_homes(const Activation<T, D>& s, int slice, int64_t begin, int64_t end) {
+  int* count = s.w.count + slice * s.table_size;
+  uint8_t* touched = s.w.touched + slice * s.table_size;
+  __builtin_memset(count, 0, sizeof(int) * s.table_size);
+  __builtin_memset(touched, 0, s.table_size);
+  int64_t dropped = 0;
+  for (int64_t p = begin; p < end; p++) {
+    const int key = s.w.key[p];
+    if (key < 0) {
+      dropped++;
+      continue;
+    }
+    count[key]++;
+    touched[key] |= uint8_t(touched_blocks_of_cell<Order, D>(s.w.cell[p]));
+  }
+  s.totals(slice)[W::kDropped] = dropped;
+}
+
+// Whether some particle touches block b of the table.
+template <class T, int D>
+bool is_active(const Activation<T, D>& s, int64_t b) {
+  int block[D];
+  block_coordinates(s.a.geometry, int(b), block);
+  for (int o = 0; o < kColours<D>; o++) {
+    bool inside = true;
+    for (int i = 0; i < D; i++) inside = inside && block[i] >= (o >> (D - 1 - i) & 1);
+    for (int k = 0; inside && k < s.w.slices; k++)
+      if (s.w.touched[k * s.table_size + b - s.neighbour[o]] >> o & 1) return true;
+  }
+  return false;
+}
+
+// Numbers the active blocks in the order of the table; returns how many there are.
+template <class T, int D>
+int64_t number_blocks(const Activation<T, D>& s) {
+  const ActivateArguments<T, D>& a = s.a;
+  for_parts(s.w.slices, s.table_size, [&](int slice, int64_t begin, int64_t end) {
+    int64_t active = 0;
+    for (int64_t b = begin; b < end; b++) active += a.table[b] = is_active(s, b);
+    s.totals(slice)[W::kActive] = active;
+  });
+  const int64_t wanted = s.scan(W::kActive);
+  for_parts(s.w.slices, s.table_size, [&](int slice, int64_t begin, int64_t end) {
+    int64_t next = s.totals(slice)[W::kActive];
+    for (int64_t b = begin; b < end; b++) {
+      const bool given = a.table[b] && next < a.capacity;
+      next += a.table[b];
+      a.table[b] = given ? int(next - 1) : -1;
+      if (given) a.block[next - 1] = int(b);
+    }
+  });
+  return wanted;
+}
+
+// After an overflow: particles that touch a block without a slot are not transferred.
+template <int Order, class T, int D>
+void drop_homeless(const Activation<T, D>& s, int64_t begin, int64_t end) {
+  for (int64_t p = begin; p < end; p++) {
+    const int key = s.w.key[p];
+    if (key < 0) continue;
+    const unsigned touched = touched_blocks_of_cell<Order, D>(s.w.cell[p]);
+    for (int o = 0; o < kColours<D>; o++)
+      if ((touched >> o & 1) && s.a.table[key + s.neighbour[o]] < 0) s.w.key[p] = -1;
+  }
+}
+
+// Offsets of each slot, and where each slice puts its particles. Returns the number of particles transferred.
+template <class T, int D>
+int64_t place_slots(const Activation<T, D>& s, int64_t slots) {
+  const ActivateArguments<T, D>& a = s.a;
+  for_parts(s.w.slices, slots, [&](int slice, int64_t begin, int64_t end) {
+    int64_t particles = 0;
+    for (int64_t slot = begin; slot < end; slot++)
+      for (int k = 0; k < s.w.slices; k++) particles += s.w.count[k * s.table_size + a.block[slot]];
+    s.totals(slice)[W::kParticles] = particles;
+  });
+  const int64_t transferred = s.scan(W::kParticles);
+  for_parts(s.w.slices, slots, [&](int slice, int64_t begin, int64_t end) {
+    int next = int(s.totals(slice)[W::kParticles]);
+    for (int64_t slot = begin; slot < end; slot++) {
+      a.offsets[slot] = next;
+      for (int k = 0; k < s.w.slices; k++) {
+        int& count = s.w.count[k * s.table_size + a.block[slot]];
+        const int n = count;
+        count = next;
+        next += n;
+      }
+    }
+  });
+  for (int64_t slot = slots; slot < a.capacity; slot++) a.block[slot] = -1;
+  for (int64_t slot = slots; slot <= a.capacity; slot++) a.offsets[slot] = int(transferred);
+  return transferred;
+}
+
+// Writes the index; `outside` is where the slice puts the particles that are not transferred.
+template <class T, int D>
+void fill_index(const Activation<T, D>& s, int slice, int64_t begin, int64_t end, int64_t outside) {
+  int* next = s.w.count + slice * s.table_size;
+  for (int64_t p = begin; p < end; p++) {
+    const int key = s.w.key[p];
+    const int64_t at = key < 0 ? outside++ : next[key]++;
+    s.a.index[at] = int(p);
+    s.w.cell_at[at] = s.w.cell[p];
+  }
+}
+
+// Lists the homes by colour and the chunks of each; returns the number of chunks.
+template <class T, int D>
+int64_t list_homes(const Activation<T, D>& s, int64_t slots) {
+  const ActivateArguments<T, D>& a = s.a;
+  const Schedule<int>& out = s.schedule;
+  const auto colour_of = [&](int64_t slot) {
+    int block[D], colour = 0;
+    block_coordinates(a.geometry, a.block[slot], block);
+    for (int i = 0; i < D; i++) colour = colour * 2 + (block[i] & 1);
+    return colour;
+  };
+  int next[kColours<D>] = {};
+  for (int64_t slot = 0; slot < slots; slot++)
+    if (a.offsets[slot + 1] > a.offsets[slot]) next[colour_of(slot)]++;
+  int homes = 0;
+  for (int c = 0; c < kColours<D>; c++) {
+    const int n = next[c];
+    out.colour_start[c] = next[c] = homes;
+    homes += n;
+  }
+  out.colour_start[kColours<D>] = homes;
+  for (int64_t slot = 0; slot < slots; slot++)
+    if (a.offsets[slot + 1] > a.offsets[slot]) out.home_slot[next[colour_of(slot)]++] = int(slot);
+  int chunks = 0;
+  for (int h = 0; h < homes; h++) {
+    const int slot = out.home_slot[h];
+    out.home_chunk[h] = chunks;
+    for (int begin = a.offsets[slot]; begin < a.offsets[slot + 1]; begin += kChunk) {
+      out.chunk_slot[chunks] = slot;
+      out.chunk_begin[chunks++] = begin;
+    }
+  }
+  out.home_chunk[homes] = chunks;
+  return chunks;
+}
+
+// Order of a chunk's particles by cell.
+template <class T, int D>
+void sort_chunk(const Activation<T, D>& s, int64_t chunk) {
+  const int begin = s.schedule.chunk_begin[chunk], slot_end = s.a.offsets[s.schedule.chunk_slot[chunk] + 1];
+  const int count = slot_end - begin < kChunk ? slot_end - begin : kChunk;
+  const uint8_t* cell = s.w.cell_at + begin;
+  uint16_t* rank = reinterpret_cast<uint16_t*>(s.schedule.rank) + begin;
+  int* end = s.schedule.cell_end + chunk * kBlockNodes<D>;
+  int next[kBlockNodes<D>] = {};
+  bool sorted = true;
+  for (int i = 0; i < count; i++) next[cell[i]]++;
+  for (int c = 0, before = 0; c < kBlockNodes<D>; c++) {
+    const int n = next[c];
+    next[c] = before;
+    end[c] = before += n;
+  }
+  for (int i = 0; i < count; i++) {
+    rank[i] = uint16_t(next[cell[i]]++);
+    sorted = sorted && rank[i] == i;
+  }
+  s.schedule.chunk_sorted[chunk] = sorted;
+}
+
+template <class T, int D>
+void write_status(const Activation<T, D>& s, int64_t wanted) {
+  int* status = s.a.status;
+  static constexpr int start[kStatusSize] = {0, 0, -1, 0, -1, 0, -1, 0};
+  for (int i = 0; i < kStatusSize; i++) status[i] = (s.a.previous_status ? s.a.previous_status : start)[i];
+  const int64_t outside = s.sum(W::kOutside), non_finite = s.sum(W::kNonFinite);
+  if (status[kProblemActivation] < 0 && (outside || non_finite || wanted > s.a.capacity)) {
+    status[kProblemActivation] = status[kActivations];
+    status[kOutsideCount] = int(outside);
+    status[kNonFiniteCount] = int(non_finite);
+    for (int k = s.w.slices - 1; k >= 0; k--) {
+      if (s.totals(k)[W::kOutside]) status[kOutsideFirst] = int(s.totals(k)[W::kOutsideFirst]);
+      if (s.totals(k)[W::kNonFinite]) status[kNonFiniteFirst] = int(s.totals(k)[W::kNonFiniteFirst]);
+    }
+  }
+  status[kActivations]++;
+  status[kBlocksNow] = int(wanted);
+  if (wanted > status[kBlocksWanted]) status[kBlocksWanted] = int(wanted);
+}
+
+template <int Order, class T, int D>
+void activate(const ActivateArguments<T, D>& a) {
+  const Activation<T, D> s(a);
+  for_parts(s.w.slices, a.particles, [&](int slice, int64_t begin, int64_t end) {
+    classify<Order>(s, slice, begin, end);
+    count_homes<Order>(s, slice, begin, end);
+  });
+  const int64_t wanted = number_blocks(s);
+  if (wanted > a.capacity)
+    for_parts(s.w.slices, a.particles, [&](int slice, int64_t begin, int64_t end) {
+      drop_homeless<Order>(s, begin, end);
+      count_homes<Order>(s, slice, begin, end);
+    });
+  const int64_t slots = wanted < a.capacity ? wanted : a.capacity;
+  const int64_t transferred = place_slots(s, slots);
+  s.scan(W::kDropped);
+  for_parts(s.w.slices, a.particles, [&](int slice, int64_t begin, int64_t end) {
+    fill_index(s, slice, begin, end, transferred + s.totals(slice)[W::kDropped]);
+  });
+  const int64_t chunks = list_homes(s, slots);
+  parallel_ranges(chunks, 16, [&](int64_t begin, int64_t end) {
+    for (int64_t chunk = begin; chunk < end; chunk++) sort_chunk(s, chunk);
+  });
+  write_status(s, wanted);
+}
+
+MPM_CPU_INSTANTIATE(activate, ActivateArguments)
+
+}  // namespace TORCH_MPM_ISA
+}  // namespace mpm::cpu

@@ -1,0 +1,46 @@
+#pragma once
+
+#include "cpu/parallel.h"
+#include "transfer/arguments.h"
+
+namespace mpm::cpu {
+
+struct ActivateWorkspace {
+  int slices;               // parts of the particles, each counted apart
+  int* key;                 // [particles] table index of the home block, -1 where not transferred
+  uint8_t* cell;            // [particles] cell of the base node in its block
+  uint8_t* cell_at;         // [particles] the same by position in the index tensor
+  int* count;               // [slices, table] particles of each home block, then where the next one goes
+  uint8_t* touched;         // [slices, table] which blocks the particles of a home touch: bit o for neighbour o
+  int64_t* totals;          // [slices, kTotals]
+  int64_t size;             // in bytes
+  enum { kActive, kParticles, kDropped, kOutside, kOutsideFirst, kNonFinite, kNonFiniteFirst, kTotals };
+};
+
+inline namespace TORCH_MPM_ISA {
+
+template <class T, int D>
+ActivateWorkspace activate_layout(const ActivateArguments<T, D>& a, char* start) {
+  const int64_t table = int64_t(a.scenes) * a.geometry.blocks_per_scene;
+  // A slice costs a table of counts: not more of them than the particles pay for.
+  const int64_t worth = 1 + 4 * a.particles / (table + 1), threads = thread_count();
+  ActivateWorkspace w;
+  w.slices = int(worth < threads ? worth : threads);
+  int64_t used = 0;
+  const auto take = [&](int64_t bytes) {
+    char* p = start + used;
+    used += (bytes + 63) / 64 * 64;
+    return p;
+  };
+  w.totals = reinterpret_cast<int64_t*>(take(int64_t(sizeof(int64_t)) * w.slices * ActivateWorkspace::kTotals));
+  w.key = reinterpret_cast<int*>(take(int64_t(sizeof(int)) * a.particles));
+  w.count = reinterpret_cast<int*>(take(int64_t(sizeof(int)) * w.slices * table));
+  w.cell = reinterpret_cast<uint8_t*>(take(a.particles));
+  w.cell_at = reinterpret_cast<uint8_t*>(take(a.particles));
+  w.touched = reinterpret_cast<uint8_t*>(take(int64_t(w.slices) * table));
+  w.size = used;
+  return w;
+}
+
+}  // namespace TORCH_MPM_ISA
+}  // namespace mpm::cpu
