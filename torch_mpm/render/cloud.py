@@ -1,0 +1,141 @@
+"""What a cloud of particles looks like from outside: its spacing, the particles that can be seen, its surface."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from .requires import require
+from .shapes import Array
+
+
+def rest_spacing(x: Array) -> float:
+    """Distance between neighbours [m] of particles [P, D], from the volume of the cells of a grid they occupy.
+
+    With cells of about one particle spacing the count of occupied cells depends on the layout; with cells of two
+    spacings, 2^D particles each, it does not, so the cell size is refined until an occupied cell holds 2^D on average.
+    """
+    if len(x) < 2:
+        return 0.0
+    dim = x.shape[1]
+    extent = np.ptp(x, axis=0)
+    size = float(np.max(extent))
+    if size == 0.0:
+        return 0.0
+    for _ in range(40):
+        cells = np.floor((x - x.min(axis=0)) / size).astype(np.int64)
+        per_cell = len(x) / len(np.unique(cells @ (1 << 20) ** np.arange(dim)))
+        if per_cell <= 2**dim:
+            break
+        size *= max((2**dim / per_cell) ** (1 / dim), 0.5) * 0.98
+    return float(size / per_cell ** (1 / dim))
+
+
+def visible(x: Array, spacing: float) -> Array:
+    """Mask [P] of the particles [P, 3] that are not enclosed by at least two full layers of cells.
+
+    Cells are 1.5 spacings wide: each holds a particle in any undisturbed body. Enclosed particles cannot be seen,
+    and a renderer that is spared them takes a fraction of the time.
+    """
+    cell = 1.5 * spacing
+    lower = x.min(axis=0)
+    shape = np.floor(np.ptp(x, axis=0) / cell).astype(np.int64) + 5
+    if np.prod(shape.astype(np.float64)) > 5e7:  # a few stray particles far away: not worth a huge table
+        return np.ones(len(x), dtype=bool)
+    index = np.ravel_multi_index(tuple((np.floor((x - lower) / cell).astype(np.int64) + 2).T), tuple(shape))
+    inside = np.zeros(shape, dtype=bool)
+    inside.ravel()[index] = True
+    for _ in range(2):
+        for axis in range(3):
+            inside = inside & np.roll(inside, 1, axis) & np.roll(inside, -1, axis)
+    return ~inside.ravel()[index]
+
+
+def box_blur(field: Array, width: int, axes: tuple[int, ...], passes: int = 3) -> Array:
+    """Repeated running mean over an odd `width` along `axes`; three passes are close to a Gaussian. Zero outside."""
+    half = width // 2
+    for axis in axes:
+        moved = np.moveaxis(field, axis, 0)
+        for _ in range(passes):
+            padded = np.pad(moved, [(half + 1, half)] + [(0, 0)] * (moved.ndim - 1))
+            total = np.cumsum(padded, axis=0, dtype=np.float64)
+            moved = ((total[width:] - total[:-width]) / width).astype(field.dtype)
+        field = np.moveaxis(moved, 0, axis)
+    return field
+
+
+@dataclass(frozen=True)
+class Skin:
+    """Surface of a cloud: vertices [V, 3] m, triangles int [T, 3], outward normals [V, 3], colours uint8 [V, 3].
+
+    `loose` is the mask [P] of particles outside it: drops too small for a surface.
+    """
+
+    vertices: Array
+    faces: Array
+    normals: Array
+    colors: Array
+    loose: Array
+
+
+def surface(x: Array, rgb: Array, spacing: float) -> Skin:
+    """Smooth surface of particles x [P, 3] m with colours uint8 [P, 3].
+
+    Particle number density on a grid of one spacing, smoothed, cut at half its value in an undisturbed body
+    (marching cubes; colours are the density-weighted mean of the particles').
+    """
+    dm = require("vtkmodules.vtkCommonDataModel")
+    flying = require("vtkmodules.vtkFiltersCore").vtkFlyingEdges3D()
+    numpy_to_vtk, vtk_to_numpy = (getattr(require("vtkmodules.util.numpy_support"), n) for n in ("numpy_to_vtk", "vtk_to_numpy"))
+    pad = 4
+    lower = x.min(axis=0) - pad * spacing
+    shape = np.ceil(np.ptp(x, axis=0) / spacing).astype(np.int64) + 2 * pad + 1
+    if np.prod(shape.astype(np.float64)) > 6e7:
+        raise ValueError(f"the surface of these particles needs a grid of {'x'.join(map(str, shape))} cells; use style='particles'")
+    weights = np.concatenate([np.ones((len(x), 1), np.float32), rgb.astype(np.float32)], axis=1)
+    field = _linear_splat((x - lower) / spacing, weights, shape)
+    field = box_blur(field, 3, (0, 1, 2), passes=2)
+    image = dm.vtkImageData()
+    image.SetDimensions(*(int(n) for n in shape[::-1]))
+    image.SetSpacing(spacing, spacing, spacing)
+    density = numpy_to_vtk(np.ascontiguousarray(field[..., 0]).ravel(), deep=1)
+    density.SetName("density")
+    color = numpy_to_vtk(np.ascontiguousarray(field[..., 1:] / np.maximum(field[..., :1], 1e-3)).reshape(-1, 3), deep=1)
+    color.SetName("color")
+    image.GetPointData().SetScalars(density)
+    image.GetPointData().AddArray(color)
+    flying.SetInputData(image)
+    flying.InterpolateAttributesOn()
+    flying.ComputeNormalsOn()
+    flying.SetValue(0, 0.5)
+    flying.Update()
+    out = flying.GetOutput()
+    nearest = tuple(np.round((x - lower) / spacing).astype(np.int64).T)
+    loose = field[nearest][:, 0] < 0.25
+    if out.GetNumberOfPoints() == 0:
+        return Skin(np.zeros((0, 3)), np.zeros((0, 3), np.int64), np.zeros((0, 3)), np.zeros((0, 3), np.uint8), loose)
+    points = out.GetPointData()
+    # The image's first axis is the array's last: reversing the axes reverses the triangles too.
+    return Skin(
+        vertices=vtk_to_numpy(out.GetPoints().GetData())[:, ::-1] + lower,
+        faces=vtk_to_numpy(out.GetPolys().GetConnectivityArray()).reshape(-1, 3)[:, ::-1],
+        normals=vtk_to_numpy(points.GetNormals())[:, ::-1],
+        colors=vtk_to_numpy(points.GetArray("color")).clip(0, 255).astype(np.uint8),
+        loose=loose,
+    )
+
+
+def _linear_splat(position: Array, weights: Array, shape: Array) -> Array:
+    """Sum of weights [P, C] spread linearly to the eight nodes around each position [P, 3] (in cells): [X, Y, Z, C]."""
+    base = np.floor(position).astype(np.int64)
+    fraction = (position - base).astype(np.float32)
+    size = int(np.prod(shape))
+    out = np.zeros((weights.shape[1], size), dtype=np.float32)
+    for corner in range(8):
+        offset = np.array([corner & 1, corner >> 1 & 1, corner >> 2])
+        w = np.prod(np.where(offset, fraction, 1 - fraction), axis=1)
+        index = np.ravel_multi_index(tuple((base + offset).T), tuple(shape))
+        for c in range(weights.shape[1]):
+            out[c] += np.bincount(index, weights=w * weights[:, c], minlength=size).astype(np.float32)
+    return np.moveaxis(out.reshape(-1, *shape), 0, -1)

@@ -1,0 +1,87 @@
+"""What a particle's colour means: the scalar behind each name, its unit, its range and its colour map."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Sequence
+
+import numpy as np
+
+from .requires import require
+from .shapes import Array
+
+PLAIN = (0.20, 0.45, 0.78)
+# Okabe and Ito's palette (2008), told apart with any colour vision.
+MATERIALS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#F0E442", "#7F7F7F")
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A particle quantity: label and unit for the scale, colour map, and whether the scale starts at zero."""
+
+    label: str
+    unit: str
+    cmap: str
+    from_zero: bool = False
+
+
+QUANTITIES = {
+    "speed": Quantity("speed", "m/s", "Spectral_r", from_zero=True),
+    "stress": Quantity("von Mises stress", "Pa", "plasma", from_zero=True),
+    "temperature": Quantity("temperature", "K", "coolwarm"),
+    "material": Quantity("material", "", ""),
+}
+
+
+def numpy_of(value: Any) -> Array:
+    """A numpy array from a torch tensor (any device) or anything that numpy reads."""
+    if hasattr(value, "detach"):
+        value = value.detach().cpu().numpy()
+    return np.asarray(value)
+
+
+def von_mises(stress: Array) -> Array:
+    """Von Mises stress [P], sqrt(3/2 dev:dev), of stress tensors [P, D, D]."""
+    trace = np.trace(stress, axis1=1, axis2=2)
+    dev = stress - trace[:, None, None] / 3 * np.eye(stress.shape[1])
+    square = np.sum(dev * dev, axis=(1, 2))
+    if stress.shape[1] == 2:  # plane strain without out-of-plane stress: dev has a third diagonal entry -trace/3
+        square = square + (trace / 3) ** 2
+    return np.sqrt(1.5 * square)
+
+
+def scalar_of(color_by: str, values: Array, count: int) -> Array:
+    """One number per particle [P]: velocities [P, D] become speeds, stress tensors [P, D, D] von Mises stresses."""
+    if color_by == "speed" and values.ndim == 2:
+        values = np.linalg.norm(values, axis=1)
+    elif color_by == "stress" and values.ndim == 3:
+        values = von_mises(values)
+    if values.shape != (count,):
+        also = {"speed": " or [P, D]", "stress": " or [P, D, D]"}.get(color_by, "")
+        raise ValueError(f"scalars must have shape [P]{also} with P = {count} for {color_by}, got {list(values.shape)}")
+    return values
+
+
+def value_range(values: Array, from_zero: bool) -> tuple[float, float]:
+    """The range that holds 98 per cent of the finite values; (0, 1) without any."""
+    finite = values[np.isfinite(values)]
+    if finite.size == 0:
+        return 0.0, 1.0
+    low, high = (float(q) for q in np.percentile(finite, (1, 99)))
+    low = 0.0 if from_zero else low
+    return (low, high) if high > low else (low, low + max(abs(low) * 1e-3, 1e-12))
+
+
+def map_colors(values: Array, limits: tuple[float, float], cmap: str) -> Array:
+    """uint8 [P, 3]: `limits` are the ends of the colour map, values beyond them take the end colours, NaN is grey."""
+    table = (require("matplotlib").colormaps[cmap](np.linspace(0, 1, 256))[:, :3] * 255).round().astype(np.uint8)
+    unit = (values - limits[0]) / (limits[1] - limits[0])
+    rgb = table[(np.clip(np.nan_to_num(unit, nan=0.0), 0, 1) * 255).round().astype(np.int64)]
+    rgb[np.isnan(unit)] = 128
+    return rgb
+
+
+def material_colors(material: Array, palette: Sequence[str] = MATERIALS) -> Array:
+    """uint8 [P, 3] for material numbers [P]; the palette repeats after its last colour."""
+    table = np.array([require("matplotlib.colors").to_rgb(c) for c in palette])
+    return (table[material.astype(np.int64) % len(palette)] * 255).round().astype(np.uint8)

@@ -1,0 +1,80 @@
+"""PNG files that are whole or absent, and contact sheets."""
+
+from __future__ import annotations
+
+import math
+import os
+import tempfile
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Iterator, Sequence
+
+import numpy as np
+
+from .requires import require
+from .shapes import Array
+
+
+@contextmanager
+def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """A temporary path beside `path` that takes its place when the block ends well and vanishes when it does not."""
+    target = Path(path)
+    handle, name = tempfile.mkstemp(prefix=f".{target.stem}-", suffix=target.suffix, dir=target.parent)
+    os.close(handle)
+    temporary = Path(name)
+    try:
+        yield temporary
+        with open(temporary, "rb") as file:
+            os.fsync(file.fileno())
+        umask = os.umask(0)
+        os.umask(umask)
+        temporary.chmod(0o666 & ~umask)  # mkstemp makes private files; pictures are like any other output
+        os.replace(temporary, target)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def check_image(name: str, image: Array) -> Array:
+    if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
+        raise ValueError(f"{name} must be uint8 [H, W, 3], got {image.dtype} {list(image.shape)}")
+    return image
+
+
+def write_png(path: str | os.PathLike[str], image: Array, colors: int | None = None) -> None:
+    """Write `image` uint8 [H, W, 3] to `path`; a killed process leaves no part of it there.
+
+    `colors` (2..256) reduces the picture to a palette, which makes the file about a third as large.
+    """
+    picture = require("PIL.Image").fromarray(check_image("image", image))
+    if colors is not None:
+        picture = picture.quantize(colors, dither=0)
+    with replacing(path) as temporary:
+        picture.save(temporary, optimize=True) if colors else picture.save(temporary, compress_level=4)
+
+
+def read_png(path: str | os.PathLike[str]) -> Array:
+    """The picture in `path` as uint8 [H, W, 3]."""
+    with require("PIL.Image").open(path) as picture:
+        return np.asarray(picture.convert("RGB"))
+
+
+def contact_sheet(frames: Sequence[Array], columns: int, width: int = 1280, gap: int = 4) -> Array:
+    """The frames (uint8 [H, W, 3], one size) scaled into a table of `columns` columns, `width` pixels wide."""
+    if not frames:
+        raise ValueError("frames must hold at least one picture, got none")
+    if columns < 1:
+        raise ValueError(f"columns must be at least 1, got {columns}")
+    image = require("PIL.Image")
+    shape = check_image("frames[0]", frames[0]).shape
+    cell_width = (width - gap * (columns - 1)) // columns
+    cell_height = round(cell_width * shape[0] / shape[1])
+    rows = math.ceil(len(frames) / columns)
+    height = rows * cell_height + gap * (rows - 1)
+    sheet = np.full((height, columns * cell_width + gap * (columns - 1), 3), 255, dtype=np.uint8)
+    for i, frame in enumerate(frames):
+        if frame.shape != shape:
+            raise ValueError(f"frames[{i}] must have shape {list(shape)} like the first, got {list(frame.shape)}")
+        small = image.fromarray(frame).resize((cell_width, cell_height), image.Resampling.LANCZOS)
+        top, left = i // columns * (cell_height + gap), i % columns * (cell_width + gap)
+        sheet[top : top + cell_height, left : left + cell_width] = np.asarray(small)
+    return sheet

@@ -1,0 +1,195 @@
+"""`Renderer`: from particle arrays to a picture, the same call for 2-D and 3-D."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+from typing import Any, Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from .annotate import blend, scale_overlay, write_text
+from .camera import framing
+from .cloud import rest_spacing
+from .colors import PLAIN, QUANTITIES, Quantity, map_colors, material_colors, numpy_of, scalar_of, value_range
+from .ground import Ground
+from .scene2d import Overlay, Scene2D
+from .scene3d import Scene3D, key_light
+from .shapes import Array, Obstacle, vector
+
+log = logging.getLogger(__name__)
+
+
+class Renderer:
+    """Draws particles, ground and obstacles of a scene, one frame per call, without a screen.
+
+    Args:
+        bounds: (lower [D], upper [D]) of the domain in metres; D = 2 or 3. It is drawn as a box and framed.
+        resolution: (width, height) in pixels.
+        color_by: "speed" [m/s], "stress" [Pa], "temperature" [K], "material", any other label for a scalar of your
+            own (then give `unit`), or None for one colour.
+        range: (lo, hi) of the colour scale in that unit. None takes each frame's own, which flickers in a video.
+        cmap: a matplotlib colour map name; None takes the quantity's own.
+        unit: unit shown on the scale; None takes the quantity's own.
+        gravity: [D] vector; its opposite is up. Default: up is y.
+        radius: particle radius [m]; None takes 0.6 (0.75 in 2-D) of the spacing of the first frame's particles.
+        style: "particles" (spheres, discs in 2-D) or "surface" (3-D only: a smooth skin around the particles).
+        materials: names of materials 0, 1, ... for the legend of color_by="material".
+        azimuth, elevation: direction of the camera in degrees (3-D), around and above the horizontal plane.
+        view: (lower [D], upper [D]) to frame instead of the bounds.
+        ground: draw the ground at the lower face of the bounds (3-D).
+
+    Raises:
+        ImportError: a package of the `render` extra is missing.
+        RenderError: VTK finds no OpenGL (3-D); the message says what to install.
+        ValueError: an argument has the wrong shape or value.
+    """
+
+    def __init__(
+        self,
+        bounds: tuple[npt.ArrayLike, npt.ArrayLike],
+        resolution: tuple[int, int] = (1280, 720),
+        color_by: str | None = "speed",
+        range: tuple[float, float] | None = None,
+        cmap: str | None = None,
+        *,
+        unit: str | None = None,
+        gravity: npt.ArrayLike | None = None,
+        radius: float | None = None,
+        style: str = "particles",
+        materials: Sequence[str] = (),
+        azimuth: float = 28.0,
+        elevation: float = 18.0,
+        view: tuple[npt.ArrayLike, npt.ArrayLike] | None = None,
+        ground: bool = True,
+    ) -> None:
+        self.bounds = _box("bounds", bounds, None)
+        self.dim = len(self.bounds[0])
+        if style not in ("particles", "surface") or (style == "surface" and self.dim == 2):
+            raise ValueError(f"style must be 'particles' or, in 3-D, 'surface', got {style!r}")
+        if range is not None and not range[0] < range[1]:
+            raise ValueError(f"range must be (lo, hi) with lo < hi, got {range}")
+        self.resolution = (int(resolution[0]), int(resolution[1]))
+        self.color_by, self.limits, self.radius, self.style = color_by, range, radius, style
+        quantity = QUANTITIES.get(color_by or "", Quantity(color_by or "", "", "viridis"))
+        self.quantity = quantity if unit is None else replace(quantity, unit=unit)
+        self.cmap = cmap or quantity.cmap
+        self.names = tuple(materials) if color_by == "material" else ()
+        frame = self.bounds if view is None else _box("view", view, self.dim)
+        self.has_scale = color_by not in (None, "material")
+        self.scene: Scene2D | Scene3D
+        if self.dim == 2:
+            self.scene = Scene2D(frame, self.resolution, self.has_scale)
+        else:
+            self.scene = self._scene3d(frame, _up(gravity), azimuth, elevation, ground)
+
+    def _scene3d(self, frame: tuple[Array, Array], up: Array, azimuth: float, elevation: float, ground: bool) -> Scene3D:
+        fill = (0.80, 0.86) if self.color_by else (0.92, 0.86)
+        camera = framing(*frame, up, self.resolution, azimuth, elevation, fill=fill)
+        plate = Ground(*self.bounds, up, key_light(camera)) if ground else None
+        return Scene3D(camera, plate, self.bounds)
+
+    def frame(
+        self,
+        x: Any,
+        scalars: Any = None,
+        obstacles: Sequence[Obstacle] = (),
+        overlays: Sequence[Overlay] = (),
+        time: float | None = None,
+        title: str = "",
+    ) -> Array:
+        """One picture, uint8 [H, W, 3].
+
+        Args:
+            x: positions [P, D] in metres, torch or numpy. Particles that are not finite are left out and logged.
+            scalars: [P] for the colour; velocities [P, D] will do for "speed", stresses [P, D, D] for "stress"
+                (von Mises), material numbers for "material". Not finite: grey.
+            obstacles: shapes of `torch_mpm.render.shapes` at their poses at this time.
+            overlays: (points [N, D] in metres, colour, label) polylines over the picture.
+            time: seconds, written into the picture.
+            title: text at the top left.
+        """
+        x = numpy_of(x)
+        if x.ndim != 2 or x.shape[1] != self.dim:
+            raise ValueError(f"x must have shape [P, {self.dim}], got {list(x.shape)}")
+        if any(o.dim != self.dim for o in obstacles):
+            raise ValueError(f"obstacles must have {self.dim} dimensions like the bounds")
+        rgb, limits = self._colors(scalars, len(x))
+        finite = np.isfinite(x).all(axis=1)
+        if not finite.all():
+            log.warning("%d of %d particles have no finite position and are not drawn", int((~finite).sum()), len(x))
+        x, rgb = x[finite].astype(np.float64), rgb[finite]
+        radius = self._radius(x)
+        stamp = "" if time is None else f"t = {time:.3f} s"
+        if isinstance(self.scene, Scene2D):
+            if limits is not None:
+                self.scene.set_scale(self.quantity, limits, self.cmap)
+            return self.scene.draw(x, rgb, radius, obstacles, overlays, self.names, title, stamp)
+        image = self.scene.draw(x, rgb, radius, self.style, obstacles)
+        return self._annotate(image, overlays, limits, title, stamp)
+
+    def project(self, points: npt.ArrayLike) -> Array:
+        """Pixel coordinates (column, row) [N, 2] at which points [N, D] in metres appear."""
+        at = np.asarray(points, dtype=np.float64)
+        return self.scene.to_pixels(at) if isinstance(self.scene, Scene2D) else self.scene.camera.project(at)[:, :2]
+
+    def close(self) -> None:
+        """Give the renderer's OpenGL context back (3-D)."""
+        if isinstance(self.scene, Scene3D):
+            self.scene.close()
+
+    def __enter__(self) -> Renderer:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _colors(self, scalars: Any, count: int) -> tuple[Array, tuple[float, float] | None]:
+        """Colours uint8 [P, 3] and the range of the scale."""
+        if self.color_by is None:
+            return np.tile((np.array(PLAIN) * 255).astype(np.uint8), (count, 1)), None
+        if scalars is None:
+            raise ValueError(f"scalars must be given for color_by={self.color_by!r}, got None")
+        values = scalar_of(self.color_by, numpy_of(scalars), count)
+        if self.color_by == "material":
+            return material_colors(values), None
+        limits = self.limits or value_range(values, self.quantity.from_zero)
+        return map_colors(values, limits, self.cmap), limits
+
+    def _radius(self, x: Array) -> float:
+        if self.radius is None and len(x):
+            extent = float(np.max(self.bounds[1] - self.bounds[0]))
+            self.radius = (0.6 if self.dim == 3 else 0.75) * rest_spacing(x) or 0.02 * extent
+        return self.radius or 0.0
+
+    def _annotate(self, image: Array, overlays: Sequence[Overlay], limits: tuple[float, float] | None, title: str, stamp: str) -> Array:
+        if overlays:
+            image = self._draw_lines(image, overlays)
+        if limits is not None or self.names:
+            image = blend(image, scale_overlay(self.resolution, self.quantity, limits, self.cmap, self.names))
+        if title:
+            image = write_text(image, title, "top left", 1.25)
+        return write_text(image, stamp, "bottom left") if stamp else image
+
+    def _draw_lines(self, image: Array, overlays: Sequence[Overlay]) -> Array:
+        from PIL import Image, ImageDraw
+
+        pil = Image.fromarray(image)
+        for points, color, _ in overlays:
+            ImageDraw.Draw(pil).line([tuple(p) for p in self.project(points)], fill=color, width=3)
+        return np.array(pil)
+
+
+def _box(name: str, box: tuple[npt.ArrayLike, npt.ArrayLike], dim: int | None) -> tuple[Array, Array]:
+    lower = vector(f"{name}[0]", box[0], dim)
+    upper = vector(f"{name}[1]", box[1], len(lower))
+    if not np.all(lower < upper):
+        raise ValueError(f"{name} must be (lower, upper) with lower < upper, got {lower.tolist()}, {upper.tolist()}")
+    return lower, upper
+
+
+def _up(gravity: npt.ArrayLike | None) -> Array:
+    down = np.array([0.0, -1.0, 0.0]) if gravity is None else vector("gravity", gravity, 3)
+    length = float(np.linalg.norm(down))
+    return np.array([0.0, 1.0, 0.0]) if length == 0 else -down / length

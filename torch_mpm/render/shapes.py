@@ -1,0 +1,152 @@
+"""Obstacles as pictures see them: a triangle mesh (3-D) or an outline (2-D) in body coordinates, and a pose."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[Any]
+GREY = (0.62, 0.64, 0.68)
+
+
+@dataclass(frozen=True)
+class Obstacle:
+    """A rigid shape at a pose: world = position + rotation @ body.
+
+    `vertices` [V, D] in metres, `faces` int [T, 3] (3-D triangles) or None (2-D, the vertices are a closed outline),
+    `position` [D], `rotation` [D, D], `color` RGB in 0..1. Made by `plane`, `box`, `sphere`, `capsule`, `cylinder`
+    and `mesh` below.
+    """
+
+    vertices: Array
+    faces: Array | None
+    position: Array
+    rotation: Array
+    color: tuple[float, float, float] = GREY
+
+    def posed(self, position: npt.ArrayLike, rotation: npt.ArrayLike | None = None) -> Obstacle:
+        """The same shape at another `position` [D] and `rotation` ([D, D] matrix, or an angle in radians in 2-D)."""
+        turned = self.rotation if rotation is None else rotation_matrix(rotation, self.dim)
+        return replace(self, position=vector("position", position, self.dim), rotation=turned)
+
+    @property
+    def dim(self) -> int:
+        return int(self.vertices.shape[1])
+
+    def world(self) -> Array:
+        """Vertices [V, D] in world coordinates."""
+        return self.position + self.vertices @ self.rotation.T
+
+
+def vector(name: str, value: npt.ArrayLike, dim: int | None = None) -> Array:
+    """`value` as float64 [D]."""
+    out = np.asarray(value, dtype=np.float64)
+    if out.ndim != 1 or out.shape[0] not in ((2, 3) if dim is None else (dim,)):
+        raise ValueError(f"{name} must have shape [{dim or '2 or 3'}], got {list(out.shape)}")
+    return out
+
+
+def rotation_matrix(rotation: npt.ArrayLike, dim: int) -> Array:
+    """A rotation matrix [D, D]; in 2-D an angle in radians will do."""
+    out = np.asarray(rotation, dtype=np.float64)
+    if out.ndim == 0 and dim == 2:
+        return np.array([[np.cos(out), -np.sin(out)], [np.sin(out), np.cos(out)]])
+    if out.shape != (dim, dim):
+        raise ValueError(f"rotation must have shape [{dim}, {dim}], got {list(out.shape)}")
+    return out
+
+
+def plane(point: npt.ArrayLike, normal: npt.ArrayLike, size: float, color: tuple[float, float, float] = GREY) -> Obstacle:
+    """A plate of side `size` [m] around `point`, whose visible side looks along `normal`; a thick line in 2-D."""
+    at, n = vector("point", point), vector("normal", normal)
+    n = n / np.linalg.norm(n)
+    if at.shape[0] == 2:
+        thick = 0.01 * size
+        flat = np.array([[-0.5 * size, -thick], [0.5 * size, -thick], [0.5 * size, 0], [-0.5 * size, 0]])
+        return Obstacle(flat, None, at, np.stack([np.array([n[1], -n[0]]), n], axis=1), color)
+    quad = 0.5 * size * np.array([[-1, 0, -1], [1, 0, -1], [1, 0, 1], [-1, 0, 1]], dtype=np.float64)
+    return Obstacle(quad, np.array([[0, 2, 1], [0, 3, 2]]), at, frame_of(n), color)
+
+
+def box(center: npt.ArrayLike, size: npt.ArrayLike, rotation: npt.ArrayLike | None = None,
+        color: tuple[float, float, float] = GREY) -> Obstacle:
+    """A box with edge lengths `size` [D] in metres around `center` [D]."""
+    at = vector("center", center)
+    dim = at.shape[0]
+    half = 0.5 * vector("size", size, dim)
+    turned = np.eye(dim) if rotation is None else rotation_matrix(rotation, dim)
+    if dim == 2:
+        return Obstacle(half * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]), None, at, turned, color)
+    corners = np.array([[(i & 1), (i >> 1) & 1, i >> 2] for i in range(8)]) * 2.0 - 1.0
+    quads = [(0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (2, 6, 7, 3), (0, 4, 6, 2), (1, 3, 7, 5)]
+    faces = np.array([t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))])
+    return Obstacle(half * corners, faces, at, turned, color)
+
+
+def sphere(center: npt.ArrayLike, radius: float, color: tuple[float, float, float] = GREY) -> Obstacle:
+    """A sphere (a disc in 2-D) of `radius` [m] around `center` [D]."""
+    at = vector("center", center)
+    return capsule(at, at, radius, color)
+
+
+def capsule(a: npt.ArrayLike, b: npt.ArrayLike, radius: float, color: tuple[float, float, float] = GREY) -> Obstacle:
+    """All points within `radius` [m] of the segment from `a` to `b` ([D] each)."""
+    start, end = vector("a", a), vector("b", b)
+    length = float(np.linalg.norm(end - start))
+    angle = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 33)
+    # The cap's equator appears twice, at both ends of the straight part.
+    angle = np.concatenate([angle[:17], angle[16:]])
+    shift = np.where(np.arange(angle.size) < 17, -0.5 * length, 0.5 * length)
+    profile = np.stack([radius * np.cos(angle), radius * np.sin(angle) + shift], axis=1)
+    axis = (end - start) / length if length > 0 else np.eye(start.shape[0])[1]
+    return revolved(profile, 0.5 * (start + end), axis, color)
+
+
+def cylinder(a: npt.ArrayLike, b: npt.ArrayLike, radius: float, color: tuple[float, float, float] = GREY) -> Obstacle:
+    """A closed cylinder of `radius` [m] from `a` to `b` ([D] each); a rectangle in 2-D."""
+    start, end = vector("a", a), vector("b", b)
+    half = 0.5 * float(np.linalg.norm(end - start))
+    profile = np.array([[0, -half], [radius, -half], [radius, half], [0, half]], dtype=np.float64)
+    return revolved(profile, 0.5 * (start + end), (end - start) / (2 * half), color)
+
+
+def mesh(vertices: npt.ArrayLike, faces: npt.ArrayLike | None = None, position: npt.ArrayLike | None = None,
+         rotation: npt.ArrayLike | None = None, color: tuple[float, float, float] = GREY) -> Obstacle:
+    """Triangles `faces` int [T, 3] over `vertices` [V, 3], or the closed outline `vertices` [V, 2]."""
+    v = np.asarray(vertices, dtype=np.float64)
+    if v.ndim != 2 or v.shape[1] not in (2, 3):
+        raise ValueError(f"vertices must have shape [V, 2] or [V, 3], got {list(v.shape)}")
+    dim = int(v.shape[1])
+    f = None if faces is None else np.asarray(faces, dtype=np.int64)
+    if dim == 3 and (f is None or f.ndim != 2 or f.shape[1] != 3):
+        raise ValueError(f"faces must have shape [T, 3] for a 3-D mesh, got {None if f is None else list(f.shape)}")
+    at = np.zeros(dim) if position is None else vector("position", position, dim)
+    turned = np.eye(dim) if rotation is None else rotation_matrix(rotation, dim)
+    return Obstacle(v, f, at, turned, color)
+
+
+def frame_of(axis: Array) -> Array:
+    """A rotation [3, 3] that takes the y axis to `axis`."""
+    helper = np.eye(3)[int(np.argmin(np.abs(axis)))]
+    u = np.cross(axis, helper)
+    u /= np.linalg.norm(u)
+    return np.stack([u, axis, np.cross(u, axis)], axis=1)
+
+
+def revolved(profile: Array, center: Array, axis: Array, color: tuple[float, float, float]) -> Obstacle:
+    """The profile (radius, height) [K, 2] turned around `axis`; mirrored into an outline in 2-D."""
+    if center.shape[0] == 2:
+        outline = np.concatenate([profile, profile[::-1] * [-1, 1]])
+        return Obstacle(outline, None, center, np.stack([np.array([axis[1], -axis[0]]), axis], axis=1), color)
+    turns, rings = 64, len(profile)
+    phi = 2 * np.pi * np.arange(turns) / turns
+    radius, height = profile[:, 0][:, None], profile[:, 1][:, None]
+    v = np.stack([radius * np.cos(phi), height + 0 * phi, radius * np.sin(phi)], axis=-1).reshape(-1, 3)
+    i, j = np.meshgrid(np.arange(rings - 1), np.arange(turns), indexing="ij")
+    k = (j + 1) % turns
+    a, b, c, d = i * turns + j, i * turns + k, (i + 1) * turns + k, (i + 1) * turns + j
+    faces = np.concatenate([np.stack([a, c, b], -1).reshape(-1, 3), np.stack([a, d, c], -1).reshape(-1, 3)])
+    return Obstacle(v, faces, center, frame_of(axis), color)
