@@ -33,15 +33,15 @@ template <class T, int D>
 struct Activation {
   const ActivateArguments<T, D>& a;
   W w;
-  Schedule<int> schedule;
+  ScheduleOut schedule;
   int64_t table_size;
   int64_t neighbour[kColours<D>];  // distance of neighbour o in the table
 
   explicit Activation(const ActivateArguments<T, D>& arguments)
       : a(arguments),
         w(activate_layout(a, static_cast<char*>(a.workspace))),
-        schedule(schedule_layout<D>(a.schedule, a.capacity, a.particles)),
         table_size(int64_t(a.scenes) * a.geometry.blocks_per_scene) {
+    lay_out<D>(schedule, a.schedule, a.capacity, a.particles);
     for (int o = 0; o < kColours<D>; o++) {
       neighbour[o] = 0;
       for (int i = 0; i < D; i++) neighbour[o] = neighbour[o] * a.geometry.blocks[i] + (o >> (D - 1 - i) & 1);
@@ -82,7 +82,7 @@ void classify(const Activation<T, D>& s, int slice, int64_t begin, int64_t end) 
   for (int64_t p = begin; p < end; p++) {
     const int scene = a.scene ? a.scene[p * a.scene_stride] : 0;
     T x[D], f[D];
-    int base[D], block[D], local[D];
+    int base[D], block[D];
     bool finite = true;
     for (int i = 0; i < D; i++) {
       x[i] = a.x.pointer[p * a.x.stride[0] + i * a.x.stride[1]];
@@ -94,10 +94,7 @@ void classify(const Activation<T, D>& s, int slice, int64_t begin, int64_t end) 
       s.w.key[p] = -1;
       continue;
     }
-    for (int i = 0; i < D; i++) {
-      block[i] = base[i] / kBlockWidth;
-      local[i] = base[i] % kBlockWidth;
-    }
+    for (int i = 0; i < D; i++) block[i] = base[i] / kBlockWidth;
     s.w.key[p] = block_index(a.geometry, scene, block);
     s.w.cell[p] = uint8_t(node_in_block<D>(base));
   }
@@ -226,7 +223,7 @@ void fill_index(const Activation<T, D>& s, int slice, int64_t begin, int64_t end
 template <class T, int D>
 int64_t list_homes(const Activation<T, D>& s, int64_t slots) {
   const ActivateArguments<T, D>& a = s.a;
-  const Schedule<int>& out = s.schedule;
+  const ScheduleOut& out = s.schedule;
   const auto colour_of = [&](int64_t slot) {
     int block[D], colour = 0;
     block_coordinates(a.geometry, a.block[slot], block);
@@ -264,15 +261,15 @@ void sort_chunk(const Activation<T, D>& s, int64_t chunk) {
   const int begin = s.schedule.chunk_begin[chunk], slot_end = s.a.offsets[s.schedule.chunk_slot[chunk] + 1];
   const int count = slot_end - begin < kChunk ? slot_end - begin : kChunk;
   const uint8_t* cell = s.w.cell_at + begin;
-  uint16_t* rank = reinterpret_cast<uint16_t*>(s.schedule.rank) + begin;
-  int* end = s.schedule.cell_end + chunk * kBlockNodes<D>;
+  uint16_t* rank = s.schedule.rank + begin;
+  uint16_t* end = s.schedule.cell_end + chunk * kBlockNodes<D>;
   int next[kBlockNodes<D>] = {};
   bool sorted = true;
   for (int i = 0; i < count; i++) next[cell[i]]++;
   for (int c = 0, before = 0; c < kBlockNodes<D>; c++) {
     const int n = next[c];
     next[c] = before;
-    end[c] = before += n;
+    end[c] = uint16_t(before += n);
   }
   for (int i = 0; i < count; i++) {
     rank[i] = uint16_t(next[cell[i]]++);

@@ -5,7 +5,6 @@
 
 #include "cpu/activate_layout.h"
 #include "cpu/kernels.h"
-#include "cpu/schedule.h"
 
 // Chooses the instruction set once per process and forwards each launcher to its kernels.
 namespace mpm::cpu {
@@ -49,11 +48,6 @@ const Level level = choose_level();
 }  // namespace
 
 template <class T, int D>
-int64_t schedule_size(const ActivateArguments<T, D>& a) {
-  return schedule_layout<D>(static_cast<int*>(nullptr), a.capacity, a.particles).size;
-}
-
-template <class T, int D>
 int64_t activate_workspace(const ActivateArguments<T, D>& a) {
   return activate_layout(a, nullptr).size;
 }
@@ -76,7 +70,6 @@ int64_t activate_workspace(const ActivateArguments<T, D>& a) {
 MPM_CPU_KERNELS(MPM_CPU_FORWARD)
 
 #define MPM_CPU_EXPORT(T, D)                                                  \
-  template int64_t schedule_size<T, D>(const ActivateArguments<T, D>&);      \
   template int64_t activate_workspace<T, D>(const ActivateArguments<T, D>&); \
   MPM_CPU_EXPORT_ORDER(T, D, 2)                                               \
   MPM_CPU_EXPORT_ORDER(T, D, 3)

@@ -12,7 +12,8 @@ constexpr int kChunk = 512;
 template <int D>
 constexpr int kColours = 1 << D;
 
-template <class I>
+// Views into the schedule tensor; I is int or const int, S a 16-bit integer alike.
+template <class I, class S>
 struct Schedule {
   I* colour_start;  // [kColours + 1] into the lists of homes
   I* home_slot;     // [homes]
@@ -20,38 +21,38 @@ struct Schedule {
   I* chunk_slot;    // [chunks]
   I* chunk_begin;   // [chunks] first particle of the chunk, as a position in the index tensor
   I* chunk_sorted;  // [chunks] 1 if the particles are in the order of cells already
-  I* cell_end;      // [chunks, kBlockNodes] particles of the chunk up to and including each cell
-  I* rank;          // [particles] place of a particle in its chunk when sorted by cell, two to an int
-  int64_t size;     // in ints
+  S* cell_end;      // [chunks, kBlockNodes] particles of the chunk up to and including each cell
+  S* rank;          // [particles] place of a particle in its chunk when sorted by cell
 };
+using ScheduleIn = Schedule<const int, const uint16_t>;
+using ScheduleOut = Schedule<int, uint16_t>;
 
 inline namespace TORCH_MPM_ISA {
 
-template <int D, class I>
-Schedule<I> schedule_layout(I* start, int64_t capacity, int64_t particles) {
+// Fits into schedule_size() ints: there are at most `capacity` homes, and capacity + particles / kChunk chunks.
+template <int D, class I, class S>
+void lay_out(Schedule<I, S>& s, I* start, int64_t capacity, int64_t particles) {
   const int64_t homes = capacity < particles ? capacity : particles, chunks = homes + particles / kChunk;
-  int64_t used = 0;
   const auto take = [&](int64_t count) {
-    I* p = start + used;
-    used += count;
+    I* p = start;
+    start += count;
     return p;
   };
-  Schedule<I> s;
   s.colour_start = take(kColours<D> + 1);
   s.home_slot = take(homes);
   s.home_chunk = take(homes + 1);
   s.chunk_slot = take(chunks);
   s.chunk_begin = take(chunks);
   s.chunk_sorted = take(chunks);
-  s.cell_end = take(chunks * kBlockNodes<D>);
-  s.rank = take((particles + 1) / 2);
-  s.size = used;
-  return s;
+  s.cell_end = reinterpret_cast<S*>(take(chunks * kBlockNodes<D> / 2));
+  s.rank = reinterpret_cast<S*>(start);
 }
 
 template <class T, int D>
-Schedule<const int> schedule_of(const Topology<T, D>& t) {
-  return schedule_layout<D>(t.schedule, t.capacity, t.particles);
+ScheduleIn schedule_of(const Topology<T, D>& t) {
+  ScheduleIn s;
+  lay_out<D>(s, t.schedule, t.capacity, t.particles);
+  return s;
 }
 
 }  // namespace TORCH_MPM_ISA

@@ -63,7 +63,7 @@ struct Support {
 // f(particle, scene) for the particles of each home, homes of one colour in parallel.
 template <class T, int D, class F>
 void for_particles(const Topology<T, D>& t, const F& f) {
-  const Schedule<const int> s = schedule_of(t);
+  const ScheduleIn s = schedule_of(t);
   for (int c = 0; c < kColours<D>; c++)
     parallel_items(s.colour_start[c + 1] - s.colour_start[c], [&](int64_t h) {
       const int slot = s.home_slot[s.colour_start[c] + h];

@@ -38,7 +38,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> activate(const Tensor
       a.scene_stride = scene->stride(0);
     }
     if (has(previous_status)) a.previous_status = int_pointer(*previous_status, "previous_status", x, kStatusSize);
-    a.schedule_size = schedule_size(capacity, x.size(0));
+    a.schedule_size = schedule_size<D>(capacity, x.size(0));
     schedule = empty_int(x, {a.schedule_size});
     a.workspace_size = backend::activate_workspace(a);
     const Tensor workspace = torch::stable::new_empty(x, Shape{a.workspace_size}, ScalarType::Byte);

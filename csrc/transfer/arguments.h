@@ -89,9 +89,12 @@ struct PositionGradientArguments {
   Field<T> position_gradient;  // [P, D], zero for particles outside
 };
 
-// Entries of the schedule tensor: room for four ints per work item of both backends (the fake kernel in
-// torch_mpm/ops/activation.py has the same formula).
-inline int64_t schedule_size(int64_t capacity, int64_t particles) { return 16 + 4 * (capacity + particles / 128); }
+// Entries of the schedule tensor: room for the work items of both backends, with the number of particles of each cell,
+// and for the order of the particles (the fake kernel in torch_mpm/ops/activation.py has the same formula).
+template <int D>
+int64_t schedule_size(int64_t capacity, int64_t particles) {
+  return 16 + (8 + kBlockNodes<D> / 2) * (capacity + particles / 128) + particles / 2;
+}
 
 template <class T, int D>
 struct ActivateArguments {

@@ -27,7 +27,8 @@ def _activate_fake(
     def ints(n: int) -> Tensor:
         return x.new_empty(n, dtype=torch.int32)
 
-    schedule = 16 + 4 * (capacity + x.shape[0] // 128)  # csrc/transfer/arguments.h
+    P, dim = x.shape
+    schedule = 16 + (8 + 4**dim // 2) * (capacity + P // 128) + P // 2  # csrc/transfer/arguments.h
     return ints(scenes * math.prod(blocks)), ints(capacity), ints(capacity + 1), ints(x.shape[0]), ints(schedule), ints(8)
 
 
