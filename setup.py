@@ -115,21 +115,23 @@ class Ninja:
         # torch loads its libraries privately, so ours must name libtorch.so, the umbrella of whatever torch is running
         # (CPU or CUDA), to find its symbols. The process has it loaded: no path to it is recorded.
         libtorch = [f"-L{torch / 'lib'}", "-Xlinker", "--no-as-needed", "-ltorch"]
-        # Functions that nobody defines fail the link, except in the CUDA library: a CPU torch has no CUDA functions.
-        defined = ["-Xlinker", "--no-undefined", "-ltorch_cpu"]
+        # Functions that nobody defines fail the link. Not in the CUDA library, since a CPU torch has no CUDA functions,
+        # nor with sanitizers, whose functions come from the process.
+        defined = [] if sanitize else ["-Xlinker", "--no-undefined", "-ltorch_cpu"]
         self.lines = ["ninja_required_version = 1.5", f"pool nvcc\n  depth = {max(1, max_jobs() // 2)}"]
         cxx = os.environ.get("CXX", "g++")
         sanitizer = [f"-fsanitize={sanitize}", "-fno-omit-frame-pointer", "-g"] if sanitize else []
-        host = [*COMMON_FLAGS, *CPU_FLAGS, *HOST_FLAGS, "-Wextra", *sanitizer, *includes]
-        self.rule("cxx", [cxx, *host, "$flags", "-MMD", "-MF", "$out.d", "-c", "$in", "-o", "$out"], depfile=True)
-        self.rule(
-            "link_cpu", [cxx, "-shared", *sanitizer, "$in", "-o", "$out", *libtorch, *([] if sanitize else defined)]
-        )
+        compile_cpu = [cxx, *COMMON_FLAGS, *CPU_FLAGS, *HOST_FLAGS, "-Wextra", *sanitizer, *includes]
+        self.rule("cxx", [*compile_cpu, "$flags", "-MMD", "-MF", "$out.d", "-c", "$in", "-o", "$out"], depfile=True)
+        self.rule("link_cpu", [cxx, "-shared", *sanitizer, "$in", "-o", "$out", *libtorch, *defined])
         self.rule("link_module", [cxx, "-shared", *sanitizer, "$in", "-o", "$out"])
         if nvcc() is not None:
-            device = [*COMMON_FLAGS, *NVCC_FLAGS, f"-Xcompiler={','.join(HOST_FLAGS)}", "-DUSE_CUDA", *includes]
-            compile_device = [str(nvcc()), f"-ccbin={cxx}", *gencode(), *device, "$flags"]
-            self.rule("nvcc", [*compile_device, "-MD", "-MF", "$out.d", "-c", "$in", "-o", "$out"], depfile=True)
+            # The host compiler sees `#pragma unroll`, which only the device compiler knows.
+            host = f"-Xcompiler={','.join([*HOST_FLAGS, '-Wno-unknown-pragmas'])}"
+            device = [str(nvcc()), f"-ccbin={cxx}", *gencode(), *COMMON_FLAGS, *NVCC_FLAGS, host, "-DUSE_CUDA"]
+            self.rule(
+                "nvcc", [*device, *includes, "$flags", "-MD", "-MF", "$out.d", "-c", "$in", "-o", "$out"], depfile=True
+            )
             self.lines[-1] += "\n  pool = nvcc"
             # cudart is linked statically (the default), so the library does not depend on the CUDA runtime of torch.
             link_device = [str(nvcc()), f"-ccbin={cxx}", *gencode(), "-shared"]
@@ -228,6 +230,7 @@ class Build(build_ext):
         name = f"{sysconfig.get_platform()}-{sys.implementation.cache_tag}"
         directory = ROOT / "build" / (f"{name}-sanitize" if sanitize else name)
         directory.mkdir(parents=True, exist_ok=True)
+        # Parallel builds queue here instead of racing in one directory.
         with open(directory / "lock", "w") as lock:
             fcntl.flock(lock, fcntl.LOCK_EX)
             self.build(directory, destination, sanitize)

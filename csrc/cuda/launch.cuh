@@ -1,0 +1,34 @@
+#pragma once
+
+#include <cuda_runtime.h>
+
+#include <algorithm>
+#include <stdexcept>
+#include <string>
+
+// Host side of a kernel launch.
+namespace mpm::cuda {
+
+inline void check(cudaError_t error) {
+  if (error != cudaSuccess) throw std::runtime_error(std::string("CUDA: ") + cudaGetErrorString(error));
+}
+
+// Thread blocks for `count` pieces of work that a kernel takes in strides of its grid. Many more than fit at once, so that
+// the hardware balances them, but not so many that empty ones cost time when `count` is a generous bound.
+inline unsigned grid_size(int64_t count) {
+  int device = 0, processors = 0;
+  check(cudaGetDevice(&device));
+  check(cudaDeviceGetAttribute(&processors, cudaDevAttrMultiProcessorCount, device));
+  return unsigned(std::clamp<int64_t>(count, 1, int64_t(processors) * 128));
+}
+
+template <class... Parameters, class... Arguments>
+void launch(void (*kernel)(Parameters...), unsigned blocks, unsigned threads, size_t shared_memory, cudaStream_t stream,
+            const Arguments&... arguments) {
+  if (shared_memory > 48 * 1024)
+    check(cudaFuncSetAttribute(kernel, cudaFuncAttributeMaxDynamicSharedMemorySize, int(shared_memory)));
+  kernel<<<blocks, threads, shared_memory, stream>>>(arguments...);
+  check(cudaGetLastError());
+}
+
+}  // namespace mpm::cuda
