@@ -6,19 +6,17 @@ VENV ?= .venv
 PY := $(VENV)/bin/python
 STAMP := $(VENV)/.torch_mpm
 QUICK := -q -m "not slow"
-# Parallel callers of make queue here instead of racing in the same build directory.
-BUILD := mkdir -p build && flock build/.lock
 
 SOURCES := $(shell find csrc -name '*.h' -o -name '*.cuh' -o -name '*.cpp' -o -name '*.cu')
 
 .PHONY: build test check format demo examples bench study sanitize gpu clean
 
 build: $(STAMP)
-	$(BUILD) $(PY) setup.py -q build_ext --inplace
+	$(PY) setup.py -q build_ext --inplace
 
 # One library alone: cpu, cuda or math (the pybind11 module of the tests).
 build-%: $(STAMP)
-	$(BUILD) $(PY) setup.py -q build_ext --inplace --targets=$*
+	$(PY) setup.py -q build_ext --inplace --targets=$*
 
 # The environment is only linked to the sources here; `build` compiles, with its progress in sight.
 $(STAMP): pyproject.toml
@@ -58,13 +56,13 @@ study: build
 SANITIZED := build/sanitized
 ASAN = $(shell $(or $(CXX),g++) -print-file-name=libasan.so)
 sanitize: $(STAMP)
-	$(BUILD) env TORCH_MPM_SANITIZE=address,undefined TORCH_MPM_CUDA=0 $(PY) setup.py -q build --build-lib $(SANITIZED)
+	env TORCH_MPM_SANITIZE=address,undefined TORCH_MPM_CUDA=0 $(PY) setup.py -q build --build-lib $(SANITIZED)
 	LD_PRELOAD=$(ASAN) ASAN_OPTIONS=detect_leaks=0 UBSAN_OPTIONS=halt_on_error=1:print_stacktrace=1 \
 	  PYTHONPATH=$(SANITIZED) $(VENV)/bin/pytest $(QUICK)
 
 # On a GPU machine whose Python already has torch, ninja and pytest: no virtual environment and no network.
 gpu:
-	$(BUILD) env TORCH_MPM_CUDA=1 $(PYTHON) setup.py -q build_ext --inplace
+	env TORCH_MPM_CUDA=1 $(PYTHON) setup.py -q build_ext --inplace
 	PYTHONPATH=. $(PYTHON) -m pytest $(QUICK)
 	PYTHONPATH=. $(PYTHON) -m benchmarks
 
