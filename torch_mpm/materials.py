@@ -1,0 +1,381 @@
+"""Constitutive laws: modules from the deformation of a state to its Kirchhoff stress.
+
+A law is a `Material`. Those compiled in csrc/materials take parameters that are numbers or tensors of shape [], [1],
+[B] (per scene) or [P] (per particle, in the order of `state.ids` where particles were reordered; this meaning wins where
+P = B), and pass gradients to them. `CustomLaw` makes a law of any module, `Mixture` combines several in one state.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor, nn
+
+from .errors import shape_of
+from .ops import material as ops
+from .ops.arguments import soa_empty
+from .reference.material import per_particle
+from .state import _take
+
+if TYPE_CHECKING:
+    from .state import State
+
+Value = float | Tensor
+
+
+class Material(nn.Module):
+    """A constitutive law. A subclass sets `state_fields` and defines `update`; the other methods where it can.
+
+    Attributes:
+        state_fields: fields of the state that a step moves for the law: "F" or "J".
+        viscous: whether the stress reads state.C, so that a step has to keep it.
+    """
+
+    state_fields: tuple[str, ...] = ("F",)
+    viscous: bool = False
+
+    def update(self, state: State) -> tuple[dict[str, Tensor], Tensor]:
+        """Fields that the law changes (a plastic law returns F to its yield surface) and Kirchhoff stress [P, D, D] [Pa]."""
+        raise NotImplementedError
+
+    def stress(self, state: State) -> Tensor:
+        """Kirchhoff stress τ [P, D, D] [Pa]."""
+        return self.update(state)[1]
+
+    def energy_density(self, state: State) -> Tensor:
+        """Elastic energy per rest volume [P] [J/m³]; infinite where the law has no meaning."""
+        raise NotImplementedError(f"{type(self).__name__} has no energy")
+
+    def energy(self, state: State) -> Tensor:
+        """Elastic energy of each particle [P] [J]."""
+        return self.energy_density(state) * state.volume
+
+    def stiffness(self, state: State) -> Tensor:
+        """Upper bound of the tangent modulus over all velocity gradients of unit norm [P] [Pa]; bounds the stable dt."""
+        raise NotImplementedError(f"{type(self).__name__} has no stiffness, which the stable time step needs")
+
+    def wave_modulus(self, state: State) -> Tensor:
+        """Rest density times the square of the largest wave speed [P] [Pa]."""
+        return self.stiffness(state)
+
+    def wave_speed(self, state: State) -> Tensor:
+        """Speed of the fastest elastic wave in the deformed material [P] [m/s]: an upper bound, at most 16% above."""
+        return (self.wave_modulus(state) * state.volume / state.mass).sqrt()
+
+    def viscosity(self, state: State) -> Tensor | None:
+        """Viscosity in terms of Kirchhoff stress [P] [Pa s], or None."""
+        return None
+
+    def invalid(self, state: State) -> Tensor:
+        """Particles where the law has no meaning, bool [P]: not finite, overflowed, or turned inside out (J ≤ 0)."""
+        return ~self.energy_density(state).isfinite()
+
+
+class CompiledLaw(Material):
+    """A law of csrc/materials; subclasses say which, and convert their arguments to its parameters."""
+
+    name: str
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._cached: tuple[Any, list[Tensor]] | None = None
+
+    def values(self) -> Sequence[Value]:
+        """The parameters of the compiled law, in its order."""
+        raise NotImplementedError
+
+    def update(self, state: State) -> tuple[dict[str, Tensor], Tensor]:
+        C = state.C if self.viscous else None
+        return {}, ops.material_stress(self.name, *self._arguments(state), C=C, scene=state.scene, dim=state.x.shape[1])
+
+    def energy_density(self, state: State) -> Tensor:
+        return ops.material_energy(self.name, *self._arguments(state), scene=state.scene, dim=state.x.shape[1])
+
+    def wave_modulus(self, state: State) -> Tensor:
+        return ops.material_wave_modulus(self.name, *self._arguments(state), scene=state.scene, dim=state.x.shape[1])
+
+    def stiffness(self, state: State) -> Tensor:
+        return ops.material_stiffness(self.name, *self._arguments(state), scene=state.scene, dim=state.x.shape[1])
+
+    def _store(self, name: str, value: Value) -> None:
+        """Keep a parameter as number, buffer or nn.Parameter, so that `.to` moves it and optimizers find it."""
+        if not isinstance(value, Tensor):
+            setattr(self, name, float(value))
+        elif isinstance(value, nn.Parameter):
+            self.register_parameter(name, value)
+        else:
+            self.register_buffer(name, value)
+
+    def _arguments(self, state: State) -> tuple[Tensor, list[Tensor]]:
+        field = self.state_fields[0]
+        deformation = getattr(state, field)
+        if deformation is None:
+            raise ValueError(f"{type(self).__name__} needs state.{field}, which is None")
+        return deformation, self._parameters_of(state)
+
+    def _parameters_of(self, state: State) -> list[Tensor]:
+        """Parameters in the dtype, on the device and in the particle order of the state.
+
+        Kept from call to call while nothing has changed and none requires grad.
+        """
+        tensors = [*self.parameters(recurse=False), *self.buffers(recurse=False)]
+        numbers = [value for value in vars(self).values() if isinstance(value, float)]
+        if torch.compiler.is_compiling() or any(t.requires_grad for t in tensors):
+            return self._convert(state)
+        key = (state.x.dtype, state.x.device, state.ids, *numbers, *((t, t._version) for t in tensors))
+        if self._cached is None or not _same(self._cached[0], key):
+            self._cached = (key, self._convert(state))
+        return self._cached[1]
+
+    def _convert(self, state: State) -> list[Tensor]:
+        x, particles = state.x, getattr(state, "particles", state.x.shape[0])
+        result = []
+        for value in self.values():
+            tensor = torch.as_tensor(value).to(dtype=x.dtype, device=x.device)
+            if state.ids is not None and particles > 1 and tensor.shape == (particles,):
+                tensor = tensor.index_select(0, state.ids)
+            result.append(tensor)
+        return result
+
+
+def _same(a: Any, b: Any) -> bool:
+    """Equality of nested tuples, tensors by identity."""
+    if isinstance(a, tuple) and isinstance(b, tuple):
+        return len(a) == len(b) and all(_same(s, t) for s, t in zip(a, b, strict=True))
+    return a is b if isinstance(a, Tensor) or isinstance(b, Tensor) else a == b
+
+
+def _check_value(name: str, value: Value, expected: str, holds: Callable[[Any], Any]) -> Value:
+    if isinstance(value, Tensor):
+        if value.dim() > 1 or value.numel() == 0 or not value.is_floating_point():
+            raise ValueError(f"{name} must be a number or a floating tensor of shape [], [1], [B] or [P], got {shape_of(value)}")
+        good = bool((holds(value.detach()) & value.detach().isfinite()).all())
+    else:
+        good = math.isfinite(value) and bool(holds(value))
+    if not good:
+        raise ValueError(f"{name} must be {expected}, got {value}")
+    return value
+
+
+class NeoHookean(CompiledLaw):
+    """Compressible neo-Hookean solid: τ = μ (F Fᵀ − I) + λ ln J I (Bonet and Wood 2008, section 6.4.3).
+
+    Args:
+        E: Young's modulus [Pa], not negative, with nu; or
+        nu: Poisson's ratio in (−1, 0.5).
+        mu: shear modulus [Pa], not negative (0 is a fluid), with lam; or
+        lam: first Lamé parameter [Pa].
+
+    Raises:
+        ValueError: for a value outside its range, or another combination of arguments. Values are checked here, and not
+            again when a tensor is changed or trained.
+    """
+
+    name = "neo_hookean"
+
+    def __init__(
+        self, E: Value | None = None, nu: Value | None = None, mu: Value | None = None, lam: Value | None = None
+    ) -> None:
+        super().__init__()
+        given = {k: v for k, v in (("E", E), ("nu", nu), ("mu", mu), ("lam", lam)) if v is not None}
+        if set(given) not in ({"E", "nu"}, {"mu", "lam"}):
+            raise ValueError(f"NeoHookean needs E and nu, or mu and lam, got {', '.join(given) or 'nothing'}")
+        if E is not None and nu is not None:
+            self._store("E", _check_value("E", E, "finite and not negative", lambda v: v >= 0))
+            self._store("nu", _check_value("nu", nu, "between -1 and 0.5", lambda v: (v > -1) & (v < 0.5)))
+            if isinstance(E, Tensor) and isinstance(nu, Tensor) and E.numel() > 1 and nu.numel() > 1 and E.shape != nu.shape:
+                raise ValueError(f"E and nu must have one shape where both vary, got {shape_of(E)} and {shape_of(nu)}")
+        elif mu is not None and lam is not None:
+            self._store("mu", _check_value("mu", mu, "finite and not negative", lambda v: v >= 0))
+            self._store("lam", _check_value("lam", lam, "finite", lambda v: v == v))
+        self._engineering = E is not None
+
+    def values(self) -> Sequence[Value]:
+        """μ and λ [Pa]."""
+        if not self._engineering:
+            return self.mu, self.lam
+        E, nu = self.E, self.nu
+        return E / (2 * (1 + nu)), E * nu / ((1 + nu) * (1 - 2 * nu))
+
+
+class WeaklyCompressible(CompiledLaw):
+    """Fluid with Tait-Murnaghan pressure p = K/γ (J^−γ − 1) (Monaghan 1994): τ = −J p I + 2 J η dev(sym C). Stores J, no F.
+
+    γ = 1 is the linear law τ = K (J − 1) I. At rest the speed of sound is √(K/ρ).
+
+    Args:
+        bulk_modulus: K [Pa], not negative.
+        gamma: γ, positive; 7 for water.
+        viscosity: η [Pa s], not negative. 0 (the number) costs nothing.
+
+    Raises:
+        ValueError: for a value outside its range.
+    """
+
+    state_fields = ("J",)
+
+    def __init__(self, bulk_modulus: Value, gamma: Value = 7.0, viscosity: Value = 0.0) -> None:
+        super().__init__()
+        self._store("bulk_modulus", _check_value("bulk_modulus", bulk_modulus, "finite and not negative", lambda v: v >= 0))
+        self._store("gamma", _check_value("gamma", gamma, "positive", lambda v: v > 0))
+        self._store("eta", _check_value("viscosity", viscosity, "finite and not negative", lambda v: v >= 0))
+        self.viscous = isinstance(viscosity, Tensor) or viscosity > 0
+        self.name = "viscous_fluid" if self.viscous else "weakly_compressible"
+
+    def values(self) -> Sequence[Value]:
+        """K [Pa], γ and, of a viscous fluid, η [Pa s]."""
+        elastic = (self.bulk_modulus, self.gamma)
+        return (*elastic, self.eta) if self.viscous else elastic
+
+    def viscosity(self, state: State) -> Tensor | None:
+        if not self.viscous:
+            return None
+        J, (_, _, eta) = self._arguments(state)
+        return J * per_particle(eta, state.scene, J.shape[0])
+
+
+class CustomLaw(Material):
+    """A law from any module or function: F [P, D, D] -> Kirchhoff stress [P, D, D] [Pa], in ordinary torch code.
+
+    Args:
+        function: called with the state field. It may return a pair (F, stress) instead, F being what a plastic law makes of
+            its argument.
+        state_field: "F", or "J" [P] for a law of the volume ratio alone.
+        stiffness: see `Material.stiffness`; a number, a tensor [P] or a function of the state. Needed for `stable_dt`.
+
+    A law that needs more than this (other fields, history) is a subclass of `Material`.
+
+    Raises:
+        ValueError: for an unknown field, or in use for a result of another shape.
+    """
+
+    def __init__(
+        self,
+        function: Callable[[Tensor], Any],
+        state_field: str = "F",
+        stiffness: Value | Callable[[State], Tensor] | None = None,
+    ) -> None:
+        super().__init__()
+        if state_field not in ("F", "J"):
+            raise ValueError(f"state_field must be 'F' or 'J', got {state_field!r}")
+        self.function = function
+        self.state_fields = (state_field,)
+        self._stiffness = stiffness
+
+    def update(self, state: State) -> tuple[dict[str, Tensor], Tensor]:
+        (field,) = self.state_fields
+        deformation = getattr(state, field)
+        result = self.function(deformation)
+        new, stress = result if isinstance(result, tuple) else (deformation, result)
+        P, D = state.x.shape
+        for name, value, shape in ((field, new, tuple(deformation.shape)), ("stress", stress, (P, D, D))):
+            if not isinstance(value, Tensor) or tuple(value.shape) != shape:
+                raise ValueError(f"the law must return {name} of shape {list(shape)}, got {shape_of(value)}")
+        return {} if new is deformation else {field: new}, stress
+
+    def stiffness(self, state: State) -> Tensor:
+        if self._stiffness is None:
+            return super().stiffness(state)
+        value = self._stiffness(state) if callable(self._stiffness) else self._stiffness
+        return torch.as_tensor(value).to(dtype=state.x.dtype, device=state.x.device).expand(state.x.shape[0])
+
+    def invalid(self, state: State) -> Tensor:
+        if self.state_fields == ("J",):
+            J = state.J
+        else:
+            J = torch.linalg.det(torch.where(state.F.isfinite(), state.F, torch.nan))
+        return ~((J > 0) & J.isfinite())
+
+
+class Mixture(Material):
+    """Several laws in one state: law k for the particles with state.material = k.
+
+    The particles of each law are found once per `state.material` tensor, which synchronises with the device; replace the
+    tensor rather than write into it. Per-particle parameters of the laws have shape [P] for all particles of the state.
+
+    Args:
+        laws: at least one.
+
+    Raises:
+        ValueError: without laws, or in use without state.material or with an id outside 0 .. len(laws) − 1.
+    """
+
+    def __init__(self, laws: Sequence[Material]) -> None:
+        super().__init__()
+        if len(laws) == 0:
+            raise ValueError("Mixture needs at least one law")
+        self.laws = nn.ModuleList(laws)
+        self.state_fields = tuple(sorted({field for law in laws for field in law.state_fields}))
+        self.viscous = any(law.viscous for law in laws)
+        self._material: Tensor | None = None
+        self._indices: list[Tensor] = []
+
+    def update(self, state: State) -> tuple[dict[str, Tensor], Tensor]:
+        changes: dict[str, Tensor] = {}
+        P, D = state.x.shape
+        stress = soa_empty(state.x, (P, D, D))
+        for part, law in self._parts(state):
+            fields, part_stress = law.update(part)
+            stress = stress.index_copy(0, part.index, part_stress)
+            for name, value in fields.items():
+                changes[name] = changes.get(name, getattr(state, name)).index_copy(0, part.index, value)
+        return changes, stress
+
+    def energy_density(self, state: State) -> Tensor:
+        return self._collect(state, lambda law, part: law.energy_density(part))
+
+    def stiffness(self, state: State) -> Tensor:
+        return self._collect(state, lambda law, part: law.stiffness(part))
+
+    def wave_modulus(self, state: State) -> Tensor:
+        return self._collect(state, lambda law, part: law.wave_modulus(part))
+
+    def invalid(self, state: State) -> Tensor:
+        return self._collect(state, lambda law, part: law.invalid(part).to(state.x.dtype)) > 0
+
+    def viscosity(self, state: State) -> Tensor | None:
+        if not self.viscous:
+            return None
+
+        def viscosity(law: Material, part: Any) -> Tensor:
+            value = law.viscosity(part)
+            return torch.zeros_like(part.mass) if value is None else value
+
+        return self._collect(state, viscosity)
+
+    def _collect(self, state: State, function: Callable[[Any, Any], Tensor]) -> Tensor:
+        result = torch.zeros_like(state.mass)
+        for part, law in self._parts(state):
+            result = result.index_copy(0, part.index, function(law, part))
+        return result
+
+    def _parts(self, state: State) -> list[tuple[Any, Any]]:
+        material = state.material
+        if material is None:
+            raise ValueError("a Mixture needs state.material, int32 [P]")
+        if material is not self._material:
+            if material.numel() and not bool(((material >= 0) & (material < len(self.laws))).all()):
+                raise ValueError(f"state.material must be in 0 .. {len(self.laws) - 1}, got {material.unique().tolist()}")
+            self._indices = [(material == k).nonzero().squeeze(1) for k in range(len(self.laws))]
+            self._material = material
+        return [(_Part(state, index), law) for index, law in zip(self._indices, self.laws, strict=True) if len(index)]
+
+
+class _Part:
+    """Some particles of a state: its fields, gathered when they are asked for."""
+
+    def __init__(self, state: State, index: Tensor) -> None:
+        self.index = index
+        self.particles = state.x.shape[0]
+        self.ids = index if state.ids is None else state.ids.index_select(0, index)
+        self._state = state
+
+    def __getattr__(self, name: str) -> Any:
+        value = getattr(self._state, name)
+        if isinstance(value, Tensor):
+            value = _take(value, self.index)
+            setattr(self, name, value)
+        return value
