@@ -18,8 +18,8 @@ template <class T, int D>
 struct LawArguments {
   int law = 0;  // index in AllLaws
   int64_t particles = 0;
-  Field<const T> state;  // F [P, D, D] of a law with shear, J [P] of one without
-  Field<const T> C;      // [P, D, D], present only for a viscous law
+  Field<const T> state;        // F [P, D, D] of a law with shear, J [P] of one without
+  Field<const T> C;            // [P, D, D], present only for a viscous law
   const int* scene = nullptr;  // int32 [P], where a parameter is per scene
   int64_t scene_stride = 0;
   Parameter<T> parameters[AllLaws::most_parameters];

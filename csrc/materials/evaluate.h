@@ -3,8 +3,8 @@
 #include "materials/arguments.h"
 
 // Stress, energy and moduli of one particle (or of one pack of particles) and their adjoints.
-// Where J is not positive, or the result is not finite, the law has no meaning: the stress and the moduli are zero, so that
-// such a particle does no harm to its neighbours, the energy is infinite, and all derivatives are zero.
+// Where J is not positive, or the result is not finite, the law has no meaning: the stress and the moduli are zero, so
+// that such a particle does no harm to its neighbours, the energy is infinite, and all derivatives are zero.
 namespace mpm {
 inline namespace TORCH_MPM_ISA {
 

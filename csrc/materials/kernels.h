@@ -2,7 +2,8 @@
 
 #include "materials/evaluate.h"
 
-// The bodies of the material kernels: load particle p (V a scalar) or particles p, p + 1, ... (V a pack), evaluate, store.
+// The bodies of the material kernels: load particle p (V a scalar) or particles p, p + 1, ... (V a pack), evaluate,
+// store.
 namespace mpm {
 inline namespace TORCH_MPM_ISA {
 

@@ -9,9 +9,9 @@ inline namespace TORCH_MPM_ISA {
 //   ψ = μ/2 (tr F Fᵀ − D) − μ ln J + λ/2 (ln J)²,   τ = μ (F Fᵀ − I) + λ ln J I.
 struct NeoHookean {
   static constexpr const char* name = "neo_hookean";
-  static constexpr bool shear = true;    // its state is F, not J alone
+  static constexpr bool shear = true;     // its state is F, not J alone
   static constexpr bool viscous = false;  // its stress depends on the velocity gradient
-  static constexpr int parameters = 2;   // μ, λ [Pa]
+  static constexpr int parameters = 2;    // μ, λ [Pa]
 
   template <class T, int D>
   MPM_HD static T energy(const Strain<T, D>& s, const T p[]) {

@@ -29,7 +29,8 @@ struct WeaklyCompressible {
     return p[0] * s.J * (T(1) + power_minus_1(s, p));
   }
 
-  // Upper bound of the second variation t' (tr G)² − t tr G², with t the tension and t' = dt/d ln J, and of |dτ/dF : G F|.
+  // Upper bound of the second variation t' (tr G)² − t tr G², with t the tension and t' = dt/d ln J, and of |dτ/dF : G
+  // F|.
   template <class T, int D>
   MPM_HD static T stiffness(const Strain<T, D>& s, const T p[]) {
     const T t = tension(s, p);

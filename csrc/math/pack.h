@@ -27,11 +27,13 @@ template <int Width>
 struct RegisterOf<float, Width> {
   typedef float Value __attribute__((vector_size(Width * 4)));
   typedef int32_t Integer __attribute__((vector_size(Width * 4)));
+  typedef uint32_t Bits __attribute__((vector_size(Width * 4)));
 };
 template <int Width>
 struct RegisterOf<double, Width> {
   typedef double Value __attribute__((vector_size(Width * 8)));
   typedef int64_t Integer __attribute__((vector_size(Width * 8)));
+  typedef uint64_t Bits __attribute__((vector_size(Width * 8)));
 };
 
 template <class T, int N>
@@ -40,6 +42,7 @@ struct Shape {
   static constexpr int kParts = N / kWidth;
   using Value = typename RegisterOf<T, kWidth>::Value;
   using Integer = typename RegisterOf<T, kWidth>::Integer;
+  using Bits = typename RegisterOf<T, kWidth>::Bits;
 };
 
 template <class T, int N>
@@ -117,6 +120,7 @@ MPM_PACK_COMPARISON(<)
 MPM_PACK_COMPARISON(>)
 MPM_PACK_COMPARISON(<=)
 MPM_PACK_COMPARISON(>=)
+MPM_PACK_COMPARISON(==)
 #undef MPM_PACK_COMPARISON
 
 #define MPM_MASK_OPERATOR(op)                                             \
@@ -191,11 +195,6 @@ MPM_HD Pack<T, N> sqrt(const Pack<T, N>& a) {
 }
 
 template <class T, int N>
-MPM_HD Pack<T, N> expm1(const Pack<T, N>& a) {
-  return map(a, [](T x) { return mpm::expm1(x); });
-}
-
-template <class T, int N>
 MPM_HD Pack<T, N> abs(const Pack<T, N>& a) {
   return select(a < Pack<T, N>(0), -a, a);
 }
@@ -205,11 +204,81 @@ MPM_HD Pack<T, N> max(const Pack<T, N>& a, const Pack<T, N>& b) {
   return select(a > b, a, b);
 }
 
+// The bits of IEEE numbers, for functions that take the exponent apart.
+template <class T>
+struct Format;
+template <>
+struct Format<float> {
+  using Bits = uint32_t;
+  static constexpr int mantissa = 23, bias = 127;
+  static constexpr Bits sqrt_half = 0x3f3504f3, mantissa_mask = 0x7fffff;
+  static constexpr float shifter = 12582912.0f;  // 1.5 2^23: adding it rounds to an integer in the low bits
+  static constexpr float ln2_high = 6.9313812256e-01f, ln2_low = 9.0580006145e-06f;
+  static constexpr float expm1_low = -87.0f, expm1_high = 88.0f;
+  static constexpr int expm1_terms = 8;
+  static constexpr float log_terms[] = {0.66666662693f, 0.40000972152f, 0.28498786688f, 0.24279078841f};
+};
+template <>
+struct Format<double> {
+  using Bits = uint64_t;
+  static constexpr int mantissa = 52, bias = 1023;
+  static constexpr Bits sqrt_half = 0x3fe6a09e667f3bcd, mantissa_mask = 0xfffffffffffff;
+  static constexpr double shifter = 6755399441055744.0;  // 1.5 2^52
+  static constexpr double ln2_high = 6.93147180369123816490e-01, ln2_low = 1.90821492927058770002e-10;
+  static constexpr double expm1_low = -708.0, expm1_high = 709.0;
+  static constexpr int expm1_terms = 15;
+  static constexpr double log_terms[] = {6.666666666666735130e-01, 3.999999999940941908e-01, 2.857142874366239149e-01,
+                                         2.222219843214978396e-01, 1.818357216161805012e-01, 1.531383769920937332e-01,
+                                         1.479819860511658591e-01};
+};
+
+// ln a: a = 2^k m with m in [√½, √2), and the series in ((m − 1)/(m + 1))² of fdlibm's log (Sun Microsystems, 1993), with
+// m − 1 taken from a_minus_1 where k = 0.
 template <class T, int N>
 MPM_HD Pack<T, N> log_1p(const Pack<T, N>& a, const Pack<T, N>& a_minus_1) {
+  using F = Format<T>;
+  using Value = typename Shape<T, N>::Value;
+  using Bits = typename Shape<T, N>::Bits;
+  constexpr typename F::Bits one = typename F::Bits(F::bias) << F::mantissa;
   Pack<T, N> r;
-  for (int i = 0; i < N; i++) r.set(i, mpm::log_1p(a[i], a_minus_1[i]));
+  MPM_UNROLL
+  for (int part = 0; part < r.kParts; part++) {
+    const Bits bits = __builtin_bit_cast(Bits, a.part[part]) + (one - F::sqrt_half);
+    const Value m = __builtin_bit_cast(Value, (bits & F::mantissa_mask) + F::sqrt_half);
+    const Bits shifted = (bits >> F::mantissa) + (__builtin_bit_cast(typename F::Bits, F::shifter) - F::bias);
+    const Value k = __builtin_bit_cast(Value, shifted) - F::shifter;
+    const Value f = k == 0 ? a_minus_1.part[part] : m - 1;
+    const Value s = f / (2 + f), z = s * s, half_square = T(0.5) * f * f;
+    Value series = z * F::log_terms[sizeof(F::log_terms) / sizeof(T) - 1];
+    MPM_UNROLL
+    for (int i = sizeof(F::log_terms) / sizeof(T) - 2; i >= 0; i--) series = z * (F::log_terms[i] + series);
+    r.part[part] = s * (half_square + series) + k * F::ln2_low - half_square + f + k * F::ln2_high;
+  }
   return r;
+}
+
+// eˣ − 1 with x = k ln 2 + r: the Taylor series of r, scaled.
+template <class T, int N>
+MPM_HD Pack<T, N> expm1(const Pack<T, N>& x) {
+  using F = Format<T>;
+  using Value = typename Shape<T, N>::Value;
+  using Bits = typename Shape<T, N>::Bits;
+  Pack<T, N> result;
+  MPM_UNROLL
+  for (int part = 0; part < x.kParts; part++) {
+    Value a = x.part[part];
+    const auto overflow = a > F::expm1_high;
+    a = a < F::expm1_low ? F::expm1_low - Value{} : overflow ? F::expm1_high - Value{} : a;
+    const Value shifted = a * T(1.4426950408889634) + F::shifter, k = shifted - F::shifter;
+    const Value r = a - k * F::ln2_high - k * F::ln2_low;
+    Value series = 1 + r * T(1.0 / F::expm1_terms);
+    MPM_UNROLL
+    for (int i = F::expm1_terms - 1; i > 1; i--) series = 1 + r * T(1.0 / i) * series;
+    const Bits exponent = (__builtin_bit_cast(Bits, shifted) + F::bias) << F::mantissa;
+    const Value scale = __builtin_bit_cast(Value, exponent);
+    result.part[part] = overflow ? T(__builtin_inf()) - Value{} : scale * (r * series) + (scale - 1);
+  }
+  return result;
 }
 
 }  // namespace TORCH_MPM_ISA
