@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import lru_cache
-from typing import Any, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -36,7 +37,9 @@ def add_scale(target: Any, axes: Any, quantity: Quantity, limits: tuple[float, f
     bar.formatter.set_powerlimits((-3, 4))
     bar.ax.tick_params(labelsize=size, colors=INK, length=3)
     bar.ax.yaxis.get_offset_text().set(size=size, color=INK)
-    bar.set_label(f"{quantity.label} [{quantity.unit}]" if quantity.unit else quantity.label, size=1.08 * size, color=INK)
+    bar.set_label(
+        f"{quantity.label} [{quantity.unit}]" if quantity.unit else quantity.label, size=1.08 * size, color=INK
+    )
 
 
 def material_handles(names: Sequence[str]) -> list[Any]:
@@ -49,15 +52,22 @@ def material_handles(names: Sequence[str]) -> list[Any]:
 
 
 @lru_cache(maxsize=4)
-def scale_overlay(resolution: tuple[int, int], quantity: Quantity, limits: tuple[float, float] | None, cmap: str,
-                  names: tuple[str, ...]) -> Array:
+def scale_overlay(
+    resolution: tuple[int, int],
+    quantity: Quantity,
+    limits: tuple[float, float] | None,
+    cmap: str,
+    names: tuple[str, ...],
+) -> Array:
     """RGBA float32 [H, W, 4] with a colour bar, or with a legend of material `names`, on the right."""
     fig, size = figure(resolution), font_size(resolution)
     fig.patch.set_alpha(0)
     if limits is not None:
         add_scale(fig, fig.add_axes((0.905, 0.24, 0.014, 0.52)), quantity, limits, cmap, size)
     elif names:
-        fig.legend(handles=material_handles(names), loc="center right", frameon=False, fontsize=1.1 * size, labelcolor=INK)
+        fig.legend(
+            handles=material_handles(names), loc="center right", frameon=False, fontsize=1.1 * size, labelcolor=INK
+        )
     fig.canvas.draw()
     return np.asarray(fig.canvas.buffer_rgba()).astype(np.float32) / 255
 

@@ -26,11 +26,21 @@ class Camera:
         depth = rel @ self.forward
         width, height = self.resolution
         scale = 0.5 * height / np.tan(0.5 * np.radians(self.view_angle)) / depth
-        return np.stack([0.5 * width + scale * (rel @ self.right), 0.5 * height - scale * (rel @ self.up), depth], axis=1)
+        return np.stack(
+            [0.5 * width + scale * (rel @ self.right), 0.5 * height - scale * (rel @ self.up), depth], axis=1
+        )
 
 
-def framing(lower: Array, upper: Array, up: Array, resolution: tuple[int, int], azimuth: float, elevation: float,
-            view_angle: float = 28.0, fill: tuple[float, float] = (0.80, 0.84)) -> Camera:
+def framing(
+    lower: Array,
+    upper: Array,
+    up: Array,
+    resolution: tuple[int, int],
+    azimuth: float,
+    elevation: float,
+    view_angle: float = 28.0,
+    fill: tuple[float, float] = (0.80, 0.84),
+) -> Camera:
     """The camera that shows the whole box [lower, upper] inside the part `fill` of the width and the height.
 
     `azimuth` and `elevation` in degrees, around and above the plane normal to `up`. The smallest distance that keeps
@@ -62,3 +72,13 @@ def horizontal_axes(up: Array) -> tuple[Array, Array]:
     side = reference - (reference @ up) * up
     side /= np.linalg.norm(side)
     return side, np.cross(side, up)
+
+
+LIGHTS = (0.85, 0.40)  # strengths of the key light and of the fill light
+
+
+def light_directions(camera: Camera) -> tuple[Array, Array]:
+    """Unit vectors towards the key light (above, left of the camera, behind it) and the fill light (right)."""
+    key = -0.55 * camera.right + 0.9 * camera.up - 0.55 * camera.forward
+    fill = 0.75 * camera.right - 0.15 * camera.up - 0.6 * camera.forward
+    return key / np.linalg.norm(key), fill / np.linalg.norm(fill)

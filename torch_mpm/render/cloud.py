@@ -33,7 +33,7 @@ def rest_spacing(x: Array) -> float:
 
 
 def visible(x: Array, spacing: float) -> Array:
-    """Mask [P] of the particles [P, 3] that are not enclosed by at least two full layers of cells.
+    """Mask [P] of the particles [P, 3] that are not enclosed by two layers of occupied cells.
 
     Cells are 1.5 spacings wide: each holds a particle in any undisturbed body. Enclosed particles cannot be seen,
     and a renderer that is spared them takes a fraction of the time.
@@ -87,12 +87,16 @@ def surface(x: Array, rgb: Array, spacing: float) -> Skin:
     """
     dm = require("vtkmodules.vtkCommonDataModel")
     flying = require("vtkmodules.vtkFiltersCore").vtkFlyingEdges3D()
-    numpy_to_vtk, vtk_to_numpy = (getattr(require("vtkmodules.util.numpy_support"), n) for n in ("numpy_to_vtk", "vtk_to_numpy"))
+    numpy_to_vtk, vtk_to_numpy = (
+        getattr(require("vtkmodules.util.numpy_support"), n) for n in ("numpy_to_vtk", "vtk_to_numpy")
+    )
     pad = 4
     lower = x.min(axis=0) - pad * spacing
     shape = np.ceil(np.ptp(x, axis=0) / spacing).astype(np.int64) + 2 * pad + 1
     if np.prod(shape.astype(np.float64)) > 6e7:
-        raise ValueError(f"the surface of these particles needs a grid of {'x'.join(map(str, shape))} cells; use style='particles'")
+        raise ValueError(
+            f"the surface of these particles needs a grid of {'x'.join(map(str, shape))} cells; use style='particles'"
+        )
     weights = np.concatenate([np.ones((len(x), 1), np.float32), rgb.astype(np.float32)], axis=1)
     field = _linear_splat((x - lower) / spacing, weights, shape)
     field = box_blur(field, 3, (0, 1, 2), passes=2)

@@ -49,13 +49,16 @@ class Ground:
     def _shadow(self, points: Array, radii: Array) -> Array:
         n = self.texels // 2
         texel = 2 * self.half / n
+        points, radii = self._spread(points, radii, texel)
         rel = points - self.origin
         height = rel @ self.up
         foot = rel - (height / (self.light @ self.up))[:, None] * self.light
-        ij = np.floor((np.stack([foot @ self.front, foot @ self.side], axis=1) / self.half + 1) * (n / 2)).astype(np.int64)
+        ij = np.floor((np.stack([foot @ self.front, foot @ self.side], axis=1) / self.half + 1) * (n / 2)).astype(
+            np.int64
+        )
         keep = (height > -radii) & np.all((ij >= 0) & (ij < n), axis=1)
         index = ij[keep] @ np.array([n, 1])
-        cover = (np.pi * radii[keep] ** 2 / texel**2)
+        cover = np.pi * radii[keep] ** 2 / texel**2
         layer = np.clip(height[keep] / (0.15 * self.diameter), 0, 2)
         light = np.ones((n, n))
         for k, width in enumerate((5, 9, 19)):
@@ -63,6 +66,21 @@ class Ground:
             depth = np.bincount(index, weights=weight, minlength=n * n).reshape(n, n)
             light *= 1 - box_blur(1 - np.exp(-1.5 * depth), width, (0, 1))
         return box_blur(np.kron(1 - light, np.ones((2, 2))), 3, (0, 1), passes=2)
+
+    def _spread(self, points: Array, radii: Array, texel: float) -> tuple[Array, Array]:
+        """Replace spheres wider than a texel by small ones over their cross-section, which add up to its area."""
+        wide = radii > texel
+        if not wide.any():
+            return points, radii
+        count = int(min((radii[wide].max() / texel) ** 2 + 1, 256))
+        k = np.arange(count)
+        radius, angle = np.sqrt((k + 0.5) / count), k * np.pi * (3 - np.sqrt(5))  # Vogel's sunflower (1979)
+        u = np.cross(self.light, self.side)
+        u /= np.linalg.norm(u)
+        disc = radius[:, None] * (np.cos(angle)[:, None] * u + np.sin(angle)[:, None] * np.cross(self.light, u))
+        spread = points[wide][:, None] + radii[wide][:, None, None] * disc
+        small = np.repeat(radii[wide] / np.sqrt(count), count)
+        return np.concatenate([points[~wide], spread.reshape(-1, 3)]), np.concatenate([radii[~wide], small])
 
     def _ruling(self, extent: Array) -> Array:
         """Base colour [T, T, 3]: thin lines every round length, about a fifth of the scene apart."""

@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, Sequence
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from .annotate import blend, scale_overlay, write_text
-from .camera import framing
+from .camera import framing, light_directions
 from .cloud import rest_spacing
 from .colors import PLAIN, QUANTITIES, Quantity, map_colors, material_colors, numpy_of, scalar_of, value_range
 from .ground import Ground
+from .requires import RenderError
 from .scene2d import Overlay, Scene2D
-from .scene3d import Scene3D, key_light
+from .scene3d import Scene3D, window_class
 from .shapes import Array, Obstacle, vector
+from .software import SoftwareScene
 
 log = logging.getLogger(__name__)
 
@@ -39,10 +42,12 @@ class Renderer:
         azimuth, elevation: direction of the camera in degrees (3-D), around and above the horizontal plane.
         view: (lower [D], upper [D]) to frame instead of the bounds.
         ground: draw the ground at the lower face of the bounds (3-D).
+        backend: "vtk", "software" (3-D without OpenGL, plainer), or "auto": VTK, and where VTK finds no OpenGL
+            a logged warning and "software". The attribute `backend` tells which it became; 2-D is "matplotlib".
 
     Raises:
         ImportError: a package of the `render` extra is missing.
-        RenderError: VTK finds no OpenGL (3-D); the message says what to install.
+        RenderError: backend is "vtk" and VTK finds no OpenGL; the message says what to install.
         ValueError: an argument has the wrong shape or value.
     """
 
@@ -63,6 +68,7 @@ class Renderer:
         elevation: float = 18.0,
         view: tuple[npt.ArrayLike, npt.ArrayLike] | None = None,
         ground: bool = True,
+        backend: str = "auto",
     ) -> None:
         self.bounds = _box("bounds", bounds, None)
         self.dim = len(self.bounds[0])
@@ -78,17 +84,20 @@ class Renderer:
         self.names = tuple(materials) if color_by == "material" else ()
         frame = self.bounds if view is None else _box("view", view, self.dim)
         self.has_scale = color_by not in (None, "material")
-        self.scene: Scene2D | Scene3D
+        self.scene: Scene2D | Scene3D | SoftwareScene
+        if backend not in ("auto", "vtk", "software"):
+            raise ValueError(f"backend must be 'auto', 'vtk' or 'software', got {backend!r}")
         if self.dim == 2:
+            self.backend = "matplotlib"
             self.scene = Scene2D(frame, self.resolution, self.has_scale)
         else:
-            self.scene = self._scene3d(frame, _up(gravity), azimuth, elevation, ground)
-
-    def _scene3d(self, frame: tuple[Array, Array], up: Array, azimuth: float, elevation: float, ground: bool) -> Scene3D:
-        fill = (0.80, 0.86) if self.color_by else (0.92, 0.86)
-        camera = framing(*frame, up, self.resolution, azimuth, elevation, fill=fill)
-        plate = Ground(*self.bounds, up, key_light(camera)) if ground else None
-        return Scene3D(camera, plate, self.bounds)
+            self.backend = _choose(backend)
+            fill = (0.80, 0.86) if color_by else (0.92, 0.86)
+            up = _up(gravity)
+            camera = framing(*frame, up, self.resolution, azimuth, elevation, fill=fill)
+            plate = Ground(*self.bounds, up, -light_directions(camera)[0]) if ground else None
+            draws = Scene3D if self.backend == "vtk" else SoftwareScene
+            self.scene = draws(camera, plate, self.bounds)
 
     def frame(
         self,
@@ -136,7 +145,7 @@ class Renderer:
 
     def close(self) -> None:
         """Give the renderer's OpenGL context back (3-D)."""
-        if isinstance(self.scene, Scene3D):
+        if not isinstance(self.scene, Scene2D):
             self.scene.close()
 
     def __enter__(self) -> Renderer:
@@ -163,7 +172,9 @@ class Renderer:
             self.radius = (0.6 if self.dim == 3 else 0.75) * rest_spacing(x) or 0.02 * extent
         return self.radius or 0.0
 
-    def _annotate(self, image: Array, overlays: Sequence[Overlay], limits: tuple[float, float] | None, title: str, stamp: str) -> Array:
+    def _annotate(
+        self, image: Array, overlays: Sequence[Overlay], limits: tuple[float, float] | None, title: str, stamp: str
+    ) -> Array:
         if overlays:
             image = self._draw_lines(image, overlays)
         if limits is not None or self.names:
@@ -193,3 +204,17 @@ def _up(gravity: npt.ArrayLike | None) -> Array:
     down = np.array([0.0, -1.0, 0.0]) if gravity is None else vector("gravity", gravity, 3)
     length = float(np.linalg.norm(down))
     return np.array([0.0, 1.0, 0.0]) if length == 0 else -down / length
+
+
+def _choose(backend: str) -> str:
+    """The backend that draws 3-D on this machine."""
+    if backend == "software":
+        return backend
+    try:
+        window_class()
+    except RenderError as error:
+        if backend == "vtk":
+            raise
+        log.warning("%s. Until then pictures are drawn in software: plainer, and without surfaces.", error)
+        return "software"
+    return "vtk"

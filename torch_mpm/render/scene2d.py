@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any, Sequence
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -55,14 +56,25 @@ class Scene2D:
             add_scale(self.figure, self.bar, quantity, limits, cmap, self.size)
             self.scale = (quantity, limits, cmap)
 
-    def draw(self, x: Array, rgb: Array, radius: float, obstacles: Sequence[Obstacle], overlays: Sequence[Overlay],
-             names: Sequence[str], title: str, stamp: str) -> Array:
+    def draw(
+        self,
+        x: Array,
+        rgb: Array,
+        radius: float,
+        obstacles: Sequence[Obstacle],
+        overlays: Sequence[Overlay],
+        names: Sequence[str],
+        title: str,
+        stamp: str,
+    ) -> Array:
         """The picture, uint8 [H, W, 3], of finite positions x [P, 2] m with colours uint8 [P, 3]."""
         for artist in self.changing:
             artist.remove()
         patches = require("matplotlib.patches")
         self.changing = [
-            self.axes.add_patch(patches.Polygon(o.world(), closed=True, facecolor=o.color, edgecolor=INK, linewidth=0.8, zorder=3))
+            self.axes.add_patch(
+                patches.Polygon(o.world(), closed=True, facecolor=o.color, edgecolor=INK, linewidth=0.8, zorder=3)
+            )
             for o in obstacles
         ]
         self.cloud.set_offsets(x)
@@ -72,10 +84,16 @@ class Scene2D:
         self.cloud.set_sizes([(diameter * 72 / DPI) ** 2])
         for points, color, label in overlays:
             points = np.asarray(points)
-            self.changing += self.axes.plot(points[:, 0], points[:, 1], color=color, label=label or None, linewidth=2, zorder=4)
-        handles = material_handles(names) + [a for a in self.changing if a.get_label() and not a.get_label().startswith("_")]
+            self.changing += self.axes.plot(
+                points[:, 0], points[:, 1], color=color, label=label or None, linewidth=2, zorder=4
+            )
+        handles = material_handles(names) + [
+            a for a in self.changing if a.get_label() and not a.get_label().startswith("_")
+        ]
         if handles:
-            legend = self.axes.legend(handles=handles, loc="upper right", fontsize=self.size, framealpha=0.9, labelcolor=INK)
+            legend = self.axes.legend(
+                handles=handles, loc="upper right", fontsize=self.size, framealpha=0.9, labelcolor=INK
+            )
             legend.set_zorder(5)
             self.changing.append(legend)
         self.title.set_text(title)

@@ -1,19 +1,20 @@
-"""Three-dimensional pictures through VTK, off screen: sphere impostors or a surface, ambient occlusion, soft shadows."""
+"""Three-dimensional pictures through VTK, off screen: spheres or a surface, ambient occlusion, soft shadows."""
 
 from __future__ import annotations
 
 import subprocess
 import sys
+from collections.abc import Sequence
 from functools import cache
-from typing import Any, Sequence
+from typing import Any
 
 import numpy as np
 
-from .camera import Camera
+from .camera import LIGHTS, Camera, light_directions
 from .cloud import Skin, surface, visible
 from .ground import BACKGROUND, Ground
 from .requires import RenderError, require
-from .shapes import Array, Obstacle
+from .shapes import Array, Obstacle, surface_samples
 
 CULL_FROM = 20_000  # particles; below this, finding the hidden ones costs more than drawing them
 
@@ -41,18 +42,23 @@ def window_class() -> Any:
     modules = [require("vtkmodules.vtkRenderingOpenGL2"), require("vtkmodules.vtkRenderingCore")]
     for kind in WINDOWS:
         found = next((getattr(m, kind) for m in modules if hasattr(m, kind)), None)
-        if found and subprocess.run([sys.executable, "-c", _PROBE, kind], capture_output=True, check=False).returncode == 0:
+        if (
+            found
+            and subprocess.run([sys.executable, "-c", _PROBE, kind], capture_output=True, check=False).returncode == 0
+        ):
             return found
     raise RenderError(
         "VTK finds no OpenGL on this machine (neither EGL, nor OSMesa, nor a screen). A software OpenGL will do: "
-        "apt-get install libegl1 libgl1-mesa-dri (Debian, Ubuntu), dnf install mesa-libEGL mesa-dri-drivers (Fedora)"
+        "apt-get install libosmesa6, or libegl1 and libgl1-mesa-dri (Debian, Ubuntu)"
     )
 
 
 class Scene3D:
     """A VTK render window that draws one frame after another. Build once, call `draw` per frame."""
 
-    def __init__(self, camera: Camera, ground: Ground | None, bounds: tuple[Array, Array], occlusion: bool = True) -> None:
+    def __init__(
+        self, camera: Camera, ground: Ground | None, bounds: tuple[Array, Array], occlusion: bool = True
+    ) -> None:
         self.core = require("vtkmodules.vtkRenderingCore")
         self.gl = require("vtkmodules.vtkRenderingOpenGL2")
         self.data = require("vtkmodules.vtkCommonDataModel")
@@ -105,9 +111,7 @@ class Scene3D:
 
     def _place_lights(self) -> None:
         self.renderer.AutomaticLightCreationOff()
-        key = key_light(self.camera)
-        fill = 0.75 * self.camera.right - 0.15 * self.camera.up - 0.6 * self.camera.forward
-        for direction, strength in ((-key, 0.85), (fill, 0.40)):
+        for direction, strength in zip(light_directions(self.camera), LIGHTS, strict=True):
             light = self.core.vtkLight()
             light.SetLightTypeToSceneLight()
             light.SetPosition(*direction)
@@ -121,7 +125,7 @@ class Scene3D:
             shading = self.gl.vtkSSAOPass()
             scale = float(np.linalg.norm(self.bounds[1] - self.bounds[0]))
             shading.SetRadius(0.04 * scale)
-            shading.SetBias(0.0015 * scale)
+            shading.SetBias(0.0025 * scale)
             shading.SetKernelSize(32)
             shading.BlurOn()
             shading.SetDelegatePass(last)
@@ -154,12 +158,9 @@ class Scene3D:
 
     def _shade_ground(self, x: Array, radius: float, obstacles: Sequence[Obstacle]) -> None:
         assert self.ground is not None
-        blockers, radii = [x], [np.full(len(x), radius)]
-        for obstacle in obstacles:
-            points, spread = surface_samples(obstacle)
-            blockers.append(points)
-            radii.append(np.full(len(points), spread))
-        pixels = self.ground.texture(np.concatenate(blockers), np.concatenate(radii))
+        samples = [surface_samples(o, count=4000) for o in obstacles]
+        radii = [np.full(len(x), radius), *(np.full(len(s.points), s.radius) for s in samples)]
+        pixels = self.ground.texture(np.concatenate([x, *(s.points for s in samples)]), np.concatenate(radii))
         image = self.data.vtkImageData()
         image.SetDimensions(pixels.shape[1], pixels.shape[0], 1)
         image.GetPointData().SetScalars(self._array(pixels.reshape(-1, 3)))
@@ -239,24 +240,3 @@ class Scene3D:
         buffer = require("vtkmodules.vtkCommonCore").vtkUnsignedCharArray()
         self.window.GetPixelData(0, 0, width - 1, height - 1, 1, buffer, 0)
         return self.support.vtk_to_numpy(buffer).reshape(height, width, 3)[::-1].copy()
-
-
-def key_light(camera: Camera) -> Array:
-    """Direction in which the key light shines: from above, left of the camera and behind it."""
-    direction = 0.55 * camera.right - 0.9 * camera.up + 0.55 * camera.forward
-    return direction / np.linalg.norm(direction)
-
-
-def surface_samples(obstacle: Obstacle, count: int = 4000) -> tuple[Array, float]:
-    """Points [N, 3] spread over an obstacle's surface and the radius [m] at which they cover it."""
-    assert obstacle.faces is not None
-    corners = obstacle.world()[obstacle.faces]
-    edges = corners[:, 1:] - corners[:, :1]
-    area = 0.5 * np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
-    per_face = np.maximum(1, np.ceil(count * area / max(area.sum(), 1e-300))).astype(np.int64)
-    face = np.repeat(np.arange(len(area)), per_face)
-    # The plastic number's sequence (Roberts 2018) fills the unit square evenly; folding maps it to the triangle.
-    uv = np.arange(1, len(face) + 1)[:, None] * np.array([0.7548776662466927, 0.5698402909980532]) % 1
-    uv = np.where(uv.sum(axis=1, keepdims=True) > 1, 1 - uv, uv)
-    points = corners[face, 0] + np.einsum("nk,nkd->nd", uv, edges[face])
-    return points, float(np.sqrt(area.sum() / len(face)))

@@ -59,7 +59,9 @@ def rotation_matrix(rotation: npt.ArrayLike, dim: int) -> Array:
     return out
 
 
-def plane(point: npt.ArrayLike, normal: npt.ArrayLike, size: float, color: tuple[float, float, float] = GREY) -> Obstacle:
+def plane(
+    point: npt.ArrayLike, normal: npt.ArrayLike, size: float, color: tuple[float, float, float] = GREY
+) -> Obstacle:
     """A plate of side `size` [m] around `point`, whose visible side looks along `normal`; a thick line in 2-D."""
     at, n = vector("point", point), vector("normal", normal)
     n = n / np.linalg.norm(n)
@@ -71,8 +73,12 @@ def plane(point: npt.ArrayLike, normal: npt.ArrayLike, size: float, color: tuple
     return Obstacle(quad, np.array([[0, 2, 1], [0, 3, 2]]), at, frame_of(n), color)
 
 
-def box(center: npt.ArrayLike, size: npt.ArrayLike, rotation: npt.ArrayLike | None = None,
-        color: tuple[float, float, float] = GREY) -> Obstacle:
+def box(
+    center: npt.ArrayLike,
+    size: npt.ArrayLike,
+    rotation: npt.ArrayLike | None = None,
+    color: tuple[float, float, float] = GREY,
+) -> Obstacle:
     """A box with edge lengths `size` [D] in metres around `center` [D]."""
     at = vector("center", center)
     dim = at.shape[0]
@@ -113,8 +119,13 @@ def cylinder(a: npt.ArrayLike, b: npt.ArrayLike, radius: float, color: tuple[flo
     return revolved(profile, 0.5 * (start + end), (end - start) / (2 * half), color)
 
 
-def mesh(vertices: npt.ArrayLike, faces: npt.ArrayLike | None = None, position: npt.ArrayLike | None = None,
-         rotation: npt.ArrayLike | None = None, color: tuple[float, float, float] = GREY) -> Obstacle:
+def mesh(
+    vertices: npt.ArrayLike,
+    faces: npt.ArrayLike | None = None,
+    position: npt.ArrayLike | None = None,
+    rotation: npt.ArrayLike | None = None,
+    color: tuple[float, float, float] = GREY,
+) -> Obstacle:
     """Triangles `faces` int [T, 3] over `vertices` [V, 3], or the closed outline `vertices` [V, 2]."""
     v = np.asarray(vertices, dtype=np.float64)
     if v.ndim != 2 or v.shape[1] not in (2, 3):
@@ -150,3 +161,29 @@ def revolved(profile: Array, center: Array, axis: Array, color: tuple[float, flo
     a, b, c, d = i * turns + j, i * turns + k, (i + 1) * turns + k, (i + 1) * turns + j
     faces = np.concatenate([np.stack([a, c, b], -1).reshape(-1, 3), np.stack([a, d, c], -1).reshape(-1, 3)])
     return Obstacle(v, faces, center, frame_of(axis), color)
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Points [N, 3] m spread over a surface, normals [N, 3] there, and the radius [m] of the disc each stands for."""
+
+    points: Array
+    normals: Array
+    radius: float
+
+
+def surface_samples(obstacle: Obstacle, count: int) -> Samples:
+    """About `count` evenly spread points on an obstacle's triangles."""
+    assert obstacle.faces is not None
+    corners = obstacle.world()[obstacle.faces]
+    edges = corners[:, 1:] - corners[:, :1]
+    normals = np.cross(edges[:, 0], edges[:, 1])
+    area = 0.5 * np.linalg.norm(normals, axis=1)
+    normals = normals / np.maximum(2 * area, 1e-300)[:, None]
+    per_face = np.ceil(count * area / max(float(area.sum()), 1e-300)).astype(np.int64)
+    face = np.repeat(np.arange(len(area)), per_face)
+    # The plastic number's sequence (Roberts 2018) fills the unit square evenly; folding maps it to the triangle.
+    uv = np.arange(1, len(face) + 1)[:, None] * np.array([0.7548776662466927, 0.5698402909980532]) % 1
+    uv = np.where(uv.sum(axis=1, keepdims=True) > 1, 1 - uv, uv)
+    points = corners[face, 0] + np.einsum("nk,nkd->nd", uv, edges[face])
+    return Samples(points, normals[face], float(np.sqrt(area.sum() / max(len(face), 1))))
