@@ -226,7 +226,7 @@ class Blocks:
     def node_positions(self, dtype: torch.dtype | None = None) -> Tensor:
         """Position of each node [m], [N, D]."""
         lower = torch.tensor(self.grid.lower, dtype=torch.float64, device=self.block.device)
-        positions = lower + (self.node_indices() - PADDING) * self.grid.dx
+        positions = lower + (self.node_indices() - PADDING).double() * self.grid.dx
         return positions.to(dtype or torch.get_default_dtype())
 
     def to_dense(self, nodes: Tensor) -> Tensor:

@@ -1,6 +1,20 @@
 """The Python faces of the ops: checks, fake kernels, autograd."""
 
 from . import activation as activation
+from .advance import advance
+from .grid_update import grid_update
+from .material import material_energy, material_stiffness, material_stress, material_wave_modulus
 from .transfer import g2p, gather, p2g, scatter
 
-__all__ = ["g2p", "gather", "p2g", "scatter"]
+__all__ = [
+    "advance",
+    "g2p",
+    "gather",
+    "grid_update",
+    "material_energy",
+    "material_stiffness",
+    "material_stress",
+    "material_wave_modulus",
+    "p2g",
+    "scatter",
+]

@@ -175,10 +175,10 @@ def gather(
 
 
 def _check_nodes(name: str, nodes: Tensor, blocks: Blocks, x: Tensor, channels: int | None) -> Tensor:
+    symbols = "[N, K]" if channels is None else "[N, D]"
     if not isinstance(nodes, Tensor) or nodes.dim() != 2:
-        raise ValueError(f"{name} must have shape [N, {channels or 'K'}], got {shape_of(nodes)}")
-    K = channels or nodes.shape[1]
-    check_like(name, nodes, x, (blocks.node_count, K), f"[N, {channels or 'K'}]")
+        raise ValueError(f"{name} must have shape {symbols}, got {shape_of(nodes)}")
+    check_like(name, nodes, x, (blocks.node_count, nodes.shape[1] if channels is None else channels), symbols)
     return nodes if nodes.shape[1] <= 1 or nodes.stride(1) == 1 else nodes.contiguous()
 
 

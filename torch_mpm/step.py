@@ -1,0 +1,240 @@
+"""One explicit MPM step, and rollouts of many."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.utils.checkpoint import checkpoint as run_checkpointed
+
+from .boundaries import Walls
+from .cfl import stable_dt
+from .errors import GridOverflowError, SimulationError
+from .grid import Blocks, Grid
+from .materials import Material
+from .ops import advance, g2p, gather, grid_update, p2g
+from .state import State, identity_deformation
+
+TRANSFERS = ("apic", "pic", "flip")
+
+
+class Step(nn.Module):
+    """Symplectic Euler: stress, P2G, grid update, boundaries, G2P, positions and deformation gradients.
+
+    Args:
+        grid: the lattice.
+        law: a material of `torch_mpm.materials`, or any module with its interface.
+        gravity: [m/s²]; D numbers, or a tensor [D] or [B, D] that may require grad; None for none.
+        walls: "slip", "sticky" or "separate" on every face of the domain, a `Walls` that says more, or None.
+        boundaries: obstacles with the interface of `torch_mpm.boundaries`, applied in order.
+        transfer: "apic" (Jiang et al. 2015), "pic", or "flip".
+        flip: share of FLIP in [0, 1] that "apic" or "pic" is blended with; 1 for transfer="flip".
+        stress_form: "mls" (Hu et al. 2018; F moves with C) or "gradient" (force −V τ ∇N; F moves with Σ v_i ∇N_i).
+        on_grid: called as `velocity = on_grid(blocks, velocity, mass, dt)` with node tensors [N, D] and [N] after the
+            boundaries: a network, a controller, a field of force.
+
+    A step without boundaries, walls, gravity or FLIP does not pay for them.
+
+    Raises:
+        ValueError: for a wrong argument.
+    """
+
+    def __init__(
+        self,
+        grid: Grid,
+        law: Material,
+        gravity: Sequence[float] | Tensor | None = None,
+        walls: str | Walls | None = None,
+        boundaries: Sequence[Any] = (),
+        transfer: str = "apic",
+        flip: float = 0.0,
+        stress_form: str = "mls",
+        on_grid: Callable[[Blocks, Tensor, Tensor, float | Tensor], Tensor] | None = None,
+    ) -> None:
+        super().__init__()
+        if transfer not in TRANSFERS:
+            raise ValueError(f"transfer must be one of {sorted(TRANSFERS)}, got {transfer!r}")
+        if not 0 <= flip <= 1:
+            raise ValueError(f"flip must be between 0 and 1, got {flip}")
+        if stress_form not in ("mls", "gradient"):
+            raise ValueError(f"stress_form must be 'gradient' or 'mls', got {stress_form!r}")
+        self.grid = grid
+        self.law = law
+        self.gravity = gravity
+        self.walls = Walls(walls) if isinstance(walls, str) else walls
+        self.boundaries = nn.ModuleList(boundaries) if all(isinstance(b, nn.Module) for b in boundaries) else list(boundaries)
+        self.transfer = transfer
+        self.flip = 1.0 if transfer == "flip" else float(flip)
+        self.stress_form = stress_form
+        self.on_grid = on_grid
+        self.status: Tensor | None = None
+        """Status of all steps so far, int32 [8] on the device of the particles; `check` reads it."""
+        self._gravity_tensor: Tensor | None = None
+
+    def forward(self, state: State, dt: float | Tensor) -> State:
+        """The state one step later.
+
+        Args:
+            state: see `State`; missing C, F or J start at zero, identity and one.
+            dt: time step [s]: a number, or a tensor of shape [], [1] or [B].
+
+        Raises:
+            ValueError, TypeError: for wrong shapes, dtypes or devices, or a number dt that is not positive.
+            GridOverflowError: on the CPU, where a grid of fixed capacity is full.
+        """
+        grid, scene = self.grid, state.scene
+        state = self.prepare(state)
+        blocks = grid.activate(state.x, scene, self.status)
+        self.status = blocks.status
+        grid.watch(blocks.status)
+        fields, stress = self.law.update(state)
+        affine = state.C if self.transfer == "apic" else None
+        nodes = p2g(blocks, state.x, state.mass, state.v, affine, stress, state.volume, dt, self.stress_form)
+        velocity = self._update_grid(blocks, nodes, state, dt)
+        gradient_form = self.stress_form == "gradient"
+        affine_wanted = self.transfer == "apic" or self.law.viscous or not gradient_form
+        v, C, grad_v = g2p(blocks, state.x, velocity, affine_wanted, gradient_form)
+        if self.flip:
+            v = self._blend_flip(blocks, state, nodes, velocity, v)
+        deformed = {name: fields.get(name, getattr(state, name)) for name in ("F", "J")}
+        x, F, J = advance(
+            state.x, v, dt, grad_v if gradient_form else C, deformed["F"], deformed["J"], scene, grid.scenes
+        )
+        changes = {**fields, "F": F, "J": J}
+        kept_C = C if self.transfer == "apic" or self.law.viscous else None
+        return state.replace(x=x, v=v, C=kept_C, time=state.time + dt, **changes)
+
+    def prepare(self, state: State) -> State:
+        """Give a state the fields that this step needs and that it lacks."""
+        changes: dict[str, Any] = {}
+        if "F" in self.law.state_fields and state.F is None:
+            changes["F"] = identity_deformation(state.x)
+        if "J" in self.law.state_fields and state.J is None:
+            changes["J"] = torch.ones_like(state.mass)
+        return state.replace(**changes) if changes else state
+
+    def _update_grid(self, blocks: Blocks, nodes: Tensor, state: State, dt: float | Tensor) -> Tensor:
+        velocity = grid_update(blocks, nodes, self._gravity(state.x), dt, self.walls)
+        if self.boundaries:
+            positions = blocks.node_positions(state.x.dtype)
+            node_scene = None if state.scene is None else blocks.node_scene()
+            for boundary in self.boundaries:
+                velocity = boundary.apply(velocity, positions, node_scene, state.time, dt)
+        if self.on_grid is not None:
+            velocity = self.on_grid(blocks, velocity, nodes[:, 0], dt)
+        return velocity
+
+    def _blend_flip(self, blocks: Blocks, state: State, nodes: Tensor, velocity: Tensor, v: Tensor) -> Tensor:
+        """(1 − flip) v_pic + flip (v_p + Σ N_i (v_i − v_i before)) (Zhu and Bridson 2005)."""
+        mass = nodes[:, :1]
+        before = torch.where(mass > 0, nodes[:, 1:] / torch.where(mass > 0, mass, 1), 0)
+        change, _, _ = gather(blocks, state.x, velocity - before)
+        return (1 - self.flip) * v + self.flip * (state.v + change)
+
+    def _gravity(self, x: Tensor) -> Tensor | None:
+        if self.gravity is None or isinstance(self.gravity, Tensor):
+            return self.gravity
+        cached = self._gravity_tensor
+        if cached is None or cached.dtype != x.dtype or cached.device != x.device:
+            cached = torch.tensor(self.gravity, dtype=x.dtype, device=x.device)
+            self._gravity_tensor = cached
+        return cached
+
+    def stable_dt(self, state: State, cfl: float = 0.5) -> Tensor:
+        """Largest stable time step of each scene [s], [B], times `cfl`; see `torch_mpm.cfl.stable_dt`."""
+        return stable_dt(self.grid, self.law, self.prepare(state), cfl, self.transfer, self.stress_form)
+
+    def check(self, state: State | None = None) -> None:
+        """Read the status of all steps so far, and look at a state if one is given; synchronises with the device.
+
+        Raises:
+            GridOverflowError: if more blocks were active than the grid has room for.
+            SimulationError: if a particle left the grid or is not finite, or if the law has no meaning for a particle's
+                deformation (turned inside out, J ≤ 0); such a particle has zero stress from then on.
+        """
+        if self.status is not None:
+            check_status(self.status, self.grid)
+        if state is not None:
+            check_deformation(self.law, self.prepare(state))
+
+    def reset(self) -> None:
+        """Forget the status of the steps so far."""
+        self.status = None
+
+
+def check_status(status: Tensor, grid: Grid) -> None:
+    """Raise a `SimulationError` for a status tensor of `activate` that tells of a problem."""
+    peak, outside, first_outside, not_finite, first_not_finite, _, activation, _ = status.tolist()
+    if not_finite > 0:
+        raise SimulationError(
+            f"{not_finite} particles have a position that is NaN or infinite, first at step {activation}, lowest index "
+            f"{first_not_finite}: the time step was probably too large; compare dt with step.stable_dt(state)"
+        )
+    if outside > 0:
+        raise SimulationError(
+            f"{outside} particles left the grid [{grid.lower}, {grid.upper}], first at step {activation}, lowest index "
+            f"{first_outside}: enlarge the domain, add walls, or reduce dt"
+        )
+    if grid.capacity is not None and peak > grid.capacity:
+        raise GridOverflowError(
+            f"{peak} blocks were active but the grid has a capacity of {grid.capacity}, first at step {activation}: "
+            "pass a larger capacity, or None to let it grow"
+        )
+
+
+def check_deformation(law: Material, state: State) -> None:
+    """Raise a `SimulationError` if the law has no meaning for the deformation of a particle."""
+    invalid = law.invalid(state)
+    if not bool(invalid.any()):
+        return
+    first = int(invalid.nonzero()[0, 0])
+    scene = 0 if state.scene is None else int(state.scene[first])
+    identity = first if state.ids is None else int(state.ids[first])
+    raise SimulationError(
+        f"{int(invalid.sum())} particles are inverted or not finite, lowest index {first} (id {identity}) in scene {scene}: "
+        "the time step was too large or the load crushed the material; compare dt with step.stable_dt(state)"
+    )
+
+
+def rollout(
+    step: Callable[[State, float | Tensor], State],
+    state: State,
+    n: int,
+    dt: float | Tensor,
+    checkpoint: int | None = None,
+) -> State:
+    """The state n steps later.
+
+    Args:
+        step: a `Step`, or any function (state, dt) -> state.
+        state: the initial state.
+        n: number of steps.
+        dt: time step [s].
+        checkpoint: if given, keep for the backward pass only the state of every `checkpoint` steps and compute the
+            steps between again (memory n/checkpoint + checkpoint states instead of n steps; sqrt(n) is best).
+
+    Raises:
+        ValueError: for a negative n or a checkpoint below 1.
+    """
+    if n < 0:
+        raise ValueError(f"n must not be negative, got {n}")
+    if checkpoint is not None and checkpoint < 1:
+        raise ValueError(f"checkpoint must be at least 1, got {checkpoint}")
+
+    def steps(state: State, count: int) -> State:
+        for _ in range(count):
+            state = step(state, dt)
+        return state
+
+    if checkpoint is None or not torch.is_grad_enabled():
+        return steps(state, n)
+    if isinstance(step, Step):
+        state = step.prepare(state)
+    done = 0
+    while done < n:
+        count = min(checkpoint, n - done)
+        state = run_checkpointed(steps, state, count, use_reentrant=False)
+        done += count
+    return state
