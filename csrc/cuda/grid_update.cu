@@ -39,7 +39,8 @@ __global__ void __launch_bounds__(kThreads) grid_update_backward_kernel(const Gr
 #pragma unroll
   for (int i = 0; i < D; i++)
 #pragma unroll
-    for (int step = kLanes<D> / 2; step > 0; step /= 2) sum[i] += __shfl_down_sync(0xffffffffu, sum[i], step, kLanes<D>);
+    for (int step = kLanes<D> / 2; step > 0; step /= 2)
+      sum[i] += __shfl_down_sync(0xffffffffu, sum[i], step, kLanes<D>);
   if (slot < a.forward.capacity && lane == 0) a.change[slot] = sum;
 }
 

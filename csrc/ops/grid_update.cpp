@@ -1,0 +1,150 @@
+#include <algorithm>
+
+#include "ops/backend.h"
+
+#if MPM_BACKEND == MPM_BACKEND_IS_cpu
+#include "cpu/grid_update_launchers.h"
+#else
+#include "cuda/grid_update_launchers.h"
+#endif
+
+// Node mass and momentum to mass and velocity, with gravity and the walls of the domain.
+namespace mpm {
+namespace {
+
+#define MPM_GRID_UPDATE_SCHEMA                                                                               \
+  "Tensor nodes, Tensor? gravity, Tensor? scene_dt, float dt, int[] wall_kind, float[] wall_plane, float[] " \
+  "wall_friction, Tensor block, float dx, float[] lower, int[] blocks"
+#define MPM_GRID_UPDATE_PARAMETERS                                                                       \
+  const Tensor &nodes, const OptionalTensor &gravity, const OptionalTensor &scene_dt, double dt,         \
+      std::vector<int64_t> wall_kind, std::vector<double> wall_plane, std::vector<double> wall_friction, \
+      const Tensor &block, double dx, std::vector<double> lower, std::vector<int64_t> blocks
+#define MPM_GRID_UPDATE_ARGUMENTS \
+  nodes, gravity, scene_dt, dt, wall_kind, wall_plane, wall_friction, block, dx, lower, blocks
+
+// Calls f.operator()<T, D>() for the dtype and dimension of node rows.
+template <class F>
+void dispatch_nodes(const Tensor& nodes, F&& f) {
+  STD_TORCH_CHECK(nodes.dim() == 2 && (nodes.size(1) == 3 || nodes.size(1) == 4), "nodes must have shape [N, 1 + D]");
+  const auto by_dimension = [&]<class T>() {
+    nodes.size(1) == 3 ? f.template operator()<T, 2>() : f.template operator()<T, 3>();
+  };
+  if (nodes.scalar_type() == ScalarType::Float)
+    by_dimension.template operator()<float>();
+  else if (nodes.scalar_type() == ScalarType::Double)
+    by_dimension.template operator()<double>();
+  else
+    STD_TORCH_CHECK(false, "nodes must be float32 or float64");
+}
+
+// Kernels read whole rows with vector loads.
+Tensor packed_rows(const Tensor& t) {
+  const bool packed = t.is_contiguous() && reinterpret_cast<uintptr_t>(t.data_ptr()) % 16 == 0;
+  if (packed) return t;
+  Tensor copy = empty(t, {t.size(0), t.size(1)});
+  torch::stable::copy_(copy, t);
+  return copy;
+}
+
+template <class T, int D>
+const NodeRow<T, D>* rows(const Tensor& t, const char* name, const Tensor& nodes) {
+  check_shape(t, name, {nodes.size(0), 1 + D});
+  STD_TORCH_CHECK(t.scalar_type() == nodes.scalar_type() && t.device() == nodes.device(), name,
+                  " must have the dtype and the device of nodes");
+  return static_cast<const NodeRow<T, D>*>(t.data_ptr());
+}
+
+template <class T>
+const T* scene_values(const OptionalTensor& t, const char* name, const Tensor& nodes, const Shape& shape) {
+  if (!has(t)) return nullptr;
+  check_shape(*t, name, shape);
+  STD_TORCH_CHECK(t->is_contiguous() && t->scalar_type() == nodes.scalar_type() && t->device() == nodes.device(), name,
+                  " must be contiguous, with the dtype and on the device of nodes");
+  return static_cast<const T*>(t->data_ptr());
+}
+
+template <class T, int D>
+Walls<T, D> walls(const std::vector<int64_t>& kind, const std::vector<double>& plane,
+                  const std::vector<double>& friction, double dx, const std::vector<double>& lower) {
+  STD_TORCH_CHECK(kind.empty() || kind.size() == 2 * D, "wall_kind must be empty or have two entries per axis");
+  STD_TORCH_CHECK(plane.size() == kind.size() && friction.size() == kind.size(),
+                  "wall_plane and wall_friction must have as many entries as wall_kind");
+  Walls<T, D> w;
+  for (int face = 0; face < 2 * D; face++) {
+    const int64_t k = kind.empty() ? int64_t(Contact::open) : kind[face];
+    STD_TORCH_CHECK(k >= int64_t(Contact::open) && k <= int64_t(Contact::separate), "wall_kind must be 0 to 3, got ",
+                    k);
+    const bool open = k == int64_t(Contact::open);
+    w.set(face, Contact(k), open ? 0 : friction[face], open ? 0 : plane[face], dx, lower[face / 2]);
+  }
+  return w;
+}
+
+template <class T, int D>
+GridUpdateArguments<T, D> grid_update_arguments(MPM_GRID_UPDATE_PARAMETERS) {
+  GridUpdateArguments<T, D> a;
+  a.geometry = geometry<T, D>(dx, lower, blocks);
+  STD_TORCH_CHECK(block.dim() == 1 && block.size(0) <= INT32_MAX, "block must have shape [capacity]");
+  a.capacity = int(block.size(0));
+  a.block = int_pointer(block, "block", nodes, a.capacity);
+  STD_TORCH_CHECK(nodes.size(0) == node_count<D>(block), "nodes must have 4^D rows per entry of block");
+  a.nodes = rows<T, D>(nodes, "nodes", nodes);
+  a.block_count = INT32_MAX;
+  if (has(gravity)) {
+    STD_TORCH_CHECK(gravity->dim() == 2, "gravity must have shape [B, D]");
+    const int64_t scenes = gravity->size(0);
+    a.gravity = scene_values<T>(gravity, "gravity", nodes, {scenes, D});
+    a.scene_dt = scene_values<T>(scene_dt, "scene_dt", nodes, {scenes});
+    a.block_count = int(std::min<int64_t>(INT32_MAX, scenes * a.geometry.blocks_per_scene));
+  }
+  a.dt = dt;
+  a.walls = walls<T, D>(wall_kind, wall_plane, wall_friction, dx, lower);
+  return a;
+}
+
+Tensor grid_update(MPM_GRID_UPDATE_PARAMETERS) {
+  const DeviceScope device(nodes);
+  const Tensor packed = packed_rows(nodes);
+  Tensor updated = torch::stable::empty_like(packed);
+  dispatch_nodes(nodes, [&]<class T, int D>() {
+    auto a = grid_update_arguments<T, D>(MPM_GRID_UPDATE_ARGUMENTS);
+    a.nodes = rows<T, D>(packed, "nodes", nodes);
+    a.updated = static_cast<NodeRow<T, D>*>(updated.data_ptr());
+    backend::grid_update(a, device.stream());
+  });
+  return updated;
+}
+
+// `change` is the adjoint of the velocity change by gravity, summed over the nodes of each slot.
+std::tuple<Tensor, Tensor> grid_update_backward(const Tensor& grad, bool wants_change, MPM_GRID_UPDATE_PARAMETERS) {
+  const DeviceScope device(nodes);
+  const Tensor packed = packed_rows(nodes), packed_grad = packed_rows(grad);
+  Tensor grad_nodes = torch::stable::empty_like(packed),
+         change = empty(nodes, {wants_change ? block.size(0) : 0, nodes.size(1) - 1});
+  dispatch_nodes(nodes, [&]<class T, int D>() {
+    GridUpdateBackwardArguments<T, D> a;
+    a.forward = grid_update_arguments<T, D>(MPM_GRID_UPDATE_ARGUMENTS);
+    a.forward.nodes = rows<T, D>(packed, "nodes", nodes);
+    a.grad_updated = rows<T, D>(packed_grad, "grad", nodes);
+    a.grad_nodes = static_cast<NodeRow<T, D>*>(grad_nodes.data_ptr());
+    if (wants_change) a.change = static_cast<Vector<T, D>*>(change.data_ptr());
+    backend::grid_update_backward(a, device.stream());
+  });
+  return {grad_nodes, change};
+}
+
+}  // namespace
+}  // namespace mpm
+
+#if MPM_BACKEND == MPM_BACKEND_IS_cpu
+STABLE_TORCH_LIBRARY_FRAGMENT(torch_mpm, m) {
+  m.def("grid_update(" MPM_GRID_UPDATE_SCHEMA ") -> Tensor");
+  m.def("grid_update_backward(Tensor grad, bool wants_change, " MPM_GRID_UPDATE_SCHEMA
+        ") -> (Tensor nodes, Tensor change)");
+}
+#endif
+
+MPM_LIBRARY_IMPL(m) {
+  m.impl("grid_update", TORCH_BOX(&mpm::grid_update));
+  m.impl("grid_update_backward", TORCH_BOX(&mpm::grid_update_backward));
+}

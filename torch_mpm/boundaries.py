@@ -1,0 +1,574 @@
+"""What acts on the velocity of the grid nodes: the walls of the domain, and obstacles that may move.
+
+Anything with a method `apply` can stand in the list of boundaries of a `Step`. It is ordinary torch code on the nodes, so
+gradients come by themselves; this one blows through the upper half of the domain:
+
+    class Wind:
+        def __init__(self, acceleration):  # [D], may require grad
+            self.acceleration = acceleration
+        def apply(self, velocity, positions, scene, time, dt):
+            return velocity + torch.where(positions[:, 1:2] > 0.5, dt * self.acceleration, 0.0)
+
+Choose with `torch.where` rather than a mask as index, which synchronises with the device.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple, Protocol
+
+import torch
+from torch import Tensor
+
+from .errors import shape_of
+from .reference.contact import contact_velocity
+
+CONTACTS = ("sticky", "slip", "separate")
+
+Value = float | Sequence[float] | Tensor
+Motion = Callable[[Tensor], Tensor]
+
+
+# ---- walls of the domain
+
+
+class Face(NamedTuple):
+    """One side of the domain: what happens to nodes at or beyond `plane` [m]."""
+
+    kind: str
+    plane: float
+    friction: float
+
+
+class _Box(Protocol):
+    """The part of a `Grid` that walls read."""
+
+    dim: int
+    lower: tuple[float, ...]
+    upper: tuple[float, ...]
+
+
+class Walls:
+    """Contact conditions on the faces of an axis-aligned box at rest, applied by `grid_update`.
+
+    Nodes at or beyond a face (within 1e-6 dx) lose their velocity ("sticky"), its normal component ("slip"), or its
+    normal component where it points into the wall ("separate"); an "open" face does nothing. Coulomb friction lowers the
+    tangential speed by `friction` times the normal velocity that the wall stops.
+
+    Args:
+        kind: "sticky", "slip", "separate" or "open", for all faces; or D of these, one per axis, each either a name or a
+            pair (lower face, upper face).
+        lower, upper: corners of the box [m], D numbers each; None for those of the grid.
+        friction: Coulomb coefficient ≥ 0, in the same forms as `kind`. It has no gradient: use a `Plane` for that.
+
+    Raises:
+        ValueError, TypeError: for a wrong argument, some of them at the first use with a grid.
+    """
+
+    def __init__(
+        self,
+        kind: str | Sequence[str | tuple[str, str]] = "slip",
+        lower: Sequence[float] | None = None,
+        upper: Sequence[float] | None = None,
+        friction: float | Sequence[float | tuple[float, float]] = 0.0,
+    ) -> None:
+        self.kind, self.friction = kind, friction
+        self.lower, self.upper = _numbers("lower", lower), _numbers("upper", upper)
+        for name in _flat(kind):
+            if name not in (*CONTACTS, "open"):
+                raise ValueError(f"kind of a wall must be one of {sorted((*CONTACTS, 'open'))}, got {name!r}")
+        for coefficient in _flat(friction):
+            if isinstance(coefficient, Tensor):
+                raise TypeError(
+                    "friction of walls must be a number, got Tensor: use a Plane for friction with a gradient"
+                )
+            if not 0 <= coefficient < math.inf:
+                raise ValueError(f"friction of walls must be a finite number >= 0, got {coefficient}")
+
+    def __repr__(self) -> str:
+        return f"Walls({self.kind!r}, lower={self.lower}, upper={self.upper}, friction={self.friction})"
+
+    def faces(self, grid: _Box) -> tuple[Face, ...]:
+        """The 2 D faces: lower and upper of the first axis, then of the next."""
+        lower = grid.lower if self.lower is None else self.lower
+        upper = grid.upper if self.upper is None else self.upper
+        if len(lower) != grid.dim or len(upper) != grid.dim:
+            raise ValueError(f"lower and upper of walls must have {grid.dim} numbers, got {lower} and {upper}")
+        if not all(a < b for a, b in zip(lower, upper, strict=True)):
+            raise ValueError(f"upper of walls must be above lower on every axis, got {lower} and {upper}")
+        planes = [plane for pair in zip(lower, upper, strict=True) for plane in pair]
+        kinds = _per_face("kind", self.kind, grid.dim)
+        frictions = _per_face("friction", self.friction, grid.dim)
+        return tuple(Face(k, p, float(f)) for k, p, f in zip(kinds, planes, frictions, strict=True))
+
+
+def _numbers(name: str, values: Sequence[float] | None) -> tuple[float, ...] | None:
+    if values is None:
+        return None
+    numbers = tuple(float(a) for a in values)
+    if not all(math.isfinite(a) for a in numbers):
+        raise ValueError(f"{name} must have finite numbers, got {numbers}")
+    return numbers
+
+
+def _flat(value: Any) -> list[Any]:
+    if isinstance(value, (str, Tensor)) or not isinstance(value, Sequence):
+        return [value]
+    return [item for entry in value for item in _flat(entry)]
+
+
+def _per_face(name: str, value: Any, dim: int) -> list[Any]:
+    if isinstance(value, str) or not isinstance(value, Sequence):
+        return [value] * (2 * dim)
+    pairs = [(v, v) if isinstance(v, str) or not isinstance(v, Sequence) else tuple(v) for v in value]
+    if len(pairs) != dim or any(len(pair) != 2 for pair in pairs):
+        raise ValueError(f"{name} of walls must have one entry or pair per axis, {dim} in all, got {value}")
+    return [item for pair in pairs for item in pair]
+
+
+# ---- obstacles
+
+
+class Pose(NamedTuple):
+    """Where an obstacle is: world = centre + rotation @ body."""
+
+    centre: Tensor  # [D] or [B, D]
+    rotation: Tensor  # [D, D] or [B, D, D]
+
+
+class Obstacle:
+    """A rigid body that acts on the nodes inside it. The base of `Plane`, `Sphere`, `Box`, `Capsule` and `SDF`.
+
+    At a node inside, the velocity relative to the surface there loses all of itself ("sticky"), its normal component
+    ("slip"), or its normal component where it points into the body ("separate"). Coulomb friction then lowers the
+    tangential speed by `friction` times the normal velocity that was stopped.
+
+    Args:
+        position: centre (or a point of the plane) at time `start` [m]: D numbers, a tensor [D] or [B, D], or a function
+            of the time, a tensor [] or [B], that returns such a tensor.
+        kind: "sticky", "slip" or "separate".
+        friction: Coulomb coefficient ≥ 0: a number, or a tensor [] or [B].
+        velocity: velocity of the centre [m/s], constant: D numbers, or a tensor [D] or [B, D]. Not with a function as
+            position, whose derivative by time is the velocity.
+        rotation: orientation at time `start` [rad]: an angle (2-D) or a rotation vector (3-D), about the centre.
+        angular_velocity: constant [rad/s], in the same forms.
+        start, end: the obstacle acts while start ≤ time < end [s].
+        scene: it acts only in this scene of a batch; None for all.
+
+    Tensors may require grad: the gradient of the node velocities goes to position, velocity, rotation,
+    angular_velocity and friction, through the normal and the surface velocity. Which nodes are inside is not
+    differentiable, so radius and size have no gradient and refuse tensors that require one. Nothing here synchronises
+    with the device.
+
+    Raises:
+        ValueError: for a wrong argument; shapes of tensors are checked at the first use.
+    """
+
+    shape: str
+    """Name of the shape, as in a scene file."""
+
+    def __init__(
+        self,
+        position: Value | Motion,
+        kind: str = "separate",
+        friction: float | Tensor = 0.0,
+        velocity: Value | None = None,
+        rotation: Value | None = None,
+        angular_velocity: Value | None = None,
+        start: float = 0.0,
+        end: float = math.inf,
+        scene: int | None = None,
+    ) -> None:
+        if kind not in CONTACTS:
+            raise ValueError(f"kind must be one of {sorted(CONTACTS)}, got {kind!r}")
+        if not isinstance(friction, Tensor) and not 0 <= friction < math.inf:
+            raise ValueError(f"friction must be a finite number >= 0, got {friction}")
+        if not (math.isfinite(start) and start <= end):
+            raise ValueError(f"start must be finite and not after end, got start {start} and end {end}")
+        if scene is not None and scene < 0:
+            raise ValueError(f"scene must not be negative, got {scene}")
+        if callable(position) and velocity is not None:
+            raise ValueError("velocity must be None where position is a function of time: it is its derivative")
+        self.position, self.velocity, self.rotation, self.angular_velocity = (
+            position,
+            velocity,
+            rotation,
+            angular_velocity,
+        )
+        self.kind, self.friction = kind, friction
+        self.start, self.end = float(start), float(end)
+        self.scene = scene
+        self._constants: dict[tuple[str, torch.device, torch.dtype], Tensor] = {}
+
+    # -- what a shape defines
+
+    def surface(self, body: Tensor, scene: Tensor | None) -> tuple[Tensor, Tensor]:
+        """Signed distance [N] [m], negative inside, and unit normal out of the body [N, D] of body coordinates [N, D].
+
+        Both need to be right inside only; a zero normal (as at the centre of a sphere) leaves the node alone.
+        """
+        raise NotImplementedError
+
+    def extents(self) -> dict[str, Any]:
+        """The parameters of the shape, in metres, as given."""
+        raise NotImplementedError
+
+    # -- interface of boundaries
+
+    def apply(
+        self, velocity: Tensor, positions: Tensor, scene: Tensor | None, time: float | Tensor, dt: float | Tensor
+    ) -> Tensor:
+        """Node velocities after contact.
+
+        Args:
+            velocity: node velocities [N, D] [m/s].
+            positions: node positions [N, D] [m].
+            scene: scene of each node, int32 [N] (negative: none), or None for one scene.
+            time: [s], a number or a tensor [] or [B].
+            dt: time step [s]; for boundaries that need one.
+
+        Returns:
+            Velocities [N, D] [m/s].
+
+        Raises:
+            ValueError: for wrong shapes or devices.
+        """
+        if velocity.dim() != 2 or velocity.shape != positions.shape:
+            raise ValueError(
+                f"velocity and positions must both have shape [N, D], got {shape_of(velocity)} and {shape_of(positions)}"
+            )
+        if self._absent(scene, time):
+            return velocity
+        centre, turn = self._centre(time, velocity), self._rotation(time, velocity, velocity.shape[1])
+        if centre.shape[-1] != velocity.shape[1]:
+            raise ValueError(f"position must have {velocity.shape[1]} numbers per point, got {shape_of(centre)}")
+        arm = positions - _per_node(centre, 1, scene)
+        turn = None if turn is None else _per_node(turn, 2, scene)
+        distance, normal = self.surface(arm if turn is None else _transform(turn.mT, arm), scene)
+        if turn is not None:
+            normal = _transform(turn, normal)
+        touching = self._touching(distance, positions, scene, time)[:, None]
+        surface_velocity = self._surface_velocity(arm, scene, time)
+        friction = self.friction
+        if isinstance(friction, Tensor):
+            friction = _per_node(self._value("friction", velocity, ()), 0, scene)[..., None]
+        # Nodes outside are set to zero first, so that a NaN there does not reach the gradient of the parameters.
+        relative = torch.where(touching, velocity if surface_velocity is None else velocity - surface_velocity, 0)
+        after = contact_velocity(relative, normal, self.kind, friction)
+        if surface_velocity is not None:
+            after = after + surface_velocity
+        return torch.where(touching, after, velocity)
+
+    def pose(self, time: float | Tensor, like: Tensor | None = None) -> Pose:
+        """Centre and rotation at a time [s], a number or a tensor [] or [B]; with the dtype and device of `like`."""
+        like = torch.empty(0, dtype=torch.float64) if like is None else like
+        centre = self._centre(time, like)
+        dim = centre.shape[-1]
+        rotation = self._rotation(time, like, dim)
+        return Pose(centre, torch.eye(dim, dtype=like.dtype, device=like.device) if rotation is None else rotation)
+
+    # -- parameters as tensors
+
+    def _value(self, name: str, like: Tensor, shape: tuple[int, ...]) -> Tensor:
+        """A parameter as a tensor of `shape` or [B, *shape], with the dtype and device of `like`."""
+        value = getattr(self, name)
+        if not isinstance(value, Tensor):
+            value = self._constant(name, value, like)
+        if value.dim() not in (len(shape), len(shape) + 1) or tuple(value.shape)[value.dim() - len(shape) :] != shape:
+            alternatives = f"{list(shape)} or {['B', *shape]}".replace("'", "")
+            raise ValueError(f"{name} must have shape {alternatives}, got {shape_of(value)}")
+        if value.device != like.device:
+            raise ValueError(f"{name} must be on the device of the nodes, {like.device}, got {value.device}")
+        return value.to(like.dtype)
+
+    def _constant(self, name: str, value: Any, like: Tensor) -> Tensor:
+        """Numbers as a tensor; copied to a device once, so that later steps do not wait and can be captured."""
+        key = (name, like.device, like.dtype)
+        if key in self._constants:
+            return self._constants[key]
+        tensor = torch.tensor(value, dtype=like.dtype, device=like.device)
+        if type(like) in (Tensor, torch.nn.Parameter) and not torch.compiler.is_compiling():
+            self._constants[key] = tensor
+        return tensor
+
+    # -- motion
+
+    def _absent(self, scene: Tensor | None, time: float | Tensor) -> bool:
+        if scene is None and self.scene not in (None, 0):
+            return True
+        return not isinstance(time, Tensor) and not self.start <= time < self.end
+
+    def _touching(self, distance: Tensor, positions: Tensor, scene: Tensor | None, time: float | Tensor) -> Tensor:
+        """Which nodes are inside, bool [N]; a node on the surface to rounding counts."""
+        rounding = 16 * torch.finfo(positions.dtype).eps
+        touching = distance.detach() <= rounding * positions.detach().abs().amax(1)
+        if self.scene is not None and scene is not None:
+            touching = touching & (scene == self.scene)
+        if isinstance(time, Tensor):
+            touching = touching & _per_node((time >= self.start) & (time < self.end), 0, scene)
+        return touching
+
+    def _elapsed(self, time: float | Tensor, like: Tensor) -> float | Tensor:
+        """Time since `start`, [] or [B]."""
+        return (time - self.start).to(like.dtype) if isinstance(time, Tensor) else time - self.start
+
+    def _centre(self, time: float | Tensor, like: Tensor) -> Tensor:
+        """[D] or [B, D]."""
+        if not isinstance(self.position, Tensor) and callable(self.position):
+            return self._path(time, like)[0]
+        position = self._value("position", like, (_length(self.position),))
+        if self.velocity is None:
+            return position
+        return position + self._value("velocity", like, position.shape[-1:]) * _column(self._elapsed(time, like), 1)
+
+    def _path(self, time: float | Tensor, like: Tensor) -> tuple[Tensor, Tensor]:
+        """Centre and its velocity where the position is a function of time."""
+        assert callable(self.position)
+        if not isinstance(time, Tensor):
+            time = torch.full((), time, dtype=like.dtype, device=like.device)
+        centre, velocity = torch.func.jvp(self.position, (time,), (torch.ones_like(time),))
+        return centre.to(like.dtype), velocity.to(like.dtype)
+
+    def _rotation(self, time: float | Tensor, like: Tensor, dim: int) -> Tensor | None:
+        """[D, D] or [B, D, D]; None where the body never turns."""
+        shape = () if dim == 2 else (3,)
+        rotation = None
+        if self.rotation is not None:
+            rotation = rotation_matrix(self._value("rotation", like, shape), dim)
+        if self.angular_velocity is not None:
+            rate = self._value("angular_velocity", like, shape)
+            turn = rotation_matrix(rate * _column(self._elapsed(time, like), len(shape)), dim)
+            rotation = turn if rotation is None else turn @ rotation
+        return rotation
+
+    def _surface_velocity(self, arm: Tensor, scene: Tensor | None, time: float | Tensor) -> Tensor | None:
+        """Velocity of the body's matter at the nodes, `arm` [N, D] away from the centre; None at rest."""
+        result = None
+        if not isinstance(self.position, Tensor) and callable(self.position):
+            result = _per_node(self._path(time, arm)[1], 1, scene)
+        elif self.velocity is not None:
+            result = _per_node(self._value("velocity", arm, arm.shape[1:]), 1, scene)
+        if self.angular_velocity is None:
+            return result
+        if arm.shape[1] == 2:
+            rate = _per_node(self._value("angular_velocity", arm, ()), 0, scene)[..., None]
+            swirl = rate * torch.stack([-arm[:, 1], arm[:, 0]], 1)
+        else:
+            rate = _per_node(self._value("angular_velocity", arm, (3,)), 1, scene)
+            swirl = torch.linalg.cross(rate.expand_as(arm), arm)
+        return swirl if result is None else result + swirl
+
+
+class Plane(Obstacle):
+    """A half-space: everything behind a plane through `position`.
+
+    Args:
+        normal: direction out of the half-space, into the material: D numbers, or a tensor [D] or [B, D] that may require
+            grad; of any length but zero.
+        position, kind, friction, velocity, rotation, angular_velocity, start, end, scene: see `Obstacle`.
+    """
+
+    shape = "plane"
+
+    def __init__(self, position: Value | Motion, normal: Value, kind: str = "separate", **motion: Any) -> None:
+        super().__init__(position, kind, **motion)
+        if not isinstance(normal, Tensor) and not any(_floats(normal)):
+            raise ValueError(f"normal must not be zero, got {normal}")
+        self.normal = normal
+
+    def surface(self, body: Tensor, scene: Tensor | None) -> tuple[Tensor, Tensor]:
+        normal = _unit(_per_node(self._value("normal", body, body.shape[1:]), 1, scene))
+        return (body * normal).sum(1), normal.expand_as(body)
+
+    def extents(self) -> dict[str, Any]:
+        return {"normal": self.normal}
+
+
+class Sphere(Obstacle):
+    """A ball; a disc in 2-D.
+
+    Args:
+        radius: [m], a number, or a tensor [] or [B].
+        position, kind, friction, velocity, rotation, angular_velocity, start, end, scene: see `Obstacle`.
+    """
+
+    shape = "sphere"
+
+    def __init__(self, position: Value | Motion, radius: float | Tensor, kind: str = "separate", **motion: Any) -> None:
+        super().__init__(position, kind, **motion)
+        self.radius = _extent("radius", radius)
+
+    def surface(self, body: Tensor, scene: Tensor | None) -> tuple[Tensor, Tensor]:
+        return _norm(body) - _per_node(self._value("radius", body, ()), 0, scene), _unit(body)
+
+    def extents(self) -> dict[str, Any]:
+        return {"radius": self.radius}
+
+
+class Box(Obstacle):
+    """A box with edges along its own axes.
+
+    Args:
+        size: edge lengths [m]: D numbers, or a tensor [D] or [B, D].
+        position, kind, friction, velocity, rotation, angular_velocity, start, end, scene: see `Obstacle`.
+    """
+
+    shape = "box"
+
+    def __init__(self, position: Value | Motion, size: Value, kind: str = "separate", **motion: Any) -> None:
+        super().__init__(position, kind, **motion)
+        self.size = _extent("size", size)
+
+    def surface(self, body: Tensor, scene: Tensor | None) -> tuple[Tensor, Tensor]:
+        # Inside, the nearest face is that of the axis with the largest (least negative) distance.
+        depth = body.abs() - 0.5 * _per_node(self._value("size", body, body.shape[1:]), 1, scene)
+        nearest = torch.nn.functional.one_hot(depth.argmax(1), body.shape[1])
+        return depth.amax(1), nearest * torch.where(body < 0, -1, 1).to(body.dtype)
+
+    def extents(self) -> dict[str, Any]:
+        return {"size": self.size}
+
+
+class Capsule(Obstacle):
+    """All points within `radius` of a segment.
+
+    Args:
+        half_axis: from the centre to one end of the segment [m]: D numbers, or a tensor [D] or [B, D] that may require
+            grad. The other end is opposite.
+        radius: [m], a number, or a tensor [] or [B].
+        position, kind, friction, velocity, rotation, angular_velocity, start, end, scene: see `Obstacle`.
+    """
+
+    shape = "capsule"
+
+    def __init__(
+        self,
+        position: Value | Motion,
+        half_axis: Value,
+        radius: float | Tensor,
+        kind: str = "separate",
+        **motion: Any,
+    ) -> None:
+        super().__init__(position, kind, **motion)
+        self.half_axis = half_axis
+        self.radius = _extent("radius", radius)
+
+    def surface(self, body: Tensor, scene: Tensor | None) -> tuple[Tensor, Tensor]:
+        axis = _per_node(self._value("half_axis", body, body.shape[1:]), 1, scene)
+        squared = (axis * axis).sum(-1, keepdim=True)
+        along = (body * axis).sum(1, keepdim=True) / torch.where(squared > 0, squared, 1)
+        offset = body - along.clamp(-1, 1) * axis
+        return _norm(offset) - _per_node(self._value("radius", body, ()), 0, scene), _unit(offset)
+
+    def extents(self) -> dict[str, Any]:
+        return {"half_axis": self.half_axis, "radius": self.radius}
+
+
+class SDF(Obstacle):
+    """Any shape, from its signed distance.
+
+    Args:
+        distance: function of body coordinates [N, D] [m], x − position turned back, that returns distances [N] [m],
+            negative inside. Torch operations; it need not be exact away from its zero level.
+        normal: function of the same coordinates that returns outward normals [N, D]; None for the gradient of
+            `distance` by automatic differentiation. Of any length; where it is zero, nodes are left alone.
+        position, kind, friction, velocity, rotation, angular_velocity, start, end, scene: see `Obstacle`.
+    """
+
+    shape = "sdf"
+
+    def __init__(
+        self,
+        distance: Callable[[Tensor], Tensor],
+        position: Value | Motion,
+        kind: str = "separate",
+        normal: Callable[[Tensor], Tensor] | None = None,
+        **motion: Any,
+    ) -> None:
+        super().__init__(position, kind, **motion)
+        self.distance, self.normal = distance, normal
+
+    def surface(self, body: Tensor, scene: Tensor | None) -> tuple[Tensor, Tensor]:
+        if self.normal is not None:
+            distance, normal = self.distance(body), self.normal(body)
+        else:
+            distance, pull_back = torch.func.vjp(self.distance, body)
+            (normal,) = pull_back(torch.ones_like(distance))
+        if distance.shape != body.shape[:1] or normal.shape != body.shape:
+            raise ValueError(
+                f"distance and normal of an SDF must have shape [N] and [N, D] = {list(body.shape)}, "
+                f"got {shape_of(distance)} and {shape_of(normal)}"
+            )
+        return distance, _unit(normal)
+
+    def extents(self) -> dict[str, Any]:
+        return {"distance": self.distance}
+
+
+# ---- small tensor functions
+
+
+def rotation_matrix(angle: Tensor, dim: int) -> Tensor:
+    """Rotation by an angle [...] (2-D) or a rotation vector [..., 3] (3-D) [rad], as matrices [..., D, D].
+
+    3-D by the formula of Rodrigues; smooth at the zero vector.
+    """
+    if dim == 2:
+        c, s = angle.cos(), angle.sin()
+        return torch.stack([torch.stack([c, -s], -1), torch.stack([s, c], -1)], -2)
+    theta = _norm(angle)[..., None, None]
+    x, y, z = angle.unbind(-1)
+    zero = torch.zeros_like(x)
+    rows = [torch.stack(row, -1) for row in ((zero, -z, y), (z, zero, -x), (-y, x, zero))]
+    cross = torch.stack(rows, -2)
+    first, second = torch.sinc(theta / math.pi), 0.5 * torch.sinc(theta / (2 * math.pi)) ** 2
+    return torch.eye(3, dtype=angle.dtype, device=angle.device) + first * cross + second * (cross @ cross)
+
+
+def _norm(v: Tensor) -> Tensor:
+    """Length of vectors [..., D], with gradient zero at the zero vector."""
+    squared = (v * v).sum(-1)
+    return torch.where(squared > 0, torch.where(squared > 0, squared, 1).sqrt(), 0)
+
+
+def _unit(v: Tensor) -> Tensor:
+    """Directions of vectors [..., D]; zero for the zero vector."""
+    norm = _norm(v)[..., None]
+    return torch.where(norm > 0, v / torch.where(norm > 0, norm, 1), 0)
+
+
+def _transform(matrix: Tensor, v: Tensor) -> Tensor:
+    """Matrix [D, D] or [N, D, D] times vectors [N, D]."""
+    return v @ matrix.mT if matrix.dim() == 2 else (matrix @ v[..., None])[..., 0]
+
+
+def _per_node(value: Tensor, rank: int, scene: Tensor | None) -> Tensor:
+    """A value of `rank` dimensions as it is, or one per scene as one per node."""
+    if value.dim() == rank:
+        return value
+    if scene is None or value.shape[0] == 1:
+        return value[0]
+    return value.index_select(0, scene.clamp_min(0))
+
+
+def _column(time: float | Tensor, rank: int) -> float | Tensor:
+    """Times [] or [B] as factors of values [...] or [B, ...] of `rank` dimensions."""
+    return time.reshape(time.shape + (1,) * rank) if isinstance(time, Tensor) and time.dim() else time
+
+
+def _floats(value: Any) -> tuple[float, ...]:
+    return tuple(float(a) for a in value) if isinstance(value, Sequence) else (float(value),)
+
+
+def _length(value: Any) -> int:
+    return int(value.shape[-1]) if isinstance(value, Tensor) and value.dim() else len(_floats(value))
+
+
+def _extent(name: str, value: Any) -> Any:
+    if isinstance(value, Tensor):
+        if value.requires_grad:
+            raise ValueError(f"{name} must not require grad: which nodes are inside is not differentiable")
+    elif not all(0 <= a < math.inf for a in _floats(value)):
+        raise ValueError(f"{name} must be finite and >= 0, got {value}")
+    return value

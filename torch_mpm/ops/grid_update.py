@@ -1,0 +1,167 @@
+"""Node momentum to node velocity with gravity and walls: Python face, fake kernels and autograd."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ..boundaries import Face, Walls
+from ..errors import FLOATING, check_like, shape_of
+from ..grid import BLOCK_WIDTH, Blocks, Grid
+from ..reference import grid_update as reference
+from .arguments import differentiate, refuse_vmap, split_dt
+
+CONTACT_KINDS = {"open": 0, "sticky": 1, "slip": 2, "separate": 3}  # csrc/boundary/contact.h
+
+
+def grid_update(
+    blocks: Blocks,
+    nodes: Tensor,
+    gravity: Tensor | None = None,
+    dt: float | Tensor | None = None,
+    walls: Walls | None = None,
+) -> Tensor:
+    """Velocity of the nodes at the end of a step: v_i = (mv)_i / m_i + dt g, then the walls of the domain.
+
+    Args:
+        blocks: active blocks.
+        nodes: mass and momentum [N, 1 + D] [kg, kg m/s], as `p2g` returns them.
+        gravity: [D] or [B, D] [m/s²], or None.
+        dt: time step [s]: a number, or a tensor of shape [], [1] or [B]; needed with gravity.
+        walls: see `torch_mpm.Walls`; None for open faces.
+
+    Returns:
+        Velocity [N, D] [m/s], a view of rows [mass, velocity] with stride 1 + D. Zero for nodes without mass, on which
+        neither gravity nor walls act, and for rows of unused blocks.
+
+    Raises:
+        ValueError, TypeError: for wrong shapes, dtypes, devices, or dt ≤ 0.
+
+    Differentiable with respect to nodes, gravity and dt, twice in eager mode.
+    """
+    grid = blocks.grid
+    if not isinstance(nodes, Tensor) or nodes.shape != (blocks.node_count, 1 + grid.dim):
+        expected = [blocks.node_count, 1 + grid.dim]
+        raise ValueError(f"nodes must have shape [N, 1 + D] = {expected}, got {shape_of(nodes)}")
+    if nodes.dtype not in FLOATING:
+        raise TypeError(f"nodes must be float32 or float64, got {nodes.dtype}")
+    if nodes.device != blocks.block.device:
+        raise ValueError(f"nodes must be on the device of blocks, {blocks.block.device}, got {nodes.device}")
+    number, scene_dt = 0.0, None
+    if gravity is not None:
+        if dt is None:
+            raise ValueError("gravity needs dt")
+        number, scene_dt = split_dt(dt, grid.scenes, nodes)
+        gravity = _per_scene(gravity, nodes, grid.scenes, grid.dim)
+    faces = () if walls is None else walls.faces(grid)
+    updated = torch.ops.torch_mpm.grid_update(
+        nodes,
+        gravity,
+        None if scene_dt is None else scene_dt.contiguous(),
+        number,
+        [CONTACT_KINDS[face.kind] for face in faces],
+        [face.plane for face in faces],
+        [face.friction for face in faces],
+        blocks.block,
+        grid.dx,
+        grid.lower,
+        grid.blocks,
+    )
+    return updated[:, 1:]
+
+
+def _per_scene(gravity: Tensor, nodes: Tensor, scenes: int, dim: int) -> Tensor:
+    """Gravity as [B, D]."""
+    if not isinstance(gravity, Tensor) or tuple(gravity.shape) not in ((dim,), (scenes, dim)):
+        raise ValueError(f"gravity must have shape [D] or [B, D] = [{scenes}, {dim}], got {shape_of(gravity)}")
+    check_like("gravity", gravity, nodes, tuple(gravity.shape), "")
+    return gravity.expand(scenes, dim).contiguous()
+
+
+# ---- fake kernels: shapes and strides only
+
+
+@torch.library.register_fake("torch_mpm::grid_update")
+def _fake(nodes, *arguments):  # type: ignore[no-untyped-def]
+    return nodes.new_empty(nodes.shape)
+
+
+@torch.library.register_fake("torch_mpm::grid_update_backward")
+def _backward_fake(grad, wants_change, nodes, gravity, scene_dt, dt, kind, plane, friction, block, *geometry):  # type: ignore[no-untyped-def]
+    return nodes.new_empty(nodes.shape), nodes.new_empty(block.shape[0] if wants_change else 0, nodes.shape[1] - 1)
+
+
+# ---- autograd
+
+
+def _setup(ctx: Any, inputs: Any, output: Any) -> None:
+    nodes, gravity, scene_dt, dt, kind, plane, friction, block, *geometry = inputs
+    ctx.save_for_backward(nodes, gravity, scene_dt, block)
+    ctx.dt, ctx.walls, ctx.geometry = dt, (kind, plane, friction), geometry
+
+
+def _backward(ctx, grad):  # type: ignore[no-untyped-def]
+    nodes, gravity, scene_dt, block = ctx.saved_tensors
+    need_nodes, need_gravity, need_dt, *_ = ctx.needs_input_grad
+    grad_nodes, change = torch.ops.torch_mpm.grid_update_backward(
+        grad, need_gravity or need_dt, nodes, gravity, scene_dt, ctx.dt, *ctx.walls, block, *ctx.geometry
+    )
+    grad_gravity = grad_dt = None
+    if need_gravity or need_dt:
+        change = _sum_by_scene(change, block, ctx.geometry[2], gravity.shape[0])
+        if need_gravity:
+            grad_gravity = ctx.dt * (change if scene_dt is None else scene_dt[:, None] * change)
+        if need_dt:
+            grad_dt = ctx.dt * (gravity * change).sum(1)
+    return (grad_nodes if need_nodes else None, grad_gravity, grad_dt) + (None,) * 8
+
+
+def _sum_by_scene(change: Tensor, block: Tensor, blocks: list[int], scenes: int) -> Tensor:
+    """Sum of slot values [capacity, D] over the slots of each scene, [B, D]."""
+    if scenes < 2:
+        return change.sum(0, keepdim=True)[:scenes]
+    scene = block.clamp_min(0) // math.prod(blocks)
+    return change.new_zeros(scenes, change.shape[1]).index_add(0, scene, change)
+
+
+def _backward_setup(ctx: Any, inputs: Any, output: Any) -> None:
+    grad, wants_change, nodes, gravity, scene_dt, dt, kind, plane, friction, block, *geometry = inputs
+    ctx.save_for_backward(grad, nodes, gravity, scene_dt, block)
+    ctx.wants_change, ctx.dt, ctx.walls, ctx.geometry = wants_change, dt, (kind, plane, friction), geometry
+
+
+def _double_backward(ctx, grad_grad_nodes, grad_change):  # type: ignore[no-untyped-def]
+    *tensors, block = ctx.saved_tensors
+    blocks = _blocks_of(block, *ctx.geometry)
+    names = list(CONTACT_KINDS)
+    faces = [Face(names[kind], plane, friction) for kind, plane, friction in zip(*ctx.walls, strict=True)]
+
+    def adjoint(grad, nodes, gravity, scene_dt):  # type: ignore[no-untyped-def]
+        change = nodes.new_zeros(block.shape[0], nodes.shape[1] - 1, requires_grad=True)
+        mass, momentum = nodes.split([1, nodes.shape[1] - 1], 1)
+        rows = torch.cat([mass, momentum + mass * change.repeat_interleave(blocks.grid.nodes_per_block, 0)], 1)
+        dt = ctx.dt if scene_dt is None else ctx.dt * scene_dt
+        updated = reference.grid_update(blocks, rows, gravity, dt, faces)
+        both = torch.autograd.grad(updated, (nodes, change), grad, create_graph=True)
+        return both if ctx.wants_change else both[0]
+
+    given = [grad_grad_nodes, grad_change] if ctx.wants_change else [grad_grad_nodes]
+    grad, nodes, gravity, scene_dt = differentiate(adjoint, tensors, given)
+    return (grad, None, nodes, gravity, scene_dt) + (None,) * 8
+
+
+def _blocks_of(block: Tensor, dx: float, lower: list[float], per_axis: list[int]) -> Blocks:
+    """As much of a `Blocks` as the reference reads."""
+    grid = Grid.__new__(Grid)
+    grid.dx, grid.lower, grid.blocks, grid.dim = dx, tuple(lower), tuple(per_axis), len(lower)
+    grid.nodes_per_block = BLOCK_WIDTH**grid.dim
+    return Blocks(grid, block, block, block, block, block, block, None)
+
+
+torch.library.register_autograd("torch_mpm::grid_update", _backward, setup_context=_setup)
+torch.library.register_autograd("torch_mpm::grid_update_backward", _double_backward, setup_context=_backward_setup)
+refuse_vmap("grid_update")
+refuse_vmap("grid_update_backward")
