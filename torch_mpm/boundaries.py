@@ -1,7 +1,7 @@
 """What acts on the velocity of the grid nodes: the walls of the domain, and obstacles that may move.
 
-Anything with a method `apply` can stand in the list of boundaries of a `Step`. It is ordinary torch code on the nodes, so
-gradients come by themselves; this one blows through the upper half of the domain:
+Anything with a method `apply` can stand in the list of boundaries of a `Step`. It is ordinary torch code on the nodes,
+so gradients come by themselves; this one blows through the upper half of the domain:
 
     class Wind:
         def __init__(self, acceleration):  # [D], may require grad
@@ -53,12 +53,13 @@ class Walls:
     """Contact conditions on the faces of an axis-aligned box at rest, applied by `grid_update`.
 
     Nodes at or beyond a face (within 1e-6 dx) lose their velocity ("sticky"), its normal component ("slip"), or its
-    normal component where it points into the wall ("separate"); an "open" face does nothing. Coulomb friction lowers the
-    tangential speed by `friction` times the normal velocity that the wall stops.
+    normal component where it points into the wall ("separate"); an "open" face does nothing. Coulomb friction lowers
+    the tangential speed by `friction` times the normal velocity that the wall stops. Where faces meet, they act one
+    after another in the order of the axes.
 
     Args:
-        kind: "sticky", "slip", "separate" or "open", for all faces; or D of these, one per axis, each either a name or a
-            pair (lower face, upper face).
+        kind: "sticky", "slip", "separate" or "open", for all faces; or D of these, one per axis, each either a name
+            or a pair (lower face, upper face).
         lower, upper: corners of the box [m], D numbers each; None for those of the grid.
         friction: Coulomb coefficient ≥ 0, in the same forms as `kind`. It has no gradient: use a `Plane` for that.
 
@@ -190,12 +191,9 @@ class Obstacle:
             raise ValueError(f"scene must not be negative, got {scene}")
         if callable(position) and velocity is not None:
             raise ValueError("velocity must be None where position is a function of time: it is its derivative")
-        self.position, self.velocity, self.rotation, self.angular_velocity = (
-            position,
-            velocity,
-            rotation,
-            angular_velocity,
-        )
+        self.position, self.velocity = _finite("position", position), _finite("velocity", velocity)
+        self.rotation = _finite("rotation", rotation)
+        self.angular_velocity = _finite("angular_velocity", angular_velocity)
         self.kind, self.friction = kind, friction
         self.start, self.end = float(start), float(end)
         self.scene = scene
@@ -236,7 +234,8 @@ class Obstacle:
         """
         if velocity.dim() != 2 or velocity.shape != positions.shape:
             raise ValueError(
-                f"velocity and positions must both have shape [N, D], got {shape_of(velocity)} and {shape_of(positions)}"
+                "velocity and positions must both have shape [N, D], "
+                f"got {shape_of(velocity)} and {shape_of(positions)}"
             )
         if self._absent(scene, time):
             return velocity
@@ -327,7 +326,7 @@ class Obstacle:
         assert callable(self.position)
         if not isinstance(time, Tensor):
             time = torch.full((), time, dtype=like.dtype, device=like.device)
-        centre, velocity = torch.func.jvp(self.position, (time,), (torch.ones_like(time),))
+        centre, velocity, *_ = torch.func.jvp(self.position, (time,), (torch.ones_like(time),))
         return centre.to(like.dtype), velocity.to(like.dtype)
 
     def _rotation(self, time: float | Tensor, like: Tensor, dim: int) -> Tensor | None:
@@ -364,8 +363,8 @@ class Plane(Obstacle):
     """A half-space: everything behind a plane through `position`.
 
     Args:
-        normal: direction out of the half-space, into the material: D numbers, or a tensor [D] or [B, D] that may require
-            grad; of any length but zero.
+        normal: direction out of the half-space, into the material: D numbers, or a tensor [D] or [B, D] that may
+            require grad; of any length but zero.
         position, kind, friction, velocity, rotation, angular_velocity, start, end, scene: see `Obstacle`.
     """
 
@@ -493,7 +492,7 @@ class SDF(Obstacle):
         if self.normal is not None:
             distance, normal = self.distance(body), self.normal(body)
         else:
-            distance, pull_back = torch.func.vjp(self.distance, body)
+            distance, pull_back, *_ = torch.func.vjp(self.distance, body)
             (normal,) = pull_back(torch.ones_like(distance))
         if distance.shape != body.shape[:1] or normal.shape != body.shape:
             raise ValueError(
@@ -558,11 +557,17 @@ def _column(time: float | Tensor, rank: int) -> float | Tensor:
 
 
 def _floats(value: Any) -> tuple[float, ...]:
-    return tuple(float(a) for a in value) if isinstance(value, Sequence) else (float(value),)
+    return tuple(float(a) for a in value) if hasattr(value, "__len__") else (float(value),)
 
 
 def _length(value: Any) -> int:
     return int(value.shape[-1]) if isinstance(value, Tensor) and value.dim() else len(_floats(value))
+
+
+def _finite(name: str, value: Any) -> Any:
+    if value is None or callable(value) or isinstance(value, Tensor) or all(math.isfinite(a) for a in _floats(value)):
+        return value
+    raise ValueError(f"{name} must be finite, got {value}")
 
 
 def _extent(name: str, value: Any) -> Any:

@@ -85,12 +85,12 @@ def _per_scene(gravity: Tensor, nodes: Tensor, scenes: int, dim: int) -> Tensor:
 
 
 @torch.library.register_fake("torch_mpm::grid_update")
-def _fake(nodes, *arguments):  # type: ignore[no-untyped-def]
+def _fake(nodes, *arguments):
     return nodes.new_empty(nodes.shape)
 
 
 @torch.library.register_fake("torch_mpm::grid_update_backward")
-def _backward_fake(grad, wants_change, nodes, gravity, scene_dt, dt, kind, plane, friction, block, *geometry):  # type: ignore[no-untyped-def]
+def _backward_fake(grad, wants_change, nodes, gravity, scene_dt, dt, kind, plane, friction, block, *geometry):
     return nodes.new_empty(nodes.shape), nodes.new_empty(block.shape[0] if wants_change else 0, nodes.shape[1] - 1)
 
 
@@ -103,7 +103,7 @@ def _setup(ctx: Any, inputs: Any, output: Any) -> None:
     ctx.dt, ctx.walls, ctx.geometry = dt, (kind, plane, friction), geometry
 
 
-def _backward(ctx, grad):  # type: ignore[no-untyped-def]
+def _backward(ctx, grad):
     nodes, gravity, scene_dt, block = ctx.saved_tensors
     need_nodes, need_gravity, need_dt, *_ = ctx.needs_input_grad
     grad_nodes, change = torch.ops.torch_mpm.grid_update_backward(
@@ -133,13 +133,13 @@ def _backward_setup(ctx: Any, inputs: Any, output: Any) -> None:
     ctx.wants_change, ctx.dt, ctx.walls, ctx.geometry = wants_change, dt, (kind, plane, friction), geometry
 
 
-def _double_backward(ctx, grad_grad_nodes, grad_change):  # type: ignore[no-untyped-def]
+def _double_backward(ctx, grad_grad_nodes, grad_change):
     *tensors, block = ctx.saved_tensors
     blocks = _blocks_of(block, *ctx.geometry)
     names = list(CONTACT_KINDS)
     faces = [Face(names[kind], plane, friction) for kind, plane, friction in zip(*ctx.walls, strict=True)]
 
-    def adjoint(grad, nodes, gravity, scene_dt):  # type: ignore[no-untyped-def]
+    def adjoint(grad, nodes, gravity, scene_dt):
         change = nodes.new_zeros(block.shape[0], nodes.shape[1] - 1, requires_grad=True)
         mass, momentum = nodes.split([1, nodes.shape[1] - 1], 1)
         rows = torch.cat([mass, momentum + mass * change.repeat_interleave(blocks.grid.nodes_per_block, 0)], 1)

@@ -27,7 +27,7 @@ def grid_update(
     mass, momentum = torch.where(active, nodes, 0).split([1, nodes.shape[1] - 1], 1)
     heavy = mass != 0
     velocity = torch.where(heavy, momentum, 0) / torch.where(heavy, mass, 1)
-    if gravity is not None:
+    if gravity is not None and dt is not None:
         change = gravity * (dt[:, None] if isinstance(dt, Tensor) and dt.dim() == 1 else dt)
         scene = blocks.node_scene().clamp_min(0)
         velocity = velocity + (change if change.dim() == 1 else change[scene])
