@@ -1,52 +1,37 @@
+#include "cpu/isa.h"
 #include "cpu/material_launchers.h"
-#include "cpu/parallel.h"
-#include "materials/kernels.h"
 
 namespace mpm::cpu {
-namespace {
 
-constexpr int64_t kGrain = 2048;  // particles below which a range is not split
-
-template <class F>
-void for_particles(int64_t particles, const F& f) {
-  parallel_ranges(particles, kGrain, [&](int64_t begin, int64_t end) {
-    for (int64_t p = begin; p < end; p++) f(p);
-  });
-}
-
-}  // namespace
+#define MPM_MATERIAL_DECLARATIONS                                      \
+  template <class T, int D>                                            \
+  void material_stress(const StressArguments<T, D>&);                  \
+  template <class T, int D>                                            \
+  void material_stress_backward(const StressBackwardArguments<T, D>&); \
+  template <class T, int D>                                            \
+  void material_scalar(const ScalarArguments<T, D>&);                  \
+  template <class T, int D>                                            \
+  void material_energy_backward(const EnergyBackwardArguments<T, D>&);
+MPM_CPU_DECLARE_LEVELS(MPM_MATERIAL_DECLARATIONS)
 
 template <class T, int D>
 void material_stress(const StressArguments<T, D>& a, Stream) {
-  AllLaws::visit(a.law.law, [&]<class Law>() {
-    for_particles(a.law.particles, [&](int64_t p) { stress_at<Law, T>(a, p); });
-  });
+  MPM_CPU_CALL_BEST(material_stress<T, D>(a));
 }
-
 template <class T, int D>
 void material_stress_backward(const StressBackwardArguments<T, D>& a, Stream) {
-  AllLaws::visit(a.law.law, [&]<class Law>() {
-    for_particles(a.law.particles, [&](int64_t p) { stress_backward_at<Law, T>(a, p); });
-  });
+  MPM_CPU_CALL_BEST(material_stress_backward<T, D>(a));
 }
-
 template <class T, int D>
 void material_scalar(const ScalarArguments<T, D>& a, Stream) {
-  AllLaws::visit(a.law.law, [&]<class Law>() {
-    for_particles(a.law.particles, [&](int64_t p) {
-      a.which == Scalar::energy ? energy_at<Law>(a, p) : modulus_at<Law, T>(a, p);
-    });
-  });
+  MPM_CPU_CALL_BEST(material_scalar<T, D>(a));
 }
-
 template <class T, int D>
 void material_energy_backward(const EnergyBackwardArguments<T, D>& a, Stream) {
-  AllLaws::visit(a.law.law, [&]<class Law>() {
-    for_particles(a.law.particles, [&](int64_t p) { energy_backward_at<Law>(a, p); });
-  });
+  MPM_CPU_CALL_BEST(material_energy_backward<T, D>(a));
 }
 
-#define INSTANTIATE(T, D)                                                              \
+#define INSTANTIATE(T, D)                                                               \
   template void material_stress(const StressArguments<T, D>&, Stream);                  \
   template void material_stress_backward(const StressBackwardArguments<T, D>&, Stream); \
   template void material_scalar(const ScalarArguments<T, D>&, Stream);                  \

@@ -7,16 +7,22 @@
 namespace mpm {
 inline namespace TORCH_MPM_ISA {
 
-template <class V, class T>
-MPM_HD V load(const T* pointer, int64_t) {
-  return V(*pointer);
-}
-
-template <class T>
-MPM_HD void store(T* pointer, int64_t, const T& value) {
-  *pointer = value;
-}
-MPM_HD void store(float* pointer, int64_t, const double& value) { *pointer = float(value); }
+// One value of a field, or the values of consecutive particles at this stride in the lanes of a pack.
+template <class V>
+struct Lane {
+  template <class T>
+  MPM_HD static V load(const T* pointer, int64_t) {
+    return V(*pointer);
+  }
+  template <class T>
+  MPM_HD static void store(T* pointer, int64_t, const V& value) {
+    *pointer = T(value);
+  }
+  template <class F>
+  MPM_HD static V each(const F& f) {  // f(lane) in each lane
+    return V(f(0));
+  }
+};
 
 template <class V, int D, class T>
 MPM_HD Matrix<V, D> load_matrix(const Field<const T>& f, int64_t p) {
@@ -25,7 +31,7 @@ MPM_HD Matrix<V, D> load_matrix(const Field<const T>& f, int64_t p) {
   for (int i = 0; i < D; i++)
     MPM_UNROLL
   for (int j = 0; j < D; j++)
-    r[i][j] = load<V>(f.pointer + p * f.stride[0] + i * f.stride[1] + j * f.stride[2], f.stride[0]);
+    r[i][j] = Lane<V>::load(f.pointer + p * f.stride[0] + i * f.stride[1] + j * f.stride[2], f.stride[0]);
   return r;
 }
 
@@ -35,7 +41,7 @@ MPM_HD void store_matrix(const Field<T>& f, int64_t p, const Matrix<V, D>& a) {
   for (int i = 0; i < D; i++)
     MPM_UNROLL
   for (int j = 0; j < D; j++)
-    store(f.pointer + p * f.stride[0] + i * f.stride[1] + j * f.stride[2], f.stride[0], a[i][j]);
+    Lane<V>::store(f.pointer + p * f.stride[0] + i * f.stride[1] + j * f.stride[2], f.stride[0], a[i][j]);
 }
 
 // A scene id out of range takes the parameter of scene 0: such a particle is not transferred anyway.
@@ -47,8 +53,9 @@ MPM_HD T scene_parameter(const Parameter<T>& a, int scene) {
 template <class V, class T, int D>
 MPM_HD V load_parameter(const LawArguments<T, D>& a, int k, int64_t p) {
   const Parameter<T>& parameter = a.parameters[k];
-  if (parameter.scenes) return V(scene_parameter(parameter, a.scene[p * a.scene_stride]));
-  return load<V>(parameter.pointer + p * parameter.stride, parameter.stride);
+  if (parameter.scenes)
+    return Lane<V>::each([&](int i) { return scene_parameter(parameter, a.scene[(p + i) * a.scene_stride]); });
+  return Lane<V>::load(parameter.pointer + p * parameter.stride, parameter.stride);
 }
 
 template <class Law, class V, class T, int D>
@@ -57,7 +64,7 @@ MPM_HD Particle<Law, V, D> load_particle(const LawArguments<T, D>& a, int64_t p)
   if constexpr (Law::shear)
     r.F = load_matrix<V, D>(a.state, p);
   else
-    r.J = load<V>(a.state.pointer + p * a.state.stride[0], a.state.stride[0]);
+    r.J = Lane<V>::load(a.state.pointer + p * a.state.stride[0], a.state.stride[0]);
   r.C = Law::viscous && a.C.pointer ? load_matrix<V, D>(a.C, p) : zero_matrix<V, D>();
   MPM_UNROLL
   for (int k = 0; k < Law::parameters; k++) r.parameters[k] = load_parameter<V>(a, k, p);
@@ -70,7 +77,7 @@ MPM_HD void store_state(const Field<T>& f, int64_t p, const Particle<Law, V, D>&
   if constexpr (Law::shear)
     store_matrix(f, p, a.F);
   else
-    store(f.pointer + p * f.stride[0], f.stride[0], a.J);
+    Lane<V>::store(f.pointer + p * f.stride[0], f.stride[0], a.J);
 }
 
 template <class Law, class V, class T, int D>
@@ -78,7 +85,7 @@ MPM_HD void store_parameters(const Field<T>& f, int64_t p, const Particle<Law, V
   if (!f.pointer) return;
   MPM_UNROLL
   for (int k = 0; k < Law::parameters; k++)
-    store(f.pointer + p * f.stride[0] + k * f.stride[1], f.stride[0], a.parameters[k]);
+    Lane<V>::store(f.pointer + p * f.stride[0] + k * f.stride[1], f.stride[0], a.parameters[k]);
 }
 
 template <class Law, class V, class T, int D>
@@ -99,14 +106,14 @@ MPM_HD void stress_backward_at(const StressBackwardArguments<T, D>& a, int64_t p
 
 template <class Law, class V, class T, int D>
 MPM_HD void modulus_at(const ScalarArguments<T, D>& a, int64_t p) {
-  store(a.value.pointer + p * a.value.stride[0], a.value.stride[0],
+  Lane<V>::store(a.value.pointer + p * a.value.stride[0], a.value.stride[0],
         evaluate_modulus(load_particle<Law, V>(a.law, p), a.which));
 }
 
 // Energies are small differences of large terms near rest: they are evaluated in float64 for either scalar type.
 template <class Law, class T, int D>
 MPM_HD void energy_at(const ScalarArguments<T, D>& a, int64_t p) {
-  store(a.value.pointer + p * a.value.stride[0], 0, evaluate_energy(load_particle<Law, double>(a.law, p)));
+  Lane<double>::store(a.value.pointer + p * a.value.stride[0], 0, evaluate_energy(load_particle<Law, double>(a.law, p)));
 }
 
 template <class Law, class T, int D>
