@@ -1,6 +1,7 @@
 """The built package: its libraries, what they need from torch, and what `info` says about them."""
 
 import json
+import platform
 import shutil
 import subprocess
 import sys
@@ -38,6 +39,22 @@ def test_library_defines_all_functions_of_its_own(library: Path) -> None:
 @pytest.mark.parametrize("library", LIBRARIES, ids=lambda path: path.stem)
 def test_library_exports_none_of_its_functions(library: Path) -> None:
     assert [name for name in symbols(library, "--defined-only") if "mpm::" in name] == []
+
+
+@pytest.mark.skipif(shutil.which("objdump") is None, reason="objdump is not installed")
+@pytest.mark.skipif(platform.machine() != "x86_64", reason="other processors have one instruction-set level")
+def test_only_code_of_the_avx_levels_uses_avx() -> None:
+    """An inline function merged across levels must be the one that every x86-64 processor can run."""
+    command = ["objdump", "--disassemble", "--demangle", "--no-show-raw-insn", str(_library.CPU_LIBRARY)]
+    lines = subprocess.run(command, check=True, capture_output=True, text=True).stdout.splitlines()
+    function, avx = "", set()
+    for line in lines:
+        if line.endswith(">:"):
+            function = line
+        elif "%ymm" in line or "%zmm" in line:
+            avx.add(function)
+    assert avx, "the avx2 and avx512 levels are missing"
+    assert [name for name in avx if "::avx2::" not in name and "::avx512::" not in name] == []
 
 
 def test_info_describes_build_and_devices() -> None:
