@@ -93,30 +93,30 @@ class Sphere:
 
 
 class _Axial:
-    def __init__(self, start: Vector, end: Vector, radius: float):
-        self.start, self.radius = _vector("start", start), _positive("radius", radius)
-        self.end = _vector("end", end, len(self.start))
-        self.length = _positive("the distance from start to end", float((self.end - self.start).norm()))
-        self.axis = (self.end - self.start) / self.length
+    def __init__(self, a: Vector, b: Vector, radius: float):
+        self.a, self.radius = _vector("a", a), _positive("radius", radius)
+        self.b = _vector("b", b, len(self.a))
+        self.length = _positive("the distance from a to b", float((self.b - self.a).norm()))
+        self.axis = (self.b - self.a) / self.length
 
     def _along_and_away(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Coordinate along the axis and squared distance from it."""
-        r = x - self.start
+        r = x - self.a
         along = r @ self.axis
         return along, r.square().sum(1) - along.square()
 
 
 class Cylinder(_Axial):
-    """Solid cylinder with flat ends between ``start`` and ``end`` [m]; 3-D only."""
+    """Solid cylinder with flat ends between ``a`` and ``b`` [m]; 3-D only."""
 
-    def __init__(self, start: Vector, end: Vector, radius: float):
-        super().__init__(start, end, radius)
-        if len(self.start) != 3:
+    def __init__(self, a: Vector, b: Vector, radius: float):
+        super().__init__(a, b, radius)
+        if len(self.a) != 3:
             raise ValueError("a cylinder needs three dimensions; in 2-D use a sphere (a disc) or a box")
         reach = self.radius * (1 - self.axis.square()).clamp(min=0).sqrt()
         self.lower, self.upper = (
-            torch.minimum(self.start, self.end) - reach,
-            torch.maximum(self.start, self.end) + reach,
+            torch.minimum(self.a, self.b) - reach,
+            torch.maximum(self.a, self.b) + reach,
         )
         self.volume = math.pi * self.radius**2 * self.length
 
@@ -126,15 +126,15 @@ class Cylinder(_Axial):
 
 
 class Capsule(_Axial):
-    """All points within ``radius`` of the segment from ``start`` to ``end`` [m]."""
+    """All points within ``radius`` of the segment from ``a`` to ``b`` [m]."""
 
-    def __init__(self, start: Vector, end: Vector, radius: float):
-        super().__init__(start, end, radius)
+    def __init__(self, a: Vector, b: Vector, radius: float):
+        super().__init__(a, b, radius)
         self.lower, self.upper = (
-            torch.minimum(self.start, self.end) - self.radius,
-            torch.maximum(self.start, self.end) + self.radius,
+            torch.minimum(self.a, self.b) - self.radius,
+            torch.maximum(self.a, self.b) + self.radius,
         )
-        dim = len(self.start)
+        dim = len(self.a)
         self.volume = _ball_volume(dim - 1, self.radius) * self.length + _ball_volume(dim, self.radius)
 
     def inside(self, x: Tensor) -> Tensor:
@@ -292,14 +292,14 @@ def sphere(center: Vector, radius: float, grid: Any, per_cell: float = 8, **opti
     return fill(Sphere(center, radius), grid, per_cell, **options)
 
 
-def cylinder(start: Vector, end: Vector, radius: float, grid: Any, per_cell: float = 8, **options: Any) -> Points:
-    """Points in a cylinder between ``start`` and ``end`` [m] (3-D); ``options`` as in :func:`fill`."""
-    return fill(Cylinder(start, end, radius), grid, per_cell, **options)
+def cylinder(a: Vector, b: Vector, radius: float, grid: Any, per_cell: float = 8, **options: Any) -> Points:
+    """Points in a cylinder between ``a`` and ``b`` [m] (3-D); ``options`` as in :func:`fill`."""
+    return fill(Cylinder(a, b, radius), grid, per_cell, **options)
 
 
-def capsule(start: Vector, end: Vector, radius: float, grid: Any, per_cell: float = 8, **options: Any) -> Points:
-    """Points within ``radius`` of the segment from ``start`` to ``end`` [m]; ``options`` as in :func:`fill`."""
-    return fill(Capsule(start, end, radius), grid, per_cell, **options)
+def capsule(a: Vector, b: Vector, radius: float, grid: Any, per_cell: float = 8, **options: Any) -> Points:
+    """Points within ``radius`` of the segment from ``a`` to ``b`` [m]; ``options`` as in :func:`fill`."""
+    return fill(Capsule(a, b, radius), grid, per_cell, **options)
 
 
 def mesh(

@@ -38,7 +38,7 @@ UNITS = {
 }  # fmt: skip
 
 
-def _h5py() -> Any:
+def h5py_module() -> Any:
     try:
         import h5py
     except ImportError as error:
@@ -75,7 +75,7 @@ def create(path: Path, layout: Layout) -> None:
     Raises:
         OSError: when the disk has no room (ENOSPC).
     """
-    h5py = _h5py()
+    h5py = h5py_module()
     building = path.with_suffix(".building")
     try:
         with h5py.File(building, "w") as out:
@@ -116,7 +116,7 @@ class TrajectoryWriter:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        with _h5py().File(path, "r") as source:
+        with h5py_module().File(path, "r") as source:
             self.frames_written = int(source["frames_written"][0])
             self._places = {
                 name: (data.id.get_offset(), data.shape[1:], data.dtype)
@@ -176,7 +176,7 @@ class Trajectory:
 
     def __init__(self, path: str | Path) -> None:
         self.path = find(path)
-        self.file = _h5py().File(self.path, "r")
+        self.file = h5py_module().File(self.path, "r")
         self.fields = [
             n for n, d in self.file.items() if d.ndim >= 2 and d.shape[:2] == self.file["position"].shape[:2]
         ]

@@ -1,0 +1,137 @@
+"""Messages about what is wrong in a scene: the key, what it takes, and what may have been meant."""
+
+from __future__ import annotations
+
+import difflib
+import types
+import typing
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+from pydantic import BaseModel, ValidationError
+
+from .schema import SceneData
+
+
+class SceneError(ValueError):
+    """A scene that cannot be simulated. ``problems`` has one line for each thing that is wrong."""
+
+    def __init__(self, problems: Sequence[str], source: str = "") -> None:
+        self.problems = list(problems)
+        head = f"{source}: " if source else ""
+        super().__init__("\n".join(f"{head}{problem}" for problem in self.problems))
+
+
+def explain(error: ValidationError) -> list[str]:
+    """One line per problem of a validation."""
+    return [_line(item) for item in error.errors(include_url=False)]
+
+
+def _line(item: Any) -> str:
+    model, path, annotation, description = _locate(item["loc"])
+    kind, given = item["type"], item["input"]
+    if kind == "extra_forbidden":
+        key = str(item["loc"][-1])
+        keys = list(model.model_fields)
+        return f"{path}: unknown key{_did_you_mean(key, keys)}; {_takes_keys(model, keys)}"
+    if kind in ("union_tag_invalid", "literal_error") or kind == "union_tag_not_found":
+        choices = _choices(annotation)
+        tag = item.get("ctx", {}).get("discriminator", "").strip("'")
+        where = f"{path}.{tag}" if tag else path
+        if kind == "union_tag_not_found":
+            return f"{where}: missing; takes one of {_listed(choices)}"
+        value = str(given.get(tag) if tag and isinstance(given, dict) else given)
+        return f"{where}: takes one of {_listed(choices)}, got {value!r}{_did_you_mean(value, choices)}"
+    takes = f"; takes: {description}" if description else ""
+    if kind == "missing":
+        return f"{path}: missing{takes}"
+    message = item["msg"][0].lower() + item["msg"][1:]
+    return f"{path}: {message.removeprefix('input ')}, got {given!r}{takes}"
+
+
+def _locate(loc: Sequence[int | str]) -> tuple[type[BaseModel], str, Any, str]:
+    """Model that holds the key, its path as written in a file, its type and its description.
+
+    The location that pydantic reports has the tag of a union as one more entry, which a file does not have.
+    """
+    model: type[BaseModel] = SceneData
+    annotation: Any = SceneData
+    path, description = "", ""
+    for entry in loc:
+        tagged = _tagged(annotation, entry)
+        if tagged is not None:
+            model = annotation = tagged
+        elif isinstance(entry, int):
+            path += f"[{entry}]"
+            annotation = (typing.get_args(annotation) or (annotation,))[0]
+        elif isinstance(annotation, type) and issubclass(annotation, BaseModel):
+            path += f".{entry}" if path else entry
+            field = annotation.model_fields.get(entry)
+            model = annotation
+            if field is None:
+                continue
+            annotation, description = _plain(field.annotation), field.description or ""
+        elif typing.get_origin(annotation) is dict:
+            path += f".{entry}"
+            annotation = _plain(typing.get_args(annotation)[1])
+        # Anything else names a branch of a plain union, which a file does not have either.
+        if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+            model = annotation
+    return model, path, annotation, description
+
+
+def _plain(annotation: Any) -> Any:
+    """A type without Annotated and without None."""
+    while typing.get_origin(annotation) is typing.Annotated:
+        annotation = typing.get_args(annotation)[0]
+    members = [a for a in _members(annotation) if a is not type(None)]
+    return members[0] if len(members) == 1 else annotation
+
+
+def _members(annotation: Any) -> tuple[Any, ...]:
+    if typing.get_origin(annotation) in (typing.Union, types.UnionType):
+        return typing.get_args(annotation)
+    if typing.get_origin(annotation) is typing.Annotated:
+        return _members(typing.get_args(annotation)[0])
+    return (annotation,)
+
+
+def _tags(annotation: Any) -> Iterator[tuple[str, type[BaseModel]]]:
+    for member in _members(annotation):
+        if isinstance(member, type) and issubclass(member, BaseModel):
+            for name in ("shape", "law"):
+                if name in member.model_fields:
+                    yield str(member.model_fields[name].default), member
+
+
+def _tagged(annotation: Any, entry: int | str) -> type[BaseModel] | None:
+    return dict(_tags(annotation)).get(str(entry)) if len(_members(annotation)) > 1 else None
+
+
+def _choices(annotation: Any) -> list[str]:
+    tags = [tag for tag, _ in _tags(annotation)]
+    if tags:
+        return tags
+    return [str(value) for member in _members(annotation) for value in _literals(member)]
+
+
+def _literals(annotation: Any) -> Iterator[Any]:
+    if typing.get_origin(annotation) is typing.Literal:
+        yield from typing.get_args(annotation)
+    else:
+        for member in typing.get_args(annotation):
+            yield from _literals(member)
+
+
+def _listed(choices: Sequence[str]) -> str:
+    return ", ".join(repr(choice) for choice in dict.fromkeys(choices))
+
+
+def _did_you_mean(key: str, choices: Sequence[str]) -> str:
+    near = difflib.get_close_matches(key, choices, 1, 0.6) or [c for c in choices if c.lower() == key.lower()]
+    return f"; did you mean {near[0]!r}?" if near else ""
+
+
+def _takes_keys(model: type[BaseModel], keys: Sequence[str]) -> str:
+    name = (model.__doc__ or model.__name__).splitlines()[0].rstrip(".")
+    return f"the keys here ({name[0].lower() + name[1:]}) are {', '.join(sorted(keys))}"

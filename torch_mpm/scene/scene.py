@@ -1,0 +1,173 @@
+"""`Scene`: a scene file, or the same words in Python."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import torch
+from pydantic import PrivateAttr, ValidationError
+
+from . import schema
+from .build import Built, build
+from .explain import SceneError, explain
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+COSMETIC = {"title", "device", "render", "output"}
+
+
+class ResolvedEntry(schema.Entry):
+    """One scene of a batch with all it takes from the file; ``path`` begins the keys of its own things in messages."""
+
+    path: str = ""
+
+
+class Scene(schema.SceneData):
+    """What to simulate. ``Scene.load("examples/jelly.toml")``, or the keys of a scene file as arguments:
+
+        scene = mpm.Scene(
+            grid=dict(lower=(0, 0), upper=(1, 1), dx=0.02),
+            gravity=(0, -9.8),
+            duration=1.0,
+            material={"jelly": dict(law="neo_hookean", E=1e5, nu=0.3)},
+            body=[dict(shape="sphere", center=(0.5, 0.5), radius=0.2, material="jelly")],
+        )
+        scene.run("out/jelly")
+
+    Raises:
+        SceneError: a ValueError with one line for each thing that is wrong.
+    """
+
+    _folder: Path = PrivateAttr(default=Path())
+
+    def __init__(self, **words: Any) -> None:
+        try:
+            super().__init__(**words)
+        except ValidationError as error:
+            raise SceneError(explain(error)) from None
+
+    @classmethod
+    def load(cls, path: str | Path, overrides: list[str] | None = None) -> Scene:
+        """Read a scene file.
+
+        Args:
+            path: a TOML file.
+            overrides: ``key=value`` with keys such as ``grid.dx`` or ``body[0].velocity`` and values as in TOML.
+
+        Raises:
+            SceneError: for what is wrong in the file, with its name.
+            FileNotFoundError: when there is no such file.
+        """
+        path = Path(path)
+        if not path.is_file():
+            raise FileNotFoundError(f"scene file {path} does not exist")
+        try:
+            words = tomllib.loads(path.read_text())
+        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+            raise SceneError([f"not a TOML file: {error}"], str(path)) from None
+        try:
+            for override in overrides or []:
+                _override(words, override)
+            scene = cls(**words)
+        except SceneError as error:
+            raise SceneError(error.problems, str(path)) from None
+        scene._folder = path.parent
+        return scene
+
+    @property
+    def folder(self) -> Path:
+        """Where relative file names start."""
+        return self._folder
+
+    @property
+    def dim(self) -> int:
+        return len(self.grid.lower)
+
+    @property
+    def frames(self) -> int:
+        """Frames after the first."""
+        return max(1, round(self.duration * self.fps))
+
+    def time_of(self, frame: int) -> float:
+        """Time of a frame [s]; the last one is at ``duration`` exactly."""
+        return self.duration * frame / self.frames
+
+    def torch_device(self) -> torch.device:
+        """Raises SceneError for a device that is not there."""
+        name = self.device
+        if name == "auto":
+            name = "cuda" if torch.cuda.is_available() else "cpu"
+        try:
+            device = torch.device(name)
+        except RuntimeError:
+            raise SceneError([f'device: takes "auto", "cpu" or "cuda", got {name!r}']) from None
+        if device.type == "cuda" and not torch.cuda.is_available():
+            raise SceneError([f'device: torch finds no CUDA device for {name!r}; use "cpu" or "auto"'])
+        return device
+
+    def entries(self) -> list[ResolvedEntry]:
+        """The scenes of the batch, each complete; one without a name for a file without [[scene]]."""
+        own = self.model_dump(include=set(schema.Content.model_fields))
+        if not self.scene:
+            return [ResolvedEntry(**own)]
+        return [self._resolve(own, k, entry) for k, entry in enumerate(self.scene)]
+
+    def _resolve(self, own: dict[str, Any], k: int, entry: schema.Entry) -> ResolvedEntry:
+        words = entry.model_dump()
+        lists = {key: words[key] + own[key] for key in ("body", "obstacle", "emitter")}
+        return ResolvedEntry(
+            name=entry.name or f"scene {k}",
+            path=f"scene[{k}].",
+            gravity=entry.gravity or self.gravity,
+            material=own["material"] | words["material"],
+            **lists,
+        )
+
+    def fingerprint(self) -> str:
+        """Hash of all that decides the trajectory, files included."""
+        digest = hashlib.sha256(self.model_dump_json(exclude=COSMETIC).encode())
+        digest.update(json.dumps(self.output.fields).encode())
+        for entry in self.entries():
+            for body in entry.body:
+                if isinstance(body, (schema.MeshBody, schema.PointsBody)):
+                    digest.update((self.folder / body.file).read_bytes())
+        return digest.hexdigest()[:16]
+
+    def build(self, device: str | torch.device | None = None) -> Built:
+        """Seed the particles and assemble the step: an object with ``state``, ``step``, ``grid``.
+
+        Raises:
+            SceneError: for shapes outside the domain, overlapping bodies, a mesh that is not closed, ...
+        """
+        return build(self, self.torch_device() if device is None else torch.device(device))
+
+    def run(self, out: str | Path, **options: Any) -> dict[str, Any]:
+        """Simulate into folder ``out`` and return the summary; ``options`` as in :func:`torch_mpm.scene.run`."""
+        from .run import run
+
+        return run(self, out, **options)
+
+
+def _override(words: dict[str, Any], text: str) -> None:
+    key, equals, value = text.partition("=")
+    steps = [s for part in key.strip().split(".") for s in part.replace("]", "").split("[")]
+    if not equals or not all(steps):
+        raise SceneError([f"override {text!r} must look like grid.dx=0.01"])
+    try:
+        parsed = tomllib.loads(f"value = {value}")["value"]
+    except tomllib.TOMLDecodeError:
+        parsed = value.strip()
+    target: Any = words
+    try:
+        for step in steps[:-1]:
+            target = target[int(step)] if isinstance(target, list) else target.setdefault(step, {})
+        target[int(steps[-1]) if isinstance(target, list) else steps[-1]] = parsed
+    except (KeyError, IndexError, ValueError, TypeError):
+        raise SceneError([f"override {text!r}: there is no {key.strip()} to set"]) from None

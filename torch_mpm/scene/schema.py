@@ -1,0 +1,382 @@
+"""What a scene file can say. The docstring under each key is its description in messages and in the JSON schema."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+Positive = Annotated[float, Field(gt=0)]
+NotNegative = Annotated[float, Field(ge=0)]
+Vector = Annotated[tuple[float, ...], Field(min_length=2, max_length=3)]
+Spin = float | Annotated[tuple[float, ...], Field(min_length=3, max_length=3)]
+Contact = Literal["slip", "sticky", "separate"]
+Wall = Literal["slip", "sticky", "separate", "open"]
+
+
+class Model(BaseModel):
+    """Unknown keys are errors; numbers are finite."""
+
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
+
+
+# ---- the domain
+
+
+class Grid(Model):
+    """The domain and its lattice."""
+
+    lower: Vector
+    """lower corner of the domain [m]; 2 or 3 numbers, which decide the dimension of the scene"""
+    upper: Vector
+    """upper corner of the domain [m]"""
+    dx: Positive
+    """distance of the grid nodes [m]"""
+    kernel: Literal["quadratic", "cubic"] = "quadratic"
+    """B-spline that joins particles and nodes"""
+    walls: Wall | list[Wall | tuple[Wall, Wall]] | None = "slip"
+    """what the faces of the domain do: one kind, or a list with one kind or pair (lower, upper) per axis"""
+    friction: NotNegative = 0.0
+    """Coulomb friction coefficient of the walls"""
+
+
+# ---- materials
+
+
+class NeoHookean(Model):
+    """Elastic solid."""
+
+    law: Literal["neo_hookean"] = "neo_hookean"
+    """name of the law"""
+    density: Positive = 1000.0
+    """density at rest [kg/m^3]"""
+    E: Positive
+    """Young's modulus [Pa]"""
+    nu: Annotated[float, Field(gt=-1, lt=0.5)] = 0.3
+    """Poisson's ratio, between -1 and 0.5"""
+
+
+class WeaklyCompressible(Model):
+    """Fluid whose pressure follows its volume."""
+
+    law: Literal["weakly_compressible"] = "weakly_compressible"
+    """name of the law"""
+    density: Positive = 1000.0
+    """density at rest [kg/m^3]"""
+    bulk_modulus: Positive
+    """bulk modulus [Pa]; density * (10 * largest expected speed)^2 keeps density changes near 1 %"""
+    gamma: Positive = 7.0
+    """exponent of the equation of state; 7 for water"""
+    viscosity: NotNegative = 0.0
+    """dynamic viscosity [Pa s]"""
+
+
+Material = Annotated[NeoHookean | WeaklyCompressible, Field(discriminator="law")]
+
+
+# ---- bodies
+
+
+class Seeding(Model):
+    """How a region is filled with particles of one material."""
+
+    material: str
+    """name of a material of this scene"""
+    per_cell: Positive = 8.0
+    """mean number of particles per grid cell"""
+
+
+class Body(Seeding):
+    """Matter that is there from the start."""
+
+    name: str = ""
+    """name for messages"""
+    velocity: Vector | None = None
+    """initial velocity [m/s]"""
+    spin: Spin | None = None
+    """initial angular velocity about the centre of mass [rad/s]: a number in 2-D, a vector in 3-D"""
+    seeding: Literal["lattice", "poisson"] = "lattice"
+    """regular lattice or Poisson-disk sample"""
+
+
+class BoxBody(Body):
+    """Axis-aligned box; a rectangle in 2-D."""
+
+    shape: Literal["box"] = "box"
+    """kind of shape"""
+    lower: Vector
+    """lower corner [m]"""
+    upper: Vector
+    """upper corner [m]"""
+
+
+class SphereBody(Body):
+    """Ball; a disc in 2-D."""
+
+    shape: Literal["sphere"] = "sphere"
+    """kind of shape"""
+    center: Vector
+    """centre [m]"""
+    radius: Positive
+    """radius [m]"""
+
+
+class CylinderBody(Body):
+    """Cylinder with flat ends (3-D)."""
+
+    shape: Literal["cylinder"] = "cylinder"
+    """kind of shape"""
+    a: Vector
+    """centre of one end [m]"""
+    b: Vector
+    """centre of the other end [m]"""
+    radius: Positive
+    """radius [m]"""
+
+
+class CapsuleBody(Body):
+    """All points near a segment."""
+
+    shape: Literal["capsule"] = "capsule"
+    """kind of shape"""
+    a: Vector
+    """one end of the segment [m]"""
+    b: Vector
+    """other end of the segment [m]"""
+    radius: Positive
+    """distance from the segment [m]"""
+
+
+class MeshBody(Body):
+    """Inside of a closed triangle mesh (3-D)."""
+
+    shape: Literal["mesh"] = "mesh"
+    """kind of shape"""
+    file: str
+    """mesh file that trimesh reads (.obj, .ply, .stl, ...), relative to the scene file"""
+    scale: Positive = 1.0
+    """factor on the coordinates of the file"""
+    offset: Vector = (0.0, 0.0, 0.0)
+    """shift after scaling [m]"""
+
+
+class PointsBody(Body):
+    """Points from a file."""
+
+    shape: Literal["points"] = "points"
+    """kind of shape"""
+    file: str
+    """.npy, .npz (x, volume) or .csv (x, y, z, volume) file, relative to the scene file"""
+    volume: Positive | None = None
+    """total volume [m^3], needed where the file has no volumes"""
+
+
+AnyBody = Annotated[
+    BoxBody | SphereBody | CylinderBody | CapsuleBody | MeshBody | PointsBody, Field(discriminator="shape")
+]
+
+
+class Emitter(Seeding):
+    """A round nozzle (a slit in 2-D) out of which matter flows along its velocity."""
+
+    name: str = ""
+    """name for messages"""
+    center: Vector
+    """centre of the nozzle [m]"""
+    radius: Positive
+    """radius of the nozzle (half width of the slit) [m]"""
+    velocity: Vector
+    """velocity of the flow [m/s], normal to the nozzle"""
+    rate: Positive | None = None
+    """volume flow [m^3/s], at most area times speed, which is the default"""
+    start: NotNegative = 0.0
+    """time of the first particles [s]"""
+    end: Positive | None = None
+    """time of the last particles [s]; the end of the run by default"""
+
+
+# ---- obstacles
+
+
+class Obstacle(Model):
+    """A rigid body that particles cannot enter."""
+
+    name: str = ""
+    """name for messages"""
+    contact: Contact = "separate"
+    """what the surface does to matter: holds it (sticky), lets it slide (slip), lets it slide and leave (separate)"""
+    friction: NotNegative = 0.0
+    """Coulomb friction coefficient"""
+    velocity: Vector | None = None
+    """constant velocity [m/s]"""
+    spin: Spin | None = None
+    """constant angular velocity about its centre [rad/s]: a number in 2-D, a vector in 3-D"""
+    rotation: Spin | None = None
+    """orientation at the start [rad]: an angle in 2-D, a rotation vector in 3-D"""
+    start: NotNegative = 0.0
+    """time from which it is there and moves [s]"""
+    end: Positive | None = None
+    """time from which it is gone [s]"""
+
+
+class PlaneObstacle(Obstacle):
+    """Half-space behind a plane."""
+
+    shape: Literal["plane"] = "plane"
+    """kind of shape"""
+    center: Vector
+    """a point of the plane [m]"""
+    normal: Vector
+    """direction out of the half-space"""
+
+
+class BoxObstacle(Obstacle):
+    """Box, turned by its rotation."""
+
+    shape: Literal["box"] = "box"
+    """kind of shape"""
+    center: Vector
+    """centre [m]"""
+    size: Vector
+    """edge lengths [m]"""
+
+
+class SphereObstacle(Obstacle):
+    """Ball; a disc in 2-D."""
+
+    shape: Literal["sphere"] = "sphere"
+    """kind of shape"""
+    center: Vector
+    """centre [m]"""
+    radius: Positive
+    """radius [m]"""
+
+
+class CapsuleObstacle(Obstacle):
+    """All points near a segment."""
+
+    shape: Literal["capsule"] = "capsule"
+    """kind of shape"""
+    a: Vector
+    """one end of the segment [m]"""
+    b: Vector
+    """other end of the segment [m]"""
+    radius: Positive
+    """distance from the segment [m]"""
+
+
+AnyObstacle = Annotated[
+    PlaneObstacle | BoxObstacle | SphereObstacle | CapsuleObstacle, Field(discriminator="shape")
+]
+
+
+# ---- outputs
+
+
+class Output(Model):
+    """What the trajectory holds beside position and velocity, and further formats."""
+
+    fields: list[Literal["F", "J", "C", "stress", "temperature"]] = []
+    """further fields of the trajectory"""
+    vtk: bool = False
+    """write a VTK file per frame, with stress"""
+    ply: bool = False
+    """write a PLY point cloud per frame"""
+
+
+class Ritter(Model):
+    """Ritter's solution of a dam break (1892) drawn over a 2-D picture."""
+
+    dam: float
+    """x of the dam [m]; the water stood on the lower side"""
+    depth: Positive
+    """depth of the water before the break [m]"""
+
+
+class Render(Model):
+    """Pictures (PNG) and video (MP4)."""
+
+    color_by: Literal["speed", "stress", "material", "temperature"] = "speed"
+    """what the colours show"""
+    range: tuple[float, float] | None = None
+    """ends of the colour scale; by default those of the whole run"""
+    style: Literal["particles", "surface"] = "particles"
+    """shaded particles, or a smooth surface around them (3-D)"""
+    resolution: Annotated[tuple[int, int], Field()] = (1280, 720)
+    """width and height [pixels]"""
+    azimuth: float = 28.0
+    """direction of the camera around the vertical [degrees] (3-D)"""
+    elevation: float = 18.0
+    """height of the camera above the horizon [degrees] (3-D)"""
+    view: tuple[Vector, Vector] | None = None
+    """corners of the box that the picture shows [m]; by default the domain"""
+    every: Annotated[int, Field(ge=1)] = 1
+    """draw one frame in so many"""
+    video: bool = True
+    """make an MP4 of the pictures"""
+    ritter: Ritter | None = None
+    """draw Ritter's solution of a dam break"""
+
+
+# ---- the scene
+
+
+class Content(Model):
+    """What fills a domain: the part of a scene that differs within a batch."""
+
+    gravity: Vector | None = None
+    """acceleration of gravity [m/s^2]"""
+    material: dict[str, Material] = {}
+    """materials by name"""
+    body: list[AnyBody] = []
+    """bodies"""
+    obstacle: list[AnyObstacle] = []
+    """obstacles"""
+    emitter: list[Emitter] = []
+    """emitters"""
+
+
+class Entry(Content):
+    """One scene of a batch. It has all that the file says outside of it, with its own gravity and materials first."""
+
+    name: str = ""
+    """name of the scene"""
+
+
+class SceneData(Content):
+    """A scene file."""
+
+    title: str = ""
+    """title of the pictures"""
+    grid: Grid
+    """the domain"""
+    duration: Positive
+    """simulated time [s]"""
+    fps: Positive = 60.0
+    """frames per second of simulated time"""
+    cfl: Annotated[float, Field(gt=0, le=1)] = 0.5
+    """time step as a share of the stability limit"""
+    dt: Positive | None = None
+    """fixed upper bound of the time step [s], instead of cfl"""
+    transfer: Literal["apic", "pic", "flip"] = "apic"
+    """how velocity moves between particles and grid"""
+    flip: Annotated[float, Field(ge=0, le=1)] = 0.0
+    """share of FLIP that the transfer is blended with"""
+    precision: Literal["float32", "float64"] = "float32"
+    """floating-point numbers of the simulation"""
+    device: str = "auto"
+    """"cpu", "cuda", "cuda:1", ... or "auto": a GPU if there is one"""
+    seed: Annotated[int, Field(ge=0)] = 0
+    """seed of everything random"""
+    scene: list[Entry] = []
+    """scenes of a batch, simulated together"""
+    output: Output = Output()
+    """further outputs"""
+    render: Render | None = None
+    """pictures; none without this table"""
+
+
+def json_schema() -> dict[str, Any]:
+    """JSON schema of a scene file, for editors."""
+    schema = SceneData.model_json_schema()
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema, "title": "torch_mpm scene"}

@@ -1,0 +1,118 @@
+"""Frames and checkpoints leave the device while it goes on computing, and are written by a thread of their own."""
+
+from __future__ import annotations
+
+import queue
+import threading
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..trajectory import TrajectoryWriter
+from . import checkpoint
+
+
+@dataclass(frozen=True)
+class Job:
+    """One frame in host memory; ``ready`` is recorded behind the copies, ``sources`` keeps their origin alive until then."""
+
+    frame: int
+    values: Mapping[str, Any]
+    state: Mapping[str, Tensor]
+    record: dict[str, Any]
+    ready: torch.cuda.Event | None
+    sources: list[Tensor]
+
+
+class FrameWriter:
+    """Queue of frames for a trajectory and its checkpoint; at most two wait, so that memory stays bounded.
+
+    A frame is counted in the trajectory first and the checkpoint follows, so a kill between the two repeats one frame
+    with the same bytes.
+    """
+
+    def __init__(self, trajectory: TrajectoryWriter, checkpoint_path: Path) -> None:
+        self.trajectory = trajectory
+        self.checkpoint_path = checkpoint_path
+        self.seconds = 0.0
+        self.waited = 0.0
+        self._error: BaseException | None = None
+        self._jobs: queue.Queue[Job | None] = queue.Queue(maxsize=2)
+        self._thread = threading.Thread(target=self._work, name="torch_mpm frame writer", daemon=True)
+        self._stream: Any = None
+        self._thread.start()
+
+    def submit(self, frame: int, fields: Mapping[str, Tensor], scalars: Mapping[str, Any], state: Mapping[str, Tensor],
+               record: dict[str, Any]) -> None:  # fmt: skip
+        """Hand over a frame: fields in id order, scalars, and the state for the checkpoint.
+
+        Raises:
+            OSError: what went wrong with an earlier frame.
+        """
+        begin = time.perf_counter()
+        sources = [*fields.values(), *state.values()]
+        host, ready = self._to_host(sources)
+        values = {**dict(zip(fields, host, strict=False)), **scalars}
+        job = Job(frame, values, dict(zip(state, host[len(fields) :], strict=True)), record, ready, sources)
+        self._raise()
+        self._jobs.put(job)
+        self.waited += time.perf_counter() - begin
+
+    def close(self) -> None:
+        """Wait for all frames and close the trajectory.
+
+        Raises:
+            OSError: what went wrong with a frame.
+        """
+        begin = time.perf_counter()
+        self._jobs.put(None)
+        self._thread.join()
+        self.trajectory.close()
+        self.waited += time.perf_counter() - begin
+        self._raise()
+
+    def _raise(self) -> None:
+        if self._error is not None:
+            error, self._error = self._error, None
+            raise error
+
+    def _to_host(self, tensors: list[Tensor]) -> tuple[list[Tensor], torch.cuda.Event | None]:
+        """Copies in host memory. On CUDA into pinned memory on a stream of their own, so that nobody waits."""
+        if not tensors[0].is_cuda:
+            return tensors, None
+        device = tensors[0].device
+        if self._stream is None:
+            self._stream = torch.cuda.Stream(device)
+        self._stream.wait_stream(torch.cuda.current_stream(device))
+        with torch.cuda.stream(self._stream):
+            host = []
+            for tensor in tensors:
+                tensor.record_stream(self._stream)
+                pinned = torch.empty(tensor.shape, dtype=tensor.dtype, pin_memory=True)
+                host.append(pinned.copy_(tensor, non_blocking=True))
+            ready = torch.cuda.Event()
+            ready.record(self._stream)
+        return host, ready
+
+    def _work(self) -> None:
+        while (job := self._jobs.get()) is not None:
+            begin = time.perf_counter()
+            try:
+                if self._error is None:
+                    self._write(job)
+            except BaseException as error:
+                self._error = error
+            self.seconds += time.perf_counter() - begin
+
+    def _write(self, job: Job) -> None:
+        if job.ready is not None:
+            job.ready.synchronize()
+        values = {k: v.numpy() if isinstance(v, Tensor) else np.asarray(v) for k, v in job.values.items()}
+        self.trajectory.write(job.frame, values)
+        checkpoint.save(self.checkpoint_path, dict(job.state), job.record)
