@@ -261,20 +261,23 @@ void sort_chunk(const Activation<T, D>& s, int64_t chunk) {
   const int begin = s.schedule.chunk_begin[chunk], slot_end = s.a.offsets[s.schedule.chunk_slot[chunk] + 1];
   const int count = slot_end - begin < kChunk ? slot_end - begin : kChunk;
   const uint8_t* cell = s.w.cell_at + begin;
-  uint16_t* rank = s.schedule.rank + begin;
+  const int* id = s.a.index + begin;
+  uint16_t* order = s.schedule.order + begin;
   uint16_t* end = s.schedule.cell_end + chunk * kBlockNodes<D>;
   int next[kBlockNodes<D>] = {};
-  bool sorted = true;
-  for (int i = 0; i < count; i++) next[cell[i]]++;
+  bool sorted = id[count - 1] - id[0] == count - 1;
+  for (int i = 0; i < count; i++) {
+    next[cell[i]]++;
+    sorted = sorted && (i == 0 || cell[i - 1] <= cell[i]);
+  }
   for (int c = 0, before = 0; c < kBlockNodes<D>; c++) {
     const int n = next[c];
     next[c] = before;
     end[c] = uint16_t(before += n);
   }
-  for (int i = 0; i < count; i++) {
-    rank[i] = uint16_t(next[cell[i]]++);
-    sorted = sorted && rank[i] == i;
-  }
+  uint16_t nth[kChunk];
+  for (int i = 0; i < count; i++) nth[next[cell[i]]++] = uint16_t(i);
+  for (int i = 0; i < count; i++) order[i] = uint16_t(cell[i] * kChunk + nth[i]);
   s.schedule.chunk_sorted[chunk] = sorted;
 }
 

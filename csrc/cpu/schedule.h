@@ -20,9 +20,9 @@ struct Schedule {
   I* home_chunk;    // [homes + 1] first chunk of a home
   I* chunk_slot;    // [chunks]
   I* chunk_begin;   // [chunks] first particle of the chunk, as a position in the index tensor
-  I* chunk_sorted;  // [chunks] 1 if the particles are in the order of cells already
+  I* chunk_sorted;  // [chunks] 1 if the particles lie in memory one after another, in the order of cells
   S* cell_end;      // [chunks, kBlockNodes] particles of the chunk up to and including each cell
-  S* rank;          // [particles] place of a particle in its chunk when sorted by cell
+  S* order;         // [particles] entry i of a chunk: cell of its particle i * kChunk + which particle is i-th by cell
 };
 using ScheduleIn = Schedule<const int, const uint16_t>;
 using ScheduleOut = Schedule<int, uint16_t>;
@@ -45,7 +45,7 @@ void lay_out(Schedule<I, S>& s, I* start, int64_t capacity, int64_t particles) {
   s.chunk_begin = take(chunks);
   s.chunk_sorted = take(chunks);
   s.cell_end = reinterpret_cast<S*>(take(chunks * kBlockNodes<D> / 2));
-  s.rank = reinterpret_cast<S*>(start);
+  s.order = reinterpret_cast<S*>(start);
 }
 
 template <class T, int D>

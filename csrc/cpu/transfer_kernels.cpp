@@ -64,13 +64,19 @@ struct Support {
 template <class T, int D, class F>
 void for_particles(const Topology<T, D>& t, const F& f) {
   const ScheduleIn s = schedule_of(t);
-  for (int c = 0; c < kColours<D>; c++)
-    parallel_items(s.colour_start[c + 1] - s.colour_start[c], [&](int64_t h) {
-      const int slot = s.home_slot[s.colour_start[c] + h];
+  PhaseCounter<kColours<D>> colours{s.colour_start};
+  parallel_items(s.colour_start[kColours<D>], 4, [&](const auto& next) {
+    int colour = 0;
+    for (int64_t h; (h = next()) >= 0;) {
+      while (h >= s.colour_start[colour + 1]) colour++;
+      colours.wait_before(colour);
+      const int slot = s.home_slot[h];
       int block[D];
       const int scene = block_coordinates(t.geometry, t.block[slot], block);
       for (int i = t.offsets[slot]; i < t.offsets[slot + 1]; i++) f(int64_t(t.index[i]), scene);
-    });
+      colours.finish(colour);
+    }
+  });
 }
 
 template <class T, int D, class F>

@@ -37,7 +37,7 @@ struct RegisterOf<double, Width> {
 };
 
 template <class T, int N>
-struct Shape {
+struct PackShape {
   static constexpr int kWidth = N * int(sizeof(T)) < kRegisterBytes ? N : kRegisterBytes / int(sizeof(T));
   static constexpr int kParts = N / kWidth;
   using Value = typename RegisterOf<T, kWidth>::Value;
@@ -47,20 +47,20 @@ struct Shape {
 
 template <class T, int N>
 struct Mask {
-  typename Shape<T, N>::Integer part[Shape<T, N>::kParts];  // -1 where true, 0 where false
-  MPM_HD bool operator[](int i) const { return part[i / Shape<T, N>::kWidth][i % Shape<T, N>::kWidth] != 0; }
+  typename PackShape<T, N>::Integer part[PackShape<T, N>::kParts];  // -1 where true, 0 where false
+  MPM_HD bool operator[](int i) const { return part[i / PackShape<T, N>::kWidth][i % PackShape<T, N>::kWidth] != 0; }
 };
 
 template <class T, int N>
 struct Pack {
-  static constexpr int kWidth = Shape<T, N>::kWidth, kParts = Shape<T, N>::kParts;
-  typename Shape<T, N>::Value part[kParts];
+  static constexpr int kWidth = PackShape<T, N>::kWidth, kParts = PackShape<T, N>::kParts;
+  typename PackShape<T, N>::Value part[kParts];
 
   Pack() = default;
   // The same value in every lane.
   MPM_HD explicit Pack(double x) {
     MPM_UNROLL
-    for (int k = 0; k < kParts; k++) part[k] = T(x) - typename Shape<T, N>::Value{};
+    for (int k = 0; k < kParts; k++) part[k] = T(x) - typename PackShape<T, N>::Value{};
   }
 
   MPM_HD T operator[](int i) const { return part[i / kWidth][i % kWidth]; }
@@ -128,7 +128,7 @@ MPM_PACK_COMPARISON(==)
   MPM_HD Mask<T, N> operator op(const Mask<T, N>& a, const Mask<T, N>& b) { \
     Mask<T, N> r;                                                         \
     MPM_UNROLL                                                            \
-    for (int k = 0; k < Shape<T, N>::kParts; k++) r.part[k] = a.part[k] op b.part[k]; \
+    for (int k = 0; k < PackShape<T, N>::kParts; k++) r.part[k] = a.part[k] op b.part[k]; \
     return r;                                                             \
   }
 MPM_MASK_OPERATOR(&)
@@ -237,8 +237,8 @@ struct Format<double> {
 template <class T, int N>
 MPM_HD Pack<T, N> log_1p(const Pack<T, N>& a, const Pack<T, N>& a_minus_1) {
   using F = Format<T>;
-  using Value = typename Shape<T, N>::Value;
-  using Bits = typename Shape<T, N>::Bits;
+  using Value = typename PackShape<T, N>::Value;
+  using Bits = typename PackShape<T, N>::Bits;
   constexpr typename F::Bits one = typename F::Bits(F::bias) << F::mantissa;
   Pack<T, N> r;
   MPM_UNROLL
@@ -261,8 +261,8 @@ MPM_HD Pack<T, N> log_1p(const Pack<T, N>& a, const Pack<T, N>& a_minus_1) {
 template <class T, int N>
 MPM_HD Pack<T, N> expm1(const Pack<T, N>& x) {
   using F = Format<T>;
-  using Value = typename Shape<T, N>::Value;
-  using Bits = typename Shape<T, N>::Bits;
+  using Value = typename PackShape<T, N>::Value;
+  using Bits = typename PackShape<T, N>::Bits;
   Pack<T, N> result;
   MPM_UNROLL
   for (int part = 0; part < x.kParts; part++) {

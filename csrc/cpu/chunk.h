@@ -1,0 +1,170 @@
+#pragma once
+
+#include "cpu/schedule.h"
+#include "math/pack.h"
+
+// What the transfer kernels share: chunks of particles of one home block, groups of kLanes of them, and tiles, private
+// copies of the nodes that the particles of one home touch.
+namespace mpm::cpu {
+inline namespace TORCH_MPM_ISA {
+
+constexpr int kLanes = 8;     // of a pack of particles: cells hold about that many
+constexpr int kChannels = 4;  // channels that are transferred together
+template <class T>
+using Lanes = Pack<T, kLanes>;
+
+// A slot that holds particles, and the slots of the blocks that these can touch: o as in activate_kernels.cpp.
+template <class T, int D>
+struct Home {
+  int scene;
+  int corner[D];  // first node of the block
+  int slot[kColours<D>];
+
+  Home(const Topology<T, D>& t, int own) {
+    int block[D];
+    scene = block_coordinates(t.geometry, t.block[own], block);
+    for (int i = 0; i < D; i++) corner[i] = block[i] * kBlockWidth;
+    for (int o = 0; o < kColours<D>; o++) {
+      int other[D];
+      bool inside = true;
+      for (int i = 0; i < D; i++) {
+        other[i] = block[i] + (o >> (D - 1 - i) & 1);
+        inside = inside && other[i] < t.geometry.blocks[i];
+      }
+      slot[o] = inside ? t.table[block_index(t.geometry, scene, other)] : -1;
+    }
+  }
+};
+
+struct Chunk {
+  int slot, count;
+  const int* id;           // particles, ascending
+  const uint16_t* order;   // see Schedule
+  const uint16_t* cell_end;
+  bool sorted;
+
+  template <class T, int D>
+  Chunk(const Topology<T, D>& t, const ScheduleIn& s, int64_t chunk) {
+    slot = s.chunk_slot[chunk];
+    const int begin = s.chunk_begin[chunk], rest = t.offsets[slot + 1] - begin;
+    count = rest < kChunk ? rest : kChunk;
+    id = t.index + begin;
+    order = s.order + begin;
+    cell_end = s.cell_end + chunk * kBlockNodes<D>;
+    sorted = s.chunk_sorted[chunk];
+  }
+  int cell(int i) const { return order[i] / kChunk; }     // of particle i
+  int by_cell(int i) const { return order[i] % kChunk; }  // the i-th particle in the order of cells
+};
+
+// Up to kLanes particles. Where they are `consecutive`, all lanes may be read and written, whatever the count.
+struct Group {
+  int count;
+  bool consecutive;
+  int id[kLanes];
+};
+
+// Particles i, i + 1, ... of a chunk.
+MPM_HD Group group_by_id(const Chunk& c, int i) {
+  Group g;
+  const int rest = c.count - i;
+  g.count = rest < kLanes ? rest : kLanes;
+  for (int l = 0; l < kLanes; l++) g.id[l] = c.id[i + (l < g.count ? l : 0)];
+  g.consecutive = rest >= kLanes && g.id[kLanes - 1] - g.id[0] == kLanes - 1;
+  return g;
+}
+
+// Particles i, ..., end - 1 of a chunk in the order of cells. In a sorted chunk a group may write over the particles
+// after it, which are written later.
+MPM_HD Group group_by_cell(const Chunk& c, int i, int end) {
+  Group g;
+  g.count = end - i < kLanes ? end - i : kLanes;
+  g.consecutive = c.sorted && i + kLanes <= c.count;
+  if (g.consecutive)
+    g.id[0] = c.id[i];
+  else
+    for (int l = 0; l < kLanes; l++) g.id[l] = c.id[c.by_cell(i + (l < g.count ? l : 0))];
+  return g;
+}
+
+template <class T>
+MPM_HD Lanes<T> load(const Field<const T>& f, const Group& g, int i = 0, int j = 0) {
+  const T* from = f.pointer + i * f.stride[1] + j * f.stride[2];
+  if (g.consecutive && f.stride[0] == 1) return Lanes<T>::load(from + g.id[0]);
+  T lanes[kLanes];
+  for (int l = 0; l < kLanes; l++) lanes[l] = from[(g.consecutive ? g.id[0] + l : g.id[l]) * f.stride[0]];
+  return Lanes<T>::load(lanes);
+}
+
+template <class T>
+MPM_HD void store(const Lanes<T>& v, const Field<T>& f, const Group& g, int i = 0, int j = 0) {
+  T* to = f.pointer + i * f.stride[1] + j * f.stride[2];
+  if (g.consecutive && f.stride[0] == 1) return v.store(to + g.id[0]);
+  T lanes[kLanes];
+  v.store(lanes);
+  for (int l = 0; l < g.count; l++) to[(g.consecutive ? g.id[0] + l : g.id[l]) * f.stride[0]] = lanes[l];
+}
+
+// Nodes that the particles of one home touch, kChannels values each. Rows run along the last axis and are long enough to
+// add four nodes anywhere.
+template <int Order, class T, int D>
+struct Tile {
+  static constexpr int kWidth = kBlockWidth + Order, kRow = 2 * kBlockWidth * kChannels;
+  static constexpr int kRows = D == 3 ? kWidth * kWidth : kWidth;
+  alignas(64) T value[kRows * kRow];
+
+  static constexpr int stride(int axis) { return axis == D - 1 ? kChannels : axis == D - 2 ? kRow : kWidth * kRow; }
+  static int at(const int node[D]) {
+    int r = 0;
+    for (int i = 0; i < D; i++) r += node[i] * stride(i);
+    return r;
+  }
+
+  // visit(tile values, node row of the pool, nodes) for every run of nodes in an active block
+  template <class F>
+  MPM_HD void for_runs(const Home<T, D>& home, const F& visit) {
+    for (int row = 0; row < kRows; row++) {
+      const int i = D == 3 ? row / kWidth : 0, j = row % kWidth;
+      const int o = (D == 3 ? i / kBlockWidth * 4 : 0) + j / kBlockWidth * 2;
+      const int inside = (i % kBlockWidth * kBlockWidth + j % kBlockWidth) * kBlockWidth;
+      const int low = home.slot[o], high = home.slot[o + 1];
+      if (low >= 0) visit(value + row * kRow, int64_t(low) * kBlockNodes<D> + inside, kBlockWidth);
+      if (high >= 0)
+        visit(value + row * kRow + kBlockWidth * kChannels, int64_t(high) * kBlockNodes<D> + inside, Order);
+    }
+  }
+
+  void clear() { __builtin_memset(value, 0, sizeof(value)); }
+
+  // Reads channels first, ..., first + count - 1 of the nodes; zero for the other channels and inactive blocks.
+  void load_from(const NodeField<const T>& nodes, const Home<T, D>& home, int first, int count) {
+    clear();
+    for_runs(home, [&](T* tile, int64_t row, int n) {
+      const T* from = nodes.pointer + row * nodes.stride + first;
+      for (int k = 0; k < n; k++)
+        for (int c = 0; c < count; c++) tile[k * kChannels + c] = from[k * nodes.stride + c];
+    });
+  }
+
+  void add_to(const NodeField<T>& nodes, const Home<T, D>& home, int first, int count) {
+    for_runs(home, [&](T* tile, int64_t row, int n) {
+      T* to = nodes.pointer + row * nodes.stride + first;
+      if (count == kChannels && nodes.stride == kChannels)
+        for (int k = 0; k < n * kChannels; k++) to[k] += tile[k];
+      else
+        for (int k = 0; k < n; k++)
+          for (int c = 0; c < count; c++) to[k * nodes.stride + c] += tile[k * kChannels + c];
+    });
+  }
+};
+
+// Calls f(particle) for the particles that are not transferred.
+template <class T, int D, class F>
+void for_outside(const Topology<T, D>& t, const F& f) {
+  for (int64_t i = t.offsets[t.capacity]; i < t.particles; i++) f(int64_t(t.index[i]));
+}
+
+constexpr int kGrainHomes = 4;  // homes or chunks that are worth a thread
+
+}  // namespace TORCH_MPM_ISA
+}  // namespace mpm::cpu
