@@ -103,6 +103,44 @@ def test_obstacles_appear_at_their_pose(backend):
         assert np.ptp(rows) > 2.5 * np.ptp(columns)  # the bar stands upright
 
 
+def test_pose_turns_counterclockwise():
+    """The body's x axis, turned by a quarter about z, points along y."""
+    arm = shapes.mesh([[1.0, 0.0], [2.0, 0.0], [1.0, 0.1]]).posed((5, 5), np.pi / 2)
+    assert np.allclose(arm.world()[:2], [[5, 6], [5, 7]])
+    solid = shapes.mesh([[1.0, 0, 0], [2, 0, 0], [1, 0.1, 0]], [[0, 1, 2]])
+    quarter = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    assert np.allclose(solid.posed((5, 5, 0), quarter).world()[:2], [[5, 6, 0], [5, 7, 0]])
+
+
+@pytest.mark.parametrize(
+    ("shape", "distance"),
+    [
+        (shapes.sphere((1, 2, 3), 0.5), lambda p: np.linalg.norm(p - [1, 2, 3], axis=1) - 0.5),
+        (shapes.capsule((0, 0, 0), (3, 0, 0), 0.5), lambda p: distance_to_segment(p, 3.0) - 0.5),
+        (
+            shapes.cylinder((0, 0, 0), (3, 0, 0), 0.5),
+            lambda p: np.maximum(np.hypot(p[:, 1], p[:, 2]) - 0.5, np.abs(p[:, 0] - 1.5) - 1.5),
+        ),
+        (shapes.box((0, 0, 0), (2, 4, 6)), lambda p: np.max(np.abs(p) - [1, 2, 3], axis=1)),
+        (shapes.plane((0, 1, 0), (0, 1, 0), 2.0), lambda p: p[:, 1] - 1),
+    ],
+)
+def test_shapes_lie_on_their_surface(shape, distance):
+    samples = shapes.surface_samples(shape, 500)
+    assert np.abs(distance(samples.points)).max() < 0.005
+    assert len(samples.points) * np.square(samples.radius) == pytest.approx(area_of(shape))
+
+
+def distance_to_segment(p, length):
+    nearest = np.clip(p[:, 0], 0, length)
+    return np.linalg.norm(p - nearest[:, None] * [1, 0, 0], axis=1)
+
+
+def area_of(shape):
+    a, b, c = (shape.world()[shape.faces[:, i]] for i in range(3))
+    return 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()
+
+
 def test_software_and_vtk_agree():
     try:
         scene3d.window_class()
@@ -291,9 +329,11 @@ def test_png_round_trip_and_atomicity(tmp_path):
 
 
 def frames_of(path):
+    """Frames uint8 [H, W, 3] of a video, and its frames per second."""
     reader = iio.read_frames(str(path))
-    size = next(reader)["size"]
-    return [np.frombuffer(f, np.uint8).reshape(size[1], size[0], 3) for f in reader]
+    about = next(reader)
+    width, height = about["size"]
+    return [np.frombuffer(f, np.uint8).reshape(height, width, 3) for f in reader], about["fps"]
 
 
 def test_video_from_pngs_reads_back(tmp_path):
@@ -302,7 +342,8 @@ def test_video_from_pngs_reads_back(tmp_path):
     for path, value in zip(paths, grey, strict=True):
         render.write_png(path, np.full((45, 63, 3), value, np.uint8))  # odd sizes, which H.264 with 4:2:0 refuses
     render.assemble_video(paths, tmp_path / "out.mp4", fps=10)
-    frames = frames_of(tmp_path / "out.mp4")
+    frames, fps = frames_of(tmp_path / "out.mp4")
+    assert fps == 10
     assert [f.shape for f in frames] == [(46, 64, 3)] * 3
     assert [abs(float(f.mean()) - g) < 4 for f, g in zip(frames, grey, strict=True)] == [True] * 3
 
