@@ -242,7 +242,8 @@ def _save(ctx: Any, tensors: Sequence[Tensor | None], topology: Sequence[Any], *
 
 
 def _saved(ctx: Any) -> tuple[list[Tensor | None], tuple[Any, ...]]:
-    return list(ctx.saved_tensors[:-5]), (*ctx.saved_tensors[-5:], *ctx.geometry)
+    saved = ctx.saved_tensors  # once: a checkpointed region unpacks a tensor only once
+    return list(saved[:-5]), (*saved[-5:], *ctx.geometry)
 
 
 def _scatter_setup(ctx, inputs, output):  # type: ignore[no-untyped-def]

@@ -1,0 +1,327 @@
+"""Whole steps and rollouts through the public API: published numbers, conservation, gradients, batches."""
+
+import pytest
+import torch
+from particles import relative_error
+
+import torch_mpm as mpm
+
+
+def block_state(dim, device="cpu", dtype=torch.float64, scene=None, low=0.3, high=0.6, spin=0.5, dx=0.1):
+    """A jittered elastic block that moves and turns; well inside [0, 1]^D."""
+    points = mpm.seed.box((low,) * dim, (high,) * dim, dx, per_cell=2**dim)
+    state = mpm.State.at_rest(points, density=1000.0, dtype=dtype, device=device)
+    generator = torch.Generator().manual_seed(3)
+    noise = torch.rand(state.x.shape, generator=generator, dtype=torch.float64).to(state.x)
+    x = state.x + 0.02 * (noise - 0.5)
+    r = x - x.mean(0)
+    turned = torch.cat([-r[:, 1:2], r[:, :1], 0 * r[:, 2:]], 1)
+    return state.replace(x=x, v=0.2 + spin * turned, scene=scene)
+
+
+def make_step(dim, scenes=1, E=1e4, **options):
+    grid = mpm.Grid(0.1, (0,) * dim, (1,) * dim, scenes=scenes, **options.pop("grid", {}))
+    return mpm.Step(grid, mpm.NeoHookean(E=E, nu=0.3), **options)
+
+
+def mpm88(device):
+    """The fluid of Taichi's mpm88 example: 4096 particles, 128² grid, linear pressure."""
+    n, i = 128, torch.arange(4096, dtype=torch.float64)
+    x = torch.stack([0.4 * (i % 64) / 64 + 0.2, 0.4 * i / 4096 + 0.05], 1)
+    dx = 1 / n
+    volume = torch.full((4096,), (dx / 2) ** 2)
+    state = mpm.State(
+        x=x.float(), v=torch.tensor([0.0, -3.0]).expand(4096, 2), mass=volume * 1.0, volume=volume
+    ).to(device)
+    walls = mpm.Walls("separate", lower=(2 * dx, 2 * dx), upper=(126 * dx, 126 * dx))
+    law = mpm.WeaklyCompressible(bulk_modulus=400.0, gamma=1.0)
+    return mpm.Step(mpm.Grid(dx, (0, 0), (1, 1)), law, gravity=(0, -9.8), walls=walls), state
+
+
+def test_mpm88_moments(device):
+    """Means of x, x², x³, x⁴ over particles and axes, y doubled, published with Taichi's test of mpm88."""
+    step, state = mpm88(device)
+    with torch.no_grad():
+        state = mpm.rollout(step, state, 500, 2e-4)
+    step.check(state)
+    x = state.x.double().cpu() * torch.tensor([1.0, 2.0])
+    for power, published in enumerate((0.31722742, 0.15826741, 0.10224003, 0.07810827), 1):
+        assert abs(float((x**power).mean()) - published) < 5e-5
+
+
+@pytest.mark.parametrize("options", [{}, {"stress_form": "gradient"}, {"grid": {"kernel": "cubic"}}, {"transfer": "pic"}])
+def test_momentum_is_conserved(device, dim, options):
+    """Without gravity and walls linear momentum stays, and APIC keeps angular momentum too, over 50 steps."""
+    step = make_step(dim, **options)
+    state = block_state(dim, device)
+
+    def momenta(state):
+        linear = (state.mass[:, None] * state.v).sum(0)
+        outer = state.x.T @ (state.mass[:, None] * state.v)
+        if state.C is not None:
+            outer = outer + (state.mass[:, None, None] * state.C).sum(0).T / step.grid.inverse_inertia
+        return linear, outer - outer.T
+
+    start = momenta(state)
+    state = mpm.rollout(step, state, 50, 2e-3)
+    end = momenta(state)
+    scale = float((state.mass[:, None] * state.v).abs().sum())
+    assert float((end[0] - start[0]).abs().max()) < 1e-12 * scale
+    if "transfer" not in options:
+        assert float((end[1] - start[1]).abs().max()) < 1e-12 * scale
+
+
+def test_free_fall_is_exact(device, dim):
+    """Symplectic Euler under gravity alone: x = x0 + n dt v0 + g dt² n (n + 1) / 2 for a rigid translation."""
+    gravity = torch.linspace(-9.8, 1.0, dim, dtype=torch.float64)
+    step = make_step(dim, gravity=gravity.to(device))
+    start = block_state(dim, device, spin=0.0)
+    n, dt = 20, 1e-3
+    end = mpm.rollout(step, start, n, dt)
+    expected = start.x + n * dt * start.v + dt**2 * n * (n + 1) / 2 * gravity.to(device)
+    torch.testing.assert_close(end.x, expected, rtol=1e-12, atol=1e-13)
+    assert end.time == pytest.approx(n * dt)
+
+
+@pytest.mark.parametrize("transfer,flip", [("apic", 0.0), ("pic", 0.0), ("apic", 0.9), ("flip", 1.0)])
+def test_only_pic_damps_rotation(device, transfer, flip):
+    """A rotating block loses no angular speed with FLIP, little with APIC, much with PIC (Jiang et al. 2015)."""
+    step = make_step(2, E=1e3, transfer=transfer, flip=flip)
+    state = block_state(2, device, spin=4.0)
+    energy = lambda s: float((s.mass * ((s.v - s.v.mean(0)) ** 2).sum(1)).sum())  # noqa: E731
+    first = mpm.rollout(step, state, 1, 1e-3)  # C starts at zero, so the first APIC step is a PIC step
+    kept = energy(mpm.rollout(step, first, 100, 1e-3)) / energy(first)
+    assert kept < 0.05 if transfer == "pic" else kept > 0.9
+
+
+def test_rollout_gradient_is_the_finite_difference(device, dim):
+    """50 substeps with contact, gravity and stress: every input against central differences, to 1e-6."""
+    base = block_state(dim, device, low=0.1, high=0.3, dx=0.1)
+    E = torch.tensor(2e4, dtype=torch.float64, device=device)
+    inputs = {"x": base.x, "v": base.v, "mass": base.mass, "E": E, "g": torch.full((dim,), -5.0, dtype=torch.float64, device=device)}
+    weights = torch.randn(base.x.shape, dtype=torch.float64).to(device)
+
+    def loss(values):
+        step = make_step(dim, E=values["E"], gravity=values["g"], walls="slip")
+        state = mpm.rollout(step, base.replace(**{k: values[k] for k in ("x", "v", "mass")}), 50, 1e-3)
+        return (weights * state.x).sum() + (state.v**2).sum() + (state.F**2).sum()
+
+    leaves = {k: t.clone().requires_grad_() for k, t in inputs.items()}
+    grads = dict(zip(leaves, torch.autograd.grad(loss(leaves), list(leaves.values())), strict=True))
+    for name, value in inputs.items():
+        direction = torch.randn(value.shape, dtype=torch.float64).to(device)
+        step_size = 1e-6 * (float(value.abs().max()) or 1.0)
+        with torch.no_grad():
+            ends = [float(loss({**inputs, name: value + sign * step_size * direction})) for sign in (1, -1)]
+        difference = (ends[0] - ends[1]) / (2 * step_size)
+        assert float((grads[name] * direction).sum()) == pytest.approx(difference, rel=1e-6), name
+
+
+def test_checkpointing_changes_nothing(device):
+    results = []
+    for every in (None, 1, 4, 10):
+        state = block_state(2, device)
+        v = state.v.clone().requires_grad_()
+        E = torch.tensor(1e4, dtype=torch.float64, device=device, requires_grad=True)
+        end = mpm.rollout(make_step(2, E=E, walls="slip"), state.replace(v=v), 10, 1e-3, checkpoint=every)
+        (end.x**2).sum().backward()
+        results.append((end.x.detach(), v.grad, E.grad))
+    for other in results[1:]:
+        for a, b in zip(results[0], other, strict=True):
+            assert relative_error(b, a) < 1e-13
+
+
+def test_scenes_in_a_batch_are_as_if_alone(device, dim):
+    """State, gradients with respect to the state, to E and gravity of each scene, whatever else is in the batch."""
+    E = torch.tensor([5e3, 1e4, 4e4], dtype=torch.float64, device=device)
+    g = torch.tensor([[0.0] * dim, [-3.0] * dim, [2.0] * dim], dtype=torch.float64, device=device)
+    dt = torch.tensor([1e-3, 2e-3, 5e-4], dtype=torch.float64, device=device)
+    alone = [block_state(dim, device, low=0.2 + 0.1 * i, high=0.5 + 0.1 * i) for i in range(3)]
+    packed = mpm.State.concatenate(alone, scene=True)
+    packed = packed.select(torch.randperm(len(packed)).to(device))
+
+    def run(state, E, g, dt, scenes):
+        E, g, v = (t.clone().requires_grad_() for t in (E, g, state.v))
+        step = make_step(dim, scenes, E=E, gravity=g, walls="separate")
+        end = mpm.rollout(step, state.replace(v=v), 20, dt)
+        loss = (end.x**2).sum() + (end.F**3).sum()
+        return end, *torch.autograd.grad(loss, (v, E, g))
+
+    end, grad_v, grad_E, grad_g = run(packed, E, g, dt, 3)
+    for i, state in enumerate(alone):
+        one, one_v, one_E, one_g = run(state, E[i : i + 1], g[i], dt[i], 1)
+        members = (packed.scene == i).nonzero()[:, 0]
+        order = torch.cdist(packed.x[members], state.x).argmin(0)
+        members = members[order]
+        assert relative_error(end.x[members], one.x) < 1e-14
+        assert relative_error(end.F[members], one.F) < 1e-13
+        assert relative_error(grad_v[members], one_v) < 1e-11
+        assert relative_error(grad_E[i : i + 1], one_E) < 1e-11
+        assert relative_error(grad_g[i], one_g) < 1e-11
+        torch.testing.assert_close(end.time[i], one.time)
+
+
+def test_sorting_keeps_identities(device):
+    state = block_state(3, device)
+    step = make_step(3, walls="slip")
+    plain = mpm.rollout(step, state, 6, 1e-3)
+    sorted_state = state
+    for _ in range(3):
+        sorted_state = mpm.rollout(step, sorted_state.sorted(step.grid), 2, 1e-3)
+    back = sorted_state.restored()
+    assert torch.equal(back.ids.cpu(), torch.arange(len(state)))
+    assert relative_error(back.x, plain.x) < 1e-14
+    assert relative_error(back.F, plain.F) < 1e-13
+
+
+def test_a_network_acts_on_the_grid_and_a_module_is_the_law(device):
+    """Gradients reach the weights of a module in the place of the law and of one acting on the grid."""
+    net = torch.nn.Linear(2, 2).double().to(device)
+    stiffness = torch.nn.Parameter(torch.tensor(100.0, dtype=torch.float64, device=device))
+    law = mpm.CustomLaw(lambda F: stiffness * (F @ F.mT - torch.eye(2, dtype=F.dtype, device=F.device)))
+    grid = mpm.Grid(0.1, (0, 0), (1, 1))
+
+    def push(blocks, velocity, mass, dt):
+        return velocity + dt * net(blocks.node_positions(velocity.dtype))
+
+    step = mpm.Step(grid, law, on_grid=push)
+    state = mpm.rollout(step, block_state(2, device), 5, 1e-3)
+    (state.x**2).sum().backward()
+    assert float(net.weight.grad.abs().min()) > 0 and float(stiffness.grad.abs()) > 0
+
+
+def test_problems_are_reported_with_the_particle_and_the_step(device):
+    step = make_step(2)
+    state = block_state(2, device)
+    state = step(state, 1e-3)
+    step.check(state)
+    broken = state.replace(x=torch.where(torch.arange(len(state), device=device)[:, None] == 5, torch.nan, state.x))
+    step(broken, 1e-3)
+    with pytest.raises(mpm.SimulationError, match=r"1 particles have a position that is NaN.*step 1, lowest index 5"):
+        step.check()
+    step.reset()
+    gone = state.replace(v=torch.where(torch.arange(len(state), device=device)[:, None] == 3, 1e6, state.v))
+    mpm.rollout(step, gone, 2, 1e-3)
+    with pytest.raises(mpm.SimulationError, match=r"left the grid.*enlarge the domain"):
+        step.check()
+    step.reset()
+    F = torch.eye(2, dtype=torch.float64, device=device).repeat(len(state), 1, 1)
+    F[4, 0, 0] = -0.5
+    inverted = step(state.replace(F=F), 1e-3)
+    assert bool(torch.isfinite(inverted.x).all())
+    with pytest.raises(mpm.SimulationError, match=r"inverted or not finite, lowest index 4"):
+        step.check(inverted)
+
+
+def test_a_full_grid_is_reported(device):
+    state = block_state(2, device)
+    step = make_step(2, grid={"capacity": 1})
+    with pytest.raises(mpm.GridOverflowError, match="capacity of 1"):
+        step(state, 1e-3)
+        step.check()
+
+
+def test_the_grid_grows_with_the_scene():
+    """Without a capacity an explosion of the particles over the domain is followed on the CPU."""
+    step = mpm.Step(mpm.Grid(0.01, (0, 0), (1, 1)), mpm.NeoHookean(E=1e4, nu=0.3))
+    state = block_state(2)
+    state = state.replace(x=0.4 + 0.05 * state.x)
+    far = state.replace(x=torch.rand(len(state), 2, dtype=torch.float64))
+    step(state, 1e-3)
+    small = step.grid.capacity
+    step(far, 1e-3)
+    step.check()
+    assert step.grid.capacity > small
+
+
+def test_scenes_without_what_they_do_not_use(device):
+    fluid = mpm.Step(mpm.Grid(0.1, (0, 0), (1, 1)), mpm.WeaklyCompressible(1e4))
+    state = fluid(block_state(2, device), 1e-4)
+    assert state.F is None and state.temperature is None and state.J is not None
+    pic = make_step(2, transfer="pic")(block_state(2, device), 1e-4)
+    assert pic.C is None
+
+
+def test_compiles_to_one_graph(dim):
+    step = make_step(dim, gravity=(0, -9.8, 1)[:dim], walls="slip")
+    state = step.prepare(block_state(dim))
+    eager = step(state, 1e-3)
+
+    @torch.compile(backend="aot_eager", fullgraph=True)
+    def compiled(x, v, C, F):
+        out = step(mpm.State(x, v, state.mass, state.volume, C, F), 1e-3)
+        return out.x, out.v, out.C, out.F
+
+    first = compiled(state.x, state.v, torch.zeros_like(state.F), state.F)
+    for a, b in zip(first, (eager.x, eager.v, eager.C, eager.F), strict=True):
+        assert relative_error(a, b) < 1e-13
+
+
+@pytest.mark.parametrize(
+    "change,error,message",
+    [
+        ({"transfer": "xpic"}, ValueError, "transfer must be one of"),
+        ({"flip": 1.5}, ValueError, "flip must be between 0 and 1"),
+        ({"stress_form": "weak"}, ValueError, "stress_form must be"),
+        ({"walls": "glue"}, ValueError, "kind of a wall must be one of"),
+    ],
+)
+def test_bad_arguments(change, error, message):
+    with pytest.raises(error, match=message):
+        make_step(2, **change)
+
+
+@pytest.mark.parametrize("dt", [0, -1e-3, float("nan")])
+def test_bad_dt(dt):
+    with pytest.raises(ValueError, match="dt must be a positive number"):
+        make_step(2, gravity=(0, 1))(block_state(2), dt)
+
+
+def test_bad_states():
+    state = block_state(2)
+    with pytest.raises(ValueError, match=r"v must have shape \[P, D\]"):
+        state.replace(v=state.v[:3])
+    with pytest.raises(TypeError, match="mass must have the dtype of x"):
+        state.replace(mass=state.mass.float())
+    with pytest.raises(ValueError, match="density must be positive"):
+        mpm.State.at_rest(mpm.seed.box((0, 0), (1, 1), 0.1), density=-1.0)
+    with pytest.raises(ValueError, match="scene must be given"):
+        make_step(2, scenes=2)(state, 1e-3)
+
+
+@pytest.mark.parametrize(
+    "arguments,message",
+    [
+        (dict(dx=0.0, lower=(0, 0), upper=(1, 1)), "dx must be a positive number"),
+        (dict(dx=0.1, lower=(0, 0), upper=(1, 0)), "upper must be above lower"),
+        (dict(dx=0.1, lower=(0,), upper=(1,)), "2 or 3 numbers"),
+        (dict(dx=0.1, lower=(0, 0), upper=(1, 1), kernel="linear"), "kernel must be one of"),
+        (dict(dx=1e-6, lower=(0, 0, 0), upper=(1, 1, 1)), r"fewer than 2\^31"),
+        (dict(dx=0.1, lower=(0, 0), upper=(1, 1), capacity=-1), "capacity must be between"),
+    ],
+)
+def test_bad_grids(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        mpm.Grid(**arguments)
+
+
+@pytest.mark.cuda
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_a_step_is_captured_in_a_cuda_graph():
+    """Replays of a captured step equal eager steps."""
+    step, state = mpm88("cuda")
+    with torch.no_grad():
+        state = mpm.rollout(step, state, 3, 2e-4)
+        eager = mpm.rollout(step, state, 4, 2e-4)
+        static = state.map(torch.clone)
+        graph, side = torch.cuda.CUDAGraph(), torch.cuda.Stream()
+        with torch.cuda.stream(side):
+            step(static, 2e-4)
+        torch.cuda.synchronize()
+        with torch.cuda.graph(graph):
+            out = step(static, 2e-4)
+            for name in ("x", "v", "C", "J"):
+                getattr(static, name).copy_(getattr(out, name))
+        for _ in range(4):
+            graph.replay()
+    assert relative_error(static.x, eager.x) < 1e-6
