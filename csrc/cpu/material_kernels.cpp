@@ -6,22 +6,20 @@
 namespace mpm {
 inline namespace TORCH_MPM_ISA {
 
-constexpr int kLanes = 8;
-
-template <class T>
-struct Lane<Pack<T, kLanes>> {
-  MPM_HD static Pack<T, kLanes> load(const T* pointer, int64_t stride) {
-    if (stride == 1) return Pack<T, kLanes>::load(pointer);
+template <class T, int N>
+struct Lane<Pack<T, N>> {
+  MPM_HD static Pack<T, N> load(const T* pointer, int64_t stride) {
+    if (stride == 1) return Pack<T, N>::load(pointer);
     return each([&](int i) { return pointer[i * stride]; });
   }
-  MPM_HD static void store(T* pointer, int64_t stride, const Pack<T, kLanes>& value) {
+  MPM_HD static void store(T* pointer, int64_t stride, const Pack<T, N>& value) {
     if (stride == 1) return value.store(pointer);
-    for (int i = 0; i < kLanes; i++) pointer[i * stride] = value[i];
+    for (int i = 0; i < N; i++) pointer[i * stride] = value[i];
   }
   template <class F>
-  MPM_HD static Pack<T, kLanes> each(const F& f) {
-    Pack<T, kLanes> r;
-    for (int i = 0; i < kLanes; i++) r.set(i, f(i));
+  MPM_HD static Pack<T, N> each(const F& f) {
+    Pack<T, N> r;
+    for (int i = 0; i < N; i++) r.set(i, f(i));
     return r;
   }
 };
@@ -31,15 +29,18 @@ struct Lane<Pack<T, kLanes>> {
 namespace cpu {
 inline namespace TORCH_MPM_ISA {
 
-constexpr int64_t kGrain = 2048 / kLanes;  // packs below which a range is not split
+constexpr int64_t kGrain = 128;  // packs below which a range is not split
 
-// f.operator()<V>(p) for the particles p, ..., in V = packs or scalars.
+// f.operator()<V>(p) for the particles p, ..., in V = packs or scalars. A pack is a cache line: the 18 arrays of F and
+// τ may fall on the same cache sets (when P is a power of two), and then a line does not survive until its other half
+// is read.
 template <class T, class F>
 void for_particles(int64_t particles, const F& f) {
-  parallel_ranges((particles + kLanes - 1) / kLanes, kGrain, [&](int64_t begin, int64_t end) {
-    for (int64_t p = begin * kLanes; p < end * kLanes && p < particles; p += kLanes) {
-      if (p + kLanes <= particles)
-        f.template operator()<Pack<T, kLanes>>(p);
+  constexpr int lanes = 64 / sizeof(T);
+  parallel_ranges((particles + lanes - 1) / lanes, kGrain, [&](int64_t begin, int64_t end) {
+    for (int64_t p = begin * lanes; p < end * lanes && p < particles; p += lanes) {
+      if (p + lanes <= particles)
+        f.template operator()<Pack<T, lanes>>(p);
       else
         for (int64_t q = p; q < particles; q++) f.template operator()<T>(q);
     }
