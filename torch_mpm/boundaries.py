@@ -197,7 +197,7 @@ class Obstacle:
         self.kind, self.friction = kind, friction
         self.start, self.end = float(start), float(end)
         self.scene = scene
-        self._constants: dict[tuple[str, torch.device, torch.dtype], Tensor] = {}
+        self._constants: dict[tuple[str, torch.device, torch.dtype], tuple[Any, Tensor]] = {}
 
     # -- what a shape defines
 
@@ -284,11 +284,14 @@ class Obstacle:
     def _constant(self, name: str, value: Any, like: Tensor) -> Tensor:
         """Numbers as a tensor; copied to a device once, so that later steps do not wait and can be captured."""
         key = (name, like.device, like.dtype)
-        if key in self._constants:
-            return self._constants[key]
-        tensor = torch.tensor(value, dtype=like.dtype, device=like.device)
-        if type(like) in (Tensor, torch.nn.Parameter) and not torch.compiler.is_compiling():
-            self._constants[key] = tensor
+        cached = self._constants.get(key)
+        if cached is not None and cached[0] is value:
+            return cached[1]
+        if torch.compiler.is_compiling() or type(like) not in (Tensor, torch.nn.Parameter):
+            return torch.tensor(value, dtype=like.dtype, device=like.device)
+        with torch.inference_mode(False):  # such that a later step may differentiate through it
+            tensor = torch.tensor(value, dtype=like.dtype, device=like.device)
+        self._constants[key] = (value, tensor)
         return tensor
 
     # -- motion
@@ -374,7 +377,7 @@ class Plane(Obstacle):
         super().__init__(position, kind, **motion)
         if not isinstance(normal, Tensor) and not any(_floats(normal)):
             raise ValueError(f"normal must not be zero, got {normal}")
-        self.normal = normal
+        self.normal = _finite("normal", normal)
 
     def surface(self, body: Tensor, scene: Tensor | None) -> tuple[Tensor, Tensor]:
         normal = _unit(_per_node(self._value("normal", body, body.shape[1:]), 1, scene))
@@ -450,7 +453,7 @@ class Capsule(Obstacle):
         **motion: Any,
     ) -> None:
         super().__init__(position, kind, **motion)
-        self.half_axis = half_axis
+        self.half_axis = _finite("half_axis", half_axis)
         self.radius = _extent("radius", radius)
 
     def surface(self, body: Tensor, scene: Tensor | None) -> tuple[Tensor, Tensor]:
@@ -565,15 +568,19 @@ def _length(value: Any) -> int:
 
 
 def _finite(name: str, value: Any) -> Any:
-    if value is None or callable(value) or isinstance(value, Tensor) or all(math.isfinite(a) for a in _floats(value)):
+    """Numbers checked and made immutable; anything else as it is."""
+    if value is None or callable(value) or isinstance(value, Tensor):
         return value
-    raise ValueError(f"{name} must be finite, got {value}")
+    numbers = _floats(value)
+    if not all(math.isfinite(a) for a in numbers):
+        raise ValueError(f"{name} must be finite, got {value}")
+    return numbers if hasattr(value, "__len__") else numbers[0]
 
 
 def _extent(name: str, value: Any) -> Any:
-    if isinstance(value, Tensor):
-        if value.requires_grad:
-            raise ValueError(f"{name} must not require grad: which nodes are inside is not differentiable")
-    elif not all(0 <= a < math.inf for a in _floats(value)):
-        raise ValueError(f"{name} must be finite and >= 0, got {value}")
+    if isinstance(value, Tensor) and value.requires_grad:
+        raise ValueError(f"{name} must not require grad: which nodes are inside is not differentiable")
+    value = _finite(name, value)
+    if not isinstance(value, Tensor) and min(_floats(value), default=-1) < 0:
+        raise ValueError(f"{name} must be >= 0, got {value}")
     return value
