@@ -1,5 +1,4 @@
-#include <torch/headeronly/util/Exception.h>
-
+#include "cuda/launch.cuh"
 #include "cuda/material_launchers.h"
 #include "materials/kernels.h"
 
@@ -40,38 +39,36 @@ __global__ void __launch_bounds__(kThreads) energy_backward_kernel(const EnergyB
 }
 
 template <class Arguments>
-void launch(void (*kernel)(Arguments), const Arguments& a, Stream stream) {
+void for_particles(void (*kernel)(Arguments), const Arguments& a, Stream stream) {
   if (a.law.particles == 0) return;
-  kernel<<<unsigned((a.law.particles + kThreads - 1) / kThreads), kThreads, 0, stream>>>(a);
-  const cudaError_t error = cudaGetLastError();
-  STD_TORCH_CHECK(error == cudaSuccess, "kernel launch failed: ", cudaGetErrorString(error));
+  launch(kernel, unsigned((a.law.particles + kThreads - 1) / kThreads), kThreads, 0, stream, a);
 }
 
 }  // namespace
 
 template <class T, int D>
 void material_stress(const StressArguments<T, D>& a, Stream stream) {
-  AllLaws::visit(a.law.law, [&]<class Law>() { launch(stress_kernel<Law, T, D>, a, stream); });
+  AllLaws::visit(a.law.law, [&]<class Law>() { for_particles(stress_kernel<Law, T, D>, a, stream); });
 }
 
 template <class T, int D>
 void material_stress_backward(const StressBackwardArguments<T, D>& a, Stream stream) {
-  AllLaws::visit(a.law.law, [&]<class Law>() { launch(stress_backward_kernel<Law, T, D>, a, stream); });
+  AllLaws::visit(a.law.law, [&]<class Law>() { for_particles(stress_backward_kernel<Law, T, D>, a, stream); });
 }
 
 template <class T, int D>
 void material_scalar(const ScalarArguments<T, D>& a, Stream stream) {
   AllLaws::visit(a.law.law, [&]<class Law>() {
-    launch(a.which == Scalar::energy ? energy_kernel<Law, T, D> : modulus_kernel<Law, T, D>, a, stream);
+    for_particles(a.which == Scalar::energy ? energy_kernel<Law, T, D> : modulus_kernel<Law, T, D>, a, stream);
   });
 }
 
 template <class T, int D>
 void material_energy_backward(const EnergyBackwardArguments<T, D>& a, Stream stream) {
-  AllLaws::visit(a.law.law, [&]<class Law>() { launch(energy_backward_kernel<Law, T, D>, a, stream); });
+  AllLaws::visit(a.law.law, [&]<class Law>() { for_particles(energy_backward_kernel<Law, T, D>, a, stream); });
 }
 
-#define INSTANTIATE(T, D)                                                              \
+#define INSTANTIATE(T, D)                                                               \
   template void material_stress(const StressArguments<T, D>&, Stream);                  \
   template void material_stress_backward(const StressBackwardArguments<T, D>&, Stream); \
   template void material_scalar(const ScalarArguments<T, D>&, Stream);                  \

@@ -165,14 +165,14 @@ std::tuple<Tensor, Tensor> material_energy_backward(const Tensor& grad_energy, c
 
 #if MPM_BACKEND == MPM_BACKEND_IS_cpu
 STABLE_TORCH_LIBRARY_FRAGMENT(torch_mpm, m) {
-  m.def(
-      "material_stress(Tensor state, Tensor? C, Tensor? scene, Tensor[] parameters, str law, int dim) -> Tensor");
+  m.def("material_stress(Tensor state, Tensor? C, Tensor? scene, Tensor[] parameters, str law, int dim) -> Tensor");
   m.def(
       "material_stress_backward(Tensor grad_stress, Tensor state, Tensor? C, Tensor? scene, Tensor[] parameters, "
       "str law, int dim, int needs) -> (Tensor state, Tensor C, Tensor parameters)");
   m.def("material_energy(Tensor state, Tensor? scene, Tensor[] parameters, str law, int dim) -> Tensor");
   m.def(
-      "material_energy_backward(Tensor grad_energy, Tensor state, Tensor? scene, Tensor[] parameters, str law, int dim, "
+      "material_energy_backward(Tensor grad_energy, Tensor state, Tensor? scene, Tensor[] parameters, str law, int "
+      "dim, "
       "int needs) -> (Tensor state, Tensor parameters)");
   m.def("material_wave_modulus(Tensor state, Tensor? scene, Tensor[] parameters, str law, int dim) -> Tensor");
   m.def("material_stiffness(Tensor state, Tensor? scene, Tensor[] parameters, str law, int dim) -> Tensor");
