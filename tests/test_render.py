@@ -314,6 +314,9 @@ def test_png_round_trip_and_atomicity(tmp_path):
     path = tmp_path / "a.png"
     render.write_png(path, image)
     assert np.array_equal(render.read_png(path), image)
+    render.write_png(tmp_path / "small.png", np.full((40, 60, 3), 77, np.uint8), width=30)
+    assert np.array_equal(render.read_png(tmp_path / "small.png"), np.full((20, 30, 3), 77))
+    (tmp_path / "small.png").unlink()
     with pytest.raises(ValueError, match=r"image must be uint8 \[H, W, 3\], got float64"):
         render.write_png(path, image / 255)
 

@@ -40,16 +40,17 @@ def check_image(name: str, image: Array) -> Array:
     return image
 
 
-def write_png(path: str | os.PathLike[str], image: Array, colors: int | None = None) -> None:
+def write_png(path: str | os.PathLike[str], image: Array, width: int | None = None) -> None:
     """Write `image` uint8 [H, W, 3] to `path`; a killed process leaves no part of it there.
 
-    `colors` (2..256) reduces the picture to a palette, which makes the file about a third as large.
+    `width` scales the picture to that many pixels and compresses harder: for a README, where size matters.
     """
-    picture = require("PIL.Image").fromarray(check_image("image", image))
-    if colors is not None:
-        picture = picture.quantize(colors, dither=0)
+    pil = require("PIL.Image")
+    picture = pil.fromarray(check_image("image", image))
+    if width is not None:
+        picture = picture.resize((width, round(picture.height * width / picture.width)), pil.Resampling.LANCZOS)
     with replacing(path) as temporary:
-        picture.save(temporary, optimize=True) if colors else picture.save(temporary, compress_level=4)
+        picture.save(temporary, compress_level=4 if width is None else 9)
 
 
 def read_png(path: str | os.PathLike[str]) -> Array:
