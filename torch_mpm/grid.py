@@ -56,7 +56,9 @@ class Grid:
             raise ValueError(f"dx must be a positive number, got {dx}")
         if len(self.lower) not in (2, 3) or len(self.upper) != len(self.lower):
             raise ValueError(f"lower and upper must both have 2 or 3 numbers, got {lower} and {upper}")
-        if not all(math.isfinite(a) and math.isfinite(b) and a < b for a, b in zip(self.lower, self.upper, strict=True)):
+        if not all(
+            math.isfinite(a) and math.isfinite(b) and a < b for a, b in zip(self.lower, self.upper, strict=True)
+        ):
             raise ValueError(f"upper must be above lower on every axis, got lower {lower} and upper {upper}")
         if scenes < 0:
             raise ValueError(f"scenes must not be negative, got {scenes}")
@@ -139,10 +141,17 @@ class Grid:
         """Keep the capacity ahead of the blocks wanted; reads the device only at the first call."""
         if self.capacity is None:
             if torch.compiler.is_compiling() or _is_fake(x):
-                raise ValueError("a grid used under torch.compile needs a capacity: pass capacity= or activate it once before")
+                raise ValueError(
+                    "a grid used under torch.compile needs a capacity: pass capacity= or activate it once before"
+                )
             wanted = int(self._activate(x, scene, None, 0).status[7])
             self.capacity = min(_with_headroom(wanted), self._max_capacity)
-        elif self._pending is not None and not torch.compiler.is_compiling() and self._pending[1].query():
+        elif (
+            self._pending is not None
+            and not torch.compiler.is_compiling()
+            and not torch.cuda.is_current_stream_capturing()  # a query would break the capture
+            and self._pending[1].query()
+        ):
             wanted = int(self._pending[0][7])
             if wanted * 4 > self.capacity * 3:
                 self.capacity = min(_with_headroom(wanted), self._max_capacity)
