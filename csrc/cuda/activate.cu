@@ -254,7 +254,7 @@ __global__ void __launch_bounds__(kThreads) offsets(const ActivateArguments<T, D
   if (count > 0) w.tally[b].count = start;
   for (int k = 0; k < items; k++) {
     const int begin = start + int(int64_t(count) * k / items), end = start + int(int64_t(count) * (k + 1) / items);
-    reinterpret_cast<int4*>(a.schedule + kScheduleHeader)[item + k] = make_int4(slot, begin, end, 0);
+    reinterpret_cast<int4*>(a.schedule + kScheduleHeader)[item + k] = make_int4(slot, begin, end, b);
   }
   if (b == table - 1) {
     w.counters->transferred = start + count;

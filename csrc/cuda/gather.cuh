@@ -39,11 +39,11 @@ struct Weights {
 //   slope     Σ ∇N Σ_c g_c (a_c + B_c · r), B being absent (None, Constant) or not (Affine)
 enum class Form { none, constant, affine };
 
-template <int Order_, class T_, int D_, int K_, int Plain_, bool Value_, bool Moment_, bool Gradient_, Form Slope_>
+template <int Order_, class T_, int D_, int K_, int Plain_, bool Moment_, bool Gradient_, Form Slope_>
 struct SumShape {
   using T = T_;
   static constexpr int Order = Order_, D = D_, K = K_, Plain = Plain_;
-  static constexpr bool Value = Value_, Moment = Moment_, Gradient = Gradient_;
+  static constexpr bool Moment = Moment_, Gradient = Gradient_;
   static constexpr Form Slope = Slope_;
 };
 
@@ -120,7 +120,7 @@ __device__ void sum_axis(const NodeValue<T, S::K>* tile, const Weights<S::Order,
 template <class S, class T>
 __device__ void add_hessian(const NodeValue<T, S::K>* tile, const Weights<S::Order, T, S::D>& w,
                             const T (&gradient)[S::K][S::D], T (&slope)[S::D]) {
-  using H = SumShape<S::Order, T, S::D, S::K, S::K, false, false, false, Form::constant>;
+  using H = SumShape<S::Order, T, S::D, S::K, S::K, false, false, Form::constant>;
 #pragma unroll
   for (int j = 0; j < S::D; j++) {
     Weights<S::Order, T, S::D> v = w;
@@ -169,7 +169,8 @@ __device__ NodeValue<T, K> load_node(const NodeField<const T>& nodes, int64_t ro
 
 constexpr int kGatherThreads = 128;
 
-// Task: topology(), position(), nodes(), home(particle, ...) and outside(particle).
+// Task: topology(), position(), nodes(); load(p, scene), what it needs of a particle; compute(loaded, weights, tile), what a
+// particle gets, with the tile at the base node of the particle; write(p, result), by value zero for particles outside.
 template <class Task>
 __global__ void __launch_bounds__(kGatherThreads) gather_kernel(const Task task, int vector_shift) {
   using T = typename Task::T;
@@ -181,35 +182,42 @@ __global__ void __launch_bounds__(kGatherThreads) gather_kernel(const Task task,
   const int items = t.schedule[0];
   for (int i = blockIdx.x; i < items; i += gridDim.x) {
     const Item item = item_at(t, i);
-    const Home<D> home = home_of(t, item.slot);
+    const Home<D> home = home_of(t, item);
+    // Positions are loaded one round ahead and their particles' indices two, so that loads overlap.
+    int k = item.begin + threadIdx.x;
+    const auto particle_at = [&](int k) { return k < item.end ? t.index[k] : t.index[item.begin]; };
+    int64_t p = particle_at(k), p_next = particle_at(k + kGatherThreads);
+    Vector<T, D> x = read_vector<T, D>(task.position(), p);
     __syncthreads();  // the tile before is done
     load_slots(t, home, slots);
     __syncthreads();
-    for (int k = threadIdx.x; k < Nodes::nodes; k += kGatherThreads) {
+    for (int n = threadIdx.x; n < Nodes::nodes; n += kGatherThreads) {
       int node[D];
-      Nodes::node(k, node);
+      Nodes::node(n, node);
       const int64_t row = node_row<D>(slots, node);
-      tile[k] = row < 0 ? NodeValue<T, K>{} : load_node<T, K>(task.nodes(), row, vector_shift);
+      tile[n] = row < 0 ? NodeValue<T, K>{} : load_node<T, K>(task.nodes(), row, vector_shift);
     }
     __syncthreads();
 #pragma unroll 1
-    for (int k = item.begin + threadIdx.x; k < item.end; k += kGatherThreads) {
-      const int64_t p = t.index[k];
-      int base[D];
+    for (; k < item.end; k += kGatherThreads) {
+      const auto loaded = task.load(p, home.scene);
+      const Vector<T, D> x_next = read_vector<T, D>(task.position(), p_next);
+      const int64_t p_after = particle_at(k + 2 * kGatherThreads);
+      int base[D], corner = 0;
       T f[D];
-      if (!locate_at_home<Task::Order>(t, task.position(), home, p, base, f)) {
-        task.outside(p);
-        continue;
-      }
-      int corner = 0;
+      const bool at_home = locate_at_home<Task::Order>(t, home, x, base, f);
 #pragma unroll
-      for (int j = 0; j < D; j++) corner = corner * Nodes::width + base[j];
-      task.inside(p, home.scene, Weights<Task::Order, T, D>(f), tile + corner);
+      for (int i = 0; i < D; i++) corner = corner * Nodes::width + base[i];
+      const auto result = task.compute(loaded, Weights<Task::Order, T, D>(f), tile + corner);
+      task.write(p, at_home ? result : typename Task::Result{});
+      p = p_next;
+      p_next = p_after;
+      x = x_next;
     }
   }
   const int64_t stride = int64_t(gridDim.x) * kGatherThreads;
   for (int64_t k = t.offsets[t.capacity] + int64_t(blockIdx.x) * kGatherThreads + threadIdx.x; k < t.particles; k += stride)
-    task.outside(t.index[k]);
+    task.write(t.index[k], typename Task::Result{});
 }
 
 template <class Task>
@@ -226,36 +234,30 @@ template <int Order_, class T_, int D_, int K_, bool Gradient>
 struct FieldGather {
   using T = T_;
   static constexpr int Order = Order_, D = D_, K = K_;
-  using Shape = SumShape<Order, T, D, K, 0, true, true, Gradient, Form::none>;
+  using Shape = SumShape<Order, T, D, K, 0, true, Gradient, Form::none>;
+  struct Loaded {};
+  using Result = Sums<Shape>;
   GatherArguments<T, D> a;
   T moment_scale;  // from moments per cell
 
   __host__ __device__ const Topology<T, D>& topology() const { return a.topology; }
   __host__ __device__ const NodeField<const T>& nodes() const { return a.nodes; }
   __device__ const Field<const T>& position() const { return a.x; }
-
-  __device__ void inside(int64_t p, int, const Weights<Order, T, D>& w, const NodeValue<T, K>* tile) const {
+  __device__ Loaded load(int64_t, int) const { return {}; }
+  __device__ Result compute(Loaded, const Weights<Order, T, D>& w, const NodeValue<T, K>* tile) const {
     const T constant[K] = {}, linear[K][D] = {};
-    Sums<Shape> s;
+    Result s;
     sum_axis<Shape, 0>(tile, w, constant, linear, s);
-#pragma unroll
-    for (int k = 0; k < K; k++) {
-      write(a.value, s.value[k], p, k);
-#pragma unroll
-      for (int i = 0; i < D; i++) {
-        write(a.moment, moment_scale * s.moment[k][i], p, k, i);
-        if (Gradient) write(a.gradient, a.topology.geometry.inverse_dx * s.gradient[k][i], p, k, i);
-      }
-    }
+    return s;
   }
-  __device__ void outside(int64_t p) const {
+  __device__ void write(int64_t p, const Result& s) const {
 #pragma unroll
     for (int k = 0; k < K; k++) {
-      write(a.value, T(0), p, k);
+      cuda::write(a.value, s.value[k], p, k);
 #pragma unroll
       for (int i = 0; i < D; i++) {
-        write(a.moment, T(0), p, k, i);
-        if (Gradient) write(a.gradient, T(0), p, k, i);
+        cuda::write(a.moment, moment_scale * s.moment[k][i], p, k, i);
+        if (Gradient) cuda::write(a.gradient, a.topology.geometry.inverse_dx * s.gradient[k][i], p, k, i);
       }
     }
   }
@@ -287,7 +289,11 @@ template <int Order_, class T_, int D_, int K_, bool Gradient>
 struct FieldPositionGradient {
   using T = T_;
   static constexpr int Order = Order_, D = D_, K = K_;
-  using Shape = SumShape<Order, T, D, K, K, true, false, false, Form::affine>;
+  using Shape = SumShape<Order, T, D, K, K, false, false, Form::affine>;
+  struct Loaded {
+    T value[K], moment[K][D], gradient[K][D];  // moments and gradients per cell
+  };
+  using Result = Vector<T, D>;
   PositionGradientArguments<T, D> a;
   T moment_scale;  // to moments per cell
   bool more;       // adds to the channels before
@@ -295,37 +301,38 @@ struct FieldPositionGradient {
   __host__ __device__ const Topology<T, D>& topology() const { return a.topology; }
   __host__ __device__ const NodeField<const T>& nodes() const { return a.nodes; }
   __device__ const Field<const T>& position() const { return a.x; }
-
-  __device__ void inside(int64_t p, int, const Weights<Order, T, D>& w, const NodeValue<T, K>* tile) const {
-    const T inverse_dx = a.topology.geometry.inverse_dx;
-    T value[K], moment[K][D];
+  __device__ Loaded load(int64_t p, int) const {
+    Loaded l;
 #pragma unroll
     for (int k = 0; k < K; k++) {
-      value[k] = read(a.value, p, k);
+      l.value[k] = read(a.value, p, k);
 #pragma unroll
-      for (int i = 0; i < D; i++) moment[k][i] = a.moment.pointer ? moment_scale * read(a.moment, p, k, i) : T(0);
+      for (int i = 0; i < D; i++) {
+        l.moment[k][i] = a.moment.pointer ? moment_scale * read(a.moment, p, k, i) : T(0);
+        l.gradient[k][i] = Gradient ? a.topology.geometry.inverse_dx * read(a.gradient, p, k, i) : T(0);
+      }
     }
+    return l;
+  }
+  __device__ Result compute(const Loaded& l, const Weights<Order, T, D>& w, const NodeValue<T, K>* tile) const {
     Sums<Shape> s;
-    sum_axis<Shape, 0>(tile, w, value, moment, s);
-    if (Gradient) {
-      T gradient[K][D];
-#pragma unroll
-      for (int k = 0; k < K; k++)
-#pragma unroll
-        for (int i = 0; i < D; i++) gradient[k][i] = inverse_dx * read(a.gradient, p, k, i);
-      add_hessian<Shape>(tile, w, gradient, s.slope);
-    }
+    sum_axis<Shape, 0>(tile, w, l.value, l.moment, s);
+    if (Gradient) add_hessian<Shape>(tile, w, l.gradient, s.slope);
+    Result r;
 #pragma unroll
     for (int i = 0; i < D; i++) {
 #pragma unroll
-      for (int k = 0; k < K; k++) s.slope[i] -= moment[k][i] * s.value[k];
-      T& out = a.position_gradient.pointer[p * a.position_gradient.stride[0] + i * a.position_gradient.stride[1]];
-      out = (more ? out : T(0)) + inverse_dx * s.slope[i];
+      for (int k = 0; k < K; k++) s.slope[i] -= l.moment[k][i] * s.value[k];
+      r[i] = a.topology.geometry.inverse_dx * s.slope[i];
     }
+    return r;
   }
-  __device__ void outside(int64_t p) const {
+  __device__ void write(int64_t p, const Result& r) const {
 #pragma unroll
-    for (int i = 0; i < D; i++) write(a.position_gradient, T(0), p, i);
+    for (int i = 0; i < D; i++) {
+      T& out = a.position_gradient.pointer[p * a.position_gradient.stride[0] + i * a.position_gradient.stride[1]];
+      out = more ? out + r[i] : r[i];
+    }
   }
 };
 
@@ -355,16 +362,20 @@ template <int Order_, class T_, int D_, bool Gradient>
 struct MomentumAdjoint {
   using T = T_;
   static constexpr int Order = Order_, D = D_, K = 1 + D;
-  using Shape = SumShape<Order, T, D, K, 1, true, true, Gradient, Form::affine>;
+  using Shape = SumShape<Order, T, D, K, 1, true, Gradient, Form::affine>;
+  using Loaded = ParticleMomentum<T, D>;
+  struct Result {
+    Vector<T, D> x;
+    ParticleMomentum<T, D> particle;
+  };
   P2GBackwardArguments<T, D> a;
 
   __host__ __device__ const Topology<T, D>& topology() const { return a.forward.topology; }
   __host__ __device__ const NodeField<const T>& nodes() const { return a.grad_nodes; }
   __device__ const Field<const T>& position() const { return a.forward.x; }
-
-  __device__ void inside(int64_t p, int scene, const Weights<Order, T, D>& w, const NodeValue<T, K>* tile) const {
+  __device__ Loaded load(int64_t p, int scene) const { return read_momentum(a.forward, p, scene); }
+  __device__ Result compute(const Loaded& particle, const Weights<Order, T, D>& w, const NodeValue<T, K>* tile) const {
     const Geometry<T, D>& g = a.forward.topology.geometry;
-    const ParticleMomentum<T, D> particle = read_momentum(a.forward, p, scene);
     const NodeMomentum<T, D> m = node_momentum<Order>(a.forward, particle);
     T value[K], moment[K][D], gradient[K][D];
     value[0] = m.mass;
@@ -381,12 +392,7 @@ struct MomentumAdjoint {
     Sums<Shape> s;
     sum_axis<Shape, 0>(tile, w, value, moment, s);
     if (Gradient) add_hessian<Shape>(tile, w, gradient, s.slope);
-#pragma unroll
-    for (int j = 0; j < D; j++) {
-#pragma unroll
-      for (int i = 0; i < D; i++) s.slope[j] -= moment[1 + i][j] * s.value[1 + i];
-      write(a.x, g.inverse_dx * s.slope[j], p, j);
-    }
+    Result r;
     NodeMomentum<T, D> sums;
     sums.mass = s.value[0];
 #pragma unroll
@@ -394,29 +400,29 @@ struct MomentumAdjoint {
       sums.momentum[i] = s.value[1 + i];
 #pragma unroll
       for (int j = 0; j < D; j++) {
+        s.slope[j] -= moment[1 + i][j] * s.value[1 + i];
         sums.moment[i][j] = s.moment[1 + i][j];
         sums.gradient[i][j] = Gradient ? s.gradient[1 + i][j] : T(0);
       }
     }
-    write_adjoint(p, adjoint<Order>(particle, sums, a.forward.form, a.forward.affine.pointer != nullptr,
-                                    a.forward.stress.pointer != nullptr, g.dx, g.inverse_dx));
-  }
-  __device__ void outside(int64_t p) const {
 #pragma unroll
-    for (int i = 0; i < D; i++) write(a.x, T(0), p, i);
-    write_adjoint(p, {T(0), zero_vector<T, D>(), zero_matrix<T, D>(), zero_matrix<T, D>(), T(0), T(0)});
+    for (int j = 0; j < D; j++) r.x[j] = g.inverse_dx * s.slope[j];
+    r.particle = adjoint<Order>(particle, sums, a.forward.form, a.forward.affine.pointer != nullptr,
+                                a.forward.stress.pointer != nullptr, g.dx, g.inverse_dx);
+    return r;
   }
-  __device__ void write_adjoint(int64_t p, const ParticleMomentum<T, D>& g) const {
-    write(a.mass, g.mass, p);
-    write(a.volume, g.volume, p);
-    write(a.dt, g.dt, p);
+  __device__ void write(int64_t p, const Result& r) const {
+    cuda::write(a.mass, r.particle.mass, p);
+    cuda::write(a.volume, r.particle.volume, p);
+    cuda::write(a.dt, r.particle.dt, p);
 #pragma unroll
     for (int i = 0; i < D; i++) {
-      write(a.velocity, g.velocity[i], p, i);
+      cuda::write(a.x, r.x[i], p, i);
+      cuda::write(a.velocity, r.particle.velocity[i], p, i);
 #pragma unroll
       for (int j = 0; j < D; j++) {
-        write(a.affine, g.affine[i][j], p, i, j);
-        write(a.stress, g.stress[i][j], p, i, j);
+        cuda::write(a.affine, r.particle.affine[i][j], p, i, j);
+        cuda::write(a.stress, r.particle.stress[i][j], p, i, j);
       }
     }
   }

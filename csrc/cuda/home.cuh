@@ -25,12 +25,13 @@ struct Tile {
 
 struct Item {
   int slot, begin, end;  // particles index[begin, end)
+  int block;             // table index of the home block
 };
 
 template <class T, int D>
 __device__ Item item_at(const Topology<T, D>& t, int i) {
   const int4 v = reinterpret_cast<const int4*>(t.schedule + kScheduleHeader)[i];
-  return {v.x, v.y, v.z};
+  return {v.x, v.y, v.z, v.w};
 }
 
 template <int D>
@@ -40,9 +41,9 @@ struct Home {
 };
 
 template <class T, int D>
-__device__ Home<D> home_of(const Topology<T, D>& t, int slot) {
+__device__ Home<D> home_of(const Topology<T, D>& t, const Item& item) {
   Home<D> h;
-  h.scene = block_coordinates(t.geometry, t.block[slot], h.block);
+  h.scene = block_coordinates(t.geometry, item.block, h.block);
   return h;
 }
 
@@ -80,21 +81,26 @@ __device__ void write(const Field<T>& f, T value, int64_t p, int i = 0, int j = 
   if (f.pointer) f.pointer[p * f.stride[0] + i * f.stride[1] + j * f.stride[2]] = value;
 }
 
-// Base node relative to the home block, and the distances from it. False for a particle that is not at home: its position
-// is not the one that was activated.
-template <int Order, class T, int D>
-__device__ bool locate_at_home(const Topology<T, D>& t, const Field<const T>& position, const Home<D>& home, int64_t p,
-                               int* base, T* f) {
-  T x[D];
+template <class T, int D>
+__device__ Vector<T, D> read_vector(const Field<const T>& f, int64_t p) {
+  Vector<T, D> v;
 #pragma unroll
-  for (int i = 0; i < D; i++) x[i] = read(position, p, i);
-  if (!locate<Order>(t.geometry, x, base, f)) return false;
-  bool inside = true;
+  for (int i = 0; i < D; i++) v[i] = read(f, p, i);
+  return v;
+}
+
+// Base node relative to the home block, and the distances from it. False, with base zero, for a particle that is not at
+// home: its position is not the one that was activated.
+template <int Order, class T, int D>
+__device__ bool locate_at_home(const Topology<T, D>& t, const Home<D>& home, const Vector<T, D>& x, int* base, T* f) {
+  bool inside = locate<Order>(t.geometry, x.e, base, f);
 #pragma unroll
   for (int i = 0; i < D; i++) {
     base[i] -= home.block[i] * kBlockWidth;
     inside = inside && unsigned(base[i]) < unsigned(kBlockWidth);
   }
+#pragma unroll
+  for (int i = 0; i < D; i++) base[i] = inside ? base[i] : 0;
   return inside;
 }
 

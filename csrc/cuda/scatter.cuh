@@ -228,23 +228,23 @@ __device__ void load_sorted(const Source& source, const Topology<T, D>& t, const
   constexpr int cells = kBlockNodes<D>;
   for (int c = threadIdx.x; c <= cells; c += S::threads) cell_start[c] = 0;
   __syncthreads();
+  int next = int(threadIdx.x) < n ? t.index[begin + threadIdx.x] : 0;
 #pragma unroll 1
   for (int k = threadIdx.x; k < n; k += S::threads) {
-    const int64_t p = t.index[begin + k];
-    int base[D], cell = cells;
+    const int64_t p = next;
+    if (k + S::threads < n) next = t.index[begin + k + S::threads];
+    int base[D];
     T f[D];
-    if (locate_at_home<S::Order>(t, source.position(), home, p, base, f)) {
-      cell = node_in_block<D>(base);
-      store_particle<S, T, D>(shared, SharedParticles<S>::row(k), f, source.load(p, home.scene));
-    }
+    // Loaded and stored wherever the particle is, so that no load waits for another.
+    const bool at_home = locate_at_home<S::Order>(t, home, read_vector<T, D>(source.position(), p), base, f);
+    store_particle<S, T, D>(shared, SharedParticles<S>::row(k), f, source.load(p, home.scene));
+    const int cell = at_home ? node_in_block<D>(base) : cells;
     shared.cell[k] = uint16_t(cell);
     if (!in_order) shared.rank[k] = uint16_t(atomicAdd(&cell_start[cell], 1));
   }
   __syncthreads();
   if (threadIdx.x < 32) {
-    if (in_order) {
-      rank_in_order(shared.cell, shared.rank, cell_start, n);
-    }
+    if (in_order) rank_in_order(shared.cell, shared.rank, cell_start, n);
     starts_from_counts<cells>(cell_start);
   }
   __syncthreads();
@@ -365,7 +365,7 @@ __global__ void __launch_bounds__(Source::Shape::threads) scatter_kernel(const S
   const int items = topology.schedule[0];
   for (int i = blockIdx.x; i < items; i += gridDim.x) {
     Item item = item_at(topology, i);
-    const Home<D> home = home_of(topology, item.slot);
+    const Home<D> home = home_of(topology, item);
     if (in_order) {
       if (colour_of(home) != colour || item.begin != topology.offsets[item.slot]) continue;
       item.end = topology.offsets[item.slot + 1];

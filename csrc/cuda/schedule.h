@@ -2,8 +2,9 @@
 
 #include <cstdint>
 
-// The schedule tensor of the CUDA kernels: the number of work items, then the items from entry 4 on, four ints each. An
-// item is at most kItemParticles particles of one home block; a crowded block makes several.
+// The schedule tensor of the CUDA kernels: the number of work items, then the items from entry 4 on, four ints each:
+// slot, begin and end in the index tensor, table index. An item is at most kItemParticles particles of one home block; a
+// crowded block makes several.
 namespace mpm::cuda {
 
 constexpr int kItemParticles = 576;

@@ -65,14 +65,16 @@ MPM_HD S distance_in_cells(const Geometry<T, D>& g, int axis, const S& x, const 
 // Base node and distance from it in cells. False for a particle that is not finite or whose support leaves the lattice.
 template <int Order, class T, int D>
 MPM_HD bool locate(const Geometry<T, D>& g, const T x[D], int base[D], T f[D]) {
+  bool inside = true;
   MPM_UNROLL
-  for (int i = 0; i < D; i++) {
+  for (int i = 0; i < D; i++) {  // no early return: it would make each coordinate wait for the one before
     const T node = base_node<Order>(g, i, x[i]);
-    if (!on_lattice<Order>(g, i, node)) return false;
-    base[i] = int(node);
+    const bool on = on_lattice<Order>(g, i, node);
+    inside = inside && on;
+    base[i] = on ? int(node) : 0;
     f[i] = distance_in_cells(g, i, x[i], node);
   }
-  return true;
+  return inside;
 }
 
 template <class T, int D>
