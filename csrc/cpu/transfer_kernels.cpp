@@ -107,21 +107,6 @@ NodeMomentum<T, D> node_form(const P2GArguments<T, D>& a, const ParticleMomentum
   return to_nodes<Order>(q, a.form, a.affine.pointer, a.stress.pointer, g.dx, g.inverse_dx);
 }
 
-template <int Order, class T, int D>
-void p2g(const P2GArguments<T, D>& a) {
-  for_particles(a.topology, [&](int64_t p, int scene) {
-    Support<Order, T, D> s;
-    if (!s.locate(a.topology, a.x, p)) return;
-    const NodeMomentum<T, D> n = node_form<Order>(a, load(a, p, scene));
-    s.for_nodes(a.topology, scene, [&](int64_t row, T N, const auto& r, const auto& g, const auto&) {
-      T* node = a.nodes.pointer + row * a.nodes.stride;
-      const Vector<T, D> momentum = N * (n.momentum + n.moment * r) + n.gradient * g;
-      node[0] += N * n.mass;
-      for (int i = 0; i < D; i++) node[1 + i] += momentum[i];
-    });
-  });
-}
-
 template <class T, int D>
 void store(const P2GBackwardArguments<T, D>& a, int64_t p, const ParticleMomentum<T, D>& g, const Vector<T, D>& x) {
   if (a.mass.pointer) at(a.mass, p) = g.mass;
@@ -167,26 +152,6 @@ void p2g_backward(const P2GBackwardArguments<T, D>& a) {
           geometry.inverse_dx * x);
   });
   for_outside(in.topology, [&](int64_t p) { store(a, p, zero, zero_vector<T, D>()); });
-}
-
-template <int Order, class T, int D>
-void scatter(const ScatterArguments<T, D>& a) {
-  const T inverse_dx = a.topology.geometry.inverse_dx, scale = T(a.moment_scale * double(a.topology.geometry.dx));
-  for_particles(a.topology, [&](int64_t p, int scene) {
-    Support<Order, T, D> s;
-    if (!s.locate(a.topology, a.x, p)) return;
-    s.for_nodes(a.topology, scene, [&](int64_t row, T N, const auto& r, const auto& g, const auto&) {
-      T* node = a.nodes.pointer + row * a.nodes.stride;
-      for (int c = 0; c < a.nodes.channels; c++) {
-        T v = N * at(a.value, p, c);
-        for (int i = 0; i < D; i++) {
-          if (a.moment.pointer) v += N * scale * r[i] * at(a.moment, p, c, i);
-          if (a.gradient.pointer) v += inverse_dx * g[i] * at(a.gradient, p, c, i);
-        }
-        node[c] += v;
-      }
-    });
-  });
 }
 
 template <int Order, class T, int D>
@@ -247,9 +212,7 @@ void position_gradient(const PositionGradientArguments<T, D>& a) {
   for_outside(a.topology, [&](int64_t p) { store(p, zero_vector<T, D>()); });
 }
 
-MPM_CPU_INSTANTIATE(p2g, P2GArguments)
 MPM_CPU_INSTANTIATE(p2g_backward, P2GBackwardArguments)
-MPM_CPU_INSTANTIATE(scatter, ScatterArguments)
 MPM_CPU_INSTANTIATE(gather, GatherArguments)
 MPM_CPU_INSTANTIATE(position_gradient, PositionGradientArguments)
 
