@@ -30,9 +30,9 @@ def mpm88(device):
     x = torch.stack([0.4 * (i % 64) / 64 + 0.2, 0.4 * i / 4096 + 0.05], 1)
     dx = 1 / n
     volume = torch.full((4096,), (dx / 2) ** 2)
-    state = mpm.State(
-        x=x.float(), v=torch.tensor([0.0, -3.0]).expand(4096, 2), mass=volume * 1.0, volume=volume
-    ).to(device)
+    state = mpm.State(x=x.float(), v=torch.tensor([0.0, -3.0]).expand(4096, 2), mass=volume * 1.0, volume=volume).to(
+        device
+    )
     walls = mpm.Walls("separate", lower=(2 * dx, 2 * dx), upper=(126 * dx, 126 * dx))
     law = mpm.WeaklyCompressible(bulk_modulus=400.0, gamma=1.0)
     return mpm.Step(mpm.Grid(dx, (0, 0), (1, 1)), law, gravity=(0, -9.8), walls=walls), state
@@ -49,7 +49,9 @@ def test_mpm88_moments(device):
         assert abs(float((x**power).mean()) - published) < 5e-5
 
 
-@pytest.mark.parametrize("options", [{}, {"stress_form": "gradient"}, {"grid": {"kernel": "cubic"}}, {"transfer": "pic"}])
+@pytest.mark.parametrize(
+    "options", [{}, {"stress_form": "gradient"}, {"grid": {"kernel": "cubic"}}, {"transfer": "pic"}]
+)
 def test_momentum_is_conserved(device, dim, options):
     """Without gravity and walls linear momentum stays, and APIC keeps angular momentum too, over 50 steps."""
     step = make_step(dim, **options)
@@ -98,7 +100,13 @@ def test_rollout_gradient_is_the_finite_difference(device, dim):
     """50 substeps with contact, gravity and stress: every input against central differences, to 1e-6."""
     base = block_state(dim, device, low=0.1, high=0.3, dx=0.1)
     E = torch.tensor(2e4, dtype=torch.float64, device=device)
-    inputs = {"x": base.x, "v": base.v, "mass": base.mass, "E": E, "g": torch.full((dim,), -5.0, dtype=torch.float64, device=device)}
+    inputs = {
+        "x": base.x,
+        "v": base.v,
+        "mass": base.mass,
+        "E": E,
+        "g": torch.full((dim,), -5.0, dtype=torch.float64, device=device),
+    }
     weights = torch.randn(base.x.shape, dtype=torch.float64).to(device)
 
     def loss(values):

@@ -39,14 +39,19 @@ def test_p2g_is_the_reference(device, dim, kernel, case):
     expected = reference.p2g(blocks, **inputs, dt=DT, stress_form=form)
     assert relative_error(nodes, expected) < 1e-14
     dense = reference.dense_blocks(blocks)
-    assert relative_error(blocks.to_dense(nodes), dense.to_dense(reference.p2g(dense, **inputs, dt=DT, stress_form=form))) < 1e-14
+    assert (
+        relative_error(blocks.to_dense(nodes), dense.to_dense(reference.p2g(dense, **inputs, dt=DT, stress_form=form)))
+        < 1e-14
+    )
 
 
 def test_g2p_is_the_reference(device, dim, kernel):
     p = random_particles(dim, kernel, device=device, sizes=(70, 0, 50))
     blocks = p.blocks()
     velocity = torch.randn(blocks.node_count, dim, dtype=torch.float64, device=device)
-    for got, expected in zip(mpm.g2p(blocks, p.x, velocity, True, True), reference.g2p(blocks, p.x, velocity), strict=True):
+    for got, expected in zip(
+        mpm.g2p(blocks, p.x, velocity, True, True), reference.g2p(blocks, p.x, velocity), strict=True
+    ):
         assert relative_error(got, expected) < 1e-14
 
 
@@ -59,7 +64,9 @@ def test_scatter_and_gather_are_the_reference(device, dim, kernel, K):
     assert relative_error(nodes, reference.scatter(blocks, p.x, value, moment, gradient, 1.7)) < 1e-14
     assert relative_error(scatter(blocks, p.x, value), reference.scatter(blocks, p.x, value, None, None, 1.0)) < 1e-14
     g = torch.randn_like(nodes)
-    for got, expected in zip(gather(blocks, p.x, g, True, True, 1.7), reference.gather(blocks, p.x, g, 1.7), strict=True):
+    for got, expected in zip(
+        gather(blocks, p.x, g, True, True, 1.7), reference.gather(blocks, p.x, g, 1.7), strict=True
+    ):
         assert relative_error(got, expected) < 1e-14
 
 

@@ -13,7 +13,7 @@ from torch import Tensor
 from .errors import GridOverflowError, check_positions
 
 PADDING = 3
-"""Nodes outside `lower` and `upper`, so that a particle on the boundary has its whole support (csrc/grid/geometry.h)."""
+"""Nodes beyond `lower` and `upper`, so that a particle on the boundary has its support (csrc/grid/geometry.h)."""
 BLOCK_WIDTH = 4
 INT32_MAX = 2**31 - 1
 
@@ -111,7 +111,7 @@ class Grid:
 
         Raises:
             ValueError, TypeError: for wrong shapes, dtypes or devices.
-            GridOverflowError: on the CPU, where a fixed capacity is too small. On CUDA the status tells (see `Blocks.check`).
+            GridOverflowError: on the CPU, where a fixed capacity is too small. On CUDA the status tells (`Step.check`).
         """
         check_positions(x, self.dim, scene, self.scenes)
         if self._grows:
@@ -187,7 +187,7 @@ class Blocks:
         block: table index of every slot, int32 [capacity], -1 where unused.
         offsets, index: particles `index[offsets[s]:offsets[s + 1]]` have their base node in the block of slot s, int32.
         schedule: order of work of the kernels.
-        status: int32 [8], see `check`.
+        status: int32 [8], see csrc/grid/status.h; `Step.check` reads it.
         scene: the scene of each particle, or None.
     """
 
@@ -205,8 +205,8 @@ class Blocks:
         """The trailing arguments of every transfer op."""
         grid = self.grid
         return (
-            self.table, self.block, self.offsets, self.index, self.schedule, grid.dx, grid.lower, grid.blocks, grid.order,
-            grid.deterministic,
+            *(self.table, self.block, self.offsets, self.index, self.schedule),
+            *(grid.dx, grid.lower, grid.blocks, grid.order, grid.deterministic),
         )  # fmt: skip
 
     @property
@@ -239,7 +239,7 @@ class Blocks:
         return positions.to(dtype or torch.get_default_dtype())
 
     def to_dense(self, nodes: Tensor) -> Tensor:
-        """Node rows [N, K] as a dense tensor [B, X, Y, (Z), K] over the whole lattice, zero where inactive; differentiable."""
+        """Node rows [N, K] as a dense tensor [B, X, Y, (Z), K] of the lattice, zero where inactive; differentiable."""
         grid = self.grid
         blocks = nodes.reshape(self.block.shape[0], *(BLOCK_WIDTH,) * grid.dim, nodes.shape[-1])
         blocks = torch.cat([blocks, blocks.new_zeros(1, *blocks.shape[1:])])

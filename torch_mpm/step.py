@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor, nn
@@ -18,6 +18,14 @@ from .ops import advance, g2p, gather, grid_update, p2g
 from .state import State, identity_deformation
 
 TRANSFERS = ("apic", "pic", "flip")
+
+
+class Boundary(Protocol):
+    """What acts on the grid velocity [N, D] of nodes at positions [N, D]; see `torch_mpm.boundaries`."""
+
+    def apply(
+        self, velocity: Tensor, positions: Tensor, scene: Tensor | None, time: float | Tensor, dt: float | Tensor
+    ) -> Tensor: ...
 
 
 class Step(nn.Module):
@@ -47,7 +55,7 @@ class Step(nn.Module):
         law: Material,
         gravity: Sequence[float] | Tensor | None = None,
         walls: str | Walls | None = None,
-        boundaries: Sequence[Any] = (),
+        boundaries: Sequence[Boundary] = (),
         transfer: str = "apic",
         flip: float = 0.0,
         stress_form: str = "mls",
@@ -64,7 +72,7 @@ class Step(nn.Module):
         self.law = law
         self.gravity = gravity
         self.walls = Walls(walls) if isinstance(walls, str) else walls
-        self.boundaries = nn.ModuleList(boundaries) if all(isinstance(b, nn.Module) for b in boundaries) else list(boundaries)
+        self.boundaries = list(boundaries)
         self.transfer = transfer
         self.flip = 1.0 if transfer == "flip" else float(flip)
         self.stress_form = stress_form
@@ -193,8 +201,8 @@ def check_deformation(law: Material, state: State) -> None:
     scene = 0 if state.scene is None else int(state.scene[first])
     identity = first if state.ids is None else int(state.ids[first])
     raise SimulationError(
-        f"{int(invalid.sum())} particles are inverted or not finite, lowest index {first} (id {identity}) in scene {scene}: "
-        "the time step was too large or the load crushed the material; compare dt with step.stable_dt(state)"
+        f"{int(invalid.sum())} particles are inverted or not finite, lowest index {first} (id {identity}) in scene "
+        f"{scene}: the time step was too large or the load crushed the material; compare dt with step.stable_dt(state)"
     )
 
 

@@ -45,15 +45,15 @@ void advance(const AdvanceArguments<T, D>& a, Stream) {
 template <class T, int D>
 void advance_backward(const AdvanceBackwardArguments<T, D>& a, Stream) {
   const auto& f = a.forward;
-  const bool contiguous = contiguous_particles(f.velocity, f.affine, f.F, f.J, a.grad_x, a.grad_F, a.grad_J,
-                                               a.velocity, a.affine, a.F, a.J, a.dt);
+  const bool contiguous = contiguous_particles(f.velocity, f.affine, f.F, f.J, a.grad_x, a.grad_F, a.grad_J, a.velocity,
+                                               a.affine, a.F, a.J, a.dt);
   parallel_ranges(f.particles, kGrain, [&](int64_t begin, int64_t end) {
     contiguous ? advance_backward_range<true>(a, begin, end) : advance_backward_range<false>(a, begin, end);
   });
 }
 
-#define INSTANTIATE(T, D)                                         \
-  template void advance(const AdvanceArguments<T, D>&, Stream);   \
+#define INSTANTIATE(T, D)                                       \
+  template void advance(const AdvanceArguments<T, D>&, Stream); \
   template void advance_backward(const AdvanceBackwardArguments<T, D>&, Stream);
 INSTANTIATE(float, 2)
 INSTANTIATE(float, 3)

@@ -1,7 +1,7 @@
 #pragma once
 
-// Entries of the status tensor (int32 [8]) that `activate` returns and hands from step to step. First means first in time:
-// once entries 1-4 and 6 tell of a problem, later activations leave them.
+// Entries of the status tensor (int32 [8]) that `activate` returns and hands from step to step. First means first in
+// time: once entries 1-4 and 6 tell of a problem, later activations leave them.
 namespace mpm {
 
 enum Status : int {

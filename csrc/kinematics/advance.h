@@ -23,9 +23,9 @@ struct AdvanceArguments {
 
 template <class T, int D>
 struct AdvanceBackwardArguments {
-  AdvanceArguments<T, D> forward;                    // its outputs unused
-  Field<const T> grad_x, grad_F, grad_J;             // adjoints of the outputs; the last two absent with F and J
-  Field<T> velocity, affine, F, J, dt;               // adjoints per particle; absent where not needed
+  AdvanceArguments<T, D> forward;         // its outputs unused
+  Field<const T> grad_x, grad_F, grad_J;  // adjoints of the outputs; the last two absent with F and J
+  Field<T> velocity, affine, F, J, dt;    // adjoints per particle; absent where not needed
 };
 
 inline namespace TORCH_MPM_ISA {

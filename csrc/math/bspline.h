@@ -14,7 +14,7 @@ struct BSpline;
 template <>
 struct BSpline<2> {
   static constexpr int support = 3;
-  static constexpr double base_offset = 0.5;  // base = floor(X - base_offset)
+  static constexpr double base_offset = 0.5;    // base = floor(X - base_offset)
   static constexpr double inverse_inertia = 4;  // dx² D⁻¹, from D = Σ N_i r rᵀ = dx²/4 I
 
   template <class T>

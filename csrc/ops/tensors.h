@@ -96,10 +96,11 @@ void dispatch(const Tensor& x, int64_t order, F&& f) {
 }
 
 // The tensors of one activation as every op takes them, in this order.
-#define MPM_TOPOLOGY_SCHEMA                                                                                       \
-  "Tensor table, Tensor block, Tensor offsets, Tensor index, Tensor schedule, float dx, float[] lower, int[] blocks, int order, " \
+#define MPM_TOPOLOGY_SCHEMA                                                                                            \
+  "Tensor table, Tensor block, Tensor offsets, Tensor index, Tensor schedule, float dx, float[] lower, int[] blocks, " \
+  "int order, "                                                                                                        \
   "bool deterministic"
-#define MPM_TOPOLOGY_PARAMETERS                                                                                   \
+#define MPM_TOPOLOGY_PARAMETERS                                                                                 \
   const Tensor &table, const Tensor &block, const Tensor &offsets, const Tensor &index, const Tensor &schedule, \
       double dx, std::vector<double> lower, std::vector<int64_t> blocks, int64_t order, bool deterministic
 #define MPM_TOPOLOGY_ARGUMENTS table, block, offsets, index, schedule, dx, lower, blocks

@@ -161,14 +161,15 @@ STABLE_TORCH_LIBRARY_FRAGMENT(torch_mpm, m) {
       "p2g_backward(Tensor grad_nodes, Tensor x, Tensor mass, Tensor v, Tensor? C, Tensor? stress, Tensor? volume, "
       "Tensor? scene_dt, float dt, int stress_form, int needs, " MPM_TOPOLOGY_SCHEMA
       ") -> (Tensor x, Tensor mass, Tensor v, Tensor C, Tensor stress, Tensor volume, Tensor dt)");
-  m.def("scatter(Tensor x, Tensor value, Tensor? moment, Tensor? gradient, float moment_scale, "
-        MPM_TOPOLOGY_SCHEMA ") -> Tensor");
+  m.def("scatter(Tensor x, Tensor value, Tensor? moment, Tensor? gradient, float moment_scale, " MPM_TOPOLOGY_SCHEMA
+        ") -> Tensor");
   m.def("gather(Tensor x, Tensor nodes, float moment_scale, bool moment, bool gradient, " MPM_TOPOLOGY_SCHEMA
         ") -> (Tensor value, Tensor moment, Tensor gradient)");
   m.def("g2p(Tensor x, Tensor velocity, bool affine, bool gradient, " MPM_TOPOLOGY_SCHEMA
         ") -> (Tensor v, Tensor C, Tensor grad_v)");
-  m.def("position_gradient(Tensor x, Tensor value, Tensor? moment, Tensor? gradient, Tensor nodes, float moment_scale, "
-        MPM_TOPOLOGY_SCHEMA ") -> Tensor");
+  m.def(
+      "position_gradient(Tensor x, Tensor value, Tensor? moment, Tensor? gradient, Tensor nodes, float "
+      "moment_scale, " MPM_TOPOLOGY_SCHEMA ") -> Tensor");
 }
 #endif
 

@@ -31,9 +31,10 @@ struct Topology {
   int scenes = 1;
   int capacity = 0;
   int64_t particles = 0;
-  const int* table = nullptr;     // [scenes * blocks_per_scene] slot of a block, -1 where inactive
-  const int* block = nullptr;     // [capacity] table index of a slot, -1 where unused
-  const int* offsets = nullptr;   // [capacity + 1] particles whose base node lies in the slot's block: index[offsets[s], offsets[s+1])
+  const int* table = nullptr;  // [scenes * blocks_per_scene] slot of a block, -1 where inactive
+  const int* block = nullptr;  // [capacity] table index of a slot, -1 where unused
+  const int* offsets =
+      nullptr;  // [capacity + 1] particles whose base node lies in the slot's block: index[offsets[s], offsets[s+1])
   const int* index = nullptr;     // [P] particles grouped by block; those outside the grid come last
   const int* schedule = nullptr;  // device-specific order of work
   int64_t schedule_size = 0;
@@ -54,11 +55,12 @@ template <class T, int D>
 struct P2GBackwardArguments {
   P2GArguments<T, D> forward;  // its `nodes` unused
   NodeField<const T> grad_nodes;
-  Field<T> x, mass, velocity, affine, stress, volume, dt;  // adjoints per particle, dt with respect to the product dt * scene_dt; absent where not needed
+  Field<T> x, mass, velocity, affine, stress, volume,
+      dt;  // adjoints per particle, dt with respect to the product dt * scene_dt; absent where not needed
 };
 
-// nodes_i += Σ_p N_i (value_p + scale moment_p · (x_i − x_p)) + gradient_p · ∇N_i, for any number of channels. The scale is 1
-// for an affine field, D⁻¹ for the adjoint of G2P.
+// nodes_i += Σ_p N_i (value_p + scale moment_p · (x_i − x_p)) + gradient_p · ∇N_i, for any number of channels. The
+// scale is 1 for an affine field, D⁻¹ for the adjoint of G2P.
 template <class T, int D>
 struct ScatterArguments {
   Topology<T, D> topology;
@@ -78,8 +80,8 @@ struct GatherArguments {
   Field<T> value, moment, gradient;  // absent where not wanted; zero for particles outside
 };
 
-// ∂Φ/∂x_p of the trilinear form Φ = Σ_p Σ_i g_i · [N_i (value_p + scale moment_p (x_i − x_p)) + gradient_p ∇N_i] that has
-// scatter as ∂Φ/∂g and gather as ∂Φ/∂(value, moment, gradient): the position gradient of both.
+// ∂Φ/∂x_p of the trilinear form Φ = Σ_p Σ_i g_i · [N_i (value_p + scale moment_p (x_i − x_p)) + gradient_p ∇N_i] that
+// has scatter as ∂Φ/∂g and gather as ∂Φ/∂(value, moment, gradient): the position gradient of both.
 template <class T, int D>
 struct PositionGradientArguments {
   Topology<T, D> topology;
@@ -104,7 +106,7 @@ struct ActivateArguments {
   int64_t particles = 0;
   bool deterministic = false;
   Field<const T> x;
-  const int* scene = nullptr;            // [P] or null for one scene
+  const int* scene = nullptr;  // [P] or null for one scene
   int64_t scene_stride = 0;
   const int* previous_status = nullptr;  // [8] or null
   int *table = nullptr, *block = nullptr, *offsets = nullptr, *index = nullptr, *schedule = nullptr, *status = nullptr;

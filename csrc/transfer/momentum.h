@@ -6,8 +6,8 @@
 // What one particle gives to its nodes in P2G, and the chain rule from the adjoint sums over those nodes.
 //   mass:      m_i    = Σ_p N_i m_p
 //   momentum:  (mv)_i = Σ_p N_i (m_p v_p + Q_p (x_i − x_p)) + G_p ∇N_i
-// APIC (Jiang et al. 2015) has Q = m C; MLS-MPM (Hu et al. 2018, eq. 18) folds the stress into it, Q = m C − dt V D⁻¹ τ;
-// the B-spline-gradient form keeps it apart, G = −dt V τ (Kirchhoff stress τ, rest volume V).
+// APIC (Jiang et al. 2015) has Q = m C; MLS-MPM (Hu et al. 2018, eq. 18) folds the stress into it, Q = m C − dt V D⁻¹
+// τ; the B-spline-gradient form keeps it apart, G = −dt V τ (Kirchhoff stress τ, rest volume V).
 namespace mpm {
 
 enum class StressForm : int { mls = 0, gradient = 1 };

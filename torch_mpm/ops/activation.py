@@ -29,7 +29,14 @@ def _activate_fake(
 
     P, dim = x.shape
     schedule = 16 + (8 + 4**dim // 2) * (capacity + P // 128) + P // 2  # csrc/transfer/arguments.h
-    return ints(scenes * math.prod(blocks)), ints(capacity), ints(capacity + 1), ints(x.shape[0]), ints(schedule), ints(8)
+    return (
+        ints(scenes * math.prod(blocks)),
+        ints(capacity),
+        ints(capacity + 1),
+        ints(x.shape[0]),
+        ints(schedule),
+        ints(8),
+    )
 
 
 refuse_vmap("activate")

@@ -56,7 +56,7 @@ def advance(
 
 
 @torch.library.register_fake("torch_mpm::advance")
-def _advance_fake(x, v, C, F, J, scene, scene_dt, dt):  # type: ignore[no-untyped-def]
+def _advance_fake(x, v, C, F, J, scene, scene_dt, dt):
     P, D = x.shape
     return (
         soa_empty(x, (P, D)),
@@ -66,7 +66,7 @@ def _advance_fake(x, v, C, F, J, scene, scene_dt, dt):  # type: ignore[no-untype
 
 
 @torch.library.register_fake("torch_mpm::advance_backward")
-def _advance_backward_fake(grad_x, grad_F, grad_J, x, v, C, F, J, scene, scene_dt, dt, needs):  # type: ignore[no-untyped-def]
+def _advance_backward_fake(grad_x, grad_F, grad_J, x, v, C, F, J, scene, scene_dt, dt, needs):
     P, D = x.shape
     shapes = ((P, D), (P, D, D), (P, D, D), (P,), (P,))
     present = (True, C is not None, F is not None, J is not None, True)
@@ -82,15 +82,15 @@ def _setup(ctx: Any, inputs: Any, output: Any) -> None:
     ctx.dt = dt
 
 
-def _backward(ctx, grad_x, grad_F, grad_J):  # type: ignore[no-untyped-def]
+def _backward(ctx, grad_x, grad_F, grad_J):
     x, v, C, F, J, scene, scene_dt = ctx.saved_tensors
     need = ctx.needs_input_grad
     needs = sum(1 << i for i, needed in enumerate((*need[1:5], need[6])) if needed)
-    grads = torch.ops.torch_mpm.advance_backward(
-        grad_x, None if F is None else grad_F, None if J is None else grad_J, x, v, C, F, J, scene, scene_dt, ctx.dt, needs
-    )  # fmt: skip
+    given = (grad_x, None if F is None else grad_F, None if J is None else grad_J)
+    grads = torch.ops.torch_mpm.advance_backward(*given, x, v, C, F, J, scene, scene_dt, ctx.dt, needs)
     grad_v, grad_C, grad_F, grad_J, grad_dt = (
-        g if needs >> i & 1 and t is not None else None for i, (g, t) in enumerate(zip(grads, (v, C, F, J, scene_dt), strict=True))
+        g if needs >> i & 1 and t is not None else None
+        for i, (g, t) in enumerate(zip(grads, (v, C, F, J, scene_dt), strict=True))
     )
     if grad_dt is not None:
         grad_dt = ctx.dt * sum_by_scene(grad_dt, scene if scene_dt.shape[0] > 1 else None, scene_dt.shape[0])
@@ -103,12 +103,12 @@ def _backward_setup(ctx: Any, inputs: Any, output: Any) -> None:
     ctx.dt, ctx.needs = dt, needs
 
 
-def _double_backward(ctx, *grads):  # type: ignore[no-untyped-def]
+def _double_backward(ctx, *grads):
     grad_x, grad_F, grad_J, x, v, C, F, J, scene, scene_dt = ctx.saved_tensors
     present = (True, C is not None, F is not None, J is not None, True)
     wanted = [bool(ctx.needs >> i & 1) and here for i, here in enumerate(present)]
 
-    def adjoint(grad_x, grad_F, grad_J, v, C, F, J, scene_dt):  # type: ignore[no-untyped-def]
+    def adjoint(grad_x, grad_F, grad_J, v, C, F, J, scene_dt):
         """`advance_particle_backward` of csrc/kinematics/advance.h once more, in plain torch."""
         dt = torch.tensor(ctx.dt, dtype=x.dtype, device=x.device)
         dt = dt.expand(x.shape[0]) if scene_dt is None else dt * per_particle(scene_dt, scene, x.shape[0])

@@ -38,8 +38,9 @@ def p2g(
 ) -> Tensor:
     """Mass and momentum of the nodes from the particles.
 
-    m_i = Σ N_i m_p and (mv)_i = Σ N_i [m_p v_p + Q_p (x_i − x_p)] with Q = m C (APIC, Jiang et al. 2015). Stress adds the
-    impulse of a step: Q −= dt V D⁻¹ τ (MLS-MPM, Hu et al. 2018, eq. 18), or −dt V τ ∇N_i (stress_form="gradient").
+    m_i = Σ N_i m_p and (mv)_i = Σ N_i [m_p v_p + Q_p (x_i − x_p)] with Q = m C (APIC, Jiang et al. 2015). Stress
+    adds the impulse of a step: Q −= dt V D⁻¹ τ (MLS-MPM, Hu et al. 2018, eq. 18) or, for stress_form="gradient", the
+    force −V τ ∇N_i of the B-spline gradient.
 
     Args:
         blocks: active blocks of these positions.
@@ -143,9 +144,7 @@ def scatter(
     check_like("value", value, x, (P, K), "[P, K]")
     check_like("moment", moment, x, (P, K, D), "[P, K, D]")
     check_like("gradient", gradient, x, (P, K, D), "[P, K, D]")
-    return torch.ops.torch_mpm.scatter(
-        x, value, moment, gradient, moment_scale, *blocks.topology
-    )
+    return torch.ops.torch_mpm.scatter(x, value, moment, gradient, moment_scale, *blocks.topology)
 
 
 def gather(
@@ -192,14 +191,12 @@ def _node_rows(topology: Sequence[Any], dim: int) -> int:
 
 
 @torch.library.register_fake("torch_mpm::p2g")
-def _p2g_fake(x, mass, v, C, stress, volume, scene_dt, dt, stress_form, *topology):  # type: ignore[no-untyped-def]
+def _p2g_fake(x, mass, v, C, stress, volume, scene_dt, dt, stress_form, *topology):
     return x.new_empty(_node_rows(topology, x.shape[1]), 1 + x.shape[1])
 
 
 @torch.library.register_fake("torch_mpm::p2g_backward")
-def _p2g_backward_fake(  # type: ignore[no-untyped-def]
-    grad_nodes, x, mass, v, C, stress, volume, scene_dt, dt, stress_form, needs, *topology
-):
+def _p2g_backward_fake(grad_nodes, x, mass, v, C, stress, volume, scene_dt, dt, stress_form, needs, *topology):
     P, D = x.shape
     shapes = ((P, D), (P,), (P, D), (P, D, D), (P, D, D), (P,), (P,))
     present = (True, True, True, C is not None) + 3 * (stress is not None,)
@@ -210,24 +207,24 @@ def _p2g_backward_fake(  # type: ignore[no-untyped-def]
 
 
 @torch.library.register_fake("torch_mpm::scatter")
-def _scatter_fake(x, value, moment, gradient, moment_scale, *topology):  # type: ignore[no-untyped-def]
+def _scatter_fake(x, value, moment, gradient, moment_scale, *topology):
     return x.new_empty(_node_rows(topology, x.shape[1]), value.shape[1])
 
 
 @torch.library.register_fake("torch_mpm::gather")
-def _gather_fake(x, nodes, moment_scale, moment, gradient, *topology):  # type: ignore[no-untyped-def]
+def _gather_fake(x, nodes, moment_scale, moment, gradient, *topology):
     (P, D), K = x.shape, nodes.shape[1]
     sums = [soa_empty(x, (P, K, D)) if wanted else x.new_empty(0) for wanted in (moment, gradient)]
     return soa_empty(x, (P, K)), *sums
 
 
 @torch.library.register_fake("torch_mpm::g2p")
-def _g2p_fake(x, velocity, affine, gradient, *topology):  # type: ignore[no-untyped-def]
+def _g2p_fake(x, velocity, affine, gradient, *topology):
     return _gather_fake(x, velocity, 1.0, affine, gradient, *topology)
 
 
 @torch.library.register_fake("torch_mpm::position_gradient")
-def _position_gradient_fake(x, value, moment, gradient, nodes, moment_scale, *topology):  # type: ignore[no-untyped-def]
+def _position_gradient_fake(x, value, moment, gradient, nodes, moment_scale, *topology):
     return soa_empty(x, tuple(x.shape))
 
 
@@ -241,17 +238,17 @@ def _save(ctx: Any, tensors: Sequence[Tensor | None], topology: Sequence[Any], *
         setattr(ctx, name, value)
 
 
-def _saved(ctx: Any) -> tuple[list[Tensor | None], tuple[Any, ...]]:
+def _saved(ctx: Any) -> tuple[list[Any], tuple[Any, ...]]:
     saved = ctx.saved_tensors  # once: a checkpointed region unpacks a tensor only once
     return list(saved[:-5]), (*saved[-5:], *ctx.geometry)
 
 
-def _scatter_setup(ctx, inputs, output):  # type: ignore[no-untyped-def]
+def _scatter_setup(ctx, inputs, output):
     x, value, moment, gradient, scale, *topology = inputs
     _save(ctx, (x, value, moment, gradient), topology, scale=scale)
 
 
-def _scatter_backward(ctx, grad):  # type: ignore[no-untyped-def]
+def _scatter_backward(ctx, grad):
     (x, value, moment, gradient), topology = _saved(ctx)
     need = ctx.needs_input_grad
     grad_x = grad_value = grad_moment = grad_gradient = None
@@ -267,17 +264,17 @@ def _scatter_backward(ctx, grad):  # type: ignore[no-untyped-def]
     )
 
 
-def _gather_setup(ctx, inputs, output):  # type: ignore[no-untyped-def]
+def _gather_setup(ctx, inputs, output):
     x, nodes, scale, moment, gradient, *topology = inputs
     _save(ctx, (x, nodes), topology, scale=scale, moment=moment, gradient=gradient)
 
 
-def _gather_backward(ctx, grad_value, grad_moment, grad_gradient):  # type: ignore[no-untyped-def]
+def _gather_backward(ctx, grad_value, grad_moment, grad_gradient):
     grad_x, grad_nodes = _gather_adjoint(ctx, grad_value, grad_moment, grad_gradient)
     return (grad_x, grad_nodes) + (None,) * (3 + TOPOLOGY)
 
 
-def _gather_adjoint(ctx, grad_value, grad_moment, grad_gradient):  # type: ignore[no-untyped-def]
+def _gather_adjoint(ctx, grad_value, grad_moment, grad_gradient):
     (x, nodes), topology = _saved(ctx)
     moment = grad_moment if ctx.moment else None
     gradient = grad_gradient if ctx.gradient else None
@@ -289,27 +286,27 @@ def _gather_adjoint(ctx, grad_value, grad_moment, grad_gradient):  # type: ignor
     return grad_x, grad_nodes
 
 
-def _g2p_setup(ctx, inputs, output):  # type: ignore[no-untyped-def]
+def _g2p_setup(ctx, inputs, output):
     x, velocity, affine, gradient, *topology = inputs
     inverse_inertia = (4.0 if topology[8] == 2 else 3.0) / topology[5] ** 2
     _save(ctx, (x, velocity), topology, scale=inverse_inertia, moment=affine, gradient=gradient)
 
 
-def _g2p_backward(ctx, grad_v, grad_C, grad_gradient):  # type: ignore[no-untyped-def]
+def _g2p_backward(ctx, grad_v, grad_C, grad_gradient):
     grad_x, grad_velocity = _gather_adjoint(ctx, grad_v, grad_C, grad_gradient)
     return (grad_x, grad_velocity) + (None,) * (2 + TOPOLOGY)
 
 
-def _position_gradient_setup(ctx, inputs, output):  # type: ignore[no-untyped-def]
+def _position_gradient_setup(ctx, inputs, output):
     x, value, moment, gradient, nodes, scale, *topology = inputs
     _save(ctx, (x, value, moment, gradient, nodes), topology, scale=scale)
 
 
-def _position_gradient_backward(ctx, grad):  # type: ignore[no-untyped-def]
+def _position_gradient_backward(ctx, grad):
     tensors, topology = _saved(ctx)
     blocks = _blocks_of(topology, tensors[0])
 
-    def function(x, value, moment, gradient, nodes):  # type: ignore[no-untyped-def]
+    def function(x, value, moment, gradient, nodes):
         return reference.position_gradient(blocks, x, value, moment, gradient, nodes, ctx.scale)
 
     return (*differentiate(function, tensors, [grad]),) + (None,) * (1 + TOPOLOGY)
@@ -332,34 +329,37 @@ def _blocks_of(topology: Sequence[Any], x: Tensor) -> Blocks:
     return Blocks(grid, table, block, offsets, index, schedule, table, scene)
 
 
-def _p2g_setup(ctx, inputs, output):  # type: ignore[no-untyped-def]
+def _p2g_setup(ctx, inputs, output):
     x, mass, v, C, stress, volume, scene_dt, dt, form, *topology = inputs
     _save(ctx, (x, mass, v, C, stress, volume, scene_dt), topology, dt=dt, form=form)
 
 
-def _p2g_backward(ctx, grad):  # type: ignore[no-untyped-def]
+def _p2g_backward(ctx, grad):
     tensors, topology = _saved(ctx)
     needs = sum(1 << i for i, needed in enumerate(ctx.needs_input_grad[:7]) if needed)
     grads = list(torch.ops.torch_mpm.p2g_backward(grad.contiguous(), *tensors, ctx.dt, ctx.form, needs, *topology))
     if ctx.needs_input_grad[6] and tensors[4] is not None:
         blocks = _blocks_of(topology, tensors[0])
         grads[6] = ctx.dt * sum_by_scene(grads[6], blocks.scene, blocks.grid.scenes)
-    grads = [g if needed and t is not None else None for g, t, needed in zip(grads, tensors, ctx.needs_input_grad[:7], strict=True)]
+    grads = [
+        g if needed and t is not None else None
+        for g, t, needed in zip(grads, tensors, ctx.needs_input_grad[:7], strict=True)
+    ]
     return (*grads,) + (None,) * (2 + TOPOLOGY)
 
 
-def _p2g_backward_setup(ctx, inputs, output):  # type: ignore[no-untyped-def]
+def _p2g_backward_setup(ctx, inputs, output):
     tensors, (dt, form, needs), topology = inputs[:8], inputs[8:11], inputs[11:]
     _save(ctx, tensors, topology, dt=dt, form=form, needs=needs)
 
 
-def _p2g_double_backward(ctx, *grads):  # type: ignore[no-untyped-def]
+def _p2g_double_backward(ctx, *grads):
     tensors, topology = _saved(ctx)
     has_stress = tensors[5] is not None
     present = [True, True, True, tensors[4] is not None] + 3 * [has_stress]
     wanted = [bool(ctx.needs >> i & 1) and here for i, here in enumerate(present)]
 
-    def function(*inputs):  # type: ignore[no-untyped-def]
+    def function(*inputs):
         outputs = _composed_p2g_backward(inputs, ctx.dt, ctx.form, topology)
         return tuple(o for o, w in zip(outputs, wanted, strict=True) if w)
 
@@ -367,7 +367,7 @@ def _p2g_double_backward(ctx, *grads):  # type: ignore[no-untyped-def]
     return (*differentiate(function, tensors, given),) + (None,) * (3 + TOPOLOGY)
 
 
-def _composed_p2g_backward(inputs, dt, form, topology):  # type: ignore[no-untyped-def]
+def _composed_p2g_backward(inputs, dt, form, topology):
     """`p2g_backward` from differentiable ops: `adjoint` of csrc/transfer/momentum.h once more, in plain torch."""
     grad, x, mass, v, C, stress, volume, scene_dt = inputs
     D = x.shape[1]

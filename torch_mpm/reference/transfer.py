@@ -13,7 +13,7 @@ from ..grid import BLOCK_WIDTH, PADDING, Blocks
 
 
 def bspline(distance: Tensor, order: int) -> Tensor:
-    """Quadratic or cubic B-spline of the distance from a node, in cells (Steffen, Kirby and Berzins 2008, eqs. 21-22)."""
+    """Quadratic or cubic B-spline of the distance from a node, in cells (Steffen, Kirby and Berzins 2008)."""
     a = distance.abs()
     if order == 2:
         return torch.where(a < 0.5, 0.75 - a * a, torch.where(a < 1.5, 0.5 * (1.5 - a) ** 2, 0))
@@ -22,7 +22,7 @@ def bspline(distance: Tensor, order: int) -> Tensor:
 
 @dataclasses.dataclass
 class Support:
-    """The S = (order + 1)^D nodes of each particle: rows [P, S] into a node tensor, weights [P, S], x_i - x_p [P, S, D]."""
+    """The S = (order + 1)^D nodes of each particle: rows of a node tensor and weights [P, S], x_i - x_p [P, S, D]."""
 
     rows: Tensor
     weight: Tensor
@@ -44,7 +44,9 @@ def support(blocks: Blocks, x: Tensor) -> Support:
     inside = ((node >= 0) & (node < extent)).all(-1).all(-1) & finite
     node = torch.where(inside[:, None, None], node, 0)
     block = node // BLOCK_WIDTH
-    index = torch.zeros_like(node[..., 0]) if blocks.scene is None else blocks.scene.long()[:, None].expand(node.shape[:2])
+    index = (
+        torch.zeros_like(node[..., 0]) if blocks.scene is None else blocks.scene.long()[:, None].expand(node.shape[:2])
+    )
     local = torch.zeros_like(index)
     for axis in range(grid.dim):
         index = index * grid.blocks[axis] + block[..., axis]
