@@ -1,0 +1,40 @@
+"""Run the benchmarks one after the other: `python -m benchmarks [--quick] [--device cpu|cuda] [--out DIRECTORY]`.
+
+Each is a process of its own; the exit status says whether all of them ended well. Without `--device`, CUDA where there is
+a GPU.
+"""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+import sys
+from pathlib import Path
+
+import torch
+
+from . import common
+
+PROGRAMS = ("benchmarks.speed.step", "benchmarks.accuracy.precision", "benchmarks.accuracy.convergence")
+ON_DEVICE = ("benchmarks.speed.step",)
+"""Programs that take --device; the others run on the CPU."""
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="small sizes, to see that the programs work")
+    parser.add_argument("--device", choices=["cpu", "cuda"], default="cuda" if torch.cuda.is_available() else "cpu")
+    parser.add_argument("--out", type=Path, default=common.RESULTS)
+    arguments = parser.parse_args()
+    options = ["--out", str(arguments.out.resolve()), *(["--quick"] if arguments.quick else [])]
+    failed = []
+    for program in PROGRAMS:
+        print(f"\n== {program}", flush=True)
+        device = ["--device", arguments.device] if program in ON_DEVICE else []
+        if subprocess.run([sys.executable, "-m", program, *options, *device], cwd=common.ROOT).returncode:
+            failed.append(program)
+    sys.exit(f"failed: {', '.join(failed)}" if failed else 0)
+
+
+if __name__ == "__main__":
+    main()

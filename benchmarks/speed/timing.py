@@ -1,0 +1,120 @@
+"""Times of tensor programs on the CPU and on CUDA."""
+
+from __future__ import annotations
+
+import dataclasses
+import statistics
+import time
+from collections.abc import Callable
+
+import torch
+
+Run = Callable[[], object]
+
+
+@dataclasses.dataclass(frozen=True)
+class Time:
+    """Median and least of several measurements [ms]; whether of a CUDA graph, in which the host does not count."""
+
+    ms: float
+    fastest_ms: float
+    graph: bool = False
+
+
+class Clock:
+    """Measures on one device.
+
+    On CUDA everything runs on one stream, that of this clock: use `with clock:` around the set-up too, because autograd
+    runs a backward pass on the stream of its forward pass and a graph can capture one stream only.
+    """
+
+    def __init__(self, device: str, samples: int = 20, budget: float = 1.0) -> None:
+        self.device = torch.device(device)
+        self.samples, self.budget = samples, budget
+        self.cuda = self.device.type == "cuda"
+        if self.cuda:
+            self.stream = torch.cuda.Stream()
+            # Read between measurements, so that a kernel finds its data in memory rather than in the cache.
+            self._flush = torch.zeros(64 * 2**20, device=self.device)
+
+    def __enter__(self) -> Clock:
+        if self.cuda:
+            torch.cuda.synchronize()
+            self._context = torch.cuda.stream(self.stream)
+            self._context.__enter__()
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        if self.cuda:
+            torch.cuda.synchronize()
+            self._context.__exit__(*exception)
+
+    def synchronize(self) -> None:
+        if self.cuda:
+            torch.cuda.synchronize()
+
+    def op(self, run: Run) -> Time:
+        """One op: CUDA events around the replay of a graph with a cold cache, or the wall clock on the CPU."""
+        for _ in range(3 if self.cuda else 1):
+            run()
+        if not self.cuda:
+            return Time(*self._sample(lambda: _wall(run)))
+        graph = self.capture(run)
+        return Time(*self._sample(lambda: self._events(graph or run)), graph is not None)
+
+    def steps(self, run: Run, count: int) -> Time:
+        """Wall clock of a program that does `count` steps and is synchronised once, per step."""
+        run()
+
+        def together() -> None:
+            run()
+            self.synchronize()
+
+        self.synchronize()
+        median, fastest = self._sample(lambda: _wall(together))
+        return Time(median / count, fastest / count)
+
+    def capture(self, run: Run) -> Run | None:
+        """Replay of a CUDA graph of `run`, or None where it cannot be captured."""
+        torch.cuda.synchronize()
+        graph = torch.cuda.CUDAGraph()
+        try:
+            with torch.cuda.graph(graph, stream=self.stream):
+                keep = run()
+        except RuntimeError as error:
+            torch.cuda.synchronize()
+            print(f"not captured in a CUDA graph: {str(error).splitlines()[0]}")
+            return None
+
+        def replay(_: object = keep) -> None:
+            graph.replay()
+
+        return replay
+
+    def _sample(self, measure: Callable[[], float]) -> tuple[float, float]:
+        times: list[float] = []
+        while len(times) < self.samples and (len(times) < 3 or sum(times) < self.budget * 1e3):
+            times.append(measure())
+        return statistics.median(times), min(times)
+
+    def _events(self, run: Run) -> float:
+        start, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
+        self._flush.sum()
+        start.record(self.stream)
+        run()
+        end.record(self.stream)
+        end.synchronize()
+        return start.elapsed_time(end)
+
+
+def _wall(run: Run) -> float:
+    begin = time.perf_counter()
+    run()
+    return (time.perf_counter() - begin) * 1e3
+
+
+def copy_bandwidth(clock: Clock, megabytes: int = 1024) -> float:
+    """Bytes read and written in a second by a copy between two large tensors [GB/s]."""
+    source = torch.ones(megabytes * 2**18, device=clock.device)
+    target = torch.empty_like(source)
+    return 2 * source.nbytes / clock.op(lambda: target.copy_(source)).fastest_ms * 1e-6

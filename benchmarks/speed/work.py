@@ -1,0 +1,51 @@
+"""The work that every program of the comparison does: a dense cube of neo-Hookean particles, quadratic kernel, float32.
+
+side³ particles, 8 per cell with jitter, in a domain of the unit cube with n³ cells, sorted by block of 4³ nodes and by
+cell. A smooth velocity field moves them, gravity pulls them, walls are far away. Needs numpy alone.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+DENSITY = 1000.0
+MU, LAM = 4e4, 6e4
+GRAVITY = 9.8
+DT = 1e-4
+MARGIN = 8
+"""Empty cells between the cube and the walls."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Work:
+    """Positions x and velocities v [P, 3] [m, m/s], cells per axis n, mass [kg] and volume [m³] of one particle."""
+
+    n: int
+    x: np.ndarray
+    v: np.ndarray
+    volume: float
+
+    @property
+    def mass(self) -> float:
+        return self.volume * DENSITY
+
+    @property
+    def particles(self) -> int:
+        return len(self.x)
+
+
+def make(side: int) -> Work:
+    """The cube with side³ particles."""
+    n = side // 2 + 2 * MARGIN
+    lattice = np.stack(np.meshgrid(*[np.arange(side, dtype=np.float32)] * 3, indexing="ij"), -1).reshape(-1, 3)
+    jitter = np.random.default_rng(0).random(lattice.shape, dtype=np.float32)
+    x = ((MARGIN + 0.5 * (lattice + 0.1 + 0.8 * jitter)) / n).astype(np.float32)
+    # Base node with the three padding nodes of torch_mpm, so that its blocks are the ones sorted by.
+    base = np.floor(x * np.float32(n) + np.float32(2.5)).astype(np.int64)
+    block, cell = base >> 2, base & 3
+    key = ((block[:, 0] * n + block[:, 1]) * n + block[:, 2]) * 64 + cell @ np.array([16, 4, 1])
+    x = x[np.argsort(key, kind="stable")]
+    turned = 2 * np.pi * x[:, [1, 2, 0]]
+    return Work(n, x, (0.1 * np.sin(turned)).astype(np.float32), (0.5 / n) ** 3)
