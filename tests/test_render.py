@@ -12,6 +12,7 @@ import torch
 pytest.importorskip("vtkmodules")
 iio = pytest.importorskip("imageio_ffmpeg")
 
+import torch_mpm as mpm  # noqa: E402
 from torch_mpm import render  # noqa: E402
 from torch_mpm.render import cloud, colors, requires, scene3d, shapes  # noqa: E402
 
@@ -129,6 +130,41 @@ def test_shapes_lie_on_their_surface(shape, distance):
     samples = shapes.surface_samples(shape, 500)
     assert np.abs(distance(samples.points)).max() < 0.005
     assert len(samples.points) * np.square(samples.radius) == pytest.approx(area_of(shape))
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_obstacles_of_a_simulation_are_drawn_where_they_act(dim):
+    """Every drawn vertex lies on the surface that the simulation uses, of a body that moves and turns."""
+    bounds = (np.zeros(dim), np.ones(dim))
+    centre, axis = (0.5, 0.4, 0.6)[:dim], (0.1, 0.05, -0.05)[:dim]
+    motion = {
+        "velocity": (0.1, -0.05, 0.02)[:dim],
+        "rotation": (0.2, 0.7, -0.4) if dim == 3 else 0.7,
+        "angular_velocity": (1.0, 0.3, 2.0) if dim == 3 else 2.0,
+    }
+    bodies = [
+        mpm.boundaries.Sphere(centre, 0.2, **motion),
+        mpm.boundaries.Box(centre, (0.4, 0.2, 0.3)[:dim], **motion),
+        mpm.boundaries.Capsule(centre, axis, 0.1, **motion),
+        mpm.boundaries.Plane(centre, (0.3, 1.0, 0.2)[:dim], **motion),
+        mpm.boundaries.SDF(lambda p: p.abs().sum(1) - 0.3, centre, **motion),
+    ]
+    time = 0.7
+    for body in bodies:
+        (shape,) = render.obstacle_shapes(body, time, bounds)
+        pose = body.pose(time)
+        local = (torch.as_tensor(shape.world()) - pose.centre) @ pose.rotation
+        distance, _ = body.surface(local, None)
+        if body.shape == "plane" and dim == 2:
+            local, distance = local[2:], distance[2:]  # the plate has a thickness behind its surface
+        assert distance.abs().max() < (0.006 if body.shape == "sdf" else 1e-9)
+
+
+def test_obstacles_that_do_not_act_are_not_drawn():
+    body = mpm.boundaries.Sphere((0.5, 0.5), 0.1, start=1.0, end=2.0, scene=3)
+    bounds = ((0, 0), (1, 1))
+    assert [len(render.obstacle_shapes(body, t, bounds, scene=3)) for t in (0.5, 1.0, 1.9, 2.0)] == [0, 1, 1, 0]
+    assert render.obstacle_shapes(body, 1.5, bounds, scene=0) == []
 
 
 def distance_to_segment(p, length):

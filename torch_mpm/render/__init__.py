@@ -13,19 +13,21 @@ and libgl1-mesa-dri); without one a logged warning says so and a plainer softwar
 """
 
 from . import shapes
+from .boundaries import obstacle_shapes
 from .images import contact_sheet, read_png, write_png
 from .renderer import Renderer
 from .requires import RenderError
-from .shapes import Obstacle
+from .shapes import Shape
 from .video import VideoWriter, assemble_video
 
 __all__ = [
-    "Obstacle",
     "RenderError",
     "Renderer",
+    "Shape",
     "VideoWriter",
     "assemble_video",
     "contact_sheet",
+    "obstacle_shapes",
     "read_png",
     "shapes",
     "write_png",

@@ -85,11 +85,6 @@ def surface(x: Array, rgb: Array, spacing: float) -> Skin:
     Particle number density on a grid of one spacing, smoothed, cut at half its value in an undisturbed body
     (marching cubes; colours are the density-weighted mean of the particles').
     """
-    dm = require("vtkmodules.vtkCommonDataModel")
-    flying = require("vtkmodules.vtkFiltersCore").vtkFlyingEdges3D()
-    numpy_to_vtk, vtk_to_numpy = (
-        getattr(require("vtkmodules.util.numpy_support"), n) for n in ("numpy_to_vtk", "vtk_to_numpy")
-    )
     pad = 4
     lower = x.min(axis=0) - pad * spacing
     shape = np.ceil(np.ptp(x, axis=0) / spacing).astype(np.int64) + 2 * pad + 1
@@ -100,33 +95,46 @@ def surface(x: Array, rgb: Array, spacing: float) -> Skin:
     weights = np.concatenate([np.ones((len(x), 1), np.float32), rgb.astype(np.float32)], axis=1)
     field = _linear_splat((x - lower) / spacing, weights, shape)
     field = box_blur(field, 3, (0, 1, 2), passes=2)
-    image = dm.vtkImageData()
-    image.SetDimensions(*(int(n) for n in shape[::-1]))
+    color = field[..., 1:] / np.maximum(field[..., :1], 1e-3)
+    vertices, faces, normals, colors = contour(field[..., 0], 0.5, spacing, lower, color)
+    nearest = tuple(np.round((x - lower) / spacing).astype(np.int64).T)
+    return Skin(vertices, faces, normals, colors.clip(0, 255).astype(np.uint8), field[nearest][:, 0] < 0.25)
+
+
+def contour(
+    field: Array, level: float, spacing: float, lower: Array, attribute: Array | None = None
+) -> tuple[Array, Array, Array, Array]:
+    """Where `field` [X, Y, Z] passes `level`: vertices [V, 3], triangles int [T, 3], normals [V, 3], attributes [V, C].
+
+    Normals point from larger to smaller values. Nodes are `spacing` apart from `lower` on; `attribute` [X, Y, Z, C]
+    is interpolated to the vertices (C = 0 without). Flying edges (Schroeder et al. 2015).
+    """
+    support = require("vtkmodules.util.numpy_support")
+    image = require("vtkmodules.vtkCommonDataModel").vtkImageData()
+    image.SetDimensions(*field.shape[::-1])
     image.SetSpacing(spacing, spacing, spacing)
-    density = numpy_to_vtk(np.ascontiguousarray(field[..., 0]).ravel(), deep=1)
-    density.SetName("density")
-    color = numpy_to_vtk(np.ascontiguousarray(field[..., 1:] / np.maximum(field[..., :1], 1e-3)).reshape(-1, 3), deep=1)
-    color.SetName("color")
-    image.GetPointData().SetScalars(density)
-    image.GetPointData().AddArray(color)
+    image.GetPointData().SetScalars(support.numpy_to_vtk(np.ascontiguousarray(field).ravel(), deep=1))
+    channels = 0 if attribute is None else attribute.shape[-1]
+    if attribute is not None:
+        extra = support.numpy_to_vtk(np.ascontiguousarray(attribute).reshape(-1, channels), deep=1)
+        extra.SetName("attribute")
+        image.GetPointData().AddArray(extra)
+    flying = require("vtkmodules.vtkFiltersCore").vtkFlyingEdges3D()
     flying.SetInputData(image)
     flying.InterpolateAttributesOn()
     flying.ComputeNormalsOn()
-    flying.SetValue(0, 0.5)
+    flying.SetValue(0, level)
     flying.Update()
     out = flying.GetOutput()
-    nearest = tuple(np.round((x - lower) / spacing).astype(np.int64).T)
-    loose = field[nearest][:, 0] < 0.25
     if out.GetNumberOfPoints() == 0:
-        return Skin(np.zeros((0, 3)), np.zeros((0, 3), np.int64), np.zeros((0, 3)), np.zeros((0, 3), np.uint8), loose)
+        return np.zeros((0, 3)), np.zeros((0, 3), np.int64), np.zeros((0, 3)), np.zeros((0, channels))
     points = out.GetPointData()
     # The image's first axis is the array's last: reversing the axes reverses the triangles too.
-    return Skin(
-        vertices=vtk_to_numpy(out.GetPoints().GetData())[:, ::-1] + lower,
-        faces=vtk_to_numpy(out.GetPolys().GetConnectivityArray()).reshape(-1, 3)[:, ::-1],
-        normals=vtk_to_numpy(points.GetNormals())[:, ::-1],
-        colors=vtk_to_numpy(points.GetArray("color")).clip(0, 255).astype(np.uint8),
-        loose=loose,
+    return (
+        support.vtk_to_numpy(out.GetPoints().GetData())[:, ::-1] + lower,
+        support.vtk_to_numpy(out.GetPolys().GetConnectivityArray()).reshape(-1, 3)[:, ::-1],
+        support.vtk_to_numpy(points.GetNormals())[:, ::-1],
+        support.vtk_to_numpy(points.GetArray("attribute")) if channels else np.zeros((out.GetNumberOfPoints(), 0)),
     )
 
 

@@ -18,7 +18,7 @@ from .ground import Ground
 from .requires import RenderError
 from .scene2d import Overlay, Scene2D
 from .scene3d import Scene3D, window_class
-from .shapes import Array, Obstacle, vector
+from .shapes import Array, Shape, vector
 from .software import SoftwareScene
 
 log = logging.getLogger(__name__)
@@ -103,7 +103,7 @@ class Renderer:
         self,
         x: Any,
         scalars: Any = None,
-        obstacles: Sequence[Obstacle] = (),
+        obstacles: Sequence[Shape] = (),
         overlays: Sequence[Overlay] = (),
         time: float | None = None,
         title: str = "",

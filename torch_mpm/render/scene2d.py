@@ -10,7 +10,7 @@ import numpy as np
 from .annotate import DPI, INK, add_scale, figure, font_size, material_handles
 from .colors import Quantity
 from .requires import require
-from .shapes import Array, Obstacle
+from .shapes import Array, Shape
 
 Overlay = tuple[Array, str, str]
 
@@ -61,7 +61,7 @@ class Scene2D:
         x: Array,
         rgb: Array,
         radius: float,
-        obstacles: Sequence[Obstacle],
+        obstacles: Sequence[Shape],
         overlays: Sequence[Overlay],
         names: Sequence[str],
         title: str,

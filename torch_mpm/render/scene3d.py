@@ -14,7 +14,7 @@ from .camera import LIGHTS, Camera, light_directions
 from .cloud import Skin, surface, visible
 from .ground import BACKGROUND, Ground
 from .requires import RenderError, require
-from .shapes import Array, Obstacle, surface_samples
+from .shapes import Array, Shape, surface_samples
 
 CULL_FROM = 20_000  # particles; below this, finding the hidden ones costs more than drawing them
 
@@ -79,7 +79,7 @@ class Scene3D:
             self._add_ground(ground)
         self.moving: list[Any] = []
 
-    def draw(self, x: Array, rgb: Array, radius: float, style: str, obstacles: Sequence[Obstacle]) -> Array:
+    def draw(self, x: Array, rgb: Array, radius: float, style: str, obstacles: Sequence[Shape]) -> Array:
         """The picture, uint8 [H, W, 3], of finite positions x [P, 3] m with colours uint8 [P, 3]."""
         for actor in self.moving:
             self.renderer.RemoveActor(actor)
@@ -156,7 +156,7 @@ class Scene3D:
         actor.SetTexture(self.texture)
         self.renderer.AddActor(actor)
 
-    def _shade_ground(self, x: Array, radius: float, obstacles: Sequence[Obstacle]) -> None:
+    def _shade_ground(self, x: Array, radius: float, obstacles: Sequence[Shape]) -> None:
         assert self.ground is not None
         samples = [surface_samples(o, count=4000) for o in obstacles]
         radii = [np.full(len(x), radius), *(np.full(len(s.points), s.radius) for s in samples)]
@@ -185,7 +185,7 @@ class Scene3D:
         actor.GetProperty().SetSpecularPower(40)
         return actor
 
-    def _obstacle_actor(self, obstacle: Obstacle) -> Any:
+    def _obstacle_actor(self, obstacle: Shape) -> Any:
         assert obstacle.faces is not None
         body = self._polydata(obstacle.world(), obstacle.faces)
         normals = require("vtkmodules.vtkFiltersCore").vtkPolyDataNormals()

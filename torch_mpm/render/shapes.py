@@ -13,7 +13,7 @@ GREY = (0.62, 0.64, 0.68)
 
 
 @dataclass(frozen=True)
-class Obstacle:
+class Shape:
     """A rigid shape at a pose: world = position + rotation @ body.
 
     `vertices` [V, D] in metres, `faces` int [T, 3] (3-D triangles) or None (2-D, the vertices are a closed outline),
@@ -27,10 +27,15 @@ class Obstacle:
     rotation: Array
     color: tuple[float, float, float] = GREY
 
-    def posed(self, position: npt.ArrayLike, rotation: npt.ArrayLike | None = None) -> Obstacle:
+    def posed(self, position: npt.ArrayLike, rotation: npt.ArrayLike | None = None) -> Shape:
         """The same shape at another `position` [D] and `rotation` ([D, D] matrix, or an angle in radians in 2-D)."""
         turned = self.rotation if rotation is None else rotation_matrix(rotation, self.dim)
         return replace(self, position=vector("position", position, self.dim), rotation=turned)
+
+    def moved(self, position: npt.ArrayLike, rotation: npt.ArrayLike) -> Shape:
+        """The shape after a rigid motion of the world: x becomes position + rotation @ x."""
+        turn, shift = rotation_matrix(rotation, self.dim), vector("position", position, self.dim)
+        return replace(self, position=shift + turn @ self.position, rotation=turn @ self.rotation)
 
     @property
     def dim(self) -> int:
@@ -59,18 +64,16 @@ def rotation_matrix(rotation: npt.ArrayLike, dim: int) -> Array:
     return out
 
 
-def plane(
-    point: npt.ArrayLike, normal: npt.ArrayLike, size: float, color: tuple[float, float, float] = GREY
-) -> Obstacle:
+def plane(point: npt.ArrayLike, normal: npt.ArrayLike, size: float, color: tuple[float, float, float] = GREY) -> Shape:
     """A plate of side `size` [m] around `point`, whose visible side looks along `normal`; a thick line in 2-D."""
     at, n = vector("point", point), vector("normal", normal)
     n = n / np.linalg.norm(n)
     if at.shape[0] == 2:
         thick = 0.01 * size
         flat = np.array([[-0.5 * size, -thick], [0.5 * size, -thick], [0.5 * size, 0], [-0.5 * size, 0]])
-        return Obstacle(flat, None, at, np.stack([np.array([n[1], -n[0]]), n], axis=1), color)
+        return Shape(flat, None, at, np.stack([np.array([n[1], -n[0]]), n], axis=1), color)
     quad = 0.5 * size * np.array([[-1, 0, -1], [1, 0, -1], [1, 0, 1], [-1, 0, 1]], dtype=np.float64)
-    return Obstacle(quad, np.array([[0, 2, 1], [0, 3, 2]]), at, frame_of(n), color)
+    return Shape(quad, np.array([[0, 2, 1], [0, 3, 2]]), at, frame_of(n), color)
 
 
 def box(
@@ -78,27 +81,27 @@ def box(
     size: npt.ArrayLike,
     rotation: npt.ArrayLike | None = None,
     color: tuple[float, float, float] = GREY,
-) -> Obstacle:
+) -> Shape:
     """A box with edge lengths `size` [D] in metres around `center` [D]."""
     at = vector("center", center)
     dim = at.shape[0]
     half = 0.5 * vector("size", size, dim)
     turned = np.eye(dim) if rotation is None else rotation_matrix(rotation, dim)
     if dim == 2:
-        return Obstacle(half * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]), None, at, turned, color)
+        return Shape(half * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]), None, at, turned, color)
     corners = np.array([[(i & 1), (i >> 1) & 1, i >> 2] for i in range(8)]) * 2.0 - 1.0
     quads = [(0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (2, 6, 7, 3), (0, 4, 6, 2), (1, 3, 7, 5)]
     faces = np.array([t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))])
-    return Obstacle(half * corners, faces, at, turned, color)
+    return Shape(half * corners, faces, at, turned, color)
 
 
-def sphere(center: npt.ArrayLike, radius: float, color: tuple[float, float, float] = GREY) -> Obstacle:
+def sphere(center: npt.ArrayLike, radius: float, color: tuple[float, float, float] = GREY) -> Shape:
     """A sphere (a disc in 2-D) of `radius` [m] around `center` [D]."""
     at = vector("center", center)
     return capsule(at, at, radius, color)
 
 
-def capsule(a: npt.ArrayLike, b: npt.ArrayLike, radius: float, color: tuple[float, float, float] = GREY) -> Obstacle:
+def capsule(a: npt.ArrayLike, b: npt.ArrayLike, radius: float, color: tuple[float, float, float] = GREY) -> Shape:
     """All points within `radius` [m] of the segment from `a` to `b` ([D] each)."""
     start, end = vector("a", a), vector("b", b)
     length = float(np.linalg.norm(end - start))
@@ -111,7 +114,7 @@ def capsule(a: npt.ArrayLike, b: npt.ArrayLike, radius: float, color: tuple[floa
     return revolved(profile, 0.5 * (start + end), axis, color)
 
 
-def cylinder(a: npt.ArrayLike, b: npt.ArrayLike, radius: float, color: tuple[float, float, float] = GREY) -> Obstacle:
+def cylinder(a: npt.ArrayLike, b: npt.ArrayLike, radius: float, color: tuple[float, float, float] = GREY) -> Shape:
     """A closed cylinder of `radius` [m] from `a` to `b` ([D] each); a rectangle in 2-D."""
     start, end = vector("a", a), vector("b", b)
     half = 0.5 * float(np.linalg.norm(end - start))
@@ -125,7 +128,7 @@ def mesh(
     position: npt.ArrayLike | None = None,
     rotation: npt.ArrayLike | None = None,
     color: tuple[float, float, float] = GREY,
-) -> Obstacle:
+) -> Shape:
     """Triangles `faces` int [T, 3] over `vertices` [V, 3], or the closed outline `vertices` [V, 2]."""
     v = np.asarray(vertices, dtype=np.float64)
     if v.ndim != 2 or v.shape[1] not in (2, 3):
@@ -136,7 +139,7 @@ def mesh(
         raise ValueError(f"faces must have shape [T, 3] for a 3-D mesh, got {None if f is None else list(f.shape)}")
     at = np.zeros(dim) if position is None else vector("position", position, dim)
     turned = np.eye(dim) if rotation is None else rotation_matrix(rotation, dim)
-    return Obstacle(v, f, at, turned, color)
+    return Shape(v, f, at, turned, color)
 
 
 def frame_of(axis: Array) -> Array:
@@ -147,11 +150,11 @@ def frame_of(axis: Array) -> Array:
     return np.stack([u, axis, np.cross(u, axis)], axis=1)
 
 
-def revolved(profile: Array, center: Array, axis: Array, color: tuple[float, float, float]) -> Obstacle:
+def revolved(profile: Array, center: Array, axis: Array, color: tuple[float, float, float]) -> Shape:
     """The profile (radius, height) [K, 2] turned around `axis`; mirrored into an outline in 2-D."""
     if center.shape[0] == 2:
         outline = np.concatenate([profile, profile[::-1] * [-1, 1]])
-        return Obstacle(outline, None, center, np.stack([np.array([axis[1], -axis[0]]), axis], axis=1), color)
+        return Shape(outline, None, center, np.stack([np.array([axis[1], -axis[0]]), axis], axis=1), color)
     turns, rings = 64, len(profile)
     phi = 2 * np.pi * np.arange(turns) / turns
     radius, height = profile[:, 0][:, None], profile[:, 1][:, None]
@@ -160,7 +163,7 @@ def revolved(profile: Array, center: Array, axis: Array, color: tuple[float, flo
     k = (j + 1) % turns
     a, b, c, d = i * turns + j, i * turns + k, (i + 1) * turns + k, (i + 1) * turns + j
     faces = np.concatenate([np.stack([a, c, b], -1).reshape(-1, 3), np.stack([a, d, c], -1).reshape(-1, 3)])
-    return Obstacle(v, faces, center, frame_of(axis), color)
+    return Shape(v, faces, center, frame_of(axis), color)
 
 
 @dataclass(frozen=True)
@@ -172,7 +175,7 @@ class Samples:
     radius: float
 
 
-def surface_samples(obstacle: Obstacle, count: int) -> Samples:
+def surface_samples(obstacle: Shape, count: int) -> Samples:
     """About `count` evenly spread points on an obstacle's triangles."""
     assert obstacle.faces is not None
     corners = obstacle.world()[obstacle.faces]

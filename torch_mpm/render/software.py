@@ -13,7 +13,7 @@ from .camera import LIGHTS, Camera, light_directions
 from .cloud import visible
 from .ground import BACKGROUND, Ground
 from .requires import require
-from .shapes import Array, Obstacle, surface_samples
+from .shapes import Array, Shape, surface_samples
 
 AMBIENT, DIFFUSE = 0.36, 0.85
 
@@ -24,7 +24,7 @@ class SoftwareScene:
     def __init__(self, camera: Camera, ground: Ground | None, bounds: tuple[Array, Array]) -> None:
         self.camera, self.ground, self.bounds = camera, ground, bounds
 
-    def draw(self, x: Array, rgb: Array, radius: float, style: str, obstacles: Sequence[Obstacle]) -> Array:
+    def draw(self, x: Array, rgb: Array, radius: float, style: str, obstacles: Sequence[Shape]) -> Array:
         """The picture, uint8 [H, W, 3], of finite positions x [P, 3] m with colours uint8 [P, 3]."""
         samples = [surface_samples(o, count=40_000) for o in obstacles]
         if self.ground is None:
