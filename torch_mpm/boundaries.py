@@ -425,7 +425,7 @@ class Box(Obstacle):
     def surface(self, body: Tensor, scene: Tensor | None) -> tuple[Tensor, Tensor]:
         # Inside, the nearest face is that of the axis with the largest (least negative) distance.
         depth = body.abs() - 0.5 * _per_node(self._value("size", body, body.shape[1:]), 1, scene)
-        nearest = torch.nn.functional.one_hot(depth.argmax(1), body.shape[1])
+        nearest = torch.arange(body.shape[1], device=body.device) == depth.argmax(1, keepdim=True)
         return depth.amax(1), nearest * torch.where(body < 0, -1, 1).to(body.dtype)
 
     def extents(self) -> dict[str, Any]:
