@@ -307,6 +307,13 @@ def test_scale_and_legend_are_drawn():
         assert difference[650:, :300].sum() > 100  # time stamp
 
 
+def test_line_over_a_three_dimensional_picture(plain):
+    ends = np.array([[0.1, 0.5, 0.5], [0.9, 0.5, 0.5]])
+    image = plain.frame(np.zeros((0, 3)), overlays=[(ends, "red", "")])
+    column, row = plain.project(ends.mean(axis=0)[None])[0].astype(int)
+    assert tuple(image[row, column]) == (255, 0, 0)
+
+
 def test_wrong_arguments_are_named():
     for arguments, message in [
         ({"bounds": ((0, 0), (1, 0))}, "bounds must be .lower, upper. with lower < upper"),

@@ -15,7 +15,7 @@ from .camera import framing, light_directions
 from .cloud import rest_spacing
 from .colors import PLAIN, QUANTITIES, Quantity, map_colors, material_colors, numpy_of, scalar_of, value_range
 from .ground import Ground
-from .requires import RenderError
+from .requires import RenderError, require
 from .scene2d import Overlay, Scene2D
 from .scene3d import Scene3D, window_class
 from .shapes import Array, Shape, vector
@@ -184,11 +184,10 @@ class Renderer:
         return write_text(image, stamp, "bottom left") if stamp else image
 
     def _draw_lines(self, image: Array, overlays: Sequence[Overlay]) -> Array:
-        from PIL import Image, ImageDraw
-
-        pil = Image.fromarray(image)
+        pil = require("PIL.Image").fromarray(image)
+        pen = require("PIL.ImageDraw").Draw(pil)
         for points, color, _ in overlays:
-            ImageDraw.Draw(pil).line([tuple(p) for p in self.project(points)], fill=color, width=3)
+            pen.line([tuple(p) for p in self.project(points)], fill=color, width=3)
         return np.array(pil)
 
 
