@@ -78,7 +78,7 @@ def create(path: Path, layout: Layout) -> None:
     h5py = h5py_module()
     building = path.with_suffix(".building")
     try:
-        with h5py.File(building, "w") as out:
+        with h5py.File(building, "w", libver="v110") as out:
             for name, (shape, dtype) in layout.fields.items():
                 _reserve(h5py, out, name, (layout.frames, layout.particles, *shape), dtype)
             for name, (shape, dtype) in layout.scalars.items():

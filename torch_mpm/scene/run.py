@@ -22,10 +22,10 @@ from torch import Tensor
 
 from ..errors import SimulationError
 from ..state import State
-from ..trajectory import COMPLETE, PARTIAL, Layout, TrajectoryWriter, create
+from ..trajectory import COMPLETE, PARTIAL, Layout, TrajectoryWriter, create, h5py_module
 from . import checkpoint
 from .build import Built
-from .diagnose import Failure, SceneFailure, replay, wrong
+from .diagnose import SceneFailure, replay, wrong
 from .explain import SceneError
 from .scene import Scene
 from .writer import FrameWriter
@@ -86,6 +86,7 @@ def run(
     """
     begin = time.perf_counter()
     folder = Path(out)
+    h5py_module()
     fingerprint = scene.fingerprint()
     _claim(folder, fingerprint, resume)
     built = scene.build()
@@ -95,10 +96,13 @@ def run(
         writer = simulation.open(folder)
         try:
             simulation.run(writer, progress, stop)
+        except SceneFailure as failure:
+            path = _save_last_good(folder, simulation.state, failure)
+            raise SceneFailure(f"{failure}\nThe state before it is in {path}.", failure.failure) from None
         finally:
             writer.close()
     summary = simulation.summary(writer, time.perf_counter() - begin)
-    _write_json(folder / RUN, {**_read_json(folder / RUN), "summary": summary})
+    record_summary(folder, summary)
     (folder / CHECKPOINT).unlink(missing_ok=True)
     return summary
 
@@ -122,7 +126,7 @@ class Simulation:
         dim, dtype = self.scene.dim, str(self.state.x.numpy(force=True).dtype)
         vector = ((dim,), dtype)
         fields = {"position": vector, "velocity": vector}
-        fields |= {name: ((dim,) * FIELD_SHAPES[name], dtype) for name in self.scene.output.fields}
+        fields |= {name: ((dim,) * FIELD_SHAPES[name], dtype) for name in self.scene.trajectory_fields}
         number = ((), "f8")
         scalars = dict.fromkeys(("time", "kinetic_energy", "elastic_energy", "potential_energy", "cfl"), number)
         counts = dict.fromkeys(("particles", "substeps"), ((), "i8"))
@@ -202,7 +206,7 @@ class Simulation:
         assert state.ids is not None
         order = torch.argsort(state.ids)
         fields = {"position": state.x, "velocity": state.v}
-        for name in self.scene.output.fields:
+        for name in self.scene.trajectory_fields:
             value = self.step.law.stress(_with_C(state)) if name == "stress" else getattr(state, name)
             if value is None and name == "C":
                 value = _with_C(state).C
@@ -342,7 +346,7 @@ def versions() -> dict[str, str]:
         own = metadata.version("torch-mpm")
     except metadata.PackageNotFoundError:
         own = "unknown"
-    return {"torch_mpm": own, "torch": torch.__version__, "python": platform.python_version()}
+    return {"torch_mpm": own, "torch": str(torch.__version__), "python": platform.python_version()}
 
 
 # ---- the folder
@@ -429,9 +433,27 @@ def _write_json(path: Path, values: dict[str, Any]) -> None:
     building.replace(path)
 
 
-def save_failure(folder: Path, state: State, failure: Failure | None) -> Path:
+def _save_last_good(folder: Path, state: State, failure: SceneFailure) -> Path:
     """Keep the last good state of a run that failed."""
     path = folder / LAST_GOOD
-    record = {"time": float(state.time), "failure": str(failure or "")}
+    record = {"time": float(state.time), "failure": str(failure)}
     checkpoint.save(path, {k: v.cpu() for k, v in checkpoint.tensors_of(state).items()}, record)
     return path
+
+
+def record_summary(folder: Path, summary: dict[str, Any]) -> None:
+    """Keep the summary of a run beside its scene in run.json."""
+    _write_json(folder / RUN, {**_read_json(folder / RUN), "summary": summary})
+
+
+def load_run(folder: str | Path, overrides: list[str] | None = None) -> Scene:
+    """The scene of a run folder, with overrides as for :meth:`Scene.load`.
+
+    Raises:
+        FileNotFoundError: when the folder holds no run.
+    """
+    path = Path(folder) / RUN
+    if not path.is_file():
+        raise FileNotFoundError(f"there is no run in {folder}")
+    record = _read_json(path)
+    return Scene.from_words(record["scene"], overrides, Path(record["folder"]))

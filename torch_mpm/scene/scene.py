@@ -73,12 +73,17 @@ class Scene(schema.SceneData):
         except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
             raise SceneError([f"not a TOML file: {error}"], str(path)) from None
         try:
-            for override in overrides or []:
-                _override(words, override)
-            scene = cls(**words)
+            return cls.from_words(words, overrides, path.parent)
         except SceneError as error:
             raise SceneError(error.problems, str(path)) from None
-        scene._folder = path.parent
+
+    @classmethod
+    def from_words(cls, words: dict[str, Any], overrides: list[str] | None = None, folder: Path = Path()) -> Scene:
+        """A scene from nested dictionaries; ``folder`` is where relative file names start."""
+        for override in overrides or []:
+            _override(words, override)
+        scene = cls(**words)
+        scene._folder = folder
         return scene
 
     @property
@@ -98,6 +103,14 @@ class Scene(schema.SceneData):
     def time_of(self, frame: int) -> float:
         """Time of a frame [s]; the last one is at ``duration`` exactly."""
         return self.duration * frame / self.frames
+
+    @property
+    def trajectory_fields(self) -> list[str]:
+        """Fields of the trajectory beside position and velocity: those asked for, and what the other outputs need."""
+        drawn = self.render.color_by if self.render else ""
+        needed = {name for name in ("stress", "temperature") if name == drawn}
+        needed |= {"stress"} if self.output.vtk else set()
+        return [name for name in ("F", "J", "C", "stress", "temperature") if name in {*self.output.fields, *needed}]
 
     def torch_device(self) -> torch.device:
         """Raises SceneError for a device that is not there."""
@@ -133,7 +146,7 @@ class Scene(schema.SceneData):
     def fingerprint(self) -> str:
         """Hash of all that decides the trajectory, files included."""
         digest = hashlib.sha256(self.model_dump_json(exclude=COSMETIC).encode())
-        digest.update(json.dumps(self.output.fields).encode())
+        digest.update(json.dumps(self.trajectory_fields).encode())
         for entry in self.entries():
             for body in entry.body:
                 if isinstance(body, (schema.MeshBody, schema.PointsBody)):

@@ -1,0 +1,255 @@
+"""The command line: ``torch-mpm run SCENE -o DIR``, check, info, schema, render, export."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line; returns the exit status: 0, 1 for a problem (told on stderr), 130 when interrupted."""
+    options = _parser().parse_args(arguments)
+    try:
+        options.command(options)
+    except KeyboardInterrupt:
+        return _told("interrupted", 130)
+    except (ValueError, OSError, ImportError, RuntimeError) as error:
+        if not _expected(error):
+            raise
+        return _told(str(error), 130 if type(error).__name__ == "Interrupted" else 1)
+    return 0
+
+
+def _expected(error: Exception) -> bool:
+    """Errors whose message is for the user. Others are defects, whose traceback should be seen."""
+    names = {"SceneError", "OutputError", "SceneFailure", "Interrupted", "RenderError", "GridOverflowError"}
+    return type(error).__name__ in names or isinstance(error, (FileNotFoundError, PermissionError, ImportError))
+
+
+def _told(message: str, status: int) -> int:
+    print(f"torch-mpm: {message}", file=sys.stderr)
+    return status
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser("torch-mpm", description="Material Point Method scenes: simulate, draw, export.")
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+
+    run = commands.add_parser("run", help="simulate a scene file")
+    _scene_arguments(run)
+    run.add_argument("-o", "--out", required=True, type=Path, help="folder for the results")
+    run.add_argument("--resume", action="store_true", help="go on with an unfinished run")
+    run.add_argument("--quiet", action="store_true", help="no progress bar")
+    run.set_defaults(command=_run)
+
+    check = commands.add_parser("check", help="check a scene file without simulating it")
+    _scene_arguments(check)
+    check.set_defaults(command=_check)
+
+    info = commands.add_parser("info", help="what a scene uses and takes; without a scene, what this installation can do")
+    _scene_arguments(info, optional=True)
+    info.set_defaults(command=_info)
+
+    schema = commands.add_parser("schema", help="print the JSON schema of scene files, for editors")
+    schema.set_defaults(command=_schema)
+
+    render = commands.add_parser("render", help="draw the pictures and the video of a run again")
+    render.add_argument("run", type=Path, help="folder of a run")
+    _set_argument(render, "render.color_by=stress")
+    render.set_defaults(command=_render)
+
+    export = commands.add_parser("export", help="write a run for other programs")
+    export.add_argument("run", type=Path, help="folder of a run")
+    export.add_argument("--vtk", action="store_true", help="VTK files for ParaView, in DIR/vtk")
+    export.add_argument("--ply", action="store_true", help="PLY point clouds, in DIR/ply")
+    export.set_defaults(command=_export)
+    return parser
+
+
+def _scene_arguments(parser: argparse.ArgumentParser, optional: bool = False) -> None:
+    parser.add_argument("scene", type=Path, help="scene file (TOML)", nargs="?" if optional else None)
+    _set_argument(parser, "grid.dx=0.01")
+
+
+def _set_argument(parser: argparse.ArgumentParser, example: str) -> None:
+    text = f"override a key of the scene, such as {example}"
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="overrides", help=text)
+
+
+# ---- commands
+
+
+def _run(options: argparse.Namespace) -> None:
+    from .scene import Scene
+    from .scene.diagnose import SceneFailure
+    from .scene.run import Interrupted, run
+
+    begin = time.perf_counter()
+    scene = Scene.load(options.scene, options.overrides)
+    _require_outputs(scene)
+    bar = None if options.quiet else _Bar()
+    source = options.scene.read_text()
+    try:
+        summary = run(scene, options.out, resume=options.resume, source=source, progress=bar)
+    except (SceneFailure, Interrupted):
+        if bar is not None:
+            bar.close()
+        raise
+    if bar is not None:
+        bar.close()
+    seconds = summary["seconds"]
+    files = {"trajectory": options.out / "trajectory.h5"}
+    for name, make in _outputs(scene, options):
+        since = time.perf_counter()
+        files[name] = make()
+        seconds[name] = time.perf_counter() - since
+    seconds["total"] = time.perf_counter() - begin
+    _write_summary(options.out, summary)
+    _print_summary(summary, files)
+
+
+def _require_outputs(scene: Any) -> None:
+    """A package that is missing is noticed before the simulation, not after it."""
+    if scene.render is not None:
+        from . import render
+        from .render.requires import require
+
+        assert render
+        for module in ("matplotlib", "PIL", "imageio_ffmpeg", *(["vtk"] if scene.dim == 3 else [])):
+            require(module)
+    if scene.output.vtk or scene.output.ply:
+        from .export import meshio_module
+
+        meshio_module()
+
+
+def _outputs(scene: Any, options: argparse.Namespace) -> list[tuple[str, Any]]:
+    from . import export
+
+    outputs: list[tuple[str, Any]] = []
+    if scene.render is not None:
+        outputs.append(("pictures", lambda: _draw(options.out, scene, options.quiet)))
+    if scene.output.vtk:
+        outputs.append(("VTK", lambda: export.export_vtk(options.out)))
+    if scene.output.ply:
+        outputs.append(("PLY", lambda: export.export_ply(options.out)))
+    return outputs
+
+
+def _draw(folder: Path, scene: Any, quiet: bool) -> Path:
+    from .scene.pictures import draw
+
+    if quiet:
+        return draw(folder, scene)[-1]
+    with _tqdm()(desc="pictures", unit="frame", total=scene.frames + 1) as bar:
+
+        def progress(k: int, frames: int) -> None:
+            bar.update(k + 1 - bar.n)
+
+        return draw(folder, scene, progress)[-1]
+
+
+def _check(options: argparse.Namespace) -> None:
+    from .scene import Scene
+
+    scene = Scene.load(options.scene, options.overrides)
+    built = scene.build("cpu")
+    print(f"{options.scene}: good, {built.particles} particles in {len(built.scenes)} scene(s), {scene.frames + 1} frames")
+
+
+def _info(options: argparse.Namespace) -> None:
+    if options.scene is None:
+        from .info import print_info
+
+        print_info()
+        return
+    from .scene import Scene
+    from .scene.describe import describe
+
+    scene = Scene.load(options.scene, options.overrides)
+    for key, value in describe(scene, scene.build()).items():
+        print(f"{key:>24}  {_shown(value)}")
+
+
+def _schema(options: argparse.Namespace) -> None:
+    from .scene import json_schema
+
+    print(json.dumps(json_schema(), indent=1))
+
+
+def _render(options: argparse.Namespace) -> None:
+    from .scene.run import load_run
+
+    print(_draw(options.run, load_run(options.run, options.overrides), quiet=False))
+
+
+def _export(options: argparse.Namespace) -> None:
+    from . import export
+
+    if options.vtk or not options.ply:
+        print(export.export_vtk(options.run))
+    if options.ply:
+        print(export.export_ply(options.run))
+
+
+# ---- telling
+
+
+def _tqdm() -> Any:
+    try:
+        from tqdm import tqdm
+    except ImportError as error:
+        raise ImportError("the progress bar needs tqdm: pip install torch-mpm[scene], or use --quiet") from error
+    return tqdm
+
+
+class _Bar:
+    """Progress bar of a run; knows the number of frames from the first report."""
+
+    def __init__(self) -> None:
+        self._make = _tqdm()
+        self._bar: Any = None
+
+    def __call__(self, figures: dict[str, Any]) -> None:
+        if self._bar is None:
+            self._bar = self._make(total=figures["frames"], initial=figures["frame"] - 1, unit="frame")
+        self._bar.set_postfix_str(
+            f"{figures['substeps']} substeps, {figures['rate'] / 1e6:.2f} M particles/s, "
+            f"kinetic {figures['kinetic_energy']:.4g} J, elastic {figures['elastic_energy']:.4g} J",
+            refresh=False,
+        )
+        self._bar.update()
+
+    def close(self) -> None:
+        if self._bar is not None:
+            self._bar.close()
+
+
+def _write_summary(folder: Path, summary: dict[str, Any]) -> None:
+    from .scene.run import record_summary
+
+    record_summary(folder, summary)
+
+
+def _print_summary(summary: dict[str, Any], files: dict[str, Path]) -> None:
+    energy = summary["energy"]
+    print(f"{summary['frames'] + 1} frames, {summary['particles']} particles, {summary['substeps']} substeps")
+    for name, value in summary["seconds"].items():
+        print(f"{name:>24}  {value:.1f} s")
+    print(f"{'energy':>24}  {energy['first']:.6g} J at the start, {energy['last']:.6g} J at the end")
+    print(f"{'mass drift':>24}  {summary['mass_drift']:.1e}")
+    print(f"{'largest CFL number':>24}  {summary['largest_cfl']:.3f}")
+    print(f"{'particles lost':>24}  {summary['particles_lost'] or 'none'}")
+    for name, path in files.items():
+        print(f"{name:>24}  {path}")
+
+
+def _shown(value: Any) -> str:
+    if isinstance(value, dict):
+        return ", ".join(f"{k} {v}" for k, v in value.items()) or "none"
+    return f"{value:.4g}" if isinstance(value, float) else str(value)

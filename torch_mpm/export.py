@@ -1,0 +1,98 @@
+"""Trajectories in the formats of other programs: VTK for ParaView, PLY point clouds."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+
+from .trajectory import Array, Trajectory, find
+
+
+def export_vtk(run: str | Path, out: str | Path | None = None) -> Path:
+    """Write every frame as ``frame_00000.vtu`` with all its fields (stress as 3 x 3), and ``run.pvd`` with their times.
+
+    Args:
+        run: run folder or trajectory file.
+        out: folder; ``vtk`` beside the trajectory by default.
+
+    Returns:
+        The .pvd file, which ParaView opens.
+
+    Raises:
+        FileNotFoundError: when there is no trajectory.
+        ImportError: when meshio is missing (extra ``data``).
+    """
+    folder = _folder(run, out, "vtk")
+    collection = ElementTree.Element("VTKFile", type="Collection", version="0.1")
+    listing = ElementTree.SubElement(collection, "Collection")
+    with Trajectory(run) as trajectory:
+        for k, frame in enumerate(trajectory):
+            name = f"frame_{k:05d}.vtu"
+            count = len(frame["position"])
+            data = {key: _three_dimensional(value) for key, value in _per_particle(frame).items()}
+            cells = [("vertex", np.arange(count)[:, None])]
+            _write(folder / name, _mesh(frame["position"], cells, {**data, "id": np.arange(count)}), {})
+            ElementTree.SubElement(listing, "DataSet", timestep=f"{float(frame['time']):.9g}", file=name)
+    index = folder / "run.pvd"
+    ElementTree.ElementTree(collection).write(index, xml_declaration=True)
+    return index
+
+
+def export_ply(run: str | Path, out: str | Path | None = None) -> Path:
+    """Write every frame as a binary point cloud ``frame_00000.ply`` with velocity and speed; returns their folder.
+
+    Arguments and errors as for :func:`export_vtk`.
+    """
+    folder = _folder(run, out, "ply")
+    with Trajectory(run) as trajectory:
+        for k, frame in enumerate(trajectory):
+            velocity = _three_dimensional(frame["velocity"])
+            data = {f"v{axis}": velocity[:, i] for i, axis in enumerate("xyz")}
+            data["speed"] = np.linalg.norm(velocity, axis=1).astype(velocity.dtype)
+            _write(folder / f"frame_{k:05d}.ply", _mesh(frame["position"], [], data), {"binary": True})
+    return folder
+
+
+def _folder(run: str | Path, out: str | Path | None, name: str) -> Path:
+    folder = find(run).parent / name if out is None else Path(out)
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder
+
+
+def meshio_module() -> Any:
+    try:
+        import meshio
+    except ImportError as error:
+        raise ImportError("VTK and PLY files need meshio: pip install torch-mpm[data]") from error
+    return meshio
+
+
+def _mesh(position: Array, cells: list[Any], data: dict[str, Array]) -> Any:
+    return meshio_module().Mesh(_three_dimensional(position), cells, point_data=data)
+
+
+def _write(path: Path, mesh: Any, options: dict[str, Any]) -> None:
+    """The file appears whole."""
+    building = path.with_name(f".{path.name}")
+    try:
+        meshio_module().write(building, mesh, file_format=path.suffix[1:], **options)
+        os.replace(building, path)
+    except BaseException:
+        building.unlink(missing_ok=True)
+        raise
+
+
+def _per_particle(frame: dict[str, Array]) -> dict[str, Array]:
+    count = len(frame["position"])
+    fields = {name: value for name, value in frame.items() if np.ndim(value) and len(value) == count}
+    return {name: value for name, value in fields.items() if name not in ("position", "momentum")}
+
+
+def _three_dimensional(value: Array) -> Array:
+    """[P, 2] and [P, 2, 2] filled up with zeros, as both formats are three-dimensional; tensors as rows of 9 numbers."""
+    padding = [(0, 0)] + [(0, 3 - n) for n in value.shape[1:]]
+    return np.pad(value, padding).reshape(len(value), *([-1] if value.ndim > 1 else []))

@@ -1,0 +1,76 @@
+"""What a scene will use and take: for `torch-mpm check` and `torch-mpm info SCENE`."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ..state import State
+from .build import Built
+from .run import Simulation, joined
+from .scene import Scene
+
+TRIAL_STEPS = 3
+
+
+def describe(scene: Scene, built: Built) -> dict[str, Any]:
+    """Fields in use with their bytes per particle, estimated time step and run time, and size of the trajectory.
+
+    The run time is that of a few substeps of the first state, times the number of substeps that its stability limit asks for.
+    """
+    state = _with_matter(built)
+    dt = float(built.step.stable_dt(state, scene.cfl).min()) if scene.dt is None else scene.dt
+    substeps = max(scene.frames, round(scene.duration / dt))
+    after, seconds = _trial(built, state, dt)
+    growth = built.particles / max(1, len(state))
+    materials = {m.name: m.words.law for m in built.materials}
+    return {
+        "title": scene.title or "(none)",
+        "dimension": scene.dim,
+        "scenes": len(built.scenes),
+        "device": str(state.x.device),
+        "precision": scene.precision,
+        "particles": built.particles,
+        "mass [kg]": float(built.statics()["mass"].double().sum()),
+        "materials": materials,
+        "obstacles": len(built.step.boundaries),
+        "emitters": len(built.nozzles),
+        "fields": _bytes_of(after),
+        "bytes per particle": sum(_bytes_of(after).values()),
+        "frames": scene.frames + 1,
+        "time step [s]": dt,
+        "substeps": substeps,
+        "estimated run time [s]": seconds * substeps * (1 + growth) / 2,
+        "trajectory [MB]": Simulation(scene, built).layout("", "").bytes / 1e6,
+    }
+
+
+def _with_matter(built: Built) -> State:
+    """The first state, or for a scene that only pours its first layer."""
+    state = built.state
+    if len(state) == 0 and built.nozzles:
+        layer = built.nozzles[0].layer
+        state = joined(state, layer.replace(ids=torch.arange(len(layer), device=layer.x.device)))
+    return state
+
+
+@torch.no_grad()
+def _trial(built: Built, state: State, dt: float) -> tuple[State, float]:
+    state = built.step(state.sorted(built.grid), dt)
+    begin = time.perf_counter()
+    for _ in range(TRIAL_STEPS):
+        state = built.step(state, dt)
+    built.step.check()  # also waits for the device
+    seconds = (time.perf_counter() - begin) / TRIAL_STEPS
+    built.step.reset()
+    return state, seconds
+
+
+def _bytes_of(state: State) -> dict[str, int]:
+    fields = {f.name: getattr(state, f.name) for f in dataclasses.fields(state) if f.name != "time"}
+    tensors = {name: value for name, value in fields.items() if isinstance(value, Tensor)}
+    return {name: t[0].numel() * t.element_size() if len(t) else 0 for name, t in tensors.items()}

@@ -1,0 +1,160 @@
+"""Pictures and video of a run, from its trajectory."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..trajectory import Array, Trajectory
+from . import schema
+from .build import obstacle
+from .scene import Scene
+
+FOLDER, VIDEO = "frames", "video.mp4"
+SAMPLES = 8
+"""Frames that decide the colour scale of a run."""
+
+
+def draw(folder: str | Path, scene: Scene, progress: Any = None) -> list[Path]:
+    """Draw the trajectory in ``folder`` as ``scene.render`` says: frames/00000.png, ..., and video.mp4.
+
+    Pictures that exist already are kept. Returns the files made; calls ``progress(frame, frames)`` after each picture.
+
+    Raises:
+        FileNotFoundError: when there is no trajectory.
+        ImportError: when a package of the extra ``render`` is missing.
+    """
+    from ..render import assemble_video, write_png
+
+    words = scene.render or schema.Render()
+    target = Path(folder) / FOLDER
+    target.mkdir(exist_ok=True)
+    with Trajectory(folder) as trajectory:
+        numbers = range(0, len(trajectory), words.every)
+        paths = [target / f"{k:05d}.png" for k in numbers]
+        artist = _Artist(scene, words, trajectory)
+        for k, path in zip(numbers, paths, strict=True):
+            if not path.exists():
+                write_png(path, artist.picture(trajectory.frame(k)))
+            if progress is not None:
+                progress(k, len(trajectory))
+        artist.close()
+    if not words.video:
+        return paths
+    video = Path(folder) / VIDEO
+    assemble_video(paths, video, scene.frames / scene.duration / words.every)
+    return [*paths, video]
+
+
+class _Artist:
+    """One renderer per scene of the batch, with one colour scale."""
+
+    def __init__(self, scene: Scene, words: schema.Render, trajectory: Trajectory) -> None:
+        from ..render import Renderer
+
+        self.scene, self.words = scene, words
+        self.entries = scene.entries()
+        self.columns = math.ceil(math.sqrt(len(self.entries)))
+        self.names = trajectory.names("material")
+        width, height = words.resolution
+        limits = words.range or self._limits(trajectory)
+        self.renderers = [
+            Renderer(
+                (scene.grid.lower, scene.grid.upper),
+                (width // self.columns, height // self.columns),
+                words.color_by,
+                limits,
+                gravity=entry.gravity if scene.dim == 3 else None,
+                style=words.style,
+                materials=self.names,
+                azimuth=words.azimuth,
+                elevation=words.elevation,
+                view=words.view,
+            )
+            for entry in self.entries
+        ]
+
+    def picture(self, frame: dict[str, Array]) -> Array:
+        """One frame, all scenes of the batch side by side."""
+        from ..render import contact_sheet
+
+        time = float(frame["time"])
+        pictures = [self._one(k, frame, time) for k in range(len(self.entries))]
+        return pictures[0] if len(pictures) == 1 else contact_sheet(pictures, self.columns, self.words.resolution[0])
+
+    def _one(self, k: int, frame: dict[str, Array], time: float) -> Array:
+        entry = self.entries[k]
+        rows = frame["scene"] == k if "scene" in frame else slice(None)
+        overlays = list(_ritter(self.scene, self.words.ritter, time)) if self.words.ritter else []
+        return self.renderers[k].frame(
+            frame["position"][rows],
+            self._values(frame)[rows],
+            obstacles=list(_obstacles(entry.obstacle, self.scene, time)),
+            overlays=overlays,
+            time=time,
+            title=entry.name or self.scene.title,
+        )
+
+    def _values(self, frame: dict[str, Array]) -> Array:
+        return frame["velocity" if self.words.color_by == "speed" else self.words.color_by]
+
+    def _limits(self, trajectory: Trajectory) -> tuple[float, float] | None:
+        """Range of the colours over some frames of the run."""
+        from ..render.colors import QUANTITIES, scalar_of, value_range
+
+        if self.words.color_by == "material":
+            return None
+        numbers = np.linspace(0, len(trajectory) - 1, SAMPLES).round().astype(int)
+        frames = [self._values(trajectory.frame(int(k))) for k in numbers]
+        values = np.concatenate([scalar_of(self.words.color_by, f, len(f)) for f in frames])
+        return value_range(values, QUANTITIES[self.words.color_by].from_zero)
+
+    def close(self) -> None:
+        for renderer in self.renderers:
+            renderer.close()
+
+
+def _obstacles(words: Sequence[Any], scene: Scene, time: float) -> Iterator[Any]:
+    """The obstacles that are there at a time, at their poses."""
+    size = float(np.linalg.norm(np.subtract(scene.grid.upper, scene.grid.lower)))
+    for item in words:
+        if not item.start <= time < (math.inf if item.end is None else item.end):
+            continue
+        shape, pose = _shape(item, size), obstacle(item, None).pose(time)
+        yield shape.posed(pose.centre.numpy(), pose.rotation.numpy() @ shape.rotation)
+
+
+def _shape(item: Any, size: float) -> Any:
+    from ..render import shapes
+
+    if isinstance(item, schema.PlaneObstacle):
+        return shapes.plane(item.center, item.normal, size)
+    if isinstance(item, schema.BoxObstacle):
+        return shapes.box(item.center, item.size)
+    if isinstance(item, schema.SphereObstacle):
+        return shapes.sphere(item.center, item.radius)
+    return shapes.capsule(item.a, item.b, item.radius)
+
+
+def ritter_front(scene: Scene, words: schema.Ritter, time: float) -> float:
+    """Front of a dam break on a dry bed, x0 + 2 sqrt(g h0) t (Ritter 1892) [m]."""
+    return words.dam + 2 * math.sqrt(_gravity(scene) * words.depth) * time
+
+
+def _gravity(scene: Scene) -> float:
+    return float(np.linalg.norm(scene.gravity or (0.0,)))
+
+
+def _ritter(scene: Scene, words: schema.Ritter, time: float) -> Iterator[tuple[Array, str, str]]:
+    """Depth h = (2 c - (x - x0) / t)^2 / (9 g) between x0 - c t and the front, with c = sqrt(g h0)."""
+    floor, (low, high) = scene.grid.lower[1], (scene.grid.lower[0], scene.grid.upper[0])
+    c = math.sqrt(_gravity(scene) * words.depth)
+    x = np.linspace(words.dam - c * time, ritter_front(scene, words, time), 128)
+    depth = (2 * c - (x - words.dam) / time) ** 2 / (9 * _gravity(scene)) if time > 0 else np.full(128, words.depth)
+    x, depth = np.append(np.insert(x, 0, low), x[-1]), np.append(np.insert(depth, 0, words.depth), 0.0)
+    seen = (x >= low) & (x <= high)
+    yield np.stack([x, floor + depth], 1)[seen], "#d62728", "Ritter 1892"
