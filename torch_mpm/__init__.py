@@ -1,5 +1,7 @@
 """torch_mpm: differentiable Material Point Method operators for PyTorch."""
 
+from typing import TYPE_CHECKING, Any
+
 from . import _library as _library
 from . import ops, seed
 from .boundaries import SDF, Box, Capsule, Plane, Sphere, Walls
@@ -10,6 +12,10 @@ from .materials import CustomLaw, Material, Mixture, NeoHookean, WeaklyCompressi
 from .ops import advance, g2p, gather, grid_update, p2g, scatter
 from .state import State
 from .step import Step, rollout
+from .trajectory import Trajectory
+
+if TYPE_CHECKING:
+    from .scene import Scene as Scene
 
 __all__ = [
     "SDF",
@@ -27,6 +33,7 @@ __all__ = [
     "Sphere",
     "State",
     "Step",
+    "Trajectory",
     "Walls",
     "WeaklyCompressible",
     "advance",
@@ -40,3 +47,12 @@ __all__ = [
     "seed",
     "stable_dt",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    """`Scene` needs the extra `scene`, so it is imported where it is used."""
+    if name == "Scene":
+        from .scene import Scene
+
+        return Scene
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
