@@ -267,6 +267,15 @@ def test_colour_scale_ends_and_clipping():
     assert np.array_equal(rgb[4], [128, 128, 128])
 
 
+def test_range_of_a_frame():
+    values = np.append(np.linspace(100, 200, 1001), [np.nan, np.inf])
+    assert colors.value_range(values, from_zero=False) == pytest.approx((101, 199))
+    assert colors.value_range(values, from_zero=True) == pytest.approx((0, 199))
+    assert colors.value_range(np.zeros(5), from_zero=True) == (0, 1)
+    assert colors.value_range(np.full(5, 300.0), from_zero=False) == pytest.approx((300, 300.3))
+    assert colors.value_range(np.array([np.nan]), from_zero=False) == (0, 1)
+
+
 def test_scalars_of_vectors_and_tensors():
     v = np.array([[3.0, 4.0, 0.0]])
     assert colors.scalar_of("speed", v, 1) == pytest.approx([5.0])

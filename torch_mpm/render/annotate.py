@@ -24,8 +24,13 @@ def figure(resolution: tuple[int, int]) -> Any:
 
 
 def font_size(resolution: tuple[int, int]) -> float:
-    """Points, so that text keeps its share of the picture."""
-    return 12.0 * min(resolution[1] / 720, resolution[0] / 1000)
+    """Points: text keeps its share of the picture down to what can be read."""
+    return max(12.0 * min(resolution[1] / 720, resolution[0] / 1000), 7.0)
+
+
+def scale_width(resolution: tuple[int, int]) -> float:
+    """Share of the width that a colour bar with its numbers and label takes."""
+    return 7.2 * font_size(resolution) * DPI / 72 / resolution[0]
 
 
 def add_scale(target: Any, axes: Any, quantity: Quantity, limits: tuple[float, float], cmap: str, size: float) -> None:
@@ -63,7 +68,7 @@ def scale_overlay(
     fig, size = figure(resolution), font_size(resolution)
     fig.patch.set_alpha(0)
     if limits is not None:
-        add_scale(fig, fig.add_axes((0.905, 0.24, 0.014, 0.52)), quantity, limits, cmap, size)
+        add_scale(fig, fig.add_axes((1 - scale_width(resolution), 0.24, 0.014, 0.52)), quantity, limits, cmap, size)
     elif names:
         fig.legend(
             handles=material_handles(names), loc="center right", frameon=False, fontsize=1.1 * size, labelcolor=INK

@@ -64,13 +64,13 @@ def scalar_of(color_by: str, values: Array, count: int) -> Array:
 
 
 def value_range(values: Array, from_zero: bool) -> tuple[float, float]:
-    """The range that holds 98 per cent of the finite values; (0, 1) without any."""
+    """The range that holds 98 per cent of the finite values; a little more than one value, (0, 1) without any."""
     finite = values[np.isfinite(values)]
     if finite.size == 0:
         return 0.0, 1.0
     low, high = (float(q) for q in np.percentile(finite, (1, 99)))
     low = 0.0 if from_zero else low
-    return (low, high) if high > low else (low, low + max(abs(low) * 1e-3, 1e-12))
+    return (low, high) if high > low else (low, low + (abs(low) * 1e-3 or 1.0))
 
 
 def map_colors(values: Array, limits: tuple[float, float], cmap: str) -> Array:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from .annotate import blend, scale_overlay, write_text
+from .annotate import blend, scale_overlay, scale_width, write_text
 from .camera import framing, light_directions
 from .cloud import rest_spacing
 from .colors import PLAIN, QUANTITIES, Quantity, map_colors, material_colors, numpy_of, scalar_of, value_range
@@ -92,7 +92,7 @@ class Renderer:
             self.scene = Scene2D(frame, self.resolution, self.has_scale)
         else:
             self.backend = _choose(backend)
-            fill = (0.80, 0.86) if color_by else (0.92, 0.86)
+            fill = (1 - 1.7 * scale_width(self.resolution) if color_by else 0.92, 0.86)
             up = _up(gravity)
             camera = framing(*frame, up, self.resolution, azimuth, elevation, fill=fill)
             plate = Ground(*self.bounds, up, -light_directions(camera)[0]) if ground else None

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from .annotate import DPI, INK, add_scale, figure, font_size, material_handles
+from .annotate import DPI, INK, add_scale, figure, font_size, material_handles, scale_width
 from .colors import Quantity
 from .requires import require
 from .shapes import Array, Shape
@@ -22,7 +22,9 @@ class Scene2D:
         self.figure, self.size = figure(resolution), font_size(resolution)
         self.resolution = resolution
         lower, upper = bounds
-        left, width, bottom, height = 0.075, (0.80 if scale else 0.90), 0.11, 0.78
+        left = 5 * self.size * DPI / 72 / resolution[0]
+        width = 0.97 - left - (scale_width(resolution) if scale else 0)
+        bottom, height = 0.11, 0.78
         aspect = (upper[1] - lower[1]) / (upper[0] - lower[0]) * resolution[0] / resolution[1]
         fitted = (width, width * aspect) if width * aspect <= height else (height / aspect, height)
         corner = (left + 0.5 * (width - fitted[0]), bottom + 0.5 * (height - fitted[1]))
