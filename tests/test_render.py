@@ -111,6 +111,8 @@ def test_pose_turns_counterclockwise():
     solid = shapes.mesh([[1.0, 0, 0], [2, 0, 0], [1, 0.1, 0]], [[0, 1, 2]])
     quarter = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
     assert np.allclose(solid.posed((5, 5, 0), quarter).world()[:2], [[5, 6, 0], [5, 7, 0]])
+    ball = shapes.sphere((1, 0, 0), 0.5).moved((0, 3, 0), quarter)
+    assert np.allclose(ball.world().mean(axis=0), [0, 4, 0])
 
 
 @pytest.mark.parametrize(
