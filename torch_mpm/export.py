@@ -93,6 +93,6 @@ def _per_particle(frame: dict[str, Array]) -> dict[str, Array]:
 
 
 def _three_dimensional(value: Array) -> Array:
-    """[P, 2] and [P, 2, 2] filled up with zeros, as both formats are three-dimensional; tensors as rows of 9 numbers."""
+    """[P, 2] and [P, 2, 2] filled up with zeros, as both formats have three dimensions; tensors as rows of 9."""
     padding = [(0, 0)] + [(0, 3 - n) for n in value.shape[1:]]
     return np.pad(value, padding).reshape(len(value), *([-1] if value.ndim > 1 else []))

@@ -1,13 +1,13 @@
-"""Trajectories on disk: one HDF5 file that any HDF5 program reads, written so that a kill at any moment cannot damage it.
+"""Trajectories on disk: one HDF5 file that any HDF5 program reads, which no kill at any moment can damage.
 
-All metadata and the room for all frames are written before the first frame; after that a frame is plain bytes at known
-offsets, followed by the number of whole frames. So the file is valid HDF5 at every moment, half a frame is never
+All metadata and the room for all frames are written before the first frame; after that a frame is plain bytes at
+known offsets, followed by the number of whole frames. So the file is valid HDF5 at every moment, half a frame is never
 counted, and a disk that is too small is noticed before the run starts. Until it is complete the file is called
 ``trajectory.partial.h5``.
 
-Layout: ``position``, ``velocity`` and the fields asked for are [T, N, ...], particle n being the one with id n; ``mass``,
-``volume``, ``material``, ``scene`` are [N]; ``time``, ``particles``, ``substeps``, the energies and ``momentum`` are
-[T] or [T, D]; ``frames_written`` is [1]. Particles that an emitter has not yet released are NaN.
+Layout: ``position``, ``velocity`` and the fields asked for are [T, N, ...], particle n being the one with id n;
+``mass``, ``volume``, ``material``, ``scene`` are [N]; ``time``, ``particles``, ``substeps``, the energies and
+``momentum`` are [T] or [T, D]; ``frames_written`` is [1]. Particles that an emitter has not yet released are NaN.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ STATICS = ("mass", "volume", "material", "scene")
 
 UNITS = {
     "position": "m", "velocity": "m/s", "F": "1", "J": "1", "stress": "Pa", "C": "1/s", "temperature": "K",
-    "mass": "kg", "volume": "m^3", "material": "index into the attribute names", "scene": "index into the attribute names",
+    "mass": "kg", "volume": "m^3", "material": "index into attribute names", "scene": "index into attribute names",
     "time": "s", "particles": "1", "substeps": "1", "kinetic_energy": "J", "elastic_energy": "J",
     "potential_energy": "J", "momentum": "kg m/s", "cfl": "1", "frames_written": "1",
 }  # fmt: skip
@@ -50,8 +50,8 @@ def h5py_module() -> Any:
 class Layout:
     """What a trajectory holds.
 
-    ``fields`` per particle and frame and ``scalars`` per frame map a name to (trailing shape, dtype); ``statics`` [N] are
-    the arrays that do not change; ``attributes`` are texts and numbers about the whole file.
+    ``fields`` per particle and frame and ``scalars`` per frame map a name to (trailing shape, dtype); ``statics`` [N]
+    are the arrays that do not change; ``attributes`` are texts and numbers about the whole file.
     """
 
     frames: int
@@ -157,7 +157,7 @@ class TrajectoryWriter:
 
 
 def _write_all(fd: int, data: Array, offset: int) -> None:
-    rest = memoryview(np.atleast_1d(data)).cast("B")
+    rest = memoryview(np.atleast_1d(data).view(np.uint8).reshape(-1))  # type: ignore[arg-type]
     while rest:
         written = os.pwrite(fd, rest, offset)
         rest, offset = rest[written:], offset + written
@@ -166,8 +166,8 @@ def _write_all(fd: int, data: Array, offset: int) -> None:
 class Trajectory:
     """A trajectory, complete or still growing: ``Trajectory("out/demo")`` or the path of an HDF5 file.
 
-    ``trajectory["position"]`` is the array [frames, N, D] of the frames written so far, ``trajectory.frame(k)`` one frame
-    without the particles that are still to come. Works as a context manager.
+    ``trajectory["position"]`` is the array [frames, N, D] of the frames written so far, ``trajectory.frame(k)`` one
+    frame without the particles that are still to come. Works as a context manager.
 
     Raises:
         FileNotFoundError: when there is no trajectory.

@@ -1,7 +1,7 @@
 """Scenes: from a scene file to a trajectory (`pip install torch-mpm[scene]`)."""
 
 try:
-    import pydantic as _pydantic
+    import pydantic as _pydantic  # noqa: F401
 except ImportError as error:
     raise ImportError("scene files need pydantic: pip install torch-mpm[scene]") from error
 

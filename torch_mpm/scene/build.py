@@ -39,7 +39,7 @@ class Nozzle:
 
 @dataclass(frozen=True)
 class Built:
-    """A scene ready to run. Materials are listed over all scenes; ``material`` [P] names those of the first particles."""
+    """A scene ready to run. ``materials`` are those of all scenes, ``material`` [P] those of the first particles."""
 
     grid: Grid
     step: Step
@@ -100,12 +100,16 @@ def build(scene: Any, device: torch.device) -> Built:
     if problems:
         raise SceneError(problems)
     dim = len(words.lower)
-    empty = seed.Points(torch.empty(0, dim, dtype=dtype), torch.empty(0, dtype=dtype), torch.empty(0, dtype=torch.int32))
+    empty = seed.Points(
+        torch.empty(0, dim, dtype=dtype), torch.empty(0, dtype=dtype), torch.empty(0, dtype=torch.int32)
+    )
     if not parts:
         parts, material = [State.at_rest(empty, dtype=dtype, device=device)], [torch.empty(0, dtype=torch.int32)]
     first = _complete(_join(parts), mixture, torch.cat(material), single=len(entries) == 1)
     nozzles = [
-        Nozzle(_complete(n.layer, mixture, torch.full((len(n.layer),), n.material), len(entries) == 1), n.material, n.times)
+        Nozzle(
+            _complete(n.layer, mixture, torch.full((len(n.layer),), n.material), len(entries) == 1), n.material, n.times
+        )
         for n in nozzles
     ]
     step = Step(
@@ -129,7 +133,7 @@ def build(scene: Any, device: torch.device) -> Built:
 class _Mixture:
     """Materials of all scenes, and the laws that serve them.
 
-    Materials of one law, at most one of them per scene, share one law whose parameters are per scene; otherwise each has its own.
+    Materials of one kind, at most one of them per scene, share one law whose parameters are per scene.
     """
 
     def __init__(self, entries: Sequence[Any]) -> None:
@@ -208,9 +212,7 @@ def shape_of(body: Any, folder: Path) -> seed.Shape | None:
     return None
 
 
-def _bodies(
-    scene: Any, entry: Any, path: str, problems: list[str]
-) -> list[tuple[Any, seed.Points, seed.Shape | None]]:
+def _bodies(scene: Any, entry: Any, path: str, problems: list[str]) -> list[tuple[Any, seed.Points, seed.Shape | None]]:
     placed = []
     for k, body in enumerate(entry.body):
         try:
@@ -294,7 +296,9 @@ def _nozzles(
             problems.append(f"{entry.path}emitter[{k}]{_called(words)}: {error}")
             continue
         if not _inside(scene.grid, points.x):
-            problems.append(f"{entry.path}emitter[{k}]{_called(words)}: the nozzle is outside the domain; move it inside")
+            problems.append(
+                f"{entry.path}emitter[{k}]{_called(words)}: the nozzle is outside the domain; move it inside"
+            )
         points = seed.Points(points.x, points.volume, torch.full((len(points),), index, dtype=torch.int32))
         layer = State.at_rest(points, density, words.velocity, torch.float64).to(device, dtype)
         nozzles.append(Nozzle(layer, mixture.number(index, words.material), times))
@@ -424,7 +428,8 @@ def _check_placement(scene: Any, entry: Any, placed: list[tuple[Any, seed.Points
             inside = int((distance < 0).sum())
             if inside:
                 problems.append(
-                    f"{path}: {inside} of its particles are inside {entry.path}obstacle[{k}]{_called(words)}; move one of them"
+                    f"{path}: {inside} of its particles are inside {entry.path}obstacle[{k}]{_called(words)}; "
+                    "move one of them"
                 )
 
 

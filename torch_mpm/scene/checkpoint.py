@@ -43,6 +43,6 @@ def load(path: Path, device: torch.device | str = "cpu") -> tuple[State, dict[st
     """The state that `save` wrote, in the memory order it had, and the record."""
     with h5py_module().File(path, "r") as source:
         record = json.loads(source.attrs["record"])
-        tensors = {name: torch.from_numpy(data[()]) for name, data in source.items()}
+        tensors: dict[str, Any] = {name: torch.from_numpy(data[()]) for name, data in source.items()}
     state = State.concatenate([State(**tensors, time=record["time"])])  # concatenate restores the memory layout
     return state.to(device), record

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import time
 from typing import Any
 
@@ -20,13 +21,13 @@ TRIAL_STEPS = 3
 def describe(scene: Scene, built: Built) -> dict[str, Any]:
     """Fields in use with their bytes per particle, estimated time step and run time, and size of the trajectory.
 
-    The run time is that of a few substeps of the first state, times the number of substeps that its stability limit asks for.
+    The run time is that of a few substeps with half of what emitters bring, times the number of substeps that the
+    stability limit of the first state asks for.
     """
-    state = _with_matter(built)
+    state = _halfway(built)
     dt = float(built.step.stable_dt(state, scene.cfl).min()) if scene.dt is None else scene.dt
     substeps = max(scene.frames, round(scene.duration / dt))
     after, seconds = _trial(built, state, dt)
-    growth = built.particles / max(1, len(state))
     materials = {m.name: m.words.law for m in built.materials}
     return {
         "title": scene.title or "(none)",
@@ -44,17 +45,17 @@ def describe(scene: Scene, built: Built) -> dict[str, Any]:
         "frames": scene.frames + 1,
         "time step [s]": dt,
         "substeps": substeps,
-        "estimated run time [s]": seconds * substeps * (1 + growth) / 2,
+        "estimated run time [s]": seconds * substeps,
         "trajectory [MB]": Simulation(scene, built).layout("", "").bytes / 1e6,
     }
 
 
-def _with_matter(built: Built) -> State:
-    """The first state, or for a scene that only pours its first layer."""
+def _halfway(built: Built) -> State:
+    """The first state and half of what the emitters bring, left where it appears."""
     state = built.state
-    if len(state) == 0 and built.nozzles:
-        layer = built.nozzles[0].layer
-        state = joined(state, layer.replace(ids=torch.arange(len(layer), device=layer.x.device)))
+    for nozzle in built.nozzles:
+        layer = State.concatenate([nozzle.layer] * math.ceil(len(nozzle.times) / 2))
+        state = joined(state, layer.replace(ids=len(state) + torch.arange(len(layer), device=layer.x.device)))
     return state
 
 

@@ -27,7 +27,8 @@ class Failure:
 
     def __str__(self) -> str:
         where = f"{self.scene}, " if self.scene else ""
-        return f"{where}step {self.step} (t = {self.time:.6g} s), particle {self.particle}: {self.quantity}.\n{self.advice}"
+        when = f"step {self.step} (t = {self.time:.6g} s)"
+        return f"{where}{when}, particle {self.particle}: {self.quantity}.\n{self.advice}"
 
 
 class SceneFailure(SimulationError):
@@ -71,7 +72,10 @@ def _described(step: Step, state: State, row: int, name: str) -> str:
         if state.J is not None and "J" in step.law.state_fields and volume == 1:
             volume, what = float(state.J[row]), "its volume ratio is not positive: J"
     else:
-        volume, what = float(state.J[row]) if state.J is not None else float("nan"), "its volume ratio is not positive: J"
+        volume, what = (
+            float(state.J[row]) if state.J is not None else float("nan"),
+            "its volume ratio is not positive: J",
+        )
     return f"{what} = {volume:.4g}" if volume <= 0 else f"its deformation is beyond the law: volume ratio {volume:.4g}"
 
 
@@ -102,8 +106,11 @@ def _advice(quantity: str, dt: float, limit: float) -> str:
             f"use dt = {0.5 * limit:.2g}, or leave dt out and set cfl = 0.5."
         )
     if "left the domain" in quantity:
-        return "Likely cause: an open wall, or an emitter or obstacle that pushes outwards; enlarge the domain or close its walls."
+        return (
+            "Likely cause: an open wall, or an emitter or obstacle that pushes outwards; "
+            "enlarge the domain or close its walls."
+        )
     return (
-        f"The time step {dt:.3g} s was below the stability limit {limit:.3g} s. Likely cause: an impact that deforms the "
-        f"material too fast; use dt = {0.25 * dt:.2g} (cfl 4 times smaller), a softer collision, or more particles per cell."
+        f"The time step {dt:.3g} s was below the stability limit {limit:.3g} s. Likely cause: an impact that deforms "
+        f"the material too fast; use dt = {0.25 * dt:.2g} (cfl 4 times smaller), or more particles per cell."
     )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -87,13 +87,17 @@ class _Artist:
         return pictures[0] if len(pictures) == 1 else contact_sheet(pictures, self.columns, self.words.resolution[0])
 
     def _one(self, k: int, frame: dict[str, Array], time: float) -> Array:
+        from ..render import obstacle_shapes
+
         entry = self.entries[k]
+        bounds = (self.scene.grid.lower, self.scene.grid.upper)
+        solids = [obstacle(words, None) for words in entry.obstacle]
         rows = frame["scene"] == k if "scene" in frame else slice(None)
         overlays = list(_ritter(self.scene, self.words.ritter, time)) if self.words.ritter else []
         return self.renderers[k].frame(
             frame["position"][rows],
             self._values(frame)[rows],
-            obstacles=list(_obstacles(entry.obstacle, self.scene, time)),
+            obstacles=[shape for solid in solids for shape in obstacle_shapes(solid, time, bounds)],
             overlays=overlays,
             time=time,
             title=entry.name or self.scene.title,
@@ -116,28 +120,6 @@ class _Artist:
     def close(self) -> None:
         for renderer in self.renderers:
             renderer.close()
-
-
-def _obstacles(words: Sequence[Any], scene: Scene, time: float) -> Iterator[Any]:
-    """The obstacles that are there at a time, at their poses."""
-    size = float(np.linalg.norm(np.subtract(scene.grid.upper, scene.grid.lower)))
-    for item in words:
-        if not item.start <= time < (math.inf if item.end is None else item.end):
-            continue
-        shape, pose = _shape(item, size), obstacle(item, None).pose(time)
-        yield shape.posed(pose.centre.numpy(), pose.rotation.numpy() @ shape.rotation)
-
-
-def _shape(item: Any, size: float) -> Any:
-    from ..render import shapes
-
-    if isinstance(item, schema.PlaneObstacle):
-        return shapes.plane(item.center, item.normal, size)
-    if isinstance(item, schema.BoxObstacle):
-        return shapes.box(item.center, item.size)
-    if isinstance(item, schema.SphereObstacle):
-        return shapes.sphere(item.center, item.radius)
-    return shapes.capsule(item.a, item.b, item.radius)
 
 
 def ritter_front(scene: Scene, words: schema.Ritter, time: float) -> float:

@@ -125,7 +125,7 @@ class Simulation:
         """What the trajectory of this scene holds."""
         dim, dtype = self.scene.dim, str(self.state.x.numpy(force=True).dtype)
         vector = ((dim,), dtype)
-        fields = {"position": vector, "velocity": vector}
+        fields: dict[str, tuple[tuple[int, ...], str]] = {"position": vector, "velocity": vector}
         fields |= {name: ((dim,) * FIELD_SHAPES[name], dtype) for name in self.scene.trajectory_fields}
         number = ((), "f8")
         scalars = dict.fromkeys(("time", "kinetic_energy", "elastic_energy", "potential_energy", "cfl"), number)
@@ -324,7 +324,7 @@ def joined(state: State, layer: State) -> State:
     return State.concatenate([state, layer.replace(time=state.time)])
 
 
-def energies(step: Any, state: State) -> dict[str, Any]:
+def energies(step: Any, state: Any) -> dict[str, Any]:
     """Kinetic, elastic and potential energy [J] and momentum [kg m/s] of all particles, summed in float64."""
     mass, v = state.mass.double(), state.v.double()
     gravity = step.gravity
@@ -404,7 +404,7 @@ def _disk_errors(folder: Path) -> Iterator[None]:
 @contextlib.contextmanager
 def _stop_signals() -> Iterator[Callable[[], bool]]:
     """SIGINT and SIGTERM ask to stop after the frame; a second SIGINT stops at once."""
-    asked = []
+    asked: list[int] = []
 
     def ask(number: int, frame: FrameType | None) -> None:
         if asked and number == signal.SIGINT:

@@ -265,9 +265,7 @@ class CapsuleObstacle(Obstacle):
     """distance from the segment [m]"""
 
 
-AnyObstacle = Annotated[
-    PlaneObstacle | BoxObstacle | SphereObstacle | CapsuleObstacle, Field(discriminator="shape")
-]
+AnyObstacle = Annotated[PlaneObstacle | BoxObstacle | SphereObstacle | CapsuleObstacle, Field(discriminator="shape")]
 
 
 # ---- outputs

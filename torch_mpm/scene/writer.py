@@ -20,7 +20,7 @@ from . import checkpoint
 
 @dataclass(frozen=True)
 class Job:
-    """One frame in host memory; ``ready`` is recorded behind the copies, ``sources`` keeps their origin alive until then."""
+    """One frame in host memory. ``ready`` comes behind the copies; ``sources`` keeps their origin alive until then."""
 
     frame: int
     values: Mapping[str, Any]
