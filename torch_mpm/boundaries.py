@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 
 from .errors import shape_of
-from .reference.contact import contact_velocity
+from .reference.contact import contact_change
 
 CONTACTS = ("sticky", "slip", "separate")
 
@@ -237,7 +237,7 @@ class Obstacle:
                 "velocity and positions must both have shape [N, D], "
                 f"got {shape_of(velocity)} and {shape_of(positions)}"
             )
-        if self._absent(scene, time):
+        if velocity.shape[0] == 0 or self._absent(scene, time):
             return velocity
         centre, turn = self._centre(time, velocity), self._rotation(time, velocity, velocity.shape[1])
         if centre.shape[-1] != velocity.shape[1]:
@@ -252,12 +252,9 @@ class Obstacle:
         friction = self.friction
         if isinstance(friction, Tensor):
             friction = _per_node(self._value("friction", velocity, ()), 0, scene)[..., None]
-        # Nodes outside are set to zero first, so that a NaN there does not reach the gradient of the parameters.
+        # Zero velocity stays zero; a NaN outside does not reach the gradient of the parameters.
         relative = torch.where(touching, velocity if surface_velocity is None else velocity - surface_velocity, 0)
-        after = contact_velocity(relative, normal, self.kind, friction)
-        if surface_velocity is not None:
-            after = after + surface_velocity
-        return torch.where(touching, after, velocity)
+        return velocity + contact_change(relative, normal, self.kind, friction)
 
     def pose(self, time: float | Tensor, like: Tensor | None = None) -> Pose:
         """Centre and rotation at a time [s], a number or a tensor [] or [B]; with the dtype and device of `like`."""
@@ -304,7 +301,7 @@ class Obstacle:
     def _touching(self, distance: Tensor, positions: Tensor, scene: Tensor | None, time: float | Tensor) -> Tensor:
         """Which nodes are inside, bool [N]; a node on the surface to rounding counts."""
         rounding = 16 * torch.finfo(positions.dtype).eps
-        touching = distance.detach() <= rounding * positions.detach().abs().amax(1)
+        touching = distance.detach() <= rounding * positions.detach().abs().amax()
         if self.scene is not None and scene is not None:
             touching = touching & (scene == self.scene)
         if isinstance(time, Tensor):

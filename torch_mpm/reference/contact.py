@@ -6,28 +6,28 @@ import torch
 from torch import Tensor
 
 
-def contact_velocity(relative: Tensor, normal: Tensor, kind: str, friction: float | Tensor) -> Tensor:
-    """Velocity relative to a surface after contact with it: the rule of csrc/boundary/contact.h.
+def contact_change(relative: Tensor, normal: Tensor, kind: str, friction: float | Tensor) -> Tensor:
+    """Change of velocity by contact with a surface: the rule of csrc/boundary/contact.h. Zero for zero velocity.
 
     Args:
         relative: velocity relative to the surface [..., D] [m/s].
-        normal: unit normal into the material [..., D]; with a zero normal the velocity stays as it is.
+        normal: unit normal into the material [..., D]; a zero normal changes nothing, except under "sticky".
         kind: "sticky", "slip" or "separate".
         friction: Coulomb coefficient, broadcast to [..., 1].
 
-    Differentiable with respect to every tensor; gradients are finite also where nothing slides.
+    Differentiable with respect to every floating tensor; gradients are finite also where nothing slides.
     """
     if kind == "sticky":
-        return torch.zeros_like(relative)
+        return -relative
     approach = -(relative * normal).sum(-1, keepdim=True)
+    pressure = approach.clamp_min(0)
+    change = (pressure if kind == "separate" else approach) * normal
+    if not isinstance(friction, Tensor) and friction == 0:
+        return change
     tangential = relative + approach * normal
-    result = tangential
-    if isinstance(friction, Tensor) or friction != 0:
-        squared = (tangential * tangential).sum(-1, keepdim=True)
-        speed = torch.where(squared > 0, torch.where(squared > 0, squared, 1).sqrt(), 0)
-        lost = friction * approach
-        slides = (speed > lost) & (speed > 0)
-        kept = 1 - torch.where(slides, lost, 0) / torch.where(slides, speed, 1)
-        stuck = (lost > 0) & ~slides
-        result = torch.where(approach > 0, torch.where(stuck, 0, kept) * tangential, tangential)
-    return torch.where(approach > 0, result, relative) if kind == "separate" else result
+    squared = (tangential * tangential).sum(-1, keepdim=True)
+    speed = torch.where(squared > 0, torch.where(squared > 0, squared, 1).sqrt(), 0)
+    lost = friction * pressure
+    slides = (speed > lost) & (speed > 0)
+    share = torch.where(slides, lost, 0) / torch.where(slides, speed, 1)
+    return change - torch.where(slides, share, torch.where(lost > 0, 1, 0)) * tangential

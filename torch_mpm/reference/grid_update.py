@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from .contact import contact_velocity
+from .contact import contact_change
 
 if TYPE_CHECKING:
     from ..boundaries import Face
@@ -42,7 +42,7 @@ def _act(faces: Sequence[Face], blocks: Blocks, velocity: Tensor) -> Tensor:
         if face.kind == "open":
             continue
         axis, sign = number // 2, 1 - 2 * (number % 2)
-        beyond = sign * (position[:, axis] - face.plane) <= 1e-6 * blocks.grid.dx
-        after = contact_velocity(velocity, sign * axes[axis], face.kind, face.friction)
-        velocity = torch.where(beyond[:, None], after, velocity)
+        beyond = sign * (position[:, axis : axis + 1] - face.plane) <= 1e-6 * blocks.grid.dx
+        touching = torch.where(beyond, velocity, 0)
+        velocity = velocity + contact_change(touching, sign * axes[axis], face.kind, face.friction)
     return velocity
