@@ -74,8 +74,9 @@ class Walls:
         upper: Sequence[float] | None = None,
         friction: float | Sequence[float | tuple[float, float]] = 0.0,
     ) -> None:
-        self.kind, self.friction = kind, friction
+        self.kind, self.friction = _frozen(kind), _frozen(friction)
         self.lower, self.upper = _numbers("lower", lower), _numbers("upper", upper)
+        self._faces: tuple[Any, tuple[Face, ...]] = (None, ())
         for name in _flat(kind):
             if name not in (*CONTACTS, "open"):
                 raise ValueError(f"kind of a wall must be one of {sorted((*CONTACTS, 'open'))}, got {name!r}")
@@ -92,6 +93,12 @@ class Walls:
 
     def faces(self, grid: _Box) -> tuple[Face, ...]:
         """The 2 D faces: lower and upper of the first axis, then of the next."""
+        key = (self.kind, self.friction, self.lower, self.upper, grid.lower, grid.upper)
+        if self._faces[0] != key:
+            self._faces = (key, self._resolve(grid))
+        return self._faces[1]
+
+    def _resolve(self, grid: _Box) -> tuple[Face, ...]:
         lower = grid.lower if self.lower is None else self.lower
         upper = grid.upper if self.upper is None else self.upper
         if len(lower) != grid.dim or len(upper) != grid.dim:
@@ -111,6 +118,13 @@ def _numbers(name: str, values: Sequence[float] | None) -> tuple[float, ...] | N
     if not all(math.isfinite(a) for a in numbers):
         raise ValueError(f"{name} must have finite numbers, got {numbers}")
     return numbers
+
+
+def _frozen(value: Any) -> Any:
+    """Nested sequences as tuples, which cannot change behind the faces kept by `Walls`."""
+    if isinstance(value, str) or not isinstance(value, Sequence):
+        return value
+    return tuple(_frozen(item) for item in value)
 
 
 def _flat(value: Any) -> list[Any]:
