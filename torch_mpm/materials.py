@@ -122,9 +122,9 @@ class CompiledLaw(Material):
         Kept from call to call while nothing has changed and none requires grad.
         """
         tensors = [*self.parameters(recurse=False), *self.buffers(recurse=False)]
-        numbers = [value for value in vars(self).values() if isinstance(value, float)]
         if torch.compiler.is_compiling() or any(t.requires_grad for t in tensors):
             return self._convert(state)
+        numbers = [value for value in vars(self).values() if isinstance(value, float)]
         key = (state.x.dtype, state.x.device, state.ids, *numbers, *((t, t._version) for t in tensors))
         if self._cached is None or not _same(self._cached[0], key):
             self._cached = (key, self._convert(state))
