@@ -12,8 +12,10 @@ Layout: ``position``, ``velocity`` and the fields asked for are [T, N, ...], par
 
 from __future__ import annotations
 
+import contextlib
 import math
 import os
+import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -44,6 +46,18 @@ def h5py_module() -> Any:
     except ImportError as error:
         raise ImportError("trajectories need h5py: pip install torch-mpm[data]") from error
     return h5py
+
+
+@contextlib.contextmanager
+def disk_errors(path: Path) -> Iterator[None]:
+    """HDF5 tells of a full disk as OSError without errno, or as RuntimeError: make it the OSError that it is."""
+    try:
+        yield
+    except (OSError, RuntimeError) as error:
+        number = re.search(r"errno = (\d+)", str(error))
+        if number is None:
+            raise
+        raise OSError(int(number[1]), os.strerror(int(number[1])), str(path)) from error
 
 
 @dataclass(frozen=True)
@@ -78,7 +92,7 @@ def create(path: Path, layout: Layout) -> None:
     h5py = h5py_module()
     building = path.with_suffix(".building")
     try:
-        with h5py.File(building, "w", libver="v110") as out:
+        with disk_errors(building), h5py.File(building, "w", libver="v110") as out:
             for name, (shape, dtype) in layout.fields.items():
                 _reserve(h5py, out, name, (layout.frames, layout.particles, *shape), dtype)
             for name, (shape, dtype) in layout.scalars.items():

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from ..state import State
-from ..trajectory import h5py_module
+from ..trajectory import disk_errors, h5py_module
 
 Host = dict[str, Tensor]
 
@@ -27,7 +27,7 @@ def save(path: Path, tensors: Host, record: dict[str, Any]) -> None:
     """Write tensors (on the CPU) and a JSON record; ``path`` is replaced at once, or not at all."""
     building = path.with_suffix(".building")
     try:
-        with h5py_module().File(building, "w") as out:
+        with disk_errors(building), h5py_module().File(building, "w") as out:
             for name, tensor in tensors.items():
                 out[name] = tensor.numpy()
             out.attrs["record"] = json.dumps(record)

@@ -392,8 +392,7 @@ def _disk_errors(folder: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        number = error.errno or next((n for n in FULL if f"errno = {n}," in str(error)), None)
-        if number not in FULL:
+        if error.errno not in FULL:
             raise
         raise OutputError(
             f"no room on the disk of {folder}: {error.strerror or error}. The frames written so far are whole; "
