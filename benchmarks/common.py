@@ -44,6 +44,8 @@ def environment(device: str = "cpu") -> dict[str, Any]:
         place["threads"] = torch.get_num_threads()
         place["instructions"] = torch.backends.cpu.get_cpu_capability()
         place["load"] = round(os.getloadavg()[0], 1)
+        if "OMP_WAIT_POLICY" in os.environ:
+            place["OMP_WAIT_POLICY"] = os.environ["OMP_WAIT_POLICY"]
     return place
 
 
