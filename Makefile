@@ -41,10 +41,14 @@ format: $(STAMP)
 	$(VENV)/bin/clang-format -i $(SOURCES)
 
 demo: build
-	$(PY) -m torch_mpm run examples/demo.toml -o out/demo
+	rm -rf out/demo
+	$(PY) -m torch_mpm run examples/jelly.toml -o out/demo
 
-examples: build
-	$(PY) -m torch_mpm run examples/demo.toml -o out/demo
+# Each scene in a folder of its own. A scene that is done is skipped, an unfinished one goes on.
+examples: $(patsubst examples/%.toml,out/%/trajectory.h5,$(wildcard examples/*.toml))
+
+out/%/trajectory.h5: examples/%.toml | build
+	$(PY) -m torch_mpm run $< -o $(@D) --resume
 
 bench: build
 	$(PY) -m benchmarks
@@ -56,13 +60,13 @@ study: build
 SANITIZED := build/sanitized
 ASAN = $(shell $(or $(CXX),g++) -print-file-name=libasan.so)
 sanitize: $(STAMP)
-	env TORCH_MPM_SANITIZE=address,undefined TORCH_MPM_CUDA=0 $(PY) setup.py -q build --build-lib $(SANITIZED)
+	TORCH_MPM_SANITIZE=address,undefined TORCH_MPM_CUDA=0 $(PY) setup.py -q build --build-lib $(SANITIZED)
 	LD_PRELOAD=$(ASAN) ASAN_OPTIONS=detect_leaks=0 UBSAN_OPTIONS=halt_on_error=1:print_stacktrace=1 \
 	  PYTHONPATH=$(SANITIZED) $(VENV)/bin/pytest $(QUICK)
 
 # On a GPU machine whose Python already has torch, ninja and pytest: no virtual environment and no network.
 gpu:
-	env TORCH_MPM_CUDA=1 $(PYTHON) setup.py -q build_ext --inplace
+	TORCH_MPM_CUDA=1 $(PYTHON) setup.py -q build_ext --inplace
 	PYTHONPATH=. $(PYTHON) -m pytest $(QUICK)
 	PYTHONPATH=. $(PYTHON) -m benchmarks
 
