@@ -36,6 +36,12 @@ struct Home {
   }
 };
 
+// Position of a cell in its block along an axis.
+template <int D>
+MPM_HD int cell_coordinate(int cell, int axis) {
+  return cell >> 2 * (D - 1 - axis) & (kBlockWidth - 1);
+}
+
 struct Chunk {
   int slot, count;
   const int* id;           // particles, ascending
@@ -53,7 +59,6 @@ struct Chunk {
     cell_end = s.cell_end + chunk * kBlockNodes<D>;
     sorted = s.chunk_sorted[chunk];
   }
-  int cell(int i) const { return order[i] / kChunk; }     // of particle i
   int by_cell(int i) const { return order[i] % kChunk; }  // the i-th particle in the order of cells
 };
 
@@ -69,8 +74,10 @@ MPM_HD Group group_by_id(const Chunk& c, int i) {
   Group g;
   const int rest = c.count - i;
   g.count = rest < kLanes ? rest : kLanes;
-  for (int l = 0; l < kLanes; l++) g.id[l] = c.id[i + (l < g.count ? l : 0)];
-  g.consecutive = rest >= kLanes && g.id[kLanes - 1] - g.id[0] == kLanes - 1;
+  g.id[0] = c.id[i];
+  g.consecutive = rest >= kLanes && c.id[i + kLanes - 1] - g.id[0] == kLanes - 1;
+  if (!g.consecutive)
+    for (int l = 1; l < kLanes; l++) g.id[l] = c.id[i + (l < g.count ? l : 0)];
   return g;
 }
 
@@ -87,6 +94,12 @@ MPM_HD Group group_by_cell(const Chunk& c, int i, int end) {
   return g;
 }
 
+// One value of one particle.
+template <class T>
+MPM_HD T& at(const Field<T>& f, int64_t p, int i = 0, int j = 0) {
+  return f.pointer[p * f.stride[0] + i * f.stride[1] + j * f.stride[2]];
+}
+
 template <class T>
 MPM_HD Lanes<T> load(const Field<const T>& f, const Group& g, int i = 0, int j = 0) {
   const T* from = f.pointer + i * f.stride[1] + j * f.stride[2];
@@ -96,13 +109,22 @@ MPM_HD Lanes<T> load(const Field<const T>& f, const Group& g, int i = 0, int j =
   return Lanes<T>::load(lanes);
 }
 
+// Writes the lanes of the group only.
 template <class T>
-MPM_HD void store(const Lanes<T>& v, const Field<T>& f, const Group& g, int i = 0, int j = 0) {
+MPM_HD void store_exactly(const Lanes<T>& v, const Field<T>& f, const Group& g, int i = 0, int j = 0) {
   T* to = f.pointer + i * f.stride[1] + j * f.stride[2];
-  if (g.consecutive && f.stride[0] == 1) return v.store(to + g.id[0]);
   T lanes[kLanes];
   v.store(lanes);
   for (int l = 0; l < g.count; l++) to[(g.consecutive ? g.id[0] + l : g.id[l]) * f.stride[0]] = lanes[l];
+}
+
+// May write over the particles after the group, see `group_by_cell`.
+template <class T>
+MPM_HD void store(const Lanes<T>& v, const Field<T>& f, const Group& g, int i = 0, int j = 0) {
+  if (g.consecutive && f.stride[0] == 1)
+    v.store(f.pointer + i * f.stride[1] + j * f.stride[2] + g.id[0]);
+  else
+    store_exactly(v, f, g, i, j);
 }
 
 // Nodes that the particles of one home touch, kChannels values each. Rows run along the last axis and are long enough to

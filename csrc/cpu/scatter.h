@@ -1,22 +1,14 @@
 #pragma once
 
-#include "cpu/chunk.h"
+#include "cpu/gift.h"
 #include "cpu/parallel.h"
 #include "cpu/transpose.h"
 #include "math/bspline.h"
 
 // Particles to nodes, for up to kChannels channels. The particles of a cell share their nodes, so that their
 // contributions are summed in registers before they go to the tile of the home.
-//   node_k += Σ_p N_k (value + slope · k) + gradient · ∇N_k,
-// with the node offset k from the base node, and distances in cells.
 namespace mpm::cpu {
 inline namespace TORCH_MPM_ISA {
-
-// What one particle, or one pack of them, gives.
-template <class P, int D>
-struct Gift {
-  P value[kChannels], slope[D][kChannels], gradient[D][kChannels];
-};
 
 // The particles of a chunk, ready to be summed.
 template <int Order, class T, int D, bool Slope, bool Gradient>
@@ -25,9 +17,10 @@ struct Gifts {
   static constexpr int kSlope = kChannels, kGradient = kChannels * (Slope ? 1 + D : 1);
   static constexpr int kFields = kGradient + (Gradient ? kChannels * D : 0);
   static constexpr int kPadded = (kFields + kLanes - 1) / kLanes * kLanes;
+  static constexpr int kLine = kChunk + 16;  // not a power of two, so that the arrays do not share cache sets
   alignas(64) T row[kChunk][kPadded];          // value, slopes, gradients
-  alignas(64) T weight[D][S][kChunk];
-  alignas(64) T derivative[D][S][Gradient ? kChunk : 1];
+  alignas(64) T weight[D][S][kLine];
+  alignas(64) T derivative[D][S][Gradient ? kLine : 1];
 
   void put(int i, const Lanes<T> f[D], const Gift<Lanes<T>, D>& gift) {
     Lanes<T> field[kPadded], w[S];
@@ -63,21 +56,36 @@ using NodeRow = Pack<T, 4 * kChannels>;
 // The same kChannels values at four nodes.
 template <class T>
 MPM_HD NodeRow<T> repeat(const T* channels) {
-  T r[4 * kChannels];
+  NodeRow<T> r;
+#ifdef __AVX512F__
   MPM_UNROLL
-  for (int k = 0; k < 4; k++) __builtin_memcpy(r + k * kChannels, channels, sizeof(T) * kChannels);
-  return NodeRow<T>::load(r);
+  for (int k = 0; k < r.kParts; k++)
+    if constexpr (sizeof(T) == 4)
+      r.part[k] = _mm512_maskz_broadcast_f32x4(__mmask16(-1), _mm_loadu_ps(channels));
+    else
+      r.part[k] = _mm512_maskz_broadcast_f64x4(__mmask8(-1), _mm256_loadu_pd(channels));
+#else
+  T lanes[4 * kChannels];
+  MPM_UNROLL
+  for (int k = 0; k < 4; k++) __builtin_memcpy(lanes + k * kChannels, channels, sizeof(T) * kChannels);
+  r = NodeRow<T>::load(lanes);
+#endif
+  return r;
 }
 
 // Value k in all channels of node k, zero beyond S nodes.
 template <int S, class T>
 MPM_HD NodeRow<T> spread(const T* value, int stride) {
-  T r[4 * kChannels];
+  using Row = NodeRow<T>;
+  Row r(0);
   MPM_UNROLL
-  for (int k = 0; k < 4; k++)
+  for (int k = 0; k < S; k++) {
+    Mask<T, 4 * kChannels> node;
     MPM_UNROLL
-    for (int c = 0; c < kChannels; c++) r[k * kChannels + c] = k < S ? value[k * stride] : T(0);
-  return NodeRow<T>::load(r);
+    for (int l = 0; l < 4 * kChannels; l++) node.part[l / Row::kWidth][l % Row::kWidth] = l / kChannels == k ? -1 : 0;
+    r = select(node, Row(value[k * stride]), r);
+  }
+  return r;
 }
 
 // Sums the particles order[0 .. count) of one cell into the tile at its base node.
@@ -101,11 +109,11 @@ void sum_cell(const Gifts<Order, T, D, Slope, Gradient>& g, const uint16_t* orde
     const auto derivative = [&](int axis, int k) { return Row(g.derivative[axis][k][p]); };
     const auto slope = [&](int axis) { return repeat(row + G::kSlope + axis * kChannels); };
     const auto gradient = [&](int axis) { return repeat(row + G::kGradient + axis * kChannels); };
-    const Row wz = spread<S>(&g.weight[Z][0][p], kChunk);
+    const Row wz = spread<S>(&g.weight[Z][0][p], G::kLine);
     Row value = repeat(row), slope_y, slope_x, gradient_y, gradient_x;
     if (Slope) value += offset * slope(Z);
     value = wz * value;
-    if (Gradient) value += spread<S>(&g.derivative[Z][0][p], kChunk) * gradient(Z);
+    if (Gradient) value += spread<S>(&g.derivative[Z][0][p], G::kLine) * gradient(Z);
     if (Slope) slope_y = wz * slope(Y);
     if (Gradient) gradient_y = wz * gradient(Y);
     if constexpr (D == 3) {
@@ -144,12 +152,15 @@ void sum_cell(const Gifts<Order, T, D, Slope, Gradient>& g, const uint16_t* orde
 template <class T, int D>
 MPM_HD void distances(const Topology<T, D>& t, const Home<T, D>& home, const Chunk& chunk, const Field<const T>& x,
                       const Group& g, int particle, Lanes<T> f[D]) {
-  int cell[kLanes];
-  for (int l = 0; l < kLanes; l++) cell[l] = chunk.cell(particle + (l < g.count ? l : 0));
+  uint16_t cell[kLanes] = {};
+  if (g.count == kLanes)
+    __builtin_memcpy(cell, chunk.order + particle, sizeof(cell));
+  else
+    for (int l = 0; l < g.count; l++) cell[l] = chunk.order[particle + l];
   MPM_UNROLL
   for (int a = 0; a < D; a++) {
     T base[kLanes];
-    for (int l = 0; l < kLanes; l++) base[l] = T(home.corner[a] + (cell[l] >> 2 * (D - 1 - a)) % kBlockWidth);
+    for (int l = 0; l < kLanes; l++) base[l] = T(home.corner[a] + cell_coordinate<D>(cell[l] / kChunk, a));
     f[a] = distance_in_cells(t.geometry, a, load(x, g, a), Lanes<T>::load(base));
   }
 }
@@ -161,7 +172,7 @@ MPM_HD int nth_cell(int n) {
   return n % (kBlockNodes<D> / kBlockWidth) * kBlockWidth + n / (kBlockNodes<D> / kBlockWidth);
 }
 
-// Adds channels first, ..., first + count - 1. give(group, f, scene, gift) fills in the gifts of a group.
+// Adds channels first, ..., first + count - 1. give(group, f, scene) makes the gifts of a group.
 template <int Order, bool Slope, bool Gradient, class T, int D, class F>
 void scatter_channels(const Topology<T, D>& t, const Field<const T>& x, const NodeField<T>& nodes, int first, int count,
                       const F& give) {
@@ -171,16 +182,14 @@ void scatter_channels(const Topology<T, D>& t, const Field<const T>& x, const No
     for (int i = 0; i < chunk.count; i += kLanes) {
       const Group g = group_by_id(chunk, i);
       Lanes<T> f[D];
-      Gift<Lanes<T>, D> gift;
       distances(t, home, chunk, x, g, i, f);
-      give(g, f, home.scene, gift);
-      gifts.put(i, f, gift);
+      gifts.put(i, f, give(g, f, home.scene));
     }
     for (int n = 0; n < kBlockNodes<D>; n++) {
       const int cell = nth_cell<D>(n), begin = cell ? chunk.cell_end[cell - 1] : 0, end = chunk.cell_end[cell];
       if (begin == end) continue;
       int base[D];
-      for (int a = 0; a < D; a++) base[a] = (cell >> 2 * (D - 1 - a)) % kBlockWidth;
+      for (int a = 0; a < D; a++) base[a] = cell_coordinate<D>(cell, a);
       sum_cell(gifts, chunk.order + begin, end - begin, tile.value + tile.at(base));
     }
   };
