@@ -116,10 +116,11 @@ def warp_program(w: work.Work, device: str) -> Program:
 
     step = launch
     if device != "cpu":
+        moving = (x, v, C, F)
+        start = [wp.clone(array) for array in moving]
         launch()  # compiles, which a capture must not
-        for array, start in ((x, w.x), (v, w.v), (F, eyes)):
-            array.assign(start)
-        C.zero_()
+        for array, initial in zip(moving, start, strict=True):
+            wp.copy(array, initial)
         with wp.ScopedCapture(device=device) as capture:
             launch()
 
