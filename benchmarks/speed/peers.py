@@ -127,6 +127,8 @@ def warp_program(w: work.Work, device: str) -> Program:
         def step() -> None:
             wp.capture_launch(capture.graph)
 
+        step.launch = launch  # type: ignore[attr-defined]  # keeps the arrays, which the graph does not
+
     return step, wp.synchronize, lambda: (x.numpy(), v.numpy())
 
 
