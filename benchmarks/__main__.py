@@ -1,7 +1,7 @@
 """Run the benchmarks one after the other: `python -m benchmarks [--quick] [--device cpu|cuda] [--out DIRECTORY]`.
 
-Each is a process of its own; the exit status says whether all of them ended well. Without `--device`, CUDA where there is
-a GPU.
+Each is a process of its own; the exit status says whether all of them ended well. Without `--device`, CUDA where there
+is a GPU.
 """
 
 from __future__ import annotations

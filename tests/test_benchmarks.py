@@ -1,0 +1,135 @@
+"""The benchmark programs run in their quick mode, and the exact solution that they compare with is one."""
+
+import json
+import math
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from benchmarks import common
+from benchmarks.accuracy import convergence, manufactured
+from benchmarks.speed import peers, step, work
+
+# Threads that wait without spinning: tests share their machine.
+PASSIVE = {**os.environ, "OMP_WAIT_POLICY": "PASSIVE"}
+
+
+def run_quick(program: str, out: Path, *options: str) -> str:
+    command = [sys.executable, "-m", program, "--quick", "--out", str(out), *options]
+    done = subprocess.run(command, cwd=common.ROOT, env=PASSIVE, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+def result(out: Path, pattern: str) -> dict:
+    (file,) = out.glob(pattern)
+    assert file.with_suffix(".md").read_text().startswith("# ")
+    found = json.loads(file.read_text())
+    assert {"device", "torch_mpm", "torch", "commit", "date"} <= found["environment"].keys()
+    return found
+
+
+def test_speed_program_times_every_part(tmp_path: Path) -> None:
+    run_quick("benchmarks.speed.step", tmp_path, "--peers")
+    found = result(tmp_path, "speed_*.json")
+    (size,) = found["sizes"]
+    names = {part["name"] for part in size["parts"]}
+    assert found["failures"] == []
+    assert {"activate", "stress", "p2g", "g2p", "grid update", "advance", "p2g with stress, backward"} <= names
+    assert all(part["ms"] > 0 and part["bytes"] > 0 for part in size["parts"])
+    assert max(size["errors"].values()) < 5e-6
+
+
+def test_failed_part_is_reported_and_the_others_go_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(*_: object) -> None:
+        raise RuntimeError("no such device")
+
+    monkeypatch.setattr(step, "whole_steps", broken)
+    found = step.measure("cpu", [8], [], samples=1, budget=0.0)
+    assert found["failures"] == ["whole steps: RuntimeError: no such device"]
+    assert found["sizes"][0]["parts"] and found["sizes"][0]["errors"]
+
+
+def test_work_is_sorted_by_block_and_fills_the_cells() -> None:
+    w = work.make(16)
+    s = step.setup(w, "cpu")
+    index = s.grid.activate(s.state.x).index
+    assert torch.equal(index, torch.arange(16**3, dtype=torch.int32))
+    cells = torch.floor(s.state.x * w.n).long().unique(dim=0, return_counts=True)[1]
+    assert cells.tolist() == [8] * 8**3
+
+
+@pytest.mark.parametrize("peer", sorted(peers.PEERS))
+def test_peer_does_the_same_work(peer: str, tmp_path: Path) -> None:
+    pytest.importorskip(peers.PEERS[peer][1])
+    report = step.Report("cpu")
+    step.measure_peer(report, peer, "cpu", [16], samples=1)
+    difference = report.result["difference"][peer]
+    assert difference["x"] < 1e-6 and difference["v"] < 1e-5
+    assert report.result["peers"][0]["particles"] == 16**3
+
+
+def test_bytes_count_node_tensors_by_their_active_rows() -> None:
+    s = step.setup(work.make(8), "cpu")
+    blocks = s.grid.activate(s.state.x)
+    nodes = torch.zeros(blocks.node_count, 4)
+    assert step.bytes_of([nodes, s.state.x], blocks, active=100) == 100 * 16 + 8**3 * 12
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_manufactured_solution_satisfies_the_equation_of_motion(dim: int) -> None:
+    """ρ ∂²u/∂t² = Div P + ρ b with P = μ (F − F⁻ᵀ) + λ ln J F⁻ᵀ, by finite differences in X and t."""
+    X, t, h = torch.rand(5, dim, dtype=torch.float64), 0.0037, 1e-4
+
+    def stress(X: torch.Tensor) -> torch.Tensor:
+        F = manufactured.Solution(X).stretch(t)
+        return manufactured.MU * (F - 1 / F) + manufactured.LAM * F.log().sum(1, keepdim=True) / F
+
+    divergence = torch.empty_like(X)
+    for axis in range(dim):
+        shift = h * torch.eye(dim, dtype=torch.float64)[axis]
+        divergence[:, axis] = ((stress(X + shift) - stress(X - shift)) / (2 * h))[:, axis]
+    s, tau = manufactured.Solution(X), h / manufactured.SPEED
+    acceleration = (s.displacement(t + tau) - 2 * s.displacement(t) + s.displacement(t - tau)) / tau**2
+    force = manufactured.DENSITY * s.body_force(t)
+    torch.testing.assert_close(manufactured.DENSITY * acceleration - divergence, force, rtol=1e-5, atol=1e-2)
+
+
+def test_manufactured_gradients_belong_to_the_motion() -> None:
+    X, t = torch.rand(4, 3, dtype=torch.float64, requires_grad=True), 0.0037
+    s = manufactured.Solution(X)
+    x = X + s.displacement(t)
+    F = torch.stack([torch.autograd.grad(x[:, i].sum(), X, retain_graph=True)[0] for i in range(3)], 1)
+    torch.testing.assert_close(F, torch.diag_embed(s.stretch(t)))
+    rate = torch.stack([torch.autograd.grad(s.velocity(t)[:, i].sum(), X, retain_graph=True)[0] for i in range(3)], 1)
+    torch.testing.assert_close(rate @ F.inverse(), torch.diag_embed(s.velocity_gradient(t, t)))
+
+
+def test_mirrored_walls_converge_with_second_order_and_slip_walls_with_first() -> None:
+    orders = {}
+    for walls in ("slip", "mirror"):
+        rows = [convergence.run(convergence.Case(2, "quadratic", walls, ()), n)[1] for n in (8, 16)]
+        orders[walls] = math.log2(rows[0]["displacement"] / rows[1]["displacement"])
+    assert 0.8 < orders["slip"] < 1.3
+    assert 1.8 < orders["mirror"] < 2.2
+
+
+@pytest.mark.parametrize("program", ["convergence", "precision"])
+def test_accuracy_program(program: str, tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    run_quick(f"benchmarks.accuracy.{program}", tmp_path)
+    result(tmp_path, f"{program}.json")
+
+
+def test_table_and_orders() -> None:
+    assert common.table(("a", "b"), [(1, None), (0.5, 1e-5)]).splitlines() == [
+        "| a   | b       |",
+        "|-----|---------|",
+        "| 1   | –       |",
+        "| 0.5 | 1.0e-05 |",
+    ]
+    assert common.order_of([1, 0.5, 0.25], [8, 2, 0.5]) == [None, 2, 2]
