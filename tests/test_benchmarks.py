@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from benchmarks import common
+from benchmarks import common, report
 from benchmarks.accuracy import convergence, manufactured
 from benchmarks.speed import peers, step, work
 
@@ -133,3 +133,22 @@ def test_table_and_orders() -> None:
         "| 0.5 | 1.0e-05 |",
     ]
     assert common.order_of([1, 0.5, 0.25], [8, 2, 0.5]) == [None, 2, 2]
+
+
+def test_report_has_every_section_and_goes_between_its_marks(tmp_path: Path) -> None:
+    place = {"device": "abacus", "commit": "0"}
+    part = {"name": "p2g", "ms": 0.5, "bytes": 1}
+    entry = {"particles": 10**6, "steps": [{"name": "step", "ms": 2.0}], "parts": [part], "errors": {"g2p": 1e-7}}
+    speed = {"environment": place, "sizes": [entry], "peers": [{"name": "warp", "particles": 10**6, "ms": 8.0}]}
+    rows = [{"n": 8, "displacement": 0.5, "seconds": 1.0}]
+    cases = {"cases": [{"name": "2-D", "order": {"displacement": 2.0}, "rows": rows}]}
+    for name, found in (("speed_abacus", speed), ("convergence", cases)):
+        (tmp_path / f"{name}.json").write_text(json.dumps(found))
+    tables = report.summary(tmp_path)
+    cells = [cell.strip() for line in tables.splitlines() if line.startswith("| abacus") for cell in line.split("|")]
+    assert cells[1:5] == ["abacus", "1 M", "2", "4.0x"] and cells[7] == "2"
+    assert "### Convergence" in tables and "### Precision" not in tables
+    document = report.insert(f"before {report.BEGIN} old {report.END} after", tables)
+    assert document.startswith("before") and document.endswith("after") and "old" not in document and "4.0x" in document
+    with pytest.raises(ValueError, match="needs the lines"):
+        report.insert("no marks", tables)

@@ -1,0 +1,122 @@
+"""The tables and figures of the README, from the result files: `python -m benchmarks.report [--readme README.md]`.
+
+Prints the tables; with --readme, puts them between the lines `<!-- benchmarks -->` and `<!-- /benchmarks -->` too.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+from . import common
+
+BEGIN, END = "<!-- benchmarks -->", "<!-- /benchmarks -->"
+FORWARD = ("step", "step, CUDA graph")
+BOTH = ("step, forward and backward", "step, forward and backward, CUDA graph")
+
+
+def speed(results: list[dict[str, Any]]) -> str:
+    """Whole steps beside the peers, and the rates of the transfers."""
+    rows = []
+    for result in results:
+        for entry in result["sizes"]:
+            steps = {row["name"]: row["ms"] for row in entry["steps"]}
+            ours, both = (min((steps[n] for n in names if n in steps), default=None) for names in (FORWARD, BOTH))
+            others = {p["name"]: p["ms"] for p in result["peers"] if p["particles"] == entry["particles"]}
+            rates = {part["name"]: entry["particles"] / part["ms"] * 1e-6 for part in entry["parts"]}
+            rows.append(
+                (
+                    result["environment"]["device"],
+                    f"{entry['particles'] / 1e6:.3g} M",
+                    ours,
+                    *(_ratio(others.get(name), ours) for name in ("warp", "taichi")),
+                    _ratio(both, ours),
+                    rates.get("p2g"),
+                    rates.get("g2p"),
+                    max(entry["errors"].values(), default=None),
+                )
+            )
+    header = (
+        "device", "particles", "step [ms]", "Warp's step", "Taichi's step", "with backward", "P2G [G/s]", "G2P [G/s]",
+        "float32 error",
+    )  # fmt: skip
+    notes = [f"- {common.describe(result['environment'])}" for result in results]
+    intro = (
+        "One explicit neo-Hookean step, 3-D, float32, quadratic kernel, 8 particles per cell, everything included. The "
+        "columns with x are multiples of its time in the same run; rates are G particles/s; the error is the largest of "
+        "P2G, G2P and their gradients against float64."
+    )
+    return "\n".join([intro, "", common.table(header, rows), "", *notes])
+
+
+def _ratio(value: float | None, base: float | None) -> str | None:
+    return f"{value / base:.1f}x" if value and base else None
+
+
+def convergence(result: dict[str, Any]) -> str:
+    """Orders and errors against the manufactured solution."""
+    header = ("case", "n", "order in dx", "displacement error", "run time [s]")
+    rows = []
+    for case in result["cases"]:
+        last = case["rows"][-1]
+        order = f"{case['order']['displacement']:.2f}"
+        rows.append((case["name"], last["n"], order, last["displacement"], last["seconds"]))
+    intro = (
+        "A manufactured solution (benchmarks/accuracy/convergence.py), one period; errors relative to the amplitude on "
+        "the finest lattice, order fitted over all. `slip` walls limit the order to 1, mirrored node values restore 2."
+    )
+    figure = "![error over dx and over run time](benchmarks/results/convergence.png)"
+    return "\n".join([intro, "", common.table(header, rows), "", figure])
+
+
+def precision(result: dict[str, Any]) -> str:
+    """Rounding over a rollout."""
+    header = ("n", "particles", "steps", "float32 [s]", "float64 [s]", "position error / dx", "energy error")
+    rows = [
+        [*(lattice[k] for k in ("n", "particles", "steps", "float32_seconds", "float64_seconds"))]
+        + [lattice["rows"][-1]["position"], lattice["rows"][-1]["energy"]]
+        for lattice in result["lattices"]
+    ]
+    intro = "float32 against float64 after a block has fallen, bounced and risen (benchmarks/accuracy/precision.py)."
+    return "\n".join([intro, "", common.table(header, rows)])
+
+
+def summary(directory: Path) -> str:
+    """All sections for which there are results."""
+    sections = []
+    if speeds := [json.loads(file.read_text()) for file in sorted(directory.glob("speed_*.json"))]:
+        sections.append("### Speed\n\n" + speed(speeds))
+    for name, section in (("convergence", convergence), ("precision", precision)):
+        if (file := directory / f"{name}.json").exists():
+            sections.append(f"### {name.capitalize()}\n\n" + section(json.loads(file.read_text())))
+    return "\n\n".join(sections)
+
+
+def insert(text: str, tables: str) -> str:
+    """A document with the tables between its marks.
+
+    Raises:
+        ValueError: where the marks are missing.
+    """
+    pattern = re.compile(f"{BEGIN}.*?{END}", re.DOTALL)
+    if not pattern.search(text):
+        raise ValueError(f"the document needs the lines {BEGIN} and {END}")
+    return pattern.sub(lambda _: f"{BEGIN}\n{tables}\n{END}", text, count=1)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--results", type=Path, default=common.RESULTS)
+    parser.add_argument("--readme", type=Path, help="file to update")
+    arguments = parser.parse_args()
+    tables = summary(arguments.results)
+    print(tables)
+    if arguments.readme:
+        arguments.readme.write_text(insert(arguments.readme.read_text(), tables))
+
+
+if __name__ == "__main__":
+    main()
