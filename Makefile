@@ -67,7 +67,7 @@ sanitize: $(STAMP)
 # On a GPU machine whose Python already has torch, ninja and pytest: no virtual environment and no network.
 gpu:
 	TORCH_MPM_CUDA=1 $(PYTHON) setup.py -q build_ext --inplace
-	PYTHONPATH=. $(PYTHON) -m pytest $(QUICK)
+	PYTHONPATH=. $(PYTHON) -m benchmarks.tests
 	PYTHONPATH=. $(PYTHON) -m benchmarks
 
 clean:
