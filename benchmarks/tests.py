@@ -1,4 +1,4 @@
-"""Run the tests on a GPU machine and keep their outcome as a result: `python -m benchmarks.tests [options] [TESTS ...]`.
+"""Run the tests on a GPU machine and keep their outcome as a result: `python -m benchmarks.tests [TESTS ...]`.
 
     python -m benchmarks.tests                                   # the quick suite
     python -m benchmarks.tests --tool memcheck -k cuda tests/test_transfer.py
