@@ -134,7 +134,7 @@ class CompiledLaw(Material):
         x, particles = state.x, getattr(state, "particles", state.x.shape[0])
         result = []
         for value in self.values():
-            tensor = torch.as_tensor(value).to(dtype=x.dtype, device=x.device)
+            tensor = torch.as_tensor(value, dtype=x.dtype, device=x.device)
             if state.ids is not None and particles > 1 and tensor.shape == (particles,):
                 tensor = tensor.index_select(0, state.ids)
             result.append(tensor)
@@ -280,7 +280,7 @@ class CustomLaw(Material):
         if self._stiffness is None:
             return super().stiffness(state)
         value = self._stiffness(state) if callable(self._stiffness) else self._stiffness
-        return torch.as_tensor(value).to(dtype=state.x.dtype, device=state.x.device).expand(state.x.shape[0])
+        return torch.as_tensor(value, dtype=state.x.dtype, device=state.x.device).expand(state.x.shape[0])
 
     def invalid(self, state: State) -> Tensor:
         if self.state_fields == ("J",):
