@@ -9,7 +9,7 @@ from .cfl import stable_dt
 from .errors import GridOverflowError, SimulationError
 from .grid import Blocks, Grid
 from .materials import CustomLaw, Material, Mixture, NeoHookean, WeaklyCompressible
-from .ops import advance, g2p, gather, grid_update, p2g, scatter
+from .ops import advance, g2p, gather, grid_update, p2g, polar, scatter, svd3
 from .state import State
 from .step import Step, rollout
 from .trajectory import Trajectory
@@ -42,10 +42,12 @@ __all__ = [
     "grid_update",
     "ops",
     "p2g",
+    "polar",
     "rollout",
     "scatter",
     "seed",
     "stable_dt",
+    "svd3",
 ]
 
 

@@ -4,6 +4,7 @@ from . import activation as activation
 from .advance import advance
 from .grid_update import grid_update
 from .material import material_energy, material_stiffness, material_stress, material_wave_modulus
+from .svd import polar, svd3
 from .transfer import g2p, gather, p2g, scatter
 
 __all__ = [
@@ -16,5 +17,7 @@ __all__ = [
     "material_stress",
     "material_wave_modulus",
     "p2g",
+    "polar",
     "scatter",
+    "svd3",
 ]

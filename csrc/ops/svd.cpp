@@ -1,0 +1,68 @@
+#include "ops/backend.h"
+
+#if MPM_BACKEND == MPM_BACKEND_IS_cpu
+#include "cpu/svd_launchers.h"
+#else
+#include "cuda/svd_launchers.h"
+#endif
+
+// Singular value and polar decompositions of small matrices.
+namespace mpm {
+namespace {
+
+// Calls f.operator()<T, D>() for the dtype and size of the matrices F [P, D, D].
+template <class F>
+void dispatch_matrices(const Tensor& matrices, F&& f) {
+  STD_TORCH_CHECK(
+      matrices.dim() == 3 && matrices.size(1) == matrices.size(2) && (matrices.size(1) == 2 || matrices.size(1) == 3),
+      "F must have shape [P, 2, 2] or [P, 3, 3]");
+  const auto by_size = [&]<class T>() {
+    matrices.size(1) == 2 ? f.template operator()<T, 2>() : f.template operator()<T, 3>();
+  };
+  if (matrices.scalar_type() == ScalarType::Float)
+    by_size.template operator()<float>();
+  else if (matrices.scalar_type() == ScalarType::Double)
+    by_size.template operator()<double>();
+  else
+    STD_TORCH_CHECK(false, "F must be float32 or float64");
+}
+
+std::tuple<Tensor, Tensor, Tensor> singular_values_and_vectors(const Tensor& F) {
+  Tensor U, sigma, V;
+  const DeviceScope device(F);
+  dispatch_matrices(F, [&]<class T, int D>() {
+    U = empty_particles(F, {F.size(0), D, D});
+    sigma = empty_particles(F, {F.size(0), D});
+    V = empty_particles(F, {F.size(0), D, D});
+    const SVDArguments<T, D> a{F.size(0), field<const T>(F), field<T>(U), field<T>(sigma), field<T>(V)};
+    backend::svd(a, device.stream());
+  });
+  return {U, sigma, V};
+}
+
+std::tuple<Tensor, Tensor> polar_decomposition(const Tensor& F) {
+  Tensor R, S;
+  const DeviceScope device(F);
+  dispatch_matrices(F, [&]<class T, int D>() {
+    R = empty_particles(F, {F.size(0), D, D});
+    S = empty_particles(F, {F.size(0), D, D});
+    const PolarArguments<T, D> a{F.size(0), field<const T>(F), field<T>(R), field<T>(S)};
+    backend::polar(a, device.stream());
+  });
+  return {R, S};
+}
+
+}  // namespace
+}  // namespace mpm
+
+#if MPM_BACKEND == MPM_BACKEND_IS_cpu
+STABLE_TORCH_LIBRARY_FRAGMENT(torch_mpm, m) {
+  m.def("svd3(Tensor F) -> (Tensor U, Tensor sigma, Tensor V)");
+  m.def("polar(Tensor F) -> (Tensor R, Tensor S)");
+}
+#endif
+
+MPM_LIBRARY_IMPL(m) {
+  m.impl("svd3", TORCH_BOX(&mpm::singular_values_and_vectors));
+  m.impl("polar", TORCH_BOX(&mpm::polar_decomposition));
+}
