@@ -46,8 +46,8 @@ def speed(results: list[dict[str, Any]]) -> str:
     notes = [f"- {common.describe(result['environment'])}" for result in results]
     intro = (
         "One explicit neo-Hookean step, 3-D, float32, quadratic kernel, 8 particles per cell, everything included. "
-        "Columns with x are multiples of its time in the same run; rates are G particles/s; the error is the largest of "
-        "P2G, G2P and their gradients against float64."
+        "Columns with x are multiples of its time in the same run; rates are G particles/s; the error is the largest "
+        "of P2G, G2P and their gradients against float64."
     )
     return "\n".join([intro, "", common.table(header, rows), "", *notes])
 
