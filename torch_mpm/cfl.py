@@ -1,9 +1,9 @@
 """The largest stable time step of an explicit step, estimated from the state.
 
-Let a_p be the largest tangent modulus of particle p in the current deformation (`Material.stiffness`), η_p its viscosity,
-V_p and m_p its rest volume and mass. The gradient that a particle gathers obeys |∇v|² ≤ (Λ/dx²) Σ_i N_i |v_i|², where Λ
-depends on the kernel and the stress form only, for any particle layout. Therefore the eigenvalues of M⁻¹H, with H the
-tangent stiffness or the viscous matrix on the grid and M the lumped mass, are at most
+Let a_p be the largest tangent modulus of particle p in the current deformation (`Material.stiffness`), η_p its
+viscosity, V_p and m_p its rest volume and mass. For any particle layout, the gradient that a particle gathers obeys
+|∇v|² ≤ (Λ/dx²) Σ_i N_i |v_i|², with a Λ of the kernel and the stress form. Therefore the eigenvalues of M⁻¹H, with H
+the tangent stiffness or the viscous matrix on the grid and M the lumped mass, are at most
 
     λ_e = max_p a_p V_p Λ/(m_p dx²)   and   λ_v = max_p 2 η_p V_p Λ/(m_p dx²).
 
@@ -12,9 +12,9 @@ advanced by v ← s v − dt λ_e u − dt λ_v v, u ← u + dt v, which is stab
 
     dt² λ_e / 2 + dt λ_v ≤ 1 + s.
 
-With APIC the stiffest modes are kept whole: a mode of y λ, y ≤ 1, has s ≥ y, and y = 1 is the worst case, so s = 1 gives
-the limit; it is dx/c for the quadratic MLS form. PIC and FLIP may lose the stiffest modes: s = 0. Speed is added so that no
-particle moves by more than dx in a step.
+With APIC the stiffest modes are kept whole: a mode of y λ, y ≤ 1, has s ≥ y, and y = 1 is the worst case, so s = 1
+gives the limit; it is dx/c with ρ c² = a for the quadratic MLS form. PIC and FLIP may lose the stiffest modes: s = 0.
+An isolated particle reaches the limit (tests/test_cfl.py). Speed is added so that none moves by more than dx in a step.
 """
 
 from __future__ import annotations
@@ -54,8 +54,8 @@ def stable_dt(
         stress_form: "mls" or "gradient".
 
     Returns:
-        dt [B] [s], constant for autograd; inf for a scene without particles, or without stiffness, viscosity and speed. A
-        particle without mass makes it zero; one that is not finite is left out.
+        dt [B] [s], constant for autograd; inf for a scene without particles, or without stiffness, viscosity and
+        speed. A particle without mass makes it zero; one that is not finite is left out.
 
     Raises:
         ValueError: for a cfl that is not positive, or an unknown stress form.

@@ -1,8 +1,8 @@
 """Constitutive laws: modules from the deformation of a state to its Kirchhoff stress.
 
 A law is a `Material`. Those compiled in csrc/materials take parameters that are numbers or tensors of shape [], [1],
-[B] (per scene) or [P] (per particle, in the order of `state.ids` where particles were reordered; this meaning wins where
-P = B), and pass gradients to them. `CustomLaw` makes a law of any module, `Mixture` combines several in one state.
+[B] (per scene) or [P] (per particle, in the order of `state.ids` where particles were reordered; also where P = B), and
+pass gradients to them. `CustomLaw` makes a law of any module, `Mixture` combines several in one state.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class Material(nn.Module):
     viscous: bool = False
 
     def update(self, state: State) -> tuple[dict[str, Tensor], Tensor]:
-        """Fields that the law changes (a plastic law returns F to its yield surface) and Kirchhoff stress [P, D, D] [Pa]."""
+        """Fields that the law changes (plastic laws: F at the yield surface), and Kirchhoff stress [P, D, D] [Pa]."""
         raise NotImplementedError
 
     def stress(self, state: State) -> Tensor:
@@ -54,7 +54,7 @@ class Material(nn.Module):
         return self.energy_density(state) * state.volume
 
     def stiffness(self, state: State) -> Tensor:
-        """Upper bound of the tangent modulus over all velocity gradients of unit norm [P] [Pa]; bounds the stable dt."""
+        """Upper bound of the tangent modulus over all velocity gradients of unit norm [P] [Pa]; limits the step."""
         raise NotImplementedError(f"{type(self).__name__} has no stiffness, which the stable time step needs")
 
     def wave_modulus(self, state: State) -> Tensor:
@@ -151,7 +151,9 @@ def _same(a: Any, b: Any) -> bool:
 def _check_value(name: str, value: Value, expected: str, holds: Callable[[Any], Any]) -> Value:
     if isinstance(value, Tensor):
         if value.dim() > 1 or value.numel() == 0 or not value.is_floating_point():
-            raise ValueError(f"{name} must be a number or a floating tensor of shape [], [1], [B] or [P], got {shape_of(value)}")
+            raise ValueError(
+                f"{name} must be a number or a floating tensor of shape [], [1], [B] or [P], got {shape_of(value)}"
+            )
         good = bool((holds(value.detach()) & value.detach().isfinite()).all())
     else:
         good = math.isfinite(value) and bool(holds(value))
@@ -175,6 +177,10 @@ class NeoHookean(CompiledLaw):
     """
 
     name = "neo_hookean"
+    E: Any  # numbers, buffers or nn.Parameters
+    nu: Any
+    mu: Any
+    lam: Any
 
     def __init__(
         self, E: Value | None = None, nu: Value | None = None, mu: Value | None = None, lam: Value | None = None
@@ -186,7 +192,7 @@ class NeoHookean(CompiledLaw):
         if E is not None and nu is not None:
             self._store("E", _check_value("E", E, "finite and not negative", lambda v: v >= 0))
             self._store("nu", _check_value("nu", nu, "between -1 and 0.5", lambda v: (v > -1) & (v < 0.5)))
-            if isinstance(E, Tensor) and isinstance(nu, Tensor) and E.numel() > 1 and nu.numel() > 1 and E.shape != nu.shape:
+            if len({v.numel() for v in (E, nu) if isinstance(v, Tensor) and v.numel() > 1}) > 1:
                 raise ValueError(f"E and nu must have one shape where both vary, got {shape_of(E)} and {shape_of(nu)}")
         elif mu is not None and lam is not None:
             self._store("mu", _check_value("mu", mu, "finite and not negative", lambda v: v >= 0))
@@ -202,9 +208,9 @@ class NeoHookean(CompiledLaw):
 
 
 class WeaklyCompressible(CompiledLaw):
-    """Fluid with Tait-Murnaghan pressure p = K/γ (J^−γ − 1) (Monaghan 1994): τ = −J p I + 2 J η dev(sym C). Stores J, no F.
+    """Fluid with Tait-Murnaghan pressure (Monaghan 1994): p = K/γ (J^−γ − 1), τ = −J p I + 2 J η dev(sym C).
 
-    γ = 1 is the linear law τ = K (J − 1) I. At rest the speed of sound is √(K/ρ).
+    It stores J and no F. γ = 1 is the linear law τ = K (J − 1) I. At rest the speed of sound is √(K/ρ).
 
     Args:
         bulk_modulus: K [Pa], not negative.
@@ -216,12 +222,17 @@ class WeaklyCompressible(CompiledLaw):
     """
 
     state_fields = ("J",)
+    bulk_modulus: Any
+    gamma: Any
+    eta: Any
 
     def __init__(self, bulk_modulus: Value, gamma: Value = 7.0, viscosity: Value = 0.0) -> None:
         super().__init__()
-        self._store("bulk_modulus", _check_value("bulk_modulus", bulk_modulus, "finite and not negative", lambda v: v >= 0))
+        for name, value in (("bulk_modulus", bulk_modulus), ("viscosity", viscosity)):
+            _check_value(name, value, "finite and not negative", lambda v: v >= 0)
+        self._store("bulk_modulus", bulk_modulus)
         self._store("gamma", _check_value("gamma", gamma, "positive", lambda v: v > 0))
-        self._store("eta", _check_value("viscosity", viscosity, "finite and not negative", lambda v: v >= 0))
+        self._store("eta", viscosity)
         self.viscous = isinstance(viscosity, Tensor) or viscosity > 0
         self.name = "viscous_fluid" if self.viscous else "weakly_compressible"
 
@@ -241,8 +252,8 @@ class CustomLaw(Material):
     """A law from any module or function: F [P, D, D] -> Kirchhoff stress [P, D, D] [Pa], in ordinary torch code.
 
     Args:
-        function: called with the state field. It may return a pair (F, stress) instead, F being what a plastic law makes of
-            its argument.
+        function: called with the state field. It may return a pair (F, stress) instead, with F what a plastic law makes
+            of its argument.
         state_field: "F", or "J" [P] for a law of the volume ratio alone.
         stiffness: see `Material.stiffness`; a number, a tensor [P] or a function of the state. Needed for `stable_dt`.
 
@@ -283,18 +294,17 @@ class CustomLaw(Material):
         return torch.as_tensor(value, dtype=state.x.dtype, device=state.x.device).expand(state.x.shape[0])
 
     def invalid(self, state: State) -> Tensor:
-        if self.state_fields == ("J",):
-            J = state.J
-        else:
-            J = torch.linalg.det(torch.where(state.F.isfinite(), state.F, torch.nan))
+        (field,) = self.state_fields
+        deformation: Tensor = getattr(state, field)
+        J = deformation if field == "J" else torch.linalg.det(deformation.where(deformation.isfinite(), torch.nan))
         return ~((J > 0) & J.isfinite())
 
 
 class Mixture(Material):
     """Several laws in one state: law k for the particles with state.material = k.
 
-    The particles of each law are found once per `state.material` tensor, which synchronises with the device; replace the
-    tensor rather than write into it. Per-particle parameters of the laws have shape [P] for all particles of the state.
+    The particles of each law are found once per `state.material` tensor, which synchronises with the device; replace
+    the tensor rather than write into it. Per-particle parameters of the laws have shape [P] for the whole state.
 
     Args:
         laws: at least one.
@@ -358,7 +368,9 @@ class Mixture(Material):
             raise ValueError("a Mixture needs state.material, int32 [P]")
         if material is not self._material:
             if material.numel() and not bool(((material >= 0) & (material < len(self.laws))).all()):
-                raise ValueError(f"state.material must be in 0 .. {len(self.laws) - 1}, got {material.unique().tolist()}")
+                raise ValueError(
+                    f"state.material must be in 0 .. {len(self.laws) - 1}, got {material.unique().tolist()}"
+                )
             self._indices = [(material == k).nonzero().squeeze(1) for k in range(len(self.laws))]
             self._material = material
         return [(_Part(state, index), law) for index, law in zip(self._indices, self.laws, strict=True) if len(index)]

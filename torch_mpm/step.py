@@ -152,7 +152,8 @@ class Step(nn.Module):
 
     def stable_dt(self, state: State, cfl: float = 0.5) -> Tensor:
         """Largest stable time step of each scene [s], [B], times `cfl`; see `torch_mpm.cfl.stable_dt`."""
-        return stable_dt(self.grid, self.law, self.prepare(state), cfl, self.transfer, self.stress_form)
+        transfer = "flip" if self.flip else self.transfer
+        return stable_dt(self.grid, self.law, self.prepare(state), cfl, transfer, self.stress_form)
 
     def check(self, state: State | None = None) -> None:
         """Read the status of all steps so far, and look at a state if one is given; synchronises with the device.

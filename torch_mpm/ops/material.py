@@ -28,7 +28,8 @@ def material_stress(
     Args:
         law: "neo_hookean", "weakly_compressible" or "viscous_fluid"; see `torch_mpm.reference.material` for formulas.
         state: deformation gradient F [P, D, D], or the volume ratio J [P] of a fluid.
-        parameters: of the law, in its order; each of shape [], [1], [B] (with `scene`) or [P]. Where P = B, [P] is meant.
+        parameters: of the law, in its order; each of shape [], [1], [B] (with `scene`) or [P] (also where
+            P = B).
         C: velocity gradient [P, D, D] [1/s] of "viscous_fluid"; None for a fluid at rest.
         scene: scene of each particle, int32 [P].
         dim: D; needed where the state is J.
@@ -50,7 +51,9 @@ def material_stress(
 def material_energy(
     law: str, state: Tensor, parameters: Parameters, scene: Tensor | None = None, dim: int | None = None
 ) -> Tensor:
-    """Elastic energy per rest volume ψ [P] [Pa]; infinite where det F or J is not positive. Arguments as `material_stress`.
+    """Elastic energy per rest volume ψ [P] [Pa]; infinite where det F or J is not positive.
+
+    Arguments as `material_stress`. Evaluated in float64 inside: near rest it is a small difference of large terms.
 
     Differentiable with respect to state and parameters, twice in eager mode.
     """
@@ -117,7 +120,7 @@ def _check(law: str, state: Tensor, parameters: Parameters, scene: Tensor | None
 
 
 @torch.library.register_fake("torch_mpm::material_stress")
-def _stress_fake(state, C, scene, parameters, law, dim):  # type: ignore[no-untyped-def]
+def _stress_fake(state, C, scene, parameters, law, dim):
     return soa_empty(state, (state.shape[0], dim, dim))
 
 
@@ -129,17 +132,17 @@ def _adjoints_fake(state: Tensor, C: Tensor | None, parameters: Parameters, dim:
 
 
 @torch.library.register_fake("torch_mpm::material_stress_backward")
-def _stress_backward_fake(grad, state, C, scene, parameters, law, dim, needs):  # type: ignore[no-untyped-def]
+def _stress_backward_fake(grad, state, C, scene, parameters, law, dim, needs):
     return _adjoints_fake(state, C, parameters, dim, needs)
 
 
 @torch.library.register_fake("torch_mpm::material_energy_backward")
-def _energy_backward_fake(grad, state, scene, parameters, law, dim, needs):  # type: ignore[no-untyped-def]
+def _energy_backward_fake(grad, state, scene, parameters, law, dim, needs):
     grad_state, _, grad_parameters = _adjoints_fake(state, None, parameters, dim, needs)
     return grad_state, grad_parameters
 
 
-def _scalar_fake(state, scene, parameters, law, dim):  # type: ignore[no-untyped-def]
+def _scalar_fake(state, scene, parameters, law, dim):
     return state.new_empty(state.shape[0])
 
 
@@ -177,7 +180,7 @@ def _needs(ctx: Any) -> int:
     return int(need[0]) | 2 * int(len(need) == 6 and need[1]) | 4 * int(parameters)
 
 
-def _stress_backward(ctx, grad):  # type: ignore[no-untyped-def]
+def _stress_backward(ctx, grad):
     state, C, scene, *parameters = ctx.saved_tensors
     needs = _needs(ctx)
     grad_state, grad_C, grad_parameters = torch.ops.torch_mpm.material_stress_backward(
@@ -187,7 +190,7 @@ def _stress_backward(ctx, grad):  # type: ignore[no-untyped-def]
     return grad_state if needs & 1 else None, grad_C if needs & 2 else None, None, shared, None, None
 
 
-def _energy_backward(ctx, grad):  # type: ignore[no-untyped-def]
+def _energy_backward(ctx, grad):
     state, scene, *parameters = ctx.saved_tensors
     needs = _needs(ctx)
     grad_state, grad_parameters = torch.ops.torch_mpm.material_energy_backward(
@@ -202,20 +205,20 @@ def _backward_setup(ctx: Any, inputs: Any, output: Any) -> None:
     ctx.save_for_backward(*tensors, *parameters)
 
 
-def _stress_double_backward(ctx, *grads):  # type: ignore[no-untyped-def]
+def _stress_double_backward(ctx, *grads):
     grad, state, C, scene, *parameters = ctx.saved_tensors
 
-    def evaluate(state, C, *parameters):  # type: ignore[no-untyped-def]
+    def evaluate(state, C, *parameters):
         return reference.stress(ctx.law, state, parameters, C, None, ctx.dim)
 
     grad, state, C, *shared = _differentiate_adjoint(ctx, evaluate, (grad, state, C, *parameters), scene, grads)
     return grad, state, C, None, shared, None, None, None
 
 
-def _energy_double_backward(ctx, grad_state, grad_parameters):  # type: ignore[no-untyped-def]
+def _energy_double_backward(ctx, grad_state, grad_parameters):
     grad, state, scene, *parameters = ctx.saved_tensors
 
-    def evaluate(state, C, *parameters):  # type: ignore[no-untyped-def]
+    def evaluate(state, C, *parameters):
         return reference.energy(ctx.law, state, parameters, None, ctx.dim)
 
     inputs = (grad, state, None, *parameters)
@@ -223,8 +226,12 @@ def _energy_double_backward(ctx, grad_state, grad_parameters):  # type: ignore[n
     return grad, state, None, shared, None, None, None
 
 
-def _differentiate_adjoint(  # type: ignore[no-untyped-def]
-    ctx, evaluate: Callable[..., Tensor], inputs: Sequence[Tensor | None], scene: Tensor | None, grads: Sequence[Tensor | None]
+def _differentiate_adjoint(
+    ctx: Any,
+    evaluate: Callable[..., Tensor],
+    inputs: Sequence[Tensor | None],
+    scene: Tensor | None,
+    grads: Sequence[Tensor | None],
 ) -> list[Tensor | None]:
     """Derivatives of a backward op by its inputs (grad, state, C, parameters...), from the reference in plain torch.
 
@@ -232,7 +239,7 @@ def _differentiate_adjoint(  # type: ignore[no-untyped-def]
     """
     wanted = [bool(ctx.needs >> i & 1) for i in range(3)]
 
-    def adjoint(grad, state, C, *parameters):  # type: ignore[no-untyped-def]
+    def adjoint(grad, state, C, *parameters):
         values = [reference.per_particle(p, scene, state.shape[0]) for p in parameters]
         grad_state, grad_C, *shared = differentiate(evaluate, (state, C, *values), [grad])
         zero = state.new_zeros(state.shape[0])
@@ -242,8 +249,10 @@ def _differentiate_adjoint(  # type: ignore[no-untyped-def]
     return differentiate(adjoint, inputs, [g for g, w in zip(grads, wanted, strict=True) if w])
 
 
-def _no_backward(ctx, grad):  # type: ignore[no-untyped-def]
-    raise NotImplementedError("wave speeds and stiffness bounds are not differentiable: compute them under torch.no_grad()")
+def _no_backward(ctx, grad):
+    raise NotImplementedError(
+        "wave speeds and stiffness bounds are not differentiable: compute them under torch.no_grad()"
+    )
 
 
 def _no_setup(ctx: Any, inputs: Any, output: Any) -> None:

@@ -1,0 +1,149 @@
+"""The estimated stable time step against simulations: it is the limit where that is sharp, and never above it."""
+
+import math
+
+import pytest
+import torch
+
+import torch_mpm as mpm
+
+DENSITY = 1000.0
+
+
+def simulate(step: mpm.Step, state: mpm.State, dt: torch.Tensor, steps: int) -> torch.Tensor:
+    """The largest |v| + dx |C| that a particle of each scene has in these steps."""
+    scenes = step.grid.scenes
+    largest = torch.zeros(scenes, dtype=state.x.dtype)
+    with torch.no_grad():
+        for _ in range(steps):
+            state = step(state, dt)
+            size = state.v.norm(dim=1) + state.C.norm(dim=(1, 2)) * step.grid.dx
+            largest = largest.scatter_reduce(0, state.scene.long(), size.nan_to_num(torch.inf), "amax")
+    return largest
+
+
+@pytest.mark.parametrize(
+    "law",
+    [
+        mpm.NeoHookean(E=1e6, nu=0.0),
+        mpm.NeoHookean(E=1e6, nu=0.49),
+        mpm.WeaklyCompressible(1e6),
+        mpm.WeaklyCompressible(10.0, viscosity=3e3),
+    ],
+    ids=["nu 0", "nu 0.49", "fluid", "viscous"],
+)
+def test_estimate_is_the_limit_of_an_isolated_particle(law: mpm.Material, kernel: str, dim: int) -> None:
+    """One particle feels every velocity gradient, so nothing is lost in the bound: stable at 0.98, unstable at 1.03."""
+    grid = mpm.Grid(dx=0.1, lower=(0,) * dim, upper=(1,) * dim, scenes=2, kernel=kernel)
+    step = mpm.Step(grid, law)
+    x = 0.4 + 0.2 * torch.rand(1, dim, dtype=torch.float64).repeat(2, 1)
+    C = 1e-8 * torch.randn(1, dim, dim, dtype=torch.float64).repeat(2, 1, 1)
+    mass = torch.ones(2, dtype=torch.float64)
+    state = mpm.State(x=x, v=torch.zeros_like(x), mass=mass, volume=mass / DENSITY, C=C, scene=torch.arange(2).int())
+    dt = step.stable_dt(state, cfl=1.0) * torch.tensor([0.98, 1.03], dtype=torch.float64)
+    growth = simulate(step, state, dt, 200) / (C.norm(dim=(1, 2)) * grid.dx)
+    assert growth[0] < 100
+    assert growth[1] > 1e4
+
+
+@pytest.mark.parametrize("transfer", ["apic", "pic", "flip"])
+def test_estimate_is_the_limit_of_one_particle_per_cell(transfer: str) -> None:
+    """At cell centres the stiffest grid mode is exactly that of the bound; PIC and FLIP lose its velocity."""
+    factors = torch.tensor([0.98, 1.15], dtype=torch.float64)
+    grid = mpm.Grid(dx=0.125, lower=(0, 0), upper=(1, 1), scenes=2)
+    step = mpm.Step(grid, mpm.NeoHookean(E=1e6, nu=0.0), walls="slip", transfer=transfer)
+    axis = (torch.arange(-1, 9, dtype=torch.float64) + 0.5) * grid.dx
+    x = torch.cartesian_prod(axis, axis)
+    volume = torch.full((2 * len(x),), grid.dx**2, dtype=torch.float64)
+    v = 1e-8 * torch.randn(len(x), 2, dtype=torch.float64).repeat(2, 1)
+    scene = torch.arange(2).repeat_interleave(len(x)).int()
+    state = mpm.State(x=x.repeat(2, 1), v=v, mass=DENSITY * volume, volume=volume, scene=scene)
+    dt = step.stable_dt(state.replace(v=torch.zeros_like(v)), cfl=1.0) * factors
+    wave = math.sqrt(1e6 / DENSITY)
+    assert float(dt[0] / factors[0]) == pytest.approx(grid.dx / wave * (1 if transfer == "apic" else math.sqrt(0.5)))
+    largest = torch.zeros(2, dtype=torch.float64)
+    with torch.no_grad():
+        for _ in range(300):
+            state = step(state, dt)
+            largest = largest.scatter_reduce(0, scene.long(), state.v.norm(dim=1).nan_to_num(torch.inf), "amax")
+    assert largest[0] < 1e-6
+    assert largest[1] > 1e-4
+
+
+def at_rest(grid: mpm.Grid, device: str, dtype: torch.dtype = torch.float64, per_scene: int = 4) -> mpm.State:
+    x = 0.3 + 0.4 * torch.rand(per_scene * grid.scenes, grid.dim, dtype=dtype, device=device)
+    volume = torch.full(x.shape[:1], 1e-3, dtype=dtype, device=device)
+    F = torch.eye(grid.dim, dtype=dtype, device=device).repeat(len(x), 1, 1)
+    scene = torch.arange(len(x), device=device).remainder(max(grid.scenes, 1)).int()
+    return mpm.State(x=x, v=torch.zeros_like(x), mass=DENSITY * volume, volume=volume, F=F, scene=scene)
+
+
+@pytest.mark.parametrize("nu", [0.0, 0.3])
+def test_formula_at_rest_and_in_motion(nu: float, kernel: str, dim: int, device: str) -> None:
+    """dx/c with ρ c² = D λ + 2 μ; a speed v adds v/dx to 1/dt."""
+    grid = mpm.Grid(dx=0.1, lower=(0,) * dim, upper=(1,) * dim, kernel=kernel)
+    law, state = mpm.NeoHookean(E=1e5, nu=nu), at_rest(grid, device)
+    lam, mu = 1e5 * nu / ((1 + nu) * (1 - 2 * nu)), 1e5 / (2 * (1 + nu))
+    limit = grid.dx * math.sqrt(DENSITY / (dim * lam + 2 * mu)) * (1 if kernel == "quadratic" else math.sqrt(4 / 3))
+    assert mpm.stable_dt(grid, law, state).tolist() == pytest.approx([limit])
+    assert mpm.stable_dt(grid, law, state, cfl=0.25).tolist() == pytest.approx([0.25 * limit])
+    state.v[1, 0] = 7.0
+    assert mpm.stable_dt(grid, law, state).tolist() == pytest.approx([1 / (1 / limit + 70)])
+
+
+def test_viscous_limit(device: str) -> None:
+    """Without pressure, dt = dx²/(4 ν)."""
+    grid = mpm.Grid(dx=0.1, lower=(0, 0), upper=(1, 1))
+    state = at_rest(grid, device).replace(F=None)
+    state = state.replace(J=torch.ones_like(state.mass))
+    dt = mpm.stable_dt(grid, mpm.WeaklyCompressible(0.0, viscosity=5.0), state)
+    assert dt.tolist() == pytest.approx([grid.dx**2 / (4 * 5.0 / DENSITY)])
+
+
+def test_scenes_have_their_own_step(device: str) -> None:
+    grid = mpm.Grid(dx=0.1, lower=(0, 0), upper=(1, 1), scenes=3)
+    E = torch.tensor([1e4, 4e4, 9e4], dtype=torch.float64, device=device)
+    dt = mpm.stable_dt(grid, mpm.NeoHookean(E=E, nu=0.3), at_rest(grid, device))
+    assert torch.allclose(dt[0] / dt, torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64, device=device))
+
+
+def test_degenerate_particles(device: str) -> None:
+    """Empty scenes have no limit, particles without meaning do not count, one without mass allows no step."""
+    grid = mpm.Grid(dx=0.1, lower=(0, 0), upper=(1, 1), scenes=3)
+    law, state = mpm.NeoHookean(E=1e5, nu=0.3), at_rest(grid, device)
+    limit = float(mpm.stable_dt(grid, law, state)[0])
+    state = state.replace(scene=state.scene.clamp(max=1))
+    state.v[0] = torch.nan
+    state.F[3] = torch.nan
+    state.F[6] *= torch.tensor([[-1.0], [1.0]], dtype=torch.float64, device=device)
+    assert mpm.stable_dt(grid, law, state).tolist() == pytest.approx([limit, limit, math.inf])
+    state.mass[0] = 0.0
+    state.v[0] = 0.0
+    assert mpm.stable_dt(grid, law, state)[0] == 0
+    empty = state.select(torch.empty(0, dtype=torch.int64, device=device))
+    assert mpm.stable_dt(grid, law, empty).tolist() == [math.inf] * 3
+    single = mpm.Grid(dx=0.1, lower=(0, 0), upper=(1, 1))
+    assert mpm.stable_dt(single, law, empty.replace(scene=None)).tolist() == [math.inf]
+
+
+def test_needs_no_synchronisation(device: str) -> None:
+    if device == "cpu":
+        pytest.skip("only a GPU can be synchronised with")
+    grid = mpm.Grid(dx=0.1, lower=(0, 0), upper=(1, 1), scenes=3)
+    law, state = mpm.NeoHookean(E=1e5, nu=0.3), at_rest(grid, device)
+    mpm.stable_dt(grid, law, state)
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        mpm.stable_dt(grid, law, state)
+        law.update(state)
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+
+
+def test_bad_arguments() -> None:
+    grid = mpm.Grid(dx=0.1, lower=(0, 0), upper=(1, 1))
+    law, state = mpm.NeoHookean(E=1e5, nu=0.3), at_rest(grid, "cpu")
+    with pytest.raises(ValueError, match="cfl must be positive, got 0"):
+        mpm.stable_dt(grid, law, state, cfl=0)
+    with pytest.raises(ValueError, match="stress_form must be 'gradient' or 'mls', got 'fem'"):
+        mpm.stable_dt(grid, law, state, stress_form="fem")
