@@ -160,6 +160,14 @@ MPM_HD bool any(const Mask<T, N>& mask) {
   return r;
 }
 
+template <class T, int N>
+MPM_HD bool all(const Mask<T, N>& mask) {
+  bool r = true;
+  MPM_UNROLL
+  for (int i = 0; i < N; i++) r &= mask[i];
+  return r;
+}
+
 // f of each lane; the compiler turns the loop into vector code where f is an instruction.
 template <class T, int N, class F>
 MPM_HD Pack<T, N> map(const Pack<T, N>& a, const F& f) {
@@ -169,11 +177,26 @@ MPM_HD Pack<T, N> map(const Pack<T, N>& a, const F& f) {
   return Pack<T, N>::load(lanes);
 }
 
+#ifdef __FMA__
+// The instruction by name: whether the compiler contracts a * b + c depends on what stands around it.
+MPM_HD __m128 fused(__m128 a, __m128 b, __m128 c) { return _mm_fmadd_ps(a, b, c); }
+MPM_HD __m128d fused(__m128d a, __m128d b, __m128d c) { return _mm_fmadd_pd(a, b, c); }
+MPM_HD __m256 fused(__m256 a, __m256 b, __m256 c) { return _mm256_fmadd_ps(a, b, c); }
+MPM_HD __m256d fused(__m256d a, __m256d b, __m256d c) { return _mm256_fmadd_pd(a, b, c); }
+#ifdef __AVX512F__
+MPM_HD __m512 fused(__m512 a, __m512 b, __m512 c) { return _mm512_fmadd_ps(a, b, c); }
+MPM_HD __m512d fused(__m512d a, __m512d b, __m512d c) { return _mm512_fmadd_pd(a, b, c); }
+#endif
+#endif
+
 // a b + c rounded once.
 template <class T, int N>
 MPM_HD Pack<T, N> fma(const Pack<T, N>& a, const Pack<T, N>& b, const Pack<T, N>& c) {
 #ifdef __FMA__
-  return a * b + c;  // contracted by -ffp-contract=fast
+  Pack<T, N> r;
+  MPM_UNROLL
+  for (int k = 0; k < r.kParts; k++) r.part[k] = fused(a.part[k], b.part[k], c.part[k]);
+  return r;
 #else
   T x[N], y[N], z[N];
   a.store(x);
