@@ -1,7 +1,7 @@
 #include "cpu/activate_layout.h"
+#include "cpu/chunk.h"
 #include "cpu/kernels.h"
 #include "cpu/parallel.h"
-#include "cpu/schedule.h"
 
 // Finds the active blocks, numbers them in the order of the table, groups the particles by home block with a stable
 // counting sort, and writes the schedule. Every result is the same for any number of threads.
@@ -10,10 +10,13 @@ inline namespace TORCH_MPM_ISA {
 
 using W = ActivateWorkspace;
 
+constexpr int64_t kWorthThreads =
+    8192;  // items of particles or of the table below which threads cost more than they give
+
 // Calls f(part, begin, end) for `parts` nearly equal parts of [0, count), in parallel.
 template <class F>
 void for_parts(int parts, int64_t count, const F& f) {
-  parallel_ranges(parts, 1, [&](int64_t first, int64_t last) {
+  parallel_ranges(parts, count < kWorthThreads ? parts : 1, [&](int64_t first, int64_t last) {
     for (int64_t part = first; part < last; part++) f(int(part), count * part / parts, count * (part + 1) / parts);
   });
 }
@@ -73,30 +76,69 @@ MPM_HD bool is_finite(T x) {
   return x - x == T(0);
 }
 
-// Home block and cell of each particle of a slice.
+// Home block and cell of one particle, or why it is left out.
 template <int Order, class T, int D>
-void classify(const Activation<T, D>& s, int slice, int64_t begin, int64_t end) {
+void classify(const Activation<T, D>& s, int64_t p, int64_t* totals) {
   const ActivateArguments<T, D>& a = s.a;
+  const int scene = a.scene ? a.scene[p * a.scene_stride] : 0;
+  T x[D], f[D];
+  int base[D], block[D];
+  bool finite = true;
+  for (int i = 0; i < D; i++) {
+    x[i] = at(a.x, p, i);
+    finite = finite && is_finite(x[i]);
+  }
+  if (!finite || scene < 0 || scene >= a.scenes || !locate<Order>(a.geometry, x, base, f)) {
+    const int which = finite ? W::kOutside : W::kNonFinite;
+    if (totals[which]++ == 0) totals[which + 1] = p;
+    s.w.key[p] = -1;
+    return;
+  }
+  for (int i = 0; i < D; i++) block[i] = base[i] / kBlockWidth;
+  s.w.key[p] = block_index(a.geometry, scene, block);
+  s.w.cell[p] = uint8_t(node_in_block<D>(base));
+}
+
+// The same for kLanes particles at once; false, and nothing done, unless all are on the lattice.
+template <int Order, class T, int D>
+bool classify_pack(const Activation<T, D>& s, int64_t p) {
+  const ActivateArguments<T, D>& a = s.a;
+  int key[kLanes] = {}, cell[kLanes] = {};
+  bool inside = true;
+  if (a.scene)
+    for (int l = 0; l < kLanes; l++) {
+      key[l] = a.scene[(p + l) * a.scene_stride];
+      inside = inside && key[l] >= 0 && key[l] < a.scenes;
+    }
+  Group g = {kLanes, true, {}};
+  for (int l = 0; l < kLanes; l++) g.id[l] = int(p) + l;
+  MPM_UNROLL
+  for (int i = 0; i < D; i++) {
+    const Lanes<T> base = base_node<Order>(a.geometry, i, load(a.x, g, i));
+    inside = inside && all(on_lattice<Order>(a.geometry, i, base));
+    if (!inside) return false;
+    T node[kLanes];
+    base.store(node);
+    for (int l = 0; l < kLanes; l++) {
+      const int n = int(node[l]);
+      key[l] = key[l] * a.geometry.blocks[i] + n / kBlockWidth;
+      cell[l] = cell[l] * kBlockWidth + n % kBlockWidth;
+    }
+  }
+  __builtin_memcpy(s.w.key + p, key, sizeof(key));
+  for (int l = 0; l < kLanes; l++) s.w.cell[p + l] = uint8_t(cell[l]);
+  return true;
+}
+
+template <int Order, class T, int D>
+void classify_slice(const Activation<T, D>& s, int slice, int64_t begin, int64_t end) {
   int64_t* totals = s.totals(slice);
   for (int i = 0; i < W::kTotals; i++) totals[i] = 0;
-  for (int64_t p = begin; p < end; p++) {
-    const int scene = a.scene ? a.scene[p * a.scene_stride] : 0;
-    T x[D], f[D];
-    int base[D], block[D];
-    bool finite = true;
-    for (int i = 0; i < D; i++) {
-      x[i] = a.x.pointer[p * a.x.stride[0] + i * a.x.stride[1]];
-      finite = finite && is_finite(x[i]);
-    }
-    if (!finite || scene < 0 || scene >= a.scenes || !locate<Order>(a.geometry, x, base, f)) {
-      const int which = finite ? W::kOutside : W::kNonFinite;
-      if (totals[which]++ == 0) totals[which + 1] = p;
-      s.w.key[p] = -1;
-      continue;
-    }
-    for (int i = 0; i < D; i++) block[i] = base[i] / kBlockWidth;
-    s.w.key[p] = block_index(a.geometry, scene, block);
-    s.w.cell[p] = uint8_t(node_in_block<D>(base));
+  for (int64_t p = begin; p < end;) {
+    if (p + kLanes <= end && classify_pack<Order>(s, p))
+      p += kLanes;
+    else
+      for (const int64_t stop = p + kLanes < end ? p + kLanes : end; p < stop; p++) classify<Order>(s, p, totals);
   }
 }
 
@@ -104,29 +146,32 @@ template <int Order, int D>
 MPM_HD unsigned touched_blocks_of_cell(int cell) {
   int local[D];
   MPM_UNROLL
-  for (int i = D - 1; i >= 0; i--) {
-    local[i] = cell % kBlockWidth;
-    cell /= kBlockWidth;
-  }
+  for (int i = 0; i < D; i++) local[i] = cell_coordinate<D>(cell, i);
   return touched_blocks<Order, D>(local);
 }
 
-// Particles of each home block in a slice, and the blocks they touch.
+// Particles of each home block in a slice, and the blocks they touch. Particles that follow each other are mostly of one
+// home: they are counted together.
 template <int Order, class T, int D>
 void count_homes(const Activation<T, D>& s, int slice, int64_t begin, int64_t end) {
   int* count = s.w.count + slice * s.table_size;
   uint8_t* touched = s.w.touched + slice * s.table_size;
+  uint8_t touched_of[kBlockNodes<D>];
+  for (int cell = 0; cell < kBlockNodes<D>; cell++) touched_of[cell] = uint8_t(touched_blocks_of_cell<Order, D>(cell));
   __builtin_memset(count, 0, sizeof(int) * s.table_size);
   __builtin_memset(touched, 0, s.table_size);
   int64_t dropped = 0;
-  for (int64_t p = begin; p < end; p++) {
+  for (int64_t p = begin; p < end;) {
     const int key = s.w.key[p];
+    const int64_t first = p;
+    unsigned blocks = 0;
+    for (; p < end && s.w.key[p] == key; p++) blocks |= key < 0 ? 0 : touched_of[s.w.cell[p]];
     if (key < 0) {
-      dropped++;
-      continue;
+      dropped += p - first;
+    } else {
+      count[key] += int(p - first);
+      touched[key] |= uint8_t(blocks);
     }
-    count[key]++;
-    touched[key] |= uint8_t(touched_blocks_of_cell<Order, D>(s.w.cell[p]));
   }
   s.totals(slice)[W::kDropped] = dropped;
 }
@@ -211,11 +256,17 @@ int64_t place_slots(const Activation<T, D>& s, int64_t slots) {
 template <class T, int D>
 void fill_index(const Activation<T, D>& s, int slice, int64_t begin, int64_t end, int64_t outside) {
   int* next = s.w.count + slice * s.table_size;
-  for (int64_t p = begin; p < end; p++) {
+  for (int64_t p = begin; p < end;) {
     const int key = s.w.key[p];
-    const int64_t at = key < 0 ? outside++ : next[key]++;
-    s.a.index[at] = int(p);
-    s.w.cell_at[at] = s.w.cell[p];
+    const int64_t first = p, place = key < 0 ? outside : next[key];
+    for (; p < end && s.w.key[p] == key; p++) {
+      s.a.index[place + p - first] = int(p);
+      if (key >= 0) s.w.cell_at[place + p - first] = s.w.cell[p];
+    }
+    if (key < 0)
+      outside += p - first;
+    else
+      next[key] += int(p - first);
   }
 }
 
@@ -264,21 +315,21 @@ void sort_chunk(const Activation<T, D>& s, int64_t chunk) {
   const int* id = s.a.index + begin;
   uint16_t* order = s.schedule.order + begin;
   uint16_t* end = s.schedule.cell_end + chunk * kBlockNodes<D>;
-  int next[kBlockNodes<D>] = {};
-  bool sorted = id[count - 1] - id[0] == count - 1;
-  for (int i = 0; i < count; i++) {
-    next[cell[i]]++;
-    sorted = sorted && (i == 0 || cell[i - 1] <= cell[i]);
-  }
+  // Four counts of each cell, so that particles that follow each other do not wait for the same one.
+  uint16_t counts[4][kBlockNodes<D>] = {}, next[kBlockNodes<D>], nth[kChunk];
+  bool falls = false;
+  for (int i = 1; i < count; i++) falls |= cell[i - 1] > cell[i];
+  for (int i = 0; i < count; i++) counts[i % 4][cell[i]]++;
   for (int c = 0, before = 0; c < kBlockNodes<D>; c++) {
-    const int n = next[c];
-    next[c] = before;
-    end[c] = uint16_t(before += n);
+    next[c] = uint16_t(before);
+    end[c] = uint16_t(before += counts[0][c] + counts[1][c] + counts[2][c] + counts[3][c]);
   }
-  uint16_t nth[kChunk];
-  for (int i = 0; i < count; i++) nth[next[cell[i]]++] = uint16_t(i);
+  if (falls)
+    for (int i = 0; i < count; i++) nth[next[cell[i]]++] = uint16_t(i);
+  else
+    for (int i = 0; i < count; i++) nth[i] = uint16_t(i);
   for (int i = 0; i < count; i++) order[i] = uint16_t(cell[i] * kChunk + nth[i]);
-  s.schedule.chunk_sorted[chunk] = sorted;
+  s.schedule.chunk_sorted[chunk] = !falls && id[count - 1] - id[0] == count - 1;
 }
 
 template <class T, int D>
@@ -305,7 +356,7 @@ template <int Order, class T, int D>
 void activate(const ActivateArguments<T, D>& a) {
   const Activation<T, D> s(a);
   for_parts(s.w.slices, a.particles, [&](int slice, int64_t begin, int64_t end) {
-    classify<Order>(s, slice, begin, end);
+    classify_slice<Order>(s, slice, begin, end);
     count_homes<Order>(s, slice, begin, end);
   });
   const int64_t wanted = number_blocks(s);

@@ -6,14 +6,14 @@
 namespace mpm::cpu {
 
 struct ActivateWorkspace {
-  int slices;               // parts of the particles, each counted apart
-  int* key;                 // [particles] table index of the home block, -1 where not transferred
-  uint8_t* cell;            // [particles] cell of the base node in its block
-  uint8_t* cell_at;         // [particles] the same by position in the index tensor
-  int* count;               // [slices, table] particles of each home block, then where the next one goes
-  uint8_t* touched;         // [slices, table] which blocks the particles of a home touch: bit o for neighbour o
-  int64_t* totals;          // [slices, kTotals]
-  int64_t size;             // in bytes
+  int slices;        // parts of the particles, each counted apart
+  int* key;          // [particles] table index of the home block, -1 where not transferred
+  uint8_t* cell;     // [particles] cell of the base node in its block
+  uint8_t* cell_at;  // [particles] the same by position in the index tensor
+  int* count;        // [slices, table] particles of each home block, then where the next one goes
+  uint8_t* touched;  // [slices, table] which blocks the particles of a home touch: bit o for neighbour o
+  int64_t* totals;   // [slices, kTotals]
+  int64_t size;      // in bytes
   enum { kActive, kParticles, kDropped, kOutside, kOutsideFirst, kNonFinite, kNonFiniteFirst, kTotals };
 };
 

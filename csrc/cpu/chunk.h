@@ -44,8 +44,8 @@ MPM_HD int cell_coordinate(int cell, int axis) {
 
 struct Chunk {
   int slot, count;
-  const int* id;           // particles, ascending
-  const uint16_t* order;   // see Schedule
+  const int* id;          // particles, ascending
+  const uint16_t* order;  // see Schedule
   const uint16_t* cell_end;
   bool sorted;
 
@@ -62,7 +62,8 @@ struct Chunk {
   int by_cell(int i) const { return order[i] % kChunk; }  // the i-th particle in the order of cells
 };
 
-// Up to kLanes particles. Where they are `consecutive`, all lanes may be read and written, whatever the count.
+// Up to kLanes particles; id repeats the first one beyond the count. Where they are `consecutive`, all lanes may be
+// read and written, whatever the count.
 struct Group {
   int count;
   bool consecutive;
@@ -74,10 +75,11 @@ MPM_HD Group group_by_id(const Chunk& c, int i) {
   Group g;
   const int rest = c.count - i;
   g.count = rest < kLanes ? rest : kLanes;
-  g.id[0] = c.id[i];
-  g.consecutive = rest >= kLanes && c.id[i + kLanes - 1] - g.id[0] == kLanes - 1;
-  if (!g.consecutive)
-    for (int l = 1; l < kLanes; l++) g.id[l] = c.id[i + (l < g.count ? l : 0)];
+  g.consecutive = rest >= kLanes && c.id[i + kLanes - 1] - c.id[i] == kLanes - 1;
+  if (rest >= kLanes)
+    __builtin_memcpy(g.id, c.id + i, sizeof(g.id));
+  else
+    for (int l = 0; l < kLanes; l++) g.id[l] = c.id[i + (l < g.count ? l : 0)];
   return g;
 }
 
@@ -86,11 +88,13 @@ MPM_HD Group group_by_id(const Chunk& c, int i) {
 MPM_HD Group group_by_cell(const Chunk& c, int i, int end) {
   Group g;
   g.count = end - i < kLanes ? end - i : kLanes;
-  g.consecutive = c.sorted && i + kLanes <= c.count;
-  if (g.consecutive)
-    g.id[0] = c.id[i];
-  else
+  if (c.sorted && i + kLanes <= c.count) {
+    g.consecutive = true;
+    __builtin_memcpy(g.id, c.id + i, sizeof(g.id));
+  } else {
     for (int l = 0; l < kLanes; l++) g.id[l] = c.id[c.by_cell(i + (l < g.count ? l : 0))];
+    g.consecutive = g.count == kLanes && g.id[kLanes - 1] - g.id[0] == kLanes - 1;
+  }
   return g;
 }
 
@@ -103,9 +107,10 @@ MPM_HD T& at(const Field<T>& f, int64_t p, int i = 0, int j = 0) {
 template <class T>
 MPM_HD Lanes<T> load(const Field<const T>& f, const Group& g, int i = 0, int j = 0) {
   const T* from = f.pointer + i * f.stride[1] + j * f.stride[2];
-  if (g.consecutive && f.stride[0] == 1) return Lanes<T>::load(from + g.id[0]);
+  if (f.stride[0] == 1) return g.consecutive ? Lanes<T>::load(from + g.id[0]) : Lanes<T>::gather(from, g.id);
   T lanes[kLanes];
-  for (int l = 0; l < kLanes; l++) lanes[l] = from[(g.consecutive ? g.id[0] + l : g.id[l]) * f.stride[0]];
+  MPM_UNROLL
+  for (int l = 0; l < kLanes; l++) lanes[l] = from[g.id[l] * f.stride[0]];
   return Lanes<T>::load(lanes);
 }
 
@@ -115,7 +120,12 @@ MPM_HD void store_exactly(const Lanes<T>& v, const Field<T>& f, const Group& g, 
   T* to = f.pointer + i * f.stride[1] + j * f.stride[2];
   T lanes[kLanes];
   v.store(lanes);
-  for (int l = 0; l < g.count; l++) to[(g.consecutive ? g.id[0] + l : g.id[l]) * f.stride[0]] = lanes[l];
+  if (g.count == kLanes && f.stride[0] == 1) {
+    MPM_UNROLL
+    for (int l = 0; l < kLanes; l++) to[g.id[l]] = lanes[l];
+  } else {
+    for (int l = 0; l < g.count; l++) to[g.id[l] * f.stride[0]] = lanes[l];
+  }
 }
 
 // May write over the particles after the group, see `group_by_cell`.

@@ -143,7 +143,7 @@ MPM_HD Form<Lanes<T>, D, Axis> form(const Weights<Order, Lanes<T>, D>& s, Gift<L
       for (int a = 1; a < N; a++) r.dpsi[d][a] += w * line.dpsi[d][a - 1];
     }
   };
-  if constexpr (Axis == 0) {  // planes one after another keep the code small
+  if constexpr (Axis == 0 || (Gradient && Axis + 1 < D)) {  // loops keep the code small
     _Pragma("GCC unroll 1") for (int k = 0; k <= Order; k++) add(k);
   } else {
     MPM_UNROLL

@@ -12,10 +12,10 @@ void gather_with(const GatherArguments<T, D>& a, int first, int count) {
   gather_groups<Order, Gradient ? 1 : 0>(
       a.topology, a.x, a.nodes, first, count,
       [&](const Group& g, const Weights<Order, P, D>& w, int, const T* tile) {
-        for (int c = 0; c < count; c++) {
-          const Sums<P, D> s = gather_channel<Order, Moment, Gradient>(w, tile + c);
-          if (a.value.pointer) store(s.value, a.value, g, first + c);
-          MPM_UNROLL
+    for (int c = 0; c < count; c++) {
+      const Sums<P, D> s = gather_channel<Order, Moment, Gradient>(w, tile + c);
+      if (a.value.pointer) store(s.value, a.value, g, first + c);
+  MPM_UNROLL
           for (int d = 0; d < D; d++) {
             if (Moment) store(scale * s.moment[d], a.moment, g, first + c, d);
             if (Gradient) store(inverse_dx * s.gradient[d], a.gradient, g, first + c, d);

@@ -25,16 +25,16 @@ int64_t activate_workspace(const ActivateArguments<T, D>& a) {
   }
 MPM_CPU_KERNELS(MPM_CPU_FORWARD)
 
-#define MPM_CPU_EXPORT(T, D)                                                  \
+#define MPM_CPU_EXPORT(T, D)                                                 \
   template int64_t activate_workspace<T, D>(const ActivateArguments<T, D>&); \
-  MPM_CPU_EXPORT_ORDER(T, D, 2)                                               \
+  MPM_CPU_EXPORT_ORDER(T, D, 2)                                              \
   MPM_CPU_EXPORT_ORDER(T, D, 3)
-#define MPM_CPU_EXPORT_ORDER(T, D, Order)                                                                 \
-  template void activate<Order, T, D>(const ActivateArguments<T, D>&, Stream);                            \
-  template void p2g<Order, T, D>(const P2GArguments<T, D>&, Stream);                                      \
-  template void p2g_backward<Order, T, D>(const P2GBackwardArguments<T, D>&, Stream);                     \
-  template void scatter<Order, T, D>(const ScatterArguments<T, D>&, Stream);                              \
-  template void gather<Order, T, D>(const GatherArguments<T, D>&, Stream);                                \
+#define MPM_CPU_EXPORT_ORDER(T, D, Order)                                             \
+  template void activate<Order, T, D>(const ActivateArguments<T, D>&, Stream);        \
+  template void p2g<Order, T, D>(const P2GArguments<T, D>&, Stream);                  \
+  template void p2g_backward<Order, T, D>(const P2GBackwardArguments<T, D>&, Stream); \
+  template void scatter<Order, T, D>(const ScatterArguments<T, D>&, Stream);          \
+  template void gather<Order, T, D>(const GatherArguments<T, D>&, Stream);            \
   template void position_gradient<Order, T, D>(const PositionGradientArguments<T, D>&, Stream);
 MPM_CPU_EXPORT(float, 2)
 MPM_CPU_EXPORT(float, 3)

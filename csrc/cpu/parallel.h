@@ -10,7 +10,8 @@ namespace mpm::cpu {
 
 int thread_count();
 
-// Calls body(context, begin, end) on ranges that cover [0, count), in parallel. Ranges shorter than `grain` are not split.
+// Calls body(context, begin, end) on ranges that cover [0, count), in parallel. Ranges shorter than `grain` are not
+// split.
 void parallel_for(int64_t count, int64_t grain, void (*body)(void* context, int64_t begin, int64_t end), void* context);
 
 // Lets another thread run: for waits that may last where cores are shared.

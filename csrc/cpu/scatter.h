@@ -18,7 +18,7 @@ struct Gifts {
   static constexpr int kFields = kGradient + (Gradient ? kChannels * D : 0);
   static constexpr int kPadded = (kFields + kLanes - 1) / kLanes * kLanes;
   static constexpr int kLine = kChunk + 16;  // not a power of two, so that the arrays do not share cache sets
-  alignas(64) T row[kChunk][kPadded];          // value, slopes, gradients
+  alignas(64) T row[kChunk][kPadded];        // value, slopes, gradients
   alignas(64) T weight[D][S][kLine];
   alignas(64) T derivative[D][S][Gradient ? kLine : 1];
 

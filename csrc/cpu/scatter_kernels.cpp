@@ -6,10 +6,10 @@ inline namespace TORCH_MPM_ISA {
 
 template <int Order, bool Slope, bool Gradient, class T, int D>
 void p2g_with(const P2GArguments<T, D>& a) {
-  scatter_channels<Order, Slope, Gradient>(
-      a.topology, a.x, a.nodes, 0, 1 + D, [&](const Group& g, const Lanes<T> f[D], int scene) {
-        return gift_of_momentum<Order, Slope>(a, load_momentum(a, g, scene), f);
-      });
+  scatter_channels<Order, Slope, Gradient>(a.topology, a.x, a.nodes, 0, 1 + D,
+                                           [&](const Group& g, const Lanes<T> f[D], int scene) {
+                                             return gift_of_momentum<Order, Slope>(a, load_momentum(a, g, scene), f);
+                                           });
 }
 
 template <int Order, class T, int D>
@@ -24,10 +24,10 @@ void p2g(const P2GArguments<T, D>& a) {
 
 template <int Order, bool Slope, bool Gradient, class T, int D>
 void scatter_with(const ScatterArguments<T, D>& a, int first, int count) {
-  scatter_channels<Order, Slope, Gradient>(
-      a.topology, a.x, a.nodes, first, count, [&](const Group& g, const Lanes<T> f[D], int) {
-        return gift_of_features<Slope, Gradient, T, D>(a, first, count, g, f);
-      });
+  scatter_channels<Order, Slope, Gradient>(a.topology, a.x, a.nodes, first, count,
+                                           [&](const Group& g, const Lanes<T> f[D], int) {
+                                             return gift_of_features<Slope, Gradient, T, D>(a, first, count, g, f);
+                                           });
 }
 
 template <int Order, class T, int D>

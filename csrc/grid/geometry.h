@@ -48,9 +48,9 @@ MPM_HD S base_node(const Geometry<T, D>& g, int axis, const S& x) {
   return floor((x - S(g.lower[axis])) * S(g.inverse_dx) + S(T(kPadding - BSpline<Order>::base_offset)));
 }
 
-template <int Order, class T, int D>
-MPM_HD bool on_lattice(const Geometry<T, D>& g, int axis, const T& base) {
-  return base >= T(0) && base < T(g.blocks[axis] * kBlockWidth - Order);  // false for NaN
+template <int Order, class S, class T, int D>
+MPM_HD auto on_lattice(const Geometry<T, D>& g, int axis, const S& base) {
+  return (base >= S(T(0))) & (base < S(T(g.blocks[axis] * kBlockWidth - Order)));  // false for NaN
 }
 
 // Distance of x from a node along an axis, in cells.
