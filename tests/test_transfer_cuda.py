@@ -4,10 +4,10 @@ import dataclasses
 
 import pytest
 import torch
+from particles import Particles, random_particles
 from torch import Tensor
 
 import torch_mpm as mpm
-from particles import Particles, random_particles
 
 cuda = pytest.mark.skipif(not torch.cuda.is_available() or mpm._library.cuda_error is not None, reason="needs CUDA")
 pytestmark = cuda

@@ -2,34 +2,39 @@
 #include <cub/block/block_scan.cuh>
 #include <cub/device/device_radix_sort.cuh>
 
-#include "cuda/home.cuh"
 #include "cuda/launch.cuh"
 #include "cuda/launchers.h"
+#include "cuda/schedule.h"
 
 // Finds the active blocks and groups the particles by home block, without the host knowing any count.
 //   classify   home block and rank of every particle, number of particles and touched neighbours of every block
 //   slots      numbers the active blocks in the order of the table (one-pass scan)
 //   offsets    first particle and work items of every slot (one-pass scan)
-//   place      the index tensor, unused slots, status
+//   place      the index tensor, homes and neighbours, unused slots, status
 // Deterministic mode replaces the ranks, which depend on the order of atomics, by a stable sort.
 namespace mpm::cuda {
 namespace {
 
 constexpr int kThreads = 256;
+// Every kSampling-th thread block counts the home blocks met by its warps. More than kScattered per warp on average,
+// and the gathers are faster in the order of memory than block by block.
+constexpr int kSampling = 64, kScattered = 2;
 using Packed = unsigned long long;
 
 // Zeroed before each activation. The lowest index of a kind is kept as the largest complement, so that zero means none.
 struct Counters {
-  int tile[2];                        // tiles handed out by each scan
-  int tail;                           // particles that are not transferred
+  int tile[2];  // tiles handed out by each scan
+  int tail;     // particles that are not transferred
   int outside, outside_first;
   int non_finite, non_finite_first;
-  int wanted;                         // active blocks
+  int wanted;  // active blocks
   int transferred, items;
+  int groups, warps;  // of the thread blocks sampled
 };
 
-// `count` becomes the first position in the index tensor, or -1 minus the position from its end for particles that are not
-// transferred. Bit o of `touched`: the neighbour one block further along the axes of o, the last axis being bit 0 of o.
+// `count` becomes the first position in the index tensor, or -1 minus the position from its end for particles that are
+// not transferred. Bit o of `touched`: the neighbour one block further along the axes of o, the last axis being bit 0
+// of o.
 struct Tally {
   int count, touched;
 };
@@ -73,8 +78,8 @@ Workspace lay_out(const ActivateArguments<T, D>& a) {
     w.slot = reinterpret_cast<int*>(take(a.particles * sizeof(int)));
     w.slot_sorted = reinterpret_cast<int*>(take(a.particles * sizeof(int)));
     w.id = reinterpret_cast<int*>(take(a.particles * sizeof(int)));
-    check(cub::DeviceRadixSort::SortPairs(nullptr, w.sort_size, w.slot, w.slot_sorted, w.id, a.index, int(a.particles), 0,
-                                          bits_for(a.capacity)));
+    check(cub::DeviceRadixSort::SortPairs(nullptr, w.sort_size, w.slot, w.slot_sorted, w.id, a.index, int(a.particles),
+                                          0, bits_for(a.capacity)));
     w.sort = take(int64_t(w.sort_size));
   }
   return w;
@@ -106,7 +111,7 @@ __global__ void __launch_bounds__(kThreads) classify(const ActivateArguments<T, 
   bool finite = true;
   if (exists) {
 #pragma unroll
-    for (int i = 0; i < D; i++) x[i] = read(a.x, p, i);
+    for (int i = 0; i < D; i++) x[i] = a.x.pointer[p * a.x.stride[0] + i * a.x.stride[1]];
     finite = is_finite<T, D>(x);
     const int scene = a.scene ? a.scene[p * a.scene_stride] : 0;
     if (finite && unsigned(scene) < unsigned(a.scenes) && locate<Order>(a.geometry, x, base, f)) {
@@ -125,6 +130,13 @@ __global__ void __launch_bounds__(kThreads) classify(const ActivateArguments<T, 
   const unsigned group = __match_any_sync(~0u, exists ? key : INT_MIN);
   const unsigned before = group & ((1u << threadIdx.x % 32) - 1);
   const unsigned touched_by_group = __reduce_or_sync(group, touched);
+  if (blockIdx.x % kSampling == 0) {
+    const int groups = __popc(__ballot_sync(~0u, exists && before == 0));
+    if (threadIdx.x % 32 == 0) {
+      atomicAdd(&w.counters->groups, groups);
+      atomicAdd(&w.counters->warps, 1);
+    }
+  }
   int first = 0;
   if (exists && before == 0) {
     if (key < 0) {
@@ -143,8 +155,8 @@ __global__ void __launch_bounds__(kThreads) classify(const ActivateArguments<T, 
   }
 }
 
-// ---- One-pass scan (decoupled look-back, Merrill and Garland 2016). A state holds two 31-bit sums and, in the top bits,
-// whether they are those of the tile alone (1) or of all tiles up to it (2).
+// ---- One-pass scan (decoupled look-back, Merrill and Garland 2016). A state holds two 31-bit sums and, in the top
+// bits, whether they are those of the tile alone (1) or of all tiles up to it (2).
 
 constexpr Packed kSums = (Packed(1) << 62) - 1;
 __device__ Packed pack(int a, int b) { return Packed(unsigned(a)) | Packed(unsigned(b)) << 31; }
@@ -252,9 +264,10 @@ __global__ void __launch_bounds__(kThreads) offsets(const ActivateArguments<T, D
   const int start = first_of(before), item = second_of(before);
   if (slot >= 0) a.offsets[slot] = start;
   if (count > 0) w.tally[b].count = start;
+  int4* const out = reinterpret_cast<int4*>(lay_out_schedule<D>(a.schedule, a.capacity, a.particles).items) + item;
   for (int k = 0; k < items; k++) {
     const int begin = start + int(int64_t(count) * k / items), end = start + int(int64_t(count) * (k + 1) / items);
-    reinterpret_cast<int4*>(a.schedule + kScheduleHeader)[item + k] = make_int4(slot, begin, end, b);
+    out[k] = make_int4(slot, begin, end, b);
   }
   if (b == table - 1) {
     w.counters->transferred = start + count;
@@ -279,27 +292,49 @@ __device__ void write_status(const Counters& c, int capacity, const int* previou
 }
 
 template <class T, int D>
+__device__ void write_neighbours(const ActivateArguments<T, D>& a, int b, int neighbours[1 << D]) {
+  int block[D];
+  block_coordinates(a.geometry, b, block);
+#pragma unroll
+  for (int o = 0; o < 1 << D; o++) {
+    int to = 0;
+    bool inside = true;
+#pragma unroll
+    for (int i = 0; i < D; i++) {
+      const int step = o >> (D - 1 - i) & 1;
+      to = to * a.geometry.blocks[i] + step;
+      inside = inside && block[i] + step < a.geometry.blocks[i];
+    }
+    neighbours[o] = inside ? a.table[b + to] : -1;
+  }
+}
+
+template <class T, int D>
 __global__ void __launch_bounds__(kThreads) place(const ActivateArguments<T, D> a, const Workspace w) {
   const Counters& c = *w.counters;
+  const Schedule<int> schedule = lay_out_schedule<D>(a.schedule, a.capacity, a.particles);
   const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   if (i == 0) {
-    a.schedule[0] = c.items;
+    *schedule.item_count = c.items;
+    *schedule.scattered = c.groups > kScattered * c.warps;
     write_status(c, a.capacity, a.previous_status, a.status);
   }
-  if (i <= a.capacity && i >= min(c.wanted, a.capacity)) {
+  if (i < min(c.wanted, a.capacity)) {
+    write_neighbours(a, a.block[i], schedule.neighbours + (i << D));
+  } else if (i <= a.capacity) {
     a.offsets[i] = c.transferred;
     if (i < a.capacity) a.block[i] = -1;
   }
   if (i >= a.particles) return;
-  const int key = w.key[i];
+  const int key = w.key[i], first = key < 0 ? -1 : w.tally[key].count, home = first < 0 ? -1 : a.table[key];
+  schedule.home[i] = home;
   if (a.deterministic) {
-    w.slot[i] = key < 0 || w.tally[key].count < 0 ? a.capacity : a.table[key];
+    w.slot[i] = home < 0 ? a.capacity : home;
     w.id[i] = int(i);
-    return;
+  } else {
+    const int rank = w.rank[i];
+    a.index[first < 0 ? a.particles + first - rank : first + rank] = int(i);
   }
-  const int first = key < 0 ? -1 : w.tally[key].count;
-  const int rank = w.rank[i];
-  a.index[first < 0 ? a.particles + first - rank : first + rank] = int(i);
 }
 
 }  // namespace
@@ -328,8 +363,8 @@ void activate(const ActivateArguments<T, D>& a, Stream stream) {
   }
 }
 
-#define INSTANTIATE(T, D)                                                \
-  template int64_t activate_workspace(const ActivateArguments<T, D>&);   \
+#define INSTANTIATE(T, D)                                                  \
+  template int64_t activate_workspace(const ActivateArguments<T, D>&);     \
   template void activate<2, T, D>(const ActivateArguments<T, D>&, Stream); \
   template void activate<3, T, D>(const ActivateArguments<T, D>&, Stream);
 INSTANTIATE(float, 2)

@@ -4,14 +4,15 @@
 #include "cuda/launchers.h"
 #include "cuda/momentum.cuh"
 
-// G2P, gather, and the two adjoints that read nodes. One thread block loads the nodes of an item's home into shared memory;
-// each thread then takes a particle and sums over its support one axis at a time.
+// G2P, gather, and the two adjoints that read nodes. A thread takes a particle and sums over its support one axis at a
+// time. Particles come in one of two orders, which `activate` chooses: item by item, with the nodes of the home block
+// in shared memory; or, when neighbours in memory are no neighbours in space, in the order of memory, so that at least
+// the particle fields are read and written at full width.
 namespace mpm::cuda {
 
-// K node channels, padded so that one load fetches them.
-template <class T, int K>
-struct alignas(K == 1 ? sizeof(T) : K == 2 ? 2 * sizeof(T) : 16) NodeValue {
-  T e[K == 3 ? 4 : K];
+template <class T>
+struct alignas(16) Quad {
+  T e[4];
 };
 
 // Weights of the nodes of the support, their derivatives per cell, and the distances of the nodes in cells.
@@ -59,22 +60,95 @@ __device__ void accumulate(T& sum, T weight, T value) {
   sum = First ? weight * value : sum + weight * value;
 }
 
-template <class S, int Axis, class T>
-__device__ void sum_axis(const NodeValue<T, S::K>* tile, const Weights<S::Order, T, S::D>& w, const T (&constant)[S::K],
-                         const T (&linear)[S::K][S::D], Sums<S>& out);
+// For each of the blocks that are left when the leading axes are decided, the row that the base node would have if the
+// nodes went on beyond the block; a node of the support is a constant distance further.
+template <int Blocks>
+struct Rows {
+  int row[Blocks];
+};
 
-template <class S, int Axis, int Node, class T>
-__device__ void sum_node(const NodeValue<T, S::K>* tile, const Weights<S::Order, T, S::D>& w, const T (&constant)[S::K],
-                         const T (&linear)[S::K][S::D], Sums<S>& out) {
+// Whether nodes are fetched as one aligned quadruple: four channels, or a velocity that lies behind the mass.
+template <int K, class T>
+bool is_vector(const NodeField<const T>& n) {
+  const auto aligned = [&](int shift) { return reinterpret_cast<uintptr_t>(n.pointer - shift) % (4 * sizeof(T)) == 0; };
+  return n.stride == 4 && ((K == 4 && aligned(0)) || (K == 3 && aligned(1)));
+}
+
+template <bool Quads, int K, class T>
+__device__ void load_node(const NodeField<const T>& nodes, int row, int offset, T (&node)[K]) {
+  if constexpr (Quads) {
+    const Quad<T> quad = *reinterpret_cast<const Quad<T>*>(nodes.pointer + int64_t(row) * 4 + offset * 4 - (K == 3));
+#pragma unroll
+    for (int c = 0; c < K; c++) node[c] = quad.e[K == 3 ? c + 1 : c];
+  } else {
+    const T* const from = nodes.pointer + int64_t(row + offset) * int(nodes.stride);
+#pragma unroll
+    for (int c = 0; c < K; c++) node[c] = from[c];
+  }
+}
+
+// Nodes in global memory, in the home block and the blocks after it.
+template <class T, int K, int D, bool Quads>
+struct GridSupport {
+  static constexpr int blocks = 1 << D, width = kBlockWidth;
+  const NodeField<const T>& nodes;
+  int base[D];  // base node in the home block
+  Rows<blocks> rows;
+
+  __device__ void set_slot(int block, int slot) {
+    int row = slot * kBlockNodes<D> + node_in_block<D>(base);
+#pragma unroll
+    for (int i = 0, step = 1; i < D; i++, step *= kBlockWidth) row -= (block >> i & 1) * kBlockWidth * step;
+    rows.row[block] = row;
+  }
+  __device__ bool is_far(int axis, int node) const { return node > 0 && base[axis] + node >= kBlockWidth; }
+  __device__ void load(int row, int offset, T (&node)[K]) const { load_node<Quads>(nodes, row, offset, node); }
+};
+
+// K node channels in shared memory, padded so that one load fetches them.
+template <class T, int K>
+struct alignas(K == 1   ? sizeof(T)
+               : K == 2 ? 2 * sizeof(T)
+                        : 16) NodeValue {
+  T e[K == 3 ? 4 : K];
+};
+
+// Nodes in shared memory: those of the home block and the next Order along each axis.
+template <int Order, class T, int K>
+struct TileSupport {
+  static constexpr int blocks = 1, width = kBlockWidth + Order;
+  const NodeValue<T, K>* corner;  // the base node
+  Rows<1> rows;
+
+  __device__ bool is_far(int, int) const { return false; }
+  __device__ void load(int, int offset, T (&node)[K]) const {
+    const NodeValue<T, K> v = corner[offset];
+#pragma unroll
+    for (int c = 0; c < K; c++) node[c] = v.e[c];
+  }
+};
+
+template <class S, int Axis, int Blocks, class Support, class T>
+__device__ void sum_axis(const Support& support, const Rows<Blocks>& rows, int offset,
+                         const Weights<S::Order, T, S::D>& w, const T (&constant)[S::K], const T (&linear)[S::K][S::D],
+                         Sums<S>& out);
+
+template <class S, int Axis, int Node, int Blocks, class Support, class T>
+__device__ void sum_node(const Support& support, const Rows<Blocks>& rows, int offset,
+                         const Weights<S::Order, T, S::D>& w, const T (&constant)[S::K], const T (&linear)[S::K][S::D],
+                         Sums<S>& out) {
   constexpr bool first = Node == 0, differentiable = S::Slope != Form::none;
-  constexpr int width = Tile<S::Order, S::D>::width;
-  constexpr int stride = Axis == S::D - 1 ? 1 : (Axis == S::D - 2 ? width : width * width);
+  constexpr int half = Blocks > 1 ? Blocks / 2 : 1;
+  const bool far = support.is_far(Axis, Node);
+  Rows<half> side;
+#pragma unroll
+  for (int o = 0; o < half; o++) side.row[o] = far ? rows.row[Blocks - half + o] : rows.row[o];
   T below[S::K];
 #pragma unroll
   for (int c = 0; c < S::K; c++)
     below[c] = S::Slope == Form::affine ? constant[c] + linear[c][Axis] * w.distance[Axis][Node] : constant[c];
   Sums<S> in;
-  sum_axis<S, Axis + 1>(tile + Node * stride, w, below, linear, in);
+  sum_axis<S, Axis + 1>(support, side, offset * Support::width + Node, w, below, linear, in);
   const T n = w.weight[Axis][Node], dn = w.first[Axis][Node];
 #pragma unroll
   for (int c = 0; c < S::K; c++) {
@@ -94,31 +168,33 @@ __device__ void sum_node(const NodeValue<T, S::K>* tile, const Weights<S::Order,
 #pragma unroll
     for (int i = Axis + 1; i < S::D; i++) accumulate<first>(out.slope[i], n, in.slope[i]);
   }
-  if constexpr (Node < S::Order) sum_node<S, Axis, Node + 1>(tile, w, constant, linear, out);
+  if constexpr (Node < S::Order) sum_node<S, Axis, Node + 1>(support, rows, offset, w, constant, linear, out);
 }
 
 // Sums over the axes from `Axis` on.
-template <class S, int Axis, class T>
-__device__ void sum_axis(const NodeValue<T, S::K>* tile, const Weights<S::Order, T, S::D>& w, const T (&constant)[S::K],
-                         const T (&linear)[S::K][S::D], Sums<S>& out) {
+template <class S, int Axis, int Blocks, class Support, class T>
+__device__ void sum_axis(const Support& support, const Rows<Blocks>& rows, int offset,
+                         const Weights<S::Order, T, S::D>& w, const T (&constant)[S::K], const T (&linear)[S::K][S::D],
+                         Sums<S>& out) {
   if constexpr (Axis == S::D) {
-    const NodeValue<T, S::K> node = *tile;
+    T node[S::K];
+    support.load(rows.row[0], offset, node);
 #pragma unroll
     for (int c = 0; c < S::K; c++) {
-      out.value[c] = node.e[c];
+      out.value[c] = node[c];
       if (S::Slope != Form::none) {
-        const T part = constant[c] * node.e[c];
+        const T part = constant[c] * node[c];
         out.potential = c == 0 ? part : out.potential + part;
       }
     }
   } else {
-    sum_node<S, Axis, 0>(tile, w, constant, linear, out);
+    sum_node<S, Axis, 0>(support, rows, offset, w, constant, linear, out);
   }
 }
 
 // slope_i += Σ_j ∂_i ∂_j N (Σ_c g_c gradient_cj): the derivative of the gradient term.
-template <class S, class T>
-__device__ void add_hessian(const NodeValue<T, S::K>* tile, const Weights<S::Order, T, S::D>& w,
+template <class S, class Support, class T>
+__device__ void add_hessian(const Support& support, const Weights<S::Order, T, S::D>& w,
                             const T (&gradient)[S::K][S::D], T (&slope)[S::D]) {
   using H = SumShape<S::Order, T, S::D, S::K, S::K, false, false, Form::constant>;
 #pragma unroll
@@ -133,82 +209,106 @@ __device__ void add_hessian(const NodeValue<T, S::K>* tile, const Weights<S::Ord
 #pragma unroll
     for (int c = 0; c < S::K; c++) constant[c] = gradient[c][j];
     Sums<H> sums;
-    sum_axis<H, 0>(tile, v, constant, gradient, sums);
+    sum_axis<H, 0>(support, support.rows, 0, v, constant, gradient, sums);
 #pragma unroll
     for (int i = 0; i < S::D; i++) slope[i] += sums.slope[i];
   }
 }
 
-// ---- Tiles
-
-// How a node is fetched at once: from `shift` words before its first channel, or channel by channel (shift < 0).
-template <int K, class T>
-int vector_shift(const NodeField<const T>& n) {
-  if (n.stride % 4 != 0) return -1;
-  const auto aligned = [&](int shift) { return reinterpret_cast<uintptr_t>(n.pointer - shift) % (4 * sizeof(T)) == 0; };
-  if (K == 4 && aligned(0)) return 0;
-  // A velocity that lies behind the mass: its row starts one word earlier, in the same aligned quadruple.
-  if (K == 3 && aligned(1)) return 1;
-  return -1;
-}
-
-template <class T, int K>
-__device__ NodeValue<T, K> load_node(const NodeField<const T>& nodes, int64_t row, int vector_shift) {
-  NodeValue<T, K> v{};
-  const T* const from = nodes.pointer + row * nodes.stride;
-  if (K >= 3 && vector_shift >= 0) {
-    const NodeValue<T, 4> quad = *reinterpret_cast<const NodeValue<T, 4>*>(from - vector_shift);
-#pragma unroll
-    for (int c = 0; c < K; c++) v.e[c] = quad.e[K == 3 ? c + 1 : c];
-    return v;
-  }
-#pragma unroll
-  for (int c = 0; c < K; c++) v.e[c] = from[c];
-  return v;
-}
+// ---- The two orders
 
 constexpr int kGatherThreads = 128;
 
-// Task: topology(), position(), nodes(); load(p, scene), what it needs of a particle; compute(loaded, weights, tile), what a
-// particle gets, with the tile at the base node of the particle; write(p, result), by value zero for particles outside.
+// Thread blocks to fit in a multiprocessor at once, which limits registers: measured for float and quadratic weights.
 template <class Task>
-__global__ void __launch_bounds__(kGatherThreads) gather_kernel(const Task task, int vector_shift) {
+constexpr int kResident = Task::Order == 2 && sizeof(typename Task::T) == 4 ? Task::resident : 2;
+
+// Task: topology, nodes, position; load(p, scene), what it needs of a particle; compute(loaded, weights, support), what
+// the particle gets; write(p, result), with a result of zeros for particles outside.
+template <bool Quads, class Task>
+__device__ void gather_in_memory_order(const Task& task, const Schedule<const int>& schedule) {
   using T = typename Task::T;
-  constexpr int D = Task::D, K = Task::K;
-  using Nodes = Tile<Task::Order, D>;
-  __shared__ NodeValue<T, K> tile[Nodes::nodes];
-  __shared__ int slots[1 << D];
-  const Topology<T, D>& t = task.topology();
-  const int items = t.schedule[0];
-  for (int i = blockIdx.x; i < items; i += gridDim.x) {
-    const Item item = item_at(t, i);
-    const Home<D> home = home_of(t, item);
-    // Positions are loaded one round ahead and their particles' indices two, so that loads overlap.
-    int k = item.begin + threadIdx.x;
-    const auto particle_at = [&](int k) { return k < item.end ? t.index[k] : t.index[item.begin]; };
-    int64_t p = particle_at(k), p_next = particle_at(k + kGatherThreads);
-    Vector<T, D> x = read_vector<T, D>(task.position(), p);
-    __syncthreads();  // the tile before is done
-    load_slots(t, home, slots);
-    __syncthreads();
-    for (int n = threadIdx.x; n < Nodes::nodes; n += kGatherThreads) {
-      int node[D];
-      Nodes::node(n, node);
-      const int64_t row = node_row<D>(slots, node);
-      tile[n] = row < 0 ? NodeValue<T, K>{} : load_node<T, K>(task.nodes(), row, vector_shift);
+  constexpr int D = Task::D;
+  const Topology<T, D>& t = task.topology;
+  const int64_t stride = int64_t(gridDim.x) * kGatherThreads;
+#pragma unroll 1
+  for (int64_t i = int64_t(blockIdx.x) * kGatherThreads + threadIdx.x; i < t.particles; i += stride) {
+    const int p = int(i), slot = schedule.home[p];
+    const Vector<T, D> x = read_vector(task.position, p);
+    const int home = slot < 0 ? -1 : t.block[slot], scene = scene_of(t, home);
+    GridSupport<T, Task::K, D, Quads> support{task.nodes};
+    T f[D];
+    if (slot < 0 || !locate_at_home<Task::Order>(t, scene, home, x, support.base, f)) {
+      task.write(p, typename Task::Result{});
+      continue;
     }
+    const auto loaded = task.load(p, scene);
+#pragma unroll
+    for (int q = 0; q < (1 << D) / 4; q++) {
+      const int4 v = reinterpret_cast<const int4*>(schedule.neighbours + (slot << D))[q];
+      support.set_slot(4 * q, v.x);
+      support.set_slot(4 * q + 1, v.y);
+      support.set_slot(4 * q + 2, v.z);
+      support.set_slot(4 * q + 3, v.w);
+    }
+    task.write(p, task.compute(loaded, Weights<Task::Order, T, D>(f), support));
+  }
+}
+
+template <bool Quads, int Order, class T, int K, int D>
+__device__ void load_tile(const NodeField<const T>& nodes, const int* slots, NodeValue<T, K>* tile) {
+  constexpr int width = kBlockWidth + Order, size = D == 2 ? width * width : width * width * width;
+  for (int i = threadIdx.x; i < size; i += kGatherThreads) {
+    int node[D], neighbour = 0;
+#pragma unroll
+    for (int axis = D - 1, rest = i; axis >= 0; axis--) {
+      node[axis] = rest % width;
+      neighbour |= (node[axis] >= kBlockWidth) << (D - 1 - axis);
+      rest /= width;
+    }
+    T value[K] = {};
+    if (slots[neighbour] >= 0)
+      load_node<Quads>(nodes, slots[neighbour] * kBlockNodes<D> + node_in_block<D>(node), 0, value);
+    NodeValue<T, K> v{};
+#pragma unroll
+    for (int c = 0; c < K; c++) v.e[c] = value[c];
+    tile[i] = v;
+  }
+}
+
+template <bool Quads, class Task>
+__device__ void gather_by_items(const Task& task, const Schedule<const int>& schedule) {
+  using T = typename Task::T;
+  constexpr int D = Task::D, K = Task::K, width = kBlockWidth + Task::Order;
+  __shared__ NodeValue<T, K> tile[D == 2 ? width * width : width * width * width];
+  __shared__ int slots[1 << D];
+  const Topology<T, D>& t = task.topology;
+  const int items = *schedule.item_count;
+  for (int i = blockIdx.x; i < items; i += gridDim.x) {
+    const int4 item = reinterpret_cast<const int4*>(schedule.items)[i];
+    const int begin = item.y, end = item.z, home = item.w, scene = scene_of(t, home);
+    // Positions are loaded one round ahead and the particles' indices two, so that loads overlap.
+    int k = begin + threadIdx.x;
+    const auto particle_at = [&](int k) { return t.index[k < end ? k : begin]; };
+    int p = particle_at(k), p_next = particle_at(k + kGatherThreads);
+    Vector<T, D> x = read_vector(task.position, p);
+    __syncthreads();  // the tile before is done
+    if (threadIdx.x < 1 << D) slots[threadIdx.x] = schedule.neighbours[(item.x << D) + threadIdx.x];
+    __syncthreads();
+    load_tile<Quads, Task::Order, T, K, D>(task.nodes, slots, tile);
     __syncthreads();
 #pragma unroll 1
-    for (; k < item.end; k += kGatherThreads) {
-      const auto loaded = task.load(p, home.scene);
-      const Vector<T, D> x_next = read_vector<T, D>(task.position(), p_next);
-      const int64_t p_after = particle_at(k + 2 * kGatherThreads);
+    for (; k < end; k += kGatherThreads) {
+      const auto loaded = task.load(p, scene);
+      const Vector<T, D> x_next = read_vector(task.position, p_next);
+      const int p_after = particle_at(k + 2 * kGatherThreads);
       int base[D], corner = 0;
       T f[D];
-      const bool at_home = locate_at_home<Task::Order>(t, home, x, base, f);
+      const bool at_home = locate_at_home<Task::Order>(t, scene, home, x, base, f);
 #pragma unroll
-      for (int i = 0; i < D; i++) corner = corner * Nodes::width + base[i];
-      const auto result = task.compute(loaded, Weights<Task::Order, T, D>(f), tile + corner);
+      for (int axis = 0; axis < D; axis++) corner = corner * width + base[axis];
+      const TileSupport<Task::Order, T, K> support{tile + corner};
+      const auto result = task.compute(loaded, Weights<Task::Order, T, D>(f), support);
       task.write(p, at_home ? result : typename Task::Result{});
       p = p_next;
       p_next = p_after;
@@ -216,16 +316,37 @@ __global__ void __launch_bounds__(kGatherThreads) gather_kernel(const Task task,
     }
   }
   const int64_t stride = int64_t(gridDim.x) * kGatherThreads;
-  for (int64_t k = t.offsets[t.capacity] + int64_t(blockIdx.x) * kGatherThreads + threadIdx.x; k < t.particles; k += stride)
-    task.write(t.index[k], typename Task::Result{});
+  for (int64_t i = t.offsets[t.capacity] + int64_t(blockIdx.x) * kGatherThreads + threadIdx.x; i < t.particles;
+       i += stride)
+    task.write(t.index[i], typename Task::Result{});
+}
+
+template <bool Quads, class Task>
+__global__ void __launch_bounds__(kGatherThreads, kResident<Task>) gather_kernel(const Task task) {
+  const Schedule<const int> schedule = schedule_of(task.topology);
+  if (*schedule.scattered)
+    gather_in_memory_order<Quads>(task, schedule);
+  else
+    gather_by_items<Quads>(task, schedule);
 }
 
 template <class Task>
 void launch_gather(const Task& task, Stream stream) {
-  const auto& t = task.topology();
-  if (t.particles == 0) return;
-  launch(gather_kernel<Task>, grid_size(std::max<int64_t>(most_items(t.capacity, t.particles), 1)), kGatherThreads, 0, stream,
-         task, vector_shift<Task::K>(task.nodes()));
+  const int64_t particles = task.topology.particles;
+  if (particles == 0) return;
+  const int64_t pieces = std::max(most_items(task.topology.capacity, particles), particles / kGatherThreads);
+  if constexpr (Task::K == 3 || Task::K == 4) {
+    if (is_vector<Task::K>(task.nodes))
+      return launch(gather_kernel<true, Task>, grid_size(pieces), kGatherThreads, 0, stream, task);
+  }
+  launch(gather_kernel<false, Task>, grid_size(pieces), kGatherThreads, 0, stream, task);
+}
+
+// The channels [first, ...) of a node field.
+template <class T>
+NodeField<const T> nodes_from(NodeField<const T> n, int first) {
+  n.pointer += first;
+  return n;
 }
 
 // ---- Gather
@@ -234,46 +355,54 @@ template <int Order_, class T_, int D_, int K_, bool Gradient>
 struct FieldGather {
   using T = T_;
   static constexpr int Order = Order_, D = D_, K = K_;
+  static constexpr int resident = Gradient ? 5 : 6;
   using Shape = SumShape<Order, T, D, K, 0, true, Gradient, Form::none>;
   struct Loaded {};
   using Result = Sums<Shape>;
-  GatherArguments<T, D> a;
-  T moment_scale;  // from moments per cell
+  Topology<T, D> topology;
+  NodeField<const T> nodes;
+  Columns<const T, D> position;
+  Columns<T, K> value;
+  Columns<T, K * D> moment, gradient;
+  T moment_scale, gradient_scale;  // from cells
 
-  __host__ __device__ const Topology<T, D>& topology() const { return a.topology; }
-  __host__ __device__ const NodeField<const T>& nodes() const { return a.nodes; }
-  __device__ const Field<const T>& position() const { return a.x; }
-  __device__ Loaded load(int64_t, int) const { return {}; }
-  __device__ Result compute(Loaded, const Weights<Order, T, D>& w, const NodeValue<T, K>* tile) const {
+  FieldGather(const GatherArguments<T, D>& a, int first)
+      : topology(a.topology),
+        nodes(nodes_from(a.nodes, first)),
+        position(a.x),
+        value(channels_from(a.value, first)),
+        moment(channels_from(a.moment, first), D),
+        gradient(channels_from(a.gradient, first), D),
+        moment_scale(T(a.moment_scale * double(a.topology.geometry.dx))),
+        gradient_scale(a.topology.geometry.inverse_dx) {}
+
+  __device__ Loaded load(int, int) const { return {}; }
+  template <class Support>
+  __device__ Result compute(Loaded, const Weights<Order, T, D>& w, const Support& support) const {
     const T constant[K] = {}, linear[K][D] = {};
     Result s;
-    sum_axis<Shape, 0>(tile, w, constant, linear, s);
+    sum_axis<Shape, 0>(support, support.rows, 0, w, constant, linear, s);
     return s;
   }
-  __device__ void write(int64_t p, const Result& s) const {
+  __device__ void write(int p, const Result& s) const {
 #pragma unroll
     for (int k = 0; k < K; k++) {
-      cuda::write(a.value, s.value[k], p, k);
+      value.write(p, k, s.value[k]);
 #pragma unroll
       for (int i = 0; i < D; i++) {
-        cuda::write(a.moment, moment_scale * s.moment[k][i], p, k, i);
-        if (Gradient) cuda::write(a.gradient, a.topology.geometry.inverse_dx * s.gradient[k][i], p, k, i);
+        moment.write(p, k * D + i, moment_scale * s.moment[k][i]);
+        if (Gradient) gradient.write(p, k * D + i, gradient_scale * s.gradient[k][i]);
       }
     }
   }
 };
 
 template <int Order, int K, class T, int D>
-void gather_channels(GatherArguments<T, D> a, int first, Stream stream) {
-  a.nodes.pointer += first;
-  a.value = channels_from(a.value, first);
-  a.moment = channels_from(a.moment, first);
-  a.gradient = channels_from(a.gradient, first);
-  const T moment_scale = T(a.moment_scale * double(a.topology.geometry.dx));
+void gather_channels(const GatherArguments<T, D>& a, int first, Stream stream) {
   if (a.gradient.pointer)
-    launch_gather(FieldGather<Order, T, D, K, true>{a, moment_scale}, stream);
+    launch_gather(FieldGather<Order, T, D, K, true>(a, first), stream);
   else
-    launch_gather(FieldGather<Order, T, D, K, false>{a, moment_scale}, stream);
+    launch_gather(FieldGather<Order, T, D, K, false>(a, first), stream);
 }
 
 template <int Order, class T, int D>
@@ -289,64 +418,72 @@ template <int Order_, class T_, int D_, int K_, bool Gradient>
 struct FieldPositionGradient {
   using T = T_;
   static constexpr int Order = Order_, D = D_, K = K_;
+  static constexpr int resident = Gradient ? 3 : 5;
   using Shape = SumShape<Order, T, D, K, K, false, false, Form::affine>;
   struct Loaded {
     T value[K], moment[K][D], gradient[K][D];  // moments and gradients per cell
   };
-  using Result = Vector<T, D>;
-  PositionGradientArguments<T, D> a;
-  T moment_scale;  // to moments per cell
-  bool more;       // adds to the channels before
+  using Result = mpm::Vector<T, D>;
+  Topology<T, D> topology;
+  NodeField<const T> nodes;
+  Columns<const T, D> position;
+  Columns<const T, K> value;
+  Columns<const T, K * D> moment, gradient;
+  Columns<T, D> out;
+  T moment_scale, inverse_dx;
+  bool more;  // adds to the channels before
 
-  __host__ __device__ const Topology<T, D>& topology() const { return a.topology; }
-  __host__ __device__ const NodeField<const T>& nodes() const { return a.nodes; }
-  __device__ const Field<const T>& position() const { return a.x; }
-  __device__ Loaded load(int64_t p, int) const {
+  FieldPositionGradient(const PositionGradientArguments<T, D>& a, int first)
+      : topology(a.topology),
+        nodes(nodes_from(a.nodes, first)),
+        position(a.x),
+        value(channels_from(a.value, first)),
+        moment(channels_from(a.moment, first), D),
+        gradient(channels_from(a.gradient, first), D),
+        out(a.position_gradient),
+        moment_scale(T(a.moment_scale * double(a.topology.geometry.dx))),
+        inverse_dx(a.topology.geometry.inverse_dx),
+        more(first > 0) {}
+
+  __device__ Loaded load(int p, int) const {
     Loaded l;
 #pragma unroll
     for (int k = 0; k < K; k++) {
-      l.value[k] = read(a.value, p, k);
+      l.value[k] = value.at(p, k);
 #pragma unroll
       for (int i = 0; i < D; i++) {
-        l.moment[k][i] = a.moment.pointer ? moment_scale * read(a.moment, p, k, i) : T(0);
-        l.gradient[k][i] = Gradient ? a.topology.geometry.inverse_dx * read(a.gradient, p, k, i) : T(0);
+        l.moment[k][i] = moment.present() ? moment_scale * moment.at(p, k * D + i) : T(0);
+        l.gradient[k][i] = Gradient ? inverse_dx * gradient.at(p, k * D + i) : T(0);
       }
     }
     return l;
   }
-  __device__ Result compute(const Loaded& l, const Weights<Order, T, D>& w, const NodeValue<T, K>* tile) const {
+  template <class Support>
+  __device__ Result compute(const Loaded& l, const Weights<Order, T, D>& w, const Support& support) const {
     Sums<Shape> s;
-    sum_axis<Shape, 0>(tile, w, l.value, l.moment, s);
-    if (Gradient) add_hessian<Shape>(tile, w, l.gradient, s.slope);
+    sum_axis<Shape, 0>(support, support.rows, 0, w, l.value, l.moment, s);
+    if (Gradient) add_hessian<Shape>(support, w, l.gradient, s.slope);
     Result r;
 #pragma unroll
     for (int i = 0; i < D; i++) {
 #pragma unroll
       for (int k = 0; k < K; k++) s.slope[i] -= l.moment[k][i] * s.value[k];
-      r[i] = a.topology.geometry.inverse_dx * s.slope[i];
+      r[i] = inverse_dx * s.slope[i];
     }
     return r;
   }
-  __device__ void write(int64_t p, const Result& r) const {
+  __device__ void write(int p, const Result& r) const {
 #pragma unroll
-    for (int i = 0; i < D; i++) {
-      T& out = a.position_gradient.pointer[p * a.position_gradient.stride[0] + i * a.position_gradient.stride[1]];
-      out = more ? out + r[i] : r[i];
-    }
+    for (int i = 0; i < D; i++) out.at(p, i) = more ? out.at(p, i) + r[i] : r[i];
   }
 };
 
 template <int Order, int K, class T, int D>
-void position_gradient_channels(PositionGradientArguments<T, D> a, int first, Stream stream) {
-  a.nodes.pointer += first;
-  a.value = channels_from(a.value, first);
-  a.moment = channels_from(a.moment, first);
-  a.gradient = channels_from(a.gradient, first);
-  const T moment_scale = T(a.moment_scale * double(a.topology.geometry.dx));
+void position_gradient_channels(const PositionGradientArguments<T, D>& a, int first, Stream stream) {
   if (a.gradient.pointer)
-    launch_gather(FieldPositionGradient<Order, T, D, K, true>{a, moment_scale, first > 0}, stream);
+    launch_gather(FieldPositionGradient<Order, T, D, K, true>(a, first), stream);
   else
-    launch_gather(FieldPositionGradient<Order, T, D, K, false>{a, moment_scale, first > 0}, stream);
+    launch_gather(FieldPositionGradient<Order, T, D, K, false>(a, first), stream);
 }
 
 template <int Order, class T, int D>
@@ -362,21 +499,38 @@ template <int Order_, class T_, int D_, bool Gradient>
 struct MomentumAdjoint {
   using T = T_;
   static constexpr int Order = Order_, D = D_, K = 1 + D;
+  static constexpr int resident = Gradient ? 2 : 4;
   using Shape = SumShape<Order, T, D, K, 1, true, Gradient, Form::affine>;
   using Loaded = ParticleMomentum<T, D>;
   struct Result {
-    Vector<T, D> x;
+    mpm::Vector<T, D> x;
     ParticleMomentum<T, D> particle;
   };
-  P2GBackwardArguments<T, D> a;
+  Topology<T, D> topology;
+  NodeField<const T> nodes;
+  Columns<const T, D> position;
+  MomentumFields<Order, T, D> fields;
+  Columns<T, 1> mass, volume, dt;
+  Columns<T, D> x, velocity;
+  Columns<T, D * D> affine, stress;
 
-  __host__ __device__ const Topology<T, D>& topology() const { return a.forward.topology; }
-  __host__ __device__ const NodeField<const T>& nodes() const { return a.grad_nodes; }
-  __device__ const Field<const T>& position() const { return a.forward.x; }
-  __device__ Loaded load(int64_t p, int scene) const { return read_momentum(a.forward, p, scene); }
-  __device__ Result compute(const Loaded& particle, const Weights<Order, T, D>& w, const NodeValue<T, K>* tile) const {
-    const Geometry<T, D>& g = a.forward.topology.geometry;
-    const NodeMomentum<T, D> m = node_momentum<Order>(a.forward, particle);
+  explicit MomentumAdjoint(const P2GBackwardArguments<T, D>& a)
+      : topology(a.forward.topology),
+        nodes(a.grad_nodes),
+        position(a.forward.x),
+        fields(a.forward),
+        mass(a.mass),
+        volume(a.volume),
+        dt(a.dt),
+        x(a.x),
+        velocity(a.velocity),
+        affine(a.affine, D),
+        stress(a.stress, D) {}
+
+  __device__ Loaded load(int p, int scene) const { return fields.read(p, scene); }
+  template <class Support>
+  __device__ Result compute(const Loaded& particle, const Weights<Order, T, D>& w, const Support& support) const {
+    const NodeMomentum<T, D> m = fields.to_nodes(particle);
     T value[K], moment[K][D], gradient[K][D];
     value[0] = m.mass;
 #pragma unroll
@@ -390,8 +544,8 @@ struct MomentumAdjoint {
       }
     }
     Sums<Shape> s;
-    sum_axis<Shape, 0>(tile, w, value, moment, s);
-    if (Gradient) add_hessian<Shape>(tile, w, gradient, s.slope);
+    sum_axis<Shape, 0>(support, support.rows, 0, w, value, moment, s);
+    if (Gradient) add_hessian<Shape>(support, w, gradient, s.slope);
     Result r;
     NodeMomentum<T, D> sums;
     sums.mass = s.value[0];
@@ -406,23 +560,22 @@ struct MomentumAdjoint {
       }
     }
 #pragma unroll
-    for (int j = 0; j < D; j++) r.x[j] = g.inverse_dx * s.slope[j];
-    r.particle = adjoint<Order>(particle, sums, a.forward.form, a.forward.affine.pointer != nullptr,
-                                a.forward.stress.pointer != nullptr, g.dx, g.inverse_dx);
+    for (int j = 0; j < D; j++) r.x[j] = fields.inverse_dx * s.slope[j];
+    r.particle = fields.adjoint(particle, sums);
     return r;
   }
-  __device__ void write(int64_t p, const Result& r) const {
-    cuda::write(a.mass, r.particle.mass, p);
-    cuda::write(a.volume, r.particle.volume, p);
-    cuda::write(a.dt, r.particle.dt, p);
+  __device__ void write(int p, const Result& r) const {
+    mass.write(p, 0, r.particle.mass);
+    volume.write(p, 0, r.particle.volume);
+    dt.write(p, 0, r.particle.dt);
 #pragma unroll
     for (int i = 0; i < D; i++) {
-      cuda::write(a.x, r.x[i], p, i);
-      cuda::write(a.velocity, r.particle.velocity[i], p, i);
+      x.write(p, i, r.x[i]);
+      velocity.write(p, i, r.particle.velocity[i]);
 #pragma unroll
       for (int j = 0; j < D; j++) {
-        cuda::write(a.affine, r.particle.affine[i][j], p, i, j);
-        cuda::write(a.stress, r.particle.stress[i][j], p, i, j);
+        affine.write(p, i * D + j, r.particle.affine[i][j]);
+        stress.write(p, i * D + j, r.particle.stress[i][j]);
       }
     }
   }
@@ -431,13 +584,13 @@ struct MomentumAdjoint {
 template <int Order, class T, int D>
 void p2g_backward(const P2GBackwardArguments<T, D>& a, Stream stream) {
   if (has_gradient(a.forward))
-    launch_gather(MomentumAdjoint<Order, T, D, true>{a}, stream);
+    launch_gather(MomentumAdjoint<Order, T, D, true>(a), stream);
   else
-    launch_gather(MomentumAdjoint<Order, T, D, false>{a}, stream);
+    launch_gather(MomentumAdjoint<Order, T, D, false>(a), stream);
 }
 
-#define INSTANTIATE_GATHER(Order, T, D)                                                \
-  template void gather<Order, T, D>(const GatherArguments<T, D>&, Stream);             \
+#define INSTANTIATE_GATHER(Order, T, D)                                               \
+  template void gather<Order, T, D>(const GatherArguments<T, D>&, Stream);            \
   template void p2g_backward<Order, T, D>(const P2GBackwardArguments<T, D>&, Stream); \
   template void position_gradient<Order, T, D>(const PositionGradientArguments<T, D>&, Stream);
 

@@ -13,8 +13,8 @@ inline void check(cudaError_t error) {
   if (error != cudaSuccess) throw std::runtime_error(std::string("CUDA: ") + cudaGetErrorString(error));
 }
 
-// Thread blocks for `count` pieces of work that a kernel takes in strides of its grid. Many more than fit at once, so that
-// the hardware balances them, but not so many that empty ones cost time when `count` is a generous bound.
+// Thread blocks for `count` pieces of work that a kernel takes in strides of its grid. Many more than fit at once, so
+// that the hardware balances them, but not so many that empty ones cost time when `count` is a generous bound.
 inline unsigned grid_size(int64_t count) {
   int device = 0, processors = 0;
   check(cudaGetDevice(&device));

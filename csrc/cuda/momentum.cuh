@@ -4,45 +4,62 @@
 
 namespace mpm::cuda {
 
-template <class T, int D>
-__device__ ParticleMomentum<T, D> read_momentum(const P2GArguments<T, D>& a, int64_t p, int scene) {
-  ParticleMomentum<T, D> m;
-  m.mass = read(a.mass, p);
-  m.volume = T(0);
-  m.dt = T(0);
-  if (a.stress.pointer) {
-    m.volume = read(a.volume, p);
-    m.dt = a.scene_dt.pointer ? T(a.dt) * read(a.scene_dt, scene) : T(a.dt);
-  }
-#pragma unroll
-  for (int i = 0; i < D; i++) {
-    m.velocity[i] = read(a.velocity, p, i);
-#pragma unroll
-    for (int j = 0; j < D; j++) {
-      m.affine[i][j] = a.affine.pointer ? read(a.affine, p, i, j) : T(0);
-      m.stress[i][j] = a.stress.pointer ? read(a.stress, p, i, j) : T(0);
-    }
-  }
-  return m;
-}
-
+// The particle fields of P2G on the device.
 template <int Order, class T, int D>
-__device__ NodeMomentum<T, D> node_momentum(const P2GArguments<T, D>& a, const ParticleMomentum<T, D>& m) {
-  const Geometry<T, D>& g = a.topology.geometry;
-  return to_nodes<Order>(m, a.form, a.affine.pointer != nullptr, a.stress.pointer != nullptr, g.dx, g.inverse_dx);
-}
+struct MomentumFields {
+  Columns<const T, 1> mass, volume;
+  Columns<const T, D> velocity;
+  Columns<const T, D * D> affine, stress;
+  Field<const T> scene_dt;
+  T dt, dx, inverse_dx;
+  StressForm form;
+
+  explicit MomentumFields(const P2GArguments<T, D>& a)
+      : mass(a.mass),
+        volume(a.volume),
+        velocity(a.velocity),
+        affine(a.affine, D),
+        stress(a.stress, D),
+        scene_dt(a.scene_dt),
+        dt(T(a.dt)),
+        dx(a.topology.geometry.dx),
+        inverse_dx(a.topology.geometry.inverse_dx),
+        form(a.form) {}
+
+  __device__ ParticleMomentum<T, D> read(int p, int scene) const {
+    ParticleMomentum<T, D> m;
+    m.mass = mass.at(p);
+#pragma unroll
+    for (int i = 0; i < D; i++) {
+      m.velocity[i] = velocity.at(p, i);
+#pragma unroll
+      for (int j = 0; j < D; j++) m.affine[i][j] = affine.present() ? affine.at(p, i * D + j) : T(0);
+    }
+    m.stress = zero_matrix<T, D>();
+    m.volume = T(0);
+    m.dt = T(0);
+    if (stress.present()) {
+      m.volume = volume.at(p);
+#pragma unroll
+      for (int i = 0; i < D; i++)
+#pragma unroll
+        for (int j = 0; j < D; j++) m.stress[i][j] = stress.at(p, i * D + j);
+      m.dt = scene_dt.pointer ? dt * scene_dt.pointer[scene * scene_dt.stride[0]] : dt;
+    }
+    return m;
+  }
+  __device__ NodeMomentum<T, D> to_nodes(const ParticleMomentum<T, D>& m) const {
+    return mpm::to_nodes<Order>(m, form, affine.present(), stress.present(), dx, inverse_dx);
+  }
+  __device__ ParticleMomentum<T, D> adjoint(const ParticleMomentum<T, D>& m, const NodeMomentum<T, D>& sums) const {
+    return mpm::adjoint<Order>(m, sums, form, affine.present(), stress.present(), dx, inverse_dx);
+  }
+};
 
 // Whether the stress stands apart from the affine momentum, as a multiple of the weight gradient.
 template <class T, int D>
 bool has_gradient(const P2GArguments<T, D>& a) {
   return a.stress.pointer && a.form == StressForm::gradient;
-}
-
-// Channels from `first` on of a particle field [P, K, ...].
-template <class T>
-Field<T> channels_from(Field<T> f, int first) {
-  if (f.pointer) f.pointer += first * f.stride[1];
-  return f;
 }
 
 }  // namespace mpm::cuda

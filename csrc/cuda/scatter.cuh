@@ -5,13 +5,13 @@
 #include "cuda/momentum.cuh"
 
 // P2G and scatter. One thread block takes the particles of one item, sorts them by cell in shared memory, and adds up
-// columns of nodes in registers: each column of cells has one thread per leading node of the support, (Order + 1)^(D - 1),
-// which walks the particles of the column's four cells. The columns are then added to a tile of nodes, and the tile to the
-// grid: one vector reduction per node, however many particles there are.
+// columns of nodes in registers: each column of cells has one thread per leading node of the support, (Order + 1)^(D -
+// 1), which walks the particles of the column's four cells. The columns are then added to a tile of nodes, and the tile
+// to the grid: one vector reduction per node, however many particles there are.
 //
 // A node gets N_i (a + B · i) + G · ∇N_i from a particle, i being the distance from the base node in cells: `Linear`
-// channels of this kind after `Plain` ones with B = G = 0. Deterministic mode adds blocks of one colour at a time, no two of
-// which share a node, with the particles in the order of the index tensor.
+// channels of this kind after `Plain` ones with B = G = 0. Deterministic mode adds blocks of one colour at a time, no
+// two of which share a node, with the particles in the order of the index tensor.
 namespace mpm::cuda {
 
 template <class T>
@@ -32,14 +32,17 @@ struct ScatterShape {
   using T = T_;
   static constexpr int Order = Order_, D = D_, Plain = Plain_, Linear = Linear_;
   static constexpr bool Gradient = Gradient_;
-  static constexpr int channels = Plain + Linear, support = Order + 1, width = Tile<Order, D>::width;
+  static constexpr int channels = Plain + Linear, support = Order + 1;
+  static constexpr int width =
+      kBlockWidth + Order;  // nodes of the tile along an axis, from the first of the home block
 
   // Threads.
   static constexpr int columns = D == 2 ? 4 : 16, lanes = D == 2 ? support : support * support;
   static constexpr int slices = D == 2 ? 8 : 1;  // threads that share the particles of one cell
   static constexpr int walkers = columns * lanes * slices, threads = (walkers + 31) / 32 * 32;
 
-  // A particle in shared memory: words that all threads of its column read, in quads, and words of which each reads its own.
+  // A particle in shared memory: words that all threads of its column read, in quads, and words of which each reads its
+  // own.
   static constexpr int derivatives = Gradient ? 2 : 1;
   static constexpr int last_weights = 0, plain = last_weights + derivatives * support, linear = plain + Plain;
   static constexpr int linear_words = 1 + D * derivatives, words = linear + Linear * linear_words;
@@ -47,7 +50,8 @@ struct ScatterShape {
   static constexpr int row_bytes = (quads * 4 + own_words) * int(sizeof(T)) + 6;
   static constexpr int fitting = 90 * 1024 / row_bytes / 32 * 32;
   static constexpr int batch = fitting < kItemParticles ? fitting : kItemParticles;
-  static constexpr int rows = batch + batch / 32;  // one row skipped in 32, so that neighbouring columns use other banks
+  static constexpr int rows =
+      batch + batch / 32;  // one row skipped in 32, so that neighbouring columns use other banks
 
   // Sums of the columns, in the same memory.
   static constexpr int column_stride = width | 1;
@@ -114,9 +118,31 @@ __device__ void store_particle(const SharedParticles<S>& shared, int row, const 
     shared.quads[q * S::rows + row] = {word[4 * q], word[4 * q + 1], word[4 * q + 2], word[4 * q + 3]};
 }
 
-// What one thread adds to the nodes of its column from one particle: `leading` are the thread's leading node coordinates.
+// One thread of a column: which of the leading nodes it adds to, and which of the particles it takes.
+template <class S>
+struct Walker {
+  using T = typename S::T;
+  int column, slice;
+  int leading[2];
+  const T* own[S::D - 1];  // its words of the particle in row 0
+  bool active;
+
+  __device__ explicit Walker(const SharedParticles<S>& shared) {
+    const int lane = threadIdx.x % S::lanes;
+    column = threadIdx.x / S::lanes % S::columns;
+    slice = threadIdx.x / (S::lanes * S::columns);
+    leading[0] = S::D == 2 ? lane : lane / S::support;
+    leading[1] = lane % S::support;
+    active = threadIdx.x < S::walkers;
+#pragma unroll
+    for (int i = 0; i < S::D - 1; i++) own[i] = shared.own + (i * S::support + leading[i]) * S::rows;
+  }
+};
+
+// What one thread adds to the nodes of its column from one particle, whose base node has coordinate Z along the last
+// axis.
 template <class S, int Z, class T>
-__device__ void add_particle(const SharedParticles<S>& shared, int row, const int leading[S::D - 1],
+__device__ void add_particle(const SharedParticles<S>& shared, const Walker<S>& walker, int row,
                              T (&sum)[S::width][S::channels]) {
   constexpr int D = S::D;
   T word[S::quads * 4];
@@ -129,9 +155,9 @@ __device__ void add_particle(const SharedParticles<S>& shared, int row, const in
   T own[D - 1], slope[D - 1], w = T(1);
 #pragma unroll
   for (int i = 0; i < D - 1; i++) {
-    own[i] = shared.own[(i * S::support + leading[i]) * S::rows + row];
+    own[i] = walker.own[i][row];
     w *= own[i];
-    if (S::Gradient) slope[i] = shared.own[((D - 1 + i) * S::support + leading[i]) * S::rows + row];
+    if (S::Gradient) slope[i] = walker.own[i][(D - 1) * S::support * S::rows + row];
   }
   const T* const last = word + S::last_weights;
 #pragma unroll
@@ -145,7 +171,7 @@ __device__ void add_particle(const SharedParticles<S>& shared, int row, const in
     const T* const v = word + S::linear + c * S::linear_words;
     T at = v[0];
 #pragma unroll
-    for (int i = 0; i < D - 1; i++) at += v[1 + i] * T(leading[i]);
+    for (int i = 0; i < D - 1; i++) at += v[1 + i] * T(walker.leading[i]);
     at *= w;
     const T step = w * v[D];
     if (S::Gradient) {
@@ -170,12 +196,13 @@ __device__ void add_particle(const SharedParticles<S>& shared, int row, const in
 }
 
 template <class S, int Z, class T>
-__device__ void walk_column(const SharedParticles<S>& shared, const int* cell_start, int slice, const int leading[S::D - 1],
+__device__ void walk_column(const SharedParticles<S>& shared, const Walker<S>& walker, const int* cell_start,
                             T (&sum)[S::width][S::channels]) {
   const int end = cell_start[Z + 1];
 #pragma unroll 1
-  for (int r = cell_start[Z] + slice; r < end; r += S::slices) add_particle<S, Z>(shared, shared.sorted[r], leading, sum);
-  if constexpr (Z + 1 < kBlockWidth) walk_column<S, Z + 1>(shared, cell_start, slice, leading, sum);
+  for (int r = cell_start[Z] + walker.slice; r < end; r += S::slices)
+    add_particle<S, Z>(shared, walker, shared.sorted[r], sum);
+  if constexpr (Z + 1 < kBlockWidth) walk_column<S, Z + 1>(shared, walker, cell_start, sum);
 }
 
 // Ranks in the order of the index tensor; by one warp.
@@ -221,23 +248,27 @@ __device__ void starts_from_counts(int* count) {
   if (threadIdx.x == 0) count[Cells] = all;
 }
 
-// Loads the particles index[begin, begin + n) into shared memory and sorts them by cell. `cell_start` holds 4^D + 1 ints.
+// Loads the particles index[begin, begin + n) into shared memory and sorts them by cell. `cell_start` holds 4^D + 1
+// ints.
 template <class S, class Source, class T, int D>
-__device__ void load_sorted(const Source& source, const Topology<T, D>& t, const Home<D>& home,
-                            const SharedParticles<S>& shared, int* cell_start, int begin, int n, bool in_order) {
+__device__ void load_sorted(const Source& source, const Topology<T, D>& t, int home, const SharedParticles<S>& shared,
+                            int* cell_start, int begin, int n, bool in_order) {
   constexpr int cells = kBlockNodes<D>;
+  const int scene = scene_of(t, home);
   for (int c = threadIdx.x; c <= cells; c += S::threads) cell_start[c] = 0;
   __syncthreads();
   int next = int(threadIdx.x) < n ? t.index[begin + threadIdx.x] : 0;
 #pragma unroll 1
   for (int k = threadIdx.x; k < n; k += S::threads) {
-    const int64_t p = next;
+    const int p = next;
     if (k + S::threads < n) next = t.index[begin + k + S::threads];
     int base[D];
     T f[D];
     // Loaded and stored wherever the particle is, so that no load waits for another.
-    const bool at_home = locate_at_home<S::Order>(t, home, read_vector<T, D>(source.position(), p), base, f);
-    store_particle<S, T, D>(shared, SharedParticles<S>::row(k), f, source.load(p, home.scene));
+    const Vector<T, D> x = read_vector(source.position, p);
+    const auto loaded = source.load(p, scene);
+    const bool at_home = locate_at_home<S::Order>(t, scene, home, x, base, f);
+    store_particle<S, T, D>(shared, SharedParticles<S>::row(k), f, source.contribution(loaded));
     const int cell = at_home ? node_in_block<D>(base) : cells;
     shared.cell[k] = uint16_t(cell);
     if (!in_order) shared.rank[k] = uint16_t(atomicAdd(&cell_start[cell], 1));
@@ -312,12 +343,15 @@ __device__ void flush_tile(const NodeField<T>& nodes, const int slots[1 << D], c
     const int tile_row = t / quads, quad = t % quads, far = quad >= near_quads;
     const int first_word = (far ? quad - near_quads : quad) * 4;
     const int leading[2] = {D == 2 ? tile_row : tile_row / width, tile_row % width};
-    int node[D];
+    int neighbour = 0, node[D] = {};
 #pragma unroll
-    for (int i = 0; i < D - 1; i++) node[i] = leading[i];
-    node[D - 1] = far * kBlockWidth;
-    const int64_t row = node_row<D>(slots, node);
-    if (row < 0) continue;
+    for (int i = 0; i < D - 1; i++) {
+      neighbour = neighbour * 2 + (leading[i] >= kBlockWidth);
+      node[i] = leading[i];
+    }
+    const int slot = slots[neighbour * 2 + far];
+    if (slot < 0) continue;
+    const int64_t row = int64_t(slot) * kBlockNodes<D> + node_in_block<D>(node);
     T value[4];
     bool any = false;
 #pragma unroll
@@ -333,17 +367,19 @@ __device__ void flush_tile(const NodeField<T>& nodes, const int slots[1 << D], c
 #pragma unroll
       for (int e = 0; e < 4; e++) {
         const int word = first_word + e;
-        if (value[e] != T(0)) add_to_nodes(nodes.pointer + (row + word / K) * nodes.stride + word % K, value[e], in_order);
+        if (value[e] != T(0))
+          add_to_nodes(nodes.pointer + (row + word / K) * nodes.stride + word % K, value[e], in_order);
       }
     }
   }
 }
 
-template <int D>
-__device__ int colour_of(const Home<D>& home) {
-  int colour = 0;
+template <class T, int D>
+__device__ int colour_of(const Topology<T, D>& t, int home) {
+  int block[D], colour = 0;
+  block_coordinates(t.geometry, home, block);
 #pragma unroll
-  for (int i = 0; i < D; i++) colour = colour * 2 + (home.block[i] & 1);
+  for (int i = 0; i < D; i++) colour = colour * 2 + (block[i] & 1);
   return colour;
 }
 
@@ -357,44 +393,42 @@ __global__ void __launch_bounds__(Source::Shape::threads) scatter_kernel(const S
   __shared__ int slots[1 << D], cell_start[kBlockNodes<D> + 1];
   const SharedParticles<S> shared(memory);
   T* const sums = reinterpret_cast<T*>(memory);
-  const Topology<T, D>& topology = source.topology();
+  const Topology<T, D>& t = source.topology;
+  const Schedule<const int> schedule = schedule_of(t);
   const bool in_order = colour >= 0;
-  const int lane = threadIdx.x % S::lanes, column = threadIdx.x / S::lanes % S::columns;
-  const int slice = threadIdx.x / (S::lanes * S::columns);
-  const int leading[2] = {D == 2 ? lane : lane / S::support, lane % S::support};
-  const int items = topology.schedule[0];
+  const Walker<S> walker(shared);
+  const int items = *schedule.item_count;
   for (int i = blockIdx.x; i < items; i += gridDim.x) {
-    Item item = item_at(topology, i);
-    const Home<D> home = home_of(topology, item);
+    const int4 entries = reinterpret_cast<const int4*>(schedule.items)[i];
+    Item item{entries.x, entries.y, entries.z, entries.w};
     if (in_order) {
-      if (colour_of(home) != colour || item.begin != topology.offsets[item.slot]) continue;
-      item.end = topology.offsets[item.slot + 1];
+      if (colour_of(t, item.block) != colour || item.begin != t.offsets[item.slot]) continue;
+      item.end = t.offsets[item.slot + 1];
     }
     __syncthreads();  // the tile before is done
-    load_slots(topology, home, slots);
+    if (threadIdx.x < 1 << D) slots[threadIdx.x] = schedule.neighbours[(item.slot << D) + threadIdx.x];
     T sum[S::width][S::channels] = {};
     for (int begin = item.begin; begin < item.end; begin += S::batch) {
       __syncthreads();
-      load_sorted<S>(source, topology, home, shared, cell_start, begin, min(S::batch, item.end - begin), in_order);
-      if (threadIdx.x < S::walkers)
-        walk_column<S, 0>(shared, cell_start + column * kBlockWidth, slice, leading, sum);
+      load_sorted<S>(source, t, item.block, shared, cell_start, begin, min(S::batch, item.end - begin), in_order);
+      if (walker.active) walk_column<S, 0>(shared, walker, cell_start + walker.column * kBlockWidth, sum);
     }
     __syncthreads();
-    if (threadIdx.x < S::walkers) {
+    if (walker.active) {
 #pragma unroll
       for (int c = 0; c < S::channels; c++)
 #pragma unroll
         for (int z = 0; z < S::width; z++) sums[c * S::sums + threadIdx.x * S::column_stride + z] = sum[z][c];
     }
     __syncthreads();
-    flush_tile<S, T, D>(source.nodes(), slots, sums, in_order);
+    flush_tile<S, T, D>(source.nodes, slots, sums, in_order);
   }
 }
 
 template <class Source>
 void launch_scatter(const Source& source, bool deterministic, Stream stream) {
   using S = typename Source::Shape;
-  const int64_t items = most_items(source.topology().capacity, source.topology().particles);
+  const int64_t items = most_items(source.topology.capacity, source.topology.particles);
   if (items == 0) return;
   for (int colour = deterministic ? 0 : -1; colour < (deterministic ? 1 << S::D : 0); colour++)
     launch(scatter_kernel<Source>, grid_size(items), S::threads, S::shared_bytes, stream, source, colour);
@@ -403,13 +437,17 @@ void launch_scatter(const Source& source, bool deterministic, Stream stream) {
 template <int Order, class T, int D, bool Gradient>
 struct MomentumSource {
   using Shape = ScatterShape<Order, T, D, 1, D, Gradient>;
-  P2GArguments<T, D> a;
+  Topology<T, D> topology;
+  NodeField<T> nodes;
+  Columns<const T, D> position;
+  MomentumFields<Order, T, D> fields;
 
-  __host__ __device__ const Topology<T, D>& topology() const { return a.topology; }
-  __device__ const Field<const T>& position() const { return a.x; }
-  __device__ const NodeField<T>& nodes() const { return a.nodes; }
-  __device__ Contribution<T, D, 1, D> load(int64_t p, int scene) const {
-    const NodeMomentum<T, D> m = node_momentum<Order>(a, read_momentum(a, p, scene));
+  explicit MomentumSource(const P2GArguments<T, D>& a)
+      : topology(a.topology), nodes(a.nodes), position(a.x), fields(a) {}
+
+  __device__ ParticleMomentum<T, D> load(int p, int scene) const { return fields.read(p, scene); }
+  __device__ Contribution<T, D, 1, D> contribution(const ParticleMomentum<T, D>& particle) const {
+    const NodeMomentum<T, D> m = fields.to_nodes(particle);
     Contribution<T, D, 1, D> c;
     c.plain[0] = m.mass;
 #pragma unroll
@@ -425,49 +463,61 @@ struct MomentumSource {
   }
 };
 
+// Channels [first, first + K).
 template <int Order, class T, int D, int K, bool Gradient>
 struct FieldSource {
   using Shape = ScatterShape<Order, T, D, 0, K, Gradient>;
-  ScatterArguments<T, D> a;
-  T moment_scale;  // to moments per cell
+  Topology<T, D> topology;
+  NodeField<T> nodes;
+  Columns<const T, D> position;
+  Columns<const T, K> value;
+  Columns<const T, K * D> moment, gradient;
+  T moment_scale, gradient_scale;  // to cells
 
-  __host__ __device__ const Topology<T, D>& topology() const { return a.topology; }
-  __device__ const Field<const T>& position() const { return a.x; }
-  __device__ const NodeField<T>& nodes() const { return a.nodes; }
-  __device__ Contribution<T, D, 0, K> load(int64_t p, int) const {
+  FieldSource(const ScatterArguments<T, D>& a, int first)
+      : topology(a.topology),
+        nodes(a.nodes),
+        position(a.x),
+        value(channels_from(a.value, first)),
+        moment(channels_from(a.moment, first), D),
+        gradient(channels_from(a.gradient, first), D),
+        moment_scale(T(a.moment_scale * double(a.topology.geometry.dx))),
+        gradient_scale(a.topology.geometry.inverse_dx) {
+    nodes.pointer += first;
+  }
+
+  __device__ Contribution<T, D, 0, K> load(int p, int) const {
     Contribution<T, D, 0, K> c;
 #pragma unroll
     for (int k = 0; k < K; k++) {
-      c.value[k] = read(a.value, p, k);
+      c.value[k] = value.at(p, k);
 #pragma unroll
       for (int i = 0; i < D; i++) {
-        c.moment[k][i] = a.moment.pointer ? moment_scale * read(a.moment, p, k, i) : T(0);
-        c.gradient[k][i] = Gradient ? a.topology.geometry.inverse_dx * read(a.gradient, p, k, i) : T(0);
+        c.moment[k][i] = moment.present() ? moment_scale * moment.at(p, k * D + i) : T(0);
+        c.gradient[k][i] = Gradient ? gradient_scale * gradient.at(p, k * D + i) : T(0);
       }
     }
     return c;
+  }
+  __device__ const Contribution<T, D, 0, K>& contribution(const Contribution<T, D, 0, K>& loaded) const {
+    return loaded;
   }
 };
 
 template <int Order, class T, int D>
 void p2g(const P2GArguments<T, D>& a, Stream stream) {
   if (has_gradient(a))
-    launch_scatter(MomentumSource<Order, T, D, true>{a}, a.deterministic, stream);
+    launch_scatter(MomentumSource<Order, T, D, true>(a), a.deterministic, stream);
   else
-    launch_scatter(MomentumSource<Order, T, D, false>{a}, a.deterministic, stream);
+    launch_scatter(MomentumSource<Order, T, D, false>(a), a.deterministic, stream);
 }
 
 template <int Order, int K, class T, int D>
-void scatter_channels(ScatterArguments<T, D> a, int first, Stream stream) {
-  a.value = channels_from(a.value, first);
-  a.moment = channels_from(a.moment, first);
-  a.gradient = channels_from(a.gradient, first);
-  a.nodes.pointer += first;
-  const T moment_scale = T(a.moment_scale * double(a.topology.geometry.dx));
+void scatter_channels(const ScatterArguments<T, D>& a, int first, Stream stream) {
   if (a.gradient.pointer)
-    launch_scatter(FieldSource<Order, T, D, K, true>{a, moment_scale}, a.deterministic, stream);
+    launch_scatter(FieldSource<Order, T, D, K, true>(a, first), a.deterministic, stream);
   else
-    launch_scatter(FieldSource<Order, T, D, K, false>{a, moment_scale}, a.deterministic, stream);
+    launch_scatter(FieldSource<Order, T, D, K, false>(a, first), a.deterministic, stream);
 }
 
 template <int Order, class T, int D>
@@ -477,7 +527,7 @@ void scatter(const ScatterArguments<T, D>& a, Stream stream) {
   for (; first < a.nodes.channels; first++) scatter_channels<Order, 1>(a, first, stream);
 }
 
-#define INSTANTIATE_SCATTER(Order, T, D)                              \
+#define INSTANTIATE_SCATTER(Order, T, D)                             \
   template void p2g<Order, T, D>(const P2GArguments<T, D>&, Stream); \
   template void scatter<Order, T, D>(const ScatterArguments<T, D>&, Stream);
 

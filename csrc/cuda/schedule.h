@@ -1,18 +1,49 @@
 #pragma once
 
-#include <cstdint>
+#include "transfer/arguments.h"
 
-// The schedule tensor of the CUDA kernels: the number of work items, then the items from entry 4 on, four ints each:
-// slot, begin and end in the index tensor, table index. An item is at most kItemParticles particles of one home block; a
-// crowded block makes several.
+// The schedule tensor of the CUDA kernels.
 namespace mpm::cuda {
 
 constexpr int kItemParticles = 576;
-constexpr int kScheduleHeader = 4;
+
+// At most kItemParticles particles of one home block; a crowded block makes several items.
+struct Item {
+  int slot, begin, end;  // particles index[begin, end)
+  int block;             // table index of the home block
+};
+
+// I is int or const int.
+template <class I>
+struct Schedule {
+  I* item_count;
+  I* scattered;   // whether particles that are neighbours in memory mostly lie in different blocks
+  I* items;       // [items, 4], each an Item
+  I* neighbours;  // [capacity, 2^D] slots of a block and of the blocks after it, -1 where inactive; the bit of axis i
+                  // is D - 1 - i
+  I* home;        // [P] slot of the home block of a particle, -1 if it is not transferred
+};
 
 // Upper bound of the number of items: homes hold particles, and splitting adds less than one item per kItemParticles.
-inline int64_t most_items(int64_t capacity, int64_t particles) {
+MPM_HD int64_t most_items(int64_t capacity, int64_t particles) {
   return (capacity < particles ? capacity : particles) + particles / kItemParticles;
+}
+
+// Fits into schedule_size() ints.
+template <int D, class I>
+MPM_HD Schedule<I> lay_out_schedule(I* start, int64_t capacity, int64_t particles) {
+  Schedule<I> s;
+  s.item_count = start;
+  s.scattered = start + 1;
+  s.items = start + 4;
+  s.neighbours = s.items + 4 * most_items(capacity, particles);
+  s.home = s.neighbours + (capacity << D);
+  return s;
+}
+
+template <class T, int D>
+MPM_HD Schedule<const int> schedule_of(const Topology<T, D>& t) {
+  return lay_out_schedule<D>(t.schedule, t.capacity, t.particles);
 }
 
 }  // namespace mpm::cuda

@@ -92,10 +92,10 @@ struct PositionGradientArguments {
 };
 
 // Entries of the schedule tensor: room for the work items of both backends, with the number of particles of each cell,
-// and for the order of the particles (the fake kernel in torch_mpm/ops/activation.py has the same formula).
+// and for an entry for each particle (the fake kernel in torch_mpm/ops/activation.py has the same formula).
 template <int D>
 int64_t schedule_size(int64_t capacity, int64_t particles) {
-  return 16 + (8 + kBlockNodes<D> / 2) * (capacity + particles / 128) + particles / 2;
+  return 16 + (8 + kBlockNodes<D> / 2) * (capacity + particles / 128) + particles;
 }
 
 template <class T, int D>

@@ -28,7 +28,7 @@ def _activate_fake(
         return x.new_empty(n, dtype=torch.int32)
 
     P, dim = x.shape
-    schedule = 16 + (8 + 4**dim // 2) * (capacity + P // 128) + P // 2  # csrc/transfer/arguments.h
+    schedule = 16 + (8 + 4**dim // 2) * (capacity + P // 128) + P  # csrc/transfer/arguments.h
     return (
         ints(scenes * math.prod(blocks)),
         ints(capacity),
