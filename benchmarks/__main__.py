@@ -15,7 +15,12 @@ import torch
 
 from . import common
 
-PROGRAMS = ("benchmarks.speed.step", "benchmarks.accuracy.precision", "benchmarks.accuracy.convergence")
+PROGRAMS = (
+    "benchmarks.speed.step",
+    "benchmarks.accuracy.precision",
+    "benchmarks.accuracy.convergence",
+    "benchmarks.stability.stable_dt",
+)
 ON_DEVICE = ("benchmarks.speed.step",)
 """Programs that take --device; the others run on the CPU."""
 
