@@ -88,7 +88,7 @@ def threads():
 @pytest.mark.parametrize("dtype, tolerance", [(torch.float32, 1e-6), (torch.float64, 1e-14)])
 def test_agrees_with_float64_reference(dim, kernel, form, dtype, tolerance):
     grid = make_grid(dim, kernel)
-    inputs = particles(dim, 1500, dtype)
+    inputs = particles(dim, 400, dtype)
     blocks = grid.activate(inputs[0])
     assert_close(run_all(blocks, *inputs, form), reference_all(blocks, *inputs, form), tolerance)
 
@@ -187,7 +187,7 @@ def test_more_than_four_channels_of_sorted_particles():
 @pytest.mark.parametrize("dim", DIMENSIONS)
 def test_crowded_cell(dim):
     grid = make_grid(dim)
-    inputs = particles(dim, 3000)
+    inputs = particles(dim, 1200)  # more than a chunk
     x = 0.5 + 0.02 * (inputs[0] - 0.1)
     blocks = grid.activate(x)
     assert_close(run_all(blocks, x, *inputs[1:]), reference_all(blocks, x, *inputs[1:]), 5e-6)
