@@ -1,0 +1,300 @@
+"""Runs of scenes: the physics of what comes out, and that nothing is lost or half-written whatever happens on the way."""
+
+import json
+import math
+import random
+import signal
+import subprocess
+
+import numpy as np
+import pytest
+import torch
+from scenes import FILE, command, disc
+
+pytest.importorskip("pydantic")
+pytest.importorskip("h5py")
+
+from torch_mpm import SimulationError, Trajectory  # noqa: E402
+from torch_mpm.scene import Scene  # noqa: E402
+from torch_mpm.scene import run as module  # noqa: E402
+from torch_mpm.scene.checkpoint import load  # noqa: E402
+from torch_mpm.scene.diagnose import SceneFailure, replay  # noqa: E402
+from torch_mpm.scene.run import Interrupted, OutputError  # noqa: E402
+
+PRECISE = {"precision": "float64", "device": "cpu"}
+
+
+def simulate(folder, **words):
+    """Summary and trajectory of the disc scene with changes."""
+    summary = Scene(**disc(**{"device": "cpu", **words})).run(folder)
+    with Trajectory(folder) as read:
+        return summary, {name: read[name] for name in read.file}, read.attributes
+
+
+# ---- physics
+
+
+def test_free_fall(tmp_path):
+    summary, data, _ = simulate(tmp_path / "out", **PRECISE, body__0__velocity=(1.0, 0.0), output={"fields": ["F"]})
+    center = (data["position"] * data["mass"][:, None]).sum(1) / data["mass"].sum()
+    t = data["time"]
+    # Symplectic Euler falls g dt t / 2 further than the parabola.
+    fallen = center[:, 1] - center[0, 1]
+    np.testing.assert_allclose(fallen, -5 * t**2, atol=5 * summary["smallest_dt"] * 2 * t[-1])
+    np.testing.assert_allclose(center[:, 0] - center[0, 0], t, atol=1e-10)
+    np.testing.assert_allclose(data["F"], np.broadcast_to(np.eye(2), data["F"].shape), atol=1e-9)
+    np.testing.assert_allclose(t, np.linspace(0, 0.1, 6), rtol=1e-14)
+    assert summary["particles_lost"] == 0 and abs(summary["mass_drift"]) < 1e-14
+
+
+def test_momentum_of_a_collision_is_kept_to_rounding(tmp_path):
+    body = {"shape": "sphere", "radius": 0.15, "material": "jelly"}
+    bodies = [
+        {**body, "center": (0.3, 0.5), "velocity": (2.0, 0.0)},
+        {**body, "center": (0.65, 0.55), "velocity": (-1.0, 0.0)},
+    ]
+    _, data, _ = simulate(tmp_path / "out", **PRECISE, body=bodies, gravity=None, duration=0.1)
+    scale = data["mass"].sum()
+    np.testing.assert_allclose(data["momentum"], np.broadcast_to(data["momentum"][0], (6, 2)), atol=1e-12 * scale)
+    assert data["elastic_energy"].max() > 0.01 * data["kinetic_energy"][0]  # they did meet
+
+
+def test_energy_of_a_bouncing_disc_is_that_of_its_trajectory(tmp_path):
+    _, data, _ = simulate(tmp_path / "out", **PRECISE)
+    kinetic = 0.5 * (data["mass"] * (data["velocity"] ** 2).sum(2)).sum(1)
+    np.testing.assert_allclose(data["kinetic_energy"], kinetic, rtol=1e-12)
+    potential = 10 * (data["mass"] * data["position"][:, :, 1]).sum(1)
+    np.testing.assert_allclose(data["potential_energy"], potential, rtol=1e-12)
+
+
+def test_emitters_pour_exactly_their_rate(tmp_path):
+    emitter = {"center": (0.2, 0.8), "radius": 0.07, "velocity": (1.0, 0.0), "material": "jelly", "start": 0.02}
+    summary, data, _ = simulate(tmp_path / "out", **PRECISE, body=[], emitter=[emitter])
+    assert float(data["mass"].sum()) == pytest.approx(1000 * 0.14 * 1.0 * 0.08, rel=1e-12)
+    assert data["particles"][:2].tolist() == [0, data["particles"][1]] and data["particles"][-1] == len(data["mass"])
+    assert np.isnan(data["position"][0]).all() and np.isfinite(data["position"][-1]).all()
+    # Before the fall has bent the jet, its matter is at speed x age from the nozzle.
+    first = np.nanmax(data["position"][-1][:, 0])
+    assert first == pytest.approx(0.2 + 0.08, abs=0.01)
+    assert summary["particles_lost"] == 0
+
+
+def test_a_moving_obstacle_pushes(tmp_path):
+    wall = {"shape": "box", "center": (0.1, 0.5), "size": (0.2, 1.0), "velocity": (2.0, 0.0), "contact": "sticky"}
+    _, data, _ = simulate(tmp_path / "out", gravity=None, obstacle=[wall], duration=0.2)
+    assert data["position"][-1][:, 0].min() > 0.2 + 2.0 * 0.2 - 0.05
+    assert data["momentum"][-1, 0] > 0 == data["momentum"][0, 0]
+
+
+def test_a_batch_gives_what_each_scene_gives_alone(tmp_path):
+    entries = [
+        {"material": {"jelly": {"law": "neo_hookean", "E": 1e4}}, "gravity": (0, -3)},
+        {"material": {"jelly": {"law": "neo_hookean", "E": 2e4}}, "gravity": (0, -9)},
+    ]
+    same = {**PRECISE, "dt": 1e-3, "body__0__center": (0.5, 0.22)}
+    _, batch, _ = simulate(tmp_path / "batch", **same, material={}, gravity=None, scene=entries)
+    for k, entry in enumerate(entries):
+        _, alone, _ = simulate(tmp_path / f"{k}", **same, **entry)
+        rows = batch["scene"] == k
+        np.testing.assert_allclose(batch["position"][:, rows], alone["position"], atol=1e-12)
+
+
+def test_the_trajectory_knows_where_it_comes_from(tmp_path):
+    _, data, attributes = simulate(tmp_path / "out", seed=7, output={"fields": ["stress", "C"]})
+    assert attributes["seed"] == 7 and attributes["torch"] == torch.__version__
+    assert Scene(**json.loads(attributes["scene"])).seed == 7
+    assert data["stress"].shape == (6, len(data["mass"]), 2, 2) and data["C"].shape == data["stress"].shape
+
+
+# ---- output folders
+
+
+def test_folders_that_hold_something_else_are_refused(tmp_path):
+    scene = Scene(**disc(device="cpu", duration=0.02))
+    (tmp_path / "notes").mkdir()
+    (tmp_path / "notes" / "mine.txt").write_text("keep")
+    with pytest.raises(OutputError, match="holds files that are no run of torch_mpm"):
+        scene.run(tmp_path / "notes")
+    with pytest.raises(OutputError, match="is a file"):
+        scene.run(tmp_path / "notes" / "mine.txt")
+    scene.run(tmp_path / "out")
+    with pytest.raises(OutputError, match="holds the complete run of this scene"):
+        scene.run(tmp_path / "out", resume=True)
+    with pytest.raises(OutputError, match="holds the run of another scene"):
+        Scene(**disc(device="cpu", duration=0.04)).run(tmp_path / "out", resume=True)
+    assert (tmp_path / "notes" / "mine.txt").read_text() == "keep"
+
+
+def test_a_disk_too_small_is_noticed_first(tmp_path, monkeypatch):
+    usage = module.shutil.disk_usage(tmp_path)._replace(free=1000)
+    monkeypatch.setattr(module.shutil, "disk_usage", lambda path: usage)
+    with pytest.raises(OutputError, match=r"the trajectory needs .* GB .* 0.00 GB are free; free some space"):
+        simulate(tmp_path / "out")
+
+
+def test_a_disk_that_fills_up_leaves_whole_frames(tmp_path, monkeypatch):
+    _, whole, _ = simulate(tmp_path / "whole")
+    scene = Scene(**disc(device="cpu"))
+    save, calls = module.checkpoint.save, []
+
+    def full(path, *arguments):
+        calls.append(path)
+        if len(calls) == 3:
+            raise OSError(28, "No space left on device")
+        save(path, *arguments)
+
+    monkeypatch.setattr(module.checkpoint, "save", full)
+    with pytest.raises(OutputError, match=r"no room on the disk .*No space left.* frames written so far are whole"):
+        scene.run(tmp_path / "out")
+    monkeypatch.undo()
+    with Trajectory(tmp_path / "out") as read:
+        assert 1 <= len(read) < len(whole["time"])
+        np.testing.assert_array_equal(read["position"], whole["position"][: len(read)])
+    scene.run(tmp_path / "out", resume=True)
+    with Trajectory(tmp_path / "out") as read:
+        np.testing.assert_array_equal(read["position"], whole["position"])
+
+
+# ---- stops and kills
+
+
+def test_a_stop_signal_ends_after_a_whole_frame_and_resumes_bit_for_bit(tmp_path):
+    _, whole, _ = simulate(tmp_path / "whole")
+    scene = Scene(**disc(device="cpu"))
+
+    def interrupt(figures):
+        if figures["frame"] == 2:
+            signal.raise_signal(signal.SIGINT)
+
+    with pytest.raises(Interrupted, match="stopped after frame 2 of 5; add --resume"):
+        scene.run(tmp_path / "out", progress=interrupt)
+    with pytest.raises(OutputError, match="holds an unfinished run of this scene; add --resume"):
+        scene.run(tmp_path / "out")
+    with Trajectory(tmp_path / "out") as read:
+        assert len(read) == 3
+    summary = scene.run(tmp_path / "out", resume=True)
+    with Trajectory(tmp_path / "out") as read:
+        for name in whole:
+            np.testing.assert_array_equal(read[name], whole[name])
+    assert summary["substeps"] == whole["substeps"].sum()
+    assert not list((tmp_path / "out").glob("*.building")) and not (tmp_path / "out" / "checkpoint.h5").exists()
+
+
+def killed_and_resumed(tmp_path, kills, duration, delay):
+    """Run a scene with SIGKILLs after random delays; returns the number of kills and both trajectories."""
+    path = tmp_path / "scene.toml"
+    path.write_text(FILE.format(duration=duration) + "\n[output]\nfields = ['F', 'C']\n")
+    assert command("run", path, "-o", tmp_path / "whole", "--quiet").wait() == 0
+    rng, done = random.Random(5), 0
+    arguments = ("run", path, "-o", tmp_path / "out", "--quiet", "--resume")
+    while done < kills:
+        process = command(*arguments)
+        try:
+            process.communicate(timeout=delay(rng, done))
+            break  # it came to its end
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.communicate()
+            done += 1
+    process = command(*arguments)
+    _, errors = process.communicate()
+    assert process.returncode == 0 or "complete run" in errors, errors
+    with Trajectory(tmp_path / "whole") as a, Trajectory(tmp_path / "out") as b:
+        assert a.complete and b.complete and list(a.file) == list(b.file)
+        for name in a.file:
+            np.testing.assert_array_equal(a[name], b[name], err_msg=name)
+    assert not list((tmp_path / "out").glob("*.building"))
+    return done
+
+
+def wait_for_frames(folder, frames, process):
+    """Until so many frames are whole or the process ends."""
+    while process.poll() is None:
+        try:
+            with Trajectory(folder) as read:
+                if len(read) >= frames:
+                    return
+        except (FileNotFoundError, OSError):
+            pass
+
+
+def test_sigkill_in_the_middle_loses_and_repeats_nothing(tmp_path):
+    path = tmp_path / "scene.toml"
+    path.write_text(FILE.format(duration=0.8))
+    assert command("run", path, "-o", tmp_path / "whole", "--quiet").wait() == 0
+    arguments = ("run", path, "-o", tmp_path / "out", "--quiet", "--resume")
+    for frames in (5, 21):
+        process = command(*arguments)
+        wait_for_frames(tmp_path / "out", frames, process)
+        process.kill()
+        process.communicate()
+    assert command(*arguments).wait() == 0
+    with Trajectory(tmp_path / "whole") as a, Trajectory(tmp_path / "out") as b:
+        assert a.complete and b.complete
+        for name in a.file:
+            np.testing.assert_array_equal(a[name], b[name], err_msg=name)
+
+
+@pytest.mark.slow
+def test_twenty_sigkills_at_random_moments(tmp_path):
+    # The scene takes longer than all the delays together, so that every kill meets a run at work.
+    done = killed_and_resumed(tmp_path, 20, 30.0, lambda rng, k: rng.uniform(1.0, 4.0))
+    assert done == 20
+
+
+# ---- what goes wrong
+
+
+def test_a_fixed_dt_above_the_limit_is_refused_with_one_that_works(tmp_path):
+    with pytest.raises(SceneFailure, match=r"step 0: dt = 0.1 s is above the stability limit .*; use dt = 0.00") as error:
+        simulate(tmp_path / "out", dt=0.1)
+    assert (tmp_path / "out" / "last_good.h5").exists()
+    wanted = float(str(error.value).split("use dt = ")[1].split(",")[0])
+    simulate(tmp_path / "again", dt=wanted)
+
+
+def test_a_particle_that_leaves_is_named_and_the_state_before_it_is_kept(tmp_path):
+    with pytest.raises(SceneFailure, match=r"(?s)particle \d+: it left the domain, at \[.*open wall") as error:
+        simulate(tmp_path / "out", grid__walls="open", body__0__velocity=(0, -20.0), duration=0.2)
+    failure = error.value.failure
+    assert failure.quantity.startswith("it left the domain") and failure.step > 1
+    state, record = load(tmp_path / "out" / "last_good.h5")
+    assert bool((state.x[:, 1] > -0.051).all()) and record["time"] < failure.time
+    assert str(failure.particle) in record["failure"]
+    with Trajectory(tmp_path / "out") as read:
+        assert 1 <= len(read) < 11
+
+
+@pytest.mark.parametrize("quantity", ["velocity", "deformation"])
+def test_what_went_first_is_found(quantity):
+    built = Scene(**disc(device="cpu", gravity=None)).build("cpu")
+    step, state = built.step, built.state
+
+    def spoil(blocks, velocity, mass, dt):
+        spoil.steps += 1
+        if spoil.steps < 5:
+            return velocity
+        near = blocks.node_positions(velocity.dtype)[:, :1] < 0.4
+        bad = math.nan if quantity == "velocity" else -100.0 * (blocks.node_positions(velocity.dtype) - 0.35) / dt / 100 * 3
+        return torch.where(near, bad, velocity)
+
+    spoil.steps = 0
+    step.on_grid = spoil
+    failure = replay(step, state, 1e-3, 20, 100, built.scenes)
+    assert failure is not None and failure.step == 105
+    assert quantity in failure.quantity
+    row = int((failure.good.ids == failure.particle).nonzero())
+    assert float(failure.good.x[row, 0]) < 0.5
+    assert bool(failure.good.v.isfinite().all())
+
+
+def test_an_unstable_run_says_that_dt_was_above_the_limit(tmp_path, monkeypatch):
+    scene = Scene(**disc(device="cpu"))
+    built = scene.build()
+    simulation = module.Simulation(scene, built)
+    monkeypatch.setattr(simulation, "_choose_dt", lambda span: (0.05, 32))
+    moving = built.state.x - 0.5
+    simulation.state = built.state.replace(v=moving * 10)
+    with pytest.raises(SimulationError, match=r"the time step 0.05 s is above the stability limit 0.00.* s; use dt = 0.00"):
+        with torch.no_grad():
+            simulation._advance(0.0, 1.6)
