@@ -1,4 +1,4 @@
-"""Runs of scenes: the physics of what comes out, and that nothing is lost or half-written whatever happens on the way."""
+"""Runs of scenes: the physics of what comes out, and that nothing is lost or half-written whatever happens."""
 
 import json
 import math
@@ -14,12 +14,12 @@ from scenes import FILE, command, disc
 pytest.importorskip("pydantic")
 pytest.importorskip("h5py")
 
-from torch_mpm import SimulationError, Trajectory  # noqa: E402
-from torch_mpm.scene import Scene  # noqa: E402
-from torch_mpm.scene import run as module  # noqa: E402
-from torch_mpm.scene.checkpoint import load  # noqa: E402
-from torch_mpm.scene.diagnose import SceneFailure, replay  # noqa: E402
-from torch_mpm.scene.run import Interrupted, OutputError  # noqa: E402
+from torch_mpm import SimulationError, Trajectory
+from torch_mpm.scene import Scene
+from torch_mpm.scene import run as module
+from torch_mpm.scene.checkpoint import load
+from torch_mpm.scene.diagnose import SceneFailure, replay
+from torch_mpm.scene.run import Interrupted, OutputError
 
 PRECISE = {"precision": "float64", "device": "cpu"}
 
@@ -246,7 +246,9 @@ def test_twenty_sigkills_at_random_moments(tmp_path):
 
 
 def test_a_fixed_dt_above_the_limit_is_refused_with_one_that_works(tmp_path):
-    with pytest.raises(SceneFailure, match=r"step 0: dt = 0.1 s is above the stability limit .*; use dt = 0.00") as error:
+    with pytest.raises(
+        SceneFailure, match=r"step 0: dt = 0.1 s is above the stability limit .*; use dt = 0.00"
+    ) as error:
         simulate(tmp_path / "out", dt=0.1)
     assert (tmp_path / "out" / "last_good.h5").exists()
     wanted = float(str(error.value).split("use dt = ")[1].split(",")[0])
@@ -274,9 +276,9 @@ def test_what_went_first_is_found(quantity):
         spoil.steps += 1
         if spoil.steps < 5:
             return velocity
-        near = blocks.node_positions(velocity.dtype)[:, :1] < 0.4
-        bad = math.nan if quantity == "velocity" else -100.0 * (blocks.node_positions(velocity.dtype) - 0.35) / dt / 100 * 3
-        return torch.where(near, bad, velocity)
+        x = blocks.node_positions(velocity.dtype)[:, :1]
+        turn_over = -1.5 * (x - 0.35) / dt * torch.tensor([1.0, 0.0])
+        return torch.where(x < 0.4, math.nan if quantity == "velocity" else turn_over, velocity)
 
     spoil.steps = 0
     step.on_grid = spoil
@@ -295,6 +297,8 @@ def test_an_unstable_run_says_that_dt_was_above_the_limit(tmp_path, monkeypatch)
     monkeypatch.setattr(simulation, "_choose_dt", lambda span: (0.05, 32))
     moving = built.state.x - 0.5
     simulation.state = built.state.replace(v=moving * 10)
-    with pytest.raises(SimulationError, match=r"the time step 0.05 s is above the stability limit 0.00.* s; use dt = 0.00"):
+    with pytest.raises(
+        SimulationError, match=r"the time step 0.05 s is above the stability limit 0.00.* s; use dt = 0.00"
+    ):
         with torch.no_grad():
             simulation._advance(0.0, 1.6)

@@ -1,5 +1,7 @@
 """Scene files: what they say is understood, and what is wrong is named with the key and what it takes."""
 
+# ruff: noqa: E501
+
 import json
 import math
 from pathlib import Path
@@ -11,8 +13,8 @@ from scenes import FILE, disc
 
 pytest.importorskip("pydantic")
 
-import torch_mpm as mpm  # noqa: E402
-from torch_mpm.scene import Scene, SceneError, json_schema  # noqa: E402
+import torch_mpm as mpm
+from torch_mpm.scene import Scene, SceneError, json_schema
 
 EXAMPLES = sorted((Path(__file__).parent.parent / "examples").glob("*.toml"))
 BOX = {"shape": "box", "lower": (0.1, 0.1), "upper": (0.3, 0.3), "material": "jelly"}
@@ -102,7 +104,7 @@ def test_files_name_themselves_in_messages(tmp_path):
     path.write_text("gravity = [0,\n[")
     with pytest.raises(SceneError, match=r"scene.toml: not a TOML file: "):
         Scene.load(path)
-    path.write_text("duration = 1\nfsp = 3\n" + FILE.format(duration=1)[FILE.index("[grid]") - 8 :])
+    path.write_text(FILE.format(duration=1).replace("fps", "fsp"))
     with pytest.raises(SceneError, match=r"scene.toml: fsp: unknown key; did you mean 'fps'"):
         Scene.load(path)
 
@@ -192,7 +194,9 @@ def test_spin_in_space_is_about_its_axis():
 def test_a_scene_has_only_the_fields_that_it_needs():
     solid = Scene(**disc()).build("cpu").state
     fluid = Scene(**disc(material__jelly={"law": "weakly_compressible", "bulk_modulus": 1e4})).build("cpu").state
-    assert solid.F is not None and solid.J is None and solid.C is None and solid.scene is None and solid.material is None
+    assert (
+        solid.F is not None and solid.J is None and solid.C is None and solid.scene is None and solid.material is None
+    )
     assert fluid.F is None and fluid.J is not None
 
 

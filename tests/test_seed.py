@@ -179,5 +179,5 @@ def test_a_shape_without_points_is_refused():
         def inside(self, x):
             return torch.zeros(len(x), dtype=torch.bool)
 
-    with pytest.raises(ValueError, match="too small for its particles: spacing 0.05 m; use a finer grid"):
+    with pytest.raises(ValueError, match=r"too small for its particles: spacing 0\.05 m; use a finer grid"):
         seed.fill(Nowhere((0, 0), (1, 1)), 0.1, 4)

@@ -1,0 +1,137 @@
+"""The command line, as a user calls it."""
+
+import json
+import sys
+
+import pytest
+from scenes import FILE, command
+
+pytest.importorskip("pydantic")
+pytest.importorskip("h5py")
+
+from torch_mpm import Trajectory
+from torch_mpm.cli import main
+
+
+@pytest.fixture
+def scene(tmp_path):
+    path = tmp_path / "scene.toml"
+    path.write_text(FILE.format(duration=0.04))
+    return path
+
+
+def test_run_prints_where_things_are_and_what_it_took(scene, tmp_path, capsys):
+    assert main(["run", str(scene), "-o", str(tmp_path / "out"), "--set", "precision=float64"]) == 0
+    told = capsys.readouterr()
+    for text in ("3 frames", "simulation", "writing", "mass drift", "largest CFL number", "particles lost  none"):
+        assert text in told.out
+    assert str(tmp_path / "out" / "trajectory.h5") in told.out
+    assert "substeps" in told.err and "kinetic" in told.err and "elastic" in told.err  # the progress bar
+    with Trajectory(tmp_path / "out") as read:
+        assert read.complete and read["position"].dtype == "float64"
+        assert read.attributes["scene"] == scene.read_text()
+    summary = json.loads((tmp_path / "out" / "run.json").read_text())["summary"]
+    assert summary["frames"] == 2 and summary["particles_lost"] == 0
+
+
+def test_outputs_that_the_scene_names(scene, tmp_path, capsys):
+    pytest.importorskip("meshio")
+    arguments = ["--set", "output.vtk=true", "--set", "output.ply=true", "--quiet"]
+    assert main(["run", str(scene), "-o", str(tmp_path / "out"), *arguments]) == 0
+    assert len(list((tmp_path / "out" / "vtk").glob("*.vtu"))) == 3
+    assert len(list((tmp_path / "out" / "ply").glob("*.ply"))) == 3
+    capsys.readouterr()
+    assert main(["export", str(tmp_path / "out"), "--ply"]) == 0
+    assert capsys.readouterr().out.strip().endswith("ply")
+
+
+def test_pictures_and_video(scene, tmp_path, capsys):
+    for package in ("matplotlib", "PIL", "imageio_ffmpeg"):
+        pytest.importorskip(package)
+    from torch_mpm.render import read_png
+
+    run = ["run", str(scene), "-o", str(tmp_path / "out"), "--set", "render.resolution=[320, 240]", "--quiet"]
+    assert main(run) == 0
+    pictures = sorted((tmp_path / "out" / "frames").glob("*.png"))
+    assert [p.name for p in pictures] == ["00000.png", "00001.png", "00002.png"]
+    assert (read_png(pictures[0]) != read_png(pictures[2])).any()
+    assert (tmp_path / "out" / "video.mp4").read_bytes()[4:8] == b"ftyp"
+    assert main(["render", str(tmp_path / "out"), "--set", "render.color_by=material"]) == 0
+    assert capsys.readouterr().out.strip().endswith("video.mp4")
+
+
+def test_check_tells_good_from_bad(scene, capsys):
+    assert main(["check", str(scene)]) == 0
+    assert "scene.toml: good, " in capsys.readouterr().out
+    assert main(["check", str(scene), "--set", "grid.dxx=3", "--set", "body[0].material=1"]) == 1
+    told = capsys.readouterr().err.splitlines()
+    assert len(told) == 2 and told[0].startswith("torch-mpm: ")
+    assert any("scene.toml: grid.dxx: unknown key; did you mean 'dx'?" in line for line in told)
+    assert any("scene.toml: body[0].material: should be a valid string, got 1" in line for line in told)
+
+
+def test_info_lists_what_the_scene_uses(scene, capsys):
+    assert main(["info", str(scene)]) == 0
+    told = dict(line.split("  ", 1) for line in map(str.strip, capsys.readouterr().out.splitlines()))
+    assert told["fields"].strip() == "x 8, v 8, mass 4, volume 4, C 16, F 16, ids 8"
+    assert told["bytes per particle"].strip() == "64"
+    assert float(told["time step [s]"]) > 0 and float(told["estimated run time [s]"]) > 0
+    assert main(["info"]) == 0
+    assert "torch:" in capsys.readouterr().out
+
+
+def test_schema_is_json(capsys):
+    assert main(["schema"]) == 0
+    assert json.loads(capsys.readouterr().out)["properties"]["grid"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["run", "nowhere.toml", "-o", "x"], "scene file nowhere.toml does not exist"),
+        (["render", "nowhere"], "there is no run in nowhere"),
+        (["export", "nowhere"], "there is no trajectory at nowhere"),
+    ],
+)
+def test_missing_files(arguments, message, capsys):
+    assert main(arguments) == 1
+    assert capsys.readouterr().err == f"torch-mpm: {message}\n"
+
+
+@pytest.mark.parametrize(
+    ("package", "override", "extra"),
+    [("h5py", "seed=0", "data"), ("meshio", "output.vtk=true", "data"), ("matplotlib", "render.every=1", "render")],
+)
+def test_a_missing_package_is_noticed_before_the_run(scene, tmp_path, monkeypatch, capsys, package, override, extra):
+    monkeypatch.setitem(sys.modules, package, None)
+    assert main(["run", str(scene), "-o", str(tmp_path / "out"), "--set", override, "--quiet"]) == 1
+    assert f"pip install torch-mpm[{extra}]" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_without_pydantic_the_extra_is_named(scene):
+    code = "import sys; sys.modules['pydantic'] = None; from torch_mpm.cli import main; raise SystemExit(main(sys.argv[1:]))"
+    import subprocess
+
+    done = subprocess.run([sys.executable, "-c", code, "check", str(scene)], capture_output=True, text=True)
+    assert done.returncode == 1 and "pip install torch-mpm[scene]" in done.stderr
+
+
+def test_ctrl_c_ends_after_a_whole_frame(tmp_path):
+    import signal
+
+    path = tmp_path / "scene.toml"
+    path.write_text(FILE.format(duration=600))
+    process = command("run", path, "-o", tmp_path / "out", "--quiet")
+    while process.poll() is None:
+        try:
+            with Trajectory(tmp_path / "out") as read:
+                if len(read) > 2:
+                    break
+        except OSError:
+            pass
+    process.send_signal(signal.SIGINT)
+    _, errors = process.communicate()
+    assert process.returncode == 130 and "add --resume to go on" in errors
+    with Trajectory(tmp_path / "out") as read:
+        assert 2 < len(read) < 30001 and f"stopped after frame {len(read) - 1} of 30000" in errors
