@@ -1,7 +1,7 @@
 """A small network acts on the grid: trained to blow a falling drop of jelly sideways onto a target.
 
-The network sees position and velocity of each grid node and adds an acceleration to it; it is called inside the step, and
-its weights get their gradient through the simulation.
+The network sees position and velocity of each grid node and adds an acceleration to it; it is called inside the step,
+and its weights get their gradient through the simulation.
 """
 
 import argparse

@@ -16,6 +16,7 @@ def main(iterations: int = 12) -> float:
 
     velocity = torch.tensor([1.0, 1.0], requires_grad=True)
     optimizer = torch.optim.Adam([velocity], lr=0.3)
+    slower = torch.optim.lr_scheduler.ExponentialLR(optimizer, 0.85)
     best = float("inf")
     for k in range(iterations):
         thrown = ball.replace(v=ball.v + velocity)
@@ -26,6 +27,7 @@ def main(iterations: int = 12) -> float:
         optimizer.zero_grad()
         miss.backward()
         optimizer.step()
+        slower.step()
     return best
 
 

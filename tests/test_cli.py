@@ -1,6 +1,8 @@
 """The command line, as a user calls it."""
 
 import json
+import signal
+import subprocess
 import sys
 
 import pytest
@@ -110,16 +112,12 @@ def test_a_missing_package_is_noticed_before_the_run(scene, tmp_path, monkeypatc
 
 
 def test_without_pydantic_the_extra_is_named(scene):
-    code = "import sys; sys.modules['pydantic'] = None; from torch_mpm.cli import main; raise SystemExit(main(sys.argv[1:]))"
-    import subprocess
-
+    code = "import sys; sys.modules['pydantic'] = None; from torch_mpm.cli import main; sys.exit(main(sys.argv[1:]))"
     done = subprocess.run([sys.executable, "-c", code, "check", str(scene)], capture_output=True, text=True)
     assert done.returncode == 1 and "pip install torch-mpm[scene]" in done.stderr
 
 
 def test_ctrl_c_ends_after_a_whole_frame(tmp_path):
-    import signal
-
     path = tmp_path / "scene.toml"
     path.write_text(FILE.format(duration=600))
     process = command("run", path, "-o", tmp_path / "out", "--quiet")
