@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import datetime
 import json
 import math
@@ -23,6 +24,17 @@ def use_all_cores() -> int:
     """Let torch use every core that this process may run on; return how many."""
     torch.set_num_threads(len(os.sched_getaffinity(0)))
     return torch.get_num_threads()
+
+
+def release_memory() -> None:
+    """Give freed memory back to the system.
+
+    The heap of glibc before 2.38 fragments without end under aligned allocations (glibc bug 14581): a rollout of
+    large tensors on the CPU then takes gigabytes.
+    """
+    libc = ctypes.CDLL(None)
+    if hasattr(libc, "malloc_trim"):
+        libc.malloc_trim(0)
 
 
 def environment(device: str = "cpu") -> dict[str, Any]:

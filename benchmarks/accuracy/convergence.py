@@ -112,6 +112,8 @@ def run(case: Case, n: int, steps: int | None = None, staggered: bool = True) ->
         for k in range(steps):
             impulse = dt * solution.body_force(k * dt)
             state = step(state.replace(v=state.v + impulse), dt)
+            if k % 20 == 19:
+                common.release_memory()
     seconds = time.perf_counter() - begin
     displacement = (state.x - solution.X - solution.displacement(exact.PERIOD)).double() / exact.AMPLITUDE
     velocity = (state.v - solution.velocity(exact.PERIOD - lag)).double() / (exact.AMPLITUDE * math.pi * exact.SPEED)
