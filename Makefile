@@ -42,7 +42,7 @@ format: $(STAMP)
 
 demo: build
 	rm -rf out/demo
-	$(PY) -m torch_mpm run examples/jelly.toml -o out/demo
+	$(PY) -m torch_mpm run examples/demo.toml -o out/demo
 
 # Each scene in a folder of its own. A scene that is done is skipped, an unfinished one goes on.
 examples: $(patsubst examples/%.toml,out/%/trajectory.h5,$(wildcard examples/*.toml))
