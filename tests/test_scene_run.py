@@ -106,6 +106,17 @@ def test_the_trajectory_knows_where_it_comes_from(tmp_path):
     assert data["stress"].shape == (6, len(data["mass"]), 2, 2) and data["C"].shape == data["stress"].shape
 
 
+def test_every_device_writes_the_frames_of_the_cpu(tmp_path, device):
+    emitter = {"center": (0.8, 0.8), "radius": 0.07, "velocity": (-1.0, 0.0), "material": "jelly"}
+    words = {"precision": "float64", "dt": 1e-3, "emitter": [emitter], "output": {"fields": ["F", "stress"]}}
+    _, expected, _ = simulate(tmp_path / "cpu", **words)
+    _, data, attributes = simulate(tmp_path / "device", **{**words, "device": device})
+    assert attributes["device"].startswith(device)
+    for name in ("position", "velocity", "F", "mass", "material", "particles", "momentum"):
+        np.testing.assert_allclose(data[name], expected[name], rtol=1e-9, atol=1e-9, err_msg=name)
+    np.testing.assert_allclose(data["stress"], expected["stress"], atol=1e-5)
+
+
 # ---- output folders
 
 

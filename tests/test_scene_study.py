@@ -55,4 +55,4 @@ def test_colliding_bodies_keep_momentum_and_lose_energy_by_dt(tmp_path):
             energy = read["kinetic_energy"] + read["elastic_energy"]
         print(f"dt = {summary['smallest_dt']:.2e} s: energy {energy[-1] / energy[0] - 1:+.3%}, momentum {drift:.1e}")
         assert drift < 1e-11
-        assert 0.5 < energy[-1] / energy[0] <= 1 + 1e-6
+        assert energy.max() <= energy[0] * (1 + 1e-6)  # APIC loses, more so in more steps, and never gains
