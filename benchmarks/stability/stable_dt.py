@@ -26,9 +26,9 @@ from .. import common
 
 DENSITY = 1000.0
 GROWTH = 100.0
-CELLS = {2: 6, 3: 3}
-STEPS = 250
-COARSE = [0.9 * 1.09**k for k in range(15)]
+CELLS = {2: 6, 3: 2}
+STEPS = 150
+COARSE = [0.9 * 1.17**k for k in range(9)]
 """Multiples of the estimate that are tried first."""
 
 
@@ -127,7 +127,7 @@ def measure(cases: Sequence[Case]) -> list[dict[str, Any]]:
         if failed := (low == 0).nonzero().flatten().tolist():
             tenth = torch.full((len(failed), 1), 0.1, dtype=torch.float64)
             never[failed] = ~stable([batch[i] for i in failed], tenth, 10 * STEPS)[0][:, 0]
-        between = torch.linspace(0, 1, 7, dtype=torch.float64)[1:-1]
+        between = torch.linspace(0, 1, 9, dtype=torch.float64)[1:-1]
         low, high, _ = bracket(batch, low[:, None] + (high - low)[:, None] * between, low, high)
         low, high = low.where(~never, 0), high.where(~never, 0)
         for c, dt, a, b in zip(batch, estimate.tolist(), low.tolist(), high.tolist(), strict=True):
