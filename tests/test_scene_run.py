@@ -128,6 +128,8 @@ def test_folders_that_hold_something_else_are_refused(tmp_path):
         scene.run(tmp_path / "notes")
     with pytest.raises(OutputError, match="is a file"):
         scene.run(tmp_path / "notes" / "mine.txt")
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "run.building").write_text("{")  # what a kill at the very start may leave
     scene.run(tmp_path / "out")
     with pytest.raises(OutputError, match="holds the complete run of this scene"):
         scene.run(tmp_path / "out", resume=True)

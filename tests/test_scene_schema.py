@@ -150,6 +150,10 @@ def test_schema_is_one_that_editors_take():
     assert not validator.is_valid(good | {"grvity": [0, 1]})
 
 
+def test_the_schema_beside_the_examples_is_that_of_the_package():
+    assert json.loads((EXAMPLES[0].parent / "scene.schema.json").read_text()) == json_schema(), "torch-mpm schema > it"
+
+
 def test_descriptions_reach_the_schema():
     text = json.dumps(json_schema())
     assert "Young's modulus [Pa]" in text and "distance of the grid nodes [m]" in text

@@ -51,7 +51,9 @@ def _parser() -> argparse.ArgumentParser:
     _scene_arguments(check)
     check.set_defaults(command=_check)
 
-    info = commands.add_parser("info", help="what a scene uses and takes; without a scene, what this installation can do")
+    info = commands.add_parser(
+        "info", help="what a scene uses and takes; without a scene, what this installation can do"
+    )
     _scene_arguments(info, optional=True)
     info.set_defaults(command=_info)
 
@@ -159,7 +161,9 @@ def _check(options: argparse.Namespace) -> None:
 
     scene = Scene.load(options.scene, options.overrides)
     built = scene.build("cpu")
-    print(f"{options.scene}: good, {built.particles} particles in {len(built.scenes)} scene(s), {scene.frames + 1} frames")
+    print(
+        f"{options.scene}: good, {built.particles} particles in {len(built.scenes)} scene(s), {scene.frames + 1} frames"
+    )
 
 
 def _info(options: argparse.Namespace) -> None:

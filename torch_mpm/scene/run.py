@@ -354,8 +354,8 @@ def versions() -> dict[str, str]:
 
 def _claim(folder: Path, fingerprint: str, resume: bool) -> None:
     """Refuse a folder that holds anything but an unfinished run of this scene that is to be resumed."""
-    if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
-        return
+    if not folder.exists() or (folder.is_dir() and all(p.suffix == ".building" for p in folder.iterdir())):
+        return  # a file that was being built when a run was killed is nothing yet
     if not folder.is_dir():
         raise OutputError(f"{folder} is a file; choose a folder for the output")
     record = folder / RUN
