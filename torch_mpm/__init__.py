@@ -9,7 +9,8 @@ from .cfl import stable_dt
 from .errors import GridOverflowError, SimulationError
 from .grid import Blocks, Grid
 from .materials import CustomLaw, Material, Mixture, NeoHookean, WeaklyCompressible
-from .ops import advance, g2p, gather, grid_update, p2g, polar, scatter, svd3
+from .ops import advance, g2p, gather, grid_update, p2g, polar, quartic_return_map, scatter, svd3
+from .sand import QuarticSand
 from .state import State
 from .step import Step, rollout
 from .trajectory import Trajectory
@@ -29,6 +30,7 @@ __all__ = [
     "Mixture",
     "NeoHookean",
     "Plane",
+    "QuarticSand",
     "SimulationError",
     "Sphere",
     "State",
@@ -43,6 +45,7 @@ __all__ = [
     "ops",
     "p2g",
     "polar",
+    "quartic_return_map",
     "rollout",
     "scatter",
     "seed",

@@ -162,21 +162,9 @@ def _check_value(name: str, value: Value, expected: str, holds: Callable[[Any], 
     return value
 
 
-class NeoHookean(CompiledLaw):
-    """Compressible neo-Hookean solid: τ = μ (F Fᵀ − I) + λ ln J I (Bonet and Wood 2008, section 6.4.3).
+class SolidLaw(CompiledLaw):
+    """A compiled law with two elastic moduli, given as Young's modulus and Poisson's ratio or as Lamé parameters."""
 
-    Args:
-        E: Young's modulus [Pa], not negative, with nu; or
-        nu: Poisson's ratio in (−1, 0.5).
-        mu: shear modulus [Pa], not negative (0 is a fluid), with lam; or
-        lam: first Lamé parameter [Pa].
-
-    Raises:
-        ValueError: for a value outside its range, or another combination of arguments. Values are checked here, and not
-            again when a tensor is changed or trained.
-    """
-
-    name = "neo_hookean"
     E: Any  # numbers, buffers or nn.Parameters
     nu: Any
     mu: Any
@@ -188,7 +176,8 @@ class NeoHookean(CompiledLaw):
         super().__init__()
         given = {k: v for k, v in (("E", E), ("nu", nu), ("mu", mu), ("lam", lam)) if v is not None}
         if set(given) not in ({"E", "nu"}, {"mu", "lam"}):
-            raise ValueError(f"NeoHookean needs E and nu, or mu and lam, got {', '.join(given) or 'nothing'}")
+            found = ", ".join(given) or "nothing"
+            raise ValueError(f"{type(self).__name__} needs E and nu, or mu and lam, got {found}")
         if E is not None and nu is not None:
             self._store("E", _check_value("E", E, "finite and not negative", lambda v: v >= 0))
             self._store("nu", _check_value("nu", nu, "between -1 and 0.5", lambda v: (v > -1) & (v < 0.5)))
@@ -205,6 +194,23 @@ class NeoHookean(CompiledLaw):
             return self.mu, self.lam
         E, nu = self.E, self.nu
         return E / (2 * (1 + nu)), E * nu / ((1 + nu) * (1 - 2 * nu))
+
+
+class NeoHookean(SolidLaw):
+    """Compressible neo-Hookean solid: τ = μ (F Fᵀ − I) + λ ln J I (Bonet and Wood 2008, section 6.4.3).
+
+    Args:
+        E: Young's modulus [Pa], not negative, with nu; or
+        nu: Poisson's ratio in (−1, 0.5).
+        mu: shear modulus [Pa], not negative (0 is a fluid), with lam; or
+        lam: first Lamé parameter [Pa].
+
+    Raises:
+        ValueError: for a value outside its range, or another combination of arguments. Values are checked here, and not
+            again when a tensor is changed or trained.
+    """
+
+    name = "neo_hookean"
 
 
 class WeaklyCompressible(CompiledLaw):

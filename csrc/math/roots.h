@@ -1,5 +1,7 @@
 #pragma once
 
+#include <type_traits>
+
 #include "math/elementary.h"
 #ifndef __CUDACC__
 #include "math/pack.h"
@@ -34,7 +36,27 @@ MPM_HD double inverse_power_of_two(double x) {
   return __builtin_bit_cast(double, exponent > 0x0010000000000000 ? exponent : 0x0010000000000000);
 }
 
+MPM_HD float cube_root(float x) { return ::cbrtf(x); }
+MPM_HD double cube_root(double x) { return ::cbrt(x); }
+
 #ifndef __CUDACC__
+// To 7 digits, for x > 0: a third of the exponent (Kahan 1991), refined by Newton's method.
+template <class T, int N>
+MPM_HD Pack<T, N> cube_root(const Pack<T, N>& x) {
+  using Integer = typename PackShape<T, N>::Integer;
+  using Value = typename PackShape<T, N>::Value;
+  constexpr T offset = sizeof(T) == 4 ? T(709921077) : T(3071306043645493248);
+  Pack<T, N> r;
+  MPM_UNROLL
+  for (int k = 0; k < r.kParts; k++) {
+    const Value bits = __builtin_convertvector(__builtin_bit_cast(Integer, x.part[k]), Value);
+    r.part[k] = __builtin_bit_cast(Value, __builtin_convertvector(bits * T(1.0 / 3) + offset, Integer));
+  }
+  MPM_UNROLL
+  for (int step = 0; step < 2; step++) r = Pack<T, N>(2.0 / 3) * r + Pack<T, N>(1.0 / 3) * x / (r * r);
+  return r;
+}
+
 template <class T, int N>
 MPM_HD Pack<T, N> rsqrt(const Pack<T, N>& x) {
 #ifdef __AVX512F__

@@ -1,6 +1,7 @@
 #include <string>
 
 #include "ops/backend.h"
+#include "ops/parameters.h"
 
 #if MPM_BACKEND == MPM_BACKEND_IS_cpu
 #include "cpu/material_launchers.h"
@@ -42,17 +43,6 @@ void dispatch_law(const Tensor& state, int64_t dim, F&& f) {
     STD_TORCH_CHECK(false, "the state must be float32 or float64");
 }
 
-template <class T>
-Parameter<T> parameter(const Tensor& t, const Tensor& state, int64_t particles, bool has_scene) {
-  STD_TORCH_CHECK(t.dim() <= 1, "a parameter must be a scalar or have shape [1], [B] or [P]");
-  check_like(t, "a parameter", state);
-  const T* pointer = static_cast<const T*>(t.data_ptr());
-  if (t.numel() == 1) return {pointer, 0, 0};
-  if (t.numel() == particles) return {pointer, t.stride(0), 0};
-  STD_TORCH_CHECK(has_scene && t.numel() > 0, "a parameter must be a scalar or have shape [1], [B] or [P]");
-  return {pointer, t.stride(0), t.numel()};
-}
-
 template <class T, int D>
 LawArguments<T, D> law_arguments(const LawInfo& law, const Tensor& state, const OptionalTensor& C,
                                  const OptionalTensor& scene, const std::vector<Tensor>& parameters) {
@@ -64,13 +54,7 @@ LawArguments<T, D> law_arguments(const LawInfo& law, const Tensor& state, const 
   a.state = input<T>(state, "the state", state, law.shear ? Shape{P, D, D} : Shape{P});
   STD_TORCH_CHECK(law.viscous || !has(C), "a law without viscosity takes no C");
   a.C = input<T>(C, "C", state, {P, D, D});
-  if (has(scene)) {
-    check_shape(*scene, "scene", {P});
-    STD_TORCH_CHECK(scene->scalar_type() == ScalarType::Int && scene->device() == state.device(),
-                    "scene must be an int32 tensor on the device of the state");
-    a.scene = static_cast<const int*>(scene->data_ptr());
-    a.scene_stride = scene->stride(0);
-  }
+  set_scene(a, scene, state);
   STD_TORCH_CHECK(int(parameters.size()) == law.parameters, "the law has another number of parameters");
   for (int k = 0; k < law.parameters; k++) a.parameters[k] = parameter<T>(parameters[k], state, P, has(scene));
   return a;
@@ -88,13 +72,6 @@ Tensor material_stress(const Tensor& state, const OptionalTensor& C, const Optio
   return stress;
 }
 
-// An adjoint per particle, or an empty tensor where it is not needed.
-template <class T>
-Field<T> adjoint(const Tensor& like, bool needed, const Shape& shape, Tensor& out) {
-  out = needed ? empty_particles(like, shape) : empty(like, {0});
-  return needed ? field<T>(out) : Field<T>{};
-}
-
 std::tuple<Tensor, Tensor, Tensor> material_stress_backward(const Tensor& grad_stress, const Tensor& state,
                                                             const OptionalTensor& C, const OptionalTensor& scene,
                                                             const std::vector<Tensor>& parameters, std::string law,
@@ -107,9 +84,9 @@ std::tuple<Tensor, Tensor, Tensor> material_stress_backward(const Tensor& grad_s
     StressBackwardArguments<T, D> a;
     a.law = law_arguments<T, D>(info, state, C, scene, parameters);
     a.grad_stress = input<T>(grad_stress, "grad_stress", state, {P, D, D});
-    a.state = adjoint<T>(state, needs & kState, info.shear ? Shape{P, D, D} : Shape{P}, grad_state);
-    a.C = adjoint<T>(state, (needs & kVelocityGradient) && has(C), {P, D, D}, grad_C);
-    a.parameters = adjoint<T>(state, needs & kParameters, {P, info.parameters}, grad_parameters);
+    a.state = optional_result<T>(state, needs & kState, info.shear ? Shape{P, D, D} : Shape{P}, grad_state);
+    a.C = optional_result<T>(state, (needs & kVelocityGradient) && has(C), {P, D, D}, grad_C);
+    a.parameters = optional_result<T>(state, needs & kParameters, {P, info.parameters}, grad_parameters);
     backend::material_stress_backward(a, device.stream());
   });
   return {grad_state, grad_C, grad_parameters};
@@ -153,8 +130,8 @@ std::tuple<Tensor, Tensor> material_energy_backward(const Tensor& grad_energy, c
     EnergyBackwardArguments<T, D> a;
     a.law = law_arguments<T, D>(info, state, {}, scene, parameters);
     a.grad_energy = input<T>(grad_energy, "grad_energy", state, {P});
-    a.state = adjoint<T>(state, needs & kState, info.shear ? Shape{P, D, D} : Shape{P}, grad_state);
-    a.parameters = adjoint<T>(state, needs & kParameters, {P, info.parameters}, grad_parameters);
+    a.state = optional_result<T>(state, needs & kState, info.shear ? Shape{P, D, D} : Shape{P}, grad_state);
+    a.parameters = optional_result<T>(state, needs & kParameters, {P, info.parameters}, grad_parameters);
     backend::material_energy_backward(a, device.stream());
   });
   return {grad_state, grad_parameters};

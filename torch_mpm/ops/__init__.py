@@ -4,6 +4,7 @@ from . import activation as activation
 from .advance import advance
 from .grid_update import grid_update
 from .material import material_energy, material_stiffness, material_stress, material_wave_modulus
+from .sand import quartic_energy, quartic_return_map, quartic_stiffness, quartic_stress
 from .svd import polar, svd3
 from .transfer import g2p, gather, p2g, scatter
 
@@ -18,6 +19,10 @@ __all__ = [
     "material_wave_modulus",
     "p2g",
     "polar",
+    "quartic_energy",
+    "quartic_return_map",
+    "quartic_stiffness",
+    "quartic_stress",
     "scatter",
     "svd3",
 ]

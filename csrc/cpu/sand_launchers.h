@@ -1,0 +1,15 @@
+#pragma once
+
+#include "cpu/launchers.h"
+#include "materials/quartic_kernels.h"
+
+namespace mpm::cpu {
+
+template <class T, int D>
+void return_map(const ReturnMapArguments<T, D>&, Stream);
+template <class T, int D>
+void return_map_backward(const ReturnMapBackwardArguments<T, D>&, Stream);
+template <class T, int D>
+void sand_scalar(const SandScalarArguments<T, D>&, Stream);
+
+}  // namespace mpm::cpu

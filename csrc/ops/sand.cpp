@@ -1,0 +1,149 @@
+#include <string>
+
+#include "ops/backend.h"
+#include "ops/parameters.h"
+
+#if MPM_BACKEND == MPM_BACKEND_IS_cpu
+#include "cpu/sand_launchers.h"
+#else
+#include "cuda/sand_launchers.h"
+#endif
+
+// Return map, stress, energy and stiffness of sand.
+namespace mpm {
+namespace {
+
+int find_energy(const std::string& name) {
+  int index = -1;
+  for (int i = 0; i < SandEnergies::size; i++)
+    SandEnergies::visit(i, [&]<class Energy>() {
+      if (name == Energy::name) index = i;
+    });
+  STD_TORCH_CHECK(index >= 0, "there is no energy named ", name);
+  return index;
+}
+
+// Calls f.operator()<T, D>().
+template <class F>
+void dispatch_deformation(const Tensor& deformation, F&& f) {
+  STD_TORCH_CHECK(deformation.dim() == 3 && (deformation.size(1) == 2 || deformation.size(1) == 3),
+                  "F must have shape [P, 2, 2] or [P, 3, 3]");
+  const auto by_dimension = [&]<class T>() {
+    deformation.size(1) == 2 ? f.template operator()<T, 2>() : f.template operator()<T, 3>();
+  };
+  if (deformation.scalar_type() == ScalarType::Float)
+    by_dimension.template operator()<float>();
+  else if (deformation.scalar_type() == ScalarType::Double)
+    by_dimension.template operator()<double>();
+  else
+    STD_TORCH_CHECK(false, "F must be float32 or float64");
+}
+
+template <class T, int D>
+SandArguments<T, D> sand_arguments(const Tensor& F, const Tensor& mu, const Tensor& lam, const Tensor& alpha,
+                                   const OptionalTensor& scene, const std::string& energy) {
+  SandArguments<T, D> a;
+  a.energy = find_energy(energy);
+  a.particles = F.size(0);
+  a.F = input<T>(F, "F", F, {F.size(0), D, D});
+  set_scene(a, scene, F);
+  a.mu = parameter<T>(mu, F, a.particles, has(scene));
+  a.lam = parameter<T>(lam, F, a.particles, has(scene));
+  a.alpha = parameter<T>(alpha, F, a.particles, has(scene));
+  return a;
+}
+
+// "none", "zero" or "keep": without plasticity, or with one of the apex rules.
+template <class T, int D>
+void set_plasticity(SandArguments<T, D>& a, const std::string& apex) {
+  STD_TORCH_CHECK(apex == "none" || apex == "zero" || apex == "keep", "there is no apex rule named ", apex);
+  a.plastic = apex != "none";
+  a.keep_apex = apex == "keep";
+}
+
+std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> quartic_return_map(const Tensor& F, const Tensor& mu,
+                                                                      const Tensor& lam, const Tensor& alpha,
+                                                                      const OptionalTensor& scene, std::string energy,
+                                                                      std::string apex, bool details) {
+  const int64_t P = F.size(0);
+  Tensor mapped, stress, branch = empty_int(F, {P}), multiplier, dissipated;
+  const DeviceScope device(F);
+  dispatch_deformation(F, [&]<class T, int D>() {
+    ReturnMapArguments<T, D> a;
+    a.sand = sand_arguments<T, D>(F, mu, lam, alpha, scene, energy);
+    set_plasticity(a.sand, apex);
+    a.F = optional_result<T>(F, true, {P, D, D}, mapped);
+    a.stress = optional_result<T>(F, true, {P, D, D}, stress);
+    a.branch = static_cast<int*>(branch.data_ptr());
+    a.multiplier = optional_result<T>(F, details, {P}, multiplier);
+    a.dissipated = optional_result<T>(F, details, {P}, dissipated);
+    backend::return_map(a, device.stream());
+  });
+  return {mapped, stress, branch, multiplier, dissipated};
+}
+
+std::tuple<Tensor, Tensor> quartic_return_map_backward(const OptionalTensor& grad_F, const OptionalTensor& grad_stress,
+                                                       const Tensor& F, const Tensor& mu, const Tensor& lam,
+                                                       const Tensor& alpha, const OptionalTensor& scene,
+                                                       std::string energy, std::string apex, bool needs_F,
+                                                       bool needs_parameters) {
+  const int64_t P = F.size(0);
+  Tensor adjoint_F, adjoint_parameters;
+  const DeviceScope device(F);
+  dispatch_deformation(F, [&]<class T, int D>() {
+    ReturnMapBackwardArguments<T, D> a;
+    a.sand = sand_arguments<T, D>(F, mu, lam, alpha, scene, energy);
+    set_plasticity(a.sand, apex);
+    a.grad_F = input<T>(grad_F, "grad_F", F, {P, D, D});
+    a.grad_stress = input<T>(grad_stress, "grad_stress", F, {P, D, D});
+    a.F = optional_result<T>(F, needs_F, {P, D, D}, adjoint_F);
+    a.parameters = optional_result<T>(F, needs_parameters, {P, 3}, adjoint_parameters);
+    backend::return_map_backward(a, device.stream());
+  });
+  return {adjoint_F, adjoint_parameters};
+}
+
+Tensor sand_scalar(const Tensor& F, const Tensor& mu, const Tensor& lam, const OptionalTensor& scene,
+                   const std::string& energy, bool stiffness, double floor) {
+  Tensor value = empty(F, {F.size(0)});
+  const DeviceScope device(F);
+  dispatch_deformation(F, [&]<class T, int D>() {
+    const SandScalarArguments<T, D> a{sand_arguments<T, D>(F, mu, lam, mu, scene, energy), stiffness, T(floor),
+                                      field<T>(value)};
+    backend::sand_scalar(a, device.stream());
+  });
+  return value;
+}
+
+Tensor quartic_energy(const Tensor& F, const Tensor& mu, const Tensor& lam, const OptionalTensor& scene,
+                      std::string energy) {
+  return sand_scalar(F, mu, lam, scene, energy, false, 0);
+}
+
+Tensor quartic_stiffness(const Tensor& F, const Tensor& mu, const Tensor& lam, const OptionalTensor& scene,
+                         std::string energy, double floor) {
+  return sand_scalar(F, mu, lam, scene, energy, true, floor);
+}
+
+}  // namespace
+}  // namespace mpm
+
+#if MPM_BACKEND == MPM_BACKEND_IS_cpu
+STABLE_TORCH_LIBRARY_FRAGMENT(torch_mpm, m) {
+  m.def(
+      "quartic_return_map(Tensor F, Tensor mu, Tensor lam, Tensor alpha, Tensor? scene, str energy, str apex, bool "
+      "details) -> (Tensor F, Tensor stress, Tensor branch, Tensor multiplier, Tensor dissipated)");
+  m.def(
+      "quartic_return_map_backward(Tensor? grad_F, Tensor? grad_stress, Tensor F, Tensor mu, Tensor lam, Tensor alpha, "
+      "Tensor? scene, str energy, str apex, bool needs_F, bool needs_parameters) -> (Tensor F, Tensor parameters)");
+  m.def("quartic_energy(Tensor F, Tensor mu, Tensor lam, Tensor? scene, str energy) -> Tensor");
+  m.def("quartic_stiffness(Tensor F, Tensor mu, Tensor lam, Tensor? scene, str energy, float floor) -> Tensor");
+}
+#endif
+
+MPM_LIBRARY_IMPL(m) {
+  m.impl("quartic_return_map", TORCH_BOX(&mpm::quartic_return_map));
+  m.impl("quartic_return_map_backward", TORCH_BOX(&mpm::quartic_return_map_backward));
+  m.impl("quartic_energy", TORCH_BOX(&mpm::quartic_energy));
+  m.impl("quartic_stiffness", TORCH_BOX(&mpm::quartic_stiffness));
+}

@@ -1,0 +1,542 @@
+"""The sand model against plain torch, 50-digit roots, closed forms, invariances and finite differences."""
+
+import math
+
+import mpmath
+import pytest
+import torch
+from torch import Tensor
+
+import torch_mpm as mpm
+from torch_mpm.ops import quartic_energy, quartic_return_map, quartic_stiffness, quartic_stress
+from torch_mpm.ops.sand import APEX, CONE, ELASTIC, INVALID
+from torch_mpm.reference import sand as reference
+
+ENERGIES = ["full", "unilateral", "hencky", "mixed"]
+FORMS = [(energy, "zero") for energy in ENERGIES] + [("unilateral", "keep")]
+COEFFICIENT = 6.254421582537118
+
+
+def rotations(count: int, dim: int) -> Tensor:
+    Q, R = torch.linalg.qr(torch.randn(count, dim, dim, dtype=torch.float64))
+    Q = Q * R.diagonal(dim1=1, dim2=2).sign()[:, None, :]
+    Q[:, :, 0] *= torch.linalg.det(Q).sign()[:, None]
+    return Q
+
+
+def deformation(h: Tensor) -> Tensor:
+    """Deformation gradients of given Hencky strains [P, D] with random axes."""
+    return rotations(*h.shape) * h.exp()[:, None, :] @ rotations(*h.shape).mT
+
+
+def hencky(F: Tensor) -> Tensor:
+    return torch.linalg.svdvals(F.double().cpu()).log()
+
+
+def random_states(count: int, dim: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """F, μ, λ and friction angles of elastic, shearing and separating states."""
+    F = deformation(0.15 * torch.randn(count, dim, dtype=torch.float64) - 0.05)
+    mu = 10 ** (2 + 4 * torch.rand(count, dtype=torch.float64))
+    nu = 0.02 + 0.43 * torch.rand(count, dtype=torch.float64)
+    return F, mu, mu * 2 * nu / (1 - 2 * nu), 0.02 + 0.6 * torch.rand(count, dtype=torch.float64)
+
+
+def yield_ratio(stress: Tensor, alpha: Tensor | float) -> Tensor:
+    """|dev τ| + α tr τ relative to |τ|: not positive inside the cone."""
+    dim = stress.shape[1]
+    trace = stress.diagonal(dim1=1, dim2=2).sum(1)
+    deviator = stress - trace[:, None, None] / dim * torch.eye(dim, dtype=stress.dtype, device=stress.device)
+    return (deviator.norm(dim=(1, 2)) + alpha * trace) / stress.norm(dim=(1, 2)).clamp_min(1e-30)
+
+
+def error(value: Tensor, expected: Tensor) -> float:
+    return float((value.cpu().double() - expected).abs().max() / expected.abs().max().clamp_min(1e-300))
+
+
+# ---- values
+
+
+@pytest.mark.parametrize(("energy", "apex"), FORMS)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_return_map_is_the_reference(device, dim, energy, apex, dtype):
+    states = random_states(3001, dim)
+    F, mu, lam, angle = states
+    expected = reference.quartic_return_map(F, mu, lam, reference.friction_alpha(angle, dim), None, energy, apex)
+    result = quartic_return_map(*(t.to(device, dtype) for t in states), energy=energy, apex=apex, details=True)
+    assert torch.equal(result.branch.cpu(), expected[2])
+    assert result.branch.unique().numel() == 3
+    assert bool(result.converged.all())
+    tolerance = 64 * torch.finfo(dtype).eps
+    found = (result.F, result.stress, result.multiplier, result.dissipated)
+    for value, wanted in zip(found, (*expected[:2], *expected[3:]), strict=True):
+        assert error(value, wanted) < tolerance
+    assert float(result.multiplier.min()) >= 0
+    assert float(result.dissipated.min()) >= 0
+
+
+def strain_at(p: Tensor, ratio: Tensor, lode: Tensor) -> Tensor:
+    """h [P, 3] with mean −p, deviator of norm ratio p and the given Lode angle."""
+    turns = torch.tensor([0.0, -2 * math.pi / 3, 2 * math.pi / 3], dtype=torch.float64)
+    return p[:, None] * (-1 + ratio[:, None] * math.sqrt(2 / 3) * torch.cos(lode[:, None] + turns))
+
+
+def exact_map(stretches: list[float], alpha: float, ratio: float, unilateral: bool) -> list[float]:
+    """Hencky strains after the map of principal stretches with a negative mean strain, to 50 digits."""
+    h = [mpmath.log(mpmath.mpf(x)) for x in stretches]
+    p = sum(h) / 3
+    alpha, ratio = mpmath.mpf(alpha), mpmath.mpf(ratio)
+
+    def value(kappa: mpmath.mpf) -> mpmath.mpf:
+        scaled = [(p + kappa * (x - p)) / abs(p) for x in h]
+        t = [(min(x, 0) if unilateral else x) ** 3 + ratio / 2 * sum(scaled) ** 3 for x in scaled]
+        mean = sum(t) / 3
+        return mpmath.sqrt(sum((x - mean) ** 2 for x in t)) + alpha * 3 * mean
+
+    low, high = mpmath.mpf(0), mpmath.mpf(1)
+    if p >= 0 or value(high) <= 0:
+        return [float(x) for x in h]
+    for _ in range(40):
+        middle = (low + high) / 2
+        low, high = (low, middle) if value(middle) > 0 else (middle, high)
+    kappa = mpmath.findroot(value, (low, high), solver="anderson", tol=1e-60, verify=False)
+    return [float(p + kappa * (x - p)) for x in h]
+
+
+@pytest.mark.parametrize("energy", ["full", "unilateral"])
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-12), (torch.float32, 2e-6)])
+def test_map_to_50_digits(device, energy, dtype, tolerance):
+    """Mean strains 1e-8 to 0.5, deviators 0.1 to 1e4 times that, all Lode angles, φ 1° to 60°, ν 0 to 0.49."""
+    count = 200
+    angle = torch.deg2rad(1 + 59 * torch.rand(count, dtype=torch.float64))
+    nu = 0.49 * torch.rand(count, dtype=torch.float64)
+    radius = 10 ** (-1 + 5 * torch.rand(count, dtype=torch.float64))
+    mean = torch.minimum(0.5 * 10 ** (-7.7 * torch.rand(count, dtype=torch.float64)), 30 / radius)
+    h = strain_at(mean, radius, math.pi / 3 * torch.rand(count, dtype=torch.float64))
+    F = torch.diag_embed(h.exp()).to(device, dtype)
+    alpha, ratio = (x.to(device, dtype) for x in (reference.friction_alpha(angle, 3), 2 * nu / (1 - 2 * nu)))
+    result = quartic_return_map(F, torch.ones_like(alpha), ratio, alpha=alpha, energy=energy)
+    assert bool(result.converged.all())
+    stretches, mapped = (x.double().cpu().diagonal(dim1=1, dim2=2) for x in (F, result.F))
+    with mpmath.workdps(50):
+        cases = zip(stretches.tolist(), alpha.tolist(), ratio.tolist(), strict=True)
+        expected = torch.tensor([exact_map(*case, energy == "unilateral") for case in cases], dtype=torch.float64)
+    # The mapped stretches are rounded as well, and so are the logarithms that the mean strain is the sum of.
+    trial = stretches.log()
+    largest, amplified = (x.abs().amax(1, keepdim=True) for x in (expected, expected / trial.mean(1, keepdim=True)))
+    rounding = 1 + trial.abs().amax(1, keepdim=True) * amplified
+    limit = tolerance * largest + 2 * torch.finfo(dtype).eps * rounding
+    checked = trial.sum(1) < 0  # rounding may have turned small strains into extension
+    assert int(checked.sum()) > count // 2
+    assert bool(((mapped.log() - expected).abs() <= limit)[checked].all())
+
+
+@pytest.mark.parametrize("energy", ENERGIES)
+def test_elastic_states_are_returned_bitwise(device, dim, energy):
+    F = (deformation(-0.1 + 1e-3 * torch.randn(500, dim, dtype=torch.float64))).float().to(device)
+    result = quartic_return_map(F, 1e5, 1e5, 0.6, energy=energy, details=True)
+    assert bool((result.branch == ELASTIC).all())
+    assert torch.equal(result.F, F)
+    assert float(result.multiplier.abs().max()) == 0
+    identity = torch.eye(dim, device=device).repeat(3, 1, 1)
+    result = quartic_return_map(identity, 1e5, 1e5, 0.6, energy=energy)
+    assert torch.equal(result.F, identity)
+    assert float(result.stress.abs().max()) == 0
+
+
+@pytest.mark.parametrize("energy", ENERGIES)
+def test_mapped_states_lie_on_the_cone(device, dim, energy):
+    F, mu, lam, angle = (t.to(device) for t in random_states(2000, dim))
+    result = quartic_return_map(F, mu, lam, angle, energy=energy)
+    alpha = reference.friction_alpha(angle, dim)
+    ratio = yield_ratio(result.stress, alpha)
+    if energy != "mixed":  # whose stress belongs to another energy than its map
+        assert float(ratio[result.branch == ELASTIC].max()) <= 1e-12
+        assert float(ratio[result.branch == CONE].abs().max()) < 1e-12
+    assert float(result.stress[result.branch == APEX].abs().max()) < 1e-12 * float(result.stress.abs().max())
+    again = quartic_return_map(result.F, mu, lam, angle, energy=energy)
+    assert error(again.F, result.F.cpu()) < 1e-13
+
+
+def test_apex_that_keeps_the_volume(device):
+    h = torch.tensor([[0.1, 0.1, 1e-6], [0.1, 0.1, -1e-6], [0.3, -0.1, -0.1], [0.2, 0.1, -0.2]], dtype=torch.float64)
+    F = torch.diag_embed(h.exp()).to(device)
+    kept = quartic_return_map(F, 1e5, 1e5, 0.5, energy="unilateral", apex="keep")
+    assert kept.branch.tolist() == [ELASTIC, APEX, APEX, APEX]
+    assert torch.allclose(torch.linalg.det(kept.F), torch.linalg.det(F), rtol=1e-14)
+    expected = torch.tensor(
+        [[0.1, 0.1, 1e-6], [0.1 - 5e-7, 0.1 - 5e-7, 0], [0.1, 0, 0], [0.1, 0, 0]], dtype=torch.float64
+    )
+    assert torch.allclose(kept.F.cpu().diagonal(dim1=1, dim2=2).log(), expected, atol=1e-15)
+    assert float(kept.stress.abs().max()) == 0
+    lost = quartic_return_map(F, 1e5, 1e5, 0.5, energy="unilateral")
+    assert torch.allclose(lost.F[1:].cpu(), torch.eye(3, dtype=torch.float64), atol=1e-15)
+
+
+# ---- exact checks
+
+
+def mohr_coulomb_angle(stress: Tensor) -> float:
+    values = -torch.linalg.eigvalsh(stress.cpu())
+    return math.degrees(math.asin(float((values.max() - values.min()) / (values.max() + values.min()))))
+
+
+@pytest.mark.parametrize(
+    ("energy", "plane_strain"), [("full", 32.2), ("unilateral", 30.6), ("hencky", 43.85), ("mixed", 29.0)]
+)
+def test_mobilised_friction(device, energy, plane_strain):
+    """Steady plane-strain shear (Lode angle 30°), triaxial compression and extension; φ = 30°, ν = 0.3."""
+    shear = torch.tensor([math.pi / 6, math.pi / 3, 0.0], dtype=torch.float64)
+    F = torch.diag_embed(strain_at(torch.full((3,), 0.01), torch.full((3,), 500.0), shear).exp()).to(device)
+    angles = [mohr_coulomb_angle(t) for t in quartic_return_map(F, 1.0, 1.5, math.pi / 6, energy=energy).stress]
+    assert angles[0] == pytest.approx(plane_strain, abs=0.1)
+    if energy != "mixed":
+        assert angles[1] == pytest.approx(30, abs=1e-6)
+        assert angles[2] == pytest.approx(48.59, abs=0.01)
+
+
+def test_mohr_coulomb_in_two_dimensions(device):
+    h = torch.tensor([[-0.06, 0.04]], dtype=torch.float64)
+    for energy in ("full", "unilateral", "hencky"):
+        for degrees in (5.0, 30.0, 45.0):
+            stress = quartic_return_map(
+                deformation(h).to(device), 1.0, 1.5, math.radians(degrees), energy=energy
+            ).stress
+            assert mohr_coulomb_angle(stress[0]) == pytest.approx(degrees, abs=1e-6)
+
+
+def test_closed_roots_in_two_dimensions(device):
+    """With h = p ± |p| t: a cubic for the full energy, and a cube root for the unilateral one where t > 1."""
+    alpha, ratio, p = 0.4, 1.5, -0.02
+    F = torch.diag_embed(torch.tensor([[p - 0.5, p + 0.5]], dtype=torch.float64).exp()).to(device)
+
+    def stretch(energy: str) -> float:
+        h = quartic_return_map(F, 1.0, ratio, alpha=alpha, energy=energy).F[0].diagonal().log()
+        return float((h[1] - h[0]) / (2 * abs(p)))
+
+    t = stretch("full")
+    value = t**3 - 3 * math.sqrt(2) * alpha * t**2 + 3 * t - math.sqrt(2) * alpha * (1 + 4 * ratio)
+    assert abs(value) < 1e-12 * t**3
+    assert stretch("unilateral") == pytest.approx(
+        2 * (ratio * alpha / (math.sqrt(0.5) - alpha)) ** (1 / 3) - 1, rel=1e-12
+    )
+
+
+@pytest.mark.parametrize("energy", ENERGIES)
+def test_uniaxial_compression_at_rest(device, energy):
+    """The lateral stress is ν/(1 − ν) of the vertical one, which is 2a (2μ + λ) ε³ (quartic) or (2μ + λ) ε."""
+    mu, nu, strain = 1e5, 0.3, 0.2
+    lam = mu * 2 * nu / (1 - 2 * nu)
+    F = torch.diag_embed(torch.tensor([[0.0, 0.0, -strain]], dtype=torch.float64).exp()).to(device)
+    result = quartic_return_map(F, mu, lam, math.radians(35), energy=energy)
+    assert int(result.branch) == ELASTIC
+    stress = result.stress[0].diagonal()
+    stiffness = (2 * mu + lam) * (strain if energy == "hencky" else 2 * COEFFICIENT * strain**3)
+    assert float(stress[2]) == pytest.approx(-stiffness, rel=1e-13)
+    assert float(stress[0] / stress[2]) == pytest.approx(nu / (1 - nu), rel=1e-13)
+
+
+@pytest.mark.parametrize("energy", ENERGIES)
+def test_invariances(device, dim, energy):
+    F, mu, lam, angle = (t.to(device) for t in random_states(500, dim))
+    result = quartic_return_map(F, mu, lam, angle, energy=energy)
+    Q = rotations(500, dim).to(device)
+    turned = quartic_return_map(Q @ F, mu, lam, angle, energy=energy)
+    assert error(turned.F, (Q @ result.F).cpu()) < 1e-13
+    assert error(turned.stress, (Q @ result.stress @ Q.mT).cpu()) < 1e-13
+    turned = quartic_return_map(F @ Q, mu, lam, angle, energy=energy)
+    assert error(turned.F, (result.F @ Q).cpu()) < 1e-13
+    assert error(turned.stress, result.stress.cpu()) < 1e-13
+    stiffer = quartic_return_map(F, 2.0**40 * mu, 2.0**40 * lam, angle, energy=energy)
+    assert torch.equal(stiffer.F, result.F)
+    assert torch.equal(stiffer.stress, 2.0**40 * result.stress)
+    diagonal = hencky(F)
+    big, small = (
+        quartic_return_map(torch.diag_embed((s * diagonal).exp()).to(device), mu, lam, angle, energy=energy)
+        for s in (1.0, 2.0**-10)
+    )
+    mapped = [r.F.diagonal(dim1=1, dim2=2).log().cpu() for r in (big, small)]
+    assert error(mapped[1] * 2.0**10, mapped[0]) < 1e-11
+
+
+# ---- stress, energy, stiffness
+
+
+@pytest.mark.parametrize("energy", ENERGIES)
+def test_stress_and_energy(device, dim, energy):
+    F, mu, lam, _ = random_states(500, dim)
+    h = reference.svd3(F)[1].log()
+    expected = reference.energy_density(h, mu, lam, energy)
+    assert error(quartic_energy(F.to(device), mu.to(device), lam.to(device), energy=energy), expected) < 1e-13
+    F, mu, lam = (t[:6].to(device).requires_grad_() for t in (F, mu, lam))
+    (grad,) = torch.autograd.grad(quartic_energy(F, mu, lam, energy=energy).sum(), F)
+    assert error(grad @ F.detach().mT, quartic_stress(F, mu, lam, energy=energy).detach().cpu()) < 1e-12
+
+
+@pytest.mark.parametrize("energy", ENERGIES)
+def test_stiffness_bounds_the_tangent(device, dim, energy):
+    F, mu, lam, _ = (t.to(device) for t in random_states(200, dim))
+    bound = quartic_stiffness(F, mu, lam, energy=energy)
+    tightest = torch.zeros_like(bound)
+    for _ in range(50):
+        G = torch.randn(200, dim, dim, dtype=torch.float64, device=device)
+        G = G / G.norm(dim=(1, 2), keepdim=True)
+        forward, backward = (quartic_stress(F + s * 1e-6 * G @ F, mu, lam, energy=energy) for s in (1, -1))
+        change = (forward - backward) / 2e-6
+        stress = quartic_stress(F, mu, lam, energy=energy)
+        second = (G * change).sum((1, 2)) - (G * (stress @ G.mT)).sum((1, 2))
+        tightest = torch.maximum(tightest, torch.maximum(change.norm(dim=(1, 2)), second.abs()))
+    assert bool((tightest <= bound * (1 + 1e-6)).all())
+    stressed = tightest > 0
+    assert torch.equal(stressed, bound > 0)
+    assert float((bound / tightest)[stressed].median()) < 2
+    rest = torch.eye(dim, dtype=torch.float64, device=device)[None]
+    assert float(quartic_stiffness(rest, 1.0, 1.0, energy=energy, smallest_strain=0.1)) > 0
+
+
+# ---- gradients
+
+
+def gradient_states(dim: int) -> Tensor:
+    """Strains on every branch, with equal and nearly equal values."""
+    h = torch.tensor(
+        [
+            [-0.1, -0.1, -0.1],
+            [-0.1, -0.1, -0.12],
+            [-0.3, -0.1, -0.05],
+            [-0.25, -0.25, 0.1],
+            [-0.3, 0.05, 0.05],
+            [0.2, 0.2, 0.1],
+            [0.2, 0.2, -0.1],
+            [0.3, 0.15, -0.2],
+            [0.3, -0.1, -0.1],
+        ],
+        dtype=torch.float64,
+    )
+    return h if dim == 3 else h[:, 1:]
+
+
+@pytest.mark.parametrize(("energy", "apex"), FORMS)
+def test_gradients(device, dim, energy, apex):
+    h = gradient_states(dim)
+    F = deformation(h).to(device).requires_grad_()
+    mu, lam, angle = (
+        (low + torch.rand(len(h), dtype=torch.float64)).to(device).requires_grad_() for low in (1.0, 0.5, 0.15)
+    )
+    angle = (0.5 * angle).detach().requires_grad_()
+
+    def mapped(*arguments: Tensor) -> tuple[Tensor, Tensor]:
+        result = quartic_return_map(*arguments, energy=energy, apex=apex)
+        return result.F, result.stress
+
+    branches = quartic_return_map(F, mu, lam, angle, energy=energy, apex=apex).branch.unique().tolist()
+    assert branches == [ELASTIC, CONE, APEX]
+    assert torch.autograd.gradcheck(mapped, (F, mu, lam, angle), eps=1e-7, atol=2e-6, rtol=1e-5)
+
+
+@pytest.mark.parametrize("energy", ENERGIES)
+def test_gradients_of_energy_and_stress(device, dim, energy):
+    F = deformation(gradient_states(dim)).to(device).requires_grad_()
+    mu, lam = (
+        torch.tensor(1.5, dtype=torch.float64, device=device),
+        torch.tensor([0.7], dtype=torch.float64, device=device),
+    )
+    inputs = (F, mu.requires_grad_(), lam.requires_grad_())
+    assert torch.autograd.gradcheck(lambda *a: quartic_energy(*a, energy=energy), inputs, atol=1e-6)
+    assert torch.autograd.gradcheck(lambda *a: quartic_stress(*a, energy=energy), inputs, atol=1e-6)
+
+
+@pytest.mark.parametrize("energy", ["full", "hencky"])
+def test_gradients_of_shared_parameters(device, energy):
+    F, mu, lam, angle = random_states(12, 3)
+    scene = torch.tensor([0, 1, 2] * 4, dtype=torch.int32)
+    for values in (torch.tensor(0.3), torch.tensor([0.3]), torch.tensor([0.3, 0.4, 0.5]), angle):
+        values = values.double().to(device)
+        per_particle = (
+            values.expand(12) if values.numel() == 1 else values[scene.long()] if len(values) == 3 else values
+        )
+        wanted = []
+        for angles in (values, per_particle):
+            leaf = angles.clone().requires_grad_()
+            result = quartic_return_map(
+                F.to(device), mu.to(device), lam.to(device), leaf, scene=scene.to(device), energy=energy
+            )
+            (grad,) = torch.autograd.grad(result.F.sum() + result.stress.sum(), leaf)
+            wanted.append(grad)
+        shared, single = wanted
+        if values.numel() == 1:
+            single = single.sum()
+        elif len(values) == 3:
+            single = torch.stack([single[scene.to(device) == b].sum() for b in range(3)])
+        assert torch.allclose(shared.reshape(-1), single.reshape(-1), rtol=1e-10)
+
+
+def test_gradient_at_the_identity(device, dim):
+    """At F = I the map is the identity, and the tangent that of linear elasticity (Hencky) or zero (quartic)."""
+    F = torch.eye(dim, dtype=torch.float32, device=device)[None].requires_grad_()
+    G, mu, lam = torch.randn(dim, dim, device=device), 2.0, 3.0
+    for energy in ENERGIES:
+        result = quartic_return_map(F, mu, lam, 0.5, energy=energy)
+        (through_F,) = torch.autograd.grad((result.F * G).sum(), F, retain_graph=True)
+        assert torch.allclose(through_F[0], G)
+        (through_stress,) = torch.autograd.grad((result.stress * G).sum(), F)
+        linear = mu * (G + G.T) + lam * G.trace() * torch.eye(dim, device=device)
+        assert torch.allclose(through_stress[0], linear if energy == "hencky" else 0 * linear, rtol=1e-5)
+
+
+@pytest.mark.parametrize("gap", [1e-2, 1e-4, 1e-6, 0.0])
+@pytest.mark.parametrize("energy", ["full", "unilateral", "hencky"])
+def test_gradients_in_float32_at_nearly_equal_stretches(device, energy, gap):
+    """On the cone, with two stretches that differ by `gap`."""
+    count = 200
+    h = torch.tensor([[-0.2, -0.2 - gap, 0.2]], dtype=torch.float64).repeat(count, 1)
+    F = deformation(h).float()
+    weights = torch.randn(2, count, 3, 3)
+    grads = []
+    for dtype in (torch.float32, torch.float64):
+        leaf = F.to(device, dtype).requires_grad_()
+        result = quartic_return_map(leaf, 1.0, 1.5, 0.2, energy=energy)
+        assert bool((result.branch == CONE).all())
+        loss = (result.F * weights[0].to(device, dtype)).sum() + (result.stress * weights[1].to(device, dtype)).sum()
+        (grad,) = torch.autograd.grad(loss, leaf)
+        grads.append(grad.double())
+    errors = (grads[0] - grads[1]).norm(dim=(1, 2)) / grads[1].norm(dim=(1, 2))
+    assert float(errors.max()) < 2e-5
+    assert float(errors.median()) < 2e-6
+
+
+def test_what_is_not_differentiable_says_so(device):
+    F = torch.eye(3, device=device)[None].repeat(2, 1, 1).requires_grad_()
+    result = quartic_return_map(F, 1.0, 1.0, 0.5, details=True)
+    with pytest.raises(NotImplementedError, match="plastic multiplier"):
+        result.multiplier.sum().backward()
+    (grad,) = torch.autograd.grad(result.F.sum(), F, create_graph=True)
+    with pytest.raises(NotImplementedError, match="no second derivatives"):
+        grad.sum().backward()
+    with pytest.raises(NotImplementedError, match="stiffness"):
+        quartic_stiffness(F, 1.0, 1.0).sum().backward()
+
+
+# ---- bad input
+
+
+@pytest.mark.parametrize("energy", ENERGIES)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_deformations_without_meaning(device, dim, energy, dtype):
+    eye = torch.eye(dim, dtype=dtype)
+    turned, singular, nan, infinite = eye.clone(), eye.clone(), eye.clone(), eye.clone()
+    turned[0, 0], singular[0, 0], nan[0, 1], infinite[1, 0] = -1, 0, torch.nan, torch.inf
+    F = torch.stack([turned, singular, nan, infinite, 0 * eye]).to(device)
+    result = quartic_return_map(F, 1e5, 1e5, 0.5, energy=energy, details=True)
+    assert bool((result.branch == INVALID).all())
+    assert torch.equal(result.F.nan_to_num(7), F.nan_to_num(7))
+    assert float(result.stress.abs().max()) == 0
+    assert bool((quartic_energy(F, 1e5, 1e5, energy=energy) == torch.inf).all())
+    assert float(quartic_stiffness(F, 1e5, 1e5, energy=energy).abs().max()) == 0
+
+
+@pytest.mark.parametrize("energy", ENERGIES)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_extreme_states_are_finite(device, dim, energy, dtype):
+    """Any F of positive determinant with any parameters: finite results and gradients, and convergence."""
+    eye = torch.eye(dim, dtype=torch.float64)
+    shear, stretch = eye.clone(), eye.clone()
+    shear[0, 1], stretch[0, 0], stretch[1, 1] = 1e3, 1e4, 1e-4
+    tiny = torch.diag_embed(torch.tensor([1e-12, -1e-12, 1e-12][:dim], dtype=torch.float64))
+    balanced = torch.diag_embed(torch.tensor([-0.1, 0.1, 0.0][:dim], dtype=torch.float64).exp())  # p = 0
+    cases = [
+        eye,
+        0.9 * eye,
+        1.1 * eye,
+        (1 - 1e-12) * eye,
+        eye + tiny,
+        balanced,
+        shear,
+        stretch,
+        1e-30 * eye,
+        1e30 * eye,
+    ]
+    cases += [*deformation(0.3 * torch.randn(100, dim, dtype=torch.float64))]
+    F = torch.stack(cases).to(device, dtype)
+    moduli = [(1e5, 1e5), (1e5, 0.0), (1e5, -3e4), (0.0, 1e5), (-1e5, 1e5), (1e5, 1e12)]
+    for mu, lam in moduli:
+        for degrees in (0, 1e-3, 30, 45, 89):
+            leaf = F.clone().requires_grad_()
+            result = quartic_return_map(leaf, mu, lam, math.radians(degrees), energy=energy)
+            for value in (result.F, result.stress):
+                assert bool(value.isfinite().all())
+            assert bool(result.converged.all())
+            assert int(result.branch.max()) < INVALID
+            (grad,) = torch.autograd.grad(result.F.sum() + result.stress.sum() / 1e5, leaf)
+            moderate = [i for i in range(len(F)) if i not in (8, 9)]
+            assert bool(grad[moderate].isfinite().all())
+
+
+def test_errors(device):
+    F = torch.eye(3, device=device).repeat(4, 1, 1)
+    with pytest.raises(ValueError, match=r"F must have shape \[P, 3, 3\] or \[P, 2, 2\], got \[4, 3\]"):
+        quartic_return_map(F[:, 0], 1.0, 1.0, 0.5)
+    with pytest.raises(TypeError, match="float32 or float64"):
+        quartic_return_map(F.half(), 1.0, 1.0, 0.5)
+    with pytest.raises(ValueError, match="either friction_angle or alpha"):
+        quartic_return_map(F, 1.0, 1.0)
+    with pytest.raises(ValueError, match="energy must be one of"):
+        quartic_return_map(F, 1.0, 1.0, 0.5, energy="cubic")
+    with pytest.raises(ValueError, match="apex='keep' needs energy='unilateral'"):
+        quartic_return_map(F, 1.0, 1.0, 0.5, energy="full", apex="keep")
+    with pytest.raises(ValueError, match=r"mu must have shape \[\], \[1\] or \[P\] = \[4\] without scene, got \[3\]"):
+        quartic_return_map(F, torch.ones(3, device=device), 1.0, 0.5)
+    with pytest.raises(TypeError, match="lam must have the dtype"):
+        quartic_return_map(F, 1.0, torch.ones((), dtype=torch.float64, device=device), 0.5)
+    with pytest.raises(NotImplementedError, match="vmap"):
+        torch.vmap(lambda F: quartic_return_map(F, 1.0, 1.0, 0.5).F)(F[None])
+
+
+def test_opcheck(device):
+    F, mu, lam, angle = (t.to(device).requires_grad_() for t in random_states(5, 2))
+    ops = torch.ops.torch_mpm
+    tests = ("test_schema", "test_autograd_registration", "test_faketensor")
+    torch.library.opcheck(
+        ops.quartic_return_map.default, (F, mu, lam, angle, None, "full", "zero", True), test_utils=tests
+    )
+    torch.library.opcheck(
+        ops.quartic_return_map_backward.default,
+        (F.detach(), None, F, mu, lam, angle, None, "full", "zero", True, True),
+        test_utils=tests,
+    )
+    torch.library.opcheck(ops.quartic_energy.default, (F, mu, lam, None, "full"), test_utils=tests)
+    torch.library.opcheck(ops.quartic_stiffness.default, (F, mu, lam, None, "full", 0.1), test_utils=tests)
+
+
+# ---- the law
+
+
+def test_law_in_a_step(device, dim):
+    """A column of sand that falls apart stays inside the yield surface and passes gradients to its parameters."""
+    grid = mpm.Grid(dx=0.1, lower=(0.0,) * dim, upper=(1.0,) * dim)
+    points = mpm.seed.box((0.3, 0.0, 0.3)[:dim], (0.5, 0.5, 0.5)[:dim], 0.1, per_cell=2**dim)
+    state = mpm.State.at_rest(points, density=1600.0).to(device)
+    angle = torch.nn.Parameter(torch.tensor(0.5))
+    law = mpm.QuarticSand(E=1e6, nu=0.3, friction_angle=angle).to(device)
+    step = mpm.Step(grid, law, gravity=(0.0, -9.8, 0.0)[:dim], walls="sticky")
+    assert 0 < float(step.stable_dt(state)) < 0.1
+    state = mpm.rollout(step, state, n=60, dt=2e-3)
+    step.check(state)
+    result = law.return_map(state)
+    assert bool(result.converged.all())
+    ratio = yield_ratio(result.stress.detach(), float(reference.friction_alpha(angle.detach(), dim)))
+    assert float(ratio.max()) < 1e-5
+    assert float(law.energy(state).sum().detach()) > 0
+    (grad,) = torch.autograd.grad(state.x.square().sum(), angle)
+    assert grad.isfinite()
+    assert float(grad) != 0
+
+
+def test_law_arguments():
+    with pytest.raises(ValueError, match="QuarticSand needs E and nu, or mu and lam"):
+        mpm.QuarticSand(E=1e6)
+    with pytest.raises(ValueError, match="friction_angle must be in"):
+        mpm.QuarticSand(E=1e6, nu=0.3, friction_angle=30.0)
+    with pytest.raises(ValueError, match="energy must be one of"):
+        mpm.QuarticSand(E=1e6, nu=0.3, energy="cubic")
+    with pytest.raises(ValueError, match="apex must be"):
+        mpm.QuarticSand(E=1e6, nu=0.3, energy="full", apex="keep")

@@ -1,0 +1,285 @@
+"""Return map, stress, energy and stiffness of sand (csrc/materials/quartic*.h)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from ..errors import FLOATING, check_like, shape_of
+from ..reference.sand import APEX, CONE, ELASTIC, ENERGIES, INVALID, friction_alpha
+from .arguments import refuse_vmap, soa_empty, sum_by_scene
+
+__all__ = [
+    "APEX",
+    "CONE",
+    "ELASTIC",
+    "INVALID",
+    "ReturnMap",
+    "quartic_energy",
+    "quartic_return_map",
+    "quartic_stiffness",
+]
+
+Value = float | Tensor
+
+
+class ReturnMap(NamedTuple):
+    """Result of `quartic_return_map`."""
+
+    F: Tensor
+    """Projected deformation gradient [P, D, D]; bitwise the trial one where elastic."""
+    stress: Tensor
+    """Kirchhoff stress τ [P, D, D] [Pa] of the projected F."""
+    branch: Tensor
+    """int32 [P]: ELASTIC = 0, CONE = 1, APEX = 2, INVALID = 3 (det F ≤ 0 or not finite)."""
+    converged: Tensor
+    """bool [P]: whether the root on the cone was found."""
+    multiplier: Tensor | None
+    """Plastic multiplier [P]: norm of the plastic increment of the Hencky strain. With details only."""
+    dissipated: Tensor | None
+    """Elastic energy lost by the map, per rest volume [P] [J/m³]. With details only."""
+
+
+def quartic_return_map(
+    F: Tensor,
+    mu: Value,
+    lam: Value,
+    friction_angle: Value | None = None,
+    alpha: Value | None = None,
+    scene: Tensor | None = None,
+    energy: str = "unilateral",
+    apex: str = "zero",
+    details: bool = False,
+) -> ReturnMap:
+    """Drucker-Prager return map of sand in Hencky strains, with its stress: one decomposition of F.
+
+    The flow is radial: the mean strain and the direction of the deviator stay (Gao et al. 2018, supplement, eq. 28).
+
+    Args:
+        F: trial deformation gradient [P, 3, 3] or [P, 2, 2], float32 or float64.
+        mu, lam: Lamé parameters [Pa]: numbers or tensors of shape [], [1], [B] (with `scene`) or [P]. Where P = B, [P]
+            is meant. Without μ > 0 there is no shear stress and therefore no cone, only the apex.
+        friction_angle: [rad], 0 to π/2, like mu; or
+        alpha: the slope α of the cone |dev τ| + α tr τ ≤ 0. From an angle φ it is √(2/3) 2 sin φ/(3 − sin φ) in 3-D,
+            which meets Mohr-Coulomb in triaxial compression, and sin φ/√2 in 2-D, which is Mohr-Coulomb.
+        scene: scene of each particle, int32 [P].
+        energy: "unilateral" or "full" quartic energy; "hencky", the quadratic one (Klár et al. 2016); "mixed": map of
+            the full energy, stress of the unilateral one. With the unilateral energy and α > 1/√6 (36.87° in 3-D) there
+            are directions without a yield surface: such states are elastic at any stretch.
+        apex: where the volume has grown, "zero" makes F a rotation; "keep" (unilateral energy only) keeps its volume
+            and removes what is compressed, which is continuous and free of stress as well.
+        details: also return the multiplier and the dissipated energy.
+
+    Returns:
+        A `ReturnMap`. A trial F that is not finite or of det F ≤ 0 is returned as it is, with zero stress.
+
+    Differentiable once: F and stress with respect to F, mu, lam and the angle or α, by implicit differentiation at the
+    root and divided differences that hold at equal principal stretches. On a boundary between branches the derivative
+    is that of the branch taken. The details are not differentiable.
+
+    Raises:
+        ValueError, TypeError: for an unknown option, or wrong shapes, dtypes or devices.
+    """
+    if (friction_angle is None) == (alpha is None):
+        raise ValueError("either friction_angle or alpha must be given")
+    if apex not in ("zero", "keep"):
+        raise ValueError(f"apex must be 'zero' or 'keep', got {apex!r}")
+    if apex == "keep" and energy != "unilateral":
+        raise ValueError(f"apex='keep' needs energy='unilateral', got {energy!r}")
+    _check_deformation(F, scene, energy)
+    slope = (
+        friction_alpha(_parameter("friction_angle", friction_angle, F, scene), F.shape[1]) if alpha is None else alpha
+    )
+    parameters = [_parameter(n, v, F, scene) for n, v in (("mu", mu), ("lam", lam), ("alpha", slope))]
+    mapped, stress, code, multiplier, dissipated = torch.ops.torch_mpm.quartic_return_map(
+        F, *parameters, scene, energy, apex, details
+    )
+    return ReturnMap(
+        mapped, stress, code & 3, code < 4, multiplier if details else None, dissipated if details else None
+    )
+
+
+def quartic_stress(F: Tensor, mu: Value, lam: Value, scene: Tensor | None = None, energy: str = "unilateral") -> Tensor:
+    """Kirchhoff stress τ [P, D, D] [Pa] of F itself, without plasticity. Arguments as `quartic_return_map`.
+
+    Differentiable once with respect to F, mu and lam.
+    """
+    _check_deformation(F, scene, energy)
+    mu, lam = _parameter("mu", mu, F, scene), _parameter("lam", lam, F, scene)
+    return torch.ops.torch_mpm.quartic_return_map(F, mu, lam, mu.detach(), scene, energy, "none", False)[1]
+
+
+def quartic_energy(F: Tensor, mu: Value, lam: Value, scene: Tensor | None = None, energy: str = "unilateral") -> Tensor:
+    """Elastic energy per rest volume [P] [J/m³] of F itself; infinite where det F ≤ 0 or F is not finite.
+
+    Arguments as `quartic_return_map`; differentiable with respect to F, mu and lam.
+    """
+    _check_deformation(F, scene, energy)
+    mu, lam = _parameter("mu", mu, F, scene), _parameter("lam", lam, F, scene)
+    return torch.ops.torch_mpm.quartic_energy(F, mu, lam, scene, energy)
+
+
+def quartic_stiffness(
+    F: Tensor,
+    mu: Value,
+    lam: Value,
+    scene: Tensor | None = None,
+    energy: str = "unilateral",
+    smallest_strain: float = 0.0,
+) -> Tensor:
+    """Upper bound [P] [Pa] of the elastic tangent modulus over all velocity gradients of unit norm.
+
+    The tangent of the quartic energies grows with the square of the strain and vanishes at rest: strains below
+    `smallest_strain` count as that. Zero where det F ≤ 0 or F is not finite. Other arguments as `quartic_return_map`;
+    not differentiable.
+    """
+    _check_deformation(F, scene, energy)
+    mu, lam = _parameter("mu", mu, F, scene), _parameter("lam", lam, F, scene)
+    return torch.ops.torch_mpm.quartic_stiffness(F, mu, lam, scene, energy, smallest_strain)
+
+
+def _check_deformation(F: Tensor, scene: Tensor | None, energy: str) -> None:
+    if energy not in ENERGIES:
+        raise ValueError(f"energy must be one of {sorted(ENERGIES)}, got {energy!r}")
+    if not isinstance(F, Tensor) or F.dim() != 3 or F.shape[1:] not in ((2, 2), (3, 3)):
+        raise ValueError(f"F must have shape [P, 3, 3] or [P, 2, 2], got {shape_of(F)}")
+    if F.dtype not in FLOATING:
+        raise TypeError(f"F must be float32 or float64, got {F.dtype}")
+    if scene is None:
+        return
+    if scene.shape != F.shape[:1]:
+        raise ValueError(f"scene must have shape [{F.shape[0]}], got {shape_of(scene)}")
+    if scene.dtype != torch.int32:
+        raise TypeError(f"scene must be int32, got {scene.dtype}")
+    if scene.device != F.device:
+        raise ValueError(f"scene must be on the device of F, {F.device}, got {scene.device}")
+
+
+def _parameter(name: str, value: Value | None, F: Tensor, scene: Tensor | None) -> Tensor:
+    if not isinstance(value, Tensor):
+        return torch.tensor(value, dtype=F.dtype, device=F.device)
+    if value.dim() > 1 or (value.numel() not in (1, F.shape[0]) and (scene is None or value.numel() == 0)):
+        expected = f"[], [1] or [P] = [{F.shape[0]}]" + (" without scene" if scene is None else ", or [B]")
+        raise ValueError(f"{name} must have shape {expected}, got {shape_of(value)}")
+    check_like(name, value, F, tuple(value.shape), "")
+    return value
+
+
+# ---- fake kernels
+
+
+@torch.library.register_fake("torch_mpm::quartic_return_map")
+def _return_map_fake(
+    F: Tensor, mu: Tensor, lam: Tensor, alpha: Tensor, scene: Tensor | None, energy: str, apex: str, details: bool
+) -> tuple[Tensor, ...]:
+    P = F.shape[0]
+    detail = [F.new_empty(P if details else 0) for _ in range(2)]
+    return soa_empty(F, F.shape), soa_empty(F, F.shape), F.new_empty(P, dtype=torch.int32), *detail
+
+
+@torch.library.register_fake("torch_mpm::quartic_return_map_backward")
+def _return_map_backward_fake(grad_F, grad_stress, F, mu, lam, alpha, scene, energy, apex, needs_F, needs_parameters):
+    P = F.shape[0]
+    return (
+        soa_empty(F, F.shape) if needs_F else F.new_empty(0),
+        soa_empty(F, (P, 3)) if needs_parameters else F.new_empty(0),
+    )
+
+
+@torch.library.register_fake("torch_mpm::quartic_energy")
+def _energy_fake(F: Tensor, mu: Tensor, lam: Tensor, scene: Tensor | None, energy: str) -> Tensor:
+    return F.new_empty(F.shape[0])
+
+
+@torch.library.register_fake("torch_mpm::quartic_stiffness")
+def _stiffness_fake(F: Tensor, mu: Tensor, lam: Tensor, scene: Tensor | None, energy: str, floor: float) -> Tensor:
+    return F.new_empty(F.shape[0])
+
+
+# ---- autograd
+
+
+def _shared(grad: Tensor, parameter: Tensor, scene: Tensor | None) -> Tensor:
+    """The gradient per particle [P], summed over the particles that share a value."""
+    if parameter.numel() == 1:
+        return grad.sum().reshape(parameter.shape)
+    return grad if parameter.numel() == grad.numel() else sum_by_scene(grad, scene, parameter.numel())
+
+
+def _return_map_setup(ctx: Any, inputs: Any, output: Any) -> None:
+    *tensors, ctx.energy, ctx.apex, _ = inputs
+    ctx.set_materialize_grads(False)
+    ctx.save_for_backward(*tensors)
+
+
+def _return_map_backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
+    grad_F, grad_stress, _, grad_multiplier, grad_dissipated = grads
+    if grad_multiplier is not None or grad_dissipated is not None:
+        raise NotImplementedError(
+            "the plastic multiplier and the dissipated energy are not differentiable: detach them"
+        )
+    F, mu, lam, alpha, scene = ctx.saved_tensors
+    needs_F, *needs = ctx.needs_input_grad[:4]
+    if (grad_F is None and grad_stress is None) or not (needs_F or any(needs)):
+        return (None,) * 8
+    adjoint_F, adjoint_parameters = torch.ops.torch_mpm.quartic_return_map_backward(
+        grad_F, grad_stress, F, mu, lam, alpha, scene, ctx.energy, ctx.apex, needs_F, any(needs)
+    )
+    shared = [
+        _shared(adjoint_parameters[:, k], p, scene) if n else None
+        for k, (p, n) in enumerate(zip((mu, lam, alpha), needs, strict=True))
+    ]
+    return adjoint_F if needs_F else None, *shared, None, None, None, None
+
+
+def _energy_setup(ctx: Any, inputs: Any, output: Any) -> None:
+    *tensors, ctx.energy = inputs
+    ctx.save_for_backward(*tensors)
+
+
+def _energy_backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+    """dψ = τ F⁻ᵀ : dF, and ψ is linear in μ and λ."""
+    F, mu, lam, scene = ctx.saved_tensors
+    needs_F, *needs = ctx.needs_input_grad[:3]
+    one, zero = torch.ones_like(mu).detach(), torch.zeros_like(lam).detach()
+    meaningful = torch.ops.torch_mpm.quartic_energy(F.detach(), one, zero, scene, ctx.energy).isfinite()
+    grad = torch.where(meaningful, grad, 0)
+    grad_F = None
+    if needs_F:
+        safe = torch.where(meaningful[:, None, None], F, torch.eye(F.shape[1], dtype=F.dtype, device=F.device))
+        stress = quartic_stress(safe, mu, lam, scene, ctx.energy)
+        grad_F = grad[:, None, None] * (stress @ torch.linalg.inv_ex(safe)[0].mT)
+    shared: list[Tensor | None] = []
+    for parameter, wanted, share in zip((mu, lam), needs, (0, 1), strict=True):
+        if not wanted:
+            shared.append(None)
+            continue
+        unit = one.new_ones(()), one.new_zeros(())
+        value = torch.ops.torch_mpm.quartic_energy(F, unit[share], unit[1 - share], scene, ctx.energy)
+        shared.append(_shared(grad * torch.where(meaningful, value, 0), parameter, scene))
+    return grad_F, *shared, None, None
+
+
+def _no_setup(ctx: Any, inputs: Any, output: Any) -> None:
+    pass
+
+
+def _no_second_derivative(ctx: Any, *grads: Tensor | None) -> Sequence[Tensor | None]:
+    raise NotImplementedError("the return map of sand has no second derivatives: differentiate it once")
+
+
+def _no_backward(ctx: Any, grad: Tensor) -> Tensor:
+    raise NotImplementedError("stiffness bounds are not differentiable: compute them under torch.no_grad()")
+
+
+for _name, _backward, _setup in (
+    ("quartic_return_map", _return_map_backward, _return_map_setup),
+    ("quartic_return_map_backward", _no_second_derivative, _no_setup),
+    ("quartic_energy", _energy_backward, _energy_setup),
+    ("quartic_stiffness", _no_backward, _no_setup),
+):
+    torch.library.register_autograd(f"torch_mpm::{_name}", _backward, setup_context=_setup)
+    refuse_vmap(_name)
