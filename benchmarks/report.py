@@ -84,12 +84,28 @@ def precision(result: dict[str, Any]) -> str:
     return "\n".join([intro, "", common.table(header, rows)])
 
 
+def stability(result: dict[str, Any]) -> str:
+    """Measured limits of the time step."""
+    cases = result["materials"]
+    ratios = sorted({c["nu"] for c in cases})
+    rows = []
+    for dim, stretch in sorted({(c["dim"], c["stretch"]) for c in cases}):
+        mine = [c for c in cases if (c["dim"], c["stretch"]) == (dim, stretch)]
+        rows.append([dim, f"{stretch:g}", *(f"{min(c['stable'] for c in mine if c['nu'] == nu):.2f}" for nu in ratios)])
+    intro = (
+        "Largest stable time step in multiples of `step.stable_dt(state, cfl=1)`, least of "
+        f"E = {', '.join(f'{E:.0e}' for E in sorted({c['E'] for c in cases}))} Pa; s < 1 is uniform compression, s > 1 "
+        "stretch at constant volume. Other layouts, transfers and kernels: benchmarks/results/stability.md."
+    )
+    return "\n".join([intro, "", common.table(("D", "s", *(f"ν = {nu:g}" for nu in ratios)), rows)])
+
+
 def summary(directory: Path) -> str:
     """All sections for which there are results."""
     sections = []
     if speeds := [json.loads(file.read_text()) for file in sorted(directory.glob("speed_*.json"))]:
         sections.append("### Speed\n\n" + speed(speeds))
-    for name, section in (("convergence", convergence), ("precision", precision)):
+    for name, section in (("convergence", convergence), ("precision", precision), ("stability", stability)):
         if (file := directory / f"{name}.json").exists():
             sections.append(f"### {name.capitalize()}\n\n" + section(json.loads(file.read_text())))
     return "\n\n".join(sections)

@@ -26,7 +26,7 @@ from .. import common
 
 DENSITY = 1000.0
 GROWTH = 100.0
-CELLS = {2: 6, 3: 2}
+CELLS = {2: 6, 3: 4}
 STEPS = 150
 COARSE = [0.9 * 1.17**k for k in range(9)]
 """Multiples of the estimate that are tried first."""
