@@ -124,7 +124,7 @@ def test_map_to_50_digits(device, energy, dtype, tolerance):
     trial = stretches.log()
     largest, amplified = (x.abs().amax(1, keepdim=True) for x in (expected, expected / trial.mean(1, keepdim=True)))
     rounding = 1 + trial.abs().amax(1, keepdim=True) * amplified
-    limit = tolerance * largest + 2 * torch.finfo(dtype).eps * rounding
+    limit = tolerance * largest + 5 * torch.finfo(dtype).eps * rounding
     checked = trial.sum(1) < 0  # rounding may have turned small strains into extension
     assert int(checked.sum()) > count // 2
     assert bool(((mapped.log() - expected).abs() <= limit)[checked].all())

@@ -21,13 +21,15 @@ template <class T>
 struct RootFinding;
 template <>
 struct RootFinding<float> {
-  static constexpr int most_steps = 24;
+  static constexpr int most_steps = 40;
   static constexpr double tolerance = 3e-5;  // of the last step, relative: the error after it is its square
+  static constexpr double rounding = 2e-6;   // of y, relative to its terms
 };
 template <>
 struct RootFinding<double> {
-  static constexpr int most_steps = 48;
+  static constexpr int most_steps = 64;
   static constexpr double tolerance = 1e-9;
+  static constexpr double rounding = 4e-15;
 };
 #ifndef __CUDACC__
 template <class T, int N>
@@ -47,13 +49,14 @@ struct Cone {
 template <class T>
 struct Yield {
   T value, slope, trace;  // y, dy/dr, Σ q − K
+  T size;                 // of the terms of y
 };
 
 template <class Energy, class T, int D>
 MPM_HD Yield<T> yield_function(const T& r, const Vector<T, D>& n, const Cone<T>& cone) {
   const T K = cone.template hydrostatic<Energy, D>();
   if constexpr (Energy::quadratic) {
-    return {r - cone.alpha * K, T(1), T(0) - K};
+    return {r - cone.alpha * K, T(1), T(0) - K, r + cone.alpha * K};
   } else {
     Vector<T, D> q, slope;
   MPM_UNROLL
@@ -73,7 +76,8 @@ MPM_HD Yield<T> yield_function(const T& r, const Vector<T, D>& n, const Cone<T>&
     const T norm = sqrt(square);
     const auto sheared = norm > T(0);
     const T norm_slope = select(sheared, product / select(sheared, norm, T(1)), T(3));
-    return {norm + cone.alpha * (total - K), norm_slope + cone.alpha * sum(slope), total - K};
+    const T trace = total - K;
+    return {norm + cone.alpha * trace, norm_slope + cone.alpha * sum(slope), trace, norm + cone.alpha * abs(trace)};
   }
 }
 
@@ -104,9 +108,12 @@ MPM_HD Root<T> yield_root(const T& start, const Vector<T, D>& n, const Cone<T>& 
     // 3 (w0 − w) w²/y' with w0 − w = −y/(w² + w w0 + w0²), which does not cancel.
     const T change = T(-3) * y.value * w * w / ((w * w + w * w0 + w0 * w0) * y.slope), next = r + change;
     const auto small = abs(change) <= tolerance * r;
+    // At a multiple root, where the step says nothing, y vanishes to rounding.
+    const auto settled = abs(y.value) <= T(RootFinding<T>::rounding) * y.size;
     const auto good = (y.slope > T(0)) & (((next >= low) & (next <= high)) | small);
-    r = select(active > T(0), select(good, next, T(0.5) * (low + high)), r);
-    active = select(good & small, T(0), active);
+    const T other = select(settled, r, T(0.5) * (low + high));
+    r = select(active > T(0), select(good, next, other), r);
+    active = select((good & small) | settled, T(0), active);
   }
   return {r, active <= T(0)};
 }
