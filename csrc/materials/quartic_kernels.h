@@ -223,7 +223,8 @@ MPM_HD Matrix<T, D> principal_adjoint(const HenckyStrain<T, D>& s, const MappedS
   for (int j = i + 1; j < D; j++) {
     const T trial = s.h[i] - s.h[j], mapped = m.h[i] - m.h[j];
     // κ on the cone; at the apex 1 between strains that are kept, 0 between those that are not.
-    const auto equal = trial == T(0), both = (m.h[i] > T(0)) & (m.h[j] > T(0));
+    const auto equal = trial == T(0);
+      const auto both = (m.h[i] > T(0)) & (m.h[j] > T(0));
     const T at_apex = select(both, T(1), select(equal, T(0), mapped / select(equal, T(1), trial)));
     const T quotient = select(m.apex, at_apex, m.kappa);
     const T half = exponential(T(0.5) * (m.h[i] + m.h[j] - s.h[i] - s.h[j]));
