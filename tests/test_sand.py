@@ -130,6 +130,24 @@ def test_map_to_50_digits(device, energy, dtype, tolerance):
     assert bool(((mapped.log() - expected).abs() <= limit)[checked].all())
 
 
+@pytest.mark.parametrize("energy", ["full", "unilateral"])
+def test_steep_cones(device, energy):
+    """Friction angles of 37° to 89°: y falls before it rises, and its leading term may nearly vanish."""
+    count = 4000
+    alpha = reference.friction_alpha(torch.deg2rad(37 + 52 * torch.rand(count, dtype=torch.float64)), 3)
+    mu, lam = torch.ones_like(alpha), 3 * torch.rand(count, dtype=torch.float64)
+    radius, lode = 300 * torch.rand(2, count, dtype=torch.float64)
+    h = strain_at(torch.full_like(alpha, 0.01), radius, lode / 300 * math.pi / 3)
+    expected, branch = reference.return_map_strain(h, mu, lam, alpha, energy)
+    arguments = (t.to(device) for t in (torch.diag_embed(h.exp()), mu, lam))
+    result = quartic_return_map(*arguments, alpha=alpha.to(device), energy=energy)
+    assert bool(result.converged.all())
+    assert torch.equal(result.branch.cpu(), branch)
+    assert {ELASTIC, CONE} == set(branch.tolist())
+    mapped = result.F.cpu().diagonal(dim1=1, dim2=2).log()
+    assert float((mapped - expected).abs().max()) < 1e-9
+
+
 @pytest.mark.parametrize("energy", ENERGIES)
 def test_elastic_states_are_returned_bitwise(device, dim, energy):
     F = (deformation(-0.1 + 1e-3 * torch.randn(500, dim, dtype=torch.float64))).float().to(device)

@@ -87,9 +87,9 @@ struct Root {
   MaskOf<T> converged;
 };
 
-// The root of y in [0, start], where y(start) > 0: Newton's method on ∛(y + c) − ∛c with c = αK + 1, nearly linear in r
-// for any overshoot, kept in a bracket by bisection. Lanes are independent of each other: each stops when it has
-// converged.
+// The root of y in [0, start], where y(start) > 0: Newton's method, where y > 0 on ∛(y + c) − ∛c with c = αK + 1, nearly
+// linear in r for any overshoot, kept in a bracket by bisection. Lanes are independent of each other: each stops when it
+// has converged.
 template <class Energy, class T, int D>
 MPM_HD Root<T> yield_root(const T& start, const Vector<T, D>& n, const Cone<T>& cone, const MaskOf<T>& wanted) {
   const T target = cone.alpha * cone.template hydrostatic<Energy, D>();
@@ -104,7 +104,7 @@ MPM_HD Root<T> yield_root(const T& start, const Vector<T, D>& n, const Cone<T>& 
     const auto above = y.value > T(0);
     high = select(above, r, high);
     low = select(above, low, r);
-    const T w = cube_root(max(y.value + c, T(1e-3)));
+    const T w = cube_root(max(y.value, T(0)) + c);
     // 3 (w0 − w) w²/y' with w0 − w = −y/(w² + w w0 + w0²), which does not cancel.
     const T change = T(-3) * y.value * w * w / ((w * w + w * w0 + w0 * w0) * y.slope), next = r + change;
     const auto small = abs(change) <= tolerance * r;
