@@ -549,6 +549,34 @@ def test_law_in_a_step(device, dim):
     assert float(grad) != 0
 
 
+def test_law_follows_its_parameters(device):
+    """Gradients in two iterations, a change in place, angles per scene, and the law as part of a mixture."""
+    F, _, _, _ = random_states(6, 3)
+    x, one = torch.full((6, 3), 0.5, dtype=torch.float64), torch.ones(6, dtype=torch.float64)
+    state = mpm.State(x, torch.zeros_like(x), mass=one, volume=one, F=F).to(device)
+    law = mpm.QuarticSand(
+        mu=1.0, lam=1.0, friction_angle=torch.nn.Parameter(torch.tensor(0.3, dtype=torch.float64))
+    ).to(device)
+    for _ in range(2):
+        (grad,) = torch.autograd.grad(law.stress(state).sum(), law.friction_angle)
+        assert float(grad) != 0
+    with torch.no_grad():
+        before = law.stress(state)
+        law.friction_angle.fill_(0.6)
+        assert not torch.equal(law.stress(state), before)
+        assert torch.equal(law.stress(state), mpm.QuarticSand(mu=1.0, lam=1.0, friction_angle=0.6).stress(state))
+        angles = torch.tensor([0.3, 0.6], dtype=torch.float64, device=device)
+        scenes = state.replace(scene=torch.tensor([0, 0, 0, 1, 1, 1], dtype=torch.int32, device=device))
+        mixed = mpm.QuarticSand(mu=1.0, lam=1.0, friction_angle=angles).stress(scenes)
+        assert torch.equal(mixed[:3], before[:3])
+        assert torch.equal(mixed[3:], law.stress(state)[3:])
+        material = torch.tensor([0, 1] * 3, dtype=torch.int32, device=device)
+        fields, stress = mpm.Mixture([mpm.NeoHookean(mu=1.0, lam=1.0), law]).update(state.replace(material=material))
+        assert torch.equal(stress[1::2], law.stress(state)[1::2])
+        assert torch.equal(fields["F"][0::2], state.F[0::2])
+        assert torch.equal(fields["F"][1::2], law.return_map(state).F[1::2])
+
+
 def test_law_arguments():
     with pytest.raises(ValueError, match="QuarticSand needs E and nu, or mu and lam"):
         mpm.QuarticSand(E=1e6)

@@ -6,9 +6,10 @@ import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
+import torch
 from torch import Tensor
 
-from .materials import SolidLaw, Value, _check_value
+from .materials import SolidLaw, Value, _check_value, _same
 from .ops.sand import ReturnMap, quartic_energy, quartic_return_map, quartic_stiffness
 from .reference.sand import ENERGIES, friction_alpha
 
@@ -61,7 +62,7 @@ class QuarticSand(SolidLaw):
         angle = _check_value("friction_angle", friction_angle, "in [0, π/2)", lambda v: (v >= 0) & (v < math.pi / 2))
         self._store("friction_angle", angle)
         self.energy_form, self.apex, self.smallest_strain = energy, apex, float(smallest_strain)
-        self._slope: tuple[Tensor, int, Tensor] | None = None
+        self._slopes: tuple[tuple[Tensor, int, int], Tensor] | None = None
 
     def values(self) -> Sequence[Value]:
         """μ and λ [Pa], and the friction angle [rad]."""
@@ -70,19 +71,25 @@ class QuarticSand(SolidLaw):
     def return_map(self, state: State, details: bool = False) -> ReturnMap:
         """The whole result of the return map: branches, convergence and, with details, multiplier and dissipation."""
         F, (mu, lam, angle) = self._arguments(state)
-        dim = F.shape[1]
-        if self._slope is None or self._slope[0] is not angle or self._slope[1] != dim:
-            self._slope = angle, dim, friction_alpha(angle, dim)
         return quartic_return_map(
             F,
             mu,
             lam,
-            alpha=self._slope[2],
+            alpha=self._slope(angle, F.shape[1]),
             scene=state.scene,
             energy=self.energy_form,
             apex=self.apex,
             details=details,
         )
+
+    def _slope(self, angle: Tensor, dim: int) -> Tensor:
+        """α of the friction angle, kept from call to call while that has not changed and requires no gradient."""
+        if torch.compiler.is_compiling() or angle.requires_grad:
+            return friction_alpha(angle, dim)
+        key = (angle, angle._version, dim)
+        if self._slopes is None or not _same(self._slopes[0], key):
+            self._slopes = key, friction_alpha(angle, dim)
+        return self._slopes[1]
 
     def update(self, state: State) -> tuple[dict[str, Tensor], Tensor]:
         result = self.return_map(state)
