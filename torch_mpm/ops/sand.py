@@ -217,7 +217,7 @@ def _return_map_setup(ctx: Any, inputs: Any, output: Any) -> None:
 
 def _return_map_backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
     grad_F, grad_stress, _, grad_multiplier, grad_dissipated = grads
-    if grad_multiplier is not None or grad_dissipated is not None:
+    if any(g is not None and g.numel() for g in (grad_multiplier, grad_dissipated)):
         raise NotImplementedError(
             "the plastic multiplier and the dissipated energy are not differentiable: detach them"
         )
