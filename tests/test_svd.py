@@ -40,7 +40,7 @@ def check_decomposition(F: Tensor, tolerance: float) -> None:
 def test_random_matrices(device, dim, dtype):
     F = torch.randn(5001, dim, dim, dtype=torch.float64).to(device, dtype)
     check_decomposition(F, 8 * torch.finfo(dtype).eps)
-    expected = reference.svd3(F.double())[1]
+    expected = reference.svd3(F.double().cpu())[1].to(device)  # LAPACK; the decompositions of GPUs are less accurate
     assert ((mpm.svd3(F).sigma.double() - expected).abs() <= 8 * torch.finfo(dtype).eps * expected[:, :1]).all()
 
 

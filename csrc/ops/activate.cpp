@@ -7,6 +7,7 @@ namespace {
 std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> activate(
     const Tensor& x, const OptionalTensor& scene, const OptionalTensor& previous_status, int64_t scenes, double dx,
     std::vector<double> lower, std::vector<int64_t> blocks, int64_t order, int64_t capacity, bool deterministic) {
+  check_rank(x, "x", 2);
   STD_TORCH_CHECK(scenes >= 0 && capacity >= 0, "scenes and capacity must not be negative");
   STD_TORCH_CHECK(x.size(0) < INT32_MAX, "x must have fewer than 2^31 particles");
   int64_t table_size = scenes;

@@ -42,6 +42,7 @@ AdvanceArguments<T, D> advance_arguments(const Tensor& x, const Tensor& v, const
 std::tuple<Tensor, Tensor, Tensor> advance(const Tensor& x, const Tensor& v, const OptionalTensor& C,
                                            const OptionalTensor& F, const OptionalTensor& J,
                                            const OptionalTensor& scene, const OptionalTensor& scene_dt, double dt) {
+  check_rank(x, "x", 2);
   const int64_t P = x.size(0), D_ = x.size(1);
   Tensor x_next = empty_particles(x, {P, D_}), F_next = has(F) ? empty_particles(x, {P, D_, D_}) : empty(x, {0}),
          J_next = has(J) ? empty_particles(x, {P}) : empty(x, {0});
@@ -63,6 +64,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> advance_backward(
     const Tensor& grad_x, const OptionalTensor& grad_F, const OptionalTensor& grad_J, const Tensor& x, const Tensor& v,
     const OptionalTensor& C, const OptionalTensor& F, const OptionalTensor& J, const OptionalTensor& scene,
     const OptionalTensor& scene_dt, double dt, int64_t needs) {
+  check_rank(x, "x", 2);
   const int64_t P = x.size(0), D_ = x.size(1);
   const auto output = [&](int bit, bool present, const Shape& shape) {
     return (needs & bit) && present ? empty_particles(x, shape) : empty(x, {0});

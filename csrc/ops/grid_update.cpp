@@ -39,6 +39,7 @@ void dispatch_nodes(const Tensor& nodes, F&& f) {
 
 // Kernels read whole rows with vector loads.
 Tensor packed_rows(const Tensor& t) {
+  check_rank(t, "nodes", 2);
   const bool packed = t.is_contiguous() && reinterpret_cast<uintptr_t>(t.data_ptr()) % 16 == 0;
   if (packed) return t;
   Tensor copy = empty(t, {t.size(0), t.size(1)});

@@ -22,6 +22,11 @@ using Shape = std::vector<int64_t>;
 
 inline bool has(const OptionalTensor& t) { return t.has_value() && t->defined(); }
 
+// Sizes of dimensions that a tensor lacks are not checked by every torch version: ask for the rank first.
+inline void check_rank(const Tensor& t, const char* name, int64_t rank) {
+  STD_TORCH_CHECK(t.dim() == rank, name, " must have ", rank, " dimensions");
+}
+
 inline void check_shape(const Tensor& t, const char* name, const Shape& shape) {
   bool same = t.dim() == int64_t(shape.size());
   for (size_t i = 0; same && i < shape.size(); i++) same = t.size(int64_t(i)) == shape[i];

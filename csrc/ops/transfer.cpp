@@ -49,6 +49,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> p2g_backward(
     const Tensor& grad_nodes, const Tensor& x, const Tensor& mass, const Tensor& v, const OptionalTensor& C,
     const OptionalTensor& stress, const OptionalTensor& volume, const OptionalTensor& scene_dt, double dt,
     int64_t stress_form, int64_t needs, MPM_TOPOLOGY_PARAMETERS) {
+  check_rank(x, "x", 2);
   const int64_t P = x.size(0), D_ = x.size(1);
   const auto output = [&](int bit, bool present, const Shape& shape) {
     return (needs & bit) && present ? empty_particles(x, shape) : empty(x, {0});
@@ -102,7 +103,8 @@ Tensor scatter(const Tensor& x, const Tensor& value, const OptionalTensor& momen
 
 std::tuple<Tensor, Tensor, Tensor> gather(const Tensor& x, const Tensor& nodes, double moment_scale, bool moment,
                                           bool gradient, MPM_TOPOLOGY_PARAMETERS) {
-  STD_TORCH_CHECK(nodes.dim() == 2, "nodes must have shape [N, K]");
+  check_rank(x, "x", 2);
+  check_rank(nodes, "nodes", 2);
   const int64_t P = x.size(0), K = nodes.size(1), D_ = x.size(1);
   Tensor value = empty_particles(x, {P, K}), moments = moment ? empty_particles(x, {P, K, D_}) : empty(x, {0}),
          gradients = gradient ? empty_particles(x, {P, K, D_}) : empty(x, {0});
@@ -123,6 +125,7 @@ std::tuple<Tensor, Tensor, Tensor> gather(const Tensor& x, const Tensor& nodes, 
 
 std::tuple<Tensor, Tensor, Tensor> g2p(const Tensor& x, const Tensor& velocity, bool affine, bool gradient,
                                        MPM_TOPOLOGY_PARAMETERS) {
+  check_rank(x, "x", 2);
   STD_TORCH_CHECK(velocity.dim() == 2 && velocity.size(1) == x.size(1), "velocity must have shape [N, D]");
   const double inverse_inertia = (order == 2 ? BSpline<2>::inverse_inertia : BSpline<3>::inverse_inertia) / (dx * dx);
   return gather(x, velocity, inverse_inertia, affine, gradient, MPM_TOPOLOGY_ARGUMENTS, order, deterministic);
@@ -131,6 +134,8 @@ std::tuple<Tensor, Tensor, Tensor> g2p(const Tensor& x, const Tensor& velocity, 
 Tensor position_gradient(const Tensor& x, const Tensor& value, const OptionalTensor& moment,
                          const OptionalTensor& gradient, const Tensor& nodes, double moment_scale,
                          MPM_TOPOLOGY_PARAMETERS) {
+  check_rank(x, "x", 2);
+  check_rank(nodes, "nodes", 2);
   Tensor result = empty_particles(x, {x.size(0), x.size(1)});
   const DeviceScope device(x);
   dispatch(x, order, [&]<class T, int D, int Order>() {
