@@ -96,6 +96,30 @@ def test_only_pic_damps_rotation(device, transfer, flip):
     assert kept < 0.05 if transfer == "pic" else kept > 0.9
 
 
+@pytest.mark.parametrize("transfer,flip", [("apic", 0.0), ("apic", 0.9), ("flip", 1.0)])
+def test_no_transfer_gains_energy_in_a_collision(device, transfer, flip):
+    """Two elastic discs hit each other: kinetic and elastic energy together never grow, and less is lost with FLIP."""
+    grid = mpm.Grid(0.05, (0, 0), (2, 1))
+    discs = [mpm.seed.sphere((x, y), 0.2, grid, per_cell=4) for x, y in ((0.7, 0.5), (1.3, 0.52))]
+    state = mpm.State.concatenate(
+        [
+            mpm.State.at_rest(disc, 1000.0, velocity=(speed, 0.0), dtype=torch.float64, device=device)
+            for disc, speed in zip(discs, (1.0, -1.0), strict=True)
+        ]
+    )
+    step = mpm.Step(grid, mpm.NeoHookean(E=3e4, nu=0.3), transfer=transfer, flip=flip)
+    state = step.prepare(state)
+
+    def energy(s):
+        return float((0.5 * s.mass * (s.v**2).sum(1)).sum() + step.law.energy(s).sum())
+
+    start, history = energy(state), []
+    for _ in range(10):
+        state = mpm.rollout(step, state, 40, 1e-3)
+        history.append(energy(state) / start)
+    assert max(history) < 1.01 and history[-1] > (0.85 if flip else 0.6)
+
+
 def test_rollout_gradient_is_the_finite_difference(device, dim):
     """50 substeps with contact, gravity and stress: every input against central differences, to 1e-6."""
     base = block_state(dim, device, low=0.1, high=0.3, dx=0.1)

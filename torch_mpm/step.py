@@ -103,12 +103,12 @@ class Step(nn.Module):
         velocity = self._update_grid(blocks, nodes, state, dt)
         gradient_form = self.stress_form == "gradient"
         affine_wanted = self.transfer == "apic" or self.law.viscous or not gradient_form
-        v, C, grad_v = g2p(blocks, state.x, velocity, affine_wanted, gradient_form)
-        if self.flip:
-            v = self._blend_flip(blocks, state, nodes, velocity, v)
+        grid_v, C, grad_v = g2p(blocks, state.x, velocity, affine_wanted, gradient_form)
+        # Particles move with the grid whatever velocity they keep, so that FLIP's noise does not reach the positions.
+        v = self._blend_flip(blocks, state, affine, velocity, grid_v) if self.flip else grid_v
         deformed = {name: fields.get(name, getattr(state, name)) for name in ("F", "J")}
         x, F, J = advance(
-            state.x, v, dt, grad_v if gradient_form else C, deformed["F"], deformed["J"], scene, grid.scenes
+            state.x, grid_v, dt, grad_v if gradient_form else C, deformed["F"], deformed["J"], scene, grid.scenes
         )
         changes = {**fields, "F": F, "J": J}
         kept_C = C if self.transfer == "apic" or self.law.viscous else None
@@ -134,10 +134,10 @@ class Step(nn.Module):
             velocity = self.on_grid(blocks, velocity, nodes[:, 0], dt)
         return velocity
 
-    def _blend_flip(self, blocks: Blocks, state: State, nodes: Tensor, velocity: Tensor, v: Tensor) -> Tensor:
-        """(1 − flip) v_pic + flip (v_p + Σ N_i (v_i − v_i before)) (Zhu and Bridson 2005)."""
-        mass = nodes[:, :1]
-        before = torch.where(mass > 0, nodes[:, 1:] / torch.where(mass > 0, mass, 1), 0)
+    def _blend_flip(self, blocks: Blocks, state: State, affine: Tensor | None, velocity: Tensor, v: Tensor) -> Tensor:
+        """(1 − flip) v_pic + flip (v_p + Σ N_i (v_i − v_i before the forces)) (Zhu and Bridson 2005)."""
+        # P2G of the step has the impulse of the stress in it already, which is part of the change.
+        before = grid_update(blocks, p2g(blocks, state.x, state.mass, state.v, affine))
         change, _, _ = gather(blocks, state.x, velocity - before)
         return (1 - self.flip) * v + self.flip * (state.v + change)
 
