@@ -1,4 +1,4 @@
-"""Time of the simulation of every example scene, without pictures: `python -m benchmarks.examples [--device cpu|cuda]`."""
+"""Time of the simulation of the example scenes, without pictures: `python -m benchmarks.examples [SCENES]`."""
 
 from __future__ import annotations
 
