@@ -20,6 +20,11 @@ INT32_MAX = 2**31 - 1
 KERNEL_ORDERS = {"quadratic": 2, "cubic": 3}
 
 
+def inverse_inertia(order: int, dx: float) -> float:
+    """D⁻¹ [1/m²] of a kernel order and node distance; `BSpline::inverse_inertia` of csrc/math/bspline.h."""
+    return (4.0 if order == 2 else 3.0) / dx**2
+
+
 class Grid:
     """A regular lattice with node i of an axis at `lower + (i - 3) dx`, shared by all scenes of a batch.
 
@@ -96,7 +101,7 @@ class Grid:
     @property
     def inverse_inertia(self) -> float:
         """D⁻¹ = 4/dx² (quadratic) or 3/dx² (cubic) [1/m²] of the APIC affine field (Jiang et al. 2015)."""
-        return (4.0 if self.order == 2 else 3.0) / self.dx**2
+        return inverse_inertia(self.order, self.dx)
 
     def activate(self, x: Tensor, scene: Tensor | None = None, previous: Tensor | None = None) -> Blocks:
         """Find the blocks that particles touch.

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from ..errors import check_like, check_positions, shape_of
-from ..grid import Blocks, Grid
+from ..grid import Blocks, Grid, inverse_inertia
 from ..reference import transfer as reference
 from .arguments import differentiate, per_particle, refuse_vmap, soa_empty, split_dt, sum_by_scene
 
@@ -288,8 +288,8 @@ def _gather_adjoint(ctx, grad_value, grad_moment, grad_gradient):
 
 def _g2p_setup(ctx, inputs, output):
     x, velocity, affine, gradient, *topology = inputs
-    inverse_inertia = (4.0 if topology[8] == 2 else 3.0) / topology[5] ** 2
-    _save(ctx, (x, velocity), topology, scale=inverse_inertia, moment=affine, gradient=gradient)
+    scale = inverse_inertia(topology[8], topology[5])
+    _save(ctx, (x, velocity), topology, scale=scale, moment=affine, gradient=gradient)
 
 
 def _g2p_backward(ctx, grad_v, grad_C, grad_gradient):
@@ -372,8 +372,6 @@ def _composed_p2g_backward(inputs, dt, form, topology):
     grad, x, mass, v, C, stress, volume, scene_dt = inputs
     D = x.shape[1]
     mls = form == STRESS_FORMS["mls"]
-    dx, order = topology[5], topology[8]
-    inverse_inertia = (4.0 if order == 2 else 3.0) / dx**2
     blocks = _blocks_of(topology, x)
     value, moment, gradient = torch.ops.torch_mpm.gather(x, grad, 1.0, True, True, *topology)
     mass_sum, momentum_sum, moment_sum = value[:, 0], value[:, 1:], moment[:, 1:]
@@ -388,7 +386,7 @@ def _composed_p2g_backward(inputs, dt, form, topology):
         B = B + torch.nn.functional.pad(mass[:, None, None] * C, (0, 0, 1, 0))
     if stress is not None:
         step = dt if scene_dt is None else dt * per_particle(scene_dt, blocks.scene, x.shape[0])
-        scale = -inverse_inertia if mls else -1.0
+        scale = -blocks.grid.inverse_inertia if mls else -1.0
         total = moment_sum if mls else gradient[:, 1:]
         work = scale * (stress * total).sum((1, 2))
         impulse = scale * step * volume
