@@ -1,7 +1,6 @@
 #pragma once
 
-#include "math/matrix.h"
-#include "math/roots.h"
+#include "materials/principal.h"
 
 // Sand in terms of the Hencky strains h (logarithms of the principal stretches): energies, stresses, moduli.
 //
@@ -36,32 +35,12 @@ struct MixedQuartic : SandEnergy<false, true, false> {
   static constexpr const char* name = "mixed";
 };
 
-template <class T>
-MPM_HD T min(const T& a, const T& b) {
-  return select(a < b, a, b);
-}
-
 template <bool Unilateral, class T>
 MPM_HD T one_sided(const T& x) {
   if constexpr (Unilateral)
     return min(x, T(0));
   else
     return x;
-}
-
-template <class T, int D>
-MPM_HD T sum(const Vector<T, D>& a) {
-  T r = a[0];
-  MPM_UNROLL
-  for (int i = 1; i < D; i++) r = r + a[i];
-  return r;
-}
-
-// eˣ to rounding also where it is small.
-template <class T>
-MPM_HD T exponential(const T& x) {
-  const T e = expm1(abs(x)) + T(1);
-  return select(x < T(0), T(1) / e, e);
 }
 
 template <class T>

@@ -3,7 +3,6 @@
 #include "materials/arguments.h"
 #include "materials/lanes.h"
 #include "materials/quartic_return_map.h"
-#include "math/svd.h"
 
 // Arguments and bodies of the sand kernels: one decomposition, the return map of the principal strains, its adjoint.
 //
@@ -50,57 +49,6 @@ inline namespace TORCH_MPM_ISA {
 
 using SandEnergies = LawList<FullQuartic, UnilateralQuartic, Hencky, MixedQuartic>;
 
-// F = U diag(exp h) Vᵀ with B = Fᵀ U = V diag(exp h) up to a power of two: no V and no order of the strains is needed.
-template <class T, int D>
-struct HenckyStrain {
-  Matrix<T, D> U, B;
-  Vector<T, D> h, square;  // squared lengths of the columns of B
-  T scale;                 // of B
-  MaskOf<T> meaningful;    // det F > 0, everything finite
-};
-
-template <class T, int D>
-MPM_HD HenckyStrain<T, D> hencky_strain(const Matrix<T, D>& F) {
-  HenckyStrain<T, D> s;
-  // Only extreme entries are scaled: the logarithm of a stretch near one keeps its digits.
-  T largest = T(0);
-  MPM_UNROLL
-  for (int i = 0; i < D; i++)
-    MPM_UNROLL
-  for (int j = 0; j < D; j++) largest = max(largest, abs(F[i][j]));
-  const auto moderate = (largest > T(1e-6)) & (largest < T(1e6));
-  s.scale = select(moderate, T(1), inverse_power_of_two(largest));
-  s.B = s.scale * transpose(F);
-  orthogonalize_columns(s.B, s.U);
-  const T shift = log_1p(s.scale, s.scale - T(1));
-  T finite = poison(F);
-  MPM_UNROLL
-  for (int i = 0; i < D; i++) {
-    T minus_1 = s.B[0][i] * s.B[0][i] - T(1);
-    s.square[i] = s.B[0][i] * s.B[0][i];
-    MPM_UNROLL
-    for (int k = 1; k < D; k++) {
-      minus_1 = minus_1 + s.B[k][i] * s.B[k][i];
-      s.square[i] = s.square[i] + s.B[k][i] * s.B[k][i];
-    }
-    s.h[i] = T(0.5) * log_1p(s.square[i], minus_1) - shift;
-    finite = finite + (s.h[i] - s.h[i]);
-  }
-  s.meaningful = (determinant(s.B) > T(0)) & (finite == T(0));
-  return s;
-}
-
-// A diag(d) Bᵀ.
-template <class T, int D>
-MPM_HD Matrix<T, D> compose(const Matrix<T, D>& A, const Vector<T, D>& d, const Matrix<T, D>& B) {
-  Matrix<T, D> scaled;
-  MPM_UNROLL
-  for (int i = 0; i < D; i++)
-    MPM_UNROLL
-  for (int j = 0; j < D; j++) scaled[i][j] = A[i][j] * d[j];
-  return scaled * transpose(B);
-}
-
 template <class T>
 struct SandParameters {
   T mu, lam, alpha;
@@ -109,23 +57,12 @@ struct SandParameters {
 };
 
 template <class At, class T, int D>
-MPM_HD typename At::Value load_parameter(const At& at, const SandArguments<T, D>& a, const Parameter<T>& parameter) {
-  if (parameter.scenes) {
-    return at.each([&](int64_t p) {
-      const int scene = a.scene[p * a.scene_stride];
-      return parameter.pointer[(scene >= 0 && scene < parameter.scenes ? scene : 0) * parameter.stride];
-    });
-  }
-  return at.load(parameter.pointer, parameter.stride);
-}
-
-template <class At, class T, int D>
 MPM_HD SandParameters<typename At::Value> load_parameters(const At& at, const SandArguments<T, D>& a) {
   using V = typename At::Value;
   SandParameters<V> r;
-  r.mu = load_parameter(at, a, a.mu);
-  r.lam = load_parameter(at, a, a.lam);
-  r.alpha = load_parameter(at, a, a.alpha);
+  r.mu = load_parameter(at, a.mu, a.scene, a.scene_stride);
+  r.lam = load_parameter(at, a.lam, a.scene, a.scene_stride);
+  r.alpha = load_parameter(at, a.alpha, a.scene, a.scene_stride);
   r.shear = r.mu > V(0);
   r.cone = {r.alpha, select(r.shear, r.lam / select(r.shear, r.mu, V(1)), V(0))};
   return r;
@@ -186,57 +123,19 @@ MPM_HD void return_map_at(const ReturnMapArguments<T, D>& a, const At& at) {
   }
 }
 
-// sinh(x)/x.
-template <class T>
-MPM_HD T sinhc(const T& x) {
-  const T square = x * x;
-  T series = T(1);
-  MPM_UNROLL
-  for (int k = 7; k > 0; k--) series = T(1) + series * square * T(1.0 / (2 * k * (2 * k + 1)));
-  const auto small = square < T(0.25);
-  const T e = exponential(abs(x));
-  return select(small, series, T(0.5) * (e - T(1) / e) / select(small, T(1), abs(x)));
-}
-
-template <class T>
-MPM_HD T cosh(const T& x) {
-  const T e = exponential(abs(x));
-  return T(0.5) * (e + T(1) / e);
-}
-
-// Adjoint of F in principal axes. M = Uᵀ F̄ V and N = Uᵀ τ̄ U are the adjoints of the results in the same axes. Divided
-// differences of exp H and τ by exp h are written with sinh x/x, so that they hold at equal strains.
+// Adjoint of F in principal axes; see principal_adjoint.
 template <class Energy, class T, int D>
-MPM_HD Matrix<T, D> principal_adjoint(const HenckyStrain<T, D>& s, const MappedStrain<T, D>& m,
-                                      const Vector<T, D>& diagonal, const Matrix<T, D>& M, const Matrix<T, D>& N,
-                                      const T& mu) {
-  Vector<T, D> inverse;  // of the stretches
-  Matrix<T, D> r;
-  MPM_UNROLL
-  for (int i = 0; i < D; i++) {
-    inverse[i] = s.scale * rsqrt(s.square[i]);
-    r[i][i] = diagonal[i] * inverse[i];
-  }
-  MPM_UNROLL
-  for (int i = 0; i < D; i++)
-    MPM_UNROLL
-  for (int j = i + 1; j < D; j++) {
+MPM_HD Matrix<T, D> sand_adjoint(const HenckyStrain<T, D>& s, const MappedStrain<T, D>& m,
+                                 const Vector<T, D>& diagonal, const Matrix<T, D>& M, const Matrix<T, D>& N,
+                                 const T& mu) {
+  return principal_adjoint(s, m.h, diagonal, M, N, [&](int i, int j) -> Quotients<T> {
     const T trial = s.h[i] - s.h[j], mapped = m.h[i] - m.h[j];
     // κ on the cone; at the apex 1 between strains that are kept, 0 between those that are not.
     const auto equal = trial == T(0);
-      const auto both = (m.h[i] > T(0)) & (m.h[j] > T(0));
+    const auto both = (m.h[i] > T(0)) & (m.h[j] > T(0));
     const T at_apex = select(both, T(1), select(equal, T(0), mapped / select(equal, T(1), trial)));
-    const T quotient = select(m.apex, at_apex, m.kappa);
-    const T half = exponential(T(0.5) * (m.h[i] + m.h[j] - s.h[i] - s.h[j]));
-    const T symmetric = half * quotient * sinhc(T(0.5) * mapped) / sinhc(T(0.5) * trial);
-    const T skew = half * cosh(T(0.5) * mapped) / cosh(T(0.5) * trial);
-    const T even = T(0.5) * symmetric * (M[i][j] + M[j][i]), odd = T(0.5) * skew * (M[i][j] - M[j][i]);
-    const T stress = (N[i][j] + N[j][i]) * stress_quotient<Energy>(m.h[i], m.h[j], mu) * quotient /
-                     (T(2) * sinhc(trial));
-    r[i][j] = even + odd + stress * inverse[i];
-    r[j][i] = even - odd + stress * inverse[j];
-  }
-  return r;
+    return {select(m.apex, at_apex, m.kappa), stress_quotient<Energy>(m.h[i], m.h[j], mu)};
+  });
 }
 
 template <class Energy, class At, class T, int D>
@@ -252,13 +151,7 @@ MPM_HD void return_map_backward_at(const ReturnMapBackwardArguments<T, D>& a, co
   for (int i = 0; i < D; i++) finite = finite + (principal[i] - principal[i]);
   const auto meaningful = s.meaningful & (finite == V(0));
 
-  Matrix<V, D> V_;
-  MPM_UNROLL
-  for (int j = 0; j < D; j++) {
-    const V inverse = rsqrt(s.square[j]);
-    MPM_UNROLL
-    for (int i = 0; i < D; i++) V_[i][j] = s.B[i][j] * inverse;
-  }
+  const Matrix<V, D> V_ = right_axes(s);
   const Matrix<V, D> grad_F = a.grad_F.pointer ? load_matrix<D>(at, a.grad_F) : zero_matrix<V, D>();
   const Matrix<V, D> grad_stress = a.grad_stress.pointer ? load_matrix<D>(at, a.grad_stress) : zero_matrix<V, D>();
   const Matrix<V, D> M = transpose(s.U) * grad_F * V_, N = transpose(s.U) * grad_stress * s.U;
@@ -275,7 +168,7 @@ MPM_HD void return_map_backward_at(const ReturnMapBackwardArguments<T, D>& a, co
   const MapAdjoint<V, D> adjoint = return_map_adjoint<Energy>(m, grad_h, p.cone, a.sand.keep_apex);
 
   if (a.F.pointer) {
-    const Matrix<V, D> g = s.U * principal_adjoint<Energy>(s, m, adjoint.h, M, N, p.mu) * transpose(V_);
+    const Matrix<V, D> g = s.U * sand_adjoint<Energy>(s, m, adjoint.h, M, N, p.mu) * transpose(V_);
     Matrix<V, D> kept;
     MPM_UNROLL
     for (int i = 0; i < D; i++)

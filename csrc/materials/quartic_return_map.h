@@ -13,11 +13,6 @@ namespace mpm {
 inline namespace TORCH_MPM_ISA {
 
 template <class T>
-using MaskOf = decltype(T(0) < T(0));
-
-MPM_HD bool any(bool mask) { return mask; }
-
-template <class T>
 struct RootFinding;
 template <>
 struct RootFinding<float> {

@@ -1,0 +1,171 @@
+#pragma once
+
+#include "materials/arguments.h"
+#include "materials/lanes.h"
+#include "math/svd.h"
+
+// What isotropic laws in principal strains share: the Hencky strains of F, and the adjoint of an isotropic tensor
+// function of F from that of its principal values.
+namespace mpm {
+inline namespace TORCH_MPM_ISA {
+
+template <class T>
+using MaskOf = decltype(T(0) < T(0));
+
+MPM_HD bool any(bool mask) { return mask; }
+
+template <class T>
+MPM_HD T min(const T& a, const T& b) {
+  return select(a < b, a, b);
+}
+
+template <class T, int D>
+MPM_HD T sum(const Vector<T, D>& a) {
+  T r = a[0];
+  MPM_UNROLL
+  for (int i = 1; i < D; i++) r = r + a[i];
+  return r;
+}
+
+// eˣ to rounding also where it is small.
+template <class T>
+MPM_HD T exponential(const T& x) {
+  const T e = expm1(abs(x)) + T(1);
+  return select(x < T(0), T(1) / e, e);
+}
+
+// sinh(x)/x.
+template <class T>
+MPM_HD T sinhc(const T& x) {
+  const T square = x * x;
+  T series = T(1);
+  MPM_UNROLL
+  for (int k = 7; k > 0; k--) series = T(1) + series * square * T(1.0 / (2 * k * (2 * k + 1)));
+  const auto small = square < T(0.25);
+  const T e = exponential(abs(x));
+  return select(small, series, T(0.5) * (e - T(1) / e) / select(small, T(1), abs(x)));
+}
+
+template <class T>
+MPM_HD T cosh(const T& x) {
+  const T e = exponential(abs(x));
+  return T(0.5) * (e + T(1) / e);
+}
+
+// F = U diag(exp h) Vᵀ with B = Fᵀ U = V diag(exp h) up to a power of two: no V and no order of the strains is needed.
+template <class T, int D>
+struct HenckyStrain {
+  Matrix<T, D> U, B;
+  Vector<T, D> h, square;  // squared lengths of the columns of B
+  T scale;                 // of B
+  MaskOf<T> meaningful;    // det F > 0, everything finite
+};
+
+template <class T, int D>
+MPM_HD HenckyStrain<T, D> hencky_strain(const Matrix<T, D>& F) {
+  HenckyStrain<T, D> s;
+  // Only extreme entries are scaled: the logarithm of a stretch near one keeps its digits.
+  T largest = T(0);
+  MPM_UNROLL
+  for (int i = 0; i < D; i++)
+    MPM_UNROLL
+  for (int j = 0; j < D; j++) largest = max(largest, abs(F[i][j]));
+  const auto moderate = (largest > T(1e-6)) & (largest < T(1e6));
+  s.scale = select(moderate, T(1), inverse_power_of_two(largest));
+  s.B = s.scale * transpose(F);
+  orthogonalize_columns(s.B, s.U);
+  const T shift = log_1p(s.scale, s.scale - T(1));
+  T finite = poison(F);
+  MPM_UNROLL
+  for (int i = 0; i < D; i++) {
+    T minus_1 = s.B[0][i] * s.B[0][i] - T(1);
+    s.square[i] = s.B[0][i] * s.B[0][i];
+    MPM_UNROLL
+    for (int k = 1; k < D; k++) {
+      minus_1 = minus_1 + s.B[k][i] * s.B[k][i];
+      s.square[i] = s.square[i] + s.B[k][i] * s.B[k][i];
+    }
+    s.h[i] = T(0.5) * log_1p(s.square[i], minus_1) - shift;
+    finite = finite + (s.h[i] - s.h[i]);
+  }
+  s.meaningful = (determinant(s.B) > T(0)) & (finite == T(0));
+  return s;
+}
+
+// A diag(d) Bᵀ.
+template <class T, int D>
+MPM_HD Matrix<T, D> compose(const Matrix<T, D>& A, const Vector<T, D>& d, const Matrix<T, D>& B) {
+  Matrix<T, D> scaled;
+  MPM_UNROLL
+  for (int i = 0; i < D; i++)
+    MPM_UNROLL
+  for (int j = 0; j < D; j++) scaled[i][j] = A[i][j] * d[j];
+  return scaled * transpose(B);
+}
+
+// V of F = U diag(exp h) Vᵀ.
+template <class T, int D>
+MPM_HD Matrix<T, D> right_axes(const HenckyStrain<T, D>& s) {
+  Matrix<T, D> r;
+  MPM_UNROLL
+  for (int j = 0; j < D; j++) {
+    const T inverse = rsqrt(s.square[j]);
+    MPM_UNROLL
+    for (int i = 0; i < D; i++) r[i][j] = s.B[i][j] * inverse;
+  }
+  return r;
+}
+
+// Divided differences of principal values i and j: (Hᵢ − Hⱼ)/(hᵢ − hⱼ) of the mapped strains H, (τᵢ − τⱼ)/(Hᵢ − Hⱼ) of
+// the stresses.
+template <class T>
+struct Quotients {
+  T map, stress;
+};
+
+// Adjoint of F in principal axes, of F ↦ U diag(exp H) Vᵀ and τ = U diag(τᵢ) Uᵀ. `diagonal` is the adjoint of h;
+// M = Uᵀ F̄ V and N = Uᵀ τ̄ U are the adjoints of the results in the same axes. Divided differences of exp H and τ by exp h
+// are written with sinh x/x, so that they hold at equal strains.
+template <class T, int D, class F>
+MPM_HD Matrix<T, D> principal_adjoint(const HenckyStrain<T, D>& s, const Vector<T, D>& H, const Vector<T, D>& diagonal,
+                                      const Matrix<T, D>& M, const Matrix<T, D>& N, const F& quotients) {
+  Vector<T, D> inverse;  // of the stretches
+  Matrix<T, D> r;
+  MPM_UNROLL
+  for (int i = 0; i < D; i++) {
+    inverse[i] = s.scale * rsqrt(s.square[i]);
+    r[i][i] = diagonal[i] * inverse[i];
+  }
+  MPM_UNROLL
+  for (int i = 0; i < D; i++)
+    MPM_UNROLL
+  for (int j = i + 1; j < D; j++) {
+    const Quotients<T> quotient = quotients(i, j);
+    const T trial = s.h[i] - s.h[j], mapped = H[i] - H[j];
+    const T half = exponential(T(0.5) * (H[i] + H[j] - s.h[i] - s.h[j]));
+    const T symmetric = half * quotient.map * sinhc(T(0.5) * mapped) / sinhc(T(0.5) * trial);
+    const T skew = half * cosh(T(0.5) * mapped) / cosh(T(0.5) * trial);
+    const T even = T(0.5) * symmetric * (M[i][j] + M[j][i]), odd = T(0.5) * skew * (M[i][j] - M[j][i]);
+    const T stress = (N[i][j] + N[j][i]) * quotient.stress * quotient.map / (T(2) * sinhc(trial));
+    r[i][j] = even + odd + stress * inverse[i];
+    r[j][i] = even - odd + stress * inverse[j];
+  }
+  return r;
+}
+
+// A parameter of the particles `at`. A scene id out of range takes that of scene 0: such a particle is not transferred
+// anyway.
+template <class At, class T>
+MPM_HD typename At::Value load_parameter(const At& at, const Parameter<T>& parameter, const int* scene,
+                                         int64_t scene_stride) {
+  if (parameter.scenes) {
+    return at.each([&](int64_t p) {
+      const int id = scene[p * scene_stride];
+      return parameter.pointer[(id >= 0 && id < parameter.scenes ? id : 0) * parameter.stride];
+    });
+  }
+  return at.load(parameter.pointer, parameter.stride);
+}
+
+}  // namespace TORCH_MPM_ISA
+}  // namespace mpm
