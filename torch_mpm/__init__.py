@@ -9,7 +9,7 @@ from .cfl import stable_dt
 from .errors import GridOverflowError, SimulationError
 from .grid import Blocks, Grid
 from .materials import CustomLaw, Material, Mixture, NeoHookean, WeaklyCompressible
-from .ops import advance, g2p, gather, grid_update, p2g, polar, quartic_return_map, scatter, svd3
+from .ops import HeatSolve, advance, g2p, gather, grid_update, heat_cg, p2g, polar, quartic_return_map, scatter, svd3
 from .sand import QuarticSand
 from .state import State
 from .step import Step, rollout
@@ -26,6 +26,7 @@ __all__ = [
     "CustomLaw",
     "Grid",
     "GridOverflowError",
+    "HeatSolve",
     "Material",
     "Mixture",
     "NeoHookean",
@@ -42,6 +43,7 @@ __all__ = [
     "g2p",
     "gather",
     "grid_update",
+    "heat_cg",
     "ops",
     "p2g",
     "polar",

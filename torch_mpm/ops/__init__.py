@@ -3,16 +3,19 @@
 from . import activation as activation
 from .advance import advance
 from .grid_update import grid_update
+from .heat import HeatSolve, heat_cg
 from .material import material_energy, material_stiffness, material_stress, material_wave_modulus
 from .sand import quartic_energy, quartic_return_map, quartic_stiffness, quartic_stress
 from .svd import polar, svd3
 from .transfer import g2p, gather, p2g, scatter
 
 __all__ = [
+    "HeatSolve",
     "advance",
     "g2p",
     "gather",
     "grid_update",
+    "heat_cg",
     "material_energy",
     "material_stiffness",
     "material_stress",

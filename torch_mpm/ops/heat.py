@@ -1,0 +1,226 @@
+"""The implicit heat step on the nodes: Python face, fake kernels and autograd of `heat_cg`."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from ..errors import check_like, check_positions, shape_of
+from ..grid import Blocks, inverse_inertia
+from ..reference import heat as reference
+from .arguments import refuse_vmap, split_dt
+from .transfer import TOPOLOGY, _blocks_of
+
+
+class HeatSolve(NamedTuple):
+    """Result of `heat_cg`: increment [N] [K]; iterations int32 [B], residual [B] [K] and converged bool [B]."""
+
+    increment: Tensor
+    iterations: Tensor
+    residual: Tensor
+    converged: Tensor
+
+
+def heat_cg(
+    blocks: Blocks,
+    x: Tensor,
+    conductance: Tensor,
+    capacity: Tensor,
+    theta: Tensor,
+    dt: float | Tensor,
+    source: Tensor | None = None,
+    exchange: Tensor | None = None,
+    fixed: Tensor | None = None,
+    tolerance: float | Tensor = 1e-5,
+    max_iterations: int | Tensor = 200,
+    adjoint_tolerance: float = 1e-6,
+) -> HeatSolve:
+    """Implicit step of the heat equation on the active nodes, by matrix-free conjugate gradients.
+
+    Solves (M/dt + H + X) d = h − (H + X) θ for the increment d, with M the lumped capacity, X the exchange, h the
+    source and H_ij = Σ_p κ_p V_p ∇Φ_i · ∇Φ_j, ∇Φ_i = D⁻¹ N_i (x_i − x_p) (Gao et al. 2018, supplement, equation 10).
+    Scenes are solved apart, each with its own time step, tolerance and iterations, and stop apart.
+
+    Args:
+        blocks: active blocks of these positions.
+        x: positions [P, D] [m].
+        conductance: conductivity times volume κ_p V_p [P] [W m²/K in 3-D].
+        capacity: lumped heat capacity of the nodes M_i = Σ m_p C_p N_i [N] [J/K].
+        theta: temperature of the nodes θ [N] [K], relative to a reference.
+        dt: time step [s]: a number, or a tensor of shape [], [1] or [B].
+        source: heat into the nodes h [N] [W].
+        exchange: derivative of the heat that leaves a node by its temperature X ≥ 0 [N] [W/K] (Robin boundaries); the
+            ambient's share belongs to `source`.
+        fixed: nodes that keep their temperature, bool [N].
+        tolerance: of dt sqrt(Σ r_i²/M_i / Σ M_i) [K], r the residual, which bounds the mass-weighted RMS error of d:
+            a number, or a tensor of shape [], [1] or [B].
+        max_iterations: a number, or an integer tensor of shape [], [1] or [B].
+        adjoint_tolerance: of the backward solve, relative to the size of its right side.
+
+    Returns:
+        HeatSolve(increment, iterations, residual, converged). The increment is zero on fixed nodes, on nodes without
+        capacity and outside the active blocks. A scene whose data are not finite, or whose time step is not positive,
+        stays as it is (increment zero, converged false) and leaves the others alone. A scene that is closed (neither
+        exchange nor fixed nodes) keeps its energy, Σ M d = dt Σ h, however early the solve ends.
+
+    Raises:
+        ValueError, TypeError: for wrong shapes, dtypes or devices, or numbers out of range.
+
+    Differentiable with respect to every floating tensor but the tolerance, by one more solve.
+    """
+    grid = blocks.grid
+    check_positions(x, grid.dim, blocks.scene, grid.scenes)
+    P, N = x.shape[0], blocks.node_count
+    check_like("conductance", conductance, x, (P,), "[P]")
+    for name, value in (("capacity", capacity), ("theta", theta), ("source", source), ("exchange", exchange)):
+        check_like(name, value, x, (N,), "[N]")
+    if fixed is not None and (not isinstance(fixed, Tensor) or fixed.shape != (N,) or fixed.dtype != torch.bool):
+        raise ValueError(f"fixed must be a bool tensor of shape [N] = [{N}], got {shape_of(fixed)}")
+    number, scene_dt = split_dt(dt, grid.scenes, x)
+    least, scene_tolerance = _per_scene("tolerance", tolerance, grid.scenes, x)
+    most, scene_limit = _per_scene("max_iterations", max_iterations, grid.scenes, x)
+    if scene_limit is not None and scene_limit.is_floating_point():
+        raise TypeError(f"max_iterations must be an integer tensor, got {scene_limit.dtype}")
+    if not 0 < adjoint_tolerance < 1:
+        raise ValueError(f"adjoint_tolerance must be between 0 and 1, got {adjoint_tolerance}")
+    return HeatSolve(
+        *torch.ops.torch_mpm.heat_cg(
+            x, conductance, capacity, theta, source, exchange, fixed, scene_dt, number,
+            None if scene_tolerance is None else scene_tolerance.to(x.dtype).contiguous(), float(least), 0.0,
+            None if scene_limit is None else scene_limit.int().contiguous(), int(most), adjoint_tolerance,
+            *blocks.topology,
+        )
+    )  # fmt: skip
+
+
+def _per_scene(name: str, value: float | Tensor, scenes: int, x: Tensor) -> tuple[float, Tensor | None]:
+    """A number, or a tensor [B] and zero."""
+    if not isinstance(value, Tensor):
+        if not 0 <= value < float("inf"):
+            raise ValueError(f"{name} must be a finite number >= 0, got {value}")
+        return value, None
+    if value.dim() > 1 or (value.dim() == 1 and value.shape[0] not in (1, scenes)):
+        raise ValueError(f"{name} must be a number or have shape [], [1] or [B] = [{scenes}], got {shape_of(value)}")
+    if value.device != x.device:
+        raise ValueError(f"{name} must be on the device of x, {x.device}, got {value.device}")
+    return 0.0, value.expand(scenes)
+
+
+SCHEMA = (
+    "heat_cg(Tensor x, Tensor conductance, Tensor capacity, Tensor? theta, Tensor? source, Tensor? exchange, "
+    "Tensor? fixed, Tensor? scene_dt, float dt, Tensor? scene_tolerance, float tolerance, float relative_tolerance, "
+    "Tensor? scene_limit, int max_iterations, float adjoint_tolerance, "
+    "Tensor table, Tensor block, Tensor offsets, Tensor index, Tensor schedule, float dx, float[] lower, int[] blocks, "
+    "int order, bool deterministic) -> (Tensor increment, Tensor iterations, Tensor residual, Tensor converged)"
+)
+torch.library.define("torch_mpm::" + SCHEMA.split("(", 1)[0], "(" + SCHEMA.split("(", 1)[1])
+
+
+@torch.library.impl("torch_mpm::heat_cg", "CompositeExplicitAutograd")
+def _heat_cg(
+    x, conductance, capacity, theta, source, exchange, fixed, scene_dt, dt, scene_tolerance, tolerance,
+    relative_tolerance, scene_limit, max_iterations, adjoint_tolerance, *topology,
+):  # fmt: skip
+    blocks = _blocks_of(topology, x)
+    steps = dt * (x.new_ones(blocks.grid.scenes) if scene_dt is None else scene_dt)
+    return reference.heat_cg(
+        blocks, x, conductance, capacity, theta, steps, source, exchange, fixed,
+        tolerance if scene_tolerance is None else scene_tolerance, relative_tolerance,
+        max_iterations if scene_limit is None else scene_limit,
+    )  # fmt: skip
+
+
+@torch.library.register_fake("torch_mpm::heat_cg")
+def _fake(x, conductance, capacity, theta, source, exchange, fixed, *arguments):
+    (table, *_, blocks, _, _) = arguments[-TOPOLOGY:]
+    per_scene = 1
+    for n in blocks:
+        per_scene *= n
+    scenes = table.shape[0] // per_scene
+    return (
+        torch.empty_like(capacity, memory_format=torch.contiguous_format),
+        x.new_empty(scenes, dtype=torch.int32),
+        x.new_empty(scenes),
+        x.new_empty(scenes, dtype=torch.bool),
+    )
+
+
+# ---- autograd: with A λ = ∂L/∂d on the free nodes, changes δA of the matrix and δb of the right side of A d = b change
+# the loss by λ · (δb − δA d).
+
+
+def _setup(ctx: Any, inputs: Any, output: Any) -> None:
+    *tensors, scene_dt, dt, _, _, _, scene_limit, max_iterations, adjoint_tolerance = inputs[:-TOPOLOGY]
+    topology = inputs[-TOPOLOGY:]
+    ctx.save_for_backward(*tensors, scene_dt, scene_limit, output[0], *topology[:5])
+    ctx.dt, ctx.max_iterations, ctx.adjoint_tolerance = dt, max_iterations, adjoint_tolerance
+    ctx.geometry = topology[5:]
+    ctx.mark_non_differentiable(*output[1:])
+
+
+def _backward(ctx: Any, grad: Tensor, *_: Any) -> tuple[Any, ...]:
+    x, conductance, capacity, theta, _, exchange, fixed, scene_dt, scene_limit, d, *topology = ctx.saved_tensors
+    topology = (*topology, *ctx.geometry)
+    need_x, need_conductance, need_capacity, need_theta, need_source, need_exchange, _, need_dt = ctx.needs_input_grad[
+        :8
+    ]
+    adjoint = torch.ops.torch_mpm.heat_cg(
+        x, conductance, capacity, None, grad.contiguous(), exchange, fixed, scene_dt, ctx.dt, None, 0.0,
+        ctx.adjoint_tolerance, scene_limit, ctx.max_iterations, ctx.adjoint_tolerance, *topology,
+    )[0]  # fmt: skip
+    after = d if theta is None else theta + d
+    grads: list[Tensor | None] = [None] * 8
+    if need_x or need_conductance or need_theta:
+        scale = inverse_inertia(topology[8], topology[5])
+        flux = [_gradient(x, u, scale, topology) for u in (adjoint, after)]
+        if need_conductance:
+            grads[1] = -(flux[0] * flux[1]).sum(1)
+        if need_theta:
+            grads[3] = -_divergence(x, conductance[:, None] * flux[0], scale, topology)
+            if exchange is not None:
+                grads[3] = grads[3] - exchange * adjoint
+        if need_x:
+            flux = [-conductance[:, None] * f for f in flux]
+            pairs = ((flux[0], after), (flux[1], adjoint))
+            first, second = (_position_gradient(x, q, u, scale, topology) for q, u in pairs)
+            grads[0] = first + second
+    rate = -adjoint * d
+    if need_capacity or need_dt:
+        blocks = _blocks_of(topology, x)
+        scene = blocks.node_scene().long().clamp_min(0)
+        steps = ctx.dt if scene_dt is None else (ctx.dt * scene_dt)[scene]
+        if need_capacity:
+            grads[2] = rate / steps
+        if need_dt:
+            per_node = -rate * capacity / steps**2 * ctx.dt
+            grads[7] = per_node.new_zeros(scene_dt.shape).index_add(0, scene, per_node)
+    if need_source:
+        grads[4] = adjoint
+    if need_exchange:
+        grads[5] = -adjoint * after
+    return (*grads,) + (None,) * (7 + TOPOLOGY)
+
+
+def _gradient(x: Tensor, nodes: Tensor, scale: float, topology: Any) -> Tensor:
+    """Σ_i ∇Φ_i u_i [P, D]."""
+    return torch.ops.torch_mpm.gather(x, nodes[:, None].contiguous(), scale, True, False, *topology)[1][:, 0]
+
+
+def _divergence(x: Tensor, flux: Tensor, scale: float, topology: Any) -> Tensor:
+    """Σ_p ∇Φ_i · q_p [N], the adjoint of `_gradient`."""
+    value = torch.zeros_like(flux[:, :1])
+    return torch.ops.torch_mpm.scatter(x, value, flux[:, None], None, scale, *topology)[:, 0]
+
+
+def _position_gradient(x: Tensor, flux: Tensor, nodes: Tensor, scale: float, topology: Any) -> Tensor:
+    """Derivative of Σ_p q_p · Σ_i ∇Φ_i u_i by the positions, at fixed q and u."""
+    value = torch.zeros_like(flux[:, :1])
+    return torch.ops.torch_mpm.position_gradient(
+        x, value, flux[:, None], None, nodes[:, None].contiguous(), scale, *topology
+    )
+
+
+torch.library.register_autograd("torch_mpm::heat_cg", _backward, setup_context=_setup)
+refuse_vmap("heat_cg")
