@@ -15,17 +15,21 @@ INSET = {
     2: mpm.Walls([("separate", "sticky"), ("slip", "open")], (0.15, 0.2), (0.61, 0.7), [(0.3, 0.0), 0.2]),
     3: mpm.Walls(["slip", ("separate", "open"), ("open", "sticky")], (0.1,) * 3, (0.3,) * 3, 0.25),
 }
-WALLS = ["none", "slip", "separate", "sticky", "friction", "inset"]
+MIXED = {  # mirrors on nodes and between them, and contact with friction on the other faces
+    2: mpm.Walls([("mirror", "separate"), ("mirror", "mirror")], (0.15, 0.1), (0.9, 0.75), [(0.0, 0.3), 0.0]),
+    3: mpm.Walls(["mirror", ("slip", "mirror"), ("open", "mirror")], (0.05, 0.0, 0.0), (0.55, 0.5, 0.45)),
+}
+WALLS = ["none", "slip", "separate", "sticky", "friction", "inset", "mirror", "mixed"]
 
 
 def walls_named(name: str, dim: int) -> mpm.Walls | None:
-    if name in ("none", "inset"):
-        return None if name == "none" else INSET[dim]
+    if name in ("none", "inset", "mixed"):
+        return {"none": None, "inset": INSET[dim], "mixed": MIXED[dim]}[name]
     return mpm.Walls("separate", friction=0.4) if name == "friction" else mpm.Walls(name)
 
 
 def grid_of(dim: int, scenes: int = 3) -> mpm.Grid:
-    return mpm.Grid(dx=0.1, lower=(0.0,) * dim, upper=(1.0, 0.8)[:dim] if dim == 2 else (0.5, 0.4, 0.3), scenes=scenes)
+    return mpm.Grid(dx=0.1, lower=(0.0,) * dim, upper=(1.0, 0.8)[:dim] if dim == 2 else (0.6, 0.5, 0.5), scenes=scenes)
 
 
 def inputs(dim: int, device: str, scenes: int = 3) -> tuple[mpm.Blocks, Tensor, Tensor, Tensor]:
@@ -219,7 +223,7 @@ def test_gradcheck_of_one_node_with_friction():
 
 
 def op_arguments(blocks: mpm.Blocks, nodes: Tensor, gravity: Tensor, dt: Tensor, walls: mpm.Walls) -> tuple:
-    kinds = {"open": 0, "sticky": 1, "slip": 2, "separate": 3}
+    kinds = {"open": 0, "sticky": 1, "slip": 2, "separate": 3, "mirror": 4}
     kind, plane, friction = zip(*walls.faces(blocks.grid), strict=True)
     grid = blocks.grid
     return (
@@ -230,6 +234,7 @@ def op_arguments(blocks: mpm.Blocks, nodes: Tensor, gravity: Tensor, dt: Tensor,
         [kinds[k] for k in kind],
         plane,
         friction,
+        blocks.table,
         blocks.block,
         grid.dx,
         grid.lower,
@@ -281,6 +286,17 @@ def test_messages():
             ValueError,
             "kind of walls must have one entry or pair per axis",
         ),
+        (
+            (nodes, None, None, mpm.Walls("mirror", (0.03, 0.0))),
+            ValueError,
+            "a mirror must lie on a node or halfway between two: the one at 0.03 m on axis 0 is 0.3 cells",
+        ),
+        ((nodes, None, None, mpm.Walls("mirror", friction=0.1)), ValueError, "friction of a mirror must be 0, got 0.1"),
+        (
+            (nodes, None, None, mpm.Walls([("slip", "mirror"), "open"], (0.6, 0.0))),
+            ValueError,
+            "a mirror must be at least 5 cells from the wall opposite, got 4 on axis 0",
+        ),
     ]:
         with pytest.raises(error, match=message):
             grid_update(blocks, *arguments)
@@ -303,8 +319,8 @@ def test_the_op_checks_what_memory_safety_needs(dim):
     shorter = torch.tensor([0, 1], dtype=torch.int32)
     for position, value in [
         (0, nodes[:-1]), (0, nodes[:, 0]), (0, nodes.long()), (1, gravity[:, :1]), (1, gravity.float()), (2, dt[:-1]),
-        (4, [1]), (4, [7] * 2 * dim), (5, [0.0]), (6, []), (7, shorter), (7, blocks.block.long()), (8, 0.0), (9, [0.0]),
-        (10, [0] * dim), (10, [2**31] * dim),
+        (4, [1]), (4, [7] * 2 * dim), (5, [0.0]), (6, []), (7, blocks.table.long()), (8, shorter),
+        (8, blocks.block.long()), (9, 0.0), (10, [0.0]), (11, [0] * dim), (11, [2**31] * dim),
     ]:  # fmt: skip
         with pytest.raises(RuntimeError):
             op(*arguments[:position], value, *arguments[position + 1 :])
@@ -315,7 +331,7 @@ def test_blocks_outside_the_batch_count_as_unused(dim):
     arguments = list(op_arguments(blocks, nodes, gravity, dt, INSET[dim]))
     wrong = blocks.block.clone()
     wrong[0], wrong[1] = blocks.grid.block_count, 2**31 - 1
-    arguments[7] = wrong
+    arguments[8] = wrong
     rows = 2 * blocks.grid.nodes_per_block
     assert (torch.ops.torch_mpm.grid_update(*arguments)[:rows] == 0).all()
 

@@ -58,6 +58,7 @@ def test_wrong_words(words, message):
         ({"grid__upper": (1, 1, 1)}, "grid.upper: must have 2 numbers like grid.lower"),
         ({"grid__upper": (1, -1)}, "grid.upper: must be above grid.lower on every axis"),
         ({"grid__walls": ["slip"]}, "grid.walls: must have one entry per axis, 2 in all"),
+        ({"grid__walls": "mirror", "grid__upper": [1.0, 1.01]}, "grid.walls: a mirror must lie on a node or halfway"),
         ({"body__0__spin": (1, 2, 3)}, "body[0].spin: takes one number in 2-D, got (1.0, 2.0, 3.0)"),
         ({"body__0__velocity": (1, 2, 3)}, "body[0].velocity: must have 2 numbers"),
         ({"body__0__material": "jely"}, "body[0].material: there is no material 'jely'; known: jelly"),

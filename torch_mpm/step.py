@@ -35,7 +35,7 @@ class Step(nn.Module):
         grid: the lattice.
         law: a material of `torch_mpm.materials`, or any module with its interface.
         gravity: [m/s²]; D numbers, or a tensor [D] or [B, D] that may require grad; None for none.
-        walls: "slip", "sticky" or "separate" on every face of the domain, a `Walls` that says more, or None.
+        walls: "slip", "sticky", "separate" or "mirror" on every face of the domain, a `Walls` that says more, or None.
         boundaries: obstacles with the interface of `torch_mpm.boundaries`, applied in order.
         transfer: "apic" (Jiang et al. 2015), "pic", or "flip".
         flip: share of FLIP in [0, 1] that "apic" or "pic" is blended with; 1 for transfer="flip".
@@ -137,7 +137,8 @@ class Step(nn.Module):
     def _blend_flip(self, blocks: Blocks, state: State, affine: Tensor | None, velocity: Tensor, v: Tensor) -> Tensor:
         """(1 − flip) v_pic + flip (v_p + Σ N_i (v_i − v_i before the forces)) (Zhu and Bridson 2005)."""
         # P2G of the step has the impulse of the stress in it already, which is part of the change.
-        before = grid_update(blocks, p2g(blocks, state.x, state.mass, state.v, affine))
+        mirrors = None if self.walls is None else self.walls.mirrors()
+        before = grid_update(blocks, p2g(blocks, state.x, state.mass, state.v, affine), walls=mirrors)
         change, _, _ = gather(blocks, state.x, velocity - before)
         return (1 - self.flip) * v + self.flip * (state.v + change)
 

@@ -10,13 +10,11 @@ solution:
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 
 import torch
 from torch import Tensor
 
 import torch_mpm as mpm
-from torch_mpm.grid import PADDING
 
 AMPLITUDE = 0.05
 E, NU, DENSITY = 1e4, 0.3, 1.0
@@ -80,30 +78,3 @@ def initial_state(solution: Solution, velocity_time: float) -> mpm.State:
         C=torch.diag_embed(solution.velocity_gradient(velocity_time, 0)),
         F=torch.diag_embed(solution.stretch(0)),
     )
-
-
-def mirror(blocks: mpm.Blocks, velocity: Tensor, mass: Tensor, dt: float) -> Tensor:
-    """Node velocities as if the particles had mirror images beyond the walls: a slip wall without error of its own.
-
-    Mass and momentum of a node beyond a wall are added to its image inside, whose velocity it then takes.
-    """
-    nodes = blocks.to_dense(torch.cat([mass[:, None], mass[:, None] * velocity], 1))
-    for outside, inside, sign in _images(blocks.grid, nodes, 1):
-        inside += sign * outside
-    velocity = torch.where(nodes[..., :1] > 0, nodes[..., 1:] / nodes[..., :1], 0)
-    for outside, inside, sign in _images(blocks.grid, velocity, 0):
-        outside.copy_(sign * inside)
-    return blocks.from_dense(velocity)
-
-
-def _images(grid: mpm.Grid, dense: Tensor, first: int) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
-    """Layers of nodes at or beyond a wall and their images, as views, and the sign that reflection gives each channel.
-
-    Axis by axis, so that edges and corners are reflected more than once. The vector's channels begin at `first`.
-    """
-    for axis in range(grid.dim):
-        sign = torch.ones(dense.shape[-1], dtype=dense.dtype)
-        sign[first + axis] = -1
-        for wall, outward in ((PADDING, -1), (grid.nodes[axis] - 1 - PADDING, 1)):
-            for k in range(PADDING):
-                yield dense.select(1 + axis, wall + outward * k), dense.select(1 + axis, wall - outward * k), sign

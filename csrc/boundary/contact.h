@@ -6,7 +6,7 @@
 
 namespace mpm {
 
-enum class Contact : int { open = 0, sticky = 1, slip = 2, separate = 3 };
+enum class Contact : int { open = 0, sticky = 1, slip = 2, separate = 3, mirror = 4 };
 
 inline namespace TORCH_MPM_ISA {
 

@@ -14,13 +14,13 @@ namespace {
 
 #define MPM_GRID_UPDATE_SCHEMA                                                                               \
   "Tensor nodes, Tensor? gravity, Tensor? scene_dt, float dt, int[] wall_kind, float[] wall_plane, float[] " \
-  "wall_friction, Tensor block, float dx, float[] lower, int[] blocks"
+  "wall_friction, Tensor table, Tensor block, float dx, float[] lower, int[] blocks"
 #define MPM_GRID_UPDATE_PARAMETERS                                                                       \
   const Tensor &nodes, const OptionalTensor &gravity, const OptionalTensor &scene_dt, double dt,         \
       std::vector<int64_t> wall_kind, std::vector<double> wall_plane, std::vector<double> wall_friction, \
-      const Tensor &block, double dx, std::vector<double> lower, std::vector<int64_t> blocks
+      const Tensor &table, const Tensor &block, double dx, std::vector<double> lower, std::vector<int64_t> blocks
 #define MPM_GRID_UPDATE_ARGUMENTS \
-  nodes, gravity, scene_dt, dt, wall_kind, wall_plane, wall_friction, block, dx, lower, blocks
+  nodes, gravity, scene_dt, dt, wall_kind, wall_plane, wall_friction, table, block, dx, lower, blocks
 
 // Calls f.operator()<T, D>() for the dtype and dimension of node rows.
 template <class F>
@@ -73,8 +73,7 @@ Walls<T, D> walls(const std::vector<int64_t>& kind, const std::vector<double>& p
   Walls<T, D> w;
   for (int face = 0; face < 2 * D; face++) {
     const int64_t k = kind.empty() ? int64_t(Contact::open) : kind[face];
-    STD_TORCH_CHECK(k >= int64_t(Contact::open) && k <= int64_t(Contact::separate), "wall_kind must be 0 to 3, got ",
-                    k);
+    STD_TORCH_CHECK(k >= int64_t(Contact::open) && k <= int64_t(Contact::mirror), "wall_kind must be 0 to 4, got ", k);
     const bool open = k == int64_t(Contact::open);
     w.set(face, Contact(k), open ? 0 : friction[face], open ? 0 : plane[face], dx, lower[face / 2]);
   }
@@ -90,13 +89,14 @@ GridUpdateArguments<T, D> grid_update_arguments(MPM_GRID_UPDATE_PARAMETERS) {
   a.block = int_pointer(block, "block", nodes, a.capacity);
   STD_TORCH_CHECK(nodes.size(0) == node_count<D>(block), "nodes must have 4^D rows per entry of block");
   a.nodes = rows<T, D>(nodes, "nodes", nodes);
-  a.block_count = INT32_MAX;
+  a.table = int_pointer(table, "table", nodes, -1);
+  a.block_count = int(std::min<int64_t>(INT32_MAX, table.numel()));
   if (has(gravity)) {
     STD_TORCH_CHECK(gravity->dim() == 2, "gravity must have shape [B, D]");
     const int64_t scenes = gravity->size(0);
     a.gravity = scene_values<T>(gravity, "gravity", nodes, {scenes, D});
     a.scene_dt = scene_values<T>(scene_dt, "scene_dt", nodes, {scenes});
-    a.block_count = int(std::min<int64_t>(INT32_MAX, scenes * a.geometry.blocks_per_scene));
+    a.block_count = int(std::min<int64_t>(a.block_count, scenes * a.geometry.blocks_per_scene));
   }
   a.dt = dt;
   a.walls = walls<T, D>(wall_kind, wall_plane, wall_friction, dx, lower);

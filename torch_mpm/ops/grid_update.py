@@ -14,7 +14,7 @@ from ..grid import BLOCK_WIDTH, Blocks, Grid
 from ..reference import grid_update as reference
 from .arguments import differentiate, refuse_vmap, split_dt
 
-CONTACT_KINDS = {"open": 0, "sticky": 1, "slip": 2, "separate": 3}  # csrc/boundary/contact.h
+CONTACT_KINDS = {"open": 0, "sticky": 1, "slip": 2, "separate": 3, "mirror": 4}  # csrc/boundary/contact.h
 
 
 def grid_update(
@@ -34,8 +34,8 @@ def grid_update(
         walls: see `torch_mpm.Walls`; None for open faces.
 
     Returns:
-        Velocity [N, D] [m/s], a view of rows [mass, velocity] with stride 1 + D. Zero for nodes without mass, on which
-        neither gravity nor walls act, and for rows of unused blocks.
+        Velocity [N, D] [m/s], a view of rows [mass, velocity] with stride 1 + D. Zero for nodes without mass (also in
+        their mirror images), on which neither gravity nor walls act, and for rows of unused blocks.
 
     Raises:
         ValueError, TypeError: for wrong shapes, dtypes, devices, or dt ≤ 0.
@@ -65,6 +65,7 @@ def grid_update(
         [CONTACT_KINDS[face.kind] for face in faces],
         [face.plane for face in faces],
         [face.friction for face in faces],
+        blocks.table,
         blocks.block,
         grid.dx,
         grid.lower,
@@ -90,7 +91,7 @@ def _fake(nodes, *arguments):
 
 
 @torch.library.register_fake("torch_mpm::grid_update_backward")
-def _backward_fake(grad, wants_change, nodes, gravity, scene_dt, dt, kind, plane, friction, block, *geometry):
+def _backward_fake(grad, wants_change, nodes, gravity, scene_dt, dt, kind, plane, friction, table, block, *geometry):
     return nodes.new_empty(nodes.shape), nodes.new_empty(block.shape[0] if wants_change else 0, nodes.shape[1] - 1)
 
 
@@ -98,16 +99,16 @@ def _backward_fake(grad, wants_change, nodes, gravity, scene_dt, dt, kind, plane
 
 
 def _setup(ctx: Any, inputs: Any, output: Any) -> None:
-    nodes, gravity, scene_dt, dt, kind, plane, friction, block, *geometry = inputs
-    ctx.save_for_backward(nodes, gravity, scene_dt, block)
+    nodes, gravity, scene_dt, dt, kind, plane, friction, table, block, *geometry = inputs
+    ctx.save_for_backward(nodes, gravity, scene_dt, table, block)
     ctx.dt, ctx.walls, ctx.geometry = dt, (kind, plane, friction), geometry
 
 
 def _backward(ctx, grad):
-    nodes, gravity, scene_dt, block = ctx.saved_tensors
+    nodes, gravity, scene_dt, table, block = ctx.saved_tensors
     need_nodes, need_gravity, need_dt, *_ = ctx.needs_input_grad
     grad_nodes, change = torch.ops.torch_mpm.grid_update_backward(
-        grad, need_gravity or need_dt, nodes, gravity, scene_dt, ctx.dt, *ctx.walls, block, *ctx.geometry
+        grad, need_gravity or need_dt, nodes, gravity, scene_dt, ctx.dt, *ctx.walls, table, block, *ctx.geometry
     )
     grad_gravity = grad_dt = None
     if need_gravity or need_dt:
@@ -116,7 +117,7 @@ def _backward(ctx, grad):
             grad_gravity = ctx.dt * (change if scene_dt is None else scene_dt[:, None] * change)
         if need_dt:
             grad_dt = ctx.dt * (gravity * change).sum(1)
-    return (grad_nodes if need_nodes else None, grad_gravity, grad_dt) + (None,) * 8
+    return (grad_nodes if need_nodes else None, grad_gravity, grad_dt) + (None,) * 9
 
 
 def _sum_by_scene(change: Tensor, block: Tensor, blocks: list[int], scenes: int) -> Tensor:
@@ -128,14 +129,14 @@ def _sum_by_scene(change: Tensor, block: Tensor, blocks: list[int], scenes: int)
 
 
 def _backward_setup(ctx: Any, inputs: Any, output: Any) -> None:
-    grad, wants_change, nodes, gravity, scene_dt, dt, kind, plane, friction, block, *geometry = inputs
-    ctx.save_for_backward(grad, nodes, gravity, scene_dt, block)
+    grad, wants_change, nodes, gravity, scene_dt, dt, kind, plane, friction, table, block, *geometry = inputs
+    ctx.save_for_backward(grad, nodes, gravity, scene_dt, table, block)
     ctx.wants_change, ctx.dt, ctx.walls, ctx.geometry = wants_change, dt, (kind, plane, friction), geometry
 
 
 def _double_backward(ctx, grad_grad_nodes, grad_change):
-    *tensors, block = ctx.saved_tensors
-    blocks = _blocks_of(block, *ctx.geometry)
+    *tensors, table, block = ctx.saved_tensors
+    blocks = _blocks_of(table, block, *ctx.geometry)
     names = list(CONTACT_KINDS)
     faces = [Face(names[kind], plane, friction) for kind, plane, friction in zip(*ctx.walls, strict=True)]
 
@@ -150,15 +151,15 @@ def _double_backward(ctx, grad_grad_nodes, grad_change):
 
     given = [grad_grad_nodes, grad_change] if ctx.wants_change else [grad_grad_nodes]
     grad, nodes, gravity, scene_dt = differentiate(adjoint, tensors, given)
-    return (grad, None, nodes, gravity, scene_dt) + (None,) * 8
+    return (grad, None, nodes, gravity, scene_dt) + (None,) * 9
 
 
-def _blocks_of(block: Tensor, dx: float, lower: list[float], per_axis: list[int]) -> Blocks:
+def _blocks_of(table: Tensor, block: Tensor, dx: float, lower: list[float], per_axis: list[int]) -> Blocks:
     """As much of a `Blocks` as the reference reads."""
     grid = Grid.__new__(Grid)
     grid.dx, grid.lower, grid.blocks, grid.dim = dx, tuple(lower), tuple(per_axis), len(lower)
     grid.nodes_per_block = BLOCK_WIDTH**grid.dim
-    return Blocks(grid, block, block, block, block, block, block, None)
+    return Blocks(grid, table, block, block, block, block, block, None)
 
 
 torch.library.register_autograd("torch_mpm::grid_update", _backward, setup_context=_setup)

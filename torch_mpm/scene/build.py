@@ -97,6 +97,7 @@ def build(scene: Any, device: torch.device) -> Built:
             material.append(torch.full((len(points),), mixture.number(index, body.material), dtype=torch.int32))
         nozzles += _nozzles(scene, entry, index, mixture, dtype, device, problems)
         obstacles += [obstacle(o, index if len(entries) > 1 else None) for o in entry.obstacle]
+    walls = _walls(words, grid, problems)
     if problems:
         raise SceneError(problems)
     dim = len(words.lower)
@@ -116,7 +117,7 @@ def build(scene: Any, device: torch.device) -> Built:
         grid,
         mixture.law(dtype, device),
         gravity=_gravity(entries, dtype, device),
-        walls=boundaries.Walls(words.walls, friction=words.friction) if words.walls else None,
+        walls=walls,
         boundaries=obstacles,
         transfer=scene.transfer,
         flip=scene.flip,
@@ -249,7 +250,18 @@ def _spin_matrix(spin: float | Sequence[float], dim: int) -> Tensor:
     return torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=torch.float64)
 
 
-# ---- obstacles
+# ---- walls and obstacles
+
+
+def _walls(words: schema.Grid, grid: Grid, problems: list[str]) -> boundaries.Walls | None:
+    if words.walls is None:
+        return None
+    walls = boundaries.Walls(words.walls, friction=words.friction)
+    try:
+        walls.faces(grid)
+    except ValueError as error:
+        problems.append(f"grid.walls: {error}")
+    return walls
 
 
 def obstacle(words: Any, scene: int | None) -> boundaries.Obstacle:

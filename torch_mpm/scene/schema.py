@@ -11,7 +11,7 @@ NotNegative = Annotated[float, Field(ge=0)]
 Vector = Annotated[tuple[float, ...], Field(min_length=2, max_length=3)]
 Spin = float | Annotated[tuple[float, ...], Field(min_length=3, max_length=3)]
 Contact = Literal["slip", "sticky", "separate"]
-Wall = Literal["slip", "sticky", "separate", "open"]
+Wall = Literal["slip", "sticky", "separate", "mirror", "open"]
 
 
 class Model(BaseModel):
@@ -35,7 +35,8 @@ class Grid(Model):
     kernel: Literal["quadratic", "cubic"] = "quadratic"
     """B-spline that joins particles and nodes"""
     walls: Wall | list[Wall | tuple[Wall, Wall]] | None = "slip"
-    """what the faces of the domain do: one kind, or a list with one kind or pair (lower, upper) per axis"""
+    """what the faces of the domain do: one kind, or a list with one kind or pair (lower, upper) per axis; a mirror is a
+    frictionless wall of second order, and needs a domain of whole or half cells"""
     friction: NotNegative = 0.0
     """Coulomb friction coefficient of the walls"""
 
