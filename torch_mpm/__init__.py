@@ -10,9 +10,11 @@ from .errors import GridOverflowError, SimulationError
 from .grid import Blocks, Grid
 from .materials import CustomLaw, Material, Mixture, NeoHookean, WeaklyCompressible
 from .ops import HeatSolve, advance, g2p, gather, grid_update, heat_cg, p2g, polar, quartic_return_map, scatter, svd3
+from .parameters import Table
 from .sand import QuarticSand
 from .state import State
 from .step import Step, rollout
+from .thermal import Melting, ThermalExpansion
 from .trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -28,6 +30,7 @@ __all__ = [
     "GridOverflowError",
     "HeatSolve",
     "Material",
+    "Melting",
     "Mixture",
     "NeoHookean",
     "Plane",
@@ -36,6 +39,8 @@ __all__ = [
     "Sphere",
     "State",
     "Step",
+    "Table",
+    "ThermalExpansion",
     "Trajectory",
     "Walls",
     "WeaklyCompressible",

@@ -314,6 +314,15 @@ class Obstacle:
         relative = torch.where(touching, velocity if surface_velocity is None else velocity - surface_velocity, 0)
         return velocity + contact_change(relative, normal, self.kind, friction)
 
+    def contains(self, positions: Tensor, scene: Tensor | None, time: float | Tensor) -> Tensor:
+        """Which positions are inside, bool [N]; arguments as `apply`."""
+        if positions.shape[0] == 0 or self._absent(scene, time):
+            return torch.zeros(positions.shape[:1], dtype=torch.bool, device=positions.device)
+        pose = self.pose(time, positions)
+        body = positions - _per_node(pose.centre, 1, scene)
+        distance, _ = self.surface(_transform(_per_node(pose.rotation, 2, scene).mT, body), scene)
+        return self._touching(distance, positions, scene, time)
+
     def pose(self, time: float | Tensor, like: Tensor | None = None) -> Pose:
         """Centre and rotation at a time [s], a number or a tensor [] or [B]; with the dtype and device of `like`."""
         like = torch.empty(0, dtype=torch.float64) if like is None else like

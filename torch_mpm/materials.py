@@ -2,7 +2,9 @@
 
 A law is a `Material`. Those compiled in csrc/materials take parameters that are numbers or tensors of shape [], [1],
 [B] (per scene) or [P] (per particle, in the order of `state.ids` where particles were reordered; also where P = B), and
-pass gradients to them. `CustomLaw` makes a law of any module, `Mixture` combines several in one state.
+pass gradients to them. A parameter may also be a function of temperature, [P] -> [P] (`Table`, an `nn.Module`, any
+torch code), evaluated at state.temperature. `CustomLaw` makes a law of any module, `Mixture` combines several in one
+state.
 """
 
 from __future__ import annotations
@@ -17,13 +19,12 @@ from torch import Tensor, nn
 from .errors import shape_of
 from .ops import material as ops
 from .ops.arguments import soa_empty
+from .parameters import Value, With, evaluate
 from .reference.material import per_particle
 from .state import _take
 
 if TYPE_CHECKING:
     from .state import State
-
-Value = float | Tensor
 
 
 class Material(nn.Module):
@@ -32,13 +33,20 @@ class Material(nn.Module):
     Attributes:
         state_fields: fields of the state that a step moves for the law: "F" or "J".
         viscous: whether the stress reads state.C, so that a step has to keep it.
+        dissipation: whether somebody wants "dissipated" from `update`, which costs something. A step with plastic
+            heating sets it on its law and on those inside.
     """
 
     state_fields: tuple[str, ...] = ("F",)
     viscous: bool = False
+    dissipation: bool = False
 
     def update(self, state: State) -> tuple[dict[str, Tensor], Tensor]:
-        """Fields that the law changes (plastic laws: F at the yield surface), and Kirchhoff stress [P, D, D] [Pa]."""
+        """Fields that the law changes (plastic laws: F at the yield surface), and Kirchhoff stress [P, D, D] [Pa].
+
+        A law that dissipates adds "dissipated" to the fields where `dissipation` is set: the energy that this step's
+        plastic flow turned into heat, per rest volume [P] [J/m³].
+        """
         raise NotImplementedError
 
     def stress(self, state: State) -> Tensor:
@@ -82,6 +90,7 @@ class CompiledLaw(Material):
     def __init__(self) -> None:
         super().__init__()
         self._cached: tuple[Any, list[Tensor]] | None = None
+        self._functions = False
 
     def values(self) -> Sequence[Value]:
         """The parameters of the compiled law, in its order."""
@@ -101,9 +110,10 @@ class CompiledLaw(Material):
         return ops.material_stiffness(self.name, *self._arguments(state), scene=state.scene, dim=state.x.shape[1])
 
     def _store(self, name: str, value: Value) -> None:
-        """Keep a parameter as number, buffer or nn.Parameter, so that `.to` moves it and optimizers find it."""
+        """Keep a parameter as number, buffer, nn.Parameter or function, so that `.to` and optimizers find it."""
         if not isinstance(value, Tensor):
-            setattr(self, name, float(value))
+            setattr(self, name, value if callable(value) else float(value))
+            self._functions = self._functions or callable(value)
         elif isinstance(value, nn.Parameter):
             self.register_parameter(name, value)
         else:
@@ -121,6 +131,9 @@ class CompiledLaw(Material):
 
         Kept from call to call while nothing has changed and none requires grad.
         """
+        if self._functions:
+            in_order: Any = With(state, ids=None)  # which evaluated parameters already are
+            return self._at_temperature(state)._convert(in_order)
         tensors = [*self.parameters(recurse=False), *self.buffers(recurse=False)]
         if torch.compiler.is_compiling() or any(t.requires_grad for t in tensors):
             return self._convert(state)
@@ -129,6 +142,16 @@ class CompiledLaw(Material):
         if self._cached is None or not _same(self._cached[0], key):
             self._cached = (key, self._convert(state))
         return self._cached[1]
+
+    def _at_temperature(self, state: State) -> CompiledLaw:
+        """The law with its parameters at the temperature of each particle, in the order of the state."""
+        law: CompiledLaw = object.__new__(type(self))
+        law.__dict__ = {**self.__dict__, "_parameters": {}, "_buffers": {}, "_modules": {}}
+        stored = {**vars(self), **self._parameters, **self._buffers, **self._modules}
+        for name, value in stored.items():
+            if isinstance(value, Tensor) or (callable(value) and not name.startswith("_")):
+                law.__dict__[name] = evaluate(name, value, state)
+        return law
 
     def _convert(self, state: State) -> list[Tensor]:
         x, particles = state.x, getattr(state, "particles", state.x.shape[0])
@@ -149,6 +172,8 @@ def _same(a: Any, b: Any) -> bool:
 
 
 def _check_value(name: str, value: Value, expected: str, holds: Callable[[Any], Any]) -> Value:
+    if callable(value) and not isinstance(value, Tensor):
+        return value  # a function of temperature
     if isinstance(value, Tensor):
         if value.dim() > 1 or value.numel() == 0 or not value.is_floating_point():
             raise ValueError(
@@ -239,7 +264,7 @@ class WeaklyCompressible(CompiledLaw):
         self._store("bulk_modulus", bulk_modulus)
         self._store("gamma", _check_value("gamma", gamma, "positive", lambda v: v > 0))
         self._store("eta", viscosity)
-        self.viscous = isinstance(viscosity, Tensor) or viscosity > 0
+        self.viscous = isinstance(viscosity, Tensor) or callable(viscosity) or viscosity > 0
         self.name = "viscous_fluid" if self.viscous else "weakly_compressible"
 
     def values(self) -> Sequence[Value]:
@@ -273,7 +298,7 @@ class CustomLaw(Material):
         self,
         function: Callable[[Tensor], Any],
         state_field: str = "F",
-        stiffness: Value | Callable[[State], Tensor] | None = None,
+        stiffness: float | Tensor | Callable[[State], Tensor] | None = None,
     ) -> None:
         super().__init__()
         if state_field not in ("F", "J"):
@@ -296,7 +321,7 @@ class CustomLaw(Material):
     def stiffness(self, state: State) -> Tensor:
         if self._stiffness is None:
             return super().stiffness(state)
-        value = self._stiffness(state) if callable(self._stiffness) else self._stiffness
+        value: Any = self._stiffness(state) if callable(self._stiffness) else self._stiffness
         return torch.as_tensor(value, dtype=state.x.dtype, device=state.x.device).expand(state.x.shape[0])
 
     def invalid(self, state: State) -> Tensor:
@@ -337,7 +362,8 @@ class Mixture(Material):
             fields, part_stress = law.update(part)
             stress = stress.index_copy(0, part.index, part_stress)
             for name, value in fields.items():
-                changes[name] = changes.get(name, getattr(state, name)).index_copy(0, part.index, value)
+                before = torch.zeros_like(state.mass) if name == "dissipated" else getattr(state, name)
+                changes[name] = changes.get(name, before).index_copy(0, part.index, value)
         return changes, stress
 
     def energy_density(self, state: State) -> Tensor:
@@ -395,5 +421,8 @@ class _Part:
         value = getattr(self._state, name)
         if isinstance(value, Tensor):
             value = _take(value, self.index)
+            setattr(self, name, value)
+        elif name == "extra":
+            value = {key: _take(t, self.index) for key, t in value.items()}
             setattr(self, name, value)
         return value

@@ -98,6 +98,7 @@ class Step(nn.Module):
         self.status = blocks.status
         grid.watch(blocks.status)
         fields, stress = self.law.update(state)
+        fields.pop("dissipated", None)
         affine = state.C if self.transfer == "apic" else None
         nodes = p2g(blocks, state.x, state.mass, state.v, affine, stress, state.volume, dt, self.stress_form)
         velocity = self._update_grid(blocks, nodes, state, dt)

@@ -1,0 +1,122 @@
+"""Parameters of materials: numbers, tensors per scene or particle, and functions of temperature."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor, nn
+
+from .errors import shape_of
+from .reference.material import per_particle
+
+if TYPE_CHECKING:
+    from .state import State
+
+Value = float | Tensor | Callable[[Tensor], Tensor]
+"""A parameter: a number; a tensor [], [1], [B] or [P]; or a function of the temperature [P] [K] that returns [P]."""
+
+
+class Table(nn.Module):
+    """Piecewise linear function of temperature, constant beyond its ends; differentiable by temperature and values.
+
+    Args:
+        temperature: at least two increasing numbers [K], relative to the reference of the simulation.
+        value: as many numbers, or a tensor [K] that may require grad.
+
+    Raises:
+        ValueError: for temperatures that do not increase, numbers that are not finite, or different lengths.
+    """
+
+    temperature: Tensor
+    value: Tensor
+
+    def __init__(self, temperature: Sequence[float] | Tensor, value: Sequence[float] | Tensor) -> None:
+        super().__init__()
+        knots = torch.as_tensor(temperature, dtype=torch.float64).detach()
+        values = value if isinstance(value, Tensor) else torch.tensor(value, dtype=torch.float64)
+        if knots.dim() != 1 or len(knots) < 2 or values.shape != knots.shape:
+            raise ValueError(
+                "temperature and value of a table must be lists of one length, 2 or more, "
+                f"got {shape_of(knots)} and {shape_of(values)}"
+            )
+        if not bool((knots.diff() > 0).all() and knots.isfinite().all()):
+            raise ValueError(f"temperature of a table must increase, got {knots.tolist()}")
+        if not bool(values.detach().isfinite().all()):
+            raise ValueError(f"value of a table must be finite, got {values.tolist()}")
+        self.register_buffer("temperature", knots)
+        if isinstance(values, nn.Parameter):
+            self.value = values
+        else:
+            self.register_buffer("value", values)
+
+    def forward(self, temperature: Tensor) -> Tensor:
+        """Values at temperatures of any shape."""
+        knots, values = (t.to(temperature) for t in (self.temperature, self.value))
+        left = torch.bucketize(temperature.detach().contiguous(), knots[1:-1].contiguous())
+        share = ((temperature - knots[left]) / knots.diff()[left]).clamp(0, 1)
+        return torch.lerp(values[left], values[left + 1], share)
+
+
+def evaluate(name: str, value: Value, state: State) -> float | Tensor:
+    """A parameter as a number, a tensor of one element, or [P] in the particle order of the state.
+
+    Raises:
+        ValueError: where a tensor or what a function returns has another shape, or is on another device.
+    """
+    P = state.x.shape[0]
+    if not isinstance(value, Tensor):
+        if not callable(value):
+            return value
+        temperature = needed_temperature(state)
+        result = value(temperature)
+        if not isinstance(result, Tensor) or result.shape != temperature.shape:
+            raise ValueError(
+                f"{name} as a function of temperature must return shape [P] = [{P}], got {shape_of(result)}"
+            )
+        return result
+    value = value.to(state.x.dtype)
+    if value.numel() == 1:
+        return value.reshape(())
+    if value.device != state.x.device:
+        raise ValueError(f"{name} must be on the device of x, {state.x.device}, got {value.device}")
+    particles = getattr(state, "particles", P)
+    if value.shape == (particles,):
+        return value if state.ids is None else value.index_select(0, state.ids)
+    if value.dim() != 1 or state.scene is None:
+        raise ValueError(f"{name} must have shape [], [1], [B] or [P] = [{particles}], got {shape_of(value)}")
+    return per_particle(value, state.scene, P)
+
+
+def needed_temperature(state: State) -> Tensor:
+    """The temperature of a state [P] [K].
+
+    Raises:
+        ValueError: where there is none.
+    """
+    temperature: Tensor | None = state.temperature
+    if temperature is None:
+        raise ValueError("state.temperature is None: set it to the temperature of each particle [P] [K]")
+    return temperature
+
+
+class With:
+    """A state, or part of one, with some fields changed."""
+
+    def __init__(self, state: Any, **changes: Any) -> None:
+        self.__dict__.update(changes)
+        self._state = state
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._state, name)
+
+
+def store(module: nn.Module, name: str, value: Any) -> None:
+    """Keep a parameter as number, buffer, nn.Parameter or module, so that `.to` moves it and optimizers find it."""
+    if isinstance(value, nn.Parameter):
+        module.register_parameter(name, value)
+    elif isinstance(value, Tensor):
+        module.register_buffer(name, value)
+    else:
+        setattr(module, name, value if callable(value) else float(value))
