@@ -3,11 +3,12 @@
 from typing import TYPE_CHECKING, Any
 
 from . import _library as _library
-from . import ops, seed
+from . import heat_boundaries, ops, seed
 from .boundaries import SDF, Box, Capsule, Plane, Sphere, Walls
 from .cfl import stable_dt
 from .errors import GridOverflowError, SimulationError
 from .grid import Blocks, Grid
+from .heat import Heat
 from .materials import CustomLaw, Material, Mixture, NeoHookean, WeaklyCompressible
 from .ops import HeatSolve, advance, g2p, gather, grid_update, heat_cg, p2g, polar, quartic_return_map, scatter, svd3
 from .parameters import Table
@@ -28,6 +29,7 @@ __all__ = [
     "CustomLaw",
     "Grid",
     "GridOverflowError",
+    "Heat",
     "HeatSolve",
     "Material",
     "Melting",
@@ -48,6 +50,7 @@ __all__ = [
     "g2p",
     "gather",
     "grid_update",
+    "heat_boundaries",
     "heat_cg",
     "ops",
     "p2g",

@@ -13,6 +13,7 @@ from .boundaries import Walls
 from .cfl import stable_dt
 from .errors import GridOverflowError, SimulationError
 from .grid import Blocks, Grid
+from .heat import Heat
 from .materials import Material
 from .ops import advance, g2p, gather, grid_update, p2g
 from .state import State, identity_deformation
@@ -42,8 +43,9 @@ class Step(nn.Module):
         stress_form: "mls" (Hu et al. 2018; F moves with C) or "gradient" (force −V τ ∇N; F moves with Σ v_i ∇N_i).
         on_grid: called as `velocity = on_grid(blocks, velocity, mass, dt)` with node tensors [N, D] and [N] after the
             boundaries: a network, a controller, a field of force.
+        heat: conduction of heat in the same particles, see `Heat`; the state then needs a temperature.
 
-    A step without boundaries, walls, gravity or FLIP does not pay for them.
+    A step without boundaries, walls, gravity, FLIP or heat does not pay for them.
 
     Raises:
         ValueError: for a wrong argument.
@@ -60,6 +62,7 @@ class Step(nn.Module):
         flip: float = 0.0,
         stress_form: str = "mls",
         on_grid: Callable[[Blocks, Tensor, Tensor, float | Tensor], Tensor] | None = None,
+        heat: Heat | None = None,
     ) -> None:
         super().__init__()
         if transfer not in TRANSFERS:
@@ -77,6 +80,11 @@ class Step(nn.Module):
         self.flip = 1.0 if transfer == "flip" else float(flip)
         self.stress_form = stress_form
         self.on_grid = on_grid
+        self.heat = heat
+        if heat is not None and heat.plastic_heating:
+            for part in law.modules():
+                if isinstance(part, Material):
+                    part.dissipation = True
         self.status: Tensor | None = None
         """Status of all steps so far, int32 [8] on the device of the particles; `check` reads it."""
         self._gravity_tensor: Tensor | None = None
@@ -98,7 +106,7 @@ class Step(nn.Module):
         self.status = blocks.status
         grid.watch(blocks.status)
         fields, stress = self.law.update(state)
-        fields.pop("dissipated", None)
+        dissipated = fields.pop("dissipated", None)
         affine = state.C if self.transfer == "apic" else None
         nodes = p2g(blocks, state.x, state.mass, state.v, affine, stress, state.volume, dt, self.stress_form)
         velocity = self._update_grid(blocks, nodes, state, dt)
@@ -108,10 +116,11 @@ class Step(nn.Module):
         # Particles move with the grid whatever velocity they keep, so that FLIP's noise does not reach the positions.
         v = self._blend_flip(blocks, state, affine, velocity, grid_v) if self.flip else grid_v
         deformed = {name: fields.get(name, getattr(state, name)) for name in ("F", "J")}
-        x, F, J = advance(
-            state.x, grid_v, dt, grad_v if gradient_form else C, deformed["F"], deformed["J"], scene, grid.scenes
-        )
-        changes = {**fields, "F": F, "J": J}
+        motion = grad_v if gradient_form else C
+        x, F, J = advance(state.x, grid_v, dt, motion, deformed["F"], deformed["J"], scene, grid.scenes)
+        changes: dict[str, Any] = {**fields, "F": F, "J": J}
+        if self.heat is not None:
+            changes |= self.heat.update(blocks, state, dt, motion, dissipated)
         kept_C = C if self.transfer == "apic" or self.law.viscous else None
         return state.replace(x=x, v=v, C=kept_C, time=state.time + dt, **changes)
 
@@ -122,7 +131,8 @@ class Step(nn.Module):
             changes["F"] = identity_deformation(state.x)
         if "J" in self.law.state_fields and state.J is None:
             changes["J"] = torch.ones_like(state.mass)
-        return state.replace(**changes) if changes else state
+        state = state.replace(**changes) if changes else state
+        return state if self.heat is None else self.heat.prepare(state)
 
     def _update_grid(self, blocks: Blocks, nodes: Tensor, state: State, dt: float | Tensor) -> Tensor:
         velocity = grid_update(blocks, nodes, self._gravity(state.x), dt, self.walls)
@@ -162,17 +172,22 @@ class Step(nn.Module):
 
         Raises:
             GridOverflowError: if more blocks were active than the grid has room for.
-            SimulationError: if a particle left the grid or is not finite, or if the law has no meaning for a particle's
-                deformation (turned inside out, J ≤ 0); such a particle has zero stress from then on.
+            SimulationError: if a particle left the grid or is not finite, if heat was not solved, or if the law has no
+                meaning for a particle's deformation (turned inside out, J ≤ 0); such a particle has zero stress from
+                then on.
         """
         if self.status is not None:
             check_status(self.status, self.grid)
+        if self.heat is not None:
+            self.heat.check()
         if state is not None:
             check_deformation(self.law, self.prepare(state))
 
     def reset(self) -> None:
         """Forget the status of the steps so far."""
         self.status = None
+        if self.heat is not None:
+            self.heat.reset()
 
 
 def check_status(status: Tensor, grid: Grid) -> None:

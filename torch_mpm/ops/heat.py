@@ -36,6 +36,7 @@ def heat_cg(
     tolerance: float | Tensor = 1e-5,
     max_iterations: int | Tensor = 200,
     adjoint_tolerance: float = 1e-6,
+    relative_tolerance: float = 0.0,
 ) -> HeatSolve:
     """Implicit step of the heat equation on the active nodes, by matrix-free conjugate gradients.
 
@@ -58,6 +59,8 @@ def heat_cg(
             a number, or a tensor of shape [], [1] or [B].
         max_iterations: a number, or an integer tensor of shape [], [1] or [B].
         adjoint_tolerance: of the backward solve, relative to the size of its right side.
+        relative_tolerance: a residual of this share of the first one will do too. The changes of many small steps add
+            up, so that a tolerance in kelvin alone stops too early there.
 
     Returns:
         HeatSolve(increment, iterations, residual, converged). The increment is zero on fixed nodes, on nodes without
@@ -85,11 +88,14 @@ def heat_cg(
         raise TypeError(f"max_iterations must be an integer tensor, got {scene_limit.dtype}")
     if not 0 < adjoint_tolerance < 1:
         raise ValueError(f"adjoint_tolerance must be between 0 and 1, got {adjoint_tolerance}")
+    if not 0 <= relative_tolerance < 1:
+        raise ValueError(f"relative_tolerance must be in [0, 1), got {relative_tolerance}")
     return HeatSolve(
         *torch.ops.torch_mpm.heat_cg(
             x, conductance, capacity, theta, source, exchange, fixed, scene_dt, number,
-            None if scene_tolerance is None else scene_tolerance.to(x.dtype).contiguous(), float(least), 0.0,
-            None if scene_limit is None else scene_limit.int().contiguous(), int(most), adjoint_tolerance,
+            None if scene_tolerance is None else scene_tolerance.to(x.dtype).contiguous(), float(least),
+            float(relative_tolerance), None if scene_limit is None else scene_limit.int().contiguous(), int(most),
+            adjoint_tolerance,
             *blocks.topology,
         )
     )  # fmt: skip

@@ -1,0 +1,283 @@
+"""What heats and cools a body beside conduction: flux, convection, radiation, held temperatures, sources.
+
+Without any of these a body is insulated. Each acts on the nodes of an implicit step through `HeatNodes`; anything with
+a method `apply(nodes)` can stand in the list of a `Heat`. Quantities of a surface are joined to the nodes by points x_s
+with areas A_s (`Surface`), h_i = Σ_s A_s η_s N_i(x_s), or by the free surface of the particles (`FreeSurface`).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from .boundaries import Obstacle, _norm, _per_node
+from .errors import shape_of
+from .grid import BLOCK_WIDTH, PADDING, Blocks
+from .ops import scatter
+from .parameters import Value, evaluate
+from .reference.transfer import bspline
+
+if TYPE_CHECKING:
+    from .state import State
+
+STEFAN_BOLTZMANN = 5.670374419e-8
+"""σ [W/(m² K⁴)] (CODATA 2018)."""
+
+Number = float | Tensor
+Timed = Number | Callable[[float | Tensor], Number]
+"""A number, a tensor, or a function of the time [s] that returns one of them."""
+
+
+@dataclasses.dataclass
+class HeatNodes:
+    """The nodes of one implicit step, to which boundary terms add their part.
+
+    Attributes:
+        blocks: active blocks of the particles.
+        state: the particles before the step.
+        volume: their present volumes [P] [m³].
+        capacity: heat capacity of the nodes [N] [J/K]; zero where there is no matter.
+        theta: temperature of the nodes [N] [K], relative to `reference`.
+        reference: absolute temperature that temperatures are relative to [K].
+        source: heat into the nodes [N] [W], or None.
+        exchange: derivative of the heat that leaves them by their temperature [N] [W/K], or None.
+        fixed: nodes whose temperature is held at `held` [N] [K], bool [N], or None.
+    """
+
+    blocks: Blocks
+    state: State
+    volume: Tensor
+    capacity: Tensor
+    theta: Tensor
+    reference: float = 0.0
+    source: Tensor | None = None
+    exchange: Tensor | None = None
+    fixed: Tensor | None = None
+    held: Tensor | None = None
+
+    @property
+    def time(self) -> float | Tensor:
+        """[s]"""
+        return self.state.time
+
+    def scene(self) -> Tensor | None:
+        """Scene of each node, int32 [N]; None for one scene."""
+        return None if self.state.scene is None else self.blocks.node_scene()
+
+    def per_node(self, value: Timed) -> Number:
+        """A number, or a tensor [], [B] or [N], or a function of the time that returns one, as a number or [N]."""
+        value = value(self.time) if callable(value) and not isinstance(value, Tensor) else value
+        if not isinstance(value, Tensor) or value.shape == self.theta.shape:
+            return value
+        return _per_node(value.to(self.theta), 0, self.scene())
+
+    def add_source(self, power: Tensor) -> None:
+        """Heat [N] [W] that goes into the nodes."""
+        self.source = power if self.source is None else self.source + power
+
+    def add_exchange(self, coefficient: Tensor, ambient: Number) -> None:
+        """Heat coefficient (ambient − θ) with coefficient [N] [W/K], taken at the end of the step."""
+        self.exchange = coefficient if self.exchange is None else self.exchange + coefficient
+        self.add_source(coefficient * ambient)
+
+    def hold(self, where: Tensor, temperature: Number) -> None:
+        """Keep nodes, bool [N], at a temperature [K]; those held before stay as they are."""
+        value = torch.where(where, temperature, 0.0).to(self.theta)
+        if self.fixed is None or self.held is None:
+            self.fixed, self.held = where, value
+        else:
+            self.held = torch.where(self.fixed, self.held, value)
+            self.fixed = self.fixed | where
+
+
+# ---- surfaces
+
+
+class Surface:
+    """Points that stand for a surface.
+
+    Args:
+        points: x_s [S, D] [m].
+        area: A_s [m²] (m in 2-D): a number for each of them, or [S].
+        scene: scene of each point, int32 [S]; None where the grid has one scene.
+
+    A point gives to the nodes around it that have matter, in proportion to N_i(x_s), all of what it has; a point with
+    no matter around it gives nothing. Points stay where they are: replace `points` between steps if the surface moves.
+
+    Raises:
+        ValueError: for wrong shapes or a negative area.
+    """
+
+    def __init__(self, points: Tensor, area: Number, scene: Tensor | None = None) -> None:
+        if not isinstance(points, Tensor) or points.dim() != 2 or points.shape[1] not in (2, 3):
+            raise ValueError(f"points must have shape [S, 2] or [S, 3], got {shape_of(points)}")
+        if isinstance(area, Tensor) and area.shape not in ((), points.shape[:1]):
+            raise ValueError(f"area must be a number or have shape [S] = [{points.shape[0]}], got {shape_of(area)}")
+        if not bool((torch.as_tensor(area) >= 0).all()):
+            raise ValueError(f"area must not be negative, got {area}")
+        if scene is not None and scene.shape != points.shape[:1]:
+            raise ValueError(f"scene must have shape [S] = [{points.shape[0]}], got {shape_of(scene)}")
+        self.points, self.area, self.scene = points, area, scene
+
+    def integrate(self, nodes: HeatNodes, density: Timed) -> Tensor:
+        """∫ N_i density dA [N] of a density per area: a number, a tensor [] or [S], or a function of the time."""
+        density = density(nodes.time) if callable(density) and not isinstance(density, Tensor) else density
+        points = self.points.to(nodes.theta)
+        rows, weight = node_weights(nodes.blocks, points, self.scene)
+        weight = weight * (nodes.capacity.detach()[rows] > 0)
+        total = weight.sum(1, keepdim=True)
+        weight = torch.where(total > 0, weight / torch.where(total > 0, total, 1), 0)
+        amount = torch.as_tensor(self.area, dtype=points.dtype, device=points.device) * density
+        given = amount.expand(len(points))[:, None] * weight
+        return torch.zeros_like(nodes.theta).index_add(0, rows.reshape(-1), given.reshape(-1))
+
+
+class FreeSurface:
+    """The surface of the particles wherever it is now: the area of a node is |Σ_p V_p ∇N_i(x_p)| = |∮ N_i n dA|.
+
+    Exact for a flat surface of evenly spread particles; disorder inside a body adds area that is not there, a share of
+    V/dx per node like that of the disorder. A side that touches an obstacle counts too.
+    """
+
+    def integrate(self, nodes: HeatNodes, density: Timed) -> Tensor:
+        """∫ N_i density dA [N] of a density per area: a number, a tensor [], [B] or [N], or a function of the time."""
+        x = nodes.state.x
+        P, D = x.shape
+        axes = torch.eye(D, dtype=x.dtype, device=x.device)
+        gradient = nodes.volume[:, None, None] * axes
+        return _norm(scatter(nodes.blocks, x, x.new_zeros(P, D), gradient=gradient)) * nodes.per_node(density)
+
+
+def node_weights(blocks: Blocks, x: Tensor, scene: Tensor | None) -> tuple[Tensor, Tensor]:
+    """Rows [S, K] of the nodes around any points [S, D], and their weights N_i [S, K], zero for inactive nodes."""
+    grid = blocks.grid
+    lower = torch.tensor(grid.lower, dtype=x.dtype, device=x.device)
+    cells = (x - lower) / grid.dx + PADDING
+    base = torch.floor(cells.detach() - (0.5 if grid.order == 2 else 1.0)).long()
+    offsets = torch.tensor(list(itertools.product(range(grid.order + 1), repeat=grid.dim)), device=x.device)
+    node = base[:, None] + offsets
+    weight = bspline(node - cells[:, None], grid.order).prod(-1)
+    extent = torch.tensor(grid.blocks, device=x.device) * BLOCK_WIDTH
+    inside = ((node >= 0) & (node < extent)).all(-1)
+    node = torch.where(inside[..., None], node, 0)
+    index = torch.zeros_like(node[..., 0]) if scene is None else scene.long()[:, None].expand(node.shape[:2])
+    local = torch.zeros_like(index)
+    for axis in range(grid.dim):
+        index = index * grid.blocks[axis] + node[..., axis] // BLOCK_WIDTH
+        local = local * BLOCK_WIDTH + node[..., axis] % BLOCK_WIDTH
+    slot = blocks.table.long()[index]
+    inside = inside & (slot >= 0)
+    return torch.where(inside, slot * grid.nodes_per_block + local, 0), torch.where(inside, weight, 0)
+
+
+# ---- terms
+
+
+class Flux:
+    """A heat flux η = κ ∇θ · n into the body through a surface.
+
+    Args:
+        surface: a `Surface` or a `FreeSurface`.
+        flux: η [W/m²], positive into the body: a number, a tensor per point or scene, or a function of the time.
+    """
+
+    def __init__(self, surface: Surface | FreeSurface, flux: Timed) -> None:
+        self.surface, self.flux = surface, flux
+
+    def apply(self, nodes: HeatNodes) -> None:
+        nodes.add_source(self.surface.integrate(nodes, self.flux))
+
+
+class Convection:
+    """Exchange with a fluid around the body, coefficient (ambient − θ) per area (Robin), implicit.
+
+    Args:
+        surface: a `Surface` or a `FreeSurface`.
+        coefficient: [W/(m² K)], not negative: a number, a tensor per point or scene, or a function of the time.
+        ambient: temperature of the fluid [K]: a number, a tensor [] or [B], or a function of the time.
+
+    Raises:
+        ValueError: for a negative number as coefficient.
+    """
+
+    def __init__(self, surface: Surface | FreeSurface, coefficient: Timed, ambient: Timed) -> None:
+        self.surface, self.ambient = surface, ambient
+        self.coefficient = _not_negative("coefficient", coefficient)
+
+    def apply(self, nodes: HeatNodes) -> None:
+        nodes.add_exchange(self.surface.integrate(nodes, self.coefficient), nodes.per_node(self.ambient))
+
+
+class Radiation:
+    """Exchange with surroundings by radiation, ε σ (T_a⁴ − T⁴) per area, linearised about the temperature of the step.
+
+    Args:
+        surface: a `Surface` or a `FreeSurface`.
+        emissivity: ε in [0, 1]: a number, a tensor per point or scene, or a function of the time.
+        ambient: temperature of the surroundings [K], relative to the reference as all temperatures, which `Heat` needs
+            to know in kelvin: a number, a tensor [] or [B], or a function of the time.
+
+    Raises:
+        ValueError: for a number as emissivity outside [0, 1].
+    """
+
+    def __init__(self, surface: Surface | FreeSurface, emissivity: Timed, ambient: Timed) -> None:
+        if isinstance(emissivity, (int, float)) and not 0 <= emissivity <= 1:
+            raise ValueError(f"emissivity must be between 0 and 1, got {emissivity}")
+        self.surface, self.emissivity, self.ambient = surface, emissivity, ambient
+
+    def apply(self, nodes: HeatNodes) -> None:
+        black = STEFAN_BOLTZMANN * self.surface.integrate(nodes, self.emissivity)
+        ambient = nodes.per_node(self.ambient) + nodes.reference
+        kelvin = (nodes.theta + nodes.reference).clamp_min(0)
+        slope = 4 * kelvin**3
+        nodes.add_exchange(black * slope, nodes.theta)
+        nodes.add_source(black * (ambient**4 - kelvin**4))
+
+
+class Fixed:
+    """Nodes that are held at a temperature (Dirichlet).
+
+    Args:
+        region: an obstacle of `torch_mpm.boundaries`, of which the nodes inside are held, wherever it moves; or a
+            function of node positions [N, D] [m] that returns bool [N]. The surface is resolved to one node distance,
+            to second order where it lies on nodes.
+        temperature: [K]: a number, a tensor [] or [B], or a function of the time.
+    """
+
+    def __init__(self, region: Obstacle | Callable[[Tensor], Tensor], temperature: Timed) -> None:
+        self.region, self.temperature = region, temperature
+
+    def apply(self, nodes: HeatNodes) -> None:
+        positions = nodes.blocks.node_positions(nodes.theta.dtype)
+        if isinstance(self.region, Obstacle):
+            where = self.region.contains(positions, nodes.scene(), nodes.time)
+        else:
+            where = self.region(positions)
+        nodes.hold(where & (nodes.capacity > 0), nodes.per_node(self.temperature))
+
+
+class Source:
+    """Heat from inside the matter.
+
+    Args:
+        power: [W/m³] of present volume: a number, a tensor [], [B] or [P], or a function of the temperature [P].
+    """
+
+    def __init__(self, power: Value) -> None:
+        self.power = power
+
+    def apply(self, nodes: HeatNodes) -> None:
+        power = evaluate("power", self.power, nodes.state) * nodes.volume
+        nodes.add_source(scatter(nodes.blocks, nodes.state.x, power[:, None])[:, 0])
+
+
+def _not_negative(name: str, value: Any) -> Any:
+    if isinstance(value, (int, float)) and not value >= 0:
+        raise ValueError(f"{name} must not be negative, got {value}")
+    return value
