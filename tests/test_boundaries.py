@@ -36,11 +36,14 @@ def shapes(dim: int, **options: object) -> list[Obstacle]:
         mpm.Sphere(at, 0.6, **options),
         mpm.Box(at, numbers(dim, 0.9, 0.5, 1.2), **options),
         mpm.Capsule(at, numbers(dim, 0.3, 0.4, -0.1), 0.35, **options),
+        mpm.Revolved(at, HOLLOW, numbers(dim, 0.3, 1.0, -0.2), **options),
         mpm.SDF(lambda x: (x * x).sum(1) - 0.4 + 0.3 * x[:, 0], at, **options),
     ]
 
 
-SHAPES = ["plane", "sphere", "box", "capsule", "sdf"]
+SHAPES = ["plane", "sphere", "box", "capsule", "revolved", "sdf"]
+HOLLOW = ((0.15, -0.5), (0.45, 0.5), (0.7, 0.5), (0.7, -0.5))
+"""A cylinder of radius 0.7 with a conical hole, clockwise."""
 
 
 def act(
@@ -75,6 +78,11 @@ def inside_by_brute_force(shape: str, obstacle: Obstacle, positions: np.ndarray)
         points = np.linspace(-1, 1, 20001)[:, None] * np.array(sizes["half_axis"])
         squared = ((body[:, None] - points[None, ::10]) ** 2).sum(-1).min(1)
         return squared <= sizes["radius"] ** 2
+    if shape == "revolved":
+        axis = np.array(sizes["axis"]) / np.linalg.norm(sizes["axis"])
+        along = body @ axis
+        away = np.linalg.norm(body - along[:, None] * axis, axis=1)
+        return (np.abs(along) <= 0.5) & (away <= 0.7) & (away >= 0.15 + 0.3 * (along + 0.5))
     return (body**2).sum(1) - 0.4 + 0.3 * body[:, 0] <= 0
 
 
@@ -290,6 +298,7 @@ def test_gradcheck(dim, shape, kind):
             "sphere": lambda: mpm.Sphere(radius=0.6, **options),
             "box": lambda: mpm.Box(size=(0.9,) * dim, **options),
             "capsule": lambda: mpm.Capsule(half_axis=extra, radius=0.3, **options),
+            "revolved": lambda: mpm.Revolved(outline=HOLLOW, axis=extra, **options),
             "sdf": lambda: mpm.SDF(lambda x: (x * x * (1 + extra**2)).sum(1) - 0.5, **options),
         }[shape]()
         return act(obstacle, velocity, positions, time=0.2)
@@ -333,6 +342,7 @@ def test_degenerate_nodes_have_finite_values_and_gradients(dim, device, kind, dt
         mpm.Sphere(radius=0.5, **options),
         mpm.Box(size=(1.0,) * dim, **options),
         mpm.Capsule(half_axis=0 * axis, radius=0.5, **options),
+        mpm.Revolved(outline=((0, 0.5), (0.5, 0.5), (0.5, -0.5), (0, -0.5)), axis=axis, **options),
         mpm.SDF(lambda x: x.square().sum(1) - 0.25, **options),
     ]:
         after = act(obstacle, velocity, positions, time=0.1)

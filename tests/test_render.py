@@ -149,13 +149,15 @@ def test_obstacles_of_a_simulation_are_drawn_where_they_act(dim):
         mpm.boundaries.Box(centre, (0.4, 0.2, 0.3)[:dim], **motion),
         mpm.boundaries.Capsule(centre, axis, 0.1, **motion),
         mpm.boundaries.Plane(centre, (0.3, 1.0, 0.2)[:dim], **motion),
+        mpm.boundaries.Revolved(centre, ((0.1, 0.0), (0.3, 0.0), (0.2, 0.4)), axis, **motion),
         mpm.boundaries.SDF(lambda p: p.abs().sum(1) - 0.3, centre, **motion),
     ]
     time = 0.7
     for body in bodies:
-        (shape,) = render.obstacle_shapes(body, time, bounds)
+        drawn = render.obstacle_shapes(body, time, bounds)
+        assert len(drawn) == (2 if body.shape == "revolved" and dim == 2 else 1)
         pose = body.pose(time)
-        local = (torch.as_tensor(shape.world()) - pose.centre) @ pose.rotation
+        local = (torch.as_tensor(np.concatenate([s.world() for s in drawn])) - pose.centre) @ pose.rotation
         distance, _ = body.surface(local, None)
         if body.shape == "plane" and dim == 2:
             local, distance = local[2:], distance[2:]  # the plate has a thickness behind its surface

@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING, Any
 
 from . import _library as _library
 from . import heat_boundaries, ops, seed
-from .boundaries import SDF, Box, Capsule, Plane, Sphere, Walls
+from .boundaries import SDF, Box, Capsule, Plane, Revolved, Sphere, Walls
 from .cfl import stable_dt
 from .errors import GridOverflowError, SimulationError
 from .grid import Blocks, Grid
@@ -37,6 +37,7 @@ __all__ = [
     "NeoHookean",
     "Plane",
     "QuarticSand",
+    "Revolved",
     "SimulationError",
     "Sphere",
     "State",

@@ -531,6 +531,72 @@ class Capsule(Obstacle):
         return {"half_axis": self.half_axis, "radius": self.radius}
 
 
+class Revolved(Obstacle):
+    """A polygon turned about an axis: a cone, a tube, a funnel, an hourglass, a drum.
+
+    In 2-D, the polygon and its mirror image.
+
+    Args:
+        outline: corners of the polygon, K pairs of distance from the axis (≥ 0) and position along it [m], counted from
+            `position`; not crossing itself.
+        axis: direction of the axis: D numbers, or a tensor [D] or [B, D] that may require grad; y by default.
+        position, kind, friction, velocity, rotation, angular_velocity, start, end, scene: see `Obstacle`.
+    """
+
+    shape = "revolved"
+
+    def __init__(
+        self,
+        position: Value | Motion,
+        outline: Sequence[Sequence[float]],
+        axis: Value | None = None,
+        kind: str = "separate",
+        **motion: Any,
+    ) -> None:
+        super().__init__(position, kind, **motion)
+        corners = tuple(_floats(corner) for corner in outline)
+        if len(corners) < 3 or any(len(c) != 2 or c[0] < 0 or not all(map(math.isfinite, c)) for c in corners):
+            raise ValueError(f"outline must be at least 3 pairs (distance >= 0, position along the axis), got {outline}")
+        area = sum(a[0] * b[1] - b[0] * a[1] for a, b in zip(corners, corners[1:] + corners[:1], strict=True))
+        if area == 0:
+            raise ValueError(f"outline must enclose an area, got {outline}")
+        self.outline = corners if area > 0 else corners[::-1]  # anticlockwise
+        self.axis = _finite("axis", axis)
+        if axis is not None and not isinstance(axis, Tensor) and not any(_floats(axis)):
+            raise ValueError(f"axis must not be zero, got {axis}")
+
+    def surface(self, body: Tensor, scene: Tensor | None) -> tuple[Tensor, Tensor]:
+        if self.axis is None:
+            axis = torch.eye(body.shape[1], dtype=body.dtype, device=body.device)[1]
+        else:
+            axis = _unit(_per_node(self._value("axis", body, body.shape[1:]), 1, scene))
+        along = (body * axis).sum(1, keepdim=True)
+        across = body - along * axis
+        distance, normal = self._polygon(torch.cat([_norm(across)[:, None], along], 1))
+        return distance, normal[:, :1] * _unit(across) + normal[:, 1:] * axis
+
+    def _polygon(self, p: Tensor) -> tuple[Tensor, Tensor]:
+        """Signed distance [N] of points [N, 2] from the polygon, and outward normal [N, 2] of the nearest edge."""
+        a = self._value("outline", p, (len(self.outline), 2))
+        edge = a.roll(-1, 0) - a
+        arm = p[:, None] - a
+        along = (arm * edge).sum(2) / (edge * edge).sum(1)
+        offset = _norm(arm - along.clamp(0, 1)[..., None] * edge)
+        # An edge on the axis is inside the body.
+        on_axis = (a[:, 0] == 0) & (edge[:, 0] == 0)
+        nearest = torch.where(on_axis, torch.inf, offset).argmin(1, keepdim=True)
+        # An odd number of edges is crossed by the ray from the point away from the axis.
+        straddles = (a[:, 1] > p[:, 1:]) != (a.roll(-1, 0)[:, 1] > p[:, 1:])
+        crossing = straddles & ((edge[:, 0] * arm[..., 1] - edge[:, 1] * arm[..., 0]) * edge[:, 1].sign() > 0)
+        inside = crossing.sum(1) % 2 == 1
+        distance = offset.gather(1, nearest)[:, 0]
+        normal = _unit(torch.stack([edge[:, 1], -edge[:, 0]], 1))[nearest[:, 0]]
+        return torch.where(inside, -distance, distance), normal
+
+    def extents(self) -> dict[str, Any]:
+        return {"outline": self.outline, "axis": self.axis}
+
+
 class SDF(Obstacle):
     """Any shape, from its signed distance.
 

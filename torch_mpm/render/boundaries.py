@@ -50,9 +50,13 @@ def obstacle_shapes(
     if obstacle.shape == "capsule":
         half = _of_scene(extents["half_axis"], 1, scene)
         return [shapes.capsule(-half, half, float(_of_scene(extents["radius"], 0, scene)), color).moved(at, turn)]
+    if obstacle.shape == "revolved":
+        axis = np.eye(dim)[1] if extents["axis"] is None else _of_scene(extents["axis"], 1, scene)
+        outline = np.asarray(extents["outline"], dtype=np.float64)
+        return [s.moved(at, turn) for s in shapes.ring(outline, np.zeros(dim), axis / np.linalg.norm(axis), color)]
     if obstacle.shape == "sdf":
         return _zero_level(extents["distance"], lower, upper, at, turn, color)
-    raise ValueError(f"obstacle.shape must be plane, sphere, box, capsule or sdf, got {obstacle.shape!r}")
+    raise ValueError(f"obstacle.shape must be plane, sphere, box, capsule, revolved or sdf, got {obstacle.shape!r}")
 
 
 def _of_scene(value: Any, rank: int, scene: int) -> Array:

@@ -14,6 +14,10 @@ from .shapes import Array
 PLAIN = (0.20, 0.45, 0.78)
 # Okabe and Ito's palette (2008), told apart with any colour vision.
 MATERIALS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#F0E442", "#7F7F7F")
+# Light and dark sands in turn, so that neighbouring layers differ.
+LAYERS = ("#E9C98A", "#8A5A2B", "#D9A75B", "#5E4630", "#F2DFB4", "#A8743C")
+PALETTES = {"material": MATERIALS, "layer": LAYERS}
+"""Colours of quantities that count rather than measure."""
 
 
 @dataclass(frozen=True)
@@ -82,7 +86,7 @@ def map_colors(values: Array, limits: tuple[float, float], cmap: str) -> Array:
     return rgb
 
 
-def material_colors(material: Array, palette: Sequence[str] = MATERIALS) -> Array:
-    """uint8 [P, 3] for material numbers [P]; the palette repeats after its last colour."""
+def palette_colors(numbers: Array, palette: Sequence[str] = MATERIALS) -> Array:
+    """uint8 [P, 3] for the numbers [P] of materials or layers; the palette repeats after its last colour."""
     table = np.array([require("matplotlib.colors").to_rgb(c) for c in palette])
-    return (table[material.astype(np.int64) % len(palette)] * 255).round().astype(np.uint8)
+    return (table[numbers.astype(np.int64) % len(palette)] * 255).round().astype(np.uint8)

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from .annotate import blend, scale_overlay, scale_width, write_text
 from .camera import framing, light_directions
 from .cloud import rest_spacing
-from .colors import PLAIN, QUANTITIES, Quantity, map_colors, material_colors, numpy_of, scalar_of, value_range
+from .colors import PALETTES, PLAIN, QUANTITIES, Quantity, map_colors, numpy_of, palette_colors, scalar_of, value_range
 from .ground import Ground
 from .requires import RenderError, require
 from .scene2d import Overlay, Scene2D
@@ -30,8 +30,8 @@ class Renderer:
     Args:
         bounds: (lower [D], upper [D]) of the domain in metres; D = 2 or 3. It is drawn as a box and framed.
         resolution: (width, height) in pixels.
-        color_by: "speed" [m/s], "stress" [Pa], "temperature" [K], "material", any other label for a scalar of your
-            own (then give `unit`), or None for one colour.
+        color_by: "speed" [m/s], "stress" [Pa], "temperature" [K], "material", "layer", any other label for a scalar
+            of your own (then give `unit`), or None for one colour.
         range: (lo, hi) of the colour scale in that unit. None takes each frame's own, which flickers in a video.
         cmap: a matplotlib colour map name; None takes the quantity's own.
         unit: unit shown on the scale; None takes the quantity's own.
@@ -83,7 +83,7 @@ class Renderer:
         self.cmap = cmap or quantity.cmap
         self.names = tuple(materials) if color_by == "material" else ()
         frame = self.bounds if view is None else _box("view", view, self.dim)
-        self.has_scale = color_by not in (None, "material")
+        self.has_scale = color_by is not None and color_by not in PALETTES
         self.scene: Scene2D | Scene3D | SoftwareScene
         if backend not in ("auto", "vtk", "software"):
             raise ValueError(f"backend must be 'auto', 'vtk' or 'software', got {backend!r}")
@@ -113,7 +113,7 @@ class Renderer:
         Args:
             x: positions [P, D] in metres, torch or numpy. Particles that are not finite are left out and logged.
             scalars: [P] for the colour; velocities [P, D] will do for "speed", stresses [P, D, D] for "stress"
-                (von Mises), material numbers for "material". Not finite: grey.
+                (von Mises), numbers for "material" and "layer". Not finite: grey.
             obstacles: shapes of `torch_mpm.render.shapes` at their poses at this time.
             overlays: (points [N, D] in metres, colour, label) polylines over the picture.
             time: seconds, written into the picture.
@@ -161,8 +161,8 @@ class Renderer:
         if scalars is None:
             raise ValueError(f"scalars must be given for color_by={self.color_by!r}, got None")
         values = scalar_of(self.color_by, numpy_of(scalars), count)
-        if self.color_by == "material":
-            return material_colors(values), None
+        if self.color_by in PALETTES:
+            return palette_colors(values, PALETTES[self.color_by]), None
         limits = self.limits or value_range(values, self.quantity.from_zero)
         return map_colors(values, limits, self.cmap), limits
 

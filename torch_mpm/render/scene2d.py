@@ -75,7 +75,9 @@ class Scene2D:
         patches = require("matplotlib.patches")
         self.changing = [
             self.axes.add_patch(
-                patches.Polygon(o.world(), closed=True, facecolor=o.color, edgecolor=INK, linewidth=0.8, zorder=3)
+                patches.Polygon(
+                    o.world(), closed=True, facecolor=(*o.color, o.opacity), edgecolor=INK, linewidth=0.8, zorder=3
+                )
             )
             for o in obstacles
         ]

@@ -158,7 +158,7 @@ class Scene3D:
 
     def _shade_ground(self, x: Array, radius: float, obstacles: Sequence[Shape]) -> None:
         assert self.ground is not None
-        samples = [surface_samples(o, count=4000) for o in obstacles]
+        samples = [surface_samples(o, count=4000) for o in obstacles if o.opacity == 1]
         radii = [np.full(len(x), radius), *(np.full(len(s.points), s.radius) for s in samples)]
         pixels = self.ground.texture(np.concatenate([x, *(s.points for s in samples)]), np.concatenate(radii))
         image = self.data.vtkImageData()
@@ -195,6 +195,7 @@ class Scene3D:
         actor = self._actor(normals.GetOutput(), obstacle.color)
         actor.GetProperty().SetAmbient(0.40)
         actor.GetProperty().SetDiffuse(0.7)
+        actor.GetProperty().SetOpacity(obstacle.opacity)
         return actor
 
     def _shaded(self, mapper: Any) -> Any:

@@ -17,7 +17,7 @@ class Shape:
     """A rigid shape at a pose: world = position + rotation @ body.
 
     `vertices` [V, D] in metres, `faces` int [T, 3] (3-D triangles) or None (2-D, the vertices are a closed outline),
-    `position` [D], `rotation` [D, D], `color` RGB in 0..1. Made by `plane`, `box`, `sphere`, `capsule`, `cylinder`
+    `position` [D], `rotation` [D, D], `color` RGB and `opacity` in 0..1. Made by `plane`, `box`, `sphere`, `capsule`, `cylinder`
     and `mesh` below.
     """
 
@@ -26,6 +26,7 @@ class Shape:
     position: Array
     rotation: Array
     color: tuple[float, float, float] = GREY
+    opacity: float = 1.0
 
     def posed(self, position: npt.ArrayLike, rotation: npt.ArrayLike | None = None) -> Shape:
         """The same shape at another `position` [D] and `rotation` ([D, D] matrix, or an angle in radians in 2-D)."""
@@ -164,6 +165,14 @@ def revolved(profile: Array, center: Array, axis: Array, color: tuple[float, flo
     a, b, c, d = i * turns + j, i * turns + k, (i + 1) * turns + k, (i + 1) * turns + j
     faces = np.concatenate([np.stack([a, c, b], -1).reshape(-1, 3), np.stack([a, d, c], -1).reshape(-1, 3)])
     return Shape(v, faces, center, frame_of(axis), color)
+
+
+def ring(outline: Array, center: Array, axis: Array, color: tuple[float, float, float] = GREY) -> list[Shape]:
+    """The closed polygon `outline` (radius, height) [K, 2] turned around `axis`; in 2-D itself and its mirror image."""
+    if center.shape[0] == 3:
+        return [revolved(np.concatenate([outline, outline[:1]]), center, axis, color)]
+    frame = np.stack([np.array([axis[1], -axis[0]]), axis], axis=1)
+    return [Shape(outline * [side, 1.0], None, center, frame, color) for side in (1.0, -1.0)]
 
 
 @dataclass(frozen=True)

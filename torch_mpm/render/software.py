@@ -13,9 +13,15 @@ from .camera import LIGHTS, Camera, light_directions
 from .cloud import visible
 from .ground import BACKGROUND, Ground
 from .requires import require
-from .shapes import Array, Shape, surface_samples
+from .shapes import Array, Samples, Shape, surface_samples
 
 AMBIENT, DIFFUSE = 0.36, 0.85
+
+
+def _screened(samples: Samples, opacity: float) -> Samples:
+    """A share `opacity` of the samples, as a screen that one sees through."""
+    kept = np.arange(len(samples.points)) * 0.618034 % 1 < opacity
+    return Samples(samples.points[kept], samples.normals[kept], samples.radius)
 
 
 class SoftwareScene:
@@ -26,7 +32,7 @@ class SoftwareScene:
 
     def draw(self, x: Array, rgb: Array, radius: float, style: str, obstacles: Sequence[Shape]) -> Array:
         """The picture, uint8 [H, W, 3], of finite positions x [P, 3] m with colours uint8 [P, 3]."""
-        samples = [surface_samples(o, count=40_000) for o in obstacles]
+        samples = [_screened(surface_samples(o, count=40_000), o.opacity) for o in obstacles]
         if self.ground is None:
             image = np.empty((*self.camera.resolution[::-1], 3), dtype=np.uint8)
             image[:] = (BACKGROUND * 255).round()

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from .. import boundaries, materials, seed
 from ..grid import Grid
+from ..sand import QuarticSand
 from ..state import State
 from ..step import Step
 from . import schema
@@ -24,7 +25,7 @@ class Material:
     """A material of one scene: its words, the index of its scene, and its place among the laws of the step."""
 
     name: str
-    words: schema.NeoHookean | schema.WeaklyCompressible
+    words: schema.NeoHookean | schema.WeaklyCompressible | schema.QuarticSand
     scene: int
 
 
@@ -148,9 +149,9 @@ class _Mixture:
         ]
         groups: dict[tuple[Any, ...], list[int]] = {}
         for number, m in enumerate(self.materials):
-            viscous = getattr(m.words, "viscosity", 0.0) > 0
-            rank = sum(o.scene == m.scene and o.words.law == m.words.law for o in self.materials[:number])
-            groups.setdefault((m.words.law, viscous, rank), []).append(number)
+            form = _form(m.words)
+            rank = sum(o.scene == m.scene and _form(o.words) == form for o in self.materials[:number])
+            groups.setdefault((form, rank), []).append(number)
         self.groups = list(groups.values())
 
     def number(self, scene: int, name: str) -> int:
@@ -177,9 +178,26 @@ class _Mixture:
             per_scene = dict(zip((m.scene for m in members), values, strict=True))
             return torch.tensor([per_scene.get(b, values[0]) for b in range(self.scenes)], dtype=dtype, device=device)
 
-        if members[0].words.law == "neo_hookean":
+        words = members[0].words
+        if isinstance(words, schema.NeoHookean):
             return materials.NeoHookean(E=value("E"), nu=value("nu"))
-        return materials.WeaklyCompressible(value("bulk_modulus"), value("gamma"), value("viscosity"))
+        if isinstance(words, schema.WeaklyCompressible):
+            return materials.WeaklyCompressible(value("bulk_modulus"), value("gamma"), value("viscosity"))
+        moduli = {name: value(name) for name in ("E", "nu", "mu", "lam") if getattr(words, name) is not None}
+        angle = value("friction_angle")
+        return QuarticSand(
+            **moduli,
+            friction_angle=torch.deg2rad(angle) if isinstance(angle, Tensor) else math.radians(angle),
+            energy=words.energy,
+            apex=words.apex,
+            smallest_strain=max(m.words.smallest_strain for m in members),
+        )
+
+
+def _form(words: Any) -> tuple[Any, ...]:
+    """What must be the same in materials that share a law."""
+    options = [getattr(words, name, None) for name in ("energy", "apex")]
+    return words.law, getattr(words, "viscosity", 0.0) > 0, getattr(words, "mu", None) is not None, *options
 
 
 def _complete(state: State, mixture: _Mixture, material: Tensor, single: bool) -> State:
@@ -282,6 +300,8 @@ def obstacle(words: Any, scene: int | None) -> boundaries.Obstacle:
         return boundaries.Box(words.center, words.size, **motion)
     if isinstance(words, schema.SphereObstacle):
         return boundaries.Sphere(words.center, words.radius, **motion)
+    if isinstance(words, schema.RevolvedObstacle):
+        return boundaries.Revolved(words.center, words.outline, words.axis, **motion)
     center = [0.5 * (p + q) for p, q in zip(words.a, words.b, strict=True)]
     half = [0.5 * (q - p) for p, q in zip(words.a, words.b, strict=True)]
     return boundaries.Capsule(center, half, words.radius, **motion)
@@ -396,7 +416,7 @@ def _item_dimension(path: str, item: Any, dim: int) -> Iterator[str]:
     if dim == 2 and getattr(item, "shape", "") in ("mesh", "cylinder"):
         yield f"{path}.shape: a {item.shape} needs three dimensions; this scene has two"
         return
-    for key in ("center", "lower", "upper", "a", "b", "size", "normal", "velocity"):
+    for key in ("center", "lower", "upper", "a", "b", "size", "normal", "axis", "velocity"):
         value = getattr(item, key, None)
         if value is not None and len(value) != dim:
             yield f"{path}.{key}: must have {dim} numbers in this {dim}-D scene, got {value}"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -60,6 +61,7 @@ class _Artist:
         self.entries = scene.entries()
         self.columns = math.ceil(math.sqrt(len(self.entries)))
         self.names = trajectory.names("material")
+        self.layers = _layers(trajectory, scene, words.layers) if words.color_by == "layer" else None
         width, height = words.resolution
         limits = words.range or self._limits(trajectory)
         self.renderers = [
@@ -91,26 +93,32 @@ class _Artist:
 
         entry = self.entries[k]
         bounds = (self.scene.grid.lower, self.scene.grid.upper)
-        solids = [obstacle(words, None) for words in entry.obstacle]
+        shapes = [
+            replace(shape, opacity=words.opacity)
+            for words in entry.obstacle
+            for shape in obstacle_shapes(obstacle(words, None), time, bounds)
+        ]
         rows = frame["scene"] == k if "scene" in frame else slice(None)
         overlays = list(_ritter(self.scene, self.words.ritter, time)) if self.words.ritter else []
         return self.renderers[k].frame(
             frame["position"][rows],
             self._values(frame)[rows],
-            obstacles=[shape for solid in solids for shape in obstacle_shapes(solid, time, bounds)],
+            obstacles=shapes,
             overlays=overlays,
             time=time,
             title=entry.name or self.scene.title,
         )
 
     def _values(self, frame: dict[str, Array]) -> Array:
+        if self.layers is not None:
+            return self.layers[: len(frame["position"])]
         return frame["velocity" if self.words.color_by == "speed" else self.words.color_by]
 
     def _limits(self, trajectory: Trajectory) -> tuple[float, float] | None:
         """Range of the colours over some frames of the run."""
-        from ..render.colors import QUANTITIES, scalar_of, value_range
+        from ..render.colors import PALETTES, QUANTITIES, scalar_of, value_range
 
-        if self.words.color_by == "material":
+        if self.words.color_by in PALETTES:
             return None
         numbers = np.linspace(0, len(trajectory) - 1, SAMPLES).round().astype(int)
         frames = [self._values(trajectory.frame(int(k))) for k in numbers]
@@ -120,6 +128,19 @@ class _Artist:
     def close(self) -> None:
         for renderer in self.renderers:
             renderer.close()
+
+
+def _layers(trajectory: Trajectory, scene: Scene, count: int) -> Array:
+    """Number of the layer of each particle [N]: by height at the start, or by time for what emitters bring."""
+    start = trajectory.frame(0)["position"]
+    total = len(trajectory["mass"])
+    up = -np.asarray(scene.gravity or np.eye(scene.dim)[1] * -1.0)
+    height = start @ up
+    numbers = np.arange(total) - len(start)
+    share = numbers / max(1, total - len(start))
+    if len(start):
+        share[: len(start)] = (height - height.min()) / max(np.ptp(height), 1e-30)
+    return np.clip((share * count).astype(np.int64), 0, count - 1)
 
 
 def ritter_front(scene: Scene, words: schema.Ritter, time: float) -> float:

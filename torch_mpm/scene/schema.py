@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
@@ -72,7 +72,43 @@ class WeaklyCompressible(Model):
     """dynamic viscosity [Pa s]"""
 
 
-Material = Annotated[NeoHookean | WeaklyCompressible, Field(discriminator="law")]
+class QuarticSand(Model):
+    """Dry sand: Drucker-Prager plasticity."""
+
+    law: Literal["quartic_sand"] = "quartic_sand"
+    """name of the law"""
+    density: Positive = 1600.0
+    """density at rest, with the air between the grains [kg/m^3]"""
+    E: Positive | None = None
+    """Young's modulus [Pa], with nu; the quartic energies are stiff as this says at a strain of 0.4, far softer below"""
+    nu: Annotated[float, Field(gt=-1, lt=0.5)] | None = None
+    """Poisson's ratio, between -1 and 0.5; 0.3 where E is given alone"""
+    mu: Positive | None = None
+    """shear modulus [Pa], with lam, instead of E and nu"""
+    lam: float | None = None
+    """first Lame parameter [Pa]"""
+    friction_angle: Annotated[float, Field(ge=0, lt=90)] = 30.0
+    """friction angle [degrees]"""
+    energy: Literal["unilateral", "full", "hencky", "mixed"] = "unilateral"
+    """elastic energy; unilateral: quartic without tension, hencky: quadratic"""
+    apex: Literal["zero", "keep"] = "zero"
+    """strain of sand that comes apart: none, or with the unilateral energy that of the expansion"""
+    smallest_strain: NotNegative = 0.05
+    """strain that the time step counts on at least; best the compression of the deepest sand, which has no need of more"""
+
+    @model_validator(mode="after")
+    def _moduli(self) -> QuarticSand:
+        if self.E is not None and self.nu is None:
+            self.nu = 0.3
+        given = {name for name in ("E", "nu", "mu", "lam") if getattr(self, name) is not None}
+        if given not in ({"E", "nu"}, {"mu", "lam"}):
+            raise ValueError(f"takes E and nu, or mu and lam, got {', '.join(sorted(given)) or 'none of them'}")
+        if self.apex == "keep" and self.energy != "unilateral":
+            raise ValueError("apex = 'keep' needs energy = 'unilateral'")
+        return self
+
+
+Material = Annotated[NeoHookean | WeaklyCompressible | QuarticSand, Field(discriminator="law")]
 
 
 # ---- bodies
@@ -218,6 +254,8 @@ class Obstacle(Model):
     """time from which it is there and moves [s]"""
     end: Positive | None = None
     """time from which it is gone [s]"""
+    opacity: Annotated[float, Field(gt=0, le=1)] = 1.0
+    """how solid it is drawn, 1 for not transparent"""
 
 
 class PlaneObstacle(Obstacle):
@@ -266,7 +304,22 @@ class CapsuleObstacle(Obstacle):
     """distance from the segment [m]"""
 
 
-AnyObstacle = Annotated[PlaneObstacle | BoxObstacle | SphereObstacle | CapsuleObstacle, Field(discriminator="shape")]
+class RevolvedObstacle(Obstacle):
+    """Polygon turned about an axis: cone, tube, funnel, hourglass, drum; in 2-D the polygon and its mirror image."""
+
+    shape: Literal["revolved"] = "revolved"
+    """kind of shape"""
+    outline: Annotated[list[tuple[NotNegative, float]], Field(min_length=3)]
+    """corners of the polygon: distance from the axis and position along it [m]"""
+    center: Vector
+    """point of the axis from which positions along it count [m]"""
+    axis: Vector | None = None
+    """direction of the axis; by default y"""
+
+
+AnyObstacle = Annotated[
+    PlaneObstacle | BoxObstacle | SphereObstacle | CapsuleObstacle | RevolvedObstacle, Field(discriminator="shape")
+]
 
 
 # ---- outputs
@@ -295,8 +348,10 @@ class Ritter(Model):
 class Render(Model):
     """Pictures (PNG) and video (MP4)."""
 
-    color_by: Literal["speed", "stress", "material", "temperature"] = "speed"
-    """what the colours show"""
+    color_by: Literal["speed", "stress", "material", "temperature", "layer"] = "speed"
+    """what the colours show; layer: by height at the start, or by time for what emitters bring"""
+    layers: Annotated[int, Field(ge=1)] = 8
+    """number of layers that the colours tell apart"""
     range: tuple[float, float] | None = None
     """ends of the colour scale; by default those of the whole run"""
     style: Literal["particles", "surface"] = "particles"
