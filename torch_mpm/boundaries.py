@@ -556,7 +556,9 @@ class Revolved(Obstacle):
         super().__init__(position, kind, **motion)
         corners = tuple(_floats(corner) for corner in outline)
         if len(corners) < 3 or any(len(c) != 2 or c[0] < 0 or not all(map(math.isfinite, c)) for c in corners):
-            raise ValueError(f"outline must be at least 3 pairs (distance >= 0, position along the axis), got {outline}")
+            raise ValueError(
+                f"outline must be at least 3 pairs (distance >= 0, position along the axis), got {outline}"
+            )
         area = sum(a[0] * b[1] - b[0] * a[1] for a, b in zip(corners, corners[1:] + corners[:1], strict=True))
         if area == 0:
             raise ValueError(f"outline must enclose an area, got {outline}")

@@ -17,8 +17,8 @@ class Shape:
     """A rigid shape at a pose: world = position + rotation @ body.
 
     `vertices` [V, D] in metres, `faces` int [T, 3] (3-D triangles) or None (2-D, the vertices are a closed outline),
-    `position` [D], `rotation` [D, D], `color` RGB and `opacity` in 0..1. Made by `plane`, `box`, `sphere`, `capsule`, `cylinder`
-    and `mesh` below.
+    `position` [D], `rotation` [D, D], `color` RGB and `opacity` in 0..1. Made by `plane`, `box`, `sphere`, `capsule`,
+    `cylinder`, `ring` and `mesh` below.
     """
 
     vertices: Array

@@ -190,13 +190,13 @@ class _Mixture:
             friction_angle=torch.deg2rad(angle) if isinstance(angle, Tensor) else math.radians(angle),
             energy=words.energy,
             apex=words.apex,
-            smallest_strain=max(m.words.smallest_strain for m in members),
+            smallest_strain=words.smallest_strain,
         )
 
 
 def _form(words: Any) -> tuple[Any, ...]:
     """What must be the same in materials that share a law."""
-    options = [getattr(words, name, None) for name in ("energy", "apex")]
+    options = [getattr(words, name, None) for name in ("energy", "apex", "smallest_strain")]
     return words.law, getattr(words, "viscosity", 0.0) > 0, getattr(words, "mu", None) is not None, *options
 
 

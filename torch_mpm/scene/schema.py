@@ -80,7 +80,7 @@ class QuarticSand(Model):
     density: Positive = 1600.0
     """density at rest, with the air between the grains [kg/m^3]"""
     E: Positive | None = None
-    """Young's modulus [Pa], with nu; the quartic energies are stiff as this says at a strain of 0.4, far softer below"""
+    """Young's modulus [Pa], with nu; the quartic energies are as stiff at a strain of 0.4, and far softer below"""
     nu: Annotated[float, Field(gt=-1, lt=0.5)] | None = None
     """Poisson's ratio, between -1 and 0.5; 0.3 where E is given alone"""
     mu: Positive | None = None
@@ -94,7 +94,7 @@ class QuarticSand(Model):
     apex: Literal["zero", "keep"] = "zero"
     """strain of sand that comes apart: none, or with the unilateral energy that of the expansion"""
     smallest_strain: NotNegative = 0.05
-    """strain that the time step counts on at least; best the compression of the deepest sand, which has no need of more"""
+    """strain that the time step counts on at least; best the compression of the deepest sand"""
 
     @model_validator(mode="after")
     def _moduli(self) -> QuarticSand:
