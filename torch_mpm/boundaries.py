@@ -256,6 +256,8 @@ class Obstacle:
         self.start, self.end = float(start), float(end)
         self.scene = scene
         self._constants: dict[tuple[str, torch.device, torch.dtype], tuple[Any, Tensor]] = {}
+        self.table: tuple[list[Any], Tensor] | None = None
+        """Kept by `torch_mpm.ops.contact` for a list of obstacles that begins with this one."""
 
     # -- what a shape defines
 
@@ -309,7 +311,7 @@ class Obstacle:
         surface_velocity = self._surface_velocity(arm, scene, time)
         friction = self.friction
         if isinstance(friction, Tensor):
-            friction = _per_node(self._value("friction", velocity, ()), 0, scene)[..., None]
+            friction = _per_node(self.parameter("friction", velocity, ()), 0, scene)[..., None]
         # Zero velocity stays zero; a NaN outside does not reach the gradient of the parameters.
         relative = torch.where(touching, velocity if surface_velocity is None else velocity - surface_velocity, 0)
         return velocity + contact_change(relative, normal, self.kind, friction)
@@ -333,7 +335,7 @@ class Obstacle:
 
     # -- parameters as tensors
 
-    def _value(self, name: str, like: Tensor, shape: tuple[int, ...]) -> Tensor:
+    def parameter(self, name: str, like: Tensor, shape: tuple[int, ...]) -> Tensor:
         """A parameter as a tensor of `shape` or [B, *shape], with the dtype and device of `like`."""
         value = getattr(self, name)
         if not isinstance(value, Tensor):
@@ -383,10 +385,10 @@ class Obstacle:
         """[D] or [B, D]."""
         if not isinstance(self.position, Tensor) and callable(self.position):
             return self._path(time, like)[0]
-        position = self._value("position", like, (_length(self.position),))
+        position = self.parameter("position", like, (_length(self.position),))
         if self.velocity is None:
             return position
-        return position + self._value("velocity", like, position.shape[-1:]) * _column(self._elapsed(time, like), 1)
+        return position + self.parameter("velocity", like, position.shape[-1:]) * _column(self._elapsed(time, like), 1)
 
     def _path(self, time: float | Tensor, like: Tensor) -> tuple[Tensor, Tensor]:
         """Centre and its velocity where the position is a function of time."""
@@ -401,9 +403,9 @@ class Obstacle:
         shape = () if dim == 2 else (3,)
         rotation = None
         if self.rotation is not None:
-            rotation = rotation_matrix(self._value("rotation", like, shape), dim)
+            rotation = rotation_matrix(self.parameter("rotation", like, shape), dim)
         if self.angular_velocity is not None:
-            rate = self._value("angular_velocity", like, shape)
+            rate = self.parameter("angular_velocity", like, shape)
             turn = rotation_matrix(rate * _column(self._elapsed(time, like), len(shape)), dim)
             rotation = turn if rotation is None else turn @ rotation
         return rotation
@@ -414,14 +416,14 @@ class Obstacle:
         if not isinstance(self.position, Tensor) and callable(self.position):
             result = _per_node(self._path(time, arm)[1], 1, scene)
         elif self.velocity is not None:
-            result = _per_node(self._value("velocity", arm, arm.shape[1:]), 1, scene)
+            result = _per_node(self.parameter("velocity", arm, arm.shape[1:]), 1, scene)
         if self.angular_velocity is None:
             return result
         if arm.shape[1] == 2:
-            rate = _per_node(self._value("angular_velocity", arm, ()), 0, scene)[..., None]
+            rate = _per_node(self.parameter("angular_velocity", arm, ()), 0, scene)[..., None]
             swirl = rate * torch.stack([-arm[:, 1], arm[:, 0]], 1)
         else:
-            rate = _per_node(self._value("angular_velocity", arm, (3,)), 1, scene)
+            rate = _per_node(self.parameter("angular_velocity", arm, (3,)), 1, scene)
             swirl = torch.linalg.cross(rate.expand_as(arm), arm)
         return swirl if result is None else result + swirl
 
@@ -444,7 +446,7 @@ class Plane(Obstacle):
         self.normal = _finite("normal", normal)
 
     def surface(self, body: Tensor, scene: Tensor | None) -> tuple[Tensor, Tensor]:
-        normal = _unit(_per_node(self._value("normal", body, body.shape[1:]), 1, scene))
+        normal = _unit(_per_node(self.parameter("normal", body, body.shape[1:]), 1, scene))
         return (body * normal).sum(1), normal.expand_as(body)
 
     def extents(self) -> dict[str, Any]:
@@ -466,7 +468,7 @@ class Sphere(Obstacle):
         self.radius = _extent("radius", radius)
 
     def surface(self, body: Tensor, scene: Tensor | None) -> tuple[Tensor, Tensor]:
-        return _norm(body) - _per_node(self._value("radius", body, ()), 0, scene), _unit(body)
+        return _norm(body) - _per_node(self.parameter("radius", body, ()), 0, scene), _unit(body)
 
     def extents(self) -> dict[str, Any]:
         return {"radius": self.radius}
@@ -488,7 +490,7 @@ class Box(Obstacle):
 
     def surface(self, body: Tensor, scene: Tensor | None) -> tuple[Tensor, Tensor]:
         # Inside, the nearest face is that of the axis with the largest (least negative) distance.
-        depth = body.abs() - 0.5 * _per_node(self._value("size", body, body.shape[1:]), 1, scene)
+        depth = body.abs() - 0.5 * _per_node(self.parameter("size", body, body.shape[1:]), 1, scene)
         nearest = torch.arange(body.shape[1], device=body.device) == depth.argmax(1, keepdim=True)
         return depth.amax(1), nearest * torch.where(body < 0, -1, 1).to(body.dtype)
 
@@ -521,11 +523,11 @@ class Capsule(Obstacle):
         self.radius = _extent("radius", radius)
 
     def surface(self, body: Tensor, scene: Tensor | None) -> tuple[Tensor, Tensor]:
-        axis = _per_node(self._value("half_axis", body, body.shape[1:]), 1, scene)
+        axis = _per_node(self.parameter("half_axis", body, body.shape[1:]), 1, scene)
         squared = (axis * axis).sum(-1, keepdim=True)
         along = (body * axis).sum(1, keepdim=True) / torch.where(squared > 0, squared, 1)
         offset = body - along.clamp(-1, 1) * axis
-        return _norm(offset) - _per_node(self._value("radius", body, ()), 0, scene), _unit(offset)
+        return _norm(offset) - _per_node(self.parameter("radius", body, ()), 0, scene), _unit(offset)
 
     def extents(self) -> dict[str, Any]:
         return {"half_axis": self.half_axis, "radius": self.radius}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
@@ -15,7 +16,7 @@ from .errors import GridOverflowError, SimulationError
 from .grid import Blocks, Grid
 from .heat import Heat
 from .materials import Material
-from .ops import advance, g2p, gather, grid_update, p2g
+from .ops import advance, contact, fusible, g2p, gather, grid_update, p2g
 from .state import State, identity_deformation
 
 TRANSFERS = ("apic", "pic", "flip")
@@ -137,12 +138,23 @@ class Step(nn.Module):
     def _update_grid(self, blocks: Blocks, nodes: Tensor, state: State, dt: float | Tensor) -> Tensor:
         velocity = grid_update(blocks, nodes, self._gravity(state.x), dt, self.walls)
         if self.boundaries:
-            positions = blocks.node_positions(state.x.dtype)
-            node_scene = None if state.scene is None else blocks.node_scene()
-            for boundary in self.boundaries:
-                velocity = boundary.apply(velocity, positions, node_scene, state.time, dt)
+            velocity = self._obstruct(blocks, velocity, state, dt)
         if self.on_grid is not None:
             velocity = self.on_grid(blocks, velocity, nodes[:, 0], dt)
+        return velocity
+
+    def _obstruct(self, blocks: Blocks, velocity: Tensor, state: State, dt: float | Tensor) -> Tensor:
+        """The boundaries in turn; neighbours in the list that one op can take together."""
+        nodes: tuple[Tensor, Tensor | None] | None = None
+        for together, group in itertools.groupby(self.boundaries, lambda b: fusible(b, state.time)):
+            if together:
+                velocity = contact(blocks, velocity, list(group), state.time)  # type: ignore[arg-type]
+                continue
+            if nodes is None:
+                scene = None if state.scene is None else blocks.node_scene()
+                nodes = (blocks.node_positions(state.x.dtype), scene)
+            for boundary in group:
+                velocity = boundary.apply(velocity, *nodes, state.time, dt)
         return velocity
 
     def _blend_flip(self, blocks: Blocks, state: State, affine: Tensor | None, velocity: Tensor, v: Tensor) -> Tensor:

@@ -2,6 +2,7 @@
 
 from . import activation as activation
 from .advance import advance
+from .contact import contact, fusible
 from .grid_update import grid_update
 from .heat import HeatSolve, heat_cg
 from .material import material_energy, material_stiffness, material_stress, material_wave_modulus
@@ -12,6 +13,8 @@ from .transfer import g2p, gather, p2g, scatter
 __all__ = [
     "HeatSolve",
     "advance",
+    "contact",
+    "fusible",
     "g2p",
     "gather",
     "grid_update",
