@@ -573,7 +573,7 @@ class Revolved(Obstacle):
         if self.axis is None:
             axis = torch.eye(body.shape[1], dtype=body.dtype, device=body.device)[1]
         else:
-            axis = _unit(_per_node(self._value("axis", body, body.shape[1:]), 1, scene))
+            axis = _unit(_per_node(self.parameter("axis", body, body.shape[1:]), 1, scene))
         along = (body * axis).sum(1, keepdim=True)
         across = body - along * axis
         distance, normal = self._polygon(torch.cat([_norm(across)[:, None], along], 1))
@@ -581,7 +581,7 @@ class Revolved(Obstacle):
 
     def _polygon(self, p: Tensor) -> tuple[Tensor, Tensor]:
         """Signed distance [N] of points [N, 2] from the polygon, and outward normal [N, 2] of the nearest edge."""
-        a = self._value("outline", p, (len(self.outline), 2))
+        a = self.parameter("outline", p, (len(self.outline), 2))
         edge = a.roll(-1, 0) - a
         arm = p[:, None] - a
         along = (arm * edge).sum(2) / (edge * edge).sum(1)
