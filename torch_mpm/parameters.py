@@ -15,7 +15,8 @@ if TYPE_CHECKING:
     from .state import State
 
 Value = float | Tensor | Callable[[Tensor], Tensor]
-"""A parameter: a number; a tensor [], [1], [B] or [P]; or a function of the temperature [P] [K] that returns [P]."""
+"""A parameter: a number; a tensor [], [1], [B] or [P]; a function of the temperature [P] [K] that returns [P], or a
+`PerMaterial` of these."""
 
 
 class Table(nn.Module):
@@ -59,6 +60,34 @@ class Table(nn.Module):
         return torch.lerp(values[left], values[left + 1], share)
 
 
+class PerMaterial(nn.Module):
+    """A `Value` for each law of a `Mixture`: number k for the particles with state.material = k.
+
+    Args:
+        values: numbers, tensors, or functions of temperature, as many as there are laws.
+    """
+
+    def __init__(self, values: Sequence[Value]) -> None:
+        super().__init__()
+        self.count = len(values)
+        for k, value in enumerate(values):
+            store(self, f"value{k}", value)
+
+    def of(self, name: str, state: State) -> Tensor:
+        """[P], zero for an unknown material.
+
+        Raises:
+            ValueError: for a state without material.
+        """
+        if state.material is None:
+            raise ValueError(f"{name} per material needs state.material, int32 [P]")
+        result = torch.zeros_like(state.mass)
+        for k in range(self.count):
+            value = evaluate(name, getattr(self, f"value{k}"), state)
+            result = torch.where(state.material == k, value, result)
+        return result
+
+
 def evaluate(name: str, value: Value, state: State) -> float | Tensor:
     """A parameter as a number, a tensor of one element, or [P] in the particle order of the state.
 
@@ -66,6 +95,8 @@ def evaluate(name: str, value: Value, state: State) -> float | Tensor:
         ValueError: where a tensor or what a function returns has another shape, or is on another device.
     """
     P = state.x.shape[0]
+    if isinstance(value, PerMaterial):
+        return value.of(name, state)
     if not isinstance(value, Tensor):
         if not callable(value):
             return value

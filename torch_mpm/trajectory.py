@@ -34,7 +34,8 @@ STATICS = ("mass", "volume", "material", "scene")
 
 UNITS = {
     "position": "m", "velocity": "m/s", "F": "1", "J": "1", "stress": "Pa", "C": "1/s", "temperature": "K",
-    "mass": "kg", "volume": "m^3", "material": "index into attribute names", "scene": "index into attribute names",
+    "liquid": "1", "heat": "J", "mass": "kg", "volume": "m^3",
+    "material": "index into attribute names", "scene": "index into attribute names",
     "time": "s", "particles": "1", "substeps": "1", "kinetic_energy": "J", "elastic_energy": "J",
     "potential_energy": "J", "momentum": "kg m/s", "cfl": "1", "frames_written": "1",
 }  # fmt: skip

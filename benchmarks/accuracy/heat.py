@@ -4,7 +4,8 @@ Cosine mode in an insulated square, Bessel mode in an insulated disc, a bar with
 from a hot wall (Stefan's problem), for both kernels and all transfers of temperature, on a lattice that fits none of
 the bodies but the wall of Stefan's problem. Particles are regular, 4 per cell, float64; the time step has a fixed
 diffusion number r, so that a method of second order shows order 2. Errors are relative: RMS of the temperature,
-distance of the front. The hybrid is APIC for r of 1/4 and more; the error of PIC does not shrink with dx but grows with 1/r.
+distance of the front. The hybrid is APIC for r of 1/4 and more; the error of PIC does not shrink with dx but grows with
+1/r.
 """
 
 from __future__ import annotations

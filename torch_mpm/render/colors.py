@@ -34,6 +34,7 @@ QUANTITIES = {
     "speed": Quantity("speed", "m/s", "Spectral_r", from_zero=True),
     "stress": Quantity("von Mises stress", "Pa", "plasma", from_zero=True),
     "temperature": Quantity("temperature", "K", "coolwarm"),
+    "liquid": Quantity("liquid fraction", "", "viridis"),
     "material": Quantity("material", "", ""),
 }
 

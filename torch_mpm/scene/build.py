@@ -16,7 +16,7 @@ from ..grid import Grid
 from ..sand import QuarticSand
 from ..state import State
 from ..step import Step
-from . import schema
+from . import heat, schema
 from .explain import SceneError
 
 
@@ -85,19 +85,21 @@ def build(scene: Any, device: torch.device) -> Built:
     _check_words(scene, entries)
     words = scene.grid
     grid = Grid(words.dx, words.lower, words.upper, scenes=len(entries), kernel=words.kernel)
-    mixture = _Mixture(entries)
+    reference = 0.0 if scene.heat is None else scene.heat.reference
+    mixture = _Mixture(entries, reference)
     parts, material = [], []
     nozzles: list[Nozzle] = []
-    obstacles = []
+    obstacles: list[tuple[Any, boundaries.Obstacle]] = []
     problems: list[str] = []
     for index, entry in enumerate(entries):
         placed = _bodies(scene, entry, entry.path, problems)
         _check_placement(scene, entry, placed, problems)
         for body, points, _ in placed:
-            parts.append(_matter(body, points, entry.material[body.material].density, index, dtype, device))
+            matter = _matter(body, points, entry.material[body.material].density, index, dtype, device)
+            parts.append(_warmed(matter, body, scene.heat))
             material.append(torch.full((len(points),), mixture.number(index, body.material), dtype=torch.int32))
         nozzles += _nozzles(scene, entry, index, mixture, dtype, device, problems)
-        obstacles += [obstacle(o, index if len(entries) > 1 else None) for o in entry.obstacle]
+        obstacles += [(o, obstacle(o, index if len(entries) > 1 else None)) for o in entry.obstacle]
     walls = _walls(words, grid, problems)
     if problems:
         raise SceneError(problems)
@@ -106,7 +108,9 @@ def build(scene: Any, device: torch.device) -> Built:
         torch.empty(0, dim, dtype=dtype), torch.empty(0, dtype=dtype), torch.empty(0, dtype=torch.int32)
     )
     if not parts:
-        parts, material = [State.at_rest(empty, dtype=dtype, device=device)], [torch.empty(0, dtype=torch.int32)]
+        nothing = State.at_rest(empty, dtype=dtype, device=device)
+        parts = [nothing if scene.heat is None else nothing.replace(temperature=torch.zeros_like(nothing.mass))]
+        material = [torch.empty(0, dtype=torch.int32)]
     first = _complete(_join(parts), mixture, torch.cat(material), single=len(entries) == 1)
     nozzles = [
         Nozzle(
@@ -119,9 +123,10 @@ def build(scene: Any, device: torch.device) -> Built:
         mixture.law(dtype, device),
         gravity=_gravity(entries, dtype, device),
         walls=walls,
-        boundaries=obstacles,
+        boundaries=[boundary for _, boundary in obstacles],
         transfer=scene.transfer,
         flip=scene.flip,
+        heat=None if scene.heat is None else heat.conduction(scene, entries, grid, mixture.words(), obstacles, device),
     )
     ids = torch.arange(len(first), device=device)
     state = step.prepare(first.replace(ids=ids))
@@ -138,7 +143,8 @@ class _Mixture:
     Materials of one kind, at most one of them per scene, share one law whose parameters are per scene.
     """
 
-    def __init__(self, entries: Sequence[Any]) -> None:
+    def __init__(self, entries: Sequence[Any], reference: float) -> None:
+        self.reference = reference
         used = [{*(b.material for b in e.body), *(m.material for m in e.emitter)} for e in entries]
         self.scenes = len(entries)
         self.materials = [
@@ -153,6 +159,10 @@ class _Mixture:
             rank = sum(o.scene == m.scene and _form(o.words) == form for o in self.materials[:number])
             groups.setdefault((form, rank), []).append(number)
         self.groups = list(groups.values())
+
+    def words(self) -> list[Any]:
+        """The words of one material of each law."""
+        return [self.materials[group[0]].words for group in self.groups]
 
     def number(self, scene: int, name: str) -> int:
         return next(k for k, m in enumerate(self.materials) if (m.scene, m.name) == (scene, name))
@@ -169,9 +179,16 @@ class _Mixture:
         return laws[0] if len(laws) == 1 else materials.Mixture(laws)
 
     def _one(self, group: list[int], dtype: torch.dtype, device: torch.device) -> materials.Material:
+        law = self._mechanical(group, dtype, device)
+        return heat.thermal(law, self.materials[group[0]].words, self.reference).to(device)
+
+    def _mechanical(self, group: list[int], dtype: torch.dtype, device: torch.device) -> materials.Material:
         members = [self.materials[k] for k in group]
 
-        def value(name: str) -> float | Tensor:
+        def value(name: str) -> Any:
+            words = getattr(members[0].words, name)
+            if isinstance(words, schema.Curve):
+                return heat.parameter(words, self.reference)
             values = [float(getattr(m.words, name)) for m in members]
             if len(set(values)) == 1:
                 return values[0]
@@ -197,7 +214,11 @@ class _Mixture:
 def _form(words: Any) -> tuple[Any, ...]:
     """What must be the same in materials that share a law."""
     options = [getattr(words, name, None) for name in ("energy", "apex", "smallest_strain")]
-    return words.law, getattr(words, "viscosity", 0.0) > 0, getattr(words, "mu", None) is not None, *options
+    options += [getattr(words, name, None) for name in (*heat.THERMAL, "liquid")]
+    curves = [v for name in ("E", "viscosity") if isinstance(v := getattr(words, name, None), schema.Curve)]
+    viscosity = getattr(words, "viscosity", 0.0)
+    viscous = isinstance(viscosity, schema.Curve) or viscosity > 0
+    return words.law, viscous, getattr(words, "mu", None) is not None, repr(options), repr(curves)
 
 
 def _complete(state: State, mixture: _Mixture, material: Tensor, single: bool) -> State:
@@ -258,6 +279,14 @@ def _matter(
         v = state.v + (points.x - center) @ gradient.T
         state = state.replace(v=v, C=gradient.expand(len(points), -1, -1))
     return state.to(device, dtype)
+
+
+def _warmed(state: State, words: schema.Seeding, heat: schema.Heat | None) -> State:
+    """Matter at its temperature, in a scene with heat."""
+    if heat is None:
+        return state
+    temperature = 0.0 if words.temperature is None else words.temperature - heat.reference
+    return state.replace(temperature=torch.full_like(state.mass, temperature))
 
 
 def _spin_matrix(spin: float | Sequence[float], dim: int) -> Tensor:
@@ -333,6 +362,7 @@ def _nozzles(
             )
         points = seed.Points(points.x, points.volume, torch.full((len(points),), index, dtype=torch.int32))
         layer = State.at_rest(points, density, words.velocity, torch.float64).to(device, dtype)
+        layer = _warmed(layer, words, scene.heat)
         nozzles.append(Nozzle(layer, mixture.number(index, words.material), times))
     return nozzles
 
@@ -391,6 +421,7 @@ def _check_words(scene: Any, entries: Sequence[Any]) -> None:
                     )
         if not entry.body and not entry.emitter:
             problems.append(f"{entry.path}body: the scene has no matter; give it a [[body]] or an [[emitter]]")
+    problems += heat.problems(scene, entries)
     if any(a >= b for a, b in zip(scene.grid.lower, scene.grid.upper, strict=False)):
         problems.append(f"grid.upper: must be above grid.lower on every axis, got {scene.grid.upper}")
     if problems:

@@ -15,11 +15,13 @@ from ..state import State
 from ..trajectory import disk_errors, h5py_module
 
 Host = dict[str, Tensor]
+EXTRA = "extra."
 
 
 def tensors_of(state: State) -> Host:
-    """The tensors that a state has, by name."""
+    """The tensors that a state has, by name, those of `extra` as "extra.NAME"."""
     fields = {f.name: getattr(state, f.name) for f in dataclasses.fields(state)}
+    fields |= {EXTRA + name: value for name, value in state.extra.items()}
     return {name: value for name, value in fields.items() if isinstance(value, Tensor)}
 
 
@@ -44,5 +46,8 @@ def load(path: Path, device: torch.device | str = "cpu") -> tuple[State, dict[st
     with h5py_module().File(path, "r") as source:
         record = json.loads(source.attrs["record"])
         tensors: dict[str, Any] = {name: torch.from_numpy(data[()]) for name, data in source.items()}
-    state = State.concatenate([State(**tensors, time=record["time"])])  # concatenate restores the memory layout
+    extra = {name.removeprefix(EXTRA): tensors.pop(name) for name in list(tensors) if name.startswith(EXTRA)}
+    state = State.concatenate(
+        [State(**tensors, extra=extra, time=record["time"])]
+    )  # concatenate restores the memory layout
     return state.to(device), record

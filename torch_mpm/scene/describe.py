@@ -72,6 +72,6 @@ def _trial(built: Built, state: State, dt: float) -> tuple[State, float]:
 
 
 def _bytes_of(state: State) -> dict[str, int]:
-    fields = {f.name: getattr(state, f.name) for f in dataclasses.fields(state) if f.name != "time"}
+    fields = {f.name: getattr(state, f.name) for f in dataclasses.fields(state) if f.name != "time"} | state.extra
     tensors = {name: value for name, value in fields.items() if isinstance(value, Tensor)}
     return {name: t[0].numel() * t.element_size() if len(t) else 0 for name, t in tensors.items()}

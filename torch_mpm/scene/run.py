@@ -22,6 +22,7 @@ from torch import Tensor
 
 from ..errors import SimulationError
 from ..state import State
+from ..thermal import LIQUID
 from ..trajectory import COMPLETE, PARTIAL, Layout, TrajectoryWriter, create, h5py_module
 from . import checkpoint
 from .build import Built
@@ -32,7 +33,7 @@ from .writer import FrameWriter
 
 SEGMENT = 32
 """Substeps between two looks at the stability limit and the validity of the state, and between two reorderings."""
-FIELD_SHAPES = {"F": 2, "C": 2, "stress": 2, "J": 0, "temperature": 0}
+FIELD_SHAPES = {"F": 2, "C": 2, "stress": 2, "J": 0, "temperature": 0, "liquid": 0}
 RUN, CHECKPOINT, LAST_GOOD = "run.json", "checkpoint.h5", "last_good.h5"
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
@@ -130,6 +131,8 @@ class Simulation:
         number = ((), "f8")
         scalars = dict.fromkeys(("time", "kinetic_energy", "elastic_energy", "potential_energy", "cfl"), number)
         counts = dict.fromkeys(("particles", "substeps"), ((), "i8"))
+        if self.step.heat is not None:
+            scalars["heat"] = number
         names = {"material": [m.name for m in self.built.materials]}
         if len(self.built.scenes) > 1:
             names["scene"] = self.built.scenes
@@ -207,13 +210,21 @@ class Simulation:
         order = torch.argsort(state.ids)
         fields = {"position": state.x, "velocity": state.v}
         for name in self.scene.trajectory_fields:
-            value = self.step.law.stress(_with_C(state)) if name == "stress" else getattr(state, name)
-            if value is None and name == "C":
-                value = _with_C(state).C
+            value = self._field(state, name)
             if value is None:
                 raise SceneError([f"output.fields: no material of this scene has {name!r}"])
             fields[name] = value
         return {name: value[order] for name, value in fields.items()}
+
+    def _field(self, state: State, name: str) -> Tensor | None:
+        if name == "stress":
+            return self.step.law.stress(_with_C(state))
+        if name == "liquid":
+            return state.extra.get(LIQUID)
+        if name == "temperature" and state.temperature is not None and self.step.heat is not None:
+            return state.temperature + self.step.heat.reference
+        value: Tensor | None = getattr(state, name)
+        return _with_C(state).C if value is None and name == "C" else value
 
     # -- time
 
@@ -325,14 +336,15 @@ def joined(state: State, layer: State) -> State:
 
 
 def energies(step: Any, state: Any) -> dict[str, Any]:
-    """Kinetic, elastic and potential energy [J] and momentum [kg m/s] of all particles, summed in float64."""
+    """Kinetic, elastic and potential energy [J], momentum [kg m/s] and heat [J] of all particles, summed in float64."""
     mass, v = state.mass.double(), state.v.double()
     gravity = step.gravity
     potential = 0.0
     if gravity is not None:
         rows = gravity if gravity.dim() == 1 else gravity[state.scene.long()]
         potential = -float((mass[:, None] * state.x.double() * rows.double()).sum())
-    return {
+    heat = {} if step.heat is None else {"heat": float(step.heat.heat_content(state).double().sum())}
+    return heat | {
         "kinetic_energy": 0.5 * float((mass * v.square().sum(1)).sum()),
         "elastic_energy": float(step.law.energy(step.prepare(state)).double().sum()),
         "potential_energy": potential,

@@ -108,9 +108,10 @@ class Scene(schema.SceneData):
     def trajectory_fields(self) -> list[str]:
         """Fields of the trajectory beside position and velocity: those asked for, and what the other outputs need."""
         drawn = self.render.color_by if self.render else ""
-        needed = {name for name in ("stress", "temperature") if name == drawn}
+        needed = {name for name in ("stress", "temperature", "liquid") if name == drawn}
         needed |= {"stress"} if self.output.vtk else set()
-        return [name for name in ("F", "J", "C", "stress", "temperature") if name in {*self.output.fields, *needed}]
+        names = ("F", "J", "C", "stress", "temperature", "liquid")
+        return [name for name in names if name in {*self.output.fields, *needed}]
 
     def torch_device(self) -> torch.device:
         """Raises SceneError for a device that is not there."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
@@ -44,20 +45,65 @@ class Grid(Model):
 # ---- materials
 
 
-class NeoHookean(Model):
+class Curve(Model):
+    """A quantity that depends on temperature: piecewise linear, constant beyond the ends."""
+
+    temperature: list[float]
+    """increasing temperatures [K]"""
+    value: list[Positive]
+    """values there"""
+
+    @model_validator(mode="after")
+    def _increasing(self) -> Curve:
+        if len(self.temperature) != len(self.value) or len(self.value) < 2:
+            raise ValueError("takes as many values as temperatures, two at least")
+        if any(b <= a for a, b in itertools.pairwise(self.temperature)):
+            raise ValueError(f"takes increasing temperatures, got {self.temperature}")
+        return self
+
+
+class Thermal(Model):
+    """What a material does with heat, in a scene with a [heat] table."""
+
+    conductivity: NotNegative | Curve | None = None
+    """heat conductivity [W/(m K)]"""
+    specific_heat: Positive | Curve | None = None
+    """heat capacity per mass [J/(kg K)]"""
+    expansion: float | None = None
+    """coefficient of linear thermal expansion about the reference temperature [1/K]"""
+    melting_point: float | None = None
+    """melting temperature [K]"""
+    latent_heat: Positive | None = None
+    """heat of melting [J/kg]"""
+
+
+class Liquid(Model):
+    """What a solid becomes when it melts: a fluid whose pressure follows its volume."""
+
+    bulk_modulus: Positive
+    """bulk modulus [Pa]"""
+    gamma: Positive = 7.0
+    """exponent of the equation of state"""
+    viscosity: NotNegative | Curve = 0.0
+    """dynamic viscosity [Pa s]"""
+
+
+class NeoHookean(Thermal):
     """Elastic solid."""
 
     law: Literal["neo_hookean"] = "neo_hookean"
     """name of the law"""
     density: Positive = 1000.0
     """density at rest [kg/m^3]"""
-    E: Positive
+    E: Positive | Curve
     """Young's modulus [Pa]"""
     nu: Annotated[float, Field(gt=-1, lt=0.5)] = 0.3
     """Poisson's ratio, between -1 and 0.5"""
+    liquid: Liquid | None = None
+    """what it becomes above its melting point"""
 
 
-class WeaklyCompressible(Model):
+class WeaklyCompressible(Thermal):
     """Fluid whose pressure follows its volume."""
 
     law: Literal["weakly_compressible"] = "weakly_compressible"
@@ -68,11 +114,11 @@ class WeaklyCompressible(Model):
     """bulk modulus [Pa]; density * (10 * largest expected speed)^2 keeps density changes near 1 %"""
     gamma: Positive = 7.0
     """exponent of the equation of state; 7 for water"""
-    viscosity: NotNegative = 0.0
+    viscosity: NotNegative | Curve = 0.0
     """dynamic viscosity [Pa s]"""
 
 
-class QuarticSand(Model):
+class QuarticSand(Thermal):
     """Dry sand: Drucker-Prager plasticity."""
 
     law: Literal["quartic_sand"] = "quartic_sand"
@@ -121,6 +167,8 @@ class Seeding(Model):
     """name of a material of this scene"""
     per_cell: Positive = 8.0
     """mean number of particles per grid cell"""
+    temperature: float | None = None
+    """initial temperature [K]; by default the reference of [heat]"""
 
 
 class Body(Seeding):
@@ -254,6 +302,8 @@ class Obstacle(Model):
     """time from which it is there and moves [s]"""
     end: Positive | None = None
     """time from which it is gone [s]"""
+    temperature: float | None = None
+    """temperature at which it holds what it touches [K]; by default it insulates"""
     opacity: Annotated[float, Field(gt=0, le=1)] = 1.0
     """how solid it is drawn, 1 for not transparent"""
 
@@ -322,13 +372,53 @@ AnyObstacle = Annotated[
 ]
 
 
+# ---- heat
+
+
+class Exchange(Model):
+    """Exchange of heat with the surroundings at the free surface of the bodies."""
+
+    coefficient: NotNegative = 0.0
+    """coefficient of convection [W/(m^2 K)]"""
+    emissivity: Annotated[float, Field(ge=0, le=1)] = 0.0
+    """emissivity, for radiation"""
+    ambient: float
+    """temperature of the surroundings [K]"""
+
+
+class Face(Model):
+    """Heat through a flat face along the axes."""
+
+    lower: Vector
+    """lower corner [m]"""
+    upper: Vector
+    """upper corner [m], equal to the lower one along one axis"""
+    flux: float
+    """heat per area into the body [W/m^2]"""
+
+
+class Heat(Model):
+    """Conduction of heat; every material then needs conductivity and specific_heat."""
+
+    reference: float = 0.0
+    """temperature that temperatures are kept relative to [K], best in their middle; where there is no thermal strain"""
+    transfer: Literal["hybrid", "apic", "flip", "pic"] = "hybrid"
+    """how temperature moves between particles and grid"""
+    plastic_heating: Annotated[float, Field(ge=0, le=1)] = 0.0
+    """share of the plastic work that becomes heat"""
+    exchange: list[Exchange] = []
+    """surroundings"""
+    face: list[Face] = []
+    """heated or cooled faces"""
+
+
 # ---- outputs
 
 
 class Output(Model):
     """What the trajectory holds beside position and velocity, and further formats."""
 
-    fields: list[Literal["F", "J", "C", "stress", "temperature"]] = []
+    fields: list[Literal["F", "J", "C", "stress", "temperature", "liquid"]] = []
     """further fields of the trajectory"""
     vtk: bool = False
     """write a VTK file per frame, with stress"""
@@ -348,7 +438,7 @@ class Ritter(Model):
 class Render(Model):
     """Pictures (PNG) and video (MP4)."""
 
-    color_by: Literal["speed", "stress", "material", "temperature", "layer"] = "speed"
+    color_by: Literal["speed", "stress", "material", "temperature", "liquid", "layer"] = "speed"
     """what the colours show; layer: by height at the start, or by time for what emitters bring"""
     layers: Annotated[int, Field(ge=1)] = 8
     """number of layers that the colours tell apart"""
@@ -422,6 +512,8 @@ class SceneData(Content):
     """"cpu", "cuda", "cuda:1", ... or "auto": a GPU if there is one"""
     seed: Annotated[int, Field(ge=0)] = 0
     """seed of everything random"""
+    heat: Heat | None = None
+    """conduction of heat; none without this table"""
     scene: list[Entry] = []
     """scenes of a batch, simulated together"""
     output: Output = Output()

@@ -1,0 +1,136 @@
+"""The thermal words of a scene: materials that depend on temperature, and the `Heat` of the step."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from .. import boundaries, materials
+from ..grid import Grid
+from ..heat import Heat
+from ..heat_boundaries import Convection, Fixed, Flux, FreeSurface, Radiation, Surface
+from ..parameters import PerMaterial, Table
+from ..thermal import Melting, ThermalExpansion
+from . import schema
+
+THERMAL = tuple(schema.Thermal.model_fields)
+
+
+def problems(scene: Any, entries: Sequence[Any]) -> Iterator[str]:
+    """What the thermal words of a scene lack or have too much."""
+    for entry in entries:
+        used = {item.material for item in (*entry.body, *entry.emitter)}
+        for name, words in entry.material.items():
+            path = f"{entry.path}material.{name}"
+            given = [key for key in (*THERMAL, "liquid") if getattr(words, key, None) is not None]
+            given += [key for key in ("E", "viscosity") if isinstance(getattr(words, key, None), schema.Curve)]
+            if scene.heat is None:
+                yield from (f"{path}.{key}: needs a [heat] table, which lets heat flow" for key in given)
+                continue
+            if name in used:
+                missing = [key for key in ("conductivity", "specific_heat") if key not in given]
+                yield from (f"{path}.{key}: missing, but the scene has a [heat] table" for key in missing)
+            if len({"melting_point", "latent_heat"} & set(given)) == 1:
+                yield f"{path}: melting_point and latent_heat must be given together"
+            if "liquid" in given and "latent_heat" not in given:
+                yield f"{path}.liquid: needs melting_point and latent_heat"
+        for kind in ("body", "emitter", "obstacle"):
+            for k, item in enumerate(getattr(entry, kind)):
+                if scene.heat is None and item.temperature is not None:
+                    yield f"{entry.path}{kind}[{k}].temperature: needs a [heat] table, which lets heat flow"
+    for k, face in enumerate(scene.heat.face if scene.heat is not None else ()):
+        dim = len(scene.grid.lower)
+        for key in ("lower", "upper"):
+            if len(getattr(face, key)) != dim:
+                yield f"heat.face[{k}].{key}: must have {dim} numbers in this {dim}-D scene, got {getattr(face, key)}"
+        flat = [a == b for a, b in zip(face.lower, face.upper, strict=False)]
+        if sum(flat) != 1 or any(a > b for a, b in zip(face.lower, face.upper, strict=False)):
+            yield f"heat.face[{k}]: upper must equal lower along one axis and be above it along the others"
+
+
+def parameter(words: float | schema.Curve, reference: float) -> float | Table:
+    """A number, or a table of temperatures relative to the reference."""
+    if isinstance(words, schema.Curve):
+        return Table([t - reference for t in words.temperature], words.value)
+    return float(words)
+
+
+def thermal(law: materials.Material, words: Any, reference: float) -> materials.Material:
+    """A law with the melting and the expansion of its material."""
+    liquid = getattr(words, "liquid", None)
+    if liquid is not None:
+        fluid = materials.WeaklyCompressible(liquid.bulk_modulus, liquid.gamma, parameter(liquid.viscosity, reference))
+        law = Melting(law, fluid)
+    return law if words.expansion is None else ThermalExpansion(law, words.expansion)
+
+
+def conduction(scene: Any, entries: Sequence[Any], grid: Grid, laws: Sequence[Any], obstacles: Sequence[Any],
+               device: torch.device) -> Heat:  # fmt: skip
+    """The `Heat` of a step.
+
+    Args:
+        scene, entries: the scene and what fills each domain of its batch.
+        grid: the lattice.
+        laws: the words of a material of each law of the step.
+        obstacles: (words, boundary) of all obstacles.
+        device: of the particles.
+    """
+    words, reference = scene.heat, scene.heat.reference
+
+    def value(name: str, absent: float) -> Any:
+        values = [absent if getattr(m, name) is None else parameter(getattr(m, name), reference) for m in laws]
+        return values[0] if len(values) == 1 else PerMaterial(values)
+
+    melting: dict[str, Any] = {}
+    if any(m.latent_heat is not None for m in laws):
+        points = [math.inf if m.melting_point is None else m.melting_point - reference for m in laws]
+        melting = {
+            "melting_point": points[0] if len(points) == 1 else PerMaterial(points),
+            "latent_heat": value("latent_heat", 1.0),
+        }
+    return Heat(
+        grid,
+        value("conductivity", 0.0),
+        value("specific_heat", 1.0),
+        list(_terms(scene, entries, obstacles, device)),
+        transfer=words.transfer,
+        plastic_heating=words.plastic_heating,
+        reference=reference,
+        **melting,
+    ).to(device)
+
+
+def _terms(
+    scene: Any, entries: Sequence[Any], obstacles: Sequence[tuple[Any, boundaries.Obstacle]], device: torch.device
+) -> Iterator[Any]:
+    reference = scene.heat.reference
+    for words, region in obstacles:
+        if words.temperature is not None:
+            yield Fixed(region, words.temperature - reference)
+    for exchange in scene.heat.exchange:
+        if exchange.coefficient:
+            yield Convection(FreeSurface(), exchange.coefficient, exchange.ambient - reference)
+        if exchange.emissivity:
+            yield Radiation(FreeSurface(), exchange.emissivity, exchange.ambient - reference)
+    for face in scene.heat.face:
+        yield Flux(_face(face, scene.grid.dx, len(entries), device), face.flux)
+
+
+def _face(words: schema.Face, dx: float, scenes: int, device: torch.device) -> Surface:
+    """Points half a node distance apart on an axis-aligned face, in every scene."""
+    sides = [b - a for a, b in zip(words.lower, words.upper, strict=True)]
+    counts = [max(1, math.ceil(2 * side / dx)) if side else 1 for side in sides]
+    axes = [
+        a + (torch.arange(n, dtype=torch.float64) + 0.5) * side / n
+        for a, side, n in zip(words.lower, sides, counts, strict=True)
+    ]
+    points = torch.cartesian_prod(*axes).to(device)
+    area = math.prod(side for side in sides if side) / len(points)
+    if scenes == 1:
+        return Surface(points, area)
+    scene: Tensor = torch.arange(scenes, dtype=torch.int32, device=device).repeat_interleave(len(points))
+    return Surface(points.repeat(scenes, 1), area, scene)
