@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from . import common
+from .accuracy.runout import PUBLISHED, published
 
 BEGIN, END = "<!-- benchmarks -->", "<!-- /benchmarks -->"
 FORWARD = ("step", "step, CUDA graph")
@@ -100,6 +101,51 @@ def stability(result: dict[str, Any]) -> str:
     return "\n".join([intro, "", common.table(("D", "s", *(f"ν = {nu:g}" for nu in ratios)), rows)])
 
 
+def runout(result: dict[str, Any]) -> str:
+    """Collapse of columns of sand beside published measurements, and the steepest slopes that stand."""
+    aspects = [row["a"] for row in result["collapse"][0]["rows"]]
+    lines = []
+    for source, (name, *_) in PUBLISHED.items():
+        values = [f"{published(source, a):.2f}" for a in aspects]
+        lines.append((f"{source}: {name}", *values, *(f"{p[1]:.2f}" for p in PUBLISHED[source][2:]), None))
+    for case in result["collapse"]:
+        runouts = [f"{row['run-out']:.2f}" for row in case["rows"]]
+        exponents = [f"{case['exponents'][k]:.2f}" for k in ("wide", "narrow")]
+        lines.append((case["name"], *runouts, *exponents, case["seconds"]))
+    header = ("run-out at a =", *(f"{a:g}" for a in aspects), "exponent, a ≤ 2", "a ≥ 3", "run time [s]")
+    slopes = [(s["name"], s["steepest"], s["least failing"]) for s in result["standing"]]
+    intro = (
+        "Run-out (r − r₀)/r₀ of columns of aspect ratio a on a rough floor (benchmarks/accuracy/runout.py, "
+        f"{result['environment']['device']}), each row one batch."
+    )
+    parts = [intro, common.table(header, lines), "![run-out over aspect ratio](benchmarks/results/runout.png)"]
+    if slopes:
+        parts.append(common.table(("slope in plane strain", "steepest that stands [°]", "fails from [°]"), slopes))
+    return "\n\n".join(parts)
+
+
+def collapse(result: dict[str, Any]) -> str:
+    """Long runs of columns of any stiffness and friction."""
+    rows = [
+        (
+            name,
+            len(rows),
+            sum(not row["finite"] for row in rows),
+            max(row["rise"] for row in rows),
+            min(row["time"] for row in rows),
+            result["seconds"][name],
+        )
+        for name in result["seconds"]
+        if (rows := [row for row in result["rows"] if row["case"] == name])
+    ]
+    header = ("law", "columns", "not finite", "largest rise of energy", "least time / √(H/g)", "run time [s]")
+    intro = (
+        f"{result['steps']} steps of collapsing columns, E from 1e3 to 1e9 Pa, friction angles 0° to 60°, at half of "
+        "`step.stable_dt(state, cfl=1)` (benchmarks/stability/collapse.py); energy relative to the first."
+    )
+    return "\n\n".join([intro, common.table(header, rows)])
+
+
 def summary(directory: Path) -> str:
     """All sections for which there are results."""
     sections = []
@@ -108,6 +154,12 @@ def summary(directory: Path) -> str:
     for name, section in (("convergence", convergence), ("precision", precision), ("stability", stability)):
         if (file := directory / f"{name}.json").exists():
             sections.append(f"### {name.capitalize()}\n\n" + section(json.loads(file.read_text())))
+    for name, title, table in (
+        ("runout", "Sand: run-out of columns", runout),
+        ("collapse", "Sand: long runs", collapse),
+    ):
+        if (file := directory / f"{name}.json").exists():
+            sections.append(f"### {title}\n\n" + table(json.loads(file.read_text())))
     return "\n\n".join(sections)
 
 
