@@ -19,11 +19,17 @@ PROGRAMS = (
     "benchmarks.speed.step",
     "benchmarks.accuracy.precision",
     "benchmarks.accuracy.convergence",
+    "benchmarks.accuracy.ritter",
     "benchmarks.accuracy.runout",
     "benchmarks.stability.stable_dt",
     "benchmarks.stability.collapse",
 )
-ON_DEVICE = ("benchmarks.speed.step", "benchmarks.accuracy.runout", "benchmarks.stability.collapse")
+ON_DEVICE = (
+    "benchmarks.speed.step",
+    "benchmarks.accuracy.ritter",
+    "benchmarks.accuracy.runout",
+    "benchmarks.stability.collapse",
+)
 """Programs that take --device; the others run on the CPU."""
 
 

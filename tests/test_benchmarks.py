@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from benchmarks import common, report
-from benchmarks.accuracy import convergence, manufactured
+from benchmarks.accuracy import convergence, manufactured, ritter
 from benchmarks.speed import peers, step, work
 
 # Threads that wait without spinning: tests share their machine.
@@ -118,7 +118,23 @@ def test_mirrored_walls_converge_with_second_order_and_slip_walls_with_first() -
     assert 1.8 < orders["mirror"] < 2.2
 
 
-@pytest.mark.parametrize("program", ["convergence", "precision"])
+def test_fronts_of_the_exact_solution_have_no_error() -> None:
+    """Particles of equal area placed by Ritter's depth; the tip is the foremost of them."""
+    t, count = 5.0, 40000
+    ahead = (torch.arange(count, dtype=torch.float64) + 0.5) / count  # share of the water released that is ahead
+    x = 2 * ritter.SPEED * t * (1 - ahead ** (1 / 3))
+    area = torch.full_like(x, 8 / 27 * ritter.SPEED * t * ritter.DEPTH / count)
+    row = ritter.fronts(float(x.max()), *ritter.profile(x.numpy(), area.numpy(), t), t)
+    assert all(abs(row["error"][str(level)]) < 1e-3 for level in ritter.LEVELS if level < 0.4)
+    assert row["tip"] == pytest.approx(1 - (0.5 / count) ** (1 / 3))
+
+
+def test_richardson() -> None:
+    assert ritter.extrapolate([1.0, 1.5, 1.75], lambda value: value) == 2.0
+    assert ritter.extrapolate([1.0, 1.5, 2.0], lambda value: value) is None
+
+
+@pytest.mark.parametrize("program", ["convergence", "precision", "ritter"])
 def test_accuracy_program(program: str, tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     run_quick(f"benchmarks.accuracy.{program}", tmp_path)

@@ -309,6 +309,14 @@ def test_two_dimensional_picture():
         assert tuple(wall[row, column]) == (0, 255, 0)
 
 
+def test_heights_can_be_exaggerated():
+    corners = np.array([[0.0, 0.0], [4.0, 0.0], [0.0, 0.5]])
+    for factor in (1.0, 3.0):
+        with render.Renderer(((0, 0), (4, 0.5)), SMALL, exaggeration=factor) as renderer:
+            at, right, up = renderer.project(corners)
+            assert at[1] - up[1] == pytest.approx(factor * (right[0] - at[0]) / 8)
+
+
 def test_scale_and_legend_are_drawn():
     x = np.array([[0.5, 0.5, 0.5]])
     for kind, names in (("speed", ()), ("material", ("water", "jelly"))):
@@ -333,6 +341,8 @@ def test_wrong_arguments_are_named():
         ({"bounds": UNIT, "style": "mist"}, "style must be"),
         ({"bounds": ((0, 0), (1, 1)), "style": "surface"}, "style must be"),
         ({"bounds": UNIT, "range": (1, 1)}, "range must be"),
+        ({"bounds": ((0, 0), (1, 1)), "exaggeration": 0.0}, "exaggeration must be positive, and 1 in 3-D, got 0.0"),
+        ({"bounds": UNIT, "exaggeration": 2.0}, "exaggeration must be positive, and 1 in 3-D, got 2.0"),
         ({"bounds": UNIT, "backend": "paint"}, "backend must be"),
     ]:
         with pytest.raises(ValueError, match=message):

@@ -49,7 +49,7 @@ struct ContactArguments {
   const T* velocity = nullptr;  // node i at velocity + i * stride
   const T* grad = nullptr;      // likewise; backward only
   int64_t stride = 0, grad_stride = 0;
-  T* result = nullptr;  // [capacity * 4^D, D] with stride 1 + D: velocity after contact, or its adjoint
+  T* result = nullptr;  // rows [capacity * 4^D, 1 + D] as of the grid update, the first column zero
 };
 
 inline namespace TORCH_MPM_ISA {
@@ -244,8 +244,10 @@ MPM_HD Vector<T, D> load_node(const T* values, int64_t stride, int64_t node) {
 
 template <class T, int D>
 MPM_HD void store_node(T* values, int64_t node, const Vector<T, D>& v) {
+  T* const row = values + node * (1 + D);
+  row[0] = T(0);
   MPM_UNROLL
-  for (int i = 0; i < D; i++) values[node * (1 + D) + i] = v[i];
+  for (int i = 0; i < D; i++) row[1 + i] = v[i];
 }
 
 // The nodes lane, lane + Lanes, ... of a slot. Obstacles act one after another.

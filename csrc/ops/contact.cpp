@@ -94,10 +94,10 @@ ContactArguments<T, D> contact_arguments(MPM_CONTACT_PARAMETERS) {
 Tensor contact(MPM_CONTACT_PARAMETERS) {
   const DeviceScope device(velocity);
   check_rank(velocity, "velocity", 2);
-  Tensor rows = torch::stable::new_zeros(velocity, {velocity.size(0), 1 + velocity.size(1)});
+  Tensor rows = empty(velocity, {velocity.size(0), 1 + velocity.size(1)});
   dispatch_velocity(velocity, [&]<class T, int D>() {
     auto a = contact_arguments<T, D>(MPM_CONTACT_ARGUMENTS);
-    a.result = static_cast<T*>(rows.data_ptr()) + 1;
+    a.result = static_cast<T*>(rows.data_ptr());
     backend::contact(a, device.stream());
   });
   return rows;
@@ -106,14 +106,14 @@ Tensor contact(MPM_CONTACT_PARAMETERS) {
 Tensor contact_backward(const Tensor& grad, MPM_CONTACT_PARAMETERS) {
   const DeviceScope device(velocity);
   check_rank(velocity, "velocity", 2);
-  Tensor rows = torch::stable::new_zeros(velocity, {velocity.size(0), 1 + velocity.size(1)});
+  Tensor rows = empty(velocity, {velocity.size(0), 1 + velocity.size(1)});
   dispatch_velocity(velocity, [&]<class T, int D>() {
     auto a = contact_arguments<T, D>(MPM_CONTACT_ARGUMENTS);
     const auto g = node_input<T>(grad, "grad", velocity, node_count<D>(block));
     STD_TORCH_CHECK(g.channels == D, "grad must have shape [N, D]");
     a.grad = g.pointer;
     a.grad_stride = g.stride;
-    a.result = static_cast<T*>(rows.data_ptr()) + 1;
+    a.result = static_cast<T*>(rows.data_ptr());
     backend::contact_backward(a, device.stream());
   });
   return rows;

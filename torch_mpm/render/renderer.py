@@ -41,6 +41,7 @@ class Renderer:
         materials: names of materials 0, 1, ... for the legend of color_by="material".
         azimuth, elevation: direction of the camera in degrees (3-D), around and above the horizontal plane.
         view: (lower [D], upper [D]) to frame instead of the bounds.
+        exaggeration: scale of heights over that of lengths (2-D); particles stay round.
         ground: draw the ground at the lower face of the bounds (3-D).
         backend: "vtk", "software" (3-D without OpenGL, plainer), or "auto": VTK, and where VTK finds no OpenGL
             a logged warning and "software". The attribute `backend` tells which it became; 2-D is "matplotlib".
@@ -67,6 +68,7 @@ class Renderer:
         azimuth: float = 28.0,
         elevation: float = 18.0,
         view: tuple[npt.ArrayLike, npt.ArrayLike] | None = None,
+        exaggeration: float = 1.0,
         ground: bool = True,
         backend: str = "auto",
     ) -> None:
@@ -76,6 +78,8 @@ class Renderer:
             raise ValueError(f"style must be 'particles' or, in 3-D, 'surface', got {style!r}")
         if range is not None and not range[0] < range[1]:
             raise ValueError(f"range must be (lo, hi) with lo < hi, got {range}")
+        if not 0 < exaggeration < np.inf or (exaggeration != 1 and self.dim == 3):
+            raise ValueError(f"exaggeration must be positive, and 1 in 3-D, got {exaggeration}")
         self.resolution = (int(resolution[0]), int(resolution[1]))
         self.color_by, self.limits, self.radius, self.style = color_by, range, radius, style
         quantity = QUANTITIES.get(color_by or "", Quantity(color_by or "", "", "viridis"))
@@ -89,7 +93,7 @@ class Renderer:
             raise ValueError(f"backend must be 'auto', 'vtk' or 'software', got {backend!r}")
         if self.dim == 2:
             self.backend = "matplotlib"
-            self.scene = Scene2D(frame, self.resolution, self.has_scale)
+            self.scene = Scene2D(frame, self.resolution, self.has_scale, exaggeration)
         else:
             self.backend = _choose(backend)
             fill = (1 - 1.7 * scale_width(self.resolution) if color_by else 0.92, 0.86)

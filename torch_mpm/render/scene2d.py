@@ -1,4 +1,4 @@
-"""Two-dimensional pictures through matplotlib: particles as discs to scale, axes in metres."""
+"""Two-dimensional pictures through matplotlib: particles as discs, axes in metres."""
 
 from __future__ import annotations
 
@@ -18,14 +18,16 @@ Overlay = tuple[Array, str, str]
 class Scene2D:
     """One figure that is drawn again for every frame; `to_pixels` gives where a point [m] lands in the picture."""
 
-    def __init__(self, bounds: tuple[Array, Array], resolution: tuple[int, int], scale: bool) -> None:
+    def __init__(
+        self, bounds: tuple[Array, Array], resolution: tuple[int, int], scale: bool, exaggeration: float = 1.0
+    ) -> None:
         self.figure, self.size = figure(resolution), font_size(resolution)
         self.resolution = resolution
         lower, upper = bounds
         left = 5 * self.size * DPI / 72 / resolution[0]
         width = 0.97 - left - (scale_width(resolution) if scale else 0)
         bottom, height = 0.11, 0.78
-        aspect = (upper[1] - lower[1]) / (upper[0] - lower[0]) * resolution[0] / resolution[1]
+        aspect = exaggeration * (upper[1] - lower[1]) / (upper[0] - lower[0]) * resolution[0] / resolution[1]
         fitted = (width, width * aspect) if width * aspect <= height else (height / aspect, height)
         corner = (left + 0.5 * (width - fitted[0]), bottom + 0.5 * (height - fitted[1]))
         self.axes = self.figure.add_axes((*corner, *fitted))

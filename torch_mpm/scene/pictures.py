@@ -76,6 +76,7 @@ class _Artist:
                 azimuth=words.azimuth,
                 elevation=words.elevation,
                 view=words.view,
+                exaggeration=words.exaggeration,
             )
             for entry in self.entries
         ]

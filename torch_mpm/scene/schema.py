@@ -454,6 +454,8 @@ class Render(Model):
     """height of the camera above the horizon [degrees] (3-D)"""
     view: tuple[Vector, Vector] | None = None
     """corners of the box that the picture shows [m]; by default the domain"""
+    exaggeration: Positive = 1.0
+    """scale of heights over that of lengths (2-D)"""
     every: Annotated[int, Field(ge=1)] = 1
     """draw one frame in so many"""
     video: bool = True
