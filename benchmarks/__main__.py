@@ -17,15 +17,20 @@ from . import common
 
 PROGRAMS = (
     "benchmarks.speed.step",
+    "benchmarks.speed.svd",
     "benchmarks.accuracy.precision",
     "benchmarks.accuracy.convergence",
+    "benchmarks.accuracy.svd",
+    "benchmarks.accuracy.sand",
     "benchmarks.accuracy.ritter",
     "benchmarks.accuracy.runout",
     "benchmarks.stability.stable_dt",
+    "benchmarks.stability.sand",
     "benchmarks.stability.collapse",
 )
 ON_DEVICE = (
     "benchmarks.speed.step",
+    "benchmarks.speed.svd",
     "benchmarks.accuracy.ritter",
     "benchmarks.accuracy.runout",
     "benchmarks.stability.collapse",

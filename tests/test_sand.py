@@ -1,5 +1,6 @@
 """The sand model against plain torch, 50-digit roots, closed forms, invariances and finite differences."""
 
+import itertools
 import math
 
 import mpmath
@@ -13,7 +14,11 @@ from torch_mpm.ops.sand import APEX, CONE, ELASTIC, INVALID
 from torch_mpm.reference import sand as reference
 
 ENERGIES = ["full", "unilateral", "hencky", "mixed"]
-FORMS = [(energy, "zero") for energy in ENERGIES] + [("unilateral", "keep")]
+FORMS = [
+    *((energy, "zero", "radial") for energy in ENERGIES),
+    *((energy, "zero", "exact") for energy in ("full", "unilateral", "mixed")),
+    ("unilateral", "keep", "radial"),
+]
 COEFFICIENT = 6.254421582537118
 
 
@@ -56,20 +61,30 @@ def error(value: Tensor, expected: Tensor) -> float:
 # ---- values
 
 
-@pytest.mark.parametrize(("energy", "apex"), FORMS)
+@pytest.mark.parametrize(("energy", "apex", "flow"), FORMS)
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_return_map_is_the_reference(device, dim, energy, apex, dtype):
-    states = random_states(3001, dim)
-    F, mu, lam, angle = states
-    expected = reference.quartic_return_map(F, mu, lam, reference.friction_alpha(angle, dim), None, energy, apex)
-    result = quartic_return_map(*(t.to(device, dtype) for t in states), energy=energy, apex=apex, details=True)
+@pytest.mark.parametrize("shifted", [False, True])
+def test_return_map_is_the_reference(device, dim, energy, apex, flow, dtype, shifted):
+    """`shifted`: with cohesion and the correction of lost volume."""
+    F, mu, lam, angle = random_states(1001 if flow == "exact" else 3001, dim)
+    alpha, options = reference.friction_alpha(angle, dim), {"energy": energy, "apex": apex, "flow": flow}
+    history = {"cohesion": 0.02 + 0.03 * torch.rand_like(mu), "volume_correction": 0.1 * torch.rand_like(mu)}
+    history["volume_correction"][::2] = 0
+    if not shifted:
+        history = {}
+    expected = reference.quartic_return_map(F, mu, lam, alpha, **options, **history)
+    arguments = (t.to(device, dtype) for t in (F, mu, lam, angle))
+    history = {name: t.to(device, dtype) for name, t in history.items()}
+    result = quartic_return_map(*arguments, **options, **history, details=True)
     assert torch.equal(result.branch.cpu(), expected[2])
     assert result.branch.unique().numel() == 3
     assert bool(result.converged.all())
     tolerance = 64 * torch.finfo(dtype).eps
     found = (result.F, result.stress, result.multiplier, result.dissipated)
-    for value, wanted in zip(found, (*expected[:2], *expected[3:]), strict=True):
+    for value, wanted in zip(found, (*expected[:2], *expected[3:5]), strict=True):
         assert error(value, wanted) < tolerance
+    if shifted:
+        assert float((result.volume_correction.cpu() - expected[5]).abs().max()) < tolerance
     assert float(result.multiplier.min()) >= 0
     assert float(result.dissipated.min()) >= 0
 
@@ -130,17 +145,18 @@ def test_map_to_50_digits(device, energy, dtype, tolerance):
     assert bool(((mapped.log() - expected).abs() <= limit)[checked].all())
 
 
+@pytest.mark.parametrize("flow", ["radial", "exact"])
 @pytest.mark.parametrize("energy", ["full", "unilateral"])
-def test_steep_cones(device, energy):
+def test_steep_cones(device, energy, flow):
     """Friction angles of 37° to 89°: y falls before it rises, and its leading term may nearly vanish."""
-    count = 4000
+    count = 4000 if flow == "radial" else 1000
     alpha = reference.friction_alpha(torch.deg2rad(37 + 52 * torch.rand(count, dtype=torch.float64)), 3)
     mu, lam = torch.ones_like(alpha), 3 * torch.rand(count, dtype=torch.float64)
     radius, lode = 300 * torch.rand(2, count, dtype=torch.float64)
     h = strain_at(torch.full_like(alpha, 0.01), radius, lode / 300 * math.pi / 3)
-    expected, branch = reference.return_map_strain(h, mu, lam, alpha, energy)
+    expected, branch = reference.return_map_strain(h, mu, lam, alpha, energy, flow=flow)
     arguments = (t.to(device) for t in (torch.diag_embed(h.exp()), mu, lam))
-    result = quartic_return_map(*arguments, alpha=alpha.to(device), energy=energy)
+    result = quartic_return_map(*arguments, alpha=alpha.to(device), energy=energy, flow=flow)
     assert bool(result.converged.all())
     assert torch.equal(result.branch.cpu(), branch)
     assert {ELASTIC, CONE} == set(branch.tolist())
@@ -199,17 +215,120 @@ def mohr_coulomb_angle(stress: Tensor) -> float:
 
 
 @pytest.mark.parametrize(
-    ("energy", "plane_strain"), [("full", 32.2), ("unilateral", 30.6), ("hencky", 43.85), ("mixed", 29.0)]
+    ("energy", "flow", "plane_strain"),
+    [
+        ("full", "radial", 32.2),
+        ("unilateral", "radial", 30.6),
+        ("hencky", "radial", 43.85),
+        ("mixed", "radial", 29.0),
+        ("full", "exact", 43.85),
+        ("unilateral", "exact", 43.85),
+    ],
 )
-def test_mobilised_friction(device, energy, plane_strain):
+def test_mobilised_friction(device, energy, flow, plane_strain):
     """Steady plane-strain shear (Lode angle 30°), triaxial compression and extension; φ = 30°, ν = 0.3."""
     shear = torch.tensor([math.pi / 6, math.pi / 3, 0.0], dtype=torch.float64)
-    F = torch.diag_embed(strain_at(torch.full((3,), 0.01), torch.full((3,), 500.0), shear).exp()).to(device)
-    angles = [mohr_coulomb_angle(t) for t in quartic_return_map(F, 1.0, 1.5, math.pi / 6, energy=energy).stress]
+    direction = strain_at(torch.ones(3, dtype=torch.float64), torch.ones(3, dtype=torch.float64), shear) + 1
+    h = torch.full((3, 3), -0.01, dtype=torch.float64)
+    for _ in range(100):
+        F = torch.diag_embed((h + 0.1 * direction).exp()).to(device)
+        result = quartic_return_map(F, 1.0, 1.5, math.pi / 6, energy=energy, flow=flow)
+        h = result.F.diagonal(dim1=1, dim2=2).log().cpu()
+    angles = [mohr_coulomb_angle(t) for t in result.stress]
     assert angles[0] == pytest.approx(plane_strain, abs=0.1)
     if energy != "mixed":
         assert angles[1] == pytest.approx(30, abs=1e-6)
         assert angles[2] == pytest.approx(48.59, abs=0.01)
+
+
+def test_exact_flow_is_along_the_stress(device):
+    """h_trial − h is a positive multiple of dev τ, and the radial map differs by what the notes of the model say."""
+    F, mu, lam, angle = (t.to(device) for t in random_states(2000, 3))
+    for energy in ("full", "unilateral"):
+        result = quartic_return_map(F, mu, lam, angle, energy=energy, flow="exact")
+        cone = (result.branch == CONE).cpu()
+        increment = 0.5 * (_log(F @ F.mT) - _log(result.F @ result.F.mT))[cone]
+        stress = result.stress.cpu()[cone]
+        deviator = stress - stress.diagonal(dim1=1, dim2=2).mean(1)[:, None, None] * torch.eye(3, dtype=stress.dtype)
+        cosine = (increment * deviator).sum((1, 2)) / (increment.norm(dim=(1, 2)) * deviator.norm(dim=(1, 2)))
+        assert float((1 - cosine)[increment.norm(dim=(1, 2)) > 1e-3].max()) < 1e-10
+        radial = quartic_return_map(F, mu, lam, angle, energy=energy)
+        difference = (_log(result.F @ result.F.mT) - _log(radial.F @ radial.F.mT)).norm(dim=(1, 2))[cone]
+        assert 0.02 < float((difference / (2 * increment.norm(dim=(1, 2)))).median()) < 0.5
+
+
+def _log(C: Tensor) -> Tensor:
+    values, axes = torch.linalg.eigh(C.cpu())
+    return (axes * values.log()[:, None, :]) @ axes.mT
+
+
+@pytest.mark.parametrize("flow", ["radial", "exact"])
+def test_flow_is_the_same_in_two_dimensions_and_for_the_quadratic_energy(device, flow):
+    for dim, energy in ((2, "full"), (2, "unilateral"), (3, "hencky")):
+        states = [t.to(device) for t in random_states(300, dim)]
+        one, other = (quartic_return_map(*states, energy=energy, flow=f) for f in ("radial", flow))
+        assert torch.equal(one.F, other.F)
+
+
+@pytest.mark.parametrize("flow", ["radial", "exact"])
+@pytest.mark.parametrize("energy", ENERGIES)
+def test_cohesion_moves_the_apex(device, dim, energy, flow):
+    """The map commutes with the shift of all strains by c; at the apex F has the strain c on every axis."""
+    F, mu, lam, angle = random_states(500, dim)
+    shift = 0.03
+    moved = math.exp(shift) * F
+    options = {"energy": energy, "flow": flow}
+    states = [t.to(device) for t in (mu, lam, angle)]
+    without = quartic_return_map(F.to(device), *states, **options)
+    cohesive = quartic_return_map(moved.to(device), *states, **options, cohesion=shift, details=True)
+    assert torch.equal(without.branch, cohesive.branch)
+    assert error(cohesive.F, (math.exp(shift) * without.F).cpu()) < 1e-12
+    apex = quartic_return_map(F.to(device), *states, **options, cohesion=shift)
+    singular = torch.linalg.svdvals(apex.F[apex.branch == APEX].cpu())
+    assert float((singular.log() - shift).abs().max()) < 1e-12
+    tension = apex.stress[apex.branch == APEX].diagonal(dim1=1, dim2=2).cpu() / mu[apex.branch.cpu() == APEX][:, None]
+    ratio = (lam / mu)[apex.branch.cpu() == APEX][:, None]
+    strength = {
+        "full": 4 * COEFFICIENT * shift**3 + 2 * COEFFICIENT * ratio * (dim * shift) ** 3,
+        "hencky": 2 * shift + ratio * dim * shift,
+    }.get(energy, 0 * ratio)
+    assert float((tension - strength).abs().max()) < 1e-12
+    assert float(cohesive.dissipated.min()) >= -1e-12 * float(cohesive.dissipated.max())
+
+
+@pytest.mark.parametrize("energy", ["full", "hencky", "mixed"])
+def test_volume_that_is_lost_comes_back(device, energy):
+    """Opened by 20% and closed again, sand has no stress until its volume is what it was.
+
+    With the unilateral energy pure extension is elastic, and no volume is lost.
+    """
+    eye = torch.eye(3, dtype=torch.float64, device=device)[None]
+    volume = torch.zeros(1, dtype=torch.float64, device=device)
+    opened = quartic_return_map(1.2 * eye, 1e5, 1e5, 0.5, energy=energy, volume_correction=volume)
+    assert float((opened.F - eye).abs().max()) < 1e-15
+    assert float(opened.volume_correction) == pytest.approx(3 * math.log(1.2), rel=1e-14)
+    half = quartic_return_map(opened.F / 1.1, 1e5, 1e5, 0.5, energy=energy, volume_correction=opened.volume_correction)
+    assert float(half.stress.abs().max()) < 1e-9
+    assert float(half.volume_correction) == pytest.approx(3 * math.log(1.2 / 1.1), rel=1e-13)
+    closed = quartic_return_map(half.F / 1.2, 1e5, 1e5, 0.5, energy=energy, volume_correction=half.volume_correction)
+    assert float(closed.volume_correction) == 0
+    assert int(closed.branch) == ELASTIC
+    assert torch.allclose(torch.linalg.det(closed.F), torch.full_like(volume, 1.1**-3), rtol=1e-13)
+
+
+@pytest.mark.parametrize("energy", ["full", "unilateral", "hencky"])
+def test_elastic_column_at_rest(device, energy):
+    """ε(z) = (ρ g z/(2a (2μ + λ)))^⅓ under the weight above, for the quadratic energy ρ g z/(2μ + λ)."""
+    mu, lam, density = 1e5, 1.5e5, 1600.0
+    load = density * 9.8 * torch.linspace(0.1, 2.0, 5, dtype=torch.float64)
+    strain = load / (2 * mu + lam)
+    if energy != "hencky":
+        strain = (strain / (2 * COEFFICIENT)) ** (1 / 3)
+    F = torch.eye(3, dtype=torch.float64).repeat(5, 1, 1)
+    F[:, 2, 2] = (-strain).exp()
+    result = quartic_return_map(F.to(device), mu, lam, math.radians(40), energy=energy)
+    assert bool((result.branch == ELASTIC).all())
+    assert torch.allclose(result.stress[:, 2, 2].cpu(), -load, rtol=1e-13)
 
 
 def test_mohr_coulomb_in_two_dimensions(device):
@@ -253,23 +372,24 @@ def test_uniaxial_compression_at_rest(device, energy):
     assert float(stress[0] / stress[2]) == pytest.approx(nu / (1 - nu), rel=1e-13)
 
 
-@pytest.mark.parametrize("energy", ENERGIES)
-def test_invariances(device, dim, energy):
+@pytest.mark.parametrize(("energy", "flow"), [(energy, flow) for energy, apex, flow in FORMS if apex == "zero"])
+def test_invariances(device, dim, energy, flow):
     F, mu, lam, angle = (t.to(device) for t in random_states(500, dim))
-    result = quartic_return_map(F, mu, lam, angle, energy=energy)
+    options = {"energy": energy, "flow": flow}
+    result = quartic_return_map(F, mu, lam, angle, **options)
     Q = rotations(500, dim).to(device)
-    turned = quartic_return_map(Q @ F, mu, lam, angle, energy=energy)
+    turned = quartic_return_map(Q @ F, mu, lam, angle, **options)
     assert error(turned.F, (Q @ result.F).cpu()) < 1e-13
     assert error(turned.stress, (Q @ result.stress @ Q.mT).cpu()) < 1e-13
-    turned = quartic_return_map(F @ Q, mu, lam, angle, energy=energy)
+    turned = quartic_return_map(F @ Q, mu, lam, angle, **options)
     assert error(turned.F, (result.F @ Q).cpu()) < 1e-13
     assert error(turned.stress, result.stress.cpu()) < 1e-13
-    stiffer = quartic_return_map(F, 2.0**40 * mu, 2.0**40 * lam, angle, energy=energy)
+    stiffer = quartic_return_map(F, 2.0**40 * mu, 2.0**40 * lam, angle, **options)
     assert torch.equal(stiffer.F, result.F)
     assert torch.equal(stiffer.stress, 2.0**40 * result.stress)
     diagonal = hencky(F)
     big, small = (
-        quartic_return_map(torch.diag_embed((s * diagonal).exp()).to(device), mu, lam, angle, energy=energy)
+        quartic_return_map(torch.diag_embed((s * diagonal).exp()).to(device), mu, lam, angle, **options)
         for s in (1.0, 2.0**-10)
     )
     mapped = [r.F.diagonal(dim1=1, dim2=2).log().cpu() for r in (big, small)]
@@ -333,22 +453,30 @@ def gradient_states(dim: int) -> Tensor:
     return h if dim == 3 else h[:, 1:]
 
 
-@pytest.mark.parametrize(("energy", "apex"), FORMS)
-def test_gradients(device, dim, energy, apex):
+@pytest.mark.parametrize(("energy", "apex", "flow"), FORMS)
+def test_gradients(device, dim, energy, apex, flow):
+    """Of every result with respect to every argument."""
     h = gradient_states(dim)
-    F = deformation(h).to(device).requires_grad_()
-    mu, lam, angle = (
-        (low + torch.rand(len(h), dtype=torch.float64)).to(device).requires_grad_() for low in (1.0, 0.5, 0.15)
+    F = deformation(h).to(device)
+    mu, lam, angle, cohesion, volume = (
+        (low + width * torch.rand(len(h), dtype=torch.float64)).to(device)
+        for low, width in ((1.0, 1.0), (0.5, 1.0), (0.07, 0.5), (0.001, 0.003), (0.001, 0.003))
     )
-    angle = (0.5 * angle).detach().requires_grad_()
+    names = ("mu", "lam", "friction_angle", "cohesion", "volume_correction")
 
-    def mapped(*arguments: Tensor) -> tuple[Tensor, Tensor]:
-        result = quartic_return_map(*arguments, energy=energy, apex=apex)
-        return result.F, result.stress
+    def mapped(F: Tensor, *arguments: Tensor) -> tuple[Tensor, ...]:
+        options = {**dict(zip(names, arguments, strict=False)), "energy": energy, "apex": apex, "flow": flow}
+        result = quartic_return_map(F, **options, details=True)
+        scalars = (result.multiplier, result.dissipated, result.volume_correction)
+        return result.F, result.stress, *(t for t in scalars if t is not None)
 
-    branches = quartic_return_map(F, mu, lam, angle, energy=energy, apex=apex).branch.unique().tolist()
-    assert branches == [ELASTIC, CONE, APEX]
-    assert torch.autograd.gradcheck(mapped, (F, mu, lam, angle), eps=1e-7, atol=2e-6, rtol=1e-5)
+    for inputs in ((F, mu, lam, angle), (F, mu, lam, angle, cohesion, volume)):
+        branches = quartic_return_map(
+            F, energy=energy, apex=apex, flow=flow, **dict(zip(names, inputs[1:], strict=False))
+        ).branch.unique()
+        assert branches.tolist() == [ELASTIC, CONE, APEX]
+        leaves = tuple(t.clone().requires_grad_() for t in inputs)
+        assert torch.autograd.gradcheck(mapped, leaves, eps=1e-7, atol=2e-6, rtol=1e-5)
 
 
 @pytest.mark.parametrize("energy", ENERGIES)
@@ -424,9 +552,7 @@ def test_gradients_in_float32_at_nearly_equal_stretches(device, energy, gap):
 
 def test_what_is_not_differentiable_says_so(device):
     F = torch.eye(3, device=device)[None].repeat(2, 1, 1).requires_grad_()
-    result = quartic_return_map(F, 1.0, 1.0, 0.5, details=True)
-    with pytest.raises(NotImplementedError, match="plastic multiplier"):
-        result.multiplier.sum().backward()
+    result = quartic_return_map(F, 1.0, 1.0, 0.5)
     (grad,) = torch.autograd.grad(result.F.sum(), F, create_graph=True)
     with pytest.raises(NotImplementedError, match="no second derivatives"):
         grad.sum().backward()
@@ -475,11 +601,12 @@ def test_extreme_states_are_finite(device, dim, energy, dtype):
     ]
     cases += [*deformation(0.3 * torch.randn(100, dim, dtype=torch.float64))]
     F = torch.stack(cases).to(device, dtype)
+    flows = ("radial", "exact")
     moduli = [(1e5, 1e5), (1e5, 0.0), (1e5, -3e4), (0.0, 1e5), (-1e5, 1e5), (1e5, 1e12)]
     for mu, lam in moduli:
-        for degrees in (0, 1e-3, 30, 45, 89):
+        for degrees, flow in itertools.product((0, 1e-3, 30, 45, 89), flows):
             leaf = F.clone().requires_grad_()
-            result = quartic_return_map(leaf, mu, lam, math.radians(degrees), energy=energy)
+            result = quartic_return_map(leaf, mu, lam, math.radians(degrees), energy=energy, flow=flow)
             for value in (result.F, result.stress):
                 assert bool(value.isfinite().all())
             assert bool(result.converged.all())
@@ -501,6 +628,12 @@ def test_errors(device):
         quartic_return_map(F, 1.0, 1.0, 0.5, energy="cubic")
     with pytest.raises(ValueError, match="apex='keep' needs energy='unilateral'"):
         quartic_return_map(F, 1.0, 1.0, 0.5, energy="full", apex="keep")
+    with pytest.raises(ValueError, match="flow must be 'radial' or 'exact', got 'associated'"):
+        quartic_return_map(F, 1.0, 1.0, 0.5, flow="associated")
+    with pytest.raises(ValueError, match=r"volume_correction must have shape \[P\] = \[4\], got \[3\]"):
+        quartic_return_map(F, 1.0, 1.0, 0.5, volume_correction=torch.zeros(3, device=device))
+    with pytest.raises(ValueError, match="cohesion must have shape"):
+        quartic_return_map(F, 1.0, 1.0, 0.5, cohesion=torch.zeros(3, device=device))
     with pytest.raises(ValueError, match=r"mu must have shape \[\], \[1\] or \[P\] = \[4\] without scene, got \[3\]"):
         quartic_return_map(F, torch.ones(3, device=device), 1.0, 0.5)
     with pytest.raises(TypeError, match="lam must have the dtype"):
@@ -511,13 +644,16 @@ def test_errors(device):
 
 def test_opcheck(device):
     F, mu, lam, angle = (t.to(device).requires_grad_() for t in random_states(5, 2))
-    ops = torch.ops.torch_mpm
-    torch.library.opcheck(ops.quartic_return_map.default, (F, mu, lam, angle, None, "full", "zero", False))
+    volume = (0 * mu).detach().requires_grad_()
+    ops, rule = torch.ops.torch_mpm, ("full", "radial", "zero")
+    torch.library.opcheck(ops.quartic_return_map.default, (F, mu, lam, angle, None, None, None, *rule, False))
     torch.library.opcheck(ops.quartic_energy.default, (F, mu, lam, None, "full"))
     once = ("test_schema", "test_autograd_registration", "test_faketensor")
+    grads = (F.detach(), None, None, None, None)
     for op, arguments in (
-        (ops.quartic_return_map, (F, mu, lam, angle, None, "full", "zero", True)),
-        (ops.quartic_return_map_backward, (F.detach(), None, F, mu, lam, angle, None, "full", "zero", True, True)),
+        (ops.quartic_return_map, (F, mu, lam, angle, angle, volume, None, *rule, True)),
+        (ops.quartic_return_map_backward, (*grads, F, mu, lam, angle, None, None, None, *rule, True, True)),
+        (ops.quartic_return_map_backward, (*grads, F, mu, lam, angle, angle, volume, None, *rule, True, True)),
         (ops.quartic_stiffness, (F, mu, lam, None, "full", 0.1)),
     ):
         torch.library.opcheck(op.default, arguments, test_utils=once)
@@ -575,11 +711,62 @@ def test_law_follows_its_parameters(device):
         assert torch.equal(fields["F"][1::2], law.return_map(state).F[1::2])
 
 
+@pytest.mark.parametrize("flow", ["radial", "exact"])
+def test_law_with_history(device, flow):
+    """A column that flies apart: hardening and lost volume are kept in the state, and gradients pass through them."""
+    grid = mpm.Grid(dx=0.1, lower=(0.0,) * 3, upper=(1.0,) * 3)
+    points = mpm.seed.box((0.3, 0.0, 0.3), (0.5, 0.4, 0.5), 0.1, per_cell=8)
+    state = mpm.State.at_rest(points, density=1600.0, dtype=torch.float64).to(device)
+    state = state.replace(v=state.x - state.x.mean(0))
+    h0 = torch.nn.Parameter(torch.tensor(math.radians(35), dtype=torch.float64))
+    law = mpm.QuarticSand(
+        E=1e6,
+        nu=0.3,
+        energy="full",
+        flow=flow,
+        cohesion=1e-3,
+        volume_correction=True,
+        hardening=(h0, math.radians(9), 0.2, math.radians(10)),
+    ).to(device)
+    law.dissipation = True
+    laws = {"alone": law, "mixed": mpm.Mixture([mpm.NeoHookean(E=1e6, nu=0.3), law])}
+    material = torch.ones(len(state), dtype=torch.int32, device=device)
+    ends = {}
+    for name, each in laws.items():
+        step = mpm.Step(grid, each, gravity=(0.0, -9.8, 0.0), walls="sticky")
+        begin = state.replace(material=material if name == "mixed" else None)
+        ends[name] = mpm.rollout(step, begin, n=40, dt=2e-3)
+        step.check(ends[name])
+    end = ends["alone"]
+    q, lost = end.extra["hardening"].detach(), end.extra["volume_correction"].detach()
+    assert float(q.min()) >= 0
+    assert float(q.max()) > 0.01
+    assert float(lost.min()) >= 0
+    assert float(lost.max()) > 1e-3
+    for name, value in end.extra.items():
+        assert torch.equal(value, ends["mixed"].extra[name])
+    fields, _ = law.update(end)
+    again = law.return_map(end, details=True)
+    assert torch.equal(fields["hardening"], end.extra["hardening"] + again.multiplier)
+    assert torch.equal(fields["dissipated"], again.dissipated)
+    (grad,) = torch.autograd.grad(end.x.square().sum(), h0)
+    assert grad.isfinite()
+    assert float(grad) != 0
+
+
 def test_law_arguments():
     with pytest.raises(ValueError, match="QuarticSand needs E and nu, or mu and lam"):
         mpm.QuarticSand(E=1e6)
     with pytest.raises(ValueError, match="friction_angle must be in"):
         mpm.QuarticSand(E=1e6, nu=0.3, friction_angle=30.0)
+    with pytest.raises(ValueError, match="flow must be"):
+        mpm.QuarticSand(E=1e6, nu=0.3, flow="associated")
+    with pytest.raises(ValueError, match="cohesion must be finite and not negative"):
+        mpm.QuarticSand(E=1e6, nu=0.3, cohesion=-0.1)
+    with pytest.raises(ValueError, match="hardening must be h0, h1, h2 and h3"):
+        mpm.QuarticSand(E=1e6, nu=0.3, hardening=(0.5, 0.1))
+    with pytest.raises(ValueError, match="h3 must not be above h0"):
+        mpm.QuarticSand(E=1e6, nu=0.3, hardening=(0.5, 0.1, 0.2, 0.6))
     with pytest.raises(ValueError, match="energy must be one of"):
         mpm.QuarticSand(E=1e6, nu=0.3, energy="cubic")
     with pytest.raises(ValueError, match="apex must be"):

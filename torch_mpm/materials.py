@@ -32,18 +32,21 @@ class Material(nn.Module):
 
     Attributes:
         state_fields: fields of the state that a step moves for the law: "F" or "J".
+        extra_fields: tensors [P] of state.extra that the law keeps from step to step, zero at first: its history.
         viscous: whether the stress reads state.C, so that a step has to keep it.
         dissipation: whether somebody wants "dissipated" from `update`, which costs something. A step with plastic
             heating sets it on its law and on those inside.
     """
 
     state_fields: tuple[str, ...] = ("F",)
+    extra_fields: tuple[str, ...] = ()
     viscous: bool = False
     dissipation: bool = False
 
     def update(self, state: State) -> tuple[dict[str, Tensor], Tensor]:
         """Fields that the law changes (plastic laws: F at the yield surface), and Kirchhoff stress [P, D, D] [Pa].
 
+        `extra_fields` are among the fields, under their own names.
         A law that dissipates adds "dissipated" to the fields where `dissipation` is set: the energy that this step's
         plastic flow turned into heat, per rest volume [P] [J/m³].
         """
@@ -350,6 +353,7 @@ class Mixture(Material):
             raise ValueError("Mixture needs at least one law")
         self.laws = nn.ModuleList(laws)
         self.state_fields = tuple(sorted({field for law in laws for field in law.state_fields}))
+        self.extra_fields = tuple(sorted({field for law in laws for field in law.extra_fields}))
         self.viscous = any(law.viscous for law in laws)
         self._material: Tensor | None = None
         self._indices: list[Tensor] = []
@@ -362,8 +366,10 @@ class Mixture(Material):
             fields, part_stress = law.update(part)
             stress = stress.index_copy(0, part.index, part_stress)
             for name, value in fields.items():
-                before = torch.zeros_like(state.mass) if name == "dissipated" else getattr(state, name)
-                changes[name] = changes.get(name, before).index_copy(0, part.index, value)
+                if name not in changes:
+                    new = name == "dissipated" or name in self.extra_fields
+                    changes[name] = state.extra.get(name, torch.zeros_like(state.mass)) if new else getattr(state, name)
+                changes[name] = changes[name].index_copy(0, part.index, value)
         return changes, stress
 
     def energy_density(self, state: State) -> Tensor:

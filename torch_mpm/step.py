@@ -108,6 +108,9 @@ class Step(nn.Module):
         grid.watch(blocks.status)
         fields, stress = self.law.update(state)
         dissipated = fields.pop("dissipated", None)
+        if self.law.extra_fields:
+            history = {name: fields.pop(name) for name in self.law.extra_fields if name in fields}
+            state = state.replace(extra={**state.extra, **history})
         affine = state.C if self.transfer == "apic" else None
         nodes = p2g(blocks, state.x, state.mass, state.v, affine, stress, state.volume, dt, self.stress_form)
         velocity = self._update_grid(blocks, nodes, state, dt)
@@ -132,6 +135,8 @@ class Step(nn.Module):
             changes["F"] = identity_deformation(state.x)
         if "J" in self.law.state_fields and state.J is None:
             changes["J"] = torch.ones_like(state.mass)
+        if missing := [name for name in self.law.extra_fields if name not in state.extra]:
+            changes["extra"] = {**state.extra, **{name: torch.zeros_like(state.mass) for name in missing}}
         state = state.replace(**changes) if changes else state
         return state if self.heat is None else self.heat.prepare(state)
 

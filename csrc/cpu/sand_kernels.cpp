@@ -6,14 +6,14 @@ inline namespace TORCH_MPM_ISA {
 
 template <class T, int D>
 void return_map(const ReturnMapArguments<T, D>& a) {
-  SandEnergies::visit(a.sand.energy, [&]<class Energy>() {
+  ReturnMaps<D>::visit(a.sand.energy, [&]<class Energy>() {
     for_groups<T>(a.sand.particles, [&](const auto& at) { return_map_at<Energy>(a, at); });
   });
 }
 
 template <class T, int D>
 void return_map_backward(const ReturnMapBackwardArguments<T, D>& a) {
-  SandEnergies::visit(a.sand.energy, [&]<class Energy>() {
+  ReturnMaps<D>::visit(a.sand.energy, [&]<class Energy>() {
     for_groups<T>(a.sand.particles, [&](const auto& at) { return_map_backward_at<Energy>(a, at); });
   });
 }

@@ -35,14 +35,14 @@ void for_particles(void (*kernel)(Arguments), const Arguments& a, Stream stream)
 
 template <class T, int D>
 void return_map(const ReturnMapArguments<T, D>& a, Stream stream) {
-  SandEnergies::visit(a.sand.energy,
-                      [&]<class Energy>() { for_particles(return_map_kernel<Energy, T, D>, a, stream); });
+  ReturnMaps<D>::visit(a.sand.energy,
+                       [&]<class Energy>() { for_particles(return_map_kernel<Energy, T, D>, a, stream); });
 }
 
 template <class T, int D>
 void return_map_backward(const ReturnMapBackwardArguments<T, D>& a, Stream stream) {
-  SandEnergies::visit(a.sand.energy,
-                      [&]<class Energy>() { for_particles(return_map_backward_kernel<Energy, T, D>, a, stream); });
+  ReturnMaps<D>::visit(a.sand.energy,
+                       [&]<class Energy>() { for_particles(return_map_backward_kernel<Energy, T, D>, a, stream); });
 }
 
 template <class T, int D>

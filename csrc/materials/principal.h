@@ -6,13 +6,18 @@
 
 // What isotropic laws in principal strains share: the Hencky strains of F, and the adjoint of an isotropic tensor
 // function of F from that of its principal values.
+// A function that many kernels share and that is too large for a call to matter: on the CPU it is compiled once.
+#if defined(__CUDACC__)
+#define MPM_HD_LARGE MPM_HD
+#else
+#define MPM_HD_LARGE inline __attribute__((noinline))
+#endif
+
 namespace mpm {
 inline namespace TORCH_MPM_ISA {
 
 template <class T>
 using MaskOf = decltype(T(0) < T(0));
-
-MPM_HD bool any(bool mask) { return mask; }
 
 template <class T>
 MPM_HD T min(const T& a, const T& b) {
@@ -28,6 +33,8 @@ MPM_HD T sum(const Vector<T, D>& a) {
 }
 
 // eˣ to rounding also where it is small.
+MPM_HD float exponential(float x) { return ::expf(x); }
+MPM_HD double exponential(double x) { return ::exp(x); }
 template <class T>
 MPM_HD T exponential(const T& x) {
   const T e = expm1(abs(x)) + T(1);
@@ -62,7 +69,7 @@ struct HenckyStrain {
 };
 
 template <class T, int D>
-MPM_HD HenckyStrain<T, D> hencky_strain(const Matrix<T, D>& F) {
+MPM_HD_LARGE HenckyStrain<T, D> hencky_strain(const Matrix<T, D>& F) {
   HenckyStrain<T, D> s;
   // Only extreme entries are scaled: the logarithm of a stretch near one keeps its digits.
   T largest = T(0);

@@ -14,10 +14,12 @@ inline namespace TORCH_MPM_ISA {
 
 constexpr double kQuarticCoefficient = 6.254421582537118;
 
-// An energy, and the one that the yield surface is drawn with where it is another.
+// An energy, and the one that the yield surface is drawn with where it is another. The flow is radial unless
+// exact_flow.
 template <bool Quadratic, bool UnilateralStress, bool UnilateralYield>
 struct SandEnergy {
   static constexpr bool quadratic = Quadratic, unilateral_stress = UnilateralStress, unilateral_yield = UnilateralYield;
+  static constexpr bool exact_flow = false;
 };
 
 struct FullQuartic : SandEnergy<false, false, false> {
@@ -33,6 +35,11 @@ struct Hencky : SandEnergy<true, false, false> {
 // al.
 struct MixedQuartic : SandEnergy<false, true, false> {
   static constexpr const char* name = "mixed";
+};
+
+template <class Energy>
+struct ExactFlow : Energy {
+  static constexpr bool exact_flow = true;
 };
 
 template <bool Unilateral, class T>
@@ -107,17 +114,23 @@ MPM_HD StressTerms<T, D> stress_tangent(const Vector<T, D>& h, const T& mu, cons
   return r;
 }
 
+// (a³ − b³)/(a − b), of the negative parts if unilateral, also where a = b.
+template <bool Unilateral, class T>
+MPM_HD T cube_quotient(const T& a, const T& b) {
+  const T c = one_sided<Unilateral>(a), d = one_sided<Unilateral>(b);
+  const T full = c * c + c * d + d * d;
+  if constexpr (!Unilateral) return full;
+  // (c − d)/(a − b): 1 where both are negative, 0 where none is.
+  const T difference = a - b;
+  const auto same = difference == T(0);
+  return full * select(same, T(1), (c - d) / select(same, T(1), difference));
+}
+
 // (τᵢ − τⱼ)/(hᵢ − hⱼ), also where the strains are equal.
 template <class Energy, class T>
 MPM_HD T stress_quotient(const T& a, const T& b, const T& mu) {
   if constexpr (Energy::quadratic) return T(2) * mu;
-  const T c = one_sided<Energy::unilateral_stress>(a), d = one_sided<Energy::unilateral_stress>(b);
-  const T full = T(4 * kQuarticCoefficient) * mu * (c * c + c * d + d * d);
-  if constexpr (!Energy::unilateral_stress) return full;
-  // (c − d)/(a − b) of the one-sided strains: 1 where both are negative, 0 where none is.
-  const T difference = a - b;
-  const auto same = difference == T(0);
-  return full * select(same, T(1), (c - d) / select(same, T(1), difference));
+  return T(4 * kQuarticCoefficient) * mu * cube_quotient<Energy::unilateral_stress>(a, b);
 }
 
 // Upper bound of |dτ/dF : G F| + max |τᵢ| ≥ the second variation of ψ, over velocity gradients G with |G| = 1. In

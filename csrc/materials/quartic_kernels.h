@@ -1,5 +1,8 @@
 #pragma once
 
+#include <string_view>
+#include <type_traits>
+
 #include "materials/arguments.h"
 #include "materials/lanes.h"
 #include "materials/quartic_return_map.h"
@@ -12,29 +15,30 @@ namespace mpm {
 
 template <class T, int D>
 struct SandArguments {
-  int energy = 0;  // index in SandEnergies
+  int energy = 0;  // index in ReturnMaps, or in SandEnergies without plasticity
   int64_t particles = 0;
   Field<const T> F;            // trial deformation gradient [P, D, D]
   const int* scene = nullptr;  // int32 [P], where a parameter is per scene
   int64_t scene_stride = 0;
-  Parameter<T> mu, lam, alpha;
-  bool plastic = true;     // otherwise F is kept
-  bool keep_apex = false;  // see return_map
+  Parameter<T> mu, lam, alpha, cohesion;  // the last may be absent, and so may
+  Field<const T> volume;                  // volume correction [P]
+  bool plastic = true;                    // otherwise F is kept
+  bool keep_apex = false;                 // see return_map
 };
 
 template <class T, int D>
 struct ReturnMapArguments {
   SandArguments<T, D> sand;
-  Field<T> F, stress;               // [P, D, D]
-  int* branch = nullptr;            // [P] SandBranch, plus 4 where the root was not found
-  Field<T> multiplier, dissipated;  // [P], absent where not wanted
+  Field<T> F, stress;                       // [P, D, D]
+  int* branch = nullptr;                    // [P] SandBranch, plus 4 where the root was not found
+  Field<T> multiplier, dissipated, volume;  // [P], absent where not wanted
 };
 
 template <class T, int D>
 struct ReturnMapBackwardArguments {
   SandArguments<T, D> sand;
-  Field<const T> grad_F, grad_stress;  // either may be absent
-  Field<T> F, parameters;              // adjoints per particle [P, D, D] and [P, 3]: μ, λ, α; absent where not needed
+  Field<const T> grad_F, grad_stress, grad_multiplier, grad_dissipated, grad_volume;  // any may be absent
+  Field<T> F, parameters, volume;  // adjoints per particle [P, D, D], [P, 4]: μ, λ, α, cohesion, [P]; or absent
 };
 
 template <class T, int D>
@@ -48,10 +52,27 @@ struct SandScalarArguments {
 inline namespace TORCH_MPM_ISA {
 
 using SandEnergies = LawList<FullQuartic, UnilateralQuartic, Hencky, MixedQuartic>;
+template <int D>
+using ReturnMaps =
+    std::conditional_t<D == 2, SandEnergies,
+                       LawList<FullQuartic, UnilateralQuartic, Hencky, MixedQuartic, ExactFlow<FullQuartic>,
+                               ExactFlow<UnilateralQuartic>, ExactFlow<MixedQuartic>>>;
+
+// The index of an energy in such a list, −1 if it has none of this name; radial where there is no exact flow of it.
+template <class Energies>
+int find_energy(std::string_view name, bool exact_flow) {
+  int index = -1;
+  for (int i = 0; i < Energies::size; i++)
+    Energies::visit(i, [&]<class Energy>() {
+      if (name == Energy::name && (index < 0 || (Energy::exact_flow && exact_flow))) index = i;
+    });
+  return index;
+}
 
 template <class T>
 struct SandParameters {
   T mu, lam, alpha;
+  T cohesion, volume;
   Cone<T> cone;
   MaskOf<T> shear;  // μ > 0
 };
@@ -59,24 +80,87 @@ struct SandParameters {
 template <class At, class T, int D>
 MPM_HD SandParameters<typename At::Value> load_parameters(const At& at, const SandArguments<T, D>& a) {
   using V = typename At::Value;
+  // 0 where it is absent.
+  const auto load = [&](const Parameter<T>& parameter) {
+    return parameter.pointer ? load_parameter(at, parameter, a.scene, a.scene_stride) : V(0);
+  };
   SandParameters<V> r;
-  r.mu = load_parameter(at, a.mu, a.scene, a.scene_stride);
-  r.lam = load_parameter(at, a.lam, a.scene, a.scene_stride);
-  r.alpha = load_parameter(at, a.alpha, a.scene, a.scene_stride);
+  r.mu = load(a.mu);
+  r.lam = load(a.lam);
+  r.alpha = load(a.alpha);
+  r.cohesion = load(a.cohesion);
+  r.volume = a.volume.pointer ? at.load(a.volume.pointer, a.volume.stride[0]) : V(0);
   r.shear = r.mu > V(0);
   r.cone = {r.alpha, select(r.shear, r.lam / select(r.shear, r.mu, V(1)), V(0))};
   return r;
 }
 
 template <class T, int D>
+MPM_HD Vector<T, D> shifted(const Vector<T, D>& h, const T& shift) {
+  Vector<T, D> r;
+  MPM_UNROLL
+  for (int i = 0; i < D; i++) r[i] = h[i] + shift;
+  return r;
+}
+
+// The trial strain as the cone with its apex at the origin sees it: with the volume v_c that was lost before (Tampubolon
+// et al. 2017), and relative to the strain of the apex, which is the cohesion on every axis.
+template <class T, int D>
+MPM_HD Vector<T, D> relative_to_apex(const HenckyStrain<T, D>& s, const SandParameters<T>& p) {
+  return shifted(s.h, T(1.0 / D) * p.volume - p.cohesion);
+}
+
+template <class T, int D>
 MPM_HD MappedStrain<T, D> unmapped(const Vector<T, D>& h) {
   const auto none = T(0) < T(0);
-  return {h, zero_vector<T, D>(), T(0), T(0), T(1), none, none, T(0) == T(0)};
+  const Vector<T, D> zero = zero_vector<T, D>();
+  return {h, zero, T(0), T(0), T(1), T(0), T(0), T(0), none, none, T(0) == T(0)};
+}
+
+// What a particle becomes, in principal axes.
+template <class T, int D>
+struct SandState {
+  Vector<T, D> trial;     // strain relative to the apex
+  MappedStrain<T, D> m;   // likewise
+  Vector<T, D> h, stress; // principal strains and stresses
+  MaskOf<T> meaningful, moved, yielded;
+};
+
+template <class Energy, class T, int D>
+MPM_HD_LARGE SandState<T, D> sand_state(const HenckyStrain<T, D>& s, const SandParameters<T>& p, bool plastic, bool keep) {
+  SandState<T, D> r;
+  r.trial = relative_to_apex(s, p);
+  r.m = plastic ? return_map<Energy>(r.trial, p.cone, p.shear, keep) : unmapped(r.trial);
+  r.h = shifted(r.m.h, p.cohesion);
+  r.stress = sand_stress<Energy>(r.h, p.mu, p.lam);
+  T finite = T(0);
+  MPM_UNROLL
+  for (int i = 0; i < D; i++) finite = finite + (r.stress[i] - r.stress[i]);
+  r.meaningful = s.meaningful & (finite == T(0));
+  r.yielded = r.meaningful & (r.m.cone | r.m.apex);
+  r.moved = r.yielded | (r.meaningful & ((p.volume > T(0)) | (p.volume < T(0))));
+  return r;
+}
+
+// Length and direction of the plastic part of the trial strain.
+template <class T, int D>
+struct PlasticIncrement {
+  T norm;
+  Vector<T, D> direction;
+};
+
+template <class T, int D>
+MPM_HD PlasticIncrement<T, D> plastic_increment(const SandState<T, D>& state) {
+  Vector<T, D> lost;
+  MPM_UNROLL
+  for (int i = 0; i < D; i++) lost[i] = state.trial[i] - state.m.h[i];
+  const T norm = sqrt(dot(lost, lost));
+  return {norm, (T(1) / select(norm > T(0), norm, T(1))) * lost};
 }
 
 template <class Energy, class T, int D>
-MPM_HD MappedStrain<T, D> map_strain(const HenckyStrain<T, D>& s, const SandParameters<T>& p, bool plastic, bool keep) {
-  return plastic ? return_map<Energy>(s.h, p.cone, p.shear, keep) : unmapped(s.h);
+MPM_HD MaskOf<T> loses_volume(const SandState<T, D>& state, bool keep) {
+  return Energy::unilateral_yield && keep ? T(0) < T(0) : state.yielded & state.m.apex;
 }
 
 template <class Energy, class At, class T, int D>
@@ -85,57 +169,57 @@ MPM_HD void return_map_at(const ReturnMapArguments<T, D>& a, const At& at) {
   const Matrix<V, D> F = load_matrix<D>(at, a.sand.F);
   const SandParameters<V> p = load_parameters(at, a.sand);
   const HenckyStrain<V, D> s = hencky_strain(F);
-  const MappedStrain<V, D> m = map_strain<Energy>(s, p, a.sand.plastic, a.sand.keep_apex);
+  const SandState<V, D> state = sand_state<Energy>(s, p, a.sand.plastic, a.sand.keep_apex);
 
-  const Vector<V, D> principal = sand_stress<Energy>(m.h, p.mu, p.lam);
-  Matrix<V, D> tau = compose(s.U, principal, s.U);
-  V finite = V(0);
-  MPM_UNROLL
-  for (int i = 0; i < D; i++) finite = finite + (principal[i] - principal[i]);
-  const auto meaningful = s.meaningful & (finite == V(0));
-
-  const auto moved = meaningful & (m.cone | m.apex);
+  Matrix<V, D> tau = compose(s.U, state.stress, s.U);
   Vector<V, D> factor;
   MPM_UNROLL
-  for (int i = 0; i < D; i++) factor[i] = exponential(m.h[i] - s.h[i]) / s.scale;
+  for (int i = 0; i < D; i++) factor[i] = exponential(state.h[i] - s.h[i]) / s.scale;
   Matrix<V, D> mapped = compose(s.U, factor, s.B);
   MPM_UNROLL
   for (int i = 0; i < D; i++)
     MPM_UNROLL
   for (int j = 0; j < D; j++) {
-    tau[i][j] = select(meaningful, tau[i][j], V(0));
-    mapped[i][j] = select(moved, mapped[i][j], F[i][j]);
+    tau[i][j] = select(state.meaningful, tau[i][j], V(0));
+    mapped[i][j] = select(state.moved, mapped[i][j], F[i][j]);
   }
   store_matrix<D>(at, a.F, mapped);
   store_matrix<D>(at, a.stress, tau);
 
-  const V branch = select(m.cone, V(kCone), select(m.apex, V(kApex), V(kElastic))) + select(m.converged, V(0), V(4));
-  at.store_integer(a.branch, select(meaningful, branch, V(kInvalid)));
-  if (a.multiplier.pointer) {
-    V square = V(0);
-    MPM_UNROLL
-    for (int i = 0; i < D; i++) square = square + (s.h[i] - m.h[i]) * (s.h[i] - m.h[i]);
-    at.store(a.multiplier.pointer, a.multiplier.stride[0], select(moved, sqrt(square), V(0)));
-  }
+  const V branch =
+      select(state.m.cone, V(kCone), select(state.m.apex, V(kApex), V(kElastic))) + select(state.m.converged, V(0), V(4));
+  at.store_integer(a.branch, select(state.meaningful, branch, V(kInvalid)));
+  if (a.multiplier.pointer)
+    at.store(a.multiplier.pointer, a.multiplier.stride[0], select(state.yielded, plastic_increment(state).norm, V(0)));
   if (a.dissipated.pointer) {
-    const V lost = sand_energy<Energy>(s.h, p.mu, p.lam) - sand_energy<Energy>(m.h, p.mu, p.lam);
-    at.store(a.dissipated.pointer, a.dissipated.stride[0], select(moved, lost, V(0)));
+    const V lost = sand_energy<Energy>(shifted(state.trial, p.cohesion), p.mu, p.lam) -
+                   sand_energy<Energy>(state.h, p.mu, p.lam);
+    at.store(a.dissipated.pointer, a.dissipated.stride[0], select(state.yielded, lost, V(0)));
+  }
+  // What the trace loses: on the cone and where the volume is kept, nothing.
+  if (a.volume.pointer) {
+    const V left = p.volume + (sum(s.h) - V(D) * p.cohesion);
+    const auto lost = loses_volume<Energy>(state, a.sand.keep_apex);
+    at.store(a.volume.pointer, a.volume.stride[0],
+             select(state.meaningful, select(lost, left, V(0)), p.volume));
   }
 }
 
 // Adjoint of F in principal axes; see principal_adjoint.
 template <class Energy, class T, int D>
-MPM_HD Matrix<T, D> sand_adjoint(const HenckyStrain<T, D>& s, const MappedStrain<T, D>& m,
+MPM_HD Matrix<T, D> sand_adjoint(const HenckyStrain<T, D>& s, const SandState<T, D>& state,
                                  const Vector<T, D>& diagonal, const Matrix<T, D>& M, const Matrix<T, D>& N,
                                  const T& mu) {
-  return principal_adjoint(s, m.h, diagonal, M, N, [&](int i, int j) -> Quotients<T> {
-    const T trial = s.h[i] - s.h[j], mapped = m.h[i] - m.h[j];
-    // κ on the cone; at the apex 1 between strains that are kept, 0 between those that are not.
-    const auto equal = trial == T(0);
-    const auto both = (m.h[i] > T(0)) & (m.h[j] > T(0));
-    const T at_apex = select(both, T(1), select(equal, T(0), mapped / select(equal, T(1), trial)));
-    return {select(m.apex, at_apex, m.kappa), stress_quotient<Energy>(m.h[i], m.h[j], mu)};
+  return principal_adjoint(s, state.h, diagonal, M, N, [&](int i, int j) -> Quotients<T> {
+    return {strain_quotient<Energy>(state.m, i, j, s.h[i] - s.h[j]),
+            stress_quotient<Energy>(state.h[i], state.h[j], mu)};
   });
+}
+
+// A value per particle where the mask is true, else 0.
+template <class At, class T>
+MPM_HD typename At::Value load_scalar(const At& at, const Field<const T>& f, const MaskOf<typename At::Value>& mask) {
+  return select(mask, at.load(f.pointer, f.stride[0]), typename At::Value(0));
 }
 
 template <class Energy, class At, class T, int D>
@@ -144,45 +228,79 @@ MPM_HD void return_map_backward_at(const ReturnMapBackwardArguments<T, D>& a, co
   const Matrix<V, D> F = load_matrix<D>(at, a.sand.F);
   const SandParameters<V> p = load_parameters(at, a.sand);
   const HenckyStrain<V, D> s = hencky_strain(F);
-  const MappedStrain<V, D> m = map_strain<Energy>(s, p, a.sand.plastic, a.sand.keep_apex);
-  const Vector<V, D> principal = sand_stress<Energy>(m.h, p.mu, p.lam);
-  V finite = V(0);
-  MPM_UNROLL
-  for (int i = 0; i < D; i++) finite = finite + (principal[i] - principal[i]);
-  const auto meaningful = s.meaningful & (finite == V(0));
+  const SandState<V, D> state = sand_state<Energy>(s, p, a.sand.plastic, a.sand.keep_apex);
 
   const Matrix<V, D> V_ = right_axes(s);
   const Matrix<V, D> grad_F = a.grad_F.pointer ? load_matrix<D>(at, a.grad_F) : zero_matrix<V, D>();
   const Matrix<V, D> grad_stress = a.grad_stress.pointer ? load_matrix<D>(at, a.grad_stress) : zero_matrix<V, D>();
   const Matrix<V, D> M = transpose(s.U) * grad_F * V_, N = transpose(s.U) * grad_stress * s.U;
 
-  const StressTerms<V, D> terms = stress_terms<Energy>(m.h), tangent = stress_tangent<Energy>(m.h, p.mu, p.lam);
-  Vector<V, D> grad_h;
-  V grad_mu = V(0);
+  const StressTerms<V, D> terms = stress_terms<Energy>(state.h),
+                          tangent = stress_tangent<Energy>(state.h, p.mu, p.lam);
   const V trace_N = trace(N);
+  Vector<V, D> grad_h;
+  V grad_mu = V(0), grad_lam = terms.dilation * trace_N;
   MPM_UNROLL
   for (int i = 0; i < D; i++) {
-    grad_h[i] = M[i][i] * exponential(m.h[i]) + tangent.shear[i] * N[i][i] + tangent.dilation * trace_N;
+    grad_h[i] = M[i][i] * exponential(state.h[i]) + tangent.shear[i] * N[i][i] + tangent.dilation * trace_N;
     grad_mu = grad_mu + terms.shear[i] * N[i][i];
   }
-  const MapAdjoint<V, D> adjoint = return_map_adjoint<Energy>(m, grad_h, p.cone, a.sand.keep_apex);
+  // The scalar results give to the mapped and, directly, to the trial strain.
+  Vector<V, D> grad_trial = zero_vector<V, D>();
+  V grad_cohesion = V(0), grad_volume = V(0);
+  if (a.grad_multiplier.pointer) {
+    const V g = load_scalar(at, a.grad_multiplier, state.yielded);
+    const Vector<V, D> along = g * plastic_increment(state).direction;
+    MPM_UNROLL
+    for (int i = 0; i < D; i++) {
+      // The increment does not see the cohesion, which the mapped strain has in it.
+      grad_h[i] = grad_h[i] - along[i];
+      grad_trial[i] = grad_trial[i] + along[i];
+    }
+    grad_cohesion = grad_cohesion + sum(along);
+  }
+  if (a.grad_dissipated.pointer) {
+    const V g = load_scalar(at, a.grad_dissipated, state.yielded);
+    const Vector<V, D> before = shifted(state.trial, p.cohesion), stress = sand_stress<Energy>(before, p.mu, p.lam);
+    MPM_UNROLL
+    for (int i = 0; i < D; i++) {
+      grad_h[i] = grad_h[i] - g * state.stress[i];
+      grad_trial[i] = grad_trial[i] + g * stress[i];
+    }
+    grad_cohesion = grad_cohesion + g * sum(stress);
+    grad_mu = grad_mu + g * (sand_energy<Energy>(before, V(1), V(0)) - sand_energy<Energy>(state.h, V(1), V(0)));
+    grad_lam = grad_lam + g * (sand_energy<Energy>(before, V(0), V(1)) - sand_energy<Energy>(state.h, V(0), V(1)));
+  }
+  if (a.grad_volume.pointer) {
+    grad_volume = load_scalar(at, a.grad_volume, loses_volume<Energy>(state, a.sand.keep_apex));
+    grad_cohesion = grad_cohesion - V(D) * grad_volume;
+  }
+  const MapAdjoint<V, D> adjoint = return_map_adjoint<Energy>(state.m, grad_h, p.cone, a.sand.keep_apex);
+  grad_trial = grad_trial + adjoint.h;
+  grad_cohesion = grad_cohesion + sum(grad_h) - sum(grad_trial);
 
   if (a.F.pointer) {
-    const Matrix<V, D> g = s.U * sand_adjoint<Energy>(s, m, adjoint.h, M, N, p.mu) * transpose(V_);
+    const Vector<V, D> diagonal = shifted(grad_trial, grad_volume);
+    const Matrix<V, D> g = s.U * sand_adjoint<Energy>(s, state, diagonal, M, N, p.mu) * transpose(V_);
     Matrix<V, D> kept;
     MPM_UNROLL
     for (int i = 0; i < D; i++)
       MPM_UNROLL
-    for (int j = 0; j < D; j++) kept[i][j] = select(meaningful, g[i][j], grad_F[i][j]);
+    for (int j = 0; j < D; j++) kept[i][j] = select(state.meaningful, g[i][j], grad_F[i][j]);
     store_matrix<D>(at, a.F, kept);
   }
   if (a.parameters.pointer) {
     const V ratio = select(p.shear, adjoint.ratio / select(p.shear, p.mu, V(1)), V(0));
-    const V values[3] = {grad_mu - ratio * p.cone.ratio, terms.dilation * trace_N + ratio, adjoint.alpha};
+    const V values[4] = {grad_mu - ratio * p.cone.ratio, grad_lam + ratio, adjoint.alpha, grad_cohesion};
     MPM_UNROLL
-    for (int k = 0; k < 3; k++)
+    for (int k = 0; k < 4; k++)
       at.store(a.parameters.pointer + k * a.parameters.stride[1], a.parameters.stride[0],
-               select(meaningful, values[k], V(0)));
+               select(state.meaningful, values[k], V(0)));
+  }
+  if (a.volume.pointer) {
+    const V kept = a.grad_volume.pointer ? at.load(a.grad_volume.pointer, a.grad_volume.stride[0]) : V(0);
+    at.store(a.volume.pointer, a.volume.stride[0],
+             select(state.meaningful, grad_volume + V(1.0 / D) * sum(grad_trial), kept));
   }
 }
 

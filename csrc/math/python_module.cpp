@@ -7,6 +7,7 @@
 #include <vector>
 
 #include "materials/laws.h"
+#include "materials/quartic_kernels.h"
 #include "math/bspline.h"
 #include "math/pack.h"
 
@@ -112,6 +113,42 @@ py::dict evaluate(const std::string& law, const Array<double>& F_, const std::ve
   return result;
 }
 
+// Mapped strains [n, 3], branches and evaluations of the yield function [n] of trial strains, in packs of 8.
+template <class T>
+py::tuple sand_return_map(const Array<T>& h, const Array<T>& alpha, const Array<T>& ratio, const std::string& energy,
+                          const std::string& flow) {
+  using P = Pack<T, 8>;
+  const py::ssize_t n = alpha.size();
+  require(h.ndim() == 2 && h.shape(0) == n && h.shape(1) == 3 && ratio.size() == n, "h must have shape [n, 3]");
+  const int index = find_energy<ReturnMaps<3>>(energy, flow == "exact");
+  require(index >= 0, "there is no energy of this name");
+  Array<T> mapped({n, py::ssize_t(3)});
+  Array<int> branch(n), steps(n);
+  ReturnMaps<3>::visit(index, [&]<class Energy>() {
+    for (py::ssize_t i = 0; i < n; i += 8) {
+      const int count = int(std::min<py::ssize_t>(8, n - i));
+      Vector<P, 3> strain;
+      Cone<P> cone;
+      for (int lane = 0; lane < 8; lane++) {
+        const py::ssize_t p = i + std::min(lane, count - 1);
+        for (int k = 0; k < 3; k++) strain[k].set(lane, h.data()[3 * p + k]);
+        cone.alpha.set(lane, alpha.data()[p]);
+        cone.ratio.set(lane, ratio.data()[p]);
+      }
+      const MappedStrain<P, 3> m = return_map<Energy>(strain, cone, P(0) == P(0), false);
+      for (int lane = 0; lane < count; lane++) {
+        for (int k = 0; k < 3; k++) mapped.mutable_data()[3 * (i + lane) + k] = m.h[k][lane];
+        branch.mutable_data()[i + lane] = (m.cone[lane]   ? kCone
+                                           : m.apex[lane] ? kApex
+                                                          : kElastic) +
+                                          4 * !m.converged[lane];
+        steps.mutable_data()[i + lane] = int(m.steps[lane]);
+      }
+    }
+  });
+  return py::make_tuple(mapped, branch, steps);
+}
+
 double eigenvalue_bound(const Array<double>& a) {
   require(a.ndim() == 2 && a.shape(0) == 3 && a.shape(1) == 3, "a must have shape [3, 3]");
   Matrix<double, 3> m;
@@ -134,6 +171,12 @@ PYBIND11_MODULE(_math, m) {
   m.def("log_1p", &pack_log_1p<double>, py::arg("a"), py::arg("a_minus_1"), "ln a of float64 [n] from a and a − 1.");
   m.def("evaluate_law", &evaluate, py::arg("law"), py::arg("F"), py::arg("parameters"),
         "Energy, stress [D, D], wave modulus and stiffness of a law at F [D, D], without its checks for a valid F.");
+  m.def("sand_return_map", &sand_return_map<float>, py::arg("h").noconvert(), py::arg("alpha").noconvert(),
+        py::arg("ratio").noconvert(), py::arg("energy"), py::arg("flow"),
+        "Return map of float32 Hencky strains h [n, 3] with slopes alpha and λ/μ [n], as the CPU kernels compute it: "
+        "mapped strains, branches plus 4 where the root was not found, and evaluations of the yield function.");
+  m.def("sand_return_map", &sand_return_map<double>, py::arg("h"), py::arg("alpha"), py::arg("ratio"),
+        py::arg("energy"), py::arg("flow"), "The same of float64.");
   m.def("largest_eigenvalue_bound", &eigenvalue_bound, py::arg("a"),
         "Upper bound of the largest eigenvalue of a symmetric [3, 3] matrix.");
 }

@@ -36,11 +36,16 @@ MPM_HD double inverse_power_of_two(double x) {
   return __builtin_bit_cast(double, exponent > 0x0010000000000000 ? exponent : 0x0010000000000000);
 }
 
+// An estimate of ∛x, to 3 digits or better and smooth, for x > 0.
+#ifdef __CUDA_ARCH__
+MPM_HD float cube_root(float x) { return ::exp2f(__log2f(x) * (1.0f / 3)); }
+#else
 MPM_HD float cube_root(float x) { return ::cbrtf(x); }
+#endif
 MPM_HD double cube_root(double x) { return ::cbrt(x); }
 
 #ifndef __CUDACC__
-// To 7 digits, for x > 0: a third of the exponent (Kahan 1991), refined by Newton's method.
+// A third of the exponent (Kahan 1991), refined by one Newton step.
 template <class T, int N>
 MPM_HD Pack<T, N> cube_root(const Pack<T, N>& x) {
   using Integer = typename PackShape<T, N>::Integer;
@@ -52,9 +57,7 @@ MPM_HD Pack<T, N> cube_root(const Pack<T, N>& x) {
     const Value bits = __builtin_convertvector(__builtin_bit_cast(Integer, x.part[k]), Value);
     r.part[k] = __builtin_bit_cast(Value, __builtin_convertvector(bits * T(1.0 / 3) + offset, Integer));
   }
-  MPM_UNROLL
-  for (int step = 0; step < 2; step++) r = Pack<T, N>(2.0 / 3) * r + Pack<T, N>(1.0 / 3) * x / (r * r);
-  return r;
+  return Pack<T, N>(2.0 / 3) * r + Pack<T, N>(1.0 / 3) * x / (r * r);
 }
 
 template <class T, int N>

@@ -12,6 +12,8 @@
 namespace mpm {
 inline namespace TORCH_MPM_ISA {
 
+MPM_HD bool any(bool mask) { return mask; }
+
 template <class T, int D>
 struct SVD {
   Matrix<T, D> U;
@@ -19,16 +21,18 @@ struct SVD {
   Matrix<T, D> V;
 };
 
-// Sweeps after which columns are orthogonal to rounding, for any matrix.
+// Sweeps after which the columns of nearly all matrices are orthogonal to rounding, and of all.
 template <class T>
 struct JacobiSweeps;
 template <>
 struct JacobiSweeps<float> {
-  static constexpr int value = 5;
+  static constexpr int least = 4, most = 5;
+  static constexpr double rounding = 4e-7;  // of the cosine between columns
 };
 template <>
 struct JacobiSweeps<double> {
-  static constexpr int value = 6;
+  static constexpr int least = 5, most = 6;
+  static constexpr double rounding = 1e-15;
 };
 #ifndef __CUDACC__
 template <class T, int N>
@@ -67,17 +71,29 @@ MPM_HD void rotate_rows(Matrix<T, D>& a, int p, int q, const T& c, const T& s) {
   }
 }
 
+// Of columns p and q with themselves and each other.
+template <class T>
+struct Products {
+  T a, b, g;
+};
+
+template <class T, int D>
+MPM_HD Products<T> products(const Matrix<T, D>& B, int p, int q) {
+  Products<T> r{T(0), T(0), T(0)};
+  MPM_UNROLL
+  for (int i = 0; i < D; i++) {
+    r.a = r.a + B[i][p] * B[i][p];
+    r.b = r.b + B[i][q] * B[i][q];
+    r.g = r.g + B[i][p] * B[i][q];
+  }
+  return r;
+}
+
 // Makes columns p and q of B orthogonal with the longer one first, and turns those of V with them. With norms a, b and
 // product g, tan 2θ = 2g/(a − b); the half angle needs two reciprocal square roots and no division.
 template <class T, int D>
 MPM_HD void orthogonalize(Matrix<T, D>& B, Matrix<T, D>& V, int p, int q) {
-  T a = T(0), b = T(0), g = T(0);
-  MPM_UNROLL
-  for (int i = 0; i < D; i++) {
-    a = a + B[i][p] * B[i][p];
-    b = b + B[i][q] * B[i][q];
-    g = g + B[i][p] * B[i][q];
-  }
+  const auto [a, b, g] = products(B, p, q);
   const T difference = a - b, twice = g + g;
   const T scale = inverse_power_of_two(max(abs(difference), abs(twice)));
   const T cosine = abs(scale * difference) + T(1e-18), sine = scale * twice;  // of 2θ, times their common norm
@@ -93,6 +109,20 @@ MPM_HD void orthogonalize(Matrix<T, D>& B, Matrix<T, D>& V, int p, int q) {
   rotate_columns(V, p, q, c, s);
 }
 
+template <class T, int D>
+MPM_HD decltype(T(0) > T(0)) is_oblique(const Matrix<T, D>& B) {
+  constexpr double tolerance = JacobiSweeps<T>::rounding * JacobiSweeps<T>::rounding;
+  T excess = T(-1);
+  MPM_UNROLL
+  for (int p = 0; p < D - 1; p++)
+    MPM_UNROLL
+  for (int q = p + 1; q < D; q++) {
+    const Products<T> m = products(B, p, q);
+    excess = max(excess, m.g * m.g - T(tolerance) * m.a * m.b);
+  }
+  return excess > T(0);
+}
+
 // B, V with B = B V and orthogonal columns of B in descending length; V starts as the identity.
 template <class T, int D>
 MPM_HD void orthogonalize_columns(Matrix<T, D>& B, Matrix<T, D>& V) {
@@ -100,11 +130,13 @@ MPM_HD void orthogonalize_columns(Matrix<T, D>& B, Matrix<T, D>& V) {
 #ifdef __CUDACC__
 #pragma unroll 1
 #endif
-  for (int sweep = 0; sweep < (D == 2 ? 2 : JacobiSweeps<T>::value); sweep++)
+  for (int sweep = 0; sweep < (D == 2 ? 2 : JacobiSweeps<T>::most); sweep++) {
+    if (D == 3 && sweep >= JacobiSweeps<T>::least && !any(is_oblique(B))) break;
     MPM_UNROLL
-  for (int p = 0; p < D - 1; p++)
-    MPM_UNROLL
-  for (int q = p + 1; q < D; q++) orthogonalize(B, V, p, q);
+    for (int p = 0; p < D - 1; p++)
+      MPM_UNROLL
+    for (int q = p + 1; q < D; q++) orthogonalize(B, V, p, q);
+  }
 }
 
 // Rotates rows p and q of B so that B[q][p] vanishes and B[p][p] ≥ 0, and columns of U so that U B stays the same.

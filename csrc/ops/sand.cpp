@@ -13,12 +13,10 @@
 namespace mpm {
 namespace {
 
-int find_energy(const std::string& name) {
-  int index = -1;
-  for (int i = 0; i < SandEnergies::size; i++)
-    SandEnergies::visit(i, [&]<class Energy>() {
-      if (name == Energy::name) index = i;
-    });
+template <class Energies>
+int energy_index(const std::string& name, const std::string& flow) {
+  STD_TORCH_CHECK(flow == "radial" || flow == "exact", "there is no flow rule named ", flow);
+  const int index = find_energy<Energies>(name, flow == "exact");
   STD_TORCH_CHECK(index >= 0, "there is no energy named ", name);
   return index;
 }
@@ -40,67 +38,77 @@ void dispatch_deformation(const Tensor& deformation, F&& f) {
 }
 
 template <class T, int D>
-SandArguments<T, D> sand_arguments(const Tensor& F, const Tensor& mu, const Tensor& lam, const Tensor& alpha,
-                                   const OptionalTensor& scene, const std::string& energy) {
+SandArguments<T, D> sand_arguments(const Tensor& F, const Tensor& mu, const Tensor& lam, const OptionalTensor& scene) {
   SandArguments<T, D> a;
-  a.energy = find_energy(energy);
   a.particles = F.size(0);
   a.F = input<T>(F, "F", F, {F.size(0), D, D});
   set_scene(a, scene, F);
   a.mu = parameter<T>(mu, F, a.particles, has(scene));
   a.lam = parameter<T>(lam, F, a.particles, has(scene));
-  a.alpha = parameter<T>(alpha, F, a.particles, has(scene));
   return a;
 }
 
-// "none", "zero" or "keep": without plasticity, or with one of the apex rules.
+// The apex rule is "none" (without plasticity), "zero" or "keep".
 template <class T, int D>
-void set_plasticity(SandArguments<T, D>& a, const std::string& apex) {
+SandArguments<T, D> plastic_arguments(const Tensor& F, const Tensor& mu, const Tensor& lam, const Tensor& alpha,
+                                      const OptionalTensor& cohesion, const OptionalTensor& volume,
+                                      const OptionalTensor& scene, const std::string& energy, const std::string& flow,
+                                      const std::string& apex) {
   STD_TORCH_CHECK(apex == "none" || apex == "zero" || apex == "keep", "there is no apex rule named ", apex);
+  SandArguments<T, D> a = sand_arguments<T, D>(F, mu, lam, scene);
+  a.energy = energy_index<ReturnMaps<D>>(energy, flow);
+  a.alpha = parameter<T>(alpha, F, a.particles, has(scene));
+  if (has(cohesion)) a.cohesion = parameter<T>(*cohesion, F, a.particles, has(scene));
+  a.volume = input<T>(volume, "volume", F, {F.size(0)});
   a.plastic = apex != "none";
   a.keep_apex = apex == "keep";
+  return a;
 }
 
-std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> quartic_return_map(const Tensor& F, const Tensor& mu,
-                                                                      const Tensor& lam, const Tensor& alpha,
-                                                                      const OptionalTensor& scene, std::string energy,
-                                                                      std::string apex, bool details) {
+std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> quartic_return_map(
+    const Tensor& F, const Tensor& mu, const Tensor& lam, const Tensor& alpha, const OptionalTensor& cohesion,
+    const OptionalTensor& volume, const OptionalTensor& scene, std::string energy, std::string flow, std::string apex,
+    bool details) {
   const int64_t P = F.size(0);
-  Tensor mapped, stress, branch = empty_int(F, {P}), multiplier, dissipated;
+  Tensor mapped, stress, branch = empty_int(F, {P}), multiplier, dissipated, corrected;
   const DeviceScope device(F);
   dispatch_deformation(F, [&]<class T, int D>() {
     ReturnMapArguments<T, D> a;
-    a.sand = sand_arguments<T, D>(F, mu, lam, alpha, scene, energy);
-    set_plasticity(a.sand, apex);
+    a.sand = plastic_arguments<T, D>(F, mu, lam, alpha, cohesion, volume, scene, energy, flow, apex);
     a.F = optional_result<T>(F, true, {P, D, D}, mapped);
     a.stress = optional_result<T>(F, true, {P, D, D}, stress);
     a.branch = static_cast<int*>(branch.data_ptr());
     a.multiplier = optional_result<T>(F, details, {P}, multiplier);
     a.dissipated = optional_result<T>(F, details, {P}, dissipated);
+    a.volume = optional_result<T>(F, has(volume), {P}, corrected);
     backend::return_map(a, device.stream());
   });
-  return {mapped, stress, branch, multiplier, dissipated};
+  return {mapped, stress, branch, multiplier, dissipated, corrected};
 }
 
-std::tuple<Tensor, Tensor> quartic_return_map_backward(const OptionalTensor& grad_F, const OptionalTensor& grad_stress,
-                                                       const Tensor& F, const Tensor& mu, const Tensor& lam,
-                                                       const Tensor& alpha, const OptionalTensor& scene,
-                                                       std::string energy, std::string apex, bool needs_F,
-                                                       bool needs_parameters) {
+std::tuple<Tensor, Tensor, Tensor> quartic_return_map_backward(
+    const OptionalTensor& grad_F, const OptionalTensor& grad_stress, const OptionalTensor& grad_multiplier,
+    const OptionalTensor& grad_dissipated, const OptionalTensor& grad_volume, const Tensor& F, const Tensor& mu,
+    const Tensor& lam, const Tensor& alpha, const OptionalTensor& cohesion, const OptionalTensor& volume,
+    const OptionalTensor& scene, std::string energy, std::string flow, std::string apex, bool needs_F,
+    bool needs_parameters) {
   const int64_t P = F.size(0);
-  Tensor adjoint_F, adjoint_parameters;
+  Tensor adjoint_F, adjoint_parameters, adjoint_volume;
   const DeviceScope device(F);
   dispatch_deformation(F, [&]<class T, int D>() {
     ReturnMapBackwardArguments<T, D> a;
-    a.sand = sand_arguments<T, D>(F, mu, lam, alpha, scene, energy);
-    set_plasticity(a.sand, apex);
+    a.sand = plastic_arguments<T, D>(F, mu, lam, alpha, cohesion, volume, scene, energy, flow, apex);
     a.grad_F = input<T>(grad_F, "grad_F", F, {P, D, D});
     a.grad_stress = input<T>(grad_stress, "grad_stress", F, {P, D, D});
+    a.grad_multiplier = input<T>(grad_multiplier, "grad_multiplier", F, {P});
+    a.grad_dissipated = input<T>(grad_dissipated, "grad_dissipated", F, {P});
+    a.grad_volume = input<T>(grad_volume, "grad_volume", F, {P});
     a.F = optional_result<T>(F, needs_F, {P, D, D}, adjoint_F);
-    a.parameters = optional_result<T>(F, needs_parameters, {P, 3}, adjoint_parameters);
+    a.parameters = optional_result<T>(F, needs_parameters, {P, 4}, adjoint_parameters);
+    a.volume = optional_result<T>(F, has(volume), {P}, adjoint_volume);
     backend::return_map_backward(a, device.stream());
   });
-  return {adjoint_F, adjoint_parameters};
+  return {adjoint_F, adjoint_parameters, adjoint_volume};
 }
 
 Tensor sand_scalar(const Tensor& F, const Tensor& mu, const Tensor& lam, const OptionalTensor& scene,
@@ -108,8 +116,8 @@ Tensor sand_scalar(const Tensor& F, const Tensor& mu, const Tensor& lam, const O
   Tensor value = empty(F, {F.size(0)});
   const DeviceScope device(F);
   dispatch_deformation(F, [&]<class T, int D>() {
-    const SandScalarArguments<T, D> a{sand_arguments<T, D>(F, mu, lam, mu, scene, energy), stiffness, T(floor),
-                                      field<T>(value)};
+    SandScalarArguments<T, D> a{sand_arguments<T, D>(F, mu, lam, scene), stiffness, T(floor), field<T>(value)};
+    a.sand.energy = energy_index<SandEnergies>(energy, "radial");
     backend::sand_scalar(a, device.stream());
   });
   return value;
@@ -131,11 +139,14 @@ Tensor quartic_stiffness(const Tensor& F, const Tensor& mu, const Tensor& lam, c
 #if MPM_BACKEND == MPM_BACKEND_IS_cpu
 STABLE_TORCH_LIBRARY_FRAGMENT(torch_mpm, m) {
   m.def(
-      "quartic_return_map(Tensor F, Tensor mu, Tensor lam, Tensor alpha, Tensor? scene, str energy, str apex, bool "
-      "details) -> (Tensor F, Tensor stress, Tensor branch, Tensor multiplier, Tensor dissipated)");
+      "quartic_return_map(Tensor F, Tensor mu, Tensor lam, Tensor alpha, Tensor? cohesion, Tensor? volume, "
+      "Tensor? scene, str energy, str flow, str apex, bool details) -> "
+      "(Tensor F, Tensor stress, Tensor branch, Tensor multiplier, Tensor dissipated, Tensor volume)");
   m.def(
-      "quartic_return_map_backward(Tensor? grad_F, Tensor? grad_stress, Tensor F, Tensor mu, Tensor lam, Tensor alpha, "
-      "Tensor? scene, str energy, str apex, bool needs_F, bool needs_parameters) -> (Tensor F, Tensor parameters)");
+      "quartic_return_map_backward(Tensor? grad_F, Tensor? grad_stress, Tensor? grad_multiplier, "
+      "Tensor? grad_dissipated, Tensor? grad_volume, Tensor F, Tensor mu, Tensor lam, Tensor alpha, Tensor? cohesion, "
+      "Tensor? volume, Tensor? scene, str energy, str flow, str apex, bool needs_F, bool needs_parameters) -> "
+      "(Tensor F, Tensor parameters, Tensor volume)");
   m.def("quartic_energy(Tensor F, Tensor mu, Tensor lam, Tensor? scene, str energy) -> Tensor");
   m.def("quartic_stiffness(Tensor F, Tensor mu, Tensor lam, Tensor? scene, str energy, float floor) -> Tensor");
 }

@@ -27,7 +27,7 @@ Value = float | Tensor
 
 
 class ReturnMap(NamedTuple):
-    """Result of `quartic_return_map`."""
+    """Result of `quartic_return_map`. The last three are None unless asked for."""
 
     F: Tensor
     """Projected deformation gradient [P, D, D]; bitwise the trial one where elastic."""
@@ -38,9 +38,11 @@ class ReturnMap(NamedTuple):
     converged: Tensor
     """bool [P]: whether the root on the cone was found."""
     multiplier: Tensor | None
-    """Plastic multiplier [P]: norm of the plastic increment of the Hencky strain. With details only."""
+    """Plastic multiplier [P]: norm of the plastic increment of the Hencky strain. With details."""
     dissipated: Tensor | None
-    """Elastic energy lost by the map, per rest volume [P] [J/m³]. With details only."""
+    """Elastic energy lost by the map, per rest volume [P] [J/m³]. With details."""
+    volume_correction: Tensor | None
+    """v_c [P] after the map. With a volume correction."""
 
 
 def quartic_return_map(
@@ -53,10 +55,13 @@ def quartic_return_map(
     energy: str = "unilateral",
     apex: str = "zero",
     details: bool = False,
+    flow: str = "radial",
+    cohesion: Value | None = None,
+    volume_correction: Tensor | None = None,
 ) -> ReturnMap:
     """Drucker-Prager return map of sand in Hencky strains, with its stress: one decomposition of F.
 
-    The flow is radial: the mean strain and the direction of the deviator stay (Gao et al. 2018, supplement, eq. 28).
+    The mean strain stays, except at the apex.
 
     Args:
         F: trial deformation gradient [P, 3, 3] or [P, 2, 2], float32 or float64.
@@ -72,13 +77,21 @@ def quartic_return_map(
         apex: where the volume has grown, "zero" makes F a rotation; "keep" (unilateral energy only) keeps its volume
             and removes what is compressed, which is continuous and free of stress as well.
         details: also return the multiplier and the dissipated energy.
+        flow: "radial": the direction of the strain deviator stays too (Gao et al. 2018, supplement, eq. 28); "exact":
+            the plastic strain increment is along the deviator of the stress on the yield surface (eq. 25 to 27). They
+            are the same in 2-D and for the quadratic energy. In plane strain the exact flow mobilises more friction.
+        cohesion: Hencky strain c ≥ 0, like mu: the tension on every axis at the apex of the cone, h = c (1, 1, 1). The
+            yield function is that of h − c. Its stress is the tensile strength, 4aμ c³ + 2aλ (D c)³ for the full
+            energy and (2μ + D λ) c for the quadratic one; the unilateral energy has none in tension.
+        volume_correction: v_c [P], logarithm of the volume that was lost at the apex, zero at first (Tampubolon et al.
+            2017): the map sees h + v_c/D, and returns v_c + log det of the trial F − log det of the new one.
 
     Returns:
         A `ReturnMap`. A trial F that is not finite or of det F ≤ 0 is returned as it is, with zero stress.
 
-    Differentiable once: F and stress with respect to F, mu, lam and the angle or α, by implicit differentiation at the
-    root and divided differences that hold at equal principal stretches. On a boundary between branches the derivative
-    is that of the branch taken. The details are not differentiable.
+    Differentiable once: every floating result with respect to F, mu, lam, the angle or α, cohesion and volume
+    correction, by implicit differentiation at the root and divided differences that hold at equal principal stretches.
+    On a boundary between branches the derivative is that of the branch taken.
 
     Raises:
         ValueError, TypeError: for an unknown option, or wrong shapes, dtypes or devices.
@@ -89,16 +102,21 @@ def quartic_return_map(
         raise ValueError(f"apex must be 'zero' or 'keep', got {apex!r}")
     if apex == "keep" and energy != "unilateral":
         raise ValueError(f"apex='keep' needs energy='unilateral', got {energy!r}")
+    if flow not in ("radial", "exact"):
+        raise ValueError(f"flow must be 'radial' or 'exact', got {flow!r}")
     _check_deformation(F, scene, energy)
+    check_like("volume_correction", volume_correction, F, (F.shape[0],), "[P]")
     slope = (
         friction_alpha(_parameter("friction_angle", friction_angle, F, scene), F.shape[1]) if alpha is None else alpha
     )
     parameters = [_parameter(n, v, F, scene) for n, v in (("mu", mu), ("lam", lam), ("alpha", slope))]
-    mapped, stress, code, multiplier, dissipated = torch.ops.torch_mpm.quartic_return_map(
-        F, *parameters, scene, energy, apex, details
+    shift = None if cohesion is None else _parameter("cohesion", cohesion, F, scene)
+    mapped, stress, code, *scalars = torch.ops.torch_mpm.quartic_return_map(
+        F, *parameters, shift, volume_correction, scene, energy, flow, apex, details
     )
+    wanted = (details, details, volume_correction is not None)
     return ReturnMap(
-        mapped, stress, code & 3, code < 4, multiplier if details else None, dissipated if details else None
+        mapped, stress, code & 3, code < 4, *(t if w else None for t, w in zip(scalars, wanted, strict=True))
     )
 
 
@@ -109,7 +127,8 @@ def quartic_stress(F: Tensor, mu: Value, lam: Value, scene: Tensor | None = None
     """
     _check_deformation(F, scene, energy)
     mu, lam = _parameter("mu", mu, F, scene), _parameter("lam", lam, F, scene)
-    return torch.ops.torch_mpm.quartic_return_map(F, mu, lam, mu.detach(), scene, energy, "none", False)[1]
+    options = (scene, energy, "radial", "none", False)
+    return torch.ops.torch_mpm.quartic_return_map(F, mu, lam, mu.detach(), None, None, *options)[1]
 
 
 def quartic_energy(F: Tensor, mu: Value, lam: Value, scene: Tensor | None = None, energy: str = "unilateral") -> Tensor:
@@ -172,20 +191,22 @@ def _parameter(name: str, value: Value | None, F: Tensor, scene: Tensor | None) 
 
 
 @torch.library.register_fake("torch_mpm::quartic_return_map")
-def _return_map_fake(
-    F: Tensor, mu: Tensor, lam: Tensor, alpha: Tensor, scene: Tensor | None, energy: str, apex: str, details: bool
-) -> tuple[Tensor, ...]:
+def _return_map_fake(F, mu, lam, alpha, cohesion, volume, scene, energy, flow, apex, details):
     P = F.shape[0]
-    detail = [F.new_empty(P if details else 0) for _ in range(2)]
-    return soa_empty(F, F.shape), soa_empty(F, F.shape), F.new_empty(P, dtype=torch.int32), *detail
+    scalars = [F.new_empty(P if wanted else 0) for wanted in (details, details, volume is not None)]
+    return soa_empty(F, F.shape), soa_empty(F, F.shape), F.new_empty(P, dtype=torch.int32), *scalars
 
 
 @torch.library.register_fake("torch_mpm::quartic_return_map_backward")
-def _return_map_backward_fake(grad_F, grad_stress, F, mu, lam, alpha, scene, energy, apex, needs_F, needs_parameters):
+def _return_map_backward_fake(
+    grad_F, grad_stress, grad_multiplier, grad_dissipated, grad_volume,
+    F, mu, lam, alpha, cohesion, volume, scene, energy, flow, apex, needs_F, needs_parameters,
+):  # fmt: skip
     P = F.shape[0]
     return (
         soa_empty(F, F.shape) if needs_F else F.new_empty(0),
-        soa_empty(F, (P, 3)) if needs_parameters else F.new_empty(0),
+        soa_empty(F, (P, 4)) if needs_parameters else F.new_empty(0),
+        F.new_empty(0 if volume is None else P),
     )
 
 
@@ -210,29 +231,28 @@ def _shared(grad: Tensor, parameter: Tensor, scene: Tensor | None) -> Tensor:
 
 
 def _return_map_setup(ctx: Any, inputs: Any, output: Any) -> None:
-    *tensors, ctx.energy, ctx.apex, _ = inputs
+    *tensors, ctx.energy, ctx.flow, ctx.apex, ctx.details = inputs
     ctx.set_materialize_grads(False)
     ctx.save_for_backward(*tensors)
 
 
 def _return_map_backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
-    grad_F, grad_stress, _, grad_multiplier, grad_dissipated = grads
-    if any(g is not None and g.numel() for g in (grad_multiplier, grad_dissipated)):
-        raise NotImplementedError(
-            "the plastic multiplier and the dissipated energy are not differentiable: detach them"
-        )
-    F, mu, lam, alpha, scene = ctx.saved_tensors
-    needs_F, *needs = ctx.needs_input_grad[:4]
-    if (grad_F is None and grad_stress is None) or not (needs_F or any(needs)):
-        return (None,) * 8
-    adjoint_F, adjoint_parameters = torch.ops.torch_mpm.quartic_return_map_backward(
-        grad_F, grad_stress, F, mu, lam, alpha, scene, ctx.energy, ctx.apex, needs_F, any(needs)
+    grad_F, grad_stress, _, *details, grad_volume = grads
+    _, mu, lam, alpha, cohesion, volume, scene = ctx.saved_tensors
+    if not ctx.details:
+        details = [None, None]
+    given = [grad_F, grad_stress, *details, grad_volume if volume is not None else None]
+    needs_F, *needs, needs_volume = ctx.needs_input_grad[:6]
+    if all(g is None for g in given) or not (needs_F or any(needs) or needs_volume):
+        return (None,) * 11
+    adjoint_F, adjoint_parameters, adjoint_volume = torch.ops.torch_mpm.quartic_return_map_backward(
+        *given, *ctx.saved_tensors, ctx.energy, ctx.flow, ctx.apex, needs_F, any(needs)
     )
     shared = [
         _shared(adjoint_parameters[:, k], p, scene) if n else None
-        for k, (p, n) in enumerate(zip((mu, lam, alpha), needs, strict=True))
+        for k, (p, n) in enumerate(zip((mu, lam, alpha, cohesion), needs, strict=True))
     ]
-    return adjoint_F if needs_F else None, *shared, None, None, None, None
+    return adjoint_F if needs_F else None, *shared, adjoint_volume if needs_volume else None, *(None,) * 5
 
 
 def _energy_setup(ctx: Any, inputs: Any, output: Any) -> None:

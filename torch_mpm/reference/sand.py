@@ -59,8 +59,62 @@ def nearest_extension(h: Tensor) -> Tensor:
     return (h - shifts.gather(1, last.clamp(min=0))).clamp(min=0)
 
 
+def flow_step(h: Tensor, c: Tensor, unilateral: bool) -> Tensor:
+    """x [P, D] with x + c dev t = h and t the cubes of x, or of its negative parts: c > 0 [P], tr x = tr h.
+
+    With x + c t = h + w each xᵢ is the root of a cubic; w is bisected for the trace.
+    """
+    c, trace = c[:, None], h.sum(1, keepdim=True)
+
+    def roots(w: Tensor) -> Tensor:
+        k = (3 * c).sqrt()
+        x = 2 / k * torch.sinh(torch.asinh(1.5 * k * (h + w)) / 3)
+        return torch.where(h + w > 0, h + w, x) if unilateral else x
+
+    t = c * (h.clamp(max=0) if unilateral else h) ** 3
+    low, high = t.amin(1, keepdim=True), t.amax(1, keepdim=True)
+    for _ in range(60):
+        middle = (low + high) / 2
+        above = roots(middle).sum(1, keepdim=True) > trace
+        low, high = torch.where(above, low, middle), torch.where(above, middle, high)
+    return roots((low + high) / 2)
+
+
+def exact_flow(h: Tensor, mu: Tensor, lam: Tensor, alpha: Tensor, energy: str) -> Tensor:
+    """The point [P, D] of the yield surface with h = x + c dev t(x) for strains h outside it of negative trace.
+
+    The first root in c > 0, bisected; then Newton's method on all D + 1 equations, whose Jacobian is written out.
+    """
+    unilateral, (P, D) = energy == "unilateral", h.shape
+    scale = h.mean(1, keepdim=True).abs()
+    h, one = h / scale, torch.ones_like(mu)
+    low, high = -40 * one, 40 * one
+    for _ in range(40):
+        middle = (low + high) / 2
+        above = yield_value(flow_step(h, middle.exp(), unilateral), one, lam / mu, alpha, energy) > 0
+        low, high = torch.where(above, middle, low), torch.where(above, high, middle)
+    log_c = (low + high) / 2
+    x = flow_step(h, log_c.exp(), unilateral)
+    deviatoric = torch.eye(D, dtype=h.dtype, device=h.device) - 1 / D
+    for _ in range(8):
+        c, t = log_c.exp()[:, None], (x.clamp(max=0) if unilateral else x) ** 3
+        slope = 3 * (x.clamp(max=0) if unilateral else x) ** 2
+        d = t @ deviatoric
+        size = d.norm(dim=1, keepdim=True)
+        trace = t.sum(1) + D / 2 * lam / mu * x.sum(1) ** 3
+        y_slope = slope * (d / size + alpha[:, None]) + alpha[:, None] * (1.5 * D * lam / mu * x.sum(1) ** 2)[:, None]
+        jacobian = torch.zeros(P, D + 1, D + 1, dtype=h.dtype, device=h.device)
+        jacobian[:, :D, :D] = torch.eye(D, dtype=h.dtype, device=h.device) + c[:, :, None] * deviatoric * slope[:, None]
+        jacobian[:, :D, D] = c * d
+        jacobian[:, D, :D] = y_slope / size
+        residual = torch.cat([x + c * d - h, 1 + (alpha * trace)[:, None] / size], 1)
+        step = torch.linalg.solve(jacobian, residual)
+        x, log_c = x - step[:, :D], log_c - step[:, D]
+    return x * scale
+
+
 def return_map_strain(
-    h: Tensor, mu: Tensor, lam: Tensor, alpha: Tensor, energy: str, apex: str = "zero"
+    h: Tensor, mu: Tensor, lam: Tensor, alpha: Tensor, energy: str, apex: str = "zero", flow: str = "radial"
 ) -> tuple[Tensor, Tensor]:
     """The mapped strain [P, D] and the branch [P] of trial strains h, for μ > 0 and positive bulk modulus."""
     p = h.mean(1, keepdim=True)
@@ -75,6 +129,8 @@ def return_map_strain(
     at_apex = outside & (p[:, 0] >= 0)
     at_rest = nearest_extension(h) if apex == "keep" else torch.zeros_like(h)
     mapped = torch.where(on_cone[:, None], p + ((low + high) / 2)[:, None] * deviator, h)
+    if flow == "exact" and energy != "hencky" and bool(on_cone.any()):
+        mapped[on_cone] = exact_flow(h[on_cone], mu[on_cone], lam[on_cone], alpha[on_cone], energy)
     mapped = torch.where(at_apex[:, None], at_rest, mapped)
     return mapped, torch.where(on_cone, CONE, torch.where(at_apex, APEX, ELASTIC)).int()
 
@@ -87,25 +143,37 @@ def quartic_return_map(
     scene: Tensor | None = None,
     energy: str = "unilateral",
     apex: str = "zero",
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """F, τ, branch, multiplier and dissipated energy; see `torch_mpm.ops.quartic_return_map`."""
-    mu, lam, alpha = (per_particle(p, scene, F.shape[0]) for p in (mu, lam, alpha))
+    flow: str = "radial",
+    cohesion: Tensor | None = None,
+    volume_correction: Tensor | None = None,
+) -> tuple[Tensor, ...]:
+    """F, τ, branch, multiplier, dissipated energy, volume correction; see `torch_mpm.ops.quartic_return_map`."""
+    zero = torch.zeros_like(mu)
+    mu, lam, alpha, cohesion = (
+        per_particle(zero if p is None else p, scene, F.shape[0]) for p in (mu, lam, alpha, cohesion)
+    )
+    volume = torch.zeros_like(mu) if volume_correction is None else volume_correction
     meaningful = F.isfinite().all(2).all(1)
     meaningful = meaningful & (torch.linalg.det(torch.where(meaningful[:, None, None], F, 0)) > 0)
     safe = torch.where(meaningful[:, None, None], F, torch.eye(F.shape[1], dtype=F.dtype, device=F.device))
     U, sigma, V = svd3(safe)
     h = sigma.log()
+    trial = h + (volume / F.shape[1] - cohesion)[:, None]
     if apex == "none":
-        mapped, branch = h, torch.zeros_like(mu, dtype=torch.int32)
+        mapped, branch = trial, torch.zeros_like(mu, dtype=torch.int32)
     else:
-        mapped, branch = return_map_strain(h, mu, lam, alpha, energy, apex)
-    moved = meaningful & (branch != ELASTIC)
+        mapped, branch = return_map_strain(trial, mu, lam, alpha, energy, apex, flow)
+    increment = (trial - mapped).norm(dim=1)
+    trial, mapped = trial + cohesion[:, None], mapped + cohesion[:, None]
+    yielded = meaningful & (branch != ELASTIC)
+    moved = yielded | (meaningful & (volume != 0))
     stress = (U * principal_stress(mapped, mu, lam, energy)[:, None, :]) @ U.mT
-    lost = energy_density(h, mu, lam, energy) - energy_density(mapped, mu, lam, energy)
+    lost = energy_density(trial, mu, lam, energy) - energy_density(mapped, mu, lam, energy)
     return (
         torch.where(moved[:, None, None], (U * mapped.exp()[:, None, :]) @ V.mT, F),
         torch.where(meaningful[:, None, None], stress, 0),
         torch.where(meaningful, branch, INVALID),
-        torch.where(moved, (h - mapped).norm(dim=1), 0),
-        torch.where(moved, lost, 0),
+        torch.where(yielded, increment, 0),
+        torch.where(yielded, lost, 0),
+        torch.where(moved, volume + h.sum(1) - mapped.sum(1), volume),
     )

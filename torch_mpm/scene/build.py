@@ -201,19 +201,30 @@ class _Mixture:
         if isinstance(words, schema.WeaklyCompressible):
             return materials.WeaklyCompressible(value("bulk_modulus"), value("gamma"), value("viscosity"))
         moduli = {name: value(name) for name in ("E", "nu", "mu", "lam") if getattr(words, name) is not None}
-        angle = value("friction_angle")
         return QuarticSand(
             **moduli,
-            friction_angle=torch.deg2rad(angle) if isinstance(angle, Tensor) else math.radians(angle),
+            **_friction(words.hardening, value("friction_angle")),
             energy=words.energy,
             apex=words.apex,
             smallest_strain=words.smallest_strain,
+            flow=words.flow,
+            cohesion=value("cohesion") if words.cohesion > 0 else None,
+            volume_correction=words.volume_correction,
         )
+
+
+def _friction(hardening: Sequence[float] | None, angle: Any) -> dict[str, Any]:
+    """Degrees to radians."""
+    if hardening is None:
+        return {"friction_angle": torch.deg2rad(angle) if isinstance(angle, Tensor) else math.radians(angle)}
+    h0, h1, h2, h3 = hardening
+    return {"hardening": (math.radians(h0), math.radians(h1), h2, math.radians(h3))}
 
 
 def _form(words: Any) -> tuple[Any, ...]:
     """What must be the same in materials that share a law."""
-    options = [getattr(words, name, None) for name in ("energy", "apex", "smallest_strain")]
+    names = ("energy", "apex", "smallest_strain", "flow", "volume_correction", "hardening")
+    options = [*(getattr(words, name, None) for name in names), getattr(words, "cohesion", 0.0) > 0]
     options += [getattr(words, name, None) for name in (*heat.THERMAL, "liquid")]
     curves = [v for name in ("E", "viscosity") if isinstance(v := getattr(words, name, None), schema.Curve)]
     viscosity = getattr(words, "viscosity", 0.0)

@@ -141,6 +141,15 @@ class QuarticSand(Thermal):
     """strain of sand that comes apart: none, or with the unilateral energy that of the expansion"""
     smallest_strain: NotNegative = 0.05
     """strain that the time step counts on at least; best the compression of the deepest sand"""
+    flow: Literal["radial", "exact"] = "radial"
+    """plastic flow; exact: along the deviator of the stress, with more friction in plane strain"""
+    cohesion: NotNegative = 0.0
+    """logarithmic strain at which the sand tears; 0 for dry sand"""
+    volume_correction: bool = False
+    """sand that came apart has no stress until its volume is what it was"""
+    hardening: Annotated[list[float], Field(min_length=4, max_length=4)] | None = None
+    """h0, h1, h2, h3 of the friction angle h0 + (h1 q - h3) exp(-h2 q) after plastic flow q, instead of friction_angle;
+    h0, h1 and h3 in degrees, for example [35, 9, 0.2, 10]"""
 
     @model_validator(mode="after")
     def _moduli(self) -> QuarticSand:
@@ -151,6 +160,12 @@ class QuarticSand(Thermal):
             raise ValueError(f"takes E and nu, or mu and lam, got {', '.join(sorted(given)) or 'none of them'}")
         if self.apex == "keep" and self.energy != "unilateral":
             raise ValueError("apex = 'keep' needs energy = 'unilateral'")
+        if self.hardening is not None:
+            if "friction_angle" in self.model_fields_set:
+                raise ValueError("takes friction_angle or hardening, got both")
+            h0, h1, h2, h3 = self.hardening
+            if not (0 <= h3 <= h0 < 90 and h1 >= 0 and h2 >= 0):
+                raise ValueError(f"hardening needs 0 <= h3 <= h0 < 90, h1 >= 0 and h2 >= 0, got {self.hardening}")
         return self
 
 
