@@ -1,5 +1,8 @@
 """Scene files with heat: what they say, what comes out, and what they may not say."""
 
+import math
+from pathlib import Path
+
 import numpy as np
 import pytest
 from scenes import disc
@@ -103,12 +106,21 @@ def test_emitted_matter_has_its_temperature(tmp_path):
         "center": (0.5, 0.8), "radius": 0.1, "velocity": (0.0, -1.0), "material": "jelly", "temperature": 315.0,
     }  # fmt: skip
     _, data = simulate(tmp_path / "out", wax(emitter=[emitter], obstacle=[]))
-    new = (
-        np.isnan(data["position"][0][:, 0])
-        if len(data["position"][0]) == len(data["mass"])
-        else slice(len(data["position"][0]), None)
-    )
-    assert np.nanmean(data["temperature"][-1][new]) == pytest.approx(315.0, abs=0.5)
+    first, last = (int(data["particles"][k]) for k in (0, -1))
+    assert last > first
+    np.testing.assert_allclose(data["temperature"][-1][first:last].mean(), 315.0, atol=0.5)
+
+
+def test_heated_bar_has_the_temperature_of_the_exact_solution(tmp_path):
+    """One end held at 400 K: 100 [1 − Σ 2/a_k exp(−a_k² α t) sin(a_k x)] above 300 K, a_k = (k + 1/2) π, α = 0.02."""
+    overrides = ["grid.dx=0.05", "duration=5.0", "fps=1", "material.rubber.expansion=0.0", 'device="cpu"']
+    overrides += ['output.fields=["temperature"]']
+    Scene.load(Path(__file__).parent.parent / "examples" / "heated_bar.toml", overrides).run(tmp_path / "out")
+    with Trajectory(tmp_path / "out") as read:
+        x, theta = read["position"][-1][:, :1] - 0.1, read["temperature"][-1]
+    a = (np.arange(50) + 0.5) * math.pi
+    exact = 400 - 100 * (2 / a * np.exp(-(a**2) * 0.02 * 5) * np.sin(a * x)).sum(1)
+    np.testing.assert_allclose(theta, exact, atol=1.0)
 
 
 @pytest.mark.parametrize(
