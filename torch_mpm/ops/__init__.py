@@ -4,7 +4,7 @@ from . import activation as activation
 from .advance import advance
 from .contact import contact, fusible
 from .grid_update import grid_update
-from .heat import HeatSolve, heat_cg
+from .heat import HeatSolve, heat_cg, heat_operator
 from .material import material_energy, material_stiffness, material_stress, material_wave_modulus
 from .sand import quartic_energy, quartic_return_map, quartic_stiffness, quartic_stress
 from .svd import polar, svd3
@@ -19,6 +19,7 @@ __all__ = [
     "gather",
     "grid_update",
     "heat_cg",
+    "heat_operator",
     "material_energy",
     "material_stiffness",
     "material_stress",

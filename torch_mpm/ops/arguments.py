@@ -60,7 +60,8 @@ def differentiate(
     """Gradients of a composition of differentiable ops with respect to its tensor inputs; itself differentiable."""
     differentiable = torch.is_grad_enabled()
     with torch.enable_grad():
-        leaves = [t if t is None or t.requires_grad else t.detach().requires_grad_() for t in inputs]
+        # Aliases, because an input may itself depend on another one, which is not this composition's share.
+        leaves = [t if t is None else t.view_as(t) if t.requires_grad else t.detach().requires_grad_() for t in inputs]
         outputs = function(*leaves)
         outputs = outputs if isinstance(outputs, tuple) else (outputs,)
         pairs = [(y, g) for y, g in zip(outputs, grad_outputs, strict=True) if g is not None and y.requires_grad]

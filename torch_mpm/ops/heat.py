@@ -9,9 +9,10 @@ from torch import Tensor
 
 from ..errors import check_like, check_positions, shape_of
 from ..grid import Blocks, inverse_inertia
-from ..reference import heat as reference
 from .arguments import refuse_vmap, split_dt
 from .transfer import TOPOLOGY, _blocks_of
+
+METHODS = {"cg": 0, "chebyshev": 1}  # HeatMethod of csrc/heat/solve.h
 
 
 class HeatSolve(NamedTuple):
@@ -35,6 +36,7 @@ def heat_cg(
     fixed: Tensor | None = None,
     tolerance: float | Tensor = 1e-5,
     max_iterations: int | Tensor = 200,
+    method: str = "cg",
     adjoint_tolerance: float = 1e-6,
     relative_tolerance: float = 0.0,
 ) -> HeatSolve:
@@ -58,6 +60,8 @@ def heat_cg(
         tolerance: of dt sqrt(Σ r_i²/M_i / Σ M_i) [K], r the residual, which bounds the mass-weighted RMS error of d:
             a number, or a tensor of shape [], [1] or [B].
         max_iterations: a number, or an integer tensor of shape [], [1] or [B].
+        method: "cg", or "chebyshev": Chebyshev iteration needs no scalar products; how many iterations reach the
+            tolerance is known before the first, from the largest diffusion number (Saad 2003, algorithm 12.1).
         adjoint_tolerance: of the backward solve, relative to the size of its right side.
         relative_tolerance: a residual of this share of the first one will do too. The changes of many small steps add
             up, so that a tolerance in kelvin alone stops too early there.
@@ -86,6 +90,8 @@ def heat_cg(
     most, scene_limit = _per_scene("max_iterations", max_iterations, grid.scenes, x)
     if scene_limit is not None and scene_limit.is_floating_point():
         raise TypeError(f"max_iterations must be an integer tensor, got {scene_limit.dtype}")
+    if method not in METHODS:
+        raise ValueError(f"method must be one of {sorted(METHODS)}, got {method!r}")
     if not 0 < adjoint_tolerance < 1:
         raise ValueError(f"adjoint_tolerance must be between 0 and 1, got {adjoint_tolerance}")
     if not 0 <= relative_tolerance < 1:
@@ -95,10 +101,32 @@ def heat_cg(
             x, conductance, capacity, theta, source, exchange, fixed, scene_dt, number,
             None if scene_tolerance is None else scene_tolerance.to(x.dtype).contiguous(), float(least),
             float(relative_tolerance), None if scene_limit is None else scene_limit.int().contiguous(), int(most),
-            adjoint_tolerance,
-            *blocks.topology,
+            METHODS[method], adjoint_tolerance, *blocks.topology,
         )
     )  # fmt: skip
+
+
+def heat_operator(blocks: Blocks, x: Tensor, conductance: Tensor, nodes: Tensor | None) -> Tensor:
+    """H u, the heat that flows out of each node at node values u; H as in `heat_cg`.
+
+    Args:
+        blocks: active blocks of these positions.
+        x: positions [P, D] [m].
+        conductance: conductivity times volume κ_p V_p [P] [W m²/K in 3-D].
+        nodes: temperature of the nodes u [N] [K]; None for the diagonal of H.
+
+    Returns:
+        H u [N] [W], or the diagonal H_ii [N] [W/K].
+
+    Raises:
+        ValueError, TypeError: for wrong shapes, dtypes or devices.
+
+    H u is differentiable with respect to every tensor, twice in eager mode; the diagonal is not.
+    """
+    check_positions(x, blocks.grid.dim, blocks.scene, blocks.grid.scenes)
+    check_like("conductance", conductance, x, (x.shape[0],), "[P]")
+    check_like("nodes", nodes, x, (blocks.node_count,), "[N]")
+    return torch.ops.torch_mpm.heat_operator(x, conductance, nodes, *blocks.topology)
 
 
 def _per_scene(name: str, value: float | Tensor, scenes: int, x: Tensor) -> tuple[float, Tensor | None]:
@@ -114,28 +142,7 @@ def _per_scene(name: str, value: float | Tensor, scenes: int, x: Tensor) -> tupl
     return 0.0, value.expand(scenes)
 
 
-SCHEMA = (
-    "heat_cg(Tensor x, Tensor conductance, Tensor capacity, Tensor? theta, Tensor? source, Tensor? exchange, "
-    "Tensor? fixed, Tensor? scene_dt, float dt, Tensor? scene_tolerance, float tolerance, float relative_tolerance, "
-    "Tensor? scene_limit, int max_iterations, float adjoint_tolerance, "
-    "Tensor table, Tensor block, Tensor offsets, Tensor index, Tensor schedule, float dx, float[] lower, int[] blocks, "
-    "int order, bool deterministic) -> (Tensor increment, Tensor iterations, Tensor residual, Tensor converged)"
-)
-torch.library.define("torch_mpm::" + SCHEMA.split("(", 1)[0], "(" + SCHEMA.split("(", 1)[1])
-
-
-@torch.library.impl("torch_mpm::heat_cg", "CompositeExplicitAutograd")
-def _heat_cg(
-    x, conductance, capacity, theta, source, exchange, fixed, scene_dt, dt, scene_tolerance, tolerance,
-    relative_tolerance, scene_limit, max_iterations, adjoint_tolerance, *topology,
-):  # fmt: skip
-    blocks = _blocks_of(topology, x)
-    steps = dt * (x.new_ones(blocks.grid.scenes) if scene_dt is None else scene_dt)
-    return reference.heat_cg(
-        blocks, x, conductance, capacity, theta, steps, source, exchange, fixed,
-        tolerance if scene_tolerance is None else scene_tolerance, relative_tolerance,
-        max_iterations if scene_limit is None else scene_limit,
-    )  # fmt: skip
+# ---- fake kernels: shapes only
 
 
 @torch.library.register_fake("torch_mpm::heat_cg")
@@ -153,15 +160,20 @@ def _fake(x, conductance, capacity, theta, source, exchange, fixed, *arguments):
     )
 
 
+@torch.library.register_fake("torch_mpm::heat_operator")
+def _operator_fake(x, conductance, nodes, *topology):
+    return x.new_empty(topology[1].shape[0] * 4 ** x.shape[1])
+
+
 # ---- autograd: with A λ = ∂L/∂d on the free nodes, changes δA of the matrix and δb of the right side of A d = b change
 # the loss by λ · (δb − δA d).
 
 
 def _setup(ctx: Any, inputs: Any, output: Any) -> None:
-    *tensors, scene_dt, dt, _, _, _, scene_limit, max_iterations, adjoint_tolerance = inputs[:-TOPOLOGY]
+    *tensors, scene_dt, dt, _, _, _, scene_limit, max_iterations, method, adjoint_tolerance = inputs[:-TOPOLOGY]
     topology = inputs[-TOPOLOGY:]
     ctx.save_for_backward(*tensors, scene_dt, scene_limit, output[0], *topology[:5])
-    ctx.dt, ctx.max_iterations, ctx.adjoint_tolerance = dt, max_iterations, adjoint_tolerance
+    ctx.dt, ctx.max_iterations, ctx.method, ctx.adjoint_tolerance = dt, max_iterations, method, adjoint_tolerance
     ctx.geometry = topology[5:]
     ctx.mark_non_differentiable(*output[1:])
 
@@ -174,24 +186,18 @@ def _backward(ctx: Any, grad: Tensor, *_: Any) -> tuple[Any, ...]:
     ]
     adjoint = torch.ops.torch_mpm.heat_cg(
         x, conductance, capacity, None, grad.contiguous(), exchange, fixed, scene_dt, ctx.dt, None, 0.0,
-        ctx.adjoint_tolerance, scene_limit, ctx.max_iterations, ctx.adjoint_tolerance, *topology,
+        ctx.adjoint_tolerance, scene_limit, ctx.max_iterations, ctx.method, ctx.adjoint_tolerance, *topology,
     )[0]  # fmt: skip
     after = d if theta is None else theta + d
     grads: list[Tensor | None] = [None] * 8
-    if need_x or need_conductance or need_theta:
-        scale = inverse_inertia(topology[8], topology[5])
-        flux = [_gradient(x, u, scale, topology) for u in (adjoint, after)]
-        if need_conductance:
-            grads[1] = -(flux[0] * flux[1]).sum(1)
-        if need_theta:
-            grads[3] = -_divergence(x, conductance[:, None] * flux[0], scale, topology)
-            if exchange is not None:
-                grads[3] = grads[3] - exchange * adjoint
-        if need_x:
-            flux = [-conductance[:, None] * f for f in flux]
-            pairs = ((flux[0], after), (flux[1], adjoint))
-            first, second = (_position_gradient(x, q, u, scale, topology) for q, u in pairs)
-            grads[0] = first + second
+    if need_x or need_conductance:
+        for_x, for_conductance = _operator_adjoint(x, conductance, after, adjoint, topology, need_x)
+        grads[0] = None if for_x is None else -for_x
+        grads[1] = -for_conductance
+    if need_theta:
+        grads[3] = -torch.ops.torch_mpm.heat_operator(x, conductance, adjoint, *topology)
+        if exchange is not None:
+            grads[3] = grads[3] - exchange * adjoint
     rate = -adjoint * d
     if need_capacity or need_dt:
         blocks = _blocks_of(topology, x)
@@ -206,27 +212,51 @@ def _backward(ctx: Any, grad: Tensor, *_: Any) -> tuple[Any, ...]:
         grads[4] = adjoint
     if need_exchange:
         grads[5] = -adjoint * after
-    return (*grads,) + (None,) * (7 + TOPOLOGY)
+    return (*grads,) + (None,) * (8 + TOPOLOGY)
 
 
-def _gradient(x: Tensor, nodes: Tensor, scale: float, topology: Any) -> Tensor:
-    """Σ_i ∇Φ_i u_i [P, D]."""
-    return torch.ops.torch_mpm.gather(x, nodes[:, None].contiguous(), scale, True, False, *topology)[1][:, 0]
-
-
-def _divergence(x: Tensor, flux: Tensor, scale: float, topology: Any) -> Tensor:
-    """Σ_p ∇Φ_i · q_p [N], the adjoint of `_gradient`."""
-    value = torch.zeros_like(flux[:, :1])
-    return torch.ops.torch_mpm.scatter(x, value, flux[:, None], None, scale, *topology)[:, 0]
-
-
-def _position_gradient(x: Tensor, flux: Tensor, nodes: Tensor, scale: float, topology: Any) -> Tensor:
-    """Derivative of Σ_p q_p · Σ_i ∇Φ_i u_i by the positions, at fixed q and u."""
-    value = torch.zeros_like(flux[:, :1])
-    return torch.ops.torch_mpm.position_gradient(
-        x, value, flux[:, None], None, nodes[:, None].contiguous(), scale, *topology
+def _operator_adjoint(
+    x: Tensor, conductance: Tensor, u: Tensor, v: Tensor, topology: Any, need_x: bool
+) -> tuple[Tensor | None, Tensor]:
+    """Derivatives of v · H u = Σ_p κ_p V_p ∇u · ∇v by the positions and by κ V."""
+    scale = inverse_inertia(topology[8], topology[5])
+    nodes = [w[:, None].contiguous() for w in (u, v)]
+    gradient = [torch.ops.torch_mpm.gather(x, w, scale, True, False, *topology)[1] for w in nodes]
+    by_conductance = (gradient[0] * gradient[1]).sum((1, 2))
+    if not need_x:
+        return None, by_conductance
+    value = torch.zeros_like(gradient[0][:, :, 0])
+    first, second = (
+        torch.ops.torch_mpm.position_gradient(x, value, conductance[:, None, None] * g, None, w, scale, *topology)
+        for g, w in zip(gradient, reversed(nodes), strict=True)
     )
+    return first + second, by_conductance
 
 
-torch.library.register_autograd("torch_mpm::heat_cg", _backward, setup_context=_setup)
-refuse_vmap("heat_cg")
+def _operator_setup(ctx: Any, inputs: Any, output: Any) -> None:
+    x, conductance, nodes, *topology = inputs
+    ctx.save_for_backward(x, conductance, nodes, *topology[:5])
+    ctx.geometry = topology[5:]
+
+
+def _operator_backward(ctx: Any, grad: Tensor) -> tuple[Any, ...]:
+    x, conductance, nodes, *topology = ctx.saved_tensors
+    topology = (*topology, *ctx.geometry)
+    if nodes is None:
+        raise NotImplementedError("the diagonal of heat_operator is not differentiable")
+    need_x, need_conductance, need_nodes = ctx.needs_input_grad[:3]
+    grad = grad.contiguous()
+    for_x = for_conductance = for_nodes = None
+    if need_x or need_conductance:
+        for_x, for_conductance = _operator_adjoint(x, conductance, nodes, grad, topology, need_x)
+    if need_nodes:
+        for_nodes = torch.ops.torch_mpm.heat_operator(x, conductance, grad, *topology)
+    return (for_x, for_conductance if need_conductance else None, for_nodes) + (None,) * TOPOLOGY
+
+
+for _name, _adjoint, _context in (
+    ("heat_cg", _backward, _setup),
+    ("heat_operator", _operator_backward, _operator_setup),
+):
+    torch.library.register_autograd(f"torch_mpm::{_name}", _adjoint, setup_context=_context)
+    refuse_vmap(_name)

@@ -109,7 +109,10 @@ def heat_cg(
         iterations = iterations + running.int()
         running = running & (residual > limit) & (iterations < most)
     # A closed scene keeps its energy: Σ M d = dt Σ h, whatever the solve left over.
-    open_to_outside = total((exchange != 0).to(x.dtype)) + zero.new_zeros(scenes).index_add(0, scene, held.to(x.dtype))
+    holding = held & ~(capacity <= 0) & (blocks.node_scene() >= 0)
+    open_to_outside = total((exchange != 0).to(x.dtype)) + zero.new_zeros(scenes).index_add(
+        0, scene, holding.to(x.dtype)
+    )
     missing = (dt * total(source) - total(mass * d)) / total(mass)
     shift = torch.where((open_to_outside == 0) & (iterations > 0), missing, 0)
     d = torch.where(free, d + shift[scene], 0)

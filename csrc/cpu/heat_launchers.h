@@ -1,0 +1,17 @@
+#pragma once
+
+#include "cpu/launchers.h"
+#include "heat/solve.h"
+
+namespace mpm::cpu {
+
+template <class T, int D>
+int64_t heat_workspace(const HeatArguments<T, D>&);
+template <int Order, class T, int D>
+void heat_cg(const HeatArguments<T, D>&, Stream);
+template <class T, int D>
+int64_t heat_operator_workspace(const HeatOperatorArguments<T, D>&);
+template <int Order, class T, int D>
+void heat_operator(const HeatOperatorArguments<T, D>&, Stream);
+
+}  // namespace mpm::cpu

@@ -1,0 +1,599 @@
+#pragma once
+
+#include <cooperative_groups.h>
+
+#include "cuda/heat_launchers.h"
+#include "cuda/home.cuh"
+#include "cuda/launch.cuh"
+#include "heat/cell.h"
+
+// The heat solve as one persistent kernel: all scenes advance together, phase by phase, with a barrier of the whole
+// grid between phases; a scene that is done takes no further work, and the kernel ends with the last one. The host is
+// never asked, and the kernel can be captured in a graph.
+//
+// H is applied by warps, one item of particles each. A lane takes a cell: it holds the nodes of the cell's support and
+// what the cell adds to them in registers, and walks the cell's particles. To that end the particles are packed once,
+// as distances from the base node and conductance, in the order in which the lanes read them.
+namespace mpm::cuda {
+
+namespace cg = cooperative_groups;
+
+constexpr int kHeatThreads = 128, kHeatWarps = kHeatThreads / 32;
+
+template <int Order_, class T_, int D_>
+struct HeatShape {
+  using T = T_;
+  static constexpr int Order = Order_, D = D_, support = Order + 1, nodes = kSupportNodes<Order, D>;
+  static constexpr int cells = kBlockNodes<D>;
+  static constexpr int slices = cells < 32 ? 32 / cells : 1;  // lanes that share the particles of a cell
+  static constexpr int parts = cells * slices / 32;           // of a block, one warp wide
+  static constexpr int width = kBlockWidth + Order, tile = D == 2 ? width * width : width * width * width;
+};
+
+template <class T, int D>
+struct alignas(16) PackedParticle {
+  T f[D], conductance;
+};
+
+// Memory of one warp.
+template <class S>
+union WarpMemory {
+  using T = typename S::T;
+  struct {
+    T u[S::tile], sum[S::tile];
+  } tile;
+  struct {
+    uint16_t cell[kItemParticles], rank[kItemParticles], order[kItemParticles];
+    int count[S::cells + 1], start[S::cells];
+  } sort;
+};
+
+template <class T, int D>
+struct PackedItems {
+  PackedParticle<T, D>* particles;  // [P]
+  uint16_t* counts;                 // [items, cells] particles of each cell
+};
+
+struct SceneRange {
+  int item, item_end, slot, slot_end;
+};
+
+// Work space in global memory.
+template <class T, int D>
+struct HeatWorkspace {
+  PackedItems<T, D> packed;
+  HeatVectors<T> v;
+  NodeSums* sums;          // [capacity] of each slot
+  double* item_curvature;  // [items] parts of p · A p
+  double* slot_curvature;  // [capacity]
+  HeatScene* scene;        // [scenes]
+  SceneRange* range;       // [scenes]
+  int* running;            // [1] scenes at work
+  int64_t size;            // in bytes
+
+  // `vectors` false: what the operator alone needs.
+  HeatWorkspace(const Topology<T, D>& t, void* memory, bool vectors) : size(0) {
+    char* const start = static_cast<char*>(memory);
+    const auto take = [&](int64_t bytes) {
+      char* p = start + size;
+      size += (bytes + 255) / 256 * 256;
+      return p;
+    };
+    const int64_t items = most_items(t.capacity, t.particles), nodes = t.capacity * int64_t(kBlockNodes<D>);
+    packed.particles = reinterpret_cast<PackedParticle<T, D>*>(take(t.particles * sizeof(PackedParticle<T, D>)));
+    packed.counts = reinterpret_cast<uint16_t*>(take(items * kBlockNodes<D> * sizeof(uint16_t)));
+    if (!vectors) return;
+    T** const all[] = {&v.mass, &v.weight, &v.inverse, &v.r, &v.p, &v.product};
+    for (T** vector : all) *vector = reinterpret_cast<T*>(take(nodes * sizeof(T)));
+    sums = reinterpret_cast<NodeSums*>(take(t.capacity * sizeof(NodeSums)));
+    item_curvature = reinterpret_cast<double*>(take(items * sizeof(double)));
+    slot_curvature = reinterpret_cast<double*>(take(t.capacity * sizeof(double)));
+    scene = reinterpret_cast<HeatScene*>(take(t.scenes * sizeof(HeatScene)));
+    range = reinterpret_cast<SceneRange*>(take(t.scenes * sizeof(SceneRange)));
+    running = reinterpret_cast<int*>(take(sizeof(int)));
+  }
+};
+
+__device__ inline int lane_index() { return threadIdx.x % 32; }
+
+// Calls begin(cell), each(particle) and end(cell) for the cells of an item, a warp's width of them at a time; load(at,
+// cell, rank) gives the particle that lies at `at` in the packed order. All lanes call begin and end.
+template <class S, class Counts, class Load, class Begin, class Each, class End>
+__device__ void walk_cells(const Counts& count, int at, const Load& load, const Begin& begin, const Each& each,
+                           const End& end) {
+  const int lane = lane_index(), slice = lane * S::slices / 32;
+  const unsigned before = (1u << lane) - 1;
+#pragma unroll 1
+  for (int part = 0; part < S::parts; part++) {
+    const int cell = part * 32 + lane % (32 / S::slices);
+    const int mine = (int(count(cell)) + S::slices - 1 - slice) / S::slices;
+    begin(cell);
+    bool has = mine > 0;
+    unsigned lanes = __ballot_sync(~0u, has);
+    decltype(load(0, 0, 0)) next;
+    if (has) next = load(at + __popc(lanes & before), cell, slice);
+#pragma unroll 1
+    for (int k = 1; lanes; k++) {
+      const auto now = next;
+      const bool had = has;
+      at += __popc(lanes);
+      has = mine > k;
+      lanes = __ballot_sync(~0u, has);
+      if (has) next = load(at + __popc(lanes & before), cell, k * S::slices + slice);
+      if (had) each(now);
+    }
+    end(cell);
+  }
+}
+
+// Sorts the particles of an item by cell, by the ranks of the index tensor, and packs them.
+template <class S, class T, int D>
+__device__ void pack_item(const Topology<T, D>& t, const Columns<const T, D>& x, const Columns<const T, 1>& conductance,
+                          const Item& item, int number, const PackedItems<T, D>& packed, WarpMemory<S>& memory) {
+  auto& m = memory.sort;
+  const int lane = lane_index(), n = item.end - item.begin, scene = scene_of(t, item.block);
+  __syncwarp();
+  for (int c = lane; c <= S::cells; c += 32) m.count[c] = 0;
+  __syncwarp();
+  for (int k = lane; k - lane < n; k += 32) {
+    int cell = -1, base[D];
+    T f[D];
+    if (k < n) {
+      const bool at_home =
+          locate_at_home<S::Order>(t, scene, item.block, read_vector(x, t.index[item.begin + k]), base, f);
+      cell = at_home ? node_in_block<D>(base) : S::cells;
+    }
+    const unsigned group = __match_any_sync(~0u, cell);
+    const int before = __popc(group & ((1u << lane) - 1)), counted = cell >= 0 ? m.count[cell] : 0;
+    __syncwarp();
+    if (cell >= 0) {
+      m.cell[k] = uint16_t(cell);
+      m.rank[k] = uint16_t(counted + before);
+      if (before == 0) m.count[cell] = counted + __popc(group);
+    }
+    __syncwarp();
+  }
+  int total = 0;
+  for (int first = 0; first < S::cells; first += 32) {
+    const int own = first + lane < S::cells ? m.count[first + lane] : 0;
+    int sum = own;
+    for (int o = 1; o < 32; o *= 2) {
+      const int v = __shfl_up_sync(~0u, sum, o);
+      if (lane >= o) sum += v;
+    }
+    if (first + lane < S::cells) {
+      m.start[first + lane] = total + sum - own;
+      packed.counts[int64_t(number) * S::cells + first + lane] = uint16_t(own);
+    }
+    total += __shfl_sync(~0u, sum, 31);
+  }
+  __syncwarp();
+  for (int k = lane; k < n; k += 32)
+    if (m.cell[k] < S::cells) m.order[m.start[m.cell[k]] + m.rank[k]] = uint16_t(k);
+  __syncwarp();
+  const auto nothing = [](int) {};
+  struct Place {
+    int at, particle;
+  };
+  walk_cells<S>(
+      [&](int cell) { return m.count[cell]; }, item.begin,
+      [&](int at, int cell, int rank) { return Place{at, t.index[item.begin + m.order[m.start[cell] + rank]]}; },
+      nothing,
+      [&](const Place& place) {
+        int base[D];
+        PackedParticle<T, D> q;
+        locate_at_home<S::Order>(t, scene, item.block, read_vector(x, place.particle), base, q.f);
+        q.conductance = scaled_conductance<S::Order>(conductance.at(place.particle), t.geometry.inverse_dx);
+        packed.particles[place.at] = q;
+      },
+      nothing);
+  __syncwarp();
+}
+
+// visit(tile entry, node row), for the nodes of a home's tile that have a row.
+template <class S, class T, int D, class Visit>
+__device__ void for_tile(const Topology<T, D>& t, int slot, const Visit& visit) {
+  const int lane = lane_index();
+  const int* const neighbours = schedule_of(t).neighbours + (int64_t(slot) << D);
+  const int slots = lane < 1 << D ? neighbours[lane] : -1;
+#pragma unroll 1
+  for (int first = 0; first < S::tile; first += 32) {
+    const int i = first + lane;
+    int node[D], neighbour = 0;
+#pragma unroll
+    for (int axis = D - 1, rest = i; axis >= 0; axis--) {
+      node[axis] = rest % S::width;
+      neighbour |= (node[axis] >= kBlockWidth) << (D - 1 - axis);
+      rest /= S::width;
+    }
+    const int row = __shfl_sync(~0u, slots, neighbour % (1 << D));
+    if (i < S::tile) visit(i, row < 0 ? int64_t(-1) : int64_t(row) * kBlockNodes<D> + node_in_block<D>(node));
+  }
+  __syncwarp();
+}
+
+template <class S, class F>
+__device__ void for_support(int cell, const F& f) {
+  constexpr int width = S::width, support = S::support;
+  const int z = cell % kBlockWidth, y = cell / kBlockWidth % kBlockWidth, x = cell / (kBlockWidth * kBlockWidth);
+  const int corner = ((S::D == 3 ? x * width : 0) + y) * width + z;
+#pragma unroll
+  for (int i = 0; i < (S::D == 3 ? support : 1); i++)
+#pragma unroll
+    for (int j = 0; j < support; j++)
+#pragma unroll
+      for (int k = 0; k < support; k++) f((i * support + j) * support + k, corner + (i * width + j) * width + k);
+}
+
+// Adds a sum over the packed particles of the items [number, end), which are of one home, to the nodes; returns Σ κ V
+// |∇u|², the same in all lanes.
+template <HeatSum Sum, class S, class T, int D>
+__device__ T sum_items(const Topology<T, D>& t, const PackedItems<T, D>& packed, int number, int end, const T* u,
+                       T* out, bool in_order, WarpMemory<S>& memory) {
+  auto& m = memory.tile;
+  const Item* const items = reinterpret_cast<const Item*>(schedule_of(t).items);
+  const int slot = items[number].slot, lane = lane_index();
+  __syncwarp();
+  for_tile<S>(t, slot, [&](int i, int64_t row) {
+    if (Sum == HeatSum::product) m.u[i] = row < 0 ? T(0) : u[row];
+    m.sum[i] = T(0);
+  });
+  T from[S::nodes], to[S::nodes], power = T(0);
+#pragma unroll 1
+  for (; number < end; number++) {
+    const uint16_t* const counts = packed.counts + int64_t(number) * S::cells;
+    walk_cells<S>([&](int cell) { return counts[cell]; }, items[number].begin,
+                  [&](int at, int, int) { return packed.particles[at]; },
+                  [&](int cell) {
+                    for_support<S>(cell, [&](int k, int i) {
+                      if (Sum == HeatSum::product) from[k] = m.u[i];
+                      to[k] = T(0);
+                    });
+                  },
+                  [&](const PackedParticle<T, D>& q) {
+                    power += add_particle<Sum, S::Order, T, D>(q.f, q.conductance, from, to);
+                  },
+                  [&](int cell) {
+                    // One node of every cell at a time: they differ, so nothing is added twice at once.
+                    for_support<S>(cell, [&](int k, int i) {
+                      T value = to[k];
+#pragma unroll
+                      for (int o = S::slices / 2; o > 0; o /= 2)
+                        value += __shfl_xor_sync(~0u, value, o * 32 / S::slices);
+                      if (S::slices == 1 || lane < 32 / S::slices) m.sum[i] += value;
+                      __syncwarp();
+                    });
+                  });
+  }
+  for_tile<S>(t, slot, [&](int i, int64_t row) {
+    const T value = m.sum[i];
+    if (row < 0 || value == T(0)) return;
+    if (in_order)
+      out[row] += value;
+    else
+      atomicAdd(out + row, value);
+  });
+#pragma unroll
+  for (int o = 16; o > 0; o /= 2) power += __shfl_xor_sync(~0u, power, o);
+  return power;
+}
+
+template <class T, int D>
+__device__ int colour_of_home(const Topology<T, D>& t, int home) {
+  int block[D], colour = 0;
+  block_coordinates(t.geometry, home, block);
+#pragma unroll
+  for (int i = 0; i < D; i++) colour = colour * 2 + (block[i] & 1);
+  return colour;
+}
+
+// f(first item, end) for the items of this warp; for a colour >= 0, the homes of that colour, whole.
+template <class T, int D, class F>
+__device__ void for_items(const Topology<T, D>& t, int colour, const F& f) {
+  const Schedule<const int> schedule = schedule_of(t);
+  const Item* const items = reinterpret_cast<const Item*>(schedule.items);
+  const int count = *schedule.item_count, warps = gridDim.x * kHeatWarps;
+#pragma unroll 1
+  for (int i = blockIdx.x + threadIdx.x / 32 * gridDim.x; i < count; i += warps) {
+    int end = i + 1;
+    if (colour >= 0) {
+      if (colour_of_home(t, items[i].block) != colour || items[i].begin != t.offsets[items[i].slot]) continue;
+      while (end < count && items[end].slot == items[i].slot) end++;
+    }
+    f(i, end);
+  }
+}
+
+template <int Order, class T, int D>
+struct HeatKernel {
+  using S = HeatShape<Order, T, D>;
+  HeatArguments<T, D> a;
+  HeatWorkspace<T, D> w;
+  Columns<const T, D> x;
+  Columns<const T, 1> conductance;
+
+  explicit HeatKernel(const HeatArguments<T, D>& a)
+      : a(a), w(a.topology, a.workspace, true), x(a.x), conductance(a.conductance) {}
+
+  __device__ int scene_of_slot(int slot) const {
+    const int block = a.topology.block[slot], scene = block / a.topology.geometry.blocks_per_scene;
+    return block < 0 || scene >= a.topology.scenes ? -1 : scene;
+  }
+  __device__ bool running(int scene) const { return scene >= 0 && w.scene[scene].running; }
+
+  // Items and slots of a scene: both are in the order of the block table.
+  __device__ SceneRange range_of(int scene) const {
+    const Topology<T, D>& t = a.topology;
+    const Schedule<const int> schedule = schedule_of(t);
+    const Item* const items = reinterpret_cast<const Item*>(schedule.items);
+    const auto first = [](int count, const auto& below) {
+      int low = 0;
+      while (low < count) {
+        const int middle = (low + count) / 2;
+        if (below(middle))
+          low = middle + 1;
+        else
+          count = middle;
+      }
+      return low;
+    };
+    const auto item = [&](int s) {
+      return first(*schedule.item_count, [&](int i) { return scene_of(t, items[i].block) < s; });
+    };
+    const auto slot = [&](int s) {
+      return first(t.capacity, [&](int i) { return t.block[i] >= 0 && scene_of(t, t.block[i]) < s; });
+    };
+    return {item(scene), item(scene + 1), slot(scene), slot(scene + 1)};
+  }
+
+  // f(slot, scene, first node) by one warp per slot.
+  template <class F>
+  __device__ void for_slots(const F& f) const {
+    const int warps = gridDim.x * kHeatWarps;
+    for (int slot = blockIdx.x + threadIdx.x / 32 * gridDim.x; slot < a.topology.capacity; slot += warps)
+      f(slot, scene_of_slot(slot), int64_t(slot) * kBlockNodes<D>);
+  }
+  // f(scene) by one block of threads per scene.
+  template <class F>
+  __device__ void for_scenes(const F& f) const {
+    for (int scene = blockIdx.x; scene < a.topology.scenes; scene += gridDim.x) f(scene);
+  }
+
+  template <HeatSum Sum, class Wanted, class Finish>
+  __device__ void sum_to(const T* u, T* out, WarpMemory<S>& memory, const Wanted& wanted, const Finish& finish) const {
+    const Item* const items = reinterpret_cast<const Item*>(schedule_of(a.topology).items);
+    for (int colour = a.deterministic ? 0 : -1; colour < (a.deterministic ? 1 << D : 0); colour++) {
+      for_items(a.topology, colour, [&](int number, int end) {
+        if (!wanted(scene_of(a.topology, items[number].block))) return;
+        const T power = sum_items<Sum, S>(a.topology, w.packed, number, end, u, out, a.deterministic, memory);
+        finish(number, end, power);
+      });
+      if (a.deterministic) cg::this_grid().sync();
+    }
+  }
+
+  __device__ void start(WarpMemory<S>& memory) const;
+  __device__ void iterate(WarpMemory<S>& memory) const;
+  __device__ void finish() const;
+};
+
+__device__ inline NodeSums sum_of_warp(NodeSums s) {
+#pragma unroll
+  for (int o = 16; o > 0; o /= 2) {
+    NodeSums other;
+    other.heat = __shfl_xor_sync(~0u, s.heat, o);
+    other.residual = __shfl_xor_sync(~0u, s.residual, o);
+    other.preconditioned = __shfl_xor_sync(~0u, s.preconditioned, o);
+    other.source = __shfl_xor_sync(~0u, s.source, o);
+    other.open = __shfl_xor_sync(~0u, s.open, o);
+    other.bound = __shfl_xor_sync(~0u, s.bound, o);
+    other.spread = __shfl_xor_sync(~0u, s.spread, o);
+    s.add(other);
+  }
+  return s;
+}
+
+__device__ inline double sum_of_warp(double s) {
+#pragma unroll
+  for (int o = 16; o > 0; o /= 2) s += __shfl_xor_sync(~0u, s, o);
+  return s;
+}
+
+__device__ inline void add_to(NodeSums& a, const NodeSums& b) { a.add(b); }
+__device__ inline void add_to(double& a, double b) { a += b; }
+
+// Sum over the threads of a block, in a fixed order; valid in thread 0.
+template <class V>
+__device__ V sum_of_block(V value) {
+  __shared__ V parts[kHeatWarps];
+  value = sum_of_warp(value);
+  __syncthreads();
+  if (threadIdx.x % 32 == 0) parts[threadIdx.x / 32] = value;
+  __syncthreads();
+  if (threadIdx.x == 0)
+    for (int k = 1; k < kHeatWarps; k++) add_to(value, parts[k]);
+  return value;
+}
+
+template <int Order, class T, int D>
+__device__ void HeatKernel<Order, T, D>::start(WarpMemory<S>& memory) const {
+  const Topology<T, D>& t = a.topology;
+  const int64_t threads = int64_t(gridDim.x) * kHeatThreads, thread = int64_t(blockIdx.x) * kHeatThreads + threadIdx.x;
+  const auto all = [](int) { return true; };
+  const auto nothing = [](int, int, T) {};
+  for (int64_t i = thread; i < int64_t(t.capacity) * kBlockNodes<D>; i += threads)
+    w.v.product[i] = w.v.inverse[i] = w.v.weight[i] = T(0);
+  for (int64_t scene = thread; scene < t.scenes; scene += threads) w.range[scene] = range_of(int(scene));
+  if (thread == 0) *w.running = 0;
+  const Item* const items = reinterpret_cast<const Item*>(schedule_of(t).items);
+  for_items(t, -1, [&](int i, int) { pack_item<S>(t, x, conductance, items[i], i, w.packed, memory); });
+  cg::this_grid().sync();
+  if (a.theta) sum_to<HeatSum::product>(a.theta, w.v.product, memory, all, nothing);
+  if (a.method == HeatMethod::chebyshev)
+    sum_to<HeatSum::bound>(nullptr, w.v.weight, memory, all, nothing);
+  else
+    sum_to<HeatSum::diagonal>(nullptr, w.v.inverse, memory, all, nothing);
+  cg::this_grid().sync();
+  for_slots([&](int slot, int scene, int64_t first) {
+    NodeSums sums = NodeSums::zero();
+    const double dt = scene < 0 ? 1 : step_of_scene(a, scene);
+    for (int n = lane_index(); n < kBlockNodes<D>; n += 32) sums.add(start_node(a, w.v, first + n, dt, scene >= 0));
+    sums = sum_of_warp(sums);
+    if (lane_index() == 0) w.sums[slot] = sums;
+  });
+  cg::this_grid().sync();
+  for_scenes([&](int scene) {
+    NodeSums sums = NodeSums::zero();
+    for (int slot = w.range[scene].slot + threadIdx.x; slot < w.range[scene].slot_end; slot += kHeatThreads)
+      sums.add(w.sums[slot]);
+    sums = sum_of_block(sums);
+    if (threadIdx.x > 0) return;
+    const HeatScene s = start_scene(a, scene, sums);
+    w.scene[scene] = s;
+    if (s.running) atomicAdd(w.running, 1);
+  });
+  cg::this_grid().sync();
+}
+
+template <int Order, class T, int D>
+__device__ void HeatKernel<Order, T, D>::iterate(WarpMemory<S>& memory) const {
+  for_slots([&](int slot, int scene, int64_t first) {
+    if (!running(scene)) return;
+    const T beta = T(w.scene[scene].beta), gamma = T(w.scene[scene].gamma);
+    T weighted = T(0);
+    for (int n = lane_index(); n < kBlockNodes<D>; n += 32) weighted += direct_node(w.v, first + n, beta, gamma);
+    const double sum = sum_of_warp(double(weighted));
+    if (lane_index() == 0) w.slot_curvature[slot] = sum;
+  });
+  cg::this_grid().sync();
+  sum_to<HeatSum::product>(
+      w.v.p, w.v.product, memory, [&](int scene) { return running(scene); },
+      [&](int number, int end, T power) {
+        for (int i = number + lane_index(); i < end; i += 32) w.item_curvature[i] = i == number ? double(power) : 0;
+      });
+  cg::this_grid().sync();
+  if (a.method == HeatMethod::conjugate_gradients) {
+    for_scenes([&](int scene) {
+      if (!running(scene)) return;
+      const SceneRange range = w.range[scene];
+      double sum = 0;
+      for (int i = range.item + threadIdx.x; i < range.item_end; i += kHeatThreads) sum += w.item_curvature[i];
+      for (int i = range.slot + threadIdx.x; i < range.slot_end; i += kHeatThreads) sum += w.slot_curvature[i];
+      sum = sum_of_block(sum);
+      if (threadIdx.x > 0) return;
+      set_step(w.scene[scene], sum);
+      if (!w.scene[scene].running) atomicSub(w.running, 1);
+    });
+    cg::this_grid().sync();
+  }
+  for_slots([&](int slot, int scene, int64_t first) {
+    if (!running(scene)) return;
+    const HeatScene& s = w.scene[scene];
+    const T alpha = T(s.alpha);
+    NodeSums sums = NodeSums::zero();
+    for (int n = lane_index(); n < kBlockNodes<D>; n += 32) sums.add(update_node(w.v, a.increment, first + n, alpha));
+    if (!wants_sums(s, a.method)) return;
+    sums = sum_of_warp(sums);
+    if (lane_index() == 0) w.sums[slot] = sums;
+  });
+  cg::this_grid().sync();
+  for_scenes([&](int scene) {
+    if (!running(scene)) return;
+    NodeSums sums = NodeSums::zero();
+    if (wants_sums(w.scene[scene], a.method)) {
+      for (int slot = w.range[scene].slot + threadIdx.x; slot < w.range[scene].slot_end; slot += kHeatThreads)
+        sums.add(w.sums[slot]);
+      sums = sum_of_block(sums);
+    }
+    __syncthreads();  // all have read the scene
+    if (threadIdx.x > 0) return;
+    finish_iteration(w.scene[scene], a.method, sums);
+    if (!w.scene[scene].running) atomicSub(w.running, 1);
+  });
+  cg::this_grid().sync();
+}
+
+template <int Order, class T, int D>
+__device__ void HeatKernel<Order, T, D>::finish() const {
+  for_slots([&](int, int scene, int64_t first) {
+    if (scene < 0) return;
+    const T shift = T(energy_shift(w.scene[scene]));
+    for (int n = lane_index(); n < kBlockNodes<D>; n += 32)
+      if (w.v.mass[first + n] != T(0)) a.increment[first + n] += shift;
+  });
+  for (int scene = blockIdx.x * kHeatThreads + threadIdx.x; scene < a.topology.scenes;
+       scene += gridDim.x * kHeatThreads)
+    report_scene(a, scene, w.scene[scene]);
+}
+
+template <int Order, class T, int D>
+__global__ void __launch_bounds__(kHeatThreads) heat_kernel(const HeatKernel<Order, T, D> kernel) {
+  __shared__ WarpMemory<HeatShape<Order, T, D>> memory[kHeatWarps];
+  WarpMemory<HeatShape<Order, T, D>>& own = memory[threadIdx.x / 32];
+  kernel.start(own);
+  while (*static_cast<volatile int*>(kernel.w.running) > 0) kernel.iterate(own);
+  kernel.finish();
+}
+
+// H u or the diagonal; colour as in `for_items`. The first launch packs the particles.
+template <int Order, class T, int D>
+__global__ void __launch_bounds__(kHeatThreads)
+    operator_kernel(const HeatOperatorArguments<T, D> a, const PackedItems<T, D> packed, const Columns<const T, D> x,
+                    const Columns<const T, 1> conductance, int colour) {
+  using S = HeatShape<Order, T, D>;
+  __shared__ WarpMemory<S> memory[kHeatWarps];
+  WarpMemory<S>& own = memory[threadIdx.x / 32];
+  const Item* const items = reinterpret_cast<const Item*>(schedule_of(a.topology).items);
+  for_items(a.topology, colour, [&](int number, int end) {
+    for (int i = number; i < end; i++) pack_item<S>(a.topology, x, conductance, items[i], i, packed, own);
+    if (a.nodes)
+      sum_items<HeatSum::product, S>(a.topology, packed, number, end, a.nodes, a.sum, colour >= 0, own);
+    else
+      sum_items<HeatSum::diagonal, S>(a.topology, packed, number, end, a.nodes, a.sum, colour >= 0, own);
+  });
+}
+
+template <int Order, class T, int D>
+void heat_cg(const HeatArguments<T, D>& a, Stream stream) {
+  const Topology<T, D>& t = a.topology;
+  HeatKernel<Order, T, D> kernel(a);
+  int device = 0, processors = 0, resident = 0;
+  check(cudaGetDevice(&device));
+  check(cudaDeviceGetAttribute(&processors, cudaDevAttrMultiProcessorCount, device));
+  check(cudaOccupancyMaxActiveBlocksPerMultiprocessor(&resident, heat_kernel<Order, T, D>, kHeatThreads, 0));
+  const int64_t wanted = std::max<int64_t>(most_items(t.capacity, t.particles), t.capacity) / kHeatWarps + 1;
+  const unsigned blocks =
+      unsigned(std::min<int64_t>(std::max<int64_t>(wanted, t.scenes), int64_t(processors) * resident));
+  void* arguments[] = {&kernel};
+  check(cudaLaunchCooperativeKernel(heat_kernel<Order, T, D>, blocks, kHeatThreads, arguments, 0, stream));
+}
+
+template <int Order, class T, int D>
+void heat_operator(const HeatOperatorArguments<T, D>& a, Stream stream) {
+  const int64_t items = most_items(a.topology.capacity, a.topology.particles);
+  if (items == 0) return;
+  const HeatWorkspace<T, D> w(a.topology, a.workspace, false);
+  for (int colour = a.deterministic ? 0 : -1; colour < (a.deterministic ? 1 << D : 0); colour++)
+    launch(operator_kernel<Order, T, D>, grid_size(items / kHeatWarps + 1), kHeatThreads, 0, stream, a, w.packed,
+           Columns<const T, D>(a.x), Columns<const T, 1>(a.conductance), colour);
+}
+
+template <class T, int D>
+int64_t heat_workspace(const HeatArguments<T, D>& a) {
+  return HeatWorkspace<T, D>(a.topology, nullptr, true).size;
+}
+template <class T, int D>
+int64_t heat_operator_workspace(const HeatOperatorArguments<T, D>& a) {
+  return HeatWorkspace<T, D>(a.topology, nullptr, false).size;
+}
+
+#define INSTANTIATE_HEAT(T, D)                                                  \
+  template int64_t heat_workspace(const HeatArguments<T, D>&);                  \
+  template int64_t heat_operator_workspace(const HeatOperatorArguments<T, D>&); \
+  INSTANTIATE_HEAT_ORDER(2, T, D)                                               \
+  INSTANTIATE_HEAT_ORDER(3, T, D)
+#define INSTANTIATE_HEAT_ORDER(Order, T, D)                               \
+  template void heat_cg<Order, T, D>(const HeatArguments<T, D>&, Stream); \
+  template void heat_operator<Order, T, D>(const HeatOperatorArguments<T, D>&, Stream);
+
+}  // namespace mpm::cuda

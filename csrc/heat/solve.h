@@ -1,0 +1,244 @@
+#pragma once
+
+#include <cmath>
+
+#include "transfer/arguments.h"
+
+// The iteration of the implicit heat step (M/dt + H + X) d = h − (H + X) θ: what happens at a node and what is decided
+// for a scene. The shells of csrc/cpu and csrc/cuda loop over nodes, sum over scenes and apply H.
+//
+// Both methods move along p: d += α p, r −= α A p, p = γ z + β p with z = inverse · r. Conjugate gradients divide by
+// the exact diagonal; Chebyshev iteration (Saad 2003, algorithm 12.1) divides by M/dt + X, where the spectrum lies
+// between 1 and 1 + c, c the largest K_i / (M_i/dt + X_i), and needs no scalar products.
+namespace mpm {
+
+enum class HeatMethod { conjugate_gradients, chebyshev };
+
+template <class T, int D>
+struct HeatArguments {
+  Topology<T, D> topology;
+  Field<const T> x, conductance;       // conductance κ V [P]
+  const T* capacity = nullptr;         // [N], as those below
+  const T* theta = nullptr;            // absent: zero
+  const T* source = nullptr;           // absent: zero
+  const T* exchange = nullptr;         // absent: zero
+  const bool* fixed = nullptr;         // absent: none
+  double dt = 0;                       // times scene_dt where given
+  const T* scene_dt = nullptr;         // [scenes]
+  double tolerance = 0;                // replaced by scene_tolerance where given
+  const T* scene_tolerance = nullptr;  // [scenes]
+  double relative_tolerance = 0;       // of the first residual
+  int most = 0;                        // iterations, replaced by scene_most where given
+  const int* scene_most = nullptr;     // [scenes]
+  HeatMethod method = HeatMethod::conjugate_gradients;
+  bool deterministic = false;
+  T* increment = nullptr;     // [N]
+  int* iterations = nullptr;  // [scenes], as those below
+  T* residual = nullptr;
+  bool* converged = nullptr;
+  void* workspace = nullptr;  // bytes asked for by heat_workspace()
+};
+
+// H u, or the diagonal of H where u is absent.
+template <class T, int D>
+struct HeatOperatorArguments {
+  Topology<T, D> topology;
+  Field<const T> x, conductance;
+  const T* nodes = nullptr;  // u [N]
+  bool deterministic = false;
+  T* sum = nullptr;           // [N], zero on entry
+  void* workspace = nullptr;  // bytes asked for by heat_operator_workspace()
+};
+
+// Work space of a solve, [N] each.
+template <class T>
+struct HeatVectors {
+  T* mass;     // M, 0 on nodes that are not solved for
+  T* weight;   // M/dt + X; K before the start
+  T* inverse;  // of the diagonal, see above; H_ii before the start
+  T* r;
+  T* p;
+  T* product;  // H p, zero between the iterations; H θ before the start
+};
+
+// Sums over nodes.
+struct NodeSums {
+  double heat;            // Σ M at the start, Σ M d later
+  double residual;        // Σ r²/M
+  double preconditioned;  // Σ r z
+  double source;          // Σ h
+  double open;            // nodes through which heat leaves
+  double bound;           // largest K / (M/dt + X)
+  double spread;          // largest (M/dt + X) / (M/dt)
+
+  MPM_HD static NodeSums zero() { return {0, 0, 0, 0, 0, 0, 0}; }
+  MPM_HD void add(const NodeSums& o) {
+    heat += o.heat;
+    residual += o.residual;
+    preconditioned += o.preconditioned;
+    source += o.source;
+    open += o.open;
+    if (!(o.bound <= bound)) bound = o.bound;  // NaN stays
+    if (!(o.spread <= spread)) spread = o.spread;
+  }
+};
+
+struct HeatScene {
+  double dt, mass, source, heat, tolerance, residual, preconditioned, bound, spread, rho;
+  double alpha, beta, gamma;
+  int iterations, most;
+  bool running, closed, converged;
+};
+
+inline namespace TORCH_MPM_ISA {
+
+template <class T, int D>
+MPM_HD double step_of_scene(const HeatArguments<T, D>& a, int scene) {
+  return a.scene_dt ? a.dt * double(a.scene_dt[scene]) : a.dt;
+}
+
+// First right side, with increment zero. `used` is false for rows of unused blocks.
+template <class T, int D>
+MPM_HD NodeSums start_node(const HeatArguments<T, D>& a, const HeatVectors<T>& v, int64_t i, double dt, bool used) {
+  const T mass = used ? a.capacity[i] : T(0), exchange = a.exchange && used ? a.exchange[i] : T(0);
+  const T source = a.source && used ? a.source[i] : T(0);
+  const bool material = used && !(mass <= T(0)), held = material && a.fixed && a.fixed[i], free = material && !held;
+  NodeSums sums = NodeSums::zero();
+  const T product = v.product[i], diagonal = v.inverse[i], bound = v.weight[i];
+  v.p[i] = v.product[i] = a.increment[i] = v.mass[i] = v.weight[i] = v.inverse[i] = v.r[i] = T(0);
+  sums.open = held || (free && exchange != T(0));
+  if (!free) return sums;
+  const T weight = mass / T(dt) + exchange;
+  const T inverse = T(1) / (a.method == HeatMethod::chebyshev ? weight : weight + diagonal);
+  T r = source - product;
+  if (a.theta) r -= exchange * a.theta[i];
+  v.mass[i] = mass;
+  v.weight[i] = weight;
+  v.inverse[i] = inverse;
+  v.r[i] = r;
+  sums.heat = mass;
+  sums.residual = r * (r / mass);
+  sums.preconditioned = r * (r * inverse);
+  sums.source = source;
+  sums.bound = bound / weight;
+  sums.spread = dt * weight / mass;
+  return sums;
+}
+
+// The next direction; returns the part of p · A p without H.
+template <class T>
+MPM_HD T direct_node(const HeatVectors<T>& v, int64_t i, T beta, T gamma) {
+  T p = gamma * (v.inverse[i] * v.r[i]);
+  if (beta != T(0)) p += beta * v.p[i];
+  v.p[i] = p;
+  return v.weight[i] * p * p;
+}
+
+// A step along the direction.
+template <class T>
+MPM_HD NodeSums update_node(const HeatVectors<T>& v, T* increment, int64_t i, T alpha) {
+  const T mass = v.mass[i], p = v.p[i], product = v.product[i] + v.weight[i] * p;
+  v.product[i] = T(0);
+  NodeSums sums = NodeSums::zero();
+  if (mass == T(0)) return sums;
+  const T d = increment[i] + alpha * p, r = v.r[i] - alpha * product;
+  increment[i] = d;
+  v.r[i] = r;
+  sums.heat = mass * d;
+  sums.residual = r * (r / mass);
+  sums.preconditioned = r * (r * v.inverse[i]);
+  return sums;
+}
+
+// dt std::sqrt(Σ r²/M / Σ M), which bounds the mass-weighted RMS error [K].
+MPM_HD double residual_in_kelvin(const HeatScene& s, double residual) {
+  return s.mass == 0 ? 0 : s.dt * std::sqrt(residual / s.mass);
+}
+
+MPM_HD void direct_chebyshev(HeatScene& s) {
+  const double center = 1 + s.bound / 2, half = s.bound / 2;
+  if (s.iterations == 0) {
+    s.rho = half / center;
+    s.beta = 0;
+    s.gamma = 1 / center;
+  } else {
+    const double gamma = 2 / (2 * center - s.rho * half), rho = gamma * half / 2;
+    s.beta = rho * s.rho;
+    s.gamma = gamma;
+    s.rho = rho;
+  }
+}
+
+// Iterations after which the Chebyshev polynomial has brought the residual below the tolerance.
+MPM_HD int chebyshev_count(const HeatScene& s) {
+  const double reduction =
+      s.residual / s.tolerance * std::sqrt(s.spread);  // the polynomial's norm weighs with M/dt + X
+  const double count = std::ceil(std::acosh(reduction) / std::acosh(1 + 2 / s.bound));
+  return count >= s.most ? s.most : count > 1 ? int(count) : 1;
+}
+
+template <class T, int D>
+MPM_HD HeatScene start_scene(const HeatArguments<T, D>& a, int scene, const NodeSums& sums) {
+  HeatScene s{};
+  s.dt = step_of_scene(a, scene);
+  s.mass = sums.heat;
+  s.source = sums.source;
+  s.preconditioned = sums.preconditioned;
+  s.bound = sums.bound;
+  s.spread = sums.spread;
+  s.closed = sums.open == 0;
+  const bool valid = s.dt > 0;
+  s.residual = valid ? residual_in_kelvin(s, sums.residual) : std::nan("");
+  const double tolerance = a.scene_tolerance ? double(a.scene_tolerance[scene]) : a.tolerance;
+  const double relative = a.relative_tolerance * s.residual;
+  s.tolerance = relative > tolerance ? relative : tolerance;
+  s.most = a.scene_most ? a.scene_most[scene] : a.most;
+  s.running = s.residual > s.tolerance && s.residual < HUGE_VAL && s.most > 0;
+  s.converged = s.residual <= s.tolerance;
+  s.alpha = s.gamma = 1;
+  if (a.method == HeatMethod::chebyshev && s.running) {
+    s.most = chebyshev_count(s);
+    direct_chebyshev(s);
+  }
+  return s;
+}
+
+// Step length of conjugate gradients. Without curvature there is nothing left to gain, or the matrix is not positive.
+MPM_HD void set_step(HeatScene& s, double curvature) {
+  s.running = curvature > 0;
+  s.alpha = s.running ? s.preconditioned / curvature : 0;
+}
+
+// Whether the sums after an iteration are needed.
+MPM_HD bool wants_sums(const HeatScene& s, HeatMethod method) {
+  return method != HeatMethod::chebyshev || s.iterations + 1 >= s.most;
+}
+
+MPM_HD void finish_iteration(HeatScene& s, HeatMethod method, const NodeSums& sums) {
+  const bool known = wants_sums(s, method);
+  s.iterations++;
+  if (known) {
+    s.residual = residual_in_kelvin(s, sums.residual);
+    s.heat = sums.heat;
+    s.converged = s.residual <= s.tolerance;
+    s.running = s.residual > s.tolerance && s.iterations < s.most;
+  }
+  if (method == HeatMethod::chebyshev) return direct_chebyshev(s);
+  s.beta = sums.preconditioned / s.preconditioned;
+  s.preconditioned = sums.preconditioned;
+}
+
+// A closed scene keeps its energy, Σ M d = dt Σ h, whatever the solve left over.
+MPM_HD double energy_shift(const HeatScene& s) {
+  return s.closed && s.iterations > 0 ? (s.dt * s.source - s.heat) / s.mass : 0;
+}
+
+template <class T, int D>
+MPM_HD void report_scene(const HeatArguments<T, D>& a, int scene, const HeatScene& s) {
+  a.iterations[scene] = s.iterations;
+  a.residual[scene] = T(s.residual);
+  a.converged[scene] = s.converged;
+}
+
+}  // namespace TORCH_MPM_ISA
+}  // namespace mpm

@@ -1,0 +1,129 @@
+#include "ops/backend.h"
+
+#if MPM_BACKEND == MPM_BACKEND_IS_cpu
+#include "cpu/heat_launchers.h"
+#else
+#include "cuda/heat_launchers.h"
+#endif
+
+// The implicit heat step on the nodes, and its operator alone.
+namespace mpm {
+namespace {
+
+// Values per node or per scene, packed.
+template <class T>
+class Values {
+ public:
+  Values(const OptionalTensor& t, const char* name, const Tensor& x, ScalarType type, int64_t size) {
+    if (!has(t)) return;
+    check_shape(*t, name, {size});
+    STD_TORCH_CHECK(t->scalar_type() == type && t->device() == x.device(), name,
+                    " has an unexpected dtype or is not on the device of x");
+    packed_ = *t;
+    if (size > 1 && t->stride(0) != 1) {
+      packed_ = torch::stable::new_empty(*t, Shape{size});
+      torch::stable::copy_(packed_, *t);
+    }
+    pointer = static_cast<const T*>(packed_.data_ptr());
+  }
+  const T* pointer = nullptr;
+
+ private:
+  Tensor packed_;
+};
+
+std::tuple<Tensor, Tensor, Tensor, Tensor> heat_cg(const Tensor& x, const Tensor& conductance, const Tensor& capacity,
+                                                   const OptionalTensor& theta, const OptionalTensor& source,
+                                                   const OptionalTensor& exchange, const OptionalTensor& fixed,
+                                                   const OptionalTensor& scene_dt, double dt,
+                                                   const OptionalTensor& scene_tolerance, double tolerance,
+                                                   double relative_tolerance, const OptionalTensor& scene_most,
+                                                   int64_t max_iterations, int64_t method, double /*adjoint_tolerance*/,
+                                                   MPM_TOPOLOGY_PARAMETERS) {
+  check_rank(block, "block", 1);
+  check_rank(x, "x", 2);
+  STD_TORCH_CHECK(method == 0 || method == 1, "method must be 0 (conjugate gradients) or 1 (Chebyshev)");
+  Tensor increment, iterations, residual, converged;
+  const DeviceScope device(x);
+  dispatch(x, order, [&]<class T, int D, int Order>() {
+    HeatArguments<T, D> a;
+    a.topology = topology<T, D>(x, MPM_TOPOLOGY_ARGUMENTS);
+    const int64_t N = node_count<D>(block), scenes = a.topology.scenes;
+    a.x = input<T>(x, "x", x, {x.size(0), D});
+    a.conductance = input<T>(conductance, "conductance", x, {x.size(0)});
+    const ScalarType type = x.scalar_type();
+    const Values<T> M(capacity, "capacity", x, type, N), u(theta, "theta", x, type, N), h(source, "source", x, type, N),
+        X(exchange, "exchange", x, type, N), steps(scene_dt, "scene_dt", x, type, scenes),
+        limit(scene_tolerance, "scene_tolerance", x, type, scenes);
+    const Values<bool> held(fixed, "fixed", x, ScalarType::Bool, N);
+    const Values<int> most(scene_most, "scene_max_iterations", x, ScalarType::Int, scenes);
+    a.capacity = M.pointer;
+    a.theta = u.pointer;
+    a.source = h.pointer;
+    a.exchange = X.pointer;
+    a.fixed = held.pointer;
+    a.dt = dt;
+    a.scene_dt = steps.pointer;
+    a.tolerance = tolerance;
+    a.scene_tolerance = limit.pointer;
+    a.relative_tolerance = relative_tolerance;
+    a.most = int(max_iterations);
+    a.scene_most = most.pointer;
+    a.method = HeatMethod(method);
+    a.deterministic = deterministic;
+    increment = empty(x, {N});
+    iterations = empty_int(x, {scenes});
+    residual = empty(x, {scenes});
+    converged = torch::stable::new_empty(x, Shape{scenes}, ScalarType::Bool);
+    a.increment = static_cast<T*>(increment.data_ptr());
+    a.iterations = static_cast<int*>(iterations.data_ptr());
+    a.residual = static_cast<T*>(residual.data_ptr());
+    a.converged = static_cast<bool*>(converged.data_ptr());
+    const Tensor workspace = torch::stable::new_empty(x, Shape{backend::heat_workspace(a)}, ScalarType::Byte);
+    a.workspace = workspace.data_ptr();
+    backend::heat_cg<Order>(a, device.stream());
+  });
+  return {increment, iterations, residual, converged};
+}
+
+Tensor heat_operator(const Tensor& x, const Tensor& conductance, const OptionalTensor& nodes, MPM_TOPOLOGY_PARAMETERS) {
+  check_rank(block, "block", 1);
+  check_rank(x, "x", 2);
+  Tensor sum;
+  const DeviceScope device(x);
+  dispatch(x, order, [&]<class T, int D, int Order>() {
+    HeatOperatorArguments<T, D> a;
+    a.topology = topology<T, D>(x, MPM_TOPOLOGY_ARGUMENTS);
+    const int64_t N = node_count<D>(block);
+    a.x = input<T>(x, "x", x, {x.size(0), D});
+    a.conductance = input<T>(conductance, "conductance", x, {x.size(0)});
+    const Values<T> u(nodes, "nodes", x, x.scalar_type(), N);
+    a.nodes = u.pointer;
+    a.deterministic = deterministic;
+    sum = torch::stable::new_zeros(x, Shape{N});
+    a.sum = static_cast<T*>(sum.data_ptr());
+    const Tensor workspace = torch::stable::new_empty(x, Shape{backend::heat_operator_workspace(a)}, ScalarType::Byte);
+    a.workspace = workspace.data_ptr();
+    backend::heat_operator<Order>(a, device.stream());
+  });
+  return sum;
+}
+
+}  // namespace
+}  // namespace mpm
+
+#if MPM_BACKEND == MPM_BACKEND_IS_cpu
+STABLE_TORCH_LIBRARY_FRAGMENT(torch_mpm, m) {
+  m.def(
+      "heat_cg(Tensor x, Tensor conductance, Tensor capacity, Tensor? theta, Tensor? source, Tensor? exchange, "
+      "Tensor? fixed, Tensor? scene_dt, float dt, Tensor? scene_tolerance, float tolerance, float relative_tolerance, "
+      "Tensor? scene_max_iterations, int max_iterations, int method, float adjoint_tolerance, " MPM_TOPOLOGY_SCHEMA
+      ") -> (Tensor increment, Tensor iterations, Tensor residual, Tensor converged)");
+  m.def("heat_operator(Tensor x, Tensor conductance, Tensor? nodes, " MPM_TOPOLOGY_SCHEMA ") -> Tensor");
+}
+#endif
+
+MPM_LIBRARY_IMPL(m) {
+  m.impl("heat_cg", TORCH_BOX(&mpm::heat_cg));
+  m.impl("heat_operator", TORCH_BOX(&mpm::heat_operator));
+}
