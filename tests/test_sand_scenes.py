@@ -206,3 +206,16 @@ def test_layers_of_a_picture(tmp_path):
     later = layers[len(start) :]
     assert (later[1:] >= later[:-1]).all()
     assert set(later.tolist()) == set(range(5))
+
+
+def test_layers_of_an_emitter_are_turned_against_each_other():
+    pytest.importorskip("pydantic")
+    emitter = {"center": (0.5, 0.7, 0.5), "radius": 0.2, "velocity": (0, -1, 0), "material": "jelly"}
+    scene = disc(grid__lower=(0, 0, 0), grid__upper=(1, 1, 1), gravity=None, body=[], emitter=[emitter])
+    (nozzle,) = mpm.Scene(**{**scene, "precision": "float64"}).build("cpu").nozzles
+    first, second = nozzle.turned(0), nozzle.turned(1)
+    assert torch.equal(first.x, nozzle.layer.x)
+    centre = torch.tensor([0.5, 0.7, 0.5], dtype=torch.float64)
+    assert torch.allclose((second.x - centre).norm(dim=1), (first.x - centre).norm(dim=1))
+    assert torch.allclose(second.x[:, 1], first.x[:, 1])
+    assert float(torch.cdist(second.x, first.x).amin(1).mean()) > 0.005

@@ -27,6 +27,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import json
 import math
 import sys
 import time
@@ -45,7 +46,6 @@ from .. import common
 
 GRAVITY, DENSITY, NU = 9.81, 1600.0, 0.3
 DX = 0.01
-COMPRESSION = 0.02
 QUARTIC = 6.254421582537118
 """Coefficient a of the quartic energies."""
 SLAB = 4
@@ -70,7 +70,12 @@ class Case:
     flow: str = "radial"
     energy: str = "unilateral"
     friction_angle: float = 30.0
-    options: tuple[tuple[str, Any], ...] = ()
+    volume_correction: bool = False
+    kernel: str = "quadratic"
+    transfer: str = "apic"
+    cfl: float = 0.5
+    compression: float = 0.02
+    per_axis: int = 2
 
     @property
     def dim(self) -> int:
@@ -79,23 +84,56 @@ class Case:
     @property
     def name(self) -> str:
         rule = "" if self.dim == 2 else f", {self.flow} flow"
-        extra = "".join(f", {key} {value}" for key, value in self.options)
+        extra = "".join(f", {item}" for item in self.unusual())
         return f"{self.shape}{rule}, {self.energy}, φ = {self.friction_angle:g}°, {self.cells} cells{extra}"
+
+    def unusual(self) -> list[str]:
+        """What differs from the usual in how it is computed."""
+        usual = Case(self.shape, self.cells)
+        words = {
+            "volume_correction": "volume correction",
+            "kernel": f"{self.kernel} kernel",
+            "transfer": self.transfer,
+            "cfl": f"CFL {self.cfl:g}",
+            "compression": f"compression {self.compression:g}",
+            "per_axis": f"{self.per_axis}^D per cell",
+        }
+        return [text for key, text in words.items() if getattr(self, key) != getattr(usual, key)]
 
 
 PLANAR = (Case("planar", 2500), Case("planar", 10000))
 SLABS = (Case("slab", 2500), Case("slab", 2500, "exact"))
 ROUND = (
     Case("axisymmetric", 4000),
-    Case("axisymmetric", 32000),
+    Case("axisymmetric", 16000),
     Case("axisymmetric", 4000, "exact"),
-    Case("axisymmetric", 32000, "exact"),
+    Case("axisymmetric", 16000, "exact"),
 )
 CASES = (*PLANAR, *SLABS, *ROUND)
 SLOPES = (
     Case("planar", 60),
     *(Case("slab", 60, flow, energy) for flow in ("radial", "exact") for energy in ("unilateral", "full")),
 )
+VARIANTS = (
+    *(Case("planar", cells) for cells in (160, 640, 2500, 10000)),
+    *(
+        dataclasses.replace(PLANAR[0], **change)  # type: ignore[arg-type]
+        for change in (
+            {"friction_angle": 20.0},
+            {"friction_angle": 40.0},
+            {"energy": "full"},
+            {"compression": 0.01},
+            {"compression": 0.04},
+            {"cfl": 0.125},
+            {"per_axis": 4},
+            {"kernel": "cubic"},
+            {"transfer": "pic"},
+        )
+    ),
+)
+"""What is computed for one aspect ratio only, to see on what the run-out depends."""
+VARIED = 2.0
+"""Aspect ratio of the variants."""
 
 
 # ---- bodies
@@ -128,31 +166,33 @@ class Heap:
 
 def column(case: Case, aspect: float) -> tuple[Points, float, float]:
     """Particles of a column, its height and its half width or radius [m]."""
+    shape: Any
     if case.shape == "axisymmetric":
         radius = DX * (4 * case.cells / (math.pi * aspect)) ** (1 / 3)
-        return fill(QuarterCylinder(radius, aspect * radius), DX, dtype=torch.float64), aspect * radius, radius
-    radius = DX * math.sqrt(case.cells / aspect)
-    size = (radius, aspect * radius, SLAB * DX)[: case.dim]
-    return fill(Box((0.0,) * case.dim, size), DX, 2**case.dim, dtype=torch.float64), aspect * radius, radius
+        shape = QuarterCylinder(radius, aspect * radius)
+    else:
+        radius = DX * math.sqrt(case.cells / aspect)
+        shape = Box((0.0,) * case.dim, (radius, aspect * radius, SLAB * DX)[: case.dim])
+    return fill(shape, DX, case.per_axis**case.dim, dtype=torch.float64), aspect * radius, radius
 
 
 # ---- simulation
 
 
-def stiffness(height: float) -> tuple[float, float]:
-    """μ and λ [Pa] with which a confined column of sand is compressed by COMPRESSION at its foot.
+def stiffness(height: float, compression: float) -> tuple[float, float]:
+    """μ and λ [Pa] with which a confined column of sand has the Hencky strain −`compression` at its foot.
 
     Uniaxial: ρ g H = 2 a (2 μ + λ) ε³.
     """
-    modulus = DENSITY * GRAVITY * height / (2 * QUARTIC * COMPRESSION**3)
+    modulus = DENSITY * GRAVITY * height / (2 * QUARTIC * compression**3)
     lam = modulus * NU / (1 - NU)
     return 0.5 * (modulus - lam), lam
 
 
-def pressed(points: Points, overburden: Tensor, height: float) -> mpm.State:
+def pressed(case: Case, points: Points, overburden: Tensor, height: float) -> mpm.State:
     """Sand at rest under the depth `overburden` [P] [m] of sand above it, in a column confined from the sides."""
     state = mpm.State.at_rest(points, DENSITY, dtype=torch.float64)
-    mu, lam = stiffness(height)
+    mu, lam = stiffness(height, case.compression)
     strain = (DENSITY * GRAVITY * overburden.clamp(min=0) / (2 * QUARTIC * (2 * mu + lam))).pow(1 / 3)
     F = torch.eye(state.x.shape[1], dtype=torch.float64).repeat(len(state), 1, 1)
     F[:, 1, 1] = torch.exp(-strain)
@@ -168,25 +208,27 @@ def simulate(
     """
     dim, height = case.dim, torch.tensor(heights, device=device)
     upper = (reach, max(heights) + 10 * DX, SLAB * DX if case.shape == "slab" else reach)[:dim]
-    grid = mpm.Grid(DX, (0.0,) * dim, upper, scenes=len(states))
+    grid = mpm.Grid(DX, (0.0,) * dim, upper, scenes=len(states), kernel=case.kernel)
     packed = mpm.State.concatenate(list(states), scene=True).to(device, torch.float32)
     wanted = int(grid.activate(packed.x, packed.scene).status[7])
     room = min(3 * wanted, grid.block_count)  # to spread; fixed, for the graph
-    grid = mpm.Grid(DX, (0.0,) * dim, upper, scenes=len(states), capacity=room)
-    mu, lam = (torch.tensor(values, device=device) for values in zip(*map(stiffness, heights), strict=True))
-    options = dict(case.options) | ({} if case.flow == "radial" else {"flow": case.flow})
+    grid = mpm.Grid(DX, (0.0,) * dim, upper, scenes=len(states), kernel=case.kernel, capacity=room)
+    moduli = [stiffness(h, case.compression) for h in heights]
+    mu, lam = (torch.tensor(values, device=device) for values in zip(*moduli, strict=True))
+    options: dict[str, Any] = {} if case.flow == "radial" else {"flow": case.flow}
+    options |= {"volume_correction": True} if case.volume_correction else {}
     law = mpm.QuarticSand(
         mu=mu,
         lam=lam,
         friction_angle=torch.full_like(mu, math.radians(case.friction_angle)),
         energy=case.energy,
-        smallest_strain=COMPRESSION,
+        smallest_strain=case.compression,
         **options,
     )
     walls = mpm.Walls([("slip", "separate"), ("sticky", "separate"), "slip"][:dim])
-    step = mpm.Step(grid, law, gravity=(0.0, -GRAVITY, 0.0)[:dim], walls=walls)
+    step = mpm.Step(grid, law, gravity=(0.0, -GRAVITY, 0.0)[:dim], walls=walls, transfer=case.transfer)
     unit = (height / GRAVITY).sqrt()
-    segment = Segment(step, packed, lambda state: (0.5 * step.stable_dt(state, 1.0) / unit).amin() * unit)
+    segment = Segment(step, packed, lambda state: (step.stable_dt(state, case.cfl) / unit).amin() * unit)
     steps, clock, records = 0, 0.0, [record(step, segment.state)]
     while clock < duration:
         segment.run()
@@ -303,7 +345,7 @@ def collapse(case: Case, aspects: Sequence[float], duration: float, device: str)
     """All columns of a case: what the deposits look like, and how energy and volume went."""
     bodies = [column(case, a) for a in aspects]
     heights = [height for _, height, _ in bodies]
-    states = [pressed(points, height - points.x[:, 1], height) for points, height, _ in bodies]
+    states = [pressed(case, points, height - points.x[:, 1], height) for points, height, _ in bodies]
     reach = max(
         radius * (1 + 4.5 * a ** (0.75 if case.dim == 2 or case.shape == "slab" else 0.6))
         for (_, _, radius), a in zip(bodies, aspects, strict=True)
@@ -363,7 +405,7 @@ def standing(case: Case, angles: Sequence[float], duration: float, device: str) 
         body = Heap(height, math.radians(angle), None if case.dim == 2 else SLAB * DX)
         points = fill(body, DX, 2**case.dim, dtype=torch.float64)
         surface = height * (1 - points.x[:, 0] / body.upper[0])
-        states.append(pressed(points, surface - points.x[:, 1], height))
+        states.append(pressed(case, points, surface - points.x[:, 1], height))
     starts = torch.cat([s.x for s in states])
     begin = time.perf_counter()
     reach = 1.3 * height / math.tan(math.radians(min(angles)))
@@ -383,6 +425,15 @@ def standing(case: Case, angles: Sequence[float], duration: float, device: str) 
 
 
 # ---- report
+
+
+def added(old: dict[str, Any], new: dict[str, Any]) -> dict[str, Any]:
+    """The results of two runs, in the order of the first; the newer where both have a case."""
+    result = {"environment": new["environment"]}
+    for part in ("collapse", "standing", "variants"):
+        cases = {entry["name"]: entry for entry in (*old[part], *new[part])}
+        result[part] = list(cases.values())
+    return result
 
 
 def published(shape: str, a: float) -> float:
@@ -406,6 +457,14 @@ def text(result: dict[str, Any]) -> str:
         header = ("case", "steepest that stands [°]", "least steep that fails [°]")
         rows = [(s["name"], s["steepest"], s["least failing"]) for s in result["standing"]]
         lines += ["", "## Standing slopes", "", common.table(header, rows)]
+    if result["variants"]:
+        header = ("variant", "particles", "steps", "run-out", "run-out of 99%", "angle [°]", "volume", "seconds")
+        rows = [
+            (c["name"], c["particles"], c["steps"])
+            + (*(c["rows"][0][k] for k in ("run-out", "run-out of 99%", "angle", "volume")), c["seconds"])
+            for c in result["variants"]
+        ]
+        lines += ["", f"## On what the run-out depends (a = {VARIED:g})", "", common.table(header, rows)]
     keys = (
         "a", "particles", "radius / dx", "run-out", "run-out of 99%", "height", "angle", "volume", "kinetic energy",
         "largest energy rise",
@@ -463,6 +522,7 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="two small columns of each shape, to see that it works")
     parser.add_argument("--device", choices=["cpu", "cuda"], default="cuda" if torch.cuda.is_available() else "cpu")
     parser.add_argument("--only", default="", help="cases whose name has this in it")
+    parser.add_argument("--add", action="store_true", help="to the results in --out, which keep their place")
     parser.add_argument("--out", type=Path, default=common.RESULTS)
     arguments = parser.parse_args()
     common.use_all_cores()
@@ -477,10 +537,14 @@ def main() -> None:
     )
     result: dict[str, Any] = {"environment": common.environment(arguments.device)}
     with torch.no_grad():
+        variants = [c for c in VARIANTS if arguments.only in f"variant {c.name}" and not arguments.quick]
+        result["variants"] = [collapse(c, (VARIED,), duration, arguments.device) for c in variants]
         result["collapse"] = [collapse(c, aspects, duration, arguments.device) for c in chosen[0]]
         result["standing"] = [
             standing(c, angles, 4.0 if not arguments.quick else 1.0, arguments.device) for c in chosen[1]
         ]
+    if arguments.add:
+        result = added(json.loads((arguments.out / "runout.json").read_text()), result)
     print(text(result).split("\n\n## ", 1)[1])
     common.write(arguments.out, "runout", result, text(result))
     plot(result, arguments.out / "runout.png")

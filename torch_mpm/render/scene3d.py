@@ -78,11 +78,15 @@ class Scene3D:
         if ground is not None:
             self._add_ground(ground)
         self.moving: list[Any] = []
+        self.occlusion = occlusion
 
     def draw(self, x: Array, rgb: Array, radius: float, style: str, obstacles: Sequence[Shape]) -> Array:
         """The picture, uint8 [H, W, 3], of finite positions x [P, 3] m with colours uint8 [P, 3]."""
         for actor in self.moving:
             self.renderer.RemoveActor(actor)
+        if self.occlusion and any(o.opacity < 1 for o in obstacles):
+            self._add_passes(occlusion=False)  # it would darken what is behind glass in stripes
+            self.occlusion = False
         self.moving = [self._obstacle_actor(o) for o in obstacles]
         shown = visible(x, 2 * radius) if len(x) > CULL_FROM and style == "particles" else np.ones(len(x), dtype=bool)
         if len(x) and style == "surface":

@@ -20,6 +20,9 @@ from . import heat, schema
 from .explain import SceneError
 
 
+GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
+
+
 @dataclass(frozen=True)
 class Material:
     """A material of one scene: its words, the index of its scene, and its place among the laws of the step."""
@@ -31,11 +34,20 @@ class Material:
 
 @dataclass(frozen=True)
 class Nozzle:
-    """An emitter ready to run: the same layer of particles appears at each of its times."""
+    """An emitter ready to run: a layer of particles appears at each of its times."""
 
     layer: State
     material: int
     times: list[float]
+
+    def turned(self, number: int) -> State:
+        """The layer, in 3-D turned about the axis of the nozzle, so that one does not line up with the one before."""
+        x, v = self.layer.x, self.layer.v
+        if x.shape[1] == 2:
+            return self.layer
+        turn = boundaries.rotation_matrix(GOLDEN_ANGLE * number * v[0] / v[0].norm(), 3)
+        centre = x.mean(0)
+        return self.layer.replace(x=centre + (x - centre) @ turn.mT)
 
 
 @dataclass(frozen=True)

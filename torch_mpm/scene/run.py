@@ -285,7 +285,7 @@ class Simulation:
     def _emit(self, until: float) -> None:
         """Add the layers that are due."""
         while self.emitted < len(self.emissions) and self.emissions[self.emitted][0] <= until:
-            layer = self.built.nozzles[self.emissions[self.emitted][1]].layer
+            layer = self.built.nozzles[self.emissions[self.emitted][1]].turned(self.emitted)
             ids = torch.arange(len(self.state), len(self.state) + len(layer), device=layer.x.device)
             self.state = joined(self.state, layer.replace(ids=ids))
             self.emitted += 1
