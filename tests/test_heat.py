@@ -128,7 +128,7 @@ def test_flux_and_source_bring_exactly_their_heat(device, kernel):
     state = state.replace(temperature=torch.zeros_like(state.mass))
     points, area = surface_of_square()
     surface = Surface(points.to(device), area)
-    terms = [Flux(surface, lambda time: 3.0), Flux(surface, torch.linspace(0, 1, 160, dtype=FLOAT)), Source(5.0)]
+    terms = [Flux(surface, lambda time: 3.0), Flux(surface, torch.linspace(0, 1, 160, dtype=FLOAT, device=device)), Source(5.0)]
     heat = mpm.Heat(grid_around(kernel=kernel), 1.0, 1.0, terms)
     end = mpm.rollout(heat.to(device), state, 4, 0.01)
     expected = 0.04 * (3.0 * 4 + 0.5 * 4 + 5.0)

@@ -37,7 +37,7 @@ class ThermalExpansion(Material):
     def __init__(self, law: Material, coefficient: Value) -> None:
         super().__init__()
         self.law = law
-        self.state_fields = law.state_fields
+        self.state_fields, self.extra_fields = law.state_fields, law.extra_fields
         self.viscous = law.viscous
         store(self, "coefficient", _check_value("coefficient", coefficient, "finite", lambda v: v == v))
 
@@ -107,6 +107,7 @@ class Melting(Material):
         if not 0 < coherency <= 1:
             raise ValueError(f"coherency must be in (0, 1], got {coherency}")
         self.solid, self.liquid, self.coherency = solid, liquid, float(coherency)
+        self.extra_fields = solid.extra_fields
         self.viscous = solid.viscous or liquid.viscous
 
     def update(self, state: State) -> tuple[dict[str, Tensor], Tensor]:
