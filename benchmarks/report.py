@@ -67,7 +67,7 @@ def convergence(result: dict[str, Any]) -> str:
         rows.append((case["name"], last["n"], order, last["displacement"], last["seconds"]))
     intro = (
         "A manufactured solution (benchmarks/accuracy/convergence.py), one period; errors relative to the amplitude on "
-        "the finest lattice, order fitted over all. `slip` walls limit the order to 1, mirrored node values restore 2."
+        "the finest lattice, order fitted over all. `slip` walls limit the order to 1, `mirror` walls restore 2."
     )
     figure = "![error over dx and over run time](benchmarks/results/convergence.png)"
     return "\n".join([intro, "", common.table(header, rows), "", figure])

@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from conftest import DEVICES
 from node_blocks import random_blocks
 from torch import Tensor
 
@@ -212,6 +213,24 @@ def test_a_step_takes_both_ways(dim, device):
         results.append(mpm.rollout(step, state, 3, 1e-3))
     torch.testing.assert_close(results[0].x, results[1].x, rtol=0, atol=1e-12)
     torch.testing.assert_close(results[0].v, results[1].v, rtol=0, atol=1e-12)
+
+
+@pytest.mark.cuda
+@pytest.mark.skipif("cuda" not in DEVICES, reason="needs a CUDA device")
+def test_a_step_with_obstacles_is_captured(dim):
+    grid = mpm.Grid(0.1, (0.0,) * dim, (1.0,) * dim, capacity=200)
+    state = mpm.State.at_rest(mpm.seed.box((0.2,) * dim, (0.8,) * dim, grid), 1000.0, (1.0,) * dim, device="cuda")
+    sdf = mpm.SDF(lambda x: x.norm(dim=1) - 0.1, (0.4,) * dim)
+    step = mpm.Step(grid, mpm.NeoHookean(E=1e4, nu=0.3), walls="mirror", boundaries=[*shapes(dim), sdf], transfer="pic")
+    with torch.no_grad():
+        expected = step(state, 1e-3)
+        torch.cuda.synchronize()
+        graph = torch.cuda.CUDAGraph()
+        with torch.cuda.graph(graph):
+            got = step(state, 1e-3)
+        graph.replay()
+    torch.testing.assert_close(got.x, expected.x)
+    torch.testing.assert_close(got.v, expected.v)
 
 
 # ---- the op itself

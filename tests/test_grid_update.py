@@ -189,7 +189,15 @@ def test_gradient_is_the_reference(device, dim, name):
         assert_close(got, want, 5e-6)
 
 
-@pytest.mark.parametrize("walls", [mpm.Walls("slip", friction=0.3), mpm.Walls("separate", (0.1,) * 2, (0.3,) * 2)])
+@pytest.mark.parametrize(
+    "walls",
+    [
+        mpm.Walls("slip", friction=0.3),
+        mpm.Walls("separate", (0.1,) * 2, (0.3,) * 2),
+        mpm.Walls([("mirror", "open"), ("open", "mirror")], (0.05, 0.0), (0.4, 0.1)),
+        mpm.Walls([("mirror", "open"), ("separate", "open")], friction=[0.0, 0.3]),
+    ],
+)
 def test_gradcheck(walls):
     grid = mpm.Grid(dx=0.1, lower=(0.0, 0.0), upper=(0.4, 0.1), scenes=2)
     blocks = random_blocks(grid, share=1.0)

@@ -218,7 +218,8 @@ class Obstacle:
     Tensors may require grad: the gradient of the node velocities goes to position, velocity, rotation,
     angular_velocity and friction, through the normal and the surface velocity. Which nodes are inside is not
     differentiable, so radius and size have no gradient and refuse tensors that require one. Nothing here synchronises
-    with the device.
+    with the device. Planes, spheres, boxes and capsules of a `Step` act together in one kernel, `torch_mpm.ops.contact`,
+    unless one of their tensors requires grad or the position is a function.
 
     Raises:
         ValueError: for a wrong argument; shapes of tensors are checked at the first use.

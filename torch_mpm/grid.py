@@ -231,17 +231,16 @@ class Blocks:
     def node_indices(self) -> Tensor:
         """Lattice indices of each node, int64 [N, D]; those of block 0 for unused rows."""
         grid = self.grid
-        block = self.block.clamp_min(0).long() % math.prod(grid.blocks)
-        corner = torch.stack(torch.unravel_index(block, grid.blocks), -1) * BLOCK_WIDTH
-        inside = torch.arange(grid.nodes_per_block, device=block.device)
-        offset = torch.stack(torch.unravel_index(inside, (BLOCK_WIDTH,) * grid.dim), -1)
+        corner = _unravel(self.block.clamp_min(0).long(), grid.blocks) * BLOCK_WIDTH
+        inside = torch.arange(grid.nodes_per_block, device=corner.device)
+        offset = _unravel(inside, (BLOCK_WIDTH,) * grid.dim)
         return (corner[:, None] + offset).reshape(-1, grid.dim)
 
     def node_positions(self, dtype: torch.dtype | None = None) -> Tensor:
         """Position of each node [m], [N, D]."""
-        lower = torch.tensor(self.grid.lower, dtype=torch.float64, device=self.block.device)
-        positions = lower + (self.node_indices() - PADDING).double() * self.grid.dx
-        return positions.to(dtype or torch.get_default_dtype())
+        columns = (self.node_indices() - PADDING).double().unbind(1)
+        positions = [a + column * self.grid.dx for a, column in zip(self.grid.lower, columns, strict=True)]
+        return torch.stack(positions, 1).to(dtype or torch.get_default_dtype())
 
     def to_dense(self, nodes: Tensor) -> Tensor:
         """Node rows [N, K] as a dense tensor [B, X, Y, (Z), K] of the lattice, zero where inactive; differentiable."""
@@ -263,6 +262,15 @@ class Blocks:
         blocks = blocks.reshape(-1, grid.nodes_per_block, dense.shape[-1])
         rows = blocks[self.block.clamp_min(0).long()]
         return torch.where((self.block >= 0)[:, None, None], rows, 0).reshape(-1, dense.shape[-1])
+
+
+def _unravel(index: Tensor, shape: Sequence[int]) -> Tensor:
+    """Coordinates [..., D] of indices modulo the size of an array; `torch.unravel_index` copies from the host."""
+    coordinates = []
+    for size in reversed(shape):
+        coordinates.append(index % size)
+        index = index // size
+    return torch.stack(coordinates[::-1], -1)
 
 
 def _interleaved(dim: int) -> list[int]:
