@@ -218,7 +218,7 @@ class Obstacle:
     Tensors may require grad: the gradient of the node velocities goes to position, velocity, rotation,
     angular_velocity and friction, through the normal and the surface velocity. Which nodes are inside is not
     differentiable, so radius and size have no gradient and refuse tensors that require one. Nothing here synchronises
-    with the device. Planes, spheres, boxes and capsules of a `Step` act together in one kernel, `torch_mpm.ops.contact`,
+    with the device. The planes, spheres, boxes and capsules of a `Step` act in one kernel, `torch_mpm.ops.contact`,
     unless one of their tensors requires grad or the position is a function.
 
     Raises:
