@@ -157,9 +157,26 @@ def test_sand_of_a_scene_file():
     mu, lam = law.values()[:2]
     assert (mu, lam) == pytest.approx((1e7 / 2.6, 1e7 * 0.3 / (1.3 * 0.4)))
     assert float(built.state.mass.sum()) == pytest.approx(1600 * math.pi * 0.04)
-    words = {"law": "quartic_sand", "mu": 2e6, "lam": 3e6}
+    assert (law.flow, law.cohesive, law.extra_fields) == ("radial", False, ())
+    words = {"law": "quartic_sand", "mu": 2e6, "lam": 3e6, "flow": "exact", "cohesion": 0.01, "volume_correction": True}
+    words["hardening"] = (35, 9, 0.2, 10)
     law = mpm.Scene(**disc(material={"jelly": words})).build("cpu").step.law
     assert law.values()[:2] == (2e6, 3e6)
+    expected = (math.radians(35), math.radians(9), 0.2, math.radians(10), 0.01)
+    assert law.values()[2:] == pytest.approx(expected)
+    assert (law.flow, law.extra_fields) == ("exact", ("volume_correction", "hardening"))
+
+
+def test_sand_with_a_history_runs_beside_other_matter(tmp_path):
+    """Fields of the history pass through emitters and mixtures."""
+    pytest.importorskip("pydantic")
+    pytest.importorskip("h5py")
+    material = {"jelly": {**SAND, "E": 1e6, "volume_correction": True}, "ball": {"law": "neo_hookean", "E": 1e4}}
+    body = {"shape": "sphere", "center": (0.3, 0.2), "radius": 0.1, "material": "ball"}
+    emitter = {"center": (0.3, 0.6), "radius": 0.1, "velocity": (0, -2), "material": "jelly", "end": 0.05}
+    summary = mpm.Scene(**disc(material=material, body=[body], emitter=[emitter])).run(tmp_path / "out")
+    assert summary["particles_lost"] == 0
+    assert summary["mass_drift"] == pytest.approx(0, abs=1e-6)
 
 
 def test_sands_of_a_batch_share_a_law_where_they_can():

@@ -1,6 +1,6 @@
 """Collapse of columns of dry sand: run-out against aspect ratio, and the steepest slope that stands.
 
-    python -m benchmarks.accuracy.runout                 # all cases; a GPU takes minutes
+    python -m benchmarks.accuracy.runout                 # all cases, minutes on a GPU; the CPU does one batch only
     python -m benchmarks.accuracy.runout --quick         # seconds
 
 A column of height H and half width (radius) r₀ stands on a rough floor, on which sand sticks, and is let go; a = H/r₀.
@@ -29,6 +29,7 @@ import argparse
 import dataclasses
 import json
 import math
+import re
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -101,13 +102,14 @@ class Case:
         return [text for key, text in words.items() if getattr(self, key) != getattr(usual, key)]
 
 
-PLANAR = (Case("planar", 2500), Case("planar", 10000))
+PLANAR = (Case("planar", 2500), Case("planar", 10000), Case("planar", 2500, volume_correction=True))
 SLABS = (Case("slab", 2500), Case("slab", 2500, "exact"))
 ROUND = (
     Case("axisymmetric", 4000),
     Case("axisymmetric", 16000),
     Case("axisymmetric", 4000, "exact"),
     Case("axisymmetric", 16000, "exact"),
+    Case("axisymmetric", 4000, volume_correction=True),
 )
 CASES = (*PLANAR, *SLABS, *ROUND)
 SLOPES = (
@@ -215,20 +217,19 @@ def simulate(
     grid = mpm.Grid(DX, (0.0,) * dim, upper, scenes=len(states), kernel=case.kernel, capacity=room)
     moduli = [stiffness(h, case.compression) for h in heights]
     mu, lam = (torch.tensor(values, device=device) for values in zip(*moduli, strict=True))
-    options: dict[str, Any] = {} if case.flow == "radial" else {"flow": case.flow}
-    options |= {"volume_correction": True} if case.volume_correction else {}
     law = mpm.QuarticSand(
         mu=mu,
         lam=lam,
         friction_angle=torch.full_like(mu, math.radians(case.friction_angle)),
         energy=case.energy,
         smallest_strain=case.compression,
-        **options,
+        flow=case.flow,
+        volume_correction=case.volume_correction,
     )
     walls = mpm.Walls([("slip", "separate"), ("sticky", "separate"), "slip"][:dim])
     step = mpm.Step(grid, law, gravity=(0.0, -GRAVITY, 0.0)[:dim], walls=walls, transfer=case.transfer)
     unit = (height / GRAVITY).sqrt()
-    segment = Segment(step, packed, lambda state: (step.stable_dt(state, case.cfl) / unit).amin() * unit)
+    segment = Segment(step, step.prepare(packed), lambda state: (step.stable_dt(state, case.cfl) / unit).amin() * unit)
     steps, clock, records = 0, 0.0, [record(step, segment.state)]
     while clock < duration:
         segment.run()
@@ -245,7 +246,7 @@ class Segment:
 
     Args:
         step: with a grid of fixed capacity.
-        state: at the start, with F.
+        state: at the start, with all that the step needs.
         time_step: of a state, dt [B].
 
     Attributes:
@@ -283,6 +284,8 @@ class Segment:
         for field in dataclasses.fields(state):
             if isinstance(kept := getattr(self.state, field.name), Tensor):
                 kept.copy_(getattr(state, field.name))
+        for name, kept in self.state.extra.items():
+            kept.copy_(state.extra[name])
 
 
 def record(step: mpm.Step, state: mpm.State) -> dict[str, list[float]]:
@@ -424,6 +427,30 @@ def standing(case: Case, angles: Sequence[float], duration: float, device: str) 
     }
 
 
+def measure(device: str, quick: bool, only: str) -> dict[str, Any]:
+    """All parts whose kind and name match the regular expression `only`; few of them on the CPU."""
+    cases, slopes, variants, aspects, angles = CASES, SLOPES, VARIANTS, ASPECTS, ANGLES
+    duration, standing_duration = 6.0, 4.0
+    if quick:
+        cases = tuple(dataclasses.replace(c, cells=150) for c in (PLANAR[0], SLABS[0], ROUND[0]))
+        slopes = tuple(dataclasses.replace(c, cells=10) for c in SLOPES[:2])
+        variants, aspects, angles = (), (1.0, 2.0), (20, 50)
+        duration = standing_duration = 1.0
+    elif device == "cpu":
+        cases, slopes, variants = PLANAR[:1], SLOPES[:1], ()
+
+    def chosen(kind: str, among: Sequence[Case]) -> list[Case]:
+        return [case for case in among if re.search(only, f"{kind} {case.name}")]
+
+    with torch.no_grad():
+        return {
+            "environment": common.environment(device),
+            "variants": [collapse(c, (VARIED,), duration, device) for c in chosen("variant", variants)],
+            "collapse": [collapse(c, aspects, duration, device) for c in chosen("column", cases)],
+            "standing": [standing(c, angles, standing_duration, device) for c in chosen("slope", slopes)],
+        }
+
+
 # ---- report
 
 
@@ -521,28 +548,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="two small columns of each shape, to see that it works")
     parser.add_argument("--device", choices=["cpu", "cuda"], default="cuda" if torch.cuda.is_available() else "cpu")
-    parser.add_argument("--only", default="", help="cases whose name has this in it")
+    parser.add_argument("--only", default="", help="parts (column, slope or variant, and case) that match this")
     parser.add_argument("--add", action="store_true", help="to the results in --out, which keep their place")
     parser.add_argument("--out", type=Path, default=common.RESULTS)
     arguments = parser.parse_args()
     common.use_all_cores()
-    cases, slopes, aspects, angles, duration = CASES, SLOPES, ASPECTS, ANGLES, 6.0
-    if arguments.quick:
-        cases = tuple(dataclasses.replace(c, cells=150) for c in (PLANAR[0], SLABS[0], ROUND[0]))
-        slopes = tuple(dataclasses.replace(c, cells=10) for c in SLOPES[:2])
-        aspects, angles, duration = (1.0, 2.0), (20, 50), 1.0
-    chosen = (
-        [c for c in cases if arguments.only in c.name],
-        [c for c in slopes if arguments.only in f"standing {c.name}"],
-    )
-    result: dict[str, Any] = {"environment": common.environment(arguments.device)}
-    with torch.no_grad():
-        variants = [c for c in VARIANTS if arguments.only in f"variant {c.name}" and not arguments.quick]
-        result["variants"] = [collapse(c, (VARIED,), duration, arguments.device) for c in variants]
-        result["collapse"] = [collapse(c, aspects, duration, arguments.device) for c in chosen[0]]
-        result["standing"] = [
-            standing(c, angles, 4.0 if not arguments.quick else 1.0, arguments.device) for c in chosen[1]
-        ]
+    result = measure(arguments.device, arguments.quick, arguments.only)
     if arguments.add:
         result = added(json.loads((arguments.out / "runout.json").read_text()), result)
     print(text(result).split("\n\n## ", 1)[1])

@@ -19,7 +19,6 @@ from ..step import Step
 from . import heat, schema
 from .explain import SceneError
 
-
 GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
 
 

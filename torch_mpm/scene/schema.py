@@ -161,7 +161,8 @@ class QuarticSand(Thermal):
         if self.apex == "keep" and self.energy != "unilateral":
             raise ValueError("apex = 'keep' needs energy = 'unilateral'")
         if self.hardening is not None:
-            if "friction_angle" in self.model_fields_set:
+            # Not by model_fields_set: an entry of a batch is made of all fields of the file.
+            if self.friction_angle != type(self).model_fields["friction_angle"].default:
                 raise ValueError("takes friction_angle or hardening, got both")
             h0, h1, h2, h3 = self.hardening
             if not (0 <= h3 <= h0 < 90 and h1 >= 0 and h2 >= 0):
