@@ -119,7 +119,7 @@ FRONT = 0.4
 """Where the melting front is at the end."""
 
 PROBLEMS = (
-    Problem("cosine mode", cosine, 0.05, 0.1, (8, 16, 32, 64)),
+    Problem("cosine mode", cosine, 0.05, 0.1, (8, 16, 32, 48)),
     Problem("disc", disc, 0.01, 0.1, (8, 16, 32, 64)),
     Problem("heated bar", bar, 0.1, 0.1, (8, 16, 32, 64)),
     *(
