@@ -20,6 +20,7 @@ PROGRAMS = (
     "benchmarks.speed.svd",
     "benchmarks.accuracy.precision",
     "benchmarks.accuracy.convergence",
+    "benchmarks.accuracy.heat",
     "benchmarks.accuracy.svd",
     "benchmarks.accuracy.sand",
     "benchmarks.accuracy.ritter",

@@ -168,6 +168,30 @@ def collapse(result: dict[str, Any]) -> str:
     return "\n\n".join([intro, common.table(header, rows)])
 
 
+def heat(result: dict[str, Any]) -> str:
+    """Errors of conduction and melting against analytic solutions."""
+    forms = [("quadratic", name) for name in ("hybrid", "apic", "flip", "pic")] + [("cubic", "hybrid")]
+    rows = []
+    for problem in dict.fromkeys(case["problem"] for case in result["cases"]):
+        cases = {(c["kernel"], c["transfer"]): c for c in result["cases"] if c["problem"] == problem}
+        first = cases[forms[0]]
+        row: list[Any] = [problem, first["number"], first["rows"][-1]["n"], first["rows"][-1]["seconds"]]
+        for form in forms:
+            case = cases.get(form)
+            row.append(f"{case['rows'][-1]['error']:.1e} ({case['order']:.1f})" if case else None)
+        rows.append(row)
+    lost = result["float32"]
+    intro = (
+        "Relative error on the finest lattice, with the order over all in brackets (benchmarks/accuracy/heat.py): RMS "
+        "of the temperature, position of the melting front; time of the hybrid [s]. 200 steps with a diffusion number "
+        f"r = 1e-5 around 300 K in float32 lose {lost['relative to 300 K']:.1%} of the change, with temperatures "
+        "relative to 300 K."
+    )
+    header = ("problem", "r", "n", "run time [s]", *(f"{t}, cubic" if k == "cubic" else t for k, t in forms))
+    figure = "![error over dx and over run time](benchmarks/results/heat.png)"
+    return "\n".join([intro, "", common.table(header, rows), "", figure])
+
+
 def summary(directory: Path) -> str:
     """All sections for which there are results."""
     sections = []
@@ -176,6 +200,7 @@ def summary(directory: Path) -> str:
     for name, title, section in (
         ("convergence", "Convergence", convergence),
         ("ritter", "Dam break", dam_break),
+        ("heat", "Heat", heat),
         ("precision", "Precision", precision),
         ("stability", "Stability", stability),
         ("runout", "Sand: run-out of columns", runout),

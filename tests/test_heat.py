@@ -90,6 +90,14 @@ def test_float32_keeps_small_changes():
     assert relative_error(ends[0], ends[1]) < 0.05
 
 
+def test_almost_no_heat_is_no_failure():
+    """A source so weak that its squares underflow."""
+    state = block(dtype=torch.float32).replace(temperature=torch.zeros_like(block(dtype=torch.float32).mass))
+    heat = mpm.Heat(grid_around(), 1.0, 1.0, [Source(1e-24 * random_like(state.mass))])
+    heat(state, 1e-3)
+    heat.check()
+
+
 def test_conductivity_of_a_function_is_that_of_its_values(device):
     state = block(2, device).replace(temperature=30 * random_like(block().mass).to(device))
     table = mpm.Table([0.0, 20.0], [1.0, 3.0])
@@ -128,7 +136,11 @@ def test_flux_and_source_bring_exactly_their_heat(device, kernel):
     state = state.replace(temperature=torch.zeros_like(state.mass))
     points, area = surface_of_square()
     surface = Surface(points.to(device), area)
-    terms = [Flux(surface, lambda time: 3.0), Flux(surface, torch.linspace(0, 1, 160, dtype=FLOAT, device=device)), Source(5.0)]
+    terms = [
+        Flux(surface, lambda time: 3.0),
+        Flux(surface, torch.linspace(0, 1, 160, dtype=FLOAT, device=device)),
+        Source(5.0),
+    ]
     heat = mpm.Heat(grid_around(kernel=kernel), 1.0, 1.0, terms)
     end = mpm.rollout(heat.to(device), state, 4, 0.01)
     expected = 0.04 * (3.0 * 4 + 0.5 * 4 + 5.0)

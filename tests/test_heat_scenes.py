@@ -123,6 +123,17 @@ def test_heated_bar_has_the_temperature_of_the_exact_solution(tmp_path):
     np.testing.assert_allclose(theta, exact, atol=1.0)
 
 
+def test_sand_warms_by_the_energy_it_loses(tmp_path):
+    """What the column of the example loses as mechanical energy is heat, but for the share of floor and transfer."""
+    overrides = ["grid.dx=0.04", "duration=0.6", "fps=5", 'device="cpu"']
+    Scene.load(Path(__file__).parent.parent / "examples" / "friction_heat.toml", overrides).run(tmp_path / "out")
+    with Trajectory(tmp_path / "out") as read:
+        mechanical = sum(read[f"{kind}_energy"] for kind in ("kinetic", "elastic", "potential"))
+        heat = read["heat"]
+    assert (np.diff(heat) > 0).all()
+    assert 0.7 < (heat[-1] - heat[0]) / (mechanical[0] - mechanical[-1]) < 1.0
+
+
 @pytest.mark.parametrize(
     "changes,message",
     [

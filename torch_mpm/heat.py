@@ -33,6 +33,8 @@ from .state import State
 from .thermal import LIQUID, determinant
 
 TRANSFERS = ("hybrid", "apic", "flip", "pic")
+NEGLIGIBLE = 1e-12
+"""Residual [K] that a solve may always leave: 1e6 of them are a microkelvin, and far less underflows in float32."""
 GRADIENT = "temperature_gradient"
 """Key of `State.extra` under which the hybrid and APIC keep the temperature gradient g_p [P, D] [K/m]."""
 
@@ -243,7 +245,7 @@ class Heat(nn.Module):
             start = torch.where(nodes.fixed, nodes.held, start)
         boundary = nodes.source, nodes.exchange, nodes.fixed
         solve = heat_cg(
-            nodes.blocks, nodes.state.x, conductance, nodes.capacity, start, dt, *boundary, tolerance=0.0,
+            nodes.blocks, nodes.state.x, conductance, nodes.capacity, start, dt, *boundary, tolerance=NEGLIGIBLE,
             relative_tolerance=self.tolerance, max_iterations=self.max_iterations,
         )  # fmt: skip
         self._record(solve.converged, solve.residual)
