@@ -11,7 +11,7 @@ from .grid import Blocks, Grid
 from .heat import Heat
 from .materials import CustomLaw, Material, Mixture, NeoHookean, WeaklyCompressible
 from .ops import HeatSolve, advance, g2p, gather, grid_update, heat_cg, p2g, polar, quartic_return_map, scatter, svd3
-from .parameters import Table
+from .parameters import PerMaterial, Table
 from .sand import QuarticSand
 from .state import State
 from .step import Step, rollout
@@ -35,6 +35,7 @@ __all__ = [
     "Melting",
     "Mixture",
     "NeoHookean",
+    "PerMaterial",
     "Plane",
     "QuarticSand",
     "Revolved",

@@ -8,7 +8,6 @@ with areas A_s (`Surface`), h_i = Σ_s A_s η_s N_i(x_s), or by the free surface
 from __future__ import annotations
 
 import dataclasses
-import itertools
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
@@ -156,20 +155,19 @@ class FreeSurface:
 def node_weights(blocks: Blocks, x: Tensor, scene: Tensor | None) -> tuple[Tensor, Tensor]:
     """Rows [S, K] of the nodes around any points [S, D], and their weights N_i [S, K], zero for inactive nodes."""
     grid = blocks.grid
-    lower = torch.tensor(grid.lower, dtype=x.dtype, device=x.device)
-    cells = (x - lower) / grid.dx + PADDING
+    cells = torch.stack([(x[:, a] - grid.lower[a]) / grid.dx + PADDING for a in range(grid.dim)], 1)
     base = torch.floor(cells.detach() - (0.5 if grid.order == 2 else 1.0)).long()
-    offsets = torch.tensor(list(itertools.product(range(grid.order + 1), repeat=grid.dim)), device=x.device)
-    node = base[:, None] + offsets
+    steps = torch.arange(grid.order + 1, device=x.device)
+    node = base[:, None] + torch.cartesian_prod(*[steps] * grid.dim)
     weight = bspline(node - cells[:, None], grid.order).prod(-1)
-    extent = torch.tensor(grid.blocks, device=x.device) * BLOCK_WIDTH
-    inside = ((node >= 0) & (node < extent)).all(-1)
-    node = torch.where(inside[..., None], node, 0)
+    inside = torch.ones_like(node[..., 0], dtype=torch.bool)
     index = torch.zeros_like(node[..., 0]) if scene is None else scene.long()[:, None].expand(node.shape[:2])
-    local = torch.zeros_like(index)
-    for axis in range(grid.dim):
-        index = index * grid.blocks[axis] + node[..., axis] // BLOCK_WIDTH
-        local = local * BLOCK_WIDTH + node[..., axis] % BLOCK_WIDTH
+    local = torch.zeros_like(node[..., 0])
+    for axis, extent in enumerate(grid.blocks):
+        at = node[..., axis]
+        inside = inside & (at >= 0) & (at < extent * BLOCK_WIDTH)
+        index = index * extent + at.clamp(0, extent * BLOCK_WIDTH - 1) // BLOCK_WIDTH
+        local = local * BLOCK_WIDTH + at % BLOCK_WIDTH
     slot = blocks.table.long()[index]
     inside = inside & (slot >= 0)
     return torch.where(inside, slot * grid.nodes_per_block + local, 0), torch.where(inside, weight, 0)
