@@ -178,27 +178,24 @@ struct HeatSolver {
     else
       sum_to<HeatSum::diagonal>(nullptr, w.v.inverse, all, nothing);
     for_slots(all, [&](int64_t slot, int scene, int64_t first) {
-      NodeSums sums = NodeSums::zero();
+      auto sums = StartSums<T>::zero();
       const double dt = scene < 0 ? 1 : step_of_scene(a, scene);
       for (int n = 0; n < kBlockNodes<D>; n++) sums.add(start_node(a, w.v, first + n, dt, scene >= 0));
-      w.sums[slot] = sums;
+      w.start[slot] = sums;
     });
-    for_scenes(all, [&](int scene, const NodeSums& sums, double) { w.scene[scene] = start_scene(a, scene, sums); });
+    for_scenes(all, w.start, StartSums<double>::zero(),
+               [&](int scene, const StartSums<double>& sums) { w.scene[scene] = start_scene(a, scene, sums); });
   }
 
-  // f(scene, sums, curvature) with what its slots have kept; the order of the sums does not depend on threads.
-  template <class Wanted, class F>
-  void for_scenes(const Wanted& wanted, const F& f) const {
+  // f(scene, sum of what its slots have kept); the order of the sums does not depend on threads.
+  template <class Wanted, class Kept, class Sum, class F>
+  void for_scenes(const Wanted& wanted, const Kept* kept, const Sum& zero, const F& f) const {
     int64_t slot = 0;
     for (int scene = 0; scene < a.topology.scenes; scene++) {
-      NodeSums sums = NodeSums::zero();
-      double curvature = 0;
-      for (; slot < a.topology.capacity && scene_of(slot) <= scene && scene_of(slot) >= 0; slot++) {
-        if (!wanted(scene)) continue;
-        sums.add(w.sums[slot]);
-        curvature += w.curvature[slot] + w.weighted[slot];
-      }
-      if (wanted(scene)) f(scene, sums, curvature);
+      Sum sum = zero;
+      for (; slot < a.topology.capacity && scene_of(slot) <= scene && scene_of(slot) >= 0; slot++)
+        if (wanted(scene)) sum.add(kept[slot]);
+      if (wanted(scene)) f(scene, sum);
     }
   }
 
@@ -211,19 +208,20 @@ struct HeatSolver {
       const T beta = T(w.scene[scene].beta), gamma = T(w.scene[scene].gamma);
       T weighted = 0;
       for (int n = 0; n < kBlockNodes<D>; n++) weighted += direct_node(w.v, first + n, beta, gamma);
-      w.weighted[slot] = weighted;
-      w.curvature[slot] = 0;
+      w.curvature[slot] = {double(weighted)};
     });
-    sum_to<HeatSum::product>(w.v.p, w.v.product, active, [&](int slot, double power) { w.curvature[slot] = power; });
+    sum_to<HeatSum::product>(w.v.p, w.v.product, active,
+                             [&](int slot, double power) { w.curvature[slot].value += power; });
     if (a.method == HeatMethod::conjugate_gradients)
-      for_scenes(active, [&](int scene, const NodeSums&, double curvature) { set_step(w.scene[scene], curvature); });
+      for_scenes(active, w.curvature, Curvature{0},
+                 [&](int scene, const Curvature& sum) { set_step(w.scene[scene], sum.value); });
     for_slots(active, [&](int64_t slot, int scene, int64_t first) {
-      NodeSums sums = NodeSums::zero();
+      auto sums = StepSums<T>::zero();
       const T alpha = T(w.scene[scene].alpha);
       for (int n = 0; n < kBlockNodes<D>; n++) sums.add(update_node(w.v, a.increment, first + n, alpha));
-      w.sums[slot] = sums;
+      w.step[slot] = sums;
     });
-    for_scenes(active, [&](int scene, const NodeSums& sums, double) {
+    for_scenes(active, w.step, StepSums<double>::zero(), [&](int scene, const StepSums<double>& sums) {
       finish_iteration(w.scene[scene], a.method, sums);
     });
     return true;

@@ -5,14 +5,20 @@
 // The work space of a heat solve on the CPU.
 namespace mpm::cpu {
 
+// Part of p · A p.
+struct Curvature {
+  double value;
+  void add(const Curvature& o) { value += o.value; }
+};
+
 template <class T>
 struct HeatWorkspace {
   HeatVectors<T> v;
-  NodeSums* sums;     // [capacity] of each slot
-  double* curvature;  // [capacity] parts of p · A p from the slot's particles
-  double* weighted;   // [capacity] and from its nodes
-  HeatScene* scene;   // [scenes]
-  int64_t size;       // in bytes
+  StartSums<T>* start;   // [capacity] of each slot
+  StepSums<T>* step;     // [capacity]
+  Curvature* curvature;  // [capacity]
+  HeatScene* scene;      // [scenes]
+  int64_t size;          // in bytes
 };
 
 inline namespace TORCH_MPM_ISA {
@@ -29,9 +35,9 @@ HeatWorkspace<T> lay_out_heat(const HeatArguments<T, D>& a, char* start) {
   };
   T** const vectors[] = {&w.v.mass, &w.v.weight, &w.v.inverse, &w.v.r, &w.v.p, &w.v.product};
   for (T** vector : vectors) *vector = reinterpret_cast<T*>(take(nodes * int64_t(sizeof(T))));
-  w.sums = reinterpret_cast<NodeSums*>(take(slots * int64_t(sizeof(NodeSums))));
-  w.curvature = reinterpret_cast<double*>(take(slots * int64_t(sizeof(double))));
-  w.weighted = reinterpret_cast<double*>(take(slots * int64_t(sizeof(double))));
+  w.start = reinterpret_cast<StartSums<T>*>(take(slots * int64_t(sizeof(StartSums<T>))));
+  w.step = reinterpret_cast<StepSums<T>*>(take(slots * int64_t(sizeof(StepSums<T>))));
+  w.curvature = reinterpret_cast<Curvature*>(take(slots * int64_t(sizeof(Curvature))));
   w.scene = reinterpret_cast<HeatScene*>(take(a.topology.scenes * int64_t(sizeof(HeatScene))));
   w.size = used;
   return w;

@@ -63,7 +63,8 @@ template <class T, int D>
 struct HeatWorkspace {
   PackedItems<T, D> packed;
   HeatVectors<T> v;
-  NodeSums* sums;          // [capacity] of each slot
+  StartSums<T>* start;     // [capacity] of each slot
+  StepSums<T>* step;       // [capacity]
   double* item_curvature;  // [items] parts of p · A p
   double* slot_curvature;  // [capacity]
   HeatScene* scene;        // [scenes]
@@ -73,9 +74,9 @@ struct HeatWorkspace {
 
   // `vectors` false: what the operator alone needs.
   HeatWorkspace(const Topology<T, D>& t, void* memory, bool vectors) : size(0) {
-    char* const start = static_cast<char*>(memory);
+    char* const base = static_cast<char*>(memory);
     const auto take = [&](int64_t bytes) {
-      char* p = start + size;
+      char* p = base + size;
       size += (bytes + 255) / 256 * 256;
       return p;
     };
@@ -85,7 +86,8 @@ struct HeatWorkspace {
     if (!vectors) return;
     T** const all[] = {&v.mass, &v.weight, &v.inverse, &v.r, &v.p, &v.product};
     for (T** vector : all) *vector = reinterpret_cast<T*>(take(nodes * sizeof(T)));
-    sums = reinterpret_cast<NodeSums*>(take(t.capacity * sizeof(NodeSums)));
+    start = reinterpret_cast<StartSums<T>*>(take(t.capacity * sizeof(StartSums<T>)));
+    step = reinterpret_cast<StepSums<T>*>(take(t.capacity * sizeof(StepSums<T>)));
     item_curvature = reinterpret_cast<double*>(take(items * sizeof(double)));
     slot_curvature = reinterpret_cast<double*>(take(t.capacity * sizeof(double)));
     scene = reinterpret_cast<HeatScene*>(take(t.scenes * sizeof(HeatScene)));
@@ -96,20 +98,35 @@ struct HeatWorkspace {
 
 __device__ inline int lane_index() { return threadIdx.x % 32; }
 
+// Particles that a lane takes of its cell in each part of a block.
+template <class S>
+struct LaneCounts {
+  int of_part[S::parts];
+
+  template <class I>
+  __device__ explicit LaneCounts(const I* of_cell) {
+    const int lane = lane_index(), slice = lane * S::slices / 32;
+#pragma unroll
+    for (int part = 0; part < S::parts; part++)
+      of_part[part] = (int(of_cell[part * 32 + lane % (32 / S::slices)]) + S::slices - 1 - slice) / S::slices;
+  }
+};
+
 // Calls begin(cell), each(particle) and end(cell) for the cells of an item, a warp's width of them at a time; load(at,
 // cell, rank) gives the particle that lies at `at` in the packed order. All lanes call begin and end.
-template <class S, class Counts, class Load, class Begin, class Each, class End>
-__device__ void walk_cells(const Counts& count, int at, const Load& load, const Begin& begin, const Each& each,
+template <class S, class Load, class Begin, class Each, class End>
+__device__ void walk_cells(const LaneCounts<S>& counts, int at, const Load& load, const Begin& begin, const Each& each,
                            const End& end) {
   const int lane = lane_index(), slice = lane * S::slices / 32;
   const unsigned before = (1u << lane) - 1;
 #pragma unroll 1
   for (int part = 0; part < S::parts; part++) {
-    const int cell = part * 32 + lane % (32 / S::slices);
-    const int mine = (int(count(cell)) + S::slices - 1 - slice) / S::slices;
-    begin(cell);
+    const int cell = part * 32 + lane % (32 / S::slices),
+              mine = part == 0 ? counts.of_part[0] : counts.of_part[S::parts - 1];
     bool has = mine > 0;
     unsigned lanes = __ballot_sync(~0u, has);
+    if (!lanes) continue;
+    begin(cell);
     decltype(load(0, 0, 0)) next;
     if (has) next = load(at + __popc(lanes & before), cell, slice);
 #pragma unroll 1
@@ -176,7 +193,7 @@ __device__ void pack_item(const Topology<T, D>& t, const Columns<const T, D>& x,
     int at, particle;
   };
   walk_cells<S>(
-      [&](int cell) { return m.count[cell]; }, item.begin,
+      LaneCounts<S>(m.count), item.begin,
       [&](int at, int cell, int rank) { return Place{at, t.index[item.begin + m.order[m.start[cell] + rank]]}; },
       nothing,
       [&](const Place& place) {
@@ -190,27 +207,33 @@ __device__ void pack_item(const Topology<T, D>& t, const Columns<const T, D>& x,
   __syncwarp();
 }
 
-// visit(tile entry, node row), for the nodes of a home's tile that have a row.
-template <class S, class T, int D, class Visit>
-__device__ void for_tile(const Topology<T, D>& t, int slot, const Visit& visit) {
-  const int lane = lane_index();
-  const int* const neighbours = schedule_of(t).neighbours + (int64_t(slot) << D);
-  const int slots = lane < 1 << D ? neighbours[lane] : -1;
-#pragma unroll 1
-  for (int first = 0; first < S::tile; first += 32) {
-    const int i = first + lane;
-    int node[D], neighbour = 0;
+// The nodes of a home's tile, in rounds of a warp's width: entry r * 32 + lane of the tile is node row[r], -1 where it
+// is none.
+template <class S>
+struct TileRows {
+  static constexpr int rounds = (S::tile + 31) / 32;
+  int row[rounds];
+
+  template <class T, int D>
+  __device__ TileRows(const Topology<T, D>& t, int slot) {
+    const int lane = lane_index();
+    const int* const neighbours = schedule_of(t).neighbours + (int64_t(slot) << D);
+    const int slots = lane < 1 << D ? neighbours[lane] : -1;
 #pragma unroll
-    for (int axis = D - 1, rest = i; axis >= 0; axis--) {
-      node[axis] = rest % S::width;
-      neighbour |= (node[axis] >= kBlockWidth) << (D - 1 - axis);
-      rest /= S::width;
+    for (int r = 0; r < rounds; r++) {
+      const int i = r * 32 + lane;
+      int node[D], neighbour = 0;
+#pragma unroll
+      for (int axis = D - 1, rest = i; axis >= 0; axis--) {
+        node[axis] = rest % S::width;
+        neighbour |= (node[axis] >= kBlockWidth) << (D - 1 - axis);
+        rest /= S::width;
+      }
+      const int at = __shfl_sync(~0u, slots, neighbour % (1 << D));
+      row[r] = at < 0 || i >= S::tile ? -1 : at * kBlockNodes<D> + node_in_block<D>(node);
     }
-    const int row = __shfl_sync(~0u, slots, neighbour % (1 << D));
-    if (i < S::tile) visit(i, row < 0 ? int64_t(-1) : int64_t(row) * kBlockNodes<D> + node_in_block<D>(node));
   }
-  __syncwarp();
-}
+};
 
 template <class S, class F>
 __device__ void for_support(int cell, const F& f) {
@@ -232,47 +255,58 @@ __device__ T sum_items(const Topology<T, D>& t, const PackedItems<T, D>& packed,
                        T* out, bool in_order, WarpMemory<S>& memory) {
   auto& m = memory.tile;
   const Item* const items = reinterpret_cast<const Item*>(schedule_of(t).items);
-  const int slot = items[number].slot, lane = lane_index();
+  const int lane = lane_index();
+  LaneCounts<S> counts(packed.counts + int64_t(number) * S::cells);
+  const TileRows<S> rows(t, items[number].slot);
+  T loaded[TileRows<S>::rounds];
+  if (Sum == HeatSum::product)
+#pragma unroll
+    for (int r = 0; r < rows.rounds; r++) loaded[r] = rows.row[r] < 0 ? T(0) : u[rows.row[r]];
   __syncwarp();
-  for_tile<S>(t, slot, [&](int i, int64_t row) {
-    if (Sum == HeatSum::product) m.u[i] = row < 0 ? T(0) : u[row];
+#pragma unroll
+  for (int r = 0; r < rows.rounds; r++) {
+    const int i = r * 32 + lane;
+    if (i >= S::tile) continue;
+    if (Sum == HeatSum::product) m.u[i] = loaded[r];
     m.sum[i] = T(0);
-  });
+  }
+  __syncwarp();
   T from[S::nodes], to[S::nodes], power = T(0);
 #pragma unroll 1
-  for (; number < end; number++) {
-    const uint16_t* const counts = packed.counts + int64_t(number) * S::cells;
-    walk_cells<S>([&](int cell) { return counts[cell]; }, items[number].begin,
-                  [&](int at, int, int) { return packed.particles[at]; },
-                  [&](int cell) {
-                    for_support<S>(cell, [&](int k, int i) {
-                      if (Sum == HeatSum::product) from[k] = m.u[i];
-                      to[k] = T(0);
-                    });
-                  },
-                  [&](const PackedParticle<T, D>& q) {
-                    power += add_particle<Sum, S::Order, T, D>(q.f, q.conductance, from, to);
-                  },
-                  [&](int cell) {
-                    // One node of every cell at a time: they differ, so nothing is added twice at once.
-                    for_support<S>(cell, [&](int k, int i) {
-                      T value = to[k];
+  while (true) {
+    walk_cells<S>(
+        counts, items[number].begin, [&](int at, int, int) { return packed.particles[at]; },
+        [&](int cell) {
+          for_support<S>(cell, [&](int k, int i) {
+            if (Sum == HeatSum::product) from[k] = m.u[i];
+            to[k] = T(0);
+          });
+        },
+        [&](const PackedParticle<T, D>& q) {
+          power += add_particle<Sum, S::Order, T, D>(q.f, q.conductance, from, to);
+        },
+        [&](int cell) {
+          // One node of every cell at a time: they differ, so nothing is added twice at once.
+          for_support<S>(cell, [&](int k, int i) {
+            T value = to[k];
 #pragma unroll
-                      for (int o = S::slices / 2; o > 0; o /= 2)
-                        value += __shfl_xor_sync(~0u, value, o * 32 / S::slices);
-                      if (S::slices == 1 || lane < 32 / S::slices) m.sum[i] += value;
-                      __syncwarp();
-                    });
-                  });
+            for (int o = S::slices / 2; o > 0; o /= 2) value += __shfl_xor_sync(~0u, value, o * 32 / S::slices);
+            if (S::slices == 1 || lane < 32 / S::slices) m.sum[i] += value;
+            __syncwarp();
+          });
+        });
+    if (++number >= end) break;
+    counts = LaneCounts<S>(packed.counts + int64_t(number) * S::cells);
   }
-  for_tile<S>(t, slot, [&](int i, int64_t row) {
-    const T value = m.sum[i];
-    if (row < 0 || value == T(0)) return;
+#pragma unroll
+  for (int r = 0; r < rows.rounds; r++) {
+    const T value = rows.row[r] < 0 ? T(0) : m.sum[r * 32 + lane];
+    if (value == T(0)) continue;
     if (in_order)
-      out[row] += value;
+      out[rows.row[r]] += value;
     else
-      atomicAdd(out + row, value);
-  });
+      atomicAdd(out + rows.row[r], value);
+  }
 #pragma unroll
   for (int o = 16; o > 0; o /= 2) power += __shfl_xor_sync(~0u, power, o);
   return power;
@@ -377,30 +411,24 @@ struct HeatKernel {
   __device__ void finish() const;
 };
 
-__device__ inline NodeSums sum_of_warp(NodeSums s) {
+template <class V>
+__device__ V sum_of_warp(V s) {
+  constexpr int words = sizeof(V) / 4;
 #pragma unroll
   for (int o = 16; o > 0; o /= 2) {
-    NodeSums other;
-    other.heat = __shfl_xor_sync(~0u, s.heat, o);
-    other.residual = __shfl_xor_sync(~0u, s.residual, o);
-    other.preconditioned = __shfl_xor_sync(~0u, s.preconditioned, o);
-    other.source = __shfl_xor_sync(~0u, s.source, o);
-    other.open = __shfl_xor_sync(~0u, s.open, o);
-    other.bound = __shfl_xor_sync(~0u, s.bound, o);
-    other.spread = __shfl_xor_sync(~0u, s.spread, o);
+    V other;
+#pragma unroll
+    for (int k = 0; k < words; k++)
+      reinterpret_cast<int*>(&other)[k] = __shfl_xor_sync(~0u, reinterpret_cast<const int*>(&s)[k], o);
     s.add(other);
   }
   return s;
 }
 
-__device__ inline double sum_of_warp(double s) {
-#pragma unroll
-  for (int o = 16; o > 0; o /= 2) s += __shfl_xor_sync(~0u, s, o);
-  return s;
-}
-
-__device__ inline void add_to(NodeSums& a, const NodeSums& b) { a.add(b); }
-__device__ inline void add_to(double& a, double b) { a += b; }
+struct Curvature {
+  double value;
+  __device__ void add(const Curvature& o) { value += o.value; }
+};
 
 // Sum over the threads of a block, in a fixed order; valid in thread 0.
 template <class V>
@@ -411,7 +439,7 @@ __device__ V sum_of_block(V value) {
   if (threadIdx.x % 32 == 0) parts[threadIdx.x / 32] = value;
   __syncthreads();
   if (threadIdx.x == 0)
-    for (int k = 1; k < kHeatWarps; k++) add_to(value, parts[k]);
+    for (int k = 1; k < kHeatWarps; k++) value.add(parts[k]);
   return value;
 }
 
@@ -435,17 +463,17 @@ __device__ void HeatKernel<Order, T, D>::start(WarpMemory<S>& memory) const {
     sum_to<HeatSum::diagonal>(nullptr, w.v.inverse, memory, all, nothing);
   cg::this_grid().sync();
   for_slots([&](int slot, int scene, int64_t first) {
-    NodeSums sums = NodeSums::zero();
+    auto sums = StartSums<T>::zero();
     const double dt = scene < 0 ? 1 : step_of_scene(a, scene);
     for (int n = lane_index(); n < kBlockNodes<D>; n += 32) sums.add(start_node(a, w.v, first + n, dt, scene >= 0));
     sums = sum_of_warp(sums);
-    if (lane_index() == 0) w.sums[slot] = sums;
+    if (lane_index() == 0) w.start[slot] = sums;
   });
   cg::this_grid().sync();
   for_scenes([&](int scene) {
-    NodeSums sums = NodeSums::zero();
+    auto sums = StartSums<double>::zero();
     for (int slot = w.range[scene].slot + threadIdx.x; slot < w.range[scene].slot_end; slot += kHeatThreads)
-      sums.add(w.sums[slot]);
+      sums.add(w.start[slot]);
     sums = sum_of_block(sums);
     if (threadIdx.x > 0) return;
     const HeatScene s = start_scene(a, scene, sums);
@@ -462,8 +490,8 @@ __device__ void HeatKernel<Order, T, D>::iterate(WarpMemory<S>& memory) const {
     const T beta = T(w.scene[scene].beta), gamma = T(w.scene[scene].gamma);
     T weighted = T(0);
     for (int n = lane_index(); n < kBlockNodes<D>; n += 32) weighted += direct_node(w.v, first + n, beta, gamma);
-    const double sum = sum_of_warp(double(weighted));
-    if (lane_index() == 0) w.slot_curvature[slot] = sum;
+    const Curvature sum = sum_of_warp(Curvature{double(weighted)});
+    if (lane_index() == 0) w.slot_curvature[slot] = sum.value;
   });
   cg::this_grid().sync();
   sum_to<HeatSum::product>(
@@ -476,12 +504,12 @@ __device__ void HeatKernel<Order, T, D>::iterate(WarpMemory<S>& memory) const {
     for_scenes([&](int scene) {
       if (!running(scene)) return;
       const SceneRange range = w.range[scene];
-      double sum = 0;
-      for (int i = range.item + threadIdx.x; i < range.item_end; i += kHeatThreads) sum += w.item_curvature[i];
-      for (int i = range.slot + threadIdx.x; i < range.slot_end; i += kHeatThreads) sum += w.slot_curvature[i];
+      Curvature sum{0};
+      for (int i = range.item + threadIdx.x; i < range.item_end; i += kHeatThreads) sum.value += w.item_curvature[i];
+      for (int i = range.slot + threadIdx.x; i < range.slot_end; i += kHeatThreads) sum.value += w.slot_curvature[i];
       sum = sum_of_block(sum);
       if (threadIdx.x > 0) return;
-      set_step(w.scene[scene], sum);
+      set_step(w.scene[scene], sum.value);
       if (!w.scene[scene].running) atomicSub(w.running, 1);
     });
     cg::this_grid().sync();
@@ -490,19 +518,19 @@ __device__ void HeatKernel<Order, T, D>::iterate(WarpMemory<S>& memory) const {
     if (!running(scene)) return;
     const HeatScene& s = w.scene[scene];
     const T alpha = T(s.alpha);
-    NodeSums sums = NodeSums::zero();
+    auto sums = StepSums<T>::zero();
     for (int n = lane_index(); n < kBlockNodes<D>; n += 32) sums.add(update_node(w.v, a.increment, first + n, alpha));
     if (!wants_sums(s, a.method)) return;
     sums = sum_of_warp(sums);
-    if (lane_index() == 0) w.sums[slot] = sums;
+    if (lane_index() == 0) w.step[slot] = sums;
   });
   cg::this_grid().sync();
   for_scenes([&](int scene) {
     if (!running(scene)) return;
-    NodeSums sums = NodeSums::zero();
+    auto sums = StepSums<double>::zero();
     if (wants_sums(w.scene[scene], a.method)) {
       for (int slot = w.range[scene].slot + threadIdx.x; slot < w.range[scene].slot_end; slot += kHeatThreads)
-        sums.add(w.sums[slot]);
+        sums.add(w.step[slot]);
       sums = sum_of_block(sums);
     }
     __syncthreads();  // all have read the scene
@@ -526,8 +554,12 @@ __device__ void HeatKernel<Order, T, D>::finish() const {
     report_scene(a, scene, w.scene[scene]);
 }
 
+// Thread blocks to fit in a multiprocessor at once, which limits registers.
+template <int Order, class T>
+constexpr int kHeatResident = Order == 2 && sizeof(T) == 4 ? 4 : 2;
+
 template <int Order, class T, int D>
-__global__ void __launch_bounds__(kHeatThreads) heat_kernel(const HeatKernel<Order, T, D> kernel) {
+__global__ void __launch_bounds__(kHeatThreads, kHeatResident<Order, T>) heat_kernel(const HeatKernel<Order, T, D> kernel) {
   __shared__ WarpMemory<HeatShape<Order, T, D>> memory[kHeatWarps];
   WarpMemory<HeatShape<Order, T, D>>& own = memory[threadIdx.x / 32];
   kernel.start(own);

@@ -61,21 +61,34 @@ struct HeatVectors {
   T* product;  // H p, zero between the iterations; H θ before the start
 };
 
-// Sums over nodes.
-struct NodeSums {
-  double heat;            // Σ M at the start, Σ M d later
-  double residual;        // Σ r²/M
-  double preconditioned;  // Σ r z
-  double source;          // Σ h
-  double open;            // nodes through which heat leaves
-  double bound;           // largest K / (M/dt + X)
-  double spread;          // largest (M/dt + X) / (M/dt)
+// Sums over nodes after a step.
+template <class V>
+struct StepSums {
+  V heat;            // Σ M d, or Σ M at the start
+  V residual;        // Σ r²/M
+  V preconditioned;  // Σ r z
 
-  MPM_HD static NodeSums zero() { return {0, 0, 0, 0, 0, 0, 0}; }
-  MPM_HD void add(const NodeSums& o) {
+  MPM_HD static StepSums zero() { return {}; }
+  template <class U>
+  MPM_HD void add(const StepSums<U>& o) {
     heat += o.heat;
     residual += o.residual;
     preconditioned += o.preconditioned;
+  }
+};
+
+// And at the start.
+template <class V>
+struct StartSums : StepSums<V> {
+  V source;  // Σ h
+  V open;    // nodes through which heat leaves
+  V bound;   // largest K / (M/dt + X)
+  V spread;  // largest (M/dt + X) / (M/dt)
+
+  MPM_HD static StartSums zero() { return {}; }
+  template <class U>
+  MPM_HD void add(const StartSums<U>& o) {
+    StepSums<V>::add(o);
     source += o.source;
     open += o.open;
     if (!(o.bound <= bound)) bound = o.bound;  // NaN stays
@@ -99,11 +112,11 @@ MPM_HD double step_of_scene(const HeatArguments<T, D>& a, int scene) {
 
 // First right side, with increment zero. `used` is false for rows of unused blocks.
 template <class T, int D>
-MPM_HD NodeSums start_node(const HeatArguments<T, D>& a, const HeatVectors<T>& v, int64_t i, double dt, bool used) {
+MPM_HD StartSums<T> start_node(const HeatArguments<T, D>& a, const HeatVectors<T>& v, int64_t i, double dt, bool used) {
   const T mass = used ? a.capacity[i] : T(0), exchange = a.exchange && used ? a.exchange[i] : T(0);
   const T source = a.source && used ? a.source[i] : T(0);
   const bool material = used && !(mass <= T(0)), held = material && a.fixed && a.fixed[i], free = material && !held;
-  NodeSums sums = NodeSums::zero();
+  auto sums = StartSums<T>::zero();
   const T product = v.product[i], diagonal = v.inverse[i], bound = v.weight[i];
   v.p[i] = v.product[i] = a.increment[i] = v.mass[i] = v.weight[i] = v.inverse[i] = v.r[i] = T(0);
   sums.open = held || (free && exchange != T(0));
@@ -121,7 +134,7 @@ MPM_HD NodeSums start_node(const HeatArguments<T, D>& a, const HeatVectors<T>& v
   sums.preconditioned = r * (r * inverse);
   sums.source = source;
   sums.bound = bound / weight;
-  sums.spread = dt * weight / mass;
+  sums.spread = T(dt) * (weight / mass);
   return sums;
 }
 
@@ -136,10 +149,10 @@ MPM_HD T direct_node(const HeatVectors<T>& v, int64_t i, T beta, T gamma) {
 
 // A step along the direction.
 template <class T>
-MPM_HD NodeSums update_node(const HeatVectors<T>& v, T* increment, int64_t i, T alpha) {
+MPM_HD StepSums<T> update_node(const HeatVectors<T>& v, T* increment, int64_t i, T alpha) {
   const T mass = v.mass[i], p = v.p[i], product = v.product[i] + v.weight[i] * p;
   v.product[i] = T(0);
-  NodeSums sums = NodeSums::zero();
+  auto sums = StepSums<T>::zero();
   if (mass == T(0)) return sums;
   const T d = increment[i] + alpha * p, r = v.r[i] - alpha * product;
   increment[i] = d;
@@ -178,7 +191,7 @@ MPM_HD int chebyshev_count(const HeatScene& s) {
 }
 
 template <class T, int D>
-MPM_HD HeatScene start_scene(const HeatArguments<T, D>& a, int scene, const NodeSums& sums) {
+MPM_HD HeatScene start_scene(const HeatArguments<T, D>& a, int scene, const StartSums<double>& sums) {
   HeatScene s{};
   s.dt = step_of_scene(a, scene);
   s.mass = sums.heat;
@@ -214,7 +227,7 @@ MPM_HD bool wants_sums(const HeatScene& s, HeatMethod method) {
   return method != HeatMethod::chebyshev || s.iterations + 1 >= s.most;
 }
 
-MPM_HD void finish_iteration(HeatScene& s, HeatMethod method, const NodeSums& sums) {
+MPM_HD void finish_iteration(HeatScene& s, HeatMethod method, const StepSums<double>& sums) {
   const bool known = wants_sums(s, method);
   s.iterations++;
   if (known) {
