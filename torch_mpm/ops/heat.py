@@ -10,6 +10,8 @@ from torch import Tensor
 from ..errors import check_like, check_positions, shape_of
 from ..grid import Blocks, inverse_inertia
 from .arguments import refuse_vmap, split_dt
+from .heat_refinement import REDUCTION
+from .heat_refinement import refine as refinement
 from .transfer import TOPOLOGY, _blocks_of
 
 METHODS = {"cg": 0, "chebyshev": 1}  # HeatMethod of csrc/heat/solve.h
@@ -39,6 +41,7 @@ def heat_cg(
     method: str = "cg",
     adjoint_tolerance: float = 1e-6,
     relative_tolerance: float = 0.0,
+    refine: bool = False,
 ) -> HeatSolve:
     """Implicit step of the heat equation on the active nodes, by matrix-free conjugate gradients.
 
@@ -65,6 +68,8 @@ def heat_cg(
         adjoint_tolerance: of the backward solve, relative to the size of its right side.
         relative_tolerance: a residual of this share of the first one will do too. The changes of many small steps add
             up, so that a tolerance in kelvin alone stops too early there.
+        refine: float64 accuracy from float32 data: solves in float32 with residuals in float64 between them. The
+            increment is then float64; `relative_tolerance` has no effect.
 
     Returns:
         HeatSolve(increment, iterations, residual, converged). The increment is zero on fixed nodes, on nodes without
@@ -96,14 +101,30 @@ def heat_cg(
         raise ValueError(f"adjoint_tolerance must be between 0 and 1, got {adjoint_tolerance}")
     if not 0 <= relative_tolerance < 1:
         raise ValueError(f"relative_tolerance must be in [0, 1), got {relative_tolerance}")
-    return HeatSolve(
-        *torch.ops.torch_mpm.heat_cg(
-            x, conductance, capacity, theta, source, exchange, fixed, scene_dt, number,
-            None if scene_tolerance is None else scene_tolerance.to(x.dtype).contiguous(), float(least),
-            float(relative_tolerance), None if scene_limit is None else scene_limit.int().contiguous(), int(most),
-            METHODS[method], adjoint_tolerance, *blocks.topology,
-        )
-    )  # fmt: skip
+    if scene_tolerance is not None:
+        scene_tolerance = scene_tolerance.to(x.dtype).contiguous()
+    if scene_limit is not None:
+        scene_limit = scene_limit.int().contiguous()
+    limits = float(least), relative_tolerance, scene_limit, int(most), METHODS[method], adjoint_tolerance
+    if not refine or x.dtype == torch.float64:
+        return HeatSolve(
+            *torch.ops.torch_mpm.heat_cg(
+                x, conductance, capacity, theta, source, exchange, fixed, scene_dt, number, scene_tolerance, *limits,
+                *blocks.topology,
+            )
+        )  # fmt: skip
+    constant = [None if t is None else t.detach() for t in (x, conductance, capacity, exchange, scene_dt)]
+
+    def solve(right: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        x, conductance, capacity, exchange, scene_dt = constant
+        return torch.ops.torch_mpm.heat_cg(
+            x, conductance, capacity, None, right, exchange, fixed, scene_dt, number, scene_tolerance, limits[0],
+            REDUCTION, *limits[2:], *blocks.topology,
+        )  # fmt: skip
+
+    steps = number * (x.new_ones(grid.scenes) if scene_dt is None else scene_dt)
+    goal = x.new_full((grid.scenes,), least) if scene_tolerance is None else scene_tolerance
+    return HeatSolve(*refinement(blocks, x, conductance, capacity, theta, steps, source, exchange, fixed, goal, solve))
 
 
 def heat_operator(blocks: Blocks, x: Tensor, conductance: Tensor, nodes: Tensor | None) -> Tensor:
