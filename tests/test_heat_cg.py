@@ -12,7 +12,6 @@ import torch_mpm as mpm
 from torch_mpm.ops import heat_operator, scatter
 from torch_mpm.reference import heat as reference
 
-
 NONDETERMINISTIC = 1e-8
 """Atomic sums on CUDA have no order."""
 

@@ -559,7 +559,8 @@ template <int Order, class T>
 constexpr int kHeatResident = Order == 2 && sizeof(T) == 4 ? 4 : 2;
 
 template <int Order, class T, int D>
-__global__ void __launch_bounds__(kHeatThreads, kHeatResident<Order, T>) heat_kernel(const HeatKernel<Order, T, D> kernel) {
+__global__ void __launch_bounds__(kHeatThreads, kHeatResident<Order, T>)
+    heat_kernel(const HeatKernel<Order, T, D> kernel) {
   __shared__ WarpMemory<HeatShape<Order, T, D>> memory[kHeatWarps];
   WarpMemory<HeatShape<Order, T, D>>& own = memory[threadIdx.x / 32];
   kernel.start(own);
