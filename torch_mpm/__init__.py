@@ -12,6 +12,15 @@ from .heat import Heat
 from .materials import CustomLaw, Material, Mixture, NeoHookean, WeaklyCompressible
 from .ops import HeatSolve, advance, g2p, gather, grid_update, heat_cg, p2g, polar, quartic_return_map, scatter, svd3
 from .parameters import PerMaterial, Table
+from .plasticity import (
+    CamClay,
+    CustomPrincipalLaw,
+    FixedCorotated,
+    Hencky,
+    HerschelBulkley,
+    Snow,
+    VonMises,
+)
 from .sand import QuarticSand
 from .state import State
 from .step import Step, rollout
@@ -25,12 +34,17 @@ __all__ = [
     "SDF",
     "Blocks",
     "Box",
+    "CamClay",
     "Capsule",
     "CustomLaw",
+    "CustomPrincipalLaw",
+    "FixedCorotated",
     "Grid",
     "GridOverflowError",
     "Heat",
     "HeatSolve",
+    "Hencky",
+    "HerschelBulkley",
     "Material",
     "Melting",
     "Mixture",
@@ -40,12 +54,14 @@ __all__ = [
     "QuarticSand",
     "Revolved",
     "SimulationError",
+    "Snow",
     "Sphere",
     "State",
     "Step",
     "Table",
     "ThermalExpansion",
     "Trajectory",
+    "VonMises",
     "Walls",
     "WeaklyCompressible",
     "advance",

@@ -34,6 +34,7 @@ class Material(nn.Module):
         state_fields: fields of the state that a step moves for the law: "F" or "J".
         extra_fields: tensors [P] of state.extra that the law keeps from step to step, zero at first: its history.
         viscous: whether the stress reads state.C, so that a step has to keep it.
+        rate_dependent: whether `update` reads state.dt, the time step [s], which a step then adds to the state.
         dissipation: whether somebody wants "dissipated" from `update`, which costs something. A step with plastic
             heating sets it on its law and on those inside.
     """
@@ -41,6 +42,7 @@ class Material(nn.Module):
     state_fields: tuple[str, ...] = ("F",)
     extra_fields: tuple[str, ...] = ()
     viscous: bool = False
+    rate_dependent: bool = False
     dissipation: bool = False
 
     def update(self, state: State) -> tuple[dict[str, Tensor], Tensor]:
@@ -425,7 +427,7 @@ class _Part:
 
     def __getattr__(self, name: str) -> Any:
         value = getattr(self._state, name)
-        if isinstance(value, Tensor):
+        if isinstance(value, Tensor) and name != "dt":  # which is that of the scenes
             value = _take(value, self.index)
             setattr(self, name, value)
         elif name == "extra":

@@ -17,6 +17,7 @@ from .grid import Blocks, Grid
 from .heat import Heat
 from .materials import Material
 from .ops import advance, contact, fusible, g2p, gather, grid_update, p2g
+from .parameters import With
 from .state import State, identity_deformation
 
 TRANSFERS = ("apic", "pic", "flip")
@@ -82,6 +83,7 @@ class Step(nn.Module):
         self.stress_form = stress_form
         self.on_grid = on_grid
         self.heat = heat
+        self._rate_dependent = any(getattr(part, "rate_dependent", False) for part in law.modules())
         if heat is not None and heat.plastic_heating:
             for part in law.modules():
                 if isinstance(part, Material):
@@ -106,7 +108,7 @@ class Step(nn.Module):
         blocks = grid.activate(state.x, scene, self.status)
         self.status = blocks.status
         grid.watch(blocks.status)
-        fields, stress = self.law.update(state)
+        fields, stress = self.law.update(With(state, dt=dt) if self._rate_dependent else state)  # type: ignore[arg-type]
         dissipated = fields.pop("dissipated", None)
         if self.law.extra_fields:
             history = {name: fields.pop(name) for name in self.law.extra_fields if name in fields}

@@ -6,6 +6,7 @@ from .contact import contact, fusible
 from .grid_update import grid_update
 from .heat import HeatSolve, heat_cg, heat_operator
 from .material import material_energy, material_stiffness, material_stress, material_wave_modulus
+from .principal import principal_energy, principal_stiffness, principal_update, principal_wave_modulus
 from .sand import quartic_energy, quartic_return_map, quartic_stiffness, quartic_stress
 from .svd import polar, svd3
 from .transfer import g2p, gather, p2g, scatter
@@ -26,6 +27,10 @@ __all__ = [
     "material_wave_modulus",
     "p2g",
     "polar",
+    "principal_energy",
+    "principal_stiffness",
+    "principal_update",
+    "principal_wave_modulus",
     "quartic_energy",
     "quartic_return_map",
     "quartic_stiffness",

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .. import boundaries, materials, seed
+from .. import boundaries, materials, plasticity, seed
 from ..grid import Grid
 from ..sand import QuarticSand
 from ..state import State
@@ -27,7 +27,7 @@ class Material:
     """A material of one scene: its words, the index of its scene, and its place among the laws of the step."""
 
     name: str
-    words: schema.NeoHookean | schema.WeaklyCompressible | schema.QuarticSand
+    words: schema.NeoHookean | schema.WeaklyCompressible | schema.QuarticSand | schema.Solid
     scene: int
 
 
@@ -211,6 +211,9 @@ class _Mixture:
             return materials.NeoHookean(E=value("E"), nu=value("nu"))
         if isinstance(words, schema.WeaklyCompressible):
             return materials.WeaklyCompressible(value("bulk_modulus"), value("gamma"), value("viscosity"))
+        if isinstance(words, schema.Solid):
+            law = getattr(plasticity, type(words).__name__)
+            return law(**{name: value(name) for name in type(words).model_fields if name not in ("law", "density")})
         moduli = {name: value(name) for name in ("E", "nu", "mu", "lam") if getattr(words, name) is not None}
         return QuarticSand(
             **moduli,

@@ -170,7 +170,103 @@ class QuarticSand(Thermal):
         return self
 
 
-Material = Annotated[NeoHookean | WeaklyCompressible | QuarticSand, Field(discriminator="law")]
+class Solid(Model):
+    """What the laws in principal strains share."""
+
+    law: str
+    """name of the law"""
+    density: Positive = 1000.0
+    """density at rest [kg/m^3]"""
+    E: Positive
+    """Young's modulus [Pa]"""
+    nu: Annotated[float, Field(gt=-1, lt=0.5)] = 0.3
+    """Poisson's ratio, between -1 and 0.5"""
+
+
+class FixedCorotated(Solid):
+    """Elastic solid with the fixed corotated energy."""
+
+    law: Literal["fixed_corotated"] = "fixed_corotated"
+    """name of the law"""
+
+
+class Hencky(Solid):
+    """Elastic solid, linear in logarithmic strains."""
+
+    law: Literal["hencky"] = "hencky"
+    """name of the law"""
+
+
+class VonMises(Solid):
+    """Metal: plastic beyond a shear strength."""
+
+    law: Literal["von_mises"] = "von_mises"
+    """name of the law"""
+    yield_stress: NotNegative
+    """yield stress in uniaxial tension [Pa]"""
+    hardening: NotNegative = 0.0
+    """plastic modulus [Pa]: slope of the yield stress over the plastic strain"""
+
+
+class HerschelBulkley(Solid):
+    """Mud, foam, paint: flows beyond a yield stress."""
+
+    law: Literal["herschel_bulkley"] = "herschel_bulkley"
+    """name of the law"""
+    yield_stress: NotNegative
+    """yield stress in shear [Pa]"""
+    consistency: NotNegative
+    """consistency [Pa s^n]: the viscosity where exponent = 1 (Bingham)"""
+    exponent: Positive = 1.0
+    """exponent n of the shear rate: below 1 shear thinning"""
+
+
+class Snow(Solid):
+    """Snow that hardens when it is compacted (Stomakhin et al. 2013)."""
+
+    law: Literal["snow"] = "snow"
+    """name of the law"""
+    density: Positive = 400.0
+    """density at rest [kg/m^3]"""
+    E: Positive = 1.4e5
+    """Young's modulus of fresh snow [Pa]"""
+    nu: Annotated[float, Field(gt=-1, lt=0.5)] = 0.2
+    """Poisson's ratio, between -1 and 0.5"""
+    critical_compression: Annotated[float, Field(ge=0, lt=1)] = 0.025
+    """compression beyond which it yields"""
+    critical_stretch: NotNegative = 0.0075
+    """stretch beyond which it yields: smaller is more brittle"""
+    hardening: NotNegative = 10.0
+    """growth of the stiffness with plastic compaction"""
+
+
+class CamClay(Solid):
+    """Clay or dense snow: modified Cam-Clay with cohesion."""
+
+    law: Literal["cam_clay"] = "cam_clay"
+    """name of the law"""
+    critical_slope: Positive
+    """ratio of shear stress to pressure in the critical state"""
+    consolidation: Positive
+    """preconsolidation pressure [Pa]"""
+    hardening: Positive
+    """growth of the logarithm of the consolidation pressure with plastic compaction"""
+    cohesion: Annotated[float, Field(ge=0, le=1)] = 0.0
+    """isotropic tensile strength over the consolidation pressure"""
+
+
+Material = Annotated[
+    NeoHookean
+    | WeaklyCompressible
+    | QuarticSand
+    | FixedCorotated
+    | Hencky
+    | VonMises
+    | HerschelBulkley
+    | Snow
+    | CamClay,
+    Field(discriminator="law"),
+]
 
 
 # ---- bodies
