@@ -213,7 +213,8 @@ class _Mixture:
             return materials.WeaklyCompressible(value("bulk_modulus"), value("gamma"), value("viscosity"))
         if isinstance(words, schema.Solid):
             law = getattr(plasticity, type(words).__name__)
-            return law(**{name: value(name) for name in type(words).model_fields if name not in ("law", "density")})
+            others = {"law", "density", *schema.Thermal.model_fields}
+            return law(**{name: value(name) for name in type(words).model_fields if name not in others})
         moduli = {name: value(name) for name in ("E", "nu", "mu", "lam") if getattr(words, name) is not None}
         return QuarticSand(
             **moduli,

@@ -170,14 +170,14 @@ class QuarticSand(Thermal):
         return self
 
 
-class Solid(Model):
+class Solid(Thermal):
     """What the laws in principal strains share."""
 
     law: str
     """name of the law"""
     density: Positive = 1000.0
     """density at rest [kg/m^3]"""
-    E: Positive
+    E: Positive | Curve
     """Young's modulus [Pa]"""
     nu: Annotated[float, Field(gt=-1, lt=0.5)] = 0.3
     """Poisson's ratio, between -1 and 0.5"""
@@ -228,7 +228,7 @@ class Snow(Solid):
     """name of the law"""
     density: Positive = 400.0
     """density at rest [kg/m^3]"""
-    E: Positive = 1.4e5
+    E: Positive | Curve = 1.4e5
     """Young's modulus of fresh snow [Pa]"""
     nu: Annotated[float, Field(gt=-1, lt=0.5)] = 0.2
     """Poisson's ratio, between -1 and 0.5"""

@@ -1,0 +1,96 @@
+"""Times of the laws: `python -m benchmarks.speed.laws [--device cuda]`.
+
+float32, 3-D, structure of arrays, states of which about half flow: return map with stress and history, with the
+dissipated energy, and its backward pass with the gradients of F, parameters and history. The ratio is to a copy of as
+many bytes as the update must read and write.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import torch
+
+import torch_mpm as mpm  # noqa: F401  (registers the ops)
+from torch_mpm.reference.principal import LAWS
+
+from .. import common
+from .svd import structure_of_arrays
+from .timing import Clock, copy_bandwidth
+
+SIZES = {"cpu": 100_000, "cuda": 1_000_000}
+PARAMETERS: dict[str, tuple[float, ...]] = {
+    "hencky": (4e4, 6e4),
+    "fixed_corotated": (4e4, 6e4),
+    "von_mises": (4e4, 6e4, 6e3, 1e3),
+    "herschel_bulkley": (4e4, 6e4, 2.5e3, 20.0, 0.5, 1e-4),
+    "snow": (4e4, 6e4, 0.1, 0.1, 10.0),
+    "cam_clay": (4e4, 6e4, 1.2, 1e4, 10.0, 0.3),
+}
+
+
+def times(device: str, count: int, clock: Clock, bandwidth: float) -> Iterator[dict[str, Any]]:
+    """One row per law: milliseconds of update and backward, the share of particles that flow."""
+    noise = torch.randn(count, 3, 3, generator=torch.Generator().manual_seed(0))
+    F = structure_of_arrays((torch.eye(3) + 0.05 * noise).to(device))
+    ops, grad = torch.ops.torch_mpm, torch.randn_like(F)
+    for law, values in PARAMETERS.items():
+        parameters = [torch.tensor(v, device=device) for v in values]
+        history = [torch.zeros(count, device=device) for _ in LAWS[law].history]
+        given = (F, parameters, history, None, law)
+        plastic = LAWS[law].flow is not None
+        grad_history = torch.ones(len(history), count, device=device).T
+        adjoint = (grad if plastic else None, grad, grad_history, None)
+        runs: tuple[tuple[str, Callable[[], object]], ...] = (
+            ("update", lambda given=given: ops.principal_update(*given, False)),
+            ("with details", lambda given=given: ops.principal_update(*given, True)),
+            ("backward", lambda given=given, a=adjoint: ops.principal_update_backward(*a, *given, 7)),
+            ("stiffness", lambda given=given: ops.principal_stiffness(*given)),
+        )
+        row: dict[str, Any] = {
+            "law": law,
+            "flowing": float((ops.principal_update(*given, True)[4] == 1).float().mean()),
+        }
+        for name, run in runs:
+            row[name] = clock.op(run).ms
+        moved = 4 * count * (18 + 9 * plastic + 2 * len(history))
+        row["copies"] = row["update"] / (moved / bandwidth * 1e-6)
+        row["backward / update"] = row["backward"] / row["update"]
+        yield row
+
+
+def text(result: dict[str, Any]) -> str:
+    columns = ("law", "flowing", "update", "with details", "backward", "stiffness", "copies", "backward / update")
+    header = [f"{c} [ms]" if c in ("update", "with details", "backward", "stiffness") else c for c in columns]
+    table = common.table(header, [[row[c] for c in columns] for row in result["laws"]])
+    title = f"# Laws in principal strains, {result['particles']} particles, copy {result['bandwidth']:.0f} GB/s"
+    return "\n\n".join((title, common.describe(result["environment"]), table))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--device", default="cpu", choices=["cpu", "cuda"])
+    parser.add_argument("--quick", action="store_true", help="a small size, to see that it works")
+    parser.add_argument("--out", type=Path, default=common.RESULTS)
+    arguments = parser.parse_args()
+    device, count = arguments.device, 2000 if arguments.quick else SIZES[arguments.device]
+    if device == "cpu":
+        common.use_all_cores()
+    clock = Clock(device, **({"samples": 3, "budget": 0.1} if arguments.quick else {}))
+    with clock, torch.no_grad():
+        bandwidth = copy_bandwidth(clock, 16 if arguments.quick else 256 if device == "cpu" else 1024)
+        result: dict[str, Any] = {
+            "environment": common.environment(device),
+            "particles": count,
+            "bandwidth": bandwidth,
+            "laws": list(times(device, count, clock, bandwidth)),
+        }
+    print(text(result))
+    common.write(arguments.out, f"laws_{common.slug(result['environment']['device'])}", result, text(result))
+
+
+if __name__ == "__main__":
+    main()
