@@ -19,6 +19,8 @@ namespace mpm::cuda {
 namespace cg = cooperative_groups;
 
 constexpr int kHeatThreads = 128, kHeatWarps = kHeatThreads / 32;
+template <int D>
+constexpr int kSlotLanes = kBlockNodes<D> / 4;  // that share the nodes of a slot
 
 template <int Order_, class T_, int D_>
 struct HeatShape {
@@ -380,13 +382,20 @@ struct HeatKernel {
     return {item(scene), item(scene + 1), slot(scene), slot(scene + 1)};
   }
 
-  // f(slot, scene, first node) by one warp per slot.
+  // f(slot, scene, first node): a slot takes kSlotLanes lanes, and a lane every kSlotLanes-th node from its first on.
   template <class F>
   __device__ void for_slots(const F& f) const {
-    const int warps = gridDim.x * kHeatWarps;
-    for (int slot = blockIdx.x + threadIdx.x / 32 * gridDim.x; slot < a.topology.capacity; slot += warps)
-      f(slot, scene_of_slot(slot), int64_t(slot) * kBlockNodes<D>);
+    constexpr int lanes = kSlotLanes<D>, slots = 32 / lanes;
+    const int warp = blockIdx.x + threadIdx.x / 32 * gridDim.x, stride = gridDim.x * kHeatWarps * slots;
+    for (int slot = warp * slots + lane_index() / lanes; slot < a.topology.capacity; slot += stride)
+      f(slot, scene_of_slot(slot), int64_t(slot) * kBlockNodes<D> + lane_index() % lanes);
   }
+  template <class F>
+  __device__ static void for_nodes(int64_t first, const F& f) {
+#pragma unroll
+    for (int n = 0; n < kBlockNodes<D>; n += kSlotLanes<D>) f(first + n);
+  }
+  __device__ static bool is_first_lane() { return lane_index() % kSlotLanes<D> == 0; }
   // f(scene) by one block of threads per scene.
   template <class F>
   __device__ void for_scenes(const F& f) const {
@@ -411,15 +420,17 @@ struct HeatKernel {
   __device__ void finish() const;
 };
 
-template <class V>
-__device__ V sum_of_warp(V s) {
+// Sum over neighbouring lanes, in each of them.
+template <int Lanes, class V>
+__device__ V sum_of_lanes(V s) {
   constexpr int words = sizeof(V) / 4;
+  const unsigned mask = Lanes == 32 ? ~0u : ((1u << Lanes % 32) - 1) << lane_index() / Lanes * Lanes;
 #pragma unroll
-  for (int o = 16; o > 0; o /= 2) {
+  for (int o = Lanes / 2; o > 0; o /= 2) {
     V other;
 #pragma unroll
     for (int k = 0; k < words; k++)
-      reinterpret_cast<int*>(&other)[k] = __shfl_xor_sync(~0u, reinterpret_cast<const int*>(&s)[k], o);
+      reinterpret_cast<int*>(&other)[k] = __shfl_xor_sync(mask, reinterpret_cast<const int*>(&s)[k], o);
     s.add(other);
   }
   return s;
@@ -434,7 +445,7 @@ struct Curvature {
 template <class V>
 __device__ V sum_of_block(V value) {
   __shared__ V parts[kHeatWarps];
-  value = sum_of_warp(value);
+  value = sum_of_lanes<32>(value);
   __syncthreads();
   if (threadIdx.x % 32 == 0) parts[threadIdx.x / 32] = value;
   __syncthreads();
@@ -465,9 +476,9 @@ __device__ void HeatKernel<Order, T, D>::start(WarpMemory<S>& memory) const {
   for_slots([&](int slot, int scene, int64_t first) {
     auto sums = StartSums<T>::zero();
     const double dt = scene < 0 ? 1 : step_of_scene(a, scene);
-    for (int n = lane_index(); n < kBlockNodes<D>; n += 32) sums.add(start_node(a, w.v, first + n, dt, scene >= 0));
-    sums = sum_of_warp(sums);
-    if (lane_index() == 0) w.start[slot] = sums;
+    for_nodes(first, [&](int64_t i) { sums.add(start_node(a, w.v, i, dt, scene >= 0)); });
+    sums = sum_of_lanes<kSlotLanes<D>>(sums);
+    if (is_first_lane()) w.start[slot] = sums;
   });
   cg::this_grid().sync();
   for_scenes([&](int scene) {
@@ -489,9 +500,9 @@ __device__ void HeatKernel<Order, T, D>::iterate(WarpMemory<S>& memory) const {
     if (!running(scene)) return;
     const T beta = T(w.scene[scene].beta), gamma = T(w.scene[scene].gamma);
     T weighted = T(0);
-    for (int n = lane_index(); n < kBlockNodes<D>; n += 32) weighted += direct_node(w.v, first + n, beta, gamma);
-    const Curvature sum = sum_of_warp(Curvature{double(weighted)});
-    if (lane_index() == 0) w.slot_curvature[slot] = sum.value;
+    for_nodes(first, [&](int64_t i) { weighted += direct_node(w.v, i, beta, gamma); });
+    const Curvature sum = sum_of_lanes<kSlotLanes<D>>(Curvature{double(weighted)});
+    if (is_first_lane()) w.slot_curvature[slot] = sum.value;
   });
   cg::this_grid().sync();
   sum_to<HeatSum::product>(
@@ -519,10 +530,10 @@ __device__ void HeatKernel<Order, T, D>::iterate(WarpMemory<S>& memory) const {
     const HeatScene& s = w.scene[scene];
     const T alpha = T(s.alpha);
     auto sums = StepSums<T>::zero();
-    for (int n = lane_index(); n < kBlockNodes<D>; n += 32) sums.add(update_node(w.v, a.increment, first + n, alpha));
+    for_nodes(first, [&](int64_t i) { sums.add(update_node(w.v, a.increment, i, alpha)); });
     if (!wants_sums(s, a.method)) return;
-    sums = sum_of_warp(sums);
-    if (lane_index() == 0) w.step[slot] = sums;
+    sums = sum_of_lanes<kSlotLanes<D>>(sums);
+    if (is_first_lane()) w.step[slot] = sums;
   });
   cg::this_grid().sync();
   for_scenes([&](int scene) {
@@ -546,8 +557,9 @@ __device__ void HeatKernel<Order, T, D>::finish() const {
   for_slots([&](int, int scene, int64_t first) {
     if (scene < 0) return;
     const T shift = T(energy_shift(w.scene[scene]));
-    for (int n = lane_index(); n < kBlockNodes<D>; n += 32)
-      if (w.v.mass[first + n] != T(0)) a.increment[first + n] += shift;
+    for_nodes(first, [&](int64_t i) {
+      if (w.v.mass[i] != T(0)) a.increment[i] += shift;
+    });
   });
   for (int scene = blockIdx.x * kHeatThreads + threadIdx.x; scene < a.topology.scenes;
        scene += gridDim.x * kHeatThreads)
@@ -556,7 +568,7 @@ __device__ void HeatKernel<Order, T, D>::finish() const {
 
 // Thread blocks to fit in a multiprocessor at once, which limits registers.
 template <int Order, class T>
-constexpr int kHeatResident = Order == 2 && sizeof(T) == 4 ? 4 : 2;
+constexpr int kHeatResident = Order == 2 && sizeof(T) == 4 ? 5 : 2;
 
 template <int Order, class T, int D>
 __global__ void __launch_bounds__(kHeatThreads, kHeatResident<Order, T>)
