@@ -18,6 +18,7 @@ from . import common
 PROGRAMS = (
     "benchmarks.speed.step",
     "benchmarks.speed.svd",
+    "benchmarks.speed.heat",
     "benchmarks.accuracy.precision",
     "benchmarks.accuracy.convergence",
     "benchmarks.accuracy.heat",
@@ -26,12 +27,14 @@ PROGRAMS = (
     "benchmarks.accuracy.ritter",
     "benchmarks.accuracy.runout",
     "benchmarks.stability.stable_dt",
+    "benchmarks.stability.heat",
     "benchmarks.stability.sand",
     "benchmarks.stability.collapse",
 )
 ON_DEVICE = (
     "benchmarks.speed.step",
     "benchmarks.speed.svd",
+    "benchmarks.speed.heat",
     "benchmarks.accuracy.ritter",
     "benchmarks.accuracy.runout",
     "benchmarks.stability.collapse",
