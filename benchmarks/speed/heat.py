@@ -41,11 +41,13 @@ class Problem:
         x = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3).repeat(scenes, 1)
         x = x + 0.2 * self.dx * (torch.rand_like(x) - 0.5)
         grid = mpm.Grid(dx=self.dx, lower=(0, 0, 0), upper=(1, 1, 1), scenes=scenes)
-        self.scene = torch.arange(scenes, dtype=torch.int32, device=device).repeat_interleave(side**3)
+        scene = None
         if scenes == 1:
-            x = x[grid.activate(x, self.scene).index.long()]
+            x = x[grid.activate(x).index.long()]
+        else:
+            scene = torch.arange(scenes, dtype=torch.int32, device=device).repeat_interleave(side**3)
         self.x = x.T.contiguous().T
-        self.blocks = grid.activate(self.x, self.scene)
+        self.blocks = grid.activate(self.x, scene)
         self.conductance = torch.full_like(self.x[:, 0], self.dx**3 / 8)
         self.capacity = scatter(self.blocks, self.x, self.conductance[:, None])[:, 0]
         self.theta = torch.rand_like(self.capacity)
