@@ -217,7 +217,7 @@ def test_a_step_takes_both_ways(dim, device):
 @pytest.mark.cuda
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 def test_a_step_with_obstacles_is_captured(dim):
-    grid = mpm.Grid(0.1, (0.0,) * dim, (1.0,) * dim, capacity=200)
+    grid = mpm.Grid(0.1, (0.0,) * dim, (1.0,) * dim, capacity=5**dim)
     state = mpm.State.at_rest(mpm.seed.box((0.2,) * dim, (0.8,) * dim, grid), 1000.0, (1.0,) * dim, device="cuda")
     sdf = mpm.SDF(lambda x: x.norm(dim=1) - 0.1, (0.4,) * dim)
     step = mpm.Step(grid, mpm.NeoHookean(E=1e4, nu=0.3), walls="mirror", boundaries=[*shapes(dim), sdf], transfer="pic")
