@@ -168,6 +168,53 @@ def collapse(result: dict[str, Any]) -> str:
     return "\n\n".join([intro, common.table(header, rows)])
 
 
+def small_matrices(results: list[dict[str, Any]]) -> str:
+    """Times of the decomposition and of the return map."""
+    names = list(dict.fromkeys(row["name"] for result in results for row in result["times"]))
+    header = ("ns per matrix", *(result["environment"]["device"] for result in results))
+    times = [{row["name"]: row["ns"] for row in result["times"]} for result in results]
+    intro = "float32, 3-D, deformations I + 0.1 G, whole op. Sand at a friction angle where all branches occur."
+    notes = [f"- {common.describe(result['environment'])}" for result in results]
+    rows = [[name, *(t.get(name) for t in times)] for name in names]
+    return "\n".join([intro, "", common.table(header, rows), "", *notes])
+
+
+def svd_accuracy(result: dict[str, Any]) -> str:
+    """Errors of decompositions."""
+    methods = list(result["rows"][0]["errors"])
+    measures = ("singular values", "product")
+    header = ("matrices", *(f"{m}: {measure}" for measure in measures for m in methods))
+    rows = [
+        [row["matrices"], *(row["errors"][m][measure][1] for measure in measures for m in methods)]
+        for row in result["rows"]
+    ]
+    intro = (
+        "float32, the largest of 20 thousand matrices each: error of a singular value relative to itself, and of "
+        "U diag(σ) Vᵀ relative to the largest singular value. Medians: benchmarks/results/svd_accuracy.md."
+    )
+    return "\n".join([intro, "", common.table(header, rows)])
+
+
+def sand_accuracy(result: dict[str, Any]) -> str:
+    """Errors of the return map."""
+    header = ("case", "states on the cone", "error of h", "error over condition", "allowed", "wrong branches")
+    rows = [
+        (
+            f"{row['energy']}, {row['flow']} flow, {name}", row[name]["on the cone"], row[name]["error"][2],
+            row[name]["error over condition"][2], row[name]["allowed"], row[name]["wrong branches"],
+        )
+        for row in result["rows"]
+        for name in ("float32", "float64")
+    ]  # fmt: skip
+    worst = max(row["reference against 50 digits"] for row in result["rows"])
+    intro = (
+        "The return map against extended precision (benchmarks/accuracy/sand.py): mean strains 1e-8 to 0.5, overshoot "
+        "1e-3 to 1e4, all Lode angles, φ 1° to 60°, ν 0 to 0.49; largest errors. The reference itself differs from 50 "
+        f"digits by at most {worst:.0e} over the condition."
+    )
+    return "\n".join([intro, "", common.table(header, rows)])
+
+
 def heat(result: dict[str, Any]) -> str:
     """Errors of conduction and melting against analytic solutions."""
     forms = [("quadratic", name) for name in ("hybrid", "apic", "flip", "pic")] + [("cubic", "hybrid")]
@@ -197,12 +244,16 @@ def summary(directory: Path) -> str:
     sections = []
     if speeds := [json.loads(file.read_text()) for file in sorted(directory.glob("speed_*.json"))]:
         sections.append("### Speed\n\n" + speed(speeds))
+    if times := [json.loads(file.read_text()) for file in sorted(directory.glob("svd_*_*.json"))]:
+        sections.append("### Small matrices and sand\n\n" + small_matrices(times))
     for name, title, section in (
         ("convergence", "Convergence", convergence),
         ("ritter", "Dam break", dam_break),
         ("heat", "Heat", heat),
         ("precision", "Precision", precision),
         ("stability", "Stability", stability),
+        ("svd_accuracy", "Singular values", svd_accuracy),
+        ("sand_accuracy", "Sand: return map", sand_accuracy),
         ("runout", "Sand: run-out of columns", runout),
         ("collapse", "Sand: long runs", collapse),
     ):

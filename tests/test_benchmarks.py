@@ -168,3 +168,22 @@ def test_report_has_every_section_and_goes_between_its_marks(tmp_path: Path) -> 
     assert document.startswith("before") and document.endswith("after") and "old" not in document and "4.0x" in document
     with pytest.raises(ValueError, match="needs the lines"):
         report.insert("no marks", tables)
+
+
+def test_return_map_of_sand_against_extended_precision(tmp_path: Path) -> None:
+    for package in ("matplotlib", "mpmath", "torch_mpm._math"):
+        pytest.importorskip(package)
+    run_quick("benchmarks.accuracy.sand", tmp_path)
+    for row in result(tmp_path, "sand_accuracy.json")["rows"]:
+        assert row["reference against 50 digits"] < 1e-18
+        for name in ("float32", "float64"):
+            found = row[name]
+            assert found["on the cone"] > 1500
+            assert found["error over condition"][2] < found["allowed"]
+            assert found["wrong branches"] == 0
+
+
+def test_svd_program(tmp_path: Path) -> None:
+    run_quick("benchmarks.accuracy.svd", tmp_path)
+    for row in result(tmp_path, "svd_accuracy.json")["rows"]:
+        assert row["errors"]["svd3"]["product"][1] < 1e-6

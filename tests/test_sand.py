@@ -523,31 +523,39 @@ def test_gradient_at_the_identity(device, dim):
     for energy in ENERGIES:
         result = quartic_return_map(F, mu, lam, 0.5, energy=energy)
         (through_F,) = torch.autograd.grad((result.F * G).sum(), F, retain_graph=True)
-        assert torch.allclose(through_F[0], G)
+        assert torch.allclose(through_F[0], G, rtol=1e-6)
         (through_stress,) = torch.autograd.grad((result.stress * G).sum(), F)
         linear = mu * (G + G.T) + lam * G.trace() * torch.eye(dim, device=device)
-        assert torch.allclose(through_stress[0], linear if energy == "hencky" else 0 * linear, rtol=1e-5)
+        assert torch.allclose(through_stress[0], linear if energy == "hencky" else 0 * linear, rtol=1e-6)
 
 
 @pytest.mark.parametrize("gap", [1e-2, 1e-4, 1e-6, 0.0])
-@pytest.mark.parametrize("energy", ["full", "unilateral", "hencky"])
-def test_gradients_in_float32_at_nearly_equal_stretches(device, energy, gap):
-    """On the cone, with two stretches that differ by `gap`."""
-    count = 200
+@pytest.mark.parametrize(
+    ("energy", "flow"),
+    [("full", "radial"), ("unilateral", "radial"), ("hencky", "radial"), ("full", "exact"), ("unilateral", "exact")],
+)
+def test_gradients_in_float32_at_nearly_equal_stretches(device, energy, flow, gap):
+    """On the cone, with two stretches that differ by `gap`: the error is that of one unit in the last place of F."""
+    count = 500
     h = torch.tensor([[-0.2, -0.2 - gap, 0.2]], dtype=torch.float64).repeat(count, 1)
     F = deformation(h).float()
     weights = torch.randn(2, count, 3, 3)
-    grads = []
-    for dtype in (torch.float32, torch.float64):
-        leaf = F.to(device, dtype).requires_grad_()
-        result = quartic_return_map(leaf, 1.0, 1.5, 0.2, energy=energy)
+
+    def gradient(F: Tensor) -> Tensor:
+        leaf = F.to(device).requires_grad_()
+        result = quartic_return_map(leaf, 1.0, 1.5, 0.2, energy=energy, flow=flow)
         assert bool((result.branch == CONE).all())
-        loss = (result.F * weights[0].to(device, dtype)).sum() + (result.stress * weights[1].to(device, dtype)).sum()
+        loss = (result.F * weights[0].to(leaf)).sum() + (result.stress * weights[1].to(leaf)).sum()
         (grad,) = torch.autograd.grad(loss, leaf)
-        grads.append(grad.double())
-    errors = (grads[0] - grads[1]).norm(dim=(1, 2)) / grads[1].norm(dim=(1, 2))
-    assert float(errors.max()) < 2e-5
-    assert float(errors.median()) < 2e-6
+        return grad.double().cpu()
+
+    exact = gradient(F.double())
+    neighbour = torch.nextafter(F, torch.where(torch.rand_like(F) < 0.5, -torch.inf, torch.inf))
+    found, inherent = (
+        (g - exact).norm(dim=(1, 2)) / exact.norm(dim=(1, 2)) for g in (gradient(F), gradient(neighbour.double()))
+    )
+    assert float(found.median()) < 1.5 * float(inherent.median()) + 2e-7
+    assert float(found.max()) < 2 * float(inherent.max()) + 2e-6
 
 
 def test_what_is_not_differentiable_says_so(device):
@@ -744,7 +752,7 @@ def test_law_with_history(device, flow):
     assert float(lost.min()) >= 0
     assert float(lost.max()) > 1e-3
     for name, value in end.extra.items():
-        assert torch.equal(value, ends["mixed"].extra[name])
+        assert torch.allclose(value, ends["mixed"].extra[name], rtol=1e-6, atol=1e-9)
     fields, _ = law.update(end)
     again = law.return_map(end, details=True)
     assert torch.equal(fields["hardening"], end.extra["hardening"] + again.multiplier)

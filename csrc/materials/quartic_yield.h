@@ -17,6 +17,7 @@ struct RootFinding<float> {
   static constexpr int most_steps = 40;
   static constexpr double tolerance = 3e-5;   // of the last step, relative: the error after it is its square
   static constexpr double rounding = 2e-6;    // of y, relative to its terms
+  static constexpr double resolution = 5e-7;  // of a direction
   static constexpr double most_radius = 1e6;  // |s| where y has the sign of its limit, and its powers do not overflow
 };
 template <>
@@ -24,6 +25,7 @@ struct RootFinding<double> {
   static constexpr int most_steps = 64;
   static constexpr double tolerance = 1e-9;
   static constexpr double rounding = 4e-15;
+  static constexpr double resolution = 1e-15;
   static constexpr double most_radius = 1e12;
 };
 #ifndef __CUDACC__
