@@ -18,6 +18,7 @@ from . import common
 PROGRAMS = (
     "benchmarks.speed.step",
     "benchmarks.speed.svd",
+    "benchmarks.speed.laws",
     "benchmarks.speed.heat",
     "benchmarks.accuracy.precision",
     "benchmarks.accuracy.convergence",
@@ -34,6 +35,7 @@ PROGRAMS = (
 ON_DEVICE = (
     "benchmarks.speed.step",
     "benchmarks.speed.svd",
+    "benchmarks.speed.laws",
     "benchmarks.speed.heat",
     "benchmarks.accuracy.ritter",
     "benchmarks.accuracy.runout",

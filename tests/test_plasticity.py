@@ -238,7 +238,7 @@ def test_limits_of_a_viscoplastic_fluid(device, dim):
     assert error(plastic.stress, metal.stress.cpu()) < 1e-12
     elastic = principal_update("herschel_bulkley", F, [*p[:5], zero])
     assert torch.equal(elastic.F, F)
-    assert torch.equal(elastic.stress, principal_update("hencky", F, p[:2]).stress)
+    assert error(elastic.stress, principal_update("hencky", F, p[:2]).stress.cpu()) < 1e-14
 
 
 def clay(dim: int) -> tuple[list[float], float]:
