@@ -111,10 +111,14 @@ class Ninja:
 
     def __init__(self, directory: Path, torch: Path, sanitize: str) -> None:
         self.directory = directory
-        includes = [f"-I{UP}csrc", "-isystem", str(torch / "include")]
+        includes = [f"-I{UP}csrc"]
+        torch_includes = [*includes, "-isystem", str(torch / "include")]
         # torch loads its libraries privately, so ours must name libtorch.so, the umbrella of whatever torch is running
         # (CPU or CUDA), to find its symbols. The process has it loaded: no path to it is recorded.
         libtorch = [f"-L{torch / 'lib'}", "-Xlinker", "--no-as-needed", "-ltorch"]
+        # The C++ library of the process, by its file name, since the compiler may come with a static one only: errors
+        # thrown here are caught in torch.
+        libtorch += ["-Xlinker", "-l:libstdc++.so.6"]
         # Functions that nobody defines fail the link. Not in the CUDA library, since a CPU torch has no CUDA functions,
         # nor with sanitizers, whose functions come from the process.
         defined = [] if sanitize else ["-Xlinker", "--no-undefined", "-ltorch_cpu"]
@@ -122,8 +126,11 @@ class Ninja:
         cxx = os.environ.get("CXX", "g++")
         # At -O3, instrumented kernels take more than ten minutes to compile.
         sanitizer = [f"-fsanitize={sanitize}", "-fno-omit-frame-pointer", "-g1", "-O1"] if sanitize else []
-        compile_cpu = [cxx, *COMMON_FLAGS, *CPU_FLAGS, *HOST_FLAGS, "-Wextra", *sanitizer, *includes]
-        self.rule("cxx", [*compile_cpu, "$flags", "-MMD", "-MF", "$out.d", "-c", "$in", "-o", "$out"], depfile=True)
+        compile_cpu = [cxx, *COMMON_FLAGS, *CPU_FLAGS, *HOST_FLAGS, "-Wextra", *sanitizer]
+        compile_one = ["$flags", "-MMD", "-MF", "$out.d", "-c", "$in", "-o", "$out"]
+        self.rule("cxx", [*compile_cpu, *torch_includes, *compile_one], depfile=True)
+        # torch carries a pybind11 of its own, which may not be used together with the stable ABI.
+        self.rule("cxx_module", [*compile_cpu, *includes, *compile_one], depfile=True)
         self.rule("link_cpu", [cxx, "-shared", *sanitizer, "$in", "-o", "$out", *libtorch, *defined])
         self.rule("link_module", [cxx, "-shared", *sanitizer, "$in", "-o", "$out"])
         if nvcc() is not None:
@@ -131,7 +138,9 @@ class Ninja:
             host = f"-Xcompiler={','.join([*HOST_FLAGS, '-Wno-unknown-pragmas'])}"
             device = [str(nvcc()), f"-ccbin={cxx}", *gencode(), *COMMON_FLAGS, *NVCC_FLAGS, host, "-DUSE_CUDA"]
             self.rule(
-                "nvcc", [*device, *includes, "$flags", "-MD", "-MF", "$out.d", "-c", "$in", "-o", "$out"], depfile=True
+                "nvcc",
+                [*device, *torch_includes, "$flags", "-MD", "-MF", "$out.d", "-c", "$in", "-o", "$out"],
+                depfile=True,
             )
             self.lines[-1] += "\n  pool = nvcc"
             # cudart is linked statically (the default), so the library does not depend on the CUDA runtime of torch.
@@ -191,7 +200,7 @@ def math_library(version: str) -> Library | None:
     flags = [f"-isystem{python}", f"-isystem{Path(pybind11.origin).parent / 'include'}"]
     flags += [f'-DTORCH_MPM_VERSION="{version}"', *isa_levels()["baseline"]]
     suffix = sysconfig.get_config_var("EXT_SUFFIX")
-    objects = [(CSRC / "math" / "python_module.cpp", "cxx", flags)]
+    objects = [(CSRC / "math" / "python_module.cpp", "cxx_module", flags)]
     return Library(f"torch_mpm/_math{suffix}", objects, "link_module")
 
 

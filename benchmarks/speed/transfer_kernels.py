@@ -1,7 +1,7 @@
 """Times of the CUDA transfer kernels: `python benchmarks/speed/transfer_kernels.py --sizes 100 200 --kernel quadratic`.
 
 Each op is captured in a CUDA graph, so that the host does not count, and replayed; the median counts. Particles lie
-lie 8 per cell, float32, 3-D, in the memory order named: `lattice` and `random` positions in order of block and cell,
+8 per cell, float32, 3-D, in the memory order named: `lattice` and `random` positions in order of block and cell,
 `drift` after a random motion of up to 0.3 cells, `shuffled` in no order at all.
 """
 
@@ -21,8 +21,8 @@ REPLAYS = 30
 
 def milliseconds(run: Callable[[], object]) -> float:
     """Median time of one replay of `run`."""
-    stream = torch.cuda.Stream()
-    with torch.cuda.stream(stream):
+    torch.cuda.synchronize()
+    with torch.cuda.stream(torch.cuda.Stream()):
         for _ in range(3):
             run()
     torch.cuda.synchronize()

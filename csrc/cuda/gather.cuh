@@ -397,19 +397,11 @@ struct FieldGather {
   }
 };
 
-template <int Order, int K, class T, int D>
-void gather_channels(const GatherArguments<T, D>& a, int first, Stream stream) {
-  if (a.gradient.pointer)
-    launch_gather(FieldGather<Order, T, D, K, true>(a, first), stream);
-  else
-    launch_gather(FieldGather<Order, T, D, K, false>(a, first), stream);
-}
-
 template <int Order, class T, int D>
 void gather(const GatherArguments<T, D>& a, Stream stream) {
-  int first = 0;
-  for (; first + D <= a.nodes.channels; first += D) gather_channels<Order, D>(a, first, stream);
-  for (; first < a.nodes.channels; first++) gather_channels<Order, 1>(a, first, stream);
+  for_channels<D>(a.nodes.channels, a.gradient.pointer, [&]<int K, bool Gradient>(int first) {
+    launch_gather(FieldGather<Order, T, D, K, Gradient>(a, first), stream);
+  });
 }
 
 // ---- Position gradient
@@ -478,19 +470,11 @@ struct FieldPositionGradient {
   }
 };
 
-template <int Order, int K, class T, int D>
-void position_gradient_channels(const PositionGradientArguments<T, D>& a, int first, Stream stream) {
-  if (a.gradient.pointer)
-    launch_gather(FieldPositionGradient<Order, T, D, K, true>(a, first), stream);
-  else
-    launch_gather(FieldPositionGradient<Order, T, D, K, false>(a, first), stream);
-}
-
 template <int Order, class T, int D>
 void position_gradient(const PositionGradientArguments<T, D>& a, Stream stream) {
-  int first = 0;
-  for (; first + D <= a.nodes.channels; first += D) position_gradient_channels<Order, D>(a, first, stream);
-  for (; first < a.nodes.channels; first++) position_gradient_channels<Order, 1>(a, first, stream);
+  for_channels<D>(a.nodes.channels, a.gradient.pointer, [&]<int K, bool Gradient>(int first) {
+    launch_gather(FieldPositionGradient<Order, T, D, K, Gradient>(a, first), stream);
+  });
 }
 
 // ---- Adjoint of P2G
@@ -527,10 +511,10 @@ struct MomentumAdjoint {
         affine(a.affine, D),
         stress(a.stress, D) {}
 
-  __device__ Loaded load(int p, int scene) const { return fields.read(p, scene); }
+  __device__ Loaded load(int p, int scene) const { return fields.read(p, scene, fields.stress.present()); }
   template <class Support>
   __device__ Result compute(const Loaded& particle, const Weights<Order, T, D>& w, const Support& support) const {
-    const NodeMomentum<T, D> m = fields.to_nodes(particle);
+    const NodeMomentum<T, D> m = fields.to_nodes(particle, fields.form, fields.stress.present());
     T value[K], moment[K][D], gradient[K][D];
     value[0] = m.mass;
 #pragma unroll

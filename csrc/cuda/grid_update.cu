@@ -1,6 +1,5 @@
-#include <torch/headeronly/util/Exception.h>
-
 #include "cuda/grid_update_launchers.h"
+#include "cuda/launch.cuh"
 
 namespace mpm::cuda {
 namespace {
@@ -43,13 +42,8 @@ __global__ void __launch_bounds__(kThreads) grid_update_backward_kernel(const Gr
   if (slot < a.forward.capacity && lane == 0) a.change[slot] = sum;
 }
 
-unsigned launch_blocks(int64_t capacity, int64_t threads_per_slot) {
+unsigned blocks_for(int64_t capacity, int64_t threads_per_slot) {
   return unsigned((capacity * threads_per_slot + kThreads - 1) / kThreads);
-}
-
-void check_launch() {
-  const cudaError_t error = cudaGetLastError();
-  STD_TORCH_CHECK(error == cudaSuccess, "kernel launch failed: ", cudaGetErrorString(error));
 }
 
 }  // namespace
@@ -57,15 +51,13 @@ void check_launch() {
 template <class T, int D>
 void grid_update(const GridUpdateArguments<T, D>& a, Stream stream) {
   if (a.capacity == 0) return;
-  grid_update_kernel<<<launch_blocks(a.capacity, kBlockNodes<D>), kThreads, 0, stream>>>(a);
-  check_launch();
+  launch(grid_update_kernel<T, D>, blocks_for(a.capacity, kBlockNodes<D>), kThreads, 0, stream, a);
 }
 
 template <class T, int D>
 void grid_update_backward(const GridUpdateBackwardArguments<T, D>& a, Stream stream) {
   if (a.forward.capacity == 0) return;
-  grid_update_backward_kernel<<<launch_blocks(a.forward.capacity, kLanes<D>), kThreads, 0, stream>>>(a);
-  check_launch();
+  launch(grid_update_backward_kernel<T, D>, blocks_for(a.forward.capacity, kLanes<D>), kThreads, 0, stream, a);
 }
 
 #define INSTANTIATE(T, D)                                              \

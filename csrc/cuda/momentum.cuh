@@ -26,7 +26,7 @@ struct MomentumFields {
         inverse_dx(a.topology.geometry.inverse_dx),
         form(a.form) {}
 
-  __device__ ParticleMomentum<T, D> read(int p, int scene) const {
+  __device__ ParticleMomentum<T, D> read(int p, int scene, bool with_stress) const {
     ParticleMomentum<T, D> m;
     m.mass = mass.at(p);
 #pragma unroll
@@ -38,7 +38,7 @@ struct MomentumFields {
     m.stress = zero_matrix<T, D>();
     m.volume = T(0);
     m.dt = T(0);
-    if (stress.present()) {
+    if (with_stress) {
       m.volume = volume.at(p);
 #pragma unroll
       for (int i = 0; i < D; i++)
@@ -48,8 +48,9 @@ struct MomentumFields {
     }
     return m;
   }
-  __device__ NodeMomentum<T, D> to_nodes(const ParticleMomentum<T, D>& m) const {
-    return mpm::to_nodes<Order>(m, form, affine.present(), stress.present(), dx, inverse_dx);
+  __device__ NodeMomentum<T, D> to_nodes(const ParticleMomentum<T, D>& m, StressForm known_form,
+                                         bool with_stress) const {
+    return mpm::to_nodes<Order>(m, known_form, affine.present(), with_stress, dx, inverse_dx);
   }
   __device__ ParticleMomentum<T, D> adjoint(const ParticleMomentum<T, D>& m, const NodeMomentum<T, D>& sums) const {
     return mpm::adjoint<Order>(m, sums, form, affine.present(), stress.present(), dx, inverse_dx);

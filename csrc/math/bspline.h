@@ -71,5 +71,41 @@ struct BSpline<3> {
   }
 };
 
+// The weight of one node, for a thread that adds to node k of every particle: c + d² (p + q d), d being the distance
+// from a point of the spline.
+template <int Order, class T>
+struct NodeWeight;
+
+template <class T>
+struct NodeWeight<2, T> {
+  T centre, constant, square;
+  MPM_HD explicit NodeWeight(int k)
+      : centre(T(1.5) - T(0.5) * T(k)), constant(k == 1 ? T(0.75) : T(0)), square(k == 1 ? T(-1) : T(0.5)) {}
+  MPM_HD T at(const T& f) const {
+    const T d = f - centre;
+    return constant + square * d * d;
+  }
+  MPM_HD T slope(const T& f) const { return T(2) * square * (f - centre); }
+};
+
+template <class T>
+struct NodeWeight<3, T> {
+  T sign, constant, square, cube;
+  MPM_HD explicit NodeWeight(int k)
+      : sign(k % 2 == 0 ? T(-1) : T(1)),
+        constant(k % 3 == 0 ? T(0) : T(2.0 / 3)),
+        square(k % 3 == 0 ? T(0) : T(-1)),
+        cube(k % 3 == 0 ? T(1.0 / 6) : T(0.5)) {}
+  MPM_HD T distance(const T& f) const { return sign < T(0) ? T(2) - f : f - T(1); }
+  MPM_HD T at(const T& f) const {
+    const T d = distance(f);
+    return constant + d * d * (square + cube * d);
+  }
+  MPM_HD T slope(const T& f) const {
+    const T d = distance(f);
+    return sign * d * (T(2) * square + T(3) * cube * d);
+  }
+};
+
 }  // namespace TORCH_MPM_ISA
 }  // namespace mpm
