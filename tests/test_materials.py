@@ -277,7 +277,7 @@ def test_memory_layout_and_number_of_particles_do_not_matter(law: str, count: in
         None if C is None else C.float().to(device),
     )
     expected = ops.material_stress(law, state, parameters, C, dim=3)
-    assert expected.stride() == ((1, 3 * count, count) if count > 1 else expected.stride())
+    assert expected.stride(0) == 1 and expected.stride(1) == 3 * expected.stride(2) >= 3 * count
 
     def spread(t: Tensor) -> Tensor:
         """The same values, structure of arrays and every second row of a larger tensor."""

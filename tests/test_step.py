@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from particles import relative_error
+from particles import random_particles, relative_error
 
 import torch_mpm as mpm
 
@@ -205,6 +205,27 @@ def test_sorting_keeps_identities(device):
     assert torch.equal(back.ids.cpu(), torch.arange(len(state)))
     assert relative_error(back.x, plain.x) < 1e-14
     assert relative_error(back.F, plain.F) < 1e-13
+
+
+def test_sorting_orders_by_block_and_cell(device, dim, kernel):
+    """Slots of the home blocks ascend, and cells within each; particles outside come last."""
+    p = random_particles(dim, kernel, sizes=(900, 0, 300), device=device, extent=0.8)
+    x = p.x.clone()
+    x[[5, 700]] = torch.nan
+    state = mpm.State(x, p.v, p.mass, p.volume, F=p.C, scene=p.scene).sorted(p.grid)
+    assert torch.equal(state.ids.sort().values, torch.arange(1200, device=device))
+    assert set(state.ids[-2:].tolist()) == {5, 700}
+    assert torch.equal(state.F, p.C[state.ids]) and torch.equal(state.mass, p.mass[state.ids])
+    assert state.F.stride(0) == 1
+    x, scene = state.x[:-2].cpu(), state.scene[:-2].cpu().long()
+    offset = 0.5 if kernel == "quadratic" else 1.0
+    base = ((x - torch.tensor(p.grid.lower)) / p.grid.dx + 3 - offset).floor().long()
+    key = scene
+    for axis in range(dim):
+        key = key * p.grid.blocks[axis] + base[:, axis] // 4
+    for axis in range(dim):
+        key = key * 4 + base[:, axis] % 4
+    assert bool((key.diff() >= 0).all())
 
 
 def test_a_network_acts_on_the_grid_and_a_module_is_the_law(device):

@@ -184,6 +184,18 @@ def test_g2p_gradients(device, dim, kernel):
     torch.autograd.gradgradcheck(function, (x, values), nondet_tol=1e-12 if device == "cuda" else 0.0)
 
 
+def test_second_derivatives_of_functions_of_g2p(dim):
+    """The adjoint that reaches G2P depends on the positions itself."""
+    p = random_particles(dim, sizes=(3,))
+    blocks = p.blocks()
+    velocity = torch.randn(blocks.node_count, dim, dtype=torch.float64)
+
+    def function(x):
+        return mpm.g2p(blocks, x, velocity)[0] ** 2
+
+    torch.autograd.gradgradcheck(function, p.x.clone().requires_grad_(), fast_mode=True)
+
+
 def test_scatter_and_gather_gradients(device, dim, kernel):
     p = random_particles(dim, kernel, device=device, sizes=(4,))
     blocks = p.blocks()

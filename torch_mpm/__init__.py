@@ -10,7 +10,20 @@ from .errors import GridOverflowError, SimulationError
 from .grid import Blocks, Grid
 from .heat import Heat
 from .materials import CustomLaw, Material, Mixture, NeoHookean, WeaklyCompressible
-from .ops import HeatSolve, advance, g2p, gather, grid_update, heat_cg, p2g, polar, quartic_return_map, scatter, svd3
+from .ops import (
+    HeatSolve,
+    advance,
+    g2p,
+    g2p_advance,
+    gather,
+    grid_update,
+    heat_cg,
+    p2g,
+    polar,
+    quartic_return_map,
+    scatter,
+    svd3,
+)
 from .parameters import PerMaterial, Table
 from .plasticity import (
     CamClay,
@@ -66,6 +79,7 @@ __all__ = [
     "WeaklyCompressible",
     "advance",
     "g2p",
+    "g2p_advance",
     "gather",
     "grid_update",
     "heat_boundaries",

@@ -141,17 +141,18 @@ class State:
         return state
 
     def select(self, particles: Tensor) -> State:
-        """The particles of an index tensor, int64 [Q], in that order; differentiable."""
+        """The particles of an index tensor, int64 or int32 [Q], in that order; differentiable."""
         return self.map(lambda t: _take(t, particles))
 
     def sorted(self, grid: Grid) -> State:
-        """Reorder by grid block, so that neighbours in space are neighbours in memory; `ids` remember the order.
+        """Reorder by grid block and cell: neighbours in space become neighbours in memory. `ids` remember the order.
 
         Reordering now and then keeps long simulations fast; results differ only by rounding. Differentiable.
         """
         ids = torch.arange(len(self), device=self.x.device) if self.ids is None else self.ids
         blocks = grid.activate(self.x, self.scene)
-        return self.replace(ids=ids).select(blocks.index.long())
+        order = torch.ops.torch_mpm.cell_order(self.x.detach(), *blocks.topology)
+        return self.replace(ids=ids).select(order)
 
     def restored(self) -> State:
         """In the order of `ids`, that is in the order before any `sorted`. Differentiable."""
@@ -204,8 +205,9 @@ def _take(t: Tensor, particles: Tensor) -> Tensor:
     """Rows of a [P, ...] tensor with the particle index contiguous."""
     if t.dim() == 1:
         return t.index_select(0, particles)
-    storage = t.permute(*range(1, t.dim()), 0)
-    return storage.index_select(t.dim() - 1, particles).permute(t.dim() - 1, *range(t.dim() - 1))
+    rows = t.permute(*range(1, t.dim()), 0).flatten(0, -2)  # of which `index_select` is ten times faster
+    taken = rows.index_select(1, particles).unflatten(0, t.shape[1:])
+    return taken.permute(t.dim() - 1, *range(t.dim() - 1))
 
 
 def _cat(tensors: list[Tensor]) -> Tensor:

@@ -16,7 +16,7 @@ from .errors import GridOverflowError, SimulationError
 from .grid import Blocks, Grid
 from .heat import Heat
 from .materials import Material
-from .ops import advance, contact, fusible, g2p, gather, grid_update, p2g
+from .ops import contact, fusible, g2p, g2p_advance, gather, grid_update, p2g
 from .parameters import With
 from .state import State, identity_deformation
 
@@ -108,27 +108,26 @@ class Step(nn.Module):
         blocks = grid.activate(state.x, scene, self.status)
         self.status = blocks.status
         grid.watch(blocks.status)
+        form, affine = self.stress_form, state.C if self.transfer == "apic" else None
         fields, stress = self.law.update(With(state, dt=dt) if self._rate_dependent else state)  # type: ignore[arg-type]
         dissipated = fields.pop("dissipated", None)
         if self.law.extra_fields:
             history = {name: fields.pop(name) for name in self.law.extra_fields if name in fields}
             state = state.replace(extra={**state.extra, **history})
-        affine = state.C if self.transfer == "apic" else None
-        nodes = p2g(blocks, state.x, state.mass, state.v, affine, stress, state.volume, dt, self.stress_form)
+        nodes = p2g(blocks, state.x, state.mass, state.v, affine, stress, state.volume, dt, form)
         velocity = self._update_grid(blocks, nodes, state, dt)
-        gradient_form = self.stress_form == "gradient"
-        affine_wanted = self.transfer == "apic" or self.law.viscous or not gradient_form
-        grid_v, C, grad_v = g2p(blocks, state.x, velocity, affine_wanted, gradient_form)
-        # Particles move with the grid whatever velocity they keep, so that FLIP's noise does not reach the positions.
-        v = self._blend_flip(blocks, state, affine, velocity, grid_v) if self.flip else grid_v
         deformed = {name: fields.get(name, getattr(state, name)) for name in ("F", "J")}
-        motion = grad_v if gradient_form else C
-        x, F, J = advance(state.x, grid_v, dt, motion, deformed["F"], deformed["J"], scene, grid.scenes)
+        keeps_C = self.transfer == "apic" or self.law.viscous
+        x, v, C, F, J = g2p_advance(
+            blocks, state.x, velocity, dt, **deformed, affine=keeps_C or self.heat is not None, stress_form=form
+        )
+        if self.flip:  # positions move with the grid all the same, so that FLIP's noise does not reach them
+            v = self._blend_flip(blocks, state, affine, velocity, v)
         changes: dict[str, Any] = {**fields, "F": F, "J": J}
         if self.heat is not None:
+            motion = C if form == "mls" else g2p(blocks, state.x, velocity, affine=False, gradient=True)[2]
             changes |= self.heat.update(blocks, state, dt, motion, dissipated)
-        kept_C = C if self.transfer == "apic" or self.law.viscous else None
-        return state.replace(x=x, v=v, C=kept_C, time=state.time + dt, **changes)
+        return state.replace(x=x, v=v, C=C if keeps_C else None, time=state.time + dt, **changes)
 
     def prepare(self, state: State) -> State:
         """Give a state the fields that this step needs and that it lacks."""

@@ -138,6 +138,9 @@ def parts(s: Setup) -> tuple[mpm.Blocks, list[Op]]:
     def p2g(x: Tensor, mass: Tensor, v: Tensor, C: Tensor, stress: Any = None, volume: Any = None) -> Tensor:
         return mpm.p2g(blocks, x, mass, v, C, stress, volume, work.DT)
 
+    def g2p_advance(x: Tensor, velocity: Tensor, F: Tensor) -> Any:
+        return mpm.g2p_advance(blocks, x, velocity, work.DT, F)[:4]
+
     return blocks, [
         Op("activate", lambda x: grid.activate(x).index, (x,), differentiable=False),
         Op("stress", lambda F: law.stress(state.replace(F=F)), (F,)),
@@ -146,6 +149,7 @@ def parts(s: Setup) -> tuple[mpm.Blocks, list[Op]]:
         Op("grid update", update, (nodes,)),
         Op("g2p", lambda x, velocity: mpm.g2p(blocks, x, velocity)[:2], (x, update(nodes))),
         Op("advance", lambda x, v, C, F: mpm.advance(x, v, work.DT, C, F)[:2], (x, v, C, F)),
+        Op("g2p and advance", g2p_advance, (x, update(nodes), F)),
     ]
 
 

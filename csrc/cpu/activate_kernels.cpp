@@ -103,12 +103,12 @@ void classify(const Activation<T, D>& s, int64_t p, int64_t* totals) {
 template <int Order, class T, int D>
 bool classify_pack(const Activation<T, D>& s, int64_t p) {
   const ActivateArguments<T, D>& a = s.a;
-  int key[kLanes] = {}, cell[kLanes] = {};
+  unsigned key[kLanes] = {}, cell[kLanes] = {};
   bool inside = true;
   if (a.scene)
     for (int l = 0; l < kLanes; l++) {
-      key[l] = a.scene[(p + l) * a.scene_stride];
-      inside = inside && key[l] >= 0 && key[l] < a.scenes;
+      key[l] = unsigned(a.scene[(p + l) * a.scene_stride]);
+      inside = inside && key[l] < unsigned(a.scenes);
     }
   Group g = {kLanes, true, {}};
   for (int l = 0; l < kLanes; l++) g.id[l] = int(p) + l;
@@ -120,8 +120,8 @@ bool classify_pack(const Activation<T, D>& s, int64_t p) {
     T node[kLanes];
     base.store(node);
     for (int l = 0; l < kLanes; l++) {
-      const int n = int(node[l]);
-      key[l] = key[l] * a.geometry.blocks[i] + n / kBlockWidth;
+      const unsigned n = unsigned(int(node[l]));
+      key[l] = key[l] * unsigned(a.geometry.blocks[i]) + n / kBlockWidth;
       cell[l] = cell[l] * kBlockWidth + n % kBlockWidth;
     }
   }
@@ -151,7 +151,7 @@ MPM_HD unsigned touched_blocks_of_cell(int cell) {
 }
 
 // Particles of each home block in a slice, and the blocks they touch. Particles that follow each other are mostly of one
-// home: they are counted together.
+// home: such runs are counted, and later placed, together.
 template <int Order, class T, int D>
 void count_homes(const Activation<T, D>& s, int slice, int64_t begin, int64_t end) {
   int* count = s.w.count + slice * s.table_size;
@@ -160,8 +160,9 @@ void count_homes(const Activation<T, D>& s, int slice, int64_t begin, int64_t en
   for (int cell = 0; cell < kBlockNodes<D>; cell++) touched_of[cell] = uint8_t(touched_blocks_of_cell<Order, D>(cell));
   __builtin_memset(count, 0, sizeof(int) * s.table_size);
   __builtin_memset(touched, 0, s.table_size);
-  int64_t dropped = 0;
+  int64_t dropped = 0, runs = 0;
   for (int64_t p = begin; p < end;) {
+    s.w.run[begin + runs++] = int(p);
     const int key = s.w.key[p];
     const int64_t first = p;
     unsigned blocks = 0;
@@ -174,6 +175,7 @@ void count_homes(const Activation<T, D>& s, int slice, int64_t begin, int64_t en
     }
   }
   s.totals(slice)[W::kDropped] = dropped;
+  s.totals(slice)[W::kRuns] = runs;
 }
 
 // Whether some particle touches block b of the table.
@@ -256,17 +258,19 @@ int64_t place_slots(const Activation<T, D>& s, int64_t slots) {
 template <class T, int D>
 void fill_index(const Activation<T, D>& s, int slice, int64_t begin, int64_t end, int64_t outside) {
   int* next = s.w.count + slice * s.table_size;
-  for (int64_t p = begin; p < end;) {
-    const int key = s.w.key[p];
-    const int64_t first = p, place = key < 0 ? outside : next[key];
-    for (; p < end && s.w.key[p] == key; p++) {
-      s.a.index[place + p - first] = int(p);
-      if (key >= 0) s.w.cell_at[place + p - first] = s.w.cell[p];
+  const int64_t runs = s.totals(slice)[W::kRuns];
+  for (int64_t r = 0; r < runs; r++) {
+    const int first = s.w.run[begin + r], count = (r + 1 < runs ? s.w.run[begin + r + 1] : int(end)) - first;
+    const int key = s.w.key[first];
+    const int64_t place = key < 0 ? outside : next[key];
+    int* index = s.a.index + place;
+    for (int i = 0; i < count; i++) index[i] = first + i;
+    if (key < 0) {
+      outside += count;
+    } else {
+      __builtin_memcpy(s.w.cell_at + place, s.w.cell + first, count);
+      next[key] += count;
     }
-    if (key < 0)
-      outside += p - first;
-    else
-      next[key] += int(p - first);
   }
 }
 
@@ -378,7 +382,23 @@ void activate(const ActivateArguments<T, D>& a) {
   write_status(s, wanted);
 }
 
+// The schedule has it already.
+template <int Order, class T, int D>
+void cell_order(const CellOrderArguments<T, D>& a) {
+  const ScheduleIn s = schedule_of(a.topology);
+  const int homes = s.colour_start[kColours<D>];
+  parallel_ranges(homes ? s.home_chunk[homes] : 0, 16, [&](int64_t begin, int64_t end) {
+    for (int64_t c = begin; c < end; c++) {
+      const Chunk chunk(a.topology, s, c);
+      for (int i = 0; i < chunk.count; i++) a.order[s.chunk_begin[c] + i] = chunk.id[chunk.by_cell(i)];
+    }
+  });
+  for (int64_t i = a.topology.offsets[a.topology.capacity]; i < a.topology.particles; i++)
+    a.order[i] = a.topology.index[i];
+}
+
 MPM_CPU_INSTANTIATE(activate, ActivateArguments)
+MPM_CPU_INSTANTIATE(cell_order, CellOrderArguments)
 
 }  // namespace TORCH_MPM_ISA
 }  // namespace mpm::cpu

@@ -8,13 +8,14 @@ namespace mpm::cpu {
 struct ActivateWorkspace {
   int slices;        // parts of the particles, each counted apart
   int* key;          // [particles] table index of the home block, -1 where not transferred
+  int* run;          // [particles] first particle of each run of one home, from the first particle of each slice on
   uint8_t* cell;     // [particles] cell of the base node in its block
   uint8_t* cell_at;  // [particles] the same by position in the index tensor
   int* count;        // [slices, table] particles of each home block, then where the next one goes
   uint8_t* touched;  // [slices, table] which blocks the particles of a home touch: bit o for neighbour o
   int64_t* totals;   // [slices, kTotals]
   int64_t size;      // in bytes
-  enum { kActive, kParticles, kDropped, kOutside, kOutsideFirst, kNonFinite, kNonFiniteFirst, kTotals };
+  enum { kActive, kParticles, kDropped, kOutside, kOutsideFirst, kNonFinite, kNonFiniteFirst, kRuns, kTotals };
 };
 
 inline namespace TORCH_MPM_ISA {
@@ -34,6 +35,7 @@ ActivateWorkspace activate_layout(const ActivateArguments<T, D>& a, char* start)
   };
   w.totals = reinterpret_cast<int64_t*>(take(int64_t(sizeof(int64_t)) * w.slices * ActivateWorkspace::kTotals));
   w.key = reinterpret_cast<int*>(take(int64_t(sizeof(int)) * a.particles));
+  w.run = reinterpret_cast<int*>(take(int64_t(sizeof(int)) * a.particles));
   w.count = reinterpret_cast<int*>(take(int64_t(sizeof(int)) * w.slices * table));
   w.cell = reinterpret_cast<uint8_t*>(take(a.particles));
   w.cell_at = reinterpret_cast<uint8_t*>(take(a.particles));

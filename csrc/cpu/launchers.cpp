@@ -1,6 +1,8 @@
 #include "cpu/launchers.h"
 
 #include "cpu/activate_layout.h"
+#include "cpu/cell_order_launchers.h"
+#include "cpu/g2p_advance_launchers.h"
 #include "cpu/isa.h"
 #include "cpu/kernels.h"
 
@@ -31,10 +33,12 @@ MPM_CPU_KERNELS(MPM_CPU_FORWARD)
   MPM_CPU_EXPORT_ORDER(T, D, 3)
 #define MPM_CPU_EXPORT_ORDER(T, D, Order)                                             \
   template void activate<Order, T, D>(const ActivateArguments<T, D>&, Stream);        \
+  template void cell_order<Order, T, D>(const CellOrderArguments<T, D>&, Stream);     \
   template void p2g<Order, T, D>(const P2GArguments<T, D>&, Stream);                  \
   template void p2g_backward<Order, T, D>(const P2GBackwardArguments<T, D>&, Stream); \
   template void scatter<Order, T, D>(const ScatterArguments<T, D>&, Stream);          \
   template void gather<Order, T, D>(const GatherArguments<T, D>&, Stream);            \
+  template void g2p_advance<Order, T, D>(const G2PAdvanceArguments<T, D>&, Stream);   \
   template void position_gradient<Order, T, D>(const PositionGradientArguments<T, D>&, Stream);
 MPM_CPU_EXPORT(float, 2)
 MPM_CPU_EXPORT(float, 3)

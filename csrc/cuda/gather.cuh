@@ -224,7 +224,7 @@ template <class Task>
 constexpr int kResident = Task::Order == 2 && sizeof(typename Task::T) == 4 ? Task::resident : 2;
 
 // Task: topology, nodes, position; load(p, scene), what it needs of a particle; compute(loaded, weights, support), what
-// the particle gets; write(p, result), with a result of zeros for particles outside.
+// the particle gets; write(p, loaded, result), with a result of zeros for particles outside.
 template <bool Quads, class Task>
 __device__ void gather_in_memory_order(const Task& task, const Schedule<const int>& schedule) {
   using T = typename Task::T;
@@ -239,7 +239,7 @@ __device__ void gather_in_memory_order(const Task& task, const Schedule<const in
     GridSupport<T, Task::K, D, Quads> support{task.nodes};
     T f[D];
     if (slot < 0 || !locate_at_home<Task::Order>(t, scene, home, x, support.base, f)) {
-      task.write(p, typename Task::Result{});
+      task.write(p, task.load(p, 0), typename Task::Result{});
       continue;
     }
     const auto loaded = task.load(p, scene);
@@ -251,7 +251,7 @@ __device__ void gather_in_memory_order(const Task& task, const Schedule<const in
       support.set_slot(4 * q + 2, v.z);
       support.set_slot(4 * q + 3, v.w);
     }
-    task.write(p, task.compute(loaded, Weights<Task::Order, T, D>(f), support));
+    task.write(p, loaded, task.compute(loaded, Weights<Task::Order, T, D>(f), support));
   }
 }
 
@@ -309,7 +309,7 @@ __device__ void gather_by_items(const Task& task, const Schedule<const int>& sch
       for (int axis = 0; axis < D; axis++) corner = corner * width + base[axis];
       const TileSupport<Task::Order, T, K> support{tile + corner};
       const auto result = task.compute(loaded, Weights<Task::Order, T, D>(f), support);
-      task.write(p, at_home ? result : typename Task::Result{});
+      task.write(p, loaded, at_home ? result : typename Task::Result{});
       p = p_next;
       p_next = p_after;
       x = x_next;
@@ -318,7 +318,7 @@ __device__ void gather_by_items(const Task& task, const Schedule<const int>& sch
   const int64_t stride = int64_t(gridDim.x) * kGatherThreads;
   for (int64_t i = t.offsets[t.capacity] + int64_t(blockIdx.x) * kGatherThreads + threadIdx.x; i < t.particles;
        i += stride)
-    task.write(t.index[i], typename Task::Result{});
+    task.write(t.index[i], task.load(t.index[i], 0), typename Task::Result{});
 }
 
 template <bool Quads, class Task>
@@ -384,7 +384,7 @@ struct FieldGather {
     sum_axis<Shape, 0>(support, support.rows, 0, w, constant, linear, s);
     return s;
   }
-  __device__ void write(int p, const Result& s) const {
+  __device__ void write(int p, const Loaded&, const Result& s) const {
 #pragma unroll
     for (int k = 0; k < K; k++) {
       value.write(p, k, s.value[k]);
@@ -464,7 +464,7 @@ struct FieldPositionGradient {
     }
     return r;
   }
-  __device__ void write(int p, const Result& r) const {
+  __device__ void write(int p, const Loaded&, const Result& r) const {
 #pragma unroll
     for (int i = 0; i < D; i++) out.at(p, i) = more ? out.at(p, i) + r[i] : r[i];
   }
@@ -548,7 +548,7 @@ struct MomentumAdjoint {
     r.particle = fields.adjoint(particle, sums);
     return r;
   }
-  __device__ void write(int p, const Result& r) const {
+  __device__ void write(int p, const Loaded&, const Result& r) const {
     mass.write(p, 0, r.particle.mass);
     volume.write(p, 0, r.particle.volume);
     dt.write(p, 0, r.particle.dt);

@@ -28,7 +28,33 @@ struct AdvanceBackwardArguments {
   Field<T> velocity, affine, F, J, dt;    // adjoints per particle; absent where not needed
 };
 
+// G2P and the end of the step in one: the velocity gradient that moves F and J is the affine field (MLS) or ∇v.
+template <class T, int D>
+struct G2PAdvanceArguments {
+  GatherArguments<T, D> gather;  // of the node velocities; value is v, moment C (may be absent), gradient unused
+  Field<const T> F, J;           // may be absent
+  Field<const T> scene_dt;       // [scenes] or absent
+  double dt = 0;
+  StressForm form = StressForm::mls;
+  Field<T> x_next, F_next, J_next;
+};
+
 inline namespace TORCH_MPM_ISA {
+
+template <class T, int D>
+MPM_HD Vector<T, D> advance_position(const Vector<T, D>& x, const Vector<T, D>& v, const T& dt) {
+  return x + dt * v;
+}
+
+template <class T, int D>
+MPM_HD Matrix<T, D> advance_deformation(const Matrix<T, D>& F, const Matrix<T, D>& C, const T& dt) {
+  return F + dt * (C * F);
+}
+
+template <class T, int D>
+MPM_HD T advance_volume_ratio(const T& J, const Matrix<T, D>& C, const T& dt) {
+  return J + dt * trace(C) * J;
+}
 
 template <class T>
 MPM_HD T load_scalar(const Field<const T>& f, int64_t p) {
@@ -83,15 +109,11 @@ MPM_HD T particle_dt(const AdvanceArguments<T, D>& a, int64_t p) {
 template <class T, int D>
 MPM_HD void advance_particle(const AdvanceArguments<T, D>& a, int64_t p) {
   const T dt = particle_dt(a, p);
-  store_vector(a.x_next, p, load_vector<T, D>(a.x, p) + dt * load_vector<T, D>(a.velocity, p));
-  if (a.F.pointer) {
-    const Matrix<T, D> F = load_matrix<T, D>(a.F, p);
-    store_matrix(a.F_next, p, F + dt * (load_matrix<T, D>(a.affine, p) * F));
-  }
-  if (a.J.pointer) {
-    const T J = load_scalar(a.J, p);
-    store_scalar(a.J_next, p, J + dt * trace(load_matrix<T, D>(a.affine, p)) * J);
-  }
+  store_vector(a.x_next, p, advance_position(load_vector<T, D>(a.x, p), load_vector<T, D>(a.velocity, p), dt));
+  if (!a.affine.pointer) return;
+  const Matrix<T, D> C = load_matrix<T, D>(a.affine, p);
+  if (a.F.pointer) store_matrix(a.F_next, p, advance_deformation(load_matrix<T, D>(a.F, p), C, dt));
+  if (a.J.pointer) store_scalar(a.J_next, p, advance_volume_ratio(load_scalar(a.J, p), C, dt));
 }
 
 template <class T, int D>

@@ -1,5 +1,11 @@
 #include "ops/backend.h"
 
+#if MPM_BACKEND == MPM_BACKEND_IS_cpu
+#include "cpu/cell_order_launchers.h"
+#else
+#include "cuda/cell_order_launchers.h"
+#endif
+
 // Finds the blocks that particles touch and groups the particles by the block of their base node.
 namespace mpm {
 namespace {
@@ -52,6 +58,19 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> activate(
   return {table, block, offsets, index, schedule, status};
 }
 
+Tensor cell_order(const Tensor& x, MPM_TOPOLOGY_PARAMETERS) {
+  Tensor result = empty_int(x, {x.size(0)});
+  const DeviceScope device(x);
+  dispatch(x, order, [&]<class T, int D, int Order>() {
+    CellOrderArguments<T, D> a;
+    a.topology = topology<T, D>(x, MPM_TOPOLOGY_ARGUMENTS);
+    a.x = input<T>(x, "x", x, {x.size(0), D});
+    a.order = static_cast<int*>(result.data_ptr());
+    backend::cell_order<Order>(a, device.stream());
+  });
+  return result;
+}
+
 }  // namespace
 }  // namespace mpm
 
@@ -61,7 +80,11 @@ STABLE_TORCH_LIBRARY_FRAGMENT(torch_mpm, m) {
       "activate(Tensor x, Tensor? scene, Tensor? previous_status, int scenes, float dx, float[] lower, int[] blocks, "
       "int order, int capacity, bool deterministic) -> (Tensor table, Tensor block, Tensor offsets, Tensor index, "
       "Tensor schedule, Tensor status)");
+  m.def("cell_order(Tensor x, " MPM_TOPOLOGY_SCHEMA ") -> Tensor");
 }
 #endif
 
-MPM_LIBRARY_IMPL(m) { m.impl("activate", TORCH_BOX(&mpm::activate)); }
+MPM_LIBRARY_IMPL(m) {
+  m.impl("activate", TORCH_BOX(&mpm::activate));
+  m.impl("cell_order", TORCH_BOX(&mpm::cell_order));
+}

@@ -1,5 +1,6 @@
 #pragma once
 
+#include <torch/csrc/inductor/aoti_torch/c/shim.h>
 #include <torch/csrc/stable/library.h>
 #include <torch/csrc/stable/ops.h>
 #include <torch/csrc/stable/tensor.h>
@@ -72,13 +73,32 @@ inline Tensor empty_int(const Tensor& like, const Shape& shape) {
   return torch::stable::new_empty(like, shape, ScalarType::Int);
 }
 
+// Elements from row to row of a structure of arrays. On the CPU, rows of whole pages (P a power of two) would share
+// cache sets, and a load would wait for stores to other rows whose addresses end alike: 23 cache lines more than pages
+// spread the nine rows of a matrix evenly over a page of 64.
+inline int64_t particle_pitch(const Tensor& like, int64_t particles) {
+  if (!like.is_cpu()) return particles;
+  constexpr int64_t line = 64, page = 64, shift = 23;
+  const int64_t bytes = int64_t(like.element_size()), lines = (particles * bytes + line - 1) / line;
+  return ((lines + page - 1 - shift) / page * page + shift) * line / bytes;
+}
+
 // A [P, ...] tensor stored as structure of arrays: the particle index is contiguous.
 inline Tensor empty_particles(const Tensor& like, const Shape& shape) {
-  Shape storage(shape.begin() + 1, shape.end());
-  storage.push_back(shape[0]);
-  Tensor t = empty(like, storage);
-  for (int64_t i = int64_t(shape.size()) - 1; i > 0; i--) t = torch::stable::transpose(t, i - 1, i);
-  return t;
+  Shape strides(shape.size());
+  strides[0] = 1;
+  int64_t next = shape.size() > 1 ? particle_pitch(like, shape[0]) : 0;
+  for (size_t i = shape.size() - 1; i > 0; i--) {
+    strides[i] = next;
+    next *= shape[i];
+  }
+  AtenTensorHandle handle;
+  int32_t dtype, device;
+  TORCH_ERROR_CODE_CHECK(aoti_torch_get_dtype(like.get(), &dtype));
+  TORCH_ERROR_CODE_CHECK(aoti_torch_get_device_type(like.get(), &device));
+  TORCH_ERROR_CODE_CHECK(aoti_torch_empty_strided(int64_t(shape.size()), shape.data(), strides.data(), dtype, device,
+                                                  like.get_device_index(), &handle));
+  return Tensor(handle);
 }
 
 // Calls f.operator()<T, D, Order>() for the dtype and dimension of x.

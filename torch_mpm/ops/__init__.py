@@ -3,6 +3,7 @@
 from . import activation as activation
 from .advance import advance
 from .contact import contact, fusible
+from .g2p_advance import g2p_advance
 from .grid_update import grid_update
 from .heat import HeatSolve, heat_cg, heat_operator
 from .material import material_energy, material_stiffness, material_stress, material_wave_modulus
@@ -17,6 +18,7 @@ __all__ = [
     "contact",
     "fusible",
     "g2p",
+    "g2p_advance",
     "gather",
     "grid_update",
     "heat_cg",

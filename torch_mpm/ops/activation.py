@@ -1,4 +1,4 @@
-"""The fake kernel of `activate`; its Python face is `Grid.activate`."""
+"""The fake kernels of `activate` and `cell_order`; their Python faces are `Grid.activate` and `State.sorted`."""
 
 from __future__ import annotations
 
@@ -39,4 +39,10 @@ def _activate_fake(
     )
 
 
+@torch.library.register_fake("torch_mpm::cell_order")
+def _cell_order_fake(x: Tensor, *topology: object) -> Tensor:
+    return x.new_empty(x.shape[0], dtype=torch.int32)
+
+
 refuse_vmap("activate")
+refuse_vmap("cell_order")

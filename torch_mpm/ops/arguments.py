@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -48,8 +49,15 @@ def sum_by_scene(value: Tensor, scene: Tensor | None, scenes: int) -> Tensor:
 
 
 def soa_empty(like: Tensor, shape: Sequence[int]) -> Tensor:
-    """An empty [P, ...] tensor with the particle index contiguous, as the ops return them."""
-    return like.new_empty((*shape[1:], shape[0])).permute(len(shape) - 1, *range(len(shape) - 1))
+    """An empty [P, ...] tensor with the particle index contiguous, as the ops return them (csrc/ops/tensors.h)."""
+    pitch = shape[0]
+    if like.device.type == "cpu":  # `particle_pitch` says why
+        lines = -(-shape[0] * like.element_size() // 64)
+        pitch = ((lines + 40) // 64 * 64 + 23) * 64 // like.element_size()
+    strides = [1]
+    for i in range(1, len(shape)):
+        strides.append(pitch * math.prod(shape[i + 1 :]))
+    return like.new_empty_strided(shape, strides)
 
 
 def differentiate(

@@ -1,0 +1,115 @@
+"""G2P and `advance` in one pass over the particles: Python face, fake kernel and autograd."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ..errors import check_like, check_positions
+from ..grid import Blocks, inverse_inertia
+from .arguments import refuse_vmap, soa_empty, split_dt, sum_by_scene
+from .transfer import STRESS_FORMS, TOPOLOGY, _blocks_of, _check_nodes, _save, _saved
+
+
+def g2p_advance(
+    blocks: Blocks,
+    x: Tensor,
+    velocity: Tensor,
+    dt: float | Tensor,
+    F: Tensor | None = None,
+    J: Tensor | None = None,
+    affine: bool = True,
+    stress_form: str = "mls",
+) -> tuple[Tensor, Tensor, Tensor | None, Tensor | None, Tensor | None]:
+    """The end of a step: `g2p`, and `advance` with what it gave. Equal to the two but for rounding, and faster.
+
+    Args:
+        blocks: active blocks of these positions.
+        x: positions [P, D] [m].
+        velocity: node velocities [N, D] [m/s].
+        dt: time step [s]: a number, or a tensor of shape [], [1] or [B].
+        F: deformation gradient [P, D, D], or None.
+        J: volume ratio [P], or None.
+        affine: whether C is wanted.
+        stress_form: "mls" (F and J move with C) or "gradient" (with ∇v), as in `p2g`.
+
+    Returns:
+        x at the end of the step, v [m/s], C [1/s] or None, F and J at the end of the step (None where not given).
+        Particles outside the grid stay as they are, with v and C zero.
+
+    Raises:
+        ValueError, TypeError: for wrong shapes, dtypes, devices, or dt ≤ 0.
+
+    Differentiable with respect to every floating tensor, twice in eager mode.
+    """
+    grid = blocks.grid
+    check_positions(x, grid.dim, blocks.scene, grid.scenes)
+    P, D = x.shape
+    check_like("F", F, x, (P, D, D), "[P, D, D]")
+    check_like("J", J, x, (P,), "[P]")
+    if stress_form not in STRESS_FORMS:
+        raise ValueError(f"stress_form must be one of {sorted(STRESS_FORMS)}, got {stress_form!r}")
+    velocity = _check_nodes("velocity", velocity, blocks, x, D)
+    number, scene_dt = split_dt(dt, grid.scenes, x)
+    next_x, v, C, next_F, next_J = torch.ops.torch_mpm.g2p_advance(
+        x, velocity, F, J, scene_dt, number, affine, STRESS_FORMS[stress_form], *blocks.topology
+    )
+    return next_x, v, C if affine else None, None if F is None else next_F, None if J is None else next_J
+
+
+@torch.library.register_fake("torch_mpm::g2p_advance")
+def _fake(x, velocity, F, J, scene_dt, dt, affine, stress_form, *topology):
+    P, D = x.shape
+    shapes = ((P, D), (P, D), (P, D, D), (P, D, D), (P,))
+    present = (True, True, affine, F is not None, J is not None)
+    return tuple(soa_empty(x, shape) if here else x.new_empty(0) for shape, here in zip(shapes, present, strict=True))
+
+
+def _setup(ctx: Any, inputs: Any, output: Any) -> None:
+    x, velocity, F, J, scene_dt, dt, affine, stress_form, *topology = inputs
+    _, v, C, _, _ = output
+    # The backward pass reads v and C, which the next step keeps alive anyway.
+    _save(ctx, (x, velocity, F, J, scene_dt, v, C), topology, dt=dt, affine=affine, mls=stress_form == 0)
+
+
+def _backward(ctx, grad_x, grad_v, grad_C, grad_F, grad_J):
+    (x, velocity, F, J, scene_dt, v, C), topology = _saved(ctx)
+    need_x, need_velocity, need_F, need_J, need_dt = ctx.needs_input_grad[:5]
+    need_nodes, moves = need_x or need_velocity, F is not None or J is not None
+    scale = inverse_inertia(topology[8], topology[5])
+    L = C if ctx.mls else None  # the velocity gradient that moved F and J
+    if moves and not (ctx.mls and ctx.affine):
+        _, C, grad_v_field = torch.ops.torch_mpm.gather(x, velocity, scale, ctx.mls, not ctx.mls, *topology)
+        L = C if ctx.mls else grad_v_field
+    scene = _blocks_of(topology, x).scene if scene_dt is not None and scene_dt.shape[0] > 1 else None
+    wanted = (need_nodes, need_nodes and moves, need_F, need_J, need_dt)
+    needs = sum(1 << i for i, needed in enumerate(wanted) if needed)
+    given = (grad_x, None if F is None else grad_F, None if J is None else grad_J)
+    L = L if moves else None
+    more_v, grad_L, grad_F, grad_J, grad_dt = torch.ops.torch_mpm.advance_backward(
+        *given, x, v, L, F, J, scene, scene_dt, ctx.dt, needs
+    )
+    grad_velocity = None
+    if need_nodes:
+        grad_v = grad_v + more_v
+        moment, gradient = grad_C if ctx.affine else None, None
+        if moves and ctx.mls:
+            moment = grad_L if moment is None else moment + grad_L
+        elif moves:
+            gradient = grad_L
+        if need_x:
+            grad_x = grad_x + torch.ops.torch_mpm.position_gradient(
+                x, grad_v, moment, gradient, velocity, scale, *topology
+            )
+        if need_velocity:
+            grad_velocity = torch.ops.torch_mpm.scatter(x, grad_v, moment, gradient, scale, *topology)
+    if need_dt:
+        grad_dt = ctx.dt * sum_by_scene(grad_dt, scene, scene_dt.shape[0])
+    grads = zip((grad_x, grad_velocity, grad_F, grad_J, grad_dt), ctx.needs_input_grad[:5], strict=True)
+    return (*(g if needed else None for g, needed in grads),) + (None,) * (3 + TOPOLOGY)
+
+
+torch.library.register_autograd("torch_mpm::g2p_advance", _backward, setup_context=_setup)
+refuse_vmap("g2p_advance")
