@@ -103,21 +103,20 @@ class Case:
 
 
 PLANAR = (Case("planar", 2500), Case("planar", 10000), Case("planar", 2500, volume_correction=True))
-SLABS = (Case("slab", 2500), Case("slab", 2500, "exact"))
+SLABS = (Case("slab", 1200), Case("slab", 1200, "exact"))
 ROUND = (
     Case("axisymmetric", 4000),
-    Case("axisymmetric", 16000),
+    Case("axisymmetric", 12000),
     Case("axisymmetric", 4000, "exact"),
-    Case("axisymmetric", 16000, "exact"),
     Case("axisymmetric", 4000, volume_correction=True),
 )
 CASES = (*PLANAR, *SLABS, *ROUND)
 SLOPES = (
-    Case("planar", 60),
-    *(Case("slab", 60, flow, energy) for flow in ("radial", "exact") for energy in ("unilateral", "full")),
+    Case("planar", 50),
+    *(Case("slab", 50, flow, energy) for flow in ("radial", "exact") for energy in ("unilateral", "full")),
 )
 VARIANTS = (
-    *(Case("planar", cells) for cells in (160, 640, 2500, 10000)),
+    *(Case("planar", cells) for cells in (160, 640, 2500)),
     *(
         dataclasses.replace(PLANAR[0], **change)  # type: ignore[arg-type]
         for change in (
@@ -126,7 +125,7 @@ VARIANTS = (
             {"energy": "full"},
             {"compression": 0.01},
             {"compression": 0.04},
-            {"cfl": 0.125},
+            {"cfl": 0.25},
             {"per_axis": 4},
             {"kernel": "cubic"},
             {"transfer": "pic"},
@@ -256,7 +255,8 @@ class Segment:
     def __init__(self, step: mpm.Step, state: mpm.State, time_step: Callable[[mpm.State], Tensor]) -> None:
         self.step, self.time_step = step, time_step
         ids = torch.arange(len(state), device=state.x.device)
-        self.state = state.replace(ids=ids, C=torch.zeros_like(state.F))  # type: ignore[arg-type]
+        C = torch.zeros_like(state.F) if step.transfer == "apic" else None  # type: ignore[arg-type]
+        self.state = state.replace(ids=ids, C=C)
         self.time = torch.zeros(step.grid.scenes, dtype=torch.float64, device=state.x.device)
         self.status = torch.zeros_like(step.grid.activate(state.x, state.scene).status)
         self.graph: torch.cuda.CUDAGraph | None = None
@@ -372,7 +372,7 @@ def collapse(case: Case, aspects: Sequence[float], duration: float, device: str)
                 "angle": flank_angle(depth, distance),
                 "volume": float(state.J[state.scene == b].median()) - 1,  # type: ignore[index]
                 "kinetic energy": records[-1]["kinetic"][b] / (energy[0] - floor_energy),
-                "largest energy rise": max(np.diff(energy)) / energy[0],
+                "largest energy rise": float(max(np.diff(energy))) / energy[0],
                 "profile": [[round(float(v) / radius, 4) for v in values] for values in (distance, depth)],
             }
         )
