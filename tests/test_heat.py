@@ -343,6 +343,25 @@ def test_plastic_work_heats(device):
         assert gained == pytest.approx(3 * share * 7.0 * float(state.volume.sum()), rel=1e-12, abs=1e-12)
 
 
+def test_metal_that_hits_a_wall_warms_by_its_plastic_work(device):
+    """A von Mises disc: the heat is the plastic work, most of the mechanical energy that it loses and no more."""
+    disc = mpm.State.at_rest(mpm.seed.sphere((0.5, 0.3), 0.2, 1 / 16, per_cell=4), 1000.0, (0.0, -3.0), dtype=FLOAT)
+    state = disc.replace(temperature=torch.zeros_like(disc.mass)).to(device)
+    law = mpm.VonMises(E=1e6, nu=0.3, yield_stress=1e4)
+    heat = mpm.Heat(grid_around(n=16, low=0.0, high=1.0), 1.0, 1.0, plastic_heating=1.0)
+    step = mpm.Step(heat.grid, law, walls="slip", heat=heat)
+
+    def mechanical(s):
+        return float((0.5 * s.mass * s.v.square().sum(1) + law.energy(step.prepare(s))).sum())
+
+    with torch.no_grad():
+        end = mpm.rollout(step, state, 300, 5e-4)
+    step.check(end)
+    lost = mechanical(state) - mechanical(end)
+    assert lost > 0.5 * mechanical(state)
+    assert 0.7 < float(heat.heat_content(end).sum()) / lost < 1.0
+
+
 def test_block_melts_through_a_step_and_keeps_its_heat(device):
     """A block of wax in free fall that a source melts: fields of both phases, heat by the source, solid to liquid."""
     state = block(2, device, low=0.2, high=0.6, density=1000.0)
