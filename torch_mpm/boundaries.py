@@ -537,8 +537,8 @@ class Capsule(Obstacle):
 class Revolved(Obstacle):
     """A polygon turned about an axis: a cone, a tube, a funnel, an hourglass, a drum.
 
-    In 2-D, the polygon and its mirror image. A wall should be at least 4 cells thick, and reach 3 cells beyond the domain
-    where it meets one of its faces: nodes outside carry momentum too.
+    In 2-D, the polygon and its mirror image. A wall should be at least 4 cells thick, and reach 3 cells beyond the
+    domain where it meets one of its faces: nodes outside carry momentum too.
 
     Args:
         outline: corners of the polygon, K pairs of distance from the axis (≥ 0) and position along it [m], counted from

@@ -51,7 +51,7 @@ def measure(dim: int, energy: str, apex: str, steps: int, device: str) -> list[d
     )
     walls = mpm.Walls([("slip", "separate"), ("separate", "separate"), ("slip", "separate")][:dim], friction=0.3)
     step = mpm.Step(grid, law, gravity=(0.0, -GRAVITY, 0.0)[:dim], walls=walls)
-    segment = Segment(step, step.prepare(packed), lambda state: step.stable_dt(state, 0.5))
+    segment = Segment(step, step.prepare(packed), lambda state: step.stable_dt(state, 0.5), every_step=True)
     records = [record(step, segment.state)]
     for _ in range(math.ceil(steps / SEGMENT)):
         segment.run()
