@@ -15,6 +15,7 @@ DISC = {
 }
 
 FILE = """
+device = "cpu"
 gravity = [0.0, -10.0]
 duration = {duration}
 fps = 50

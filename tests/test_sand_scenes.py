@@ -110,7 +110,8 @@ def test_columns_of_a_batch_are_what_they_are_alone(device, dim):
 
     def run(parts: list[mpm.State], chosen: slice) -> mpm.State:
         mu, lam = (torch.tensor(v, dtype=torch.float64, device=device) for v in zip(*laws[chosen], strict=True))
-        grid = mpm.Grid(0.05, (0.0,) * dim, (1.5, 1.0, 0.1)[:dim], scenes=len(parts))
+        # Deterministic: a branch of the return map that falls otherwise by rounding moves F by more than rounding.
+        grid = mpm.Grid(0.05, (0.0,) * dim, (1.5, 1.0, 0.1)[:dim], scenes=len(parts), deterministic=True)
         step = mpm.Step(
             grid, mpm.QuarticSand(mu=mu, lam=lam), gravity=(0.0, -GRAVITY, 0.0)[:dim], walls=mpm.Walls("separate")
         )

@@ -124,6 +124,8 @@ class Scene(schema.SceneData):
             raise SceneError([f'device: takes "auto", "cpu" or "cuda", got {name!r}']) from None
         if device.type == "cuda" and not torch.cuda.is_available():
             raise SceneError([f'device: torch finds no CUDA device for {name!r}; use "cpu" or "auto"'])
+        if device.type == "cuda" and (device.index or 0) >= torch.cuda.device_count():
+            raise SceneError([f"device: there are {torch.cuda.device_count()} CUDA devices, got {name!r}"])
         return device
 
     def entries(self) -> list[ResolvedEntry]:
