@@ -251,7 +251,7 @@ def test_sigkill_in_the_middle_loses_and_repeats_nothing(tmp_path):
 @pytest.mark.slow
 def test_twenty_sigkills_at_random_moments(tmp_path):
     # The scene takes longer than all the delays together, so that every kill meets a run at work.
-    done = killed_and_resumed(tmp_path, 20, 60.0, lambda rng, k: rng.uniform(1.0, 4.0))
+    done = killed_and_resumed(tmp_path, 20, 200.0, lambda rng, k: rng.uniform(1.0, 4.0))
     assert done == 20
 
 
