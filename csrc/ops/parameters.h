@@ -3,8 +3,24 @@
 #include "materials/arguments.h"
 #include "ops/tensors.h"
 
-// Parameters of constitutive laws and adjoints that are wanted only now and then.
+// What the ops of constitutive laws share: dispatch on the deformation gradient, parameters, optional results.
 namespace mpm {
+
+// Calls f.operator()<T, D>().
+template <class F>
+void dispatch_deformation(const Tensor& deformation, F&& f) {
+  STD_TORCH_CHECK(deformation.dim() == 3 && (deformation.size(1) == 2 || deformation.size(1) == 3),
+                  "F must have shape [P, 2, 2] or [P, 3, 3]");
+  const auto by_dimension = [&]<class T>() {
+    deformation.size(1) == 2 ? f.template operator()<T, 2>() : f.template operator()<T, 3>();
+  };
+  if (deformation.scalar_type() == ScalarType::Float)
+    by_dimension.template operator()<float>();
+  else if (deformation.scalar_type() == ScalarType::Double)
+    by_dimension.template operator()<double>();
+  else
+    STD_TORCH_CHECK(false, "F must be float32 or float64");
+}
 
 template <class T>
 Parameter<T> parameter(const Tensor& t, const Tensor& state, int64_t particles, bool has_scene) {

@@ -28,22 +28,6 @@ PrincipalLawInfo find_principal_law(const std::string& name) {
   return info;
 }
 
-// Calls f.operator()<T, D>().
-template <class F>
-void dispatch_strain(const Tensor& deformation, F&& f) {
-  STD_TORCH_CHECK(deformation.dim() == 3 && (deformation.size(1) == 2 || deformation.size(1) == 3),
-                  "F must have shape [P, 2, 2] or [P, 3, 3]");
-  const auto by_dimension = [&]<class T>() {
-    deformation.size(1) == 2 ? f.template operator()<T, 2>() : f.template operator()<T, 3>();
-  };
-  if (deformation.scalar_type() == ScalarType::Float)
-    by_dimension.template operator()<float>();
-  else if (deformation.scalar_type() == ScalarType::Double)
-    by_dimension.template operator()<double>();
-  else
-    STD_TORCH_CHECK(false, "F must be float32 or float64");
-}
-
 template <class T, int D>
 PrincipalArguments<T, D> principal_arguments(const PrincipalLawInfo& law, const Tensor& F,
                                              const std::vector<Tensor>& parameters, const std::vector<Tensor>& history,
@@ -69,7 +53,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> principal_update(const Tensor
   const int64_t P = F.size(0);
   Tensor mapped, stress, moved, dissipated, branch = empty_int(F, {details ? P : 0});
   const DeviceScope device(F);
-  dispatch_strain(F, [&]<class T, int D>() {
+  dispatch_deformation(F, [&]<class T, int D>() {
     PrincipalUpdateArguments<T, D> a;
     a.law = principal_arguments<T, D>(info, F, parameters, history, scene);
     a.F = optional_result<T>(F, info.plastic, {P, D, D}, mapped);
@@ -90,7 +74,7 @@ std::tuple<Tensor, Tensor, Tensor> principal_update_backward(
   const int64_t P = F.size(0);
   Tensor adjoint_F, adjoint_parameters, adjoint_history;
   const DeviceScope device(F);
-  dispatch_strain(F, [&]<class T, int D>() {
+  dispatch_deformation(F, [&]<class T, int D>() {
     PrincipalBackwardArguments<T, D> a;
     a.law = principal_arguments<T, D>(info, F, parameters, history, scene);
     a.grad_F = input<T>(grad_F, "grad_F", F, {P, D, D});
@@ -110,7 +94,7 @@ Tensor principal_scalar(PrincipalScalar which, const Tensor& F, const std::vecto
   const PrincipalLawInfo info = find_principal_law(law);
   Tensor value = empty(F, {F.size(0)});
   const DeviceScope device(F);
-  dispatch_strain(F, [&]<class T, int D>() {
+  dispatch_deformation(F, [&]<class T, int D>() {
     const PrincipalScalarArguments<T, D> a{principal_arguments<T, D>(info, F, parameters, history, scene), which,
                                            field<T>(value)};
     backend::principal_scalar(a, device.stream());
@@ -142,7 +126,7 @@ std::tuple<Tensor, Tensor, Tensor> principal_energy_backward(const Tensor& grad_
   const int64_t P = F.size(0);
   Tensor adjoint_F, adjoint_parameters, adjoint_history;
   const DeviceScope device(F);
-  dispatch_strain(F, [&]<class T, int D>() {
+  dispatch_deformation(F, [&]<class T, int D>() {
     PrincipalEnergyBackwardArguments<T, D> a;
     a.law = principal_arguments<T, D>(info, F, parameters, history, scene);
     a.grad_energy = input<T>(grad_energy, "grad_energy", F, {P});

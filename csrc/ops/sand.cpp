@@ -21,22 +21,6 @@ int energy_index(const std::string& name, const std::string& flow) {
   return index;
 }
 
-// Calls f.operator()<T, D>().
-template <class F>
-void dispatch_deformation(const Tensor& deformation, F&& f) {
-  STD_TORCH_CHECK(deformation.dim() == 3 && (deformation.size(1) == 2 || deformation.size(1) == 3),
-                  "F must have shape [P, 2, 2] or [P, 3, 3]");
-  const auto by_dimension = [&]<class T>() {
-    deformation.size(1) == 2 ? f.template operator()<T, 2>() : f.template operator()<T, 3>();
-  };
-  if (deformation.scalar_type() == ScalarType::Float)
-    by_dimension.template operator()<float>();
-  else if (deformation.scalar_type() == ScalarType::Double)
-    by_dimension.template operator()<double>();
-  else
-    STD_TORCH_CHECK(false, "F must be float32 or float64");
-}
-
 template <class T, int D>
 SandArguments<T, D> sand_arguments(const Tensor& F, const Tensor& mu, const Tensor& lam, const OptionalTensor& scene) {
   SandArguments<T, D> a;

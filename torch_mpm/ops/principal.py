@@ -11,6 +11,7 @@ from torch import Tensor
 from ..errors import FLOATING, check_like, shape_of
 from ..reference.principal import ELASTIC, INVALID, LAWS, PLASTIC
 from .arguments import refuse_vmap, soa_empty, sum_by_scene
+from .material import _no_backward, _no_setup
 
 __all__ = [
     "ELASTIC",
@@ -231,18 +232,8 @@ def _energy_backward(ctx, grad):
     return *_gradients(ctx, torch.ops.torch_mpm.principal_energy_backward, (grad,)), None, None
 
 
-def _no_setup(ctx: Any, inputs: Any, output: Any) -> None:
-    pass
-
-
 def _no_second_derivative(ctx, *grads):
     raise NotImplementedError("laws in principal strains have no second derivatives: differentiate them once")
-
-
-def _no_backward(ctx, grad):
-    raise NotImplementedError(
-        "wave speeds and stiffness bounds are not differentiable: compute them under torch.no_grad()"
-    )
 
 
 for _name, _backward, _context in (

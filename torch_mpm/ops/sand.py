@@ -11,6 +11,7 @@ from torch import Tensor
 from ..errors import FLOATING, check_like, shape_of
 from ..reference.sand import APEX, CONE, ELASTIC, ENERGIES, INVALID, friction_alpha
 from .arguments import refuse_vmap, soa_empty, sum_by_scene
+from .material import _no_setup
 
 __all__ = [
     "APEX",
@@ -281,10 +282,6 @@ def _energy_backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         value = torch.ops.torch_mpm.quartic_energy(F, unit[share], unit[1 - share], scene, ctx.energy)
         shared.append(_shared(grad * torch.where(meaningful, value, 0), parameter, scene))
     return grad_F, *shared, None, None
-
-
-def _no_setup(ctx: Any, inputs: Any, output: Any) -> None:
-    pass
 
 
 def _no_second_derivative(ctx: Any, *grads: Tensor | None) -> Sequence[Tensor | None]:
