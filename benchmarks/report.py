@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from . import common
-from .accuracy.runout import PUBLISHED, published
+from .accuracy.runout import PUBLISHED, published, slopes
 
 BEGIN, END = "<!-- benchmarks -->", "<!-- /benchmarks -->"
 FORWARD = ("step", "step, CUDA graph")
@@ -135,14 +135,13 @@ def runout(result: dict[str, Any]) -> str:
         exponents = [f"{case['exponents'][k]:.2f}" for k in ("wide", "narrow")]
         lines.append((case["name"], *runouts, *exponents, case["seconds"]))
     header = ("run-out at a =", *(f"{a:g}" for a in aspects), "exponent, a ≤ 2", "a ≥ 3", "run time [s]")
-    slopes = [(s["name"], s["steepest"], s["least failing"]) for s in result["standing"]]
     intro = (
         "Run-out (r − r₀)/r₀ of columns of aspect ratio a on a rough floor (benchmarks/accuracy/runout.py, "
         f"{result['environment']['device']}), each row one batch."
     )
     parts = [intro, common.table(header, lines), "![run-out over aspect ratio](benchmarks/results/runout.png)"]
-    if slopes:
-        parts.append(common.table(("slope in plane strain", "steepest that stands [°]", "fails from [°]"), slopes))
+    if result["standing"]:
+        parts.append(slopes(result))
     return "\n\n".join(parts)
 
 

@@ -18,9 +18,8 @@ material and on the side walls of the experiments; exponents in 0.9 ± 0.1 and, 
 materials (Balmforth and Kerswell 2005).
 
 Standing slopes: heaps with a plane flank from 20° to 50° stand against a frictionless wall, in one batch. One has
-failed if the mean displacement is more than 2% of its height after 4 √(H/g). The steepest one that stands shows the
-Mohr-Coulomb angle that the law mobilises in plane strain: the friction angle in 2-D, and in 3-D one that depends on the
-flow rule.
+failed if the mean displacement is more than 2% of its height after 4 √(H/g). Beside it the Mohr-Coulomb angle that the
+law mobilises in steady shear: the friction angle in 2-D, and in plane strain one that depends on energy and flow rule.
 """
 
 from __future__ import annotations
@@ -432,6 +431,22 @@ def standing(case: Case, angles: Sequence[float], duration: float, device: str) 
     }
 
 
+def mobilised_angle(case: Case) -> float:
+    """Mohr-Coulomb angle [degrees] of steady shear in plane strain, by a hundred steps of the return map."""
+    dim = case.dim
+    shear = torch.tensor([-0.1, 0.1, 0.0][:dim], dtype=torch.float64)
+    h = torch.full_like(shear, -0.01)
+    for _ in range(100):
+        F = torch.diag_embed((h + shear).exp())[None]
+        friction_angle = math.radians(case.friction_angle)
+        lam = 2 * NU / (1 - 2 * NU)
+        result = mpm.ops.quartic_return_map(F, 1.0, lam, friction_angle, energy=case.energy, flow=case.flow)
+        h = result.F[0].diagonal().log()
+    pressure = -result.stress[0].diagonal()
+    least, most = float(pressure[:2].min()), float(pressure[:2].max())
+    return math.degrees(math.asin((most - least) / (most + least)))
+
+
 def measure(device: str, quick: bool, only: str) -> dict[str, Any]:
     """All parts whose kind and name match the regular expression `only`; few of them on the CPU."""
     cases, slopes, variants, aspects, angles = CASES, SLOPES, VARIANTS, ASPECTS, ANGLES
@@ -475,6 +490,16 @@ def published(shape: str, a: float) -> float:
     return factor * a**power
 
 
+def slopes(result: dict[str, Any]) -> str:
+    """Table of the slopes that stand, beside the angle that the law mobilises."""
+    header = ("slope in plane strain", "steepest that stands [°]", "least steep that fails [°]", "mobilised [°]")
+    rows = [
+        (s["name"], s["steepest"], s["least failing"], f"{mobilised_angle(Case(**s['case'])):.1f}")
+        for s in result["standing"]
+    ]
+    return common.table(header, rows)
+
+
 def text(result: dict[str, Any]) -> str:
     """Tables of a result in Markdown."""
     lines = ["# Collapse of columns of sand", "", common.describe(result["environment"]), ""]
@@ -486,9 +511,7 @@ def text(result: dict[str, Any]) -> str:
     ]
     lines += ["## Exponents and run time", "", common.table(header, rows)]
     if result["standing"]:
-        header = ("case", "steepest that stands [°]", "least steep that fails [°]")
-        rows = [(s["name"], s["steepest"], s["least failing"]) for s in result["standing"]]
-        lines += ["", "## Standing slopes", "", common.table(header, rows)]
+        lines += ["", "## Standing slopes", "", slopes(result)]
     if result["variants"]:
         header = ("variant", "particles", "steps", "run-out", "run-out of 99%", "angle [°]", "volume", "seconds")
         rows = [
