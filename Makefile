@@ -67,8 +67,8 @@ sanitize: $(STAMP)
 # On a GPU machine whose Python already has torch, ninja and pytest: no virtual environment and no network.
 gpu:
 	TORCH_MPM_CUDA=1 $(PYTHON) setup.py -q build_ext --inplace
-	PYTHONPATH=. $(PYTHON) -m benchmarks.tests
-	PYTHONPATH=. $(PYTHON) -m benchmarks
+	PYTHONPATH=. $(PYTHON) -m benchmarks.tests --processes $(shell nproc)
+	PYTHONPATH=. $(PYTHON) -m benchmarks --device cuda
 
 clean:
 	rm -rf build dist out torch_mpm/lib torch_mpm/_math*.so

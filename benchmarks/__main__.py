@@ -1,7 +1,7 @@
 """Run the benchmarks one after the other: `python -m benchmarks [--quick] [--device cpu|cuda] [--out DIRECTORY]`.
 
-Each is a process of its own; the exit status says whether all of them ended well. Without `--device`, CUDA where there
-is a GPU.
+Each is a process of its own; the exit status says whether all of them ended well. Without `--device`, all of them, on
+CUDA where there is a GPU; with `--device cuda` those that use it.
 """
 
 from __future__ import annotations
@@ -47,15 +47,16 @@ ON_DEVICE = (
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="small sizes, to see that the programs work")
-    parser.add_argument("--device", choices=["cpu", "cuda"], default="cuda" if torch.cuda.is_available() else "cpu")
+    parser.add_argument("--device", choices=["cpu", "cuda"])
     parser.add_argument("--out", type=Path, default=common.RESULTS)
     arguments = parser.parse_args()
     options = ["--out", str(arguments.out.resolve()), *(["--quick"] if arguments.quick else [])]
+    device = arguments.device or ("cuda" if torch.cuda.is_available() else "cpu")
     failed = []
-    for program in PROGRAMS:
+    for program in ON_DEVICE if arguments.device == "cuda" else PROGRAMS:
         print(f"\n== {program}", flush=True)
-        device = ["--device", arguments.device] if program in ON_DEVICE else []
-        if subprocess.run([sys.executable, "-m", program, *options, *device], cwd=common.ROOT).returncode:
+        words = ["--device", device] if program in ON_DEVICE else []
+        if subprocess.run([sys.executable, "-m", program, *options, *words], cwd=common.ROOT).returncode:
             failed.append(program)
     sys.exit(f"failed: {', '.join(failed)}" if failed else 0)
 
