@@ -45,7 +45,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> activate(
     a.schedule_size = schedule_size<D>(capacity, x.size(0));
     schedule = empty_int(x, {a.schedule_size});
     a.workspace_size = backend::activate_workspace(a);
-    const Tensor workspace = torch::stable::new_empty(x, Shape{a.workspace_size}, ScalarType::Byte);
+    const Tensor workspace = empty(x, {a.workspace_size}, ScalarType::Byte);
     a.workspace = workspace.data_ptr();
     a.table = static_cast<int*>(table.data_ptr());
     a.block = static_cast<int*>(block.data_ptr());

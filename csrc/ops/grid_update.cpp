@@ -106,7 +106,7 @@ GridUpdateArguments<T, D> grid_update_arguments(MPM_GRID_UPDATE_PARAMETERS) {
 Tensor grid_update(MPM_GRID_UPDATE_PARAMETERS) {
   const DeviceScope device(nodes);
   const Tensor packed = packed_rows(nodes);
-  Tensor updated = torch::stable::empty_like(packed);
+  Tensor updated = empty(packed, {packed.size(0), packed.size(1)});
   dispatch_nodes(nodes, [&]<class T, int D>() {
     auto a = grid_update_arguments<T, D>(MPM_GRID_UPDATE_ARGUMENTS);
     a.nodes = rows<T, D>(packed, "nodes", nodes);
@@ -120,7 +120,7 @@ Tensor grid_update(MPM_GRID_UPDATE_PARAMETERS) {
 std::tuple<Tensor, Tensor> grid_update_backward(const Tensor& grad, bool wants_change, MPM_GRID_UPDATE_PARAMETERS) {
   const DeviceScope device(nodes);
   const Tensor packed = packed_rows(nodes), packed_grad = packed_rows(grad);
-  Tensor grad_nodes = torch::stable::empty_like(packed),
+  Tensor grad_nodes = empty(packed, {packed.size(0), packed.size(1)}),
          change = empty(nodes, {wants_change ? block.size(0) : 0, nodes.size(1) - 1});
   dispatch_nodes(nodes, [&]<class T, int D>() {
     GridUpdateBackwardArguments<T, D> a;

@@ -21,7 +21,7 @@ class Values {
                     " has an unexpected dtype or is not on the device of x");
     packed_ = *t;
     if (size > 1 && t->stride(0) != 1) {
-      packed_ = torch::stable::new_empty(*t, Shape{size});
+      packed_ = empty(*t, {size});
       torch::stable::copy_(packed_, *t);
     }
     pointer = static_cast<const T*>(packed_.data_ptr());
@@ -74,12 +74,12 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> heat_cg(const Tensor& x, const Tensor
     increment = empty(x, {N});
     iterations = empty_int(x, {scenes});
     residual = empty(x, {scenes});
-    converged = torch::stable::new_empty(x, Shape{scenes}, ScalarType::Bool);
+    converged = empty(x, {scenes}, ScalarType::Bool);
     a.increment = static_cast<T*>(increment.data_ptr());
     a.iterations = static_cast<int*>(iterations.data_ptr());
     a.residual = static_cast<T*>(residual.data_ptr());
     a.converged = static_cast<bool*>(converged.data_ptr());
-    const Tensor workspace = torch::stable::new_empty(x, Shape{backend::heat_workspace(a)}, ScalarType::Byte);
+    const Tensor workspace = empty(x, {backend::heat_workspace(a)}, ScalarType::Byte);
     a.workspace = workspace.data_ptr();
     backend::heat_cg<Order>(a, device.stream());
   });
@@ -100,9 +100,9 @@ Tensor heat_operator(const Tensor& x, const Tensor& conductance, const OptionalT
     const Values<T> u(nodes, "nodes", x, x.scalar_type(), N);
     a.nodes = u.pointer;
     a.deterministic = deterministic;
-    sum = torch::stable::new_zeros(x, Shape{N});
+    sum = zeros(x, {N});
     a.sum = static_cast<T*>(sum.data_ptr());
-    const Tensor workspace = torch::stable::new_empty(x, Shape{backend::heat_operator_workspace(a)}, ScalarType::Byte);
+    const Tensor workspace = empty(x, {backend::heat_operator_workspace(a)}, ScalarType::Byte);
     a.workspace = workspace.data_ptr();
     backend::heat_operator<Order>(a, device.stream());
   });

@@ -68,10 +68,12 @@ NodeField<const T> node_input(const Tensor& t, const char* name, const Tensor& x
   return {static_cast<const T*>(t.data_ptr()), t.stride(0), int(t.size(1))};
 }
 
-inline Tensor empty(const Tensor& like, const Shape& shape) { return torch::stable::new_empty(like, shape); }
-inline Tensor empty_int(const Tensor& like, const Shape& shape) {
-  return torch::stable::new_empty(like, shape, ScalarType::Int);
-}
+// Uninitialised tensors on the device of another one; on the CPU, large ones come from a pool (csrc/cpu/pool.h).
+Tensor empty_strided(const Tensor& like, const Shape& shape, const Shape& strides, ScalarType type);
+Tensor empty(const Tensor& like, const Shape& shape, ScalarType type);
+Tensor empty(const Tensor& like, const Shape& shape);
+inline Tensor empty_int(const Tensor& like, const Shape& shape) { return empty(like, shape, ScalarType::Int); }
+Tensor zeros(const Tensor& like, const Shape& shape);
 
 // Elements from row to row of a structure of arrays. On the CPU, rows of whole pages (P a power of two) would share
 // cache sets, and a load would wait for stores to other rows whose addresses end alike: 23 cache lines more than pages
@@ -84,22 +86,7 @@ inline int64_t particle_pitch(const Tensor& like, int64_t particles) {
 }
 
 // A [P, ...] tensor stored as structure of arrays: the particle index is contiguous.
-inline Tensor empty_particles(const Tensor& like, const Shape& shape) {
-  Shape strides(shape.size());
-  strides[0] = 1;
-  int64_t next = shape.size() > 1 ? particle_pitch(like, shape[0]) : 0;
-  for (size_t i = shape.size() - 1; i > 0; i--) {
-    strides[i] = next;
-    next *= shape[i];
-  }
-  AtenTensorHandle handle;
-  int32_t dtype, device;
-  TORCH_ERROR_CODE_CHECK(aoti_torch_get_dtype(like.get(), &dtype));
-  TORCH_ERROR_CODE_CHECK(aoti_torch_get_device_type(like.get(), &device));
-  TORCH_ERROR_CODE_CHECK(aoti_torch_empty_strided(int64_t(shape.size()), shape.data(), strides.data(), dtype, device,
-                                                  like.get_device_index(), &handle));
-  return Tensor(handle);
-}
+Tensor empty_particles(const Tensor& like, const Shape& shape);
 
 // Calls f.operator()<T, D, Order>() for the dtype and dimension of x.
 template <class F>

@@ -35,7 +35,7 @@ Tensor p2g(const Tensor& x, const Tensor& mass, const Tensor& v, const OptionalT
   dispatch(x, order, [&]<class T, int D, int Order>() {
     P2GArguments<T, D> a = p2g_arguments(x, mass, v, C, stress, volume, scene_dt, dt, stress_form, deterministic,
                                          topology<T, D>(x, MPM_TOPOLOGY_ARGUMENTS));
-    nodes = torch::stable::new_zeros(x, Shape{node_count<D>(block), 1 + D});
+    nodes = zeros(x, {node_count<D>(block), 1 + D});
     a.nodes = {static_cast<T*>(nodes.data_ptr()), 1 + D, 1 + D};
     backend::p2g<Order>(a, device.stream());
   });
@@ -94,7 +94,7 @@ Tensor scatter(const Tensor& x, const Tensor& value, const OptionalTensor& momen
     a.gradient = input<T>(gradient, "gradient", x, {P, K, D});
     a.moment_scale = moment_scale;
     a.deterministic = deterministic;
-    nodes = torch::stable::new_zeros(x, Shape{node_count<D>(block), K});
+    nodes = zeros(x, {node_count<D>(block), K});
     a.nodes = {static_cast<T*>(nodes.data_ptr()), K, int(K)};
     backend::scatter<Order>(a, device.stream());
   });
