@@ -54,8 +54,12 @@ def run_side_by_side(
     statuses, total = [], dict.fromkeys((*COUNTS, "time"), 0.0)
     for number, started in enumerate(running):
         statuses.append(started.wait())
-        print((folder / f"{number}.log").read_text()[-2000:], flush=True)
-        suite = counts_of(folder / f"{number}.xml")
+        log, report = folder / f"{number}.log", folder / f"{number}.xml"
+        print(f"process {number}: exit status {statuses[-1]}\n{log.read_text()[-2000:]}", flush=True)
+        if not report.exists():  # it crashed
+            total["errors"] += 1
+            continue
+        suite = counts_of(report)
         for name in COUNTS:
             total[name] += int(suite[name])
         total["time"] = max(total["time"], float(suite["time"]))
