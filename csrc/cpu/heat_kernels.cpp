@@ -180,7 +180,10 @@ struct HeatSolver {
     for_slots(all, [&](int64_t slot, int scene, int64_t first) {
       auto sums = StartSums<T>::zero();
       const double dt = scene < 0 ? 1 : step_of_scene(a, scene);
-      for (int n = 0; n < kBlockNodes<D>; n++) sums.add(start_node(a, w.v, first + n, dt, scene >= 0));
+      for (int64_t i = first; i < first + kBlockNodes<D>; i++) {
+        sums.add(start_node(a, w.v, i, i, dt, scene >= 0));
+        a.increment[i] = T(0);
+      }
       w.start[slot] = sums;
     });
     for_scenes(all, w.start, StartSums<double>::zero(),

@@ -3,11 +3,14 @@
 #include <cooperative_groups.h>
 
 #include "cuda/heat_launchers.h"
+#include "cuda/heat_scene.cuh"
+#include "cuda/heat_sums.cuh"
 #include "cuda/home.cuh"
 #include "cuda/launch.cuh"
 #include "heat/cell.h"
 
-// The heat solve as one persistent kernel: all scenes advance together, phase by phase, with a barrier of the whole
+// The heat solve. Scenes that are small are solved one by one (csrc/cuda/heat_scene.cuh), the others here by one
+// persistent kernel: all scenes advance together, phase by phase, with a barrier of the whole
 // grid between phases; a scene that is done takes no further work, and the kernel ends with the last one. The host is
 // never asked, and the kernel can be captured in a graph.
 //
@@ -30,11 +33,6 @@ struct HeatShape {
   static constexpr int slices = cells < 32 ? 32 / cells : 1;  // lanes that share the particles of a cell
   static constexpr int parts = cells * slices / 32;           // of a block, one warp wide
   static constexpr int width = kBlockWidth + Order, tile = D == 2 ? width * width : width * width * width;
-};
-
-template <class T, int D>
-struct alignas(16) PackedParticle {
-  T f[D], conductance;
 };
 
 // Memory of one warp.
@@ -72,10 +70,11 @@ struct HeatWorkspace {
   HeatScene* scene;        // [scenes]
   SceneRange* range;       // [scenes]
   int* running;            // [1] scenes at work
+  SceneWorkspace apart;    // of small scenes
   int64_t size;            // in bytes
 
   // `vectors` false: what the operator alone needs.
-  HeatWorkspace(const Topology<T, D>& t, void* memory, bool vectors) : size(0) {
+  HeatWorkspace(const Topology<T, D>& t, void* memory, bool vectors, bool small = false) : apart{}, size(0) {
     char* const base = static_cast<char*>(memory);
     const auto take = [&](int64_t bytes) {
       char* p = base + size;
@@ -95,10 +94,12 @@ struct HeatWorkspace {
     scene = reinterpret_cast<HeatScene*>(take(t.scenes * sizeof(HeatScene)));
     range = reinterpret_cast<SceneRange*>(take(t.scenes * sizeof(SceneRange)));
     running = reinterpret_cast<int*>(take(sizeof(int)));
+    if (!small) return;
+    apart.order = reinterpret_cast<int*>(take(t.particles * sizeof(int)));
+    apart.cells = reinterpret_cast<SceneCell*>(take((t.particles + t.scenes) * sizeof(SceneCell)));
+    apart.left = reinterpret_cast<bool*>(take(t.scenes));
   }
 };
-
-__device__ inline int lane_index() { return threadIdx.x % 32; }
 
 // Particles that a lane takes of its cell in each part of a block.
 template <class S>
@@ -348,8 +349,16 @@ struct HeatKernel {
   Columns<const T, D> x;
   Columns<const T, 1> conductance;
 
-  explicit HeatKernel(const HeatArguments<T, D>& a)
-      : a(a), w(a.topology, a.workspace, true), x(a.x), conductance(a.conductance) {}
+  HeatKernel(const HeatArguments<T, D>& a, bool small)
+      : a(a), w(a.topology, a.workspace, true, small), x(a.x), conductance(a.conductance) {}
+
+  // Whether the scene is solved here, and not by a thread block.
+  __device__ bool takes(int scene) const { return !w.apart.left || w.apart.left[scene]; }
+  __device__ bool takes_any() const {
+    bool any = !w.apart.left;
+    for (int scene = threadIdx.x; scene < a.topology.scenes && !any; scene += kHeatThreads) any = w.apart.left[scene];
+    return __syncthreads_or(any);
+  }
 
   __device__ int scene_of_slot(int slot) const {
     const int block = a.topology.block[slot], scene = block / a.topology.geometry.blocks_per_scene;
@@ -382,13 +391,15 @@ struct HeatKernel {
     return {item(scene), item(scene + 1), slot(scene), slot(scene + 1)};
   }
 
-  // f(slot, scene, first node): a slot takes kSlotLanes lanes, and a lane every kSlotLanes-th node from its first on.
+  // f(slot, scene, first node) for slots of scenes taken and unused ones: a slot takes kSlotLanes lanes, and a lane
+  // every kSlotLanes-th node from its first on.
   template <class F>
   __device__ void for_slots(const F& f) const {
     constexpr int lanes = kSlotLanes<D>, slots = 32 / lanes;
     const int warp = blockIdx.x + threadIdx.x / 32 * gridDim.x, stride = gridDim.x * kHeatWarps * slots;
     for (int slot = warp * slots + lane_index() / lanes; slot < a.topology.capacity; slot += stride)
-      f(slot, scene_of_slot(slot), int64_t(slot) * kBlockNodes<D> + lane_index() % lanes);
+      if (const int scene = scene_of_slot(slot); scene < 0 || takes(scene))
+        f(slot, scene, int64_t(slot) * kBlockNodes<D> + lane_index() % lanes);
   }
   template <class F>
   __device__ static void for_nodes(int64_t first, const F& f) {
@@ -396,10 +407,11 @@ struct HeatKernel {
     for (int n = 0; n < kBlockNodes<D>; n += kSlotLanes<D>) f(first + n);
   }
   __device__ static bool is_first_lane() { return lane_index() % kSlotLanes<D> == 0; }
-  // f(scene) by one block of threads per scene.
+  // f(scene) by one block of threads per scene taken.
   template <class F>
   __device__ void for_scenes(const F& f) const {
-    for (int scene = blockIdx.x; scene < a.topology.scenes; scene += gridDim.x) f(scene);
+    for (int scene = blockIdx.x; scene < a.topology.scenes; scene += gridDim.x)
+      if (takes(scene)) f(scene);
   }
 
   template <HeatSum Sum, class Wanted, class Finish>
@@ -420,52 +432,23 @@ struct HeatKernel {
   __device__ void finish() const;
 };
 
-// Sum over neighbouring lanes, in each of them.
-template <int Lanes, class V>
-__device__ V sum_of_lanes(V s) {
-  constexpr int words = sizeof(V) / 4;
-  const unsigned mask = Lanes == 32 ? ~0u : ((1u << Lanes % 32) - 1) << lane_index() / Lanes * Lanes;
-#pragma unroll
-  for (int o = Lanes / 2; o > 0; o /= 2) {
-    V other;
-#pragma unroll
-    for (int k = 0; k < words; k++)
-      reinterpret_cast<int*>(&other)[k] = __shfl_xor_sync(mask, reinterpret_cast<const int*>(&s)[k], o);
-    s.add(other);
-  }
-  return s;
-}
-
-struct Curvature {
-  double value;
-  __device__ void add(const Curvature& o) { value += o.value; }
-};
-
-// Sum over the threads of a block, in a fixed order; valid in thread 0.
-template <class V>
-__device__ V sum_of_block(V value) {
-  __shared__ V parts[kHeatWarps];
-  value = sum_of_lanes<32>(value);
-  __syncthreads();
-  if (threadIdx.x % 32 == 0) parts[threadIdx.x / 32] = value;
-  __syncthreads();
-  if (threadIdx.x == 0)
-    for (int k = 1; k < kHeatWarps; k++) value.add(parts[k]);
-  return value;
-}
-
 template <int Order, class T, int D>
 __device__ void HeatKernel<Order, T, D>::start(WarpMemory<S>& memory) const {
   const Topology<T, D>& t = a.topology;
   const int64_t threads = int64_t(gridDim.x) * kHeatThreads, thread = int64_t(blockIdx.x) * kHeatThreads + threadIdx.x;
-  const auto all = [](int) { return true; };
+  const auto all = [&](int scene) { return takes(scene); };
   const auto nothing = [](int, int, T) {};
   for (int64_t i = thread; i < int64_t(t.capacity) * kBlockNodes<D>; i += threads)
     w.v.product[i] = w.v.inverse[i] = w.v.weight[i] = T(0);
-  for (int64_t scene = thread; scene < t.scenes; scene += threads) w.range[scene] = range_of(int(scene));
+  for (int64_t scene = thread; scene < t.scenes; scene += threads) {
+    w.range[scene] = range_of(int(scene));
+    w.scene[scene].running = false;
+  }
   if (thread == 0) *w.running = 0;
   const Item* const items = reinterpret_cast<const Item*>(schedule_of(t).items);
-  for_items(t, -1, [&](int i, int) { pack_item<S>(t, x, conductance, items[i], i, w.packed, memory); });
+  for_items(t, -1, [&](int i, int) {
+    if (takes(scene_of(t, items[i].block))) pack_item<S>(t, x, conductance, items[i], i, w.packed, memory);
+  });
   cg::this_grid().sync();
   if (a.theta) sum_to<HeatSum::product>(a.theta, w.v.product, memory, all, nothing);
   if (a.method == HeatMethod::chebyshev)
@@ -476,7 +459,10 @@ __device__ void HeatKernel<Order, T, D>::start(WarpMemory<S>& memory) const {
   for_slots([&](int slot, int scene, int64_t first) {
     auto sums = StartSums<T>::zero();
     const double dt = scene < 0 ? 1 : step_of_scene(a, scene);
-    for_nodes(first, [&](int64_t i) { sums.add(start_node(a, w.v, i, dt, scene >= 0)); });
+    for_nodes(first, [&](int64_t i) {
+      sums.add(start_node(a, w.v, i, i, dt, scene >= 0));
+      a.increment[i] = T(0);
+    });
     sums = sum_of_lanes<kSlotLanes<D>>(sums);
     if (is_first_lane()) w.start[slot] = sums;
   });
@@ -563,7 +549,7 @@ __device__ void HeatKernel<Order, T, D>::finish() const {
   });
   for (int scene = blockIdx.x * kHeatThreads + threadIdx.x; scene < a.topology.scenes;
        scene += gridDim.x * kHeatThreads)
-    report_scene(a, scene, w.scene[scene]);
+    if (takes(scene)) report_scene(a, scene, w.scene[scene]);
 }
 
 // Thread blocks to fit in a multiprocessor at once, which limits registers.
@@ -575,6 +561,7 @@ __global__ void __launch_bounds__(kHeatThreads, kHeatResident<Order, T>)
     heat_kernel(const HeatKernel<Order, T, D> kernel) {
   __shared__ WarpMemory<HeatShape<Order, T, D>> memory[kHeatWarps];
   WarpMemory<HeatShape<Order, T, D>>& own = memory[threadIdx.x / 32];
+  if (!kernel.takes_any()) return;
   kernel.start(own);
   while (*static_cast<volatile int*>(kernel.w.running) > 0) kernel.iterate(own);
   kernel.finish();
@@ -601,10 +588,11 @@ __global__ void __launch_bounds__(kHeatThreads)
 template <int Order, class T, int D>
 void heat_cg(const HeatArguments<T, D>& a, Stream stream) {
   const Topology<T, D>& t = a.topology;
-  HeatKernel<Order, T, D> kernel(a);
-  int device = 0, processors = 0, resident = 0;
-  check(cudaGetDevice(&device));
-  check(cudaDeviceGetAttribute(&processors, cudaDevAttrMultiProcessorCount, device));
+  const bool small = small_scenes(t);
+  HeatKernel<Order, T, D> kernel(a, small);
+  if (small) solve_scenes<Order, T, D>({a, kernel.w.packed.particles, kernel.w.v, kernel.w.apart}, stream);
+  const int processors = device_attribute(cudaDevAttrMultiProcessorCount);
+  int resident = 0;
   check(cudaOccupancyMaxActiveBlocksPerMultiprocessor(&resident, heat_kernel<Order, T, D>, kHeatThreads, 0));
   const int64_t wanted = std::max<int64_t>(most_items(t.capacity, t.particles), t.capacity) / kHeatWarps + 1;
   const unsigned blocks =
@@ -625,7 +613,7 @@ void heat_operator(const HeatOperatorArguments<T, D>& a, Stream stream) {
 
 template <class T, int D>
 int64_t heat_workspace(const HeatArguments<T, D>& a) {
-  return HeatWorkspace<T, D>(a.topology, nullptr, true).size;
+  return HeatWorkspace<T, D>(a.topology, nullptr, true, small_scenes(a.topology)).size;
 }
 template <class T, int D>
 int64_t heat_operator_workspace(const HeatOperatorArguments<T, D>& a) {

@@ -13,12 +13,17 @@ inline void check(cudaError_t error) {
   if (error != cudaSuccess) throw std::runtime_error(std::string("CUDA: ") + cudaGetErrorString(error));
 }
 
+inline int device_attribute(cudaDeviceAttr attribute) {
+  int device = 0, value = 0;
+  check(cudaGetDevice(&device));
+  check(cudaDeviceGetAttribute(&value, attribute, device));
+  return value;
+}
+
 // Thread blocks for `count` pieces of work that a kernel takes in strides of its grid. Many more than fit at once, so
 // that the hardware balances them, but not so many that empty ones cost time when `count` is a generous bound.
 inline unsigned grid_size(int64_t count) {
-  int device = 0, processors = 0;
-  check(cudaGetDevice(&device));
-  check(cudaDeviceGetAttribute(&processors, cudaDevAttrMultiProcessorCount, device));
+  const int processors = device_attribute(cudaDevAttrMultiProcessorCount);
   return unsigned(std::clamp<int64_t>(count, 1, int64_t(processors) * 128));
 }
 

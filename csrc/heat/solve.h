@@ -110,21 +110,23 @@ MPM_HD double step_of_scene(const HeatArguments<T, D>& a, int scene) {
   return a.scene_dt ? a.dt * double(a.scene_dt[scene]) : a.dt;
 }
 
-// First right side, with increment zero. `used` is false for rows of unused blocks.
+// First right side, of increment zero, of node i of the vectors, which lies in `row`. `used` is false for rows of
+// unused blocks.
 template <class T, int D>
-MPM_HD StartSums<T> start_node(const HeatArguments<T, D>& a, const HeatVectors<T>& v, int64_t i, double dt, bool used) {
-  const T mass = used ? a.capacity[i] : T(0), exchange = a.exchange && used ? a.exchange[i] : T(0);
-  const T source = a.source && used ? a.source[i] : T(0);
-  const bool material = used && !(mass <= T(0)), held = material && a.fixed && a.fixed[i], free = material && !held;
+MPM_HD StartSums<T> start_node(const HeatArguments<T, D>& a, const HeatVectors<T>& v, int64_t row, int64_t i, double dt,
+                               bool used) {
+  const T mass = used ? a.capacity[row] : T(0), exchange = a.exchange && used ? a.exchange[row] : T(0);
+  const T source = a.source && used ? a.source[row] : T(0);
+  const bool material = used && !(mass <= T(0)), held = material && a.fixed && a.fixed[row], free = material && !held;
   auto sums = StartSums<T>::zero();
   const T product = v.product[i], diagonal = v.inverse[i], bound = v.weight[i];
-  v.p[i] = v.product[i] = a.increment[i] = v.mass[i] = v.weight[i] = v.inverse[i] = v.r[i] = T(0);
+  v.p[i] = v.product[i] = v.mass[i] = v.weight[i] = v.inverse[i] = v.r[i] = T(0);
   sums.open = held || (free && exchange != T(0));
   if (!free) return sums;
   const T weight = mass / T(dt) + exchange;
   const T inverse = T(1) / (a.method == HeatMethod::chebyshev ? weight : weight + diagonal);
   T r = source - product;
-  if (a.theta) r -= exchange * a.theta[i];
+  if (a.theta) r -= exchange * a.theta[row];
   v.mass[i] = mass;
   v.weight[i] = weight;
   v.inverse[i] = inverse;

@@ -35,7 +35,8 @@ def refine(
     Returns:
         increment in float64 [N], iterations, residual and converged [B].
     """
-    wide = blocks.grid.activate(x.detach().double(), blocks.scene)
+    position, conduction = x.double(), conductance.double()
+    wide = blocks.grid.activate(position.detach(), blocks.scene)
     scene, scenes = wide.node_scene().long(), blocks.grid.scenes
     node_scene = scene.clamp_min(0)
     steps = torch.where(dt > 0, dt.double(), 1)
@@ -48,7 +49,7 @@ def refine(
 
     def residual(d: Tensor) -> Tensor:
         after = temperature + d
-        flux = torch.ops.torch_mpm.heat_operator(x.double(), conductance.double(), after, *wide.topology)
+        flux = torch.ops.torch_mpm.heat_operator(position, conduction, after, *wide.topology)
         r = given - flux - mass / steps[node_scene] * d
         return torch.where(free, r if outflow is None else r - outflow * after, 0)
 
