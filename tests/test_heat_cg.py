@@ -199,7 +199,7 @@ def test_particles_elsewhere_than_activated_conduct_nothing_on_cuda(device, dim)
 # ---- the solve
 
 
-@pytest.mark.parametrize("method", ["cg", "chebyshev"])
+@pytest.mark.parametrize("method", ["cg", "chebyshev", "multigrid"])
 @pytest.mark.parametrize("boundaries", [False, True])
 def test_solve_is_the_dense_one(device, dim, kernel, boundaries, method, far):
     h = heat(dim, kernel, device, far=far)
@@ -261,7 +261,7 @@ def test_tolerance_bounds_the_error(dim, kernel):
         assert solve.converged.all() and (error <= tolerance).all()
 
 
-@pytest.mark.parametrize("method", ["cg", "chebyshev"])
+@pytest.mark.parametrize("method", ["cg", "chebyshev", "multigrid"])
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
 def test_energy_after_any_number_of_iterations(device, dim, kernel, dtype, method):
     h = heat(dim, kernel, device, dtype, sizes=(500, 0, 300))
@@ -292,7 +292,7 @@ def test_scenes_are_solved_apart(device, dim, far):
         assert int(alone.iterations[i]) == int(together.iterations[i])
 
 
-@pytest.mark.parametrize("method", ["cg", "chebyshev"])
+@pytest.mark.parametrize("method", ["cg", "chebyshev", "multigrid"])
 def test_runs_are_bit_identical(device, dim, method, far):
     h = heat(dim, device=device, dtype=torch.float32, sizes=(800, 500), deterministic=True, far=far)
     first, second = (h.solve(tolerance=1e-6, method=method) for _ in range(2))
@@ -330,7 +330,7 @@ def test_replay_of_a_cuda_graph(device, far):
 # ---- gradients
 
 
-@pytest.mark.parametrize("method", ["cg", "chebyshev"])
+@pytest.mark.parametrize("method", ["cg", "chebyshev", "multigrid"])
 def test_gradients(device, dim, kernel, method):
     h = heat(dim, kernel, device, sizes=(9, 0, 7), dx=0.4)
     some = h.capacity > 0
@@ -408,7 +408,7 @@ def test_not_converged(device, dim, far):
 
 
 @pytest.mark.parametrize("where", ["theta", "conductance", "capacity", "source"])
-@pytest.mark.parametrize("method", ["cg", "chebyshev"])
+@pytest.mark.parametrize("method", ["cg", "chebyshev", "multigrid"])
 def test_nan_stays_in_its_scene(device, dim, where, method, far):
     h = heat(dim, device=device, sizes=(60, 50, 40), deterministic=True, far=far)
     scene = h.blocks.node_scene()
@@ -461,7 +461,7 @@ def test_messages():
         ({"tolerance": h.dt[1:]}, ValueError, "tolerance must be a number or have shape"),
         ({"max_iterations": -1}, ValueError, "max_iterations must be a finite number >= 0, got -1"),
         ({"max_iterations": h.dt}, TypeError, "max_iterations must be an integer tensor, got torch.float64"),
-        ({"method": "gmres"}, ValueError, r"method must be one of \['cg', 'chebyshev'\], got 'gmres'"),
+        ({"method": "gmres"}, ValueError, r"method must be one of \['cg', 'chebyshev', 'multigrid'\], got 'gmres'"),
         ({"adjoint_tolerance": 0.0}, ValueError, "adjoint_tolerance must be between 0 and 1, got 0.0"),
     ]:
         with pytest.raises(error, match=message):

@@ -28,5 +28,7 @@ def test_conjugate_gradients_of_the_peer():
 
 
 def test_case_of_the_stability_table():
-    row = case(8, 1.0, 1e3, torch.float64, "cg")
+    row = case(8, 1.0, 1e3, "cg", torch.float64, False)
     assert row["converged"] and row["error"] < 1e-8 and 5 < row["iterations"] < 40
+    row = case(8, 1e4, 1e3, "multigrid", torch.float32, True)
+    assert row["converged"] and row["error"] < 1e-8 and row["iterations"] < 40

@@ -77,7 +77,8 @@ void add_support(Lanes<T>* packs, int cell, ScalarTile<Order, T, D>& tile) {
 // The particles order[begin, end) of a chunk, which lie in one cell; returns Σ κ V |∇u|².
 template <HeatSum Sum, int Order, class T, int D>
 T sum_cell(const Topology<T, D>& t, const Field<const T>& x, const Field<const T>& conductance, const Home<T, D>& home,
-           const Chunk& chunk, int cell, int begin, int end, ScalarTile<Order, T, D>& u, ScalarTile<Order, T, D>& sum) {
+           const Chunk& chunk, int cell, int begin, int end, ScalarTile<Order, T, D>& u, ScalarTile<Order, T, D>& sum,
+           const int* e) {
   using P = Lanes<T>;
   constexpr int kNodes = kSupportNodes<Order, D>, kPadded = (kNodes + kLanes - 1) / kLanes * kLanes;
   static constexpr T kLane[kLanes] = {0, 1, 2, 3, 4, 5, 6, 7};
@@ -95,7 +96,7 @@ T sum_cell(const Topology<T, D>& t, const Field<const T>& x, const Field<const T
     }
     const auto real = P::load(kLane) < P(g.count);
     const P scaled = scaled_conductance<Order>(load(conductance, g), t.geometry.inverse_dx);
-    power += add_particle<Sum, Order, P, D>(f, select(real, scaled, P(0)), from, to);
+    power += add_particle<Sum, Order, P, D>(f, select(real, scaled, P(0)), from, to, e);
   }
   add_support<Order, T, D>(to, cell, sum);
   T total = power[0];
@@ -106,7 +107,7 @@ T sum_cell(const Topology<T, D>& t, const Field<const T>& x, const Field<const T
 // Adds a sum over the particles of every home whose scene is wanted to the nodes; finish(slot, Σ κ V |∇u|²) per home.
 template <HeatSum Sum, int Order, class T, int D, class Wanted, class Finish>
 void sum_particles(const Topology<T, D>& t, const Field<const T>& x, const Field<const T>& conductance, const T* nodes,
-                   T* out, const Wanted& wanted, const Finish& finish) {
+                   T* out, const Wanted& wanted, const Finish& finish, const int* e = nullptr) {
   const ScheduleIn s = schedule_of(t);
   PhaseCounter<kColours<D>> colours{s.colour_start};
   parallel_items(s.colour_start[kColours<D>], kGrainHomes, [&](const auto& next) {
@@ -127,7 +128,7 @@ void sum_particles(const Topology<T, D>& t, const Field<const T>& x, const Field
         const Chunk chunk(t, s, c);
         for (int cell = 0, begin = 0; cell < kBlockNodes<D>; begin = chunk.cell_end[cell++])
           if (const int end = chunk.cell_end[cell]; begin < end)
-            power += double(sum_cell<Sum, Order>(t, x, conductance, home, chunk, cell, begin, end, u, sum));
+            power += double(sum_cell<Sum, Order>(t, x, conductance, home, chunk, cell, begin, end, u, sum, e));
       }
       finish(slot, power);
       colours.wait_before(colour);
@@ -260,8 +261,21 @@ void heat_operator(const HeatOperatorArguments<T, D>& a) {
     sum_particles<HeatSum::diagonal, Order>(a.topology, a.x, a.conductance, a.nodes, a.sum, all, nothing);
 }
 
+template <int Order, class T, int D>
+void heat_stencil(const HeatOperatorArguments<T, D>& a) {
+  const auto all = [](int) { return true; };
+  const auto nothing = [](int, double) {};
+  for (int pair = 0; pair < kPairs<D>; pair++) {
+    int e[D];
+    pair_offset<D>(pair, e);
+    T* const sum = a.sum + pair * int64_t(a.topology.capacity) * kBlockNodes<D>;
+    sum_particles<HeatSum::pair, Order>(a.topology, a.x, a.conductance, a.nodes, sum, all, nothing, e);
+  }
+}
+
 MPM_CPU_INSTANTIATE(heat_cg, HeatArguments)
 MPM_CPU_INSTANTIATE(heat_operator, HeatOperatorArguments)
+MPM_CPU_INSTANTIATE(heat_stencil, HeatOperatorArguments)
 
 }  // namespace TORCH_MPM_ISA
 }  // namespace mpm::cpu

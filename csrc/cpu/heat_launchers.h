@@ -1,6 +1,7 @@
 #pragma once
 
 #include "cpu/launchers.h"
+#include "heat/patches.h"
 #include "heat/solve.h"
 
 namespace mpm::cpu {
@@ -13,5 +14,9 @@ template <class T, int D>
 int64_t heat_operator_workspace(const HeatOperatorArguments<T, D>&);
 template <int Order, class T, int D>
 void heat_operator(const HeatOperatorArguments<T, D>&, Stream);
+template <int Order, class T, int D>
+void heat_stencil(const HeatOperatorArguments<T, D>&, Stream);
+template <class T, int D>
+void heat_patches(const PatchArguments<T, D>&, Stream);
 
 }  // namespace mpm::cpu

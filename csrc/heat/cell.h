@@ -12,7 +12,7 @@ inline namespace TORCH_MPM_ISA {
 template <int Order, int D>
 constexpr int kSupportNodes = D == 2 ? (Order + 1) * (Order + 1) : (Order + 1) * (Order + 1) * (Order + 1);
 
-// N and N (i − x) along each axis. `squared` has their squares, for the diagonal.
+// N and N (i − x) along each axis.
 template <int Order, class P, int D>
 struct CellWeights {
   static constexpr int S = Order + 1;
@@ -26,18 +26,33 @@ struct CellWeights {
       for (int k = 0; k < S; k++) moment[a][k] = weight[a][k] * (P(k) - f[a]);
     }
   }
-  MPM_HD CellWeights squared() const {
+  // Times those of the nodes at an offset of -1, 0 or 1 along each axis; zero where they are not in the support.
+  MPM_HD CellWeights times_neighbour(const int e[D]) const {
     CellWeights s = *this;
     MPM_UNROLL
     for (int a = 0; a < D; a++)
       MPM_UNROLL
       for (int k = 0; k < S; k++) {
-        s.weight[a][k] = weight[a][k] * weight[a][k];
-        s.moment[a][k] = moment[a][k] * moment[a][k];
+        const int n = k + e[a], inside = n >= 0 && n < S;
+        s.weight[a][k] = inside ? weight[a][k] * weight[a][n] : P(0);
+        s.moment[a][k] = inside ? moment[a][k] * moment[a][n] : P(0);
       }
     return s;
   }
 };
+
+// H_{i, i+e} is kept for the node itself and for half of its neighbours, those after it in the order of nodes.
+template <int D>
+constexpr int kPairs = D == 2 ? 5 : 14;
+template <int D>
+MPM_HD void pair_offset(int pair, int e[D]) {
+  int digits = pair + kPairs<D> - 1;
+  MPM_UNROLL
+  for (int a = D - 1; a >= 0; a--) {
+    e[a] = digits % 3 - 1;
+    digits /= 3;
+  }
+}
 
 // κ V times (D⁻¹ dx)², so that the gradients below, in cells, make H.
 template <int Order, class P, class T>
@@ -123,13 +138,13 @@ MPM_HD void add_cell_value(const CellWeights<Order, P, D>& s, const P& value, P*
   }
 }
 
-// What is summed over particles: H u, the diagonal of H, or K_i = D⁻¹ Σ_p κ_p V_p N_i, for which u · H u ≤ Σ K_i u_i²
+// What is summed over particles: H u, the diagonal of H, H_{i, i+e}, or K_i = D⁻¹ Σ_p κ_p V_p N_i, for which u · H u ≤ Σ K_i u_i²
 // (Cauchy-Schwarz with Σ_i N_i (x_i − x_p)(x_i − x_p)ᵀ = D).
-enum class HeatSum { product, diagonal, bound };
+enum class HeatSum { product, diagonal, pair, bound };
 
-// One particle's share of a sum; returns κ V |∇u|² for the product.
+// One particle's share of a sum; returns κ V |∇u|² for the product. The offset e is for pairs.
 template <HeatSum Sum, int Order, class P, int D, class U>
-MPM_HD P add_particle(const P f[D], const P& conductance, const U* u, P* node) {
+MPM_HD P add_particle(const P f[D], const P& conductance, const U* u, P* node, const int* e = nullptr) {
   const CellWeights<Order, P, D> s(f);
   P flux[D], power = P(0);
   if constexpr (Sum == HeatSum::product) {
@@ -141,10 +156,11 @@ MPM_HD P add_particle(const P f[D], const P& conductance, const U* u, P* node) {
       power += flux[a] * g;
     }
     add_cell_divergence(s, flux, node);
-  } else if constexpr (Sum == HeatSum::diagonal) {
+  } else if constexpr (Sum == HeatSum::diagonal || Sum == HeatSum::pair) {
+    constexpr int same[D] = {};
     MPM_UNROLL
     for (int a = 0; a < D; a++) flux[a] = conductance;
-    add_cell_divergence(s.squared(), flux, node);
+    add_cell_divergence(s.times_neighbour(Sum == HeatSum::diagonal ? same : e), flux, node);
   } else {
     add_cell_value(s, conductance * P(1 / BSpline<Order>::inverse_inertia), node);
   }

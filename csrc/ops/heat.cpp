@@ -1,3 +1,4 @@
+#include "heat/cell.h"
 #include "ops/backend.h"
 
 #if MPM_BACKEND == MPM_BACKEND_IS_cpu
@@ -109,6 +110,59 @@ Tensor heat_operator(const Tensor& x, const Tensor& conductance, const OptionalT
   return sum;
 }
 
+Tensor heat_stencil(const Tensor& x, const Tensor& conductance, MPM_TOPOLOGY_PARAMETERS) {
+  check_rank(block, "block", 1);
+  check_rank(x, "x", 2);
+  Tensor sum;
+  const DeviceScope device(x);
+  dispatch(x, order, [&]<class T, int D, int Order>() {
+    HeatOperatorArguments<T, D> a;
+    a.topology = topology<T, D>(x, MPM_TOPOLOGY_ARGUMENTS);
+    a.x = input<T>(x, "x", x, {x.size(0), D});
+    a.conductance = input<T>(conductance, "conductance", x, {x.size(0)});
+    a.deterministic = deterministic;
+    sum = zeros(x, {kPairs<D>, node_count<D>(block)});
+    a.sum = static_cast<T*>(sum.data_ptr());
+    backend::heat_stencil<Order>(a, device.stream());
+  });
+  return sum;
+}
+
+Tensor heat_patches(const Tensor& inverse, const Tensor& rows, const Tensor& patches, const Tensor& r) {
+  check_rank(r, "r", 1);
+  check_rank(rows, "rows", 2);
+  check_like(inverse, "inverse", r);
+  const int64_t N = r.size(0), K = rows.size(1);
+  STD_TORCH_CHECK(K == 4 || K == 8, "rows must have 4 or 8 columns");
+  check_shape(inverse, "inverse", {N, K, K});
+  check_shape(rows, "rows", {N, K});
+  check_shape(patches, "patches", {N, K});
+  STD_TORCH_CHECK(inverse.is_contiguous() && r.is_contiguous(), "inverse and r must be contiguous");
+  const Tensor sum = empty(r, {N}), solved = empty(r, {N, K});
+  const DeviceScope device(r);
+  const auto run = [&]<class T, int D>() {
+    PatchArguments<T, D> a;
+    a.count = N;
+    a.inverse = static_cast<const T*>(inverse.data_ptr());
+    a.rows = int_pointer(rows, "rows", r, N * K);
+    a.patches = int_pointer(patches, "patches", r, N * K);
+    a.r = static_cast<const T*>(r.data_ptr());
+    a.solved = static_cast<T*>(solved.data_ptr());
+    a.sum = static_cast<T*>(sum.data_ptr());
+    backend::heat_patches(a, device.stream());
+  };
+  const auto by_dimension = [&]<class T>() {
+    K == 4 ? run.template operator()<T, 2>() : run.template operator()<T, 3>();
+  };
+  if (r.scalar_type() == ScalarType::Float)
+    by_dimension.template operator()<float>();
+  else if (r.scalar_type() == ScalarType::Double)
+    by_dimension.template operator()<double>();
+  else
+    STD_TORCH_CHECK(false, "r must be float32 or float64");
+  return sum;
+}
+
 }  // namespace
 }  // namespace mpm
 
@@ -120,10 +174,14 @@ STABLE_TORCH_LIBRARY_FRAGMENT(torch_mpm, m) {
       "Tensor? scene_max_iterations, int max_iterations, int method, float adjoint_tolerance, " MPM_TOPOLOGY_SCHEMA
       ") -> (Tensor increment, Tensor iterations, Tensor residual, Tensor converged)");
   m.def("heat_operator(Tensor x, Tensor conductance, Tensor? nodes, " MPM_TOPOLOGY_SCHEMA ") -> Tensor");
+  m.def("heat_stencil(Tensor x, Tensor conductance, " MPM_TOPOLOGY_SCHEMA ") -> Tensor");
+  m.def("heat_patches(Tensor inverse, Tensor rows, Tensor patches, Tensor r) -> Tensor");
 }
 #endif
 
 MPM_LIBRARY_IMPL(m) {
   m.impl("heat_cg", TORCH_BOX(&mpm::heat_cg));
   m.impl("heat_operator", TORCH_BOX(&mpm::heat_operator));
+  m.impl("heat_stencil", TORCH_BOX(&mpm::heat_stencil));
+  m.impl("heat_patches", TORCH_BOX(&mpm::heat_patches));
 }

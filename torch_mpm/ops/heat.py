@@ -1,4 +1,4 @@
-"""The implicit heat step on the nodes: Python face, fake kernels and autograd of `heat_cg`."""
+"""The implicit heat step on the nodes: Python face, fake kernels and autograd of `heat_cg` and `heat_multigrid`."""
 
 from __future__ import annotations
 
@@ -10,11 +10,12 @@ from torch import Tensor
 from ..errors import check_like, check_positions, shape_of
 from ..grid import Blocks, inverse_inertia
 from .arguments import refuse_vmap, split_dt
+from .heat_multigrid import heat_multigrid
 from .heat_refinement import REDUCTION
 from .heat_refinement import refine as refinement
 from .transfer import TOPOLOGY, _blocks_of
 
-METHODS = {"cg": 0, "chebyshev": 1}  # HeatMethod of csrc/heat/solve.h
+METHODS = {"cg": 0, "chebyshev": 1, "multigrid": 2}  # the first two are HeatMethod of csrc/heat/solve.h
 
 
 class HeatSolve(NamedTuple):
@@ -63,8 +64,13 @@ def heat_cg(
         tolerance: of dt sqrt(Σ r_i²/M_i / Σ M_i) [K], r the residual, which bounds the mass-weighted RMS error of d:
             a number, or a tensor of shape [], [1] or [B].
         max_iterations: a number, or an integer tensor of shape [], [1] or [B].
-        method: "cg", or "chebyshev": Chebyshev iteration needs no scalar products; how many iterations reach the
-            tolerance is known before the first, from the largest diffusion number (Saad 2003, algorithm 12.1).
+        method: "cg", conjugate gradients preconditioned by the diagonal, as one fused op. "chebyshev": Chebyshev
+            iteration needs no scalar products; how many iterations reach the tolerance is known before the first, from
+            the largest diffusion number r (Saad 2003, algorithm 12.1). They grow like √r without end: for r up to 100.
+            "multigrid": conjugate gradients preconditioned by a multigrid cycle (`torch_mpm.ops.heat_multigrid`), for r
+            from 1e3: few iterations whatever r and the lattice, each as long as some ten of "cg", after a start as long
+            as some hundred. On CUDA the host waits once per iteration, except while a graph is captured: that runs
+            `max_iterations`, which then must be a number and should be small.
         adjoint_tolerance: of the backward solve, relative to the size of its right side.
         relative_tolerance: a residual of this share of the first one will do too. The changes of many small steps add
             up, so that a tolerance in kelvin alone stops too early there.
@@ -106,9 +112,10 @@ def heat_cg(
     if scene_limit is not None:
         scene_limit = scene_limit.int().contiguous()
     limits = float(least), relative_tolerance, scene_limit, int(most), METHODS[method], adjoint_tolerance
+    op = _op_of(METHODS[method])
     if not refine or x.dtype == torch.float64:
         return HeatSolve(
-            *torch.ops.torch_mpm.heat_cg(
+            *op(
                 x, conductance, capacity, theta, source, exchange, fixed, scene_dt, number, scene_tolerance, *limits,
                 *blocks.topology,
             )
@@ -117,7 +124,7 @@ def heat_cg(
 
     def solve(right: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         x, conductance, capacity, exchange, scene_dt = constant
-        return torch.ops.torch_mpm.heat_cg(
+        return op(
             x, conductance, capacity, None, right, exchange, fixed, scene_dt, number, scene_tolerance, limits[0],
             REDUCTION, *limits[2:], *blocks.topology,
         )  # fmt: skip
@@ -150,6 +157,10 @@ def heat_operator(blocks: Blocks, x: Tensor, conductance: Tensor, nodes: Tensor 
     return torch.ops.torch_mpm.heat_operator(x, conductance, nodes, *blocks.topology)
 
 
+def _op_of(method: int) -> Any:
+    return torch.ops.torch_mpm.heat_multigrid if method == METHODS["multigrid"] else torch.ops.torch_mpm.heat_cg
+
+
 def _per_scene(name: str, value: float | Tensor, scenes: int, x: Tensor) -> tuple[float, Tensor | None]:
     """A number, or a tensor [B] and zero."""
     if not isinstance(value, Tensor):
@@ -163,10 +174,18 @@ def _per_scene(name: str, value: float | Tensor, scenes: int, x: Tensor) -> tupl
     return 0.0, value.expand(scenes)
 
 
+# ---- `heat_multigrid` is made of ops, with the schema of `heat_cg`
+
+_schema = str(torch.ops.torch_mpm.heat_cg.default._schema).partition("heat_cg")[2]
+torch.library.define("torch_mpm::heat_multigrid", _schema)
+torch.library.impl("torch_mpm::heat_multigrid", "CompositeExplicitAutograd")(heat_multigrid)
+
+
 # ---- fake kernels: shapes only
 
 
 @torch.library.register_fake("torch_mpm::heat_cg")
+@torch.library.register_fake("torch_mpm::heat_multigrid")
 def _fake(x, conductance, capacity, theta, source, exchange, fixed, *arguments):
     (table, *_, blocks, _, _) = arguments[-TOPOLOGY:]
     per_scene = 1
@@ -205,7 +224,7 @@ def _backward(ctx: Any, grad: Tensor, *_: Any) -> tuple[Any, ...]:
     need_x, need_conductance, need_capacity, need_theta, need_source, need_exchange, _, need_dt = ctx.needs_input_grad[
         :8
     ]
-    adjoint = torch.ops.torch_mpm.heat_cg(
+    adjoint = _op_of(ctx.method)(
         x, conductance, capacity, None, grad.contiguous(), exchange, fixed, scene_dt, ctx.dt, None, 0.0,
         ctx.adjoint_tolerance, scene_limit, ctx.max_iterations, ctx.method, ctx.adjoint_tolerance, *topology,
     )[0]  # fmt: skip
@@ -277,6 +296,7 @@ def _operator_backward(ctx: Any, grad: Tensor) -> tuple[Any, ...]:
 
 for _name, _adjoint, _context in (
     ("heat_cg", _backward, _setup),
+    ("heat_multigrid", _backward, _setup),
     ("heat_operator", _operator_backward, _operator_setup),
 ):
     torch.library.register_autograd(f"torch_mpm::{_name}", _adjoint, setup_context=_context)

@@ -9,6 +9,7 @@ All of them are derivatives of one trilinear form of positions, particle values 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -312,20 +313,24 @@ def _position_gradient_backward(ctx, grad):
     return (*differentiate(function, tensors, [grad]),) + (None,) * (1 + TOPOLOGY)
 
 
-def _blocks_of(topology: Sequence[Any], x: Tensor) -> Blocks:
-    """The `Blocks` that a topology came from, with the scene of each particle found again from its block."""
-    table, block, offsets, index, schedule, dx, lower, blocks, order, _ = topology
+def _grid_of(topology: Sequence[Any]) -> Grid:
+    """The lattice of a topology."""
+    table, dx, lower, blocks, order, deterministic = topology[0], *topology[5:]
     grid = Grid.__new__(Grid)
     grid.dx, grid.lower, grid.blocks, grid.order, grid.dim = dx, tuple(lower), tuple(blocks), order, len(lower)
-    grid.nodes_per_block = 4**grid.dim
-    per_scene = 1
-    for n in blocks:
-        per_scene *= n
-    grid.scenes = table.shape[0] // per_scene
+    grid.nodes_per_block, grid.deterministic = 4**grid.dim, deterministic
+    grid.scenes = table.shape[0] // math.prod(blocks)
+    return grid
+
+
+def _blocks_of(topology: Sequence[Any], x: Tensor) -> Blocks:
+    """The `Blocks` that a topology came from, with the scene of each particle found again from its block."""
+    table, block, offsets, index, schedule = topology[:5]
+    grid = _grid_of(topology)
     position = torch.arange(x.shape[0], device=x.device, dtype=offsets.dtype)
     slot = torch.searchsorted(offsets[1:].contiguous(), position, right=True).clamp_max(block.shape[0] - 1)
     scene = torch.zeros_like(index)
-    scene[index.long()] = (block[slot] // per_scene).clamp_min(0)
+    scene[index.long()] = (block[slot] // math.prod(grid.blocks)).clamp_min(0)
     return Blocks(grid, table, block, offsets, index, schedule, table, scene)
 
 
