@@ -13,6 +13,8 @@ from typing import Any
 
 from . import common
 from .accuracy.runout import PUBLISHED, published, slopes
+from .stability.heat import cell as heat_cell
+from .stability.heat import kind as heat_kind
 
 BEGIN, END = "<!-- benchmarks -->", "<!-- /benchmarks -->"
 FORWARD = ("step", "step, CUDA graph")
@@ -231,11 +233,57 @@ def heat(result: dict[str, Any]) -> str:
         "Relative error on the finest lattice, with the order over all in brackets (benchmarks/accuracy/heat.py): RMS "
         "of the temperature, position of the melting front; time of the hybrid [s]. 200 steps with a diffusion number "
         f"r = 1e-5 around 300 K in float32 lose {lost['relative to 300 K']:.1%} of the change, with temperatures "
-        "relative to 300 K. The front is of order 1: held nodes seem to stand off by less than 0.1 dx."
+        "relative to 300 K. The front is of order 1: the held nodes of a wall seem to lie 0.17 dx behind it, with the "
+        "cubic kernel 0.36 dx."
     )
     header = ("problem", "r", "n", "run time [s]", *(f"{t}, cubic" if k == "cubic" else t for k, t in forms))
     figure = "![error over dx and over run time](benchmarks/results/heat.png)"
     return "\n".join([intro, "", common.table(header, rows), "", figure])
+
+
+def heat_solve(result: dict[str, Any]) -> str:
+    """Iterations and errors of the solve by method, diffusion number and contrast."""
+    kinds = ("cg float64", "multigrid float64", "cg float32", "multigrid float32", "multigrid float32 refined")
+    cells = {(row["r"], row["contrast"], heat_kind(row)): heat_cell(row) for row in result["rows"]}
+    ends = [f(row["contrast"] for row in result["rows"]) for f in (min, max)]
+    places = dict.fromkeys((row["r"], row["contrast"]) for row in result["rows"])
+    places = [(r, contrast) for r, contrast in places if r >= 1 and contrast in ends]
+    rows = [[f"{r:g}", f"{contrast:g}", *(cells.get((r, contrast, k)) for k in kinds)] for r, contrast in places]
+    intro = (
+        "Iterations: relative RMS error against a direct solve (benchmarks/stability/heat.py), 64 × 64 cells, half of "
+        "them conducting worse by the contrast, down to 1e-10 (float32: 1e-6) of the first residual. Smaller r and "
+        "Chebyshev iteration: benchmarks/results/heat_stability.md."
+    )
+    return "\n\n".join([intro, common.table(("r", "contrast", *kinds), rows)])
+
+
+def heat_speed(results: list[dict[str, Any]]) -> str:
+    """Times of the heat solve beside transfers and assembled matrices."""
+    header = ("device", "particles", "scalar P2G [ms]", "G2P [ms]", "iteration [ms]", "peer", "peer's time")
+    rows = []
+    for result in results:
+        one, peer = result["one"], result["peer"]
+        parts = [one[k] for k in ("p2g", "g2p", "iteration")]
+        rows.append(
+            [result["environment"]["device"], f"{one['particles'] / 1e6:.3g} M", *parts]
+            + [f"{peer['peer']}, {peer['count']} iterations", _ratio(peer["peer_ms"], peer["ms"])]
+        )
+    large = [
+        [result["environment"]["device"], f"{row['r']:g}", row["cg"], row["cg iterations"], row["multigrid"]]
+        + [row["multigrid iterations"]]
+        for result in results
+        for row in result.get("large", [])
+    ]
+    intro = (
+        "3-D, float32, quadratic kernel, 8 particles per cell (benchmarks/speed/heat.py); the peer's matrix is "
+        "assembled, on the CPU within its time."
+    )
+    parts = [intro, common.table(header, rows)]
+    if large:
+        header = ("device", "r", "conjugate gradients [ms]", "iterations", "multigrid [ms]", "iterations")
+        parts += ["Whole solves to 1e-6 of the first residual:", common.table(header, large)]
+    parts.append("\n".join(f"- {common.describe(result['environment'])}" for result in results))
+    return "\n\n".join(parts)
 
 
 def summary(directory: Path) -> str:
@@ -245,10 +293,13 @@ def summary(directory: Path) -> str:
         sections.append("### Speed\n\n" + speed(speeds))
     if times := [json.loads(file.read_text()) for file in sorted(directory.glob("svd_*_*.json"))]:
         sections.append("### Small matrices and sand\n\n" + small_matrices(times))
+    if times := [json.loads(file.read_text()) for file in sorted(directory.glob("heat_*_*.json"))]:
+        sections.append("### Speed of the heat solve\n\n" + heat_speed(times))
     for name, title, section in (
         ("convergence", "Convergence", convergence),
         ("ritter", "Dam break", dam_break),
         ("heat", "Heat", heat),
+        ("heat_stability", "Heat solve", heat_solve),
         ("precision", "Precision", precision),
         ("stability", "Stability", stability),
         ("svd_accuracy", "Singular values", svd_accuracy),

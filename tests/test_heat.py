@@ -210,6 +210,24 @@ def test_fixed_ends_give_a_linear_profile(device):
     assert float(offset) < 0.1 * dx
 
 
+@pytest.mark.parametrize("kernel,offset", [("quadratic", 0.174), ("cubic", 0.360)])
+def test_stand_off_of_held_nodes(kernel, offset):
+    """A bar that ends at a wall on nodes, with flux 1 at its other end: the wall seems to be `offset` dx behind."""
+    dx = 1 / 16
+    bar = mpm.State.at_rest(mpm.seed.box((0, 0), (1, 2 * dx), dx, per_cell=4), 1.0, dtype=FLOAT)
+    bar = bar.replace(temperature=bar.x[:, 0].clone())
+    heights = (torch.arange(4, dtype=FLOAT) + 0.5) * dx / 2
+    flux = Flux(Surface(torch.stack([torch.ones_like(heights), heights], 1), dx / 2), 1.0)
+    wall = Fixed(mpm.Plane((0.0, 0.0), (1.0, 0.0)), 0.0)
+    grid = mpm.Grid(dx, (-1, -1), (2, 1), kernel=kernel)
+    heat = mpm.Heat(grid, 1.0, 1.0, [wall, flux], transfer="apic", tolerance=1e-10, method="multigrid")
+    end = mpm.rollout(heat, bar, 15, 10.0)
+    heat.check()
+    middle = (end.x[:, 0] - 0.5).abs() < 0.2
+    seen = (end.temperature - end.x[:, 0])[middle] / dx
+    assert float(seen.mean()) == pytest.approx(offset, abs=0.005) and float(seen.std()) < 0.005
+
+
 def test_free_surface_has_the_length_of_the_body(device):
     """A square and a disc of evenly spread particles, in units of their perimeters."""
 

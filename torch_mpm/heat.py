@@ -28,6 +28,7 @@ from .heat_boundaries import HeatNodes
 from .materials import _check_value
 from .ops import gather, heat_cg, scatter
 from .ops.arguments import per_particle, soa_empty
+from .ops.heat import METHODS
 from .parameters import Value, evaluate, needed_temperature, store
 from .state import State
 from .thermal import LIQUID, determinant
@@ -67,6 +68,7 @@ class Heat(nn.Module):
         tolerance: residual of each solve relative to its first, in (0, 1). The error of the change in a step is at most
             1 + 4 r times as large relative to it, with the largest diffusion number r, both as mass-weighted RMS.
         max_iterations: of each solve.
+        method: of `heat_cg`: "cg", or "multigrid" for steps with diffusion numbers from about 1e3.
 
     Differentiable with respect to temperatures, positions, masses, volumes, dt and all parameters.
 
@@ -93,6 +95,7 @@ class Heat(nn.Module):
         reference: float = 0.0,
         tolerance: float = 1e-6,
         max_iterations: int = 500,
+        method: str = "cg",
     ) -> None:
         super().__init__()
         if transfer not in TRANSFERS:
@@ -105,9 +108,11 @@ class Heat(nn.Module):
             raise ValueError(f"tolerance must be between 0 and 1, got {tolerance}")
         if max_iterations < 1:
             raise ValueError(f"max_iterations must be at least 1, got {max_iterations}")
+        if method not in METHODS:
+            raise ValueError(f"method must be one of {sorted(METHODS)}, got {method!r}")
         self.grid, self.boundaries, self.transfer = grid, list(boundaries), transfer
         self.plastic_heating, self.reference = float(plastic_heating), float(reference)
-        self.tolerance, self.max_iterations = float(tolerance), int(max_iterations)
+        self.tolerance, self.max_iterations, self.method = float(tolerance), int(max_iterations), method
         not_negative, positive = (lambda v: v >= 0), (lambda v: v > 0)
         store(self, "conductivity", _check_value("conductivity", conductivity, "not negative", not_negative))
         store(self, "specific_heat", _check_value("specific_heat", specific_heat, "positive", positive))
@@ -246,7 +251,7 @@ class Heat(nn.Module):
         boundary = nodes.source, nodes.exchange, nodes.fixed
         solve = heat_cg(
             nodes.blocks, nodes.state.x, conductance, nodes.capacity, start, dt, *boundary, tolerance=NEGLIGIBLE,
-            relative_tolerance=self.tolerance, max_iterations=self.max_iterations,
+            relative_tolerance=self.tolerance, max_iterations=self.max_iterations, method=self.method,
         )  # fmt: skip
         self._record(solve.converged, solve.residual)
         return start + solve.increment

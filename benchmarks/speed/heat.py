@@ -2,8 +2,9 @@
 
 The cost of an iteration beside a scalar P2G and G2P; a whole solve at r = 0.01; twenty iterations (ten on the CPU)
 beside conjugate gradients on the assembled matrix: on CUDA a CSR matrix times vector of torch (cuSPARSE) in a loop
-without synchronisation, its assembly not counted; on the CPU scipy's `cg`, assembly counted. On CUDA also 1024 scenes
-of 4913 particles in one call, beside a call for each. Eight jittered particles per cell, sorted by block.
+without synchronisation, its assembly not counted; on the CPU scipy's `cg`, assembly counted. Whole solves to 1e-6 of
+the first residual at large r by conjugate gradients and multigrid, random temperatures. On CUDA also 1024 scenes of
+4913 particles in one call, beside a call for each. Eight jittered particles per cell, sorted by block.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ from .timing import Clock
 
 CELLS = {"cpu": 24, "cuda": 100}
 SCENES, SCENE_SIDE, SCENE_CELLS = 1024, 17, 32
+LARGE = (1e2, 1e4, 1e6)
 CHUNK = 1_000_000
 """Particles whose share of the matrix is added at once."""
 
@@ -181,6 +183,22 @@ def beside_scipy(p: Problem, clock: Clock, count: int) -> dict[str, Any]:
     }
 
 
+def large_steps(p: Problem, clock: Clock) -> list[dict[str, Any]]:
+    """Whole solves at large diffusion numbers by both methods."""
+    rows = []
+    for r in LARGE:
+        row: dict[str, Any] = {"r": r}
+        for method in ("cg", "multigrid"):
+
+            def solve(r: float = r, method: str = method) -> mpm.HeatSolve:
+                return p.solve(r, tolerance=0.0, relative_tolerance=1e-6, max_iterations=2000, method=method)
+
+            row[method] = wall(solve, clock, 2)
+            row[f"{method} iterations"] = int(solve().iterations)
+        rows.append(row)
+    return rows
+
+
 def many_scenes(device: str, clock: Clock, scenes: int) -> list[dict[str, Any]]:
     """A batch in one call, beside one call per scene."""
     batch, alone = (Problem(SCENE_CELLS, device, SCENE_SIDE, count) for count in (scenes, 1))
@@ -204,6 +222,10 @@ def text(result: dict[str, Any]) -> str:
     header = ("peer", "iterations", "nonzeros", "peer ms", "heat_cg ms", "times faster", "relative difference")
     row = [peer[k] for k in ("peer", "count", "nonzeros", "peer_ms", "ms")]
     lines += [common.table(header, [(*row, peer["peer_ms"] / peer["ms"], peer["difference"])]), ""]
+    lines += ["Whole solves to 1e-6 of the first residual, wall clock in ms:", ""]
+    header = ("r", "cg", "iterations", "multigrid", "iterations")
+    names = ("r", "cg", "cg iterations", "multigrid", "multigrid iterations")
+    lines += [common.table(header, [[row[k] for k in names] for row in result["large"]]), ""]
     if result["scenes"]:
         lines += [f"{SCENES} scenes of {SCENE_SIDE**3} particles, wall clock in ms:", ""]
         header = ("r", "iterations", "one call", "a call per scene", "times faster")
@@ -230,6 +252,7 @@ def main() -> None:
     with clock, torch.no_grad():
         p = Problem(8 if quick else CELLS[device], device)
         result: dict[str, Any] = {"environment": common.environment(device), "one": one_scene(p, clock)}
+        result["large"] = large_steps(p, clock)
         result["scenes"] = [] if device == "cpu" else many_scenes(device, clock, 16 if quick else SCENES)
         result["peer"] = beside_scipy(p, clock, 10) if device == "cpu" else beside_csr(p, clock, 20)
     print(text(result))
