@@ -491,12 +491,13 @@ def test_opcheck(device, dim):
     )
 
 
-def test_compile():
+@pytest.mark.parametrize("method", ["cg", "multigrid"])
+def test_compile(method):
     h = heat(2)
     theta = h.theta.clone().requires_grad_()
 
     def increment(theta: Tensor) -> Tensor:
-        return h.solve(theta=theta, tolerance=1e-10).increment
+        return h.solve(theta=theta, tolerance=1e-10, method=method).increment
 
     got, expected = torch.compile(increment, fullgraph=True, backend="aot_eager")(theta), increment(theta)
     assert torch.equal(got, expected)

@@ -147,6 +147,23 @@ def test_hard_layouts(device, case, most):
     assert weighted_error(h, solve.increment, dense_increment(h, case == "held")) < 1e-6
 
 
+def test_coarse_lattices_that_do_not_fit_the_pool(device, dim):
+    """Lonely particles touch more blocks of the coarse lattices than the pool has: slower, but right."""
+    x = torch.rand(20, dim, generator=torch.Generator().manual_seed(5), dtype=FLOAT).to(device)
+    lattice = {"dx": 1 / 64, "lower": (0,) * dim, "upper": (1,) * dim}
+    tight = int((mpm.Grid(**lattice).activate(x).block >= 0).sum())
+    heats = []
+    for capacity in (tight, 2 * tight):
+        blocks = mpm.Grid(**lattice, capacity=capacity).activate(x)
+        mass = scatter(blocks, x, torch.ones_like(x[:, :1]))[:, 0]
+        theta = torch.sin(7 * blocks.node_positions(FLOAT)).sum(1) * blocks.active_nodes()
+        options = {"tolerance": 0.0, "relative_tolerance": 1e-9, "method": "multigrid"}
+        solve = mpm.heat_cg(blocks, x, torch.ones_like(x[:, 0]), mass, theta, 0.02, **options)
+        assert solve.converged.all()
+        heats.append(float((mass * solve.increment**2).sum()))
+    assert heats[0] == pytest.approx(heats[1], rel=1e-6)
+
+
 def test_float32_with_refinement(device):
     h = square(16, 1e4, device=device, dtype=torch.float32, contrast=1e3)
     exact = dense_increment(h, False)
