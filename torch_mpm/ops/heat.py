@@ -67,10 +67,12 @@ def heat_cg(
         method: "cg", conjugate gradients preconditioned by the diagonal, as one fused op. "chebyshev": Chebyshev
             iteration needs no scalar products; how many iterations reach the tolerance is known before the first, from
             the largest diffusion number r (Saad 2003, algorithm 12.1). They grow like √r without end: for r up to 100.
-            "multigrid": conjugate gradients preconditioned by a multigrid cycle (`torch_mpm.ops.heat_multigrid`), for r
-            from 1e3: few iterations whatever r and the lattice, each as long as some ten of "cg", after a start as long
-            as some hundred. On CUDA the host waits once per iteration, except while a graph is captured: that runs
-            `max_iterations`, which then must be a number and should be small.
+            "multigrid": conjugate gradients preconditioned by a multigrid cycle (`torch_mpm.ops.heat_multigrid`): few
+            iterations whatever r and the lattice, each as long as some ten of "cg", after a start as long as some
+            hundred. Shorter than "cg" for r from 1e3 on the CPU; on CUDA, where it is hundreds of launches and "cg" is
+            one, on large lattices only (2-D from 400² nodes). The host waits once per iteration, except while a graph
+            is captured: that runs `max_iterations`, which then must be a number and should be small. Takes about 100
+            numbers per node (3-D: 300 while it starts).
         adjoint_tolerance: of the backward solve, relative to the size of its right side.
         relative_tolerance: a residual of this share of the first one will do too. The changes of many small steps add
             up, so that a tolerance in kelvin alone stops too early there.
