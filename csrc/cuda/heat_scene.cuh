@@ -482,25 +482,26 @@ __global__ void __launch_bounds__(kSceneThreads<Order, T>)
   solver.finish();
 }
 
-constexpr int kFewParticles = 8192, kManyParticles = 32768;  // of a scene, where scenes are few and where they are many
+constexpr int kFewNodes = 3072, kFewParticles = 8192;  // a scene of no more is small in any batch
 
-// Whether scenes are small on average: several together keep the device busy, so that they may be larger.
+// Whether scenes are small on average. A few keep the device busy by its whole grid of threads; where they are many,
+// they may be larger.
 template <class T, int D>
 bool small_scenes(const Topology<T, D>& t) {
-  const bool many = 2 * int64_t(t.scenes) >= device_attribute(cudaDevAttrMultiProcessorCount);
-  return t.scenes > 0 && t.particles <= int64_t(t.scenes) * (many ? kManyParticles : kFewParticles);
+  const bool many = 4 * int64_t(t.scenes) >= device_attribute(cudaDevAttrMultiProcessorCount);
+  return t.scenes > 0 && t.particles <= int64_t(t.scenes) * (many ? 32768 : 4096);
 }
 
-// Up to four scenes at once share the threads and the memory of a multiprocessor.
+// Where there are more scenes than multiprocessors, two at once share one. The shared memory asked for is what scenes
+// of equal size need, whose rows are by more than a fourth outside of their boxes: the less, the larger the cache.
 template <int Order, class T, int D>
 void solve_scenes(SceneKernel<Order, T, D> kernel, Stream stream) {
   const Topology<T, D>& t = kernel.a.topology;
-  const int processors = device_attribute(cudaDevAttrMultiProcessorCount);
-  const int together = std::clamp((t.scenes + processors - 1) / processors, 1, 4);
+  const int together = t.scenes > device_attribute(cudaDevAttrMultiProcessorCount) ? 2 : 1;
   const int reserved = 5 * 1024;  // for the system, and for what is not dynamic
-  const int64_t room = device_attribute(cudaDevAttrMaxSharedMemoryPerMultiprocessor) / together - reserved;
-  const int64_t lattice = int64_t(t.geometry.blocks_per_scene) * kBlockNodes<D>;
-  kernel.most_nodes = int(std::min<int64_t>(room / (2 * sizeof(T)), lattice));
+  const int room = device_attribute(cudaDevAttrMaxSharedMemoryPerMultiprocessor) / together - reserved;
+  const int64_t nodes = int64_t(t.capacity) * kBlockNodes<D> / t.scenes * 3 / 4;
+  kernel.most_nodes = int(std::min<int64_t>(room / (2 * sizeof(T)), std::max<int64_t>(nodes, kFewNodes)));
   kernel.most_particles = int(std::max<int64_t>(kFewParticles, 2 * t.particles / t.scenes));
   kernel.x = Columns<const T, D>(kernel.a.x);
   kernel.conductance = Columns<const T, 1>(kernel.a.conductance);
