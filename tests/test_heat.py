@@ -512,6 +512,7 @@ def test_bad_arguments():
         ({"plastic_heating": 1.5}, "between 0 and 1"),
         ({"tolerance": 0.0}, "tolerance must be between"),
         ({"max_iterations": 0}, "at least 1"),
+        ({"method": "gmres"}, "method must be one of"),
     ):
         with pytest.raises(ValueError, match=message):
             mpm.Heat(grid, **{"conductivity": 1.0, "specific_heat": 1.0, **options})
