@@ -262,12 +262,13 @@ def heat_speed(results: list[dict[str, Any]]) -> str:
     header = ("device", "particles", "scalar P2G [ms]", "G2P [ms]", "iteration [ms]", "peer", "peer's time")
     rows = []
     for result in results:
-        one, peer = result["one"], result["peer"]
+        one = result["one"]
         parts = [one[k] for k in ("p2g", "g2p", "iteration")]
-        rows.append(
+        rows += [
             [result["environment"]["device"], f"{one['particles'] / 1e6:.3g} M", *parts]
             + [f"{peer['peer']}, {peer['count']} iterations", _ratio(peer["peer_ms"], peer["ms"])]
-        )
+            for peer in result["peers"]
+        ]
     large = [
         [result["environment"]["device"], f"{row['r']:g}", row["cg"], row["cg iterations"], row["multigrid"]]
         + [row["multigrid iterations"]]

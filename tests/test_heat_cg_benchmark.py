@@ -11,9 +11,9 @@ def test_assembled_matrices_are_the_operator():
     p = Problem(4, "cpu")
     u = torch.rand_like(p.theta)
     expected = heat_operator(p.blocks, p.x, p.conductance, u)
-    H = csr(p)
-    torch.testing.assert_close(H @ u[: len(H)], expected[: len(H)], rtol=1e-4, atol=1e-7)
-    assert (expected[len(H) :] == 0).all()
+    some = p.capacity > 0
+    torch.testing.assert_close(csr(p) @ u[some], expected[some], rtol=1e-4, atol=1e-7)
+    assert (expected[~some] == 0).all()
     product = assembled(p.blocks, p.x, p.conductance) @ u.double().numpy()
     torch.testing.assert_close(torch.from_numpy(product).float(), expected, rtol=1e-4, atol=1e-7)
 
@@ -21,10 +21,10 @@ def test_assembled_matrices_are_the_operator():
 def test_conjugate_gradients_of_the_peer():
     p = Problem(4, "cpu")
     H = csr(p)
-    weight = torch.where(p.capacity > 0, p.capacity / p.dx**2, 1.0)[: len(H)]
-    diagonal = heat_operator(p.blocks, p.x, p.conductance, None)[: len(H)]
-    peer = csr_cg(H, weight, diagonal, -(H @ p.theta[: len(H)]), 30)
-    torch.testing.assert_close(p.solve(1.0, tolerance=1e-7).increment[: len(H)], peer, rtol=1e-3, atol=1e-5)
+    some = p.capacity > 0
+    diagonal = heat_operator(p.blocks, p.x, p.conductance, None)[some]
+    peer = csr_cg(H, p.capacity[some] / p.dx**2, diagonal, -(H @ p.theta[some]), 30)
+    torch.testing.assert_close(p.solve(1.0, tolerance=1e-7).increment[some], peer, rtol=1e-3, atol=1e-5)
 
 
 def test_case_of_the_stability_table():

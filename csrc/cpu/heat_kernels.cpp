@@ -60,7 +60,7 @@ struct ScalarTile {
 };
 
 // Sums over the lanes of packs, added to the support of a cell.
-template <int Order, class T, int D>
+template <HeatSum Sum, int Order, class T, int D>
 void add_support(Lanes<T>* packs, int cell, ScalarTile<Order, T, D>& tile) {
   constexpr int kNodes = kSupportNodes<Order, D>, kPadded = (kNodes + kLanes - 1) / kLanes * kLanes;
   alignas(64) T rows[kLanes][kPadded];
@@ -71,6 +71,7 @@ void add_support(Lanes<T>* packs, int cell, ScalarTile<Order, T, D>& tile) {
     for (int l = 1; l < kLanes; l++) sum += rows[l][n];
     rows[0][n] = sum;
   }
+  if (Sum == HeatSum::product) to_nodes<Order, D>(rows[0]);
   tile.for_support(cell, [&](int n, T& value) { value += rows[0][n]; });
 }
 
@@ -83,7 +84,10 @@ T sum_cell(const Topology<T, D>& t, const Field<const T>& x, const Field<const T
   constexpr int kNodes = kSupportNodes<Order, D>, kPadded = (kNodes + kLanes - 1) / kLanes * kLanes;
   static constexpr T kLane[kLanes] = {0, 1, 2, 3, 4, 5, 6, 7};
   T from[kNodes];
-  if (Sum == HeatSum::product) u.for_support(cell, [&](int n, T& value) { from[n] = value; });
+  if (Sum == HeatSum::product) {
+    u.for_support(cell, [&](int n, T& value) { from[n] = value; });
+    to_differences<Order, D>(from);
+  }
   P to[kPadded], power(0);
   for (int n = 0; n < kPadded; n++) to[n] = P(0);
   for (int i = begin; i < end; i += kLanes) {
@@ -98,7 +102,7 @@ T sum_cell(const Topology<T, D>& t, const Field<const T>& x, const Field<const T
     const P scaled = scaled_conductance<Order>(load(conductance, g), t.geometry.inverse_dx);
     power += add_particle<Sum, Order, P, D>(f, select(real, scaled, P(0)), from, to, e);
   }
-  add_support<Order, T, D>(to, cell, sum);
+  add_support<Sum, Order, T, D>(to, cell, sum);
   T total = power[0];
   for (int l = 1; l < kLanes; l++) total += power[l];
   return total;

@@ -385,6 +385,7 @@ struct SceneSolver {
             if (Sum == HeatSum::product) from[n] = count > 0 ? u[i] : T(0);
             to[n] = T(0);
           });
+          if (Sum == HeatSum::product) to_differences<Order, D>(from);
           walk_lanes(
               count, first, [&](int at, int) { return k.packed[at]; },
               [&](const PackedParticle<T, D>& q) {
@@ -392,6 +393,7 @@ struct SceneSolver {
               });
         },
         [&](const SceneCell& cell) {
+          if (Sum == HeatSum::product) to_nodes<Order, D>(to);
           box.template for_support<Order>(cell.corner, [&](int n, int i) {
             if (cell.corner >= 0) out[i] += to[n];
             __syncthreads();

@@ -11,7 +11,7 @@
 namespace mpm {
 namespace {
 
-// Values per node or per scene, packed.
+// Values per node or per scene, packed and aligned for loads of four.
 template <class T>
 class Values {
  public:
@@ -21,7 +21,7 @@ class Values {
     STD_TORCH_CHECK(t->scalar_type() == type && t->device() == x.device(), name,
                     " has an unexpected dtype or is not on the device of x");
     packed_ = *t;
-    if (size > 1 && t->stride(0) != 1) {
+    if (size > 1 && (t->stride(0) != 1 || reinterpret_cast<uintptr_t>(t->data_ptr()) % 16 != 0)) {
       packed_ = empty(*t, {size});
       torch::stable::copy_(packed_, *t);
     }
