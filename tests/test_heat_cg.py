@@ -311,6 +311,18 @@ def test_any_strides(device, dim, far):
     torch.testing.assert_close(h.solve(tolerance=1e-10).increment, expected, rtol=1e-9, atol=1e-12)
 
 
+def test_any_address(device, dim, far):
+    """Views of nodes that do not begin where four of them can be loaded at once."""
+    h = heat(dim, device=device, dtype=torch.float32, far=far)
+    solve = h.solve(tolerance=1e-6).increment
+    product = heat_operator(h.blocks, h.x, h.conductance, h.theta)
+    for name in ("capacity", "theta", "source", "exchange"):
+        nodes = getattr(h, name)
+        setattr(h, name, torch.cat([nodes[:1], nodes])[1:])
+    torch.testing.assert_close(h.solve(tolerance=1e-6).increment, solve, rtol=1e-3, atol=1e-4)
+    torch.testing.assert_close(heat_operator(h.blocks, h.x, h.conductance, h.theta), product, rtol=1e-3, atol=1e-4)
+
+
 def test_replay_of_a_cuda_graph(device, far):
     if device == "cpu":
         pytest.skip("graphs are of CUDA")

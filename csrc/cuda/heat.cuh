@@ -14,9 +14,9 @@
 // scene that is done takes no further work, and the kernel ends with the last one. The host is never asked, and the
 // kernel can be captured in a graph.
 //
-// H is applied by warps, one item of particles each. A lane takes a cell: it holds the nodes of the cell's support and
-// what the cell adds to them in registers, and walks the cell's particles. To that end the particles are packed once,
-// as distances from the base node and conductance, in the order in which the lanes read them.
+// H is applied by warps, one item of particles each. A lane takes a cell: it holds the differences of the nodes of the
+// cell's support and what the cell adds to them in registers, and walks the cell's particles. To that end the particles
+// are packed once, as distances from the base node and conductance, in the order in which the lanes read them.
 namespace mpm::cuda {
 
 namespace cg = cooperative_groups;
@@ -174,8 +174,8 @@ __device__ void walk_cells(const LaneCounts<S>& counts, const PackedParticle<T, 
   const unsigned before = (1u << lane) - 1;
 #pragma unroll 1
   for (int part = 0; part < S::parts; part++) {
-    const int cell = part * 32 + lane % (32 / S::slices),
-              mine = part == 0 ? counts.of_part[0] : counts.of_part[S::parts - 1];
+    const int cell = part * 32 + lane % (32 / S::slices);
+    const int mine = part == 0 ? counts.of_part[0] : counts.of_part[S::parts - 1];
     bool has = mine > 0;
     unsigned lanes = __ballot_sync(~0u, has);
     if (!lanes) continue;
