@@ -68,6 +68,29 @@ struct Group {
   int count;
   bool consecutive;
   int id[kLanes];
+#ifdef __AVX512VL__
+  // Otherwise: runs of lanes whose particles lie one after another in memory. Particles that have changed places since
+  // they were sorted are few, so most groups have one to three.
+  int runs;
+  uint8_t lanes[kLanes];  // of each run, as bits
+  int start[kLanes];      // the particle that lane 0 would have in the run
+#endif
+
+  void find_runs() {
+#ifdef __AVX512VL__
+    unsigned first = 1;  // lanes that begin a run, as bits
+    MPM_UNROLL
+    for (int l = 1; l < kLanes; l++) first |= unsigned(id[l] != id[l - 1] + 1) << l;
+    const unsigned all = (1u << count) - 1;
+    runs = 0;
+    for (first &= all; first; first &= first - 1) {
+      const int lane = __builtin_ctz(first);
+      const unsigned later = first & (first - 1), end = later ? 1u << __builtin_ctz(later) : all + 1;
+      lanes[runs] = uint8_t(end - (1u << lane));
+      start[runs++] = id[lane] - lane;
+    }
+#endif
+  }
 };
 
 // Particles i, i + 1, ... of a chunk.
@@ -80,6 +103,7 @@ MPM_HD Group group_by_id(const Chunk& c, int i) {
     __builtin_memcpy(g.id, c.id + i, sizeof(g.id));
   else
     for (int l = 0; l < kLanes; l++) g.id[l] = c.id[i + (l < g.count ? l : 0)];
+  if (!g.consecutive) g.find_runs();
   return g;
 }
 
@@ -94,6 +118,7 @@ MPM_HD Group group_by_cell(const Chunk& c, int i, int end) {
   } else {
     for (int l = 0; l < kLanes; l++) g.id[l] = c.id[c.by_cell(i + (l < g.count ? l : 0))];
     g.consecutive = g.count == kLanes && g.id[kLanes - 1] - g.id[0] == kLanes - 1;
+    if (!g.consecutive) g.find_runs();
   }
   return g;
 }
@@ -105,9 +130,21 @@ MPM_HD T& at(const Field<T>& f, int64_t p, int i = 0, int j = 0) {
 }
 
 template <class T>
+MPM_HD Lanes<T> load_runs(const T* from, const Group& g) {
+#ifdef __AVX512VL__
+  Lanes<T> r(0);
+  for (int k = 0; k < g.runs; k++) r = r.with(from + g.start[k], g.lanes[k]);
+  return r;
+#else
+  return Lanes<T>::gather(from, g.id);
+#endif
+}
+
+template <class T>
 MPM_HD Lanes<T> load(const Field<const T>& f, const Group& g, int i = 0, int j = 0) {
   const T* from = f.pointer + i * f.stride[1] + j * f.stride[2];
-  if (f.stride[0] == 1) return g.consecutive ? Lanes<T>::load(from + g.id[0]) : Lanes<T>::gather(from, g.id);
+  if (f.stride[0] == 1 && g.consecutive) return Lanes<T>::load(from + g.id[0]);
+  if (f.stride[0] == 1) return load_runs(from, g);
   T lanes[kLanes];
   MPM_UNROLL
   for (int l = 0; l < kLanes; l++) lanes[l] = from[g.id[l] * f.stride[0]];
@@ -131,10 +168,31 @@ MPM_HD void store_exactly(const Lanes<T>& v, const Field<T>& f, const Group& g, 
 // May write over the particles after the group, see `group_by_cell`.
 template <class T>
 MPM_HD void store(const Lanes<T>& v, const Field<T>& f, const Group& g, int i = 0, int j = 0) {
-  if (g.consecutive && f.stride[0] == 1)
-    v.store(f.pointer + i * f.stride[1] + j * f.stride[2] + g.id[0]);
-  else
-    store_exactly(v, f, g, i, j);
+  T* to = f.pointer + i * f.stride[1] + j * f.stride[2];
+  if (g.consecutive && f.stride[0] == 1) return v.store(to + g.id[0]);
+#ifdef __AVX512VL__
+  if (f.stride[0] == 1) {
+    for (int k = 0; k < g.runs; k++) v.store(to + g.start[k], g.lanes[k]);
+    return;
+  }
+#endif
+  store_exactly(v, f, g, i, j);
+}
+
+// kLanes particles one after another in memory, of fields with unit stride: loads without a question.
+struct Run {
+  int first;
+};
+
+template <class T>
+MPM_HD Lanes<T> load(const Field<const T>& f, const Run& r, int i = 0, int j = 0) {
+  return Lanes<T>::load(f.pointer + i * f.stride[1] + j * f.stride[2] + r.first);
+}
+
+// Whether all fields that are present have particles one after another.
+template <class... Fields>
+MPM_HD bool unit_stride(const Fields&... f) {
+  return ((!f.pointer || f.stride[0] == 1) && ...);
 }
 
 // Nodes that the particles of one home touch, kChannels values each. Rows run along the last axis and are long enough to

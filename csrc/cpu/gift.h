@@ -14,23 +14,28 @@ struct Gift {
   P value[kChannels], slope[D][kChannels], gradient[D][kChannels];
 };
 
-// The inputs of a group of particles.
-template <class T, int D>
-MPM_HD ParticleMomentum<Lanes<T>, D> load_momentum(const P2GArguments<T, D>& a, const Group& g, int scene) {
+template <class T, int D, class G>
+MPM_HD Matrix<Lanes<T>, D> load_matrix(const Field<const T>& f, const G& g) {
+  if (!f.pointer) return zero_matrix<Lanes<T>, D>();
+  Matrix<Lanes<T>, D> r;
+  MPM_UNROLL
+  for (int i = 0; i < D; i++)
+    MPM_UNROLL
+  for (int j = 0; j < D; j++) r[i][j] = load(f, g, i, j);
+  return r;
+}
+
+// The inputs of a group of particles, a Group or a Run.
+template <class T, int D, class G>
+MPM_HD ParticleMomentum<Lanes<T>, D> load_momentum(const P2GArguments<T, D>& a, const G& g, int scene) {
   ParticleMomentum<Lanes<T>, D> p;
   p.mass = load(a.mass, g);
-  p.affine = p.stress = zero_matrix<Lanes<T>, D>();
+  p.affine = load_matrix<T, D>(a.affine, g);
+  p.stress = load_matrix<T, D>(a.stress, g);
   p.volume = a.stress.pointer ? load(a.volume, g) : Lanes<T>(0);
   p.dt = Lanes<T>(T(a.dt) * (a.scene_dt.pointer ? a.scene_dt.pointer[scene * a.scene_dt.stride[0]] : T(1)));
   MPM_UNROLL
-  for (int i = 0; i < D; i++) {
-    p.velocity[i] = load(a.velocity, g, i);
-    MPM_UNROLL
-    for (int j = 0; j < D; j++) {
-      if (a.affine.pointer) p.affine[i][j] = load(a.affine, g, i, j);
-      if (a.stress.pointer) p.stress[i][j] = load(a.stress, g, i, j);
-    }
-  }
+  for (int i = 0; i < D; i++) p.velocity[i] = load(a.velocity, g, i);
   return p;
 }
 

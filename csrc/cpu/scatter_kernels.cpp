@@ -6,10 +6,13 @@ inline namespace TORCH_MPM_ISA {
 
 template <int Order, bool Slope, bool Gradient, class T, int D>
 void p2g_with(const P2GArguments<T, D>& a) {
-  scatter_channels<Order, Slope, Gradient>(a.topology, a.x, a.nodes, 0, 1 + D,
-                                           [&](const Group& g, const Lanes<T> f[D], int scene) {
-                                             return gift_of_momentum<Order, Slope>(a, load_momentum(a, g, scene), f);
-                                           });
+  const bool direct = unit_stride(a.mass, a.velocity, a.affine, a.stress, a.volume);
+  scatter_channels<Order, Slope, Gradient>(
+      a.topology, a.x, a.nodes, 0, 1 + D, [&](const Group& g, const Lanes<T> f[D], int scene) {
+        // One gift for both, so that rounding does not depend on what is consecutive.
+        const auto p = direct && g.consecutive ? load_momentum(a, Run{g.id[0]}, scene) : load_momentum(a, g, scene);
+        return gift_of_momentum<Order, Slope>(a, p, f);
+      });
 }
 
 template <int Order, class T, int D>

@@ -17,7 +17,8 @@ MPM_HD void transpose(Lanes<T> r[kLanes]) {
     t[i + 1] = __builtin_shufflevector(r[i].part[0], r[i + 1].part[0], 1, 9, 3, 11, 5, 13, 7, 15);
   }
   MPM_UNROLL
-  for (int i = 0; i < 8; i += i % 4 == 1 ? 3 : 1) {
+  for (int k = 0; k < 4; k++) {
+    const int i = k / 2 * 4 + k % 2;
     u[i] = __builtin_shufflevector(t[i], t[i + 2], 0, 1, 8, 9, 4, 5, 12, 13);
     u[i + 2] = __builtin_shufflevector(t[i], t[i + 2], 2, 3, 10, 11, 6, 7, 14, 15);
   }

@@ -73,6 +73,25 @@ struct Pack {
   }
   MPM_HD void store(T* to) const { __builtin_memcpy(to, part, sizeof(part)); }
 
+#ifdef __AVX512VL__
+  // Lanes of a bit mask from `from` on, the others of this pack; only the former are read. For N = 8.
+  MPM_HD Pack with(const T* from, unsigned lanes) const {
+    Pack r;
+    if constexpr (sizeof(T) == 4)
+      r.part[0] = _mm256_mask_loadu_ps(part[0], __mmask8(lanes), from);
+    else
+      r.part[0] = _mm512_mask_loadu_pd(part[0], __mmask8(lanes), from);
+    return r;
+  }
+  // Writes the lanes of a bit mask. For N = 8.
+  MPM_HD void store(T* to, unsigned lanes) const {
+    if constexpr (sizeof(T) == 4)
+      _mm256_mask_storeu_ps(to, __mmask8(lanes), part[0]);
+    else
+      _mm512_mask_storeu_pd(to, __mmask8(lanes), part[0]);
+  }
+#endif
+
   // from[index[i]] in lane i.
   MPM_HD static Pack gather(const T* from, const int* index) {
 #ifdef __AVX2__
