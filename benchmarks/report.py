@@ -125,6 +125,24 @@ def stability(result: dict[str, Any]) -> str:
     return "\n".join([intro, "", common.table(("D", "s", *(f"ν = {nu:g}" for nu in ratios)), rows)])
 
 
+def stability_laws(result: dict[str, Any]) -> str:
+    """Measured limits of the time step of the laws in principal strains."""
+    cases = result["cases"]
+    stretches = sorted({c["stretch"] for c in cases})
+    rows = []
+    for law in dict.fromkeys(c["law"] for c in cases):
+        mine = [c for c in cases if c["law"] == law]
+        limits = ([c["stable"] for c in mine if c["stretch"] == s and c["stable"] > 0] for s in stretches)
+        rows.append([law, *(f"{min(values):.2f}" if values else "–" for values in limits)])
+    intro = (
+        "The same of the other laws, least of 2-D and 3-D, "
+        f"ν = {', '.join(f'{nu:g}' for nu in sorted({c['nu'] for c in cases}))} and "
+        f"E = {', '.join(f'{E:.0e}' for E in sorted({c['E'] for c in cases}))} Pa, where some step is stable. "
+        "By ν: benchmarks/results/stability_laws.md."
+    )
+    return "\n".join([intro, "", common.table(("law", *(f"s = {s:g}" for s in stretches)), rows)])
+
+
 def runout(result: dict[str, Any]) -> str:
     """Collapse of columns of sand beside published measurements, and the steepest slopes that stand."""
     aspects = [row["a"] for row in result["collapse"][0]["rows"]]
@@ -216,6 +234,27 @@ def sand_accuracy(result: dict[str, Any]) -> str:
     return "\n".join([intro, "", common.table(header, rows)])
 
 
+def sand_gradient(result: dict[str, Any]) -> str:
+    """Errors of the float32 gradients of the return map."""
+    gaps = [case["gap"] for case in result["rows"][0]["gaps"]]
+    rows = [
+        (
+            f"{row['energy']}, {row['flow']} flow, {row['result']}", *(case["largest"] for case in row["gaps"]),
+            row["at rest"], max(case["one unit of F, largest"] for case in row["gaps"]),
+        )
+        for row in result["rows"]
+    ]  # fmt: skip
+    states = sum(case["states"] for row in result["rows"] for case in row["gaps"])
+    intro = (
+        "float32 gradients of the new F and of the stress on the cone against float64 at the same F, by the gap of two "
+        f"singular values: the largest relative error of {states / 1e6:.2g} million states with mean strains from "
+        "1e-4 to 0.2 (benchmarks/accuracy/sand_gradient.py). The last column is what one unit in the last place of F "
+        "changes in the exact gradient."
+    )
+    header = ("gradient of", *(f"gap {gap:g}" for gap in gaps), "F = I", "one unit of F")
+    return "\n".join([intro, "", common.table(header, rows)])
+
+
 def heat(result: dict[str, Any]) -> str:
     """Errors of conduction and melting against analytic solutions."""
     forms = [("quadratic", name) for name in ("hybrid", "apic", "flip", "pic")] + [("cubic", "hybrid")]
@@ -303,8 +342,10 @@ def summary(directory: Path) -> str:
         ("heat_stability", "Heat solve", heat_solve),
         ("precision", "Precision", precision),
         ("stability", "Stability", stability),
+        ("stability_laws", "Stability of every law", stability_laws),
         ("svd_accuracy", "Singular values", svd_accuracy),
         ("sand_accuracy", "Sand: return map", sand_accuracy),
+        ("sand_gradient", "Sand: gradients", sand_gradient),
         ("runout", "Sand: run-out of columns", runout),
         ("collapse", "Sand: long runs", collapse),
     ):

@@ -183,6 +183,14 @@ def test_return_map_of_sand_against_extended_precision(tmp_path: Path) -> None:
             assert found["wrong branches"] == 0
 
 
+def test_gradients_of_sand_program(tmp_path: Path) -> None:
+    run_quick("benchmarks.accuracy.sand_gradient", tmp_path)
+    found = result(tmp_path, "sand_gradient.json")
+    for row in found["rows"]:
+        assert row["at rest"] < found["allowed"]
+        assert all(case["states"] > 300 and case["largest"] < found["allowed"] for case in row["gaps"])
+
+
 def test_svd_program(tmp_path: Path) -> None:
     run_quick("benchmarks.accuracy.svd", tmp_path)
     for row in result(tmp_path, "svd_accuracy.json")["rows"]:

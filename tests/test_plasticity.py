@@ -581,6 +581,52 @@ def test_moduli_and_strengths_of_zero(device, dim, law):
         assert bool(result.converged.all())
 
 
+# Parameters that are stresses, behind μ and λ.
+STRESSES = {"von_mises": (2, 3), "herschel_bulkley": (2, 3), "cam_clay": (3,)}
+
+
+@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("exponent", [-90, 90])
+def test_the_unit_of_stress_does_not_matter(device, dim, law, dtype, exponent):
+    """All moduli and strengths times 2^±90, 1e±27 Pa: the same strains, history and branches, stress in proportion."""
+    F, (p, q) = random_states(300, dim), data(law, 300)
+    scaled = [v * 2.0**exponent if k < 2 or k in STRESSES.get(law, ()) else v for k, v in enumerate(p)]
+    F, p, scaled, q = F.to(device, dtype), to(p, device, dtype), to(scaled, device, dtype), to(q, device, dtype)
+    one, other = (principal_update(law, F, values, q, details=True) for values in (p, scaled))
+    limit = 1e-10 if dtype == torch.float64 else 1e-3
+    assert torch.equal(one.branch, other.branch) and int(one.branch.max()) < INVALID
+    assert torch.allclose(other.F, one.F, rtol=limit, atol=limit)
+    assert error(other.stress * 2.0**-exponent, one.stress.cpu().double()) < limit
+    for a, b in zip(other.history, one.history, strict=True):
+        assert torch.allclose(a, b, rtol=limit, atol=limit)
+    stiffness = [principal_stiffness(law, F, values, q) for values in (p, scaled)]
+    assert torch.allclose(stiffness[1] * 2.0**-exponent, stiffness[0], rtol=limit)
+
+
+@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("distance", [1e-3, 1e-6, 1e-12])
+def test_nearly_incompressible(device, dim, law, dtype, distance):
+    """ν = 1/2 − distance: finite results and gradients, convergence, a positive time step; pressure from the volume."""
+    F, (p, q) = random_states(300, dim), data(law, 300)
+    nu = 0.5 - distance
+    p[1] = p[0] * 2 * nu / (1 - 2 * nu)
+    leaves = [v.requires_grad_() for v in to([F, *p, *q], device, dtype)]
+    result = principal_update(law, leaves[0], leaves[1 : 1 + len(p)], leaves[1 + len(p) :], details=True)
+    assert bool(result.converged.all()) and int(result.branch.max()) < INVALID
+    values = (result.F, result.stress, result.dissipated, *result.history)
+    assert all(bool(v.isfinite().all()) for v in values)
+    total = result.F.sum() + result.stress.sum() * distance
+    assert all(bool(g.isfinite().all()) for g in torch.autograd.grad(total, leaves, allow_unused=True) if g is not None)
+    stiffness = principal_stiffness(law, leaves[0].detach(), *(to(v, device, dtype) for v in (p, q)))
+    assert bool(stiffness.isfinite().all()) and float(stiffness.min().detach()) > 0
+    if law == "hencky" and dtype == torch.float64:
+        mean = result.stress.detach().diagonal(dim1=1, dim2=2).mean(1).cpu()
+        bulk = p[1] + 2 * p[0] / dim
+        assert torch.allclose(mean, bulk * torch.linalg.det(F).log(), rtol=1e-6, atol=1e-9 / distance)
+
+
 def test_errors(device):
     F, one = torch.eye(3, device=device).repeat(4, 1, 1), torch.ones((), device=device)
     with pytest.raises(ValueError, match=r"law must be one of \['cam_clay', .*, got 'steel'"):

@@ -13,7 +13,7 @@ import dataclasses
 import itertools
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +31,21 @@ STEPS = 150
 COARSE = [0.9 * 1.17**k for k in range(9)]
 """Multiples of the estimate that are tried first."""
 
+LAWS: dict[str, Callable[[Tensor, Tensor], mpm.Material]] = {
+    "neo-Hookean": lambda E, nu: mpm.NeoHookean(E=E, nu=nu),
+    "fixed corotated": lambda E, nu: mpm.FixedCorotated(E=E, nu=nu),
+    "Hencky": lambda E, nu: mpm.Hencky(E=E, nu=nu),
+    "von Mises": lambda E, nu: mpm.VonMises(E=E, nu=nu, yield_stress=0.05 * E, hardening=0.02 * E),
+    "Herschel-Bulkley": lambda E, nu: mpm.HerschelBulkley(
+        E=E, nu=nu, yield_stress=0.02 * E, consistency=1e-3 * E, exponent=0.6
+    ),
+    "snow": lambda E, nu: mpm.Snow(E=E, nu=nu),
+    "Cam-Clay": lambda E, nu: mpm.CamClay(
+        E=E, nu=nu, critical_slope=1.2, consolidation=0.02 * E, hardening=10.0, cohesion=0.2
+    ),
+}
+"""Laws of Young's modulus and Poisson's ratio; the other parameters so that large strains yield."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Case:
@@ -44,11 +59,12 @@ class Case:
     transfer: str = "apic"
     stress_form: str = "mls"
     kernel: str = "quadratic"
+    law: str = "neo-Hookean"
 
     @property
     def setting(self) -> tuple[Any, ...]:
         """Cases of one setting run in one batch."""
-        return self.dim, self.layout, self.transfer, self.stress_form, self.kernel
+        return self.dim, self.layout, self.transfer, self.stress_form, self.kernel, self.law
 
     def deformation(self) -> Tensor:
         other = self.stretch if self.stretch < 1 else self.stretch ** (-1 / (self.dim - 1))
@@ -70,7 +86,7 @@ def positions(dim: int, layout: str, dx: float, generator: torch.Generator) -> t
     return x, per_axis**-dim
 
 
-def stable(cases: Sequence[Case], factors: Tensor, steps: int = STEPS) -> tuple[Tensor, Tensor]:
+def stable(cases: Sequence[Case], factors: Tensor, steps: int = STEPS, device: str = "cpu") -> tuple[Tensor, Tensor]:
     """Which multiples of the estimate [cases, K] are stable, and the estimates [cases] [s]; cases of one setting."""
     first, (count, tries) = cases[0], factors.shape
     dim, scenes = first.dim, count * tries
@@ -82,7 +98,7 @@ def stable(cases: Sequence[Case], factors: Tensor, steps: int = STEPS) -> tuple[
     def per_scene(values: Sequence[float]) -> Tensor:
         return torch.tensor(values, dtype=torch.float64).repeat_interleave(tries)
 
-    law = mpm.NeoHookean(E=per_scene([c.E for c in cases]), nu=per_scene([c.nu for c in cases]))
+    law = LAWS[first.law](per_scene([c.E for c in cases]), per_scene([c.nu for c in cases])).to(device)
     F = torch.stack([c.deformation() for c in cases]).repeat_interleave(tries * n, 0)
     rest_volume = volume * grid.dx**dim / torch.linalg.det(F)
     state = mpm.State(
@@ -92,18 +108,19 @@ def stable(cases: Sequence[Case], factors: Tensor, steps: int = STEPS) -> tuple[
         volume=rest_volume,
         F=F,
         scene=torch.arange(scenes).repeat_interleave(n).int(),
-    )
+    ).to(device)
     walls = None if first.layout == "isolated" else "slip"
     step = mpm.Step(grid, law, walls=walls, transfer=first.transfer, stress_form=first.stress_form)
     estimate = step.stable_dt(state, cfl=1.0)
     speed = 1e-7 * law.wave_speed(state)[:, None]
-    noise = speed * torch.randn(n, dim * (1 + dim), generator=generator, dtype=torch.float64).repeat(scenes, 1)
+    noise = torch.randn(n, dim * (1 + dim), generator=generator, dtype=torch.float64)
+    noise = speed * noise.repeat(scenes, 1).to(device)
     state = state.replace(v=noise[:, :dim], C=noise[:, dim:].reshape(-1, dim, dim) / grid.dx)
     start = largest = size(state, grid)
     for _ in range(steps):
-        state = step(state, estimate * factors.flatten())
+        state = step(state, estimate * factors.flatten().to(device))
         largest = torch.maximum(largest, size(state, grid))
-    return (largest < GROWTH * start).view(count, tries), estimate.view(count, tries)[:, 0]
+    return (largest < GROWTH * start).view(count, tries).cpu(), estimate.view(count, tries)[:, 0].cpu()
 
 
 def size(state: mpm.State, grid: mpm.Grid) -> Tensor:
@@ -117,18 +134,18 @@ def size(state: mpm.State, grid: mpm.Grid) -> Tensor:
 
 
 @torch.no_grad()
-def measure(cases: Sequence[Case]) -> list[dict[str, Any]]:
+def measure(cases: Sequence[Case], device: str = "cpu") -> list[dict[str, Any]]:
     """Of each case: the estimate [s], and the multiples of it between which the limit lies (0, 0: unstable at any)."""
     results = []
     for setting, group in itertools.groupby(cases, key=lambda c: c.setting):
         batch = list(group)
-        low, high, estimate = bracket(batch, torch.tensor(COARSE, dtype=torch.float64).repeat(len(batch), 1))
+        low, high, estimate = bracket(batch, torch.tensor(COARSE, dtype=torch.float64).repeat(len(batch), 1), device)
         never = torch.zeros(len(batch), dtype=torch.bool)
         if failed := (low == 0).nonzero().flatten().tolist():
             tenth = torch.full((len(failed), 1), 0.1, dtype=torch.float64)
-            never[failed] = ~stable([batch[i] for i in failed], tenth, 10 * STEPS)[0][:, 0]
+            never[failed] = ~stable([batch[i] for i in failed], tenth, 10 * STEPS, device)[0][:, 0]
         between = torch.linspace(0, 1, 9, dtype=torch.float64)[1:-1]
-        low, high, _ = bracket(batch, low[:, None] + (high - low)[:, None] * between, low, high)
+        low, high, _ = bracket(batch, low[:, None] + (high - low)[:, None] * between, device, low, high)
         low, high = low.where(~never, 0), high.where(~never, 0)
         for c, dt, a, b in zip(batch, estimate.tolist(), low.tolist(), high.tolist(), strict=True):
             results.append({**dataclasses.asdict(c), "estimate": dt, "stable": a, "unstable": b})
@@ -137,10 +154,10 @@ def measure(cases: Sequence[Case]) -> list[dict[str, Any]]:
 
 
 def bracket(
-    cases: Sequence[Case], factors: Tensor, low: Tensor | None = None, high: Tensor | None = None
+    cases: Sequence[Case], factors: Tensor, device: str, low: Tensor | None = None, high: Tensor | None = None
 ) -> tuple[Tensor, Tensor, Tensor]:
     """The largest multiple up to which all are stable, and the next; `low` is known to be and `high` not to be."""
-    good, estimate = stable(cases, factors)
+    good, estimate = stable(cases, factors, STEPS, device)
     low = factors.new_zeros(len(cases)) if low is None else low
     high = 2 * factors[:, -1] if high is None else high
     ladder = torch.cat([low[:, None], factors, high[:, None]], 1)

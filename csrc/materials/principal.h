@@ -3,6 +3,7 @@
 #include "materials/arguments.h"
 #include "materials/lanes.h"
 #include "math/svd.h"
+#include "math/wide.h"
 
 // What isotropic laws in principal strains share: the Hencky strains of F, and the adjoint of an isotropic tensor
 // function of F from that of its principal values.
@@ -15,9 +16,6 @@
 
 namespace mpm {
 inline namespace TORCH_MPM_ISA {
-
-template <class T>
-using MaskOf = decltype(T(0) < T(0));
 
 template <class T>
 MPM_HD T min(const T& a, const T& b) {
@@ -68,21 +66,37 @@ struct HenckyStrain {
   MaskOf<T> meaningful;    // det F > 0, everything finite
 };
 
+// ln a of the square of a stretch, where a warp of a GPU should take one branch: small strains are never below the other.
+#ifdef __CUDACC__
+MPM_HD float logarithm_of_square(float a, float a_minus_1) {
+  return a_minus_1 > -0.75f ? ::log1pf(a_minus_1) : ::logf(a);
+}
+MPM_HD double logarithm_of_square(double a, double a_minus_1) {
+  return a_minus_1 > -0.75 ? ::log1p(a_minus_1) : ::log(a);
+}
+#else
+template <class T>
+MPM_HD T logarithm_of_square(const T& a, const T& a_minus_1) {
+  return log_1p(a, a_minus_1);
+}
+#endif
+
+// Only extreme entries are scaled: the logarithm of a stretch near one keeps its digits.
 template <class T, int D>
-MPM_HD_LARGE HenckyStrain<T, D> hencky_strain(const Matrix<T, D>& F) {
-  HenckyStrain<T, D> s;
-  // Only extreme entries are scaled: the logarithm of a stretch near one keeps its digits.
+MPM_HD T scale_of_strain(const Matrix<T, D>& F) {
   T largest = T(0);
   MPM_UNROLL
   for (int i = 0; i < D; i++)
     MPM_UNROLL
   for (int j = 0; j < D; j++) largest = max(largest, abs(F[i][j]));
   const auto moderate = (largest > T(1e-6)) & (largest < T(1e6));
-  s.scale = select(moderate, T(1), inverse_power_of_two(largest));
-  s.B = s.scale * transpose(F);
-  orthogonalize_columns(s.B, s.U);
-  const T shift = log_1p(s.scale, s.scale - T(1));
-  T finite = poison(F);
+  return select(moderate, T(1), inverse_power_of_two(largest));
+}
+
+// The rest of s from its U, B and scale, of which `shift` is the logarithm.
+template <class T, int D>
+MPM_HD void measure_strain(HenckyStrain<T, D>& s, const T& shift) {
+  T finite = poison(s.B);
   MPM_UNROLL
   for (int i = 0; i < D; i++) {
     T minus_1 = s.B[0][i] * s.B[0][i] - T(1);
@@ -92,11 +106,54 @@ MPM_HD_LARGE HenckyStrain<T, D> hencky_strain(const Matrix<T, D>& F) {
       minus_1 = minus_1 + s.B[k][i] * s.B[k][i];
       s.square[i] = s.square[i] + s.B[k][i] * s.B[k][i];
     }
-    s.h[i] = T(0.5) * log_1p(s.square[i], minus_1) - shift;
+    s.h[i] = T(0.5) * logarithm_of_square(s.square[i], minus_1) - shift;
     finite = finite + (s.h[i] - s.h[i]);
   }
   s.meaningful = (determinant(s.B) > T(0)) & (finite == T(0));
+}
+
+template <class T, int D>
+MPM_HD_LARGE HenckyStrain<T, D> hencky_strain(const Matrix<T, D>& F) {
+  HenckyStrain<T, D> s;
+  s.scale = scale_of_strain(F);
+  s.B = s.scale * transpose(F);
+  orthogonalize_columns(s.B, s.U);
+  measure_strain(s, log_1p(s.scale, s.scale - T(1)));
   return s;
+}
+
+// One step of Newton's method towards the nearest orthogonal matrix.
+template <class T, int D>
+MPM_HD Matrix<T, D> orthogonalized(const Matrix<T, D>& U) {
+  return U * (T(1.5) * identity<T, D>() - T(0.5) * (transpose(U) * U));
+}
+
+// Strains and axes in float64 of an F in float32: every digit of a difference of strains is that of F. The axes come
+// from float32, and a sweep in float64 makes them exact.
+template <class T, int D>
+MPM_HD_LARGE HenckyStrain<Wide<T>, D> wide_hencky_strain(const Matrix<T, D>& F) {
+  using W = Wide<T>;
+  if constexpr (std::is_same_v<T, W> || D == 2) {
+    return hencky_strain(convert<W>(F));
+  } else {
+    const T scale = scale_of_strain(F);
+    Matrix<T, D> B = scale * transpose(F), U = identity<T, D>();
+    sweep_columns(B, U, JacobiSweeps<T>::least, JacobiSweeps<T>::least, 0);
+    HenckyStrain<W, D> s;
+    s.scale = convert<W>(scale);
+    s.U = orthogonalized(convert<W>(U));
+    s.B = transpose(s.scale * convert<W>(F)) * s.U;
+    sweep_columns(s.B, s.U, 1, JacobiSweeps<W>::most, 1e-12);
+    measure_strain(s, convert<W>(log_1p(scale, scale - T(1))));
+    return s;
+  }
+}
+
+// The same in another arithmetic.
+template <class To, class T, int D>
+MPM_HD HenckyStrain<To, D> convert(const HenckyStrain<T, D>& s) {
+  return {convert<To>(s.U),      convert<To>(s.B),     convert<To>(s.h),
+          convert<To>(s.square), convert<To>(s.scale), convert<MaskOf<To>>(s.meaningful)};
 }
 
 // A diag(d) Bᵀ.

@@ -17,7 +17,7 @@ inline namespace TORCH_MPM_ISA {
 template <class T>
 struct FlowRoot {
   Vector<T, 3> direction;  // m
-  T r, b;
+  T u, r, b;
   T steps;  // evaluations of y, those of the radial root included
   MaskOf<T> converged;
 };
@@ -81,20 +81,21 @@ MPM_HD FlowStep<T> flow_step(const T& r, const Vector<T, 3>& m, const Vector<T, 
   return {turn, to_surface + radius_slope * turn, value, slope};
 }
 
-// From the radial root.
+// From the radial root, u = 0 with near = 0; or from a point near the root, with near = 1. Until a step is at most
+// `tolerance`.
 template <class Energy, class T>
-MPM_HD FlowRoot<T> flow_root(const Root<T>& radial, const Vector<T, 3>& n, const T& x, const Cone<T>& cone,
-                             const MaskOf<T>& wanted) {
+MPM_HD_LARGE FlowRoot<T> flow_root(const Root<T>& start, T u, T near, const Vector<T, 3>& n, const T& x,
+                                   const Cone<T>& cone, const MaskOf<T>& wanted, double tolerance) {
   const Vector<T, 3> e = towards_extension(n);
   FlowRoot<T> f;
-  f.direction = n;
-  f.r = radial.r;
-  f.steps = radial.steps;
-  f.converged = radial.converged;
+  f.direction = rsqrt(T(1) + u * u) * (n + u * e);
+  f.r = start.r;
+  f.steps = start.steps;
+  f.converged = start.converged;
   const T most = T(RootFinding<T>::most_radius);
-  T u = T(0), low = T(0), high = tangent_of_lode_angle(n);
-  T active = select(wanted & radial.converged & (radial.r > T(0)), T(1), T(0));
-  T on_surface = T(1), near = T(0);  // whether r(u) exists; whether the last step was small and r was not solved for
+  T low = T(0), high = tangent_of_lode_angle(n);
+  T active = select(wanted & start.converged & (start.r > T(0)), T(1), T(0));
+  T on_surface = T(1);  // whether r(u) exists; near: whether the last step was small and r was not solved for
   for (int step = 0; step < RootFinding<T>::most_steps && any(active > T(0)); step++) {
     const T square = T(1) + u * u, cosine = rsqrt(square);
     const Vector<T, 3> k = cosine * (e + (T(0) - u) * n);
@@ -104,8 +105,7 @@ MPM_HD FlowRoot<T> flow_root(const Root<T>& radial, const Vector<T, 3>& n, const
     high = select((near > T(0)) | before, high, u);
     const T next = u + g.turn * square, size = abs(g.turn) + abs(g.change) / f.r;
     // Where the root is so ill-conditioned that rounding keeps the steps larger, the last of them may be.
-    const double tolerance = RootFinding<T>::tolerance * (step + 5 < RootFinding<T>::most_steps ? 1 : 300);
-    const auto small = size <= T(tolerance);
+    const auto small = size <= T(tolerance * (step + 5 < RootFinding<T>::most_steps ? 1 : 300));
     const auto inside = (next >= low) & (next <= high);
     // A bracket that cannot be halved further may still leave r open.
     const auto settled = high - low <= T(RootFinding<T>::resolution);
@@ -123,11 +123,12 @@ MPM_HD FlowRoot<T> flow_root(const Root<T>& radial, const Vector<T, 3>& n, const
         on_surface = select((near > T(0)) | (yield_function<Energy>(most, f.direction, cone).value > T(0)), T(1), T(0));
     }
     const auto solve = now & (on_surface > T(0)) & (near <= T(0));
-    const Root<T> root = yield_root<Energy>(f.r, most, f.direction, cone, solve);
+    const Root<T> root = yield_root<Energy>(f.r, most, f.direction, cone, solve, tolerance);
     f.r = select(solve, root.r, f.r);
     f.steps = f.steps + root.steps + active;
     active = select(good & small, T(0), active);
   }
+  f.u = u;
   f.converged = f.converged & (active <= T(0));
   const Vector<T, 3> d = deviator(scaled_stress<Energy>(f.r * f.direction).q);
   const T square = dot(d, d);

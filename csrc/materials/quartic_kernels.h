@@ -77,19 +77,18 @@ struct SandParameters {
   MaskOf<T> shear;  // μ > 0
 };
 
-template <class At, class T, int D>
-MPM_HD SandParameters<typename At::Value> load_parameters(const At& at, const SandArguments<T, D>& a) {
-  using V = typename At::Value;
+template <class V, class At, class T, int D>
+MPM_HD SandParameters<V> load_parameters(const At& at, const SandArguments<T, D>& a) {
   // 0 where it is absent.
   const auto load = [&](const Parameter<T>& parameter) {
-    return parameter.pointer ? load_parameter(at, parameter, a.scene, a.scene_stride) : V(0);
+    return parameter.pointer ? convert<V>(load_parameter(at, parameter, a.scene, a.scene_stride)) : V(0);
   };
   SandParameters<V> r;
   r.mu = load(a.mu);
   r.lam = load(a.lam);
   r.alpha = load(a.alpha);
   r.cohesion = load(a.cohesion);
-  r.volume = a.volume.pointer ? at.load(a.volume.pointer, a.volume.stride[0]) : V(0);
+  r.volume = a.volume.pointer ? convert<V>(at.load(a.volume.pointer, a.volume.stride[0])) : V(0);
   r.shear = r.mu > V(0);
   r.cone = {r.alpha, select(r.shear, r.lam / select(r.shear, r.mu, V(1)), V(0))};
   return r;
@@ -126,11 +125,11 @@ struct SandState {
   MaskOf<T> meaningful, moved, yielded;
 };
 
-template <class Energy, class T, int D>
+template <class Energy, class Rough, class T, int D>
 MPM_HD_LARGE SandState<T, D> sand_state(const HenckyStrain<T, D>& s, const SandParameters<T>& p, bool plastic, bool keep) {
   SandState<T, D> r;
   r.trial = relative_to_apex(s, p);
-  r.m = plastic ? return_map<Energy>(r.trial, p.cone, p.shear, keep) : unmapped(r.trial);
+  r.m = plastic ? return_map<Energy, Rough>(r.trial, p.cone, p.shear, keep) : unmapped(r.trial);
   r.h = shifted(r.m.h, p.cohesion);
   r.stress = sand_stress<Energy>(r.h, p.mu, p.lam);
   T finite = T(0);
@@ -167,9 +166,9 @@ template <class Energy, class At, class T, int D>
 MPM_HD void return_map_at(const ReturnMapArguments<T, D>& a, const At& at) {
   using V = typename At::Value;
   const Matrix<V, D> F = load_matrix<D>(at, a.sand.F);
-  const SandParameters<V> p = load_parameters(at, a.sand);
+  const SandParameters<V> p = load_parameters<V>(at, a.sand);
   const HenckyStrain<V, D> s = hencky_strain(F);
-  const SandState<V, D> state = sand_state<Energy>(s, p, a.sand.plastic, a.sand.keep_apex);
+  const SandState<V, D> state = sand_state<Energy, V>(s, p, a.sand.plastic, a.sand.keep_apex);
 
   Matrix<V, D> tau = compose(s.U, state.stress, s.U);
   Vector<V, D> factor;
@@ -205,109 +204,144 @@ MPM_HD void return_map_at(const ReturnMapArguments<T, D>& a, const At& at) {
   }
 }
 
-// Adjoint of F in principal axes; see principal_adjoint.
-template <class Energy, class T, int D>
-MPM_HD Matrix<T, D> sand_adjoint(const HenckyStrain<T, D>& s, const SandState<T, D>& state,
-                                 const Vector<T, D>& diagonal, const Matrix<T, D>& M, const Matrix<T, D>& N,
-                                 const T& mu) {
-  return principal_adjoint(s, state.h, diagonal, M, N, [&](int i, int j) -> Quotients<T> {
-    return {strain_quotient<Energy>(state.m, i, j, s.h[i] - s.h[j]),
-            stress_quotient<Energy>(state.h[i], state.h[j], mu)};
-  });
-}
-
 // A value per particle where the mask is true, else 0.
-template <class At, class T>
-MPM_HD typename At::Value load_scalar(const At& at, const Field<const T>& f, const MaskOf<typename At::Value>& mask) {
-  return select(mask, at.load(f.pointer, f.stride[0]), typename At::Value(0));
+template <class V, class At, class T>
+MPM_HD V load_scalar(const At& at, const Field<const T>& f, const MaskOf<V>& mask) {
+  return select(mask, convert<V>(at.load(f.pointer, f.stride[0])), V(0));
 }
 
+// Adjoints in principal axes: of the mapped and, directly, the trial strains, and of the parameters.
+template <class T, int D>
+struct SandAdjoint {
+  Vector<T, D> mapped, trial;
+  T mu, lam, alpha, cohesion, volume;
+};
+
+// Of F and stress, by the diagonals M and N of their adjoints in principal axes. Exponentials have no small differences.
+template <class Energy, class Narrow, class T, int D>
+MPM_HD SandAdjoint<T, D> adjoint_of_tensors(const SandState<T, D>& state, const SandParameters<T>& p,
+                                            const Vector<T, D>& M, const Vector<T, D>& N) {
+  const StressTerms<T, D> terms = stress_terms<Energy>(state.h), tangent = stress_tangent<Energy>(state.h, p.mu, p.lam);
+  const T trace_N = sum(N);
+  SandAdjoint<T, D> r;
+  MPM_UNROLL
+  for (int i = 0; i < D; i++)
+    r.mapped[i] = M[i] * convert<T>(exponential(convert<Narrow>(state.h[i]))) + tangent.shear[i] * N[i] +
+                  tangent.dilation * trace_N;
+  r.mu = dot(terms.shear, N);
+  r.lam = terms.dilation * trace_N;
+  r.trial = zero_vector<T, D>();
+  r.alpha = r.cohesion = r.volume = T(0);
+  return r;
+}
+
+// Of the scalar results that are asked for.
+template <class Energy, class At, class T, class V, int D>
+MPM_HD void add_adjoint_of_scalars(SandAdjoint<V, D>& r, const ReturnMapBackwardArguments<T, D>& a, const At& at,
+                                   const SandState<V, D>& state, const SandParameters<V>& p) {
+  if (a.grad_multiplier.pointer) {
+    const V g = load_scalar<V>(at, a.grad_multiplier, state.yielded);
+    const Vector<V, D> along = g * plastic_increment(state).direction;
+    r.trial = r.trial + along;
+    r.mapped = r.mapped + V(-1) * along;
+    r.cohesion = r.cohesion + sum(along);  // the increment does not see the cohesion, which the mapped strain has in it
+  }
+  if (a.grad_dissipated.pointer) {
+    const V g = load_scalar<V>(at, a.grad_dissipated, state.yielded);
+    const Vector<V, D> before = shifted(state.trial, p.cohesion), stress = sand_stress<Energy>(before, p.mu, p.lam);
+    r.trial = r.trial + g * stress;
+    r.mapped = r.mapped + (V(0) - g) * state.stress;
+    r.cohesion = r.cohesion + g * sum(stress);
+    r.mu = r.mu + g * (sand_energy<Energy>(before, V(1), V(0)) - sand_energy<Energy>(state.h, V(1), V(0)));
+    r.lam = r.lam + g * (sand_energy<Energy>(before, V(0), V(1)) - sand_energy<Energy>(state.h, V(0), V(1)));
+  }
+  if (a.grad_volume.pointer) {
+    r.volume = load_scalar<V>(at, a.grad_volume, loses_volume<Energy>(state, a.sand.keep_apex));
+    r.cohesion = r.cohesion - V(D) * r.volume;
+  }
+}
+
+// Through the return map.
+template <class Energy, class T, int D>
+MPM_HD void pull_back(SandAdjoint<T, D>& r, const SandState<T, D>& state, const SandParameters<T>& p, bool keep) {
+  const MapAdjoint<T, D> map = return_map_adjoint<Energy>(state.m, r.mapped, p.cone, keep);
+  const T ratio = select(p.shear, map.ratio / select(p.shear, p.mu, T(1)), T(0));
+  r.trial = r.trial + map.h;
+  r.mu = r.mu - ratio * p.cone.ratio;
+  r.lam = r.lam + ratio;
+  r.alpha = map.alpha;
+  r.cohesion = r.cohesion + sum(r.mapped) - sum(r.trial);
+}
+
+// The diagonal of Aᵀ G B.
+template <class T, int D>
+MPM_HD Vector<T, D> diagonal_in(const Matrix<T, D>& A, const Matrix<T, D>& G, const Matrix<T, D>& B) {
+  const Matrix<T, D> turned = G * B;
+  Vector<T, D> r;
+  MPM_UNROLL
+  for (int j = 0; j < D; j++) {
+    r[j] = A[0][j] * turned[0][j];
+    MPM_UNROLL
+    for (int i = 1; i < D; i++) r[j] = r[j] + A[i][j] * turned[i][j];
+  }
+  return r;
+}
+
+// The strains, their map and its adjoint in W, the axes in V: of float32 arguments in float64 and float32, because a
+// relative error of the mean strain grows with the strains over their mean, but that of the axes does not.
 template <class Energy, class At, class T, int D>
 MPM_HD void return_map_backward_at(const ReturnMapBackwardArguments<T, D>& a, const At& at) {
   using V = typename At::Value;
-  const Matrix<V, D> F = load_matrix<D>(at, a.sand.F);
-  const SandParameters<V> p = load_parameters(at, a.sand);
-  const HenckyStrain<V, D> s = hencky_strain(F);
-  const SandState<V, D> state = sand_state<Energy>(s, p, a.sand.plastic, a.sand.keep_apex);
+  using W = Wide<V>;
+  const SandParameters<W> p = load_parameters<W>(at, a.sand);
+  const HenckyStrain<W, D> wide = wide_hencky_strain(load_matrix<D>(at, a.sand.F));
+  const SandState<W, D> state = sand_state<Energy, V>(wide, p, a.sand.plastic, a.sand.keep_apex);
 
-  const Matrix<V, D> V_ = right_axes(s);
+  const HenckyStrain<V, D> s = convert<V>(wide);
+  const Matrix<V, D> right = right_axes(s);
   const Matrix<V, D> grad_F = a.grad_F.pointer ? load_matrix<D>(at, a.grad_F) : zero_matrix<V, D>();
   const Matrix<V, D> grad_stress = a.grad_stress.pointer ? load_matrix<D>(at, a.grad_stress) : zero_matrix<V, D>();
-  const Matrix<V, D> M = transpose(s.U) * grad_F * V_, N = transpose(s.U) * grad_stress * s.U;
+  const Matrix<V, D> M = transpose(s.U) * grad_F * right, N = transpose(s.U) * grad_stress * s.U;
 
-  const StressTerms<V, D> terms = stress_terms<Energy>(state.h),
-                          tangent = stress_tangent<Energy>(state.h, p.mu, p.lam);
-  const V trace_N = trace(N);
-  Vector<V, D> grad_h;
-  V grad_mu = V(0), grad_lam = terms.dilation * trace_N;
-  MPM_UNROLL
-  for (int i = 0; i < D; i++) {
-    grad_h[i] = M[i][i] * exponential(state.h[i]) + tangent.shear[i] * N[i][i] + tangent.dilation * trace_N;
-    grad_mu = grad_mu + terms.shear[i] * N[i][i];
-  }
-  // The scalar results give to the mapped and, directly, to the trial strain.
-  Vector<V, D> grad_trial = zero_vector<V, D>();
-  V grad_cohesion = V(0), grad_volume = V(0);
-  if (a.grad_multiplier.pointer) {
-    const V g = load_scalar(at, a.grad_multiplier, state.yielded);
-    const Vector<V, D> along = g * plastic_increment(state).direction;
-    MPM_UNROLL
-    for (int i = 0; i < D; i++) {
-      // The increment does not see the cohesion, which the mapped strain has in it.
-      grad_h[i] = grad_h[i] - along[i];
-      grad_trial[i] = grad_trial[i] + along[i];
-    }
-    grad_cohesion = grad_cohesion + sum(along);
-  }
-  if (a.grad_dissipated.pointer) {
-    const V g = load_scalar(at, a.grad_dissipated, state.yielded);
-    const Vector<V, D> before = shifted(state.trial, p.cohesion), stress = sand_stress<Energy>(before, p.mu, p.lam);
-    MPM_UNROLL
-    for (int i = 0; i < D; i++) {
-      grad_h[i] = grad_h[i] - g * state.stress[i];
-      grad_trial[i] = grad_trial[i] + g * stress[i];
-    }
-    grad_cohesion = grad_cohesion + g * sum(stress);
-    grad_mu = grad_mu + g * (sand_energy<Energy>(before, V(1), V(0)) - sand_energy<Energy>(state.h, V(1), V(0)));
-    grad_lam = grad_lam + g * (sand_energy<Energy>(before, V(0), V(1)) - sand_energy<Energy>(state.h, V(0), V(1)));
-  }
-  if (a.grad_volume.pointer) {
-    grad_volume = load_scalar(at, a.grad_volume, loses_volume<Energy>(state, a.sand.keep_apex));
-    grad_cohesion = grad_cohesion - V(D) * grad_volume;
-  }
-  const MapAdjoint<V, D> adjoint = return_map_adjoint<Energy>(state.m, grad_h, p.cone, a.sand.keep_apex);
-  grad_trial = grad_trial + adjoint.h;
-  grad_cohesion = grad_cohesion + sum(grad_h) - sum(grad_trial);
+  SandAdjoint<W, D> g =
+      adjoint_of_tensors<Energy, V>(state, p, diagonal_in(wide.U, convert<W>(grad_F), right_axes(wide)),
+                                 diagonal_in(wide.U, convert<W>(grad_stress), wide.U));
+  add_adjoint_of_scalars<Energy>(g, a, at, state, p);
+  pull_back<Energy>(g, state, p, a.sand.keep_apex);
 
+  const auto meaningful = convert<MaskOf<V>>(state.meaningful);
   if (a.F.pointer) {
-    const Vector<V, D> diagonal = shifted(grad_trial, grad_volume);
-    const Matrix<V, D> g = s.U * sand_adjoint<Energy>(s, state, diagonal, M, N, p.mu) * transpose(V_);
+    const Matrix<V, D> principal = principal_adjoint(
+        s, convert<V>(state.h), convert<V>(shifted(g.trial, g.volume)), M, N, [&](int i, int j) -> Quotients<V> {
+          return {convert<V>(strain_quotient<Energy>(state.m, i, j, wide.h[i] - wide.h[j])),
+                  convert<V>(stress_quotient<Energy>(state.h[i], state.h[j], p.mu))};
+        });
+    const Matrix<V, D> grad = s.U * principal * transpose(right);
     Matrix<V, D> kept;
     MPM_UNROLL
     for (int i = 0; i < D; i++)
       MPM_UNROLL
-    for (int j = 0; j < D; j++) kept[i][j] = select(state.meaningful, g[i][j], grad_F[i][j]);
+    for (int j = 0; j < D; j++) kept[i][j] = select(meaningful, grad[i][j], grad_F[i][j]);
     store_matrix<D>(at, a.F, kept);
   }
   if (a.parameters.pointer) {
-    const V ratio = select(p.shear, adjoint.ratio / select(p.shear, p.mu, V(1)), V(0));
-    const V values[4] = {grad_mu - ratio * p.cone.ratio, grad_lam + ratio, adjoint.alpha, grad_cohesion};
+    const W values[4] = {g.mu, g.lam, g.alpha, g.cohesion};
     MPM_UNROLL
     for (int k = 0; k < 4; k++)
       at.store(a.parameters.pointer + k * a.parameters.stride[1], a.parameters.stride[0],
-               select(state.meaningful, values[k], V(0)));
+               select(meaningful, convert<V>(values[k]), V(0)));
   }
   if (a.volume.pointer) {
     const V kept = a.grad_volume.pointer ? at.load(a.grad_volume.pointer, a.grad_volume.stride[0]) : V(0);
     at.store(a.volume.pointer, a.volume.stride[0],
-             select(state.meaningful, grad_volume + V(1.0 / D) * sum(grad_trial), kept));
+             select(meaningful, convert<V>(g.volume + W(1.0 / D) * sum(g.trial)), kept));
   }
 }
 
 template <class Energy, class At, class T, int D>
 MPM_HD void sand_scalar_at(const SandScalarArguments<T, D>& a, const At& at) {
   using V = typename At::Value;
-  const SandParameters<V> p = load_parameters(at, a.sand);
+  const SandParameters<V> p = load_parameters<V>(at, a.sand);
   const HenckyStrain<V, D> s = hencky_strain(load_matrix<D>(at, a.sand.F));
   const V value = a.stiffness ? sand_stiffness<Energy>(s.h, p.mu, p.lam, V(a.floor))
                               : sand_energy<Energy>(s.h, p.mu, p.lam);

@@ -55,25 +55,91 @@ MPM_HD MaskOf<T> yields_in_extension(const Vector<T, D>& h, const T& alpha) {
   return sqrt(dot(d, d)) + alpha * sum(t) > T(0);
 }
 
+// Whether y > 0 at s = r n, in the arithmetic of Rough.
+template <class Energy, class Rough, class T, int D>
+MPM_HD MaskOf<T> outside(const T& r, const Vector<T, D>& n, const Cone<T>& cone) {
+  const Rough most = Rough(RootFinding<Rough>::most_radius);
+  const Rough y =
+      yield_function<Energy>(min(convert<Rough>(r), most), convert<Rough>(n), convert<Rough>(cone)).value;
+  return convert<MaskOf<T>>(y > Rough(0));
+}
+
+// The root of y below r = `most`. Where Rough is a type of fewer digits the steps there are taken in it, all but the last.
+template <class Energy, class Rough, class T, int D>
+MPM_HD Root<T> radial_root(const T& most, const Vector<T, D>& n, const Cone<T>& cone, const MaskOf<T>& wanted) {
+  constexpr double tolerance = RootFinding<Rough>::tolerance;
+  T start = most;
+  if constexpr (!std::is_same_v<Rough, T>) {
+    const Rough end = min(convert<Rough>(most), Rough(RootFinding<Rough>::most_radius));
+    const Root<Rough> rough = yield_root<Energy>(end, end, convert<Rough>(n), convert<Rough>(cone),
+                                                 convert<MaskOf<Rough>>(wanted), tolerance);
+    start = min(convert<T>(rough.r), most);
+  }
+  return yield_root<Energy>(start, most, n, cone, wanted, tolerance);
+}
+
+// Roots that float32 cannot resolve, of steep cones far from their axis: a few in 1e5.
+template <class Energy, class T>
+MPM_HD_LARGE void solve_in_float64(FlowRoot<T>& f, const Vector<T, 3>& n, const T& x, const Cone<T>& cone,
+                                   const MaskOf<T>& open) {
+  using W = Wide<T>;
+  const auto some = convert<MaskOf<W>>(open);
+  const Vector<W, 3> direction = convert<W>(n);
+  const Cone<W> wide = convert<W>(cone);
+  const W most = min(W(1) / convert<W>(x), W(RootFinding<W>::most_radius));
+  const Root<W> radial = radial_root<Energy, W>(most, direction, wide, some);
+  const FlowRoot<W> g = flow_root<Energy>(radial, W(0), W(0), direction, convert<W>(x), wide, some,
+                                          RootFinding<W>::tolerance);
+  MPM_UNROLL
+  for (int i = 0; i < 3; i++) f.direction[i] = select(open, convert<T>(g.direction[i]), f.direction[i]);
+  f.r = select(open, convert<T>(g.r), f.r);
+  f.b = select(open, convert<T>(g.b), f.b);
+  f.steps = f.steps + select(open, convert<T>(g.steps), T(0));
+  f.converged = f.converged | (open & convert<MaskOf<T>>(g.converged));
+}
+
+template <class Energy, class Rough, class T>
+MPM_HD FlowRoot<T> exact_root(const Root<T>& radial, const Vector<T, 3>& n, const T& x, const Cone<T>& cone,
+                              const MaskOf<T>& wanted) {
+  constexpr double tolerance = RootFinding<Rough>::tolerance;
+  Root<T> start = radial;
+  T u = T(0), near = T(0);
+  if constexpr (!std::is_same_v<Rough, T>) {
+    const auto some = convert<MaskOf<Rough>>(wanted);
+    const Root<Rough> first{convert<Rough>(radial.r), Rough(0), convert<MaskOf<Rough>>(radial.converged)};
+    const FlowRoot<Rough> rough = flow_root<Energy>(first, Rough(0), Rough(0), convert<Rough>(n), convert<Rough>(x),
+                                                    convert<Rough>(cone), some, tolerance);
+    const auto found = convert<MaskOf<T>>(rough.converged);
+    start.r = select(found, convert<T>(rough.r), radial.r);
+    u = select(found, convert<T>(rough.u), T(0));
+    near = select(found, T(1), T(0));
+  }
+  FlowRoot<T> f = flow_root<Energy>(start, u, near, n, x, cone, wanted, tolerance);
+  if constexpr (Energy::unilateral_yield && !std::is_same_v<T, Wide<T>>) {
+    const auto open = wanted & (select(f.converged, T(0), T(1)) > T(0));
+    if (any(open)) solve_in_float64<Energy>(f, n, x, cone, open);
+  }
+  return f;
+}
+
 // `keep` chooses between the two apex rules: all strain is lost, or the volume is kept (unilateral energy only). Without
-// shear stiffness there is no cone.
-template <class Energy, class T, int D>
+// shear stiffness there is no cone. Rough: see radial_root.
+template <class Energy, class Rough, class T, int D>
 MPM_HD MappedStrain<T, D> return_map(const Vector<T, D>& h, const Cone<T>& cone, const MaskOf<T>& shear, bool keep) {
   MappedStrain<T, D> m;
   m.p = T(1.0 / D) * sum(h);
   Vector<T, D> s;
   MPM_UNROLL
   for (int i = 0; i < D; i++) s[i] = h[i] - m.p;
-  const T norm = sqrt(dot(s, s)), pressure = abs(m.p);
-  const auto sheared = norm > T(0), compressed = m.p < T(0);
-  const T inverse = T(1) / select(sheared, norm, T(1));
+  const T square = dot(s, s), pressure = abs(m.p);
+  const auto sheared = square > T(0), compressed = m.p < T(0);
+  const T inverse = rsqrt(select(sheared, square, T(1))), norm = square * inverse;
   m.direction = inverse * s;
 
   const T start = min(norm / select(compressed, pressure, T(1)), T(RootFinding<T>::most_radius));
-  const T y = yield_function<Energy>(start, m.direction, cone).value;
-  m.cone = compressed & shear & sheared & (y > T(0));
+  m.cone = compressed & shear & sheared & outside<Energy, Rough>(start, m.direction, cone);
   m.apex = (m.p >= T(0)) & yields_in_extension<Energy>(h, cone.alpha);
-  const Root<T> root = yield_root<Energy>(start, start, m.direction, cone, m.cone);
+  const Root<T> root = radial_root<Energy, Rough>(start, m.direction, cone, m.cone);
   m.radius = root.r;
   m.converged = root.converged;
   m.steps = root.steps;
@@ -81,7 +147,7 @@ MPM_HD MappedStrain<T, D> return_map(const Vector<T, D>& h, const Cone<T>& cone,
   m.x = m.b = T(0);
   if constexpr (Energy::exact_flow) {
     m.x = max(pressure * inverse, T(1e-30));
-    const FlowRoot<T> flow = flow_root<Energy>(root, m.direction, m.x, cone, m.cone);
+    const FlowRoot<T> flow = exact_root<Energy, Rough>(root, m.direction, m.x, cone, m.cone);
     m.radius = flow.r;
     m.direction = flow.direction;
     m.b = flow.b;

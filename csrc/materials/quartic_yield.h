@@ -43,6 +43,11 @@ struct Cone {
   }
 };
 
+template <class To, class T>
+MPM_HD Cone<To> convert(const Cone<T>& cone) {
+  return {convert<To>(cone.alpha), convert<To>(cone.ratio)};
+}
+
 // q and dqᵢ/dsᵢ.
 template <class T, int D>
 struct ScaledStress {
@@ -109,14 +114,14 @@ struct Root {
 };
 
 // The root of y in [0, most] from a guess `start` in it, where y(most) > 0: Newton's method, where y > 0 on
-// ∛(y + c) − ∛c with c = αK + 1, nearly linear in r for any overshoot, kept in a bracket by bisection. Lanes are
-// independent of each other: each stops when it has converged.
+// ∛(y + c) − ∛c with c = αK + 1, nearly linear in r for any overshoot, kept in a bracket by bisection, until a step is at
+// most `tolerance` of r. Lanes are independent of each other: each stops when it has converged.
 template <class Energy, class T, int D>
 MPM_HD_LARGE Root<T> yield_root(const T& start, const T& most, const Vector<T, D>& n, const Cone<T>& cone,
-                          const MaskOf<T>& wanted) {
+                          const MaskOf<T>& wanted, double tolerance) {
   const T target = cone.alpha * cone.template hydrostatic<Energy, D>();
   if constexpr (Energy::quadratic) return {max(T(0), target), T(0), T(0) == T(0)};
-  const T c = target + T(1), w0 = cube_root(c), tolerance = T(RootFinding<T>::tolerance);
+  const T c = target + T(1), w0 = cube_root(c);
   const auto on_axis = target <= T(0);
   T r = select(on_axis, T(0), start), low = T(0), high = most;
   // 1 until a lane has converged.
@@ -130,7 +135,7 @@ MPM_HD_LARGE Root<T> yield_root(const T& start, const T& most, const Vector<T, D
     const T w = cube_root(max(y.value, T(0)) + c);
     // 3 (w0 − w) w²/y' with w0 − w = −y/(w² + w w0 + w0²), which does not cancel.
     const T change = T(-3) * y.value * w * w / ((w * w + w * w0 + w0 * w0) * y.slope), next = r + change;
-    const auto small = abs(change) <= tolerance * r;
+    const auto small = abs(change) <= T(tolerance) * r;
     // At a multiple root, where the step says nothing, y vanishes to rounding.
     const auto settled = abs(y.value) <= T(RootFinding<T>::rounding) * y.size;
     const auto good = (y.slope > T(0)) & (((next >= low) & (next <= high)) | small);

@@ -39,10 +39,11 @@ MPM_HD double inverse_power_of_two(double x) {
 // An estimate of ∛x, to 3 digits or better and smooth, for x > 0.
 #ifdef __CUDA_ARCH__
 MPM_HD float cube_root(float x) { return ::exp2f(__log2f(x) * (1.0f / 3)); }
+MPM_HD double cube_root(double x) { return cube_root(float(x)); }
 #else
 MPM_HD float cube_root(float x) { return ::cbrtf(x); }
-#endif
 MPM_HD double cube_root(double x) { return ::cbrt(x); }
+#endif
 
 #ifndef __CUDACC__
 // A third of the exponent (Kahan 1991), refined by one Newton step.

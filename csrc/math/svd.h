@@ -110,33 +110,43 @@ MPM_HD void orthogonalize(Matrix<T, D>& B, Matrix<T, D>& V, int p, int q) {
 }
 
 template <class T, int D>
-MPM_HD decltype(T(0) > T(0)) is_oblique(const Matrix<T, D>& B) {
-  constexpr double tolerance = JacobiSweeps<T>::rounding * JacobiSweeps<T>::rounding;
+MPM_HD decltype(T(0) > T(0)) is_oblique(const Matrix<T, D>& B, double cosine) {
+  const T tolerance = T(cosine * cosine);
   T excess = T(-1);
   MPM_UNROLL
   for (int p = 0; p < D - 1; p++)
     MPM_UNROLL
   for (int q = p + 1; q < D; q++) {
     const Products<T> m = products(B, p, q);
-    excess = max(excess, m.g * m.g - T(tolerance) * m.a * m.b);
+    excess = max(excess, m.g * m.g - tolerance * m.a * m.b);
   }
   return excess > T(0);
+}
+
+// Sweeps over the columns of B, of which V takes part, until their cosines are small.
+template <class T, int D>
+MPM_HD void sweep_columns(Matrix<T, D>& B, Matrix<T, D>& V, int least, int most, double cosine) {
+#ifdef __CUDACC__
+#pragma unroll 1
+#endif
+  for (int sweep = 0; sweep < most; sweep++) {
+    if (sweep >= least && !any(is_oblique(B, cosine))) break;
+    MPM_UNROLL
+    for (int p = 0; p < D - 1; p++)
+      MPM_UNROLL
+    for (int q = p + 1; q < D; q++) orthogonalize(B, V, p, q);
+  }
 }
 
 // B, V with B = B V and orthogonal columns of B in descending length; V starts as the identity.
 template <class T, int D>
 MPM_HD void orthogonalize_columns(Matrix<T, D>& B, Matrix<T, D>& V) {
   V = identity<T, D>();
-#ifdef __CUDACC__
-#pragma unroll 1
-#endif
-  for (int sweep = 0; sweep < (D == 2 ? 2 : JacobiSweeps<T>::most); sweep++) {
-    if (D == 3 && sweep >= JacobiSweeps<T>::least && !any(is_oblique(B))) break;
-    MPM_UNROLL
-    for (int p = 0; p < D - 1; p++)
-      MPM_UNROLL
-    for (int q = p + 1; q < D; q++) orthogonalize(B, V, p, q);
-  }
+  using Sweeps = JacobiSweeps<T>;
+  if constexpr (D == 2)
+    sweep_columns(B, V, 2, 2, 0);
+  else
+    sweep_columns(B, V, Sweeps::least, Sweeps::most, Sweeps::rounding);
 }
 
 // Rotates rows p and q of B so that B[q][p] vanishes and B[p][p] ≥ 0, and columns of U so that U B stays the same.

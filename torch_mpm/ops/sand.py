@@ -92,7 +92,8 @@ def quartic_return_map(
 
     Differentiable once: every floating result with respect to F, mu, lam, the angle or α, cohesion and volume
     correction, by implicit differentiation at the root and divided differences that hold at equal principal stretches.
-    On a boundary between branches the derivative is that of the branch taken.
+    On a boundary between branches the derivative is that of one of them. Of float32 arguments the gradient takes
+    strains and map in float64: it is right to rounding at the F that is given.
 
     Raises:
         ValueError, TypeError: for an unknown option, or wrong shapes, dtypes or devices.
