@@ -25,9 +25,11 @@ PROGRAMS = (
     "benchmarks.accuracy.heat",
     "benchmarks.accuracy.svd",
     "benchmarks.accuracy.sand",
+    "benchmarks.accuracy.sand_gradient",
     "benchmarks.accuracy.ritter",
     "benchmarks.accuracy.runout",
     "benchmarks.stability.stable_dt",
+    "benchmarks.stability.law_dt",
     "benchmarks.stability.heat",
     "benchmarks.stability.sand",
     "benchmarks.stability.collapse",
@@ -39,6 +41,7 @@ ON_DEVICE = (
     "benchmarks.speed.heat",
     "benchmarks.accuracy.ritter",
     "benchmarks.accuracy.runout",
+    "benchmarks.stability.law_dt",
     "benchmarks.stability.collapse",
 )
 """Programs that take --device; the others run on the CPU."""

@@ -13,6 +13,7 @@ import torch
 from benchmarks import common, report
 from benchmarks.accuracy import convergence, manufactured, ritter
 from benchmarks.speed import peers, step, work
+from benchmarks.stability.stable_dt import LAWS
 
 # Threads that wait without spinning: tests share their machine.
 PASSIVE = {**os.environ, "OMP_WAIT_POLICY": "PASSIVE"}
@@ -189,6 +190,13 @@ def test_gradients_of_sand_program(tmp_path: Path) -> None:
     for row in found["rows"]:
         assert row["at rest"] < found["allowed"]
         assert all(case["states"] > 300 and case["largest"] < found["allowed"] for case in row["gaps"])
+
+
+def test_no_law_is_unstable_below_its_estimate(tmp_path: Path) -> None:
+    run_quick("benchmarks.stability.law_dt", tmp_path)
+    cases = result(tmp_path, "stability_laws.json")["cases"]
+    assert {case["law"] for case in cases} == set(LAWS) - {"neo-Hookean"}
+    assert all(1 <= case["stable"] < 10 for case in cases)
 
 
 def test_svd_program(tmp_path: Path) -> None:

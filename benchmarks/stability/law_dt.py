@@ -21,7 +21,7 @@ from .stable_dt import LAWS, Case, measure, ratio
 def all_cases(quick: bool) -> list[Case]:
     stiffness = (1e6,) if quick else (1e3, 1e6, 1e9)
     ratios = (0.0, 0.49) if quick else (0.0, 0.2, 0.4, 0.49)
-    stretches = (0.5, 1.0, 2.0) if quick else (0.2, 0.5, 0.9, 1.0, 1.1, 2.0, 5.0)
+    stretches = (0.5, 2.0) if quick else (0.2, 0.5, 0.9, 1.0, 1.1, 2.0, 5.0)
     values = itertools.product(LAWS, (2,) if quick else (2, 3), stretches, ratios, stiffness)
     return [Case(dim, E, nu, stretch, law=law) for law, dim, stretch, nu, E in values if law != "neo-Hookean"]
 
