@@ -311,10 +311,11 @@ MPM_HD void return_map_backward_at(const ReturnMapBackwardArguments<T, D>& a, co
 
   const auto meaningful = convert<MaskOf<V>>(state.meaningful);
   if (a.F.pointer) {
+    const Vector<V, D> h = convert<V>(state.h);
     const Matrix<V, D> principal = principal_adjoint(
-        s, convert<V>(state.h), convert<V>(shifted(g.trial, g.volume)), M, N, [&](int i, int j) -> Quotients<V> {
-          return {convert<V>(strain_quotient<Energy>(state.m, i, j, wide.h[i] - wide.h[j])),
-                  convert<V>(stress_quotient<Energy>(state.h[i], state.h[j], p.mu))};
+        s, h, convert<V>(shifted(g.trial, g.volume)), M, N, [&](int i, int j) -> Quotients<V> {
+          return {strain_quotient<Energy, V>(state.m, i, j, wide.h[i] - wide.h[j]),
+                  stress_quotient<Energy>(h[i], h[j], convert<V>(p.mu))};
         });
     const Matrix<V, D> grad = s.U * principal * transpose(right);
     Matrix<V, D> kept;

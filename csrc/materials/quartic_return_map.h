@@ -138,7 +138,7 @@ MPM_HD MappedStrain<T, D> return_map(const Vector<T, D>& h, const Cone<T>& cone,
 
   const T start = min(norm / select(compressed, pressure, T(1)), T(RootFinding<T>::most_radius));
   m.cone = compressed & shear & sheared & outside<Energy, Rough>(start, m.direction, cone);
-  m.apex = (m.p >= T(0)) & yields_in_extension<Energy>(h, cone.alpha);
+  m.apex = (m.p >= T(0)) & convert<MaskOf<T>>(yields_in_extension<Energy>(convert<Rough>(h), convert<Rough>(cone.alpha)));
   const Root<T> root = radial_root<Energy, Rough>(start, m.direction, cone, m.cone);
   m.radius = root.r;
   m.converged = root.converged;
@@ -163,9 +163,10 @@ MPM_HD MappedStrain<T, D> return_map(const Vector<T, D>& h, const Cone<T>& cone,
   return m;
 }
 
-// (Hᵢ − Hⱼ)/(hᵢ − hⱼ) of mapped strains H of trial strains h, also where these are equal. `trial` is hᵢ − hⱼ.
-template <class Energy, class T, int D>
-MPM_HD T strain_quotient(const MappedStrain<T, D>& m, int i, int j, const T& trial) {
+// (Hᵢ − Hⱼ)/(hᵢ − hⱼ) of mapped strains H of trial strains h, also where these are equal. `trial` is hᵢ − hⱼ. Differences
+// are taken in T, their quotient in V.
+template <class Energy, class V, class T, int D>
+MPM_HD V strain_quotient(const MappedStrain<T, D>& m, int i, int j, const T& trial) {
   T on_cone = m.kappa;
   if constexpr (Energy::exact_flow) {
     const T a = m.radius * m.direction[i] - T(1), b = m.radius * m.direction[j] - T(1);
@@ -173,10 +174,11 @@ MPM_HD T strain_quotient(const MappedStrain<T, D>& m, int i, int j, const T& tri
     on_cone = select(m.cone, on_cone, T(1));
   }
   // At the apex 1 between strains that are kept, 0 between those that are not.
-  const auto equal = trial == T(0);
-  const auto both = (m.h[i] > T(0)) & (m.h[j] > T(0));
-  const T at_apex = select(both, T(1), select(equal, T(0), (m.h[i] - m.h[j]) / select(equal, T(1), trial)));
-  return select(m.apex, at_apex, on_cone);
+  const V before = convert<V>(trial), after = convert<V>(m.h[i] - m.h[j]);
+  const auto equal = before == V(0);
+  const MaskOf<T> both = (m.h[i] > T(0)) & (m.h[j] > T(0));
+  const V at_apex = select(convert<MaskOf<V>>(both), V(1), select(equal, V(0), after / select(equal, V(1), before)));
+  return select(convert<MaskOf<V>>(m.apex), at_apex, convert<V>(on_cone));
 }
 
 // Adjoint of `return_map`: from that of the mapped strain to those of the trial strain, α and Λ, by the implicit function
