@@ -73,7 +73,9 @@ def device_name(device: str) -> str:
 
 
 def commit() -> str:
-    """Commit of the source tree, "-dirty" where files differ; without git, what TORCH_MPM_COMMIT says."""
+    """What TORCH_MPM_COMMIT says, for a tree that is not git's; else its commit, "-dirty" where files differ."""
+    if given := os.environ.get("TORCH_MPM_COMMIT"):
+        return given
     try:
         run = subprocess.run(
             ["git", "describe", "--always", "--dirty", "--exclude=*"], cwd=ROOT, capture_output=True, text=True
@@ -81,7 +83,7 @@ def commit() -> str:
         described = run.stdout.strip() if run.returncode == 0 else ""
     except OSError:
         described = ""
-    return described or os.environ.get("TORCH_MPM_COMMIT", "unknown")
+    return described or "unknown"
 
 
 def slug(name: str) -> str:

@@ -3,13 +3,15 @@
 Deformations next to the identity, of any size and shape from 1e-10 to 1e10, with stretches up to e²⁰, and nearly
 spherical; friction angles 0° to 89°, ν from 0 to 0.4999, μ from 1 to 1e8 Pa. Counts results that are not finite, roots
 that were not found, and states of clearly positive determinant that were called invalid; the exit status says whether
-all are zero, but for roots of the exact flow that say so, up to one in a million.
+all are zero. Roots that were not found on steep cones of the unilateral energy (3-D, φ above asin(3/5) = 36.87°), where
+some directions have none, are counted by themselves and are no failure: the op reports them.
 """
 
 from __future__ import annotations
 
 import argparse
 import itertools
+import math
 import sys
 import time
 from pathlib import Path
@@ -35,6 +37,9 @@ FORMS = (
 )
 DTYPES = (torch.float32, torch.float64)
 COUNTS = ("not finite", "not converged", "wrongly invalid", "gradient not finite")
+STEEP = "not converged, steep cone"
+STEEP_ANGLE = math.asin(3 / 5)
+"""Friction angle above which the unilateral energy leaves some directions without a root."""
 
 
 def deformations(kind: int, dim: int, generator: torch.Generator) -> Tensor:
@@ -56,13 +61,14 @@ def deformations(kind: int, dim: int, generator: torch.Generator) -> Tensor:
 
 
 def count_failures(dim: int, dtype: torch.dtype, energy: str, flow: str, apex: str, batches: int) -> list[int]:
-    """The COUNTS over `batches` times BATCH states."""
+    """The COUNTS and STEEP over `batches` times BATCH states."""
     generator = torch.Generator().manual_seed(0)
-    counts = torch.zeros(len(COUNTS), dtype=torch.int64)
+    counts = torch.zeros(len(COUNTS) + 1, dtype=torch.int64)
     for batch in range(batches):
         F = deformations(batch % 4, dim, generator).to(dtype)
         random = torch.rand(3, BATCH, generator=generator, dtype=torch.float64)
-        mu, nu, alpha = 10 ** (8 * random[0]), 0.4999 * random[1], friction_alpha(torch.deg2rad(89 * random[2]), dim)
+        mu, nu, angle = 10 ** (8 * random[0]), 0.4999 * random[1], torch.deg2rad(89 * random[2])
+        alpha = friction_alpha(angle, dim)
         parameters = (mu.to(dtype), (mu * 2 * nu / (1 - 2 * nu)).to(dtype), alpha.to(dtype))
         options = (F, *parameters, None, None, None, energy, flow, apex)
         *values, code, multiplier, dissipated, _ = torch.ops.torch_mpm.quartic_return_map(*options, True)
@@ -74,7 +80,8 @@ def count_failures(dim: int, dtype: torch.dtype, energy: str, flow: str, apex: s
         ones = torch.ones_like(F)
         gradient = torch.ops.torch_mpm.quartic_return_map_backward(ones, *(None,) * 4, *options, True, True)[0]
         smooth = gradient.isfinite().all(2).all(1)
-        failed = (~finite, code > 3, (code == 3) & regular, ~smooth)
+        steep = (angle > STEEP_ANGLE) & (energy == "unilateral" and dim == 3)
+        failed = (~finite, (code > 3) & ~steep, (code == 3) & regular, ~smooth, (code > 3) & steep)
         counts += torch.tensor([int(f.sum()) for f in failed])
     return counts.tolist()
 
@@ -93,22 +100,18 @@ def main() -> None:
         begin = time.perf_counter()
         counts = count_failures(dim, dtype, energy, flow, apex, batches)
         name = f"{dim}-D, {energy}, {flow} flow, apex {apex}, {str(dtype).split('.')[1]}"
-        rows.append({"name": name, "states": batches * BATCH, **dict(zip(COUNTS, counts, strict=True))})
+        rows.append({"name": name, "states": batches * BATCH, **dict(zip((*COUNTS, STEEP), counts, strict=True))})
         print(f"{rows[-1]} in {time.perf_counter() - begin:.0f} s", flush=True)
     result = {"environment": common.environment(), "rows": rows}
-    header = ("case", "states", *COUNTS)
-    table = common.table(header, [[row[key] for key in ("name", "states", *COUNTS)] for row in rows])
+    header = ("case", "states", *COUNTS, STEEP)
+    table = common.table(header, [[row[key] for key in ("name", *header[1:])] for row in rows])
     common.write(
         arguments.out,
         "sand",
         result,
         "\n\n".join(("# Random states of sand", common.describe(result["environment"]), table)),
     )
-    sys.exit(any(row[key] > allowed(row, key) for row in rows for key in COUNTS))
-
-
-def allowed(row: dict[str, Any], count: str) -> float:
-    return row["states"] / 1e6 if count == "not converged" and "exact" in row["name"] else 0
+    sys.exit(any(row[key] for row in rows for key in COUNTS))
 
 
 if __name__ == "__main__":
