@@ -1,6 +1,7 @@
-"""The tables and figures of the README, from the result files: `python -m benchmarks.report [--readme README.md]`.
+"""The tables and figures of the documents, from the result files: `python -m benchmarks.report [--write]`.
 
-Prints the tables; with --readme, puts them between the lines `<!-- benchmarks -->` and `<!-- /benchmarks -->` too.
+Prints the tables; with --write, puts them between the lines `<!-- benchmarks -->` and `<!-- /benchmarks -->` of
+README.md, which has the sections of OVERVIEW, and of docs/measured.md, which has the others.
 """
 
 from __future__ import annotations
@@ -8,6 +9,7 @@ from __future__ import annotations
 import argparse
 import json
 import re
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +18,7 @@ from .accuracy.runout import PUBLISHED, published, slopes
 from .stability.heat import cell as heat_cell
 from .stability.heat import kind as heat_kind
 
+README, MEASURED = common.ROOT / "README.md", common.ROOT / "docs" / "measured.md"
 BEGIN, END = "<!-- benchmarks -->", "<!-- /benchmarks -->"
 FORWARD = ("step", "step, CUDA graph")
 BOTH = ("step, forward and backward", "step, forward and backward, CUDA graph")
@@ -326,16 +329,20 @@ def heat_speed(results: list[dict[str, Any]]) -> str:
     return "\n\n".join(parts)
 
 
-def summary(directory: Path) -> str:
-    """All sections for which there are results."""
-    sections = []
-    if speeds := [json.loads(file.read_text()) for file in sorted(directory.glob("speed_*.json"))]:
-        sections.append("### Speed\n\n" + speed(speeds))
-    if times := [json.loads(file.read_text()) for file in sorted(directory.glob("svd_*_*.json"))]:
-        sections.append("### Small matrices and sand\n\n" + small_matrices(times))
-    if times := [json.loads(file.read_text()) for file in sorted(directory.glob("heat_*_*.json"))]:
-        sections.append("### Speed of the heat solve\n\n" + heat_speed(times))
-    for name, title, section in (
+OVERVIEW = ("Speed", "Small matrices and sand", "Speed of the heat solve", "Convergence", "Heat", "Stability")
+
+
+def sections(directory: Path) -> dict[str, str]:
+    """All sections for which there are results, by title."""
+    found = {}
+    for pattern, title, section in (
+        ("speed_*.json", "Speed", speed),
+        ("svd_*_*.json", "Small matrices and sand", small_matrices),
+        ("heat_*_*.json", "Speed of the heat solve", heat_speed),
+    ):
+        if results := [json.loads(file.read_text()) for file in sorted(directory.glob(pattern))]:
+            found[title] = section(results)
+    for name, title, section_of_one in (
         ("convergence", "Convergence", convergence),
         ("ritter", "Dam break", dam_break),
         ("heat", "Heat", heat),
@@ -350,8 +357,13 @@ def summary(directory: Path) -> str:
         ("collapse", "Sand: long runs", collapse),
     ):
         if (file := directory / f"{name}.json").exists():
-            sections.append(f"### {title}\n\n" + section(json.loads(file.read_text())))
-    return "\n\n".join(sections)
+            found[title] = section_of_one(json.loads(file.read_text()))
+    return found
+
+
+def summary(found: dict[str, str], titles: Iterable[str]) -> str:
+    """The sections of these titles, as far as found, one after the other."""
+    return "\n\n".join(f"### {title}\n\n{found[title]}" for title in titles if title in found)
 
 
 def insert(text: str, tables: str) -> str:
@@ -369,12 +381,15 @@ def insert(text: str, tables: str) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--results", type=Path, default=common.RESULTS)
-    parser.add_argument("--readme", type=Path, help="file to update")
+    parser.add_argument("--write", action="store_true", help="update README.md and docs/measured.md")
     arguments = parser.parse_args()
-    tables = summary(arguments.results)
-    print(tables)
-    if arguments.readme:
-        arguments.readme.write_text(insert(arguments.readme.read_text(), tables))
+    found = sections(arguments.results)
+    overview, details = summary(found, OVERVIEW), summary(found, [t for t in found if t not in OVERVIEW])
+    print(overview, details, sep="\n\n")
+    if arguments.write:
+        details = details.replace("](benchmarks/", "](../benchmarks/")
+        for document, tables in ((README, overview), (MEASURED, details)):
+            document.write_text(insert(document.read_text(), tables))
 
 
 if __name__ == "__main__":

@@ -161,10 +161,11 @@ def test_report_has_every_section_and_goes_between_its_marks(tmp_path: Path) -> 
     cases = {"cases": [{"name": "2-D", "order": {"displacement": 2.0}, "rows": rows}]}
     for name, found in (("speed_abacus", speed), ("convergence", cases)):
         (tmp_path / f"{name}.json").write_text(json.dumps(found))
-    tables = report.summary(tmp_path)
+    found = report.sections(tmp_path)
+    tables = report.summary(found, report.OVERVIEW)
     cells = [cell.strip() for line in tables.splitlines() if line.startswith("| abacus") for cell in line.split("|")]
     assert cells[1:5] == ["abacus", "1 M", "2", "4.0x"] and cells[7] == "2"
-    assert "### Convergence" in tables and "### Precision" not in tables
+    assert list(found) == ["Speed", "Convergence"] and tables.index("### Speed") < tables.index("### Convergence")
     document = report.insert(f"before {report.BEGIN} old {report.END} after", tables)
     assert document.startswith("before") and document.endswith("after") and "old" not in document and "4.0x" in document
     with pytest.raises(ValueError, match="needs the lines"):
