@@ -24,7 +24,7 @@ from ..errors import SimulationError
 from ..state import State
 from ..thermal import LIQUID
 from ..trajectory import COMPLETE, PARTIAL, Layout, TrajectoryWriter, create, h5py_module
-from . import checkpoint
+from . import checkpoint, heap
 from .build import Built
 from .diagnose import SceneFailure, replay, wrong
 from .explain import SceneError
@@ -241,6 +241,8 @@ class Simulation:
             steps = min(count, SEGMENT)
             largest = max(largest, self._speed() * dt / self.step.grid.dx)
             self._segment(dt, steps)
+            if self.state.x.is_cpu:
+                heap.trim()
             now = target if steps == count else now + steps * dt
             self.totals.substeps += steps
             self.totals.smallest_dt = min(self.totals.smallest_dt, dt)
