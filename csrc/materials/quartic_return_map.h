@@ -190,21 +190,32 @@ struct MapAdjoint {
 };
 
 // Aᵀ⁻¹ a of the flow rule A dH = dh − d db with the yield surface left aside: A = κ⁻¹ in the deviators if radial, and
-// I + b/x dev diag(∂q/∂s) if exact.
+// I + b/x dev diag(∂q/∂s) if exact. As mean + scale deviator, whose mean is another than that of a if exact: x may be
+// far below the rounding of the mean.
+template <class T, int D>
+struct PulledBack {
+  T mean, scale;
+  Vector<T, D> deviator;
+
+  MPM_HD T operator[](int i) const { return mean + scale * deviator[i]; }
+};
+
 template <class Energy, class T, int D>
-MPM_HD Vector<T, D> pull_back(const MappedStrain<T, D>& m, const Vector<T, D>& slope, const Vector<T, D>& a) {
-  Vector<T, D> r;
+MPM_HD PulledBack<T, D> pull_back(const MappedStrain<T, D>& m, const Vector<T, D>& slope, const Vector<T, D>& a) {
+  PulledBack<T, D> r;
   if constexpr (Energy::exact_flow) {
     Vector<T, D> inverse;
     MPM_UNROLL
     for (int i = 0; i < D; i++) inverse[i] = T(1) / (m.x + m.b * slope[i]);
-    const T mean = dot(a, inverse) / sum(inverse);
+    r.mean = dot(a, inverse) / sum(inverse);
+    r.scale = m.x;
     MPM_UNROLL
-    for (int i = 0; i < D; i++) r[i] = (m.x * a[i] + m.b * slope[i] * mean) * inverse[i];
+    for (int i = 0; i < D; i++) r.deviator[i] = (a[i] - r.mean) * inverse[i];
   } else {
-    const T mean = T(1.0 / D) * sum(a);
+    r.mean = T(1.0 / D) * sum(a);
+    r.scale = m.kappa;
     MPM_UNROLL
-    for (int i = 0; i < D; i++) r[i] = mean + m.kappa * (a[i] - mean);
+    for (int i = 0; i < D; i++) r.deviator[i] = a[i] - r.mean;
   }
   return r;
 }
@@ -225,11 +236,11 @@ MPM_HD_LARGE MapAdjoint<T, D> return_map_adjoint(const MappedStrain<T, D>& m, co
     g[i] = stress.slope[i] * (select(sheared, d[i] * inverse, n[i]) + cone.alpha) + trace;
 
   // dH = A⁻¹ (dh − f dγ) with g · dH = 0 and the flow direction f.
-  const Vector<T, D> pulled = pull_back<Energy>(m, stress.slope, grad), normal = pull_back<Energy>(m, stress.slope, g);
+  const PulledBack<T, D> pulled = pull_back<Energy>(m, stress.slope, grad), normal = pull_back<Energy>(m, stress.slope, g);
   T along = dot(n, grad), across = dot(n, g);
-  if constexpr (Energy::exact_flow) {
-    along = select(sheared, dot(d, pulled), along);
-    across = select(sheared, dot(d, normal), across);
+  if constexpr (Energy::exact_flow) {  // f = d, to which the means add nothing
+    along = select(sheared, dot(d, pulled.deviator), along);
+    across = select(sheared, dot(d, normal.deviator), across);
   }
   const T step = along / select(m.cone, across, T(1));
   // The share of the other strains where the volume is kept: dHᵢ = dhᵢ + Σ_{dropped} dh/#kept.
