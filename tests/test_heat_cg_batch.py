@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 from particles import relative_error
-from test_heat_cg import heat
+from test_heat_cg import check_replay, heat
 
 from torch_mpm.reference import heat as reference
 
@@ -99,16 +99,7 @@ def test_batch_in_a_cuda_graph(device):
     if device == "cpu":
         pytest.skip("graphs are of CUDA")
     h = batch(3, device=device, dtype=torch.float32)
-    h.solve(tolerance=1e-6)
-    torch.cuda.synchronize()
-    graph = torch.cuda.CUDAGraph()
-    with torch.cuda.graph(graph):
-        solve = h.solve(tolerance=1e-6)
-    for factor in (1.0, 0.25):
-        h.theta.mul_(factor)
-        graph.replay()
-        expected = h.solve(tolerance=1e-6)
-        torch.testing.assert_close(solve.increment, expected.increment, rtol=1e-4, atol=1e-6)
+    check_replay(h)
 
 
 def test_solve_asks_the_device_nothing(device):

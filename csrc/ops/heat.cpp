@@ -87,20 +87,28 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> heat_cg(const Tensor& x, const Tensor
   return {increment, iterations, residual, converged};
 }
 
+// What the operator and its stencil read.
+template <class T, int D>
+HeatOperatorArguments<T, D> operator_arguments(const Topology<T, D>& topology, const Tensor& x,
+                                               const Tensor& conductance, bool deterministic) {
+  HeatOperatorArguments<T, D> a;
+  a.topology = topology;
+  a.x = input<T>(x, "x", x, {x.size(0), D});
+  a.conductance = input<T>(conductance, "conductance", x, {x.size(0)});
+  a.deterministic = deterministic;
+  return a;
+}
+
 Tensor heat_operator(const Tensor& x, const Tensor& conductance, const OptionalTensor& nodes, MPM_TOPOLOGY_PARAMETERS) {
   check_rank(block, "block", 1);
   check_rank(x, "x", 2);
   Tensor sum;
   const DeviceScope device(x);
   dispatch(x, order, [&]<class T, int D, int Order>() {
-    HeatOperatorArguments<T, D> a;
-    a.topology = topology<T, D>(x, MPM_TOPOLOGY_ARGUMENTS);
+    auto a = operator_arguments(topology<T, D>(x, MPM_TOPOLOGY_ARGUMENTS), x, conductance, deterministic);
     const int64_t N = node_count<D>(block);
-    a.x = input<T>(x, "x", x, {x.size(0), D});
-    a.conductance = input<T>(conductance, "conductance", x, {x.size(0)});
     const Values<T> u(nodes, "nodes", x, x.scalar_type(), N);
     a.nodes = u.pointer;
-    a.deterministic = deterministic;
     sum = zeros(x, {N});
     a.sum = static_cast<T*>(sum.data_ptr());
     const Tensor workspace = empty(x, {backend::heat_operator_workspace(a)}, ScalarType::Byte);
@@ -116,11 +124,7 @@ Tensor heat_stencil(const Tensor& x, const Tensor& conductance, MPM_TOPOLOGY_PAR
   Tensor sum;
   const DeviceScope device(x);
   dispatch(x, order, [&]<class T, int D, int Order>() {
-    HeatOperatorArguments<T, D> a;
-    a.topology = topology<T, D>(x, MPM_TOPOLOGY_ARGUMENTS);
-    a.x = input<T>(x, "x", x, {x.size(0), D});
-    a.conductance = input<T>(conductance, "conductance", x, {x.size(0)});
-    a.deterministic = deterministic;
+    auto a = operator_arguments(topology<T, D>(x, MPM_TOPOLOGY_ARGUMENTS), x, conductance, deterministic);
     sum = zeros(x, {kPairs<D>, node_count<D>(block)});
     a.sum = static_cast<T*>(sum.data_ptr());
     backend::heat_stencil<Order>(a, device.stream());
