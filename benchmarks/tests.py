@@ -4,17 +4,22 @@
     python -m benchmarks.tests --tool memcheck -k cuda tests/test_transfer.py
     python -m benchmarks.tests --tool racecheck -k cuda --processes 12
 
-With `--tool` the tests run under compute-sanitizer, and an error that it finds fails the run. `--processes` deals the
-tests out to several processes side by side, each under a compute-sanitizer of its own.
+With `--tool` the tests run under compute-sanitizer, and an error that it finds fails the run. With `--processes`,
+so many run side by side and share the cores, each under a compute-sanitizer of its own; none takes more than a few
+tests then, because racecheck keeps host memory until its process ends.
 """
 
 from __future__ import annotations
 
 import argparse
+import math
+import os
 import subprocess
 import sys
 import tempfile
+import time
 import xml.etree.ElementTree as ElementTree
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +28,7 @@ import torch
 from . import common
 
 COUNTS = ("tests", "failures", "errors", "skipped")
+SANITIZED_TESTS = 40  # of one process
 
 
 def sanitized(tool: str) -> list[str]:
@@ -31,39 +37,47 @@ def sanitized(tool: str) -> list[str]:
     return ["compute-sanitizer", "--tool", tool, *options, "--kernel-regex", "kns=mpm"]
 
 
-def deal(command: list[str], processes: int) -> list[list[str]]:
-    """The tests that `command` selects, dealt out in turn."""
+def deal(command: list[str], processes: int, most: int | None) -> list[list[str]]:
+    """The tests that `command` selects, dealt out in turn to hands of at most `most` tests."""
     listed = subprocess.run([*command, "--collect-only"], cwd=common.ROOT, capture_output=True, text=True)
     names = [line for line in listed.stdout.splitlines() if "::" in line]
-    return [names[first::processes] for first in range(min(processes, len(names)))]
+    hands = min(len(names), max(processes, math.ceil(len(names) / most) if most else 0))
+    return [names[first::hands] for first in range(hands)]
+
+
+def run_hand(
+    command: list[str], environment: dict[str, str], folder: Path, number: int, names: list[str]
+) -> tuple[int, dict[str, str] | None]:
+    """The exit status of pytest on these tests, and their counts, None if it crashed."""
+    arguments, report = folder / f"{number}.txt", folder / f"{number}.xml"
+    arguments.write_text("\n".join(names))
+    started = subprocess.run(
+        [*command, f"--junitxml={report}", f"@{arguments}"],
+        cwd=common.ROOT,
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+    print(f"hand {number}: exit status {started.returncode}\n{started.stdout[-2000:]}", flush=True)
+    return started.returncode, counts_of(report) if report.exists() else None
 
 
 def run_side_by_side(
-    tool: list[str], command: list[str], hands: list[list[str]], folder: Path
+    command: list[str], hands: list[list[str]], processes: int, folder: Path
 ) -> tuple[int, dict[str, str]]:
     """The worst exit status of all hands, and their counts together."""
-    running = []
-    for number, names in enumerate(hands):
-        arguments, report = folder / f"{number}.txt", folder / f"{number}.xml"
-        arguments.write_text("\n".join(names))
-        with open(folder / f"{number}.log", "w") as log:
-            started = subprocess.Popen(
-                [*tool, *command, f"--junitxml={report}", f"@{arguments}"], cwd=common.ROOT, stdout=log, stderr=log
-            )
-        running.append(started)
-    statuses, total = [], dict.fromkeys((*COUNTS, "time"), 0.0)
-    for number, started in enumerate(running):
-        statuses.append(started.wait())
-        log, report = folder / f"{number}.log", folder / f"{number}.xml"
-        print(f"process {number}: exit status {statuses[-1]}\n{log.read_text()[-2000:]}", flush=True)
-        if not report.exists():  # it crashed
-            total["errors"] += 1
-            continue
-        suite = counts_of(report)
+    start = time.monotonic()
+    environment = {**os.environ, "OMP_NUM_THREADS": str(max(1, (os.cpu_count() or 1) // processes))}
+    with ThreadPoolExecutor(processes) as pool:
+        numbers = range(len(hands))
+        outcomes = list(pool.map(lambda number: run_hand(command, environment, folder, number, hands[number]), numbers))
+    total = dict.fromkeys(COUNTS, 0)
+    for _, counts in outcomes:
         for name in COUNTS:
-            total[name] += int(suite[name])
-        total["time"] = max(total["time"], float(suite["time"]))
-    return max(statuses, key=abs), {name: str(value) for name, value in total.items()}
+            total[name] += int(counts[name]) if counts else int(name == "errors")
+    status = max((status for status, _ in outcomes), key=abs, default=5)  # pytest: no test was selected
+    return status, {name: str(value) for name, value in {**total, "time": time.monotonic() - start}.items()}
 
 
 def counts_of(report: Path) -> dict[str, str]:
@@ -85,8 +99,8 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as name:
         folder, report = Path(name), Path(name) / "report.xml"
         if arguments.processes > 1:
-            hands = deal([*command, *selection], arguments.processes)
-            status, suite = run_side_by_side(tool, command, hands, folder)
+            hands = deal([*command, *selection], arguments.processes, SANITIZED_TESTS if tool else None)
+            status, suite = run_side_by_side([*tool, *command], hands, arguments.processes, folder)
         else:
             status = subprocess.run([*tool, *command, f"--junitxml={report}", *selection], cwd=common.ROOT).returncode
             suite = counts_of(report)
