@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 import torch_mpm as mpm
-from torch_mpm.heat_boundaries import Fixed
+from torch_mpm.heat_boundaries import FixedSurface
 
 CELLS, STEPS, DT = 32, 24, 4e-3
 
@@ -38,7 +38,7 @@ def main(iterations: int = 20) -> float:
     grid = mpm.Grid(dx, (-0.2, -0.2), (1.2, 0.4))
     bar = mpm.State.at_rest(mpm.seed.box((0, 0), (1, 2 * dx), dx, per_cell=4), 1.0, dtype=torch.float64)
     start = bar.replace(temperature=torch.zeros_like(bar.mass))
-    hot = Fixed(mpm.Plane((0.0, 0.0), (1.0, 0.0)), 1.0)
+    hot = FixedSurface(mpm.Plane((0.0, 0.0), (1.0, 0.0)), 1.0)
 
     def observed(law: nn.Module) -> Tensor:
         """Temperatures after every step [STEPS, P]."""

@@ -265,7 +265,8 @@ class Obstacle:
     def surface(self, body: Tensor, scene: Tensor | None) -> tuple[Tensor, Tensor]:
         """Signed distance [N] [m], negative inside, and unit normal out of the body [N, D] of body coordinates [N, D].
 
-        Both need to be right inside only; a zero normal (as at the centre of a sphere) leaves the node alone.
+        For contact both need to be right inside only, for `signed_distance` near the surface on both sides. A zero
+        normal (as at the centre of a sphere) leaves the node alone.
         """
         raise NotImplementedError
 
@@ -319,12 +320,20 @@ class Obstacle:
 
     def contains(self, positions: Tensor, scene: Tensor | None, time: float | Tensor) -> Tensor:
         """Which positions are inside, bool [N]; arguments as `apply`."""
+        return self._inside(self.signed_distance(positions, scene, time), positions)
+
+    def signed_distance(self, positions: Tensor, scene: Tensor | None, time: float | Tensor) -> Tensor:
+        """Distance of positions from the surface [N] [m], negative inside; infinite while the obstacle is not there.
+
+        Arguments as `apply`. Differentiable; true near the surface, and away from it where the shape allows.
+        """
         if positions.shape[0] == 0 or self._absent(scene, time):
-            return torch.zeros(positions.shape[:1], dtype=torch.bool, device=positions.device)
+            return positions.new_full(positions.shape[:1], torch.inf)
         pose = self.pose(time, positions)
         body = positions - _per_node(pose.centre, 1, scene)
         distance, _ = self.surface(_transform(_per_node(pose.rotation, 2, scene).mT, body), scene)
-        return self._touching(distance, positions, scene, time)
+        present = self._present(scene, time)
+        return distance if present is None else torch.where(present, distance, torch.inf)
 
     def pose(self, time: float | Tensor, like: Tensor | None = None) -> Pose:
         """Centre and rotation at a time [s], a number or a tensor [] or [B]; with the dtype and device of `like`."""
@@ -369,14 +378,26 @@ class Obstacle:
         return not isinstance(time, Tensor) and not self.start <= time < self.end
 
     def _touching(self, distance: Tensor, positions: Tensor, scene: Tensor | None, time: float | Tensor) -> Tensor:
-        """Which nodes are inside, bool [N]; a node on the surface to rounding counts."""
+        """Which nodes are inside, bool [N]."""
+        inside, present = self._inside(distance, positions), self._present(scene, time)
+        return inside if present is None else inside & present
+
+    def _inside(self, distance: Tensor, positions: Tensor) -> Tensor:
+        """Which distances are not outside; a node on the surface to rounding counts as inside."""
+        if positions.shape[0] == 0:
+            return torch.zeros_like(distance, dtype=torch.bool)
         rounding = 16 * torch.finfo(positions.dtype).eps
-        touching = distance.detach() <= rounding * positions.detach().abs().amax()
+        return distance.detach() <= rounding * positions.detach().abs().amax()
+
+    def _present(self, scene: Tensor | None, time: float | Tensor) -> Tensor | None:
+        """The nodes for which the obstacle is there, bool [N] or []; None for all."""
+        present = None
         if self.scene is not None and scene is not None:
-            touching = touching & (scene == self.scene)
+            present = scene == self.scene
         if isinstance(time, Tensor):
-            touching = touching & _per_node((time >= self.start) & (time < self.end), 0, scene)
-        return touching
+            now = _per_node((time >= self.start) & (time < self.end), 0, scene)
+            present = now if present is None else present & now
+        return present
 
     def _elapsed(self, time: float | Tensor, like: Tensor) -> float | Tensor:
         """Time since `start`, [] or [B]."""

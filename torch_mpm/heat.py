@@ -24,7 +24,7 @@ from torch import Tensor, nn
 from .boundaries import _norm
 from .errors import SimulationError, check_like
 from .grid import Blocks, Grid
-from .heat_boundaries import HeatNodes
+from .heat_boundaries import FixedSurface, HeatNodes
 from .materials import _check_value
 from .ops import gather, heat_cg, scatter
 from .ops.arguments import per_particle, soa_empty
@@ -110,6 +110,8 @@ class Heat(nn.Module):
             raise ValueError(f"max_iterations must be at least 1, got {max_iterations}")
         if method not in METHODS:
             raise ValueError(f"method must be one of {sorted(METHODS)}, got {method!r}")
+        if method == "chebyshev" and any(isinstance(boundary, FixedSurface) for boundary in boundaries):
+            raise ValueError('method must be "cg" or "multigrid" where a boundary is a FixedSurface, got "chebyshev"')
         self.grid, self.boundaries, self.transfer = grid, list(boundaries), transfer
         self.plastic_heating, self.reference = float(plastic_heating), float(reference)
         self.tolerance, self.max_iterations, self.method = float(tolerance), int(max_iterations), method
@@ -193,14 +195,14 @@ class Heat(nn.Module):
         conductance = conductivity * volume
         number = step * conductance / (heat_capacity * self.grid.dx**2)
         blend = self._blend(number, step, velocity_gradient)
-        nodes, weight = self._to_nodes(blocks, state, volume, heat_capacity, theta, gradient, blend)
+        nodes, weight = self._to_nodes(blocks, state, volume, conductance, heat_capacity, theta, gradient, blend)
         before = nodes.theta
         for boundary in self.boundaries:
             boundary.apply(nodes)
         if self.plastic_heating and dissipated is not None:
             power = self.plastic_heating * dissipated * state.volume / step
             nodes.add_source(scatter(blocks, state.x, power[:, None])[:, 0])
-        increment = self._solve(nodes, conductance, dt) - before
+        increment = self._solve(nodes, dt) - before
         theta, gradient = self._to_particles(nodes, before, increment, weight, theta, gradient)
         extra = dict(state.extra)
         if gradient is not None:
@@ -225,6 +227,7 @@ class Heat(nn.Module):
         blocks: Blocks,
         state: State,
         volume: Tensor,
+        conductance: Tensor,
         heat_capacity: Tensor,
         theta: Tensor,
         gradient: Tensor | None,
@@ -240,11 +243,12 @@ class Heat(nn.Module):
         energy, capacity, *weighted = scatter(blocks, state.x, torch.stack(values, 1), moment).unbind(1)
         full = capacity > 0
         inverse = torch.where(full, 1 / torch.where(full, capacity, 1), 0)
-        nodes = HeatNodes(blocks, state, volume, capacity, energy * inverse, self.reference)
+        nodes = HeatNodes(blocks, state, volume, conductance, capacity, energy * inverse, self.reference)
         return nodes, weighted[0] * inverse if weighted else float(blend)
 
-    def _solve(self, nodes: HeatNodes, conductance: Tensor, dt: float | Tensor) -> Tensor:
+    def _solve(self, nodes: HeatNodes, dt: float | Tensor) -> Tensor:
         """Temperature of the nodes at the end of the step [N]."""
+        conductance = nodes.left_conductance()
         start = nodes.theta
         if nodes.fixed is not None and nodes.held is not None:
             start = torch.where(nodes.fixed, nodes.held, start)

@@ -169,7 +169,7 @@ def _coarsen(level: Level, weight: Tensor) -> Level:
     fine, given = level.blocks, level.conductance[:, None]
     conductance = torch.ops.torch_mpm.scatter(level.x, given, None, None, 1.0, *fine.topology)[:, 0].contiguous()
     # Nodes without conductance are nowhere, and left out of the activation.
-    x = torch.where((conductance > 0)[:, None], fine.node_positions(level.x.dtype), torch.nan).T.contiguous().T
+    x = torch.where((conductance.abs() > 0)[:, None], fine.node_positions(level.x.dtype), torch.nan).T.contiguous().T
     grid = _coarse_grid(fine.grid)
     scene = None if grid.scenes == 1 else fine.node_scene().clamp_min(0).int()
     blocks = grid._activate(x, scene, None, min(grid.block_count, fine.block.shape[0]))

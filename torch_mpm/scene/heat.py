@@ -12,7 +12,7 @@ from torch import Tensor
 from .. import boundaries, materials
 from ..grid import Grid
 from ..heat import Heat
-from ..heat_boundaries import Convection, Fixed, Flux, FreeSurface, Radiation, Surface
+from ..heat_boundaries import Convection, Fixed, FixedSurface, Flux, FreeSurface, Radiation, Surface
 from ..parameters import PerMaterial, Table
 from ..thermal import Melting, ThermalExpansion
 from . import schema
@@ -42,6 +42,11 @@ def problems(scene: Any, entries: Sequence[Any]) -> Iterator[str]:
             for k, item in enumerate(getattr(entry, kind)):
                 if scene.heat is None and item.temperature is not None:
                     yield f"{entry.path}{kind}[{k}].temperature: needs a [heat] table, which lets heat flow"
+        for k, item in enumerate(entry.obstacle):
+            if item.held == "surface" and item.temperature is None:
+                yield f'{entry.path}obstacle[{k}].held: "surface" needs a temperature'
+            if item.held == "surface" and scene.heat is not None and scene.heat.method == "chebyshev":
+                yield f'{entry.path}obstacle[{k}].held: "surface" needs heat.method "cg" or "multigrid"'
     for k, face in enumerate(scene.heat.face if scene.heat is not None else ()):
         dim = len(scene.grid.lower)
         for key in ("lower", "upper"):
@@ -99,6 +104,7 @@ def conduction(scene: Any, entries: Sequence[Any], grid: Grid, laws: Sequence[An
         list(_terms(scene, entries, obstacles, device)),
         transfer=words.transfer,
         plastic_heating=words.plastic_heating,
+        method=words.method,
         reference=reference,
         **melting,
     ).to(device)
@@ -110,7 +116,8 @@ def _terms(
     reference = scene.heat.reference
     for words, region in obstacles:
         if words.temperature is not None:
-            yield Fixed(region, words.temperature - reference)
+            hold = FixedSurface if words.held == "surface" else Fixed
+            yield hold(region, words.temperature - reference)
     for exchange in scene.heat.exchange:
         if exchange.coefficient:
             yield Convection(FreeSurface(), exchange.coefficient, exchange.ambient - reference)

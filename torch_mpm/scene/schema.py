@@ -416,6 +416,8 @@ class Obstacle(Model):
     """time from which it is gone [s]"""
     temperature: float | None = None
     """temperature at which it holds what it touches [K]; by default it insulates"""
+    held: Literal["nodes", "surface"] = "nodes"
+    """what it holds at its temperature: the nodes inside, or its surface, which is more accurate"""
     opacity: Annotated[float, Field(gt=0, le=1)] = 1.0
     """how solid it is drawn, 1 for not transparent"""
 
@@ -516,6 +518,8 @@ class Heat(Model):
     """temperature that temperatures are kept relative to [K], best in their middle; where there is no thermal strain"""
     transfer: Literal["hybrid", "apic", "flip", "pic"] = "hybrid"
     """how temperature moves between particles and grid"""
+    method: Literal["cg", "chebyshev", "multigrid"] = "cg"
+    """solver of the implicit step; multigrid for diffusion numbers kappa dt/(rho C dx^2) from about 1000"""
     plastic_heating: Annotated[float, Field(ge=0, le=1)] = 0.0
     """share of the plastic work that becomes heat"""
     exchange: list[Exchange] = []
