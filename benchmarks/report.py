@@ -275,7 +275,8 @@ def heat(result: dict[str, Any]) -> str:
         "Relative error on the finest lattice, with the order over all in brackets (benchmarks/accuracy/heat.py): RMS "
         "of the temperature, position of the melting front; time of the hybrid [s]. 200 steps with a diffusion number "
         f"r = 1e-5 around 300 K in float32 lose {lost['relative to 300 K']:.1%} of the change, with temperatures "
-        "relative to 300 K. Errors of the front below 1e-3 change sign with dx, so that an order fitted to them says little."
+        "relative to 300 K. Errors of the front below 1e-3 change sign with dx, so that an order fitted to them says "
+        "little."
     )
     header = ("problem", "r", "n", "run time [s]", *(f"{t}, cubic" if k == "cubic" else t for k, t in forms))
     figure = "![error over dx and over run time](benchmarks/results/heat.png)"
