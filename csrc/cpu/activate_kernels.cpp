@@ -103,30 +103,38 @@ void classify(const Activation<T, D>& s, int64_t p, int64_t* totals) {
 template <int Order, class T, int D>
 bool classify_pack(const Activation<T, D>& s, int64_t p) {
   const ActivateArguments<T, D>& a = s.a;
-  unsigned key[kLanes] = {}, cell[kLanes] = {};
-  bool inside = true;
+  typedef T Values __attribute__((vector_size(kLanes * sizeof(T))));
+  typedef int32_t Integers __attribute__((vector_size(kLanes * sizeof(int32_t))));
+  typedef uint32_t Unsigned __attribute__((vector_size(kLanes * sizeof(uint32_t))));
+  typedef uint8_t Bytes __attribute__((vector_size(kLanes)));
+  Unsigned key = {}, cell = {};
+  bool known = true;
   if (a.scene)
     for (int l = 0; l < kLanes; l++) {
       key[l] = unsigned(a.scene[(p + l) * a.scene_stride]);
-      inside = inside && key[l] < unsigned(a.scenes);
+      known = known && key[l] < unsigned(a.scenes);
     }
-  Group g = {kLanes, true, {}};
+  Mask<T, kLanes> inside;
+  const Run run{int(p)};
+  Group g = {};
+  g.count = kLanes;
   for (int l = 0; l < kLanes; l++) g.id[l] = int(p) + l;
   MPM_UNROLL
   for (int i = 0; i < D; i++) {
-    const Lanes<T> base = base_node<Order>(a.geometry, i, load(a.x, g, i));
-    inside = inside && all(on_lattice<Order>(a.geometry, i, base));
-    if (!inside) return false;
-    T node[kLanes];
-    base.store(node);
-    for (int l = 0; l < kLanes; l++) {
-      const unsigned n = unsigned(int(node[l]));
-      key[l] = key[l] * unsigned(a.geometry.blocks[i]) + n / kBlockWidth;
-      cell[l] = cell[l] * kBlockWidth + n % kBlockWidth;
-    }
+    const Lanes<T> x = a.x.stride[0] == 1 ? load(a.x, run, i) : load(a.x, g, i);
+    const Lanes<T> base = base_node<Order>(a.geometry, i, x);
+    const auto on = on_lattice<Order>(a.geometry, i, base);
+    inside = i ? inside & on : on;
+    Values node;
+    __builtin_memcpy(&node, &base, sizeof(node));
+    const Unsigned n = Unsigned(__builtin_convertvector(node, Integers));
+    key = key * unsigned(a.geometry.blocks[i]) + n / kBlockWidth;
+    cell = cell * kBlockWidth + n % kBlockWidth;
   }
-  __builtin_memcpy(s.w.key + p, key, sizeof(key));
-  for (int l = 0; l < kLanes; l++) s.w.cell[p + l] = uint8_t(cell[l]);
+  if (!known || !all(inside)) return false;
+  const Bytes cells = __builtin_convertvector(cell, Bytes);
+  __builtin_memcpy(s.w.key + p, &key, sizeof(key));
+  __builtin_memcpy(s.w.cell + p, &cells, sizeof(cells));
   return true;
 }
 

@@ -27,26 +27,29 @@ void p2g_backward_with(const P2GBackwardArguments<T, D>& a, const Field<T> wante
   using P = Lanes<T>;
   const P2GArguments<T, D>& in = a.forward;
   const P dx(in.topology.geometry.dx), inverse_dx(in.topology.geometry.inverse_dx);
-  gather_groups<Order, Gradient ? 2 : 1>(
+  gather_groups<Order>(
       in.topology, in.x, a.grad_nodes, 0, 1 + D,
-      [&](const Group& g, const Weights<Order, P, D>& w, int scene, const T* tile) {
+      [&](const Group& g, const P f[D], int scene, const T* tile) {
         const ParticleMomentum<P, D> p = load_momentum(in, g, scene);
         NodeMomentum<P, D> sum;
         P gathered[kChannels], x[D];
-        sum.mass = gathered[0] = gather_channel<Order, false, false>(w, tile).value;
-        _Pragma("GCC unroll 1") for (int i = 0; i < D; i++) {
-          const Sums<P, D> s = gather_channel<Order, Moment, Gradient>(w, tile + 1 + i);
-          sum.momentum[i] = gathered[1 + i] = s.value;
+        Sums<P, D> s[1 + D];
+        gather_channels<Order, 1 + D, Moment, Gradient, T, D>(f, tile, s);
+        sum.mass = gathered[0] = s[0].value;
+        MPM_UNROLL
+        for (int i = 0; i < D; i++) {
+          sum.momentum[i] = gathered[1 + i] = s[1 + i].value;
           MPM_UNROLL
           for (int j = 0; j < D; j++) {
-            sum.moment[i][j] = Moment ? s.moment[j] : P(0);
-            sum.gradient[i][j] = Gradient ? s.gradient[j] : P(0);
+            sum.moment[i][j] = Moment ? s[1 + i].moment[j] : P(0);
+            sum.gradient[i][j] = Gradient ? s[1 + i].gradient[j] : P(0);
           }
         }
         MPM_UNROLL
         for (int i = 0; i < D; i++) x[i] = P(0);
         if (a.x.pointer) {
-          const Gift<P, D> gift = gift_of_momentum<Order, Moment>(in, p, w.f);
+          const Weights<Order, P, D> w(f, Gradient ? 2 : 1);
+          const Gift<P, D> gift = gift_of_momentum<Order, Moment>(in, p, f);
           add_position_gradient<Order, 1 + D, Moment, Gradient>(w, gift, tile, gathered, x);
           MPM_UNROLL
           for (int i = 0; i < D; i++) x[i] = inverse_dx * x[i];
@@ -84,16 +87,20 @@ void position_gradient_with(const PositionGradientArguments<T, D>& a, int first,
   const P inverse_dx(a.topology.geometry.inverse_dx);
   const Field<const T> before = {a.position_gradient.pointer,
                                  {a.position_gradient.stride[0], a.position_gradient.stride[1], 0}};
-  gather_groups<Order, Gradient ? 2 : 1>(
+  gather_groups<Order>(
       a.topology, a.x, a.nodes, first, count,
-      [&](const Group& g, const Weights<Order, P, D>& w, int, const T* tile) {
+      [&](const Group& g, const P f[D], int, const T* tile) {
         P gathered[kChannels], x[D];
-        if (Slope)
-          _Pragma("GCC unroll 1") for (int c = 0; c < kChannels; c++) gathered[c] =
-              gather_channel<Order, false, false>(w, tile + c).value;
+        if (Slope) {
+          Sums<P, D> s[kChannels];
+          gather_channels<Order, kChannels, false, false, T, D>(f, tile, s);
+          MPM_UNROLL
+          for (int c = 0; c < kChannels; c++) gathered[c] = s[c].value;
+        }
         MPM_UNROLL
         for (int i = 0; i < D; i++) x[i] = P(0);
-        const Gift<P, D> gift = gift_of_features<Slope, Gradient, T, D>(a, first, count, g, w.f);
+        const Weights<Order, P, D> w(f, Gradient ? 2 : 1);
+        const Gift<P, D> gift = gift_of_features<Slope, Gradient, T, D>(a, first, count, g, f);
         add_position_gradient<Order, kChannels, Slope, Gradient>(w, gift, tile, gathered, x);
         MPM_UNROLL
         for (int i = 0; i < D; i++) {

@@ -141,53 +141,88 @@ MPM_HD Lanes<T> load_runs(const T* from, const Group& g) {
 }
 
 template <class T>
-MPM_HD Lanes<T> load(const Field<const T>& f, const Group& g, int i = 0, int j = 0) {
-  const T* from = f.pointer + i * f.stride[1] + j * f.stride[2];
-  if (f.stride[0] == 1 && g.consecutive) return Lanes<T>::load(from + g.id[0]);
-  if (f.stride[0] == 1) return load_runs(from, g);
+MPM_HD Lanes<T> load_row(const T* row, int64_t stride, const Group& g) {
+  if (stride == 1) return g.consecutive ? Lanes<T>::load(row + g.id[0]) : load_runs(row, g);
   T lanes[kLanes];
   MPM_UNROLL
-  for (int l = 0; l < kLanes; l++) lanes[l] = from[g.id[l] * f.stride[0]];
+  for (int l = 0; l < kLanes; l++) lanes[l] = row[g.id[l] * stride];
   return Lanes<T>::load(lanes);
 }
 
 // Writes the lanes of the group only.
 template <class T>
-MPM_HD void store_exactly(const Lanes<T>& v, const Field<T>& f, const Group& g, int i = 0, int j = 0) {
-  T* to = f.pointer + i * f.stride[1] + j * f.stride[2];
+MPM_HD void store_row_exactly(const Lanes<T>& v, T* row, int64_t stride, const Group& g) {
   T lanes[kLanes];
   v.store(lanes);
-  if (g.count == kLanes && f.stride[0] == 1) {
+  if (g.count == kLanes && stride == 1) {
     MPM_UNROLL
-    for (int l = 0; l < kLanes; l++) to[g.id[l]] = lanes[l];
+    for (int l = 0; l < kLanes; l++) row[g.id[l]] = lanes[l];
   } else {
-    for (int l = 0; l < g.count; l++) to[g.id[l] * f.stride[0]] = lanes[l];
+    for (int l = 0; l < g.count; l++) row[g.id[l] * stride] = lanes[l];
   }
 }
 
 // May write over the particles after the group, see `group_by_cell`.
 template <class T>
-MPM_HD void store(const Lanes<T>& v, const Field<T>& f, const Group& g, int i = 0, int j = 0) {
-  T* to = f.pointer + i * f.stride[1] + j * f.stride[2];
-  if (g.consecutive && f.stride[0] == 1) return v.store(to + g.id[0]);
+MPM_HD void store_row(const Lanes<T>& v, T* row, int64_t stride, const Group& g) {
+  if (g.consecutive && stride == 1) return v.store(row + g.id[0]);
 #ifdef __AVX512VL__
-  if (f.stride[0] == 1) {
-    for (int k = 0; k < g.runs; k++) v.store(to + g.start[k], g.lanes[k]);
+  if (stride == 1) {
+    for (int k = 0; k < g.runs; k++) v.store(row + g.start[k], g.lanes[k]);
     return;
   }
 #endif
-  store_exactly(v, f, g, i, j);
+  store_row_exactly(v, row, stride, g);
 }
 
-// kLanes particles one after another in memory, of fields with unit stride: loads without a question.
+template <class T>
+MPM_HD T* row_of(const Field<T>& f, int i = 0, int j = 0) {
+  return f.pointer + i * f.stride[1] + j * f.stride[2];
+}
+
+template <class T>
+MPM_HD Lanes<T> load(const Field<const T>& f, const Group& g, int i = 0, int j = 0) {
+  return load_row(row_of(f, i, j), f.stride[0], g);
+}
+template <class T>
+MPM_HD void store_exactly(const Lanes<T>& v, const Field<T>& f, const Group& g, int i = 0, int j = 0) {
+  store_row_exactly(v, row_of(f, i, j), f.stride[0], g);
+}
+template <class T>
+MPM_HD void store(const Lanes<T>& v, const Field<T>& f, const Group& g, int i = 0, int j = 0) {
+  store_row(v, row_of(f, i, j), f.stride[0], g);
+}
+
+// kLanes particles one after another in memory, of fields with unit stride: loads and stores without a question.
 struct Run {
   int first;
 };
 
 template <class T>
-MPM_HD Lanes<T> load(const Field<const T>& f, const Run& r, int i = 0, int j = 0) {
-  return Lanes<T>::load(f.pointer + i * f.stride[1] + j * f.stride[2] + r.first);
+MPM_HD Lanes<T> load_row(const T* row, int64_t, const Run& r) {
+  return Lanes<T>::load(row + r.first);
 }
+template <class T>
+MPM_HD void store_row(const Lanes<T>& v, T* row, int64_t, const Run& r) {
+  v.store(row + r.first);
+}
+template <class T>
+MPM_HD Lanes<T> load(const Field<const T>& f, const Run& r, int i = 0, int j = 0) {
+  return load_row(row_of(f, i, j), 1, r);
+}
+
+// Where the N components of a field begin. A store through a Field makes the compiler read its strides again.
+template <class T, int N>
+struct Rows {
+  T* row[N] = {};  // null where the field is absent
+  int64_t stride = 0;
+
+  explicit Rows(const Field<T>& f, int inner = 1) : stride(f.stride[0]) {
+    if (f.pointer)
+      for (int k = 0; k < N; k++) row[k] = row_of(f, k / inner, k % inner);
+  }
+  MPM_HD explicit operator bool() const { return row[0]; }
+};
 
 // Whether all fields that are present have particles one after another.
 template <class... Fields>
@@ -229,11 +264,17 @@ struct Tile {
   // Reads channels first, ..., first + count - 1 of the nodes; zero for the other channels and inactive blocks.
   void load_from(const NodeField<const T>& nodes, const Home<T, D>& home, int first, int count) {
     clear();
-    for_runs(home, [&](T* tile, int64_t row, int n) {
-      const T* from = nodes.pointer + row * nodes.stride + first;
-      for (int k = 0; k < n; k++)
-        for (int c = 0; c < count; c++) tile[k * kChannels + c] = from[k * nodes.stride + c];
-    });
+    const auto copy = [&]<int Channels>() {
+      for_runs(home, [&](T* tile, int64_t row, int n) {
+        const T* from = nodes.pointer + row * nodes.stride + first;
+        for (int k = 0; k < n; k++)
+          __builtin_memcpy(tile + k * kChannels, from + k * nodes.stride, Channels * sizeof(T));
+      });
+    };
+    if (count == 1) copy.template operator()<1>();
+    if (count == 2) copy.template operator()<2>();
+    if (count == 3) copy.template operator()<3>();
+    if (count == 4) copy.template operator()<4>();
   }
 
   void add_to(const NodeField<T>& nodes, const Home<T, D>& home, int first, int count) {

@@ -15,9 +15,11 @@ struct Weights {
   static constexpr int S = Order + 1;
   P f[D], w[D][S], dw[D][S], ddw[D][S];
 
-  MPM_HD void make(int derivatives) {
+  // Of particles at distances f from their base nodes, in cells.
+  MPM_HD Weights(const P distances[D], int derivatives) {
     MPM_UNROLL
     for (int a = 0; a < D; a++) {
+      f[a] = distances[a];
       BSpline<Order>::weights(f[a], w[a]);
       if (derivatives > 0) BSpline<Order>::first_derivatives(f[a], dw[a]);
       if (derivatives > 1) BSpline<Order>::second_derivatives(f[a], ddw[a]);
@@ -31,9 +33,52 @@ struct Sums {
   P value, moment[N ? N : 1], gradient[N ? N : 1];
 };
 
+// Channels that are summed in one register: lane kTogether l + c for channel c of particle l.
+template <class T>
+constexpr int kTogether = kLanes * int(sizeof(T)) * 2 <= kRegisterBytes ? 2 : 1;
+template <class T>
+using Together = Pack<T, kLanes * kTogether<T>>;
+
+// The same for all channels.
+template <class T>
+MPM_HD Together<T> for_all_channels(const Lanes<T>& v) {
+  if constexpr (kTogether<T> == 1) return v;
+  else {
+    Together<T> r;
+    r.part[0] = __builtin_shufflevector(v.part[0], v.part[0], 0, 0, 1, 1, 2, 2, 3, 3, 4, 4, 5, 5, 6, 6, 7, 7);
+    return r;
+  }
+}
+
+// kTogether channels of a node for all particles.
+template <class T>
+MPM_HD Together<T> node_channels(const T* node) {
+  if constexpr (kTogether<T> == 1) return Together<T>(node[0]);
+#ifdef __AVX512F__
+  else {
+    Together<T> r;
+    double both;
+    __builtin_memcpy(&both, node, sizeof(both));
+    r.part[0] = _mm512_castpd_ps(_mm512_set1_pd(both));
+    return r;
+  }
+#endif
+}
+
+template <class T>
+MPM_HD Lanes<T> one_channel(const Together<T>& v, int channel) {
+  if constexpr (kTogether<T> == 1) return v;
+  else {
+    Lanes<T> r;
+    r.part[0] = channel ? __builtin_shufflevector(v.part[0], v.part[0], 1, 3, 5, 7, 9, 11, 13, 15)
+                        : __builtin_shufflevector(v.part[0], v.part[0], 0, 2, 4, 6, 8, 10, 12, 14);
+    return r;
+  }
+}
+
 template <int Order, int Axis, bool Moment, bool Gradient, class T, int D>
-MPM_HD Sums<Lanes<T>, D - Axis> sum_nodes(const Weights<Order, Lanes<T>, D>& s, const T* tile) {
-  using P = Lanes<T>;
+MPM_HD Sums<Together<T>, D - Axis> sum_nodes(const Weights<Order, Together<T>, D>& s, const T* tile) {
+  using P = Together<T>;
   constexpr int N = D - Axis, stride = Tile<Order, T, D>::stride(Axis);
   Sums<P, N> r;
   MPM_UNROLL
@@ -42,7 +87,7 @@ MPM_HD Sums<Lanes<T>, D - Axis> sum_nodes(const Weights<Order, Lanes<T>, D>& s, 
     if constexpr (Axis + 1 < D)
       line = sum_nodes<Order, Axis + 1, Moment, Gradient>(s, tile + k * stride);
     else
-      line.value = P(tile[k * stride]);
+      line.value = node_channels(tile + k * stride);
     const P& w = s.w[Axis][k];
     const P part = w * line.value;
     r.value = k ? r.value + part : part;
@@ -64,14 +109,30 @@ MPM_HD Sums<Lanes<T>, D - Axis> sum_nodes(const Weights<Order, Lanes<T>, D>& s, 
   return r;
 }
 
-// Value Σ N g, moment Σ N g r and gradient Σ g ∂N of one channel, with distances r from the particle.
-template <int Order, bool Moment, bool Gradient, class T, int D>
-MPM_HD Sums<Lanes<T>, D> gather_channel(const Weights<Order, Lanes<T>, D>& s, const T* tile) {
-  Sums<Lanes<T>, D> r = sum_nodes<Order, 0, Moment, Gradient>(s, tile);
-  if (Moment)
+// Value Σ N g, moment Σ N g r and gradient Σ g ∂N of the first `Channels` channels, with distances r from the particle.
+template <int Order, int Channels, bool Moment, bool Gradient, class T, int D>
+MPM_HD void gather_channels(const Lanes<T> f[D], const T* tile, Sums<Lanes<T>, D> sums[Channels]) {
+  Together<T> distances[D];
+  MPM_UNROLL
+  for (int a = 0; a < D; a++) distances[a] = for_all_channels(f[a]);
+  const Weights<Order, Together<T>, D> s(distances, Gradient ? 1 : 0);
+  MPM_UNROLL
+  for (int first = 0; first < Channels; first += kTogether<T>) {
+    Sums<Together<T>, D> r = sum_nodes<Order, 0, Moment, Gradient>(s, tile + first);
     MPM_UNROLL
-    for (int a = 0; a < D; a++) r.moment[a] = r.moment[a] - (s.f[a] - Lanes<T>(1)) * r.value;
-  return r;
+    for (int a = 0; a < D; a++)
+      if (Moment) r.moment[a] = r.moment[a] - (s.f[a] - Together<T>(1)) * r.value;
+    MPM_UNROLL
+    for (int c = 0; c < kTogether<T>; c++) {
+      if (first + c >= Channels) continue;
+      sums[first + c].value = one_channel<T>(r.value, c);
+      MPM_UNROLL
+      for (int a = 0; a < D; a++) {
+        if (Moment) sums[first + c].moment[a] = one_channel<T>(r.moment[a], c);
+        if (Gradient) sums[first + c].gradient[a] = one_channel<T>(r.gradient[a], c);
+      }
+    }
+  }
 }
 
 // The form u = Σ_i N_i g_i · (value + slope k_i) + Σ_d ∂_d N_i g_i · gradient_d of node values g and a particle's gift,
@@ -152,7 +213,7 @@ MPM_HD Form<Lanes<T>, D, Axis> form(const Weights<Order, Lanes<T>, D>& s, Gift<L
   return r;
 }
 
-// Adds the derivative of the form by the position, in cells; needs `make(Gradient ? 2 : 1)` of the weights.
+// Adds the derivative of the form by the position, in cells; needs first derivatives of the weights, second with Gradient.
 template <int Order, int Channels, bool Slope, bool Gradient, class T, int D>
 MPM_HD void add_position_gradient(const Weights<Order, Lanes<T>, D>& s, const Gift<Lanes<T>, D>& gift, const T* tile,
                                   const Lanes<T> gathered[kChannels], Lanes<T> sum[D]) {
@@ -166,14 +227,13 @@ MPM_HD void add_position_gradient(const Weights<Order, Lanes<T>, D>& s, const Gi
   }
 }
 
-// visit(group, weights, scene, tile at the base node) for groups of particles of a cell; the tile holds channels first,
-// ..., first + count - 1.
-template <int Order, int Derivatives, class T, int D, class F>
+// visit(group, distances from the base node in cells, scene, tile at the base node) for groups of particles of a cell; the
+// tile holds channels first, ..., first + count - 1.
+template <int Order, class T, int D, class F>
 void gather_groups(const Topology<T, D>& t, const Field<const T>& x, const NodeField<const T>& nodes, int first,
                    int count, const F& visit) {
   const ScheduleIn s = schedule_of(t);
-  const int homes = s.colour_start[kColours<D>];
-  parallel_items(homes, kGrainHomes, [&](const auto& next) {
+  parallel_phases<kColours<D>>(s.colour_start, kGrainHomes, [&](const auto& next) {
     Tile<Order, T, D> tile;
     for (int64_t h; (h = next()) >= 0;) {
       const Home<T, D> home(t, s.home_slot[h]);
@@ -185,12 +245,11 @@ void gather_groups(const Topology<T, D>& t, const Field<const T>& x, const NodeF
           for (int a = 0; a < D; a++) base[a] = cell_coordinate<D>(cell, a);
           for (const int end = chunk.cell_end[cell]; i < end; i += kLanes) {
             const Group g = group_by_cell(chunk, i, end);
-            Weights<Order, Lanes<T>, D> w;
+            Lanes<T> f[D];
             MPM_UNROLL
             for (int a = 0; a < D; a++)
-              w.f[a] = distance_in_cells(t.geometry, a, load(x, g, a), Lanes<T>(T(home.corner[a] + base[a])));
-            w.make(Derivatives);
-            visit(g, w, home.scene, tile.value + tile.at(base));
+              f[a] = distance_in_cells(t.geometry, a, load(x, g, a), Lanes<T>(T(home.corner[a] + base[a])));
+            visit(g, f, home.scene, tile.value + tile.at(base));
           }
           i = chunk.cell_end[cell];
         }

@@ -9,16 +9,19 @@ void gather_with(const GatherArguments<T, D>& a, int first, int count) {
   using P = Lanes<T>;
   const Geometry<T, D>& geometry = a.topology.geometry;
   const P scale(a.moment_scale * double(geometry.dx)), inverse_dx(geometry.inverse_dx);
-  gather_groups<Order, Gradient ? 1 : 0>(
-      a.topology, a.x, a.nodes, first, count,
-      [&](const Group& g, const Weights<Order, P, D>& w, int, const T* tile) {
-    for (int c = 0; c < count; c++) {
-      const Sums<P, D> s = gather_channel<Order, Moment, Gradient>(w, tile + c);
-      if (a.value.pointer) store(s.value, a.value, g, first + c);
+  gather_groups<Order>(
+      a.topology, a.x, a.nodes, first, count, [&](const Group& g, const P f[D], int, const T* tile) {
+    for (int c = 0; c < count; c += kTogether<T>) {
+      Sums<P, D> sums[kTogether<T>];
+      gather_channels<Order, kTogether<T>, Moment, Gradient, T, D>(f, tile + c, sums);
+      for (int k = 0; k < kTogether<T> && c + k < count; k++) {
+        const Sums<P, D>& s = sums[k];
+        if (a.value.pointer) store(s.value, a.value, g, first + c + k);
   MPM_UNROLL
-          for (int d = 0; d < D; d++) {
-            if (Moment) store(scale * s.moment[d], a.moment, g, first + c, d);
-            if (Gradient) store(inverse_dx * s.gradient[d], a.gradient, g, first + c, d);
+            for (int d = 0; d < D; d++) {
+              if (Moment) store(scale * s.moment[d], a.moment, g, first + c + k, d);
+              if (Gradient) store(inverse_dx * s.gradient[d], a.gradient, g, first + c + k, d);
+            }
           }
         }
       });

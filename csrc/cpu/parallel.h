@@ -26,22 +26,57 @@ void parallel_ranges(int64_t count, int64_t grain, const F& f) {
       const_cast<void*>(static_cast<const void*>(&f)));
 }
 
-// Calls f(next) once per thread, where next() hands out the items [0, count) in order. At most one thread per `grain`
-// items.
-template <class F>
-void parallel_items(int64_t count, int64_t grain, const F& f) {
-  int64_t taken = 0;
-  const int64_t worth = (count + grain - 1) / grain, threads = thread_count();
-  parallel_ranges(worth < threads ? worth : threads, 1, [&](int64_t, int64_t) {
-    f([&] {
-      const int64_t i = __atomic_fetch_add(&taken, 1, __ATOMIC_RELAXED);
-      return i < count ? i : -1;
-    });
+// Hands out the items of consecutive phases to a team of threads: each member has a share of every phase, a range of
+// neighbours, and takes from those of others what they have not begun. So a thread stays with the same part of space,
+// whose nodes and particles its caches hold, from phase to phase and from kernel to kernel.
+template <int Phases>
+class Shares {
+ public:
+  // start: [Phases + 1] first item of each phase.
+  Shares(const int* start, int members) : start_(start), members_(members < kMost ? members : kMost) {}
+
+  // The next item for a member that calls with `place` zero at first; −1 at the end. A member leaves a phase when all
+  // of its items are taken.
+  struct Place {
+    int phase = 0, share = 0;
+  };
+  int64_t take(int member, Place& place) {
+    for (; place.phase < Phases; place.phase++, place.share = 0)
+      for (; place.share < members_; place.share++) {
+        const int owner = (member + place.share) % members_;
+        const int first = start_[place.phase], count = start_[place.phase + 1] - first;
+        const int begin = part(count, owner), end = part(count, owner + 1);
+        const int i = begin + __atomic_fetch_add(&taken_[owner].phase[place.phase], 1, __ATOMIC_RELAXED);
+        if (i < end) return first + i;
+      }
+    return -1;
+  }
+
+ private:
+  static constexpr int kMost = 64;  // threads beyond share a share
+  int part(int64_t count, int member) const { return int(count * member / members_); }
+
+  const int* start_;
+  int members_;
+  struct alignas(64) Taken {
+    int phase[Phases] = {};
+  } taken_[kMost];
+};
+
+// Calls f(next) once per thread, where next() hands out the items of all phases. At most one thread per `grain` items.
+template <int Phases, class F>
+void parallel_phases(const int* start, int64_t grain, const F& f) {
+  const int64_t worth = (start[Phases] + grain - 1) / grain, threads = thread_count();
+  const int64_t members = worth < threads ? worth : threads;
+  Shares<Phases> shares(start, int(members));
+  parallel_ranges(members, 1, [&](int64_t member, int64_t) {
+    typename Shares<Phases>::Place place;
+    f([&] { return shares.take(int(member), place); });
   });
 }
 
-// Counts the finished items of consecutive phases. A thread that took an item of a phase may wait for the phase before:
-// items are taken in order, so that every earlier one has a thread at work on it.
+// Counts the finished items of consecutive phases. A thread that took an item of a phase may wait for the phase before,
+// of which every item is taken then and has a thread at work on it.
 template <int Phases>
 struct PhaseCounter {
   const int* start;  // [Phases + 1] first item of each phase

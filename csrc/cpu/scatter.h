@@ -152,16 +152,22 @@ void sum_cell(const Gifts<Order, T, D, Slope, Gradient>& g, const uint16_t* orde
 template <class T, int D>
 MPM_HD void distances(const Topology<T, D>& t, const Home<T, D>& home, const Chunk& chunk, const Field<const T>& x,
                       const Group& g, int particle, Lanes<T> f[D]) {
-  uint16_t cell[kLanes] = {};
+  typedef uint16_t Entries __attribute__((vector_size(kLanes * sizeof(uint16_t))));
+  Entries entry = {};
   if (g.count == kLanes)
-    __builtin_memcpy(cell, chunk.order + particle, sizeof(cell));
+    __builtin_memcpy(&entry, chunk.order + particle, sizeof(entry));
   else
-    for (int l = 0; l < g.count; l++) cell[l] = chunk.order[particle + l];
+    for (int l = 0; l < g.count; l++) entry[l] = chunk.order[particle + l];
+  typedef int32_t Integers __attribute__((vector_size(kLanes * sizeof(int32_t))));
+  typedef T Values __attribute__((vector_size(kLanes * sizeof(T))));
+  const Integers cell = __builtin_convertvector(entry / kChunk, Integers);
   MPM_UNROLL
   for (int a = 0; a < D; a++) {
-    T base[kLanes];
-    for (int l = 0; l < kLanes; l++) base[l] = T(home.corner[a] + cell_coordinate<D>(cell[l] / kChunk, a));
-    f[a] = distance_in_cells(t.geometry, a, load(x, g, a), Lanes<T>::load(base));
+    const Integers coordinate = cell >> 2 * (D - 1 - a) & (kBlockWidth - 1);  // cell_coordinate() of each
+    const Values base = __builtin_convertvector(coordinate + home.corner[a], Values);
+    Lanes<T> node;
+    __builtin_memcpy(&node, &base, sizeof(node));
+    f[a] = distance_in_cells(t.geometry, a, load(x, g, a), node);
   }
 }
 
@@ -194,7 +200,7 @@ void scatter_channels(const Topology<T, D>& t, const Field<const T>& x, const No
     }
   };
   PhaseCounter<kColours<D>> colours{s.colour_start};
-  parallel_items(s.colour_start[kColours<D>], kGrainHomes, [&](const auto& next) {
+  parallel_phases<kColours<D>>(s.colour_start, kGrainHomes, [&](const auto& next) {
     Gifts<Order, T, D, Slope, Gradient> gifts;
     Tile<Order, T, D> tile;
     int colour = 0;
