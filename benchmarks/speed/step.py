@@ -8,8 +8,9 @@ It needs no network. Warp and Taichi take part where they are installed (`pip in
 `--peers` and no name. Where there is no git, the environment variable TORCH_MPM_COMMIT names the commit. A part that
 fails is reported at the end and does not stop the others.
 
-Work: `benchmarks/speed/work.py`. Whole steps: wall clock of several steps in a row, synchronised once, everything
-included: activation, stress, P2G, grid update, G2P, positions and F. On CUDA they are replayed from a CUDA graph too.
+Work: `benchmarks/speed/work.py`. Whole steps: wall clock of several steps in a row from particles in the order of their
+cells, synchronised once, everything included: activation, stress, P2G, grid update, G2P, positions and F. On CUDA they
+are replayed from a CUDA graph too.
 Parts: median of single calls; on CUDA from a graph with the cache emptied before. Bytes: every tensor of an op once,
 node tensors by their active rows. Errors: float32 against float64, the largest error over the largest value.
 """
@@ -40,6 +41,7 @@ from .timing import Clock, Time, copy_bandwidth
 
 SIDES = {"cpu": [64], "cuda": [100, 200]}
 STEPS = 10
+REORDER = 32  # steps between two reorderings in a scene
 FIELDS = ("x", "v", "C", "F")
 
 
@@ -73,15 +75,17 @@ def setup(w: work.Work, device: str, dtype: torch.dtype = torch.float32) -> Setu
 
 def whole_steps(clock: Clock, s: Setup) -> Iterator[tuple[str, Time]]:
     """Steps in a row, each from the state that the one before left; and a step with its backward pass."""
-    state = s.state
 
-    def forward() -> None:
-        nonlocal state
-        for _ in range(STEPS):
+    def forward(steps: int) -> mpm.State:
+        state = s.state
+        for _ in range(steps):
             state = s.step(state, work.DT)
+        return state
 
     with torch.no_grad():
-        yield "step", clock.steps(forward, STEPS)
+        yield "step", clock.steps(lambda: forward(STEPS), STEPS)
+        reordered = clock.steps(lambda: forward(REORDER).sorted(s.grid), REORDER)
+        yield f"step, with a reordering every {REORDER}", reordered
         if clock.cuda and (replay := clock.capture(lambda: roll(s, s.state))):
             yield "step, CUDA graph", dataclasses.replace(clock.steps(replay, STEPS), graph=True)
     leaves = [getattr(s.state, name).detach().requires_grad_() for name in FIELDS]

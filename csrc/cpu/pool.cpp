@@ -87,8 +87,9 @@ void give_back(Buffer* buffer) {
     p.living_bytes -= buffer->size;
     p.kept_bytes += buffer->size;
     p.kept.push_back(buffer);
+    const int64_t most = kKept * p.living_bytes > kKeptAnyway ? kKept * p.living_bytes : kKeptAnyway;
     size_t oldest = 0;
-    for (; p.kept_bytes > kKept * p.living_bytes; oldest++) p.kept_bytes -= p.kept[oldest]->size;
+    for (; p.kept_bytes > most; oldest++) p.kept_bytes -= p.kept[oldest]->size;
     surplus.assign(p.kept.begin(), p.kept.begin() + ptrdiff_t(oldest));
     p.kept.erase(p.kept.begin(), p.kept.begin() + ptrdiff_t(oldest));
   }
