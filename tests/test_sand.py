@@ -451,6 +451,7 @@ def gradient_states(dim: int) -> Tensor:
             [0.2, 0.2, -0.1],
             [0.3, 0.15, -0.2],
             [0.3, -0.1, -0.1],
+            [0.1, -1.4, -0.2],
         ],
         dtype=torch.float64,
     )
@@ -559,6 +560,25 @@ def test_gradients_in_float32_at_nearly_equal_stretches(device, energy, flow, me
     found = (gradient(F) - exact).norm(dim=(1, 2)) / exact.norm(dim=(1, 2))
     assert float(found.median()) < 2e-7
     assert float(found.max()) < 1e-6
+
+
+@pytest.mark.parametrize("energy", ["full", "unilateral"])
+def test_gradients_in_float32_of_a_loss_that_misses_the_stiff_axis(device, energy):
+    """Weights between two soft axes, 1e-3 times as stiff as the third: what they have of it is their rounding alone."""
+    count = 500
+    strains = torch.tensor([[-0.5, -0.012, -0.01]], dtype=torch.float64).repeat(count, 1)
+    U, V = rotations(count, 3), rotations(count, 3)
+    F = (U @ torch.diag_embed(strains.exp()) @ V).float()
+    weights = (U[:, :, 1, None] * U[:, None, :, 2]).float()
+
+    def gradient(F: Tensor) -> Tensor:
+        leaf = F.to(device).requires_grad_()
+        stress = quartic_return_map(leaf, 1.0, 0.0, alpha=1.0, energy=energy).stress
+        (grad,) = torch.autograd.grad((stress * weights.to(leaf)).sum(), leaf)
+        return grad.double().cpu()
+
+    exact = gradient(F.double())
+    assert float(((gradient(F) - exact).norm(dim=(1, 2)) / exact.norm(dim=(1, 2))).max()) < 1e-6
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

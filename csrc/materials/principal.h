@@ -39,29 +39,56 @@ MPM_HD T exponential(const T& x) {
   return select(x < T(0), T(1) / e, e);
 }
 
-// sinh(x)/x.
+// sinh(x)/x and cosh(x).
 template <class T>
-MPM_HD T sinhc(const T& x) {
+struct Hyperbolic {
+  T sinhc, cosh;
+};
+
+// Terms of their series that matter up to x² = 1/4.
+template <class T>
+constexpr int kHyperbolicTerms = 7;
+template <>
+constexpr int kHyperbolicTerms<float> = 4;
+#ifndef __CUDACC__
+template <int N>
+constexpr int kHyperbolicTerms<Pack<float, N>> = 4;
+#endif
+
+template <class T>
+MPM_HD Hyperbolic<T> hyperbolic(const T& x) {
+  constexpr auto inverse_factorial = [] {
+    std::array<double, 16> r = {1.0};
+    for (int k = 1; k < 16; k++) r[k] = r[k - 1] / k;
+    return r;
+  }();
+  constexpr int terms = kHyperbolicTerms<T>;
   const T square = x * x;
-  T series = T(1);
+  Hyperbolic<T> r = {T(inverse_factorial[2 * terms + 1]), T(inverse_factorial[2 * terms])};
   MPM_UNROLL
-  for (int k = 7; k > 0; k--) series = T(1) + series * square * T(1.0 / (2 * k * (2 * k + 1)));
-  const auto small = square < T(0.25);
-  const T e = exponential(abs(x));
-  return select(small, series, T(0.5) * (e - T(1) / e) / select(small, T(1), abs(x)));
+  for (int k = terms - 1; k >= 0; k--) {
+    r.sinhc = r.sinhc * square + T(inverse_factorial[2 * k + 1]);
+    r.cosh = r.cosh * square + T(inverse_factorial[2 * k]);
+  }
+  const auto large = square > T(0.25);
+  if (any(large)) {
+    const T size = select(large, abs(x), T(1)), e = exponential(size), inverse = T(1) / e;
+    r.sinhc = select(large, T(0.5) * (e - inverse) / size, r.sinhc);
+    r.cosh = select(large, T(0.5) * (e + inverse), r.cosh);
+  }
+  return r;
 }
 
 template <class T>
-MPM_HD T cosh(const T& x) {
-  const T e = exponential(abs(x));
-  return T(0.5) * (e + T(1) / e);
+MPM_HD T sinhc(const T& x) {
+  return hyperbolic(x).sinhc;
 }
 
 // F = U diag(exp h) Vᵀ with B = Fᵀ U = V diag(exp h) up to a power of two: no V and no order of the strains is needed.
 template <class T, int D>
 struct HenckyStrain {
   Matrix<T, D> U, B;
-  Vector<T, D> h, square;  // squared lengths of the columns of B
+  Vector<T, D> h, inverse;  // reciprocal lengths of the columns of B
   T scale;                 // of B
   MaskOf<T> meaningful;    // det F > 0, everything finite
 };
@@ -72,7 +99,7 @@ MPM_HD float logarithm_of_square(float a, float a_minus_1) {
   return a_minus_1 > -0.75f ? ::log1pf(a_minus_1) : ::logf(a);
 }
 MPM_HD double logarithm_of_square(double a, double a_minus_1) {
-  return a_minus_1 > -0.75 ? ::log1p(a_minus_1) : ::log(a);
+  return logarithm<double, uint64_t>(a, a_minus_1);
 }
 #else
 template <class T>
@@ -93,23 +120,25 @@ MPM_HD T scale_of_strain(const Matrix<T, D>& F) {
   return select(moderate, T(1), inverse_power_of_two(largest));
 }
 
-// The rest of s from its U, B and scale, of which `shift` is the logarithm.
+// The rest of s from its U, B and scale.
 template <class T, int D>
-MPM_HD void measure_strain(HenckyStrain<T, D>& s, const T& shift) {
-  T finite = poison(s.B);
+MPM_HD void measure_strain(HenckyStrain<T, D>& s) {
+  T shift = T(0);
+  if (any((s.scale < T(1)) | (s.scale > T(1)))) shift = logarithm_of_square(s.scale, s.scale - T(1));
   MPM_UNROLL
   for (int i = 0; i < D; i++) {
-    T minus_1 = s.B[0][i] * s.B[0][i] - T(1);
-    s.square[i] = s.B[0][i] * s.B[0][i];
+    T square = s.B[0][i] * s.B[0][i], minus_1 = s.B[0][i] * s.B[0][i] - T(1);
     MPM_UNROLL
     for (int k = 1; k < D; k++) {
       minus_1 = minus_1 + s.B[k][i] * s.B[k][i];
-      s.square[i] = s.square[i] + s.B[k][i] * s.B[k][i];
+      square = square + s.B[k][i] * s.B[k][i];
     }
-    s.h[i] = T(0.5) * logarithm_of_square(s.square[i], minus_1) - shift;
-    finite = finite + (s.h[i] - s.h[i]);
+    s.h[i] = T(0.5) * logarithm_of_square(square, minus_1) - shift;
+    s.inverse[i] = rsqrt(square);
   }
-  s.meaningful = (determinant(s.B) > T(0)) & (finite == T(0));
+  // Neither is finite where an entry of B is not.
+  const T volume = determinant(s.B), finite = (volume - volume) + (sum(s.h) - sum(s.h));
+  s.meaningful = (volume > T(0)) & (finite == T(0));
 }
 
 template <class T, int D>
@@ -118,7 +147,7 @@ MPM_HD_LARGE HenckyStrain<T, D> hencky_strain(const Matrix<T, D>& F) {
   s.scale = scale_of_strain(F);
   s.B = s.scale * transpose(F);
   orthogonalize_columns(s.B, s.U);
-  measure_strain(s, log_1p(s.scale, s.scale - T(1)));
+  measure_strain(s);
   return s;
 }
 
@@ -144,7 +173,7 @@ MPM_HD_LARGE HenckyStrain<Wide<T>, D> wide_hencky_strain(const Matrix<T, D>& F) 
     s.U = orthogonalized(convert<W>(U));
     s.B = transpose(s.scale * convert<W>(F)) * s.U;
     sweep_columns(s.B, s.U, 1, JacobiSweeps<W>::most, 1e-10);
-    measure_strain(s, convert<W>(log_1p(scale, scale - T(1))));
+    measure_strain(s);
     return s;
   }
 }
@@ -152,8 +181,8 @@ MPM_HD_LARGE HenckyStrain<Wide<T>, D> wide_hencky_strain(const Matrix<T, D>& F) 
 // The same in another arithmetic.
 template <class To, class T, int D>
 MPM_HD HenckyStrain<To, D> convert(const HenckyStrain<T, D>& s) {
-  return {convert<To>(s.U),      convert<To>(s.B),     convert<To>(s.h),
-          convert<To>(s.square), convert<To>(s.scale), convert<MaskOf<To>>(s.meaningful)};
+  return {convert<To>(s.U),       convert<To>(s.B),     convert<To>(s.h),
+          convert<To>(s.inverse), convert<To>(s.scale), convert<MaskOf<To>>(s.meaningful)};
 }
 
 // A diag(d) Bᵀ.
@@ -172,11 +201,9 @@ template <class T, int D>
 MPM_HD Matrix<T, D> right_axes(const HenckyStrain<T, D>& s) {
   Matrix<T, D> r;
   MPM_UNROLL
-  for (int j = 0; j < D; j++) {
-    const T inverse = rsqrt(s.square[j]);
+  for (int i = 0; i < D; i++)
     MPM_UNROLL
-    for (int i = 0; i < D; i++) r[i][j] = s.B[i][j] * inverse;
-  }
+  for (int j = 0; j < D; j++) r[i][j] = s.B[i][j] * s.inverse[j];
   return r;
 }
 
@@ -188,16 +215,18 @@ struct Quotients {
 };
 
 // Adjoint of F in principal axes, of F ↦ U diag(exp H) Vᵀ and τ = U diag(τᵢ) Uᵀ. `diagonal` is the adjoint of h;
-// M = Uᵀ F̄ V and N = Uᵀ τ̄ U are the adjoints of the results in the same axes. Divided differences of exp H and τ by exp h
+// Uᵀ F̄ V = even + odd and N = Uᵀ τ̄ U are the adjoints of the results in the same axes, as symmetric and skew part. Divided differences of exp H and τ by exp h
 // are written with sinh x/x, so that they hold at equal strains.
 template <class T, int D, class F>
 MPM_HD Matrix<T, D> principal_adjoint(const HenckyStrain<T, D>& s, const Vector<T, D>& H, const Vector<T, D>& diagonal,
-                                      const Matrix<T, D>& M, const Matrix<T, D>& N, const F& quotients) {
-  Vector<T, D> inverse;  // of the stretches
+                                      const Matrix<T, D>& even, const Matrix<T, D>& odd, const Matrix<T, D>& N,
+                                      const F& quotients) {
+  Vector<T, D> inverse, root;  // of the stretches; of what the map multiplies them by
   Matrix<T, D> r;
   MPM_UNROLL
   for (int i = 0; i < D; i++) {
-    inverse[i] = s.scale * rsqrt(s.square[i]);
+    inverse[i] = s.scale * s.inverse[i];
+    root[i] = exponential(T(0.5) * (H[i] - s.h[i]));
     r[i][i] = diagonal[i] * inverse[i];
   }
   MPM_UNROLL
@@ -205,14 +234,13 @@ MPM_HD Matrix<T, D> principal_adjoint(const HenckyStrain<T, D>& s, const Vector<
     MPM_UNROLL
   for (int j = i + 1; j < D; j++) {
     const Quotients<T> quotient = quotients(i, j);
-    const T trial = s.h[i] - s.h[j], mapped = H[i] - H[j];
-    const T half = exponential(T(0.5) * (H[i] + H[j] - s.h[i] - s.h[j]));
-    const T symmetric = half * quotient.map * sinhc(T(0.5) * mapped) / sinhc(T(0.5) * trial);
-    const T skew = half * cosh(T(0.5) * mapped) / cosh(T(0.5) * trial);
-    const T even = T(0.5) * symmetric * (M[i][j] + M[j][i]), odd = T(0.5) * skew * (M[i][j] - M[j][i]);
-    const T stress = (N[i][j] + N[j][i]) * quotient.stress * quotient.map / (T(2) * sinhc(trial));
-    r[i][j] = even + odd + stress * inverse[i];
-    r[j][i] = even - odd + stress * inverse[j];
+    const Hyperbolic<T> trial = hyperbolic(T(0.5) * (s.h[i] - s.h[j])), mapped = hyperbolic(T(0.5) * (H[i] - H[j]));
+    const T by_sinhc = quotient.map * reciprocal(trial.sinhc), by_cosh = reciprocal(trial.cosh);
+    const T stretch = root[i] * root[j];
+    const T symmetric = stretch * mapped.sinhc * by_sinhc * even[i][j], skew = stretch * mapped.cosh * by_cosh * odd[i][j];
+    const T stress = quotient.stress * by_sinhc * by_cosh * N[i][j];
+    r[i][j] = symmetric + skew + stress * inverse[i];
+    r[j][i] = symmetric - skew + stress * inverse[j];
   }
   return r;
 }

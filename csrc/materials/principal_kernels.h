@@ -234,7 +234,7 @@ MPM_HD void principal_backward_at(const PrincipalBackwardArguments<T, D>& a, con
   const Matrix<V, D> right = right_axes(s);
   const Matrix<V, D> grad_F = a.grad_F.pointer ? load_matrix<D>(at, a.grad_F) : zero_matrix<V, D>();
   const Matrix<V, D> grad_stress = a.grad_stress.pointer ? load_matrix<D>(at, a.grad_stress) : zero_matrix<V, D>();
-  const Matrix<V, D> M = transpose(s.U) * grad_F * right, N = transpose(s.U) * grad_stress * s.U;
+  const Matrix<V, D> M = transpose(s.U) * grad_F * right, N = transpose(s.U) * symmetric_part(grad_stress) * s.U;
   const V grad_dissipated =
       a.grad_dissipated.pointer ? at.load(a.grad_dissipated.pointer, a.grad_dissipated.stride[0]) : V(0);
 
@@ -278,7 +278,7 @@ MPM_HD void principal_backward_at(const PrincipalBackwardArguments<T, D>& a, con
   });
   if (!a.F.pointer) return;
   const Matrix<V, D> principal =
-      principal_adjoint(s, mapped, diagonal, M, N, [&](int i, int j) { return quotients[i][j]; });
+      principal_adjoint(s, mapped, diagonal, symmetric_part(M), skew_part(M), N, [&](int i, int j) { return quotients[i][j]; });
   store_matrix<D>(at, a.F, select(meaningful, s.U * principal * transpose(right), grad_F));
 }
 
@@ -367,7 +367,7 @@ MPM_HD void principal_energy_backward_at(const PrincipalEnergyBackwardArguments<
   });
   if (!a.F.pointer) return;
   MPM_UNROLL
-  for (int i = 0; i < D; i++) diagonal[i] = diagonal[i] * s.scale * rsqrt(s.square[i]);
+  for (int i = 0; i < D; i++) diagonal[i] = diagonal[i] * s.scale * s.inverse[i];
   store_matrix<D>(at, a.F, select(meaningful, compose(s.U, diagonal, right_axes(s)), zero_matrix<V, D>()));
 }
 

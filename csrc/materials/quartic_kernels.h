@@ -166,8 +166,8 @@ template <class Energy, class At, class T, int D>
 MPM_HD void return_map_at(const ReturnMapArguments<T, D>& a, const At& at) {
   using V = typename At::Value;
   const Matrix<V, D> F = load_matrix<D>(at, a.sand.F);
-  const SandParameters<V> p = load_parameters<V>(at, a.sand);
   const HenckyStrain<V, D> s = hencky_strain(F);
+  const SandParameters<V> p = load_parameters<V>(at, a.sand);
   const SandState<V, D> state = sand_state<Energy, V>(s, p, a.sand.plastic, a.sand.keep_apex);
 
   Matrix<V, D> tau = compose(s.U, state.stress, s.U);
@@ -265,7 +265,7 @@ MPM_HD void add_adjoint_of_scalars(SandAdjoint<V, D>& r, const ReturnMapBackward
 template <class Energy, class T, int D>
 MPM_HD void pull_back(SandAdjoint<T, D>& r, const SandState<T, D>& state, const SandParameters<T>& p, bool keep) {
   const MapAdjoint<T, D> map = return_map_adjoint<Energy>(state.m, r.mapped, p.cone, keep);
-  const T ratio = select(p.shear, map.ratio / select(p.shear, p.mu, T(1)), T(0));
+  const T ratio = select(p.shear, quotient(map.ratio, select(p.shear, p.mu, T(1))), T(0));
   r.trial = r.trial + map.h;
   r.mu = r.mu - ratio * p.cone.ratio;
   r.lam = r.lam + ratio;
@@ -273,17 +273,11 @@ MPM_HD void pull_back(SandAdjoint<T, D>& r, const SandState<T, D>& state, const 
   r.cohesion = r.cohesion + sum(r.mapped) - sum(r.trial);
 }
 
-// The diagonal of Aᵀ G B.
 template <class T, int D>
-MPM_HD Vector<T, D> diagonal_in(const Matrix<T, D>& A, const Matrix<T, D>& G, const Matrix<T, D>& B) {
-  const Matrix<T, D> turned = G * B;
+MPM_HD Vector<T, D> diagonal(const Matrix<T, D>& a) {
   Vector<T, D> r;
   MPM_UNROLL
-  for (int j = 0; j < D; j++) {
-    r[j] = A[0][j] * turned[0][j];
-    MPM_UNROLL
-    for (int i = 1; i < D; i++) r[j] = r[j] + A[i][j] * turned[i][j];
-  }
+  for (int i = 0; i < D; i++) r[i] = a[i][i];
   return r;
 }
 
@@ -293,19 +287,20 @@ template <class Energy, class At, class T, int D>
 MPM_HD void return_map_backward_at(const ReturnMapBackwardArguments<T, D>& a, const At& at) {
   using V = typename At::Value;
   using W = Wide<V>;
-  const SandParameters<W> p = load_parameters<W>(at, a.sand);
-  const HenckyStrain<W, D> wide = wide_hencky_strain(load_matrix<D>(at, a.sand.F));
-  const SandState<W, D> state = sand_state<Energy, V>(wide, p, a.sand.plastic, a.sand.keep_apex);
-
-  const HenckyStrain<V, D> s = convert<V>(wide);
-  const Matrix<V, D> right = right_axes(s);
+  const Matrix<V, D> F = load_matrix<D>(at, a.sand.F);
   const Matrix<V, D> grad_F = a.grad_F.pointer ? load_matrix<D>(at, a.grad_F) : zero_matrix<V, D>();
   const Matrix<V, D> grad_stress = a.grad_stress.pointer ? load_matrix<D>(at, a.grad_stress) : zero_matrix<V, D>();
-  const Matrix<V, D> M = transpose(s.U) * grad_F * right, N = transpose(s.U) * grad_stress * s.U;
+  const HenckyStrain<W, D> wide = wide_hencky_strain(F);
+  const Matrix<W, D> wide_right = right_axes(wide), M = transpose(wide.U) * (convert<W>(grad_F) * wide_right),
+                     N = transpose(wide.U) * (symmetric_part(convert<W>(grad_stress)) * wide.U);
+  // Before the map, whose registers these take no longer.
+  const HenckyStrain<V, D> s = convert<V>(wide);
+  const Matrix<V, D> right = convert<V>(wide_right), even = convert<V>(symmetric_part(M)),
+                     odd = convert<V>(skew_part(M)), narrow_N = convert<V>(N);
 
-  SandAdjoint<W, D> g =
-      adjoint_of_tensors<Energy, V>(state, p, diagonal_in(wide.U, convert<W>(grad_F), right_axes(wide)),
-                                 diagonal_in(wide.U, convert<W>(grad_stress), wide.U));
+  const SandParameters<W> p = load_parameters<W>(at, a.sand);
+  const SandState<W, D> state = sand_state<Energy, V>(wide, p, a.sand.plastic, a.sand.keep_apex);
+  SandAdjoint<W, D> g = adjoint_of_tensors<Energy, V>(state, p, diagonal(M), diagonal(N));
   add_adjoint_of_scalars<Energy>(g, a, at, state, p);
   pull_back<Energy>(g, state, p, a.sand.keep_apex);
 
@@ -313,7 +308,7 @@ MPM_HD void return_map_backward_at(const ReturnMapBackwardArguments<T, D>& a, co
   if (a.F.pointer) {
     const Vector<V, D> h = convert<V>(state.h);
     const Matrix<V, D> principal = principal_adjoint(
-        s, h, convert<V>(shifted(g.trial, g.volume)), M, N, [&](int i, int j) -> Quotients<V> {
+        s, h, convert<V>(shifted(g.trial, g.volume)), even, odd, narrow_N, [&](int i, int j) -> Quotients<V> {
           return {strain_quotient<Energy, V>(state.m, i, j, wide.h[i] - wide.h[j]),
                   stress_quotient<Energy>(h[i], h[j], convert<V>(p.mu))};
         });

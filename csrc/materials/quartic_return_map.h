@@ -242,7 +242,7 @@ MPM_HD_LARGE MapAdjoint<T, D> return_map_adjoint(const MappedStrain<T, D>& m, co
     along = select(sheared, dot(d, pulled.deviator), along);
     across = select(sheared, dot(d, normal.deviator), across);
   }
-  const T step = along / select(m.cone, across, T(1));
+  const T step = quotient(along, select(m.cone, across, T(1)));
   // The share of the other strains where the volume is kept: dHᵢ = dhᵢ + Σ_{dropped} dh/#kept.
   T positive = T(0), share = T(0);
   MPM_UNROLL

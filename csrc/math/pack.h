@@ -246,56 +246,12 @@ MPM_HD Pack<T, N> max(const Pack<T, N>& a, const Pack<T, N>& b) {
   return select(a > b, a, b);
 }
 
-// The bits of IEEE numbers, for functions that take the exponent apart.
-template <class T>
-struct Format;
-template <>
-struct Format<float> {
-  using Bits = uint32_t;
-  static constexpr int mantissa = 23, bias = 127;
-  static constexpr Bits sqrt_half = 0x3f3504f3, mantissa_mask = 0x7fffff;
-  static constexpr float shifter = 12582912.0f;  // 1.5 2^23: adding it rounds to an integer in the low bits
-  static constexpr float ln2_high = 6.9313812256e-01f, ln2_low = 9.0580006145e-06f;
-  static constexpr float expm1_low = -87.0f, expm1_high = 88.0f;
-  static constexpr int expm1_terms = 8;
-  static constexpr float log_terms[] = {0.66666662693f, 0.40000972152f, 0.28498786688f, 0.24279078841f};
-};
-template <>
-struct Format<double> {
-  using Bits = uint64_t;
-  static constexpr int mantissa = 52, bias = 1023;
-  static constexpr Bits sqrt_half = 0x3fe6a09e667f3bcd, mantissa_mask = 0xfffffffffffff;
-  static constexpr double shifter = 6755399441055744.0;  // 1.5 2^52
-  static constexpr double ln2_high = 6.93147180369123816490e-01, ln2_low = 1.90821492927058770002e-10;
-  static constexpr double expm1_low = -708.0, expm1_high = 709.0;
-  static constexpr int expm1_terms = 15;
-  static constexpr double log_terms[] = {6.666666666666735130e-01, 3.999999999940941908e-01, 2.857142874366239149e-01,
-                                         2.222219843214978396e-01, 1.818357216161805012e-01, 1.531383769920937332e-01,
-                                         1.479819860511658591e-01};
-};
-
-// ln a: a = 2^k m with m in [√½, √2), and the series in ((m − 1)/(m + 1))² of fdlibm's log (Sun Microsystems, 1993), with
-// m − 1 taken from a_minus_1 where k = 0.
 template <class T, int N>
 MPM_HD Pack<T, N> log_1p(const Pack<T, N>& a, const Pack<T, N>& a_minus_1) {
-  using F = Format<T>;
-  using Value = typename PackShape<T, N>::Value;
-  using Bits = typename PackShape<T, N>::Bits;
-  constexpr typename F::Bits one = typename F::Bits(F::bias) << F::mantissa;
   Pack<T, N> r;
   MPM_UNROLL
-  for (int part = 0; part < r.kParts; part++) {
-    const Bits bits = __builtin_bit_cast(Bits, a.part[part]) + (one - F::sqrt_half);
-    const Value m = __builtin_bit_cast(Value, (bits & F::mantissa_mask) + F::sqrt_half);
-    const Bits shifted = (bits >> F::mantissa) + (__builtin_bit_cast(typename F::Bits, F::shifter) - F::bias);
-    const Value k = __builtin_bit_cast(Value, shifted) - F::shifter;
-    const Value f = k == 0 ? a_minus_1.part[part] : m - 1;
-    const Value s = f / (2 + f), z = s * s, half_square = T(0.5) * f * f;
-    Value series = z * F::log_terms[sizeof(F::log_terms) / sizeof(T) - 1];
-    MPM_UNROLL
-    for (int i = sizeof(F::log_terms) / sizeof(T) - 2; i >= 0; i--) series = z * (F::log_terms[i] + series);
-    r.part[part] = s * (half_square + series) + k * F::ln2_low - half_square + f + k * F::ln2_high;
-  }
+  for (int k = 0; k < r.kParts; k++)
+    r.part[k] = logarithm<T, typename PackShape<T, N>::Bits>(a.part[k], a_minus_1.part[k]);
   return r;
 }
 

@@ -17,9 +17,26 @@ MPM_HD T refine_rsqrt(const T& x, const T& y) {
   return y + T(0.5) * y * (T(1) - x * y * y);
 }
 
+// 1/√x to 6 digits or better, for x > 0 that are neither tiny nor huge.
+template <class T>
+MPM_HD T rsqrt_estimate(const T& x) {
+  return rsqrt(x);
+}
+
 #ifdef __CUDA_ARCH__
+MPM_HD float rsqrt_estimate(float x) {
+  asm("rsqrt.approx.ftz.f32 %0, %0;" : "+f"(x));
+  return x;
+}
+MPM_HD double rsqrt_estimate(double x) {
+  asm("rsqrt.approx.ftz.f64 %0, %0;" : "+d"(x));
+  return x;
+}
 MPM_HD float rsqrt(float x) { return refine_rsqrt(x, ::rsqrtf(x)); }
-MPM_HD double rsqrt(double x) { return ::rsqrt(x); }
+MPM_HD double rsqrt(double x) {
+  const double y = rsqrt_estimate(max(x, 1e-300)), error = 1 - x * y * y;
+  return y + y * error * (0.5 + 0.375 * error);
+}
 #else
 MPM_HD float rsqrt(float x) { return 1 / ::sqrtf(x); }
 MPM_HD double rsqrt(double x) { return 1 / ::sqrt(x); }

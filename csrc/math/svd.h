@@ -97,12 +97,12 @@ MPM_HD void orthogonalize(Matrix<T, D>& B, Matrix<T, D>& V, int p, int q) {
   const T difference = a - b, twice = g + g;
   const T scale = inverse_power_of_two(max(abs(difference), abs(twice)));
   const T cosine = abs(scale * difference) + T(1e-18), sine = scale * twice;  // of 2θ, times their common norm
-  const T inverse_norm = rsqrt(cosine * cosine + sine * sine);
-  const T square = T(0.5) + T(0.5) * cosine * inverse_norm, inverse = rsqrt(square);
+  const T inverse_norm = rsqrt_estimate(cosine * cosine + sine * sine);
+  const T square = T(0.5) + T(0.5) * cosine * inverse_norm, inverse = rsqrt_estimate(square);
   const T large = square * inverse, small = T(0.5) * sine * inverse_norm * inverse;
   const auto exchange = difference < T(0);
   // What is left of 1 − c² − s² would add up over the rotations.
-  const T excess = T(0.5) * (T(1) - large * large - small * small);
+  const T missing = T(1) - large * large - small * small, excess = missing * (T(0.5) + T(0.375) * missing);
   const T cosine_half = large + excess * large, sine_half = small + excess * small;
   const T c = select(exchange, sine_half, cosine_half), s = select(exchange, cosine_half, sine_half);
   rotate_columns(B, p, q, c, s);
