@@ -190,7 +190,9 @@ def test_gradients_of_sand_program(tmp_path: Path) -> None:
     found = result(tmp_path, "sand_gradient.json")
     for row in found["rows"]:
         assert row["at rest"] < found["allowed"]
-        assert all(case["states"] > 300 and case["largest"] < found["allowed"] for case in row["gaps"])
+        for case in row["gaps"]:
+            assert case["states"] > 300
+            assert max(case["largest"], case["of the usual norm, largest"]) < found["allowed"]
 
 
 def test_no_law_is_unstable_below_its_estimate(tmp_path: Path) -> None:
