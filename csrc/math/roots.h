@@ -17,7 +17,7 @@ MPM_HD T refine_rsqrt(const T& x, const T& y) {
   return y + T(0.5) * y * (T(1) - x * y * y);
 }
 
-// 1/√x to 6 digits or better, for x > 0 that are neither tiny nor huge.
+// 1/√x for x > 0 that are neither tiny nor huge, to rounding in float32 and to 11 digits or better in float64.
 template <class T>
 MPM_HD T rsqrt_estimate(const T& x) {
   return rsqrt(x);
@@ -29,14 +29,12 @@ MPM_HD float rsqrt_estimate(float x) {
   return x;
 }
 MPM_HD double rsqrt_estimate(double x) {
-  asm("rsqrt.approx.ftz.f64 %0, %0;" : "+d"(x));
-  return x;
+  double y;
+  asm("rsqrt.approx.ftz.f64 %0, %1;" : "=d"(y) : "d"(x));
+  return refine_rsqrt(x, y);
 }
 MPM_HD float rsqrt(float x) { return refine_rsqrt(x, ::rsqrtf(x)); }
-MPM_HD double rsqrt(double x) {
-  const double y = rsqrt_estimate(max(x, 1e-300)), error = 1 - x * y * y;
-  return y + y * error * (0.5 + 0.375 * error);
-}
+MPM_HD double rsqrt(double x) { return refine_rsqrt(x, rsqrt_estimate(max(x, 1e-300))); }
 #else
 MPM_HD float rsqrt(float x) { return 1 / ::sqrtf(x); }
 MPM_HD double rsqrt(double x) { return 1 / ::sqrt(x); }

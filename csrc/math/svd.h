@@ -102,7 +102,7 @@ MPM_HD void orthogonalize(Matrix<T, D>& B, Matrix<T, D>& V, int p, int q) {
   const T large = square * inverse, small = T(0.5) * sine * inverse_norm * inverse;
   const auto exchange = difference < T(0);
   // What is left of 1 − c² − s² would add up over the rotations.
-  const T missing = T(1) - large * large - small * small, excess = missing * (T(0.5) + T(0.375) * missing);
+  const T excess = T(0.5) * (T(1) - large * large - small * small);
   const T cosine_half = large + excess * large, sine_half = small + excess * small;
   const T c = select(exchange, sine_half, cosine_half), s = select(exchange, cosine_half, sine_half);
   rotate_columns(B, p, q, c, s);
