@@ -28,7 +28,7 @@ import torch
 from . import common
 
 COUNTS = ("tests", "failures", "errors", "skipped")
-SANITIZED_TESTS = 6  # of one process; racecheck takes some .1 GB per second
+SANITIZED_TESTS = 4  # of one process; racecheck takes some .1 GB per second
 
 
 def sanitized(tool: str) -> list[str]:
@@ -69,14 +69,18 @@ def run_side_by_side(
     """The worst exit status of all hands, and their counts together."""
     start = time.monotonic()
     environment = {**os.environ, "OMP_NUM_THREADS": str(max(1, (os.cpu_count() or 1) // processes))}
-    with ThreadPoolExecutor(processes) as pool:
-        numbers = range(len(hands))
-        outcomes = list(pool.map(lambda number: run_hand(command, environment, folder, number, hands[number]), numbers))
+    outcomes: dict[int, tuple[int, dict[str, str] | None]] = {}
+    unfinished = list(range(len(hands)))
+    for side_by_side in (processes, max(1, processes // 4)):  # those killed for want of memory again, with more of it
+        with ThreadPoolExecutor(side_by_side) as pool:
+            results = pool.map(lambda number: run_hand(command, environment, folder, number, hands[number]), unfinished)
+            outcomes |= dict(zip(unfinished, results, strict=True))
+        unfinished = [number for number, (_, counts) in outcomes.items() if counts is None]
     total = dict.fromkeys(COUNTS, 0)
-    for _, counts in outcomes:
+    for _, counts in outcomes.values():
         for name in COUNTS:
             total[name] += int(counts[name]) if counts else int(name == "errors")
-    status = max((status for status, _ in outcomes), key=abs, default=5)  # pytest: no test was selected
+    status = max((status for status, _ in outcomes.values()), key=abs, default=5)  # pytest: no test was selected
     return status, {name: str(value) for name, value in {**total, "time": time.monotonic() - start}.items()}
 
 
