@@ -63,7 +63,7 @@ PRELOAD = $(foreach name,libasan.so libstdc++.so.6,$(shell $(or $(CXX),g++) -pri
 sanitize: $(STAMP)
 	TORCH_MPM_SANITIZE=address,undefined TORCH_MPM_CUDA=0 $(PY) setup.py -q build --build-lib $(SANITIZED)
 	LD_PRELOAD='$(PRELOAD)' ASAN_OPTIONS=detect_leaks=0 UBSAN_OPTIONS=halt_on_error=1:print_stacktrace=1 \
-	  PYTHONPATH=$(SANITIZED):$(CURDIR) $(VENV)/bin/pytest $(QUICK)
+	  PYTHONPATH=$(CURDIR)/$(SANITIZED):$(CURDIR) $(VENV)/bin/pytest $(QUICK)
 
 # On a GPU machine whose Python already has torch, ninja and pytest: no virtual environment and no network.
 gpu:

@@ -5,6 +5,7 @@ import math
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import mpmath
 import numpy as np
@@ -694,7 +695,9 @@ def test_extreme_states_are_finite_with_every_instruction_set(level):
     if torch.cuda.is_available():
         pytest.skip("the CPU library alone")
     command = [sys.executable, "-m", "pytest", "-q", "-k", "extreme_states_are_finite and not instruction", __file__]
-    done = subprocess.run(command, env=os.environ | {"TORCH_MPM_ISA_LEVEL": level}, capture_output=True, text=True)
+    environment = os.environ | {"TORCH_MPM_ISA_LEVEL": level}
+    here = Path(__file__).parent  # not the root, whose package may be another build than the one under test
+    done = subprocess.run(command, env=environment, cwd=here, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout[-2000:]
 
 
