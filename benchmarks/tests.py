@@ -64,14 +64,16 @@ def run_hand(
 
 
 def run_side_by_side(
-    command: list[str], hands: list[list[str]], processes: int, folder: Path
+    tool: list[str], command: list[str], hands: list[list[str]], processes: int, folder: Path
 ) -> tuple[int, dict[str, str]]:
     """The worst exit status of all hands, and their counts together."""
+    command = [*tool, *command]
     start = time.monotonic()
     environment = {**os.environ, "OMP_NUM_THREADS": str(max(1, (os.cpu_count() or 1) // processes))}
     outcomes: dict[int, tuple[int, dict[str, str] | None]] = {}
     unfinished = list(range(len(hands)))
-    for side_by_side in (processes, max(1, processes // 4)):  # those killed for want of memory again, with more of it
+    # What a sanitizer's want of memory killed runs again with more of it; without one a crash is a crash.
+    for side_by_side in (processes, max(1, processes // 4)) if tool else (processes,):
         with ThreadPoolExecutor(side_by_side) as pool:
             results = pool.map(lambda number: run_hand(command, environment, folder, number, hands[number]), unfinished)
             outcomes |= dict(zip(unfinished, results, strict=True))
@@ -104,7 +106,7 @@ def main() -> None:
         folder, report = Path(name), Path(name) / "report.xml"
         if arguments.processes > 1:
             hands = deal([*command, *selection], arguments.processes, SANITIZED_TESTS if tool else None)
-            status, suite = run_side_by_side([*tool, *command], hands, arguments.processes, folder)
+            status, suite = run_side_by_side(tool, command, hands, arguments.processes, folder)
         else:
             status = subprocess.run([*tool, *command, f"--junitxml={report}", *selection], cwd=common.ROOT).returncode
             suite = counts_of(report)

@@ -29,6 +29,17 @@ def random_like(t, seed=5):
     return torch.rand(t.shape, generator=torch.Generator().manual_seed(seed), dtype=FLOAT).to(t)
 
 
+def check_gradients(loss, inputs):
+    """The gradient by each input along a random direction, against differences of the loss."""
+    gradients = torch.autograd.grad(loss(*inputs), inputs)
+    for k, gradient in enumerate(gradients):
+        direction = random_like(inputs[k], 20 + k) + 0.5
+        with torch.no_grad():
+            sides = [loss(*(t + s * 1e-6 * direction if j == k else t for j, t in enumerate(inputs))) for s in (1, -1)]
+        slope = float((sides[0] - sides[1]) / 2e-6)
+        assert float((gradient * direction).sum()) == pytest.approx(slope, rel=2e-5, abs=1e-5), k
+
+
 # ---- conduction
 
 
@@ -476,13 +487,7 @@ def test_gradients_of_a_rollout(device, transfer):
     numbers = (0.7, 1.3, 1.0, 2.0, 3.0, 0.8, 4.0, 1.5, 0.02)
     inputs = [t.detach().clone().requires_grad_() for t in values]
     inputs += [torch.tensor(a, dtype=FLOAT, device=device, requires_grad=True) for a in numbers]
-    gradients = torch.autograd.grad(loss(*inputs), inputs)
-    for k, gradient in enumerate(gradients):
-        direction = random_like(inputs[k], 20 + k) + 0.5
-        with torch.no_grad():
-            sides = [loss(*(t + s * 1e-6 * direction if j == k else t for j, t in enumerate(inputs))) for s in (1, -1)]
-        slope = float((sides[0] - sides[1]) / 2e-6)
-        assert float((gradient * direction).sum()) == pytest.approx(slope, rel=2e-5, abs=1e-5), k
+    check_gradients(loss, inputs)
 
 
 def test_gradient_through_checkpoints():

@@ -115,14 +115,13 @@ bool classify_pack(const Activation<T, D>& s, int64_t p) {
       known = known && key[l] < unsigned(a.scenes);
     }
   Mask<T, kLanes> inside;
-  const Run run{int(p)};
   Group g = {};
   g.count = kLanes;
+  g.consecutive = true;
   for (int l = 0; l < kLanes; l++) g.id[l] = int(p) + l;
   MPM_UNROLL
   for (int i = 0; i < D; i++) {
-    const Lanes<T> x = a.x.stride[0] == 1 ? load(a.x, run, i) : load(a.x, g, i);
-    const Lanes<T> base = base_node<Order>(a.geometry, i, x);
+    const Lanes<T> base = base_node<Order>(a.geometry, i, load(a.x, g, i));
     const auto on = on_lattice<Order>(a.geometry, i, base);
     inside = i ? inside & on : on;
     Values node;
