@@ -5,8 +5,8 @@
     python -m benchmarks.tests --tool racecheck -k cuda --processes 12
 
 With `--tool` the tests run under compute-sanitizer, and an error that it finds fails the run. With `--processes`,
-so many run side by side and share the cores, each under a compute-sanitizer of its own; none takes more than a few
-tests then, because racecheck keeps host memory until its process ends.
+so many run side by side and share the cores and the GPUs, each under a compute-sanitizer of its own; none takes more
+than a few tests then, because racecheck keeps host memory until its process ends.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ import torch
 from . import common
 
 COUNTS = ("tests", "failures", "errors", "skipped")
-SANITIZED_TESTS = 4  # of one process; racecheck takes some .1 GB per second
+SANITIZED_TESTS = {"racecheck": 4, "memcheck": 16}  # of one process; racecheck takes some .1 GB per second
 
 
 def sanitized(tool: str) -> list[str]:
@@ -43,6 +43,12 @@ def deal(command: list[str], processes: int, most: int | None) -> list[list[str]
     names = [line for line in listed.stdout.splitlines() if "::" in line]
     hands = min(len(names), max(processes, math.ceil(len(names) / most) if most else 0))
     return [names[first::hands] for first in range(hands)]
+
+
+def visible_gpus() -> list[str]:
+    """The values of CUDA_VISIBLE_DEVICES that name one GPU each; a single empty one where there is none."""
+    numbered = ",".join(map(str, range(torch.cuda.device_count())))
+    return os.environ.get("CUDA_VISIBLE_DEVICES", numbered).split(",")
 
 
 def run_hand(
@@ -70,13 +76,18 @@ def run_side_by_side(
     command = [*tool, *command]
     start = time.monotonic()
     environment = {**os.environ, "OMP_NUM_THREADS": str(max(1, (os.cpu_count() or 1) // processes))}
+    gpus = visible_gpus()
+
+    def run(number: int) -> tuple[int, dict[str, str] | None]:
+        on_one_gpu = {**environment, "CUDA_VISIBLE_DEVICES": gpus[number % len(gpus)]}
+        return run_hand(command, on_one_gpu, folder, number, hands[number])
+
     outcomes: dict[int, tuple[int, dict[str, str] | None]] = {}
     unfinished = list(range(len(hands)))
     # What a sanitizer's want of memory killed runs again with more of it; without one a crash is a crash.
     for side_by_side in (processes, max(1, processes // 4)) if tool else (processes,):
         with ThreadPoolExecutor(side_by_side) as pool:
-            results = pool.map(lambda number: run_hand(command, environment, folder, number, hands[number]), unfinished)
-            outcomes |= dict(zip(unfinished, results, strict=True))
+            outcomes |= dict(zip(unfinished, pool.map(run, unfinished), strict=True))
         unfinished = [number for number, (_, counts) in outcomes.items() if counts is None]
     total = dict.fromkeys(COUNTS, 0)
     for _, counts in outcomes.values():
@@ -92,7 +103,7 @@ def counts_of(report: Path) -> dict[str, str]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--tool", choices=["memcheck", "racecheck", "initcheck", "synccheck"])
+    parser.add_argument("--tool", choices=sorted(SANITIZED_TESTS))
     parser.add_argument("--out", type=Path, default=common.RESULTS)
     parser.add_argument("-k", dest="expression", help="pytest's -k")
     parser.add_argument("--processes", type=int, default=1, help="that share the tests")
@@ -105,7 +116,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as name:
         folder, report = Path(name), Path(name) / "report.xml"
         if arguments.processes > 1:
-            hands = deal([*command, *selection], arguments.processes, SANITIZED_TESTS if tool else None)
+            hands = deal([*command, *selection], arguments.processes, SANITIZED_TESTS.get(arguments.tool))
             status, suite = run_side_by_side(tool, command, hands, arguments.processes, folder)
         else:
             status = subprocess.run([*tool, *command, f"--junitxml={report}", *selection], cwd=common.ROOT).returncode
