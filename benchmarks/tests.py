@@ -6,7 +6,7 @@
 
 With `--tool` the tests run under compute-sanitizer, and an error that it finds fails the run. With `--processes`,
 so many run side by side and share the cores and the GPUs, each under a compute-sanitizer of its own; none takes more
-than a few tests then, because racecheck keeps host memory until its process ends.
+than a few tests then, because racecheck keeps host memory until its process ends. The result is written after each.
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ import sys
 import tempfile
 import time
 import xml.etree.ElementTree as ElementTree
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any
 
@@ -65,16 +66,15 @@ def run_hand(
         stderr=subprocess.STDOUT,
         text=True,
     )
-    print(f"hand {number}: exit status {started.returncode}\n{started.stdout[-2000:]}", flush=True)
+    print(f"hand {number}: exit status {started.returncode}\n{started.stdout}", flush=True)
     return started.returncode, counts_of(report) if report.exists() else None
 
 
 def run_side_by_side(
     tool: list[str], command: list[str], hands: list[list[str]], processes: int, folder: Path
-) -> tuple[int, dict[str, str]]:
-    """The worst exit status of all hands, and their counts together."""
+) -> Iterator[dict[int, tuple[int, dict[str, str] | None]]]:
+    """The outcomes of all hands that have run so far, after each."""
     command = [*tool, *command]
-    start = time.monotonic()
     environment = {**os.environ, "OMP_NUM_THREADS": str(max(1, (os.cpu_count() or 1) // processes))}
     gpus = visible_gpus()
 
@@ -87,18 +87,36 @@ def run_side_by_side(
     # What a sanitizer's want of memory killed runs again with more of it; without one a crash is a crash.
     for side_by_side in (processes, max(1, processes // 4)) if tool else (processes,):
         with ThreadPoolExecutor(side_by_side) as pool:
-            outcomes |= dict(zip(unfinished, pool.map(run, unfinished), strict=True))
+            started = {pool.submit(run, number): number for number in unfinished}
+            for finished in as_completed(started):
+                outcomes[started[finished]] = finished.result()
+                yield outcomes
         unfinished = [number for number, (_, counts) in outcomes.items() if counts is None]
-    total = dict.fromkeys(COUNTS, 0)
-    for _, counts in outcomes.values():
-        for name in COUNTS:
-            total[name] += int(counts[name]) if counts else int(name == "errors")
-    status = max((status for status, _ in outcomes.values()), key=abs, default=5)  # pytest: no test was selected
-    return status, {name: str(value) for name, value in {**total, "time": time.monotonic() - start}.items()}
 
 
 def counts_of(report: Path) -> dict[str, str]:
     return next(ElementTree.parse(report).getroot().iter("testsuite")).attrib
+
+
+def summary(outcomes: dict[int, tuple[int, dict[str, str] | None]]) -> dict[str, int]:
+    """The worst exit status of the hands, and their counts together."""
+    total = dict.fromkeys(COUNTS, 0)
+    for _, counts in outcomes.values():
+        for name in COUNTS:
+            total[name] += int(counts[name]) if counts else int(name == "errors")
+    return {"exit_status": max((status for status, _ in outcomes.values()), key=abs), **total}
+
+
+def write(out: Path, result: dict[str, Any]) -> None:
+    tool, columns = result["tool"], ("selected", *COUNTS, "seconds")
+    lines = [
+        f"# Tests{f' under compute-sanitizer {tool}' if tool else ''}",
+        common.describe(result["environment"]),
+        f"`pytest {' '.join(result['selection'])}`: exit status {result['exit_status']}",
+        common.table(columns, [[result[name] for name in columns]]),
+    ]
+    device = common.slug(result["environment"]["device"])
+    common.write(out, "_".join(filter(None, ("tests", tool, device))), result, "\n\n".join(lines))
 
 
 def main() -> None:
@@ -109,35 +127,23 @@ def main() -> None:
     parser.add_argument("--processes", type=int, default=1, help="that share the tests")
     parser.add_argument("tests", nargs="*", default=["tests"])
     arguments = parser.parse_args()
-    device = "cuda" if torch.cuda.is_available() else "cpu"
     tool = sanitized(arguments.tool) if arguments.tool else []
     selection = [*arguments.tests, *(["-k", arguments.expression] if arguments.expression else [])]
     command = [sys.executable, "-m", "pytest", "-q", "-m", "not slow"]
-    with tempfile.TemporaryDirectory() as name:
-        folder, report = Path(name), Path(name) / "report.xml"
-        if arguments.processes > 1:
-            hands = deal([*command, *selection], arguments.processes, SANITIZED_TESTS.get(arguments.tool))
-            status, suite = run_side_by_side(tool, command, hands, arguments.processes, folder)
-        else:
-            status = subprocess.run([*tool, *command, f"--junitxml={report}", *selection], cwd=common.ROOT).returncode
-            suite = counts_of(report)
+    start = time.monotonic()
+    hands = deal([*command, *selection], arguments.processes, SANITIZED_TESTS.get(arguments.tool))
     result: dict[str, Any] = {
-        "environment": common.environment(device),
+        "environment": common.environment("cuda" if torch.cuda.is_available() else "cpu"),
         "tool": arguments.tool,
         "selection": selection,
-        "exit_status": status,
-        "seconds": float(suite["time"]),
-        **{name: int(float(suite[name])) for name in COUNTS},
+        "selected": sum(map(len, hands)),
+        "exit_status": 5,  # pytest: no test was selected
     }
-    lines = [
-        f"# Tests{f' under compute-sanitizer {arguments.tool}' if arguments.tool else ''}",
-        common.describe(result["environment"]),
-        f"`pytest {' '.join(result['selection'])}`: exit status {status}",
-        common.table((*COUNTS, "seconds"), [[result[name] for name in (*COUNTS, "seconds")]]),
-    ]
-    name = "_".join(filter(None, ("tests", arguments.tool, common.slug(common.device_name(device)))))
-    common.write(arguments.out, name, result, "\n\n".join(lines))
-    sys.exit(status)
+    with tempfile.TemporaryDirectory() as name:
+        for outcomes in run_side_by_side(tool, command, hands, arguments.processes, Path(name)):
+            result |= summary(outcomes) | {"seconds": time.monotonic() - start}
+            write(arguments.out, result)  # after each hand: what an interrupted run has found is kept
+    sys.exit(result["exit_status"])
 
 
 if __name__ == "__main__":
