@@ -194,6 +194,24 @@ def test_scenes_in_a_batch_are_as_if_alone(device, dim):
         torch.testing.assert_close(end.time[i], one.time)
 
 
+@pytest.mark.parametrize("law", [mpm.NeoHookean(E=1e4, nu=0.3), mpm.QuarticSand(E=1e4, nu=0.3)])
+def test_recording_changes_no_result(device, dim, law):
+    """A step is the same whether autograd records it, is off, or is absent; recorded just where something needs it."""
+    grid = mpm.Grid(0.1, (0,) * dim, (1,) * dim)
+    step, state = mpm.Step(grid, law, gravity=(0, -9.8, 0)[:dim], walls="slip"), block_state(dim, device)
+    recorded = mpm.rollout(step, state.replace(v=state.v.clone().requires_grad_()), 3, 1e-3)
+    plain = mpm.rollout(step, state, 3, 1e-3)
+    with torch.no_grad():
+        off = mpm.rollout(step, state.replace(v=state.v.clone().requires_grad_()), 3, 1e-3)
+    with torch.inference_mode():
+        absent = mpm.rollout(step, state, 3, 1e-3)
+    for name in ("x", "v", "C", "F"):
+        assert getattr(recorded, name).requires_grad
+        for other in (plain, off, absent):
+            assert not getattr(other, name).requires_grad
+            assert relative_error(getattr(other, name), getattr(recorded, name).detach()) < 1e-13
+
+
 def test_sorting_keeps_identities(device):
     state = block_state(3, device)
     step = make_step(3, walls="slip")

@@ -41,7 +41,7 @@ def check_like(name: str, value: Tensor | None, x: Tensor, shape: tuple[int, ...
     """Check an optional floating tensor against x; `symbols` names its shape in the message."""
     if value is None:
         return
-    if not isinstance(value, Tensor) or tuple(value.shape) != shape:
+    if not isinstance(value, Tensor) or value.shape != shape:
         raise ValueError(f"{name} must have shape {symbols} = {list(shape)}, got {shape_of(value)}")
     if value.dtype != x.dtype:
         raise TypeError(f"{name} must have the dtype of x, {x.dtype}, got {value.dtype}")

@@ -90,7 +90,8 @@ class Grid:
             raise ValueError(f"capacity must be between 0 and {self._max_capacity} blocks, got {capacity}")
         self.capacity = capacity
         self._grows = capacity is None
-        self._pending: tuple[Tensor, torch.cuda.Event] | None = None
+        self._pending: torch.cuda.Event | None = None
+        self._on_host: Tensor | None = None
 
     def __repr__(self) -> str:
         return (
@@ -137,8 +138,8 @@ class Grid:
 
     def _activate(self, x: Tensor, scene: Tensor | None, previous: Tensor | None, capacity: int) -> Blocks:
         table, block, offsets, index, schedule, status = torch.ops.torch_mpm.activate(
-            x.detach(), scene, previous, self.scenes, self.dx, self.lower, self.blocks, self.order, capacity,
-            self.deterministic,
+            x.detach() if x.requires_grad else x, scene, previous, self.scenes, self.dx, self.lower, self.blocks,
+            self.order, capacity, self.deterministic,
         )  # fmt: skip
         return Blocks(self, table, block, offsets, index, schedule, status, scene)
 
@@ -155,9 +156,10 @@ class Grid:
             self._pending is not None
             and not torch.compiler.is_compiling()
             and not torch.cuda.is_current_stream_capturing()  # a query would break the capture
-            and self._pending[1].query()
+            and self._pending.query()
         ):
-            wanted = int(self._pending[0][7])
+            assert self._on_host is not None
+            wanted = self._on_host.tolist()[7]
             if wanted * 4 > self.capacity * 3:
                 self.capacity = min(_with_headroom(wanted), self._max_capacity)
             self._pending = None
@@ -168,11 +170,11 @@ class Grid:
             return
         if torch.compiler.is_compiling() or _is_fake(status) or torch.cuda.is_current_stream_capturing():
             return
-        host = torch.empty(status.shape, dtype=status.dtype, pin_memory=True)
-        host.copy_(status, non_blocking=True)
-        event = torch.cuda.Event()
-        event.record()
-        self._pending = (host, event)
+        if self._on_host is None:
+            self._on_host = torch.empty(status.shape, dtype=status.dtype, pin_memory=True)
+        self._on_host.copy_(status, non_blocking=True)
+        self._pending = torch.cuda.Event()
+        self._pending.record()
 
 
 def _with_headroom(blocks: int) -> int:

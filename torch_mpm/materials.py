@@ -139,7 +139,7 @@ class CompiledLaw(Material):
         if self._functions:
             in_order: Any = With(state, ids=None)  # which evaluated parameters already are
             return self._at_temperature(state)._convert(in_order)
-        tensors = [*self.parameters(recurse=False), *self.buffers(recurse=False)]
+        tensors = [t for t in (*self._parameters.values(), *self._buffers.values()) if t is not None]
         if torch.compiler.is_compiling() or any(t.requires_grad for t in tensors):
             return self._convert(state)
         numbers = [value for value in vars(self).values() if isinstance(value, float)]

@@ -176,7 +176,9 @@ class Step(nn.Module):
             return self.gravity
         cached = self._gravity_tensor
         if cached is None or cached.dtype != x.dtype or cached.device != x.device:
-            cached = torch.tensor(self.gravity, dtype=x.dtype, device=x.device)
+            cached = (
+                torch.tensor(self.gravity, dtype=x.dtype, device=x.device).expand(self.grid.scenes, -1).contiguous()
+            )
             self._gravity_tensor = cached
         return cached
 

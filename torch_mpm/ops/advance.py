@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ..errors import check_like, shape_of
-from .arguments import differentiate, per_particle, refuse_vmap, soa_empty, split_dt, sum_by_scene
+from .arguments import differentiate, dispatch, per_particle, refuse_vmap, soa_empty, split_dt, sum_by_scene
 
 
 def advance(
@@ -51,7 +51,7 @@ def advance(
     if C is None and (F is not None or J is not None):
         raise ValueError("F and J need C")
     number, scene_dt = split_dt(dt, scenes, x)
-    next_x, next_F, next_J = torch.ops.torch_mpm.advance(x, v, C, F, J, scene, scene_dt, number)
+    next_x, next_F, next_J = dispatch(torch.ops.torch_mpm.advance, x, v, C, F, J, scene, scene_dt, number)
     return next_x, None if F is None else next_F, None if J is None else next_J
 
 

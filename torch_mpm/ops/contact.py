@@ -13,7 +13,7 @@ from ..boundaries import Box, Capsule, Obstacle, Plane, Sphere
 from ..errors import check_like, shape_of
 from ..grid import Blocks
 from ..reference.obstacles import contact as reference
-from .arguments import differentiate, refuse_vmap
+from .arguments import differentiate, dispatch, refuse_vmap
 from .grid_update import CONTACT_KINDS, _blocks_of
 
 MAX_OBSTACLES = 16  # of one call, csrc/boundary/obstacle.h
@@ -61,7 +61,8 @@ def contact(blocks: Blocks, velocity: Tensor, obstacles: Sequence[Obstacle], tim
         obstacles = [o for o in obstacles if o.start <= number < o.end]
     for first in range(0, len(obstacles), MAX_OBSTACLES):
         group = obstacles[first : first + MAX_OBSTACLES]
-        rows = torch.ops.torch_mpm.contact(
+        rows = dispatch(
+            torch.ops.torch_mpm.contact,
             _packed(velocity),
             _table(group, velocity, grid.scenes),
             [SHAPES[type(o)] for o in group],

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ..errors import check_like, check_positions
 from ..grid import Blocks, inverse_inertia
-from .arguments import refuse_vmap, soa_empty, split_dt, sum_by_scene
+from .arguments import dispatch, refuse_vmap, soa_empty, split_dt, sum_by_scene
 from .transfer import STRESS_FORMS, TOPOLOGY, _blocks_of, _check_nodes, _save, _saved
 
 
@@ -53,8 +53,9 @@ def g2p_advance(
         raise ValueError(f"stress_form must be one of {sorted(STRESS_FORMS)}, got {stress_form!r}")
     velocity = _check_nodes("velocity", velocity, blocks, x, D)
     number, scene_dt = split_dt(dt, grid.scenes, x)
-    next_x, v, C, next_F, next_J = torch.ops.torch_mpm.g2p_advance(
-        x, velocity, F, J, scene_dt, number, affine, STRESS_FORMS[stress_form], *blocks.topology
+    next_x, v, C, next_F, next_J = dispatch(
+        torch.ops.torch_mpm.g2p_advance,
+        *(x, velocity, F, J, scene_dt, number, affine, STRESS_FORMS[stress_form], *blocks.topology),
     )
     return next_x, v, C if affine else None, None if F is None else next_F, None if J is None else next_J
 

@@ -12,7 +12,7 @@ from ..boundaries import Face, Walls
 from ..errors import FLOATING, check_like, shape_of
 from ..grid import BLOCK_WIDTH, Blocks, Grid
 from ..reference import grid_update as reference
-from .arguments import differentiate, refuse_vmap, split_dt
+from .arguments import differentiate, dispatch, refuse_vmap, split_dt
 
 CONTACT_KINDS = {"open": 0, "sticky": 1, "slip": 2, "separate": 3, "mirror": 4}  # csrc/boundary/contact.h
 
@@ -57,7 +57,8 @@ def grid_update(
         number, scene_dt = split_dt(dt, grid.scenes, nodes)
         gravity = _per_scene(gravity, nodes, grid.scenes, grid.dim)
     faces = () if walls is None else walls.faces(grid)
-    updated = torch.ops.torch_mpm.grid_update(
+    updated = dispatch(
+        torch.ops.torch_mpm.grid_update,
         nodes,
         gravity,
         None if scene_dt is None else scene_dt.contiguous(),
@@ -79,7 +80,7 @@ def _per_scene(gravity: Tensor, nodes: Tensor, scenes: int, dim: int) -> Tensor:
     if not isinstance(gravity, Tensor) or tuple(gravity.shape) not in ((dim,), (scenes, dim)):
         raise ValueError(f"gravity must have shape [D] or [B, D] = [{scenes}, {dim}], got {shape_of(gravity)}")
     check_like("gravity", gravity, nodes, tuple(gravity.shape), "")
-    return gravity.expand(scenes, dim).contiguous()
+    return gravity if gravity.dim() == 2 and gravity.is_contiguous() else gravity.expand(scenes, dim).contiguous()
 
 
 # ---- fake kernels: shapes and strides only

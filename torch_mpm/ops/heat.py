@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ..errors import check_like, check_positions, shape_of
 from ..grid import Blocks, inverse_inertia
-from .arguments import refuse_vmap, split_dt
+from .arguments import dispatch, refuse_vmap, split_dt
 from .heat_multigrid import heat_multigrid
 from .heat_refinement import REDUCTION
 from .heat_refinement import refine as refinement
@@ -117,17 +117,17 @@ def heat_cg(
     op = _op_of(METHODS[method])
     if not refine or x.dtype == torch.float64:
         return HeatSolve(
-            *op(
-                x, conductance, capacity, theta, source, exchange, fixed, scene_dt, number, scene_tolerance, *limits,
-                *blocks.topology,
+            *dispatch(
+                op, x, conductance, capacity, theta, source, exchange, fixed, scene_dt, number, scene_tolerance,
+                *limits, *blocks.topology,
             )
         )  # fmt: skip
     constant = [None if t is None else t.detach() for t in (x, conductance, capacity, exchange, scene_dt)]
 
     def solve(right: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         x, conductance, capacity, exchange, scene_dt = constant
-        return op(
-            x, conductance, capacity, None, right, exchange, fixed, scene_dt, number, scene_tolerance, limits[0],
+        return dispatch(
+            op, x, conductance, capacity, None, right, exchange, fixed, scene_dt, number, scene_tolerance, limits[0],
             REDUCTION, *limits[2:], *blocks.topology,
         )  # fmt: skip
 
@@ -156,7 +156,7 @@ def heat_operator(blocks: Blocks, x: Tensor, conductance: Tensor, nodes: Tensor 
     check_positions(x, blocks.grid.dim, blocks.scene, blocks.grid.scenes)
     check_like("conductance", conductance, x, (x.shape[0],), "[P]")
     check_like("nodes", nodes, x, (blocks.node_count,), "[N]")
-    return torch.ops.torch_mpm.heat_operator(x, conductance, nodes, *blocks.topology)
+    return dispatch(torch.ops.torch_mpm.heat_operator, x, conductance, nodes, *blocks.topology)
 
 
 def _op_of(method: int) -> Any:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ..errors import FLOATING, check_like, shape_of
 from ..reference import material as reference
-from .arguments import differentiate, refuse_vmap, soa_empty, sum_by_scene
+from .arguments import differentiate, dispatch, refuse_vmap, soa_empty, sum_by_scene
 
 Parameters = Sequence[Tensor]
 
@@ -45,7 +45,7 @@ def material_stress(
     if C is not None and not reference.LAWS[law].viscous:
         raise ValueError(f"{law} has no viscosity: C must be None")
     check_like("C", C, state, (state.shape[0], dim, dim), "[P, D, D]")
-    return torch.ops.torch_mpm.material_stress(state, C, scene, parameters, law, dim)
+    return dispatch(torch.ops.torch_mpm.material_stress, state, C, scene, parameters, law, dim)
 
 
 def material_energy(
@@ -58,7 +58,7 @@ def material_energy(
     Differentiable with respect to state and parameters, twice in eager mode.
     """
     dim = _check(law, state, parameters, scene, dim)
-    return torch.ops.torch_mpm.material_energy(state, scene, parameters, law, dim)
+    return dispatch(torch.ops.torch_mpm.material_energy, state, scene, parameters, law, dim)
 
 
 def material_wave_modulus(

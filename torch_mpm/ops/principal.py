@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ..errors import FLOATING, check_like, shape_of
 from ..reference.principal import ELASTIC, INVALID, LAWS, PLASTIC
-from .arguments import refuse_vmap, soa_empty, sum_by_scene
+from .arguments import dispatch, refuse_vmap, soa_empty, sum_by_scene
 from .material import _no_backward, _no_setup
 
 __all__ = [
@@ -73,8 +73,8 @@ def principal_update(
         ValueError, TypeError: for an unknown law, or wrong shapes, dtypes or devices.
     """
     _check(law, F, parameters, history, scene)
-    mapped, stress, moved, dissipated, code = torch.ops.torch_mpm.principal_update(
-        F, parameters, history, scene, law, details
+    mapped, stress, moved, dissipated, code = dispatch(
+        torch.ops.torch_mpm.principal_update, F, parameters, history, scene, law, details
     )
     return PrincipalUpdate(
         mapped if LAWS[law].flow is not None else F,
@@ -94,7 +94,7 @@ def principal_energy(
     Arguments as `principal_update`; differentiable once with respect to F, parameters and history.
     """
     _check(law, F, parameters, history, scene)
-    return torch.ops.torch_mpm.principal_energy(F, parameters, history, scene, law)
+    return dispatch(torch.ops.torch_mpm.principal_energy, F, parameters, history, scene, law)
 
 
 def principal_stiffness(

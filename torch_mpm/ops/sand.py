@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ..errors import FLOATING, check_like, shape_of
 from ..reference.sand import APEX, CONE, ELASTIC, ENERGIES, INVALID, friction_alpha
-from .arguments import refuse_vmap, soa_empty, sum_by_scene
+from .arguments import dispatch, refuse_vmap, soa_empty, sum_by_scene
 from .material import _no_setup
 
 __all__ = [
@@ -113,8 +113,9 @@ def quartic_return_map(
     )
     parameters = [_parameter(n, v, F, scene) for n, v in (("mu", mu), ("lam", lam), ("alpha", slope))]
     shift = None if cohesion is None else _parameter("cohesion", cohesion, F, scene)
-    mapped, stress, code, *scalars = torch.ops.torch_mpm.quartic_return_map(
-        F, *parameters, shift, volume_correction, scene, energy, flow, apex, details
+    mapped, stress, code, *scalars = dispatch(
+        torch.ops.torch_mpm.quartic_return_map,
+        *(F, *parameters, shift, volume_correction, scene, energy, flow, apex, details),
     )
     wanted = (details, details, volume_correction is not None)
     return ReturnMap(
@@ -130,7 +131,7 @@ def quartic_stress(F: Tensor, mu: Value, lam: Value, scene: Tensor | None = None
     _check_deformation(F, scene, energy)
     mu, lam = _parameter("mu", mu, F, scene), _parameter("lam", lam, F, scene)
     options = (scene, energy, "radial", "none", False)
-    return torch.ops.torch_mpm.quartic_return_map(F, mu, lam, mu.detach(), None, None, *options)[1]
+    return dispatch(torch.ops.torch_mpm.quartic_return_map, F, mu, lam, mu.detach(), None, None, *options)[1]
 
 
 def quartic_energy(F: Tensor, mu: Value, lam: Value, scene: Tensor | None = None, energy: str = "unilateral") -> Tensor:
@@ -140,7 +141,7 @@ def quartic_energy(F: Tensor, mu: Value, lam: Value, scene: Tensor | None = None
     """
     _check_deformation(F, scene, energy)
     mu, lam = _parameter("mu", mu, F, scene), _parameter("lam", lam, F, scene)
-    return torch.ops.torch_mpm.quartic_energy(F, mu, lam, scene, energy)
+    return dispatch(torch.ops.torch_mpm.quartic_energy, F, mu, lam, scene, energy)
 
 
 def quartic_stiffness(

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ..errors import FLOATING, shape_of
-from .arguments import refuse_vmap, soa_empty
+from .arguments import dispatch, refuse_vmap, soa_empty
 
 
 class SVD(NamedTuple):
@@ -44,7 +44,7 @@ def svd3(F: Tensor) -> SVD:
     """
     _check(F)
     flat = F.reshape(-1, *F.shape[-2:])
-    U, sigma, V = torch.ops.torch_mpm.svd3(flat)
+    U, sigma, V = dispatch(torch.ops.torch_mpm.svd3, flat)
     return SVD(U.reshape(F.shape), sigma.reshape(F.shape[:-1]), V.reshape(F.shape))
 
 
@@ -65,7 +65,7 @@ def polar(F: Tensor) -> Polar:
         ValueError, TypeError: for a wrong shape or dtype.
     """
     _check(F)
-    R, S = torch.ops.torch_mpm.polar(F.reshape(-1, *F.shape[-2:]))
+    R, S = dispatch(torch.ops.torch_mpm.polar, F.reshape(-1, *F.shape[-2:]))
     return Polar(R.reshape(F.shape), S.reshape(F.shape))
 
 

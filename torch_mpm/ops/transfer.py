@@ -19,7 +19,7 @@ from torch import Tensor
 from ..errors import check_like, check_positions, shape_of
 from ..grid import Blocks, Grid, inverse_inertia
 from ..reference import transfer as reference
-from .arguments import differentiate, per_particle, refuse_vmap, soa_empty, split_dt, sum_by_scene
+from .arguments import differentiate, dispatch, per_particle, refuse_vmap, soa_empty, split_dt, sum_by_scene
 
 STRESS_FORMS = {"mls": 0, "gradient": 1}
 TOPOLOGY = 10
@@ -78,8 +78,9 @@ def p2g(
         raise ValueError("stress needs volume and dt")
     else:
         dt, scene_dt = split_dt(dt, blocks.grid.scenes, x)
-    return torch.ops.torch_mpm.p2g(
-        x, mass, v, C, stress, volume, scene_dt, dt, STRESS_FORMS[stress_form], *blocks.topology
+    return dispatch(
+        torch.ops.torch_mpm.p2g,
+        *(x, mass, v, C, stress, volume, scene_dt, dt, STRESS_FORMS[stress_form], *blocks.topology),
     )
 
 
@@ -107,7 +108,7 @@ def g2p(
     """
     check_positions(x, blocks.grid.dim, blocks.scene, blocks.grid.scenes)
     velocity = _check_nodes("velocity", velocity, blocks, x, blocks.grid.dim)
-    v, C, grad_v = torch.ops.torch_mpm.g2p(x, velocity, affine, gradient, *blocks.topology)
+    v, C, grad_v = dispatch(torch.ops.torch_mpm.g2p, x, velocity, affine, gradient, *blocks.topology)
     return v, C if affine else None, grad_v if gradient else None
 
 
@@ -145,7 +146,7 @@ def scatter(
     check_like("value", value, x, (P, K), "[P, K]")
     check_like("moment", moment, x, (P, K, D), "[P, K, D]")
     check_like("gradient", gradient, x, (P, K, D), "[P, K, D]")
-    return torch.ops.torch_mpm.scatter(x, value, moment, gradient, moment_scale, *blocks.topology)
+    return dispatch(torch.ops.torch_mpm.scatter, x, value, moment, gradient, moment_scale, *blocks.topology)
 
 
 def gather(
@@ -170,7 +171,7 @@ def gather(
     """
     check_positions(x, blocks.grid.dim, blocks.scene, blocks.grid.scenes)
     nodes = _check_nodes("nodes", nodes, blocks, x, None)
-    a, b, c = torch.ops.torch_mpm.gather(x, nodes, moment_scale, moment, gradient, *blocks.topology)
+    a, b, c = dispatch(torch.ops.torch_mpm.gather, x, nodes, moment_scale, moment, gradient, *blocks.topology)
     return a, b if moment else None, c if gradient else None
 
 
