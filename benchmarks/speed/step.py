@@ -42,6 +42,7 @@ from .timing import Clock, Time, copy_bandwidth
 SIDES = {"cpu": [64], "cuda": [100, 200]}
 STEPS = 10
 REORDER = 32  # steps between two reorderings in a scene
+SMALLEST = 4  # particles along a side of a cube that keeps no device busy
 FIELDS = ("x", "v", "C", "F")
 
 
@@ -88,6 +89,8 @@ def whole_steps(clock: Clock, s: Setup) -> Iterator[tuple[str, Time]]:
         yield f"step, with a reordering every {REORDER}", reordered
         if clock.cuda and (replay := clock.capture(lambda: roll(s, s.state))):
             yield "step, CUDA graph", dataclasses.replace(clock.steps(replay, STEPS), graph=True)
+    with torch.inference_mode():
+        yield "step, inference mode", clock.steps(lambda: forward(STEPS), STEPS)
     leaves = [getattr(s.state, name).detach().requires_grad_() for name in FIELDS]
     start = s.state.replace(**dict(zip(FIELDS, leaves, strict=True)))
     grads = [torch.ones_like(leaf) for leaf in leaves]
@@ -264,6 +267,7 @@ class Report:
         self.result: dict[str, Any] = {
             "environment": common.environment(device),
             "sizes": [],
+            "host": [],
             "peers": [],
             "difference": {},
             "failures": [],
@@ -302,6 +306,14 @@ def measure_size(report: Report, clock: Clock, side: int) -> None:
         report.attempt("errors", lambda: entry["errors"].update(errors(setup(w, device))))
 
 
+def measure_host(report: Report, clock: Clock) -> None:
+    """Steps of a scene so small that they take the time of the host alone."""
+    w = work.make(SMALLEST)
+    with clock:
+        for name, time in whole_steps(clock, setup(w, str(clock.device))):
+            report.result["host"].append({"name": name, "particles": w.particles, **dataclasses.asdict(time)})
+
+
 def measure_peer(report: Report, peer: str, device: str, sides: Sequence[int], samples: int) -> None:
     """The peer's times of all sizes, and how far its particles are from ours."""
     if importlib.util.find_spec(peers.PEERS[peer][1]) is None:
@@ -332,6 +344,7 @@ def measure(
     for side in sides:
         report.attempt(f"{side}^3 particles", lambda side=side: measure_size(report, clock, side))  # type: ignore[misc]
     report.attempt("copy", copy)
+    report.attempt("host", lambda: measure_host(report, clock))
     for peer in peer_names:
         report.attempt(peer, lambda peer=peer: measure_peer(report, peer, device, sides, min(samples, 7)))  # type: ignore[misc]
     return report.result
@@ -351,6 +364,10 @@ def text(result: dict[str, Any]) -> str:
               for peer, d in result["difference"].items()]  # fmt: skip
     for entry in result["sizes"]:
         lines += ["", f"## {entry['particles']} particles", "", *_size_tables(entry, result["peers"], copy)]
+    if result["host"]:
+        lines += ["", f"## {result['host'][0]['particles']} particles: the host's part", ""]
+        lines += [common.table(("whole step", "median ms", "least ms"),
+                               [(r["name"], r["ms"], r["fastest_ms"]) for r in result["host"]])]  # fmt: skip
     lines += ["", *(f"Failed: {failure}" for failure in result["failures"])]
     return "\n".join(lines)
 

@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 
 from ..errors import check_like, shape_of
-from .arguments import differentiate, dispatch, per_particle, refuse_vmap, soa_empty, split_dt, sum_by_scene
+from .arguments import differentiate, per_particle, refuse_vmap, soa_empty, split_dt, sum_by_scene
+from .autograd import dispatch, register_autograd
 
 
 def advance(
@@ -87,7 +88,7 @@ def _backward(ctx, grad_x, grad_F, grad_J):
     need = ctx.needs_input_grad
     needs = sum(1 << i for i, needed in enumerate((*need[1:5], need[6])) if needed)
     given = (grad_x, None if F is None else grad_F, None if J is None else grad_J)
-    grads = torch.ops.torch_mpm.advance_backward(*given, x, v, C, F, J, scene, scene_dt, ctx.dt, needs)
+    grads = dispatch(torch.ops.torch_mpm.advance_backward, *given, x, v, C, F, J, scene, scene_dt, ctx.dt, needs)
     grad_v, grad_C, grad_F, grad_J, grad_dt = (
         g if needs >> i & 1 and t is not None else None
         for i, (g, t) in enumerate(zip(grads, (v, C, F, J, scene_dt), strict=True))
@@ -135,7 +136,7 @@ def _double_backward(ctx, *grads):
     return gx, gF, gJ, None, gv, gC, g_F, g_J, None, gdt, None, None
 
 
-torch.library.register_autograd("torch_mpm::advance", _backward, setup_context=_setup)
-torch.library.register_autograd("torch_mpm::advance_backward", _double_backward, setup_context=_backward_setup)
+register_autograd("advance", _backward, _setup)
+register_autograd("advance_backward", _double_backward, _backward_setup)
 refuse_vmap("advance")
 refuse_vmap("advance_backward")

@@ -12,17 +12,6 @@ from torch import Tensor
 from ..errors import shape_of
 
 
-def dispatch(op: Any, *arguments: Any) -> Any:
-    """`op(*arguments)`, past torch.library's autograd kernel where it would record nothing.
-
-    That kernel is Python and takes the host as long as the op itself.
-    """
-    if torch.compiler.is_compiling() or (torch.is_grad_enabled() and torch._C._any_requires_grad(*arguments)):
-        return op(*arguments)
-    with torch._C._AutoDispatchBelowAutograd():
-        return op(*arguments)
-
-
 def split_dt(dt: float | Tensor, scenes: int, x: Tensor) -> tuple[float, Tensor | None]:
     """A time step [s] as the ops take it: a number times an optional tensor [B].
 

@@ -13,7 +13,8 @@ from ..boundaries import Box, Capsule, Obstacle, Plane, Sphere
 from ..errors import check_like, shape_of
 from ..grid import Blocks
 from ..reference.obstacles import contact as reference
-from .arguments import differentiate, dispatch, refuse_vmap
+from .arguments import differentiate, refuse_vmap
+from .autograd import dispatch, register_autograd
 from .grid_update import CONTACT_KINDS, _blocks_of
 
 MAX_OBSTACLES = 16  # of one call, csrc/boundary/obstacle.h
@@ -163,8 +164,9 @@ def _setup(ctx: Any, inputs: Any, output: Any) -> None:
 
 def _backward(ctx, grad):
     velocity, obstacles, scene_time, block = ctx.saved_tensors
-    rows = torch.ops.torch_mpm.contact_backward(
-        _packed(grad[:, 1:]), velocity, obstacles, *ctx.kinds, scene_time, ctx.time, block, *ctx.geometry
+    rows = dispatch(
+        torch.ops.torch_mpm.contact_backward,
+        *(_packed(grad[:, 1:]), velocity, obstacles, *ctx.kinds, scene_time, ctx.time, block, *ctx.geometry),
     )
     return (rows[:, 1:],) + (None,) * 12
 
@@ -188,7 +190,7 @@ def _double_backward(ctx, grad_rows):
     return (*grads,) + (None,) * 12
 
 
-torch.library.register_autograd("torch_mpm::contact", _backward, setup_context=_setup)
-torch.library.register_autograd("torch_mpm::contact_backward", _double_backward, setup_context=_backward_setup)
+register_autograd("contact", _backward, _setup)
+register_autograd("contact_backward", _double_backward, _backward_setup)
 refuse_vmap("contact")
 refuse_vmap("contact_backward")

@@ -9,7 +9,8 @@ from torch import Tensor
 
 from ..errors import check_like, check_positions
 from ..grid import Blocks, inverse_inertia
-from .arguments import dispatch, refuse_vmap, soa_empty, split_dt, sum_by_scene
+from .arguments import refuse_vmap, soa_empty, split_dt, sum_by_scene
+from .autograd import dispatch, register_autograd
 from .transfer import STRESS_FORMS, TOPOLOGY, _blocks_of, _check_nodes, _save, _saved
 
 
@@ -82,15 +83,15 @@ def _backward(ctx, grad_x, grad_v, grad_C, grad_F, grad_J):
     scale = inverse_inertia(topology[8], topology[5])
     L = C if ctx.mls else None  # the velocity gradient that moved F and J
     if moves and not (ctx.mls and ctx.affine):
-        _, C, grad_v_field = torch.ops.torch_mpm.gather(x, velocity, scale, ctx.mls, not ctx.mls, *topology)
+        _, C, grad_v_field = dispatch(torch.ops.torch_mpm.gather, x, velocity, scale, ctx.mls, not ctx.mls, *topology)
         L = C if ctx.mls else grad_v_field
     scene = _blocks_of(topology, x).scene if scene_dt is not None and scene_dt.shape[0] > 1 else None
     wanted = (need_nodes, need_nodes and moves, need_F, need_J, need_dt)
     needs = sum(1 << i for i, needed in enumerate(wanted) if needed)
     given = (grad_x, None if F is None else grad_F, None if J is None else grad_J)
     L = L if moves else None
-    more_v, grad_L, grad_F, grad_J, grad_dt = torch.ops.torch_mpm.advance_backward(
-        *given, x, v, L, F, J, scene, scene_dt, ctx.dt, needs
+    more_v, grad_L, grad_F, grad_J, grad_dt = dispatch(
+        torch.ops.torch_mpm.advance_backward, *given, x, v, L, F, J, scene, scene_dt, ctx.dt, needs
     )
     grad_velocity = None
     if need_nodes:
@@ -101,16 +102,16 @@ def _backward(ctx, grad_x, grad_v, grad_C, grad_F, grad_J):
         elif moves:
             gradient = grad_L
         if need_x:
-            grad_x = grad_x + torch.ops.torch_mpm.position_gradient(
-                x, grad_v, moment, gradient, velocity, scale, *topology
+            grad_x = grad_x + dispatch(
+                torch.ops.torch_mpm.position_gradient, x, grad_v, moment, gradient, velocity, scale, *topology
             )
         if need_velocity:
-            grad_velocity = torch.ops.torch_mpm.scatter(x, grad_v, moment, gradient, scale, *topology)
+            grad_velocity = dispatch(torch.ops.torch_mpm.scatter, x, grad_v, moment, gradient, scale, *topology)
     if need_dt:
         grad_dt = ctx.dt * sum_by_scene(grad_dt, scene, scene_dt.shape[0])
     grads = zip((grad_x, grad_velocity, grad_F, grad_J, grad_dt), ctx.needs_input_grad[:5], strict=True)
     return (*(g if needed else None for g, needed in grads),) + (None,) * (3 + TOPOLOGY)
 
 
-torch.library.register_autograd("torch_mpm::g2p_advance", _backward, setup_context=_setup)
+register_autograd("g2p_advance", _backward, _setup)
 refuse_vmap("g2p_advance")

@@ -12,7 +12,8 @@ from ..boundaries import Face, Walls
 from ..errors import FLOATING, check_like, shape_of
 from ..grid import BLOCK_WIDTH, Blocks, Grid
 from ..reference import grid_update as reference
-from .arguments import differentiate, dispatch, refuse_vmap, split_dt
+from .arguments import differentiate, refuse_vmap, split_dt
+from .autograd import dispatch, register_autograd
 
 CONTACT_KINDS = {"open": 0, "sticky": 1, "slip": 2, "separate": 3, "mirror": 4}  # csrc/boundary/contact.h
 
@@ -108,8 +109,9 @@ def _setup(ctx: Any, inputs: Any, output: Any) -> None:
 def _backward(ctx, grad):
     nodes, gravity, scene_dt, table, block = ctx.saved_tensors
     need_nodes, need_gravity, need_dt, *_ = ctx.needs_input_grad
-    grad_nodes, change = torch.ops.torch_mpm.grid_update_backward(
-        grad, need_gravity or need_dt, nodes, gravity, scene_dt, ctx.dt, *ctx.walls, table, block, *ctx.geometry
+    grad_nodes, change = dispatch(
+        torch.ops.torch_mpm.grid_update_backward,
+        *(grad, need_gravity or need_dt, nodes, gravity, scene_dt, ctx.dt, *ctx.walls, table, block, *ctx.geometry),
     )
     grad_gravity = grad_dt = None
     if need_gravity or need_dt:
@@ -163,7 +165,7 @@ def _blocks_of(table: Tensor, block: Tensor, dx: float, lower: list[float], per_
     return Blocks(grid, table, block, block, block, block, block, None)
 
 
-torch.library.register_autograd("torch_mpm::grid_update", _backward, setup_context=_setup)
-torch.library.register_autograd("torch_mpm::grid_update_backward", _double_backward, setup_context=_backward_setup)
+register_autograd("grid_update", _backward, _setup)
+register_autograd("grid_update_backward", _double_backward, _backward_setup)
 refuse_vmap("grid_update")
 refuse_vmap("grid_update_backward")

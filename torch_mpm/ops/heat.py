@@ -9,7 +9,8 @@ from torch import Tensor
 
 from ..errors import check_like, check_positions, shape_of
 from ..grid import Blocks, inverse_inertia
-from .arguments import dispatch, refuse_vmap, split_dt
+from .arguments import refuse_vmap, split_dt
+from .autograd import dispatch, register_autograd
 from .heat_multigrid import heat_multigrid
 from .heat_refinement import REDUCTION
 from .heat_refinement import refine as refinement
@@ -237,7 +238,7 @@ def _backward(ctx: Any, grad: Tensor, *_: Any) -> tuple[Any, ...]:
         grads[0] = None if for_x is None else -for_x
         grads[1] = -for_conductance
     if need_theta:
-        grads[3] = -torch.ops.torch_mpm.heat_operator(x, conductance, adjoint, *topology)
+        grads[3] = -dispatch(torch.ops.torch_mpm.heat_operator, x, conductance, adjoint, *topology)
         if exchange is not None:
             grads[3] = grads[3] - exchange * adjoint
     rate = -adjoint * d
@@ -263,13 +264,15 @@ def _operator_adjoint(
     """Derivatives of v · H u = Σ_p κ_p V_p ∇u · ∇v by the positions and by κ V."""
     scale = inverse_inertia(topology[8], topology[5])
     nodes = [w[:, None].contiguous() for w in (u, v)]
-    gradient = [torch.ops.torch_mpm.gather(x, w, scale, True, False, *topology)[1] for w in nodes]
+    gradient = [dispatch(torch.ops.torch_mpm.gather, x, w, scale, True, False, *topology)[1] for w in nodes]
     by_conductance = (gradient[0] * gradient[1]).sum((1, 2))
     if not need_x:
         return None, by_conductance
     value = torch.zeros_like(gradient[0][:, :, 0])
     first, second = (
-        torch.ops.torch_mpm.position_gradient(x, value, conductance[:, None, None] * g, None, w, scale, *topology)
+        dispatch(
+            torch.ops.torch_mpm.position_gradient, x, value, conductance[:, None, None] * g, None, w, scale, *topology
+        )
         for g, w in zip(gradient, reversed(nodes), strict=True)
     )
     return first + second, by_conductance
@@ -292,7 +295,7 @@ def _operator_backward(ctx: Any, grad: Tensor) -> tuple[Any, ...]:
     if need_x or need_conductance:
         for_x, for_conductance = _operator_adjoint(x, conductance, nodes, grad, topology, need_x)
     if need_nodes:
-        for_nodes = torch.ops.torch_mpm.heat_operator(x, conductance, grad, *topology)
+        for_nodes = dispatch(torch.ops.torch_mpm.heat_operator, x, conductance, grad, *topology)
     return (for_x, for_conductance if need_conductance else None, for_nodes) + (None,) * TOPOLOGY
 
 
@@ -301,5 +304,5 @@ for _name, _adjoint, _context in (
     ("heat_multigrid", _backward, _setup),
     ("heat_operator", _operator_backward, _operator_setup),
 ):
-    torch.library.register_autograd(f"torch_mpm::{_name}", _adjoint, setup_context=_context)
+    register_autograd(_name, _adjoint, _context)
     refuse_vmap(_name)

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from ..grid import BLOCK_WIDTH, Blocks, _unravel
 from .arguments import refuse_vmap
+from .autograd import register_autograd
 
 
 class Patches:
@@ -109,5 +110,5 @@ def _no_gradient(ctx: Any, grad: Tensor) -> None:
 
 
 for _name in ("heat_stencil", "heat_patches"):
-    torch.library.register_autograd(f"torch_mpm::{_name}", _no_gradient)
+    register_autograd(_name, _no_gradient)
     refuse_vmap(_name)

@@ -10,7 +10,8 @@ from torch import Tensor
 
 from ..errors import FLOATING, check_like, shape_of
 from ..reference import material as reference
-from .arguments import differentiate, dispatch, refuse_vmap, soa_empty, sum_by_scene
+from .arguments import differentiate, refuse_vmap, soa_empty, sum_by_scene
+from .autograd import dispatch, register_autograd
 
 Parameters = Sequence[Tensor]
 
@@ -183,8 +184,8 @@ def _needs(ctx: Any) -> int:
 def _stress_backward(ctx, grad):
     state, C, scene, *parameters = ctx.saved_tensors
     needs = _needs(ctx)
-    grad_state, grad_C, grad_parameters = torch.ops.torch_mpm.material_stress_backward(
-        grad, state, C, scene, parameters, ctx.law, ctx.dim, needs
+    grad_state, grad_C, grad_parameters = dispatch(
+        torch.ops.torch_mpm.material_stress_backward, grad, state, C, scene, parameters, ctx.law, ctx.dim, needs
     )
     shared = _shared_gradients(ctx, grad_parameters, parameters, scene) if needs & 4 else [None] * len(parameters)
     return grad_state if needs & 1 else None, grad_C if needs & 2 else None, None, shared, None, None
@@ -193,8 +194,8 @@ def _stress_backward(ctx, grad):
 def _energy_backward(ctx, grad):
     state, scene, *parameters = ctx.saved_tensors
     needs = _needs(ctx)
-    grad_state, grad_parameters = torch.ops.torch_mpm.material_energy_backward(
-        grad, state, scene, parameters, ctx.law, ctx.dim, needs
+    grad_state, grad_parameters = dispatch(
+        torch.ops.torch_mpm.material_energy_backward, grad, state, scene, parameters, ctx.law, ctx.dim, needs
     )
     shared = _shared_gradients(ctx, grad_parameters, parameters, scene) if needs & 4 else [None] * len(parameters)
     return grad_state if needs & 1 else None, None, shared, None, None
@@ -267,7 +268,7 @@ for _name, _backward, _context in (
     ("material_wave_modulus", _no_backward, _no_setup),
     ("material_stiffness", _no_backward, _no_setup),
 ):
-    torch.library.register_autograd(f"torch_mpm::{_name}", _backward, setup_context=_context)
+    register_autograd(_name, _backward, _context)
     refuse_vmap(_name)
 for _name in ("material_energy", "material_wave_modulus", "material_stiffness"):
     torch.library.register_fake(f"torch_mpm::{_name}", _scalar_fake)

@@ -10,7 +10,8 @@ from torch import Tensor
 
 from ..errors import FLOATING, check_like, shape_of
 from ..reference.principal import ELASTIC, INVALID, LAWS, PLASTIC
-from .arguments import dispatch, refuse_vmap, soa_empty, sum_by_scene
+from .arguments import refuse_vmap, soa_empty, sum_by_scene
+from .autograd import dispatch, register_autograd
 from .material import _no_backward, _no_setup
 
 __all__ = [
@@ -244,7 +245,7 @@ for _name, _backward, _context in (
     ("principal_stiffness", _no_backward, _no_setup),
     ("principal_wave_modulus", _no_backward, _no_setup),
 ):
-    torch.library.register_autograd(f"torch_mpm::{_name}", _backward, setup_context=_context)
+    register_autograd(_name, _backward, _context)
     refuse_vmap(_name)
 for _name in ("principal_energy", "principal_stiffness", "principal_wave_modulus"):
     torch.library.register_fake(f"torch_mpm::{_name}", _scalar_fake)

@@ -10,7 +10,8 @@ from torch import Tensor
 
 from ..errors import FLOATING, check_like, shape_of
 from ..reference.sand import APEX, CONE, ELASTIC, ENERGIES, INVALID, friction_alpha
-from .arguments import dispatch, refuse_vmap, soa_empty, sum_by_scene
+from .arguments import refuse_vmap, soa_empty, sum_by_scene
+from .autograd import dispatch, register_autograd
 from .material import _no_setup
 
 __all__ = [
@@ -248,8 +249,9 @@ def _return_map_backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None
     needs_F, *needs, needs_volume = ctx.needs_input_grad[:6]
     if all(g is None for g in given) or not (needs_F or any(needs) or needs_volume):
         return (None,) * 11
-    adjoint_F, adjoint_parameters, adjoint_volume = torch.ops.torch_mpm.quartic_return_map_backward(
-        *given, *ctx.saved_tensors, ctx.energy, ctx.flow, ctx.apex, needs_F, any(needs)
+    adjoint_F, adjoint_parameters, adjoint_volume = dispatch(
+        torch.ops.torch_mpm.quartic_return_map_backward,
+        *(*given, *ctx.saved_tensors, ctx.energy, ctx.flow, ctx.apex, needs_F, any(needs)),
     )
     shared = [
         _shared(adjoint_parameters[:, k], p, scene) if n else None
@@ -268,7 +270,7 @@ def _energy_backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
     F, mu, lam, scene = ctx.saved_tensors
     needs_F, *needs = ctx.needs_input_grad[:3]
     one, zero = torch.ones_like(mu).detach(), torch.zeros_like(lam).detach()
-    meaningful = torch.ops.torch_mpm.quartic_energy(F.detach(), one, zero, scene, ctx.energy).isfinite()
+    meaningful = dispatch(torch.ops.torch_mpm.quartic_energy, F.detach(), one, zero, scene, ctx.energy).isfinite()
     grad = torch.where(meaningful, grad, 0)
     grad_F = None
     if needs_F:
@@ -281,7 +283,7 @@ def _energy_backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
             shared.append(None)
             continue
         unit = one.new_ones(()), one.new_zeros(())
-        value = torch.ops.torch_mpm.quartic_energy(F, unit[share], unit[1 - share], scene, ctx.energy)
+        value = dispatch(torch.ops.torch_mpm.quartic_energy, F, unit[share], unit[1 - share], scene, ctx.energy)
         shared.append(_shared(grad * torch.where(meaningful, value, 0), parameter, scene))
     return grad_F, *shared, None, None
 
@@ -300,5 +302,5 @@ for _name, _backward, _setup in (
     ("quartic_energy", _energy_backward, _energy_setup),
     ("quartic_stiffness", _no_backward, _no_setup),
 ):
-    torch.library.register_autograd(f"torch_mpm::{_name}", _backward, setup_context=_setup)
+    register_autograd(_name, _backward, _setup)
     refuse_vmap(_name)

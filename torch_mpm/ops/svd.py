@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 
 from ..errors import FLOATING, shape_of
-from .arguments import dispatch, refuse_vmap, soa_empty
+from .arguments import refuse_vmap, soa_empty
+from .autograd import dispatch, register_autograd
 
 
 class SVD(NamedTuple):
@@ -144,5 +145,5 @@ def _solve_skew(S: Tensor, X: Tensor) -> Tensor:
 
 
 for _name, _backward in (("svd3", _svd3_backward), ("polar", _polar_backward)):
-    torch.library.register_autograd(f"torch_mpm::{_name}", _backward, setup_context=_keep_output)
+    register_autograd(_name, _backward, _keep_output)
     refuse_vmap(_name)

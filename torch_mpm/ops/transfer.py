@@ -19,7 +19,8 @@ from torch import Tensor
 from ..errors import check_like, check_positions, shape_of
 from ..grid import Blocks, Grid, inverse_inertia
 from ..reference import transfer as reference
-from .arguments import differentiate, dispatch, per_particle, refuse_vmap, soa_empty, split_dt, sum_by_scene
+from .arguments import differentiate, per_particle, refuse_vmap, soa_empty, split_dt, sum_by_scene
+from .autograd import dispatch, register_autograd
 
 STRESS_FORMS = {"mls": 0, "gradient": 1}
 TOPOLOGY = 10
@@ -256,11 +257,11 @@ def _scatter_backward(ctx, grad):
     grad_x = grad_value = grad_moment = grad_gradient = None
     grad = grad.contiguous()
     if need[1] or need[2] or need[3]:
-        grad_value, grad_moment, grad_gradient = torch.ops.torch_mpm.gather(
-            x, grad, ctx.scale, bool(need[2]), bool(need[3]), *topology
+        grad_value, grad_moment, grad_gradient = dispatch(
+            torch.ops.torch_mpm.gather, x, grad, ctx.scale, bool(need[2]), bool(need[3]), *topology
         )
     if need[0]:
-        grad_x = torch.ops.torch_mpm.position_gradient(x, value, moment, gradient, grad, ctx.scale, *topology)
+        grad_x = dispatch(torch.ops.torch_mpm.position_gradient, x, value, moment, gradient, grad, ctx.scale, *topology)
     return (grad_x, grad_value, grad_moment if need[2] else None, grad_gradient if need[3] else None) + (None,) * (
         1 + TOPOLOGY
     )
@@ -282,9 +283,11 @@ def _gather_adjoint(ctx, grad_value, grad_moment, grad_gradient):
     gradient = grad_gradient if ctx.gradient else None
     grad_x = grad_nodes = None
     if ctx.needs_input_grad[0]:
-        grad_x = torch.ops.torch_mpm.position_gradient(x, grad_value, moment, gradient, nodes, ctx.scale, *topology)
+        grad_x = dispatch(
+            torch.ops.torch_mpm.position_gradient, x, grad_value, moment, gradient, nodes, ctx.scale, *topology
+        )
     if ctx.needs_input_grad[1]:
-        grad_nodes = torch.ops.torch_mpm.scatter(x, grad_value, moment, gradient, ctx.scale, *topology)
+        grad_nodes = dispatch(torch.ops.torch_mpm.scatter, x, grad_value, moment, gradient, ctx.scale, *topology)
     return grad_x, grad_nodes
 
 
@@ -343,7 +346,9 @@ def _p2g_setup(ctx, inputs, output):
 def _p2g_backward(ctx, grad):
     tensors, topology = _saved(ctx)
     needs = sum(1 << i for i, needed in enumerate(ctx.needs_input_grad[:7]) if needed)
-    grads = list(torch.ops.torch_mpm.p2g_backward(grad.contiguous(), *tensors, ctx.dt, ctx.form, needs, *topology))
+    grads = list(
+        dispatch(torch.ops.torch_mpm.p2g_backward, grad.contiguous(), *tensors, ctx.dt, ctx.form, needs, *topology)
+    )
     if ctx.needs_input_grad[6] and tensors[4] is not None:
         blocks = _blocks_of(topology, tensors[0])
         grads[6] = ctx.dt * sum_by_scene(grads[6], blocks.scene, blocks.grid.scenes)
@@ -379,7 +384,7 @@ def _composed_p2g_backward(inputs, dt, form, topology):
     D = x.shape[1]
     mls = form == STRESS_FORMS["mls"]
     blocks = _blocks_of(topology, x)
-    value, moment, gradient = torch.ops.torch_mpm.gather(x, grad, 1.0, True, True, *topology)
+    value, moment, gradient = dispatch(torch.ops.torch_mpm.gather, x, grad, 1.0, True, True, *topology)
     mass_sum, momentum_sum, moment_sum = value[:, 0], value[:, 1:], moment[:, 1:]
     grad_mass = mass_sum + (v * momentum_sum).sum(1)
     grad_v = mass[:, None] * momentum_sum
@@ -401,7 +406,7 @@ def _composed_p2g_backward(inputs, dt, form, topology):
         grad_dt = volume * work
         padded = torch.nn.functional.pad(impulse[:, None, None] * stress, (0, 0, 1, 0))
         B, G = (B + padded, None) if mls else (B, padded)
-    grad_x = torch.ops.torch_mpm.position_gradient(x, a, B, G, grad, 1.0, *topology)
+    grad_x = dispatch(torch.ops.torch_mpm.position_gradient, x, a, B, G, grad, 1.0, *topology)
     return grad_x, grad_mass, grad_v, grad_C, grad_stress, grad_volume, grad_dt
 
 
@@ -413,5 +418,5 @@ for _name, _backward, _setup in (
     ("p2g", _p2g_backward, _p2g_setup),
     ("p2g_backward", _p2g_double_backward, _p2g_backward_setup),
 ):
-    torch.library.register_autograd(f"torch_mpm::{_name}", _backward, setup_context=_setup)
+    register_autograd(_name, _backward, _setup)
     refuse_vmap(_name)
