@@ -51,7 +51,7 @@ def test_failed_part_is_reported_and_the_others_go_on(monkeypatch: pytest.Monkey
 
     monkeypatch.setattr(step, "whole_steps", broken)
     found = step.measure("cpu", [8], [], samples=1, budget=0.0)
-    assert found["failures"] == ["whole steps: RuntimeError: no such device"]
+    assert found["failures"] == [f"{part}: RuntimeError: no such device" for part in ("whole steps", "host")]
     assert found["sizes"][0]["parts"] and found["sizes"][0]["errors"]
 
 

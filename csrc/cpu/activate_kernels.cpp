@@ -185,27 +185,41 @@ void count_homes(const Activation<T, D>& s, int slice, int64_t begin, int64_t en
   s.totals(slice)[W::kRuns] = runs;
 }
 
-// Whether some particle touches block b of the table.
+// Sets the table to 1 at each block that the particles of homes [begin, end) touch.
 template <class T, int D>
-bool is_active(const Activation<T, D>& s, int64_t b) {
-  int block[D];
-  block_coordinates(s.a.geometry, int(b), block);
-  for (int o = 0; o < kColours<D>; o++) {
-    bool inside = true;
-    for (int i = 0; i < D; i++) inside = inside && block[i] >= (o >> (D - 1 - i) & 1);
-    for (int k = 0; inside && k < s.w.slices; k++)
-      if (s.w.touched[k * s.table_size + b - s.neighbour[o]] >> o & 1) return true;
+void mark_touched(const Activation<T, D>& s, int64_t begin, int64_t end) {
+  const auto touched_from = [&](int64_t home, auto& blocks) {
+    for (int k = 0; k < s.w.slices; k++) {
+      auto of_slice = blocks;
+      __builtin_memcpy(&of_slice, s.w.touched + k * s.table_size + home, sizeof(blocks));
+      blocks |= of_slice;
+    }
+  };
+  for (int64_t home = begin; home < end; home++) {
+    uint64_t of_eight = 0;  // most homes have no particles
+    if (home + 8 <= end) touched_from(home, of_eight);
+    if (home + 8 <= end && !of_eight) {
+      home += 7;
+      continue;
+    }
+    uint8_t blocks = 0;
+    touched_from(home, blocks);
+    for (int o = 0; o < kColours<D>; o++)
+      if (blocks >> o & 1) __atomic_store_n(s.a.table + home + s.neighbour[o], 1, __ATOMIC_RELAXED);
   }
-  return false;
 }
 
 // Numbers the active blocks in the order of the table; returns how many there are.
 template <class T, int D>
 int64_t number_blocks(const Activation<T, D>& s) {
   const ActivateArguments<T, D>& a = s.a;
+  for_parts(s.w.slices, s.table_size, [&](int, int64_t begin, int64_t end) {
+    __builtin_memset(a.table + begin, 0, sizeof(int) * (end - begin));
+  });
+  for_parts(s.w.slices, s.table_size, [&](int, int64_t begin, int64_t end) { mark_touched(s, begin, end); });
   for_parts(s.w.slices, s.table_size, [&](int slice, int64_t begin, int64_t end) {
     int64_t active = 0;
-    for (int64_t b = begin; b < end; b++) active += a.table[b] = is_active(s, b);
+    for (int64_t b = begin; b < end; b++) active += a.table[b];
     s.totals(slice)[W::kActive] = active;
   });
   const int64_t wanted = s.scan(W::kActive);

@@ -295,7 +295,14 @@ void for_outside(const Topology<T, D>& t, const F& f) {
   for (int64_t i = t.offsets[t.capacity]; i < t.particles; i++) f(int64_t(t.index[i]));
 }
 
-constexpr int kGrainHomes = 4;  // homes or chunks that are worth a thread
+// Calls f(next) once per thread, where next() hands out the homes of a schedule colour by colour.
+template <int D, class F>
+void parallel_homes(const ScheduleIn& s, int64_t particles, const F& f) {
+  constexpr int64_t kHomes = 4, kParticles = 2048;  // that are worth a thread
+  const int64_t homes = s.colour_start[kColours<D>];
+  const int64_t by_homes = (homes + kHomes - 1) / kHomes, by_particles = (particles + kParticles - 1) / kParticles;
+  parallel_phases<kColours<D>>(s.colour_start, by_homes < by_particles ? by_homes : by_particles, f);
+}
 
 }  // namespace TORCH_MPM_ISA
 }  // namespace mpm::cpu

@@ -233,7 +233,7 @@ template <int Order, class T, int D, class F>
 void gather_groups(const Topology<T, D>& t, const Field<const T>& x, const NodeField<const T>& nodes, int first,
                    int count, const F& visit) {
   const ScheduleIn s = schedule_of(t);
-  parallel_phases<kColours<D>>(s.colour_start, kGrainHomes, [&](const auto& next) {
+  parallel_homes<D>(s, t.particles, [&](const auto& next) {
     Tile<Order, T, D> tile;
     for (int64_t h; (h = next()) >= 0;) {
       const Home<T, D> home(t, s.home_slot[h]);

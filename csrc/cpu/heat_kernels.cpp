@@ -114,7 +114,7 @@ void sum_particles(const Topology<T, D>& t, const Field<const T>& x, const Field
                    T* out, const Wanted& wanted, const Finish& finish, const int* e = nullptr) {
   const ScheduleIn s = schedule_of(t);
   PhaseCounter<kColours<D>> colours{s.colour_start};
-  parallel_phases<kColours<D>>(s.colour_start, kGrainHomes, [&](const auto& next) {
+  parallel_homes<D>(s, t.particles, [&](const auto& next) {
     ScalarTile<Order, T, D> u, sum;
     int colour = 0;
     for (int64_t h; (h = next()) >= 0;) {

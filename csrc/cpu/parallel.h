@@ -63,11 +63,10 @@ class Shares {
   } taken_[kMost];
 };
 
-// Calls f(next) once per thread, where next() hands out the items of all phases. At most one thread per `grain` items.
+// Calls f(next) once per thread, where next() hands out the items of all phases, on at most `most` threads.
 template <int Phases, class F>
-void parallel_phases(const int* start, int64_t grain, const F& f) {
-  const int64_t worth = (start[Phases] + grain - 1) / grain, threads = thread_count();
-  const int64_t members = worth < threads ? worth : threads;
+void parallel_phases(const int* start, int64_t most, const F& f) {
+  const int64_t threads = thread_count(), members = most < threads ? most : threads;
   Shares<Phases> shares(start, int(members));
   parallel_ranges(members, 1, [&](int64_t member, int64_t) {
     typename Shares<Phases>::Place place;

@@ -200,7 +200,7 @@ void scatter_channels(const Topology<T, D>& t, const Field<const T>& x, const No
     }
   };
   PhaseCounter<kColours<D>> colours{s.colour_start};
-  parallel_phases<kColours<D>>(s.colour_start, kGrainHomes, [&](const auto& next) {
+  parallel_homes<D>(s, t.particles, [&](const auto& next) {
     Gifts<Order, T, D, Slope, Gradient> gifts;
     Tile<Order, T, D> tile;
     int colour = 0;
