@@ -14,6 +14,10 @@ def dispatch(op: Any, *arguments: Any) -> Any:
     """`op(*arguments)`, past the kernel of `register_autograd` where nothing requires grad."""
     if torch.compiler.is_compiling() or (torch.is_grad_enabled() and torch._C._any_requires_grad(*arguments)):
         return op(*arguments)
+    return _below_autograd(op, arguments)
+
+
+def _below_autograd(op: Any, arguments: Sequence[Any]) -> Any:
     with torch._C._AutoDispatchBelowAutograd():
         return op(*arguments)
 
@@ -33,8 +37,7 @@ def register_autograd(
 
     def forward(ctx: Any, lengths: list[int], *flat: Any) -> Any:
         arguments = _nested(flat, lists, lengths)
-        with torch._C._AutoDispatchBelowAutograd():
-            output = op(*arguments)
+        output = _below_autograd(op, arguments)
         ctx.lengths = lengths
         if setup is not None:
             setup(ctx, arguments, output)
@@ -55,8 +58,7 @@ def register_autograd(
     def kernel(*arguments: Any) -> Any:
         if torch.is_grad_enabled() and torch._C._any_requires_grad(*arguments):
             return function.apply([len(arguments[i]) for i in lists], *_flat(arguments, lists))
-        with torch._C._AutoDispatchBelowAutograd():
-            return op(*arguments)
+        return _below_autograd(op, arguments)
 
     _LIBRARY.impl(name, kernel, "Autograd")
 
