@@ -214,7 +214,7 @@ template <class T, int D>
 int64_t number_blocks(const Activation<T, D>& s) {
   const ActivateArguments<T, D>& a = s.a;
   for_parts(s.w.slices, s.table_size, [&](int, int64_t begin, int64_t end) {
-    __builtin_memset(a.table + begin, 0, sizeof(int) * (end - begin));
+    for (int64_t b = begin; b < end; b++) a.table[b] = 0;
   });
   for_parts(s.w.slices, s.table_size, [&](int, int64_t begin, int64_t end) { mark_touched(s, begin, end); });
   for_parts(s.w.slices, s.table_size, [&](int slice, int64_t begin, int64_t end) {
