@@ -212,6 +212,21 @@ def test_recording_changes_no_result(device, dim, law):
             assert relative_error(getattr(other, name), getattr(recorded, name).detach()) < 1e-13
 
 
+@pytest.mark.parametrize("law", [mpm.NeoHookean(E=1e4, nu=0.3), mpm.FixedCorotated(E=1e4, nu=0.3)])
+def test_a_step_can_be_recorded_after_inference(device, dim, law):
+    """What a step keeps from one call to the next may be made in inference mode and be saved for a gradient later."""
+    grid = mpm.Grid(0.1, (0,) * dim, (1,) * dim)
+    step = mpm.Step(grid, law, gravity=(0, -9.8, 0)[:dim], walls="slip")
+    state = step.prepare(block_state(dim, device))
+    with torch.inference_mode():
+        expected = mpm.rollout(step, state, 2, 1e-3)
+    leaves = {name: getattr(state, name).clone().requires_grad_() for name in ("v", "F")}
+    end = mpm.rollout(step, state.replace(**leaves), 2, 1e-3)
+    end.x.sum().backward()
+    assert all(leaf.grad.isfinite().all() and leaf.grad.any() for leaf in leaves.values())
+    assert relative_error(end.x.detach(), expected.x) < 1e-13
+
+
 def test_sorting_keeps_identities(device):
     state = block_state(3, device)
     step = make_step(3, walls="slip")

@@ -171,7 +171,8 @@ class Grid:
         if torch.compiler.is_compiling() or _is_fake(status) or torch.cuda.is_current_stream_capturing():
             return
         if self._on_host is None:
-            self._on_host = torch.empty(status.shape, dtype=status.dtype, pin_memory=True)
+            with torch.inference_mode(False):  # such that a later step may write to it
+                self._on_host = torch.empty(status.shape, dtype=status.dtype, pin_memory=True)
         self._on_host.copy_(status, non_blocking=True)
         self._pending = torch.cuda.Event()
         self._pending.record()

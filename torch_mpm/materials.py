@@ -145,7 +145,8 @@ class CompiledLaw(Material):
         numbers = [value for value in vars(self).values() if isinstance(value, float)]
         key = (state.x.dtype, state.x.device, state.ids, *numbers, *((t, t._version) for t in tensors))
         if self._cached is None or not _same(self._cached[0], key):
-            self._cached = (key, self._convert(state))
+            with torch.inference_mode(False):  # such that a later step may differentiate through them
+                self._cached = (key, self._convert(state))
         return self._cached[1]
 
     def _at_temperature(self, state: State) -> CompiledLaw:

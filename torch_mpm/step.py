@@ -176,9 +176,9 @@ class Step(nn.Module):
             return self.gravity
         cached = self._gravity_tensor
         if cached is None or cached.dtype != x.dtype or cached.device != x.device:
-            cached = (
-                torch.tensor(self.gravity, dtype=x.dtype, device=x.device).expand(self.grid.scenes, -1).contiguous()
-            )
+            with torch.inference_mode(False):  # such that a later step may differentiate through it
+                gravity = torch.tensor(self.gravity, dtype=x.dtype, device=x.device)
+                cached = gravity.expand(self.grid.scenes, -1).contiguous()
             self._gravity_tensor = cached
         return cached
 
