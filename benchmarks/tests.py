@@ -29,7 +29,10 @@ import torch
 from . import common
 
 COUNTS = ("tests", "failures", "errors", "skipped")
-SANITIZED_TESTS = {"racecheck": 4, "memcheck": 16}  # of one process; racecheck takes some .1 GB per second
+SANITIZED_TESTS = {"memcheck": 16, "racecheck": 4, "initcheck": 16, "synccheck": 16}
+"""Tests of one process; racecheck takes some .1 GB per second."""
+Outcome = tuple[int, dict[str, str] | None]
+"""The exit status of pytest, and the counts of its tests, None if it crashed."""
 
 
 def sanitized(tool: str) -> list[str]:
@@ -52,9 +55,7 @@ def visible_gpus() -> list[str]:
     return os.environ.get("CUDA_VISIBLE_DEVICES", numbered).split(",")
 
 
-def run_hand(
-    command: list[str], environment: dict[str, str], folder: Path, number: int, names: list[str]
-) -> tuple[int, dict[str, str] | None]:
+def run_hand(command: list[str], environment: dict[str, str], folder: Path, number: int, names: list[str]) -> Outcome:
     """The exit status of pytest on these tests, and their counts, None if it crashed."""
     arguments, report = folder / f"{number}.txt", folder / f"{number}.xml"
     arguments.write_text("\n".join(names))
@@ -72,17 +73,17 @@ def run_hand(
 
 def run_side_by_side(
     tool: list[str], command: list[str], hands: list[list[str]], processes: int, folder: Path
-) -> Iterator[dict[int, tuple[int, dict[str, str] | None]]]:
+) -> Iterator[dict[int, Outcome]]:
     """The outcomes of all hands that have run so far, after each."""
     command = [*tool, *command]
     environment = {**os.environ, "OMP_NUM_THREADS": str(max(1, (os.cpu_count() or 1) // processes))}
     gpus = visible_gpus()
 
-    def run(number: int) -> tuple[int, dict[str, str] | None]:
+    def run(number: int) -> Outcome:
         on_one_gpu = {**environment, "CUDA_VISIBLE_DEVICES": gpus[number % len(gpus)]}
         return run_hand(command, on_one_gpu, folder, number, hands[number])
 
-    outcomes: dict[int, tuple[int, dict[str, str] | None]] = {}
+    outcomes: dict[int, Outcome] = {}
     unfinished = list(range(len(hands)))
     # What a sanitizer's want of memory killed runs again with more of it; without one a crash is a crash.
     for side_by_side in (processes, max(1, processes // 4)) if tool else (processes,):
@@ -98,7 +99,7 @@ def counts_of(report: Path) -> dict[str, str]:
     return next(ElementTree.parse(report).getroot().iter("testsuite")).attrib
 
 
-def summary(outcomes: dict[int, tuple[int, dict[str, str] | None]]) -> dict[str, int]:
+def summary(outcomes: dict[int, Outcome]) -> dict[str, int]:
     """The worst exit status of the hands, and their counts together."""
     total = dict.fromkeys(COUNTS, 0)
     for _, counts in outcomes.values():
