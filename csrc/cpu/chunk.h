@@ -12,6 +12,9 @@ constexpr int kLanes = 8;     // of a pack of particles: cells hold about that m
 constexpr int kChannels = 4;  // channels that are transferred together
 template <class T>
 using Lanes = Pack<T, kLanes>;
+// Lanes where nothing depends on the cells: a register of values, if that is more.
+template <class T>
+constexpr int kWideLanes = kRegisterBytes / int(sizeof(T)) > kLanes ? kRegisterBytes / int(sizeof(T)) : kLanes;
 
 // A slot that holds particles, and the slots of the blocks that these can touch: o as in activate_kernels.cpp.
 template <class T, int D>
@@ -62,47 +65,51 @@ struct Chunk {
   int by_cell(int i) const { return order[i] % kChunk; }  // the i-th particle in the order of cells
 };
 
-// Up to kLanes particles; id repeats the first one beyond the count. Where they are `consecutive`, all lanes may be
-// read and written, whatever the count.
-struct Group {
+// Up to N particles; id repeats the first one beyond the count. Where they are `consecutive`, all lanes may be read and
+// written, whatever the count.
+template <int N>
+struct GroupOf {
+  static constexpr int kSize = N;
   int count;
   bool consecutive;
-  int id[kLanes];
+  int id[N];
 #ifdef __AVX512VL__
   // Otherwise: runs of lanes whose particles lie one after another in memory. Particles that have changed places since
   // they were sorted are few, so most groups have one to three.
   int runs;
-  uint8_t lanes[kLanes];  // of each run, as bits
-  int start[kLanes];      // the particle that lane 0 would have in the run
+  uint16_t lanes[N];  // of each run, as bits
+  int start[N];       // the particle that lane 0 would have in the run
 #endif
 
   void find_runs() {
 #ifdef __AVX512VL__
     unsigned first = 1;  // lanes that begin a run, as bits
     MPM_UNROLL
-    for (int l = 1; l < kLanes; l++) first |= unsigned(id[l] != id[l - 1] + 1) << l;
+    for (int l = 1; l < N; l++) first |= unsigned(id[l] != id[l - 1] + 1) << l;
     const unsigned all = (1u << count) - 1;
     runs = 0;
     for (first &= all; first; first &= first - 1) {
       const int lane = __builtin_ctz(first);
       const unsigned later = first & (first - 1), end = later ? 1u << __builtin_ctz(later) : all + 1;
-      lanes[runs] = uint8_t(end - (1u << lane));
+      lanes[runs] = uint16_t(end - (1u << lane));
       start[runs++] = id[lane] - lane;
     }
 #endif
   }
 };
+using Group = GroupOf<kLanes>;
 
 // Particles i, i + 1, ... of a chunk.
-MPM_HD Group group_by_id(const Chunk& c, int i) {
-  Group g;
+template <int N>
+MPM_HD GroupOf<N> group_by_id(const Chunk& c, int i) {
+  GroupOf<N> g;
   const int rest = c.count - i;
-  g.count = rest < kLanes ? rest : kLanes;
-  g.consecutive = rest >= kLanes && c.id[i + kLanes - 1] - c.id[i] == kLanes - 1;
-  if (rest >= kLanes)
+  g.count = rest < N ? rest : N;
+  g.consecutive = rest >= N && c.id[i + N - 1] - c.id[i] == N - 1;
+  if (rest >= N)
     __builtin_memcpy(g.id, c.id + i, sizeof(g.id));
   else
-    for (int l = 0; l < kLanes; l++) g.id[l] = c.id[i + (l < g.count ? l : 0)];
+    for (int l = 0; l < N; l++) g.id[l] = c.id[i + (l < g.count ? l : 0)];
   if (!g.consecutive) g.find_runs();
   return g;
 }
@@ -129,24 +136,24 @@ MPM_HD T& at(const Field<T>& f, int64_t p, int i = 0, int j = 0) {
   return f.pointer[p * f.stride[0] + i * f.stride[1] + j * f.stride[2]];
 }
 
-template <class T>
-MPM_HD Lanes<T> load_runs(const T* from, const Group& g) {
+template <class T, int N>
+MPM_HD Pack<T, N> load_runs(const T* from, const GroupOf<N>& g) {
 #ifdef __AVX512VL__
-  Lanes<T> r(0);
+  Pack<T, N> r(0);
   for (int k = 0; k < g.runs; k++) r = r.with(from + g.start[k], g.lanes[k]);
   return r;
 #else
-  return Lanes<T>::gather(from, g.id);
+  return Pack<T, N>::gather(from, g.id);
 #endif
 }
 
-template <class T>
-MPM_HD Lanes<T> load_row(const T* row, int64_t stride, const Group& g) {
-  if (stride == 1) return g.consecutive ? Lanes<T>::load(row + g.id[0]) : load_runs(row, g);
-  T lanes[kLanes];
+template <class T, int N>
+MPM_HD Pack<T, N> load_row(const T* row, int64_t stride, const GroupOf<N>& g) {
+  if (stride == 1) return g.consecutive ? Pack<T, N>::load(row + g.id[0]) : load_runs(row, g);
+  T lanes[N];
   MPM_UNROLL
-  for (int l = 0; l < kLanes; l++) lanes[l] = row[g.id[l] * stride];
-  return Lanes<T>::load(lanes);
+  for (int l = 0; l < N; l++) lanes[l] = row[g.id[l] * stride];
+  return Pack<T, N>::load(lanes);
 }
 
 // Writes the lanes of the group only.
@@ -180,8 +187,8 @@ MPM_HD T* row_of(const Field<T>& f, int i = 0, int j = 0) {
   return f.pointer + i * f.stride[1] + j * f.stride[2];
 }
 
-template <class T>
-MPM_HD Lanes<T> load(const Field<const T>& f, const Group& g, int i = 0, int j = 0) {
+template <class T, int N>
+MPM_HD Pack<T, N> load(const Field<const T>& f, const GroupOf<N>& g, int i = 0, int j = 0) {
   return load_row(row_of(f, i, j), f.stride[0], g);
 }
 template <class T>
@@ -193,21 +200,24 @@ MPM_HD void store(const Lanes<T>& v, const Field<T>& f, const Group& g, int i = 
   store_row(v, row_of(f, i, j), f.stride[0], g);
 }
 
-// kLanes particles one after another in memory, of fields with unit stride: loads and stores without a question.
-struct Run {
+// N particles one after another in memory, of fields with unit stride: loads and stores without a question.
+template <int N>
+struct RunOf {
+  static constexpr int kSize = N;
   int first;
 };
+using Run = RunOf<kLanes>;
 
-template <class T>
-MPM_HD Lanes<T> load_row(const T* row, int64_t, const Run& r) {
-  return Lanes<T>::load(row + r.first);
+template <class T, int N>
+MPM_HD Pack<T, N> load_row(const T* row, int64_t, const RunOf<N>& r) {
+  return Pack<T, N>::load(row + r.first);
 }
 template <class T>
 MPM_HD void store_row(const Lanes<T>& v, T* row, int64_t, const Run& r) {
   v.store(row + r.first);
 }
-template <class T>
-MPM_HD Lanes<T> load(const Field<const T>& f, const Run& r, int i = 0, int j = 0) {
+template <class T, int N>
+MPM_HD Pack<T, N> load(const Field<const T>& f, const RunOf<N>& r, int i = 0, int j = 0) {
   return load_row(row_of(f, i, j), 1, r);
 }
 

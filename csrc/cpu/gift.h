@@ -15,9 +15,10 @@ struct Gift {
 };
 
 template <class T, int D, class G>
-MPM_HD Matrix<Lanes<T>, D> load_matrix(const Field<const T>& f, const G& g) {
-  if (!f.pointer) return zero_matrix<Lanes<T>, D>();
-  Matrix<Lanes<T>, D> r;
+MPM_HD Matrix<Pack<T, G::kSize>, D> load_matrix(const Field<const T>& f, const G& g) {
+  using P = Pack<T, G::kSize>;
+  if (!f.pointer) return zero_matrix<P, D>();
+  Matrix<P, D> r;
   MPM_UNROLL
   for (int i = 0; i < D; i++)
     MPM_UNROLL
@@ -25,24 +26,23 @@ MPM_HD Matrix<Lanes<T>, D> load_matrix(const Field<const T>& f, const G& g) {
   return r;
 }
 
-// The inputs of a group of particles, a Group or a Run.
+// The inputs of a GroupOf or RunOf particles.
 template <class T, int D, class G>
-MPM_HD ParticleMomentum<Lanes<T>, D> load_momentum(const P2GArguments<T, D>& a, const G& g, int scene) {
-  ParticleMomentum<Lanes<T>, D> p;
+MPM_HD ParticleMomentum<Pack<T, G::kSize>, D> load_momentum(const P2GArguments<T, D>& a, const G& g, int scene) {
+  using P = Pack<T, G::kSize>;
+  ParticleMomentum<P, D> p;
   p.mass = load(a.mass, g);
   p.affine = load_matrix<T, D>(a.affine, g);
   p.stress = load_matrix<T, D>(a.stress, g);
-  p.volume = a.stress.pointer ? load(a.volume, g) : Lanes<T>(0);
-  p.dt = Lanes<T>(T(a.dt) * (a.scene_dt.pointer ? a.scene_dt.pointer[scene * a.scene_dt.stride[0]] : T(1)));
+  p.volume = a.stress.pointer ? load(a.volume, g) : P(0);
+  p.dt = P(T(a.dt) * (a.scene_dt.pointer ? a.scene_dt.pointer[scene * a.scene_dt.stride[0]] : T(1)));
   MPM_UNROLL
   for (int i = 0; i < D; i++) p.velocity[i] = load(a.velocity, g, i);
   return p;
 }
 
-template <int Order, bool Slope, class T, int D>
-MPM_HD Gift<Lanes<T>, D> gift_of_momentum(const P2GArguments<T, D>& a, const ParticleMomentum<Lanes<T>, D>& p,
-                                          const Lanes<T> f[D]) {
-  using P = Lanes<T>;
+template <int Order, bool Slope, class T, class P, int D>
+MPM_HD Gift<P, D> gift_of_momentum(const P2GArguments<T, D>& a, const ParticleMomentum<P, D>& p, const P f[D]) {
   const Geometry<T, D>& geometry = a.topology.geometry;
   const NodeMomentum<P, D> n =
       to_nodes<Order>(p, a.form, a.affine.pointer, a.stress.pointer, P(geometry.dx), P(geometry.inverse_dx));
@@ -63,10 +63,10 @@ MPM_HD Gift<Lanes<T>, D> gift_of_momentum(const P2GArguments<T, D>& a, const Par
 }
 
 // Channels first, ..., first + count - 1 of the features of ScatterArguments or PositionGradientArguments.
-template <bool Slope, bool Gradient, class T, int D, class Arguments>
-MPM_HD Gift<Lanes<T>, D> gift_of_features(const Arguments& a, int first, int count, const Group& g,
-                                          const Lanes<T> f[D]) {
-  using P = Lanes<T>;
+template <bool Slope, bool Gradient, class T, int D, class Arguments, int N>
+MPM_HD Gift<Pack<T, N>, D> gift_of_features(const Arguments& a, int first, int count, const GroupOf<N>& g,
+                                            const Pack<T, N> f[D]) {
+  using P = Pack<T, N>;
   const Geometry<T, D>& geometry = a.topology.geometry;
   const P scale(a.moment_scale * double(geometry.dx)), inverse_dx(geometry.inverse_dx);
   Gift<P, D> gift;

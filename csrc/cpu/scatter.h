@@ -22,8 +22,9 @@ struct Gifts {
   alignas(64) T weight[D][S][kLine];
   alignas(64) T derivative[D][S][Gradient ? kLine : 1];
 
-  void put(int i, const Lanes<T> f[D], const Gift<Lanes<T>, D>& gift) {
-    Lanes<T> field[kPadded], w[S];
+  template <int N>
+  void put(int i, const Pack<T, N> f[D], const Gift<Pack<T, N>, D>& gift) {
+    Pack<T, N> field[kPadded], w[S];
     MPM_UNROLL
     for (int c = 0; c < kChannels; c++) {
       field[c] = gift.value[c];
@@ -34,7 +35,7 @@ struct Gifts {
       }
     }
     MPM_UNROLL
-    for (int k = kFields; k < kPadded; k++) field[k] = Lanes<T>(0);
+    for (int k = kFields; k < kPadded; k++) field[k] = Pack<T, N>(0);
     store_transposed<kPadded>(field, row[i], kPadded);
     MPM_UNROLL
     for (int a = 0; a < D; a++) {
@@ -148,24 +149,29 @@ void sum_cell(const Gifts<Order, T, D, Slope, Gradient>& g, const uint16_t* orde
     for (int j = 0; j < S; j++) sum[i][j].store(tile + i * kTileX + j * kTileY);
 }
 
+// Numbers of N cells as a Schedule holds them.
+template <int N>
+struct EntriesOf {
+  typedef uint16_t Value __attribute__((vector_size(N * sizeof(uint16_t))));
+};
+
 // Distance of the particles of a group from their base nodes; `particle` is the first one's number in the chunk.
-template <class T, int D>
+template <class T, int D, int N>
 MPM_HD void distances(const Topology<T, D>& t, const Home<T, D>& home, const Chunk& chunk, const Field<const T>& x,
-                      const Group& g, int particle, Lanes<T> f[D]) {
-  typedef uint16_t Entries __attribute__((vector_size(kLanes * sizeof(uint16_t))));
-  Entries entry = {};
-  if (g.count == kLanes)
+                      const GroupOf<N>& g, int particle, Pack<T, N> f[D]) {
+  typename EntriesOf<N>::Value entry = {};
+  if (g.count == N)
     __builtin_memcpy(&entry, chunk.order + particle, sizeof(entry));
   else
     for (int l = 0; l < g.count; l++) entry[l] = chunk.order[particle + l];
-  typedef int32_t Integers __attribute__((vector_size(kLanes * sizeof(int32_t))));
-  typedef T Values __attribute__((vector_size(kLanes * sizeof(T))));
+  using Integers = typename RegisterOf<float, N>::Integer;
+  using Values = typename RegisterOf<T, N>::Value;
   const Integers cell = __builtin_convertvector(entry / kChunk, Integers);
   MPM_UNROLL
   for (int a = 0; a < D; a++) {
     const Integers coordinate = cell >> 2 * (D - 1 - a) & (kBlockWidth - 1);  // cell_coordinate() of each
     const Values base = __builtin_convertvector(coordinate + home.corner[a], Values);
-    Lanes<T> node;
+    Pack<T, N> node;
     __builtin_memcpy(&node, &base, sizeof(node));
     f[a] = distance_in_cells(t.geometry, a, load(x, g, a), node);
   }
@@ -185,9 +191,10 @@ void scatter_channels(const Topology<T, D>& t, const Field<const T>& x, const No
   const ScheduleIn s = schedule_of(t);
   const auto fill = [&](const Home<T, D>& home, const Chunk& chunk, Gifts<Order, T, D, Slope, Gradient>& gifts,
                         Tile<Order, T, D>& tile) {
-    for (int i = 0; i < chunk.count; i += kLanes) {
-      const Group g = group_by_id(chunk, i);
-      Lanes<T> f[D];
+    constexpr int N = kWideLanes<T>;
+    for (int i = 0; i < chunk.count; i += N) {
+      const GroupOf<N> g = group_by_id<N>(chunk, i);
+      Pack<T, N> f[D];
       distances(t, home, chunk, x, g, i, f);
       gifts.put(i, f, give(g, f, home.scene));
     }

@@ -8,9 +8,10 @@ template <int Order, bool Slope, bool Gradient, class T, int D>
 void p2g_with(const P2GArguments<T, D>& a) {
   const bool direct = unit_stride(a.mass, a.velocity, a.affine, a.stress, a.volume);
   scatter_channels<Order, Slope, Gradient>(
-      a.topology, a.x, a.nodes, 0, 1 + D, [&](const Group& g, const Lanes<T> f[D], int scene) {
+      a.topology, a.x, a.nodes, 0, 1 + D, [&]<int N>(const GroupOf<N>& g, const Pack<T, N> f[D], int scene) {
         // One gift for both, so that rounding does not depend on what is consecutive.
-        const auto p = direct && g.consecutive ? load_momentum(a, Run{g.id[0]}, scene) : load_momentum(a, g, scene);
+        const bool run = direct && g.consecutive;
+        const auto p = run ? load_momentum(a, RunOf<N>{g.id[0]}, scene) : load_momentum(a, g, scene);
         return gift_of_momentum<Order, Slope>(a, p, f);
       });
 }
@@ -28,7 +29,7 @@ void p2g(const P2GArguments<T, D>& a) {
 template <int Order, bool Slope, bool Gradient, class T, int D>
 void scatter_with(const ScatterArguments<T, D>& a, int first, int count) {
   scatter_channels<Order, Slope, Gradient>(a.topology, a.x, a.nodes, first, count,
-                                           [&](const Group& g, const Lanes<T> f[D], int) {
+                                           [&]<int N>(const GroupOf<N>& g, const Pack<T, N> f[D], int) {
                                              return gift_of_features<Slope, Gradient, T, D>(a, first, count, g, f);
                                            });
 }

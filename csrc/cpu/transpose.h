@@ -1,49 +1,55 @@
 #pragma once
 
+#include <utility>
+
 #include "cpu/chunk.h"
 
 // From one pack per field to one row of fields per particle.
 namespace mpm::cpu {
 inline namespace TORCH_MPM_ISA {
 
-// Transposes 8 packs of 8 lanes in registers: three rounds that exchange halves, quarters and neighbours.
-template <class T>
-MPM_HD void transpose(Lanes<T> r[kLanes]) {
-  typedef typename PackShape<T, kLanes>::Value V;
-  V t[8], u[8];
-  MPM_UNROLL
-  for (int i = 0; i < 8; i += 2) {
-    t[i] = __builtin_shufflevector(r[i].part[0], r[i + 1].part[0], 0, 8, 2, 10, 4, 12, 6, 14);
-    t[i + 1] = __builtin_shufflevector(r[i].part[0], r[i + 1].part[0], 1, 9, 3, 11, 5, 13, 7, 15);
-  }
-  MPM_UNROLL
-  for (int k = 0; k < 4; k++) {
-    const int i = k / 2 * 4 + k % 2;
-    u[i] = __builtin_shufflevector(t[i], t[i + 2], 0, 1, 8, 9, 4, 5, 12, 13);
-    u[i + 2] = __builtin_shufflevector(t[i], t[i + 2], 2, 3, 10, 11, 6, 7, 14, 15);
-  }
-  MPM_UNROLL
-  for (int i = 0; i < 4; i++) {
-    r[i].part[0] = __builtin_shufflevector(u[i], u[i + 4], 0, 1, 2, 3, 8, 9, 10, 11);
-    r[i + 4].part[0] = __builtin_shufflevector(u[i], u[i + 4], 4, 5, 6, 7, 12, 13, 14, 15);
-  }
+// Lanes whose number lacks the bit `Step` from a, or that have it if High, each beside the same one of b.
+template <int Step, bool High, class V, int... Lane>
+MPM_HD V exchange(const V& a, const V& b, std::integer_sequence<int, Lane...>) {
+  constexpr int N = sizeof...(Lane);
+  return __builtin_shufflevector(a, b, ((Lane & Step ? N : 0) + (High ? Lane | Step : Lane & ~Step))...);
 }
 
-// Lane l of field k to to[l * stride + k]; Fields is a multiple of kLanes.
-template <int Fields, class T>
-MPM_HD void store_transposed(Lanes<T> field[Fields], T* to, int stride) {
+// Transposes 8 packs of 8 lanes, or the two halves of 8 packs of 16 lanes by themselves.
+template <class T, int N>
+MPM_HD void transpose(Pack<T, N> r[8]) {
+  constexpr auto all = std::make_integer_sequence<int, N>();
+  const auto exchange_all = [&]<int Step>() {
   MPM_UNROLL
-  for (int first = 0; first < Fields; first += kLanes) {
-    if constexpr (Lanes<T>::kParts == 1) {
-      transpose<T>(field + first);
+    for (int i = 0; i < 8; i++) {
+      if (i & Step) continue;
+      const auto a = r[i].part[0], b = r[i + Step].part[0];
+      r[i].part[0] = exchange<Step, false>(a, b, all);
+      r[i + Step].part[0] = exchange<Step, true>(a, b, all);
+    }
+  };
+  exchange_all.template operator()<1>();
+  exchange_all.template operator()<2>();
+  exchange_all.template operator()<4>();
+}
+
+// Lane l of field k to to[l * stride + k]; Fields is a multiple of 8.
+template <int Fields, class T, int N>
+MPM_HD void store_transposed(Pack<T, N> field[Fields], T* to, int stride) {
+  MPM_UNROLL
+  for (int first = 0; first < Fields; first += 8) {
+    if constexpr (Pack<T, N>::kParts == 1) {
+      transpose(field + first);
       MPM_UNROLL
-      for (int l = 0; l < kLanes; l++) field[first + l].store(to + l * stride + first);
+      for (int l = 0; l < N; l++)
+        __builtin_memcpy(to + l * stride + first, reinterpret_cast<const T*>(field[first + l % 8].part) + l / 8 * 8,
+                         8 * sizeof(T));
     } else {
-      T lanes[kLanes][kLanes];
+      T lanes[8][N];
       MPM_UNROLL
-      for (int k = 0; k < kLanes; k++) field[first + k].store(lanes[k]);
-      for (int l = 0; l < kLanes; l++)
-        for (int k = 0; k < kLanes; k++) to[l * stride + first + k] = lanes[k][l];
+      for (int k = 0; k < 8; k++) field[first + k].store(lanes[k]);
+      for (int l = 0; l < N; l++)
+        for (int k = 0; k < 8; k++) to[l * stride + first + k] = lanes[k][l];
     }
   }
 }

@@ -74,10 +74,12 @@ struct Pack {
   MPM_HD void store(T* to) const { __builtin_memcpy(to, part, sizeof(part)); }
 
 #ifdef __AVX512VL__
-  // Lanes of a bit mask from `from` on, the others of this pack; only the former are read. For N = 8.
+  // Lanes of a bit mask from `from` on, the others of this pack; only the former are read. For N = 8, and 16 in float.
   MPM_HD Pack with(const T* from, unsigned lanes) const {
     Pack r;
-    if constexpr (sizeof(T) == 4)
+    if constexpr (N == 16)
+      r.part[0] = _mm512_mask_loadu_ps(part[0], __mmask16(lanes), from);
+    else if constexpr (sizeof(T) == 4)
       r.part[0] = _mm256_mask_loadu_ps(part[0], __mmask8(lanes), from);
     else
       r.part[0] = _mm512_mask_loadu_pd(part[0], __mmask8(lanes), from);
