@@ -8,7 +8,8 @@ template <int Order, bool Slope, bool Gradient, class T, int D>
 void p2g_with(const P2GArguments<T, D>& a) {
   const bool direct = unit_stride(a.mass, a.velocity, a.affine, a.stress, a.volume);
   scatter_channels<Order, Slope, Gradient>(
-      a.topology, a.x, a.nodes, 0, 1 + D, [&]<int N>(const GroupOf<N>& g, const Pack<T, N> f[D], int scene) {
+      a.topology, a.x, a.nodes, 0, 1 + D,
+      [&]<int N>(const GroupOf<N>& g, const Pack<T, N> f[D], int scene) __attribute__((always_inline)) {
         // One gift for both, so that rounding does not depend on what is consecutive.
         const bool run = direct && g.consecutive;
         const auto p = run ? load_momentum(a, RunOf<N>{g.id[0]}, scene) : load_momentum(a, g, scene);

@@ -33,6 +33,18 @@ MPM_HD void transpose(Pack<T, N> r[8]) {
   exchange_all.template operator()<4>();
 }
 
+// The first or second 8 lanes.
+template <class T, int N>
+MPM_HD void store_half(const Pack<T, N>& v, int half, T* to) {
+  if constexpr (N == 8) {
+    v.store(to);
+  } else {
+  const auto eight = half ? __builtin_shufflevector(v.part[0], v.part[0], 8, 9, 10, 11, 12, 13, 14, 15)
+                          : __builtin_shufflevector(v.part[0], v.part[0], 0, 1, 2, 3, 4, 5, 6, 7);
+  __builtin_memcpy(to, &eight, sizeof(eight));
+  }
+}
+
 // Lane l of field k to to[l * stride + k]; Fields is a multiple of 8.
 template <int Fields, class T, int N>
 MPM_HD void store_transposed(Pack<T, N> field[Fields], T* to, int stride) {
@@ -42,8 +54,7 @@ MPM_HD void store_transposed(Pack<T, N> field[Fields], T* to, int stride) {
       transpose(field + first);
       MPM_UNROLL
       for (int l = 0; l < N; l++)
-        __builtin_memcpy(to + l * stride + first, reinterpret_cast<const T*>(field[first + l % 8].part) + l / 8 * 8,
-                         8 * sizeof(T));
+        store_half(field[first + l % 8], l / 8, to + l * stride + first);
     } else {
       T lanes[8][N];
       MPM_UNROLL
