@@ -103,9 +103,9 @@ void classify(const Activation<T, D>& s, int64_t p, int64_t* totals) {
 template <int Order, class T, int D>
 bool classify_pack(const Activation<T, D>& s, int64_t p) {
   const ActivateArguments<T, D>& a = s.a;
-  typedef T Values __attribute__((vector_size(kLanes * sizeof(T))));
-  typedef int32_t Integers __attribute__((vector_size(kLanes * sizeof(int32_t))));
-  typedef uint32_t Unsigned __attribute__((vector_size(kLanes * sizeof(uint32_t))));
+  using Values = typename RegisterOf<T, kLanes>::Value;
+  using Integers = RegisterOf<float, kLanes>::Integer;
+  using Unsigned = RegisterOf<float, kLanes>::Bits;
   typedef uint8_t Bytes __attribute__((vector_size(kLanes)));
   Unsigned key = {}, cell = {};
   bool known = true;
@@ -188,22 +188,21 @@ void count_homes(const Activation<T, D>& s, int slice, int64_t begin, int64_t en
 // Sets the table to 1 at each block that the particles of homes [begin, end) touch.
 template <class T, int D>
 void mark_touched(const Activation<T, D>& s, int64_t begin, int64_t end) {
-  const auto touched_from = [&](int64_t home, auto& blocks) {
+  const auto touched_from = [&]<class Blocks>(int64_t home) {  // of one home, or of eight in a row
+    Blocks blocks = 0;
     for (int k = 0; k < s.w.slices; k++) {
-      auto of_slice = blocks;
-      __builtin_memcpy(&of_slice, s.w.touched + k * s.table_size + home, sizeof(blocks));
+      Blocks of_slice;
+      __builtin_memcpy(&of_slice, s.w.touched + k * s.table_size + home, sizeof(Blocks));
       blocks |= of_slice;
     }
+    return blocks;
   };
   for (int64_t home = begin; home < end; home++) {
-    uint64_t of_eight = 0;  // most homes have no particles
-    if (home + 8 <= end) touched_from(home, of_eight);
-    if (home + 8 <= end && !of_eight) {
+    if (home + 8 <= end && !touched_from.template operator()<uint64_t>(home)) {  // most homes have no particles
       home += 7;
       continue;
     }
-    uint8_t blocks = 0;
-    touched_from(home, blocks);
+    const unsigned blocks = touched_from.template operator()<uint8_t>(home);
     for (int o = 0; o < kColours<D>; o++)
       if (blocks >> o & 1) __atomic_store_n(s.a.table + home + s.neighbour[o], 1, __ATOMIC_RELAXED);
   }
