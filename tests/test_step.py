@@ -412,3 +412,37 @@ def test_a_step_is_captured_in_a_cuda_graph():
         for _ in range(4):
             graph.replay()
     assert relative_error(static.x, eager.x) < 1e-6
+
+
+@pytest.mark.cuda
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+@pytest.mark.parametrize("inference", [False, True])
+def test_replays_of_a_graph_are_watched(inference):
+    """Problems of any replay are reported, whatever else happens to the step and to the memory between."""
+    step, state = mpm88("cuda")
+    with torch.inference_mode(inference), torch.no_grad():
+        static = step(state, 2e-4).map(torch.clone)
+        graph = torch.cuda.CUDAGraph()
+        with torch.cuda.graph(graph):
+            for _ in range(2):
+                step(static, 2e-4)
+        step(state, 2e-4)
+        scribble = [torch.full((8,), 7, dtype=torch.int32, device="cuda") for _ in range(100)]
+        for _ in range(3):
+            graph.replay()
+        step.check()
+        assert [status[5].item() for status in step._activations.all()] == [
+            2,
+            7,
+        ]  # activations: eager, and with replays
+        inside = static.x[5].clone()
+        static.x[5] = -9.0
+        graph.replay()
+        static.x[5] = inside
+        graph.replay()
+        with pytest.raises(mpm.SimulationError, match=r"1 particles left the grid .* at step 7, lowest index 5"):
+            step.check()
+        step.reset()
+        graph.replay()
+        step.check()
+    assert all(bool((t == 7).all()) for t in scribble)

@@ -16,6 +16,8 @@ PADDING = 3
 """Nodes beyond `lower` and `upper`, so that a particle on the boundary has its support (csrc/grid/geometry.h)."""
 BLOCK_WIDTH = 4
 INT32_MAX = 2**31 - 1
+NO_PROBLEM = (0, 0, -1, 0, -1, 0, -1, 0)
+"""The status before the first activation (csrc/grid/status.h)."""
 
 KERNEL_ORDERS = {"quadratic": 2, "cubic": 3}
 
@@ -178,8 +180,53 @@ class Grid:
         self._pending.record()
 
 
+class ActivationRecord:
+    """The status of all activations of one user of a grid, also of those that CUDA graphs replay.
+
+    A replay reads and writes the tensors of the capture. So captured activations go on in the tensor that they found,
+    which is kept; the first activation of all should not be a captured one, or each replay forgets those before.
+
+    Attributes:
+        status: int32 [8], see csrc/grid/status.h; None before the first activation.
+    """
+
+    def __init__(self) -> None:
+        self.status: Tensor | None = None
+        self._replayed: list[Tensor] = []
+
+    def activate(self, grid: Grid, x: Tensor, scene: Tensor | None) -> Blocks:
+        """As `Grid.activate`; the capacity of the grid follows."""
+        before = self.status
+        blocks = grid.activate(x, scene, before)
+        grid.watch(blocks.status)
+        if before is None or not _is_captured(x):
+            self.status = blocks.status
+            return blocks
+        with torch.inference_mode():  # in which any tensor may be written to
+            before.copy_(blocks.status)
+        if not any(before is kept for kept in self._replayed):
+            self._replayed.append(before)
+        return blocks
+
+    def all(self) -> list[Tensor]:
+        """The latest status, and those that graphs go on with."""
+        latest = [] if self.status is None else [self.status]
+        return latest + [kept for kept in self._replayed if kept is not self.status]
+
+    def reset(self) -> None:
+        self.status = None
+        with torch.inference_mode():
+            for kept in self._replayed:
+                kept.copy_(torch.tensor(NO_PROBLEM, dtype=torch.int32))
+
+
 def _with_headroom(blocks: int) -> int:
     return blocks + blocks // 2 + 16
+
+
+def _is_captured(x: Tensor) -> bool:
+    """Whether what is done with a tensor goes into a CUDA graph."""
+    return x.is_cuda and not torch.compiler.is_compiling() and torch.cuda.is_current_stream_capturing()
 
 
 def _is_fake(x: Tensor) -> bool:

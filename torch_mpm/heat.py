@@ -23,7 +23,7 @@ from torch import Tensor, nn
 
 from .boundaries import _norm
 from .errors import SimulationError, check_like
-from .grid import Blocks, Grid
+from .grid import ActivationRecord, Blocks, Grid
 from .heat_boundaries import FixedSurface, HeatNodes
 from .materials import _check_value
 from .ops import gather, heat_cg, scatter
@@ -122,11 +122,15 @@ class Heat(nn.Module):
         if melting_point is not None and latent_heat is not None:
             store(self, "melting_point", melting_point)
             store(self, "latent_heat", _check_value("latent_heat", latent_heat, "positive", positive))
-        self.status: Tensor | None = None
-        """Status of the activations of `forward`, as `Step.status`."""
+        self._activations = ActivationRecord()
         self.unsolved: Tensor | None = None
         """Solves of each scene so far that missed their tolerance, int32 [B], and the largest residual [B] [K]."""
         self.residual: Tensor | None = None
+
+    @property
+    def status(self) -> Tensor | None:
+        """Status of the activations of `forward`, as `Step.status`."""
+        return self._activations.status
 
     @property
     def affine(self) -> bool:
@@ -163,9 +167,7 @@ class Heat(nn.Module):
                 is not positive.
         """
         state = self.prepare(state)
-        blocks = self.grid.activate(state.x, state.scene, self.status)
-        self.status = blocks.status
-        self.grid.watch(blocks.status)
+        blocks = self._activations.activate(self.grid, state.x, state.scene)
         return state.replace(**self.update(blocks, state, dt), time=state.time + dt)
 
     def update(
@@ -337,7 +339,10 @@ class Heat(nn.Module):
 
     def reset(self) -> None:
         """Forget what became of the solves so far."""
-        self.status = self.unsolved = self.residual = None
+        self._activations.reset()
+        for kept in (self.unsolved, self.residual):
+            if kept is not None:  # and CUDA graphs may write to it
+                kept.zero_()
 
 
 def present_volume(state: State) -> Tensor:

@@ -13,7 +13,7 @@ from torch.utils.checkpoint import checkpoint as run_checkpointed
 from .boundaries import Walls
 from .cfl import stable_dt
 from .errors import GridOverflowError, SimulationError
-from .grid import Blocks, Grid
+from .grid import ActivationRecord, Blocks, Grid
 from .heat import Heat
 from .materials import Material
 from .ops import contact, fusible, g2p, g2p_advance, gather, grid_update, p2g
@@ -88,8 +88,7 @@ class Step(nn.Module):
             for part in law.modules():
                 if isinstance(part, Material):
                     part.dissipation = True
-        self.status: Tensor | None = None
-        """Status of all steps so far, int32 [8] on the device of the particles; `check` reads it."""
+        self._activations = ActivationRecord()
         self._gravity_tensor: Tensor | None = None
 
     def forward(self, state: State, dt: float | Tensor) -> State:
@@ -105,9 +104,7 @@ class Step(nn.Module):
         """
         grid, scene = self.grid, state.scene
         state = self.prepare(state)
-        blocks = grid.activate(state.x, scene, self.status)
-        self.status = blocks.status
-        grid.watch(blocks.status)
+        blocks = self._activations.activate(grid, state.x, scene)
         form, affine = self.stress_form, state.C if self.transfer == "apic" else None
         fields, stress = self.law.update(With(state, dt=dt) if self._rate_dependent else state)  # type: ignore[arg-type]
         dissipated = fields.pop("dissipated", None)
@@ -187,8 +184,15 @@ class Step(nn.Module):
         transfer = "flip" if self.flip else self.transfer
         return stable_dt(self.grid, self.law, self.prepare(state), cfl, transfer, self.stress_form)
 
+    @property
+    def status(self) -> Tensor | None:
+        """Status of all steps so far, int32 [8] on the device of the particles, see csrc/grid/status.h."""
+        return self._activations.status
+
     def check(self, state: State | None = None) -> None:
         """Read the status of all steps so far, and look at a state if one is given; synchronises with the device.
+
+        What CUDA graphs replay is among them, if the step had been taken once before it was captured.
 
         Raises:
             GridOverflowError: if more blocks were active than the grid has room for.
@@ -196,8 +200,8 @@ class Step(nn.Module):
                 meaning for a particle's deformation (turned inside out, J ≤ 0); such a particle has zero stress from
                 then on.
         """
-        if self.status is not None:
-            check_status(self.status, self.grid)
+        for status in self._activations.all():
+            check_status(status, self.grid)
         if self.heat is not None:
             self.heat.check()
         if state is not None:
@@ -205,7 +209,7 @@ class Step(nn.Module):
 
     def reset(self) -> None:
         """Forget the status of the steps so far."""
-        self.status = None
+        self._activations.reset()
         if self.heat is not None:
             self.heat.reset()
 

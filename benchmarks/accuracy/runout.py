@@ -260,7 +260,6 @@ class Segment:
         C = torch.zeros_like(state.F) if step.transfer == "apic" else None  # type: ignore[arg-type]
         self.state = state.replace(ids=ids, C=C)
         self.time = torch.zeros(step.grid.scenes, dtype=torch.float64, device=state.x.device)
-        self.status = torch.zeros_like(step.grid.activate(state.x, state.scene).status)
         self.graph: torch.cuda.CUDAGraph | None = None
         self.called = False
 
@@ -276,7 +275,6 @@ class Segment:
         self.called = True
 
     def _steps(self) -> None:
-        self.step.status = self.status
         state = self.state.sorted(self.step.grid)
         dt = self.time_step(state)
         for k in range(SEGMENT):
@@ -284,7 +282,6 @@ class Segment:
                 dt = self.time_step(state)
             state = self.step(state, dt)
             self.time += dt
-        self.status.copy_(self.step.status)
         for field in dataclasses.fields(state):
             if isinstance(kept := getattr(self.state, field.name), Tensor):
                 kept.copy_(getattr(state, field.name))
