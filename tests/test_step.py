@@ -212,7 +212,9 @@ def test_recording_changes_no_result(device, dim, law):
             assert relative_error(getattr(other, name), getattr(recorded, name).detach()) < 1e-13
 
 
-@pytest.mark.parametrize("law", [mpm.NeoHookean(E=1e4, nu=0.3), mpm.FixedCorotated(E=1e4, nu=0.3)])
+@pytest.mark.parametrize(
+    "law", [mpm.NeoHookean(E=1e4, nu=0.3), mpm.FixedCorotated(E=1e4, nu=0.3), mpm.QuarticSand(E=1e4, nu=0.3)]
+)
 def test_a_step_can_be_recorded_after_inference(device, dim, law):
     """What a step keeps from one call to the next may be made in inference mode and be saved for a gradient later."""
     grid = mpm.Grid(0.1, (0,) * dim, (1,) * dim)
@@ -445,4 +447,29 @@ def test_replays_of_a_graph_are_watched(inference):
         step.reset()
         graph.replay()
         step.check()
+    assert all(bool((t == 7).all()) for t in scribble)
+
+
+@pytest.mark.cuda
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+@pytest.mark.parametrize("law", [mpm.NeoHookean(E=1e4, nu=0.3), mpm.QuarticSand(E=1e4, nu=0.3)])
+def test_a_graph_keeps_what_it_was_captured_with(law):
+    """Replays are not touched by what the step, its law or an obstacle is used for in between."""
+    grid = mpm.Grid(0.1, (0, 0), (1, 1))
+    ball = mpm.Sphere((0.5, 0.2), 0.15)
+    step = mpm.Step(grid, law, gravity=(0, -9.8), walls="slip", boundaries=[ball])
+    state = block_state(2, "cuda").map(torch.clone)
+    with torch.no_grad():
+        state = step(state, 1e-3)
+        expected = step(state, 1e-3)
+        graph = torch.cuda.CUDAGraph()
+        with torch.cuda.graph(graph):
+            end = step(state, 1e-3)
+        law.E, ball.radius, step.gravity = 2e4, 0.2, (0, 5.0)
+        for dtype in (torch.float32, torch.float64):
+            step(state.map(lambda t, to=dtype: t.to(to) if t.is_floating_point() else t), 1e-3)
+        scribble = [torch.full((8,), 7.0, dtype=torch.float64, device="cuda") for _ in range(200)]
+        graph.replay()
+    law.E = 1e4
+    assert all(relative_error(getattr(end, k), getattr(expected, k)) < 1e-13 for k in ("x", "v", "F"))
     assert all(bool((t == 7).all()) for t in scribble)

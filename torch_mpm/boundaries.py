@@ -21,6 +21,7 @@ from typing import Any, NamedTuple, Protocol
 import torch
 from torch import Tensor
 
+from .capture import Kept
 from .errors import shape_of
 from .reference.contact import contact_change
 
@@ -256,8 +257,8 @@ class Obstacle:
         self.kind, self.friction = kind, friction
         self.start, self.end = float(start), float(end)
         self.scene = scene
-        self._constants: dict[tuple[str, torch.device, torch.dtype], tuple[Any, Tensor]] = {}
-        self.table: tuple[list[Any], Tensor] | None = None
+        self._constants: dict[tuple[str, torch.device, torch.dtype], Kept] = {}
+        self.kept_table = Kept()
         """Kept by `torch_mpm.ops.contact` for a list of obstacles that begins with this one."""
 
     # -- what a shape defines
@@ -359,16 +360,10 @@ class Obstacle:
 
     def _constant(self, name: str, value: Any, like: Tensor) -> Tensor:
         """Numbers as a tensor; copied to a device once, so that later steps do not wait and can be captured."""
-        key = (name, like.device, like.dtype)
-        cached = self._constants.get(key)
-        if cached is not None and cached[0] is value:
-            return cached[1]
         if torch.compiler.is_compiling() or type(like) not in (Tensor, torch.nn.Parameter):
             return torch.tensor(value, dtype=like.dtype, device=like.device)
-        with torch.inference_mode(False):  # such that a later step may differentiate through it
-            tensor = torch.tensor(value, dtype=like.dtype, device=like.device)
-        self._constants[key] = (value, tensor)
-        return tensor
+        kept = self._constants.setdefault((name, like.device, like.dtype), Kept())
+        return kept.get((value,), lambda: torch.tensor(value, dtype=like.dtype, device=like.device), like)
 
     # -- motion
 

@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from .capture import is_captured
 from .errors import GridOverflowError, check_positions
 
 PADDING = 3
@@ -199,7 +200,7 @@ class ActivationRecord:
         before = self.status
         blocks = grid.activate(x, scene, before)
         grid.watch(blocks.status)
-        if before is None or not _is_captured(x):
+        if before is None or not is_captured(x):
             self.status = blocks.status
             return blocks
         with torch.inference_mode():  # in which any tensor may be written to
@@ -222,11 +223,6 @@ class ActivationRecord:
 
 def _with_headroom(blocks: int) -> int:
     return blocks + blocks // 2 + 16
-
-
-def _is_captured(x: Tensor) -> bool:
-    """Whether what is done with a tensor goes into a CUDA graph."""
-    return x.is_cuda and not torch.compiler.is_compiling() and torch.cuda.is_current_stream_capturing()
 
 
 def _is_fake(x: Tensor) -> bool:

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor, nn
 
+from .capture import Kept
 from .errors import shape_of
 from .ops import material as ops
 from .ops.arguments import soa_empty
@@ -94,7 +95,7 @@ class CompiledLaw(Material):
 
     def __init__(self) -> None:
         super().__init__()
-        self._cached: tuple[Any, list[Tensor]] | None = None
+        self._kept_parameters = Kept()
         self._functions = False
 
     def values(self) -> Sequence[Value]:
@@ -144,10 +145,7 @@ class CompiledLaw(Material):
             return self._convert(state)
         numbers = [value for value in vars(self).values() if isinstance(value, float)]
         key = (state.x.dtype, state.x.device, state.ids, *numbers, *((t, t._version) for t in tensors))
-        if self._cached is None or not _same(self._cached[0], key):
-            with torch.inference_mode(False):  # such that a later step may differentiate through them
-                self._cached = (key, self._convert(state))
-        return self._cached[1]
+        return self._kept_parameters.get(key, lambda: self._convert(state), state.x)
 
     def _at_temperature(self, state: State) -> CompiledLaw:
         """The law with its parameters at the temperature of each particle, in the order of the state."""
@@ -168,13 +166,6 @@ class CompiledLaw(Material):
                 tensor = tensor.index_select(0, state.ids)
             result.append(tensor)
         return result
-
-
-def _same(a: Any, b: Any) -> bool:
-    """Equality of nested tuples, tensors by identity."""
-    if isinstance(a, tuple) and isinstance(b, tuple):
-        return len(a) == len(b) and all(_same(s, t) for s, t in zip(a, b, strict=True))
-    return a is b if isinstance(a, Tensor) or isinstance(b, Tensor) else a == b
 
 
 def _check_value(name: str, value: Value, expected: str, holds: Callable[[Any], Any]) -> Value:

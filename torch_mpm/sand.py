@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from .materials import SolidLaw, Value, _check_value, _same
+from .capture import Kept
+from .materials import SolidLaw, Value, _check_value
 from .ops.sand import ReturnMap, quartic_energy, quartic_return_map, quartic_stiffness
 from .reference.material import per_particle
 from .reference.sand import ENERGIES, friction_alpha
@@ -93,7 +94,7 @@ class QuarticSand(SolidLaw):
         self.extra_fields = tuple(
             name for name, used in ((VOLUME, volume_correction), (HARDENING, hardening is not None)) if used
         )
-        self._slopes: tuple[tuple[Tensor, int, int], Tensor] | None = None
+        self._kept_slope = Kept()
 
     def _set_friction(self, angle: Value | None, hardening: Sequence[Value] | None) -> None:
         expected: tuple[str, Callable[[Any], Any]] = ("in [0, π/2)", lambda v: (v >= 0) & (v < math.pi / 2))
@@ -147,9 +148,7 @@ class QuarticSand(SolidLaw):
         if torch.compiler.is_compiling() or angle.requires_grad or HARDENING in self.extra_fields:
             return friction_alpha(angle, dim)
         key = (angle, angle._version, dim)
-        if self._slopes is None or not _same(self._slopes[0], key):
-            self._slopes = key, friction_alpha(angle, dim)
-        return self._slopes[1]
+        return self._kept_slope.get(key, lambda: friction_alpha(angle, dim), angle)
 
     def update(self, state: State) -> tuple[dict[str, Tensor], Tensor]:
         result = self.return_map(state, details=self.dissipation or HARDENING in self.extra_fields)

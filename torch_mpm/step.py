@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint as run_checkpointed
 
 from .boundaries import Walls
+from .capture import Kept
 from .cfl import stable_dt
 from .errors import GridOverflowError, SimulationError
 from .grid import ActivationRecord, Blocks, Grid
@@ -89,7 +90,7 @@ class Step(nn.Module):
                 if isinstance(part, Material):
                     part.dissipation = True
         self._activations = ActivationRecord()
-        self._gravity_tensor: Tensor | None = None
+        self._kept_gravity = Kept()
 
     def forward(self, state: State, dt: float | Tensor) -> State:
         """The state one step later.
@@ -171,13 +172,12 @@ class Step(nn.Module):
     def _gravity(self, x: Tensor) -> Tensor | None:
         if self.gravity is None or isinstance(self.gravity, Tensor):
             return self.gravity
-        cached = self._gravity_tensor
-        if cached is None or cached.dtype != x.dtype or cached.device != x.device:
-            with torch.inference_mode(False):  # such that a later step may differentiate through it
-                gravity = torch.tensor(self.gravity, dtype=x.dtype, device=x.device)
-                cached = gravity.expand(self.grid.scenes, -1).contiguous()
-            self._gravity_tensor = cached
-        return cached
+        gravity = tuple(self.gravity)
+
+        def make() -> Tensor:
+            return torch.tensor(gravity, dtype=x.dtype, device=x.device).expand(self.grid.scenes, -1).contiguous()
+
+        return self._kept_gravity.get((gravity, x.dtype, x.device), make, x)
 
     def stable_dt(self, state: State, cfl: float = 0.5) -> Tensor:
         """Largest stable time step of each scene [s], [B], times `cfl`; see `torch_mpm.cfl.stable_dt`."""

@@ -99,18 +99,10 @@ def _table(obstacles: Sequence[Obstacle], like: Tensor, scenes: int) -> Tensor:
     """Parameters [1 or B, K, width] of the nodes' dtype, rows as `ObstacleRow`; kept while nothing has changed."""
     if torch.compiler.is_compiling() or type(like) not in (Tensor, torch.nn.Parameter):
         return _build(obstacles, like, scenes)
-    key = [like.dtype, like.device, scenes]
+    key: list[Any] = [like.dtype, like.device, scenes]
     for value in (v for o in obstacles for v in (o, *_values(o))):
         key += [value, value._version if isinstance(value, Tensor) else None]
-    kept = obstacles[0].table
-    if kept is None or len(kept[0]) != len(key) or not all(map(_same, kept[0], key)):
-        with torch.inference_mode(False):  # such that a later step may differentiate through it
-            kept = obstacles[0].table = (key, _build(obstacles, like, scenes))
-    return kept[1]
-
-
-def _same(a: Any, b: Any) -> bool:
-    return a is b or (not (isinstance(a, Tensor) or isinstance(b, Tensor)) and a == b)
+    return obstacles[0].kept_table.get(tuple(key), lambda: _build(obstacles, like, scenes), like)
 
 
 def _build(obstacles: Sequence[Obstacle], like: Tensor, scenes: int) -> Tensor:

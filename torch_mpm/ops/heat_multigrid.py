@@ -16,6 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ..capture import is_captured
 from ..grid import BLOCK_WIDTH, PADDING, Blocks, Grid
 from ..reference.transfer import bspline
 from .heat_patches import Patches, lattice_rows
@@ -255,7 +256,7 @@ def heat_multigrid(
     limit = torch.maximum(least, relative_tolerance * residual)
     most = torch.full_like(step, max_iterations) if scene_limit is None else scene_limit
     running = valid & (residual > limit) & (most > 0)
-    capturing = x.is_cuda and torch.cuda.is_current_stream_capturing()
+    capturing = is_captured(x)
 
     def unfinished() -> bool:
         """A captured graph cannot ask; what has converged then stays as it is."""

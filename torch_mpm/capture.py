@@ -1,0 +1,54 @@
+"""CUDA graphs: whether one is captured, and tensors that live as long as graphs may read them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+
+def is_captured(x: Tensor) -> bool:
+    """Whether what is done with a tensor goes into a CUDA graph."""
+    return x.is_cuda and not torch.compiler.is_compiling() and torch.cuda.is_current_stream_capturing()
+
+
+class Kept:
+    """What is made once from a key, and again when the key changes: tensors on the device that no step waits for.
+
+    What a graph has captured is kept for its replays, also when the key has changed since.
+    """
+
+    def __init__(self) -> None:
+        self._latest: tuple[Any, Any] | None = None
+        self._captured: list[Any] = []
+
+    def get(self, key: tuple[Any, ...], make: Callable[[], Any], like: Tensor) -> Any:
+        """The value of a key, of numbers and tensors (these by identity), for work on the device of `like`."""
+        captured = is_captured(like)
+        if self._latest is None or not _same(self._latest[0], key):
+            with torch.inference_mode(False):  # such that a later step may differentiate through it
+                made = make()
+            if captured:  # what is made in a graph has its value in replays only
+                return made
+            self._latest = (key, made)
+        value = self._latest[1]
+        if captured and not any(value is kept for kept in self._captured):
+            self._captured.append(value)
+        return value
+
+
+def _same(a: tuple[Any, ...], b: tuple[Any, ...]) -> bool:
+    """Equality of nested tuples, tensors by identity."""
+    if len(a) != len(b):
+        return False
+    for s, t in zip(a, b, strict=True):
+        if s is t:
+            continue
+        if isinstance(s, tuple) and isinstance(t, tuple):
+            if not _same(s, t):
+                return False
+        elif isinstance(s, Tensor) or isinstance(t, Tensor) or s != t:
+            return False
+    return True
