@@ -433,10 +433,8 @@ def test_replays_of_a_graph_are_watched(inference):
         for _ in range(3):
             graph.replay()
         step.check()
-        assert [status[5].item() for status in step._activations.all()] == [
-            2,
-            7,
-        ]  # activations: eager, and with replays
+        activations = [status[5].item() for status in step._activations.all()]
+        assert activations == [2, 7]  # of eager steps, and with replays
         inside = static.x[5].clone()
         static.x[5] = -9.0
         graph.replay()

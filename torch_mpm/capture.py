@@ -14,6 +14,12 @@ def is_captured(x: Tensor) -> bool:
     return x.is_cuda and not torch.compiler.is_compiling() and torch.cuda.is_current_stream_capturing()
 
 
+def remember(kept: list[Any], value: Any) -> None:
+    """Keep a value, by identity, that a graph reads or writes."""
+    if not any(value is known for known in kept):
+        kept.append(value)
+
+
 class Kept:
     """What is made once from a key, and again when the key changes: tensors on the device that no step waits for.
 
@@ -34,8 +40,8 @@ class Kept:
                 return made
             self._latest = (key, made)
         value = self._latest[1]
-        if captured and not any(value is kept for kept in self._captured):
-            self._captured.append(value)
+        if captured:
+            remember(self._captured, value)
         return value
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .capture import is_captured
+from .capture import is_captured, remember
 from .errors import GridOverflowError, check_positions
 
 PADDING = 3
@@ -158,7 +158,7 @@ class Grid:
         elif (
             self._pending is not None
             and not torch.compiler.is_compiling()
-            and not torch.cuda.is_current_stream_capturing()  # a query would break the capture
+            and not is_captured(x)  # a query would break the capture
             and self._pending.query()
         ):
             assert self._on_host is not None
@@ -171,7 +171,7 @@ class Grid:
         """Let the capacity follow `status`, an activation's, without waiting for the device."""
         if not self._grows or self._pending is not None or status.device.type != "cuda":
             return
-        if torch.compiler.is_compiling() or _is_fake(status) or torch.cuda.is_current_stream_capturing():
+        if torch.compiler.is_compiling() or _is_fake(status) or is_captured(status):
             return
         if self._on_host is None:
             with torch.inference_mode(False):  # such that a later step may write to it
@@ -205,8 +205,7 @@ class ActivationRecord:
             return blocks
         with torch.inference_mode():  # in which any tensor may be written to
             before.copy_(blocks.status)
-        if not any(before is kept for kept in self._replayed):
-            self._replayed.append(before)
+        remember(self._replayed, before)
         return blocks
 
     def all(self) -> list[Tensor]:

@@ -12,25 +12,29 @@ inline namespace TORCH_MPM_ISA {
 template <int Step, bool High, class V, int... Lane>
 MPM_HD V exchange(const V& a, const V& b, std::integer_sequence<int, Lane...>) {
   constexpr int N = sizeof...(Lane);
-  return __builtin_shufflevector(a, b, ((Lane & Step ? N : 0) + (High ? Lane | Step : Lane & ~Step))...);
+  constexpr auto source = [](int lane) { return (lane & Step ? N : 0) + (High ? lane | Step : lane & ~Step); };
+  return __builtin_shufflevector(a, b, source(Lane)...);
+}
+
+// One round of a transposition: lanes and packs whose numbers differ in the bit `Step` change places.
+template <int Step, class T, int N>
+MPM_HD void exchange_all(Pack<T, N> r[8]) {
+  constexpr auto all = std::make_integer_sequence<int, N>();
+  MPM_UNROLL
+  for (int i = 0; i < 8; i++) {
+    if (i & Step) continue;
+    const auto a = r[i].part[0], b = r[i + Step].part[0];
+    r[i].part[0] = exchange<Step, false>(a, b, all);
+    r[i + Step].part[0] = exchange<Step, true>(a, b, all);
+  }
 }
 
 // Transposes 8 packs of 8 lanes, or the two halves of 8 packs of 16 lanes by themselves.
 template <class T, int N>
 MPM_HD void transpose(Pack<T, N> r[8]) {
-  constexpr auto all = std::make_integer_sequence<int, N>();
-  const auto exchange_all = [&]<int Step>() {
-  MPM_UNROLL
-    for (int i = 0; i < 8; i++) {
-      if (i & Step) continue;
-      const auto a = r[i].part[0], b = r[i + Step].part[0];
-      r[i].part[0] = exchange<Step, false>(a, b, all);
-      r[i + Step].part[0] = exchange<Step, true>(a, b, all);
-    }
-  };
-  exchange_all.template operator()<1>();
-  exchange_all.template operator()<2>();
-  exchange_all.template operator()<4>();
+  exchange_all<1>(r);
+  exchange_all<2>(r);
+  exchange_all<4>(r);
 }
 
 // The first or second 8 lanes.
@@ -39,9 +43,9 @@ MPM_HD void store_half(const Pack<T, N>& v, int half, T* to) {
   if constexpr (N == 8) {
     v.store(to);
   } else {
-  const auto eight = half ? __builtin_shufflevector(v.part[0], v.part[0], 8, 9, 10, 11, 12, 13, 14, 15)
-                          : __builtin_shufflevector(v.part[0], v.part[0], 0, 1, 2, 3, 4, 5, 6, 7);
-  __builtin_memcpy(to, &eight, sizeof(eight));
+    const auto eight = half ? __builtin_shufflevector(v.part[0], v.part[0], 8, 9, 10, 11, 12, 13, 14, 15)
+                            : __builtin_shufflevector(v.part[0], v.part[0], 0, 1, 2, 3, 4, 5, 6, 7);
+    __builtin_memcpy(to, &eight, sizeof(eight));
   }
 }
 
@@ -53,8 +57,7 @@ MPM_HD void store_transposed(Pack<T, N> field[Fields], T* to, int stride) {
     if constexpr (Pack<T, N>::kParts == 1) {
       transpose(field + first);
       MPM_UNROLL
-      for (int l = 0; l < N; l++)
-        store_half(field[first + l % 8], l / 8, to + l * stride + first);
+      for (int l = 0; l < N; l++) store_half(field[first + l % 8], l / 8, to + l * stride + first);
     } else {
       T lanes[8][N];
       MPM_UNROLL
