@@ -49,11 +49,30 @@ NVCC_FLAGS = ["-O3", "--expt-relaxed-constexpr", "--threads=2", "-Xfatbin=-compr
 X86_LEVELS = {"baseline": "x86-64", "avx2": "x86-64-v3", "avx512": "x86-64-v4"}
 
 
-def isa_levels() -> dict[str, list[str]]:
-    """Compiler options of each instruction-set level of this machine's architecture."""
-    if platform.machine().lower() in ("x86_64", "amd64"):
-        return {name: [f"-march={march}"] for name, march in X86_LEVELS.items()}
-    return {"baseline": []}
+def isa_levels(native: bool) -> dict[str, list[str]]:
+    """Compiler options of the instruction-set levels to build: all of this architecture, or this machine's best alone.
+
+    TORCH_MPM_ISA_LEVELS, "all" or "native", decides where it is set.
+    """
+    choice = os.environ.get("TORCH_MPM_ISA_LEVELS") or ("native" if native else "all")
+    if choice not in ("all", "native"):
+        raise SystemExit(f"TORCH_MPM_ISA_LEVELS must be all, native or unset, got {choice!r}")
+    if platform.machine().lower() not in ("x86_64", "amd64"):
+        return {"baseline": []}
+    levels = {name: [f"-march={march}"] for name, march in X86_LEVELS.items()}
+    if choice == "all":
+        return levels
+    best = best_level()
+    return {best: levels[best]}
+
+
+def best_level() -> str:
+    """The best instruction-set level of this machine, as the compiler sees it."""
+    command = [os.environ.get("CXX", "g++"), "-march=native", "-dM", "-E", "-x", "c++", os.devnull]
+    macros = set(re.findall(r"#define (__\w+__) 1", subprocess.run(command, capture_output=True, text=True).stdout))
+    if {"__AVX512F__", "__AVX512BW__", "__AVX512CD__", "__AVX512DQ__", "__AVX512VL__"} <= macros:
+        return "avx512"
+    return "avx2" if {"__AVX2__", "__FMA__", "__BMI2__", "__F16C__", "__LZCNT__", "__MOVBE__"} <= macros else "baseline"
 
 
 def cuda_wanted() -> bool:
@@ -171,12 +190,13 @@ class Ninja:
             raise SystemExit(f"the build of {', '.join(targets)} failed (see the compiler's messages above)")
 
 
-def cpu_library() -> Library:
-    flags = ["-DTORCH_MPM_BACKEND=cpu"]
-    levels = isa_levels()
+def cpu_library(levels: dict[str, list[str]]) -> Library:
+    # csrc/cpu/isa.h forwards calls to the levels that exist.
+    flags = ["-DTORCH_MPM_BACKEND=cpu", *(f"-DTORCH_MPM_HAS_{level.upper()}" for level in levels)]
+    plain_options = [f"-march={X86_LEVELS['baseline']}"] if next(iter(levels.values())) else []
     kernels = sorted((CSRC / "cpu").glob("*_kernels.cpp"))
     plain = sorted({*(CSRC / "ops").glob("*.cpp"), *(CSRC / "cpu").glob("*.cpp")} - set(kernels))
-    objects = [(source, "cxx", [*flags, *levels["baseline"]]) for source in plain]
+    objects = [(source, "cxx", [*flags, *plain_options]) for source in plain]
     # The baseline comes first: of an inline function that several objects define, the linker keeps the first, and that
     # one must run on every machine.
     for level, options in levels.items():
@@ -198,7 +218,7 @@ def math_library(version: str) -> Library | None:
         print(f"torch_mpm._math is left out: {sys.executable} has no pybind11 or no Python.h")
         return None
     flags = [f"-isystem{python}", f"-isystem{Path(pybind11.origin).parent / 'include'}"]
-    flags += [f'-DTORCH_MPM_VERSION="{version}"', *isa_levels()["baseline"]]
+    flags += [f'-DTORCH_MPM_VERSION="{version}"']
     suffix = sysconfig.get_config_var("EXT_SUFFIX")
     objects = [(CSRC / "math" / "python_module.cpp", "cxx_module", flags)]
     return Library(f"torch_mpm/_math{suffix}", objects, "link_module")
@@ -236,6 +256,8 @@ class Build(build_ext):
             return
         destination = ROOT if self.inplace or self.editable_mode else Path(self.build_lib)
         sanitize = os.environ.get("TORCH_MPM_SANITIZE", "")
+        # What is built in place serves this machine; a wheel serves every one.
+        self.levels = isa_levels(native=bool(self.inplace or self.editable_mode))
         # One place for in-place, editable and wheel builds, so that each reuses the objects of the others.
         name = f"{sysconfig.get_platform()}-{sys.implementation.cache_tag}"
         directory = ROOT / "build" / (f"{name}-sanitize" if sanitize else name)
@@ -265,7 +287,7 @@ class Build(build_ext):
             raise SystemExit(f"--targets must be of cpu, cuda, math, got {sorted(unknown)}")
         libraries = {}
         if "cpu" in wanted:
-            libraries["cpu"] = cpu_library()
+            libraries["cpu"] = cpu_library(self.levels)
         if "cuda" in wanted and cuda_wanted():
             libraries["cuda"] = cuda_library()
         if "math" in wanted and (library := math_library(self.distribution.get_version())):
@@ -279,7 +301,7 @@ class Build(build_ext):
         record["torch_target"] = "2.11"
         if "cpu" in built:
             compiler = compiler_version(os.environ.get("CXX", "g++"))
-            record["cpu"] = {"compiler": compiler, "flags": CPU_FLAGS, "isa": list(isa_levels()), "sanitize": sanitize}
+            record["cpu"] = {"compiler": compiler, "flags": CPU_FLAGS, "isa": list(self.levels), "sanitize": sanitize}
         if "cuda" in built:
             compiler = compiler_version(str(nvcc()))
             record["cuda"] = {"compiler": compiler, "flags": NVCC_FLAGS, "archs": cuda_archs()}

@@ -53,14 +53,14 @@ def test_only_code_of_the_avx_levels_uses_avx() -> None:
             function = line
         elif "%ymm" in line or "%zmm" in line:
             avx.add(function)
-    assert avx, "the avx2 and avx512 levels are missing"
+    assert bool(avx) == bool({"avx2", "avx512"} & set(info()["build"]["cpu"]["isa"]))
     assert [name for name in avx if "avx2" not in name and "avx512" not in name] == []
 
 
 def test_info_describes_build_and_devices() -> None:
     values = info()
     assert values["torch"] == torch.__version__
-    assert values["build"]["cpu"]["isa"][0] == "baseline"
+    assert set(values["build"]["cpu"]["isa"]) <= {"baseline", "avx2", "avx512"}
     assert values["cuda"]["usable"] or values["cuda"]["reason"]
     assert values["cuda"]["usable"] == (torch.cuda.is_available() and _library.cuda_error is None)
 

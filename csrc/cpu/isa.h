@@ -4,35 +4,58 @@
 // time.
 namespace mpm::cpu {
 
-enum class Level { baseline, avx2, avx512 };
+enum class Level { none, baseline, avx2, avx512 };
 
-// The best level of this machine, or a lower one asked for by the environment variable TORCH_MPM_ISA_LEVEL.
+// The best level that was built and that this machine has, or a lower one asked for by the environment variable
+// TORCH_MPM_ISA_LEVEL.
 Level isa_level();
+
+[[noreturn]] void refuse_machine();
 
 }  // namespace mpm::cpu
 
-// The declarations in the namespace of every level, and a call of the best of them.
-#ifdef __x86_64__
-#define MPM_CPU_DECLARE_LEVELS(declarations) \
-  inline namespace baseline {                \
-  declarations                               \
-  }                                          \
-  namespace avx2 {                           \
-  declarations                               \
-  }                                          \
-  namespace avx512 {                         \
-  declarations                               \
+// The declarations in the namespace of every level that is built (setup.py), and a call of the best of them.
+#ifdef TORCH_MPM_HAS_BASELINE
+#define MPM_CPU_DECLARE_BASELINE(...) \
+  inline namespace baseline {         \
+  __VA_ARGS__                         \
   }
-#define MPM_CPU_CALL_BEST(...)                                    \
-  do {                                                            \
-    if (isa_level() == Level::avx512) return avx512::__VA_ARGS__; \
-    if (isa_level() == Level::avx2) return avx2::__VA_ARGS__;     \
-    return baseline::__VA_ARGS__;                                 \
-  } while (false)
+#define MPM_CPU_CALL_BASELINE(...) \
+  if (isa_level() == Level::baseline) return baseline::__VA_ARGS__
 #else
-#define MPM_CPU_DECLARE_LEVELS(declarations) \
-  inline namespace baseline {                \
-  declarations                               \
-  }
-#define MPM_CPU_CALL_BEST(...) return baseline::__VA_ARGS__
+#define MPM_CPU_DECLARE_BASELINE(...)
+#define MPM_CPU_CALL_BASELINE(...)
 #endif
+#ifdef TORCH_MPM_HAS_AVX2
+#define MPM_CPU_DECLARE_AVX2(...) \
+  namespace avx2 {                \
+  __VA_ARGS__                     \
+  }
+#define MPM_CPU_CALL_AVX2(...) \
+  if (isa_level() == Level::avx2) return avx2::__VA_ARGS__
+#else
+#define MPM_CPU_DECLARE_AVX2(...)
+#define MPM_CPU_CALL_AVX2(...)
+#endif
+#ifdef TORCH_MPM_HAS_AVX512
+#define MPM_CPU_DECLARE_AVX512(...) \
+  namespace avx512 {                \
+  __VA_ARGS__                       \
+  }
+#define MPM_CPU_CALL_AVX512(...) \
+  if (isa_level() == Level::avx512) return avx512::__VA_ARGS__
+#else
+#define MPM_CPU_DECLARE_AVX512(...)
+#define MPM_CPU_CALL_AVX512(...)
+#endif
+#define MPM_CPU_DECLARE_LEVELS(...)     \
+  MPM_CPU_DECLARE_BASELINE(__VA_ARGS__) \
+  MPM_CPU_DECLARE_AVX2(__VA_ARGS__)     \
+  MPM_CPU_DECLARE_AVX512(__VA_ARGS__)
+#define MPM_CPU_CALL_BEST(...)          \
+  do {                                  \
+    MPM_CPU_CALL_AVX512(__VA_ARGS__);   \
+    MPM_CPU_CALL_AVX2(__VA_ARGS__);     \
+    MPM_CPU_CALL_BASELINE(__VA_ARGS__); \
+    refuse_machine();                   \
+  } while (false)
