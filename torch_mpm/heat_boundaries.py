@@ -8,6 +8,7 @@ with areas A_s (`Surface`), h_i = Σ_s A_s η_s N_i(x_s), or by the free surface
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
@@ -17,6 +18,7 @@ from torch import Tensor
 from .boundaries import Obstacle, _norm, _per_node
 from .errors import shape_of
 from .grid import BLOCK_WIDTH, PADDING, Blocks
+from .materials import _check_value
 from .ops import scatter
 from .parameters import Value, evaluate
 from .reference.transfer import bspline
@@ -92,7 +94,7 @@ class HeatNodes:
 
     def hold(self, where: Tensor, temperature: Number) -> None:
         """Keep nodes, bool [N], at a temperature [K]; those held before stay as they are."""
-        value = torch.where(where, temperature, 0.0).to(self.theta)
+        value = torch.where(where, torch.zeros_like(self.theta) + temperature, 0)
         if self.fixed is None or self.held is None:
             self.fixed, self.held = where, value
         else:
@@ -142,7 +144,7 @@ class Surface:
     no matter around it gives nothing. Points stay where they are: replace `points` between steps if the surface moves.
 
     Raises:
-        ValueError: for wrong shapes or a negative area.
+        ValueError: for wrong shapes, points that are not finite, or an area that is not or is negative.
     """
 
     def __init__(self, points: Tensor, area: Number, scene: Tensor | None = None) -> None:
@@ -150,8 +152,9 @@ class Surface:
             raise ValueError(f"points must have shape [S, 2] or [S, 3], got {shape_of(points)}")
         if isinstance(area, Tensor) and area.shape not in ((), points.shape[:1]):
             raise ValueError(f"area must be a number or have shape [S] = [{points.shape[0]}], got {shape_of(area)}")
-        if not bool((torch.as_tensor(area) >= 0).all()):
-            raise ValueError(f"area must not be negative, got {area}")
+        if not bool(points.detach().isfinite().all()):
+            raise ValueError("points must be finite, and some are NaN or infinite")
+        _checked("area", area, "not negative", lambda v: v >= 0)
         if scene is not None and scene.shape != points.shape[:1]:
             raise ValueError(f"scene must have shape [S] = [{points.shape[0]}], got {shape_of(scene)}")
         self.points, self.area, self.scene = points, area, scene
@@ -164,8 +167,8 @@ class Surface:
         weight = weight * (nodes.capacity.detach()[rows] > 0)
         total = weight.sum(1, keepdim=True)
         weight = torch.where(total > 0, weight / torch.where(total > 0, total, 1), 0)
-        amount = torch.as_tensor(self.area, dtype=points.dtype, device=points.device) * density
-        given = amount.expand(len(points))[:, None] * weight
+        amount = (torch.ones_like(points[:, 0]) * self.area * density).to(points)
+        given = amount[:, None] * weight
         return torch.zeros_like(nodes.theta).index_add(0, rows.reshape(-1), given.reshape(-1))
 
 
@@ -215,10 +218,13 @@ class Flux:
     Args:
         surface: a `Surface` or a `FreeSurface`.
         flux: η [W/m²], positive into the body: a number, a tensor per point or scene, or a function of the time.
+
+    Raises:
+        ValueError: for a flux that is not finite.
     """
 
     def __init__(self, surface: Surface | FreeSurface, flux: Timed) -> None:
-        self.surface, self.flux = surface, flux
+        self.surface, self.flux = surface, _checked("flux", flux)
 
     def apply(self, nodes: HeatNodes) -> None:
         nodes.add_source(self.surface.integrate(nodes, self.flux))
@@ -233,12 +239,12 @@ class Convection:
         ambient: temperature of the fluid [K]: a number, a tensor [] or [B], or a function of the time.
 
     Raises:
-        ValueError: for a negative number as coefficient.
+        ValueError: for a negative coefficient, or values that are not finite.
     """
 
     def __init__(self, surface: Surface | FreeSurface, coefficient: Timed, ambient: Timed) -> None:
-        self.surface, self.ambient = surface, ambient
-        self.coefficient = _not_negative("coefficient", coefficient)
+        self.surface, self.ambient = surface, _checked("ambient", ambient)
+        self.coefficient = _checked("coefficient", coefficient, "not negative", lambda v: v >= 0)
 
     def apply(self, nodes: HeatNodes) -> None:
         nodes.add_exchange(self.surface.integrate(nodes, self.coefficient), nodes.per_node(self.ambient))
@@ -254,13 +260,12 @@ class Radiation:
             to know in kelvin: a number, a tensor [] or [B], or a function of the time.
 
     Raises:
-        ValueError: for a number as emissivity outside [0, 1].
+        ValueError: for an emissivity outside [0, 1], or an ambient temperature that is not finite.
     """
 
     def __init__(self, surface: Surface | FreeSurface, emissivity: Timed, ambient: Timed) -> None:
-        if isinstance(emissivity, (int, float)) and not 0 <= emissivity <= 1:
-            raise ValueError(f"emissivity must be between 0 and 1, got {emissivity}")
-        self.surface, self.emissivity, self.ambient = surface, emissivity, ambient
+        self.surface, self.ambient = surface, _checked("ambient", ambient)
+        self.emissivity = _checked("emissivity", emissivity, "between 0 and 1", lambda v: (v >= 0) & (v <= 1))
 
     def apply(self, nodes: HeatNodes) -> None:
         black = STEFAN_BOLTZMANN * self.surface.integrate(nodes, self.emissivity)
@@ -281,10 +286,13 @@ class Fixed:
             where matter reaches into the region), because splines smooth the bend of the temperature there; between
             nodes, or where matter does not quite reach it, many times farther. See `FixedSurface`.
         temperature: [K]: a number, a tensor [] or [B], or a function of the time.
+
+    Raises:
+        ValueError: for a temperature that is not finite.
     """
 
     def __init__(self, region: Obstacle | Callable[[Tensor], Tensor], temperature: Timed) -> None:
-        self.region, self.temperature = region, temperature
+        self.region, self.temperature = region, _checked("temperature", temperature)
 
     def apply(self, nodes: HeatNodes) -> None:
         positions = nodes.blocks.node_positions(nodes.theta.dtype)
@@ -309,7 +317,7 @@ class FixedSurface:
         temperature: [K]: a number, a tensor [] or [B], or a function of the time.
 
     Raises:
-        ValueError: for a region that is no obstacle.
+        ValueError: for a region that is no obstacle, or a temperature that is not finite.
     """
 
     WIDTH = 2.0
@@ -318,7 +326,7 @@ class FixedSurface:
     def __init__(self, region: Obstacle, temperature: Timed) -> None:
         if not isinstance(region, Obstacle):
             raise ValueError(f"region must be an obstacle of torch_mpm.boundaries, got {type(region).__name__}")
-        self.region, self.temperature = region, temperature
+        self.region, self.temperature = region, _checked("temperature", temperature)
 
     def apply(self, nodes: HeatNodes) -> None:
         width, state = self.WIDTH * nodes.blocks.grid.dx, nodes.state
@@ -332,17 +340,25 @@ class Source:
 
     Args:
         power: [W/m³] of present volume: a number, a tensor [], [B] or [P], or a function of the temperature [P].
+
+    Raises:
+        ValueError: for a power that is not finite.
     """
 
     def __init__(self, power: Value) -> None:
-        self.power = power
+        self.power = _check_value("power", power, "finite", lambda v: v == v)
 
     def apply(self, nodes: HeatNodes) -> None:
         power = evaluate("power", self.power, nodes.state) * nodes.volume
         nodes.add_source(scatter(nodes.blocks, nodes.state.x, power[:, None])[:, 0])
 
 
-def _not_negative(name: str, value: Any) -> Any:
-    if isinstance(value, (int, float)) and not value >= 0:
-        raise ValueError(f"{name} must not be negative, got {value}")
+def _checked(name: str, value: Timed, expected: str = "", holds: Callable[[Any], Any] = lambda v: v == v) -> Timed:
+    """A number or tensor of which all is finite and holds; a function of the time is not asked."""
+    if isinstance(value, Tensor):
+        good = bool((holds(value.detach()) & value.detach().isfinite()).all())
+    else:
+        good = callable(value) or (math.isfinite(value) and bool(holds(value)))
+    if not good:
+        raise ValueError(f"{name} must be {expected + ' and ' if expected else ''}finite, got {value}")
     return value

@@ -20,7 +20,7 @@ from .capture import Kept
 from .errors import shape_of
 from .ops import material as ops
 from .ops.arguments import soa_empty
-from .parameters import Value, With, evaluate
+from .parameters import PerMaterial, Value, With, evaluate
 from .reference.material import per_particle
 from .state import _take
 
@@ -168,7 +168,11 @@ class CompiledLaw(Material):
         return result
 
 
-def _check_value(name: str, value: Value, expected: str, holds: Callable[[Any], Any]) -> Value:
+def _check_value(name: str, value: Value, expected: str, holds: Callable[[Any], Any], infinite: bool = False) -> Value:
+    """A value whose numbers hold, and are finite unless they may be infinite; a function is not asked."""
+    if isinstance(value, PerMaterial):
+        for k, one in enumerate(value.values()):
+            _check_value(f"{name} of material {k}", one, expected, holds, infinite)
     if callable(value) and not isinstance(value, Tensor):
         return value  # a function of temperature
     if isinstance(value, Tensor):
@@ -176,9 +180,9 @@ def _check_value(name: str, value: Value, expected: str, holds: Callable[[Any], 
             raise ValueError(
                 f"{name} must be a number or a floating tensor of shape [], [1], [B] or [P], got {shape_of(value)}"
             )
-        good = bool((holds(value.detach()) & value.detach().isfinite()).all())
+        good = bool((holds(value.detach()) & (value.detach().isfinite() | infinite)).all())
     else:
-        good = math.isfinite(value) and bool(holds(value))
+        good = (math.isfinite(value) or infinite) and bool(holds(value))
     if not good:
         raise ValueError(f"{name} must be {expected}, got {value}")
     return value

@@ -73,6 +73,10 @@ class PerMaterial(nn.Module):
         for k, value in enumerate(values):
             store(self, f"value{k}", value)
 
+    def values(self) -> list[Value]:
+        """The values, one per material."""
+        return [getattr(self, f"value{k}") for k in range(self.count)]
+
     def of(self, name: str, state: State) -> Tensor:
         """[P], zero for an unknown material.
 
@@ -82,9 +86,8 @@ class PerMaterial(nn.Module):
         if state.material is None:
             raise ValueError(f"{name} per material needs state.material, int32 [P]")
         result = torch.zeros_like(state.mass)
-        for k in range(self.count):
-            value = evaluate(name, getattr(self, f"value{k}"), state)
-            result = torch.where(state.material == k, value, result)
+        for k, value in enumerate(self.values()):
+            result = torch.where(state.material == k, evaluate(name, value, state), result)
         return result
 
 

@@ -245,7 +245,8 @@ def _backward(ctx: Any, grad: Tensor, *_: Any) -> tuple[Any, ...]:
     if need_capacity or need_dt:
         blocks = _blocks_of(topology, x)
         scene = blocks.node_scene().long().clamp_min(0)
-        steps = ctx.dt if scene_dt is None else (ctx.dt * scene_dt)[scene]
+        # Where dt is not positive, nothing is solved: both d and λ are zero.
+        steps = ctx.dt if scene_dt is None else torch.where(scene_dt > 0, ctx.dt * scene_dt, 1)[scene]
         if need_capacity:
             grads[2] = rate / steps
         if need_dt:

@@ -63,7 +63,7 @@ class Transfer:
         local = torch.arange(BLOCK_WIDTH, device=device)
         # From the first: a coarse spline's share in its fine ones is the spline of one order less at their distance.
         shift = 3.5 if fine.grid.order == 2 else 3.0
-        distance = ((1 + local).to(like) - (local[:, None] + shift) / 2).abs()
+        distance = ((1 + local).to(like) - (local[:, None].to(like) + shift) / 2).abs()
         line = (1 - distance).clamp_min(0) if fine.grid.order == 2 else bspline(distance, 2)
         self.weight = line
         for _ in range(dim - 1):
