@@ -83,7 +83,10 @@ def test_update_is_the_reference(device, dim, law, dtype):
     tolerance = 2e-5 if dtype == torch.float32 else 1e-11
     assert error(result.F, expected[0]) < tolerance
     assert error(result.stress, expected[1]) < tolerance
-    assert error(result.dissipated, expected[3]) < tolerance if law in PLASTIC_LAWS else not result.dissipated.any()
+    if law in PLASTIC_LAWS:  # rounding of the stress, times strains about one
+        assert error(result.dissipated, expected[3]) < 2 * tolerance
+    else:
+        assert not result.dissipated.any()
     for value, wanted in zip(result.history, expected[2], strict=True):
         assert error(value, wanted) < tolerance
     assert float(result.dissipated.min()) >= 0
@@ -775,8 +778,41 @@ def test_dissipated_energy_on_request(device, dim):
     metal = laws()["von_mises"]
     metal.dissipation = True
     fields, _ = metal.update(state)
-    trial = principal_energy("hencky", F, metal._parameters_of(state)[:2])
-    assert torch.allclose(trial - metal.energy_density(state), fields["dissipated"], rtol=1e-6, atol=1e-6)
+    assert torch.allclose(2e3 * fields["plastic_strain"], fields["dissipated"], rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("law", PLASTIC_LAWS)
+def test_work_is_stored_or_dissipated(device, dim, law):
+    """Work along a path of strains, by the trapezoidal rule in 40 steps and 80, less what is stored in the end, elastic
+    or by hardening, is heat to the order of the step.
+    """
+    p = {
+        "von_mises": [1.0, 1.5, 0.02, 0.3],
+        "herschel_bulkley": [1.0, 1.5, 0.005, 0.05, 0.8, 0.0],
+        "snow": [1.0, 1.5, 0.02, 0.02, 8.0],
+        "cam_clay": [1.0, 1.5, 1.2, 0.03, 5.0, 0.2],
+    }[law]
+    path = torch.tensor([[-0.1, 0.05, -0.02], [-0.08, -0.06, -0.03], [0.06, -0.1, 0.03]], dtype=torch.float64)[:, :dim]
+    errors = []
+    for steps in (40, 80):
+        given = [torch.tensor(v, dtype=torch.float64, device=device) for v in p]
+        if law == "herschel_bulkley":
+            given[-1] = given[-1] + 1 / steps
+        history = [torch.zeros(len(path), dtype=torch.float64, device=device) for _ in reference.LAWS[law].history]
+        stretch = torch.diag_embed((path / steps).exp()).to(device)
+        F = torch.eye(dim, dtype=torch.float64, device=device).expand(len(path), dim, dim)
+        tau, work, heat = torch.zeros_like(F), 0.0, 0.0
+        for _ in range(steps):
+            result = principal_update(law, stretch @ F, given, history, details=True)
+            work = work + ((tau + result.stress) / 2).diagonal(dim1=1, dim2=2).cpu().mul(path / steps).sum(1)
+            heat = heat + result.dissipated.cpu()
+            F, tau, history = result.F, result.stress, list(result.history)
+        stored = principal_energy(law, F, given, history).cpu()
+        if law == "von_mises":
+            stored = stored + 0.3 / 2 * history[0].cpu() ** 2
+        errors.append(float(((work - stored - heat) / heat).abs().max()))
+    assert errors[1] < 0.03
+    assert errors[1] < 0.6 * errors[0]
 
 
 def test_laws_in_a_mixture(device):

@@ -105,6 +105,8 @@ class VonMises(PrincipalLaw):
     """J2 plasticity with linear isotropic hardening on Hencky elasticity (Simo 1992): √(3/2) |dev τ| ≤ σ_y + H ε̄.
 
     State: state.extra["plastic_strain"], the equivalent plastic strain ε̄ (dε̄ = √(2/3) |dh_p|).
+    Dissipated is σ_y dε̄: of the plastic work (σ_y + H ε̄) dε̄ hardening stores ½ H ε̄², which is no part of
+    `energy_density`, the elastic energy.
 
     Args:
         E, nu or mu, lam: as for `FixedCorotated`.
@@ -143,7 +145,7 @@ class HerschelBulkley(PrincipalLaw):
 
     t = |dev τ|/√2 and g = √2 |dh_p/dt| are shear stress and shear rate in simple shear. Backward Euler over the time
     step, which a `Step` hands over; without one (`law.stress(state)` of a state that a step returned) the fluid is
-    elastic, which gives the stress before the flow of the coming step.
+    elastic, which gives the stress before the flow of the coming step. Dissipated is all plastic work.
 
     Args:
         E, nu or mu, lam: as for `FixedCorotated`, of the elastic strains. The wave speed and so the time step follow
@@ -195,6 +197,8 @@ class Snow(PrincipalLaw):
 
     Plastic compaction hardens it: μ and λ are multiplied by exp(ξ (1 − J_p)).
     State: state.extra["log_plastic_volume"], ln J_p.
+    Dissipated is the plastic work less what hardening adds to the elastic energy, or zero where that is more: the model
+    is not consistent thermodynamically.
 
     Args:
         E, nu or mu, lam: as for `FixedCorotated`, of fresh snow (1.4e5 Pa and 0.2 in the paper, density 400 kg/m³).
@@ -239,6 +243,8 @@ class CamClay(PrincipalLaw):
     softens. p = −tr τ/D and q = √((6 − D)/2) |dev τ|, in 2-D the difference of the principal stresses. |ln (p_c/p₀)| is
     limited to 10.
     State: state.extra["log_plastic_volume"], ln J_p.
+    Dissipated is all plastic work, as if consolidation stored nothing (Collins and Houlsby 1997 let it store a part, in
+    isotropic compression a half).
 
     Args:
         E, nu or mu, lam: as for `FixedCorotated`.

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from .capture import Kept
 from .materials import SolidLaw, Value, _check_value
-from .ops.sand import ReturnMap, quartic_energy, quartic_return_map, quartic_stiffness
+from .ops.sand import ANGLE, ReturnMap, quartic_energy, quartic_return_map, quartic_stiffness
 from .reference.material import per_particle
 from .reference.sand import ENERGIES, friction_alpha
 
@@ -44,14 +44,16 @@ class QuarticSand(SolidLaw):
             have no stiffness at rest, so that without it the time step of sand at rest would be unlimited.
         flow: "radial" or "exact". The radial flow mobilises less friction in plane strain: at a friction angle of 30°
             and ν = 0.3 a Mohr-Coulomb angle of 32° (full), 31° (unilateral) or 29° (mixed), against 44°.
-        cohesion: Hencky strain at which the sand tears on every axis, not negative.
-        volume_correction: whether sand that was torn apart remembers the volume that it lost, and has no stress until
-            it is compressed again (Tampubolon et al. 2017); kept in state.extra["volume_correction"] [P].
+        cohesion: Hencky strain that the sand bears on every axis, not negative. Beyond it, it flows under the tension
+            of that strain, or tears where there is a volume correction.
+        volume_correction: whether sand that was torn apart remembers the volume that it lost, and has neither stress
+            nor cohesion until that gap is closed (Tampubolon et al. 2017); in state.extra["volume_correction"] [P].
         hardening: h0, h1, h2, h3 of the friction angle φ = h0 + (h1 q − h3) exp(−h2 q), each like mu, with φ in
             [0, π/2) and h0, h1, h3 in [rad], in the place of friction_angle; Klár et al. 2016 use 35°, 9°, 0.2, 10°.
             q is the sum of plastic multipliers, kept in state.extra["hardening"] [P].
 
-    With `dissipation` set, `update` returns "dissipated", the elastic energy that the return map takes [P] [J/m³].
+    With `dissipation` set, `update` returns "dissipated", the energy that plastic flow and tearing turn into heat [P]
+    [J/m³]; see `ReturnMap`. Hardening stores none.
 
     Raises:
         ValueError: for a value outside its range or an unknown option. Values are checked here, and not again when a
@@ -97,7 +99,7 @@ class QuarticSand(SolidLaw):
         self._kept_slope = Kept()
 
     def _set_friction(self, angle: Value | None, hardening: Sequence[Value] | None) -> None:
-        expected: tuple[str, Callable[[Any], Any]] = ("in [0, π/2)", lambda v: (v >= 0) & (v < math.pi / 2))
+        expected: tuple[str, Callable[[Any], Any]] = (ANGLE, lambda v: (v >= 0) & (v < math.pi / 2))
         self._friction = ("friction_angle",) if hardening is None else ("h0", "h1", "h2", "h3")
         if hardening is None:
             values: Sequence[Value] = (math.pi / 6 if angle is None else angle,)
@@ -110,7 +112,7 @@ class QuarticSand(SolidLaw):
             self._store(name, _check_value(name, value, *limits))
         first, last = values[0], values[-1]
         if isinstance(first, float) and isinstance(last, float) and last > first:
-            raise ValueError(f"h3 must not be above h0, got {last} and {first}")
+            raise ValueError(f"h3 must not be above h0 (in radians), got {last} and {first}")
 
     def values(self) -> Sequence[Value]:
         """μ and λ [Pa], the friction angle [rad] or the constants of its hardening, and the cohesion if given."""

@@ -126,7 +126,7 @@ MPM_HD Response<Law, T, D> respond(const Vector<T, D>& h, const PrincipalData<La
   r.flow = {T(1), T(0) < T(0), T(0) == T(0)};
   if constexpr (Law::plastic) {
     r.flow = Law::flow(r.h, data.parameters, r.history);
-    r.dissipated = select(r.flow.plastic, Law::lost(h, r.h, data.parameters, r.history), T(0));
+    r.dissipated = select(r.flow.plastic, Law::lost(h, r.h, data.parameters, data.history, r.history), T(0));
   }
   r.tau = Law::stress(r.h, data.parameters, r.history);
   return r;

@@ -9,7 +9,8 @@
 //   flow(h, p, q)               the return map: moves the Hencky strains h and the history q of a particle with the
 //                               parameters p, and tells what happened (plastic laws only);
 //   map_quotient(...)           (Hᵢ − Hⱼ)/(hᵢ − hⱼ) of trial strains h and mapped strains H (plastic laws only);
-//   lost(h, H, p, q)            energy that the map dissipates per rest volume (plastic laws only);
+//   lost(h, H, p, before, q)    energy that the map from h to H, of the history from `before` to q, turns into heat per
+//                               rest volume: plastic work less what hardening stores (plastic laws only);
 //   energy, stress, tangent     ψ(h), τᵢ = ∂ψ/∂hᵢ and ∂τ/∂h, at given history;
 //   stress_quotient(a, b)       (τᵢ − τⱼ)/(hᵢ − hⱼ) at hᵢ = a, hⱼ = b.
 // All of it is written for any scalar: its derivatives come from dual numbers. The map must be continuous; on a
@@ -103,6 +104,16 @@ template <class T, int N>
 struct NewtonTolerance<Pack<T, N>> : NewtonTolerance<T> {};
 #endif
 
+// τ(H) · (h − H): the work of a plastic step by backward Euler (Simo and Hughes 1998). ψ(h) − ψ(H) is more, by what the
+// stress of the trial strain beyond the yield surface would do, which no step has done.
+template <class T, int D>
+MPM_HD T plastic_work(const Vector<T, D>& tau, const Vector<T, D>& h, const Vector<T, D>& H) {
+  T r = T(0);
+  MPM_UNROLL
+  for (int i = 0; i < D; i++) r = r + tau[i] * (h[i] - H[i]);
+  return r;
+}
+
 // Small strain elasticity in Hencky strains: ψ = μ Σ hᵢ² + λ/2 (tr h)² (Hencky 1928). The parameters begin with μ, λ [Pa].
 // Convex maps of the deviator and the trace alone are radial.
 struct HenckyElasticity {
@@ -140,15 +151,10 @@ struct HenckyElasticity {
     return flow.kappa;
   }
 
-  // The stress is linear in h: its mean times the plastic strain is the energy difference, without cancellation but for
-  // rounding in the trace.
+  // Without a stored energy of hardening all plastic work is heat.
   template <class T, int D>
-  MPM_HD static T lost(const Vector<T, D>& h, const Vector<T, D>& H, const T p[], const T q[]) {
-    const Vector<T, D> tau = stress(T(0.5) * (h + H), p, q);
-    T r = T(0);
-    MPM_UNROLL
-    for (int i = 0; i < D; i++) r = r + tau[i] * (h[i] - H[i]);
-    return max(r, T(0));
+  MPM_HD static T lost(const Vector<T, D>& h, const Vector<T, D>& H, const T p[], const T[], const T q[]) {
+    return max(plastic_work(stress(H, p, q), h, H), T(0));
   }
 };
 

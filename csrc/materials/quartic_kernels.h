@@ -11,6 +11,10 @@
 //
 // A deformation that is not finite or not of positive determinant has no meaning: it is returned as it is, its stress
 // and moduli are zero, its energy is infinite, and no derivative passes but that of F with respect to itself.
+//
+// With a volume correction (Tampubolon et al. 2017) what reaches the apex is torn: it loses all strain, cohesion
+// included, and remembers the logarithm v_c of the volume. Until compression has closed that gap it has no stress and
+// no cohesion: it sees its trial strain h as h + v_c/D, and is at the apex while tr h + v_c ≥ 0.
 namespace mpm {
 
 template <class T, int D>
@@ -72,12 +76,18 @@ int find_energy(std::string_view name, bool exact_flow) {
 template <class T>
 struct SandParameters {
   T mu, lam, alpha;
-  T cohesion, volume;
+  T cohesion, volume;  // the cohesion of what is torn is 0
   Cone<T> cone;
-  MaskOf<T> shear;  // μ > 0
+  MaskOf<T> shear, torn;  // μ > 0; v_c > 0 where the apex loses volume
 };
 
-template <class V, class At, class T, int D>
+// Whether the apex keeps the volume: nothing tears.
+template <class Energy, class T, int D>
+MPM_HD bool keeps_volume(const SandArguments<T, D>& a) {
+  return Energy::unilateral_yield && a.keep_apex;
+}
+
+template <class Energy, class V, class At, class T, int D>
 MPM_HD SandParameters<V> load_parameters(const At& at, const SandArguments<T, D>& a) {
   // 0 where it is absent.
   const auto load = [&](const Parameter<T>& parameter) {
@@ -87,8 +97,9 @@ MPM_HD SandParameters<V> load_parameters(const At& at, const SandArguments<T, D>
   r.mu = load(a.mu);
   r.lam = load(a.lam);
   r.alpha = load(a.alpha);
-  r.cohesion = load(a.cohesion);
   r.volume = a.volume.pointer ? convert<V>(at.load(a.volume.pointer, a.volume.stride[0])) : V(0);
+  r.torn = (keeps_volume<Energy>(a) ? V(0) : r.volume) > V(0);
+  r.cohesion = select(r.torn, V(0), load(a.cohesion));
   r.shear = r.mu > V(0);
   r.cone = {r.alpha, select(r.shear, r.lam / select(r.shear, r.mu, V(1)), V(0))};
   return r;
@@ -102,13 +113,6 @@ MPM_HD Vector<T, D> shifted(const Vector<T, D>& h, const T& shift) {
   return r;
 }
 
-// The trial strain as the cone with its apex at the origin sees it: with the volume v_c that was lost before (Tampubolon
-// et al. 2017), and relative to the strain of the apex, which is the cohesion on every axis.
-template <class T, int D>
-MPM_HD Vector<T, D> relative_to_apex(const HenckyStrain<T, D>& s, const SandParameters<T>& p) {
-  return shifted(s.h, T(1.0 / D) * p.volume - p.cohesion);
-}
-
 template <class T, int D>
 MPM_HD MappedStrain<T, D> unmapped(const Vector<T, D>& h) {
   const auto none = T(0) < T(0);
@@ -119,29 +123,32 @@ MPM_HD MappedStrain<T, D> unmapped(const Vector<T, D>& h) {
 // What a particle becomes, in principal axes.
 template <class T, int D>
 struct SandState {
-  Vector<T, D> trial;     // strain relative to the apex
-  MappedStrain<T, D> m;   // likewise
-  Vector<T, D> h, stress; // principal strains and stresses
-  MaskOf<T> meaningful, moved, yielded;
+  MappedStrain<T, D> m;    // relative to the apex of the cone
+  Vector<T, D> h, stress;  // principal strains and stresses
+  MaskOf<T> meaningful, moved, tears;
 };
 
-template <class Energy, class Rough, class T, int D>
-MPM_HD_LARGE SandState<T, D> sand_state(const HenckyStrain<T, D>& s, const SandParameters<T>& p, bool plastic, bool keep) {
-  SandState<T, D> r;
-  r.trial = relative_to_apex(s, p);
-  r.m = plastic ? return_map<Energy, Rough>(r.trial, p.cone, p.shear, keep) : unmapped(r.trial);
-  r.h = shifted(r.m.h, p.cohesion);
+// The cone has its apex at the strain of the cohesion on every axis.
+template <class Energy, class Rough, class V, class T, int D>
+MPM_HD_LARGE SandState<V, D> sand_state(const HenckyStrain<V, D>& s, const SandParameters<V>& p,
+                                        const SandArguments<T, D>& a) {
+  const auto never = V(0) < V(0);
+  const bool keeps = keeps_volume<Energy>(a);
+  const Vector<V, D> trial = shifted(s.h, V(1.0 / D) * p.volume - p.cohesion);
+  SandState<V, D> r;
+  r.m = a.plastic ? return_map<Energy, Rough>(trial, p.cone, p.shear, p.torn, keeps) : unmapped(trial);
+  r.tears = a.volume.pointer && !keeps ? r.m.apex : never;
+  r.h = shifted(r.m.h, select(r.tears, V(0), p.cohesion));
   r.stress = sand_stress<Energy>(r.h, p.mu, p.lam);
-  T finite = T(0);
+  V finite = V(0);
   MPM_UNROLL
   for (int i = 0; i < D; i++) finite = finite + (r.stress[i] - r.stress[i]);
-  r.meaningful = s.meaningful & (finite == T(0));
-  r.yielded = r.meaningful & (r.m.cone | r.m.apex);
-  r.moved = r.yielded | (r.meaningful & ((p.volume > T(0)) | (p.volume < T(0))));
+  r.meaningful = s.meaningful & (finite == V(0));
+  r.moved = r.meaningful & (r.m.cone | r.m.apex | (p.volume > V(0)) | (p.volume < V(0)));
   return r;
 }
 
-// Length and direction of the plastic part of the trial strain.
+// Length and direction of the plastic increment of the strain.
 template <class T, int D>
 struct PlasticIncrement {
   T norm;
@@ -149,17 +156,39 @@ struct PlasticIncrement {
 };
 
 template <class T, int D>
-MPM_HD PlasticIncrement<T, D> plastic_increment(const SandState<T, D>& state) {
-  Vector<T, D> lost;
-  MPM_UNROLL
-  for (int i = 0; i < D; i++) lost[i] = state.trial[i] - state.m.h[i];
+MPM_HD PlasticIncrement<T, D> plastic_increment(const HenckyStrain<T, D>& s, const SandState<T, D>& state) {
+  const Vector<T, D> lost = s.h + T(-1) * state.h;
   const T norm = sqrt(dot(lost, lost));
   return {norm, (T(1) / select(norm > T(0), norm, T(1))) * lost};
 }
 
+// The energy that turns into heat, ψ(x) − ψ(H) + τ(x) · (h − x): plastic flow from the trial strain h under the stress at
+// the strain x where it yields (backward Euler; Simo and Hughes 1998), and what is stored there and not in the mapped
+// strain H. x is H but for two jumps: what tears does so at the cohesion, and the compressed axes of a unilateral energy
+// lose theirs at the apex, which a steep cone reaches at any strain. Never negative, and zero where no stress is.
+template <class T, int D>
+struct Dissipation {
+  Vector<T, D> at, flow;  // x, h − x
+};
+
 template <class Energy, class T, int D>
-MPM_HD MaskOf<T> loses_volume(const SandState<T, D>& state, bool keep) {
-  return Energy::unilateral_yield && keep ? T(0) < T(0) : state.yielded & state.m.apex;
+MPM_HD Dissipation<T, D> dissipation(const HenckyStrain<T, D>& s, const SandState<T, D>& state,
+                                     const SandParameters<T>& p) {
+  Dissipation<T, D> r;
+  MPM_UNROLL
+  for (int i = 0; i < D; i++) {
+    const T jump = Energy::unilateral_yield ? select(state.m.apex, s.h[i], state.h[i])
+                                            : select(state.tears, p.cohesion, state.h[i]);
+    r.at[i] = select(p.torn, state.h[i], jump);
+    r.flow[i] = s.h[i] - r.at[i];
+  }
+  return r;
+}
+
+template <class Energy, class T, int D>
+MPM_HD T dissipated_energy(const Dissipation<T, D>& d, const Vector<T, D>& mapped, const T& mu, const T& lam) {
+  return sand_energy<Energy>(d.at, mu, lam) - sand_energy<Energy>(mapped, mu, lam) +
+         dot(sand_stress<Energy>(d.at, mu, lam), d.flow);
 }
 
 template <class Energy, class At, class T, int D>
@@ -167,8 +196,8 @@ MPM_HD void return_map_at(const ReturnMapArguments<T, D>& a, const At& at) {
   using V = typename At::Value;
   const Matrix<V, D> F = load_matrix<D>(at, a.sand.F);
   const HenckyStrain<V, D> s = hencky_strain(F);
-  const SandParameters<V> p = load_parameters<V>(at, a.sand);
-  const SandState<V, D> state = sand_state<Energy, V>(s, p, a.sand.plastic, a.sand.keep_apex);
+  const SandParameters<V> p = load_parameters<Energy, V>(at, a.sand);
+  const SandState<V, D> state = sand_state<Energy, V>(s, p, a.sand);
 
   Matrix<V, D> tau = compose(s.U, state.stress, s.U);
   Vector<V, D> factor;
@@ -189,19 +218,16 @@ MPM_HD void return_map_at(const ReturnMapArguments<T, D>& a, const At& at) {
       select(state.m.cone, V(kCone), select(state.m.apex, V(kApex), V(kElastic))) + select(state.m.converged, V(0), V(4));
   at.store_integer(a.branch, select(state.meaningful, branch, V(kInvalid)));
   if (a.multiplier.pointer)
-    at.store(a.multiplier.pointer, a.multiplier.stride[0], select(state.yielded, plastic_increment(state).norm, V(0)));
+    at.store(a.multiplier.pointer, a.multiplier.stride[0],
+             select(state.moved, plastic_increment(s, state).norm, V(0)));
   if (a.dissipated.pointer) {
-    const V lost = sand_energy<Energy>(shifted(state.trial, p.cohesion), p.mu, p.lam) -
-                   sand_energy<Energy>(state.h, p.mu, p.lam);
-    at.store(a.dissipated.pointer, a.dissipated.stride[0], select(state.yielded, lost, V(0)));
+    const V lost = dissipated_energy<Energy>(dissipation<Energy>(s, state, p), state.h, p.mu, p.lam);
+    at.store(a.dissipated.pointer, a.dissipated.stride[0], select(state.moved, lost, V(0)));
   }
   // What the trace loses: on the cone and where the volume is kept, nothing.
-  if (a.volume.pointer) {
-    const V left = p.volume + (sum(s.h) - V(D) * p.cohesion);
-    const auto lost = loses_volume<Energy>(state, a.sand.keep_apex);
+  if (a.volume.pointer)
     at.store(a.volume.pointer, a.volume.stride[0],
-             select(state.meaningful, select(lost, left, V(0)), p.volume));
-  }
+             select(state.meaningful, select(state.tears, p.volume + sum(s.h), V(0)), p.volume));
 }
 
 // A value per particle where the mask is true, else 0.
@@ -210,7 +236,7 @@ MPM_HD V load_scalar(const At& at, const Field<const T>& f, const MaskOf<V>& mas
   return select(mask, convert<V>(at.load(f.pointer, f.stride[0])), V(0));
 }
 
-// Adjoints in principal axes: of the mapped and, directly, the trial strains, and of the parameters.
+// Adjoints in principal axes: of the mapped and the trial strains, and of the parameters.
 template <class T, int D>
 struct SandAdjoint {
   Vector<T, D> mapped, trial;
@@ -235,29 +261,40 @@ MPM_HD SandAdjoint<T, D> adjoint_of_tensors(const SandState<T, D>& state, const 
   return r;
 }
 
+// Of the dissipated energy.
+template <class Energy, class T, int D>
+MPM_HD void add_adjoint_of_dissipation(SandAdjoint<T, D>& r, const T& g, const HenckyStrain<T, D>& s,
+                                       const SandState<T, D>& state, const SandParameters<T>& p) {
+  const Dissipation<T, D> d = dissipation<Energy>(s, state, p);
+  const StressTerms<T, D> terms = stress_terms<Energy>(d.at), tangent = stress_tangent<Energy>(d.at, p.mu, p.lam);
+  const T trace = sum(d.flow);
+  MPM_UNROLL
+  for (int i = 0; i < D; i++) {
+    const T by_yield_strain = g * (tangent.shear[i] * d.flow[i] + tangent.dilation * trace);
+    r.trial[i] = r.trial[i] + g * (p.mu * terms.shear[i] + p.lam * terms.dilation);
+    r.mapped[i] = r.mapped[i] - g * state.stress[i] + select(state.tears, T(0), by_yield_strain);
+    r.cohesion = r.cohesion + select(state.tears, by_yield_strain, T(0));
+  }
+  r.mu = r.mu + g * dissipated_energy<Energy>(d, state.h, T(1), T(0));
+  r.lam = r.lam + g * dissipated_energy<Energy>(d, state.h, T(0), T(1));
+}
+
 // Of the scalar results that are asked for.
 template <class Energy, class At, class T, class V, int D>
 MPM_HD void add_adjoint_of_scalars(SandAdjoint<V, D>& r, const ReturnMapBackwardArguments<T, D>& a, const At& at,
-                                   const SandState<V, D>& state, const SandParameters<V>& p) {
+                                   const HenckyStrain<V, D>& s, const SandState<V, D>& state,
+                                   const SandParameters<V>& p) {
   if (a.grad_multiplier.pointer) {
-    const V g = load_scalar<V>(at, a.grad_multiplier, state.yielded);
-    const Vector<V, D> along = g * plastic_increment(state).direction;
+    const V g = load_scalar<V>(at, a.grad_multiplier, state.moved);
+    const Vector<V, D> along = g * plastic_increment(s, state).direction;
     r.trial = r.trial + along;
     r.mapped = r.mapped + V(-1) * along;
-    r.cohesion = r.cohesion + sum(along);  // the increment does not see the cohesion, which the mapped strain has in it
   }
-  if (a.grad_dissipated.pointer) {
-    const V g = load_scalar<V>(at, a.grad_dissipated, state.yielded);
-    const Vector<V, D> before = shifted(state.trial, p.cohesion), stress = sand_stress<Energy>(before, p.mu, p.lam);
-    r.trial = r.trial + g * stress;
-    r.mapped = r.mapped + (V(0) - g) * state.stress;
-    r.cohesion = r.cohesion + g * sum(stress);
-    r.mu = r.mu + g * (sand_energy<Energy>(before, V(1), V(0)) - sand_energy<Energy>(state.h, V(1), V(0)));
-    r.lam = r.lam + g * (sand_energy<Energy>(before, V(0), V(1)) - sand_energy<Energy>(state.h, V(0), V(1)));
-  }
+  if (a.grad_dissipated.pointer)
+    add_adjoint_of_dissipation<Energy>(r, load_scalar<V>(at, a.grad_dissipated, state.moved), s, state, p);
   if (a.grad_volume.pointer) {
-    r.volume = load_scalar<V>(at, a.grad_volume, loses_volume<Energy>(state, a.sand.keep_apex));
-    r.cohesion = r.cohesion - V(D) * r.volume;
+    r.volume = load_scalar<V>(at, a.grad_volume, state.meaningful & state.tears);
+    r.trial = shifted(r.trial, r.volume);
   }
 }
 
@@ -265,12 +302,14 @@ MPM_HD void add_adjoint_of_scalars(SandAdjoint<V, D>& r, const ReturnMapBackward
 template <class Energy, class T, int D>
 MPM_HD void pull_back(SandAdjoint<T, D>& r, const SandState<T, D>& state, const SandParameters<T>& p, bool keep) {
   const MapAdjoint<T, D> map = return_map_adjoint<Energy>(state.m, r.mapped, p.cone, keep);
-  const T ratio = select(p.shear, quotient(map.ratio, select(p.shear, p.mu, T(1))), T(0));
+  const T ratio = select(p.shear, quotient(map.ratio, select(p.shear, p.mu, T(1))), T(0)), through = sum(map.h);
   r.trial = r.trial + map.h;
   r.mu = r.mu - ratio * p.cone.ratio;
   r.lam = r.lam + ratio;
   r.alpha = map.alpha;
-  r.cohesion = r.cohesion + sum(r.mapped) - sum(r.trial);
+  r.volume = r.volume + T(1.0 / D) * through;
+  r.cohesion = r.cohesion + select(state.tears, T(0), sum(r.mapped)) - through;
+  r.cohesion = select(p.torn, T(0), r.cohesion);
 }
 
 template <class T, int D>
@@ -298,17 +337,17 @@ MPM_HD void return_map_backward_at(const ReturnMapBackwardArguments<T, D>& a, co
   const Matrix<V, D> right = convert<V>(wide_right), even = convert<V>(symmetric_part(M)),
                      odd = convert<V>(skew_part(M)), narrow_N = convert<V>(N);
 
-  const SandParameters<W> p = load_parameters<W>(at, a.sand);
-  const SandState<W, D> state = sand_state<Energy, V>(wide, p, a.sand.plastic, a.sand.keep_apex);
+  const SandParameters<W> p = load_parameters<Energy, W>(at, a.sand);
+  const SandState<W, D> state = sand_state<Energy, V>(wide, p, a.sand);
   SandAdjoint<W, D> g = adjoint_of_tensors<Energy, V>(state, p, diagonal(M), diagonal(N));
-  add_adjoint_of_scalars<Energy>(g, a, at, state, p);
+  add_adjoint_of_scalars<Energy>(g, a, at, wide, state, p);
   pull_back<Energy>(g, state, p, a.sand.keep_apex);
 
   const auto meaningful = convert<MaskOf<V>>(state.meaningful);
   if (a.F.pointer) {
     const Vector<V, D> h = convert<V>(state.h);
     const Matrix<V, D> principal = principal_adjoint(
-        s, h, convert<V>(shifted(g.trial, g.volume)), even, odd, narrow_N, [&](int i, int j) -> Quotients<V> {
+        s, h, convert<V>(g.trial), even, odd, narrow_N, [&](int i, int j) -> Quotients<V> {
           return {strain_quotient<Energy, V>(state.m, i, j, wide.h[i] - wide.h[j]),
                   stress_quotient<Energy>(h[i], h[j], convert<V>(p.mu))};
         });
@@ -330,14 +369,14 @@ MPM_HD void return_map_backward_at(const ReturnMapBackwardArguments<T, D>& a, co
   if (a.volume.pointer) {
     const V kept = a.grad_volume.pointer ? at.load(a.grad_volume.pointer, a.grad_volume.stride[0]) : V(0);
     at.store(a.volume.pointer, a.volume.stride[0],
-             select(meaningful, convert<V>(g.volume + W(1.0 / D) * sum(g.trial)), kept));
+             select(meaningful, convert<V>(g.volume), kept));
   }
 }
 
 template <class Energy, class At, class T, int D>
 MPM_HD void sand_scalar_at(const SandScalarArguments<T, D>& a, const At& at) {
   using V = typename At::Value;
-  const SandParameters<V> p = load_parameters<V>(at, a.sand);
+  const SandParameters<V> p = load_parameters<Energy, V>(at, a.sand);
   const HenckyStrain<V, D> s = hencky_strain(load_matrix<D>(at, a.sand.F));
   const V value = a.stiffness ? sand_stiffness<Energy>(s.h, p.mu, p.lam, V(a.floor))
                               : sand_energy<Energy>(s.h, p.mu, p.lam);

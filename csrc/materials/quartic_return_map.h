@@ -123,9 +123,10 @@ MPM_HD FlowRoot<T> exact_root(const Root<T>& radial, const Vector<T, 3>& n, cons
 }
 
 // `keep` chooses between the two apex rules: all strain is lost, or the volume is kept (unilateral energy only). Without
-// shear stiffness there is no cone. Rough: see radial_root.
+// shear stiffness there is no cone. What is torn is at the apex in all extension. Rough: see radial_root.
 template <class Energy, class Rough, class T, int D>
-MPM_HD MappedStrain<T, D> return_map(const Vector<T, D>& h, const Cone<T>& cone, const MaskOf<T>& shear, bool keep) {
+MPM_HD MappedStrain<T, D> return_map(const Vector<T, D>& h, const Cone<T>& cone, const MaskOf<T>& shear,
+                                     const MaskOf<T>& torn, bool keep) {
   MappedStrain<T, D> m;
   m.p = T(1.0 / D) * sum(h);
   Vector<T, D> s;
@@ -138,7 +139,8 @@ MPM_HD MappedStrain<T, D> return_map(const Vector<T, D>& h, const Cone<T>& cone,
 
   const T start = min(norm / select(compressed, pressure, T(1)), T(RootFinding<T>::most_radius));
   m.cone = compressed & shear & sheared & outside<Energy, Rough>(start, m.direction, cone);
-  m.apex = (m.p >= T(0)) & convert<MaskOf<T>>(yields_in_extension<Energy>(convert<Rough>(h), convert<Rough>(cone.alpha)));
+  const auto yields = yields_in_extension<Energy>(convert<Rough>(h), convert<Rough>(cone.alpha));
+  m.apex = (m.p >= T(0)) & (torn | convert<MaskOf<T>>(yields));
   const Root<T> root = radial_root<Energy, Rough>(start, m.direction, cone, m.cone);
   m.radius = root.r;
   m.converged = root.converged;

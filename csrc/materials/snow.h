@@ -37,11 +37,12 @@ struct Snow : FixedCorotatedElasticity {
     return select(equal, select(h[i] == H[i], T(1), T(0)), (H[i] - H[j]) / select(equal, T(1), trial));
   }
 
-  // With the moduli after the step. The clamp may raise the volumetric energy by more than it lowers the other: that
-  // counts as nothing.
+  // Hardening stores what it adds to the elastic energy. The clamp may raise the volumetric energy by more than it lowers
+  // the other: that counts as nothing.
   template <class T, int D>
-  MPM_HD static T lost(const Vector<T, D>& h, const Vector<T, D>& H, const T p[], const T q[]) {
-    return max(energy(h, p, q) - energy(H, p, q), T(0));
+  MPM_HD static T lost(const Vector<T, D>& h, const Vector<T, D>& H, const T p[], const T before[], const T q[]) {
+    const T stored = energy(H, p, q) - energy(H, p, before);
+    return max(plastic_work(stress(H, p, q), h, H) - stored, T(0));
   }
 
   template <class T, int D>

@@ -28,6 +28,12 @@ struct VonMises : HenckyElasticity {
     q[0] = q[0] + T(0.81649658092772603) * step;
     return {kappa, plastic, T(0) == T(0)};
   }
+
+  // σ_y Δε̄: of the plastic work (σ_y + H ε̄) Δε̄ hardening stores ½ H ε̄² (Simo and Hughes 1998, section 3.2).
+  template <class T, int D>
+  MPM_HD static T lost(const Vector<T, D>& h, const Vector<T, D>& H, const T p[], const T[], const T[]) {
+    return T(0.81649658092772603) * max(p[2], T(0)) * max(deviator(h).norm - deviator(H).norm, T(0));
+  }
 };
 
 }  // namespace TORCH_MPM_ISA

@@ -135,7 +135,7 @@ py::tuple sand_return_map(const Array<T>& h, const Array<T>& alpha, const Array<
         cone.alpha.set(lane, alpha.data()[p]);
         cone.ratio.set(lane, ratio.data()[p]);
       }
-      const MappedStrain<P, 3> m = return_map<Energy, P>(strain, cone, P(0) == P(0), false);
+      const MappedStrain<P, 3> m = return_map<Energy, P>(strain, cone, P(0) == P(0), P(0) < P(0), false);
       for (int lane = 0; lane < count; lane++) {
         for (int k = 0; k < 3; k++) mapped.mutable_data()[3 * (i + lane) + k] = m.h[k][lane];
         branch.mutable_data()[i + lane] = (m.cone[lane]   ? kCone

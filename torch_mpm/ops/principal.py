@@ -38,7 +38,12 @@ class PrincipalUpdate(NamedTuple):
     history: tuple[Tensor, ...]
     """History variables after the return map, [P] each."""
     dissipated: Tensor | None
-    """Energy that the map dissipates per rest volume [P] [J/m³], not negative. With details only."""
+    """Energy that the map turns into heat, per rest volume [P] [J/m³], not negative. With details only.
+
+    It is the plastic work τ · (h − H) of the mapped stress on the plastic increment of the Hencky strains (backward
+    Euler; Simo and Hughes 1998) less what hardening stores: ½ H ε̄² of "von_mises", what "snow" adds to its elastic
+    energy, nothing of the others.
+    """
     branch: Tensor | None
     """int32 [P]: ELASTIC = 0, PLASTIC = 1, INVALID = 3 (det F ≤ 0, not finite, or it overflows). With details only."""
     converged: Tensor | None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -27,6 +28,9 @@ __all__ = [
 
 Value = float | Tensor
 
+ANGLE = "in radians, in [0, π/2), such as 0.5236 for 30°"
+"""What a friction angle must be."""
+
 
 class ReturnMap(NamedTuple):
     """Result of `quartic_return_map`. The last three are None unless asked for."""
@@ -40,9 +44,14 @@ class ReturnMap(NamedTuple):
     converged: Tensor
     """bool [P]: whether the root on the cone was found."""
     multiplier: Tensor | None
-    """Plastic multiplier [P]: norm of the plastic increment of the Hencky strain. With details."""
+    """Plastic multiplier [P]: norm of the plastic increment of the Hencky strain, trial less mapped. With details."""
     dissipated: Tensor | None
-    """Elastic energy lost by the map, per rest volume [P] [J/m³]. With details."""
+    """Energy that the map turns into heat, per rest volume [P] [J/m³], not negative. With details.
+
+    It is the work of the mapped stress on the plastic increment, τ · (h − H) (backward Euler; Simo and Hughes 1998),
+    and the elastic energy that is lost at once: of sand that tears with a cohesion, and of the axes that are compressed
+    when a unilateral energy reaches the apex. Sand stores no energy by hardening.
+    """
     volume_correction: Tensor | None
     """v_c [P] after the map. With a volume correction."""
 
@@ -84,9 +93,13 @@ def quartic_return_map(
             are the same in 2-D and for the quadratic energy. In plane strain the exact flow mobilises more friction.
         cohesion: Hencky strain c ≥ 0, like mu: the tension on every axis at the apex of the cone, h = c (1, 1, 1). The
             yield function is that of h − c. Its stress is the tensile strength, 4aμ c³ + 2aλ (D c)³ for the full
-            energy and (2μ + D λ) c for the quadratic one; the unilateral energy has none in tension.
-        volume_correction: v_c [P], logarithm of the volume that was lost at the apex, zero at first (Tampubolon et al.
-            2017): the map sees h + v_c/D, and returns v_c + log det of the trial F − log det of the new one.
+            energy and (2μ + D λ) c for the quadratic one; the unilateral energy has none in tension. Without a volume
+            correction sand flows at the apex under that tension.
+        volume_correction: v_c [P], logarithm of the volume that was lost at the apex, zero at first and not negative
+            (Tampubolon et al. 2017). With it, what reaches the apex tears: F becomes a rotation whatever the cohesion,
+            and v_c grows by log det of the trial F. Torn sand, v_c > 0, has neither stress nor cohesion until
+            compression has closed the gap: the map sees h + v_c/D, is at the apex while its trace is not negative, and
+            gives v_c back to F once it is. With apex="keep" F keeps the volume itself, and v_c stays zero.
 
     Returns:
         A `ReturnMap`. A trial F that is not finite or of det F ≤ 0 is returned as it is, with zero stress.
@@ -97,7 +110,8 @@ def quartic_return_map(
     strains and map in float64: it is right to rounding at the F that is given.
 
     Raises:
-        ValueError, TypeError: for an unknown option, or wrong shapes, dtypes or devices.
+        ValueError, TypeError: for an unknown option, a number out of range, or wrong shapes, dtypes or devices. Values
+            in tensors are not read.
     """
     if (friction_angle is None) == (alpha is None):
         raise ValueError("either friction_angle or alpha must be given")
@@ -109,6 +123,9 @@ def quartic_return_map(
         raise ValueError(f"flow must be 'radial' or 'exact', got {flow!r}")
     _check_deformation(F, scene, energy)
     check_like("volume_correction", volume_correction, F, (F.shape[0],), "[P]")
+    _check_number("friction_angle", friction_angle, ANGLE, most=math.pi / 2)
+    _check_number("alpha", alpha, "finite and not negative")
+    _check_number("cohesion", cohesion, "finite and not negative")
     slope = (
         friction_alpha(_parameter("friction_angle", friction_angle, F, scene), F.shape[1]) if alpha is None else alpha
     )
@@ -179,6 +196,12 @@ def _check_deformation(F: Tensor, scene: Tensor | None, energy: str) -> None:
         raise TypeError(f"scene must be int32, got {scene.dtype}")
     if scene.device != F.device:
         raise ValueError(f"scene must be on the device of F, {F.device}, got {scene.device}")
+
+
+def _check_number(name: str, value: Value | None, expected: str, most: float = math.inf) -> None:
+    """A tensor is left alone: to read it would wait for its device."""
+    if value is not None and not isinstance(value, Tensor) and not 0 <= value < most:
+        raise ValueError(f"{name} must be {expected}, got {value}")
 
 
 def _parameter(name: str, value: Value | None, F: Tensor, scene: Tensor | None) -> Tensor:

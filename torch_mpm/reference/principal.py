@@ -27,6 +27,7 @@ class PrincipalLaw:
         energy: ψ [P].
         stress: principal Kirchhoff stresses [P, D].
         flow: mapped strains, new history and whether the state yields; None for an elastic law.
+        heat: dissipated energy [P] of trial and mapped strains, parameters, history before and after.
     """
 
     parameters: tuple[str, ...]
@@ -34,6 +35,7 @@ class PrincipalLaw:
     energy: Callable[..., Tensor]
     stress: Callable[..., Tensor]
     flow: Flow | None
+    heat: Callable[..., Tensor] | None = None
 
 
 def _hencky_energy(h: Tensor, p: Sequence[Tensor], q: Sequence[Tensor]) -> Tensor:
@@ -153,6 +155,30 @@ def _cam_clay_flow(h: Tensor, p: Sequence[Tensor], q: Sequence[Tensor]) -> tuple
     return _radial(h, kappa, plastic, compaction / dim), [torch.where(plastic, q[0] - compaction, q[0])], plastic
 
 
+def _plastic_work(stress: Tensor, h: Tensor, mapped: Tensor) -> Tensor:
+    return (stress * (h - mapped)).sum(1)
+
+
+def _hencky_heat(
+    h: Tensor, mapped: Tensor, p: Sequence[Tensor], before: Sequence[Tensor], after: Sequence[Tensor]
+) -> Tensor:
+    return _plastic_work(_hencky_stress(mapped, p, after), h, mapped)
+
+
+def _von_mises_heat(
+    h: Tensor, mapped: Tensor, p: Sequence[Tensor], before: Sequence[Tensor], after: Sequence[Tensor]
+) -> Tensor:
+    """Plastic work less the work of hardening H ε̄ dε̄, both by backward Euler."""
+    return _hencky_heat(h, mapped, p, before, after) - p[3] * after[0] * (after[0] - before[0])
+
+
+def _snow_heat(
+    h: Tensor, mapped: Tensor, p: Sequence[Tensor], before: Sequence[Tensor], after: Sequence[Tensor]
+) -> Tensor:
+    stored = _snow_energy(mapped, p, after) - _snow_energy(mapped, p, before)
+    return _plastic_work(_snow_stress(mapped, p, after), h, mapped) - stored
+
+
 LAWS = {
     "fixed_corotated": PrincipalLaw(("mu", "lam"), (), _corotated_energy, _corotated_stress, None),
     "hencky": PrincipalLaw(("mu", "lam"), (), _hencky_energy, _hencky_stress, None),
@@ -162,6 +188,7 @@ LAWS = {
         _hencky_energy,
         _hencky_stress,
         _von_mises_flow,
+        _von_mises_heat,
     ),
     "herschel_bulkley": PrincipalLaw(
         ("mu", "lam", "yield_stress", "consistency", "exponent", "dt"),
@@ -169,6 +196,7 @@ LAWS = {
         _hencky_energy,
         _hencky_stress,
         _viscoplastic_flow,
+        _hencky_heat,
     ),
     "snow": PrincipalLaw(
         ("mu", "lam", "critical_compression", "critical_stretch", "hardening"),
@@ -176,6 +204,7 @@ LAWS = {
         _snow_energy,
         _snow_stress,
         _snow_flow,
+        _snow_heat,
     ),
     "cam_clay": PrincipalLaw(
         ("mu", "lam", "critical_slope", "consolidation", "hardening", "cohesion"),
@@ -183,6 +212,7 @@ LAWS = {
         _hencky_energy,
         _hencky_stress,
         _cam_clay_flow,
+        _hencky_heat,
     ),
 }
 
@@ -208,13 +238,15 @@ def principal_update(
         mapped, moved, plastic = this.flow(h, p, history)
     plastic = plastic & meaningful
     stress = (U * this.stress(mapped, p, moved)[:, None, :]) @ U.mT
-    lost = (this.energy(h, p, moved) - this.energy(mapped, p, moved)).clamp(min=0)
+    heat = torch.zeros_like(h[:, 0])
+    if this.heat is not None:
+        heat = this.heat(h, mapped, p, history, moved).clamp(min=0)
     branch = torch.where(plastic, PLASTIC, ELASTIC)
     return (
         torch.where(plastic[:, None, None], (U * mapped.exp()[:, None, :]) @ V.mT, F),
         torch.where(meaningful[:, None, None], stress, 0),
         [torch.where(plastic, new, old) for new, old in zip(moved, history, strict=True)],
-        torch.where(plastic, lost, 0),
+        torch.where(plastic, heat, 0),
         torch.where(meaningful, branch, INVALID).int(),
     )
 

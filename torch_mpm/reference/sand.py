@@ -148,11 +148,13 @@ def quartic_return_map(
     volume_correction: Tensor | None = None,
 ) -> tuple[Tensor, ...]:
     """F, τ, branch, multiplier, dissipated energy, volume correction; see `torch_mpm.ops.quartic_return_map`."""
-    zero = torch.zeros_like(mu)
+    corrects, zero = volume_correction is not None and apex == "zero", torch.zeros_like(mu)
     mu, lam, alpha, cohesion = (
         per_particle(zero if p is None else p, scene, F.shape[0]) for p in (mu, lam, alpha, cohesion)
     )
     volume = torch.zeros_like(mu) if volume_correction is None else volume_correction
+    torn = (volume > 0) & corrects
+    cohesion = torch.where(torn, 0, cohesion)
     meaningful = F.isfinite().all(2).all(1)
     meaningful = meaningful & (torch.linalg.det(torch.where(meaningful[:, None, None], F, 0)) > 0)
     safe = torch.where(meaningful[:, None, None], F, torch.eye(F.shape[1], dtype=F.dtype, device=F.device))
@@ -163,17 +165,42 @@ def quartic_return_map(
         mapped, branch = trial, torch.zeros_like(mu, dtype=torch.int32)
     else:
         mapped, branch = return_map_strain(trial, mu, lam, alpha, energy, apex, flow)
-    increment = (trial - mapped).norm(dim=1)
-    trial, mapped = trial + cohesion[:, None], mapped + cohesion[:, None]
-    yielded = meaningful & (branch != ELASTIC)
-    moved = yielded | (meaningful & (volume != 0))
+    mapped = mapped + cohesion[:, None]
+    tears = torch.zeros_like(torn)
+    if corrects:
+        tears = (branch == APEX) | (torn & (trial.sum(1) >= 0))
+        mapped, branch = torch.where(tears[:, None], 0, mapped), torch.where(tears, APEX, branch)
+    moved = meaningful & ((branch != ELASTIC) | (volume != 0))
     stress = (U * principal_stress(mapped, mu, lam, energy)[:, None, :]) @ U.mT
-    lost = energy_density(trial, mu, lam, energy) - energy_density(mapped, mu, lam, energy)
+    heat = dissipation(h, mapped, branch, torch.where(tears & ~torn, cohesion, 0), torn, mu, lam, energy)
     return (
         torch.where(moved[:, None, None], (U * mapped.exp()[:, None, :]) @ V.mT, F),
         torch.where(meaningful[:, None, None], stress, 0),
         torch.where(meaningful, branch, INVALID),
-        torch.where(yielded, increment, 0),
-        torch.where(yielded, lost, 0),
+        torch.where(moved, (h - mapped).norm(dim=1), 0),
+        torch.where(moved, heat, 0),
         torch.where(moved, volume + h.sum(1) - mapped.sum(1), volume),
     )
+
+
+def dissipation(
+    h: Tensor,
+    mapped: Tensor,
+    branch: Tensor,
+    tearing: Tensor,
+    torn: Tensor,
+    mu: Tensor,
+    lam: Tensor,
+    energy: str,
+) -> Tensor:
+    """Energy [P] that the map turns into heat: the work of its stress on the plastic strain, and what is lost at once.
+
+    At once goes the energy of the strain at which sand tears [P], and at the apex of the unilateral energy all of it.
+    """
+    work = (principal_stress(mapped, mu, lam, energy) * (h - mapped)).sum(1)
+    edge = tearing[:, None].expand_as(h)
+    tear = energy_density(edge, mu, lam, energy) + (principal_stress(edge, mu, lam, energy) * (h - edge)).sum(1)
+    heat = torch.where(tearing > 0, tear, work)
+    if energy != "unilateral":
+        return heat
+    return torch.where((branch == APEX) & ~torn, energy_density(h, mu, lam, energy), heat)

@@ -1,0 +1,139 @@
+"""A law that sees its own result again changes nothing: deformation, history and stress stay, nothing dissipates."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable
+
+import pytest
+import torch
+from torch import Tensor
+
+import torch_mpm as mpm
+
+E, NU = 1e6, 0.3
+KLAR = tuple(math.radians(v) for v in (35, 9)) + (0.2, math.radians(10))
+
+LAWS: dict[str, Callable[[], mpm.Material]] = {
+    "neo_hookean": lambda: mpm.NeoHookean(E=E, nu=NU),
+    "weakly_compressible": lambda: mpm.WeaklyCompressible(bulk_modulus=E, viscosity=1.0),
+    "fixed_corotated": lambda: mpm.FixedCorotated(E=E, nu=NU),
+    "hencky": lambda: mpm.Hencky(E=E, nu=NU),
+    "von_mises": lambda: mpm.VonMises(E=E, nu=NU, yield_stress=0.02 * E),
+    "von_mises_hardening": lambda: mpm.VonMises(E=E, nu=NU, yield_stress=0.02 * E, hardening=0.1 * E),
+    "plastic_fluid": lambda: mpm.HerschelBulkley(E=E, nu=NU, yield_stress=0.01 * E, consistency=0.0),
+    "viscoplastic_fluid": lambda: mpm.HerschelBulkley(E=E, nu=NU, yield_stress=0.01 * E, consistency=100.0),
+    "snow": lambda: mpm.Snow(E=E, nu=NU),
+    "cam_clay": lambda: mpm.CamClay(E=E, nu=NU, critical_slope=1.2, consolidation=3e4, hardening=5.0, cohesion=0.2),
+    "expanding": lambda: mpm.ThermalExpansion(mpm.VonMises(E=E, nu=NU, yield_stress=0.02 * E), 1e-3),
+    "melting": lambda: mpm.Melting(
+        mpm.VonMises(E=E, nu=NU, yield_stress=0.02 * E), mpm.WeaklyCompressible(bulk_modulus=E)
+    ),
+}
+SAND_FORMS = [
+    *((energy, "radial", "zero") for energy in ("full", "unilateral", "hencky", "mixed")),
+    *((energy, "exact", "zero") for energy in ("full", "unilateral", "hencky", "mixed")),
+    *(("unilateral", flow, "keep") for flow in ("radial", "exact")),
+]
+SAND_OPTIONS = list(itertools.product((False, True), repeat=3))
+
+
+def rotations(count: int, dim: int) -> Tensor:
+    Q, R = torch.linalg.qr(torch.randn(count, dim, dim, dtype=torch.float64))
+    Q = Q * R.diagonal(dim1=1, dim2=2).sign()[:, None, :]
+    Q[:, :, 0] *= torch.linalg.det(Q).sign()[:, None]
+    return Q
+
+
+def strains(count: int, dim: int) -> Tensor:
+    """Hencky strains [P, D] from 1e-4 to 1: compressed, torn, sheared, and the same on every axis."""
+    size = 10 ** (-4 + 4 * torch.rand(count, 1, dtype=torch.float64))
+    mean = torch.tensor([-1.0, -0.3, 0.0, 0.3, 1.0], dtype=torch.float64).repeat(count)[:count, None]
+    spread = torch.randn(count, dim, dtype=torch.float64)
+    spread[::7] = 0
+    return size * (mean + 0.5 * spread)
+
+
+def states(dim: int, dtype: torch.dtype, device: str, count: int = 420) -> mpm.State:
+    """Random deformations with random histories: gaps that are open, hardening, melt and temperature."""
+    h = strains(count, dim)
+    F = rotations(count, dim) * h.exp()[:, None, :] @ rotations(count, dim).mT
+    one, gap = torch.ones(count, dtype=torch.float64), 0.2 * torch.rand(count, dtype=torch.float64)
+    gap[::2] = 0
+    extra = {
+        "volume_correction": gap,
+        "hardening": 0.5 * torch.rand_like(one),
+        "plastic_strain": 0.1 * torch.rand_like(one),
+        "log_plastic_volume": 0.1 * torch.rand_like(one) - 0.05,
+        "liquid": torch.rand_like(one),
+    }
+    x, C = torch.full((count, dim), 0.5, dtype=torch.float64), torch.randn(count, dim, dim, dtype=torch.float64)
+    state = mpm.State(x, 0 * x, one, one, C=C, F=F, J=torch.linalg.det(F), temperature=20 * one, extra=extra)
+    return state.to(device, dtype)
+
+
+def assert_second_update_changes_nothing(law: mpm.Material, state: mpm.State, dt: float = 0.0) -> None:
+    def updated(state: mpm.State) -> tuple[dict[str, Tensor], Tensor]:
+        state.dt = dt
+        return law.update(state)
+
+    law.dissipation = True
+    for part in law.modules():
+        if isinstance(part, mpm.Material):
+            part.dissipation = True
+    first, stress = updated(state)
+    moved = {name: value for name, value in first.items() if name in ("F", "J")}
+    history = {name: first[name] for name in law.extra_fields}
+    second, again = updated(state.replace(**moved, extra={**state.extra, **history}))
+
+    rounding = 500 * torch.finfo(state.x.dtype).eps
+    size = {name: value.abs().flatten(1).amax(1) if value.dim() > 1 else 1 for name, value in first.items()}
+    for name in (*moved, *history):
+        change = (second[name] - first[name]).abs()
+        worst = float((change.flatten(1).amax(1) / size[name] if change.dim() > 1 else change).max())
+        assert worst < rounding, f"{name} changes by {worst:.3g}"
+    scale = E + stress.abs().amax((1, 2))
+    worst = float(((again - stress).abs().amax((1, 2)) / scale).max())
+    assert worst < rounding, f"stress changes by {worst:.3g} of its scale"
+    if "dissipated" in second:
+        worst = float((second["dissipated"].abs() / scale).max())
+        assert worst < rounding, f"{float(second['dissipated'].abs().max()):.6g} J/m3 dissipate again"
+
+
+@pytest.mark.parametrize("name", LAWS)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_second_update_changes_nothing(device, dim, dtype, name):
+    """A fluid that flows at a rate does so in time alone: without a time step it rests."""
+    law = LAWS[name]().to(device)
+    assert_second_update_changes_nothing(law, states(dim, dtype, device), dt=1.0 if name == "plastic_fluid" else 0.0)
+
+
+@pytest.mark.parametrize(("energy", "flow", "apex"), SAND_FORMS)
+@pytest.mark.parametrize(("correction", "cohesive", "hardens"), SAND_OPTIONS)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_second_update_of_sand_changes_nothing(device, dim, dtype, energy, flow, apex, correction, cohesive, hardens):
+    law = mpm.QuarticSand(
+        E=E,
+        nu=NU,
+        energy=energy,
+        flow=flow,
+        apex=apex,
+        cohesion=0.01 if cohesive else None,
+        volume_correction=correction,
+        hardening=KLAR if hardens else None,
+    )
+    assert_second_update_changes_nothing(law, states(dim, dtype, device))
+
+
+def test_flow_at_a_rate_vanishes_with_the_time_step(device, dim):
+    """What a second update moves is of the order of dt."""
+    law, state = LAWS["viscoplastic_fluid"](), states(dim, torch.float64, device)
+    changes = []
+    for dt in (1e-8, 1e-9):
+        state.dt = dt
+        first = law.update(state)[0]["F"]
+        after = state.replace(F=first)
+        after.dt = dt
+        changes.append(float((law.update(after)[0]["F"] - first).abs().max()))
+    assert 0 < changes[1] < 0.2 * changes[0]
