@@ -1,4 +1,4 @@
-"""Ways to use autograd: every law and differentiable op under checkpointing, hooks, torch.func and torch.compile."""
+"""Ways to use autograd: every law and differentiable op under checkpointing, hooks, forward mode and torch.func."""
 
 import dataclasses
 import warnings
