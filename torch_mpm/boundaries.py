@@ -20,6 +20,7 @@ from typing import Any, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
+from torch.autograd.graph import saved_tensors_hooks
 
 from .capture import Kept
 from .errors import shape_of
@@ -647,8 +648,7 @@ class SDF(Obstacle):
         if self.normal is not None:
             distance, normal = self.distance(body), self.normal(body)
         else:
-            distance, pull_back, *_ = torch.func.vjp(self.distance, body)
-            (normal,) = pull_back(torch.ones_like(distance))
+            distance, normal = _with_gradient(self.distance, body)
         if distance.shape != body.shape[:1] or normal.shape != body.shape:
             raise ValueError(
                 f"distance and normal of an SDF must have shape [N] and [N, D] = {list(body.shape)}, "
@@ -678,6 +678,25 @@ def rotation_matrix(angle: Tensor, dim: int) -> Tensor:
     cross = torch.stack(rows, -2)
     first, second = torch.sinc(theta / math.pi), 0.5 * torch.sinc(theta / (2 * math.pi)) ** 2
     return torch.eye(3, dtype=angle.dtype, device=angle.device) + first * cross + second * (cross @ cross)
+
+
+def _with_gradient(function: Callable[[Tensor], Tensor], points: Tensor) -> tuple[Tensor, Tensor]:
+    """Values [N] of a function of points [N, D], each of its own point, and their gradients; differentiable."""
+    if torch.compiler.is_compiling() or torch._C._autograd._top_saved_tensors_default_hooks(False) is None:
+        values, pull_back, *_ = torch.func.vjp(function, points)
+        return values, pull_back(torch.ones_like(values))[0]
+    # torch.func refuses the hooks of checkpointing, which would compute its steps again for a gradient taken in them.
+    differentiable = torch.is_grad_enabled()
+    with torch.enable_grad(), saved_tensors_hooks(_same, _same):
+        leaf = points.view_as(points)
+        leaf = leaf if leaf.requires_grad else leaf.requires_grad_()
+        values = function(leaf)
+        (gradient,) = torch.autograd.grad(values, leaf, torch.ones_like(values), create_graph=differentiable)
+    return values, gradient
+
+
+def _same(t: Tensor) -> Tensor:
+    return t
 
 
 def _norm(v: Tensor) -> Tensor:

@@ -1,7 +1,8 @@
-"""CUDA graphs: whether one is captured, and tensors that live as long as graphs may read them."""
+"""What outlives a call: tensors that CUDA graphs may read, and none that belongs to a transform of torch.func."""
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable
 from typing import Any
 
@@ -12,6 +13,21 @@ from torch import Tensor
 def is_captured(x: Tensor) -> bool:
     """Whether what is done with a tensor goes into a CUDA graph."""
     return x.is_cuda and not torch.compiler.is_compiling() and torch.cuda.is_current_stream_capturing()
+
+
+def without_transforms(t: Tensor) -> Tensor:
+    """The plain tensor below the levels of torch.func.grad and its like, which may be kept when they have ended."""
+    if torch.compiler.is_compiling():
+        return t
+    while torch._C._functorch.is_gradtrackingtensor(t):
+        t = torch._C._functorch.get_unwrapped(t)
+    return t
+
+
+def outside_transforms() -> contextlib.AbstractContextManager[Any]:
+    """Where what is kept may be written to, which a transform of torch.func forbids."""
+    active = not torch.compiler.is_compiling() and torch._C._are_functorch_transforms_active()
+    return torch._C._DisableFuncTorch() if active else contextlib.nullcontext()
 
 
 def remember(kept: list[Any], value: Any) -> None:
@@ -36,7 +52,8 @@ class Kept:
         if self._latest is None or not _same(self._latest[0], key):
             with torch.inference_mode(False):  # such that a later step may differentiate through it
                 made = make()
-            if captured:  # what is made in a graph has its value in replays only
+            # What is made in a graph has its value in replays only, in a transform of torch.func belongs to that.
+            if captured or torch._C._are_functorch_transforms_active():
                 return made
             self._latest = (key, made)
         value = self._latest[1]

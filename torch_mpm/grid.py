@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .capture import is_captured, remember
+from .capture import is_captured, outside_transforms, remember, without_transforms
 from .errors import GridOverflowError, check_positions
 
 PADDING = 3
@@ -176,7 +176,8 @@ class Grid:
         if self._on_host is None:
             with torch.inference_mode(False):  # such that a later step may write to it
                 self._on_host = torch.empty(status.shape, dtype=status.dtype, pin_memory=True)
-        self._on_host.copy_(status, non_blocking=True)
+        with outside_transforms():
+            self._on_host.copy_(status, non_blocking=True)
         self._pending = torch.cuda.Event()
         self._pending.record()
 
@@ -199,12 +200,13 @@ class ActivationRecord:
         """As `Grid.activate`; the capacity of the grid follows."""
         before = self.status
         blocks = grid.activate(x, scene, before)
-        grid.watch(blocks.status)
+        status = without_transforms(blocks.status)
+        grid.watch(status)
         if before is None or not is_captured(x):
-            self.status = blocks.status
+            self.status = status
             return blocks
-        with torch.inference_mode():  # in which any tensor may be written to
-            before.copy_(blocks.status)
+        with torch.inference_mode(), outside_transforms():  # in which any tensor may be written to
+            before.copy_(status)
         remember(self._replayed, before)
         return blocks
 

@@ -28,6 +28,7 @@ import torch
 from torch import Tensor, nn
 
 from .boundaries import _norm
+from .capture import outside_transforms, without_transforms
 from .errors import SimulationError, check_like
 from .grid import ActivationRecord, Blocks, Grid
 from .heat_boundaries import FixedSurface, HeatNodes
@@ -349,8 +350,10 @@ class Heat(nn.Module):
             with torch.inference_mode(False):
                 self.unsolved = torch.zeros(converged.shape, dtype=torch.int32, device=converged.device)
                 self.residual = torch.zeros(residual.shape, dtype=torch.float64, device=residual.device)
-        self.unsolved += ~converged
-        self.residual.copy_(torch.where(converged, self.residual, torch.maximum(self.residual, residual.double())))
+        converged, residual = without_transforms(converged), without_transforms(residual)
+        with outside_transforms():
+            self.unsolved += ~converged
+            self.residual.copy_(torch.where(converged, self.residual, torch.maximum(self.residual, residual.double())))
 
     def check(self) -> None:
         """Read what became of the solves so far; synchronises with the device.

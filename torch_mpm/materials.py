@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor, nn
 
-from .capture import Kept
+from .capture import Kept, without_transforms
 from .errors import shape_of
 from .ops import material as ops
 from .ops.arguments import soa_empty
@@ -407,7 +407,8 @@ class Mixture(Material):
                 raise ValueError(
                     f"state.material must be in 0 .. {len(self.laws) - 1}, got {material.unique().tolist()}"
                 )
-            self._indices = [(material == k).nonzero().squeeze(1) for k in range(len(self.laws))]
+            indices = ((material == k).nonzero().squeeze(1) for k in range(len(self.laws)))
+            self._indices = [without_transforms(index) for index in indices]
             self._material = material
         return [(_Part(state, index), law) for index, law in zip(self._indices, self.laws, strict=True) if len(index)]
 

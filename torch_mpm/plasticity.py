@@ -353,16 +353,19 @@ class _IsotropicFunction(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, F: Tensor, U: Tensor, sigma: Tensor, V: Tensor, mapped: Tensor, tau: Tensor, evaluate: Any
+        F: Tensor, U: Tensor, sigma: Tensor, V: Tensor, mapped: Tensor, tau: Tensor, evaluate: Any
     ) -> tuple[Tensor, Tensor]:
-        ctx.save_for_backward(U, sigma, V, mapped, tau)
-        ctx.evaluate = evaluate
         return (U * mapped[:, None, :]) @ V.mT, (U * tau[:, None, :]) @ U.mT
 
     @staticmethod
+    def setup_context(ctx: Any, inputs: Any, output: Any) -> None:
+        *tensors, ctx.evaluate = inputs
+        ctx.save_for_backward(*tensors)
+
+    @staticmethod
     def backward(ctx: Any, grad_F: Tensor, grad_stress: Tensor) -> Any:
-        U, sigma, V, mapped, tau = ctx.saved_tensors
-        M, N = U.mT @ grad_F @ V, U.mT @ grad_stress @ U
+        F, U, sigma, V, mapped, tau = ctx.saved_tensors
+        M, N = (_DifferentiatedOnce.apply(t, F) for t in (U.mT @ grad_F @ V, U.mT @ grad_stress @ U))
         turned = None
         if ctx.needs_input_grad[0]:
             principal = torch.zeros_like(M)
@@ -376,9 +379,25 @@ class _IsotropicFunction(torch.autograd.Function):
                     stress = (N[:, i, j] + N[:, j, i]) * stress_slope / total
                     principal[:, i, j] = even + odd + stress * sigma[:, j]
                     principal[:, j, i] = even - odd + stress * sigma[:, i]
-            turned = U @ principal @ V.mT
+            turned = _DifferentiatedOnce.apply(U @ principal @ V.mT, mapped, tau)
         diagonals = (t.diagonal(dim1=1, dim2=2) for t in (M, N))
         return turned, None, None, None, *diagonals, None
+
+
+class _DifferentiatedOnce(torch.autograd.Function):
+    """A gradient that depends on other tensors in a way that autograd does not see."""
+
+    @staticmethod
+    def forward(gradient: Tensor, *others: Tensor) -> Tensor:
+        return gradient.clone()
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: Any, output: Any) -> None:
+        pass
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> Any:
+        raise NotImplementedError("CustomPrincipalLaw has no second derivatives: differentiate it once")
 
 
 def _quotients(

@@ -17,6 +17,27 @@ if TYPE_CHECKING:
     from .seed import Points
 
 
+class Time:
+    """`State.time`. A number is kept as (tensor [],), because compiled code takes Python numbers for constants."""
+
+    def __get__(self, state: State | None, owner: type) -> float | Tensor:
+        if state is None:
+            return 0.0  # of a new state
+        time: Tensor | tuple[Tensor] = state.__dict__["_time"]
+        if isinstance(time, Tensor):
+            return time
+        return time[0] if torch.compiler.is_compiling() else time[0].item()
+
+    def __set__(self, state: State, time: float | Tensor | tuple[Tensor]) -> None:
+        if isinstance(time, Tensor):
+            number = torch.compiler.is_compiling() and time.dim() == 0 and time.dtype == torch.float64
+            if number and time.device.type == "cpu" and not time.requires_grad:
+                time = (time,)
+        elif not isinstance(time, tuple):
+            time = (torch.scalar_tensor(time, dtype=torch.float64, device="cpu"),)
+        state.__dict__["_time"] = time
+
+
 @dataclasses.dataclass(eq=False)
 class State:
     """Particles of all scenes of a batch, packed. A field that a simulation does not use is None.
@@ -34,7 +55,8 @@ class State:
         material: law of each particle, int32 [P], for a `Mixture`.
         temperature: relative to a reference [P] [K].
         extra: further per-particle tensors [P, ...] that follow a reordering.
-        time: simulated time [s]: a number, or a tensor [B] once dt is a tensor.
+        time: simulated time [s]: a number, or a tensor [B] once dt is a tensor. Code compiled by `torch.compile` sees a
+            number as a tensor [] of float64 on the CPU, so that it serves every time.
 
     All floating tensors have one dtype and device. Any strides work; those that the ops return keep the particle index
     contiguous, which is fastest.
@@ -52,7 +74,7 @@ class State:
     material: Tensor | None = None
     temperature: Tensor | None = None
     extra: dict[str, Tensor] = dataclasses.field(default_factory=dict)
-    time: float | Tensor = 0.0
+    time: float | Tensor = Time()  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
         if not isinstance(self.x, Tensor) or self.x.dim() != 2 or self.x.shape[1] not in (2, 3):
@@ -115,7 +137,7 @@ class State:
 
     def replace(self, **changes: Any) -> State:
         """A copy with some fields changed."""
-        return dataclasses.replace(self, **changes)
+        return dataclasses.replace(self, **{"time": self.__dict__["_time"]} | changes)
 
     def map(self, function: Callable[[Tensor], Tensor]) -> State:
         """A copy with a function applied to every per-particle tensor, absent fields staying None."""

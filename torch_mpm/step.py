@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
@@ -149,16 +148,19 @@ class Step(nn.Module):
 
     def _obstruct(self, blocks: Blocks, velocity: Tensor, state: State, dt: float | Tensor) -> Tensor:
         """The boundaries in turn; neighbours in the list that one op can take together."""
+        time = state.time
+        if isinstance(time, Tensor) and time.dim() == 0:
+            time = time.to(velocity.device)  # a number of a compiled step
         nodes: tuple[Tensor, Tensor | None] | None = None
-        for together, group in itertools.groupby(self.boundaries, lambda b: fusible(b, state.time)):
+        for together, group in _neighbours(self.boundaries, time):
             if together:
-                velocity = contact(blocks, velocity, list(group), state.time)  # type: ignore[arg-type]
+                velocity = contact(blocks, velocity, group, time)
                 continue
             if nodes is None:
                 scene = None if state.scene is None else blocks.node_scene()
                 nodes = (blocks.node_positions(state.x.dtype), scene)
             for boundary in group:
-                velocity = boundary.apply(velocity, *nodes, state.time, dt)
+                velocity = boundary.apply(velocity, *nodes, time, dt)
         return velocity
 
     def _blend_flip(self, blocks: Blocks, state: State, affine: Tensor | None, velocity: Tensor, v: Tensor) -> Tensor:
@@ -212,6 +214,17 @@ class Step(nn.Module):
         self._activations.reset()
         if self.heat is not None:
             self.heat.reset()
+
+
+def _neighbours(boundaries: Sequence[Boundary], time: float | Tensor) -> list[tuple[bool, list[Any]]]:
+    """Runs of boundaries that `contact` takes together, or not; `itertools.groupby` can't be compiled."""
+    runs: list[tuple[bool, list[Any]]] = []
+    for boundary in boundaries:
+        together = fusible(boundary, time)
+        if not runs or runs[-1][0] != together:
+            runs.append((together, []))
+        runs[-1][1].append(boundary)
+    return runs
 
 
 def check_status(status: Tensor, grid: Grid) -> None:

@@ -66,6 +66,8 @@ def differentiate(
     grad_outputs: Sequence[Tensor | None],
 ) -> list[Tensor | None]:
     """Gradients of a composition of differentiable ops with respect to its tensor inputs; itself differentiable."""
+    if torch._C._are_functorch_transforms_active():
+        return _pull_back(function, inputs, grad_outputs)
     differentiable = torch.is_grad_enabled()
     with torch.enable_grad():
         # Aliases, because an input may itself depend on another one, which is not this composition's share.
@@ -83,13 +85,35 @@ def differentiate(
     return [None if t is None else next(result) for t in leaves]
 
 
+def _pull_back(
+    function: Callable[..., Tensor | tuple[Tensor, ...]],
+    inputs: Sequence[Tensor | None],
+    grad_outputs: Sequence[Tensor | None],
+) -> list[Tensor | None]:
+    """As `differentiate`, inside a transform of torch.func, which forbids `requires_grad_`."""
+    wanted = [i for i, t in enumerate(inputs) if t is not None]
+
+    def outputs(*given: Tensor) -> tuple[Tensor, ...]:
+        arguments = list(inputs)
+        for i, t in zip(wanted, given, strict=True):
+            arguments[i] = t
+        result = function(*arguments)
+        result = result if isinstance(result, tuple) else (result,)
+        return tuple(y for y, g in zip(result, grad_outputs, strict=True) if g is not None)
+
+    _, pull_back, *_ = torch.func.vjp(outputs, *(inputs[i] for i in wanted))
+    grads = dict(zip(wanted, pull_back(tuple(g for g in grad_outputs if g is not None)), strict=True))
+    return [grads.get(i) for i in range(len(inputs))]
+
+
 def refuse_vmap(name: str) -> None:
-    """Make `torch.vmap` over an op say what to do instead."""
+    """Make `torch.vmap` over an op, and so `torch.func.jacrev` and `hessian`, say what to do instead."""
 
     def vmap(info: Any, in_dims: Any, *args: Any, **kwargs: Any) -> Any:
         raise NotImplementedError(
             f"torch.vmap over torch_mpm::{name} is not supported: pack the scenes into one call with `scene` and "
-            "Grid(scenes=B)"
+            "Grid(scenes=B); in the place of torch.func.jacrev or hessian use those of torch.autograd.functional, or a "
+            "loop over rows"
         )
 
     torch.library.register_vmap(f"torch_mpm::{name}", vmap)

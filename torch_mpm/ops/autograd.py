@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from typing import Any
 
 import torch
+from torch._functorch.utils import enable_single_level_autograd_function
+from torch.autograd import forward_ad
 
 _LIBRARY = torch.library.Library("torch_mpm", "IMPL")
 
 
 def dispatch(op: Any, *arguments: Any) -> Any:
-    """`op(*arguments)`, past the kernel of `register_autograd` where nothing requires grad."""
-    if torch.compiler.is_compiling() or (torch.is_grad_enabled() and torch._C._any_requires_grad(*arguments)):
+    """`op(*arguments)`, past the kernel of `register_autograd` where nothing requires grad or has a tangent."""
+    if (
+        torch.compiler.is_compiling()
+        or forward_ad._current_level >= 0
+        or (torch.is_grad_enabled() and torch._C._any_requires_grad(*arguments))
+    ):
         return op(*arguments)
     return _below_autograd(op, arguments)
 
@@ -37,7 +44,8 @@ def register_autograd(
 
     def forward(ctx: Any, lengths: list[int], *flat: Any) -> Any:
         arguments = _nested(flat, lists, lengths)
-        output = _below_autograd(op, arguments)
+        with _outer_levels():
+            output = _below_autograd(op, arguments)
         ctx.lengths = lengths
         if setup is not None:
             setup(ctx, arguments, output)
@@ -54,13 +62,44 @@ def register_autograd(
 
     methods = {"forward": staticmethod(forward), "backward": staticmethod(nested_backward)}
     function: Any = type(f"torch_mpm_{name}", (torch.autograd.Function,), methods)  # its name stands in the graph
+    # `Function.apply` deals with the levels of torch.func first, which the dispatcher has done where it calls `kernel`.
+    record = super(torch.autograd.Function, function).apply
 
     def kernel(*arguments: Any) -> Any:
-        if torch.is_grad_enabled() and torch._C._any_requires_grad(*arguments):
-            return function.apply([len(arguments[i]) for i in lists], *_flat(arguments, lists))
-        return _below_autograd(op, arguments)
+        if forward_ad._current_level >= 0:
+            _refuse_tangents(name, _flat(arguments, lists))
+        if not (torch.is_grad_enabled() and torch._C._any_requires_grad(*arguments)):
+            return _below_autograd(op, arguments)
+        with _one_level():
+            return record([len(arguments[i]) for i in lists], *_flat(arguments, lists))
 
     _LIBRARY.impl(name, kernel, "Autograd")
+
+
+def _one_level() -> AbstractContextManager[Any]:
+    """Lets a Function record for one level of torch.func; where none is active this takes no time."""
+    return enable_single_level_autograd_function() if torch._C._are_functorch_transforms_active() else nullcontext()
+
+
+@contextmanager
+def _recorded_again() -> Iterator[None]:
+    with torch.enable_grad(), forward_ad._set_fwd_grad_enabled(True):
+        yield
+
+
+def _outer_levels() -> AbstractContextManager[Any]:
+    """Lets the levels of torch.func outside the present one record too, what `Function.forward` switches off."""
+    return _recorded_again() if torch._C._are_functorch_transforms_active() else nullcontext()
+
+
+def _refuse_tangents(name: str, arguments: Sequence[Any]) -> None:
+    for argument in arguments:
+        if isinstance(argument, torch.Tensor) and forward_ad.unpack_dual(argument).tangent is not None:
+            raise NotImplementedError(
+                f"torch_mpm::{name} has no forward-mode derivative (torch.func.jvp, jacfwd, dual tensors): "
+                "use reverse mode, torch.func.vjp or backward(); torch.autograd.functional.jvp, which takes it twice, "
+                "gives the product of the Jacobian with a vector"
+            )
 
 
 def _flat(arguments: tuple[Any, ...], lists: Sequence[int]) -> tuple[Any, ...]:

@@ -174,9 +174,11 @@ def _double_backward(ctx, grad_rows):
     blocks = _blocks_of(block, block, *ctx.geometry)
     shape, kind, scene, start, end = ctx.kinds
 
-    def adjoint(grad: Tensor, velocity: Tensor) -> Tensor:
-        after = reference(blocks, velocity, obstacles, shape, kind, scene, start, end, scene_time, ctx.time)
-        return torch.autograd.grad(after, velocity, grad, create_graph=True)[0]
+    def adjoint(grad: Tensor, velocity: Tensor) -> Any:
+        def after(velocity: Tensor) -> Tensor:
+            return reference(blocks, velocity, obstacles, shape, kind, scene, start, end, scene_time, ctx.time)
+
+        return differentiate(after, [velocity], [grad])[0]
 
     grads = differentiate(adjoint, [grad, velocity], [grad_rows[:, 1:]])
     return (*grads,) + (None,) * 12

@@ -144,13 +144,15 @@ def _double_backward(ctx, grad_grad_nodes, grad_change):
     faces = [Face(names[kind], plane, friction) for kind, plane, friction in zip(*ctx.walls, strict=True)]
 
     def adjoint(grad, nodes, gravity, scene_dt):
-        change = nodes.new_zeros(block.shape[0], nodes.shape[1] - 1, requires_grad=True)
-        mass, momentum = nodes.split([1, nodes.shape[1] - 1], 1)
-        rows = torch.cat([mass, momentum + mass * change.repeat_interleave(blocks.grid.nodes_per_block, 0)], 1)
-        dt = ctx.dt if scene_dt is None else ctx.dt * scene_dt
-        updated = reference.grid_update(blocks, rows, gravity, dt, faces)
-        both = torch.autograd.grad(updated, (nodes, change), grad, create_graph=True)
-        return both if ctx.wants_change else both[0]
+        def updated(nodes, change):
+            mass, momentum = nodes.split([1, nodes.shape[1] - 1], 1)
+            rows = torch.cat([mass, momentum + mass * change.repeat_interleave(blocks.grid.nodes_per_block, 0)], 1)
+            dt = ctx.dt if scene_dt is None else ctx.dt * scene_dt
+            return reference.grid_update(blocks, rows, gravity, dt, faces)
+
+        change = nodes.new_zeros(block.shape[0], nodes.shape[1] - 1)
+        both = differentiate(updated, (nodes, change), [grad])
+        return tuple(both) if ctx.wants_change else both[0]
 
     given = [grad_grad_nodes, grad_change] if ctx.wants_change else [grad_grad_nodes]
     grad, nodes, gravity, scene_dt = differentiate(adjoint, tensors, given)

@@ -265,7 +265,8 @@ def _return_map_setup(ctx: Any, inputs: Any, output: Any) -> None:
 
 def _return_map_backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
     grad_F, grad_stress, _, *details, grad_volume = grads
-    _, mu, lam, alpha, cohesion, volume, scene = ctx.saved_tensors
+    saved = ctx.saved_tensors  # once: a checkpointed region unpacks a tensor only once
+    _, mu, lam, alpha, cohesion, volume, scene = saved
     if not ctx.details:
         details = [None, None]
     given = [grad_F, grad_stress, *details, grad_volume if volume is not None else None]
@@ -274,7 +275,7 @@ def _return_map_backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None
         return (None,) * 11
     adjoint_F, adjoint_parameters, adjoint_volume = dispatch(
         torch.ops.torch_mpm.quartic_return_map_backward,
-        *(*given, *ctx.saved_tensors, ctx.energy, ctx.flow, ctx.apex, needs_F, any(needs)),
+        *(*given, *saved, ctx.energy, ctx.flow, ctx.apex, needs_F, any(needs)),
     )
     shared = [
         _shared(adjoint_parameters[:, k], p, scene) if n else None

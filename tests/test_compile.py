@@ -1,0 +1,125 @@
+"""Rollouts of a compiled step: compiled once, with the results and gradients of the step itself."""
+
+import math
+
+import pytest
+import torch
+from particles import relative_error
+from torch._dynamo.testing import CompileCounter
+
+import torch_mpm as mpm
+
+STEPS, DT = 100, 1e-3
+
+
+class LearnedLaw(torch.nn.Module):
+    """A small network on the invariants of F beside a linear law."""
+
+    def __init__(self):
+        super().__init__()
+        self.net = torch.nn.Sequential(torch.nn.Linear(1, 4), torch.nn.Tanh(), torch.nn.Linear(4, 1))
+
+    def forward(self, F):
+        strain = 0.5 * (F.mT @ F - torch.eye(2, dtype=F.dtype, device=F.device))
+        modulus = 1e3 * (2 + self.net(strain.square().sum((1, 2))[:, None]))
+        return modulus[:, :, None] * strain
+
+
+@pytest.fixture(autouse=True)
+def fresh_compiler():
+    torch._dynamo.reset()
+    torch._dynamo.utils.counters.clear()
+
+
+def make_step(name, device):
+    """A step that was taken once, so that its grid has a capacity, and the state after it."""
+    grid = mpm.Grid(0.1, (0, 0), (1, 1), deterministic=True)
+    torch.manual_seed(0)
+    law = mpm.CustomLaw(LearnedLaw().double().to(device)) if name == "learned law" else mpm.NeoHookean(E=1e4, nu=0.3)
+    obstacles = {
+        "moving obstacles": [
+            mpm.Sphere((0.45, 0.15), 0.1, velocity=(0.2, 0.5), friction=0.3, start=0.02, end=0.08),
+            mpm.Plane((0.0, 0.2), (0.1, 1.0), angular_velocity=0.4),
+            mpm.Sphere(lambda t: torch.stack([0.6 - 0.5 * t, 0.7 - t]), 0.1),
+            mpm.SDF(lambda x: x.norm(dim=1) - 0.1, (0.2, 0.5), velocity=(0.3, 0.0)),
+        ]
+    }
+    step = mpm.Step(grid, law, gravity=(0.0, -9.8), walls="separate", boundaries=obstacles.get(name, ()))
+    points = mpm.seed.box((0.3, 0.3), (0.6, 0.6), 0.1, per_cell=4)
+    state = mpm.State.at_rest(points, dtype=torch.float64, device=device, velocity=(0.3, -0.5))
+    dt = torch.tensor([DT], dtype=torch.float64, device=device) if name == "tensor dt" else DT
+    return step, step(state, dt).detach(), dt
+
+
+@pytest.mark.parametrize("name", ["fixed dt", "tensor dt", "moving obstacles", "learned law"])
+def test_a_rollout_compiles_once(name, device):
+    """The time, a tensor dt and what moves with the time are no constants of the compiled step."""
+    step, state, dt = make_step(name, device)
+    with torch.no_grad():
+        counter = CompileCounter()
+        compiled = torch.compile(step, fullgraph=True, backend=counter)
+        got = expected = state
+        for i in range(STEPS):
+            now = dt * (1 + 0.5 * math.sin(i)) if isinstance(dt, torch.Tensor) else dt
+            got, expected = compiled(got, now), step(expected, now)
+    assert counter.frame_count == 1
+    assert type(got.time) is type(expected.time)
+    torch.testing.assert_close(got.time, expected.time, rtol=1e-14, atol=0)
+    for field in ("x", "v", "C", "F"):
+        assert relative_error(getattr(got, field), getattr(expected, field)) < 1e-12
+    step.check(got)
+
+
+@pytest.mark.parametrize("name", ["tensor dt", "learned law"])
+def test_gradients_of_a_compiled_rollout(name, device):
+    """Recorded by AOTAutograd, in one compilation: of the state, and of the weights of a network."""
+    step, state, dt = make_step(name, device)
+    fields = ("x", "v", "C", "F")
+
+    def gradient(run):
+        leaves = {field: getattr(state, field).detach().requires_grad_() for field in fields}  # of the same strides
+        now = state.replace(**leaves)
+        for _ in range(5):
+            now = run(now, dt)
+        loss = (now.x**2).sum() + (now.F**3).sum()
+        return torch.autograd.grad(loss, [*leaves.values(), *step.parameters()])
+
+    got = gradient(torch.compile(step, fullgraph=True, backend="aot_eager"))
+    assert torch._dynamo.utils.counters["stats"]["unique_graphs"] == 1
+    for a, b in zip(got, gradient(step), strict=True):
+        assert relative_error(a, b) < 1e-11
+
+
+def test_a_rollout_that_was_never_run_compiles_twice(device):
+    """With the capacity given: once without the affine field that the first step adds, once with it."""
+    grid = mpm.Grid(0.1, (0, 0), (1, 1), capacity=9)
+    step = mpm.Step(grid, mpm.NeoHookean(E=1e4, nu=0.3), gravity=(0.0, -9.8))
+    points = mpm.seed.box((0.3, 0.3), (0.6, 0.6), 0.1, per_cell=4)
+    counter = CompileCounter()
+    state = mpm.State.at_rest(points, dtype=torch.float64, device=device)
+    with torch.no_grad():
+        end = mpm.rollout(torch.compile(step, fullgraph=True, backend=counter), state, STEPS, DT)
+    assert counter.frame_count == 2
+    assert end.time == pytest.approx(STEPS * DT)
+
+
+@pytest.mark.slow
+def test_inductor_compiles_a_step(device):
+    step, state, dt = make_step("fixed dt", device)
+    with torch.no_grad():
+        got, expected = mpm.rollout(torch.compile(step, fullgraph=True), state, 3, dt), mpm.rollout(step, state, 3, dt)
+    assert torch._dynamo.utils.counters["stats"]["unique_graphs"] == 1
+    assert got.time == pytest.approx(expected.time)
+    for field in ("x", "v", "C", "F"):
+        assert relative_error(getattr(got, field), getattr(expected, field)) < 1e-12
+
+
+def test_the_time_of_a_state_is_what_was_given(device):
+    """Numbers stay numbers, tensors the same tensors, through copies, moves and steps."""
+    step, state, _ = make_step("fixed dt", device)
+    assert isinstance(state.time, float) and state.time == DT
+    assert step(state, 2 * DT).time == DT + 2 * DT and state.replace(time=3).time == 3.0
+    for time in (torch.zeros((), dtype=torch.float64), torch.ones(1, device=device)):
+        given = state.replace(time=time)
+        assert given.time is time and given.replace(x=state.x).time is time and given.detach().time.shape == time.shape
+    assert state.to(dtype=torch.float32).time == DT
