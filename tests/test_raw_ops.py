@@ -61,7 +61,10 @@ def test_sizes_of_the_index_tensors() -> None:
             # The table of no scene, of one instead of two, and of less than a whole one.
             sizes = (0, len(value) // 2, len(value) - 1) if name == "table" else (0, 1, len(value) - 1)
             for size in sizes:
-                yield {name: value[:size].clone()}, f"{name} must|entries below the .* of {name}" if name != "block" else "must have shape"
+                yield (
+                    {name: value[:size].clone()},
+                    f"{name} must|entries below the .* of {name}" if name != "block" else "must have shape",
+                )
             yield {name: value.long()}, f"{name} must be int32, got int64"
             yield {name: value[:, None]}, f"{name} must have"
             yield {name: value[0]}, f"{name} must have"

@@ -43,6 +43,7 @@ INTERNAL = re.compile(
 """Messages about something inside, which name no argument."""
 BATCH = 400
 """Calls of a child."""
+Arguments, Changes = dict[str, Any], dict[str, tuple[str, Any]]
 SECONDS, MEMORY = 60.0, 2 << 30
 """What a child may take."""
 PUBLIC = 0.2
@@ -83,34 +84,47 @@ def names() -> list[str]:
     return sorted(raw_calls().keys() | public_calls().keys())
 
 
-def malformed(seed: int, number: int, only: str | None = None) -> tuple[str, Callable[..., Any], dict[str, Any], Any]:
-    """(name, what to call, arguments, changes) of a call; the same for the same seed and number."""
+def malformed(seed: int, number: int, only: str | None = None) -> tuple[str, Callable[..., Any], Arguments, Changes]:
+    """(name, what to call, valid arguments, changes of some); the same for the same seed and number."""
     choose = random.Random(f"{seed} {number}")
     if only is None:
         only = choose.choice(sorted(public_calls() if choose.random() < PUBLIC else raw_calls()))
+    function: Callable[..., Any]
     if only in raw_calls():
         function = getattr(torch.ops.torch_mpm, only.removeprefix("ops."))
-        arguments = dict(choose.choice(raw_calls()[only]))
+        arguments = choose.choice(raw_calls()[only])
     else:
-        function, given = public_calls()[only]()
-        arguments = dict(given)
+        function, arguments = public_calls()[only]()
     torch.manual_seed(number)
-    others, changes = list(arguments.values()), []
-    for argument in choose.sample(list(arguments), min(choose.choice((1, 1, 2, 3)), len(arguments))):
-        done, arguments[argument] = mutate(argument, arguments[argument], others, choose)
-        changes.append((argument, done))
-    return only, function, arguments, changes
+    changed = choose.sample(list(arguments), min(choose.choice((1, 1, 2, 3)), len(arguments)))
+    others = list(arguments.values())
+    return only, function, arguments, {a: mutate(a, arguments[a], others, choose) for a in changed}
 
 
 def call(seed: int, number: int, only: str | None = None) -> Result:
+    """Makes a call. After an unclear error it is made again with each change alone, to name the argument at fault."""
+    name, *_, changes = malformed(seed, number, only)
+    texts = {argument: text for argument, (text, _) in changes.items()}
+    end, error = _end(seed, number, only, list(changes))
+    if end == "unclear" and len(changes) > 1:
+        for argument in changes:
+            if (alone := _end(seed, number, only, [argument]))[0] == end:
+                return Result(number, name, ((argument, texts[argument]),), *alone)
+    return Result(number, name, tuple(texts.items()), end, error)
+
+
+def _end(seed: int, number: int, only: str | None, chosen: Sequence[str]) -> tuple[str, str]:
+    """How a call with the chosen changes ends, and its error."""
     name, function, arguments, changes = malformed(seed, number, only)
-    positional = name.startswith("ops.")  # names of tensors that an op returns may be those of arguments
+    arguments = arguments | {argument: changes[argument][1] for argument in chosen}
     try:
-        function(*arguments.values()) if positional else function(**arguments)
+        if name in raw_calls():  # positional: a list of results has the names of some arguments
+            function(*arguments.values())
+        else:
+            function(**arguments)
     except Exception as error:
-        end = "clear error" if is_clear(error) else "unclear"
-        return Result(number, name, tuple(changes), end, f"{type(error).__name__}: {str(error)[:200]}")
-    return Result(number, name, tuple(changes), "ok")
+        return "clear error" if is_clear(error) else "unclear", f"{type(error).__name__}: {str(error)[:200]}"
+    return "ok", ""
 
 
 def is_clear(error: Exception) -> bool:
@@ -151,8 +165,10 @@ def results(seed: int, numbers: Sequence[int], only: str | None = None) -> list[
         return found
     last = len(found) if len(found) < len(numbers) else len(numbers) - 1
     culprit = _culprit(seed, numbers[: last + 1], only, outcome.kind)
-    return [r for r in found if r.number < numbers[last]] + [culprit] + (
-        results(seed, numbers[last + 1 :], only) if numbers[last + 1 :] else []
+    return (
+        [r for r in found if r.number < numbers[last]]
+        + [culprit]
+        + (results(seed, numbers[last + 1 :], only) if numbers[last + 1 :] else [])
     )
 
 
@@ -161,10 +177,13 @@ def _culprit(seed: int, numbers: Sequence[int], only: str | None, kind: str) -> 
     for number in reversed(numbers):
         outcome = run(functools.partial(child, seed, [number], only), seconds=SECONDS, memory=MEMORY)
         if outcome.kind != "ok":
-            name, *_, changes = malformed(seed, number, only)
-            return Result(number, name, tuple(changes), outcome.kind, outcome.text.strip()[-200:])
-    name, *_, changes = malformed(seed, numbers[-1], only)
-    return Result(numbers[-1], name, tuple(changes), kind, "not alone, after the calls before it")
+            return _ended(seed, number, only, outcome.kind, outcome.text.strip()[-200:])
+    return _ended(seed, numbers[-1], only, kind, "not alone, after the calls before it")
+
+
+def _ended(seed: int, number: int, only: str | None, kind: str, text: str) -> Result:
+    name, *_, changes = malformed(seed, number, only)
+    return Result(number, name, tuple((argument, done) for argument, (done, _) in changes.items()), kind, text)
 
 
 def fuzz(calls: int, seed: int, only: str | None = None) -> list[Result]:
@@ -191,7 +210,7 @@ def faults(found: Sequence[Result]) -> list[dict[str, Any]]:
     groups = collections.defaultdict(list)
     for r in found:
         if r.end in FAULTS:
-            key = (r.name, ", ".join(sorted(a for a, _ in r.changes)), r.end, re.sub(r"[\d.e+-]+", "#", r.error)[:80])
+            key = (r.name, ", ".join(sorted(a for a, _ in r.changes)), r.end, _kind_of(r.error))
             groups[key].append(r)
     return [
         {"callable": key[0], "arguments": key[1], "end": key[2], "calls": len(same), "example": vars(same[0])}
@@ -199,14 +218,27 @@ def faults(found: Sequence[Result]) -> list[dict[str, Any]]:
     ]
 
 
+def _kind_of(error: str) -> str:
+    """A message without the types, names and numbers of one call."""
+    return re.sub(r"'[^']*'|\d[\d.e+-]*", "…", error)[:60]
+
+
 def write(out: Path, found: Sequence[Result], seed: int, seconds: float) -> None:
     listed, place = faults(found), common.environment()
     ends = collections.Counter(r.end for r in found)
     result = {"environment": place, "calls": len(found), "seed": seed, "seconds": round(seconds), "ends": ends}
-    lines = [f"# {len(found)} calls with malformed arguments, seed {seed}", "", common.describe(place), "", table(found)]
+    lines = [
+        f"# {len(found)} calls with malformed arguments, seed {seed}",
+        "",
+        common.describe(place),
+        "",
+        table(found),
+    ]
     for fault in listed:
         changes = "; ".join(f"`{name}` {done}" for name, done in fault["example"]["changes"])
-        lines.append(f"- {fault['callable']}, {fault['end']} ({fault['calls']}): {changes}: {fault['example']['error']}")
+        lines.append(
+            f"- {fault['callable']}, {fault['end']} ({fault['calls']}): {changes}: {fault['example']['error']}"
+        )
     common.write(out, "fuzz_calls", {**result, "faults": listed}, "\n".join(lines) + "\n")
 
 

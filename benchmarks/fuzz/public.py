@@ -75,7 +75,9 @@ def _grids_and_states() -> dict[str, Callable[[], Call]]:
     def concatenate() -> Call:
         return mpm.State.concatenate, dict(states=[_World().state, _World().state], scene=True)
 
-    lattice = dict(dx=0.1, lower=(0.0, 0.0), upper=(1.0, 1.0), scenes=2, kernel="cubic", capacity=20, deterministic=True)
+    lattice = dict(
+        dx=0.1, lower=(0.0, 0.0), upper=(1.0, 1.0), scenes=2, kernel="cubic", capacity=20, deterministic=True
+    )
     return {
         "Grid": lambda: (mpm.Grid, lattice),
         "Grid.activate": activate,
@@ -116,7 +118,15 @@ def _steps() -> dict[str, Callable[[], Call]]:
 
     def rollout() -> Call:
         w = _World()
-        return mpm.rollout, dict(step=mpm.Step(w.grid, w.law), state=w.state, n=2, dt=1e-4, checkpoint=1)
+        step, taken = mpm.Step(w.grid, w.law), []
+
+        def at_most_five(state: mpm.State, dt: Any) -> mpm.State:
+            taken.append(dt)
+            if len(taken) > 5:
+                raise mpm.SimulationError("n is too large for this program")
+            return step(state, dt)
+
+        return mpm.rollout, dict(step=at_most_five, state=w.state, n=2, dt=1e-4, checkpoint=1)
 
     def stable_dt() -> Call:
         w = _World()
@@ -241,9 +251,7 @@ def _heat() -> dict[str, Callable[[], Call]]:
 
 
 def _seed() -> dict[str, Callable[[], Call]]:
-    options: dict[str, Any] = dict(
-        grid=0.25, per_cell=4, method="lattice", seed=0, dtype=torch.float32, device="cpu"
-    )
+    options: dict[str, Any] = dict(grid=0.25, per_cell=4, method="lattice", seed=0, dtype=torch.float32, device="cpu")
     return {
         "seed.box": lambda: (seed.box, dict(lower=(0.0, 0.0), upper=(1.0, 1.0), **options)),
         "seed.sphere": lambda: (seed.sphere, dict(center=(0.0, 0.0), radius=1.0, **options)),
