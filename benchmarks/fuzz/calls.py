@@ -10,17 +10,19 @@ from __future__ import annotations
 
 import argparse
 import collections
+import dataclasses
 import functools
 import itertools
 import json
 import os
 import random
 import re
+import resource
+import signal
 import sys
 import time
 import warnings
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +32,7 @@ import torch
 
 from benchmarks import common
 from benchmarks.fuzz import operators, public
-from benchmarks.fuzz.common import run
+from benchmarks.fuzz.common import Outcome, run
 from benchmarks.fuzz.mutations import mutate
 
 CLEAR = (RuntimeError, ValueError, TypeError, NotImplementedError)  # SimulationError is a RuntimeError
@@ -44,14 +46,16 @@ INTERNAL = re.compile(
 BATCH = 400
 """Calls of a child."""
 Arguments, Changes = dict[str, Any], dict[str, tuple[str, Any]]
-SECONDS, MEMORY = 60.0, 2 << 30
-"""What a child may take."""
+CPU_SECONDS, SECONDS, MEMORY = 60, 600.0, 2 << 30
+"""What a child may take; the machine may be busy."""
+SUSPECTS = 20
+"""Calls before the end of a child that are made again alone."""
 PUBLIC = 0.2
 """Share of the calls that are of public functions."""
 FAULTS = ("crash", "time limit", "unclear")
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class Result:
     """A call: which, what was done to which arguments, and how it ended."""
 
@@ -144,6 +148,7 @@ def is_clear(error: Exception) -> bool:
 def child(seed: int, numbers: Iterable[int], only: str | None) -> int:
     """Makes calls; writes the number of each before, and its result after it."""
     warnings.simplefilter("ignore")
+    resource.setrlimit(resource.RLIMIT_CPU, (CPU_SECONDS, CPU_SECONDS))
     for number in numbers:
         os.write(1, f"\n{number}\n".encode())  # not through sys.stdout, which pytest replaces
         result = call(seed, number, only)
@@ -153,7 +158,7 @@ def child(seed: int, numbers: Iterable[int], only: str | None) -> int:
 
 def results(seed: int, numbers: Sequence[int], only: str | None = None) -> list[Result]:
     """The results of calls in a child; after a crash the others go on in another one."""
-    outcome = run(functools.partial(child, seed, numbers, only), seconds=SECONDS, memory=MEMORY)
+    outcome = _run(seed, numbers, only)
     found, started = [], None
     for line in outcome.text.splitlines():
         if line.isdigit():
@@ -172,10 +177,15 @@ def results(seed: int, numbers: Sequence[int], only: str | None = None) -> list[
     )
 
 
+def _run(seed: int, numbers: Sequence[int], only: str | None) -> Outcome:
+    outcome = run(functools.partial(child, seed, numbers, only), seconds=SECONDS, memory=MEMORY)
+    return dataclasses.replace(outcome, kind="time limit") if outcome.status == -signal.SIGXCPU else outcome
+
+
 def _culprit(seed: int, numbers: Sequence[int], only: str | None, kind: str) -> Result:
-    """Which of the calls, each in a child of its own, ends the process; the last one if none does alone."""
-    for number in reversed(numbers):
-        outcome = run(functools.partial(child, seed, [number], only), seconds=SECONDS, memory=MEMORY)
+    """Which of the last calls, each in a child of its own, ends the process; the last one if none does alone."""
+    for number in reversed(numbers[-SUSPECTS:]):
+        outcome = _run(seed, [number], only)
         if outcome.kind != "ok":
             return _ended(seed, number, only, outcome.kind, outcome.text.strip()[-200:])
     return _ended(seed, numbers[-1], only, kind, "not alone, after the calls before it")
@@ -186,11 +196,11 @@ def _ended(seed: int, number: int, only: str | None, kind: str, text: str) -> Re
     return Result(number, name, tuple((argument, done) for argument, (done, _) in changes.items()), kind, text)
 
 
-def fuzz(calls: int, seed: int, only: str | None = None) -> list[Result]:
+def fuzz(calls: int, seed: int, only: str | None = None) -> Iterator[Result]:
     torch.set_num_threads(1)
     raw_calls()  # before the fork, and so once
-    batches = [range(first, min(first + BATCH, calls)) for first in range(0, calls, BATCH)]
-    return [result for batch in batches for result in results(seed, batch, only)]
+    for first in range(0, calls, BATCH):
+        yield from results(seed, range(first, min(first + BATCH, calls)), only)
 
 
 # ---- report
@@ -250,7 +260,14 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=common.RESULTS)
     arguments = parser.parse_args()
     start = time.monotonic()
-    found = fuzz(arguments.calls, arguments.seed, arguments.only)
+    found: list[Result] = []
+    try:
+        for result in fuzz(arguments.calls, arguments.seed, arguments.only):
+            found.append(result)
+            if len(found) % 5000 == 0:
+                print(f"{len(found)} calls, {time.monotonic() - start:.0f} s", file=sys.stderr, flush=True)
+    except KeyboardInterrupt:
+        print(f"stopped after {len(found)} calls", file=sys.stderr)
     write(arguments.out, found, arguments.seed, time.monotonic() - start)
     print(table(found))
     bad = [r for r in found if r.end in FAULTS]

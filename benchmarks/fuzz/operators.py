@@ -32,7 +32,7 @@ def calls(dim: int, dtype: torch.dtype = torch.float64) -> list[tuple[str, dict[
 
 def _named(op: str, values: tuple[Any, ...]) -> dict[str, Any]:
     names = [a.name for a in getattr(torch.ops.torch_mpm, op).default._schema.arguments]
-    return dict(zip(names, values))  # those left out have defaults
+    return dict(zip(names, values, strict=False))  # those left out have defaults
 
 
 class _Calls:
