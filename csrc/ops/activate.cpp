@@ -13,36 +13,31 @@ namespace {
 std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> activate(
     const Tensor& x, const OptionalTensor& scene, const OptionalTensor& previous_status, int64_t scenes, double dx,
     std::vector<double> lower, std::vector<int64_t> blocks, int64_t order, int64_t capacity, bool deterministic) {
-  check_rank(x, "x", 2);
-  STD_TORCH_CHECK(scenes >= 0 && capacity >= 0, "scenes and capacity must not be negative");
-  STD_TORCH_CHECK(x.size(0) < INT32_MAX, "x must have fewer than 2^31 particles");
-  int64_t table_size = scenes;
-  for (int64_t b : blocks) {
-    STD_TORCH_CHECK(b > 0 && table_size <= INT32_MAX / b, "scenes times blocks must stay below 2^31");
-    table_size *= b;
-  }
-  STD_TORCH_CHECK(capacity <= INT32_MAX / (x.size(1) == 2 ? kBlockNodes<2> : kBlockNodes<3>),
-                  "capacity times nodes per block must stay below 2^31");
-  Tensor table = empty_int(x, {table_size}), block = empty_int(x, {capacity}), offsets = empty_int(x, {capacity + 1}),
-         index = empty_int(x, {x.size(0)}), status = empty_int(x, {kStatusSize}), schedule;
+  STD_TORCH_CHECK(scenes >= 0, "scenes must not be negative, got ", scenes);
+  STD_TORCH_CHECK(capacity >= 0, "capacity must not be negative, got ", capacity);
+  Tensor table, block, offsets, index, status, schedule;
   const DeviceScope device(x);
   dispatch(x, order, [&]<class T, int D, int Order>() {
     ActivateArguments<T, D> a;
     a.geometry = geometry<T, D>(dx, lower, blocks);
+    const int64_t per_scene = a.geometry.blocks_per_scene, most = INT32_MAX / kBlockNodes<D>;
+    STD_TORCH_CHECK(scenes <= INT32_MAX / per_scene, "scenes times blocks must be below 2^31, got ", scenes, " times ",
+                    per_scene);
+    STD_TORCH_CHECK(scenes > 0 || x.size(0) == 0, "x must have no particles where scenes is 0, got ", x.size(0));
+    STD_TORCH_CHECK(capacity <= most, "capacity must be at most ", most, ", got ", capacity);
     a.scenes = int(scenes);
     a.capacity = int(capacity);
     a.particles = x.size(0);
     a.deterministic = deterministic;
     a.x = input<T>(x, "x", x, {x.size(0), D});
-    if (has(scene)) {
-      check_shape(*scene, "scene", {x.size(0)});
-      STD_TORCH_CHECK(scene->scalar_type() == ScalarType::Int && scene->device() == x.device(),
-                      "scene must be an int32 tensor on the device of x");
-      a.scene = static_cast<const int*>(scene->data_ptr());
-      a.scene_stride = scene->stride(0);
-    }
-    if (has(previous_status)) a.previous_status = int_pointer(*previous_status, "previous_status", x, kStatusSize);
+    set_scene(a, scene, x);
+    if (has(previous_status)) a.previous_status = int_pointer(*previous_status, "previous_status", x, {kStatusSize});
     a.schedule_size = schedule_size<D>(capacity, x.size(0));
+    table = empty_int(x, {scenes * per_scene});
+    block = empty_int(x, {capacity});
+    offsets = empty_int(x, {capacity + 1});
+    index = empty_int(x, {x.size(0)});
+    status = empty_int(x, {kStatusSize});
     schedule = empty_int(x, {a.schedule_size});
     a.workspace_size = backend::activate_workspace(a);
     const Tensor workspace = empty(x, {a.workspace_size}, ScalarType::Byte);
@@ -59,6 +54,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> activate(
 }
 
 Tensor cell_order(const Tensor& x, MPM_TOPOLOGY_PARAMETERS) {
+  check_positions(x);
   Tensor result = empty_int(x, {x.size(0)});
   const DeviceScope device(x);
   dispatch(x, order, [&]<class T, int D, int Order>() {

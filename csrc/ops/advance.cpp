@@ -23,15 +23,10 @@ AdvanceArguments<T, D> advance_arguments(const Tensor& x, const Tensor& v, const
   a.affine = input<T>(C, "C", x, {P, D, D});
   a.F = input<T>(F, "F", x, {P, D, D});
   a.J = input<T>(J, "J", x, {P});
-  if (has(scene)) {
-    check_shape(*scene, "scene", {P});
-    STD_TORCH_CHECK(scene->scalar_type() == ScalarType::Int && scene->device() == x.device(),
-                    "scene must be an int32 tensor on the device of x");
-    a.scene = static_cast<const int*>(scene->data_ptr());
-    a.scene_stride = scene->stride(0);
-  }
+  set_scene(a, scene, x);
   if (has(scene_dt)) {
-    STD_TORCH_CHECK(scene_dt->dim() == 1 && scene_dt->size(0) > 0, "scene_dt must have shape [B]");
+    STD_TORCH_CHECK(scene_dt->dim() == 1 && scene_dt->size(0) > 0, "scene_dt must have shape [B], B > 0, got ",
+                    shape_of(*scene_dt));
     a.scenes = scene_dt->size(0);
     a.scene_dt = input<T>(scene_dt, "scene_dt", x, {a.scenes});
   }
@@ -42,7 +37,7 @@ AdvanceArguments<T, D> advance_arguments(const Tensor& x, const Tensor& v, const
 std::tuple<Tensor, Tensor, Tensor> advance(const Tensor& x, const Tensor& v, const OptionalTensor& C,
                                            const OptionalTensor& F, const OptionalTensor& J,
                                            const OptionalTensor& scene, const OptionalTensor& scene_dt, double dt) {
-  check_rank(x, "x", 2);
+  check_positions(x);
   const int64_t P = x.size(0), D_ = x.size(1);
   Tensor x_next = empty_particles(x, {P, D_}), F_next = has(F) ? empty_particles(x, {P, D_, D_}) : empty(x, {0}),
          J_next = has(J) ? empty_particles(x, {P}) : empty(x, {0});
@@ -64,7 +59,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> advance_backward(
     const Tensor& grad_x, const OptionalTensor& grad_F, const OptionalTensor& grad_J, const Tensor& x, const Tensor& v,
     const OptionalTensor& C, const OptionalTensor& F, const OptionalTensor& J, const OptionalTensor& scene,
     const OptionalTensor& scene_dt, double dt, int64_t needs) {
-  check_rank(x, "x", 2);
+  check_positions(x);
   const int64_t P = x.size(0), D_ = x.size(1);
   const auto output = [&](int bit, bool present, const Shape& shape) {
     return (needs & bit) && present ? empty_particles(x, shape) : empty(x, {0});

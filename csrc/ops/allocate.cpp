@@ -35,6 +35,20 @@ Tensor empty_in_pool(const Tensor& like, const Shape& shape, const Shape& stride
 }
 #endif
 
+// Sizes whose products below would overflow, or that no memory holds.
+[[noreturn]] void fail_to_allocate(const Shape& shape) {
+  STD_TORCH_CHECK(false, "a result of shape ", text(shape), " could not be allocated");
+}
+
+void check_allocatable(const Shape& shape) {
+  constexpr int64_t most = int64_t(1) << 48;
+  int64_t count = 1;
+  for (int64_t size : shape) {
+    if (size < 0 || size > most / count) fail_to_allocate(shape);
+    count *= size > 1 ? size : 1;
+  }
+}
+
 }  // namespace
 
 Tensor empty_strided(const Tensor& like, const Shape& shape, const Shape& strides, ScalarType type) {
@@ -45,12 +59,14 @@ Tensor empty_strided(const Tensor& like, const Shape& shape, const Shape& stride
   int32_t device;
   TORCH_ERROR_CODE_CHECK(aoti_torch_get_device_type(like.get(), &device));
   const int32_t dtype = torch::stable::detail::to<int32_t>(torch::stable::detail::from(type));
-  TORCH_ERROR_CODE_CHECK(aoti_torch_empty_strided(int64_t(shape.size()), shape.data(), strides.data(), dtype, device,
-                                                  like.get_device_index(), &handle));
+  if (aoti_torch_empty_strided(int64_t(shape.size()), shape.data(), strides.data(), dtype, device,
+                               like.get_device_index(), &handle) != AOTI_TORCH_SUCCESS)
+    fail_to_allocate(shape);
   return Tensor(handle);
 }
 
 Tensor empty(const Tensor& like, const Shape& shape, ScalarType type) {
+  check_allocatable(shape);
   Shape strides(shape.size());
   int64_t next = 1;
   for (size_t i = shape.size(); i-- > 0; next *= shape[i]) strides[i] = next;
@@ -65,6 +81,7 @@ Tensor zeros(const Tensor& like, const Shape& shape) {
 }
 
 Tensor empty_particles(const Tensor& like, const Shape& shape) {
+  check_allocatable(shape);
   Shape strides(shape.size());
   strides[0] = 1;
   int64_t next = shape.size() > 1 ? particle_pitch(like, shape[0]) : 0;

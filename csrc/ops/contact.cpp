@@ -25,20 +25,10 @@ namespace {
 #define MPM_CONTACT_ARGUMENTS \
   velocity, obstacles, shape, contact_kind, scene, start, end, scene_time, time, block, dx, lower, blocks
 
-// Calls f.operator()<T, D>() for the dtype and dimension of node velocities.
-template <class F>
-void dispatch_velocity(const Tensor& velocity, F&& f) {
+void check_velocity(const Tensor& velocity) {
   STD_TORCH_CHECK(velocity.dim() == 2 && (velocity.size(1) == 2 || velocity.size(1) == 3),
-                  "velocity must have shape [N, D]");
-  const auto by_dimension = [&]<class T>() {
-    velocity.size(1) == 2 ? f.template operator()<T, 2>() : f.template operator()<T, 3>();
-  };
-  if (velocity.scalar_type() == ScalarType::Float)
-    by_dimension.template operator()<float>();
-  else if (velocity.scalar_type() == ScalarType::Double)
-    by_dimension.template operator()<double>();
-  else
-    STD_TORCH_CHECK(false, "velocity must be float32 or float64");
+                  "velocity must have shape [N, 2] or [N, 3], got ", shape_of(velocity));
+  check_count(velocity.size(0), "velocity", "nodes");
 }
 
 template <class T, int D>
@@ -53,9 +43,8 @@ ContactArguments<T, D> contact_arguments(MPM_CONTACT_PARAMETERS) {
     largest = std::fmax(largest, T(std::fmax(std::fabs(lower[i]), std::fabs(upper))));
   }
   a.rounding = 16 * std::numeric_limits<T>::epsilon() * largest;
-  STD_TORCH_CHECK(block.dim() == 1 && block.size(0) <= INT32_MAX, "block must have shape [capacity]");
-  a.capacity = int(block.size(0));
-  a.block = int_pointer(block, "block", velocity, a.capacity);
+  a.capacity = block_capacity<D>(block);
+  a.block = int_pointer(block, "block", velocity, {a.capacity});
   const auto v = node_input<T>(velocity, "velocity", velocity, node_count<D>(block));
   a.velocity = v.pointer;
   a.stride = v.stride;
@@ -64,19 +53,26 @@ ContactArguments<T, D> contact_arguments(MPM_CONTACT_PARAMETERS) {
   check_like(obstacles, "obstacles", velocity);
   STD_TORCH_CHECK(obstacles.is_contiguous() && obstacles.size(0) > 0 && obstacles.size(0) <= INT32_MAX &&
                       obstacles.size(1) <= kMaxObstacles && obstacles.size(2) == width,
-                  "obstacles must be contiguous with shape [1 or B, at most ", kMaxObstacles, ", ", width, "]");
+                  "obstacles must be contiguous with shape [1 or B, at most ", kMaxObstacles, ", ", width, "], got ",
+                  shape_of(obstacles));
   a.row = static_cast<const ObstacleRow<T, D>*>(obstacles.data_ptr());
   a.rows = int(obstacles.size(0));
   a.obstacles = int(obstacles.size(1));
   const size_t count = size_t(a.obstacles);
-  STD_TORCH_CHECK(shape.size() == count && contact_kind.size() == count && scene.size() == count &&
-                      start.size() == count && end.size() == count,
-                  "shape, contact, scene, start and end must have one entry per obstacle");
+  const auto check_entries = [&](const auto& list, const char* name) {
+    STD_TORCH_CHECK(list.size() == count, name, " must have an entry per obstacle, ", count, ", got ", list.size());
+  };
+  check_entries(shape, "shape");
+  check_entries(contact_kind, "contact");
+  check_entries(scene, "scene");
+  check_entries(start, "start");
+  check_entries(end, "end");
   for (size_t k = 0; k < count; k++) {
     STD_TORCH_CHECK(shape[k] >= int64_t(ObstacleShape::plane) && shape[k] <= int64_t(ObstacleShape::capsule),
                     "shape must be 0 to 3, got ", shape[k]);
     STD_TORCH_CHECK(contact_kind[k] >= int64_t(Contact::sticky) && contact_kind[k] <= int64_t(Contact::separate),
                     "contact must be 1 to 3, got ", contact_kind[k]);
+    STD_TORCH_CHECK(scene[k] >= -1 && scene[k] <= INT32_MAX, "scene must be -1 or a scene, got ", scene[k]);
     a.kind[k] = {ObstacleShape(shape[k]), Contact(contact_kind[k]), int(scene[k]), start[k], end[k]};
   }
   a.time = time;
@@ -84,7 +80,7 @@ ContactArguments<T, D> contact_arguments(MPM_CONTACT_PARAMETERS) {
     check_rank(*scene_time, "scene_time", 1);
     check_like(*scene_time, "scene_time", velocity);
     STD_TORCH_CHECK(scene_time->is_contiguous() && scene_time->size(0) > 0 && scene_time->size(0) <= INT32_MAX,
-                    "scene_time must be contiguous with shape [1 or B]");
+                    "scene_time must be contiguous with shape [1 or B], got ", shape_of(*scene_time));
     a.scene_time = static_cast<const T*>(scene_time->data_ptr());
     a.times = int(scene_time->size(0));
   }
@@ -93,9 +89,9 @@ ContactArguments<T, D> contact_arguments(MPM_CONTACT_PARAMETERS) {
 
 Tensor contact(MPM_CONTACT_PARAMETERS) {
   const DeviceScope device(velocity);
-  check_rank(velocity, "velocity", 2);
+  check_velocity(velocity);
   Tensor rows = empty(velocity, {velocity.size(0), 1 + velocity.size(1)});
-  dispatch_velocity(velocity, [&]<class T, int D>() {
+  dispatch_dimension(velocity, "velocity", velocity.size(1), [&]<class T, int D>() {
     auto a = contact_arguments<T, D>(MPM_CONTACT_ARGUMENTS);
     a.result = static_cast<T*>(rows.data_ptr());
     backend::contact(a, device.stream());
@@ -105,12 +101,12 @@ Tensor contact(MPM_CONTACT_PARAMETERS) {
 
 Tensor contact_backward(const Tensor& grad, MPM_CONTACT_PARAMETERS) {
   const DeviceScope device(velocity);
-  check_rank(velocity, "velocity", 2);
+  check_velocity(velocity);
   Tensor rows = empty(velocity, {velocity.size(0), 1 + velocity.size(1)});
-  dispatch_velocity(velocity, [&]<class T, int D>() {
+  dispatch_dimension(velocity, "velocity", velocity.size(1), [&]<class T, int D>() {
     auto a = contact_arguments<T, D>(MPM_CONTACT_ARGUMENTS);
+    check_shape(grad, "grad", {velocity.size(0), D});
     const auto g = node_input<T>(grad, "grad", velocity, node_count<D>(block));
-    STD_TORCH_CHECK(g.channels == D, "grad must have shape [N, D]");
     a.grad = g.pointer;
     a.grad_stride = g.stride;
     a.result = static_cast<T*>(rows.data_ptr());

@@ -14,10 +14,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> g2p_advance(const Tensor& x, 
                                                                const OptionalTensor& F, const OptionalTensor& J,
                                                                const OptionalTensor& scene_dt, double dt, bool affine,
                                                                int64_t stress_form, MPM_TOPOLOGY_PARAMETERS) {
-  check_rank(x, "x", 2);
-  check_rank(velocity, "velocity", 2);
-  STD_TORCH_CHECK(velocity.size(1) == x.size(1), "velocity must have shape [N, D]");
-  STD_TORCH_CHECK(stress_form == 0 || stress_form == 1, "stress_form must be 0 (MLS) or 1 (B-spline gradient)");
+  check_positions(x);
   const int64_t P = x.size(0), D_ = x.size(1);
   const auto output = [&](bool wanted, const Shape& shape) {
     return wanted ? empty_particles(x, shape) : empty(x, {0});
@@ -29,6 +26,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> g2p_advance(const Tensor& x, 
     G2PAdvanceArguments<T, D> a;
     a.gather.topology = topology<T, D>(x, MPM_TOPOLOGY_ARGUMENTS);
     a.gather.x = input<T>(x, "x", x, {P, D});
+    check_shape(velocity, "velocity", {node_count<D>(block), D});
     a.gather.nodes = node_input<T>(velocity, "velocity", x, node_count<D>(block));
     a.gather.moment_scale = BSpline<Order>::inverse_inertia / (dx * dx);
     a.gather.value = field<T>(v);
@@ -37,7 +35,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> g2p_advance(const Tensor& x, 
     a.J = input<T>(J, "J", x, {P});
     a.scene_dt = input<T>(scene_dt, "scene_dt", x, {a.gather.topology.scenes});
     a.dt = dt;
-    a.form = StressForm(stress_form);
+    a.form = stress_form_of(stress_form);
     a.x_next = field<T>(x_next);
     if (has(F)) a.F_next = field<T>(F_next);
     if (has(J)) a.J_next = field<T>(J_next);

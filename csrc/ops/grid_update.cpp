@@ -22,24 +22,14 @@ namespace {
 #define MPM_GRID_UPDATE_ARGUMENTS \
   nodes, gravity, scene_dt, dt, wall_kind, wall_plane, wall_friction, table, block, dx, lower, blocks
 
-// Calls f.operator()<T, D>() for the dtype and dimension of node rows.
-template <class F>
-void dispatch_nodes(const Tensor& nodes, F&& f) {
-  STD_TORCH_CHECK(nodes.dim() == 2 && (nodes.size(1) == 3 || nodes.size(1) == 4), "nodes must have shape [N, 1 + D]");
-  const auto by_dimension = [&]<class T>() {
-    nodes.size(1) == 3 ? f.template operator()<T, 2>() : f.template operator()<T, 3>();
-  };
-  if (nodes.scalar_type() == ScalarType::Float)
-    by_dimension.template operator()<float>();
-  else if (nodes.scalar_type() == ScalarType::Double)
-    by_dimension.template operator()<double>();
-  else
-    STD_TORCH_CHECK(false, "nodes must be float32 or float64");
+void check_nodes(const Tensor& nodes) {
+  STD_TORCH_CHECK(nodes.dim() == 2 && (nodes.size(1) == 3 || nodes.size(1) == 4),
+                  "nodes must have shape [N, 3] or [N, 4], got ", shape_of(nodes));
+  check_count(nodes.size(0), "nodes", "rows");
 }
 
 // Kernels read whole rows with vector loads.
 Tensor packed_rows(const Tensor& t) {
-  check_rank(t, "nodes", 2);
   const bool packed = t.is_contiguous() && reinterpret_cast<uintptr_t>(t.data_ptr()) % 16 == 0;
   if (packed) return t;
   Tensor copy = empty(t, {t.size(0), t.size(1)});
@@ -50,8 +40,7 @@ Tensor packed_rows(const Tensor& t) {
 template <class T, int D>
 const NodeRow<T, D>* rows(const Tensor& t, const char* name, const Tensor& nodes) {
   check_shape(t, name, {nodes.size(0), 1 + D});
-  STD_TORCH_CHECK(t.scalar_type() == nodes.scalar_type() && t.device() == nodes.device(), name,
-                  " must have the dtype and the device of nodes");
+  check_like(t, name, nodes);
   return static_cast<const NodeRow<T, D>*>(t.data_ptr());
 }
 
@@ -59,17 +48,20 @@ template <class T>
 const T* scene_values(const OptionalTensor& t, const char* name, const Tensor& nodes, const Shape& shape) {
   if (!has(t)) return nullptr;
   check_shape(*t, name, shape);
-  STD_TORCH_CHECK(t->is_contiguous() && t->scalar_type() == nodes.scalar_type() && t->device() == nodes.device(), name,
-                  " must be contiguous, with the dtype and on the device of nodes");
+  check_like(*t, name, nodes);
+  STD_TORCH_CHECK(t->is_contiguous(), name, " must be contiguous");
   return static_cast<const T*>(t->data_ptr());
 }
 
 template <class T, int D>
 Walls<T, D> walls(const std::vector<int64_t>& kind, const std::vector<double>& plane,
                   const std::vector<double>& friction, double dx, const std::vector<double>& lower) {
-  STD_TORCH_CHECK(kind.empty() || kind.size() == 2 * D, "wall_kind must be empty or have two entries per axis");
-  STD_TORCH_CHECK(plane.size() == kind.size() && friction.size() == kind.size(),
-                  "wall_plane and wall_friction must have as many entries as wall_kind");
+  STD_TORCH_CHECK(kind.empty() || kind.size() == 2 * D, "wall_kind must be empty or have ", 2 * D,
+                  " entries, two per axis, got ", kind.size());
+  STD_TORCH_CHECK(plane.size() == kind.size(), "wall_plane must have an entry per wall_kind, ", kind.size(), ", got ",
+                  plane.size());
+  STD_TORCH_CHECK(friction.size() == kind.size(), "wall_friction must have an entry per wall_kind, ", kind.size(),
+                  ", got ", friction.size());
   Walls<T, D> w;
   for (int face = 0; face < 2 * D; face++) {
     const int64_t k = kind.empty() ? int64_t(Contact::open) : kind[face];
@@ -84,15 +76,15 @@ template <class T, int D>
 GridUpdateArguments<T, D> grid_update_arguments(MPM_GRID_UPDATE_PARAMETERS) {
   GridUpdateArguments<T, D> a;
   a.geometry = geometry<T, D>(dx, lower, blocks);
-  STD_TORCH_CHECK(block.dim() == 1 && block.size(0) <= INT32_MAX, "block must have shape [capacity]");
-  a.capacity = int(block.size(0));
-  a.block = int_pointer(block, "block", nodes, a.capacity);
-  STD_TORCH_CHECK(nodes.size(0) == node_count<D>(block), "nodes must have 4^D rows per entry of block");
+  a.capacity = block_capacity<D>(block);
+  a.block = int_pointer(block, "block", nodes, {a.capacity});
+  check_shape(nodes, "nodes", {node_count<D>(block), 1 + D});
   a.nodes = rows<T, D>(nodes, "nodes", nodes);
-  a.table = int_pointer(table, "table", nodes, -1);
+  check_rank(table, "table", 1);
+  a.table = int_pointer(table, "table", nodes, {table.size(0)});
   a.block_count = int(std::min<int64_t>(INT32_MAX, table.numel()));
   if (has(gravity)) {
-    STD_TORCH_CHECK(gravity->dim() == 2, "gravity must have shape [B, D]");
+    check_rank(*gravity, "gravity", 2);
     const int64_t scenes = gravity->size(0);
     a.gravity = scene_values<T>(gravity, "gravity", nodes, {scenes, D});
     a.scene_dt = scene_values<T>(scene_dt, "scene_dt", nodes, {scenes});
@@ -104,10 +96,11 @@ GridUpdateArguments<T, D> grid_update_arguments(MPM_GRID_UPDATE_PARAMETERS) {
 }
 
 Tensor grid_update(MPM_GRID_UPDATE_PARAMETERS) {
+  check_nodes(nodes);
   const DeviceScope device(nodes);
   const Tensor packed = packed_rows(nodes);
   Tensor updated = empty(packed, {packed.size(0), packed.size(1)});
-  dispatch_nodes(nodes, [&]<class T, int D>() {
+  dispatch_dimension(nodes, "nodes", nodes.size(1) - 1, [&]<class T, int D>() {
     auto a = grid_update_arguments<T, D>(MPM_GRID_UPDATE_ARGUMENTS);
     a.nodes = rows<T, D>(packed, "nodes", nodes);
     a.updated = static_cast<NodeRow<T, D>*>(updated.data_ptr());
@@ -118,16 +111,18 @@ Tensor grid_update(MPM_GRID_UPDATE_PARAMETERS) {
 
 // `change` is the adjoint of the velocity change by gravity, summed over the nodes of each slot.
 std::tuple<Tensor, Tensor> grid_update_backward(const Tensor& grad, bool wants_change, MPM_GRID_UPDATE_PARAMETERS) {
+  check_nodes(nodes);
+  check_shape(grad, "grad", {nodes.size(0), nodes.size(1)});
   const DeviceScope device(nodes);
   const Tensor packed = packed_rows(nodes), packed_grad = packed_rows(grad);
-  Tensor grad_nodes = empty(packed, {packed.size(0), packed.size(1)}),
-         change = empty(nodes, {wants_change ? block.size(0) : 0, nodes.size(1) - 1});
-  dispatch_nodes(nodes, [&]<class T, int D>() {
+  Tensor grad_nodes = empty(packed, {packed.size(0), packed.size(1)}), change;
+  dispatch_dimension(nodes, "nodes", nodes.size(1) - 1, [&]<class T, int D>() {
     GridUpdateBackwardArguments<T, D> a;
     a.forward = grid_update_arguments<T, D>(MPM_GRID_UPDATE_ARGUMENTS);
     a.forward.nodes = rows<T, D>(packed, "nodes", nodes);
     a.grad_updated = rows<T, D>(packed_grad, "grad", nodes);
     a.grad_nodes = static_cast<NodeRow<T, D>*>(grad_nodes.data_ptr());
+    change = empty(nodes, {wants_change ? a.forward.capacity : 0, D});
     if (wants_change) a.change = static_cast<Vector<T, D>*>(change.data_ptr());
     backend::grid_update_backward(a, device.stream());
   });

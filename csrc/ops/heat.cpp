@@ -18,8 +18,7 @@ class Values {
   Values(const OptionalTensor& t, const char* name, const Tensor& x, ScalarType type, int64_t size) {
     if (!has(t)) return;
     check_shape(*t, name, {size});
-    STD_TORCH_CHECK(t->scalar_type() == type && t->device() == x.device(), name,
-                    " has an unexpected dtype or is not on the device of x");
+    check_type(*t, name, type, x);
     packed_ = *t;
     if (size > 1 && (t->stride(0) != 1 || reinterpret_cast<uintptr_t>(t->data_ptr()) % 16 != 0)) {
       packed_ = empty(*t, {size});
@@ -41,9 +40,9 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> heat_cg(const Tensor& x, const Tensor
                                                    double relative_tolerance, const OptionalTensor& scene_most,
                                                    int64_t max_iterations, int64_t method, double /*adjoint_tolerance*/,
                                                    MPM_TOPOLOGY_PARAMETERS) {
-  check_rank(block, "block", 1);
-  check_rank(x, "x", 2);
-  STD_TORCH_CHECK(method == 0 || method == 1, "method must be 0 (conjugate gradients) or 1 (Chebyshev)");
+  STD_TORCH_CHECK(method == 0 || method == 1, "method must be 0 (conjugate gradients) or 1 (Chebyshev), got ", method);
+  STD_TORCH_CHECK(max_iterations >= 0 && max_iterations <= INT32_MAX, "max_iterations must be 0 to 2^31 - 1, got ",
+                  max_iterations);
   Tensor increment, iterations, residual, converged;
   const DeviceScope device(x);
   dispatch(x, order, [&]<class T, int D, int Order>() {
@@ -100,8 +99,6 @@ HeatOperatorArguments<T, D> operator_arguments(const Topology<T, D>& topology, c
 }
 
 Tensor heat_operator(const Tensor& x, const Tensor& conductance, const OptionalTensor& nodes, MPM_TOPOLOGY_PARAMETERS) {
-  check_rank(block, "block", 1);
-  check_rank(x, "x", 2);
   Tensor sum;
   const DeviceScope device(x);
   dispatch(x, order, [&]<class T, int D, int Order>() {
@@ -119,8 +116,6 @@ Tensor heat_operator(const Tensor& x, const Tensor& conductance, const OptionalT
 }
 
 Tensor heat_stencil(const Tensor& x, const Tensor& conductance, MPM_TOPOLOGY_PARAMETERS) {
-  check_rank(block, "block", 1);
-  check_rank(x, "x", 2);
   Tensor sum;
   const DeviceScope device(x);
   dispatch(x, order, [&]<class T, int D, int Order>() {
@@ -134,36 +129,27 @@ Tensor heat_stencil(const Tensor& x, const Tensor& conductance, MPM_TOPOLOGY_PAR
 
 Tensor heat_patches(const Tensor& inverse, const Tensor& rows, const Tensor& patches, const Tensor& r) {
   check_rank(r, "r", 1);
+  check_count(r.size(0), "r", "nodes");
   check_rank(rows, "rows", 2);
   check_like(inverse, "inverse", r);
   const int64_t N = r.size(0), K = rows.size(1);
-  STD_TORCH_CHECK(K == 4 || K == 8, "rows must have 4 or 8 columns");
+  STD_TORCH_CHECK(K == 4 || K == 8, "rows must have shape [N, 4] or [N, 8], got ", shape_of(rows));
   check_shape(inverse, "inverse", {N, K, K});
-  check_shape(rows, "rows", {N, K});
-  check_shape(patches, "patches", {N, K});
-  STD_TORCH_CHECK(inverse.is_contiguous() && r.is_contiguous(), "inverse and r must be contiguous");
+  STD_TORCH_CHECK(inverse.is_contiguous(), "inverse must be contiguous");
+  STD_TORCH_CHECK(r.is_contiguous(), "r must be contiguous");
   const Tensor sum = empty(r, {N}), solved = empty(r, {N, K});
   const DeviceScope device(r);
-  const auto run = [&]<class T, int D>() {
+  dispatch_dimension(r, "r", K == 4 ? 2 : 3, [&]<class T, int D>() {
     PatchArguments<T, D> a;
     a.count = N;
     a.inverse = static_cast<const T*>(inverse.data_ptr());
-    a.rows = int_pointer(rows, "rows", r, N * K);
-    a.patches = int_pointer(patches, "patches", r, N * K);
+    a.rows = int_pointer(rows, "rows", r, {N, K});
+    a.patches = int_pointer(patches, "patches", r, {N, K});
     a.r = static_cast<const T*>(r.data_ptr());
     a.solved = static_cast<T*>(solved.data_ptr());
     a.sum = static_cast<T*>(sum.data_ptr());
     backend::heat_patches(a, device.stream());
-  };
-  const auto by_dimension = [&]<class T>() {
-    K == 4 ? run.template operator()<T, 2>() : run.template operator()<T, 3>();
-  };
-  if (r.scalar_type() == ScalarType::Float)
-    by_dimension.template operator()<float>();
-  else if (r.scalar_type() == ScalarType::Double)
-    by_dimension.template operator()<double>();
-  else
-    STD_TORCH_CHECK(false, "r must be float32 or float64");
+  });
   return sum;
 }
 

@@ -18,35 +18,25 @@ struct LawInfo {
   bool shear = false, viscous = false;
 };
 
-LawInfo find_law(const std::string& name) {
+LawInfo find(const std::string& name) {
   LawInfo info;
-  for (int i = 0; i < AllLaws::size; i++)
-    AllLaws::visit(i, [&]<class Law>() {
-      if (name == Law::name) info = {i, Law::parameters, Law::shear, Law::viscous};
-    });
-  STD_TORCH_CHECK(info.index >= 0, "there is no law named ", name);
+  find_law<AllLaws>(name, [&]<class Law>(int i) { info = {i, Law::parameters, Law::shear, Law::viscous}; });
   return info;
 }
 
-// Calls f.operator()<T, D>().
-template <class F>
-void dispatch_law(const Tensor& state, int64_t dim, F&& f) {
-  STD_TORCH_CHECK(dim == 2 || dim == 3, "dim must be 2 or 3");
-  const auto by_dimension = [&]<class T>() {
-    dim == 2 ? f.template operator()<T, 2>() : f.template operator()<T, 3>();
-  };
-  if (state.scalar_type() == ScalarType::Float)
-    by_dimension.template operator()<float>();
-  else if (state.scalar_type() == ScalarType::Double)
-    by_dimension.template operator()<double>();
-  else
-    STD_TORCH_CHECK(false, "the state must be float32 or float64");
+// F [P, D, D], or J [P] of a law without shear.
+void check_state(const LawInfo& law, const Tensor& state, int64_t dim) {
+  STD_TORCH_CHECK(dim == 2 || dim == 3, "dim must be 2 or 3, got ", dim);
+  STD_TORCH_CHECK(state.dim() == (law.shear ? 3 : 1), "the state must have shape ", law.shear ? "[P, D, D]" : "[P]",
+                  ", got ", shape_of(state));
+  check_shape(state, "the state", law.shear ? Shape{state.size(0), dim, dim} : Shape{state.size(0)});
+  check_count(state.size(0), "the state", "particles");
 }
 
 template <class T, int D>
-LawArguments<T, D> law_arguments(const LawInfo& law, const Tensor& state, const OptionalTensor& C,
-                                 const OptionalTensor& scene, const std::vector<Tensor>& parameters) {
-  STD_TORCH_CHECK(state.dim() >= 1, "the state must have shape [P] or [P, D, D]");
+LawArguments<T, D> law_arguments(const LawInfo& law, const std::string& name, const Tensor& state,
+                                 const OptionalTensor& C, const OptionalTensor& scene,
+                                 const std::vector<Tensor>& parameters) {
   const int64_t P = state.size(0);
   LawArguments<T, D> a;
   a.law = law.index;
@@ -55,18 +45,20 @@ LawArguments<T, D> law_arguments(const LawInfo& law, const Tensor& state, const 
   STD_TORCH_CHECK(law.viscous || !has(C), "a law without viscosity takes no C");
   a.C = input<T>(C, "C", state, {P, D, D});
   set_scene(a, scene, state);
-  STD_TORCH_CHECK(int(parameters.size()) == law.parameters, "the law has another number of parameters");
-  for (int k = 0; k < law.parameters; k++) a.parameters[k] = parameter<T>(parameters[k], state, P, has(scene));
+  check_number(parameters, "parameters", law.parameters, name);
+  for (int k = 0; k < law.parameters; k++)
+    a.parameters[k] = parameter<T>(parameters[k], element("parameters", k), state, P, has(scene));
   return a;
 }
 
 Tensor material_stress(const Tensor& state, const OptionalTensor& C, const OptionalTensor& scene,
                        const std::vector<Tensor>& parameters, std::string law, int64_t dim) {
-  const LawInfo info = find_law(law);
+  const LawInfo info = find(law);
+  check_state(info, state, dim);
   Tensor stress = empty_particles(state, {state.size(0), dim, dim});
   const DeviceScope device(state);
-  dispatch_law(state, dim, [&]<class T, int D>() {
-    const StressArguments<T, D> a{law_arguments<T, D>(info, state, C, scene, parameters), field<T>(stress)};
+  dispatch_dimension(state, "the state", dim, [&]<class T, int D>() {
+    const StressArguments<T, D> a{law_arguments<T, D>(info, law, state, C, scene, parameters), field<T>(stress)};
     backend::material_stress(a, device.stream());
   });
   return stress;
@@ -76,13 +68,14 @@ std::tuple<Tensor, Tensor, Tensor> material_stress_backward(const Tensor& grad_s
                                                             const OptionalTensor& C, const OptionalTensor& scene,
                                                             const std::vector<Tensor>& parameters, std::string law,
                                                             int64_t dim, int64_t needs) {
-  const LawInfo info = find_law(law);
+  const LawInfo info = find(law);
+  check_state(info, state, dim);
   const int64_t P = state.size(0);
   Tensor grad_state, grad_C, grad_parameters;
   const DeviceScope device(state);
-  dispatch_law(state, dim, [&]<class T, int D>() {
+  dispatch_dimension(state, "the state", dim, [&]<class T, int D>() {
     StressBackwardArguments<T, D> a;
-    a.law = law_arguments<T, D>(info, state, C, scene, parameters);
+    a.law = law_arguments<T, D>(info, law, state, C, scene, parameters);
     a.grad_stress = input<T>(grad_stress, "grad_stress", state, {P, D, D});
     a.state = optional_result<T>(state, needs & kState, info.shear ? Shape{P, D, D} : Shape{P}, grad_state);
     a.C = optional_result<T>(state, (needs & kVelocityGradient) && has(C), {P, D, D}, grad_C);
@@ -94,11 +87,12 @@ std::tuple<Tensor, Tensor, Tensor> material_stress_backward(const Tensor& grad_s
 
 Tensor material_scalar(Scalar which, const Tensor& state, const OptionalTensor& scene,
                        const std::vector<Tensor>& parameters, const std::string& law, int64_t dim) {
-  const LawInfo info = find_law(law);
+  const LawInfo info = find(law);
+  check_state(info, state, dim);
   Tensor value = empty(state, {state.size(0)});
   const DeviceScope device(state);
-  dispatch_law(state, dim, [&]<class T, int D>() {
-    const ScalarArguments<T, D> a{law_arguments<T, D>(info, state, {}, scene, parameters), which, field<T>(value)};
+  dispatch_dimension(state, "the state", dim, [&]<class T, int D>() {
+    const ScalarArguments<T, D> a{law_arguments<T, D>(info, law, state, {}, scene, parameters), which, field<T>(value)};
     backend::material_scalar(a, device.stream());
   });
   return value;
@@ -122,13 +116,14 @@ Tensor material_stiffness(const Tensor& state, const OptionalTensor& scene, cons
 std::tuple<Tensor, Tensor> material_energy_backward(const Tensor& grad_energy, const Tensor& state,
                                                     const OptionalTensor& scene, const std::vector<Tensor>& parameters,
                                                     std::string law, int64_t dim, int64_t needs) {
-  const LawInfo info = find_law(law);
+  const LawInfo info = find(law);
+  check_state(info, state, dim);
   const int64_t P = state.size(0);
   Tensor grad_state, grad_parameters;
   const DeviceScope device(state);
-  dispatch_law(state, dim, [&]<class T, int D>() {
+  dispatch_dimension(state, "the state", dim, [&]<class T, int D>() {
     EnergyBackwardArguments<T, D> a;
-    a.law = law_arguments<T, D>(info, state, {}, scene, parameters);
+    a.law = law_arguments<T, D>(info, law, state, {}, scene, parameters);
     a.grad_energy = input<T>(grad_energy, "grad_energy", state, {P});
     a.state = optional_result<T>(state, needs & kState, info.shear ? Shape{P, D, D} : Shape{P}, grad_state);
     a.parameters = optional_result<T>(state, needs & kParameters, {P, info.parameters}, grad_parameters);

@@ -3,45 +3,52 @@
 #include "materials/arguments.h"
 #include "ops/tensors.h"
 
-// What the ops of constitutive laws share: dispatch on the deformation gradient, parameters, optional results.
+// What the ops of constitutive laws share: laws by name, parameters, optional results.
 namespace mpm {
 
-// Calls f.operator()<T, D>().
-template <class F>
-void dispatch_deformation(const Tensor& deformation, F&& f) {
-  STD_TORCH_CHECK(deformation.dim() == 3 && (deformation.size(1) == 2 || deformation.size(1) == 3),
-                  "F must have shape [P, 2, 2] or [P, 3, 3]");
-  const auto by_dimension = [&]<class T>() {
-    deformation.size(1) == 2 ? f.template operator()<T, 2>() : f.template operator()<T, 3>();
-  };
-  if (deformation.scalar_type() == ScalarType::Float)
-    by_dimension.template operator()<float>();
-  else if (deformation.scalar_type() == ScalarType::Double)
-    by_dimension.template operator()<double>();
-  else
-    STD_TORCH_CHECK(false, "F must be float32 or float64");
-}
-
 template <class T>
-Parameter<T> parameter(const Tensor& t, const Tensor& state, int64_t particles, bool has_scene) {
-  STD_TORCH_CHECK(t.dim() <= 1, "a parameter must be a scalar or have shape [1], [B] or [P]");
-  check_like(t, "a parameter", state);
+Parameter<T> parameter(const Tensor& t, const std::string& name, const Tensor& state, int64_t particles,
+                       bool has_scene) {
+  check_like(t, name.c_str(), state);
+  const bool uniform = t.dim() <= 1 && t.numel() == 1, per_particle = t.dim() == 1 && t.size(0) == particles;
+  STD_TORCH_CHECK(uniform || per_particle || (t.dim() == 1 && has_scene && t.size(0) > 0), name,
+                  " must be a scalar or have shape [1], [B] (with scene) or [P] = [", particles, "], got ",
+                  shape_of(t));
   const T* pointer = static_cast<const T*>(t.data_ptr());
-  if (t.numel() == 1) return {pointer, 0, 0};
-  if (t.numel() == particles) return {pointer, t.stride(0), 0};
-  STD_TORCH_CHECK(has_scene && t.numel() > 0, "a parameter must be a scalar or have shape [1], [B] or [P]");
-  return {pointer, t.stride(0), t.numel()};
+  if (uniform) return {pointer, 0, 0};
+  return {pointer, t.stride(0), per_particle ? 0 : t.size(0)};
 }
 
-// Sets `scene` and `scene_stride` of the arguments of a law.
-template <class Arguments>
-void set_scene(Arguments& a, const OptionalTensor& scene, const Tensor& state) {
-  if (!has(scene)) return;
-  check_shape(*scene, "scene", {state.size(0)});
-  STD_TORCH_CHECK(scene->scalar_type() == ScalarType::Int && scene->device() == state.device(),
-                  "scene must be an int32 tensor on the device of the state");
-  a.scene = static_cast<const int*>(scene->data_ptr());
-  a.scene_stride = scene->stride(0);
+// Of a law in the order of its parameters, or of its history.
+inline void check_number(const std::vector<Tensor>& given, const char* name, int expected, const std::string& law) {
+  STD_TORCH_CHECK(int64_t(given.size()) == expected, name, " must be ", expected, " tensors for the law ", law,
+                  ", got ", given.size());
+}
+
+inline std::string element(const char* list, int k) { return list + ("[" + std::to_string(k) + "]"); }
+
+// Names in a list of laws, for messages.
+template <class List>
+std::string names_of() {
+  std::string names;
+  for (int i = 0; i < List::size; i++)
+    List::visit(i, [&]<class Entry>() {
+      if (names.find(Entry::name) == std::string::npos) names += (names.empty() ? "" : ", ") + std::string(Entry::name);
+    });
+  return names;
+}
+
+// Calls found.operator()<Law>(index) for the law of a name.
+template <class Laws, class F>
+void find_law(const std::string& name, F&& found) {
+  bool known = false;
+  for (int i = 0; i < Laws::size; i++)
+    Laws::visit(i, [&]<class Law>() {
+      if (name != Law::name) return;
+      known = true;
+      found.template operator()<Law>(i);
+    });
+  STD_TORCH_CHECK(known, "law must be one of ", names_of<Laws>(), ", got ", name);
 }
 
 // A result per particle, or an empty tensor where it is not wanted.

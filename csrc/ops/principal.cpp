@@ -18,18 +18,14 @@ struct PrincipalLawInfo {
   bool plastic = false;
 };
 
-PrincipalLawInfo find_principal_law(const std::string& name) {
+PrincipalLawInfo find(const std::string& name) {
   PrincipalLawInfo info;
-  for (int i = 0; i < PrincipalLaws::size; i++)
-    PrincipalLaws::visit(i, [&]<class Law>() {
-      if (name == Law::name) info = {i, Law::parameters, Law::history, Law::plastic};
-    });
-  STD_TORCH_CHECK(info.index >= 0, "there is no law in principal strains named ", name);
+  find_law<PrincipalLaws>(name, [&]<class Law>(int i) { info = {i, Law::parameters, Law::history, Law::plastic}; });
   return info;
 }
 
 template <class T, int D>
-PrincipalArguments<T, D> principal_arguments(const PrincipalLawInfo& law, const Tensor& F,
+PrincipalArguments<T, D> principal_arguments(const PrincipalLawInfo& law, const std::string& name, const Tensor& F,
                                              const std::vector<Tensor>& parameters, const std::vector<Tensor>& history,
                                              const OptionalTensor& scene) {
   PrincipalArguments<T, D> a;
@@ -37,10 +33,12 @@ PrincipalArguments<T, D> principal_arguments(const PrincipalLawInfo& law, const 
   a.particles = F.size(0);
   a.F = input<T>(F, "F", F, {F.size(0), D, D});
   set_scene(a, scene, F);
-  STD_TORCH_CHECK(int(parameters.size()) == law.parameters, "the law has another number of parameters");
-  STD_TORCH_CHECK(int(history.size()) == law.history, "the law has another number of history variables");
-  for (int k = 0; k < law.parameters; k++) a.parameters[k] = parameter<T>(parameters[k], F, a.particles, has(scene));
-  for (int k = 0; k < law.history; k++) a.history[k] = input<T>(history[k], "a history variable", F, {a.particles});
+  check_number(parameters, "parameters", law.parameters, name);
+  check_number(history, "history", law.history, name);
+  for (int k = 0; k < law.parameters; k++)
+    a.parameters[k] = parameter<T>(parameters[k], element("parameters", k), F, a.particles, has(scene));
+  for (int k = 0; k < law.history; k++)
+    a.history[k] = input<T>(history[k], element("history", k).c_str(), F, {a.particles});
   return a;
 }
 
@@ -49,13 +47,14 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> principal_update(const Tensor
                                                                     const std::vector<Tensor>& history,
                                                                     const OptionalTensor& scene, std::string law,
                                                                     bool details) {
-  const PrincipalLawInfo info = find_principal_law(law);
+  const PrincipalLawInfo info = find(law);
+  check_matrices(F, "F");
   const int64_t P = F.size(0);
   Tensor mapped, stress, moved, dissipated, branch = empty_int(F, {details ? P : 0});
   const DeviceScope device(F);
-  dispatch_deformation(F, [&]<class T, int D>() {
+  dispatch_dimension(F, "F", F.size(1), [&]<class T, int D>() {
     PrincipalUpdateArguments<T, D> a;
-    a.law = principal_arguments<T, D>(info, F, parameters, history, scene);
+    a.law = principal_arguments<T, D>(info, law, F, parameters, history, scene);
     a.F = optional_result<T>(F, info.plastic, {P, D, D}, mapped);
     a.stress = optional_result<T>(F, true, {P, D, D}, stress);
     a.history = optional_result<T>(F, true, {P, info.history}, moved);
@@ -70,13 +69,14 @@ std::tuple<Tensor, Tensor, Tensor> principal_update_backward(
     const OptionalTensor& grad_F, const OptionalTensor& grad_stress, const OptionalTensor& grad_history,
     const OptionalTensor& grad_dissipated, const Tensor& F, const std::vector<Tensor>& parameters,
     const std::vector<Tensor>& history, const OptionalTensor& scene, std::string law, int64_t needs) {
-  const PrincipalLawInfo info = find_principal_law(law);
+  const PrincipalLawInfo info = find(law);
+  check_matrices(F, "F");
   const int64_t P = F.size(0);
   Tensor adjoint_F, adjoint_parameters, adjoint_history;
   const DeviceScope device(F);
-  dispatch_deformation(F, [&]<class T, int D>() {
+  dispatch_dimension(F, "F", F.size(1), [&]<class T, int D>() {
     PrincipalBackwardArguments<T, D> a;
-    a.law = principal_arguments<T, D>(info, F, parameters, history, scene);
+    a.law = principal_arguments<T, D>(info, law, F, parameters, history, scene);
     a.grad_F = input<T>(grad_F, "grad_F", F, {P, D, D});
     a.grad_stress = input<T>(grad_stress, "grad_stress", F, {P, D, D});
     a.grad_history = input<T>(grad_history, "grad_history", F, {P, info.history});
@@ -91,11 +91,12 @@ std::tuple<Tensor, Tensor, Tensor> principal_update_backward(
 
 Tensor principal_scalar(PrincipalScalar which, const Tensor& F, const std::vector<Tensor>& parameters,
                         const std::vector<Tensor>& history, const OptionalTensor& scene, const std::string& law) {
-  const PrincipalLawInfo info = find_principal_law(law);
+  const PrincipalLawInfo info = find(law);
+  check_matrices(F, "F");
   Tensor value = empty(F, {F.size(0)});
   const DeviceScope device(F);
-  dispatch_deformation(F, [&]<class T, int D>() {
-    const PrincipalScalarArguments<T, D> a{principal_arguments<T, D>(info, F, parameters, history, scene), which,
+  dispatch_dimension(F, "F", F.size(1), [&]<class T, int D>() {
+    const PrincipalScalarArguments<T, D> a{principal_arguments<T, D>(info, law, F, parameters, history, scene), which,
                                            field<T>(value)};
     backend::principal_scalar(a, device.stream());
   });
@@ -122,13 +123,14 @@ std::tuple<Tensor, Tensor, Tensor> principal_energy_backward(const Tensor& grad_
                                                              const std::vector<Tensor>& history,
                                                              const OptionalTensor& scene, std::string law,
                                                              int64_t needs) {
-  const PrincipalLawInfo info = find_principal_law(law);
+  const PrincipalLawInfo info = find(law);
+  check_matrices(F, "F");
   const int64_t P = F.size(0);
   Tensor adjoint_F, adjoint_parameters, adjoint_history;
   const DeviceScope device(F);
-  dispatch_deformation(F, [&]<class T, int D>() {
+  dispatch_dimension(F, "F", F.size(1), [&]<class T, int D>() {
     PrincipalEnergyBackwardArguments<T, D> a;
-    a.law = principal_arguments<T, D>(info, F, parameters, history, scene);
+    a.law = principal_arguments<T, D>(info, law, F, parameters, history, scene);
     a.grad_energy = input<T>(grad_energy, "grad_energy", F, {P});
     a.F = optional_result<T>(F, needs & 1, {P, D, D}, adjoint_F);
     a.parameters = optional_result<T>(F, needs & 2, {P, info.parameters}, adjoint_parameters);

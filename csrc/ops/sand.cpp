@@ -15,9 +15,9 @@ namespace {
 
 template <class Energies>
 int energy_index(const std::string& name, const std::string& flow) {
-  STD_TORCH_CHECK(flow == "radial" || flow == "exact", "there is no flow rule named ", flow);
+  STD_TORCH_CHECK(flow == "radial" || flow == "exact", "flow must be radial or exact, got ", flow);
   const int index = find_energy<Energies>(name, flow == "exact");
-  STD_TORCH_CHECK(index >= 0, "there is no energy named ", name);
+  STD_TORCH_CHECK(index >= 0, "energy must be one of ", names_of<Energies>(), ", got ", name);
   return index;
 }
 
@@ -27,8 +27,8 @@ SandArguments<T, D> sand_arguments(const Tensor& F, const Tensor& mu, const Tens
   a.particles = F.size(0);
   a.F = input<T>(F, "F", F, {F.size(0), D, D});
   set_scene(a, scene, F);
-  a.mu = parameter<T>(mu, F, a.particles, has(scene));
-  a.lam = parameter<T>(lam, F, a.particles, has(scene));
+  a.mu = parameter<T>(mu, "mu", F, a.particles, has(scene));
+  a.lam = parameter<T>(lam, "lam", F, a.particles, has(scene));
   return a;
 }
 
@@ -38,11 +38,11 @@ SandArguments<T, D> plastic_arguments(const Tensor& F, const Tensor& mu, const T
                                       const OptionalTensor& cohesion, const OptionalTensor& volume,
                                       const OptionalTensor& scene, const std::string& energy, const std::string& flow,
                                       const std::string& apex) {
-  STD_TORCH_CHECK(apex == "none" || apex == "zero" || apex == "keep", "there is no apex rule named ", apex);
+  STD_TORCH_CHECK(apex == "none" || apex == "zero" || apex == "keep", "apex must be none, zero or keep, got ", apex);
   SandArguments<T, D> a = sand_arguments<T, D>(F, mu, lam, scene);
   a.energy = energy_index<ReturnMaps<D>>(energy, flow);
-  a.alpha = parameter<T>(alpha, F, a.particles, has(scene));
-  if (has(cohesion)) a.cohesion = parameter<T>(*cohesion, F, a.particles, has(scene));
+  a.alpha = parameter<T>(alpha, "alpha", F, a.particles, has(scene));
+  if (has(cohesion)) a.cohesion = parameter<T>(*cohesion, "cohesion", F, a.particles, has(scene));
   a.volume = input<T>(volume, "volume", F, {F.size(0)});
   a.plastic = apex != "none";
   a.keep_apex = apex == "keep";
@@ -53,10 +53,11 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> quartic_return_map(
     const Tensor& F, const Tensor& mu, const Tensor& lam, const Tensor& alpha, const OptionalTensor& cohesion,
     const OptionalTensor& volume, const OptionalTensor& scene, std::string energy, std::string flow, std::string apex,
     bool details) {
+  check_matrices(F, "F");
   const int64_t P = F.size(0);
   Tensor mapped, stress, branch = empty_int(F, {P}), multiplier, dissipated, corrected;
   const DeviceScope device(F);
-  dispatch_deformation(F, [&]<class T, int D>() {
+  dispatch_dimension(F, "F", F.size(1), [&]<class T, int D>() {
     ReturnMapArguments<T, D> a;
     a.sand = plastic_arguments<T, D>(F, mu, lam, alpha, cohesion, volume, scene, energy, flow, apex);
     a.F = optional_result<T>(F, true, {P, D, D}, mapped);
@@ -76,10 +77,11 @@ std::tuple<Tensor, Tensor, Tensor> quartic_return_map_backward(
     const Tensor& lam, const Tensor& alpha, const OptionalTensor& cohesion, const OptionalTensor& volume,
     const OptionalTensor& scene, std::string energy, std::string flow, std::string apex, bool needs_F,
     bool needs_parameters) {
+  check_matrices(F, "F");
   const int64_t P = F.size(0);
   Tensor adjoint_F, adjoint_parameters, adjoint_volume;
   const DeviceScope device(F);
-  dispatch_deformation(F, [&]<class T, int D>() {
+  dispatch_dimension(F, "F", F.size(1), [&]<class T, int D>() {
     ReturnMapBackwardArguments<T, D> a;
     a.sand = plastic_arguments<T, D>(F, mu, lam, alpha, cohesion, volume, scene, energy, flow, apex);
     a.grad_F = input<T>(grad_F, "grad_F", F, {P, D, D});
@@ -97,9 +99,10 @@ std::tuple<Tensor, Tensor, Tensor> quartic_return_map_backward(
 
 Tensor sand_scalar(const Tensor& F, const Tensor& mu, const Tensor& lam, const OptionalTensor& scene,
                    const std::string& energy, bool stiffness, double floor) {
+  check_matrices(F, "F");
   Tensor value = empty(F, {F.size(0)});
   const DeviceScope device(F);
-  dispatch_deformation(F, [&]<class T, int D>() {
+  dispatch_dimension(F, "F", F.size(1), [&]<class T, int D>() {
     SandScalarArguments<T, D> a{sand_arguments<T, D>(F, mu, lam, scene), stiffness, T(floor), field<T>(value)};
     a.sand.energy = energy_index<SandEnergies>(energy, "radial");
     backend::sand_scalar(a, device.stream());

@@ -10,27 +10,11 @@
 namespace mpm {
 namespace {
 
-// Calls f.operator()<T, D>() for the dtype and size of the matrices F [P, D, D].
-template <class F>
-void dispatch_matrices(const Tensor& matrices, F&& f) {
-  STD_TORCH_CHECK(
-      matrices.dim() == 3 && matrices.size(1) == matrices.size(2) && (matrices.size(1) == 2 || matrices.size(1) == 3),
-      "F must have shape [P, 2, 2] or [P, 3, 3]");
-  const auto by_size = [&]<class T>() {
-    matrices.size(1) == 2 ? f.template operator()<T, 2>() : f.template operator()<T, 3>();
-  };
-  if (matrices.scalar_type() == ScalarType::Float)
-    by_size.template operator()<float>();
-  else if (matrices.scalar_type() == ScalarType::Double)
-    by_size.template operator()<double>();
-  else
-    STD_TORCH_CHECK(false, "F must be float32 or float64");
-}
-
 std::tuple<Tensor, Tensor, Tensor> singular_values_and_vectors(const Tensor& F) {
   Tensor U, sigma, V;
+  check_matrices(F, "F");
   const DeviceScope device(F);
-  dispatch_matrices(F, [&]<class T, int D>() {
+  dispatch_dimension(F, "F", F.size(1), [&]<class T, int D>() {
     U = empty_particles(F, {F.size(0), D, D});
     sigma = empty_particles(F, {F.size(0), D});
     V = empty_particles(F, {F.size(0), D, D});
@@ -42,8 +26,9 @@ std::tuple<Tensor, Tensor, Tensor> singular_values_and_vectors(const Tensor& F) 
 
 std::tuple<Tensor, Tensor> polar_decomposition(const Tensor& F) {
   Tensor R, S;
+  check_matrices(F, "F");
   const DeviceScope device(F);
-  dispatch_matrices(F, [&]<class T, int D>() {
+  dispatch_dimension(F, "F", F.size(1), [&]<class T, int D>() {
     R = empty_particles(F, {F.size(0), D, D});
     S = empty_particles(F, {F.size(0), D, D});
     const PolarArguments<T, D> a{F.size(0), field<const T>(F), field<T>(R), field<T>(S)};

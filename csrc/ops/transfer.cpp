@@ -11,7 +11,6 @@ P2GArguments<T, D> p2g_arguments(const Tensor& x, const Tensor& mass, const Tens
                                  const Topology<T, D>& topology) {
   const int64_t P = x.size(0);
   STD_TORCH_CHECK(!has(stress) || has(volume), "stress needs volume");
-  STD_TORCH_CHECK(stress_form == 0 || stress_form == 1, "stress_form must be 0 (MLS) or 1 (B-spline gradient)");
   P2GArguments<T, D> a;
   a.topology = topology;
   a.x = input<T>(x, "x", x, {P, D});
@@ -22,7 +21,7 @@ P2GArguments<T, D> p2g_arguments(const Tensor& x, const Tensor& mass, const Tens
   a.volume = has(stress) ? input<T>(volume, "volume", x, {P}) : Field<const T>{};
   a.scene_dt = input<T>(scene_dt, "scene_dt", x, {topology.scenes});
   a.dt = dt;
-  a.form = StressForm(stress_form);
+  a.form = stress_form_of(stress_form);
   a.deterministic = deterministic;
   return a;
 }
@@ -49,7 +48,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> p2g_backward(
     const Tensor& grad_nodes, const Tensor& x, const Tensor& mass, const Tensor& v, const OptionalTensor& C,
     const OptionalTensor& stress, const OptionalTensor& volume, const OptionalTensor& scene_dt, double dt,
     int64_t stress_form, int64_t needs, MPM_TOPOLOGY_PARAMETERS) {
-  check_rank(x, "x", 2);
+  check_positions(x);
   const int64_t P = x.size(0), D_ = x.size(1);
   const auto output = [&](int bit, bool present, const Shape& shape) {
     return (needs & bit) && present ? empty_particles(x, shape) : empty(x, {0});
@@ -63,7 +62,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> p2g_backward(
     a.forward = p2g_arguments(x, mass, v, C, stress, volume, scene_dt, dt, stress_form, false,
                               topology<T, D>(x, MPM_TOPOLOGY_ARGUMENTS));
     a.grad_nodes = node_input<T>(grad_nodes, "grad_nodes", x, node_count<D>(block));
-    STD_TORCH_CHECK(a.grad_nodes.channels == 1 + D, "grad_nodes must have 1 + D channels");
+    STD_TORCH_CHECK(a.grad_nodes.channels == 1 + D, "grad_nodes must have 1 + D channels, got ", a.grad_nodes.channels);
     const auto wanted = [&](int bit, const Tensor& t) {
       return (needs & bit) && t.numel() > 0 ? field<T>(t) : Field<T>{};
     };
@@ -84,8 +83,9 @@ Tensor scatter(const Tensor& x, const Tensor& value, const OptionalTensor& momen
   Tensor nodes;
   const DeviceScope device(x);
   dispatch(x, order, [&]<class T, int D, int Order>() {
-    STD_TORCH_CHECK(value.dim() == 2, "value must have shape [P, K]");
+    check_rank(value, "value", 2);
     const int64_t P = x.size(0), K = value.size(1);
+    check_count(K, "value", "channels");
     ScatterArguments<T, D> a;
     a.topology = topology<T, D>(x, MPM_TOPOLOGY_ARGUMENTS);
     a.x = input<T>(x, "x", x, {P, D});
@@ -103,8 +103,9 @@ Tensor scatter(const Tensor& x, const Tensor& value, const OptionalTensor& momen
 
 std::tuple<Tensor, Tensor, Tensor> gather(const Tensor& x, const Tensor& nodes, double moment_scale, bool moment,
                                           bool gradient, MPM_TOPOLOGY_PARAMETERS) {
-  check_rank(x, "x", 2);
+  check_positions(x);
   check_rank(nodes, "nodes", 2);
+  check_count(nodes.size(1), "nodes", "channels");
   const int64_t P = x.size(0), K = nodes.size(1), D_ = x.size(1);
   Tensor value = empty_particles(x, {P, K}), moments = moment ? empty_particles(x, {P, K, D_}) : empty(x, {0}),
          gradients = gradient ? empty_particles(x, {P, K, D_}) : empty(x, {0});
@@ -125,8 +126,9 @@ std::tuple<Tensor, Tensor, Tensor> gather(const Tensor& x, const Tensor& nodes, 
 
 std::tuple<Tensor, Tensor, Tensor> g2p(const Tensor& x, const Tensor& velocity, bool affine, bool gradient,
                                        MPM_TOPOLOGY_PARAMETERS) {
-  check_rank(x, "x", 2);
-  STD_TORCH_CHECK(velocity.dim() == 2 && velocity.size(1) == x.size(1), "velocity must have shape [N, D]");
+  check_positions(x);
+  check_rank(block, "block", 1);
+  check_shape(velocity, "velocity", {x.size(1) == 2 ? node_count<2>(block) : node_count<3>(block), x.size(1)});
   const double inverse_inertia = (order == 2 ? BSpline<2>::inverse_inertia : BSpline<3>::inverse_inertia) / (dx * dx);
   return gather(x, velocity, inverse_inertia, affine, gradient, MPM_TOPOLOGY_ARGUMENTS, order, deterministic);
 }
@@ -134,7 +136,7 @@ std::tuple<Tensor, Tensor, Tensor> g2p(const Tensor& x, const Tensor& velocity, 
 Tensor position_gradient(const Tensor& x, const Tensor& value, const OptionalTensor& moment,
                          const OptionalTensor& gradient, const Tensor& nodes, double moment_scale,
                          MPM_TOPOLOGY_PARAMETERS) {
-  check_rank(x, "x", 2);
+  check_positions(x);
   check_rank(nodes, "nodes", 2);
   Tensor result = empty_particles(x, {x.size(0), x.size(1)});
   const DeviceScope device(x);

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+import numbers
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from ..errors import shape_of
+from ..errors import check_like, shape_of
 
 
 def split_dt(dt: float | Tensor, scenes: int, x: Tensor) -> tuple[float, Tensor | None]:
@@ -104,6 +105,51 @@ def _pull_back(
     _, pull_back, *_ = torch.func.vjp(outputs, *(inputs[i] for i in wanted))
     grads = dict(zip(wanted, pull_back(tuple(g for g in grad_outputs if g is not None)), strict=True))
     return [grads.get(i) for i in range(len(inputs))]
+
+
+def check_choice(name: str, value: object, choices: Iterable[str]) -> None:
+    if not isinstance(value, str) or value not in choices:
+        raise ValueError(f"{name} must be one of {sorted(choices)}, got {value!r}")
+
+
+def check_real(name: str, value: object) -> None:
+    if not isinstance(value, (numbers.Real, torch.SymFloat, torch.SymInt)):
+        raise TypeError(f"{name} must be a number or a tensor, got {type(value).__name__}")
+
+
+def check_scene(scene: Tensor | None, state: Tensor, name: str = "F") -> None:
+    """Check the scene of each particle, int32 [P], against a particle tensor that messages call `name`."""
+    if scene is None:
+        return
+    if not isinstance(scene, Tensor) or scene.shape != state.shape[:1]:
+        raise ValueError(f"scene must have shape [{state.shape[0]}], got {shape_of(scene)}")
+    if scene.dtype != torch.int32:
+        raise TypeError(f"scene must be int32, got {scene.dtype}")
+    if scene.device != state.device:
+        raise ValueError(f"scene must be on the device of {name}, {state.device}, got {scene.device}")
+
+
+def check_parameter(name: str, value: Tensor, state: Tensor, scene: Tensor | None) -> None:
+    """Check a parameter of a law: uniform, per scene or per particle."""
+    P = state.shape[0]
+    if not isinstance(value, Tensor):
+        raise TypeError(f"{name} must be a tensor, got {type(value).__name__}")
+    if value.dim() > 1 or (value.numel() not in (1, P) and (scene is None or value.numel() == 0)):
+        expected = f"[], [1] or [P] = [{P}]" + (" without scene" if scene is None else ", or [B]")
+        raise ValueError(f"{name} must have shape {expected}, got {shape_of(value)}")
+    check_like(name, value, state, tuple(value.shape), "")
+
+
+def check_list(name: str, values: Any) -> Sequence[Any]:
+    if not isinstance(values, (list, tuple)):
+        raise TypeError(f"{name} must be a list, got {type(values).__name__}")
+    return values
+
+
+def check_tensors(law: str, kind: str, names: Sequence[str], values: Sequence[Tensor]) -> None:
+    """Check that as many tensors are given as a law has parameters or history variables."""
+    if len(check_list(kind, values)) != len(names):
+        raise ValueError(f"{law} has the {kind} {', '.join(names) or 'none'}, got {len(values)} tensors")
 
 
 def refuse_vmap(name: str) -> None:

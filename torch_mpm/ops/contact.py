@@ -13,7 +13,7 @@ from ..boundaries import Box, Capsule, Obstacle, Plane, Sphere
 from ..errors import check_like, shape_of
 from ..grid import Blocks
 from ..reference.obstacles import contact as reference
-from .arguments import differentiate, refuse_vmap
+from .arguments import check_list, check_real, differentiate, refuse_vmap
 from .autograd import dispatch, register_autograd
 from .grid_update import CONTACT_KINDS, _blocks_of
 
@@ -51,6 +51,10 @@ def contact(blocks: Blocks, velocity: Tensor, obstacles: Sequence[Obstacle], tim
     grid = blocks.grid
     if not isinstance(velocity, Tensor) or velocity.shape != (blocks.node_count, grid.dim):
         raise ValueError(f"velocity must have shape [N, D] = {[blocks.node_count, grid.dim]}, got {shape_of(velocity)}")
+    for k, obstacle in enumerate(check_list("obstacles", obstacles)):
+        if type(obstacle) not in SHAPES:
+            expected = ", ".join(shape.__name__ for shape in SHAPES)
+            raise TypeError(f"obstacles[{k}] must be one of {expected}, got {type(obstacle).__name__}")
     scene_time, number = None, 0.0
     if isinstance(time, Tensor):
         if time.dim() > 1 or time.numel() not in (1, grid.scenes):
@@ -58,6 +62,7 @@ def contact(blocks: Blocks, velocity: Tensor, obstacles: Sequence[Obstacle], tim
         scene_time = time.detach().reshape(-1).to(velocity.dtype).contiguous()
         check_like("time", scene_time, velocity, tuple(scene_time.shape), "")
     else:
+        check_real("time", time)
         number = float(time)
         obstacles = [o for o in obstacles if o.start <= number < o.end]
     for first in range(0, len(obstacles), MAX_OBSTACLES):

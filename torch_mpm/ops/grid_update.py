@@ -57,6 +57,8 @@ def grid_update(
             raise ValueError("gravity needs dt")
         number, scene_dt = split_dt(dt, grid.scenes, nodes)
         gravity = _per_scene(gravity, nodes, grid.scenes, grid.dim)
+    if walls is not None and not isinstance(walls, Walls):
+        raise TypeError(f"walls must be Walls or None, got {type(walls).__name__}")
     faces = () if walls is None else walls.faces(grid)
     updated = dispatch(
         torch.ops.torch_mpm.grid_update,

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ..errors import check_like, check_positions, shape_of
 from ..grid import Blocks, inverse_inertia
-from .arguments import refuse_vmap, split_dt
+from .arguments import check_choice, check_real, refuse_vmap, split_dt
 from .autograd import dispatch, register_autograd
 from .heat_multigrid import heat_multigrid
 from .heat_refinement import REDUCTION
@@ -104,8 +104,9 @@ def heat_cg(
     most, scene_limit = _per_scene("max_iterations", max_iterations, grid.scenes, x)
     if scene_limit is not None and scene_limit.is_floating_point():
         raise TypeError(f"max_iterations must be an integer tensor, got {scene_limit.dtype}")
-    if method not in METHODS:
-        raise ValueError(f"method must be one of {sorted(METHODS)}, got {method!r}")
+    check_choice("method", method, METHODS)
+    check_real("adjoint_tolerance", adjoint_tolerance)
+    check_real("relative_tolerance", relative_tolerance)
     if not 0 < adjoint_tolerance < 1:
         raise ValueError(f"adjoint_tolerance must be between 0 and 1, got {adjoint_tolerance}")
     if not 0 <= relative_tolerance < 1:
@@ -167,6 +168,7 @@ def _op_of(method: int) -> Any:
 def _per_scene(name: str, value: float | Tensor, scenes: int, x: Tensor) -> tuple[float, Tensor | None]:
     """A number, or a tensor [B] and zero."""
     if not isinstance(value, Tensor):
+        check_real(name, value)
         if not 0 <= value < float("inf"):
             raise ValueError(f"{name} must be a finite number >= 0, got {value}")
         return value, None

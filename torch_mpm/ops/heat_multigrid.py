@@ -17,7 +17,8 @@ import torch
 from torch import Tensor
 
 from ..capture import is_captured
-from ..grid import BLOCK_WIDTH, PADDING, Blocks, Grid
+from ..errors import check_like, shape_of
+from ..grid import BLOCK_WIDTH, INT32_MAX, PADDING, Blocks, Grid
 from ..reference.transfer import bspline
 from .heat_patches import Patches, lattice_rows
 from .transfer import _grid_of
@@ -180,9 +181,10 @@ def _coarsen(level: Level, weight: Tensor) -> Level:
     return _level(blocks, x, conductance, weight, (weight > 0).to(x), diagonal)
 
 
-def _levels(blocks: Blocks, x: Tensor, conductance: Tensor, weight: Tensor, free: Tensor, held: Tensor) -> list[Level]:
-    """From the finest to the coarsest."""
-    diagonal = torch.ops.torch_mpm.heat_operator(x, conductance, None, *blocks.topology)
+def _levels(
+    blocks: Blocks, x: Tensor, conductance: Tensor, weight: Tensor, free: Tensor, held: Tensor, diagonal: Tensor
+) -> list[Level]:
+    """From the finest to the coarsest; `diagonal` is that of the operator on the finest."""
     several = max(blocks.grid.blocks) > COARSEST
     levels = [_level(blocks, x, conductance, weight, free, diagonal, patches=several)]
     # Held nodes weigh as much as conduction on the coarse levels, which do not know them.
@@ -207,6 +209,14 @@ def _cycle(levels: list[Level], depth: int, r: Tensor) -> Tensor:
     return level.smooth(r - level.apply(d), d)
 
 
+def _check_exact(name: str, value: Tensor | None, dtype: torch.dtype, shape: tuple[int, ...], x: Tensor) -> None:
+    if value is not None and (value.dtype != dtype or value.shape != shape or value.device != x.device):
+        raise ValueError(
+            f"{name} must have shape {list(shape)} and be {dtype} on {x.device}, "
+            f"got {shape_of(value)}, {value.dtype} on {value.device}"
+        )
+
+
 def heat_multigrid(
     x: Tensor,
     conductance: Tensor,
@@ -227,9 +237,18 @@ def heat_multigrid(
     *topology: Any,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """What the op `heat_cg` takes and returns (csrc/heat/solve.h)."""
+    diagonal = torch.ops.torch_mpm.heat_operator(x, conductance, None, *topology)  # checks what it takes
     grid = _grid_of(topology)
     table, block, offsets, index, schedule = topology[:5]
     blocks = Blocks(grid, table, block, offsets, index, schedule, table, None)
+    for name, value in (("capacity", capacity), ("theta", theta), ("source", source), ("exchange", exchange)):
+        check_like(name, value, x, (blocks.node_count,), "[N]")
+    for name, value in (("scene_dt", scene_dt), ("scene_tolerance", scene_tolerance)):
+        check_like(name, value, x, (grid.scenes,), "[B]")
+    _check_exact("fixed", fixed, torch.bool, (blocks.node_count,), x)
+    _check_exact("scene_max_iterations", scene_limit, torch.int32, (grid.scenes,), x)
+    if not 0 <= max_iterations <= INT32_MAX:
+        raise ValueError(f"max_iterations must be 0 to 2^31 - 1, got {max_iterations}")
     scenes = Scenes(blocks)
     step = x.new_full((grid.scenes,), dt, dtype=torch.float64) if scene_dt is None else dt * scene_dt.double()
     used, zero = blocks.active_nodes(), torch.zeros_like(capacity, memory_format=torch.contiguous_format)
@@ -265,7 +284,7 @@ def heat_multigrid(
     d = p = before = zero
     product = torch.ones_like(step)
     iterations = torch.zeros(grid.scenes, dtype=torch.int32, device=x.device)
-    levels = _levels(blocks, x, conductance, weight, free, held) if unfinished() else []
+    levels = _levels(blocks, x, conductance, weight, free, held, diagonal) if unfinished() else []
     if scene_limit is not None and levels:
         max_iterations = int(scene_limit.max())
     for k in range(max_iterations):

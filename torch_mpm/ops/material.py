@@ -10,7 +10,16 @@ from torch import Tensor
 
 from ..errors import FLOATING, check_like, shape_of
 from ..reference import material as reference
-from .arguments import differentiate, refuse_vmap, soa_empty, sum_by_scene
+from .arguments import (
+    check_choice,
+    check_parameter,
+    check_scene,
+    check_tensors,
+    differentiate,
+    refuse_vmap,
+    soa_empty,
+    sum_by_scene,
+)
 from .autograd import dispatch, register_autograd
 
 Parameters = Sequence[Tensor]
@@ -86,8 +95,7 @@ def material_stiffness(
 
 def _check(law: str, state: Tensor, parameters: Parameters, scene: Tensor | None, dim: int | None) -> int:
     """Check all arguments but C; return the dimension."""
-    if law not in reference.LAWS:
-        raise ValueError(f"law must be one of {sorted(reference.LAWS)}, got {law!r}")
+    check_choice("law", law, reference.LAWS)
     names, shear = reference.LAWS[law].parameters, reference.LAWS[law].shear
     if not isinstance(state, Tensor) or state.dtype not in FLOATING:
         raise TypeError(f"the state must be float32 or float64, got {getattr(state, 'dtype', type(state).__name__)}")
@@ -99,21 +107,10 @@ def _check(law: str, state: Tensor, parameters: Parameters, scene: Tensor | None
         raise ValueError(f"J must have shape [P], got {shape_of(state)}")
     if dim not in (2, 3):
         raise ValueError(f"dim must be 2 or 3, got {dim}")
-    P = state.shape[0]
-    if scene is not None:
-        if scene.shape != (P,):
-            raise ValueError(f"scene must have shape [{P}], got {shape_of(scene)}")
-        if scene.dtype != torch.int32:
-            raise TypeError(f"scene must be int32, got {scene.dtype}")
-        if scene.device != state.device:
-            raise ValueError(f"scene must be on the device of the state, {state.device}, got {scene.device}")
-    if len(parameters) != len(names):
-        raise ValueError(f"{law} has the parameters {', '.join(names)}, got {len(parameters)} tensors")
+    check_scene(scene, state, "the state")
+    check_tensors(law, "parameters", names, parameters)
     for name, value in zip(names, parameters, strict=True):
-        if value.dim() > 1 or (value.numel() not in (1, P) and (scene is None or value.numel() == 0)):
-            expected = f"[], [1] or [P] = [{P}]" + (" without scene" if scene is None else ", or [B]")
-            raise ValueError(f"{name} must have shape {expected}, got {shape_of(value)}")
-        check_like(name, value, state, tuple(value.shape), "")
+        check_parameter(name, value, state, scene)
     return dim
 
 

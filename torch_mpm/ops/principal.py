@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ..errors import FLOATING, check_like, shape_of
 from ..reference.principal import ELASTIC, INVALID, LAWS, PLASTIC
-from .arguments import refuse_vmap, soa_empty, sum_by_scene
+from .arguments import check_choice, check_parameter, check_scene, check_tensors, refuse_vmap, soa_empty, sum_by_scene
 from .autograd import dispatch, register_autograd
 from .material import _no_backward, _no_setup
 
@@ -126,33 +126,20 @@ def principal_wave_modulus(
 
 
 def _check(law: str, F: Tensor, parameters: Tensors, history: Tensors, scene: Tensor | None) -> None:
-    if law not in LAWS:
-        raise ValueError(f"law must be one of {sorted(LAWS)}, got {law!r}")
+    check_choice("law", law, LAWS)
     if not isinstance(F, Tensor) or F.dim() != 3 or F.shape[1:] not in ((2, 2), (3, 3)):
         raise ValueError(f"F must have shape [P, 3, 3] or [P, 2, 2], got {shape_of(F)}")
     if F.dtype not in FLOATING:
         raise TypeError(f"F must be float32 or float64, got {F.dtype}")
-    P = F.shape[0]
-    if scene is not None:
-        if scene.shape != (P,):
-            raise ValueError(f"scene must have shape [{P}], got {shape_of(scene)}")
-        if scene.dtype != torch.int32:
-            raise TypeError(f"scene must be int32, got {scene.dtype}")
-        if scene.device != F.device:
-            raise ValueError(f"scene must be on the device of F, {F.device}, got {scene.device}")
-    for kind, names, values in (
-        ("parameters", LAWS[law].parameters, parameters),
-        ("history variables", LAWS[law].history, history),
-    ):
-        if len(values) != len(names):
-            raise ValueError(f"{law} has the {kind} {', '.join(names) or 'none'}, got {len(values)} tensors")
+    check_scene(scene, F)
+    check_tensors(law, "parameters", LAWS[law].parameters, parameters)
+    check_tensors(law, "history variables", LAWS[law].history, history)
     for name, value in zip(LAWS[law].parameters, parameters, strict=True):
-        if value.dim() > 1 or (value.numel() not in (1, P) and (scene is None or value.numel() == 0)):
-            expected = f"[], [1] or [P] = [{P}]" + (" without scene" if scene is None else ", or [B]")
-            raise ValueError(f"{name} must have shape {expected}, got {shape_of(value)}")
-        check_like(name, value, F, tuple(value.shape), "")
+        check_parameter(name, value, F, scene)
     for name, value in zip(LAWS[law].history, history, strict=True):
-        check_like(name, value, F, (P,), "[P]")
+        if value is None:
+            raise TypeError(f"{name} must be a tensor, got None")
+        check_like(name, value, F, F.shape[:1], "[P]")
 
 
 # ---- fake kernels

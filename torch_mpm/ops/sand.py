@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ..errors import FLOATING, check_like, shape_of
 from ..reference.sand import APEX, CONE, ELASTIC, ENERGIES, INVALID, friction_alpha
-from .arguments import refuse_vmap, soa_empty, sum_by_scene
+from .arguments import check_choice, check_parameter, check_real, check_scene, refuse_vmap, soa_empty, sum_by_scene
 from .autograd import dispatch, register_autograd
 from .material import _no_setup
 
@@ -182,20 +182,12 @@ def quartic_stiffness(
 
 
 def _check_deformation(F: Tensor, scene: Tensor | None, energy: str) -> None:
-    if energy not in ENERGIES:
-        raise ValueError(f"energy must be one of {sorted(ENERGIES)}, got {energy!r}")
+    check_choice("energy", energy, ENERGIES)
     if not isinstance(F, Tensor) or F.dim() != 3 or F.shape[1:] not in ((2, 2), (3, 3)):
         raise ValueError(f"F must have shape [P, 3, 3] or [P, 2, 2], got {shape_of(F)}")
     if F.dtype not in FLOATING:
         raise TypeError(f"F must be float32 or float64, got {F.dtype}")
-    if scene is None:
-        return
-    if scene.shape != F.shape[:1]:
-        raise ValueError(f"scene must have shape [{F.shape[0]}], got {shape_of(scene)}")
-    if scene.dtype != torch.int32:
-        raise TypeError(f"scene must be int32, got {scene.dtype}")
-    if scene.device != F.device:
-        raise ValueError(f"scene must be on the device of F, {F.device}, got {scene.device}")
+    check_scene(scene, F)
 
 
 def _check_number(name: str, value: Value | None, expected: str, most: float = math.inf) -> None:
@@ -206,11 +198,9 @@ def _check_number(name: str, value: Value | None, expected: str, most: float = m
 
 def _parameter(name: str, value: Value | None, F: Tensor, scene: Tensor | None) -> Tensor:
     if not isinstance(value, Tensor):
+        check_real(name, value)
         return torch.tensor(value, dtype=F.dtype, device=F.device)
-    if value.dim() > 1 or (value.numel() not in (1, F.shape[0]) and (scene is None or value.numel() == 0)):
-        expected = f"[], [1] or [P] = [{F.shape[0]}]" + (" without scene" if scene is None else ", or [B]")
-        raise ValueError(f"{name} must have shape {expected}, got {shape_of(value)}")
-    check_like(name, value, F, tuple(value.shape), "")
+    check_parameter(name, value, F, scene)
     return value
 
 

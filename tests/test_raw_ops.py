@@ -1,0 +1,153 @@
+"""What the ops check of their arguments, also where nobody has checked them before: `torch.ops.torch_mpm`.
+
+A call that is not refused may end the process, so each test makes its calls in a child; the op named last did it.
+"""
+
+import math
+import os
+import re
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+import torch
+
+from benchmarks.fuzz import operators
+from benchmarks.fuzz.common import run
+
+Arguments = dict[str, Any]
+Changes = Callable[[Arguments], Iterator[tuple[Arguments, str]]]
+OPS = operators.operators()
+CALLS = [(dim, *call) for dim in (2, 3) for call in operators.calls(dim)]
+COMPARED = ("x", "F", "state", "velocity", "nodes", "r", "gravity", "previous_status")
+"""What the shapes of other arguments are compared with."""
+ANY_NUMBER = ("mu", "lam", "alpha", "cohesion", "scene_dt", "scene_time", "obstacles")
+"""Tensors that are given once, per scene or per particle."""
+TOPOLOGY = ("table", "block", "offsets", "index", "schedule")
+
+
+def taking(name: str) -> list[str]:
+    """The ops that take an argument."""
+    return sorted({op for _, op, arguments in CALLS if name in arguments})
+
+
+def refusals(ops: Sequence[str], changes: Changes) -> None:
+    """Each change of the valid arguments of the ops must be refused with its message, a pattern."""
+
+    def work() -> int:
+        wrong = 0
+        for dim, op, arguments in CALLS:
+            if op not in ops:
+                continue
+            os.write(1, f"{op} in {dim}-D\n".encode())  # not through sys.stdout, which pytest replaces
+            for changed, message in changes(arguments):
+                try:
+                    getattr(torch.ops.torch_mpm, op)(*(arguments | changed).values())
+                    end = "no error"
+                except (RuntimeError, ValueError, TypeError) as error:
+                    end = str(error)
+                if not re.search(message, end):
+                    wrong = 1
+                    os.write(1, f"wanted {message!r}, got {end!r}\n".encode())
+        return wrong
+
+    outcome = run(work)
+    assert outcome.kind == "ok" and outcome.status == 0, f"{outcome.kind} {outcome.status}\n{outcome.text}"
+
+
+def test_sizes_of_the_index_tensors() -> None:
+    def changes(arguments: Arguments) -> Iterator[tuple[Arguments, str]]:
+        for name in TOPOLOGY:
+            value = arguments[name]
+            # The table of no scene, of one instead of two, and of less than a whole one.
+            sizes = (0, len(value) // 2, len(value) - 1) if name == "table" else (0, 1, len(value) - 1)
+            for size in sizes:
+                yield (
+                    {name: value[:size].clone()},
+                    f"{name} must|entries below the .* of {name}" if name != "block" else "must have shape",
+                )
+            yield {name: value.long()}, f"{name} must be int32, got int64"
+            yield {name: value[:, None]}, f"{name} must have"
+            yield {name: value[0]}, f"{name} must have"
+            yield {name: value[:1].expand(value.shape)}, f"{name} must be contiguous"
+
+    refusals(taking("schedule"), changes)
+
+
+def test_the_lattice() -> None:
+    def changes(arguments: Arguments) -> Iterator[tuple[Arguments, str]]:
+        for dx in (math.nan, math.inf, 0.0, -1.0, 1e-320):
+            yield {"dx": dx}, "dx must be positive and finite, got"
+        lower, blocks = list(arguments["lower"]), list(arguments["blocks"])
+        yield {"lower": [math.nan, *lower[1:]]}, "lower must be finite, got"
+        yield {"lower": lower[1:]}, r"lower must have \d entries, one per axis, got \d"
+        yield {"blocks": [*blocks, 1]}, r"blocks must have \d entries, one per axis, got \d"
+        for count in (0, -1, 2**31, 2**62):
+            yield {"blocks": [count, *blocks[1:]]}, r"blocks must be positive .* got"
+
+    refusals(taking("dx"), changes)
+
+
+def test_expected_and_given_shapes_are_told() -> None:
+    """One row fewer in each particle or node tensor: the message says which, what was expected, and what came."""
+
+    def changes(arguments: Arguments) -> Iterator[tuple[Arguments, str]]:
+        for name, value in arguments.items():
+            if not isinstance(value, torch.Tensor) or name in (*TOPOLOGY, *COMPARED, *ANY_NUMBER):
+                continue
+            shape = re.escape(str(list(value[1:].shape)))
+            yield {name: value[1:]}, rf"{name} must .*got {shape}"
+
+    refusals(OPS, changes)
+
+
+def test_sizes_that_overflow() -> None:
+    """2^31 to 2^56 rows, in the memory of one or of none."""
+
+    def changes(arguments: Arguments) -> Iterator[tuple[Arguments, str]]:
+        for name, value in arguments.items():
+            if not isinstance(value, torch.Tensor) or name in ANY_NUMBER:
+                continue
+            for rows in (2**31, 2**40, 2**56):
+                shape = list(value.shape)
+                shape[0] = rows
+                yield {name: value[:1].expand(shape)}, " must (have|be)"
+                if value.dim() > 1:
+                    empty = value.new_empty(0, *value.shape[1:-1], rows)
+                    yield {name: empty}, " must (have|be)"
+
+    refusals(OPS, changes)
+
+
+def test_activation_without_scenes() -> None:
+    """A grid of no scenes takes no particles, with their scenes given or not."""
+
+    def changes(arguments: Arguments) -> Iterator[tuple[Arguments, str]]:
+        for scene in (arguments["scene"], None):
+            yield {"scenes": 0, "scene": scene}, "x must have no particles where scenes is 0, got 37"
+        yield {"scenes": -1}, "scenes must not be negative, got -1"
+        yield {"scenes": 2**40}, r"scenes times blocks must be below 2\^31"
+        yield {"capacity": -1}, "capacity must not be negative, got -1"
+        yield {"capacity": 2**40}, r"capacity must be at most \d+, got"
+        yield {"previous_status": arguments["previous_status"][:3]}, r"previous_status must have shape \[8\]"
+
+    refusals(["activate"], changes)
+
+
+def test_the_dimension_of_a_law() -> None:
+    def changes(arguments: Arguments) -> Iterator[tuple[Arguments, str]]:
+        for dim in (-1, 0, 1, 4, 2**40):
+            yield {"dim": dim}, "dim must be 2 or 3, got"
+        yield {"state": arguments["state"].sum()}, "the state must have"
+        yield {"law": "neo"}, "law must be one of .*neo_hookean.*, got neo"
+        yield {"parameters": []}, r"parameters must be \d tensors for the law \w+, got 0"
+        yield {"parameters": [p.new_empty(0) for p in arguments["parameters"]]}, r"parameters\[0\] must"
+
+    refusals(taking("dim"), changes)
+
+
+def test_iterations_of_a_heat_solve() -> None:
+    def changes(arguments: Arguments) -> Iterator[tuple[Arguments, str]]:
+        for count in (-1, 2**31, 2**62):
+            yield {"max_iterations": count}, "max_iterations must be .* got"
+
+    refusals(taking("max_iterations"), changes)
