@@ -12,7 +12,8 @@ namespace {
 
 std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> activate(
     const Tensor& x, const OptionalTensor& scene, const OptionalTensor& previous_status, int64_t scenes, double dx,
-    std::vector<double> lower, std::vector<int64_t> blocks, int64_t order, int64_t capacity, bool deterministic) {
+    std::vector<double> lower, std::vector<int64_t> blocks, int64_t order, int64_t capacity, bool deterministic,
+    const OptionalTensor& ids) {
   check_rank(x, "x", 2);
   STD_TORCH_CHECK(scenes >= 0 && capacity >= 0, "scenes and capacity must not be negative");
   STD_TORCH_CHECK(x.size(0) < INT32_MAX, "x must have fewer than 2^31 particles");
@@ -24,7 +25,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> activate(
   STD_TORCH_CHECK(capacity <= INT32_MAX / (x.size(1) == 2 ? kBlockNodes<2> : kBlockNodes<3>),
                   "capacity times nodes per block must stay below 2^31");
   Tensor table = empty_int(x, {table_size}), block = empty_int(x, {capacity}), offsets = empty_int(x, {capacity + 1}),
-         index = empty_int(x, {x.size(0)}), status = empty_int(x, {kStatusSize}), schedule;
+         index = empty_int(x, {x.size(0)}), status = empty_int(x, {1 + scenes, kStatusSize}), schedule;
   const DeviceScope device(x);
   dispatch(x, order, [&]<class T, int D, int Order>() {
     ActivateArguments<T, D> a;
@@ -41,7 +42,15 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> activate(
       a.scene = static_cast<const int*>(scene->data_ptr());
       a.scene_stride = scene->stride(0);
     }
-    if (has(previous_status)) a.previous_status = int_pointer(*previous_status, "previous_status", x, kStatusSize);
+    if (has(ids)) {
+      check_shape(*ids, "ids", {x.size(0)});
+      STD_TORCH_CHECK(ids->scalar_type() == ScalarType::Long && ids->device() == x.device(),
+                      "ids must be an int64 tensor on the device of x");
+      a.id = static_cast<const int64_t*>(ids->data_ptr());
+      a.id_stride = ids->stride(0);
+    }
+    if (has(previous_status))
+      a.previous_status = int_pointer(*previous_status, "previous_status", x, (1 + scenes) * kStatusSize);
     a.schedule_size = schedule_size<D>(capacity, x.size(0));
     schedule = empty_int(x, {a.schedule_size});
     a.workspace_size = backend::activate_workspace(a);
@@ -78,8 +87,8 @@ Tensor cell_order(const Tensor& x, MPM_TOPOLOGY_PARAMETERS) {
 STABLE_TORCH_LIBRARY_FRAGMENT(torch_mpm, m) {
   m.def(
       "activate(Tensor x, Tensor? scene, Tensor? previous_status, int scenes, float dx, float[] lower, int[] blocks, "
-      "int order, int capacity, bool deterministic) -> (Tensor table, Tensor block, Tensor offsets, Tensor index, "
-      "Tensor schedule, Tensor status)");
+      "int order, int capacity, bool deterministic, Tensor? ids=None) -> (Tensor table, Tensor block, Tensor offsets, "
+      "Tensor index, Tensor schedule, Tensor status)");
   m.def("cell_order(Tensor x, " MPM_TOPOLOGY_SCHEMA ") -> Tensor");
 }
 #endif
