@@ -13,12 +13,13 @@ from torch.utils.checkpoint import checkpoint as run_checkpointed
 from .boundaries import Walls
 from .capture import Kept
 from .cfl import stable_dt
-from .failures import Failures, problems_of_state, problems_of_status, raise_failures
+from .failures import Failures, problems_of_state, problems_of_status, raise_failures, refused_steps
 from .grid import ActivationRecord, Blocks, Grid
 from .heat import Heat
 from .materials import Material
 from .ops import contact, fusible, g2p, g2p_advance, gather, grid_update, p2g
 from .parameters import With
+from .pause import split_paused, standing
 from .state import State, identity_deformation
 
 TRANSFERS = ("apic", "pic", "flip")
@@ -90,6 +91,7 @@ class Step(nn.Module):
                 if isinstance(part, Material):
                     part.dissipation = True
         self._activations = ActivationRecord()
+        self._refused: Tensor | None = None  # steps of each scene whose dt could not be taken, int32 [B]
         self._kept_gravity = Kept()
 
     def forward(self, state: State, dt: float | Tensor) -> State:
@@ -97,13 +99,23 @@ class Step(nn.Module):
 
         Args:
             state: see `State`; missing C, F or J start at zero, identity and one.
-            dt: time step [s]: a number, or a tensor of shape [], [1] or [B].
+            dt: time step [s]: a number, or a tensor of shape [], [1] or [B]. A scene with zero in a tensor is paused:
+                its particles stay as they are, bit by bit, and gradients pass through them unchanged. A negative one,
+                or one that is not finite, pauses the scene too, and `check` reports it.
 
         Raises:
             ValueError, TypeError: for wrong shapes, dtypes or devices, or a number dt that is not positive.
             GridOverflowError: on the CPU, where a grid of fixed capacity is full.
         """
         state = self.prepare(state)
+        if not isinstance(dt, Tensor):
+            return self._advanced(state, dt)
+        dt, moving, refused = split_paused(dt, state, self.grid.scenes)
+        self._record(refused)
+        return standing(state, self._advanced(state, dt), moving)
+
+    def _advanced(self, state: State, dt: float | Tensor) -> State:
+        """A prepared state one step later."""
         grid, scene = self.grid, state.scene
         blocks = self._activations.activate(grid, state.x, scene, state.ids)
         form, affine = self.stress_form, state.C if self.transfer == "apic" else None
@@ -190,6 +202,14 @@ class Step(nn.Module):
         return self._activations.status
 
     @torch.no_grad()
+    def _record(self, refused: Tensor) -> None:
+        """Keep which entries of a tensor dt could not be taken, on the device."""
+        if self._refused is None or self._refused.device != refused.device:
+            with torch.inference_mode(False):
+                self._refused = torch.zeros(self.grid.scenes, dtype=torch.int32, device=refused.device)
+        self._refused += refused
+
+    @torch.no_grad()
     def failures(self, state: State | None = None) -> Failures:
         """Which scenes went wrong in the steps so far, and how; tensors on the device, which is not waited for.
 
@@ -201,6 +221,8 @@ class Step(nn.Module):
         """
         statuses = self._activations.all()
         problems = problems_of_status(statuses, self.grid)
+        if self._refused is not None:
+            problems["dt"] = refused_steps(self._refused)
         if self.heat is not None:
             problems |= self.heat.problems()
         if state is not None:
@@ -215,7 +237,8 @@ class Step(nn.Module):
 
         Raises:
             SimulationError: that names each scene (up to a dozen of a kind), when and how many, and has `failures`: if
-                a particle left the grid or is not finite, if heat was not solved; and in the state, if a mass or volume is not positive and finite, or if the law
+                a particle left the grid or is not finite, if heat was not solved, if an entry of a tensor dt was
+                negative or not finite; and in the state, if a mass or volume is not positive and finite, or if the law
                 has no meaning for a particle's deformation (turned inside out, J ≤ 0); such a particle has zero stress
                 from then on.
             GridOverflowError: if more blocks were active than the grid has room for, and nothing else is wrong.
@@ -225,6 +248,8 @@ class Step(nn.Module):
     def reset(self) -> None:
         """Forget the status of the steps so far."""
         self._activations.reset()
+        if self._refused is not None:  # and CUDA graphs may write to it
+            self._refused.zero_()
         if self.heat is not None:
             self.heat.reset()
 
