@@ -147,6 +147,25 @@ def test_a_wrong_shape_is_refused(device):
         step(state, times([DT, DT], device))
 
 
+def test_a_pause_compiles_to_one_graph():
+    step, state = scenes(2, "cpu", obstacle=False)
+
+    @torch.compile(backend="aot_eager", fullgraph=True)
+    def compiled(x, v, C, F, dt):
+        out = step(state.replace(x=x, v=v, C=C, F=F), dt)
+        return out.x, out.v, out.C, out.F
+
+    for dt in (times([DT, 0.0], "cpu"), times([-1.0, DT], "cpu")):
+        expected = step(state, dt)
+        for a, b in zip(
+            compiled(state.x, state.v, state.C, state.F, dt),
+            (expected.x, expected.v, expected.C, expected.F),
+            strict=True,
+        ):
+            torch.testing.assert_close(a, b, rtol=1e-13, atol=1e-13)
+    assert step.failures().problems["dt"].count.tolist() == [2, 0]
+
+
 @pytest.mark.cuda
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 def test_a_pause_needs_no_synchronisation():

@@ -194,13 +194,16 @@ class ActivationRecord:
 
     Attributes:
         status: int32 [1 + B, 8], see csrc/grid/status.h; None before the first activation.
+        refused: steps of each scene whose entry of a tensor dt could not be taken, int32 [B]; None before the first
+            tensor dt.
     """
 
     def __init__(self) -> None:
         self.status: Tensor | None = None
+        self.refused: Tensor | None = None
         self._replayed: list[Tensor] = []
 
-    def activate(self, grid: Grid, x: Tensor, scene: Tensor | None, ids: Tensor | None) -> Blocks:
+    def activate(self, grid: Grid, x: Tensor, scene: Tensor | None, ids: Tensor | None = None) -> Blocks:
         """As `Grid.activate`; the capacity of the grid follows."""
         before = self.status
         blocks = grid.activate(x, scene, before, ids)
@@ -218,8 +221,18 @@ class ActivationRecord:
         latest = [] if self.status is None else [self.status]
         return latest + [kept for kept in self._replayed if kept is not self.status]
 
+    @torch.no_grad()
+    def refuse(self, entries: Tensor, scenes: int) -> None:
+        """Count entries of a tensor dt that could not be taken: bool of shape [], [1] or [B]."""
+        if self.refused is None or self.refused.device != entries.device:
+            with torch.inference_mode(False):
+                self.refused = torch.zeros(scenes, dtype=torch.int32, device=entries.device)
+        self.refused += entries
+
     def reset(self) -> None:
         self.status = None
+        if self.refused is not None:  # and CUDA graphs may write to it
+            self.refused.zero_()
         with torch.inference_mode():
             for kept in self._replayed:
                 kept.copy_(torch.tensor(NO_PROBLEM, dtype=torch.int32))

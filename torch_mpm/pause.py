@@ -11,6 +11,8 @@ from torch import Tensor
 from .ops.arguments import per_particle, split_dt
 from .state import State
 
+FIELDS = tuple(f.name for f in dataclasses.fields(State) if f.name not in ("extra", "time"))
+
 
 def split_paused(dt: Tensor, state: State, scenes: int) -> tuple[Tensor, Tensor, Tensor]:
     """A tensor dt [s] with zero for every scene that stands still, without synchronising.
@@ -50,6 +52,5 @@ def standing(before: State, after: State, moving: Tensor) -> State:
         rows = moving.reshape(-1, *(1,) * (new.dim() - 1))
         return torch.where(rows, new, torch.zeros_like(new) if old is None else old)
 
-    names = [f.name for f in dataclasses.fields(State) if f.name not in ("extra", "time")]
     extra = {name: field(before.extra.get(name), new) for name, new in after.extra.items()}
-    return after.replace(**{name: field(getattr(before, name), getattr(after, name)) for name in names}, extra=extra)
+    return after.replace(**{name: field(getattr(before, name), getattr(after, name)) for name in FIELDS}, extra=extra)

@@ -91,7 +91,6 @@ class Step(nn.Module):
                 if isinstance(part, Material):
                     part.dissipation = True
         self._activations = ActivationRecord()
-        self._refused: Tensor | None = None  # steps of each scene whose dt could not be taken, int32 [B]
         self._kept_gravity = Kept()
 
     def forward(self, state: State, dt: float | Tensor) -> State:
@@ -111,7 +110,7 @@ class Step(nn.Module):
         if not isinstance(dt, Tensor):
             return self._advanced(state, dt)
         dt, moving, refused = split_paused(dt, state, self.grid.scenes)
-        self._record(refused)
+        self._activations.refuse(refused, self.grid.scenes)
         return standing(state, self._advanced(state, dt), moving)
 
     def _advanced(self, state: State, dt: float | Tensor) -> State:
@@ -202,14 +201,6 @@ class Step(nn.Module):
         return self._activations.status
 
     @torch.no_grad()
-    def _record(self, refused: Tensor) -> None:
-        """Keep which entries of a tensor dt could not be taken, on the device."""
-        if self._refused is None or self._refused.device != refused.device:
-            with torch.inference_mode(False):
-                self._refused = torch.zeros(self.grid.scenes, dtype=torch.int32, device=refused.device)
-        self._refused += refused
-
-    @torch.no_grad()
     def failures(self, state: State | None = None) -> Failures:
         """Which scenes went wrong in the steps so far, and how; tensors on the device, which is not waited for.
 
@@ -221,8 +212,8 @@ class Step(nn.Module):
         """
         statuses = self._activations.all()
         problems = problems_of_status(statuses, self.grid)
-        if self._refused is not None:
-            problems["dt"] = refused_steps(self._refused)
+        if self._activations.refused is not None:
+            problems["dt"] = refused_steps(self._activations.refused)
         if self.heat is not None:
             problems |= self.heat.problems()
         if state is not None:
@@ -248,8 +239,6 @@ class Step(nn.Module):
     def reset(self) -> None:
         """Forget the status of the steps so far."""
         self._activations.reset()
-        if self._refused is not None:  # and CUDA graphs may write to it
-            self._refused.zero_()
         if self.heat is not None:
             self.heat.reset()
 
