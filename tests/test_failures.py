@@ -203,7 +203,7 @@ def test_lost_particles_have_no_velocity(device, dim, kernel):
 
 @pytest.mark.parametrize("form", ["mls", "gradient"])
 def test_lost_particles_spoil_no_gradient(device, dim, form):
-    """Gradients of nodes, dt and F are those without the lost particles, whichever the last scene is."""
+    """Gradients of nodes, dt, F and J, and second ones, are those without the lost particles."""
     p = random_particles(dim, "quadratic", (30, 25), device=device)
     x = p.x.clone()
     x[[2, 7]] = torch.nan
@@ -217,14 +217,16 @@ def test_lost_particles_spoil_no_gradient(device, dim, form):
         out = mpm.g2p_advance(blocks, x, nodes, dt, F, J, stress_form=form)
         keep = x.isfinite().all(1)
         loss = sum((t[keep] * torch.linspace(1, 2, t[0].numel()).to(t).reshape(t[0].shape)).sum() for t in out)
-        dense_nodes, dt, F, J = torch.autograd.grad(loss + out[3].sum() + out[4].sum(), (nodes, dt, F, J))
-        return blocks.to_dense(dense_nodes), dt, F, J
+        loss = loss + out[3].sum() + out[4].sum()
+        first = torch.autograd.grad(loss, (nodes, dt, F, J), create_graph=True)
+        second = torch.autograd.grad(first[0].square().sum() + first[1].square().sum(), (nodes, dt))
+        return blocks.to_dense(first[0]), blocks.to_dense(second[0]), first[1], second[1], *first[2:]
 
     mine = gradients(x, p.scene, p.stress, p.volume)
     alone = gradients(x[good], p.scene[good], p.stress[good], p.volume[good])
-    for a, b in zip((*mine[:2], mine[2][good], mine[3][good]), alone, strict=True):
+    for a, b in zip((*mine[:4], mine[4][good], mine[5][good]), alone, strict=True):
         torch.testing.assert_close(a, b)
-    assert mine[2][~good].eq(1).all() and mine[3][~good].eq(1).all()
+    assert mine[4][~good].eq(1).all() and mine[5][~good].eq(1).all()
 
 
 @pytest.mark.parametrize("transfer", ["apic", "pic", "flip"])
