@@ -77,7 +77,7 @@ class Failures:
         problems: each kind that was looked for:
             "not_finite": particles whose position is NaN or infinite,
             "outside": particles that left the grid,
-            "dt": steps whose entry of a tensor dt was negative or not finite,
+            "dt": steps whose entry of a tensor dt was negative or NaN,
             "heat_data", "heat": solves of heat without a result, or that missed their tolerance,
             and of the state given "mass", "volume", "velocity" and "deformation".
     """
@@ -166,7 +166,7 @@ def refused_steps(count: Tensor) -> Problem:
     """Steps of each scene [B] whose dt could not be taken."""
     return Problem(
         count,
-        "steps had a dt that was negative or not finite, so that the scene was paused",
+        "steps had a dt that was negative or NaN, so that the scene was paused",
         "give each scene a dt that is positive, or zero to pause it",
     )
 

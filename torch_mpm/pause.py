@@ -23,15 +23,14 @@ def split_paused(dt: Tensor, state: State, scenes: int) -> tuple[Tensor, Tensor,
         scenes: B.
 
     Returns:
-        dt in its shape; which particles move, bool [P]; and which entries of dt were negative or not finite, in the
-        shape of dt.
+        dt in its shape; which particles move, bool [P]; and which entries of dt were negative or NaN, in the shape of
+        dt.
 
     Raises:
         ValueError: for a wrong shape or device.
     """
     split_dt(dt, scenes, state.x)
-    moving = (dt > 0) & (dt < torch.inf)
-    refused = ~(moving | (dt == 0))
+    moving, refused = dt > 0, ~(dt >= 0)
     if dt.numel() <= 1:  # also the particles of a batch without scenes, which no step moves
         particles = moving.reshape(-1)[:1].expand(len(state)) if dt.numel() else dt.new_zeros(len(state)).bool()
     else:

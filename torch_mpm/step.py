@@ -99,8 +99,8 @@ class Step(nn.Module):
         Args:
             state: see `State`; missing C, F or J start at zero, identity and one.
             dt: time step [s]: a number, or a tensor of shape [], [1] or [B]. A scene with zero in a tensor is paused:
-                its particles stay as they are, bit by bit, and gradients pass through them unchanged. A negative one,
-                or one that is not finite, pauses the scene too, and `check` reports it.
+                its particles stay as they are, bit by bit, and gradients pass through them unchanged. One that is
+                negative or NaN pauses the scene too, and `check` reports it.
 
         Raises:
             ValueError, TypeError: for wrong shapes, dtypes or devices, or a number dt that is not positive.
@@ -204,8 +204,8 @@ class Step(nn.Module):
     def failures(self, state: State | None = None) -> Failures:
         """Which scenes went wrong in the steps so far, and how; tensors on the device, which is not waited for.
 
-        A training loop can leave them out: `loss = torch.where(step.failures().failed, 0, loss_of_scene).sum()`, where
-        the loss is computed from `state.x` and `state.v` that are masked too, since what a lost scene has is NaN.
+        A training loop leaves such scenes out by their particles, since zero times the NaN of a lost scene is NaN:
+        `failed = step.failures().failed[state.scene.long()]; v = torch.where(failed[:, None], 0, state.v)`.
 
         Args:
             state: its masses, volumes, velocities and deformations are looked at too.
@@ -229,7 +229,7 @@ class Step(nn.Module):
         Raises:
             SimulationError: that names each scene (up to a dozen of a kind), when and how many, and has `failures`: if
                 a particle left the grid or is not finite, if heat was not solved, if an entry of a tensor dt was
-                negative or not finite; and in the state, if a mass or volume is not positive and finite, or if the law
+                negative or NaN; and in the state, if a mass or volume is not positive and finite, or if the law
                 has no meaning for a particle's deformation (turned inside out, J ≤ 0); such a particle has zero stress
                 from then on.
             GridOverflowError: if more blocks were active than the grid has room for, and nothing else is wrong.

@@ -30,8 +30,8 @@ struct Counters {
   int groups, warps;  // of the thread blocks sampled
 };
 
-// Particles that are left out, zeroed before each activation. The lowest index is kept as the largest complement, so that
-// zero means none.
+// Particles that are left out, zeroed before each activation. The lowest index is kept as the largest complement, so
+// that zero means none.
 struct LeftOut {
   int count, first;
 };
@@ -378,7 +378,8 @@ void activate(const ActivateArguments<T, D>& a, Stream stream) {
     launch(slots<T, D>, blocks(table), kThreads, 0, stream, a, w, table);
     launch(offsets<T, D>, blocks(table), kThreads, 0, stream, a, w, table);
   }
-  launch(place<T, D>, blocks(std::max<int64_t>(a.particles, int64_t(std::max(a.capacity, a.scenes)) + 1)), kThreads, 0, stream, a, w);
+  const int64_t rows = int64_t(std::max(a.capacity, a.scenes)) + 1;  // of slots with their end, or of the status
+  launch(place<T, D>, blocks(std::max(a.particles, rows)), kThreads, 0, stream, a, w);
   if (a.deterministic && a.particles > 0) {
     size_t size = w.sort_size;
     check(cub::DeviceRadixSort::SortPairs(w.sort, size, w.slot, w.slot_sorted, w.id, a.index, int(a.particles), 0,

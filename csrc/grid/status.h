@@ -2,9 +2,10 @@
 
 #include "math/host_device.h"
 
-// The status tensor, int32 [1 + B, 8], that `activate` returns and hands from step to step. Row 0 counts the particles of
-// all scenes, row 1 + b those of scene b; a particle whose scene is none of these counts in row 0 alone. First means
-// first in time, for each row by itself: once entries 1-4 and 6 of a row tell of a problem, later activations leave them.
+// The status tensor, int32 [1 + B, 8], that `activate` returns and hands from step to step. Row 0 counts the particles
+// of all scenes, row 1 + b those of scene b; a particle whose scene is none of these counts in row 0 alone. First means
+// first in time, for each row by itself: once entries 1-4 and 6 of a row tell of a problem, later activations leave
+// them.
 namespace mpm {
 
 enum Status : int {
@@ -14,7 +15,7 @@ enum Status : int {
   kNonFiniteCount = 3,     // particles with a NaN or Inf position
   kNonFiniteFirst = 4,     // lowest index of those, -1 for none
   kActivations = 5,        // of row 0: activations so far
-  kProblemActivation = 6,  // 0-based activation of the first problem (outside, not finite; in row 0 overflow too), or -1
+  kProblemActivation = 6,  // 0-based activation of the first problem (for row 0 also overflow), -1 for none
   kBlocksNow = 7,          // of row 0: active blocks wanted by this activation
   kStatusSize = 8,
 };
