@@ -298,7 +298,7 @@ def test_problems_are_reported_with_the_particle_and_the_step(device):
     F[4, 0, 0] = -0.5
     inverted = step(state.replace(F=F), 1e-3)
     assert bool(torch.isfinite(inverted.x).all())
-    with pytest.raises(mpm.SimulationError, match=r"inverted or not finite, lowest index 4"):
+    with pytest.raises(mpm.SimulationError, match=r"inverted or not finite: .*lowest index 4"):
         step.check(inverted)
 
 
@@ -433,7 +433,7 @@ def test_replays_of_a_graph_are_watched(inference):
         for _ in range(3):
             graph.replay()
         step.check()
-        activations = [status[5].item() for status in step._activations.all()]
+        activations = [status[0, 5].item() for status in step._activations.all()]
         assert activations == [2, 7]  # of eager steps, and with replays
         inside = static.x[5].clone()
         static.x[5] = -9.0

@@ -7,6 +7,7 @@ from . import heat_boundaries, ops, seed
 from .boundaries import SDF, Box, Capsule, Plane, Revolved, Sphere, Walls
 from .cfl import stable_dt
 from .errors import GridOverflowError, SimulationError
+from .failures import Failures
 from .grid import Blocks, Grid
 from .heat import Heat
 from .materials import CustomLaw, Material, Mixture, NeoHookean, WeaklyCompressible
@@ -51,6 +52,7 @@ __all__ = [
     "Capsule",
     "CustomLaw",
     "CustomPrincipalLaw",
+    "Failures",
     "FixedCorotated",
     "Grid",
     "GridOverflowError",

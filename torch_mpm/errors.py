@@ -2,14 +2,27 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import torch
 from torch import Tensor
+
+if TYPE_CHECKING:
+    from .failures import Failures
 
 FLOATING = (torch.float32, torch.float64)
 
 
 class SimulationError(RuntimeError):
-    """The state of a simulation is no longer meaningful: a particle left the grid, is not finite, or is inverted."""
+    """The state of a simulation is no longer meaningful: a particle left the grid, is not finite, or is inverted.
+
+    Attributes:
+        failures: `Failures` of the scenes, as `Step.failures` gives them; None where they are not known.
+    """
+
+    def __init__(self, message: str, failures: Failures | None = None) -> None:
+        super().__init__(message)
+        self.failures = failures
 
 
 class GridOverflowError(SimulationError):

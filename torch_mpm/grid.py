@@ -18,7 +18,7 @@ PADDING = 3
 BLOCK_WIDTH = 4
 INT32_MAX = 2**31 - 1
 NO_PROBLEM = (0, 0, -1, 0, -1, 0, -1, 0)
-"""The status before the first activation (csrc/grid/status.h)."""
+"""A row of the status before the first activation (csrc/grid/status.h)."""
 
 KERNEL_ORDERS = {"quadratic": 2, "cubic": 3}
 
@@ -107,13 +107,16 @@ class Grid:
         """D⁻¹ = 4/dx² (quadratic) or 3/dx² (cubic) [1/m²] of the APIC affine field (Jiang et al. 2015)."""
         return inverse_inertia(self.order, self.dx)
 
-    def activate(self, x: Tensor, scene: Tensor | None = None, previous: Tensor | None = None) -> Blocks:
+    def activate(
+        self, x: Tensor, scene: Tensor | None = None, previous: Tensor | None = None, ids: Tensor | None = None
+    ) -> Blocks:
         """Find the blocks that particles touch.
 
         Args:
             x: positions [P, D] [m], float32 or float64.
             scene: scene of each particle, int32 [P]; None where the grid has one scene.
             previous: status of the activation before, to be carried on.
+            ids: identity of each particle, int64 [P], for the status; None for its index.
 
         Returns:
             The active blocks. On CUDA nothing is synchronised, except at the very first call without a `capacity`.
@@ -126,9 +129,9 @@ class Grid:
         if self._grows:
             self._grow(x, scene)
         assert self.capacity is not None
-        blocks = self._activate(x, scene, previous, self.capacity)
+        blocks = self._activate(x, scene, previous, self.capacity, ids)
         if x.device.type == "cpu" and not torch.compiler.is_compiling() and not _is_fake(x):
-            wanted = int(blocks.status[7])
+            wanted = blocks.wanted
             if wanted > self.capacity:
                 if not self._grows:
                     raise GridOverflowError(
@@ -136,13 +139,15 @@ class Grid:
                         f"pass capacity={_with_headroom(wanted)} or more, or None to let it grow"
                     )
                 self.capacity = min(_with_headroom(wanted), self._max_capacity)
-                blocks = self._activate(x, scene, previous, self.capacity)
+                blocks = self._activate(x, scene, previous, self.capacity, ids)
         return blocks
 
-    def _activate(self, x: Tensor, scene: Tensor | None, previous: Tensor | None, capacity: int) -> Blocks:
+    def _activate(
+        self, x: Tensor, scene: Tensor | None, previous: Tensor | None, capacity: int, ids: Tensor | None = None
+    ) -> Blocks:
         table, block, offsets, index, schedule, status = torch.ops.torch_mpm.activate(
             x.detach() if x.requires_grad else x, scene, previous, self.scenes, self.dx, self.lower, self.blocks,
-            self.order, capacity, self.deterministic,
+            self.order, capacity, self.deterministic, ids,
         )  # fmt: skip
         return Blocks(self, table, block, offsets, index, schedule, status, scene)
 
@@ -153,7 +158,7 @@ class Grid:
                 raise ValueError(
                     "a grid used under torch.compile needs a capacity: pass capacity= or activate it once before"
                 )
-            wanted = int(self._activate(x, scene, None, 0).status[7])
+            wanted = self._activate(x, scene, None, 0).wanted
             self.capacity = min(_with_headroom(wanted), self._max_capacity)
         elif (
             self._pending is not None
@@ -175,9 +180,9 @@ class Grid:
             return
         if self._on_host is None:
             with torch.inference_mode(False):  # such that a later step may write to it
-                self._on_host = torch.empty(status.shape, dtype=status.dtype, pin_memory=True)
+                self._on_host = torch.empty(status.shape[1:], dtype=status.dtype, pin_memory=True)
         with outside_transforms():
-            self._on_host.copy_(status, non_blocking=True)
+            self._on_host.copy_(status[0], non_blocking=True)
         self._pending = torch.cuda.Event()
         self._pending.record()
 
@@ -189,17 +194,20 @@ class ActivationRecord:
     which is kept; the first activation of all should not be a captured one, or each replay forgets those before.
 
     Attributes:
-        status: int32 [8], see csrc/grid/status.h; None before the first activation.
+        status: int32 [1 + B, 8], see csrc/grid/status.h; None before the first activation.
+        refused: steps of each scene whose entry of a tensor dt could not be taken, int32 [B]; None before the first
+            tensor dt.
     """
 
     def __init__(self) -> None:
         self.status: Tensor | None = None
+        self.refused: Tensor | None = None
         self._replayed: list[Tensor] = []
 
-    def activate(self, grid: Grid, x: Tensor, scene: Tensor | None) -> Blocks:
+    def activate(self, grid: Grid, x: Tensor, scene: Tensor | None, ids: Tensor | None = None) -> Blocks:
         """As `Grid.activate`; the capacity of the grid follows."""
         before = self.status
-        blocks = grid.activate(x, scene, before)
+        blocks = grid.activate(x, scene, before, ids)
         status = without_transforms(blocks.status)
         grid.watch(status)
         if before is None or not is_captured(x):
@@ -215,8 +223,18 @@ class ActivationRecord:
         latest = [] if self.status is None else [self.status]
         return latest + [kept for kept in self._replayed if kept is not self.status]
 
+    @torch.no_grad()
+    def refuse(self, entries: Tensor, scenes: int) -> None:
+        """Count entries of a tensor dt that could not be taken: bool of shape [], [1] or [B]."""
+        if self.refused is None or self.refused.device != entries.device:
+            with torch.inference_mode(False):
+                self.refused = torch.zeros(scenes, dtype=torch.int32, device=entries.device)
+        self.refused += entries
+
     def reset(self) -> None:
         self.status = None
+        if self.refused is not None:  # and CUDA graphs may write to it
+            self.refused.zero_()
         with torch.inference_mode():
             for kept in self._replayed:
                 kept.copy_(torch.tensor(NO_PROBLEM, dtype=torch.int32))
@@ -239,7 +257,7 @@ class Blocks:
         block: table index of every slot, int32 [capacity], -1 where unused.
         offsets, index: particles `index[offsets[s]:offsets[s + 1]]` have their base node in the block of slot s, int32.
         schedule: order of work of the kernels.
-        status: int32 [8], see csrc/grid/status.h; `Step.check` reads it.
+        status: int32 [1 + B, 8], see csrc/grid/status.h; `Step.check` and `Step.failures` read it.
         scene: the scene of each particle, or None.
     """
 
@@ -260,6 +278,11 @@ class Blocks:
             *(self.table, self.block, self.offsets, self.index, self.schedule),
             *(grid.dx, grid.lower, grid.blocks, grid.order, grid.deterministic),
         )  # fmt: skip
+
+    @property
+    def wanted(self) -> int:
+        """Active blocks that this activation wanted, which may be more than it got; synchronises."""
+        return int(self.status[0, 7])
 
     @property
     def node_count(self) -> int:

@@ -29,7 +29,8 @@ from torch import Tensor, nn
 
 from .boundaries import _norm
 from .capture import outside_transforms, without_transforms
-from .errors import SimulationError, check_like
+from .errors import check_like
+from .failures import Failures, Problem, problems_of_status, raise_failures, unsolved_heat
 from .grid import ActivationRecord, Blocks, Grid
 from .heat_boundaries import FixedSurface, HeatNodes
 from .materials import _check_value
@@ -182,7 +183,7 @@ class Heat(nn.Module):
                 is not positive.
         """
         state = self.prepare(state)
-        blocks = self._activations.activate(self.grid, state.x, state.scene)
+        blocks = self._activations.activate(self.grid, state.x, state.scene, state.ids)
         return state.replace(**self.update(blocks, state, dt), time=state.time + dt)
 
     def update(
@@ -355,29 +356,25 @@ class Heat(nn.Module):
             self.unsolved += ~converged
             self.residual.copy_(torch.where(converged, self.residual, torch.maximum(self.residual, residual.double())))
 
+    def problems(self) -> dict[str, Problem]:
+        """What became of the solves so far, by kind as in `Failures`, without synchronising."""
+        if self.unsolved is None or self.residual is None:
+            return {}
+        return unsolved_heat(self.unsolved, self.residual, self.max_iterations)
+
     def check(self) -> None:
         """Read what became of the solves so far; synchronises with the device.
 
         Raises:
-            SimulationError: for scenes in which a solve missed its tolerance, or data were not finite.
+            SimulationError: for scenes in which a solve missed its tolerance, or data were not finite; for particles
+                that left the grid or are not finite.
+            GridOverflowError: if more blocks were active than the grid has room for, and nothing else is wrong.
         """
-        if self.unsolved is None or self.residual is None:
+        if self.unsolved is None:
             return
-        unsolved, residual = self.unsolved.tolist(), self.residual.tolist()
-        failed = [b for b, count in enumerate(unsolved) if count]
-        if not failed:
-            return
-        b = failed[0]
-        if residual[b] != residual[b]:
-            what = "a temperature, a conductivity or a boundary is not finite, or a conductivity is negative"
-        else:
-            what = (
-                f"a residual of {residual[b]:.3g} K was left after {self.max_iterations} iterations: "
-                "reduce dt, or raise max_iterations or tolerance"
-            )
-        raise SimulationError(
-            f"heat was not solved in {len(failed)} scenes, first in scene {b}, {unsolved[b]} times: {what}"
-        )
+        statuses = self._activations.all()
+        problems = problems_of_status(statuses, self.grid) | self.problems()
+        raise_failures(Failures.of(problems, self.unsolved), statuses, self.grid)
 
     def reset(self) -> None:
         """Forget what became of the solves so far."""

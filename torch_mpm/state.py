@@ -118,10 +118,12 @@ class State:
             device: the points' if None.
 
         Raises:
-            ValueError: for a number as density that is not positive, or wrong shapes.
+            ValueError: for a density that is not positive and finite, or wrong shapes.
         """
-        if not isinstance(density, Tensor) and not density > 0:
-            raise ValueError(f"density must be positive, got {density}")
+        values = torch.as_tensor(density)
+        bad = values[~((values > 0) & (values < torch.inf))]
+        if bad.numel():
+            raise ValueError(f"density must be positive and finite, got {float(bad[0])}")
         dtype = dtype or torch.get_default_dtype()
         x = _as_soa(points.x.to(device=device, dtype=dtype))
         volume = points.volume.to(device=x.device, dtype=dtype)

@@ -12,12 +12,13 @@ from torch.utils.checkpoint import checkpoint as run_checkpointed
 from .boundaries import Walls
 from .capture import Kept
 from .cfl import stable_dt
-from .errors import GridOverflowError, SimulationError
+from .failures import Failures, problems_of_state, problems_of_status, raise_failures, refused_steps
 from .grid import ActivationRecord, Blocks, Grid
 from .heat import Heat
 from .materials import Material
 from .ops import contact, fusible, g2p, g2p_advance, gather, grid_update, p2g
 from .parameters import With
+from .pause import split_paused, standing
 from .state import State, identity_deformation
 
 TRANSFERS = ("apic", "pic", "flip")
@@ -96,15 +97,25 @@ class Step(nn.Module):
 
         Args:
             state: see `State`; missing C, F or J start at zero, identity and one.
-            dt: time step [s]: a number, or a tensor of shape [], [1] or [B].
+            dt: time step [s]: a number, or a tensor of shape [], [1] or [B]. A scene with zero in a tensor is paused:
+                its particles stay as they are, bit by bit, and gradients pass through them unchanged. One that is
+                negative or NaN pauses the scene too, and `check` reports it.
 
         Raises:
             ValueError, TypeError: for wrong shapes, dtypes or devices, or a number dt that is not positive.
             GridOverflowError: on the CPU, where a grid of fixed capacity is full.
         """
-        grid, scene = self.grid, state.scene
         state = self.prepare(state)
-        blocks = self._activations.activate(grid, state.x, scene)
+        if not isinstance(dt, Tensor):
+            return self._advanced(state, dt)
+        dt, moving, refused = split_paused(dt, state, self.grid.scenes)
+        self._activations.refuse(refused, self.grid.scenes)
+        return standing(state, self._advanced(state, dt), moving)
+
+    def _advanced(self, state: State, dt: float | Tensor) -> State:
+        """A prepared state one step later."""
+        grid, scene = self.grid, state.scene
+        blocks = self._activations.activate(grid, state.x, scene, state.ids)
         form, affine = self.stress_form, state.C if self.transfer == "apic" else None
         fields, stress = self.law.update(With(state, dt=dt) if self._rate_dependent else state)  # type: ignore[arg-type]
         dissipated = fields.pop("dissipated", None)
@@ -188,8 +199,29 @@ class Step(nn.Module):
 
     @property
     def status(self) -> Tensor | None:
-        """Status of all steps so far, int32 [8] on the device of the particles, see csrc/grid/status.h."""
+        """Status of all steps so far, int32 [1 + B, 8] on the device of the particles, see csrc/grid/status.h."""
         return self._activations.status
+
+    @torch.no_grad()
+    def failures(self, state: State | None = None) -> Failures:
+        """Which scenes went wrong in the steps so far, and how; tensors on the device, which is not waited for.
+
+        A training loop leaves such scenes out by their particles, since zero times the NaN of a lost scene is NaN:
+        `failed = step.failures().failed[state.scene.long()]; v = torch.where(failed[:, None], 0, state.v)`.
+
+        Args:
+            state: its masses, volumes, velocities and deformations are looked at too.
+        """
+        statuses = self._activations.all()
+        problems = problems_of_status(statuses, self.grid)
+        if self._activations.refused is not None:
+            problems["dt"] = refused_steps(self._activations.refused)
+        if self.heat is not None:
+            problems |= self.heat.problems()
+        if state is not None:
+            problems |= problems_of_state(self.law, self.prepare(state), self.grid.scenes)
+        device = statuses[0].device if statuses else None if state is None else state.x.device
+        return Failures.of(problems, torch.zeros(self.grid.scenes, device=device))
 
     def check(self, state: State | None = None) -> None:
         """Read the status of all steps so far, and look at a state if one is given; synchronises with the device.
@@ -197,17 +229,14 @@ class Step(nn.Module):
         What CUDA graphs replay is among them, if the step had been taken once before it was captured.
 
         Raises:
-            GridOverflowError: if more blocks were active than the grid has room for.
-            SimulationError: if a particle left the grid or is not finite, if heat was not solved, or if the law has no
-                meaning for a particle's deformation (turned inside out, J ≤ 0); such a particle has zero stress from
-                then on.
+            SimulationError: that names each scene (up to a dozen of a kind), when and how many, and has `failures`: if
+                a particle left the grid or is not finite, if heat was not solved, if an entry of a tensor dt was
+                negative or NaN; and in the state, if a mass or volume is not positive and finite, or if the law
+                has no meaning for a particle's deformation (turned inside out, J ≤ 0); such a particle has zero stress
+                from then on.
+            GridOverflowError: if more blocks were active than the grid has room for, and nothing else is wrong.
         """
-        for status in self._activations.all():
-            check_status(status, self.grid)
-        if self.heat is not None:
-            self.heat.check()
-        if state is not None:
-            check_deformation(self.law, self.prepare(state))
+        raise_failures(self.failures(state), self._activations.all(), self.grid)
 
     def reset(self) -> None:
         """Forget the status of the steps so far."""
@@ -225,40 +254,6 @@ def _neighbours(boundaries: Sequence[Boundary], time: float | Tensor) -> list[tu
             runs.append((together, []))
         runs[-1][1].append(boundary)
     return runs
-
-
-def check_status(status: Tensor, grid: Grid) -> None:
-    """Raise a `SimulationError` for a status tensor of `activate` that tells of a problem."""
-    peak, outside, first_outside, not_finite, first_not_finite, _, activation, _ = status.tolist()
-    if not_finite > 0:
-        raise SimulationError(
-            f"{not_finite} particles have a position that is NaN or infinite, first at step {activation}, lowest index "
-            f"{first_not_finite}: the time step was probably too large; compare dt with step.stable_dt(state)"
-        )
-    if outside > 0:
-        raise SimulationError(
-            f"{outside} particles left the grid [{grid.lower}, {grid.upper}], first at step {activation}, lowest index "
-            f"{first_outside}: enlarge the domain, add walls, or reduce dt"
-        )
-    if grid.capacity is not None and peak > grid.capacity:
-        raise GridOverflowError(
-            f"{peak} blocks were active but the grid has a capacity of {grid.capacity}, first at step {activation}: "
-            "pass a larger capacity, or None to let it grow"
-        )
-
-
-def check_deformation(law: Material, state: State) -> None:
-    """Raise a `SimulationError` if the law has no meaning for the deformation of a particle."""
-    invalid = law.invalid(state)
-    if not bool(invalid.any()):
-        return
-    first = int(invalid.nonzero()[0, 0])
-    scene = 0 if state.scene is None else int(state.scene[first])
-    identity = first if state.ids is None else int(state.ids[first])
-    raise SimulationError(
-        f"{int(invalid.sum())} particles are inverted or not finite, lowest index {first} (id {identity}) in scene "
-        f"{scene}: the time step was too large or the load crushed the material; compare dt with step.stable_dt(state)"
-    )
 
 
 def rollout(

@@ -210,7 +210,7 @@ def simulate(
     upper = (reach, max(heights) + 10 * DX, SLAB * DX if case.shape == "slab" else reach)[:dim]
     grid = mpm.Grid(DX, (0.0,) * dim, upper, scenes=len(states), kernel=case.kernel)
     packed = mpm.State.concatenate(list(states), scene=True).to(device, torch.float32)
-    wanted = int(grid.activate(packed.x, packed.scene).status[7])
+    wanted = grid.activate(packed.x, packed.scene).wanted
     room = min(3 * wanted, grid.block_count)  # to spread; fixed, for the graph
     grid = mpm.Grid(DX, (0.0,) * dim, upper, scenes=len(states), kernel=case.kernel, capacity=room)
     moduli = [stiffness(h, case.compression) for h in heights]

@@ -43,7 +43,7 @@ def measure(dim: int, energy: str, apex: str, steps: int, device: str) -> list[d
     packed = mpm.State.concatenate([column] * len(cases), scene=True).to(device, torch.float32)
     upper = (40 * size[0] * DX if dim == 2 else 15 * size[0] * DX, 1.5 * height, 15 * size[0] * DX)[:dim]
     roomy = mpm.Grid(DX, (0.0,) * dim, upper, scenes=len(cases))
-    room = min(12 * int(roomy.activate(packed.x, packed.scene).status[7]), roomy.block_count)
+    room = min(12 * roomy.activate(packed.x, packed.scene).wanted, roomy.block_count)
     grid = mpm.Grid(DX, (0.0,) * dim, upper, scenes=len(cases), capacity=room)
     E, angle = (torch.tensor(v, dtype=torch.float32, device=device) for v in zip(*cases, strict=True))
     law = mpm.QuarticSand(

@@ -53,12 +53,6 @@ struct Activation {
 
   int64_t* totals(int slice) const { return w.totals + slice * W::kTotals; }
 
-  int64_t sum(int which) const {
-    int64_t s = 0;
-    for (int k = 0; k < w.slices; k++) s += totals(k)[which];
-    return s;
-  }
-
   // Replaces an entry of the totals by the sum over the slices before; returns the sum over all.
   int64_t scan(int which) const {
     int64_t s = 0;
@@ -71,26 +65,25 @@ struct Activation {
   }
 };
 
-template <class T>
-MPM_HD bool is_finite(T x) {
-  return x - x == T(0);
+enum class Place { inside, outside, not_finite };
+
+// Scene and base node of one particle, and whether it is left out for its position or its scene.
+template <int Order, class T, int D>
+Place place_of(const ActivateArguments<T, D>& a, int64_t p, int& scene, int base[D]) {
+  T x[D], f[D];
+  scene = a.scene ? a.scene[p * a.scene_stride] : 0;
+  for (int i = 0; i < D; i++) x[i] = at(a.x, p, i);
+  if (!is_finite<D>(x)) return Place::not_finite;
+  const bool inside = locate<Order>(a.geometry, x, base, f) && scene >= 0 && scene < a.scenes;
+  return inside ? Place::inside : Place::outside;
 }
 
-// Home block and cell of one particle, or why it is left out.
+// Home block and cell of one particle.
 template <int Order, class T, int D>
-void classify(const Activation<T, D>& s, int64_t p, int64_t* totals) {
+void classify(const Activation<T, D>& s, int64_t p) {
   const ActivateArguments<T, D>& a = s.a;
-  const int scene = a.scene ? a.scene[p * a.scene_stride] : 0;
-  T x[D], f[D];
-  int base[D], block[D];
-  bool finite = true;
-  for (int i = 0; i < D; i++) {
-    x[i] = at(a.x, p, i);
-    finite = finite && is_finite(x[i]);
-  }
-  if (!finite || scene < 0 || scene >= a.scenes || !locate<Order>(a.geometry, x, base, f)) {
-    const int which = finite ? W::kOutside : W::kNonFinite;
-    if (totals[which]++ == 0) totals[which + 1] = p;
+  int scene, base[D], block[D];
+  if (place_of<Order>(a, p, scene, base) != Place::inside) {
     s.w.key[p] = -1;
     return;
   }
@@ -108,7 +101,7 @@ bool classify_pack(const Activation<T, D>& s, int64_t p) {
   using Unsigned = RegisterOf<float, kLanes>::Bits;
   typedef uint8_t Bytes __attribute__((vector_size(kLanes)));
   Unsigned key = {}, cell = {};
-  bool known = true;
+  bool known = a.scene || a.scenes > 0;
   if (a.scene)
     for (int l = 0; l < kLanes; l++) {
       key[l] = unsigned(a.scene[(p + l) * a.scene_stride]);
@@ -138,14 +131,12 @@ bool classify_pack(const Activation<T, D>& s, int64_t p) {
 }
 
 template <int Order, class T, int D>
-void classify_slice(const Activation<T, D>& s, int slice, int64_t begin, int64_t end) {
-  int64_t* totals = s.totals(slice);
-  for (int i = 0; i < W::kTotals; i++) totals[i] = 0;
+void classify_slice(const Activation<T, D>& s, int64_t begin, int64_t end) {
   for (int64_t p = begin; p < end;) {
     if (p + kLanes <= end && classify_pack<Order>(s, p))
       p += kLanes;
     else
-      for (const int64_t stop = p + kLanes < end ? p + kLanes : end; p < stop; p++) classify<Order>(s, p, totals);
+      for (const int64_t stop = p + kLanes < end ? p + kLanes : end; p < stop; p++) classify<Order>(s, p);
   }
 }
 
@@ -356,21 +347,37 @@ void sort_chunk(const Activation<T, D>& s, int64_t chunk) {
   s.schedule.chunk_sorted[chunk] = !falls && id[count - 1] - id[0] == count - 1;
 }
 
-template <class T, int D>
-void write_status(const Activation<T, D>& s, int64_t wanted) {
-  int* status = s.a.status;
-  static constexpr int start[kStatusSize] = {0, 0, -1, 0, -1, 0, -1, 0};
-  for (int i = 0; i < kStatusSize; i++) status[i] = (s.a.previous_status ? s.a.previous_status : start)[i];
-  const int64_t outside = s.sum(W::kOutside), non_finite = s.sum(W::kNonFinite);
-  if (status[kProblemActivation] < 0 && (outside || non_finite || wanted > s.a.capacity)) {
-    status[kProblemActivation] = status[kActivations];
-    status[kOutsideCount] = int(outside);
-    status[kNonFiniteCount] = int(non_finite);
-    for (int k = s.w.slices - 1; k >= 0; k--) {
-      if (s.totals(k)[W::kOutside]) status[kOutsideFirst] = int(s.totals(k)[W::kOutsideFirst]);
-      if (s.totals(k)[W::kNonFinite]) status[kNonFiniteFirst] = int(s.totals(k)[W::kNonFiniteFirst]);
-    }
+// Counts a particle that is left out in a row of the status, unless an earlier activation has done so; whether it is the
+// first of the row.
+bool report(int* row, int activation, Place place, int p) {
+  if (row[kProblemActivation] >= 0 && row[kProblemActivation] != activation) return false;
+  row[kProblemActivation] = activation;
+  int* entry = row + (place == Place::outside ? kOutsideCount : kNonFiniteCount);
+  if (entry[0]++ > 0) return false;
+  entry[1] = p;
+  return true;
+}
+
+// Particles that are not transferred stand at the end of the index, in ascending order.
+template <int Order, class T, int D>
+void write_status(const Activation<T, D>& s, int64_t wanted, int64_t transferred) {
+  const ActivateArguments<T, D>& a = s.a;
+  int* status = a.status;
+  for (int64_t row = 0; row <= a.scenes; row++)
+    copy_status(a.previous_status ? a.previous_status + row * kStatusSize : nullptr, status + row * kStatusSize);
+  const int activation = status[kActivations];
+  for (int64_t i = transferred; i < a.particles; i++) {
+    int scene, base[D];
+    const int p = a.index[i];
+    const Place place = place_of<Order>(a, p, scene, base);
+    if (place == Place::inside) continue;  // left out because the grid is full
+    report(status, activation, place, p);
+    if (scene < 0 || scene >= a.scenes) continue;
+    int* row = status + (1 + int64_t(scene)) * kStatusSize;
+    if (report(row, activation, place, p))
+      row[place == Place::outside ? kOutsideId : kNonFiniteId] = a.id ? int(a.id[p * a.id_stride]) : p;
   }
+  if (wanted > a.capacity && status[kProblemActivation] < 0) status[kProblemActivation] = activation;
   status[kActivations]++;
   status[kBlocksNow] = int(wanted);
   if (wanted > status[kBlocksWanted]) status[kBlocksWanted] = int(wanted);
@@ -380,7 +387,7 @@ template <int Order, class T, int D>
 void activate(const ActivateArguments<T, D>& a) {
   const Activation<T, D> s(a);
   for_parts(s.w.slices, a.particles, [&](int slice, int64_t begin, int64_t end) {
-    classify_slice<Order>(s, slice, begin, end);
+    classify_slice<Order>(s, begin, end);
     count_homes<Order>(s, slice, begin, end);
   });
   const int64_t wanted = number_blocks(s);
@@ -399,7 +406,7 @@ void activate(const ActivateArguments<T, D>& a) {
   parallel_ranges(chunks, 16, [&](int64_t begin, int64_t end) {
     for (int64_t chunk = begin; chunk < end; chunk++) sort_chunk(s, chunk);
   });
-  write_status(s, wanted);
+  write_status<Order>(s, wanted, transferred);
 }
 
 // The schedule has it already.

@@ -15,7 +15,7 @@ struct ActivateWorkspace {
   uint8_t* touched;  // [slices, table] which blocks the particles of a home touch: bit o for neighbour o
   int64_t* totals;   // [slices, kTotals]
   int64_t size;      // in bytes
-  enum { kActive, kParticles, kDropped, kOutside, kOutsideFirst, kNonFinite, kNonFiniteFirst, kRuns, kTotals };
+  enum { kActive, kParticles, kDropped, kRuns, kTotals };
 };
 
 inline namespace TORCH_MPM_ISA {

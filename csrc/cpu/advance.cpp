@@ -26,8 +26,8 @@ void advance_range(AdvanceArguments<T, D> a, int64_t begin, int64_t end) {
 template <bool Contiguous, class T, int D>
 void advance_backward_range(AdvanceBackwardArguments<T, D> a, int64_t begin, int64_t end) {
   if (Contiguous)
-    assume_contiguous(a.forward.velocity, a.forward.affine, a.forward.F, a.forward.J, a.grad_x, a.grad_F, a.grad_J,
-                      a.velocity, a.affine, a.F, a.J, a.dt);
+    assume_contiguous(a.forward.x, a.forward.velocity, a.forward.affine, a.forward.F, a.forward.J, a.grad_x, a.grad_F,
+                      a.grad_J, a.velocity, a.affine, a.F, a.J, a.dt);
 #pragma GCC ivdep
   for (int64_t p = begin; p < end; p++) advance_particle_backward(a, p);
 }
@@ -45,8 +45,8 @@ void advance(const AdvanceArguments<T, D>& a, Stream) {
 template <class T, int D>
 void advance_backward(const AdvanceBackwardArguments<T, D>& a, Stream) {
   const auto& f = a.forward;
-  const bool contiguous = contiguous_particles(f.velocity, f.affine, f.F, f.J, a.grad_x, a.grad_F, a.grad_J, a.velocity,
-                                               a.affine, a.F, a.J, a.dt);
+  const bool contiguous = contiguous_particles(f.x, f.velocity, f.affine, f.F, f.J, a.grad_x, a.grad_F, a.grad_J,
+                                               a.velocity, a.affine, a.F, a.J, a.dt);
   parallel_ranges(f.particles, kGrain, [&](int64_t begin, int64_t end) {
     contiguous ? advance_backward_range<true>(a, begin, end) : advance_backward_range<false>(a, begin, end);
   });

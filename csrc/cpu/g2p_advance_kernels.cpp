@@ -103,11 +103,13 @@ void g2p_advance(const G2PAdvanceArguments<T, D>& a) {
   else
     g2p_advance_with<Order, false>(a);
   for_outside(a.gather.topology, [&](int64_t p) {
+    const Vector<T, D> x = load_vector<T, D>(a.gather.x, p);
+    const T rest = is_finite<D>(x.e) ? T(0) : T(a.gather.lost);
     for (int i = 0; i < D; i++) {
-      at(a.gather.value, p, i) = 0;
-      at(a.x_next, p, i) = at(a.gather.x, p, i);
+      at(a.gather.value, p, i) = rest;
+      at(a.x_next, p, i) = x[i];
       for (int j = 0; j < D; j++) {
-        if (a.gather.moment.pointer) at(a.gather.moment, p, i, j) = 0;
+        if (a.gather.moment.pointer) at(a.gather.moment, p, i, j) = rest;
         if (a.F.pointer) at(a.F_next, p, i, j) = at(a.F, p, i, j);
       }
     }

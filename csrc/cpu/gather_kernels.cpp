@@ -41,11 +41,12 @@ void gather(const GatherArguments<T, D>& a) {
       gather_with<Order, false, false>(a, first, count);
   }
   for_outside(a.topology, [&](int64_t p) {
+    const T nothing = is_finite<D>(load_vector<T, D>(a.x, p).e) ? T(0) : T(a.lost);
     for (int c = 0; c < a.nodes.channels; c++) {
-      if (a.value.pointer) at(a.value, p, c) = 0;
+      if (a.value.pointer) at(a.value, p, c) = nothing;
       for (int d = 0; d < D; d++) {
-        if (a.moment.pointer) at(a.moment, p, c, d) = 0;
-        if (a.gradient.pointer) at(a.gradient, p, c, d) = 0;
+        if (a.moment.pointer) at(a.moment, p, c, d) = nothing;
+        if (a.gradient.pointer) at(a.gradient, p, c, d) = nothing;
       }
     }
   });

@@ -21,15 +21,22 @@ constexpr int kThreads = 256;
 constexpr int kSampling = 64, kScattered = 2;
 using Packed = unsigned long long;
 
-// Zeroed before each activation. The lowest index of a kind is kept as the largest complement, so that zero means none.
+// Zeroed before each activation.
 struct Counters {
   int tile[2];  // tiles handed out by each scan
   int tail;     // particles that are not transferred
-  int outside, outside_first;
-  int non_finite, non_finite_first;
-  int wanted;  // active blocks
+  int wanted;   // active blocks
   int transferred, items;
   int groups, warps;  // of the thread blocks sampled
+};
+
+// Particles that are left out, zeroed before each activation. The lowest index is kept as the largest complement, so
+// that zero means none.
+struct LeftOut {
+  int count, first;
+};
+struct Trouble {
+  LeftOut outside, not_finite;
 };
 
 // `count` becomes the first position in the index tensor, or -1 minus the position from its end for particles that are
@@ -41,6 +48,7 @@ struct Tally {
 
 struct Workspace {
   Counters* counters;
+  Trouble* trouble;                     // [1 + scenes] of all particles, and of each scene
   Packed *slot_states, *offset_states;  // one per tile of the scans
   Tally* tally;                         // [table]
   int64_t zeroed;                       // bytes from the start
@@ -68,6 +76,7 @@ Workspace lay_out(const ActivateArguments<T, D>& a) {
     return p;
   };
   w.counters = reinterpret_cast<Counters*>(take(sizeof(Counters)));
+  w.trouble = reinterpret_cast<Trouble*>(take((1 + int64_t(a.scenes)) * sizeof(Trouble)));
   w.slot_states = reinterpret_cast<Packed*>(take(tiles * sizeof(Packed)));
   w.offset_states = reinterpret_cast<Packed*>(take(tiles * sizeof(Packed)));
   w.tally = reinterpret_cast<Tally*>(take(table * sizeof(Tally)));
@@ -85,20 +94,18 @@ Workspace lay_out(const ActivateArguments<T, D>& a) {
   return w;
 }
 
+// Counts a particle that is left out among all and in its scene, unless an earlier activation has told of that row: a
+// scene that is lost costs atomics only once.
 template <class T, int D>
-__device__ bool is_finite(const T x[D]) {
-  bool finite = true;
-#pragma unroll
-  for (int i = 0; i < D; i++) finite = finite && isfinite(x[i]);
-  return finite;
-}
-
-// Counts the lanes that are in `which` kind of trouble and remembers the lowest particle.
-__device__ void report(bool trouble, int p, int* count, int* first) {
-  const unsigned lanes = __ballot_sync(~0u, trouble);
-  if (lanes == 0 || threadIdx.x % 32 != __ffs(lanes) - 1) return;
-  atomicAdd(count, __popc(lanes));
-  atomicMax(first, INT_MAX - p);
+__device__ void report(const ActivateArguments<T, D>& a, Trouble* trouble, bool finite, int scene, int p) {
+  const auto count_in = [&](int row) {
+    if (a.previous_status && a.previous_status[row * int64_t(kStatusSize) + kProblemActivation] >= 0) return;
+    LeftOut& out = finite ? trouble[row].outside : trouble[row].not_finite;
+    atomicAdd(&out.count, 1);
+    atomicMax(&out.first, INT_MAX - p);
+  };
+  count_in(0);
+  if (unsigned(scene) < unsigned(a.scenes)) count_in(1 + scene);
 }
 
 template <int Order, class T, int D>
@@ -108,11 +115,10 @@ __global__ void __launch_bounds__(kThreads) classify(const ActivateArguments<T, 
   T x[D], f[D];
   int base[D], key = -1;
   unsigned touched = 0;
-  bool finite = true;
   if (exists) {
 #pragma unroll
     for (int i = 0; i < D; i++) x[i] = a.x.pointer[p * a.x.stride[0] + i * a.x.stride[1]];
-    finite = is_finite<T, D>(x);
+    const bool finite = is_finite<D>(x);
     const int scene = a.scene ? a.scene[p * a.scene_stride] : 0;
     if (finite && unsigned(scene) < unsigned(a.scenes) && locate<Order>(a.geometry, x, base, f)) {
       touched = 1;
@@ -122,10 +128,10 @@ __global__ void __launch_bounds__(kThreads) classify(const ActivateArguments<T, 
         base[i] /= kBlockWidth;
       }
       key = block_index(a.geometry, scene, base);
+    } else {
+      report(a, w.trouble, finite, scene, int(p));
     }
   }
-  report(exists && !finite, int(p), &w.counters->non_finite, &w.counters->non_finite_first);
-  report(exists && finite && key < 0, int(p), &w.counters->outside, &w.counters->outside_first);
   // One atomic per block and warp: neighbours in memory are mostly neighbours in space.
   const unsigned group = __match_any_sync(~0u, exists ? key : INT_MIN);
   const unsigned before = group & ((1u << threadIdx.x % 32) - 1);
@@ -275,20 +281,37 @@ __global__ void __launch_bounds__(kThreads) offsets(const ActivateArguments<T, D
   }
 }
 
-__device__ void write_status(const Counters& c, int capacity, const int* previous, int* status) {
-  const int fresh[kStatusSize] = {0, 0, -1, 0, -1, 0, -1, 0};
-  for (int i = 0; i < kStatusSize; i++) status[i] = previous ? previous[i] : fresh[i];
-  const bool problem = c.outside > 0 || c.non_finite > 0 || c.wanted > capacity;
-  if (problem && status[kProblemActivation] < 0) {
-    status[kProblemActivation] = status[kActivations];
-    status[kOutsideCount] = c.outside;
-    status[kOutsideFirst] = c.outside > 0 ? INT_MAX - c.outside_first : -1;
-    status[kNonFiniteCount] = c.non_finite;
-    status[kNonFiniteFirst] = c.non_finite > 0 ? INT_MAX - c.non_finite_first : -1;
+__device__ void write_left_out(const LeftOut& out, int* entry) {
+  entry[0] = out.count;
+  entry[1] = out.count > 0 ? INT_MAX - out.first : -1;
+}
+
+template <class T, int D>
+__device__ int id_of(const ActivateArguments<T, D>& a, int p) {
+  return a.id && p >= 0 ? int(a.id[p * a.id_stride]) : p;
+}
+
+template <class T, int D>
+__device__ void write_status(const ActivateArguments<T, D>& a, const Workspace& w, int row) {
+  const int wanted = w.counters->wanted;
+  const Trouble& trouble = w.trouble[row];
+  const int64_t start = row * int64_t(kStatusSize);
+  int* const status = a.status + start;
+  copy_status(a.previous_status ? a.previous_status + start : nullptr, status);
+  const bool left_out = trouble.outside.count > 0 || trouble.not_finite.count > 0;
+  if (status[kProblemActivation] < 0 && (left_out || (row == 0 && wanted > a.capacity))) {
+    status[kProblemActivation] = a.previous_status ? a.previous_status[kActivations] : 0;
+    write_left_out(trouble.outside, status + kOutsideCount);
+    write_left_out(trouble.not_finite, status + kNonFiniteCount);
+    if (row > 0) {
+      status[kOutsideId] = id_of(a, status[kOutsideFirst]);
+      status[kNonFiniteId] = id_of(a, status[kNonFiniteFirst]);
+    }
   }
+  if (row > 0) return;
   status[kActivations]++;
-  status[kBlocksWanted] = max(status[kBlocksWanted], c.wanted);
-  status[kBlocksNow] = c.wanted;
+  status[kBlocksWanted] = max(status[kBlocksWanted], wanted);
+  status[kBlocksNow] = wanted;
 }
 
 template <class T, int D>
@@ -317,8 +340,8 @@ __global__ void __launch_bounds__(kThreads) place(const ActivateArguments<T, D> 
   if (i == 0) {
     *schedule.item_count = c.items;
     *schedule.scattered = c.groups > kScattered * c.warps;
-    write_status(c, a.capacity, a.previous_status, a.status);
   }
+  if (i <= a.scenes) write_status(a, w, int(i));
   if (i < min(c.wanted, a.capacity)) {
     write_neighbours(a, a.block[i], schedule.neighbours + (i << D));
   } else if (i <= a.capacity) {
@@ -355,7 +378,8 @@ void activate(const ActivateArguments<T, D>& a, Stream stream) {
     launch(slots<T, D>, blocks(table), kThreads, 0, stream, a, w, table);
     launch(offsets<T, D>, blocks(table), kThreads, 0, stream, a, w, table);
   }
-  launch(place<T, D>, blocks(std::max<int64_t>(a.particles, a.capacity + 1)), kThreads, 0, stream, a, w);
+  const int64_t rows = int64_t(std::max(a.capacity, a.scenes)) + 1;  // of slots with their end, or of the status
+  launch(place<T, D>, blocks(std::max(a.particles, rows)), kThreads, 0, stream, a, w);
   if (a.deterministic && a.particles > 0) {
     size_t size = w.sort_size;
     check(cub::DeviceRadixSort::SortPairs(w.sort, size, w.slot, w.slot_sorted, w.id, a.index, int(a.particles), 0,

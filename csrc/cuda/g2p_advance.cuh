@@ -28,6 +28,7 @@ struct AdvanceGather {
   Columns<T, 1> J_next;
   Field<const T> scene_dt;
   T dt, moment_scale, gradient_scale;  // from cells
+  T lost;
 
   explicit AdvanceGather(const G2PAdvanceArguments<T, D>& a)
       : topology(a.gather.topology),
@@ -43,7 +44,8 @@ struct AdvanceGather {
         scene_dt(a.scene_dt),
         dt(T(a.dt)),
         moment_scale(T(a.gather.moment_scale * double(topology.geometry.dx))),
-        gradient_scale(topology.geometry.inverse_dx) {}
+        gradient_scale(topology.geometry.inverse_dx),
+        lost(T(a.gather.lost)) {}
 
   __device__ Loaded load(int p, int scene) const {
     Loaded l;
@@ -86,6 +88,21 @@ struct AdvanceGather {
       for (int j = 0; j < D; j++) F_next.write(p, i * D + j, deformed[i][j]);
     }
     J_next.write(p, 0, advance_volume_ratio(l.J, L, l.dt));
+  }
+  __device__ void leave_out(int p) const {
+    const mpm::Vector<T, D> x = read_vector(position, p);
+    const T rest = is_finite<D>(x.e) ? T(0) : lost;
+#pragma unroll
+    for (int i = 0; i < D; i++) {
+      velocity.at(p, i) = rest;
+      x_next.at(p, i) = x[i];
+    }
+#pragma unroll
+    for (int k = 0; k < D * D; k++) {
+      affine.write(p, k, rest);
+      if (F.present()) F_next.at(p, k) = F.at(p, k);
+    }
+    if (J.present()) J_next.at(p) = J.at(p);
   }
 };
 

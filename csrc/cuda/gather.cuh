@@ -224,7 +224,8 @@ template <class Task>
 constexpr int kResident = Task::Order == 2 && sizeof(typename Task::T) == 4 ? Task::resident : 2;
 
 // Task: topology, nodes, position; load(p, scene), what it needs of a particle; compute(loaded, weights, support), what
-// the particle gets; write(p, loaded, result), with a result of zeros for particles outside.
+// the particle gets; write(p, loaded, result), with a result of zeros where positions are not those of the activation;
+// leave_out(p) for a particle outside.
 template <bool Quads, class Task>
 __device__ void gather_in_memory_order(const Task& task, const Schedule<const int>& schedule) {
   using T = typename Task::T;
@@ -239,7 +240,7 @@ __device__ void gather_in_memory_order(const Task& task, const Schedule<const in
     GridSupport<T, Task::K, D, Quads> support{task.nodes};
     T f[D];
     if (slot < 0 || !locate_at_home<Task::Order>(t, scene, home, x, support.base, f)) {
-      task.write(p, task.load(p, 0), typename Task::Result{});
+      task.leave_out(p);
       continue;
     }
     const auto loaded = task.load(p, scene);
@@ -318,7 +319,7 @@ __device__ void gather_by_items(const Task& task, const Schedule<const int>& sch
   const int64_t stride = int64_t(gridDim.x) * kGatherThreads;
   for (int64_t i = t.offsets[t.capacity] + int64_t(blockIdx.x) * kGatherThreads + threadIdx.x; i < t.particles;
        i += stride)
-    task.write(t.index[i], task.load(t.index[i], 0), typename Task::Result{});
+    task.leave_out(t.index[i]);
 }
 
 template <bool Quads, class Task>
@@ -365,6 +366,7 @@ struct FieldGather {
   Columns<T, K> value;
   Columns<T, K * D> moment, gradient;
   T moment_scale, gradient_scale;  // from cells
+  T lost;
 
   FieldGather(const GatherArguments<T, D>& a, int first)
       : topology(a.topology),
@@ -374,7 +376,8 @@ struct FieldGather {
         moment(channels_from(a.moment, first), D),
         gradient(channels_from(a.gradient, first), D),
         moment_scale(T(a.moment_scale * double(a.topology.geometry.dx))),
-        gradient_scale(a.topology.geometry.inverse_dx) {}
+        gradient_scale(a.topology.geometry.inverse_dx),
+        lost(T(a.lost)) {}
 
   __device__ Loaded load(int, int) const { return {}; }
   template <class Support>
@@ -393,6 +396,16 @@ struct FieldGather {
         moment.write(p, k * D + i, moment_scale * s.moment[k][i]);
         if (Gradient) gradient.write(p, k * D + i, gradient_scale * s.gradient[k][i]);
       }
+    }
+  }
+  __device__ void leave_out(int p) const {
+    const T nothing = is_finite<D>(read_vector(position, p).e) ? T(0) : lost;
+#pragma unroll
+    for (int k = 0; k < K; k++) value.write(p, k, nothing);
+#pragma unroll
+    for (int k = 0; k < K * D; k++) {
+      moment.write(p, k, nothing);
+      gradient.write(p, k, nothing);
     }
   }
 };
@@ -468,6 +481,7 @@ struct FieldPositionGradient {
 #pragma unroll
     for (int i = 0; i < D; i++) out.at(p, i) = more ? out.at(p, i) + r[i] : r[i];
   }
+  __device__ void leave_out(int p) const { write(p, {}, {}); }
 };
 
 template <int Order, class T, int D>
@@ -563,6 +577,7 @@ struct MomentumAdjoint {
       }
     }
   }
+  __device__ void leave_out(int p) const { write(p, {}, {}); }
 };
 
 template <int Order, class T, int D>

@@ -40,6 +40,14 @@ struct Geometry {
 
 inline namespace TORCH_MPM_ISA {
 
+template <int D, class T>
+MPM_HD bool is_finite(const T x[D]) {
+  bool finite = true;
+  MPM_UNROLL
+  for (int i = 0; i < D; i++) finite = finite && x[i] - x[i] == T(0);
+  return finite;
+}
+
 // Index of the base node along an axis, not yet rounded to an integer type: it may lie outside the lattice or be NaN.
 // S is T or a pack of T.
 template <int Order, class S, class T, int D>

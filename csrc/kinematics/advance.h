@@ -116,23 +116,39 @@ MPM_HD void advance_particle(const AdvanceArguments<T, D>& a, int64_t p) {
   if (a.J.pointer) store_scalar(a.J_next, p, advance_volume_ratio(load_scalar(a.J, p), C, dt));
 }
 
+// The velocity and the affine field that moved a particle. Those of a particle whose position is not finite are NaN and
+// count as zero: it stays as it is, and must not spoil the gradients of others.
+template <class T, int D>
+MPM_HD void load_motion(const AdvanceArguments<T, D>& a, int64_t p, Vector<T, D>& v, Matrix<T, D>& C) {
+  const bool moves = is_finite<D>(load_vector<T, D>(a.x, p).e);
+  MPM_UNROLL
+  for (int i = 0; i < D; i++) {
+    v[i] = moves ? a.velocity.pointer[p * a.velocity.stride[0] + i * a.velocity.stride[1]] : T(0);
+    MPM_UNROLL
+    for (int j = 0; j < D; j++)
+      C[i][j] = a.affine.pointer && moves
+                    ? a.affine.pointer[p * a.affine.stride[0] + i * a.affine.stride[1] + j * a.affine.stride[2]]
+                    : T(0);
+  }
+}
+
 template <class T, int D>
 MPM_HD void advance_particle_backward(const AdvanceBackwardArguments<T, D>& a, int64_t p) {
   const T dt = particle_dt(a.forward, p);
   const Vector<T, D> grad_x = load_vector<T, D>(a.grad_x, p);
+  Vector<T, D> v;
+  Matrix<T, D> C, grad_affine = zero_matrix<T, D>();
+  load_motion(a.forward, p, v, C);
   if (a.velocity.pointer) store_vector(a.velocity, p, dt * grad_x);
-  T grad_dt = dot(load_vector<T, D>(a.forward.velocity, p), grad_x);
-  Matrix<T, D> grad_affine = zero_matrix<T, D>();
+  T grad_dt = dot(v, grad_x);
   if (a.forward.F.pointer) {
-    const Matrix<T, D> F = load_matrix<T, D>(a.forward.F, p), C = load_matrix<T, D>(a.forward.affine, p),
-                       G = load_matrix<T, D>(a.grad_F, p);
+    const Matrix<T, D> F = load_matrix<T, D>(a.forward.F, p), G = load_matrix<T, D>(a.grad_F, p);
     if (a.F.pointer) store_matrix(a.F, p, G + dt * (transpose(C) * G));
     grad_affine = dt * (G * transpose(F));
     grad_dt = grad_dt + contract(C * F, G);
   }
   if (a.forward.J.pointer) {
-    const T J = load_scalar(a.forward.J, p), g = load_scalar(a.grad_J, p),
-            rate = trace(load_matrix<T, D>(a.forward.affine, p));
+    const T J = load_scalar(a.forward.J, p), g = load_scalar(a.grad_J, p), rate = trace(C);
     if (a.J.pointer) store_scalar(a.J, p, g + dt * rate * g);
     MPM_UNROLL
     for (int i = 0; i < D; i++) grad_affine[i][i] = grad_affine[i][i] + dt * J * g;

@@ -12,7 +12,8 @@ namespace {
 
 std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> activate(
     const Tensor& x, const OptionalTensor& scene, const OptionalTensor& previous_status, int64_t scenes, double dx,
-    std::vector<double> lower, std::vector<int64_t> blocks, int64_t order, int64_t capacity, bool deterministic) {
+    std::vector<double> lower, std::vector<int64_t> blocks, int64_t order, int64_t capacity, bool deterministic,
+    const OptionalTensor& ids) {
   STD_TORCH_CHECK(scenes >= 0, "scenes must not be negative, got ", scenes);
   STD_TORCH_CHECK(capacity >= 0, "capacity must not be negative, got ", capacity);
   Tensor table, block, offsets, index, status, schedule;
@@ -31,13 +32,21 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> activate(
     a.deterministic = deterministic;
     a.x = input<T>(x, "x", x, {x.size(0), D});
     set_scene(a, scene, x);
-    if (has(previous_status)) a.previous_status = int_pointer(*previous_status, "previous_status", x, {kStatusSize});
+    if (has(ids)) {
+      check_shape(*ids, "ids", {x.size(0)});
+      STD_TORCH_CHECK(ids->scalar_type() == ScalarType::Long && ids->device() == x.device(),
+                      "ids must be an int64 tensor on the device of x");
+      a.id = static_cast<const int64_t*>(ids->data_ptr());
+      a.id_stride = ids->stride(0);
+    }
+    if (has(previous_status))
+      a.previous_status = int_pointer(*previous_status, "previous_status", x, {1 + scenes, kStatusSize});
     a.schedule_size = schedule_size<D>(capacity, x.size(0));
     table = empty_int(x, {scenes * per_scene});
     block = empty_int(x, {capacity});
     offsets = empty_int(x, {capacity + 1});
     index = empty_int(x, {x.size(0)});
-    status = empty_int(x, {kStatusSize});
+    status = empty_int(x, {1 + scenes, kStatusSize});
     schedule = empty_int(x, {a.schedule_size});
     a.workspace_size = backend::activate_workspace(a);
     const Tensor workspace = empty(x, {a.workspace_size}, ScalarType::Byte);
@@ -74,8 +83,8 @@ Tensor cell_order(const Tensor& x, MPM_TOPOLOGY_PARAMETERS) {
 STABLE_TORCH_LIBRARY_FRAGMENT(torch_mpm, m) {
   m.def(
       "activate(Tensor x, Tensor? scene, Tensor? previous_status, int scenes, float dx, float[] lower, int[] blocks, "
-      "int order, int capacity, bool deterministic) -> (Tensor table, Tensor block, Tensor offsets, Tensor index, "
-      "Tensor schedule, Tensor status)");
+      "int order, int capacity, bool deterministic, Tensor? ids=None) -> (Tensor table, Tensor block, Tensor offsets, "
+      "Tensor index, Tensor schedule, Tensor status)");
   m.def("cell_order(Tensor x, " MPM_TOPOLOGY_SCHEMA ") -> Tensor");
 }
 #endif

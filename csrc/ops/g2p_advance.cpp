@@ -1,3 +1,5 @@
+#include <cmath>
+
 #include "ops/backend.h"
 
 #if MPM_BACKEND == MPM_BACKEND_IS_cpu
@@ -29,6 +31,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> g2p_advance(const Tensor& x, 
     check_shape(velocity, "velocity", {node_count<D>(block), D});
     a.gather.nodes = node_input<T>(velocity, "velocity", x, node_count<D>(block));
     a.gather.moment_scale = BSpline<Order>::inverse_inertia / (dx * dx);
+    a.gather.lost = NAN;
     a.gather.value = field<T>(v);
     if (affine) a.gather.moment = field<T>(C);
     a.F = input<T>(F, "F", x, {P, D, D});

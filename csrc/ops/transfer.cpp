@@ -1,3 +1,5 @@
+#include <cmath>
+
 #include "ops/backend.h"
 
 // P2G, G2P and the channel-wise scatter and gather below them.
@@ -101,8 +103,8 @@ Tensor scatter(const Tensor& x, const Tensor& value, const OptionalTensor& momen
   return nodes;
 }
 
-std::tuple<Tensor, Tensor, Tensor> gather(const Tensor& x, const Tensor& nodes, double moment_scale, bool moment,
-                                          bool gradient, MPM_TOPOLOGY_PARAMETERS) {
+std::tuple<Tensor, Tensor, Tensor> gather_with(const Tensor& x, const Tensor& nodes, double moment_scale, double lost,
+                                               bool moment, bool gradient, MPM_TOPOLOGY_PARAMETERS) {
   check_positions(x);
   check_rank(nodes, "nodes", 2);
   check_count(nodes.size(1), "nodes", "channels");
@@ -116,6 +118,7 @@ std::tuple<Tensor, Tensor, Tensor> gather(const Tensor& x, const Tensor& nodes, 
     a.x = input<T>(x, "x", x, {P, D});
     a.nodes = node_input<T>(nodes, "nodes", x, node_count<D>(block));
     a.moment_scale = moment_scale;
+    a.lost = lost;
     a.value = field<T>(value);
     if (moment) a.moment = field<T>(moments);
     if (gradient) a.gradient = field<T>(gradients);
@@ -124,13 +127,18 @@ std::tuple<Tensor, Tensor, Tensor> gather(const Tensor& x, const Tensor& nodes, 
   return {value, moments, gradients};
 }
 
+std::tuple<Tensor, Tensor, Tensor> gather(const Tensor& x, const Tensor& nodes, double moment_scale, bool moment,
+                                          bool gradient, MPM_TOPOLOGY_PARAMETERS) {
+  return gather_with(x, nodes, moment_scale, 0, moment, gradient, MPM_TOPOLOGY_ARGUMENTS, order, deterministic);
+}
+
 std::tuple<Tensor, Tensor, Tensor> g2p(const Tensor& x, const Tensor& velocity, bool affine, bool gradient,
                                        MPM_TOPOLOGY_PARAMETERS) {
   check_positions(x);
   check_rank(block, "block", 1);
   check_shape(velocity, "velocity", {x.size(1) == 2 ? node_count<2>(block) : node_count<3>(block), x.size(1)});
   const double inverse_inertia = (order == 2 ? BSpline<2>::inverse_inertia : BSpline<3>::inverse_inertia) / (dx * dx);
-  return gather(x, velocity, inverse_inertia, affine, gradient, MPM_TOPOLOGY_ARGUMENTS, order, deterministic);
+  return gather_with(x, velocity, inverse_inertia, NAN, affine, gradient, MPM_TOPOLOGY_ARGUMENTS, order, deterministic);
 }
 
 Tensor position_gradient(const Tensor& x, const Tensor& value, const OptionalTensor& moment,

@@ -77,7 +77,8 @@ struct GatherArguments {
   Field<const T> x;
   NodeField<const T> nodes;
   double moment_scale = 1;
-  Field<T> value, moment, gradient;  // absent where not wanted; zero for particles outside
+  double lost = 0;                   // what a particle gets whose position is not finite
+  Field<T> value, moment, gradient;  // absent where not wanted; zero for other particles outside
 };
 
 // ∂Φ/∂x_p of the trilinear form Φ = Σ_p Σ_i g_i · [N_i (value_p + scale moment_p (x_i − x_p)) + gradient_p ∇N_i] that
@@ -108,7 +109,9 @@ struct ActivateArguments {
   Field<const T> x;
   const int* scene = nullptr;  // [P] or null for one scene
   int64_t scene_stride = 0;
-  const int* previous_status = nullptr;  // [8] or null
+  const int64_t* id = nullptr;  // [P] or null
+  int64_t id_stride = 0;
+  const int* previous_status = nullptr;  // [1 + scenes, 8] or null
   int *table = nullptr, *block = nullptr, *offsets = nullptr, *index = nullptr, *schedule = nullptr, *status = nullptr;
   int64_t schedule_size = 0;
   void* workspace = nullptr;  // bytes asked for by activate_workspace()

@@ -23,9 +23,10 @@ def _activate_fake(
     order: int,
     capacity: int,
     deterministic: bool,
+    ids: Tensor | None = None,
 ) -> tuple[Tensor, ...]:
-    def ints(n: int) -> Tensor:
-        return x.new_empty(n, dtype=torch.int32)
+    def ints(*shape: int) -> Tensor:
+        return x.new_empty(shape, dtype=torch.int32)
 
     P, dim = x.shape
     schedule = 16 + (8 + 4**dim // 2) * (capacity + P // 128) + P  # csrc/transfer/arguments.h
@@ -35,7 +36,7 @@ def _activate_fake(
         ints(capacity + 1),
         ints(x.shape[0]),
         ints(schedule),
-        ints(8),
+        ints(1 + scenes, 8),
     )
 
 

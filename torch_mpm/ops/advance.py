@@ -114,6 +114,9 @@ def _double_backward(ctx, *grads):
         dt = torch.tensor(ctx.dt, dtype=x.dtype, device=x.device)
         dt = dt.expand(x.shape[0]) if scene_dt is None else dt * per_particle(scene_dt, scene, x.shape[0])
         step = dt[:, None, None]
+        lost = ~x.isfinite().all(1)
+        v = v.masked_fill(lost[:, None], 0)
+        C = None if C is None else C.masked_fill(lost[:, None, None], 0)
         out_v, out_dt = dt[:, None] * grad_x, (v * grad_x).sum(1)
         out_C = out_F = out_J = None
         if C is not None:

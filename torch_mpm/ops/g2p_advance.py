@@ -24,7 +24,7 @@ def g2p_advance(
     affine: bool = True,
     stress_form: str = "mls",
 ) -> tuple[Tensor, Tensor, Tensor | None, Tensor | None, Tensor | None]:
-    """The end of a step: `g2p`, and `advance` with what it gave. Equal to the two but for rounding, and faster.
+    """The end of a step: `g2p`, and `advance` with what it gave, but for rounding and particles outside, and faster.
 
     Args:
         blocks: active blocks of these positions.
@@ -38,7 +38,7 @@ def g2p_advance(
 
     Returns:
         x at the end of the step, v [m/s], C [1/s] or None, F and J at the end of the step (None where not given).
-        Particles outside the grid stay as they are, with v and C zero.
+        Particles outside the grid stay as they are, with v and C zero, or NaN where the position is not finite.
 
     Raises:
         ValueError, TypeError: for wrong shapes, dtypes, devices, or dt ≤ 0.

@@ -100,7 +100,8 @@ def g2p(
         gradient: whether ∇v is wanted.
 
     Returns:
-        v [P, D] [m/s], C [P, D, D] [1/s] or None, ∇v [P, D, D] [1/s] or None; zero for particles outside the grid.
+        v [P, D] [m/s], C [P, D, D] [1/s] or None, ∇v [P, D, D] [1/s] or None; for particles outside the grid zero, or
+        NaN where the position is not finite. No gradient passes through either.
 
     Raises:
         ValueError, TypeError: for wrong shapes, dtypes or devices.
@@ -163,7 +164,8 @@ def gather(
         moment_scale: s; `grid.inverse_inertia` makes the moment the APIC affine field.
 
     Returns:
-        value [P, K] [u], moment [P, K, D] [s u m] or None, gradient [P, K, D] [u/m] or None.
+        value [P, K] [u], moment [P, K, D] [s u m] or None, gradient [P, K, D] [u/m] or None; zero for particles
+        outside the grid or without a finite position.
 
     Raises:
         ValueError, TypeError: for wrong shapes, dtypes or devices.

@@ -141,7 +141,9 @@ def p2g(
 
 def g2p(blocks: Blocks, x: Tensor, velocity: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """v, C = D⁻¹ Σ N_i v_i (x_i − x_p)ᵀ and ∇v of each particle; see `torch_mpm.ops.g2p`."""
-    return gather(blocks, x, velocity, blocks.grid.inverse_inertia)
+    lost = torch.where(x.isfinite().all(1), 0.0, torch.nan)
+    v, C, gradient = gather(blocks, x, velocity, blocks.grid.inverse_inertia)
+    return v + lost[:, None], C + lost[:, None, None], gradient + lost[:, None, None]
 
 
 def dense_blocks(blocks: Blocks) -> Blocks:

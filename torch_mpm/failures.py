@@ -1,0 +1,221 @@
+"""What went wrong in which scene: kept on the device without waiting for it, and told in words."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from .errors import GridOverflowError, SimulationError
+
+if TYPE_CHECKING:
+    from .grid import Grid
+    from .materials import Material
+    from .state import State
+
+NAMED = 12
+"""Scenes that a message names of each kind of problem."""
+CONSEQUENCES = ("velocity", "deformation")
+"""Kinds that a message leaves out where a scene has another problem, of which they mostly are consequences."""
+CHECK_DT = "the time step was probably too large; compare dt with step.stable_dt(state)"
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Problem:
+    """One kind of problem in each of B scenes; tensors [B] on the device of the particles.
+
+    Attributes:
+        count: how many: particles when it was found first; steps so far for "dt", solves so far for "heat". 0 for none.
+        what, advice: words for the problem and for what to do.
+        first: lowest index of these particles then, -1 for none; None for what is not about particles.
+        id: id of that particle, its index where the state had no ids.
+        step: in which step it was found first, counted from 0, -1 for none; None where this is not known.
+        size: how large the worst one is, and
+        size_in_words: a format for it.
+    """
+
+    count: Tensor
+    what: str
+    advice: str
+    first: Tensor | None = None
+    id: Tensor | None = None
+    step: Tensor | None = None
+    size: Tensor | None = None
+    size_in_words: str = ""
+
+    def told(self, others: Sequence[bool]) -> str:
+        """A sentence about the scenes that have it, but not about `others`; "" for none. Synchronises."""
+        counts = self.count.tolist()
+        scenes = [b for b, count in enumerate(counts) if count and not others[b]]
+        if not scenes:
+            return ""
+        first, identity, step, size = (
+            None if t is None else t.tolist() for t in (self.first, self.id, self.step, self.size)
+        )
+        parts = []
+        for b in scenes[:NAMED]:
+            details = [] if step is None else [f"first at step {step[b]}"]
+            if first is not None and identity is not None:
+                details.append(f"lowest index {first[b]}" + (f", id {identity[b]}" if identity[b] != first[b] else ""))
+            if size is not None:
+                details.append(self.size_in_words.format(size[b]))
+            parts.append(f"{counts[b]} in scene {b}" + (f" ({', '.join(details)})" if details else ""))
+        if len(scenes) > NAMED:
+            parts.append(f"and more in {len(scenes) - NAMED} other scenes")
+        return f"{sum(counts[b] for b in scenes)} {self.what}: {'; '.join(parts)}: {self.advice}"
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Failures:
+    """Which scenes went wrong, and how.
+
+    Attributes:
+        failed: whether a scene has any problem, bool [B] on the device of the particles.
+        problems: each kind that was looked for:
+            "not_finite": particles whose position is NaN or infinite,
+            "outside": particles that left the grid,
+            "dt": steps whose entry of a tensor dt was negative or NaN,
+            "heat_data", "heat": solves of heat without a result, or that missed their tolerance,
+            and of the state given "mass", "volume", "velocity" and "deformation".
+    """
+
+    failed: Tensor
+    problems: dict[str, Problem]
+
+    @staticmethod
+    def of(problems: dict[str, Problem], like: Tensor) -> Failures:
+        """Failures of B scenes; `like` is a tensor [B] on their device."""
+        failed = torch.zeros_like(like, dtype=torch.bool)
+        for problem in problems.values():
+            failed = failed | (problem.count > 0)
+        return Failures(failed, problems)
+
+    def sentences(self) -> list[str]:
+        """One for each kind of problem that there is; synchronises."""
+        others, told = [False] * len(self.failed), []
+        for kind, problem in sorted(self.problems.items(), key=lambda item: item[0] in CONSEQUENCES):
+            sentence = problem.told(others if kind in CONSEQUENCES else [False] * len(others))
+            if sentence:
+                told.append(sentence)
+                others = [a or count > 0 for a, count in zip(others, problem.count.tolist(), strict=True)]
+        return told
+
+
+def problems_of_status(statuses: Iterable[Tensor], grid: Grid) -> dict[str, Problem]:
+    """What status tensors [1 + B, 8] of `activate` tell about scenes; the first of them that has a problem counts."""
+    rows: Tensor | None = None
+    for status in statuses:
+        rows = status[1:] if rows is None else torch.where(rows[:, 6:7] >= 0, rows, status[1:])
+    if rows is None:
+        return {}
+    first_id, outside, first_outside, lost, first_lost, _, step, lost_id = rows.unbind(1)
+    domain = f"particles left the grid [{grid.lower}, {grid.upper}]"
+    return {
+        "not_finite": Problem(
+            lost, "particles have a position that is NaN or infinite", CHECK_DT, first_lost, lost_id, step
+        ),
+        "outside": Problem(
+            outside, domain, "enlarge the domain, add walls, or reduce dt", first_outside, first_id, step
+        ),
+    }
+
+
+def problems_of_state(law: Material, state: State, scenes: int) -> dict[str, Problem]:
+    """What a state tells that has all fields that the law needs."""
+
+    def problem(bad: Tensor, what: str, advice: str) -> Problem:
+        index = torch.arange(len(state), device=bad.device)
+        scene = torch.zeros_like(index) if state.scene is None else state.scene.long()
+        bad = bad & (scene >= 0) & (scene < scenes)
+        scene = torch.where(bad, scene, scenes)  # the rest goes to a scene that is cut off
+        count = index.new_zeros(scenes + 1).index_add_(0, scene, bad.long())[:-1]
+        first = index.new_full((scenes + 1,), len(state)).scatter_reduce_(0, scene, index, "amin")[:-1]
+        first = torch.where(count > 0, first, -1)
+        identity = first
+        if state.ids is not None and len(state):
+            identity = torch.where(count > 0, state.ids[first.clamp_min(0)], -1)
+        return Problem(count, f"particles {what}", advice, first, identity)
+
+    def not_positive(value: Tensor) -> Tensor:
+        return ~((value > 0) & (value < torch.inf))
+
+    return {
+        "mass": problem(
+            not_positive(state.mass),
+            "have a mass that is not positive and finite",
+            "give each particle its mass; a tracer needs none, as g2p gathers the velocity at any position",
+        ),
+        "volume": problem(
+            not_positive(state.volume),
+            "have a rest volume that is not positive and finite",
+            "give each particle its volume without deformation",
+        ),
+        "velocity": problem(~state.v.isfinite().all(1), "have a velocity that is NaN or infinite", CHECK_DT),
+        "deformation": problem(
+            law.invalid(state),
+            "are inverted or not finite",
+            "the time step was too large or the load crushed the material; compare dt with step.stable_dt(state)",
+        ),
+    }
+
+
+def refused_steps(count: Tensor) -> Problem:
+    """Steps of each scene [B] whose dt could not be taken."""
+    return Problem(
+        count,
+        "steps had a dt that was negative or NaN, so that the scene was paused",
+        "give each scene a dt that is positive, or zero to pause it",
+    )
+
+
+def unsolved_heat(unsolved: Tensor, residual: Tensor, iterations: int) -> dict[str, Problem]:
+    """Solves of heat of each scene that failed, [B], and their largest residual [B] [K], NaN for those without data."""
+    without = residual.isnan()
+    return {
+        "heat_data": Problem(
+            torch.where(without, unsolved, 0),
+            "solves of heat had no result",
+            "a temperature, a conductivity or a boundary is not finite, or a conductivity is negative",
+        ),
+        "heat": Problem(
+            torch.where(without, 0, unsolved),
+            "solves of heat missed their tolerance",
+            "reduce dt, or raise max_iterations or tolerance",
+            size=residual,
+            size_in_words=f"a residual of {{:.3g}} K was left after {iterations} iterations",
+        ),
+    }
+
+
+def raise_failures(failures: Failures, statuses: Iterable[Tensor], grid: Grid) -> None:
+    """Raise one error for all problems of scenes, particles without a scene and a full grid; synchronises.
+
+    Raises:
+        SimulationError: with the failures as its attribute.
+        GridOverflowError: where a full grid is the only problem.
+    """
+    sentences, full = failures.sentences(), ""
+    for status in statuses:  # of which the later ones go on from the others
+        total, *scenes = status.tolist()
+        peak, outside, _, lost, _, _, step, _ = total
+        for row in scenes:
+            if row[6] == step:  # found in the same activation, so counted there too
+                outside, lost = outside - row[1], lost - row[3]
+        if outside + lost > 0:
+            sentences.append(
+                f"{outside + lost} particles have a scene that is not among the {grid.scenes} of the grid, first at "
+                f"step {step}: give each particle a scene from 0 to {grid.scenes - 1}"
+            )
+        if grid.capacity is not None and peak > grid.capacity:
+            when = "" if outside + lost > 0 or any(row[6] >= 0 for row in scenes) else f", first at step {step}"
+            full = (
+                f"{peak} blocks were active but the grid has a capacity of {grid.capacity}{when}: "
+                "pass a larger capacity, or None to let it grow"
+            )
+    if sentences:
+        raise SimulationError("\n".join(sentences + [full] * bool(full)), failures)
+    if full:
+        raise GridOverflowError(full, failures)

@@ -1,0 +1,55 @@
+"""Scenes that stand still: those whose entry of a tensor dt is zero, or is none that a step could take."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from .ops.arguments import per_particle, split_dt
+from .state import State
+
+FIELDS = tuple(f.name for f in dataclasses.fields(State) if f.name not in ("extra", "time"))
+
+
+def split_paused(dt: Tensor, state: State, scenes: int) -> tuple[Tensor, Tensor, Tensor]:
+    """A tensor dt [s] with zero for every scene that stands still, without synchronising.
+
+    Args:
+        dt: of shape [], [1] or [B].
+        state: the particles.
+        scenes: B.
+
+    Returns:
+        dt in its shape; which particles move, bool [P]; and which entries of dt were negative or NaN, in the shape of
+        dt.
+
+    Raises:
+        ValueError: for a wrong shape or device.
+    """
+    split_dt(dt, scenes, state.x)
+    moving, refused = dt > 0, ~(dt >= 0)
+    if dt.numel() <= 1:  # also the particles of a batch without scenes, which no step moves
+        particles = moving.reshape(-1)[:1].expand(len(state)) if dt.numel() else dt.new_zeros(len(state)).bool()
+    else:
+        assert state.scene is not None
+        particles = per_particle(moving, state.scene.clamp(0, scenes - 1), len(state))
+    return torch.where(moving, dt, 0), particles, refused
+
+
+def standing(before: State, after: State, moving: Tensor) -> State:
+    """The state after a step with every field as before it for the particles that do not move; differentiable.
+
+    Fields that the step has made, such as C at the first one, are zero there.
+    """
+
+    def field(old: Tensor | None, new: Any) -> Any:
+        if new is old or not isinstance(new, Tensor):
+            return new
+        rows = moving.reshape(-1, *(1,) * (new.dim() - 1))
+        return torch.where(rows, new, torch.zeros_like(new) if old is None else old)
+
+    extra = {name: field(before.extra.get(name), new) for name, new in after.extra.items()}
+    return after.replace(**{name: field(getattr(before, name), getattr(after, name)) for name in FIELDS}, extra=extra)
