@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
@@ -10,7 +11,7 @@ import torch
 from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint as run_checkpointed
 
-from .boundaries import Walls
+from .boundaries import Obstacle, Walls
 from .capture import Kept
 from .cfl import stable_dt
 from .errors import GridOverflowError, SimulationError
@@ -182,7 +183,19 @@ class Step(nn.Module):
     def stable_dt(self, state: State, cfl: float = 0.5) -> Tensor:
         """Largest stable time step of each scene [s], [B], times `cfl`; see `torch_mpm.cfl.stable_dt`."""
         transfer = "flip" if self.flip else self.transfer
-        return stable_dt(self.grid, self.law, self.prepare(state), cfl, transfer, self.stress_form)
+        return stable_dt(
+            self.grid, self.law, self.prepare(state), cfl, transfer, self.stress_form, self._obstacle_speed(state)
+        )
+
+    def _obstacle_speed(self, state: State) -> Tensor | None:
+        """Largest speed of the obstacles that a particle may touch [P] [m/s]; None where none moves."""
+        reach = 2 * math.sqrt(self.grid.dim) * self.grid.dx  # of a particle's nodes
+        speeds = [
+            boundary.speed(state.x, state.scene, state.time, reach)
+            for boundary in self.boundaries
+            if isinstance(boundary, Obstacle) and boundary.moves
+        ]
+        return torch.stack(speeds).amax(0) if speeds else None
 
     @property
     def status(self) -> Tensor | None:
