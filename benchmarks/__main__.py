@@ -30,6 +30,7 @@ PROGRAMS = (
     "benchmarks.accuracy.runout",
     "benchmarks.stability.stable_dt",
     "benchmarks.stability.law_dt",
+    "benchmarks.stability.adversarial",
     "benchmarks.stability.heat",
     "benchmarks.stability.sand",
     "benchmarks.stability.collapse",

@@ -202,6 +202,13 @@ def test_no_law_is_unstable_below_its_estimate(tmp_path: Path) -> None:
     assert all(1 <= case["stable"] < 10 for case in cases)
 
 
+def test_random_rollouts_program(tmp_path: Path) -> None:
+    run_quick("benchmarks.stability.adversarial", tmp_path)
+    rows = result(tmp_path, "adversarial.json")["rows"]
+    assert len({row["motion"] for row in rows}) == 10
+    assert not any(row["inverted"] or row["flattened"] or row["not finite"] for row in rows)
+
+
 def test_svd_program(tmp_path: Path) -> None:
     run_quick("benchmarks.accuracy.svd", tmp_path)
     for row in result(tmp_path, "svd_accuracy.json")["rows"]:

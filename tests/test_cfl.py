@@ -192,10 +192,12 @@ def test_needs_no_synchronisation(device: str) -> None:
         pytest.skip("only a GPU can be synchronised with")
     grid = mpm.Grid(dx=0.1, lower=(0, 0), upper=(1, 1), scenes=3)
     law, state = mpm.NeoHookean(E=1e5, nu=0.3), at_rest(grid, device)
-    mpm.stable_dt(grid, law, state)
+    plate = mpm.Plane((0.5, 0.4), (0.0, 1.0), velocity=(0.0, 1.0), angular_velocity=1.0)
+    step = mpm.Step(grid, law, boundaries=[plate])
+    step.stable_dt(state)
     torch.cuda.set_sync_debug_mode("error")
     try:
-        mpm.stable_dt(grid, law, state)
+        step.stable_dt(state)
         law.update(state)
     finally:
         torch.cuda.set_sync_debug_mode("default")

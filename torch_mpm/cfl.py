@@ -81,8 +81,8 @@ def stable_dt(
         speed: of the obstacles near each particle [P] [m/s], or None; `Step.stable_dt` gives it.
 
     Returns:
-        dt [B] [s], constant for autograd; inf for a scene without particles, or without stiffness, viscosity and
-        speed. A particle without mass makes it zero; one that is not finite is left out.
+        dt [B] [s], constant for autograd; inf for a scene without particles, or without stress, stiffness,
+        viscosity and speed. A particle without mass makes it zero; one that is not finite is left out.
 
     Raises:
         ValueError: for a cfl that is not positive and finite, or an unknown stress form.
