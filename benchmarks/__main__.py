@@ -28,6 +28,7 @@ PROGRAMS = (
     "benchmarks.accuracy.sand_gradient",
     "benchmarks.accuracy.ritter",
     "benchmarks.accuracy.runout",
+    "benchmarks.accuracy.limits",
     "benchmarks.stability.stable_dt",
     "benchmarks.stability.law_dt",
     "benchmarks.stability.adversarial",

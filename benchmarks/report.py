@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from . import common
+from .accuracy.limits import tables as limit_tables
 from .accuracy.runout import PUBLISHED, published, slopes
 from .stability.adversarial import summary as rollouts
 from .stability.heat import cell as heat_cell
@@ -189,6 +190,15 @@ def collapse(result: dict[str, Any]) -> str:
         "`step.stable_dt(state, cfl=1)` (benchmarks/stability/collapse.py); energy relative to the first."
     )
     return "\n\n".join([intro, common.table(header, rows)])
+
+
+def limits(result: dict[str, Any]) -> str:
+    """What the method loses."""
+    intro = (
+        "A disc that spins freely, a disc that bounces off a wall, blocks on an incline of 30°, and the gradient of "
+        "R = U Vᵀ through `svd3` (benchmarks/accuracy/limits.py); what follows from them: docs/limitations.md."
+    )
+    return "\n\n".join([intro, *limit_tables(result).values(), f"- {common.describe(result['environment'])}"])
 
 
 def adversarial(result: dict[str, Any]) -> str:
@@ -368,6 +378,7 @@ def sections(directory: Path) -> dict[str, str]:
         ("stability", "Stability", stability),
         ("stability_laws", "Stability of every law", stability_laws),
         ("adversarial", "Stability of random rollouts", adversarial),
+        ("limits", "What the method loses", limits),
         ("svd_accuracy", "Singular values", svd_accuracy),
         ("sand_accuracy", "Sand: return map", sand_accuracy),
         ("sand_gradient", "Sand: gradients", sand_gradient),
