@@ -42,8 +42,8 @@ class Step(nn.Module):
         gravity: [m/s²]; D numbers, or a tensor [D] or [B, D] that may require grad; None for none.
         walls: "slip", "sticky", "separate" or "mirror" on every face of the domain, a `Walls` that says more, or None.
         boundaries: obstacles with the interface of `torch_mpm.boundaries`, applied in order.
-        transfer: "apic" (Jiang et al. 2015), "pic", or "flip". All keep momentum; only "apic" keeps angular momentum, and
-            "pic" damps strongly (docs/limitations.md).
+        transfer: "apic" (Jiang et al. 2015), "pic", or "flip". All keep momentum; only "apic" keeps angular momentum
+            too, and "pic" damps strongly (docs/limitations.md).
         flip: share of FLIP in [0, 1] that "apic" or "pic" is blended with; 1 for transfer="flip".
         stress_form: "mls" (Hu et al. 2018; F moves with C) or "gradient" (force −V τ ∇N; F moves with Σ v_i ∇N_i).
         on_grid: called as `velocity = on_grid(blocks, velocity, mass, dt)` with node tensors [N, D] and [N] after the
