@@ -315,6 +315,14 @@ class Wheel(bdist_wheel):
     def get_tag(self) -> tuple[str, str, str]:
         return "py3", "none", super().get_tag()[2]
 
+    def run(self) -> None:
+        if os.environ.get("TORCH_MPM_SKIP_BUILD") == "1":
+            raise SystemExit(
+                "TORCH_MPM_SKIP_BUILD=1 leaves the libraries out, and a wheel without them does not work: unset it, or "
+                "link an environment to the sources with `pip install -e .` and run `make build`"
+            )
+        super().run()
+
 
 setup(
     ext_modules=[Extension("torch_mpm._math", ["csrc/math/python_module.cpp"], optional=True)],

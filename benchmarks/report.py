@@ -14,7 +14,9 @@ from pathlib import Path
 from typing import Any
 
 from . import common
+from .accuracy.limits import tables as limit_tables
 from .accuracy.runout import PUBLISHED, published, slopes
+from .stability.adversarial import summary as rollouts
 from .stability.heat import cell as heat_cell
 from .stability.heat import kind as heat_kind
 
@@ -190,6 +192,30 @@ def collapse(result: dict[str, Any]) -> str:
     return "\n\n".join([intro, common.table(header, rows)])
 
 
+def limits(result: dict[str, Any]) -> str:
+    """What the method loses."""
+    intro = (
+        "A disc that spins freely, a disc that bounces off a wall, blocks on an incline of 30°, and the gradient of "
+        "R = U Vᵀ through `svd3` (benchmarks/accuracy/limits.py); what follows from them: docs/limitations.md."
+    )
+    return "\n\n".join([intro, *limit_tables(result).values(), f"- {common.describe(result['environment'])}"])
+
+
+def adversarial(result: dict[str, Any]) -> str:
+    """Random rollouts at the limit of the time step."""
+    intro = (
+        f"Rollouts of {result['steps']} steps made at random to turn particles inside out, at up to three times the "
+        "speed of sound (benchmarks/stability/adversarial.py), with dt = `step.stable_dt(state, cfl)` taken anew at "
+        "every step; how many of them went wrong, by cfl. Flattened: a particle's stretch fell below rounding before "
+        "its sign was lost, which a law of finite energy cannot prevent. Energy: above 1.1 of the first in a closed "
+        "system without FLIP."
+    )
+    parts = [intro, rollouts(result["rows"], "law")]
+    if "before" in result:
+        parts += ["The same with the linear limit alone:", rollouts(result["before"]["rows"], "law")]
+    return "\n\n".join([*parts, f"- {common.describe(result['environment'])}"])
+
+
 def small_matrices(results: list[dict[str, Any]]) -> str:
     """Times of the decomposition and of the return map."""
     names = list(dict.fromkeys(row["name"] for result in results for row in result["times"]))
@@ -351,6 +377,8 @@ def sections(directory: Path) -> dict[str, str]:
         ("precision", "Precision", precision),
         ("stability", "Stability", stability),
         ("stability_laws", "Stability of every law", stability_laws),
+        ("adversarial", "Stability of random rollouts", adversarial),
+        ("limits", "What the method loses", limits),
         ("svd_accuracy", "Singular values", svd_accuracy),
         ("sand_accuracy", "Sand: return map", sand_accuracy),
         ("sand_gradient", "Sand: gradients", sand_gradient),

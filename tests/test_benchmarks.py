@@ -135,6 +135,21 @@ def test_richardson() -> None:
     assert ritter.extrapolate([1.0, 1.5, 2.0], lambda value: value) is None
 
 
+def test_limits_program(tmp_path: Path) -> None:
+    run_quick("benchmarks.accuracy.limits", tmp_path)
+    found = result(tmp_path, "limits.json")
+    for row in found["spins"]:
+        assert row["momentum"] < 1e-13
+        kept = row["angular momentum"]
+        assert abs(kept - 1) < 1e-12 if row["transfer"] == "apic" else kept < 1
+    sliding, sticking = found["inclines"][0], found["inclines"][-1]
+    assert sliding["speed"] == pytest.approx(sliding["rigid"], rel=0.02)
+    assert abs(sticking["speed"]) < 0.01
+    errors = {row["gap"]: row for row in found["vectors"] if row["dtype"] == "float32"}
+    assert errors[1e-6]["error"] > 1e3 * errors[1e-2]["error"]
+    assert all(row["polar"] < 1e-6 for row in errors.values())
+
+
 @pytest.mark.parametrize("program", ["convergence", "precision", "ritter"])
 def test_accuracy_program(program: str, tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
@@ -200,6 +215,13 @@ def test_no_law_is_unstable_below_its_estimate(tmp_path: Path) -> None:
     cases = result(tmp_path, "stability_laws.json")["cases"]
     assert {case["law"] for case in cases} == set(LAWS) - {"neo-Hookean"}
     assert all(1 <= case["stable"] < 10 for case in cases)
+
+
+def test_random_rollouts_program(tmp_path: Path) -> None:
+    run_quick("benchmarks.stability.adversarial", tmp_path)
+    rows = result(tmp_path, "adversarial.json")["rows"]
+    assert len({row["motion"] for row in rows}) == 10
+    assert not any(row["inverted"] or row["flattened"] or row["not finite"] for row in rows)
 
 
 def test_svd_program(tmp_path: Path) -> None:

@@ -203,7 +203,8 @@ class Obstacle:
 
     At a node inside, the velocity relative to the surface there loses all of itself ("sticky"), its normal component
     ("slip"), or its normal component where it points into the body ("separate"). Coulomb friction then lowers the
-    tangential speed by `friction` times the normal velocity that was stopped.
+    tangential speed by `friction` times the normal velocity that was stopped. A vibrating body needs more friction to
+    stick than a rigid one (docs/limitations.md).
 
     Args:
         position: centre (or a point of the plane) at time `start` [m]: D numbers, a tensor [D] or [B, D], or a function
@@ -337,6 +338,29 @@ class Obstacle:
         present = self._present(scene, time)
         return distance if present is None else torch.where(present, distance, torch.inf)
 
+    @property
+    def moves(self) -> bool:
+        """Whether its surface ever has a velocity."""
+        return self._follows_path or self.velocity is not None or self.angular_velocity is not None
+
+    @property
+    def _follows_path(self) -> bool:
+        return not isinstance(self.position, Tensor) and callable(self.position)
+
+    def speed(self, positions: Tensor, scene: Tensor | None, time: float | Tensor, reach: float) -> Tensor:
+        """Speed of the body's matter at positions no further than `reach` [m] outside, else zero [N] [m/s].
+
+        Other arguments as `apply`.
+        """
+        velocity = None
+        if positions.shape[0] and not self._absent(scene, time):
+            arm = positions - _per_node(self._centre(time, positions), 1, scene)
+            velocity = self._surface_velocity(arm, scene, time)
+        if velocity is None:
+            return positions.new_zeros(positions.shape[:1])
+        near = self.signed_distance(positions, scene, time) <= reach
+        return torch.where(near, velocity.norm(dim=-1), 0)
+
     def pose(self, time: float | Tensor, like: Tensor | None = None) -> Pose:
         """Centre and rotation at a time [s], a number or a tensor [] or [B]; with the dtype and device of `like`."""
         like = torch.empty(0, dtype=torch.float64) if like is None else like
@@ -401,7 +425,7 @@ class Obstacle:
 
     def _centre(self, time: float | Tensor, like: Tensor) -> Tensor:
         """[D] or [B, D]."""
-        if not isinstance(self.position, Tensor) and callable(self.position):
+        if self._follows_path:
             return self._path(time, like)[0]
         position = self.parameter("position", like, (_length(self.position),))
         if self.velocity is None:
@@ -431,7 +455,7 @@ class Obstacle:
     def _surface_velocity(self, arm: Tensor, scene: Tensor | None, time: float | Tensor) -> Tensor | None:
         """Velocity of the body's matter at the nodes, `arm` [N, D] away from the centre; None at rest."""
         result = None
-        if not isinstance(self.position, Tensor) and callable(self.position):
+        if self._follows_path:
             result = _per_node(self._path(time, arm)[1], 1, scene)
         elif self.velocity is not None:
             result = _per_node(self.parameter("velocity", arm, arm.shape[1:]), 1, scene)

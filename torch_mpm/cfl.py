@@ -15,10 +15,23 @@ advanced by v ← s v − dt λ_e u − dt λ_v v, u ← u + dt v, which is stab
 With APIC the stiffest modes are kept whole: a mode of y λ, y ≤ 1, has s ≥ y, and y = 1 is the worst case, so s = 1
 gives the limit; it is dx/c with ρ c² = a for the quadratic MLS form. PIC and FLIP may lose the stiffest modes: s = 0.
 An isolated particle reaches the limit (tests/test_cfl.py). Speed is added so that none moves by more than dx in a step.
+
+That is the linear limit. A step must not turn a particle inside out either: it multiplies F by I + dt ∇v, or J by
+1 + dt tr ∇v, so that changes of more than one in a step change the sign. With the velocity v_p + C_p (x_i − x_p) and
+the stress τ_p of each particle on the nodes, the bound on |∇v| above gives, for particles that are alike,
+
+    |∇v| ≤ g + dt h,   g² = Λ |v_p|²/dx² + |C_p|²,   h = |τ_p| V_p Λ/(m_p dx²),
+
+and |tr ∇v| at most √D times that. dt (g + dt h) may be a half: no stretch and no volume loses more than half of itself
+in a step, else the pressure of a fluid would rise by orders of magnitude at once. Speeds are those of particles and of
+the obstacles near them; two bodies that meet have both. Near rest and below a third of the speed of sound (fluids: a
+fifth) this is no limit. It is a bound where neighbours are alike, and was measured where they are not
+(benchmarks/stability/adversarial.py).
 """
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
 
 import torch
@@ -38,45 +51,82 @@ GRADIENT_BOUND = {
     ("gradient", "cubic"): 3.137,
 }
 
+LARGEST_CHANGE = 0.5
+"""Of a stretch or of the volume of a particle in one step."""
+
 
 @torch.no_grad()
 def stable_dt(
-    grid: Grid, law: Material, state: State, cfl: float = 1.0, transfer: str = "apic", stress_form: str = "mls"
+    grid: Grid,
+    law: Material,
+    state: State,
+    cfl: float = 1.0,
+    transfer: str = "apic",
+    stress_form: str = "mls",
+    speed: Tensor | None = None,
 ) -> Tensor:
     """Estimate of the largest stable time step of each scene, times `cfl`, without synchronising with the device.
+
+    With cfl = 1 and dt taken anew at every step no rollout of the stability benchmark turned a particle inside out;
+    keep 0.5, the default of `Step.stable_dt`, where dt is taken less often or something else acts on the grid.
 
     Args:
         grid: the lattice.
         law: the material, for its `stiffness` and `viscosity`.
         state: the particles.
-        cfl: fraction of the limit, positive. The limit holds for the current deformation, which a step may stiffen.
+        cfl: fraction of the limit, positive and finite. The limit holds for the current state, which a step may
+            stiffen.
         transfer: "apic"; anything else is limited as "pic" is.
         stress_form: "mls" or "gradient".
+        speed: of the obstacles near each particle [P] [m/s], or None; `Step.stable_dt` gives it.
 
     Returns:
-        dt [B] [s], constant for autograd; inf for a scene without particles, or without stiffness, viscosity and
-        speed. A particle without mass makes it zero; one that is not finite is left out.
+        dt [B] [s], constant for autograd; inf for a scene without particles, or without stress, stiffness,
+        viscosity and speed. A particle without mass makes it zero; one that is not finite is left out.
 
     Raises:
-        ValueError: for a cfl that is not positive, or an unknown stress form.
+        ValueError: for a cfl that is not positive and finite, or an unknown stress form.
     """
-    if not cfl > 0:
-        raise ValueError(f"cfl must be positive, got {cfl}")
+    if not 0 < cfl < math.inf:
+        raise ValueError(f"cfl must be positive and finite, got {cfl}")
     if (stress_form, grid.kernel) not in GRADIENT_BOUND:
         raise ValueError(f"stress_form must be 'gradient' or 'mls', got {stress_form!r}")
     kept = 2.0 if transfer == "apic" and stress_form == "mls" else 1.0  # 1 + s
-    inverse_inertia = GRADIENT_BOUND[stress_form, grid.kernel] / grid.dx**2 * state.volume / state.mass
-    elastic = law.stiffness(state) * inverse_inertia
-    viscosity = law.viscosity(state)
-    if viscosity is None:
-        rate = (elastic / (2 * kept)).sqrt()
-    else:
-        viscous = 2 * viscosity * inverse_inertia
-        rate = (viscous + (viscous.square() + 2 * kept * elastic).sqrt()) / (2 * kept)
-    rate = (rate + state.v.norm(dim=1) / grid.dx).nan_to_num(nan=0.0, posinf=torch.inf)
+    bound = GRADIENT_BOUND[stress_form, grid.kernel] / grid.dx**2
+    fastest_near = state.v.norm(dim=1) if speed is None else torch.maximum(state.v.norm(dim=1), speed)
+    oscillation = _oscillation_rate(law, state, bound, kept) + fastest_near / grid.dx
+    deformation = _deformation_rate(law, state, bound, fastest_near)
+    rate = torch.maximum(_known(oscillation), _known(deformation))
     if state.scene is None:
         fastest = rate.amax().reshape(1) if len(rate) else rate.new_zeros(1)
     else:
         scene = state.scene.clamp(0, grid.scenes - 1).long()
         fastest = rate.new_zeros(grid.scenes).scatter_reduce(0, scene, rate, "amax")
     return cfl / fastest
+
+
+def _oscillation_rate(law: Material, state: State, bound: float, kept: float) -> Tensor:
+    """1/dt [P] of the linear limit: the positive root of kept/dt² − λ_v/dt − λ_e/2."""
+    inverse_inertia = bound * state.volume / state.mass
+    elastic = law.stiffness(state) * inverse_inertia
+    viscosity = law.viscosity(state)
+    if viscosity is None:
+        return (elastic / (2 * kept)).sqrt()
+    viscous = 2 * viscosity * inverse_inertia
+    return (viscous + (viscous.square() + 2 * kept * elastic).sqrt()) / (2 * kept)
+
+
+def _deformation_rate(law: Material, state: State, bound: float, speed: Tensor) -> Tensor:
+    """1/dt [P] of the largest change c: the positive root of c/dt² − g/dt − h."""
+    gradient = math.sqrt(bound) * speed
+    if state.C is not None:
+        gradient = torch.hypot(gradient, state.C.norm(dim=(1, 2)))
+    growth = bound * law.stress(state).norm(dim=(1, 2)) * state.volume / state.mass
+    if "J" in law.state_fields:
+        gradient, growth = (math.sqrt(state.x.shape[1]) * value for value in (gradient, growth))
+    return (gradient + torch.hypot(gradient, 2 * (LARGEST_CHANGE * growth).sqrt())) / (2 * LARGEST_CHANGE)
+
+
+def _known(rate: Tensor) -> Tensor:
+    """A rate that is not known limits nothing."""
+    return rate.nan_to_num(nan=0.0, posinf=torch.inf)

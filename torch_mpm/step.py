@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
@@ -9,7 +10,7 @@ import torch
 from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint as run_checkpointed
 
-from .boundaries import Walls
+from .boundaries import Obstacle, Walls
 from .capture import Kept
 from .cfl import stable_dt
 from .failures import Failures, problems_of_state, problems_of_status, raise_failures, refused_steps
@@ -41,7 +42,8 @@ class Step(nn.Module):
         gravity: [m/s²]; D numbers, or a tensor [D] or [B, D] that may require grad; None for none.
         walls: "slip", "sticky", "separate" or "mirror" on every face of the domain, a `Walls` that says more, or None.
         boundaries: obstacles with the interface of `torch_mpm.boundaries`, applied in order.
-        transfer: "apic" (Jiang et al. 2015), "pic", or "flip".
+        transfer: "apic" (Jiang et al. 2015), "pic", or "flip". All keep momentum; only "apic" keeps angular momentum
+            too, and "pic" damps strongly (docs/limitations.md).
         flip: share of FLIP in [0, 1] that "apic" or "pic" is blended with; 1 for transfer="flip".
         stress_form: "mls" (Hu et al. 2018; F moves with C) or "gradient" (force −V τ ∇N; F moves with Σ v_i ∇N_i).
         on_grid: called as `velocity = on_grid(blocks, velocity, mass, dt)` with node tensors [N, D] and [N] after the
@@ -193,9 +195,24 @@ class Step(nn.Module):
         return self._kept_gravity.get((gravity, x.dtype, x.device), make, x)
 
     def stable_dt(self, state: State, cfl: float = 0.5) -> Tensor:
-        """Largest stable time step of each scene [s], [B], times `cfl`; see `torch_mpm.cfl.stable_dt`."""
+        """Largest stable time step of each scene [s], [B], times `cfl`; see `torch_mpm.cfl.stable_dt`.
+
+        Moving obstacles count; what `on_grid` and other boundaries do to the velocities is not known.
+        """
         transfer = "flip" if self.flip else self.transfer
-        return stable_dt(self.grid, self.law, self.prepare(state), cfl, transfer, self.stress_form)
+        return stable_dt(
+            self.grid, self.law, self.prepare(state), cfl, transfer, self.stress_form, self._obstacle_speed(state)
+        )
+
+    def _obstacle_speed(self, state: State) -> Tensor | None:
+        """Largest speed of the obstacles that a particle may touch [P] [m/s]; None where none moves."""
+        reach = 2 * math.sqrt(self.grid.dim) * self.grid.dx  # of a particle's nodes
+        speeds = [
+            boundary.speed(state.x, state.scene, state.time, reach)
+            for boundary in self.boundaries
+            if isinstance(boundary, Obstacle) and boundary.moves
+        ]
+        return torch.stack(speeds).amax(0) if speeds else None
 
     @property
     def status(self) -> Tensor | None:

@@ -37,8 +37,11 @@ def svd3(F: Tensor) -> SVD:
         U [..., D, D], sigma [..., D], V [..., D, D]. det U = det V = 1, so that the last singular value has the sign of
         det F; |sigma| descends, up to rounding between equal values. A matrix with a NaN or an infinity gives NaN.
 
-    Differentiable, also twice. The gradient of sigma always exists; that of U and V is NaN or infinite where two
-    |σ| are equal, because singular vectors are not continuous there: use `polar`, or functions of F itself.
+    Differentiable, also twice. The gradient of sigma always exists. Those of U and V are divided by the gap of two |σ|,
+    and their rounding error with them (relative to the rest about eps |F|/gap): where two |σ| are equal up to rounding
+    they are finite but wrong, where they are equal NaN or infinite, because singular vectors are not continuous there.
+    Use `polar` for the rotation, functions of F itself, or `CustomPrincipalLaw` for a law of the stretches; the other
+    laws bring gradients that hold there too.
 
     Raises:
         ValueError, TypeError: for a wrong shape or dtype.
