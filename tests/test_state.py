@@ -108,7 +108,7 @@ def test_absent_fields_are_made_or_named(device):
     kept = first.replace(extra={"plastic_strain": torch.zeros_like(first.mass)})
     with pytest.raises(ValueError, match=r"state 0 has no extra\['plastic_strain'\], which state 1 has.*step.prepare"):
         mpm.State.concatenate([second, kept])
-    with pytest.raises(ValueError, match="states must have one dimension, dtype and device.*float32"):
+    with pytest.raises(ValueError, match=r"states must have one dimension, dtype and device.*float32"):
         mpm.State.concatenate([first, second.to(dtype=torch.float32)])
     with pytest.raises(TypeError, match="states must be a list of State, got State"):
         mpm.State.concatenate(first)

@@ -297,8 +297,8 @@ def _extra(key: str, state: State, number: int, states: Sequence[State]) -> Tens
     if key not in state.extra:
         has = next(k for k, s in enumerate(states) if key in s.extra)
         raise ValueError(
-            f"state {number} has no extra[{key!r}], which state {has} has: set it, or join states that step.prepare has "
-            "given the fields of their step"
+            f"state {number} has no extra[{key!r}], which state {has} has: set it, or join what step.prepare makes of the "
+            "states"
         )
     return state.extra[key]
 
