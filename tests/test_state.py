@@ -68,7 +68,7 @@ def test_scenes_of_several_batches_follow_each_other(device):
     assert counted.scene.tolist() == [0] * 3 + [1] * 2 + [5] * 4
     with pytest.raises(ValueError, match=r"scenes must have one count for each of 2 states, got \[1\]"):
         mpm.State.concatenate([two, one], scene=True, scenes=[1])
-    with pytest.raises(ValueError, match="state 0 holds scene 1, but scenes counts 1"):
+    with pytest.raises(ValueError, match=r"scenes\[0\] must be above 1, .*, got 1"):
         mpm.State.concatenate([two, one], scene=True, scenes=[1, 1])
 
 

@@ -24,6 +24,8 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from .errors import check_number
+
 if TYPE_CHECKING:
     from .grid import Grid
     from .materials import Material
@@ -60,8 +62,7 @@ def stable_dt(
     Raises:
         ValueError: for a cfl that is not positive, or an unknown stress form.
     """
-    if not cfl > 0:
-        raise ValueError(f"cfl must be positive, got {cfl}")
+    check_number("cfl", cfl, "positive", lambda v: v > 0)
     if (stress_form, grid.kernel) not in GRADIENT_BOUND:
         raise ValueError(f"stress_form must be 'gradient' or 'mls', got {stress_form!r}")
     kept = 2.0 if transfer == "apic" and stress_form == "mls" else 1.0  # 1 + s

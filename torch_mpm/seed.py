@@ -19,6 +19,8 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
+from .errors import check_number, check_vector
+
 Vector = Sequence[float] | Tensor
 
 # Measured for _poisson_disk: a sample of least distance r has (_POISSON_SPACING * r)^-D points per unit of volume,
@@ -50,7 +52,11 @@ class Shape(Protocol):
 
 
 def _vector(name: str, value: Vector, dim: int | None = None) -> Tensor:
-    v = torch.as_tensor(value, dtype=torch.float64).cpu()
+    if isinstance(value, Tensor):
+        v = value.detach().to("cpu", torch.float64)
+    else:
+        check_vector(name, value, dim)
+        v = torch.tensor(value, dtype=torch.float64, device="cpu")
     if v.dim() != 1 or v.numel() not in ((2, 3) if dim is None else (dim,)):
         raise ValueError(f"{name} must have {dim or '2 or 3'} numbers, got {list(v.shape)}: {value}")
     if not bool(torch.isfinite(v).all()):
@@ -59,9 +65,7 @@ def _vector(name: str, value: Vector, dim: int | None = None) -> Tensor:
 
 
 def _positive(name: str, value: float) -> float:
-    if not (math.isfinite(value) and value > 0):
-        raise ValueError(f"{name} must be positive, got {value}")
-    return float(value)
+    return float(check_number(name, value, "positive", lambda v: 0 < v < math.inf))
 
 
 class Box:
@@ -223,7 +227,7 @@ def fill(
     Raises:
         ValueError: for an unknown method, or a shape too small to hold a point.
     """
-    dx = _positive("dx", float(getattr(grid, "dx", grid)))
+    dx = _positive("the grid's dx", getattr(grid, "dx", grid))
     dim = len(shape.lower)
     spacing = dx / _positive("per_cell", per_cell) ** (1 / dim)
     if method == "lattice":

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import math
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
-from .errors import FLOATING, check_like, shape_of
+from .errors import FLOATING, REAL, check_count, check_like, check_number, shape_of
 from .ops.arguments import soa_empty
 
 if TYPE_CHECKING:
@@ -76,8 +77,11 @@ class State:
             if index.dtype != dtype:
                 raise TypeError(f"{name} must be {dtype}, got {index.dtype}")
         for name, value in self.extra.items():
-            if value.shape[:1] != (P,):
+            if not isinstance(value, Tensor) or value.shape[:1] != (P,):
                 raise ValueError(f"extra[{name!r}] must have {P} rows, got {shape_of(value)}")
+
+        if not isinstance(self.time, (Tensor, *REAL)):
+            raise TypeError(f"time must be a number or a tensor [B], got {shape_of(self.time)}")
 
     @classmethod
     def at_rest(
@@ -93,22 +97,28 @@ class State:
         Args:
             points: positions [m], rest volumes [m³] and perhaps scenes, as the functions of `torch_mpm.seed` give them.
             density: [kg/m³]; a number or [P].
-            velocity: [m/s]; D numbers or [P, D]; None for zero.
+            velocity: [m/s]; D numbers, or a tensor [D] or [P, D]; None for zero.
             dtype: float32 or float64; torch's default if None.
             device: the points' if None.
 
         Raises:
-            ValueError: for a number as density that is not positive, or wrong shapes.
+            TypeError, ValueError: for a number as density that is not positive, numbers as velocity that are not
+                finite, or wrong shapes. Values of tensors are not read.
         """
-        if not isinstance(density, Tensor) and not density > 0:
-            raise ValueError(f"density must be positive, got {density}")
+        if not isinstance(getattr(points, "x", None), Tensor):
+            raise TypeError(f"points must be what torch_mpm.seed gives, got {shape_of(points)}")
+        P, D = points.x.shape
+        if not isinstance(density, Tensor):
+            check_number("density", density, "positive", lambda v: 0 < v < math.inf)
+        elif density.shape not in ((), (P,)):
+            raise ValueError(f"density must be a number or have shape [P] = [{P}], got {shape_of(density)}")
         dtype = dtype or torch.get_default_dtype()
         x = _as_soa(points.x.to(device=device, dtype=dtype))
         volume = points.volume.to(device=x.device, dtype=dtype)
         mass = (points.volume.to(x.device) * density).to(dtype)
-        v = soa_empty(x, tuple(x.shape)).zero_()
+        v = soa_empty(x, (P, D)).zero_()
         if velocity is not None:
-            v = v + torch.as_tensor(velocity, dtype=dtype, device=x.device)
+            v = v + _given_velocity(velocity, P, D).to(device=x.device, dtype=dtype)
         scene = None if points.scene is None else points.scene.to(device=x.device, dtype=torch.int32)
         return cls(x=x, v=v, mass=mass, volume=volume, scene=scene)
 
@@ -207,11 +217,12 @@ class State:
 
 def _checked(states: Sequence[State]) -> list[State]:
     """The states as a list, after a look at what they must have in common."""
-    if isinstance(states, State) or not all(isinstance(s, State) for s in states):
-        kind = type(states).__name__ if isinstance(states, State) else {type(s).__name__ for s in states}
-        raise TypeError(f"states must be a list of State, got {kind}")
+    if not isinstance(states, (list, tuple)):
+        raise TypeError(f"states must be a list of State, got {shape_of(states)}")
+    if wrong := [s for s in states if not isinstance(s, State)]:
+        raise TypeError(f"states must be a list of State, got a list with {shape_of(wrong[0])}")
     if len(states) == 0:
-        raise ValueError("states must not be empty")
+        raise ValueError("states must have at least one State, got none")
     kinds = [(s.x.shape[1], s.x.dtype, s.x.device) for s in states]
     if len(set(kinds)) > 1:
         found = " and ".join(f"{dim}-D {dtype} on {device}" for dim, dtype, device in dict.fromkeys(kinds))
@@ -237,8 +248,8 @@ def _scene_counts(states: Sequence[State], given: Sequence[int] | None) -> list[
         if known is None and several:
             known = len(state.time)  # type: ignore[arg-type]
         last = int(state.scene.max()) if state.scene is not None and len(state) else 0
-        if known is not None and not last < known:
-            raise ValueError(f"state {k} holds scene {last}, but scenes counts {known}")
+        if known is not None and check_count(f"scenes[{k}]", known) <= last:
+            raise ValueError(f"scenes[{k}] must be above {last}, the largest scene of its state, got {known}")
         counts.append(last + 1 if known is None else known)
     return counts
 
@@ -297,8 +308,8 @@ def _extra(key: str, state: State, number: int, states: Sequence[State]) -> Tens
     if key not in state.extra:
         has = next(k for k, s in enumerate(states) if key in s.extra)
         raise ValueError(
-            f"state {number} has no extra[{key!r}], which state {has} has: set it, or join what step.prepare makes of the "
-            "states"
+            f"state {number} has no extra[{key!r}], which state {has} has: set it, or join what step.prepare makes of "
+            "the states"
         )
     return state.extra[key]
 
@@ -306,6 +317,20 @@ def _extra(key: str, state: State, number: int, states: Sequence[State]) -> Tens
 def _no_motion(x: Tensor) -> Tensor:
     P, D = x.shape
     return x.new_zeros(P, D, D)
+
+
+def _given_velocity(velocity: Any, P: int, D: int) -> Tensor:
+    """[D] or [P, D]."""
+    if not isinstance(velocity, Tensor):
+        try:
+            velocity = torch.as_tensor(velocity, dtype=torch.float64, device="cpu")
+        except (TypeError, ValueError) as error:
+            raise TypeError(f"velocity must be {D} numbers or a tensor, got {velocity!r}") from error
+        if not bool(velocity.isfinite().all()):
+            raise ValueError(f"velocity must be finite, got {velocity.tolist()}")
+    if tuple(velocity.shape) not in ((D,), (P, D)):
+        raise ValueError(f"velocity must have shape [D] = [{D}] or [P, D] = [{P}, {D}], got {shape_of(velocity)}")
+    return velocity
 
 
 def _as_soa(t: Tensor) -> Tensor:
