@@ -13,6 +13,12 @@ from torch import Tensor
 FLOATING = (torch.float32, torch.float64)
 
 
+def default_dtype() -> torch.dtype:
+    """torch's default dtype, or float32 where that is a half, in which positions mean nothing."""
+    dtype = torch.get_default_dtype()
+    return dtype if dtype in FLOATING else torch.float32
+
+
 class SimulationError(RuntimeError):
     """The state of a simulation is no longer meaningful: a particle left the grid, is not finite, or is inverted."""
 

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from .capture import is_captured, remember
-from .errors import GridOverflowError, check_count, check_number, check_positions, check_vector
+from .errors import GridOverflowError, check_count, check_number, check_positions, check_vector, default_dtype
 
 PADDING = 3
 """Nodes beyond `lower` and `upper`, so that a particle on the boundary has its support (csrc/grid/geometry.h)."""
@@ -283,7 +283,7 @@ class Blocks:
         """Position of each node [m], [N, D]."""
         columns = (self.node_indices() - PADDING).double().unbind(1)
         positions = [a + column * self.grid.dx for a, column in zip(self.grid.lower, columns, strict=True)]
-        return torch.stack(positions, 1).to(dtype or torch.get_default_dtype())
+        return torch.stack(positions, 1).to(dtype or default_dtype())
 
     def to_dense(self, nodes: Tensor) -> Tensor:
         """Node rows [N, K] as a dense tensor [B, X, Y, (Z), K] of the lattice, zero where inactive; differentiable."""

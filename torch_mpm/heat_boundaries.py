@@ -92,7 +92,8 @@ class HeatNodes:
 
     def hold(self, where: Tensor, temperature: Number) -> None:
         """Keep nodes, bool [N], at a temperature [K]; those held before stay as they are."""
-        value = torch.where(where, temperature, 0.0).to(self.theta)
+        given = temperature if isinstance(temperature, Tensor) else torch.full_like(self.theta, temperature)
+        value = torch.where(where, given, 0.0).to(self.theta)
         if self.fixed is None or self.held is None:
             self.fixed, self.held = where, value
         else:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from .errors import FLOATING, REAL, check_count, check_like, check_number, shape_of
+from .errors import FLOATING, REAL, check_count, check_like, check_number, default_dtype, shape_of
 from .ops.arguments import soa_empty
 
 if TYPE_CHECKING:
@@ -98,7 +98,7 @@ class State:
             points: positions [m], rest volumes [m³] and perhaps scenes, as the functions of `torch_mpm.seed` give them.
             density: [kg/m³]; a number or [P].
             velocity: [m/s]; D numbers, or a tensor [D] or [P, D]; None for zero.
-            dtype: float32 or float64; torch's default if None.
+            dtype: float32 or float64; torch's default if None, or float32 where that is a half.
             device: the points' if None.
 
         Raises:
@@ -112,7 +112,7 @@ class State:
             check_number("density", density, "positive", lambda v: 0 < v < math.inf)
         elif density.shape not in ((), (P,)):
             raise ValueError(f"density must be a number or have shape [P] = [{P}], got {shape_of(density)}")
-        dtype = dtype or torch.get_default_dtype()
+        dtype = dtype or default_dtype()
         x = _as_soa(points.x.to(device=device, dtype=dtype))
         volume = points.volume.to(device=x.device, dtype=dtype)
         mass = (points.volume.to(x.device) * density).to(dtype)

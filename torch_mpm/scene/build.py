@@ -74,7 +74,7 @@ class Built:
         """Mass, volume, material and scene of all particles, also of those still to come, by id."""
         layers = [(self.nozzles[k].layer, self.nozzles[k].material) for _, k in self.emissions()]
         states = [self.state, *(layer for layer, _ in layers)]
-        material = [self.material, *(torch.full((len(s),), m, dtype=torch.int32) for s, m in layers)]
+        material = [self.material, *(torch.full((len(s),), m, dtype=torch.int32, device="cpu") for s, m in layers)]
         values = {
             "mass": torch.cat([s.mass for s in states]),
             "volume": torch.cat([s.volume for s in states]),
