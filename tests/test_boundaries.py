@@ -451,12 +451,11 @@ def test_the_example_of_the_docstring(device):
     lines = boundaries.__doc__.split("\n\n")[2].splitlines()
     namespace: dict = {"torch": torch}
     exec(textwrap.dedent("\n".join(lines)), namespace)
-    acceleration = torch.tensor([3.0, 0.0], device=device, requires_grad=True)
-    wind = namespace["Wind"](acceleration)
+    wind = namespace["Wind"](torch.tensor([3.0, 0.0], device=device))
     positions, velocity = torch.tensor([[0.0, 0.2], [0.0, 0.7]], device=device), torch.zeros(2, 2, device=device)
-    after = wind.apply(velocity, positions, None, 0.0, 0.5)
+    after = wind(velocity, positions, None, 0.0, 0.5)
     assert after.tolist() == [[0.0, 0.0], [1.5, 0.0]]
-    (grad,) = torch.autograd.grad(after.sum(), acceleration)
+    (grad,) = torch.autograd.grad(after.sum(), list(wind.parameters()))
     assert grad.tolist() == [0.5, 0.5]
 
 

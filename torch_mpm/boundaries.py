@@ -1,29 +1,33 @@
 """What acts on the velocity of the grid nodes: the walls of the domain, and obstacles that may move.
 
-Anything with a method `apply` can stand in the list of boundaries of a `Step`. It is ordinary torch code on the nodes,
-so gradients come by themselves; this one blows through the upper half of the domain:
+An `nn.Module` with the arguments below, or any object with a method `apply` that takes them, can stand in the list of
+boundaries of a `Step`. It is ordinary torch code on the nodes, so gradients come by themselves; this one blows through
+the upper half of the domain:
 
-    class Wind:
-        def __init__(self, acceleration):  # [D], may require grad
-            self.acceleration = acceleration
-        def apply(self, velocity, positions, scene, time, dt):
+    class Wind(torch.nn.Module):
+        def __init__(self, acceleration):  # [D]
+            super().__init__()
+            self.acceleration = torch.nn.Parameter(acceleration)
+        def forward(self, velocity, positions, scene, time, dt):
             return velocity + torch.where(positions[:, 1:2] > 0.5, dt * self.acceleration, 0.0)
 
+The step finds the parameters of modules, and so does an optimizer that is given `step.parameters()`.
 Choose with `torch.where` rather than a mask as index, which synchronises with the device.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, MutableSequence, Sequence
 from typing import Any, NamedTuple, Protocol
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.autograd.graph import saved_tensors_hooks
 
 from .capture import Kept
-from .errors import shape_of
+from .errors import check_count, check_number, check_numbers, shape_of
+from .parameters import TensorModule
 from .reference.contact import contact_change
 
 CONTACTS = ("sticky", "slip", "separate")
@@ -97,8 +101,7 @@ class Walls:
                 raise TypeError(
                     "friction of walls must be a number, got Tensor: use a Plane for friction with a gradient"
                 )
-            if not 0 <= coefficient < math.inf:
-                raise ValueError(f"friction of walls must be a finite number >= 0, got {coefficient}")
+            check_number("friction of walls", coefficient, "a finite number >= 0", lambda v: 0 <= v < math.inf)
 
     def __repr__(self) -> str:
         return f"Walls({self.kind!r}, lower={self.lower}, upper={self.upper}, friction={self.friction})"
@@ -160,10 +163,7 @@ def _replaced(value: Any, names: dict[str, str]) -> Any:
 def _numbers(name: str, values: Sequence[float] | None) -> tuple[float, ...] | None:
     if values is None:
         return None
-    numbers = tuple(float(a) for a in values)
-    if not all(math.isfinite(a) for a in numbers):
-        raise ValueError(f"{name} must have finite numbers, got {numbers}")
-    return numbers
+    return check_numbers(f"{name} of walls", values)
 
 
 def _frozen(value: Any) -> Any:
@@ -198,7 +198,7 @@ class Pose(NamedTuple):
     rotation: Tensor  # [D, D] or [B, D, D]
 
 
-class Obstacle:
+class Obstacle(TensorModule):
     """A rigid body that acts on the nodes inside it. The base of `Plane`, `Sphere`, `Box`, `Capsule` and `SDF`.
 
     At a node inside, the velocity relative to the surface there loses all of itself ("sticky"), its normal component
@@ -220,12 +220,13 @@ class Obstacle:
 
     Tensors may require grad: the gradient of the node velocities goes to position, velocity, rotation,
     angular_velocity and friction, through the normal and the surface velocity. Which nodes are inside is not
-    differentiable, so radius and size have no gradient and refuse tensors that require one. Nothing here synchronises
-    with the device. The planes, spheres, boxes and capsules of a `Step` act in one kernel, `torch_mpm.ops.contact`,
-    unless one of their tensors requires grad or the position is a function.
+    differentiable, so radius and size have no gradient and refuse tensors that require one. An obstacle is a module:
+    its tensors are buffers, or parameters where they are given as `nn.Parameter`. Nothing here synchronises with the
+    device. The planes, spheres, boxes and capsules of a `Step` act in one kernel, `torch_mpm.ops.contact`, unless they
+    have hooks, one of their tensors requires grad, or the position is a function.
 
     Raises:
-        ValueError: for a wrong argument; shapes of tensors are checked at the first use.
+        TypeError, ValueError: for a wrong argument; shapes of tensors are checked at the first use.
     """
 
     shape: str
@@ -243,14 +244,19 @@ class Obstacle:
         end: float = math.inf,
         scene: int | None = None,
     ) -> None:
+        super().__init__()
         if kind not in CONTACTS:
             raise ValueError(f"kind must be one of {sorted(CONTACTS)}, got {kind!r}")
-        if not isinstance(friction, Tensor) and not 0 <= friction < math.inf:
-            raise ValueError(f"friction must be a finite number >= 0, got {friction}")
+        if not isinstance(friction, Tensor):
+            check_number("friction", friction, "a finite number >= 0", lambda v: 0 <= v < math.inf)
+        for name, value in (("start", start), ("end", end)):
+            check_number(name, value, "a number", lambda v: v == v)
         if not (math.isfinite(start) and start <= end):
             raise ValueError(f"start must be finite and not after end, got start {start} and end {end}")
-        if scene is not None and scene < 0:
-            raise ValueError(f"scene must not be negative, got {scene}")
+        if scene is not None:
+            check_count("scene", scene)
+        if position is None:
+            raise TypeError("position must be numbers, a tensor or a function of time, got None")
         if callable(position) and velocity is not None:
             raise ValueError("velocity must be None where position is a function of time: it is its derivative")
         self.position, self.velocity = _finite("position", position), _finite("velocity", velocity)
@@ -277,9 +283,15 @@ class Obstacle:
         """The parameters of the shape, in metres, as given."""
         raise NotImplementedError
 
-    # -- interface of boundaries
+    # -- interface of boundaries, which `apply` takes as `forward` does
 
-    def apply(
+    def apply(self, *arguments: Any, **named: Any) -> Any:
+        """The node velocities of `forward`; of a function alone, what `nn.Module.apply` does."""
+        if arguments and callable(arguments[0]):
+            return super().apply(*arguments)
+        return self(*arguments, **named)
+
+    def forward(
         self, velocity: Tensor, positions: Tensor, scene: Tensor | None, time: float | Tensor, dt: float | Tensor
     ) -> Tensor:
         """Node velocities after contact.
@@ -322,13 +334,13 @@ class Obstacle:
         return velocity + contact_change(relative, normal, self.kind, friction)
 
     def contains(self, positions: Tensor, scene: Tensor | None, time: float | Tensor) -> Tensor:
-        """Which positions are inside, bool [N]; arguments as `apply`."""
+        """Which positions are inside, bool [N]; arguments as `forward`."""
         return self._inside(self.signed_distance(positions, scene, time), positions)
 
     def signed_distance(self, positions: Tensor, scene: Tensor | None, time: float | Tensor) -> Tensor:
         """Distance of positions from the surface [N] [m], negative inside; infinite while the obstacle is not there.
 
-        Arguments as `apply`. Differentiable; true near the surface, and away from it where the shape allows.
+        Arguments as `forward`. Differentiable; true near the surface, and away from it where the shape allows.
         """
         if positions.shape[0] == 0 or self._absent(scene, time):
             return positions.new_full(positions.shape[:1], torch.inf)
@@ -363,7 +375,7 @@ class Obstacle:
 
     def pose(self, time: float | Tensor, like: Tensor | None = None) -> Pose:
         """Centre and rotation at a time [s], a number or a tensor [] or [B]; with the dtype and device of `like`."""
-        like = torch.empty(0, dtype=torch.float64) if like is None else like
+        like = torch.empty(0, dtype=torch.float64, device="cpu") if like is None else like
         centre = self._centre(time, like)
         dim = centre.shape[-1]
         rotation = self._rotation(time, like, dim)
@@ -483,9 +495,7 @@ class Plane(Obstacle):
 
     def __init__(self, position: Value | Motion, normal: Value, kind: str = "separate", **motion: Any) -> None:
         super().__init__(position, kind, **motion)
-        if not isinstance(normal, Tensor) and not any(_floats(normal)):
-            raise ValueError(f"normal must not be zero, got {normal}")
-        self.normal = _finite("normal", normal)
+        self.normal = _direction("normal", normal)
 
     def surface(self, body: Tensor, scene: Tensor | None) -> tuple[Tensor, Tensor]:
         normal = _unit(_per_node(self.parameter("normal", body, body.shape[1:]), 1, scene))
@@ -561,7 +571,7 @@ class Capsule(Obstacle):
         **motion: Any,
     ) -> None:
         super().__init__(position, kind, **motion)
-        self.half_axis = _finite("half_axis", half_axis)
+        self.half_axis = _finite("half_axis", _constant("half_axis", half_axis))
         self.radius = _extent("radius", radius)
 
     def surface(self, body: Tensor, scene: Tensor | None) -> tuple[Tensor, Tensor]:
@@ -599,7 +609,9 @@ class Revolved(Obstacle):
         **motion: Any,
     ) -> None:
         super().__init__(position, kind, **motion)
-        corners = tuple(_floats(corner) for corner in outline)
+        if not isinstance(outline, Sequence):
+            raise TypeError(f"outline must be at least 3 pairs, got {shape_of(outline)}")
+        corners = tuple(_floats("outline", corner) for corner in outline)
         if len(corners) < 3 or any(len(c) != 2 or c[0] < 0 or not all(map(math.isfinite, c)) for c in corners):
             raise ValueError(
                 f"outline must be at least 3 pairs (distance >= 0, position along the axis), got {outline}"
@@ -608,9 +620,7 @@ class Revolved(Obstacle):
         if area == 0:
             raise ValueError(f"outline must enclose an area, got {outline}")
         self.outline = corners if area > 0 else corners[::-1]  # anticlockwise
-        self.axis = _finite("axis", axis)
-        if axis is not None and not isinstance(axis, Tensor) and not any(_floats(axis)):
-            raise ValueError(f"axis must not be zero, got {axis}")
+        self.axis = None if axis is None else _direction("axis", axis)
 
     def surface(self, body: Tensor, scene: Tensor | None) -> tuple[Tensor, Tensor]:
         if self.axis is None:
@@ -666,6 +676,9 @@ class SDF(Obstacle):
         **motion: Any,
     ) -> None:
         super().__init__(position, kind, **motion)
+        for name, function in (("distance", distance), ("normal", normal)):
+            if not callable(function) and (name == "distance" or function is not None):
+                raise TypeError(f"{name} must be a function of positions [N, D], got {shape_of(function)}")
         self.distance, self.normal = distance, normal
 
     def surface(self, body: Tensor, scene: Tensor | None) -> tuple[Tensor, Tensor]:
@@ -754,28 +767,105 @@ def _column(time: float | Tensor, rank: int) -> float | Tensor:
     return time.reshape(time.shape + (1,) * rank) if isinstance(time, Tensor) and time.dim() else time
 
 
-def _floats(value: Any) -> tuple[float, ...]:
-    return tuple(float(a) for a in value) if hasattr(value, "__len__") else (float(value),)
+def _floats(name: str, value: Any) -> tuple[float, ...]:
+    values = value if hasattr(value, "__len__") and not isinstance(value, str) else (value,)
+    return tuple(float(check_number(name, a, "a number", lambda v: True)) for a in values)
 
 
 def _length(value: Any) -> int:
-    return int(value.shape[-1]) if isinstance(value, Tensor) and value.dim() else len(_floats(value))
+    return int(value.shape[-1]) if isinstance(value, Tensor) and value.dim() else len(_floats("position", value))
 
 
 def _finite(name: str, value: Any) -> Any:
     """Numbers checked and made immutable; anything else as it is."""
     if value is None or callable(value) or isinstance(value, Tensor):
         return value
-    numbers = _floats(value)
+    numbers = _floats(name, value)
     if not all(math.isfinite(a) for a in numbers):
         raise ValueError(f"{name} must be finite, got {value}")
     return numbers if hasattr(value, "__len__") else numbers[0]
 
 
+def _constant(name: str, value: Any) -> Any:
+    if value is None or callable(value):
+        raise TypeError(f"{name} must be numbers or a tensor, got {shape_of(value)}")
+    return value
+
+
+def _direction(name: str, value: Any) -> Any:
+    if not isinstance(_constant(name, value), Tensor) and not any(_floats(name, value)):
+        raise ValueError(f"{name} must not be zero, got {value}")
+    return _finite(name, value)
+
+
 def _extent(name: str, value: Any) -> Any:
-    if isinstance(value, Tensor) and value.requires_grad:
-        raise ValueError(f"{name} must not require grad: which nodes are inside is not differentiable")
-    value = _finite(name, value)
-    if not isinstance(value, Tensor) and min(_floats(value), default=-1) < 0:
+    if isinstance(value, Tensor):
+        if value.requires_grad:
+            raise ValueError(f"{name} must not require grad: which nodes are inside is not differentiable")
+        return value
+    value = _finite(name, _constant(name, value))
+    if min(_floats(name, value), default=-1) < 0:
         raise ValueError(f"{name} must be >= 0, got {value}")
     return value
+
+
+# ---- the list of a step
+
+
+class BoundaryList(nn.Module, MutableSequence[Any]):
+    """A list of boundaries, of which those that are modules are submodules.
+
+    Raises:
+        TypeError: for anything but a list, or an entry that is neither a module nor has a method `apply`.
+    """
+
+    def __init__(self, boundaries: Iterable[Any] = ()) -> None:
+        super().__init__()
+        if not isinstance(boundaries, Iterable) or isinstance(boundaries, str):
+            raise TypeError(f"boundaries must be a list of obstacles, got {shape_of(boundaries)}: put it in a list")
+        self._entries: list[Any] = []
+        self.extend(boundaries)
+
+    def __len__(self) -> int:
+        return len(self._entries)
+
+    def __iter__(self) -> Iterator[Any]:
+        return iter(self._entries)
+
+    def __getitem__(self, index: Any) -> Any:
+        return self._entries[index]
+
+    def __setitem__(self, index: Any, value: Any) -> None:
+        self._entries[index] = value
+        self._register()
+
+    def __delitem__(self, index: Any) -> None:
+        del self._entries[index]
+        self._register()
+
+    def insert(self, index: int, value: Any) -> None:
+        self._entries.insert(index, value)
+        self._register()
+
+    def _register(self) -> None:
+        for entry in self._entries:
+            if not (isinstance(entry, nn.Module) or callable(getattr(entry, "apply", None))):
+                raise TypeError(
+                    "boundaries must be obstacles, modules or objects with a method apply(velocity, positions, scene, "
+                    f"time, dt), got {shape_of(entry)}"
+                )
+        self._modules = {str(k): entry for k, entry in enumerate(self._entries) if isinstance(entry, nn.Module)}
+
+    def apply(self, function: Callable[[nn.Module], None]) -> Any:
+        """As for any module, also where a user's own has an `apply` that is that of boundaries."""
+        for module in self.children():
+            nn.Module.apply(module, function)
+        function(self)
+        return self
+
+
+def call_boundary(boundary: Any, *arguments: Any) -> Tensor:
+    """Node velocities after a boundary: its own `apply`, or the call of a module that has none."""
+    own = getattr(type(boundary), "apply", None) is not nn.Module.apply
+    result: Tensor = boundary.apply(*arguments) if own else boundary(*arguments)
+    return result

@@ -37,6 +37,8 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from .errors import check_number
+
 if TYPE_CHECKING:
     from .grid import Grid
     from .materials import Material
@@ -87,8 +89,7 @@ def stable_dt(
     Raises:
         ValueError: for a cfl that is not positive and finite, or an unknown stress form.
     """
-    if not 0 < cfl < math.inf:
-        raise ValueError(f"cfl must be positive and finite, got {cfl}")
+    check_number("cfl", cfl, "positive", lambda v: v > 0)
     if (stress_form, grid.kernel) not in GRADIENT_BOUND:
         raise ValueError(f"stress_form must be 'gradient' or 'mls', got {stress_form!r}")
     kept = 2.0 if transfer == "apic" and stress_form == "mls" else 1.0  # 1 + s

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import math
+import numbers
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -11,6 +14,12 @@ if TYPE_CHECKING:
     from .failures import Failures
 
 FLOATING = (torch.float32, torch.float64)
+
+
+def default_dtype() -> torch.dtype:
+    """torch's default dtype, or float32 where that is a half, in which positions mean nothing."""
+    dtype = torch.get_default_dtype()
+    return dtype if dtype in FLOATING else torch.float32
 
 
 class SimulationError(RuntimeError):
@@ -33,6 +42,52 @@ def shape_of(x: object) -> str:
     return str(list(x.shape)) if isinstance(x, Tensor) else type(x).__name__
 
 
+REAL = (float, int, torch.SymFloat, torch.SymInt, numbers.Real)
+"""Types of a number; the first of them is found without a search."""
+
+
+def check_number(
+    name: str, value: Any, expected: str = "finite", holds: Callable[[float], bool] = math.isfinite
+) -> float:
+    """A number for which `holds`; `expected` says in words what that is."""
+    if not isinstance(value, REAL):
+        raise TypeError(f"{name} must be a number, got {_described(value)}")
+    if not holds(value):  # type: ignore[arg-type]
+        raise ValueError(f"{name} must be {expected}, got {value}")
+    return value  # type: ignore[return-value]
+
+
+def check_count(name: str, value: Any, least: int = 0) -> int:
+    """A whole number, not a bool."""
+    if isinstance(value, bool) or not isinstance(value, (numbers.Integral, torch.SymInt)):
+        raise TypeError(f"{name} must be a whole number, got {_described(value)}")
+    if value < least:
+        expected = f"be at least {least}" if least else "not be negative"
+        raise ValueError(f"{name} must {expected}, got {value}")
+    return value  # type: ignore[return-value]
+
+
+def check_numbers(name: str, value: Any, expected: str = "numbers") -> tuple[float, ...]:
+    """Finite numbers, from a list or an array of one dimension."""
+    values = value.tolist() if hasattr(value, "tolist") else value
+    if isinstance(values, str) or not isinstance(values, Sequence):
+        raise TypeError(f"{name} must be {expected}, got {_described(value)}")
+    return tuple(float(check_number(name, a)) for a in values)
+
+
+def check_vector(name: str, value: Any, dim: int | None = None) -> tuple[float, ...]:
+    """D finite numbers."""
+    expected = f"{dim or '2 or 3'} numbers"
+    numbers = check_numbers(name, value, expected)
+    if len(numbers) not in ((dim,) if dim else (2, 3)):
+        raise ValueError(f"{name} must have {expected}, got {value}")
+    return numbers
+
+
+def _described(value: object) -> str:
+    return f"{type(value).__name__} {value!r}" if isinstance(value, (str, bool, float)) else shape_of(value)
+
+
 def check_positions(x: Tensor, dim: int, scene: Tensor | None, scenes: int) -> None:
     if not isinstance(x, Tensor) or x.dim() != 2 or x.shape[1] != dim:
         raise ValueError(f"x must have shape [P, {dim}], got {shape_of(x)}")
@@ -42,7 +97,7 @@ def check_positions(x: Tensor, dim: int, scene: Tensor | None, scenes: int) -> N
         if scenes != 1:
             raise ValueError(f"scene must be given, int32 [P], for a grid of {scenes} scenes")
         return
-    if scene.shape != x.shape[:1]:
+    if not isinstance(scene, Tensor) or scene.shape != x.shape[:1]:
         raise ValueError(f"scene must have shape [{x.shape[0]}], got {shape_of(scene)}")
     if scene.dtype != torch.int32:
         raise TypeError(f"scene must be int32, got {scene.dtype}")

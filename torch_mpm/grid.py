@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from .capture import is_captured, outside_transforms, remember, without_transforms
-from .errors import GridOverflowError, check_positions
+from .errors import GridOverflowError, check_count, check_number, check_positions, check_vector, default_dtype
 
 PADDING = 3
 """Nodes beyond `lower` and `upper`, so that a particle on the boundary has its support (csrc/grid/geometry.h)."""
@@ -44,7 +44,7 @@ class Grid:
         deterministic: bit-identical results from run to run on CUDA too (the CPU always is).
 
     Raises:
-        ValueError: for a wrong argument, or a lattice of 2^31 blocks or more.
+        TypeError, ValueError: for a wrong argument, or a lattice of 2^31 blocks or more.
     """
 
     def __init__(
@@ -57,20 +57,13 @@ class Grid:
         capacity: int | None = None,
         deterministic: bool = False,
     ) -> None:
-        self.dx = float(dx)
-        self.lower = tuple(float(a) for a in lower)
-        self.upper = tuple(float(a) for a in upper)
-        if not (self.dx > 0 and math.isfinite(self.dx)):
-            raise ValueError(f"dx must be a positive number, got {dx}")
-        if len(self.lower) not in (2, 3) or len(self.upper) != len(self.lower):
-            raise ValueError(f"lower and upper must both have 2 or 3 numbers, got {lower} and {upper}")
-        if not all(
-            math.isfinite(a) and math.isfinite(b) and a < b for a, b in zip(self.lower, self.upper, strict=True)
-        ):
+        self.dx = float(check_number("dx", dx, "a positive number", lambda v: 0 < v < math.inf))
+        self.lower = check_vector("lower", lower)
+        self.upper = check_vector("upper", upper, len(self.lower))
+        if not all(a < b for a, b in zip(self.lower, self.upper, strict=True)):
             raise ValueError(f"upper must be above lower on every axis, got lower {lower} and upper {upper}")
-        if scenes < 0:
-            raise ValueError(f"scenes must not be negative, got {scenes}")
-        if kernel not in KERNEL_ORDERS:
+        check_count("scenes", scenes)
+        if kernel not in tuple(KERNEL_ORDERS):
             raise ValueError(f"kernel must be one of {sorted(KERNEL_ORDERS)}, got {kernel!r}")
         self.scenes = int(scenes)
         self.kernel = kernel
@@ -89,7 +82,7 @@ class Grid:
             )
         self.nodes_per_block = BLOCK_WIDTH**self.dim
         self._max_capacity = min(self.block_count, INT32_MAX // self.nodes_per_block)
-        if capacity is not None and not 0 <= capacity <= self._max_capacity:
+        if capacity is not None and check_count("capacity", capacity) > self._max_capacity:
             raise ValueError(f"capacity must be between 0 and {self._max_capacity} blocks, got {capacity}")
         self.capacity = capacity
         self._grows = capacity is None
@@ -180,7 +173,8 @@ class Grid:
             return
         if self._on_host is None:
             with torch.inference_mode(False):  # such that a later step may write to it
-                self._on_host = torch.empty(status.shape[1:], dtype=status.dtype, pin_memory=True)
+                shape = status.shape[1:]
+                self._on_host = torch.empty(shape, dtype=status.dtype, device="cpu", pin_memory=True)
         with outside_transforms():
             self._on_host.copy_(status[0], non_blocking=True)
         self._pending = torch.cuda.Event()
@@ -237,7 +231,12 @@ class ActivationRecord:
             self.refused.zero_()
         with torch.inference_mode():
             for kept in self._replayed:
-                kept.copy_(torch.tensor(NO_PROBLEM, dtype=torch.int32))
+                kept.copy_(torch.tensor(NO_PROBLEM, dtype=torch.int32, device="cpu"))
+
+
+def check_blocks(blocks: Any) -> None:
+    if not isinstance(blocks, Blocks):
+        raise TypeError(f"blocks must be the active blocks that Grid.activate returns, got {type(blocks).__name__}")
 
 
 def _with_headroom(blocks: int) -> int:
@@ -310,7 +309,7 @@ class Blocks:
         """Position of each node [m], [N, D]."""
         columns = (self.node_indices() - PADDING).double().unbind(1)
         positions = [a + column * self.grid.dx for a, column in zip(self.grid.lower, columns, strict=True)]
-        return torch.stack(positions, 1).to(dtype or torch.get_default_dtype())
+        return torch.stack(positions, 1).to(dtype or default_dtype())
 
     def to_dense(self, nodes: Tensor) -> Tensor:
         """Node rows [N, K] as a dense tensor [B, X, Y, (Z), K] of the lattice, zero where inactive; differentiable."""

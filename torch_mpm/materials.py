@@ -17,12 +17,13 @@ import torch
 from torch import Tensor, nn
 
 from .capture import Kept, without_transforms
-from .errors import shape_of
+from .errors import REAL, check_number, shape_of
 from .ops import material as ops
 from .ops.arguments import soa_empty
 from .parameters import PerMaterial, Value, With, evaluate
 from .reference.material import per_particle
 from .state import _take
+from .tangent import differentiated_stiffness
 
 if TYPE_CHECKING:
     from .state import State
@@ -46,6 +47,10 @@ class Material(nn.Module):
     rate_dependent: bool = False
     dissipation: bool = False
 
+    def forward(self, state: State) -> tuple[dict[str, Tensor], Tensor]:
+        """`update`, as a step calls it, with the hooks of the module."""
+        return self.update(state)
+
     def update(self, state: State) -> tuple[dict[str, Tensor], Tensor]:
         """Fields that the law changes (plastic laws: F at the yield surface), and Kirchhoff stress [P, D, D] [Pa].
 
@@ -68,8 +73,12 @@ class Material(nn.Module):
         return self.energy_density(state) * state.volume
 
     def stiffness(self, state: State) -> Tensor:
-        """Upper bound of the tangent modulus over all velocity gradients of unit norm [P] [Pa]; limits the step."""
-        raise NotImplementedError(f"{type(self).__name__} has no stiffness, which the stable time step needs")
+        """Upper bound of the tangent modulus over all velocity gradients of unit norm [P] [Pa]; limits the step.
+
+        By automatic differentiation of `update` here: D² backward passes, for laws in which each particle's stress
+        follows from its own state. Zero where it is not finite.
+        """
+        return differentiated_stiffness(self, state)
 
     def wave_modulus(self, state: State) -> Tensor:
         """Rest density times the square of the largest wave speed [P] [Pa]."""
@@ -181,6 +190,8 @@ def _check_value(name: str, value: Value, expected: str, holds: Callable[[Any], 
                 f"{name} must be a number or a floating tensor of shape [], [1], [B] or [P], got {shape_of(value)}"
             )
         good = bool((holds(value.detach()) & (value.detach().isfinite() | infinite)).all())
+    elif not isinstance(value, REAL):
+        raise TypeError(f"{name} must be a number, a tensor or a function of temperature, got {shape_of(value)}")
     else:
         good = (math.isfinite(value) or infinite) and bool(holds(value))
     if not good:
@@ -287,12 +298,15 @@ class CustomLaw(Material):
         function: called with the state field. It may return a pair (F, stress) instead, with F what a plastic law makes
             of its argument.
         state_field: "F", or "J" [P] for a law of the volume ratio alone.
-        stiffness: see `Material.stiffness`; a number, a tensor [P] or a function of the state. Needed for `stable_dt`.
+        stiffness: see `Material.stiffness`; a number, a tensor [P] or a function of the state. None takes it from the
+            function by automatic differentiation, each time that `stable_dt` asks.
 
     A law that needs more than this (other fields, history) is a subclass of `Material`.
 
     Raises:
-        ValueError: for an unknown field, or in use for a result of another shape.
+        TypeError: for what is no function.
+        ValueError: for an unknown field, a number as stiffness that is negative or not finite, or in use for a result
+            of another shape.
     """
 
     def __init__(
@@ -304,9 +318,9 @@ class CustomLaw(Material):
         super().__init__()
         if state_field not in ("F", "J"):
             raise ValueError(f"state_field must be 'F' or 'J', got {state_field!r}")
-        self.function = function
+        self.function = check_function(function)
         self.state_fields = (state_field,)
-        self._stiffness = stiffness
+        self._stiffness = check_stiffness(stiffness)
 
     def update(self, state: State) -> tuple[dict[str, Tensor], Tensor]:
         (field,) = self.state_fields
@@ -320,16 +334,50 @@ class CustomLaw(Material):
         return {} if new is deformation else {field: new}, stress
 
     def stiffness(self, state: State) -> Tensor:
-        if self._stiffness is None:
-            return super().stiffness(state)
-        value: Any = self._stiffness(state) if callable(self._stiffness) else self._stiffness
-        return torch.as_tensor(value, dtype=state.x.dtype, device=state.x.device).expand(state.x.shape[0])
+        return given_stiffness(self._stiffness, state) if self._stiffness is not None else super().stiffness(state)
 
     def invalid(self, state: State) -> Tensor:
         (field,) = self.state_fields
         deformation: Tensor = getattr(state, field)
         J = deformation if field == "J" else torch.linalg.det(deformation.where(deformation.isfinite(), torch.nan))
         return ~((J > 0) & J.isfinite())
+
+
+def check_function(function: Any) -> Any:
+    """The function of a custom law."""
+    if not callable(function):
+        raise TypeError(f"function must be a function or module, got {shape_of(function)}")
+    return function
+
+
+def check_stiffness(value: Any) -> Any:
+    """A stiffness that is given to a custom law."""
+    if value is not None and not isinstance(value, Tensor) and not callable(value):
+        check_number("stiffness", value, "finite and not negative", lambda v: 0 <= v < math.inf)
+    return value
+
+
+def given_stiffness(value: Any, state: State) -> Tensor:
+    """[P]"""
+    value = value(state) if callable(value) else value
+    return torch.as_tensor(value, dtype=state.x.dtype, device=state.x.device).expand(state.x.shape[0])
+
+
+def as_law(name: str, law: Any) -> Material:
+    """A material as it is; a function or module F [P, D, D] -> Kirchhoff stress as a `CustomLaw`.
+
+    Raises:
+        TypeError: for anything else.
+    """
+    if isinstance(law, Material):
+        return law
+    if isinstance(law, type) or hasattr(law, "update") or not callable(law):
+        found = f"the class {law.__name__}" if isinstance(law, type) else shape_of(law)
+        raise TypeError(
+            f"{name} must be a material (an instance of torch_mpm.Material), or a function or module from the "
+            f"deformation gradient [P, D, D] to the Kirchhoff stress, got {found}"
+        )
+    return CustomLaw(law)
 
 
 class Mixture(Material):
@@ -339,20 +387,24 @@ class Mixture(Material):
     the tensor rather than write into it. Per-particle parameters of the laws have shape [P] for the whole state.
 
     Args:
-        laws: at least one.
+        laws: at least one; functions and modules F -> τ as by `CustomLaw`.
 
     Raises:
+        TypeError: for what is no law.
         ValueError: without laws, or in use without state.material or with an id outside 0 .. len(laws) − 1.
     """
 
-    def __init__(self, laws: Sequence[Material]) -> None:
+    def __init__(self, laws: Sequence[Material | Callable[[Tensor], Any]]) -> None:
         super().__init__()
+        if not isinstance(laws, (list, tuple, nn.ModuleList)):
+            raise TypeError(f"laws must be a list of materials, got {shape_of(laws)}")
         if len(laws) == 0:
             raise ValueError("Mixture needs at least one law")
-        self.laws = nn.ModuleList(laws)
-        self.state_fields = tuple(sorted({field for law in laws for field in law.state_fields}))
-        self.extra_fields = tuple(sorted({field for law in laws for field in law.extra_fields}))
-        self.viscous = any(law.viscous for law in laws)
+        parts = [as_law(f"laws[{k}]", law) for k, law in enumerate(laws)]
+        self.laws = nn.ModuleList(parts)
+        self.state_fields = tuple(sorted({field for law in parts for field in law.state_fields}))
+        self.extra_fields = tuple(sorted({field for law in parts for field in law.extra_fields}))
+        self.viscous = any(law.viscous for law in parts)
         self._material: Tensor | None = None
         self._indices: list[Tensor] = []
 
@@ -361,7 +413,7 @@ class Mixture(Material):
         P, D = state.x.shape
         stress = soa_empty(state.x, (P, D, D))
         for part, law in self._parts(state):
-            fields, part_stress = law.update(part)
+            fields, part_stress = law(part)
             stress = stress.index_copy(0, part.index, part_stress)
             for name, value in fields.items():
                 if name not in changes:

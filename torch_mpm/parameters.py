@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor, nn
 
-from .errors import shape_of
+from .errors import check_numbers, shape_of
 from .reference.material import per_particle
 
 if TYPE_CHECKING:
@@ -17,6 +17,13 @@ if TYPE_CHECKING:
 Value = float | Tensor | Callable[[Tensor], Tensor]
 """A parameter: a number; a tensor [], [1], [B] or [P]; a function of the temperature [P] [K] that returns [P], or a
 `PerMaterial` of these."""
+
+
+def _knots(name: str, given: Sequence[float] | Tensor) -> Tensor:
+    """Numbers as a tensor on the default device, as modules have their tensors."""
+    if isinstance(given, Tensor):
+        return given
+    return torch.tensor(check_numbers(f"{name} of a table", given), dtype=torch.float64)
 
 
 class Table(nn.Module):
@@ -35,8 +42,8 @@ class Table(nn.Module):
 
     def __init__(self, temperature: Sequence[float] | Tensor, value: Sequence[float] | Tensor) -> None:
         super().__init__()
-        knots = torch.as_tensor(temperature, dtype=torch.float64).detach()
-        values = value if isinstance(value, Tensor) else torch.tensor(value, dtype=torch.float64)
+        knots = _knots("temperature", temperature).detach().double()
+        values = _knots("value", value)
         if knots.dim() != 1 or len(knots) < 2 or values.shape != knots.shape:
             raise ValueError(
                 "temperature and value of a table must be lists of one length, 2 or more, "
@@ -154,3 +161,19 @@ def store(module: nn.Module, name: str, value: Any) -> None:
         module.register_buffer(name, value)
     else:
         setattr(module, name, value if callable(value) else float(value))
+
+
+class TensorModule(nn.Module):
+    """A module whose tensors are buffers, so that `.to` moves them and a `state_dict` has them.
+
+    Any attribute may be assigned again as something else: a number, a tensor, an nn.Parameter, a module.
+    """
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        for stored in ("_parameters", "_buffers", "_modules"):
+            self.__dict__.get(stored, {}).pop(name, None)
+        if isinstance(value, Tensor) and not isinstance(value, nn.Parameter):
+            self.__dict__.pop(name, None)
+            self._buffers[name] = value
+        else:
+            super().__setattr__(name, value)

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from .errors import shape_of
-from .materials import Material, SolidLaw, _check_value
+from .materials import Material, SolidLaw, _check_value, check_function, check_stiffness, given_stiffness
 from .ops.principal import (
     PrincipalUpdate,
     principal_energy,
@@ -293,14 +293,16 @@ class CustomPrincipalLaw(Material):
     Args:
         function: called with the stretches σ [P, D], in no order that matters: it must treat them alike. Returns the
             principal Kirchhoff stresses [P, D] [Pa], or a pair (stretches, stresses) where a plastic law changes σ.
-        stiffness: see `Material.stiffness`; a number, a tensor [P] or a function of the state. Needed for `stable_dt`.
+        stiffness: see `Material.stiffness`; a number, a tensor [P] or a function of the state. None takes it from the
+            function by automatic differentiation, each time that `stable_dt` asks.
 
     The gradient with respect to F holds at equal stretches: differences of the function over a gap of at least the cube
     root of the rounding error stand for its derivative there (relative error about 1e-10 in float64, 1e-5 in float32).
     Particles with det F ≤ 0 or F not finite have no stress, and the function sees them at rest.
 
     Raises:
-        ValueError: in use for a result of another shape.
+        TypeError: for what is no function.
+        ValueError: for a number as stiffness that is negative or not finite, or in use for a result of another shape.
     """
 
     def __init__(
@@ -309,8 +311,8 @@ class CustomPrincipalLaw(Material):
         stiffness: float | Tensor | Callable[[State], Tensor] | None = None,
     ) -> None:
         super().__init__()
-        self.function = function
-        self._stiffness = stiffness
+        self.function = check_function(function)
+        self._stiffness = check_stiffness(stiffness)
 
     def update(self, state: State) -> tuple[dict[str, Tensor], Tensor]:
         if state.F is None:
@@ -326,10 +328,7 @@ class CustomPrincipalLaw(Material):
         return {} if mapped is sigma else {"F": new.where(good, state.F)}, stress
 
     def stiffness(self, state: State) -> Tensor:
-        if self._stiffness is None:
-            return super().stiffness(state)
-        value = self._stiffness(state) if callable(self._stiffness) else self._stiffness
-        return torch.as_tensor(value, dtype=state.x.dtype, device=state.x.device).expand(state.x.shape[0])
+        return given_stiffness(self._stiffness, state) if self._stiffness is not None else super().stiffness(state)
 
     def invalid(self, state: State) -> Tensor:
         assert state.F is not None

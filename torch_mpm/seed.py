@@ -19,12 +19,16 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
+from .errors import check_number, check_vector, default_dtype
+
 Vector = Sequence[float] | Tensor
 
 # Measured for _poisson_disk: a sample of least distance r has (_POISSON_SPACING * r)^-D points per unit of volume,
 # within 0.2 %.
 _POISSON_SPACING = {2: 1.245, 3: 1.147}
 _POISSON_TRIALS = 12
+HOST = torch.device("cpu")
+"""Shapes and points are made here, whatever torch's default device, and moved when they are whole."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +54,11 @@ class Shape(Protocol):
 
 
 def _vector(name: str, value: Vector, dim: int | None = None) -> Tensor:
-    v = torch.as_tensor(value, dtype=torch.float64).cpu()
+    if isinstance(value, Tensor):
+        v = value.detach().to("cpu", torch.float64)
+    else:
+        check_vector(name, value, dim)
+        v = torch.tensor(value, dtype=torch.float64, device="cpu")
     if v.dim() != 1 or v.numel() not in ((2, 3) if dim is None else (dim,)):
         raise ValueError(f"{name} must have {dim or '2 or 3'} numbers, got {list(v.shape)}: {value}")
     if not bool(torch.isfinite(v).all()):
@@ -59,9 +67,7 @@ def _vector(name: str, value: Vector, dim: int | None = None) -> Tensor:
 
 
 def _positive(name: str, value: float) -> float:
-    if not (math.isfinite(value) and value > 0):
-        raise ValueError(f"{name} must be positive, got {value}")
-    return float(value)
+    return float(check_number(name, value, "positive", lambda v: 0 < v < math.inf))
 
 
 class Box:
@@ -150,7 +156,10 @@ class Mesh:
     """
 
     def __init__(self, source: str | Path | Any, scale: float = 1.0, offset: Vector = (0.0, 0.0, 0.0)):
-        mesh = _load_mesh(source)
+        with HOST:
+            self._set(_load_mesh(source), source, scale, offset)
+
+    def _set(self, mesh: Any, source: Any, scale: float, offset: Vector) -> None:
         if not mesh.is_watertight:
             raise ValueError(
                 f"mesh {source} is not closed: {_open_edges(mesh)} of its edges do not join two triangles; "
@@ -218,12 +227,21 @@ def fill(
         per_cell: mean number of particles in a cell of volume dx^D.
         method: "lattice" or "poisson".
         seed: seed of the Poisson-disk sample.
-        dtype, device: of the result; by default torch's.
+        dtype, device: of the result; by default torch's (float32 where that is a half).
 
     Raises:
         ValueError: for an unknown method, or a shape too small to hold a point.
     """
-    dx = _positive("dx", float(getattr(grid, "dx", grid)))
+    dtype, device = dtype or default_dtype(), torch.get_default_device() if device is None else device
+    with HOST:
+        x = _points_in(shape, grid, per_cell, method, seed)
+        volume = torch.full((len(x),), shape.volume / len(x), dtype=torch.float64)
+    return Points(x.to(device=device, dtype=dtype), volume.to(device=device, dtype=dtype))
+
+
+def _points_in(shape: Shape, grid: Any, per_cell: float, method: str, seed: int) -> Tensor:
+    """[P, D], float64, on the CPU."""
+    dx = _positive("the grid's dx", getattr(grid, "dx", grid))
     dim = len(shape.lower)
     spacing = dx / _positive("per_cell", per_cell) ** (1 / dim)
     if method == "lattice":
@@ -237,9 +255,7 @@ def fill(
         raise ValueError(
             f"the shape is too small for its particles: spacing {spacing:g} m; use a finer grid or a larger per_cell"
         )
-    dtype = dtype or torch.get_default_dtype()
-    volume = torch.full((len(x),), shape.volume / len(x), dtype=dtype, device=device)
-    return Points(x.to(device=device, dtype=dtype), volume)
+    return x
 
 
 def _lattice(lower: Tensor, upper: Tensor, spacing: float) -> Tensor:
@@ -331,18 +347,19 @@ def file(
         FileNotFoundError: when there is no such file.
         ValueError: for an unknown format, a wrong shape, numbers not finite, or volumes missing or not positive.
     """
-    x, volumes = _read_points(Path(path))
+    with HOST:
+        x, volumes = _read_points(Path(path))
     if x.dim() != 2 or x.shape[1] not in (2, 3) or len(x) == 0:
         raise ValueError(f"points in {path} must have shape [P, 2] or [P, 3] with P > 0, got {list(x.shape)}")
     if volume is not None:
-        volumes = torch.full((len(x),), _positive("volume", volume) / len(x), dtype=torch.float64)
+        volumes = torch.full_like(x[:, 0], _positive("volume", volume) / len(x))
     if volumes is None:
         raise ValueError(f"{path} has no particle volumes; give the total volume of the points")
     if volumes.shape != x.shape[:1] or not bool((volumes > 0).all()):
         raise ValueError(f"volumes in {path} must be positive with shape [{len(x)}], got {list(volumes.shape)}")
     if not bool(torch.isfinite(x).all() and torch.isfinite(volumes).all()):
         raise ValueError(f"points in {path} must be finite")
-    dtype = dtype or torch.get_default_dtype()
+    dtype, device = dtype or default_dtype(), torch.get_default_device() if device is None else device
     return Points(x.to(device=device, dtype=dtype), volumes.to(device=device, dtype=dtype))
 
 

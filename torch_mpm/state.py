@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+import itertools
+import math
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
-from .errors import FLOATING, check_like, shape_of
+from .errors import FLOATING, REAL, check_count, check_like, check_number, default_dtype, shape_of
 from .ops.arguments import soa_empty
 
 if TYPE_CHECKING:
@@ -51,7 +53,8 @@ class State:
         F: deformation gradient [P, D, D]; for laws that need only its determinant,
         J: volume ratio [P].
         scene: scene of each particle, int32 [P]; None for one scene.
-        ids: stable identity of each particle, int64 [P], set once particles are reordered.
+        ids: stable identity of each particle, int64 [P], set once particles are reordered; 0 .. P − 1 in some order
+            where parameters are given per particle.
         material: law of each particle, int32 [P], for a `Mixture`.
         temperature: relative to a reference [P] [K].
         extra: further per-particle tensors [P, ...] that follow a reordering.
@@ -96,8 +99,11 @@ class State:
             if index.dtype != dtype:
                 raise TypeError(f"{name} must be {dtype}, got {index.dtype}")
         for name, value in self.extra.items():
-            if value.shape[:1] != (P,):
+            if not isinstance(value, Tensor) or value.shape[:1] != (P,):
                 raise ValueError(f"extra[{name!r}] must have {P} rows, got {shape_of(value)}")
+
+        if not isinstance(self.time, (Tensor, *REAL)):
+            raise TypeError(f"time must be a number or a tensor [B], got {shape_of(self.time)}")
 
     @classmethod
     def at_rest(
@@ -113,24 +119,25 @@ class State:
         Args:
             points: positions [m], rest volumes [m³] and perhaps scenes, as the functions of `torch_mpm.seed` give them.
             density: [kg/m³]; a number or [P].
-            velocity: [m/s]; D numbers or [P, D]; None for zero.
-            dtype: float32 or float64; torch's default if None.
+            velocity: [m/s]; D numbers, or a tensor [D] or [P, D]; None for zero.
+            dtype: float32 or float64; torch's default if None, or float32 where that is a half.
             device: the points' if None.
 
         Raises:
-            ValueError: for a density that is not positive and finite, or wrong shapes.
+            TypeError, ValueError: for a density that is not positive and finite, numbers as velocity that are not
+                finite, or wrong shapes.
         """
-        values = torch.as_tensor(density)
-        bad = values[~((values > 0) & (values < torch.inf))]
-        if bad.numel():
-            raise ValueError(f"density must be positive and finite, got {float(bad[0])}")
-        dtype = dtype or torch.get_default_dtype()
+        if not isinstance(getattr(points, "x", None), Tensor):
+            raise TypeError(f"points must be what torch_mpm.seed gives, got {shape_of(points)}")
+        P, D = points.x.shape
+        _check_density(density, P)
+        dtype = dtype or default_dtype()
         x = _as_soa(points.x.to(device=device, dtype=dtype))
         volume = points.volume.to(device=x.device, dtype=dtype)
         mass = (points.volume.to(x.device) * density).to(dtype)
-        v = soa_empty(x, tuple(x.shape)).zero_()
+        v = soa_empty(x, (P, D)).zero_()
         if velocity is not None:
-            v = v + torch.as_tensor(velocity, dtype=dtype, device=x.device)
+            v = v + _given_velocity(velocity, P, D).to(device=x.device, dtype=dtype)
         scene = None if points.scene is None else points.scene.to(device=x.device, dtype=torch.int32)
         return cls(x=x, v=v, mass=mass, volume=volume, scene=scene)
 
@@ -165,7 +172,11 @@ class State:
         return state
 
     def select(self, particles: Tensor) -> State:
-        """The particles of an index tensor, int64 or int32 [Q], in that order; differentiable."""
+        """The particles of an index tensor, int64 or int32 [Q], in that order; differentiable.
+
+        `ids` go with their particles. A law with parameters per particle needs those of the Q particles in the order of
+        `ids`, and ids 0 .. Q − 1, which `State.concatenate([state])` makes.
+        """
         return self.map(lambda t: _take(t, particles))
 
     def sorted(self, grid: Grid) -> State:
@@ -183,38 +194,174 @@ class State:
         return self if self.ids is None else self.select(torch.argsort(self.ids))
 
     @staticmethod
-    def concatenate(states: list[State], scene: bool = False) -> State:
-        """Pack several states into one.
+    def concatenate(states: Sequence[State], scene: bool = False, scenes: Sequence[int] | None = None) -> State:
+        """Pack several states into one; differentiable.
 
         Args:
-            states: with the same fields present.
-            scene: make each of them its own scene, numbered in order.
+            states: of one dimension, dtype and device. C, F and J that only some have are made as a step makes them:
+                zero, identity, one.
+            scene: False packs parts of one batch, whose scenes stay as they are. True packs batches: the scenes of each
+                state follow those of the states before it, and each keeps its time.
+            scenes: with scene=True, how many scenes each state holds. None counts those of its time [B], or else one
+                more than its largest scene, which synchronises with the device.
+
+        Returns:
+            A state with ids 0 .. P − 1 where one of the states has ids, such that `restored` gives the states one after
+            another, each in its own restored order. Parameters [P] are then those of the states, joined alike.
 
         Raises:
-            ValueError: for an empty list, or where a field is present in some states only.
+            TypeError: for anything but a list of states.
+            ValueError: for an empty list; states of one batch at different times; another field that is present in some
+                states only; counts that do not fit.
         """
-        if not states:
-            raise ValueError("states must not be empty")
+        states = _checked(states)
+        counts = [0] * len(states)
         if scene:
-            states = [
-                s.replace(scene=torch.full((len(s),), i, dtype=torch.int32, device=s.x.device))
-                for i, s in enumerate(states)
-            ]
+            counts = _scene_counts(states, scenes)
+            firsts = itertools.accumulate([0, *counts])
+            states = [s.replace(scene=_scene_of(s) + first) for s, first in zip(states, firsts, strict=False)]
+        time = _times_of_scenes(states, counts) if scene else _one_time(states)
+        if any(s.ids is not None for s in states):
+            befores = itertools.accumulate([0, *(len(s) for s in states)])
+            states = [s.replace(ids=_rank(s) + before) for s, before in zip(states, befores, strict=False)]
+        names = [f.name for f in dataclasses.fields(State) if f.name not in ("extra", "time")]
+        keys = dict.fromkeys(key for s in states for key in s.extra)
+        joined: dict[str, Any] = {name: _joined(name, states) for name in names}
+        extra = {key: _as_soa(torch.cat([_extra(key, s, k, states) for k, s in enumerate(states)])) for key in keys}
+        return State(**joined, extra=extra, time=time)
 
-        def joined(name: str) -> Tensor | None:
-            values = [getattr(s, name) for s in states]
-            if all(v is None for v in values):
-                return None
-            if any(v is None for v in values):
-                raise ValueError(f"{name} is present in some states and absent in others")
-            return _cat(values)
 
-        fields = [f.name for f in dataclasses.fields(State) if f.name not in ("extra", "time")]
-        keys = states[0].extra.keys()
-        if any(s.extra.keys() != keys for s in states):
-            raise ValueError("the states have different extra fields")
-        extra = {k: _cat([s.extra[k] for s in states]) for k in keys}
-        return State(**{name: joined(name) for name in fields}, extra=extra, time=states[0].time)  # type: ignore[arg-type]
+# ---- joining
+
+
+def _checked(states: Sequence[State]) -> list[State]:
+    """The states as a list, after a look at what they must have in common."""
+    if not isinstance(states, (list, tuple)):
+        raise TypeError(f"states must be a list of State, got {shape_of(states)}")
+    if wrong := [s for s in states if not isinstance(s, State)]:
+        raise TypeError(f"states must be a list of State, got a list with {shape_of(wrong[0])}")
+    if len(states) == 0:
+        raise ValueError("states must have at least one State, got none")
+    kinds = [(s.x.shape[1], s.x.dtype, s.x.device) for s in states]
+    if len(set(kinds)) > 1:
+        found = " and ".join(f"{dim}-D {dtype} on {device}" for dim, dtype, device in dict.fromkeys(kinds))
+        raise ValueError(f"states must have one dimension, dtype and device, got {found}")
+    return list(states)
+
+
+def _scene_of(state: State) -> Tensor:
+    """Scene of each particle, int32 [P], also of a state of one scene."""
+    if state.scene is not None:
+        return state.scene
+    return torch.zeros(len(state), dtype=torch.int32, device=state.x.device)
+
+
+def _scene_counts(states: Sequence[State], given: Sequence[int] | None) -> list[int]:
+    """Number of scenes of each state."""
+    if given is not None and len(given) != len(states):
+        raise ValueError(f"scenes must have one count for each of {len(states)} states, got {list(given)}")
+    counts = []
+    for k, state in enumerate(states):
+        several = isinstance(state.time, Tensor) and state.time.numel() > 1
+        known = None if given is None else given[k]
+        if known is None and several:
+            known = len(state.time)  # type: ignore[arg-type]
+        last = int(state.scene.max()) if state.scene is not None and len(state) else 0
+        if known is not None and check_count(f"scenes[{k}]", known) <= last:
+            raise ValueError(f"scenes[{k}] must be above {last}, the largest scene of its state, got {known}")
+        counts.append(last + 1 if known is None else known)
+    return counts
+
+
+def _times_of_scenes(states: Sequence[State], counts: Sequence[int]) -> float | Tensor:
+    """A number where it is the same for all, else [B]."""
+    times = [s.time for s in states]
+    if not any(isinstance(t, Tensor) for t in times) and len(set(times)) == 1:
+        return times[0]
+    x = states[0].x
+    rows = [torch.as_tensor(t, dtype=x.dtype, device=x.device).reshape(-1) for t in times]
+    return torch.cat([row.expand(count) for row, count in zip(rows, counts, strict=True)])
+
+
+def _one_time(states: Sequence[State]) -> float | Tensor:
+    """The time of states that are parts of one batch."""
+    first, x = states[0].time, states[0].x
+    for other in (s.time for s in states[1:]):
+        if other is first:
+            continue
+        if isinstance(first, Tensor) or isinstance(other, Tensor):
+            a, b = (torch.as_tensor(t, dtype=x.dtype, device=x.device) for t in (first, other))
+            same = bool((a == b).all())
+        else:
+            same = first == other
+        if not same:
+            raise ValueError(
+                f"states of one batch must have one time, got {first} and {other}: set it with replace(time=...), or "
+                "pass scene=True for states that are scenes of their own"
+            )
+    return first
+
+
+def _rank(state: State) -> Tensor:
+    """Place of each particle in the restored order of its state, int64 [P]."""
+    places = torch.arange(len(state), device=state.x.device)
+    return places if state.ids is None else torch.empty_like(places).scatter_(0, torch.argsort(state.ids), places)
+
+
+def _joined(name: str, states: Sequence[State]) -> Tensor | None:
+    """A field of all states, made where a step would make it; None where no state has it."""
+    values = [getattr(s, name) for s in states]
+    if all(v is None for v in values):
+        return None
+    make = {"C": _no_motion, "F": identity_deformation, "J": lambda x: torch.ones_like(x[:, 0])}.get(name)
+    if make is not None:
+        values = [make(s.x.detach()) if v is None else v for s, v in zip(states, values, strict=True)]
+    lacks = next((k for k, v in enumerate(values) if v is None), None)
+    if lacks is not None:
+        has = next(k for k, v in enumerate(values) if v is not None)
+        raise ValueError(f"state {lacks} has no {name}, which state {has} has: set it with replace({name}=...)")
+    return _as_soa(torch.cat(values))
+
+
+def _extra(key: str, state: State, number: int, states: Sequence[State]) -> Tensor:
+    if key not in state.extra:
+        has = next(k for k, s in enumerate(states) if key in s.extra)
+        raise ValueError(
+            f"state {number} has no extra[{key!r}], which state {has} has: set it, or join what step.prepare makes of "
+            "the states"
+        )
+    return state.extra[key]
+
+
+def _no_motion(x: Tensor) -> Tensor:
+    P, D = x.shape
+    return x.new_zeros(P, D, D)
+
+
+def _given_velocity(velocity: Any, P: int, D: int) -> Tensor:
+    """[D] or [P, D]."""
+    if not isinstance(velocity, Tensor):
+        try:
+            velocity = torch.as_tensor(velocity, dtype=torch.float64, device="cpu")
+        except (TypeError, ValueError) as error:
+            raise TypeError(f"velocity must be {D} numbers or a tensor, got {velocity!r}") from error
+        if not bool(velocity.isfinite().all()):
+            raise ValueError(f"velocity must be finite, got {velocity.tolist()}")
+    if tuple(velocity.shape) not in ((D,), (P, D)):
+        raise ValueError(f"velocity must have shape [D] = [{D}] or [P, D] = [{P}, {D}], got {shape_of(velocity)}")
+    return velocity
+
+
+def _check_density(density: float | Tensor, particles: int) -> None:
+    if not isinstance(density, Tensor):
+        check_number("density", density, "positive", lambda v: 0 < v < math.inf)
+        return
+    if density.shape not in ((), (particles,)):
+        raise ValueError(f"density must be a number or have shape [P] = [{particles}], got {shape_of(density)}")
+    values = density.detach()
+    bad = values[~((values > 0) & (values < math.inf))]
+    if bad.numel():
+        raise ValueError(f"density must be positive and finite, got {float(bad[0])}")
 
 
 def _as_soa(t: Tensor) -> Tensor:
@@ -232,10 +379,6 @@ def _take(t: Tensor, particles: Tensor) -> Tensor:
     rows = t.permute(*range(1, t.dim()), 0).flatten(0, -2)  # of which `index_select` is ten times faster
     taken = rows.index_select(1, particles).unflatten(0, t.shape[1:])
     return taken.permute(t.dim() - 1, *range(t.dim() - 1))
-
-
-def _cat(tensors: list[Tensor]) -> Tensor:
-    return _as_soa(torch.cat(tensors))
 
 
 def identity_deformation(x: Tensor) -> Tensor:

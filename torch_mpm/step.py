@@ -7,18 +7,19 @@ from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.utils.checkpoint import checkpoint as run_checkpointed
 
-from .boundaries import Obstacle, Walls
+from .boundaries import BoundaryList, Obstacle, Walls, call_boundary
 from .capture import Kept
 from .cfl import stable_dt
+from .errors import check_count, check_number, check_vector, shape_of
 from .failures import Failures, problems_of_state, problems_of_status, raise_failures, refused_steps
 from .grid import ActivationRecord, Blocks, Grid
 from .heat import Heat
-from .materials import Material
+from .materials import Material, as_law
 from .ops import contact, fusible, g2p, g2p_advance, gather, grid_update, p2g
-from .parameters import With
+from .parameters import TensorModule, With
 from .pause import split_paused, standing
 from .state import State, identity_deformation
 
@@ -26,22 +27,26 @@ TRANSFERS = ("apic", "pic", "flip")
 
 
 class Boundary(Protocol):
-    """What acts on the grid velocity [N, D] of nodes at positions [N, D]; see `torch_mpm.boundaries`."""
+    """What acts on the grid velocity [N, D] of nodes at positions [N, D]; see `torch_mpm.boundaries`.
+
+    A module may have the same as `forward`.
+    """
 
     def apply(
         self, velocity: Tensor, positions: Tensor, scene: Tensor | None, time: float | Tensor, dt: float | Tensor
     ) -> Tensor: ...
 
 
-class Step(nn.Module):
+class Step(TensorModule):
     """Symplectic Euler: stress, P2G, grid update, boundaries, G2P, positions and deformation gradients.
 
     Args:
         grid: the lattice.
-        law: a material of `torch_mpm.materials`, or any module with its interface.
-        gravity: [m/s²]; D numbers, or a tensor [D] or [B, D] that may require grad; None for none.
+        law: a material; or a function or module F [P, D, D] -> Kirchhoff stress, of which `CustomLaw` makes one.
+        gravity: [m/s²]; D numbers, or a tensor [D] or [B, D] that may require grad, on the device of the particles, a
+            buffer or parameter of the step; None for none.
         walls: "slip", "sticky", "separate" or "mirror" on every face of the domain, a `Walls` that says more, or None.
-        boundaries: obstacles with the interface of `torch_mpm.boundaries`, applied in order.
+        boundaries: obstacles with the interface of `torch_mpm.boundaries`, applied in order; a list that may change.
         transfer: "apic" (Jiang et al. 2015), "pic", or "flip". All keep momentum; only "apic" keeps angular momentum
             too, and "pic" damps strongly (docs/limitations.md).
         flip: share of FLIP in [0, 1] that "apic" or "pic" is blended with; 1 for transfer="flip".
@@ -50,16 +55,26 @@ class Step(nn.Module):
             boundaries: a network, a controller, a field of force.
         heat: conduction of heat in the same particles, see `Heat`; the state then needs a temperature.
 
-    A step without boundaries, walls, gravity, FLIP or heat does not pay for them.
+    A step without boundaries, walls, gravity, FLIP or heat does not pay for them. The arguments are attributes, which
+    may be assigned in the forms of the arguments. Forward hooks act on the step, its law and its boundaries; backward
+    hooks on the law, whose output is a tensor.
 
     Raises:
-        ValueError: for a wrong argument.
+        TypeError, ValueError: for a wrong argument.
     """
+
+    grid: Grid
+    law: Material
+    gravity: tuple[float, ...] | Tensor | None
+    walls: Walls | None
+    boundaries: BoundaryList
+    on_grid: Callable[[Blocks, Tensor, Tensor, float | Tensor], Tensor] | None
+    heat: Heat | None
 
     def __init__(
         self,
         grid: Grid,
-        law: Material,
+        law: Material | Callable[[Tensor], Any],
         gravity: Sequence[float] | Tensor | None = None,
         walls: str | Walls | None = None,
         boundaries: Sequence[Boundary] = (),
@@ -72,27 +87,50 @@ class Step(nn.Module):
         super().__init__()
         if transfer not in TRANSFERS:
             raise ValueError(f"transfer must be one of {sorted(TRANSFERS)}, got {transfer!r}")
-        if not 0 <= flip <= 1:
-            raise ValueError(f"flip must be between 0 and 1, got {flip}")
+        check_number("flip", flip, "between 0 and 1", lambda v: 0 <= v <= 1)
         if stress_form not in ("mls", "gradient"):
             raise ValueError(f"stress_form must be 'gradient' or 'mls', got {stress_form!r}")
         self.grid = grid
-        self.law = law
-        self.gravity = gravity
-        self.walls = Walls(walls) if isinstance(walls, str) else walls
-        self.boundaries = list(boundaries)
+        self.law = law  # type: ignore[assignment]
+        self.gravity = gravity  # type: ignore[assignment]
+        self.walls = walls  # type: ignore[assignment]
+        self.boundaries = boundaries  # type: ignore[assignment]
         self.transfer = transfer
         self.flip = 1.0 if transfer == "flip" else float(flip)
         self.stress_form = stress_form
         self.on_grid = on_grid
         self.heat = heat
-        self._rate_dependent = any(getattr(part, "rate_dependent", False) for part in law.modules())
-        if heat is not None and heat.plastic_heating:
-            for part in law.modules():
-                if isinstance(part, Material):
-                    part.dissipation = True
         self._activations = ActivationRecord()
         self._kept_gravity = Kept()
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        """Arguments in any form, checked and converted."""
+        super().__setattr__(name, _argument(self, name, value))
+        if name in ("law", "heat"):
+            self._fit_law()
+
+    def _fit_law(self) -> None:
+        """What the law reads of a step, and what the step wants of its law."""
+        parts = list(self.law.modules())
+        self._rate_dependent = any(getattr(part, "rate_dependent", False) for part in parts)
+        heat = getattr(self, "heat", None)
+        if heat is not None and heat.plastic_heating:
+            for part in parts:
+                if isinstance(part, Material):
+                    part.dissipation = True
+
+    def register_full_backward_hook(self, *arguments: Any, **options: Any) -> Any:
+        """Refused: PyTorch's hooks would never be called for a `State`.
+
+        Raises:
+            NotImplementedError: always.
+        """
+        raise NotImplementedError(
+            "a backward hook of a Step would never be called, because a State is no tensor: hook its law "
+            "(step.law.register_full_backward_hook), or a tensor of the state (state.x.register_hook)"
+        )
+
+    register_full_backward_pre_hook = register_full_backward_hook
 
     def forward(self, state: State, dt: float | Tensor) -> State:
         """The state one step later.
@@ -119,7 +157,7 @@ class Step(nn.Module):
         grid, scene = self.grid, state.scene
         blocks = self._activations.activate(grid, state.x, scene, state.ids)
         form, affine = self.stress_form, state.C if self.transfer == "apic" else None
-        fields, stress = self.law.update(With(state, dt=dt) if self._rate_dependent else state)  # type: ignore[arg-type]
+        fields, stress = self.law(With(state, dt=dt) if self._rate_dependent else state)
         dissipated = fields.pop("dissipated", None)
         if self.law.extra_fields:
             history = {name: fields.pop(name) for name in self.law.extra_fields if name in fields}
@@ -173,7 +211,7 @@ class Step(nn.Module):
                 scene = None if state.scene is None else blocks.node_scene()
                 nodes = (blocks.node_positions(state.x.dtype), scene)
             for boundary in group:
-                velocity = boundary.apply(velocity, *nodes, time, dt)
+                velocity = call_boundary(boundary, velocity, *nodes, time, dt)
         return velocity
 
     def _blend_flip(self, blocks: Blocks, state: State, affine: Tensor | None, velocity: Tensor, v: Tensor) -> Tensor:
@@ -185,9 +223,11 @@ class Step(nn.Module):
         return (1 - self.flip) * v + self.flip * (state.v + change)
 
     def _gravity(self, x: Tensor) -> Tensor | None:
-        if self.gravity is None or isinstance(self.gravity, Tensor):
-            return self.gravity
-        gravity = tuple(self.gravity)
+        gravity = self.gravity
+        if gravity is None:
+            return None
+        if isinstance(gravity, Tensor):
+            return gravity.to(x.dtype)
 
         def make() -> Tensor:
             return torch.tensor(gravity, dtype=x.dtype, device=x.device).expand(self.grid.scenes, -1).contiguous()
@@ -273,6 +313,42 @@ def _neighbours(boundaries: Sequence[Boundary], time: float | Tensor) -> list[tu
     return runs
 
 
+def _argument(step: Step, name: str, value: Any) -> Any:
+    """An argument of a `Step` in the form that the step keeps.
+
+    Raises:
+        TypeError, ValueError: for a wrong one.
+    """
+    if name == "grid" and not isinstance(value, Grid):
+        raise TypeError(f"grid must be a Grid, got {shape_of(value)}")
+    if name == "law":
+        return as_law("law", value)
+    if name == "gravity" and value is not None:
+        return _checked_gravity(value, step.grid)
+    if name == "walls" and value is not None and not isinstance(value, Walls):
+        if not isinstance(value, str):
+            raise TypeError(f"walls must be the name of a kind, Walls or None, got {shape_of(value)}")
+        return Walls(value)
+    if name == "boundaries":
+        return BoundaryList(value)
+    if name == "on_grid" and value is not None and not callable(value):
+        raise TypeError(f"on_grid must be a function, a module or None, got {shape_of(value)}")
+    if name == "heat" and value is not None and not isinstance(value, Heat):
+        raise TypeError(f"heat must be a Heat or None, got {shape_of(value)}")
+    return value
+
+
+def _checked_gravity(gravity: Any, grid: Grid) -> tuple[float, ...] | Tensor:
+    if not isinstance(gravity, Tensor):
+        return check_vector("gravity", gravity, grid.dim)
+    if not gravity.is_floating_point():
+        raise TypeError(f"gravity must be numbers or a floating tensor, got {gravity.dtype}")
+    if tuple(gravity.shape) not in ((grid.dim,), (grid.scenes, grid.dim)):
+        expected = f"[D] or [B, D] = [{grid.scenes}, {grid.dim}]"
+        raise ValueError(f"gravity must have shape {expected}, got {shape_of(gravity)}")
+    return gravity
+
+
 def rollout(
     step: Callable[[State, float | Tensor], State],
     state: State,
@@ -291,12 +367,14 @@ def rollout(
             steps between again (memory n/checkpoint + checkpoint states instead of n steps; sqrt(n) is best).
 
     Raises:
-        ValueError: for a negative n or a checkpoint below 1.
+        TypeError, ValueError: for an n or a checkpoint that is no whole number, a negative n, a checkpoint below 1, or
+            what `step` raises.
     """
-    if n < 0:
-        raise ValueError(f"n must not be negative, got {n}")
-    if checkpoint is not None and checkpoint < 1:
-        raise ValueError(f"checkpoint must be at least 1, got {checkpoint}")
+    if not callable(step):
+        raise TypeError(f"step must be a Step or a function (state, dt) -> state, got {shape_of(step)}")
+    check_count("n", n)
+    if checkpoint is not None:
+        check_count("checkpoint", checkpoint, 1)
 
     def steps(state: State, count: int) -> State:
         for _ in range(count):

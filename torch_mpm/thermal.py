@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from .materials import Material, _check_value
+from .errors import check_number
+from .materials import Material, _check_value, as_law
 from .parameters import Value, With, evaluate, needed_temperature, store
 
 if TYPE_CHECKING:
@@ -36,14 +37,14 @@ class ThermalExpansion(Material):
 
     def __init__(self, law: Material, coefficient: Value) -> None:
         super().__init__()
-        self.law = law
+        self.law = law = as_law("law", law)
         self.state_fields, self.extra_fields = law.state_fields, law.extra_fields
         self.viscous = law.viscous
         store(self, "coefficient", _check_value("coefficient", coefficient, "finite", lambda v: v == v))
 
     def update(self, state: State) -> tuple[dict[str, Tensor], Tensor]:
         stretch = self._stretch(state)
-        fields, stress = self.law.update(self._elastic(state, stretch))
+        fields, stress = self.law(self._elastic(state, stretch))
         changes = dict(fields)
         if "F" in fields:
             changes["F"] = fields["F"] * stretch[:, None, None]
@@ -99,13 +100,13 @@ class Melting(Material):
 
     def __init__(self, solid: Material, liquid: Material, coherency: float = 0.8) -> None:
         super().__init__()
+        solid, liquid = as_law("solid", solid), as_law("liquid", liquid)
         if tuple(solid.state_fields) != ("F",) or tuple(liquid.state_fields) != ("J",):
             raise ValueError(
                 "Melting needs a solid with the field F and a liquid with the field J, "
                 f"got {solid.state_fields} and {liquid.state_fields}"
             )
-        if not 0 < coherency <= 1:
-            raise ValueError(f"coherency must be in (0, 1], got {coherency}")
+        check_number("coherency", coherency, "in (0, 1]", lambda v: 0 < v <= 1)
         self.solid, self.liquid, self.coherency = solid, liquid, float(coherency)
         self.extra_fields = solid.extra_fields
         self.viscous = solid.viscous or liquid.viscous
@@ -113,8 +114,8 @@ class Melting(Material):
     def update(self, state: State) -> tuple[dict[str, Tensor], Tensor]:
         fraction, flows = self._phases(state)
         part = self._consistent(state, flows)
-        fields, solid = self.solid.update(part)
-        _, liquid = self.liquid.update(part)
+        fields, solid = self.solid(part)
+        _, liquid = self.liquid(part)
         changes = {**fields, "F": fields.get("F", part.F), "J": part.J}
         if "dissipated" in fields:
             changes["dissipated"] = torch.where(flows, 0, fields["dissipated"])

@@ -10,7 +10,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..errors import check_like, shape_of
+from ..errors import REAL, check_like, shape_of
+
+LARGEST = {dtype: torch.finfo(dtype).max for dtype in (torch.float32, torch.float64)}
 
 
 def split_dt(dt: float | Tensor, scenes: int, x: Tensor) -> tuple[float, Tensor | None]:
@@ -20,12 +22,15 @@ def split_dt(dt: float | Tensor, scenes: int, x: Tensor) -> tuple[float, Tensor 
         dt: number, or tensor of shape [], [1] or [B].
 
     Raises:
-        ValueError: for a number that is not positive and finite, or a wrong shape or device. Values of a tensor are not
-            read, so that the device is not synchronised.
+        TypeError: for anything else.
+        ValueError: for a number that is not positive and finite in the dtype of x, or a wrong shape or device. Values
+            of a tensor are not read, so that the device is not synchronised.
     """
     if not isinstance(dt, Tensor):
-        if not 0 < dt < float("inf"):
-            raise ValueError(f"dt must be a positive number of seconds, got {dt}")
+        if not isinstance(dt, REAL):
+            raise TypeError(f"dt must be a number of seconds or a tensor, got {type(dt).__name__} {dt!r}")
+        if not 0 < dt <= LARGEST.get(x.dtype, math.inf):
+            raise ValueError(f"dt must be a positive number of seconds, finite in {x.dtype}, got {dt}")
         return float(dt), None
     if dt.dim() > 1 or (dt.dim() == 1 and dt.shape[0] not in (1, scenes)):
         raise ValueError(f"dt must be a number or have shape [], [1] or [B] = [{scenes}], got {shape_of(dt)}")

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ..boundaries import Box, Capsule, Obstacle, Plane, Sphere
 from ..errors import check_like, shape_of
-from ..grid import Blocks
+from ..grid import Blocks, check_blocks
 from ..reference.obstacles import contact as reference
 from .arguments import check_list, check_real, differentiate, refuse_vmap
 from .autograd import dispatch, register_autograd
@@ -22,11 +22,18 @@ SHAPES: dict[type, int] = {Plane: 0, Sphere: 1, Box: 2, Capsule: 3}
 
 
 def fusible(obstacle: Any, time: float | Tensor) -> bool:
-    """Whether `contact` takes an obstacle: a built-in shape without anything that requires grad.
+    """Whether `contact` takes an obstacle: a built-in shape without hooks and without anything that requires grad.
 
     An `SDF`, a position as a function of time, a parameter or a time that requires grad need `Obstacle.apply`.
     """
     if type(obstacle) not in SHAPES or (callable(obstacle.position) and not isinstance(obstacle.position, Tensor)):
+        return False
+    if (
+        obstacle._forward_hooks
+        or obstacle._forward_pre_hooks
+        or obstacle._backward_hooks
+        or obstacle._backward_pre_hooks
+    ):
         return False
     return not any(isinstance(value, Tensor) and value.requires_grad for value in (time, *_values(obstacle)))
 
@@ -48,6 +55,7 @@ def contact(blocks: Blocks, velocity: Tensor, obstacles: Sequence[Obstacle], tim
 
     Differentiable with respect to velocity, twice in eager mode.
     """
+    check_blocks(blocks)
     grid = blocks.grid
     if not isinstance(velocity, Tensor) or velocity.shape != (blocks.node_count, grid.dim):
         raise ValueError(f"velocity must have shape [N, D] = {[blocks.node_count, grid.dim]}, got {shape_of(velocity)}")

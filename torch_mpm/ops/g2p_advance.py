@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ..errors import check_like, check_positions
-from ..grid import Blocks, inverse_inertia
+from ..grid import Blocks, check_blocks, inverse_inertia
 from .arguments import refuse_vmap, soa_empty, split_dt, sum_by_scene
 from .autograd import dispatch, register_autograd
 from .transfer import STRESS_FORMS, TOPOLOGY, _blocks_of, _check_nodes, _save, _saved
@@ -45,6 +45,7 @@ def g2p_advance(
 
     Differentiable with respect to every floating tensor, twice in eager mode.
     """
+    check_blocks(blocks)
     grid = blocks.grid
     check_positions(x, grid.dim, blocks.scene, grid.scenes)
     P, D = x.shape

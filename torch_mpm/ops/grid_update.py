@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ..boundaries import Face, Walls
 from ..errors import FLOATING, check_like, shape_of
-from ..grid import BLOCK_WIDTH, Blocks, Grid
+from ..grid import BLOCK_WIDTH, Blocks, Grid, check_blocks
 from ..reference import grid_update as reference
 from .arguments import differentiate, refuse_vmap, split_dt
 from .autograd import dispatch, register_autograd
@@ -43,6 +43,7 @@ def grid_update(
 
     Differentiable with respect to nodes, gravity and dt, twice in eager mode.
     """
+    check_blocks(blocks)
     grid = blocks.grid
     if not isinstance(nodes, Tensor) or nodes.shape != (blocks.node_count, 1 + grid.dim):
         expected = [blocks.node_count, 1 + grid.dim]

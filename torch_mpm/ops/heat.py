@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ..errors import check_like, check_positions, shape_of
-from ..grid import Blocks, inverse_inertia
+from ..grid import Blocks, check_blocks, inverse_inertia
 from .arguments import check_choice, check_real, refuse_vmap, split_dt
 from .autograd import dispatch, register_autograd
 from .heat_multigrid import heat_multigrid
@@ -91,6 +91,7 @@ def heat_cg(
 
     Differentiable with respect to every floating tensor but the tolerance, by one more solve.
     """
+    check_blocks(blocks)
     grid = blocks.grid
     check_positions(x, grid.dim, blocks.scene, grid.scenes)
     P, N = x.shape[0], blocks.node_count
@@ -155,6 +156,7 @@ def heat_operator(blocks: Blocks, x: Tensor, conductance: Tensor, nodes: Tensor 
 
     H u is differentiable with respect to every tensor, twice in eager mode; the diagonal is not.
     """
+    check_blocks(blocks)
     check_positions(x, blocks.grid.dim, blocks.scene, blocks.grid.scenes)
     check_like("conductance", conductance, x, (x.shape[0],), "[P]")
     check_like("nodes", nodes, x, (blocks.node_count,), "[N]")

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from ..errors import check_like, check_positions, shape_of
-from ..grid import Blocks, Grid, inverse_inertia
+from ..grid import Blocks, Grid, check_blocks, inverse_inertia
 from ..reference import transfer as reference
 from .arguments import differentiate, per_particle, refuse_vmap, soa_empty, split_dt, sum_by_scene
 from .autograd import dispatch, register_autograd
@@ -63,6 +63,7 @@ def p2g(
 
     Differentiable with respect to every floating tensor, twice in eager mode.
     """
+    check_blocks(blocks)
     check_positions(x, blocks.grid.dim, blocks.scene, blocks.grid.scenes)
     P, D = x.shape
     check_like("mass", mass, x, (P,), "[P]")
@@ -108,6 +109,7 @@ def g2p(
 
     Differentiable with respect to x and velocity, twice in eager mode.
     """
+    check_blocks(blocks)
     check_positions(x, blocks.grid.dim, blocks.scene, blocks.grid.scenes)
     velocity = _check_nodes("velocity", velocity, blocks, x, blocks.grid.dim)
     v, C, grad_v = dispatch(torch.ops.torch_mpm.g2p, x, velocity, affine, gradient, *blocks.topology)
@@ -140,6 +142,7 @@ def scatter(
 
     Differentiable with respect to every tensor, twice in eager mode.
     """
+    check_blocks(blocks)
     check_positions(x, blocks.grid.dim, blocks.scene, blocks.grid.scenes)
     P, D = x.shape
     if not isinstance(value, Tensor) or value.dim() != 2:
@@ -172,6 +175,7 @@ def gather(
 
     Differentiable with respect to x and nodes, twice in eager mode.
     """
+    check_blocks(blocks)
     check_positions(x, blocks.grid.dim, blocks.scene, blocks.grid.scenes)
     nodes = _check_nodes("nodes", nodes, blocks, x, None)
     a, b, c = dispatch(torch.ops.torch_mpm.gather, x, nodes, moment_scale, moment, gradient, *blocks.topology)

@@ -73,7 +73,7 @@ def _zero_level(
     axes = [np.arange(a - 2 * step, b + 2.5 * step, step) for a, b in zip(lower, upper, strict=True)]
     nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
     with torch.no_grad():
-        body = torch.as_tensor((nodes.reshape(-1, len(lower)) - at) @ turn)
+        body = torch.as_tensor((nodes.reshape(-1, len(lower)) - at) @ turn, device="cpu")
         field = numpy_of(distance(body)).reshape(nodes.shape[:-1])
     if len(lower) == 2:
         rings = require("contourpy").contour_generator(*axes, field.T).lines(0.0)

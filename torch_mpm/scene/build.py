@@ -74,7 +74,7 @@ class Built:
         """Mass, volume, material and scene of all particles, also of those still to come, by id."""
         layers = [(self.nozzles[k].layer, self.nozzles[k].material) for _, k in self.emissions()]
         states = [self.state, *(layer for layer, _ in layers)]
-        material = [self.material, *(torch.full((len(s),), m, dtype=torch.int32) for s, m in layers)]
+        material = [self.material, *(torch.full((len(s),), m, dtype=torch.int32, device="cpu") for s, m in layers)]
         values = {
             "mass": torch.cat([s.mass for s in states]),
             "volume": torch.cat([s.volume for s in states]),
@@ -122,7 +122,7 @@ def build(scene: Any, device: torch.device) -> Built:
         nothing = State.at_rest(empty, dtype=dtype, device=device)
         parts = [nothing if scene.heat is None else nothing.replace(temperature=torch.zeros_like(nothing.mass))]
         material = [torch.empty(0, dtype=torch.int32)]
-    first = _complete(_join(parts), mixture, torch.cat(material), single=len(entries) == 1)
+    first = _complete(State.concatenate(parts), mixture, torch.cat(material), single=len(entries) == 1)
     nozzles = [
         Nozzle(
             _complete(n.layer, mixture, torch.full((len(n.layer),), n.material), len(entries) == 1), n.material, n.times
@@ -251,13 +251,6 @@ def _complete(state: State, mixture: _Mixture, material: Tensor, single: bool) -
     """Drop or add the indices that the step asks for."""
     law = mixture.law_of(material).to(state.x.device) if len(mixture.groups) > 1 else None
     return state.replace(scene=None if single else state.scene, material=law)
-
-
-def _join(parts: list[State]) -> State:
-    """One state of many bodies, of which only those that spin have C."""
-    if any(p.C is not None for p in parts):
-        parts = [p if p.C is not None else p.replace(C=p.x.new_zeros(*p.x.shape, p.x.shape[1])) for p in parts]
-    return State.concatenate(parts)
 
 
 # ---- bodies

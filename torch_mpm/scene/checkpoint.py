@@ -47,7 +47,6 @@ def load(path: Path, device: torch.device | str = "cpu") -> tuple[State, dict[st
         record = json.loads(source.attrs["record"])
         tensors: dict[str, Any] = {name: torch.from_numpy(data[()]) for name, data in source.items()}
     extra = {name.removeprefix(EXTRA): tensors.pop(name) for name in list(tensors) if name.startswith(EXTRA)}
-    state = State.concatenate(
-        [State(**tensors, extra=extra, time=record["time"])]
-    )  # concatenate restores the memory layout
+    time = tensors.pop("time", record["time"])
+    state = State.concatenate([State(**tensors, extra=extra, time=time)])  # which restores the memory layout
     return state.to(device), record

@@ -329,11 +329,7 @@ def _with_C(state: State) -> State:
 
 
 def joined(state: State, layer: State) -> State:
-    """A state with more particles, which are at rest in themselves."""
-    if state.C is not None and layer.C is None:
-        layer = _with_C(layer)
-    elif state.C is None and layer.C is not None:
-        state = _with_C(state)
+    """A state with more particles, which appear now."""
     return State.concatenate([state, layer.replace(time=state.time)])
 
 

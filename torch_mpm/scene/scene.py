@@ -162,7 +162,8 @@ class Scene(schema.SceneData):
         Raises:
             SceneError: for shapes outside the domain, overlapping bodies, a mesh that is not closed, ...
         """
-        return build(self, self.torch_device() if device is None else torch.device(device))
+        with torch.device("cpu"):  # where a scene is put together, whatever torch's default device
+            return build(self, self.torch_device() if device is None else torch.device(device))
 
     def run(self, out: str | Path, **options: Any) -> dict[str, Any]:
         """Simulate into folder ``out`` and return the summary; ``options`` as in :func:`torch_mpm.scene.run`."""

@@ -94,7 +94,7 @@ class FrameWriter:
             host = []
             for tensor in tensors:
                 tensor.record_stream(self._stream)
-                pinned = torch.empty(tensor.shape, dtype=tensor.dtype, pin_memory=True)
+                pinned = torch.empty(tensor.shape, dtype=tensor.dtype, device="cpu", pin_memory=True)
                 host.append(pinned.copy_(tensor, non_blocking=True))
             ready = torch.cuda.Event()
             ready.record(self._stream)

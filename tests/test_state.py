@@ -1,0 +1,133 @@
+"""Packing states: what joining, selecting and reordering keep of every particle."""
+
+import pytest
+import torch
+from torch import Tensor
+
+import torch_mpm as mpm
+
+
+def block(count: int, device: str = "cpu", at: float = 0.3, **fields: object) -> mpm.State:
+    """`count` particles of a 2-D scene, told apart by their mass."""
+    x = at + 0.3 * torch.rand(count, 2, dtype=torch.float64)
+    mass = 1e-3 * (1 + torch.rand(count, dtype=torch.float64))
+    state = mpm.State(x=x, v=torch.zeros_like(x), mass=mass, volume=torch.full_like(mass, 1e-3))
+    return state.to(device).replace(**fields)
+
+
+def grid(scenes: int = 1) -> mpm.Grid:
+    return mpm.Grid(0.1, (0, 0), (1, 1), scenes=scenes, deterministic=True)
+
+
+def test_joined_states_restore_in_their_own_orders(device):
+    """ids of states that were sorted, selected or neither: unique, and `restored` is each state's own, one by one."""
+    first, second, third = (block(n, device) for n in (40, 30, 20))
+    parts = [first.sorted(grid()), second, third.sorted(grid())]
+    some = third.sorted(grid()).select(torch.arange(0, 20, 3, device=device))
+    joined = mpm.State.concatenate([*parts, some])
+    assert torch.equal(joined.ids.sort().values, torch.arange(len(joined), device=device))
+    expected = torch.cat([first.mass, second.mass, third.mass, some.restored().mass])
+    assert torch.equal(joined.sorted(grid()).restored().mass, expected)
+    again = mpm.State.concatenate([joined, first])
+    assert torch.equal(again.restored().mass, torch.cat([expected, first.mass]))
+    assert mpm.State.concatenate([first, second]).ids is None
+
+
+def test_parameters_follow_particles_through_sorting_and_joining(device):
+    """E per particle in a batch of sorted scenes: as each scene alone, and gradients too."""
+    sizes = (60, 45)
+    alone = [block(n, device, at) for n, at in zip(sizes, (0.2, 0.45), strict=True)]
+    moduli = [1e4 * (1 + torch.rand(n, dtype=torch.float64)).to(device) for n in sizes]
+
+    def run(state: mpm.State, E: Tensor, scenes: int) -> tuple[Tensor, Tensor]:
+        E = E.clone().requires_grad_()
+        step = mpm.Step(grid(scenes), mpm.NeoHookean(E=E, nu=0.3), gravity=(0.0, -9.8), walls="slip")
+        end = mpm.rollout(step, state, 5, 1e-3).restored()
+        return end.x.detach(), torch.autograd.grad(end.x.square().sum(), E)[0]
+
+    packed = mpm.State.concatenate([s.sorted(grid()) for s in alone], scene=True)
+    x, slope = run(packed, torch.cat(moduli), 2)
+    ends = [run(s, E, 1) for s, E in zip(alone, moduli, strict=True)]
+    torch.testing.assert_close(x, torch.cat([end for end, _ in ends]), rtol=1e-12, atol=0)
+    torch.testing.assert_close(slope, torch.cat([grad for _, grad in ends]), rtol=1e-8, atol=1e-18)
+
+
+def test_scenes_of_several_batches_follow_each_other(device):
+    def batch(*sizes: int, **fields: object) -> mpm.State:
+        return mpm.State.concatenate([block(n, device) for n in sizes], scene=True).replace(**fields)
+
+    two, one, three = batch(3, 2), block(4, device), batch(1, 2, 1)
+    joined = mpm.State.concatenate([two, one, three], scene=True)
+    assert joined.scene.tolist() == [0] * 3 + [1] * 2 + [2] * 4 + [3] + [4] * 2 + [5]
+    times = torch.tensor([0.1, 0.2, 0.3], dtype=torch.float64, device=device)
+    longer = batch(3, 2, time=times)  # whose last scene has lost its particles
+    joined = mpm.State.concatenate([longer, one.replace(time=0.5)], scene=True)
+    assert joined.scene.tolist() == [0] * 3 + [1] * 2 + [3] * 4
+    torch.testing.assert_close(joined.time, torch.tensor([0.1, 0.2, 0.3, 0.5], dtype=torch.float64, device=device))
+    counted = mpm.State.concatenate([two, one], scene=True, scenes=[5, 1])
+    assert counted.scene.tolist() == [0] * 3 + [1] * 2 + [5] * 4
+    with pytest.raises(ValueError, match=r"scenes must have one count for each of 2 states, got \[1\]"):
+        mpm.State.concatenate([two, one], scene=True, scenes=[1])
+    with pytest.raises(ValueError, match=r"scenes\[0\] must be above 1, .*, got 1"):
+        mpm.State.concatenate([two, one], scene=True, scenes=[1, 1])
+
+
+def test_time_of_joined_states(device):
+    """Each scene keeps its time, with its gradient; bodies of one batch need one time."""
+    dt = torch.tensor(0.25, dtype=torch.float64, device=device, requires_grad=True)
+    first, second = block(3, device), block(2, device)
+    late = second.replace(time=0.5 + dt)
+    joined = mpm.State.concatenate([first.replace(time=0.5), late], scene=True)
+    torch.testing.assert_close(joined.time.detach(), torch.tensor([0.5, 0.75], dtype=torch.float64, device=device))
+    assert float(torch.autograd.grad(joined.time.sum(), dt)[0]) == 1
+    same = [s.replace(time=0.5) for s in (first, second)]
+    assert mpm.State.concatenate(same, scene=True).time == 0.5
+    assert mpm.State.concatenate(same).time == 0.5
+    with pytest.raises(ValueError, match=r"states of one batch must have one time, got 0.0 and 0.5.*scene=True"):
+        mpm.State.concatenate([first, same[1]])
+    with pytest.raises(ValueError, match="one time"):
+        mpm.State.concatenate([same[0], late])
+
+
+def test_absent_fields_are_made_or_named(device):
+    first, second = block(3, device), block(2, device)
+    moving = first.replace(
+        C=torch.rand(3, 2, 2, dtype=torch.float64, device=device),
+        F=torch.rand(3, 2, 2, dtype=torch.float64, device=device),
+        J=torch.rand(3, dtype=torch.float64, device=device),
+    )
+    joined = mpm.State.concatenate([moving, second])
+    step = mpm.Step(grid(), mpm.Mixture([mpm.NeoHookean(E=1.0, nu=0.3), mpm.WeaklyCompressible(1.0)]))
+    made = step.prepare(second)
+    for name, expected in (("C", torch.zeros_like(moving.C[:2])), ("F", made.F), ("J", made.J)):
+        assert torch.equal(getattr(joined, name), torch.cat([getattr(moving, name), expected]))
+    for name, dtype in (("temperature", torch.float64), ("material", torch.int32), ("scene", torch.int32)):
+        given = first.replace(**{name: torch.zeros(3, dtype=dtype, device=device)})
+        with pytest.raises(ValueError, match=f"state 1 has no {name}, which state 0 has"):
+            mpm.State.concatenate([given, second])
+    kept = first.replace(extra={"plastic_strain": torch.zeros_like(first.mass)})
+    with pytest.raises(ValueError, match=r"state 0 has no extra\['plastic_strain'\], which state 1 has.*step.prepare"):
+        mpm.State.concatenate([second, kept])
+    with pytest.raises(ValueError, match=r"states must have one dimension, dtype and device.*float32"):
+        mpm.State.concatenate([first, second.to(dtype=torch.float32)])
+    with pytest.raises(TypeError, match="states must be a list of State, got State"):
+        mpm.State.concatenate(first)
+
+
+def test_gradients_through_joining_and_selecting():
+    first, second = block(3), block(2)
+    leaf = first.x.clone().requires_grad_()
+    joined = mpm.State.concatenate([first.replace(x=leaf), second, first.replace(x=2 * leaf)])
+    weights = torch.rand(8, 2, dtype=torch.float64)
+    grad = torch.autograd.grad((weights * joined.select(torch.arange(7, -1, -1)).x).sum(), leaf)[0].flip(0)
+    torch.testing.assert_close(grad, weights[5:] + 2 * weights[:3], rtol=1e-14, atol=0)
+
+
+def test_time_of_every_scene_in_a_checkpoint(tmp_path):
+    from torch_mpm.scene import checkpoint
+
+    pytest.importorskip("h5py")
+    state = mpm.State.concatenate([block(3).replace(time=0.1), block(2).replace(time=0.2)], scene=True)
+    checkpoint.save(tmp_path / "state.h5", checkpoint.tensors_of(state), {"time": 0.0})
+    loaded, _ = checkpoint.load(tmp_path / "state.h5")
+    assert torch.equal(loaded.time, state.time) and torch.equal(loaded.x, state.x)
