@@ -21,9 +21,10 @@ import torch
 from torch import Tensor
 
 from ..errors import SimulationError
+from ..hdf5 import h5py_module
 from ..state import State
 from ..thermal import LIQUID
-from ..trajectory import COMPLETE, PARTIAL, Layout, TrajectoryWriter, create, h5py_module
+from ..trajectory import COMPLETE, PARTIAL, Layout, TrajectoryWriter, create
 from . import checkpoint, heap
 from .build import Built
 from .diagnose import SceneFailure, replay, wrong
