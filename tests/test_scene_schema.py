@@ -67,14 +67,14 @@ def test_wrong_words(words, message):
         ({"body__0__center": (0.9, 0.5), "body__0__name": "ball"}, "body[0] (ball): reaches from [0.7"),
         ({"body": [BOX, {**BOX, "lower": (0.2, 0.2), "upper": (0.5, 0.5)}]}, "body[0]: overlaps body[1], 36 of its particles"),
         ({"obstacle": [{"shape": "sphere", "center": (0.5, 0.3), "radius": 0.1}]}, "body[0]: "),
-        ({"body": [{"shape": "points", "file": "none.npy", "material": "jelly"}]}, "body[0]: points file none.npy does not exist"),
+        ({"body": [{"shape": "points", "file": "none.npy", "material": "jelly"}]}, "body[0].file: points file none.npy does not exist"),
         ({"emitter": [{"center": (0.5, 0.98), "radius": 0.1, "velocity": (1, 0), "material": "jelly"}]},
          "emitter[0]: the nozzle is outside the domain"),
         ({"emitter": [{"center": (0.5, 0.8), "radius": 0.1, "velocity": (1, 0), "material": "jelly", "rate": 1.0}]},
          "emitter[0]: rate must be at most area times speed, 0.2 m^2/s, got 1.0"),
         ({"emitter": [{"center": (0.5, 0.8), "radius": 0.1, "velocity": (0, 0), "material": "jelly"}]},
          "emitter[0]: velocity must not be zero"),
-        ({"scene": [{}, {"body": [{**BOX, "lower": (-0.3, 0.1)}]}]}, "scene[1].body[0]: reaches from [-0.2"),
+        ({"scene": [{}, {"body": [{**BOX, "lower": (-0.3, 0.1)}]}]}, "scene[1].body[0]: reaches from [-0.3"),
         ({"device": "cuda:9000"}, "device: "),
         ({"device": "toaster"}, 'device: takes "auto", "cpu" or "cuda", got \'toaster\''),
     ],
@@ -94,7 +94,7 @@ def test_a_mesh_that_is_not_closed_is_named(tmp_path):
     text = text.replace('shape = "sphere"\ncenter = [0.4, 0.3]\nradius = 0.2', 'shape = "mesh"\nfile = "open.ply"')
     text = text[: text.index("[[emitter]]")].replace("[0.0, 0.0]", "[0, 0, 0]").replace("[1.0, 1.0]", "[1, 1, 1]")
     (tmp_path / "scene.toml").write_text(text)
-    with pytest.raises(SceneError, match=r"body\[0\]: mesh .*open.ply is not closed: 3 of its edges"):
+    with pytest.raises(SceneError, match=r"scene.toml: body\[0\]: mesh .*open.ply is not closed: 3 of its edges"):
         Scene.load(tmp_path / "scene.toml").build()
 
 

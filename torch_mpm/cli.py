@@ -187,7 +187,7 @@ def _schema(options: argparse.Namespace) -> None:
 
 
 def _render(options: argparse.Namespace) -> None:
-    from .scene.run import load_run
+    from .scene.folder import load_run
 
     print(_draw(options.run, load_run(options.run, options.overrides), quiet=False))
 
@@ -235,7 +235,7 @@ class _Bar:
 
 
 def _write_summary(folder: Path, summary: dict[str, Any]) -> None:
-    from .scene.run import record_summary
+    from .scene.folder import record_summary
 
     record_summary(folder, summary)
 

@@ -69,6 +69,15 @@ class Layout:
         per_frame = sum(self.particles * math.prod(s) * np.dtype(t).itemsize for s, t in self.fields.values())
         return self.frames * (per_frame + sum(math.prod(s) * np.dtype(t).itemsize for s, t in self.scalars.values()))
 
+    def describes(self, trajectory: Trajectory) -> bool:
+        """Whether a trajectory has these arrays and this fingerprint."""
+        arrays = {name: ((self.frames, self.particles, *shape), dtype) for name, (shape, dtype) in self.fields.items()}
+        arrays |= {name: ((self.frames, *shape), dtype) for name, (shape, dtype) in self.scalars.items()}
+        arrays |= {name: (values.shape, values.dtype.str) for name, values in self.statics.items()}
+        found = {name: (d.shape, d.dtype.str) for name, d in trajectory.file.items() if name not in COUNTERS}
+        same = found == {name: (shape, np.dtype(dtype).str) for name, (shape, dtype) in arrays.items()}
+        return same and trajectory.attributes.get("fingerprint") == self.attributes.get("fingerprint")
+
 
 def create(path: Path, layout: Layout) -> None:
     """Write an empty trajectory with room for all its frames; the file appears under ``path`` only when it is whole.
@@ -158,7 +167,7 @@ class TrajectoryWriter:
                 row[: len(value)] = value
             data = np.ascontiguousarray(row, dtype)
             _write_all(self._fd, data, offset + frame * data.nbytes)
-            checksums.append(zlib.crc32(data))
+            checksums.append(zlib.crc32(data.data))
         row = np.array(checksums, np.uint32)
         _write_all(self._fd, row, self._places["checksum"][0] + frame * row.nbytes)
         os.fsync(self._fd)
@@ -258,7 +267,7 @@ class Trajectory:
 
     def _check(self, name: str, k: int, row: Any) -> None:
         expected = int(self.file["checksum"][k, self.columns.index(name)])
-        if zlib.crc32(np.ascontiguousarray(row)) != expected:
+        if zlib.crc32(np.ascontiguousarray(row).data) != expected:
             raise DamagedFileError(self.path, f"{name} of frame {k} is damaged, its checksum is wrong", self._remedy)
 
     def names(self, name: str) -> list[str]:
@@ -300,7 +309,7 @@ def _problem(file: Any) -> str:
     frames, particles = shapes["position"][:2]
     names = {name: len(file[name].attrs.get("names", ())) for name in ("material", "scene", "checksum") if name in file}
     columns = [str(name) for name in file["checksum"].attrs.get("names", ())]
-    expected = {name: (particles,) for name in STATICS if name in shapes}
+    expected: dict[str, tuple[int, ...]] = {name: (particles,) for name in STATICS if name in shapes}
     expected |= {"frames_written": (1,), "checksum": (frames, len(columns))}
     expected |= {name: (frames, *shape[1:]) for name, shape in shapes.items() if name not in expected}
     wrong = [name for name, shape in shapes.items() if shape != expected[name]]

@@ -12,7 +12,7 @@ import numpy as np
 
 from ..trajectory import Array, Trajectory
 from . import schema
-from .build import obstacle
+from .check import obstacle
 from .scene import Scene
 
 FOLDER, VIDEO = "frames", "video.mp4"
