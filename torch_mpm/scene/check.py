@@ -27,7 +27,7 @@ PIXELS = range(16, 16385)
 
 def problems(scene: Any, entries: Sequence[Any]) -> list[str]:
     """One line for each mistake, beginning with its key."""
-    found = [*_grid_problems(scene.grid, len(entries)), *_time_problems(scene), *_render_problems(scene)]
+    found = [*_grid_problems(scene.grid, len(entries)), *_time_problems(scene), *render_problems(scene)]
     for entry in entries:
         found += _material_problems(entry)
     found += heat.problems(scene, entries)
@@ -104,7 +104,8 @@ def _material_problems(entry: Any) -> Iterator[str]:
         yield f"{entry.path}body: the scene has no matter; give it a [[body]] or an [[emitter]]"
 
 
-def _render_problems(scene: Any) -> Iterator[str]:
+def render_problems(scene: Any) -> Iterator[str]:
+    """What no picture can be made of."""
     words, grid = scene.render, scene.grid
     if words is None:
         return

@@ -24,18 +24,20 @@ class ResolvedEntry(schema.Entry):
     def resolved(cls, entry: schema.Content, shared: schema.Content | None = None, index: int = 0) -> ResolvedEntry:
         """An entry with what it shares; or, without ``shared``, the only scene of a file."""
         kinds = ("body", "obstacle", "emitter")
+        lists: dict[str, Any] = {kind: list(getattr(entry, kind)) for kind in kinds}
         if shared is None:
-            return cls.model_construct(
-                gravity=entry.gravity, material=entry.material, **{kind: list(getattr(entry, kind)) for kind in kinds}
-            )
+            return cls.model_construct(gravity=entry.gravity, material=entry.material, **lists)
+        own = {kind: len(items) for kind, items in lists.items()}
+        for kind in kinds:
+            lists[kind] += getattr(shared, kind)
         return cls.model_construct(
             name=getattr(entry, "name", "") or f"scene {index}",
             path=f"scene[{index}].",
-            own={kind: len(getattr(entry, kind)) for kind in kinds},
+            own=own,
             own_gravity=bool(entry.gravity),
             gravity=entry.gravity or shared.gravity,
             material=shared.material | entry.material,
-            **{kind: [*getattr(entry, kind), *getattr(shared, kind)] for kind in kinds},
+            **lists,
         )
 
     def keyed(self, kind: str) -> Iterator[tuple[str, Any]]:

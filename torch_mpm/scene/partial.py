@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 from pydantic import TypeAdapter, ValidationError
 
@@ -37,7 +37,9 @@ def _entries(words: dict[str, Any]) -> list[ResolvedEntry]:
 
 def _content(words: dict[str, Any]) -> schema.Entry:
     """A scene of a batch, or what all share, with None in the place of pieces that are wrong."""
-    lists = {name: [_piece(kind, item) for item in _list(words.get(name))] for name, kind in LISTS.items()}
+    lists: dict[str, Any] = {
+        name: [_piece(kind, item) for item in _list(words.get(name))] for name, kind in LISTS.items()
+    }
     materials = words.get("material")
     pieces = {
         str(name): _piece(schema.Material, value)
@@ -51,7 +53,7 @@ def _field(name: str, words: dict[str, Any]) -> Any:
     field = schema.SceneData.model_fields[name]
     if name not in words:
         return None if field.is_required() else field.get_default()
-    return _piece(Annotated[(field.annotation, field, *field.metadata)], words[name])  # type: ignore[misc]
+    return _piece(field.rebuild_annotation(), words[name])
 
 
 def _piece(kind: Any, value: Any) -> Any:
