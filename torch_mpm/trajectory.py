@@ -211,7 +211,10 @@ class Trajectory:
     def __init__(self, path: str | Path) -> None:
         self.path = find(path)
         self.file = open_sealed(self.path, self._remedy)
-        problem = _problem(self.file)
+        try:
+            problem = _problem(self.file)
+        except (KeyError, TypeError, ValueError, IndexError) as error:  # attributes of another kind
+            problem = f"is no trajectory: {error}"
         if problem:
             self.file.close()
             raise DamagedFileError(self.path, problem, self._remedy)
@@ -300,10 +303,11 @@ def find(path: str | Path) -> Path:
 
 def _problem(file: Any) -> str:
     """What keeps a file of plain arrays from being a trajectory; "" for nothing."""
-    if file.attrs.get("format") != FORMAT:
+    if not np.array_equal(file.attrs.get("format"), FORMAT):
         return "is no trajectory of this version of torch_mpm"
     shapes = {name: data.shape for name, data in file.items()}
-    missing = [n for n in ("position", "velocity", "mass", "time", "particles", *COUNTERS) if n not in shapes]
+    needed = ("position", "velocity", "mass", "volume", "material", "time", "particles", *COUNTERS)
+    missing = [name for name in needed if name not in shapes]
     if missing or len(shapes["position"]) != 3:
         return f"is no trajectory: it lacks {', '.join(missing) or 'positions [T, N, D]'}"
     frames, particles = shapes["position"][:2]
@@ -318,6 +322,9 @@ def _problem(file: Any) -> str:
     for name, count in names.items():
         if name != "checksum" and particles and not 0 <= file[name][:].min() <= file[name][:].max() < count:
             return f"{name} has a number that stands for nothing"
+    for name in ("mass", "volume"):
+        if not (np.isfinite(file[name][:]) & (file[name][:] > 0)).all():
+            return f"{name} has a number that is not positive"
     written = int(file["frames_written"][0])
     if not 0 <= written <= frames:
         return f"it says that {written} of its {frames} frames are written"

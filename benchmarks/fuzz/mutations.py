@@ -46,10 +46,11 @@ BASES: list[dict[str, Any]] = [
     },
 ]  # fmt: skip
 NASTY: list[Any] = [
-    0, -1, 1, 3, 0.5, 1e-9, 1e9, 1e30, -1e30, 1e300, 1e-300, 5e-324, 2**31, 2**63, 10**400, math.nan, math.inf, -math.inf,
-    True, "", "jelly", "a" * 10000, "\u0000", "../..", ".", "none.npy", "slip", [], [1.0], [1e30, 1e30], [0, 0, 0], [math.nan] * 2,
-    [[1, 2], [3]], {}, {"law": "hencky"}, {"a": {"b": 1}}, [{}], ["slip", "slip"], [9.5, 9.5, 9.5],
-]  # fmt: skip
+    *(0, -1, 1, 3, 0.5, 1e-9, 1e9, 1e30, -1e30, 1e300, 1e-300, 5e-324, 2**31, 2**63, 10**400, True),
+    *(math.nan, math.inf, -math.inf, "", "jelly", "a" * 10000, "\u0000", "../..", ".", "none.npy", "slip"),
+    *([], [1.0], [1e30, 1e30], [0, 0, 0], [math.nan] * 2, [[1, 2], [3]], ["slip", "slip"], [9.5, 9.5, 9.5]),
+    *({}, {"law": "hencky"}, {"a": {"b": 1}}, [{}]),
+]
 
 
 def prepare(folder: Path) -> None:

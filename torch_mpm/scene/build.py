@@ -130,6 +130,7 @@ def build(scene: Any, device: torch.device) -> Built:
         )
         for n in nozzles
     ]
+    _check_mass(scene, [first, *(n.layer for n in nozzles)])
     step = Step(
         grid,
         mixture.law(dtype, device),
@@ -155,6 +156,17 @@ def _named(key: str, make: Callable[..., Any], *arguments: Any, **options: Any) 
         return make(*arguments, **options)
     except (ValueError, TypeError) as error:
         raise SceneError([f"{key}: {error}"]) from error
+
+
+def _check_mass(scene: Any, states: Sequence[State]) -> None:
+    for mass in (values for state in states for values in (state.mass, state.volume)):
+        if not bool(((mass > 0) & mass.isfinite()).all()):
+            raise SceneError(
+                [
+                    f"precision: {scene.precision} cannot hold a mass or a volume of the particles; "
+                    "change density, grid.dx or per_cell"
+                ]
+            )
 
 
 def _check_fields(scene: Any, state: State) -> None:
@@ -292,8 +304,8 @@ Placed = list[tuple[str, Any, seed.Points, "seed.Shape | None"]]
 
 def _placed(scene: Any, entry: Any, problems: list[str]) -> Placed:
     """The bodies in which nothing is wrong; what their particles show to be wrong is added to the problems."""
-    if any(problem.startswith("grid") for problem in problems):
-        return []
+    if any(problem.startswith("grid") or ".per_cell: " in problem for problem in problems):
+        return []  # without a lattice, or with too many particles for the memory
     placed = []
     for k, (key, body) in enumerate(entry.keyed("body")):
         if not _is_good(key, problems):
