@@ -17,11 +17,12 @@ pytest.importorskip("pydantic")
 pytest.importorskip("h5py")
 
 from torch_mpm import SimulationError, Trajectory
-from torch_mpm.scene import Scene, heap
+from torch_mpm.scene import Scene, folder, heap
 from torch_mpm.scene import run as module
 from torch_mpm.scene.checkpoint import load
 from torch_mpm.scene.diagnose import SceneFailure, replay
-from torch_mpm.scene.run import Interrupted, OutputError
+from torch_mpm.scene.folder import OutputError
+from torch_mpm.scene.run import Interrupted
 
 PRECISE = {"precision": "float64", "device": "cpu"}
 
@@ -141,8 +142,8 @@ def test_folders_that_hold_something_else_are_refused(tmp_path):
 
 
 def test_a_disk_too_small_is_noticed_first(tmp_path, monkeypatch):
-    usage = module.shutil.disk_usage(tmp_path)._replace(free=1000)
-    monkeypatch.setattr(module.shutil, "disk_usage", lambda path: usage)
+    usage = folder.shutil.disk_usage(tmp_path)._replace(free=1000)
+    monkeypatch.setattr(folder.shutil, "disk_usage", lambda path: usage)
     with pytest.raises(OutputError, match=r"the trajectory needs .* GB .* 0.00 GB are free; free some space"):
         simulate(tmp_path / "out")
 

@@ -67,14 +67,14 @@ def test_wrong_words(words, message):
         ({"body__0__center": (0.9, 0.5), "body__0__name": "ball"}, "body[0] (ball): reaches from [0.7"),
         ({"body": [BOX, {**BOX, "lower": (0.2, 0.2), "upper": (0.5, 0.5)}]}, "body[0]: overlaps body[1], 36 of its particles"),
         ({"obstacle": [{"shape": "sphere", "center": (0.5, 0.3), "radius": 0.1}]}, "body[0]: "),
-        ({"body": [{"shape": "points", "file": "none.npy", "material": "jelly"}]}, "body[0]: points file none.npy does not exist"),
+        ({"body": [{"shape": "points", "file": "none.npy", "material": "jelly"}]}, "body[0].file: points file none.npy does not exist"),
         ({"emitter": [{"center": (0.5, 0.98), "radius": 0.1, "velocity": (1, 0), "material": "jelly"}]},
          "emitter[0]: the nozzle is outside the domain"),
         ({"emitter": [{"center": (0.5, 0.8), "radius": 0.1, "velocity": (1, 0), "material": "jelly", "rate": 1.0}]},
          "emitter[0]: rate must be at most area times speed, 0.2 m^2/s, got 1.0"),
         ({"emitter": [{"center": (0.5, 0.8), "radius": 0.1, "velocity": (0, 0), "material": "jelly"}]},
          "emitter[0]: velocity must not be zero"),
-        ({"scene": [{}, {"body": [{**BOX, "lower": (-0.3, 0.1)}]}]}, "scene[1].body[0]: reaches from [-0.2"),
+        ({"scene": [{}, {"body": [{**BOX, "lower": (-0.3, 0.1)}]}]}, "scene[1].body[0]: reaches from [-0.3"),
         ({"device": "cuda:9000"}, "device: "),
         ({"device": "toaster"}, 'device: takes "auto", "cpu" or "cuda", got \'toaster\''),
     ],
@@ -94,7 +94,7 @@ def test_a_mesh_that_is_not_closed_is_named(tmp_path):
     text = text.replace('shape = "sphere"\ncenter = [0.4, 0.3]\nradius = 0.2', 'shape = "mesh"\nfile = "open.ply"')
     text = text[: text.index("[[emitter]]")].replace("[0.0, 0.0]", "[0, 0, 0]").replace("[1.0, 1.0]", "[1, 1, 1]")
     (tmp_path / "scene.toml").write_text(text)
-    with pytest.raises(SceneError, match=r"body\[0\]: mesh .*open.ply is not closed: 3 of its edges"):
+    with pytest.raises(SceneError, match=r"scene.toml: body\[0\]: mesh .*open.ply is not closed: 3 of its edges"):
         Scene.load(tmp_path / "scene.toml").build()
 
 
@@ -228,3 +228,119 @@ def test_a_batch_has_the_parameters_of_each_scene():
     counts = [int(((built.material == m) & (built.state.scene == s)).sum()) for m, s in ((0, 0), (1, 1), (2, 1))]
     assert counts[0] == counts[1] and counts[2] == 11 * 11
     assert sum(counts) == len(built.state)
+
+
+# ---- nothing is seeded that cannot be
+
+
+BALL = {"shape": "sphere", "center": (0.5, 0.5), "radius": 0.2, "material": "jelly"}
+NOZZLE = {"center": (0.5, 0.9), "radius": 0.05, "velocity": (1.0, 0.0), "material": "jelly"}
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ({"body": [{**BOX, "upper": (9.5, 9.5)}]}, "body[0]: reaches from [0.1, 0.1] to [9.5, 9.5], outside the domain"),
+        ({"body": [{**BOX, "upper": (1e30, 1e30)}]}, "body[0]: reaches from"),
+        ({"body": [{**BALL, "radius": 1e30}]}, "body[0]: reaches from"),
+        ({"body": [{**BALL, "radius": 1e200}]}, "body[0]: reaches from"),
+        ({"body": [{**BALL, "per_cell": 1e9}]}, "body[0].per_cell: about 5.03e+10 of the"),
+        ({"body": [BALL, {**BOX, "per_cell": 1e9}]}, "body[1].per_cell: about 1.6e+10 of the"),
+        ({"body": [{**BALL, "seeding": "poisson", "per_cell": 1e9}]}, "body[0].per_cell: about"),
+        ({"grid__dx": 1e-9}, "grid: the grid has"),
+        ({"grid__dx": 1e-300}, "grid.dx: the domain has 1e+300 nodes along an axis"),
+        ({"grid__lower": (-1e308, 0), "grid__upper": (1e308, 1)}, "grid.dx: the domain has inf nodes"),
+        ({"emitter": [{**NOZZLE, "radius": 1e30}]}, "emitter[0]: the nozzle is outside the domain"),
+        ({"emitter": [{**NOZZLE, "per_cell": 1e12}]}, "emitter[0].per_cell: about"),
+        ({"emitter": [{**NOZZLE, "velocity": (1e12, 0.0)}]}, "emitter[0].per_cell: about"),
+        ({"duration": 1e300, "fps": 1e300}, "duration: inf frames are too many"),
+        ({"heat": {"face": [{"lower": (0, 0), "upper": (1e30, 0), "flux": 1.0}]}}, "heat.face[0]: is outside the domain"),
+    ],
+)  # fmt: skip
+def test_sizes_are_checked_before_a_particle_is_seeded(words, message, monkeypatch):
+    lattice = mpm.seed._lattice
+
+    def small(lower, upper, spacing):
+        assert float(((upper - lower) / spacing).prod()) < 1e4
+        return lattice(lower, upper, spacing)
+
+    monkeypatch.setattr(mpm.seed, "_lattice", small)
+    monkeypatch.delattr(mpm.seed, "_poisson_disk")
+    with pytest.raises(SceneError) as error:
+        Scene(**disc(**words)).build()
+    assert any(problem.startswith(message) for problem in error.value.problems), str(error.value)
+
+
+def test_files_of_bodies_are_named_with_their_key(tmp_path):
+    pytest.importorskip("trimesh")
+    (tmp_path / "folder.obj").mkdir()
+    (tmp_path / "text.obj").write_text("this is no mesh")
+    (tmp_path / "bad.stl").write_bytes(bytes(range(100)))
+    np.save(tmp_path / "words.npy", np.array(["a", "b"]))
+    (tmp_path / "cut.npz").write_bytes(b"PK\x03\x04")
+    header = b"\x93NUMPY\x01\x00v\x00" + b"{'descr': '<f8', 'fortran_order': False, 'shape': (4000000000000, 3), }"
+    (tmp_path / "huge.npy").write_bytes(header.ljust(127) + b"\n")
+    grid = {"lower": (0, 0, 0), "upper": (1, 1, 1), "dx": 0.2}
+    files = {"none.obj": "does not exist", "folder.obj": "is a folder", "text.obj": "text.obj", "bad.stl": "bad.stl"}
+    files |= {"words.npy": "cannot be read", "cut.npz": "cannot be read", "huge.npy": "cannot be read"}
+    bodies = [
+        {"shape": "points" if ".np" in name else "mesh", "file": name, "material": "jelly", "volume": 1.0}
+        for name in files
+    ]
+    for body in bodies:
+        if body["shape"] == "mesh":
+            del body["volume"]
+    scene = Scene.from_words(disc(grid=grid, gravity=None, body=bodies), folder=tmp_path, source="scene.toml")
+    with pytest.raises(SceneError) as error:
+        scene.build()
+    for (k, (name, message)), line in zip(enumerate(files.items()), sorted(error.value.problems), strict=True):
+        assert line.startswith(f"body[{k}]") and name in line and message in line
+    assert str(error.value).count("scene.toml: body[") == len(files)
+    with pytest.raises(SceneError, match=r"scene.toml: body\[0\].file: mesh file .*none.obj does not exist"):
+        scene.fingerprint()
+
+
+def test_all_mistakes_of_both_stages_at_once(tmp_path):
+    path = tmp_path / "scene.toml"
+    text = FILE.format(duration=1).replace("fps", "fsp").replace("[0.8, 0.7]", "[0.8, 7.0]")
+    text += "[[body]]\nshape = 'sphere'\ncenter = [0.5, 0.5, 0.5]\nradius = 0.1\nmaterial = 'jelly'\n"
+    text += "[[body]]\nshape = 'sphere'\ncenter = [0.5, 0.5]\nradius = -1\nmaterial = 'jelly'\n"
+    text += "[[body]]\nshape = 'points'\nfile = 'none.npy'\nmaterial = 'jely'\n"
+    path.write_text(text)
+    with pytest.raises(SceneError) as error:
+        Scene.load(path)
+    lines = [
+        "fsp: unknown key; did you mean 'fps'?",
+        "body[2].radius: should be greater than 0",
+        "body[3].material: there is no material 'jely'",
+        "body[1].center: must have 2 numbers",
+        "emitter[0]: the nozzle is outside the domain",
+        "body[3].file: points file",
+    ]
+    assert len(error.value.problems) == len(lines), str(error.value)
+    for line in lines:
+        assert f"{path}: {line}" in str(error.value)
+
+
+@pytest.mark.parametrize("key", ["grid", "duration", "fps", "material", "body", "gravity", "heat", "emitter"])
+@pytest.mark.parametrize("value", [None, "x", [], {}, [{}], -1.0])
+def test_what_cannot_be_read_is_not_judged(key, value):
+    words = disc(**{"emitter": [NOZZLE], "grvity": 1, key: value})
+    if value is None:
+        del words[key]
+    with pytest.raises(SceneError, match="grvity: unknown key"):
+        Scene(**words)
+
+
+def test_overlaps_show_beside_other_mistakes():
+    bodies = [BOX, {**BOX, "lower": (0.2, 0.2), "upper": (0.5, 0.5)}, {**BALL, "center": (3.0, 3.0)}]
+    with pytest.raises(SceneError) as error:
+        Scene(**disc(body=bodies)).build()
+    assert [problem[:20] for problem in error.value.problems] == ["body[2]: reaches fro", "body[0]: overlaps bo"]
+
+
+def test_a_missing_material_is_not_told_twice():
+    words = disc(material={"jelly": {"law": "neo_hookean", "E": 1.0, "nu": 0.7}})
+    with pytest.raises(SceneError) as error:
+        Scene(**words)
+    assert len(error.value.problems) == 1

@@ -186,3 +186,16 @@ def test_a_shape_without_points_is_refused():
 
     with pytest.raises(ValueError, match=r"too small for its particles: spacing 0\.05 m; use a finer grid"):
         seed.fill(Nowhere((0, 0), (1, 1)), 0.1, 4)
+
+
+@pytest.mark.parametrize("method", ["lattice", "poisson"])
+@pytest.mark.parametrize(
+    "shape",
+    [seed.Box([0.0] * 3, [1e30] * 3), seed.Sphere([0.0] * 2, 1e200), seed.Capsule([0.0] * 3, [1.0] * 3, 1e60)],
+    ids=["box", "sphere", "capsule"],
+)
+def test_more_points_than_memory_holds_are_refused_at_once(shape, method):
+    with pytest.raises(ValueError, match=r"points at a spacing of .*; make the shape smaller, dx larger"):
+        seed.fill(shape, 0.1, method=method)
+    with pytest.raises(ValueError, match=r"points at a spacing of .*; make the shape smaller, dx larger"):
+        seed.fill(seed.Box([0.0] * 2, [1.0] * 2), 0.1, 1e9, method=method)

@@ -20,7 +20,11 @@ def layout():
         particles=PARTICLES,
         fields={"position": ((2,), "f4"), "velocity": ((2,), "f4"), "stress": ((2, 2), "f4")},
         scalars=scalars,
-        statics={"mass": np.arange(PARTICLES), "material": np.zeros(PARTICLES, np.int32)},
+        statics={
+            "mass": np.arange(1.0, PARTICLES + 1),
+            "volume": np.ones(PARTICLES),
+            "material": np.zeros(PARTICLES, np.int32),
+        },
         names={"material": ["water"]},
         attributes={"title": "test", "scene": "x" * 100_000, "seed": 3},
     )

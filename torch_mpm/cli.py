@@ -18,17 +18,25 @@ def main(arguments: Sequence[str] | None = None) -> int:
         options.command(options)
     except KeyboardInterrupt:
         return _told("interrupted", 130)
-    except (ValueError, OSError, ImportError, RuntimeError) as error:
-        if not _expected(error):
+    except (ValueError, OSError, ImportError, RuntimeError, MemoryError) as error:
+        message = _message(error)
+        if message is None:
             raise
-        return _told(str(error), 130 if type(error).__name__ == "Interrupted" else 1)
+        return _told(message, 130 if type(error).__name__ == "Interrupted" else 1)
     return 0
 
 
-def _expected(error: Exception) -> bool:
-    """Errors whose message is for the user. Others are defects, whose traceback should be seen."""
-    names = {"SceneError", "OutputError", "SceneFailure", "Interrupted", "RenderError", "GridOverflowError"}
-    return type(error).__name__ in names or isinstance(error, (FileNotFoundError, PermissionError, ImportError))
+TOLD = ("SceneError", "OutputError", "DamagedFileError", "SimulationError", "Interrupted", "RenderError")
+
+
+def _message(error: Exception) -> str | None:
+    """What to tell the user. None for errors that are defects, whose traceback should be seen."""
+    if isinstance(error, MemoryError) or "allocate memory" in str(error) or "out of memory" in str(error):
+        return "out of memory; make grid.dx larger or per_cell smaller, or ask for fewer fields and pictures"
+    if isinstance(error, OSError) and error.strerror and error.filename is not None:
+        return f"{error.filename}: {error.strerror}"
+    names = {kind.__name__ for kind in type(error).__mro__}
+    return str(error) if names.intersection(TOLD) or isinstance(error, (OSError, ImportError)) else None
 
 
 def _told(message: str, status: int) -> int:
@@ -95,7 +103,7 @@ def _run(options: argparse.Namespace) -> None:
     scene = Scene.load(options.scene, options.overrides)
     _require_outputs(scene)
     bar = None if options.quiet else _Bar()
-    source = options.scene.read_text()
+    source = options.scene.read_text(encoding="utf-8")
     try:
         summary = run(scene, options.out, resume=options.resume, source=source, progress=bar)
     except (SceneFailure, Interrupted):
@@ -187,7 +195,7 @@ def _schema(options: argparse.Namespace) -> None:
 
 
 def _render(options: argparse.Namespace) -> None:
-    from .scene.run import load_run
+    from .scene.folder import load_run
 
     print(_draw(options.run, load_run(options.run, options.overrides), quiet=False))
 
@@ -235,7 +243,7 @@ class _Bar:
 
 
 def _write_summary(folder: Path, summary: dict[str, Any]) -> None:
-    from .scene.run import record_summary
+    from .scene.folder import record_summary
 
     record_summary(folder, summary)
 

@@ -38,6 +38,13 @@ class GridOverflowError(SimulationError):
     """More blocks are active than the grid has room for."""
 
 
+class DamagedFileError(ValueError):
+    """A file of a run is damaged, was changed by another program, or is of another kind."""
+
+    def __init__(self, path: object, problem: str, remedy: str) -> None:
+        super().__init__(f"{path}: {problem}; {remedy}")
+
+
 def shape_of(x: object) -> str:
     return str(list(x.shape)) if isinstance(x, Tensor) else type(x).__name__
 

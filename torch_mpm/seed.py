@@ -11,14 +11,16 @@ from __future__ import annotations
 import csv
 import itertools
 import math
+import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import IO, Any, Protocol
 
 import torch
 from torch import Tensor
 
+from . import memory
 from .errors import check_number, check_vector, default_dtype
 
 Vector = Sequence[float] | Tensor
@@ -29,6 +31,11 @@ _POISSON_SPACING = {2: 1.245, 3: 1.147}
 _POISSON_TRIALS = 12
 HOST = torch.device("cpu")
 """Shapes and points are made here, whatever torch's default device, and moved when they are whole."""
+
+MOST = 2**31 - 1
+"""Particles that can be numbered."""
+CELL_BYTES = 150
+"""Memory per point of a lattice, or per cell of a Poisson-disk sample, while a shape is filled."""
 
 
 @dataclass(frozen=True)
@@ -124,7 +131,7 @@ class Cylinder(_Axial):
             torch.minimum(self.a, self.b) - reach,
             torch.maximum(self.a, self.b) + reach,
         )
-        self.volume = math.pi * self.radius**2 * self.length
+        self.volume = _ball_volume(2, self.radius) * self.length
 
     def inside(self, x: Tensor) -> Tensor:
         along, away = self._along_and_away(x)
@@ -170,7 +177,7 @@ class Mesh:
         )
         self.triangles = vertices[torch.as_tensor(mesh.faces.copy(), dtype=torch.int64)]
         self.lower, self.upper = vertices.amin(0), vertices.amax(0)
-        self.volume = _positive(f"the volume of mesh {source}", abs(float(mesh.volume)) * scale**3)
+        self.volume = _positive(f"the volume of mesh {source}", abs(float(mesh.volume)) * scale * scale * scale)
 
     def inside(self, x: Tensor) -> Tensor:
         """Where the winding number is above 1/2 (Jacobson et al. 2013; angles: Van Oosterom and Strackee 1983)."""
@@ -185,6 +192,25 @@ class Mesh:
         return torch.atan2(determinant, denominator).sum(1) / (2 * math.pi)
 
 
+def check_file(path: str | Path, kind: str) -> None:
+    """Raise for a file that is not there, is a folder, or cannot be read.
+
+    Raises:
+        OSError: FileNotFoundError, IsADirectoryError or PermissionError, with the path.
+    """
+    path = Path(path)
+    try:
+        if path.is_dir():
+            raise IsADirectoryError(f"{kind} file {path} is a folder")
+        path.open("rb").close()
+    except FileNotFoundError:
+        raise FileNotFoundError(f"{kind} file {path} does not exist") from None
+    except IsADirectoryError:
+        raise
+    except (OSError, ValueError) as error:  # ValueError: a null character in the name
+        raise PermissionError(f"{kind} file {path} cannot be read: {error}") from None
+
+
 def _load_mesh(source: str | Path | Any) -> Any:
     try:
         import trimesh
@@ -192,9 +218,11 @@ def _load_mesh(source: str | Path | Any) -> Any:
         raise ImportError("a mesh shape needs trimesh: pip install torch-mpm[mesh]") from error
     if isinstance(source, trimesh.Trimesh):
         return source
-    if not Path(source).is_file():
-        raise FileNotFoundError(f"mesh file {source} does not exist")
-    mesh = trimesh.load(source, force="mesh")
+    check_file(source, "mesh")
+    try:
+        mesh = trimesh.load(source, force="mesh")
+    except Exception as error:  # readers of many formats raise anything
+        raise ValueError(f"mesh file {source} cannot be read: {type(error).__name__}: {error}") from error
     if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
         raise ValueError(f"mesh file {source} holds no triangles")
     return mesh
@@ -206,7 +234,8 @@ def _open_edges(mesh: Any) -> int:
 
 
 def _ball_volume(dim: int, radius: float) -> float:
-    return {1: 2 * radius, 2: math.pi * radius**2, 3: 4 / 3 * math.pi * radius**3}[dim]
+    # Products become infinite where a power raises.
+    return {1: 2.0, 2: math.pi, 3: 4 / 3 * math.pi}[dim] * math.prod([radius] * dim)
 
 
 def fill(
@@ -230,7 +259,7 @@ def fill(
         dtype, device: of the result; by default torch's (float32 where that is a half).
 
     Raises:
-        ValueError: for an unknown method, or a shape too small to hold a point.
+        ValueError: for an unknown method, a shape too small to hold a point, or more points than memory holds.
     """
     dtype, device = dtype or default_dtype(), torch.get_default_device() if device is None else device
     with HOST:
@@ -244,6 +273,7 @@ def _points_in(shape: Shape, grid: Any, per_cell: float, method: str, seed: int)
     dx = _positive("the grid's dx", getattr(grid, "dx", grid))
     dim = len(shape.lower)
     spacing = dx / _positive("per_cell", per_cell) ** (1 / dim)
+    _check_size(shape, spacing, method)
     if method == "lattice":
         x = _lattice(shape.lower, shape.upper, spacing)
     elif method == "poisson":
@@ -256,6 +286,25 @@ def _points_in(shape: Shape, grid: Any, per_cell: float, method: str, seed: int)
             f"the shape is too small for its particles: spacing {spacing:g} m; use a finer grid or a larger per_cell"
         )
     return x
+
+
+def _check_size(shape: Shape, spacing: float, method: str) -> None:
+    """Raise ValueError before the points of a shape's bounding box fill the memory."""
+    sides = ((shape.upper - shape.lower).double() / spacing).clamp(min=1).tolist()
+    points = math.prod(sides)
+    cells = points
+    if method == "poisson":
+        cells *= (_POISSON_SPACING[len(sides)] * math.sqrt(len(sides))) ** len(sides)
+    if points > MOST:
+        room = f"{MOST} can be numbered"
+    elif cells * CELL_BYTES > (free := memory.available()):
+        room = f"filling it takes {cells * CELL_BYTES / 1e9:.3g} GB, and {free / 1e9:.3g} GB are free"
+    else:
+        return
+    raise ValueError(
+        f"the box around the shape holds about {points:.3g} points at a spacing of {spacing:.3g} m, but {room}; "
+        "make the shape smaller, dx larger or per_cell smaller"
+    )
 
 
 def _lattice(lower: Tensor, upper: Tensor, spacing: float) -> Tensor:
@@ -344,7 +393,7 @@ def file(
     needed where the file has no volumes.
 
     Raises:
-        FileNotFoundError: when there is no such file.
+        OSError: when there is no such file, or it cannot be read.
         ValueError: for an unknown format, a wrong shape, numbers not finite, or volumes missing or not positive.
     """
     with HOST:
@@ -364,21 +413,47 @@ def file(
 
 
 def _read_points(path: Path) -> tuple[Tensor, Tensor | None]:
+    check_file(path, "points")
+    readers = {".npy": _read_npy, ".npz": _read_npz, ".csv": _read_csv}
+    if path.suffix not in readers:
+        raise ValueError(f"points file must end in .npy, .npz or .csv, got {path}")
+    try:
+        return readers[path.suffix](path)
+    except Exception as error:  # damaged archives and tables raise many kinds
+        raise ValueError(f"points file {path} cannot be read: {error}") from error
+
+
+def _read_npy(path: Path) -> tuple[Tensor, Tensor | None]:
+    with path.open("rb") as handle:
+        return _read_array(handle, path.stat().st_size), None
+
+
+def _read_npz(path: Path) -> tuple[Tensor, Tensor | None]:
+    with zipfile.ZipFile(path) as archive:
+        sizes = {item.filename.removesuffix(".npy"): item.file_size for item in archive.infolist()}
+        if "x" not in sizes:
+            raise ValueError(f"it must hold an array 'x' of positions, got {sorted(sizes)}")
+        arrays = {}
+        for name in {"x", "volume"} & sizes.keys():
+            with archive.open(name + ".npy") as handle:
+                arrays[name] = _read_array(handle, sizes[name])
+    return arrays["x"], arrays.get("volume")
+
+
+def _read_array(handle: IO[bytes], size: int) -> Tensor:
+    """The array of a .npy file of ``size`` bytes; nothing is allocated for one that says it is larger."""
     import numpy as np
 
-    if not path.is_file():
-        raise FileNotFoundError(f"points file {path} does not exist")
-    if path.suffix == ".npy":
-        return torch.as_tensor(np.load(path, allow_pickle=False)).double(), None
-    if path.suffix == ".npz":
-        with np.load(path, allow_pickle=False) as arrays:
-            if "x" not in arrays:
-                raise ValueError(f"{path} must hold an array 'x' of positions, got {sorted(arrays)}")
-            volume = torch.as_tensor(arrays["volume"]).double() if "volume" in arrays else None
-            return torch.as_tensor(arrays["x"]).double(), volume
-    if path.suffix == ".csv":
-        return _read_csv(path)
-    raise ValueError(f"points file must end in .npy, .npz or .csv, got {path}")
+    read_header = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+    version = np.lib.format.read_magic(handle)
+    if version not in read_header:
+        raise ValueError(f"format {version} is not known")
+    shape, fortran, dtype = read_header[version](handle)
+    count = math.prod(shape)
+    if dtype.kind not in "fiu" or count * dtype.itemsize > min(size, memory.available() / 4):
+        raise ValueError(f"it must hold numbers that fit the memory, got {dtype} {list(shape)} in {size} bytes")
+    values = np.frombuffer(handle.read(count * dtype.itemsize), dtype, count).astype(np.float64)
+    return torch.from_numpy(values.reshape(shape, order="F" if fortran else "C").copy())
 
 
 def _read_csv(path: Path) -> tuple[Tensor, Tensor | None]:
@@ -387,7 +462,7 @@ def _read_csv(path: Path) -> tuple[Tensor, Tensor | None]:
         names = rows.fieldnames or []
         axes = [name for name in ("x", "y", "z") if name in names]
         if axes[:2] != ["x", "y"]:
-            raise ValueError(f"{path} must have a first line naming the columns x, y, (z,) (volume), got {names}")
+            raise ValueError(f"its first line must name the columns x, y, (z,) (volume), got {names}")
         table = [[float(row[name]) for name in [*axes, *(["volume"] if "volume" in names else [])]] for row in rows]
     values = torch.tensor(table, dtype=torch.float64).reshape(len(table), -1)
     return values[:, : len(axes)], values[:, len(axes)] if "volume" in names else None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,8 @@ from ..grid import Grid
 from ..sand import QuarticSand
 from ..state import State
 from ..step import Step
-from . import heat, schema
+from ..thermal import LIQUID
+from . import check, heat, schema
 from .explain import SceneError
 
 GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
@@ -93,7 +94,11 @@ def build(scene: Any, device: torch.device) -> Built:
     """
     dtype = getattr(torch, scene.precision)
     entries = scene.entries()
-    _check_words(scene, entries)
+    problems = check.problems(scene, entries)
+    problems += [p for entry in entries for p in check.file_problems(entry, scene.folder) if p not in problems]
+    placed = [_placed(scene, entry, problems) for entry in entries]
+    if problems:
+        raise SceneError(list(dict.fromkeys(problems)))
     words = scene.grid
     grid = Grid(words.dx, words.lower, words.upper, scenes=len(entries), kernel=words.kernel)
     reference = 0.0 if scene.heat is None else scene.heat.reference
@@ -101,19 +106,15 @@ def build(scene: Any, device: torch.device) -> Built:
     parts, material = [], []
     nozzles: list[Nozzle] = []
     obstacles: list[tuple[Any, boundaries.Obstacle]] = []
-    problems: list[str] = []
     for index, entry in enumerate(entries):
-        placed = _bodies(scene, entry, entry.path, problems)
-        _check_placement(scene, entry, placed, problems)
-        for body, points, _ in placed:
-            matter = _matter(body, points, entry.material[body.material].density, index, dtype, device)
-            parts.append(_warmed(matter, body, scene.heat))
+        for key, body, points, _ in placed[index]:
+            density = entry.material[body.material].density
+            parts.append(_named(key, _matter, body, points, density, index, scene.heat, dtype, device))
             material.append(torch.full((len(points),), mixture.number(index, body.material), dtype=torch.int32))
-        nozzles += _nozzles(scene, entry, index, mixture, dtype, device, problems)
-        obstacles += [(o, obstacle(o, index if len(entries) > 1 else None)) for o in entry.obstacle]
-    walls = _walls(words, grid, problems)
-    if problems:
-        raise SceneError(problems)
+        for key, emitter in entry.keyed("emitter"):
+            nozzles.append(_named(key, _nozzle, scene, entry, emitter, index, mixture, dtype, device))
+        obstacles += [(o, check.obstacle(o, index if len(entries) > 1 else None)) for o in entry.obstacle]
+    walls = None if words.walls is None else boundaries.Walls(words.walls, friction=words.friction)
     dim = len(words.lower)
     empty = seed.Points(
         torch.empty(0, dim, dtype=dtype), torch.empty(0, dtype=dtype), torch.empty(0, dtype=torch.int32)
@@ -129,6 +130,7 @@ def build(scene: Any, device: torch.device) -> Built:
         )
         for n in nozzles
     ]
+    _check_mass(scene, [first, *(n.layer for n in nozzles)])
     step = Step(
         grid,
         mixture.law(dtype, device),
@@ -137,12 +139,44 @@ def build(scene: Any, device: torch.device) -> Built:
         boundaries=[boundary for _, boundary in obstacles],
         transfer=scene.transfer,
         flip=scene.flip,
-        heat=None if scene.heat is None else heat.conduction(scene, entries, grid, mixture.words(), obstacles, device),
+        heat=None
+        if scene.heat is None
+        else _named("heat", heat.conduction, scene, entries, grid, mixture.words(), obstacles, device),
     )
     ids = torch.arange(len(first), device=device)
     state = step.prepare(first.replace(ids=ids))
+    _check_fields(scene, state)
     nozzles = [Nozzle(step.prepare(n.layer), n.material, n.times) for n in nozzles]
     return Built(grid, step, state, torch.cat(material), mixture.materials, nozzles, [e.name for e in entries])
+
+
+def _named(key: str, make: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
+    """Call ``make``; what it refuses is told under a key of the scene."""
+    try:
+        return make(*arguments, **options)
+    except (ValueError, TypeError) as error:
+        raise SceneError([f"{key}: {error}"]) from error
+
+
+def _check_mass(scene: Any, states: Sequence[State]) -> None:
+    for mass in (values for state in states for values in (state.mass, state.volume)):
+        if not bool(((mass > 0) & mass.isfinite()).all()):
+            raise SceneError(
+                [
+                    f"precision: {scene.precision} cannot hold a mass or a volume of the particles; "
+                    "change density, grid.dx or per_cell"
+                ]
+            )
+
+
+def _check_fields(scene: Any, state: State) -> None:
+    """The fields that the outputs ask for are those of some material."""
+    values = {"F": state.F, "J": state.J, "temperature": state.temperature, "liquid": state.extra.get(LIQUID)}
+    absent = [name for name in scene.trajectory_fields if name in values and values[name] is None]
+    if absent:
+        asked = set(scene.output.fields)
+        keys = {name: "output.fields" if name in asked else "render.color_by" for name in absent}
+        raise SceneError([f"{key}: no material of this scene has {name!r}" for name, key in keys.items()])
 
 
 # ---- materials
@@ -190,8 +224,9 @@ class _Mixture:
         return laws[0] if len(laws) == 1 else materials.Mixture(laws)
 
     def _one(self, group: list[int], dtype: torch.dtype, device: torch.device) -> materials.Material:
-        law = self._mechanical(group, dtype, device)
-        return heat.thermal(law, self.materials[group[0]].words, self.reference).to(device)
+        first = self.materials[group[0]]
+        law = _named(f"material.{first.name}", self._mechanical, group, dtype, device)
+        return _named(f"material.{first.name}", heat.thermal, law, first.words, self.reference).to(device)
 
     def _mechanical(self, group: list[int], dtype: torch.dtype, device: torch.device) -> materials.Material:
         members = [self.materials[k] for k in group]
@@ -256,40 +291,66 @@ def _complete(state: State, mixture: _Mixture, material: Tensor, single: bool) -
 # ---- bodies
 
 
-def shape_of(body: Any, folder: Path) -> seed.Shape | None:
-    """The region of a body; None for points from a file."""
-    if isinstance(body, schema.BoxBody):
-        return seed.Box(body.lower, body.upper)
-    if isinstance(body, schema.SphereBody):
-        return seed.Sphere(body.center, body.radius)
-    if isinstance(body, schema.CylinderBody):
-        return seed.Cylinder(body.a, body.b, body.radius)
-    if isinstance(body, schema.CapsuleBody):
-        return seed.Capsule(body.a, body.b, body.radius)
-    if isinstance(body, schema.MeshBody):
-        return seed.Mesh(folder / body.file, body.scale, body.offset)
-    return None
+Placed = list[tuple[str, Any, seed.Points, "seed.Shape | None"]]
+"""(key, words, particles, region) of the bodies of a scene."""
 
 
-def _bodies(scene: Any, entry: Any, path: str, problems: list[str]) -> list[tuple[Any, seed.Points, seed.Shape | None]]:
+def _placed(scene: Any, entry: Any, problems: list[str]) -> Placed:
+    """The bodies in which nothing is wrong; what their particles show to be wrong is added to the problems."""
+    if any(problem.startswith("grid") or ".per_cell: " in problem for problem in problems):
+        return []  # without a lattice, or with too many particles for the memory
     placed = []
-    for k, body in enumerate(entry.body):
+    for k, (key, body) in enumerate(entry.keyed("body")):
+        if not _is_good(key, problems):
+            continue
         try:
-            shape = shape_of(body, scene.folder)
-            if shape is None:
-                points = seed.file(scene.folder / body.file, body.volume, dtype=torch.float64)
-            else:
-                options = {"method": body.seeding, "seed": scene.seed + k, "dtype": torch.float64}
-                points = seed.fill(shape, scene.grid.dx, body.per_cell, **options)
-            placed.append((body, points, shape))
-        except (ValueError, FileNotFoundError) as error:
-            problems.append(f"{path}body[{k}]{_called(body)}: {error}")
+            points, shape = _seeded(scene, body, scene.seed + k)
+        except (ValueError, OSError) as error:
+            problems.append(f"{key}{check.called(body)}: {error}")
+            continue
+        found = [] if shape is None else list(check.bounds_problems(key, body, shape, scene.grid))
+        if not found and not check.inside(scene.grid, points.x):
+            lower, upper = points.x.amin(0), points.x.amax(0)
+            found = [check.outside(f"{key}{check.called(body)}", lower, upper, scene.grid)]
+        problems += found
+        placed.append((key + check.called(body), body, points, shape))
+    problems += _overlaps(placed, [o for o in entry.keyed("obstacle") if _is_good(o[0], problems)])
     return placed
 
 
+def _is_good(key: str, problems: list[str]) -> bool:
+    return not any(problem.startswith((f"{key}.", f"{key}:", f"{key} ")) for problem in problems)
+
+
+def _seeded(scene: Any, body: Any, number: int) -> tuple[seed.Points, seed.Shape | None]:
+    if isinstance(body, schema.PointsBody):
+        points = seed.file(scene.folder / body.file, body.volume, dtype=torch.float64)
+        if points.x.shape[1] != scene.dim:
+            raise ValueError(f"{body.file} has points in {points.x.shape[1]}-D, and the scene is in {scene.dim}-D")
+        return points, None
+    shape = _shape(body, scene.folder)
+    options = {"method": body.seeding, "seed": number, "dtype": torch.float64}
+    return seed.fill(shape, scene.grid.dx, body.per_cell, **options), shape
+
+
+def _shape(body: Any, folder: Path) -> seed.Shape:
+    if isinstance(body, schema.MeshBody):
+        return seed.Mesh(folder / body.file, body.scale, body.offset)
+    shape = check.shape_of(body)
+    assert shape is not None
+    return shape
+
+
 def _matter(
-    body: Any, points: seed.Points, density: float, scene: int, dtype: torch.dtype, device: torch.device
+    body: Any,
+    points: seed.Points,
+    density: float,
+    scene: int,
+    heat: schema.Heat | None,
+    dtype: torch.dtype,
+    device: torch.device,
 ) -> State:
+    """The particles of a body at rest in themselves."""
     index = torch.full((len(points),), scene, dtype=torch.int32)
     state = State.at_rest(seed.Points(points.x, points.volume, index), density, body.velocity, torch.float64)
     if body.spin is not None:
@@ -297,7 +358,7 @@ def _matter(
         center = (points.x * points.volume[:, None]).sum(0) / points.volume.sum()
         v = state.v + (points.x - center) @ gradient.T
         state = state.replace(v=v, C=gradient.expand(len(points), -1, -1))
-    return state.to(device, dtype)
+    return _warmed(state.to(device, dtype), body, heat)
 
 
 def _warmed(state: State, words: schema.Seeding, heat: schema.Heat | None) -> State:
@@ -316,74 +377,20 @@ def _spin_matrix(spin: float | Sequence[float], dim: int) -> Tensor:
     return torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=torch.float64)
 
 
-# ---- walls and obstacles
-
-
-def _walls(words: schema.Grid, grid: Grid, problems: list[str]) -> boundaries.Walls | None:
-    if words.walls is None:
-        return None
-    walls = boundaries.Walls(words.walls, friction=words.friction)
-    try:
-        walls.faces(grid)
-    except ValueError as error:
-        problems.append(f"grid.walls: {error}")
-    return walls
-
-
-def obstacle(words: Any, scene: int | None) -> boundaries.Obstacle:
-    """The boundary of the step that an obstacle of a scene names."""
-    motion = {
-        "kind": words.contact,
-        "friction": words.friction,
-        "velocity": words.velocity,
-        "rotation": words.rotation,
-        "angular_velocity": words.spin,
-        "start": words.start,
-        "end": math.inf if words.end is None else words.end,
-        "scene": scene,
-    }
-    if isinstance(words, schema.PlaneObstacle):
-        return boundaries.Plane(words.center, words.normal, **motion)
-    if isinstance(words, schema.BoxObstacle):
-        return boundaries.Box(words.center, words.size, **motion)
-    if isinstance(words, schema.SphereObstacle):
-        return boundaries.Sphere(words.center, words.radius, **motion)
-    if isinstance(words, schema.RevolvedObstacle):
-        return boundaries.Revolved(words.center, words.outline, words.axis, **motion)
-    center = [0.5 * (p + q) for p, q in zip(words.a, words.b, strict=True)]
-    half = [0.5 * (q - p) for p, q in zip(words.a, words.b, strict=True)]
-    return boundaries.Capsule(center, half, words.radius, **motion)
-
-
 # ---- emitters
 
 
-def _nozzles(
-    scene: Any,
-    entry: Any,
-    index: int,
-    mixture: _Mixture,
-    dtype: torch.dtype,
+def _nozzle(
+    scene: Any, entry: Any, words: schema.Emitter, index: int, mixture: _Mixture, dtype: torch.dtype,
     device: torch.device,
-    problems: list[str],
-) -> list[Nozzle]:
-    nozzles = []
-    for k, words in enumerate(entry.emitter):
-        try:
-            density = entry.material[words.material].density
-            points, times = emitter_layer(words, scene.grid, scene.duration)
-        except ValueError as error:
-            problems.append(f"{entry.path}emitter[{k}]{_called(words)}: {error}")
-            continue
-        if not _inside(scene.grid, points.x):
-            problems.append(
-                f"{entry.path}emitter[{k}]{_called(words)}: the nozzle is outside the domain; move it inside"
-            )
-        points = seed.Points(points.x, points.volume, torch.full((len(points),), index, dtype=torch.int32))
-        layer = State.at_rest(points, density, words.velocity, torch.float64).to(device, dtype)
-        layer = _warmed(layer, words, scene.heat)
-        nozzles.append(Nozzle(layer, mixture.number(index, words.material), times))
-    return nozzles
+) -> Nozzle:  # fmt: skip
+    points, times = emitter_layer(words, scene.grid, scene.duration)
+    if not check.inside(scene.grid, points.x):
+        raise ValueError("the nozzle is outside the domain; move it inside")
+    points = seed.Points(points.x, points.volume, torch.full((len(points),), index, dtype=torch.int32))
+    density = entry.material[words.material].density
+    layer = State.at_rest(points, density, words.velocity, torch.float64).to(device, dtype)
+    return Nozzle(_warmed(layer, words, scene.heat), mixture.number(index, words.material), times)
 
 
 def emitter_layer(words: schema.Emitter, grid: schema.Grid, duration: float) -> tuple[seed.Points, list[float]]:
@@ -393,24 +400,14 @@ def emitter_layer(words: schema.Emitter, grid: schema.Grid, duration: float) -> 
     """
     velocity = torch.tensor(words.velocity, dtype=torch.float64)
     speed, dim = float(velocity.norm()), len(words.center)
-    if speed == 0:
-        raise ValueError("velocity must not be zero: it is the direction of the nozzle")
     spacing = grid.dx / words.per_cell ** (1 / dim)
-    nozzle: seed.Shape
-    if dim == 2:
-        area, nozzle = 2 * words.radius, seed.Box([-words.radius, -1.0], [words.radius, 1.0])
-    else:
-        area, nozzle = math.pi * words.radius**2, seed.Sphere([0.0, 0.0], words.radius)
-    counts = ((nozzle.upper - nozzle.lower) / spacing).round().clamp(min=1).tolist()
-    axes = [(torch.arange(n, dtype=torch.float64) + 0.5) / n * 2 - 1 for n in map(int, counts[: dim - 1])]
+    area = check.nozzle_area(words)
+    count = max(1, round(2 * words.radius / spacing))
+    axes = [(torch.arange(count, dtype=torch.float64) + 0.5) / count * 2 - 1] * (dim - 1)
     flat = torch.cartesian_prod(*axes).reshape(-1, dim - 1) * words.radius
     flat = flat[flat.square().sum(1) <= words.radius**2]
     end = min(duration, words.end or duration)
     rate = words.rate or area * speed
-    if rate > area * speed * (1 + 1e-9):
-        raise ValueError(f"rate must be at most area times speed, {area * speed:g} m^{dim}/s, got {words.rate}")
-    if end <= words.start:
-        raise ValueError(f"end must be after start, got start {words.start} and end {end}")
     layers = max(1, round((end - words.start) * rate / (area * spacing)))
     interval = (end - words.start) / layers
     x = torch.tensor(words.center, dtype=torch.float64) + flat @ _across(velocity / speed)
@@ -424,95 +421,31 @@ def _across(direction: Tensor) -> Tensor:
     return basis.T[1 : len(direction)]
 
 
-# ---- checks
+# ---- the whole
 
 
-def _check_words(scene: Any, entries: Sequence[Any]) -> None:
-    """What can be said without seeding: lengths of vectors, names of materials."""
-    problems = list(_dimension_problems(scene))
-    for entry in entries:
-        for kind in ("body", "emitter"):
-            for k, item in enumerate(getattr(entry, kind)):
-                if item.material not in entry.material:
-                    known = ", ".join(sorted(entry.material)) or "there is none"
-                    problems.append(
-                        f"{entry.path}{kind}[{k}].material: there is no material {item.material!r}; known: {known}"
-                    )
-        if not entry.body and not entry.emitter:
-            problems.append(f"{entry.path}body: the scene has no matter; give it a [[body]] or an [[emitter]]")
-    problems += heat.problems(scene, entries)
-    if any(a >= b for a, b in zip(scene.grid.lower, scene.grid.upper, strict=False)):
-        problems.append(f"grid.upper: must be above grid.lower on every axis, got {scene.grid.upper}")
-    if problems:
-        raise SceneError(problems)
-
-
-def _dimension_problems(scene: Any) -> Iterator[str]:
-    dim = len(scene.grid.lower)
-    if len(scene.grid.upper) != dim:
-        yield f"grid.upper: must have {dim} numbers like grid.lower, got {scene.grid.upper}"
-    if isinstance(scene.grid.walls, list) and len(scene.grid.walls) != dim:
-        yield f"grid.walls: must have one entry per axis, {dim} in all, got {scene.grid.walls}"
-    contents = [("", scene), *((f"scene[{k}].", entry) for k, entry in enumerate(scene.scene))]
-    for path, content in contents:
-        if content.gravity is not None and len(content.gravity) != dim:
-            yield f"{path}gravity: must have {dim} numbers in this {dim}-D scene, got {content.gravity}"
-        for kind in ("body", "obstacle", "emitter"):
-            for k, item in enumerate(getattr(content, kind)):
-                yield from _item_dimension(f"{path}{kind}[{k}]", item, dim)
-
-
-def _item_dimension(path: str, item: Any, dim: int) -> Iterator[str]:
-    if dim == 2 and getattr(item, "shape", "") in ("mesh", "cylinder"):
-        yield f"{path}.shape: a {item.shape} needs three dimensions; this scene has two"
-        return
-    for key in ("center", "lower", "upper", "a", "b", "size", "normal", "axis", "velocity"):
-        value = getattr(item, key, None)
-        if value is not None and len(value) != dim:
-            yield f"{path}.{key}: must have {dim} numbers in this {dim}-D scene, got {value}"
-    for key in ("spin", "rotation"):
-        value = getattr(item, key, None)
-        if value is not None and isinstance(value, (int, float)) != (dim == 2):
-            yield f"{path}.{key}: takes {'one number' if dim == 2 else 'a vector of 3 numbers'} in {dim}-D, got {value}"
-
-
-def _inside(grid: schema.Grid, x: Tensor) -> bool:
-    lower, upper = (torch.tensor(v, dtype=torch.float64) for v in (grid.lower, grid.upper))
-    return bool(((x >= lower) & (x <= upper)).all())
-
-
-def _check_placement(scene: Any, entry: Any, placed: list[tuple[Any, seed.Points, Any]], problems: list[str]) -> None:
-    """Bodies inside the domain, apart from each other, and outside the obstacles."""
-    grid = scene.grid
-    numbers = {id(body): k for k, body in enumerate(entry.body)}
-    paths = [f"{entry.path}body[{numbers[id(body)]}]{_called(body)}" for body, _, _ in placed]
-    for (_, points, _), path in zip(placed, paths, strict=True):
-        if not _inside(grid, points.x):
-            lower, upper = points.x.amin(0), points.x.amax(0)
-            problems.append(
-                f"{path}: reaches from {_numbers(lower)} to {_numbers(upper)}, outside the domain "
-                f"{_numbers(grid.lower)} to {_numbers(grid.upper)}; move the body or enlarge grid.lower, grid.upper"
-            )
-    for i, (_, points, _) in enumerate(placed):
-        for j, (_, _, shape) in enumerate(placed):
-            inside = 0 if i == j or shape is None else int(shape.inside(points.x).sum())
-            if inside and f"{paths[j]}: overlaps {paths[i]}" not in str(problems):
-                problems.append(
-                    f"{paths[i]}: overlaps {paths[j]}, {inside} of its particles are inside it; move one of them"
-                )
-    for k, words in enumerate(entry.obstacle):
+def _overlaps(placed: Placed, obstacles: Sequence[tuple[str, Any]]) -> Iterator[str]:
+    """Bodies within each other, and within obstacles that are there from the start."""
+    seen = set()
+    for i, (key, _, points, _) in enumerate(placed):
+        for j, (other, _, _, shape) in enumerate(placed):
+            if i == j or shape is None or (j, i) in seen:
+                continue
+            inside = int(shape.inside(points.x).sum())
+            if inside:
+                seen.add((i, j))
+                yield f"{key}: overlaps {other}, {inside} of its particles are inside it; move one of them"
+    for path, words in obstacles:
         if words.start > 0:
             continue
-        solid = obstacle(words, None)
+        solid = check.obstacle(words, None)
         pose = solid.pose(0.0)
-        for (_, points, _), path in zip(placed, paths, strict=True):
+        for key, _, points, _ in placed:
             distance, _ = solid.surface((points.x - pose.centre) @ pose.rotation, None)
             inside = int((distance < 0).sum())
             if inside:
-                problems.append(
-                    f"{path}: {inside} of its particles are inside {entry.path}obstacle[{k}]{_called(words)}; "
-                    "move one of them"
-                )
+                where = f"{path}{check.called(words)}"
+                yield f"{key}: {inside} of its particles are inside {where}; move one of them"
 
 
 def _gravity(entries: Sequence[Any], dtype: torch.dtype, device: torch.device) -> Tensor | None:
@@ -522,11 +455,3 @@ def _gravity(entries: Sequence[Any], dtype: torch.dtype, device: torch.device) -
     dim = next(len(value) for value in values if value is not None)
     rows = torch.tensor([value or (0.0,) * dim for value in values], dtype=dtype, device=device)
     return rows[0] if len(values) == 1 else rows
-
-
-def _called(item: Any) -> str:
-    return f" ({item.name})" if item.name else ""
-
-
-def _numbers(values: Any) -> str:
-    return "[" + ", ".join(f"{float(v):.4g}" for v in values) + "]"

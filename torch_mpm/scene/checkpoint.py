@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import io
 import json
 import os
 from pathlib import Path
@@ -11,10 +12,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ..errors import DamagedFileError
+from ..hdf5 import h5py_module, open_sealed, seal
 from ..state import State
-from ..trajectory import disk_errors, h5py_module
 
 Host = dict[str, Tensor]
+REMEDY = "remove it and add --resume to simulate from the start"
 EXTRA = "extra."
 
 
@@ -26,14 +29,22 @@ def tensors_of(state: State) -> Host:
 
 
 def save(path: Path, tensors: Host, record: dict[str, Any]) -> None:
-    """Write tensors (on the CPU) and a JSON record; ``path`` is replaced at once, or not at all."""
+    """Write tensors (on the CPU) and a JSON record; ``path`` is replaced at once, or not at all.
+
+    Raises:
+        OSError: when the disk has no room.
+    """
+    image = io.BytesIO()
+    with h5py_module().File(image, "w") as out:
+        for name, tensor in tensors.items():
+            out[name] = tensor.numpy()
+        out.attrs["record"] = json.dumps(record)
     building = path.with_suffix(".building")
     try:
-        with disk_errors(building), h5py_module().File(building, "w") as out:
-            for name, tensor in tensors.items():
-                out[name] = tensor.numpy()
-            out.attrs["record"] = json.dumps(record)
-        with open(building, "rb") as handle:
+        with open(building, "w+b") as handle:
+            handle.write(image.getbuffer())
+            seal(handle, [(0, image.getbuffer().nbytes)])
+            handle.flush()
             os.fsync(handle.fileno())
         building.replace(path)
     except BaseException:
@@ -42,11 +53,18 @@ def save(path: Path, tensors: Host, record: dict[str, Any]) -> None:
 
 
 def load(path: Path, device: torch.device | str = "cpu") -> tuple[State, dict[str, Any]]:
-    """The state that `save` wrote, in the memory order it had, and the record."""
-    with h5py_module().File(path, "r") as source:
-        record = json.loads(source.attrs["record"])
-        tensors: dict[str, Any] = {name: torch.from_numpy(data[()]) for name, data in source.items()}
-    extra = {name.removeprefix(EXTRA): tensors.pop(name) for name in list(tensors) if name.startswith(EXTRA)}
-    time = tensors.pop("time", record["time"])
-    state = State.concatenate([State(**tensors, extra=extra, time=time)])  # which restores the memory layout
-    return state.to(device), record
+    """The state that `save` wrote, in the memory order it had, and the record.
+
+    Raises:
+        DamagedFileError: for a file that is damaged or holds something else.
+    """
+    with open_sealed(path, REMEDY, in_memory=True) as source:
+        try:
+            record = json.loads(source.attrs["record"])
+            tensors: dict[str, Any] = {name: torch.from_numpy(data[()]) for name, data in source.items()}
+            extra = {name.removeprefix(EXTRA): tensors.pop(name) for name in list(tensors) if name.startswith(EXTRA)}
+            time = tensors.pop("time", record["time"])
+            state = State(**tensors, extra=extra, time=time)
+        except (KeyError, TypeError, ValueError, RecursionError) as error:
+            raise DamagedFileError(path, f"does not hold the state of a run ({error})", REMEDY) from None
+    return State.concatenate([state]).to(device), record  # concatenate restores the memory layout

@@ -23,8 +23,10 @@ THERMAL = tuple(schema.Thermal.model_fields)
 def problems(scene: Any, entries: Sequence[Any]) -> Iterator[str]:
     """What the thermal words of a scene lack or have too much."""
     for entry in entries:
-        used = {item.material for item in (*entry.body, *entry.emitter)}
+        used = {item.material for kind in ("body", "emitter") for _, item in entry.keyed(kind)}
         for name, words in entry.material.items():
+            if words is None:
+                continue
             path = f"{entry.path}material.{name}"
             given = [key for key in (*THERMAL, "liquid") if getattr(words, key, None) is not None]
             given += [key for key in ("E", "viscosity") if isinstance(getattr(words, key, None), schema.Curve)]
@@ -39,22 +41,30 @@ def problems(scene: Any, entries: Sequence[Any]) -> Iterator[str]:
             if "liquid" in given and "latent_heat" not in given:
                 yield f"{path}.liquid: needs melting_point and latent_heat"
         for kind in ("body", "emitter", "obstacle"):
-            for k, item in enumerate(getattr(entry, kind)):
+            for key, item in entry.keyed(kind):
                 if scene.heat is None and item.temperature is not None:
-                    yield f"{entry.path}{kind}[{k}].temperature: needs a [heat] table, which lets heat flow"
-        for k, item in enumerate(entry.obstacle):
+                    yield f"{key}.temperature: needs a [heat] table, which lets heat flow"
+        for key, item in entry.keyed("obstacle"):
             if item.held == "surface" and item.temperature is None:
-                yield f'{entry.path}obstacle[{k}].held: "surface" needs a temperature'
+                yield f'{key}.held: "surface" needs a temperature'
             if item.held == "surface" and scene.heat is not None and scene.heat.method == "chebyshev":
-                yield f'{entry.path}obstacle[{k}].held: "surface" needs heat.method "cg" or "multigrid"'
-    for k, face in enumerate(scene.heat.face if scene.heat is not None else ()):
-        dim = len(scene.grid.lower)
+                yield f'{key}.held: "surface" needs heat.method "cg" or "multigrid"'
+    if scene.heat is not None and scene.grid is not None:
+        yield from _face_problems(scene.heat.face, scene.grid)
+
+
+def _face_problems(faces: Sequence[schema.Face], grid: schema.Grid) -> Iterator[str]:
+    dim = len(grid.lower)
+    for k, face in enumerate(faces):
         for key in ("lower", "upper"):
             if len(getattr(face, key)) != dim:
                 yield f"heat.face[{k}].{key}: must have {dim} numbers in this {dim}-D scene, got {getattr(face, key)}"
         flat = [a == b for a, b in zip(face.lower, face.upper, strict=False)]
         if sum(flat) != 1 or any(a > b for a, b in zip(face.lower, face.upper, strict=False)):
             yield f"heat.face[{k}]: upper must equal lower along one axis and be above it along the others"
+        ends = zip(grid.lower, face.lower, face.upper, grid.upper, strict=False)
+        if any(p < a - grid.dx or q > b + grid.dx for a, p, q, b in ends):
+            yield f"heat.face[{k}]: is outside the domain, {grid.lower} to {grid.upper}"
 
 
 def parameter(words: float | schema.Curve, reference: float) -> float | Table:

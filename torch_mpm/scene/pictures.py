@@ -11,8 +11,10 @@ from typing import Any
 import numpy as np
 
 from ..trajectory import Array, Trajectory
-from . import schema
-from .build import obstacle
+from . import check, schema
+from .check import obstacle
+from .explain import SceneError
+from .run import FIELD_SHAPES
 from .scene import Scene
 
 FOLDER, VIDEO = "frames", "video.mp4"
@@ -26,7 +28,9 @@ def draw(folder: str | Path, scene: Scene, progress: Any = None) -> list[Path]:
     Pictures that exist already are kept. Returns the files made; calls ``progress(frame, frames)`` after each picture.
 
     Raises:
-        FileNotFoundError: when there is no trajectory.
+        FileNotFoundError: when there is no trajectory, or no frame in it yet.
+        DamagedFileError: for a trajectory that is damaged.
+        SceneError: when `scene.render` does not fit the trajectory.
         ImportError: when a package of the extra ``render`` is missing.
     """
     from ..render import assemble_video, write_png
@@ -35,6 +39,11 @@ def draw(folder: str | Path, scene: Scene, progress: Any = None) -> list[Path]:
     target = Path(folder) / FOLDER
     target.mkdir(exist_ok=True)
     with Trajectory(folder) as trajectory:
+        if not len(trajectory):
+            raise FileNotFoundError(f"{trajectory.path} has no frames yet")
+        problems = list(_problems(scene, words, trajectory))
+        if problems:
+            raise SceneError(problems, scene.source)
         numbers = range(0, len(trajectory), words.every)
         paths = [target / f"{k:05d}.png" for k in numbers]
         artist = _Artist(scene, words, trajectory)
@@ -49,6 +58,16 @@ def draw(folder: str | Path, scene: Scene, progress: Any = None) -> list[Path]:
     video = Path(folder) / VIDEO
     assemble_video(paths, video, scene.frames / scene.duration / words.every)
     return [*paths, video]
+
+
+def _problems(scene: Scene, words: schema.Render, trajectory: Trajectory) -> Iterator[str]:
+    """What of a scene with overrides does not fit its trajectory."""
+    yield from check.render_problems(scene)
+    dim = trajectory.file["position"].shape[2]
+    if scene.dim != dim:
+        yield f"grid.lower: the trajectory has {dim} dimensions, got {scene.grid.lower}"
+    if words.color_by in FIELD_SHAPES and words.color_by not in trajectory.fields:
+        yield f"render.color_by: the trajectory has no {words.color_by!r}; simulate with it in output.fields"
 
 
 class _Artist:

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import contextlib
-import errno
 import json
 import math
 import platform
-import shutil
 import signal
 import time
 from collections.abc import Callable, Iterator
@@ -20,28 +18,24 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..errors import SimulationError
+from ..errors import DamagedFileError, SimulationError
+from ..hdf5 import h5py_module
+from ..materials import Mixture
 from ..state import State
 from ..thermal import LIQUID
-from ..trajectory import COMPLETE, PARTIAL, Layout, TrajectoryWriter, create, h5py_module
+from ..trajectory import PARTIAL, Layout, Trajectory, TrajectoryWriter
 from . import checkpoint, heap
 from .build import Built
 from .diagnose import SceneFailure, replay, wrong
-from .explain import SceneError
+from .folder import CHECKPOINT, LAST_GOOD, claim, locked, output_errors, prepare, record_summary
 from .scene import Scene
 from .writer import FrameWriter
 
 SEGMENT = 32
 """Substeps between two looks at the stability limit and the validity of the state, and between two reorderings."""
 FIELD_SHAPES = {"F": 2, "C": 2, "stress": 2, "J": 0, "temperature": 0, "liquid": 0}
-RUN, CHECKPOINT, LAST_GOOD = "run.json", "checkpoint.h5", "last_good.h5"
-FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 Progress = Callable[[dict[str, Any]], None]
-
-
-class OutputError(RuntimeError):
-    """The output folder cannot be used, or its disk is full."""
 
 
 class Interrupted(RuntimeError):
@@ -81,7 +75,8 @@ def run(
 
     Raises:
         SceneError: for a scene that cannot be simulated.
-        OutputError: for a folder that holds something else, or a full disk.
+        OutputError: for a folder that holds something else or in which another process runs, or a full disk.
+        DamagedFileError: for a run to be resumed whose files are damaged.
         SceneFailure: for a simulation that went wrong; the state before it is in ``last_good.h5``.
         Interrupted: after Ctrl-C or SIGTERM, once the frame is whole.
     """
@@ -89,22 +84,24 @@ def run(
     folder = Path(out)
     h5py_module()
     fingerprint = scene.fingerprint()
-    _claim(folder, fingerprint, resume)
-    built = scene.build()
-    simulation = Simulation(scene, built)
-    with _stop_signals() as stop, _disk_errors(folder), torch.no_grad():
-        _prepare_folder(folder, scene, built, fingerprint, source)
-        writer = simulation.open(folder)
+    with output_errors(folder):
+        claim(folder, fingerprint, resume)
+    simulation = Simulation(scene, scene.build())
+    layout = simulation.layout(source, fingerprint)
+    with _stop_signals() as stop, output_errors(folder), locked(folder), torch.no_grad():
+        claim(folder, fingerprint, resume)  # again: another process may have been here before the lock
+        prepare(folder, scene, layout, fingerprint)
+        writer = simulation.open(folder, layout)
         try:
             simulation.run(writer, progress, stop)
         except SceneFailure as failure:
-            path = _save_last_good(folder, simulation.state, failure)
-            raise SceneFailure(f"{failure}\nThe state before it is in {path}.", failure.failure) from None
+            kept = _save_last_good(folder, simulation.state, failure)
+            raise SceneFailure(f"{failure}\n{kept}", failure.failure) from None
         finally:
             writer.close()
-    summary = simulation.summary(writer, time.perf_counter() - begin)
-    record_summary(folder, summary)
-    (folder / CHECKPOINT).unlink(missing_ok=True)
+        summary = simulation.summary(writer, time.perf_counter() - begin)
+        record_summary(folder, summary)
+        (folder / CHECKPOINT).unlink(missing_ok=True)
     return summary
 
 
@@ -118,6 +115,7 @@ class Simulation:
         self.totals = Totals()
         self.emissions = built.emissions()
         self.emitted = 0
+        self.fingerprint = ""
         self._figures: dict[str, Any] = {}
 
     # -- output
@@ -154,16 +152,62 @@ class Simulation:
             },
         )
 
-    def open(self, folder: Path) -> FrameWriter:
-        """Continue from the checkpoint of a folder, or start; returns the writer of its trajectory."""
-        trajectory = TrajectoryWriter(folder / PARTIAL)
+    def open(self, folder: Path, layout: Layout) -> FrameWriter:
+        """Continue from the checkpoint of a folder, or start; returns the writer of its trajectory.
+
+        Raises:
+            DamagedFileError: for files that are damaged or do not belong to this run.
+        """
         path = folder / CHECKPOINT
-        if path.exists():
-            self.state, record = checkpoint.load(path, self.state.x.device)
-            self.frame, self.emitted = record["frame"], record["emitted"]
-            self.totals = Totals(**record["totals"])
-        trajectory.rewind(self.frame + 1)
-        return FrameWriter(trajectory, path)
+        self.fingerprint = str(layout.attributes["fingerprint"])
+        with Trajectory(folder / PARTIAL) as trajectory:
+            if not layout.describes(trajectory):
+                raise DamagedFileError(trajectory.path, "is the trajectory of another scene", checkpoint.REMEDY)
+            if path.exists():
+                self._restore(path, layout, len(trajectory))
+            trajectory.verify(self.frame + 1)
+        writer = TrajectoryWriter(folder / PARTIAL)
+        writer.rewind(self.frame + 1)
+        return FrameWriter(writer, path)
+
+    def _restore(self, path: Path, layout: Layout, written: int) -> None:
+        """Take over a checkpoint beside a trajectory of ``written`` frames."""
+        state, record = checkpoint.load(path, self.state.x.device)
+        problem = self._unfit(state, record, layout, written)
+        if problem:
+            raise DamagedFileError(path, problem, checkpoint.REMEDY)
+        self.state, self.frame, self.emitted = state, record["frame"], record["emitted"]
+        self.totals = Totals(**record["totals"])
+
+    def _unfit(self, state: State, record: dict[str, Any], layout: Layout, written: int) -> str:
+        """Why a checkpoint cannot be that of this run; "" for one that can."""
+        if record.get("fingerprint") != self.fingerprint:
+            return "is the checkpoint of another scene"
+        frame, emitted, totals = (record.get(name) for name in ("frame", "emitted", "totals"))
+        # A frame is counted, then its checkpoint follows, and the disk may lack the last count.
+        if type(frame) is not int or not 0 <= frame < layout.frames or not frame <= written <= frame + 2:
+            return f"is of frame {frame}, which does not fit the {written} frames of the trajectory"
+        known = isinstance(totals, dict) and totals.keys() == vars(self.totals).keys()
+        if state.time != self.scene.time_of(frame) or not known:
+            return "has a record that is not of this run"
+        if type(emitted) is not int or not 0 <= emitted <= len(self.emissions):
+            return f"has {emitted} layers of {len(self.emissions)} from the emitters"
+        count = len(self.state) + sum(len(self.built.nozzles[k].layer) for _, k in self.emissions[:emitted])
+        fields = set(checkpoint.tensors_of(self.state)) - set(checkpoint.tensors_of(state))
+        if fields or len(state) != count or state.x.dtype != self.state.x.dtype:
+            return f"has not the {count} particles of this run with all their fields"
+        ids = state.ids.cpu() if state.ids is not None else torch.empty(0)
+        if not torch.equal(ids.sort().values, torch.arange(count)):
+            return "has ids that are not 0, 1, 2, ..."
+        for name in ("mass", "volume", "scene"):
+            value = getattr(state, name)
+            if value is not None and not torch.equal(value.cpu(), torch.from_numpy(layout.statics[name])[ids]):
+                return f"has another {name} of particles than the scene"
+        laws = len(self.step.law.laws) if isinstance(self.step.law, Mixture) else 1
+        if state.material is not None and count and not 0 <= state.material.min() <= state.material.max() < laws:
+            return "has materials that the scene lacks"
+        bad = wrong(self.step, state)
+        return f"has a particle that is not meaningful: {bad[1]}" if bad else ""
 
     def run(self, writer: FrameWriter, progress: Progress | None, stop: Callable[[], bool]) -> None:
         """All frames that are missing."""
@@ -199,6 +243,7 @@ class Simulation:
             "frame": self.frame,
             "time": float(state.time),
             "emitted": self.emitted,
+            "fingerprint": self.fingerprint,
             "totals": vars(self.totals),
         }
         writer.submit(self.frame, self._fields(), scalars, checkpoint.tensors_of(state), json.loads(json.dumps(record)))
@@ -211,8 +256,7 @@ class Simulation:
         fields = {"position": state.x, "velocity": state.v}
         for name in self.scene.trajectory_fields:
             value = self._field(state, name)
-            if value is None:
-                raise SceneError([f"output.fields: no material of this scene has {name!r}"])
+            assert value is not None, name  # `build` refuses fields that no material has
             fields[name] = value
         return {name: value[order] for name, value in fields.items()}
 
@@ -359,55 +403,7 @@ def versions() -> dict[str, str]:
     return {"torch_mpm": own, "torch": str(torch.__version__), "python": platform.python_version()}
 
 
-# ---- the folder
-
-
-def _claim(folder: Path, fingerprint: str, resume: bool) -> None:
-    """Refuse a folder that holds anything but an unfinished run of this scene that is to be resumed."""
-    if not folder.exists() or (folder.is_dir() and all(p.suffix == ".building" for p in folder.iterdir())):
-        return  # a file that was being built when a run was killed is nothing yet
-    if not folder.is_dir():
-        raise OutputError(f"{folder} is a file; choose a folder for the output")
-    record = folder / RUN
-    if not record.is_file():
-        raise OutputError(f"{folder} holds files that are no run of torch_mpm; choose an empty or a new folder")
-    if _read_json(record).get("fingerprint") != fingerprint:
-        raise OutputError(f"{folder} holds the run of another scene; choose another folder, or remove it first")
-    if (folder / COMPLETE).exists():
-        raise OutputError(f"{folder} holds the complete run of this scene; choose another folder, or remove it first")
-    if not resume:
-        raise OutputError(f"{folder} holds an unfinished run of this scene; add --resume to go on, or remove it first")
-
-
-def _prepare_folder(folder: Path, scene: Scene, built: Built, fingerprint: str, source: str) -> None:
-    folder.mkdir(parents=True, exist_ok=True)
-    record = folder / RUN
-    if not record.exists():
-        words = json.loads(scene.model_dump_json())
-        _write_json(record, {"fingerprint": fingerprint, "scene": words, "folder": str(scene.folder.resolve())})
-    if not (folder / PARTIAL).exists():
-        (folder / CHECKPOINT).unlink(missing_ok=True)
-        layout = Simulation(scene, built).layout(source, fingerprint)
-        free = shutil.disk_usage(folder).free
-        if layout.bytes > free:
-            raise OutputError(
-                f"the trajectory needs {layout.bytes / 1e9:.2f} GB in {folder}, where {free / 1e9:.2f} GB are free; "
-                "free some space, lower fps or leave out output.fields"
-            )
-        create(folder / PARTIAL, layout)
-
-
-@contextlib.contextmanager
-def _disk_errors(folder: Path) -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        if error.errno not in FULL:
-            raise
-        raise OutputError(
-            f"no room on the disk of {folder}: {error.strerror or error}. The frames written so far are whole; "
-            "free some space and add --resume to go on"
-        ) from error
+# ---- signals and failures
 
 
 @contextlib.contextmanager
@@ -431,38 +427,12 @@ def _stop_signals() -> Iterator[Callable[[], bool]]:
             signal.signal(number, handler)
 
 
-def _read_json(path: Path) -> dict[str, Any]:
-    values: dict[str, Any] = json.loads(path.read_text())
-    return values
-
-
-def _write_json(path: Path, values: dict[str, Any]) -> None:
-    building = path.with_suffix(".building")
-    building.write_text(json.dumps(values, indent=1))
-    building.replace(path)
-
-
-def _save_last_good(folder: Path, state: State, failure: SceneFailure) -> Path:
-    """Keep the last good state of a run that failed."""
+def _save_last_good(folder: Path, state: State, failure: SceneFailure) -> str:
+    """Keep the last good state of a run that failed; says where it is."""
     path = folder / LAST_GOOD
     record = {"time": float(state.time), "failure": str(failure)}
-    checkpoint.save(path, {k: v.cpu() for k, v in checkpoint.tensors_of(state).items()}, record)
-    return path
-
-
-def record_summary(folder: Path, summary: dict[str, Any]) -> None:
-    """Keep the summary of a run beside its scene in run.json."""
-    _write_json(folder / RUN, {**_read_json(folder / RUN), "summary": summary})
-
-
-def load_run(folder: str | Path, overrides: list[str] | None = None) -> Scene:
-    """The scene of a run folder, with overrides as for :meth:`Scene.load`.
-
-    Raises:
-        FileNotFoundError: when the folder holds no run.
-    """
-    path = Path(folder) / RUN
-    if not path.is_file():
-        raise FileNotFoundError(f"there is no run in {folder}")
-    record = _read_json(path)
-    return Scene.from_words(record["scene"], overrides, Path(record["folder"]))
+    try:
+        checkpoint.save(path, {k: v.cpu() for k, v in checkpoint.tensors_of(state).items()}, record)
+    except OSError as error:
+        return f"The state before it could not be kept: {error.strerror or error}."
+    return f"The state before it is in {path}."

@@ -11,8 +11,9 @@ from typing import Any
 import torch
 from pydantic import PrivateAttr, ValidationError
 
-from . import schema
+from . import check, partial, schema
 from .build import Built, build
+from .entry import ResolvedEntry
 from .explain import SceneError, explain
 
 if sys.version_info >= (3, 11):
@@ -21,12 +22,6 @@ else:
     import tomli as tomllib
 
 COSMETIC = {"title", "device", "render", "output"}
-
-
-class ResolvedEntry(schema.Entry):
-    """One scene of a batch with all it takes from the file; ``path`` begins the keys of its own things in messages."""
-
-    path: str = ""
 
 
 class Scene(schema.SceneData):
@@ -46,12 +41,13 @@ class Scene(schema.SceneData):
     """
 
     _folder: Path = PrivateAttr(default=Path())
+    _source: str = PrivateAttr(default="")
 
     def __init__(self, **words: Any) -> None:
         try:
             super().__init__(**words)
         except ValidationError as error:
-            raise SceneError(explain(error)) from None
+            raise SceneError([*explain(error), *partial.problems(words)]) from None
 
     @classmethod
     def load(cls, path: str | Path, overrides: list[str] | None = None) -> Scene:
@@ -66,30 +62,49 @@ class Scene(schema.SceneData):
             FileNotFoundError: when there is no such file.
         """
         path = Path(path)
-        if not path.is_file():
+        if not path.exists():
             raise FileNotFoundError(f"scene file {path} does not exist")
         try:
-            words = tomllib.loads(path.read_text())
-        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+            words = tomllib.loads(path.read_text(encoding="utf-8"))
+        except OSError as error:
+            raise SceneError([f"cannot be read: {error.strerror}"], str(path)) from None
+        except (ValueError, RecursionError) as error:
             raise SceneError([f"not a TOML file: {error}"], str(path)) from None
-        try:
-            return cls.from_words(words, overrides, path.parent)
-        except SceneError as error:
-            raise SceneError(error.problems, str(path)) from None
+        return cls.from_words(words, overrides, path.parent, str(path))
 
     @classmethod
-    def from_words(cls, words: dict[str, Any], overrides: list[str] | None = None, folder: Path = Path()) -> Scene:
-        """A scene from nested dictionaries; ``folder`` is where relative file names start."""
-        for override in overrides or []:
-            _override(words, override)
-        scene = cls(**words)
-        scene._folder = folder
+    def from_words(
+        cls, words: dict[str, Any], overrides: list[str] | None = None, folder: Path = Path(), source: str = ""
+    ) -> Scene:
+        """A scene from nested dictionaries.
+
+        Args:
+            words: the keys of a scene file.
+            overrides: as for :meth:`load`; set in ``words``.
+            folder: where relative file names start.
+            source: name of the file that the words are from, for messages.
+        """
+        try:
+            for override in overrides or []:
+                _override(words, override)
+        except SceneError as error:
+            raise SceneError(error.problems, source) from None
+        try:
+            scene = cls(**words)
+        except SceneError as error:
+            raise SceneError([*error.problems, *partial.file_problems(words, folder)], source) from None
+        scene._folder, scene._source = folder, source
         return scene
 
     @property
     def folder(self) -> Path:
         """Where relative file names start."""
         return self._folder
+
+    @property
+    def source(self) -> str:
+        """Name of the file that the scene is from, for messages; "" for a scene made in Python."""
+        return self._source
 
     @property
     def dim(self) -> int:
@@ -130,27 +145,23 @@ class Scene(schema.SceneData):
 
     def entries(self) -> list[ResolvedEntry]:
         """The scenes of the batch, each complete; one without a name for a file without [[scene]]."""
-        own = self.model_dump(include=set(schema.Content.model_fields))
         if not self.scene:
-            return [ResolvedEntry(**own)]
-        return [self._resolve(own, k, entry) for k, entry in enumerate(self.scene)]
-
-    def _resolve(self, own: dict[str, Any], k: int, entry: schema.Entry) -> ResolvedEntry:
-        words = entry.model_dump()
-        lists = {key: words[key] + own[key] for key in ("body", "obstacle", "emitter")}
-        return ResolvedEntry(
-            name=entry.name or f"scene {k}",
-            path=f"scene[{k}].",
-            gravity=entry.gravity or self.gravity,
-            material=own["material"] | words["material"],
-            **lists,
-        )
+            return [ResolvedEntry.resolved(self)]
+        return [ResolvedEntry.resolved(entry, self, k) for k, entry in enumerate(self.scene)]
 
     def fingerprint(self) -> str:
-        """Hash of all that decides the trajectory, files included."""
+        """Hash of all that decides the trajectory, files included.
+
+        Raises:
+            SceneError: for a file that cannot be read.
+        """
         digest = hashlib.sha256(self.model_dump_json(exclude=COSMETIC).encode())
         digest.update(json.dumps(self.trajectory_fields).encode())
-        for entry in self.entries():
+        entries = self.entries()
+        problems = [p for entry in entries for p in check.file_problems(entry, self.folder)]
+        if problems:
+            raise SceneError(problems, self.source)
+        for entry in entries:
             for body in entry.body:
                 if isinstance(body, (schema.MeshBody, schema.PointsBody)):
                     digest.update((self.folder / body.file).read_bytes())
@@ -160,10 +171,14 @@ class Scene(schema.SceneData):
         """Seed the particles and assemble the step: an object with ``state``, ``step``, ``grid``.
 
         Raises:
-            SceneError: for shapes outside the domain, overlapping bodies, a mesh that is not closed, ...
+            SceneError: for shapes outside the domain, overlapping bodies, a mesh that is not closed, more particles
+                than memory holds, ...
         """
-        with torch.device("cpu"):  # where a scene is put together, whatever torch's default device
-            return build(self, self.torch_device() if device is None else torch.device(device))
+        try:
+            with torch.device("cpu"):  # where a scene is put together, whatever torch's default device
+                return build(self, self.torch_device() if device is None else torch.device(device))
+        except SceneError as error:
+            raise SceneError(error.problems, self.source) from None
 
     def run(self, out: str | Path, **options: Any) -> dict[str, Any]:
         """Simulate into folder ``out`` and return the summary; ``options`` as in :func:`torch_mpm.scene.run`."""
@@ -179,7 +194,7 @@ def _override(words: dict[str, Any], text: str) -> None:
         raise SceneError([f"override {text!r} must look like grid.dx=0.01"])
     try:
         parsed = tomllib.loads(f"value = {value}")["value"]
-    except tomllib.TOMLDecodeError:
+    except (ValueError, RecursionError):
         parsed = value.strip()
     target: Any = words
     try:

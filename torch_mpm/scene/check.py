@@ -1,0 +1,307 @@
+"""What is wrong with a scene, as far as it can be told before a particle is seeded.
+
+Pieces of the scene that could not be understood are None (:mod:`.partial`); what depends on them is not judged.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from .. import boundaries, memory, seed
+from ..grid import Grid
+from . import heat, schema
+
+PARTICLE_BYTES = 400
+"""Memory that a particle takes at least while a scene is built and simulated."""
+NODES = 2**33
+"""Nodes along an axis beyond which no grid can have fewer than 2^31 blocks."""
+FRAMES = 10**8
+PIXELS = range(16, 16385)
+
+
+def problems(scene: Any, entries: Sequence[Any]) -> list[str]:
+    """One line for each mistake, beginning with its key."""
+    found = [*_grid_problems(scene.grid, len(entries)), *_time_problems(scene), *render_problems(scene)]
+    for entry in entries:
+        found += _material_problems(entry)
+    found += heat.problems(scene, entries)
+    if scene.grid is not None:
+        dim = len(scene.grid.lower)
+        for entry in entries:
+            if entry.gravity is not None and len(entry.gravity) != dim:
+                key = f"{entry.path if entry.own_gravity else ''}gravity"
+                found.append(f"{key}: must have {dim} numbers in this {dim}-D scene, got {entry.gravity}")
+            for kind in ("body", "obstacle", "emitter"):
+                for key, item in entry.keyed(kind):
+                    found += _item_problems(key, item, scene)
+        if not found:
+            found += _size_problems(scene, entries)
+    return list(dict.fromkeys(found))  # entries of a batch share what stands outside of them
+
+
+def file_problems(entry: Any, folder: Path) -> Iterator[str]:
+    """Files of bodies that cannot be read."""
+    for key, body in entry.keyed("body"):
+        if isinstance(body, (schema.MeshBody, schema.PointsBody)):
+            try:
+                seed.check_file(folder / body.file, body.shape)
+            except OSError as error:
+                yield f"{key}.file: {error}"
+
+
+# ---- words
+
+
+def _grid_problems(grid: schema.Grid | None, scenes: int) -> Iterator[str]:
+    if grid is None:
+        return
+    found = list(_corner_problems(grid))
+    yield from found
+    try:
+        lattice = None if found else Grid(grid.dx, grid.lower, grid.upper, scenes, grid.kernel)
+    except ValueError as error:
+        yield f"grid: {error}"
+        return
+    try:
+        if lattice is not None and grid.walls is not None:
+            boundaries.Walls(grid.walls, friction=grid.friction).faces(lattice)
+    except ValueError as error:
+        yield f"grid.walls: {error}"
+
+
+def _corner_problems(grid: schema.Grid) -> Iterator[str]:
+    dim = len(grid.lower)
+    if len(grid.upper) != dim:
+        yield f"grid.upper: must have {dim} numbers like grid.lower, got {grid.upper}"
+    if isinstance(grid.walls, list) and len(grid.walls) != dim:
+        yield f"grid.walls: must have one entry per axis, {dim} in all, got {grid.walls}"
+    if any(a >= b for a, b in zip(grid.lower, grid.upper, strict=False)):
+        yield f"grid.upper: must be above grid.lower on every axis, got {grid.upper}"
+    nodes = [(b - a) / grid.dx for a, b in zip(grid.lower, grid.upper, strict=False)]
+    if max(nodes) > NODES:
+        yield f"grid.dx: the domain has {max(nodes):.2g} nodes along an axis; make dx larger or the domain smaller"
+
+
+def _time_problems(scene: Any) -> Iterator[str]:
+    if scene.duration is not None and scene.fps is not None and scene.duration * scene.fps > FRAMES:
+        frames = scene.duration * scene.fps
+        yield f"duration: {frames:.3g} frames are too many; make the duration shorter or fps smaller"
+
+
+def _material_problems(entry: Any) -> Iterator[str]:
+    for kind in ("body", "emitter"):
+        for key, item in entry.keyed(kind):
+            if item.material not in entry.material:
+                known = ", ".join(sorted(entry.material)) or "there is none"
+                yield f"{key}.material: there is no material {item.material!r}; known: {known}"
+    if not entry.body and not entry.emitter:
+        yield f"{entry.path}body: the scene has no matter; give it a [[body]] or an [[emitter]]"
+
+
+def render_problems(scene: Any) -> Iterator[str]:
+    """What no picture can be made of."""
+    words, grid = scene.render, scene.grid
+    if words is None:
+        return
+    if any(n not in PIXELS for n in words.resolution):
+        ends = f"{PIXELS[0]} to {PIXELS[-1]}"
+        yield f"render.resolution: takes a width and a height of {ends} pixels, got {words.resolution}"
+    if words.range is not None and not words.range[0] < words.range[1]:
+        yield f"render.range: takes a lower and an upper end, got {words.range}"
+    if grid is None:
+        return
+    dim = len(grid.lower)
+    if words.view is not None:
+        lower, upper = words.view
+        if len(lower) != dim or len(upper) != dim or any(a >= b for a, b in zip(lower, upper, strict=False)):
+            yield f"render.view: takes a lower and an upper corner of {dim} numbers each, got {words.view}"
+    if dim == 2 and words.style == "surface":
+        yield "render.style: a surface needs three dimensions; this scene has two"
+    if dim == 3 and words.exaggeration != 1:
+        yield f"render.exaggeration: is for 2-D scenes, got {words.exaggeration}"
+    if words.ritter is not None and (dim == 3 or not any(scene.gravity or ())):
+        yield "render.ritter: needs a 2-D scene with gravity"
+
+
+def _item_problems(key: str, item: Any, scene: Any) -> list[str]:
+    """Mistakes of a body, an obstacle or an emitter."""
+    dim = len(scene.grid.lower)
+    found = list(_dimension_problems(key, item, dim))
+    if found or len(scene.grid.upper) != dim:
+        return found
+    try:
+        if isinstance(item, schema.Emitter):
+            return [*_nozzle_problems(key, item, scene)]
+        if isinstance(item, schema.Obstacle):
+            obstacle(item, None).pose(0.0)
+            return []
+        shape = shape_of(item)
+        return [] if shape is None else list(bounds_problems(key, item, shape, scene.grid))
+    except (ValueError, TypeError) as error:
+        return [f"{key}{called(item)}: {error}"]
+
+
+def _dimension_problems(key: str, item: Any, dim: int) -> Iterator[str]:
+    if dim == 2 and getattr(item, "shape", "") in ("mesh", "cylinder"):
+        yield f"{key}.shape: a {item.shape} needs three dimensions; this scene has two"
+        return
+    for name in ("center", "lower", "upper", "a", "b", "size", "normal", "axis", "velocity", "offset"):
+        value = getattr(item, name, None)
+        if value is not None and len(value) != dim:
+            yield f"{key}.{name}: must have {dim} numbers in this {dim}-D scene, got {value}"
+    for name in ("spin", "rotation"):
+        value = getattr(item, name, None)
+        if value is not None and isinstance(value, (int, float)) != (dim == 2):
+            yield f"{key}.{name}: takes {'one number' if dim == 2 else 'a vector of 3 numbers'} in {dim}-D, got {value}"
+
+
+# ---- places
+
+
+def shape_of(body: Any) -> seed.Shape | None:
+    """The region of a body that needs no file; None for one that does."""
+    if isinstance(body, schema.BoxBody):
+        return seed.Box(body.lower, body.upper)
+    if isinstance(body, schema.SphereBody):
+        return seed.Sphere(body.center, body.radius)
+    if isinstance(body, schema.CylinderBody):
+        return seed.Cylinder(body.a, body.b, body.radius)
+    if isinstance(body, schema.CapsuleBody):
+        return seed.Capsule(body.a, body.b, body.radius)
+    return None
+
+
+def obstacle(words: Any, scene: int | None) -> boundaries.Obstacle:
+    """The boundary of the step that an obstacle of a scene names."""
+    motion = {
+        "kind": words.contact,
+        "friction": words.friction,
+        "velocity": words.velocity,
+        "rotation": words.rotation,
+        "angular_velocity": words.spin,
+        "start": words.start,
+        "end": math.inf if words.end is None else words.end,
+        "scene": scene,
+    }
+    if isinstance(words, schema.PlaneObstacle):
+        return boundaries.Plane(words.center, words.normal, **motion)
+    if isinstance(words, schema.BoxObstacle):
+        return boundaries.Box(words.center, words.size, **motion)
+    if isinstance(words, schema.SphereObstacle):
+        return boundaries.Sphere(words.center, words.radius, **motion)
+    if isinstance(words, schema.RevolvedObstacle):
+        return boundaries.Revolved(words.center, words.outline, words.axis, **motion)
+    center = [0.5 * (p + q) for p, q in zip(words.a, words.b, strict=True)]
+    half = [0.5 * (q - p) for p, q in zip(words.a, words.b, strict=True)]
+    return boundaries.Capsule(center, half, words.radius, **motion)
+
+
+def bounds_problems(key: str, item: Any, shape: seed.Shape, grid: schema.Grid) -> Iterator[str]:
+    """A region that reaches out of the domain by more than its outermost particles keep away from its surface."""
+    slack = 0.5 * _spacing(item, grid)
+    if not inside(grid, shape.lower + slack) or not inside(grid, shape.upper - slack):
+        yield outside(f"{key}{called(item)}", shape.lower, shape.upper, grid)
+
+
+def inside(grid: schema.Grid, x: Tensor) -> bool:
+    """Whether all points [..., D] lie in the domain."""
+    lower, upper = (torch.tensor(v, dtype=torch.float64) for v in (grid.lower, grid.upper))
+    rounding = 1e-9 * (upper - lower)
+    return bool(((x >= lower - rounding) & (x <= upper + rounding)).all())
+
+
+def outside(path: str, lower: Tensor, upper: Tensor, grid: schema.Grid) -> str:
+    return (
+        f"{path}: reaches from {_numbers(lower)} to {_numbers(upper)}, outside the domain "
+        f"{_numbers(grid.lower)} to {_numbers(grid.upper)}; move the body or enlarge grid.lower, grid.upper"
+    )
+
+
+def _nozzle_problems(key: str, words: schema.Emitter, scene: Any) -> Iterator[str]:
+    velocity = torch.tensor(words.velocity, dtype=torch.float64)
+    if not 0 < float(velocity.norm()) < math.inf:
+        yield f"{key}{called(words)}: velocity must not be zero: it is the direction of the nozzle"
+        return
+    end = min(scene.duration or math.inf, words.end or math.inf)
+    if end <= words.start:
+        yield f"{key}{called(words)}: end must be after start, got start {words.start} and end {end}"
+    most = nozzle_area(words) * float(velocity.norm())
+    if words.rate is not None and words.rate > most * (1 + 1e-9):
+        unit = f"m^{len(words.center)}/s"
+        yield f"{key}{called(words)}: rate must be at most area times speed, {most:g} {unit}, got {words.rate}"
+    center = torch.tensor(words.center, dtype=torch.float64)
+    reach = words.radius * (1 - (velocity / velocity.norm()).square()).clamp(min=0).sqrt()
+    slack = torch.minimum(reach, torch.tensor(0.5 * _spacing(words, scene.grid)))
+    if not inside(scene.grid, center - reach + slack) or not inside(scene.grid, center + reach - slack):
+        yield f"{key}{called(words)}: the nozzle is outside the domain; move it inside"
+
+
+def nozzle_area(words: schema.Emitter) -> float:
+    """Area of a nozzle [m^2], or width of a slit [m]."""
+    return 2 * words.radius if len(words.center) == 2 else math.pi * words.radius * words.radius
+
+
+# ---- sizes
+
+
+def _size_problems(scene: Any, entries: Sequence[Any]) -> Iterator[str]:
+    """Particles of all bodies and emitters against numbers and memory."""
+    counts: dict[str, float] = {}
+    for entry in entries:
+        for key, body in entry.keyed("body"):
+            shape = shape_of(body)
+            if shape is not None:
+                counts[f"{entry.path}|{key}"] = _filling(shape.volume, len(shape.lower), _spacing(body, scene.grid))
+        for key, words in entry.keyed("emitter") if scene.duration is not None else ():
+            counts[f"{entry.path}|{key}"] = _poured(words, scene)
+    total, free = sum(counts.values()), memory.available()
+    if total <= seed.MOST and total * PARTICLE_BYTES <= free:
+        return
+    room = (
+        f"{seed.MOST} can be numbered"
+        if total > seed.MOST
+        else f"they take {total * PARTICLE_BYTES / 1e9:.3g} GB, and {free / 1e9:.3g} GB are free"
+    )
+    key = max(counts, key=lambda name: counts[name]).partition("|")[2]
+    yield (
+        f"{key}.per_cell: about {max(counts.values()):.3g} of the {total:.3g} particles of the scene are "
+        f"here, but {room}; make per_cell smaller or grid.dx larger"
+    )
+
+
+def _poured(words: schema.Emitter, scene: Any) -> float:
+    """About how many particles an emitter brings; whole layers of at least one particle."""
+    dim, spacing = len(words.center), _spacing(words, scene.grid)
+    area, speed = nozzle_area(words), math.hypot(*words.velocity)
+    seconds = max(0.0, min(scene.duration, words.end or scene.duration) - words.start)
+    layers = max(1.0, seconds * (words.rate or area * speed) / (area * spacing))
+    return layers * max(1.0, _filling(area, dim - 1, spacing))
+
+
+def _filling(volume: float, dim: int, spacing: float) -> float:
+    """Particles that fill a volume; infinite where a power would raise."""
+    for _ in range(dim):
+        volume /= spacing
+    return volume
+
+
+def _spacing(item: schema.Seeding, grid: schema.Grid) -> float:
+    """Distance of particles [m]."""
+    return max(1e-300, grid.dx / float(item.per_cell ** (1 / len(grid.lower))))
+
+
+# ---- words of messages
+
+
+def called(item: Any) -> str:
+    return f" ({item.name})" if item.name else ""
+
+
+def _numbers(values: Any) -> str:
+    return "[" + ", ".join(f"{float(v):.4g}" for v in values) + "]"

@@ -1,0 +1,163 @@
+"""The folder of a run: whose it is, who works in it, its record run.json, and disks that are full."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import fcntl
+import hashlib
+import json
+import os
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from ..errors import DamagedFileError
+from ..hdf5 import h5py_module
+from ..trajectory import COMPLETE, PARTIAL, Layout, Trajectory, create
+from .scene import Scene
+
+RUN, CHECKPOINT, LAST_GOOD, LOCK = "run.json", "checkpoint.h5", "last_good.h5", "run.lock"
+FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+REMEDY = "choose another folder, or remove this one"
+
+
+class OutputError(RuntimeError):
+    """The output folder cannot be used, or its disk is full."""
+
+
+def claim(folder: Path, fingerprint: str, resume: bool) -> None:
+    """Refuse a folder that holds anything but an unfinished run of this scene that is to be resumed."""
+    if folder.exists() and not folder.is_dir():
+        raise OutputError(f"{folder} is a file; choose a folder for the output")
+    # A lock, and a file that was being built when a run was killed, are nothing yet.
+    if not folder.exists() or all(p.name == LOCK or p.suffix == ".building" for p in folder.iterdir()):
+        return
+    if not (folder / RUN).is_file():
+        raise OutputError(f"{folder} holds files that are no run of torch_mpm; choose an empty or a new folder")
+    if read_run(folder)["fingerprint"] != fingerprint:
+        raise OutputError(f"{folder} holds the run of another scene; choose another folder, or remove it first")
+    if (folder / COMPLETE).exists():
+        raise OutputError(f"{folder} holds the complete run of this scene; choose another folder, or remove it first")
+    if not resume:
+        raise OutputError(f"{folder} holds an unfinished run of this scene; add --resume to go on, or remove it first")
+
+
+@contextlib.contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """Keep other processes out of a folder, which is made. The lock ends with this process, however it ends.
+
+    A file system without locks (some network file systems) keeps nobody out.
+
+    Raises:
+        OutputError: when another process runs in the folder.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    with open(folder / LOCK, "w") as handle:
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise OutputError(f"another process runs in {folder}; wait for its end, or choose another folder") from None
+        except OSError as error:
+            if error.errno not in (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP, errno.EINVAL):
+                raise
+        yield
+
+
+def prepare(folder: Path, scene: Scene, layout: Layout, fingerprint: str) -> None:
+    """The record and the empty trajectory of a run, where they are not there yet."""
+    if not (folder / RUN).exists():
+        words = json.loads(scene.model_dump_json())
+        _write_run(folder, {"fingerprint": fingerprint, "scene": words, "folder": str(scene.folder.resolve())})
+    if not (folder / PARTIAL).exists():
+        (folder / CHECKPOINT).unlink(missing_ok=True)
+        free = shutil.disk_usage(folder).free
+        if layout.bytes > free:
+            raise OutputError(
+                f"the trajectory needs {layout.bytes / 1e9:.2f} GB in {folder}, where {free / 1e9:.2f} GB are free; "
+                "free some space, lower fps or leave out output.fields"
+            )
+        create(folder / PARTIAL, layout)
+
+
+@contextlib.contextmanager
+def output_errors(folder: Path) -> Iterator[None]:
+    """What keeps this process from writing in a folder, as an OutputError."""
+    try:
+        yield
+    except OSError as error:
+        reason = error.strerror or str(error)
+        if error.errno not in FULL:
+            raise OutputError(f"cannot use {error.filename or folder} for the output: {reason}") from error
+        raise OutputError(
+            f"no room on the disk of {folder}: {reason}. The frames written so far are whole; "
+            "free some space and add --resume to go on"
+        ) from error
+
+
+# ---- run.json
+
+
+def _write_run(folder: Path, values: dict[str, Any]) -> None:
+    building = (folder / RUN).with_suffix(".building")
+    try:
+        with open(building, "w") as handle:
+            handle.write(json.dumps({**values, "checksum": _checksum(values)}, indent=1))
+            handle.flush()
+            os.fsync(handle.fileno())
+        building.replace(folder / RUN)
+    except BaseException:
+        building.unlink(missing_ok=True)
+        raise
+
+
+def read_run(folder: Path) -> dict[str, Any]:
+    """The record of a run: its ``fingerprint``, ``scene``, ``folder`` (of the scene file), and ``summary`` at its end.
+
+    Raises:
+        DamagedFileError: for a record that is not as it was written.
+    """
+    path = folder / RUN
+    try:
+        values = json.loads(path.read_bytes())
+    except (ValueError, RecursionError) as error:
+        raise DamagedFileError(path, f"is damaged ({error})", REMEDY) from None
+    if not isinstance(values, dict) or values.pop("checksum", None) != _checksum(values):
+        raise DamagedFileError(path, "is damaged or was changed, its checksum is wrong", REMEDY)
+    missing = [name for name in ("fingerprint", "scene", "folder") if name not in values]
+    if missing:
+        raise DamagedFileError(path, f"lacks {', '.join(missing)}", REMEDY)
+    return values
+
+
+def _checksum(values: dict[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
+
+
+def record_summary(folder: Path, summary: dict[str, Any]) -> None:
+    """Keep the summary of a run beside its scene in run.json.
+
+    Raises:
+        OutputError: when the disk is full.
+    """
+    with output_errors(folder):
+        _write_run(folder, {**read_run(folder), "summary": summary})
+
+
+def load_run(folder: str | Path, overrides: list[str] | None = None) -> Scene:
+    """The scene of a run folder, with overrides as for :meth:`Scene.load`.
+
+    Raises:
+        FileNotFoundError: when the folder holds no run.
+        DamagedFileError: when its record is damaged, or its trajectory is that of another scene.
+    """
+    folder = Path(folder)
+    if not (folder / RUN).is_file():
+        raise FileNotFoundError(f"there is no run in {folder}")
+    h5py_module()
+    record = read_run(folder)
+    with Trajectory(folder) as trajectory:
+        if trajectory.attributes.get("fingerprint") != record["fingerprint"]:
+            raise DamagedFileError(trajectory.path, f"is not the trajectory of the run in {RUN}", REMEDY)
+    return Scene.from_words(record["scene"], overrides, Path(record["folder"]), source=str(folder / RUN))

@@ -1,0 +1,67 @@
+"""What else is wrong with words of which some cannot be understood: the checks of the pieces that can."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from pydantic import TypeAdapter, ValidationError
+
+from . import check, schema
+from .entry import ResolvedEntry
+
+LISTS = {"body": schema.AnyBody, "obstacle": schema.AnyObstacle, "emitter": schema.Emitter}
+
+
+def problems(words: dict[str, Any]) -> list[str]:
+    """One line for each mistake that shows in spite of the others; none for a piece that could not be read."""
+    names = ("grid", "duration", "fps", "render", "gravity")
+    scene = schema.SceneData.model_construct(**{name: _field(name, words) for name in names})
+    heat = words.get("heat")
+    scene.heat = None if heat is None else _piece(schema.Heat, heat) or schema.Heat()
+    return check.problems(scene, _entries(words))
+
+
+def file_problems(words: dict[str, Any], folder: Path) -> list[str]:
+    """Files of the bodies that can be read."""
+    return list(dict.fromkeys(p for entry in _entries(words) for p in check.file_problems(entry, folder)))
+
+
+def _entries(words: dict[str, Any]) -> list[ResolvedEntry]:
+    own = _content(words)
+    scenes = [entry for entry in _list(words.get("scene")) if isinstance(entry, dict)]
+    if not scenes:
+        return [ResolvedEntry.resolved(own)]
+    return [ResolvedEntry.resolved(_content(entry), own, k) for k, entry in enumerate(scenes)]
+
+
+def _content(words: dict[str, Any]) -> schema.Entry:
+    """A scene of a batch, or what all share, with None in the place of pieces that are wrong."""
+    lists: dict[str, Any] = {
+        name: [_piece(kind, item) for item in _list(words.get(name))] for name, kind in LISTS.items()
+    }
+    materials = words.get("material")
+    pieces = {
+        str(name): _piece(schema.Material, value)
+        for name, value in (materials.items() if isinstance(materials, dict) else ())
+    }
+    return schema.Entry.model_construct(gravity=_field("gravity", words), material=pieces, **lists)
+
+
+def _field(name: str, words: dict[str, Any]) -> Any:
+    """The value of a key of the scene, its default where it is absent, None where it is wrong or missing."""
+    field = schema.SceneData.model_fields[name]
+    if name not in words:
+        return None if field.is_required() else field.get_default()
+    return _piece(field.rebuild_annotation(), words[name])
+
+
+def _piece(kind: Any, value: Any) -> Any:
+    try:
+        return TypeAdapter(kind).validate_python(value)
+    except ValidationError:
+        return None
+
+
+def _list(value: Any) -> list[Any]:
+    return list(value) if isinstance(value, (list, tuple)) else []
