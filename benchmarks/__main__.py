@@ -31,6 +31,7 @@ PROGRAMS = (
     "benchmarks.stability.stable_dt",
     "benchmarks.stability.law_dt",
     "benchmarks.stability.heat",
+    "benchmarks.stability.heat_step",
     "benchmarks.stability.sand",
     "benchmarks.stability.collapse",
 )
