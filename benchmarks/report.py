@@ -305,7 +305,7 @@ def heat_step(result: dict[str, Any]) -> str:
     """What a whole heat step can grow by."""
     intro = (
         f"The larger of ρ − 1 and ‖A‖ − 1, with the spectral radius ρ and the energy norm of a whole heat step A, "
-        f"transfer there and back and exact solve, in {len(result['rows'])} cases: jumps of κ or ρ C by up to 1e8, "
+        f"transfer there and back and exact solve, in {result['cases']} cases: jumps of κ or ρ C by up to 1e8, "
         "lattice, random and Poisson-disc layouts of 1 to 16 particles per cell, 2-D and 3-D, both kernels, insulated, "
         "held and exchanging (benchmarks/stability/heat_step.py)."
     )

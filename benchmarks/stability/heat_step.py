@@ -37,7 +37,8 @@ BODIES = (
     *itertools.product((2,), ("quadratic", "cubic"), ("lattice", "random", "poisson"), (1, 4, 16)),
     *itertools.product((3,), ("quadratic", "cubic"), ("lattice", "random", "poisson"), (1, 8)),
 )
-"""Dimension, kernel, layout, particles per cell."""
+BODY = ("dim", "kernel", "layout", "per_cell")
+"""What a body is, as fields of a case."""
 VARIANTS = tuple(itertools.product(("conductivity", "capacity"), ("plane", "random"), BOUNDARIES))
 """What jumps, where, and the boundary."""
 LARGE_CONTRASTS = (1e2, 1e8)
@@ -173,9 +174,23 @@ def cases(quick: bool) -> Iterator[Case]:
             yield Case(*body, transfer, number, contrast, *VARIANTS[(k + turn) % len(VARIANTS)])
 
 
+def excess(row: dict[str, Any]) -> float:
+    """The larger of ρ − 1 and norm − 1."""
+    return max(row["radius"], row["norm"])
+
+
+def summary(rows: Iterable[dict[str, Any]]) -> dict[str, Any]:
+    """How many cases there are, and the worst of each body, transfer and diffusion number."""
+    groups: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
+    for row in rows:
+        groups.setdefault(tuple(row[name] for name in (*BODY, "transfer", "number")), []).append(row)
+    worst = [max(group, key=excess) for group in groups.values()]
+    return {"cases": sum(len(group) for group in groups.values()), "rows": worst}
+
+
 def largest(rows: Iterable[dict[str, Any]]) -> str:
-    """The larger of ρ − 1 and norm − 1 over some cases; what is no more than rounding as that."""
-    worst = max(max(row["radius"], row["norm"]) for row in rows)
+    """The largest excess of some cases; what is no more than rounding as that."""
+    worst = max(excess(row) for row in rows)
     return f"< {LIMIT:g}" if worst < LIMIT else f"{worst:.1e}"
 
 
@@ -193,12 +208,11 @@ def text(result: dict[str, Any]) -> str:
     """Tables in Markdown: by diffusion number, and by body and contrast."""
     rows = result["rows"]
     lines = ["# One heat step as a linear map", "", common.describe(result["environment"]), ""]
-    lines += [(__doc__ or "").split("\n\n", 1)[1], f"{len(rows)} steps; the larger of ρ − 1 and norm − 1.", ""]
+    lines += [(__doc__ or "").split("\n\n", 1)[1], f"{result['cases']} steps; the larger of ρ − 1 and norm − 1.", ""]
     lines += [table(result), ""]
-    body = ("dim", "kernel", "layout", "per_cell")
     bodies: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
     for row in rows:
-        bodies.setdefault(tuple(row[name] for name in body), []).append(row)
+        bodies.setdefault(tuple(row[name] for name in BODY), []).append(row)
     cells = [
         [*kind, *(largest(row for row in mine if row["transfer"] == name) for name in TRANSFERS)]
         for kind, mine in bodies.items()
@@ -212,7 +226,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=common.RESULTS)
     arguments = parser.parse_args()
     environment = common.environment()
-    result = {"environment": environment, "rows": [measure(case) for case in cases(arguments.quick)]}
+    result = {"environment": environment, **summary(measure(case) for case in cases(arguments.quick))}
     print(text(result))
     common.write(arguments.out, "stability_heat_step", result, text(result))
 
