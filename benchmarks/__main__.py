@@ -33,6 +33,7 @@ PROGRAMS = (
     "benchmarks.stability.law_dt",
     "benchmarks.stability.adversarial",
     "benchmarks.stability.heat",
+    "benchmarks.stability.heat_step",
     "benchmarks.stability.sand",
     "benchmarks.stability.collapse",
 )

@@ -19,6 +19,7 @@ from .accuracy.runout import PUBLISHED, published, slopes
 from .stability.adversarial import summary as rollouts
 from .stability.heat import cell as heat_cell
 from .stability.heat import kind as heat_kind
+from .stability.heat_step import table as heat_step_table
 
 README, MEASURED = common.ROOT / "README.md", common.ROOT / "docs" / "measured.md"
 BEGIN, END = "<!-- benchmarks -->", "<!-- /benchmarks -->"
@@ -326,6 +327,17 @@ def heat_solve(result: dict[str, Any]) -> str:
     return "\n\n".join([intro, common.table(("r", "contrast", *kinds), rows)])
 
 
+def heat_step(result: dict[str, Any]) -> str:
+    """What a whole heat step can grow by."""
+    intro = (
+        f"The larger of ρ − 1 and ‖A‖ − 1, with the spectral radius ρ and the energy norm of a whole heat step A, "
+        f"transfer there and back and exact solve, in {result['cases']} cases: jumps of κ or ρ C by up to 1e8, "
+        "lattice, random and Poisson-disc layouts of 1 to 16 particles per cell, 2-D and 3-D, both kernels, insulated, "
+        "held and exchanging (benchmarks/stability/heat_step.py)."
+    )
+    return "\n\n".join([intro, heat_step_table(result)])
+
+
 def heat_speed(results: list[dict[str, Any]]) -> str:
     """Times of the heat solve beside transfers and assembled matrices."""
     header = ("device", "particles", "scalar P2G [ms]", "G2P [ms]", "iteration [ms]", "peer", "peer's time")
@@ -374,6 +386,7 @@ def sections(directory: Path) -> dict[str, str]:
         ("ritter", "Dam break", dam_break),
         ("heat", "Heat", heat),
         ("heat_stability", "Heat solve", heat_solve),
+        ("stability_heat_step", "Heat step", heat_step),
         ("precision", "Precision", precision),
         ("stability", "Stability", stability),
         ("stability_laws", "Stability of every law", stability_laws),

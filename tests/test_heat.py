@@ -7,9 +7,10 @@ import torch
 from particles import relative_error
 
 import torch_mpm as mpm
-from torch_mpm.heat_boundaries import Convection, Fixed, Flux, FreeSurface, Radiation, Source, Surface
+from torch_mpm.heat_boundaries import Convection, Fixed, FixedSurface, Flux, FreeSurface, Radiation, Source, Surface
+from torch_mpm.parameters import PerMaterial
 
-FLOAT = torch.float64
+FLOAT, NAN = torch.float64, float("nan")
 
 
 def block(dim=2, device="cpu", dtype=FLOAT, n=8, jitter=0.0, low=0.0, high=1.0, density=2.0, dx=None):
@@ -514,6 +515,20 @@ def test_bad_arguments():
         ({"transfer": "tpic"}, "transfer must be one of"),
         ({"melting_point": 1.0}, "given together"),
         ({"melting_point": 1.0, "latent_heat": 0.0}, "latent_heat must be positive"),
+        ({"melting_point": NAN, "latent_heat": 1.0}, "melting_point must be a number, got nan"),
+        ({"melting_point": torch.tensor([1.0, NAN]), "latent_heat": 1.0}, "melting_point must be a number"),
+        (
+            {"melting_point": PerMaterial([1.0, NAN]), "latent_heat": 1.0},
+            "melting_point of material 1 must be a number",
+        ),
+        ({"melting_point": 1.0, "latent_heat": NAN}, "latent_heat must be positive"),
+        ({"conductivity": PerMaterial([-1.0, 1.0])}, "conductivity of material 0 must be not negative"),
+        ({"specific_heat": PerMaterial([1.0, NAN])}, "specific_heat of material 1 must be positive"),
+        ({"reference": NAN}, "reference must be finite, got nan"),
+        ({"reference": math.inf}, "reference must be finite, got inf"),
+        ({"max_iterations": NAN}, "max_iterations must be at least 1, got nan"),
+        ({"tolerance": NAN}, "tolerance must be between"),
+        ({"plastic_heating": NAN}, "between 0 and 1"),
         ({"plastic_heating": 1.5}, "between 0 and 1"),
         ({"tolerance": 0.0}, "tolerance must be between"),
         ({"max_iterations": 0}, "at least 1"),
@@ -521,6 +536,8 @@ def test_bad_arguments():
     ):
         with pytest.raises(ValueError, match=message):
             mpm.Heat(grid, **{"conductivity": 1.0, "specific_heat": 1.0, **options})
+    never = PerMaterial([1.0, math.inf])
+    assert mpm.Heat(grid, 1.0, 1.0, melting_point=never, latent_heat=1.0).melting_point is never
     heat = mpm.Heat(grid, 1.0, 1.0)
     with pytest.raises(ValueError, match="temperature is None"):
         heat(block(), 1.0)
@@ -534,14 +551,25 @@ def test_bad_arguments():
 
 
 def test_bad_boundaries():
-    points = torch.zeros(4, 2)
+    points, plane = torch.zeros(4, 2), mpm.Plane((0.0, 0.0), (1.0, 0.0))
     for make, message in (
         (lambda: Surface(points[:, :1], 1.0), "points must have shape"),
         (lambda: Surface(points, torch.ones(3)), "area must be a number or have shape"),
-        (lambda: Surface(points, -1.0), "area must not be negative"),
+        (lambda: Surface(points, -1.0), "area must be not negative"),
         (lambda: Surface(points, 1.0, torch.zeros(3)), "scene must have shape"),
-        (lambda: Convection(FreeSurface(), -1.0, 0.0), "coefficient must not be negative"),
+        (lambda: Convection(FreeSurface(), -1.0, 0.0), "coefficient must be not negative"),
+        (lambda: Convection(FreeSurface(), torch.tensor([1.0, -1.0]), 0.0), "coefficient must be not negative"),
+        (lambda: Convection(FreeSurface(), 1.0, NAN), "ambient must be finite, got nan"),
         (lambda: Radiation(FreeSurface(), 1.1, 0.0), "emissivity must be between 0 and 1"),
+        (lambda: Radiation(FreeSurface(), torch.tensor(NAN), 0.0), "emissivity must be between 0 and 1"),
+        (lambda: Radiation(FreeSurface(), 0.5, math.inf), "ambient must be finite, got inf"),
+        (lambda: Flux(FreeSurface(), NAN), "flux must be finite, got nan"),
+        (lambda: Flux(FreeSurface(), torch.tensor([0.0, NAN])), "flux must be finite"),
+        (lambda: Fixed(plane, NAN), "temperature must be finite, got nan"),
+        (lambda: FixedSurface(plane, torch.tensor(NAN)), "temperature must be finite"),
+        (lambda: Source(NAN), "power must be finite, got nan"),
+        (lambda: Surface(points + NAN, 1.0), "points must be finite"),
+        (lambda: Surface(points, math.inf), "area must be not negative and finite, got inf"),
     ):
         with pytest.raises(ValueError, match=message):
             make()

@@ -10,6 +10,8 @@ from particles import relative_error
 from test_heat import FLOAT, block, grid_around, random_like
 
 import torch_mpm as mpm
+from benchmarks import common, report
+from benchmarks.stability import heat_step
 from benchmarks.stability.heat_step import LIMIT, TRANSFERS, Case, matrix, measure
 from torch_mpm.heat_boundaries import Convection, Fixed, FixedSurface, FreeSurface, Source
 
@@ -33,6 +35,19 @@ def test_no_jump_makes_a_step_grow(case, transfer):
     assert found["radius"] < LIMIT and found["norm"] < LIMIT
     A = matrix(case)
     assert float((A - A.T).abs().max()) < 1e-12
+
+
+def test_table_of_the_benchmark():
+    """Its quick form has every variant, and its tables say what the cases do."""
+    chosen = list(heat_step.cases(quick=True))
+    variants = {(case.jump, case.at, case.boundary) for case in chosen}
+    assert len(variants) == 12 and {case.transfer for case in chosen} == set(TRANSFERS)
+    rows = [measure(case) for case in chosen]
+    assert max(heat_step.excess(row) for row in rows) < LIMIT
+    found = {"environment": common.environment(), **heat_step.summary(rows)}
+    assert heat_step.text(found).count("< 1e-12") == 24 and "100 cases" in report.heat_step(found)
+    rows[7]["radius"] = 0.07
+    assert "7.0e-02" in report.heat_step({**found, **heat_step.summary(rows)})
 
 
 def test_matrix_is_the_step():

@@ -154,7 +154,7 @@ class Heat(nn.Module):
     def prepare(self, state: State) -> State:
         """Give a state the fields that this needs and that it lacks.
 
-        The gradient is that of the node temperatures, of which the particles with their gradients are averaged again:
+        The gradient is that of the node temperatures, to which the particles with their gradients are averaged again:
         it approaches the one with which neighbours agree best about the nodes between them. Differentiable.
 
         Raises:
@@ -308,9 +308,12 @@ class Heat(nn.Module):
         return blended(theta, value), blended(gradient, moment)
 
     def _gradient(self, state: State, temperature: Tensor) -> Tensor:
-        """The temperature gradient of particles that know none [P, D] [K/m]."""
+        """The temperature gradient of particles that know none [P, D] [K/m]; zero where they do not conduct.
+
+        Weights κ V are those of θ̄_i, β_p m_p C_p, in small steps: an insulator does not count for what touches it.
+        """
         blocks = self.grid.activate(state.x, state.scene)
-        weights = (evaluate("specific_heat", self.specific_heat, state) * state.mass)[:, None]
+        weights = (evaluate("conductivity", self.conductivity, state) * present_volume(state))[:, None]
         gradient = None
         for _ in range(SWEEPS):
             _, mean = _averages(blocks, state.x, weights, temperature, gradient)
@@ -318,7 +321,7 @@ class Heat(nn.Module):
             assert moment is not None
             gradient = moment[:, 0]
         assert gradient is not None
-        return gradient
+        return torch.where(weights > 0, gradient, 0)
 
     def _liquid(self, state: State) -> Tensor:
         """Liquid fraction [P]: that of the state, or by its temperature."""
