@@ -178,24 +178,10 @@ class Step(TensorModule):
 
     def _update_grid(self, blocks: Blocks, nodes: Tensor, state: State, dt: float | Tensor) -> Tensor:
         velocity = grid_update(blocks, nodes, self._gravity(state.x), dt, self.walls)
-        if self.boundaries:
-            velocity = self._obstruct(blocks, velocity, state, dt)
+        if boundaries := self.boundaries.entries:
+            velocity = _obstruct(blocks, velocity, boundaries, state, dt)
         if self.on_grid is not None:
             velocity = self.on_grid(blocks, velocity, nodes[:, 0], dt)
-        return velocity
-
-    def _obstruct(self, blocks: Blocks, velocity: Tensor, state: State, dt: float | Tensor) -> Tensor:
-        """The boundaries in turn; neighbours in the list that one op can take together."""
-        nodes: tuple[Tensor, Tensor | None] | None = None
-        for together, group in itertools.groupby(self.boundaries, lambda b: fusible(b, state.time)):
-            if together:
-                velocity = contact(blocks, velocity, list(group), state.time)
-                continue
-            if nodes is None:
-                scene = None if state.scene is None else blocks.node_scene()
-                nodes = (blocks.node_positions(state.x.dtype), scene)
-            for boundary in group:
-                velocity = call_boundary(boundary, velocity, *nodes, state.time, dt)
         return velocity
 
     def _blend_flip(self, blocks: Blocks, state: State, affine: Tensor | None, velocity: Tensor, v: Tensor) -> Tensor:
@@ -251,6 +237,21 @@ class Step(TensorModule):
         self._activations.reset()
         if self.heat is not None:
             self.heat.reset()
+
+
+def _obstruct(blocks: Blocks, velocity: Tensor, boundaries: Sequence[Any], state: State, dt: float | Tensor) -> Tensor:
+    """The boundaries in turn; neighbours in the list that one op can take together."""
+    nodes: tuple[Tensor, Tensor | None] | None = None
+    for together, group in itertools.groupby(boundaries, lambda b: fusible(b, state.time)):
+        if together:
+            velocity = contact(blocks, velocity, list(group), state.time)
+            continue
+        if nodes is None:
+            scene = None if state.scene is None else blocks.node_scene()
+            nodes = (blocks.node_positions(state.x.dtype), scene)
+        for boundary in group:
+            velocity = call_boundary(boundary, velocity, *nodes, state.time, dt)
+    return velocity
 
 
 def _argument(step: Step, name: str, value: Any) -> Any:
