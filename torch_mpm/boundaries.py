@@ -811,8 +811,7 @@ class BoundaryList(nn.Module, MutableSequence[Any]):
         for entry in self.entries:
             if not (isinstance(entry, nn.Module) or callable(getattr(entry, "apply", None))):
                 raise TypeError(
-                    "boundaries must be obstacles, modules or objects with a method apply(velocity, positions, scene, "
-                    f"time, dt), got {shape_of(entry)}"
+                    f"boundaries must be a list of modules or objects with a method apply, got {shape_of(entry)}"
                 )
         self._modules = {str(k): entry for k, entry in enumerate(self.entries) if isinstance(entry, nn.Module)}
 

@@ -18,7 +18,7 @@ from .boundaries import Obstacle, _norm, _per_node
 from .errors import shape_of
 from .grid import BLOCK_WIDTH, PADDING, Blocks
 from .ops import scatter
-from .parameters import Value, evaluate
+from .parameters import TensorModule, Value, evaluate
 from .reference.transfer import bspline
 
 if TYPE_CHECKING:
@@ -92,8 +92,7 @@ class HeatNodes:
 
     def hold(self, where: Tensor, temperature: Number) -> None:
         """Keep nodes, bool [N], at a temperature [K]; those held before stay as they are."""
-        given = temperature if isinstance(temperature, Tensor) else torch.full_like(self.theta, temperature)
-        value = torch.where(where, given, 0.0).to(self.theta)
+        value = torch.where(where, torch.zeros_like(self.theta) + temperature, 0)
         if self.fixed is None or self.held is None:
             self.fixed, self.held = where, value
         else:
@@ -131,7 +130,7 @@ class HeatNodes:
 # ---- surfaces
 
 
-class Surface:
+class Surface(TensorModule):
     """Points that stand for a surface.
 
     Args:
@@ -170,7 +169,7 @@ class Surface:
         return torch.zeros_like(nodes.theta).index_add(0, rows.reshape(-1), given.reshape(-1))
 
 
-class FreeSurface:
+class FreeSurface(TensorModule):
     """The surface of the particles wherever it is now: the area of a node is |Σ_p V_p ∇N_i(x_p)| = |∮ N_i n dA|.
 
     Exact for a flat surface of evenly spread particles; disorder inside a body adds area that is not there, a share of
@@ -210,7 +209,11 @@ def node_weights(blocks: Blocks, x: Tensor, scene: Tensor | None) -> tuple[Tenso
 # ---- terms
 
 
-class Flux:
+class Term(TensorModule):
+    """What adds to the nodes by `apply(nodes)`, a module with the tensors and parameters of its arguments."""
+
+
+class Flux(Term):
     """A heat flux η = κ ∇θ · n into the body through a surface.
 
     Args:
@@ -221,11 +224,11 @@ class Flux:
     def __init__(self, surface: Surface | FreeSurface, flux: Timed) -> None:
         self.surface, self.flux = surface, flux
 
-    def apply(self, nodes: HeatNodes) -> None:
+    def apply(self, nodes: HeatNodes) -> None:  # type: ignore[override]
         nodes.add_source(self.surface.integrate(nodes, self.flux))
 
 
-class Convection:
+class Convection(Term):
     """Exchange with a fluid around the body, coefficient (ambient − θ) per area (Robin), implicit.
 
     Args:
@@ -241,11 +244,11 @@ class Convection:
         self.surface, self.ambient = surface, ambient
         self.coefficient = _not_negative("coefficient", coefficient)
 
-    def apply(self, nodes: HeatNodes) -> None:
+    def apply(self, nodes: HeatNodes) -> None:  # type: ignore[override]
         nodes.add_exchange(self.surface.integrate(nodes, self.coefficient), nodes.per_node(self.ambient))
 
 
-class Radiation:
+class Radiation(Term):
     """Exchange with surroundings by radiation, ε σ (T_a⁴ − T⁴) per area, linearised about the temperature of the step.
 
     Args:
@@ -263,7 +266,7 @@ class Radiation:
             raise ValueError(f"emissivity must be between 0 and 1, got {emissivity}")
         self.surface, self.emissivity, self.ambient = surface, emissivity, ambient
 
-    def apply(self, nodes: HeatNodes) -> None:
+    def apply(self, nodes: HeatNodes) -> None:  # type: ignore[override]
         black = STEFAN_BOLTZMANN * self.surface.integrate(nodes, self.emissivity)
         ambient = nodes.per_node(self.ambient) + nodes.reference
         kelvin = (nodes.theta + nodes.reference).clamp_min(0)
@@ -272,7 +275,7 @@ class Radiation:
         nodes.add_source(black * (ambient**4 - kelvin**4))
 
 
-class Fixed:
+class Fixed(Term):
     """Nodes that are held at a temperature (Dirichlet).
 
     Args:
@@ -287,7 +290,7 @@ class Fixed:
     def __init__(self, region: Obstacle | Callable[[Tensor], Tensor], temperature: Timed) -> None:
         self.region, self.temperature = region, temperature
 
-    def apply(self, nodes: HeatNodes) -> None:
+    def apply(self, nodes: HeatNodes) -> None:  # type: ignore[override]
         positions = nodes.blocks.node_positions(nodes.theta.dtype)
         if isinstance(self.region, Obstacle):
             where = self.region.contains(positions, nodes.scene(), nodes.time)
@@ -296,7 +299,7 @@ class Fixed:
         nodes.hold(where & (nodes.capacity > 0), nodes.per_node(self.temperature))
 
 
-class FixedSurface:
+class FixedSurface(Term):
     """The surface of an obstacle that is held at a temperature (Dirichlet), to second order in dx.
 
     Matter at a distance a < w from it conducts with the share s = 1 − (1 − a²/w²)³ of its conductivity, and exchanges
@@ -321,14 +324,14 @@ class FixedSurface:
             raise ValueError(f"region must be an obstacle of torch_mpm.boundaries, got {type(region).__name__}")
         self.region, self.temperature = region, temperature
 
-    def apply(self, nodes: HeatNodes) -> None:
+    def apply(self, nodes: HeatNodes) -> None:  # type: ignore[override]
         width, state = self.WIDTH * nodes.blocks.grid.dx, nodes.state
         distance = self.region.signed_distance(state.x, state.scene, nodes.time)
         rest = 1 - (distance / width).clamp(0, 1) ** 2
         nodes.add_layer(1 - rest**3, 6 / width**2 * rest**2, nodes.per_node(self.temperature))
 
 
-class Source:
+class Source(Term):
     """Heat from inside the matter.
 
     Args:
@@ -338,7 +341,7 @@ class Source:
     def __init__(self, power: Value) -> None:
         self.power = power
 
-    def apply(self, nodes: HeatNodes) -> None:
+    def apply(self, nodes: HeatNodes) -> None:  # type: ignore[override]
         power = evaluate("power", self.power, nodes.state) * nodes.volume
         nodes.add_source(scatter(nodes.blocks, nodes.state.x, power[:, None])[:, 0])
 
