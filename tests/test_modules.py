@@ -7,6 +7,7 @@ import torch
 from torch import Tensor, nn
 
 import torch_mpm as mpm
+from torch_mpm import heat_boundaries
 
 
 def block(device: str = "cpu", dtype: torch.dtype = torch.float64) -> tuple[mpm.Grid, mpm.State]:
@@ -151,6 +152,37 @@ def test_a_function_of_time_with_parameters(device):
     mpm.rollout(step, state, 3, 1e-3).v.sum().backward()
     (speed,) = step.parameters()
     assert float(speed.grad[1]) > 0
+
+
+def test_parameters_of_heat(device):
+    """Those of its boundaries, of their surfaces and of the obstacles in them."""
+    grid, state = block(device)
+    where = {"dtype": torch.float64, "device": device}
+    flux = nn.Parameter(torch.tensor(1e4, **where))
+    held = mpm.Plane((0.0, 0.25), (0.0, 1.0), rotation=torch.tensor(0.1, **where))
+    points = torch.tensor([[0.45, 0.45]], **where)
+    terms = [
+        heat_boundaries.Flux(heat_boundaries.FreeSurface(), flux),
+        heat_boundaries.Fixed(held, nn.Parameter(torch.tensor(30.0, **where))),
+        heat_boundaries.Convection(
+            heat_boundaries.Surface(points, 0.1), 5.0, nn.Parameter(torch.tensor(10.0, **where))
+        ),
+    ]
+    step = mpm.Step(grid, mpm.NeoHookean(E=1e4, nu=0.3), heat=mpm.Heat(grid, 100.0, 1.0, terms))
+    heated = step(state.replace(temperature=torch.zeros_like(state.mass)), 1e-3)
+    heated.temperature.sum().backward()
+    grads = {name: float(p.grad) for name, p in step.named_parameters()}
+    assert grads.keys() == {f"heat.boundaries.{k}" for k in ("0.flux", "1.temperature", "2.ambient")}
+    assert min(grads.values()) > 0
+    assert {name for name, _ in step.heat.named_buffers()} == {
+        "boundaries.1.region.rotation",
+        "boundaries.2.surface.points",
+    }
+    seen: list[nn.Module] = []
+    step.apply(seen.append)
+    assert len(seen) == len(list(step.modules()))
+    step.heat.boundaries = []
+    assert not list(step.parameters())
 
 
 # ---- hooks

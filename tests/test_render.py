@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import subprocess
 import sys
 
@@ -453,3 +454,17 @@ def test_contact_sheet_places_frames_in_rows():
     assert [int(sheet[88, 50 + 104 * i, 0]) for i in range(3)] == [180, 240, 255]
     with pytest.raises(ValueError, match="at least one picture"):
         render.contact_sheet([], 2)
+
+
+@pytest.mark.parametrize("scenes", [1, 4, 9, 25])
+def test_labels_are_inside_the_pictures_of_a_batch(scenes):
+    """Axis labels, tick labels, title and colour bar, for the smallest pictures of a sheet too."""
+    columns = math.isqrt(scenes)
+    renderer = render.Renderer(((0.0, 0.0), (1.0, 1.0)), (1280 // columns, 720 // columns), "speed", (0.0, 1.0))
+    image = renderer.frame(torch.rand(10, 2), torch.rand(10, 2), time=1.0, title="one")
+    scene = renderer.scene
+    texts = [scene.axes.xaxis.label, scene.axes.yaxis.label, scene.title, scene.stamp, scene.bar.yaxis.label]
+    texts += [*scene.axes.get_xticklabels(), *scene.axes.get_yticklabels(), *scene.bar.get_yticklabels()]
+    for text in texts:
+        box = text.get_window_extent()
+        assert box.x0 >= 0 and box.y0 >= 0 and box.x1 <= image.shape[1] and box.y1 <= image.shape[0], text

@@ -815,6 +815,9 @@ def _extent(name: str, value: Any) -> Any:
 class BoundaryList(nn.Module, MutableSequence[Any]):
     """A list of boundaries, of which those that are modules are submodules.
 
+    Attributes:
+        entries: the same as a plain list, to be read only.
+
     Raises:
         TypeError: for anything but a list, or an entry that is neither a module nor has a method `apply`.
     """
@@ -823,38 +826,37 @@ class BoundaryList(nn.Module, MutableSequence[Any]):
         super().__init__()
         if not isinstance(boundaries, Iterable) or isinstance(boundaries, str):
             raise TypeError(f"boundaries must be a list of obstacles, got {shape_of(boundaries)}: put it in a list")
-        self._entries: list[Any] = []
+        self.entries: list[Any] = []
         self.extend(boundaries)
 
     def __len__(self) -> int:
-        return len(self._entries)
+        return len(self.entries)
 
     def __iter__(self) -> Iterator[Any]:
-        return iter(self._entries)
+        return iter(self.entries)
 
     def __getitem__(self, index: Any) -> Any:
-        return self._entries[index]
+        return self.entries[index]
 
     def __setitem__(self, index: Any, value: Any) -> None:
-        self._entries[index] = value
+        self.entries[index] = value
         self._register()
 
     def __delitem__(self, index: Any) -> None:
-        del self._entries[index]
+        del self.entries[index]
         self._register()
 
     def insert(self, index: int, value: Any) -> None:
-        self._entries.insert(index, value)
+        self.entries.insert(index, value)
         self._register()
 
     def _register(self) -> None:
-        for entry in self._entries:
+        for entry in self.entries:
             if not (isinstance(entry, nn.Module) or callable(getattr(entry, "apply", None))):
                 raise TypeError(
-                    "boundaries must be obstacles, modules or objects with a method apply(velocity, positions, scene, "
-                    f"time, dt), got {shape_of(entry)}"
+                    f"boundaries must be a list of modules or objects with a method apply, got {shape_of(entry)}"
                 )
-        self._modules = {str(k): entry for k, entry in enumerate(self._entries) if isinstance(entry, nn.Module)}
+        self._modules = {str(k): entry for k, entry in enumerate(self.entries) if isinstance(entry, nn.Module)}
 
     def apply(self, function: Callable[[nn.Module], None]) -> Any:
         """As for any module, also where a user's own has an `apply` that is that of boundaries."""

@@ -27,7 +27,7 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor, nn
 
-from .boundaries import _norm
+from .boundaries import BoundaryList, _norm
 from .capture import outside_transforms, without_transforms
 from .errors import check_like
 from .failures import Failures, Problem, problems_of_status, raise_failures, unsolved_heat
@@ -125,7 +125,7 @@ class Heat(nn.Module):
             raise ValueError(f"method must be one of {sorted(METHODS)}, got {method!r}")
         if method == "chebyshev" and any(isinstance(boundary, FixedSurface) for boundary in boundaries):
             raise ValueError('method must be "cg" or "multigrid" where a boundary is a FixedSurface, got "chebyshev"')
-        self.grid, self.boundaries, self.transfer = grid, list(boundaries), transfer
+        self.grid, self.boundaries, self.transfer = grid, boundaries, transfer
         self.plastic_heating, self.reference = float(plastic_heating), float(reference)
         self.tolerance, self.max_iterations, self.method = float(tolerance), int(max_iterations), method
         not_negative, positive = (lambda v: v >= 0), (lambda v: v > 0)
@@ -140,6 +140,9 @@ class Heat(nn.Module):
         self.unsolved: Tensor | None = None
         """Solves of each scene so far that missed their tolerance, int32 [B], and the largest residual [B] [K]."""
         self.residual: Tensor | None = None
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        super().__setattr__(name, BoundaryList(value) if name == "boundaries" else value)
 
     @property
     def status(self) -> Tensor | None:

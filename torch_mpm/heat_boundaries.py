@@ -20,7 +20,7 @@ from .errors import shape_of
 from .grid import BLOCK_WIDTH, PADDING, Blocks
 from .materials import _check_value
 from .ops import scatter
-from .parameters import Value, evaluate
+from .parameters import TensorModule, Value, evaluate
 from .reference.transfer import bspline
 
 if TYPE_CHECKING:
@@ -132,7 +132,7 @@ class HeatNodes:
 # ---- surfaces
 
 
-class Surface:
+class Surface(TensorModule):
     """Points that stand for a surface.
 
     Args:
@@ -172,7 +172,7 @@ class Surface:
         return torch.zeros_like(nodes.theta).index_add(0, rows.reshape(-1), given.reshape(-1))
 
 
-class FreeSurface:
+class FreeSurface(TensorModule):
     """The surface of the particles wherever it is now: the area of a node is |Σ_p V_p ∇N_i(x_p)| = |∮ N_i n dA|.
 
     Exact for a flat surface of evenly spread particles; disorder inside a body adds area that is not there, a share of
@@ -212,7 +212,11 @@ def node_weights(blocks: Blocks, x: Tensor, scene: Tensor | None) -> tuple[Tenso
 # ---- terms
 
 
-class Flux:
+class Term(TensorModule):
+    """What adds to the nodes by `apply(nodes)`, a module with the tensors and parameters of its arguments."""
+
+
+class Flux(Term):
     """A heat flux η = κ ∇θ · n into the body through a surface.
 
     Args:
@@ -226,11 +230,11 @@ class Flux:
     def __init__(self, surface: Surface | FreeSurface, flux: Timed) -> None:
         self.surface, self.flux = surface, _checked("flux", flux)
 
-    def apply(self, nodes: HeatNodes) -> None:
+    def apply(self, nodes: HeatNodes) -> None:  # type: ignore[override]
         nodes.add_source(self.surface.integrate(nodes, self.flux))
 
 
-class Convection:
+class Convection(Term):
     """Exchange with a fluid around the body, coefficient (ambient − θ) per area (Robin), implicit.
 
     Args:
@@ -246,11 +250,11 @@ class Convection:
         self.surface, self.ambient = surface, _checked("ambient", ambient)
         self.coefficient = _checked("coefficient", coefficient, "not negative", lambda v: v >= 0)
 
-    def apply(self, nodes: HeatNodes) -> None:
+    def apply(self, nodes: HeatNodes) -> None:  # type: ignore[override]
         nodes.add_exchange(self.surface.integrate(nodes, self.coefficient), nodes.per_node(self.ambient))
 
 
-class Radiation:
+class Radiation(Term):
     """Exchange with surroundings by radiation, ε σ (T_a⁴ − T⁴) per area, linearised about the temperature of the step.
 
     Args:
@@ -267,7 +271,7 @@ class Radiation:
         self.surface, self.ambient = surface, _checked("ambient", ambient)
         self.emissivity = _checked("emissivity", emissivity, "between 0 and 1", lambda v: (v >= 0) & (v <= 1))
 
-    def apply(self, nodes: HeatNodes) -> None:
+    def apply(self, nodes: HeatNodes) -> None:  # type: ignore[override]
         black = STEFAN_BOLTZMANN * self.surface.integrate(nodes, self.emissivity)
         ambient = nodes.per_node(self.ambient) + nodes.reference
         kelvin = (nodes.theta + nodes.reference).clamp_min(0)
@@ -276,7 +280,7 @@ class Radiation:
         nodes.add_source(black * (ambient**4 - kelvin**4))
 
 
-class Fixed:
+class Fixed(Term):
     """Nodes that are held at a temperature (Dirichlet).
 
     Args:
@@ -294,7 +298,7 @@ class Fixed:
     def __init__(self, region: Obstacle | Callable[[Tensor], Tensor], temperature: Timed) -> None:
         self.region, self.temperature = region, _checked("temperature", temperature)
 
-    def apply(self, nodes: HeatNodes) -> None:
+    def apply(self, nodes: HeatNodes) -> None:  # type: ignore[override]
         positions = nodes.blocks.node_positions(nodes.theta.dtype)
         if isinstance(self.region, Obstacle):
             where = self.region.contains(positions, nodes.scene(), nodes.time)
@@ -303,7 +307,7 @@ class Fixed:
         nodes.hold(where & (nodes.capacity > 0), nodes.per_node(self.temperature))
 
 
-class FixedSurface:
+class FixedSurface(Term):
     """The surface of an obstacle that is held at a temperature (Dirichlet), to second order in dx.
 
     Matter at a distance a < w from it conducts with the share s = 1 − (1 − a²/w²)³ of its conductivity, and exchanges
@@ -328,14 +332,14 @@ class FixedSurface:
             raise ValueError(f"region must be an obstacle of torch_mpm.boundaries, got {type(region).__name__}")
         self.region, self.temperature = region, _checked("temperature", temperature)
 
-    def apply(self, nodes: HeatNodes) -> None:
+    def apply(self, nodes: HeatNodes) -> None:  # type: ignore[override]
         width, state = self.WIDTH * nodes.blocks.grid.dx, nodes.state
         distance = self.region.signed_distance(state.x, state.scene, nodes.time)
         rest = 1 - (distance / width).clamp(0, 1) ** 2
         nodes.add_layer(1 - rest**3, 6 / width**2 * rest**2, nodes.per_node(self.temperature))
 
 
-class Source:
+class Source(Term):
     """Heat from inside the matter.
 
     Args:
@@ -348,7 +352,7 @@ class Source:
     def __init__(self, power: Value) -> None:
         self.power = _check_value("power", power, "finite", lambda v: v == v)
 
-    def apply(self, nodes: HeatNodes) -> None:
+    def apply(self, nodes: HeatNodes) -> None:  # type: ignore[override]
         power = evaluate("power", self.power, nodes.state) * nodes.volume
         nodes.add_source(scatter(nodes.blocks, nodes.state.x, power[:, None])[:, 0])
 

@@ -166,8 +166,14 @@ def store(module: nn.Module, name: str, value: Any) -> None:
 class TensorModule(nn.Module):
     """A module whose tensors are buffers, so that `.to` moves them and a `state_dict` has them.
 
-    Any attribute may be assigned again as something else: a number, a tensor, an nn.Parameter, a module.
+    Any attribute may be assigned again as something else: a number, a tensor, an nn.Parameter, a module. A subclass
+    need not call `super().__init__`.
     """
+
+    def __new__(cls, *arguments: Any, **named: Any) -> Any:
+        module = super().__new__(cls)
+        nn.Module.__init__(module)
+        return module
 
     def __setattr__(self, name: str, value: Any) -> None:
         for stored in ("_parameters", "_buffers", "_modules"):

@@ -191,27 +191,10 @@ class Step(TensorModule):
 
     def _update_grid(self, blocks: Blocks, nodes: Tensor, state: State, dt: float | Tensor) -> Tensor:
         velocity = grid_update(blocks, nodes, self._gravity(state.x), dt, self.walls)
-        if self.boundaries:
-            velocity = self._obstruct(blocks, velocity, state, dt)
+        if boundaries := self.boundaries.entries:
+            velocity = _obstruct(blocks, velocity, boundaries, state, dt)
         if self.on_grid is not None:
             velocity = self.on_grid(blocks, velocity, nodes[:, 0], dt)
-        return velocity
-
-    def _obstruct(self, blocks: Blocks, velocity: Tensor, state: State, dt: float | Tensor) -> Tensor:
-        """The boundaries in turn; neighbours in the list that one op can take together."""
-        time = state.time
-        if isinstance(time, Tensor) and time.dim() == 0:
-            time = time.to(velocity.device)  # a number of a compiled step
-        nodes: tuple[Tensor, Tensor | None] | None = None
-        for together, group in _neighbours(self.boundaries, time):
-            if together:
-                velocity = contact(blocks, velocity, group, time)
-                continue
-            if nodes is None:
-                scene = None if state.scene is None else blocks.node_scene()
-                nodes = (blocks.node_positions(state.x.dtype), scene)
-            for boundary in group:
-                velocity = call_boundary(boundary, velocity, *nodes, time, dt)
         return velocity
 
     def _blend_flip(self, blocks: Blocks, state: State, affine: Tensor | None, velocity: Tensor, v: Tensor) -> Tensor:
@@ -302,7 +285,25 @@ class Step(TensorModule):
             self.heat.reset()
 
 
-def _neighbours(boundaries: Sequence[Boundary], time: float | Tensor) -> list[tuple[bool, list[Any]]]:
+def _obstruct(blocks: Blocks, velocity: Tensor, boundaries: Sequence[Any], state: State, dt: float | Tensor) -> Tensor:
+    """The boundaries in turn; neighbours in the list that one op can take together."""
+    time = state.time
+    if isinstance(time, Tensor) and time.dim() == 0:
+        time = time.to(velocity.device)  # a number of a compiled step
+    nodes: tuple[Tensor, Tensor | None] | None = None
+    for together, group in _neighbours(boundaries, time):
+        if together:
+            velocity = contact(blocks, velocity, group, time)
+            continue
+        if nodes is None:
+            scene = None if state.scene is None else blocks.node_scene()
+            nodes = (blocks.node_positions(state.x.dtype), scene)
+        for boundary in group:
+            velocity = call_boundary(boundary, velocity, *nodes, time, dt)
+    return velocity
+
+
+def _neighbours(boundaries: Sequence[Any], time: float | Tensor) -> list[tuple[bool, list[Any]]]:
     """Runs of boundaries that `contact` takes together, or not; `itertools.groupby` can't be compiled."""
     runs: list[tuple[bool, list[Any]]] = []
     for boundary in boundaries:

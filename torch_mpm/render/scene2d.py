@@ -26,7 +26,9 @@ class Scene2D:
         lower, upper = bounds
         left = 5 * self.size * DPI / 72 / resolution[0]
         width = 0.97 - left - (scale_width(resolution) if scale else 0)
-        bottom, height = 0.11, 0.78
+        line = self.size * DPI / 72 / resolution[1]  # share of the height that a line of text takes
+        bottom, top = max(0.11, 3.8 * line), max(0.11, 2.6 * line)
+        height = 1 - bottom - top
         aspect = exaggeration * (upper[1] - lower[1]) / (upper[0] - lower[0]) * resolution[0] / resolution[1]
         fitted = (width, width * aspect) if width * aspect <= height else (height / aspect, height)
         corner = (left + 0.5 * (width - fitted[0]), bottom + 0.5 * (height - fitted[1]))
