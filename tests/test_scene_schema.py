@@ -322,6 +322,16 @@ def test_all_mistakes_of_both_stages_at_once(tmp_path):
         assert f"{path}: {line}" in str(error.value)
 
 
+@pytest.mark.parametrize("key", ["grid", "duration", "fps", "material", "body", "gravity", "heat", "emitter"])
+@pytest.mark.parametrize("value", [None, "x", [], {}, [{}], -1.0])
+def test_what_cannot_be_read_is_not_judged(key, value):
+    words = disc(**{"emitter": [NOZZLE], "grvity": 1, key: value})
+    if value is None:
+        del words[key]
+    with pytest.raises(SceneError, match="grvity: unknown key"):
+        Scene(**words)
+
+
 def test_overlaps_show_beside_other_mistakes():
     bodies = [BOX, {**BOX, "lower": (0.2, 0.2), "upper": (0.5, 0.5)}, {**BALL, "center": (3.0, 3.0)}]
     with pytest.raises(SceneError) as error:

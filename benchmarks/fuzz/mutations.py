@@ -79,7 +79,7 @@ def mutated(rng: random.Random) -> tuple[str, bool]:
         elif kind == "repeat" and isinstance(holder, list):
             holder.append(copy.deepcopy(holder[key]))
         wrong = "colour" in (words["grid"] if isinstance(words.get("grid"), dict) else {})
-    text = "\n".join(f"{_toml(key)} = {_toml(value)}" for key, value in words.items())
+    text = toml(words)
     if rng.random() < 0.1:
         return text[: rng.randrange(len(text))] + rng.choice(("", "[" * 5000, "= =", "\x00", "\udcff")), False
     return text, wrong
@@ -91,6 +91,11 @@ def _places(words: Any) -> Iterator[tuple[Any, Any]]:
         yield words, key
         if isinstance(value, (dict, list)):
             yield from _places(value)
+
+
+def toml(words: dict[str, Any]) -> str:
+    """A scene file with these words."""
+    return "\n".join(f"{json.dumps(str(key))} = {_toml(value)}" for key, value in words.items())
 
 
 def _toml(value: Any) -> str:

@@ -257,8 +257,8 @@ def _size_problems(scene: Any, entries: Sequence[Any]) -> Iterator[str]:
         for key, body in entry.keyed("body"):
             shape = shape_of(body)
             if shape is not None:
-                counts[f"{entry.path}|{key}"] = shape.volume / _spacing(body, scene.grid) ** len(scene.grid.lower)
-        for key, words in entry.keyed("emitter"):
+                counts[f"{entry.path}|{key}"] = _filling(shape.volume, len(shape.lower), _spacing(body, scene.grid))
+        for key, words in entry.keyed("emitter") if scene.duration is not None else ():
             counts[f"{entry.path}|{key}"] = _poured(words, scene)
     total, free = sum(counts.values()), memory.available()
     if total <= seed.MOST and total * PARTICLE_BYTES <= free:
@@ -270,7 +270,7 @@ def _size_problems(scene: Any, entries: Sequence[Any]) -> Iterator[str]:
     )
     key = max(counts, key=lambda name: counts[name]).partition("|")[2]
     yield (
-        f"{key}.per_cell: about {counts and max(counts.values()):.3g} of the {total:.3g} particles of the scene are "
+        f"{key}.per_cell: about {max(counts.values()):.3g} of the {total:.3g} particles of the scene are "
         f"here, but {room}; make per_cell smaller or grid.dx larger"
     )
 
@@ -281,12 +281,19 @@ def _poured(words: schema.Emitter, scene: Any) -> float:
     area, speed = nozzle_area(words), math.hypot(*words.velocity)
     seconds = max(0.0, min(scene.duration, words.end or scene.duration) - words.start)
     layers = max(1.0, seconds * (words.rate or area * speed) / (area * spacing))
-    return layers * max(1.0, area / spacing ** (dim - 1))
+    return layers * max(1.0, _filling(area, dim - 1, spacing))
+
+
+def _filling(volume: float, dim: int, spacing: float) -> float:
+    """Particles that fill a volume; infinite where a power would raise."""
+    for _ in range(dim):
+        volume /= spacing
+    return volume
 
 
 def _spacing(item: schema.Seeding, grid: schema.Grid) -> float:
     """Distance of particles [m]."""
-    return grid.dx / float(item.per_cell ** (1 / len(grid.lower)))
+    return max(1e-300, grid.dx / float(item.per_cell ** (1 / len(grid.lower))))
 
 
 # ---- words of messages
