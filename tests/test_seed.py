@@ -140,7 +140,7 @@ def test_points_files_that_are_wrong(tmp_path):
         "nan.npy": "must be finite",
         "good.txt": "does not exist",
         "bad.csv": r"columns x, y, \(z,\) \(volume\), got \['a', 'b'\]",
-        "object.npy": "Object arrays cannot be loaded",
+        "object.npy": "must hold numbers, got an array of object",
     }.items():
         with pytest.raises((ValueError, FileNotFoundError), match=message):
             seed.file(tmp_path / name, volume=1.0)

@@ -6,7 +6,7 @@ from . import _library as _library
 from . import heat_boundaries, ops, seed
 from .boundaries import SDF, Box, Capsule, Plane, Revolved, Sphere, Walls
 from .cfl import stable_dt
-from .errors import GridOverflowError, SimulationError
+from .errors import DamagedFileError, GridOverflowError, SimulationError
 from .failures import Failures
 from .grid import Blocks, Grid
 from .heat import Heat
@@ -52,6 +52,7 @@ __all__ = [
     "Capsule",
     "CustomLaw",
     "CustomPrincipalLaw",
+    "DamagedFileError",
     "Failures",
     "FixedCorotated",
     "Grid",

@@ -18,7 +18,10 @@ Damage = Callable[[Path, random.Random], None]
 
 
 def _bytes(change: Callable[[bytearray, random.Random], bytes | bytearray]) -> Damage:
-    return lambda path, rng: (path.write_bytes(change(bytearray(path.read_bytes()), rng)), None)[1]
+    def damage(path: Path, rng: random.Random) -> None:
+        path.write_bytes(change(bytearray(path.read_bytes()), rng))
+
+    return damage
 
 
 def _flip(data: bytearray, rng: random.Random) -> bytearray:
@@ -79,10 +82,6 @@ def _record(**changes: object) -> Callable[[h5py.File, random.Random], None]:
             file["frames_written"][0] = 10**6
 
     return change
-
-
-def _numbers(value: float) -> Callable[[h5py.File, random.Random], None]:
-    return lambda file, rng: file[_array(file, rng)].write_direct(np.full_like(file[_array(file, rng)][()], value))
 
 
 def _fill(file: h5py.File, rng: random.Random) -> None:
@@ -153,14 +152,10 @@ def forge(path: Path, name: str, rng: random.Random) -> None:
             FORGERIES[name](file, rng)
     except (KeyError, OSError, TypeError, ValueError):
         path.write_bytes(data)  # not for this file
-        _hole_in(path, rng)
+        ACCIDENTS["hole"](path, rng)
         return
     with open(path, "r+b") as handle:
         seal(handle, [(0, path.stat().st_size)])
-
-
-def _hole_in(path: Path, rng: random.Random) -> None:
-    ACCIDENTS["hole"](path, rng)
 
 
 def corrupt(folder: Path, rng: random.Random) -> str:
