@@ -202,8 +202,8 @@ class Obstacle:
 
     At a node inside, the velocity relative to the surface there loses all of itself ("sticky"), its normal component
     ("slip"), or its normal component where it points into the body ("separate"). Coulomb friction then lowers the
-    tangential speed by `friction` times the normal velocity that was stopped. A vibrating body needs more friction to stick
-    than a rigid one (docs/limitations.md).
+    tangential speed by `friction` times the normal velocity that was stopped. A vibrating body needs more friction to
+    stick than a rigid one (docs/limitations.md).
 
     Args:
         position: centre (or a point of the plane) at time `start` [m]: D numbers, a tensor [D] or [B, D], or a function
