@@ -227,6 +227,7 @@ class Step(TensorModule):
             self.grid, self.law, self.prepare(state), cfl, transfer, self.stress_form, self._obstacle_speed(state)
         )
 
+    @torch.no_grad()
     def _obstacle_speed(self, state: State) -> Tensor | None:
         """Largest speed of the obstacles that a particle may touch [P] [m/s]; None where none moves."""
         reach = 2 * math.sqrt(self.grid.dim) * self.grid.dx  # of a particle's nodes
