@@ -49,6 +49,9 @@ class Step(nn.Module):
 
     A step without boundaries, walls, gravity, FLIP or heat does not pay for them.
 
+    Differentiable in reverse mode, by torch.func.grad and vjp too. `torch.compile(step, fullgraph=True)` needs a grid
+    with a capacity; it compiles again for another number dt (a tensor avoids that), and once a field is None no more.
+
     Raises:
         ValueError: for a wrong argument.
     """
