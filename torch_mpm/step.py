@@ -59,6 +59,9 @@ class Step(TensorModule):
     may be assigned in the forms of the arguments. Forward hooks act on the step, its law and its boundaries; backward
     hooks on the law, whose output is a tensor.
 
+    Differentiable in reverse mode, by torch.func.grad and vjp too. `torch.compile(step, fullgraph=True)` needs a grid
+    with a capacity; it compiles again for another number dt (a tensor avoids that), and once a field is None no more.
+
     Raises:
         TypeError, ValueError: for a wrong argument.
     """

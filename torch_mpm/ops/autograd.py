@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
 from torch._functorch.utils import enable_single_level_autograd_function
 from torch.autograd import forward_ad
 
+_transformed = torch._C._are_functorch_transforms_active
 _LIBRARY = torch.library.Library("torch_mpm", "IMPL")
 
 
@@ -44,8 +44,7 @@ def register_autograd(
 
     def forward(ctx: Any, lengths: list[int], *flat: Any) -> Any:
         arguments = _nested(flat, lists, lengths)
-        with _outer_levels():
-            output = _below_autograd(op, arguments)
+        output = _for_outer_levels(op, arguments) if _transformed() else _below_autograd(op, arguments)
         ctx.lengths = lengths
         if setup is not None:
             setup(ctx, arguments, output)
@@ -70,26 +69,19 @@ def register_autograd(
             _refuse_tangents(name, _flat(arguments, lists))
         if not (torch.is_grad_enabled() and torch._C._any_requires_grad(*arguments)):
             return _below_autograd(op, arguments)
-        with _one_level():
-            return record([len(arguments[i]) for i in lists], *_flat(arguments, lists))
+        flat = [len(arguments[i]) for i in lists], *_flat(arguments, lists)
+        if _transformed():
+            with enable_single_level_autograd_function():
+                return record(*flat)
+        return record(*flat)
 
     _LIBRARY.impl(name, kernel, "Autograd")
 
 
-def _one_level() -> AbstractContextManager[Any]:
-    """Lets a Function record for one level of torch.func; where none is active this takes no time."""
-    return enable_single_level_autograd_function() if torch._C._are_functorch_transforms_active() else nullcontext()
-
-
-@contextmanager
-def _recorded_again() -> Iterator[None]:
+def _for_outer_levels(op: Any, arguments: Sequence[Any]) -> Any:
+    """Below autograd come the outer levels of torch.func, which record too: `Function.forward` switches that off."""
     with torch.enable_grad(), forward_ad._set_fwd_grad_enabled(True):
-        yield
-
-
-def _outer_levels() -> AbstractContextManager[Any]:
-    """Lets the levels of torch.func outside the present one record too, what `Function.forward` switches off."""
-    return _recorded_again() if torch._C._are_functorch_transforms_active() else nullcontext()
+        return _below_autograd(op, arguments)
 
 
 def _refuse_tangents(name: str, arguments: Sequence[Any]) -> None:
