@@ -312,7 +312,7 @@ def test_messages():
         (("stiky",), ValueError, "kind of a wall must be one of .*'stiky'"),
         (("slip", None, None, -0.1), ValueError, "friction of walls must be a finite number >= 0, got -0.1"),
         (("slip", None, None, torch.tensor(0.1)), TypeError, "friction of walls must be a number, got Tensor"),
-        (("slip", (math.nan, 0)), ValueError, "lower must have finite numbers"),
+        (("slip", (math.nan, 0)), ValueError, "lower of walls must be finite"),
     ]:
         with pytest.raises(error, match=message):
             mpm.Walls(*arguments)

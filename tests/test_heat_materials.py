@@ -55,7 +55,7 @@ def test_table_is_differentiable():
     [
         ([0, 0], [1, 2], "must increase"),
         ([1, 0], [1, 2], "must increase"),
-        ([0, float("nan")], [1, 2], "must increase"),
+        ([0, float("nan")], [1, 2], "must be finite"),
         ([0, 1], [1, float("inf")], "finite"),
         ([0, 1], [1, 2, 3], "one length"),
         ([0], [1], "2 or more"),

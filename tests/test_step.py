@@ -386,7 +386,7 @@ def test_bad_states():
         (dict(dx=0.1, lower=(0,), upper=(1,)), "2 or 3 numbers"),
         (dict(dx=0.1, lower=(0, 0), upper=(1, 1), kernel="linear"), "kernel must be one of"),
         (dict(dx=1e-6, lower=(0, 0, 0), upper=(1, 1, 1)), r"fewer than 2\^31"),
-        (dict(dx=0.1, lower=(0, 0), upper=(1, 1), capacity=-1), "capacity must be between"),
+        (dict(dx=0.1, lower=(0, 0), upper=(1, 1), capacity=-1), "capacity must not be negative"),
     ],
 )
 def test_bad_grids(arguments, message):

@@ -30,7 +30,7 @@ def split_dt(dt: float | Tensor, scenes: int, x: Tensor) -> tuple[float, Tensor 
         if not isinstance(dt, REAL):
             raise TypeError(f"dt must be a number of seconds or a tensor, got {type(dt).__name__} {dt!r}")
         if not 0 < dt <= LARGEST.get(x.dtype, math.inf):
-            raise ValueError(f"dt must be a positive number of seconds, finite in {x.dtype}, got {dt}")
+            raise ValueError(f"dt must be a positive number of seconds, got {dt} in {x.dtype}")
         return float(dt), None
     if dt.dim() > 1 or (dt.dim() == 1 and dt.shape[0] not in (1, scenes)):
         raise ValueError(f"dt must be a number or have shape [], [1] or [B] = [{scenes}], got {shape_of(dt)}")
