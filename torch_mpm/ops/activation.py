@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from .arguments import refuse_vmap
+from .arguments import refuse_vmap, sizes
 
 
 @torch.library.register_fake("torch_mpm::activate")
@@ -27,7 +27,7 @@ def _activate_fake(
     def ints(n: int) -> Tensor:
         return x.new_empty(n, dtype=torch.int32)
 
-    P, dim = x.shape
+    P, dim = sizes(x, "x", 2)
     schedule = 16 + (8 + 4**dim // 2) * (capacity + P // 128) + P  # csrc/transfer/arguments.h
     return (
         ints(scenes * math.prod(blocks)),
@@ -41,7 +41,7 @@ def _activate_fake(
 
 @torch.library.register_fake("torch_mpm::cell_order")
 def _cell_order_fake(x: Tensor, *topology: object) -> Tensor:
-    return x.new_empty(x.shape[0], dtype=torch.int32)
+    return x.new_empty(sizes(x, "x", 2)[0], dtype=torch.int32)
 
 
 refuse_vmap("activate")
