@@ -2,8 +2,8 @@
 
 The ops themselves, `torch.ops.torch_mpm.*`, check sizes, dtypes, devices and numbers as well, and raise RuntimeError.
 Their index tensors `table`, `block`, `offsets`, `index` and `schedule` must be those of one call of `activate`, with
-its `dx`, `lower`, `blocks` and `order`: their sizes are checked, but not their values, and other values can make a kernel
-read or write outside of its tensors.
+its `dx`, `lower`, `blocks` and `order`: their sizes are checked, but not their values, and others can make a
+kernel read or write outside of its tensors.
 """
 
 from . import activation as activation
