@@ -10,8 +10,9 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import torch
+from torch.utils._pytree import tree_flatten, tree_map_only
 
-from benchmarks.fuzz import operators
+from benchmarks.fuzz import calls, operators
 from benchmarks.fuzz.common import run
 
 Arguments = dict[str, Any]
@@ -151,3 +152,18 @@ def test_iterations_of_a_heat_solve() -> None:
             yield {"max_iterations": count}, "max_iterations must be .* got"
 
     refusals(taking("max_iterations"), changes)
+
+
+def test_malformed_arguments_of_fake_kernels() -> None:
+    """On the meta device: the results of the op, and errors that name an argument."""
+    for _, name, arguments in CALLS:
+        op = getattr(torch.ops.torch_mpm, name)
+        meta = {n: tree_map_only(torch.Tensor, lambda t: t.to("meta"), value) for n, value in arguments.items()}
+        results, fakes = tree_flatten(op(*arguments.values()))[0], tree_flatten(op(*meta.values()))[0]
+        assert [(t.shape, t.dtype) for t in results] == [(t.shape, t.dtype) for t in fakes]
+        for changed, value in meta.items():
+            for wrong in (value.new_empty(()), value[None]) if isinstance(value, torch.Tensor) else ():
+                try:
+                    op(*(meta | {changed: wrong}).values())
+                except (RuntimeError, ValueError, TypeError) as error:
+                    assert calls.is_clear(error), f"{name}, {changed}: {error}"

@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 import collections
 import dataclasses
+import faulthandler
 import functools
 import itertools
 import json
@@ -148,6 +149,7 @@ def is_clear(error: Exception) -> bool:
 def child(seed: int, numbers: Iterable[int], only: str | None) -> int:
     """Makes calls; writes the number of each before, and its result after it."""
     warnings.simplefilter("ignore")
+    faulthandler.disable()  # pytest's writes pages about a crash
     resource.setrlimit(resource.RLIMIT_CPU, (CPU_SECONDS, CPU_SECONDS))
     for number in numbers:
         os.write(1, f"\n{number}\n".encode())  # not through sys.stdout, which pytest replaces

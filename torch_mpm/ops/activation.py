@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from .arguments import refuse_vmap
+from .arguments import refuse_vmap, sizes
 
 
 @torch.library.register_fake("torch_mpm::activate")
@@ -28,7 +28,7 @@ def _activate_fake(
     def ints(*shape: int) -> Tensor:
         return x.new_empty(shape, dtype=torch.int32)
 
-    P, dim = x.shape
+    P, dim = sizes(x, "x", 2)
     schedule = 16 + (8 + 4**dim // 2) * (capacity + P // 128) + P  # csrc/transfer/arguments.h
     return (
         ints(scenes * math.prod(blocks)),
@@ -42,7 +42,7 @@ def _activate_fake(
 
 @torch.library.register_fake("torch_mpm::cell_order")
 def _cell_order_fake(x: Tensor, *topology: object) -> Tensor:
-    return x.new_empty(x.shape[0], dtype=torch.int32)
+    return x.new_empty(sizes(x, "x", 2)[0], dtype=torch.int32)
 
 
 refuse_vmap("activate")

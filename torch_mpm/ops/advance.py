@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ..errors import check_like, shape_of
-from .arguments import differentiate, per_particle, refuse_vmap, soa_empty, split_dt, sum_by_scene
+from .arguments import differentiate, per_particle, refuse_vmap, sizes, soa_empty, split_dt, sum_by_scene
 from .autograd import dispatch, register_autograd
 
 
@@ -58,7 +58,7 @@ def advance(
 
 @torch.library.register_fake("torch_mpm::advance")
 def _advance_fake(x, v, C, F, J, scene, scene_dt, dt):
-    P, D = x.shape
+    P, D = sizes(x, "x", 2)
     return (
         soa_empty(x, (P, D)),
         x.new_empty(0) if F is None else soa_empty(x, (P, D, D)),
@@ -68,7 +68,7 @@ def _advance_fake(x, v, C, F, J, scene, scene_dt, dt):
 
 @torch.library.register_fake("torch_mpm::advance_backward")
 def _advance_backward_fake(grad_x, grad_F, grad_J, x, v, C, F, J, scene, scene_dt, dt, needs):
-    P, D = x.shape
+    P, D = sizes(x, "x", 2)
     shapes = ((P, D), (P, D, D), (P, D, D), (P,), (P,))
     present = (True, C is not None, F is not None, J is not None, True)
     return tuple(

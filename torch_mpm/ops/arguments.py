@@ -157,6 +157,13 @@ def check_tensors(law: str, kind: str, names: Sequence[str], values: Sequence[Te
         raise ValueError(f"{law} has the {kind} {', '.join(names) or 'none'}, got {len(values)} tensors")
 
 
+def sizes(t: Tensor, name: str, rank: int) -> torch.Size:
+    """The shape of an argument of a fake kernel, of a rank that the op itself checks."""
+    if t.dim() != rank:
+        raise ValueError(f"{name} must have {rank} dimensions, got shape {shape_of(t)}")
+    return t.shape
+
+
 def refuse_vmap(name: str) -> None:
     """Make `torch.vmap` over an op, and so `torch.func.jacrev` and `hessian`, say what to do instead."""
 

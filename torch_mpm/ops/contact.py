@@ -13,7 +13,7 @@ from ..boundaries import Box, Capsule, Obstacle, Plane, Sphere
 from ..errors import check_like, shape_of
 from ..grid import Blocks, check_blocks
 from ..reference.obstacles import contact as reference
-from .arguments import check_list, check_real, differentiate, refuse_vmap
+from .arguments import check_list, check_real, differentiate, refuse_vmap, sizes
 from .autograd import dispatch, register_autograd
 from .grid_update import CONTACT_KINDS, _blocks_of
 
@@ -153,12 +153,14 @@ def _part(obstacle: Obstacle, name: str | None, like: Tensor, shape: tuple[int, 
 
 @torch.library.register_fake("torch_mpm::contact")
 def _fake(velocity, *arguments):
-    return velocity.new_empty(velocity.shape[0], 1 + velocity.shape[1])
+    N, D = sizes(velocity, "velocity", 2)
+    return velocity.new_empty(N, 1 + D)
 
 
 @torch.library.register_fake("torch_mpm::contact_backward")
 def _backward_fake(grad, velocity, *arguments):
-    return velocity.new_empty(velocity.shape[0], 1 + velocity.shape[1])
+    N, D = sizes(velocity, "velocity", 2)
+    return velocity.new_empty(N, 1 + D)
 
 
 def _setup(ctx: Any, inputs: Any, output: Any) -> None:

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ..errors import check_like, check_positions
 from ..grid import Blocks, check_blocks, inverse_inertia
-from .arguments import refuse_vmap, soa_empty, split_dt, sum_by_scene
+from .arguments import refuse_vmap, sizes, soa_empty, split_dt, sum_by_scene
 from .autograd import dispatch, register_autograd
 from .transfer import STRESS_FORMS, TOPOLOGY, _blocks_of, _check_nodes, _save, _saved
 
@@ -64,7 +64,7 @@ def g2p_advance(
 
 @torch.library.register_fake("torch_mpm::g2p_advance")
 def _fake(x, velocity, F, J, scene_dt, dt, affine, stress_form, *topology):
-    P, D = x.shape
+    P, D = sizes(x, "x", 2)
     shapes = ((P, D), (P, D), (P, D, D), (P, D, D), (P,))
     present = (True, True, affine, F is not None, J is not None)
     return tuple(soa_empty(x, shape) if here else x.new_empty(0) for shape, here in zip(shapes, present, strict=True))

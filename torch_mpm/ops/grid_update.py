@@ -12,7 +12,7 @@ from ..boundaries import Face, Walls
 from ..errors import FLOATING, check_like, shape_of
 from ..grid import BLOCK_WIDTH, Blocks, Grid, check_blocks
 from ..reference import grid_update as reference
-from .arguments import differentiate, refuse_vmap, split_dt
+from .arguments import differentiate, refuse_vmap, sizes, split_dt
 from .autograd import dispatch, register_autograd
 
 CONTACT_KINDS = {"open": 0, "sticky": 1, "slip": 2, "separate": 3, "mirror": 4}  # csrc/boundary/contact.h
@@ -97,7 +97,8 @@ def _fake(nodes, *arguments):
 
 @torch.library.register_fake("torch_mpm::grid_update_backward")
 def _backward_fake(grad, wants_change, nodes, gravity, scene_dt, dt, kind, plane, friction, table, block, *geometry):
-    return nodes.new_empty(nodes.shape), nodes.new_empty(block.shape[0] if wants_change else 0, nodes.shape[1] - 1)
+    slots = sizes(block, "block", 1)[0] if wants_change else 0
+    return nodes.new_empty(nodes.shape), nodes.new_empty(slots, sizes(nodes, "nodes", 2)[1] - 1)
 
 
 # ---- autograd

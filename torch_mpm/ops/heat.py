@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ..errors import check_like, check_positions, shape_of
 from ..grid import Blocks, check_blocks, inverse_inertia
-from .arguments import check_choice, check_real, refuse_vmap, split_dt
+from .arguments import check_choice, check_real, refuse_vmap, sizes, split_dt
 from .autograd import dispatch, register_autograd
 from .heat_multigrid import heat_multigrid
 from .heat_refinement import REDUCTION
@@ -197,8 +197,10 @@ def _fake(x, conductance, capacity, theta, source, exchange, fixed, *arguments):
     (table, *_, blocks, _, _) = arguments[-TOPOLOGY:]
     per_scene = 1
     for n in blocks:
+        if n < 1:
+            raise ValueError(f"blocks must be positive, got {list(blocks)}")
         per_scene *= n
-    scenes = table.shape[0] // per_scene
+    scenes = sizes(table, "table", 1)[0] // per_scene
     return (
         torch.empty_like(capacity, memory_format=torch.contiguous_format),
         x.new_empty(scenes, dtype=torch.int32),
@@ -209,7 +211,7 @@ def _fake(x, conductance, capacity, theta, source, exchange, fixed, *arguments):
 
 @torch.library.register_fake("torch_mpm::heat_operator")
 def _operator_fake(x, conductance, nodes, *topology):
-    return x.new_empty(topology[1].shape[0] * 4 ** x.shape[1])
+    return x.new_empty(sizes(topology[1], "block", 1)[0] * 4 ** sizes(x, "x", 2)[1])
 
 
 # ---- autograd: with A λ = ∂L/∂d on the free nodes, changes δA of the matrix and δb of the right side of A d = b change

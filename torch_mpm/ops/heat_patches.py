@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from ..grid import BLOCK_WIDTH, Blocks, _unravel
-from .arguments import refuse_vmap
+from .arguments import refuse_vmap, sizes
 from .autograd import register_autograd
 
 
@@ -96,8 +96,8 @@ def lattice_rows(source: Blocks, target: Blocks, nodes: Callable[[Tensor], Tenso
 
 @torch.library.register_fake("torch_mpm::heat_stencil")
 def _stencil_fake(x: Tensor, conductance: Tensor, *topology: Any) -> Tensor:
-    dim = x.shape[1]
-    return x.new_empty((3**dim + 1) // 2, topology[1].shape[0] * 4**dim)
+    dim = sizes(x, "x", 2)[1]
+    return x.new_empty((3**dim + 1) // 2, sizes(topology[1], "block", 1)[0] * 4**dim)
 
 
 @torch.library.register_fake("torch_mpm::heat_patches")

@@ -17,6 +17,7 @@ from .arguments import (
     check_tensors,
     differentiate,
     refuse_vmap,
+    sizes,
     soa_empty,
     sum_by_scene,
 )
@@ -117,13 +118,17 @@ def _check(law: str, state: Tensor, parameters: Parameters, scene: Tensor | None
 # ---- fake kernels: shapes and strides only
 
 
+def _particles(state: Tensor) -> int:
+    return sizes(state, "the state", 3 if state.dim() == 3 else 1)[0]
+
+
 @torch.library.register_fake("torch_mpm::material_stress")
 def _stress_fake(state, C, scene, parameters, law, dim):
-    return soa_empty(state, (state.shape[0], dim, dim))
+    return soa_empty(state, (_particles(state), dim, dim))
 
 
 def _adjoints_fake(state: Tensor, C: Tensor | None, parameters: Parameters, dim: int, needs: int) -> tuple[Tensor, ...]:
-    P = state.shape[0]
+    P = _particles(state)
     shapes = (tuple(state.shape), (P, dim, dim), (P, len(parameters)))
     wanted = (needs & 1, needs & 2 and C is not None, needs & 4)
     return tuple(soa_empty(state, s) if w else state.new_empty(0) for s, w in zip(shapes, wanted, strict=True))
@@ -141,7 +146,7 @@ def _energy_backward_fake(grad, state, scene, parameters, law, dim, needs):
 
 
 def _scalar_fake(state, scene, parameters, law, dim):
-    return state.new_empty(state.shape[0])
+    return state.new_empty(_particles(state))
 
 
 # ---- autograd

@@ -10,7 +10,16 @@ from torch import Tensor
 
 from ..errors import FLOATING, check_like, shape_of
 from ..reference.principal import ELASTIC, INVALID, LAWS, PLASTIC
-from .arguments import check_choice, check_parameter, check_scene, check_tensors, refuse_vmap, soa_empty, sum_by_scene
+from .arguments import (
+    check_choice,
+    check_parameter,
+    check_scene,
+    check_tensors,
+    refuse_vmap,
+    sizes,
+    soa_empty,
+    sum_by_scene,
+)
 from .autograd import dispatch, register_autograd
 from .material import _no_backward, _no_setup
 
@@ -147,7 +156,8 @@ def _check(law: str, F: Tensor, parameters: Tensors, history: Tensors, scene: Te
 
 @torch.library.register_fake("torch_mpm::principal_update")
 def _update_fake(F, parameters, history, scene, law, details):
-    P = F.shape[0]
+    P = sizes(F, "F", 3)[0]
+    check_choice("law", law, LAWS)
     return (
         soa_empty(F, F.shape) if LAWS[law].flow is not None else F.new_empty(0),
         soa_empty(F, F.shape),
@@ -158,7 +168,8 @@ def _update_fake(F, parameters, history, scene, law, details):
 
 
 def _adjoints_fake(F: Tensor, parameters: Tensors, history: Tensors, needs: int) -> tuple[Tensor, ...]:
-    shapes = (tuple(F.shape), (F.shape[0], len(parameters)), (F.shape[0], len(history)))
+    P = sizes(F, "F", 3)[0]
+    shapes = (tuple(F.shape), (P, len(parameters)), (P, len(history)))
     return tuple(soa_empty(F, s) if needs >> i & 1 else F.new_empty(0) for i, s in enumerate(shapes))
 
 
@@ -175,7 +186,7 @@ def _energy_backward_fake(grad_energy, F, parameters, history, scene, law, needs
 
 
 def _scalar_fake(F, parameters, history, scene, law):
-    return F.new_empty(F.shape[0])
+    return F.new_empty(sizes(F, "F", 3)[0])
 
 
 # ---- autograd

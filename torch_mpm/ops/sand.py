@@ -11,7 +11,16 @@ from torch import Tensor
 
 from ..errors import FLOATING, check_like, shape_of
 from ..reference.sand import APEX, CONE, ELASTIC, ENERGIES, INVALID, friction_alpha
-from .arguments import check_choice, check_parameter, check_real, check_scene, refuse_vmap, soa_empty, sum_by_scene
+from .arguments import (
+    check_choice,
+    check_parameter,
+    check_real,
+    check_scene,
+    refuse_vmap,
+    sizes,
+    soa_empty,
+    sum_by_scene,
+)
 from .autograd import dispatch, register_autograd
 from .material import _no_setup
 
@@ -209,7 +218,7 @@ def _parameter(name: str, value: Value | None, F: Tensor, scene: Tensor | None) 
 
 @torch.library.register_fake("torch_mpm::quartic_return_map")
 def _return_map_fake(F, mu, lam, alpha, cohesion, volume, scene, energy, flow, apex, details):
-    P = F.shape[0]
+    P = sizes(F, "F", 3)[0]
     scalars = [F.new_empty(P if wanted else 0) for wanted in (details, details, volume is not None)]
     return soa_empty(F, F.shape), soa_empty(F, F.shape), F.new_empty(P, dtype=torch.int32), *scalars
 
@@ -219,7 +228,7 @@ def _return_map_backward_fake(
     grad_F, grad_stress, grad_multiplier, grad_dissipated, grad_volume,
     F, mu, lam, alpha, cohesion, volume, scene, energy, flow, apex, needs_F, needs_parameters,
 ):  # fmt: skip
-    P = F.shape[0]
+    P = sizes(F, "F", 3)[0]
     return (
         soa_empty(F, F.shape) if needs_F else F.new_empty(0),
         soa_empty(F, (P, 4)) if needs_parameters else F.new_empty(0),
@@ -229,12 +238,12 @@ def _return_map_backward_fake(
 
 @torch.library.register_fake("torch_mpm::quartic_energy")
 def _energy_fake(F: Tensor, mu: Tensor, lam: Tensor, scene: Tensor | None, energy: str) -> Tensor:
-    return F.new_empty(F.shape[0])
+    return F.new_empty(sizes(F, "F", 3)[0])
 
 
 @torch.library.register_fake("torch_mpm::quartic_stiffness")
 def _stiffness_fake(F: Tensor, mu: Tensor, lam: Tensor, scene: Tensor | None, energy: str, floor: float) -> Tensor:
-    return F.new_empty(F.shape[0])
+    return F.new_empty(sizes(F, "F", 3)[0])
 
 
 # ---- autograd

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ..errors import FLOATING, shape_of
-from .arguments import refuse_vmap, soa_empty
+from .arguments import refuse_vmap, sizes, soa_empty
 from .autograd import dispatch, register_autograd
 
 
@@ -85,12 +85,14 @@ def _check(F: Tensor) -> None:
 
 @torch.library.register_fake("torch_mpm::svd3")
 def _svd3_fake(F: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    return soa_empty(F, F.shape), soa_empty(F, F.shape[:2]), soa_empty(F, F.shape)
+    shape = sizes(F, "F", 3)
+    return soa_empty(F, shape), soa_empty(F, shape[:2]), soa_empty(F, shape)
 
 
 @torch.library.register_fake("torch_mpm::polar")
 def _polar_fake(F: Tensor) -> tuple[Tensor, Tensor]:
-    return soa_empty(F, F.shape), soa_empty(F, F.shape)
+    shape = sizes(F, "F", 3)
+    return soa_empty(F, shape), soa_empty(F, shape)
 
 
 # ---- autograd: in plain torch on the results, so that it can be differentiated again

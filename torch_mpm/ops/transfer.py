@@ -19,7 +19,7 @@ from torch import Tensor
 from ..errors import check_like, check_positions, shape_of
 from ..grid import Blocks, Grid, check_blocks, inverse_inertia
 from ..reference import transfer as reference
-from .arguments import differentiate, per_particle, refuse_vmap, soa_empty, split_dt, sum_by_scene
+from .arguments import differentiate, per_particle, refuse_vmap, sizes, soa_empty, split_dt, sum_by_scene
 from .autograd import dispatch, register_autograd
 
 STRESS_FORMS = {"mls": 0, "gradient": 1}
@@ -196,17 +196,18 @@ _Topology = Any
 
 
 def _node_rows(topology: Sequence[Any], dim: int) -> int:
-    return topology[1].shape[0] * 4**dim
+    return sizes(topology[1], "block", 1)[0] * 4**dim
 
 
 @torch.library.register_fake("torch_mpm::p2g")
 def _p2g_fake(x, mass, v, C, stress, volume, scene_dt, dt, stress_form, *topology):
-    return x.new_empty(_node_rows(topology, x.shape[1]), 1 + x.shape[1])
+    D = sizes(x, "x", 2)[1]
+    return x.new_empty(_node_rows(topology, D), 1 + D)
 
 
 @torch.library.register_fake("torch_mpm::p2g_backward")
 def _p2g_backward_fake(grad_nodes, x, mass, v, C, stress, volume, scene_dt, dt, stress_form, needs, *topology):
-    P, D = x.shape
+    P, D = sizes(x, "x", 2)
     shapes = ((P, D), (P,), (P, D), (P, D, D), (P, D, D), (P,), (P,))
     present = (True, True, True, C is not None) + 3 * (stress is not None,)
     return tuple(
@@ -217,12 +218,12 @@ def _p2g_backward_fake(grad_nodes, x, mass, v, C, stress, volume, scene_dt, dt, 
 
 @torch.library.register_fake("torch_mpm::scatter")
 def _scatter_fake(x, value, moment, gradient, moment_scale, *topology):
-    return x.new_empty(_node_rows(topology, x.shape[1]), value.shape[1])
+    return x.new_empty(_node_rows(topology, sizes(x, "x", 2)[1]), sizes(value, "value", 2)[1])
 
 
 @torch.library.register_fake("torch_mpm::gather")
 def _gather_fake(x, nodes, moment_scale, moment, gradient, *topology):
-    (P, D), K = x.shape, nodes.shape[1]
+    (P, D), K = sizes(x, "x", 2), sizes(nodes, "nodes", 2)[1]
     sums = [soa_empty(x, (P, K, D)) if wanted else x.new_empty(0) for wanted in (moment, gradient)]
     return soa_empty(x, (P, K)), *sums
 
@@ -234,7 +235,7 @@ def _g2p_fake(x, velocity, affine, gradient, *topology):
 
 @torch.library.register_fake("torch_mpm::position_gradient")
 def _position_gradient_fake(x, value, moment, gradient, nodes, moment_scale, *topology):
-    return soa_empty(x, tuple(x.shape))
+    return soa_empty(x, sizes(x, "x", 2))
 
 
 # ---- autograd
