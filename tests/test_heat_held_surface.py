@@ -189,7 +189,8 @@ def test_bad_input():
     with pytest.raises(ValueError, match='method must be "cg" or "multigrid" where a boundary is a FixedSurface'):
         mpm.Heat(mpm.Grid(0.1, (0, 0), (1, 1)), 1.0, 1.0, [FixedSurface(plane, 1.0)], method="chebyshev")
     state, _ = bar(1 / 8)
-    heat = mpm.Heat(mpm.Grid(1 / 8, (-0.5, -0.5), (1.5, 0.5)), 1.0, 1.0, [FixedSurface(plane, math.nan)])
+    held = FixedSurface(plane, lambda time: math.nan)
+    heat = mpm.Heat(mpm.Grid(1 / 8, (-0.5, -0.5), (1.5, 0.5)), 1.0, 1.0, [held])
     heat(state, 0.1)
     with pytest.raises(mpm.SimulationError, match="not finite"):
         heat.check()
