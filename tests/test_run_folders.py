@@ -2,6 +2,7 @@
 
 import json
 import resource
+import shutil
 import signal
 
 import numpy as np
@@ -36,17 +37,25 @@ def scene(tmp_path):
     return path
 
 
-@pytest.fixture
-def unfinished(scene, tmp_path):
+@pytest.fixture(scope="module")
+def stopped(tmp_path_factory):
     """A folder with a run that was stopped after frame 2 of 4."""
+    folder = tmp_path_factory.mktemp("stopped")
+    (folder / "scene.toml").write_text(FILE.format(duration=0.08))
 
     def interrupt(figures):
         if figures["frame"] == 2:
             signal.raise_signal(signal.SIGINT)
 
     with pytest.raises(Interrupted):
-        Scene.load(scene).run(tmp_path / "out", progress=interrupt)
-    return tmp_path / "out"
+        Scene.load(folder / "scene.toml").run(folder / "out", progress=interrupt)
+    return folder / "out"
+
+
+@pytest.fixture
+def unfinished(stopped, tmp_path):
+    """A copy of that folder."""
+    return shutil.copytree(stopped, tmp_path / "out")
 
 
 def told(capsys, *arguments):
