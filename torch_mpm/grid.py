@@ -11,7 +11,16 @@ import torch
 from torch import Tensor
 
 from .capture import is_captured, outside_transforms, remember, without_transforms
-from .errors import GridOverflowError, check_count, check_number, check_positions, check_vector, default_dtype
+from .errors import (
+    GridOverflowError,
+    check_count,
+    check_flag,
+    check_number,
+    check_positions,
+    check_vector,
+    default_dtype,
+    shape_of,
+)
 
 PADDING = 3
 """Nodes beyond `lower` and `upper`, so that a particle on the boundary has its support (csrc/grid/geometry.h)."""
@@ -69,7 +78,7 @@ class Grid:
         self.kernel = kernel
         self.order = KERNEL_ORDERS[kernel]
         self.dim = len(self.lower)
-        self.deterministic = bool(deterministic)
+        self.deterministic = check_flag("deterministic", deterministic)
         # A node on `upper` exists even when the extent is a multiple of dx only up to rounding.
         cells = [math.ceil((b - a) / self.dx - 1e-6) for a, b in zip(self.lower, self.upper, strict=True)]
         self.nodes = tuple(n + 1 + 2 * PADDING for n in cells)
@@ -232,6 +241,11 @@ class ActivationRecord:
         with torch.inference_mode():
             for kept in self._replayed:
                 kept.copy_(torch.tensor(NO_PROBLEM, dtype=torch.int32, device="cpu"))
+
+
+def check_grid(grid: Any) -> None:
+    if not isinstance(grid, Grid):
+        raise TypeError(f"grid must be a Grid, got {shape_of(grid)}")
 
 
 def check_blocks(blocks: Any) -> None:

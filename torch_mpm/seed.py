@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 from . import memory
-from .errors import check_number, check_vector, default_dtype
+from .errors import check_device, check_dtype, check_number, check_vector, default_dtype, shape_of
 
 Vector = Sequence[float] | Tensor
 
@@ -261,6 +261,10 @@ def fill(
     Raises:
         ValueError: for an unknown method, a shape too small to hold a point, or more points than memory holds.
     """
+    if missing := [name for name in ("lower", "upper", "volume", "inside") if not hasattr(shape, name)]:
+        raise TypeError(f"shape must be a shape of torch_mpm.seed, got {shape_of(shape)} without {missing[0]}")
+    check_dtype(dtype)
+    check_device(device)
     dtype, device = dtype or default_dtype(), torch.get_default_device() if device is None else device
     with HOST:
         x = _points_in(shape, grid, per_cell, method, seed)
@@ -396,6 +400,8 @@ def file(
         OSError: when there is no such file, or it cannot be read.
         ValueError: for an unknown format, a wrong shape, numbers not finite, or volumes missing or not positive.
     """
+    check_dtype(dtype)
+    check_device(device)
     with HOST:
         x, volumes = _read_points(Path(path))
     if x.dim() != 2 or x.shape[1] not in (2, 3) or len(x) == 0:

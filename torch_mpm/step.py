@@ -15,13 +15,13 @@ from .capture import Kept
 from .cfl import stable_dt
 from .errors import check_count, check_number, check_vector, shape_of
 from .failures import Failures, problems_of_state, problems_of_status, raise_failures, refused_steps
-from .grid import ActivationRecord, Blocks, Grid
+from .grid import ActivationRecord, Blocks, Grid, check_grid
 from .heat import Heat
 from .materials import Material, as_law
 from .ops import contact, fusible, g2p, g2p_advance, gather, grid_update, p2g
 from .parameters import TensorModule, With
 from .pause import split_paused, standing
-from .state import State, identity_deformation
+from .state import State, check_state, identity_deformation
 
 TRANSFERS = ("apic", "pic", "flip")
 
@@ -182,6 +182,7 @@ class Step(TensorModule):
 
     def prepare(self, state: State) -> State:
         """Give a state the fields that this step needs and that it lacks."""
+        check_state(state)
         changes: dict[str, Any] = {}
         if "F" in self.law.state_fields and state.F is None:
             changes["F"] = identity_deformation(state.x)
@@ -324,8 +325,8 @@ def _argument(step: Step, name: str, value: Any) -> Any:
     Raises:
         TypeError, ValueError: for a wrong one.
     """
-    if name == "grid" and not isinstance(value, Grid):
-        raise TypeError(f"grid must be a Grid, got {shape_of(value)}")
+    if name == "grid":
+        check_grid(value)
     if name == "law":
         return as_law("law", value)
     if name == "gravity" and value is not None:
