@@ -66,7 +66,8 @@ class Grid:
         capacity: int | None = None,
         deterministic: bool = False,
     ) -> None:
-        self.dx = float(check_number("dx", dx, "a positive number", lambda v: 0 < v < math.inf))
+        square = "a positive number, with a square that is positive and finite"
+        self.dx = float(check_number("dx", dx, square, lambda v: v > 0 and 0 < float(v) * float(v) < math.inf))
         self.lower = check_vector("lower", lower)
         self.upper = check_vector("upper", upper, len(self.lower))
         if not all(a < b for a, b in zip(self.lower, self.upper, strict=True)):

@@ -154,20 +154,18 @@ class Surface(TensorModule):
     def __init__(self, points: Tensor, area: Number, scene: Tensor | None = None) -> None:
         if not isinstance(points, Tensor) or points.dim() != 2 or points.shape[1] not in (2, 3):
             raise ValueError(f"points must have shape [S, 2] or [S, 3], got {shape_of(points)}")
-        if not isinstance(area, Tensor):
-            check_number(
-                "area", area, "not negative and finite", lambda v: 0 <= v < math.inf, "a number or a tensor [S]"
-            )
-        elif area.shape not in ((), points.shape[:1]):
+        if callable(area) and not isinstance(area, Tensor):
+            raise TypeError(f"area must be {NUMBER_OR_TENSOR}, got {shape_of(area)}")
+        if isinstance(area, Tensor) and area.shape not in ((), points.shape[:1]):
             raise ValueError(f"area must be a number or have shape [S] = [{points.shape[0]}], got {shape_of(area)}")
         if not bool(points.detach().isfinite().all()):
             raise ValueError("points must be finite, and some are NaN or infinite")
-        _checked("area", area, "not negative", lambda v: v >= 0)
+        self.area: Number = _checked("area", area, "not negative", lambda v: v >= 0)  # type: ignore[assignment]
         if scene is not None and (not isinstance(scene, Tensor) or scene.shape != points.shape[:1]):
             raise ValueError(f"scene must have shape [S] = [{points.shape[0]}], got {shape_of(scene)}")
         if scene is not None and scene.dtype != torch.int32:
             raise TypeError(f"scene must be int32, got {scene.dtype}")
-        self.points, self.area, self.scene = points, area, scene
+        self.points, self.scene = points, scene
 
     def integrate(self, nodes: HeatNodes, density: Timed) -> Tensor:
         """∫ N_i density dA [N] of a density per area: a number, a tensor [] or [S], or a function of the time."""

@@ -182,8 +182,11 @@ def _check_value(name: str, value: Value, expected: str, holds: Callable[[Any], 
     if isinstance(value, PerMaterial):
         for k, one in enumerate(value.values()):
             _check_value(f"{name} of material {k}", one, expected, holds, infinite)
+    kinds = "a number, a tensor or a function of temperature"
+    if isinstance(value, Material):
+        raise TypeError(f"{name} must be {kinds}, got {shape_of(value)}")
     if callable(value) and not isinstance(value, Tensor):
-        return value  # a function of temperature
+        return value
     if isinstance(value, Tensor):
         if value.dim() > 1 or value.numel() == 0 or not value.is_floating_point():
             raise ValueError(
@@ -192,8 +195,9 @@ def _check_value(name: str, value: Value, expected: str, holds: Callable[[Any], 
         if not bool((holds(value.detach()) & (value.detach().isfinite() | infinite)).all()):
             raise ValueError(f"{name} must be {expected}, got {value}")
         return value
-    kinds = "a number, a tensor or a function of temperature"
-    return check_number(name, value, expected, lambda v: (math.isfinite(v) or infinite) and bool(holds(v)), kinds)
+    return float(
+        check_number(name, value, expected, lambda v: (math.isfinite(v) or infinite) and bool(holds(v)), kinds)
+    )
 
 
 class SolidLaw(CompiledLaw):

@@ -102,7 +102,7 @@ class Sphere:
         self.volume = _ball_volume(len(self.center), self.radius)
 
     def inside(self, x: Tensor) -> Tensor:
-        return (x - self.center).square().sum(1) <= self.radius**2
+        return (x - self.center).square().sum(1) <= self.radius * self.radius
 
 
 class _Axial:
@@ -135,7 +135,7 @@ class Cylinder(_Axial):
 
     def inside(self, x: Tensor) -> Tensor:
         along, away = self._along_and_away(x)
-        return (along >= 0) & (along <= self.length) & (away <= self.radius**2)
+        return (along >= 0) & (along <= self.length) & (away <= self.radius * self.radius)
 
 
 class Capsule(_Axial):
@@ -153,7 +153,7 @@ class Capsule(_Axial):
     def inside(self, x: Tensor) -> Tensor:
         along, away = self._along_and_away(x)
         beyond = along - along.clamp(0, self.length)
-        return away + beyond.square() <= self.radius**2
+        return away + beyond.square() <= self.radius * self.radius
 
 
 class Mesh:

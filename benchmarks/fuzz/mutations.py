@@ -19,6 +19,10 @@ def refuses(*_: Any, **__: Any) -> Any:
     raise ValueError("refused")
 
 
+def nothing(_: Any) -> None:
+    """A function of the caller's that returns what none should."""
+
+
 class Refuses:
     """A class, of which `refuses` is true too."""
 
@@ -27,7 +31,7 @@ class Refuses:
 
 
 STRANGERS: tuple[Any, ...] = (
-    None, True, 5, -3, 0.5, math.nan, 1j, "", "neo", "a\0b", b"bytes", (), [], {}, [None], [[1.0]], object(), len,
+    None, True, 5, -3, 0.5, math.nan, 1j, "", "neo", "a\0b", b"bytes", (), [], {}, [None], [[1.0]], object(), nothing,
     refuses, Refuses, torch.float32, torch.zeros(()), torch.zeros(3), torch.zeros(0, dtype=torch.int64), {"a": 1},
     slice(None), range(3),
 )  # fmt: skip
