@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from .boundaries import Obstacle, _norm, _per_node
-from .errors import shape_of
+from .errors import check_number, shape_of
 from .grid import BLOCK_WIDTH, PADDING, Blocks
 from .materials import _check_value
 from .ops import scatter
@@ -359,10 +359,10 @@ class Source(Term):
 
 def _checked(name: str, value: Timed, expected: str = "", holds: Callable[[Any], Any] = lambda v: v == v) -> Timed:
     """A number or tensor of which all is finite and holds; a function of the time is not asked."""
+    expected = f"{expected} and finite" if expected else "finite"
     if isinstance(value, Tensor):
-        good = bool((holds(value.detach()) & value.detach().isfinite()).all())
-    else:
-        good = callable(value) or (math.isfinite(value) and bool(holds(value)))
-    if not good:
-        raise ValueError(f"{name} must be {expected + ' and ' if expected else ''}finite, got {value}")
+        if not bool((holds(value.detach()) & value.detach().isfinite()).all()):
+            raise ValueError(f"{name} must be {expected}, got {value}")
+    elif not callable(value):
+        check_number(name, value, expected, lambda v: math.isfinite(v) and holds(v))
     return value

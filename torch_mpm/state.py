@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from .errors import FLOATING, REAL, check_count, check_like, check_number, default_dtype, shape_of
+from .errors import FLOATING, REAL, check_count, check_index, check_like, check_number, default_dtype, shape_of
 from .ops.arguments import soa_empty
 
 if TYPE_CHECKING:
@@ -30,14 +30,16 @@ class Time:
             return time
         return time[0] if torch.compiler.is_compiling() else time[0].item()
 
-    def __set__(self, state: State, time: float | Tensor | tuple[Tensor]) -> None:
+    def __set__(self, state: State, time: float | Tensor) -> None:
+        kept: Tensor | tuple[Tensor]
         if isinstance(time, Tensor):
             number = torch.compiler.is_compiling() and time.dim() == 0 and time.dtype == torch.float64
-            if number and time.device.type == "cpu" and not time.requires_grad:
-                time = (time,)
-        elif not isinstance(time, tuple):
-            time = (torch.scalar_tensor(time, dtype=torch.float64, device="cpu"),)
-        state.__dict__["_time"] = time
+            kept = (time,) if number and time.device.type == "cpu" and not time.requires_grad else time
+        elif isinstance(time, REAL):
+            kept = (torch.scalar_tensor(time, dtype=torch.float64, device="cpu"),)
+        else:
+            raise TypeError(f"time must be a number or a tensor [B], got {shape_of(time)}")
+        state.__dict__["_time"] = kept
 
 
 @dataclasses.dataclass(eq=False)
@@ -91,19 +93,10 @@ class State:
         for name in ("mass", "volume", "J", "temperature"):
             check_like(name, getattr(self, name), self.x, (P,), "[P]")
         for name, dtype in (("scene", torch.int32), ("material", torch.int32), ("ids", torch.int64)):
-            index = getattr(self, name)
-            if index is None:
-                continue
-            if not isinstance(index, Tensor) or index.shape != (P,):
-                raise ValueError(f"{name} must have shape [P] = [{P}], got {shape_of(index)}")
-            if index.dtype != dtype:
-                raise TypeError(f"{name} must be {dtype}, got {index.dtype}")
+            check_index(name, getattr(self, name), self.x, dtype)
         for name, value in self.extra.items():
             if not isinstance(value, Tensor) or value.shape[:1] != (P,):
                 raise ValueError(f"extra[{name!r}] must have {P} rows, got {shape_of(value)}")
-
-        if not isinstance(self.time, (Tensor, *REAL)):
-            raise TypeError(f"time must be a number or a tensor [B], got {shape_of(self.time)}")
 
     @classmethod
     def at_rest(
@@ -146,7 +139,7 @@ class State:
 
     def replace(self, **changes: Any) -> State:
         """A copy with some fields changed."""
-        return dataclasses.replace(self, **{"time": self.__dict__["_time"]} | changes)
+        return dataclasses.replace(self, **changes)
 
     def map(self, function: Callable[[Tensor], Tensor]) -> State:
         """A copy with a function applied to every per-particle tensor, absent fields staying None."""
@@ -354,7 +347,7 @@ def _given_velocity(velocity: Any, P: int, D: int) -> Tensor:
 
 def _check_density(density: float | Tensor, particles: int) -> None:
     if not isinstance(density, Tensor):
-        check_number("density", density, "positive", lambda v: 0 < v < math.inf)
+        check_number("density", density, "positive and finite", lambda v: 0 < v < math.inf)
         return
     if density.shape not in ((), (particles,)):
         raise ValueError(f"density must be a number or have shape [P] = [{particles}], got {shape_of(density)}")

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from ..errors import check_like, check_positions, shape_of
+from ..errors import check_like, check_number, check_positions, shape_of
 from ..grid import Blocks, check_blocks, inverse_inertia
-from .arguments import check_choice, check_real, refuse_vmap, sizes, split_dt
+from .arguments import check_choice, refuse_vmap, sizes, split_dt
 from .autograd import dispatch, register_autograd
 from .heat_multigrid import heat_multigrid
 from .heat_refinement import REDUCTION
@@ -106,12 +107,8 @@ def heat_cg(
     if scene_limit is not None and scene_limit.is_floating_point():
         raise TypeError(f"max_iterations must be an integer tensor, got {scene_limit.dtype}")
     check_choice("method", method, METHODS)
-    check_real("adjoint_tolerance", adjoint_tolerance)
-    check_real("relative_tolerance", relative_tolerance)
-    if not 0 < adjoint_tolerance < 1:
-        raise ValueError(f"adjoint_tolerance must be between 0 and 1, got {adjoint_tolerance}")
-    if not 0 <= relative_tolerance < 1:
-        raise ValueError(f"relative_tolerance must be in [0, 1), got {relative_tolerance}")
+    check_number("adjoint_tolerance", adjoint_tolerance, "between 0 and 1", lambda v: 0 < v < 1)
+    check_number("relative_tolerance", relative_tolerance, "in [0, 1)", lambda v: 0 <= v < 1)
     if scene_tolerance is not None:
         scene_tolerance = scene_tolerance.to(x.dtype).contiguous()
     if scene_limit is not None:
@@ -170,10 +167,7 @@ def _op_of(method: int) -> Any:
 def _per_scene(name: str, value: float | Tensor, scenes: int, x: Tensor) -> tuple[float, Tensor | None]:
     """A number, or a tensor [B] and zero."""
     if not isinstance(value, Tensor):
-        check_real(name, value)
-        if not 0 <= value < float("inf"):
-            raise ValueError(f"{name} must be a finite number >= 0, got {value}")
-        return value, None
+        return check_number(name, value, "a finite number >= 0", lambda v: 0 <= v < math.inf), None
     if value.dim() > 1 or (value.dim() == 1 and value.shape[0] not in (1, scenes)):
         raise ValueError(f"{name} must be a number or have shape [], [1] or [B] = [{scenes}], got {shape_of(value)}")
     if value.device != x.device:

@@ -9,13 +9,12 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from ..errors import FLOATING, check_like, shape_of
+from ..errors import FLOATING, check_index, check_like, check_number, shape_of
 from ..reference.sand import APEX, CONE, ELASTIC, ENERGIES, INVALID, friction_alpha
 from .arguments import (
     check_choice,
     check_parameter,
     check_real,
-    check_scene,
     refuse_vmap,
     sizes,
     soa_empty,
@@ -196,13 +195,13 @@ def _check_deformation(F: Tensor, scene: Tensor | None, energy: str) -> None:
         raise ValueError(f"F must have shape [P, 3, 3] or [P, 2, 2], got {shape_of(F)}")
     if F.dtype not in FLOATING:
         raise TypeError(f"F must be float32 or float64, got {F.dtype}")
-    check_scene(scene, F)
+    check_index("scene", scene, F, of="F")
 
 
 def _check_number(name: str, value: Value | None, expected: str, most: float = math.inf) -> None:
     """A tensor is left alone: to read it would wait for its device."""
-    if value is not None and not isinstance(value, Tensor) and not 0 <= value < most:
-        raise ValueError(f"{name} must be {expected}, got {value}")
+    if value is not None and not isinstance(value, Tensor):
+        check_number(name, value, expected, lambda v: 0 <= v < most)
 
 
 def _parameter(name: str, value: Value | None, F: Tensor, scene: Tensor | None) -> Tensor:
