@@ -354,7 +354,7 @@ def _given_velocity(velocity: Any, P: int, D: int) -> Tensor:
 
 def _check_density(density: float | Tensor, particles: int) -> None:
     if not isinstance(density, Tensor):
-        check_number("density", density, "positive", lambda v: 0 < v < math.inf)
+        check_number("density", density, "positive and finite", lambda v: 0 < v < math.inf)
         return
     if density.shape not in ((), (particles,)):
         raise ValueError(f"density must be a number or have shape [P] = [{particles}], got {shape_of(density)}")
