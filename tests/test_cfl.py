@@ -211,3 +211,14 @@ def test_bad_arguments() -> None:
             mpm.stable_dt(grid, law, state, cfl=cfl)
     with pytest.raises(ValueError, match="stress_form must be 'gradient' or 'mls', got 'fem'"):
         mpm.stable_dt(grid, law, state, stress_form="fem")
+
+
+def test_moving_obstacles_and_particles_without_a_scene(device):
+    """A particle whose scene is none of the grid raises nothing."""
+    grid = mpm.Grid(0.1, (0, 0), (1, 1), scenes=2)
+    sphere = mpm.Sphere((0.5, 0.5), 0.1, velocity=torch.ones(2, 2, dtype=torch.float64, device=device))
+    step = mpm.Step(grid, mpm.NeoHookean(E=1e3, nu=0.3), boundaries=[sphere])
+    points = mpm.seed.box((0.4, 0.4), (0.6, 0.6), 0.1, dtype=torch.float64, device=device)
+    state = mpm.State.at_rest(points, dtype=torch.float64)
+    scene = torch.full((len(state),), 5, dtype=torch.int32, device=device)
+    assert bool((step.stable_dt(state.replace(scene=scene)) > 0).all())

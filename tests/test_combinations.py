@@ -85,10 +85,11 @@ def test_gradients_of_a_rollout_equal_differences(c, device):
         torch.testing.assert_close(a, b, rtol=1e-9, atol=1e-9 * float(a.abs().max()), msg=f"{name}: {c.text}")
     errors = []
     with torch.no_grad():
-        for h in (1e-4, 1e-5, 1e-6):
+        for h in (1e-5, 1e-6, 1e-7):
             ends = [loss({n: v + s * h * along[n] for n, v in leaves.items()}, None) for s in (1, -1)]
             errors.append(abs(float(ends[0] - ends[1]) / (2 * h) - slope) / max(abs(slope), 1e-3))
-    assert min(errors) < 1e-5, f"{errors}: {c.text}"
+    # A solve to 1e-13 of its first residual leaves more noise in the differences where its condition is 1e4.
+    assert min(errors) < (1e-4 if c.contrast > 1e3 else 1e-5), f"{errors}: {c.text}"
 
 
 @every(lambda c: c.scenes > 1)
@@ -100,6 +101,27 @@ def test_a_scene_of_a_batch_moves_as_it_does_alone(c, device):
         alone = make(c, device, scene=b)
         rows = (together.scene == b).nonzero()[:, 0]
         assert_same(together.select(rows), roll(alone.step, alone.state, 3), 1e-10, c.text)
+
+
+@every(lambda c: c.scenes > 1)
+def test_a_paused_scene_stays_and_the_others_move(c, device):
+    """Scene 1 has dt = 0: bit by bit the same, gradients pass through it, and the others do what they do alone."""
+    case = make(c, device)
+    dt = torch.tensor([DT, 0.0, DT], dtype=case.state.x.dtype, device=device)
+    x = case.state.x.detach().clone().requires_grad_()
+    moved = mpm.rollout(case.step, case.state.replace(x=x), 3, dt)
+    assert moved.scene is not None
+    still = (moved.scene == 1).nonzero()[:, 0]
+    before, after = fields_of(case.state.select(still)), fields_of(moved.select(still))
+    for name, value in before.items():
+        assert torch.equal(after[name], value), f"{name}: {c.text}"
+    (grad,) = torch.autograd.grad(moved.x.sum() + moved.v.sum(), x)
+    assert bool(grad.isfinite().all()) and torch.equal(grad[still], torch.ones_like(grad[still])), c.text
+    for b in (0, 2):
+        alone = make(c, device, scene=b)
+        rows = (moved.scene == b).nonzero()[:, 0]
+        assert_same(moved.detach().select(rows), roll(alone.step, alone.state, 3), 1e-10, c.text)
+    case.step.check()
 
 
 @every()

@@ -188,3 +188,33 @@ def test_a_pause_needs_no_synchronisation():
     finally:
         torch.cuda.set_sync_debug_mode("default")
     assert step.failures().problems["dt"].count.tolist() == [0, 0, 2]
+
+
+def test_heat_alone_pauses_and_reports_as_a_step_does(device):
+    """`Heat.forward` with a dt of zero, negative and NaN: the scenes stay, and `check` names the last two."""
+    _, state = scenes(3, device)
+    state = state.replace(temperature=state.x[:, 0].clone())
+    heat = mpm.Heat(mpm.Grid(0.1, (0, 0), (1, 1), scenes=3), 1.0, 1.0)
+    end = heat(heat.prepare(state), times([0.0, -1.0, math.nan], device))
+    for name, before in fields_of(heat.prepare(state)).items():
+        assert torch.equal(fields_of(end)[name], before), name
+    assert torch.equal(end.time, times([state.time] * 3, device))
+    with pytest.raises(mpm.SimulationError, match=r"^2 steps had a dt that was negative or NaN.*: 1 in scene 1; 1 in"):
+        heat.check()
+    heat.reset()
+    heat.check()
+
+
+def test_what_is_counted_belongs_to_no_transform(device):
+    """Counts made inside of torch.func.grad can be read and added to when it has ended."""
+    step, state = scenes(1, device)
+    state = state.replace(temperature=state.x[:, 0].clone())
+    heat = mpm.Heat(step.grid, 1.0, 1.0)
+
+    def end(dt):
+        return step(state, dt).x.square().sum() + heat(state, dt).temperature.square().sum()
+
+    torch.func.grad(torch.func.grad(end))(times(-DT, device))
+    for count in (step._activations.refused, heat._activations.refused, heat.unsolved, heat.residual):
+        assert not torch._C._functorch.is_functorch_wrapped_tensor(count)
+    assert step.failures().problems["dt"].count.tolist() == [1]

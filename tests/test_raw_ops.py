@@ -129,7 +129,7 @@ def test_activation_without_scenes() -> None:
         yield {"scenes": 2**40}, r"scenes times blocks must be below 2\^31"
         yield {"capacity": -1}, "capacity must not be negative, got -1"
         yield {"capacity": 2**40}, r"capacity must be at most \d+, got"
-        yield {"previous_status": arguments["previous_status"][:3]}, r"previous_status must have shape \[8\]"
+        yield {"previous_status": arguments["previous_status"][:2]}, r"previous_status must have shape \[3, 8\]"
 
     refusals(["activate"], changes)
 

@@ -828,8 +828,7 @@ class BoundaryList(nn.Module, MutableSequence[Any]):
         super().__init__()
         if not isinstance(boundaries, Iterable) or isinstance(boundaries, str):
             raise TypeError(f"boundaries must be a list of obstacles, got {shape_of(boundaries)}: put it in a list")
-        self.entries: list[Any] = []
-        self.extend(boundaries)
+        self._keep(list(boundaries))
 
     def __len__(self) -> int:
         return len(self.entries)
@@ -841,24 +840,26 @@ class BoundaryList(nn.Module, MutableSequence[Any]):
         return self.entries[index]
 
     def __setitem__(self, index: Any, value: Any) -> None:
-        self.entries[index] = value
-        self._register()
+        entries = list(self.entries)
+        entries[index] = value
+        self._keep(entries)
 
     def __delitem__(self, index: Any) -> None:
-        del self.entries[index]
-        self._register()
+        entries = list(self.entries)
+        del entries[index]
+        self._keep(entries)
 
     def insert(self, index: int, value: Any) -> None:
-        self.entries.insert(index, value)
-        self._register()
+        self._keep([*self.entries[:index], value, *self.entries[index:]])
 
-    def _register(self) -> None:
-        for entry in self.entries:
+    def _keep(self, entries: list[Any]) -> None:
+        for entry in entries:
             if not (isinstance(entry, nn.Module) or callable(getattr(entry, "apply", None))):
                 raise TypeError(
                     f"boundaries must be a list of modules or objects with a method apply, got {shape_of(entry)}"
                 )
-        self._modules = {str(k): entry for k, entry in enumerate(self.entries) if isinstance(entry, nn.Module)}
+        self.entries = entries
+        self._modules = {str(k): entry for k, entry in enumerate(entries) if isinstance(entry, nn.Module)}
 
     def apply(self, function: Callable[[nn.Module], None]) -> Any:
         """As for any module, also where a user's own has an `apply` that is that of boundaries."""

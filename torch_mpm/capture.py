@@ -15,6 +15,11 @@ def is_captured(x: Tensor) -> bool:
     return x.is_cuda and not torch.compiler.is_compiling() and torch.cuda.is_current_stream_capturing()
 
 
+def is_traced(x: Tensor) -> bool:
+    """Whether a compiler or a fake tensor stands for values, which cannot be read."""
+    return torch.compiler.is_compiling() or isinstance(x, torch._subclasses.FakeTensor)
+
+
 def without_transforms(t: Tensor) -> Tensor:
     """The plain tensor below the levels of torch.func.grad and its like, which may be kept when they have ended."""
     if torch.compiler.is_compiling():

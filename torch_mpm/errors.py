@@ -146,12 +146,19 @@ def check_positions(x: Tensor, dim: int, scene: Tensor | None, scenes: int) -> N
         if scenes != 1:
             raise ValueError(f"scene must be given, int32 [P], for a grid of {scenes} scenes")
         return
-    if not isinstance(scene, Tensor) or scene.shape != x.shape[:1]:
-        raise ValueError(f"scene must have shape [{x.shape[0]}], got {shape_of(scene)}")
-    if scene.dtype != torch.int32:
-        raise TypeError(f"scene must be int32, got {scene.dtype}")
-    if scene.device != x.device:
-        raise ValueError(f"scene must be on the device of x, {x.device}, got {scene.device}")
+    check_index("scene", scene, x)
+
+
+def check_index(name: str, index: Tensor | None, x: Tensor, dtype: torch.dtype = torch.int32, of: str = "x") -> None:
+    """Check an optional whole number of each particle [P] against a particle tensor that messages call `of`."""
+    if index is None:
+        return
+    if not isinstance(index, Tensor) or index.shape != x.shape[:1]:
+        raise ValueError(f"{name} must have shape [{x.shape[0]}], got {shape_of(index)}")
+    if index.dtype != dtype:
+        raise TypeError(f"{name} must be {str(dtype).removeprefix('torch.')}, got {index.dtype}")
+    if index.device != x.device:
+        raise ValueError(f"{name} must be on the device of {of}, {x.device}, got {index.device}")
 
 
 def check_like(name: str, value: Tensor | None, x: Tensor, shape: tuple[int, ...], symbols: str) -> None:

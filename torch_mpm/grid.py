@@ -10,17 +10,19 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .capture import is_captured, outside_transforms, remember, without_transforms
+from .capture import is_captured, is_traced, outside_transforms, remember, without_transforms
 from .errors import (
     GridOverflowError,
     check_count,
     check_flag,
+    check_index,
     check_number,
     check_positions,
     check_vector,
     default_dtype,
     shape_of,
 )
+from .failures import Problem, problems_of_status, refused_steps
 
 PADDING = 3
 """Nodes beyond `lower` and `upper`, so that a particle on the boundary has its support (csrc/grid/geometry.h)."""
@@ -129,11 +131,12 @@ class Grid:
             GridOverflowError: on the CPU, where a fixed capacity is too small. On CUDA the status tells (`Step.check`).
         """
         check_positions(x, self.dim, scene, self.scenes)
+        check_index("ids", ids, x, torch.int64)
         if self._grows:
             self._grow(x, scene)
         assert self.capacity is not None
         blocks = self._activate(x, scene, previous, self.capacity, ids)
-        if x.device.type == "cpu" and not torch.compiler.is_compiling() and not _is_fake(x):
+        if x.device.type == "cpu" and not is_traced(x):
             wanted = blocks.wanted
             if wanted > self.capacity:
                 if not self._grows:
@@ -157,7 +160,7 @@ class Grid:
     def _grow(self, x: Tensor, scene: Tensor | None) -> None:
         """Keep the capacity ahead of the blocks wanted; reads the device only at the first call."""
         if self.capacity is None:
-            if torch.compiler.is_compiling() or _is_fake(x):
+            if is_traced(x):
                 raise ValueError(
                     "a grid used under torch.compile needs a capacity: pass capacity= or activate it once before"
                 )
@@ -179,7 +182,7 @@ class Grid:
         """Let the capacity follow `status`, an activation's, without waiting for the device."""
         if not self._grows or self._pending is not None or status.device.type != "cuda":
             return
-        if torch.compiler.is_compiling() or _is_fake(status) or is_captured(status):
+        if is_traced(status) or is_captured(status):
             return
         if self._on_host is None:
             with torch.inference_mode(False):  # such that a later step may write to it
@@ -227,13 +230,26 @@ class ActivationRecord:
         latest = [] if self.status is None else [self.status]
         return latest + [kept for kept in self._replayed if kept is not self.status]
 
+    def problems(self, grid: Grid) -> dict[str, Problem]:
+        """What these steps tell about scenes, without synchronising."""
+        problems = problems_of_status(self.all(), grid)
+        if self.refused is not None:
+            problems["dt"] = refused_steps(self.refused)
+        return problems
+
     @torch.no_grad()
     def refuse(self, entries: Tensor, scenes: int) -> None:
         """Count entries of a tensor dt that could not be taken: bool of shape [], [1] or [B]."""
-        if self.refused is None or self.refused.device != entries.device:
-            with torch.inference_mode(False):
-                self.refused = torch.zeros(scenes, dtype=torch.int32, device=entries.device)
-        self.refused += entries
+        refused = self.counts(scenes, entries.device)
+        with outside_transforms():
+            refused += without_transforms(entries)
+
+    def counts(self, scenes: int, device: torch.device) -> Tensor:
+        """`refused`, made at the first tensor dt."""
+        if self.refused is None or self.refused.device != device:
+            with outside_transforms(), torch.inference_mode(False):
+                self.refused = torch.zeros(scenes, dtype=torch.int32, device=device)
+        return self.refused
 
     def reset(self) -> None:
         self.status = None
@@ -256,10 +272,6 @@ def check_blocks(blocks: Any) -> None:
 
 def _with_headroom(blocks: int) -> int:
     return blocks + blocks // 2 + 16
-
-
-def _is_fake(x: Tensor) -> bool:
-    return isinstance(x, torch._subclasses.FakeTensor)
 
 
 @dataclasses.dataclass(eq=False)

@@ -20,6 +20,7 @@ because variances about a node with the weights β_p m_p C_p are at most those w
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any, Protocol
 
@@ -28,8 +29,8 @@ from torch import Tensor, nn
 
 from .boundaries import BoundaryList, _norm
 from .capture import outside_transforms, without_transforms
-from .errors import check_count, check_like, check_number
-from .failures import Failures, Problem, problems_of_status, raise_failures, unsolved_heat
+from .errors import check_like, check_number
+from .failures import Failures, Problem, raise_failures, unsolved_heat
 from .grid import ActivationRecord, Blocks, Grid, check_grid
 from .heat_boundaries import FixedSurface, HeatNodes
 from .materials import _check_value
@@ -37,6 +38,7 @@ from .ops import gather, heat_cg, scatter
 from .ops.arguments import check_choice, per_particle
 from .ops.heat import METHODS
 from .parameters import Value, evaluate, needed_temperature, store
+from .pause import paused
 from .state import State, check_state
 from .thermal import LIQUID, determinant
 
@@ -83,8 +85,9 @@ class Heat(nn.Module):
     Differentiable with respect to temperatures, positions, masses, volumes, dt and all parameters.
 
     Raises:
-        ValueError: for a wrong argument. Values of tensors are checked here, and not again when they are changed or
-            trained; a function that returns a negative conductivity makes the scene fail, which `check` reports.
+        TypeError, ValueError: for a wrong argument. Values of tensors are checked here, and not again when they are
+            changed or trained; a function that returns a negative conductivity makes the scene fail, which `check`
+            reports.
     """
 
     conductivity: Any
@@ -116,7 +119,7 @@ class Heat(nn.Module):
         check_number("plastic_heating", plastic_heating, "between 0 and 1", lambda v: 0 <= v <= 1)
         check_number("tolerance", tolerance, "between 0 and 1", lambda v: 0 < v < 1)
         check_number("reference", reference)
-        check_count("max_iterations", max_iterations, 1)
+        check_number("max_iterations", max_iterations, "at least 1", lambda v: 1 <= v < math.inf)
         check_choice("method", method, METHODS)
         if method == "chebyshev" and any(isinstance(boundary, FixedSurface) for boundary in boundaries):
             raise ValueError('method must be "cg" or "multigrid" where a boundary is a FixedSurface, got "chebyshev"')
@@ -174,14 +177,17 @@ class Heat(nn.Module):
 
         Args:
             state: with a temperature.
-            dt: time step [s]: a number, or a tensor of shape [], [1] or [B]. Any size is stable. A scene with dt = 0
-                is paused: all of its fields stay as they are, and so do gradients on their way through.
+            dt: time step [s]: a number, or a tensor of shape [], [1] or [B]. Any size is stable. A scene with zero in a
+                tensor is paused, as by `Step.forward`.
 
         Raises:
             ValueError, TypeError: for a state without temperature, wrong shapes, dtypes or devices, or a number dt that
                 is not positive.
         """
-        state = self.prepare(state)
+        return paused(self._advanced, self._activations, self.prepare(state), dt, self.grid.scenes)
+
+    def _advanced(self, state: State, dt: float | Tensor) -> State:
+        """A prepared state one step later."""
         blocks = self._activations.activate(self.grid, state.x, state.scene, state.ids)
         return state.replace(**self.update(blocks, state, dt), time=state.time + dt)
 
@@ -198,7 +204,7 @@ class Heat(nn.Module):
         Args:
             blocks: active blocks of the state's positions.
             state: prepared.
-            dt: as for `forward`.
+            dt: as for `forward`; what becomes of the particles of a paused scene has no meaning.
             velocity_gradient: ∇v [P, D, D] [1/s] that the particles move with; None at rest.
             dissipated: energy that the law turned into heat in this step, per rest volume [P] [J/m³], or None.
         """
@@ -227,11 +233,6 @@ class Heat(nn.Module):
             extra[GRADIENT] = _convected(gradient, velocity_gradient, step)
         if self.melts:
             theta, extra[LIQUID] = self._melt(state, theta, extra[LIQUID])
-        if isinstance(step, Tensor):  # in a scene that is paused, held nodes and melting change nothing either
-            theta = torch.where(step > 0, theta, needed_temperature(state))
-            for name in extra.keys() & {GRADIENT, LIQUID}:
-                value = extra[name]
-                extra[name] = torch.where(_column(step > 0, value), value, state.extra[name])
         return {"temperature": theta, "extra": extra} if extra else {"temperature": theta}
 
     def _blend(self, number: Tensor, step: float | Tensor, velocity_gradient: Tensor | None) -> float | Tensor:
@@ -349,12 +350,12 @@ class Heat(nn.Module):
     @torch.no_grad()
     def _record(self, converged: Tensor, residual: Tensor) -> None:
         """Keep what `check` reports, on the device."""
-        if self.unsolved is None or self.residual is None or self.unsolved.device != converged.device:
-            with torch.inference_mode(False):
-                self.unsolved = torch.zeros(converged.shape, dtype=torch.int32, device=converged.device)
-                self.residual = torch.zeros(residual.shape, dtype=torch.float64, device=residual.device)
         converged, residual = without_transforms(converged), without_transforms(residual)
         with outside_transforms():
+            if self.unsolved is None or self.residual is None or self.unsolved.device != converged.device:
+                with torch.inference_mode(False):
+                    self.unsolved = torch.zeros(converged.shape, dtype=torch.int32, device=converged.device)
+                    self.residual = torch.zeros(residual.shape, dtype=torch.float64, device=residual.device)
             self.unsolved += ~converged
             self.residual.copy_(torch.where(converged, self.residual, torch.maximum(self.residual, residual.double())))
 
@@ -369,14 +370,13 @@ class Heat(nn.Module):
 
         Raises:
             SimulationError: for scenes in which a solve missed its tolerance, or data were not finite; for particles
-                that left the grid or are not finite.
+                that left the grid or are not finite; for entries of a tensor dt that were negative or NaN.
             GridOverflowError: if more blocks were active than the grid has room for, and nothing else is wrong.
         """
         if self.unsolved is None:
             return
-        statuses = self._activations.all()
-        problems = problems_of_status(statuses, self.grid) | self.problems()
-        raise_failures(Failures.of(problems, self.unsolved), statuses, self.grid)
+        problems = self._activations.problems(self.grid) | self.problems()
+        raise_failures(Failures.of(problems, self.unsolved), self._activations.all(), self.grid)
 
     def reset(self) -> None:
         """Forget what became of the solves so far."""

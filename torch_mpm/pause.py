@@ -3,15 +3,41 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from .capture import is_traced
+from .grid import ActivationRecord
 from .ops.arguments import per_particle, split_dt
 from .state import State
 
 FIELDS = tuple(f.name for f in dataclasses.fields(State) if f.name not in ("extra", "time"))
+
+
+def paused(
+    advanced: Callable[[State, float | Tensor], State],
+    record: ActivationRecord,
+    state: State,
+    dt: float | Tensor,
+    scenes: int,
+) -> State:
+    """`advanced(state, dt)`, but for the scenes that a tensor dt pauses; `record` counts the entries it refuses."""
+    if not isinstance(dt, Tensor):
+        return advanced(state, dt)
+    if _all_move(dt):
+        record.counts(scenes, dt.device)  # that a compiled step finds it
+        return advanced(state, dt)
+    dt, moving, refused = split_paused(dt, state, scenes)
+    record.refuse(refused, scenes)
+    return standing(state, advanced(state, dt), moving)
+
+
+def _all_move(dt: Tensor) -> bool:
+    """Whether no scene stands still, where that is known without waiting for a device."""
+    return dt.device.type == "cpu" and not is_traced(dt) and bool((dt > 0).all())
 
 
 def split_paused(dt: Tensor, state: State, scenes: int) -> tuple[Tensor, Tensor, Tensor]:

@@ -61,16 +61,7 @@ class Shape(Protocol):
 
 
 def _vector(name: str, value: Vector, dim: int | None = None) -> Tensor:
-    if isinstance(value, Tensor):
-        v = value.detach().to("cpu", torch.float64)
-    else:
-        check_vector(name, value, dim)
-        v = torch.tensor(value, dtype=torch.float64, device="cpu")
-    if v.dim() != 1 or v.numel() not in ((2, 3) if dim is None else (dim,)):
-        raise ValueError(f"{name} must have {dim or '2 or 3'} numbers, got {list(v.shape)}: {value}")
-    if not bool(torch.isfinite(v).all()):
-        raise ValueError(f"{name} must be finite, got {value}")
-    return v
+    return torch.tensor(check_vector(name, value, dim), dtype=torch.float64, device="cpu")
 
 
 def _positive(name: str, value: float) -> float:

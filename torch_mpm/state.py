@@ -13,10 +13,12 @@ from torch import Tensor
 
 from .errors import (
     FLOATING,
+    NUMBER_OR_TENSOR,
     check_count,
     check_device,
     check_dtype,
     check_flag,
+    check_index,
     check_like,
     check_number,
     check_real,
@@ -41,15 +43,15 @@ class Time:
             return time
         return time[0] if torch.compiler.is_compiling() else time[0].item()
 
-    def __set__(self, state: State, time: float | Tensor | tuple[Tensor]) -> None:
+    def __set__(self, state: State, time: float | Tensor) -> None:
+        kept: Tensor | tuple[Tensor]
         if isinstance(time, Tensor):
             number = torch.compiler.is_compiling() and time.dim() == 0 and time.dtype == torch.float64
-            if number and time.device.type == "cpu" and not time.requires_grad:
-                time = (time,)
-        elif not (isinstance(time, tuple) and len(time) == 1 and isinstance(time[0], Tensor)):
+            kept = (time,) if number and time.device.type == "cpu" and not time.requires_grad else time
+        else:
             seconds = float(check_real("time", time, "a number or a tensor [B]"))
-            time = (torch.scalar_tensor(seconds, dtype=torch.float64, device="cpu"),)
-        state.__dict__["_time"] = time
+            kept = (torch.scalar_tensor(seconds, dtype=torch.float64, device="cpu"),)
+        state.__dict__["_time"] = kept
 
 
 @dataclasses.dataclass(eq=False)
@@ -103,13 +105,7 @@ class State:
         for name in ("mass", "volume", "J", "temperature"):
             check_like(name, getattr(self, name), self.x, (P,), "[P]")
         for name, dtype in (("scene", torch.int32), ("material", torch.int32), ("ids", torch.int64)):
-            index = getattr(self, name)
-            if index is None:
-                continue
-            if not isinstance(index, Tensor) or index.shape != (P,):
-                raise ValueError(f"{name} must have shape [P] = [{P}], got {shape_of(index)}")
-            if index.dtype != dtype:
-                raise TypeError(f"{name} must be {dtype}, got {index.dtype}")
+            check_index(name, getattr(self, name), self.x, dtype)
         if not isinstance(self.extra, dict):
             raise TypeError(f"extra must be a dict of tensors [P, ...], got {shape_of(self.extra)}")
         for name, value in self.extra.items():
@@ -159,7 +155,7 @@ class State:
 
     def replace(self, **changes: Any) -> State:
         """A copy with some fields changed."""
-        return dataclasses.replace(self, **{"time": self.__dict__["_time"]} | changes)
+        return dataclasses.replace(self, **changes)
 
     def map(self, function: Callable[[Tensor], Tensor]) -> State:
         """A copy with a function applied to every per-particle tensor, absent fields staying None."""
@@ -379,7 +375,8 @@ def _given_velocity(velocity: Any, P: int, D: int) -> Tensor:
 
 def _checked_density(density: float | Tensor, particles: int) -> float | Tensor:
     if not isinstance(density, Tensor):
-        return float(check_number("density", density, "positive", lambda v: 0 < v < math.inf, "a number or a tensor"))
+        positive = check_number("density", density, "positive and finite", lambda v: 0 < v < math.inf, NUMBER_OR_TENSOR)
+        return float(positive)
     if density.shape not in ((), (particles,)):
         raise ValueError(f"density must be a number or have shape [P] = [{particles}], got {shape_of(density)}")
     values = density.detach()

@@ -14,13 +14,15 @@ from .boundaries import BoundaryList, Obstacle, Walls, call_boundary
 from .capture import Kept
 from .cfl import stable_dt
 from .errors import check_count, check_number, check_vector, shape_of
-from .failures import Failures, problems_of_state, problems_of_status, raise_failures, refused_steps
+from .failures import Failures, problems_of_state, raise_failures
 from .grid import ActivationRecord, Blocks, Grid, check_grid
 from .heat import Heat
 from .materials import Material, as_law
 from .ops import contact, fusible, g2p, g2p_advance, gather, grid_update, p2g
+from .ops.arguments import check_choice
+from .ops.transfer import STRESS_FORMS
 from .parameters import TensorModule, With
-from .pause import split_paused, standing
+from .pause import paused
 from .state import State, check_state, identity_deformation
 
 TRANSFERS = ("apic", "pic", "flip")
@@ -60,7 +62,8 @@ class Step(TensorModule):
     hooks on the law, whose output is a tensor.
 
     Differentiable in reverse mode, by torch.func.grad and vjp too. `torch.compile(step, fullgraph=True)` needs a grid
-    with a capacity; it compiles again for another number dt (a tensor avoids that), and once a field is None no more.
+    with a capacity; it compiles again for another number dt (a tensor avoids that), for other strides, and once a field
+    that was None is a tensor.
 
     Raises:
         TypeError, ValueError: for a wrong argument.
@@ -88,18 +91,13 @@ class Step(TensorModule):
         heat: Heat | None = None,
     ) -> None:
         super().__init__()
-        if transfer not in TRANSFERS:
-            raise ValueError(f"transfer must be one of {sorted(TRANSFERS)}, got {transfer!r}")
-        check_number("flip", flip, "between 0 and 1", lambda v: 0 <= v <= 1)
-        if stress_form not in ("mls", "gradient"):
-            raise ValueError(f"stress_form must be 'gradient' or 'mls', got {stress_form!r}")
         self.grid = grid
         self.law = law  # type: ignore[assignment]
         self.gravity = gravity  # type: ignore[assignment]
         self.walls = walls  # type: ignore[assignment]
         self.boundaries = boundaries  # type: ignore[assignment]
         self.transfer = transfer
-        self.flip = 1.0 if transfer == "flip" else float(flip)
+        self.flip = flip
         self.stress_form = stress_form
         self.on_grid = on_grid
         self.heat = heat
@@ -148,12 +146,7 @@ class Step(TensorModule):
             ValueError, TypeError: for wrong shapes, dtypes or devices, or a number dt that is not positive.
             GridOverflowError: on the CPU, where a grid of fixed capacity is full.
         """
-        state = self.prepare(state)
-        if not isinstance(dt, Tensor):
-            return self._advanced(state, dt)
-        dt, moving, refused = split_paused(dt, state, self.grid.scenes)
-        self._activations.refuse(refused, self.grid.scenes)
-        return standing(state, self._advanced(state, dt), moving)
+        return paused(self._advanced, self._activations, self.prepare(state), dt, self.grid.scenes)
 
     def _advanced(self, state: State, dt: float | Tensor) -> State:
         """A prepared state one step later."""
@@ -172,7 +165,7 @@ class Step(TensorModule):
         x, v, C, F, J = g2p_advance(
             blocks, state.x, velocity, dt, **deformed, affine=keeps_C or self.heat is not None, stress_form=form
         )
-        if self.flip:  # positions move with the grid all the same, so that FLIP's noise does not reach them
+        if self._flip_share:  # positions move with the grid all the same, so that FLIP's noise does not reach them
             v = self._blend_flip(blocks, state, affine, velocity, v)
         changes: dict[str, Any] = {**fields, "F": F, "J": J}
         if self.heat is not None:
@@ -201,13 +194,17 @@ class Step(TensorModule):
             velocity = self.on_grid(blocks, velocity, nodes[:, 0], dt)
         return velocity
 
+    @property
+    def _flip_share(self) -> float:
+        return 1.0 if self.transfer == "flip" else self.flip
+
     def _blend_flip(self, blocks: Blocks, state: State, affine: Tensor | None, velocity: Tensor, v: Tensor) -> Tensor:
         """(1 − flip) v_pic + flip (v_p + Σ N_i (v_i − v_i before the forces)) (Zhu and Bridson 2005)."""
         # P2G of the step has the impulse of the stress in it already, which is part of the change.
         mirrors = None if self.walls is None else self.walls.mirrors()
         before = grid_update(blocks, p2g(blocks, state.x, state.mass, state.v, affine), walls=mirrors)
         change, _, _ = gather(blocks, state.x, velocity - before)
-        return (1 - self.flip) * v + self.flip * (state.v + change)
+        return (1 - self._flip_share) * v + self._flip_share * (state.v + change)
 
     def _gravity(self, x: Tensor) -> Tensor | None:
         gravity = self.gravity
@@ -226,7 +223,7 @@ class Step(TensorModule):
 
         Moving obstacles count; what `on_grid` and other boundaries do to the velocities is not known.
         """
-        transfer = "flip" if self.flip else self.transfer
+        transfer = "flip" if self._flip_share else self.transfer
         return stable_dt(
             self.grid, self.law, self.prepare(state), cfl, transfer, self.stress_form, self._obstacle_speed(state)
         )
@@ -234,9 +231,10 @@ class Step(TensorModule):
     @torch.no_grad()
     def _obstacle_speed(self, state: State) -> Tensor | None:
         """Largest speed of the obstacles that a particle may touch [P] [m/s]; None where none moves."""
+        scene = None if state.scene is None else state.scene.clamp(0, self.grid.scenes - 1)
         reach = 2 * math.sqrt(self.grid.dim) * self.grid.dx  # of a particle's nodes
         speeds = [
-            boundary.speed(state.x, state.scene, state.time, reach)
+            boundary.speed(state.x, scene, state.time, reach)
             for boundary in self.boundaries
             if isinstance(boundary, Obstacle) and boundary.moves
         ]
@@ -258,9 +256,7 @@ class Step(TensorModule):
             state: its masses, volumes, velocities and deformations are looked at too.
         """
         statuses = self._activations.all()
-        problems = problems_of_status(statuses, self.grid)
-        if self._activations.refused is not None:
-            problems["dt"] = refused_steps(self._activations.refused)
+        problems = self._activations.problems(self.grid)
         if self.heat is not None:
             problems |= self.heat.problems()
         if state is not None:
@@ -329,6 +325,12 @@ def _argument(step: Step, name: str, value: Any) -> Any:
         check_grid(value)
     if name == "law":
         return as_law("law", value)
+    if name == "transfer":
+        check_choice("transfer", value, TRANSFERS)
+    if name == "stress_form":
+        check_choice("stress_form", value, STRESS_FORMS)
+    if name == "flip":
+        return float(check_number("flip", value, "between 0 and 1", lambda v: 0 <= v <= 1))
     if name == "gravity" and value is not None:
         return _checked_gravity(value, step.grid)
     if name == "walls" and value is not None and not isinstance(value, Walls):

@@ -101,7 +101,7 @@ bool classify_pack(const Activation<T, D>& s, int64_t p) {
   using Unsigned = RegisterOf<float, kLanes>::Bits;
   typedef uint8_t Bytes __attribute__((vector_size(kLanes)));
   Unsigned key = {}, cell = {};
-  bool known = a.scene || a.scenes > 0;
+  bool known = true;
   if (a.scene)
     for (int l = 0; l < kLanes; l++) {
       key[l] = unsigned(a.scene[(p + l) * a.scene_stride]);

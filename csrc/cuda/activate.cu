@@ -281,16 +281,6 @@ __global__ void __launch_bounds__(kThreads) offsets(const ActivateArguments<T, D
   }
 }
 
-__device__ void write_left_out(const LeftOut& out, int* entry) {
-  entry[0] = out.count;
-  entry[1] = out.count > 0 ? INT_MAX - out.first : -1;
-}
-
-template <class T, int D>
-__device__ int id_of(const ActivateArguments<T, D>& a, int p) {
-  return a.id && p >= 0 ? int(a.id[p * a.id_stride]) : p;
-}
-
 template <class T, int D>
 __device__ void write_status(const ActivateArguments<T, D>& a, const Workspace& w, int row) {
   const int wanted = w.counters->wanted;
@@ -301,12 +291,15 @@ __device__ void write_status(const ActivateArguments<T, D>& a, const Workspace& 
   const bool left_out = trouble.outside.count > 0 || trouble.not_finite.count > 0;
   if (status[kProblemActivation] < 0 && (left_out || (row == 0 && wanted > a.capacity))) {
     status[kProblemActivation] = a.previous_status ? a.previous_status[kActivations] : 0;
-    write_left_out(trouble.outside, status + kOutsideCount);
-    write_left_out(trouble.not_finite, status + kNonFiniteCount);
-    if (row > 0) {
-      status[kOutsideId] = id_of(a, status[kOutsideFirst]);
-      status[kNonFiniteId] = id_of(a, status[kNonFiniteFirst]);
-    }
+    const auto write = [&](const LeftOut& out, int count, int first, int id) {
+      if (out.count == 0) return;
+      const int p = INT_MAX - out.first;
+      status[count] = out.count;
+      status[first] = p;
+      if (row > 0) status[id] = a.id ? int(a.id[p * a.id_stride]) : p;
+    };
+    write(trouble.outside, kOutsideCount, kOutsideFirst, kOutsideId);
+    write(trouble.not_finite, kNonFiniteCount, kNonFiniteFirst, kNonFiniteId);
   }
   if (row > 0) return;
   status[kActivations]++;

@@ -20,7 +20,8 @@ enum Status : int {
   kStatusSize = 8,
 };
 
-// Of the rows of scenes: the id of the particle at kOutsideFirst or kNonFiniteFirst, its index where there are no ids.
+// Of the rows of scenes: the id of the particle at kOutsideFirst or kNonFiniteFirst, its index where there are no ids;
+// 0 where there is no such particle.
 enum SceneStatus : int { kOutsideId = 0, kNonFiniteId = 7 };
 
 inline namespace TORCH_MPM_ISA {

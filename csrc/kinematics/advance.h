@@ -121,14 +121,13 @@ MPM_HD void advance_particle(const AdvanceArguments<T, D>& a, int64_t p) {
 template <class T, int D>
 MPM_HD void load_motion(const AdvanceArguments<T, D>& a, int64_t p, Vector<T, D>& v, Matrix<T, D>& C) {
   const bool moves = is_finite<D>(load_vector<T, D>(a.x, p).e);
+  v = load_vector<T, D>(a.velocity, p);
+  C = a.affine.pointer ? load_matrix<T, D>(a.affine, p) : zero_matrix<T, D>();
   MPM_UNROLL
   for (int i = 0; i < D; i++) {
-    v[i] = moves ? a.velocity.pointer[p * a.velocity.stride[0] + i * a.velocity.stride[1]] : T(0);
+    v[i] = moves ? v[i] : T(0);
     MPM_UNROLL
-    for (int j = 0; j < D; j++)
-      C[i][j] = a.affine.pointer && moves
-                    ? a.affine.pointer[p * a.affine.stride[0] + i * a.affine.stride[1] + j * a.affine.stride[2]]
-                    : T(0);
+    for (int j = 0; j < D; j++) C[i][j] = moves ? C[i][j] : T(0);
   }
 }
 

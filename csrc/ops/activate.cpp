@@ -34,8 +34,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> activate(
     set_scene(a, scene, x);
     if (has(ids)) {
       check_shape(*ids, "ids", {x.size(0)});
-      STD_TORCH_CHECK(ids->scalar_type() == ScalarType::Long && ids->device() == x.device(),
-                      "ids must be an int64 tensor on the device of x");
+      check_type(*ids, "ids", ScalarType::Long, x);
       a.id = static_cast<const int64_t*>(ids->data_ptr());
       a.id_stride = ids->stride(0);
     }

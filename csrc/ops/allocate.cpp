@@ -35,11 +35,11 @@ Tensor empty_in_pool(const Tensor& like, const Shape& shape, const Shape& stride
 }
 #endif
 
-// Sizes whose products below would overflow, or that no memory holds.
 [[noreturn]] void fail_to_allocate(const Shape& shape) {
   STD_TORCH_CHECK(false, "a result of shape ", text(shape), " could not be allocated");
 }
 
+// Refuses sizes whose products below would overflow, or that no memory holds.
 void check_allocatable(const Shape& shape) {
   constexpr int64_t most = int64_t(1) << 48;
   int64_t count = 1;

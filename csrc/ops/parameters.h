@@ -25,7 +25,7 @@ inline void check_number(const std::vector<Tensor>& given, const char* name, int
                   ", got ", given.size());
 }
 
-inline std::string element(const char* list, int k) { return list + ("[" + std::to_string(k) + "]"); }
+inline std::string element(const std::string& list, int k) { return list + "[" + std::to_string(k) + "]"; }
 
 // Names in a list of laws, for messages.
 template <class List>

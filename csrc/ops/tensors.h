@@ -7,6 +7,7 @@
 #include <torch/headeronly/core/ScalarType.h>
 #include <torch/headeronly/util/Exception.h>
 
+#include <algorithm>
 #include <cmath>
 #include <optional>
 #include <string>
@@ -190,7 +191,8 @@ void dispatch(const Tensor& x, int64_t order, F&& f) {
   "bool deterministic"
 #define MPM_TOPOLOGY_PARAMETERS                                                                                 \
   const Tensor &table, const Tensor &block, const Tensor &offsets, const Tensor &index, const Tensor &schedule, \
-      double dx, std::vector<double> lower, std::vector<int64_t> blocks, int64_t order, bool deterministic
+      double dx, std::vector<double> lower, std::vector<int64_t> blocks, int64_t order,                         \
+      [[maybe_unused]] bool deterministic
 #define MPM_TOPOLOGY_ARGUMENTS table, block, offsets, index, schedule, dx, lower, blocks
 
 inline const int* int_pointer(const Tensor& t, const char* name, const Tensor& x, const Shape& shape) {
@@ -245,8 +247,11 @@ Topology<T, D> topology(const Tensor& x, const Tensor& table, const Tensor& bloc
   t.index = int_pointer(index, "index", x, {t.particles});
   t.schedule_size = schedule_size<D>(t.capacity, t.particles);
   t.schedule = int_pointer(schedule, "schedule", x, {t.schedule_size});
-  for (int slot = 0; x.is_cpu() && slot < t.capacity; slot++)
-    STD_TORCH_CHECK(t.block[slot] < size, "block must have entries below the ", size, " of table, got ", t.block[slot]);
+  if (x.is_cpu()) {
+    int most = -1;
+    for (int slot = 0; slot < t.capacity; slot++) most = std::max(most, t.block[slot]);
+    STD_TORCH_CHECK(most < size, "block must have entries below the ", size, " of table, got ", most);
+  }
   return t;
 }
 

@@ -114,18 +114,6 @@ def check_choice(name: str, value: object, choices: Iterable[str]) -> None:
         raise ValueError(f"{name} must be one of {sorted(choices)}, got {value!r}")
 
 
-def check_scene(scene: Tensor | None, state: Tensor, name: str = "F") -> None:
-    """Check the scene of each particle, int32 [P], against a particle tensor that messages call `name`."""
-    if scene is None:
-        return
-    if not isinstance(scene, Tensor) or scene.shape != state.shape[:1]:
-        raise ValueError(f"scene must have shape [{state.shape[0]}], got {shape_of(scene)}")
-    if scene.dtype != torch.int32:
-        raise TypeError(f"scene must be int32, got {scene.dtype}")
-    if scene.device != state.device:
-        raise ValueError(f"scene must be on the device of {name}, {state.device}, got {scene.device}")
-
-
 def check_parameter(name: str, value: Tensor, state: Tensor, scene: Tensor | None) -> None:
     """Check a parameter of a law: uniform, per scene or per particle."""
     P = state.shape[0]

@@ -8,12 +8,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..errors import FLOATING, check_like, shape_of
+from ..errors import FLOATING, check_index, check_like, shape_of
 from ..reference import material as reference
 from .arguments import (
     check_choice,
     check_parameter,
-    check_scene,
     check_tensors,
     differentiate,
     refuse_vmap,
@@ -108,7 +107,7 @@ def _check(law: str, state: Tensor, parameters: Parameters, scene: Tensor | None
         raise ValueError(f"J must have shape [P], got {shape_of(state)}")
     if dim not in (2, 3):
         raise ValueError(f"dim must be 2 or 3, got {dim}")
-    check_scene(scene, state, "the state")
+    check_index("scene", scene, state, of="the state")
     check_tensors(law, "parameters", names, parameters)
     for name, value in zip(names, parameters, strict=True):
         check_parameter(name, value, state, scene)

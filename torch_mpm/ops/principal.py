@@ -8,12 +8,11 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from ..errors import FLOATING, check_like, shape_of
+from ..errors import FLOATING, check_index, check_like, shape_of
 from ..reference.principal import ELASTIC, INVALID, LAWS, PLASTIC
 from .arguments import (
     check_choice,
     check_parameter,
-    check_scene,
     check_tensors,
     refuse_vmap,
     sizes,
@@ -140,7 +139,7 @@ def _check(law: str, F: Tensor, parameters: Tensors, history: Tensors, scene: Te
         raise ValueError(f"F must have shape [P, 3, 3] or [P, 2, 2], got {shape_of(F)}")
     if F.dtype not in FLOATING:
         raise TypeError(f"F must be float32 or float64, got {F.dtype}")
-    check_scene(scene, F)
+    check_index("scene", scene, F, of="F")
     check_tensors(law, "parameters", LAWS[law].parameters, parameters)
     check_tensors(law, "history variables", LAWS[law].history, history)
     for name, value in zip(LAWS[law].parameters, parameters, strict=True):

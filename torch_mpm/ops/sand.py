@@ -9,12 +9,11 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from ..errors import FLOATING, NUMBER_OR_TENSOR, check_like, check_number, check_real, shape_of
+from ..errors import FLOATING, NUMBER_OR_TENSOR, check_index, check_like, check_number, check_real, shape_of
 from ..reference.sand import APEX, CONE, ELASTIC, ENERGIES, INVALID, friction_alpha
 from .arguments import (
     check_choice,
     check_parameter,
-    check_scene,
     refuse_vmap,
     sizes,
     soa_empty,
@@ -195,7 +194,7 @@ def _check_deformation(F: Tensor, scene: Tensor | None, energy: str) -> None:
         raise ValueError(f"F must have shape [P, 3, 3] or [P, 2, 2], got {shape_of(F)}")
     if F.dtype not in FLOATING:
         raise TypeError(f"F must be float32 or float64, got {F.dtype}")
-    check_scene(scene, F)
+    check_index("scene", scene, F, of="F")
 
 
 def _check_number(name: str, value: Value | None, expected: str, most: float = math.inf) -> None:
