@@ -250,15 +250,22 @@ SEED = [
 ]
 
 OPS = [
-    (lambda v, op=op, arguments=arguments: op(v, *arguments), "blocks", [-1, None, {}])
-    for op, arguments in (
-        (p2g, [torch.zeros(3, 2)] * 3),
-        (g2p, [torch.zeros(3, 2)] * 2),
-        (scatter, [torch.zeros(3, 2)] * 2),
-        (gather, [torch.zeros(3, 2)] * 2),
-        (grid_update, [torch.zeros(3, 3)]),
-        (g2p_advance, [torch.zeros(3, 2), torch.zeros(3, 2), 1e-3]),
-    )
+    (
+        lambda v: g2p_advance(blocks(), state().x, torch.zeros(3, 2), 1e-3, stress_form=v),
+        "stress_form",
+        [{}, "pk1", None],
+    ),
+    *(
+        (lambda v, op=op, arguments=arguments: op(v, *arguments), "blocks", [-1, None, {}])
+        for op, arguments in (
+            (p2g, [torch.zeros(3, 2)] * 3),
+            (g2p, [torch.zeros(3, 2)] * 2),
+            (scatter, [torch.zeros(3, 2)] * 2),
+            (gather, [torch.zeros(3, 2)] * 2),
+            (grid_update, [torch.zeros(3, 3)]),
+            (g2p_advance, [torch.zeros(3, 2), torch.zeros(3, 2), 1e-3]),
+        )
+    ),
 ]
 
 ROWS = [

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ..errors import check_like, check_positions
 from ..grid import Blocks, check_blocks, inverse_inertia
-from .arguments import refuse_vmap, sizes, soa_empty, split_dt, sum_by_scene
+from .arguments import check_choice, refuse_vmap, sizes, soa_empty, split_dt, sum_by_scene
 from .autograd import dispatch, register_autograd
 from .transfer import STRESS_FORMS, TOPOLOGY, _blocks_of, _check_nodes, _save, _saved
 
@@ -51,8 +51,7 @@ def g2p_advance(
     P, D = x.shape
     check_like("F", F, x, (P, D, D), "[P, D, D]")
     check_like("J", J, x, (P,), "[P]")
-    if stress_form not in STRESS_FORMS:
-        raise ValueError(f"stress_form must be one of {sorted(STRESS_FORMS)}, got {stress_form!r}")
+    check_choice("stress_form", stress_form, STRESS_FORMS)
     velocity = _check_nodes("velocity", velocity, blocks, x, D)
     number, scene_dt = split_dt(dt, grid.scenes, x)
     next_x, v, C, next_F, next_J = dispatch(

@@ -19,7 +19,7 @@ from torch import Tensor
 from ..errors import check_like, check_positions, shape_of
 from ..grid import Blocks, Grid, check_blocks, inverse_inertia
 from ..reference import transfer as reference
-from .arguments import differentiate, per_particle, refuse_vmap, sizes, soa_empty, split_dt, sum_by_scene
+from .arguments import check_choice, differentiate, per_particle, refuse_vmap, sizes, soa_empty, split_dt, sum_by_scene
 from .autograd import dispatch, register_autograd
 
 STRESS_FORMS = {"mls": 0, "gradient": 1}
@@ -71,8 +71,7 @@ def p2g(
     check_like("C", C, x, (P, D, D), "[P, D, D]")
     check_like("stress", stress, x, (P, D, D), "[P, D, D]")
     check_like("volume", volume, x, (P,), "[P]")
-    if stress_form not in STRESS_FORMS:
-        raise ValueError(f"stress_form must be one of {sorted(STRESS_FORMS)}, got {stress_form!r}")
+    check_choice("stress_form", stress_form, STRESS_FORMS)
     scene_dt = None
     if stress is None:
         dt = 0.0
