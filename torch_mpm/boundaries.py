@@ -248,7 +248,7 @@ class Obstacle(TensorModule):
         if kind not in CONTACTS:
             raise ValueError(f"kind must be one of {sorted(CONTACTS)}, got {kind!r}")
         if not isinstance(friction, Tensor):
-            check_number("friction", friction, "a finite number >= 0", lambda v: 0 <= v < math.inf)
+            friction = float(check_number("friction", friction, "a finite number >= 0", lambda v: 0 <= v < math.inf))
         for name, value in (("start", start), ("end", end)):
             check_number(name, value, "a number", lambda v: v == v)
         if not (math.isfinite(start) and start <= end):
@@ -259,7 +259,8 @@ class Obstacle(TensorModule):
             raise TypeError("position must be numbers, a tensor or a function of time, got None")
         if callable(position) and velocity is not None:
             raise ValueError("velocity must be None where position is a function of time: it is its derivative")
-        self.position, self.velocity = _finite("position", position), _finite("velocity", velocity)
+        self.position = position if callable(position) else _finite("position", position)
+        self.velocity = _finite("velocity", velocity)
         self.rotation = _finite("rotation", rotation)
         self.angular_velocity = _finite("angular_velocity", angular_velocity)
         self.kind, self.friction = kind, friction
@@ -388,7 +389,8 @@ class Obstacle(TensorModule):
         value = getattr(self, name)
         if not isinstance(value, Tensor):
             value = self._constant(name, value, like)
-        if value.dim() not in (len(shape), len(shape) + 1) or tuple(value.shape)[value.dim() - len(shape) :] != shape:
+        per_scene = value.dim() == len(shape) + 1 and value.shape[0] > 0
+        if not (per_scene or value.dim() == len(shape)) or tuple(value.shape)[value.dim() - len(shape) :] != shape:
             alternatives = f"{list(shape)} or {['B', *shape]}".replace("'", "")
             raise ValueError(f"{name} must have shape {alternatives}, got {shape_of(value)}")
         if value.device != like.device:
@@ -777,8 +779,8 @@ def _length(value: Any) -> int:
 
 
 def _finite(name: str, value: Any) -> Any:
-    """Numbers checked and made immutable; anything else as it is."""
-    if value is None or callable(value) or isinstance(value, Tensor):
+    """Numbers checked and made immutable; None and tensors as they are."""
+    if value is None or isinstance(value, Tensor):
         return value
     numbers = _floats(name, value)
     if not all(math.isfinite(a) for a in numbers):

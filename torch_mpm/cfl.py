@@ -32,17 +32,14 @@ fifth) this is no limit. It is a bound where neighbours are alike, and was measu
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from .errors import check_number
-
-if TYPE_CHECKING:
-    from .grid import Grid
-    from .materials import Material
-    from .state import State
+from .grid import Grid, check_grid
+from .materials import Material, as_law
+from .state import State, check_state
 
 GRADIENT_BOUND = {
     # Λ = dx² D⁻¹ of the MLS form: Σ_i N_i |D⁻¹ (x_i − x_p)|² per axis.
@@ -89,8 +86,11 @@ def stable_dt(
     Raises:
         ValueError: for a cfl that is not positive and finite, or an unknown stress form.
     """
-    check_number("cfl", cfl, "positive", lambda v: v > 0)
-    if (stress_form, grid.kernel) not in GRADIENT_BOUND:
+    check_grid(grid)
+    check_state(state)
+    law = as_law("law", law)
+    check_number("cfl", cfl, "positive and finite", lambda v: 0 < v < math.inf)
+    if stress_form not in ("mls", "gradient"):
         raise ValueError(f"stress_form must be 'gradient' or 'mls', got {stress_form!r}")
     kept = 2.0 if transfer == "apic" and stress_form == "mls" else 1.0  # 1 + s
     bound = GRADIENT_BOUND[stress_form, grid.kernel] / grid.dx**2

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from .failures import Failures
 
 FLOATING = (torch.float32, torch.float64)
+LARGEST = {dtype: torch.finfo(dtype).max for dtype in FLOATING}
 
 
 def default_dtype() -> torch.dtype:
@@ -53,15 +54,29 @@ REAL = (float, int, torch.SymFloat, torch.SymInt, numbers.Real)
 """Types of a number; the first of them is found without a search."""
 
 
+NUMBER_OR_TENSOR = "a number or a tensor"
+
+
+def check_real(name: str, value: Any, kinds: str = "a number") -> float:
+    """A number that a float can hold, infinity and NaN among them; `kinds` says in words what else there may be."""
+    if not isinstance(value, REAL):
+        raise TypeError(f"{name} must be {kinds}, got {_described(value)}")
+    if isinstance(value, int) and abs(value) > LARGEST[torch.float64]:
+        raise ValueError(f"{name} must be finite, got a whole number of {value.bit_length()} bits")
+    return value  # type: ignore[return-value]
+
+
 def check_number(
-    name: str, value: Any, expected: str = "finite", holds: Callable[[float], bool] = math.isfinite
+    name: str,
+    value: Any,
+    expected: str = "finite",
+    holds: Callable[[float], bool] = math.isfinite,
+    kinds: str = "a number",
 ) -> float:
     """A number for which `holds`; `expected` says in words what that is."""
-    if not isinstance(value, REAL):
-        raise TypeError(f"{name} must be a number, got {_described(value)}")
-    if not holds(value):  # type: ignore[arg-type]
+    if not holds(check_real(name, value, kinds)):
         raise ValueError(f"{name} must be {expected}, got {value}")
-    return value  # type: ignore[return-value]
+    return value
 
 
 def check_count(name: str, value: Any, least: int = 0) -> int:
@@ -72,6 +87,33 @@ def check_count(name: str, value: Any, least: int = 0) -> int:
         expected = f"be at least {least}" if least else "not be negative"
         raise ValueError(f"{name} must {expected}, got {value}")
     return value  # type: ignore[return-value]
+
+
+def check_flag(name: str, value: Any) -> bool:
+    """True or False, also as another type's 1 or 0."""
+    if isinstance(value, Tensor) or value not in (True, False):
+        raise TypeError(f"{name} must be True or False, got {_described(value)}")
+    return bool(value)
+
+
+def check_dtype(dtype: Any) -> None:
+    """The dtype of a state, or None."""
+    if dtype is not None and not isinstance(dtype, torch.dtype):
+        raise TypeError(f"dtype must be torch.float32 or torch.float64, got {_described(dtype)}")
+    if dtype is not None and dtype not in FLOATING:
+        raise ValueError(f"dtype must be torch.float32 or torch.float64, got {dtype}")
+
+
+def check_device(device: Any) -> None:
+    """A device, or None; torch says which of them are there."""
+    if device is None or isinstance(device, torch.device):
+        return
+    if isinstance(device, bool) or not isinstance(device, (str, int)):
+        raise TypeError(f"device must be a torch.device or its name, got {_described(device)}")
+    try:
+        torch.device(device)
+    except (RuntimeError, OverflowError) as error:
+        raise ValueError(f"device must be a torch.device or its name, got {device!r}: {error}") from None
 
 
 def check_numbers(name: str, value: Any, expected: str = "numbers") -> tuple[float, ...]:

@@ -14,11 +14,13 @@ from .capture import is_captured, is_traced, outside_transforms, remember, witho
 from .errors import (
     GridOverflowError,
     check_count,
+    check_flag,
     check_index,
     check_number,
     check_positions,
     check_vector,
     default_dtype,
+    shape_of,
 )
 from .failures import Problem, problems_of_status, refused_steps
 
@@ -66,7 +68,8 @@ class Grid:
         capacity: int | None = None,
         deterministic: bool = False,
     ) -> None:
-        self.dx = float(check_number("dx", dx, "a positive number", lambda v: 0 < v < math.inf))
+        square = "a positive number, with a square that is positive and finite"
+        self.dx = float(check_number("dx", dx, square, lambda v: v > 0 and 0 < float(v) * float(v) < math.inf))
         self.lower = check_vector("lower", lower)
         self.upper = check_vector("upper", upper, len(self.lower))
         if not all(a < b for a, b in zip(self.lower, self.upper, strict=True)):
@@ -78,7 +81,7 @@ class Grid:
         self.kernel = kernel
         self.order = KERNEL_ORDERS[kernel]
         self.dim = len(self.lower)
-        self.deterministic = bool(deterministic)
+        self.deterministic = check_flag("deterministic", deterministic)
         # A node on `upper` exists even when the extent is a multiple of dx only up to rounding.
         cells = [math.ceil((b - a) / self.dx - 1e-6) for a, b in zip(self.lower, self.upper, strict=True)]
         self.nodes = tuple(n + 1 + 2 * PADDING for n in cells)
@@ -255,6 +258,11 @@ class ActivationRecord:
         with torch.inference_mode():
             for kept in self._replayed:
                 kept.copy_(torch.tensor(NO_PROBLEM, dtype=torch.int32, device="cpu"))
+
+
+def check_grid(grid: Any) -> None:
+    if not isinstance(grid, Grid):
+        raise TypeError(f"grid must be a Grid, got {shape_of(grid)}")
 
 
 def check_blocks(blocks: Any) -> None:

@@ -20,7 +20,6 @@ because variances about a node with the weights β_p m_p C_p are at most those w
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import Any, Protocol
 
@@ -29,9 +28,9 @@ from torch import Tensor, nn
 
 from .boundaries import BoundaryList, _norm
 from .capture import outside_transforms, without_transforms
-from .errors import check_like, check_number, shape_of
+from .errors import check_count, check_like, check_number
 from .failures import Failures, Problem, raise_failures, unsolved_heat
-from .grid import ActivationRecord, Blocks, Grid
+from .grid import ActivationRecord, Blocks, Grid, check_grid
 from .heat_boundaries import FixedSurface, HeatNodes
 from .materials import _check_value
 from .ops import gather, heat_cg, scatter
@@ -39,7 +38,7 @@ from .ops.arguments import check_choice, per_particle
 from .ops.heat import METHODS
 from .parameters import Value, evaluate, needed_temperature, store
 from .pause import paused
-from .state import State
+from .state import State, check_state
 from .thermal import LIQUID, determinant
 
 TRANSFERS = ("hybrid", "apic", "flip", "pic")
@@ -111,8 +110,7 @@ class Heat(nn.Module):
         method: str = "cg",
     ) -> None:
         super().__init__()
-        if not isinstance(grid, Grid):
-            raise TypeError(f"grid must be a Grid, got {shape_of(grid)}")
+        check_grid(grid)
         if transfer not in TRANSFERS:
             raise ValueError(f"transfer must be one of {sorted(TRANSFERS)}, got {transfer!r}")
         if (melting_point is None) != (latent_heat is None):
@@ -120,7 +118,7 @@ class Heat(nn.Module):
         check_number("plastic_heating", plastic_heating, "between 0 and 1", lambda v: 0 <= v <= 1)
         check_number("tolerance", tolerance, "between 0 and 1", lambda v: 0 < v < 1)
         check_number("reference", reference)
-        check_number("max_iterations", max_iterations, "at least 1", lambda v: 1 <= v < math.inf)
+        check_count("max_iterations", max_iterations, 1)
         check_choice("method", method, METHODS)
         if method == "chebyshev" and any(isinstance(boundary, FixedSurface) for boundary in boundaries):
             raise ValueError('method must be "cg" or "multigrid" where a boundary is a FixedSurface, got "chebyshev"')
@@ -162,6 +160,7 @@ class Heat(nn.Module):
         Raises:
             ValueError: for a state without temperature, or fields of a wrong shape.
         """
+        check_state(state)
         temperature = needed_temperature(state)
         extra = dict(state.extra)
         if self.affine and GRADIENT not in extra:

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from .boundaries import Obstacle, _norm, _per_node
-from .errors import check_number, shape_of
+from .errors import NUMBER_OR_TENSOR, check_number, check_real, shape_of
 from .grid import BLOCK_WIDTH, PADDING, Blocks
 from .materials import _check_value
 from .ops import scatter
@@ -26,6 +26,7 @@ from .reference.transfer import bspline
 if TYPE_CHECKING:
     from .state import State
 
+FROM_TIME = "what a function of the time returns"
 STEFAN_BOLTZMANN = 5.670374419e-8
 """σ [W/(m² K⁴)] (CODATA 2018)."""
 
@@ -78,9 +79,12 @@ class HeatNodes:
 
     def per_node(self, value: Timed) -> Number:
         """A number, or a tensor [], [B] or [N], or a function of the time that returns one, as a number or [N]."""
-        value = value(self.time) if callable(value) and not isinstance(value, Tensor) else value
+        value = _at(value, self.time)
         if not isinstance(value, Tensor) or value.shape == self.theta.shape:
             return value
+        scenes = self.blocks.grid.scenes
+        if value.shape not in ((), (1,), (scenes,)):
+            raise ValueError(f"a value at nodes must have shape [], [B] = [{scenes}] or [N], got {shape_of(value)}")
         return _per_node(value.to(self.theta), 0, self.scene())
 
     def add_source(self, power: Tensor) -> None:
@@ -150,18 +154,22 @@ class Surface(TensorModule):
     def __init__(self, points: Tensor, area: Number, scene: Tensor | None = None) -> None:
         if not isinstance(points, Tensor) or points.dim() != 2 or points.shape[1] not in (2, 3):
             raise ValueError(f"points must have shape [S, 2] or [S, 3], got {shape_of(points)}")
+        if callable(area) and not isinstance(area, Tensor):
+            raise TypeError(f"area must be {NUMBER_OR_TENSOR}, got {shape_of(area)}")
         if isinstance(area, Tensor) and area.shape not in ((), points.shape[:1]):
             raise ValueError(f"area must be a number or have shape [S] = [{points.shape[0]}], got {shape_of(area)}")
         if not bool(points.detach().isfinite().all()):
             raise ValueError("points must be finite, and some are NaN or infinite")
-        _checked("area", area, "not negative", lambda v: v >= 0)
-        if scene is not None and scene.shape != points.shape[:1]:
+        self.area: Number = _checked("area", area, "not negative", lambda v: v >= 0)  # type: ignore[assignment]
+        if scene is not None and (not isinstance(scene, Tensor) or scene.shape != points.shape[:1]):
             raise ValueError(f"scene must have shape [S] = [{points.shape[0]}], got {shape_of(scene)}")
-        self.points, self.area, self.scene = points, area, scene
+        if scene is not None and scene.dtype != torch.int32:
+            raise TypeError(f"scene must be int32, got {scene.dtype}")
+        self.points, self.scene = points, scene
 
     def integrate(self, nodes: HeatNodes, density: Timed) -> Tensor:
         """∫ N_i density dA [N] of a density per area: a number, a tensor [] or [S], or a function of the time."""
-        density = density(nodes.time) if callable(density) and not isinstance(density, Tensor) else density
+        density = _at(density, nodes.time)
         points = self.points.to(nodes.theta)
         rows, weight = node_weights(nodes.blocks, points, self.scene)
         weight = weight * (nodes.capacity.detach()[rows] > 0)
@@ -228,7 +236,7 @@ class Flux(Term):
     """
 
     def __init__(self, surface: Surface | FreeSurface, flux: Timed) -> None:
-        self.surface, self.flux = surface, _checked("flux", flux)
+        self.surface, self.flux = _surface(surface), _checked("flux", flux)
 
     def apply(self, nodes: HeatNodes) -> None:  # type: ignore[override]
         nodes.add_source(self.surface.integrate(nodes, self.flux))
@@ -247,7 +255,7 @@ class Convection(Term):
     """
 
     def __init__(self, surface: Surface | FreeSurface, coefficient: Timed, ambient: Timed) -> None:
-        self.surface, self.ambient = surface, _checked("ambient", ambient)
+        self.surface, self.ambient = _surface(surface), _checked("ambient", ambient)
         self.coefficient = _checked("coefficient", coefficient, "not negative", lambda v: v >= 0)
 
     def apply(self, nodes: HeatNodes) -> None:  # type: ignore[override]
@@ -268,16 +276,16 @@ class Radiation(Term):
     """
 
     def __init__(self, surface: Surface | FreeSurface, emissivity: Timed, ambient: Timed) -> None:
-        self.surface, self.ambient = surface, _checked("ambient", ambient)
+        self.surface, self.ambient = _surface(surface), _checked("ambient", ambient)
         self.emissivity = _checked("emissivity", emissivity, "between 0 and 1", lambda v: (v >= 0) & (v <= 1))
 
     def apply(self, nodes: HeatNodes) -> None:  # type: ignore[override]
         black = STEFAN_BOLTZMANN * self.surface.integrate(nodes, self.emissivity)
         ambient = nodes.per_node(self.ambient) + nodes.reference
         kelvin = (nodes.theta + nodes.reference).clamp_min(0)
-        slope = 4 * kelvin**3
+        slope, squared = 4 * kelvin**3, ambient * ambient  # a power of floats would raise where it is too large
         nodes.add_exchange(black * slope, nodes.theta)
-        nodes.add_source(black * (ambient**4 - kelvin**4))
+        nodes.add_source(black * (squared * squared - kelvin**4))
 
 
 class Fixed(Term):
@@ -296,6 +304,8 @@ class Fixed(Term):
     """
 
     def __init__(self, region: Obstacle | Callable[[Tensor], Tensor], temperature: Timed) -> None:
+        if not callable(region):
+            raise TypeError(f"region must be an obstacle or a function of positions [N, D], got {shape_of(region)}")
         self.region, self.temperature = region, _checked("temperature", temperature)
 
     def apply(self, nodes: HeatNodes) -> None:  # type: ignore[override]
@@ -304,6 +314,8 @@ class Fixed(Term):
             where = self.region.contains(positions, nodes.scene(), nodes.time)
         else:
             where = self.region(positions)
+            if not isinstance(where, Tensor) or where.shape != nodes.theta.shape or where.dtype != torch.bool:
+                raise ValueError(f"region must return bool [N] = {list(nodes.theta.shape)}, got {shape_of(where)}")
         nodes.hold(where & (nodes.capacity > 0), nodes.per_node(self.temperature))
 
 
@@ -357,12 +369,28 @@ class Source(Term):
         nodes.add_source(scatter(nodes.blocks, nodes.state.x, power[:, None])[:, 0])
 
 
+def _surface(surface: Any) -> Surface | FreeSurface:
+    if not isinstance(surface, (Surface, FreeSurface)):
+        raise TypeError(f"surface must be a Surface or a FreeSurface, got {shape_of(surface)}")
+    return surface
+
+
+def _at(value: Timed, time: float | Tensor) -> Number:
+    """A number or a tensor, given or what a function of the time returns."""
+    if isinstance(value, (float, Tensor)):
+        return value
+    value = value(time) if callable(value) else value
+    return value if isinstance(value, Tensor) else float(check_real(FROM_TIME, value, NUMBER_OR_TENSOR))
+
+
 def _checked(name: str, value: Timed, expected: str = "", holds: Callable[[Any], Any] = lambda v: v == v) -> Timed:
     """A number or tensor of which all is finite and holds; a function of the time is not asked."""
     expected = f"{expected} and finite" if expected else "finite"
     if isinstance(value, Tensor):
         if not bool((holds(value.detach()) & value.detach().isfinite()).all()):
             raise ValueError(f"{name} must be {expected}, got {value}")
-    elif not callable(value):
-        check_number(name, value, expected, lambda v: math.isfinite(v) and holds(v))
-    return value
+        return value
+    if callable(value):
+        return value
+    kinds = "a number, a tensor or a function of the time"
+    return float(check_number(name, value, expected, lambda v: math.isfinite(v) and bool(holds(v)), kinds))

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor, nn
 
 from .capture import Kept, without_transforms
-from .errors import REAL, check_number, shape_of
+from .errors import check_number, shape_of
 from .ops import material as ops
 from .ops.arguments import soa_empty
 from .parameters import PerMaterial, Value, With, evaluate
@@ -182,21 +182,22 @@ def _check_value(name: str, value: Value, expected: str, holds: Callable[[Any], 
     if isinstance(value, PerMaterial):
         for k, one in enumerate(value.values()):
             _check_value(f"{name} of material {k}", one, expected, holds, infinite)
+    kinds = "a number, a tensor or a function of temperature"
+    if isinstance(value, Material):
+        raise TypeError(f"{name} must be {kinds}, got {shape_of(value)}")
     if callable(value) and not isinstance(value, Tensor):
-        return value  # a function of temperature
+        return value
     if isinstance(value, Tensor):
         if value.dim() > 1 or value.numel() == 0 or not value.is_floating_point():
             raise ValueError(
                 f"{name} must be a number or a floating tensor of shape [], [1], [B] or [P], got {shape_of(value)}"
             )
-        good = bool((holds(value.detach()) & (value.detach().isfinite() | infinite)).all())
-    elif not isinstance(value, REAL):
-        raise TypeError(f"{name} must be a number, a tensor or a function of temperature, got {shape_of(value)}")
-    else:
-        good = (math.isfinite(value) or infinite) and bool(holds(value))
-    if not good:
-        raise ValueError(f"{name} must be {expected}, got {value}")
-    return value
+        if not bool((holds(value.detach()) & (value.detach().isfinite() | infinite)).all()):
+            raise ValueError(f"{name} must be {expected}, got {value}")
+        return value
+    return float(
+        check_number(name, value, expected, lambda v: (math.isfinite(v) or infinite) and bool(holds(v)), kinds)
+    )
 
 
 class SolidLaw(CompiledLaw):
@@ -353,7 +354,7 @@ def check_function(function: Any) -> Any:
 def check_stiffness(value: Any) -> Any:
     """A stiffness that is given to a custom law."""
     if value is not None and not isinstance(value, Tensor) and not callable(value):
-        check_number("stiffness", value, "finite and not negative", lambda v: 0 <= v < math.inf)
+        return float(check_number("stiffness", value, "finite and not negative", lambda v: 0 <= v < math.inf))
     return value
 
 

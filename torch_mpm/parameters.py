@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor, nn
 
-from .errors import check_numbers, shape_of
+from .errors import check_numbers, check_real, shape_of
 from .reference.material import per_particle
 
 if TYPE_CHECKING:
@@ -76,8 +76,12 @@ class PerMaterial(nn.Module):
 
     def __init__(self, values: Sequence[Value]) -> None:
         super().__init__()
+        if not isinstance(values, (list, tuple)):
+            raise TypeError(f"values must be a list of one for each material, got {shape_of(values)}")
         self.count = len(values)
         for k, value in enumerate(values):
+            if not callable(value) and not isinstance(value, Tensor):
+                check_real(f"values[{k}]", value, "a number, a tensor or a function of temperature")
             store(self, f"value{k}", value)
 
     def values(self) -> list[Value]:

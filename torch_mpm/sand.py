@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from .capture import Kept
+from .errors import check_flag, check_number
 from .materials import SolidLaw, Value, _check_value
 from .ops.sand import ANGLE, ReturnMap, quartic_energy, quartic_return_map, quartic_stiffness
 from .reference.material import per_particle
@@ -83,8 +84,7 @@ class QuarticSand(SolidLaw):
             raise ValueError(f"energy must be one of {sorted(ENERGIES)}, got {energy!r}")
         if apex not in ("zero", "keep") or (apex == "keep" and energy != "unilateral"):
             raise ValueError(f"apex must be 'zero' or, with energy='unilateral', 'keep', got {apex!r} with {energy!r}")
-        if not smallest_strain >= 0:
-            raise ValueError(f"smallest_strain must not be negative, got {smallest_strain}")
+        check_number("smallest_strain", smallest_strain, "finite and not negative", lambda v: 0 <= v < math.inf)
         if flow not in ("radial", "exact"):
             raise ValueError(f"flow must be 'radial' or 'exact', got {flow!r}")
         self._set_friction(friction_angle, hardening)
@@ -92,7 +92,7 @@ class QuarticSand(SolidLaw):
         if cohesion is not None:
             self._store("cohesion", _check_value("cohesion", cohesion, "finite and not negative", lambda v: v >= 0))
         self.energy_form, self.apex, self.smallest_strain = energy, apex, float(smallest_strain)
-        self.flow, self.volume_correction = flow, volume_correction
+        self.flow, self.volume_correction = flow, check_flag("volume_correction", volume_correction)
         self.extra_fields = tuple(
             name for name, used in ((VOLUME, volume_correction), (HARDENING, hardening is not None)) if used
         )

@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 from . import memory
-from .errors import check_number, check_vector, default_dtype
+from .errors import check_device, check_dtype, check_number, check_vector, default_dtype, shape_of
 
 Vector = Sequence[float] | Tensor
 
@@ -93,7 +93,7 @@ class Sphere:
         self.volume = _ball_volume(len(self.center), self.radius)
 
     def inside(self, x: Tensor) -> Tensor:
-        return (x - self.center).square().sum(1) <= self.radius**2
+        return (x - self.center).square().sum(1) <= self.radius * self.radius
 
 
 class _Axial:
@@ -126,7 +126,7 @@ class Cylinder(_Axial):
 
     def inside(self, x: Tensor) -> Tensor:
         along, away = self._along_and_away(x)
-        return (along >= 0) & (along <= self.length) & (away <= self.radius**2)
+        return (along >= 0) & (along <= self.length) & (away <= self.radius * self.radius)
 
 
 class Capsule(_Axial):
@@ -144,7 +144,7 @@ class Capsule(_Axial):
     def inside(self, x: Tensor) -> Tensor:
         along, away = self._along_and_away(x)
         beyond = along - along.clamp(0, self.length)
-        return away + beyond.square() <= self.radius**2
+        return away + beyond.square() <= self.radius * self.radius
 
 
 class Mesh:
@@ -252,6 +252,10 @@ def fill(
     Raises:
         ValueError: for an unknown method, a shape too small to hold a point, or more points than memory holds.
     """
+    if missing := [name for name in ("lower", "upper", "volume", "inside") if not hasattr(shape, name)]:
+        raise TypeError(f"shape must be a shape of torch_mpm.seed, got {shape_of(shape)} without {missing[0]}")
+    check_dtype(dtype)
+    check_device(device)
     dtype, device = dtype or default_dtype(), torch.get_default_device() if device is None else device
     with HOST:
         x = _points_in(shape, grid, per_cell, method, seed)
@@ -387,6 +391,8 @@ def file(
         OSError: when there is no such file, or it cannot be read.
         ValueError: for an unknown format, a wrong shape, numbers not finite, or volumes missing or not positive.
     """
+    check_dtype(dtype)
+    check_device(device)
     with HOST:
         x, volumes = _read_points(Path(path))
     if x.dim() != 2 or x.shape[1] not in (2, 3) or len(x) == 0:

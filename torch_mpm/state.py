@@ -11,11 +11,23 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from .errors import FLOATING, REAL, check_count, check_index, check_like, check_number, default_dtype, shape_of
+from .errors import (
+    FLOATING,
+    check_count,
+    check_device,
+    check_dtype,
+    check_flag,
+    check_index,
+    check_like,
+    check_number,
+    check_real,
+    default_dtype,
+    shape_of,
+)
+from .grid import Grid, check_grid
 from .ops.arguments import soa_empty
 
 if TYPE_CHECKING:
-    from .grid import Grid
     from .seed import Points
 
 
@@ -35,10 +47,11 @@ class Time:
         if isinstance(time, Tensor):
             number = torch.compiler.is_compiling() and time.dim() == 0 and time.dtype == torch.float64
             kept = (time,) if number and time.device.type == "cpu" and not time.requires_grad else time
-        elif isinstance(time, REAL):
-            kept = (torch.scalar_tensor(time, dtype=torch.float64, device="cpu"),)
+        elif isinstance(time, tuple) and len(time) == 1 and isinstance(time[0], Tensor):
+            kept = time
         else:
-            raise TypeError(f"time must be a number or a tensor [B], got {shape_of(time)}")
+            seconds = float(check_real("time", time, "a number or a tensor [B]"))
+            kept = (torch.scalar_tensor(seconds, dtype=torch.float64, device="cpu"),)
         state.__dict__["_time"] = kept
 
 
@@ -94,6 +107,8 @@ class State:
             check_like(name, getattr(self, name), self.x, (P,), "[P]")
         for name, dtype in (("scene", torch.int32), ("material", torch.int32), ("ids", torch.int64)):
             check_index(name, getattr(self, name), self.x, dtype)
+        if not isinstance(self.extra, dict):
+            raise TypeError(f"extra must be a dict of tensors [P, ...], got {shape_of(self.extra)}")
         for name, value in self.extra.items():
             if not isinstance(value, Tensor) or value.shape[:1] != (P,):
                 raise ValueError(f"extra[{name!r}] must have {P} rows, got {shape_of(value)}")
@@ -123,7 +138,9 @@ class State:
         if not isinstance(getattr(points, "x", None), Tensor):
             raise TypeError(f"points must be what torch_mpm.seed gives, got {shape_of(points)}")
         P, D = points.x.shape
-        _check_density(density, P)
+        density = _checked_density(density, P)
+        check_dtype(dtype)
+        check_device(device)
         dtype = dtype or default_dtype()
         x = _as_soa(points.x.to(device=device, dtype=dtype))
         volume = points.volume.to(device=x.device, dtype=dtype)
@@ -152,6 +169,8 @@ class State:
 
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> State:
         """Move to a device, and floating tensors to a dtype."""
+        check_device(device)
+        check_dtype(dtype)
         state = self.map(lambda t: t.to(device=device, dtype=dtype if t.is_floating_point() else None))
         if isinstance(self.time, Tensor):
             state.time = self.time.to(device=device, dtype=dtype)
@@ -170,6 +189,10 @@ class State:
         `ids` go with their particles. A law with parameters per particle needs those of the Q particles in the order of
         `ids`, and ids 0 .. Q − 1, which `State.concatenate([state])` makes.
         """
+        if not isinstance(particles, Tensor) or particles.dim() != 1 or particles.layout != torch.strided:
+            raise ValueError(f"particles must be an index tensor of shape [Q], got {shape_of(particles)}")
+        if particles.dtype not in (torch.int32, torch.int64):
+            raise TypeError(f"particles must be int32 or int64, got {particles.dtype}")
         return self.map(lambda t: _take(t, particles))
 
     def sorted(self, grid: Grid) -> State:
@@ -177,6 +200,7 @@ class State:
 
         Reordering now and then keeps long simulations fast; results differ only by rounding. Differentiable.
         """
+        check_grid(grid)
         ids = torch.arange(len(self), device=self.x.device) if self.ids is None else self.ids
         blocks = grid.activate(self.x, self.scene)
         order = torch.ops.torch_mpm.cell_order(self.x.detach(), *blocks.topology)
@@ -207,7 +231,7 @@ class State:
             ValueError: for an empty list; states of one batch at different times; another field that is present in some
                 states only; counts that do not fit.
         """
-        states = _checked(states)
+        states, scene = _checked(states), check_flag("scene", scene)
         counts = [0] * len(states)
         if scene:
             counts = _scene_counts(states, scenes)
@@ -222,6 +246,11 @@ class State:
         joined: dict[str, Any] = {name: _joined(name, states) for name in names}
         extra = {key: _as_soa(torch.cat([_extra(key, s, k, states) for k, s in enumerate(states)])) for key in keys}
         return State(**joined, extra=extra, time=time)
+
+
+def check_state(state: Any) -> None:
+    if not isinstance(state, State):
+        raise TypeError(f"state must be a State, got {shape_of(state)}")
 
 
 # ---- joining
@@ -251,8 +280,8 @@ def _scene_of(state: State) -> Tensor:
 
 def _scene_counts(states: Sequence[State], given: Sequence[int] | None) -> list[int]:
     """Number of scenes of each state."""
-    if given is not None and len(given) != len(states):
-        raise ValueError(f"scenes must have one count for each of {len(states)} states, got {list(given)}")
+    if given is not None and (not isinstance(given, (list, tuple)) or len(given) != len(states)):
+        raise ValueError(f"scenes must have one count for each of {len(states)} states, got {given}")
     counts = []
     for k, state in enumerate(states):
         several = isinstance(state.time, Tensor) and state.time.numel() > 1
@@ -336,7 +365,7 @@ def _given_velocity(velocity: Any, P: int, D: int) -> Tensor:
     if not isinstance(velocity, Tensor):
         try:
             velocity = torch.as_tensor(velocity, dtype=torch.float64, device="cpu")
-        except (TypeError, ValueError) as error:
+        except (TypeError, ValueError, OverflowError, RuntimeError) as error:
             raise TypeError(f"velocity must be {D} numbers or a tensor, got {velocity!r}") from error
         if not bool(velocity.isfinite().all()):
             raise ValueError(f"velocity must be finite, got {velocity.tolist()}")
@@ -345,16 +374,18 @@ def _given_velocity(velocity: Any, P: int, D: int) -> Tensor:
     return velocity
 
 
-def _check_density(density: float | Tensor, particles: int) -> None:
+def _checked_density(density: float | Tensor, particles: int) -> float | Tensor:
     if not isinstance(density, Tensor):
-        check_number("density", density, "positive and finite", lambda v: 0 < v < math.inf)
-        return
+        return float(
+            check_number("density", density, "positive and finite", lambda v: 0 < v < math.inf, "a number or a tensor")
+        )
     if density.shape not in ((), (particles,)):
         raise ValueError(f"density must be a number or have shape [P] = [{particles}], got {shape_of(density)}")
     values = density.detach()
     bad = values[~((values > 0) & (values < math.inf))]
     if bad.numel():
         raise ValueError(f"density must be positive and finite, got {float(bad[0])}")
+    return density
 
 
 def _as_soa(t: Tensor) -> Tensor:

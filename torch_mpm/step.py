@@ -15,7 +15,7 @@ from .capture import Kept
 from .cfl import stable_dt
 from .errors import check_count, check_number, check_vector, shape_of
 from .failures import Failures, problems_of_state, raise_failures
-from .grid import ActivationRecord, Blocks, Grid
+from .grid import ActivationRecord, Blocks, Grid, check_grid
 from .heat import Heat
 from .materials import Material, as_law
 from .ops import contact, fusible, g2p, g2p_advance, gather, grid_update, p2g
@@ -23,7 +23,7 @@ from .ops.arguments import check_choice
 from .ops.transfer import STRESS_FORMS
 from .parameters import TensorModule, With
 from .pause import paused
-from .state import State, identity_deformation
+from .state import State, check_state, identity_deformation
 
 TRANSFERS = ("apic", "pic", "flip")
 
@@ -175,6 +175,7 @@ class Step(TensorModule):
 
     def prepare(self, state: State) -> State:
         """Give a state the fields that this step needs and that it lacks."""
+        check_state(state)
         changes: dict[str, Any] = {}
         if "F" in self.law.state_fields and state.F is None:
             changes["F"] = identity_deformation(state.x)
@@ -320,8 +321,8 @@ def _argument(step: Step, name: str, value: Any) -> Any:
     Raises:
         TypeError, ValueError: for a wrong one.
     """
-    if name == "grid" and not isinstance(value, Grid):
-        raise TypeError(f"grid must be a Grid, got {shape_of(value)}")
+    if name == "grid":
+        check_grid(value)
     if name == "law":
         return as_law("law", value)
     if name == "transfer":

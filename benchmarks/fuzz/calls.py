@@ -41,7 +41,8 @@ INTERNAL = re.compile(
     r"has no attribute|not supported between|unsupported operand|object is not|is not iterable|to unpack|"
     r"object does not support|bad operand type|must be real number|cannot be interpreted as|cannot unpack|"
     r"INTERNAL ASSERT|API call failed|bad_alloc|std::|maximum recursion|only one element tensors|"
-    r"Boolean value of Tensor|list index|indices must be|invalid combination of arguments",
+    r"Boolean value of Tensor|list index|indices must be|invalid combination of arguments|"
+    r"has no len|(float|int)\(\) argument|unhashable|not subscriptable|can't multiply|only concatenate",
 )
 """Messages about something inside, which name no argument."""
 BATCH = 400

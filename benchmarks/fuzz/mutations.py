@@ -12,9 +12,28 @@ from torch import Tensor
 
 INTEGERS = (-1, 0, 1, 2, 3, 7, 2**31 - 1, 2**31, 2**40, 2**63 - 1, -(2**63), 2**64)
 NUMBERS = (math.nan, math.inf, -math.inf, 0.0, -1.0, -0.0, 1e-300, 1e-45, 1e300, 1e39, 10**400)
+
+
+def refuses(*_: Any, **__: Any) -> Any:
+    """A function of the caller's, whose own error no check can foresee."""
+    raise ValueError("refused")
+
+
+def nothing(_: Any) -> None:
+    """A function of the caller's that returns what none should."""
+
+
+class Refuses:
+    """A class, of which `refuses` is true too."""
+
+    def __init__(self, *_: Any, **__: Any) -> None:
+        refuses()
+
+
 STRANGERS: tuple[Any, ...] = (
-    None, True, 5, -3, 0.5, math.nan, 1j, "", "neo", "a\0b", b"bytes", (), [], {}, [None], [[1.0]], object(), len, dict,
-    torch.float32, torch.zeros(()), torch.zeros(3), torch.zeros(0, dtype=torch.int64), {"a": 1}, slice(None), range(3),
+    None, True, 5, -3, 0.5, math.nan, 1j, "", "neo", "a\0b", b"bytes", (), [], {}, [None], [[1.0]], object(), nothing,
+    refuses, Refuses, torch.float32, torch.zeros(()), torch.zeros(3), torch.zeros(0, dtype=torch.int64), {"a": 1},
+    slice(None), range(3),
 )  # fmt: skip
 """Values of other types, for any argument."""
 FIXED_CONTENTS = ("table", "block", "offsets", "index", "schedule")

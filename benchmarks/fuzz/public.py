@@ -9,6 +9,7 @@ from typing import Any
 import torch
 
 import torch_mpm as mpm
+from benchmarks.fuzz.mutations import refuses
 from torch_mpm import heat_boundaries, seed
 
 Call = tuple[Callable[..., Any], dict[str, Any]]
@@ -154,8 +155,13 @@ def _laws() -> dict[str, Callable[[], Call]]:
 
         return lambda: (use, dict(given))
 
-    def stress(F: torch.Tensor) -> torch.Tensor:
+    def stress(F: Any) -> torch.Tensor:
+        if not isinstance(F, torch.Tensor):  # as another argument
+            refuses()
         return F @ F.mT - torch.eye(2)
+
+    def principal_stress(s: Any) -> torch.Tensor:
+        return s - 1 if isinstance(s, torch.Tensor) else refuses()
 
     moduli = dict(E=E, nu=NU)
     return {
@@ -174,7 +180,7 @@ def _laws() -> dict[str, Callable[[], Call]]:
             flow="radial", cohesion=0.01, volume_correction=False,
         ),
         "CustomLaw": applied(mpm.CustomLaw, function=stress, state_field="F", stiffness=1.0),
-        "CustomPrincipalLaw": applied(mpm.CustomPrincipalLaw, function=lambda s: s - 1, stiffness=1.0),
+        "CustomPrincipalLaw": applied(mpm.CustomPrincipalLaw, function=principal_stress, stiffness=1.0),
         "ThermalExpansion": applied(mpm.ThermalExpansion, law=mpm.NeoHookean(**moduli), coefficient=1e-5),
         "HerschelBulkley": lambda: (
             mpm.HerschelBulkley, dict(**moduli, yield_stress=10.0, consistency=1.0, exponent=1.0)

@@ -9,9 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..errors import REAL, check_like, shape_of
-
-LARGEST = {dtype: torch.finfo(dtype).max for dtype in (torch.float32, torch.float64)}
+from ..errors import LARGEST, REAL, check_like, shape_of
 
 
 def split_dt(dt: float | Tensor, scenes: int, x: Tensor) -> tuple[float, Tensor | None]:
@@ -114,11 +112,6 @@ def _pull_back(
 def check_choice(name: str, value: object, choices: Iterable[str]) -> None:
     if not isinstance(value, str) or value not in choices:
         raise ValueError(f"{name} must be one of {sorted(choices)}, got {value!r}")
-
-
-def check_real(name: str, value: object) -> None:
-    if not isinstance(value, REAL):
-        raise TypeError(f"{name} must be a number or a tensor, got {type(value).__name__}")
 
 
 def check_parameter(name: str, value: Tensor, state: Tensor, scene: Tensor | None) -> None:

@@ -10,10 +10,10 @@ import torch
 from torch import Tensor
 
 from ..boundaries import Box, Capsule, Obstacle, Plane, Sphere
-from ..errors import check_like, shape_of
+from ..errors import NUMBER_OR_TENSOR, check_like, check_real, shape_of
 from ..grid import Blocks, check_blocks
 from ..reference.obstacles import contact as reference
-from .arguments import check_list, check_real, differentiate, refuse_vmap, sizes
+from .arguments import check_list, differentiate, refuse_vmap, sizes
 from .autograd import dispatch, register_autograd
 from .grid_update import CONTACT_KINDS, _blocks_of
 
@@ -70,8 +70,7 @@ def contact(blocks: Blocks, velocity: Tensor, obstacles: Sequence[Obstacle], tim
         scene_time = time.detach().reshape(-1).to(velocity.dtype).contiguous()
         check_like("time", scene_time, velocity, tuple(scene_time.shape), "")
     else:
-        check_real("time", time)
-        number = float(time)
+        number = float(check_real("time", time, NUMBER_OR_TENSOR))
         obstacles = [o for o in obstacles if o.start <= number < o.end]
     for first in range(0, len(obstacles), MAX_OBSTACLES):
         group = obstacles[first : first + MAX_OBSTACLES]

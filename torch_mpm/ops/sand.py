@@ -9,12 +9,11 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from ..errors import FLOATING, check_index, check_like, check_number, shape_of
+from ..errors import FLOATING, NUMBER_OR_TENSOR, check_index, check_like, check_number, check_real, shape_of
 from ..reference.sand import APEX, CONE, ELASTIC, ENERGIES, INVALID, friction_alpha
 from .arguments import (
     check_choice,
     check_parameter,
-    check_real,
     refuse_vmap,
     sizes,
     soa_empty,
@@ -201,12 +200,12 @@ def _check_deformation(F: Tensor, scene: Tensor | None, energy: str) -> None:
 def _check_number(name: str, value: Value | None, expected: str, most: float = math.inf) -> None:
     """A tensor is left alone: to read it would wait for its device."""
     if value is not None and not isinstance(value, Tensor):
-        check_number(name, value, expected, lambda v: 0 <= v < most)
+        check_number(name, value, expected, lambda v: 0 <= v < most, NUMBER_OR_TENSOR)
 
 
 def _parameter(name: str, value: Value | None, F: Tensor, scene: Tensor | None) -> Tensor:
     if not isinstance(value, Tensor):
-        check_real(name, value)
+        check_real(name, value, NUMBER_OR_TENSOR)
         return torch.tensor(value, dtype=F.dtype, device=F.device)
     check_parameter(name, value, F, scene)
     return value
