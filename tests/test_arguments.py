@@ -8,10 +8,12 @@ import pytest
 import torch
 
 import torch_mpm as mpm
-from torch_mpm import boundaries, seed
+from torch_mpm import boundaries, heat_boundaries, seed
 from torch_mpm.ops import g2p, g2p_advance, gather, grid_update, p2g, scatter
 
 NAN, INF = math.nan, math.inf
+HUGE = 10**400
+"""Beyond float64."""
 
 
 def grid(**options: Any) -> mpm.Grid:
@@ -46,13 +48,31 @@ def moved(**given: Any) -> mpm.State:
     return mpm.rollout(**{"step": step(), "state": state(), "n": 1, "dt": 1e-3, **given})
 
 
+def heat(**options: Any) -> mpm.Heat:
+    return mpm.Heat(**{"grid": grid(), "conductivity": 1.0, "specific_heat": 1.0, **options})
+
+
+def warm(boundary: Any) -> mpm.State:
+    """A state after a step with a term of heat."""
+    return heat(boundaries=[boundary])(state(temperature=torch.zeros(len(state()))), 1e-3)
+
+
+FREE = heat_boundaries.FreeSurface()
+USES = (
+    lambda v: step()(v, 1e-3),
+    lambda v: heat()(v, 1e-3),
+    lambda v: moved(state=v),
+    lambda v: mpm.stable_dt(grid(), law(), v),
+)
+
 GRID = [
-    (lambda v: grid(dx=v), "dx", [NAN, INF, 0, -1.0, "x", None]),
+    (lambda v: grid(dx=v), "dx", [NAN, INF, 0, -1.0, "x", None, HUGE, 1e300, 1e-300]),
     (lambda v: grid(lower=v), "lower", [(0, NAN), (0, "a"), 3, "ab", (0,), None]),
     (lambda v: grid(upper=v), "upper", [(1, INF), (1, 1, 1), {}, (-1, 1)]),
     (lambda v: grid(scenes=v), "scenes", [-1, 1.5, NAN, True, "2"]),
     (lambda v: grid(kernel=v), "kernel", ["linear", 2, ["quadratic"]]),
     (lambda v: grid(capacity=v), "capacity", [-1, 2.5, NAN, "all", 10**9]),
+    (lambda v: grid(deterministic=v), "deterministic", [torch.zeros(3), None, "x", 2]),
     (lambda v: grid().activate(state().x, v), "scene", [5, torch.zeros(3, dtype=torch.int32)]),
 ]
 
@@ -71,7 +91,11 @@ STEP = [
     (lambda v: step(on_grid=v), "on_grid", [3, "wind"]),
     (lambda v: step(heat=v), "heat", [3, True, law()]),
     (lambda v: step()(state(), v), "dt", ["x", NAN, INF, 0, -1e-3, 1e300, [1e-3], torch.zeros(2, 2)]),
-    (lambda v: step().stable_dt(state(), v), "cfl", [NAN, 0, -1, "x"]),
+    (lambda v: step().stable_dt(state(), v), "cfl", [NAN, 0, -1, "x", HUGE]),
+    *((lambda v, use=use: use(v), "state", [None, 0.5, {}, torch.zeros(3), mpm.State]) for use in USES),
+    (lambda v: mpm.stable_dt(v, law(), state()), "grid", [None, 0.1]),
+    (lambda v: mpm.stable_dt(grid(), v, state()), "law", [None, 5, mpm.NeoHookean]),
+    (lambda v: mpm.stable_dt(grid(), law(), state(), stress_form=v), "stress_form", ["fem", [[1.0]]]),
     (lambda v: moved(n=v), "n", [NAN, 2.5, True, "3", -1, None]),
     (lambda v: moved(checkpoint=v), "checkpoint", [0, 1.5, True, "all"]),
     (lambda v: moved(step=v), "step", [None, 3]),
@@ -86,7 +110,15 @@ STATE = [
     (lambda v: state(v=v), "v", [3, torch.zeros(2, 2)]),
     (lambda v: state(scene=v), "scene", [5, torch.zeros(3)]),
     (lambda v: state(extra={"kept": v}), r"extra\['kept'\]", [5, torch.zeros(3)]),
-    (lambda v: state(time=v), "time", ["now", None, (0.0,)]),
+    (lambda v: state(extra=v), "extra", [[], None, 5]),
+    (lambda v: state(time=v), "time", ["now", None, (0.0,), (), HUGE]),
+    (lambda v: at_rest(dtype=v), "dtype", [-3, "float32", torch.int32, torch.float16]),
+    (lambda v: at_rest(device=v), "device", [[], 0.5, torch.zeros(3), "neo", HUGE]),
+    (lambda v: state().to(dtype=v), "dtype", [[[1.0]], torch.bfloat16]),
+    (lambda v: state().to(device=v), "device", [torch.float32, True, "neo"]),
+    (lambda v: state().select(v), "particles", [None, [0], torch.zeros(2, 2).long(), torch.zeros(2)]),
+    (lambda v: state().sorted(v), "grid", [None, 0.5, mpm.Grid]),
+    (lambda v: mpm.State.concatenate([state()], scene=v), "scene", [torch.zeros(3), None, "x"]),
     (lambda v: mpm.State.concatenate(v), "states", [[], [3], None, 5]),
     (lambda v: mpm.State.concatenate([state()], scene=True, scenes=v), r"scenes(\[0\])?", [[1, 2], [0], ["x"]]),
 ]
@@ -132,12 +164,17 @@ PARAMETERS: list[tuple[Any, str, list[Any]]] = [
 """Each is tried with numbers that are not finite, words and tensors that are wrong too."""
 
 LAWS = [
-    *((make, name, [*bad, NAN, INF, "x", torch.tensor([NAN]), torch.zeros(2, 2)]) for make, name, bad in PARAMETERS),
+    *(
+        (make, name, [*bad, NAN, INF, "x", torch.tensor([NAN]), torch.zeros(2, 2), HUGE, law()])
+        for make, name, bad in PARAMETERS
+    ),
     (lambda v: mpm.CustomLaw(v), "function", [None, "neo", 3]),
     (lambda v: mpm.CustomLaw(lambda F: F, v), "state_field", ["C", None]),
     (lambda v: mpm.CustomLaw(lambda F: F, stiffness=v), "stiffness", [NAN, INF, -1.0, "x"]),
     (lambda v: mpm.CustomPrincipalLaw(v), "function", [None, "neo", 3]),
     (lambda v: mpm.CustomPrincipalLaw(lambda s: s, v), "stiffness", [NAN, -1.0, "x"]),
+    (lambda v: mpm.PerMaterial(v), r"values(\[0\])?", [5, "12", [None], ["1"], [HUGE]]),
+    (lambda v: mpm.QuarticSand(E=1.0, nu=0.3, smallest_strain=v), "smallest_strain", [None, "x", NAN, -1.0]),
     (lambda v: mpm.Mixture(v), "laws", [law(), None, "neo"]),
     (lambda v: mpm.Mixture([law(), v]), r"laws\[1\]", ["neo", None, mpm.NeoHookean]),
     (lambda v: mpm.ThermalExpansion(v, 1e-3), "law", ["neo", None]),
@@ -156,10 +193,11 @@ BOUNDARIES = [
     (lambda v: ball(position=v), "position", [None, (0, NAN), "ab", (0, "x"), INF]),
     (lambda v: ball(radius=v), "radius", [None, NAN, INF, -0.1, "x"]),
     (lambda v: ball(kind=v), "kind", ["stick", None, 3]),
-    (lambda v: ball(friction=v), "friction", [NAN, INF, -0.1, "x", None]),
+    (lambda v: ball(friction=v), "friction", [NAN, INF, -0.1, "x", None, HUGE]),
     (lambda v: ball(velocity=v), "velocity", [(0, NAN), "ab", (INF, 0)]),
-    (lambda v: ball(rotation=v), "rotation", [NAN, "x", (0, INF, 0)]),
-    (lambda v: ball(angular_velocity=v), "angular_velocity", [NAN, "x"]),
+    (lambda v: ball(rotation=v), "rotation", [NAN, "x", (0, INF, 0), len]),
+    (lambda v: ball(angular_velocity=v), "angular_velocity", [NAN, "x", dict, HUGE]),
+    (lambda v: step(boundaries=[ball(friction=v)])(state(), 1e-3), "friction", [torch.zeros(0)]),
     (lambda v: ball(start=v), "start", [NAN, INF, "x", None]),
     (lambda v: ball(end=v), "end", [NAN, -1.0, "x", None]),
     (lambda v: ball(scene=v), "scene", [-1, 1.5, True, "x"]),
@@ -177,14 +215,36 @@ BOUNDARIES = [
     (lambda v: mpm.SDF(lambda x: x[:, 0], (0, 0), normal=v), "normal", [3.0, "up"]),
 ]
 
+HEAT = [
+    (lambda v: heat(grid=v), "grid", [None, 0.1]),
+    (lambda v: heat(plastic_heating=v), "plastic_heating", [None, "x", NAN, 1.5]),
+    (lambda v: heat(reference=v), "reference", [torch.zeros(3), None, NAN, HUGE]),
+    (lambda v: heat(tolerance=v), "tolerance", [[1.0], 0, NAN]),
+    (lambda v: heat(max_iterations=v), "max_iterations", [INF, NAN, 0, "x"]),
+    (lambda v: heat(method=v), "method", [[], "gmres"]),
+    (lambda v: heat_boundaries.Surface(torch.zeros(3, 2), v), "area", [None, {}, [None], len, -1.0, HUGE]),
+    (lambda v: heat_boundaries.Surface(torch.zeros(3, 2), 1.0, v), "scene", ["", dict, torch.zeros(3)]),
+    (lambda v: heat_boundaries.Flux(v, 1.0), "surface", [None, 1j, heat_boundaries.FreeSurface]),
+    (lambda v: heat_boundaries.Flux(FREE, v), "flux", [None, (), "x", NAN, HUGE]),
+    (lambda v: heat_boundaries.Convection(FREE, 1.0, v), "ambient", [None, b"x", 1j, HUGE]),
+    (lambda v: heat_boundaries.Radiation(FREE, v, 0.0), "emissivity", [(), None, 1.5]),
+    (lambda v: heat_boundaries.Fixed(v, 1.0), "region", [None, 1j, torch.zeros(3)]),
+    (lambda v: warm(heat_boundaries.Fixed(v, 1.0)), "region", [lambda x: None, lambda x: x[:, 0], lambda x: x > 0]),
+    (lambda v: warm(heat_boundaries.Flux(FREE, lambda t: v)), "a function of the time", [None, "x"]),
+    (lambda v: warm(heat_boundaries.Convection(FREE, 1.0, v)), "a value at nodes", [torch.zeros(0), torch.zeros(3)]),
+]
+
 SEED = [
     (lambda v: seed.box(v, (1, 1), 0.1), "lower", [(0, NAN), "ab", None, (2, 2), (0,), (0, "x")]),
     (lambda v: seed.box((0, 0), v, 0.1), "upper", [(0, INF), (1, 1, 1), 3]),
     (lambda v: seed.box((0, 0), (1, 1), v), "grid", [{}, NAN, 0, "x", None]),
     (lambda v: seed.box((0, 0), (1, 1), 0.1, v), "per_cell", [NAN, 0, -1, "x", None]),
+    (lambda v: seed.box((0, 0), (1, 1), 0.1, dtype=v), "dtype", ["neo", 1j, torch.zeros(3), torch.int64]),
+    (lambda v: seed.box((0, 0), (1, 1), 0.1, device=v), "device", [0.5, (), torch.zeros(0), "neo"]),
+    (lambda v: seed.fill(v, 0.1), "shape", [None, dict, torch.zeros(3)]),
     (lambda v: seed.box((0, 0), (1, 1), 0.1, method=v), "method", ["random", None]),
     (lambda v: seed.sphere(v, 0.2, 0.1), "center", [(0, NAN), "ab", 3]),
-    (lambda v: seed.sphere((0, 0), v, 0.1), "radius", [NAN, 0, -1, "x", None]),
+    (lambda v: seed.sphere((0, 0), v, 0.1), "radius", [NAN, 0, -1, "x", None, HUGE]),
     (lambda v: seed.capsule((0, 0), v, 0.1, 0.1), "a to b", [(0, 0)]),
     (lambda v: seed.cylinder(v, (0, 0, 1), 0.1, 0.1), "a", [(0, 0, NAN), "abc"]),
 ]
@@ -204,8 +264,8 @@ OPS = [
 ROWS = [
     pytest.param(call, name, values, id=f"{group}-{number}-{name}")
     for group, table in (
-        ("grid", GRID), ("step", STEP), ("state", STATE), ("law", LAWS), ("boundary", BOUNDARIES), ("seed", SEED),
-        ("op", OPS),
+        ("grid", GRID), ("step", STEP), ("state", STATE), ("law", LAWS), ("boundary", BOUNDARIES), ("heat", HEAT),
+        ("seed", SEED), ("op", OPS),
     )
     for number, (call, name, values) in enumerate(table)
 ]  # fmt: skip

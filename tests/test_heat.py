@@ -526,6 +526,7 @@ def test_bad_arguments():
         ({"specific_heat": PerMaterial([1.0, NAN])}, "specific_heat of material 1 must be positive"),
         ({"reference": NAN}, "reference must be finite, got nan"),
         ({"reference": math.inf}, "reference must be finite, got inf"),
+        ({"max_iterations": NAN}, "max_iterations must be at least 1, got nan"),
         ({"tolerance": NAN}, "tolerance must be between"),
         ({"plastic_heating": NAN}, "between 0 and 1"),
         ({"plastic_heating": 1.5}, "between 0 and 1"),

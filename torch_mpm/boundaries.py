@@ -770,7 +770,7 @@ def _column(time: float | Tensor, rank: int) -> float | Tensor:
 
 
 def _floats(name: str, value: Any) -> tuple[float, ...]:
-    values = value if hasattr(value, "__len__") and not isinstance(value, str) else (value,)
+    values = value if hasattr(value, "__len__") and not isinstance(value, (str, type)) else (value,)
     return tuple(float(check_number(name, a, "a number", lambda v: True)) for a in values)
 
 

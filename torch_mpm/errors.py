@@ -112,7 +112,7 @@ def check_device(device: Any) -> None:
         raise TypeError(f"device must be a torch.device or its name, got {_described(device)}")
     try:
         torch.device(device)
-    except (RuntimeError, OverflowError) as error:
+    except (RuntimeError, OverflowError, ValueError) as error:
         raise ValueError(f"device must be a torch.device or its name, got {device!r}: {error}") from None
 
 

@@ -20,6 +20,7 @@ because variances about a node with the weights β_p m_p C_p are at most those w
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any, Protocol
 
@@ -28,7 +29,7 @@ from torch import Tensor, nn
 
 from .boundaries import BoundaryList, _norm
 from .capture import outside_transforms, without_transforms
-from .errors import check_count, check_like, check_number
+from .errors import check_like, check_number
 from .failures import Failures, Problem, raise_failures, unsolved_heat
 from .grid import ActivationRecord, Blocks, Grid, check_grid
 from .heat_boundaries import FixedSurface, HeatNodes
@@ -118,7 +119,7 @@ class Heat(nn.Module):
         check_number("plastic_heating", plastic_heating, "between 0 and 1", lambda v: 0 <= v <= 1)
         check_number("tolerance", tolerance, "between 0 and 1", lambda v: 0 < v < 1)
         check_number("reference", reference)
-        check_count("max_iterations", max_iterations, 1)
+        check_number("max_iterations", max_iterations, "at least 1", lambda v: 1 <= v < math.inf)
         check_choice("method", method, METHODS)
         if method == "chebyshev" and any(isinstance(boundary, FixedSurface) for boundary in boundaries):
             raise ValueError('method must be "cg" or "multigrid" where a boundary is a FixedSurface, got "chebyshev"')

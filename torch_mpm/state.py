@@ -13,6 +13,7 @@ from torch import Tensor
 
 from .errors import (
     FLOATING,
+    NUMBER_OR_TENSOR,
     check_count,
     check_device,
     check_dtype,
@@ -47,8 +48,6 @@ class Time:
         if isinstance(time, Tensor):
             number = torch.compiler.is_compiling() and time.dim() == 0 and time.dtype == torch.float64
             kept = (time,) if number and time.device.type == "cpu" and not time.requires_grad else time
-        elif isinstance(time, tuple) and len(time) == 1 and isinstance(time[0], Tensor):
-            kept = time
         else:
             seconds = float(check_real("time", time, "a number or a tensor [B]"))
             kept = (torch.scalar_tensor(seconds, dtype=torch.float64, device="cpu"),)
@@ -376,9 +375,8 @@ def _given_velocity(velocity: Any, P: int, D: int) -> Tensor:
 
 def _checked_density(density: float | Tensor, particles: int) -> float | Tensor:
     if not isinstance(density, Tensor):
-        return float(
-            check_number("density", density, "positive and finite", lambda v: 0 < v < math.inf, "a number or a tensor")
-        )
+        positive = check_number("density", density, "positive and finite", lambda v: 0 < v < math.inf, NUMBER_OR_TENSOR)
+        return float(positive)
     if density.shape not in ((), (particles,)):
         raise ValueError(f"density must be a number or have shape [P] = [{particles}], got {shape_of(density)}")
     values = density.detach()

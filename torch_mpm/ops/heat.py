@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 import torch
@@ -166,8 +167,7 @@ def _op_of(method: int) -> Any:
 def _per_scene(name: str, value: float | Tensor, scenes: int, x: Tensor) -> tuple[float, Tensor | None]:
     """A number, or a tensor [B] and zero."""
     if not isinstance(value, Tensor):
-        check_number(name, value, "a finite number >= 0", lambda v: 0 <= v < float("inf"), NUMBER_OR_TENSOR)
-        return value, None
+        return check_number(name, value, "a finite number >= 0", lambda v: 0 <= v < math.inf, NUMBER_OR_TENSOR), None
     if value.dim() > 1 or (value.dim() == 1 and value.shape[0] not in (1, scenes)):
         raise ValueError(f"{name} must be a number or have shape [], [1] or [B] = [{scenes}], got {shape_of(value)}")
     if value.device != x.device:
