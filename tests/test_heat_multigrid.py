@@ -41,7 +41,8 @@ def square(
 
 def levels_of(h: Heat) -> list[heat_multigrid.Level]:
     free, weight = (h.capacity > 0).to(h.x), h.capacity / h.dt
-    return heat_multigrid._levels(h.blocks, h.x, h.conductance, weight, free, h.fixed & False)
+    diagonal = torch.ops.torch_mpm.heat_operator(h.x, h.conductance, None, *h.blocks.topology)
+    return heat_multigrid._levels(h.blocks, h.x, h.conductance, weight, free, h.fixed & False, diagonal)
 
 
 def weighted_error(h: Heat, increment: Tensor, exact: Tensor) -> float:

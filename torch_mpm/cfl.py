@@ -89,7 +89,7 @@ def stable_dt(
     check_grid(grid)
     check_state(state)
     law = as_law("law", law)
-    check_number("cfl", cfl, "positive", lambda v: v > 0)
+    check_number("cfl", cfl, "positive and finite", lambda v: 0 < v < math.inf)
     if stress_form not in ("mls", "gradient"):
         raise ValueError(f"stress_form must be 'gradient' or 'mls', got {stress_form!r}")
     kept = 2.0 if transfer == "apic" and stress_form == "mls" else 1.0  # 1 + s

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ..errors import DamagedFileError
 from ..hdf5 import h5py_module, open_sealed, seal
-from ..state import State
+from ..state import State, _as_soa
 
 Host = dict[str, Tensor]
 REMEDY = "remove it and add --resume to simulate from the start"
@@ -67,4 +67,4 @@ def load(path: Path, device: torch.device | str = "cpu") -> tuple[State, dict[st
             state = State(**tensors, extra=extra, time=time)
         except (KeyError, TypeError, ValueError, RecursionError) as error:
             raise DamagedFileError(path, f"does not hold the state of a run ({error})", REMEDY) from None
-    return State.concatenate([state]).to(device), record  # concatenate restores the memory layout
+    return state.map(_as_soa).to(device), record
