@@ -81,8 +81,9 @@ def test_gradients_of_a_rollout_equal_differences(c, device):
     grads = torch.autograd.grad(loss(leaves, None), list(leaves.values()))
     slope = sum(float((g * along[name]).sum()) for name, g in zip(leaves, grads, strict=True))
     again = torch.autograd.grad(loss(leaves, c.checkpoint or 2), list(leaves.values()))
+    noise = 1e-6 if device == "cuda" and c.contrast > 1e3 else 1e-9  # sums in another order, through such a solve
     for name, a, b in zip(leaves, grads, again, strict=True):
-        torch.testing.assert_close(a, b, rtol=1e-9, atol=1e-9 * float(a.abs().max()), msg=f"{name}: {c.text}")
+        torch.testing.assert_close(a, b, rtol=noise, atol=noise * float(a.abs().max()), msg=f"{name}: {c.text}")
     errors = []
     with torch.no_grad():
         for h in (1e-5, 1e-6, 1e-7):

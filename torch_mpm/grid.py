@@ -101,6 +101,10 @@ class Grid:
         self._pending: torch.cuda.Event | None = None
         self._on_host: Tensor | None = None
 
+    def __getstate__(self) -> dict[str, Any]:
+        """For copies: without what is on its way from the device, which neither copies nor pickles."""
+        return {**self.__dict__, "_pending": None, "_on_host": None}
+
     def __repr__(self) -> str:
         return (
             f"Grid(dx={self.dx}, lower={self.lower}, upper={self.upper}, scenes={self.scenes}, kernel={self.kernel!r}, "

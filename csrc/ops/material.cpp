@@ -27,6 +27,7 @@ LawInfo find(const std::string& name) {
 // F [P, D, D], or J [P] of a law without shear.
 void check_state(const LawInfo& law, const Tensor& state, int64_t dim) {
   STD_TORCH_CHECK(dim == 2 || dim == 3, "dim must be 2 or 3, got ", dim);
+  STD_TORCH_CHECK(state.defined(), "the state must be a tensor, got None");
   STD_TORCH_CHECK(state.dim() == (law.shear ? 3 : 1), "the state must have shape ", law.shear ? "[P, D, D]" : "[P]",
                   ", got ", shape_of(state));
   check_shape(state, "the state", law.shear ? Shape{state.size(0), dim, dim} : Shape{state.size(0)});
