@@ -168,7 +168,8 @@ def test_a_loss_leaves_failed_scenes_out(device):
         x = state.x.clone()
         if poisoned:
             x[first_of(state, 1) + 5] = torch.nan
-        state = mpm.rollout(step, state.replace(x=x), 4, 1e-3)
+        F = 1.1 * torch.eye(state.x.shape[1], dtype=x.dtype, device=device).expand(len(state), -1, -1)
+        state = mpm.rollout(step, state.replace(x=x, F=F), 4, 1e-3)
         failed = step.failures().failed
         kept = ~failed[state.scene.long()] & (state.scene == 0)
         return torch.autograd.grad(torch.where(kept[:, None], state.v, 0).square().sum(), law.E)[0], failed.tolist()

@@ -86,9 +86,10 @@ class Failures:
     problems: dict[str, Problem]
 
     @staticmethod
-    def of(problems: dict[str, Problem], like: Tensor) -> Failures:
-        """Failures of B scenes; `like` is a tensor [B] on their device."""
-        failed = torch.zeros_like(like, dtype=torch.bool)
+    def of(problems: dict[str, Problem], scenes: int) -> Failures:
+        """Failures of B scenes, on the device of the problems."""
+        device = next((problem.count.device for problem in problems.values()), "cpu")
+        failed = torch.zeros(scenes, dtype=torch.bool, device=device)
         for problem in problems.values():
             failed = failed | (problem.count > 0)
         return Failures(failed, problems)

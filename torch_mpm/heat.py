@@ -376,7 +376,7 @@ class Heat(nn.Module):
         if self.unsolved is None:
             return
         problems = self._activations.problems(self.grid) | self.problems()
-        raise_failures(Failures.of(problems, self.unsolved), self._activations.all(), self.grid)
+        raise_failures(Failures.of(problems, self.grid.scenes), self._activations.all(), self.grid)
 
     def reset(self) -> None:
         """Forget what became of the solves so far."""

@@ -255,14 +255,12 @@ class Step(TensorModule):
         Args:
             state: its masses, volumes, velocities and deformations are looked at too.
         """
-        statuses = self._activations.all()
         problems = self._activations.problems(self.grid)
         if self.heat is not None:
             problems |= self.heat.problems()
         if state is not None:
             problems |= problems_of_state(self.law, self.prepare(state), self.grid.scenes)
-        device = statuses[0].device if statuses else None if state is None else state.x.device
-        return Failures.of(problems, torch.zeros(self.grid.scenes, device=device))
+        return Failures.of(problems, self.grid.scenes)
 
     def check(self, state: State | None = None) -> None:
         """Read the status of all steps so far, and look at a state if one is given; synchronises with the device.

@@ -280,10 +280,6 @@ def text(result: dict[str, Any]) -> str:
         "",
         summary(result["rows"], "law"),
     ]
-    if "before" in result:
-        before = result["before"]
-        lines += ["", f"The linear limit alone, commit {before['environment']['commit']}:", ""]
-        lines += [summary(before["rows"], "motion")]
     keys = (*DESCRIBED, "cfl", "step", "gain")
     wrong = [[row[k] for k in keys] for row in result["rows"] if any(f(row) for f in COUNTS.values())]
     return "\n".join([*lines, "", "## What went wrong", "", common.table(keys, wrong)])
@@ -294,7 +290,6 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="a few rollouts, to see that it works")
     parser.add_argument("--out", type=Path, default=common.RESULTS)
     parser.add_argument("--count", type=int, default=240, help="number of rollouts")
-    parser.add_argument("--before", type=Path, help="result of other code, shown beside this one's")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     count, begin = 10 if arguments.quick else arguments.count, time.perf_counter()
@@ -302,8 +297,6 @@ def main() -> None:
     cases = [Case.make(number) for number in range(count)]
     result["rows"] = [run(case, cfl, result["steps"]) for cfl in CFL for case in cases]
     result["seconds"] = time.perf_counter() - begin
-    if arguments.before:
-        result["before"] = json.loads(arguments.before.read_text())
     print(summary(result["rows"], "motion"))
     common.write(arguments.out, "adversarial", result, text(result))
     sys.exit(any(row["cfl"] == 1 and (row["inverted"] or row["not finite"]) for row in result["rows"]))
