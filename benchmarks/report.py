@@ -212,8 +212,6 @@ def adversarial(result: dict[str, Any]) -> str:
         "system without FLIP."
     )
     parts = [intro, rollouts(result["rows"], "law")]
-    if "before" in result:
-        parts += ["The same with the linear limit alone:", rollouts(result["before"]["rows"], "law")]
     return "\n\n".join([*parts, f"- {common.describe(result['environment'])}"])
 
 
