@@ -18,6 +18,7 @@ import shutil
 import subprocess
 import sys
 import sysconfig
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
@@ -45,7 +46,10 @@ HOST_FLAGS = ["-fPIC", "-fvisibility=hidden", "-Wall", f"-ffile-prefix-map={UP}=
 # One thread of nvcc per architecture (--threads); template kernels make large fat binaries, so they are compressed.
 NVCC_FLAGS = ["-O3", "--expt-relaxed-constexpr", "--threads=2", "-Xfatbin=-compress-all"]
 
-# Files csrc/cpu/*_kernels.cpp are compiled once per level, in the namespace named by TORCH_MPM_ISA.
+# Definitions that tell the objects of one source apart.
+VARIANTS = ("-DTORCH_MPM_ISA=", "-DMPM_SCALAR=", "-DMPM_DIMENSION=")
+
+# Files csrc/*/*.cpu.cpp are compiled once per level, in the namespace named by TORCH_MPM_ISA.
 X86_LEVELS = {"baseline": "x86-64", "avx2": "x86-64-v3", "avx512": "x86-64-v4"}
 
 
@@ -174,9 +178,9 @@ class Ninja:
     def library(self, library: Library) -> None:
         objects = []
         for source, rule, flags in library.objects:
-            level = next((f.partition("=")[2] for f in flags if f.startswith("-DTORCH_MPM_ISA=")), "")
             relative = source.relative_to(ROOT)
-            target = f"{library.name}.obj/{relative}{level and '.' + level}.o"
+            variant = [f.partition("=")[2] for f in flags if f.startswith(VARIANTS)]
+            target = f"{library.name}.obj/{'.'.join([str(relative), *variant])}.o"
             self.lines.append(f"build {target}: {rule} {UP}{relative}\n  flags = {shlex.join(flags)}")
             objects.append(target)
         self.lines.append(f"build {library.name}: {library.rule} {' '.join(objects)}")
@@ -194,20 +198,28 @@ def cpu_library(levels: dict[str, list[str]]) -> Library:
     # csrc/cpu/isa.h forwards calls to the levels that exist.
     flags = ["-DTORCH_MPM_BACKEND=cpu", *(f"-DTORCH_MPM_HAS_{level.upper()}" for level in levels)]
     plain_options = [f"-march={X86_LEVELS['baseline']}"] if next(iter(levels.values())) else []
-    kernels = sorted((CSRC / "cpu").glob("*_kernels.cpp"))
-    plain = sorted({*(CSRC / "ops").glob("*.cpp"), *(CSRC / "cpu").glob("*.cpp")} - set(kernels))
+    plain = sorted([*CSRC.glob("*/*.op.cpp"), *(CSRC / "cpu").glob("*.cpp")])
     objects = [(source, "cxx", [*flags, *plain_options]) for source in plain]
     # The baseline comes first: of an inline function that several objects define, the linker keeps the first, and that
     # one must run on every machine.
     for level, options in levels.items():
-        objects += [(source, "cxx", [*flags, *options, f"-DTORCH_MPM_ISA={level}"]) for source in kernels]
+        own = [*flags, *options, f"-DTORCH_MPM_ISA={level}"]
+        objects += [(source, "cxx", [*own, *part]) for source, part in parts(CSRC.glob("*/*.cpu.cpp"))]
     return Library("torch_mpm/lib/libtorch_mpm_cpu.so", objects, "link_cpu")
 
 
 def cuda_library() -> Library:
-    sources = [*sorted((CSRC / "ops").glob("*.cpp")), *sorted((CSRC / "cuda").glob("*.cu"))]
-    objects = [(source, "nvcc", ["-DTORCH_MPM_BACKEND=cuda"]) for source in sources]
+    sources = [*parts(CSRC.glob("*/*.op.cpp")), *parts(CSRC.glob("*/*.cu"))]
+    objects = [(source, "nvcc", ["-DTORCH_MPM_BACKEND=cuda", *part]) for source, part in sources]
     return Library("torch_mpm/lib/libtorch_mpm_cuda.so", objects, "link_cuda")
+
+
+def parts(sources: Iterable[Path]) -> list[tuple[Path, list[str]]]:
+    """Sources with the options of each part that they are compiled in (csrc/common/instantiate.h)."""
+    scalars = [[f"-DMPM_SCALAR={scalar}"] for scalar in ("float", "double")]
+    shapes = [[*scalar, f"-DMPM_DIMENSION={dimension}"] for scalar in scalars for dimension in (2, 3)]
+    split = {"gather.cu": shapes, "scatter.cu": shapes, "heat.cu": shapes, "g2p_advance.cu": scalars}
+    return [(source, part) for source in sorted(sources) for part in split.get(source.name, [[]])]
 
 
 def math_library(version: str) -> Library | None:
@@ -220,7 +232,7 @@ def math_library(version: str) -> Library | None:
     flags = [f"-isystem{python}", f"-isystem{Path(pybind11.origin).parent / 'include'}"]
     flags += [f'-DTORCH_MPM_VERSION="{version}"']
     suffix = sysconfig.get_config_var("EXT_SUFFIX")
-    objects = [(CSRC / "math" / "python_module.cpp", "cxx_module", flags)]
+    objects = [(CSRC / "common" / "python_module.cpp", "cxx_module", flags)]
     return Library(f"torch_mpm/_math{suffix}", objects, "link_module")
 
 
@@ -325,6 +337,6 @@ class Wheel(bdist_wheel):
 
 
 setup(
-    ext_modules=[Extension("torch_mpm._math", ["csrc/math/python_module.cpp"], optional=True)],
+    ext_modules=[Extension("torch_mpm._math", ["csrc/common/python_module.cpp"], optional=True)],
     cmdclass={"build_ext": Build, "bdist_wheel": Wheel},
 )

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 import torch_mpm as mpm
-from torch_mpm.heat_boundaries import FixedSurface
+from torch_mpm.heat.boundaries import FixedSurface
 
 CELLS, STEPS, DT = 32, 24, 4e-3
 

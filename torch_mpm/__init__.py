@@ -3,14 +3,27 @@
 from typing import TYPE_CHECKING, Any
 
 from . import _library as _library
-from . import heat_boundaries, ops, seed
+from . import ops, seed
 from .boundaries import SDF, Box, Capsule, Plane, Revolved, Sphere, Walls
 from .cfl import stable_dt
+from .data.trajectory import Trajectory
 from .errors import DamagedFileError, GridOverflowError, SimulationError
 from .failures import Failures
 from .grid import Blocks, Grid
 from .heat import Heat
-from .materials import CustomLaw, Material, Mixture, NeoHookean, WeaklyCompressible
+from .heat import boundaries as heat_boundaries
+from .laws.material import CustomLaw, Material, Mixture, NeoHookean, WeaklyCompressible
+from .laws.plastic import (
+    CamClay,
+    CustomPrincipalLaw,
+    FixedCorotated,
+    Hencky,
+    HerschelBulkley,
+    Snow,
+    VonMises,
+)
+from .laws.sand import QuarticSand
+from .laws.thermal import Melting, ThermalExpansion
 from .ops import (
     HeatSolve,
     advance,
@@ -26,23 +39,11 @@ from .ops import (
     svd3,
 )
 from .parameters import PerMaterial, Table
-from .plasticity import (
-    CamClay,
-    CustomPrincipalLaw,
-    FixedCorotated,
-    Hencky,
-    HerschelBulkley,
-    Snow,
-    VonMises,
-)
-from .sand import QuarticSand
 from .state import State
 from .step import Step, rollout
-from .thermal import Melting, ThermalExpansion
-from .trajectory import Trajectory
 
 if TYPE_CHECKING:
-    from .scene import Scene as Scene
+    from ..scene import Scene as Scene
 
 __all__ = [
     "SDF",
@@ -102,7 +103,7 @@ __all__ = [
 def __getattr__(name: str) -> Any:
     """`Scene` needs the extra `scene`, so it is imported where it is used."""
     if name == "Scene":
-        from .scene import Scene
+        from ..scene import Scene
 
         return Scene
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

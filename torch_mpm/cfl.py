@@ -38,7 +38,7 @@ from torch import Tensor
 
 from .errors import check_number
 from .grid import Grid, check_grid
-from .materials import Material, as_law
+from .laws.material import Material, as_law
 from .state import State, check_state
 
 GRADIENT_BOUND = {

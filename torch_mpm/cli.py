@@ -133,13 +133,13 @@ def _require_outputs(scene: Any) -> None:
         for module in ("matplotlib", "PIL", "imageio_ffmpeg", *(["vtk"] if scene.dim == 3 else [])):
             require(module)
     if scene.output.vtk or scene.output.ply:
-        from .export import meshio_module
+        from .data.export import meshio_module
 
         meshio_module()
 
 
 def _outputs(scene: Any, options: argparse.Namespace) -> list[tuple[str, Any]]:
-    from . import export
+    from .data import export
 
     outputs: list[tuple[str, Any]] = []
     if scene.render is not None:
@@ -201,7 +201,7 @@ def _render(options: argparse.Namespace) -> None:
 
 
 def _export(options: argparse.Namespace) -> None:
-    from . import export
+    from .data import export
 
     if options.vtk or not options.ply:
         print(export.export_vtk(options.run))

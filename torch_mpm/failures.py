@@ -13,7 +13,7 @@ from .errors import GridOverflowError, SimulationError
 
 if TYPE_CHECKING:
     from .grid import Grid
-    from .materials import Material
+    from .laws.material import Material
     from .state import State
 
 NAMED = 12

@@ -35,7 +35,7 @@ KERNEL_ORDERS = {"quadratic": 2, "cubic": 3}
 
 
 def inverse_inertia(order: int, dx: float) -> float:
-    """D⁻¹ [1/m²] of a kernel order and node distance; `BSpline::inverse_inertia` of csrc/math/bspline.h."""
+    """D⁻¹ [1/m²] of a kernel order and node distance; `BSpline::inverse_inertia` of csrc/common/bspline.h."""
     return (4.0 if order == 2 else 3.0) / dx**2
 
 

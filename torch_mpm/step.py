@@ -16,8 +16,8 @@ from .cfl import stable_dt
 from .errors import check_count, check_number, check_vector, shape_of
 from .failures import Failures, problems_of_state, raise_failures
 from .grid import ActivationRecord, Blocks, Grid, check_grid
-from .heat import Heat
-from .materials import Material, as_law
+from .heat.heat import Heat
+from .laws.material import Material, as_law
 from .ops import contact, fusible, g2p, g2p_advance, gather, grid_update, p2g
 from .ops.arguments import check_choice
 from .ops.transfer import STRESS_FORMS

@@ -24,7 +24,7 @@ import torch
 from torch import Tensor
 
 import torch_mpm as mpm
-from torch_mpm.heat_boundaries import FixedSurface, Flux, Surface
+from torch_mpm.heat.boundaries import FixedSurface, Flux, Surface
 
 from .. import common
 from .convergence import fitted_order

@@ -11,7 +11,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from torch_mpm.hdf5 import FOOTER, seal
+from torch_mpm.data.hdf5 import FOOTER, seal
 from torch_mpm.scene import folder as folders
 
 Damage = Callable[[Path, random.Random], None]

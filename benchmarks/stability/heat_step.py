@@ -24,7 +24,7 @@ import torch
 from torch import Tensor
 
 import torch_mpm as mpm
-from torch_mpm.heat_boundaries import Convection, Fixed, FreeSurface, HeatNodes
+from torch_mpm.heat.boundaries import Convection, Fixed, FreeSurface, HeatNodes
 from torch_mpm.reference.heat import HeatOperator
 
 from .. import common

@@ -1,7 +1,7 @@
 #pragma once
 
+#include "common/pack.h"
 #include "cpu/schedule.h"
-#include "math/pack.h"
 
 // What the transfer kernels share: chunks of particles of one home block, groups of kLanes of them, and tiles, private
 // copies of the nodes that the particles of one home touch.
@@ -16,7 +16,7 @@ using Lanes = Pack<T, kLanes>;
 template <class T>
 constexpr int kWideLanes = kRegisterBytes / int(sizeof(T)) > kLanes ? kRegisterBytes / int(sizeof(T)) : kLanes;
 
-// A slot that holds particles, and the slots of the blocks that these can touch: o as in activate_kernels.cpp.
+// A slot that holds particles, and the slots of the blocks that these can touch: o as in activate.cpu.cpp.
 template <class T, int D>
 struct Home {
   int scene;
@@ -84,8 +84,8 @@ struct GroupOf {
   void find_runs() {
 #ifdef __AVX512VL__
     unsigned first = 1;  // lanes that begin a run, as bits
-    MPM_UNROLL
-    for (int l = 1; l < N; l++) first |= unsigned(id[l] != id[l - 1] + 1) << l;
+    MPM_UNROLL for (int l = 1; l < N; l++)
+      first |= unsigned(id[l] != id[l - 1] + 1) << l;
     const unsigned all = (1u << count) - 1;
     runs = 0;
     for (first &= all; first; first &= first - 1) {
@@ -151,8 +151,8 @@ template <class T, int N>
 MPM_HD Pack<T, N> load_row(const T* row, int64_t stride, const GroupOf<N>& g) {
   if (stride == 1) return g.consecutive ? Pack<T, N>::load(row + g.id[0]) : load_runs(row, g);
   T lanes[N];
-  MPM_UNROLL
-  for (int l = 0; l < N; l++) lanes[l] = row[g.id[l] * stride];
+  MPM_UNROLL for (int l = 0; l < N; l++)
+    lanes[l] = row[g.id[l] * stride];
   return Pack<T, N>::load(lanes);
 }
 
@@ -162,8 +162,8 @@ MPM_HD void store_row_exactly(const Lanes<T>& v, T* row, int64_t stride, const G
   T lanes[kLanes];
   v.store(lanes);
   if (g.count == kLanes && stride == 1) {
-    MPM_UNROLL
-    for (int l = 0; l < kLanes; l++) row[g.id[l]] = lanes[l];
+    MPM_UNROLL for (int l = 0; l < kLanes; l++)
+      row[g.id[l]] = lanes[l];
   } else {
     for (int l = 0; l < g.count; l++) row[g.id[l] * stride] = lanes[l];
   }
@@ -240,8 +240,8 @@ MPM_HD bool unit_stride(const Fields&... f) {
   return ((!f.pointer || f.stride[0] == 1) && ...);
 }
 
-// Nodes that the particles of one home touch, kChannels values each. Rows run along the last axis and are long enough to
-// add four nodes anywhere.
+// Nodes that the particles of one home touch, kChannels values each. Rows run along the last axis and are long enough
+// to add four nodes anywhere.
 template <int Order, class T, int D>
 struct Tile {
   static constexpr int kWidth = kBlockWidth + Order, kRow = 2 * kBlockWidth * kChannels;

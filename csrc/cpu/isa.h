@@ -1,6 +1,6 @@
 #pragma once
 
-// Kernels of *_kernels.cpp exist once per instruction set, in a namespace named after it; the best one is chosen at run
+// Kernels of *.cpu.cpp exist once per instruction set, in a namespace named after it; the best one is chosen at run
 // time.
 namespace mpm::cpu {
 

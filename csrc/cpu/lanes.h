@@ -1,8 +1,8 @@
 #pragma once
 
+#include "common/lanes.h"
+#include "common/pack.h"
 #include "cpu/parallel.h"
-#include "materials/lanes.h"
-#include "math/pack.h"
 
 namespace mpm {
 inline namespace TORCH_MPM_ISA {

@@ -2,7 +2,8 @@
 
 #include <cstdint>
 
-#include "math/host_device.h"
+#include "common/host_device.h"
+#include "common/instantiate.h"
 
 // Parallel loops for the kernels of csrc/cpu, which are compiled for several instruction sets and therefore see neither
 // torch nor templates of the standard library.

@@ -20,8 +20,7 @@ MPM_HD V exchange(const V& a, const V& b, std::integer_sequence<int, Lane...>) {
 template <int Step, class T, int N>
 MPM_HD void exchange_all(Pack<T, N> r[8]) {
   constexpr auto all = std::make_integer_sequence<int, N>();
-  MPM_UNROLL
-  for (int i = 0; i < 8; i++) {
+  MPM_UNROLL for (int i = 0; i < 8; i++) {
     if (i & Step) continue;
     const auto a = r[i].part[0], b = r[i + Step].part[0];
     r[i].part[0] = exchange<Step, false>(a, b, all);
@@ -52,16 +51,15 @@ MPM_HD void store_half(const Pack<T, N>& v, int half, T* to) {
 // Lane l of field k to to[l * stride + k]; Fields is a multiple of 8.
 template <int Fields, class T, int N>
 MPM_HD void store_transposed(Pack<T, N> field[Fields], T* to, int stride) {
-  MPM_UNROLL
-  for (int first = 0; first < Fields; first += 8) {
+  MPM_UNROLL for (int first = 0; first < Fields; first += 8) {
     if constexpr (Pack<T, N>::kParts == 1) {
       transpose(field + first);
-      MPM_UNROLL
-      for (int l = 0; l < N; l++) store_half(field[first + l % 8], l / 8, to + l * stride + first);
+      MPM_UNROLL for (int l = 0; l < N; l++)
+        store_half(field[first + l % 8], l / 8, to + l * stride + first);
     } else {
       T lanes[8][N];
-      MPM_UNROLL
-      for (int k = 0; k < 8; k++) field[first + k].store(lanes[k]);
+      MPM_UNROLL for (int k = 0; k < 8; k++)
+        field[first + k].store(lanes[k]);
       for (int l = 0; l < N; l++)
         for (int k = 0; k < 8; k++) to[l * stride + first + k] = lanes[k][l];
     }

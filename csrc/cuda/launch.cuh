@@ -6,8 +6,12 @@
 #include <stdexcept>
 #include <string>
 
+#include "common/instantiate.h"
+
 // Host side of a kernel launch.
 namespace mpm::cuda {
+
+using Stream = cudaStream_t;
 
 inline void check(cudaError_t error) {
   if (error != cudaSuccess) throw std::runtime_error(std::string("CUDA: ") + cudaGetErrorString(error));

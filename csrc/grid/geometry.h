@@ -3,7 +3,7 @@
 #include <cmath>
 #include <cstdint>
 
-#include "math/bspline.h"
+#include "common/bspline.h"
 
 // The node lattice of one scene: node i of an axis lies at lower + (i - padding) dx. Blocks are 4 nodes wide.
 namespace mpm {
@@ -43,8 +43,8 @@ inline namespace TORCH_MPM_ISA {
 template <int D, class T>
 MPM_HD bool is_finite(const T x[D]) {
   bool finite = true;
-  MPM_UNROLL
-  for (int i = 0; i < D; i++) finite = finite && x[i] - x[i] == T(0);
+  MPM_UNROLL for (int i = 0; i < D; i++)
+    finite = finite && x[i] - x[i] == T(0);
   return finite;
 }
 
@@ -74,8 +74,7 @@ MPM_HD S distance_in_cells(const Geometry<T, D>& g, int axis, const S& x, const 
 template <int Order, class T, int D>
 MPM_HD bool locate(const Geometry<T, D>& g, const T x[D], int base[D], T f[D]) {
   bool inside = true;
-  MPM_UNROLL
-  for (int i = 0; i < D; i++) {  // no early return: it would make each coordinate wait for the one before
+  MPM_UNROLL for (int i = 0; i < D; i++) {  // no early return: it would make each coordinate wait for the one before
     const T node = base_node<Order>(g, i, x[i]);
     const bool on = on_lattice<Order>(g, i, node);
     inside = inside && on;
@@ -88,16 +87,15 @@ MPM_HD bool locate(const Geometry<T, D>& g, const T x[D], int base[D], T f[D]) {
 template <class T, int D>
 MPM_HD int block_index(const Geometry<T, D>& g, int scene, const int block[D]) {
   int r = scene;
-  MPM_UNROLL
-  for (int i = 0; i < D; i++) r = r * g.blocks[i] + block[i];
+  MPM_UNROLL for (int i = 0; i < D; i++)
+    r = r * g.blocks[i] + block[i];
   return r;
 }
 
 // Scene and block coordinates of an entry of the block table.
 template <class T, int D>
 MPM_HD int block_coordinates(const Geometry<T, D>& g, int index, int block[D]) {
-  MPM_UNROLL
-  for (int i = D - 1; i >= 0; i--) {
+  MPM_UNROLL for (int i = D - 1; i >= 0; i--) {
     block[i] = index % g.blocks[i];
     index /= g.blocks[i];
   }
@@ -108,8 +106,8 @@ MPM_HD int block_coordinates(const Geometry<T, D>& g, int index, int block[D]) {
 template <int D>
 MPM_HD int node_in_block(const int node[D]) {
   int r = 0;
-  MPM_UNROLL
-  for (int i = 0; i < D; i++) r = r * kBlockWidth + (node[i] & (kBlockWidth - 1));
+  MPM_UNROLL for (int i = 0; i < D; i++)
+    r = r * kBlockWidth + (node[i] & (kBlockWidth - 1));
   return r;
 }
 

@@ -1,6 +1,6 @@
 #pragma once
 
-#include "math/host_device.h"
+#include "common/host_device.h"
 
 // The status tensor, int32 [1 + B, 8], that `activate` returns and hands from step to step. Row 0 counts the particles
 // of all scenes, row 1 + b those of scene b; a particle whose scene is none of these counts in row 0 alone. First means

@@ -1,7 +1,7 @@
 #pragma once
 
-#include "math/bspline.h"
-#include "math/host_device.h"
+#include "common/bspline.h"
+#include "common/host_device.h"
 
 // What one particle adds to the heat operator H_ij = Σ_p κ_p V_p ∇Φ_i · ∇Φ_j with ∇Φ_i = D⁻¹ N_i (x_i − x_p) (Gao et
 // al. 2018, supplement, equation 8), on the (Order + 1)^D nodes of its support, one axis after another (sum
@@ -21,9 +21,7 @@ constexpr int kMiddle = 1;  // the node of an axis whose value stays
 template <int Order, int D, class F>
 MPM_HD void for_lines(const F& f) {
   constexpr int S = Order + 1, lines = kSupportNodes<Order, D> / S;
-  MPM_UNROLL
-  for (int axis = 0, stride = 1; axis < D; axis++, stride *= S)
-    MPM_UNROLL
+  MPM_UNROLL for (int axis = 0, stride = 1; axis < D; axis++, stride *= S) MPM_UNROLL
     for (int line = 0; line < lines; line++) f(line / stride * stride * S + line % stride, stride);
 }
 
@@ -31,8 +29,8 @@ MPM_HD void for_lines(const F& f) {
 template <int Order, int D, class T>
 MPM_HD void to_differences(T* u) {
   for_lines<Order, D>([&](int first, int stride) {
-    MPM_UNROLL
-    for (int k = Order; k > kMiddle; k--) u[first + k * stride] -= u[first + (k - 1) * stride];
+    MPM_UNROLL for (int k = Order; k > kMiddle; k--)
+      u[first + k * stride] -= u[first + (k - 1) * stride];
     u[first] -= u[first + kMiddle * stride];
   });
 }
@@ -41,8 +39,8 @@ template <int Order, int D, class T>
 MPM_HD void to_nodes(T* sum) {
   for_lines<Order, D>([&](int first, int stride) {
     sum[first + kMiddle * stride] -= sum[first];
-    MPM_UNROLL
-    for (int k = kMiddle; k < Order; k++) sum[first + k * stride] -= sum[first + (k + 1) * stride];
+    MPM_UNROLL for (int k = kMiddle; k < Order; k++)
+      sum[first + k * stride] -= sum[first + (k + 1) * stride];
   });
 }
 
@@ -53,19 +51,16 @@ struct CellWeights {
   P weight[D][S], moment[D][S];
 
   MPM_HD explicit CellWeights(const P f[D]) {
-    MPM_UNROLL
-    for (int a = 0; a < D; a++) {
+    MPM_UNROLL for (int a = 0; a < D; a++) {
       BSpline<Order>::weights(f[a], weight[a]);
-      MPM_UNROLL
-      for (int k = 0; k < S; k++) moment[a][k] = k == 0 ? -(weight[a][k] * f[a]) : weight[a][k] * (P(k) - f[a]);
+      MPM_UNROLL for (int k = 0; k < S; k++)
+        moment[a][k] = k == 0 ? -(weight[a][k] * f[a]) : weight[a][k] * (P(k) - f[a]);
     }
   }
   // Times those of the nodes at an offset of -1, 0 or 1 along each axis; zero where they are not in the support.
   MPM_HD CellWeights times_neighbour(const int e[D]) const {
     CellWeights s = *this;
-    MPM_UNROLL
-    for (int a = 0; a < D; a++)
-      MPM_UNROLL
+    MPM_UNROLL for (int a = 0; a < D; a++) MPM_UNROLL
       for (int k = 0; k < S; k++) {
         const int n = k + e[a], inside = n >= 0 && n < S;
         s.weight[a][k] = inside ? weight[a][k] * weight[a][n] : P(0);
@@ -81,9 +76,7 @@ struct DifferenceWeights : CellWeights<Order, P, D> {
   using CellWeights<Order, P, D>::weight, CellWeights<Order, P, D>::moment;
 
   MPM_HD explicit DifferenceWeights(const P f[D]) : CellWeights<Order, P, D>(f) {
-    MPM_UNROLL
-    for (int a = 0; a < D; a++)
-      MPM_UNROLL
+    MPM_UNROLL for (int a = 0; a < D; a++) MPM_UNROLL
       for (int k = Order - 1; k > kMiddle; k--) {
         weight[a][k] += weight[a][k + 1];
         moment[a][k] += moment[a][k + 1];
@@ -91,15 +84,14 @@ struct DifferenceWeights : CellWeights<Order, P, D> {
   }
   MPM_HD P interpolate(int axis, const P* u) const {
     P sum = u[kMiddle];
-    MPM_UNROLL
-    for (int k = 0; k <= Order; k++)
+    MPM_UNROLL for (int k = 0; k <= Order; k++)
       if (k != kMiddle) sum += weight[axis][k] * u[k];
     return sum;
   }
   MPM_HD P slope(int axis, const P* u) const {
     P sum = moment[axis][0] * u[0];
-    MPM_UNROLL
-    for (int k = kMiddle + 1; k <= Order; k++) sum += moment[axis][k] * u[k];
+    MPM_UNROLL for (int k = kMiddle + 1; k <= Order; k++)
+      sum += moment[axis][k] * u[k];
     return sum;
   }
   MPM_HD P weigh(int axis, int k, const P& value) const { return k == kMiddle ? value : weight[axis][k] * value; }
@@ -111,8 +103,7 @@ constexpr int kPairs = D == 2 ? 5 : 14;
 template <int D>
 MPM_HD void pair_offset(int pair, int e[D]) {
   int digits = pair + kPairs<D> - 1;
-  MPM_UNROLL
-  for (int a = D - 1; a >= 0; a--) {
+  MPM_UNROLL for (int a = D - 1; a >= 0; a--) {
     e[a] = digits % 3 - 1;
     digits /= 3;
   }
@@ -130,14 +121,12 @@ template <int Order, class P, int D, class U>
 MPM_HD void cell_gradient(const DifferenceWeights<Order, P, D>& s, const U* u, P gradient[D]) {
   constexpr int S = Order + 1, X = D - 3, Y = D - 2, Z = D - 1, planes = D == 3 ? S : 1;
   P value[planes], y[planes], z[planes];
-  MPM_UNROLL
-  for (int i = 0; i < planes; i++) {
+  MPM_UNROLL for (int i = 0; i < planes; i++) {
     P line[S], slope[S];
-    MPM_UNROLL
-    for (int j = 0; j < S; j++) {
+    MPM_UNROLL for (int j = 0; j < S; j++) {
       P nodes[S];
-      MPM_UNROLL
-      for (int k = 0; k < S; k++) nodes[k] = P(u[(i * S + j) * S + k]);
+      MPM_UNROLL for (int k = 0; k < S; k++)
+        nodes[k] = P(u[(i * S + j) * S + k]);
       line[j] = s.interpolate(Z, nodes);
       slope[j] = s.slope(Z, nodes);
     }
@@ -159,8 +148,7 @@ MPM_HD void cell_gradient(const DifferenceWeights<Order, P, D>& s, const U* u, P
 template <int Order, class P, int D>
 MPM_HD void add_cell_divergence(const DifferenceWeights<Order, P, D>& s, const P flux[D], P* sum) {
   constexpr int S = Order + 1, X = D - 3, Y = D - 2, Z = D - 1;
-  MPM_UNROLL
-  for (int i = 0; i < (D == 3 ? S : 1); i++) {
+  MPM_UNROLL for (int i = 0; i < (D == 3 ? S : 1); i++) {
     const bool across_x = D == 3 && i != kMiddle;
     P x(0), y = flux[Y], z = flux[Z];
     if constexpr (D == 3) {
@@ -168,15 +156,13 @@ MPM_HD void add_cell_divergence(const DifferenceWeights<Order, P, D>& s, const P
       y = s.weigh(X, i, y);
       z = s.weigh(X, i, z);
     }
-    MPM_UNROLL
-    for (int j = 0; j < S; j++) {
+    MPM_UNROLL for (int j = 0; j < S; j++) {
       const bool across_y = j != kMiddle;
       P line(0);
       if (across_x) line = s.weigh(Y, j, x);
       if (across_y) line = across_x ? line + s.moment[Y][j] * y : s.moment[Y][j] * y;
       const P slope = s.weigh(Y, j, z);
-      MPM_UNROLL
-      for (int k = 0; k < S; k++) {
+      MPM_UNROLL for (int k = 0; k < S; k++) {
         P& n = sum[(i * S + j) * S + k];
         if (across_x || across_y) n += s.weigh(Z, k, line);
         if (k != kMiddle) n += s.moment[Z][k] * slope;
@@ -189,20 +175,17 @@ MPM_HD void add_cell_divergence(const DifferenceWeights<Order, P, D>& s, const P
 template <int Order, class P, int D>
 MPM_HD void add_cell_products(const CellWeights<Order, P, D>& s, const P& value, P* node) {
   constexpr int S = Order + 1, X = D - 3, Y = D - 2, Z = D - 1;
-  MPM_UNROLL
-  for (int i = 0; i < (D == 3 ? S : 1); i++) {
+  MPM_UNROLL for (int i = 0; i < (D == 3 ? S : 1); i++) {
     P x(0), plane = value;
     if constexpr (D == 3) {
       x = s.moment[X][i] * value;
       plane = s.weight[X][i] * value;
     }
-    MPM_UNROLL
-    for (int j = 0; j < S; j++) {
+    MPM_UNROLL for (int j = 0; j < S; j++) {
       P line = s.moment[Y][j] * plane;
       if constexpr (D == 3) line += s.weight[Y][j] * x;
       const P slope = s.weight[Y][j] * plane;
-      MPM_UNROLL
-      for (int k = 0; k < S; k++) {
+      MPM_UNROLL for (int k = 0; k < S; k++) {
         P& n = node[(i * S + j) * S + k];
         n += s.weight[Z][k] * line;
         n += s.moment[Z][k] * slope;
@@ -215,15 +198,13 @@ MPM_HD void add_cell_products(const CellWeights<Order, P, D>& s, const P& value,
 template <int Order, class P, int D>
 MPM_HD void add_cell_value(const CellWeights<Order, P, D>& s, const P& value, P* node) {
   constexpr int S = Order + 1, X = D - 3, Y = D - 2, Z = D - 1;
-  MPM_UNROLL
-  for (int i = 0; i < (D == 3 ? S : 1); i++) {
+  MPM_UNROLL for (int i = 0; i < (D == 3 ? S : 1); i++) {
     P plane = value;
     if constexpr (D == 3) plane = s.weight[X][i] * plane;
-    MPM_UNROLL
-    for (int j = 0; j < S; j++) {
+    MPM_UNROLL for (int j = 0; j < S; j++) {
       const P line = s.weight[Y][j] * plane;
-      MPM_UNROLL
-      for (int k = 0; k < S; k++) node[(i * S + j) * S + k] += s.weight[Z][k] * line;
+      MPM_UNROLL for (int k = 0; k < S; k++)
+        node[(i * S + j) * S + k] += s.weight[Z][k] * line;
     }
   }
 }
@@ -241,8 +222,7 @@ MPM_HD P add_particle(const P f[D], const P& conductance, const U* u, P* sum, co
     const DifferenceWeights<Order, P, D> s(f);
     P flux[D];
     cell_gradient(s, u, flux);
-    MPM_UNROLL
-    for (int a = 0; a < D; a++) {
+    MPM_UNROLL for (int a = 0; a < D; a++) {
       const P g = flux[a];
       flux[a] = conductance * g;
       power += flux[a] * g;

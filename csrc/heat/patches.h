@@ -2,7 +2,7 @@
 
 #include <cstdint>
 
-#include "math/host_device.h"
+#include "common/host_device.h"
 
 // Additive Schwarz on overlapping patches of 2^D nodes: z_i = Σ_o (B_o R_o r)_i with the inverse B_o of a small matrix.
 namespace mpm {
@@ -27,8 +27,7 @@ inline namespace TORCH_MPM_ISA {
 template <class T, int D>
 MPM_HD void solve_corner(const PatchArguments<T, D>& a, int64_t o, int k) {
   T sum = T(0);
-  MPM_UNROLL
-  for (int j = 0; j < kCorners<D>; j++) {
+  MPM_UNROLL for (int j = 0; j < kCorners<D>; j++) {
     const int i = a.rows[o * kCorners<D> + j];
     if (i >= 0 && i < a.count) sum += a.inverse[(o * kCorners<D> + k) * kCorners<D> + j] * a.r[i];
   }
@@ -38,8 +37,7 @@ MPM_HD void solve_corner(const PatchArguments<T, D>& a, int64_t o, int k) {
 template <class T, int D>
 MPM_HD void sum_corners(const PatchArguments<T, D>& a, int64_t i) {
   T sum = T(0);
-  MPM_UNROLL
-  for (int k = 0; k < kCorners<D>; k++) {
+  MPM_UNROLL for (int k = 0; k < kCorners<D>; k++) {
     const int o = a.patches[i * kCorners<D> + k];
     if (o >= 0 && o < a.count) sum += a.solved[int64_t(o) * kCorners<D> + k];
   }

@@ -5,7 +5,7 @@
 #include "transfer/arguments.h"
 
 // The iteration of the implicit heat step (M/dt + H + X) d = h − (H + X) θ: what happens at a node and what is decided
-// for a scene. The shells of csrc/cpu and csrc/cuda loop over nodes, sum over scenes and apply H.
+// for a scene. The loops of both backends go over nodes, sum over scenes and apply H.
 //
 // Both methods move along p: d += α p, r −= α A p, p = γ z + β p with z = inverse · r. Conjugate gradients divide by
 // the exact diagonal; Chebyshev iteration (Saad 2003, algorithm 12.1) divides by M/dt + X, where the spectrum lies

@@ -6,7 +6,7 @@
 #include "transfer/momentum.h"
 
 // Arguments of the transfer kernels: plain pointers and strides, shared by the CPU and the CUDA launchers. Only the
-// launchers know threads and streams; only csrc/ops knows tensors.
+// launchers know threads and streams; only the files *.op.cpp know tensors.
 namespace mpm {
 
 // A tensor [P], [P, I] or [P, I, J] of any strides (in elements); a null pointer is an absent field.
@@ -24,7 +24,7 @@ struct NodeField {
   int channels = 0;
 };
 
-// The active blocks of one activation (see csrc/ops/activate.cpp for the meaning of each tensor).
+// The active blocks of one activation (see csrc/grid/activate.op.cpp for the meaning of each tensor).
 template <class T, int D>
 struct Topology {
   Geometry<T, D> geometry;

@@ -1,7 +1,7 @@
 #pragma once
 
-#include "math/bspline.h"
-#include "math/matrix.h"
+#include "common/bspline.h"
+#include "common/matrix.h"
 
 // What one particle gives to its nodes in P2G, and the chain rule from the adjoint sums over those nodes.
 //   mass:      m_i    = Σ_p N_i m_p

@@ -52,7 +52,7 @@ def sum_by_scene(value: Tensor, scene: Tensor | None, scenes: int) -> Tensor:
 
 
 def soa_empty(like: Tensor, shape: Sequence[int]) -> Tensor:
-    """An empty [P, ...] tensor with the particle index contiguous, as the ops return them (csrc/ops/tensors.h)."""
+    """An empty [P, ...] tensor with the particle index contiguous, as the ops return them (csrc/common/tensors.h)."""
     pitch = shape[0]
     if like.device.type == "cpu":  # `particle_pitch` says why
         lines = -(-shape[0] * like.element_size() // 64)

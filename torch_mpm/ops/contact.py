@@ -17,7 +17,7 @@ from .arguments import check_list, differentiate, refuse_vmap, sizes
 from .autograd import dispatch, register_autograd
 from .grid_update import CONTACT_KINDS, _blocks_of
 
-MAX_OBSTACLES = 16  # of one call, csrc/boundary/obstacle.h
+MAX_OBSTACLES = 16  # of one call, csrc/grid/obstacle.h
 SHAPES: dict[type, int] = {Plane: 0, Sphere: 1, Box: 2, Capsule: 3}
 
 

@@ -15,7 +15,7 @@ from ..reference import grid_update as reference
 from .arguments import differentiate, refuse_vmap, sizes, split_dt
 from .autograd import dispatch, register_autograd
 
-CONTACT_KINDS = {"open": 0, "sticky": 1, "slip": 2, "separate": 3, "mirror": 4}  # csrc/boundary/contact.h
+CONTACT_KINDS = {"open": 0, "sticky": 1, "slip": 2, "separate": 3, "mirror": 4}  # csrc/grid/friction.h
 
 
 def grid_update(

@@ -1,4 +1,4 @@
-"""Stress, energy and moduli of the compiled laws (csrc/materials): Python faces, fake kernels and autograd."""
+"""Stress, energy and moduli of the compiled laws (csrc/laws): Python faces, fake kernels and autograd."""
 
 from __future__ import annotations
 
@@ -176,7 +176,7 @@ def _shared_gradients(ctx: Any, grad: Tensor, parameters: Parameters, scene: Ten
 
 
 def _needs(ctx: Any) -> int:
-    """Bits for state 1, C 2, parameters 4, as csrc/materials/arguments.h has them."""
+    """Bits for state 1, C 2, parameters 4, as csrc/laws/arguments.h has them."""
     need = ctx.needs_input_grad
     parameters = need[-3] if isinstance(need[-3], bool) else any(need[-3])
     return int(need[0]) | 2 * int(len(need) == 6 and need[1]) | 4 * int(parameters)

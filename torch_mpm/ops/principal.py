@@ -1,4 +1,4 @@
-"""Laws in principal strains (csrc/materials/principal*.h): return map with stress, energy, moduli."""
+"""Laws in principal strains (csrc/laws/principal*.h): return map with stress, energy, moduli."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Return map, stress, energy and stiffness of sand (csrc/materials/quartic*.h)."""
+"""Return map, stress, energy and stiffness of sand (csrc/laws/quartic*.h)."""
 
 from __future__ import annotations
 

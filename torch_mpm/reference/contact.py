@@ -7,7 +7,7 @@ from torch import Tensor
 
 
 def contact_change(relative: Tensor, normal: Tensor, kind: str, friction: float | Tensor) -> Tensor:
-    """Change of velocity by contact with a surface: the rule of csrc/boundary/contact.h. Zero for zero velocity.
+    """Change of velocity by contact with a surface: the rule of csrc/grid/friction.h. Zero for zero velocity.
 
     Args:
         relative: velocity relative to the surface [..., D] [m/s].

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from ..grid import Blocks
 
 MIRROR_REACH = 2
-"""Nodes on both sides of a mirror that have images (csrc/boundary/grid_update.h)."""
+"""Nodes on both sides of a mirror that have images (csrc/grid/grid_update.h)."""
 
 
 def grid_update(

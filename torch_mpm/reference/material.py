@@ -1,4 +1,4 @@
-"""The compiled laws of csrc/materials in plain torch."""
+"""The compiled laws of csrc/laws in plain torch."""
 
 from __future__ import annotations
 

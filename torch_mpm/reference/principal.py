@@ -1,4 +1,4 @@
-"""The laws in principal strains of csrc/materials in plain torch, from their definitions; roots by bisection."""
+"""The laws in principal strains of csrc/laws in plain torch, from their definitions; roots by bisection."""
 
 from __future__ import annotations
 

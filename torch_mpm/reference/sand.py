@@ -1,4 +1,4 @@
-"""The sand model of csrc/materials/quartic*.h in plain torch, written from its definitions; the root by bisection."""
+"""The sand model of csrc/laws/quartic*.h in plain torch, written from its definitions; the root by bisection."""
 
 from __future__ import annotations
 

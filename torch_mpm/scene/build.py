@@ -11,12 +11,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .. import boundaries, materials, plasticity, seed
+from .. import boundaries, laws, seed
 from ..grid import Grid
-from ..sand import QuarticSand
+from ..laws.sand import QuarticSand
+from ..laws.thermal import LIQUID
 from ..state import State
 from ..step import Step
-from ..thermal import LIQUID
 from . import check, heat, schema
 from .explain import SceneError
 
@@ -219,16 +219,16 @@ class _Mixture:
             table[torch.tensor(group)] = law
         return table[material.long()]
 
-    def law(self, dtype: torch.dtype, device: torch.device) -> materials.Material:
-        laws = [self._one(group, dtype, device) for group in self.groups]
-        return laws[0] if len(laws) == 1 else materials.Mixture(laws)
+    def law(self, dtype: torch.dtype, device: torch.device) -> laws.Material:
+        made = [self._one(group, dtype, device) for group in self.groups]
+        return made[0] if len(made) == 1 else laws.Mixture(made)
 
-    def _one(self, group: list[int], dtype: torch.dtype, device: torch.device) -> materials.Material:
+    def _one(self, group: list[int], dtype: torch.dtype, device: torch.device) -> laws.Material:
         first = self.materials[group[0]]
         law = _named(f"material.{first.name}", self._mechanical, group, dtype, device)
         return _named(f"material.{first.name}", heat.thermal, law, first.words, self.reference).to(device)
 
-    def _mechanical(self, group: list[int], dtype: torch.dtype, device: torch.device) -> materials.Material:
+    def _mechanical(self, group: list[int], dtype: torch.dtype, device: torch.device) -> laws.Material:
         members = [self.materials[k] for k in group]
 
         def value(name: str) -> Any:
@@ -243,11 +243,11 @@ class _Mixture:
 
         words = members[0].words
         if isinstance(words, schema.NeoHookean):
-            return materials.NeoHookean(E=value("E"), nu=value("nu"))
+            return laws.NeoHookean(E=value("E"), nu=value("nu"))
         if isinstance(words, schema.WeaklyCompressible):
-            return materials.WeaklyCompressible(value("bulk_modulus"), value("gamma"), value("viscosity"))
+            return laws.WeaklyCompressible(value("bulk_modulus"), value("gamma"), value("viscosity"))
         if isinstance(words, schema.Solid):
-            law = getattr(plasticity, type(words).__name__)
+            law = getattr(laws, type(words).__name__)
             others = {"law", "density", *schema.Thermal.model_fields}
             return law(**{name: value(name) for name in type(words).model_fields if name not in others})
         moduli = {name: value(name) for name in ("E", "nu", "mu", "lam") if getattr(words, name) is not None}

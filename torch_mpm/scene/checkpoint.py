@@ -12,8 +12,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ..data.hdf5 import h5py_module, open_sealed, seal
 from ..errors import DamagedFileError
-from ..hdf5 import h5py_module, open_sealed, seal
 from ..state import State, _as_soa
 
 Host = dict[str, Tensor]

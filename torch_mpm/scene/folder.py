@@ -13,9 +13,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from ..data.hdf5 import h5py_module
+from ..data.trajectory import COMPLETE, PARTIAL, Layout, Trajectory, create
 from ..errors import DamagedFileError
-from ..hdf5 import h5py_module
-from ..trajectory import COMPLETE, PARTIAL, Layout, Trajectory, create
 from .scene import Scene
 
 RUN, CHECKPOINT, LAST_GOOD, LOCK = "run.json", "checkpoint.h5", "last_good.h5", "run.lock"

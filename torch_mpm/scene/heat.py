@@ -9,12 +9,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .. import boundaries, materials
+from .. import boundaries, laws
 from ..grid import Grid
-from ..heat import Heat
-from ..heat_boundaries import Convection, Fixed, FixedSurface, Flux, FreeSurface, Radiation, Surface
+from ..heat.boundaries import Convection, Fixed, FixedSurface, Flux, FreeSurface, Radiation, Surface
+from ..heat.heat import Heat
+from ..laws.thermal import Melting, ThermalExpansion
 from ..parameters import PerMaterial, Table
-from ..thermal import Melting, ThermalExpansion
 from . import schema
 
 THERMAL = tuple(schema.Thermal.model_fields)
@@ -74,11 +74,11 @@ def parameter(words: float | schema.Curve, reference: float) -> float | Table:
     return float(words)
 
 
-def thermal(law: materials.Material, words: Any, reference: float) -> materials.Material:
+def thermal(law: laws.Material, words: Any, reference: float) -> laws.Material:
     """A law with the melting and the expansion of its material."""
     liquid = getattr(words, "liquid", None)
     if liquid is not None:
-        fluid = materials.WeaklyCompressible(liquid.bulk_modulus, liquid.gamma, parameter(liquid.viscosity, reference))
+        fluid = laws.WeaklyCompressible(liquid.bulk_modulus, liquid.gamma, parameter(liquid.viscosity, reference))
         law = Melting(law, fluid)
     return law if words.expansion is None else ThermalExpansion(law, words.expansion)
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ..trajectory import Array, Trajectory
+from ..data.trajectory import Array, Trajectory
 from . import check, schema
 from .check import obstacle
 from .explain import SceneError

@@ -18,12 +18,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ..data.hdf5 import h5py_module
+from ..data.trajectory import PARTIAL, Layout, Trajectory, TrajectoryWriter
 from ..errors import DamagedFileError, SimulationError
-from ..hdf5 import h5py_module
-from ..materials import Mixture
+from ..laws.material import Mixture
+from ..laws.thermal import LIQUID
 from ..state import State
-from ..thermal import LIQUID
-from ..trajectory import PARTIAL, Layout, Trajectory, TrajectoryWriter
 from . import checkpoint, heap
 from .build import Built
 from .diagnose import SceneFailure, replay, wrong

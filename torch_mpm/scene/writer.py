@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..trajectory import TrajectoryWriter
+from ..data.trajectory import TrajectoryWriter
 from . import checkpoint
 
 

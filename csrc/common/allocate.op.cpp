@@ -1,0 +1,95 @@
+#include "common/backend.h"
+
+#if MPM_BACKEND == MPM_BACKEND_IS_cpu
+#include "cpu/pool.h"
+#endif
+
+namespace mpm {
+namespace {
+
+#if MPM_BACKEND == MPM_BACKEND_IS_cpu
+int64_t element_size(ScalarType type) {
+  switch (type) {
+    case ScalarType::Double:
+      return 8;
+    case ScalarType::Float:
+    case ScalarType::Int:
+      return 4;
+    default:
+      return 1;  // Byte and Bool
+  }
+}
+
+// A tensor in memory of the pool; not defined where the tensor is small or the pool has none.
+Tensor empty_in_pool(const Tensor& like, const Shape& shape, const Shape& strides, ScalarType type) {
+  int64_t last = 0;
+  for (size_t i = 0; i < shape.size(); i++) {
+    if (shape[i] == 0) return {};
+    last += (shape[i] - 1) * strides[i];
+  }
+  const int64_t bytes = (last + 1) * element_size(type);
+  cpu::Buffer* buffer = bytes < cpu::kPooled ? nullptr : cpu::take(bytes);
+  if (!buffer) return {};
+  return torch::stable::from_blob(buffer->data, shape, strides, like.device(), type,
+                                  [buffer](void*) { cpu::give_back(buffer); });
+}
+#endif
+
+[[noreturn]] void fail_to_allocate(const Shape& shape) {
+  STD_TORCH_CHECK(false, "a result of shape ", text(shape), " could not be allocated");
+}
+
+// Refuses sizes whose products below would overflow, or that no memory holds.
+void check_allocatable(const Shape& shape) {
+  constexpr int64_t most = int64_t(1) << 48;
+  int64_t count = 1;
+  for (int64_t size : shape) {
+    if (size < 0 || size > most / count) fail_to_allocate(shape);
+    count *= size > 1 ? size : 1;
+  }
+}
+
+}  // namespace
+
+Tensor empty_strided(const Tensor& like, const Shape& shape, const Shape& strides, ScalarType type) {
+#if MPM_BACKEND == MPM_BACKEND_IS_cpu
+  if (Tensor pooled = empty_in_pool(like, shape, strides, type); pooled.defined()) return pooled;
+#endif
+  AtenTensorHandle handle;
+  int32_t device;
+  TORCH_ERROR_CODE_CHECK(aoti_torch_get_device_type(like.get(), &device));
+  const int32_t dtype = torch::stable::detail::to<int32_t>(torch::stable::detail::from(type));
+  if (aoti_torch_empty_strided(int64_t(shape.size()), shape.data(), strides.data(), dtype, device,
+                               like.get_device_index(), &handle) != AOTI_TORCH_SUCCESS)
+    fail_to_allocate(shape);
+  return Tensor(handle);
+}
+
+Tensor empty(const Tensor& like, const Shape& shape, ScalarType type) {
+  check_allocatable(shape);
+  Shape strides(shape.size());
+  int64_t next = 1;
+  for (size_t i = shape.size(); i-- > 0; next *= shape[i]) strides[i] = next;
+  return empty_strided(like, shape, strides, type);
+}
+
+Tensor empty(const Tensor& like, const Shape& shape) { return empty(like, shape, like.scalar_type()); }
+
+Tensor zeros(const Tensor& like, const Shape& shape) {
+  Tensor t = empty(like, shape);
+  return torch::stable::zero_(t);
+}
+
+Tensor empty_particles(const Tensor& like, const Shape& shape) {
+  check_allocatable(shape);
+  Shape strides(shape.size());
+  strides[0] = 1;
+  int64_t next = shape.size() > 1 ? particle_pitch(like, shape[0]) : 0;
+  for (size_t i = shape.size() - 1; i > 0; i--) {
+    strides[i] = next;
+    next *= shape[i];
+  }
+  return empty_strided(like, shape, strides, like.scalar_type());
+}
+
+}  // namespace mpm

@@ -1,0 +1,41 @@
+#pragma once
+
+#include "common/matrix.h"
+#include "transfer/arguments.h"
+
+// Access of a kernel body to its particles: `One` is the particle of a CUDA thread; cpu/lanes.h has the particles in
+// the lanes of a pack.
+namespace mpm {
+inline namespace TORCH_MPM_ISA {
+
+template <class T>
+struct One {
+  using Value = T;
+  int64_t p;
+
+  MPM_HD T load(const T* pointer, int64_t stride) const { return pointer[p * stride]; }
+  MPM_HD void store(T* pointer, int64_t stride, const T& value) const { pointer[p * stride] = value; }
+  // f(particle) of each particle.
+  template <class F>
+  MPM_HD T each(const F& f) const {
+    return f(p);
+  }
+  MPM_HD void store_integer(int* pointer, const T& value) const { pointer[p] = int(value); }
+};
+
+template <int D, class At, class T>
+MPM_HD Matrix<typename At::Value, D> load_matrix(const At& at, const Field<const T>& f) {
+  Matrix<typename At::Value, D> r;
+  MPM_UNROLL for (int i = 0; i < D; i++) MPM_UNROLL
+    for (int j = 0; j < D; j++) r[i][j] = at.load(f.pointer + i * f.stride[1] + j * f.stride[2], f.stride[0]);
+  return r;
+}
+
+template <int D, class At, class T>
+MPM_HD void store_matrix(const At& at, const Field<T>& f, const Matrix<typename At::Value, D>& a) {
+  MPM_UNROLL for (int i = 0; i < D; i++) MPM_UNROLL
+    for (int j = 0; j < D; j++) at.store(f.pointer + i * f.stride[1] + j * f.stride[2], f.stride[0], a[i][j]);
+}
+
+}  // namespace TORCH_MPM_ISA
+}  // namespace mpm

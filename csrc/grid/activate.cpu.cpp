@@ -1,0 +1,436 @@
+#include "cpu/chunk.h"
+#include "cpu/parallel.h"
+#include "grid/activate_workspace.cpu.h"
+#include "grid/cell_order.h"
+#include "grid/status.h"
+
+// Finds the active blocks, numbers them in the order of the table, groups the particles by home block with a stable
+// counting sort, and writes the schedule. Every result is the same for any number of threads.
+namespace mpm::cpu {
+inline namespace TORCH_MPM_ISA {
+
+using W = ActivateWorkspace;
+
+constexpr int64_t kWorthThreads =
+    8192;  // items of particles or of the table below which threads cost more than they give
+
+// Calls f(part, begin, end) for `parts` nearly equal parts of [0, count), in parallel.
+template <class F>
+void for_parts(int parts, int64_t count, const F& f) {
+  parallel_ranges(parts, count < kWorthThreads ? parts : 1, [&](int64_t first, int64_t last) {
+    for (int64_t part = first; part < last; part++) f(int(part), count * part / parts, count * (part + 1) / parts);
+  });
+}
+
+// Blocks touched from a home whose particle has its base node at `local` inside it: bit o for the neighbour that lies
+// one block further along the axes of o, the last axis being bit 0 of o.
+template <int Order, int D>
+MPM_HD unsigned touched_blocks(const int local[D]) {
+  unsigned blocks = 1;
+  MPM_UNROLL for (int i = D - 1, bit = 1; i >= 0; i--, bit *= 2)
+    if (local[i] + Order >= kBlockWidth) blocks |= blocks << bit;
+  return blocks;
+}
+
+template <class T, int D>
+struct Activation {
+  const ActivateArguments<T, D>& a;
+  W w;
+  ScheduleOut schedule;
+  int64_t table_size;
+  int64_t neighbour[kColours<D>];  // distance of neighbour o in the table
+
+  explicit Activation(const ActivateArguments<T, D>& arguments)
+      : a(arguments),
+        w(activate_layout(a, static_cast<char*>(a.workspace))),
+        table_size(int64_t(a.scenes) * a.geometry.blocks_per_scene) {
+    lay_out<D>(schedule, a.schedule, a.capacity, a.particles);
+    for (int o = 0; o < kColours<D>; o++) {
+      neighbour[o] = 0;
+      for (int i = 0; i < D; i++) neighbour[o] = neighbour[o] * a.geometry.blocks[i] + (o >> (D - 1 - i) & 1);
+    }
+  }
+
+  int64_t* totals(int slice) const { return w.totals + slice * W::kTotals; }
+
+  // Replaces an entry of the totals by the sum over the slices before; returns the sum over all.
+  int64_t scan(int which) const {
+    int64_t s = 0;
+    for (int k = 0; k < w.slices; k++) {
+      const int64_t n = totals(k)[which];
+      totals(k)[which] = s;
+      s += n;
+    }
+    return s;
+  }
+};
+
+enum class Place { inside, outside, not_finite };
+
+// Scene and base node of one particle, and whether it is left out for its position or its scene.
+template <int Order, class T, int D>
+Place place_of(const ActivateArguments<T, D>& a, int64_t p, int& scene, int base[D]) {
+  T x[D], f[D];
+  scene = a.scene ? a.scene[p * a.scene_stride] : 0;
+  for (int i = 0; i < D; i++) x[i] = at(a.x, p, i);
+  if (!is_finite<D>(x)) return Place::not_finite;
+  const bool inside = locate<Order>(a.geometry, x, base, f) && scene >= 0 && scene < a.scenes;
+  return inside ? Place::inside : Place::outside;
+}
+
+// Home block and cell of one particle.
+template <int Order, class T, int D>
+void classify(const Activation<T, D>& s, int64_t p) {
+  const ActivateArguments<T, D>& a = s.a;
+  int scene, base[D], block[D];
+  if (place_of<Order>(a, p, scene, base) != Place::inside) {
+    s.w.key[p] = -1;
+    return;
+  }
+  for (int i = 0; i < D; i++) block[i] = base[i] / kBlockWidth;
+  s.w.key[p] = block_index(a.geometry, scene, block);
+  s.w.cell[p] = uint8_t(node_in_block<D>(base));
+}
+
+// The same for kLanes particles at once; false, and nothing done, unless all are on the lattice.
+template <int Order, class T, int D>
+bool classify_pack(const Activation<T, D>& s, int64_t p) {
+  const ActivateArguments<T, D>& a = s.a;
+  using Values = typename RegisterOf<T, kLanes>::Value;
+  using Integers = RegisterOf<float, kLanes>::Integer;
+  using Unsigned = RegisterOf<float, kLanes>::Bits;
+  typedef uint8_t Bytes __attribute__((vector_size(kLanes)));
+  Unsigned key = {}, cell = {};
+  bool known = true;
+  if (a.scene)
+    for (int l = 0; l < kLanes; l++) {
+      key[l] = unsigned(a.scene[(p + l) * a.scene_stride]);
+      known = known && key[l] < unsigned(a.scenes);
+    }
+  Mask<T, kLanes> inside;
+  Group g = {};
+  g.count = kLanes;
+  g.consecutive = true;
+  for (int l = 0; l < kLanes; l++) g.id[l] = int(p) + l;
+  MPM_UNROLL for (int i = 0; i < D; i++) {
+    const Lanes<T> base = base_node<Order>(a.geometry, i, load(a.x, g, i));
+    const auto on = on_lattice<Order>(a.geometry, i, base);
+    inside = i ? inside & on : on;
+    Values node;
+    __builtin_memcpy(&node, &base, sizeof(node));
+    const Unsigned n = Unsigned(__builtin_convertvector(node, Integers));
+    key = key * unsigned(a.geometry.blocks[i]) + n / kBlockWidth;
+    cell = cell * kBlockWidth + n % kBlockWidth;
+  }
+  if (!known || !all(inside)) return false;
+  const Bytes cells = __builtin_convertvector(cell, Bytes);
+  __builtin_memcpy(s.w.key + p, &key, sizeof(key));
+  __builtin_memcpy(s.w.cell + p, &cells, sizeof(cells));
+  return true;
+}
+
+template <int Order, class T, int D>
+void classify_slice(const Activation<T, D>& s, int64_t begin, int64_t end) {
+  for (int64_t p = begin; p < end;) {
+    if (p + kLanes <= end && classify_pack<Order>(s, p))
+      p += kLanes;
+    else
+      for (const int64_t stop = p + kLanes < end ? p + kLanes : end; p < stop; p++) classify<Order>(s, p);
+  }
+}
+
+template <int Order, int D>
+MPM_HD unsigned touched_blocks_of_cell(int cell) {
+  int local[D];
+  MPM_UNROLL for (int i = 0; i < D; i++)
+    local[i] = cell_coordinate<D>(cell, i);
+  return touched_blocks<Order, D>(local);
+}
+
+// Particles of each home block in a slice, and the blocks they touch. Particles that follow each other are mostly of
+// one home: such runs are counted, and later placed, together.
+template <int Order, class T, int D>
+void count_homes(const Activation<T, D>& s, int slice, int64_t begin, int64_t end) {
+  int* count = s.w.count + slice * s.table_size;
+  uint8_t* touched = s.w.touched + slice * s.table_size;
+  uint8_t touched_of[kBlockNodes<D>];
+  for (int cell = 0; cell < kBlockNodes<D>; cell++) touched_of[cell] = uint8_t(touched_blocks_of_cell<Order, D>(cell));
+  __builtin_memset(count, 0, sizeof(int) * s.table_size);
+  __builtin_memset(touched, 0, s.table_size);
+  int64_t dropped = 0, runs = 0;
+  for (int64_t p = begin; p < end;) {
+    s.w.run[begin + runs++] = int(p);
+    const int key = s.w.key[p];
+    const int64_t first = p;
+    unsigned blocks = 0;
+    for (; p < end && s.w.key[p] == key; p++) blocks |= key < 0 ? 0 : touched_of[s.w.cell[p]];
+    if (key < 0) {
+      dropped += p - first;
+    } else {
+      count[key] += int(p - first);
+      touched[key] |= uint8_t(blocks);
+    }
+  }
+  s.totals(slice)[W::kDropped] = dropped;
+  s.totals(slice)[W::kRuns] = runs;
+}
+
+// Sets the table to 1 at each block that the particles of homes [begin, end) touch.
+template <class T, int D>
+void mark_touched(const Activation<T, D>& s, int64_t begin, int64_t end) {
+  const auto touched_from = [&]<class Blocks>(int64_t home) {  // of one home, or of eight in a row
+    Blocks blocks = 0;
+    for (int k = 0; k < s.w.slices; k++) {
+      Blocks of_slice;
+      __builtin_memcpy(&of_slice, s.w.touched + k * s.table_size + home, sizeof(Blocks));
+      blocks |= of_slice;
+    }
+    return blocks;
+  };
+  for (int64_t home = begin; home < end; home++) {
+    if (home + 8 <= end && !touched_from.template operator()<uint64_t>(home)) {  // most homes have no particles
+      home += 7;
+      continue;
+    }
+    const unsigned blocks = touched_from.template operator()<uint8_t>(home);
+    for (int o = 0; o < kColours<D>; o++)
+      if (blocks >> o & 1) __atomic_store_n(s.a.table + home + s.neighbour[o], 1, __ATOMIC_RELAXED);
+  }
+}
+
+// Numbers the active blocks in the order of the table; returns how many there are.
+template <class T, int D>
+int64_t number_blocks(const Activation<T, D>& s) {
+  const ActivateArguments<T, D>& a = s.a;
+  for_parts(s.w.slices, s.table_size, [&](int, int64_t begin, int64_t end) {
+    for (int64_t b = begin; b < end; b++) a.table[b] = 0;
+  });
+  for_parts(s.w.slices, s.table_size, [&](int, int64_t begin, int64_t end) { mark_touched(s, begin, end); });
+  for_parts(s.w.slices, s.table_size, [&](int slice, int64_t begin, int64_t end) {
+    int64_t active = 0;
+    for (int64_t b = begin; b < end; b++) active += a.table[b];
+    s.totals(slice)[W::kActive] = active;
+  });
+  const int64_t wanted = s.scan(W::kActive);
+  for_parts(s.w.slices, s.table_size, [&](int slice, int64_t begin, int64_t end) {
+    int64_t next = s.totals(slice)[W::kActive];
+    for (int64_t b = begin; b < end; b++) {
+      const bool given = a.table[b] && next < a.capacity;
+      next += a.table[b];
+      a.table[b] = given ? int(next - 1) : -1;
+      if (given) a.block[next - 1] = int(b);
+    }
+  });
+  return wanted;
+}
+
+// After an overflow: particles that touch a block without a slot are not transferred.
+template <int Order, class T, int D>
+void drop_homeless(const Activation<T, D>& s, int64_t begin, int64_t end) {
+  for (int64_t p = begin; p < end; p++) {
+    const int key = s.w.key[p];
+    if (key < 0) continue;
+    const unsigned touched = touched_blocks_of_cell<Order, D>(s.w.cell[p]);
+    for (int o = 0; o < kColours<D>; o++)
+      if ((touched >> o & 1) && s.a.table[key + s.neighbour[o]] < 0) s.w.key[p] = -1;
+  }
+}
+
+// Offsets of each slot, and where each slice puts its particles. Returns the number of particles transferred.
+template <class T, int D>
+int64_t place_slots(const Activation<T, D>& s, int64_t slots) {
+  const ActivateArguments<T, D>& a = s.a;
+  for_parts(s.w.slices, slots, [&](int slice, int64_t begin, int64_t end) {
+    int64_t particles = 0;
+    for (int64_t slot = begin; slot < end; slot++)
+      for (int k = 0; k < s.w.slices; k++) particles += s.w.count[k * s.table_size + a.block[slot]];
+    s.totals(slice)[W::kParticles] = particles;
+  });
+  const int64_t transferred = s.scan(W::kParticles);
+  for_parts(s.w.slices, slots, [&](int slice, int64_t begin, int64_t end) {
+    int next = int(s.totals(slice)[W::kParticles]);
+    for (int64_t slot = begin; slot < end; slot++) {
+      a.offsets[slot] = next;
+      for (int k = 0; k < s.w.slices; k++) {
+        int& count = s.w.count[k * s.table_size + a.block[slot]];
+        const int n = count;
+        count = next;
+        next += n;
+      }
+    }
+  });
+  for (int64_t slot = slots; slot < a.capacity; slot++) a.block[slot] = -1;
+  for (int64_t slot = slots; slot <= a.capacity; slot++) a.offsets[slot] = int(transferred);
+  return transferred;
+}
+
+// Writes the index; `outside` is where the slice puts the particles that are not transferred.
+template <class T, int D>
+void fill_index(const Activation<T, D>& s, int slice, int64_t begin, int64_t end, int64_t outside) {
+  int* next = s.w.count + slice * s.table_size;
+  const int64_t runs = s.totals(slice)[W::kRuns];
+  for (int64_t r = 0; r < runs; r++) {
+    const int first = s.w.run[begin + r], count = (r + 1 < runs ? s.w.run[begin + r + 1] : int(end)) - first;
+    const int key = s.w.key[first];
+    const int64_t place = key < 0 ? outside : next[key];
+    int* index = s.a.index + place;
+    for (int i = 0; i < count; i++) index[i] = first + i;
+    if (key < 0) {
+      outside += count;
+    } else {
+      __builtin_memcpy(s.w.cell_at + place, s.w.cell + first, count);
+      next[key] += count;
+    }
+  }
+}
+
+// Lists the homes by colour and the chunks of each; returns the number of chunks.
+template <class T, int D>
+int64_t list_homes(const Activation<T, D>& s, int64_t slots) {
+  const ActivateArguments<T, D>& a = s.a;
+  const ScheduleOut& out = s.schedule;
+  const auto colour_of = [&](int64_t slot) {
+    int block[D], colour = 0;
+    block_coordinates(a.geometry, a.block[slot], block);
+    for (int i = 0; i < D; i++) colour = colour * 2 + (block[i] & 1);
+    return colour;
+  };
+  int next[kColours<D>] = {};
+  for (int64_t slot = 0; slot < slots; slot++)
+    if (a.offsets[slot + 1] > a.offsets[slot]) next[colour_of(slot)]++;
+  int homes = 0;
+  for (int c = 0; c < kColours<D>; c++) {
+    const int n = next[c];
+    out.colour_start[c] = next[c] = homes;
+    homes += n;
+  }
+  out.colour_start[kColours<D>] = homes;
+  for (int64_t slot = 0; slot < slots; slot++)
+    if (a.offsets[slot + 1] > a.offsets[slot]) out.home_slot[next[colour_of(slot)]++] = int(slot);
+  int chunks = 0;
+  for (int h = 0; h < homes; h++) {
+    const int slot = out.home_slot[h];
+    out.home_chunk[h] = chunks;
+    for (int begin = a.offsets[slot]; begin < a.offsets[slot + 1]; begin += kChunk) {
+      out.chunk_slot[chunks] = slot;
+      out.chunk_begin[chunks++] = begin;
+    }
+  }
+  out.home_chunk[homes] = chunks;
+  return chunks;
+}
+
+// Order of a chunk's particles by cell.
+template <class T, int D>
+void sort_chunk(const Activation<T, D>& s, int64_t chunk) {
+  const int begin = s.schedule.chunk_begin[chunk], slot_end = s.a.offsets[s.schedule.chunk_slot[chunk] + 1];
+  const int count = slot_end - begin < kChunk ? slot_end - begin : kChunk;
+  const uint8_t* cell = s.w.cell_at + begin;
+  const int* id = s.a.index + begin;
+  uint16_t* order = s.schedule.order + begin;
+  uint16_t* end = s.schedule.cell_end + chunk * kBlockNodes<D>;
+  // Four counts of each cell, so that particles that follow each other do not wait for the same one.
+  uint16_t counts[4][kBlockNodes<D>] = {}, next[kBlockNodes<D>], nth[kChunk];
+  bool falls = false;
+  for (int i = 1; i < count; i++) falls |= cell[i - 1] > cell[i];
+  for (int i = 0; i < count; i++) counts[i % 4][cell[i]]++;
+  for (int c = 0, before = 0; c < kBlockNodes<D>; c++) {
+    next[c] = uint16_t(before);
+    end[c] = uint16_t(before += counts[0][c] + counts[1][c] + counts[2][c] + counts[3][c]);
+  }
+  if (falls)
+    for (int i = 0; i < count; i++) nth[next[cell[i]]++] = uint16_t(i);
+  else
+    for (int i = 0; i < count; i++) nth[i] = uint16_t(i);
+  for (int i = 0; i < count; i++) order[i] = uint16_t(cell[i] * kChunk + nth[i]);
+  s.schedule.chunk_sorted[chunk] = !falls && id[count - 1] - id[0] == count - 1;
+}
+
+// Counts a particle that is left out in a row of the status, unless an earlier activation has done so; whether it is
+// the first of the row.
+bool report(int* row, int activation, Place place, int p) {
+  if (row[kProblemActivation] >= 0 && row[kProblemActivation] != activation) return false;
+  row[kProblemActivation] = activation;
+  int* entry = row + (place == Place::outside ? kOutsideCount : kNonFiniteCount);
+  if (entry[0]++ > 0) return false;
+  entry[1] = p;
+  return true;
+}
+
+// Particles that are not transferred stand at the end of the index, in ascending order.
+template <int Order, class T, int D>
+void write_status(const Activation<T, D>& s, int64_t wanted, int64_t transferred) {
+  const ActivateArguments<T, D>& a = s.a;
+  int* status = a.status;
+  for (int64_t row = 0; row <= a.scenes; row++)
+    copy_status(a.previous_status ? a.previous_status + row * kStatusSize : nullptr, status + row * kStatusSize);
+  const int activation = status[kActivations];
+  for (int64_t i = transferred; i < a.particles; i++) {
+    int scene, base[D];
+    const int p = a.index[i];
+    const Place place = place_of<Order>(a, p, scene, base);
+    if (place == Place::inside) continue;  // left out because the grid is full
+    report(status, activation, place, p);
+    if (scene < 0 || scene >= a.scenes) continue;
+    int* row = status + (1 + int64_t(scene)) * kStatusSize;
+    if (report(row, activation, place, p))
+      row[place == Place::outside ? kOutsideId : kNonFiniteId] = a.id ? int(a.id[p * a.id_stride]) : p;
+  }
+  if (wanted > a.capacity && status[kProblemActivation] < 0) status[kProblemActivation] = activation;
+  status[kActivations]++;
+  status[kBlocksNow] = int(wanted);
+  if (wanted > status[kBlocksWanted]) status[kBlocksWanted] = int(wanted);
+}
+
+template <int Order, class T, int D>
+void activate(const ActivateArguments<T, D>& a) {
+  const Activation<T, D> s(a);
+  for_parts(s.w.slices, a.particles, [&](int slice, int64_t begin, int64_t end) {
+    classify_slice<Order>(s, begin, end);
+    count_homes<Order>(s, slice, begin, end);
+  });
+  const int64_t wanted = number_blocks(s);
+  if (wanted > a.capacity)
+    for_parts(s.w.slices, a.particles, [&](int slice, int64_t begin, int64_t end) {
+      drop_homeless<Order>(s, begin, end);
+      count_homes<Order>(s, slice, begin, end);
+    });
+  const int64_t slots = wanted < a.capacity ? wanted : a.capacity;
+  const int64_t transferred = place_slots(s, slots);
+  s.scan(W::kDropped);
+  for_parts(s.w.slices, a.particles, [&](int slice, int64_t begin, int64_t end) {
+    fill_index(s, slice, begin, end, transferred + s.totals(slice)[W::kDropped]);
+  });
+  const int64_t chunks = list_homes(s, slots);
+  parallel_ranges(chunks, 16, [&](int64_t begin, int64_t end) {
+    for (int64_t chunk = begin; chunk < end; chunk++) sort_chunk(s, chunk);
+  });
+  write_status<Order>(s, wanted, transferred);
+}
+
+// The schedule has it already.
+template <int Order, class T, int D>
+void cell_order(const CellOrderArguments<T, D>& a) {
+  const ScheduleIn s = schedule_of(a.topology);
+  const int homes = s.colour_start[kColours<D>];
+  parallel_ranges(homes ? s.home_chunk[homes] : 0, 16, [&](int64_t begin, int64_t end) {
+    for (int64_t c = begin; c < end; c++) {
+      const Chunk chunk(a.topology, s, c);
+      for (int i = 0; i < chunk.count; i++) a.order[s.chunk_begin[c] + i] = chunk.id[chunk.by_cell(i)];
+    }
+  });
+  for (int64_t i = a.topology.offsets[a.topology.capacity]; i < a.topology.particles; i++)
+    a.order[i] = a.topology.index[i];
+}
+
+template <class T, int D>
+int64_t activate_workspace(const ActivateArguments<T, D>& a) {
+  return activate_layout(a, nullptr).size;
+}
+
+MPM_INSTANTIATE_SIZE(activate_workspace, ActivateArguments)
+MPM_INSTANTIATE_ORDERS(activate, ActivateArguments)
+MPM_INSTANTIATE_ORDERS(cell_order, CellOrderArguments)
+
+}  // namespace TORCH_MPM_ISA
+}  // namespace mpm::cpu

@@ -1,0 +1,387 @@
+#include <climits>
+#include <cub/block/block_scan.cuh>
+#include <cub/device/device_radix_sort.cuh>
+
+#include "cuda/launch.cuh"
+#include "cuda/schedule.h"
+#include "grid/status.h"
+#include "transfer/arguments.h"
+
+// Finds the active blocks and groups the particles by home block, without the host knowing any count.
+//   classify   home block and rank of every particle, number of particles and touched neighbours of every block
+//   slots      numbers the active blocks in the order of the table (one-pass scan)
+//   offsets    first particle and work items of every slot (one-pass scan)
+//   place      the index tensor, homes and neighbours, unused slots, status
+// Deterministic mode replaces the ranks, which depend on the order of atomics, by a stable sort.
+namespace mpm::cuda {
+namespace {
+
+constexpr int kThreads = 256;
+// Every kSampling-th thread block counts the home blocks met by its warps. More than kScattered per warp on average,
+// and the gathers are faster in the order of memory than block by block.
+constexpr int kSampling = 64, kScattered = 2;
+using Packed = unsigned long long;
+
+// Zeroed before each activation.
+struct Counters {
+  int tile[2];  // tiles handed out by each scan
+  int tail;     // particles that are not transferred
+  int wanted;   // active blocks
+  int transferred, items;
+  int groups, warps;  // of the thread blocks sampled
+};
+
+// Particles that are left out, zeroed before each activation. The lowest index is kept as the largest complement, so
+// that zero means none.
+struct LeftOut {
+  int count, first;
+};
+struct Trouble {
+  LeftOut outside, not_finite;
+};
+
+// `count` becomes the first position in the index tensor, or -1 minus the position from its end for particles that are
+// not transferred. Bit o of `touched`: the neighbour one block further along the axes of o, the last axis being bit 0
+// of o.
+struct Tally {
+  int count, touched;
+};
+
+struct Workspace {
+  Counters* counters;
+  Trouble* trouble;                     // [1 + scenes] of all particles, and of each scene
+  Packed *slot_states, *offset_states;  // one per tile of the scans
+  Tally* tally;                         // [table]
+  int64_t zeroed;                       // bytes from the start
+  int *key, *rank;                      // [P] table index (-1 outside) and rank among its particles
+  int *slot, *slot_sorted, *id;         // [P], for the stable sort
+  void* sort;
+  size_t sort_size;
+  int64_t size;
+};
+
+int bits_for(int capacity) {
+  int bits = 1;
+  while (capacity >> bits) bits++;
+  return bits;
+}
+
+template <class T, int D>
+Workspace lay_out(const ActivateArguments<T, D>& a) {
+  const int64_t table = int64_t(a.scenes) * a.geometry.blocks_per_scene, tiles = (table + kThreads - 1) / kThreads;
+  Workspace w{};
+  char* const start = static_cast<char*>(a.workspace);
+  const auto take = [&](int64_t bytes) {
+    char* p = start + w.size;
+    w.size += (bytes + 255) / 256 * 256;
+    return p;
+  };
+  w.counters = reinterpret_cast<Counters*>(take(sizeof(Counters)));
+  w.trouble = reinterpret_cast<Trouble*>(take((1 + int64_t(a.scenes)) * sizeof(Trouble)));
+  w.slot_states = reinterpret_cast<Packed*>(take(tiles * sizeof(Packed)));
+  w.offset_states = reinterpret_cast<Packed*>(take(tiles * sizeof(Packed)));
+  w.tally = reinterpret_cast<Tally*>(take(table * sizeof(Tally)));
+  w.zeroed = w.size;
+  w.key = reinterpret_cast<int*>(take(a.particles * sizeof(int)));
+  w.rank = reinterpret_cast<int*>(take(a.particles * sizeof(int)));
+  if (a.deterministic) {
+    w.slot = reinterpret_cast<int*>(take(a.particles * sizeof(int)));
+    w.slot_sorted = reinterpret_cast<int*>(take(a.particles * sizeof(int)));
+    w.id = reinterpret_cast<int*>(take(a.particles * sizeof(int)));
+    check(cub::DeviceRadixSort::SortPairs(nullptr, w.sort_size, w.slot, w.slot_sorted, w.id, a.index, int(a.particles),
+                                          0, bits_for(a.capacity)));
+    w.sort = take(int64_t(w.sort_size));
+  }
+  return w;
+}
+
+// Counts a particle that is left out among all and in its scene, unless an earlier activation has told of that row: a
+// scene that is lost costs atomics only once.
+template <class T, int D>
+__device__ void report(const ActivateArguments<T, D>& a, Trouble* trouble, bool finite, int scene, int p) {
+  const auto count_in = [&](int row) {
+    if (a.previous_status && a.previous_status[row * int64_t(kStatusSize) + kProblemActivation] >= 0) return;
+    LeftOut& out = finite ? trouble[row].outside : trouble[row].not_finite;
+    atomicAdd(&out.count, 1);
+    atomicMax(&out.first, INT_MAX - p);
+  };
+  count_in(0);
+  if (unsigned(scene) < unsigned(a.scenes)) count_in(1 + scene);
+}
+
+template <int Order, class T, int D>
+__global__ void __launch_bounds__(kThreads) classify(const ActivateArguments<T, D> a, const Workspace w) {
+  const int64_t p = int64_t(blockIdx.x) * kThreads + threadIdx.x;
+  const bool exists = p < a.particles;
+  T x[D], f[D];
+  int base[D], key = -1;
+  unsigned touched = 0;
+  if (exists) {
+#pragma unroll
+    for (int i = 0; i < D; i++) x[i] = a.x.pointer[p * a.x.stride[0] + i * a.x.stride[1]];
+    const bool finite = is_finite<D>(x);
+    const int scene = a.scene ? a.scene[p * a.scene_stride] : 0;
+    if (finite && unsigned(scene) < unsigned(a.scenes) && locate<Order>(a.geometry, x, base, f)) {
+      touched = 1;
+#pragma unroll
+      for (int i = D - 1; i >= 0; i--) {
+        if ((base[i] & (kBlockWidth - 1)) + Order >= kBlockWidth) touched |= touched << (1 << (D - 1 - i));
+        base[i] /= kBlockWidth;
+      }
+      key = block_index(a.geometry, scene, base);
+    } else {
+      report(a, w.trouble, finite, scene, int(p));
+    }
+  }
+  // One atomic per block and warp: neighbours in memory are mostly neighbours in space.
+  const unsigned group = __match_any_sync(~0u, exists ? key : INT_MIN);
+  const unsigned before = group & ((1u << threadIdx.x % 32) - 1);
+  const unsigned touched_by_group = __reduce_or_sync(group, touched);
+  if (blockIdx.x % kSampling == 0) {
+    const int groups = __popc(__ballot_sync(~0u, exists && before == 0));
+    if (threadIdx.x % 32 == 0) {
+      atomicAdd(&w.counters->groups, groups);
+      atomicAdd(&w.counters->warps, 1);
+    }
+  }
+  int first = 0;
+  if (exists && before == 0) {
+    if (key < 0) {
+      first = atomicAdd(&w.counters->tail, __popc(group));
+    } else {
+      Tally* tally = w.tally + key;
+      first = atomicAdd(&tally->count, __popc(group));
+      if (touched_by_group & ~*const_cast<volatile int*>(&tally->touched))
+        atomicOr(&tally->touched, int(touched_by_group));
+    }
+  }
+  const int rank = __shfl_sync(~0u, first, __ffs(group) - 1) + __popc(before);
+  if (exists) {
+    w.key[p] = key;
+    w.rank[p] = rank;
+  }
+}
+
+// ---- One-pass scan (decoupled look-back, Merrill and Garland 2016). A state holds two 31-bit sums and, in the top
+// bits, whether they are those of the tile alone (1) or of all tiles up to it (2).
+
+constexpr Packed kSums = (Packed(1) << 62) - 1;
+__device__ Packed pack(int a, int b) { return Packed(unsigned(a)) | Packed(unsigned(b)) << 31; }
+__device__ int first_of(Packed v) { return int(v & 0x7fffffff); }
+__device__ int second_of(Packed v) { return int(v >> 31 & 0x7fffffff); }
+
+// Sum over the tiles before; called by a whole warp.
+__device__ Packed sum_before(volatile Packed* states, int tile) {
+  const int lane = threadIdx.x % 32;
+  Packed sum = 0;
+  for (int end = tile; end > 0; end -= 32) {
+    const int t = end - 1 - lane;
+    Packed state;
+    do state = t >= 0 ? states[t] : Packed(2) << 62;
+    while (__any_sync(~0u, state >> 62 == 0));
+    const unsigned complete = __ballot_sync(~0u, state >> 62 == 2);
+    Packed part = complete && lane > __ffs(complete) - 1 ? 0 : state & kSums;
+#pragma unroll
+    for (int o = 16; o > 0; o /= 2) part += __shfl_xor_sync(~0u, part, o);
+    sum += part;
+    if (complete) break;
+  }
+  return sum;
+}
+
+// Sum over all entries of the table before this thread's; every thread of the block calls it with its own value.
+__device__ Packed exclusive_sum(Packed value, Packed* states, int tile) {
+  using Scan = cub::BlockScan<Packed, kThreads>;
+  __shared__ typename Scan::TempStorage storage;
+  __shared__ Packed before;
+  Packed inside, total;
+  Scan(storage).ExclusiveSum(value, inside, total);
+  if (threadIdx.x < 32) {
+    volatile Packed* const state = states + tile;
+    if (threadIdx.x == 0) *state = total | Packed(1) << 62;
+    const Packed sum = sum_before(states, tile);
+    if (threadIdx.x == 0) {
+      *state = (sum + total) | Packed(2) << 62;
+      before = sum;
+    }
+  }
+  __syncthreads();
+  return before + inside;
+}
+
+// Tiles are numbered in the order in which their blocks start, so that those before are always running or done.
+__device__ int next_tile(int* counter) {
+  __shared__ int tile;
+  if (threadIdx.x == 0) tile = atomicAdd(counter, 1);
+  __syncthreads();
+  return tile;
+}
+
+template <class T, int D>
+__global__ void __launch_bounds__(kThreads) slots(const ActivateArguments<T, D> a, const Workspace w, int table) {
+  const int tile = next_tile(&w.counters->tile[0]), b = tile * kThreads + int(threadIdx.x);
+  bool active = false;
+  if (b < table) {
+    int block[D];
+    block_coordinates(a.geometry, b, block);
+#pragma unroll
+    for (int o = 0; o < 1 << D; o++) {
+      int from = 0;
+      bool inside = true;
+#pragma unroll
+      for (int i = 0; i < D; i++) {
+        const int step = o >> (D - 1 - i) & 1;
+        from = from * a.geometry.blocks[i] + step;
+        inside = inside && block[i] >= step;
+      }
+      if (inside) active = active || w.tally[b - from].touched >> o & 1;
+    }
+  }
+  const int slot = first_of(exclusive_sum(active, w.slot_states, tile));
+  if (b >= table) return;
+  const bool given = active && slot < a.capacity;
+  a.table[b] = given ? slot : -1;
+  if (given) a.block[slot] = b;
+  if (b == table - 1) w.counters->wanted = slot + active;
+}
+
+template <class T, int D>
+__global__ void __launch_bounds__(kThreads) offsets(const ActivateArguments<T, D> a, const Workspace w, int table) {
+  const int tile = next_tile(&w.counters->tile[1]), b = tile * kThreads + int(threadIdx.x);
+  int count = 0, items = 0, slot = -1;
+  if (b < table) {
+    const Tally tally = w.tally[b];
+    slot = a.table[b];
+    count = tally.count;
+    if (count > 0) {
+      // Slots grow with the table, so the furthest neighbour touched tells whether all have one.
+      int furthest = 0;
+      const int o = 31 - __clz(tally.touched);
+#pragma unroll
+      for (int i = 0; i < D; i++) furthest = furthest * a.geometry.blocks[i] + (o >> (D - 1 - i) & 1);
+      if (a.table[b + furthest] < 0) {
+        w.tally[b].count = -1 - atomicAdd(&w.counters->tail, count);
+        count = 0;
+      }
+    }
+    items = (count + kItemParticles - 1) / kItemParticles;
+  }
+  const Packed before = exclusive_sum(pack(count, items), w.offset_states, tile);
+  if (b >= table) return;
+  const int start = first_of(before), item = second_of(before);
+  if (slot >= 0) a.offsets[slot] = start;
+  if (count > 0) w.tally[b].count = start;
+  int4* const out = reinterpret_cast<int4*>(lay_out_schedule<D>(a.schedule, a.capacity, a.particles).items) + item;
+  for (int k = 0; k < items; k++) {
+    const int begin = start + int(int64_t(count) * k / items), end = start + int(int64_t(count) * (k + 1) / items);
+    out[k] = make_int4(slot, begin, end, b);
+  }
+  if (b == table - 1) {
+    w.counters->transferred = start + count;
+    w.counters->items = item + items;
+  }
+}
+
+template <class T, int D>
+__device__ void write_status(const ActivateArguments<T, D>& a, const Workspace& w, int row) {
+  const int wanted = w.counters->wanted;
+  const Trouble& trouble = w.trouble[row];
+  const int64_t start = row * int64_t(kStatusSize);
+  int* const status = a.status + start;
+  copy_status(a.previous_status ? a.previous_status + start : nullptr, status);
+  const bool left_out = trouble.outside.count > 0 || trouble.not_finite.count > 0;
+  if (status[kProblemActivation] < 0 && (left_out || (row == 0 && wanted > a.capacity))) {
+    status[kProblemActivation] = a.previous_status ? a.previous_status[kActivations] : 0;
+    const auto write = [&](const LeftOut& out, int count, int first, int id) {
+      if (out.count == 0) return;
+      const int p = INT_MAX - out.first;
+      status[count] = out.count;
+      status[first] = p;
+      if (row > 0) status[id] = a.id ? int(a.id[p * a.id_stride]) : p;
+    };
+    write(trouble.outside, kOutsideCount, kOutsideFirst, kOutsideId);
+    write(trouble.not_finite, kNonFiniteCount, kNonFiniteFirst, kNonFiniteId);
+  }
+  if (row > 0) return;
+  status[kActivations]++;
+  status[kBlocksWanted] = max(status[kBlocksWanted], wanted);
+  status[kBlocksNow] = wanted;
+}
+
+template <class T, int D>
+__device__ void write_neighbours(const ActivateArguments<T, D>& a, int b, int neighbours[1 << D]) {
+  int block[D];
+  block_coordinates(a.geometry, b, block);
+#pragma unroll
+  for (int o = 0; o < 1 << D; o++) {
+    int to = 0;
+    bool inside = true;
+#pragma unroll
+    for (int i = 0; i < D; i++) {
+      const int step = o >> (D - 1 - i) & 1;
+      to = to * a.geometry.blocks[i] + step;
+      inside = inside && block[i] + step < a.geometry.blocks[i];
+    }
+    neighbours[o] = inside ? a.table[b + to] : -1;
+  }
+}
+
+template <class T, int D>
+__global__ void __launch_bounds__(kThreads) place(const ActivateArguments<T, D> a, const Workspace w) {
+  const Counters& c = *w.counters;
+  const Schedule<int> schedule = lay_out_schedule<D>(a.schedule, a.capacity, a.particles);
+  const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
+  if (i == 0) {
+    *schedule.item_count = c.items;
+    *schedule.scattered = c.groups > kScattered * c.warps;
+  }
+  if (i <= a.scenes) write_status(a, w, int(i));
+  if (i < min(c.wanted, a.capacity)) {
+    write_neighbours(a, a.block[i], schedule.neighbours + (i << D));
+  } else if (i <= a.capacity) {
+    a.offsets[i] = c.transferred;
+    if (i < a.capacity) a.block[i] = -1;
+  }
+  if (i >= a.particles) return;
+  const int key = w.key[i], first = key < 0 ? -1 : w.tally[key].count, home = first < 0 ? -1 : a.table[key];
+  schedule.home[i] = home;
+  if (a.deterministic) {
+    w.slot[i] = home < 0 ? a.capacity : home;
+    w.id[i] = int(i);
+  } else {
+    const int rank = w.rank[i];
+    a.index[first < 0 ? a.particles + first - rank : first + rank] = int(i);
+  }
+}
+
+}  // namespace
+
+template <class T, int D>
+int64_t activate_workspace(const ActivateArguments<T, D>& a) {
+  return lay_out(a).size;
+}
+
+template <int Order, class T, int D>
+void activate(const ActivateArguments<T, D>& a, Stream stream) {
+  const Workspace w = lay_out(a);
+  const int table = a.scenes * a.geometry.blocks_per_scene;
+  const auto blocks = [](int64_t count) { return unsigned((count + kThreads - 1) / kThreads); };
+  check(cudaMemsetAsync(a.workspace, 0, w.zeroed, stream));
+  if (a.particles > 0) launch(classify<Order, T, D>, blocks(a.particles), kThreads, 0, stream, a, w);
+  if (table > 0) {
+    launch(slots<T, D>, blocks(table), kThreads, 0, stream, a, w, table);
+    launch(offsets<T, D>, blocks(table), kThreads, 0, stream, a, w, table);
+  }
+  const int64_t rows = int64_t(std::max(a.capacity, a.scenes)) + 1;  // of slots with their end, or of the status
+  launch(place<T, D>, blocks(std::max(a.particles, rows)), kThreads, 0, stream, a, w);
+  if (a.deterministic && a.particles > 0) {
+    size_t size = w.sort_size;
+    check(cub::DeviceRadixSort::SortPairs(w.sort, size, w.slot, w.slot_sorted, w.id, a.index, int(a.particles), 0,
+                                          bits_for(a.capacity), stream));
+  }
+}
+
+MPM_INSTANTIATE_SIZE(activate_workspace, ActivateArguments)
+MPM_INSTANTIATE_ORDERS(activate, ActivateArguments)
+
+}  // namespace mpm::cuda

@@ -1,0 +1,53 @@
+#include "cuda/home.cuh"
+#include "cuda/launch.cuh"
+#include "grid/cell_order.h"
+
+// Orders the particles of each work item by cell with a stable counting sort in shared memory.
+namespace mpm::cuda {
+namespace {
+
+// One thread per cell: each reads all cells of the item, which is a broadcast from shared memory.
+template <int Order, class T, int D>
+__global__ void __launch_bounds__(kBlockNodes<D>)
+    cell_order_kernel(const Topology<T, D> t, const Columns<const T, D> position, int* order) {
+  constexpr int cells = kBlockNodes<D>;
+  __shared__ unsigned char cell[kItemParticles];
+  __shared__ int counts[cells];
+  const Schedule<const int> schedule = schedule_of(t);
+  const int items = *schedule.item_count, own = threadIdx.x;
+  for (int i = blockIdx.x; i < items; i += gridDim.x) {
+    const int4 item = reinterpret_cast<const int4*>(schedule.items)[i];
+    const int begin = item.y, count = item.z - begin;
+    __syncthreads();  // the item before is done
+    for (int k = own; k < count; k += cells) {
+      int base[D];
+      T f[D];
+      const bool inside = locate<Order>(t.geometry, read_vector(position, t.index[begin + k]).e, base, f);
+      cell[k] = inside ? node_in_block<D>(base) : 0;
+    }
+    __syncthreads();
+    int mine = 0, next = begin;
+    for (int k = 0; k < count; k++) mine += cell[k] == own;
+    counts[own] = mine;
+    __syncthreads();
+    for (int c = 0; c < own; c++) next += counts[c];
+    for (int k = 0; k < count; k++)
+      if (cell[k] == own) order[next++] = t.index[begin + k];
+  }
+  const int64_t stride = int64_t(gridDim.x) * cells;
+  for (int64_t i = t.offsets[t.capacity] + int64_t(blockIdx.x) * cells + own; i < t.particles; i += stride)
+    order[i] = t.index[i];
+}
+
+}  // namespace
+
+template <int Order, class T, int D>
+void cell_order(const CellOrderArguments<T, D>& a, Stream stream) {
+  if (a.topology.particles == 0) return;
+  launch(cell_order_kernel<Order, T, D>, grid_size(most_items(a.topology.capacity, a.topology.particles)),
+         kBlockNodes<D>, 0, stream, a.topology, Columns<const T, D>(a.x), a.order);
+}
+
+MPM_INSTANTIATE_ORDERS(cell_order, CellOrderArguments)
+
+}  // namespace mpm::cuda

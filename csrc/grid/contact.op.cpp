@@ -1,0 +1,125 @@
+#include <algorithm>
+#include <cmath>
+#include <limits>
+
+#include "grid/kernels.h"
+
+// Contact of the grid with rigid obstacles.
+namespace mpm {
+namespace {
+
+#define MPM_CONTACT_SCHEMA                                                                                           \
+  "Tensor velocity, Tensor obstacles, int[] shape, int[] contact, int[] scene, float[] start, float[] end, Tensor? " \
+  "scene_time, float time, Tensor block, float dx, float[] lower, int[] blocks"
+#define MPM_CONTACT_PARAMETERS                                                                                    \
+  const Tensor &velocity, const Tensor &obstacles, std::vector<int64_t> shape, std::vector<int64_t> contact_kind, \
+      std::vector<int64_t> scene, std::vector<double> start, std::vector<double> end,                             \
+      const OptionalTensor &scene_time, double time, const Tensor &block, double dx, std::vector<double> lower,   \
+      std::vector<int64_t> blocks
+#define MPM_CONTACT_ARGUMENTS \
+  velocity, obstacles, shape, contact_kind, scene, start, end, scene_time, time, block, dx, lower, blocks
+
+void check_velocity(const Tensor& velocity) {
+  STD_TORCH_CHECK(velocity.dim() == 2 && (velocity.size(1) == 2 || velocity.size(1) == 3),
+                  "velocity must have shape [N, 2] or [N, 3], got ", shape_of(velocity));
+  check_count(velocity.size(0), "velocity", "nodes");
+}
+
+template <class T, int D>
+ContactArguments<T, D> contact_arguments(MPM_CONTACT_PARAMETERS) {
+  ContactArguments<T, D> a;
+  a.geometry = geometry<T, D>(dx, lower, blocks);
+  a.dx = dx;
+  T largest = T(0);  // coordinate of a node
+  for (int i = 0; i < D; i++) {
+    a.lower[i] = lower[i];
+    const double upper = lower[i] + dx * double(blocks[i] * kBlockWidth);
+    largest = std::fmax(largest, T(std::fmax(std::fabs(lower[i]), std::fabs(upper))));
+  }
+  a.rounding = 16 * std::numeric_limits<T>::epsilon() * largest;
+  a.capacity = block_capacity<D>(block);
+  a.block = int_pointer(block, "block", velocity, {a.capacity});
+  const auto v = node_input<T>(velocity, "velocity", velocity, node_count<D>(block));
+  a.velocity = v.pointer;
+  a.stride = v.stride;
+  constexpr int64_t width = sizeof(ObstacleRow<T, D>) / sizeof(T);
+  check_rank(obstacles, "obstacles", 3);
+  check_like(obstacles, "obstacles", velocity);
+  STD_TORCH_CHECK(obstacles.is_contiguous() && obstacles.size(0) > 0 && obstacles.size(0) <= INT32_MAX &&
+                      obstacles.size(1) <= kMaxObstacles && obstacles.size(2) == width,
+                  "obstacles must be contiguous with shape [1 or B, at most ", kMaxObstacles, ", ", width, "], got ",
+                  shape_of(obstacles));
+  a.row = static_cast<const ObstacleRow<T, D>*>(obstacles.data_ptr());
+  a.rows = int(obstacles.size(0));
+  a.obstacles = int(obstacles.size(1));
+  const size_t count = size_t(a.obstacles);
+  const auto check_entries = [&](const auto& list, const char* name) {
+    STD_TORCH_CHECK(list.size() == count, name, " must have an entry per obstacle, ", count, ", got ", list.size());
+  };
+  check_entries(shape, "shape");
+  check_entries(contact_kind, "contact");
+  check_entries(scene, "scene");
+  check_entries(start, "start");
+  check_entries(end, "end");
+  for (size_t k = 0; k < count; k++) {
+    STD_TORCH_CHECK(shape[k] >= int64_t(ObstacleShape::plane) && shape[k] <= int64_t(ObstacleShape::capsule),
+                    "shape must be 0 to 3, got ", shape[k]);
+    STD_TORCH_CHECK(contact_kind[k] >= int64_t(Contact::sticky) && contact_kind[k] <= int64_t(Contact::separate),
+                    "contact must be 1 to 3, got ", contact_kind[k]);
+    STD_TORCH_CHECK(scene[k] >= -1 && scene[k] <= INT32_MAX, "scene must be -1 or a scene, got ", scene[k]);
+    a.kind[k] = {ObstacleShape(shape[k]), Contact(contact_kind[k]), int(scene[k]), start[k], end[k]};
+  }
+  a.time = time;
+  if (has(scene_time)) {
+    check_rank(*scene_time, "scene_time", 1);
+    check_like(*scene_time, "scene_time", velocity);
+    STD_TORCH_CHECK(scene_time->is_contiguous() && scene_time->size(0) > 0 && scene_time->size(0) <= INT32_MAX,
+                    "scene_time must be contiguous with shape [1 or B], got ", shape_of(*scene_time));
+    a.scene_time = static_cast<const T*>(scene_time->data_ptr());
+    a.times = int(scene_time->size(0));
+  }
+  return a;
+}
+
+Tensor contact(MPM_CONTACT_PARAMETERS) {
+  const DeviceScope device(velocity);
+  check_velocity(velocity);
+  Tensor rows = empty(velocity, {velocity.size(0), 1 + velocity.size(1)});
+  dispatch(velocity, "velocity", velocity.size(1), [&]<class T, int D>() {
+    auto a = contact_arguments<T, D>(MPM_CONTACT_ARGUMENTS);
+    a.result = static_cast<T*>(rows.data_ptr());
+    backend::contact(a, device.stream());
+  });
+  return rows;
+}
+
+Tensor contact_backward(const Tensor& grad, MPM_CONTACT_PARAMETERS) {
+  const DeviceScope device(velocity);
+  check_velocity(velocity);
+  Tensor rows = empty(velocity, {velocity.size(0), 1 + velocity.size(1)});
+  dispatch(velocity, "velocity", velocity.size(1), [&]<class T, int D>() {
+    auto a = contact_arguments<T, D>(MPM_CONTACT_ARGUMENTS);
+    check_shape(grad, "grad", {velocity.size(0), D});
+    const auto g = node_input<T>(grad, "grad", velocity, node_count<D>(block));
+    a.grad = g.pointer;
+    a.grad_stride = g.stride;
+    a.result = static_cast<T*>(rows.data_ptr());
+    backend::contact_backward(a, device.stream());
+  });
+  return rows;
+}
+
+}  // namespace
+}  // namespace mpm
+
+#if MPM_BACKEND == MPM_BACKEND_IS_cpu
+STABLE_TORCH_LIBRARY_FRAGMENT(torch_mpm, m) {
+  m.def("contact(" MPM_CONTACT_SCHEMA ") -> Tensor");
+  m.def("contact_backward(Tensor grad, " MPM_CONTACT_SCHEMA ") -> Tensor");
+}
+#endif
+
+MPM_LIBRARY_IMPL(m) {
+  m.impl("contact", TORCH_BOX(&mpm::contact));
+  m.impl("contact_backward", TORCH_BOX(&mpm::contact_backward));
+}

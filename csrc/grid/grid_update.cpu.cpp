@@ -1,0 +1,45 @@
+#include "grid/grid_update.h"
+#include "cpu/parallel.h"
+
+namespace mpm::cpu {
+inline namespace TORCH_MPM_ISA {
+namespace {
+
+template <int D>
+constexpr int64_t kGrain = 4096 / kBlockNodes<D>;  // slots below which a range is not split
+
+}  // namespace
+
+template <class T, int D>
+void grid_update(const GridUpdateArguments<T, D>& a) {
+  parallel_ranges(a.capacity, kGrain<D>, [&](int64_t begin, int64_t end) {
+    for (int64_t slot = begin; slot < end; slot++) {
+      const SlotUpdate<T, D> s = slot_update(a, int(slot));
+      const int64_t first = slot * kBlockNodes<D>;
+      for (int local = 0; local < kBlockNodes<D>; local++)
+        a.updated[first + local] = update_node(a, s, local, a.nodes[first + local]);
+    }
+  });
+}
+
+template <class T, int D>
+void grid_update_backward(const GridUpdateBackwardArguments<T, D>& a) {
+  parallel_ranges(a.forward.capacity, kGrain<D>, [&](int64_t begin, int64_t end) {
+    for (int64_t slot = begin; slot < end; slot++) {
+      const SlotUpdate<T, D> s = slot_update(a.forward, int(slot));
+      const int64_t first = slot * kBlockNodes<D>;
+      Vector<T, D> sum = zero_vector<T, D>(), change;
+      for (int local = 0; local < kBlockNodes<D>; local++) {
+        a.grad_nodes[first + local] = update_node_backward(a, s, local, first + local, change);
+        sum = sum + change;
+      }
+      if (a.change) a.change[slot] = sum;
+    }
+  });
+}
+
+MPM_INSTANTIATE(grid_update, GridUpdateArguments)
+MPM_INSTANTIATE(grid_update_backward, GridUpdateBackwardArguments)
+
+}  // namespace TORCH_MPM_ISA
+}  // namespace mpm::cpu

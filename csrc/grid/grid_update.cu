@@ -1,0 +1,66 @@
+#include "cuda/launch.cuh"
+#include "grid/grid_update.h"
+
+namespace mpm::cuda {
+namespace {
+
+constexpr int kThreads = 256;
+template <int D>
+constexpr int kLanes = kBlockNodes<D> < 32 ? kBlockNodes<D> : 32;  // lanes of a warp that share a slot
+
+template <class T, int D>
+__global__ void __launch_bounds__(kThreads) grid_update_kernel(const GridUpdateArguments<T, D> a) {
+  const int64_t node = int64_t(blockIdx.x) * kThreads + threadIdx.x;
+  const int slot = int(node / kBlockNodes<D>);
+  if (slot >= a.capacity) return;
+  a.updated[node] = update_node(a, slot_update(a, slot), int(node % kBlockNodes<D>), a.nodes[node]);
+}
+
+// A whole warp, or half of one in 2-D, works on a slot and sums over its nodes in a fixed order.
+template <class T, int D>
+__global__ void __launch_bounds__(kThreads) grid_update_backward_kernel(const GridUpdateBackwardArguments<T, D> a) {
+  const int64_t thread = int64_t(blockIdx.x) * kThreads + threadIdx.x;
+  const int64_t slot = thread / kLanes<D>;
+  const int lane = int(thread % kLanes<D>);
+  Vector<T, D> sum = zero_vector<T, D>();
+  if (slot < a.forward.capacity) {
+    const SlotUpdate<T, D> s = slot_update(a.forward, int(slot));
+#pragma unroll
+    for (int local = lane; local < kBlockNodes<D>; local += kLanes<D>) {
+      const int64_t node = slot * kBlockNodes<D> + local;
+      Vector<T, D> change;
+      a.grad_nodes[node] = update_node_backward(a, s, local, node, change);
+      sum = sum + change;
+    }
+  }
+  if (!a.change) return;
+#pragma unroll
+  for (int i = 0; i < D; i++)
+#pragma unroll
+    for (int step = kLanes<D> / 2; step > 0; step /= 2)
+      sum[i] += __shfl_down_sync(0xffffffffu, sum[i], step, kLanes<D>);
+  if (slot < a.forward.capacity && lane == 0) a.change[slot] = sum;
+}
+
+unsigned blocks_for(int64_t capacity, int64_t threads_per_slot) {
+  return unsigned((capacity * threads_per_slot + kThreads - 1) / kThreads);
+}
+
+}  // namespace
+
+template <class T, int D>
+void grid_update(const GridUpdateArguments<T, D>& a, Stream stream) {
+  if (a.capacity == 0) return;
+  launch(grid_update_kernel<T, D>, blocks_for(a.capacity, kBlockNodes<D>), kThreads, 0, stream, a);
+}
+
+template <class T, int D>
+void grid_update_backward(const GridUpdateBackwardArguments<T, D>& a, Stream stream) {
+  if (a.forward.capacity == 0) return;
+  launch(grid_update_backward_kernel<T, D>, blocks_for(a.forward.capacity, kLanes<D>), kThreads, 0, stream, a);
+}
+
+MPM_INSTANTIATE(grid_update, GridUpdateArguments)
+MPM_INSTANTIATE(grid_update_backward, GridUpdateBackwardArguments)
+
+}  // namespace mpm::cuda

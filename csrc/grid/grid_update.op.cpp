@@ -1,0 +1,140 @@
+#include <algorithm>
+
+#include "grid/kernels.h"
+
+// Node mass and momentum to mass and velocity, with gravity and the walls of the domain.
+namespace mpm {
+namespace {
+
+#define MPM_GRID_UPDATE_SCHEMA                                                                               \
+  "Tensor nodes, Tensor? gravity, Tensor? scene_dt, float dt, int[] wall_kind, float[] wall_plane, float[] " \
+  "wall_friction, Tensor table, Tensor block, float dx, float[] lower, int[] blocks"
+#define MPM_GRID_UPDATE_PARAMETERS                                                                       \
+  const Tensor &nodes, const OptionalTensor &gravity, const OptionalTensor &scene_dt, double dt,         \
+      std::vector<int64_t> wall_kind, std::vector<double> wall_plane, std::vector<double> wall_friction, \
+      const Tensor &table, const Tensor &block, double dx, std::vector<double> lower, std::vector<int64_t> blocks
+#define MPM_GRID_UPDATE_ARGUMENTS \
+  nodes, gravity, scene_dt, dt, wall_kind, wall_plane, wall_friction, table, block, dx, lower, blocks
+
+void check_nodes(const Tensor& nodes) {
+  STD_TORCH_CHECK(nodes.dim() == 2 && (nodes.size(1) == 3 || nodes.size(1) == 4),
+                  "nodes must have shape [N, 3] or [N, 4], got ", shape_of(nodes));
+  check_count(nodes.size(0), "nodes", "rows");
+}
+
+// Kernels read whole rows with vector loads.
+Tensor packed_rows(const Tensor& t) {
+  const bool packed = t.is_contiguous() && reinterpret_cast<uintptr_t>(t.data_ptr()) % 16 == 0;
+  if (packed) return t;
+  Tensor copy = empty(t, {t.size(0), t.size(1)});
+  torch::stable::copy_(copy, t);
+  return copy;
+}
+
+template <class T, int D>
+const NodeRow<T, D>* rows(const Tensor& t, const char* name, const Tensor& nodes) {
+  check_shape(t, name, {nodes.size(0), 1 + D});
+  check_like(t, name, nodes);
+  return static_cast<const NodeRow<T, D>*>(t.data_ptr());
+}
+
+template <class T>
+const T* scene_values(const OptionalTensor& t, const char* name, const Tensor& nodes, const Shape& shape) {
+  if (!has(t)) return nullptr;
+  check_shape(*t, name, shape);
+  check_like(*t, name, nodes);
+  STD_TORCH_CHECK(t->is_contiguous(), name, " must be contiguous");
+  return static_cast<const T*>(t->data_ptr());
+}
+
+template <class T, int D>
+Walls<T, D> walls(const std::vector<int64_t>& kind, const std::vector<double>& plane,
+                  const std::vector<double>& friction, double dx, const std::vector<double>& lower) {
+  STD_TORCH_CHECK(kind.empty() || kind.size() == 2 * D, "wall_kind must be empty or have ", 2 * D,
+                  " entries, two per axis, got ", kind.size());
+  STD_TORCH_CHECK(plane.size() == kind.size(), "wall_plane must have an entry per wall_kind, ", kind.size(), ", got ",
+                  plane.size());
+  STD_TORCH_CHECK(friction.size() == kind.size(), "wall_friction must have an entry per wall_kind, ", kind.size(),
+                  ", got ", friction.size());
+  Walls<T, D> w;
+  for (int face = 0; face < 2 * D; face++) {
+    const int64_t k = kind.empty() ? int64_t(Contact::open) : kind[face];
+    STD_TORCH_CHECK(k >= int64_t(Contact::open) && k <= int64_t(Contact::mirror), "wall_kind must be 0 to 4, got ", k);
+    const bool open = k == int64_t(Contact::open);
+    w.set(face, Contact(k), open ? 0 : friction[face], open ? 0 : plane[face], dx, lower[face / 2]);
+  }
+  return w;
+}
+
+template <class T, int D>
+GridUpdateArguments<T, D> grid_update_arguments(MPM_GRID_UPDATE_PARAMETERS) {
+  GridUpdateArguments<T, D> a;
+  a.geometry = geometry<T, D>(dx, lower, blocks);
+  a.capacity = block_capacity<D>(block);
+  a.block = int_pointer(block, "block", nodes, {a.capacity});
+  check_shape(nodes, "nodes", {node_count<D>(block), 1 + D});
+  a.nodes = rows<T, D>(nodes, "nodes", nodes);
+  check_rank(table, "table", 1);
+  a.table = int_pointer(table, "table", nodes, {table.size(0)});
+  a.block_count = int(std::min<int64_t>(INT32_MAX, table.numel()));
+  if (has(gravity)) {
+    check_rank(*gravity, "gravity", 2);
+    const int64_t scenes = gravity->size(0);
+    a.gravity = scene_values<T>(gravity, "gravity", nodes, {scenes, D});
+    a.scene_dt = scene_values<T>(scene_dt, "scene_dt", nodes, {scenes});
+    a.block_count = int(std::min<int64_t>(a.block_count, scenes * a.geometry.blocks_per_scene));
+  }
+  a.dt = dt;
+  a.walls = walls<T, D>(wall_kind, wall_plane, wall_friction, dx, lower);
+  return a;
+}
+
+Tensor grid_update(MPM_GRID_UPDATE_PARAMETERS) {
+  check_nodes(nodes);
+  const DeviceScope device(nodes);
+  const Tensor packed = packed_rows(nodes);
+  Tensor updated = empty(packed, {packed.size(0), packed.size(1)});
+  dispatch(nodes, "nodes", nodes.size(1) - 1, [&]<class T, int D>() {
+    auto a = grid_update_arguments<T, D>(MPM_GRID_UPDATE_ARGUMENTS);
+    a.nodes = rows<T, D>(packed, "nodes", nodes);
+    a.updated = static_cast<NodeRow<T, D>*>(updated.data_ptr());
+    backend::grid_update(a, device.stream());
+  });
+  return updated;
+}
+
+// `change` is the adjoint of the velocity change by gravity, summed over the nodes of each slot.
+std::tuple<Tensor, Tensor> grid_update_backward(const Tensor& grad, bool wants_change, MPM_GRID_UPDATE_PARAMETERS) {
+  check_nodes(nodes);
+  check_shape(grad, "grad", {nodes.size(0), nodes.size(1)});
+  const DeviceScope device(nodes);
+  const Tensor packed = packed_rows(nodes), packed_grad = packed_rows(grad);
+  Tensor grad_nodes = empty(packed, {packed.size(0), packed.size(1)}), change;
+  dispatch(nodes, "nodes", nodes.size(1) - 1, [&]<class T, int D>() {
+    GridUpdateBackwardArguments<T, D> a;
+    a.forward = grid_update_arguments<T, D>(MPM_GRID_UPDATE_ARGUMENTS);
+    a.forward.nodes = rows<T, D>(packed, "nodes", nodes);
+    a.grad_updated = rows<T, D>(packed_grad, "grad", nodes);
+    a.grad_nodes = static_cast<NodeRow<T, D>*>(grad_nodes.data_ptr());
+    change = empty(nodes, {wants_change ? a.forward.capacity : 0, D});
+    if (wants_change) a.change = static_cast<Vector<T, D>*>(change.data_ptr());
+    backend::grid_update_backward(a, device.stream());
+  });
+  return {grad_nodes, change};
+}
+
+}  // namespace
+}  // namespace mpm
+
+#if MPM_BACKEND == MPM_BACKEND_IS_cpu
+STABLE_TORCH_LIBRARY_FRAGMENT(torch_mpm, m) {
+  m.def("grid_update(" MPM_GRID_UPDATE_SCHEMA ") -> Tensor");
+  m.def("grid_update_backward(Tensor grad, bool wants_change, " MPM_GRID_UPDATE_SCHEMA
+        ") -> (Tensor nodes, Tensor change)");
+}
+#endif
+
+MPM_LIBRARY_IMPL(m) {
+  m.impl("grid_update", TORCH_BOX(&mpm::grid_update));
+  m.impl("grid_update_backward", TORCH_BOX(&mpm::grid_update_backward));
+}

@@ -1,0 +1,17 @@
+#pragma once
+
+#include "common/backend.h"
+#include "grid/cell_order.h"
+#include "grid/grid_update.h"
+#include "grid/obstacle.h"
+#include "grid/status.h"
+
+#define MPM_GRID_KERNELS(PLAIN, ORDERED, SIZE)             \
+  SIZE(activate_workspace, ActivateArguments)              \
+  ORDERED(activate, ActivateArguments)                     \
+  ORDERED(cell_order, CellOrderArguments)                  \
+  PLAIN(grid_update, GridUpdateArguments)                  \
+  PLAIN(grid_update_backward, GridUpdateBackwardArguments) \
+  PLAIN(contact, ContactArguments)                         \
+  PLAIN(contact_backward, ContactArguments)
+MPM_BACKEND_KERNELS(MPM_GRID_KERNELS)

@@ -1,0 +1,303 @@
+#pragma once
+
+#include <cmath>
+#include <cstdint>
+
+#include "grid/friction.h"
+#include "grid/geometry.h"
+
+// Rigid obstacles: which nodes are inside, and the velocity of those after contact.
+namespace mpm {
+
+enum class ObstacleShape : int { plane = 0, sphere = 1, box = 2, capsule = 3 };
+
+constexpr int kMaxObstacles = 16;  // of one call
+
+// What differs between the obstacles of a call, but not between scenes.
+struct ObstacleKind {
+  ObstacleShape shape;
+  Contact contact;
+  int scene;          // -1 for all
+  double start, end;  // acts while start <= time < end [s]
+};
+
+// A row of the table of obstacles, all of it numbers of the nodes' type (torch_mpm/ops/contact.py writes it).
+template <class T, int D>
+struct ObstacleRow {
+  static constexpr int angles = D == 2 ? 1 : 3;
+  T friction;
+  T position[D], velocity[D];                    // of the centre at time `start`
+  T rotation[angles], angular_velocity[angles];  // an angle in 2-D, a vector in 3-D; about the centre
+  T extent[D];                                   // plane: normal; box: edge lengths; capsule: half axis
+  T radius;                                      // of a sphere or capsule
+};
+
+template <class T, int D>
+struct ContactArguments {
+  Geometry<T, D> geometry;
+  double dx, lower[D];
+  T rounding;  // distance within which a node lies on a surface [m]
+  int capacity = 0;
+  const int* block = nullptr;  // [capacity] block of a slot, -1 where unused
+  int obstacles = 0;
+  ObstacleKind kind[kMaxObstacles];
+  const ObstacleRow<T, D>* row = nullptr;  // [rows, obstacles]; one row for all scenes, or one per scene
+  int rows = 0;
+  const T* scene_time = nullptr;  // [times], one for all scenes or one per scene; or null
+  int times = 0;
+  double time = 0;              // where scene_time is null
+  const T* velocity = nullptr;  // node i at velocity + i * stride
+  const T* grad = nullptr;      // likewise; backward only
+  int64_t stride = 0, grad_stride = 0;
+  T* result = nullptr;  // rows [capacity * 4^D, 1 + D] as of the grid update, the first column zero
+};
+
+inline namespace TORCH_MPM_ISA {
+
+// Rotation by an angle, or by a vector (Rodrigues).
+template <class T>
+MPM_HD Matrix<T, 2> rotation_matrix(const T (&angle)[1], T factor) {
+  const T c = std::cos(angle[0] * factor), s = std::sin(angle[0] * factor);
+  return {{{c, T(0) - s}, {s, c}}};
+}
+
+template <class T>
+MPM_HD Matrix<T, 3> rotation_matrix(const T (&vector)[3], T factor) {
+  const T x = vector[0] * factor, y = vector[1] * factor, z = vector[2] * factor;
+  const T half = T(0.5) * std::sqrt(x * x + y * y + z * z);
+  const T s = half > T(0) ? std::sin(half) / half : T(1);  // sin(θ/2)/(θ/2)
+  const T first = s * std::cos(half), second = T(0.5) * s * s;
+  const Matrix<T, 3> cross = {{{T(0), T(0) - z, y}, {z, T(0), T(0) - x}, {T(0) - y, x, T(0)}}};
+  return identity<T, 3>() + first * cross + second * (cross * cross);
+}
+
+// An obstacle at a time.
+template <class T, int D>
+struct ObstaclePose {
+  bool acts;
+  ObstacleShape shape;
+  Contact contact;
+  const ObstacleRow<T, D>* row;
+  Vector<T, D> centre;
+  Matrix<T, D> rotation;  // world = centre + rotation body
+};
+
+template <class T, int D>
+MPM_HD ObstaclePose<T, D> obstacle_pose(const ContactArguments<T, D>& a, const ObstacleKind& kind,
+                                        const ObstacleRow<T, D>& row, int scene) {
+  const double time = a.scene_time ? double(a.scene_time[a.times == 1 ? 0 : scene]) : a.time;
+  ObstaclePose<T, D> p;
+  p.acts = (kind.scene < 0 || kind.scene == scene) && time >= kind.start && time < kind.end;
+  if (!p.acts) return p;
+  p.shape = kind.shape;
+  p.contact = kind.contact;
+  p.row = &row;
+  const T elapsed = T(time - kind.start);
+  MPM_UNROLL for (int i = 0; i < D; i++)
+    p.centre[i] = row.position[i] + row.velocity[i] * elapsed;
+  p.rotation = rotation_matrix(row.angular_velocity, elapsed) * rotation_matrix(row.rotation, T(1));
+  return p;
+}
+
+template <class T, int D>
+MPM_HD T length(const Vector<T, D>& v) {
+  return std::sqrt(dot(v, v));
+}
+
+// Signed distance of a point in body coordinates, and the unit normal out of the body: right inside, zero where the
+// shape has none.
+template <class T, int D>
+MPM_HD T surface(const ObstaclePose<T, D>& o, const Vector<T, D>& body, Vector<T, D>& normal) {
+  Vector<T, D> extent;
+  MPM_UNROLL for (int i = 0; i < D; i++)
+    extent[i] = o.row->extent[i];
+  if (o.shape == ObstacleShape::plane) {
+    normal = (T(1) / length(extent)) * extent;
+    return dot(body, normal);
+  }
+  if (o.shape == ObstacleShape::box) {  // the nearest face is that of the axis with the least negative distance
+    T deepest = T(0);
+    int axis = -1;
+    MPM_UNROLL for (int i = 0; i < D; i++) {
+      const T distance = std::fabs(body[i]) - T(0.5) * extent[i];
+      if (axis < 0 || distance > deepest) deepest = distance, axis = i;
+    }
+    MPM_UNROLL for (int i = 0; i < D; i++)
+      normal[i] = i != axis ? T(0) : body[i] < T(0) ? T(-1) : T(1);
+    return deepest;
+  }
+  Vector<T, D> offset = body;
+  if (o.shape == ObstacleShape::capsule) {
+    const T squared = dot(extent, extent);
+    T along = squared > T(0) ? dot(body, extent) / squared : T(0);
+    along = along < T(-1) ? T(-1) : along > T(1) ? T(1) : along;
+    offset = body + (T(0) - along) * extent;
+  }
+  const T distance = length(offset);
+  normal = (distance > T(0) ? T(1) / distance : T(0)) * offset;
+  return distance - o.row->radius;
+}
+
+// A node seen by an obstacle.
+template <class T, int D>
+struct Touch {
+  bool touching;
+  Vector<T, D> normal, surface_velocity;
+};
+
+template <class T, int D>
+MPM_HD Touch<T, D> touch(const ContactArguments<T, D>& a, const ObstaclePose<T, D>& o, const Vector<T, D>& position) {
+  Touch<T, D> t;
+  const Vector<T, D> arm = position + T(-1) * o.centre;
+  Vector<T, D> normal;
+  t.touching = surface(o, transpose(o.rotation) * arm, normal) <= a.rounding;
+  if (!t.touching) return t;
+  t.normal = o.rotation * normal;
+  MPM_UNROLL for (int i = 0; i < D; i++)
+    t.surface_velocity[i] = o.row->velocity[i];
+  if constexpr (D == 2) {
+    t.surface_velocity[0] -= o.row->angular_velocity[0] * arm[1];
+    t.surface_velocity[1] += o.row->angular_velocity[0] * arm[0];
+  } else {
+    MPM_UNROLL for (int i = 0; i < 3; i++) {
+      const int j = (i + 1) % 3, k = (i + 2) % 3;
+      t.surface_velocity[i] += o.row->angular_velocity[j] * arm[k] - o.row->angular_velocity[k] * arm[j];
+    }
+  }
+  return t;
+}
+
+// Whether an obstacle may touch a node of the block whose first node is at `first`. Distances change by no more than
+// the way from a point to another.
+template <class T, int D>
+MPM_HD bool near_block(const ContactArguments<T, D>& a, const ObstaclePose<T, D>& o, const Vector<T, D>& first) {
+  const T half = T(0.5 * (kBlockWidth - 1) * a.dx);
+  Vector<T, D> arm, normal;
+  MPM_UNROLL for (int i = 0; i < D; i++)
+    arm[i] = first[i] + half - o.centre[i];
+  const T reach = std::sqrt(T(D)) * half * T(1.001) + a.rounding;
+  return surface(o, transpose(o.rotation) * arm, normal) <= reach;
+}
+
+template <class T, int D>
+MPM_HD Vector<T, D> node_position(const ContactArguments<T, D>& a, const int corner[D], int local) {
+  Vector<T, D> x;
+  MPM_UNROLL for (int i = 0; i < D; i++) {
+    const int node = corner[i] + ((local >> 2 * (D - 1 - i)) & (kBlockWidth - 1));
+    x[i] = T(a.lower[i] + double(node - kPadding) * a.dx);
+  }
+  return x;
+}
+
+template <class T, int D>
+MPM_HD Vector<T, D> relative_velocity(const Touch<T, D>& t, const Vector<T, D>& v) {
+  return v + T(-1) * t.surface_velocity;
+}
+
+template <class T, int D>
+MPM_HD Vector<T, D> after_contact(const ObstaclePose<T, D>& o, const Touch<T, D>& t, const Vector<T, D>& v) {
+  const Vector<T, D> u = relative_velocity(t, v);
+  return v + (contact_velocity(o.contact, u, t.normal, o.row->friction) + T(-1) * u);
+}
+
+// What the nodes of a slot share.
+template <class T, int D>
+struct ContactSlot {
+  bool active;
+  int scene;
+  int corner[D];                 // lattice index of the first node
+  const ObstacleRow<T, D>* row;  // the obstacles of its scene
+};
+
+template <class T, int D>
+MPM_HD ContactSlot<T, D> contact_slot(const ContactArguments<T, D>& a, int slot) {
+  ContactSlot<T, D> s;
+  const int index = a.block[slot];
+  s.active = index >= 0;
+  if (!s.active) return s;
+  s.scene = block_coordinates(a.geometry, index, s.corner);
+  s.active = (a.rows == 1 || s.scene < a.rows) && (!a.scene_time || a.times == 1 || s.scene < a.times);
+  s.row = a.row + (a.rows == 1 ? 0 : int64_t(s.scene) * a.obstacles);
+  MPM_UNROLL for (int i = 0; i < D; i++)
+    s.corner[i] *= kBlockWidth;
+  return s;
+}
+
+// The pose of obstacle k; it does not act where it cannot touch the block.
+template <class T, int D>
+MPM_HD ObstaclePose<T, D> pose_at(const ContactArguments<T, D>& a, const ContactSlot<T, D>& s, int k) {
+  ObstaclePose<T, D> pose = obstacle_pose(a, a.kind[k], s.row[k], s.scene);
+  pose.acts = pose.acts && near_block(a, pose, node_position(a, s.corner, 0));
+  return pose;
+}
+
+template <class T, int D>
+MPM_HD Vector<T, D> load_node(const T* values, int64_t stride, int64_t node) {
+  Vector<T, D> v;
+  MPM_UNROLL for (int i = 0; i < D; i++)
+    v[i] = values[node * stride + i];
+  return v;
+}
+
+template <class T, int D>
+MPM_HD void store_node(T* values, int64_t node, const Vector<T, D>& v) {
+  T* const row = values + node * (1 + D);
+  row[0] = T(0);
+  MPM_UNROLL for (int i = 0; i < D; i++)
+    row[1 + i] = v[i];
+}
+
+// The nodes lane, lane + Lanes, ... of a slot. Obstacles act one after another.
+template <int Lanes, class T, int D>
+MPM_HD void slot_contact(const ContactArguments<T, D>& a, int slot, int lane) {
+  constexpr int count = kBlockNodes<D> / Lanes;
+  const ContactSlot<T, D> s = contact_slot(a, slot);
+  const int64_t first = int64_t(slot) * kBlockNodes<D> + lane;
+  Vector<T, D> v[count];
+  for (int n = 0; n < count; n++) v[n] = load_node<T, D>(a.velocity, a.stride, first + n * Lanes);
+  for (int k = 0; s.active && k < a.obstacles; k++) {
+    const ObstaclePose<T, D> pose = pose_at(a, s, k);
+    for (int n = 0; pose.acts && n < count; n++) {
+      const Touch<T, D> t = touch(a, pose, node_position(a, s.corner, lane + n * Lanes));
+      if (t.touching) v[n] = after_contact(pose, t, v[n]);
+    }
+  }
+  for (int n = 0; n < count; n++) store_node(a.result, first + n * Lanes, v[n]);
+}
+
+// Velocity of a node after the first `last` obstacles.
+template <class T, int D>
+MPM_HD Vector<T, D> velocity_before(const ContactArguments<T, D>& a, const ContactSlot<T, D>& s, int last, int64_t node,
+                                    const Vector<T, D>& position) {
+  Vector<T, D> v = load_node<T, D>(a.velocity, a.stride, node);
+  for (int k = 0; k < last; k++) {
+    const ObstaclePose<T, D> pose = pose_at(a, s, k);
+    if (!pose.acts) continue;
+    const Touch<T, D> t = touch(a, pose, position);
+    if (t.touching) v = after_contact(pose, t, v);
+  }
+  return v;
+}
+
+template <int Lanes, class T, int D>
+MPM_HD void slot_contact_backward(const ContactArguments<T, D>& a, int slot, int lane) {
+  constexpr int count = kBlockNodes<D> / Lanes;
+  const ContactSlot<T, D> s = contact_slot(a, slot);
+  const int64_t first = int64_t(slot) * kBlockNodes<D> + lane;
+  Vector<T, D> grad[count];
+  for (int n = 0; n < count; n++) grad[n] = load_node<T, D>(a.grad, a.grad_stride, first + n * Lanes);
+  for (int k = s.active ? a.obstacles - 1 : -1; k >= 0; k--) {
+    const ObstaclePose<T, D> pose = pose_at(a, s, k);
+    for (int n = 0; pose.acts && n < count; n++) {
+      const Vector<T, D> position = node_position(a, s.corner, lane + n * Lanes);
+      const Touch<T, D> t = touch(a, pose, position);
+      if (!t.touching) continue;
+      const Vector<T, D> u = relative_velocity(t, velocity_before(a, s, k, first + n * Lanes, position));
+      grad[n] = contact_adjoint(pose.contact, u, t.normal, pose.row->friction, grad[n]);
+    }
+  }
+  for (int n = 0; n < count; n++) store_node(a.result, first + n * Lanes, grad[n]);
+}
+
+}  // namespace TORCH_MPM_ISA
+}  // namespace mpm

@@ -1,0 +1,49 @@
+#include "cuda/launch.cuh"
+#include "transfer/advance.h"
+
+#include <torch/headeronly/util/Exception.h>
+
+namespace mpm::cuda {
+namespace {
+
+constexpr int kThreads = 256;
+
+template <class T, int D>
+__global__ void __launch_bounds__(kThreads) advance_kernel(const AdvanceArguments<T, D> a) {
+  const int64_t p = int64_t(blockIdx.x) * kThreads + threadIdx.x;
+  if (p < a.particles) advance_particle(a, p);
+}
+
+template <class T, int D>
+__global__ void __launch_bounds__(kThreads) advance_backward_kernel(const AdvanceBackwardArguments<T, D> a) {
+  const int64_t p = int64_t(blockIdx.x) * kThreads + threadIdx.x;
+  if (p < a.forward.particles) advance_particle_backward(a, p);
+}
+
+unsigned blocks_for(int64_t particles) { return unsigned((particles + kThreads - 1) / kThreads); }
+
+void check_launch() {
+  const cudaError_t error = cudaGetLastError();
+  STD_TORCH_CHECK(error == cudaSuccess, "kernel launch failed: ", cudaGetErrorString(error));
+}
+
+}  // namespace
+
+template <class T, int D>
+void advance(const AdvanceArguments<T, D>& a, Stream stream) {
+  if (a.particles == 0) return;
+  advance_kernel<<<blocks_for(a.particles), kThreads, 0, stream>>>(a);
+  check_launch();
+}
+
+template <class T, int D>
+void advance_backward(const AdvanceBackwardArguments<T, D>& a, Stream stream) {
+  if (a.forward.particles == 0) return;
+  advance_backward_kernel<<<blocks_for(a.forward.particles), kThreads, 0, stream>>>(a);
+  check_launch();
+}
+
+MPM_INSTANTIATE(advance, AdvanceArguments)
+MPM_INSTANTIATE(advance_backward, AdvanceBackwardArguments)
+
+}  // namespace mpm::cuda

@@ -1,0 +1,55 @@
+#include <cmath>
+
+#include "transfer/kernels.h"
+
+// G2P and the end of the step in one op.
+namespace mpm {
+namespace {
+
+std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> g2p_advance(const Tensor& x, const Tensor& velocity,
+                                                               const OptionalTensor& F, const OptionalTensor& J,
+                                                               const OptionalTensor& scene_dt, double dt, bool affine,
+                                                               int64_t stress_form, MPM_TOPOLOGY_PARAMETERS) {
+  check_positions(x);
+  const int64_t P = x.size(0), D_ = x.size(1);
+  const auto output = [&](bool wanted, const Shape& shape) {
+    return wanted ? empty_particles(x, shape) : empty(x, {0});
+  };
+  Tensor x_next = output(true, {P, D_}), v = output(true, {P, D_}), C = output(affine, {P, D_, D_}),
+         F_next = output(has(F), {P, D_, D_}), J_next = output(has(J), {P});
+  const DeviceScope device(x);
+  dispatch(x, order, [&]<class T, int D>() {
+    G2PAdvanceArguments<T, D> a;
+    a.gather.topology = topology<T, D>(x, MPM_TOPOLOGY_ARGUMENTS);
+    a.gather.x = input<T>(x, "x", x, {P, D});
+    check_shape(velocity, "velocity", {node_count<D>(block), D});
+    a.gather.nodes = node_input<T>(velocity, "velocity", x, node_count<D>(block));
+    a.gather.moment_scale = inverse_inertia(order) / (dx * dx);
+    a.gather.lost = NAN;
+    a.gather.value = field<T>(v);
+    if (affine) a.gather.moment = field<T>(C);
+    a.F = input<T>(F, "F", x, {P, D, D});
+    a.J = input<T>(J, "J", x, {P});
+    a.scene_dt = input<T>(scene_dt, "scene_dt", x, {a.gather.topology.scenes});
+    a.dt = dt;
+    a.form = stress_form_of(stress_form);
+    a.x_next = field<T>(x_next);
+    if (has(F)) a.F_next = field<T>(F_next);
+    if (has(J)) a.J_next = field<T>(J_next);
+    backend::g2p_advance(order, a, device.stream());
+  });
+  return {x_next, v, C, F_next, J_next};
+}
+
+}  // namespace
+}  // namespace mpm
+
+#if MPM_BACKEND == MPM_BACKEND_IS_cpu
+STABLE_TORCH_LIBRARY_FRAGMENT(torch_mpm, m) {
+  m.def(
+      "g2p_advance(Tensor x, Tensor velocity, Tensor? F, Tensor? J, Tensor? scene_dt, float dt, bool affine, "
+      "int stress_form, " MPM_TOPOLOGY_SCHEMA ") -> (Tensor x, Tensor v, Tensor C, Tensor F, Tensor J)");
+}
+#endif
+
+MPM_LIBRARY_IMPL(m) { m.impl("g2p_advance", TORCH_BOX(&mpm::g2p_advance)); }

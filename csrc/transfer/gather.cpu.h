@@ -1,0 +1,252 @@
+#pragma once
+
+#include "common/bspline.h"
+#include "cpu/parallel.h"
+#include "transfer/contribution.cpu.h"
+
+// Nodes to particles: sums over the nodes of a cell for a pack of its particles, one axis after another (sum
+// factorisation), so that the work is the nodes of a line, plus lines of a plane, plus planes.
+namespace mpm::cpu {
+inline namespace TORCH_MPM_ISA {
+
+// Weights of a pack of particles in one cell, and their derivatives where asked for.
+template <int Order, class P, int D>
+struct Weights {
+  static constexpr int S = Order + 1;
+  P f[D], w[D][S], dw[D][S], ddw[D][S];
+
+  // Of particles at distances f from their base nodes, in cells.
+  MPM_HD Weights(const P distances[D], int derivatives) {
+    MPM_UNROLL for (int a = 0; a < D; a++) {
+      f[a] = distances[a];
+      BSpline<Order>::weights(f[a], w[a]);
+      if (derivatives > 0) BSpline<Order>::first_derivatives(f[a], dw[a]);
+      if (derivatives > 1) BSpline<Order>::second_derivatives(f[a], ddw[a]);
+    }
+  }
+};
+
+// Σ N g, Σ N g k and Σ g ∂N over the axes from D − N on; k counts from the second node of an axis.
+template <class P, int N>
+struct Sums {
+  P value, moment[N ? N : 1], gradient[N ? N : 1];
+};
+
+// Channels that are summed in one register: lane kTogether l + c for channel c of particle l.
+template <class T>
+constexpr int kTogether = kLanes * int(sizeof(T)) * 2 <= kRegisterBytes ? 2 : 1;
+template <class T>
+using Together = Pack<T, kLanes * kTogether<T>>;
+
+// The same for all channels.
+template <class T>
+MPM_HD Together<T> for_all_channels(const Lanes<T>& v) {
+  if constexpr (kTogether<T> == 1)
+    return v;
+  else {
+    Together<T> r;
+    r.part[0] = __builtin_shufflevector(v.part[0], v.part[0], 0, 0, 1, 1, 2, 2, 3, 3, 4, 4, 5, 5, 6, 6, 7, 7);
+    return r;
+  }
+}
+
+// kTogether channels of a node for all particles.
+template <class T>
+MPM_HD Together<T> node_channels(const T* node) {
+  if constexpr (kTogether<T> == 1) return Together<T>(node[0]);
+#ifdef __AVX512F__
+  else {
+    Together<T> r;
+    double both;
+    __builtin_memcpy(&both, node, sizeof(both));
+    r.part[0] = _mm512_castpd_ps(_mm512_set1_pd(both));
+    return r;
+  }
+#endif
+}
+
+template <class T>
+MPM_HD Lanes<T> one_channel(const Together<T>& v, int channel) {
+  if constexpr (kTogether<T> == 1)
+    return v;
+  else {
+    Lanes<T> r;
+    r.part[0] = channel ? __builtin_shufflevector(v.part[0], v.part[0], 1, 3, 5, 7, 9, 11, 13, 15)
+                        : __builtin_shufflevector(v.part[0], v.part[0], 0, 2, 4, 6, 8, 10, 12, 14);
+    return r;
+  }
+}
+
+template <int Order, int Axis, bool Moment, bool Gradient, class T, int D>
+MPM_HD Sums<Together<T>, D - Axis> sum_nodes(const Weights<Order, Together<T>, D>& s, const T* tile) {
+  using P = Together<T>;
+  constexpr int N = D - Axis, stride = Tile<Order, T, D>::stride(Axis);
+  Sums<P, N> r;
+  MPM_UNROLL for (int k = 0; k <= Order; k++) {
+    Sums<P, N - 1> line;
+    if constexpr (Axis + 1 < D)
+      line = sum_nodes<Order, Axis + 1, Moment, Gradient>(s, tile + k * stride);
+    else
+      line.value = node_channels(tile + k * stride);
+    const P& w = s.w[Axis][k];
+    const P part = w * line.value;
+    r.value = k ? r.value + part : part;
+    if (Moment) {
+      if (k == 0) r.moment[0] = P(0) - part;
+      if (k == 2) r.moment[0] += part;
+      if (k == 3) r.moment[0] += P(2) * part;
+      MPM_UNROLL for (int a = 1; a < N; a++)
+        r.moment[a] = k ? r.moment[a] + w * line.moment[a - 1] : w * line.moment[a - 1];
+    }
+    if (Gradient) {
+      const P slope = s.dw[Axis][k] * line.value;
+      r.gradient[0] = k ? r.gradient[0] + slope : slope;
+      MPM_UNROLL for (int a = 1; a < N; a++)
+        r.gradient[a] = k ? r.gradient[a] + w * line.gradient[a - 1] : w * line.gradient[a - 1];
+    }
+  }
+  return r;
+}
+
+// Value Σ N g, moment Σ N g r and gradient Σ g ∂N of the first `Channels` channels, with distances r from the particle.
+template <int Order, int Channels, bool Moment, bool Gradient, class T, int D>
+MPM_HD void gather_channels(const Lanes<T> f[D], const T* tile, Sums<Lanes<T>, D> sums[Channels]) {
+  Together<T> distances[D];
+  MPM_UNROLL for (int a = 0; a < D; a++)
+    distances[a] = for_all_channels(f[a]);
+  const Weights<Order, Together<T>, D> s(distances, Gradient ? 1 : 0);
+  MPM_UNROLL for (int first = 0; first < Channels; first += kTogether<T>) {
+    Sums<Together<T>, D> r = sum_nodes<Order, 0, Moment, Gradient>(s, tile + first);
+    MPM_UNROLL for (int a = 0; a < D; a++)
+      if (Moment) r.moment[a] = r.moment[a] - (s.f[a] - Together<T>(1)) * r.value;
+    MPM_UNROLL for (int c = 0; c < kTogether<T>; c++) {
+      if (first + c >= Channels) continue;
+      sums[first + c].value = one_channel<T>(r.value, c);
+      MPM_UNROLL for (int a = 0; a < D; a++) {
+        if (Moment) sums[first + c].moment[a] = one_channel<T>(r.moment[a], c);
+        if (Gradient) sums[first + c].gradient[a] = one_channel<T>(r.gradient[a], c);
+      }
+    }
+  }
+}
+
+// The form u = Σ_i N_i g_i · (value + slope k_i) + Σ_d ∂_d N_i g_i · gradient_d of node values g and a particle's gift,
+// over the axes from `Axis` on; its derivatives `du` by position along these; and psi_d = Σ_i N_i g_i · gradient_d of
+// the axes before with its derivatives, from which the sums over the axes before make more of u.
+template <class P, int D, int Axis>
+struct Form {
+  static constexpr int N = D - Axis;
+  P u, du[N ? N : 1], psi[Axis ? Axis : 1], dpsi[Axis ? Axis : 1][N ? N : 1];
+};
+
+// The form at one node, of the first `Channels` channels.
+template <int Channels, bool Gradient, class T, int D>
+MPM_HD Form<Lanes<T>, D, D> form_at_node(const Gift<Lanes<T>, D>& gift, const T* node) {
+  using P = Lanes<T>;
+  Form<P, D, D> r;
+  r.u = P(node[0]) * gift.value[0];
+  MPM_UNROLL for (int c = 1; c < Channels; c++)
+    r.u += P(node[c]) * gift.value[c];
+  if (!Gradient) return r;
+  MPM_UNROLL for (int d = 0; d < D; d++) {
+    r.psi[d] = P(node[0]) * gift.gradient[d][0];
+    MPM_UNROLL for (int c = 1; c < Channels; c++)
+      r.psi[d] += P(node[c]) * gift.gradient[d][c];
+  }
+  return r;
+}
+
+// `gift` holds the gift at the first node of the axis.
+template <int Order, int Axis, int Channels, bool Slope, bool Gradient, class T, int D>
+MPM_HD Form<Lanes<T>, D, Axis> form(const Weights<Order, Lanes<T>, D>& s, Gift<Lanes<T>, D> gift, const T* tile) {
+  using P = Lanes<T>;
+  constexpr int N = D - Axis, stride = Tile<Order, T, D>::stride(Axis);
+  Form<P, D, Axis> r;
+  r.u = P(0);
+  MPM_UNROLL for (int a = 0; a < N; a++)
+    r.du[a] = P(0);
+  MPM_UNROLL for (int d = 0; d < Axis; d++) {
+    r.psi[d] = P(0);
+    MPM_UNROLL for (int a = 0; a < N; a++)
+      r.dpsi[d][a] = P(0);
+  }
+  const auto add = [&](int k) {
+    Form<P, D, Axis + 1> line;
+    if constexpr (Axis + 1 < D)
+      line = form<Order, Axis + 1, Channels, Slope, Gradient>(s, gift, tile + k * stride);
+    else
+      line = form_at_node<Channels, Gradient>(gift, tile + k * stride);
+    if (Slope) MPM_UNROLL
+      for (int c = 0; c < Channels; c++) gift.value[c] += gift.slope[Axis][c];
+    const P &w = s.w[Axis][k], &dw = s.dw[Axis][k];
+    r.u += w * line.u;
+    r.du[0] += dw * line.u;
+    MPM_UNROLL for (int a = 1; a < N; a++)
+      r.du[a] += w * line.du[a - 1];
+    if (!Gradient) return;
+    r.u += dw * line.psi[Axis];
+    r.du[0] += s.ddw[Axis][k] * line.psi[Axis];
+    MPM_UNROLL for (int a = 1; a < N; a++)
+      r.du[a] += dw * line.dpsi[Axis][a - 1];
+    MPM_UNROLL for (int d = 0; d < Axis; d++) {
+      r.psi[d] += w * line.psi[d];
+      r.dpsi[d][0] += dw * line.psi[d];
+      MPM_UNROLL for (int a = 1; a < N; a++)
+        r.dpsi[d][a] += w * line.dpsi[d][a - 1];
+    }
+  };
+  if constexpr (Axis == 0 || (Gradient && Axis + 1 < D)) {  // loops keep the code small
+    _Pragma("GCC unroll 1") for (int k = 0; k <= Order; k++) add(k);
+  } else {
+    MPM_UNROLL for (int k = 0; k <= Order; k++)
+      add(k);
+  }
+  return r;
+}
+
+// Adds the derivative of the form by the position, in cells; needs first derivatives of the weights, second with
+// Gradient.
+template <int Order, int Channels, bool Slope, bool Gradient, class T, int D>
+MPM_HD void add_position_gradient(const Weights<Order, Lanes<T>, D>& s, const Gift<Lanes<T>, D>& gift, const T* tile,
+                                  const Lanes<T> gathered[kChannels], Lanes<T> sum[D]) {
+  const Form<Lanes<T>, D, 0> r = form<Order, 0, Channels, Slope, Gradient>(s, gift, tile);
+  MPM_UNROLL for (int a = 0; a < D; a++) {
+    sum[a] += r.du[a];
+    if (Slope)  // the distance of every node changes with the particle
+        MPM_UNROLL
+      for (int c = 0; c < Channels; c++) sum[a] = sum[a] - gathered[c] * gift.slope[a][c];
+  }
+}
+
+// visit(group, distances from the base node in cells, scene, tile at the base node) for groups of particles of a cell;
+// the tile holds channels first, ..., first + count - 1.
+template <int Order, class T, int D, class F>
+void gather_groups(const Topology<T, D>& t, const Field<const T>& x, const NodeField<const T>& nodes, int first,
+                   int count, const F& visit) {
+  const ScheduleIn s = schedule_of(t);
+  parallel_homes<D>(s, t.particles, [&](const auto& next) {
+    Tile<Order, T, D> tile;
+    for (int64_t h; (h = next()) >= 0;) {
+      const Home<T, D> home(t, s.home_slot[h]);
+      tile.load_from(nodes, home, first, count);
+      for (int64_t c = s.home_chunk[h]; c < s.home_chunk[h + 1]; c++) {
+        const Chunk chunk(t, s, c);
+        for (int cell = 0, i = 0; cell < kBlockNodes<D>; cell++) {
+          int base[D];
+          for (int a = 0; a < D; a++) base[a] = cell_coordinate<D>(cell, a);
+          for (const int end = chunk.cell_end[cell]; i < end; i += kLanes) {
+            const Group g = group_by_cell(chunk, i, end);
+            Lanes<T> f[D];
+            MPM_UNROLL for (int a = 0; a < D; a++)
+              f[a] = distance_in_cells(t.geometry, a, load(x, g, a), Lanes<T>(T(home.corner[a] + base[a])));
+            visit(g, f, home.scene, tile.value + tile.at(base));
+          }
+          i = chunk.cell_end[cell];
+        }
+      }
+    }
+  });
+}
+
+}  // namespace TORCH_MPM_ISA
+}  // namespace mpm::cpu

@@ -1,0 +1,255 @@
+#include "transfer/gather.cuh"
+
+// Gather, its position gradient, and the adjoint of P2G.
+namespace mpm::cuda {
+
+// The channels [first, ...) of a node field.
+template <class T>
+NodeField<const T> nodes_from(NodeField<const T> n, int first) {
+  n.pointer += first;
+  return n;
+}
+
+// ---- Gather
+
+template <int Order_, class T_, int D_, int K_, bool Gradient>
+struct FieldGather {
+  using T = T_;
+  static constexpr int Order = Order_, D = D_, K = K_;
+  static constexpr int resident = Gradient ? 5 : 6;
+  using Shape = SumShape<Order, T, D, K, 0, true, Gradient, Form::none>;
+  struct Loaded {};
+  using Result = Sums<Shape>;
+  Topology<T, D> topology;
+  NodeField<const T> nodes;
+  Columns<const T, D> position;
+  Columns<T, K> value;
+  Columns<T, K * D> moment, gradient;
+  T moment_scale, gradient_scale;  // from cells
+  T lost;
+
+  FieldGather(const GatherArguments<T, D>& a, int first)
+      : topology(a.topology),
+        nodes(nodes_from(a.nodes, first)),
+        position(a.x),
+        value(channels_from(a.value, first)),
+        moment(channels_from(a.moment, first), D),
+        gradient(channels_from(a.gradient, first), D),
+        moment_scale(T(a.moment_scale * double(a.topology.geometry.dx))),
+        gradient_scale(a.topology.geometry.inverse_dx),
+        lost(T(a.lost)) {}
+
+  __device__ Loaded load(int, int) const { return {}; }
+  template <class Support>
+  __device__ Result compute(Loaded, const Weights<Order, T, D>& w, const Support& support) const {
+    const T constant[K] = {}, linear[K][D] = {};
+    Result s;
+    sum_axis<Shape, 0>(support, support.rows, 0, w, constant, linear, s);
+    return s;
+  }
+  __device__ void write(int p, const Loaded&, const Result& s) const {
+#pragma unroll
+    for (int k = 0; k < K; k++) {
+      value.write(p, k, s.value[k]);
+#pragma unroll
+      for (int i = 0; i < D; i++) {
+        moment.write(p, k * D + i, moment_scale * s.moment[k][i]);
+        if (Gradient) gradient.write(p, k * D + i, gradient_scale * s.gradient[k][i]);
+      }
+    }
+  }
+  __device__ void leave_out(int p) const {
+    const T nothing = is_finite<D>(read_vector(position, p).e) ? T(0) : lost;
+#pragma unroll
+    for (int k = 0; k < K; k++) value.write(p, k, nothing);
+#pragma unroll
+    for (int k = 0; k < K * D; k++) {
+      moment.write(p, k, nothing);
+      gradient.write(p, k, nothing);
+    }
+  }
+};
+
+template <int Order, class T, int D>
+void gather(const GatherArguments<T, D>& a, Stream stream) {
+  for_channels<D>(a.nodes.channels, a.gradient.pointer, [&]<int K, bool Gradient>(int first) {
+    launch_gather(FieldGather<Order, T, D, K, Gradient>(a, first), stream);
+  });
+}
+
+// ---- Position gradient
+
+template <int Order_, class T_, int D_, int K_, bool Gradient>
+struct FieldPositionGradient {
+  using T = T_;
+  static constexpr int Order = Order_, D = D_, K = K_;
+  static constexpr int resident = Gradient ? 3 : 5;
+  using Shape = SumShape<Order, T, D, K, K, false, false, Form::affine>;
+  struct Loaded {
+    T value[K], moment[K][D], gradient[K][D];  // moments and gradients per cell
+  };
+  using Result = mpm::Vector<T, D>;
+  Topology<T, D> topology;
+  NodeField<const T> nodes;
+  Columns<const T, D> position;
+  Columns<const T, K> value;
+  Columns<const T, K * D> moment, gradient;
+  Columns<T, D> out;
+  T moment_scale, inverse_dx;
+  bool more;  // adds to the channels before
+
+  FieldPositionGradient(const PositionGradientArguments<T, D>& a, int first)
+      : topology(a.topology),
+        nodes(nodes_from(a.nodes, first)),
+        position(a.x),
+        value(channels_from(a.value, first)),
+        moment(channels_from(a.moment, first), D),
+        gradient(channels_from(a.gradient, first), D),
+        out(a.position_gradient),
+        moment_scale(T(a.moment_scale * double(a.topology.geometry.dx))),
+        inverse_dx(a.topology.geometry.inverse_dx),
+        more(first > 0) {}
+
+  __device__ Loaded load(int p, int) const {
+    Loaded l;
+#pragma unroll
+    for (int k = 0; k < K; k++) {
+      l.value[k] = value.at(p, k);
+#pragma unroll
+      for (int i = 0; i < D; i++) {
+        l.moment[k][i] = moment.present() ? moment_scale * moment.at(p, k * D + i) : T(0);
+        l.gradient[k][i] = Gradient ? inverse_dx * gradient.at(p, k * D + i) : T(0);
+      }
+    }
+    return l;
+  }
+  template <class Support>
+  __device__ Result compute(const Loaded& l, const Weights<Order, T, D>& w, const Support& support) const {
+    Sums<Shape> s;
+    sum_axis<Shape, 0>(support, support.rows, 0, w, l.value, l.moment, s);
+    if (Gradient) add_hessian<Shape>(support, w, l.gradient, s.slope);
+    Result r;
+#pragma unroll
+    for (int i = 0; i < D; i++) {
+#pragma unroll
+      for (int k = 0; k < K; k++) s.slope[i] -= l.moment[k][i] * s.value[k];
+      r[i] = inverse_dx * s.slope[i];
+    }
+    return r;
+  }
+  __device__ void write(int p, const Loaded&, const Result& r) const {
+#pragma unroll
+    for (int i = 0; i < D; i++) out.at(p, i) = more ? out.at(p, i) + r[i] : r[i];
+  }
+  __device__ void leave_out(int p) const { write(p, {}, {}); }
+};
+
+template <int Order, class T, int D>
+void position_gradient(const PositionGradientArguments<T, D>& a, Stream stream) {
+  for_channels<D>(a.nodes.channels, a.gradient.pointer, [&]<int K, bool Gradient>(int first) {
+    launch_gather(FieldPositionGradient<Order, T, D, K, Gradient>(a, first), stream);
+  });
+}
+
+// ---- Adjoint of P2G
+
+template <int Order_, class T_, int D_, bool Gradient>
+struct MomentumAdjoint {
+  using T = T_;
+  static constexpr int Order = Order_, D = D_, K = 1 + D;
+  static constexpr int resident = Gradient ? 2 : 4;
+  using Shape = SumShape<Order, T, D, K, 1, true, Gradient, Form::affine>;
+  using Loaded = ParticleMomentum<T, D>;
+  struct Result {
+    mpm::Vector<T, D> x;
+    ParticleMomentum<T, D> particle;
+  };
+  Topology<T, D> topology;
+  NodeField<const T> nodes;
+  Columns<const T, D> position;
+  MomentumFields<Order, T, D> fields;
+  Columns<T, 1> mass, volume, dt;
+  Columns<T, D> x, velocity;
+  Columns<T, D * D> affine, stress;
+
+  explicit MomentumAdjoint(const P2GBackwardArguments<T, D>& a)
+      : topology(a.forward.topology),
+        nodes(a.grad_nodes),
+        position(a.forward.x),
+        fields(a.forward),
+        mass(a.mass),
+        volume(a.volume),
+        dt(a.dt),
+        x(a.x),
+        velocity(a.velocity),
+        affine(a.affine, D),
+        stress(a.stress, D) {}
+
+  __device__ Loaded load(int p, int scene) const { return fields.read(p, scene, fields.stress.present()); }
+  template <class Support>
+  __device__ Result compute(const Loaded& particle, const Weights<Order, T, D>& w, const Support& support) const {
+    const NodeMomentum<T, D> m = fields.to_nodes(particle, fields.form, fields.stress.present());
+    T value[K], moment[K][D], gradient[K][D];
+    value[0] = m.mass;
+#pragma unroll
+    for (int i = 0; i < D; i++) {
+      value[1 + i] = m.momentum[i];
+      moment[0][i] = gradient[0][i] = T(0);
+#pragma unroll
+      for (int j = 0; j < D; j++) {
+        moment[1 + i][j] = m.moment[i][j];
+        gradient[1 + i][j] = m.gradient[i][j];
+      }
+    }
+    Sums<Shape> s;
+    sum_axis<Shape, 0>(support, support.rows, 0, w, value, moment, s);
+    if (Gradient) add_hessian<Shape>(support, w, gradient, s.slope);
+    Result r;
+    NodeMomentum<T, D> sums;
+    sums.mass = s.value[0];
+#pragma unroll
+    for (int i = 0; i < D; i++) {
+      sums.momentum[i] = s.value[1 + i];
+#pragma unroll
+      for (int j = 0; j < D; j++) {
+        s.slope[j] -= moment[1 + i][j] * s.value[1 + i];
+        sums.moment[i][j] = s.moment[1 + i][j];
+        sums.gradient[i][j] = Gradient ? s.gradient[1 + i][j] : T(0);
+      }
+    }
+#pragma unroll
+    for (int j = 0; j < D; j++) r.x[j] = fields.inverse_dx * s.slope[j];
+    r.particle = fields.adjoint(particle, sums);
+    return r;
+  }
+  __device__ void write(int p, const Loaded&, const Result& r) const {
+    mass.write(p, 0, r.particle.mass);
+    volume.write(p, 0, r.particle.volume);
+    dt.write(p, 0, r.particle.dt);
+#pragma unroll
+    for (int i = 0; i < D; i++) {
+      x.write(p, i, r.x[i]);
+      velocity.write(p, i, r.particle.velocity[i]);
+#pragma unroll
+      for (int j = 0; j < D; j++) {
+        affine.write(p, i * D + j, r.particle.affine[i][j]);
+        stress.write(p, i * D + j, r.particle.stress[i][j]);
+      }
+    }
+  }
+  __device__ void leave_out(int p) const { write(p, {}, {}); }
+};
+
+template <int Order, class T, int D>
+void p2g_backward(const P2GBackwardArguments<T, D>& a, Stream stream) {
+  if (has_gradient(a.forward))
+    launch_gather(MomentumAdjoint<Order, T, D, true>(a), stream);
+  else
+    launch_gather(MomentumAdjoint<Order, T, D, false>(a), stream);
+}
+
+MPM_INSTANTIATE_ORDERS(gather, GatherArguments)
+MPM_INSTANTIATE_ORDERS(p2g_backward, P2GBackwardArguments)
+MPM_INSTANTIATE_ORDERS(position_gradient, PositionGradientArguments)
+
+}  // namespace mpm::cuda

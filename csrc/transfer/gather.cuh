@@ -1,0 +1,345 @@
+#pragma once
+
+#include "cuda/launch.cuh"
+#include "transfer/momentum.cuh"
+
+// G2P, gather, and the two adjoints that read nodes. A thread takes a particle and sums over its support one axis at a
+// time. Particles come in one of two orders, which `activate` chooses: item by item, with the nodes of the home block
+// in shared memory; or, when neighbours in memory are no neighbours in space, in the order of memory, so that at least
+// the particle fields are read and written at full width.
+namespace mpm::cuda {
+
+template <class T>
+struct alignas(16) Quad {
+  T e[4];
+};
+
+// Weights of the nodes of the support, their derivatives per cell, and the distances of the nodes in cells.
+template <int Order, class T, int D>
+struct Weights {
+  static constexpr int support = Order + 1;
+  T weight[D][support], first[D][support], second[D][support], distance[D][support];
+
+  __device__ explicit Weights(const T* f) {
+#pragma unroll
+    for (int i = 0; i < D; i++) {
+      BSpline<Order>::weights(f[i], weight[i]);
+      BSpline<Order>::first_derivatives(f[i], first[i]);
+      BSpline<Order>::second_derivatives(f[i], second[i]);
+#pragma unroll
+      for (int k = 0; k < support; k++) distance[i][k] = T(k) - f[i];
+    }
+  }
+};
+
+// Which sums over the nodes are wanted, with N a weight, r a distance, g a node value:
+//   value     Σ N g
+//   moment    Σ N g r, and
+//   gradient  Σ ∇N g, both without the first `Plain` channels
+//   slope     Σ ∇N Σ_c g_c (a_c + B_c · r), B being absent (None, Constant) or not (Affine)
+enum class Form { none, constant, affine };
+
+template <int Order_, class T_, int D_, int K_, int Plain_, bool Moment_, bool Gradient_, Form Slope_>
+struct SumShape {
+  using T = T_;
+  static constexpr int Order = Order_, D = D_, K = K_, Plain = Plain_;
+  static constexpr bool Moment = Moment_, Gradient = Gradient_;
+  static constexpr Form Slope = Slope_;
+};
+
+template <class S>
+struct Sums {
+  using T = typename S::T;
+  T value[S::K], moment[S::K][S::D], gradient[S::K][S::D];
+  T potential, slope[S::D];
+};
+
+template <bool First, class T>
+__device__ void accumulate(T& sum, T weight, T value) {
+  sum = First ? weight * value : sum + weight * value;
+}
+
+// For each of the blocks that are left when the leading axes are decided, the row that the base node would have if the
+// nodes went on beyond the block; a node of the support is a constant distance further.
+template <int Blocks>
+struct Rows {
+  int row[Blocks];
+};
+
+// Whether nodes are fetched as one aligned quadruple: four channels, or a velocity that lies behind the mass.
+template <int K, class T>
+bool is_vector(const NodeField<const T>& n) {
+  const auto aligned = [&](int shift) { return reinterpret_cast<uintptr_t>(n.pointer - shift) % (4 * sizeof(T)) == 0; };
+  return n.stride == 4 && ((K == 4 && aligned(0)) || (K == 3 && aligned(1)));
+}
+
+template <bool Quads, int K, class T>
+__device__ void load_node(const NodeField<const T>& nodes, int row, int offset, T (&node)[K]) {
+  if constexpr (Quads) {
+    const Quad<T> quad = *reinterpret_cast<const Quad<T>*>(nodes.pointer + int64_t(row) * 4 + offset * 4 - (K == 3));
+#pragma unroll
+    for (int c = 0; c < K; c++) node[c] = quad.e[K == 3 ? c + 1 : c];
+  } else {
+    const T* const from = nodes.pointer + int64_t(row + offset) * int(nodes.stride);
+#pragma unroll
+    for (int c = 0; c < K; c++) node[c] = from[c];
+  }
+}
+
+// Nodes in global memory, in the home block and the blocks after it.
+template <class T, int K, int D, bool Quads>
+struct GridSupport {
+  static constexpr int blocks = 1 << D, width = kBlockWidth;
+  const NodeField<const T>& nodes;
+  int base[D];  // base node in the home block
+  Rows<blocks> rows;
+
+  __device__ void set_slot(int block, int slot) {
+    int row = slot * kBlockNodes<D> + node_in_block<D>(base);
+#pragma unroll
+    for (int i = 0, step = 1; i < D; i++, step *= kBlockWidth) row -= (block >> i & 1) * kBlockWidth * step;
+    rows.row[block] = row;
+  }
+  __device__ bool is_far(int axis, int node) const { return node > 0 && base[axis] + node >= kBlockWidth; }
+  __device__ void load(int row, int offset, T (&node)[K]) const { load_node<Quads>(nodes, row, offset, node); }
+};
+
+// K node channels in shared memory, padded so that one load fetches them.
+template <class T, int K>
+struct alignas(K == 1   ? sizeof(T)
+               : K == 2 ? 2 * sizeof(T)
+                        : 16) NodeValue {
+  T e[K == 3 ? 4 : K];
+};
+
+// Nodes in shared memory: those of the home block and the next Order along each axis.
+template <int Order, class T, int K>
+struct TileSupport {
+  static constexpr int blocks = 1, width = kBlockWidth + Order;
+  const NodeValue<T, K>* corner;  // the base node
+  Rows<1> rows;
+
+  __device__ bool is_far(int, int) const { return false; }
+  __device__ void load(int, int offset, T (&node)[K]) const {
+    const NodeValue<T, K> v = corner[offset];
+#pragma unroll
+    for (int c = 0; c < K; c++) node[c] = v.e[c];
+  }
+};
+
+template <class S, int Axis, int Blocks, class Support, class T>
+__device__ void sum_axis(const Support& support, const Rows<Blocks>& rows, int offset,
+                         const Weights<S::Order, T, S::D>& w, const T (&constant)[S::K], const T (&linear)[S::K][S::D],
+                         Sums<S>& out);
+
+template <class S, int Axis, int Node, int Blocks, class Support, class T>
+__device__ void sum_node(const Support& support, const Rows<Blocks>& rows, int offset,
+                         const Weights<S::Order, T, S::D>& w, const T (&constant)[S::K], const T (&linear)[S::K][S::D],
+                         Sums<S>& out) {
+  constexpr bool first = Node == 0, differentiable = S::Slope != Form::none;
+  constexpr int half = Blocks > 1 ? Blocks / 2 : 1;
+  const bool far = support.is_far(Axis, Node);
+  Rows<half> side;
+#pragma unroll
+  for (int o = 0; o < half; o++) side.row[o] = far ? rows.row[Blocks - half + o] : rows.row[o];
+  T below[S::K];
+#pragma unroll
+  for (int c = 0; c < S::K; c++)
+    below[c] = S::Slope == Form::affine ? constant[c] + linear[c][Axis] * w.distance[Axis][Node] : constant[c];
+  Sums<S> in;
+  sum_axis<S, Axis + 1>(support, side, offset * Support::width + Node, w, below, linear, in);
+  const T n = w.weight[Axis][Node], dn = w.first[Axis][Node];
+#pragma unroll
+  for (int c = 0; c < S::K; c++) {
+    accumulate<first>(out.value[c], n, in.value[c]);
+    if (c < S::Plain) continue;
+    if (S::Moment) accumulate<first>(out.moment[c][Axis], n * w.distance[Axis][Node], in.value[c]);
+    if (S::Gradient) accumulate<first>(out.gradient[c][Axis], dn, in.value[c]);
+#pragma unroll
+    for (int i = Axis + 1; i < S::D; i++) {
+      if (S::Moment) accumulate<first>(out.moment[c][i], n, in.moment[c][i]);
+      if (S::Gradient) accumulate<first>(out.gradient[c][i], n, in.gradient[c][i]);
+    }
+  }
+  if (differentiable) {
+    if (Axis > 0) accumulate<first>(out.potential, n, in.potential);
+    accumulate<first>(out.slope[Axis], dn, in.potential);
+#pragma unroll
+    for (int i = Axis + 1; i < S::D; i++) accumulate<first>(out.slope[i], n, in.slope[i]);
+  }
+  if constexpr (Node < S::Order) sum_node<S, Axis, Node + 1>(support, rows, offset, w, constant, linear, out);
+}
+
+// Sums over the axes from `Axis` on.
+template <class S, int Axis, int Blocks, class Support, class T>
+__device__ void sum_axis(const Support& support, const Rows<Blocks>& rows, int offset,
+                         const Weights<S::Order, T, S::D>& w, const T (&constant)[S::K], const T (&linear)[S::K][S::D],
+                         Sums<S>& out) {
+  if constexpr (Axis == S::D) {
+    T node[S::K];
+    support.load(rows.row[0], offset, node);
+#pragma unroll
+    for (int c = 0; c < S::K; c++) {
+      out.value[c] = node[c];
+      if (S::Slope != Form::none) {
+        const T part = constant[c] * node[c];
+        out.potential = c == 0 ? part : out.potential + part;
+      }
+    }
+  } else {
+    sum_node<S, Axis, 0>(support, rows, offset, w, constant, linear, out);
+  }
+}
+
+// slope_i += Σ_j ∂_i ∂_j N (Σ_c g_c gradient_cj): the derivative of the gradient term.
+template <class S, class Support, class T>
+__device__ void add_hessian(const Support& support, const Weights<S::Order, T, S::D>& w,
+                            const T (&gradient)[S::K][S::D], T (&slope)[S::D]) {
+  using H = SumShape<S::Order, T, S::D, S::K, S::K, false, false, Form::constant>;
+#pragma unroll
+  for (int j = 0; j < S::D; j++) {
+    Weights<S::Order, T, S::D> v = w;
+    T constant[S::K];
+#pragma unroll
+    for (int k = 0; k <= S::Order; k++) {
+      v.weight[j][k] = w.first[j][k];
+      v.first[j][k] = w.second[j][k];
+    }
+#pragma unroll
+    for (int c = 0; c < S::K; c++) constant[c] = gradient[c][j];
+    Sums<H> sums;
+    sum_axis<H, 0>(support, support.rows, 0, v, constant, gradient, sums);
+#pragma unroll
+    for (int i = 0; i < S::D; i++) slope[i] += sums.slope[i];
+  }
+}
+
+// ---- The two orders
+
+constexpr int kGatherThreads = 128;
+
+// Thread blocks to fit in a multiprocessor at once, which limits registers: measured for float and quadratic weights.
+template <class Task>
+constexpr int kResident = Task::Order == 2 && sizeof(typename Task::T) == 4 ? Task::resident : 2;
+
+// Task: topology, nodes, position; load(p, scene), what it needs of a particle; compute(loaded, weights, support), what
+// the particle gets; write(p, loaded, result), with a result of zeros where positions are not those of the activation;
+// leave_out(p) for a particle outside.
+template <bool Quads, class Task>
+__device__ void gather_in_memory_order(const Task& task, const Schedule<const int>& schedule) {
+  using T = typename Task::T;
+  constexpr int D = Task::D;
+  const Topology<T, D>& t = task.topology;
+  const int64_t stride = int64_t(gridDim.x) * kGatherThreads;
+#pragma unroll 1
+  for (int64_t i = int64_t(blockIdx.x) * kGatherThreads + threadIdx.x; i < t.particles; i += stride) {
+    const int p = int(i), slot = schedule.home[p];
+    const Vector<T, D> x = read_vector(task.position, p);
+    const int home = slot < 0 ? -1 : t.block[slot], scene = scene_of(t, home);
+    GridSupport<T, Task::K, D, Quads> support{task.nodes};
+    T f[D];
+    if (slot < 0 || !locate_at_home<Task::Order>(t, scene, home, x, support.base, f)) {
+      task.leave_out(p);
+      continue;
+    }
+    const auto loaded = task.load(p, scene);
+#pragma unroll
+    for (int q = 0; q < (1 << D) / 4; q++) {
+      const int4 v = reinterpret_cast<const int4*>(schedule.neighbours + (slot << D))[q];
+      support.set_slot(4 * q, v.x);
+      support.set_slot(4 * q + 1, v.y);
+      support.set_slot(4 * q + 2, v.z);
+      support.set_slot(4 * q + 3, v.w);
+    }
+    task.write(p, loaded, task.compute(loaded, Weights<Task::Order, T, D>(f), support));
+  }
+}
+
+template <bool Quads, int Order, class T, int K, int D>
+__device__ void load_tile(const NodeField<const T>& nodes, const int* slots, NodeValue<T, K>* tile) {
+  constexpr int width = kBlockWidth + Order, size = D == 2 ? width * width : width * width * width;
+  for (int i = threadIdx.x; i < size; i += kGatherThreads) {
+    int node[D], neighbour = 0;
+#pragma unroll
+    for (int axis = D - 1, rest = i; axis >= 0; axis--) {
+      node[axis] = rest % width;
+      neighbour |= (node[axis] >= kBlockWidth) << (D - 1 - axis);
+      rest /= width;
+    }
+    T value[K] = {};
+    if (slots[neighbour] >= 0)
+      load_node<Quads>(nodes, slots[neighbour] * kBlockNodes<D> + node_in_block<D>(node), 0, value);
+    NodeValue<T, K> v{};
+#pragma unroll
+    for (int c = 0; c < K; c++) v.e[c] = value[c];
+    tile[i] = v;
+  }
+}
+
+template <bool Quads, class Task>
+__device__ void gather_by_items(const Task& task, const Schedule<const int>& schedule) {
+  using T = typename Task::T;
+  constexpr int D = Task::D, K = Task::K, width = kBlockWidth + Task::Order;
+  __shared__ NodeValue<T, K> tile[D == 2 ? width * width : width * width * width];
+  __shared__ int slots[1 << D];
+  const Topology<T, D>& t = task.topology;
+  const int items = *schedule.item_count;
+  for (int i = blockIdx.x; i < items; i += gridDim.x) {
+    const int4 item = reinterpret_cast<const int4*>(schedule.items)[i];
+    const int begin = item.y, end = item.z, home = item.w, scene = scene_of(t, home);
+    // Positions are loaded one round ahead and the particles' indices two, so that loads overlap.
+    int k = begin + threadIdx.x;
+    const auto particle_at = [&](int k) { return t.index[k < end ? k : begin]; };
+    int p = particle_at(k), p_next = particle_at(k + kGatherThreads);
+    Vector<T, D> x = read_vector(task.position, p);
+    __syncthreads();  // the tile before is done
+    if (threadIdx.x < 1 << D) slots[threadIdx.x] = schedule.neighbours[(item.x << D) + threadIdx.x];
+    __syncthreads();
+    load_tile<Quads, Task::Order, T, K, D>(task.nodes, slots, tile);
+    __syncthreads();
+#pragma unroll 1
+    for (; k < end; k += kGatherThreads) {
+      const auto loaded = task.load(p, scene);
+      const Vector<T, D> x_next = read_vector(task.position, p_next);
+      const int p_after = particle_at(k + 2 * kGatherThreads);
+      int base[D], corner = 0;
+      T f[D];
+      const bool at_home = locate_at_home<Task::Order>(t, scene, home, x, base, f);
+#pragma unroll
+      for (int axis = 0; axis < D; axis++) corner = corner * width + base[axis];
+      const TileSupport<Task::Order, T, K> support{tile + corner};
+      const auto result = task.compute(loaded, Weights<Task::Order, T, D>(f), support);
+      task.write(p, loaded, at_home ? result : typename Task::Result{});
+      p = p_next;
+      p_next = p_after;
+      x = x_next;
+    }
+  }
+  const int64_t stride = int64_t(gridDim.x) * kGatherThreads;
+  for (int64_t i = t.offsets[t.capacity] + int64_t(blockIdx.x) * kGatherThreads + threadIdx.x; i < t.particles;
+       i += stride)
+    task.leave_out(t.index[i]);
+}
+
+template <bool Quads, class Task>
+__global__ void __launch_bounds__(kGatherThreads, kResident<Task>) gather_kernel(const Task task) {
+  const Schedule<const int> schedule = schedule_of(task.topology);
+  if (*schedule.scattered)
+    gather_in_memory_order<Quads>(task, schedule);
+  else
+    gather_by_items<Quads>(task, schedule);
+}
+
+template <class Task>
+void launch_gather(const Task& task, Stream stream) {
+  const int64_t particles = task.topology.particles;
+  if (particles == 0) return;
+  const int64_t pieces = std::max(most_items(task.topology.capacity, particles), particles / kGatherThreads);
+  if constexpr (Task::K == 3 || Task::K == 4) {
+    if (is_vector<Task::K>(task.nodes))
+      return launch(gather_kernel<true, Task>, grid_size(pieces), kGatherThreads, 0, stream, task);
+  }
+  launch(gather_kernel<false, Task>, grid_size(pieces), kGatherThreads, 0, stream, task);
+}
+
+}  // namespace mpm::cuda

@@ -1,0 +1,16 @@
+#pragma once
+
+#include "common/backend.h"
+#include "transfer/advance.h"
+#include "transfer/arguments.h"
+
+#define MPM_TRANSFER_KERNELS(PLAIN, ORDERED, SIZE)      \
+  ORDERED(p2g, P2GArguments)                            \
+  ORDERED(p2g_backward, P2GBackwardArguments)           \
+  ORDERED(scatter, ScatterArguments)                    \
+  ORDERED(gather, GatherArguments)                      \
+  ORDERED(position_gradient, PositionGradientArguments) \
+  ORDERED(g2p_advance, G2PAdvanceArguments)             \
+  PLAIN(advance, AdvanceArguments)                      \
+  PLAIN(advance_backward, AdvanceBackwardArguments)
+MPM_BACKEND_KERNELS(MPM_TRANSFER_KERNELS)

@@ -1,0 +1,215 @@
+#pragma once
+
+#include "common/bspline.h"
+#include "cpu/parallel.h"
+#include "cpu/transpose.h"
+#include "transfer/contribution.cpu.h"
+
+// Particles to nodes, for up to kChannels channels. The particles of a cell share their nodes, so that their
+// contributions are summed in registers before they go to the tile of the home.
+namespace mpm::cpu {
+inline namespace TORCH_MPM_ISA {
+
+// The particles of a chunk, ready to be summed.
+template <int Order, class T, int D, bool Slope, bool Gradient>
+struct Gifts {
+  static constexpr int S = Order + 1;
+  static constexpr int kSlope = kChannels, kGradient = kChannels * (Slope ? 1 + D : 1);
+  static constexpr int kFields = kGradient + (Gradient ? kChannels * D : 0);
+  static constexpr int kPadded = (kFields + kLanes - 1) / kLanes * kLanes;
+  static constexpr int kLine = kChunk + 16;  // not a power of two, so that the arrays do not share cache sets
+  alignas(64) T row[kChunk][kPadded];        // value, slopes, gradients
+  alignas(64) T weight[D][S][kLine];
+  alignas(64) T derivative[D][S][Gradient ? kLine : 1];
+
+  template <int N>
+  void put(int i, const Pack<T, N> f[D], const Gift<Pack<T, N>, D>& gift) {
+    Pack<T, N> field[kPadded], w[S];
+    MPM_UNROLL for (int c = 0; c < kChannels; c++) {
+      field[c] = gift.value[c];
+      MPM_UNROLL for (int a = 0; a < D; a++) {
+        if (Slope) field[kSlope + a * kChannels + c] = gift.slope[a][c];
+        if (Gradient) field[kGradient + a * kChannels + c] = gift.gradient[a][c];
+      }
+    }
+    MPM_UNROLL for (int k = kFields; k < kPadded; k++)
+      field[k] = Pack<T, N>(0);
+    store_transposed<kPadded>(field, row[i], kPadded);
+    MPM_UNROLL for (int a = 0; a < D; a++) {
+      BSpline<Order>::weights(f[a], w);
+      MPM_UNROLL for (int k = 0; k < S; k++)
+        w[k].store(&weight[a][k][i]);
+      if (!Gradient) continue;
+      BSpline<Order>::first_derivatives(f[a], w);
+      MPM_UNROLL for (int k = 0; k < S; k++)
+        w[k].store(&derivative[a][k][i]);
+    }
+  }
+};
+
+// Four nodes along the last axis, kChannels values each.
+template <class T>
+using NodeRow = Pack<T, 4 * kChannels>;
+
+// The same kChannels values at four nodes.
+template <class T>
+MPM_HD NodeRow<T> repeat(const T* channels) {
+  NodeRow<T> r;
+#ifdef __AVX512F__
+  MPM_UNROLL for (int k = 0; k < r.kParts; k++)
+    if constexpr (sizeof(T) == 4)
+      r.part[k] = _mm512_maskz_broadcast_f32x4(__mmask16(-1), _mm_loadu_ps(channels));
+    else
+      r.part[k] = _mm512_maskz_broadcast_f64x4(__mmask8(-1), _mm256_loadu_pd(channels));
+#else
+  T lanes[4 * kChannels];
+  MPM_UNROLL for (int k = 0; k < 4; k++)
+    __builtin_memcpy(lanes + k * kChannels, channels, sizeof(T) * kChannels);
+  r = NodeRow<T>::load(lanes);
+#endif
+  return r;
+}
+
+// Value k in all channels of node k, zero beyond S nodes.
+template <int S, class T>
+MPM_HD NodeRow<T> spread(const T* value, int stride) {
+  using Row = NodeRow<T>;
+  Row r(0);
+  MPM_UNROLL for (int k = 0; k < S; k++) {
+    Mask<T, 4 * kChannels> node;
+    MPM_UNROLL for (int l = 0; l < 4 * kChannels; l++)
+      node.part[l / Row::kWidth][l % Row::kWidth] = l / kChannels == k ? -1 : 0;
+    r = select(node, Row(value[k * stride]), r);
+  }
+  return r;
+}
+
+// Sums the particles order[0 .. count) of one cell into the tile at its base node.
+template <int Order, class T, int D, bool Slope, bool Gradient>
+void sum_cell(const Gifts<Order, T, D, Slope, Gradient>& g, const uint16_t* order, int count, T* tile) {
+  using Row = NodeRow<T>;
+  using G = Gifts<Order, T, D, Slope, Gradient>;
+  constexpr int S = Order + 1, X = D - 3, Y = D - 2, Z = D - 1, kPlanes = D == 3 ? S : 1;
+  constexpr int kTileX = D == 3 ? Tile<Order, T, D>::stride(0) : 0, kTileY = Tile<Order, T, D>::stride(Y);
+  static constexpr T kOffset[4] = {0, 1, 2, 3};
+  const Row offset = spread<4>(kOffset, 1);
+  Row sum[kPlanes][S];
+  MPM_UNROLL for (int i = 0; i < kPlanes; i++) MPM_UNROLL
+    for (int j = 0; j < S; j++) sum[i][j] = Row::load(tile + i * kTileX + j * kTileY);
+  for (int n = 0; n < count; n++) {
+    const int p = order[n] % kChunk;
+    const T* row = g.row[p];
+    const auto weight = [&](int axis, int k) { return Row(g.weight[axis][k][p]); };
+    const auto derivative = [&](int axis, int k) { return Row(g.derivative[axis][k][p]); };
+    const auto slope = [&](int axis) { return repeat(row + G::kSlope + axis * kChannels); };
+    const auto gradient = [&](int axis) { return repeat(row + G::kGradient + axis * kChannels); };
+    const Row wz = spread<S>(&g.weight[Z][0][p], G::kLine);
+    Row value = repeat(row), slope_y, slope_x, gradient_y, gradient_x;
+    if (Slope) value += offset * slope(Z);
+    value = wz * value;
+    if (Gradient) value += spread<S>(&g.derivative[Z][0][p], G::kLine) * gradient(Z);
+    if (Slope) slope_y = wz * slope(Y);
+    if (Gradient) gradient_y = wz * gradient(Y);
+    if constexpr (D == 3) {
+      if (Slope) slope_x = wz * slope(X);
+      if (Gradient) gradient_x = wz * gradient(X);
+    }
+    MPM_UNROLL for (int j = 0; j < S; j++) {
+      Row line = value;
+      if (Slope && j == 1) line += slope_y;
+      if (Slope && j > 1) line += Row(j) * slope_y;
+      line = weight(Y, j) * line;
+      if (Gradient) line += derivative(Y, j) * gradient_y;
+      if constexpr (D == 2) {
+        sum[0][j] += line;
+      } else {
+        const Row line_x = Slope ? weight(Y, j) * slope_x : line, line_g = Gradient ? weight(Y, j) * gradient_x : line;
+        MPM_UNROLL for (int i = 0; i < S; i++) {
+          Row plane = line;
+          if (Slope && i == 1) plane += line_x;
+          if (Slope && i > 1) plane += Row(i) * line_x;
+          sum[i][j] += weight(X, i) * plane;
+          if (Gradient) sum[i][j] += derivative(X, i) * line_g;
+        }
+      }
+    }
+  }
+  MPM_UNROLL for (int i = 0; i < kPlanes; i++) MPM_UNROLL
+    for (int j = 0; j < S; j++) sum[i][j].store(tile + i * kTileX + j * kTileY);
+}
+
+// Numbers of N cells as a Schedule holds them.
+template <int N>
+struct EntriesOf {
+  typedef uint16_t Value __attribute__((vector_size(N * sizeof(uint16_t))));
+};
+
+// Distance of the particles of a group from their base nodes; `particle` is the first one's number in the chunk.
+template <class T, int D, int N>
+MPM_HD void distances(const Topology<T, D>& t, const Home<T, D>& home, const Chunk& chunk, const Field<const T>& x,
+                      const GroupOf<N>& g, int particle, Pack<T, N> f[D]) {
+  typename EntriesOf<N>::Value entry = {};
+  if (g.count == N)
+    __builtin_memcpy(&entry, chunk.order + particle, sizeof(entry));
+  else
+    for (int l = 0; l < g.count; l++) entry[l] = chunk.order[particle + l];
+  using Integers = typename RegisterOf<float, N>::Integer;
+  using Values = typename RegisterOf<T, N>::Value;
+  const Integers cell = __builtin_convertvector(entry / kChunk, Integers);
+  MPM_UNROLL for (int a = 0; a < D; a++) {
+    const Integers coordinate = cell >> 2 * (D - 1 - a) & (kBlockWidth - 1);  // cell_coordinate() of each
+    const Values base = __builtin_convertvector(coordinate + home.corner[a], Values);
+    Pack<T, N> node;
+    __builtin_memcpy(&node, &base, sizeof(node));
+    f[a] = distance_in_cells(t.geometry, a, load(x, g, a), node);
+  }
+}
+
+// Cells in an order in which neighbours along the last axis, whose rows overlap shifted, do not follow each other: a
+// load must not wait for a store that covers it in part.
+template <int D>
+MPM_HD int nth_cell(int n) {
+  return n % (kBlockNodes<D> / kBlockWidth) * kBlockWidth + n / (kBlockNodes<D> / kBlockWidth);
+}
+
+// Adds channels first, ..., first + count - 1. give(group, f, scene) makes the gifts of a group.
+template <int Order, bool Slope, bool Gradient, class T, int D, class F>
+void scatter_channels(const Topology<T, D>& t, const Field<const T>& x, const NodeField<T>& nodes, int first, int count,
+                      const F& give) {
+  const ScheduleIn s = schedule_of(t);
+  const auto fill = [&](const Home<T, D>& home, const Chunk& chunk, Gifts<Order, T, D, Slope, Gradient>& gifts,
+                        Tile<Order, T, D>& tile) {
+    constexpr int N = kWideLanes<T>;
+    for (int i = 0; i < chunk.count; i += N) {
+      const GroupOf<N> g = group_by_id<N>(chunk, i);
+      Pack<T, N> f[D];
+      distances(t, home, chunk, x, g, i, f);
+      gifts.put(i, f, give(g, f, home.scene));
+    }
+    for (int n = 0; n < kBlockNodes<D>; n++) {
+      const int cell = nth_cell<D>(n), begin = cell ? chunk.cell_end[cell - 1] : 0, end = chunk.cell_end[cell];
+      if (begin == end) continue;
+      int base[D];
+      for (int a = 0; a < D; a++) base[a] = cell_coordinate<D>(cell, a);
+      sum_cell(gifts, chunk.order + begin, end - begin, tile.value + tile.at(base));
+    }
+  };
+  PhaseCounter<kColours<D>> colours{s.colour_start};
+  parallel_homes<D>(s, t.particles, [&](const auto& next) {
+    Gifts<Order, T, D, Slope, Gradient> gifts;
+    Tile<Order, T, D> tile;
+    int colour = 0;
+    for (int64_t h; (h = next()) >= 0;) {
+      const Home<T, D> home(t, s.home_slot[h]);
+      tile.clear();
+      for (int64_t c = s.home_chunk[h]; c < s.home_chunk[h + 1]; c++) fill(home, Chunk(t, s, c), gifts, tile);
+      while (h >= s.colour_start[colour + 1]) colour++;
+      colours.wait_before(colour);
+      tile.add_to(nodes, home, first, count);
+      colours.finish(colour);
+    }
+  });
+}
+
+}  // namespace TORCH_MPM_ISA
+}  // namespace mpm::cpu

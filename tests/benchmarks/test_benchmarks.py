@@ -1,0 +1,210 @@
+"""The benchmark programs run in their quick mode, and the exact solution that they compare with is one."""
+
+import json
+import math
+from pathlib import Path
+
+import pytest
+import torch
+from benchmark_runs import result, run_quick
+
+from benchmarks import common, report
+from benchmarks.accuracy import convergence, manufactured, ritter
+from benchmarks.speed import peers, step, work
+from benchmarks.stability.stable_dt import LAWS
+
+
+def test_speed_program_times_every_part(tmp_path: Path) -> None:
+    run_quick("benchmarks.speed.step", tmp_path, "--peers")
+    found = result(tmp_path, "speed_*.json")
+    (size,) = found["sizes"]
+    names = {part["name"] for part in size["parts"]}
+    assert found["failures"] == []
+    assert {"activate", "stress", "p2g", "g2p", "grid update", "advance", "p2g with stress, backward"} <= names
+    assert all(part["ms"] > 0 and part["bytes"] > 0 for part in size["parts"])
+    assert max(size["errors"].values()) < 5e-6
+
+
+def test_failed_part_is_reported_and_the_others_go_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(*_: object) -> None:
+        raise RuntimeError("no such device")
+
+    monkeypatch.setattr(step, "whole_steps", broken)
+    found = step.measure("cpu", [8], [], samples=1, budget=0.0)
+    assert found["failures"] == [f"{part}: RuntimeError: no such device" for part in ("whole steps", "host")]
+    assert found["sizes"][0]["parts"] and found["sizes"][0]["errors"]
+
+
+def test_work_is_sorted_by_block_and_fills_the_cells() -> None:
+    w = work.make(16)
+    s = step.setup(w, "cpu")
+    index = s.grid.activate(s.state.x).index
+    assert torch.equal(index, torch.arange(16**3, dtype=torch.int32))
+    cells = torch.floor(s.state.x * w.n).long().unique(dim=0, return_counts=True)[1]
+    assert cells.tolist() == [8] * 8**3
+
+
+@pytest.mark.parametrize("peer", sorted(peers.PEERS))
+def test_peer_does_the_same_work(peer: str, tmp_path: Path) -> None:
+    pytest.importorskip(peers.PEERS[peer][1])
+    report = step.Report("cpu")
+    step.measure_peer(report, peer, "cpu", [16], samples=1)
+    difference = report.result["difference"][peer]
+    assert difference["x"] < 1e-6 and difference["v"] < 1e-5
+    assert report.result["peers"][0]["particles"] == 16**3
+
+
+def test_bytes_count_node_tensors_by_their_active_rows() -> None:
+    s = step.setup(work.make(8), "cpu")
+    blocks = s.grid.activate(s.state.x)
+    nodes = torch.zeros(blocks.node_count, 4)
+    assert step.bytes_of([nodes, s.state.x], blocks, active=100) == 100 * 16 + 8**3 * 12
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_manufactured_solution_satisfies_the_equation_of_motion(dim: int) -> None:
+    """ρ ∂²u/∂t² = Div P + ρ b with P = μ (F − F⁻ᵀ) + λ ln J F⁻ᵀ, by finite differences in X and t."""
+    X, t, h = torch.rand(5, dim, dtype=torch.float64), 0.0037, 1e-4
+
+    def stress(X: torch.Tensor) -> torch.Tensor:
+        F = manufactured.Solution(X).stretch(t)
+        return manufactured.MU * (F - 1 / F) + manufactured.LAM * F.log().sum(1, keepdim=True) / F
+
+    divergence = torch.empty_like(X)
+    for axis in range(dim):
+        shift = h * torch.eye(dim, dtype=torch.float64)[axis]
+        divergence[:, axis] = ((stress(X + shift) - stress(X - shift)) / (2 * h))[:, axis]
+    s, tau = manufactured.Solution(X), h / manufactured.SPEED
+    acceleration = (s.displacement(t + tau) - 2 * s.displacement(t) + s.displacement(t - tau)) / tau**2
+    force = manufactured.DENSITY * s.body_force(t)
+    torch.testing.assert_close(manufactured.DENSITY * acceleration - divergence, force, rtol=1e-5, atol=1e-2)
+
+
+def test_manufactured_gradients_belong_to_the_motion() -> None:
+    X, t = torch.rand(4, 3, dtype=torch.float64, requires_grad=True), 0.0037
+    s = manufactured.Solution(X)
+    x = X + s.displacement(t)
+    F = torch.stack([torch.autograd.grad(x[:, i].sum(), X, retain_graph=True)[0] for i in range(3)], 1)
+    torch.testing.assert_close(F, torch.diag_embed(s.stretch(t)))
+    rate = torch.stack([torch.autograd.grad(s.velocity(t)[:, i].sum(), X, retain_graph=True)[0] for i in range(3)], 1)
+    torch.testing.assert_close(rate @ F.inverse(), torch.diag_embed(s.velocity_gradient(t, t)))
+
+
+def test_mirrored_walls_converge_with_second_order_and_slip_walls_with_first() -> None:
+    orders = {}
+    for walls in ("slip", "mirror"):
+        rows = [convergence.run(convergence.Case(2, "quadratic", walls, ()), n)[1] for n in (8, 16)]
+        orders[walls] = math.log2(rows[0]["displacement"] / rows[1]["displacement"])
+    assert 0.8 < orders["slip"] < 1.3
+    assert 1.8 < orders["mirror"] < 2.2
+
+
+def test_fronts_of_the_exact_solution_have_no_error() -> None:
+    """Particles of equal area placed by Ritter's depth; the tip is the foremost of them."""
+    t, count = 5.0, 40000
+    ahead = (torch.arange(count, dtype=torch.float64) + 0.5) / count  # share of the water released that is ahead
+    x = 2 * ritter.SPEED * t * (1 - ahead ** (1 / 3))
+    area = torch.full_like(x, 8 / 27 * ritter.SPEED * t * ritter.DEPTH / count)
+    row = ritter.fronts(float(x.max()), *ritter.profile(x.numpy(), area.numpy(), t), t)
+    assert all(abs(row["error"][str(level)]) < 1e-3 for level in ritter.LEVELS if level < 0.4)
+    assert row["tip"] == pytest.approx(1 - (0.5 / count) ** (1 / 3))
+
+
+def test_richardson() -> None:
+    assert ritter.extrapolate([1.0, 1.5, 1.75], lambda value: value) == 2.0
+    assert ritter.extrapolate([1.0, 1.5, 2.0], lambda value: value) is None
+
+
+def test_limits_program(tmp_path: Path) -> None:
+    run_quick("benchmarks.accuracy.limits", tmp_path)
+    found = result(tmp_path, "limits.json")
+    for row in found["spins"]:
+        assert row["momentum"] < 1e-13
+        kept = row["angular momentum"]
+        assert abs(kept - 1) < 1e-12 if row["transfer"] == "apic" else kept < 1
+    sliding, sticking = found["inclines"][0], found["inclines"][-1]
+    assert sliding["speed"] == pytest.approx(sliding["rigid"], rel=0.02)
+    assert abs(sticking["speed"]) < 0.01
+    errors = {row["gap"]: row for row in found["vectors"] if row["dtype"] == "float32"}
+    assert errors[1e-6]["error"] > 1e3 * errors[1e-2]["error"]
+    assert all(row["polar"] < 1e-6 for row in errors.values())
+
+
+@pytest.mark.parametrize("program", ["convergence", "precision", "ritter"])
+def test_accuracy_program(program: str, tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    run_quick(f"benchmarks.accuracy.{program}", tmp_path)
+    result(tmp_path, f"{program}.json")
+
+
+def test_table_and_orders() -> None:
+    assert common.table(("a", "b"), [(1, None), (0.5, 1e-5)]).splitlines() == [
+        "| a   | b       |",
+        "|-----|---------|",
+        "| 1   | –       |",
+        "| 0.5 | 1.0e-05 |",
+    ]
+    assert common.order_of([1, 0.5, 0.25], [8, 2, 0.5]) == [None, 2, 2]
+
+
+def test_report_has_every_section_and_goes_between_its_marks(tmp_path: Path) -> None:
+    place = {"device": "abacus", "commit": "0"}
+    part = {"name": "p2g", "ms": 0.5, "bytes": 1}
+    entry = {"particles": 10**6, "steps": [{"name": "step", "ms": 2.0}], "parts": [part], "errors": {"g2p": 1e-7}}
+    speed = {"environment": place, "sizes": [entry], "peers": [{"name": "warp", "particles": 10**6, "ms": 8.0}]}
+    rows = [{"n": 8, "displacement": 0.5, "seconds": 1.0}]
+    cases = {"cases": [{"name": "2-D", "order": {"displacement": 2.0}, "rows": rows}]}
+    for name, found in (("speed_abacus", speed), ("convergence", cases)):
+        (tmp_path / f"{name}.json").write_text(json.dumps(found))
+    found = report.sections(tmp_path)
+    tables = report.summary(found, report.OVERVIEW)
+    cells = [cell.strip() for line in tables.splitlines() if line.startswith("| abacus") for cell in line.split("|")]
+    assert cells[1:5] == ["abacus", "1 M", "2", "4.0x"] and cells[7] == "2"
+    assert list(found) == ["Speed", "Convergence"] and tables.index("### Speed") < tables.index("### Convergence")
+    document = report.insert(f"before {report.BEGIN} old {report.END} after", tables)
+    assert document.startswith("before") and document.endswith("after") and "old" not in document and "4.0x" in document
+    with pytest.raises(ValueError, match="needs the lines"):
+        report.insert("no marks", tables)
+
+
+def test_return_map_of_sand_against_extended_precision(tmp_path: Path) -> None:
+    for package in ("matplotlib", "mpmath", "torch_mpm._math"):
+        pytest.importorskip(package)
+    run_quick("benchmarks.accuracy.sand", tmp_path)
+    for row in result(tmp_path, "sand_accuracy.json")["rows"]:
+        assert row["reference against 50 digits"] < 1e-18
+        for name in ("float32", "float64"):
+            found = row[name]
+            assert found["on the cone"] > 1500
+            assert found["error over condition"][2] < found["allowed"]
+            assert found["wrong branches"] == 0
+
+
+def test_gradients_of_sand_program(tmp_path: Path) -> None:
+    run_quick("benchmarks.accuracy.sand_gradient", tmp_path)
+    found = result(tmp_path, "sand_gradient.json")
+    for row in found["rows"]:
+        assert row["at rest"] < found["allowed"]
+        for case in row["gaps"]:
+            assert case["states"] > 300
+            assert max(case["largest"], case["of the usual norm, largest"]) < found["allowed"]
+
+
+def test_no_law_is_unstable_below_its_estimate(tmp_path: Path) -> None:
+    run_quick("benchmarks.stability.law_dt", tmp_path)
+    cases = result(tmp_path, "stability_laws.json")["cases"]
+    assert {case["law"] for case in cases} == set(LAWS) - {"neo-Hookean"}
+    assert all(1 <= case["stable"] < 10 for case in cases)
+
+
+def test_random_rollouts_program(tmp_path: Path) -> None:
+    run_quick("benchmarks.stability.adversarial", tmp_path)
+    rows = result(tmp_path, "adversarial.json")["rows"]
+    assert len({row["motion"] for row in rows}) == 10
+    assert not any(row["inverted"] or row["flattened"] or row["not finite"] for row in rows)
+
+
+def test_svd_program(tmp_path: Path) -> None:
+    run_quick("benchmarks.accuracy.svd", tmp_path)
+    for row in result(tmp_path, "svd_accuracy.json")["rows"]:
+        assert row["errors"]["svd3"]["product"][1] < 1e-6

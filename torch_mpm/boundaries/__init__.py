@@ -1,0 +1,39 @@
+"""What acts on the velocity of the grid nodes: the walls of the domain, and obstacles that may move.
+
+An `nn.Module` with the arguments below, or any object with a method `apply` that takes them, can stand in the list of
+boundaries of a `Step`. It is ordinary torch code on the nodes, so gradients come by themselves; this one blows through
+the upper half of the domain:
+
+    class Wind(torch.nn.Module):
+        def __init__(self, acceleration):  # [D]
+            super().__init__()
+            self.acceleration = torch.nn.Parameter(acceleration)
+        def forward(self, velocity, positions, scene, time, dt):
+            return velocity + torch.where(positions[:, 1:2] > 0.5, dt * self.acceleration, 0.0)
+
+The step finds the parameters of modules, and so does an optimizer that is given `step.parameters()`.
+Choose with `torch.where` rather than a mask as index, which synchronises with the device.
+"""
+
+from .list import BoundaryList, call_boundary
+from .obstacles import SDF, Box, Capsule, Obstacle, Plane, Pose, Revolved, Sphere, rotation_matrix
+from .walls import CONTACTS, LEAST_BETWEEN_MIRRORS, WALL_KINDS, Face, Walls
+
+__all__ = [
+    "CONTACTS",
+    "LEAST_BETWEEN_MIRRORS",
+    "SDF",
+    "WALL_KINDS",
+    "BoundaryList",
+    "Box",
+    "Capsule",
+    "Face",
+    "Obstacle",
+    "Plane",
+    "Pose",
+    "Revolved",
+    "Sphere",
+    "Walls",
+    "call_boundary",
+    "rotation_matrix",
+]

@@ -1,0 +1,5 @@
+"""Files of simulations: trajectories, and what is made of them."""
+
+from .trajectory import Trajectory
+
+__all__ = ["Trajectory"]

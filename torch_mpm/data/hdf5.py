@@ -1,0 +1,187 @@
+"""HDF5 files without their dangers: a full disk that HDF5 cannot handle, damaged bytes, and data of other files.
+
+HDF5 crashes at exit after a write that failed, so files are made in memory and written as plain bytes. A *seal* at the
+end of a file holds the SHA-256 of the bytes that will not change; it is checked before HDF5 reads any of them, and
+HDF5 ignores what follows its own end. A seal tells damage, not forgery, so what a file holds is looked at as well.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import os
+import struct
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from ..errors import DamagedFileError
+
+Extents = Sequence[tuple[int, int]]
+"""Parts of a file: (offset, length) [bytes]."""
+MAGIC = b"torch_mpm seal 1"
+FOOTER = struct.Struct("<I32s16s")
+"""The end of a seal: length of its JSON text, SHA-256, magic."""
+CHUNK = 1 << 20
+
+
+def h5py_module() -> Any:
+    try:
+        import h5py
+    except ImportError as error:
+        raise ImportError("trajectories need h5py: pip install torch-mpm[data]") from error
+    return h5py
+
+
+class SparseFile:
+    """A file in memory of which only the pages written to take room: h5py makes an HDF5 file of any size in it."""
+
+    PAGE = 4096
+
+    def __init__(self) -> None:
+        self.size = 0
+        self._at = 0
+        self._pages: dict[int, bytearray] = {}
+        self._written: list[tuple[int, int]] = []
+
+    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
+        self._at = offset + {os.SEEK_SET: 0, os.SEEK_CUR: self._at, os.SEEK_END: self.size}[whence]
+        return self._at
+
+    def tell(self) -> int:
+        return self._at
+
+    def write(self, data: Any) -> int:
+        view = memoryview(data).cast("B")
+        self._written.append((self._at, len(view)))
+        for page, inside, part in self._parts(view):
+            self._pages.setdefault(page, bytearray(self.PAGE))[inside : inside + len(part)] = part
+        self.size = max(self.size, self._at)
+        return len(view)
+
+    def readinto(self, buffer: Any) -> int:
+        view = memoryview(buffer).cast("B")
+        for page, inside, part in self._parts(view):
+            part[:] = self._pages.get(page, bytes(self.PAGE))[inside : inside + len(part)]
+        return len(view)
+
+    def read(self, length: int) -> bytes:
+        buffer = bytearray(length)
+        self.readinto(buffer)
+        return bytes(buffer)
+
+    def truncate(self, size: int) -> None:
+        self.size = size
+
+    def flush(self) -> None:
+        """Nothing waits."""
+
+    def extents(self) -> list[tuple[int, int]]:
+        """What was written, in order and without overlap."""
+        merged: list[tuple[int, int]] = []
+        for offset, length in sorted(self._written):
+            begin, size = merged[-1] if merged else (0, 0)
+            if merged and offset <= begin + size:
+                merged[-1] = (begin, max(size, offset + length - begin))
+            else:
+                merged.append((offset, length))
+        return merged
+
+    def _parts(self, view: memoryview) -> list[tuple[int, int, memoryview]]:
+        """(page, offset in it, part of ``view``) from the present place on, which moves behind ``view``."""
+        parts, done = [], 0
+        while done < len(view):
+            page, inside = divmod(self._at, self.PAGE)
+            part = view[done : done + self.PAGE - inside]
+            parts.append((page, inside, part))
+            done += len(part)
+            self._at += len(part)
+        return parts
+
+
+# ---- seals
+
+
+def seal(handle: BinaryIO, extents: Extents) -> None:
+    """Append the seal of these parts to a file that is open for reading and writing."""
+    text = json.dumps([list(part) for part in extents]).encode()
+    digest = _digest(handle, extents, text)
+    handle.seek(0, os.SEEK_END)
+    handle.write(text + FOOTER.pack(len(text), digest, MAGIC))
+
+
+def check_seal(path: Path, remedy: str) -> None:
+    """Raise DamagedFileError with ``remedy`` unless the parts under the seal of a file are as they were written."""
+    with open(path, "rb") as handle:
+        size = handle.seek(0, os.SEEK_END)
+        handle.seek(max(0, size - FOOTER.size))
+        footer = handle.read(FOOTER.size)
+        length, digest, magic = FOOTER.unpack(footer) if len(footer) == FOOTER.size else (0, b"", b"")
+        end = size - FOOTER.size - length
+        if magic != MAGIC or end < 0:
+            raise DamagedFileError(path, "is cut off, or no file of this version of torch_mpm", remedy)
+        handle.seek(end)
+        text = handle.read(length)
+        try:
+            extents = [(int(offset), int(count)) for offset, count in json.loads(text)]
+        except (ValueError, TypeError, RecursionError):
+            extents = [(-1, 0)]
+        inside = all(0 <= offset <= offset + count <= end for offset, count in extents)
+        if not inside or sum(count for _, count in extents) > end or _digest(handle, extents, text) != digest:
+            raise DamagedFileError(path, "is damaged, its checksum is wrong", remedy)
+
+
+def _digest(handle: BinaryIO, extents: Extents, text: bytes) -> bytes:
+    digest = hashlib.sha256(text)
+    for offset, length in extents:
+        handle.seek(offset)
+        while length > 0 and (data := handle.read(min(length, CHUNK))):
+            digest.update(data)
+            length -= len(data)
+    return digest.digest()
+
+
+# ---- reading
+
+
+def open_sealed(path: Path, remedy: str, in_memory: bool = False) -> Any:
+    """The h5py.File of a sealed file, all of whose data are its own; ``in_memory`` leaves no file open.
+
+    Raises:
+        DamagedFileError: with ``remedy``, what to do.
+        OSError: for a file that cannot be read.
+        ImportError: when h5py is missing (extra ``data``).
+    """
+    h5py = h5py_module()
+    check_seal(path, remedy)
+    try:
+        file = h5py.File(io.BytesIO(path.read_bytes()) if in_memory else path, "r")
+    except (OSError, RuntimeError, ValueError, KeyError) as error:
+        raise DamagedFileError(path, f"is no HDF5 file ({error})", remedy) from None
+    problem = _foreign(h5py, file, path.stat().st_size)
+    if problem:
+        file.close()
+        raise DamagedFileError(path, problem, remedy)
+    return file
+
+
+def _foreign(h5py: Any, file: Any, size: int) -> str:
+    """What in a file is no plain array of numbers within it: links, other files' data, filters, groups."""
+    try:
+        for name in file:
+            if not isinstance(file.get(name, getlink=True), h5py.HardLink):
+                return f"{name!r} is a link"
+            data = file[name]
+            if not isinstance(data, h5py.Dataset) or data.dtype.kind not in "fiu":
+                return f"{name!r} is no array of numbers"
+            properties = data.id.get_create_plist()
+            if properties.get_layout() != h5py.h5d.CONTIGUOUS or properties.get_external_count():
+                return f"{name!r} is not stored as a plain array in the file"
+            offset = data.id.get_offset()
+            if data.nbytes and (offset is None or offset + data.nbytes > size):
+                return f"{name!r} is larger than the file"
+        dict(file.attrs)
+    except (OSError, RuntimeError, ValueError, KeyError, TypeError) as error:
+        return f"it cannot be read ({error})"
+    return ""

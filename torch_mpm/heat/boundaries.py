@@ -1,0 +1,396 @@
+"""What heats and cools a body beside conduction: flux, convection, radiation, held temperatures, sources.
+
+Without any of these a body is insulated. Each acts on the nodes of an implicit step through `HeatNodes`; anything with
+a method `apply(nodes)` can stand in the list of a `Heat`. Quantities of a surface are joined to the nodes by points x_s
+with areas A_s (`Surface`), h_i = Σ_s A_s η_s N_i(x_s), or by the free surface of the particles (`FreeSurface`).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from ..boundaries.obstacles import Obstacle, _norm, _per_node
+from ..errors import NUMBER_OR_TENSOR, check_number, check_real, shape_of
+from ..grid import BLOCK_WIDTH, PADDING, Blocks
+from ..laws.material import _check_value
+from ..ops import scatter
+from ..parameters import TensorModule, Value, evaluate
+from ..reference.transfer import bspline
+
+if TYPE_CHECKING:
+    from ..state import State
+
+FROM_TIME = "what a function of the time returns"
+STEFAN_BOLTZMANN = 5.670374419e-8
+"""σ [W/(m² K⁴)] (CODATA 2018)."""
+
+Number = float | Tensor
+Timed = Number | Callable[[float | Tensor], Number]
+"""A number, a tensor, or a function of the time [s] that returns one of them."""
+
+
+@dataclasses.dataclass
+class HeatNodes:
+    """The nodes of one implicit step, to which boundary terms add their part.
+
+    Attributes:
+        blocks: active blocks of the particles.
+        state: the particles before the step.
+        volume: their present volumes [P] [m³].
+        conductance: conductivity times volume κ V of the particles [P] [W m²/K in 3-D].
+        capacity: heat capacity of the nodes [N] [J/K]; zero where there is no matter.
+        theta: temperature of the nodes [N] [K], relative to `reference`.
+        reference: absolute temperature that temperatures are relative to [K].
+        source: heat into the nodes [N] [W], or None.
+        exchange: derivative of the heat that leaves them by their temperature [N] [W/K], or None.
+        fixed: nodes whose temperature is held at `held` [N] [K], bool [N], or None.
+        share: of their conductivity that particles are left with [P], or None for all.
+        layers: what replaces the rest, see `add_layer`.
+    """
+
+    blocks: Blocks
+    state: State
+    volume: Tensor
+    conductance: Tensor
+    capacity: Tensor
+    theta: Tensor
+    reference: float = 0.0
+    source: Tensor | None = None
+    exchange: Tensor | None = None
+    fixed: Tensor | None = None
+    held: Tensor | None = None
+    share: Tensor | None = None
+    layers: list[tuple[Tensor, Number]] = dataclasses.field(default_factory=list)
+
+    @property
+    def time(self) -> float | Tensor:
+        """[s]"""
+        return self.state.time
+
+    def scene(self) -> Tensor | None:
+        """Scene of each node, int32 [N]; None for one scene."""
+        return None if self.state.scene is None else self.blocks.node_scene()
+
+    def per_node(self, value: Timed) -> Number:
+        """A number, or a tensor [], [B] or [N], or a function of the time that returns one, as a number or [N]."""
+        value = _at(value, self.time)
+        if not isinstance(value, Tensor) or value.shape == self.theta.shape:
+            return value
+        scenes = self.blocks.grid.scenes
+        if value.shape not in ((), (1,), (scenes,)):
+            raise ValueError(f"a value at nodes must have shape [], [B] = [{scenes}] or [N], got {shape_of(value)}")
+        return _per_node(value.to(self.theta), 0, self.scene())
+
+    def add_source(self, power: Tensor) -> None:
+        """Heat [N] [W] that goes into the nodes."""
+        self.source = power if self.source is None else self.source + power
+
+    def add_exchange(self, coefficient: Tensor, ambient: Number) -> None:
+        """Heat coefficient (ambient − θ) with coefficient [N] [W/K], taken at the end of the step."""
+        self.exchange = coefficient if self.exchange is None else self.exchange + coefficient
+        self.add_source(coefficient * ambient)
+
+    def hold(self, where: Tensor, temperature: Number) -> None:
+        """Keep nodes, bool [N], at a temperature [K]; those held before stay as they are."""
+        value = torch.where(where, torch.zeros_like(self.theta) + temperature, 0)
+        if self.fixed is None or self.held is None:
+            self.fixed, self.held = where, value
+        else:
+            self.held = torch.where(self.fixed, self.held, value)
+            self.fixed = self.fixed | where
+
+    def add_layer(self, share: Tensor, rate: Tensor, temperature: Number) -> None:
+        """Let particles conduct with a share [P] of their conductivity, and exchange κ V rate (temperature − θ).
+
+        Args:
+            share: s [P] of the distance a from a surface.
+            rate: s'/a [P] [1/m²]. Where layers overlap, s is the product of their shares.
+            temperature: of the surface [K], a number or [N].
+        """
+        before = self.share
+        self.layers = [(other * share, value) for other, value in self.layers]
+        self.layers.append((rate if before is None else rate * before, temperature))
+        self.share = share if before is None else before * share
+
+    def left_conductance(self) -> Tensor:
+        """κ V of the particles [P] without what layers replace; adds their exchange.
+
+        At the nodes a particle exchanges with Σ_i N_i (θ_i − temperature)², which on a linear temperature is D |∇θ|²
+        more than at the particle. This is taken from its κ V, which may get negative; H + X stays positive.
+        """
+        if self.share is None:
+            return self.conductance
+        rates = self.conductance[:, None] * torch.stack([rate for rate, _ in self.layers], 1)
+        exchange = scatter(self.blocks, self.state.x, rates)
+        for coefficient, (_, temperature) in zip(exchange.unbind(1), self.layers, strict=True):
+            self.add_exchange(coefficient, temperature)
+        return self.share * self.conductance - rates.sum(1) / self.blocks.grid.inverse_inertia
+
+
+# ---- surfaces
+
+
+class Surface(TensorModule):
+    """Points that stand for a surface.
+
+    Args:
+        points: x_s [S, D] [m].
+        area: A_s [m²] (m in 2-D): a number for each of them, or [S].
+        scene: scene of each point, int32 [S]; None where the grid has one scene.
+
+    A point gives to the nodes around it that have matter, in proportion to N_i(x_s), all of what it has; a point with
+    no matter around it gives nothing. Points stay where they are: replace `points` between steps if the surface moves.
+
+    Raises:
+        ValueError: for wrong shapes, points that are not finite, or an area that is not or is negative.
+    """
+
+    def __init__(self, points: Tensor, area: Number, scene: Tensor | None = None) -> None:
+        if not isinstance(points, Tensor) or points.dim() != 2 or points.shape[1] not in (2, 3):
+            raise ValueError(f"points must have shape [S, 2] or [S, 3], got {shape_of(points)}")
+        if callable(area) and not isinstance(area, Tensor):
+            raise TypeError(f"area must be {NUMBER_OR_TENSOR}, got {shape_of(area)}")
+        if isinstance(area, Tensor) and area.shape not in ((), points.shape[:1]):
+            raise ValueError(f"area must be a number or have shape [S] = [{points.shape[0]}], got {shape_of(area)}")
+        if not bool(points.detach().isfinite().all()):
+            raise ValueError("points must be finite, and some are NaN or infinite")
+        self.area: Number = _checked("area", area, "not negative", lambda v: v >= 0)  # type: ignore[assignment]
+        if scene is not None and (not isinstance(scene, Tensor) or scene.shape != points.shape[:1]):
+            raise ValueError(f"scene must have shape [S] = [{points.shape[0]}], got {shape_of(scene)}")
+        if scene is not None and scene.dtype != torch.int32:
+            raise TypeError(f"scene must be int32, got {scene.dtype}")
+        self.points, self.scene = points, scene
+
+    def integrate(self, nodes: HeatNodes, density: Timed) -> Tensor:
+        """∫ N_i density dA [N] of a density per area: a number, a tensor [] or [S], or a function of the time."""
+        density = _at(density, nodes.time)
+        points = self.points.to(nodes.theta)
+        rows, weight = node_weights(nodes.blocks, points, self.scene)
+        weight = weight * (nodes.capacity.detach()[rows] > 0)
+        total = weight.sum(1, keepdim=True)
+        weight = torch.where(total > 0, weight / torch.where(total > 0, total, 1), 0)
+        amount = (torch.ones_like(points[:, 0]) * self.area * density).to(points)
+        given = amount[:, None] * weight
+        return torch.zeros_like(nodes.theta).index_add(0, rows.reshape(-1), given.reshape(-1))
+
+
+class FreeSurface(TensorModule):
+    """The surface of the particles wherever it is now: the area of a node is |Σ_p V_p ∇N_i(x_p)| = |∮ N_i n dA|.
+
+    Exact for a flat surface of evenly spread particles; disorder inside a body adds area that is not there, a share of
+    V/dx per node like that of the disorder. A side that touches an obstacle counts too.
+    """
+
+    def integrate(self, nodes: HeatNodes, density: Timed) -> Tensor:
+        """∫ N_i density dA [N] of a density per area: a number, a tensor [], [B] or [N], or a function of the time."""
+        x = nodes.state.x
+        P, D = x.shape
+        axes = torch.eye(D, dtype=x.dtype, device=x.device)
+        gradient = nodes.volume[:, None, None] * axes
+        return _norm(scatter(nodes.blocks, x, x.new_zeros(P, D), gradient=gradient)) * nodes.per_node(density)
+
+
+def node_weights(blocks: Blocks, x: Tensor, scene: Tensor | None) -> tuple[Tensor, Tensor]:
+    """Rows [S, K] of the nodes around any points [S, D], and their weights N_i [S, K], zero for inactive nodes."""
+    grid = blocks.grid
+    cells = torch.stack([(x[:, a] - grid.lower[a]) / grid.dx + PADDING for a in range(grid.dim)], 1)
+    base = torch.floor(cells.detach() - (0.5 if grid.order == 2 else 1.0)).long()
+    steps = torch.arange(grid.order + 1, device=x.device)
+    node = base[:, None] + torch.cartesian_prod(*[steps] * grid.dim)
+    weight = bspline(node - cells[:, None], grid.order).prod(-1)
+    inside = torch.ones_like(node[..., 0], dtype=torch.bool)
+    index = torch.zeros_like(node[..., 0]) if scene is None else scene.long()[:, None].expand(node.shape[:2])
+    local = torch.zeros_like(node[..., 0])
+    for axis, extent in enumerate(grid.blocks):
+        at = node[..., axis]
+        inside = inside & (at >= 0) & (at < extent * BLOCK_WIDTH)
+        index = index * extent + at.clamp(0, extent * BLOCK_WIDTH - 1) // BLOCK_WIDTH
+        local = local * BLOCK_WIDTH + at % BLOCK_WIDTH
+    slot = blocks.table.long()[index]
+    inside = inside & (slot >= 0)
+    return torch.where(inside, slot * grid.nodes_per_block + local, 0), torch.where(inside, weight, 0)
+
+
+# ---- terms
+
+
+class Term(TensorModule):
+    """What adds to the nodes by `apply(nodes)`, a module with the tensors and parameters of its arguments."""
+
+
+class Flux(Term):
+    """A heat flux η = κ ∇θ · n into the body through a surface.
+
+    Args:
+        surface: a `Surface` or a `FreeSurface`.
+        flux: η [W/m²], positive into the body: a number, a tensor per point or scene, or a function of the time.
+
+    Raises:
+        ValueError: for a flux that is not finite.
+    """
+
+    def __init__(self, surface: Surface | FreeSurface, flux: Timed) -> None:
+        self.surface, self.flux = _surface(surface), _checked("flux", flux)
+
+    def apply(self, nodes: HeatNodes) -> None:  # type: ignore[override]
+        nodes.add_source(self.surface.integrate(nodes, self.flux))
+
+
+class Convection(Term):
+    """Exchange with a fluid around the body, coefficient (ambient − θ) per area (Robin), implicit.
+
+    Args:
+        surface: a `Surface` or a `FreeSurface`.
+        coefficient: [W/(m² K)], not negative: a number, a tensor per point or scene, or a function of the time.
+        ambient: temperature of the fluid [K]: a number, a tensor [] or [B], or a function of the time.
+
+    Raises:
+        ValueError: for a negative coefficient, or values that are not finite.
+    """
+
+    def __init__(self, surface: Surface | FreeSurface, coefficient: Timed, ambient: Timed) -> None:
+        self.surface, self.ambient = _surface(surface), _checked("ambient", ambient)
+        self.coefficient = _checked("coefficient", coefficient, "not negative", lambda v: v >= 0)
+
+    def apply(self, nodes: HeatNodes) -> None:  # type: ignore[override]
+        nodes.add_exchange(self.surface.integrate(nodes, self.coefficient), nodes.per_node(self.ambient))
+
+
+class Radiation(Term):
+    """Exchange with surroundings by radiation, ε σ (T_a⁴ − T⁴) per area, linearised about the temperature of the step.
+
+    Args:
+        surface: a `Surface` or a `FreeSurface`.
+        emissivity: ε in [0, 1]: a number, a tensor per point or scene, or a function of the time.
+        ambient: temperature of the surroundings [K], relative to the reference as all temperatures, which `Heat` needs
+            to know in kelvin: a number, a tensor [] or [B], or a function of the time.
+
+    Raises:
+        ValueError: for an emissivity outside [0, 1], or an ambient temperature that is not finite.
+    """
+
+    def __init__(self, surface: Surface | FreeSurface, emissivity: Timed, ambient: Timed) -> None:
+        self.surface, self.ambient = _surface(surface), _checked("ambient", ambient)
+        self.emissivity = _checked("emissivity", emissivity, "between 0 and 1", lambda v: (v >= 0) & (v <= 1))
+
+    def apply(self, nodes: HeatNodes) -> None:  # type: ignore[override]
+        black = STEFAN_BOLTZMANN * self.surface.integrate(nodes, self.emissivity)
+        ambient = nodes.per_node(self.ambient) + nodes.reference
+        kelvin = (nodes.theta + nodes.reference).clamp_min(0)
+        slope, squared = 4 * kelvin**3, ambient * ambient  # a power of floats would raise where it is too large
+        nodes.add_exchange(black * slope, nodes.theta)
+        nodes.add_source(black * (squared * squared - kelvin**4))
+
+
+class Fixed(Term):
+    """Nodes that are held at a temperature (Dirichlet).
+
+    Args:
+        region: an obstacle of `torch_mpm.boundaries`, of which the nodes inside are held, wherever it moves; or a
+            function of node positions [N, D] [m] that returns bool [N]. The surface is resolved to one node distance.
+            Where it lies on nodes, matter beside it sees it 0.17 dx farther away (cubic kernel 0.36 dx; 0.16 and 0.29
+            where matter reaches into the region), because splines smooth the bend of the temperature there; between
+            nodes, or where matter does not quite reach it, many times farther. See `FixedSurface`.
+        temperature: [K]: a number, a tensor [] or [B], or a function of the time.
+
+    Raises:
+        ValueError: for a temperature that is not finite.
+    """
+
+    def __init__(self, region: Obstacle | Callable[[Tensor], Tensor], temperature: Timed) -> None:
+        if not callable(region):
+            raise TypeError(f"region must be an obstacle or a function of positions [N, D], got {shape_of(region)}")
+        self.region, self.temperature = region, _checked("temperature", temperature)
+
+    def apply(self, nodes: HeatNodes) -> None:  # type: ignore[override]
+        positions = nodes.blocks.node_positions(nodes.theta.dtype)
+        if isinstance(self.region, Obstacle):
+            where = self.region.contains(positions, nodes.scene(), nodes.time)
+        else:
+            where = self.region(positions)
+            if not isinstance(where, Tensor) or where.shape != nodes.theta.shape or where.dtype != torch.bool:
+                raise ValueError(f"region must return bool [N] = {list(nodes.theta.shape)}, got {shape_of(where)}")
+        nodes.hold(where & (nodes.capacity > 0), nodes.per_node(self.temperature))
+
+
+class FixedSurface(Term):
+    """The surface of an obstacle that is held at a temperature (Dirichlet), to second order in dx.
+
+    Matter at a distance a < w from it conducts with the share s = 1 − (1 − a²/w²)³ of its conductivity, and exchanges
+    the heat κ (s'/a) (temperature − θ) per volume with the surface itself. That is what ∇ · (s κ ∇θ) lacks where θ is
+    linear, and on average over the layer for any θ. So the layer does not show in the temperature, which meets that of
+    the surface within 0.02 dx wherever it lies between the nodes, and within 0.1 dx where a gap of 0.5 dx is between it
+    and the matter. Matter inside the obstacle is held as at the surface.
+
+    Args:
+        region: an obstacle of `torch_mpm.boundaries`, wherever it moves.
+        temperature: [K]: a number, a tensor [] or [B], or a function of the time.
+
+    Raises:
+        ValueError: for a region that is no obstacle, or a temperature that is not finite.
+    """
+
+    WIDTH = 2.0
+    """w in dx: below 1.5 the rows of particles show."""
+
+    def __init__(self, region: Obstacle, temperature: Timed) -> None:
+        if not isinstance(region, Obstacle):
+            raise ValueError(f"region must be an obstacle of torch_mpm.boundaries, got {type(region).__name__}")
+        self.region, self.temperature = region, _checked("temperature", temperature)
+
+    def apply(self, nodes: HeatNodes) -> None:  # type: ignore[override]
+        width, state = self.WIDTH * nodes.blocks.grid.dx, nodes.state
+        distance = self.region.signed_distance(state.x, state.scene, nodes.time)
+        rest = 1 - (distance / width).clamp(0, 1) ** 2
+        nodes.add_layer(1 - rest**3, 6 / width**2 * rest**2, nodes.per_node(self.temperature))
+
+
+class Source(Term):
+    """Heat from inside the matter.
+
+    Args:
+        power: [W/m³] of present volume: a number, a tensor [], [B] or [P], or a function of the temperature [P].
+
+    Raises:
+        ValueError: for a power that is not finite.
+    """
+
+    def __init__(self, power: Value) -> None:
+        self.power = _check_value("power", power, "finite", lambda v: v == v)
+
+    def apply(self, nodes: HeatNodes) -> None:  # type: ignore[override]
+        power = evaluate("power", self.power, nodes.state) * nodes.volume
+        nodes.add_source(scatter(nodes.blocks, nodes.state.x, power[:, None])[:, 0])
+
+
+def _surface(surface: Any) -> Surface | FreeSurface:
+    if not isinstance(surface, (Surface, FreeSurface)):
+        raise TypeError(f"surface must be a Surface or a FreeSurface, got {shape_of(surface)}")
+    return surface
+
+
+def _at(value: Timed, time: float | Tensor) -> Number:
+    """A number or a tensor, given or what a function of the time returns."""
+    if isinstance(value, (float, Tensor)):
+        return value
+    value = value(time) if callable(value) else value
+    return value if isinstance(value, Tensor) else float(check_real(FROM_TIME, value, NUMBER_OR_TENSOR))
+
+
+def _checked(name: str, value: Timed, expected: str = "", holds: Callable[[Any], Any] = lambda v: v == v) -> Timed:
+    """A number or tensor of which all is finite and holds; a function of the time is not asked."""
+    expected = f"{expected} and finite" if expected else "finite"
+    if isinstance(value, Tensor):
+        if not bool((holds(value.detach()) & value.detach().isfinite()).all()):
+            raise ValueError(f"{name} must be {expected}, got {value}")
+        return value
+    if callable(value):
+        return value
+    kinds = "a number, a tensor or a function of the time"
+    return float(check_number(name, value, expected, lambda v: math.isfinite(v) and bool(holds(v)), kinds))

@@ -1,0 +1,420 @@
+"""Heat in the particles: one implicit step of conduction, and the temperature that moves with them.
+
+M ∂θ/∂t + H θ = h on the nodes (Gao et al. 2018, supplement, equation 10), solved by `heat_cg` for the increment d of
+the node temperatures θ_i = Σ_p N_i m_p C_p (θ_p + g_p · (x_i − x_p)) / M_i, with M_i = Σ_p N_i m_p C_p. Back on the
+particles
+
+    θ_p ← θ_p + Σ_i N_i [d_i + β_p (θ̄_i − θ_p)],
+    g_p ← g_p + D⁻¹ Σ_i N_i (d_i + β_p θ̄_i) (x_i − x_p) − β_p g_p,
+
+where θ̄_i is the average of the particles with weights β_p m_p C_p instead of m_p C_p. β = 0 is FLIP; β = 1 is APIC, or
+PIC without g. PIC and APIC diffuse by the transfer alone, PIC with a diffusion number of 0.25 in every step; FLIP keeps
+whatever noise the grid does not see. The hybrid has β_p = min(1, 4 r) with the diffusion number r = κ dt/(ρ C dx²):
+what the transfer smooths, conduction smooths too, and what does not conduct takes no part in it.
+
+Heat is conserved exactly. At rest and without heat from outside, a step is symmetric with the energy
+Σ_p m_p C_p (θ_p² + D |g_p|²) = Σ_pi N_i m_p C_p f_pi², f_pi = θ_p + g_p · (x_i − x_p), and has eigenvalues between 0
+and 1, for any β_p in [0, 1], κ, C and dt: conduction takes from what f and the nodes share, the blend from the rest,
+because variances about a node with the weights β_p m_p C_p are at most those with m_p C_p.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor, nn
+
+from ..boundaries import BoundaryList
+from ..boundaries.obstacles import _norm
+from ..capture import outside_transforms, without_transforms
+from ..errors import check_like, check_number
+from ..failures import Failures, Problem, raise_failures, unsolved_heat
+from ..grid import ActivationRecord, Blocks, Grid, check_grid
+from ..laws.material import _check_value
+from ..laws.thermal import LIQUID, determinant
+from ..ops import gather, heat_cg, scatter
+from ..ops.arguments import check_choice, per_particle
+from ..ops.heat import METHODS
+from ..parameters import Value, evaluate, needed_temperature, store
+from ..pause import paused
+from ..state import State, check_state
+from .boundaries import FixedSurface, HeatNodes
+
+TRANSFERS = ("hybrid", "apic", "flip", "pic")
+NEGLIGIBLE = 1e-12
+"""Residual [K] that a solve may always leave: 1e6 of them are a microkelvin, and far less underflows in float32."""
+SWEEPS = 4
+"""Of averaging the gradient that a state starts with: steps then conduct within 2% as with that of the exact field."""
+GRADIENT = "temperature_gradient"
+"""Key of `State.extra` under which the hybrid and APIC keep the temperature gradient g_p [P, D] [K/m]."""
+
+
+class HeatBoundary(Protocol):
+    """What adds to the nodes of a heat step; see `torch_mpm.heat_boundaries`."""
+
+    def apply(self, nodes: HeatNodes) -> None: ...
+
+
+class Heat(nn.Module):
+    """Conduction of heat in the particles, as part of a `Step` or alone, `state = heat(state, dt)`, in a body at rest.
+
+    Args:
+        grid: the lattice.
+        conductivity: κ [W/(m K)], not negative; a `Value`: a number, a tensor [], [1], [B] or [P], or a function of the
+            temperature [P] (a `Table`, a network, any torch code), taken at the beginning of the step.
+        specific_heat: C [J/(kg K)], positive; a `Value`.
+        boundaries: terms of `torch_mpm.heat_boundaries`; none for an insulated body.
+        transfer: "hybrid", "apic", "flip" or "pic"; see above. "hybrid" and "apic" keep the temperature gradient in
+            state.extra["temperature_gradient"] [P, D] [K/m]. Where the caller does not give it, it starts as that of
+            the nodes (`prepare`), so that the first steps conduct as later ones do.
+        melting_point: θ_m [K], relative to the reference; a `Value`, infinite for what does not melt.
+        latent_heat: L [J/kg], positive; a `Value`. With it the liquid mass fraction of each particle is kept in
+            state.extra["liquid"] [P]; a particle stays at the melting point while it takes up or gives off L
+            (enthalpy buffer, Stomakhin et al. 2014). It starts from the temperature where the caller does not give it.
+        plastic_heating: share of the energy dissipated by the law that becomes heat (Taylor and Quinney 1934), in
+            [0, 1].
+        reference: absolute temperature that state.temperature is relative to [K], finite; only radiation asks for it.
+            Temperatures are best kept relative to one in their middle: float32 then resolves small changes.
+        tolerance: residual of each solve relative to its first, in (0, 1). The error of the change in a step is at most
+            1 + 4 r times as large relative to it, with the largest diffusion number r, both as mass-weighted RMS.
+        max_iterations: of each solve.
+        method: of `heat_cg`: "cg", or "multigrid" for steps with diffusion numbers from about 1e3.
+
+    Differentiable with respect to temperatures, positions, masses, volumes, dt and all parameters.
+
+    Raises:
+        TypeError, ValueError: for a wrong argument. Values of tensors are checked here, and not again when they are
+            changed or trained; a function that returns a negative conductivity makes the scene fail, which `check`
+            reports.
+    """
+
+    conductivity: Any
+    specific_heat: Any
+    melting_point: Any
+    latent_heat: Any
+
+    def __init__(
+        self,
+        grid: Grid,
+        conductivity: Value,
+        specific_heat: Value,
+        boundaries: Sequence[HeatBoundary] = (),
+        transfer: str = "hybrid",
+        melting_point: Value | None = None,
+        latent_heat: Value | None = None,
+        plastic_heating: float = 0.0,
+        reference: float = 0.0,
+        tolerance: float = 1e-6,
+        max_iterations: int = 500,
+        method: str = "cg",
+    ) -> None:
+        super().__init__()
+        check_grid(grid)
+        if transfer not in TRANSFERS:
+            raise ValueError(f"transfer must be one of {sorted(TRANSFERS)}, got {transfer!r}")
+        if (melting_point is None) != (latent_heat is None):
+            raise ValueError("melting_point and latent_heat must be given together")
+        check_number("plastic_heating", plastic_heating, "between 0 and 1", lambda v: 0 <= v <= 1)
+        check_number("tolerance", tolerance, "between 0 and 1", lambda v: 0 < v < 1)
+        check_number("reference", reference)
+        check_number("max_iterations", max_iterations, "at least 1", lambda v: 1 <= v < math.inf)
+        check_choice("method", method, METHODS)
+        if method == "chebyshev" and any(isinstance(boundary, FixedSurface) for boundary in boundaries):
+            raise ValueError('method must be "cg" or "multigrid" where a boundary is a FixedSurface, got "chebyshev"')
+        self.grid, self.boundaries, self.transfer = grid, boundaries, transfer
+        self.plastic_heating, self.reference = float(plastic_heating), float(reference)
+        self.tolerance, self.max_iterations, self.method = float(tolerance), int(max_iterations), method
+        not_negative, positive = (lambda v: v >= 0), (lambda v: v > 0)
+        store(self, "conductivity", _check_value("conductivity", conductivity, "not negative", not_negative))
+        store(self, "specific_heat", _check_value("specific_heat", specific_heat, "positive", positive))
+        self.melts = latent_heat is not None
+        if melting_point is not None and latent_heat is not None:
+            _check_value("melting_point", melting_point, "a number", lambda v: v == v, infinite=True)
+            store(self, "melting_point", melting_point)
+            store(self, "latent_heat", _check_value("latent_heat", latent_heat, "positive", positive))
+        self._activations = ActivationRecord()
+        self.unsolved: Tensor | None = None
+        """Solves of each scene so far that missed their tolerance, int32 [B], and the largest residual [B] [K]."""
+        self.residual: Tensor | None = None
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        super().__setattr__(name, BoundaryList(value) if name == "boundaries" else value)
+
+    @property
+    def status(self) -> Tensor | None:
+        """Status of the activations of `forward`, as `Step.status`."""
+        return self._activations.status
+
+    @property
+    def affine(self) -> bool:
+        """Whether particles keep a temperature gradient."""
+        return self.transfer in ("hybrid", "apic")
+
+    def prepare(self, state: State) -> State:
+        """Give a state the fields that this needs and that it lacks.
+
+        The gradient is that of the node temperatures, to which the particles with their gradients are averaged again:
+        it approaches the one with which neighbours agree best about the nodes between them. Differentiable.
+
+        Raises:
+            ValueError: for a state without temperature, or fields of a wrong shape.
+        """
+        check_state(state)
+        temperature = needed_temperature(state)
+        extra = dict(state.extra)
+        if self.affine and GRADIENT not in extra:
+            extra[GRADIENT] = self._gradient(state, temperature)
+        if self.melts:
+            extra[LIQUID] = self._liquid(state)
+        check_like(GRADIENT, extra.get(GRADIENT), state.x, tuple(state.x.shape), "[P, D]")
+        check_like(LIQUID, extra.get(LIQUID), state.x, tuple(state.mass.shape), "[P]")
+        return state if extra.keys() == state.extra.keys() else state.replace(extra=extra)
+
+    def forward(self, state: State, dt: float | Tensor) -> State:
+        """The state of a body at rest one step later.
+
+        Args:
+            state: with a temperature.
+            dt: time step [s]: a number, or a tensor of shape [], [1] or [B]. Any size is stable. A scene with zero in a
+                tensor is paused, as by `Step.forward`.
+
+        Raises:
+            ValueError, TypeError: for a state without temperature, wrong shapes, dtypes or devices, or a number dt that
+                is not positive.
+        """
+        return paused(self._advanced, self._activations, self.prepare(state), dt, self.grid.scenes)
+
+    def _advanced(self, state: State, dt: float | Tensor) -> State:
+        """A prepared state one step later."""
+        blocks = self._activations.activate(self.grid, state.x, state.scene, state.ids)
+        return state.replace(**self.update(blocks, state, dt), time=state.time + dt)
+
+    def update(
+        self,
+        blocks: Blocks,
+        state: State,
+        dt: float | Tensor,
+        velocity_gradient: Tensor | None = None,
+        dissipated: Tensor | None = None,
+    ) -> dict[str, Any]:
+        """Fields of the state that a step changes: temperature, and extra where it has fields of this.
+
+        Args:
+            blocks: active blocks of the state's positions.
+            state: prepared.
+            dt: as for `forward`; what becomes of the particles of a paused scene has no meaning.
+            velocity_gradient: ∇v [P, D, D] [1/s] that the particles move with; None at rest.
+            dissipated: energy that the law turned into heat in this step, per rest volume [P] [J/m³], or None.
+        """
+        theta, gradient = needed_temperature(state), state.extra.get(GRADIENT) if self.affine else None
+        volume = present_volume(state)
+        step = dt if not isinstance(dt, Tensor) else per_particle(dt.reshape(-1).to(theta), state.scene, len(theta))
+        heat_capacity = evaluate("specific_heat", self.specific_heat, state) * state.mass
+        conductivity = evaluate("conductivity", self.conductivity, state)
+        if isinstance(conductivity, Tensor):
+            conductivity = torch.where(conductivity >= 0, conductivity, torch.nan)
+        conductance = conductivity * volume
+        number = step * conductance / (heat_capacity * self.grid.dx**2)
+        blend = self._blend(number, step, velocity_gradient)
+        nodes, smooth = self._to_nodes(blocks, state, volume, conductance, heat_capacity, theta, gradient, blend)
+        initial = nodes.theta
+        for boundary in self.boundaries:
+            boundary.apply(nodes)
+        if self.plastic_heating and dissipated is not None:
+            seconds = step.where(step > 0, 1) if isinstance(step, Tensor) else step
+            power = self.plastic_heating * dissipated * state.volume / seconds
+            nodes.add_source(scatter(blocks, state.x, power[:, None])[:, 0])
+        increment = self._solve(nodes, dt) - initial
+        theta, gradient = self._to_particles(nodes, increment, smooth, blend, theta, gradient)
+        extra = dict(state.extra)
+        if gradient is not None:
+            extra[GRADIENT] = _convected(gradient, velocity_gradient, step)
+        if self.melts:
+            theta, extra[LIQUID] = self._melt(state, theta, extra[LIQUID])
+        return {"temperature": theta, "extra": extra} if extra else {"temperature": theta}
+
+    def _blend(self, number: Tensor, step: float | Tensor, velocity_gradient: Tensor | None) -> float | Tensor:
+        """β_p: a number for all particles, or [P]."""
+        if self.transfer != "hybrid":
+            return 0.0 if self.transfer == "flip" else 1.0
+        rate = 4 * number
+        if velocity_gradient is not None:
+            # Where matter is strained, g_p of the particle is forgotten for that of the grid.
+            strain = 0.5 * (velocity_gradient + velocity_gradient.mT)
+            rate = rate + step * _norm(strain.flatten(1))
+        return rate.clamp(max=1)
+
+    def _to_nodes(
+        self,
+        blocks: Blocks,
+        state: State,
+        volume: Tensor,
+        conductance: Tensor,
+        heat_capacity: Tensor,
+        theta: Tensor,
+        gradient: Tensor | None,
+        blend: float | Tensor,
+    ) -> tuple[HeatNodes, Tensor]:
+        """Heat capacity and temperature θ_i of the nodes, and what particles are smoothed to, θ̄_i [N]."""
+        weights = heat_capacity[:, None]
+        if isinstance(blend, Tensor):
+            weights = torch.stack([heat_capacity, heat_capacity * blend], 1)
+        capacity, mean = _averages(blocks, state.x, weights, theta, gradient)
+        nodes = HeatNodes(blocks, state, volume, conductance, capacity[:, 0], mean[:, 0], self.reference)
+        return nodes, mean[:, -1]
+
+    def _solve(self, nodes: HeatNodes, dt: float | Tensor) -> Tensor:
+        """Temperature of the nodes at the end of the step [N]."""
+        conductance = nodes.left_conductance()
+        start = nodes.theta
+        if nodes.fixed is not None and nodes.held is not None:
+            start = torch.where(nodes.fixed, nodes.held, start)
+        boundary = nodes.source, nodes.exchange, nodes.fixed
+        solve = heat_cg(
+            nodes.blocks, nodes.state.x, conductance, nodes.capacity, start, dt, *boundary, tolerance=NEGLIGIBLE,
+            relative_tolerance=self.tolerance, max_iterations=self.max_iterations, method=self.method,
+        )  # fmt: skip
+        solved = solve.converged
+        if isinstance(dt, Tensor):
+            solved = solved | (dt.detach() == 0)  # a scene that is paused has nothing to solve
+        self._record(solved, solve.residual)
+        return start + solve.increment
+
+    def _to_particles(
+        self,
+        nodes: HeatNodes,
+        increment: Tensor,
+        smooth: Tensor,
+        blend: float | Tensor,
+        theta: Tensor,
+        gradient: Tensor | None,
+    ) -> tuple[Tensor, Tensor | None]:
+        """Temperature and gradient of the particles, as at the top of this file."""
+        varies = isinstance(blend, Tensor)
+        channels = torch.stack([increment, smooth], 1) if varies else (increment + blend * smooth)[:, None]
+        value, moment, _ = gather(
+            nodes.blocks, nodes.state.x, channels, moment=gradient is not None, moment_scale=self.grid.inverse_inertia
+        )
+
+        def blended(before: Tensor, change: Tensor) -> Tensor:
+            if isinstance(blend, Tensor):
+                return before + change[:, 0] + _column(blend, before) * (change[:, 1] - before)
+            return (1 - blend) * before + change[:, 0]
+
+        if gradient is None or moment is None:
+            return blended(theta, value), None
+        return blended(theta, value), blended(gradient, moment)
+
+    def _gradient(self, state: State, temperature: Tensor) -> Tensor:
+        """The temperature gradient of particles that know none [P, D] [K/m]; zero where they do not conduct.
+
+        Weights κ V are those of θ̄_i, β_p m_p C_p, in small steps: an insulator does not count for what touches it.
+        """
+        blocks = self.grid.activate(state.x, state.scene)
+        weights = (evaluate("conductivity", self.conductivity, state) * present_volume(state))[:, None]
+        gradient = None
+        for _ in range(SWEEPS):
+            _, mean = _averages(blocks, state.x, weights, temperature, gradient)
+            _, moment, _ = gather(blocks, state.x, mean, moment=True, moment_scale=self.grid.inverse_inertia)
+            assert moment is not None
+            gradient = moment[:, 0]
+        assert gradient is not None
+        return torch.where(weights > 0, gradient, 0)
+
+    def _liquid(self, state: State) -> Tensor:
+        """Liquid fraction [P]: that of the state, or by its temperature."""
+        if LIQUID in state.extra:
+            return state.extra[LIQUID]
+        temperature = needed_temperature(state)
+        return (temperature.detach() > evaluate("melting_point", self.melting_point, state)).to(temperature)
+
+    def _melt(self, state: State, theta: Tensor, liquid: Tensor) -> tuple[Tensor, Tensor]:
+        """Temperature and liquid fraction with the excess over the melting point in the latent heat, or out of it."""
+        melting_point = evaluate("melting_point", self.melting_point, state)
+        ratio = evaluate("specific_heat", self.specific_heat, state) / evaluate("latent_heat", self.latent_heat, state)
+        fraction = (liquid + ratio * (theta - melting_point)).clamp(0, 1)
+        return theta - (fraction - liquid) / ratio, fraction
+
+    def heat_content(self, state: State) -> Tensor:
+        """m (C θ + L f) of each particle [P] [J], relative to the solid at the reference temperature.
+
+        With a specific heat that depends on temperature this is no energy.
+        """
+        content = evaluate("specific_heat", self.specific_heat, state) * needed_temperature(state)
+        if self.melts:
+            content = content + evaluate("latent_heat", self.latent_heat, state) * self._liquid(state)
+        return state.mass * content
+
+    @torch.no_grad()
+    def _record(self, converged: Tensor, residual: Tensor) -> None:
+        """Keep what `check` reports, on the device."""
+        converged, residual = without_transforms(converged), without_transforms(residual)
+        with outside_transforms():
+            if self.unsolved is None or self.residual is None or self.unsolved.device != converged.device:
+                with torch.inference_mode(False):
+                    self.unsolved = torch.zeros(converged.shape, dtype=torch.int32, device=converged.device)
+                    self.residual = torch.zeros(residual.shape, dtype=torch.float64, device=residual.device)
+            self.unsolved += ~converged
+            self.residual.copy_(torch.where(converged, self.residual, torch.maximum(self.residual, residual.double())))
+
+    def problems(self) -> dict[str, Problem]:
+        """What became of the solves so far, by kind as in `Failures`, without synchronising."""
+        if self.unsolved is None or self.residual is None:
+            return {}
+        return unsolved_heat(self.unsolved, self.residual, self.max_iterations)
+
+    def check(self) -> None:
+        """Read what became of the solves so far; synchronises with the device.
+
+        Raises:
+            SimulationError: for scenes in which a solve missed its tolerance, or data were not finite; for particles
+                that left the grid or are not finite; for entries of a tensor dt that were negative or NaN.
+            GridOverflowError: if more blocks were active than the grid has room for, and nothing else is wrong.
+        """
+        if self.unsolved is None:
+            return
+        problems = self._activations.problems(self.grid) | self.problems()
+        raise_failures(Failures.of(problems, self.grid.scenes), self._activations.all(), self.grid)
+
+    def reset(self) -> None:
+        """Forget what became of the solves so far."""
+        self._activations.reset()
+        for kept in (self.unsolved, self.residual):
+            if kept is not None:  # and CUDA graphs may write to it
+                kept.zero_()
+
+
+def _averages(
+    blocks: Blocks, x: Tensor, weights: Tensor, theta: Tensor, gradient: Tensor | None
+) -> tuple[Tensor, Tensor]:
+    """Σ_p N_i w_p and the averages Σ_p N_i w_p (θ_p + g_p · (x_i − x_p)) / Σ_p N_i w_p of weights [P, K], [N, K]."""
+    moment = None
+    if gradient is not None:
+        moment = nn.functional.pad(weights[:, :, None] * gradient[:, None], (0, 0, 0, weights.shape[1]))
+    total, weight = scatter(blocks, x, torch.cat([weights * theta[:, None], weights], 1), moment).chunk(2, 1)
+    full = weight > 0
+    return weight, torch.where(full, total / torch.where(full, weight, 1), 0)
+
+
+def _column(values: Tensor, like: Tensor) -> Tensor:
+    """Values [P] as factors of a tensor [P, ...]."""
+    return values.reshape([-1] + [1] * (like.dim() - 1))
+
+
+def present_volume(state: State) -> Tensor:
+    """Volume of the particles now [P] [m³]."""
+    if state.J is not None:
+        return state.volume * state.J
+    return state.volume if state.F is None else state.volume * determinant(state.F)
+
+
+def _convected(gradient: Tensor, velocity_gradient: Tensor | None, step: float | Tensor) -> Tensor:
+    """∇θ of matter that moved by 1 + dt ∇v: its inverse transpose times the gradient, to second order in dt."""
+    if velocity_gradient is None:
+        return gradient
+    rate = velocity_gradient.mT * (step[:, None, None] if isinstance(step, Tensor) else step)
+    first = (rate @ gradient[..., None])[..., 0]
+    return gradient - first + (rate @ first[..., None])[..., 0]

@@ -1,0 +1,178 @@
+"""Sand: Drucker-Prager plasticity with the quartic energies of Gao et al. 2018 or that of Klár et al. 2016."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from ..capture import Kept
+from ..errors import check_flag, check_number
+from ..ops.sand import ANGLE, ReturnMap, quartic_energy, quartic_return_map, quartic_stiffness
+from ..reference.material import per_particle
+from ..reference.sand import ENERGIES, friction_alpha
+from .material import SolidLaw, Value, _check_value
+
+if TYPE_CHECKING:
+    from ..state import State
+
+
+VOLUME, HARDENING = "volume_correction", "hardening"
+"""Keys of `State.extra` under which a law keeps v_c and q [P]."""
+
+
+def _kept(name: str, state: State) -> Tensor:
+    """A field of `State.extra`, zero at first."""
+    value = state.extra.get(name)
+    return torch.zeros_like(state.mass) if value is None else value
+
+
+class QuarticSand(SolidLaw):
+    """Dry sand: each step returns F to a Drucker-Prager cone in the space of Hencky strains; see `quartic_return_map`.
+
+    Args:
+        E: Young's modulus [Pa], not negative, with nu; or
+        nu: Poisson's ratio in (−1, 0.5).
+        mu, lam: Lamé parameters [Pa]. The quartic energies equal the quadratic one at a strain of 0.4 and are softer
+            below.
+        friction_angle: [rad], in [0, π/2); 30° if None.
+        energy: "unilateral", "full", "hencky" or "mixed".
+        apex: "zero" or, with the unilateral energy, "keep".
+        smallest_strain: strain that the stiffness, and so `Step.stable_dt`, counts on at least. The quartic energies
+            have no stiffness at rest, so that without it the time step of sand at rest would be unlimited.
+        flow: "radial" or "exact". The radial flow mobilises less friction in plane strain: at a friction angle of 30°
+            and ν = 0.3 a Mohr-Coulomb angle of 32° (full), 31° (unilateral) or 29° (mixed), against 44°.
+        cohesion: Hencky strain that the sand bears on every axis, not negative. Beyond it, it flows under the tension
+            of that strain, or tears where there is a volume correction.
+        volume_correction: whether sand that was torn apart remembers the volume that it lost, and has neither stress
+            nor cohesion until that gap is closed (Tampubolon et al. 2017); in state.extra["volume_correction"] [P].
+        hardening: h0, h1, h2, h3 of the friction angle φ = h0 + (h1 q − h3) exp(−h2 q), each like mu, with φ in
+            [0, π/2) and h0, h1, h3 in [rad], in the place of friction_angle; Klár et al. 2016 use 35°, 9°, 0.2, 10°.
+            q is the sum of plastic multipliers, kept in state.extra["hardening"] [P].
+
+    With `dissipation` set, `update` returns "dissipated", the energy that plastic flow and tearing turn into heat [P]
+    [J/m³]; see `ReturnMap`. Hardening stores none.
+
+    Raises:
+        ValueError: for a value outside its range or an unknown option. Values are checked here, and not again when a
+            tensor is changed or trained.
+    """
+
+    friction_angle: Any  # numbers, buffers, nn.Parameters or functions of temperature
+    cohesion: Any
+
+    def __init__(
+        self,
+        E: Value | None = None,
+        nu: Value | None = None,
+        mu: Value | None = None,
+        lam: Value | None = None,
+        friction_angle: Value | None = None,
+        energy: str = "unilateral",
+        apex: str = "zero",
+        smallest_strain: float = 0.05,
+        flow: str = "radial",
+        cohesion: Value | None = None,
+        volume_correction: bool = False,
+        hardening: Sequence[Value] | None = None,
+    ) -> None:
+        super().__init__(E, nu, mu, lam)
+        if energy not in ENERGIES:
+            raise ValueError(f"energy must be one of {sorted(ENERGIES)}, got {energy!r}")
+        if apex not in ("zero", "keep") or (apex == "keep" and energy != "unilateral"):
+            raise ValueError(f"apex must be 'zero' or, with energy='unilateral', 'keep', got {apex!r} with {energy!r}")
+        check_number("smallest_strain", smallest_strain, "finite and not negative", lambda v: 0 <= v < math.inf)
+        if flow not in ("radial", "exact"):
+            raise ValueError(f"flow must be 'radial' or 'exact', got {flow!r}")
+        self._set_friction(friction_angle, hardening)
+        self.cohesive = cohesion is not None
+        if cohesion is not None:
+            self._store("cohesion", _check_value("cohesion", cohesion, "finite and not negative", lambda v: v >= 0))
+        self.energy_form, self.apex, self.smallest_strain = energy, apex, float(smallest_strain)
+        self.flow, self.volume_correction = flow, check_flag("volume_correction", volume_correction)
+        self.extra_fields = tuple(
+            name for name, used in ((VOLUME, volume_correction), (HARDENING, hardening is not None)) if used
+        )
+        self._kept_slope = Kept()
+
+    def _set_friction(self, angle: Value | None, hardening: Sequence[Value] | None) -> None:
+        expected: tuple[str, Callable[[Any], Any]] = (ANGLE, lambda v: (v >= 0) & (v < math.pi / 2))
+        self._friction = ("friction_angle",) if hardening is None else ("h0", "h1", "h2", "h3")
+        if hardening is None:
+            values: Sequence[Value] = (math.pi / 6 if angle is None else angle,)
+        elif angle is not None or len(hardening) != 4:
+            raise ValueError("hardening must be h0, h1, h2 and h3, in the place of friction_angle")
+        else:
+            values = hardening
+        for name, value in zip(self._friction, values, strict=True):
+            limits = ("finite and not negative", lambda v: v >= 0) if name in ("h1", "h2") else expected
+            self._store(name, _check_value(name, value, *limits))
+        first, last = values[0], values[-1]
+        if isinstance(first, float) and isinstance(last, float) and last > first:
+            raise ValueError(f"h3 must not be above h0 (in radians), got {last} and {first}")
+
+    def values(self) -> Sequence[Value]:
+        """μ and λ [Pa], the friction angle [rad] or the constants of its hardening, and the cohesion if given."""
+        cohesion = (self.cohesion,) if self.cohesive else ()
+        return *super().values(), *(getattr(self, name) for name in self._friction), *cohesion
+
+    def return_map(self, state: State, details: bool = False) -> ReturnMap:
+        """The whole result of the return map: branches, convergence and, with details, multiplier and dissipation."""
+        F, (mu, lam, *friction) = self._arguments(state)
+        cohesion = friction.pop() if self.cohesive else None
+        return quartic_return_map(
+            F,
+            mu,
+            lam,
+            alpha=self._slope(self._friction_angle(friction, state), F.shape[1]),
+            scene=state.scene,
+            energy=self.energy_form,
+            apex=self.apex,
+            details=details,
+            flow=self.flow,
+            cohesion=cohesion,
+            volume_correction=_kept(VOLUME, state) if self.volume_correction else None,
+        )
+
+    def _friction_angle(self, constants: Sequence[Tensor], state: State) -> Tensor:
+        """As it is given, or [P] after hardening (Klár et al. 2016, equation 29)."""
+        if HARDENING not in self.extra_fields:
+            return constants[0]
+        q = _kept(HARDENING, state)
+        h0, h1, h2, h3 = (per_particle(h, state.scene, len(q)) for h in constants)
+        return h0 + (h1 * q - h3) * (-h2 * q).exp()
+
+    def _slope(self, angle: Tensor, dim: int) -> Tensor:
+        """α of the friction angle, kept from call to call while that has not changed and requires no gradient."""
+        if torch.compiler.is_compiling() or angle.requires_grad or HARDENING in self.extra_fields:
+            return friction_alpha(angle, dim)
+        key = (angle, angle._version, dim)
+        return self._kept_slope.get(key, lambda: friction_alpha(angle, dim), angle)
+
+    def update(self, state: State) -> tuple[dict[str, Tensor], Tensor]:
+        result = self.return_map(state, details=self.dissipation or HARDENING in self.extra_fields)
+        fields: dict[str, Any] = {"F": result.F}
+        if self.volume_correction:
+            fields[VOLUME] = result.volume_correction
+        if HARDENING in self.extra_fields and result.multiplier is not None:
+            fields[HARDENING] = _kept(HARDENING, state) + result.multiplier
+        if self.dissipation:
+            fields["dissipated"] = result.dissipated
+        return fields, result.stress
+
+    def energy_density(self, state: State) -> Tensor:
+        """Elastic energy per rest volume [P] [J/m³] of the projected F."""
+        _, (mu, lam, *_) = self._arguments(state)
+        return quartic_energy(self.return_map(state).F, mu, lam, state.scene, self.energy_form)
+
+    def stiffness(self, state: State) -> Tensor:
+        """Upper bound of the elastic tangent modulus [P] [Pa]."""
+        F, (mu, lam, *_) = self._arguments(state)
+        return quartic_stiffness(F, mu, lam, state.scene, self.energy_form, self.smallest_strain)
+
+    def wave_modulus(self, state: State) -> Tensor:
+        """Upper bound of rest density times squared wave speed [P] [Pa]: `stiffness`."""
+        return self.stiffness(state)
