@@ -6,7 +6,7 @@ import argparse
 import json
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -116,7 +116,7 @@ def _run(options: argparse.Namespace) -> None:
     files = {"trajectory": options.out / "trajectory.h5"}
     for name, make in _outputs(scene, options):
         since = time.perf_counter()
-        files[name] = make()
+        files |= make()
         seconds[name] = time.perf_counter() - since
     seconds["total"] = time.perf_counter() - begin
     _write_summary(options.out, summary)
@@ -138,30 +138,38 @@ def _require_outputs(scene: Any) -> None:
         meshio_module()
 
 
-def _outputs(scene: Any, options: argparse.Namespace) -> list[tuple[str, Any]]:
+def _outputs(scene: Any, options: argparse.Namespace) -> list[tuple[str, Callable[[], dict[str, Path]]]]:
+    """What the scene asks for beside its trajectory: names, and functions that make it and return where it is."""
     from .data import export
 
-    outputs: list[tuple[str, Any]] = []
+    outputs: list[tuple[str, Callable[[], dict[str, Path]]]] = []
     if scene.render is not None:
         outputs.append(("pictures", lambda: _draw(options.out, scene, options.quiet)))
     if scene.output.vtk:
-        outputs.append(("VTK", lambda: export.export_vtk(options.out)))
+        outputs.append(("VTK", lambda: {"VTK": export.export_vtk(options.out)}))
     if scene.output.ply:
-        outputs.append(("PLY", lambda: export.export_ply(options.out)))
+        outputs.append(("PLY", lambda: {"PLY": export.export_ply(options.out)}))
     return outputs
 
 
-def _draw(folder: Path, scene: Any, quiet: bool) -> Path:
+def _draw(folder: Path, scene: Any, quiet: bool) -> dict[str, Path]:
+    """Draw a run; returns where its pictures and its video are."""
     from .scene.pictures import draw
 
-    if quiet:
-        return draw(folder, scene)[-1]
+    made = draw(folder, scene) if quiet else _draw_with_a_bar(folder, scene)
+    video = {"video": made[-1]} if made[-1].suffix == ".mp4" else {}
+    return {"pictures": made[0].parent, **video}
+
+
+def _draw_with_a_bar(folder: Path, scene: Any) -> list[Path]:
+    from .scene.pictures import draw
+
     with _tqdm()(desc="pictures", unit="frame", total=scene.frames + 1) as bar:
 
         def progress(k: int, frames: int) -> None:
             bar.update(k + 1 - bar.n)
 
-        return draw(folder, scene, progress)[-1]
+        return draw(folder, scene, progress)
 
 
 def _check(options: argparse.Namespace) -> None:
@@ -197,7 +205,8 @@ def _schema(options: argparse.Namespace) -> None:
 def _render(options: argparse.Namespace) -> None:
     from .scene.folder import load_run
 
-    print(_draw(options.run, load_run(options.run, options.overrides), quiet=False))
+    for path in _draw(options.run, load_run(options.run, options.overrides), quiet=False).values():
+        print(path)
 
 
 def _export(options: argparse.Namespace) -> None:

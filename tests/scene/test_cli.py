@@ -58,6 +58,9 @@ def test_pictures_and_video(scene, tmp_path, capsys):
     assert [p.name for p in pictures] == ["00000.png", "00001.png", "00002.png"]
     assert (read_png(pictures[0]) != read_png(pictures[2])).any()
     assert (tmp_path / "out" / "video.mp4").read_bytes()[4:8] == b"ftyp"
+    told = [line.split() for line in capsys.readouterr().out.splitlines()]
+    for name, place in {"trajectory": "trajectory.h5", "pictures": "frames", "video": "video.mp4"}.items():
+        assert [name, str(tmp_path / "out" / place)] in told
     assert main(["render", str(tmp_path / "out"), "--set", "render.color_by=material"]) == 0
     assert capsys.readouterr().out.strip().endswith("video.mp4")
 
