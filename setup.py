@@ -113,7 +113,8 @@ def nvcc() -> str | None:
 
 
 def cuda_archs() -> list[str]:
-    return [arch.strip() for arch in os.environ.get("TORCH_MPM_CUDA_ARCHS", "8.0;9.0").split(";") if arch.strip()]
+    wanted = os.environ.get("TORCH_MPM_CUDA_ARCHS") or "8.0;9.0"
+    return [arch.strip() for arch in wanted.split(";") if arch.strip()]
 
 
 def gencode() -> list[str]:
