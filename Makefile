@@ -75,11 +75,11 @@ PRELOAD = $(foreach name,libasan.so libstdc++.so.6,$(shell $(or $(CXX),g++) -pri
 sanitize: $(STAMP)
 	TORCH_MPM_SANITIZE=address,undefined TORCH_MPM_CUDA=0 $(PY) setup.py -q build --build-lib $(SANITIZED)
 	LD_PRELOAD='$(PRELOAD)' ASAN_OPTIONS=detect_leaks=0 UBSAN_OPTIONS=halt_on_error=1:print_stacktrace=1 \
-	  PYTHONPATH=$(CURDIR)/$(SANITIZED):$(CURDIR) $(VENV)/bin/pytest $(QUICK)
+	  TORCH_MPM_CUDA=0 PYTHONPATH=$(CURDIR)/$(SANITIZED):$(CURDIR) $(VENV)/bin/pytest $(QUICK)
 
 # On a GPU machine whose Python already has torch, ninja and pytest: no virtual environment and no network.
 gpu:
-	TORCH_MPM_CUDA=1 $(PYTHON) setup.py -q build_ext --inplace
+	TORCH_MPM_CUDA=1 TORCH_MPM_ISA_LEVELS=all $(PYTHON) setup.py -q build_ext --inplace
 	PYTHONPATH=. $(PYTHON) -m benchmarks.tests --processes $(shell nproc)
 	PYTHONPATH=. $(PYTHON) -m benchmarks --device cuda
 

@@ -272,7 +272,6 @@ def test_errors_can_be_sent_between_processes():
 
 
 @pytest.mark.cuda
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 def test_failures_need_no_synchronisation_and_see_replays():
     """Scenes that fail in different replays of a CUDA graph, and a dt that becomes negative, are all named."""
     step, state = batch(3, "cuda")

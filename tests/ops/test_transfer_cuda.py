@@ -9,8 +9,7 @@ from torch import Tensor
 
 import torch_mpm as mpm
 
-cuda = pytest.mark.skipif(not torch.cuda.is_available() or mpm._library.cuda_error is not None, reason="needs CUDA")
-pytestmark = cuda
+pytestmark = pytest.mark.cuda
 
 
 def uneven_particles(dim: int, kernel: str, **options: object) -> Particles:
