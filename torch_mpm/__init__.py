@@ -43,7 +43,7 @@ from .state import State
 from .step import Step, rollout
 
 if TYPE_CHECKING:
-    from ..scene import Scene as Scene
+    from .scene import Scene as Scene
 
 __all__ = [
     "SDF",
@@ -103,7 +103,7 @@ __all__ = [
 def __getattr__(name: str) -> Any:
     """`Scene` needs the extra `scene`, so it is imported where it is used."""
     if name == "Scene":
-        from ..scene import Scene
+        from .scene import Scene
 
         return Scene
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
