@@ -1,7 +1,7 @@
 """The tables and figures of the documents, from the result files: `python -m benchmarks.report [--write]`.
 
 Prints the tables; with --write, puts them between the lines `<!-- benchmarks -->` and `<!-- /benchmarks -->` of
-README.md, which has the sections of OVERVIEW, and of docs/measured.md, which has the others.
+docs/measured.md, which has all of them, and of README.md, which has one of speed and one of accuracy.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import argparse
 import json
 import re
-from collections.abc import Iterable
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +28,12 @@ BOTH = ("step, forward and backward", "step, forward and backward, CUDA graph")
 
 
 def speed(results: list[dict[str, Any]]) -> str:
+    """Whole steps beside the peers, with where they were measured."""
+    notes = [f"- {common.describe(result['environment'])}" for result in results]
+    return "\n".join([speed_table(results), "", *notes])
+
+
+def speed_table(results: list[dict[str, Any]]) -> str:
     """Whole steps beside the peers, and the rates of the transfers."""
     rows = []
     for result in results:
@@ -52,13 +58,12 @@ def speed(results: list[dict[str, Any]]) -> str:
         "device", "particles", "step [ms]", "Warp's step", "Taichi's step", "with backward", "P2G [G/s]", "G2P [G/s]",
         "float32 error",
     )  # fmt: skip
-    notes = [f"- {common.describe(result['environment'])}" for result in results]
     intro = (
         "One explicit neo-Hookean step, 3-D, float32, quadratic kernel, 8 particles per cell, everything included. "
-        "Columns with x are multiples of its time in the same run; rates are G particles/s; the error is the largest "
-        "of P2G, G2P and their gradients against float64."
+        "Columns with x are multiples of its time in the same run; rates are in billions of particles per second; the "
+        "error is the largest of P2G, G2P and their gradients against float64."
     )
-    return "\n".join([intro, "", common.table(header, rows), "", *notes])
+    return "\n".join([intro, "", common.table(header, rows)])
 
 
 def _ratio(value: float | None, base: float | None) -> str | None:
@@ -366,7 +371,82 @@ def heat_speed(results: list[dict[str, Any]]) -> str:
     return "\n\n".join(parts)
 
 
-OVERVIEW = ("Speed", "Small matrices and sand", "Speed of the heat solve", "Convergence", "Heat", "Stability")
+def accuracy(directory: Path) -> str:
+    """One error of each part of the library, as far as there are results."""
+    parts = {
+        "convergence": _motion_errors,
+        "ritter": _front_errors,
+        "heat": _conduction_errors,
+        "precision": _rounding_errors,
+        "svd_accuracy": _decomposition_errors,
+        "sand_accuracy": _return_map_errors,
+        "sand_gradient": _gradient_errors,
+    }
+    rows = []
+    for name, part in parts.items():
+        if (file := directory / f"{name}.json").exists():
+            result = json.loads(file.read_text())
+            for *row, seconds in part(result):
+                rows.append([*row, seconds and f"{seconds:.3g} s, {result['environment']['device']}"])
+    header = ("what", "compared with", "error", "order in dx", "run time")
+    intro = (
+        "Errors are relative unless said otherwise: of a solution those at the finest lattice, of a function the "
+        "largest found."
+    )
+    return "\n".join([intro, "", common.table(header, rows)])
+
+
+Row = tuple[str, str, Any, str | None, float | None]
+
+
+def _motion_errors(result: dict[str, Any]) -> Iterator[Row]:
+    for case in result["cases"]:
+        if case["name"].endswith("cubic, mls, mirror walls"):
+            last, order = case["rows"][-1], f"{case['order']['displacement']:.2f}"
+            what = f"motion of an elastic body, {case['dim']}-D, {last['n']} cells"
+            yield what, "manufactured solution", last["displacement"], order, last["seconds"]
+
+
+def _front_errors(result: dict[str, Any]) -> Iterator[Row]:
+    (case,) = (case for case in result["cases"] if case["name"] == "h0/dx = 32")
+    late = [row["error"] for row in case["rows"] if row["time"] >= result["judged"] - 1e-9]
+    worst = max(abs(e) for row in late for level, e in row.items() if float(level) >= 0.02 and e is not None)
+    yield "dam break, fronts of 2% of the depth and more", "Ritter 1892", worst, None, case["seconds"]
+
+
+def _conduction_errors(result: dict[str, Any]) -> Iterator[Row]:
+    for problem in ("heated bar", "melting front, St = 0.5"):
+        for case in result["cases"]:
+            if (case["problem"], case["kernel"], case["transfer"]) == (problem, "quadratic", "hybrid"):
+                last = case["rows"][-1]
+                yield problem, "exact solution", last["error"], f"{case['order']:.1f}", last["seconds"]
+
+
+def _rounding_errors(result: dict[str, Any]) -> Iterator[Row]:
+    lattice = result["lattices"][-1]
+    what = f"position after {lattice['steps']} steps in float32, in units of dx"
+    yield what, "float64", lattice["rows"][-1]["position"], None, lattice["float32_seconds"]
+
+
+def _decomposition_errors(result: dict[str, Any]) -> Iterator[Row]:
+    worst = max(row["errors"]["svd3"]["product"][1] for row in result["rows"])
+    yield "`svd3` in float32: U diag(σ) Vᵀ", "the matrix", worst, None, None
+
+
+def _return_map_errors(result: dict[str, Any]) -> Iterator[Row]:
+    worst = max(row["float32"]["error over condition"][2] for row in result["rows"])
+    yield "return map of sand in float32, over the condition number", "extended precision", worst, None, None
+
+
+def _gradient_errors(result: dict[str, Any]) -> Iterator[Row]:
+    worst = max(case["largest"] for row in result["rows"] for case in row["gaps"])
+    yield "gradients of the return map in float32", "float64", worst, None, None
+
+
+def overview(directory: Path) -> str:
+    """The two tables of the README."""
+    results = [json.loads(file.read_text()) for file in sorted(directory.glob("speed_*.json"))]
+    return "\n\n".join([*(["### Speed", speed_table(results)] if results else []), "### Accuracy", accuracy(directory)])
 
 
 def sections(directory: Path) -> dict[str, str]:
@@ -401,9 +481,10 @@ def sections(directory: Path) -> dict[str, str]:
     return found
 
 
-def summary(found: dict[str, str], titles: Iterable[str]) -> str:
-    """The sections of these titles, as far as found, one after the other."""
-    return "\n\n".join(f"### {title}\n\n{found[title]}" for title in titles if title in found)
+def documents(directory: Path) -> dict[Path, str]:
+    """The text between the marks of each document."""
+    details = "\n\n".join(f"### {title}\n\n{text}" for title, text in sections(directory).items())
+    return {README: overview(directory), MEASURED: details.replace("](benchmarks/", "](../benchmarks/")}
 
 
 def insert(text: str, tables: str) -> str:
@@ -423,12 +504,9 @@ def main() -> None:
     parser.add_argument("--results", type=Path, default=common.RESULTS)
     parser.add_argument("--write", action="store_true", help="update README.md and docs/measured.md")
     arguments = parser.parse_args()
-    found = sections(arguments.results)
-    overview, details = summary(found, OVERVIEW), summary(found, [t for t in found if t not in OVERVIEW])
-    print(overview, details, sep="\n\n")
-    if arguments.write:
-        details = details.replace("](benchmarks/", "](../benchmarks/")
-        for document, tables in ((README, overview), (MEASURED, details)):
+    for document, tables in documents(arguments.results).items():
+        print(tables)
+        if arguments.write:
             document.write_text(insert(document.read_text(), tables))
 
 
