@@ -129,7 +129,7 @@ def test_particles_without_a_scene_count_in_the_totals(device):
     scene[[3, 8]], scene[5] = -1, 2
     step(state.replace(scene=scene), 1e-3)
     assert not step.failures().failed.any()
-    with pytest.raises(mpm.SimulationError, match="3 particles have a scene that is not among the 2 of the grid"):
+    with pytest.raises(mpm.SimulationError, match="3 particles have a scene id outside the 2 scenes of the grid"):
         step.check()
 
 

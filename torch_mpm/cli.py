@@ -51,7 +51,7 @@ def _parser() -> argparse.ArgumentParser:
     run = commands.add_parser("run", help="simulate a scene file")
     _scene_arguments(run)
     run.add_argument("-o", "--out", required=True, type=Path, help="folder for the results")
-    run.add_argument("--resume", action="store_true", help="go on with an unfinished run")
+    run.add_argument("--resume", action="store_true", help="continue an unfinished run")
     run.add_argument("--quiet", action="store_true", help="no progress bar")
     run.set_defaults(command=_run)
 
@@ -60,7 +60,7 @@ def _parser() -> argparse.ArgumentParser:
     check.set_defaults(command=_check)
 
     info = commands.add_parser(
-        "info", help="what a scene uses and takes; without a scene, what this installation can do"
+        "info", help="what a scene uses and how long it takes; without a scene, what this installation can do"
     )
     _scene_arguments(info, optional=True)
     info.set_defaults(command=_info)
@@ -68,12 +68,12 @@ def _parser() -> argparse.ArgumentParser:
     schema = commands.add_parser("schema", help="print the JSON schema of scene files, for editors")
     schema.set_defaults(command=_schema)
 
-    render = commands.add_parser("render", help="draw the pictures and the video of a run again")
+    render = commands.add_parser("render", help="redraw the pictures and the video of a run")
     render.add_argument("run", type=Path, help="folder of a run")
     _set_argument(render, "render.color_by=stress")
     render.set_defaults(command=_render)
 
-    export = commands.add_parser("export", help="write a run for other programs")
+    export = commands.add_parser("export", help="convert a run for other programs")
     export.add_argument("run", type=Path, help="folder of a run")
     export.add_argument("--vtk", action="store_true", help="VTK files for ParaView, in DIR/vtk")
     export.add_argument("--ply", action="store_true", help="PLY point clouds, in DIR/ply")

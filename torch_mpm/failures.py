@@ -178,12 +178,12 @@ def unsolved_heat(unsolved: Tensor, residual: Tensor, iterations: int) -> dict[s
     return {
         "heat_data": Problem(
             torch.where(without, unsolved, 0),
-            "solves of heat had no result",
+            "heat solves had no result",
             "a temperature, a conductivity or a boundary is not finite, or a conductivity is negative",
         ),
         "heat": Problem(
             torch.where(without, 0, unsolved),
-            "solves of heat missed their tolerance",
+            "heat solves missed their tolerance",
             "reduce dt, or raise max_iterations or tolerance",
             size=residual,
             size_in_words=f"a residual of {{:.3g}} K was left after {iterations} iterations",
@@ -207,7 +207,7 @@ def raise_failures(failures: Failures, statuses: Iterable[Tensor], grid: Grid) -
                 outside, lost = outside - row[1], lost - row[3]
         if outside + lost > 0:
             sentences.append(
-                f"{outside + lost} particles have a scene that is not among the {grid.scenes} of the grid, first at "
+                f"{outside + lost} particles have a scene id outside the {grid.scenes} scenes of the grid, first at "
                 f"step {step}: give each particle a scene from 0 to {grid.scenes - 1}"
             )
         if grid.capacity is not None and peak > grid.capacity:

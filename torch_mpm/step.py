@@ -127,7 +127,7 @@ class Step(TensorModule):
             NotImplementedError: always.
         """
         raise NotImplementedError(
-            "a backward hook of a Step would never be called, because a State is no tensor: hook its law "
+            "a backward hook of a Step would never be called, because a State is not a tensor: hook its law "
             "(step.law.register_full_backward_hook), or a tensor of the state (state.x.register_hook)"
         )
 

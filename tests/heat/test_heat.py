@@ -441,7 +441,7 @@ def test_nan_stays_in_its_scene_and_is_reported(device):
     end = mpm.rollout(heat, both, 2, 1e-2)
     expected = mpm.rollout(mpm.Heat(grid_around(), 1.0, 1.0), two, 2, 1e-2)
     torch.testing.assert_close(end.temperature[end.scene == 1], expected.temperature)
-    with pytest.raises(mpm.SimulationError, match=r"2 solves of heat had no result: 2 in scene 0: .*not finite"):
+    with pytest.raises(mpm.SimulationError, match=r"2 heat solves had no result: 2 in scene 0: .*not finite"):
         heat.check()
     heat.reset()
     heat.check()

@@ -133,6 +133,6 @@ def test_ctrl_c_ends_after_a_whole_frame(tmp_path):
             pass
     process.send_signal(signal.SIGINT)
     _, errors = process.communicate()
-    assert process.returncode == 130 and "add --resume to go on" in errors
+    assert process.returncode == 130 and "add --resume to continue" in errors
     with Trajectory(tmp_path / "out") as read:
         assert 2 < len(read) < 30001 and f"stopped after frame {len(read) - 1} of 30000" in errors

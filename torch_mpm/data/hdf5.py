@@ -120,7 +120,7 @@ def check_seal(path: Path, remedy: str) -> None:
         length, digest, magic = FOOTER.unpack(footer) if len(footer) == FOOTER.size else (0, b"", b"")
         end = size - FOOTER.size - length
         if magic != MAGIC or end < 0:
-            raise DamagedFileError(path, "is cut off, or no file of this version of torch_mpm", remedy)
+            raise DamagedFileError(path, "is truncated, or not a file of this version of torch_mpm", remedy)
         handle.seek(end)
         text = handle.read(length)
         try:
@@ -129,7 +129,7 @@ def check_seal(path: Path, remedy: str) -> None:
             extents = [(-1, 0)]
         inside = all(0 <= offset <= offset + count <= end for offset, count in extents)
         if not inside or sum(count for _, count in extents) > end or _digest(handle, extents, text) != digest:
-            raise DamagedFileError(path, "is damaged, its checksum is wrong", remedy)
+            raise DamagedFileError(path, "is damaged: its checksum is wrong", remedy)
 
 
 def _digest(handle: BinaryIO, extents: Extents, text: bytes) -> bytes:
@@ -158,7 +158,7 @@ def open_sealed(path: Path, remedy: str, in_memory: bool = False) -> Any:
     try:
         file = h5py.File(io.BytesIO(path.read_bytes()) if in_memory else path, "r")
     except (OSError, RuntimeError, ValueError, KeyError) as error:
-        raise DamagedFileError(path, f"is no HDF5 file ({error})", remedy) from None
+        raise DamagedFileError(path, f"is not an HDF5 file ({error})", remedy) from None
     problem = _foreign(h5py, file, path.stat().st_size)
     if problem:
         file.close()

@@ -271,7 +271,7 @@ class Trajectory:
     def _check(self, name: str, k: int, row: Any) -> None:
         expected = int(self.file["checksum"][k, self.columns.index(name)])
         if zlib.crc32(np.ascontiguousarray(row).data) != expected:
-            raise DamagedFileError(self.path, f"{name} of frame {k} is damaged, its checksum is wrong", self._remedy)
+            raise DamagedFileError(self.path, f"{name} of frame {k} is damaged: its checksum is wrong", self._remedy)
 
     def names(self, name: str) -> list[str]:
         """Names that the indices of ``material`` or ``scene`` stand for."""

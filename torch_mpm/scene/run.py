@@ -227,7 +227,7 @@ class Simulation:
 
     def _check_stop(self, stop: Callable[[], bool]) -> None:
         if stop():
-            raise Interrupted(f"stopped after frame {self.frame} of {self.scene.frames}; add --resume to go on")
+            raise Interrupted(f"stopped after frame {self.frame} of {self.scene.frames}; add --resume to continue")
 
     def _put(self, writer: FrameWriter, substeps: int, cfl: float) -> None:
         """Hand the present state over as the next frame."""

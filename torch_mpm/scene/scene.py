@@ -202,4 +202,4 @@ def _override(words: dict[str, Any], text: str) -> None:
             target = target[int(step)] if isinstance(target, list) else target.setdefault(step, {})
         target[int(steps[-1]) if isinstance(target, list) else steps[-1]] = parsed
     except (KeyError, IndexError, ValueError, TypeError):
-        raise SceneError([f"override {text!r}: there is no {key.strip()} to set"]) from None
+        raise SceneError([f"override {text!r}: there is no {key.strip()}"]) from None
