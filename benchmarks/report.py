@@ -97,10 +97,11 @@ def dam_break(result: dict[str, Any]) -> str:
         shown = [None if e is None else f"{e:.1%}" for e in worst]
         rows.append((case["name"], case["particles"], *shown, f"{case['rows'][-1]['tip']:.3f}", case["seconds"]))
     intro = (
-        "2-D dam break over a frictionless dry bed against Ritter's solution (benchmarks/accuracy/ritter.py, where the "
-        "definitions stand). Largest distance between the fronts of some depths and Ritter's, over the distance of his "
-        f"dry front, for t √(g/h0) from {result['judged']:g} to {result['cases'][0]['duration']:g}; and the place of "
-        "the foremost particle at the end. Particles per cell 9 and mirrored walls, unless said otherwise."
+        "2-D dam break over a frictionless dry bed against Ritter's solution (defined in "
+        "benchmarks/accuracy/ritter.py): largest distance between the fronts of some depths and Ritter's, relative to "
+        "the distance of his dry front, for t √(g/h0) from "
+        f"{result['judged']:g} to {result['cases'][0]['duration']:g}; and the position of the foremost particle at the "
+        "end. 9 particles per cell and mirror walls unless said otherwise."
     )
     figure = "![depth, fronts over time, errors over dx](benchmarks/results/ritter.png)"
     return "\n".join(
@@ -129,7 +130,7 @@ def stability(result: dict[str, Any]) -> str:
         mine = [c for c in cases if (c["dim"], c["stretch"]) == (dim, stretch)]
         rows.append([dim, f"{stretch:g}", *(f"{min(c['stable'] for c in mine if c['nu'] == nu):.2f}" for nu in ratios)])
     intro = (
-        "Largest stable time step in multiples of `step.stable_dt(state, cfl=1)`, least of "
+        "Largest stable time step in multiples of `step.stable_dt(state, cfl=1)`, the least over "
         f"E = {', '.join(f'{E:.0e}' for E in sorted({c['E'] for c in cases}))} Pa; s < 1 is uniform compression, s > 1 "
         "stretch at constant volume. Other layouts, transfers and kernels: benchmarks/results/stability.md."
     )
@@ -146,10 +147,10 @@ def stability_laws(result: dict[str, Any]) -> str:
         limits = ([c["stable"] for c in mine if c["stretch"] == s and c["elliptic"]] for s in stretches)
         rows.append([law, *(f"{min(values):.2f}" if values else "–" for values in limits)])
     intro = (
-        "The same of the other laws, least of 2-D and 3-D, "
+        "The same for the other laws, the least over 2-D and 3-D, "
         f"ν = {', '.join(f'{nu:g}' for nu in sorted({c['nu'] for c in cases}))} and "
         f"E = {', '.join(f'{E:.0e}' for E in sorted({c['E'] for c in cases}))} Pa, where the law is "
-        "elliptic (elsewhere disturbances grow whatever the step). By ν: benchmarks/results/stability_laws.md."
+        "elliptic (elsewhere disturbances grow with any time step). By ν: benchmarks/results/stability_laws.md."
     )
     return "\n".join([intro, "", common.table(("law", *(f"s = {s:g}" for s in stretches)), rows)])
 
@@ -210,11 +211,11 @@ def limits(result: dict[str, Any]) -> str:
 def adversarial(result: dict[str, Any]) -> str:
     """Random rollouts at the limit of the time step."""
     intro = (
-        f"Rollouts of {result['steps']} steps made at random to turn particles inside out, at up to three times the "
-        "speed of sound (benchmarks/stability/adversarial.py), with dt = `step.stable_dt(state, cfl)` taken anew at "
-        "every step; how many of them went wrong, by cfl. Flattened: a particle's stretch fell below rounding before "
-        "its sign was lost, which a law of finite energy cannot prevent. Energy: above 1.1 of the first in a closed "
-        "system without FLIP."
+        f"Random rollouts of {result['steps']} steps that are meant to invert particles, at up to three times the "
+        "speed of sound (benchmarks/stability/adversarial.py), with dt = `step.stable_dt(state, cfl)` computed anew at "
+        "every step: how many of them went wrong, by cfl. Flattened: the stretch of a particle fell below rounding "
+        "error before its sign was lost, which a law of finite energy cannot prevent. Energy: above 1.1 times the "
+        "initial one in a closed system without FLIP."
     )
     parts = [intro, rollouts(result["rows"], "law")]
     return "\n\n".join([*parts, f"- {common.describe(result['environment'])}"])
@@ -225,7 +226,10 @@ def small_matrices(results: list[dict[str, Any]]) -> str:
     names = list(dict.fromkeys(row["name"] for result in results for row in result["times"]))
     header = ("ns per matrix", *(result["environment"]["device"] for result in results))
     times = [{row["name"]: row["ns"] for row in result["times"]} for result in results]
-    intro = "float32, 3-D, deformations I + 0.1 G, whole op. Sand at a friction angle where all branches occur."
+    intro = (
+        "float32, 3-D, deformations I + 0.1 G with normally distributed G, the whole op; sand at a friction angle at "
+        "which all branches occur."
+    )
     notes = [f"- {common.describe(result['environment'])}" for result in results]
     rows = [[name, *(t.get(name) for t in times)] for name in names]
     return "\n".join([intro, "", common.table(header, rows), "", *notes])
@@ -241,8 +245,8 @@ def svd_accuracy(result: dict[str, Any]) -> str:
         for row in result["rows"]
     ]
     intro = (
-        "float32, the largest of 20 thousand matrices each: error of a singular value relative to itself, and of "
-        "U diag(σ) Vᵀ relative to the largest singular value. Medians: benchmarks/results/svd_accuracy.md."
+        "float32, the largest over 20 thousand matrices of each kind: error of a singular value relative to itself, "
+        "and of U diag(σ) Vᵀ relative to the largest singular value. Medians: benchmarks/results/svd_accuracy.md."
     )
     return "\n".join([intro, "", common.table(header, rows)])
 
@@ -323,9 +327,9 @@ def heat_solve(result: dict[str, Any]) -> str:
     places = [(r, contrast) for r, contrast in places if r >= 1 and contrast in ends]
     rows = [[f"{r:g}", f"{contrast:g}", *(cells.get((r, contrast, k)) for k in kinds)] for r, contrast in places]
     intro = (
-        "Iterations: relative RMS error against a direct solve (benchmarks/stability/heat.py), 64 × 64 cells, half of "
-        "them conducting worse by the contrast, down to 1e-10 (float32: 1e-6) of the first residual. Smaller r and "
-        "Chebyshev iteration: benchmarks/results/heat_stability.md."
+        "Number of iterations, and relative RMS error against a direct solve (benchmarks/stability/heat.py), for "
+        "64 × 64 cells, half of which conduct worse by the factor `contrast`; solved to 1e-10 (float32: 1e-6) of the "
+        "first residual. Smaller r and Chebyshev iteration: benchmarks/results/heat_stability.md."
     )
     return "\n\n".join([intro, common.table(("r", "contrast", *kinds), rows)])
 
@@ -360,8 +364,8 @@ def heat_speed(results: list[dict[str, Any]]) -> str:
         for row in result.get("large", [])
     ]
     intro = (
-        "3-D, float32, quadratic kernel, 8 particles per cell (benchmarks/speed/heat.py); the peer's matrix is "
-        "assembled, on the CPU within its time."
+        "3-D, float32, quadratic kernel, 8 particles per cell (benchmarks/speed/heat.py). The peer's matrix is "
+        "assembled beforehand; on the CPU its time includes the assembly."
     )
     parts = [intro, common.table(header, rows)]
     if large:
