@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import pytest
 import torch
-from scenes import disc
+from helpers import disc
 from torch import Tensor
 
 import torch_mpm as mpm

@@ -5,7 +5,7 @@ import pickle
 
 import pytest
 import torch
-from particles import random_particles
+from helpers import random_particles
 
 import torch_mpm as mpm
 from torch_mpm.reference import advance, transfer

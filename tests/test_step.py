@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from particles import random_particles, relative_error
+from helpers import random_particles, relative_error
 
 import torch_mpm as mpm
 

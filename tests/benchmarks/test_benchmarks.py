@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from benchmark_runs import result, run_quick
+from helpers import result, run_quick
 
 from benchmarks import common, report
 from benchmarks.accuracy import convergence, manufactured, ritter

@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from node_blocks import random_blocks
+from helpers import random_blocks
 from torch import Tensor
 
 import torch_mpm as mpm

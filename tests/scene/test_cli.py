@@ -6,7 +6,7 @@ import subprocess
 import sys
 
 import pytest
-from scenes import FILE, command
+from helpers import FILE, command
 
 pytest.importorskip("pydantic")
 pytest.importorskip("h5py")

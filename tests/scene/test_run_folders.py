@@ -7,7 +7,7 @@ import signal
 
 import numpy as np
 import pytest
-from scenes import FILE, command, disc
+from helpers import FILE, command, disc
 
 pytest.importorskip("pydantic")
 pytest.importorskip("h5py")

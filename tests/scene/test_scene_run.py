@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from scenes import FILE, command, disc
+from helpers import FILE, command, disc
 
 pytest.importorskip("pydantic")
 pytest.importorskip("h5py")

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from scenes import FILE, disc
+from helpers import FILE, disc
 
 pytest.importorskip("pydantic")
 
