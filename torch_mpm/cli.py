@@ -12,7 +12,7 @@ from typing import Any
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line; returns the exit status: 0, 1 for a problem (told on stderr), 130 when interrupted."""
+    """Run the command line; returns the exit status: 0, 1 for a problem (described on stderr), 130 when interrupted."""
     options = _parser().parse_args(arguments)
     try:
         options.command(options)
@@ -30,7 +30,7 @@ TOLD = ("SceneError", "OutputError", "DamagedFileError", "SimulationError", "Int
 
 
 def _message(error: Exception) -> str | None:
-    """What to tell the user. None for errors that are defects, whose traceback should be seen."""
+    """What to tell the user. None for errors that are defects of torch_mpm, whose traceback should be seen."""
     if isinstance(error, MemoryError) or "allocate memory" in str(error) or "out of memory" in str(error):
         return "out of memory; make grid.dx larger or per_cell smaller, or ask for fewer fields and pictures"
     if isinstance(error, OSError) and error.strerror and error.filename is not None:
@@ -124,7 +124,7 @@ def _run(options: argparse.Namespace) -> None:
 
 
 def _require_outputs(scene: Any) -> None:
-    """A package that is missing is noticed before the simulation, not after it."""
+    """Raise ImportError for a missing package before the simulation rather than after it."""
     if scene.render is not None:
         from . import render
         from .render.requires import require

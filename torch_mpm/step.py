@@ -121,7 +121,7 @@ class Step(TensorModule):
                     part.dissipation = True
 
     def register_full_backward_hook(self, *arguments: Any, **options: Any) -> Any:
-        """Refused: PyTorch's hooks would never be called for a `State`.
+        """Raises: PyTorch's hooks would never be called for a `State`.
 
         Raises:
             NotImplementedError: always.

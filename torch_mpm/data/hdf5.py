@@ -1,4 +1,4 @@
-"""HDF5 files without their dangers: a full disk that HDF5 cannot handle, damaged bytes, and data of other files.
+"""HDF5 files made safe: against a full disk, which HDF5 cannot handle, damaged bytes, and links to other files.
 
 HDF5 crashes at exit after a write that failed, so files are made in memory and written as plain bytes. A *seal* at the
 end of a file holds the SHA-256 of the bytes that will not change; it is checked before HDF5 reads any of them, and
@@ -167,7 +167,7 @@ def open_sealed(path: Path, remedy: str, in_memory: bool = False) -> Any:
 
 
 def _foreign(h5py: Any, file: Any, size: int) -> str:
-    """What in a file is no plain array of numbers within it: links, other files' data, filters, groups."""
+    """What in a file is not a plain array of numbers stored in it: links, external data, filters, groups."""
     try:
         for name in file:
             if not isinstance(file.get(name, getlink=True), h5py.HardLink):

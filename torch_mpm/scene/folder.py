@@ -50,7 +50,7 @@ def claim(folder: Path, fingerprint: str, resume: bool) -> None:
 def locked(folder: Path) -> Iterator[None]:
     """Keep other processes out of a folder, which is made. The lock ends with this process, however it ends.
 
-    A file system without locks (some network file systems) keeps nobody out.
+    A file system without locks (some network file systems) does not exclude other processes.
 
     Raises:
         OutputError: when another process runs in the folder.
