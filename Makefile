@@ -1,4 +1,4 @@
-# Targets: build, test, check, demo, examples, bench, study, sanitize, gpu, clean (see CONTRIBUTING.md).
+# Targets: build, test, check, format, demo, examples, wheel, bench, study, sanitize, gpu, clean (see CONTRIBUTING.md).
 # PYTHON makes the virtual environment; TORCH is installed there unless torch is already present.
 PYTHON ?= python3
 TORCH ?= 2.13.0
@@ -9,12 +9,17 @@ QUICK := -q -m "not slow"
 
 SOURCES := $(shell find csrc -name '*.h' -o -name '*.cuh' -o -name '*.cpp' -o -name '*.cu')
 
-.PHONY: build test check format demo examples bench study sanitize gpu clean
+.PHONY: build libraries test check format demo examples wheel bench study sanitize gpu clean
 
 build: $(STAMP)
 	$(PY) setup.py -q build_ext --inplace
 
+# What a user needs: the CPU library, and the CUDA library where there is a GPU. `build` adds the module of the tests.
+libraries: $(STAMP)
+	$(PY) setup.py -q build_ext --inplace --targets=cpu,cuda
+
 # One library alone: cpu, cuda or math (the pybind11 module of the tests).
+build-cuda: export TORCH_MPM_CUDA = 1
 build-%: $(STAMP)
 	$(PY) setup.py -q build_ext --inplace --targets=$*
 
@@ -40,15 +45,22 @@ format: $(STAMP)
 	$(PY) -m ruff format .
 	$(VENV)/bin/clang-format -i $(SOURCES)
 
-demo: build
+demo: libraries
 	rm -rf out/demo
 	$(PY) -m torch_mpm run examples/demo.toml -o out/demo
 
 # Each scene in a folder of its own. A scene that is done is skipped, an unfinished one goes on.
 examples: $(patsubst examples/%.toml,out/%/trajectory.h5,$(wildcard examples/*.toml))
 
-out/%/trajectory.h5: examples/%.toml | build
+out/%/trajectory.h5: examples/%.toml | libraries
 	$(PY) -m torch_mpm run $< -o $(@D) --resume
+
+# For every machine: all instruction-set levels, and two GPU architectures where nvcc is found. What an earlier build has
+# left in build/lib* would go into the wheel too.
+wheel: $(STAMP)
+	rm -rf build/lib* dist/*.whl
+	$(PY) setup.py -q bdist_wheel
+	@echo "The wheel is $$(ls dist/*.whl); pip install $$(ls dist/*.whl) puts it into any environment."
 
 bench: build
 	$(PY) -m benchmarks
@@ -63,11 +75,11 @@ PRELOAD = $(foreach name,libasan.so libstdc++.so.6,$(shell $(or $(CXX),g++) -pri
 sanitize: $(STAMP)
 	TORCH_MPM_SANITIZE=address,undefined TORCH_MPM_CUDA=0 $(PY) setup.py -q build --build-lib $(SANITIZED)
 	LD_PRELOAD='$(PRELOAD)' ASAN_OPTIONS=detect_leaks=0 UBSAN_OPTIONS=halt_on_error=1:print_stacktrace=1 \
-	  PYTHONPATH=$(CURDIR)/$(SANITIZED):$(CURDIR) $(VENV)/bin/pytest $(QUICK)
+	  TORCH_MPM_CUDA=0 PYTHONPATH=$(CURDIR)/$(SANITIZED):$(CURDIR) $(VENV)/bin/pytest $(QUICK)
 
 # On a GPU machine whose Python already has torch, ninja and pytest: no virtual environment and no network.
 gpu:
-	TORCH_MPM_CUDA=1 $(PYTHON) setup.py -q build_ext --inplace
+	TORCH_MPM_CUDA=1 TORCH_MPM_ISA_LEVELS=all $(PYTHON) setup.py -q build_ext --inplace
 	PYTHONPATH=. $(PYTHON) -m benchmarks.tests --processes $(shell nproc)
 	PYTHONPATH=. $(PYTHON) -m benchmarks --device cuda
 

@@ -31,6 +31,7 @@ from build_backend import torch_directory
 
 ROOT = Path(__file__).resolve().parent
 CSRC = ROOT / "csrc"
+DEVICE_FILES = Path("/dev")
 
 # The oldest torch whose stable ABI the libraries ask for: 2.11.
 TORCH_TARGET_VERSION = "0x020b000000000000"
@@ -79,14 +80,31 @@ def best_level() -> str:
     return "avx2" if {"__AVX2__", "__FMA__", "__BMI2__", "__F16C__", "__LZCNT__", "__MOVBE__"} <= macros else "baseline"
 
 
-def cuda_wanted() -> bool:
-    """TORCH_MPM_CUDA=1 forces the CUDA library, 0 leaves it out; by default it is built where nvcc is found."""
+def cuda_wanted(native: bool) -> bool:
+    """Whether to build the CUDA library: where nvcc is found and, if for this machine only, it has a GPU.
+
+    TORCH_MPM_CUDA, 1 or 0, decides where it is set.
+    """
     choice = os.environ.get("TORCH_MPM_CUDA", "")
     if choice not in ("", "0", "1"):
         raise SystemExit(f"TORCH_MPM_CUDA must be 0, 1 or unset, got {choice!r}")
     if choice == "1" and nvcc() is None:
         raise SystemExit("TORCH_MPM_CUDA=1, but nvcc is neither in CUDA_HOME/bin nor in PATH")
-    return choice != "0" and nvcc() is not None
+    if choice or nvcc() is None:
+        return choice == "1"
+    if native and not gpu_present():
+        print("The CUDA library is left out, since this machine has no GPU; TORCH_MPM_CUDA=1 builds it all the same.")
+        return False
+    return True
+
+
+def gpu_present() -> bool:
+    """Whether this machine has an NVIDIA GPU: a device file of its driver, or one that nvidia-smi lists."""
+    if any(DEVICE_FILES.glob("nvidia[0-9]*")):
+        return True
+    lister = shutil.which("nvidia-smi")
+    listed = subprocess.run([lister, "-L"], capture_output=True, text=True) if lister else None
+    return listed is not None and listed.returncode == 0 and "GPU" in listed.stdout
 
 
 def nvcc() -> str | None:
@@ -95,7 +113,8 @@ def nvcc() -> str | None:
 
 
 def cuda_archs() -> list[str]:
-    return [arch.strip() for arch in os.environ.get("TORCH_MPM_CUDA_ARCHS", "8.0;9.0").split(";") if arch.strip()]
+    wanted = os.environ.get("TORCH_MPM_CUDA_ARCHS") or "8.0;9.0"
+    return [arch.strip() for arch in wanted.split(";") if arch.strip()]
 
 
 def gencode() -> list[str]:
@@ -269,7 +288,8 @@ class Build(build_ext):
         destination = ROOT if self.inplace or self.editable_mode else Path(self.build_lib)
         sanitize = os.environ.get("TORCH_MPM_SANITIZE", "")
         # What is built in place serves this machine; a wheel serves every one.
-        self.levels = isa_levels(native=bool(self.inplace or self.editable_mode))
+        self.native = bool(self.inplace or self.editable_mode)
+        self.levels = isa_levels(self.native)
         # One place for in-place, editable and wheel builds, so that each reuses the objects of the others.
         name = f"{sysconfig.get_platform()}-{sys.implementation.cache_tag}"
         directory = ROOT / "build" / (f"{name}-sanitize" if sanitize else name)
@@ -300,7 +320,7 @@ class Build(build_ext):
         libraries = {}
         if "cpu" in wanted:
             libraries["cpu"] = cpu_library(self.levels)
-        if "cuda" in wanted and cuda_wanted():
+        if "cuda" in wanted and cuda_wanted(self.native):
             libraries["cuda"] = cuda_library()
         if "math" in wanted and (library := math_library(self.distribution.get_version())):
             libraries["math"] = library
@@ -336,7 +356,8 @@ class Wheel(bdist_wheel):
         super().run()
 
 
-setup(
-    ext_modules=[Extension("torch_mpm._math", ["csrc/common/python_module.cpp"], optional=True)],
-    cmdclass={"build_ext": Build, "bdist_wheel": Wheel},
-)
+if __name__ == "__main__":
+    setup(
+        ext_modules=[Extension("torch_mpm._math", ["csrc/common/python_module.cpp"], optional=True)],
+        cmdclass={"build_ext": Build, "bdist_wheel": Wheel},
+    )

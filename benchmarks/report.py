@@ -1,7 +1,7 @@
 """The tables and figures of the documents, from the result files: `python -m benchmarks.report [--write]`.
 
 Prints the tables; with --write, puts them between the lines `<!-- benchmarks -->` and `<!-- /benchmarks -->` of
-README.md, which has the sections of OVERVIEW, and of docs/measured.md, which has the others.
+docs/measured.md, which has all of them, and of README.md, which has one of speed and one of accuracy.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import argparse
 import json
 import re
-from collections.abc import Iterable
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +28,12 @@ BOTH = ("step, forward and backward", "step, forward and backward, CUDA graph")
 
 
 def speed(results: list[dict[str, Any]]) -> str:
+    """Whole steps beside the peers, with where they were measured."""
+    notes = [f"- {common.describe(result['environment'])}" for result in results]
+    return "\n".join([speed_table(results), "", *notes])
+
+
+def speed_table(results: list[dict[str, Any]]) -> str:
     """Whole steps beside the peers, and the rates of the transfers."""
     rows = []
     for result in results:
@@ -52,13 +58,12 @@ def speed(results: list[dict[str, Any]]) -> str:
         "device", "particles", "step [ms]", "Warp's step", "Taichi's step", "with backward", "P2G [G/s]", "G2P [G/s]",
         "float32 error",
     )  # fmt: skip
-    notes = [f"- {common.describe(result['environment'])}" for result in results]
     intro = (
         "One explicit neo-Hookean step, 3-D, float32, quadratic kernel, 8 particles per cell, everything included. "
-        "Columns with x are multiples of its time in the same run; rates are G particles/s; the error is the largest "
-        "of P2G, G2P and their gradients against float64."
+        "Columns with x are multiples of its time in the same run; rates are in billions of particles per second; the "
+        "error is the largest of P2G, G2P and their gradients against float64."
     )
-    return "\n".join([intro, "", common.table(header, rows), "", *notes])
+    return "\n".join([intro, "", common.table(header, rows)])
 
 
 def _ratio(value: float | None, base: float | None) -> str | None:
@@ -92,10 +97,11 @@ def dam_break(result: dict[str, Any]) -> str:
         shown = [None if e is None else f"{e:.1%}" for e in worst]
         rows.append((case["name"], case["particles"], *shown, f"{case['rows'][-1]['tip']:.3f}", case["seconds"]))
     intro = (
-        "2-D dam break over a frictionless dry bed against Ritter's solution (benchmarks/accuracy/ritter.py, where the "
-        "definitions stand). Largest distance between the fronts of some depths and Ritter's, over the distance of his "
-        f"dry front, for t √(g/h0) from {result['judged']:g} to {result['cases'][0]['duration']:g}; and the place of "
-        "the foremost particle at the end. Particles per cell 9 and mirrored walls, unless said otherwise."
+        "2-D dam break over a frictionless dry bed against Ritter's solution (defined in "
+        "benchmarks/accuracy/ritter.py): largest distance between the fronts of some depths and Ritter's, relative to "
+        "the distance of his dry front, for t √(g/h0) from "
+        f"{result['judged']:g} to {result['cases'][0]['duration']:g}; and the position of the foremost particle at the "
+        "end. 9 particles per cell and mirror walls unless said otherwise."
     )
     figure = "![depth, fronts over time, errors over dx](benchmarks/results/ritter.png)"
     return "\n".join(
@@ -124,7 +130,7 @@ def stability(result: dict[str, Any]) -> str:
         mine = [c for c in cases if (c["dim"], c["stretch"]) == (dim, stretch)]
         rows.append([dim, f"{stretch:g}", *(f"{min(c['stable'] for c in mine if c['nu'] == nu):.2f}" for nu in ratios)])
     intro = (
-        "Largest stable time step in multiples of `step.stable_dt(state, cfl=1)`, least of "
+        "Largest stable time step in multiples of `step.stable_dt(state, cfl=1)`, the least over "
         f"E = {', '.join(f'{E:.0e}' for E in sorted({c['E'] for c in cases}))} Pa; s < 1 is uniform compression, s > 1 "
         "stretch at constant volume. Other layouts, transfers and kernels: benchmarks/results/stability.md."
     )
@@ -141,10 +147,10 @@ def stability_laws(result: dict[str, Any]) -> str:
         limits = ([c["stable"] for c in mine if c["stretch"] == s and c["elliptic"]] for s in stretches)
         rows.append([law, *(f"{min(values):.2f}" if values else "–" for values in limits)])
     intro = (
-        "The same of the other laws, least of 2-D and 3-D, "
+        "The same for the other laws, the least over 2-D and 3-D, "
         f"ν = {', '.join(f'{nu:g}' for nu in sorted({c['nu'] for c in cases}))} and "
         f"E = {', '.join(f'{E:.0e}' for E in sorted({c['E'] for c in cases}))} Pa, where the law is "
-        "elliptic (elsewhere disturbances grow whatever the step). By ν: benchmarks/results/stability_laws.md."
+        "elliptic (elsewhere disturbances grow with any time step). By ν: benchmarks/results/stability_laws.md."
     )
     return "\n".join([intro, "", common.table(("law", *(f"s = {s:g}" for s in stretches)), rows)])
 
@@ -205,11 +211,11 @@ def limits(result: dict[str, Any]) -> str:
 def adversarial(result: dict[str, Any]) -> str:
     """Random rollouts at the limit of the time step."""
     intro = (
-        f"Rollouts of {result['steps']} steps made at random to turn particles inside out, at up to three times the "
-        "speed of sound (benchmarks/stability/adversarial.py), with dt = `step.stable_dt(state, cfl)` taken anew at "
-        "every step; how many of them went wrong, by cfl. Flattened: a particle's stretch fell below rounding before "
-        "its sign was lost, which a law of finite energy cannot prevent. Energy: above 1.1 of the first in a closed "
-        "system without FLIP."
+        f"Random rollouts of {result['steps']} steps that are meant to invert particles, at up to three times the "
+        "speed of sound (benchmarks/stability/adversarial.py), with dt = `step.stable_dt(state, cfl)` computed anew at "
+        "every step: how many of them went wrong, by cfl. Flattened: the stretch of a particle fell below rounding "
+        "error before its sign was lost, which a law of finite energy cannot prevent. Energy: above 1.1 times the "
+        "initial one in a closed system without FLIP."
     )
     parts = [intro, rollouts(result["rows"], "law")]
     return "\n\n".join([*parts, f"- {common.describe(result['environment'])}"])
@@ -220,7 +226,10 @@ def small_matrices(results: list[dict[str, Any]]) -> str:
     names = list(dict.fromkeys(row["name"] for result in results for row in result["times"]))
     header = ("ns per matrix", *(result["environment"]["device"] for result in results))
     times = [{row["name"]: row["ns"] for row in result["times"]} for result in results]
-    intro = "float32, 3-D, deformations I + 0.1 G, whole op. Sand at a friction angle where all branches occur."
+    intro = (
+        "float32, 3-D, deformations I + 0.1 G with normally distributed G, the whole op; sand at a friction angle at "
+        "which all branches occur."
+    )
     notes = [f"- {common.describe(result['environment'])}" for result in results]
     rows = [[name, *(t.get(name) for t in times)] for name in names]
     return "\n".join([intro, "", common.table(header, rows), "", *notes])
@@ -236,8 +245,8 @@ def svd_accuracy(result: dict[str, Any]) -> str:
         for row in result["rows"]
     ]
     intro = (
-        "float32, the largest of 20 thousand matrices each: error of a singular value relative to itself, and of "
-        "U diag(σ) Vᵀ relative to the largest singular value. Medians: benchmarks/results/svd_accuracy.md."
+        "float32, the largest over 20 thousand matrices of each kind: error of a singular value relative to itself, "
+        "and of U diag(σ) Vᵀ relative to the largest singular value. Medians: benchmarks/results/svd_accuracy.md."
     )
     return "\n".join([intro, "", common.table(header, rows)])
 
@@ -318,9 +327,9 @@ def heat_solve(result: dict[str, Any]) -> str:
     places = [(r, contrast) for r, contrast in places if r >= 1 and contrast in ends]
     rows = [[f"{r:g}", f"{contrast:g}", *(cells.get((r, contrast, k)) for k in kinds)] for r, contrast in places]
     intro = (
-        "Iterations: relative RMS error against a direct solve (benchmarks/stability/heat.py), 64 × 64 cells, half of "
-        "them conducting worse by the contrast, down to 1e-10 (float32: 1e-6) of the first residual. Smaller r and "
-        "Chebyshev iteration: benchmarks/results/heat_stability.md."
+        "Number of iterations, and relative RMS error against a direct solve (benchmarks/stability/heat.py), for "
+        "64 × 64 cells, half of which conduct worse by the factor `contrast`; solved to 1e-10 (float32: 1e-6) of the "
+        "first residual. Smaller r and Chebyshev iteration: benchmarks/results/heat_stability.md."
     )
     return "\n\n".join([intro, common.table(("r", "contrast", *kinds), rows)])
 
@@ -355,8 +364,8 @@ def heat_speed(results: list[dict[str, Any]]) -> str:
         for row in result.get("large", [])
     ]
     intro = (
-        "3-D, float32, quadratic kernel, 8 particles per cell (benchmarks/speed/heat.py); the peer's matrix is "
-        "assembled, on the CPU within its time."
+        "3-D, float32, quadratic kernel, 8 particles per cell (benchmarks/speed/heat.py). The peer's matrix is "
+        "assembled beforehand; on the CPU its time includes the assembly."
     )
     parts = [intro, common.table(header, rows)]
     if large:
@@ -366,7 +375,82 @@ def heat_speed(results: list[dict[str, Any]]) -> str:
     return "\n\n".join(parts)
 
 
-OVERVIEW = ("Speed", "Small matrices and sand", "Speed of the heat solve", "Convergence", "Heat", "Stability")
+def accuracy(directory: Path) -> str:
+    """One error of each part of the library, as far as there are results."""
+    parts = {
+        "convergence": _motion_errors,
+        "ritter": _front_errors,
+        "heat": _conduction_errors,
+        "precision": _rounding_errors,
+        "svd_accuracy": _decomposition_errors,
+        "sand_accuracy": _return_map_errors,
+        "sand_gradient": _gradient_errors,
+    }
+    rows = []
+    for name, part in parts.items():
+        if (file := directory / f"{name}.json").exists():
+            result = json.loads(file.read_text())
+            for *row, seconds in part(result):
+                rows.append([*row, seconds and f"{seconds:.3g} s, {result['environment']['device']}"])
+    header = ("what", "compared with", "error", "order in dx", "run time")
+    intro = (
+        "Errors are relative unless said otherwise: of a solution those at the finest lattice, of a function the "
+        "largest found."
+    )
+    return "\n".join([intro, "", common.table(header, rows)])
+
+
+Row = tuple[str, str, Any, str | None, float | None]
+
+
+def _motion_errors(result: dict[str, Any]) -> Iterator[Row]:
+    for case in result["cases"]:
+        if case["name"].endswith("cubic, mls, mirror walls"):
+            last, order = case["rows"][-1], f"{case['order']['displacement']:.2f}"
+            what = f"motion of an elastic body, {case['dim']}-D, {last['n']} cells"
+            yield what, "manufactured solution", last["displacement"], order, last["seconds"]
+
+
+def _front_errors(result: dict[str, Any]) -> Iterator[Row]:
+    (case,) = (case for case in result["cases"] if case["name"] == "h0/dx = 32")
+    late = [row["error"] for row in case["rows"] if row["time"] >= result["judged"] - 1e-9]
+    worst = max(abs(e) for row in late for level, e in row.items() if float(level) >= 0.02 and e is not None)
+    yield "dam break, fronts of 2% of the depth and more", "Ritter 1892", worst, None, case["seconds"]
+
+
+def _conduction_errors(result: dict[str, Any]) -> Iterator[Row]:
+    for problem in ("heated bar", "melting front, St = 0.5"):
+        for case in result["cases"]:
+            if (case["problem"], case["kernel"], case["transfer"]) == (problem, "quadratic", "hybrid"):
+                last = case["rows"][-1]
+                yield problem, "exact solution", last["error"], f"{case['order']:.1f}", last["seconds"]
+
+
+def _rounding_errors(result: dict[str, Any]) -> Iterator[Row]:
+    lattice = result["lattices"][-1]
+    what = f"position after {lattice['steps']} steps in float32, in units of dx"
+    yield what, "float64", lattice["rows"][-1]["position"], None, lattice["float32_seconds"]
+
+
+def _decomposition_errors(result: dict[str, Any]) -> Iterator[Row]:
+    worst = max(row["errors"]["svd3"]["product"][1] for row in result["rows"])
+    yield "`svd3` in float32: U diag(σ) Vᵀ", "the matrix", worst, None, None
+
+
+def _return_map_errors(result: dict[str, Any]) -> Iterator[Row]:
+    worst = max(row["float32"]["error over condition"][2] for row in result["rows"])
+    yield "return map of sand in float32, over the condition number", "extended precision", worst, None, None
+
+
+def _gradient_errors(result: dict[str, Any]) -> Iterator[Row]:
+    worst = max(case["largest"] for row in result["rows"] for case in row["gaps"])
+    yield "gradients of the return map in float32", "float64", worst, None, None
+
+
+def overview(directory: Path) -> str:
+    """The two tables of the README."""
+    results = [json.loads(file.read_text()) for file in sorted(directory.glob("speed_*.json"))]
+    return "\n\n".join([*(["### Speed", speed_table(results)] if results else []), "### Accuracy", accuracy(directory)])
 
 
 def sections(directory: Path) -> dict[str, str]:
@@ -401,9 +485,10 @@ def sections(directory: Path) -> dict[str, str]:
     return found
 
 
-def summary(found: dict[str, str], titles: Iterable[str]) -> str:
-    """The sections of these titles, as far as found, one after the other."""
-    return "\n\n".join(f"### {title}\n\n{found[title]}" for title in titles if title in found)
+def documents(directory: Path) -> dict[Path, str]:
+    """The text between the marks of each document."""
+    details = "\n\n".join(f"### {title}\n\n{text}" for title, text in sections(directory).items())
+    return {README: overview(directory), MEASURED: details.replace("](benchmarks/", "](../benchmarks/")}
 
 
 def insert(text: str, tables: str) -> str:
@@ -423,12 +508,9 @@ def main() -> None:
     parser.add_argument("--results", type=Path, default=common.RESULTS)
     parser.add_argument("--write", action="store_true", help="update README.md and docs/measured.md")
     arguments = parser.parse_args()
-    found = sections(arguments.results)
-    overview, details = summary(found, OVERVIEW), summary(found, [t for t in found if t not in OVERVIEW])
-    print(overview, details, sep="\n\n")
-    if arguments.write:
-        details = details.replace("](benchmarks/", "](../benchmarks/")
-        for document, tables in ((README, overview), (MEASURED, details)):
+    for document, tables in documents(arguments.results).items():
+        print(tables)
+        if arguments.write:
             document.write_text(insert(document.read_text(), tables))
 
 

@@ -1,7 +1,7 @@
 """Run the tests on a GPU machine and keep their outcome as a result: `python -m benchmarks.tests [TESTS ...]`.
 
     python -m benchmarks.tests                                   # the quick suite
-    python -m benchmarks.tests --tool memcheck -k cuda tests/test_transfer.py
+    python -m benchmarks.tests --tool memcheck -k cuda tests/ops/test_transfer.py
     python -m benchmarks.tests --tool racecheck -k cuda --processes 12
 
 With `--tool` the tests run under compute-sanitizer, and an error that it finds fails the run. With `--processes`,

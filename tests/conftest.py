@@ -1,19 +1,33 @@
+import os
+
 import pytest
 import torch
 
+import setup
 from torch_mpm import _library
 
 # Small tensors: more threads only wait for each other, above all on a busy machine.
 torch.set_num_threads(min(2, torch.get_num_threads()))
 
-DEVICES = ["cpu"]
-if torch.cuda.is_available() and _library.cuda_error is None:
-    DEVICES.append("cuda")
+CUDA = torch.cuda.is_available() and _library.cuda_error is None
+DEVICES = ["cpu", *([pytest.param("cuda", marks=pytest.mark.cuda)] if CUDA else [])]
+
+
+def pytest_configure() -> None:
+    """A machine with a GPU tests it, or is told by TORCH_MPM_CUDA=0 not to: its tests never vanish in silence."""
+    if not CUDA and setup.gpu_present() and os.environ.get("TORCH_MPM_CUDA") != "0":
+        reason = _library.cuda_error or f"torch {torch.__version__} finds no CUDA device"
+        raise pytest.UsageError(f"this machine has a GPU, but {reason}. TORCH_MPM_CUDA=0 tests the CPU alone.")
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    if item.get_closest_marker("cuda") and not CUDA:
+        pytest.skip("needs a CUDA device")
 
 
 @pytest.fixture(params=DEVICES)
 def device(request: pytest.FixtureRequest) -> str:
-    """Every device that this machine can use, so that the same test runs on each."""
+    """Every device that this machine can use, so that the same test runs on each; those on CUDA are marked so."""
     return request.param
 
 

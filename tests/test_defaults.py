@@ -10,13 +10,13 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import pytest
 import torch
-from scenes import disc
+from helpers import disc
 from torch import Tensor
 
 import torch_mpm as mpm
 from torch_mpm import heat_boundaries
 
-DEFAULTS = ["meta", "context", *(["cuda"] if torch.cuda.is_available() else []), "float64", "float16"]
+DEFAULTS = ["meta", "context", pytest.param("cuda", marks=pytest.mark.cuda), "float64", "float16"]
 
 
 @contextlib.contextmanager

@@ -1,12 +1,15 @@
 """What is handed out: the source distribution, the metadata and the licence of the packages."""
 
 import hashlib
+import json
 import os
+import platform
 import re
 import shutil
 import subprocess
 import sys
 import tarfile
+import zipfile
 from pathlib import Path
 
 import pytest
@@ -65,6 +68,34 @@ def test_wheel_without_libraries_is_refused(clean_copy: Path, tmp_path: Path) ->
     assert done.returncode != 0
     assert "TORCH_MPM_SKIP_BUILD=1 leaves the libraries out" in done.stderr
     assert list(tmp_path.iterdir()) == []
+
+
+COMPILER = """#!/bin/sh
+while [ $# -gt 0 ]; do
+  case $1 in --version) echo "stub release 1.0" ;; -o) touch "$2" ;; esac
+  shift
+done
+"""
+
+
+def test_wheel_has_the_libraries_of_every_machine(clean_copy: Path, tmp_path: Path) -> None:
+    """Built by a compiler that writes empty files: which are compiled and packed, not what is in them."""
+    (tmp_path / "bin").mkdir()
+    for name in ("nvcc", "g++"):
+        (tmp_path / "bin" / name).write_text(COMPILER)
+        (tmp_path / "bin" / name).chmod(0o755)
+    compilers = {"CXX": str(tmp_path / "bin" / "g++"), "CUDA_HOME": str(tmp_path)}
+    unset = dict.fromkeys(("TORCH_MPM_CUDA", "TORCH_MPM_CUDA_ARCHS", "TORCH_MPM_ISA_LEVELS", "TORCH_MPM_SANITIZE"), "")
+    done = setup(clean_copy, "bdist_wheel", "--dist-dir", str(tmp_path / "dist"), **compilers, **unset)
+    assert done.returncode == 0, done.stderr
+    (archive,) = (tmp_path / "dist").glob("torch_mpm-*-py3-none-*.whl")
+    with zipfile.ZipFile(archive) as contents:
+        names = set(contents.namelist())
+        build = json.loads(contents.read("torch_mpm/lib/build.json"))
+    libraries = {"torch_mpm/lib/libtorch_mpm_cpu.so", "torch_mpm/lib/libtorch_mpm_cuda.so", "torch_mpm/py.typed"}
+    assert libraries | {name for name in tracked("--others") if name.startswith("torch_mpm/")} <= names
+    assert build["cuda"]["archs"] == ["8.0", "9.0"]
+    assert build["cpu"]["isa"] == (["baseline", "avx2", "avx512"] if platform.machine() == "x86_64" else ["baseline"])
 
 
 def test_editable_install_needs_no_libraries(clean_copy: Path, tmp_path: Path) -> None:

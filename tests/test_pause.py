@@ -177,7 +177,6 @@ def test_a_pause_compiles_to_one_graph():
 
 
 @pytest.mark.cuda
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 def test_a_pause_needs_no_synchronisation():
     step, state = scenes(3, "cuda")
     dt = times([DT, 0.0, -DT], "cuda")

@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from particles import random_particles, relative_error
+from helpers import random_particles, relative_error
 
 import torch_mpm as mpm
 
@@ -395,7 +395,6 @@ def test_bad_grids(arguments, message):
 
 
 @pytest.mark.cuda
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 def test_a_step_is_captured_in_a_cuda_graph():
     """Replays of a captured step equal eager steps."""
     step, state = mpm88("cuda")
@@ -417,7 +416,6 @@ def test_a_step_is_captured_in_a_cuda_graph():
 
 
 @pytest.mark.cuda
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 @pytest.mark.parametrize("inference", [False, True])
 def test_replays_of_a_graph_are_watched(inference):
     """Problems of any replay are reported, whatever else happens to the step and to the memory between."""
@@ -449,7 +447,6 @@ def test_replays_of_a_graph_are_watched(inference):
 
 
 @pytest.mark.cuda
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 @pytest.mark.parametrize("law", [mpm.NeoHookean(E=1e4, nu=0.3), mpm.QuarticSand(E=1e4, nu=0.3)])
 def test_a_graph_keeps_what_it_was_captured_with(law):
     """Replays are not touched by what the step, its law or an obstacle is used for in between."""

@@ -6,13 +6,13 @@ import argparse
 import json
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line; returns the exit status: 0, 1 for a problem (told on stderr), 130 when interrupted."""
+    """Run the command line; returns the exit status: 0, 1 for a problem (described on stderr), 130 when interrupted."""
     options = _parser().parse_args(arguments)
     try:
         options.command(options)
@@ -30,7 +30,7 @@ TOLD = ("SceneError", "OutputError", "DamagedFileError", "SimulationError", "Int
 
 
 def _message(error: Exception) -> str | None:
-    """What to tell the user. None for errors that are defects, whose traceback should be seen."""
+    """What to tell the user. None for errors that are defects of torch_mpm, whose traceback should be seen."""
     if isinstance(error, MemoryError) or "allocate memory" in str(error) or "out of memory" in str(error):
         return "out of memory; make grid.dx larger or per_cell smaller, or ask for fewer fields and pictures"
     if isinstance(error, OSError) and error.strerror and error.filename is not None:
@@ -51,7 +51,7 @@ def _parser() -> argparse.ArgumentParser:
     run = commands.add_parser("run", help="simulate a scene file")
     _scene_arguments(run)
     run.add_argument("-o", "--out", required=True, type=Path, help="folder for the results")
-    run.add_argument("--resume", action="store_true", help="go on with an unfinished run")
+    run.add_argument("--resume", action="store_true", help="continue an unfinished run")
     run.add_argument("--quiet", action="store_true", help="no progress bar")
     run.set_defaults(command=_run)
 
@@ -60,7 +60,7 @@ def _parser() -> argparse.ArgumentParser:
     check.set_defaults(command=_check)
 
     info = commands.add_parser(
-        "info", help="what a scene uses and takes; without a scene, what this installation can do"
+        "info", help="what a scene uses and how long it takes; without a scene, what this installation can do"
     )
     _scene_arguments(info, optional=True)
     info.set_defaults(command=_info)
@@ -68,12 +68,12 @@ def _parser() -> argparse.ArgumentParser:
     schema = commands.add_parser("schema", help="print the JSON schema of scene files, for editors")
     schema.set_defaults(command=_schema)
 
-    render = commands.add_parser("render", help="draw the pictures and the video of a run again")
+    render = commands.add_parser("render", help="redraw the pictures and the video of a run")
     render.add_argument("run", type=Path, help="folder of a run")
     _set_argument(render, "render.color_by=stress")
     render.set_defaults(command=_render)
 
-    export = commands.add_parser("export", help="write a run for other programs")
+    export = commands.add_parser("export", help="convert a run for other programs")
     export.add_argument("run", type=Path, help="folder of a run")
     export.add_argument("--vtk", action="store_true", help="VTK files for ParaView, in DIR/vtk")
     export.add_argument("--ply", action="store_true", help="PLY point clouds, in DIR/ply")
@@ -116,7 +116,7 @@ def _run(options: argparse.Namespace) -> None:
     files = {"trajectory": options.out / "trajectory.h5"}
     for name, make in _outputs(scene, options):
         since = time.perf_counter()
-        files[name] = make()
+        files |= make()
         seconds[name] = time.perf_counter() - since
     seconds["total"] = time.perf_counter() - begin
     _write_summary(options.out, summary)
@@ -124,7 +124,7 @@ def _run(options: argparse.Namespace) -> None:
 
 
 def _require_outputs(scene: Any) -> None:
-    """A package that is missing is noticed before the simulation, not after it."""
+    """Raise ImportError for a missing package before the simulation rather than after it."""
     if scene.render is not None:
         from . import render
         from .render.requires import require
@@ -138,30 +138,38 @@ def _require_outputs(scene: Any) -> None:
         meshio_module()
 
 
-def _outputs(scene: Any, options: argparse.Namespace) -> list[tuple[str, Any]]:
+def _outputs(scene: Any, options: argparse.Namespace) -> list[tuple[str, Callable[[], dict[str, Path]]]]:
+    """What the scene asks for beside its trajectory: names, and functions that make it and return where it is."""
     from .data import export
 
-    outputs: list[tuple[str, Any]] = []
+    outputs: list[tuple[str, Callable[[], dict[str, Path]]]] = []
     if scene.render is not None:
         outputs.append(("pictures", lambda: _draw(options.out, scene, options.quiet)))
     if scene.output.vtk:
-        outputs.append(("VTK", lambda: export.export_vtk(options.out)))
+        outputs.append(("VTK", lambda: {"VTK": export.export_vtk(options.out)}))
     if scene.output.ply:
-        outputs.append(("PLY", lambda: export.export_ply(options.out)))
+        outputs.append(("PLY", lambda: {"PLY": export.export_ply(options.out)}))
     return outputs
 
 
-def _draw(folder: Path, scene: Any, quiet: bool) -> Path:
+def _draw(folder: Path, scene: Any, quiet: bool) -> dict[str, Path]:
+    """Draw a run; returns where its pictures and its video are."""
     from .scene.pictures import draw
 
-    if quiet:
-        return draw(folder, scene)[-1]
+    made = draw(folder, scene) if quiet else _draw_with_a_bar(folder, scene)
+    video = {"video": made[-1]} if made[-1].suffix == ".mp4" else {}
+    return {"pictures": made[0].parent, **video}
+
+
+def _draw_with_a_bar(folder: Path, scene: Any) -> list[Path]:
+    from .scene.pictures import draw
+
     with _tqdm()(desc="pictures", unit="frame", total=scene.frames + 1) as bar:
 
         def progress(k: int, frames: int) -> None:
             bar.update(k + 1 - bar.n)
 
-        return draw(folder, scene, progress)[-1]
+        return draw(folder, scene, progress)
 
 
 def _check(options: argparse.Namespace) -> None:
@@ -197,7 +205,8 @@ def _schema(options: argparse.Namespace) -> None:
 def _render(options: argparse.Namespace) -> None:
     from .scene.folder import load_run
 
-    print(_draw(options.run, load_run(options.run, options.overrides), quiet=False))
+    for path in _draw(options.run, load_run(options.run, options.overrides), quiet=False).values():
+        print(path)
 
 
 def _export(options: argparse.Namespace) -> None:

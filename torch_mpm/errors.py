@@ -18,7 +18,7 @@ LARGEST = {dtype: torch.finfo(dtype).max for dtype in FLOATING}
 
 
 def default_dtype() -> torch.dtype:
-    """torch's default dtype, or float32 where that is a half, in which positions mean nothing."""
+    """torch's default dtype, or float32 if that is a half precision, too coarse for positions."""
     dtype = torch.get_default_dtype()
     return dtype if dtype in FLOATING else torch.float32
 
@@ -73,7 +73,7 @@ def check_number(
     holds: Callable[[float], bool] = math.isfinite,
     kinds: str = "a number",
 ) -> float:
-    """A number for which `holds`; `expected` says in words what that is."""
+    """A number for which `holds` is true; `expected` describes it in words."""
     if not holds(check_real(name, value, kinds)):
         raise ValueError(f"{name} must be {expected}, got {value}")
     return value
@@ -90,7 +90,7 @@ def check_count(name: str, value: Any, least: int = 0) -> int:
 
 
 def check_flag(name: str, value: Any) -> bool:
-    """True or False, also as another type's 1 or 0."""
+    """True or False, or a number equal to one of them."""
     if isinstance(value, Tensor) or value not in (True, False):
         raise TypeError(f"{name} must be True or False, got {_described(value)}")
     return bool(value)
@@ -105,7 +105,7 @@ def check_dtype(dtype: Any) -> None:
 
 
 def check_device(device: Any) -> None:
-    """A device, or None; torch says which of them are there."""
+    """A device, or None; torch decides which ones are valid."""
     if device is None or isinstance(device, torch.device):
         return
     if isinstance(device, bool) or not isinstance(device, (str, int)):

@@ -1,4 +1,4 @@
-"""What went wrong in which scene: kept on the device without waiting for it, and told in words."""
+"""What went wrong in which scene: recorded on the device without waiting for it, and described in words."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ class Failures:
         return Failures(failed, problems)
 
     def sentences(self) -> list[str]:
-        """One for each kind of problem that there is; synchronises."""
+        """One for each kind of problem found; synchronises."""
         others, told = [False] * len(self.failed), []
         for kind, problem in sorted(self.problems.items(), key=lambda item: item[0] in CONSEQUENCES):
             sentence = problem.told(others if kind in CONSEQUENCES else [False] * len(others))
@@ -106,7 +106,7 @@ class Failures:
 
 
 def problems_of_status(statuses: Iterable[Tensor], grid: Grid) -> dict[str, Problem]:
-    """What status tensors [1 + B, 8] of `activate` tell about scenes; the first of them that has a problem counts."""
+    """Problems of scenes in status tensors [1 + B, 8] of `activate`; of each scene the first one counts."""
     rows: Tensor | None = None
     for status in statuses:
         rows = status[1:] if rows is None else torch.where(rows[:, 6:7] >= 0, rows, status[1:])
@@ -125,7 +125,7 @@ def problems_of_status(statuses: Iterable[Tensor], grid: Grid) -> dict[str, Prob
 
 
 def problems_of_state(law: Material, state: State, scenes: int) -> dict[str, Problem]:
-    """What a state tells that has all fields that the law needs."""
+    """Problems of a state that has all fields that the law needs."""
 
     def problem(bad: Tensor, what: str, advice: str) -> Problem:
         index = torch.arange(len(state), device=bad.device)
@@ -173,17 +173,17 @@ def refused_steps(count: Tensor) -> Problem:
 
 
 def unsolved_heat(unsolved: Tensor, residual: Tensor, iterations: int) -> dict[str, Problem]:
-    """Solves of heat of each scene that failed, [B], and their largest residual [B] [K], NaN for those without data."""
+    """Failed heat solves of each scene [B], and their largest residual [B] [K], NaN where the data are not finite."""
     without = residual.isnan()
     return {
         "heat_data": Problem(
             torch.where(without, unsolved, 0),
-            "solves of heat had no result",
+            "heat solves had no result",
             "a temperature, a conductivity or a boundary is not finite, or a conductivity is negative",
         ),
         "heat": Problem(
             torch.where(without, 0, unsolved),
-            "solves of heat missed their tolerance",
+            "heat solves missed their tolerance",
             "reduce dt, or raise max_iterations or tolerance",
             size=residual,
             size_in_words=f"a residual of {{:.3g}} K was left after {iterations} iterations",
@@ -207,7 +207,7 @@ def raise_failures(failures: Failures, statuses: Iterable[Tensor], grid: Grid) -
                 outside, lost = outside - row[1], lost - row[3]
         if outside + lost > 0:
             sentences.append(
-                f"{outside + lost} particles have a scene that is not among the {grid.scenes} of the grid, first at "
+                f"{outside + lost} particles have a scene id outside the {grid.scenes} scenes of the grid, first at "
                 f"step {step}: give each particle a scene from 0 to {grid.scenes - 1}"
             )
         if grid.capacity is not None and peak > grid.capacity:

@@ -13,7 +13,7 @@ LIMITS = (
 
 
 def available() -> float:
-    """Memory that can be allocated without swapping [bytes]; infinite where the system does not tell."""
+    """Memory that can be allocated without swapping [bytes]; infinite where the system does not say."""
     return min(_of_machine(), *(_of_container(*files) for files in LIMITS))
 
 

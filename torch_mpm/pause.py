@@ -1,4 +1,4 @@
-"""Scenes that stand still: those whose entry of a tensor dt is zero, or is none that a step could take."""
+"""Paused scenes: those whose entry of a tensor dt is zero, negative or NaN."""
 
 from __future__ import annotations
 
@@ -36,12 +36,12 @@ def paused(
 
 
 def _all_move(dt: Tensor) -> bool:
-    """Whether no scene stands still, where that is known without waiting for a device."""
+    """Whether no scene is paused, where that is known without waiting for a device."""
     return dt.device.type == "cpu" and not is_traced(dt) and bool((dt > 0).all())
 
 
 def split_paused(dt: Tensor, state: State, scenes: int) -> tuple[Tensor, Tensor, Tensor]:
-    """A tensor dt [s] with zero for every scene that stands still, without synchronising.
+    """A tensor dt [s] with zero for every paused scene, without synchronising.
 
     Args:
         dt: of shape [], [1] or [B].

@@ -450,7 +450,7 @@ def _read_array(handle: IO[bytes], size: int) -> Tensor:
     if dtype.kind not in "fiu":
         raise ValueError(f"it must hold numbers, got an array of {dtype}")
     if count * dtype.itemsize > min(size, memory.available() / 4):
-        raise ValueError(f"its array {list(shape)} is larger than its {size} bytes, or than the memory that is free")
+        raise ValueError(f"its array {list(shape)} is larger than its {size} bytes, or than the free memory")
     values = np.frombuffer(handle.read(count * dtype.itemsize), dtype, count).astype(np.float64)
     return torch.from_numpy(values.reshape(shape, order="F" if fortran else "C").copy())
 

@@ -256,7 +256,7 @@ def check_state(state: Any) -> None:
 
 
 def _checked(states: Sequence[State]) -> list[State]:
-    """The states as a list, after a look at what they must have in common."""
+    """The states as a list, after checking what they must have in common."""
     if not isinstance(states, (list, tuple)):
         raise TypeError(f"states must be a list of State, got {shape_of(states)}")
     if wrong := [s for s in states if not isinstance(s, State)]:

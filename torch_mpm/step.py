@@ -121,13 +121,13 @@ class Step(TensorModule):
                     part.dissipation = True
 
     def register_full_backward_hook(self, *arguments: Any, **options: Any) -> Any:
-        """Refused: PyTorch's hooks would never be called for a `State`.
+        """Raises: PyTorch's hooks would never be called for a `State`.
 
         Raises:
             NotImplementedError: always.
         """
         raise NotImplementedError(
-            "a backward hook of a Step would never be called, because a State is no tensor: hook its law "
+            "a backward hook of a Step would never be called, because a State is not a tensor: hook its law "
             "(step.law.register_full_backward_hook), or a tensor of the state (state.x.register_hook)"
         )
 

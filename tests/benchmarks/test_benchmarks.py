@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from benchmark_runs import result, run_quick
+from helpers import result, run_quick
 
 from benchmarks import common, report
 from benchmarks.accuracy import convergence, manufactured, ritter
@@ -156,15 +156,22 @@ def test_report_has_every_section_and_goes_between_its_marks(tmp_path: Path) -> 
     cases = {"cases": [{"name": "2-D", "order": {"displacement": 2.0}, "rows": rows}]}
     for name, found in (("speed_abacus", speed), ("convergence", cases)):
         (tmp_path / f"{name}.json").write_text(json.dumps(found))
-    found = report.sections(tmp_path)
-    tables = report.summary(found, report.OVERVIEW)
+    assert list(report.sections(tmp_path)) == ["Speed", "Convergence"]
+    tables = report.documents(tmp_path)[report.MEASURED]
     cells = [cell.strip() for line in tables.splitlines() if line.startswith("| abacus") for cell in line.split("|")]
     assert cells[1:5] == ["abacus", "1 M", "2", "4.0x"] and cells[7] == "2"
-    assert list(found) == ["Speed", "Convergence"] and tables.index("### Speed") < tables.index("### Convergence")
+    assert tables.index("### Speed") < tables.index("### Convergence")
     document = report.insert(f"before {report.BEGIN} old {report.END} after", tables)
     assert document.startswith("before") and document.endswith("after") and "old" not in document and "4.0x" in document
     with pytest.raises(ValueError, match="needs the lines"):
         report.insert("no marks", tables)
+
+
+def test_tables_of_the_documents_are_those_of_the_results() -> None:
+    """`python -m benchmarks.report --write` writes them."""
+    for document, tables in report.documents(common.RESULTS).items():
+        text = document.read_text()
+        assert report.insert(text, tables) == text, f"{document.name} differs: python -m benchmarks.report --write"
 
 
 def test_return_map_of_sand_against_extended_precision(tmp_path: Path) -> None:

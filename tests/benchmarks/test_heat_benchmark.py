@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from benchmark_runs import result, run_quick
+from helpers import result, run_quick
 
 from benchmarks import report
 

@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from node_blocks import random_blocks
+from helpers import random_blocks
 from torch import Tensor
 
 import torch_mpm as mpm
@@ -215,7 +215,6 @@ def test_a_step_takes_both_ways(dim, device):
 
 
 @pytest.mark.cuda
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 def test_a_step_with_obstacles_is_captured(dim):
     grid = mpm.Grid(0.1, (0.0,) * dim, (1.0,) * dim, capacity=5**dim)
     state = mpm.State.at_rest(mpm.seed.box((0.2,) * dim, (0.8,) * dim, grid), 1000.0, (1.0,) * dim, device="cuda")

@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from node_blocks import random_blocks, random_nodes
+from helpers import random_blocks, random_nodes, relative_error
 from torch import Tensor
 
 import torch_mpm as mpm
@@ -47,7 +47,7 @@ def updated(
 
 
 def assert_close(value: Tensor, expected: Tensor, tolerance: float) -> None:
-    assert float((value.double() - expected.double()).norm()) <= tolerance * float(expected.double().norm())
+    assert relative_error(value, expected) <= tolerance
 
 
 # ---- values

@@ -5,7 +5,7 @@ import math
 
 import pytest
 import torch
-from particles import Particles, random_particles, relative_error
+from helpers import Particles, random_particles, relative_error
 from torch import Tensor
 
 import torch_mpm as mpm

@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from particles import relative_error
+from helpers import relative_error
 from test_heat_cg import check_replay, heat
 
 from torch_mpm.reference import heat as reference

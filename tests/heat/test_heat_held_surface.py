@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from particles import relative_error
+from helpers import relative_error
 from test_heat import FLOAT, block, check_gradients, random_like
 
 import torch_mpm as mpm

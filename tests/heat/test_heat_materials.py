@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from particles import relative_error
+from helpers import relative_error
 
 import torch_mpm as mpm
 from torch_mpm.parameters import evaluate

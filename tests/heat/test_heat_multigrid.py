@@ -4,7 +4,7 @@ import itertools
 
 import pytest
 import torch
-from particles import relative_error
+from helpers import relative_error
 from test_heat_cg import Heat, dense_increment, dense_operator, heat, op_arguments
 from torch import Tensor
 

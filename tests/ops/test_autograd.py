@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import pytest
 import torch
-from particles import random_particles, relative_error
+from helpers import random_particles, relative_error
 from torch.autograd import forward_ad
 from torch.autograd.graph import save_on_cpu, saved_tensors_hooks
 from torch.utils.checkpoint import checkpoint

@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from particles import relative_error
+from helpers import relative_error
 from torch._dynamo.testing import CompileCounter
 
 import torch_mpm as mpm

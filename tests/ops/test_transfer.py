@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from particles import Particles, random_particles, relative_error
+from helpers import Particles, random_particles, relative_error
 
 import torch_mpm as mpm
 from torch_mpm.ops import gather, scatter

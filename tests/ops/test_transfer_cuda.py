@@ -4,13 +4,12 @@ import dataclasses
 
 import pytest
 import torch
-from particles import Particles, random_particles
+from helpers import TOLERANCE, Particles, random_particles, relative_error
 from torch import Tensor
 
 import torch_mpm as mpm
 
-cuda = pytest.mark.skipif(not torch.cuda.is_available() or mpm._library.cuda_error is not None, reason="needs CUDA")
-pytestmark = cuda
+pytestmark = pytest.mark.cuda
 
 
 def uneven_particles(dim: int, kernel: str, **options: object) -> Particles:
@@ -29,11 +28,6 @@ def uneven_particles(dim: int, kernel: str, **options: object) -> Particles:
 def activate(p: Particles) -> tuple[Tensor, ...]:
     blocks = p.blocks()
     return blocks.table, blocks.block, blocks.offsets, blocks.index, blocks.status
-
-
-def relative_error(value: Tensor, expected: Tensor) -> float:
-    expected = expected.double().cpu()
-    return float((value.double().cpu() - expected).norm() / expected.norm())
 
 
 @pytest.mark.parametrize("deterministic", [False, True])
@@ -109,9 +103,9 @@ def test_uneven_particles_agree_with_the_cpu(dim, kernel, deterministic, form):
         loss = (nodes**2).sum() + (v**2).sum() + (C**2).sum() + (grad_v**2).sum()
         results[device, dtype] = [nodes, v, C, grad_v, *torch.autograd.grad(loss, leaves)]
     expected = results["cpu", torch.float64]
-    for dtype, tolerance in [(torch.float64, 1e-12), (torch.float32, 5e-5)]:
+    for dtype, rounding in TOLERANCE.items():
         for value, reference in zip(results["cuda", dtype], expected, strict=True):
-            assert relative_error(value, reference) < tolerance
+            assert relative_error(value, reference) < 50 * rounding  # gradients of sums through three transfers
     assert finite.sum() == len(p.x) - 2
 
 

@@ -6,7 +6,7 @@ import subprocess
 import sys
 
 import pytest
-from scenes import FILE, command
+from helpers import FILE, command
 
 pytest.importorskip("pydantic")
 pytest.importorskip("h5py")
@@ -58,6 +58,9 @@ def test_pictures_and_video(scene, tmp_path, capsys):
     assert [p.name for p in pictures] == ["00000.png", "00001.png", "00002.png"]
     assert (read_png(pictures[0]) != read_png(pictures[2])).any()
     assert (tmp_path / "out" / "video.mp4").read_bytes()[4:8] == b"ftyp"
+    told = [line.split() for line in capsys.readouterr().out.splitlines()]
+    for name, place in {"trajectory": "trajectory.h5", "pictures": "frames", "video": "video.mp4"}.items():
+        assert [name, str(tmp_path / "out" / place)] in told
     assert main(["render", str(tmp_path / "out"), "--set", "render.color_by=material"]) == 0
     assert capsys.readouterr().out.strip().endswith("video.mp4")
 
@@ -130,6 +133,6 @@ def test_ctrl_c_ends_after_a_whole_frame(tmp_path):
             pass
     process.send_signal(signal.SIGINT)
     _, errors = process.communicate()
-    assert process.returncode == 130 and "add --resume to go on" in errors
+    assert process.returncode == 130 and "add --resume to continue" in errors
     with Trajectory(tmp_path / "out") as read:
         assert 2 < len(read) < 30001 and f"stopped after frame {len(read) - 1} of 30000" in errors

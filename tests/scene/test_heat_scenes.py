@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scenes import disc
+from helpers import disc
 
 pytest.importorskip("pydantic")
 pytest.importorskip("h5py")

@@ -7,7 +7,7 @@ import signal
 
 import numpy as np
 import pytest
-from scenes import FILE, command, disc
+from helpers import FILE, command, disc
 
 pytest.importorskip("pydantic")
 pytest.importorskip("h5py")
@@ -243,7 +243,7 @@ def test_two_processes_in_one_folder(scene, unfinished, capsys):
 
     with locked(unfinished):
         errors = told(capsys, "run", scene, "-o", unfinished, "--resume", "--quiet")
-    assert f"another process runs in {unfinished}" in errors
+    assert f"another process is working in {unfinished}" in errors
     assert main(["run", str(scene), "-o", str(unfinished), "--resume", "--quiet"]) == 0
 
 

@@ -4,8 +4,7 @@ import math
 
 import pytest
 import torch
-from benchmark_runs import result, run_quick
-from scenes import disc
+from helpers import disc, result, run_quick
 
 import torch_mpm as mpm
 from benchmarks import report

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from scenes import FILE, command, disc
+from helpers import FILE, command, disc
 
 pytest.importorskip("pydantic")
 pytest.importorskip("h5py")
@@ -127,7 +127,7 @@ def test_folders_that_hold_something_else_are_refused(tmp_path):
     scene = Scene(**disc(device="cpu", duration=0.02))
     (tmp_path / "notes").mkdir()
     (tmp_path / "notes" / "mine.txt").write_text("keep")
-    with pytest.raises(OutputError, match="holds files that are no run of torch_mpm"):
+    with pytest.raises(OutputError, match="holds files that are not a run of torch_mpm"):
         scene.run(tmp_path / "notes")
     with pytest.raises(OutputError, match="is a file"):
         scene.run(tmp_path / "notes" / "mine.txt")

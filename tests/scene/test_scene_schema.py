@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from scenes import FILE, disc
+from helpers import FILE, disc
 
 pytest.importorskip("pydantic")
 
@@ -157,7 +157,7 @@ def test_the_schema_beside_the_examples_is_that_of_the_package():
 
 def test_descriptions_reach_the_schema():
     text = json.dumps(json_schema())
-    assert "Young's modulus [Pa]" in text and "distance of the grid nodes [m]" in text
+    assert "Young's modulus [Pa]" in text and "distance between grid nodes [m]" in text
 
 
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda p: p.stem)

@@ -1,4 +1,4 @@
-"""Files of simulations: trajectories, and what is made of them."""
+"""Files of simulations: trajectories, and their conversion to other formats."""
 
 from .trajectory import Trajectory
 

@@ -76,7 +76,7 @@ def _mesh(position: Array, cells: list[Any], data: dict[str, Array]) -> Any:
 
 
 def _write(path: Path, mesh: Any, options: dict[str, Any]) -> None:
-    """The file appears whole."""
+    """Write a file that appears only when it is complete."""
     building = path.with_name(f".{path.name}")
     try:
         meshio_module().write(building, mesh, file_format=path.suffix[1:], **options)
@@ -93,6 +93,6 @@ def _per_particle(frame: dict[str, Array]) -> dict[str, Array]:
 
 
 def _three_dimensional(value: Array) -> Array:
-    """[P, 2] and [P, 2, 2] filled up with zeros, as both formats have three dimensions; tensors as rows of 9."""
+    """[P, 2] and [P, 2, 2] padded with zeros, since both formats have three dimensions; tensors as rows of 9."""
     padding = [(0, 0)] + [(0, 3 - n) for n in value.shape[1:]]
     return np.pad(value, padding).reshape(len(value), *([-1] if value.ndim > 1 else []))

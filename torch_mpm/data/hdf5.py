@@ -1,4 +1,4 @@
-"""HDF5 files without their dangers: a full disk that HDF5 cannot handle, damaged bytes, and data of other files.
+"""HDF5 files made safe: against a full disk, which HDF5 cannot handle, damaged bytes, and links to other files.
 
 HDF5 crashes at exit after a write that failed, so files are made in memory and written as plain bytes. A *seal* at the
 end of a file holds the SHA-256 of the bytes that will not change; it is checked before HDF5 reads any of them, and
@@ -120,7 +120,7 @@ def check_seal(path: Path, remedy: str) -> None:
         length, digest, magic = FOOTER.unpack(footer) if len(footer) == FOOTER.size else (0, b"", b"")
         end = size - FOOTER.size - length
         if magic != MAGIC or end < 0:
-            raise DamagedFileError(path, "is cut off, or no file of this version of torch_mpm", remedy)
+            raise DamagedFileError(path, "is truncated, or not a file of this version of torch_mpm", remedy)
         handle.seek(end)
         text = handle.read(length)
         try:
@@ -129,7 +129,7 @@ def check_seal(path: Path, remedy: str) -> None:
             extents = [(-1, 0)]
         inside = all(0 <= offset <= offset + count <= end for offset, count in extents)
         if not inside or sum(count for _, count in extents) > end or _digest(handle, extents, text) != digest:
-            raise DamagedFileError(path, "is damaged, its checksum is wrong", remedy)
+            raise DamagedFileError(path, "is damaged: its checksum is wrong", remedy)
 
 
 def _digest(handle: BinaryIO, extents: Extents, text: bytes) -> bytes:
@@ -158,7 +158,7 @@ def open_sealed(path: Path, remedy: str, in_memory: bool = False) -> Any:
     try:
         file = h5py.File(io.BytesIO(path.read_bytes()) if in_memory else path, "r")
     except (OSError, RuntimeError, ValueError, KeyError) as error:
-        raise DamagedFileError(path, f"is no HDF5 file ({error})", remedy) from None
+        raise DamagedFileError(path, f"is not an HDF5 file ({error})", remedy) from None
     problem = _foreign(h5py, file, path.stat().st_size)
     if problem:
         file.close()
@@ -167,7 +167,7 @@ def open_sealed(path: Path, remedy: str, in_memory: bool = False) -> Any:
 
 
 def _foreign(h5py: Any, file: Any, size: int) -> str:
-    """What in a file is no plain array of numbers within it: links, other files' data, filters, groups."""
+    """What in a file is not a plain array of numbers stored in it: links, external data, filters, groups."""
     try:
         for name in file:
             if not isinstance(file.get(name, getlink=True), h5py.HardLink):

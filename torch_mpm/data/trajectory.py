@@ -1,4 +1,4 @@
-"""Trajectories on disk: one HDF5 file that any HDF5 program reads, which no kill at any moment can damage.
+"""Trajectories on disk: one HDF5 file that any HDF5 program reads, and that a kill at any moment cannot damage.
 
 All metadata and the room for all frames are written before the first frame; after that a frame is plain bytes at
 known offsets, followed by the number of whole frames. So the file is valid HDF5 at every moment, half a frame is never
@@ -138,7 +138,7 @@ def _reserve(h5py: Any, out: Any, name: str, shape: tuple[int, ...], dtype: str)
 
 
 class TrajectoryWriter:
-    """Writes frames of a trajectory that `create` made, or goes on with one, from frame ``frames_written``.
+    """Writes frames of a trajectory that `create` made, or continues one from frame ``frames_written``.
 
     Raises:
         DamagedFileError: for a file that is no whole trajectory.
@@ -263,7 +263,7 @@ class Trajectory:
         return array
 
     def verify(self, frames: int) -> None:
-        """Read the first frames and raise DamagedFileError for one that is not as it was written."""
+        """Read the first frames and raise DamagedFileError for one that has changed since it was written."""
         for k in range(frames):
             for name in self.columns:
                 self._check(name, k, self.file[name][k])
@@ -271,14 +271,14 @@ class Trajectory:
     def _check(self, name: str, k: int, row: Any) -> None:
         expected = int(self.file["checksum"][k, self.columns.index(name)])
         if zlib.crc32(np.ascontiguousarray(row).data) != expected:
-            raise DamagedFileError(self.path, f"{name} of frame {k} is damaged, its checksum is wrong", self._remedy)
+            raise DamagedFileError(self.path, f"{name} of frame {k} is damaged: its checksum is wrong", self._remedy)
 
     def names(self, name: str) -> list[str]:
         """Names that the indices of ``material`` or ``scene`` stand for."""
         return [str(n) for n in self.file[name].attrs["names"]]
 
     def frame(self, k: int) -> dict[str, Array]:
-        """Everything about frame ``k``: the fields and statics of its particles, and its scalars."""
+        """All of frame ``k``: the fields and constants of its particles, and its scalars."""
         if not 0 <= k < len(self):
             raise IndexError(f"frame must be between 0 and {len(self) - 1}, got {k}")
         rows = {name: self.file[name][k] for name in self.columns}
@@ -302,7 +302,7 @@ def find(path: str | Path) -> Path:
 
 
 def _problem(file: Any) -> str:
-    """What keeps a file of plain arrays from being a trajectory; "" for nothing."""
+    """Why a file of plain arrays is not a trajectory; "" if it is one."""
     if not np.array_equal(file.attrs.get("format"), FORMAT):
         return "is no trajectory of this version of torch_mpm"
     shapes = {name: data.shape for name, data in file.items()}

@@ -150,7 +150,7 @@ def refuse_vmap(name: str) -> None:
     def vmap(info: Any, in_dims: Any, *args: Any, **kwargs: Any) -> Any:
         raise NotImplementedError(
             f"torch.vmap over torch_mpm::{name} is not supported: pack the scenes into one call with `scene` and "
-            "Grid(scenes=B); in the place of torch.func.jacrev or hessian use those of torch.autograd.functional, or a "
+            "Grid(scenes=B); instead of torch.func.jacrev or hessian use those of torch.autograd.functional, or a "
             "loop over rows"
         )
 

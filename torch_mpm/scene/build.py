@@ -151,7 +151,7 @@ def build(scene: Any, device: torch.device) -> Built:
 
 
 def _named(key: str, make: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
-    """Call ``make``; what it refuses is told under a key of the scene."""
+    """Call ``make``; an error it raises is reported under a key of the scene."""
     try:
         return make(*arguments, **options)
     except (ValueError, TypeError) as error:

@@ -1,4 +1,4 @@
-"""What is wrong with a scene, as far as it can be told before a particle is seeded.
+"""What is wrong with a scene, as far as can be said before a particle is seeded.
 
 Pieces of the scene that could not be understood are None (:mod:`.partial`); what depends on them is not judged.
 """

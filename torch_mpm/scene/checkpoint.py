@@ -1,4 +1,4 @@
-"""The whole state of a run in one HDF5 file, from which it goes on bit for bit."""
+"""The whole state of a run in one HDF5 file, from which it continues bit for bit."""
 
 from __future__ import annotations
 

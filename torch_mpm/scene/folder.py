@@ -35,20 +35,22 @@ def claim(folder: Path, fingerprint: str, resume: bool) -> None:
     if not folder.exists() or all(p.name == LOCK or p.suffix == ".building" for p in folder.iterdir()):
         return
     if not (folder / RUN).is_file():
-        raise OutputError(f"{folder} holds files that are no run of torch_mpm; choose an empty or a new folder")
+        raise OutputError(f"{folder} holds files that are not a run of torch_mpm; choose an empty or a new folder")
     if read_run(folder)["fingerprint"] != fingerprint:
         raise OutputError(f"{folder} holds the run of another scene; choose another folder, or remove it first")
     if (folder / COMPLETE).exists():
         raise OutputError(f"{folder} holds the complete run of this scene; choose another folder, or remove it first")
     if not resume:
-        raise OutputError(f"{folder} holds an unfinished run of this scene; add --resume to go on, or remove it first")
+        raise OutputError(
+            f"{folder} holds an unfinished run of this scene; add --resume to continue, or remove it first"
+        )
 
 
 @contextlib.contextmanager
 def locked(folder: Path) -> Iterator[None]:
     """Keep other processes out of a folder, which is made. The lock ends with this process, however it ends.
 
-    A file system without locks (some network file systems) keeps nobody out.
+    A file system without locks (some network file systems) does not exclude other processes.
 
     Raises:
         OutputError: when another process runs in the folder.
@@ -58,7 +60,9 @@ def locked(folder: Path) -> Iterator[None]:
         try:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            raise OutputError(f"another process runs in {folder}; wait for its end, or choose another folder") from None
+            raise OutputError(
+                f"another process is working in {folder}; wait until it has finished, or choose another folder"
+            ) from None
         except OSError as error:
             if error.errno not in (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP, errno.EINVAL):
                 raise
@@ -92,7 +96,7 @@ def output_errors(folder: Path) -> Iterator[None]:
             raise OutputError(f"cannot use {error.filename or folder} for the output: {reason}") from error
         raise OutputError(
             f"no room on the disk of {folder}: {reason}. The frames written so far are whole; "
-            "free some space and add --resume to go on"
+            "free some space and add --resume to continue"
         ) from error
 
 
@@ -124,7 +128,7 @@ def read_run(folder: Path) -> dict[str, Any]:
     except (ValueError, RecursionError) as error:
         raise DamagedFileError(path, f"is damaged ({error})", REMEDY) from None
     if not isinstance(values, dict) or values.pop("checksum", None) != _checksum(values):
-        raise DamagedFileError(path, "is damaged or was changed, its checksum is wrong", REMEDY)
+        raise DamagedFileError(path, "is damaged or was changed: its checksum is wrong", REMEDY)
     missing = [name for name in ("fingerprint", "scene", "folder") if name not in values]
     if missing:
         raise DamagedFileError(path, f"lacks {', '.join(missing)}", REMEDY)

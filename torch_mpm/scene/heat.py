@@ -21,7 +21,7 @@ THERMAL = tuple(schema.Thermal.model_fields)
 
 
 def problems(scene: Any, entries: Sequence[Any]) -> Iterator[str]:
-    """What the thermal words of a scene lack or have too much."""
+    """Missing and superfluous thermal keys of a scene."""
     for entry in entries:
         used = {item.material for kind in ("body", "emitter") for _, item in entry.keyed(kind)}
         for name, words in entry.material.items():

@@ -1,4 +1,4 @@
-"""What else is wrong with words of which some cannot be understood: the checks of the pieces that can."""
+"""Further mistakes in a scene that could not be read as a whole: checks of the parts that could."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ LISTS = {"body": schema.AnyBody, "obstacle": schema.AnyObstacle, "emitter": sche
 
 
 def problems(words: dict[str, Any]) -> list[str]:
-    """One line for each mistake that shows in spite of the others; none for a piece that could not be read."""
+    """One line for each mistake that can be found in spite of the others; none for a part that could not be read."""
     names = ("grid", "duration", "fps", "render", "gravity")
     scene = schema.SceneData.model_construct(**{name: _field(name, words) for name in names})
     heat = words.get("heat")
@@ -36,7 +36,7 @@ def _entries(words: dict[str, Any]) -> list[ResolvedEntry]:
 
 
 def _content(words: dict[str, Any]) -> schema.Entry:
-    """A scene of a batch, or what all share, with None in the place of pieces that are wrong."""
+    """A scene of a batch, or what all share, with None in place of the parts that are wrong."""
     lists: dict[str, Any] = {
         name: [_piece(kind, item) for item in _list(words.get(name))] for name, kind in LISTS.items()
     }

@@ -39,12 +39,12 @@ Progress = Callable[[dict[str, Any]], None]
 
 
 class Interrupted(RuntimeError):
-    """The run was asked to stop, and did after a whole frame."""
+    """The run was asked to stop, and stopped after a complete frame."""
 
 
 @dataclass
 class Totals:
-    """What the summary tells, kept in the checkpoint so that a resumed run tells it of the whole."""
+    """Figures of the summary, kept in the checkpoint so that a resumed run reports them for the whole run."""
 
     substeps: int = 0
     simulating: float = 0.0
@@ -227,10 +227,10 @@ class Simulation:
 
     def _check_stop(self, stop: Callable[[], bool]) -> None:
         if stop():
-            raise Interrupted(f"stopped after frame {self.frame} of {self.scene.frames}; add --resume to go on")
+            raise Interrupted(f"stopped after frame {self.frame} of {self.scene.frames}; add --resume to continue")
 
     def _put(self, writer: FrameWriter, substeps: int, cfl: float) -> None:
-        """Hand the present state over as the next frame."""
+        """Submit the present state as the next frame."""
         self.frame += 1
         state = self.state
         scalars = {"time": self.scene.time_of(self.frame), "particles": len(state), "substeps": substeps, "cfl": cfl}
@@ -310,7 +310,7 @@ class Simulation:
         return span / count, count
 
     def _segment(self, dt: float, steps: int) -> None:
-        """Some substeps, then a look at the state; what went wrong is found by doing them again."""
+        """Take some substeps, then check the state; a failure is located by repeating them."""
         good = self.state
         try:
             for _ in range(steps):
@@ -342,7 +342,7 @@ class Simulation:
     # -- the end
 
     def summary(self, writer: FrameWriter, seconds: float) -> dict[str, Any]:
-        """What the run took and how well it kept what should be kept."""
+        """Run times of the run, and how well conserved quantities were conserved."""
         first, last = self.totals.first, self._figures
         energy = [sum(v for k, v in values.items() if k.endswith("energy")) for values in (first, last)]
         layers = [self.built.nozzles[k].layer.mass for _, k in self.emissions[: self.emitted]]
@@ -395,7 +395,7 @@ def energies(step: Any, state: Any) -> dict[str, Any]:
 
 
 def versions() -> dict[str, str]:
-    """Versions that a trajectory remembers."""
+    """Versions that are recorded in a trajectory."""
     try:
         own = metadata.version("torch-mpm")
     except metadata.PackageNotFoundError:
@@ -418,7 +418,7 @@ def _stop_signals() -> Iterator[Callable[[], bool]]:
 
     try:
         previous = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
-    except ValueError:  # not the main thread, where signals are somebody else's
+    except ValueError:  # not the main thread, which alone may handle signals
         previous = {}
     try:
         yield lambda: bool(asked)

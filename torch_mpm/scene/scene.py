@@ -1,4 +1,4 @@
-"""`Scene`: a scene file, or the same words in Python."""
+"""`Scene`: a scene file, or the same keys in Python."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ class Scene(schema.SceneData):
 
     @property
     def source(self) -> str:
-        """Name of the file that the scene is from, for messages; "" for a scene made in Python."""
+        """Name of the file that the scene was read from, for messages; "" for a scene made in Python."""
         return self._source
 
     @property
@@ -129,7 +129,7 @@ class Scene(schema.SceneData):
         return [name for name in names if name in {*self.output.fields, *needed}]
 
     def torch_device(self) -> torch.device:
-        """Raises SceneError for a device that is not there."""
+        """Raises SceneError for a device that does not exist."""
         name = self.device
         if name == "auto":
             name = "cuda" if torch.cuda.is_available() else "cpu"
@@ -150,7 +150,7 @@ class Scene(schema.SceneData):
         return [ResolvedEntry.resolved(entry, self, k) for k, entry in enumerate(self.scene)]
 
     def fingerprint(self) -> str:
-        """Hash of all that decides the trajectory, files included.
+        """Hash of everything that determines the trajectory, files included.
 
         Raises:
             SceneError: for a file that cannot be read.
@@ -202,4 +202,4 @@ def _override(words: dict[str, Any], text: str) -> None:
             target = target[int(step)] if isinstance(target, list) else target.setdefault(step, {})
         target[int(steps[-1]) if isinstance(target, list) else steps[-1]] = parsed
     except (KeyError, IndexError, ValueError, TypeError):
-        raise SceneError([f"override {text!r}: there is no {key.strip()} to set"]) from None
+        raise SceneError([f"override {text!r}: there is no {key.strip()}"]) from None

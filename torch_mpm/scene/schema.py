@@ -1,4 +1,4 @@
-"""What a scene file can say. The docstring under each key is its description in messages and in the JSON schema."""
+"""The keys of a scene file. The docstring under each key is its description in messages and in the JSON schema."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ class Grid(Model):
     upper: Vector
     """upper corner of the domain [m]"""
     dx: Positive
-    """distance of the grid nodes [m]"""
+    """distance between grid nodes [m]"""
     kernel: Literal["quadratic", "cubic"] = "quadratic"
-    """B-spline that joins particles and nodes"""
+    """B-spline of the transfers between particles and nodes"""
     walls: Wall | list[Wall | tuple[Wall, Wall]] | None = "slip"
     """what the faces of the domain do: one kind, or a list with one kind or pair (lower, upper) per axis; a mirror is a
-    frictionless wall of second order, and needs a domain of whole or half cells"""
+    frictionless wall of second order, and needs a domain of a whole or half-integer number of cells"""
     friction: NotNegative = 0.0
     """Coulomb friction coefficient of the walls"""
 
@@ -56,7 +56,7 @@ class Curve(Model):
     @model_validator(mode="after")
     def _increasing(self) -> Curve:
         if len(self.temperature) != len(self.value) or len(self.value) < 2:
-            raise ValueError("takes as many values as temperatures, two at least")
+            raise ValueError("takes as many values as temperatures, at least two")
         if any(b <= a for a, b in itertools.pairwise(self.temperature)):
             raise ValueError(f"takes increasing temperatures, got {self.temperature}")
         return self
@@ -284,10 +284,10 @@ class Seeding(Model):
 
 
 class Body(Seeding):
-    """Matter that is there from the start."""
+    """A body that exists from the start."""
 
     name: str = ""
-    """name for messages"""
+    """name in messages"""
     velocity: Vector | None = None
     """initial velocity [m/s]"""
     spin: Spin | None = None
@@ -345,7 +345,7 @@ class CapsuleBody(Body):
 
 
 class MeshBody(Body):
-    """Inside of a closed triangle mesh (3-D)."""
+    """Interior of a closed triangle mesh (3-D)."""
 
     shape: Literal["mesh"] = "mesh"
     """kind of shape"""
@@ -365,7 +365,7 @@ class PointsBody(Body):
     file: str
     """.npy, .npz (x, volume) or .csv (x, y, z, volume) file, relative to the scene file"""
     volume: Positive | None = None
-    """total volume [m^3], needed where the file has no volumes"""
+    """total volume [m^3], needed if the file has no volumes"""
 
 
 AnyBody = Annotated[
@@ -374,10 +374,10 @@ AnyBody = Annotated[
 
 
 class Emitter(Seeding):
-    """A round nozzle (a slit in 2-D) out of which matter flows along its velocity."""
+    """A round nozzle (a slit in 2-D) that emits particles along its velocity."""
 
     name: str = ""
-    """name for messages"""
+    """name in messages"""
     center: Vector
     """centre of the nozzle [m]"""
     radius: Positive
@@ -385,11 +385,11 @@ class Emitter(Seeding):
     velocity: Vector
     """velocity of the flow [m/s], normal to the nozzle"""
     rate: Positive | None = None
-    """volume flow [m^3/s], at most area times speed, which is the default"""
+    """volume flow rate [m^3/s], at most area times speed, which is the default"""
     start: NotNegative = 0.0
-    """time of the first particles [s]"""
+    """time at which it starts to emit [s]"""
     end: Positive | None = None
-    """time of the last particles [s]; the end of the run by default"""
+    """time at which it stops [s]; by default the end of the run"""
 
 
 # ---- obstacles
@@ -399,9 +399,9 @@ class Obstacle(Model):
     """A rigid body that particles cannot enter."""
 
     name: str = ""
-    """name for messages"""
+    """name in messages"""
     contact: Contact = "separate"
-    """what the surface does to matter: holds it (sticky), lets it slide (slip), lets it slide and leave (separate)"""
+    """what particles do at the surface: stick to it (sticky), slide along it (slip), slide and leave it (separate)"""
     friction: NotNegative = 0.0
     """Coulomb friction coefficient"""
     velocity: Vector | None = None
@@ -411,15 +411,15 @@ class Obstacle(Model):
     rotation: Spin | None = None
     """orientation at the start [rad]: an angle in 2-D, a rotation vector in 3-D"""
     start: NotNegative = 0.0
-    """time from which it is there and moves [s]"""
+    """time at which it appears and starts to move [s]"""
     end: Positive | None = None
-    """time from which it is gone [s]"""
+    """time at which it disappears [s]"""
     temperature: float | None = None
-    """temperature at which it holds what it touches [K]; by default it insulates"""
+    """temperature that it imposes on what it touches [K]; by default it insulates"""
     held: Literal["nodes", "surface"] = "nodes"
-    """what it holds at its temperature: the nodes inside, or its surface, which is more accurate"""
+    """where it imposes its temperature: at the nodes inside, or on its surface, which is more accurate"""
     opacity: Annotated[float, Field(gt=0, le=1)] = 1.0
-    """how solid it is drawn, 1 for not transparent"""
+    """opacity in pictures; 1 is opaque"""
 
 
 class PlaneObstacle(Obstacle):
@@ -469,14 +469,14 @@ class CapsuleObstacle(Obstacle):
 
 
 class RevolvedObstacle(Obstacle):
-    """Polygon turned about an axis: cone, tube, funnel, hourglass, drum; in 2-D the polygon and its mirror image."""
+    """Polygon revolved about an axis: cone, tube, funnel, hourglass, drum; in 2-D the polygon and its mirror image."""
 
     shape: Literal["revolved"] = "revolved"
     """kind of shape"""
     outline: Annotated[list[tuple[NotNegative, float]], Field(min_length=3)]
     """corners of the polygon: distance from the axis and position along it [m]"""
     center: Vector
-    """point of the axis from which positions along it count [m]"""
+    """origin of the positions along the axis [m]"""
     axis: Vector | None = None
     """direction of the axis; by default y"""
 
@@ -508,22 +508,22 @@ class Face(Model):
     upper: Vector
     """upper corner [m], equal to the lower one along one axis"""
     flux: float
-    """heat per area into the body [W/m^2]"""
+    """heat flux into the body [W/m^2]"""
 
 
 class Heat(Model):
     """Conduction of heat; every material then needs conductivity and specific_heat."""
 
     reference: float = 0.0
-    """temperature that temperatures are kept relative to [K], best in their middle; where there is no thermal strain"""
+    """temperatures are stored relative to this one [K], best in the middle of their range; no thermal strain there"""
     transfer: Literal["hybrid", "apic", "flip", "pic"] = "hybrid"
-    """how temperature moves between particles and grid"""
+    """how temperature is transferred between particles and grid"""
     method: Literal["cg", "chebyshev", "multigrid"] = "cg"
     """solver of the implicit step; multigrid for diffusion numbers kappa dt/(rho C dx^2) from about 1000"""
     plastic_heating: Annotated[float, Field(ge=0, le=1)] = 0.0
     """share of the plastic work that becomes heat"""
     exchange: list[Exchange] = []
-    """surroundings"""
+    """exchange with the surroundings"""
     face: list[Face] = []
     """heated or cooled faces"""
 
@@ -532,10 +532,10 @@ class Heat(Model):
 
 
 class Output(Model):
-    """What the trajectory holds beside position and velocity, and further formats."""
+    """What is stored in addition to position and velocity, and in which other formats."""
 
     fields: list[Literal["F", "J", "C", "stress", "temperature", "liquid"]] = []
-    """further fields of the trajectory"""
+    """additional fields of the trajectory"""
     vtk: bool = False
     """write a VTK file per frame, with stress"""
     ply: bool = False
@@ -555,9 +555,9 @@ class Render(Model):
     """Pictures (PNG) and video (MP4)."""
 
     color_by: Literal["speed", "stress", "material", "temperature", "liquid", "layer"] = "speed"
-    """what the colours show; layer: by height at the start, or by time for what emitters bring"""
+    """what the colours show; layer: the height at the start, or for emitted particles the time"""
     layers: Annotated[int, Field(ge=1)] = 8
-    """number of layers that the colours tell apart"""
+    """number of layers with colours of their own"""
     range: tuple[float, float] | None = None
     """ends of the colour scale; by default those of the whole run"""
     style: Literal["particles", "surface"] = "particles"
@@ -573,7 +573,7 @@ class Render(Model):
     exaggeration: Positive = 1.0
     """scale of heights over that of lengths (2-D)"""
     every: Annotated[int, Field(ge=1)] = 1
-    """draw one frame in so many"""
+    """draw every n-th frame"""
     video: bool = True
     """make an MP4 of the pictures"""
     ritter: Ritter | None = None
@@ -599,7 +599,7 @@ class Content(Model):
 
 
 class Entry(Content):
-    """One scene of a batch. It has all that the file says outside of it, with its own gravity and materials first."""
+    """One scene of a batch. It inherits everything outside its table; its own gravity and materials take precedence."""
 
     name: str = ""
     """name of the scene"""
@@ -621,15 +621,15 @@ class SceneData(Content):
     dt: Positive | None = None
     """fixed upper bound of the time step [s], instead of cfl"""
     transfer: Literal["apic", "pic", "flip"] = "apic"
-    """how velocity moves between particles and grid"""
+    """how velocity is transferred between particles and grid"""
     flip: Annotated[float, Field(ge=0, le=1)] = 0.0
     """share of FLIP that the transfer is blended with"""
     precision: Literal["float32", "float64"] = "float32"
-    """floating-point numbers of the simulation"""
+    """floating-point type of the simulation"""
     device: str = "auto"
     """"cpu", "cuda", "cuda:1", ... or "auto": a GPU if there is one"""
     seed: Annotated[int, Field(ge=0)] = 0
-    """seed of everything random"""
+    """seed of all random numbers"""
     heat: Heat | None = None
     """conduction of heat; none without this table"""
     scene: list[Entry] = []

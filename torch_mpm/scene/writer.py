@@ -1,4 +1,4 @@
-"""Frames and checkpoints leave the device while it goes on computing, and are written by a thread of their own."""
+"""Frames and checkpoints are copied from the device while it computes, and written by a thread of their own."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class FrameWriter:
 
     def submit(self, frame: int, fields: Mapping[str, Tensor], scalars: Mapping[str, Any], state: Mapping[str, Tensor],
                record: dict[str, Any]) -> None:  # fmt: skip
-        """Hand over a frame: fields in id order, scalars, and the state for the checkpoint.
+        """Queue a frame: fields in id order, scalars, and the state for the checkpoint.
 
         Raises:
             OSError: what went wrong with an earlier frame.
@@ -83,7 +83,7 @@ class FrameWriter:
             raise error
 
     def _to_host(self, tensors: list[Tensor]) -> tuple[list[Tensor], torch.cuda.Event | None]:
-        """Copies in host memory. On CUDA into pinned memory on a stream of their own, so that nobody waits."""
+        """Copies in host memory. On CUDA into pinned memory on a stream of their own, so that nothing waits."""
         if not tensors[0].is_cuda:
             return tensors, None
         device = tensors[0].device
