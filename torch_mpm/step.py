@@ -10,12 +10,13 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint as run_checkpointed
 
+from .activation_record import ActivationRecord
 from .boundaries import BoundaryList, Obstacle, Walls, call_boundary
 from .capture import Kept
 from .cfl import stable_dt
 from .errors import check_count, check_number, check_vector, shape_of
 from .failures import Failures, problems_of_state, raise_failures
-from .grid import ActivationRecord, Blocks, Grid, check_grid
+from .grid import Blocks, Grid, check_grid
 from .heat.heat import Heat
 from .laws.material import Material, as_law
 from .ops import contact, fusible, g2p, g2p_advance, gather, grid_update, p2g
@@ -62,8 +63,8 @@ class Step(TensorModule):
     hooks on the law, whose output is a tensor.
 
     Differentiable in reverse mode, by torch.func.grad and vjp too. `torch.compile(step, fullgraph=True)` needs a grid
-    with a capacity; it compiles again for another number dt (a tensor avoids that), for other strides, and once a field
-    that was None is a tensor.
+    with `max_blocks`; it compiles again for another number dt (a tensor avoids that), for other strides, and once a
+    field that was None is a tensor.
 
     Raises:
         TypeError, ValueError: for a wrong argument.
@@ -144,7 +145,7 @@ class Step(TensorModule):
 
         Raises:
             ValueError, TypeError: for wrong shapes, dtypes or devices, or a number dt that is not positive.
-            GridOverflowError: on the CPU, where a grid of fixed capacity is full.
+            GridOverflowError: on the CPU, where a grid of fixed `max_blocks` is full.
         """
         return paused(self._advanced, self._activations, self.prepare(state), dt, self.grid.scenes)
 

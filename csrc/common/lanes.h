@@ -1,7 +1,7 @@
 #pragma once
 
+#include "common/fields.h"
 #include "common/matrix.h"
-#include "transfer/arguments.h"
 
 // Access of a kernel body to its particles: `One` is the particle of a CUDA thread; cpu/lanes.h has the particles in
 // the lanes of a pack.

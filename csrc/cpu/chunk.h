@@ -1,5 +1,6 @@
 #pragma once
 
+#include "common/fields.h"
 #include "common/pack.h"
 #include "cpu/schedule.h"
 
@@ -302,7 +303,7 @@ struct Tile {
 // Calls f(particle) for the particles that are not transferred.
 template <class T, int D, class F>
 void for_outside(const Topology<T, D>& t, const F& f) {
-  for (int64_t i = t.offsets[t.capacity]; i < t.particles; i++) f(int64_t(t.index[i]));
+  for (int64_t i = t.offsets[t.max_blocks]; i < t.particles; i++) f(int64_t(t.index[i]));
 }
 
 // Calls f(next) once per thread, where next() hands out the homes of a schedule colour by colour.

@@ -1,7 +1,6 @@
 #pragma once
 
-#include "grid/geometry.h"
-#include "transfer/arguments.h"
+#include "grid/topology.h"
 
 // The order of work of the CPU kernels, which `activate` writes into the schedule tensor:
 // homes (slots that hold particles) grouped by colour, so that the nodes touched from two homes of one colour never
@@ -29,10 +28,10 @@ using ScheduleOut = Schedule<int, uint16_t>;
 
 inline namespace TORCH_MPM_ISA {
 
-// Fits into schedule_size() ints: there are at most `capacity` homes, and capacity + particles / kChunk chunks.
+// Fits into schedule_size() ints: there are at most `max_blocks` homes, and max_blocks + particles / kChunk chunks.
 template <int D, class I, class S>
-void lay_out(Schedule<I, S>& s, I* start, int64_t capacity, int64_t particles) {
-  const int64_t homes = capacity < particles ? capacity : particles, chunks = homes + particles / kChunk;
+void lay_out(Schedule<I, S>& s, I* start, int64_t max_blocks, int64_t particles) {
+  const int64_t homes = max_blocks < particles ? max_blocks : particles, chunks = homes + particles / kChunk;
   const auto take = [&](int64_t count) {
     I* p = start;
     start += count;
@@ -51,7 +50,7 @@ void lay_out(Schedule<I, S>& s, I* start, int64_t capacity, int64_t particles) {
 template <class T, int D>
 ScheduleIn schedule_of(const Topology<T, D>& t) {
   ScheduleIn s;
-  lay_out<D>(s, t.schedule, t.capacity, t.particles);
+  lay_out<D>(s, t.schedule, t.max_blocks, t.particles);
   return s;
 }
 

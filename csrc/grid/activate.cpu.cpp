@@ -44,7 +44,7 @@ struct Activation {
       : a(arguments),
         w(activate_layout(a, static_cast<char*>(a.workspace))),
         table_size(int64_t(a.scenes) * a.geometry.blocks_per_scene) {
-    lay_out<D>(schedule, a.schedule, a.capacity, a.particles);
+    lay_out<D>(schedule, a.schedule, a.max_blocks, a.particles);
     for (int o = 0; o < kColours<D>; o++) {
       neighbour[o] = 0;
       for (int i = 0; i < D; i++) neighbour[o] = neighbour[o] * a.geometry.blocks[i] + (o >> (D - 1 - i) & 1);
@@ -215,7 +215,7 @@ int64_t number_blocks(const Activation<T, D>& s) {
   for_parts(s.w.slices, s.table_size, [&](int slice, int64_t begin, int64_t end) {
     int64_t next = s.totals(slice)[W::kActive];
     for (int64_t b = begin; b < end; b++) {
-      const bool given = a.table[b] && next < a.capacity;
+      const bool given = a.table[b] && next < a.max_blocks;
       next += a.table[b];
       a.table[b] = given ? int(next - 1) : -1;
       if (given) a.block[next - 1] = int(b);
@@ -259,8 +259,8 @@ int64_t place_slots(const Activation<T, D>& s, int64_t slots) {
       }
     }
   });
-  for (int64_t slot = slots; slot < a.capacity; slot++) a.block[slot] = -1;
-  for (int64_t slot = slots; slot <= a.capacity; slot++) a.offsets[slot] = int(transferred);
+  for (int64_t slot = slots; slot < a.max_blocks; slot++) a.block[slot] = -1;
+  for (int64_t slot = slots; slot <= a.max_blocks; slot++) a.offsets[slot] = int(transferred);
   return transferred;
 }
 
@@ -376,7 +376,7 @@ void write_status(const Activation<T, D>& s, int64_t wanted, int64_t transferred
     if (report(row, activation, place, p))
       row[place == Place::outside ? kOutsideId : kNonFiniteId] = a.id ? int(a.id[p * a.id_stride]) : p;
   }
-  if (wanted > a.capacity && status[kProblemActivation] < 0) status[kProblemActivation] = activation;
+  if (wanted > a.max_blocks && status[kProblemActivation] < 0) status[kProblemActivation] = activation;
   status[kActivations]++;
   status[kBlocksNow] = int(wanted);
   if (wanted > status[kBlocksWanted]) status[kBlocksWanted] = int(wanted);
@@ -390,12 +390,12 @@ void activate(const ActivateArguments<T, D>& a) {
     count_homes<Order>(s, slice, begin, end);
   });
   const int64_t wanted = number_blocks(s);
-  if (wanted > a.capacity)
+  if (wanted > a.max_blocks)
     for_parts(s.w.slices, a.particles, [&](int slice, int64_t begin, int64_t end) {
       drop_homeless<Order>(s, begin, end);
       count_homes<Order>(s, slice, begin, end);
     });
-  const int64_t slots = wanted < a.capacity ? wanted : a.capacity;
+  const int64_t slots = wanted < a.max_blocks ? wanted : a.max_blocks;
   const int64_t transferred = place_slots(s, slots);
   s.scan(W::kDropped);
   for_parts(s.w.slices, a.particles, [&](int slice, int64_t begin, int64_t end) {
@@ -419,7 +419,7 @@ void cell_order(const CellOrderArguments<T, D>& a) {
       for (int i = 0; i < chunk.count; i++) a.order[s.chunk_begin[c] + i] = chunk.id[chunk.by_cell(i)];
     }
   });
-  for (int64_t i = a.topology.offsets[a.topology.capacity]; i < a.topology.particles; i++)
+  for (int64_t i = a.topology.offsets[a.topology.max_blocks]; i < a.topology.particles; i++)
     a.order[i] = a.topology.index[i];
 }
 

@@ -1,7 +1,7 @@
 #pragma once
 
 #include "cpu/parallel.h"
-#include "transfer/arguments.h"
+#include "grid/activate.h"
 
 namespace mpm::cpu {
 

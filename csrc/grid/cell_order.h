@@ -1,6 +1,7 @@
 #pragma once
 
-#include "transfer/arguments.h"
+#include "common/fields.h"
+#include "grid/topology.h"
 
 namespace mpm {
 

@@ -157,7 +157,7 @@ struct HeatSolver {
   // f(node) for the nodes of every slot whose scene is wanted; the returned sums are kept by slot.
   template <class Wanted, class F>
   void for_slots(const Wanted& wanted, const F& f) const {
-    parallel_ranges(a.topology.capacity, kGrain, [&](int64_t begin, int64_t end) {
+    parallel_ranges(a.topology.max_blocks, kGrain, [&](int64_t begin, int64_t end) {
       for (int64_t slot = begin; slot < end; slot++)
         if (const int scene = scene_of(slot); wanted(scene)) f(slot, scene, slot * kBlockNodes<D>);
     });
@@ -165,7 +165,7 @@ struct HeatSolver {
   bool running(int scene) const { return scene >= 0 && w.scene[scene].running; }
 
   void start() const {
-    const int64_t nodes = a.topology.capacity * int64_t(kBlockNodes<D>);
+    const int64_t nodes = a.topology.max_blocks * int64_t(kBlockNodes<D>);
     parallel_ranges(nodes, 65536, [&](int64_t begin, int64_t end) {
       T* const vectors[] = {w.v.product, w.v.inverse, w.v.weight};
       for (T* vector : vectors) __builtin_memset(vector + begin, 0, (end - begin) * sizeof(T));
@@ -196,7 +196,7 @@ struct HeatSolver {
     int64_t slot = 0;
     for (int scene = 0; scene < a.topology.scenes; scene++) {
       Sum sum = zero;
-      for (; slot < a.topology.capacity && scene_of(slot) <= scene && scene_of(slot) >= 0; slot++)
+      for (; slot < a.topology.max_blocks && scene_of(slot) <= scene && scene_of(slot) >= 0; slot++)
         if (wanted(scene)) sum.add(kept[slot]);
       if (wanted(scene)) f(scene, sum);
     }
@@ -266,7 +266,7 @@ void heat_stencil(const HeatOperatorArguments<T, D>& a) {
   for (int pair = 0; pair < kPairs<D>; pair++) {
     int e[D];
     pair_offset<D>(pair, e);
-    T* const sum = a.sum + pair * int64_t(a.topology.capacity) * kBlockNodes<D>;
+    T* const sum = a.sum + pair * int64_t(a.topology.max_blocks) * kBlockNodes<D>;
     sum_particles<HeatSum::pair, Order>(a.topology, a.x, a.conductance, a.nodes, sum, all, nothing, e);
   }
 }

@@ -95,7 +95,7 @@ struct SceneRange {
 // Of one solve; more would find nothing to do.
 template <class T, int D>
 int64_t most_thread_blocks(const Topology<T, D>& t) {
-  return std::max<int64_t>(most_items(t.capacity, t.particles), t.capacity) / 4 + 1;
+  return std::max<int64_t>(most_items(t.max_blocks, t.particles), t.max_blocks) / 4 + 1;
 }
 
 // Work space in global memory. A part of a sum is what one thread block adds to one scene. Blocks take their items and
@@ -125,7 +125,7 @@ struct HeatWorkspace {
       size += (bytes + 255) / 256 * 256;
       return p;
     };
-    const int64_t items = most_items(t.capacity, t.particles), nodes = t.capacity * int64_t(kBlockNodes<D>);
+    const int64_t items = most_items(t.max_blocks, t.particles), nodes = t.max_blocks * int64_t(kBlockNodes<D>);
     packed.particles = reinterpret_cast<PackedParticle<T, D>*>(take(t.particles * sizeof(PackedParticle<T, D>)));
     packed.counts = reinterpret_cast<uint16_t*>(take(items * kBlockNodes<D> * sizeof(uint16_t)));
     if (!vectors) return;
@@ -486,7 +486,7 @@ struct HeatKernel {
       return entries_below(*schedule_of(a.topology).item_count, [&](int i) { return scene_of_item(i) < s; });
     };
     const auto slot = [&](int s) {
-      return entries_below(a.topology.capacity,
+      return entries_below(a.topology.max_blocks,
                            [&](int i) { return a.topology.block[i] >= 0 && scene_of_slot(i) < s; });
     };
     r.item = item(scene);
@@ -583,7 +583,7 @@ __device__ void HeatKernel<Order, T, D>::start(WarpMemory<S>& memory) const {
   const Topology<T, D>& t = a.topology;
   const int64_t threads = int64_t(gridDim.x) * blockDim.x, thread = int64_t(blockIdx.x) * blockDim.x + threadIdx.x;
   const auto all = [&](int scene) { return takes(scene); };
-  for (int64_t quad = thread; quad < int64_t(t.capacity) * kSlotQuads<D>; quad += threads) {
+  for (int64_t quad = thread; quad < int64_t(t.max_blocks) * kSlotQuads<D>; quad += threads) {
     T* const vectors[] = {w.v.product, w.v.inverse, w.v.weight};
 #pragma unroll
     for (T* vector : vectors) store_quad(vector + quad * kBlockWidth, Quad<T>{});
@@ -629,7 +629,7 @@ __device__ void HeatKernel<Order, T, D>::start(WarpMemory<S>& memory) const {
     });
     put_part(w.start, scene, sums);
   });
-  for (int64_t quad = int64_t(*w.used) * kSlotQuads<D> + thread; quad < int64_t(t.capacity) * kSlotQuads<D>;
+  for (int64_t quad = int64_t(*w.used) * kSlotQuads<D> + thread; quad < int64_t(t.max_blocks) * kSlotQuads<D>;
        quad += threads)
     store_quad(a.increment + quad * kBlockWidth, Quad<T>{});
   wait_for_all();
@@ -791,7 +791,7 @@ void heat_cg(const HeatArguments<T, D>& a, Stream stream) {
 
 template <int Order, class T, int D>
 void heat_operator(const HeatOperatorArguments<T, D>& a, Stream stream) {
-  const int64_t items = most_items(a.topology.capacity, a.topology.particles);
+  const int64_t items = most_items(a.topology.max_blocks, a.topology.particles);
   if (items == 0) return;
   const HeatWorkspace<T, D> w(a.topology, a.workspace, false);
   for (int colour = a.deterministic ? 0 : -1; colour < (a.deterministic ? 1 << D : 0); colour++)

@@ -14,7 +14,7 @@ constexpr int kThreads = 128;
 template <int Order, class T, int D>
 __global__ void __launch_bounds__(kThreads) stencil_kernel(const HeatOperatorArguments<T, D> a) {
   const Topology<T, D>& t = a.topology;
-  const int64_t count = int64_t(t.capacity) * kBlockNodes<D>, node = int64_t(blockIdx.x) * kThreads + threadIdx.x;
+  const int64_t count = int64_t(t.max_blocks) * kBlockNodes<D>, node = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   if (node >= count) return;
   const int block = t.block[node / kBlockNodes<D>];
   if (block < 0) return;
@@ -100,7 +100,7 @@ unsigned blocks_for(int64_t threads) { return unsigned((threads + kThreads - 1) 
 
 template <int Order, class T, int D>
 void heat_stencil(const HeatOperatorArguments<T, D>& a, Stream stream) {
-  const int64_t nodes = int64_t(a.topology.capacity) * kBlockNodes<D>;
+  const int64_t nodes = int64_t(a.topology.max_blocks) * kBlockNodes<D>;
   if (nodes > 0) launch(stencil_kernel<Order, T, D>, blocks_for(nodes), kThreads, 0, stream, a);
 }
 

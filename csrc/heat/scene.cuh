@@ -154,7 +154,7 @@ struct SceneSolver {
     for (int number = warp_index(); number < 3; number += warps()) {
       const int wanted = number < 2 ? scene + number : t.scenes;
       const int slot = first_not_below(
-          t.capacity, [&](int i) { return t.block[i] >= 0 && t.block[i] / t.geometry.blocks_per_scene < wanted; });
+          t.max_blocks, [&](int i) { return t.block[i] >= 0 && t.block[i] / t.geometry.blocks_per_scene < wanted; });
       if (lane_index() == 0) (number == 0 ? s.slot : number == 1 ? s.slot_end : s.used) = slot;
     }
     if (threadIdx.x < D) {
@@ -172,7 +172,7 @@ struct SceneSolver {
 
   // Unused rows, shared among the scenes.
   __device__ void clear_unused() const {
-    const int64_t last = int64_t(t.capacity) * kBlockNodes<D>, stride = int64_t(gridDim.x) * blockDim.x;
+    const int64_t last = int64_t(t.max_blocks) * kBlockNodes<D>, stride = int64_t(gridDim.x) * blockDim.x;
     int64_t row = int64_t(s.used) * kBlockNodes<D> + int64_t(blockIdx.x) * blockDim.x + threadIdx.x;
     for (; row < last; row += stride) k.a.increment[row] = T(0);
   }
@@ -236,7 +236,7 @@ struct SceneSolver {
     }
   }
 
-  // The box around the supports of the particles and the nodes with capacity. False if the scene is too large.
+  // The box around the supports of the particles and the nodes with heat capacity. False if the scene is too large.
   __device__ bool set_box() {
     if (end - begin > k.most_particles) return false;
     int low[D], high[D];
@@ -254,7 +254,7 @@ struct SceneSolver {
     };
     for_particles([&](int, const int* base) { include(base, Order + 1); });
     for_rows([&](int row) {
-      if (k.a.capacity[row] <= T(0)) return;
+      if (k.a.heat_capacity[row] <= T(0)) return;
       int node[D];
       node_of_row(row, node);
       include(node, 1);
@@ -502,7 +502,7 @@ void solve_scenes(SceneKernel<Order, T, D> kernel, Stream stream) {
   const int together = t.scenes > device_attribute(cudaDevAttrMultiProcessorCount) ? 2 : 1;
   const int reserved = 5 * 1024;  // for the system, and for what is not dynamic
   const int room = device_attribute(cudaDevAttrMaxSharedMemoryPerMultiprocessor) / together - reserved;
-  const int64_t nodes = int64_t(t.capacity) * kBlockNodes<D> / t.scenes * 3 / 4;
+  const int64_t nodes = int64_t(t.max_blocks) * kBlockNodes<D> / t.scenes * 3 / 4;
   kernel.most_nodes = int(std::min<int64_t>(room / (2 * sizeof(T)), std::max<int64_t>(nodes, kFewNodes)));
   kernel.most_particles = int(std::max<int64_t>(kFewParticles, 2 * t.particles / t.scenes));
   kernel.x = Columns<const T, D>(kernel.a.x);

@@ -316,7 +316,7 @@ __device__ void gather_by_items(const Task& task, const Schedule<const int>& sch
     }
   }
   const int64_t stride = int64_t(gridDim.x) * kGatherThreads;
-  for (int64_t i = t.offsets[t.capacity] + int64_t(blockIdx.x) * kGatherThreads + threadIdx.x; i < t.particles;
+  for (int64_t i = t.offsets[t.max_blocks] + int64_t(blockIdx.x) * kGatherThreads + threadIdx.x; i < t.particles;
        i += stride)
     task.leave_out(t.index[i]);
 }
@@ -334,7 +334,7 @@ template <class Task>
 void launch_gather(const Task& task, Stream stream) {
   const int64_t particles = task.topology.particles;
   if (particles == 0) return;
-  const int64_t pieces = std::max(most_items(task.topology.capacity, particles), particles / kGatherThreads);
+  const int64_t pieces = std::max(most_items(task.topology.max_blocks, particles), particles / kGatherThreads);
   if constexpr (Task::K == 3 || Task::K == 4) {
     if (is_vector<Task::K>(task.nodes))
       return launch(gather_kernel<true, Task>, grid_size(pieces), kGatherThreads, 0, stream, task);

@@ -420,7 +420,7 @@ __global__ void __launch_bounds__(Source::Shape::threads, Source::resident)
 template <class Source>
 void launch_scatter(const Source& source, bool deterministic, Stream stream) {
   using S = typename Source::Shape;
-  const int64_t items = most_items(source.topology.capacity, source.topology.particles);
+  const int64_t items = most_items(source.topology.max_blocks, source.topology.particles);
   if (items == 0) return;
   for (int colour = deterministic ? 0 : -1; colour < (deterministic ? 1 << S::D : 0); colour++)
     launch(scatter_kernel<Source>, grid_size(items), S::threads, S::shared_bytes, stream, source, colour);

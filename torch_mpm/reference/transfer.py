@@ -9,7 +9,7 @@ import math
 import torch
 from torch import Tensor
 
-from ..grid import BLOCK_WIDTH, PADDING, Blocks
+from ..topology import BLOCK_WIDTH, PADDING, Topology
 
 
 def bspline(distance: Tensor, order: int) -> Tensor:
@@ -30,7 +30,7 @@ class Support:
     weight_gradient: Tensor  # [P, S, D]
 
 
-def support(blocks: Blocks, x: Tensor) -> Support:
+def support(blocks: Topology, x: Tensor) -> Support:
     """Weights are zero for particles whose support is not inside the active blocks."""
     grid = blocks.grid
     lower = torch.tensor(grid.lower, dtype=x.dtype, device=x.device)
@@ -73,7 +73,7 @@ def _bspline_derivative(r: Tensor, order: int) -> Tensor:
 
 
 def scatter(
-    blocks: Blocks, x: Tensor, value: Tensor, moment: Tensor | None, gradient: Tensor | None, moment_scale: float
+    blocks: Topology, x: Tensor, value: Tensor, moment: Tensor | None, gradient: Tensor | None, moment_scale: float
 ) -> Tensor:
     """nodes_i = Σ_p N_i (value_p + scale moment_p (x_i − x_p)) + gradient_p ∇N_i; see `torch_mpm.ops.scatter`."""
     s = support(blocks, x)
@@ -86,7 +86,7 @@ def scatter(
     return nodes.index_add(0, s.rows.reshape(-1), given.reshape(-1, value.shape[1]))
 
 
-def gather(blocks: Blocks, x: Tensor, nodes: Tensor, moment_scale: float) -> tuple[Tensor, Tensor, Tensor]:
+def gather(blocks: Topology, x: Tensor, nodes: Tensor, moment_scale: float) -> tuple[Tensor, Tensor, Tensor]:
     """The adjoint of `scatter`: value, moment, gradient; see `torch_mpm.ops.gather`."""
     s = support(blocks, x)
     g = nodes[s.rows]
@@ -96,7 +96,7 @@ def gather(blocks: Blocks, x: Tensor, nodes: Tensor, moment_scale: float) -> tup
 
 
 def position_gradient(
-    blocks: Blocks,
+    blocks: Topology,
     x: Tensor,
     value: Tensor,
     moment: Tensor | None,
@@ -112,7 +112,7 @@ def position_gradient(
 
 
 def p2g(
-    blocks: Blocks,
+    blocks: Topology,
     x: Tensor,
     mass: Tensor,
     v: Tensor,
@@ -139,16 +139,16 @@ def p2g(
     return scatter(blocks, x, value, moment, gradient, 1.0)
 
 
-def g2p(blocks: Blocks, x: Tensor, velocity: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def g2p(blocks: Topology, x: Tensor, velocity: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """v, C = D⁻¹ Σ N_i v_i (x_i − x_p)ᵀ and ∇v of each particle; see `torch_mpm.ops.g2p`."""
     lost = torch.where(x.isfinite().all(1), 0.0, torch.nan)
     v, C, gradient = gather(blocks, x, velocity, blocks.grid.inverse_inertia)
     return v + lost[:, None], C + lost[:, None, None], gradient + lost[:, None, None]
 
 
-def dense_blocks(blocks: Blocks) -> Blocks:
+def dense_blocks(blocks: Topology) -> Topology:
     """The same lattice with every block active: an activation-independent topology for checks."""
     grid = blocks.grid
-    count = grid.scenes * math.prod(grid.blocks)
+    count = blocks.scenes * math.prod(grid.blocks)
     table = torch.arange(count, dtype=torch.int32, device=blocks.table.device)
     return dataclasses.replace(blocks, table=table, block=table)
