@@ -7,17 +7,17 @@
 #include "grid/activate.h"
 #include "grid/status.h"
 
-// Finds the active blocks and groups the particles by home block, without the host knowing any count.
-//   classify   home block and rank of every particle, number of particles and touched neighbours of every block
+// Finds the active blocks and groups the particles by base block, without the host knowing any count.
+//   classify   base block and rank of every particle, number of particles and touched neighbours of every block
 //   slots      numbers the active blocks in the order of the table (one-pass scan)
 //   offsets    first particle and work items of every slot (one-pass scan)
-//   place      the index tensor, homes and neighbours, unused slots, status
+//   place      the index tensor, base blocks and neighbours, unused slots, status
 // Deterministic mode replaces the ranks, which depend on the order of atomics, by a stable sort.
 namespace mpm::cuda {
 namespace {
 
 constexpr int kThreads = 256;
-// Every kSampling-th thread block counts the home blocks met by its warps. More than kScattered per warp on average,
+// Every kSampling-th thread block counts the base blocks met by its warps. More than kScattered per warp on average,
 // and the gathers are faster in the order of memory than block by block.
 constexpr int kSampling = 64, kScattered = 2;
 using Packed = unsigned long long;
@@ -343,10 +343,10 @@ __global__ void __launch_bounds__(kThreads) place(const ActivateArguments<T, D> 
     if (i < a.max_blocks) a.block[i] = -1;
   }
   if (i >= a.particles) return;
-  const int key = w.key[i], first = key < 0 ? -1 : w.tally[key].count, home = first < 0 ? -1 : a.table[key];
-  schedule.home[i] = home;
+  const int key = w.key[i], first = key < 0 ? -1 : w.tally[key].count, base_slot = first < 0 ? -1 : a.table[key];
+  schedule.base_slot[i] = base_slot;
   if (a.deterministic) {
-    w.slot[i] = home < 0 ? a.max_blocks : home;
+    w.slot[i] = base_slot < 0 ? a.max_blocks : base_slot;
     w.id[i] = int(i);
   } else {
     const int rank = w.rank[i];

@@ -1,7 +1,9 @@
 #include <cooperative_groups.h>
 
-#include "cuda/home.cuh"
+#include "cuda/base_block.cuh"
+#include "cuda/columns.cuh"
 #include "cuda/launch.cuh"
+#include "cuda/quad.cuh"
 #include "heat/cell.h"
 #include "heat/scene.cuh"
 #include "heat/solve.h"
@@ -34,26 +36,11 @@ struct HeatShape {
   static constexpr int cells = kBlockNodes<D>;
   static constexpr int slices = cells < 32 ? 32 / cells : 1;  // lanes that share the particles of a cell
   static constexpr int parts = cells * slices / 32;           // of a block, one warp wide
-  // A tile holds the nodes of a home and the next Order along each axis: rows of two blocks, and planes set apart so
-  // that the cells of a part lie in different banks.
+  // A tile holds the nodes of a base block and the next Order along each axis: rows of two blocks, and planes set apart
+  // so that the cells of a part lie in different banks.
   static constexpr int width = kBlockWidth + Order, row = 2 * kBlockWidth, plane = width * row + kBlockWidth;
   static constexpr int tile = D == 2 ? width * row : width * plane;
 };
-
-// Nodes of a row of a block.
-template <class T>
-struct alignas(16) Quad {
-  T e[kBlockWidth];
-};
-
-template <class T>
-__device__ Quad<T> load_quad(const T* p) {
-  return *reinterpret_cast<const Quad<T>*>(p);
-}
-template <class T>
-__device__ void store_quad(T* p, const Quad<T>& q) {
-  *reinterpret_cast<Quad<T>*>(p) = q;
-}
 
 // Read by one warp only, which leaves the cache to the nodes.
 template <class P>
@@ -203,8 +190,8 @@ __device__ void pack_item(const Topology<T, D>& t, const Columns<const T, D>& x,
   auto& m = memory.sort;
   const int lane = lane_index(), n = item.end - item.begin;
   const int* const index = t.index + item.begin;
-  Home<T, D> home;
-  home.template set<S::Order>(t, item.block);
+  BaseBlock<T, D> base_block;
+  base_block.template set<S::Order>(t, item.block);
   __syncwarp();
   for (int c = lane; c <= S::cells; c += 32) m.count[c] = 0;
   __syncwarp();
@@ -218,7 +205,7 @@ __device__ void pack_item(const Topology<T, D>& t, const Columns<const T, D>& x,
     particle = index_at(k + 64);
     int cell = -1;
     T f[D];
-    if (k < n) home.template locate<S::Order>(t.geometry, position, cell, f);
+    if (k < n) base_block.template locate<S::Order>(t.geometry, position, cell, f);
     const unsigned group = __match_any_sync(~0u, cell);
     const int before = __popc(group & ((1u << lane) - 1)), counted = cell >= 0 ? m.count[cell] : 0;
     __syncwarp();
@@ -254,7 +241,7 @@ __device__ void pack_item(const Topology<T, D>& t, const Columns<const T, D>& x,
     conductance_ahead = conductance.at(particle);
     particle = index_at(k + 64);
     int cell;
-    if (!home.template locate<S::Order>(t.geometry, position, cell, q.f)) continue;
+    if (!base_block.template locate<S::Order>(t.geometry, position, cell, q.f)) continue;
     const int row = m.row[cell / width] + m.rank[k] / S::slices;
     const int place = m.rank[k] % S::slices * width + cell % width;
     const int at = m.start[row] + __popc(m.lanes[row] & ((1u << place) - 1));
@@ -263,8 +250,8 @@ __device__ void pack_item(const Topology<T, D>& t, const Columns<const T, D>& x,
   __syncwarp();
 }
 
-// The quads of a home's tile, in rounds of a warp's width: quad r of a lane lies at entry at[r] of the tile, and at
-// node node[r], -1 where it is none.
+// The quads of a base block's tile, in rounds of a warp's width: quad r of a lane lies at entry at[r] of the tile, and
+// at node node[r], -1 where it is none.
 template <class S>
 struct TileQuads {
   static constexpr int rows = S::D == 2 ? S::width : S::width * S::width, rounds = (2 * rows + 31) / 32;
@@ -315,8 +302,8 @@ __device__ void add_quad(T* nodes, const Quad<T>& q) {
       if (q.e[k] != T(0)) atomicAdd(nodes + k, q.e[k]);
 }
 
-// Adds a sum over the packed particles of the items [number, end), which are of one home, to the nodes; returns Σ κ V
-// |∇u|², the same in all lanes.
+// Adds a sum over the packed particles of the items [number, end), which are of one base block, to the nodes; returns Σ
+// κ V |∇u|², the same in all lanes.
 template <HeatSum Sum, class S, class T, int D>
 __device__ T sum_items(const Topology<T, D>& t, const PackedItems<T, D>& packed, int number, int end, const T* u,
                        T* out, bool in_order, WarpMemory<S>& memory) {
@@ -382,17 +369,8 @@ __device__ T sum_items(const Topology<T, D>& t, const PackedItems<T, D>& packed,
   return power;
 }
 
-template <class T, int D>
-__device__ int colour_of_home(const Topology<T, D>& t, int home) {
-  int block[D], colour = 0;
-  block_coordinates(t.geometry, home, block);
-#pragma unroll
-  for (int i = 0; i < D; i++) colour = colour * 2 + (block[i] & 1);
-  return colour;
-}
-
 // f(first item, end) for the items from `first` on that are this warp's, every `stride`-th; for a colour >= 0, the
-// homes of that colour, whole.
+// base blocks of that colour, whole.
 template <class T, int D, class F>
 __device__ void for_items(const Topology<T, D>& t, int first, int last, int stride, int colour, const F& f) {
   const Schedule<const int> schedule = schedule_of(t);
@@ -401,7 +379,7 @@ __device__ void for_items(const Topology<T, D>& t, int first, int last, int stri
   for (int i = first; i < last; i += stride) {
     int end = i + 1;
     if (colour >= 0) {
-      if (colour_of_home(t, items[i].block) != colour || items[i].begin != t.offsets[items[i].slot]) continue;
+      if (block_colour(t.geometry, items[i].block) != colour || items[i].begin != t.offsets[items[i].slot]) continue;
       while (end < *schedule.item_count && items[end].slot == items[i].slot) end++;
     }
     f(i, end);

@@ -1,4 +1,5 @@
-#include "cuda/home.cuh"
+#include "cuda/base_block.cuh"
+#include "cuda/columns.cuh"
 #include "cuda/launch.cuh"
 #include "heat/cell.h"
 #include "heat/patches.h"
@@ -27,15 +28,15 @@ __global__ void __launch_bounds__(kThreads) stencil_kernel(const HeatOperatorArg
   }
   T sum[kPairs<D>] = {};
   for (int o = 0; o < 1 << D; o++) {
-    int home[D];
+    int base_block[D];
     bool reaches = true;
 #pragma unroll
     for (int i = 0; i < D; i++) {
       const int before = o >> i & 1;
-      home[i] = own[i] - before;
-      reaches = reaches && home[i] >= 0 && (!before || local[i] < Order);
+      base_block[i] = own[i] - before;
+      reaches = reaches && base_block[i] >= 0 && (!before || local[i] < Order);
     }
-    const int slot = reaches ? t.table[block_index(t.geometry, scene, home)] : -1;
+    const int slot = reaches ? t.table[block_index(t.geometry, scene, base_block)] : -1;
     if (slot < 0) continue;
     for (int k = t.offsets[slot]; k < t.offsets[slot + 1]; k++) {
       const int64_t p = t.index[k];

@@ -2,7 +2,8 @@
 
 #include <climits>
 
-#include "cuda/home.cuh"
+#include "cuda/base_block.cuh"
+#include "cuda/columns.cuh"
 #include "cuda/launch.cuh"
 #include "heat/cell.h"
 #include "heat/solve.h"
@@ -202,35 +203,35 @@ struct SceneSolver {
     return slot < 0 ? -1 : slot * kBlockNodes<D> + node_in_block<D>(node);
   }
 
-  // Base node of particle p and distances from it. False for a particle that is not at home: its position is not the
-  // one that was activated.
-  __device__ bool locate_particle(const Vector<T, D>& position, int home, int* base, T* f) const {
+  // Base node of particle p and distances from it. False for a particle that is not in its base block: its position is
+  // not the one that was activated.
+  __device__ bool locate_particle(const Vector<T, D>& position, int base_block, int* base, T* f) const {
     const bool inside = locate<Order>(t.geometry, position.e, base, f);
     int block[D];
 #pragma unroll
     for (int i = 0; i < D; i++) block[i] = base[i] / kBlockWidth;
-    return inside && block_index(t.geometry, scene, block) == home;
+    return inside && block_index(t.geometry, scene, block) == base_block;
   }
-  __device__ int home_of(int particle) const { return t.block[schedule_of(t).home[particle]]; }
-  // f(particle, base node) for the particles at home, by any thread.
+  __device__ int base_block_of(int particle) const { return t.block[schedule_of(t).base_slot[particle]]; }
+  // f(particle, base node) for the particles in their base block, by any thread.
   template <class F>
   __device__ void for_particles(const F& f) const {
     constexpr int batch = 4;  // loads in flight
     for (int first = begin + int(threadIdx.x); first < end; first += batch * blockDim.x) {
-      int particle[batch], home[batch];
+      int particle[batch], base_block[batch];
       Vector<T, D> position[batch];
 #pragma unroll
       for (int n = 0; n < batch; n++) particle[n] = t.index[min(first + n * int(blockDim.x), end - 1)];
 #pragma unroll
       for (int n = 0; n < batch; n++) {
         position[n] = read_vector(k.x, particle[n]);
-        home[n] = home_of(particle[n]);
+        base_block[n] = base_block_of(particle[n]);
       }
 #pragma unroll
       for (int n = 0; n < batch; n++) {
         int base[D];
         T distance[D];
-        if (first + n * int(blockDim.x) < end && locate_particle(position[n], home[n], base, distance))
+        if (first + n * int(blockDim.x) < end && locate_particle(position[n], base_block[n], base, distance))
           f(particle[n], base);
       }
     }
@@ -307,7 +308,7 @@ struct SceneSolver {
       const int at = first + int(threadIdx.x), particle = at < end ? t.index[at] : -1;
       int base[D], corner = -1;
       T f[D];
-      if (particle >= 0 && locate_particle(read_vector(k.x, particle), home_of(particle), base, f))
+      if (particle >= 0 && locate_particle(read_vector(k.x, particle), base_block_of(particle), base, f))
         corner = box.index(base);
       for (int turn = 0; turn < warps(); turn++) {
         if (warp_index() == turn) {
