@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from .errors import check_numbers, check_real, shape_of
-from .reference.material import per_particle
+from .ops.arguments import per_particle
 
 if TYPE_CHECKING:
     from .state import State

@@ -130,6 +130,29 @@ class Topology:
         offset = unravel(inside, (BLOCK_WIDTH,) * grid.dim)
         return (corner[:, None] + offset).reshape(-1, grid.dim)
 
+    def rows_at(self, node: Tensor, scene: Tensor | None) -> Tensor:
+        """Rows of lattice nodes.
+
+        Args:
+            node: lattice indices, int64 [..., D].
+            scene: int32 or int64, of the first axes of `node`; None for the first scene.
+
+        Returns:
+            int64 [...], -1 where no block is active.
+        """
+        shape = node.shape[:-1]
+        index = torch.zeros(shape, dtype=torch.int64, device=node.device)
+        if scene is not None:
+            index = index + scene.reshape(*scene.shape, *[1] * (len(shape) - scene.dim()))
+        local, inside = torch.zeros_like(index), torch.ones_like(index, dtype=torch.bool)
+        for axis, count in enumerate(self.grid.blocks):
+            at = node[..., axis]
+            inside = inside & (at >= 0) & (at < count * BLOCK_WIDTH)
+            at = at.clamp(0, count * BLOCK_WIDTH - 1)
+            index, local = index * count + at // BLOCK_WIDTH, local * BLOCK_WIDTH + at % BLOCK_WIDTH
+        slot = self.table[index].long()
+        return torch.where(inside & (slot >= 0), slot * self.grid.nodes_per_block + local, -1)
+
     def node_positions(self, dtype: torch.dtype | None = None) -> Tensor:
         """Position of each node [m], [N, D]."""
         columns = (self.node_indices() - PADDING).double().unbind(1)

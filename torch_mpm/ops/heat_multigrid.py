@@ -16,10 +16,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ..bspline import bspline
 from ..capture import is_captured
 from ..errors import check_like, shape_of
 from ..grid import INT32_MAX, Grid
-from ..reference.transfer import bspline
 from ..topology import BLOCK_WIDTH, PADDING, Topology
 from .heat_patches import Patches, lattice_rows
 

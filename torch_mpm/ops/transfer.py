@@ -14,8 +14,8 @@ from torch import Tensor
 
 from ..errors import check_like, check_positions, shape_of
 from ..grid import Blocks, check_blocks
-from ..reference import transfer as reference
 from ..topology import Topology
+from . import composed
 from .arguments import check_choice, differentiate, per_particle, refuse_vmap, sizes, soa_empty, split_dt, sum_by_scene
 from .autograd import dispatch, register_autograd, save_with_topology, saved_with_topology
 
@@ -292,7 +292,7 @@ def _position_gradient_backward(ctx, grad):
     blocks = Topology.unpack(*topology)
 
     def function(x, value, moment, gradient, nodes):
-        return reference.position_gradient(blocks, x, value, moment, gradient, nodes, ctx.scale)
+        return composed.position_gradient(blocks, x, value, moment, gradient, nodes, ctx.scale)
 
     return (*differentiate(function, tensors, [grad]),) + (None,) * 4
 
