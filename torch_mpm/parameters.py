@@ -146,8 +146,8 @@ def needed_temperature(state: State) -> Tensor:
     return temperature
 
 
-class With:
-    """A state, or part of one, with some fields changed."""
+class Overlay:
+    """A state, or part of one, seen with some fields replaced."""
 
     def __init__(self, state: Any, **changes: Any) -> None:
         self.__dict__.update(changes)

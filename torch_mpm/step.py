@@ -12,7 +12,7 @@ from torch.utils.checkpoint import checkpoint as run_checkpointed
 
 from .activation_record import ActivationRecord
 from .boundaries import BoundaryList, Obstacle, Walls, call_boundary
-from .capture import Kept
+from .capture import GraphCache
 from .cfl import stable_dt
 from .errors import check_count, check_number, check_vector, shape_of
 from .failures import Failures, problems_of_state, raise_failures
@@ -22,7 +22,7 @@ from .laws.material import Material, as_law
 from .ops import contact, fusible, g2p, g2p_advance, gather, grid_update, p2g
 from .ops.arguments import check_choice
 from .ops.transfer import STRESS_FORMS
-from .parameters import TensorModule, With
+from .parameters import Overlay, TensorModule
 from .pause import paused
 from .state import State, check_state, identity_deformation
 
@@ -103,7 +103,7 @@ class Step(TensorModule):
         self.on_grid = on_grid
         self.heat = heat
         self._activations = ActivationRecord()
-        self._kept_gravity = Kept()
+        self._kept_gravity = GraphCache()
 
     def __setattr__(self, name: str, value: Any) -> None:
         """Arguments in any form, checked and converted."""
@@ -154,7 +154,7 @@ class Step(TensorModule):
         grid, scene = self.grid, state.scene
         blocks = self._activations.activate(grid, state.x, scene, state.ids)
         form, affine = self.stress_form, state.C if self.transfer == "apic" else None
-        fields, stress = self.law(With(state, dt=dt) if self._rate_dependent else state)
+        fields, stress = self.law(Overlay(state, dt=dt) if self._rate_dependent else state)
         dissipated = fields.pop("dissipated", None)
         if self.law.extra_fields:
             history = {name: fields.pop(name) for name in self.law.extra_fields if name in fields}
