@@ -243,7 +243,7 @@ def test_sorting_keeps_identities(device):
 
 
 def test_sorting_orders_by_block_and_cell(device, dim, kernel):
-    """Slots of the home blocks ascend, and cells within each; particles outside come last."""
+    """Slots of the base blocks ascend, and cells within each; particles outside come last."""
     p = random_particles(dim, kernel, sizes=(900, 0, 300), device=device, extent=0.8)
     x = p.x.clone()
     x[[5, 700]] = torch.nan

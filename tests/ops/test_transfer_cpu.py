@@ -136,10 +136,10 @@ def test_index_groups_particles_by_block(dim):
     scene = torch.randint(0, 2, (3000,), dtype=torch.int32, generator=torch.Generator().manual_seed(1))
     blocks = grid.activate(x, scene)
     base = torch.floor((x.double() - 0.1) / grid.dx + 3 - 0.5).long()
-    home = scene.long()
+    entry = scene.long()
     for axis in range(dim):
-        home = home * grid.blocks[axis] + base[:, axis] // 4
-    slot = blocks.table[home]
+        entry = entry * grid.blocks[axis] + base[:, axis] // 4
+    slot = blocks.table[entry]
     assert torch.equal(blocks.index.long(), torch.argsort(slot, stable=True))
     assert torch.equal(
         blocks.offsets, torch.searchsorted(slot.sort()[0], torch.arange(len(blocks.offsets)), out_int32=True)
