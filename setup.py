@@ -237,7 +237,8 @@ def parts(sources: Iterable[Path]) -> list[tuple[Path, list[str]]]:
     """Sources with the options of each part that they are compiled in (csrc/common/instantiate.h)."""
     scalars = [[f"-DMPM_SCALAR={scalar}"] for scalar in ("float", "double")]
     shapes = [[*scalar, f"-DMPM_DIMENSION={dimension}"] for scalar in scalars for dimension in (2, 3)]
-    split = {"gather.cu": shapes, "scatter.cu": shapes, "heat.cu": shapes, "g2p_advance.cu": scalars}
+    split = dict.fromkeys(("gather.cu", "scatter.cu", "heat.cu", "heat_operator.cu"), shapes)
+    split["g2p_advance.cu"] = scalars
     return [(source, part) for source in sorted(sources) for part in split.get(source.name, [[]])]
 
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from .errors import check_numbers, check_real, shape_of
-from .reference.material import per_particle
+from .ops.arguments import per_particle
 
 if TYPE_CHECKING:
     from .state import State
@@ -146,8 +146,8 @@ def needed_temperature(state: State) -> Tensor:
     return temperature
 
 
-class With:
-    """A state, or part of one, with some fields changed."""
+class Overlay:
+    """A state, or part of one, seen with some fields replaced."""
 
     def __init__(self, state: Any, **changes: Any) -> None:
         self.__dict__.update(changes)

@@ -46,7 +46,7 @@ class _Calls:
         self.scene = torch.arange(P, dtype=torch.int32) % 2
         self.lattice = mpm.Grid(0.21, (0.0,) * D, (2.0,) * D, scenes=2)
         self.blocks = self.lattice.activate(self.x, self.scene)
-        self.topology = self.blocks.topology
+        self.topology = self.blocks.packed
         self.N = self.blocks.node_count
         self.dt = 0.5 + self.uniform(2)
         self.F = torch.eye(D, dtype=dtype) + 0.1 * self.normal(P, D, D)
@@ -64,8 +64,7 @@ class _Calls:
         given = (x, mass, v, C, stress, self.uniform(P), self.dt, 0.1, 0)
         rows, velocity = self.normal(self.N, 1 + D), self.normal(self.N, D)
         moving = (x, v, C, self.F, J, self.scene, self.dt, 0.1)
-        grid = self.lattice
-        activation = (x, self.scene, self.blocks.status, 2, grid.dx, grid.lower, grid.blocks, grid.order, 40, True)
+        activation = (x, self.scene, torch.arange(P), self.blocks.status, 2, 40, *self.lattice.packed)
         return [
             ("activate", activation),
             ("cell_order", (x, *top)),
@@ -81,14 +80,13 @@ class _Calls:
         ]
 
     def grid(self) -> list[tuple[str, tuple[Any, ...]]]:
-        D, blocks, grid = self.dim, self.blocks, self.lattice
-        lattice = (grid.dx, grid.lower, grid.blocks)
+        D, top = self.dim, self.topology
         walls = ([2, 4] + [1, 3] * (D - 1), [0.0, 1.0] * D, [0.1] * 2 * D)
         rows, velocity = self.uniform(self.N, 1 + D), self.normal(self.N, D)
-        update = (rows, self.normal(2, D), self.dt, 0.1, *walls, blocks.table, blocks.block, *lattice)
+        update = (rows, self.normal(2, D), self.dt, 0.1, *walls, *top)
         table = self.uniform(2, 4, 10 if D == 2 else 17)
         kinds = ([0, 1, 2, 3], [1, 2, 3, 2], [-1, -1, 0, 1], [0.0] * 4, [float("inf")] * 4)
-        obstacles = (velocity, table, *kinds, self.uniform(2), 0.1, blocks.block, *lattice)
+        obstacles = (velocity, table, *kinds, self.uniform(2), 0.1, *top)
         return [
             ("grid_update", update),
             ("grid_update_backward", (self.uniform(self.N, 1 + D), True, *update)),
@@ -99,10 +97,10 @@ class _Calls:
     def heat(self) -> list[tuple[str, tuple[Any, ...]]]:
         x, N, blocks, top = self.x, self.N, self.blocks, self.topology
         conductance = self.uniform(PARTICLES)
-        capacity = mpm.scatter(blocks, x, self.uniform(PARTICLES, 1))[:, 0].contiguous()
-        nodes = (capacity, self.normal(N), self.normal(N), self.uniform(N), self.uniform(N) < 0.1)
+        heat_capacity = mpm.scatter(blocks, x, self.uniform(PARTICLES, 1))[:, 0].contiguous()
+        nodes = (heat_capacity, self.normal(N), self.normal(N), self.uniform(N), self.uniform(N) < 0.1)
         limits = (0.1 * self.uniform(2), 1e-6, 0.0, torch.tensor([20, 30], dtype=torch.int32), 40)
-        patches = Patches(blocks, x, conductance, capacity, capacity > 0)
+        patches = Patches(blocks, x, conductance, heat_capacity, heat_capacity > 0)
         return [
             ("heat_cg", (x, conductance, *nodes, self.dt, 0.5, *limits, 0, 1e-6, *top)),
             ("heat_cg", (x, conductance, *nodes, self.dt, 0.5, *limits, 1, 1e-6, *top)),

@@ -1,7 +1,7 @@
 #pragma once
 
+#include "common/fields.h"
 #include "laws/laws.h"
-#include "transfer/arguments.h"
 
 // Arguments of the material kernels.
 namespace mpm {

@@ -103,17 +103,17 @@ def transfer_case(name, device):
 def heat_case(name, device):
     p = random_particles(2, sizes=(30,), device=device, deterministic=True)
     blocks = p.blocks()
-    capacity = ops.scatter(blocks, p.x, p.mass[:, None])[:, 0].detach()
-    theta = torch.randn(capacity.shape, generator=torch.Generator().manual_seed(2), dtype=torch.float64).to(device)
+    heat_capacity = ops.scatter(blocks, p.x, p.mass[:, None])[:, 0].detach()
+    theta = torch.randn(heat_capacity.shape, generator=torch.Generator().manual_seed(2), dtype=torch.float64).to(device)
     if name == "heat_operator":
         return Case(lambda x, k, u: (ops.heat_operator(blocks, x, k, u),), [p.x, p.volume, theta])
     method = {"heat_cg": "cg", "heat_multigrid": "multigrid"}[name]
     options = dict(tolerance=1e-13, adjoint_tolerance=1e-13, method=method)
 
-    def solve(x, conductance, capacity, theta, dt):
-        return (ops.heat_cg(blocks, x, conductance, capacity, theta, dt, **options).increment,)
+    def solve(x, conductance, heat_capacity, theta, dt):
+        return (ops.heat_cg(blocks, x, conductance, heat_capacity, theta, dt, **options).increment,)
 
-    return Case(solve, [p.x, p.volume, capacity, theta, number(0.02, device)])
+    return Case(solve, [p.x, p.volume, heat_capacity, theta, number(0.02, device)])
 
 
 def law_op_case(name, device):

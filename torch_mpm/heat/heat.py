@@ -27,12 +27,13 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor, nn
 
+from ..activation_record import ActivationRecord
 from ..boundaries import BoundaryList
 from ..boundaries.obstacles import _norm
 from ..capture import outside_transforms, without_transforms
 from ..errors import check_like, check_number
 from ..failures import Failures, Problem, raise_failures, unsolved_heat
-from ..grid import ActivationRecord, Blocks, Grid, check_grid
+from ..grid import Blocks, Grid, check_grid
 from ..laws.material import _check_value
 from ..laws.thermal import LIQUID, determinant
 from ..ops import gather, heat_cg, scatter
@@ -258,12 +259,12 @@ class Heat(nn.Module):
         gradient: Tensor | None,
         blend: float | Tensor,
     ) -> tuple[HeatNodes, Tensor]:
-        """Heat capacity and temperature θ_i of the nodes, and what particles are smoothed to, θ̄_i [N]."""
+        """Heat heat_capacity and temperature θ_i of the nodes, and what particles are smoothed to, θ̄_i [N]."""
         weights = heat_capacity[:, None]
         if isinstance(blend, Tensor):
             weights = torch.stack([heat_capacity, heat_capacity * blend], 1)
-        capacity, mean = _averages(blocks, state.x, weights, theta, gradient)
-        nodes = HeatNodes(blocks, state, volume, conductance, capacity[:, 0], mean[:, 0], self.reference)
+        totals, mean = _averages(blocks, state.x, weights, theta, gradient)
+        nodes = HeatNodes(blocks, state, volume, conductance, totals[:, 0], mean[:, 0], self.reference)
         return nodes, mean[:, -1]
 
     def _solve(self, nodes: HeatNodes, dt: float | Tensor) -> Tensor:
@@ -274,7 +275,7 @@ class Heat(nn.Module):
             start = torch.where(nodes.fixed, nodes.held, start)
         boundary = nodes.source, nodes.exchange, nodes.fixed
         solve = heat_cg(
-            nodes.blocks, nodes.state.x, conductance, nodes.capacity, start, dt, *boundary, tolerance=NEGLIGIBLE,
+            nodes.blocks, nodes.state.x, conductance, nodes.heat_capacity, start, dt, *boundary, tolerance=NEGLIGIBLE,
             relative_tolerance=self.tolerance, max_iterations=self.max_iterations, method=self.method,
         )  # fmt: skip
         solved = solve.converged

@@ -16,11 +16,11 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor, nn
 
-from ..capture import Kept, without_transforms
+from ..capture import GraphCache, without_transforms
 from ..errors import check_number, shape_of
 from ..ops import material as ops
 from ..ops.arguments import soa_empty
-from ..parameters import PerMaterial, Value, With, evaluate
+from ..parameters import Overlay, PerMaterial, Value, evaluate
 from ..reference.material import per_particle
 from ..state import _take
 from .tangent import differentiated_stiffness
@@ -104,7 +104,7 @@ class CompiledLaw(Material):
 
     def __init__(self) -> None:
         super().__init__()
-        self._kept_parameters = Kept()
+        self._kept_parameters = GraphCache()
         self._functions = False
 
     def values(self) -> Sequence[Value]:
@@ -147,7 +147,7 @@ class CompiledLaw(Material):
         Kept from call to call while nothing has changed and none requires grad.
         """
         if self._functions:
-            in_order: Any = With(state, ids=None)  # which evaluated parameters already are
+            in_order: Any = Overlay(state, ids=None)  # which evaluated parameters already are
             return self._at_temperature(state)._convert(in_order)
         tensors = [t for t in (*self._parameters.values(), *self._buffers.values()) if t is not None]
         if torch.compiler.is_compiling() or any(t.requires_grad for t in tensors):

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from ..capture import Kept
+from ..capture import GraphCache
 from ..errors import check_flag, check_number
 from ..ops.sand import ANGLE, ReturnMap, quartic_energy, quartic_return_map, quartic_stiffness
 from ..reference.material import per_particle
@@ -96,7 +96,7 @@ class QuarticSand(SolidLaw):
         self.extra_fields = tuple(
             name for name, used in ((VOLUME, volume_correction), (HARDENING, hardening is not None)) if used
         )
-        self._kept_slope = Kept()
+        self._kept_slope = GraphCache()
 
     def _set_friction(self, angle: Value | None, hardening: Sequence[Value] | None) -> None:
         expected: tuple[str, Callable[[Any], Any]] = (ANGLE, lambda v: (v >= 0) & (v < math.pi / 2))

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ..errors import check_number
-from ..parameters import Value, With, evaluate, needed_temperature, store
+from ..parameters import Overlay, Value, evaluate, needed_temperature, store
 from .material import Material, _check_value, as_law
 
 if TYPE_CHECKING:
@@ -77,7 +77,7 @@ class ThermalExpansion(Material):
             changes["F"] = state.F / stretch[:, None, None]
         if "J" in self.state_fields and state.J is not None:
             changes["J"] = state.J / stretch ** state.x.shape[1]
-        return With(state, **changes)
+        return Overlay(state, **changes)
 
 
 class Melting(Material):
@@ -167,7 +167,9 @@ class Melting(Material):
         dim = F.shape[1]
         root = J.where(flows & (J > 0), 1) ** (1 / dim)
         isotropic = torch.diag_embed(root[:, None].expand(-1, dim))
-        return With(state, F=torch.where(flows[:, None, None], isotropic, F), J=torch.where(flows, J, determinant(F)))
+        return Overlay(
+            state, F=torch.where(flows[:, None, None], isotropic, F), J=torch.where(flows, J, determinant(F))
+        )
 
 
 def determinant(F: Tensor) -> Tensor:

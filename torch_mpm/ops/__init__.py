@@ -1,8 +1,8 @@
 """The Python faces of the ops: checks, fake kernels, autograd.
 
 The ops themselves, `torch.ops.torch_mpm.*`, check sizes, dtypes, devices and numbers as well, and raise RuntimeError.
-Their index tensors `table`, `block`, `offsets`, `index` and `schedule` must be those of one call of `activate`, with
-its `dx`, `lower`, `blocks` and `order`: their sizes are checked, but not their values, and others can make a
+The last three arguments `topology`, `lattice` and `layout` are `Blocks.packed`. The index tensors in `topology` must be
+those of one call of `activate` with this lattice: their sizes are checked, but not their values, and others can make a
 kernel read or write outside of its tensors.
 """
 
