@@ -11,17 +11,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import torch
 from torch import Tensor, nn
 
 from ..capture import Kept, without_transforms
 from ..errors import check_number, shape_of
-from ..ops import material as ops
-from ..ops.arguments import soa_empty
+from ..ops.arguments import per_parameter, soa_empty
+from ..ops.law import DISSIPATED, LawUpdate, law_energy, law_stiffness, law_update, law_wave_modulus
+from ..ops.registry import LAWS, Quantity
 from ..parameters import PerMaterial, Value, With, evaluate
-from ..reference.material import per_particle
 from ..state import _take
 from .tangent import differentiated_stiffness
 
@@ -98,31 +98,97 @@ class Material(nn.Module):
 
 
 class CompiledLaw(Material):
-    """A law of csrc/laws; subclasses say which, and convert their arguments to its parameters."""
+    """A law of csrc/laws; subclasses say which, and convert their arguments to its parameters.
+
+    Its fields, history, parameters and their ranges are those of the compiled registry, `torch_mpm.ops.LAWS`. The
+    history is in state.extra, where a `Step` keeps it; what is absent counts as zero.
+    """
 
     name: str
+    scene_defaults: ClassVar[dict[str, float]] = {}
+    """Density [kg/m³] and other values that a scene file takes for what it does not say."""
+
+    def __init_subclass__(cls) -> None:
+        if "name" in vars(cls):
+            cls._describe(cls)
 
     def __init__(self) -> None:
         super().__init__()
         self._kept_parameters = Kept()
         self._functions = False
 
+    @staticmethod
+    def _describe(target: Any) -> None:
+        """Set what a step asks a law from the registry, on a class or on one instance."""
+        info = LAWS[target.name]
+        target.state_fields = (info.field,)
+        target.extra_fields = tuple(q.name for q in info.history)
+        target.viscous, target.rate_dependent = info.viscous, info.rate_dependent
+
     def values(self) -> Sequence[Value]:
-        """The parameters of the compiled law, in its order."""
-        raise NotImplementedError
+        """The parameters of the compiled law, in its order; without the time step."""
+        return [getattr(self, p.name) for p in LAWS[self.name].parameters if p.name != "dt"]
+
+    def return_map(self, state: State, details: bool | int = False) -> LawUpdate:
+        """The whole result of the law: with details also dissipated energy, multiplier, branches and convergence."""
+        deformation, parameters = self._arguments(state)
+        C = state.C if self.viscous else None
+        return law_update(
+            self._name(state),
+            deformation,
+            parameters,
+            self._history(state),
+            C,
+            state.scene,
+            state.x.shape[1],
+            self._options(),
+            details,
+        )
 
     def update(self, state: State) -> tuple[dict[str, Tensor], Tensor]:
-        C = state.C if self.viscous else None
-        return {}, ops.material_stress(self.name, *self._arguments(state), C=C, scene=state.scene, dim=state.x.shape[1])
+        result = self.return_map(state, DISSIPATED if self.dissipation else False)
+        if not LAWS[self.name].plastic:
+            return {}, result.stress
+        fields = {self.state_fields[0]: result.state, **dict(zip(self.extra_fields, result.history, strict=True))}
+        if result.dissipated is not None:
+            fields["dissipated"] = result.dissipated
+        return fields, result.stress
 
     def energy_density(self, state: State) -> Tensor:
-        return ops.material_energy(self.name, *self._arguments(state), scene=state.scene, dim=state.x.shape[1])
+        """Elastic energy per rest volume [P] [J/m³] after the return map."""
+        deformation, parameters = self._arguments(state)
+        history: Sequence[Tensor] = self._history(state)
+        if LAWS[self.name].plastic:
+            moved = self.return_map(state)
+            deformation, history = moved.state, moved.history
+        return law_energy(self._name(state), deformation, parameters, history, state.scene, state.x.shape[1])
 
     def wave_modulus(self, state: State) -> Tensor:
-        return ops.material_wave_modulus(self.name, *self._arguments(state), scene=state.scene, dim=state.x.shape[1])
+        """Upper bound of rest density times squared wave speed after the return map [P] [Pa]; exact at rest."""
+        return self._modulus(law_wave_modulus, state)
 
     def stiffness(self, state: State) -> Tensor:
-        return ops.material_stiffness(self.name, *self._arguments(state), scene=state.scene, dim=state.x.shape[1])
+        """Upper bound of the elastic tangent modulus after the return map [P] [Pa]."""
+        return self._modulus(law_stiffness, state)
+
+    def _modulus(self, op: Callable[..., Tensor], state: State) -> Tensor:
+        deformation, parameters = self._arguments(state)
+        return op(self._name(state), deformation, parameters, self._history(state), state.scene, state.x.shape[1])
+
+    def _name(self, state: State) -> str:
+        """The compiled law, which may depend on the dimension."""
+        return self.name
+
+    def _options(self) -> Sequence[str]:
+        return ()
+
+    def _history(self, state: State) -> list[Tensor]:
+        return [_kept(q, state) for q in LAWS[self.name].history if q.name in self.extra_fields]
+
+    def _add(self, name: str, value: Value) -> None:
+        """Check a parameter of the law against its range and keep it."""
+        quantity = LAWS[self.name].parameter(name)
+        self._store(name, _check_value(name, value, quantity.expected, quantity.holds))
 
     def _store(self, name: str, value: Value) -> None:
         """Keep a parameter as number, buffer, nn.Parameter or function, so that `.to` and optimizers find it."""
@@ -139,7 +205,11 @@ class CompiledLaw(Material):
         deformation = getattr(state, field)
         if deformation is None:
             raise ValueError(f"{type(self).__name__} needs state.{field}, which is None")
-        return deformation, self._parameters_of(state)
+        parameters = self._parameters_of(state)
+        if self.rate_dependent:
+            dt, like = getattr(state, "dt", 0.0), {"dtype": deformation.dtype, "device": deformation.device}
+            parameters = [*parameters, dt.to(**like) if isinstance(dt, Tensor) else torch.full((), dt, **like)]
+        return deformation, parameters
 
     def _parameters_of(self, state: State) -> list[Tensor]:
         """Parameters in the dtype, on the device and in the particle order of the state.
@@ -175,6 +245,15 @@ class CompiledLaw(Material):
                 tensor = tensor.index_select(0, state.ids)
             result.append(tensor)
         return result
+
+
+def _kept(quantity: Quantity, state: State) -> Tensor:
+    """A history variable in `State.extra`, zero at first."""
+    value = state.extra.get(quantity.name)
+    if value is not None:
+        return value
+    P, D = state.x.shape
+    return soa_empty(state.x, (P, D, D)).zero_() if quantity.matrix else torch.zeros_like(state.mass)
 
 
 def _check_value(name: str, value: Value, expected: str, holds: Callable[[Any], Any], infinite: bool = False) -> Value:
@@ -227,7 +306,11 @@ class SolidLaw(CompiledLaw):
         self._engineering = E is not None
 
     def values(self) -> Sequence[Value]:
-        """μ and λ [Pa]."""
+        """μ and λ [Pa], then the other parameters of the law in its order, without the time step."""
+        others = [getattr(self, p.name) for p in LAWS[self.name].parameters[2:] if p.name != "dt"]
+        return *self._lame(), *others
+
+    def _lame(self) -> tuple[Any, Any]:
         if not self._engineering:
             return self.mu, self.lam
         E, nu = self.E, self.nu
@@ -265,20 +348,20 @@ class WeaklyCompressible(CompiledLaw):
         ValueError: for a value outside its range.
     """
 
-    state_fields = ("J",)
+    name = "weakly_compressible"
     bulk_modulus: Any
     gamma: Any
     eta: Any
 
     def __init__(self, bulk_modulus: Value, gamma: Value = 7.0, viscosity: Value = 0.0) -> None:
         super().__init__()
-        for name, value in (("bulk_modulus", bulk_modulus), ("viscosity", viscosity)):
-            _check_value(name, value, "finite and not negative", lambda v: v >= 0)
-        self._store("bulk_modulus", bulk_modulus)
-        self._store("gamma", _check_value("gamma", gamma, "positive", lambda v: v > 0))
-        self._store("eta", viscosity)
-        self.viscous = isinstance(viscosity, Tensor) or callable(viscosity) or viscosity > 0
-        self.name = "viscous_fluid" if self.viscous else "weakly_compressible"
+        self._add("bulk_modulus", bulk_modulus)
+        self._add("gamma", gamma)
+        quantity = LAWS["viscous_fluid"].parameter("viscosity")
+        self._store("eta", _check_value("viscosity", viscosity, quantity.expected, quantity.holds))
+        if isinstance(viscosity, Tensor) or callable(viscosity) or viscosity > 0:
+            self.name = "viscous_fluid"
+            self._describe(self)
 
     def values(self) -> Sequence[Value]:
         """K [Pa], γ and, of a viscous fluid, η [Pa s]."""
@@ -289,7 +372,7 @@ class WeaklyCompressible(CompiledLaw):
         if not self.viscous:
             return None
         J, (_, _, eta) = self._arguments(state)
-        return J * per_particle(eta, state.scene, J.shape[0])
+        return J * per_parameter(eta, state.scene, J.shape[0])
 
 
 class CustomLaw(Material):
@@ -419,7 +502,8 @@ class Mixture(Material):
             for name, value in fields.items():
                 if name not in changes:
                     new = name == "dissipated" or name in self.extra_fields
-                    changes[name] = state.extra.get(name, torch.zeros_like(state.mass)) if new else getattr(state, name)
+                    zero = value.new_zeros(P, *value.shape[1:])
+                    changes[name] = state.extra.get(name, zero) if new else getattr(state, name)
                 changes[name] = changes[name].index_copy(0, part.index, value)
         return changes, stress
 

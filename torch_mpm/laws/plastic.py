@@ -2,76 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import torch
 from torch import Tensor
 
 from ..errors import shape_of
-from ..ops.principal import (
-    PrincipalUpdate,
-    principal_energy,
-    principal_stiffness,
-    principal_update,
-    principal_wave_modulus,
-)
 from ..ops.svd import svd3
 from ..parameters import Value
-from ..reference.principal import LAWS
-from .material import Material, SolidLaw, _check_value, check_function, check_stiffness, given_stiffness
+from .material import Material, SolidLaw, check_function, check_stiffness, given_stiffness
 
 if TYPE_CHECKING:
     from ..state import State
 
 
-class PrincipalLaw(SolidLaw):
-    """A law of csrc/laws in principal strains: one decomposition of F, its return map and stress.
-
-    Its history is in state.extra, where a `Step` keeps it; what is absent counts as zero.
-    """
-
-    def __init_subclass__(cls) -> None:
-        cls.extra_fields = LAWS[cls.name].history
-
-    def return_map(self, state: State, details: bool = False) -> PrincipalUpdate:
-        """The whole result of the map: with details also dissipated energy, branches and convergence."""
-        F, parameters = self._arguments(state)
-        return principal_update(self.name, F, parameters, self._history(state), state.scene, details)
-
-    def update(self, state: State) -> tuple[dict[str, Tensor], Tensor]:
-        result = self.return_map(state, self.dissipation)
-        if LAWS[self.name].flow is None:
-            return {}, result.stress
-        fields = {"F": result.F, **dict(zip(self.extra_fields, result.history, strict=True))}
-        if result.dissipated is not None:
-            fields["dissipated"] = result.dissipated
-        return fields, result.stress
-
-    def energy_density(self, state: State) -> Tensor:
-        """Elastic energy per rest volume [P] [J/m³] after the return map."""
-        F, parameters = self._arguments(state)
-        moved = principal_update(self.name, F, parameters, self._history(state), state.scene)
-        return principal_energy(self.name, moved.F, parameters, moved.history, state.scene)
-
-    def stiffness(self, state: State) -> Tensor:
-        """Upper bound of the elastic tangent modulus after the return map [P] [Pa]."""
-        F, parameters = self._arguments(state)
-        return principal_stiffness(self.name, F, parameters, self._history(state), state.scene)
-
-    def wave_modulus(self, state: State) -> Tensor:
-        """Upper bound of rest density times squared wave speed after the return map [P] [Pa]; exact at rest."""
-        F, parameters = self._arguments(state)
-        return principal_wave_modulus(self.name, F, parameters, self._history(state), state.scene)
-
-    def _history(self, state: State) -> list[Tensor]:
-        return [state.extra.get(name, torch.zeros_like(state.mass)) for name in self.extra_fields]
-
-    def _add(self, name: str, value: Value, expected: str, holds: Callable[[Any], Any]) -> None:
-        self._store(name, _check_value(name, value, expected, holds))
-
-
-class FixedCorotated(PrincipalLaw):
+class FixedCorotated(SolidLaw):
     """Fixed corotated elastic solid (Stomakhin et al. 2012): ψ = μ Σ (σᵢ − 1)² + λ/2 (J − 1)².
 
     Args:
@@ -88,7 +34,7 @@ class FixedCorotated(PrincipalLaw):
     name = "fixed_corotated"
 
 
-class Hencky(PrincipalLaw):
+class Hencky(SolidLaw):
     """Elastic solid with the quadratic energy of logarithmic strains: ψ = μ Σ hᵢ² + λ/2 (tr h)², h = ln σ.
 
     Args:
@@ -101,7 +47,7 @@ class Hencky(PrincipalLaw):
     name = "hencky"
 
 
-class VonMises(PrincipalLaw):
+class VonMises(SolidLaw):
     """J2 plasticity with linear isotropic hardening on Hencky elasticity (Simo 1992): √(3/2) |dev τ| ≤ σ_y + H ε̄.
 
     State: state.extra["plastic_strain"], the equivalent plastic strain ε̄ (dε̄ = √(2/3) |dh_p|).
@@ -132,15 +78,11 @@ class VonMises(PrincipalLaw):
         hardening: Value = 0.0,
     ) -> None:
         super().__init__(E, nu, mu, lam)
-        self._add("yield_stress", yield_stress, "finite and not negative", lambda v: v >= 0)
-        self._add("hardening", hardening, "finite and not negative", lambda v: v >= 0)
-
-    def values(self) -> Sequence[Value]:
-        """μ, λ, σ_y and H [Pa]."""
-        return *super().values(), self.yield_stress, self.hardening
+        self._add("yield_stress", yield_stress)
+        self._add("hardening", hardening)
 
 
-class HerschelBulkley(PrincipalLaw):
+class HerschelBulkley(SolidLaw):
     """Viscoplastic fluid on Hencky elasticity: above the yield stress, t = τ_y + η gⁿ (Bingham's fluid for n = 1).
 
     t = |dev τ|/√2 and g = √2 |dh_p/dt| are shear stress and shear rate in simple shear. Backward Euler over the time
@@ -159,7 +101,6 @@ class HerschelBulkley(PrincipalLaw):
     """
 
     name = "herschel_bulkley"
-    rate_dependent = True
     yield_stress: Any
     consistency: Any
     exponent: Any
@@ -176,23 +117,12 @@ class HerschelBulkley(PrincipalLaw):
         exponent: Value = 1.0,
     ) -> None:
         super().__init__(E, nu, mu, lam)
-        self._add("yield_stress", yield_stress, "finite and not negative", lambda v: v >= 0)
-        self._add("consistency", consistency, "finite and not negative", lambda v: v >= 0)
-        self._add("exponent", exponent, "positive", lambda v: v > 0)
-
-    def values(self) -> Sequence[Value]:
-        """μ, λ, τ_y [Pa], η [Pa sⁿ] and n."""
-        return *super().values(), self.yield_stress, self.consistency, self.exponent
-
-    def _arguments(self, state: State) -> tuple[Tensor, list[Tensor]]:
-        F, parameters = super()._arguments(state)
-        dt = getattr(state, "dt", 0.0)
-        if isinstance(dt, Tensor):
-            return F, [*parameters, dt.to(F.dtype)]
-        return F, [*parameters, torch.full((), dt, dtype=F.dtype, device=F.device)]
+        self._add("yield_stress", yield_stress)
+        self._add("consistency", consistency)
+        self._add("exponent", exponent)
 
 
-class Snow(PrincipalLaw):
+class Snow(SolidLaw):
     """Snow (Stomakhin et al. 2013): fixed corotated elasticity with stretches clamped to [1 − θ_c, 1 + θ_s].
 
     Plastic compaction hardens it: μ and λ are multiplied by exp(ξ (1 − J_p)).
@@ -211,6 +141,7 @@ class Snow(PrincipalLaw):
     """
 
     name = "snow"
+    scene_defaults: ClassVar = {"density": 400.0, "E": 1.4e5, "nu": 0.2}
     critical_compression: Any
     critical_stretch: Any
     hardening: Any
@@ -227,16 +158,12 @@ class Snow(PrincipalLaw):
         hardening: Value = 10.0,
     ) -> None:
         super().__init__(E, nu, mu, lam)
-        self._add("critical_compression", critical_compression, "in [0, 1)", lambda v: (v >= 0) & (v < 1))
-        self._add("critical_stretch", critical_stretch, "finite and not negative", lambda v: v >= 0)
-        self._add("hardening", hardening, "finite and not negative", lambda v: v >= 0)
-
-    def values(self) -> Sequence[Value]:
-        """μ, λ [Pa], θ_c, θ_s and ξ."""
-        return *super().values(), self.critical_compression, self.critical_stretch, self.hardening
+        self._add("critical_compression", critical_compression)
+        self._add("critical_stretch", critical_stretch)
+        self._add("hardening", hardening)
 
 
-class CamClay(PrincipalLaw):
+class CamClay(SolidLaw):
     """Modified Cam-Clay with cohesion on Hencky elasticity (Borja and Tamagnini 1998; cohesion as Gaume et al. 2018).
 
     q² + M² (p − p_c)(p + β p_c) ≤ 0 with associated flow and p_c = p₀ exp(−Θ ln J_p): compaction hardens, dilation
@@ -277,14 +204,10 @@ class CamClay(PrincipalLaw):
         cohesion: Value = 0.0,
     ) -> None:
         super().__init__(E, nu, mu, lam)
-        self._add("critical_slope", critical_slope, "positive", lambda v: v > 0)
-        self._add("consolidation", consolidation, "positive", lambda v: v > 0)
-        self._add("hardening", hardening, "positive", lambda v: v > 0)
-        self._add("cohesion", cohesion, "between 0 and 1", lambda v: (v >= 0) & (v <= 1))
-
-    def values(self) -> Sequence[Value]:
-        """μ, λ [Pa], M, p₀ [Pa], Θ and β."""
-        return *super().values(), self.critical_slope, self.consolidation, self.hardening, self.cohesion
+        self._add("critical_slope", critical_slope)
+        self._add("consolidation", consolidation)
+        self._add("hardening", hardening)
+        self._add("cohesion", cohesion)
 
 
 class CustomPrincipalLaw(Material):
