@@ -133,7 +133,7 @@ MPM_HD PrincipalData<Law, typename At::Value> load_data(const At& at, const LawA
   MPM_UNROLL for (int k = 0; k < kParameters<Law>; k++)
     r.parameters[k] = load_parameter(at, a, k);
   MPM_UNROLL for (int k = 0; k < kHistory<Law>; k++)
-    r.history[k] = at.load(a.history[k].pointer, a.history[k].stride[0]);
+    r.history[k] = load_scalar_or_zero(at, a.history[k]);
   return r;
 }
 
@@ -185,18 +185,15 @@ MPM_HD T increment_norm(const Vector<T, D>& h, const Vector<T, D>& H) {
 
 // Adjoints of what a law takes, from forward derivatives: `derivative(h, data)` gives the sum of the adjoints of the
 // results times their derivatives in the direction that its arguments carry. It is asked once per strain, parameter and
-// history variable; parameters and history go to memory at once, those of the strains are returned. Invalid particles
-// have the adjoints 0 of the parameters and `grad_history` of the history.
-template <class Law, class At, class T, int D, class Mask, class F>
-MPM_HD Vector<typename At::Value, D> differentiate(const At& at, const Vector<typename At::Value, D>& h,
-                                                   const PrincipalData<Law, typename At::Value>& data,
-                                                   const Field<T>& parameters, const Field<T>& history,
-                                                   const Mask& valid, const typename At::Value grad_history[],
-                                                   const F& derivative) {
-  using V = typename At::Value;
+// history variable that is wanted; `parameter(k, value)` and `history(k, value)` take theirs, those of the strains are
+// returned.
+template <class Law, class V, int D, class F, class StoreParameter, class StoreHistory>
+MPM_HD Vector<V, D> differentiate(const Vector<V, D>& h, const PrincipalData<Law, V>& data, bool parameters,
+                                  bool history, const StoreParameter& store_parameter,
+                                  const StoreHistory& store_history, const F& derivative) {
   Vector<V, D> r = zero_vector<V, D>();
-  const int first_history = D + (parameters.pointer ? kParameters<Law> : 0);
-  const int count = first_history + (history.pointer ? kHistory<Law> : 0);
+  const int first_history = D + (parameters ? kParameters<Law> : 0);
+  const int count = first_history + (history ? kHistory<Law> : 0);
 #ifdef __CUDACC__
 #pragma unroll 1
 #endif
@@ -207,18 +204,74 @@ MPM_HD Vector<typename At::Value, D> differentiate(const At& at, const Vector<ty
     MPM_UNROLL for (int i = 0; i < D; i++)
       strain[i] = seed(h[i], i);
     MPM_UNROLL for (int k = 0; k < kParameters<Law>; k++)
-      given.parameters[k] = seed(data.parameters[k], parameters.pointer ? D + k : -1);
+      given.parameters[k] = seed(data.parameters[k], parameters ? D + k : -1);
     MPM_UNROLL for (int k = 0; k < kHistory<Law>; k++)
       given.history[k] = seed(data.history[k], first_history + k);
     const V value = derivative(strain, given);
     MPM_UNROLL for (int i = 0; i < D; i++)
       r[i] = i == direction ? value : r[i];
     MPM_UNROLL for (int k = 0; k < kHistory<Law>; k++)
-      if (direction == first_history + k) store_entry(at, history, k, select(valid, value, grad_history[k]));
-    if (direction >= D && direction < first_history)
-      store_entry(at, parameters, direction - D, select(valid, value, V(0)));
+      if (direction == first_history + k) store_history(k, value);
+    if (direction >= D && direction < first_history) store_parameter(direction - D, value);
   }
   return r;
+}
+
+// Adjoints of the results of a law.
+template <class Law, class V, int D>
+struct PrincipalGrads {
+  Matrix<V, D> F, stress;
+  V history[kHistoryLength<Law>];
+  V dissipated, multiplier;
+  bool has_multiplier;
+};
+
+// The adjoint of F through the map and its stress; those of parameters and history go to where `differentiate` says.
+template <class Law, class V, int D, class StoreParameter, class StoreHistory>
+MPM_HD Matrix<V, D> map_adjoint(const HenckyStrain<V, D>& s, const PrincipalData<Law, V>& data,
+                                const Response<Law, V, D>& r, const PrincipalGrads<Law, V, D>& grad, bool parameters,
+                                bool history, const StoreParameter& store_parameter,
+                                const StoreHistory& store_history) {
+  const Matrix<V, D> right = right_axes(s);
+  const Matrix<V, D> M = transpose(s.U) * grad.F * right, N = transpose(s.U) * symmetric_part(grad.stress) * s.U;
+  Vector<V, D> grad_h;
+  MPM_UNROLL for (int i = 0; i < D; i++)
+    grad_h[i] = M[i][i] * exponential(r.h[i]);
+  const Vector<V, D> diagonal =
+      differentiate<Law>(s.h, data, parameters, history, store_parameter, store_history,
+                         [&](const Vector<Dual<V>, D>& h, const PrincipalData<Law, Dual<V>>& given) {
+                           const Response<Law, Dual<V>, D> moved = respond<Law>(h, given);
+                           V value = grad.dissipated * moved.dissipated.derivative;
+                           if (grad.has_multiplier)
+                             value = value + grad.multiplier * increment_norm(h, moved.h).derivative;
+                           MPM_UNROLL for (int i = 0; i < D; i++)
+                             value = value + grad_h[i] * moved.h[i].derivative + N[i][i] * moved.tau[i].derivative;
+                           MPM_UNROLL for (int k = 0; k < kHistory<Law>; k++)
+                             value = value + grad.history[k] * moved.history[k].derivative;
+                           return value;
+                         });
+  const Matrix<V, D> principal =
+      principal_adjoint(s, r.h, diagonal, symmetric_part(M), skew_part(M), N, [&](int i, int j) {
+        Quotients<V> q = {V(1), Law::stress_quotient(r.h[i], r.h[j], data.parameters, r.history)};
+        if constexpr (Law::plastic) q.map = Law::map_quotient(r.flow, s.h, r.h, i, j);
+        return q;
+      });
+  return s.U * principal * transpose(right);
+}
+
+// The adjoint of F through the energy, likewise.
+template <class Law, class V, int D, class StoreParameter, class StoreHistory>
+MPM_HD Matrix<V, D> energy_adjoint(const HenckyStrain<V, D>& s, const PrincipalData<Law, V>& data, const V& grad,
+                                   bool parameters, bool history, const StoreParameter& store_parameter,
+                                   const StoreHistory& store_history) {
+  Vector<V, D> diagonal =
+      differentiate<Law>(s.h, data, parameters, history, store_parameter, store_history,
+                         [&](const Vector<Dual<V>, D>& h, const PrincipalData<Law, Dual<V>>& given) {
+                           return grad * Law::energy(h, given.parameters, given.history).derivative;
+                         });
+  MPM_UNROLL for (int i = 0; i < D; i++)
+    diagonal[i] = diagonal[i] * s.scale * s.inverse[i];
+  return compose(s.U, diagonal, right_axes(s));
 }
 
 // Upper bound of |dτ/dF : G F| + max |τᵢ| ≥ the second variation of ψ, over velocity gradients G with |G| = 1. In
@@ -296,43 +349,22 @@ struct PrincipalKernels {
   MPM_HD static void update_backward(const LawBackwardArguments<T, D>& a, const At& at) {
     using V = typename At::Value;
     const HenckyStrain<V, D> s = hencky_strain(load_matrix<D>(at, a.law.state));
-    const Matrix<V, D> right = right_axes(s);
-    const Matrix<V, D> grad_F = load_matrix_or_zero<D>(at, a.grad_state);
-    const Matrix<V, D> M = transpose(s.U) * grad_F * right,
-                       N = transpose(s.U) * symmetric_part(load_matrix_or_zero<D>(at, a.grad_stress)) * s.U;
-    const V grad_dissipated = load_scalar_or_zero(at, a.grad_dissipated),
-            grad_multiplier = load_scalar_or_zero(at, a.grad_multiplier);
-
     const PrincipalData<Law, V> data = load_data<Law>(at, a.law);
     const Response<Law, V, D> r = respond<Law>(s.h, data);
     const auto valid = s.valid & (poison(r) == V(0));
-    Vector<V, D> grad_h;
-    MPM_UNROLL for (int i = 0; i < D; i++)
-      grad_h[i] = M[i][i] * exponential(r.h[i]);
-    V grad_history[kHistoryLength<Law>];
+    PrincipalGrads<Law, V, D> grad;
+    grad.F = load_matrix_or_zero<D>(at, a.grad_state);
+    grad.stress = load_matrix_or_zero<D>(at, a.grad_stress);
+    grad.dissipated = load_scalar_or_zero(at, a.grad_dissipated);
+    grad.multiplier = load_scalar_or_zero(at, a.grad_multiplier);
+    grad.has_multiplier = a.grad_multiplier.pointer != nullptr;
     MPM_UNROLL for (int k = 0; k < kHistory<Law>; k++)
-      grad_history[k] = a.grad_history.pointer ? load_entry(at, a.grad_history, k) : V(0);
-    const Vector<V, D> diagonal =
-        differentiate<Law>(at, s.h, data, a.parameters, a.history, valid, grad_history,
-                           [&](const Vector<Dual<V>, D>& h, const PrincipalData<Law, Dual<V>>& given) {
-                             const Response<Law, Dual<V>, D> moved = respond<Law>(h, given);
-                             V value = grad_dissipated * moved.dissipated.derivative;
-                             if (a.grad_multiplier.pointer)
-                               value = value + grad_multiplier * increment_norm(h, moved.h).derivative;
-                             MPM_UNROLL for (int i = 0; i < D; i++)
-                               value = value + grad_h[i] * moved.h[i].derivative + N[i][i] * moved.tau[i].derivative;
-                             MPM_UNROLL for (int k = 0; k < kHistory<Law>; k++)
-                               value = value + grad_history[k] * moved.history[k].derivative;
-                             return value;
-                           });
-    if (!a.state.pointer) return;
-    const Matrix<V, D> principal =
-        principal_adjoint(s, r.h, diagonal, symmetric_part(M), skew_part(M), N, [&](int i, int j) {
-          Quotients<V> q = {V(1), Law::stress_quotient(r.h[i], r.h[j], data.parameters, r.history)};
-          if constexpr (Law::plastic) q.map = Law::map_quotient(r.flow, s.h, r.h, i, j);
-          return q;
-        });
-    store_matrix<D>(at, a.state, select(valid, s.U * principal * transpose(right), grad_F));
+      grad.history[k] = a.grad_history.pointer ? load_entry(at, a.grad_history, k) : V(0);
+    const Matrix<V, D> by_F = map_adjoint<Law>(
+        s, data, r, grad, a.parameters.pointer != nullptr, a.history.pointer != nullptr,
+        [&](int k, const V& value) { store_entry(at, a.parameters, k, select(valid, value, V(0))); },
+        [&](int k, const V& value) { store_entry(at, a.history, k, select(valid, value, grad.history[k])); });
+    if (a.state.pointer) store_matrix<D>(at, a.state, select(valid, by_F, grad.F));
   }
 
   template <class At, class T, int D>
@@ -359,18 +391,11 @@ struct PrincipalKernels {
     const PrincipalData<Law, V> data = load_data<Law>(at, a.law);
     const V energy = Law::energy(s.h, data.parameters, data.history);
     const auto valid = s.valid & (energy - energy == V(0));
-    V none[kHistoryLength<Law>];
-    MPM_UNROLL for (int k = 0; k < kHistory<Law>; k++)
-      none[k] = V(0);
-    Vector<V, D> diagonal =
-        differentiate<Law>(at, s.h, data, a.parameters, a.history, valid, none,
-                           [&](const Vector<Dual<V>, D>& h, const PrincipalData<Law, Dual<V>>& given) {
-                             return grad * Law::energy(h, given.parameters, given.history).derivative;
-                           });
-    if (!a.state.pointer) return;
-    MPM_UNROLL for (int i = 0; i < D; i++)
-      diagonal[i] = diagonal[i] * s.scale * s.inverse[i];
-    store_matrix<D>(at, a.state, select(valid, compose(s.U, diagonal, right_axes(s)), zero_matrix<V, D>()));
+    const Matrix<V, D> by_F = energy_adjoint<Law>(
+        s, data, grad, a.parameters.pointer != nullptr, a.history.pointer != nullptr,
+        [&](int k, const V& value) { store_entry(at, a.parameters, k, select(valid, value, V(0))); },
+        [&](int k, const V& value) { store_entry(at, a.history, k, select(valid, value, V(0))); });
+    if (a.state.pointer) store_matrix<D>(at, a.state, select(valid, by_F, zero_matrix<V, D>()));
   }
 };
 

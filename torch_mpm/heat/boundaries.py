@@ -18,7 +18,7 @@ from torch import Tensor
 from ..boundaries.obstacles import Obstacle, _norm, _per_node
 from ..errors import NUMBER_OR_TENSOR, check_number, check_real, shape_of
 from ..grid import BLOCK_WIDTH, PADDING, Blocks
-from ..laws.material import _check_value
+from ..laws.compiled import check_value
 from ..ops import scatter
 from ..parameters import TensorModule, Value, evaluate
 from ..reference.transfer import bspline
@@ -362,7 +362,7 @@ class Source(Term):
     """
 
     def __init__(self, power: Value) -> None:
-        self.power = _check_value("power", power, "finite", lambda v: v == v)
+        self.power = check_value("power", power, "finite", lambda v: v == v)
 
     def apply(self, nodes: HeatNodes) -> None:  # type: ignore[override]
         power = evaluate("power", self.power, nodes.state) * nodes.volume

@@ -16,11 +16,13 @@ from ..ops.law import DISSIPATED, MULTIPLIER
 from ..ops.registry import LAWS
 from ..ops.sand import ANGLE, ENERGIES, friction_alpha, law_name
 from ..parameters import Value
-from .material import SolidLaw, _check_value
+from .compiled import SolidLaw, check_value
 
 if TYPE_CHECKING:
     from ..state import State
 
+
+__all__ = ["QuarticSand"]
 
 VOLUME, HARDENING = "volume_correction", "hardening"
 """Keys of `State.extra` under which a law keeps v_c and q [P]."""
@@ -106,7 +108,7 @@ class QuarticSand(SolidLaw):
             values = hardening
         for name, value in zip(self._friction, values, strict=True):
             limits = ("finite and not negative", lambda v: v >= 0) if name in ("h1", "h2") else expected
-            self._store(name, _check_value(name, value, *limits))
+            self._store(name, check_value(name, value, *limits))
         first, last = values[0], values[-1]
         if isinstance(first, float) and isinstance(last, float) and last > first:
             raise ValueError(f"h3 must not be above h0 (in radians), got {last} and {first}")

@@ -242,8 +242,8 @@ def _parameter(name: str, value: Value | None, F: Tensor, scene: Tensor | None) 
 _LIBRARY = torch.library.Library("torch_mpm", "FRAGMENT")
 _LIBRARY.define(
     "quartic_return_map(Tensor F, Tensor mu, Tensor lam, Tensor alpha, Tensor? cohesion, Tensor? volume, "
-    "Tensor? scene, str energy, str flow, str apex, bool details) -> (Tensor F, Tensor stress, Tensor branch, Tensor multiplier, "
-    "Tensor dissipated, Tensor volume)"
+    "Tensor? scene, str energy, str flow, str apex, bool details) -> "
+    "(Tensor F, Tensor stress, Tensor branch, Tensor multiplier, Tensor dissipated, Tensor volume)"
 )
 
 

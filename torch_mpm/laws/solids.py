@@ -1,20 +1,39 @@
-"""Laws in principal strains: elastic, plastic and viscoplastic solids, snow, clay, and a user's own."""
+"""Elastic, plastic, viscoplastic and viscoelastic solids, snow and clay."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
-import torch
-from torch import Tensor
-
-from ..errors import shape_of
-from ..ops.svd import svd3
 from ..parameters import Value
-from .material import Material, SolidLaw, check_function, check_stiffness, given_stiffness
+from .compiled import SolidLaw
 
-if TYPE_CHECKING:
-    from ..state import State
+__all__ = [
+    "CamClay",
+    "FixedCorotated",
+    "Hencky",
+    "HerschelBulkley",
+    "NeoHookean",
+    "Snow",
+    "Viscoelastic",
+    "VonMises",
+]
+
+
+class NeoHookean(SolidLaw):
+    """Compressible neo-Hookean solid: τ = μ (F Fᵀ − I) + λ ln J I (Bonet and Wood 2008, section 6.4.3).
+
+    Args:
+        E: Young's modulus [Pa], not negative, with nu; or
+        nu: Poisson's ratio in (−1, 0.5).
+        mu: shear modulus [Pa], not negative (0 is a fluid), with lam; or
+        lam: first Lamé parameter [Pa].
+
+    Raises:
+        ValueError: for a value outside its range, or another combination of arguments. Values are checked here, and not
+            again when a tensor is changed or trained.
+    """
+
+    name = "neo_hookean"
 
 
 class FixedCorotated(SolidLaw):
@@ -122,6 +141,43 @@ class HerschelBulkley(SolidLaw):
         self._add("exponent", exponent)
 
 
+class Viscoelastic(SolidLaw):
+    """Viscoelastic solid that relaxes: neo-Hookean with a Maxwell branch beside it (Reese and Govindjee 1998).
+
+    ψ = ψ_NH(F) + μ_v |dev h|² with the Hencky strains h of the elastic deformation F_e = F F_v⁻¹ of the branch, which
+    flows by dh/dt = −dev h/T: backward Euler over the time step with the exponential map. Fast loads meet the shear
+    modulus μ + μ_v, slow ones μ. Without a time step (`law.stress(state)` outside of a step) nothing flows.
+    State: state.extra["inverse_viscous_deformation"], F_v⁻¹ − 1 [P, D, D].
+    Dissipated is τ_v · dh of the flow; `energy_density` counts both springs.
+
+    Args:
+        E, nu or mu, lam: as for `FixedCorotated`, of the solid at rest.
+        branch_modulus: shear modulus of the Maxwell branch [Pa]
+        relaxation_time: time in which the stress of the branch falls to 1/e [s]
+
+    Raises:
+        ValueError: for a value outside its range, or another combination of arguments.
+    """
+
+    name = "viscoelastic"
+    branch_modulus: Any
+    relaxation_time: Any
+
+    def __init__(
+        self,
+        E: Value | None = None,
+        nu: Value | None = None,
+        mu: Value | None = None,
+        lam: Value | None = None,
+        *,
+        branch_modulus: Value,
+        relaxation_time: Value,
+    ) -> None:
+        super().__init__(E, nu, mu, lam)
+        self._add("branch_modulus", branch_modulus)
+        self._add("relaxation_time", relaxation_time)
+
+
 class Snow(SolidLaw):
     """Snow (Stomakhin et al. 2013): fixed corotated elasticity with stretches clamped to [1 − θ_c, 1 + θ_s].
 
@@ -208,132 +264,3 @@ class CamClay(SolidLaw):
         self._add("consolidation", consolidation)
         self._add("hardening", hardening)
         self._add("cohesion", cohesion)
-
-
-class CustomPrincipalLaw(Material):
-    """A law from any module or function of the principal stretches, in ordinary torch code.
-
-    Args:
-        function: called with the stretches σ [P, D], in no order that matters: it must treat them alike. Returns the
-            principal Kirchhoff stresses [P, D] [Pa], or a pair (stretches, stresses) where a plastic law changes σ.
-        stiffness: see `Material.stiffness`; a number, a tensor [P] or a function of the state. None takes it from the
-            function by automatic differentiation, each time that `stable_dt` asks.
-
-    The gradient with respect to F holds at equal stretches: differences of the function over a gap of at least the cube
-    root of the rounding error stand for its derivative there (relative error about 1e-10 in float64, 1e-5 in float32).
-    Particles with det F ≤ 0 or F not finite have no stress, and the function sees them at rest.
-
-    Raises:
-        TypeError: for what is no function.
-        ValueError: for a number as stiffness that is negative or not finite, or in use for a result of another shape.
-    """
-
-    def __init__(
-        self,
-        function: Callable[[Tensor], Any],
-        stiffness: float | Tensor | Callable[[State], Tensor] | None = None,
-    ) -> None:
-        super().__init__()
-        self.function = check_function(function)
-        self._stiffness = check_stiffness(stiffness)
-
-    def update(self, state: State) -> tuple[dict[str, Tensor], Tensor]:
-        if state.F is None:
-            raise ValueError("CustomPrincipalLaw needs state.F, which is None")
-        good = ~self.invalid(state)[:, None, None]
-        F = state.F.where(good, torch.eye(state.x.shape[1], dtype=state.x.dtype, device=state.x.device))
-        with torch.no_grad():
-            U, _, V = svd3(F)
-        sigma = svd3(F).sigma
-        mapped, tau = self._evaluate(sigma)
-        new, stress = _IsotropicFunction.apply(F, U, sigma.detach(), V, mapped, tau, self._evaluate)
-        stress = stress.where(good, torch.zeros((), dtype=stress.dtype, device=stress.device))
-        return {} if mapped is sigma else {"F": new.where(good, state.F)}, stress
-
-    def stiffness(self, state: State) -> Tensor:
-        return given_stiffness(self._stiffness, state) if self._stiffness is not None else super().stiffness(state)
-
-    def invalid(self, state: State) -> Tensor:
-        assert state.F is not None
-        J = torch.linalg.det(state.F.where(state.F.isfinite(), torch.nan))
-        return ~((J > 0) & J.isfinite())
-
-    def _evaluate(self, sigma: Tensor) -> tuple[Tensor, Tensor]:
-        result = self.function(sigma)
-        mapped, tau = result if isinstance(result, tuple) else (sigma, result)
-        for name, value in (("stretches", mapped), ("stresses", tau)):
-            if not isinstance(value, Tensor) or value.shape != sigma.shape:
-                raise ValueError(f"the law must return {name} of shape {list(sigma.shape)}, got {shape_of(value)}")
-        return mapped, tau
-
-
-class _IsotropicFunction(torch.autograd.Function):
-    """U diag(mapped) Vᵀ and U diag(tau) Uᵀ for F = U diag(sigma) Vᵀ.
-
-    Its gradient of F is that of turning the principal axes; mapped and tau bring their own.
-    """
-
-    @staticmethod
-    def forward(
-        F: Tensor, U: Tensor, sigma: Tensor, V: Tensor, mapped: Tensor, tau: Tensor, evaluate: Any
-    ) -> tuple[Tensor, Tensor]:
-        return (U * mapped[:, None, :]) @ V.mT, (U * tau[:, None, :]) @ U.mT
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: Any, output: Any) -> None:
-        *tensors, ctx.evaluate = inputs
-        ctx.save_for_backward(*tensors)
-
-    @staticmethod
-    def backward(ctx: Any, grad_F: Tensor, grad_stress: Tensor) -> Any:
-        F, U, sigma, V, mapped, tau = ctx.saved_tensors
-        M, N = (_DifferentiatedOnce.apply(t, F) for t in (U.mT @ grad_F @ V, U.mT @ grad_stress @ U))
-        turned = None
-        if ctx.needs_input_grad[0]:
-            principal = torch.zeros_like(M)
-            for i in range(sigma.shape[1]):
-                for j in range(i + 1, sigma.shape[1]):
-                    with torch.no_grad():
-                        map_slope, stress_slope = _quotients(ctx.evaluate, sigma, mapped, tau, i, j)
-                    total = sigma[:, i] + sigma[:, j]
-                    even = map_slope * (M[:, i, j] + M[:, j, i]) / 2
-                    odd = (mapped[:, i] + mapped[:, j]) / total * (M[:, i, j] - M[:, j, i]) / 2
-                    stress = (N[:, i, j] + N[:, j, i]) * stress_slope / total
-                    principal[:, i, j] = even + odd + stress * sigma[:, j]
-                    principal[:, j, i] = even - odd + stress * sigma[:, i]
-            turned = _DifferentiatedOnce.apply(U @ principal @ V.mT, mapped, tau)
-        diagonals = (t.diagonal(dim1=1, dim2=2) for t in (M, N))
-        return turned, None, None, None, *diagonals, None
-
-
-class _DifferentiatedOnce(torch.autograd.Function):
-    """A gradient that depends on other tensors in a way that autograd does not see."""
-
-    @staticmethod
-    def forward(gradient: Tensor, *others: Tensor) -> Tensor:
-        return gradient.clone()
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: Any, output: Any) -> None:
-        pass
-
-    @staticmethod
-    def backward(ctx: Any, grad: Tensor) -> Any:
-        raise NotImplementedError("CustomPrincipalLaw has no second derivatives: differentiate it once")
-
-
-def _quotients(
-    evaluate: Callable[[Tensor], tuple[Tensor, Tensor]], sigma: Tensor, mapped: Tensor, tau: Tensor, i: int, j: int
-) -> tuple[Tensor, Tensor]:
-    """Differences of mapped stretches and stresses i and j over that of the stretches, which is widened where small."""
-    middle = (sigma[:, i] + sigma[:, j]) / 2
-    least = torch.finfo(sigma.dtype).eps ** (1 / 3) * middle
-    near = (sigma[:, i] - sigma[:, j]).abs() < least
-    spread = sigma.clone()
-    spread[:, i] = torch.where(near, middle + least / 2, sigma[:, i])
-    spread[:, j] = torch.where(near, middle - least / 2, sigma[:, j])
-    gap = spread[:, i] - spread[:, j]
-    wide = evaluate(spread)
-    return tuple(  # type: ignore[return-value]
-        torch.where(near, w[:, i] - w[:, j], v[:, i] - v[:, j]) / gap for w, v in zip(wide, (mapped, tau), strict=True)
-    )
