@@ -15,11 +15,17 @@ struct MaxwellBranch : PrincipalLaw {
                                             time_step};
   static constexpr bool plastic = true;
 
+  // What flows of the deviator, without the difference of h and H.
+  template <class T>
+  MPM_HD static T share(const T p[]) {
+    return p[2] / (p[1] + p[2]);
+  }
+
   template <class T, int D>
   MPM_HD static Flow<T> flow(Vector<T, D>& h, const T p[], T[]) {
     const T kappa = p[1] / (p[1] + p[2]), mean = T(1.0 / D) * sum(h);
     h = scale_deviator(h, mean, mean, kappa);
-    return {kappa, T(0) == T(0), T(0) == T(0)};
+    return {kappa, p[2] > T(0), T(0) == T(0)};
   }
 
   template <class T, int D>
@@ -29,7 +35,7 @@ struct MaxwellBranch : PrincipalLaw {
 
   template <class T, int D>
   MPM_HD static T lost(const Vector<T, D>& h, const Vector<T, D>& H, const T p[], const T[], const T q[]) {
-    return plastic_work(stress(H, p, q), h, H);
+    return share(p) * dot(stress(H, p, q), h);  // of which the mean does no work
   }
 
   template <class T, int D>
@@ -148,14 +154,21 @@ struct ViscoelasticKernels {
     const Parts<V, D> p = load(at, a.law);
     const State<V, D> state = respond_to(p);
     store_matrix<D>(at, a.stress, select(state.valid, state.stress, zero_matrix<V, D>()));
-    const Matrix<V, D> flow = inverse(p.solid.F) * flowed(state) - identity<V, D>();
-    store_entries(at, a.history, select(state.valid, flow, load_matrix<D>(at, a.law.history[0])));
+    // F_v⁻¹ changes by F⁻¹ U diag(exp(H − h) − 1) Uᵀ F_e, which keeps the digits of a slow flow.
+    const V share = MaxwellBranch::share(p.branch.parameters), mean = V(1.0 / D) * sum(state.s.h);
+    Vector<V, D> rate;
+    MPM_UNROLL for (int i = 0; i < D; i++)
+      rate[i] = expm1(share * (mean - state.s.h[i]));
+    const Matrix<V, D> change = inverse(p.solid.F) * (compose(state.s.U, rate, state.s.U) * p.elastic());
+    const Matrix<V, D> before = load_matrix<D>(at, a.law.history[0]);
+    store_entries(at, a.history, select(state.valid, before + change, before));
     if (a.dissipated.pointer)
       at.store(a.dissipated.pointer, a.dissipated.stride[0], select(state.valid, state.r.dissipated, V(0)));
     if (a.multiplier.pointer)
       at.store(a.multiplier.pointer, a.multiplier.stride[0],
                select(state.valid, increment_norm(state.s.h, state.r.h), V(0)));
-    if (a.branch) at.store_integer(a.branch, select(state.valid, V(kPlasticFlow), V(kInvalidFlow)));
+    const V branch = select(state.r.flow.plastic, V(kPlasticFlow), V(kElasticFlow));
+    if (a.branch) at.store_integer(a.branch, select(state.valid, branch, V(kInvalidFlow)));
   }
 
   // By F_e = F F_v⁻¹ of the branch and by F of the solid; then F_v⁻¹ after the flow is F⁻¹ F_e, whose adjoint is that

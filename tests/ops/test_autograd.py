@@ -167,6 +167,7 @@ LAWS = {
     "VonMises": lambda E: mpm.VonMises(E=E, nu=0.3, yield_stress=200.0, hardening=50.0),
     "HerschelBulkley": lambda E: mpm.HerschelBulkley(E=E, nu=0.3, yield_stress=100.0, consistency=10.0),
     "Snow": lambda E: mpm.Snow(E=E, nu=0.3),
+    "Viscoelastic": lambda E: mpm.Viscoelastic(E=E, nu=0.3, branch_modulus=5e3, relaxation_time=2e-3),
     "CamClay": lambda E: mpm.CamClay(E=E, nu=0.3, critical_slope=1.0, consolidation=300.0, hardening=5.0),
     "QuarticSand": lambda E: mpm.QuarticSand(E=E, nu=0.3, volume_correction=True, cohesion=0.01),
     "QuarticSand, hardening": lambda E: mpm.QuarticSand(E=E, nu=0.3, hardening=(0.6, 0.15, 0.2, 0.17)),
