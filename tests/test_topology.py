@@ -4,7 +4,7 @@ import dataclasses
 
 import pytest
 import torch
-from particles import random_particles
+from helpers import random_particles
 
 import torch_mpm as mpm
 from torch_mpm.topology import Topology

@@ -18,7 +18,8 @@ from .errors import check_count, check_number, check_vector, shape_of
 from .failures import Failures, problems_of_state, raise_failures
 from .grid import Blocks, Grid, check_grid
 from .heat.heat import Heat
-from .laws.material import Material, as_law
+from .laws.custom import as_law
+from .laws.material import Material
 from .ops import contact, fusible, g2p, g2p_advance, gather, grid_update, p2g
 from .ops.arguments import check_choice
 from .ops.transfer import STRESS_FORMS
@@ -183,7 +184,7 @@ class Step(TensorModule):
         if "J" in self.law.state_fields and state.J is None:
             changes["J"] = torch.ones_like(state.mass)
         if missing := [name for name in self.law.extra_fields if name not in state.extra]:
-            changes["extra"] = {**state.extra, **{name: torch.zeros_like(state.mass) for name in missing}}
+            changes["extra"] = {**state.extra, **{name: self.law.initial(name, state) for name in missing}}
         state = state.replace(**changes) if changes else state
         return state if self.heat is None else self.heat.prepare(state)
 

@@ -9,12 +9,10 @@ import torch
 from torch import Tensor
 
 import torch_mpm as mpm
+from torch_mpm.ops import LAWS
 from torch_mpm.ops.heat_patches import Patches
-from torch_mpm.reference.principal import LAWS
 
 PARTICLES = 37
-MATERIALS = {"neo_hookean": (2, True), "viscous_fluid": (3, False)}
-"""Laws of `material_stress`: parameters, and whether the state is F (or J)."""
 
 
 def operators() -> list[str]:
@@ -26,7 +24,7 @@ def operators() -> list[str]:
 def calls(dim: int, dtype: torch.dtype = torch.float64) -> list[tuple[str, dict[str, Any]]]:
     """(op, arguments by name) of at least one valid call of every op."""
     make = _Calls(dim, dtype)
-    found = [*make.transfers(), *make.grid(), *make.heat(), *make.principal(), *make.materials(), *make.sand()]
+    found = [*make.transfers(), *make.grid(), *make.heat(), *make.laws(), *make.sand()]
     return [(op, _named(op, values)) for op, values in found]
 
 
@@ -110,51 +108,46 @@ class _Calls:
             ("heat_patches", (patches.inverse, patches.rows, patches.patches, self.normal(N))),
         ]
 
-    def principal(self) -> list[tuple[str, tuple[Any, ...]]]:
+    def laws(self) -> list[tuple[str, tuple[Any, ...]]]:
         P, D, found = PARTICLES, self.dim, []
-        for law, description in LAWS.items():
-            shapes = itertools.islice(itertools.cycle(((2,), (P,), (), (1,))), len(description.parameters))
+        for law, info in LAWS.items():
+            if D == 2 and not info.in_2d:
+                continue
+            shapes = itertools.islice(itertools.cycle(((2,), (P,), (), (1,))), len(info.parameters))
             p = [0.5 + self.uniform(*shape) for shape in shapes]
-            q = [0.5 + self.uniform(P) for _ in description.history]
-            given = (self.F, p, q, self.scene, law)
-            grads = (self.normal(P, D, D), self.normal(P, D, D), self.normal(P, len(q)), self.normal(P))
+            q = [0.5 + (self.uniform(P, D, D) if h.matrix else self.uniform(P)) for h in info.history]
+            state = self.F if info.field == "F" else 0.5 + self.uniform(P)
+            C = self.normal(P, D, D) if info.viscous else None
+            tail = (self.scene, law, D)
+            entries = sum(D * D if h.matrix else 1 for h in info.history)
+            grads = (
+                self.normal(P, D, D) if info.plastic else None,
+                *(self.normal(P, D, D), self.normal(P, entries) if q else None, self.normal(P), self.normal(P)),
+            )
             found += [
-                ("principal_update", (*given, True)),
-                ("principal_update_backward", (*grads, *given, 7)),
-                ("principal_energy", given),
-                ("principal_energy_backward", (self.normal(P), *given, 7)),
-                ("principal_stiffness", given),
-                ("principal_wave_modulus", given),
+                ("law_update", (state, C, p, q, *tail, 0, 7)),
+                ("law_update_backward", (*grads, state, C, p, q, *tail, 0, 15)),
+                ("law_energy", (state, p, q, *tail)),
+                ("law_energy_backward", (self.normal(P), state, p, q, *tail, 13)),
+                ("law_stiffness", (state, p, q, *tail)),
+                ("law_wave_modulus", (state, p, q, *tail)),
             ]
-        return found
-
-    def materials(self) -> list[tuple[str, tuple[Any, ...]]]:
-        P, D, found = PARTICLES, self.dim, []
-        for law, (count, shear) in MATERIALS.items():
-            parameters = [0.5 + self.uniform(*shape) for shape in ((2,), (P,), ())[:count]]
-            state, C = (self.F, None) if shear else (0.5 + self.uniform(P), self.normal(P, D, D))
-            tail = (self.scene, parameters, law, D)
-            found += [
-                ("material_stress", (state, C, *tail)),
-                ("material_stress_backward", (self.normal(P, D, D), state, C, *tail, 7)),
-                ("material_energy", (state, *tail)),
-                ("material_energy_backward", (self.normal(P), state, *tail, 7)),
-                ("material_stiffness", (state, *tail)),
-                ("material_wave_modulus", (state, *tail)),
-            ]
+            if info.twice_differentiable:
+                along = (self.normal(*state.shape), C, self.normal(P, len(p)))
+                found += [
+                    ("law_update_double_backward", (*along, self.normal(P, D, D), state, C, p, *tail, 7)),
+                    ("law_energy_double_backward", (along[0], along[2], self.normal(P), state, p, *tail, 5)),
+                ]
         return found
 
     def sand(self) -> list[tuple[str, tuple[Any, ...]]]:
-        P, D = PARTICLES, self.dim
-        moduli = (0.5 + self.uniform(2), 0.5 + self.uniform(P))
-        options = ("full", "exact", "zero")
-        given = (self.F, *moduli, self.uniform(), self.uniform(1), self.uniform(P), self.scene, *options)
-        grads = (self.normal(P, D, D), self.normal(P, D, D), *(self.normal(P) for _ in range(3)))
+        moduli = (0.5 + self.uniform(2), 0.5 + self.uniform(PARTICLES))
+        options = ("full", "exact", "zero", True)
         return [
-            ("quartic_return_map", (*given, True)),
-            ("quartic_return_map_backward", (*grads, *given, True, True)),
-            ("quartic_energy", (self.F, *moduli, self.scene, "full")),
-            ("quartic_stiffness", (self.F, *moduli, self.scene, "full", 0.1)),
+            (
+                "quartic_return_map",
+                (self.F, *moduli, self.uniform(), self.uniform(1), self.uniform(PARTICLES), self.scene, *options),
+            ),
             ("svd3", (self.F,)),
             ("polar", (self.F,)),
         ]

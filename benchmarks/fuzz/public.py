@@ -291,14 +291,14 @@ def _ops() -> dict[str, Callable[[], Call]]:
     def on_F(name: str, /, **further: Any) -> Callable[[], Call]:
         return lambda: (getattr(mpm.ops, name), dict(F=_World().matrix, **further))
 
-    def of_law(name: str) -> Callable[[], Call]:
+    def of_law(name: str, **further: Any) -> Callable[[], Call]:
         w = _World()
         scene = torch.zeros(POINTS, dtype=torch.int32)
-        given = dict(law="neo_hookean", state=w.matrix, parameters=[w.one, torch.ones(())], scene=scene, dim=2)
-        return lambda: (getattr(mpm.ops, name), dict(given))
+        parameters = [w.one, torch.ones(()), w.one, torch.ones(1)]
+        given = dict(law="von_mises", state=w.matrix, parameters=parameters, history=[w.one], scene=scene, dim=2)
+        return lambda: (getattr(mpm.ops, name), given | further)
 
     w = _World()
-    principal = dict(law="von_mises", parameters=[w.one] * 4, history=[w.one])
     sand: dict[str, Any] = dict(mu=1.0, lam=w.one, scene=torch.zeros(POINTS, dtype=torch.int32), energy="unilateral")
     plastic = dict(friction_angle=0.5, apex="zero", flow="exact", cohesion=0.1, volume_correction=w.one, details=True)
     moving = dict(x=w.x, v=w.x, dt=0.1, C=w.matrix, F=w.matrix, J=w.one, scene=sand["scene"], scenes=2)
@@ -321,12 +321,8 @@ def _ops() -> dict[str, Callable[[], Call]]:
         "quartic_energy": on_F("quartic_energy", **sand),
         "quartic_stress": on_F("quartic_stress", **sand),
         "quartic_stiffness": on_F("quartic_stiffness", **sand, smallest_strain=0.1),
-        "principal_update": on_F("principal_update", **principal, details=True),
-        "principal_energy": on_F("principal_energy", **principal),
-        "principal_stiffness": on_F("principal_stiffness", **principal),
-        "principal_wave_modulus": on_F("principal_wave_modulus", **principal),
-        "material_stress": of_law("material_stress"),
-        "material_energy": of_law("material_energy"),
-        "material_stiffness": of_law("material_stiffness"),
-        "material_wave_modulus": of_law("material_wave_modulus"),
+        "law_update": of_law("law_update", details=True),
+        "law_energy": of_law("law_energy"),
+        "law_stiffness": of_law("law_stiffness"),
+        "law_wave_modulus": of_law("law_wave_modulus"),
     }

@@ -38,10 +38,10 @@ struct Consecutive {
 namespace cpu {
 inline namespace TORCH_MPM_ISA {
 
-// f(at) with the particles in groups of one register.
-template <class T, class F>
+// f(at) with the particles in groups of one register, or of another number of bytes.
+template <class T, int Bytes = kRegisterBytes, class F>
 void for_groups(int64_t particles, const F& f) {
-  constexpr int lanes = kRegisterBytes / sizeof(T);
+  constexpr int lanes = Bytes / sizeof(T);
   constexpr int64_t grain = 64;  // groups below which a range is not split
   parallel_ranges((particles + lanes - 1) / lanes, grain, [&](int64_t begin, int64_t end) {
     for (int64_t p = begin * lanes; p < end * lanes && p < particles; p += lanes)

@@ -19,7 +19,7 @@ from ..boundaries.obstacles import Obstacle, _norm, _per_node
 from ..bspline import base_node, bspline
 from ..errors import NUMBER_OR_TENSOR, check_number, check_real, shape_of
 from ..grid import Blocks
-from ..laws.material import _check_value
+from ..laws.compiled import check_value
 from ..ops import scatter
 from ..parameters import TensorModule, Value, evaluate
 from ..topology import PADDING
@@ -353,7 +353,7 @@ class Source(Term):
     """
 
     def __init__(self, power: Value) -> None:
-        self.power = _check_value("power", power, "finite", lambda v: v == v)
+        self.power = check_value("power", power, "finite", lambda v: v == v)
 
     def apply(self, nodes: HeatNodes) -> None:  # type: ignore[override]
         power = evaluate("power", self.power, nodes.state) * nodes.volume

@@ -34,7 +34,7 @@ from ..capture import outside_transforms, without_transforms
 from ..errors import check_like, check_number
 from ..failures import Failures, Problem, raise_failures, unsolved_heat
 from ..grid import Blocks, Grid, check_grid
-from ..laws.material import _check_value
+from ..laws.compiled import check_value
 from ..laws.thermal import LIQUID, determinant
 from ..ops import gather, heat_cg, scatter
 from ..ops.arguments import check_choice, per_particle
@@ -129,13 +129,13 @@ class Heat(nn.Module):
         self.plastic_heating, self.reference = float(plastic_heating), float(reference)
         self.tolerance, self.max_iterations, self.method = float(tolerance), int(max_iterations), method
         not_negative, positive = (lambda v: v >= 0), (lambda v: v > 0)
-        store(self, "conductivity", _check_value("conductivity", conductivity, "not negative", not_negative))
-        store(self, "specific_heat", _check_value("specific_heat", specific_heat, "positive", positive))
+        store(self, "conductivity", check_value("conductivity", conductivity, "not negative", not_negative))
+        store(self, "specific_heat", check_value("specific_heat", specific_heat, "positive", positive))
         self.melts = latent_heat is not None
         if melting_point is not None and latent_heat is not None:
-            _check_value("melting_point", melting_point, "a number", lambda v: v == v, infinite=True)
+            check_value("melting_point", melting_point, "a number", lambda v: v == v, infinite=True)
             store(self, "melting_point", melting_point)
-            store(self, "latent_heat", _check_value("latent_heat", latent_heat, "positive", positive))
+            store(self, "latent_heat", check_value("latent_heat", latent_heat, "positive", positive))
         self._activations = ActivationRecord()
         self.unsolved: Tensor | None = None
         """Solves of each scene so far that missed their tolerance, int32 [B], and the largest residual [B] [K]."""

@@ -1,6 +1,6 @@
 #pragma once
 
-#include "laws/principal.h"
+#include "laws/hencky_strain.h"
 
 // Sand in terms of the Hencky strains h (logarithms of the principal stretches): energies, stresses, moduli.
 //
@@ -22,20 +22,12 @@ struct SandEnergy {
   static constexpr bool exact_flow = false;
 };
 
-struct FullQuartic : SandEnergy<false, false, false> {
-  static constexpr const char* name = "full";
-};
-struct UnilateralQuartic : SandEnergy<false, true, true> {
-  static constexpr const char* name = "unilateral";
-};
-struct Hencky : SandEnergy<true, false, false> {
-  static constexpr const char* name = "hencky";
-};
+struct FullQuartic : SandEnergy<false, false, false> {};
+struct UnilateralQuartic : SandEnergy<false, true, true> {};
+struct Quadratic : SandEnergy<true, false, false> {};
 // Returned to the yield surface of the full energy, stress of the unilateral one, as in the program published by Gao et
 // al.
-struct MixedQuartic : SandEnergy<false, true, false> {
-  static constexpr const char* name = "mixed";
-};
+struct MixedQuartic : SandEnergy<false, true, false> {};
 
 template <class Energy>
 struct ExactFlow : Energy {

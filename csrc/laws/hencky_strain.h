@@ -1,9 +1,7 @@
 #pragma once
 
-#include "common/lanes.h"
 #include "common/svd.h"
 #include "common/wide.h"
-#include "laws/arguments.h"
 
 // What isotropic laws in principal strains share: the Hencky strains of F, and the adjoint of an isotropic tensor
 // function of F from that of its principal values.
@@ -89,7 +87,7 @@ struct HenckyStrain {
   Matrix<T, D> U, B;
   Vector<T, D> h, inverse;  // reciprocal lengths of the columns of B
   T scale;                  // of B
-  MaskOf<T> meaningful;     // det F > 0, everything finite
+  MaskOf<T> valid;          // det F > 0, everything finite
 };
 
 // ln a of the square of a stretch, where a warp of a GPU should take one branch: small strains are never below the
@@ -132,7 +130,7 @@ MPM_HD void measure_strain(HenckyStrain<T, D>& s) {
   }
   // Neither is finite where an entry of B is not.
   const T volume = determinant(s.B), finite = (volume - volume) + (sum(s.h) - sum(s.h));
-  s.meaningful = (volume > T(0)) & (finite == T(0));
+  s.valid = (volume > T(0)) & (finite == T(0));
 }
 
 template <class T, int D>
@@ -176,7 +174,7 @@ MPM_HD_LARGE HenckyStrain<Wide<T>, D> wide_hencky_strain(const Matrix<T, D>& F) 
 template <class To, class T, int D>
 MPM_HD HenckyStrain<To, D> convert(const HenckyStrain<T, D>& s) {
   return {convert<To>(s.U),       convert<To>(s.B),     convert<To>(s.h),
-          convert<To>(s.inverse), convert<To>(s.scale), convert<MaskOf<To>>(s.meaningful)};
+          convert<To>(s.inverse), convert<To>(s.scale), convert<MaskOf<To>>(s.valid)};
 }
 
 // A diag(d) Bᵀ.
@@ -231,20 +229,6 @@ MPM_HD Matrix<T, D> principal_adjoint(const HenckyStrain<T, D>& s, const Vector<
       r[j][i] = symmetric - skew + stress * inverse[j];
     }
   return r;
-}
-
-// A parameter of the particles `at`. A scene id out of range takes that of scene 0: such a particle is not transferred
-// anyway.
-template <class At, class T>
-MPM_HD typename At::Value load_parameter(const At& at, const Parameter<T>& parameter, const int* scene,
-                                         int64_t scene_stride) {
-  if (parameter.scenes) {
-    return at.each([&](int64_t p) {
-      const int id = scene[p * scene_stride];
-      return parameter.pointer[(id >= 0 && id < parameter.scenes ? id : 0) * parameter.stride];
-    });
-  }
-  return at.load(parameter.pointer, parameter.stride);
 }
 
 }  // namespace TORCH_MPM_ISA
