@@ -78,7 +78,7 @@ Location place_of(const ActivateArguments<T, D>& a, int64_t p, int& scene, int b
   return inside ? Location::inside : Location::outside;
 }
 
-// Home block and cell of one particle.
+// Base block and cell of one particle.
 template <int Order, class T, int D>
 void classify(const Activation<T, D>& s, int64_t p) {
   const ActivateArguments<T, D>& a = s.a;
@@ -304,9 +304,9 @@ int64_t list_base_blocks(const Activation<T, D>& s, int64_t slots) {
   for (int64_t slot = 0; slot < slots; slot++)
     if (a.offsets[slot + 1] > a.offsets[slot]) out.base_slot[next[colour_of(slot)]++] = int(slot);
   int chunks = 0;
-  for (int h = 0; h < base_blocks; h++) {
-    const int slot = out.base_slot[h];
-    out.base_chunk[h] = chunks;
+  for (int b = 0; b < base_blocks; b++) {
+    const int slot = out.base_slot[b];
+    out.base_chunk[b] = chunks;
     for (int begin = a.offsets[slot]; begin < a.offsets[slot + 1]; begin += kChunk) {
       out.chunk_slot[chunks] = slot;
       out.chunk_begin[chunks++] = begin;

@@ -113,10 +113,10 @@ void sum_particles(const Topology<T, D>& t, const Field<const T>& x, const Field
   parallel_base_blocks<D>(s, t.particles, [&](const auto& next) {
     ScalarTile<Order, T, D> u, sum;
     int colour = 0;
-    for (int64_t h; (h = next()) >= 0;) {
-      const int slot = s.base_slot[h];
+    for (int64_t b; (b = next()) >= 0;) {
+      const int slot = s.base_slot[b];
       const BaseBlock<T, D> base_block(t, slot);
-      while (h >= s.colour_start[colour + 1]) colour++;
+      while (b >= s.colour_start[colour + 1]) colour++;
       if (!wanted(base_block.scene)) {
         colours.finish(colour);
         continue;
@@ -124,7 +124,7 @@ void sum_particles(const Topology<T, D>& t, const Field<const T>& x, const Field
       if (Sum == HeatSum::product) u.load_from(nodes, base_block);
       sum.clear();
       double power = 0;
-      for (int64_t c = s.base_chunk[h]; c < s.base_chunk[h + 1]; c++) {
+      for (int64_t c = s.base_chunk[b]; c < s.base_chunk[b + 1]; c++) {
         const Chunk chunk(t, s, c);
         for (int cell = 0, begin = 0; cell < kBlockNodes<D>; begin = chunk.cell_end[cell++])
           if (const int end = chunk.cell_end[cell]; begin < end)

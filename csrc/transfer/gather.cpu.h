@@ -227,10 +227,10 @@ void gather_groups(const Topology<T, D>& t, const Field<const T>& x, const NodeF
   const ScheduleIn s = schedule_of(t);
   parallel_base_blocks<D>(s, t.particles, [&](const auto& next) {
     Tile<Order, T, D> tile;
-    for (int64_t h; (h = next()) >= 0;) {
-      const BaseBlock<T, D> base_block(t, s.base_slot[h]);
+    for (int64_t b; (b = next()) >= 0;) {
+      const BaseBlock<T, D> base_block(t, s.base_slot[b]);
       tile.load_from(nodes, base_block, first, count);
-      for (int64_t c = s.base_chunk[h]; c < s.base_chunk[h + 1]; c++) {
+      for (int64_t c = s.base_chunk[b]; c < s.base_chunk[b + 1]; c++) {
         const Chunk chunk(t, s, c);
         for (int cell = 0, i = 0; cell < kBlockNodes<D>; cell++) {
           int base[D];

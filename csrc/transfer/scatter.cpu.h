@@ -199,12 +199,12 @@ void scatter_channels(const Topology<T, D>& t, const Field<const T>& x, const No
     Contributions<Order, T, D, Slope, Gradient> contributions;
     Tile<Order, T, D> tile;
     int colour = 0;
-    for (int64_t h; (h = next()) >= 0;) {
-      const BaseBlock<T, D> base_block(t, s.base_slot[h]);
+    for (int64_t b; (b = next()) >= 0;) {
+      const BaseBlock<T, D> base_block(t, s.base_slot[b]);
       tile.clear();
-      for (int64_t c = s.base_chunk[h]; c < s.base_chunk[h + 1]; c++)
+      for (int64_t c = s.base_chunk[b]; c < s.base_chunk[b + 1]; c++)
         fill(base_block, Chunk(t, s, c), contributions, tile);
-      while (h >= s.colour_start[colour + 1]) colour++;
+      while (b >= s.colour_start[colour + 1]) colour++;
       colours.wait_before(colour);
       tile.add_to(nodes, base_block, first, count);
       colours.finish(colour);
