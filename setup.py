@@ -48,7 +48,7 @@ HOST_FLAGS = ["-fPIC", "-fvisibility=hidden", "-Wall", f"-ffile-prefix-map={UP}=
 NVCC_FLAGS = ["-O3", "--expt-relaxed-constexpr", "--threads=2", "-Xfatbin=-compress-all"]
 
 # Definitions that tell the objects of one source apart.
-VARIANTS = ("-DTORCH_MPM_ISA=", "-DMPM_SCALAR=", "-DMPM_DIMENSION=")
+VARIANTS = ("-DTORCH_MPM_ISA=", "-DMPM_SCALAR=", "-DMPM_DIMENSION=", "-DMPM_LAW_HEADER=")
 
 # Files csrc/*/*.cpu.cpp are compiled once per level, in the namespace named by TORCH_MPM_ISA.
 X86_LEVELS = {"baseline": "x86-64", "avx2": "x86-64-v3", "avx512": "x86-64-v4"}
@@ -198,7 +198,7 @@ class Ninja:
         objects = []
         for source, rule, flags in library.objects:
             relative = source.relative_to(ROOT)
-            variant = [f.partition("=")[2] for f in flags if f.startswith(VARIANTS)]
+            variant = [Path(f.partition("=")[2].strip('"')).stem for f in flags if f.startswith(VARIANTS)]
             target = f"{library.name}.obj/{'.'.join([str(relative), *variant])}.o"
             self.lines.append(f"build {target}: {rule} {UP}{relative}\n  flags = {shlex.join(flags)}")
             objects.append(target)
@@ -237,7 +237,10 @@ def parts(sources: Iterable[Path]) -> list[tuple[Path, list[str]]]:
     """Sources with the options of each part that they are compiled in (csrc/common/instantiate.h)."""
     scalars = [[f"-DMPM_SCALAR={scalar}"] for scalar in ("float", "double")]
     shapes = [[*scalar, f"-DMPM_DIMENSION={dimension}"] for scalar in scalars for dimension in (2, 3)]
-    split = {"gather.cu": shapes, "scatter.cu": shapes, "heat.cu": shapes, "g2p_advance.cu": scalars}
+    headers = sorted(h for h in (CSRC / "laws").glob("*.h") if "\nMPM_REGISTER_LAW(" in h.read_text())
+    each_law = [[f'-DMPM_LAW_HEADER="laws/{header.name}"'] for header in headers]
+    split = dict.fromkeys(("gather.cu", "scatter.cu", "heat.cu", "heat_operator.cu"), shapes)
+    split |= {"g2p_advance.cu": scalars, "law.cpu.cpp": each_law, "law.cu": each_law}
     return [(source, part) for source in sorted(sources) for part in split.get(source.name, [[]])]
 
 

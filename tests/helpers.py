@@ -98,7 +98,7 @@ def random_blocks(grid: mpm.Grid, device: str = "cpu", share: float = 0.7, unuse
     table = torch.full((total,), -1, dtype=torch.int32)
     table[active.long()] = slots.int()
     nothing = torch.empty(0, dtype=torch.int32, device=device)
-    return mpm.Blocks(grid, table.to(device), block.to(device), nothing, nothing, nothing, nothing, None)
+    return mpm.Blocks(grid, table.to(device), block.to(device), nothing, nothing, nothing, None, nothing)
 
 
 def random_nodes(blocks: mpm.Blocks) -> Tensor:

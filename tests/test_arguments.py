@@ -71,7 +71,7 @@ GRID = [
     (lambda v: grid(upper=v), "upper", [(1, INF), (1, 1, 1), {}, (-1, 1)]),
     (lambda v: grid(scenes=v), "scenes", [-1, 1.5, NAN, True, "2"]),
     (lambda v: grid(kernel=v), "kernel", ["linear", 2, ["quadratic"]]),
-    (lambda v: grid(capacity=v), "capacity", [-1, 2.5, NAN, "all", 10**9]),
+    (lambda v: grid(max_blocks=v), "max_blocks", [-1, 2.5, NAN, "all", 10**9]),
     (lambda v: grid(deterministic=v), "deterministic", [torch.zeros(3), None, "x", 2]),
     (lambda v: grid().activate(state().x, v), "scene", [5, torch.zeros(3, dtype=torch.int32)]),
 ]

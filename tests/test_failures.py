@@ -305,7 +305,7 @@ def test_failures_need_no_synchronisation_and_see_replays():
 
 def batch(scenes, device, law=None, **options):
     """Scenes of elastic blocks of 36 particles that move, in one batch; scene 0 is the same in every batch."""
-    grid = mpm.Grid(0.1, (0, 0), (1, 1), scenes=scenes, capacity=None)
+    grid = mpm.Grid(0.1, (0, 0), (1, 1), scenes=scenes, max_blocks=None)
     step = mpm.Step(grid, law or mpm.NeoHookean(E=1e4, nu=0.3), gravity=(0, -9.8), walls="slip", **options)
     points = mpm.seed.box((0.3, 0.3), (0.6, 0.6), 0.1, per_cell=4)
     one = mpm.State.at_rest(points, velocity=(0.5, 0.1), dtype=torch.float64, device=device)

@@ -1,5 +1,6 @@
 """The built package: its libraries, what they need from torch, and what `info` says about them."""
 
+import ast
 import json
 import platform
 import shutil
@@ -14,6 +15,7 @@ import torch_mpm
 from torch_mpm import _library
 from torch_mpm.info import info
 
+PACKAGE = Path(torch_mpm.__file__).parent
 LIBRARIES = [path for path in (_library.CPU_LIBRARY, _library.CUDA_LIBRARY) if path.exists()]
 
 
@@ -71,9 +73,41 @@ def test_command_line_prints_info() -> None:
     assert f"torch: {torch.__version__}" in output
 
 
+KNOWN_IMPORTS_OF_THE_ORACLE: set[str] = {
+    "boundaries/obstacles.py", "laws/material.py", "laws/plastic.py", "laws/sand.py", "ops/contact.py",
+    "ops/grid_update.py", "ops/material.py", "ops/principal.py", "ops/sand.py",
+}  # fmt: skip
+"""Modules that still import torch_mpm.reference."""
+
+
+def imported_modules(path: Path) -> set[str]:
+    """Full names of what a module of the package imports, anywhere in it."""
+    package = ("torch_mpm", *path.relative_to(PACKAGE).parts[:-1])
+    found: set[str] = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        if isinstance(node, ast.ImportFrom):
+            base = package[: len(package) - node.level + 1] if node.level else ()
+            module = ".".join((*base, *([node.module] if node.module else [])))
+            found |= {module} | {f"{module}.{alias.name}" for alias in node.names}
+    return found
+
+
+def test_production_never_imports_the_oracle() -> None:
+    """`torch_mpm.reference` is what tests compare with; it may import production, but not the other way round."""
+    paths = [path for path in PACKAGE.rglob("*.py") if path.relative_to(PACKAGE).parts[0] != "reference"]
+    assert len(paths) > 50
+    guilty = {
+        path.relative_to(PACKAGE).as_posix()
+        for path in paths
+        if any(name.startswith("torch_mpm.reference") for name in imported_modules(path))
+    }
+    assert guilty == KNOWN_IMPORTS_OF_THE_ORACLE
+
+
 def copy_package(directory: Path, *left_out: str) -> None:
-    package = Path(torch_mpm.__file__).parent
-    shutil.copytree(package, directory / "torch_mpm", ignore=shutil.ignore_patterns("__pycache__", *left_out))
+    shutil.copytree(PACKAGE, directory / "torch_mpm", ignore=shutil.ignore_patterns("__pycache__", *left_out))
 
 
 def run_python(directory: Path, script: str) -> subprocess.CompletedProcess[str]:

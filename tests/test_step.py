@@ -243,7 +243,7 @@ def test_sorting_keeps_identities(device):
 
 
 def test_sorting_orders_by_block_and_cell(device, dim, kernel):
-    """Slots of the home blocks ascend, and cells within each; particles outside come last."""
+    """Slots of the base blocks ascend, and cells within each; particles outside come last."""
     p = random_particles(dim, kernel, sizes=(900, 0, 300), device=device, extent=0.8)
     x = p.x.clone()
     x[[5, 700]] = torch.nan
@@ -304,23 +304,23 @@ def test_problems_are_reported_with_the_particle_and_the_step(device):
 
 def test_a_full_grid_is_reported(device):
     state = block_state(2, device)
-    step = make_step(2, grid={"capacity": 1})
-    with pytest.raises(mpm.GridOverflowError, match="capacity of 1"):
+    step = make_step(2, grid={"max_blocks": 1})
+    with pytest.raises(mpm.GridOverflowError, match="max_blocks=1"):
         step(state, 1e-3)
         step.check()
 
 
 def test_the_grid_grows_with_the_scene():
-    """Without a capacity an explosion of the particles over the domain is followed on the CPU."""
+    """Without `max_blocks` an explosion of the particles over the domain is followed on the CPU."""
     step = mpm.Step(mpm.Grid(0.01, (0, 0), (1, 1)), mpm.NeoHookean(E=1e4, nu=0.3))
     state = block_state(2)
     state = state.replace(x=0.4 + 0.05 * state.x)
     far = state.replace(x=torch.rand(len(state), 2, dtype=torch.float64))
     step(state, 1e-3)
-    small = step.grid.capacity
+    small = step.grid.max_blocks
     step(far, 1e-3)
     step.check()
-    assert step.grid.capacity > small
+    assert step.grid.max_blocks > small
 
 
 def test_scenes_without_what_they_do_not_use(device):
@@ -386,7 +386,7 @@ def test_bad_states():
         (dict(dx=0.1, lower=(0,), upper=(1,)), "2 or 3 numbers"),
         (dict(dx=0.1, lower=(0, 0), upper=(1, 1), kernel="linear"), "kernel must be one of"),
         (dict(dx=1e-6, lower=(0, 0, 0), upper=(1, 1, 1)), r"fewer than 2\^31"),
-        (dict(dx=0.1, lower=(0, 0), upper=(1, 1), capacity=-1), "capacity must not be negative"),
+        (dict(dx=0.1, lower=(0, 0), upper=(1, 1), max_blocks=-1), "max_blocks must not be negative"),
     ],
 )
 def test_bad_grids(arguments, message):

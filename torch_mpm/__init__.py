@@ -3,7 +3,7 @@
 from typing import TYPE_CHECKING, Any
 
 from . import _library as _library
-from . import ops, seed
+from . import laws, ops, seed
 from .boundaries import SDF, Box, Capsule, Plane, Revolved, Sphere, Walls
 from .cfl import stable_dt
 from .data.trajectory import Trajectory
@@ -12,18 +12,7 @@ from .failures import Failures
 from .grid import Blocks, Grid
 from .heat import Heat
 from .heat import boundaries as heat_boundaries
-from .laws.material import CustomLaw, Material, Mixture, NeoHookean, WeaklyCompressible
-from .laws.plastic import (
-    CamClay,
-    CustomPrincipalLaw,
-    FixedCorotated,
-    Hencky,
-    HerschelBulkley,
-    Snow,
-    VonMises,
-)
-from .laws.sand import QuarticSand
-from .laws.thermal import Melting, ThermalExpansion
+from .laws import *  # noqa: F403
 from .ops import (
     HeatSolve,
     advance,
@@ -46,41 +35,27 @@ if TYPE_CHECKING:
     from .scene import Scene as Scene
 
 __all__ = [
+    *laws.__all__,
     "SDF",
     "Blocks",
     "Box",
-    "CamClay",
     "Capsule",
-    "CustomLaw",
-    "CustomPrincipalLaw",
     "DamagedFileError",
     "Failures",
-    "FixedCorotated",
     "Grid",
     "GridOverflowError",
     "Heat",
     "HeatSolve",
-    "Hencky",
-    "HerschelBulkley",
-    "Material",
-    "Melting",
-    "Mixture",
-    "NeoHookean",
     "PerMaterial",
     "Plane",
-    "QuarticSand",
     "Revolved",
     "SimulationError",
-    "Snow",
     "Sphere",
     "State",
     "Step",
     "Table",
-    "ThermalExpansion",
     "Trajectory",
-    "VonMises",
     "Walls",
-    "WeaklyCompressible",
     "advance",
     "g2p",
     "g2p_advance",

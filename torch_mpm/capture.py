@@ -41,10 +41,10 @@ def remember(kept: list[Any], value: Any) -> None:
         kept.append(value)
 
 
-class Kept:
-    """What is made once from a key, and again when the key changes: tensors on the device that no step waits for.
+class GraphCache:
+    """The latest value by key: tensors on the device that no step waits for, made again when the key changes.
 
-    What a graph has captured is kept for its replays, also when the key has changed since.
+    A value that a CUDA graph has captured is kept for its replays, also when the key has changed since.
     """
 
     def __init__(self) -> None:

@@ -38,7 +38,8 @@ from torch import Tensor
 
 from .errors import check_number
 from .grid import Grid, check_grid
-from .laws.material import Material, as_law
+from .laws.custom import as_law
+from .laws.material import Material
 from .state import State, check_state
 
 GRADIENT_BOUND = {

@@ -210,11 +210,11 @@ def raise_failures(failures: Failures, statuses: Iterable[Tensor], grid: Grid) -
                 f"{outside + lost} particles have a scene id outside the {grid.scenes} scenes of the grid, first at "
                 f"step {step}: give each particle a scene from 0 to {grid.scenes - 1}"
             )
-        if grid.capacity is not None and peak > grid.capacity:
+        if grid.max_blocks is not None and peak > grid.max_blocks:
             when = "" if outside + lost > 0 or any(row[6] >= 0 for row in scenes) else f", first at step {step}"
             full = (
-                f"{peak} blocks were active but the grid has a capacity of {grid.capacity}{when}: "
-                "pass a larger capacity, or None to let it grow"
+                f"{peak} blocks were active but the grid has max_blocks={grid.max_blocks}{when}: "
+                "pass a larger max_blocks, or None to let it grow"
             )
     if sentences:
         raise SimulationError("\n".join(sentences + [full] * bool(full)), failures)

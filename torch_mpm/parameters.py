@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from .errors import check_numbers, check_real, shape_of
-from .reference.material import per_particle
+from .ops.arguments import per_parameter
 
 if TYPE_CHECKING:
     from .state import State
@@ -131,7 +131,7 @@ def evaluate(name: str, value: Value, state: State) -> float | Tensor:
         return value if state.ids is None else value.index_select(0, state.ids)
     if value.dim() != 1 or state.scene is None:
         raise ValueError(f"{name} must have shape [], [1], [B] or [P] = [{particles}], got {shape_of(value)}")
-    return per_particle(value, state.scene, P)
+    return per_parameter(value, state.scene, P)
 
 
 def needed_temperature(state: State) -> Tensor:
@@ -146,8 +146,8 @@ def needed_temperature(state: State) -> Tensor:
     return temperature
 
 
-class With:
-    """A state, or part of one, with some fields changed."""
+class Overlay:
+    """A state, or part of one, seen with some fields replaced."""
 
     def __init__(self, state: Any, **changes: Any) -> None:
         self.__dict__.update(changes)

@@ -9,8 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from .activation_record import ActivationRecord
 from .capture import is_traced
-from .grid import ActivationRecord
 from .ops.arguments import per_particle, split_dt
 from .state import State
 

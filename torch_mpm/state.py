@@ -202,7 +202,7 @@ class State:
         check_grid(grid)
         ids = torch.arange(len(self), device=self.x.device) if self.ids is None else self.ids
         blocks = grid.activate(self.x, self.scene)
-        order = torch.ops.torch_mpm.cell_order(self.x.detach(), *blocks.topology)
+        order = torch.ops.torch_mpm.cell_order(self.x.detach(), *blocks.packed)
         return self.replace(ids=ids).select(order)
 
     def restored(self) -> State:

@@ -10,18 +10,20 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint as run_checkpointed
 
+from .activation_record import ActivationRecord
 from .boundaries import BoundaryList, Obstacle, Walls, call_boundary
-from .capture import Kept
+from .capture import GraphCache
 from .cfl import stable_dt
 from .errors import check_count, check_number, check_vector, shape_of
 from .failures import Failures, problems_of_state, raise_failures
-from .grid import ActivationRecord, Blocks, Grid, check_grid
+from .grid import Blocks, Grid, check_grid
 from .heat.heat import Heat
-from .laws.material import Material, as_law
+from .laws.custom import as_law
+from .laws.material import Material
 from .ops import contact, fusible, g2p, g2p_advance, gather, grid_update, p2g
 from .ops.arguments import check_choice
 from .ops.transfer import STRESS_FORMS
-from .parameters import TensorModule, With
+from .parameters import Overlay, TensorModule
 from .pause import paused
 from .state import State, check_state, identity_deformation
 
@@ -62,8 +64,8 @@ class Step(TensorModule):
     hooks on the law, whose output is a tensor.
 
     Differentiable in reverse mode, by torch.func.grad and vjp too. `torch.compile(step, fullgraph=True)` needs a grid
-    with a capacity; it compiles again for another number dt (a tensor avoids that), for other strides, and once a field
-    that was None is a tensor.
+    with `max_blocks`; it compiles again for another number dt (a tensor avoids that), for other strides, and once a
+    field that was None is a tensor.
 
     Raises:
         TypeError, ValueError: for a wrong argument.
@@ -102,7 +104,7 @@ class Step(TensorModule):
         self.on_grid = on_grid
         self.heat = heat
         self._activations = ActivationRecord()
-        self._kept_gravity = Kept()
+        self._kept_gravity = GraphCache()
 
     def __setattr__(self, name: str, value: Any) -> None:
         """Arguments in any form, checked and converted."""
@@ -144,7 +146,7 @@ class Step(TensorModule):
 
         Raises:
             ValueError, TypeError: for wrong shapes, dtypes or devices, or a number dt that is not positive.
-            GridOverflowError: on the CPU, where a grid of fixed capacity is full.
+            GridOverflowError: on the CPU, where a grid of fixed `max_blocks` is full.
         """
         return paused(self._advanced, self._activations, self.prepare(state), dt, self.grid.scenes)
 
@@ -153,7 +155,7 @@ class Step(TensorModule):
         grid, scene = self.grid, state.scene
         blocks = self._activations.activate(grid, state.x, scene, state.ids)
         form, affine = self.stress_form, state.C if self.transfer == "apic" else None
-        fields, stress = self.law(With(state, dt=dt) if self._rate_dependent else state)
+        fields, stress = self.law(Overlay(state, dt=dt) if self._rate_dependent else state)
         dissipated = fields.pop("dissipated", None)
         if self.law.extra_fields:
             history = {name: fields.pop(name) for name in self.law.extra_fields if name in fields}
@@ -182,7 +184,7 @@ class Step(TensorModule):
         if "J" in self.law.state_fields and state.J is None:
             changes["J"] = torch.ones_like(state.mass)
         if missing := [name for name in self.law.extra_fields if name not in state.extra]:
-            changes["extra"] = {**state.extra, **{name: torch.zeros_like(state.mass) for name in missing}}
+            changes["extra"] = {**state.extra, **{name: self.law.initial(name, state) for name in missing}}
         state = state.replace(**changes) if changes else state
         return state if self.heat is None else self.heat.prepare(state)
 

@@ -76,7 +76,7 @@ def setup(case: Case, device: str) -> tuple[mpm.Step, mpm.State]:
     """The water at rest, with room for the waves that go up and down the channel."""
     behind, ahead = math.ceil(1.1 * case.duration), math.ceil(2.5 * case.duration)
     grid = mpm.Grid(DEPTH / case.n, (-behind * DEPTH, 0.0), (ahead * DEPTH, 1.5 * DEPTH), kernel=case.kernel)
-    grid = mpm.Grid(grid.dx, grid.lower, grid.upper, kernel=case.kernel, capacity=grid.block_count)
+    grid = mpm.Grid(grid.dx, grid.lower, grid.upper, kernel=case.kernel, max_blocks=grid.block_count)
     points = mpm.seed.box((-behind * DEPTH, 0.0), (0.0, DEPTH), grid, per_cell=case.per_cell)
     state = mpm.State.at_rest(points, DENSITY, dtype=torch.float32, device=device)
     bulk = DENSITY * (case.mach * 2 * SPEED) ** 2

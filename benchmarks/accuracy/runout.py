@@ -212,7 +212,7 @@ def simulate(
     packed = mpm.State.concatenate(list(states), scene=True).to(device, torch.float32)
     wanted = grid.activate(packed.x, packed.scene).wanted
     room = min(3 * wanted, grid.block_count)  # to spread; fixed, for the graph
-    grid = mpm.Grid(DX, (0.0,) * dim, upper, scenes=len(states), kernel=case.kernel, capacity=room)
+    grid = mpm.Grid(DX, (0.0,) * dim, upper, scenes=len(states), kernel=case.kernel, max_blocks=room)
     moduli = [stiffness(h, case.compression) for h in heights]
     mu, lam = (torch.tensor(values, device=device) for values in zip(*moduli, strict=True))
     law = mpm.QuarticSand(
@@ -243,7 +243,7 @@ class Segment:
     """SEGMENT steps in place; on a GPU, from the second call on, a CUDA graph.
 
     Args:
-        step: with a grid of fixed capacity.
+        step: with a grid of fixed max_blocks.
         state: at the start, with all that the step needs.
         time_step: of a state, dt [B].
         every_step: whether to ask for dt at every step, not once.

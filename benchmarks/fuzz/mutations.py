@@ -36,8 +36,8 @@ STRANGERS: tuple[Any, ...] = (
     slice(None), range(3),
 )  # fmt: skip
 """Values of other types, for any argument."""
-FIXED_CONTENTS = ("table", "block", "offsets", "index", "schedule")
-"""Index tensors that only `activate` may fill: their values are not checked, so that they are not changed here."""
+FIXED_CONTENTS = ("topology",)
+"""Lists of index tensors that only `activate` may fill: their values are not checked, so they are not changed here."""
 
 
 def mutate(name: str, value: Any, others: list[Any], choose: random.Random) -> tuple[str, Any]:
@@ -52,7 +52,7 @@ def mutate(name: str, value: Any, others: list[Any], choose: random.Random) -> t
     if isinstance(value, Tensor):
         return _tensor(value, name not in FIXED_CONTENTS, choose)
     if isinstance(value, (list, tuple)) and not hasattr(value, "_fields"):
-        return _sequence(value, choose)
+        return _sequence(name, value, choose)
     if isinstance(value, bool) or value is None:
         other = choose.choice(STRANGERS)
     elif isinstance(value, int):
@@ -72,12 +72,12 @@ def _text(value: Any) -> str:
     return repr(value) if len(repr(value)) < 40 else repr(value)[:40] + "…"
 
 
-def _sequence(values: Any, choose: random.Random) -> tuple[str, Any]:
+def _sequence(name: str, values: Any, choose: random.Random) -> tuple[str, Any]:
     items = list(values)
     action = choose.choice(("empty", "shorter", "longer", "element", "element", "element", "tensor", "nested"))
     if action == "element" and items:
         k = choose.randrange(len(items))
-        done, items[k] = mutate("", items[k], items, choose)
+        done, items[k] = mutate(name, items[k], items, choose)
         return f"[{k}] {done}", items
     changed: dict[str, Any] = {
         "empty": [], "shorter": items[:-1], "longer": items + items[-1:], "element": [None],

@@ -9,12 +9,10 @@ import torch
 from torch import Tensor
 
 import torch_mpm as mpm
+from torch_mpm.ops import LAWS
 from torch_mpm.ops.heat_patches import Patches
-from torch_mpm.reference.principal import LAWS
 
 PARTICLES = 37
-MATERIALS = {"neo_hookean": (2, True), "viscous_fluid": (3, False)}
-"""Laws of `material_stress`: parameters, and whether the state is F (or J)."""
 
 
 def operators() -> list[str]:
@@ -26,7 +24,7 @@ def operators() -> list[str]:
 def calls(dim: int, dtype: torch.dtype = torch.float64) -> list[tuple[str, dict[str, Any]]]:
     """(op, arguments by name) of at least one valid call of every op."""
     make = _Calls(dim, dtype)
-    found = [*make.transfers(), *make.grid(), *make.heat(), *make.principal(), *make.materials(), *make.sand()]
+    found = [*make.transfers(), *make.grid(), *make.heat(), *make.laws(), *make.sand()]
     return [(op, _named(op, values)) for op, values in found]
 
 
@@ -46,7 +44,7 @@ class _Calls:
         self.scene = torch.arange(P, dtype=torch.int32) % 2
         self.lattice = mpm.Grid(0.21, (0.0,) * D, (2.0,) * D, scenes=2)
         self.blocks = self.lattice.activate(self.x, self.scene)
-        self.topology = self.blocks.topology
+        self.topology = self.blocks.packed
         self.N = self.blocks.node_count
         self.dt = 0.5 + self.uniform(2)
         self.F = torch.eye(D, dtype=dtype) + 0.1 * self.normal(P, D, D)
@@ -64,8 +62,7 @@ class _Calls:
         given = (x, mass, v, C, stress, self.uniform(P), self.dt, 0.1, 0)
         rows, velocity = self.normal(self.N, 1 + D), self.normal(self.N, D)
         moving = (x, v, C, self.F, J, self.scene, self.dt, 0.1)
-        grid = self.lattice
-        activation = (x, self.scene, self.blocks.status, 2, grid.dx, grid.lower, grid.blocks, grid.order, 40, True)
+        activation = (x, self.scene, torch.arange(P), self.blocks.status, 2, 40, *self.lattice.packed)
         return [
             ("activate", activation),
             ("cell_order", (x, *top)),
@@ -81,14 +78,13 @@ class _Calls:
         ]
 
     def grid(self) -> list[tuple[str, tuple[Any, ...]]]:
-        D, blocks, grid = self.dim, self.blocks, self.lattice
-        lattice = (grid.dx, grid.lower, grid.blocks)
+        D, top = self.dim, self.topology
         walls = ([2, 4] + [1, 3] * (D - 1), [0.0, 1.0] * D, [0.1] * 2 * D)
         rows, velocity = self.uniform(self.N, 1 + D), self.normal(self.N, D)
-        update = (rows, self.normal(2, D), self.dt, 0.1, *walls, blocks.table, blocks.block, *lattice)
+        update = (rows, self.normal(2, D), self.dt, 0.1, *walls, *top)
         table = self.uniform(2, 4, 10 if D == 2 else 17)
         kinds = ([0, 1, 2, 3], [1, 2, 3, 2], [-1, -1, 0, 1], [0.0] * 4, [float("inf")] * 4)
-        obstacles = (velocity, table, *kinds, self.uniform(2), 0.1, blocks.block, *lattice)
+        obstacles = (velocity, table, *kinds, self.uniform(2), 0.1, *top)
         return [
             ("grid_update", update),
             ("grid_update_backward", (self.uniform(self.N, 1 + D), True, *update)),
@@ -99,10 +95,10 @@ class _Calls:
     def heat(self) -> list[tuple[str, tuple[Any, ...]]]:
         x, N, blocks, top = self.x, self.N, self.blocks, self.topology
         conductance = self.uniform(PARTICLES)
-        capacity = mpm.scatter(blocks, x, self.uniform(PARTICLES, 1))[:, 0].contiguous()
-        nodes = (capacity, self.normal(N), self.normal(N), self.uniform(N), self.uniform(N) < 0.1)
+        heat_capacity = mpm.scatter(blocks, x, self.uniform(PARTICLES, 1))[:, 0].contiguous()
+        nodes = (heat_capacity, self.normal(N), self.normal(N), self.uniform(N), self.uniform(N) < 0.1)
         limits = (0.1 * self.uniform(2), 1e-6, 0.0, torch.tensor([20, 30], dtype=torch.int32), 40)
-        patches = Patches(blocks, x, conductance, capacity, capacity > 0)
+        patches = Patches(blocks, x, conductance, heat_capacity, heat_capacity > 0)
         return [
             ("heat_cg", (x, conductance, *nodes, self.dt, 0.5, *limits, 0, 1e-6, *top)),
             ("heat_cg", (x, conductance, *nodes, self.dt, 0.5, *limits, 1, 1e-6, *top)),
@@ -112,51 +108,46 @@ class _Calls:
             ("heat_patches", (patches.inverse, patches.rows, patches.patches, self.normal(N))),
         ]
 
-    def principal(self) -> list[tuple[str, tuple[Any, ...]]]:
+    def laws(self) -> list[tuple[str, tuple[Any, ...]]]:
         P, D, found = PARTICLES, self.dim, []
-        for law, description in LAWS.items():
-            shapes = itertools.islice(itertools.cycle(((2,), (P,), (), (1,))), len(description.parameters))
+        for law, info in LAWS.items():
+            if D == 2 and not info.in_2d:
+                continue
+            shapes = itertools.islice(itertools.cycle(((2,), (P,), (), (1,))), len(info.parameters))
             p = [0.5 + self.uniform(*shape) for shape in shapes]
-            q = [0.5 + self.uniform(P) for _ in description.history]
-            given = (self.F, p, q, self.scene, law)
-            grads = (self.normal(P, D, D), self.normal(P, D, D), self.normal(P, len(q)), self.normal(P))
+            q = [0.5 + (self.uniform(P, D, D) if h.matrix else self.uniform(P)) for h in info.history]
+            state = self.F if info.field == "F" else 0.5 + self.uniform(P)
+            C = self.normal(P, D, D) if info.viscous else None
+            tail = (self.scene, law, D)
+            entries = sum(D * D if h.matrix else 1 for h in info.history)
+            grads = (
+                self.normal(P, D, D) if info.plastic else None,
+                *(self.normal(P, D, D), self.normal(P, entries) if q else None, self.normal(P), self.normal(P)),
+            )
             found += [
-                ("principal_update", (*given, True)),
-                ("principal_update_backward", (*grads, *given, 7)),
-                ("principal_energy", given),
-                ("principal_energy_backward", (self.normal(P), *given, 7)),
-                ("principal_stiffness", given),
-                ("principal_wave_modulus", given),
+                ("law_update", (state, C, p, q, *tail, 0, 7)),
+                ("law_update_backward", (*grads, state, C, p, q, *tail, 0, 15)),
+                ("law_energy", (state, p, q, *tail)),
+                ("law_energy_backward", (self.normal(P), state, p, q, *tail, 13)),
+                ("law_stiffness", (state, p, q, *tail)),
+                ("law_wave_modulus", (state, p, q, *tail)),
             ]
-        return found
-
-    def materials(self) -> list[tuple[str, tuple[Any, ...]]]:
-        P, D, found = PARTICLES, self.dim, []
-        for law, (count, shear) in MATERIALS.items():
-            parameters = [0.5 + self.uniform(*shape) for shape in ((2,), (P,), ())[:count]]
-            state, C = (self.F, None) if shear else (0.5 + self.uniform(P), self.normal(P, D, D))
-            tail = (self.scene, parameters, law, D)
-            found += [
-                ("material_stress", (state, C, *tail)),
-                ("material_stress_backward", (self.normal(P, D, D), state, C, *tail, 7)),
-                ("material_energy", (state, *tail)),
-                ("material_energy_backward", (self.normal(P), state, *tail, 7)),
-                ("material_stiffness", (state, *tail)),
-                ("material_wave_modulus", (state, *tail)),
-            ]
+            if info.twice_differentiable:
+                along = (self.normal(*state.shape), C, self.normal(P, len(p)))
+                found += [
+                    ("law_update_double_backward", (*along, self.normal(P, D, D), state, C, p, *tail, 7)),
+                    ("law_energy_double_backward", (along[0], along[2], self.normal(P), state, p, *tail, 5)),
+                ]
         return found
 
     def sand(self) -> list[tuple[str, tuple[Any, ...]]]:
-        P, D = PARTICLES, self.dim
-        moduli = (0.5 + self.uniform(2), 0.5 + self.uniform(P))
-        options = ("full", "exact", "zero")
-        given = (self.F, *moduli, self.uniform(), self.uniform(1), self.uniform(P), self.scene, *options)
-        grads = (self.normal(P, D, D), self.normal(P, D, D), *(self.normal(P) for _ in range(3)))
+        moduli = (0.5 + self.uniform(2), 0.5 + self.uniform(PARTICLES))
+        options = ("full", "exact", "zero", True)
         return [
-            ("quartic_return_map", (*given, True)),
-            ("quartic_return_map_backward", (*grads, *given, True, True)),
-            ("quartic_energy", (self.F, *moduli, self.scene, "full")),
-            ("quartic_stiffness", (self.F, *moduli, self.scene, "full", 0.1)),
+            (
+                "quartic_return_map",
+                (self.F, *moduli, self.uniform(), self.uniform(1), self.uniform(PARTICLES), self.scene, *options),
+            ),
             ("svd3", (self.F,)),
             ("polar", (self.F,)),
         ]

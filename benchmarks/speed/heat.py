@@ -52,16 +52,16 @@ class Problem:
         self.x = x.T.contiguous().T
         self.blocks = grid.activate(self.x, scene)
         self.conductance = torch.full_like(self.x[:, 0], self.dx**3 / 8)
-        self.capacity = scatter(self.blocks, self.x, self.conductance[:, None])[:, 0]
-        self.theta = torch.rand_like(self.capacity)
+        self.heat_capacity = scatter(self.blocks, self.x, self.conductance[:, None])[:, 0]
+        self.theta = torch.rand_like(self.heat_capacity)
 
     def solve(self, r: float, **options: Any) -> mpm.HeatSolve:
         dt = r * self.dx**2
-        return mpm.heat_cg(self.blocks, self.x, self.conductance, self.capacity, self.theta, dt, **options)
+        return mpm.heat_cg(self.blocks, self.x, self.conductance, self.heat_capacity, self.theta, dt, **options)
 
 
 def csr(p: Problem) -> Tensor:
-    """The nonzeros of H on the nodes with capacity as a CSR matrix."""
+    """The nonzeros of H on the nodes with heat capacity as a CSR matrix."""
     operator, dim = HeatOperator, 3
     N, width = p.blocks.node_count, 5
     values = p.x.new_zeros(N * width**dim)
@@ -83,7 +83,7 @@ def csr(p: Problem) -> Tensor:
     columns = torch.empty(used, width**dim, dtype=torch.int32, device=p.x.device)
     for entry, shift in enumerate(itertools.product(range(width), repeat=dim)):
         columns[:, entry] = padded[tuple((at[:, k] + shift[k]) for k in range(dim))]
-    some = p.capacity[:used] > 0
+    some = p.heat_capacity[:used] > 0
     table = values[: used * width**dim].reshape(used, -1)
     kept = (table != 0) & (columns >= 0) & some[:, None]
     start = torch.nn.functional.pad(kept.sum(1)[some].cumsum(0), (1, 0)).int()
@@ -162,8 +162,8 @@ def cupy_cg(H: Tensor, weight: Tensor, diagonal: Tensor, b: Tensor) -> Callable[
 def beside_csr(p: Problem, clock: Clock, count: int) -> list[dict[str, Any]]:
     """The same number of iterations with the assembled matrix, on CUDA."""
     H = csr(p)
-    some = p.capacity > 0
-    weight = p.capacity[some] / p.dx**2
+    some = p.heat_capacity > 0
+    weight = p.heat_capacity[some] / p.dx**2
     b = -(H @ p.theta[some])
     diagonal = heat_operator(p.blocks, p.x, p.conductance, None)[some]
 
@@ -201,9 +201,9 @@ def beside_scipy(p: Problem, clock: Clock, count: int) -> dict[str, Any]:
     from scipy.sparse.linalg import cg
 
     assembly = wall(lambda: assembled(p.blocks, p.x, p.conductance), clock, 1)
-    some = (p.capacity > 0).numpy()
+    some = (p.heat_capacity > 0).numpy()
     H = assembled(p.blocks, p.x, p.conductance)[some][:, some]
-    A = (H + sparse.diags(p.capacity.double().numpy()[some] / p.dx**2)).tocsr().astype("float32")
+    A = (H + sparse.diags(p.heat_capacity.double().numpy()[some] / p.dx**2)).tocsr().astype("float32")
     b = -(H @ p.theta.numpy()[some])
     M = sparse.diags(1 / A.diagonal())
     iterations = wall(lambda: cg(A, b, rtol=0.0, maxiter=count, M=M), clock)

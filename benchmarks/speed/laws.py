@@ -15,7 +15,7 @@ from typing import Any
 import torch
 
 import torch_mpm as mpm  # noqa: F401  (registers the ops)
-from torch_mpm.reference.principal import LAWS
+from torch_mpm.ops import LAWS
 
 from .. import common
 from .svd import structure_of_arrays
@@ -40,19 +40,18 @@ def times(device: str, count: int, clock: Clock, bandwidth: float) -> Iterator[d
     for law, values in PARAMETERS.items():
         parameters = [torch.tensor(v, device=device) for v in values]
         history = [torch.zeros(count, device=device) for _ in LAWS[law].history]
-        given = (F, parameters, history, None, law)
-        plastic = LAWS[law].flow is not None
+        given, plastic = (parameters, history, None, law, 3), LAWS[law].plastic
         grad_history = torch.ones(len(history), count, device=device).T
-        adjoint = (grad if plastic else None, grad, grad_history, None)
+        adjoint = (grad if plastic else None, grad, grad_history if history else None, None, None)
         runs: tuple[tuple[str, Callable[[], object]], ...] = (
-            ("update", lambda given=given: ops.principal_update(*given, False)),
-            ("with details", lambda given=given: ops.principal_update(*given, True)),
-            ("backward", lambda given=given, a=adjoint: ops.principal_update_backward(*a, *given, 7)),
-            ("stiffness", lambda given=given: ops.principal_stiffness(*given)),
+            ("update", lambda given=given: ops.law_update(F, None, *given, 0, 0)),
+            ("with details", lambda given=given: ops.law_update(F, None, *given, 0, 5)),
+            ("backward", lambda given=given, a=adjoint: ops.law_update_backward(*a, F, None, *given, 0, 13)),
+            ("stiffness", lambda given=given: ops.law_stiffness(F, *given)),
         )
         row: dict[str, Any] = {
             "law": law,
-            "flowing": float((ops.principal_update(*given, True)[4] == 1).float().mean()),
+            "flowing": float((ops.law_update(F, None, *given, 0, 4)[5] == 1).float().mean()),
         }
         for name, run in runs:
             row[name] = clock.op(run).ms

@@ -80,7 +80,7 @@ def measure(side: int, kernel: str, order: str) -> dict[str, float]:
     blocks, fixed_blocks = grid.activate(x), fixed.activate(x)
     nodes = mpm.p2g(blocks, x, mass, v, C)
     velocity = nodes[:, 1:]
-    op, topology, scale = torch.ops.torch_mpm, blocks.topology, grid.inverse_inertia
+    op, topology, scale = torch.ops.torch_mpm, blocks.packed, grid.inverse_inertia
     runs: dict[str, Callable[[], object]] = {
         "zero nodes": lambda: torch.zeros_like(nodes),
         "activate": lambda: grid.activate(x),

@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 
 import torch_mpm as mpm
-from torch_mpm.parameters import With
+from torch_mpm.parameters import Overlay
 
 from .. import common
 from .stable_dt import LAWS as SOLIDS
@@ -199,7 +199,7 @@ def energy(step: mpm.Step, state: mpm.State, dt: float) -> float:
     """Kinetic, elastic and potential [J]."""
     law = step.law
     total = 0.5 * state.mass * state.v.square().sum(1)
-    total = total + law.energy(With(state, dt=dt) if getattr(law, "rate_dependent", False) else state)  # type: ignore[arg-type]
+    total = total + law.energy(Overlay(state, dt=dt) if getattr(law, "rate_dependent", False) else state)  # type: ignore[arg-type]
     if state.C is not None and step.transfer == "apic":
         second = step.grid.dx**2 / (4 if step.grid.kernel == "quadratic" else 3)
         total = total + 0.5 * state.mass * second * state.C.square().sum((1, 2))

@@ -44,7 +44,7 @@ def measure(dim: int, energy: str, apex: str, steps: int, device: str) -> list[d
     upper = (40 * size[0] * DX if dim == 2 else 15 * size[0] * DX, 1.5 * height, 15 * size[0] * DX)[:dim]
     roomy = mpm.Grid(DX, (0.0,) * dim, upper, scenes=len(cases))
     room = min(12 * roomy.activate(packed.x, packed.scene).wanted, roomy.block_count)
-    grid = mpm.Grid(DX, (0.0,) * dim, upper, scenes=len(cases), capacity=room)
+    grid = mpm.Grid(DX, (0.0,) * dim, upper, scenes=len(cases), max_blocks=room)
     E, angle = (torch.tensor(v, dtype=torch.float32, device=device) for v in zip(*cases, strict=True))
     law = mpm.QuarticSand(
         E=E, nu=torch.full_like(E, 0.3), friction_angle=torch.deg2rad(angle), energy=energy, apex=apex

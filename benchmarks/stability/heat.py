@@ -64,16 +64,16 @@ def case(n: int, r: float, contrast: float, method: str, dtype: torch.dtype, ref
     blocks = grid.activate(x)
     volume = dx * dx / 4
     conductance = torch.where(x[:, 0] < 0.5, volume, volume / contrast).to(dtype)
-    capacity = scatter(blocks, x, torch.full_like(x[:, :1], volume))[:, 0]
+    heat_capacity = scatter(blocks, x, torch.full_like(x[:, :1], volume))[:, 0]
     theta = torch.rand(blocks.node_count, generator=generator, dtype=torch.float64).to(dtype)
     dt = r * dx * dx
     solve = mpm.heat_cg(
-        blocks, x, conductance, capacity, theta, dt, tolerance=REFINED if refine else 0.0,
+        blocks, x, conductance, heat_capacity, theta, dt, tolerance=REFINED if refine else 0.0,
         relative_tolerance=0.0 if refine else RELATIVE[dtype], max_iterations=MOST, method=method, refine=refine,
     )  # fmt: skip
-    some = (capacity > 0).numpy()
+    some = (heat_capacity > 0).numpy()
     H = assembled(blocks, x, conductance)
-    mass = capacity.double().numpy()
+    mass = heat_capacity.double().numpy()
     A = (H + sparse.diags(mass / dt))[some][:, some].tocsc()
     exact = spsolve(A, -(H @ theta.double().numpy())[some])
     weight = mass[some] / mass.sum()

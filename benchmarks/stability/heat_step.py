@@ -89,11 +89,11 @@ class Exact(mpm.Heat):
         W = W.flatten(0, 1)
         if nodes.exchange is not None:
             W = torch.cat([W, torch.diag((dt * by_site(nodes.exchange)[0]).sqrt())])
-        free = nodes.capacity > 0
+        free = nodes.heat_capacity > 0
         if nodes.fixed is not None:
             free &= ~nodes.fixed
         rows = by_site(free)[0].nonzero()[:, 0]
-        root = by_site(nodes.capacity)[0, rows].sqrt()
+        root = by_site(nodes.heat_capacity)[0, rows].sqrt()
         _, sigma, V = torch.linalg.svd(W[:, rows] / root, full_matrices=False)
         decay = V.T * (sigma**2 / (1 + sigma**2)) @ V
         after = by_site(torch.where(free, nodes.theta, 0))

@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 import torch_mpm as mpm  # noqa: F401  (registers the ops)
-from torch_mpm.reference.sand import friction_alpha
+from torch_mpm.ops.sand import friction_alpha
 
 from .. import common
 

@@ -14,7 +14,9 @@
 #define MPM_DISPATCH_KEY CPU
 namespace mpm {
 namespace cpu {
-struct Stream {};
+struct Stream {
+  operator void*() const { return nullptr; }
+};
 }  // namespace cpu
 namespace backend = cpu;
 // Nothing to guard on the CPU; gives the kernels' stream argument.

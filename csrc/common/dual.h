@@ -48,7 +48,7 @@ MPM_HD Dual<T> sqrt(const Dual<T>& a) {
   return {root, T(0.5) * a.derivative / root};
 }
 
-// ln a; see math/elementary.h for its arguments.
+// ln a; see common/elementary.h for its arguments.
 template <class T>
 MPM_HD Dual<T> log_1p(const Dual<T>& a, const Dual<T>& a_minus_1) {
   return {log_1p(a.value, a_minus_1.value), a.derivative / a.value};

@@ -6,8 +6,8 @@
 
 #include "common/host_device.h"
 
-// Elementary functions under one name for every scalar type: here for float and double, in math/dual.h and
-// math/pack.h for dual numbers and packs.
+// Elementary functions under one name for every scalar type: here for float and double, in common/dual.h and
+// common/pack.h for dual numbers and packs.
 namespace mpm {
 inline namespace TORCH_MPM_ISA {
 
@@ -106,10 +106,11 @@ MPM_HD Value logarithm(const Value& a, const Value& a_minus_1) {
 // (eˣ − 1)/x, also at x = 0.
 template <class T>
 MPM_HD T expm1_quotient(const T& x) {
-  if (!(abs(value_of(x)) < 0.5)) return expm1(x) / x;
-  T r = T(1);
-  for (int k = 15; k > 1; k--) r = T(1) + r * x * T(1.0 / k);
-  return r;
+  const auto small = abs(x) < T(0.5);
+  T series = T(1);
+  for (int k = 15; k > 1; k--) series = T(1) + series * x * T(1.0 / k);
+  const T safe = select(small, T(1), x);
+  return select(small, series, expm1(safe) / safe);
 }
 
 }  // namespace TORCH_MPM_ISA

@@ -1,7 +1,7 @@
 #pragma once
 
+#include "common/fields.h"
 #include "common/matrix.h"
-#include "transfer/arguments.h"
 
 // Access of a kernel body to its particles: `One` is the particle of a CUDA thread; cpu/lanes.h has the particles in
 // the lanes of a pack.
@@ -22,6 +22,30 @@ struct One {
   }
   MPM_HD void store_integer(int* pointer, const T& value) const { pointer[p] = int(value); }
 };
+
+template <class At, class T>
+MPM_HD typename At::Value load_scalar(const At& at, const Field<const T>& f) {
+  return at.load(f.pointer, f.stride[0]);
+}
+
+template <class At, class T>
+MPM_HD void store_scalar(const At& at, const Field<T>& f, const typename At::Value& a) {
+  at.store(f.pointer, f.stride[0], a);
+}
+
+template <int D, class At, class T>
+MPM_HD Vector<typename At::Value, D> load_vector(const At& at, const Field<const T>& f) {
+  Vector<typename At::Value, D> r;
+  MPM_UNROLL for (int i = 0; i < D; i++)
+    r[i] = at.load(f.pointer + i * f.stride[1], f.stride[0]);
+  return r;
+}
+
+template <int D, class At, class T>
+MPM_HD void store_vector(const At& at, const Field<T>& f, const Vector<typename At::Value, D>& a) {
+  MPM_UNROLL for (int i = 0; i < D; i++)
+    at.store(f.pointer + i * f.stride[1], f.stride[0], a[i]);
+}
 
 template <int D, class At, class T>
 MPM_HD Matrix<typename At::Value, D> load_matrix(const At& at, const Field<const T>& f) {

@@ -1,6 +1,6 @@
 #pragma once
 
-#include "common/host_device.h"
+#include "common/elementary.h"
 
 // Vectors and square matrices of D = 2 or 3 over any scalar: float, double, a dual number or a pack of lanes.
 namespace mpm {
@@ -171,6 +171,32 @@ MPM_HD T determinant(const Matrix<T, D>& a) {
   T r = a[0][0] * c[0][0];
   MPM_UNROLL for (int j = 1; j < D; j++)
     r = r + a[0][j] * c[0][j];
+  return r;
+}
+
+template <class T, int D>
+MPM_HD Matrix<T, D> symmetric_part(const Matrix<T, D>& a) {
+  return T(0.5) * (a + transpose(a));
+}
+
+template <class T, int D>
+MPM_HD Matrix<T, D> skew_part(const Matrix<T, D>& a) {
+  return T(0.5) * (a - transpose(a));
+}
+
+template <class Mask, class T, int D>
+MPM_HD Vector<T, D> select(const Mask& mask, const Vector<T, D>& a, const Vector<T, D>& b) {
+  Vector<T, D> r;
+  MPM_UNROLL for (int i = 0; i < D; i++)
+    r[i] = select(mask, a[i], b[i]);
+  return r;
+}
+
+template <class Mask, class T, int D>
+MPM_HD Matrix<T, D> select(const Mask& mask, const Matrix<T, D>& a, const Matrix<T, D>& b) {
+  Matrix<T, D> r;
+  MPM_UNROLL for (int i = 0; i < D; i++) MPM_UNROLL
+    for (int j = 0; j < D; j++) r[i][j] = select(mask, a[i][j], b[i][j]);
   return r;
 }
 

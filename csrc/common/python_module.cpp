@@ -8,8 +8,9 @@
 
 #include "common/bspline.h"
 #include "common/pack.h"
-#include "laws/laws.h"
-#include "laws/quartic_kernels.h"
+#include "laws/neo_hookean.h"
+#include "laws/quartic_return_map.h"
+#include "laws/weakly_compressible.h"
 
 namespace py = pybind11;
 using namespace mpm;
@@ -81,13 +82,15 @@ void at_strain(const std::string& name, const Array<double>& F_, const std::vect
   for (int i = 0; i < D; i++)
     for (int j = 0; j < D; j++) F[i][j] = F_.data()[i * D + j];
   bool found = false;
-  for (int k = 0; k < AllLaws::size; k++)
-    AllLaws::visit(k, [&]<class Law>() {
-      if (name != Law::name) return;
-      found = true;
-      require(int(parameters.size()) == Law::parameters, "the law has another number of parameters");
-      f.template operator()<Law>(strain_of_deformation(F, zero_matrix<double, D>()), parameters.data());
-    });
+  const auto try_law = [&]<class Law>() {
+    if (name != Law::name) return;
+    found = true;
+    require(int(parameters.size()) == kParameters<Law>, "the law has another number of parameters");
+    f.template operator()<Law>(strain_of_deformation(F, zero_matrix<double, D>()), parameters.data());
+  };
+  try_law.template operator()<NeoHookean>();
+  try_law.template operator()<WeaklyCompressible>();
+  try_law.template operator()<ViscousFluid>();
   require(found, "there is no law of this name");
 }
 
@@ -114,39 +117,50 @@ py::dict evaluate(const std::string& law, const Array<double>& F_, const std::ve
 }
 
 // Mapped strains [n, 3], branches and evaluations of the yield function [n] of trial strains, in packs of 8.
+template <class Energy, class T>
+py::tuple map_strains(const Array<T>& h, const Array<T>& alpha, const Array<T>& ratio) {
+  using P = Pack<T, 8>;
+  const py::ssize_t n = alpha.size();
+  Array<T> mapped({n, py::ssize_t(3)});
+  Array<int> branch(n), steps(n);
+  for (py::ssize_t i = 0; i < n; i += 8) {
+    const int count = int(std::min<py::ssize_t>(8, n - i));
+    Vector<P, 3> strain;
+    Cone<P> cone;
+    for (int lane = 0; lane < 8; lane++) {
+      const py::ssize_t p = i + std::min(lane, count - 1);
+      for (int k = 0; k < 3; k++) strain[k].set(lane, h.data()[3 * p + k]);
+      cone.alpha.set(lane, alpha.data()[p]);
+      cone.ratio.set(lane, ratio.data()[p]);
+    }
+    const MappedStrain<P, 3> m = return_map<Energy, P>(strain, cone, P(0) == P(0), P(0) < P(0), false);
+    for (int lane = 0; lane < count; lane++) {
+      for (int k = 0; k < 3; k++) mapped.mutable_data()[3 * (i + lane) + k] = m.h[k][lane];
+      branch.mutable_data()[i + lane] = (m.cone[lane]   ? kCone
+                                         : m.apex[lane] ? kApex
+                                                        : kElastic) +
+                                        4 * !m.converged[lane];
+      steps.mutable_data()[i + lane] = int(m.steps[lane]);
+    }
+  }
+  return py::make_tuple(mapped, branch, steps);
+}
+
 template <class T>
 py::tuple sand_return_map(const Array<T>& h, const Array<T>& alpha, const Array<T>& ratio, const std::string& energy,
                           const std::string& flow) {
-  using P = Pack<T, 8>;
   const py::ssize_t n = alpha.size();
   require(h.ndim() == 2 && h.shape(0) == n && h.shape(1) == 3 && ratio.size() == n, "h must have shape [n, 3]");
-  const int index = find_energy<ReturnMaps<3>>(energy, flow == "exact");
-  require(index >= 0, "there is no energy of this name");
-  Array<T> mapped({n, py::ssize_t(3)});
-  Array<int> branch(n), steps(n);
-  ReturnMaps<3>::visit(index, [&]<class Energy>() {
-    for (py::ssize_t i = 0; i < n; i += 8) {
-      const int count = int(std::min<py::ssize_t>(8, n - i));
-      Vector<P, 3> strain;
-      Cone<P> cone;
-      for (int lane = 0; lane < 8; lane++) {
-        const py::ssize_t p = i + std::min(lane, count - 1);
-        for (int k = 0; k < 3; k++) strain[k].set(lane, h.data()[3 * p + k]);
-        cone.alpha.set(lane, alpha.data()[p]);
-        cone.ratio.set(lane, ratio.data()[p]);
-      }
-      const MappedStrain<P, 3> m = return_map<Energy, P>(strain, cone, P(0) == P(0), P(0) < P(0), false);
-      for (int lane = 0; lane < count; lane++) {
-        for (int k = 0; k < 3; k++) mapped.mutable_data()[3 * (i + lane) + k] = m.h[k][lane];
-        branch.mutable_data()[i + lane] = (m.cone[lane]   ? kCone
-                                           : m.apex[lane] ? kApex
-                                                          : kElastic) +
-                                          4 * !m.converged[lane];
-        steps.mutable_data()[i + lane] = int(m.steps[lane]);
-      }
-    }
-  });
-  return py::make_tuple(mapped, branch, steps);
+  const bool exact = flow == "exact";
+  if (energy == "full")
+    return exact ? map_strains<ExactFlow<FullQuartic>>(h, alpha, ratio) : map_strains<FullQuartic>(h, alpha, ratio);
+  if (energy == "unilateral")
+    return exact ? map_strains<ExactFlow<UnilateralQuartic>>(h, alpha, ratio)
+                 : map_strains<UnilateralQuartic>(h, alpha, ratio);
+  if (energy == "mixed")
+    return exact ? map_strains<ExactFlow<MixedQuartic>>(h, alpha, ratio) : map_strains<MixedQuartic>(h, alpha, ratio);
+  require(energy == "hencky", "there is no energy of this name");
+  return map_strains<Quadratic>(h, alpha, ratio);
 }
 
 double eigenvalue_bound(const Array<double>& a) {

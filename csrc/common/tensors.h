@@ -13,7 +13,7 @@
 #include <string>
 #include <vector>
 
-#include "transfer/arguments.h"
+#include "common/fields.h"
 
 // Checks, allocation and views shared by the op families. The Python face has checked values and given readable errors
 // already; here everything is checked again that memory safety depends on.
@@ -174,94 +174,18 @@ void dispatch(const Tensor& t, const char* name, int64_t dim, F&& f) {
     STD_TORCH_CHECK(false, name, " must be float32 or float64, got ", name_of(t.scalar_type()));
 }
 
-// The same for the dtype and dimension of x, of an op that takes the order of the kernel.
+// The same for the dtype and dimension of positions.
 template <class F>
-void dispatch(const Tensor& x, int64_t order, F&& f) {
+void dispatch(const Tensor& x, F&& f) {
   check_positions(x);
-  STD_TORCH_CHECK(order == 2 || order == 3, "order must be 2 or 3, got ", order);
   dispatch(x, "x", x.size(1), f);
 }
-
-// The tensors of one activation as every op takes them, in this order.
-#define MPM_TOPOLOGY_SCHEMA                                                                                            \
-  "Tensor table, Tensor block, Tensor offsets, Tensor index, Tensor schedule, float dx, float[] lower, int[] blocks, " \
-  "int order, "                                                                                                        \
-  "bool deterministic"
-#define MPM_TOPOLOGY_PARAMETERS                                                                                 \
-  const Tensor &table, const Tensor &block, const Tensor &offsets, const Tensor &index, const Tensor &schedule, \
-      double dx, std::vector<double> lower, std::vector<int64_t> blocks, int64_t order,                         \
-      [[maybe_unused]] bool deterministic
-#define MPM_TOPOLOGY_ARGUMENTS table, block, offsets, index, schedule, dx, lower, blocks
 
 inline const int* int_pointer(const Tensor& t, const char* name, const Tensor& x, const Shape& shape) {
   check_shape(t, name, shape);
   check_type(t, name, ScalarType::Int, x);
   STD_TORCH_CHECK(t.is_contiguous(), name, " must be contiguous");
   return static_cast<const int*>(t.data_ptr());
-}
-
-template <class T, int D>
-Geometry<T, D> geometry(double dx, const std::vector<double>& lower, const std::vector<int64_t>& blocks) {
-  STD_TORCH_CHECK(int(lower.size()) == D, "lower must have ", D, " entries, one per axis, got ", lower.size());
-  STD_TORCH_CHECK(int(blocks.size()) == D, "blocks must have ", D, " entries, one per axis, got ", blocks.size());
-  STD_TORCH_CHECK(dx > 0 && std::isfinite(dx) && std::isfinite(1 / dx), "dx must be positive and finite, got ", dx);
-  for (double a : lower) STD_TORCH_CHECK(std::isfinite(a), "lower must be finite, got ", a);
-  int64_t product = 1;
-  for (int64_t b : blocks) {
-    STD_TORCH_CHECK(b > 0 && b <= INT32_MAX / kBlockWidth && b <= INT32_MAX / product,
-                    "blocks must be positive and below 2^29, their product below 2^31, got ", text(blocks));
-    product *= b;
-  }
-  return Geometry<T, D>::make(dx, lower.data(), blocks.data());
-}
-
-// Slots of the pool of nodes.
-template <int D>
-int block_capacity(const Tensor& block) {
-  check_rank(block, "block", 1);
-  STD_TORCH_CHECK(block.size(0) <= INT32_MAX / kBlockNodes<D>, "block must have at most ", INT32_MAX / kBlockNodes<D>,
-                  " entries, got ", block.size(0));
-  return int(block.size(0));
-}
-
-// Sizes are checked; of the contents, which only `activate` may write, no more than costs nothing: on the CPU, that no
-// slot has a block beyond the table, which may be that of fewer scenes.
-template <class T, int D>
-Topology<T, D> topology(const Tensor& x, const Tensor& table, const Tensor& block, const Tensor& offsets,
-                        const Tensor& index, const Tensor& schedule, double dx, const std::vector<double>& lower,
-                        const std::vector<int64_t>& blocks) {
-  Topology<T, D> t;
-  t.geometry = geometry<T, D>(dx, lower, blocks);
-  t.particles = x.size(0);
-  t.capacity = block_capacity<D>(block);
-  check_rank(table, "table", 1);
-  const int64_t size = table.size(0), per_scene = t.geometry.blocks_per_scene;
-  STD_TORCH_CHECK(size % per_scene == 0 && size <= INT32_MAX && (size > 0 || t.particles == 0),
-                  "table must have shape [B * ", per_scene, "] for the scenes of all particles, got ", shape_of(table));
-  t.scenes = int(size / per_scene);
-  t.table = int_pointer(table, "table", x, {size});
-  t.block = int_pointer(block, "block", x, {t.capacity});
-  t.offsets = int_pointer(offsets, "offsets", x, {int64_t(t.capacity) + 1});
-  t.index = int_pointer(index, "index", x, {t.particles});
-  t.schedule_size = schedule_size<D>(t.capacity, t.particles);
-  t.schedule = int_pointer(schedule, "schedule", x, {t.schedule_size});
-  if (x.is_cpu()) {
-    int most = -1;
-    for (int slot = 0; slot < t.capacity; slot++) most = std::max(most, t.block[slot]);
-    STD_TORCH_CHECK(most < size, "block must have entries below the ", size, " of table, got ", most);
-  }
-  return t;
-}
-
-inline StressForm stress_form_of(int64_t form) {
-  STD_TORCH_CHECK(form == int64_t(StressForm::mls) || form == int64_t(StressForm::gradient),
-                  "stress_form must be 0 (MLS) or 1 (B-spline gradient), got ", form);
-  return StressForm(form);
-}
-
-template <int D>
-int64_t node_count(const Tensor& block) {
-  return block.size(0) * kBlockNodes<D>;
 }
 
 }  // namespace mpm

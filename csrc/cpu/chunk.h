@@ -1,49 +1,19 @@
 #pragma once
 
+#include "common/fields.h"
 #include "common/pack.h"
-#include "cpu/schedule.h"
+#include "cpu/base_block.h"
 
-// What the transfer kernels share: chunks of particles of one home block, groups of kLanes of them, and tiles, private
-// copies of the nodes that the particles of one home touch.
+// Chunks of particles of one base block, and groups of them in the lanes of packs with their loads and stores.
 namespace mpm::cpu {
 inline namespace TORCH_MPM_ISA {
 
-constexpr int kLanes = 8;     // of a pack of particles: cells hold about that many
-constexpr int kChannels = 4;  // channels that are transferred together
+constexpr int kLanes = 8;  // of a pack of particles: cells hold about that many
 template <class T>
 using Lanes = Pack<T, kLanes>;
 // Lanes where nothing depends on the cells: a register of values, if that is more.
 template <class T>
 constexpr int kWideLanes = kRegisterBytes / int(sizeof(T)) > kLanes ? kRegisterBytes / int(sizeof(T)) : kLanes;
-
-// A slot that holds particles, and the slots of the blocks that these can touch: o as in activate.cpu.cpp.
-template <class T, int D>
-struct Home {
-  int scene;
-  int corner[D];  // first node of the block
-  int slot[kColours<D>];
-
-  Home(const Topology<T, D>& t, int own) {
-    int block[D];
-    scene = block_coordinates(t.geometry, t.block[own], block);
-    for (int i = 0; i < D; i++) corner[i] = block[i] * kBlockWidth;
-    for (int o = 0; o < kColours<D>; o++) {
-      int other[D];
-      bool inside = true;
-      for (int i = 0; i < D; i++) {
-        other[i] = block[i] + (o >> (D - 1 - i) & 1);
-        inside = inside && other[i] < t.geometry.blocks[i];
-      }
-      slot[o] = inside ? t.table[block_index(t.geometry, scene, other)] : -1;
-    }
-  }
-};
-
-// Position of a cell in its block along an axis.
-template <int D>
-MPM_HD int cell_coordinate(int cell, int axis) {
-  return cell >> 2 * (D - 1 - axis) & (kBlockWidth - 1);
-}
 
 struct Chunk {
   int slot, count;
@@ -223,11 +193,11 @@ MPM_HD Pack<T, N> load(const Field<const T>& f, const RunOf<N>& r, int i = 0, in
 
 // Where the N components of a field begin. A store through a Field makes the compiler read its strides again.
 template <class T, int N>
-struct Rows {
+struct FieldRows {
   T* row[N] = {};  // null where the field is absent
   int64_t stride = 0;
 
-  explicit Rows(const Field<T>& f, int inner = 1) : stride(f.stride[0]) {
+  explicit FieldRows(const Field<T>& f, int inner = 1) : stride(f.stride[0]) {
     if (f.pointer)
       for (int k = 0; k < N; k++) row[k] = row_of(f, k / inner, k % inner);
   }
@@ -238,80 +208,6 @@ struct Rows {
 template <class... Fields>
 MPM_HD bool unit_stride(const Fields&... f) {
   return ((!f.pointer || f.stride[0] == 1) && ...);
-}
-
-// Nodes that the particles of one home touch, kChannels values each. Rows run along the last axis and are long enough
-// to add four nodes anywhere.
-template <int Order, class T, int D>
-struct Tile {
-  static constexpr int kWidth = kBlockWidth + Order, kRow = 2 * kBlockWidth * kChannels;
-  static constexpr int kRows = D == 3 ? kWidth * kWidth : kWidth;
-  alignas(64) T value[kRows * kRow];
-
-  static constexpr int stride(int axis) { return axis == D - 1 ? kChannels : axis == D - 2 ? kRow : kWidth * kRow; }
-  static int at(const int node[D]) {
-    int r = 0;
-    for (int i = 0; i < D; i++) r += node[i] * stride(i);
-    return r;
-  }
-
-  // visit(tile values, node row of the pool, nodes) for every run of nodes in an active block
-  template <class F>
-  MPM_HD void for_runs(const Home<T, D>& home, const F& visit) {
-    for (int row = 0; row < kRows; row++) {
-      const int i = D == 3 ? row / kWidth : 0, j = row % kWidth;
-      const int o = (D == 3 ? i / kBlockWidth * 4 : 0) + j / kBlockWidth * 2;
-      const int inside = (i % kBlockWidth * kBlockWidth + j % kBlockWidth) * kBlockWidth;
-      const int low = home.slot[o], high = home.slot[o + 1];
-      if (low >= 0) visit(value + row * kRow, int64_t(low) * kBlockNodes<D> + inside, kBlockWidth);
-      if (high >= 0)
-        visit(value + row * kRow + kBlockWidth * kChannels, int64_t(high) * kBlockNodes<D> + inside, Order);
-    }
-  }
-
-  void clear() { __builtin_memset(value, 0, sizeof(value)); }
-
-  // Reads channels first, ..., first + count - 1 of the nodes; zero for the other channels and inactive blocks.
-  void load_from(const NodeField<const T>& nodes, const Home<T, D>& home, int first, int count) {
-    clear();
-    const auto copy = [&]<int Channels>() {
-      for_runs(home, [&](T* tile, int64_t row, int n) {
-        const T* from = nodes.pointer + row * nodes.stride + first;
-        for (int k = 0; k < n; k++)
-          __builtin_memcpy(tile + k * kChannels, from + k * nodes.stride, Channels * sizeof(T));
-      });
-    };
-    if (count == 1) copy.template operator()<1>();
-    if (count == 2) copy.template operator()<2>();
-    if (count == 3) copy.template operator()<3>();
-    if (count == 4) copy.template operator()<4>();
-  }
-
-  void add_to(const NodeField<T>& nodes, const Home<T, D>& home, int first, int count) {
-    for_runs(home, [&](T* tile, int64_t row, int n) {
-      T* to = nodes.pointer + row * nodes.stride + first;
-      if (count == kChannels && nodes.stride == kChannels)
-        for (int k = 0; k < n * kChannels; k++) to[k] += tile[k];
-      else
-        for (int k = 0; k < n; k++)
-          for (int c = 0; c < count; c++) to[k * nodes.stride + c] += tile[k * kChannels + c];
-    });
-  }
-};
-
-// Calls f(particle) for the particles that are not transferred.
-template <class T, int D, class F>
-void for_outside(const Topology<T, D>& t, const F& f) {
-  for (int64_t i = t.offsets[t.capacity]; i < t.particles; i++) f(int64_t(t.index[i]));
-}
-
-// Calls f(next) once per thread, where next() hands out the homes of a schedule colour by colour.
-template <int D, class F>
-void parallel_homes(const ScheduleIn& s, int64_t particles, const F& f) {
-  constexpr int64_t kHomes = 4, kParticles = 2048;  // that are worth a thread
-  const int64_t homes = s.colour_start[kColours<D>];
-  const int64_t by_homes = (homes + kHomes - 1) / kHomes, by_particles = (particles + kParticles - 1) / kParticles;
-  parallel_phases<kColours<D>>(s.colour_start, by_homes < by_particles ? by_homes : by_particles, f);
 }
 
 }  // namespace TORCH_MPM_ISA

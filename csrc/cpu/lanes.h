@@ -9,7 +9,7 @@ inline namespace TORCH_MPM_ISA {
 
 // Particles p, ..., p + count − 1 in the first lanes of a pack; the other lanes repeat the last one and are not stored.
 template <class T, int N>
-struct Group {
+struct Consecutive {
   using Value = Pack<T, N>;
   int64_t p;
   int count;
@@ -38,14 +38,14 @@ struct Group {
 namespace cpu {
 inline namespace TORCH_MPM_ISA {
 
-// f(at) with the particles in groups of one register.
-template <class T, class F>
+// f(at) with the particles in groups of one register, or of another number of bytes.
+template <class T, int Bytes = kRegisterBytes, class F>
 void for_groups(int64_t particles, const F& f) {
-  constexpr int lanes = kRegisterBytes / sizeof(T);
+  constexpr int lanes = Bytes / sizeof(T);
   constexpr int64_t grain = 64;  // groups below which a range is not split
   parallel_ranges((particles + lanes - 1) / lanes, grain, [&](int64_t begin, int64_t end) {
     for (int64_t p = begin * lanes; p < end * lanes && p < particles; p += lanes)
-      f(Group<T, lanes>{p, int(particles - p < lanes ? particles - p : lanes)});
+      f(Consecutive<T, lanes>{p, int(particles - p < lanes ? particles - p : lanes)});
   });
 }
 

@@ -1,11 +1,10 @@
 #pragma once
 
-#include "grid/geometry.h"
-#include "transfer/arguments.h"
+#include "grid/topology.h"
 
-// The order of work of the CPU kernels, which `activate` writes into the schedule tensor:
-// homes (slots that hold particles) grouped by colour, so that the nodes touched from two homes of one colour never
-// overlap, and chunks of at most kChunk particles of one home, with the order of each chunk's particles by cell.
+// The order of work of the CPU kernels, which `activate` writes into the schedule tensor: base blocks (slots that hold
+// particles) grouped by colour, so that the nodes touched from two base blocks of one colour never overlap, and chunks
+// of at most kChunk particles of one base block, with the order of each chunk's particles by cell.
 namespace mpm::cpu {
 
 constexpr int kChunk = 512;
@@ -15,9 +14,9 @@ constexpr int kColours = 1 << D;
 // Views into the schedule tensor; I is int or const int, S a 16-bit integer alike.
 template <class I, class S>
 struct Schedule {
-  I* colour_start;  // [kColours + 1] into the lists of homes
-  I* home_slot;     // [homes]
-  I* home_chunk;    // [homes + 1] first chunk of a home
+  I* colour_start;  // [kColours + 1] into the lists of base blocks
+  I* base_slot;     // [base blocks]
+  I* base_chunk;    // [base blocks + 1] first chunk of a base block
   I* chunk_slot;    // [chunks]
   I* chunk_begin;   // [chunks] first particle of the chunk, as a position in the index tensor
   I* chunk_sorted;  // [chunks] 1 if the particles lie in memory one after another, in the order of cells
@@ -29,18 +28,20 @@ using ScheduleOut = Schedule<int, uint16_t>;
 
 inline namespace TORCH_MPM_ISA {
 
-// Fits into schedule_size() ints: there are at most `capacity` homes, and capacity + particles / kChunk chunks.
+// Fits into schedule_size() ints: there are at most `max_blocks` base blocks, and max_blocks + particles / kChunk
+// chunks.
 template <int D, class I, class S>
-void lay_out(Schedule<I, S>& s, I* start, int64_t capacity, int64_t particles) {
-  const int64_t homes = capacity < particles ? capacity : particles, chunks = homes + particles / kChunk;
+void lay_out(Schedule<I, S>& s, I* start, int64_t max_blocks, int64_t particles) {
+  const int64_t base_blocks = max_blocks < particles ? max_blocks : particles,
+                chunks = base_blocks + particles / kChunk;
   const auto take = [&](int64_t count) {
     I* p = start;
     start += count;
     return p;
   };
   s.colour_start = take(kColours<D> + 1);
-  s.home_slot = take(homes);
-  s.home_chunk = take(homes + 1);
+  s.base_slot = take(base_blocks);
+  s.base_chunk = take(base_blocks + 1);
   s.chunk_slot = take(chunks);
   s.chunk_begin = take(chunks);
   s.chunk_sorted = take(chunks);
@@ -51,7 +52,7 @@ void lay_out(Schedule<I, S>& s, I* start, int64_t capacity, int64_t particles) {
 template <class T, int D>
 ScheduleIn schedule_of(const Topology<T, D>& t) {
   ScheduleIn s;
-  lay_out<D>(s, t.schedule, t.capacity, t.particles);
+  lay_out<D>(s, t.schedule, t.max_blocks, t.particles);
   return s;
 }
 

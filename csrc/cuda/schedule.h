@@ -1,16 +1,16 @@
 #pragma once
 
-#include "transfer/arguments.h"
+#include "grid/topology.h"
 
 // The schedule tensor of the CUDA kernels.
 namespace mpm::cuda {
 
 constexpr int kItemParticles = 576;
 
-// At most kItemParticles particles of one home block; a crowded block makes several items.
+// At most kItemParticles particles of one base block; a crowded block makes several items.
 struct Item {
   int slot, begin, end;  // particles index[begin, end)
-  int block;             // table index of the home block
+  int block;             // table index of the base block
 };
 
 // I is int or const int.
@@ -19,31 +19,32 @@ struct Schedule {
   I* item_count;
   I* scattered;   // whether particles that are neighbours in memory mostly lie in different blocks
   I* items;       // [items, 4], each an Item
-  I* neighbours;  // [capacity, 2^D] slots of a block and of the blocks after it, -1 where inactive; the bit of axis i
+  I* neighbours;  // [max_blocks, 2^D] slots of a block and of the blocks after it, -1 where inactive; the bit of axis i
                   // is D - 1 - i
-  I* home;        // [P] slot of the home block of a particle, -1 if it is not transferred
+  I* base_slot;   // [P] slot of the base block of a particle, -1 if it is not transferred
 };
 
-// Upper bound of the number of items: homes hold particles, and splitting adds less than one item per kItemParticles.
-MPM_HD int64_t most_items(int64_t capacity, int64_t particles) {
-  return (capacity < particles ? capacity : particles) + particles / kItemParticles;
+// Upper bound of the number of items: base blocks hold particles, and splitting adds less than one item per
+// kItemParticles.
+MPM_HD int64_t most_items(int64_t max_blocks, int64_t particles) {
+  return (max_blocks < particles ? max_blocks : particles) + particles / kItemParticles;
 }
 
 // Fits into schedule_size() ints.
 template <int D, class I>
-MPM_HD Schedule<I> lay_out_schedule(I* start, int64_t capacity, int64_t particles) {
+MPM_HD Schedule<I> lay_out_schedule(I* start, int64_t max_blocks, int64_t particles) {
   Schedule<I> s;
   s.item_count = start;
   s.scattered = start + 1;
   s.items = start + 4;
-  s.neighbours = s.items + 4 * most_items(capacity, particles);
-  s.home = s.neighbours + (capacity << D);
+  s.neighbours = s.items + 4 * most_items(max_blocks, particles);
+  s.base_slot = s.neighbours + (max_blocks << D);
   return s;
 }
 
 template <class T, int D>
 MPM_HD Schedule<const int> schedule_of(const Topology<T, D>& t) {
-  return lay_out_schedule<D>(t.schedule, t.capacity, t.particles);
+  return lay_out_schedule<D>(t.schedule, t.max_blocks, t.particles);
 }
 
 }  // namespace mpm::cuda

@@ -4,7 +4,7 @@
 #include "grid/cell_order.h"
 #include "grid/status.h"
 
-// Finds the active blocks, numbers them in the order of the table, groups the particles by home block with a stable
+// Finds the active blocks, numbers them in the order of the table, groups the particles by base block with a stable
 // counting sort, and writes the schedule. Every result is the same for any number of threads.
 namespace mpm::cpu {
 inline namespace TORCH_MPM_ISA {
@@ -22,8 +22,8 @@ void for_parts(int parts, int64_t count, const F& f) {
   });
 }
 
-// Blocks touched from a home whose particle has its base node at `local` inside it: bit o for the neighbour that lies
-// one block further along the axes of o, the last axis being bit 0 of o.
+// Blocks touched from a base block whose particle has its base node at `local` inside it: bit o for the neighbour that
+// lies one block further along the axes of o, the last axis being bit 0 of o.
 template <int Order, int D>
 MPM_HD unsigned touched_blocks(const int local[D]) {
   unsigned blocks = 1;
@@ -44,7 +44,7 @@ struct Activation {
       : a(arguments),
         w(activate_layout(a, static_cast<char*>(a.workspace))),
         table_size(int64_t(a.scenes) * a.geometry.blocks_per_scene) {
-    lay_out<D>(schedule, a.schedule, a.capacity, a.particles);
+    lay_out<D>(schedule, a.schedule, a.max_blocks, a.particles);
     for (int o = 0; o < kColours<D>; o++) {
       neighbour[o] = 0;
       for (int i = 0; i < D; i++) neighbour[o] = neighbour[o] * a.geometry.blocks[i] + (o >> (D - 1 - i) & 1);
@@ -65,17 +65,17 @@ struct Activation {
   }
 };
 
-enum class Place { inside, outside, not_finite };
+enum class Location { inside, outside, not_finite };
 
 // Scene and base node of one particle, and whether it is left out for its position or its scene.
 template <int Order, class T, int D>
-Place place_of(const ActivateArguments<T, D>& a, int64_t p, int& scene, int base[D]) {
+Location place_of(const ActivateArguments<T, D>& a, int64_t p, int& scene, int base[D]) {
   T x[D], f[D];
   scene = a.scene ? a.scene[p * a.scene_stride] : 0;
   for (int i = 0; i < D; i++) x[i] = at(a.x, p, i);
-  if (!is_finite<D>(x)) return Place::not_finite;
+  if (!is_finite<D>(x)) return Location::not_finite;
   const bool inside = locate<Order>(a.geometry, x, base, f) && scene >= 0 && scene < a.scenes;
-  return inside ? Place::inside : Place::outside;
+  return inside ? Location::inside : Location::outside;
 }
 
 // Home block and cell of one particle.
@@ -83,7 +83,7 @@ template <int Order, class T, int D>
 void classify(const Activation<T, D>& s, int64_t p) {
   const ActivateArguments<T, D>& a = s.a;
   int scene, base[D], block[D];
-  if (place_of<Order>(a, p, scene, base) != Place::inside) {
+  if (place_of<Order>(a, p, scene, base) != Location::inside) {
     s.w.key[p] = -1;
     return;
   }
@@ -147,10 +147,10 @@ MPM_HD unsigned touched_blocks_of_cell(int cell) {
   return touched_blocks<Order, D>(local);
 }
 
-// Particles of each home block in a slice, and the blocks they touch. Particles that follow each other are mostly of
-// one home: such runs are counted, and later placed, together.
+// Particles of each base block in a slice, and the blocks they touch. Particles that follow each other are mostly of
+// one base block: such runs are counted, and later placed, together.
 template <int Order, class T, int D>
-void count_homes(const Activation<T, D>& s, int slice, int64_t begin, int64_t end) {
+void count_particles(const Activation<T, D>& s, int slice, int64_t begin, int64_t end) {
   int* count = s.w.count + slice * s.table_size;
   uint8_t* touched = s.w.touched + slice * s.table_size;
   uint8_t touched_of[kBlockNodes<D>];
@@ -175,26 +175,27 @@ void count_homes(const Activation<T, D>& s, int slice, int64_t begin, int64_t en
   s.totals(slice)[W::kRuns] = runs;
 }
 
-// Sets the table to 1 at each block that the particles of homes [begin, end) touch.
+// Sets the table to 1 at each block that the particles of base blocks [begin, end) touch.
 template <class T, int D>
 void mark_touched(const Activation<T, D>& s, int64_t begin, int64_t end) {
-  const auto touched_from = [&]<class Blocks>(int64_t home) {  // of one home, or of eight in a row
+  const auto touched_from = [&]<class Blocks>(int64_t base_block) {  // of one base block, or of eight in a row
     Blocks blocks = 0;
     for (int k = 0; k < s.w.slices; k++) {
       Blocks of_slice;
-      __builtin_memcpy(&of_slice, s.w.touched + k * s.table_size + home, sizeof(Blocks));
+      __builtin_memcpy(&of_slice, s.w.touched + k * s.table_size + base_block, sizeof(Blocks));
       blocks |= of_slice;
     }
     return blocks;
   };
-  for (int64_t home = begin; home < end; home++) {
-    if (home + 8 <= end && !touched_from.template operator()<uint64_t>(home)) {  // most homes have no particles
-      home += 7;
+  for (int64_t base_block = begin; base_block < end; base_block++) {
+    if (base_block + 8 <= end &&
+        !touched_from.template operator()<uint64_t>(base_block)) {  // most base blocks have no particles
+      base_block += 7;
       continue;
     }
-    const unsigned blocks = touched_from.template operator()<uint8_t>(home);
+    const unsigned blocks = touched_from.template operator()<uint8_t>(base_block);
     for (int o = 0; o < kColours<D>; o++)
-      if (blocks >> o & 1) __atomic_store_n(s.a.table + home + s.neighbour[o], 1, __ATOMIC_RELAXED);
+      if (blocks >> o & 1) __atomic_store_n(s.a.table + base_block + s.neighbour[o], 1, __ATOMIC_RELAXED);
   }
 }
 
@@ -215,7 +216,7 @@ int64_t number_blocks(const Activation<T, D>& s) {
   for_parts(s.w.slices, s.table_size, [&](int slice, int64_t begin, int64_t end) {
     int64_t next = s.totals(slice)[W::kActive];
     for (int64_t b = begin; b < end; b++) {
-      const bool given = a.table[b] && next < a.capacity;
+      const bool given = a.table[b] && next < a.max_blocks;
       next += a.table[b];
       a.table[b] = given ? int(next - 1) : -1;
       if (given) a.block[next - 1] = int(b);
@@ -226,7 +227,7 @@ int64_t number_blocks(const Activation<T, D>& s) {
 
 // After an overflow: particles that touch a block without a slot are not transferred.
 template <int Order, class T, int D>
-void drop_homeless(const Activation<T, D>& s, int64_t begin, int64_t end) {
+void drop_particles_without_slot(const Activation<T, D>& s, int64_t begin, int64_t end) {
   for (int64_t p = begin; p < end; p++) {
     const int key = s.w.key[p];
     if (key < 0) continue;
@@ -259,8 +260,8 @@ int64_t place_slots(const Activation<T, D>& s, int64_t slots) {
       }
     }
   });
-  for (int64_t slot = slots; slot < a.capacity; slot++) a.block[slot] = -1;
-  for (int64_t slot = slots; slot <= a.capacity; slot++) a.offsets[slot] = int(transferred);
+  for (int64_t slot = slots; slot < a.max_blocks; slot++) a.block[slot] = -1;
+  for (int64_t slot = slots; slot <= a.max_blocks; slot++) a.offsets[slot] = int(transferred);
   return transferred;
 }
 
@@ -284,39 +285,34 @@ void fill_index(const Activation<T, D>& s, int slice, int64_t begin, int64_t end
   }
 }
 
-// Lists the homes by colour and the chunks of each; returns the number of chunks.
+// Lists the base blocks by colour and the chunks of each; returns the number of chunks.
 template <class T, int D>
-int64_t list_homes(const Activation<T, D>& s, int64_t slots) {
+int64_t list_base_blocks(const Activation<T, D>& s, int64_t slots) {
   const ActivateArguments<T, D>& a = s.a;
   const ScheduleOut& out = s.schedule;
-  const auto colour_of = [&](int64_t slot) {
-    int block[D], colour = 0;
-    block_coordinates(a.geometry, a.block[slot], block);
-    for (int i = 0; i < D; i++) colour = colour * 2 + (block[i] & 1);
-    return colour;
-  };
+  const auto colour_of = [&](int64_t slot) { return block_colour(a.geometry, a.block[slot]); };
   int next[kColours<D>] = {};
   for (int64_t slot = 0; slot < slots; slot++)
     if (a.offsets[slot + 1] > a.offsets[slot]) next[colour_of(slot)]++;
-  int homes = 0;
+  int base_blocks = 0;
   for (int c = 0; c < kColours<D>; c++) {
     const int n = next[c];
-    out.colour_start[c] = next[c] = homes;
-    homes += n;
+    out.colour_start[c] = next[c] = base_blocks;
+    base_blocks += n;
   }
-  out.colour_start[kColours<D>] = homes;
+  out.colour_start[kColours<D>] = base_blocks;
   for (int64_t slot = 0; slot < slots; slot++)
-    if (a.offsets[slot + 1] > a.offsets[slot]) out.home_slot[next[colour_of(slot)]++] = int(slot);
+    if (a.offsets[slot + 1] > a.offsets[slot]) out.base_slot[next[colour_of(slot)]++] = int(slot);
   int chunks = 0;
-  for (int h = 0; h < homes; h++) {
-    const int slot = out.home_slot[h];
-    out.home_chunk[h] = chunks;
+  for (int h = 0; h < base_blocks; h++) {
+    const int slot = out.base_slot[h];
+    out.base_chunk[h] = chunks;
     for (int begin = a.offsets[slot]; begin < a.offsets[slot + 1]; begin += kChunk) {
       out.chunk_slot[chunks] = slot;
       out.chunk_begin[chunks++] = begin;
     }
   }
-  out.home_chunk[homes] = chunks;
+  out.base_chunk[base_blocks] = chunks;
   return chunks;
 }
 
@@ -348,10 +344,10 @@ void sort_chunk(const Activation<T, D>& s, int64_t chunk) {
 
 // Counts a particle that is left out in a row of the status, unless an earlier activation has done so; whether it is
 // the first of the row.
-bool report(int* row, int activation, Place place, int p) {
+bool report(int* row, int activation, Location place, int p) {
   if (row[kProblemActivation] >= 0 && row[kProblemActivation] != activation) return false;
   row[kProblemActivation] = activation;
-  int* entry = row + (place == Place::outside ? kOutsideCount : kNonFiniteCount);
+  int* entry = row + (place == Location::outside ? kOutsideCount : kNonFiniteCount);
   if (entry[0]++ > 0) return false;
   entry[1] = p;
   return true;
@@ -368,15 +364,15 @@ void write_status(const Activation<T, D>& s, int64_t wanted, int64_t transferred
   for (int64_t i = transferred; i < a.particles; i++) {
     int scene, base[D];
     const int p = a.index[i];
-    const Place place = place_of<Order>(a, p, scene, base);
-    if (place == Place::inside) continue;  // left out because the grid is full
+    const Location place = place_of<Order>(a, p, scene, base);
+    if (place == Location::inside) continue;  // left out because the grid is full
     report(status, activation, place, p);
     if (scene < 0 || scene >= a.scenes) continue;
     int* row = status + (1 + int64_t(scene)) * kStatusSize;
     if (report(row, activation, place, p))
-      row[place == Place::outside ? kOutsideId : kNonFiniteId] = a.id ? int(a.id[p * a.id_stride]) : p;
+      row[place == Location::outside ? kOutsideId : kNonFiniteId] = a.id ? int(a.id[p * a.id_stride]) : p;
   }
-  if (wanted > a.capacity && status[kProblemActivation] < 0) status[kProblemActivation] = activation;
+  if (wanted > a.max_blocks && status[kProblemActivation] < 0) status[kProblemActivation] = activation;
   status[kActivations]++;
   status[kBlocksNow] = int(wanted);
   if (wanted > status[kBlocksWanted]) status[kBlocksWanted] = int(wanted);
@@ -387,21 +383,21 @@ void activate(const ActivateArguments<T, D>& a) {
   const Activation<T, D> s(a);
   for_parts(s.w.slices, a.particles, [&](int slice, int64_t begin, int64_t end) {
     classify_slice<Order>(s, begin, end);
-    count_homes<Order>(s, slice, begin, end);
+    count_particles<Order>(s, slice, begin, end);
   });
   const int64_t wanted = number_blocks(s);
-  if (wanted > a.capacity)
+  if (wanted > a.max_blocks)
     for_parts(s.w.slices, a.particles, [&](int slice, int64_t begin, int64_t end) {
-      drop_homeless<Order>(s, begin, end);
-      count_homes<Order>(s, slice, begin, end);
+      drop_particles_without_slot<Order>(s, begin, end);
+      count_particles<Order>(s, slice, begin, end);
     });
-  const int64_t slots = wanted < a.capacity ? wanted : a.capacity;
+  const int64_t slots = wanted < a.max_blocks ? wanted : a.max_blocks;
   const int64_t transferred = place_slots(s, slots);
   s.scan(W::kDropped);
   for_parts(s.w.slices, a.particles, [&](int slice, int64_t begin, int64_t end) {
     fill_index(s, slice, begin, end, transferred + s.totals(slice)[W::kDropped]);
   });
-  const int64_t chunks = list_homes(s, slots);
+  const int64_t chunks = list_base_blocks(s, slots);
   parallel_ranges(chunks, 16, [&](int64_t begin, int64_t end) {
     for (int64_t chunk = begin; chunk < end; chunk++) sort_chunk(s, chunk);
   });
@@ -412,14 +408,14 @@ void activate(const ActivateArguments<T, D>& a) {
 template <int Order, class T, int D>
 void cell_order(const CellOrderArguments<T, D>& a) {
   const ScheduleIn s = schedule_of(a.topology);
-  const int homes = s.colour_start[kColours<D>];
-  parallel_ranges(homes ? s.home_chunk[homes] : 0, 16, [&](int64_t begin, int64_t end) {
+  const int base_blocks = s.colour_start[kColours<D>];
+  parallel_ranges(base_blocks ? s.base_chunk[base_blocks] : 0, 16, [&](int64_t begin, int64_t end) {
     for (int64_t c = begin; c < end; c++) {
       const Chunk chunk(a.topology, s, c);
       for (int i = 0; i < chunk.count; i++) a.order[s.chunk_begin[c] + i] = chunk.id[chunk.by_cell(i)];
     }
   });
-  for (int64_t i = a.topology.offsets[a.topology.capacity]; i < a.topology.particles; i++)
+  for (int64_t i = a.topology.offsets[a.topology.max_blocks]; i < a.topology.particles; i++)
     a.order[i] = a.topology.index[i];
 }
 

@@ -4,20 +4,20 @@
 
 #include "cuda/launch.cuh"
 #include "cuda/schedule.h"
+#include "grid/activate.h"
 #include "grid/status.h"
-#include "transfer/arguments.h"
 
-// Finds the active blocks and groups the particles by home block, without the host knowing any count.
-//   classify   home block and rank of every particle, number of particles and touched neighbours of every block
+// Finds the active blocks and groups the particles by base block, without the host knowing any count.
+//   classify   base block and rank of every particle, number of particles and touched neighbours of every block
 //   slots      numbers the active blocks in the order of the table (one-pass scan)
 //   offsets    first particle and work items of every slot (one-pass scan)
-//   place      the index tensor, homes and neighbours, unused slots, status
+//   place      the index tensor, base blocks and neighbours, unused slots, status
 // Deterministic mode replaces the ranks, which depend on the order of atomics, by a stable sort.
 namespace mpm::cuda {
 namespace {
 
 constexpr int kThreads = 256;
-// Every kSampling-th thread block counts the home blocks met by its warps. More than kScattered per warp on average,
+// Every kSampling-th thread block counts the base blocks met by its warps. More than kScattered per warp on average,
 // and the gathers are faster in the order of memory than block by block.
 constexpr int kSampling = 64, kScattered = 2;
 using Packed = unsigned long long;
@@ -60,9 +60,9 @@ struct Workspace {
   int64_t size;
 };
 
-int bits_for(int capacity) {
+int bits_for(int max_blocks) {
   int bits = 1;
-  while (capacity >> bits) bits++;
+  while (max_blocks >> bits) bits++;
   return bits;
 }
 
@@ -89,7 +89,7 @@ Workspace lay_out(const ActivateArguments<T, D>& a) {
     w.slot_sorted = reinterpret_cast<int*>(take(a.particles * sizeof(int)));
     w.id = reinterpret_cast<int*>(take(a.particles * sizeof(int)));
     check(cub::DeviceRadixSort::SortPairs(nullptr, w.sort_size, w.slot, w.slot_sorted, w.id, a.index, int(a.particles),
-                                          0, bits_for(a.capacity)));
+                                          0, bits_for(a.max_blocks)));
     w.sort = take(int64_t(w.sort_size));
   }
   return w;
@@ -239,7 +239,7 @@ __global__ void __launch_bounds__(kThreads) slots(const ActivateArguments<T, D> 
   }
   const int slot = first_of(exclusive_sum(active, w.slot_states, tile));
   if (b >= table) return;
-  const bool given = active && slot < a.capacity;
+  const bool given = active && slot < a.max_blocks;
   a.table[b] = given ? slot : -1;
   if (given) a.block[slot] = b;
   if (b == table - 1) w.counters->wanted = slot + active;
@@ -271,7 +271,7 @@ __global__ void __launch_bounds__(kThreads) offsets(const ActivateArguments<T, D
   const int start = first_of(before), item = second_of(before);
   if (slot >= 0) a.offsets[slot] = start;
   if (count > 0) w.tally[b].count = start;
-  int4* const out = reinterpret_cast<int4*>(lay_out_schedule<D>(a.schedule, a.capacity, a.particles).items) + item;
+  int4* const out = reinterpret_cast<int4*>(lay_out_schedule<D>(a.schedule, a.max_blocks, a.particles).items) + item;
   for (int k = 0; k < items; k++) {
     const int begin = start + int(int64_t(count) * k / items), end = start + int(int64_t(count) * (k + 1) / items);
     out[k] = make_int4(slot, begin, end, b);
@@ -290,7 +290,7 @@ __device__ void write_status(const ActivateArguments<T, D>& a, const Workspace& 
   int* const status = a.status + start;
   copy_status(a.previous_status ? a.previous_status + start : nullptr, status);
   const bool left_out = trouble.outside.count > 0 || trouble.not_finite.count > 0;
-  if (status[kProblemActivation] < 0 && (left_out || (row == 0 && wanted > a.capacity))) {
+  if (status[kProblemActivation] < 0 && (left_out || (row == 0 && wanted > a.max_blocks))) {
     status[kProblemActivation] = a.previous_status ? a.previous_status[kActivations] : 0;
     const auto write = [&](const LeftOut& out, int count, int first, int id) {
       if (out.count == 0) return;
@@ -329,24 +329,24 @@ __device__ void write_neighbours(const ActivateArguments<T, D>& a, int b, int ne
 template <class T, int D>
 __global__ void __launch_bounds__(kThreads) place(const ActivateArguments<T, D> a, const Workspace w) {
   const Counters& c = *w.counters;
-  const Schedule<int> schedule = lay_out_schedule<D>(a.schedule, a.capacity, a.particles);
+  const Schedule<int> schedule = lay_out_schedule<D>(a.schedule, a.max_blocks, a.particles);
   const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   if (i == 0) {
     *schedule.item_count = c.items;
     *schedule.scattered = c.groups > kScattered * c.warps;
   }
   if (i <= a.scenes) write_status(a, w, int(i));
-  if (i < min(c.wanted, a.capacity)) {
+  if (i < min(c.wanted, a.max_blocks)) {
     write_neighbours(a, a.block[i], schedule.neighbours + (i << D));
-  } else if (i <= a.capacity) {
+  } else if (i <= a.max_blocks) {
     a.offsets[i] = c.transferred;
-    if (i < a.capacity) a.block[i] = -1;
+    if (i < a.max_blocks) a.block[i] = -1;
   }
   if (i >= a.particles) return;
-  const int key = w.key[i], first = key < 0 ? -1 : w.tally[key].count, home = first < 0 ? -1 : a.table[key];
-  schedule.home[i] = home;
+  const int key = w.key[i], first = key < 0 ? -1 : w.tally[key].count, base_slot = first < 0 ? -1 : a.table[key];
+  schedule.base_slot[i] = base_slot;
   if (a.deterministic) {
-    w.slot[i] = home < 0 ? a.capacity : home;
+    w.slot[i] = base_slot < 0 ? a.max_blocks : base_slot;
     w.id[i] = int(i);
   } else {
     const int rank = w.rank[i];
@@ -372,12 +372,12 @@ void activate(const ActivateArguments<T, D>& a, Stream stream) {
     launch(slots<T, D>, blocks(table), kThreads, 0, stream, a, w, table);
     launch(offsets<T, D>, blocks(table), kThreads, 0, stream, a, w, table);
   }
-  const int64_t rows = int64_t(std::max(a.capacity, a.scenes)) + 1;  // of slots with their end, or of the status
+  const int64_t rows = int64_t(std::max(a.max_blocks, a.scenes)) + 1;  // of slots with their end, or of the status
   launch(place<T, D>, blocks(std::max(a.particles, rows)), kThreads, 0, stream, a, w);
   if (a.deterministic && a.particles > 0) {
     size_t size = w.sort_size;
     check(cub::DeviceRadixSort::SortPairs(w.sort, size, w.slot, w.slot_sorted, w.id, a.index, int(a.particles), 0,
-                                          bits_for(a.capacity), stream));
+                                          bits_for(a.max_blocks), stream));
   }
 }
 

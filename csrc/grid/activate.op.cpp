@@ -1,29 +1,30 @@
 #include "grid/kernels.h"
+#include "grid/topology.op.h"
 
 // Finds the blocks that particles touch and groups the particles by the block of their base node.
 namespace mpm {
 namespace {
 
 std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> activate(
-    const Tensor& x, const OptionalTensor& scene, const OptionalTensor& previous_status, int64_t scenes, double dx,
-    std::vector<double> lower, std::vector<int64_t> blocks, int64_t order, int64_t capacity, bool deterministic,
-    const OptionalTensor& ids) {
+    const Tensor& x, const OptionalTensor& scene, const OptionalTensor& ids, const OptionalTensor& previous_status,
+    int64_t scenes, int64_t max_blocks, const std::vector<double>& lattice, const std::vector<int64_t>& layout) {
+  const PackedLattice packed(lattice, layout);
   STD_TORCH_CHECK(scenes >= 0, "scenes must not be negative, got ", scenes);
-  STD_TORCH_CHECK(capacity >= 0, "capacity must not be negative, got ", capacity);
+  STD_TORCH_CHECK(max_blocks >= 0, "max_blocks must not be negative, got ", max_blocks);
   Tensor table, block, offsets, index, status, schedule;
   const DeviceScope device(x);
-  dispatch(x, order, [&]<class T, int D>() {
+  dispatch(x, [&]<class T, int D>() {
     ActivateArguments<T, D> a;
-    a.geometry = geometry<T, D>(dx, lower, blocks);
+    a.geometry = packed.geometry<T, D>();
     const int64_t per_scene = a.geometry.blocks_per_scene, most = INT32_MAX / kBlockNodes<D>;
     STD_TORCH_CHECK(scenes <= INT32_MAX / per_scene, "scenes times blocks must be below 2^31, got ", scenes, " times ",
                     per_scene);
     STD_TORCH_CHECK(scenes > 0 || x.size(0) == 0, "x must have no particles where scenes is 0, got ", x.size(0));
-    STD_TORCH_CHECK(capacity <= most, "capacity must be at most ", most, ", got ", capacity);
+    STD_TORCH_CHECK(max_blocks <= most, "max_blocks must be at most ", most, ", got ", max_blocks);
     a.scenes = int(scenes);
-    a.capacity = int(capacity);
+    a.max_blocks = int(max_blocks);
     a.particles = x.size(0);
-    a.deterministic = deterministic;
+    a.deterministic = packed.deterministic();
     a.x = input<T>(x, "x", x, {x.size(0), D});
     set_scene(a, scene, x);
     if (has(ids)) {
@@ -34,10 +35,10 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> activate(
     }
     if (has(previous_status))
       a.previous_status = int_pointer(*previous_status, "previous_status", x, {1 + scenes, kStatusSize});
-    a.schedule_size = schedule_size<D>(capacity, x.size(0));
+    a.schedule_size = schedule_size<D>(max_blocks, x.size(0));
     table = empty_int(x, {scenes * per_scene});
-    block = empty_int(x, {capacity});
-    offsets = empty_int(x, {capacity + 1});
+    block = empty_int(x, {max_blocks});
+    offsets = empty_int(x, {max_blocks + 1});
     index = empty_int(x, {x.size(0)});
     status = empty_int(x, {1 + scenes, kStatusSize});
     schedule = empty_int(x, {a.schedule_size});
@@ -50,21 +51,23 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> activate(
     a.index = static_cast<int*>(index.data_ptr());
     a.schedule = static_cast<int*>(schedule.data_ptr());
     a.status = static_cast<int*>(status.data_ptr());
-    backend::activate(order, a, device.stream());
+    backend::activate(packed.order(), a, device.stream());
   });
   return {table, block, offsets, index, schedule, status};
 }
 
-Tensor cell_order(const Tensor& x, MPM_TOPOLOGY_PARAMETERS) {
+Tensor cell_order(const Tensor& x, const std::vector<Tensor>& topology, const std::vector<double>& lattice,
+                  const std::vector<int64_t>& layout) {
+  const PackedTopology blocks(topology, lattice, layout);
   check_positions(x);
   Tensor result = empty_int(x, {x.size(0)});
   const DeviceScope device(x);
-  dispatch(x, order, [&]<class T, int D>() {
+  dispatch(x, [&]<class T, int D>() {
     CellOrderArguments<T, D> a;
-    a.topology = topology<T, D>(x, MPM_TOPOLOGY_ARGUMENTS);
+    a.topology = blocks.unpack<T, D>(x);
     a.x = input<T>(x, "x", x, {x.size(0), D});
     a.order = static_cast<int*>(result.data_ptr());
-    backend::cell_order(order, a, device.stream());
+    backend::cell_order(blocks.order(), a, device.stream());
   });
   return result;
 }
@@ -75,8 +78,9 @@ Tensor cell_order(const Tensor& x, MPM_TOPOLOGY_PARAMETERS) {
 #if MPM_BACKEND == MPM_BACKEND_IS_cpu
 STABLE_TORCH_LIBRARY_FRAGMENT(torch_mpm, m) {
   m.def(
-      "activate(Tensor x, Tensor? scene, Tensor? previous_status, int scenes, float dx, float[] lower, int[] blocks, "
-      "int order, int capacity, bool deterministic, Tensor? ids=None) -> (Tensor table, Tensor block, Tensor offsets, "
+      "activate(Tensor x, Tensor? scene, Tensor? ids, Tensor? previous_status, int scenes, int "
+      "max_blocks, " MPM_LATTICE_SCHEMA
+      ") -> (Tensor table, Tensor block, Tensor offsets, "
       "Tensor index, Tensor schedule, Tensor status)");
   m.def("cell_order(Tensor x, " MPM_TOPOLOGY_SCHEMA ") -> Tensor");
 }

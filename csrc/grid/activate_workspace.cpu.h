@@ -1,18 +1,18 @@
 #pragma once
 
 #include "cpu/parallel.h"
-#include "transfer/arguments.h"
+#include "grid/activate.h"
 
 namespace mpm::cpu {
 
 struct ActivateWorkspace {
-  int slices;        // parts of the particles, each counted apart
-  int* key;          // [particles] table index of the home block, -1 where not transferred
-  int* run;          // [particles] first particle of each run of one home, from the first particle of each slice on
-  uint8_t* cell;     // [particles] cell of the base node in its block
+  int slices;     // parts of the particles, each counted apart
+  int* key;       // [particles] table index of the base block, -1 where not transferred
+  int* run;       // [particles] first particle of each run of one base block, from the first particle of each slice on
+  uint8_t* cell;  // [particles] cell of the base node in its block
   uint8_t* cell_at;  // [particles] the same by position in the index tensor
-  int* count;        // [slices, table] particles of each home block, then where the next one goes
-  uint8_t* touched;  // [slices, table] which blocks the particles of a home touch: bit o for neighbour o
+  int* count;        // [slices, table] particles of each base block, then where the next one goes
+  uint8_t* touched;  // [slices, table] which blocks the particles of a base block touch: bit o for neighbour o
   int64_t* totals;   // [slices, kTotals]
   int64_t size;      // in bytes
   enum { kActive, kParticles, kDropped, kRuns, kTotals };

@@ -1,4 +1,5 @@
-#include "cuda/home.cuh"
+#include "cuda/base_block.cuh"
+#include "cuda/columns.cuh"
 #include "cuda/launch.cuh"
 #include "grid/cell_order.h"
 
@@ -35,7 +36,7 @@ __global__ void __launch_bounds__(kBlockNodes<D>)
       if (cell[k] == own) order[next++] = t.index[begin + k];
   }
   const int64_t stride = int64_t(gridDim.x) * cells;
-  for (int64_t i = t.offsets[t.capacity] + int64_t(blockIdx.x) * cells + own; i < t.particles; i += stride)
+  for (int64_t i = t.offsets[t.max_blocks] + int64_t(blockIdx.x) * cells + own; i < t.particles; i += stride)
     order[i] = t.index[i];
 }
 
@@ -44,7 +45,7 @@ __global__ void __launch_bounds__(kBlockNodes<D>)
 template <int Order, class T, int D>
 void cell_order(const CellOrderArguments<T, D>& a, Stream stream) {
   if (a.topology.particles == 0) return;
-  launch(cell_order_kernel<Order, T, D>, grid_size(most_items(a.topology.capacity, a.topology.particles)),
+  launch(cell_order_kernel<Order, T, D>, grid_size(most_items(a.topology.max_blocks, a.topology.particles)),
          kBlockNodes<D>, 0, stream, a.topology, Columns<const T, D>(a.x), a.order);
 }
 

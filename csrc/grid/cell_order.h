@@ -1,10 +1,11 @@
 #pragma once
 
-#include "transfer/arguments.h"
+#include "common/fields.h"
+#include "grid/topology.h"
 
 namespace mpm {
 
-// The particles by home block, and within a block (or a part of a crowded one) by the cell of their base node,
+// The particles by base block, and within a block (or a part of a crowded one) by the cell of their base node,
 // otherwise in the order of the index tensor.
 template <class T, int D>
 struct CellOrderArguments {

@@ -3,6 +3,7 @@
 #include <limits>
 
 #include "grid/kernels.h"
+#include "grid/topology.op.h"
 
 // Contact of the grid with rigid obstacles.
 namespace mpm {
@@ -10,14 +11,14 @@ namespace {
 
 #define MPM_CONTACT_SCHEMA                                                                                           \
   "Tensor velocity, Tensor obstacles, int[] shape, int[] contact, int[] scene, float[] start, float[] end, Tensor? " \
-  "scene_time, float time, Tensor block, float dx, float[] lower, int[] blocks"
+  "scene_time, float time, " MPM_TOPOLOGY_SCHEMA
 #define MPM_CONTACT_PARAMETERS                                                                                    \
   const Tensor &velocity, const Tensor &obstacles, std::vector<int64_t> shape, std::vector<int64_t> contact_kind, \
       std::vector<int64_t> scene, std::vector<double> start, std::vector<double> end,                             \
-      const OptionalTensor &scene_time, double time, const Tensor &block, double dx, std::vector<double> lower,   \
-      std::vector<int64_t> blocks
+      const OptionalTensor &scene_time, double time, const std::vector<Tensor>&topology,                          \
+      const std::vector<double>&lattice, const std::vector<int64_t>&layout
 #define MPM_CONTACT_ARGUMENTS \
-  velocity, obstacles, shape, contact_kind, scene, start, end, scene_time, time, block, dx, lower, blocks
+  velocity, obstacles, shape, contact_kind, scene, start, end, scene_time, time, topology, lattice, layout
 
 void check_velocity(const Tensor& velocity) {
   STD_TORCH_CHECK(velocity.dim() == 2 && (velocity.size(1) == 2 || velocity.size(1) == 3),
@@ -27,19 +28,20 @@ void check_velocity(const Tensor& velocity) {
 
 template <class T, int D>
 ContactArguments<T, D> contact_arguments(MPM_CONTACT_PARAMETERS) {
+  const PackedTopology blocks(topology, lattice, layout);
   ContactArguments<T, D> a;
-  a.geometry = geometry<T, D>(dx, lower, blocks);
-  a.dx = dx;
+  a.geometry = blocks.geometry<T, D>();
+  a.dx = blocks.dx();
   T largest = T(0);  // coordinate of a node
   for (int i = 0; i < D; i++) {
-    a.lower[i] = lower[i];
-    const double upper = lower[i] + dx * double(blocks[i] * kBlockWidth);
-    largest = std::fmax(largest, T(std::fmax(std::fabs(lower[i]), std::fabs(upper))));
+    a.lower[i] = blocks.lower()[i];
+    const double upper = a.lower[i] + a.dx * double(a.geometry.blocks[i] * kBlockWidth);
+    largest = std::fmax(largest, T(std::fmax(std::fabs(a.lower[i]), std::fabs(upper))));
   }
   a.rounding = 16 * std::numeric_limits<T>::epsilon() * largest;
-  a.capacity = block_capacity<D>(block);
-  a.block = int_pointer(block, "block", velocity, {a.capacity});
-  const auto v = node_input<T>(velocity, "velocity", velocity, node_count<D>(block));
+  a.capacity = blocks.max_blocks<D>();
+  a.block = blocks.block_pointer(velocity);
+  const auto v = node_input<T>(velocity, "velocity", velocity, blocks.node_count<D>());
   a.velocity = v.pointer;
   a.stride = v.stride;
   constexpr int64_t width = sizeof(ObstacleRow<T, D>) / sizeof(T);
@@ -100,7 +102,7 @@ Tensor contact_backward(const Tensor& grad, MPM_CONTACT_PARAMETERS) {
   dispatch(velocity, "velocity", velocity.size(1), [&]<class T, int D>() {
     auto a = contact_arguments<T, D>(MPM_CONTACT_ARGUMENTS);
     check_shape(grad, "grad", {velocity.size(0), D});
-    const auto g = node_input<T>(grad, "grad", velocity, node_count<D>(block));
+    const auto g = node_input<T>(grad, "grad", velocity, velocity.size(0));
     a.grad = g.pointer;
     a.grad_stride = g.stride;
     a.result = static_cast<T*>(rows.data_ptr());

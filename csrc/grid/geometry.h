@@ -102,6 +102,16 @@ MPM_HD int block_coordinates(const Geometry<T, D>& g, int index, int block[D]) {
   return index;
 }
 
+// Blocks of one colour, 2^D of them, are two blocks apart, so that particles of different ones share no node.
+template <class T, int D>
+MPM_HD int block_colour(const Geometry<T, D>& g, int index) {
+  int block[D], colour = 0;
+  block_coordinates(g, index, block);
+  MPM_UNROLL for (int i = 0; i < D; i++)
+    colour = colour * 2 + (block[i] & 1);
+  return colour;
+}
+
 // Position of a node inside its block, z fastest.
 template <int D>
 MPM_HD int node_in_block(const int node[D]) {

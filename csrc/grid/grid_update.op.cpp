@@ -1,6 +1,7 @@
 #include <algorithm>
 
 #include "grid/kernels.h"
+#include "grid/topology.op.h"
 
 // Node mass and momentum to mass and velocity, with gravity and the walls of the domain.
 namespace mpm {
@@ -8,13 +9,13 @@ namespace {
 
 #define MPM_GRID_UPDATE_SCHEMA                                                                               \
   "Tensor nodes, Tensor? gravity, Tensor? scene_dt, float dt, int[] wall_kind, float[] wall_plane, float[] " \
-  "wall_friction, Tensor table, Tensor block, float dx, float[] lower, int[] blocks"
+  "wall_friction, " MPM_TOPOLOGY_SCHEMA
 #define MPM_GRID_UPDATE_PARAMETERS                                                                       \
   const Tensor &nodes, const OptionalTensor &gravity, const OptionalTensor &scene_dt, double dt,         \
       std::vector<int64_t> wall_kind, std::vector<double> wall_plane, std::vector<double> wall_friction, \
-      const Tensor &table, const Tensor &block, double dx, std::vector<double> lower, std::vector<int64_t> blocks
+      const std::vector<Tensor>&topology, const std::vector<double>&lattice, const std::vector<int64_t>&layout
 #define MPM_GRID_UPDATE_ARGUMENTS \
-  nodes, gravity, scene_dt, dt, wall_kind, wall_plane, wall_friction, table, block, dx, lower, blocks
+  nodes, gravity, scene_dt, dt, wall_kind, wall_plane, wall_friction, topology, lattice, layout
 
 void check_nodes(const Tensor& nodes) {
   STD_TORCH_CHECK(nodes.dim() == 2 && (nodes.size(1) == 3 || nodes.size(1) == 4),
@@ -49,7 +50,7 @@ const T* scene_values(const OptionalTensor& t, const char* name, const Tensor& n
 
 template <class T, int D>
 Walls<T, D> walls(const std::vector<int64_t>& kind, const std::vector<double>& plane,
-                  const std::vector<double>& friction, double dx, const std::vector<double>& lower) {
+                  const std::vector<double>& friction, const PackedLattice& lattice) {
   STD_TORCH_CHECK(kind.empty() || kind.size() == 2 * D, "wall_kind must be empty or have ", 2 * D,
                   " entries, two per axis, got ", kind.size());
   STD_TORCH_CHECK(plane.size() == kind.size(), "wall_plane must have an entry per wall_kind, ", kind.size(), ", got ",
@@ -61,22 +62,23 @@ Walls<T, D> walls(const std::vector<int64_t>& kind, const std::vector<double>& p
     const int64_t k = kind.empty() ? int64_t(Contact::open) : kind[face];
     STD_TORCH_CHECK(k >= int64_t(Contact::open) && k <= int64_t(Contact::mirror), "wall_kind must be 0 to 4, got ", k);
     const bool open = k == int64_t(Contact::open);
-    w.set(face, Contact(k), open ? 0 : friction[face], open ? 0 : plane[face], dx, lower[face / 2]);
+    w.set(face, Contact(k), open ? 0 : friction[face], open ? 0 : plane[face], lattice.dx(), lattice.lower()[face / 2]);
   }
   return w;
 }
 
 template <class T, int D>
 GridUpdateArguments<T, D> grid_update_arguments(MPM_GRID_UPDATE_PARAMETERS) {
+  const PackedTopology blocks(topology, lattice, layout);
   GridUpdateArguments<T, D> a;
-  a.geometry = geometry<T, D>(dx, lower, blocks);
-  a.capacity = block_capacity<D>(block);
-  a.block = int_pointer(block, "block", nodes, {a.capacity});
-  check_shape(nodes, "nodes", {node_count<D>(block), 1 + D});
+  a.geometry = blocks.geometry<T, D>();
+  a.capacity = blocks.max_blocks<D>();
+  a.block = blocks.block_pointer(nodes);
+  check_shape(nodes, "nodes", {blocks.node_count<D>(), 1 + D});
   a.nodes = rows<T, D>(nodes, "nodes", nodes);
-  check_rank(table, "table", 1);
-  a.table = int_pointer(table, "table", nodes, {table.size(0)});
-  a.block_count = int(std::min<int64_t>(INT32_MAX, table.numel()));
+  int64_t table_size;
+  a.table = blocks.table_pointer(nodes, table_size);
+  a.block_count = int(std::min<int64_t>(INT32_MAX, table_size));
   if (has(gravity)) {
     check_rank(*gravity, "gravity", 2);
     const int64_t scenes = gravity->size(0);
@@ -85,7 +87,7 @@ GridUpdateArguments<T, D> grid_update_arguments(MPM_GRID_UPDATE_PARAMETERS) {
     a.block_count = int(std::min<int64_t>(a.block_count, scenes * a.geometry.blocks_per_scene));
   }
   a.dt = dt;
-  a.walls = walls<T, D>(wall_kind, wall_plane, wall_friction, dx, lower);
+  a.walls = walls<T, D>(wall_kind, wall_plane, wall_friction, blocks);
   return a;
 }
 

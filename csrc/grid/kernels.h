@@ -1,6 +1,7 @@
 #pragma once
 
 #include "common/backend.h"
+#include "grid/activate.h"
 #include "grid/cell_order.h"
 #include "grid/grid_update.h"
 #include "grid/obstacle.h"

@@ -5,12 +5,12 @@
 #include "heat/solve.h"
 #include "heat/workspace.cpu.h"
 
-// H applied in one pass: the particles of a cell read its nodes into registers as packs, and add to them there. Homes
-// add their tiles colour by colour, so that every sum has the same order for any number of threads.
+// H applied in one pass: the particles of a cell read its nodes into registers as packs, and add to them there. Base
+// blocks add their tiles colour by colour, so that every sum has the same order for any number of threads.
 namespace mpm::cpu {
 inline namespace TORCH_MPM_ISA {
 
-// One value at each node that the particles of a home touch; rows along the last axis.
+// One value at each node that the particles of a base block touch; rows along the last axis.
 template <int Order, class T, int D>
 struct ScalarTile {
   static constexpr int kWidth = kBlockWidth + Order, kRow = 2 * kBlockWidth;
@@ -22,24 +22,24 @@ struct ScalarTile {
 
   // visit(tile values, node row of the pool, nodes) for every run of nodes in an active block
   template <class F>
-  MPM_HD void for_runs(const Home<T, D>& home, const F& visit) {
+  MPM_HD void for_runs(const BaseBlock<T, D>& base_block, const F& visit) {
     for (int row = 0; row < kRows; row++) {
       const int i = D == 3 ? row / kWidth : 0, j = row % kWidth;
       const int o = (D == 3 ? i / kBlockWidth * 4 : 0) + j / kBlockWidth * 2;
       const int inside = (i % kBlockWidth * kBlockWidth + j % kBlockWidth) * kBlockWidth;
-      const int low = home.slot[o], high = home.slot[o + 1];
+      const int low = base_block.slot[o], high = base_block.slot[o + 1];
       if (low >= 0) visit(value + row * kRow, int64_t(low) * kBlockNodes<D> + inside, kBlockWidth);
       if (high >= 0) visit(value + row * kRow + kBlockWidth, int64_t(high) * kBlockNodes<D> + inside, Order);
     }
   }
-  void load_from(const T* nodes, const Home<T, D>& home) {
+  void load_from(const T* nodes, const BaseBlock<T, D>& base_block) {
     clear();
-    for_runs(home, [&](T* tile, int64_t row, int n) {
+    for_runs(base_block, [&](T* tile, int64_t row, int n) {
       for (int k = 0; k < n; k++) tile[k] = nodes[row + k];
     });
   }
-  void add_to(T* nodes, const Home<T, D>& home) {
-    for_runs(home, [&](const T* tile, int64_t row, int n) {
+  void add_to(T* nodes, const BaseBlock<T, D>& base_block) {
+    for_runs(base_block, [&](const T* tile, int64_t row, int n) {
       for (int k = 0; k < n; k++) nodes[row + k] += tile[k];
     });
   }
@@ -73,9 +73,9 @@ void add_support(Lanes<T>* packs, int cell, ScalarTile<Order, T, D>& tile) {
 
 // The particles order[begin, end) of a chunk, which lie in one cell; returns Σ κ V |∇u|².
 template <HeatSum Sum, int Order, class T, int D>
-T sum_cell(const Topology<T, D>& t, const Field<const T>& x, const Field<const T>& conductance, const Home<T, D>& home,
-           const Chunk& chunk, int cell, int begin, int end, ScalarTile<Order, T, D>& u, ScalarTile<Order, T, D>& sum,
-           const int* e) {
+T sum_cell(const Topology<T, D>& t, const Field<const T>& x, const Field<const T>& conductance,
+           const BaseBlock<T, D>& base_block, const Chunk& chunk, int cell, int begin, int end,
+           ScalarTile<Order, T, D>& u, ScalarTile<Order, T, D>& sum, const int* e) {
   using P = Lanes<T>;
   constexpr int kNodes = kSupportNodes<Order, D>, kPadded = (kNodes + kLanes - 1) / kLanes * kLanes;
   static constexpr T kLane[kLanes] = {0, 1, 2, 3, 4, 5, 6, 7};
@@ -90,7 +90,7 @@ T sum_cell(const Topology<T, D>& t, const Field<const T>& x, const Field<const T
     const Group g = group_by_cell(chunk, i, end);
     P f[D];
     MPM_UNROLL for (int a = 0; a < D; a++) {
-      const T base = T(home.corner[a] + cell_coordinate<D>(cell, a));
+      const T base = T(base_block.corner[a] + cell_coordinate<D>(cell, a));
       f[a] = distance_in_cells(t.geometry, a, load(x, g, a), P(base));
     }
     const auto real = P::load(kLane) < P(g.count);
@@ -103,35 +103,36 @@ T sum_cell(const Topology<T, D>& t, const Field<const T>& x, const Field<const T
   return total;
 }
 
-// Adds a sum over the particles of every home whose scene is wanted to the nodes; finish(slot, Σ κ V |∇u|²) per home.
+// Adds a sum over the particles of every base block whose scene is wanted to the nodes; finish(slot, Σ κ V |∇u|²) per
+// base block.
 template <HeatSum Sum, int Order, class T, int D, class Wanted, class Finish>
 void sum_particles(const Topology<T, D>& t, const Field<const T>& x, const Field<const T>& conductance, const T* nodes,
                    T* out, const Wanted& wanted, const Finish& finish, const int* e = nullptr) {
   const ScheduleIn s = schedule_of(t);
   PhaseCounter<kColours<D>> colours{s.colour_start};
-  parallel_homes<D>(s, t.particles, [&](const auto& next) {
+  parallel_base_blocks<D>(s, t.particles, [&](const auto& next) {
     ScalarTile<Order, T, D> u, sum;
     int colour = 0;
     for (int64_t h; (h = next()) >= 0;) {
-      const int slot = s.home_slot[h];
-      const Home<T, D> home(t, slot);
+      const int slot = s.base_slot[h];
+      const BaseBlock<T, D> base_block(t, slot);
       while (h >= s.colour_start[colour + 1]) colour++;
-      if (!wanted(home.scene)) {
+      if (!wanted(base_block.scene)) {
         colours.finish(colour);
         continue;
       }
-      if (Sum == HeatSum::product) u.load_from(nodes, home);
+      if (Sum == HeatSum::product) u.load_from(nodes, base_block);
       sum.clear();
       double power = 0;
-      for (int64_t c = s.home_chunk[h]; c < s.home_chunk[h + 1]; c++) {
+      for (int64_t c = s.base_chunk[h]; c < s.base_chunk[h + 1]; c++) {
         const Chunk chunk(t, s, c);
         for (int cell = 0, begin = 0; cell < kBlockNodes<D>; begin = chunk.cell_end[cell++])
           if (const int end = chunk.cell_end[cell]; begin < end)
-            power += double(sum_cell<Sum, Order>(t, x, conductance, home, chunk, cell, begin, end, u, sum, e));
+            power += double(sum_cell<Sum, Order>(t, x, conductance, base_block, chunk, cell, begin, end, u, sum, e));
       }
       finish(slot, power);
       colours.wait_before(colour);
-      sum.add_to(out, home);
+      sum.add_to(out, base_block);
       colours.finish(colour);
     }
   });
@@ -157,7 +158,7 @@ struct HeatSolver {
   // f(node) for the nodes of every slot whose scene is wanted; the returned sums are kept by slot.
   template <class Wanted, class F>
   void for_slots(const Wanted& wanted, const F& f) const {
-    parallel_ranges(a.topology.capacity, kGrain, [&](int64_t begin, int64_t end) {
+    parallel_ranges(a.topology.max_blocks, kGrain, [&](int64_t begin, int64_t end) {
       for (int64_t slot = begin; slot < end; slot++)
         if (const int scene = scene_of(slot); wanted(scene)) f(slot, scene, slot * kBlockNodes<D>);
     });
@@ -165,7 +166,7 @@ struct HeatSolver {
   bool running(int scene) const { return scene >= 0 && w.scene[scene].running; }
 
   void start() const {
-    const int64_t nodes = a.topology.capacity * int64_t(kBlockNodes<D>);
+    const int64_t nodes = a.topology.max_blocks * int64_t(kBlockNodes<D>);
     parallel_ranges(nodes, 65536, [&](int64_t begin, int64_t end) {
       T* const vectors[] = {w.v.product, w.v.inverse, w.v.weight};
       for (T* vector : vectors) __builtin_memset(vector + begin, 0, (end - begin) * sizeof(T));
@@ -196,7 +197,7 @@ struct HeatSolver {
     int64_t slot = 0;
     for (int scene = 0; scene < a.topology.scenes; scene++) {
       Sum sum = zero;
-      for (; slot < a.topology.capacity && scene_of(slot) <= scene && scene_of(slot) >= 0; slot++)
+      for (; slot < a.topology.max_blocks && scene_of(slot) <= scene && scene_of(slot) >= 0; slot++)
         if (wanted(scene)) sum.add(kept[slot]);
       if (wanted(scene)) f(scene, sum);
     }
@@ -266,7 +267,7 @@ void heat_stencil(const HeatOperatorArguments<T, D>& a) {
   for (int pair = 0; pair < kPairs<D>; pair++) {
     int e[D];
     pair_offset<D>(pair, e);
-    T* const sum = a.sum + pair * int64_t(a.topology.capacity) * kBlockNodes<D>;
+    T* const sum = a.sum + pair * int64_t(a.topology.max_blocks) * kBlockNodes<D>;
     sum_particles<HeatSum::pair, Order>(a.topology, a.x, a.conductance, a.nodes, sum, all, nothing, e);
   }
 }

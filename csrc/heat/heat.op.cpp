@@ -1,3 +1,4 @@
+#include "grid/topology.op.h"
 #include "heat/cell.h"
 #include "heat/kernels.h"
 
@@ -26,32 +27,32 @@ class Values {
   Tensor packed_;
 };
 
-std::tuple<Tensor, Tensor, Tensor, Tensor> heat_cg(const Tensor& x, const Tensor& conductance, const Tensor& capacity,
-                                                   const OptionalTensor& theta, const OptionalTensor& source,
-                                                   const OptionalTensor& exchange, const OptionalTensor& fixed,
-                                                   const OptionalTensor& scene_dt, double dt,
-                                                   const OptionalTensor& scene_tolerance, double tolerance,
-                                                   double relative_tolerance, const OptionalTensor& scene_most,
-                                                   int64_t max_iterations, int64_t method, double /*adjoint_tolerance*/,
-                                                   MPM_TOPOLOGY_PARAMETERS) {
+std::tuple<Tensor, Tensor, Tensor, Tensor> heat_cg(
+    const Tensor& x, const Tensor& conductance, const Tensor& heat_capacity, const OptionalTensor& theta,
+    const OptionalTensor& source, const OptionalTensor& exchange, const OptionalTensor& fixed,
+    const OptionalTensor& scene_dt, double dt, const OptionalTensor& scene_tolerance, double tolerance,
+    double relative_tolerance, const OptionalTensor& scene_most, int64_t max_iterations, int64_t method,
+    double /*adjoint_tolerance*/, const std::vector<Tensor>& topology, const std::vector<double>& lattice,
+    const std::vector<int64_t>& layout) {
+  const PackedTopology blocks(topology, lattice, layout);
   STD_TORCH_CHECK(method == 0 || method == 1, "method must be 0 (conjugate gradients) or 1 (Chebyshev), got ", method);
   STD_TORCH_CHECK(max_iterations >= 0 && max_iterations <= INT32_MAX, "max_iterations must be 0 to 2^31 - 1, got ",
                   max_iterations);
   Tensor increment, iterations, residual, converged;
   const DeviceScope device(x);
-  dispatch(x, order, [&]<class T, int D>() {
+  dispatch(x, [&]<class T, int D>() {
     HeatArguments<T, D> a;
-    a.topology = topology<T, D>(x, MPM_TOPOLOGY_ARGUMENTS);
-    const int64_t N = node_count<D>(block), scenes = a.topology.scenes;
+    a.topology = blocks.unpack<T, D>(x);
+    const int64_t N = blocks.node_count<D>(), scenes = a.topology.scenes;
     a.x = input<T>(x, "x", x, {x.size(0), D});
     a.conductance = input<T>(conductance, "conductance", x, {x.size(0)});
     const ScalarType type = x.scalar_type();
-    const Values<T> M(capacity, "capacity", x, type, N), u(theta, "theta", x, type, N), h(source, "source", x, type, N),
-        X(exchange, "exchange", x, type, N), steps(scene_dt, "scene_dt", x, type, scenes),
-        limit(scene_tolerance, "scene_tolerance", x, type, scenes);
+    const Values<T> M(heat_capacity, "heat_capacity", x, type, N), u(theta, "theta", x, type, N),
+        h(source, "source", x, type, N), X(exchange, "exchange", x, type, N),
+        steps(scene_dt, "scene_dt", x, type, scenes), limit(scene_tolerance, "scene_tolerance", x, type, scenes);
     const Values<bool> held(fixed, "fixed", x, ScalarType::Bool, N);
     const Values<int> most(scene_most, "scene_max_iterations", x, ScalarType::Int, scenes);
-    a.capacity = M.pointer;
+    a.heat_capacity = M.pointer;
     a.theta = u.pointer;
     a.source = h.pointer;
     a.exchange = X.pointer;
@@ -64,7 +65,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> heat_cg(const Tensor& x, const Tensor
     a.most = int(max_iterations);
     a.scene_most = most.pointer;
     a.method = HeatMethod(method);
-    a.deterministic = deterministic;
+    a.deterministic = blocks.deterministic();
     increment = empty(x, {N});
     iterations = empty_int(x, {scenes});
     residual = empty(x, {scenes});
@@ -75,48 +76,53 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> heat_cg(const Tensor& x, const Tensor
     a.converged = static_cast<bool*>(converged.data_ptr());
     const Tensor workspace = empty(x, {backend::heat_workspace(a, device.stream())}, ScalarType::Byte);
     a.workspace = workspace.data_ptr();
-    backend::heat_cg(order, a, device.stream());
+    backend::heat_cg(blocks.order(), a, device.stream());
   });
   return {increment, iterations, residual, converged};
 }
 
 // What the operator and its stencil read.
 template <class T, int D>
-HeatOperatorArguments<T, D> operator_arguments(const Topology<T, D>& topology, const Tensor& x,
-                                               const Tensor& conductance, bool deterministic) {
+HeatOperatorArguments<T, D> operator_arguments(const PackedTopology& blocks, const Tensor& x,
+                                               const Tensor& conductance) {
   HeatOperatorArguments<T, D> a;
-  a.topology = topology;
+  a.topology = blocks.unpack<T, D>(x);
   a.x = input<T>(x, "x", x, {x.size(0), D});
   a.conductance = input<T>(conductance, "conductance", x, {x.size(0)});
-  a.deterministic = deterministic;
+  a.deterministic = blocks.deterministic();
   return a;
 }
 
-Tensor heat_operator(const Tensor& x, const Tensor& conductance, const OptionalTensor& nodes, MPM_TOPOLOGY_PARAMETERS) {
+Tensor heat_operator(const Tensor& x, const Tensor& conductance, const OptionalTensor& nodes,
+                     const std::vector<Tensor>& topology, const std::vector<double>& lattice,
+                     const std::vector<int64_t>& layout) {
+  const PackedTopology blocks(topology, lattice, layout);
   Tensor sum;
   const DeviceScope device(x);
-  dispatch(x, order, [&]<class T, int D>() {
-    auto a = operator_arguments(topology<T, D>(x, MPM_TOPOLOGY_ARGUMENTS), x, conductance, deterministic);
-    const int64_t N = node_count<D>(block);
+  dispatch(x, [&]<class T, int D>() {
+    auto a = operator_arguments<T, D>(blocks, x, conductance);
+    const int64_t N = blocks.node_count<D>();
     const Values<T> u(nodes, "nodes", x, x.scalar_type(), N);
     a.nodes = u.pointer;
     sum = zeros(x, {N});
     a.sum = static_cast<T*>(sum.data_ptr());
     const Tensor workspace = empty(x, {backend::heat_operator_workspace(a, device.stream())}, ScalarType::Byte);
     a.workspace = workspace.data_ptr();
-    backend::heat_operator(order, a, device.stream());
+    backend::heat_operator(blocks.order(), a, device.stream());
   });
   return sum;
 }
 
-Tensor heat_stencil(const Tensor& x, const Tensor& conductance, MPM_TOPOLOGY_PARAMETERS) {
+Tensor heat_stencil(const Tensor& x, const Tensor& conductance, const std::vector<Tensor>& topology,
+                    const std::vector<double>& lattice, const std::vector<int64_t>& layout) {
+  const PackedTopology blocks(topology, lattice, layout);
   Tensor sum;
   const DeviceScope device(x);
-  dispatch(x, order, [&]<class T, int D>() {
-    auto a = operator_arguments(topology<T, D>(x, MPM_TOPOLOGY_ARGUMENTS), x, conductance, deterministic);
-    sum = zeros(x, {kPairs<D>, node_count<D>(block)});
+  dispatch(x, [&]<class T, int D>() {
+    auto a = operator_arguments<T, D>(blocks, x, conductance);
+    sum = zeros(x, {kPairs<D>, blocks.node_count<D>()});
     a.sum = static_cast<T*>(sum.data_ptr());
-    backend::heat_stencil(order, a, device.stream());
+    backend::heat_stencil(blocks.order(), a, device.stream());
   });
   return sum;
 }
@@ -153,7 +159,7 @@ Tensor heat_patches(const Tensor& inverse, const Tensor& rows, const Tensor& pat
 #if MPM_BACKEND == MPM_BACKEND_IS_cpu
 STABLE_TORCH_LIBRARY_FRAGMENT(torch_mpm, m) {
   m.def(
-      "heat_cg(Tensor x, Tensor conductance, Tensor capacity, Tensor? theta, Tensor? source, Tensor? exchange, "
+      "heat_cg(Tensor x, Tensor conductance, Tensor heat_capacity, Tensor? theta, Tensor? source, Tensor? exchange, "
       "Tensor? fixed, Tensor? scene_dt, float dt, Tensor? scene_tolerance, float tolerance, float relative_tolerance, "
       "Tensor? scene_max_iterations, int max_iterations, int method, float adjoint_tolerance, " MPM_TOPOLOGY_SCHEMA
       ") -> (Tensor increment, Tensor iterations, Tensor residual, Tensor converged)");

@@ -1,4 +1,5 @@
-#include "cuda/home.cuh"
+#include "cuda/base_block.cuh"
+#include "cuda/columns.cuh"
 #include "cuda/launch.cuh"
 #include "heat/cell.h"
 #include "heat/patches.h"
@@ -14,7 +15,7 @@ constexpr int kThreads = 128;
 template <int Order, class T, int D>
 __global__ void __launch_bounds__(kThreads) stencil_kernel(const HeatOperatorArguments<T, D> a) {
   const Topology<T, D>& t = a.topology;
-  const int64_t count = int64_t(t.capacity) * kBlockNodes<D>, node = int64_t(blockIdx.x) * kThreads + threadIdx.x;
+  const int64_t count = int64_t(t.max_blocks) * kBlockNodes<D>, node = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   if (node >= count) return;
   const int block = t.block[node / kBlockNodes<D>];
   if (block < 0) return;
@@ -27,15 +28,15 @@ __global__ void __launch_bounds__(kThreads) stencil_kernel(const HeatOperatorArg
   }
   T sum[kPairs<D>] = {};
   for (int o = 0; o < 1 << D; o++) {
-    int home[D];
+    int base_block[D];
     bool reaches = true;
 #pragma unroll
     for (int i = 0; i < D; i++) {
       const int before = o >> i & 1;
-      home[i] = own[i] - before;
-      reaches = reaches && home[i] >= 0 && (!before || local[i] < Order);
+      base_block[i] = own[i] - before;
+      reaches = reaches && base_block[i] >= 0 && (!before || local[i] < Order);
     }
-    const int slot = reaches ? t.table[block_index(t.geometry, scene, home)] : -1;
+    const int slot = reaches ? t.table[block_index(t.geometry, scene, base_block)] : -1;
     if (slot < 0) continue;
     for (int k = t.offsets[slot]; k < t.offsets[slot + 1]; k++) {
       const int64_t p = t.index[k];
@@ -100,7 +101,7 @@ unsigned blocks_for(int64_t threads) { return unsigned((threads + kThreads - 1) 
 
 template <int Order, class T, int D>
 void heat_stencil(const HeatOperatorArguments<T, D>& a, Stream stream) {
-  const int64_t nodes = int64_t(a.topology.capacity) * kBlockNodes<D>;
+  const int64_t nodes = int64_t(a.topology.max_blocks) * kBlockNodes<D>;
   if (nodes > 0) launch(stencil_kernel<Order, T, D>, blocks_for(nodes), kThreads, 0, stream, a);
 }
 

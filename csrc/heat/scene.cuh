@@ -2,7 +2,8 @@
 
 #include <climits>
 
-#include "cuda/home.cuh"
+#include "cuda/base_block.cuh"
+#include "cuda/columns.cuh"
 #include "cuda/launch.cuh"
 #include "heat/cell.h"
 #include "heat/solve.h"
@@ -154,7 +155,7 @@ struct SceneSolver {
     for (int number = warp_index(); number < 3; number += warps()) {
       const int wanted = number < 2 ? scene + number : t.scenes;
       const int slot = first_not_below(
-          t.capacity, [&](int i) { return t.block[i] >= 0 && t.block[i] / t.geometry.blocks_per_scene < wanted; });
+          t.max_blocks, [&](int i) { return t.block[i] >= 0 && t.block[i] / t.geometry.blocks_per_scene < wanted; });
       if (lane_index() == 0) (number == 0 ? s.slot : number == 1 ? s.slot_end : s.used) = slot;
     }
     if (threadIdx.x < D) {
@@ -172,7 +173,7 @@ struct SceneSolver {
 
   // Unused rows, shared among the scenes.
   __device__ void clear_unused() const {
-    const int64_t last = int64_t(t.capacity) * kBlockNodes<D>, stride = int64_t(gridDim.x) * blockDim.x;
+    const int64_t last = int64_t(t.max_blocks) * kBlockNodes<D>, stride = int64_t(gridDim.x) * blockDim.x;
     int64_t row = int64_t(s.used) * kBlockNodes<D> + int64_t(blockIdx.x) * blockDim.x + threadIdx.x;
     for (; row < last; row += stride) k.a.increment[row] = T(0);
   }
@@ -202,41 +203,41 @@ struct SceneSolver {
     return slot < 0 ? -1 : slot * kBlockNodes<D> + node_in_block<D>(node);
   }
 
-  // Base node of particle p and distances from it. False for a particle that is not at home: its position is not the
-  // one that was activated.
-  __device__ bool locate_particle(const Vector<T, D>& position, int home, int* base, T* f) const {
+  // Base node of particle p and distances from it. False for a particle that is not in its base block: its position is
+  // not the one that was activated.
+  __device__ bool locate_particle(const Vector<T, D>& position, int base_block, int* base, T* f) const {
     const bool inside = locate<Order>(t.geometry, position.e, base, f);
     int block[D];
 #pragma unroll
     for (int i = 0; i < D; i++) block[i] = base[i] / kBlockWidth;
-    return inside && block_index(t.geometry, scene, block) == home;
+    return inside && block_index(t.geometry, scene, block) == base_block;
   }
-  __device__ int home_of(int particle) const { return t.block[schedule_of(t).home[particle]]; }
-  // f(particle, base node) for the particles at home, by any thread.
+  __device__ int base_block_of(int particle) const { return t.block[schedule_of(t).base_slot[particle]]; }
+  // f(particle, base node) for the particles in their base block, by any thread.
   template <class F>
   __device__ void for_particles(const F& f) const {
     constexpr int batch = 4;  // loads in flight
     for (int first = begin + int(threadIdx.x); first < end; first += batch * blockDim.x) {
-      int particle[batch], home[batch];
+      int particle[batch], base_block[batch];
       Vector<T, D> position[batch];
 #pragma unroll
       for (int n = 0; n < batch; n++) particle[n] = t.index[min(first + n * int(blockDim.x), end - 1)];
 #pragma unroll
       for (int n = 0; n < batch; n++) {
         position[n] = read_vector(k.x, particle[n]);
-        home[n] = home_of(particle[n]);
+        base_block[n] = base_block_of(particle[n]);
       }
 #pragma unroll
       for (int n = 0; n < batch; n++) {
         int base[D];
         T distance[D];
-        if (first + n * int(blockDim.x) < end && locate_particle(position[n], home[n], base, distance))
+        if (first + n * int(blockDim.x) < end && locate_particle(position[n], base_block[n], base, distance))
           f(particle[n], base);
       }
     }
   }
 
-  // The box around the supports of the particles and the nodes with capacity. False if the scene is too large.
+  // The box around the supports of the particles and the nodes with heat capacity. False if the scene is too large.
   __device__ bool set_box() {
     if (end - begin > k.most_particles) return false;
     int low[D], high[D];
@@ -254,7 +255,7 @@ struct SceneSolver {
     };
     for_particles([&](int, const int* base) { include(base, Order + 1); });
     for_rows([&](int row) {
-      if (k.a.capacity[row] <= T(0)) return;
+      if (k.a.heat_capacity[row] <= T(0)) return;
       int node[D];
       node_of_row(row, node);
       include(node, 1);
@@ -307,7 +308,7 @@ struct SceneSolver {
       const int at = first + int(threadIdx.x), particle = at < end ? t.index[at] : -1;
       int base[D], corner = -1;
       T f[D];
-      if (particle >= 0 && locate_particle(read_vector(k.x, particle), home_of(particle), base, f))
+      if (particle >= 0 && locate_particle(read_vector(k.x, particle), base_block_of(particle), base, f))
         corner = box.index(base);
       for (int turn = 0; turn < warps(); turn++) {
         if (warp_index() == turn) {
@@ -502,7 +503,7 @@ void solve_scenes(SceneKernel<Order, T, D> kernel, Stream stream) {
   const int together = t.scenes > device_attribute(cudaDevAttrMultiProcessorCount) ? 2 : 1;
   const int reserved = 5 * 1024;  // for the system, and for what is not dynamic
   const int room = device_attribute(cudaDevAttrMaxSharedMemoryPerMultiprocessor) / together - reserved;
-  const int64_t nodes = int64_t(t.capacity) * kBlockNodes<D> / t.scenes * 3 / 4;
+  const int64_t nodes = int64_t(t.max_blocks) * kBlockNodes<D> / t.scenes * 3 / 4;
   kernel.most_nodes = int(std::min<int64_t>(room / (2 * sizeof(T)), std::max<int64_t>(nodes, kFewNodes)));
   kernel.most_particles = int(std::max<int64_t>(kFewParticles, 2 * t.particles / t.scenes));
   kernel.x = Columns<const T, D>(kernel.a.x);

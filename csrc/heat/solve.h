@@ -2,7 +2,8 @@
 
 #include <cmath>
 
-#include "transfer/arguments.h"
+#include "common/fields.h"
+#include "grid/topology.h"
 
 // The iteration of the implicit heat step (M/dt + H + X) d = h − (H + X) θ: what happens at a node and what is decided
 // for a scene. The loops of both backends go over nodes, sum over scenes and apply H.
@@ -18,7 +19,7 @@ template <class T, int D>
 struct HeatArguments {
   Topology<T, D> topology;
   Field<const T> x, conductance;       // conductance κ V [P]
-  const T* capacity = nullptr;         // [N], as those below
+  const T* heat_capacity = nullptr;    // [N], as those below
   const T* theta = nullptr;            // absent: zero
   const T* source = nullptr;           // absent: zero
   const T* exchange = nullptr;         // absent: zero
@@ -115,7 +116,7 @@ MPM_HD double step_of_scene(const HeatArguments<T, D>& a, int scene) {
 template <class T, int D>
 MPM_HD StartSums<T> start_node(const HeatArguments<T, D>& a, const HeatVectors<T>& v, int64_t row, int64_t i, double dt,
                                bool used) {
-  const T mass = used ? a.capacity[row] : T(0), exchange = a.exchange && used ? a.exchange[row] : T(0);
+  const T mass = used ? a.heat_capacity[row] : T(0), exchange = a.exchange && used ? a.exchange[row] : T(0);
   const T source = a.source && used ? a.source[row] : T(0);
   const bool material = used && !(mass <= T(0)), held = material && a.fixed && a.fixed[row], free = material && !held;
   auto sums = StartSums<T>::zero();

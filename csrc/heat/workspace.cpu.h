@@ -14,9 +14,9 @@ struct Curvature {
 template <class T>
 struct HeatWorkspace {
   HeatVectors<T> v;
-  StartSums<T>* start;   // [capacity] of each slot
-  StepSums<T>* step;     // [capacity]
-  Curvature* curvature;  // [capacity]
+  StartSums<T>* start;   // [max_blocks] of each slot
+  StepSums<T>* step;     // [max_blocks]
+  Curvature* curvature;  // [max_blocks]
   HeatScene* scene;      // [scenes]
   int64_t size;          // in bytes
 };
@@ -25,7 +25,7 @@ inline namespace TORCH_MPM_ISA {
 
 template <class T, int D>
 HeatWorkspace<T> lay_out_heat(const HeatArguments<T, D>& a, char* start) {
-  const int64_t slots = a.topology.capacity, nodes = slots * kBlockNodes<D>;
+  const int64_t slots = a.topology.max_blocks, nodes = slots * kBlockNodes<D>;
   HeatWorkspace<T> w;
   int64_t used = 0;
   const auto take = [&](int64_t bytes) {

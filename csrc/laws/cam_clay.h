@@ -1,6 +1,6 @@
 #pragma once
 
-#include "laws/principal_law.h"
+#include "laws/elasticity.h"
 
 namespace mpm {
 inline namespace TORCH_MPM_ISA {
@@ -13,13 +13,15 @@ inline namespace TORCH_MPM_ISA {
 //   A = S with A = M cos ϑ q_trial, S = sin ϑ ((6 − D) μ w + M² a cos ϑ).
 struct CamClay : HenckyElasticity {
   static constexpr const char* name = "cam_clay";
-  static constexpr int parameters = 6;  // μ, λ [Pa], M, p₀ [Pa], Θ, β
-  static constexpr int history = 1;     // ln J_p of the plastic volume ratio
+  static constexpr std::array parameters = {not_negative("mu", "Pa"),       real("lam", "Pa"),
+                                            positive("critical_slope", ""), positive("consolidation", "Pa"),
+                                            positive("hardening", ""),      Quantity{"cohesion", "", 0, 1}};
+  static constexpr std::array history = {real("log_plastic_volume", "")};
   static constexpr bool plastic = true;
 
   template <class T, int D>
   MPM_HD static Flow<T> flow(Vector<T, D>& h, const T p[], T q[]) {
-    const Deviator<T, D> s = deviator(h);
+    const Deviator<T, D> s = measure_deviator(h);
     const T bulk = p[1] + T(2.0 / D) * p[0];
     const auto stiff = bulk > T(0);
     const T inverse = T(1) / select(stiff, bulk, T(1));
@@ -141,6 +143,8 @@ struct CamClay : HenckyElasticity {
     return {select(moves, root - rest / lift<T>(select(moves, slope, V(1))), root), active <= V(0)};
   }
 };
+
+MPM_REGISTER_LAW(CamClay)
 
 }  // namespace TORCH_MPM_ISA
 }  // namespace mpm

@@ -14,13 +14,8 @@ void polar(const PolarArguments<T, D>& a) {
   for_groups<T>(a.count, [&](const auto& at) { polar_at(a, at); });
 }
 
-#define INSTANTIATE(T, D)                       \
-  template void svd(const SVDArguments<T, D>&); \
-  template void polar(const PolarArguments<T, D>&);
-INSTANTIATE(float, 2)
-INSTANTIATE(float, 3)
-INSTANTIATE(double, 2)
-INSTANTIATE(double, 3)
+MPM_INSTANTIATE(svd, SVDArguments)
+MPM_INSTANTIATE(polar, PolarArguments)
 
 }  // namespace TORCH_MPM_ISA
 }  // namespace mpm::cpu

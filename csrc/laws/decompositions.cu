@@ -37,12 +37,7 @@ void polar(const PolarArguments<T, D>& a, Stream stream) {
   for_matrices(polar_kernel<T, D>, a, stream);
 }
 
-#define INSTANTIATE(T, D)                               \
-  template void svd(const SVDArguments<T, D>&, Stream); \
-  template void polar(const PolarArguments<T, D>&, Stream);
-INSTANTIATE(float, 2)
-INSTANTIATE(float, 3)
-INSTANTIATE(double, 2)
-INSTANTIATE(double, 3)
+MPM_INSTANTIATE(svd, SVDArguments)
+MPM_INSTANTIATE(polar, PolarArguments)
 
 }  // namespace mpm::cuda

@@ -1,4 +1,10 @@
-#include "laws/backend_kernels.h"
+#include "laws/decompositions.h"
+#include "common/backend.h"
+
+#define MPM_DECOMPOSITION_KERNELS(PLAIN, ORDERED, SIZE) \
+  PLAIN(svd, SVDArguments)                              \
+  PLAIN(polar, PolarArguments)
+MPM_BACKEND_KERNELS(MPM_DECOMPOSITION_KERNELS)
 
 // Singular value and polar decompositions of small matrices.
 namespace mpm {

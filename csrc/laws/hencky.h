@@ -1,6 +1,6 @@
 #pragma once
 
-#include "laws/principal_law.h"
+#include "laws/elasticity.h"
 
 namespace mpm {
 inline namespace TORCH_MPM_ISA {
@@ -8,10 +8,10 @@ inline namespace TORCH_MPM_ISA {
 // Elastic solid with the quadratic energy of the Hencky strains: St. Venant-Kirchhoff's in logarithmic strain.
 struct HenckyElastic : HenckyElasticity {
   static constexpr const char* name = "hencky";
-  static constexpr int parameters = 2;  // μ, λ [Pa]
-  static constexpr int history = 0;
-  static constexpr bool plastic = false;
+  static constexpr std::array parameters = {not_negative("mu", "Pa"), real("lam", "Pa")};
 };
+
+MPM_REGISTER_LAW(HenckyElastic)
 
 }  // namespace TORCH_MPM_ISA
 }  // namespace mpm

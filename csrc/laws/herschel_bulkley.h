@@ -1,6 +1,6 @@
 #pragma once
 
-#include "laws/principal_law.h"
+#include "laws/elasticity.h"
 
 namespace mpm {
 inline namespace TORCH_MPM_ISA {
@@ -12,13 +12,14 @@ inline namespace TORCH_MPM_ISA {
 // infinite step it is perfect plasticity, without a step it is elasticity.
 struct HerschelBulkley : HenckyElasticity {
   static constexpr const char* name = "herschel_bulkley";
-  static constexpr int parameters = 6;  // μ, λ, τ_y [Pa], η [Pa sⁿ], n, Δt [s]
-  static constexpr int history = 0;
+  static constexpr std::array parameters = {not_negative("mu", "Pa"),           real("lam", "Pa"),
+                                            not_negative("yield_stress", "Pa"), not_negative("consistency", "Pa s^n"),
+                                            positive("exponent", ""),           time_step};
   static constexpr bool plastic = true;
 
   template <class T, int D>
   MPM_HD static Flow<T> flow(Vector<T, D>& h, const T p[], T[]) {
-    const Deviator<T, D> s = deviator(h);
+    const Deviator<T, D> s = measure_deviator(h);
     const T stress = T(1.4142135623730951) * p[0] * s.norm, excess = stress - p[2];
     const auto plastic = (excess > T(0)) & (stress > T(0)) & (p[0] * p[5] > T(0));
     const auto viscous = plastic & (p[3] > T(0));
@@ -73,6 +74,8 @@ struct HerschelBulkley : HenckyElasticity {
     return {exponential(root - f.value / f.slope), active <= V(0)};
   }
 };
+
+MPM_REGISTER_LAW(HerschelBulkley)
 
 }  // namespace TORCH_MPM_ISA
 }  // namespace mpm

@@ -1,17 +1,16 @@
 #pragma once
 
-#include "laws/strain.h"
+#include "laws/invariants.h"
 
 namespace mpm {
 inline namespace TORCH_MPM_ISA {
 
 // Compressible neo-Hookean solid (Bonet and Wood 2008, section 6.4.3):
 //   ψ = μ/2 (tr F Fᵀ − D) − μ ln J + λ/2 (ln J)²,   τ = μ (F Fᵀ − I) + λ ln J I.
-struct NeoHookean {
+struct NeoHookean : InvariantLaw {
   static constexpr const char* name = "neo_hookean";
-  static constexpr bool shear = true;     // its state is F, not J alone
-  static constexpr bool viscous = false;  // its stress depends on the velocity gradient
-  static constexpr int parameters = 2;    // μ, λ [Pa]
+  static constexpr Deformation field = Deformation::gradient;
+  static constexpr std::array parameters = {not_negative("mu", "Pa"), real("lam", "Pa")};
 
   template <class T, int D>
   MPM_HD static T energy(const Strain<T, D>& s, const T p[]) {
@@ -52,6 +51,8 @@ struct NeoHookean {
     return largest_eigenvalue_bound(s.e + identity<T, D>());
   }
 };
+
+MPM_REGISTER_LAW(NeoHookean)
 
 }  // namespace TORCH_MPM_ISA
 }  // namespace mpm

@@ -1,11 +1,10 @@
 #pragma once
 
 #include "common/dual.h"
-#include "laws/principal.h"
+#include "laws/hencky_strain.h"
+#include "laws/law.h"
 
-// A law in principal strains is one header with a struct of:
-//   name, parameters, history   how many parameters and history variables it has;
-//   plastic                     whether it moves strains; without it F is never written;
+// Laws in principal strains: one decomposition of F, the map of the Hencky strains h, stress. Such a law gives
 //   flow(h, p, q)               the return map: moves the Hencky strains h and the history q of a particle with the
 //                               parameters p, and tells what happened (plastic laws only);
 //   map_quotient(...)           (Hᵢ − Hⱼ)/(hᵢ − hⱼ) of trial strains h and mapped strains H (plastic laws only);
@@ -13,10 +12,25 @@
 //                               rest volume: plastic work less what hardening stores (plastic laws only);
 //   energy, stress, tangent     ψ(h), τᵢ = ∂ψ/∂hᵢ and ∂τ/∂h, at given history;
 //   stress_quotient(a, b)       (τᵢ − τⱼ)/(hᵢ − hⱼ) at hᵢ = a, hⱼ = b.
-// All of it is written for any scalar: its derivatives come from dual numbers. The map must be continuous; on a
-// boundary between branches its derivative is that of the branch which the comparison takes.
+// Its derivatives, of first order, come from dual numbers. The map must be continuous; on a boundary between branches
+// its derivative is that of the branch which the comparison takes.
 namespace mpm {
 inline namespace TORCH_MPM_ISA {
+
+template <class Law>
+struct PrincipalKernels;
+
+struct PrincipalLaw {
+  static constexpr Deformation field = Deformation::gradient;
+  static constexpr bool viscous = false, plastic = false, twice_differentiable = false, optional_history = false,
+                        in_2d = true;
+  static constexpr auto history = no_history;
+  static constexpr auto options = no_options;
+  static constexpr bool packs_fill_cache_lines = false;
+  static constexpr int gpu_threads = 128, gpu_update_blocks = 1, gpu_backward_blocks = 1;
+  template <class Law>
+  using Kernels = PrincipalKernels<Law>;
+};
 
 // What a return map did: the factor of the deviator (radial maps), and where it is not the identity.
 template <class T>
@@ -39,7 +53,7 @@ struct Deviator {
 };
 
 template <class T, int D>
-MPM_HD Deviator<T, D> deviator(const Vector<T, D>& h) {
+MPM_HD Deviator<T, D> measure_deviator(const Vector<T, D>& h) {
   Deviator<T, D> r;
   r.mean = T(1.0 / D) * sum(h);
   T square = T(0);
@@ -56,14 +70,6 @@ MPM_HD Vector<T, D> scale_deviator(const Vector<T, D>& h, const T& trial_mean, c
   Vector<T, D> r;
   MPM_UNROLL for (int i = 0; i < D; i++)
     r[i] = mean + kappa * (h[i] - trial_mean);
-  return r;
-}
-
-template <class Mask, class T, int D>
-MPM_HD Vector<T, D> select(const Mask& mask, const Vector<T, D>& a, const Vector<T, D>& b) {
-  Vector<T, D> r;
-  MPM_UNROLL for (int i = 0; i < D; i++)
-    r[i] = select(mask, a[i], b[i]);
   return r;
 }
 
@@ -114,47 +120,282 @@ MPM_HD T plastic_work(const Vector<T, D>& tau, const Vector<T, D>& h, const Vect
   return r;
 }
 
-// Small strain elasticity in Hencky strains: ψ = μ Σ hᵢ² + λ/2 (tr h)² (Hencky 1928). The parameters begin with μ, λ
-// [Pa]. Convex maps of the deviator and the trace alone are radial.
-struct HenckyElasticity {
-  template <class T, int D>
-  MPM_HD static T energy(const Vector<T, D>& h, const T p[], const T[]) {
-    const T trace = sum(h);
-    return p[0] * dot(h, h) + T(0.5) * p[1] * trace * trace;
-  }
+// Parameters and history of a particle.
+template <class Law, class T>
+struct PrincipalData {
+  T parameters[kParameters<Law>];
+  T history[kHistoryLength<Law>];
+};
 
-  template <class T, int D>
-  MPM_HD static Vector<T, D> stress(const Vector<T, D>& h, const T p[], const T[]) {
-    const T dilation = p[1] * sum(h);
-    Vector<T, D> r;
+template <class Law, class At, class T, int D>
+MPM_HD PrincipalData<Law, typename At::Value> load_data(const At& at, const LawArguments<T, D>& a) {
+  PrincipalData<Law, typename At::Value> r;
+  MPM_UNROLL for (int k = 0; k < kParameters<Law>; k++)
+    r.parameters[k] = load_parameter(at, a, k);
+  MPM_UNROLL for (int k = 0; k < kHistory<Law>; k++)
+    r.history[k] = load_scalar_or_zero(at, a.history[k]);
+  return r;
+}
+
+// What a law makes of a trial strain.
+template <class Law, class T, int D>
+struct Response {
+  Vector<T, D> h, tau;
+  T history[kHistoryLength<Law>];
+  T dissipated;
+  Flow<T> flow;
+};
+
+template <class Law, class T, int D>
+MPM_HD Response<Law, T, D> respond(const Vector<T, D>& h, const PrincipalData<Law, T>& data) {
+  Response<Law, T, D> r;
+  r.h = h;
+  MPM_UNROLL for (int k = 0; k < kHistory<Law>; k++)
+    r.history[k] = data.history[k];
+  r.dissipated = T(0);
+  r.flow = {T(1), T(0) < T(0), T(0) == T(0)};
+  if constexpr (Law::plastic) {
+    r.flow = Law::flow(r.h, data.parameters, r.history);
+    r.dissipated = select(r.flow.plastic, Law::lost(h, r.h, data.parameters, data.history, r.history), T(0));
+  }
+  r.tau = Law::stress(r.h, data.parameters, r.history);
+  return r;
+}
+
+// 0, or NaN where a result is not finite.
+template <class Law, class T, int D>
+MPM_HD T poison(const Response<Law, T, D>& r) {
+  T nan = T(0);
+  MPM_UNROLL for (int i = 0; i < D; i++)
+    nan = nan + (r.tau[i] - r.tau[i]) + (r.h[i] - r.h[i]);
+  MPM_UNROLL for (int k = 0; k < kHistory<Law>; k++)
+    nan = nan + (r.history[k] - r.history[k]);
+  return nan;
+}
+
+// Length of the plastic increment of the strains; its derivative is zero where there is none.
+template <class T, int D>
+MPM_HD T increment_norm(const Vector<T, D>& h, const Vector<T, D>& H) {
+  T square = T(0);
+  MPM_UNROLL for (int i = 0; i < D; i++)
+    square = square + (h[i] - H[i]) * (h[i] - H[i]);
+  const auto moved = square > T(0);
+  return select(moved, sqrt(select(moved, square, T(1))), T(0));
+}
+
+// Adjoints of what a law takes, from forward derivatives: `derivative(h, data)` gives the sum of the adjoints of the
+// results times their derivatives in the direction that its arguments carry. It is asked once per strain, parameter and
+// history variable that is wanted; `parameter(k, value)` and `history(k, value)` take theirs, those of the strains are
+// returned.
+template <class Law, class V, int D, class F, class StoreParameter, class StoreHistory>
+MPM_HD Vector<V, D> differentiate(const Vector<V, D>& h, const PrincipalData<Law, V>& data, bool parameters,
+                                  bool history, const StoreParameter& store_parameter,
+                                  const StoreHistory& store_history, const F& derivative) {
+  Vector<V, D> r = zero_vector<V, D>();
+  const int first_history = D + (parameters ? kParameters<Law> : 0);
+  const int count = first_history + (history ? kHistory<Law> : 0);
+#ifdef __CUDACC__
+#pragma unroll 1
+#endif
+  for (int direction = 0; direction < count; direction++) {
+    const auto seed = [&](const V& value, int index) { return Dual<V>(value, V(index == direction ? 1.0 : 0.0)); };
+    Vector<Dual<V>, D> strain;
+    PrincipalData<Law, Dual<V>> given;
     MPM_UNROLL for (int i = 0; i < D; i++)
-      r[i] = T(2) * p[0] * h[i] + dilation;
-    return r;
-  }
-
-  template <class T, int D>
-  MPM_HD static PrincipalTangent<T, D> tangent(const Vector<T, D>&, const T p[], const T[]) {
-    PrincipalTangent<T, D> r;
+      strain[i] = seed(h[i], i);
+    MPM_UNROLL for (int k = 0; k < kParameters<Law>; k++)
+      given.parameters[k] = seed(data.parameters[k], parameters ? D + k : -1);
+    MPM_UNROLL for (int k = 0; k < kHistory<Law>; k++)
+      given.history[k] = seed(data.history[k], first_history + k);
+    const V value = derivative(strain, given);
     MPM_UNROLL for (int i = 0; i < D; i++)
-      r.shear[i] = T(2) * p[0];
-    r.dilation = p[1];
-    return r;
+      r[i] = i == direction ? value : r[i];
+    MPM_UNROLL for (int k = 0; k < kHistory<Law>; k++)
+      if (direction == first_history + k) store_history(k, value);
+    if (direction >= D && direction < first_history) store_parameter(direction - D, value);
+  }
+  return r;
+}
+
+// Adjoints of the results of a law.
+template <class Law, class V, int D>
+struct PrincipalGrads {
+  Matrix<V, D> F, stress;
+  V history[kHistoryLength<Law>];
+  V dissipated, multiplier;
+  bool has_multiplier;
+};
+
+// The adjoint of F through the map and its stress; those of parameters and history go to where `differentiate` says.
+template <class Law, class V, int D, class StoreParameter, class StoreHistory>
+MPM_HD Matrix<V, D> map_adjoint(const HenckyStrain<V, D>& s, const PrincipalData<Law, V>& data,
+                                const Response<Law, V, D>& r, const PrincipalGrads<Law, V, D>& grad, bool parameters,
+                                bool history, const StoreParameter& store_parameter,
+                                const StoreHistory& store_history) {
+  const Matrix<V, D> right = right_axes(s);
+  const Matrix<V, D> M = transpose(s.U) * grad.F * right, N = transpose(s.U) * symmetric_part(grad.stress) * s.U;
+  Vector<V, D> grad_h;
+  MPM_UNROLL for (int i = 0; i < D; i++)
+    grad_h[i] = M[i][i] * exponential(r.h[i]);
+  const Vector<V, D> diagonal =
+      differentiate<Law>(s.h, data, parameters, history, store_parameter, store_history,
+                         [&](const Vector<Dual<V>, D>& h, const PrincipalData<Law, Dual<V>>& given) {
+                           const Response<Law, Dual<V>, D> moved = respond<Law>(h, given);
+                           V value = grad.dissipated * moved.dissipated.derivative;
+                           if (grad.has_multiplier)
+                             value = value + grad.multiplier * increment_norm(h, moved.h).derivative;
+                           MPM_UNROLL for (int i = 0; i < D; i++)
+                             value = value + grad_h[i] * moved.h[i].derivative + N[i][i] * moved.tau[i].derivative;
+                           MPM_UNROLL for (int k = 0; k < kHistory<Law>; k++)
+                             value = value + grad.history[k] * moved.history[k].derivative;
+                           return value;
+                         });
+  const Matrix<V, D> principal =
+      principal_adjoint(s, r.h, diagonal, symmetric_part(M), skew_part(M), N, [&](int i, int j) {
+        Quotients<V> q = {V(1), Law::stress_quotient(r.h[i], r.h[j], data.parameters, r.history)};
+        if constexpr (Law::plastic) q.map = Law::map_quotient(r.flow, s.h, r.h, i, j);
+        return q;
+      });
+  return s.U * principal * transpose(right);
+}
+
+// The adjoint of F through the energy, likewise.
+template <class Law, class V, int D, class StoreParameter, class StoreHistory>
+MPM_HD Matrix<V, D> energy_adjoint(const HenckyStrain<V, D>& s, const PrincipalData<Law, V>& data, const V& grad,
+                                   bool parameters, bool history, const StoreParameter& store_parameter,
+                                   const StoreHistory& store_history) {
+  Vector<V, D> diagonal =
+      differentiate<Law>(s.h, data, parameters, history, store_parameter, store_history,
+                         [&](const Vector<Dual<V>, D>& h, const PrincipalData<Law, Dual<V>>& given) {
+                           return grad * Law::energy(h, given.parameters, given.history).derivative;
+                         });
+  MPM_UNROLL for (int i = 0; i < D; i++)
+    diagonal[i] = diagonal[i] * s.scale * s.inverse[i];
+  return compose(s.U, diagonal, right_axes(s));
+}
+
+// Upper bound of |dτ/dF : G F| + max |τᵢ| ≥ the second variation of ψ, over velocity gradients G with |G| = 1. In
+// principal axes the diagonal of dτ is the tangent; off the diagonal, with d = hᵢ − hⱼ, its size is at most
+// |τᵢ − τⱼ|/sinh d √cosh 2d ≤ |τᵢ − τⱼ|/d √(1 + 2d²).
+template <class Law, class T, int D>
+MPM_HD T stiffness_bound(const Response<Law, T, D>& r, const PrincipalData<Law, T>& data) {
+  const PrincipalTangent<T, D> tangent = Law::tangent(r.h, data.parameters, r.history);
+  T diagonal = T(0), shear = T(0), largest = T(0);
+  MPM_UNROLL for (int i = 0; i < D; i++) {
+    diagonal = max(diagonal, abs(tangent.shear[i]));
+    largest = max(largest, abs(r.tau[i]));
+    MPM_UNROLL for (int j = i + 1; j < D; j++) {
+      const T d = r.h[i] - r.h[j];
+      const T quotient = abs(Law::stress_quotient(r.h[i], r.h[j], data.parameters, r.history));
+      shear = max(shear, quotient * sqrt(T(1) + T(2) * d * d));
+    }
+  }
+  return max(diagonal + T(D) * abs(tangent.dilation), shear) + largest;
+}
+
+// Upper bound of the second variation over G = a nᵀ with unit a and n, that is of ρ₀ c² of plane waves. With the
+// tangent A it is Σ (Aᵢᵢ − τᵢ) aᵢ²nᵢ² + Σ_{i≠j} mᵢⱼ aᵢ²nⱼ² + 2 Σ_{i<j} cᵢⱼ aᵢaⱼnᵢnⱼ, where with d = hᵢ − hⱼ and the
+// quotient t of the stresses m = t e^(−d)/(2 sinhc d) and c = Aᵢⱼ + t d coth d/2 − (τᵢ + τⱼ)/2, and 2 aᵢaⱼnᵢnⱼ ≤ aᵢ²nⱼ²
+// + aⱼ²nᵢ²: a weighted mean of the coefficients, exact at rest.
+template <class Law, class T, int D>
+MPM_HD T wave_modulus_bound(const Response<Law, T, D>& r, const PrincipalData<Law, T>& data) {
+  const PrincipalTangent<T, D> tangent = Law::tangent(r.h, data.parameters, r.history);
+  T largest = T(0);
+  MPM_UNROLL for (int i = 0; i < D; i++) {
+    largest = max(largest, tangent.shear[i] + tangent.dilation - r.tau[i]);
+    MPM_UNROLL for (int j = i + 1; j < D; j++) {
+      const T d = abs(r.h[i] - r.h[j]), root = sqrt(T(1) + d * d);  // ≥ d coth d ≥ 1
+      const T half = T(0.5) * Law::stress_quotient(r.h[i], r.h[j], data.parameters, r.history);
+      const T mean = tangent.dilation - T(0.5) * (r.tau[i] + r.tau[j]);
+      const T mixed = max(abs(mean + half), abs(mean + half * root));
+      largest = max(largest, max(half, T(0)) * (root + d) + mixed);
+    }
+  }
+  return largest;
+}
+
+// The bodies of the kernels.
+template <class Law>
+struct PrincipalKernels {
+  template <class At, class T, int D>
+  MPM_HD static void update(const LawUpdateArguments<T, D>& a, const At& at) {
+    using V = typename At::Value;
+    const Matrix<V, D> F = load_matrix<D>(at, a.law.state);
+    const HenckyStrain<V, D> s = hencky_strain(F);
+    const PrincipalData<Law, V> data = load_data<Law>(at, a.law);
+    const Response<Law, V, D> r = respond<Law>(s.h, data);
+    const auto valid = s.valid & (poison(r) == V(0));
+    const auto moved = valid & r.flow.plastic;
+    MPM_UNROLL for (int k = 0; k < kHistory<Law>; k++)
+      store_entry(at, a.history, k, select(moved, r.history[k], data.history[k]));
+    if (a.dissipated.pointer) at.store(a.dissipated.pointer, a.dissipated.stride[0], select(moved, r.dissipated, V(0)));
+    if (a.multiplier.pointer)
+      at.store(a.multiplier.pointer, a.multiplier.stride[0], select(moved, increment_norm(s.h, r.h), V(0)));
+    if (a.branch) {
+      const V branch =
+          select(r.flow.plastic, V(kPlasticFlow), V(kElasticFlow)) + select(r.flow.converged, V(0), V(kNotConverged));
+      at.store_integer(a.branch, select(valid, branch, V(kInvalidFlow)));
+    }
+    store_matrix<D>(at, a.stress, select(valid, compose(s.U, r.tau, s.U), zero_matrix<V, D>()));
+    if constexpr (Law::plastic) {
+      Vector<V, D> factor;
+      MPM_UNROLL for (int i = 0; i < D; i++)
+        factor[i] = exponential(r.h[i] - s.h[i]) / s.scale;
+      store_matrix<D>(at, a.state, select(moved, compose(s.U, factor, s.B), F));
+    }
   }
 
-  template <class T>
-  MPM_HD static T stress_quotient(const T&, const T&, const T p[], const T[]) {
-    return T(2) * p[0];
+  template <class At, class T, int D>
+  MPM_HD static void update_backward(const LawBackwardArguments<T, D>& a, const At& at) {
+    using V = typename At::Value;
+    const HenckyStrain<V, D> s = hencky_strain(load_matrix<D>(at, a.law.state));
+    const PrincipalData<Law, V> data = load_data<Law>(at, a.law);
+    const Response<Law, V, D> r = respond<Law>(s.h, data);
+    const auto valid = s.valid & (poison(r) == V(0));
+    PrincipalGrads<Law, V, D> grad;
+    grad.F = load_matrix_or_zero<D>(at, a.grad_state);
+    grad.stress = load_matrix_or_zero<D>(at, a.grad_stress);
+    grad.dissipated = load_scalar_or_zero(at, a.grad_dissipated);
+    grad.multiplier = load_scalar_or_zero(at, a.grad_multiplier);
+    grad.has_multiplier = a.grad_multiplier.pointer != nullptr;
+    MPM_UNROLL for (int k = 0; k < kHistory<Law>; k++)
+      grad.history[k] = a.grad_history.pointer ? load_entry(at, a.grad_history, k) : V(0);
+    const Matrix<V, D> by_F = map_adjoint<Law>(
+        s, data, r, grad, a.parameters.pointer != nullptr, a.history.pointer != nullptr,
+        [&](int k, const V& value) { store_entry(at, a.parameters, k, select(valid, value, V(0))); },
+        [&](int k, const V& value) { store_entry(at, a.history, k, select(valid, value, grad.history[k])); });
+    if (a.state.pointer) store_matrix<D>(at, a.state, select(valid, by_F, grad.F));
   }
 
-  template <class T, int D>
-  MPM_HD static T map_quotient(const Flow<T>& flow, const Vector<T, D>&, const Vector<T, D>&, int, int) {
-    return flow.kappa;
+  template <class At, class T, int D>
+  MPM_HD static void scalar(const LawScalarArguments<T, D>& a, const At& at) {
+    using V = typename At::Value;
+    const HenckyStrain<V, D> s = hencky_strain(load_matrix<D>(at, a.law.state));
+    const PrincipalData<Law, V> data = load_data<Law>(at, a.law);
+    V value;
+    if (a.which == LawScalar::energy) {
+      value = Law::energy(s.h, data.parameters, data.history);
+    } else {
+      const Response<Law, V, D> r = respond<Law>(s.h, data);
+      value = (a.which == LawScalar::stiffness ? stiffness_bound(r, data) : wave_modulus_bound(r, data)) + poison(r);
+    }
+    const V invalid = V(a.which == LawScalar::energy ? INFINITY : 0.0);
+    at.store(a.value.pointer, a.value.stride[0], select(s.valid & (value - value == V(0)), value, invalid));
   }
 
-  // Without a stored energy of hardening all plastic work is heat.
-  template <class T, int D>
-  MPM_HD static T lost(const Vector<T, D>& h, const Vector<T, D>& H, const T p[], const T[], const T q[]) {
-    return max(plastic_work(stress(H, p, q), h, H), T(0));
+  template <class At, class T, int D>
+  MPM_HD static void energy_backward(const LawEnergyBackwardArguments<T, D>& a, const At& at) {
+    using V = typename At::Value;
+    const HenckyStrain<V, D> s = hencky_strain(load_matrix<D>(at, a.law.state));
+    const V grad = at.load(a.grad_energy.pointer, a.grad_energy.stride[0]);
+    const PrincipalData<Law, V> data = load_data<Law>(at, a.law);
+    const V energy = Law::energy(s.h, data.parameters, data.history);
+    const auto valid = s.valid & (energy - energy == V(0));
+    const Matrix<V, D> by_F = energy_adjoint<Law>(
+        s, data, grad, a.parameters.pointer != nullptr, a.history.pointer != nullptr,
+        [&](int k, const V& value) { store_entry(at, a.parameters, k, select(valid, value, V(0))); },
+        [&](int k, const V& value) { store_entry(at, a.history, k, select(valid, value, V(0))); });
+    if (a.state.pointer) store_matrix<D>(at, a.state, select(valid, by_F, zero_matrix<V, D>()));
   }
 };
 

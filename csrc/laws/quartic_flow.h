@@ -3,7 +3,7 @@
 #include "laws/quartic_yield.h"
 
 // The exact flow rule of the quartic energies in 3-D (supplement, equations 25 to 27): h + δγ dev ∂y/∂τ = h_trial. In
-// the units of materials/quartic_yield.h, with the trial deviator n of unit length and x = |p|/|dev h_trial|,
+// the units of laws/quartic_yield.h, with the trial deviator n of unit length and x = |p|/|dev h_trial|,
 //   x s + b d = n,   y(s) = 0,   d = dev q(s),   b ≥ 0.
 //
 // dev(h³) = (3p² + |s|²/2) s + 3p dev(s²) lies on the side of triaxial compression of s, so that s lies between the

@@ -16,7 +16,7 @@ struct MappedStrain {
   Vector<T, D> h;          // after the map
   Vector<T, D> direction;  // its unit deviator
   T p, radius, kappa;      // mean strain; |dev h|/|p|; the factor of the deviator if radial
-  T x, b;                  // of the exact flow, see materials/quartic_flow.h
+  T x, b;                  // of the exact flow, see laws/quartic_flow.h
   T steps;                 // evaluations of the yield function by the root finding
   MaskOf<T> cone, apex, converged;
 };

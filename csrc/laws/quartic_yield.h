@@ -1,6 +1,6 @@
 #pragma once
 
-#include "laws/quartic.h"
+#include "laws/quartic_energy.h"
 
 // The Drucker-Prager yield function in Hencky strains of a fixed mean strain p < 0, and its root along a ray.
 //

@@ -1,6 +1,6 @@
 #pragma once
 
-#include "laws/fixed_corotated.h"
+#include "laws/elasticity.h"
 
 namespace mpm {
 inline namespace TORCH_MPM_ISA {
@@ -9,8 +9,10 @@ inline namespace TORCH_MPM_ISA {
 // whose moduli grow with plastic compaction, μ e^(ξ (1 − J_p)).
 struct Snow : FixedCorotatedElasticity {
   static constexpr const char* name = "snow";
-  static constexpr int parameters = 5;  // μ, λ [Pa] of fresh snow, θ_c, θ_s, ξ
-  static constexpr int history = 1;     // ln J_p of the plastic volume ratio
+  static constexpr std::array parameters = {not_negative("mu", "Pa"), real("lam", "Pa"),
+                                            Quantity{"critical_compression", "", 0, 1, true, false},
+                                            not_negative("critical_stretch", ""), not_negative("hardening", "")};
+  static constexpr std::array history = {real("log_plastic_volume", "")};
   static constexpr bool plastic = true;
 
   template <class T, int D>
@@ -72,6 +74,8 @@ struct Snow : FixedCorotatedElasticity {
     return exponential(T(0) - p[4] * expm1(q[0]));
   }
 };
+
+MPM_REGISTER_LAW(Snow)
 
 }  // namespace TORCH_MPM_ISA
 }  // namespace mpm

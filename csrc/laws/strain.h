@@ -17,16 +17,6 @@ struct Strain {
   Matrix<T, D> rate;  // symmetric part of the velocity gradient C [1/s], of laws with viscosity
 };
 
-template <class T, int D>
-MPM_HD Matrix<T, D> symmetric_part(const Matrix<T, D>& a) {
-  return T(0.5) * (a + transpose(a));
-}
-
-template <class T, int D>
-MPM_HD Matrix<T, D> skew_part(const Matrix<T, D>& a) {
-  return T(0.5) * (a - transpose(a));
-}
-
 // det(I + H) − 1 from the principal invariants of H.
 template <class T>
 MPM_HD T determinant_minus_1(const Matrix<T, 2>& H) {

@@ -1,6 +1,6 @@
 #pragma once
 
-#include "laws/principal_law.h"
+#include "laws/elasticity.h"
 
 namespace mpm {
 inline namespace TORCH_MPM_ISA {
@@ -10,13 +10,14 @@ inline namespace TORCH_MPM_ISA {
 // In 2-D the same bound on the in-plane deviator is the shear strength σ_y/√3, as in fully plastic plane strain.
 struct VonMises : HenckyElasticity {
   static constexpr const char* name = "von_mises";
-  static constexpr int parameters = 4;  // μ, λ, σ_y, H [Pa]
-  static constexpr int history = 1;     // ε̄, equivalent plastic strain
+  static constexpr std::array parameters = {not_negative("mu", "Pa"), real("lam", "Pa"),
+                                            not_negative("yield_stress", "Pa"), not_negative("hardening", "Pa")};
+  static constexpr std::array history = {real("plastic_strain", "")};
   static constexpr bool plastic = true;
 
   template <class T, int D>
   MPM_HD static Flow<T> flow(Vector<T, D>& h, const T p[], T q[]) {
-    const Deviator<T, D> s = deviator(h);
+    const Deviator<T, D> s = measure_deviator(h);
     const T shear = T(2) * p[0], hardening = T(2.0 / 3) * p[3];
     const T radius = T(0.81649658092772603) * max(p[2] + p[3] * q[0], T(0));
     const auto plastic = shear * s.norm > radius;
@@ -32,9 +33,11 @@ struct VonMises : HenckyElasticity {
   // σ_y Δε̄: of the plastic work (σ_y + H ε̄) Δε̄ hardening stores ½ H ε̄² (Simo and Hughes 1998, section 3.2).
   template <class T, int D>
   MPM_HD static T lost(const Vector<T, D>& h, const Vector<T, D>& H, const T p[], const T[], const T[]) {
-    return T(0.81649658092772603) * max(p[2], T(0)) * max(deviator(h).norm - deviator(H).norm, T(0));
+    return T(0.81649658092772603) * max(p[2], T(0)) * max(measure_deviator(h).norm - measure_deviator(H).norm, T(0));
   }
 };
+
+MPM_REGISTER_LAW(VonMises)
 
 }  // namespace TORCH_MPM_ISA
 }  // namespace mpm

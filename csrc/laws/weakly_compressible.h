@@ -1,17 +1,16 @@
 #pragma once
 
-#include "laws/strain.h"
+#include "laws/invariants.h"
 
 namespace mpm {
 inline namespace TORCH_MPM_ISA {
 
 // Weakly compressible fluid with the Tait-Murnaghan pressure p = K/γ (J^−γ − 1) (Monaghan 1994), so τ = −J p I.
 // For γ = 1 that is τ = K (J − 1) I.
-struct WeaklyCompressible {
+struct WeaklyCompressible : InvariantLaw {
   static constexpr const char* name = "weakly_compressible";
-  static constexpr bool shear = false;
-  static constexpr bool viscous = false;
-  static constexpr int parameters = 2;  // K [Pa], γ
+  static constexpr Deformation field = Deformation::volume_ratio;
+  static constexpr std::array parameters = {not_negative("bulk_modulus", "Pa"), positive("gamma", "")};
 
   template <class T, int D>
   MPM_HD static T energy(const Strain<T, D>& s, const T p[]) {
@@ -48,6 +47,24 @@ struct WeaklyCompressible {
     return expm1((T(0) - p[1]) * s.log_J);
   }
 };
+
+MPM_REGISTER_LAW(WeaklyCompressible)
+
+// The same with Newtonian viscosity: Cauchy stress 2 η dev(sym C), so τ += 2 J η dev(sym C).
+struct ViscousFluid : WeaklyCompressible {
+  static constexpr const char* name = "viscous_fluid";
+  static constexpr bool viscous = true;
+  static constexpr std::array parameters = {WeaklyCompressible::parameters[0], WeaklyCompressible::parameters[1],
+                                            not_negative("viscosity", "Pa s")};
+
+  template <class T, int D>
+  MPM_HD static Matrix<T, D> stress(const Strain<T, D>& s, const T p[]) {
+    const Matrix<T, D> deviator = s.rate - (trace(s.rate) * T(1.0 / D)) * identity<T, D>();
+    return WeaklyCompressible::stress(s, p) + (T(2) * s.J * p[2]) * deviator;
+  }
+};
+
+MPM_REGISTER_LAW(ViscousFluid)
 
 }  // namespace TORCH_MPM_ISA
 }  // namespace mpm

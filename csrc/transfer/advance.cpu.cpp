@@ -21,7 +21,7 @@ template <bool Contiguous, class T, int D>
 void advance_range(AdvanceArguments<T, D> a, int64_t begin, int64_t end) {
   if (Contiguous) assume_contiguous(a.x, a.velocity, a.affine, a.F, a.J, a.x_next, a.F_next, a.J_next);
 #pragma GCC ivdep
-  for (int64_t p = begin; p < end; p++) advance_particle(a, p);
+  for (int64_t p = begin; p < end; p++) advance_particle(a, One<T>{p});
 }
 
 template <bool Contiguous, class T, int D>
@@ -30,7 +30,7 @@ void advance_backward_range(AdvanceBackwardArguments<T, D> a, int64_t begin, int
     assume_contiguous(a.forward.x, a.forward.velocity, a.forward.affine, a.forward.F, a.forward.J, a.grad_x, a.grad_F,
                       a.grad_J, a.velocity, a.affine, a.F, a.J, a.dt);
 #pragma GCC ivdep
-  for (int64_t p = begin; p < end; p++) advance_particle_backward(a, p);
+  for (int64_t p = begin; p < end; p++) advance_particle_backward(a, One<T>{p});
 }
 
 }  // namespace

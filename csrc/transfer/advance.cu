@@ -11,13 +11,13 @@ constexpr int kThreads = 256;
 template <class T, int D>
 __global__ void __launch_bounds__(kThreads) advance_kernel(const AdvanceArguments<T, D> a) {
   const int64_t p = int64_t(blockIdx.x) * kThreads + threadIdx.x;
-  if (p < a.particles) advance_particle(a, p);
+  if (p < a.particles) advance_particle(a, One<T>{p});
 }
 
 template <class T, int D>
 __global__ void __launch_bounds__(kThreads) advance_backward_kernel(const AdvanceBackwardArguments<T, D> a) {
   const int64_t p = int64_t(blockIdx.x) * kThreads + threadIdx.x;
-  if (p < a.forward.particles) advance_particle_backward(a, p);
+  if (p < a.forward.particles) advance_particle_backward(a, One<T>{p});
 }
 
 unsigned blocks_for(int64_t particles) { return unsigned((particles + kThreads - 1) / kThreads); }

@@ -1,8 +1,6 @@
 #pragma once
 
-#include <cstdint>
-
-#include "common/matrix.h"
+#include "common/lanes.h"
 #include "transfer/arguments.h"
 
 // The end of a symplectic Euler step, with the velocity and the affine field just gathered:
@@ -56,69 +54,31 @@ MPM_HD T advance_volume_ratio(const T& J, const Matrix<T, D>& C, const T& dt) {
   return J + dt * trace(C) * J;
 }
 
-template <class T>
-MPM_HD T load_scalar(const Field<const T>& f, int64_t p) {
-  return f.pointer[p * f.stride[0]];
-}
-
-template <class T, int D>
-MPM_HD Vector<T, D> load_vector(const Field<const T>& f, int64_t p) {
-  Vector<T, D> r;
-  MPM_UNROLL for (int i = 0; i < D; i++)
-    r[i] = f.pointer[p * f.stride[0] + i * f.stride[1]];
-  return r;
-}
-
-template <class T, int D>
-MPM_HD Matrix<T, D> load_matrix(const Field<const T>& f, int64_t p) {
-  Matrix<T, D> r;
-  MPM_UNROLL for (int i = 0; i < D; i++) MPM_UNROLL
-    for (int j = 0; j < D; j++) r[i][j] = f.pointer[p * f.stride[0] + i * f.stride[1] + j * f.stride[2]];
-  return r;
-}
-
-template <class T>
-MPM_HD void store_scalar(const Field<T>& f, int64_t p, T a) {
-  f.pointer[p * f.stride[0]] = a;
-}
-
-template <class T, int D>
-MPM_HD void store_vector(const Field<T>& f, int64_t p, const Vector<T, D>& a) {
-  MPM_UNROLL for (int i = 0; i < D; i++)
-    f.pointer[p * f.stride[0] + i * f.stride[1]] = a[i];
-}
-
-template <class T, int D>
-MPM_HD void store_matrix(const Field<T>& f, int64_t p, const Matrix<T, D>& a) {
-  MPM_UNROLL for (int i = 0; i < D; i++) MPM_UNROLL
-    for (int j = 0; j < D; j++) f.pointer[p * f.stride[0] + i * f.stride[1] + j * f.stride[2]] = a[i][j];
-}
-
 // Time step of a particle. A scene id out of range takes that of scene 0: such a particle is not transferred anyway.
 template <class T, int D>
-MPM_HD T particle_dt(const AdvanceArguments<T, D>& a, int64_t p) {
+MPM_HD T particle_dt(const AdvanceArguments<T, D>& a, const One<T>& at) {
   if (!a.scene_dt.pointer) return T(a.dt);
-  const int64_t s = a.scene ? a.scene[p * a.scene_stride] : 0;
+  const int64_t s = a.scene ? a.scene[at.p * a.scene_stride] : 0;
   return T(a.dt) * a.scene_dt.pointer[(s >= 0 && s < a.scenes ? s : 0) * a.scene_dt.stride[0]];
 }
 
 template <class T, int D>
-MPM_HD void advance_particle(const AdvanceArguments<T, D>& a, int64_t p) {
-  const T dt = particle_dt(a, p);
-  store_vector(a.x_next, p, advance_position(load_vector<T, D>(a.x, p), load_vector<T, D>(a.velocity, p), dt));
+MPM_HD void advance_particle(const AdvanceArguments<T, D>& a, const One<T>& at) {
+  const T dt = particle_dt(a, at);
+  store_vector<D>(at, a.x_next, advance_position(load_vector<D>(at, a.x), load_vector<D>(at, a.velocity), dt));
   if (!a.affine.pointer) return;
-  const Matrix<T, D> C = load_matrix<T, D>(a.affine, p);
-  if (a.F.pointer) store_matrix(a.F_next, p, advance_deformation(load_matrix<T, D>(a.F, p), C, dt));
-  if (a.J.pointer) store_scalar(a.J_next, p, advance_volume_ratio(load_scalar(a.J, p), C, dt));
+  const Matrix<T, D> C = load_matrix<D>(at, a.affine);
+  if (a.F.pointer) store_matrix<D>(at, a.F_next, advance_deformation(load_matrix<D>(at, a.F), C, dt));
+  if (a.J.pointer) store_scalar(at, a.J_next, advance_volume_ratio(load_scalar(at, a.J), C, dt));
 }
 
 // The velocity and the affine field that moved a particle. Those of a particle whose position is not finite are NaN and
 // count as zero: it stays as it is, and must not spoil the gradients of others.
 template <class T, int D>
-MPM_HD void load_motion(const AdvanceArguments<T, D>& a, int64_t p, Vector<T, D>& v, Matrix<T, D>& C) {
-  const bool moves = is_finite<D>(load_vector<T, D>(a.x, p).e);
-  v = load_vector<T, D>(a.velocity, p);
-  C = a.affine.pointer ? load_matrix<T, D>(a.affine, p) : zero_matrix<T, D>();
+MPM_HD void load_motion(const AdvanceArguments<T, D>& a, const One<T>& at, Vector<T, D>& v, Matrix<T, D>& C) {
+  const bool moves = is_finite<D>(load_vector<D>(at, a.x).e);
+  v = load_vector<D>(at, a.velocity);
+  C = a.affine.pointer ? load_matrix<D>(at, a.affine) : zero_matrix<T, D>();
   MPM_UNROLL for (int i = 0; i < D; i++) {
     v[i] = moves ? v[i] : T(0);
     MPM_UNROLL for (int j = 0; j < D; j++)
@@ -127,29 +87,29 @@ MPM_HD void load_motion(const AdvanceArguments<T, D>& a, int64_t p, Vector<T, D>
 }
 
 template <class T, int D>
-MPM_HD void advance_particle_backward(const AdvanceBackwardArguments<T, D>& a, int64_t p) {
-  const T dt = particle_dt(a.forward, p);
-  const Vector<T, D> grad_x = load_vector<T, D>(a.grad_x, p);
+MPM_HD void advance_particle_backward(const AdvanceBackwardArguments<T, D>& a, const One<T>& at) {
+  const T dt = particle_dt(a.forward, at);
+  const Vector<T, D> grad_x = load_vector<D>(at, a.grad_x);
   Vector<T, D> v;
   Matrix<T, D> C, grad_affine = zero_matrix<T, D>();
-  load_motion(a.forward, p, v, C);
-  if (a.velocity.pointer) store_vector(a.velocity, p, dt * grad_x);
+  load_motion(a.forward, at, v, C);
+  if (a.velocity.pointer) store_vector<D>(at, a.velocity, dt * grad_x);
   T grad_dt = dot(v, grad_x);
   if (a.forward.F.pointer) {
-    const Matrix<T, D> F = load_matrix<T, D>(a.forward.F, p), G = load_matrix<T, D>(a.grad_F, p);
-    if (a.F.pointer) store_matrix(a.F, p, G + dt * (transpose(C) * G));
+    const Matrix<T, D> F = load_matrix<D>(at, a.forward.F), G = load_matrix<D>(at, a.grad_F);
+    if (a.F.pointer) store_matrix<D>(at, a.F, G + dt * (transpose(C) * G));
     grad_affine = dt * (G * transpose(F));
     grad_dt = grad_dt + contract(C * F, G);
   }
   if (a.forward.J.pointer) {
-    const T J = load_scalar(a.forward.J, p), g = load_scalar(a.grad_J, p), rate = trace(C);
-    if (a.J.pointer) store_scalar(a.J, p, g + dt * rate * g);
+    const T J = load_scalar(at, a.forward.J), g = load_scalar(at, a.grad_J), rate = trace(C);
+    if (a.J.pointer) store_scalar(at, a.J, g + dt * rate * g);
     MPM_UNROLL for (int i = 0; i < D; i++)
       grad_affine[i][i] = grad_affine[i][i] + dt * J * g;
     grad_dt = grad_dt + rate * J * g;
   }
-  if (a.affine.pointer) store_matrix(a.affine, p, grad_affine);
-  if (a.dt.pointer) store_scalar(a.dt, p, grad_dt);
+  if (a.affine.pointer) store_matrix<D>(at, a.affine, grad_affine);
+  if (a.dt.pointer) store_scalar(at, a.dt, grad_dt);
 }
 
 }  // namespace TORCH_MPM_ISA

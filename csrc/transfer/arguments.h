@@ -1,44 +1,11 @@
 #pragma once
 
-#include <cstdint>
-
-#include "grid/geometry.h"
+#include "common/fields.h"
+#include "grid/topology.h"
 #include "transfer/momentum.h"
 
-// Arguments of the transfer kernels: plain pointers and strides, shared by the CPU and the CUDA launchers. Only the
-// launchers know threads and streams; only the files *.op.cpp know tensors.
+// Arguments of the transfer kernels.
 namespace mpm {
-
-// A tensor [P], [P, I] or [P, I, J] of any strides (in elements); a null pointer is an absent field.
-template <class T>
-struct Field {
-  T* pointer = nullptr;
-  int64_t stride[3] = {0, 0, 0};
-};
-
-// Node values [capacity * 4^D, channels] with unit channel stride.
-template <class T>
-struct NodeField {
-  T* pointer = nullptr;
-  int64_t stride = 0;  // elements from node to node
-  int channels = 0;
-};
-
-// The active blocks of one activation (see csrc/grid/activate.op.cpp for the meaning of each tensor).
-template <class T, int D>
-struct Topology {
-  Geometry<T, D> geometry;
-  int scenes = 1;
-  int capacity = 0;
-  int64_t particles = 0;
-  const int* table = nullptr;  // [scenes * blocks_per_scene] slot of a block, -1 where inactive
-  const int* block = nullptr;  // [capacity] table index of a slot, -1 where unused
-  const int* offsets =
-      nullptr;  // [capacity + 1] particles whose base node lies in the slot's block: index[offsets[s], offsets[s+1])
-  const int* index = nullptr;     // [P] particles grouped by block; those outside the grid come last
-  const int* schedule = nullptr;  // device-specific order of work
-  int64_t schedule_size = 0;
-};
 
 template <class T, int D>
 struct P2GArguments {
@@ -90,32 +57,6 @@ struct PositionGradientArguments {
   NodeField<const T> nodes;  // g
   double moment_scale = 1;
   Field<T> position_gradient;  // [P, D], zero for particles outside
-};
-
-// Entries of the schedule tensor: room for the work items of both backends, with the number of particles of each cell,
-// and for an entry for each particle (the fake kernel in torch_mpm/ops/activation.py has the same formula).
-template <int D>
-int64_t schedule_size(int64_t capacity, int64_t particles) {
-  return 16 + (8 + kBlockNodes<D> / 2) * (capacity + particles / 128) + particles;
-}
-
-template <class T, int D>
-struct ActivateArguments {
-  Geometry<T, D> geometry;
-  int scenes = 1;
-  int capacity = 0;
-  int64_t particles = 0;
-  bool deterministic = false;
-  Field<const T> x;
-  const int* scene = nullptr;  // [P] or null for one scene
-  int64_t scene_stride = 0;
-  const int64_t* id = nullptr;  // [P] or null
-  int64_t id_stride = 0;
-  const int* previous_status = nullptr;  // [1 + scenes, 8] or null
-  int *table = nullptr, *block = nullptr, *offsets = nullptr, *index = nullptr, *schedule = nullptr, *status = nullptr;
-  int64_t schedule_size = 0;
-  void* workspace = nullptr;  // bytes asked for by activate_workspace()
-  int64_t workspace_size = 0;
 };
 
 }  // namespace mpm

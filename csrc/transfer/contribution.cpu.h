@@ -1,7 +1,8 @@
 #pragma once
 
 #include "cpu/chunk.h"
-#include "transfer/momentum.h"
+#include "cpu/tile.h"
+#include "transfer/arguments.h"
 
 // What particles give to their nodes, in the form that the sums of scatter.h and gather.h take:
 //   node k += N_k (value + slope · k) + gradient · ∇N_k,
@@ -10,12 +11,12 @@ namespace mpm::cpu {
 inline namespace TORCH_MPM_ISA {
 
 template <class P, int D>
-struct Gift {
+struct Contribution {
   P value[kChannels], slope[D][kChannels], gradient[D][kChannels];
 };
 
 template <class T, int D, class G>
-MPM_HD Matrix<Pack<T, G::kSize>, D> load_matrix(const Field<const T>& f, const G& g) {
+MPM_HD Matrix<Pack<T, G::kSize>, D> load_matrix_or_zero(const Field<const T>& f, const G& g) {
   using P = Pack<T, G::kSize>;
   if (!f.pointer) return zero_matrix<P, D>();
   Matrix<P, D> r;
@@ -30,8 +31,8 @@ MPM_HD ParticleMomentum<Pack<T, G::kSize>, D> load_momentum(const P2GArguments<T
   using P = Pack<T, G::kSize>;
   ParticleMomentum<P, D> p;
   p.mass = load(a.mass, g);
-  p.affine = load_matrix<T, D>(a.affine, g);
-  p.stress = load_matrix<T, D>(a.stress, g);
+  p.affine = load_matrix_or_zero<T, D>(a.affine, g);
+  p.stress = load_matrix_or_zero<T, D>(a.stress, g);
   p.volume = a.stress.pointer ? load(a.volume, g) : P(0);
   p.dt = P(T(a.dt) * (a.scene_dt.pointer ? a.scene_dt.pointer[scene * a.scene_dt.stride[0]] : T(1)));
   MPM_UNROLL for (int i = 0; i < D; i++)
@@ -40,41 +41,43 @@ MPM_HD ParticleMomentum<Pack<T, G::kSize>, D> load_momentum(const P2GArguments<T
 }
 
 template <int Order, bool Slope, class T, class P, int D>
-MPM_HD Gift<P, D> gift_of_momentum(const P2GArguments<T, D>& a, const ParticleMomentum<P, D>& p, const P f[D]) {
+MPM_HD Contribution<P, D> momentum_contribution(const P2GArguments<T, D>& a, const ParticleMomentum<P, D>& p,
+                                                const P f[D]) {
   const Geometry<T, D>& geometry = a.topology.geometry;
   const NodeMomentum<P, D> n =
       to_nodes<Order>(p, a.form, a.affine.pointer, a.stress.pointer, P(geometry.dx), P(geometry.inverse_dx));
-  Gift<P, D> gift;
+  Contribution<P, D> contribution;
   MPM_UNROLL for (int c = 0; c < kChannels; c++) {
     const bool momentum = c >= 1 && c <= D;
     const int i = momentum ? c - 1 : 0;
-    gift.value[c] = c == 0 ? n.mass : momentum ? n.momentum[i] : P(0);
+    contribution.value[c] = c == 0 ? n.mass : momentum ? n.momentum[i] : P(0);
     MPM_UNROLL for (int d = 0; d < D; d++) {
-      gift.slope[d][c] = momentum ? n.moment[i][d] : P(0);
-      gift.gradient[d][c] = momentum ? n.gradient[i][d] : P(0);
-      if (Slope && momentum) gift.value[c] = gift.value[c] - n.moment[i][d] * f[d];
+      contribution.slope[d][c] = momentum ? n.moment[i][d] : P(0);
+      contribution.gradient[d][c] = momentum ? n.gradient[i][d] : P(0);
+      if (Slope && momentum) contribution.value[c] = contribution.value[c] - n.moment[i][d] * f[d];
     }
   }
-  return gift;
+  return contribution;
 }
 
 // Channels first, ..., first + count - 1 of the features of ScatterArguments or PositionGradientArguments.
 template <bool Slope, bool Gradient, class T, int D, class Arguments, int N>
-MPM_HD Gift<Pack<T, N>, D> gift_of_features(const Arguments& a, int first, int count, const GroupOf<N>& g,
-                                            const Pack<T, N> f[D]) {
+MPM_HD Contribution<Pack<T, N>, D> feature_contribution(const Arguments& a, int first, int count, const GroupOf<N>& g,
+                                                        const Pack<T, N> f[D]) {
   using P = Pack<T, N>;
   const Geometry<T, D>& geometry = a.topology.geometry;
   const P scale(a.moment_scale * double(geometry.dx)), inverse_dx(geometry.inverse_dx);
-  Gift<P, D> gift;
+  Contribution<P, D> contribution;
   MPM_UNROLL for (int c = 0; c < kChannels; c++) {
-    gift.value[c] = c < count ? load(a.value, g, first + c) : P(0);
+    contribution.value[c] = c < count ? load(a.value, g, first + c) : P(0);
     MPM_UNROLL for (int d = 0; d < D; d++) {
-      gift.slope[d][c] = Slope && a.moment.pointer && c < count ? scale * load(a.moment, g, first + c, d) : P(0);
-      gift.gradient[d][c] = Gradient && c < count ? inverse_dx * load(a.gradient, g, first + c, d) : P(0);
-      if (Slope) gift.value[c] = gift.value[c] - gift.slope[d][c] * f[d];
+      contribution.slope[d][c] =
+          Slope && a.moment.pointer && c < count ? scale * load(a.moment, g, first + c, d) : P(0);
+      contribution.gradient[d][c] = Gradient && c < count ? inverse_dx * load(a.gradient, g, first + c, d) : P(0);
+      if (Slope) contribution.value[c] = contribution.value[c] - contribution.slope[d][c] * f[d];
     }
   }
-  return gift;
+  return contribution;
 }
 
 }  // namespace TORCH_MPM_ISA

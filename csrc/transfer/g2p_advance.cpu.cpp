@@ -8,12 +8,12 @@ inline namespace TORCH_MPM_ISA {
 // The fields of the particles, by rows.
 template <class T, int D>
 struct AdvancedRows {
-  Rows<const T, D> x;
-  Rows<const T, D * D> F;
-  Rows<const T, 1> J;
-  Rows<T, D> v, x_next;
-  Rows<T, D * D> affine, F_next;
-  Rows<T, 1> J_next;
+  FieldRows<const T, D> x;
+  FieldRows<const T, D * D> F;
+  FieldRows<const T, 1> J;
+  FieldRows<T, D> v, x_next;
+  FieldRows<T, D * D> affine, F_next;
+  FieldRows<T, 1> J_next;
 
   explicit AdvancedRows(const G2PAdvanceArguments<T, D>& a)
       : x(a.gather.x),
@@ -95,7 +95,7 @@ void g2p_advance(const G2PAdvanceArguments<T, D>& a) {
   else
     g2p_advance_with<Order, false>(a);
   for_outside(a.gather.topology, [&](int64_t p) {
-    const Vector<T, D> x = load_vector<T, D>(a.gather.x, p);
+    const Vector<T, D> x = load_vector<D>(One<T>{p}, a.gather.x);
     const T rest = is_finite<D>(x.e) ? T(0) : T(a.gather.lost);
     for (int i = 0; i < D; i++) {
       at(a.gather.value, p, i) = rest;

@@ -9,7 +9,7 @@ struct AdvanceGather {
   using T = T_;
   static constexpr int Order = Order_, D = D_, K = D;
   static constexpr int resident = Gradient ? 4 : 5;
-  using Shape = SumShape<Order, T, D, K, 0, true, Gradient, Form::none>;
+  using Shape = SumShape<Order, T, D, K, 0, true, Gradient, SlopeForm::none>;
   struct Loaded {
     mpm::Vector<T, D> x;
     Matrix<T, D> F;

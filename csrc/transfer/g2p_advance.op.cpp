@@ -1,5 +1,6 @@
 #include <cmath>
 
+#include "grid/topology.op.h"
 #include "transfer/kernels.h"
 
 // G2P and the end of the step in one op.
@@ -9,7 +10,10 @@ namespace {
 std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> g2p_advance(const Tensor& x, const Tensor& velocity,
                                                                const OptionalTensor& F, const OptionalTensor& J,
                                                                const OptionalTensor& scene_dt, double dt, bool affine,
-                                                               int64_t stress_form, MPM_TOPOLOGY_PARAMETERS) {
+                                                               int64_t stress_form, const std::vector<Tensor>& topology,
+                                                               const std::vector<double>& lattice,
+                                                               const std::vector<int64_t>& layout) {
+  const PackedTopology blocks(topology, lattice, layout);
   check_positions(x);
   const int64_t P = x.size(0), D_ = x.size(1);
   const auto output = [&](bool wanted, const Shape& shape) {
@@ -18,13 +22,13 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> g2p_advance(const Tensor& x, 
   Tensor x_next = output(true, {P, D_}), v = output(true, {P, D_}), C = output(affine, {P, D_, D_}),
          F_next = output(has(F), {P, D_, D_}), J_next = output(has(J), {P});
   const DeviceScope device(x);
-  dispatch(x, order, [&]<class T, int D>() {
+  dispatch(x, [&]<class T, int D>() {
     G2PAdvanceArguments<T, D> a;
-    a.gather.topology = topology<T, D>(x, MPM_TOPOLOGY_ARGUMENTS);
+    a.gather.topology = blocks.unpack<T, D>(x);
     a.gather.x = input<T>(x, "x", x, {P, D});
-    check_shape(velocity, "velocity", {node_count<D>(block), D});
-    a.gather.nodes = node_input<T>(velocity, "velocity", x, node_count<D>(block));
-    a.gather.moment_scale = inverse_inertia(order) / (dx * dx);
+    check_shape(velocity, "velocity", {blocks.node_count<D>(), D});
+    a.gather.nodes = node_input<T>(velocity, "velocity", x, blocks.node_count<D>());
+    a.gather.moment_scale = blocks.inverse_inertia();
     a.gather.lost = NAN;
     a.gather.value = field<T>(v);
     if (affine) a.gather.moment = field<T>(C);
@@ -36,7 +40,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> g2p_advance(const Tensor& x, 
     a.x_next = field<T>(x_next);
     if (has(F)) a.F_next = field<T>(F_next);
     if (has(J)) a.J_next = field<T>(J_next);
-    backend::g2p_advance(order, a, device.stream());
+    backend::g2p_advance(blocks.order(), a, device.stream());
   });
   return {x_next, v, C, F_next, J_next};
 }

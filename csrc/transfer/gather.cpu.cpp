@@ -39,7 +39,7 @@ void gather(const GatherArguments<T, D>& a) {
       gather_with<Order, false, false>(a, first, count);
   }
   for_outside(a.topology, [&](int64_t p) {
-    const T nothing = is_finite<D>(load_vector<T, D>(a.x, p).e) ? T(0) : T(a.lost);
+    const T nothing = is_finite<D>(load_vector<D>(One<T>{p}, a.x).e) ? T(0) : T(a.lost);
     for (int c = 0; c < a.nodes.channels; c++) {
       if (a.value.pointer) at(a.value, p, c) = nothing;
       for (int d = 0; d < D; d++) {

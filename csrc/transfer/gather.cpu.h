@@ -130,9 +130,9 @@ MPM_HD void gather_channels(const Lanes<T> f[D], const T* tile, Sums<Lanes<T>, D
   }
 }
 
-// The form u = Σ_i N_i g_i · (value + slope k_i) + Σ_d ∂_d N_i g_i · gradient_d of node values g and a particle's gift,
-// over the axes from `Axis` on; its derivatives `du` by position along these; and psi_d = Σ_i N_i g_i · gradient_d of
-// the axes before with its derivatives, from which the sums over the axes before make more of u.
+// The form u = Σ_i N_i g_i · (value + slope k_i) + Σ_d ∂_d N_i g_i · gradient_d of node values g and a particle's
+// contribution, over the axes from `Axis` on; its derivatives `du` by position along these; and psi_d = Σ_i N_i g_i ·
+// gradient_d of the axes before with its derivatives, from which the sums over the axes before make more of u.
 template <class P, int D, int Axis>
 struct Form {
   static constexpr int N = D - Axis;
@@ -141,24 +141,25 @@ struct Form {
 
 // The form at one node, of the first `Channels` channels.
 template <int Channels, bool Gradient, class T, int D>
-MPM_HD Form<Lanes<T>, D, D> form_at_node(const Gift<Lanes<T>, D>& gift, const T* node) {
+MPM_HD Form<Lanes<T>, D, D> form_at_node(const Contribution<Lanes<T>, D>& contribution, const T* node) {
   using P = Lanes<T>;
   Form<P, D, D> r;
-  r.u = P(node[0]) * gift.value[0];
+  r.u = P(node[0]) * contribution.value[0];
   MPM_UNROLL for (int c = 1; c < Channels; c++)
-    r.u += P(node[c]) * gift.value[c];
+    r.u += P(node[c]) * contribution.value[c];
   if (!Gradient) return r;
   MPM_UNROLL for (int d = 0; d < D; d++) {
-    r.psi[d] = P(node[0]) * gift.gradient[d][0];
+    r.psi[d] = P(node[0]) * contribution.gradient[d][0];
     MPM_UNROLL for (int c = 1; c < Channels; c++)
-      r.psi[d] += P(node[c]) * gift.gradient[d][c];
+      r.psi[d] += P(node[c]) * contribution.gradient[d][c];
   }
   return r;
 }
 
-// `gift` holds the gift at the first node of the axis.
+// `contribution` holds the contribution at the first node of the axis.
 template <int Order, int Axis, int Channels, bool Slope, bool Gradient, class T, int D>
-MPM_HD Form<Lanes<T>, D, Axis> form(const Weights<Order, Lanes<T>, D>& s, Gift<Lanes<T>, D> gift, const T* tile) {
+MPM_HD Form<Lanes<T>, D, Axis> form(const Weights<Order, Lanes<T>, D>& s, Contribution<Lanes<T>, D> contribution,
+                                    const T* tile) {
   using P = Lanes<T>;
   constexpr int N = D - Axis, stride = Tile<Order, T, D>::stride(Axis);
   Form<P, D, Axis> r;
@@ -173,11 +174,11 @@ MPM_HD Form<Lanes<T>, D, Axis> form(const Weights<Order, Lanes<T>, D>& s, Gift<L
   const auto add = [&](int k) {
     Form<P, D, Axis + 1> line;
     if constexpr (Axis + 1 < D)
-      line = form<Order, Axis + 1, Channels, Slope, Gradient>(s, gift, tile + k * stride);
+      line = form<Order, Axis + 1, Channels, Slope, Gradient>(s, contribution, tile + k * stride);
     else
-      line = form_at_node<Channels, Gradient>(gift, tile + k * stride);
+      line = form_at_node<Channels, Gradient>(contribution, tile + k * stride);
     if (Slope) MPM_UNROLL
-      for (int c = 0; c < Channels; c++) gift.value[c] += gift.slope[Axis][c];
+      for (int c = 0; c < Channels; c++) contribution.value[c] += contribution.slope[Axis][c];
     const P &w = s.w[Axis][k], &dw = s.dw[Axis][k];
     r.u += w * line.u;
     r.du[0] += dw * line.u;
@@ -207,14 +208,14 @@ MPM_HD Form<Lanes<T>, D, Axis> form(const Weights<Order, Lanes<T>, D>& s, Gift<L
 // Adds the derivative of the form by the position, in cells; needs first derivatives of the weights, second with
 // Gradient.
 template <int Order, int Channels, bool Slope, bool Gradient, class T, int D>
-MPM_HD void add_position_gradient(const Weights<Order, Lanes<T>, D>& s, const Gift<Lanes<T>, D>& gift, const T* tile,
-                                  const Lanes<T> gathered[kChannels], Lanes<T> sum[D]) {
-  const Form<Lanes<T>, D, 0> r = form<Order, 0, Channels, Slope, Gradient>(s, gift, tile);
+MPM_HD void add_position_gradient(const Weights<Order, Lanes<T>, D>& s, const Contribution<Lanes<T>, D>& contribution,
+                                  const T* tile, const Lanes<T> gathered[kChannels], Lanes<T> sum[D]) {
+  const Form<Lanes<T>, D, 0> r = form<Order, 0, Channels, Slope, Gradient>(s, contribution, tile);
   MPM_UNROLL for (int a = 0; a < D; a++) {
     sum[a] += r.du[a];
     if (Slope)  // the distance of every node changes with the particle
         MPM_UNROLL
-      for (int c = 0; c < Channels; c++) sum[a] = sum[a] - gathered[c] * gift.slope[a][c];
+      for (int c = 0; c < Channels; c++) sum[a] = sum[a] - gathered[c] * contribution.slope[a][c];
   }
 }
 
@@ -224,12 +225,12 @@ template <int Order, class T, int D, class F>
 void gather_groups(const Topology<T, D>& t, const Field<const T>& x, const NodeField<const T>& nodes, int first,
                    int count, const F& visit) {
   const ScheduleIn s = schedule_of(t);
-  parallel_homes<D>(s, t.particles, [&](const auto& next) {
+  parallel_base_blocks<D>(s, t.particles, [&](const auto& next) {
     Tile<Order, T, D> tile;
     for (int64_t h; (h = next()) >= 0;) {
-      const Home<T, D> home(t, s.home_slot[h]);
-      tile.load_from(nodes, home, first, count);
-      for (int64_t c = s.home_chunk[h]; c < s.home_chunk[h + 1]; c++) {
+      const BaseBlock<T, D> base_block(t, s.base_slot[h]);
+      tile.load_from(nodes, base_block, first, count);
+      for (int64_t c = s.base_chunk[h]; c < s.base_chunk[h + 1]; c++) {
         const Chunk chunk(t, s, c);
         for (int cell = 0, i = 0; cell < kBlockNodes<D>; cell++) {
           int base[D];
@@ -238,8 +239,8 @@ void gather_groups(const Topology<T, D>& t, const Field<const T>& x, const NodeF
             const Group g = group_by_cell(chunk, i, end);
             Lanes<T> f[D];
             MPM_UNROLL for (int a = 0; a < D; a++)
-              f[a] = distance_in_cells(t.geometry, a, load(x, g, a), Lanes<T>(T(home.corner[a] + base[a])));
-            visit(g, f, home.scene, tile.value + tile.at(base));
+              f[a] = distance_in_cells(t.geometry, a, load(x, g, a), Lanes<T>(T(base_block.corner[a] + base[a])));
+            visit(g, f, base_block.scene, tile.value + tile.at(base));
           }
           i = chunk.cell_end[cell];
         }

@@ -17,7 +17,7 @@ struct FieldGather {
   using T = T_;
   static constexpr int Order = Order_, D = D_, K = K_;
   static constexpr int resident = Gradient ? 5 : 6;
-  using Shape = SumShape<Order, T, D, K, 0, true, Gradient, Form::none>;
+  using Shape = SumShape<Order, T, D, K, 0, true, Gradient, SlopeForm::none>;
   struct Loaded {};
   using Result = Sums<Shape>;
   Topology<T, D> topology;
@@ -84,7 +84,7 @@ struct FieldPositionGradient {
   using T = T_;
   static constexpr int Order = Order_, D = D_, K = K_;
   static constexpr int resident = Gradient ? 3 : 5;
-  using Shape = SumShape<Order, T, D, K, K, false, false, Form::affine>;
+  using Shape = SumShape<Order, T, D, K, K, false, false, SlopeForm::affine>;
   struct Loaded {
     T value[K], moment[K][D], gradient[K][D];  // moments and gradients per cell
   };
@@ -158,7 +158,7 @@ struct MomentumAdjoint {
   using T = T_;
   static constexpr int Order = Order_, D = D_, K = 1 + D;
   static constexpr int resident = Gradient ? 2 : 4;
-  using Shape = SumShape<Order, T, D, K, 1, true, Gradient, Form::affine>;
+  using Shape = SumShape<Order, T, D, K, 1, true, Gradient, SlopeForm::affine>;
   using Loaded = ParticleMomentum<T, D>;
   struct Result {
     mpm::Vector<T, D> x;

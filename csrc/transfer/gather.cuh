@@ -1,18 +1,14 @@
 #pragma once
 
 #include "cuda/launch.cuh"
+#include "cuda/quad.cuh"
 #include "transfer/momentum.cuh"
 
 // G2P, gather, and the two adjoints that read nodes. A thread takes a particle and sums over its support one axis at a
-// time. Particles come in one of two orders, which `activate` chooses: item by item, with the nodes of the home block
+// time. Particles come in one of two orders, which `activate` chooses: item by item, with the nodes of the base block
 // in shared memory; or, when neighbours in memory are no neighbours in space, in the order of memory, so that at least
 // the particle fields are read and written at full width.
 namespace mpm::cuda {
-
-template <class T>
-struct alignas(16) Quad {
-  T e[4];
-};
 
 // Weights of the nodes of the support, their derivatives per cell, and the distances of the nodes in cells.
 template <int Order, class T, int D>
@@ -37,14 +33,14 @@ struct Weights {
 //   moment    Σ N g r, and
 //   gradient  Σ ∇N g, both without the first `Plain` channels
 //   slope     Σ ∇N Σ_c g_c (a_c + B_c · r), B being absent (None, Constant) or not (Affine)
-enum class Form { none, constant, affine };
+enum class SlopeForm { none, constant, affine };
 
-template <int Order_, class T_, int D_, int K_, int Plain_, bool Moment_, bool Gradient_, Form Slope_>
+template <int Order_, class T_, int D_, int K_, int Plain_, bool Moment_, bool Gradient_, SlopeForm Slope_>
 struct SumShape {
   using T = T_;
   static constexpr int Order = Order_, D = D_, K = K_, Plain = Plain_;
   static constexpr bool Moment = Moment_, Gradient = Gradient_;
-  static constexpr Form Slope = Slope_;
+  static constexpr SlopeForm Slope = Slope_;
 };
 
 template <class S>
@@ -62,7 +58,7 @@ __device__ void accumulate(T& sum, T weight, T value) {
 // For each of the blocks that are left when the leading axes are decided, the row that the base node would have if the
 // nodes went on beyond the block; a node of the support is a constant distance further.
 template <int Blocks>
-struct Rows {
+struct BlockRows {
   int row[Blocks];
 };
 
@@ -76,7 +72,7 @@ bool is_vector(const NodeField<const T>& n) {
 template <bool Quads, int K, class T>
 __device__ void load_node(const NodeField<const T>& nodes, int row, int offset, T (&node)[K]) {
   if constexpr (Quads) {
-    const Quad<T> quad = *reinterpret_cast<const Quad<T>*>(nodes.pointer + int64_t(row) * 4 + offset * 4 - (K == 3));
+    const Quad<T> quad = load_quad(nodes.pointer + int64_t(row) * 4 + offset * 4 - (K == 3));
 #pragma unroll
     for (int c = 0; c < K; c++) node[c] = quad.e[K == 3 ? c + 1 : c];
   } else {
@@ -86,13 +82,13 @@ __device__ void load_node(const NodeField<const T>& nodes, int row, int offset, 
   }
 }
 
-// Nodes in global memory, in the home block and the blocks after it.
+// Nodes in global memory, in the base block and the blocks after it.
 template <class T, int K, int D, bool Quads>
 struct GridSupport {
   static constexpr int blocks = 1 << D, width = kBlockWidth;
   const NodeField<const T>& nodes;
-  int base[D];  // base node in the home block
-  Rows<blocks> rows;
+  int base[D];  // base node in the base block
+  BlockRows<blocks> rows;
 
   __device__ void set_slot(int block, int slot) {
     int row = slot * kBlockNodes<D> + node_in_block<D>(base);
@@ -112,12 +108,12 @@ struct alignas(K == 1   ? sizeof(T)
   T e[K == 3 ? 4 : K];
 };
 
-// Nodes in shared memory: those of the home block and the next Order along each axis.
+// Nodes in shared memory: those of the base block and the next Order along each axis.
 template <int Order, class T, int K>
 struct TileSupport {
   static constexpr int blocks = 1, width = kBlockWidth + Order;
   const NodeValue<T, K>* corner;  // the base node
-  Rows<1> rows;
+  BlockRows<1> rows;
 
   __device__ bool is_far(int, int) const { return false; }
   __device__ void load(int, int offset, T (&node)[K]) const {
@@ -128,24 +124,24 @@ struct TileSupport {
 };
 
 template <class S, int Axis, int Blocks, class Support, class T>
-__device__ void sum_axis(const Support& support, const Rows<Blocks>& rows, int offset,
+__device__ void sum_axis(const Support& support, const BlockRows<Blocks>& rows, int offset,
                          const Weights<S::Order, T, S::D>& w, const T (&constant)[S::K], const T (&linear)[S::K][S::D],
                          Sums<S>& out);
 
 template <class S, int Axis, int Node, int Blocks, class Support, class T>
-__device__ void sum_node(const Support& support, const Rows<Blocks>& rows, int offset,
+__device__ void sum_node(const Support& support, const BlockRows<Blocks>& rows, int offset,
                          const Weights<S::Order, T, S::D>& w, const T (&constant)[S::K], const T (&linear)[S::K][S::D],
                          Sums<S>& out) {
-  constexpr bool first = Node == 0, differentiable = S::Slope != Form::none;
+  constexpr bool first = Node == 0, differentiable = S::Slope != SlopeForm::none;
   constexpr int half = Blocks > 1 ? Blocks / 2 : 1;
   const bool far = support.is_far(Axis, Node);
-  Rows<half> side;
+  BlockRows<half> side;
 #pragma unroll
   for (int o = 0; o < half; o++) side.row[o] = far ? rows.row[Blocks - half + o] : rows.row[o];
   T below[S::K];
 #pragma unroll
   for (int c = 0; c < S::K; c++)
-    below[c] = S::Slope == Form::affine ? constant[c] + linear[c][Axis] * w.distance[Axis][Node] : constant[c];
+    below[c] = S::Slope == SlopeForm::affine ? constant[c] + linear[c][Axis] * w.distance[Axis][Node] : constant[c];
   Sums<S> in;
   sum_axis<S, Axis + 1>(support, side, offset * Support::width + Node, w, below, linear, in);
   const T n = w.weight[Axis][Node], dn = w.first[Axis][Node];
@@ -172,7 +168,7 @@ __device__ void sum_node(const Support& support, const Rows<Blocks>& rows, int o
 
 // Sums over the axes from `Axis` on.
 template <class S, int Axis, int Blocks, class Support, class T>
-__device__ void sum_axis(const Support& support, const Rows<Blocks>& rows, int offset,
+__device__ void sum_axis(const Support& support, const BlockRows<Blocks>& rows, int offset,
                          const Weights<S::Order, T, S::D>& w, const T (&constant)[S::K], const T (&linear)[S::K][S::D],
                          Sums<S>& out) {
   if constexpr (Axis == S::D) {
@@ -181,7 +177,7 @@ __device__ void sum_axis(const Support& support, const Rows<Blocks>& rows, int o
 #pragma unroll
     for (int c = 0; c < S::K; c++) {
       out.value[c] = node[c];
-      if (S::Slope != Form::none) {
+      if (S::Slope != SlopeForm::none) {
         const T part = constant[c] * node[c];
         out.potential = c == 0 ? part : out.potential + part;
       }
@@ -195,7 +191,7 @@ __device__ void sum_axis(const Support& support, const Rows<Blocks>& rows, int o
 template <class S, class Support, class T>
 __device__ void add_hessian(const Support& support, const Weights<S::Order, T, S::D>& w,
                             const T (&gradient)[S::K][S::D], T (&slope)[S::D]) {
-  using H = SumShape<S::Order, T, S::D, S::K, S::K, false, false, Form::constant>;
+  using H = SumShape<S::Order, T, S::D, S::K, S::K, false, false, SlopeForm::constant>;
 #pragma unroll
   for (int j = 0; j < S::D; j++) {
     Weights<S::Order, T, S::D> v = w;
@@ -233,12 +229,12 @@ __device__ void gather_in_memory_order(const Task& task, const Schedule<const in
   const int64_t stride = int64_t(gridDim.x) * kGatherThreads;
 #pragma unroll 1
   for (int64_t i = int64_t(blockIdx.x) * kGatherThreads + threadIdx.x; i < t.particles; i += stride) {
-    const int p = int(i), slot = schedule.home[p];
+    const int p = int(i), slot = schedule.base_slot[p];
     const Vector<T, D> x = read_vector(task.position, p);
-    const int home = slot < 0 ? -1 : t.block[slot], scene = scene_of(t, home);
+    const int base_block = slot < 0 ? -1 : t.block[slot], scene = scene_of(t, base_block);
     GridSupport<T, Task::K, D, Quads> support{task.nodes};
     T f[D];
-    if (slot < 0 || !locate_at_home<Task::Order>(t, scene, home, x, support.base, f)) {
+    if (slot < 0 || !locate_in_block<Task::Order>(t, scene, base_block, x, support.base, f)) {
       task.leave_out(p);
       continue;
     }
@@ -286,7 +282,7 @@ __device__ void gather_by_items(const Task& task, const Schedule<const int>& sch
   const int items = *schedule.item_count;
   for (int i = blockIdx.x; i < items; i += gridDim.x) {
     const int4 item = reinterpret_cast<const int4*>(schedule.items)[i];
-    const int begin = item.y, end = item.z, home = item.w, scene = scene_of(t, home);
+    const int begin = item.y, end = item.z, base_block = item.w, scene = scene_of(t, base_block);
     // Positions are loaded one round ahead and the particles' indices two, so that loads overlap.
     int k = begin + threadIdx.x;
     const auto particle_at = [&](int k) { return t.index[k < end ? k : begin]; };
@@ -304,19 +300,19 @@ __device__ void gather_by_items(const Task& task, const Schedule<const int>& sch
       const int p_after = particle_at(k + 2 * kGatherThreads);
       int base[D], corner = 0;
       T f[D];
-      const bool at_home = locate_at_home<Task::Order>(t, scene, home, x, base, f);
+      const bool in_block = locate_in_block<Task::Order>(t, scene, base_block, x, base, f);
 #pragma unroll
       for (int axis = 0; axis < D; axis++) corner = corner * width + base[axis];
       const TileSupport<Task::Order, T, K> support{tile + corner};
       const auto result = task.compute(loaded, Weights<Task::Order, T, D>(f), support);
-      task.write(p, loaded, at_home ? result : typename Task::Result{});
+      task.write(p, loaded, in_block ? result : typename Task::Result{});
       p = p_next;
       p_next = p_after;
       x = x_next;
     }
   }
   const int64_t stride = int64_t(gridDim.x) * kGatherThreads;
-  for (int64_t i = t.offsets[t.capacity] + int64_t(blockIdx.x) * kGatherThreads + threadIdx.x; i < t.particles;
+  for (int64_t i = t.offsets[t.max_blocks] + int64_t(blockIdx.x) * kGatherThreads + threadIdx.x; i < t.particles;
        i += stride)
     task.leave_out(t.index[i]);
 }
@@ -334,7 +330,7 @@ template <class Task>
 void launch_gather(const Task& task, Stream stream) {
   const int64_t particles = task.topology.particles;
   if (particles == 0) return;
-  const int64_t pieces = std::max(most_items(task.topology.capacity, particles), particles / kGatherThreads);
+  const int64_t pieces = std::max(most_items(task.topology.max_blocks, particles), particles / kGatherThreads);
   if constexpr (Task::K == 3 || Task::K == 4) {
     if (is_vector<Task::K>(task.nodes))
       return launch(gather_kernel<true, Task>, grid_size(pieces), kGatherThreads, 0, stream, task);

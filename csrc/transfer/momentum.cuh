@@ -1,6 +1,8 @@
 #pragma once
 
-#include "cuda/home.cuh"
+#include "cuda/base_block.cuh"
+#include "cuda/columns.cuh"
+#include "transfer/arguments.h"
 
 namespace mpm::cuda {
 

@@ -9,10 +9,10 @@ void p2g_with(const P2GArguments<T, D>& a) {
   scatter_channels<Order, Slope, Gradient>(
       a.topology, a.x, a.nodes, 0, 1 + D,
       [&]<int N>(const GroupOf<N>& g, const Pack<T, N> f[D], int scene) __attribute__((always_inline)) {
-        // One gift for both, so that rounding does not depend on what is consecutive.
+        // One contribution for both, so that rounding does not depend on what is consecutive.
         const bool run = direct && g.consecutive;
         const auto p = run ? load_momentum(a, RunOf<N>{g.id[0]}, scene) : load_momentum(a, g, scene);
-        return gift_of_momentum<Order, Slope>(a, p, f);
+        return momentum_contribution<Order, Slope>(a, p, f);
       });
 }
 
@@ -30,7 +30,7 @@ template <int Order, bool Slope, bool Gradient, class T, int D>
 void scatter_with(const ScatterArguments<T, D>& a, int first, int count) {
   scatter_channels<Order, Slope, Gradient>(a.topology, a.x, a.nodes, first, count,
                                            [&]<int N>(const GroupOf<N>& g, const Pack<T, N> f[D], int) {
-                                             return gift_of_features<Slope, Gradient, T, D>(a, first, count, g, f);
+                                             return feature_contribution<Slope, Gradient, T, D>(a, first, count, g, f);
                                            });
 }
 

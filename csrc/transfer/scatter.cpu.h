@@ -6,13 +6,13 @@
 #include "transfer/contribution.cpu.h"
 
 // Particles to nodes, for up to kChannels channels. The particles of a cell share their nodes, so that their
-// contributions are summed in registers before they go to the tile of the home.
+// contributions are summed in registers before they go to the tile of the base block.
 namespace mpm::cpu {
 inline namespace TORCH_MPM_ISA {
 
 // The particles of a chunk, ready to be summed.
 template <int Order, class T, int D, bool Slope, bool Gradient>
-struct Gifts {
+struct Contributions {
   static constexpr int S = Order + 1;
   static constexpr int kSlope = kChannels, kGradient = kChannels * (Slope ? 1 + D : 1);
   static constexpr int kFields = kGradient + (Gradient ? kChannels * D : 0);
@@ -23,13 +23,13 @@ struct Gifts {
   alignas(64) T derivative[D][S][Gradient ? kLine : 1];
 
   template <int N>
-  void put(int i, const Pack<T, N> f[D], const Gift<Pack<T, N>, D>& gift) {
+  void put(int i, const Pack<T, N> f[D], const Contribution<Pack<T, N>, D>& contribution) {
     Pack<T, N> field[kPadded], w[S];
     MPM_UNROLL for (int c = 0; c < kChannels; c++) {
-      field[c] = gift.value[c];
+      field[c] = contribution.value[c];
       MPM_UNROLL for (int a = 0; a < D; a++) {
-        if (Slope) field[kSlope + a * kChannels + c] = gift.slope[a][c];
-        if (Gradient) field[kGradient + a * kChannels + c] = gift.gradient[a][c];
+        if (Slope) field[kSlope + a * kChannels + c] = contribution.slope[a][c];
+        if (Gradient) field[kGradient + a * kChannels + c] = contribution.gradient[a][c];
       }
     }
     MPM_UNROLL for (int k = kFields; k < kPadded; k++)
@@ -49,12 +49,12 @@ struct Gifts {
 
 // Four nodes along the last axis, kChannels values each.
 template <class T>
-using NodeRow = Pack<T, 4 * kChannels>;
+using FourNodes = Pack<T, 4 * kChannels>;
 
 // The same kChannels values at four nodes.
 template <class T>
-MPM_HD NodeRow<T> repeat(const T* channels) {
-  NodeRow<T> r;
+MPM_HD FourNodes<T> repeat(const T* channels) {
+  FourNodes<T> r;
 #ifdef __AVX512F__
   MPM_UNROLL for (int k = 0; k < r.kParts; k++)
     if constexpr (sizeof(T) == 4)
@@ -65,15 +65,15 @@ MPM_HD NodeRow<T> repeat(const T* channels) {
   T lanes[4 * kChannels];
   MPM_UNROLL for (int k = 0; k < 4; k++)
     __builtin_memcpy(lanes + k * kChannels, channels, sizeof(T) * kChannels);
-  r = NodeRow<T>::load(lanes);
+  r = FourNodes<T>::load(lanes);
 #endif
   return r;
 }
 
 // Value k in all channels of node k, zero beyond S nodes.
 template <int S, class T>
-MPM_HD NodeRow<T> spread(const T* value, int stride) {
-  using Row = NodeRow<T>;
+MPM_HD FourNodes<T> spread(const T* value, int stride) {
+  using Row = FourNodes<T>;
   Row r(0);
   MPM_UNROLL for (int k = 0; k < S; k++) {
     Mask<T, 4 * kChannels> node;
@@ -86,9 +86,9 @@ MPM_HD NodeRow<T> spread(const T* value, int stride) {
 
 // Sums the particles order[0 .. count) of one cell into the tile at its base node.
 template <int Order, class T, int D, bool Slope, bool Gradient>
-void sum_cell(const Gifts<Order, T, D, Slope, Gradient>& g, const uint16_t* order, int count, T* tile) {
-  using Row = NodeRow<T>;
-  using G = Gifts<Order, T, D, Slope, Gradient>;
+void sum_cell(const Contributions<Order, T, D, Slope, Gradient>& g, const uint16_t* order, int count, T* tile) {
+  using Row = FourNodes<T>;
+  using G = Contributions<Order, T, D, Slope, Gradient>;
   constexpr int S = Order + 1, X = D - 3, Y = D - 2, Z = D - 1, kPlanes = D == 3 ? S : 1;
   constexpr int kTileX = D == 3 ? Tile<Order, T, D>::stride(0) : 0, kTileY = Tile<Order, T, D>::stride(Y);
   static constexpr T kOffset[4] = {0, 1, 2, 3};
@@ -146,8 +146,8 @@ struct EntriesOf {
 
 // Distance of the particles of a group from their base nodes; `particle` is the first one's number in the chunk.
 template <class T, int D, int N>
-MPM_HD void distances(const Topology<T, D>& t, const Home<T, D>& home, const Chunk& chunk, const Field<const T>& x,
-                      const GroupOf<N>& g, int particle, Pack<T, N> f[D]) {
+MPM_HD void distances(const Topology<T, D>& t, const BaseBlock<T, D>& base_block, const Chunk& chunk,
+                      const Field<const T>& x, const GroupOf<N>& g, int particle, Pack<T, N> f[D]) {
   typename EntriesOf<N>::Value entry = {};
   if (g.count == N)
     __builtin_memcpy(&entry, chunk.order + particle, sizeof(entry));
@@ -158,7 +158,7 @@ MPM_HD void distances(const Topology<T, D>& t, const Home<T, D>& home, const Chu
   const Integers cell = __builtin_convertvector(entry / kChunk, Integers);
   MPM_UNROLL for (int a = 0; a < D; a++) {
     const Integers coordinate = cell >> 2 * (D - 1 - a) & (kBlockWidth - 1);  // cell_coordinate() of each
-    const Values base = __builtin_convertvector(coordinate + home.corner[a], Values);
+    const Values base = __builtin_convertvector(coordinate + base_block.corner[a], Values);
     Pack<T, N> node;
     __builtin_memcpy(&node, &base, sizeof(node));
     f[a] = distance_in_cells(t.geometry, a, load(x, g, a), node);
@@ -172,40 +172,41 @@ MPM_HD int nth_cell(int n) {
   return n % (kBlockNodes<D> / kBlockWidth) * kBlockWidth + n / (kBlockNodes<D> / kBlockWidth);
 }
 
-// Adds channels first, ..., first + count - 1. give(group, f, scene) makes the gifts of a group.
+// Adds channels first, ..., first + count - 1. give(group, f, scene) makes the contributions of a group.
 template <int Order, bool Slope, bool Gradient, class T, int D, class F>
 void scatter_channels(const Topology<T, D>& t, const Field<const T>& x, const NodeField<T>& nodes, int first, int count,
                       const F& give) {
   const ScheduleIn s = schedule_of(t);
-  const auto fill = [&](const Home<T, D>& home, const Chunk& chunk, Gifts<Order, T, D, Slope, Gradient>& gifts,
-                        Tile<Order, T, D>& tile) {
+  const auto fill = [&](const BaseBlock<T, D>& base_block, const Chunk& chunk,
+                        Contributions<Order, T, D, Slope, Gradient>& contributions, Tile<Order, T, D>& tile) {
     constexpr int N = kWideLanes<T>;
     for (int i = 0; i < chunk.count; i += N) {
       const GroupOf<N> g = group_by_id<N>(chunk, i);
       Pack<T, N> f[D];
-      distances(t, home, chunk, x, g, i, f);
-      gifts.put(i, f, give(g, f, home.scene));
+      distances(t, base_block, chunk, x, g, i, f);
+      contributions.put(i, f, give(g, f, base_block.scene));
     }
     for (int n = 0; n < kBlockNodes<D>; n++) {
       const int cell = nth_cell<D>(n), begin = cell ? chunk.cell_end[cell - 1] : 0, end = chunk.cell_end[cell];
       if (begin == end) continue;
       int base[D];
       for (int a = 0; a < D; a++) base[a] = cell_coordinate<D>(cell, a);
-      sum_cell(gifts, chunk.order + begin, end - begin, tile.value + tile.at(base));
+      sum_cell(contributions, chunk.order + begin, end - begin, tile.value + tile.at(base));
     }
   };
   PhaseCounter<kColours<D>> colours{s.colour_start};
-  parallel_homes<D>(s, t.particles, [&](const auto& next) {
-    Gifts<Order, T, D, Slope, Gradient> gifts;
+  parallel_base_blocks<D>(s, t.particles, [&](const auto& next) {
+    Contributions<Order, T, D, Slope, Gradient> contributions;
     Tile<Order, T, D> tile;
     int colour = 0;
     for (int64_t h; (h = next()) >= 0;) {
-      const Home<T, D> home(t, s.home_slot[h]);
+      const BaseBlock<T, D> base_block(t, s.base_slot[h]);
       tile.clear();
-      for (int64_t c = s.home_chunk[h]; c < s.home_chunk[h + 1]; c++) fill(home, Chunk(t, s, c), gifts, tile);
+      for (int64_t c = s.base_chunk[h]; c < s.base_chunk[h + 1]; c++)
+        fill(base_block, Chunk(t, s, c), contributions, tile);
       while (h >= s.colour_start[colour + 1]) colour++;
       colours.wait_before(colour);
-      tile.add_to(nodes, home, first, count);
+      tile.add_to(nodes, base_block, first, count);
       colours.finish(colour);
     }
   });

@@ -1,4 +1,5 @@
 #include "cuda/launch.cuh"
+#include "cuda/quad.cuh"
 #include "transfer/momentum.cuh"
 
 // P2G and scatter. One thread block takes the particles of one item, links them by cell in shared memory, and adds up
@@ -10,11 +11,6 @@
 // channels of this kind after `Plain` ones with B = G = 0. Deterministic mode adds blocks of one colour at a time, no
 // two of which share a node, with the particles in the order of the index tensor.
 namespace mpm::cuda {
-
-template <class T>
-struct alignas(16) Quad {
-  T e[4];
-};
 
 template <class T>
 struct alignas(2 * sizeof(T)) Pair {
@@ -36,7 +32,7 @@ struct ScatterShape {
   static constexpr bool Gradient = Gradient_;
   static constexpr int channels = Plain + Linear, support = Order + 1;
   static constexpr int width =
-      kBlockWidth + Order;  // nodes of the tile along an axis, from the first of the home block
+      kBlockWidth + Order;  // nodes of the tile along an axis, from the first of the base block
 
   // Threads.
   static constexpr int cells = kBlockNodes<D>, slab = D == 2 ? support : support * support;
@@ -73,7 +69,7 @@ struct SharedParticles {
   Quad<T>* quads;  // [quads, batch]
   Pair<T>* pairs;  // [pairs, batch]
   uint16_t* next;  // [batch]
-  int* head;       // [lists + 1], the last of particles that are not at home
+  int* head;       // [lists + 1], the last of particles that are not in their base block
 
   __device__ SharedParticles(char* memory, int* head) : head(head) {
     quads = reinterpret_cast<Quad<T>*>(memory);
@@ -236,10 +232,10 @@ __device__ void link_in_order(const SharedParticles<S>& shared, int n) {
 
 // Loads the particles index[begin, begin + n) of a block into shared memory and links them by cell.
 template <class S, class Source, class T, int D>
-__device__ void load_particles(const Source& source, const Topology<T, D>& t, int block, Home<T, D>& home,
+__device__ void load_particles(const Source& source, const Topology<T, D>& t, int block, BaseBlock<T, D>& base_block,
                                const SharedParticles<S>& shared, int begin, int n, bool in_order) {
   int following = int(threadIdx.x) < n ? t.index[begin + threadIdx.x] : 0;
-  if (threadIdx.x == 32) home.template set<S::Order>(t, block);
+  if (threadIdx.x == 32) base_block.template set<S::Order>(t, block);
   for (int c = threadIdx.x; c <= S::lists; c += S::threads) shared.head[c] = SharedParticles<S>::end;
   __syncthreads();
 #pragma unroll 1
@@ -250,9 +246,9 @@ __device__ void load_particles(const Source& source, const Topology<T, D>& t, in
     T f[D];
     // Loaded and stored wherever the particle is, so that no load waits for another.
     const Vector<T, D> x = read_vector(source.position, p);
-    const auto loaded = source.load(p, home.scene);
-    const bool at_home = home.template locate<S::Order>(t.geometry, x, cell, f);
-    const int row = SharedParticles<S>::row(k), list = at_home ? k % S::slices * S::cells + cell : S::lists;
+    const auto loaded = source.load(p, base_block.scene);
+    const bool in_block = base_block.template locate<S::Order>(t.geometry, x, cell, f);
+    const int row = SharedParticles<S>::row(k), list = in_block ? k % S::slices * S::cells + cell : S::lists;
     store_particle<S, T, D>(shared, row, f, source.contribution(loaded));
     shared.next[row] = uint16_t(in_order ? list : atomicExch(&shared.head[list], row));
   }
@@ -361,16 +357,7 @@ __device__ void flush_tile(const NodeField<T>& nodes, const int slots[1 << D], c
   }
 }
 
-template <class T, int D>
-__device__ int colour_of(const Topology<T, D>& t, int home) {
-  int block[D], colour = 0;
-  block_coordinates(t.geometry, home, block);
-#pragma unroll
-  for (int i = 0; i < D; i++) colour = colour * 2 + (block[i] & 1);
-  return colour;
-}
-
-// colour < 0: every item, with atomics. Otherwise the homes of that colour, whole, without atomics.
+// colour < 0: every item, with atomics. Otherwise the base blocks of that colour, whole, without atomics.
 template <class Source>
 __global__ void __launch_bounds__(Source::Shape::threads, Source::resident)
     scatter_kernel(const Source source, int colour) {
@@ -379,7 +366,7 @@ __global__ void __launch_bounds__(Source::Shape::threads, Source::resident)
   constexpr int D = S::D;
   extern __shared__ __align__(16) char memory[];
   __shared__ int slots[1 << D], head[S::lists + 1];
-  __shared__ Home<T, D> home;
+  __shared__ BaseBlock<T, D> base_block;
   const SharedParticles<S> shared(memory, head);
   Quad<T>* const planes = reinterpret_cast<Quad<T>*>(memory);
   const Topology<T, D>& t = source.topology;
@@ -394,12 +381,12 @@ __global__ void __launch_bounds__(Source::Shape::threads, Source::resident)
     i += gridDim.x;
     if (i < count) entries = items[i];
     if (in_order) {
-      if (colour_of(t, item.block) != colour || item.begin != t.offsets[item.slot]) continue;
+      if (block_colour(t.geometry, item.block) != colour || item.begin != t.offsets[item.slot]) continue;
       item.end = t.offsets[item.slot + 1];
     }
     const int slot = threadIdx.x < 1 << D ? schedule.neighbours[(item.slot << D) + threadIdx.x] : -1;
     for (int begin = item.begin; begin < item.end; begin += S::batch) {
-      load_particles<S>(source, t, item.block, home, shared, begin, min(S::batch, item.end - begin), in_order);
+      load_particles<S>(source, t, item.block, base_block, shared, begin, min(S::batch, item.end - begin), in_order);
       if (threadIdx.x < 1 << D) slots[threadIdx.x] = slot;
       T sum[S::slab][S::channels] = {};
 #pragma unroll 1
@@ -420,7 +407,7 @@ __global__ void __launch_bounds__(Source::Shape::threads, Source::resident)
 template <class Source>
 void launch_scatter(const Source& source, bool deterministic, Stream stream) {
   using S = typename Source::Shape;
-  const int64_t items = most_items(source.topology.capacity, source.topology.particles);
+  const int64_t items = most_items(source.topology.max_blocks, source.topology.particles);
   if (items == 0) return;
   for (int colour = deterministic ? 0 : -1; colour < (deterministic ? 1 << S::D : 0); colour++)
     launch(scatter_kernel<Source>, grid_size(items), S::threads, S::shared_bytes, stream, source, colour);

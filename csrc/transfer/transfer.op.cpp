@@ -1,5 +1,6 @@
 #include <cmath>
 
+#include "grid/topology.op.h"
 #include "transfer/kernels.h"
 
 // P2G, G2P and the channel-wise scatter and gather below them.
@@ -9,36 +10,37 @@ namespace {
 template <class T, int D>
 P2GArguments<T, D> p2g_arguments(const Tensor& x, const Tensor& mass, const Tensor& v, const OptionalTensor& affine,
                                  const OptionalTensor& stress, const OptionalTensor& volume,
-                                 const OptionalTensor& scene_dt, double dt, int64_t stress_form, bool deterministic,
-                                 const Topology<T, D>& topology) {
+                                 const OptionalTensor& scene_dt, double dt, int64_t stress_form,
+                                 const PackedTopology& blocks) {
   const int64_t P = x.size(0);
   STD_TORCH_CHECK(!has(stress) || has(volume), "stress needs volume");
   P2GArguments<T, D> a;
-  a.topology = topology;
+  a.topology = blocks.unpack<T, D>(x);
   a.x = input<T>(x, "x", x, {P, D});
   a.mass = input<T>(mass, "mass", x, {P});
   a.velocity = input<T>(v, "v", x, {P, D});
   a.affine = input<T>(affine, "C", x, {P, D, D});
   a.stress = input<T>(stress, "stress", x, {P, D, D});
   a.volume = has(stress) ? input<T>(volume, "volume", x, {P}) : Field<const T>{};
-  a.scene_dt = input<T>(scene_dt, "scene_dt", x, {topology.scenes});
+  a.scene_dt = input<T>(scene_dt, "scene_dt", x, {a.topology.scenes});
   a.dt = dt;
   a.form = stress_form_of(stress_form);
-  a.deterministic = deterministic;
+  a.deterministic = blocks.deterministic();
   return a;
 }
 
 Tensor p2g(const Tensor& x, const Tensor& mass, const Tensor& v, const OptionalTensor& C, const OptionalTensor& stress,
            const OptionalTensor& volume, const OptionalTensor& scene_dt, double dt, int64_t stress_form,
-           MPM_TOPOLOGY_PARAMETERS) {
+           const std::vector<Tensor>& topology, const std::vector<double>& lattice,
+           const std::vector<int64_t>& layout) {
+  const PackedTopology blocks(topology, lattice, layout);
   Tensor nodes;
   const DeviceScope device(x);
-  dispatch(x, order, [&]<class T, int D>() {
-    P2GArguments<T, D> a = p2g_arguments(x, mass, v, C, stress, volume, scene_dt, dt, stress_form, deterministic,
-                                         topology<T, D>(x, MPM_TOPOLOGY_ARGUMENTS));
-    nodes = zeros(x, {node_count<D>(block), 1 + D});
+  dispatch(x, [&]<class T, int D>() {
+    auto a = p2g_arguments<T, D>(x, mass, v, C, stress, volume, scene_dt, dt, stress_form, blocks);
+    nodes = zeros(x, {blocks.node_count<D>(), 1 + D});
     a.nodes = {static_cast<T*>(nodes.data_ptr()), 1 + D, 1 + D};
-    backend::p2g(order, a, device.stream());
+    backend::p2g(blocks.order(), a, device.stream());
   });
   return nodes;
 }
@@ -49,7 +51,9 @@ enum Need { kX = 1, kMass = 2, kVelocity = 4, kAffine = 8, kStress = 16, kVolume
 std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> p2g_backward(
     const Tensor& grad_nodes, const Tensor& x, const Tensor& mass, const Tensor& v, const OptionalTensor& C,
     const OptionalTensor& stress, const OptionalTensor& volume, const OptionalTensor& scene_dt, double dt,
-    int64_t stress_form, int64_t needs, MPM_TOPOLOGY_PARAMETERS) {
+    int64_t stress_form, int64_t needs, const std::vector<Tensor>& topology, const std::vector<double>& lattice,
+    const std::vector<int64_t>& layout) {
+  const PackedTopology blocks(topology, lattice, layout);
   check_positions(x);
   const int64_t P = x.size(0), D_ = x.size(1);
   const auto output = [&](int bit, bool present, const Shape& shape) {
@@ -59,11 +63,10 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> p2g_backward(
          gC = output(kAffine, has(C), {P, D_, D_}), gs = output(kStress, has(stress), {P, D_, D_}),
          gV = output(kVolume, has(stress), {P}), gt = output(kDt, has(stress), {P});
   const DeviceScope device(x);
-  dispatch(x, order, [&]<class T, int D>() {
+  dispatch(x, [&]<class T, int D>() {
     P2GBackwardArguments<T, D> a;
-    a.forward = p2g_arguments(x, mass, v, C, stress, volume, scene_dt, dt, stress_form, false,
-                              topology<T, D>(x, MPM_TOPOLOGY_ARGUMENTS));
-    a.grad_nodes = node_input<T>(grad_nodes, "grad_nodes", x, node_count<D>(block));
+    a.forward = p2g_arguments<T, D>(x, mass, v, C, stress, volume, scene_dt, dt, stress_form, blocks);
+    a.grad_nodes = node_input<T>(grad_nodes, "grad_nodes", x, blocks.node_count<D>());
     STD_TORCH_CHECK(a.grad_nodes.channels == 1 + D, "grad_nodes must have 1 + D channels, got ", a.grad_nodes.channels);
     const auto wanted = [&](int bit, const Tensor& t) {
       return (needs & bit) && t.numel() > 0 ? field<T>(t) : Field<T>{};
@@ -75,36 +78,38 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> p2g_backward(
     a.stress = wanted(kStress, gs);
     a.volume = wanted(kVolume, gV);
     a.dt = wanted(kDt, gt);
-    backend::p2g_backward(order, a, device.stream());
+    backend::p2g_backward(blocks.order(), a, device.stream());
   });
   return {gx, gm, gv, gC, gs, gV, gt};
 }
 
 Tensor scatter(const Tensor& x, const Tensor& value, const OptionalTensor& moment, const OptionalTensor& gradient,
-               double moment_scale, MPM_TOPOLOGY_PARAMETERS) {
+               double moment_scale, const std::vector<Tensor>& topology, const std::vector<double>& lattice,
+               const std::vector<int64_t>& layout) {
+  const PackedTopology blocks(topology, lattice, layout);
   Tensor nodes;
   const DeviceScope device(x);
-  dispatch(x, order, [&]<class T, int D>() {
+  dispatch(x, [&]<class T, int D>() {
     check_rank(value, "value", 2);
     const int64_t P = x.size(0), K = value.size(1);
     check_count(K, "value", "channels");
     ScatterArguments<T, D> a;
-    a.topology = topology<T, D>(x, MPM_TOPOLOGY_ARGUMENTS);
+    a.topology = blocks.unpack<T, D>(x);
     a.x = input<T>(x, "x", x, {P, D});
     a.value = input<T>(value, "value", x, {P, K});
     a.moment = input<T>(moment, "moment", x, {P, K, D});
     a.gradient = input<T>(gradient, "gradient", x, {P, K, D});
     a.moment_scale = moment_scale;
-    a.deterministic = deterministic;
-    nodes = zeros(x, {node_count<D>(block), K});
+    a.deterministic = blocks.deterministic();
+    nodes = zeros(x, {blocks.node_count<D>(), K});
     a.nodes = {static_cast<T*>(nodes.data_ptr()), K, int(K)};
-    backend::scatter(order, a, device.stream());
+    backend::scatter(blocks.order(), a, device.stream());
   });
   return nodes;
 }
 
 std::tuple<Tensor, Tensor, Tensor> gather_with(const Tensor& x, const Tensor& nodes, double moment_scale, double lost,
-                                               bool moment, bool gradient, MPM_TOPOLOGY_PARAMETERS) {
+                                               bool moment, bool gradient, const PackedTopology& blocks) {
   check_positions(x);
   check_rank(nodes, "nodes", 2);
   check_count(nodes.size(1), "nodes", "channels");
@@ -112,54 +117,57 @@ std::tuple<Tensor, Tensor, Tensor> gather_with(const Tensor& x, const Tensor& no
   Tensor value = empty_particles(x, {P, K}), moments = moment ? empty_particles(x, {P, K, D_}) : empty(x, {0}),
          gradients = gradient ? empty_particles(x, {P, K, D_}) : empty(x, {0});
   const DeviceScope device(x);
-  dispatch(x, order, [&]<class T, int D>() {
+  dispatch(x, [&]<class T, int D>() {
     GatherArguments<T, D> a;
-    a.topology = topology<T, D>(x, MPM_TOPOLOGY_ARGUMENTS);
+    a.topology = blocks.unpack<T, D>(x);
     a.x = input<T>(x, "x", x, {P, D});
-    a.nodes = node_input<T>(nodes, "nodes", x, node_count<D>(block));
+    a.nodes = node_input<T>(nodes, "nodes", x, blocks.node_count<D>());
     a.moment_scale = moment_scale;
     a.lost = lost;
     a.value = field<T>(value);
     if (moment) a.moment = field<T>(moments);
     if (gradient) a.gradient = field<T>(gradients);
-    backend::gather(order, a, device.stream());
+    backend::gather(blocks.order(), a, device.stream());
   });
   return {value, moments, gradients};
 }
 
 std::tuple<Tensor, Tensor, Tensor> gather(const Tensor& x, const Tensor& nodes, double moment_scale, bool moment,
-                                          bool gradient, MPM_TOPOLOGY_PARAMETERS) {
-  return gather_with(x, nodes, moment_scale, 0, moment, gradient, MPM_TOPOLOGY_ARGUMENTS, order, deterministic);
+                                          bool gradient, const std::vector<Tensor>& topology,
+                                          const std::vector<double>& lattice, const std::vector<int64_t>& layout) {
+  return gather_with(x, nodes, moment_scale, 0, moment, gradient, PackedTopology(topology, lattice, layout));
 }
 
 std::tuple<Tensor, Tensor, Tensor> g2p(const Tensor& x, const Tensor& velocity, bool affine, bool gradient,
-                                       MPM_TOPOLOGY_PARAMETERS) {
+                                       const std::vector<Tensor>& topology, const std::vector<double>& lattice,
+                                       const std::vector<int64_t>& layout) {
+  const PackedTopology blocks(topology, lattice, layout);
   check_positions(x);
-  check_rank(block, "block", 1);
-  check_shape(velocity, "velocity", {x.size(1) == 2 ? node_count<2>(block) : node_count<3>(block), x.size(1)});
-  return gather_with(x, velocity, inverse_inertia(order) / (dx * dx), NAN, affine, gradient, MPM_TOPOLOGY_ARGUMENTS,
-                     order, deterministic);
+  check_shape(velocity, "velocity", {blocks.node_count(x.size(1)), x.size(1)});
+  return gather_with(x, velocity, blocks.inverse_inertia(), NAN, affine, gradient, blocks);
 }
 
 Tensor position_gradient(const Tensor& x, const Tensor& value, const OptionalTensor& moment,
                          const OptionalTensor& gradient, const Tensor& nodes, double moment_scale,
-                         MPM_TOPOLOGY_PARAMETERS) {
+                         const std::vector<Tensor>& topology, const std::vector<double>& lattice,
+                         const std::vector<int64_t>& layout) {
+  const PackedTopology blocks(topology, lattice, layout);
   check_positions(x);
   check_rank(nodes, "nodes", 2);
   Tensor result = empty_particles(x, {x.size(0), x.size(1)});
   const DeviceScope device(x);
-  dispatch(x, order, [&]<class T, int D>() {
+  dispatch(x, [&]<class T, int D>() {
     const int64_t P = x.size(0), K = nodes.size(1);
     PositionGradientArguments<T, D> a;
-    a.topology = topology<T, D>(x, MPM_TOPOLOGY_ARGUMENTS);
+    a.topology = blocks.unpack<T, D>(x);
     a.x = input<T>(x, "x", x, {P, D});
     a.value = input<T>(value, "value", x, {P, K});
     a.moment = input<T>(moment, "moment", x, {P, K, D});
     a.gradient = input<T>(gradient, "gradient", x, {P, K, D});
-    a.nodes = node_input<T>(nodes, "nodes", x, node_count<D>(block));
+    a.nodes = node_input<T>(nodes, "nodes", x, blocks.node_count<D>());
     a.moment_scale = moment_scale;
     a.position_gradient = field<T>(result);
-    backend::position_gradient(order, a, device.stream());
+    backend::position_gradient(blocks.order(), a, device.stream());
   });
   return result;
 }

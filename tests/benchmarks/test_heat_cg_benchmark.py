@@ -11,7 +11,7 @@ def test_assembled_matrices_are_the_operator():
     p = Problem(4, "cpu")
     u = torch.rand_like(p.theta)
     expected = heat_operator(p.blocks, p.x, p.conductance, u)
-    some = p.capacity > 0
+    some = p.heat_capacity > 0
     torch.testing.assert_close(csr(p) @ u[some], expected[some], rtol=1e-4, atol=1e-7)
     assert (expected[~some] == 0).all()
     product = assembled(p.blocks, p.x, p.conductance) @ u.double().numpy()
@@ -21,9 +21,9 @@ def test_assembled_matrices_are_the_operator():
 def test_conjugate_gradients_of_the_peer():
     p = Problem(4, "cpu")
     H = csr(p)
-    some = p.capacity > 0
+    some = p.heat_capacity > 0
     diagonal = heat_operator(p.blocks, p.x, p.conductance, None)[some]
-    peer = csr_cg(H, p.capacity[some] / p.dx**2, diagonal, -(H @ p.theta[some]), 30)
+    peer = csr_cg(H, p.heat_capacity[some] / p.dx**2, diagonal, -(H @ p.theta[some]), 30)
     torch.testing.assert_close(p.solve(1.0, tolerance=1e-7).increment[some], peer, rtol=1e-3, atol=1e-5)
 
 

@@ -31,7 +31,7 @@ class Heat:
     blocks: mpm.Blocks
     x: Tensor
     conductance: Tensor
-    capacity: Tensor
+    heat_capacity: Tensor
     theta: Tensor
     source: Tensor
     exchange: Tensor
@@ -43,7 +43,7 @@ class Heat:
         if boundaries:
             values |= {"exchange": self.exchange, "fixed": self.fixed}
         values |= options
-        return mpm.heat_cg(self.blocks, self.x, self.conductance, self.capacity, **values)
+        return mpm.heat_cg(self.blocks, self.x, self.conductance, self.heat_capacity, **values)
 
     def scenes(self, nodes: Tensor) -> Tensor:
         """Sums over the nodes of each scene."""
@@ -76,14 +76,14 @@ def heat(
         blocks,
         p.x,
         conductance=0.02 * (0.1 + uniform(P)),
-        capacity=scatter(blocks, p.x, p.mass[:, None])[:, 0],
+        heat_capacity=scatter(blocks, p.x, p.mass[:, None])[:, 0],
         theta=uniform(N) - 0.5,
         source=uniform(N) - 0.5,
         exchange=torch.where(uniform(N) < 0.3, 0.3 * uniform(N), 0),
         fixed=uniform(N) < 0.1,
         dt=0.5 + uniform(order),
     )
-    values.source = torch.where(values.capacity > 0, values.source, 0)
+    values.source = torch.where(values.heat_capacity > 0, values.source, 0)
     tensors = {f.name: getattr(values, f.name) for f in dataclasses.fields(values) if f.name != "blocks"}
     cast = {k: t.to(dtype) if t.is_floating_point() else t for k, t in tensors.items()}
     return Heat(blocks=p.grid.activate(cast["x"], p.scene), **cast)
@@ -116,20 +116,19 @@ def dense_operator(h: Heat) -> Tensor:
 def dense_increment(h: Heat, boundaries: bool = True) -> Tensor:
     """The increment by a dense solve with H from the reference, in float64 on the CPU."""
     grid, N = h.blocks.grid, h.blocks.node_count
-    blocks = mpm.Blocks(grid, *(getattr(h.blocks, f.name).cpu() for f in dataclasses.fields(h.blocks)[1:-1]), None)
-    if h.blocks.scene is not None:
-        blocks = dataclasses.replace(blocks, scene=h.blocks.scene.cpu())
-    x, conductance, capacity, theta, source, exchange, dt = (
-        t.cpu().double() for t in (h.x, h.conductance, h.capacity, h.theta, h.source, h.exchange, h.dt)
+    tensors = {f.name: getattr(h.blocks, f.name) for f in dataclasses.fields(h.blocks)[1:]}
+    blocks = mpm.Blocks(grid, **{name: None if t is None else t.cpu() for name, t in tensors.items()})
+    x, conductance, heat_capacity, theta, source, exchange, dt = (
+        t.cpu().double() for t in (h.x, h.conductance, h.heat_capacity, h.theta, h.source, h.exchange, h.dt)
     )
     operator = reference.HeatOperator.at(blocks, x, conductance)
     H = torch.stack([operator.apply(c) for c in torch.eye(N, dtype=torch.float64)], 1)
     if not boundaries:
         exchange = torch.zeros_like(exchange)
-    free = capacity > 0
+    free = heat_capacity > 0
     if boundaries:
         free &= ~h.fixed.cpu()
-    A = torch.diag(capacity / dt[blocks.node_scene().clamp_min(0).long()] + exchange) + H
+    A = torch.diag(heat_capacity / dt[blocks.node_scene().clamp_min(0).long()] + exchange) + H
     b = source - H @ theta - exchange * theta
     d = torch.zeros(N, dtype=torch.float64)
     d[free] = torch.linalg.solve(A[free][:, free], b[free])
@@ -176,9 +175,9 @@ def test_largest_eigenvalue(device, dim, kernel):
     diffusivity = 0.7
     mass = 0.1 + torch.rand(h.x.shape[0], dtype=h.x.dtype, device=device)
     h.conductance = diffusivity * mass
-    capacity = scatter(h.blocks, h.x, mass[:, None])[:, 0]
-    some = capacity > 0
-    root = capacity[some].sqrt()
+    heat_capacity = scatter(h.blocks, h.x, mass[:, None])[:, 0]
+    some = heat_capacity > 0
+    root = heat_capacity[some].sqrt()
     values = torch.linalg.eigvalsh(dense_operator(h)[some][:, some] / root / root[:, None])
     assert float(values.max()) <= diffusivity * h.blocks.grid.inverse_inertia * (1 + 1e-12)
 
@@ -208,13 +207,13 @@ def test_solve_is_the_dense_one(device, dim, kernel, boundaries, method, far):
     assert relative_error(solve.increment, dense_increment(h, boundaries)) < 1e-10
     if boundaries:
         assert (solve.increment[h.fixed] == 0).all()
-    assert (solve.increment[h.capacity == 0] == 0).all()
+    assert (solve.increment[h.heat_capacity == 0] == 0).all()
 
 
 @pytest.mark.parametrize("deterministic", [False, True])
 def test_solve_is_the_reference_iteration_by_iteration(device, dim, kernel, deterministic, far):
     h = heat(dim, kernel, device, deterministic=deterministic, far=far)
-    arguments = (h.blocks, h.x, h.conductance, h.capacity, h.theta, h.dt, h.source, h.exchange, h.fixed)
+    arguments = (h.blocks, h.x, h.conductance, h.heat_capacity, h.theta, h.dt, h.source, h.exchange, h.fixed)
     for most in (0, 1, 3):
         got = h.solve(max_iterations=most)
         expected = reference.heat_cg(*arguments, tolerance=0.0, max_iterations=most)
@@ -235,7 +234,7 @@ def test_refinement(device, dim, boundaries):
     """float32 data, float64 accuracy; the gradient is that of the float64 solve."""
     h = heat(dim, device=device, dtype=torch.float32, sizes=(60, 0, 40))
     plain = h.solve(boundaries, tolerance=1e-12)
-    names = ("x", "conductance", "capacity", "theta", "dt", "source")
+    names = ("x", "conductance", "heat_capacity", "theta", "dt", "source")
     grads = []
     for dtype in (torch.float32, torch.float64):
         inputs = {name: getattr(h, name).detach().to(dtype).requires_grad_() for name in names}
@@ -257,7 +256,9 @@ def test_tolerance_bounds_the_error(dim, kernel):
     exact = dense_increment(h, False)
     for tolerance in (1e-2, 1e-4, 1e-7):
         solve = h.solve(False, tolerance=tolerance)
-        error = (h.scenes(h.capacity * (solve.increment - exact) ** 2) / h.scenes(h.capacity)).nan_to_num().sqrt()
+        error = (
+            (h.scenes(h.heat_capacity * (solve.increment - exact) ** 2) / h.scenes(h.heat_capacity)).nan_to_num().sqrt()
+        )
         assert solve.converged.all() and (error <= tolerance).all()
 
 
@@ -267,8 +268,8 @@ def test_energy_after_any_number_of_iterations(device, dim, kernel, dtype, metho
     h = heat(dim, kernel, device, dtype, sizes=(500, 0, 300))
     for most in (1, 2, 5, 200):
         d = h.solve(False, max_iterations=most, method=method).increment.double()
-        gained, given = h.scenes(h.capacity.double() * d), h.dt.double() * h.scenes(h.source.double())
-        scale = h.scenes(h.capacity.double() * d.abs()) + h.dt.double() * h.scenes(h.source.double().abs())
+        gained, given = h.scenes(h.heat_capacity.double() * d), h.dt.double() * h.scenes(h.source.double())
+        scale = h.scenes(h.heat_capacity.double() * d.abs()) + h.dt.double() * h.scenes(h.source.double().abs())
         assert ((gained - given).abs() <= (1e-12 if dtype == torch.float64 else 1e-6) * scale).all()
 
 
@@ -306,7 +307,7 @@ def test_any_strides(device, dim, far):
     def apart(t: Tensor) -> Tensor:
         return t.repeat_interleave(3, 0)[::3]
 
-    for name in ("x", "conductance", "capacity", "theta", "source", "exchange", "fixed"):
+    for name in ("x", "conductance", "heat_capacity", "theta", "source", "exchange", "fixed"):
         setattr(h, name, apart(getattr(h, name)))
     torch.testing.assert_close(h.solve(tolerance=1e-10).increment, expected, rtol=1e-9, atol=1e-12)
 
@@ -316,7 +317,7 @@ def test_any_address(device, dim, far):
     h = heat(dim, device=device, dtype=torch.float32, far=far)
     solve = h.solve(tolerance=1e-6).increment
     product = heat_operator(h.blocks, h.x, h.conductance, h.theta)
-    for name in ("capacity", "theta", "source", "exchange"):
+    for name in ("heat_capacity", "theta", "source", "exchange"):
         nodes = getattr(h, name)
         setattr(h, name, torch.cat([nodes[:1], nodes])[1:])
     torch.testing.assert_close(h.solve(tolerance=1e-6).increment, solve, rtol=1e-3, atol=1e-4)
@@ -350,18 +351,18 @@ def test_replay_of_a_cuda_graph(device, far):
 @pytest.mark.parametrize("method", ["cg", "chebyshev", "multigrid"])
 def test_gradients(device, dim, kernel, method):
     h = heat(dim, kernel, device, sizes=(9, 0, 7), dx=0.4)
-    some = h.capacity > 0
-    names = ("x", "conductance", "capacity", "theta", "dt", "source", "exchange")
+    some = h.heat_capacity > 0
+    names = ("x", "conductance", "heat_capacity", "theta", "dt", "source", "exchange")
 
     def increment(*inputs: Tensor) -> Tensor:
-        x, conductance, capacity, theta, dt, source, exchange = inputs
+        x, conductance, heat_capacity, theta, dt, source, exchange = inputs
         return mpm.heat_cg(
-            h.blocks, x, conductance, torch.where(some, capacity, 0), theta, dt, source, exchange, h.fixed,
+            h.blocks, x, conductance, torch.where(some, heat_capacity, 0), theta, dt, source, exchange, h.fixed,
             tolerance=1e-11, max_iterations=500, method=method, adjoint_tolerance=1e-11,
         ).increment  # fmt: skip
 
-    # Away from zero capacity, where a node joins the system.
-    h.capacity = torch.where(some, h.capacity + 0.05, 0)
+    # Away from zero heat capacity, where a node joins the system.
+    h.heat_capacity = torch.where(some, h.heat_capacity + 0.05, 0)
     h.exchange = torch.where(some, h.exchange + 0.01, 0)
     inputs = [getattr(h, name).clone().requires_grad_() for name in names]
     assert torch.autograd.gradcheck(
@@ -371,11 +372,11 @@ def test_gradients(device, dim, kernel, method):
 
 def test_second_derivatives():
     h = heat(2, sizes=(8,), dx=0.5)
-    h.capacity = torch.where(h.capacity > 0, h.capacity + 0.1, 0)
+    h.heat_capacity = torch.where(h.heat_capacity > 0, h.heat_capacity + 0.1, 0)
 
     def loss(conductance: Tensor, theta: Tensor, x: Tensor) -> Tensor:
         return mpm.heat_cg(
-            h.blocks, x, conductance, h.capacity, theta, 0.5, tolerance=1e-14, adjoint_tolerance=1e-13
+            h.blocks, x, conductance, h.heat_capacity, theta, 0.5, tolerance=1e-14, adjoint_tolerance=1e-13
         ).increment.pow(2)
 
     inputs = [t.clone().requires_grad_() for t in (h.conductance, h.theta, h.x)]
@@ -403,7 +404,9 @@ def test_no_conductance(device, dim):
     h.conductance = torch.zeros_like(h.conductance)
     for method in ("cg", "chebyshev"):
         solve = h.solve(False, tolerance=1e-12, method=method)
-        expected = torch.where(h.capacity > 0, h.dt[h.blocks.node_scene().clamp_min(0)] * h.source / h.capacity, 0)
+        expected = torch.where(
+            h.heat_capacity > 0, h.dt[h.blocks.node_scene().clamp_min(0)] * h.source / h.heat_capacity, 0
+        )
         assert solve.converged.all() and int(solve.iterations.max()) == 1
         torch.testing.assert_close(solve.increment, expected, rtol=1e-10, atol=1e-12)
 
@@ -424,7 +427,7 @@ def test_not_converged(device, dim, far):
     assert float(solve.residual[0]) > 1e-10
 
 
-@pytest.mark.parametrize("where", ["theta", "conductance", "capacity", "source"])
+@pytest.mark.parametrize("where", ["theta", "conductance", "heat_capacity", "source"])
 @pytest.mark.parametrize("method", ["cg", "chebyshev", "multigrid"])
 def test_nan_stays_in_its_scene(device, dim, where, method, far):
     h = heat(dim, device=device, sizes=(60, 50, 40), deterministic=True, far=far)
@@ -434,7 +437,7 @@ def test_nan_stays_in_its_scene(device, dim, where, method, far):
     if where == "conductance":
         broken[torch.nonzero(h.blocks.scene == 1)[5]] = math.nan
     else:
-        broken[torch.nonzero((scene == 1) & (h.capacity > 0))[5]] = math.nan
+        broken[torch.nonzero((scene == 1) & (h.heat_capacity > 0))[5]] = math.nan
     setattr(h, where, broken)
     got = h.solve(False, tolerance=1e-9, method=method)
     assert got.converged.tolist() == [True, False, True] and int(got.iterations[1]) == 0
@@ -484,27 +487,29 @@ def test_messages():
         with pytest.raises(error, match=message):
             h.solve(**options)
     with pytest.raises(ValueError, match=rf"conductance must have shape \[P\] = \[{P}\], got \[1\]"):
-        mpm.heat_cg(h.blocks, h.x, h.conductance[:1], h.capacity, h.theta, 0.1)
+        mpm.heat_cg(h.blocks, h.x, h.conductance[:1], h.heat_capacity, h.theta, 0.1)
     with pytest.raises(ValueError, match=r"nodes must have shape \[N\]"):
         heat_operator(h.blocks, h.x, h.conductance, h.theta[1:])
     with pytest.raises(NotImplementedError, match="vmap"):
-        torch.vmap(lambda t: mpm.heat_cg(h.blocks, h.x, h.conductance, h.capacity, t, 0.1).increment)(h.theta[None])
+        torch.vmap(lambda t: mpm.heat_cg(h.blocks, h.x, h.conductance, h.heat_capacity, t, 0.1).increment)(
+            h.theta[None]
+        )
 
 
 def op_arguments(h: Heat) -> list:
     return [
-        h.x, h.conductance, h.capacity, h.theta, h.source, h.exchange, h.fixed, h.dt, 0.5, None, 1e-8, 0.0, None, 50, 0,
-        1e-8, *h.blocks.topology,
+        h.x, h.conductance, h.heat_capacity, h.theta, h.source, h.exchange, h.fixed, h.dt, 0.5, None, 1e-8, 0.0, None,
+        50, 0, 1e-8, *h.blocks.packed,
     ]  # fmt: skip
 
 
 def test_opcheck(device, dim):
     h = heat(dim, device=device, sizes=(9, 7), dx=0.4, deterministic=True)
-    for name in ("x", "conductance", "capacity", "theta", "source", "exchange", "dt"):
+    for name in ("x", "conductance", "heat_capacity", "theta", "source", "exchange", "dt"):
         getattr(h, name).requires_grad_()
     torch.library.opcheck(torch.ops.torch_mpm.heat_cg, tuple(op_arguments(h)))
     torch.library.opcheck(
-        torch.ops.torch_mpm.heat_operator, (h.x, h.conductance, h.theta.detach().requires_grad_(), *h.blocks.topology)
+        torch.ops.torch_mpm.heat_operator, (h.x, h.conductance, h.theta.detach().requires_grad_(), *h.blocks.packed)
     )
 
 
@@ -525,9 +530,10 @@ def test_the_op_checks_what_memory_safety_needs(dim):
     h = heat(dim)
     arguments = op_arguments(h)
     for position, value in [
-        (0, h.x[:-1]), (0, h.x[:, 0]), (1, h.conductance[1:]), (1, h.conductance.float()), (2, h.capacity[1:]),
-        (2, h.capacity[:, None]), (3, h.theta[1:]), (4, h.source.float()), (5, h.exchange[1:]), (6, h.fixed[1:]),
-        (6, h.fixed.int()), (7, h.dt[1:]), (9, h.dt[1:]), (12, h.dt), (14, 2), (17, h.blocks.block[1:]),
+        (0, h.x[:-1]), (0, h.x[:, 0]), (1, h.conductance[1:]), (1, h.conductance.float()), (2, h.heat_capacity[1:]),
+        (2, h.heat_capacity[:, None]), (3, h.theta[1:]), (4, h.source.float()), (5, h.exchange[1:]), (6, h.fixed[1:]),
+        (6, h.fixed.int()), (7, h.dt[1:]), (9, h.dt[1:]), (12, h.dt), (14, 2),
+        (16, dataclasses.replace(h.blocks, block=h.blocks.block[1:]).packed[0]),
     ]:  # fmt: skip
         with pytest.raises(RuntimeError):
             torch.ops.torch_mpm.heat_cg(*arguments[:position], value, *arguments[position + 1 :])

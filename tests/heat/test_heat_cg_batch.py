@@ -20,7 +20,7 @@ def batch(dim, kernel="quadratic", device="cpu", dtype=torch.float64, **options)
 def alone(h, **options):
     """The solve in plain torch."""
     return reference.heat_cg(
-        h.blocks, h.x, h.conductance, h.capacity, h.theta, h.dt, h.source, h.exchange, h.fixed, **options
+        h.blocks, h.x, h.conductance, h.heat_capacity, h.theta, h.dt, h.source, h.exchange, h.fixed, **options
     )
 
 
@@ -55,7 +55,7 @@ def test_nan_spreads_to_no_other_scene(device, dim):
     scene, expected = h.blocks.node_scene(), h.solve(tolerance=1e-9)
     broken = (7, len(SIZES) + 1)
     for number in broken:
-        h.theta[torch.nonzero((scene == number) & (h.capacity > 0))[3]] = math.nan
+        h.theta[torch.nonzero((scene == number) & (h.heat_capacity > 0))[3]] = math.nan
     got = h.solve(tolerance=1e-9)
     rest = (scene != broken[0]) & (scene != broken[1])
     assert torch.equal(got.increment[rest], expected.increment[rest]) and (got.increment[~rest] == 0).all()
@@ -68,21 +68,21 @@ def test_batch_is_bit_identical(device, dim):
     assert all(torch.equal(a, b) for a, b in zip(first, second, strict=True))
 
 
-def test_capacity_without_particles(device, dim):
-    """Nodes with capacity that no particle reaches warm by their own source; those without capacity keep theirs."""
+def test_heat_capacity_without_particles(device, dim):
+    """Nodes with heat capacity that no particle reaches warm by their own source; those without keep theirs."""
     h = batch(dim, device=device)
     scene = h.blocks.node_scene().long()
-    reached = h.capacity > 0
-    h.capacity[(scene >= 0) & ~reached] = 0.3
+    reached = h.heat_capacity > 0
+    h.heat_capacity[(scene >= 0) & ~reached] = 0.3
     h.source[scene >= 0] += 0.1
     got = h.solve(False, tolerance=1e-12)
-    expected = torch.where(scene < 0, 0, h.dt[scene.clamp_min(0)] * h.source / h.capacity)
+    expected = torch.where(scene < 0, 0, h.dt[scene.clamp_min(0)] * h.source / h.heat_capacity)
     torch.testing.assert_close(got.increment[~reached], expected[~reached], rtol=1e-9, atol=1e-12)
-    h.capacity[:] = torch.where(reached & (torch.arange(len(scene), device=device) % 3 > 0), h.capacity, 0)
+    h.heat_capacity[:] = torch.where(reached & (torch.arange(len(scene), device=device) % 3 > 0), h.heat_capacity, 0)
     h.exchange[:], h.fixed[:] = 0, False
     got = h.solve(tolerance=1e-12)
     assert relative_error(got.increment, alone(h, tolerance=1e-12)[0]) < 1e-9
-    assert (got.increment[h.capacity == 0] == 0).all()
+    assert (got.increment[h.heat_capacity == 0] == 0).all()
 
 
 def test_crowded_cells_of_a_batch(device, dim):

@@ -130,8 +130,8 @@ def nodes_of(state, kernel="quadratic"):
     grid = mpm.Grid(1 / 6, (-0.5, -0.5), (1.5, 1.5), kernel=kernel)
     blocks = grid.activate(state.x)
     conductance = state.volume * 10 ** (3 * random_like(state.mass))
-    capacity = scatter(blocks, state.x, state.mass[:, None])[:, 0]
-    return HeatNodes(blocks, state, state.volume, conductance, capacity, torch.zeros_like(capacity))
+    heat_capacity = scatter(blocks, state.x, state.mass[:, None])[:, 0]
+    return HeatNodes(blocks, state, state.volume, conductance, heat_capacity, torch.zeros_like(heat_capacity))
 
 
 def test_operator_stays_positive(kernel):
@@ -142,8 +142,8 @@ def test_operator_stays_positive(kernel):
         FixedSurface(region, 1.0).apply(nodes)
     conductance = nodes.left_conductance()
     assert float(conductance.min()) < 0 < float(conductance.max())
-    used = (nodes.capacity > 0).nonzero()[:, 0]
-    unit = torch.eye(len(nodes.capacity), dtype=FLOAT)[used]
+    used = (nodes.heat_capacity > 0).nonzero()[:, 0]
+    unit = torch.eye(len(nodes.heat_capacity), dtype=FLOAT)[used]
     matrix = torch.stack([heat_operator(nodes.blocks, state.x, conductance, u)[used] for u in unit])
     values = torch.linalg.eigvalsh(matrix + torch.diag(nodes.exchange[used]))
     assert float(values[0]) > -1e-12 * float(values[-1])

@@ -31,23 +31,23 @@ def square(
     grid = mpm.Grid(dx, (0,) * dim, (1,) * dim, kernel=kernel, deterministic=True)
     blocks = grid.activate(x)
     volume = torch.full_like(x[:, 0], (dx / 2) ** dim)
-    capacity = scatter(blocks, x, volume[:, None])[:, 0]
+    heat_capacity = scatter(blocks, x, volume[:, None])[:, 0]
     theta = torch.rand(blocks.node_count, generator=generator, dtype=FLOAT).to(x)
     zero = torch.zeros_like(theta)
     conductance = torch.where(x[:, 0] < 0.5, volume, volume / contrast)
     dt = torch.full((1,), r * dx**2, dtype=dtype, device=device)
-    return Heat(blocks, x, conductance, capacity, theta, zero, zero, blocks.node_positions(FLOAT)[:, 0] < 0.05, dt)
+    return Heat(blocks, x, conductance, heat_capacity, theta, zero, zero, blocks.node_positions(FLOAT)[:, 0] < 0.05, dt)
 
 
 def levels_of(h: Heat) -> list[heat_multigrid.Level]:
-    free, weight = (h.capacity > 0).to(h.x), h.capacity / h.dt
-    diagonal = torch.ops.torch_mpm.heat_operator(h.x, h.conductance, None, *h.blocks.topology)
+    free, weight = (h.heat_capacity > 0).to(h.x), h.heat_capacity / h.dt
+    diagonal = torch.ops.torch_mpm.heat_operator(h.x, h.conductance, None, *h.blocks.packed)
     return heat_multigrid._levels(h.blocks, h.x, h.conductance, weight, free, h.fixed & False, diagonal)
 
 
 def weighted_error(h: Heat, increment: Tensor, exact: Tensor) -> float:
     """Mass-weighted RMS, relative."""
-    weight = h.capacity.cpu().double()
+    weight = h.heat_capacity.cpu().double()
     squares = [float((weight * d.cpu().double() ** 2).sum()) for d in (increment.cpu() - exact, exact)]
     return (squares[0] / squares[1]) ** 0.5
 
@@ -57,7 +57,7 @@ def weighted_error(h: Heat, increment: Tensor, exact: Tensor) -> float:
 
 def test_stencil_has_the_entries_of_the_operator(device, dim, kernel):
     h = heat(dim, kernel, device, sizes=(40, 0, 30), dx=0.4)
-    stencil = torch.ops.torch_mpm.heat_stencil(h.x, h.conductance, *h.blocks.topology)
+    stencil = torch.ops.torch_mpm.heat_stencil(h.x, h.conductance, *h.blocks.packed)
     H, index, scene = dense_operator(h), h.blocks.node_indices(), h.blocks.node_scene()
     offsets = [e for e in itertools.product((-1, 0, 1), repeat=dim) if e >= (0,) * dim]
     assert stencil.shape == (len(offsets), len(H))
@@ -70,7 +70,7 @@ def test_stencil_has_the_entries_of_the_operator(device, dim, kernel):
 
 def test_patches_are_the_sum_of_inverses(device, dim):
     h = heat(dim, device=device, sizes=(40,), dx=0.4)
-    free, weight = (h.capacity > 0) & ~h.fixed, h.capacity / 10
+    free, weight = (h.heat_capacity > 0) & ~h.fixed, h.heat_capacity / 10
     patches = Patches(h.blocks, h.x, h.conductance, weight, free)
     A, index = dense_operator(h) + weight.diag(), h.blocks.node_indices()
     used = torch.nonzero(h.blocks.active_nodes())[:, 0]
@@ -115,8 +115,8 @@ def test_cycle_is_symmetric_and_near_the_inverse(kernel, thin, monkeypatch):
     monkeypatch.setattr(heat_multigrid, "COARSE_ITERATIONS", 300)
     h = square(12, 1e3, kernel=kernel, thin=thin)
     levels = levels_of(h)
-    some = torch.nonzero(h.capacity > 0)[:, 0]
-    unit = torch.eye(len(h.capacity), dtype=FLOAT)
+    some = torch.nonzero(h.heat_capacity > 0)[:, 0]
+    unit = torch.eye(len(h.heat_capacity), dtype=FLOAT)
     assert len(levels) == 3
     B = torch.stack([heat_multigrid._cycle(levels, 0, unit[i]) for i in some], 1)[some]
     A = torch.stack([levels[0].apply(unit[i]) for i in some], 1)[some]
@@ -154,8 +154,8 @@ def test_coarse_lattices_that_do_not_fit_the_pool(device, dim):
     lattice = {"dx": 1 / 64, "lower": (0,) * dim, "upper": (1,) * dim}
     tight = int((mpm.Grid(**lattice).activate(x).block >= 0).sum())
     heats = []
-    for capacity in (tight, 2 * tight):
-        blocks = mpm.Grid(**lattice, capacity=capacity).activate(x)
+    for max_blocks in (tight, 2 * tight):
+        blocks = mpm.Grid(**lattice, max_blocks=max_blocks).activate(x)
         mass = scatter(blocks, x, torch.ones_like(x[:, :1]))[:, 0]
         theta = torch.sin(7 * blocks.node_positions(FLOAT)).sum(1) * blocks.active_nodes()
         options = {"tolerance": 0.0, "relative_tolerance": 1e-9, "method": "multigrid"}
@@ -205,25 +205,25 @@ def test_captured_in_a_cuda_graph(device):
 
 def test_opcheck(device, dim):
     h = heat(dim, device=device, sizes=(9, 7), dx=0.4, deterministic=True)
-    patches = Patches(h.blocks, h.x, h.conductance, h.capacity, h.capacity > 0)
+    patches = Patches(h.blocks, h.x, h.conductance, h.heat_capacity, h.heat_capacity > 0)
     for name, arguments in (
-        ("heat_stencil", (h.x, h.conductance, *h.blocks.topology)),
+        ("heat_stencil", (h.x, h.conductance, *h.blocks.packed)),
         ("heat_patches", (patches.inverse, patches.rows, patches.patches, h.theta)),
     ):
         torch.library.opcheck(getattr(torch.ops.torch_mpm, name), arguments)
-    for name in ("x", "conductance", "capacity", "theta", "source", "exchange", "dt"):
+    for name in ("x", "conductance", "heat_capacity", "theta", "source", "exchange", "dt"):
         getattr(h, name).requires_grad_()
     torch.library.opcheck(torch.ops.torch_mpm.heat_multigrid, tuple(op_arguments(h)))
     with pytest.raises(NotImplementedError, match="not differentiable"):
-        torch.ops.torch_mpm.heat_stencil(h.x, h.conductance, *h.blocks.topology).sum().backward()
+        torch.ops.torch_mpm.heat_stencil(h.x, h.conductance, *h.blocks.packed).sum().backward()
 
 
 def test_ops_check_what_memory_safety_needs(dim):
     h = heat(dim, sizes=(30,))
     for x, conductance in ((h.x[:-1], h.conductance), (h.x, h.conductance.float()), (h.x[:, 0], h.conductance)):
         with pytest.raises(RuntimeError):
-            torch.ops.torch_mpm.heat_stencil(x, conductance, *h.blocks.topology)
-    p = Patches(h.blocks, h.x, h.conductance, h.capacity, h.capacity > 0)
+            torch.ops.torch_mpm.heat_stencil(x, conductance, *h.blocks.packed)
+    p = Patches(h.blocks, h.x, h.conductance, h.heat_capacity, h.heat_capacity > 0)
     good = [p.inverse, p.rows, p.patches, h.theta]
     for position, value in (
         (0, p.inverse[1:]), (0, p.inverse.float()), (0, p.inverse[..., 0]), (1, p.rows[1:]), (1, p.rows.long()),

@@ -8,7 +8,7 @@ from helpers import relative_error
 from torch import Tensor
 
 import torch_mpm as mpm
-from torch_mpm.ops import material as ops
+from torch_mpm import ops
 from torch_mpm.reference import material as reference
 
 LAWS = sorted(reference.LAWS)
@@ -54,15 +54,10 @@ def state_of(F: Tensor | None = None, J: Tensor | None = None, dim: int = 3, **f
 @pytest.mark.parametrize("law", LAWS)
 def test_stress_and_energy_equal_the_reference(law: str, shape: str, dim: int, device: str) -> None:
     state, parameters, C, scene = arguments(law, dim, count=37, shape=shape)
-    stress = ops.material_stress(
-        law,
-        state.to(device),
-        [p.to(device) for p in parameters],
-        None if C is None else C.to(device),
-        scene.to(device),
-        dim,
-    )
-    energy = ops.material_energy(law, state.to(device), [p.to(device) for p in parameters], scene.to(device), dim)
+    given = (law, state.to(device), [p.to(device) for p in parameters])
+    others = {"scene": scene.to(device), "dim": dim}
+    stress = ops.law_update(*given, C=None if C is None else C.to(device), **others).stress
+    energy = ops.law_energy(*given, **others)
     assert relative_error(stress, reference.stress(law, state, parameters, C, scene, dim)) < 1e-13
     assert relative_error(energy, reference.energy(law, state, parameters, scene, dim)) < 1e-12
 
@@ -72,8 +67,8 @@ def test_stress_is_the_derivative_of_the_energy(law: str, dim: int, device: str)
     """τ = ∂ψ/∂F Fᵀ, and τ = J ψ'(J) I for a fluid."""
     state, parameters, _, _ = arguments(law, dim, count=20)
     state, parameters = state.to(device).requires_grad_(), [p.to(device) for p in parameters]
-    (gradient,) = torch.autograd.grad(ops.material_energy(law, state, parameters, dim=dim).sum(), state)
-    stress = ops.material_stress(law, state, parameters, dim=dim)
+    (gradient,) = torch.autograd.grad(ops.law_energy(law, state, parameters, dim=dim).sum(), state)
+    stress = ops.law_update(law, state, parameters, dim=dim).stress
     if law == "neo_hookean":
         expected = gradient @ state.mT
     else:
@@ -236,10 +231,11 @@ def test_first_and_second_derivatives(law: str, shape: str, dim: int, device: st
     inputs = [t.to(device).requires_grad_() for t in inputs]
 
     def stress(state: Tensor, *rest: Tensor) -> Tensor:
-        return ops.material_stress(law, state, rest[:count], rest[count] if C is not None else None, scene, dim)
+        rate = rest[count] if C is not None else None
+        return ops.law_update(law, state, rest[:count], C=rate, scene=scene, dim=dim).stress
 
     def energy(state: Tensor, *rest: Tensor) -> Tensor:
-        return ops.material_energy(law, state, rest[:count], scene, dim)
+        return ops.law_energy(law, state, rest[:count], scene=scene, dim=dim)
 
     assert torch.autograd.gradcheck(stress, inputs)
     assert torch.autograd.gradgradcheck(stress, inputs)
@@ -255,16 +251,23 @@ def test_opcheck(law: str, dim: int, device: str) -> None:
     C = None if C is None else C.to(device).requires_grad_()
     namespace = torch.ops.torch_mpm
     checks = ("test_schema", "test_autograd_registration", "test_faketensor", "test_aot_dispatch_dynamic")
-    torch.library.opcheck(namespace.material_stress.default, (state, C, scene, parameters, law, dim), test_utils=checks)
-    torch.library.opcheck(namespace.material_energy.default, (state, scene, parameters, law, dim), test_utils=checks)
+    update, energy = (state, C, parameters, [], scene, law, dim, 0, 7), (state, parameters, [], scene, law, dim)
+    torch.library.opcheck(namespace.law_update.default, update, test_utils=checks)
+    torch.library.opcheck(namespace.law_energy.default, energy, test_utils=checks)
     with torch.no_grad():
-        values = (state.detach(), scene, [p.detach() for p in parameters], law, dim)
+        state, values, C = state.detach(), [p.detach() for p in parameters], None if C is None else C.detach()
         grad = torch.randn(5, dim, dim, dtype=torch.float64, device=device)
-        detached = None if C is None else C.detach()
-        torch.library.opcheck(namespace.material_stress_backward.default, (grad, values[0], detached, *values[1:], 7))
-        torch.library.opcheck(namespace.material_energy_backward.default, (grad[:, 0, 0], *values, 5))
-        torch.library.opcheck(namespace.material_stiffness.default, values)
-        torch.library.opcheck(namespace.material_wave_modulus.default, values)
+        by_parameters = torch.randn(5, len(values), dtype=torch.float64, device=device)
+        nothing, rest = (None, None, None), (scene, law, dim)
+        for op, given in (
+            (namespace.law_update_backward, (None, grad, *nothing, state, C, values, [], *rest, 0, 7)),
+            (namespace.law_update_double_backward, (state, C, by_parameters, grad, state, C, values, *rest, 7)),
+            (namespace.law_energy_backward, (grad[:, 0, 0], state, values, [], *rest, 5)),
+            (namespace.law_energy_double_backward, (state, by_parameters, grad[:, 0, 0], state, values, *rest, 5)),
+            (namespace.law_stiffness, (state, values, [], *rest)),
+            (namespace.law_wave_modulus, (state, values, [], *rest)),
+        ):
+            torch.library.opcheck(op.default, given)
 
 
 @pytest.mark.parametrize("count", [0, 1, 15, 16, 17, 100])
@@ -276,7 +279,7 @@ def test_memory_layout_and_number_of_particles_do_not_matter(law: str, count: in
         [p.float().to(device) for p in parameters],
         None if C is None else C.float().to(device),
     )
-    expected = ops.material_stress(law, state, parameters, C, dim=3)
+    expected = ops.law_update(law, state, parameters, C=C, dim=3).stress
     assert expected.stride(0) == 1 and expected.stride(1) == 3 * expected.stride(2) >= 3 * count
 
     def spread(t: Tensor) -> Tensor:
@@ -285,14 +288,13 @@ def test_memory_layout_and_number_of_particles_do_not_matter(law: str, count: in
         wide[..., 0 : 2 * count : 2] = t.permute(*range(1, t.dim()), 0)
         return wide[..., 0 : 2 * count : 2].permute(t.dim() - 1, *range(t.dim() - 1))
 
-    result = ops.material_stress(
-        law, spread(state), [spread(p) for p in parameters], None if C is None else spread(C), dim=3
+    result = ops.law_update(
+        law, spread(state), [spread(p) for p in parameters], C=None if C is None else spread(C), dim=3
     )
-    assert torch.equal(result, expected)
+    assert torch.equal(result.stress, expected)
     for p in range(0, count, 7):  # alone, not in the lanes of a pack
-        alone = ops.material_stress(
-            law, state[p : p + 1], [q[p : p + 1] for q in parameters], None if C is None else C[p : p + 1], dim=3
-        )
+        rate = None if C is None else C[p : p + 1]
+        alone = ops.law_update(law, state[p : p + 1], [q[p : p + 1] for q in parameters], C=rate, dim=3).stress
         assert torch.allclose(alone[0], expected[p], rtol=2e-6, atol=1e-6)
 
 
@@ -303,7 +305,7 @@ def test_wave_speed_refuses_gradients_and_vmap(device: str) -> None:
         law.wave_speed(state_of(F)).sum().backward()
     mu = torch.ones(2, 3, dtype=torch.float64, device=device)
     with pytest.raises(NotImplementedError, match="pack the scenes"):
-        torch.vmap(lambda m: ops.material_stress("neo_hookean", F.detach(), (m, m)))(mu)
+        torch.vmap(lambda m: ops.law_update("neo_hookean", F.detach(), (m, m)).stress)(mu)
 
 
 def test_compiles_to_one_graph(device: str) -> None:
@@ -466,7 +468,7 @@ def test_bad_parameters(build: object, message: str) -> None:
 
 
 def test_bad_arguments() -> None:
-    stress = ops.material_stress
+    stress = ops.law_update
     F, J, one = torch.eye(3).repeat(10, 1, 1), torch.ones(10), torch.ones(1)
     pair, four, scene = (one, one), torch.ones(4), torch.zeros(10, dtype=torch.int32)
     solid, fluid, viscous = "neo_hookean", "weakly_compressible", "viscous_fluid"

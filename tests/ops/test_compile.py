@@ -32,7 +32,7 @@ def fresh_compiler():
 
 
 def make_step(name, device):
-    """A step that was taken once, so that its grid has a capacity, and the state after it."""
+    """A step that was taken once, so that its grid has `max_blocks`, and the state after it."""
     grid = mpm.Grid(0.1, (0, 0), (1, 1), deterministic=True)
     torch.manual_seed(0)
     law = mpm.CustomLaw(LearnedLaw().double().to(device)) if name == "learned law" else mpm.NeoHookean(E=1e4, nu=0.3)
@@ -93,8 +93,8 @@ def test_gradients_of_a_compiled_rollout(name, device):
 
 
 def test_a_rollout_that_was_never_run_compiles_twice(device):
-    """With the capacity given: once without the affine field that the first step adds, once with it."""
-    grid = mpm.Grid(0.1, (0, 0), (1, 1), capacity=9)
+    """With `max_blocks` given: once without the affine field that the first step adds, once with it."""
+    grid = mpm.Grid(0.1, (0, 0), (1, 1), max_blocks=9)
     step = mpm.Step(grid, mpm.NeoHookean(E=1e4, nu=0.3), gravity=(0.0, -9.8))
     points = mpm.seed.box((0.3, 0.3), (0.6, 0.6), 0.1, per_cell=4)
     counter = CompileCounter()

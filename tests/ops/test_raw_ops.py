@@ -23,7 +23,7 @@ COMPARED = ("x", "F", "state", "velocity", "nodes", "r", "gravity", "previous_st
 """What the shapes of other arguments are compared with."""
 ANY_NUMBER = ("mu", "lam", "alpha", "cohesion", "scene_dt", "scene_time", "obstacles")
 """Tensors that are given once, per scene or per particle."""
-TOPOLOGY = ("table", "block", "offsets", "index", "schedule")
+TOPOLOGY = ("table", "block", "offsets", "index", "schedule", "scene")
 
 
 def taking(name: str) -> list[str]:
@@ -57,35 +57,52 @@ def refusals(ops: Sequence[str], changes: Changes) -> None:
 
 def test_sizes_of_the_index_tensors() -> None:
     def changes(arguments: Arguments) -> Iterator[tuple[Arguments, str]]:
-        for name in TOPOLOGY:
-            value = arguments[name]
+        for count in (0, 4, 7):
+            yield {"topology": (2 * arguments["topology"])[:count]}, "topology must be .* got"
+        # The other ops with a topology read its table and block only.
+        read = TOPOLOGY if "x" in arguments else ("table", "block") if "nodes" in arguments else ("block",)
+        for name in read:
+            k = TOPOLOGY.index(name)
+            value = arguments["topology"][k]
+
+            def replaced(other: torch.Tensor, k: int = k) -> Arguments:
+                tensors = arguments["topology"]
+                return {"topology": [*tensors[:k], other, *tensors[k + 1 :]]}
+
             # The table of no scene, of one instead of two, and of less than a whole one.
             sizes = (0, len(value) // 2, len(value) - 1) if name == "table" else (0, 1, len(value) - 1)
-            for size in sizes:
+            for size in sizes if "x" in arguments else ():
                 yield (
-                    {name: value[:size].clone()},
+                    replaced(value[:size].clone()),
                     f"{name} must|entries below the .* of {name}" if name != "block" else "must have shape",
                 )
-            yield {name: value.long()}, f"{name} must be int32, got int64"
-            yield {name: value[:, None]}, f"{name} must have"
-            yield {name: value[0]}, f"{name} must have"
-            yield {name: value[:1].expand(value.shape)}, f"{name} must be contiguous"
+            yield replaced(value.long()), f"{name} must be int32, got int64"
+            yield replaced(value[:, None]), f"{name} must have"
+            yield replaced(value[0]), f"{name} must have"
+            if name != "scene":
+                yield replaced(value[:1].expand(value.shape)), f"{name} must be contiguous"
 
-    refusals(taking("schedule"), changes)
+    refusals(taking("topology"), changes)
 
 
 def test_the_lattice() -> None:
     def changes(arguments: Arguments) -> Iterator[tuple[Arguments, str]]:
-        for dx in (math.nan, math.inf, 0.0, -1.0, 1e-320):
-            yield {"dx": dx}, "dx must be positive and finite, got"
-        lower, blocks = list(arguments["lower"]), list(arguments["blocks"])
-        yield {"lower": [math.nan, *lower[1:]]}, "lower must be finite, got"
-        yield {"lower": lower[1:]}, r"lower must have \d entries, one per axis, got \d"
-        yield {"blocks": [*blocks, 1]}, r"blocks must have \d entries, one per axis, got \d"
-        for count in (0, -1, 2**31, 2**62):
-            yield {"blocks": [count, *blocks[1:]]}, r"blocks must be positive .* got"
+        dx, *lower = arguments["lattice"]
+        order, deterministic, *blocks = arguments["layout"]
+        for wrong in (math.nan, math.inf, 0.0, -1.0, 1e-320):
+            yield {"lattice": [wrong, *lower]}, "dx must be positive and finite, got"
+        yield {"lattice": [dx, math.nan, *lower[1:]]}, "lower must be finite, got"
+        for count in range(len(lower) + 1):
+            yield {"lattice": [dx, *lower][:count]}, r"lattice must .* got"
+        for count in range(len(blocks) + 2):
+            yield {"layout": [order, deterministic, *blocks][:count]}, r"layout must .* got"
+        yield {"layout": [*arguments["layout"], 1]}, r"layout must have \d entries, .* got \d"
+        for wrong in (0, -1, 2**31, 2**62):
+            yield {"layout": [order, deterministic, wrong, *blocks[1:]]}, r"blocks must be positive .* got"
+        for wrong in (-1, 0, 1, 4, 2**40):
+            yield {"layout": [wrong, deterministic, *blocks]}, "order must be 2 or 3, got"
 
-    refusals(taking("dx"), changes)
+    refusals(taking("lattice"), changes)
 
 
 def test_expected_and_given_shapes_are_told() -> None:
@@ -93,7 +110,7 @@ def test_expected_and_given_shapes_are_told() -> None:
 
     def changes(arguments: Arguments) -> Iterator[tuple[Arguments, str]]:
         for name, value in arguments.items():
-            if not isinstance(value, torch.Tensor) or name in (*TOPOLOGY, *COMPARED, *ANY_NUMBER):
+            if not isinstance(value, torch.Tensor) or name in (*COMPARED, *ANY_NUMBER):
                 continue
             shape = re.escape(str(list(value[1:].shape)))
             yield {name: value[1:]}, rf"{name} must .*got {shape}"
@@ -127,8 +144,8 @@ def test_activation_without_scenes() -> None:
             yield {"scenes": 0, "scene": scene}, "x must have no particles where scenes is 0, got 37"
         yield {"scenes": -1}, "scenes must not be negative, got -1"
         yield {"scenes": 2**40}, r"scenes times blocks must be below 2\^31"
-        yield {"capacity": -1}, "capacity must not be negative, got -1"
-        yield {"capacity": 2**40}, r"capacity must be at most \d+, got"
+        yield {"max_blocks": -1}, "max_blocks must not be negative, got -1"
+        yield {"max_blocks": 2**40}, r"max_blocks must be at most \d+, got"
         yield {"previous_status": arguments["previous_status"][:2]}, r"previous_status must have shape \[3, 8\]"
 
     refusals(["activate"], changes)
@@ -154,6 +171,16 @@ def test_iterations_of_a_heat_solve() -> None:
     refusals(taking("max_iterations"), changes)
 
 
+def malformed_tensors(arguments: Arguments) -> Iterator[tuple[str, Any]]:
+    """Each tensor, also of the topology, with all dimensions fewer and with one more."""
+    for name, value in arguments.items():
+        if isinstance(value, torch.Tensor):
+            yield from ((name, value.new_empty(())), (name, value[None]))
+        if name == "topology":
+            for k, t in enumerate(value):
+                yield from ((name, [*value[:k], wrong, *value[k + 1 :]]) for wrong in (t.new_empty(()), t[None]))
+
+
 def test_malformed_arguments_of_fake_kernels() -> None:
     """On the meta device: the results of the op, and errors that name an argument."""
     for _, name, arguments in CALLS:
@@ -161,9 +188,8 @@ def test_malformed_arguments_of_fake_kernels() -> None:
         meta = {n: tree_map_only(torch.Tensor, lambda t: t.to("meta"), value) for n, value in arguments.items()}
         results, fakes = tree_flatten(op(*arguments.values()))[0], tree_flatten(op(*meta.values()))[0]
         assert [(t.shape, t.dtype) for t in results] == [(t.shape, t.dtype) for t in fakes]
-        for changed, value in meta.items():
-            for wrong in (value.new_empty(()), value[None]) if isinstance(value, torch.Tensor) else ():
-                try:
-                    op(*(meta | {changed: wrong}).values())
-                except (RuntimeError, ValueError, TypeError) as error:
-                    assert calls.is_clear(error), f"{name}, {changed}: {error}"
+        for changed, wrong in malformed_tensors(meta):
+            try:
+                op(*(meta | {changed: wrong}).values())
+            except (RuntimeError, ValueError, TypeError) as error:
+                assert calls.is_clear(error), f"{name}, {changed}: {error}"

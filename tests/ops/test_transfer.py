@@ -307,10 +307,9 @@ def test_opcheck(device, dim, kernel):
     grad = torch.randn(blocks.node_count, 1 + dim, dtype=torch.float64, device=device)
     dt = torch.tensor([0.1, 0.2], dtype=torch.float64, device=device)
     tensors = [t.clone().requires_grad_() for t in (p.x, p.mass, p.v, p.C, p.stress, p.volume, dt)]
-    top = blocks.topology
+    top = blocks.packed
     value, moment = p.v.clone().requires_grad_(), p.C.clone().requires_grad_()
-    grid = p.grid
-    activation = (p.x, p.scene, None, 2, grid.dx, grid.lower, grid.blocks, grid.order, grid.capacity, False)
+    activation = (p.x, p.scene, None, None, 2, p.grid.max_blocks, *p.grid.packed)
     checks = {
         ops.activate.default: activation,
         ops.p2g.default: (*tensors, 1.0, 0, *top),
@@ -329,7 +328,7 @@ def test_vmap_is_refused(dim):
     p = random_particles(dim, sizes=(4,))
     blocks = p.blocks()
     with pytest.raises(NotImplementedError, match="pack the scenes"):
-        torch.vmap(lambda m: torch.ops.torch_mpm.p2g(p.x, m, p.v, None, None, None, None, 0.0, 0, *blocks.topology))(
+        torch.vmap(lambda m: torch.ops.torch_mpm.p2g(p.x, m, p.v, None, None, None, None, 0.0, 0, *blocks.packed))(
             torch.ones(2, 4, dtype=torch.float64)
         )
 

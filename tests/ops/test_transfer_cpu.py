@@ -36,7 +36,7 @@ def particles(dim, count, dtype=torch.float32, seed=0):
 
 def run_all(blocks, x, mass, v, C, stress, volume, form=MLS):
     """Every transfer op once, by name."""
-    topology = blocks.topology
+    topology = blocks.packed
     p2g = OPS.p2g(x, mass, v, C, stress, volume, None, 0.1, form, *topology)
     random = torch.Generator().manual_seed(9)
     nodes = torch.randn(p2g.shape, generator=random, dtype=torch.float64).to(x.dtype)
@@ -135,10 +135,10 @@ def test_index_groups_particles_by_block(dim):
     scene = torch.randint(0, 2, (3000,), dtype=torch.int32, generator=torch.Generator().manual_seed(1))
     blocks = grid.activate(x, scene)
     base = torch.floor((x.double() - 0.1) / grid.dx + 3 - 0.5).long()
-    home = scene.long()
+    entry = scene.long()
     for axis in range(dim):
-        home = home * grid.blocks[axis] + base[:, axis] // 4
-    slot = blocks.table[home]
+        entry = entry * grid.blocks[axis] + base[:, axis] // 4
+    slot = blocks.table[entry]
     assert torch.equal(blocks.index.long(), torch.argsort(slot, stable=True))
     assert torch.equal(
         blocks.offsets, torch.searchsorted(slot.sort()[0], torch.arange(len(blocks.offsets)), out_int32=True)
@@ -179,7 +179,7 @@ def test_more_than_four_channels_of_sorted_particles():
     value, moment = value.double(), moment.double()
     blocks = grid.activate(x)
     nodes = torch.randn(blocks.node_count, 6, generator=random).double()
-    result = OPS.position_gradient(x, value, moment, None, nodes, 2.0, *blocks.topology)
+    result = OPS.position_gradient(x, value, moment, None, nodes, 2.0, *blocks.packed)
     expected = reference.position_gradient(blocks, x, value, moment, None, nodes, 2.0)
     torch.testing.assert_close(result, expected, rtol=1e-10, atol=1e-10)
 
@@ -231,15 +231,15 @@ def test_particles_outside_give_and_take_nothing(dim):
 
 
 @pytest.mark.parametrize("dim", DIMENSIONS)
-@pytest.mark.parametrize("capacity", [0, 1, 7])
-def test_overflow_leaves_out_whole_particles(dim, capacity):
+@pytest.mark.parametrize("max_blocks", [0, 1, 7])
+def test_overflow_leaves_out_whole_particles(dim, max_blocks):
     grid = make_grid(dim)
     inputs = particles(dim, 2000, torch.float64)
     x, mass = inputs[:2]
     wanted = grid.activate(x).wanted
     assert wanted > 7
-    tensors = OPS.activate(x, None, None, 1, grid.dx, grid.lower, grid.blocks, grid.order, capacity, grid.deterministic)
-    blocks = mpm.grid.Blocks(grid, *tensors, None)
+    tensors = OPS.activate(x, None, None, None, 1, max_blocks, *grid.packed)
+    blocks = mpm.grid.Blocks(grid, *tensors[:5], None, tensors[5])
     assert blocks.status.tolist() == [[wanted, 0, -1, 0, -1, 1, 0, wanted], [0, 0, -1, 0, -1, 0, -1, 0]]
     assert torch.equal(blocks.index.sort()[0], torch.arange(2000, dtype=torch.int32))
     count = int(blocks.offsets[-1])

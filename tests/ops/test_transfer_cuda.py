@@ -14,7 +14,7 @@ pytestmark = pytest.mark.cuda
 
 def uneven_particles(dim: int, kernel: str, **options: object) -> Particles:
     """Two scenes of 4000: two thousand in one cell, the rest spread, many alone in their block, some outside or NaN."""
-    options = {"capacity": 5400 if dim == 2 else 3450} | options
+    options = {"max_blocks": 5400 if dim == 2 else 3450} | options
     p = random_particles(dim, kernel, (4000, 4000), dx=0.1 if dim == 3 else 0.02, extent=4.0, **options)
     x = p.x.clone()
     cell = torch.tensor([0.523, 0.541, 0.562][:dim])
@@ -69,12 +69,12 @@ def test_a_scene_that_does_not_exist_is_outside(dim, kernel, scene_value):
     assert status[1] == len(p.x) - 2 and status[3] == 2 and status[7] == 0 and out[2].eq(0).all()
 
 
-@pytest.mark.parametrize("capacity", [0, 1, 7, 100])
-def test_an_overflow_drops_whole_particles(dim, kernel, capacity):
-    p = uneven_particles(dim, kernel, capacity=capacity).to("cuda", torch.float64)
+@pytest.mark.parametrize("max_blocks", [0, 1, 7, 100])
+def test_an_overflow_drops_whole_particles(dim, kernel, max_blocks):
+    p = uneven_particles(dim, kernel, max_blocks=max_blocks).to("cuda", torch.float64)
     blocks = p.blocks()
     transferred = int(blocks.offsets[-1])
-    assert blocks.status[0, 0] > capacity and blocks.status[0, 6] == 0
+    assert blocks.status[0, 0] > max_blocks and blocks.status[0, 6] == 0
     index = blocks.index.long()
     assert torch.equal(index.sort().values, torch.arange(len(p.x), device="cuda"))
     nodes = mpm.p2g(blocks, p.x, p.mass, p.v, p.C)

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.autograd.graph import saved_tensors_hooks
 
-from ..capture import Kept
+from ..capture import GraphCache
 from ..errors import check_count, check_number, shape_of
 from ..parameters import TensorModule
 from ..reference.contact import contact_change
@@ -95,8 +95,8 @@ class Obstacle(TensorModule):
         self.kind, self.friction = kind, friction
         self.start, self.end = float(start), float(end)
         self.scene = scene
-        self._constants: dict[tuple[str, torch.device, torch.dtype], Kept] = {}
-        self.kept_table = Kept()
+        self._constants: dict[tuple[str, torch.device, torch.dtype], GraphCache] = {}
+        self.kept_table = GraphCache()
         """Kept by `torch_mpm.ops.contact` for a list of obstacles that begins with this one."""
 
     # -- what a shape defines
@@ -230,7 +230,7 @@ class Obstacle(TensorModule):
         """Numbers as a tensor; copied to a device once, so that later steps do not wait and can be captured."""
         if torch.compiler.is_compiling() or type(like) not in (Tensor, torch.nn.Parameter):
             return torch.tensor(value, dtype=like.dtype, device=like.device)
-        kept = self._constants.setdefault((name, like.device, like.dtype), Kept())
+        kept = self._constants.setdefault((name, like.device, like.dtype), GraphCache())
         return kept.get((value,), lambda: torch.tensor(value, dtype=like.dtype, device=like.device), like)
 
     # -- motion

@@ -16,12 +16,13 @@ import torch
 from torch import Tensor
 
 from ..boundaries.obstacles import Obstacle, _norm, _per_node
+from ..bspline import base_node, bspline
 from ..errors import NUMBER_OR_TENSOR, check_number, check_real, shape_of
-from ..grid import BLOCK_WIDTH, PADDING, Blocks
-from ..laws.material import _check_value
+from ..grid import Blocks
+from ..laws.compiled import check_value
 from ..ops import scatter
 from ..parameters import TensorModule, Value, evaluate
-from ..reference.transfer import bspline
+from ..topology import PADDING
 
 if TYPE_CHECKING:
     from ..state import State
@@ -44,7 +45,7 @@ class HeatNodes:
         state: the particles before the step.
         volume: their present volumes [P] [m³].
         conductance: conductivity times volume κ V of the particles [P] [W m²/K in 3-D].
-        capacity: heat capacity of the nodes [N] [J/K]; zero where there is no matter.
+        heat_capacity: heat capacity of the nodes [N] [J/K]; zero where there is no matter.
         theta: temperature of the nodes [N] [K], relative to `reference`.
         reference: absolute temperature that temperatures are relative to [K].
         source: heat into the nodes [N] [W], or None.
@@ -58,7 +59,7 @@ class HeatNodes:
     state: State
     volume: Tensor
     conductance: Tensor
-    capacity: Tensor
+    heat_capacity: Tensor
     theta: Tensor
     reference: float = 0.0
     source: Tensor | None = None
@@ -172,7 +173,7 @@ class Surface(TensorModule):
         density = _at(density, nodes.time)
         points = self.points.to(nodes.theta)
         rows, weight = node_weights(nodes.blocks, points, self.scene)
-        weight = weight * (nodes.capacity.detach()[rows] > 0)
+        weight = weight * (nodes.heat_capacity.detach()[rows] > 0)
         total = weight.sum(1, keepdim=True)
         weight = torch.where(total > 0, weight / torch.where(total > 0, total, 1), 0)
         amount = (torch.ones_like(points[:, 0]) * self.area * density).to(points)
@@ -200,21 +201,11 @@ def node_weights(blocks: Blocks, x: Tensor, scene: Tensor | None) -> tuple[Tenso
     """Rows [S, K] of the nodes around any points [S, D], and their weights N_i [S, K], zero for inactive nodes."""
     grid = blocks.grid
     cells = torch.stack([(x[:, a] - grid.lower[a]) / grid.dx + PADDING for a in range(grid.dim)], 1)
-    base = torch.floor(cells.detach() - (0.5 if grid.order == 2 else 1.0)).long()
     steps = torch.arange(grid.order + 1, device=x.device)
-    node = base[:, None] + torch.cartesian_prod(*[steps] * grid.dim)
+    node = base_node(cells.detach(), grid.order)[:, None] + torch.cartesian_prod(*[steps] * grid.dim)
     weight = bspline(node - cells[:, None], grid.order).prod(-1)
-    inside = torch.ones_like(node[..., 0], dtype=torch.bool)
-    index = torch.zeros_like(node[..., 0]) if scene is None else scene.long()[:, None].expand(node.shape[:2])
-    local = torch.zeros_like(node[..., 0])
-    for axis, extent in enumerate(grid.blocks):
-        at = node[..., axis]
-        inside = inside & (at >= 0) & (at < extent * BLOCK_WIDTH)
-        index = index * extent + at.clamp(0, extent * BLOCK_WIDTH - 1) // BLOCK_WIDTH
-        local = local * BLOCK_WIDTH + at % BLOCK_WIDTH
-    slot = blocks.table.long()[index]
-    inside = inside & (slot >= 0)
-    return torch.where(inside, slot * grid.nodes_per_block + local, 0), torch.where(inside, weight, 0)
+    rows = blocks.rows_at(node, scene)
+    return rows.clamp_min(0), torch.where(rows >= 0, weight, 0)
 
 
 # ---- terms
@@ -316,7 +307,7 @@ class Fixed(Term):
             where = self.region(positions)
             if not isinstance(where, Tensor) or where.shape != nodes.theta.shape or where.dtype != torch.bool:
                 raise ValueError(f"region must return bool [N] = {list(nodes.theta.shape)}, got {shape_of(where)}")
-        nodes.hold(where & (nodes.capacity > 0), nodes.per_node(self.temperature))
+        nodes.hold(where & (nodes.heat_capacity > 0), nodes.per_node(self.temperature))
 
 
 class FixedSurface(Term):
@@ -362,7 +353,7 @@ class Source(Term):
     """
 
     def __init__(self, power: Value) -> None:
-        self.power = _check_value("power", power, "finite", lambda v: v == v)
+        self.power = check_value("power", power, "finite", lambda v: v == v)
 
     def apply(self, nodes: HeatNodes) -> None:  # type: ignore[override]
         power = evaluate("power", self.power, nodes.state) * nodes.volume

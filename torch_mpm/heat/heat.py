@@ -27,13 +27,14 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor, nn
 
+from ..activation_record import ActivationRecord
 from ..boundaries import BoundaryList
 from ..boundaries.obstacles import _norm
 from ..capture import outside_transforms, without_transforms
 from ..errors import check_like, check_number
 from ..failures import Failures, Problem, raise_failures, unsolved_heat
-from ..grid import ActivationRecord, Blocks, Grid, check_grid
-from ..laws.material import _check_value
+from ..grid import Blocks, Grid, check_grid
+from ..laws.compiled import check_value
 from ..laws.thermal import LIQUID, determinant
 from ..ops import gather, heat_cg, scatter
 from ..ops.arguments import check_choice, per_particle
@@ -128,13 +129,13 @@ class Heat(nn.Module):
         self.plastic_heating, self.reference = float(plastic_heating), float(reference)
         self.tolerance, self.max_iterations, self.method = float(tolerance), int(max_iterations), method
         not_negative, positive = (lambda v: v >= 0), (lambda v: v > 0)
-        store(self, "conductivity", _check_value("conductivity", conductivity, "not negative", not_negative))
-        store(self, "specific_heat", _check_value("specific_heat", specific_heat, "positive", positive))
+        store(self, "conductivity", check_value("conductivity", conductivity, "not negative", not_negative))
+        store(self, "specific_heat", check_value("specific_heat", specific_heat, "positive", positive))
         self.melts = latent_heat is not None
         if melting_point is not None and latent_heat is not None:
-            _check_value("melting_point", melting_point, "a number", lambda v: v == v, infinite=True)
+            check_value("melting_point", melting_point, "a number", lambda v: v == v, infinite=True)
             store(self, "melting_point", melting_point)
-            store(self, "latent_heat", _check_value("latent_heat", latent_heat, "positive", positive))
+            store(self, "latent_heat", check_value("latent_heat", latent_heat, "positive", positive))
         self._activations = ActivationRecord()
         self.unsolved: Tensor | None = None
         """Solves of each scene so far that missed their tolerance, int32 [B], and the largest residual [B] [K]."""
@@ -258,12 +259,12 @@ class Heat(nn.Module):
         gradient: Tensor | None,
         blend: float | Tensor,
     ) -> tuple[HeatNodes, Tensor]:
-        """Heat capacity and temperature θ_i of the nodes, and what particles are smoothed to, θ̄_i [N]."""
+        """Heat heat_capacity and temperature θ_i of the nodes, and what particles are smoothed to, θ̄_i [N]."""
         weights = heat_capacity[:, None]
         if isinstance(blend, Tensor):
             weights = torch.stack([heat_capacity, heat_capacity * blend], 1)
-        capacity, mean = _averages(blocks, state.x, weights, theta, gradient)
-        nodes = HeatNodes(blocks, state, volume, conductance, capacity[:, 0], mean[:, 0], self.reference)
+        totals, mean = _averages(blocks, state.x, weights, theta, gradient)
+        nodes = HeatNodes(blocks, state, volume, conductance, totals[:, 0], mean[:, 0], self.reference)
         return nodes, mean[:, -1]
 
     def _solve(self, nodes: HeatNodes, dt: float | Tensor) -> Tensor:
@@ -274,7 +275,7 @@ class Heat(nn.Module):
             start = torch.where(nodes.fixed, nodes.held, start)
         boundary = nodes.source, nodes.exchange, nodes.fixed
         solve = heat_cg(
-            nodes.blocks, nodes.state.x, conductance, nodes.capacity, start, dt, *boundary, tolerance=NEGLIGIBLE,
+            nodes.blocks, nodes.state.x, conductance, nodes.heat_capacity, start, dt, *boundary, tolerance=NEGLIGIBLE,
             relative_tolerance=self.tolerance, max_iterations=self.max_iterations, method=self.method,
         )  # fmt: skip
         solved = solve.converged

@@ -1,24 +1,26 @@
-"""Constitutive laws: modules from the deformation of a state to its Kirchhoff stress."""
+"""Constitutive laws: modules from the deformation of a state to its Kirchhoff stress.
 
-from .material import CustomLaw, Material, Mixture, NeoHookean, WeaklyCompressible
-from .plastic import CamClay, CustomPrincipalLaw, FixedCorotated, Hencky, HerschelBulkley, Snow, VonMises
-from .sand import QuarticSand
-from .thermal import Melting, ThermalExpansion
+A law is a `Material`. Most are compiled (`CompiledLaw`); `CustomLaw` makes one of any module, `Mixture` combines
+several in one state. A new compiled law is a class in `solids` or `fluids`, named in the `__all__` of that module.
+"""
+
+from . import custom, fluids, mixture, sand, solids, thermal
+from .compiled import CompiledLaw as CompiledLaw
+from .compiled import SolidLaw as SolidLaw
+from .custom import *  # noqa: F403
+from .fluids import *  # noqa: F403
+from .material import Material
+from .mixture import *  # noqa: F403
+from .sand import *  # noqa: F403
+from .solids import *  # noqa: F403
+from .thermal import *  # noqa: F403
 
 __all__ = [
-    "CamClay",
-    "CustomLaw",
-    "CustomPrincipalLaw",
-    "FixedCorotated",
-    "Hencky",
-    "HerschelBulkley",
     "Material",
-    "Melting",
-    "Mixture",
-    "NeoHookean",
-    "QuarticSand",
-    "Snow",
-    "ThermalExpansion",
-    "VonMises",
-    "WeaklyCompressible",
+    *custom.__all__,
+    *fluids.__all__,
+    *mixture.__all__,
+    *sand.__all__,
+    *solids.__all__,
+    *thermal.__all__,
 ]

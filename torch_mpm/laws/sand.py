@@ -9,25 +9,23 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from ..capture import Kept
+from ..capture import GraphCache
 from ..errors import check_flag, check_number
-from ..ops.sand import ANGLE, ReturnMap, quartic_energy, quartic_return_map, quartic_stiffness
-from ..reference.material import per_particle
-from ..reference.sand import ENERGIES, friction_alpha
-from .material import SolidLaw, Value, _check_value
+from ..ops.arguments import per_parameter
+from ..ops.law import DISSIPATED, MULTIPLIER
+from ..ops.registry import LAWS
+from ..ops.sand import ANGLE, ENERGIES, friction_alpha, law_name
+from ..parameters import Value
+from .compiled import SolidLaw, check_value
 
 if TYPE_CHECKING:
     from ..state import State
 
 
+__all__ = ["QuarticSand"]
+
 VOLUME, HARDENING = "volume_correction", "hardening"
 """Keys of `State.extra` under which a law keeps v_c and q [P]."""
-
-
-def _kept(name: str, state: State) -> Tensor:
-    """A field of `State.extra`, zero at first."""
-    value = state.extra.get(name)
-    return torch.zeros_like(state.mass) if value is None else value
 
 
 class QuarticSand(SolidLaw):
@@ -61,6 +59,7 @@ class QuarticSand(SolidLaw):
             tensor is changed or trained.
     """
 
+    name = "sand_unilateral"
     friction_angle: Any  # numbers, buffers, nn.Parameters or functions of temperature
     cohesion: Any
 
@@ -84,19 +83,19 @@ class QuarticSand(SolidLaw):
             raise ValueError(f"energy must be one of {sorted(ENERGIES)}, got {energy!r}")
         if apex not in ("zero", "keep") or (apex == "keep" and energy != "unilateral"):
             raise ValueError(f"apex must be 'zero' or, with energy='unilateral', 'keep', got {apex!r} with {energy!r}")
-        check_number("smallest_strain", smallest_strain, "finite and not negative", lambda v: 0 <= v < math.inf)
+        quantity = LAWS[self.name].parameter("smallest_strain")
+        check_number("smallest_strain", smallest_strain, quantity.expected, lambda v: 0 <= v < math.inf)
         if flow not in ("radial", "exact"):
             raise ValueError(f"flow must be 'radial' or 'exact', got {flow!r}")
         self._set_friction(friction_angle, hardening)
-        self.cohesive = cohesion is not None
-        if cohesion is not None:
-            self._store("cohesion", _check_value("cohesion", cohesion, "finite and not negative", lambda v: v >= 0))
+        self.name = f"sand_{energy}"
+        self._add("cohesion", 0.0 if cohesion is None else cohesion)
         self.energy_form, self.apex, self.smallest_strain = energy, apex, float(smallest_strain)
         self.flow, self.volume_correction = flow, check_flag("volume_correction", volume_correction)
         self.extra_fields = tuple(
             name for name, used in ((VOLUME, volume_correction), (HARDENING, hardening is not None)) if used
         )
-        self._kept_slope = Kept()
+        self._kept_slope = GraphCache()
 
     def _set_friction(self, angle: Value | None, hardening: Sequence[Value] | None) -> None:
         expected: tuple[str, Callable[[Any], Any]] = (ANGLE, lambda v: (v >= 0) & (v < math.pi / 2))
@@ -109,40 +108,33 @@ class QuarticSand(SolidLaw):
             values = hardening
         for name, value in zip(self._friction, values, strict=True):
             limits = ("finite and not negative", lambda v: v >= 0) if name in ("h1", "h2") else expected
-            self._store(name, _check_value(name, value, *limits))
+            self._store(name, check_value(name, value, *limits))
         first, last = values[0], values[-1]
         if isinstance(first, float) and isinstance(last, float) and last > first:
             raise ValueError(f"h3 must not be above h0 (in radians), got {last} and {first}")
 
     def values(self) -> Sequence[Value]:
-        """μ and λ [Pa], the friction angle [rad] or the constants of its hardening, and the cohesion if given."""
-        cohesion = (self.cohesion,) if self.cohesive else ()
-        return *super().values(), *(getattr(self, name) for name in self._friction), *cohesion
+        """μ and λ [Pa], the friction angle [rad] or the constants of its hardening, cohesion and smallest strain."""
+        friction = (getattr(self, name) for name in self._friction)
+        return *self._lame(), *friction, self.cohesion, self.smallest_strain
 
-    def return_map(self, state: State, details: bool = False) -> ReturnMap:
-        """The whole result of the return map: branches, convergence and, with details, multiplier and dissipation."""
-        F, (mu, lam, *friction) = self._arguments(state)
-        cohesion = friction.pop() if self.cohesive else None
-        return quartic_return_map(
-            F,
-            mu,
-            lam,
-            alpha=self._slope(self._friction_angle(friction, state), F.shape[1]),
-            scene=state.scene,
-            energy=self.energy_form,
-            apex=self.apex,
-            details=details,
-            flow=self.flow,
-            cohesion=cohesion,
-            volume_correction=_kept(VOLUME, state) if self.volume_correction else None,
-        )
+    def _arguments(self, state: State) -> tuple[Tensor, list[Tensor]]:
+        F, (mu, lam, *friction, cohesion, smallest) = super()._arguments(state)
+        slope = self._slope(self._friction_angle(friction, state), F.shape[1])
+        return F, [mu, lam, slope, cohesion, smallest]
+
+    def _name(self, state: State) -> str:
+        return law_name(self.energy_form, self.flow, state.x.shape[1])
+
+    def _options(self) -> Sequence[str]:
+        return ("keep_apex",) if self.apex == "keep" else ()
 
     def _friction_angle(self, constants: Sequence[Tensor], state: State) -> Tensor:
         """As it is given, or [P] after hardening (Klár et al. 2016, equation 29)."""
         if HARDENING not in self.extra_fields:
             return constants[0]
-        q = _kept(HARDENING, state)
-        h0, h1, h2, h3 = (per_particle(h, state.scene, len(q)) for h in constants)
+        q = self._hardening(state)
+        h0, h1, h2, h3 = (per_parameter(h, state.scene, len(q)) for h in constants)
         return h0 + (h1 * q - h3) * (-h2 * q).exp()
 
     def _slope(self, angle: Tensor, dim: int) -> Tensor:
@@ -152,27 +144,18 @@ class QuarticSand(SolidLaw):
         key = (angle, angle._version, dim)
         return self._kept_slope.get(key, lambda: friction_alpha(angle, dim), angle)
 
+    def _hardening(self, state: State) -> Tensor:
+        q = state.extra.get(HARDENING)
+        return torch.zeros_like(state.mass) if q is None else q
+
     def update(self, state: State) -> tuple[dict[str, Tensor], Tensor]:
-        result = self.return_map(state, details=self.dissipation or HARDENING in self.extra_fields)
-        fields: dict[str, Any] = {"F": result.F}
+        hardens = HARDENING in self.extra_fields
+        result = self.return_map(state, DISSIPATED * self.dissipation | MULTIPLIER * hardens)
+        fields = {"F": result.state}
         if self.volume_correction:
-            fields[VOLUME] = result.volume_correction
-        if HARDENING in self.extra_fields and result.multiplier is not None:
-            fields[HARDENING] = _kept(HARDENING, state) + result.multiplier
-        if self.dissipation:
+            (fields[VOLUME],) = result.history
+        if result.multiplier is not None:
+            fields[HARDENING] = self._hardening(state) + result.multiplier
+        if result.dissipated is not None:
             fields["dissipated"] = result.dissipated
         return fields, result.stress
-
-    def energy_density(self, state: State) -> Tensor:
-        """Elastic energy per rest volume [P] [J/m³] of the projected F."""
-        _, (mu, lam, *_) = self._arguments(state)
-        return quartic_energy(self.return_map(state).F, mu, lam, state.scene, self.energy_form)
-
-    def stiffness(self, state: State) -> Tensor:
-        """Upper bound of the elastic tangent modulus [P] [Pa]."""
-        F, (mu, lam, *_) = self._arguments(state)
-        return quartic_stiffness(F, mu, lam, state.scene, self.energy_form, self.smallest_strain)
-
-    def wave_modulus(self, state: State) -> Tensor:
-        """Upper bound of rest density times squared wave speed [P] [Pa]: `stiffness`."""
-        return self.stiffness(state)

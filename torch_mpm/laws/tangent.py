@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from ..parameters import With
+from ..parameters import Overlay
 
 if TYPE_CHECKING:
     from ..state import State
@@ -26,11 +26,11 @@ def differentiated_stiffness(law: Material, state: State) -> Tensor:
     """
     fields = [name for name in law.state_fields if name in ("F", "J") and getattr(state, name) is not None]
     with torch.inference_mode(False), torch.no_grad():
-        given: Any = With(state, **{name: getattr(state, name).clone() for name in fields})
+        given: Any = Overlay(state, **{name: getattr(state, name).clone() for name in fields})
         changes, _ = law.update(given)
         leaves = {name: changes.get(name, getattr(given, name)).detach().clone().requires_grad_() for name in fields}
         history = {name: value for name, value in changes.items() if name in law.extra_fields}
-        moved: Any = With(given, **leaves, extra={**state.extra, **history})
+        moved: Any = Overlay(given, **leaves, extra={**state.extra, **history})
         with torch.enable_grad():
             _, stress = law.update(moved)
             tangent = _tangent(stress, leaves)

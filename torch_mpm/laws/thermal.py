@@ -9,11 +9,15 @@ import torch
 from torch import Tensor
 
 from ..errors import check_number
-from ..parameters import Value, With, evaluate, needed_temperature, store
-from .material import Material, _check_value, as_law
+from ..parameters import Overlay, Value, evaluate, needed_temperature, store
+from .compiled import check_value
+from .custom import as_law
+from .material import Material
 
 if TYPE_CHECKING:
     from ..state import State
+
+__all__ = ["Melting", "ThermalExpansion"]
 
 LIQUID = "liquid"
 """Key of `State.extra` under which `Heat` keeps the liquid mass fraction [P] of a material that melts."""
@@ -40,7 +44,7 @@ class ThermalExpansion(Material):
         self.law = law = as_law("law", law)
         self.state_fields, self.extra_fields = law.state_fields, law.extra_fields
         self.viscous = law.viscous
-        store(self, "coefficient", _check_value("coefficient", coefficient, "finite", lambda v: v == v))
+        store(self, "coefficient", check_value("coefficient", coefficient, "finite", lambda v: v == v))
 
     def update(self, state: State) -> tuple[dict[str, Tensor], Tensor]:
         stretch = self._stretch(state)
@@ -51,6 +55,9 @@ class ThermalExpansion(Material):
         if "J" in fields:
             changes["J"] = fields["J"] * stretch ** state.x.shape[1]
         return changes, stress
+
+    def initial(self, name: str, state: State) -> Tensor:
+        return self.law.initial(name, state)
 
     def energy_density(self, state: State) -> Tensor:
         return self.law.energy_density(self._elastic(state))
@@ -77,7 +84,7 @@ class ThermalExpansion(Material):
             changes["F"] = state.F / stretch[:, None, None]
         if "J" in self.state_fields and state.J is not None:
             changes["J"] = state.J / stretch ** state.x.shape[1]
-        return With(state, **changes)
+        return Overlay(state, **changes)
 
 
 class Melting(Material):
@@ -121,6 +128,9 @@ class Melting(Material):
             changes["dissipated"] = torch.where(flows, 0, fields["dissipated"])
         weight = fraction[:, None, None]
         return changes, torch.where(flows[:, None, None], liquid, torch.lerp(solid, liquid, weight))
+
+    def initial(self, name: str, state: State) -> Tensor:
+        return self.solid.initial(name, state)
 
     def energy_density(self, state: State) -> Tensor:
         return self._mixed(state, lambda law, part: law.energy_density(part))
@@ -167,7 +177,9 @@ class Melting(Material):
         dim = F.shape[1]
         root = J.where(flows & (J > 0), 1) ** (1 / dim)
         isotropic = torch.diag_embed(root[:, None].expand(-1, dim))
-        return With(state, F=torch.where(flows[:, None, None], isotropic, F), J=torch.where(flows, J, determinant(F)))
+        return Overlay(
+            state, F=torch.where(flows[:, None, None], isotropic, F), J=torch.where(flows, J, determinant(F))
+        )
 
 
 def determinant(F: Tensor) -> Tensor:

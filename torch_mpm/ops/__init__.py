@@ -1,8 +1,8 @@
 """The Python faces of the ops: checks, fake kernels, autograd.
 
 The ops themselves, `torch.ops.torch_mpm.*`, check sizes, dtypes, devices and numbers as well, and raise RuntimeError.
-Their index tensors `table`, `block`, `offsets`, `index` and `schedule` must be those of one call of `activate`, with
-its `dx`, `lower`, `blocks` and `order`: their sizes are checked, but not their values, and others can make a
+The last three arguments `topology`, `lattice` and `layout` are `Blocks.packed`. The index tensors in `topology` must be
+those of one call of `activate` with this lattice: their sizes are checked, but not their values, and others can make a
 kernel read or write outside of its tensors.
 """
 
@@ -12,14 +12,16 @@ from .contact import contact, fusible
 from .g2p_advance import g2p_advance
 from .grid_update import grid_update
 from .heat import HeatSolve, heat_cg, heat_operator
-from .material import material_energy, material_stiffness, material_stress, material_wave_modulus
-from .principal import principal_energy, principal_stiffness, principal_update, principal_wave_modulus
+from .law import LawUpdate, law_energy, law_stiffness, law_update, law_wave_modulus
+from .registry import LAWS
 from .sand import quartic_energy, quartic_return_map, quartic_stiffness, quartic_stress
 from .svd import polar, svd3
 from .transfer import g2p, gather, p2g, scatter
 
 __all__ = [
+    "LAWS",
     "HeatSolve",
+    "LawUpdate",
     "advance",
     "contact",
     "fusible",
@@ -29,16 +31,12 @@ __all__ = [
     "grid_update",
     "heat_cg",
     "heat_operator",
-    "material_energy",
-    "material_stiffness",
-    "material_stress",
-    "material_wave_modulus",
+    "law_energy",
+    "law_stiffness",
+    "law_update",
+    "law_wave_modulus",
     "p2g",
     "polar",
-    "principal_energy",
-    "principal_stiffness",
-    "principal_update",
-    "principal_wave_modulus",
     "quartic_energy",
     "quartic_return_map",
     "quartic_stiffness",

@@ -15,25 +15,22 @@ from .arguments import refuse_vmap, sizes
 def _activate_fake(
     x: Tensor,
     scene: Tensor | None,
+    ids: Tensor | None,
     previous_status: Tensor | None,
     scenes: int,
-    dx: float,
-    lower: Sequence[float],
-    blocks: Sequence[int],
-    order: int,
-    capacity: int,
-    deterministic: bool,
-    ids: Tensor | None = None,
+    max_blocks: int,
+    lattice: Sequence[float],
+    layout: Sequence[int],
 ) -> tuple[Tensor, ...]:
     def ints(*shape: int) -> Tensor:
         return x.new_empty(shape, dtype=torch.int32)
 
     P, dim = sizes(x, "x", 2)
-    schedule = 16 + (8 + 4**dim // 2) * (capacity + P // 128) + P  # csrc/transfer/arguments.h
+    schedule = 16 + (8 + 4**dim // 2) * (max_blocks + P // 128) + P  # csrc/grid/topology.h
     return (
-        ints(scenes * math.prod(blocks)),
-        ints(capacity),
-        ints(capacity + 1),
+        ints(scenes * math.prod(layout[2:])),
+        ints(max_blocks),
+        ints(max_blocks + 1),
         ints(x.shape[0]),
         ints(schedule),
         ints(1 + scenes, 8),

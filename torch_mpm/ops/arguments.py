@@ -44,6 +44,13 @@ def per_particle(value: Tensor, scene: Tensor | None, particles: int) -> Tensor:
     return value.index_select(0, scene)
 
 
+def per_parameter(value: Tensor, scene: Tensor | None, particles: int) -> Tensor:
+    """A parameter of shape [], [1], [B] or [P] as [P]."""
+    if value.numel() == 1:
+        return value.reshape(1).expand(particles)
+    return value if value.numel() == particles else per_particle(value, scene, particles)
+
+
 def sum_by_scene(value: Tensor, scene: Tensor | None, scenes: int) -> Tensor:
     """Sum of a per-particle tensor [P, ...] over the particles of each scene, [B, ...]."""
     if scene is None:

@@ -9,6 +9,8 @@ import torch
 from torch._functorch.utils import enable_single_level_autograd_function
 from torch.autograd import forward_ad
 
+from ..topology import PackedTopology
+
 _transformed = torch._C._are_functorch_transforms_active
 _LIBRARY = torch.library.Library("torch_mpm", "IMPL")
 
@@ -34,13 +36,15 @@ def register_autograd(
 ) -> None:
     """As `torch.library.register_autograd`, which reads the op's schema anew at every call: most of the time it takes.
 
+    The tensors of a `topology` are integers: they are passed on in their list, and `save_with_topology` keeps them.
+
     Args:
         name: of the op. No argument may have a default value.
         backward: (ctx, *grads) to the gradients of all arguments; a list of them for a list of tensors.
         setup: (ctx, inputs, output), or None where backward needs nothing.
     """
     op = getattr(torch.ops.torch_mpm, name).default
-    lists = [i for i, argument in enumerate(op._schema.arguments) if str(argument.type) == "List[Tensor]"]
+    lists = [i for i, a in enumerate(op._schema.arguments) if str(a.type) == "List[Tensor]" and a.name != "topology"]
 
     def forward(ctx: Any, lengths: list[int], *flat: Any) -> Any:
         arguments = _nested(flat, lists, lengths)
@@ -76,6 +80,23 @@ def register_autograd(
         return record(*flat)
 
     _LIBRARY.impl(name, kernel, "Autograd")
+
+
+def save_with_topology(
+    ctx: Any, tensors: Sequence[torch.Tensor | None], topology: PackedTopology, **attributes: Any
+) -> None:
+    """Keep the tensors of an op and the topology that are its last three arguments for the backward pass."""
+    ctx.save_for_backward(*tensors, *topology[0])
+    ctx.topology = len(tensors), *topology[1:]
+    for name, value in attributes.items():
+        setattr(ctx, name, value)
+
+
+def saved_with_topology(ctx: Any) -> tuple[list[Any], PackedTopology]:
+    """What `save_with_topology` kept."""
+    saved = list(ctx.saved_tensors)  # once: a checkpointed region unpacks a tensor only once
+    count, *lattice = ctx.topology
+    return saved[:count], (saved[count:], *lattice)
 
 
 def _for_outer_levels(op: Any, arguments: Sequence[Any]) -> Any:

@@ -13,9 +13,10 @@ from ..boundaries import Box, Capsule, Obstacle, Plane, Sphere
 from ..errors import NUMBER_OR_TENSOR, check_like, check_real, shape_of
 from ..grid import Blocks, check_blocks
 from ..reference.obstacles import contact as reference
+from ..topology import Topology
 from .arguments import check_list, differentiate, refuse_vmap, sizes
-from .autograd import dispatch, register_autograd
-from .grid_update import CONTACT_KINDS, _blocks_of
+from .autograd import dispatch, register_autograd, save_with_topology, saved_with_topology
+from .grid_update import CONTACT_KINDS
 
 MAX_OBSTACLES = 16  # of one call, csrc/grid/obstacle.h
 SHAPES: dict[type, int] = {Plane: 0, Sphere: 1, Box: 2, Capsule: 3}
@@ -85,10 +86,7 @@ def contact(blocks: Blocks, velocity: Tensor, obstacles: Sequence[Obstacle], tim
             [o.end for o in group],
             scene_time,
             number,
-            blocks.block,
-            grid.dx,
-            grid.lower,
-            grid.blocks,
+            *blocks.packed,
         )
         velocity = rows[:, 1:]
     return velocity
@@ -163,29 +161,27 @@ def _backward_fake(grad, velocity, *arguments):
 
 
 def _setup(ctx: Any, inputs: Any, output: Any) -> None:
-    velocity, obstacles, *kinds, scene_time, time, block, dx, lower, blocks = inputs
-    ctx.save_for_backward(velocity, obstacles, scene_time, block)
-    ctx.kinds, ctx.time, ctx.geometry = kinds, time, (dx, lower, blocks)
+    velocity, obstacles, *kinds, scene_time, time = inputs[:-3]
+    save_with_topology(ctx, (velocity, obstacles, scene_time), inputs[-3:], kinds=kinds, time=time)
 
 
 def _backward(ctx, grad):
-    velocity, obstacles, scene_time, block = ctx.saved_tensors
+    (velocity, obstacles, scene_time), topology = saved_with_topology(ctx)
     rows = dispatch(
         torch.ops.torch_mpm.contact_backward,
-        *(_packed(grad[:, 1:]), velocity, obstacles, *ctx.kinds, scene_time, ctx.time, block, *ctx.geometry),
+        *(_packed(grad[:, 1:]), velocity, obstacles, *ctx.kinds, scene_time, ctx.time, *topology),
     )
-    return (rows[:, 1:],) + (None,) * 12
+    return (rows[:, 1:],) + (None,) * 11
 
 
 def _backward_setup(ctx: Any, inputs: Any, output: Any) -> None:
-    grad, velocity, obstacles, *kinds, scene_time, time, block, dx, lower, blocks = inputs
-    ctx.save_for_backward(grad, velocity, obstacles, scene_time, block)
-    ctx.kinds, ctx.time, ctx.geometry = kinds, time, (dx, lower, blocks)
+    grad, velocity, obstacles, *kinds, scene_time, time = inputs[:-3]
+    save_with_topology(ctx, (grad, velocity, obstacles, scene_time), inputs[-3:], kinds=kinds, time=time)
 
 
 def _double_backward(ctx, grad_rows):
-    grad, velocity, obstacles, scene_time, block = ctx.saved_tensors
-    blocks = _blocks_of(block, block, *ctx.geometry)
+    (grad, velocity, obstacles, scene_time), topology = saved_with_topology(ctx)
+    blocks = Topology.unpack(*topology)
     shape, kind, scene, start, end = ctx.kinds
 
     def adjoint(grad: Tensor, velocity: Tensor) -> Any:
@@ -195,7 +191,7 @@ def _double_backward(ctx, grad_rows):
         return differentiate(after, [velocity], [grad])[0]
 
     grads = differentiate(adjoint, [grad, velocity], [grad_rows[:, 1:]])
-    return (*grads,) + (None,) * 12
+    return (*grads,) + (None,) * 11
 
 
 register_autograd("contact", _backward, _setup)

@@ -8,10 +8,11 @@ import torch
 from torch import Tensor
 
 from ..errors import check_like, check_positions
-from ..grid import Blocks, check_blocks, inverse_inertia
+from ..grid import Blocks, check_blocks
+from ..topology import Topology
 from .arguments import check_choice, refuse_vmap, sizes, soa_empty, split_dt, sum_by_scene
-from .autograd import dispatch, register_autograd
-from .transfer import STRESS_FORMS, TOPOLOGY, _blocks_of, _check_nodes, _save, _saved
+from .autograd import dispatch, register_autograd, save_with_topology, saved_with_topology
+from .transfer import STRESS_FORMS, _check_nodes
 
 
 def g2p_advance(
@@ -56,7 +57,7 @@ def g2p_advance(
     number, scene_dt = split_dt(dt, grid.scenes, x)
     next_x, v, C, next_F, next_J = dispatch(
         torch.ops.torch_mpm.g2p_advance,
-        *(x, velocity, F, J, scene_dt, number, affine, STRESS_FORMS[stress_form], *blocks.topology),
+        *(x, velocity, F, J, scene_dt, number, affine, STRESS_FORMS[stress_form], *blocks.packed),
     )
     return next_x, v, C if affine else None, None if F is None else next_F, None if J is None else next_J
 
@@ -73,19 +74,20 @@ def _setup(ctx: Any, inputs: Any, output: Any) -> None:
     x, velocity, F, J, scene_dt, dt, affine, stress_form, *topology = inputs
     _, v, C, _, _ = output
     # The backward pass reads v and C, which the next step keeps alive anyway.
-    _save(ctx, (x, velocity, F, J, scene_dt, v, C), topology, dt=dt, affine=affine, mls=stress_form == 0)
+    save_with_topology(ctx, (x, velocity, F, J, scene_dt, v, C), topology, dt=dt, affine=affine, mls=stress_form == 0)
 
 
 def _backward(ctx, grad_x, grad_v, grad_C, grad_F, grad_J):
-    (x, velocity, F, J, scene_dt, v, C), topology = _saved(ctx)
+    (x, velocity, F, J, scene_dt, v, C), topology = saved_with_topology(ctx)
     need_x, need_velocity, need_F, need_J, need_dt = ctx.needs_input_grad[:5]
     need_nodes, moves = need_x or need_velocity, F is not None or J is not None
-    scale = inverse_inertia(topology[8], topology[5])
+    blocks = Topology.unpack(*topology)
+    scale = blocks.grid.inverse_inertia
     L = C if ctx.mls else None  # the velocity gradient that moved F and J
     if moves and not (ctx.mls and ctx.affine):
         _, C, grad_v_field = dispatch(torch.ops.torch_mpm.gather, x, velocity, scale, ctx.mls, not ctx.mls, *topology)
         L = C if ctx.mls else grad_v_field
-    scene = _blocks_of(topology, x).scene if scene_dt is not None and scene_dt.shape[0] > 1 else None
+    scene = blocks.particle_scene() if scene_dt is not None and scene_dt.shape[0] > 1 else None
     wanted = (need_nodes, need_nodes and moves, need_F, need_J, need_dt)
     needs = sum(1 << i for i, needed in enumerate(wanted) if needed)
     given = (grad_x, None if F is None else grad_F, None if J is None else grad_J)
@@ -110,7 +112,7 @@ def _backward(ctx, grad_x, grad_v, grad_C, grad_F, grad_J):
     if need_dt:
         grad_dt = ctx.dt * sum_by_scene(grad_dt, scene, scene_dt.shape[0])
     grads = zip((grad_x, grad_velocity, grad_F, grad_J, grad_dt), ctx.needs_input_grad[:5], strict=True)
-    return (*(g if needed else None for g, needed in grads),) + (None,) * (3 + TOPOLOGY)
+    return (*(g if needed else None for g, needed in grads),) + (None,) * 6
 
 
 register_autograd("g2p_advance", _backward, _setup)

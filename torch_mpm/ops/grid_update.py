@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import torch
@@ -10,10 +9,11 @@ from torch import Tensor
 
 from ..boundaries import Face, Walls
 from ..errors import FLOATING, check_like, shape_of
-from ..grid import BLOCK_WIDTH, Blocks, Grid, check_blocks
+from ..grid import Blocks, check_blocks
 from ..reference import grid_update as reference
+from ..topology import Topology
 from .arguments import differentiate, refuse_vmap, sizes, split_dt
-from .autograd import dispatch, register_autograd
+from .autograd import dispatch, register_autograd, save_with_topology, saved_with_topology
 
 CONTACT_KINDS = {"open": 0, "sticky": 1, "slip": 2, "separate": 3, "mirror": 4}  # csrc/grid/friction.h
 
@@ -70,11 +70,7 @@ def grid_update(
         [CONTACT_KINDS[face.kind] for face in faces],
         [face.plane for face in faces],
         [face.friction for face in faces],
-        blocks.table,
-        blocks.block,
-        grid.dx,
-        grid.lower,
-        grid.blocks,
+        *blocks.packed,
     )
     return updated[:, 1:]
 
@@ -96,8 +92,8 @@ def _fake(nodes, *arguments):
 
 
 @torch.library.register_fake("torch_mpm::grid_update_backward")
-def _backward_fake(grad, wants_change, nodes, gravity, scene_dt, dt, kind, plane, friction, table, block, *geometry):
-    slots = sizes(block, "block", 1)[0] if wants_change else 0
+def _backward_fake(grad, wants_change, nodes, gravity, scene_dt, dt, kind, plane, friction, *topology):
+    slots = sizes(Topology.unpack(*topology).block, "block", 1)[0] if wants_change else 0
     return nodes.new_empty(nodes.shape), nodes.new_empty(slots, sizes(nodes, "nodes", 2)[1] - 1)
 
 
@@ -105,45 +101,44 @@ def _backward_fake(grad, wants_change, nodes, gravity, scene_dt, dt, kind, plane
 
 
 def _setup(ctx: Any, inputs: Any, output: Any) -> None:
-    nodes, gravity, scene_dt, dt, kind, plane, friction, table, block, *geometry = inputs
-    ctx.save_for_backward(nodes, gravity, scene_dt, table, block)
-    ctx.dt, ctx.walls, ctx.geometry = dt, (kind, plane, friction), geometry
+    nodes, gravity, scene_dt, dt, kind, plane, friction, *topology = inputs
+    save_with_topology(ctx, (nodes, gravity, scene_dt), topology, dt=dt, walls=(kind, plane, friction))
 
 
 def _backward(ctx, grad):
-    nodes, gravity, scene_dt, table, block = ctx.saved_tensors
+    (nodes, gravity, scene_dt), topology = saved_with_topology(ctx)
     need_nodes, need_gravity, need_dt, *_ = ctx.needs_input_grad
     grad_nodes, change = dispatch(
         torch.ops.torch_mpm.grid_update_backward,
-        *(grad, need_gravity or need_dt, nodes, gravity, scene_dt, ctx.dt, *ctx.walls, table, block, *ctx.geometry),
+        *(grad, need_gravity or need_dt, nodes, gravity, scene_dt, ctx.dt, *ctx.walls, *topology),
     )
     grad_gravity = grad_dt = None
     if need_gravity or need_dt:
-        change = _sum_by_scene(change, block, ctx.geometry[2], gravity.shape[0])
+        change = _sum_by_scene(change, Topology.unpack(*topology), gravity.shape[0])
         if need_gravity:
             grad_gravity = ctx.dt * (change if scene_dt is None else scene_dt[:, None] * change)
         if need_dt:
             grad_dt = ctx.dt * (gravity * change).sum(1)
-    return (grad_nodes if need_nodes else None, grad_gravity, grad_dt) + (None,) * 9
+    return (grad_nodes if need_nodes else None, grad_gravity, grad_dt) + (None,) * 7
 
 
-def _sum_by_scene(change: Tensor, block: Tensor, blocks: list[int], scenes: int) -> Tensor:
-    """Sum of slot values [capacity, D] over the slots of each scene, [B, D]."""
+def _sum_by_scene(change: Tensor, blocks: Topology, scenes: int) -> Tensor:
+    """Sum of slot values [max_blocks, D] over the slots of each scene, [B, D]."""
     if scenes < 2:
         return change.sum(0, keepdim=True)[:scenes]
-    scene = block.clamp_min(0) // math.prod(blocks)
+    scene = blocks.block_scene().clamp_min(0)
     return change.new_zeros(scenes, change.shape[1]).index_add(0, scene, change)
 
 
 def _backward_setup(ctx: Any, inputs: Any, output: Any) -> None:
-    grad, wants_change, nodes, gravity, scene_dt, dt, kind, plane, friction, table, block, *geometry = inputs
-    ctx.save_for_backward(grad, nodes, gravity, scene_dt, table, block)
-    ctx.wants_change, ctx.dt, ctx.walls, ctx.geometry = wants_change, dt, (kind, plane, friction), geometry
+    grad, wants_change, nodes, gravity, scene_dt, dt, kind, plane, friction, *topology = inputs
+    options = {"wants_change": wants_change, "dt": dt, "walls": (kind, plane, friction)}
+    save_with_topology(ctx, (grad, nodes, gravity, scene_dt), topology, **options)
 
 
 def _double_backward(ctx, grad_grad_nodes, grad_change):
-    *tensors, table, block = ctx.saved_tensors
-    blocks = _blocks_of(table, block, *ctx.geometry)
+    tensors, topology = saved_with_topology(ctx)
+    blocks = Topology.unpack(*topology)
     names = list(CONTACT_KINDS)
     faces = [Face(names[kind], plane, friction) for kind, plane, friction in zip(*ctx.walls, strict=True)]
 
@@ -154,21 +149,13 @@ def _double_backward(ctx, grad_grad_nodes, grad_change):
             dt = ctx.dt if scene_dt is None else ctx.dt * scene_dt
             return reference.grid_update(blocks, rows, gravity, dt, faces)
 
-        change = nodes.new_zeros(block.shape[0], nodes.shape[1] - 1)
+        change = nodes.new_zeros(blocks.block.shape[0], nodes.shape[1] - 1)
         both = differentiate(updated, (nodes, change), [grad])
         return tuple(both) if ctx.wants_change else both[0]
 
     given = [grad_grad_nodes, grad_change] if ctx.wants_change else [grad_grad_nodes]
     grad, nodes, gravity, scene_dt = differentiate(adjoint, tensors, given)
-    return (grad, None, nodes, gravity, scene_dt) + (None,) * 9
-
-
-def _blocks_of(table: Tensor, block: Tensor, dx: float, lower: list[float], per_axis: list[int]) -> Blocks:
-    """As much of a `Blocks` as the reference reads."""
-    grid = Grid.__new__(Grid)
-    grid.dx, grid.lower, grid.blocks, grid.dim = dx, tuple(lower), tuple(per_axis), len(lower)
-    grid.nodes_per_block = BLOCK_WIDTH**grid.dim
-    return Blocks(grid, table, block, block, block, block, block, None)
+    return (grad, None, nodes, gravity, scene_dt) + (None,) * 7
 
 
 register_autograd("grid_update", _backward, _setup)

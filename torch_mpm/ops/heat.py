@@ -9,13 +9,13 @@ import torch
 from torch import Tensor
 
 from ..errors import NUMBER_OR_TENSOR, check_like, check_number, check_positions, shape_of
-from ..grid import Blocks, check_blocks, inverse_inertia
-from .arguments import check_choice, refuse_vmap, sizes, split_dt
-from .autograd import dispatch, register_autograd
+from ..grid import Blocks, check_blocks
+from ..topology import PackedTopology, Topology
+from .arguments import check_choice, refuse_vmap, split_dt
+from .autograd import dispatch, register_autograd, save_with_topology, saved_with_topology
 from .heat_multigrid import heat_multigrid
 from .heat_refinement import REDUCTION
 from .heat_refinement import refine as refinement
-from .transfer import TOPOLOGY, _blocks_of
 
 METHODS = {"cg": 0, "chebyshev": 1, "multigrid": 2}  # the first two are HeatMethod of csrc/heat/solve.h
 
@@ -33,7 +33,7 @@ def heat_cg(
     blocks: Blocks,
     x: Tensor,
     conductance: Tensor,
-    capacity: Tensor,
+    heat_capacity: Tensor,
     theta: Tensor,
     dt: float | Tensor,
     source: Tensor | None = None,
@@ -48,7 +48,7 @@ def heat_cg(
 ) -> HeatSolve:
     """Implicit step of the heat equation on the active nodes, by matrix-free conjugate gradients.
 
-    Solves (M/dt + H + X) d = h − (H + X) θ for the increment d, with M the lumped capacity, X the exchange, h the
+    Solves (M/dt + H + X) d = h − (H + X) θ for the increment d, with M the lumped heat capacity, X the exchange, h the
     source and H_ij = Σ_p κ_p V_p ∇Φ_i · ∇Φ_j, ∇Φ_i = D⁻¹ N_i (x_i − x_p) (Gao et al. 2018, supplement, equation 10).
     Scenes are solved apart, each with its own time step, tolerance and iterations, and stop apart.
 
@@ -56,7 +56,7 @@ def heat_cg(
         blocks: active blocks of these positions.
         x: positions [P, D] [m].
         conductance: conductivity times volume κ_p V_p [P] [W m²/K in 3-D].
-        capacity: lumped heat capacity of the nodes M_i = Σ m_p C_p N_i [N] [J/K].
+        heat_capacity: lumped heat capacity of the nodes M_i = Σ m_p C_p N_i [N] [J/K].
         theta: temperature of the nodes θ [N] [K], relative to a reference.
         dt: time step [s]: a number, or a tensor of shape [], [1] or [B].
         source: heat into the nodes h [N] [W].
@@ -83,9 +83,9 @@ def heat_cg(
 
     Returns:
         HeatSolve(increment, iterations, residual, converged). The increment is zero on fixed nodes, on nodes without
-        capacity and outside the active blocks. A scene whose data are not finite, or whose time step is not positive,
-        stays as it is (increment zero, converged false) and leaves the others alone. A scene that is closed (neither
-        exchange nor fixed nodes) keeps its energy, Σ M d = dt Σ h, however early the solve ends.
+        heat capacity and outside the active blocks. A scene whose data are not finite, or whose time step is not
+        positive, stays as it is (increment zero, converged false) and leaves the others alone. A scene that is closed
+        (neither exchange nor fixed nodes) keeps its energy, Σ M d = dt Σ h, however early the solve ends.
 
     Raises:
         ValueError, TypeError: for wrong shapes, dtypes or devices, or numbers out of range.
@@ -97,7 +97,7 @@ def heat_cg(
     check_positions(x, grid.dim, blocks.scene, grid.scenes)
     P, N = x.shape[0], blocks.node_count
     check_like("conductance", conductance, x, (P,), "[P]")
-    for name, value in (("capacity", capacity), ("theta", theta), ("source", source), ("exchange", exchange)):
+    for name, value in (("heat_capacity", heat_capacity), ("theta", theta), ("source", source), ("exchange", exchange)):
         check_like(name, value, x, (N,), "[N]")
     if fixed is not None and (not isinstance(fixed, Tensor) or fixed.shape != (N,) or fixed.dtype != torch.bool):
         raise ValueError(f"fixed must be a bool tensor of shape [N] = [{N}], got {shape_of(fixed)}")
@@ -118,22 +118,24 @@ def heat_cg(
     if not refine or x.dtype == torch.float64:
         return HeatSolve(
             *dispatch(
-                op, x, conductance, capacity, theta, source, exchange, fixed, scene_dt, number, scene_tolerance,
-                *limits, *blocks.topology,
+                op, x, conductance, heat_capacity, theta, source, exchange, fixed, scene_dt, number, scene_tolerance,
+                *limits, *blocks.packed,
             )
         )  # fmt: skip
-    constant = [None if t is None else t.detach() for t in (x, conductance, capacity, exchange, scene_dt)]
+    constant = [None if t is None else t.detach() for t in (x, conductance, heat_capacity, exchange, scene_dt)]
 
     def solve(right: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        x, conductance, capacity, exchange, scene_dt = constant
+        x, conductance, heat_capacity, exchange, scene_dt = constant
         return dispatch(
-            op, x, conductance, capacity, None, right, exchange, fixed, scene_dt, number, scene_tolerance, limits[0],
-            REDUCTION, *limits[2:], *blocks.topology,
+            op, x, conductance, heat_capacity, None, right, exchange, fixed, scene_dt, number, scene_tolerance,
+            limits[0], REDUCTION, *limits[2:], *blocks.packed,
         )  # fmt: skip
 
     steps = number * (x.new_ones(grid.scenes) if scene_dt is None else scene_dt)
     goal = x.new_full((grid.scenes,), least) if scene_tolerance is None else scene_tolerance
-    return HeatSolve(*refinement(blocks, x, conductance, capacity, theta, steps, source, exchange, fixed, goal, solve))
+    return HeatSolve(
+        *refinement(blocks, x, conductance, heat_capacity, theta, steps, source, exchange, fixed, goal, solve)
+    )
 
 
 def heat_operator(blocks: Blocks, x: Tensor, conductance: Tensor, nodes: Tensor | None) -> Tensor:
@@ -157,7 +159,7 @@ def heat_operator(blocks: Blocks, x: Tensor, conductance: Tensor, nodes: Tensor 
     check_positions(x, blocks.grid.dim, blocks.scene, blocks.grid.scenes)
     check_like("conductance", conductance, x, (x.shape[0],), "[P]")
     check_like("nodes", nodes, x, (blocks.node_count,), "[N]")
-    return dispatch(torch.ops.torch_mpm.heat_operator, x, conductance, nodes, *blocks.topology)
+    return dispatch(torch.ops.torch_mpm.heat_operator, x, conductance, nodes, *blocks.packed)
 
 
 def _op_of(method: int) -> Any:
@@ -187,16 +189,10 @@ torch.library.impl("torch_mpm::heat_multigrid", "CompositeExplicitAutograd")(hea
 
 @torch.library.register_fake("torch_mpm::heat_cg")
 @torch.library.register_fake("torch_mpm::heat_multigrid")
-def _fake(x, conductance, capacity, theta, source, exchange, fixed, *arguments):
-    (table, *_, blocks, _, _) = arguments[-TOPOLOGY:]
-    per_scene = 1
-    for n in blocks:
-        if n < 1:
-            raise ValueError(f"blocks must be positive, got {list(blocks)}")
-        per_scene *= n
-    scenes = sizes(table, "table", 1)[0] // per_scene
+def _fake(x, conductance, heat_capacity, theta, source, exchange, fixed, *arguments):
+    scenes = Topology.unpack(*arguments[-3:]).scenes
     return (
-        torch.empty_like(capacity, memory_format=torch.contiguous_format),
+        torch.empty_like(heat_capacity, memory_format=torch.contiguous_format),
         x.new_empty(scenes, dtype=torch.int32),
         x.new_empty(scenes),
         x.new_empty(scenes, dtype=torch.bool),
@@ -205,7 +201,7 @@ def _fake(x, conductance, capacity, theta, source, exchange, fixed, *arguments):
 
 @torch.library.register_fake("torch_mpm::heat_operator")
 def _operator_fake(x, conductance, nodes, *topology):
-    return x.new_empty(sizes(topology[1], "block", 1)[0] * 4 ** sizes(x, "x", 2)[1])
+    return x.new_empty(Topology.unpack(*topology).node_count)
 
 
 # ---- autograd: with A λ = ∂L/∂d on the free nodes, changes δA of the matrix and δb of the right side of A d = b change
@@ -213,22 +209,20 @@ def _operator_fake(x, conductance, nodes, *topology):
 
 
 def _setup(ctx: Any, inputs: Any, output: Any) -> None:
-    *tensors, scene_dt, dt, _, _, _, scene_limit, max_iterations, method, adjoint_tolerance = inputs[:-TOPOLOGY]
-    topology = inputs[-TOPOLOGY:]
-    ctx.save_for_backward(*tensors, scene_dt, scene_limit, output[0], *topology[:5])
-    ctx.dt, ctx.max_iterations, ctx.method, ctx.adjoint_tolerance = dt, max_iterations, method, adjoint_tolerance
-    ctx.geometry = topology[5:]
+    *tensors, scene_dt, dt, _, _, _, scene_limit, max_iterations, method, adjoint_tolerance = inputs[:-3]
+    save_with_topology(ctx, (*tensors, scene_dt, scene_limit, output[0]), inputs[-3:], dt=dt)
+    ctx.max_iterations, ctx.method, ctx.adjoint_tolerance = max_iterations, method, adjoint_tolerance
     ctx.mark_non_differentiable(*output[1:])
 
 
 def _backward(ctx: Any, grad: Tensor, *_: Any) -> tuple[Any, ...]:
-    x, conductance, capacity, theta, _, exchange, fixed, scene_dt, scene_limit, d, *topology = ctx.saved_tensors
-    topology = (*topology, *ctx.geometry)
+    tensors, topology = saved_with_topology(ctx)
+    x, conductance, heat_capacity, theta, _, exchange, fixed, scene_dt, scene_limit, d = tensors
     need_x, need_conductance, need_capacity, need_theta, need_source, need_exchange, _, need_dt = ctx.needs_input_grad[
         :8
     ]
     adjoint = _op_of(ctx.method)(
-        x, conductance, capacity, None, grad.contiguous(), exchange, fixed, scene_dt, ctx.dt, None, 0.0,
+        x, conductance, heat_capacity, None, grad.contiguous(), exchange, fixed, scene_dt, ctx.dt, None, 0.0,
         ctx.adjoint_tolerance, scene_limit, ctx.max_iterations, ctx.method, ctx.adjoint_tolerance, *topology,
     )[0]  # fmt: skip
     after = d if theta is None else theta + d
@@ -243,27 +237,26 @@ def _backward(ctx: Any, grad: Tensor, *_: Any) -> tuple[Any, ...]:
             grads[3] = grads[3] - exchange * adjoint
     rate = -adjoint * d
     if need_capacity or need_dt:
-        blocks = _blocks_of(topology, x)
-        scene = blocks.node_scene().long().clamp_min(0)
+        scene = Topology.unpack(*topology).node_scene().long().clamp_min(0)
         # Where dt is not positive, nothing is solved: both d and λ are zero.
         steps = ctx.dt if scene_dt is None else torch.where(scene_dt > 0, ctx.dt * scene_dt, 1)[scene]
         if need_capacity:
             grads[2] = rate / steps
         if need_dt:
-            per_node = -rate * capacity / steps**2 * ctx.dt
+            per_node = -rate * heat_capacity / steps**2 * ctx.dt
             grads[7] = per_node.new_zeros(scene_dt.shape).index_add(0, scene, per_node)
     if need_source:
         grads[4] = adjoint
     if need_exchange:
         grads[5] = -adjoint * after
-    return (*grads,) + (None,) * (8 + TOPOLOGY)
+    return (*grads,) + (None,) * 11
 
 
 def _operator_adjoint(
-    x: Tensor, conductance: Tensor, u: Tensor, v: Tensor, topology: Any, need_x: bool
+    x: Tensor, conductance: Tensor, u: Tensor, v: Tensor, topology: PackedTopology, need_x: bool
 ) -> tuple[Tensor | None, Tensor]:
     """Derivatives of v · H u = Σ_p κ_p V_p ∇u · ∇v by the positions and by κ V."""
-    scale = inverse_inertia(topology[8], topology[5])
+    scale = Topology.unpack(*topology).grid.inverse_inertia
     nodes = [w[:, None].contiguous() for w in (u, v)]
     gradient = [dispatch(torch.ops.torch_mpm.gather, x, w, scale, True, False, *topology)[1] for w in nodes]
     by_conductance = (gradient[0] * gradient[1]).sum((1, 2))
@@ -281,13 +274,11 @@ def _operator_adjoint(
 
 def _operator_setup(ctx: Any, inputs: Any, output: Any) -> None:
     x, conductance, nodes, *topology = inputs
-    ctx.save_for_backward(x, conductance, nodes, *topology[:5])
-    ctx.geometry = topology[5:]
+    save_with_topology(ctx, (x, conductance, nodes), topology)
 
 
 def _operator_backward(ctx: Any, grad: Tensor) -> tuple[Any, ...]:
-    x, conductance, nodes, *topology = ctx.saved_tensors
-    topology = (*topology, *ctx.geometry)
+    (x, conductance, nodes), topology = saved_with_topology(ctx)
     if nodes is None:
         raise NotImplementedError("the diagonal of heat_operator is not differentiable")
     need_x, need_conductance, need_nodes = ctx.needs_input_grad[:3]
@@ -297,7 +288,7 @@ def _operator_backward(ctx: Any, grad: Tensor) -> tuple[Any, ...]:
         for_x, for_conductance = _operator_adjoint(x, conductance, nodes, grad, topology, need_x)
     if need_nodes:
         for_nodes = dispatch(torch.ops.torch_mpm.heat_operator, x, conductance, grad, *topology)
-    return (for_x, for_conductance if need_conductance else None, for_nodes) + (None,) * TOPOLOGY
+    return (for_x, for_conductance if need_conductance else None, for_nodes) + (None,) * 3
 
 
 for _name, _adjoint, _context in (

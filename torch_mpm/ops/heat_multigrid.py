@@ -16,17 +16,17 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ..bspline import bspline
 from ..capture import is_captured
 from ..errors import check_like, shape_of
-from ..grid import BLOCK_WIDTH, INT32_MAX, PADDING, Blocks, Grid
-from ..reference.transfer import bspline
+from ..grid import INT32_MAX, Grid
+from ..topology import BLOCK_WIDTH, PADDING, Topology
 from .heat_patches import Patches, lattice_rows
-from .transfer import _grid_of
 
 DEGREE, COARSE_DEGREE = 4, 2
 """Of the smoother's polynomial, on the finest level and on the others."""
 COARSEST = 3
-"""Blocks along the longest side of the domain at which coarsening ends: five cells."""
+"""Topology along the longest side of the domain at which coarsening ends: five cells."""
 COARSE_REDUCTION, COARSE_ITERATIONS = 1e-2, 40
 """Of the residual on the coarsest level, where conjugate gradients solve."""
 POWER_ITERATIONS, MARGIN = 8, 1.1
@@ -36,8 +36,8 @@ POWER_ITERATIONS, MARGIN = 8, 1.1
 class Scenes:
     """Sums over the nodes of each scene, and values of scenes at their nodes."""
 
-    def __init__(self, blocks: Blocks) -> None:
-        self.blocks, self.count = blocks, blocks.grid.scenes
+    def __init__(self, blocks: Topology) -> None:
+        self.blocks, self.count = blocks, blocks.scenes
         self.node = None if self.count == 1 else blocks.node_scene().long().clamp_min(0)
 
     def sum(self, nodes: Tensor) -> Tensor:
@@ -59,7 +59,7 @@ class Transfer:
     The 4^D nodes of a fine block b take from the 4^D coarse nodes 2 b + 1 ... 2 b + 4, with the same weights in each.
     """
 
-    def __init__(self, fine: Blocks, coarse: Blocks, like: Tensor) -> None:
+    def __init__(self, fine: Topology, coarse: Topology, like: Tensor) -> None:
         dim, device = fine.grid.dim, like.device
         local = torch.arange(BLOCK_WIDTH, device=device)
         # From the first: a coarse spline's share in its fine ones is the spline of one order less at their distance.
@@ -100,7 +100,7 @@ class Level:
         transfer: from the next level; None on the coarsest.
     """
 
-    blocks: Blocks
+    blocks: Topology
     x: Tensor
     conductance: Tensor
     weight: Tensor
@@ -111,7 +111,7 @@ class Level:
 
     def product(self, u: Tensor) -> Tensor:
         """H u."""
-        return torch.ops.torch_mpm.heat_operator(self.x, self.conductance, u, *self.blocks.topology)
+        return torch.ops.torch_mpm.heat_operator(self.x, self.conductance, u, *self.blocks.packed)
 
     def apply(self, u: Tensor) -> Tensor:
         """A u on the free nodes, for u that is zero on the others; anything there."""
@@ -132,7 +132,7 @@ class Level:
 
 
 def _level(
-    blocks: Blocks,
+    blocks: Topology,
     x: Tensor,
     conductance: Tensor,
     weight: Tensor,
@@ -157,32 +157,33 @@ def _level(
     return level
 
 
-def _coarse_grid(grid: Grid) -> Grid:
-    """Lattice of twice the node distance whose splines are sums of those of `grid`."""
+def _coarse_grid(fine: Topology) -> Grid:
+    """Grid of twice the node distance whose splines are sums of those of `fine`."""
+    grid = fine.grid
     shift = 0.5 if grid.order == 2 else 0.0
     lower = [a - shift * grid.dx for a in grid.lower]
     upper = [a + (BLOCK_WIDTH * n - 1 - 2 * PADDING) * grid.dx for a, n in zip(grid.lower, grid.blocks, strict=True)]
     kernel = "quadratic" if grid.order == 2 else "cubic"
-    return Grid(2 * grid.dx, lower, upper, grid.scenes, kernel, deterministic=grid.deterministic)
+    return Grid(2 * grid.dx, lower, upper, fine.scenes, kernel, deterministic=grid.deterministic)
 
 
 def _coarsen(level: Level, weight: Tensor) -> Level:
     """The next level; `weight` has M/dt + X, and what stands for held nodes."""
     fine, given = level.blocks, level.conductance[:, None]
-    conductance = torch.ops.torch_mpm.scatter(level.x, given, None, None, 1.0, *fine.topology)[:, 0].contiguous()
+    conductance = torch.ops.torch_mpm.scatter(level.x, given, None, None, 1.0, *fine.packed)[:, 0].contiguous()
     # Nodes without conductance are nowhere, and left out of the activation.
     x = torch.where((conductance.abs() > 0)[:, None], fine.node_positions(level.x.dtype), torch.nan).T.contiguous().T
-    grid = _coarse_grid(fine.grid)
+    grid = _coarse_grid(fine)
     scene = None if grid.scenes == 1 else fine.node_scene().clamp_min(0).int()
     blocks = grid._activate(x, scene, None, min(grid.block_count, fine.block.shape[0]))
     level.transfer = Transfer(fine, blocks, x)
-    weight = torch.ops.torch_mpm.scatter(x, weight[:, None], None, None, 1.0, *blocks.topology)[:, 0].contiguous()
-    diagonal = torch.ops.torch_mpm.heat_operator(x, conductance, None, *blocks.topology)
+    weight = torch.ops.torch_mpm.scatter(x, weight[:, None], None, None, 1.0, *blocks.packed)[:, 0].contiguous()
+    diagonal = torch.ops.torch_mpm.heat_operator(x, conductance, None, *blocks.packed)
     return _level(blocks, x, conductance, weight, (weight > 0).to(x), diagonal)
 
 
 def _levels(
-    blocks: Blocks, x: Tensor, conductance: Tensor, weight: Tensor, free: Tensor, held: Tensor, diagonal: Tensor
+    blocks: Topology, x: Tensor, conductance: Tensor, weight: Tensor, free: Tensor, held: Tensor, diagonal: Tensor
 ) -> list[Level]:
     """From the finest to the coarsest; `diagonal` is that of the operator on the finest."""
     several = max(blocks.grid.blocks) > COARSEST
@@ -201,7 +202,7 @@ def _cycle(levels: list[Level], depth: int, r: Tensor) -> Tensor:
     if level.transfer is None:
         return torch.ops.torch_mpm.heat_cg(
             level.x, level.conductance, level.weight, None, r, None, None, None, 1.0, None, 0.0, COARSE_REDUCTION,
-            None, COARSE_ITERATIONS, 0, 0.5, *level.blocks.topology,
+            None, COARSE_ITERATIONS, 0, 0.5, *level.blocks.packed,
         )[0]  # fmt: skip
     d = level.smooth(r)
     coarse = level.transfer.restrict(level.free * (r - level.apply(d)))
@@ -220,7 +221,7 @@ def _check_exact(name: str, value: Tensor | None, dtype: torch.dtype, shape: tup
 def heat_multigrid(
     x: Tensor,
     conductance: Tensor,
-    capacity: Tensor,
+    heat_capacity: Tensor,
     theta: Tensor | None,
     source: Tensor | None,
     exchange: Tensor | None,
@@ -238,24 +239,23 @@ def heat_multigrid(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """What the op `heat_cg` takes and returns (csrc/heat/solve.h)."""
     diagonal = torch.ops.torch_mpm.heat_operator(x, conductance, None, *topology)  # checks what it takes
-    grid = _grid_of(topology)
-    table, block, offsets, index, schedule = topology[:5]
-    blocks = Blocks(grid, table, block, offsets, index, schedule, table, None)
-    for name, value in (("capacity", capacity), ("theta", theta), ("source", source), ("exchange", exchange)):
+    blocks = Topology.unpack(*topology)
+    count = blocks.scenes
+    for name, value in (("heat_capacity", heat_capacity), ("theta", theta), ("source", source), ("exchange", exchange)):
         check_like(name, value, x, (blocks.node_count,), "[N]")
     for name, value in (("scene_dt", scene_dt), ("scene_tolerance", scene_tolerance)):
-        check_like(name, value, x, (grid.scenes,), "[B]")
+        check_like(name, value, x, (count,), "[B]")
     _check_exact("fixed", fixed, torch.bool, (blocks.node_count,), x)
-    _check_exact("scene_max_iterations", scene_limit, torch.int32, (grid.scenes,), x)
+    _check_exact("scene_max_iterations", scene_limit, torch.int32, (count,), x)
     if not 0 <= max_iterations <= INT32_MAX:
         raise ValueError(f"max_iterations must be 0 to 2^31 - 1, got {max_iterations}")
     scenes = Scenes(blocks)
-    step = x.new_full((grid.scenes,), dt, dtype=torch.float64) if scene_dt is None else dt * scene_dt.double()
-    used, zero = blocks.active_nodes(), torch.zeros_like(capacity, memory_format=torch.contiguous_format)
-    material = used & ~(capacity <= 0)
+    step = x.new_full((count,), dt, dtype=torch.float64) if scene_dt is None else dt * scene_dt.double()
+    used, zero = blocks.active_nodes(), torch.zeros_like(heat_capacity, memory_format=torch.contiguous_format)
+    material = used & ~(heat_capacity <= 0)
     held = torch.zeros_like(used) if fixed is None else material & fixed
     is_free = material & ~held
-    free, mass = is_free.to(x), torch.where(is_free, capacity, 1)
+    free, mass = is_free.to(x), torch.where(is_free, heat_capacity, 1)
     outflow = zero if exchange is None else torch.where(used, exchange, 0)
     given = zero if source is None else torch.where(is_free, source, 0)
     weight = torch.where(is_free, mass / scenes.spread(torch.where(step > 0, step, 1), x.dtype) + outflow, 0)
@@ -263,7 +263,7 @@ def heat_multigrid(
     if theta is not None:
         r = r - torch.ops.torch_mpm.heat_operator(x, conductance, theta, *topology) - outflow * theta
     r = torch.where(is_free, r, 0)
-    total = scenes.sum(torch.where(is_free, capacity, 0))
+    total = scenes.sum(torch.where(is_free, heat_capacity, 0))
     inverse_mass = free / mass
 
     def in_kelvin(r: Tensor) -> Tensor:
@@ -283,7 +283,7 @@ def heat_multigrid(
 
     d = p = before = zero
     product = torch.ones_like(step)
-    iterations = torch.zeros(grid.scenes, dtype=torch.int32, device=x.device)
+    iterations = torch.zeros(count, dtype=torch.int32, device=x.device)
     levels = _levels(blocks, x, conductance, weight, free, held, diagonal) if unfinished() else []
     if scene_limit is not None and levels:
         max_iterations = int(scene_limit.max())

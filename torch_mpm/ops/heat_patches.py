@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..grid import BLOCK_WIDTH, Blocks, _unravel
+from ..topology import BLOCK_WIDTH, Topology, unravel
 from .arguments import refuse_vmap, sizes
 from .autograd import register_autograd
 
@@ -28,7 +28,7 @@ class Patches:
         free: nodes that are solved for, bool [N]; z is zero on the others.
     """
 
-    def __init__(self, blocks: Blocks, x: Tensor, conductance: Tensor, weight: Tensor, free: Tensor) -> None:
+    def __init__(self, blocks: Topology, x: Tensor, conductance: Tensor, weight: Tensor, free: Tensor) -> None:
         dim, device = blocks.grid.dim, x.device
         local, pair = torch.arange(BLOCK_WIDTH, device=device), torch.arange(2, device=device)
 
@@ -42,10 +42,10 @@ class Patches:
         self.rows, self.patches = torch.where(inside, rows, -1).int(), patches.int()
         # The entry between corners a < b of a patch is that of a and its neighbour at b − a.
         number = torch.arange(2**dim, device=device)
-        corner, digits = _unravel(number, (2,) * dim), 3 ** torch.arange(dim - 1, -1, -1, device=device)
+        corner, digits = unravel(number, (2,) * dim), 3 ** torch.arange(dim - 1, -1, -1, device=device)
         first = torch.minimum(number[:, None], number)
         which = ((corner[None] - corner[:, None]) * digits).sum(-1).abs()
-        stencil = torch.ops.torch_mpm.heat_stencil(x, conductance, *blocks.topology)
+        stencil = torch.ops.torch_mpm.heat_stencil(x, conductance, *blocks.packed)
         stencil[0] += weight
         matrix = torch.nn.functional.pad(stencil, (0, 1))[which, rows[:, first]]
         matrix = torch.where(inside[:, :, None] & inside[:, None, :], matrix, 0)
@@ -59,7 +59,7 @@ class Patches:
         return torch.ops.torch_mpm.heat_patches(self.inverse, self.rows, self.patches, r)
 
 
-def lattice_rows(source: Blocks, target: Blocks, nodes: Callable[[Tensor], Tensor]) -> Tensor:
+def lattice_rows(source: Topology, target: Topology, nodes: Callable[[Tensor], Tensor]) -> Tensor:
     """Rows in `target` of lattice nodes that belong to each block of `source`; one past the last where inactive.
 
     `nodes` maps the block's coordinate along an axis [S] to node coordinates [S, 4] or [S, 4, K] along it.
@@ -71,7 +71,7 @@ def lattice_rows(source: Blocks, target: Blocks, nodes: Callable[[Tensor], Tenso
     table, dim = source.block.clamp_min(0).long(), grid.dim
     per_scene = math.prod(source.grid.blocks)
     index = local = inside = torch.empty(0)
-    for axis, coordinate in enumerate(_unravel(table, source.grid.blocks).unbind(1)):
+    for axis, coordinate in enumerate(unravel(table, source.grid.blocks).unbind(1)):
         node = nodes(coordinate)
         shape = [1] * (1 + dim * (node.dim() - 1))
         shape[0], shape[1 + axis] = node.shape[0], node.shape[1]
@@ -97,7 +97,7 @@ def lattice_rows(source: Blocks, target: Blocks, nodes: Callable[[Tensor], Tenso
 @torch.library.register_fake("torch_mpm::heat_stencil")
 def _stencil_fake(x: Tensor, conductance: Tensor, *topology: Any) -> Tensor:
     dim = sizes(x, "x", 2)[1]
-    return x.new_empty((3**dim + 1) // 2, sizes(topology[1], "block", 1)[0] * 4**dim)
+    return x.new_empty((3**dim + 1) // 2, Topology.unpack(*topology).node_count)
 
 
 @torch.library.register_fake("torch_mpm::heat_patches")

@@ -18,7 +18,7 @@ def refine(
     blocks: Blocks,
     x: Tensor,
     conductance: Tensor,
-    capacity: Tensor,
+    heat_capacity: Tensor,
     theta: Tensor,
     dt: Tensor,
     source: Tensor | None,
@@ -40,7 +40,7 @@ def refine(
     scene, scenes = wide.node_scene().long(), blocks.grid.scenes
     node_scene = scene.clamp_min(0)
     steps = torch.where(dt > 0, dt.double(), 1)
-    mass, temperature = (_move(t.double(), blocks, wide) for t in (capacity, theta))
+    mass, temperature = (_move(t.double(), blocks, wide) for t in (heat_capacity, theta))
     free = (scene >= 0) & ~(mass <= 0)
     if fixed is not None:
         free &= ~_move(fixed, blocks, wide)
@@ -49,7 +49,7 @@ def refine(
 
     def residual(d: Tensor) -> Tensor:
         after = temperature + d
-        flux = torch.ops.torch_mpm.heat_operator(position, conduction, after, *wide.topology)
+        flux = torch.ops.torch_mpm.heat_operator(position, conduction, after, *wide.packed)
         r = given - flux - mass / steps[node_scene] * d
         return torch.where(free, r if outflow is None else r - outflow * after, 0)
 

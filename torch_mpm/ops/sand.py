@@ -1,37 +1,33 @@
-"""Return map, stress, energy and stiffness of sand (csrc/laws/quartic*.h)."""
+"""Sand: the return map of the quartic energies, stress, energy and stiffness, as faces of the laws sand_*."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from ..errors import FLOATING, NUMBER_OR_TENSOR, check_index, check_like, check_number, check_real, shape_of
-from ..reference.sand import APEX, CONE, ELASTIC, ENERGIES, INVALID, friction_alpha
-from .arguments import (
-    check_choice,
-    check_parameter,
-    refuse_vmap,
-    sizes,
-    soa_empty,
-    sum_by_scene,
-)
-from .autograd import dispatch, register_autograd
-from .material import _no_setup
+from .arguments import check_choice, check_parameter
+from .law import APEX, BRANCH, ELASTIC, INVALID, NOT_CONVERGED, law_energy, law_stiffness, law_update
+from .law import PLASTIC as CONE
 
 __all__ = [
     "APEX",
     "CONE",
     "ELASTIC",
+    "ENERGIES",
     "INVALID",
     "ReturnMap",
+    "friction_alpha",
     "quartic_energy",
     "quartic_return_map",
     "quartic_stiffness",
+    "quartic_stress",
 ]
+
+ENERGIES = ("unilateral", "full", "hencky", "mixed")
 
 Value = float | Tensor
 
@@ -133,19 +129,45 @@ def quartic_return_map(
     _check_number("friction_angle", friction_angle, ANGLE, most=math.pi / 2)
     _check_number("alpha", alpha, "finite and not negative")
     _check_number("cohesion", cohesion, "finite and not negative")
-    slope = (
-        friction_alpha(_parameter("friction_angle", friction_angle, F, scene), F.shape[1]) if alpha is None else alpha
+    if alpha is None:
+        alpha = friction_alpha(_parameter("friction_angle", friction_angle, F, scene), F.shape[1])
+    given = (("mu", mu), ("lam", lam), ("alpha", alpha), ("cohesion", 0.0 if cohesion is None else cohesion))
+    parameters = [_parameter(n, v, F, scene) for n, v in given]
+    history = () if volume_correction is None else (volume_correction,)
+    result = law_update(
+        law_name(energy, flow, F.shape[1]),
+        F,
+        [*parameters, _parameter("smallest_strain", 0.0, F, scene)],
+        history,
+        scene=scene,
+        options=["keep_apex"] if apex == "keep" else [],
+        details=True if details else BRANCH,
     )
-    parameters = [_parameter(n, v, F, scene) for n, v in (("mu", mu), ("lam", lam), ("alpha", slope))]
-    shift = None if cohesion is None else _parameter("cohesion", cohesion, F, scene)
-    mapped, stress, code, *scalars = dispatch(
-        torch.ops.torch_mpm.quartic_return_map,
-        *(F, *parameters, shift, volume_correction, scene, energy, flow, apex, details),
-    )
-    wanted = (details, details, volume_correction is not None)
+    assert result.branch is not None and result.converged is not None
     return ReturnMap(
-        mapped, stress, code & 3, code < 4, *(t if w else None for t, w in zip(scalars, wanted, strict=True))
+        result.state,
+        result.stress,
+        result.branch,
+        result.converged,
+        result.multiplier,
+        result.dissipated,
+        result.history[0] if history else None,
     )
+
+
+def law_name(energy: str, flow: str, dim: int) -> str:
+    """The compiled law of an energy and a flow; for D = 2 and the quadratic energy the exact flow is the radial one."""
+    exact = flow == "exact" and dim == 3 and energy != "hencky"
+    return f"sand_{energy}_exact" if exact else f"sand_{energy}"
+
+
+def friction_alpha(angle: Tensor, dim: int) -> Tensor:
+    """Slope α of the cone |dev τ| + α tr τ ≤ 0 from a friction angle [rad].
+
+    √(2/3) 2 sin φ/(3 − sin φ) in 3-D meets Mohr-Coulomb in triaxial compression; sin φ/√2 in 2-D is Mohr-Coulomb there.
+    """
+    sine = torch.sin(angle)
+    return sine / math.sqrt(2) if dim == 2 else math.sqrt(2 / 3) * 2 * sine / (3 - sine)
 
 
 def quartic_stress(F: Tensor, mu: Value, lam: Value, scene: Tensor | None = None, energy: str = "unilateral") -> Tensor:
@@ -153,10 +175,8 @@ def quartic_stress(F: Tensor, mu: Value, lam: Value, scene: Tensor | None = None
 
     Differentiable once with respect to F, mu and lam.
     """
-    _check_deformation(F, scene, energy)
-    mu, lam = _parameter("mu", mu, F, scene), _parameter("lam", lam, F, scene)
-    options = (scene, energy, "radial", "none", False)
-    return dispatch(torch.ops.torch_mpm.quartic_return_map, F, mu, lam, mu.detach(), None, None, *options)[1]
+    parameters = _elastic(F, mu, lam, scene, energy)
+    return law_update(f"sand_{energy}", F, parameters, scene=scene, options=["elastic"]).stress
 
 
 def quartic_energy(F: Tensor, mu: Value, lam: Value, scene: Tensor | None = None, energy: str = "unilateral") -> Tensor:
@@ -164,9 +184,7 @@ def quartic_energy(F: Tensor, mu: Value, lam: Value, scene: Tensor | None = None
 
     Arguments as `quartic_return_map`; differentiable with respect to F, mu and lam.
     """
-    _check_deformation(F, scene, energy)
-    mu, lam = _parameter("mu", mu, F, scene), _parameter("lam", lam, F, scene)
-    return dispatch(torch.ops.torch_mpm.quartic_energy, F, mu, lam, scene, energy)
+    return law_energy(f"sand_{energy}", F, _elastic(F, mu, lam, scene, energy), scene=scene)
 
 
 def quartic_stiffness(
@@ -183,9 +201,17 @@ def quartic_stiffness(
     `smallest_strain` count as that. Zero where det F ≤ 0 or F is not finite. Other arguments as `quartic_return_map`;
     not differentiable.
     """
+    parameters = _elastic(F, mu, lam, scene, energy, smallest_strain)
+    return law_stiffness(f"sand_{energy}", F, parameters, scene=scene)
+
+
+def _elastic(
+    F: Tensor, mu: Value, lam: Value, scene: Tensor | None, energy: str, smallest_strain: float = 0.0
+) -> list[Tensor]:
+    """Parameters of a law of sand for what needs no yield surface."""
     _check_deformation(F, scene, energy)
-    mu, lam = _parameter("mu", mu, F, scene), _parameter("lam", lam, F, scene)
-    return torch.ops.torch_mpm.quartic_stiffness(F, mu, lam, scene, energy, smallest_strain)
+    values = (("mu", mu), ("lam", lam), ("alpha", 0.0), ("cohesion", 0.0), ("smallest_strain", smallest_strain))
+    return [_parameter(name, value, F, scene) for name, value in values]
 
 
 def _check_deformation(F: Tensor, scene: Tensor | None, energy: str) -> None:
@@ -211,117 +237,35 @@ def _parameter(name: str, value: Value | None, F: Tensor, scene: Tensor | None) 
     return value
 
 
-# ---- fake kernels
+# ---- torch.ops.torch_mpm.quartic_return_map, the name by which training code calls it
+
+_LIBRARY = torch.library.Library("torch_mpm", "FRAGMENT")
+_LIBRARY.define(
+    "quartic_return_map(Tensor F, Tensor mu, Tensor lam, Tensor alpha, Tensor? cohesion, Tensor? volume, "
+    "Tensor? scene, str energy, str flow, str apex, bool details) -> "
+    "(Tensor F, Tensor stress, Tensor branch, Tensor multiplier, Tensor dissipated, Tensor volume)"
+)
 
 
-@torch.library.register_fake("torch_mpm::quartic_return_map")
-def _return_map_fake(F, mu, lam, alpha, cohesion, volume, scene, energy, flow, apex, details):
-    P = sizes(F, "F", 3)[0]
-    scalars = [F.new_empty(P if wanted else 0) for wanted in (details, details, volume is not None)]
-    return soa_empty(F, F.shape), soa_empty(F, F.shape), F.new_empty(P, dtype=torch.int32), *scalars
-
-
-@torch.library.register_fake("torch_mpm::quartic_return_map_backward")
-def _return_map_backward_fake(
-    grad_F, grad_stress, grad_multiplier, grad_dissipated, grad_volume,
-    F, mu, lam, alpha, cohesion, volume, scene, energy, flow, apex, needs_F, needs_parameters,
-):  # fmt: skip
-    P = sizes(F, "F", 3)[0]
-    return (
-        soa_empty(F, F.shape) if needs_F else F.new_empty(0),
-        soa_empty(F, (P, 4)) if needs_parameters else F.new_empty(0),
-        F.new_empty(0 if volume is None else P),
+def _composed(
+    F: Tensor,
+    mu: Tensor,
+    lam: Tensor,
+    alpha: Tensor,
+    cohesion: Tensor | None,
+    volume: Tensor | None,
+    scene: Tensor | None,
+    energy: str,
+    flow: str,
+    apex: str,
+    details: bool,
+) -> tuple[Tensor, ...]:
+    r = quartic_return_map(
+        F, mu, lam, None, alpha, scene, energy, apex, details, flow, cohesion, volume_correction=volume
     )
+    absent = F.new_empty(0)
+    scalars = (absent if t is None else t for t in (r.multiplier, r.dissipated, r.volume_correction))
+    return r.F, r.stress, torch.where(r.converged, r.branch, r.branch + NOT_CONVERGED), *scalars
 
 
-@torch.library.register_fake("torch_mpm::quartic_energy")
-def _energy_fake(F: Tensor, mu: Tensor, lam: Tensor, scene: Tensor | None, energy: str) -> Tensor:
-    return F.new_empty(sizes(F, "F", 3)[0])
-
-
-@torch.library.register_fake("torch_mpm::quartic_stiffness")
-def _stiffness_fake(F: Tensor, mu: Tensor, lam: Tensor, scene: Tensor | None, energy: str, floor: float) -> Tensor:
-    return F.new_empty(sizes(F, "F", 3)[0])
-
-
-# ---- autograd
-
-
-def _shared(grad: Tensor, parameter: Tensor, scene: Tensor | None) -> Tensor:
-    """The gradient per particle [P], summed over the particles that share a value."""
-    if parameter.numel() == 1:
-        return grad.sum().reshape(parameter.shape)
-    return grad if parameter.numel() == grad.numel() else sum_by_scene(grad, scene, parameter.numel())
-
-
-def _return_map_setup(ctx: Any, inputs: Any, output: Any) -> None:
-    *tensors, ctx.energy, ctx.flow, ctx.apex, ctx.details = inputs
-    ctx.set_materialize_grads(False)
-    ctx.save_for_backward(*tensors)
-
-
-def _return_map_backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
-    grad_F, grad_stress, _, *details, grad_volume = grads
-    saved = ctx.saved_tensors  # once: a checkpointed region unpacks a tensor only once
-    _, mu, lam, alpha, cohesion, volume, scene = saved
-    if not ctx.details:
-        details = [None, None]
-    given = [grad_F, grad_stress, *details, grad_volume if volume is not None else None]
-    needs_F, *needs, needs_volume = ctx.needs_input_grad[:6]
-    if all(g is None for g in given) or not (needs_F or any(needs) or needs_volume):
-        return (None,) * 11
-    adjoint_F, adjoint_parameters, adjoint_volume = dispatch(
-        torch.ops.torch_mpm.quartic_return_map_backward,
-        *(*given, *saved, ctx.energy, ctx.flow, ctx.apex, needs_F, any(needs)),
-    )
-    shared = [
-        _shared(adjoint_parameters[:, k], p, scene) if n else None
-        for k, (p, n) in enumerate(zip((mu, lam, alpha, cohesion), needs, strict=True))
-    ]
-    return adjoint_F if needs_F else None, *shared, adjoint_volume if needs_volume else None, *(None,) * 5
-
-
-def _energy_setup(ctx: Any, inputs: Any, output: Any) -> None:
-    *tensors, ctx.energy = inputs
-    ctx.save_for_backward(*tensors)
-
-
-def _energy_backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-    """dψ = τ F⁻ᵀ : dF, and ψ is linear in μ and λ."""
-    F, mu, lam, scene = ctx.saved_tensors
-    needs_F, *needs = ctx.needs_input_grad[:3]
-    one, zero = torch.ones_like(mu).detach(), torch.zeros_like(lam).detach()
-    meaningful = dispatch(torch.ops.torch_mpm.quartic_energy, F.detach(), one, zero, scene, ctx.energy).isfinite()
-    grad = torch.where(meaningful, grad, 0)
-    grad_F = None
-    if needs_F:
-        safe = torch.where(meaningful[:, None, None], F, torch.eye(F.shape[1], dtype=F.dtype, device=F.device))
-        stress = quartic_stress(safe, mu, lam, scene, ctx.energy)
-        grad_F = grad[:, None, None] * (stress @ torch.linalg.inv_ex(safe)[0].mT)
-    shared: list[Tensor | None] = []
-    for parameter, wanted, share in zip((mu, lam), needs, (0, 1), strict=True):
-        if not wanted:
-            shared.append(None)
-            continue
-        unit = one.new_ones(()), one.new_zeros(())
-        value = dispatch(torch.ops.torch_mpm.quartic_energy, F, unit[share], unit[1 - share], scene, ctx.energy)
-        shared.append(_shared(grad * torch.where(meaningful, value, 0), parameter, scene))
-    return grad_F, *shared, None, None
-
-
-def _no_second_derivative(ctx: Any, *grads: Tensor | None) -> Sequence[Tensor | None]:
-    raise NotImplementedError("the return map of sand has no second derivatives: differentiate it once")
-
-
-def _no_backward(ctx: Any, grad: Tensor) -> Tensor:
-    raise NotImplementedError("stiffness bounds are not differentiable: compute them under torch.no_grad()")
-
-
-for _name, _backward, _setup in (
-    ("quartic_return_map", _return_map_backward, _return_map_setup),
-    ("quartic_return_map_backward", _no_second_derivative, _no_setup),
-    ("quartic_energy", _energy_backward, _energy_setup),
-    ("quartic_stiffness", _no_backward, _no_setup),
-):
-    register_autograd(_name, _backward, _setup)
-    refuse_vmap(_name)
+_LIBRARY.impl("quartic_return_map", _composed, "CompositeImplicitAutograd")

@@ -9,22 +9,17 @@ All of them are derivatives of one trilinear form of positions, particle values 
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
-from typing import Any
-
 import torch
 from torch import Tensor
 
 from ..errors import check_like, check_positions, shape_of
-from ..grid import Blocks, Grid, check_blocks, inverse_inertia
-from ..reference import transfer as reference
+from ..grid import Blocks, check_blocks
+from ..topology import Topology
+from . import composed
 from .arguments import check_choice, differentiate, per_particle, refuse_vmap, sizes, soa_empty, split_dt, sum_by_scene
-from .autograd import dispatch, register_autograd
+from .autograd import dispatch, register_autograd, save_with_topology, saved_with_topology
 
 STRESS_FORMS = {"mls": 0, "gradient": 1}
-TOPOLOGY = 10
-"""Trailing arguments of every op: five tensors of `Blocks`, then dx, lower, blocks, order, deterministic."""
 
 
 def p2g(
@@ -81,7 +76,7 @@ def p2g(
         dt, scene_dt = split_dt(dt, blocks.grid.scenes, x)
     return dispatch(
         torch.ops.torch_mpm.p2g,
-        *(x, mass, v, C, stress, volume, scene_dt, dt, STRESS_FORMS[stress_form], *blocks.topology),
+        *(x, mass, v, C, stress, volume, scene_dt, dt, STRESS_FORMS[stress_form], *blocks.packed),
     )
 
 
@@ -111,7 +106,7 @@ def g2p(
     check_blocks(blocks)
     check_positions(x, blocks.grid.dim, blocks.scene, blocks.grid.scenes)
     velocity = _check_nodes("velocity", velocity, blocks, x, blocks.grid.dim)
-    v, C, grad_v = dispatch(torch.ops.torch_mpm.g2p, x, velocity, affine, gradient, *blocks.topology)
+    v, C, grad_v = dispatch(torch.ops.torch_mpm.g2p, x, velocity, affine, gradient, *blocks.packed)
     return v, C if affine else None, grad_v if gradient else None
 
 
@@ -150,7 +145,7 @@ def scatter(
     check_like("value", value, x, (P, K), "[P, K]")
     check_like("moment", moment, x, (P, K, D), "[P, K, D]")
     check_like("gradient", gradient, x, (P, K, D), "[P, K, D]")
-    return dispatch(torch.ops.torch_mpm.scatter, x, value, moment, gradient, moment_scale, *blocks.topology)
+    return dispatch(torch.ops.torch_mpm.scatter, x, value, moment, gradient, moment_scale, *blocks.packed)
 
 
 def gather(
@@ -177,7 +172,7 @@ def gather(
     check_blocks(blocks)
     check_positions(x, blocks.grid.dim, blocks.scene, blocks.grid.scenes)
     nodes = _check_nodes("nodes", nodes, blocks, x, None)
-    a, b, c = dispatch(torch.ops.torch_mpm.gather, x, nodes, moment_scale, moment, gradient, *blocks.topology)
+    a, b, c = dispatch(torch.ops.torch_mpm.gather, x, nodes, moment_scale, moment, gradient, *blocks.packed)
     return a, b if moment else None, c if gradient else None
 
 
@@ -191,17 +186,10 @@ def _check_nodes(name: str, nodes: Tensor, blocks: Blocks, x: Tensor, channels: 
 
 # ---- fake kernels: shapes and strides only
 
-_Topology = Any
-
-
-def _node_rows(topology: Sequence[Any], dim: int) -> int:
-    return sizes(topology[1], "block", 1)[0] * 4**dim
-
 
 @torch.library.register_fake("torch_mpm::p2g")
 def _p2g_fake(x, mass, v, C, stress, volume, scene_dt, dt, stress_form, *topology):
-    D = sizes(x, "x", 2)[1]
-    return x.new_empty(_node_rows(topology, D), 1 + D)
+    return x.new_empty(Topology.unpack(*topology).node_count, 1 + sizes(x, "x", 2)[1])
 
 
 @torch.library.register_fake("torch_mpm::p2g_backward")
@@ -217,7 +205,7 @@ def _p2g_backward_fake(grad_nodes, x, mass, v, C, stress, volume, scene_dt, dt, 
 
 @torch.library.register_fake("torch_mpm::scatter")
 def _scatter_fake(x, value, moment, gradient, moment_scale, *topology):
-    return x.new_empty(_node_rows(topology, sizes(x, "x", 2)[1]), sizes(value, "value", 2)[1])
+    return x.new_empty(Topology.unpack(*topology).node_count, sizes(value, "value", 2)[1])
 
 
 @torch.library.register_fake("torch_mpm::gather")
@@ -240,25 +228,13 @@ def _position_gradient_fake(x, value, moment, gradient, nodes, moment_scale, *to
 # ---- autograd
 
 
-def _save(ctx: Any, tensors: Sequence[Tensor | None], topology: Sequence[Any], **attributes: Any) -> None:
-    ctx.save_for_backward(*tensors, *topology[:5])
-    ctx.geometry = topology[5:]
-    for name, value in attributes.items():
-        setattr(ctx, name, value)
-
-
-def _saved(ctx: Any) -> tuple[list[Any], tuple[Any, ...]]:
-    saved = ctx.saved_tensors  # once: a checkpointed region unpacks a tensor only once
-    return list(saved[:-5]), (*saved[-5:], *ctx.geometry)
-
-
 def _scatter_setup(ctx, inputs, output):
     x, value, moment, gradient, scale, *topology = inputs
-    _save(ctx, (x, value, moment, gradient), topology, scale=scale)
+    save_with_topology(ctx, (x, value, moment, gradient), topology, scale=scale)
 
 
 def _scatter_backward(ctx, grad):
-    (x, value, moment, gradient), topology = _saved(ctx)
+    (x, value, moment, gradient), topology = saved_with_topology(ctx)
     need = ctx.needs_input_grad
     grad_x = grad_value = grad_moment = grad_gradient = None
     grad = grad.contiguous()
@@ -268,23 +244,21 @@ def _scatter_backward(ctx, grad):
         )
     if need[0]:
         grad_x = dispatch(torch.ops.torch_mpm.position_gradient, x, value, moment, gradient, grad, ctx.scale, *topology)
-    return (grad_x, grad_value, grad_moment if need[2] else None, grad_gradient if need[3] else None) + (None,) * (
-        1 + TOPOLOGY
-    )
+    return (grad_x, grad_value, grad_moment if need[2] else None, grad_gradient if need[3] else None) + (None,) * 4
 
 
 def _gather_setup(ctx, inputs, output):
     x, nodes, scale, moment, gradient, *topology = inputs
-    _save(ctx, (x, nodes), topology, scale=scale, moment=moment, gradient=gradient)
+    save_with_topology(ctx, (x, nodes), topology, scale=scale, moment=moment, gradient=gradient)
 
 
 def _gather_backward(ctx, grad_value, grad_moment, grad_gradient):
     grad_x, grad_nodes = _gather_adjoint(ctx, grad_value, grad_moment, grad_gradient)
-    return (grad_x, grad_nodes) + (None,) * (3 + TOPOLOGY)
+    return (grad_x, grad_nodes) + (None,) * 6
 
 
 def _gather_adjoint(ctx, grad_value, grad_moment, grad_gradient):
-    (x, nodes), topology = _saved(ctx)
+    (x, nodes), topology = saved_with_topology(ctx)
     moment = grad_moment if ctx.moment else None
     gradient = grad_gradient if ctx.gradient else None
     grad_x = grad_nodes = None
@@ -299,79 +273,58 @@ def _gather_adjoint(ctx, grad_value, grad_moment, grad_gradient):
 
 def _g2p_setup(ctx, inputs, output):
     x, velocity, affine, gradient, *topology = inputs
-    scale = inverse_inertia(topology[8], topology[5])
-    _save(ctx, (x, velocity), topology, scale=scale, moment=affine, gradient=gradient)
+    scale = Topology.unpack(*topology).grid.inverse_inertia
+    save_with_topology(ctx, (x, velocity), topology, scale=scale, moment=affine, gradient=gradient)
 
 
 def _g2p_backward(ctx, grad_v, grad_C, grad_gradient):
     grad_x, grad_velocity = _gather_adjoint(ctx, grad_v, grad_C, grad_gradient)
-    return (grad_x, grad_velocity) + (None,) * (2 + TOPOLOGY)
+    return (grad_x, grad_velocity) + (None,) * 5
 
 
 def _position_gradient_setup(ctx, inputs, output):
     x, value, moment, gradient, nodes, scale, *topology = inputs
-    _save(ctx, (x, value, moment, gradient, nodes), topology, scale=scale)
+    save_with_topology(ctx, (x, value, moment, gradient, nodes), topology, scale=scale)
 
 
 def _position_gradient_backward(ctx, grad):
-    tensors, topology = _saved(ctx)
-    blocks = _blocks_of(topology, tensors[0])
+    tensors, topology = saved_with_topology(ctx)
+    blocks = Topology.unpack(*topology)
 
     def function(x, value, moment, gradient, nodes):
-        return reference.position_gradient(blocks, x, value, moment, gradient, nodes, ctx.scale)
+        return composed.position_gradient(blocks, x, value, moment, gradient, nodes, ctx.scale)
 
-    return (*differentiate(function, tensors, [grad]),) + (None,) * (1 + TOPOLOGY)
-
-
-def _grid_of(topology: Sequence[Any]) -> Grid:
-    """The lattice of a topology."""
-    table, dx, lower, blocks, order, deterministic = topology[0], *topology[5:]
-    grid = Grid.__new__(Grid)
-    grid.dx, grid.lower, grid.blocks, grid.order, grid.dim = dx, tuple(lower), tuple(blocks), order, len(lower)
-    grid.nodes_per_block, grid.deterministic = 4**grid.dim, deterministic
-    grid.scenes = table.shape[0] // math.prod(blocks)
-    return grid
-
-
-def _blocks_of(topology: Sequence[Any], x: Tensor) -> Blocks:
-    """The `Blocks` that a topology came from, with the scene of each particle found again from its block."""
-    table, block, offsets, index, schedule = topology[:5]
-    grid = _grid_of(topology)
-    position = torch.arange(x.shape[0], device=x.device, dtype=offsets.dtype)
-    slot = torch.searchsorted(offsets[1:].contiguous(), position, right=True).clamp_max(block.shape[0] - 1)
-    scene = torch.zeros_like(index)
-    scene[index.long()] = (block[slot] // math.prod(grid.blocks)).clamp_min(0)
-    return Blocks(grid, table, block, offsets, index, schedule, table, scene)
+    return (*differentiate(function, tensors, [grad]),) + (None,) * 4
 
 
 def _p2g_setup(ctx, inputs, output):
     x, mass, v, C, stress, volume, scene_dt, dt, form, *topology = inputs
-    _save(ctx, (x, mass, v, C, stress, volume, scene_dt), topology, dt=dt, form=form)
+    save_with_topology(ctx, (x, mass, v, C, stress, volume, scene_dt), topology, dt=dt, form=form)
 
 
 def _p2g_backward(ctx, grad):
-    tensors, topology = _saved(ctx)
+    tensors, topology = saved_with_topology(ctx)
     needs = sum(1 << i for i, needed in enumerate(ctx.needs_input_grad[:7]) if needed)
     grads = list(
         dispatch(torch.ops.torch_mpm.p2g_backward, grad.contiguous(), *tensors, ctx.dt, ctx.form, needs, *topology)
     )
     if ctx.needs_input_grad[6] and tensors[4] is not None:
-        blocks = _blocks_of(topology, tensors[0])
-        grads[6] = ctx.dt * sum_by_scene(grads[6], blocks.scene, blocks.grid.scenes)
+        blocks = Topology.unpack(*topology)
+        grads[6] = ctx.dt * sum_by_scene(grads[6], blocks.particle_scene(), blocks.scenes)
     grads = [
         g if needed and t is not None else None
         for g, t, needed in zip(grads, tensors, ctx.needs_input_grad[:7], strict=True)
     ]
-    return (*grads,) + (None,) * (2 + TOPOLOGY)
+    return (*grads,) + (None,) * 5
 
 
 def _p2g_backward_setup(ctx, inputs, output):
     tensors, (dt, form, needs), topology = inputs[:8], inputs[8:11], inputs[11:]
-    _save(ctx, tensors, topology, dt=dt, form=form, needs=needs)
+    save_with_topology(ctx, tensors, topology, dt=dt, form=form, needs=needs)
 
 
 def _p2g_double_backward(ctx, *grads):
-    tensors, topology = _saved(ctx)
+    tensors, topology = saved_with_topology(ctx)
     has_stress = tensors[5] is not None
     present = [True, True, True, tensors[4] is not None] + 3 * [has_stress]
     wanted = [bool(ctx.needs >> i & 1) and here for i, here in enumerate(present)]
@@ -381,7 +334,7 @@ def _p2g_double_backward(ctx, *grads):
         return tuple(o for o, w in zip(outputs, wanted, strict=True) if w)
 
     given = [g for g, w in zip(grads, wanted, strict=True) if w]
-    return (*differentiate(function, tensors, given),) + (None,) * (3 + TOPOLOGY)
+    return (*differentiate(function, tensors, given),) + (None,) * 6
 
 
 def _composed_p2g_backward(inputs, dt, form, topology):
@@ -389,7 +342,7 @@ def _composed_p2g_backward(inputs, dt, form, topology):
     grad, x, mass, v, C, stress, volume, scene_dt = inputs
     D = x.shape[1]
     mls = form == STRESS_FORMS["mls"]
-    blocks = _blocks_of(topology, x)
+    blocks = Topology.unpack(*topology)
     value, moment, gradient = dispatch(torch.ops.torch_mpm.gather, x, grad, 1.0, True, True, *topology)
     mass_sum, momentum_sum, moment_sum = value[:, 0], value[:, 1:], moment[:, 1:]
     grad_mass = mass_sum + (v * momentum_sum).sum(1)
@@ -402,7 +355,7 @@ def _composed_p2g_backward(inputs, dt, form, topology):
         grad_C = mass[:, None, None] * moment_sum
         B = B + torch.nn.functional.pad(mass[:, None, None] * C, (0, 0, 1, 0))
     if stress is not None:
-        step = dt if scene_dt is None else dt * per_particle(scene_dt, blocks.scene, x.shape[0])
+        step = dt if scene_dt is None else dt * per_particle(scene_dt, blocks.particle_scene(), x.shape[0])
         scale = -blocks.grid.inverse_inertia if mls else -1.0
         total = moment_sum if mls else gradient[:, 1:]
         work = scale * (stress * total).sum((1, 2))

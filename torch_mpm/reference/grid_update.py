@@ -9,19 +9,19 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from ..grid import BLOCK_WIDTH, PADDING
+from ..topology import BLOCK_WIDTH, PADDING
 from .contact import contact_change
 
 if TYPE_CHECKING:
     from ..boundaries import Face
-    from ..grid import Blocks
+    from ..topology import Topology
 
 MIRROR_REACH = 2
 """Nodes on both sides of a mirror that have images (csrc/grid/grid_update.h)."""
 
 
 def grid_update(
-    blocks: Blocks,
+    blocks: Topology,
     nodes: Tensor,
     gravity: Tensor | None = None,
     dt: float | Tensor | None = None,
@@ -41,7 +41,7 @@ def grid_update(
     return torch.cat([mass, torch.where(heavy, velocity, 0)], 1)
 
 
-def _mirror(faces: Sequence[Face], blocks: Blocks, rows: Tensor) -> Tensor:
+def _mirror(faces: Sequence[Face], blocks: Topology, rows: Tensor) -> Tensor:
     """Rows of mass and momentum plus those of their images in every mirror and corner of mirrors."""
     mirrors = [(number // 2, face.plane) for number, face in enumerate(faces) if face.kind == "mirror"]
     result = rows
@@ -60,7 +60,7 @@ def _mirror(faces: Sequence[Face], blocks: Blocks, rows: Tensor) -> Tensor:
     return result
 
 
-def _rows_at(blocks: Blocks, node: Tensor) -> Tensor:
+def _rows_at(blocks: Topology, node: Tensor) -> Tensor:
     """Row of the node at lattice indices [N, D] in the scene of each row, int64 [N]; -1 where there is none."""
     per_axis = torch.tensor(blocks.grid.blocks, device=node.device)
     inside = ((node >= 0) & (node < BLOCK_WIDTH * per_axis)).all(1) & blocks.active_nodes()
@@ -73,7 +73,7 @@ def _rows_at(blocks: Blocks, node: Tensor) -> Tensor:
     return torch.where(slot >= 0, slot * blocks.grid.nodes_per_block + local, -1)
 
 
-def _act(faces: Sequence[Face], blocks: Blocks, velocity: Tensor) -> Tensor:
+def _act(faces: Sequence[Face], blocks: Topology, velocity: Tensor) -> Tensor:
     position = blocks.node_positions(torch.float64)
     axes = torch.eye(velocity.shape[1], dtype=velocity.dtype, device=velocity.device)
     for number, face in enumerate(faces):

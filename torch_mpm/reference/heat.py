@@ -49,7 +49,7 @@ def heat_cg(
     blocks: Blocks,
     x: Tensor,
     conductance: Tensor,
-    capacity: Tensor,
+    heat_capacity: Tensor,
     theta: Tensor | None,
     dt: Tensor,
     source: Tensor | None = None,
@@ -65,11 +65,11 @@ def heat_cg(
     """
     operator = HeatOperator.at(blocks, x, conductance)
     scenes, scene = blocks.grid.scenes, blocks.node_scene().long()
-    zero = torch.zeros_like(capacity)
+    zero = torch.zeros_like(heat_capacity)
     source = zero if source is None else source
     exchange = zero if exchange is None else exchange
     held = torch.zeros_like(scene, dtype=torch.bool) if fixed is None else fixed
-    free = (scene >= 0) & ~(capacity <= 0) & ~held
+    free = (scene >= 0) & ~(heat_capacity <= 0) & ~held
     scene = scene.clamp_min(0)
 
     def total(values: Tensor) -> Tensor:
@@ -77,8 +77,8 @@ def heat_cg(
 
     valid = dt > 0
     node_dt = torch.where(valid, dt, 1)[scene]
-    mass = torch.where(free, capacity, 1)
-    diagonal = mass / node_dt + operator.diagonal(len(capacity)) + exchange
+    mass = torch.where(free, heat_capacity, 1)
+    diagonal = mass / node_dt + operator.diagonal(len(heat_capacity)) + exchange
 
     def apply(u: Tensor) -> Tensor:
         return torch.where(free, mass / node_dt * u + operator.apply(u) + exchange * u, 0)
@@ -109,7 +109,7 @@ def heat_cg(
         iterations = iterations + running.int()
         running = running & (residual > limit) & (iterations < most)
     # A closed scene keeps its energy: Σ M d = dt Σ h, whatever the solve left over.
-    holding = held & ~(capacity <= 0) & (blocks.node_scene() >= 0)
+    holding = held & ~(heat_capacity <= 0) & (blocks.node_scene() >= 0)
     open_to_outside = total((exchange != 0).to(x.dtype)) + zero.new_zeros(scenes).index_add(
         0, scene, holding.to(x.dtype)
     )

@@ -10,13 +10,13 @@ from torch import Tensor
 from ..boundaries import Box, Capsule, Obstacle, Plane, Sphere
 
 if TYPE_CHECKING:
-    from ..grid import Blocks
+    from ..topology import Topology
 
 KINDS = (None, "sticky", "slip", "separate")
 
 
 def contact(
-    blocks: Blocks,
+    blocks: Topology,
     velocity: Tensor,
     obstacles: Tensor,
     shape: Sequence[int],

@@ -9,15 +9,20 @@ import math
 import torch
 from torch import Tensor
 
-from ..grid import BLOCK_WIDTH, PADDING, Blocks
+from ..topology import BLOCK_WIDTH, PADDING, Topology
 
 
 def bspline(distance: Tensor, order: int) -> Tensor:
-    """Quadratic or cubic B-spline of the distance from a node, in cells (Steffen, Kirby and Berzins 2008)."""
-    a = distance.abs()
-    if order == 2:
-        return torch.where(a < 0.5, 0.75 - a * a, torch.where(a < 1.5, 0.5 * (1.5 - a) ** 2, 0))
-    return torch.where(a < 1, 2 / 3 - a * a * (1 - a / 2), torch.where(a < 2, (2 - a) ** 3 / 6, 0))
+    """Centred B-spline of the distance from a node, in cells, by the recursion of Cox and de Boor (de Boor 1972)."""
+    if order == 0:
+        return ((distance > -0.5) & (distance <= 0.5)).to(distance)
+    half = (order + 1) / 2
+    left, right = bspline(distance + 0.5, order - 1), bspline(distance - 0.5, order - 1)
+    return ((distance + half) * left + (half - distance) * right) / order
+
+
+def bspline_derivative(distance: Tensor, order: int) -> Tensor:
+    return bspline(distance + 0.5, order - 1) - bspline(distance - 0.5, order - 1)
 
 
 @dataclasses.dataclass
@@ -30,50 +35,48 @@ class Support:
     weight_gradient: Tensor  # [P, S, D]
 
 
-def support(blocks: Blocks, x: Tensor) -> Support:
-    """Weights are zero for particles whose support is not inside the active blocks."""
+def support(blocks: Topology, x: Tensor) -> Support:
+    """Found by a search over all nodes of each axis; weights are zero for particles without their whole support."""
     grid = blocks.grid
     lower = torch.tensor(grid.lower, dtype=x.dtype, device=x.device)
-    cells = (x - lower) / grid.dx + PADDING
-    finite = torch.isfinite(cells).all(1)
-    cells = torch.where(finite[:, None], cells, torch.full_like(cells, -10.0))
-    base = torch.floor(cells.detach() - (0.5 if grid.order == 2 else 1.0)).clamp(-10, 2**30).long()
-    offsets = torch.tensor(list(itertools.product(range(grid.order + 1), repeat=grid.dim)), device=x.device)
-    node = base[:, None] + offsets
-    extent = torch.tensor(grid.blocks, device=x.device) * BLOCK_WIDTH
-    inside = ((node >= 0) & (node < extent)).all(-1).all(-1) & finite
-    node = torch.where(inside[:, None, None], node, 0)
-    block = node // BLOCK_WIDTH
-    index = (
-        torch.zeros_like(node[..., 0]) if blocks.scene is None else blocks.scene.long()[:, None].expand(node.shape[:2])
-    )
-    local = torch.zeros_like(index)
-    for axis in range(grid.dim):
-        index = index * grid.blocks[axis] + block[..., axis]
-        local = local * BLOCK_WIDTH + node[..., axis] % BLOCK_WIDTH
-    slot = blocks.table.long()[index]
-    inside = inside & (slot >= 0).all(1)
-    rows = torch.where(inside[:, None], slot * grid.nodes_per_block + local, 0)
+    cells = torch.where(x.isfinite().all(1, keepdim=True), (x - lower) / grid.dx + PADDING, -10)
+    extent = [BLOCK_WIDTH * n for n in grid.blocks]
+    half, count = (grid.order + 1) / 2, grid.order + 1
+    nodes, near = [], torch.ones(x.shape[0], dtype=torch.bool, device=x.device)
+    for axis, size in enumerate(extent):
+        index = torch.arange(size, device=x.device)
+        distance = index - cells.detach()[:, axis : axis + 1]
+        within = (distance > -half) & (distance <= half)
+        near = near & (within.sum(1) == count)
+        nodes.append(torch.where(within, index, size).sort(1).values[:, :count].clamp_max(size - 1))
+    choices = itertools.product(range(count), repeat=grid.dim)
+    node = torch.stack([torch.stack([nodes[a][:, k] for a, k in enumerate(choice)], 1) for choice in choices], 1)
+    scene = torch.zeros_like(node[:, 0, 0]) if blocks.scene is None else blocks.scene.long()
+    near = near & (scene >= 0) & (scene < blocks.scenes)
+    where = scene.clamp(0, max(blocks.scenes - 1, 0))[:, None], *node.unbind(-1)
+    rows = _row_map(blocks)[where]
+    inside = (near[:, None] & (rows >= 0)).all(1)
     r = torch.where(inside[:, None, None], node - cells[:, None], 0.25)  # in cells
-    n = bspline(r, grid.order)
-    slopes = _bspline_derivative(r, grid.order)
+    n, slopes = bspline(r, grid.order), bspline_derivative(r, grid.order)
     weight = torch.where(inside[:, None], n.prod(-1), 0)
     # r is node minus particle, so the gradient with respect to the particle changes sign
     gradient = torch.stack(
         [-slopes[..., a] * torch.cat([n[..., :a], n[..., a + 1 :]], -1).prod(-1) / grid.dx for a in range(grid.dim)], -1
     )
+    rows = torch.where(inside[:, None], rows, 0)
     return Support(rows, weight, r * grid.dx, torch.where(inside[:, None, None], gradient, 0))
 
 
-def _bspline_derivative(r: Tensor, order: int) -> Tensor:
-    a = r.abs()
-    if order == 2:
-        return torch.where(a < 0.5, -2 * r, torch.where(a < 1.5, r - 1.5 * torch.sign(r), 0))
-    return torch.where(a < 1, r * (1.5 * a - 2), torch.where(a < 2, -0.5 * torch.sign(r) * (2 - a) ** 2, 0))
+def _row_map(blocks: Topology) -> Tensor:
+    """The row of every node of the lattice of every scene, int64 [B, X, Y, (Z)], -1 where there is none."""
+    rows = torch.nonzero(blocks.active_nodes())[:, 0]
+    where = blocks.node_scene().long()[rows], *blocks.node_indices()[rows].unbind(1)
+    shape = blocks.scenes, *(BLOCK_WIDTH * n for n in blocks.grid.blocks)
+    return torch.full(shape, -1, device=rows.device).index_put(where, rows)
 
 
 def scatter(
-    blocks: Blocks, x: Tensor, value: Tensor, moment: Tensor | None, gradient: Tensor | None, moment_scale: float
+    blocks: Topology, x: Tensor, value: Tensor, moment: Tensor | None, gradient: Tensor | None, moment_scale: float
 ) -> Tensor:
     """nodes_i = Σ_p N_i (value_p + scale moment_p (x_i − x_p)) + gradient_p ∇N_i; see `torch_mpm.ops.scatter`."""
     s = support(blocks, x)
@@ -86,7 +89,7 @@ def scatter(
     return nodes.index_add(0, s.rows.reshape(-1), given.reshape(-1, value.shape[1]))
 
 
-def gather(blocks: Blocks, x: Tensor, nodes: Tensor, moment_scale: float) -> tuple[Tensor, Tensor, Tensor]:
+def gather(blocks: Topology, x: Tensor, nodes: Tensor, moment_scale: float) -> tuple[Tensor, Tensor, Tensor]:
     """The adjoint of `scatter`: value, moment, gradient; see `torch_mpm.ops.gather`."""
     s = support(blocks, x)
     g = nodes[s.rows]
@@ -96,7 +99,7 @@ def gather(blocks: Blocks, x: Tensor, nodes: Tensor, moment_scale: float) -> tup
 
 
 def position_gradient(
-    blocks: Blocks,
+    blocks: Topology,
     x: Tensor,
     value: Tensor,
     moment: Tensor | None,
@@ -112,7 +115,7 @@ def position_gradient(
 
 
 def p2g(
-    blocks: Blocks,
+    blocks: Topology,
     x: Tensor,
     mass: Tensor,
     v: Tensor,
@@ -139,16 +142,16 @@ def p2g(
     return scatter(blocks, x, value, moment, gradient, 1.0)
 
 
-def g2p(blocks: Blocks, x: Tensor, velocity: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def g2p(blocks: Topology, x: Tensor, velocity: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """v, C = D⁻¹ Σ N_i v_i (x_i − x_p)ᵀ and ∇v of each particle; see `torch_mpm.ops.g2p`."""
     lost = torch.where(x.isfinite().all(1), 0.0, torch.nan)
     v, C, gradient = gather(blocks, x, velocity, blocks.grid.inverse_inertia)
     return v + lost[:, None], C + lost[:, None, None], gradient + lost[:, None, None]
 
 
-def dense_blocks(blocks: Blocks) -> Blocks:
+def dense_blocks(blocks: Topology) -> Topology:
     """The same lattice with every block active: an activation-independent topology for checks."""
     grid = blocks.grid
-    count = grid.scenes * math.prod(grid.blocks)
+    count = blocks.scenes * math.prod(grid.blocks)
     table = torch.arange(count, dtype=torch.int32, device=blocks.table.device)
     return dataclasses.replace(blocks, table=table, block=table)

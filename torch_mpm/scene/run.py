@@ -21,7 +21,7 @@ from torch import Tensor
 from ..data.hdf5 import h5py_module
 from ..data.trajectory import PARTIAL, Layout, Trajectory, TrajectoryWriter
 from ..errors import DamagedFileError, SimulationError
-from ..laws.material import Mixture
+from ..laws import Mixture
 from ..laws.thermal import LIQUID
 from ..state import State
 from . import checkpoint, heap

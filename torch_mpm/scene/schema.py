@@ -2,10 +2,18 @@
 
 from __future__ import annotations
 
+import functools
+import inspect
 import itertools
+import math
+import operator
+import re
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, create_model, model_validator
+
+from .. import laws
+from ..ops.registry import LAWS, Quantity
 
 Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
@@ -183,88 +191,52 @@ class Solid(Thermal):
     """Poisson's ratio, between -1 and 0.5"""
 
 
-class FixedCorotated(Solid):
-    """Elastic solid with the fixed corotated energy."""
-
-    law: Literal["fixed_corotated"] = "fixed_corotated"
-    """name of the law"""
-
-
-class Hencky(Solid):
-    """Elastic solid, linear in logarithmic strains."""
-
-    law: Literal["hencky"] = "hencky"
-    """name of the law"""
+def _range(quantity: Quantity) -> Any:
+    """The type of a number in the range of a parameter."""
+    ends: dict[str, Any] = {
+        "ge" if quantity.with_low else "gt": quantity.low,
+        "le" if quantity.with_high else "lt": quantity.high,
+    }
+    return Annotated[float, Field(**{key: end for key, end in ends.items() if math.isfinite(end)})]
 
 
-class VonMises(Solid):
-    """Metal: plastic beyond a shear strength."""
-
-    law: Literal["von_mises"] = "von_mises"
-    """name of the law"""
-    yield_stress: NotNegative
-    """yield stress in uniaxial tension [Pa]"""
-    hardening: NotNegative = 0.0
-    """plastic modulus [Pa]: slope of the yield stress over the plastic strain"""
+def _descriptions(law: type) -> dict[str, str]:
+    """What the docstring of a law says of each argument."""
+    text = inspect.getdoc(law) or ""
+    _, _, arguments = text.partition("Args:\n")
+    found = re.findall(r"^    (\w+): (.*(?:\n        .*)*)", arguments.partition("\n\n")[0], re.MULTILINE)
+    return {name: " ".join(description.split()) for name, description in found}
 
 
-class HerschelBulkley(Solid):
-    """Mud, foam, paint: flows beyond a yield stress."""
-
-    law: Literal["herschel_bulkley"] = "herschel_bulkley"
-    """name of the law"""
-    yield_stress: NotNegative
-    """yield stress in shear [Pa]"""
-    consistency: NotNegative
-    """consistency [Pa s^n]: the viscosity where exponent = 1 (Bingham)"""
-    exponent: Positive = 1.0
-    """exponent n of the shear rate: below 1 shear thinning"""
-
-
-class Snow(Solid):
-    """Snow that hardens when it is compacted (Stomakhin et al. 2013)."""
-
-    law: Literal["snow"] = "snow"
-    """name of the law"""
-    density: Positive = 400.0
-    """density at rest [kg/m^3]"""
-    E: Positive | Curve = 1.4e5
-    """Young's modulus of fresh snow [Pa]"""
-    nu: Annotated[float, Field(gt=-1, lt=0.5)] = 0.2
-    """Poisson's ratio, between -1 and 0.5"""
-    critical_compression: Annotated[float, Field(ge=0, lt=1)] = 0.025
-    """compression beyond which it yields"""
-    critical_stretch: NotNegative = 0.0075
-    """stretch beyond which it yields: smaller is more brittle"""
-    hardening: NotNegative = 10.0
-    """growth of the stiffness with plastic compaction"""
+def _solid(law: type[laws.SolidLaw]) -> type[Solid]:
+    """The table of a material with a compiled law, from its constructor and the ranges of its parameters."""
+    descriptions = _descriptions(law)
+    fields: dict[str, Any] = {}
+    for name, default in law.scene_defaults.items():
+        field = Solid.model_fields[name]
+        fields[name] = (field.rebuild_annotation(), Field(default, description=field.description))
+    for name, argument in inspect.signature(law).parameters.items():
+        if argument.kind is not argument.KEYWORD_ONLY:
+            continue  # the elastic moduli, which all solids have
+        kind = _range(LAWS[law.name].parameter(name))
+        given = {} if argument.default is argument.empty else {"default": argument.default}
+        fields[name] = (kind, Field(**given, description=descriptions[name]))
+    summary = (inspect.getdoc(law) or "").partition("\n")[0]
+    name_of_law: Any = (Literal[law.name], Field(law.name, description="name of the law"))
+    return create_model(law.__name__, __base__=Solid, __doc__=summary, law=name_of_law, **fields)
 
 
-class CamClay(Solid):
-    """Clay or dense snow: modified Cam-Clay with cohesion."""
+SOLIDS = tuple(
+    _solid(law)
+    for law in vars(laws).values()
+    if isinstance(law, type)
+    and issubclass(law, laws.SolidLaw)
+    and law not in (laws.SolidLaw, laws.NeoHookean, laws.QuarticSand)
+)
+"""Tables of the solids that need no words of their own here: a new class in torch_mpm.laws is one of them."""
 
-    law: Literal["cam_clay"] = "cam_clay"
-    """name of the law"""
-    critical_slope: Positive
-    """ratio of shear stress to pressure in the critical state"""
-    consolidation: Positive
-    """preconsolidation pressure [Pa]"""
-    hardening: Positive
-    """growth of the logarithm of the consolidation pressure with plastic compaction"""
-    cohesion: Annotated[float, Field(ge=0, le=1)] = 0.0
-    """isotropic tensile strength over the consolidation pressure"""
-
-
-Material = Annotated[
-    NeoHookean
-    | WeaklyCompressible
-    | QuarticSand
-    | FixedCorotated
-    | Hencky
-    | VonMises
-    | HerschelBulkley
-    | Snow
-    | CamClay,
+Material: Any = Annotated[
+    functools.reduce(operator.or_, SOLIDS, NeoHookean | WeaklyCompressible | QuarticSand),
     Field(discriminator="law"),
 ]
 

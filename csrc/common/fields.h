@@ -1,0 +1,24 @@
+#pragma once
+
+#include <cstdint>
+
+// Particle and node values as the kernels see them: plain pointers and strides, shared by the CPU and CUDA kernels.
+// Only the files *.op.cpp know tensors.
+namespace mpm {
+
+// A tensor [P], [P, I] or [P, I, J] of any strides (in elements); a null pointer is an absent field.
+template <class T>
+struct Field {
+  T* pointer = nullptr;
+  int64_t stride[3] = {0, 0, 0};
+};
+
+// Node values [max_blocks * 4^D, channels] with unit channel stride.
+template <class T>
+struct NodeField {
+  T* pointer = nullptr;
+  int64_t stride = 0;  // elements from node to node
+  int channels = 0;
+};
+
+}  // namespace mpm

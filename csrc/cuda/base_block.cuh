@@ -1,0 +1,64 @@
+#pragma once
+
+#include "common/matrix.h"
+#include "cuda/schedule.h"
+
+// Where a particle lies in its base block.
+namespace mpm::cuda {
+
+template <class T, int D>
+__device__ int scene_of(const Topology<T, D>& t, int block) {
+  return t.scenes > 1 ? block / t.geometry.blocks_per_scene : 0;
+}
+
+// Base node relative to the base block, and the distances from it. False for a particle that is not in its base block:
+// its position is not the one that was activated.
+template <int Order, class T, int D>
+__device__ bool locate_in_block(const Topology<T, D>& t, int scene, int base_block, const Vector<T, D>& x, int* base,
+                                T* f) {
+  const bool inside = locate<Order>(t.geometry, x.e, base, f);
+  int block[D];
+#pragma unroll
+  for (int i = 0; i < D; i++) {
+    block[i] = base[i] / kBlockWidth;
+    base[i] %= kBlockWidth;
+  }
+  return inside && block_index(t.geometry, scene, block) == base_block;
+}
+
+// The base block of a thread block: its base nodes lie in [first, end), as numbers of type T.
+template <class T, int D>
+struct BaseBlock {
+  int scene;
+  T first[D], end[D];
+
+  BaseBlock() = default;
+  template <int Order>
+  __device__ void set(const Topology<T, D>& t, int block) {
+    int coordinates[D];
+    scene = block_coordinates(t.geometry, block, coordinates);
+#pragma unroll
+    for (int i = 0; i < D; i++) {
+      first[i] = T(coordinates[i] * kBlockWidth);
+      end[i] = min(first[i] + T(kBlockWidth), T(t.geometry.blocks[i] * kBlockWidth - Order));
+    }
+  }
+  // Cell of x in the block, counted as its base node is, and the distances from that node. False for a particle that is
+  // not in its base block: its position is not the one that was activated.
+  template <int Order>
+  __device__ bool locate(const Geometry<T, D>& g, const Vector<T, D>& x, int& cell, T* f) const {
+    bool inside = true;
+    T place = T(0);
+#pragma unroll
+    for (int i = 0; i < D; i++) {  // no early return: it would make each coordinate wait for the one before
+      const T node = base_node<Order>(g, i, x[i]);
+      inside = inside && node >= first[i] && node < end[i];  // false for NaN
+      place = place * T(kBlockWidth) + (node - first[i]);
+      f[i] = distance_in_cells(g, i, x[i], node);
+    }
+    cell = inside ? int(place) : kBlockNodes<D>;
+    return inside;
+  }
+};
+
+}  // namespace mpm::cuda

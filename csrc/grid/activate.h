@@ -1,0 +1,27 @@
+#pragma once
+
+#include "common/fields.h"
+#include "grid/topology.h"
+
+namespace mpm {
+
+template <class T, int D>
+struct ActivateArguments {
+  Geometry<T, D> geometry;
+  int scenes = 1;
+  int max_blocks = 0;
+  int64_t particles = 0;
+  bool deterministic = false;
+  Field<const T> x;
+  const int* scene = nullptr;  // [P] or null for one scene
+  int64_t scene_stride = 0;
+  const int64_t* id = nullptr;  // [P] or null
+  int64_t id_stride = 0;
+  const int* previous_status = nullptr;  // [1 + scenes, 8] or null
+  int *table = nullptr, *block = nullptr, *offsets = nullptr, *index = nullptr, *schedule = nullptr, *status = nullptr;
+  int64_t schedule_size = 0;
+  void* workspace = nullptr;  // bytes asked for by activate_workspace()
+  int64_t workspace_size = 0;
+};
+
+}  // namespace mpm

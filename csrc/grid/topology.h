@@ -1,0 +1,31 @@
+#pragma once
+
+#include <cstdint>
+
+#include "grid/geometry.h"
+
+namespace mpm {
+
+// The active blocks of one activation, and which particles lie in each.
+template <class T, int D>
+struct Topology {
+  Geometry<T, D> geometry;
+  int scenes = 1;
+  int max_blocks = 0;  // slots of the pool of blocks
+  int64_t particles = 0;
+  const int* table = nullptr;     // [scenes * blocks_per_scene] slot of a block, -1 where inactive
+  const int* block = nullptr;     // [max_blocks] table index of a slot, -1 where unused
+  const int* offsets = nullptr;   // [max_blocks + 1] index[offsets[s], offsets[s + 1]) have their base node in slot s
+  const int* index = nullptr;     // [P] particles grouped by block; those outside the grid come last
+  const int* schedule = nullptr;  // order of work, of each backend its own
+  int64_t schedule_size = 0;
+};
+
+// Entries of the schedule tensor: room for the work items of both backends, with the number of particles of each cell,
+// and for an entry for each particle (the fake kernel in torch_mpm/ops/activation.py has the same formula).
+template <int D>
+int64_t schedule_size(int64_t max_blocks, int64_t particles) {
+  return 16 + (8 + kBlockNodes<D> / 2) * (max_blocks + particles / 128) + particles;
+}
+
+}  // namespace mpm

@@ -1,0 +1,324 @@
+#pragma once
+
+#include "cuda/base_block.cuh"
+#include "cuda/columns.cuh"
+#include "cuda/quad.cuh"
+#include "heat/cell.h"
+#include "heat/sums.cuh"
+
+// The heat operator H, applied by warps, one item of particles each. A lane takes a cell: it holds the differences of
+// the nodes of the cell's support and what the cell adds to them in registers, and walks the cell's particles. To that
+// end the particles are packed once, as distances from the base node and conductance, in the order in which the lanes
+// read them.
+namespace mpm::cuda {
+
+template <int Order_, class T_, int D_>
+struct HeatShape {
+  using T = T_;
+  static constexpr int Order = Order_, D = D_, support = Order + 1, nodes = kSupportNodes<Order, D>;
+  static constexpr int cells = kBlockNodes<D>;
+  static constexpr int slices = cells < 32 ? 32 / cells : 1;  // lanes that share the particles of a cell
+  static constexpr int parts = cells * slices / 32;           // of a block, one warp wide
+  // A tile holds the nodes of a base block and the next Order along each axis: rows of two blocks, and planes set apart
+  // so that the cells of a part lie in different banks.
+  static constexpr int width = kBlockWidth + Order, row = 2 * kBlockWidth, plane = width * row + kBlockWidth;
+  static constexpr int tile = D == 2 ? width * row : width * plane;
+};
+
+// Read by one warp only, which leaves the cache to the nodes.
+template <class P>
+__device__ P load_once(const P* p) {
+  P q;
+#pragma unroll
+  for (int k = 0; k < sizeof(P) / sizeof(uint4); k++)
+    reinterpret_cast<uint4*>(&q)[k] = __ldcs(reinterpret_cast<const uint4*>(p) + k);
+  return q;
+}
+
+// Memory of one warp.
+template <class S>
+union WarpMemory {
+  using T = typename S::T;
+  struct {
+    alignas(16) T u[S::tile];
+    alignas(16) T sum[S::tile];
+  } tile;
+  struct {
+    uint16_t rank[kItemParticles];
+    unsigned lanes[kItemParticles];  // of a row: those that have a particle of this rank
+    uint16_t start[kItemParticles];  // of a row in the packed order
+    int count[S::cells + 1], row[S::parts];
+  } sort;
+};
+
+template <class T, int D>
+struct PackedItems {
+  PackedParticle<T, D>* particles;  // [P]
+  uint16_t* counts;                 // [items, cells] particles of each cell
+
+  // In a work space, where take(bytes) gives memory.
+  template <class Take>
+  void lay_out(const Topology<T, D>& t, const Take& take) {
+    const int64_t items = most_items(t.max_blocks, t.particles);
+    particles = reinterpret_cast<PackedParticle<T, D>*>(take(t.particles * sizeof(PackedParticle<T, D>)));
+    counts = reinterpret_cast<uint16_t*>(take(items * kBlockNodes<D> * sizeof(uint16_t)));
+  }
+};
+
+// Particles that a lane takes of its cell in each part of a block.
+template <class S>
+struct LaneCounts {
+  int of_part[S::parts];
+
+  template <class I>
+  __device__ explicit LaneCounts(const I* of_cell) {
+    const int lane = lane_index(), slice = lane * S::slices / 32;
+#pragma unroll
+    for (int part = 0; part < S::parts; part++)
+      of_part[part] = (int(of_cell[part * 32 + lane % (32 / S::slices)]) + S::slices - 1 - slice) / S::slices;
+  }
+};
+
+// Calls begin(cell, whether there are particles), each(particle) and end(cell) for the cells of an item, a warp's width
+// of them at a time. All lanes do, where they have no particle with one that conducts nothing.
+template <class S, class T, int D, class Begin, class Each, class End>
+__device__ void walk_cells(const LaneCounts<S>& counts, const PackedParticle<T, D>* particles, const Begin& begin,
+                           const Each& each, const End& end) {
+  const int lane = lane_index();
+  const unsigned before = (1u << lane) - 1;
+#pragma unroll 1
+  for (int part = 0; part < S::parts; part++) {
+    const int cell = part * 32 + lane % (32 / S::slices);
+    const int mine = part == 0 ? counts.of_part[0] : counts.of_part[S::parts - 1];
+    bool has = mine > 0;
+    unsigned lanes = __ballot_sync(~0u, has);
+    if (!lanes) continue;
+    PackedParticle<T, D> next{};
+    if (has) next = load_once(particles + __popc(lanes & before));
+    begin(cell, has);
+#pragma unroll 1
+    for (int k = 1; lanes; k++) {
+      PackedParticle<T, D> now = next;
+      if (!has) now.conductance = T(0);
+      particles += __popc(lanes);
+      has = mine > k;
+      lanes = __ballot_sync(~0u, has);
+      if (has) next = load_once(particles + __popc(lanes & before));
+      each(now);
+    }
+    end(cell);
+  }
+}
+
+// Packs the particles of an item as `walk_cells` reads them: row by row, the lanes of a row being those with a particle
+// of this rank.
+template <class S, class T, int D>
+__device__ void pack_item(const Topology<T, D>& t, const Columns<const T, D>& x, const Columns<const T, 1>& conductance,
+                          const Item& item, int number, const PackedItems<T, D>& packed, WarpMemory<S>& memory) {
+  constexpr int width = 32 / S::slices;  // cells in a part
+  auto& m = memory.sort;
+  const int lane = lane_index(), n = item.end - item.begin;
+  const int* const index = t.index + item.begin;
+  BaseBlock<T, D> base_block;
+  base_block.template set<S::Order>(t, item.block);
+  __syncwarp();
+  for (int c = lane; c <= S::cells; c += 32) m.count[c] = 0;
+  __syncwarp();
+  const auto index_at = [&](int k) { return k < n ? index[k] : 0; };
+  Vector<T, D> ahead = read_vector(x, index_at(lane));  // loads are ahead of their use
+  int particle = index_at(lane + 32);
+#pragma unroll 1
+  for (int k = lane; k - lane < n; k += 32) {
+    const Vector<T, D> position = ahead;
+    ahead = read_vector(x, particle);
+    particle = index_at(k + 64);
+    int cell = -1;
+    T f[D];
+    if (k < n) base_block.template locate<S::Order>(t.geometry, position, cell, f);
+    const unsigned group = __match_any_sync(~0u, cell);
+    const int before = __popc(group & ((1u << lane) - 1)), counted = cell >= 0 ? m.count[cell] : 0;
+    __syncwarp();
+    if (cell >= 0) {
+      m.rank[k] = uint16_t(counted + before);
+      if (before == 0) m.count[cell] = counted + __popc(group);
+    }
+    __syncwarp();
+  }
+  for (int c = lane; c < S::cells; c += 32) packed.counts[int64_t(number) * S::cells + c] = uint16_t(m.count[c]);
+  const LaneCounts<S> counts(m.count);
+#pragma unroll
+  for (int part = 0, row = 0, at = 0; part < S::parts; part++) {
+    if (lane == 0) m.row[part] = row;
+    for (int k = 0; const unsigned lanes = __ballot_sync(~0u, counts.of_part[part] > k); k++, row++) {
+      if (lane == 0) {
+        m.lanes[row] = lanes;
+        m.start[row] = uint16_t(at);
+      }
+      at += __popc(lanes);
+    }
+  }
+  __syncwarp();
+  ahead = read_vector(x, index_at(lane));
+  T conductance_ahead = conductance.at(index_at(lane));
+  particle = index_at(lane + 32);
+#pragma unroll 1
+  for (int k = lane; k < n; k += 32) {
+    const Vector<T, D> position = ahead;
+    PackedParticle<T, D> q;
+    q.conductance = scaled_conductance<S::Order>(conductance_ahead, t.geometry.inverse_dx);
+    ahead = read_vector(x, particle);
+    conductance_ahead = conductance.at(particle);
+    particle = index_at(k + 64);
+    int cell;
+    if (!base_block.template locate<S::Order>(t.geometry, position, cell, q.f)) continue;
+    const int row = m.row[cell / width] + m.rank[k] / S::slices;
+    const int place = m.rank[k] % S::slices * width + cell % width;
+    const int at = m.start[row] + __popc(m.lanes[row] & ((1u << place) - 1));
+    packed.particles[item.begin + at] = q;
+  }
+  __syncwarp();
+}
+
+// The quads of a base block's tile, in rounds of a warp's width: quad r of a lane lies at entry at[r] of the tile, and
+// at node node[r], -1 where it is none.
+template <class S>
+struct TileQuads {
+  static constexpr int rows = S::D == 2 ? S::width : S::width * S::width, rounds = (2 * rows + 31) / 32;
+  int at[rounds], node[rounds];
+
+  template <class T, int D>
+  __device__ TileQuads(const Topology<T, D>& t, int slot) {
+    const int lane = lane_index();
+    const int* const neighbours = schedule_of(t).neighbours + (int64_t(slot) << D);
+    const int slots = lane < 1 << D ? neighbours[lane] : -1;
+#pragma unroll
+    for (int r = 0; r < rounds; r++) {
+      const int quad = r * 32 + lane, far = quad % 2, y = quad / 2 % S::width, x = quad / 2 / S::width;
+      const int row[] = {x, y, 0};  // in 2-D, x is 0
+      int neighbour = far;
+#pragma unroll
+      for (int axis = 0; axis < D - 1; axis++) neighbour |= (row[axis + 3 - D] >= kBlockWidth) << (D - 1 - axis);
+      const int block = __shfl_sync(~0u, slots, neighbour % (1 << D));
+      at[r] = x * S::plane + y * S::row + far * kBlockWidth;
+      node[r] = block < 0 || quad >= 2 * rows ? -1 : block * kBlockNodes<D> + node_in_block<D>(row + 3 - D);
+    }
+  }
+};
+
+template <class S, class F>
+__device__ void for_support(int cell, const F& f) {
+  constexpr int support = S::support;
+  const int z = cell % kBlockWidth, y = cell / kBlockWidth % kBlockWidth, x = cell / (kBlockWidth * kBlockWidth);
+  const int corner = x * S::plane + y * S::row + z;
+#pragma unroll
+  for (int i = 0; i < (S::D == 3 ? support : 1); i++)
+#pragma unroll
+    for (int j = 0; j < support; j++)
+#pragma unroll
+      for (int k = 0; k < support; k++) f((i * support + j) * support + k, corner + i * S::plane + j * S::row + k);
+}
+
+// nodes += q by one atomic operation where there is one for four.
+template <class T>
+__device__ void add_quad(T* nodes, const Quad<T>& q) {
+#if __CUDA_ARCH__ >= 900
+  if constexpr (sizeof(T) == 4)
+    atomicAdd(reinterpret_cast<float4*>(nodes), make_float4(q.e[0], q.e[1], q.e[2], q.e[3]));
+  else
+#endif
+#pragma unroll
+    for (int k = 0; k < kBlockWidth; k++)
+      if (q.e[k] != T(0)) atomicAdd(nodes + k, q.e[k]);
+}
+
+// Adds a sum over the packed particles of the items [number, end), which are of one base block, to the nodes; returns Σ
+// κ V |∇u|², the same in all lanes.
+template <HeatSum Sum, class S, class T, int D>
+__device__ T sum_items(const Topology<T, D>& t, const PackedItems<T, D>& packed, int number, int end, const T* u,
+                       T* out, bool in_order, WarpMemory<S>& memory) {
+  auto& m = memory.tile;
+  const Item* const items = reinterpret_cast<const Item*>(schedule_of(t).items);
+  LaneCounts<S> counts(packed.counts + int64_t(number) * S::cells);
+  const TileQuads<S> quads(t, items[number].slot);
+  Quad<T> loaded[TileQuads<S>::rounds];
+#pragma unroll
+  for (int r = 0; r < quads.rounds; r++)
+    loaded[r] = Sum == HeatSum::product && quads.node[r] >= 0 ? load_quad(u + quads.node[r]) : Quad<T>{};
+  __syncwarp();
+#pragma unroll
+  for (int r = 0; r < quads.rounds; r++) {
+    if (r * 32 + lane_index() >= 2 * quads.rows) continue;
+    if (Sum == HeatSum::product) store_quad(m.u + quads.at[r], loaded[r]);
+    store_quad(m.sum + quads.at[r], Quad<T>{});
+  }
+  __syncwarp();
+  T from[S::nodes], to[S::nodes], power = T(0);
+#pragma unroll 1
+  while (true) {
+    walk_cells<S>(
+        counts, packed.particles + items[number].begin,
+        [&](int cell, bool some) {
+          for_support<S>(cell, [&](int k, int i) {
+            if (Sum == HeatSum::product) from[k] = some ? m.u[i] : T(0);  // u may be NaN away from the particles
+            to[k] = T(0);
+          });
+          if (Sum == HeatSum::product) to_differences<S::Order, D>(from);
+        },
+        [&](const PackedParticle<T, D>& q) {
+          power += add_particle<Sum, S::Order, T, D>(q.f, q.conductance, from, to);
+        },
+        [&](int cell) {
+          if (Sum == HeatSum::product) to_nodes<S::Order, D>(to);
+          // One node of every cell at a time: they differ, so nothing is added twice at once.
+          for_support<S>(cell, [&](int k, int i) {
+            T value = to[k];
+#pragma unroll
+            for (int o = S::slices / 2; o > 0; o /= 2) value += __shfl_xor_sync(~0u, value, o * 32 / S::slices);
+            if (S::slices == 1 || lane_index() < 32 / S::slices) m.sum[i] += value;
+            __syncwarp();
+          });
+        });
+    if (++number >= end) break;
+    counts = LaneCounts<S>(packed.counts + int64_t(number) * S::cells);
+  }
+#pragma unroll
+  for (int r = 0; r < quads.rounds; r++) {
+    if (quads.node[r] < 0) continue;
+    const Quad<T> sum = load_quad(m.sum + quads.at[r]);
+    T* const nodes = out + quads.node[r];
+    if (!in_order) {
+      add_quad(nodes, sum);
+      continue;
+    }
+#pragma unroll
+    for (int k = 0; k < kBlockWidth; k++) nodes[k] += sum.e[k];
+  }
+#pragma unroll
+  for (int o = 16; o > 0; o /= 2) power += __shfl_xor_sync(~0u, power, o);
+  return power;
+}
+
+// f(first item, end) for the items from `first` on that are this warp's, every `stride`-th; for a colour >= 0, the
+// base blocks of that colour, whole.
+template <class T, int D, class F>
+__device__ void for_items(const Topology<T, D>& t, int first, int last, int stride, int colour, const F& f) {
+  const Schedule<const int> schedule = schedule_of(t);
+  const Item* const items = reinterpret_cast<const Item*>(schedule.items);
+#pragma unroll 1
+  for (int i = first; i < last; i += stride) {
+    int end = i + 1;
+    if (colour >= 0) {
+      if (block_colour(t.geometry, items[i].block) != colour || items[i].begin != t.offsets[items[i].slot]) continue;
+      while (end < *schedule.item_count && items[end].slot == items[i].slot) end++;
+    }
+    f(i, end);
+  }
+}
+// Of all items, by the warps of all thread blocks.
+template <class T, int D, class F>
+__device__ void for_items(const Topology<T, D>& t, int colour, const F& f) {
+  for_items(t, blockIdx.x + threadIdx.x / 32 * gridDim.x, *schedule_of(t).item_count, gridDim.x * (blockDim.x / 32),
+            colour, f);
+}
+
+}  // namespace mpm::cuda

@@ -1,0 +1,181 @@
+#pragma once
+
+#include <array>
+#include <cmath>
+#include <cstdint>
+
+#include "common/lanes.h"
+#include "grid/geometry.h"
+
+// A law is one header with a struct that ends with MPM_REGISTER_LAW(Struct). The struct has
+//   name, parameters, history   what it is called; its parameters and history variables, each a Quantity;
+//   field                       what of the deformation it reads and moves: F, or the volume ratio J alone;
+//   viscous                     whether its stress reads the velocity gradient C;
+//   plastic                     whether it changes the deformation, or history, that it is given;
+// and, written for any scalar (a number, a pack of numbers, a dual number), the functions that one of two forms asks
+// for: laws of strain invariants (laws/invariants.h), which need no decomposition, or laws of principal strains
+// (laws/principal_law.h). Their derivatives come from dual numbers. A law may bring kernel bodies of its own
+// (laws/sand.h) where its adjoint asks for more than that.
+//
+// Nothing else has to know the law: setup.py compiles laws/law.cpu.cpp and laws/law.cu once for each such header, which
+// enter its kernels in the registry (laws/registry.h) that the ops and Python read.
+#ifndef MPM_REGISTER_LAW
+#define MPM_REGISTER_LAW(Law)
+#endif
+
+namespace mpm {
+
+// A parameter or history variable: its unit ("" for a pure number) and the range of its values, ends included or not.
+// Infinite ends mean any finite number.
+struct Quantity {
+  const char* name;
+  const char* unit;
+  double low = -INFINITY, high = INFINITY;
+  bool with_low = true, with_high = true;
+  bool matrix = false;  // history alone: D by D entries
+};
+
+constexpr Quantity real(const char* name, const char* unit) { return {name, unit}; }
+constexpr Quantity not_negative(const char* name, const char* unit) { return {name, unit, 0}; }
+constexpr Quantity positive(const char* name, const char* unit) { return {name, unit, 0, INFINITY, false}; }
+
+constexpr Quantity matrix(const char* name, const char* unit) {
+  return {name, unit, -INFINITY, INFINITY, true, true, true};
+}
+
+// The time step [s] of a law whose flow takes time: the last of its parameters.
+constexpr Quantity time_step = not_negative("dt", "s");
+
+enum class Deformation : int { gradient, volume_ratio };
+
+constexpr int kMostParameters = 8, kMostHistory = 4;
+
+// A parameter that is uniform, per scene or per particle.
+template <class T>
+struct Parameter {
+  const T* pointer = nullptr;
+  int64_t stride = 0;  // elements from particle to particle, or from scene to scene
+  int64_t scenes = 0;  // entries where it is per scene, 0 otherwise
+};
+
+template <class T, int D>
+struct LawArguments {
+  int64_t particles = 0;
+  Field<const T> state;        // trial F [P, D, D], or J [P]
+  Field<const T> C;            // [P, D, D], may be absent; of viscous laws
+  const int* scene = nullptr;  // int32 [P], where a parameter is per scene
+  int64_t scene_stride = 0;
+  int options = 0;  // bits, in the order of the law's options
+  Parameter<T> parameters[kMostParameters];
+  Field<const T> history[kMostHistory];  // [P] or [P, D, D]; absent where a law may go without
+};
+
+enum FlowBranch : int { kElasticFlow = 0, kPlasticFlow = 1, kApexFlow = 2, kInvalidFlow = 3, kNotConverged = 4 };
+
+// A deformation that is not finite or has no positive volume, or whose stress overflows, is invalid: it is returned as
+// it is and so is its history, its stress and moduli are zero, so that it does no harm to its neighbours, its energy is
+// infinite, and no derivative passes but those of deformation and history with respect to themselves.
+template <class T, int D>
+struct LawUpdateArguments {
+  LawArguments<T, D> law;
+  Field<T> state;         // absent for laws that do not change it
+  Field<T> stress;        // [P, D, D]
+  Field<T> history;       // [P, m], absent without history
+  Field<T> dissipated;    // [P], absent where not wanted
+  Field<T> multiplier;    // [P], length of the plastic increment of the Hencky strains; absent where not wanted
+  int* branch = nullptr;  // [P] FlowBranch, plus kNotConverged where a root was not found; absent where not wanted
+};
+
+template <class T, int D>
+struct LawBackwardArguments {
+  LawArguments<T, D> law;
+  Field<const T> grad_state, grad_stress, grad_history, grad_dissipated, grad_multiplier;  // each may be absent
+  Field<T> state, C, parameters, history;  // adjoints per particle, parameters [P, n], history [P, m]; or absent
+};
+
+// The derivative of the adjoints of the stress, along a direction in (state, C, parameters).
+template <class T, int D>
+struct LawDoubleBackwardArguments {
+  LawArguments<T, D> law;
+  Field<const T> grad_stress;                             // [P, D, D]
+  Field<const T> along_state, along_C, along_parameters;  // each may be absent
+  Field<T> stress;                                        // by grad_stress
+  Field<T> state, C, parameters;                          // absent where not needed
+};
+
+enum class LawScalar : int { energy, stiffness, wave_modulus };
+
+template <class T, int D>
+struct LawScalarArguments {
+  LawArguments<T, D> law;
+  LawScalar which = LawScalar::energy;
+  Field<T> value;  // [P] [Pa]
+};
+
+template <class T, int D>
+struct LawEnergyBackwardArguments {
+  LawArguments<T, D> law;
+  Field<const T> grad_energy;  // [P]
+  Field<T> state, parameters, history;
+};
+
+template <class T, int D>
+struct LawEnergyDoubleBackwardArguments {
+  LawArguments<T, D> law;
+  Field<const T> grad_energy;
+  Field<const T> along_state, along_parameters;
+  Field<T> energy;  // by grad_energy
+  Field<T> state, parameters;
+};
+
+inline namespace TORCH_MPM_ISA {
+
+template <class Law>
+constexpr int kParameters = int(Law::parameters.size());
+template <class Law>
+constexpr int kHistory = int(Law::history.size());
+// Length of arrays that hold it.
+template <class Law>
+constexpr int kHistoryLength = kHistory<Law> > 0 ? kHistory<Law> : 1;
+
+constexpr std::array<Quantity, 0> no_history = {};
+constexpr std::array<const char*, 0> no_options = {};
+
+// A parameter of the particles `at`. A scene id out of range takes that of scene 0: such a particle is not transferred
+// anyway.
+template <class At, class T, int D>
+MPM_HD typename At::Value load_parameter(const At& at, const LawArguments<T, D>& a, int k) {
+  const Parameter<T>& parameter = a.parameters[k];
+  if (parameter.scenes) {
+    return at.each([&](int64_t p) {
+      const int id = a.scene[p * a.scene_stride];
+      return parameter.pointer[(id >= 0 && id < parameter.scenes ? id : 0) * parameter.stride];
+    });
+  }
+  return at.load(parameter.pointer, parameter.stride);
+}
+
+// Entry k of a field [P, n].
+template <class At, class T>
+MPM_HD typename At::Value load_entry(const At& at, const Field<const T>& f, int k) {
+  return at.load(f.pointer + k * f.stride[1], f.stride[0]);
+}
+
+template <class At, class T>
+MPM_HD void store_entry(const At& at, const Field<T>& f, int k, const typename At::Value& value) {
+  at.store(f.pointer + k * f.stride[1], f.stride[0], value);
+}
+
+// Where a field is absent, zero.
+template <int D, class At, class T>
+MPM_HD Matrix<typename At::Value, D> load_matrix_or_zero(const At& at, const Field<const T>& f) {
+  return f.pointer ? load_matrix<D>(at, f) : zero_matrix<typename At::Value, D>();
+}
+
+template <class At, class T>
+MPM_HD typename At::Value load_scalar_or_zero(const At& at, const Field<const T>& f) {
+  return f.pointer ? at.load(f.pointer, f.stride[0]) : typename At::Value(0);
+}
+
+}  // namespace TORCH_MPM_ISA
+}  // namespace mpm

@@ -1,0 +1,110 @@
+#pragma once
+
+#include <string>
+#include <vector>
+
+#include "laws/law.h"
+
+// The laws that were compiled, with their kernels: the only list of them. Each object file of laws/law.cpu.cpp and
+// laws/law.cu enters its laws when the library is loaded; ops find them by name, and Python reads the whole list.
+namespace mpm {
+
+struct LawInfo {
+  const char* name = "";
+  Deformation field = Deformation::gradient;
+  bool viscous = false, plastic = false, optional_history = false, twice_differentiable = false, in_2d = true;
+  std::vector<Quantity> parameters, history;
+  std::vector<const char*> options;
+};
+
+// Of one scalar and dimension; the stream is that of CUDA, or null. Kernels that a law has not are null.
+template <class T, int D>
+struct LawKernels {
+  void (*update)(const LawUpdateArguments<T, D>&, void* stream) = nullptr;
+  void (*update_backward)(const LawBackwardArguments<T, D>&, void* stream) = nullptr;
+  void (*double_backward)(const LawDoubleBackwardArguments<T, D>&, void* stream) = nullptr;
+  void (*scalar)(const LawScalarArguments<T, D>&, void* stream) = nullptr;
+  void (*energy_backward)(const LawEnergyBackwardArguments<T, D>&, void* stream) = nullptr;
+  void (*energy_double_backward)(const LawEnergyDoubleBackwardArguments<T, D>&, void* stream) = nullptr;
+};
+
+struct Law {
+  LawInfo info;
+  int level = 0;  // instruction set, in the CPU library
+  LawKernels<float, 2> float_2;
+  LawKernels<float, 3> float_3;
+  LawKernels<double, 2> double_2;
+  LawKernels<double, 3> double_3;
+
+  template <class T, int D>
+  LawKernels<T, D>& kernels() {
+    if constexpr (sizeof(T) == sizeof(float)) {
+      if constexpr (D == 2)
+        return float_2;
+      else
+        return float_3;
+    } else {
+      if constexpr (D == 2)
+        return double_2;
+      else
+        return double_3;
+    }
+  }
+};
+
+// Enters a law, or more kernels of one that is there.
+Law& enter_law(const LawInfo& info, int level);
+
+// Null where there is none of this name for the instruction set in use.
+Law* find_law(const std::string& name);
+
+// As Python reads it.
+std::string laws_as_json();
+std::string law_names();
+
+inline namespace TORCH_MPM_ISA {
+
+template <class Law>
+LawInfo info_of() {
+  return {Law::name,
+          Law::field,
+          Law::viscous,
+          Law::plastic,
+          Law::optional_history,
+          Law::twice_differentiable,
+          Law::in_2d,
+          {Law::parameters.begin(), Law::parameters.end()},
+          {Law::history.begin(), Law::history.end()},
+          {Law::options.begin(), Law::options.end()}};
+}
+
+// Kernels<Law, T, D> has the functions of LawKernels as static members.
+template <template <class, class, int> class Kernels, class Law, class T, int D>
+void fill_kernels(mpm::Law& entry) {
+  static_assert(kParameters<Law> <= kMostParameters && kHistory<Law> <= kMostHistory);
+  if constexpr (D == 3 || Law::in_2d) {
+    using K = Kernels<Law, T, D>;
+    LawKernels<T, D>& kernels = entry.template kernels<T, D>();
+    kernels.update = K::update;
+    kernels.update_backward = K::update_backward;
+    kernels.scalar = K::scalar;
+    kernels.energy_backward = K::energy_backward;
+    if constexpr (Law::twice_differentiable) {
+      kernels.double_backward = K::double_backward;
+      kernels.energy_double_backward = K::energy_double_backward;
+    }
+  }
+}
+
+template <template <class, class, int> class Kernels, class Law>
+bool enter(int level) {
+  mpm::Law& entry = enter_law(info_of<Law>(), level);
+  fill_kernels<Kernels, Law, float, 2>(entry);
+  fill_kernels<Kernels, Law, float, 3>(entry);
+  fill_kernels<Kernels, Law, double, 2>(entry);
+  fill_kernels<Kernels, Law, double, 3>(entry);
+  return true;
+}
+
+}  // namespace TORCH_MPM_ISA
+}  // namespace mpm

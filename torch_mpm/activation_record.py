@@ -1,0 +1,79 @@
+"""What the activations of one user of a grid have told, for `check` and `failures`."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from .capture import is_captured, outside_transforms, remember, without_transforms
+from .failures import Problem, problems_of_status, refused_steps
+from .grid import Blocks, Grid
+
+NO_PROBLEM = (0, 0, -1, 0, -1, 0, -1, 0)
+"""A row of the status before the first activation (csrc/grid/status.h)."""
+
+
+class ActivationRecord:
+    """The status of all activations of one user of a grid, also of those that CUDA graphs replay.
+
+    A replay reads and writes the tensors of the capture. So captured activations go on in the tensor that they found,
+    which is kept; the first activation of all should not be a captured one, or each replay forgets those before.
+
+    Attributes:
+        status: int32 [1 + B, 8], see csrc/grid/status.h; None before the first activation.
+        refused: steps of each scene whose entry of a tensor dt could not be taken, int32 [B]; None before the first
+            tensor dt.
+    """
+
+    def __init__(self) -> None:
+        self.status: Tensor | None = None
+        self.refused: Tensor | None = None
+        self._replayed: list[Tensor] = []
+
+    def activate(self, grid: Grid, x: Tensor, scene: Tensor | None, ids: Tensor | None = None) -> Blocks:
+        """As `Grid.activate`; `max_blocks` of the grid follows."""
+        before = self.status
+        blocks = grid.activate(x, scene, before, ids)
+        status = without_transforms(blocks.status)
+        grid.watch(status)
+        if before is None or not is_captured(x):
+            self.status = status
+            return blocks
+        with torch.inference_mode(), outside_transforms():  # in which any tensor may be written to
+            before.copy_(status)
+        remember(self._replayed, before)
+        return blocks
+
+    def all(self) -> list[Tensor]:
+        """The latest status, and those that graphs go on with."""
+        latest = [] if self.status is None else [self.status]
+        return latest + [kept for kept in self._replayed if kept is not self.status]
+
+    def problems(self, grid: Grid) -> dict[str, Problem]:
+        """What these steps tell about scenes, without synchronising."""
+        problems = problems_of_status(self.all(), grid)
+        if self.refused is not None:
+            problems["dt"] = refused_steps(self.refused)
+        return problems
+
+    @torch.no_grad()
+    def refuse(self, entries: Tensor, scenes: int) -> None:
+        """Count entries of a tensor dt that could not be taken: bool of shape [], [1] or [B]."""
+        refused = self.counts(scenes, entries.device)
+        with outside_transforms():
+            refused += without_transforms(entries)
+
+    def counts(self, scenes: int, device: torch.device) -> Tensor:
+        """`refused`, made at the first tensor dt."""
+        if self.refused is None or self.refused.device != device:
+            with outside_transforms(), torch.inference_mode(False):
+                self.refused = torch.zeros(scenes, dtype=torch.int32, device=device)
+        return self.refused
+
+    def reset(self) -> None:
+        self.status = None
+        if self.refused is not None:  # and CUDA graphs may write to it
+            self.refused.zero_()
+        with torch.inference_mode():
+            for kept in self._replayed:
+                kept.copy_(torch.tensor(NO_PROBLEM, dtype=torch.int32, device="cpu"))

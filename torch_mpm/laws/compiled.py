@@ -1,0 +1,246 @@
+"""Laws of csrc/laws: their parameters, in whatever form they are given, and their call.
+
+Parameters are numbers or tensors of shape [], [1], [B] (per scene) or [P] (per particle, in the order of `state.ids`
+where particles were reordered; also where P = B), and gradients pass to them. A parameter may also be a function of
+temperature, [P] -> [P] (`Table`, an `nn.Module`, any torch code), evaluated at state.temperature.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import torch
+from torch import Tensor, nn
+
+from ..capture import GraphCache
+from ..errors import check_number, shape_of
+from ..ops.arguments import soa_empty
+from ..ops.law import DISSIPATED, LawUpdate, law_energy, law_stiffness, law_update, law_wave_modulus
+from ..ops.registry import LAWS
+from ..parameters import Overlay, PerMaterial, Value, evaluate
+from .material import Material
+
+if TYPE_CHECKING:
+    from ..state import State
+
+
+class CompiledLaw(Material):
+    """A law of csrc/laws; subclasses say which, and convert their arguments to its parameters.
+
+    Its fields, history, parameters and their ranges are those of the compiled registry, `torch_mpm.ops.LAWS`. The
+    history is in state.extra, where a `Step` keeps it; what is absent counts as zero.
+    """
+
+    name: str
+    scene_defaults: ClassVar[dict[str, float]] = {}
+    """Density [kg/m³] and other values that a scene file takes for what it does not say."""
+
+    def __init_subclass__(cls) -> None:
+        if "name" in vars(cls):
+            cls._describe(cls)
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._kept_parameters = GraphCache()
+        self._functions = False
+
+    @staticmethod
+    def _describe(target: Any) -> None:
+        """Set what a step asks a law from the registry, on a class or on one instance."""
+        info = LAWS[target.name]
+        target.state_fields = (info.field,)
+        target.extra_fields = tuple(q.name for q in info.history)
+        target.viscous, target.rate_dependent = info.viscous, info.rate_dependent
+
+    def values(self) -> Sequence[Value]:
+        """The parameters of the compiled law, in its order; without the time step."""
+        return [getattr(self, p.name) for p in LAWS[self.name].parameters if p.name != "dt"]
+
+    def return_map(self, state: State, details: bool | int = False) -> LawUpdate:
+        """The whole result of the law: with details also dissipated energy, multiplier, branches and convergence."""
+        deformation, parameters = self._arguments(state)
+        C = state.C if self.viscous else None
+        return law_update(
+            self._name(state),
+            deformation,
+            parameters,
+            self._history(state),
+            C,
+            state.scene,
+            state.x.shape[1],
+            self._options(),
+            details,
+        )
+
+    def update(self, state: State) -> tuple[dict[str, Tensor], Tensor]:
+        info = LAWS[self.name]
+        flows = info.plastic or bool(info.history)
+        result = self.return_map(state, DISSIPATED if self.dissipation and flows else False)
+        fields = dict(zip(self.extra_fields, result.history, strict=True))
+        if info.plastic:
+            fields[info.field] = result.state
+        if result.dissipated is not None:
+            fields["dissipated"] = result.dissipated
+        return fields, result.stress
+
+    def energy_density(self, state: State) -> Tensor:
+        """Elastic energy per rest volume [P] [J/m³] after the return map."""
+        deformation, parameters = self._arguments(state)
+        history: Sequence[Tensor] = self._history(state)
+        if LAWS[self.name].plastic or history:
+            moved = self.return_map(state)
+            deformation, history = moved.state, moved.history
+        return law_energy(self._name(state), deformation, parameters, history, state.scene, state.x.shape[1])
+
+    def wave_modulus(self, state: State) -> Tensor:
+        """Upper bound of rest density times squared wave speed after the return map [P] [Pa]; exact at rest."""
+        return self._modulus(law_wave_modulus, state)
+
+    def stiffness(self, state: State) -> Tensor:
+        """Upper bound of the elastic tangent modulus after the return map [P] [Pa]."""
+        return self._modulus(law_stiffness, state)
+
+    def _modulus(self, op: Callable[..., Tensor], state: State) -> Tensor:
+        deformation, parameters = self._arguments(state)
+        return op(self._name(state), deformation, parameters, self._history(state), state.scene, state.x.shape[1])
+
+    def _name(self, state: State) -> str:
+        """The compiled law, which may depend on the dimension."""
+        return self.name
+
+    def _options(self) -> Sequence[str]:
+        return ()
+
+    def _history(self, state: State) -> list[Tensor]:
+        names = [q.name for q in LAWS[self.name].history if q.name in self.extra_fields]
+        return [state.extra[n] if n in state.extra else self.initial(n, state) for n in names]
+
+    def initial(self, name: str, state: State) -> Tensor:
+        P, D = state.x.shape
+        if any(q.name == name and q.matrix for q in LAWS[self.name].history):
+            return soa_empty(state.x, (P, D, D)).zero_()
+        return torch.zeros_like(state.mass)
+
+    def _add(self, name: str, value: Value) -> None:
+        """Check a parameter of the law against its range and keep it."""
+        quantity = LAWS[self.name].parameter(name)
+        self._store(name, check_value(name, value, quantity.expected, quantity.holds))
+
+    def _store(self, name: str, value: Value) -> None:
+        """Keep a parameter as number, buffer, nn.Parameter or function, so that `.to` and optimizers find it."""
+        if not isinstance(value, Tensor):
+            setattr(self, name, value if callable(value) else float(value))
+            self._functions = self._functions or callable(value)
+        elif isinstance(value, nn.Parameter):
+            self.register_parameter(name, value)
+        else:
+            self.register_buffer(name, value)
+
+    def _arguments(self, state: State) -> tuple[Tensor, list[Tensor]]:
+        field = self.state_fields[0]
+        deformation = getattr(state, field)
+        if deformation is None:
+            raise ValueError(f"{type(self).__name__} needs state.{field}, which is None")
+        parameters = self._parameters_of(state)
+        if self.rate_dependent:
+            dt, like = getattr(state, "dt", 0.0), {"dtype": deformation.dtype, "device": deformation.device}
+            parameters = [*parameters, dt.to(**like) if isinstance(dt, Tensor) else torch.full((), dt, **like)]
+        return deformation, parameters
+
+    def _parameters_of(self, state: State) -> list[Tensor]:
+        """Parameters in the dtype, on the device and in the particle order of the state.
+
+        GraphCache from call to call while nothing has changed and none requires grad.
+        """
+        if self._functions:
+            in_order: Any = Overlay(state, ids=None)  # which evaluated parameters already are
+            return self._at_temperature(state)._convert(in_order)
+        tensors = [t for t in (*self._parameters.values(), *self._buffers.values()) if t is not None]
+        if torch.compiler.is_compiling() or any(t.requires_grad for t in tensors):
+            return self._convert(state)
+        numbers = [value for value in vars(self).values() if isinstance(value, float)]
+        key = (state.x.dtype, state.x.device, state.ids, *numbers, *((t, t._version) for t in tensors))
+        return self._kept_parameters.get(key, lambda: self._convert(state), state.x)
+
+    def _at_temperature(self, state: State) -> CompiledLaw:
+        """The law with its parameters at the temperature of each particle, in the order of the state."""
+        law: CompiledLaw = object.__new__(type(self))
+        law.__dict__ = {**self.__dict__, "_parameters": {}, "_buffers": {}, "_modules": {}}
+        stored = {**vars(self), **self._parameters, **self._buffers, **self._modules}
+        for name, value in stored.items():
+            if isinstance(value, Tensor) or (callable(value) and not name.startswith("_")):
+                law.__dict__[name] = evaluate(name, value, state)
+        return law
+
+    def _convert(self, state: State) -> list[Tensor]:
+        x, particles = state.x, getattr(state, "particles", state.x.shape[0])
+        result = []
+        for value in self.values():
+            tensor = torch.as_tensor(value, dtype=x.dtype, device=x.device)
+            if state.ids is not None and particles > 1 and tensor.shape == (particles,):
+                tensor = tensor.index_select(0, state.ids)
+            result.append(tensor)
+        return result
+
+
+class SolidLaw(CompiledLaw):
+    """A compiled law with two elastic moduli, given as Young's modulus and Poisson's ratio or as Lamé parameters."""
+
+    E: Any  # numbers, buffers or nn.Parameters
+    nu: Any
+    mu: Any
+    lam: Any
+
+    def __init__(
+        self, E: Value | None = None, nu: Value | None = None, mu: Value | None = None, lam: Value | None = None
+    ) -> None:
+        super().__init__()
+        given = {k: v for k, v in (("E", E), ("nu", nu), ("mu", mu), ("lam", lam)) if v is not None}
+        if set(given) not in ({"E", "nu"}, {"mu", "lam"}):
+            found = ", ".join(given) or "nothing"
+            raise ValueError(f"{type(self).__name__} needs E and nu, or mu and lam, got {found}")
+        if E is not None and nu is not None:
+            self._store("E", check_value("E", E, "finite and not negative", lambda v: v >= 0))
+            self._store("nu", check_value("nu", nu, "between -1 and 0.5", lambda v: (v > -1) & (v < 0.5)))
+            if len({v.numel() for v in (E, nu) if isinstance(v, Tensor) and v.numel() > 1}) > 1:
+                raise ValueError(f"E and nu must have one shape where both vary, got {shape_of(E)} and {shape_of(nu)}")
+        elif mu is not None and lam is not None:
+            self._store("mu", check_value("mu", mu, "finite and not negative", lambda v: v >= 0))
+            self._store("lam", check_value("lam", lam, "finite", lambda v: v == v))
+        self._engineering = E is not None
+
+    def values(self) -> Sequence[Value]:
+        """μ and λ [Pa], then the other parameters of the law in its order, without the time step."""
+        others = [getattr(self, p.name) for p in LAWS[self.name].parameters[2:] if p.name != "dt"]
+        return *self._lame(), *others
+
+    def _lame(self) -> tuple[Any, Any]:
+        if not self._engineering:
+            return self.mu, self.lam
+        E, nu = self.E, self.nu
+        return E / (2 * (1 + nu)), E * nu / ((1 + nu) * (1 - 2 * nu))
+
+
+def check_value(name: str, value: Value, expected: str, holds: Callable[[Any], Any], infinite: bool = False) -> Value:
+    """A value whose numbers hold, and are finite unless they may be infinite; a function is not asked."""
+    if isinstance(value, PerMaterial):
+        for k, one in enumerate(value.values()):
+            check_value(f"{name} of material {k}", one, expected, holds, infinite)
+    kinds = "a number, a tensor or a function of temperature"
+    if isinstance(value, Material):
+        raise TypeError(f"{name} must be {kinds}, got {shape_of(value)}")
+    if callable(value) and not isinstance(value, Tensor):
+        return value
+    if isinstance(value, Tensor):
+        if value.dim() > 1 or value.numel() == 0 or not value.is_floating_point():
+            raise ValueError(
+                f"{name} must be a number or a floating tensor of shape [], [1], [B] or [P], got {shape_of(value)}"
+            )
+        if not bool((holds(value.detach()) & (value.detach().isfinite() | infinite)).all()):
+            raise ValueError(f"{name} must be {expected}, got {value}")
+        return value
+    return float(
+        check_number(name, value, expected, lambda v: (math.isfinite(v) or infinite) and bool(holds(v)), kinds)
+    )

@@ -1,0 +1,130 @@
+"""Several laws in one state."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor, nn
+
+from ..capture import without_transforms
+from ..errors import shape_of
+from ..ops.arguments import soa_empty
+from ..state import _take
+from .custom import as_law
+from .material import Material
+
+if TYPE_CHECKING:
+    from ..state import State
+
+__all__ = ["Mixture"]
+
+
+class Mixture(Material):
+    """Several laws in one state: law k for the particles with state.material = k.
+
+    The particles of each law are found once per `state.material` tensor, which synchronises with the device; replace
+    the tensor rather than write into it. Per-particle parameters of the laws have shape [P] for the whole state.
+
+    Args:
+        laws: at least one; functions and modules F -> τ as by `CustomLaw`.
+
+    Raises:
+        TypeError: for what is no law.
+        ValueError: without laws, or in use without state.material or with an id outside 0 .. len(laws) − 1.
+    """
+
+    def __init__(self, laws: Sequence[Material | Callable[[Tensor], Any]]) -> None:
+        super().__init__()
+        if not isinstance(laws, (list, tuple, nn.ModuleList)):
+            raise TypeError(f"laws must be a list of materials, got {shape_of(laws)}")
+        if len(laws) == 0:
+            raise ValueError("Mixture needs at least one law")
+        parts = [as_law(f"laws[{k}]", law) for k, law in enumerate(laws)]
+        self.laws = nn.ModuleList(parts)
+        self.state_fields = tuple(sorted({field for law in parts for field in law.state_fields}))
+        self.extra_fields = tuple(sorted({field for law in parts for field in law.extra_fields}))
+        self.viscous = any(law.viscous for law in parts)
+        self._material: Tensor | None = None
+        self._indices: list[Tensor] = []
+
+    def update(self, state: State) -> tuple[dict[str, Tensor], Tensor]:
+        changes: dict[str, Tensor] = {}
+        P, D = state.x.shape
+        stress = soa_empty(state.x, (P, D, D))
+        for part, law in self._parts(state):
+            fields, part_stress = law(part)
+            stress = stress.index_copy(0, part.index, part_stress)
+            for name, value in fields.items():
+                if name not in changes:
+                    new = name == "dissipated" or name in self.extra_fields
+                    zero = value.new_zeros(P, *value.shape[1:])
+                    changes[name] = state.extra.get(name, zero) if new else getattr(state, name)
+                changes[name] = changes[name].index_copy(0, part.index, value)
+        return changes, stress
+
+    def initial(self, name: str, state: State) -> Tensor:
+        return next(law.initial(name, state) for law in self.laws if name in law.extra_fields)  # type: ignore[operator]
+
+    def energy_density(self, state: State) -> Tensor:
+        return self._collect(state, lambda law, part: law.energy_density(part))
+
+    def stiffness(self, state: State) -> Tensor:
+        return self._collect(state, lambda law, part: law.stiffness(part))
+
+    def wave_modulus(self, state: State) -> Tensor:
+        return self._collect(state, lambda law, part: law.wave_modulus(part))
+
+    def invalid(self, state: State) -> Tensor:
+        return self._collect(state, lambda law, part: law.invalid(part).to(state.x.dtype)) > 0
+
+    def viscosity(self, state: State) -> Tensor | None:
+        if not self.viscous:
+            return None
+
+        def viscosity(law: Material, part: Any) -> Tensor:
+            value = law.viscosity(part)
+            return torch.zeros_like(part.mass) if value is None else value
+
+        return self._collect(state, viscosity)
+
+    def _collect(self, state: State, function: Callable[[Any, Any], Tensor]) -> Tensor:
+        result = torch.zeros_like(state.mass)
+        for part, law in self._parts(state):
+            result = result.index_copy(0, part.index, function(law, part))
+        return result
+
+    def _parts(self, state: State) -> list[tuple[Any, Any]]:
+        material = state.material
+        if material is None:
+            raise ValueError("a Mixture needs state.material, int32 [P]")
+        if material is not self._material:
+            if material.numel() and not bool(((material >= 0) & (material < len(self.laws))).all()):
+                raise ValueError(
+                    f"state.material must be in 0 .. {len(self.laws) - 1}, got {material.unique().tolist()}"
+                )
+            indices = ((material == k).nonzero().squeeze(1) for k in range(len(self.laws)))
+            self._indices = [without_transforms(index) for index in indices]
+            self._material = material
+        return [(_Part(state, index), law) for index, law in zip(self._indices, self.laws, strict=True) if len(index)]
+
+
+class _Part:
+    """Some particles of a state: its fields, gathered when they are asked for."""
+
+    def __init__(self, state: State, index: Tensor) -> None:
+        self.index = index
+        self.particles = state.x.shape[0]
+        self.ids = index if state.ids is None else state.ids.index_select(0, index)
+        self._state = state
+
+    def __getattr__(self, name: str) -> Any:
+        value = getattr(self._state, name)
+        if isinstance(value, Tensor) and name != "dt":  # which is that of the scenes
+            value = _take(value, self.index)
+            setattr(self, name, value)
+        elif name == "extra":
+            value = {key: _take(t, self.index) for key, t in value.items()}
+            setattr(self, name, value)
+        return value

@@ -1,0 +1,463 @@
+"""The compiled laws (csrc/laws): update with stress, energy and moduli; Python faces, fake kernels and autograd."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from ..errors import FLOATING, check_index, check_like, shape_of
+from .arguments import check_choice, check_parameter, check_tensors, refuse_vmap, sizes, soa_empty, sum_by_scene
+from .autograd import dispatch, register_autograd
+from .registry import LAWS, LawInfo
+
+ELASTIC, PLASTIC, APEX, INVALID = 0, 1, 2, 3
+"""Branches of an update. What reaches the apex of a yield surface flows too."""
+NOT_CONVERGED = 4
+DISSIPATED, MULTIPLIER, BRANCH = 1, 2, 4
+"""Bits of `details` in csrc/laws/law.op.cpp."""
+STATE, VELOCITY_GRADIENT, PARAMETERS, HISTORY = 1, 2, 4, 8
+"""Bits of `needs` in csrc/laws/law.op.cpp."""
+
+Tensors = Sequence[Tensor]
+
+
+class LawUpdate(NamedTuple):
+    """Result of `law_update`."""
+
+    state: Tensor
+    """F [P, D, D] after the return map, bitwise the trial one where elastic; J [P] of a fluid as it was given."""
+    stress: Tensor
+    """Kirchhoff stress τ [P, D, D] [Pa] of that state, stored as structure of arrays."""
+    history: tuple[Tensor, ...]
+    """History variables after the update, each in the shape that it was given in."""
+    dissipated: Tensor | None
+    """Energy that the map turns into heat, per rest volume [P] [J/m³], not negative. With details.
+
+    The plastic work τ · (h − H) of the mapped stress on the plastic increment of the Hencky strains (backward Euler;
+    Simo and Hughes 1998), less what hardening stores, and what is lost at once (`ReturnMap` says it for sand).
+    """
+    multiplier: Tensor | None
+    """Length of the plastic increment of the Hencky strains, trial less mapped [P]. With details."""
+    branch: Tensor | None
+    """int32 [P]: ELASTIC = 0, PLASTIC = 1, APEX = 2 (sand), INVALID = 3. With details."""
+    converged: Tensor | None
+    """bool [P]: whether the root of the flow rule was found. With details."""
+
+
+def law_update(
+    law: str,
+    state: Tensor,
+    parameters: Tensors,
+    history: Tensors = (),
+    C: Tensor | None = None,
+    scene: Tensor | None = None,
+    dim: int | None = None,
+    options: Sequence[str] = (),
+    details: bool | int = False,
+) -> LawUpdate:
+    """Return map and Kirchhoff stress of a compiled law.
+
+    Args:
+        law: a name in `torch_mpm.ops.LAWS`, which tells its parameters, history and options.
+        state: trial deformation gradient F [P, D, D], or the volume ratio J [P] of a fluid; float32 or float64.
+        parameters: of the law, in its order; each of shape [], [1], [B] (with `scene`) or [P] (also where P = B).
+        history: history variables of the law, [P] or [P, D, D] each.
+        C: velocity gradient [P, D, D] [1/s] of a viscous law; None at rest.
+        scene: scene of each particle, int32 [P].
+        dim: D; needed where the state is J.
+        options: names of switches of the law.
+        details: whether dissipated energy, multiplier, branch and convergence are wanted too; or some of them, as bits.
+
+    A state that is not finite, of det F ≤ 0 or J ≤ 0, or with a stress that overflows, is returned as it is with its
+    history, and has zero stress and no derivatives.
+
+    Differentiable: every floating result with respect to state, parameters, C and history; twice in eager mode where
+    the law says so. On a boundary between branches the derivative is that of one of them, at equal principal stretches
+    it is right.
+
+    Raises:
+        ValueError, TypeError: for an unknown law or option, or wrong shapes, dtypes or devices.
+    """
+    dim = _check(law, state, parameters, history, scene, dim)
+    if C is not None and not LAWS[law].viscous:
+        raise ValueError(f"{law} has no viscosity: C must be None")
+    check_like("C", C, state, (state.shape[0], dim, dim), "[P, D, D]")
+    bits = 0
+    for option in options:
+        check_choice("an option", option, LAWS[law].options)
+        bits |= 1 << LAWS[law].options.index(option)
+    wanted = (DISSIPATED | MULTIPLIER | BRANCH if details else 0) if isinstance(details, bool) else details
+    mapped, stress, moved, dissipated, multiplier, code = dispatch(
+        torch.ops.torch_mpm.law_update, state, C, parameters, history, scene, law, dim, bits, wanted
+    )
+    return LawUpdate(
+        mapped if LAWS[law].plastic else state,
+        stress,
+        _split(moved, history),
+        dissipated if wanted & DISSIPATED else None,
+        multiplier if wanted & MULTIPLIER else None,
+        code & 3 if wanted & BRANCH else None,
+        code < NOT_CONVERGED if wanted & BRANCH else None,
+    )
+
+
+def law_energy(
+    law: str,
+    state: Tensor,
+    parameters: Tensors,
+    history: Tensors = (),
+    scene: Tensor | None = None,
+    dim: int | None = None,
+) -> Tensor:
+    """Elastic energy per rest volume ψ [P] [J/m³] of the state itself; infinite where `law_update` has no stress.
+
+    Arguments as `law_update`; differentiable as that is.
+    """
+    dim = _check(law, state, parameters, history, scene, dim)
+    return dispatch(torch.ops.torch_mpm.law_energy, state, parameters, history, scene, law, dim)
+
+
+def law_stiffness(
+    law: str,
+    state: Tensor,
+    parameters: Tensors,
+    history: Tensors = (),
+    scene: Tensor | None = None,
+    dim: int | None = None,
+) -> Tensor:
+    """Upper bound [P] [Pa] of the elastic tangent modulus over all velocity gradients of unit norm, after the map.
+
+    Zero where the stress is; not differentiable. Arguments as `law_update`.
+    """
+    dim = _check(law, state, parameters, history, scene, dim)
+    return torch.ops.torch_mpm.law_stiffness(state, parameters, history, scene, law, dim)
+
+
+def law_wave_modulus(
+    law: str,
+    state: Tensor,
+    parameters: Tensors,
+    history: Tensors = (),
+    scene: Tensor | None = None,
+    dim: int | None = None,
+) -> Tensor:
+    """ρ₀ c² [P] [Pa] of the fastest elastic plane wave in the material after the map, or an upper bound.
+
+    Zero where the stress is; not differentiable. Arguments as `law_update`.
+    """
+    dim = _check(law, state, parameters, history, scene, dim)
+    return torch.ops.torch_mpm.law_wave_modulus(state, parameters, history, scene, law, dim)
+
+
+def _check(
+    law: str, state: Tensor, parameters: Tensors, history: Tensors, scene: Tensor | None, dim: int | None
+) -> int:
+    """Check what all ops share; return the dimension."""
+    check_choice("law", law, LAWS)
+    info = LAWS[law]
+    dim = _check_state(info, state, dim)
+    check_index("scene", scene, state, of="the state")
+    check_tensors(law, "parameters", [p.name for p in info.parameters], parameters)
+    for quantity, value in zip(info.parameters, parameters, strict=True):
+        check_parameter(quantity.name, value, state, scene)
+    if history or not info.optional_history:
+        check_tensors(law, "history variables", [q.name for q in info.history], history)
+    P = state.shape[0]
+    for quantity, value in zip(info.history, history, strict=False):
+        if value is None:
+            raise TypeError(f"{quantity.name} must be a tensor, got None")
+        shape = (P, dim, dim) if quantity.matrix else (P,)
+        check_like(quantity.name, value, state, shape, "[P, D, D]" if quantity.matrix else "[P]")
+    return dim
+
+
+def _check_state(info: LawInfo, state: Tensor, dim: int | None) -> int:
+    if not isinstance(state, Tensor) or state.dtype not in FLOATING:
+        raise TypeError(f"{info.field} must be float32 or float64, got {getattr(state, 'dtype', type(state).__name__)}")
+    if info.field == "F":
+        if state.dim() != 3 or state.shape[1:] not in ((2, 2), (3, 3)):
+            raise ValueError(f"F must have shape [P, 3, 3] or [P, 2, 2], got {shape_of(state)}")
+        dim = state.shape[1]
+    elif state.dim() != 1:
+        raise ValueError(f"J must have shape [P], got {shape_of(state)}")
+    if dim is None or dim not in ((2, 3) if info.in_2d else (3,)):
+        raise ValueError(f"dim must be {'2 or 3' if info.in_2d else '3'}, got {dim}")
+    return dim
+
+
+def _split(columns: Tensor, history: Tensors) -> tuple[Tensor, ...]:
+    """The entries [P, m] of all history variables as one view each."""
+    result, first = [], 0
+    for variable in history:
+        if variable.dim() == 1:
+            result.append(columns[:, first])
+            first += 1
+        else:
+            D = variable.shape[1]
+            result.append(columns[:, first : first + D * D].unflatten(1, (D, D)))
+            first += D * D
+    return tuple(result)
+
+
+def _entries(history: Tensors) -> int:
+    return sum(h.shape[1] ** 2 if h.dim() == 3 else 1 for h in history)
+
+
+# ---- fake kernels: shapes and strides only
+
+
+def _particles(state: Tensor) -> int:
+    return sizes(state, "the state", 3 if state.dim() == 3 else 1)[0]
+
+
+@torch.library.register_fake("torch_mpm::law_update")
+def _update_fake(state, C, parameters, history, scene, law, dim, options, details):
+    P = _particles(state)
+    check_choice("law", law, LAWS)
+    matrices = (P, dim, dim)
+    return (
+        soa_empty(state, matrices) if LAWS[law].plastic else state.new_empty(0),
+        soa_empty(state, matrices),
+        soa_empty(state, (P, _entries(history))) if history else state.new_empty(0),
+        state.new_empty(P if details & DISSIPATED else 0),
+        state.new_empty(P if details & MULTIPLIER else 0),
+        state.new_empty(P if details & BRANCH else 0, dtype=torch.int32),
+    )
+
+
+def _adjoints_fake(
+    state: Tensor, C: Tensor | None, parameters: Tensors, history: Tensors, dim: int, needs: int
+) -> tuple[Tensor, ...]:
+    P = _particles(state)
+    shapes = (tuple(state.shape), (P, dim, dim), (P, len(parameters)), (P, _entries(history)))
+    by_C, by_history = needs & VELOCITY_GRADIENT and C is not None, needs & HISTORY and history
+    wanted = (needs & STATE, by_C, needs & PARAMETERS, by_history)
+    return tuple(soa_empty(state, s) if w else state.new_empty(0) for s, w in zip(shapes, wanted, strict=True))
+
+
+@torch.library.register_fake("torch_mpm::law_update_backward")
+def _update_backward_fake(
+    grad_state, grad_stress, grad_history, grad_dissipated, grad_multiplier,
+    state, C, parameters, history, scene, law, dim, options, needs,
+):  # fmt: skip
+    return _adjoints_fake(state, C, parameters, history, dim, needs)
+
+
+@torch.library.register_fake("torch_mpm::law_update_double_backward")
+def _update_double_backward_fake(
+    along_state, along_C, along_parameters, grad_stress, state, C, parameters, scene, law, dim, needs
+):
+    adjoints = _adjoints_fake(state, C, parameters, (), dim, needs)
+    return soa_empty(state, (_particles(state), dim, dim)), *adjoints[:3]
+
+
+@torch.library.register_fake("torch_mpm::law_energy_backward")
+def _energy_backward_fake(grad_energy, state, parameters, history, scene, law, dim, needs):
+    by_state, _, by_parameters, by_history = _adjoints_fake(state, None, parameters, history, dim, needs)
+    return by_state, by_parameters, by_history
+
+
+@torch.library.register_fake("torch_mpm::law_energy_double_backward")
+def _energy_double_backward_fake(along_state, along_parameters, grad_energy, state, parameters, scene, law, dim, needs):
+    by_state, _, by_parameters, _ = _adjoints_fake(state, None, parameters, (), dim, needs)
+    return state.new_empty(_particles(state)), by_state, by_parameters
+
+
+def _scalar_fake(state, parameters, history, scene, law, dim):
+    return state.new_empty(_particles(state))
+
+
+# ---- autograd
+
+
+def _needed(need: bool | Sequence[bool], count: int) -> list[bool]:
+    """Which tensors of a list need a gradient."""
+    return [need] * count if isinstance(need, bool) else list(need)
+
+
+def _of_parameters(grads: Tensor, parameters: Tensors, wanted: Sequence[bool], scene: Tensor | None) -> list[Any]:
+    """Gradients of the parameters: those per particle [P, n], summed over the particles that share a value."""
+
+    def shared(grad: Tensor, parameter: Tensor) -> Tensor:
+        if parameter.numel() == 1:
+            return grad.sum().reshape(parameter.shape)
+        return grad if parameter.numel() == grad.numel() else sum_by_scene(grad, scene, parameter.numel())
+
+    pairs = zip(parameters, wanted, strict=True)
+    return [shared(grads[:, k], p) if w else None for k, (p, w) in enumerate(pairs)]
+
+
+def _of_history(grads: Tensor, history: Tensors, wanted: Sequence[bool]) -> list[Any]:
+    parts = _split(grads, history) if any(wanted) else [None] * len(history)
+    return [part if w else None for part, w in zip(parts, wanted, strict=True)]
+
+
+def _absent(grad: Tensor | None) -> Tensor | None:
+    """A gradient, or None for that of a result that was not wanted, which has no elements."""
+    return grad if grad is not None and grad.numel() else None
+
+
+class _Saved:
+    """The tensors of a call in one order: state, C, scene, parameters, history."""
+
+    def __init__(self, ctx: Any) -> None:
+        self.state, self.C, self.scene, *rest = ctx.saved_tensors  # once: a checkpointed region unpacks it only once
+        self.parameters, self.history = rest[: ctx.parameters], rest[ctx.parameters :]
+
+
+def _save(ctx: Any, state: Any, C: Any, scene: Any, parameters: Tensors, history: Tensors, *others: Any) -> None:
+    ctx.parameters = len(parameters)
+    ctx.set_materialize_grads(False)
+    ctx.save_for_backward(state, C, scene, *parameters, *history, *others)
+
+
+def _update_setup(ctx: Any, inputs: Any, output: Any) -> None:
+    state, C, parameters, history, scene, ctx.law, ctx.dim, ctx.options, _ = inputs
+    _save(ctx, state, C, scene, parameters, history)
+
+
+def _update_backward(ctx, *grads):
+    saved = _Saved(ctx)
+    need_state, need_C, need_parameters, need_history = ctx.needs_input_grad[:4]
+    by_parameter = _needed(need_parameters, len(saved.parameters))
+    by_history = _needed(need_history, len(saved.history))
+    needs = STATE * need_state + VELOCITY_GRADIENT * need_C + PARAMETERS * any(by_parameter) + HISTORY * any(by_history)
+    given = [_absent(g) for g in grads[:5]]
+    if not needs or all(g is None for g in given):
+        return None, None, [None] * len(saved.parameters), [None] * len(saved.history), *(None,) * 5
+    grad_state, grad_C, grad_parameters, grad_history = dispatch(
+        torch.ops.torch_mpm.law_update_backward,
+        *(*given, saved.state, saved.C, saved.parameters, saved.history, saved.scene),
+        *(ctx.law, ctx.dim, ctx.options, needs),
+    )
+    return (
+        grad_state if need_state else None,
+        grad_C if need_C else None,
+        _of_parameters(grad_parameters, saved.parameters, by_parameter, saved.scene),
+        _of_history(grad_history, saved.history, by_history),
+        *(None,) * 5,
+    )
+
+
+def _update_backward_setup(ctx: Any, inputs: Any, output: Any) -> None:
+    *grads, state, C, parameters, history, scene, ctx.law, ctx.dim, _, ctx.needs = inputs
+    ctx.history = len(history)
+    _save(ctx, state, C, scene, parameters, (), grads[1])
+
+
+def _update_double_backward(ctx, along_state, along_C, along_parameters, _):
+    _check_twice(ctx.law)
+    saved = _Saved(ctx)
+    (grad_stress,) = saved.history
+    _, need_grad, *_, need_state, need_C, need_parameters = ctx.needs_input_grad[:8]
+    by_parameter = _needed(need_parameters, len(saved.parameters))
+    nothing = (*(None,) * 7, [None] * len(saved.parameters), [None] * ctx.history, *(None,) * 5)
+    along = [_absent(t) for t in (along_state, along_C, along_parameters)]
+    if grad_stress is None or all(t is None for t in along):
+        return nothing
+    needs = STATE * need_state + VELOCITY_GRADIENT * need_C + PARAMETERS * any(by_parameter)
+    by_grad, by_state, by_C, grad_parameters = dispatch(
+        torch.ops.torch_mpm.law_update_double_backward,
+        *(*along, grad_stress, saved.state, saved.C, saved.parameters, saved.scene, ctx.law, ctx.dim, needs),
+    )
+    return (
+        None,
+        by_grad if need_grad else None,
+        *(None,) * 3,
+        by_state if need_state else None,
+        by_C if need_C else None,
+        _of_parameters(grad_parameters, saved.parameters, by_parameter, saved.scene),
+        *nothing[8:],
+    )
+
+
+def _energy_setup(ctx: Any, inputs: Any, output: Any) -> None:
+    state, parameters, history, scene, ctx.law, ctx.dim = inputs
+    _save(ctx, state, None, scene, parameters, history)
+
+
+def _energy_backward(ctx, grad):
+    saved = _Saved(ctx)
+    need_state, need_parameters, need_history = ctx.needs_input_grad[:3]
+    by_parameter = _needed(need_parameters, len(saved.parameters))
+    by_history = _needed(need_history, len(saved.history))
+    needs = STATE * need_state + PARAMETERS * any(by_parameter) + HISTORY * any(by_history)
+    if not needs or grad is None:
+        return None, [None] * len(saved.parameters), [None] * len(saved.history), *(None,) * 3
+    grad_state, grad_parameters, grad_history = dispatch(
+        torch.ops.torch_mpm.law_energy_backward,
+        *(grad, saved.state, saved.parameters, saved.history, saved.scene, ctx.law, ctx.dim, needs),
+    )
+    return (
+        grad_state if need_state else None,
+        _of_parameters(grad_parameters, saved.parameters, by_parameter, saved.scene),
+        _of_history(grad_history, saved.history, by_history),
+        *(None,) * 3,
+    )
+
+
+def _energy_backward_setup(ctx: Any, inputs: Any, output: Any) -> None:
+    grad, state, parameters, history, scene, ctx.law, ctx.dim, ctx.needs = inputs
+    ctx.history = len(history)
+    _save(ctx, state, None, scene, parameters, (), grad)
+
+
+def _energy_double_backward(ctx, along_state, along_parameters, _):
+    _check_twice(ctx.law)
+    saved = _Saved(ctx)
+    (grad,) = saved.history
+    need_grad, need_state, need_parameters = ctx.needs_input_grad[:3]
+    by_parameter = _needed(need_parameters, len(saved.parameters))
+    along = [_absent(t) for t in (along_state, along_parameters)]
+    if all(t is None for t in along):
+        return None, None, [None] * len(saved.parameters), [None] * ctx.history, *(None,) * 4
+    needs = STATE * need_state + PARAMETERS * any(by_parameter)
+    by_grad, by_state, grad_parameters = dispatch(
+        torch.ops.torch_mpm.law_energy_double_backward,
+        *(*along, grad, saved.state, saved.parameters, saved.scene, ctx.law, ctx.dim, needs),
+    )
+    return (
+        by_grad if need_grad else None,
+        by_state if need_state else None,
+        _of_parameters(grad_parameters, saved.parameters, by_parameter, saved.scene),
+        [None] * ctx.history,
+        *(None,) * 4,
+    )
+
+
+def _check_twice(law: str) -> None:
+    if not LAWS[law].twice_differentiable:
+        raise NotImplementedError(f"the law {law} has no second derivatives: differentiate it once")
+
+
+def _no_backward(ctx, grad):
+    raise NotImplementedError(
+        "wave speeds and stiffness bounds are not differentiable: compute them under torch.no_grad()"
+    )
+
+
+def _no_third_derivative(ctx, *grads):
+    raise NotImplementedError("laws have no third derivatives: differentiate them twice")
+
+
+def _no_setup(ctx: Any, inputs: Any, output: Any) -> None:
+    pass
+
+
+for _name, _backward, _context in (
+    ("law_update", _update_backward, _update_setup),
+    ("law_update_backward", _update_double_backward, _update_backward_setup),
+    ("law_update_double_backward", _no_third_derivative, _no_setup),
+    ("law_energy", _energy_backward, _energy_setup),
+    ("law_energy_backward", _energy_double_backward, _energy_backward_setup),
+    ("law_energy_double_backward", _no_third_derivative, _no_setup),
+    ("law_stiffness", _no_backward, _no_setup),
+    ("law_wave_modulus", _no_backward, _no_setup),
+):
+    register_autograd(_name, _backward, _context)
+    refuse_vmap(_name)
+for _name in ("law_energy", "law_stiffness", "law_wave_modulus"):
+    torch.library.register_fake(f"torch_mpm::{_name}", _scalar_fake)

@@ -1,0 +1,102 @@
+"""The compiled laws, as the CPU library lists them (csrc/laws/registry.h)."""
+
+from __future__ import annotations
+
+import ctypes
+import dataclasses
+import json
+import math
+from typing import Any
+
+from .. import _library
+
+
+@dataclasses.dataclass(frozen=True)
+class Quantity:
+    """A parameter or history variable of a law.
+
+    Attributes:
+        name, unit: the unit is "" for a pure number.
+        low, high: ends of its range; infinite ends mean any finite number.
+        with_low, with_high: whether a finite end is in the range.
+        matrix: of history, whether it has D by D entries per particle.
+    """
+
+    name: str
+    unit: str
+    low: float
+    high: float
+    with_low: bool
+    with_high: bool
+    matrix: bool
+
+    def holds(self, value: Any) -> Any:
+        """Whether a number, or each entry of a tensor, is in the range; infinite values are."""
+        above = value >= self.low if self.with_low else value > self.low
+        below = value <= self.high if self.with_high else value < self.high
+        return above & below
+
+    @property
+    def expected(self) -> str:
+        """The range in words, for messages."""
+        if math.isinf(self.high):
+            if math.isinf(self.low):
+                return "finite"
+            if self.low == 0:
+                return "finite and not negative" if self.with_low else "positive"
+        return f"in {'[' if self.with_low else '('}{self.low:g}, {self.high:g}{']' if self.with_high else ')'}"
+
+
+@dataclasses.dataclass(frozen=True)
+class LawInfo:
+    """What a compiled law says of itself.
+
+    Attributes:
+        field: what of the deformation it reads and moves: "F" or "J".
+        viscous: whether its stress reads C.
+        plastic: whether it changes F.
+        optional_history: whether it works without its history.
+        twice_differentiable: whether its stress and energy have second derivatives.
+        in_2d: whether it exists in two dimensions.
+        parameters, history: in the order of the ops.
+        options: names of the bits of `options`.
+    """
+
+    name: str
+    field: str
+    viscous: bool
+    plastic: bool
+    optional_history: bool
+    twice_differentiable: bool
+    in_2d: bool
+    parameters: tuple[Quantity, ...]
+    history: tuple[Quantity, ...]
+    options: tuple[str, ...]
+
+    @property
+    def rate_dependent(self) -> bool:
+        """Whether the last parameter is the time step."""
+        return any(p.name == "dt" for p in self.parameters)
+
+    def parameter(self, name: str) -> Quantity:
+        return next(p for p in self.parameters if p.name == name)
+
+
+def _quantities(entries: list[dict[str, Any]]) -> tuple[Quantity, ...]:
+    ends = ({"low": -math.inf if e["low"] is None else e["low"]} for e in entries)
+    high = ({"high": math.inf if e["high"] is None else e["high"]} for e in entries)
+    return tuple(Quantity(**{**e, **a, **b}) for e, a, b in zip(entries, ends, high, strict=True))
+
+
+def _read() -> dict[str, LawInfo]:
+    library = ctypes.CDLL(str(_library.CPU_LIBRARY))
+    library.torch_mpm_laws.restype = ctypes.c_char_p
+    laws = {}
+    for entry in json.loads(library.torch_mpm_laws()):
+        lists = {key: _quantities(entry[key]) for key in ("parameters", "history")}
+        laws[entry["name"]] = LawInfo(**{**entry, **lists, "options": tuple(entry["options"])})
+    return dict(sorted(laws.items()))
+
+
+LAWS: dict[str, LawInfo] = _read()
+"""Every compiled law by its name."""
