@@ -146,7 +146,7 @@ class QuarticSand(Thermal):
     energy: Literal["unilateral", "full", "hencky", "mixed"] = "unilateral"
     """elastic energy; unilateral: quartic without tension, hencky: quadratic"""
     apex: Literal["zero", "keep"] = "zero"
-    """strain of sand that comes apart: none (zero), or with the unilateral energy that of the expansion (keep)"""
+    """strain of sand that comes apart: none, or, with the unilateral energy, that of the expansion (keep)"""
     smallest_strain: NotNegative = 0.05
     """least strain that the time step is chosen for; best the compression of the deepest sand"""
     flow: Literal["radial", "exact"] = "radial"
