@@ -134,7 +134,7 @@ class QuarticSand(Thermal):
     density: Positive = 1600.0
     """density at rest, with the air between the grains [kg/m^3]"""
     E: Positive | None = None
-    """Young's modulus [Pa], with nu; quartic energies reach this stiffness at a strain of 0.4 and are far softer below"""
+    """Young's modulus [Pa], with nu; quartic energies are as stiff at a strain of 0.4 and far softer below it"""
     nu: Annotated[float, Field(gt=-1, lt=0.5)] | None = None
     """Poisson's ratio, between -1 and 0.5; 0.3 if only E is given"""
     mu: Positive | None = None
