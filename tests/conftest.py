@@ -1,10 +1,16 @@
 import os
+import sys
+from pathlib import Path
 
 import pytest
 import torch
 
+# For setup.py, the benchmarks and, unless PYTHONPATH names another build of it, torch_mpm.
+sys.path.append(str(Path(__file__).parent.parent))
+
 import setup
 from torch_mpm import _library
+from torch_mpm.info import info
 
 # Small tensors: more threads only wait for each other, above all on a busy machine.
 torch.set_num_threads(min(2, torch.get_num_threads()))
@@ -18,6 +24,9 @@ def pytest_configure() -> None:
     if not CUDA and setup.gpu_present() and os.environ.get("TORCH_MPM_CUDA") != "0":
         reason = _library.cuda_error or f"torch {torch.__version__} finds no CUDA device"
         raise pytest.UsageError(f"this machine has a GPU, but {reason}. TORCH_MPM_CUDA=0 tests the CPU alone.")
+    sanitizers = os.environ.get("TORCH_MPM_SANITIZE", "")
+    if sanitizers and info()["build"]["cpu"]["sanitize"] != sanitizers:
+        raise pytest.UsageError(f"{_library.CPU_LIBRARY} is not built with TORCH_MPM_SANITIZE={sanitizers}")
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:

@@ -7,7 +7,14 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parent.parent
+TESTS = Path(__file__).parent
+
+
+def session(**environment: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "pytest", "-q", "--collect-only", "test_build.py"]
+    # Not in the root, whose package may be another build than the one under test.
+    environment = {**os.environ, "TORCH_MPM_SANITIZE": "", "PYTHONPATH": os.pathsep.join(sys.path), **environment}
+    return subprocess.run(command, cwd=TESTS, env=environment, capture_output=True, text=True)
 
 
 def session_with_a_hidden_gpu(directory: Path, **environment: str) -> subprocess.CompletedProcess[str]:
@@ -16,9 +23,7 @@ def session_with_a_hidden_gpu(directory: Path, **environment: str) -> subprocess
     lister.write_text("#!/bin/sh\necho 'GPU 0: a GPU'\n")
     lister.chmod(0o755)
     path = os.pathsep.join([str(directory), os.environ["PATH"]])
-    command = [sys.executable, "-m", "pytest", "-q", "--collect-only", "tests/test_build.py"]
-    environment = {**os.environ, "TORCH_MPM_CUDA": "", "CUDA_VISIBLE_DEVICES": "", "PATH": path, **environment}
-    return subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
+    return session(**{"TORCH_MPM_CUDA": "", "CUDA_VISIBLE_DEVICES": "", "PATH": path, **environment})
 
 
 def test_a_gpu_that_cannot_be_tested_is_an_error(tmp_path: Path) -> None:
@@ -30,3 +35,16 @@ def test_a_gpu_that_cannot_be_tested_is_an_error(tmp_path: Path) -> None:
 def test_a_gpu_may_be_left_out_by_name(tmp_path: Path) -> None:
     done = session_with_a_hidden_gpu(tmp_path, TORCH_MPM_CUDA="0")
     assert done.returncode == 0, done.stderr
+
+
+def test_a_library_without_the_sanitizers_asked_for_is_an_error() -> None:
+    done = session(TORCH_MPM_SANITIZE="thread", TORCH_MPM_CUDA="0")
+    assert done.returncode == pytest.ExitCode.USAGE_ERROR
+    assert "is not built with TORCH_MPM_SANITIZE=thread" in done.stderr
+
+
+def test_the_package_that_the_environment_names_is_tested(tmp_path: Path) -> None:
+    (tmp_path / "torch_mpm").mkdir()
+    (tmp_path / "torch_mpm" / "__init__.py").write_text("raise ImportError('another build')")
+    done = session(PYTHONPATH=str(tmp_path), TORCH_MPM_CUDA="0")
+    assert done.returncode != 0 and "another build" in done.stdout + done.stderr

@@ -1,7 +1,11 @@
 """The fuzz program of calls: a short run of it, and that it sees what it looks for."""
 
+import json
 import os
 import signal
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 import torch
@@ -16,13 +20,25 @@ def test_every_op_is_called_and_every_valid_call_works() -> None:
         function(**arguments)
 
 
-@pytest.mark.skipif(torch.cuda.is_available(), reason="a process that has used CUDA must not fork")
-def test_no_call_crashes_or_ends_in_an_unclear_error(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(calls, "PUBLIC", 0.4)
-    found = list(calls.fuzz(1500, seed=0))
-    assert [r for r in found if r.end in calls.FAULTS] == []
-    assert {r.end for r in found} == {"ok", "clear error"}
-    assert {r.name for r in found} >= set(calls.raw_calls())
+PROGRAM = """
+import json
+from benchmarks.fuzz import calls
+calls.PUBLIC = 0.4
+print(json.dumps([[r.name, r.end, r.error] for r in calls.fuzz(1500, seed=0)]))
+"""
+
+
+def test_no_call_crashes_or_ends_in_an_unclear_error(tmp_path: Path) -> None:
+    """In a process of its own, that sees no GPU: one that has used CUDA must not fork."""
+    environment = os.environ | {"CUDA_VISIBLE_DEVICES": "", "PYTHONPATH": os.pathsep.join(sys.path)}
+    done = subprocess.run(
+        [sys.executable, "-c", PROGRAM], cwd=tmp_path, env=environment, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout.splitlines()[-1])
+    assert [call for call in found if call[1] in calls.FAULTS] == []
+    assert {end for _, end, _ in found} == {"ok", "clear error"}
+    assert {name for name, _, _ in found} >= set(calls.raw_calls())
 
 
 def test_faults_are_found_and_named(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -21,7 +21,7 @@ class Material(nn.Module):
         extra_fields: tensors of state.extra that the law keeps from step to step, its history; see `initial`.
         viscous: whether the stress reads state.C, so that a step has to keep it.
         rate_dependent: whether `update` reads state.dt, the time step [s], which a step then adds to the state.
-        dissipation: whether somebody wants "dissipated" from `update`, which costs something. A step with plastic
+        dissipation: whether `update` should return "dissipated", which takes time. A step with plastic
             heating sets it on its law and on those inside.
     """
 

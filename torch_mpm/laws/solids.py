@@ -105,7 +105,7 @@ class HerschelBulkley(SolidLaw):
     """Viscoplastic fluid on Hencky elasticity: above the yield stress, t = τ_y + η gⁿ (Bingham's fluid for n = 1).
 
     t = |dev τ|/√2 and g = √2 |dh_p/dt| are shear stress and shear rate in simple shear. Backward Euler over the time
-    step, which a `Step` hands over; without one (`law.stress(state)` of a state that a step returned) the fluid is
+    step, which a `Step` provides; without one (`law.stress(state)` of a state that a step returned) the fluid is
     elastic, which gives the stress before the flow of the coming step. Dissipated is all plastic work.
 
     Args:

@@ -71,7 +71,7 @@ class Curve(Model):
 
 
 class Thermal(Model):
-    """What a material does with heat, in a scene with a [heat] table."""
+    """Thermal properties of a material, in a scene with a [heat] table."""
 
     conductivity: NotNegative | Curve | None = None
     """heat conductivity [W/(m K)]"""
@@ -108,7 +108,7 @@ class NeoHookean(Thermal):
     nu: Annotated[float, Field(gt=-1, lt=0.5)] = 0.3
     """Poisson's ratio, between -1 and 0.5"""
     liquid: Liquid | None = None
-    """what it becomes above its melting point"""
+    """the fluid that it becomes above its melting point"""
 
 
 class WeaklyCompressible(Thermal):
@@ -119,7 +119,7 @@ class WeaklyCompressible(Thermal):
     density: Positive = 1000.0
     """density at rest [kg/m^3]"""
     bulk_modulus: Positive
-    """bulk modulus [Pa]; density * (10 * largest expected speed)^2 keeps density changes near 1 %"""
+    """bulk modulus [Pa]; density * (10 * largest expected speed)^2 keeps density changes near 1%"""
     gamma: Positive = 7.0
     """exponent of the equation of state; 7 for water"""
     viscosity: NotNegative | Curve = 0.0
@@ -134,9 +134,9 @@ class QuarticSand(Thermal):
     density: Positive = 1600.0
     """density at rest, with the air between the grains [kg/m^3]"""
     E: Positive | None = None
-    """Young's modulus [Pa], with nu; the quartic energies are as stiff at a strain of 0.4, and far softer below"""
+    """Young's modulus [Pa], with nu; quartic energies are as stiff at a strain of 0.4 and far softer below it"""
     nu: Annotated[float, Field(gt=-1, lt=0.5)] | None = None
-    """Poisson's ratio, between -1 and 0.5; 0.3 where E is given alone"""
+    """Poisson's ratio, between -1 and 0.5; 0.3 if only E is given"""
     mu: Positive | None = None
     """shear modulus [Pa], with lam, instead of E and nu"""
     lam: float | None = None
@@ -146,15 +146,15 @@ class QuarticSand(Thermal):
     energy: Literal["unilateral", "full", "hencky", "mixed"] = "unilateral"
     """elastic energy; unilateral: quartic without tension, hencky: quadratic"""
     apex: Literal["zero", "keep"] = "zero"
-    """strain of sand that comes apart: none, or with the unilateral energy that of the expansion"""
+    """strain of sand that comes apart: none, or, with the unilateral energy, that of the expansion (keep)"""
     smallest_strain: NotNegative = 0.05
-    """strain that the time step counts on at least; best the compression of the deepest sand"""
+    """least strain that the time step is chosen for; best the compression of the deepest sand"""
     flow: Literal["radial", "exact"] = "radial"
     """plastic flow; exact: along the deviator of the stress, with more friction in plane strain"""
     cohesion: NotNegative = 0.0
     """logarithmic strain at which the sand tears; 0 for dry sand"""
     volume_correction: bool = False
-    """sand that came apart has no stress until its volume is what it was"""
+    """sand that has come apart has no stress until it has regained its volume"""
     hardening: Annotated[list[float], Field(min_length=4, max_length=4)] | None = None
     """h0, h1, h2, h3 of the friction angle h0 + (h1 q - h3) exp(-h2 q) after plastic flow q, instead of friction_angle;
     h0, h1 and h3 in degrees, for example [35, 9, 0.2, 10]"""
