@@ -11,11 +11,12 @@ from torch import Tensor
 from ..boundaries import Face, Walls
 from ..errors import FLOATING, check_like, shape_of
 from ..grid import BLOCK_WIDTH, Blocks, Grid, check_blocks
-from ..reference import grid_update as reference
 from .arguments import differentiate, refuse_vmap, sizes, split_dt
 from .autograd import dispatch, register_autograd
+from .grid_update_composed import composed_grid_update
 
 CONTACT_KINDS = {"open": 0, "sticky": 1, "slip": 2, "separate": 3, "mirror": 4}  # csrc/grid/friction.h
+CONTACT_NAMES = list(CONTACT_KINDS)
 
 
 def grid_update(
@@ -128,11 +129,11 @@ def _backward(ctx, grad):
 
 
 def _sum_by_scene(change: Tensor, block: Tensor, blocks: list[int], scenes: int) -> Tensor:
-    """Sum of slot values [capacity, D] over the slots of each scene, [B, D]."""
+    """Sum of slot values [capacity, ...] over the slots of each scene, [B, ...]."""
     if scenes < 2:
         return change.sum(0, keepdim=True)[:scenes]
     scene = block.clamp_min(0) // math.prod(blocks)
-    return change.new_zeros(scenes, change.shape[1]).index_add(0, scene, change)
+    return change.new_zeros(scenes, *change.shape[1:]).index_add(0, scene, change)
 
 
 def _backward_setup(ctx: Any, inputs: Any, output: Any) -> None:
@@ -144,15 +145,14 @@ def _backward_setup(ctx: Any, inputs: Any, output: Any) -> None:
 def _double_backward(ctx, grad_grad_nodes, grad_change):
     *tensors, table, block = ctx.saved_tensors
     blocks = _blocks_of(table, block, *ctx.geometry)
-    names = list(CONTACT_KINDS)
-    faces = [Face(names[kind], plane, friction) for kind, plane, friction in zip(*ctx.walls, strict=True)]
+    faces = [Face(CONTACT_NAMES[kind], plane, friction) for kind, plane, friction in zip(*ctx.walls, strict=True)]
 
     def adjoint(grad, nodes, gravity, scene_dt):
         def updated(nodes, change):
             mass, momentum = nodes.split([1, nodes.shape[1] - 1], 1)
             rows = torch.cat([mass, momentum + mass * change.repeat_interleave(blocks.grid.nodes_per_block, 0)], 1)
             dt = ctx.dt if scene_dt is None else ctx.dt * scene_dt
-            return reference.grid_update(blocks, rows, gravity, dt, faces)
+            return composed_grid_update(blocks, rows, gravity, dt, faces)
 
         change = nodes.new_zeros(block.shape[0], nodes.shape[1] - 1)
         both = differentiate(updated, (nodes, change), [grad])
