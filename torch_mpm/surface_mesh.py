@@ -64,11 +64,12 @@ def ring(outline: Array, axis: Array) -> list[SurfaceMesh]:
 
 
 def revolved(profile: Array, axis: Array) -> SurfaceMesh:
-    """The profile (radius, height) [K, 2] turned around the unit vector `axis` [3]."""
+    """The profile (radius, height) [K, 2] turned about the unit vector `axis` [3], without edges on the axis."""
     phi = 2 * np.pi * np.arange(TURNS) / TURNS
     radius, height = profile[:, 0][:, None], profile[:, 1][:, None]
     v = np.stack([radius * np.cos(phi), height + 0 * phi, radius * np.sin(phi)], axis=-1).reshape(-1, 3)
-    i, j = np.meshgrid(np.arange(len(profile) - 1), np.arange(TURNS), indexing="ij")
+    (edges,) = np.nonzero((profile[:-1, 0] > 0) | (profile[1:, 0] > 0))
+    i, j = np.meshgrid(edges, np.arange(TURNS), indexing="ij")
     k = (j + 1) % TURNS
     a, b, c, d = i * TURNS + j, i * TURNS + k, (i + 1) * TURNS + k, (i + 1) * TURNS + j
     faces = np.concatenate([np.stack([a, c, b], -1).reshape(-1, 3), np.stack([a, d, c], -1).reshape(-1, 3)])
