@@ -58,11 +58,6 @@ ContactArguments<T, D> contact_arguments(MPM_CONTACT_PARAMETERS) {
   const auto check_entries = [&](const auto& list, const char* name) {
     STD_TORCH_CHECK(list.size() == count, name, " must have an entry per obstacle, ", count, ", got ", list.size());
   };
-  check_rank(outline, "outline", 2);
-  check_like(outline, "outline", velocity);
-  STD_TORCH_CHECK(outline.is_contiguous() && outline.size(1) == 2 && outline.size(0) <= INT32_MAX / 2,
-                  "outline must be contiguous with shape [corners, 2], got ", shape_of(outline));
-  a.outline = static_cast<const T*>(outline.data_ptr());
   check_entries(shape, "shape");
   check_entries(corners, "corners");
   check_entries(contact_kind, "contact");
@@ -73,8 +68,8 @@ ContactArguments<T, D> contact_arguments(MPM_CONTACT_PARAMETERS) {
   for (size_t k = 0; k < count; k++) {
     STD_TORCH_CHECK(shape[k] >= int64_t(ObstacleShape::plane) && shape[k] <= int64_t(ObstacleShape::revolved),
                     "shape must be 0 to 4, got ", shape[k]);
-    STD_TORCH_CHECK(corners[k] >= 0 && corners[k] <= outline.size(0) - corner,
-                    "corners must add up to those of outline, ", outline.size(0), ", got ", corners[k]);
+    STD_TORCH_CHECK(corners[k] >= 0 && corners[k] <= INT32_MAX / kMaxObstacles,
+                    "corners must not be negative nor too many, got ", corners[k]);
     STD_TORCH_CHECK(contact_kind[k] >= int64_t(Contact::sticky) && contact_kind[k] <= int64_t(Contact::separate),
                     "contact must be 1 to 3, got ", contact_kind[k]);
     STD_TORCH_CHECK(scene[k] >= -1 && scene[k] <= INT32_MAX, "scene must be -1 or a scene, got ", scene[k]);
@@ -82,6 +77,10 @@ ContactArguments<T, D> contact_arguments(MPM_CONTACT_PARAMETERS) {
                  int(corners[k])};
     corner += corners[k];
   }
+  check_shape(outline, "outline", {corner, 2});
+  check_like(outline, "outline", velocity);
+  STD_TORCH_CHECK(outline.is_contiguous(), "outline must be contiguous, got shape ", shape_of(outline));
+  a.outline = static_cast<const T*>(outline.data_ptr());
   a.time = time;
   if (has(scene_time)) {
     check_rank(*scene_time, "scene_time", 1);
