@@ -15,13 +15,14 @@ import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any, Protocol
+from typing import IO, Any
 
 import torch
 from torch import Tensor
 
-from . import memory
-from .errors import check_device, check_dtype, check_number, check_vector, default_dtype, shape_of
+from . import memory, shapes
+from .errors import check_device, check_dtype, check_file, check_number, check_vector, default_dtype, shape_of
+from .shapes import Shape
 
 Vector = Sequence[float] | Tensor
 
@@ -36,6 +37,8 @@ MOST = 2**31 - 1
 """Particles that can be numbered."""
 CELL_BYTES = 150
 """Memory per point of a lattice, or per cell of a Poisson-disk sample, while a shape is filled."""
+CHUNK = 2**18
+"""Points that a shape is asked for at once."""
 
 
 @dataclass(frozen=True)
@@ -50,14 +53,73 @@ class Points:
         return self.x.shape[0]
 
 
-class Shape(Protocol):
-    """A closed region: bounding box [D], [D], exact volume, and membership of points [P, D]."""
+class Region:
+    """A shape at a place, to be filled.
 
-    lower: Tensor
-    upper: Tensor
-    volume: float
+    Args:
+        shape: see `torch_mpm.shapes`; its volume and bounds must be known.
+        position: of its origin [m], D numbers.
 
-    def inside(self, x: Tensor) -> Tensor: ...
+    Attributes:
+        lower, upper: corners [D] [m] of its bounding box, float64.
+        volume: exact [m³] ([m²] in 2-D).
+    """
+
+    def __init__(self, shape: Shape, position: Vector) -> None:
+        self.shape, self.position = shape, _vector("position", position)
+        lower, upper = shape.bounds(len(self.position))
+        self.lower, self.upper = self.position + lower, self.position + upper
+        self.volume = shape.volume(len(self.position))
+
+    def inside(self, x: Tensor) -> Tensor:
+        """Which points [P, D] are inside or on the surface, bool [P]."""
+        return torch.cat([self.shape.contains(part - self.position) for part in x.split(CHUNK)])
+
+
+class Box(Region):
+    """Axis-aligned box (rectangle in 2-D) from ``lower`` to ``upper`` [m]."""
+
+    def __init__(self, lower: Vector, upper: Vector):
+        a = _vector("lower", lower)
+        b = _vector("upper", upper, len(a))
+        if not bool((a < b).all()):
+            raise ValueError(f"lower must be below upper on every axis, got {a.tolist()} and {b.tolist()}")
+        super().__init__(shapes.Box((b - a).tolist()), 0.5 * (a + b))
+        self.lower, self.upper = a, b  # as given, not rounded
+
+
+class Sphere(Region):
+    """Ball (disc in 2-D) around ``center`` with ``radius`` [m]."""
+
+    def __init__(self, center: Vector, radius: float):
+        middle = _vector("center", center)
+        super().__init__(shapes.Sphere(_positive("radius", radius)), middle)
+
+
+class Cylinder(Region):
+    """Solid cylinder with flat ends between ``a`` and ``b`` [m]; 3-D only."""
+
+    def __init__(self, a: Vector, b: Vector, radius: float):
+        middle, half = _segment(a, b, radius)
+        super().__init__(shapes.Cylinder(half.tolist(), radius), middle)
+
+
+class Capsule(Region):
+    """All points within ``radius`` of the segment from ``a`` to ``b`` [m]."""
+
+    def __init__(self, a: Vector, b: Vector, radius: float):
+        middle, half = _segment(a, b, radius)
+        super().__init__(shapes.Capsule(half.tolist(), radius), middle)
+
+
+class Mesh(Region):
+    """The inside of a closed triangle mesh: a file that trimesh reads (.obj, .ply, .stl, ...) or a ``trimesh.Trimesh``.
+
+    The mesh is scaled about its origin, then moved by ``offset`` [m]. Raises ValueError for a mesh that is not closed.
+    """
+
+    def __init__(self, source: str | Path | Any, scale: float = 1.0, offset: Vector = (0.0, 0.0, 0.0)):
+        super().__init__(shapes.Mesh(source, scale), _vector("offset", offset, 3))
 
 
 def _vector(name: str, value: Vector, dim: int | None = None) -> Tensor:
@@ -68,169 +130,17 @@ def _positive(name: str, value: float) -> float:
     return float(check_number(name, value, "positive", lambda v: 0 < v < math.inf))
 
 
-class Box:
-    """Axis-aligned box (rectangle in 2-D) from ``lower`` to ``upper`` [m]."""
-
-    def __init__(self, lower: Vector, upper: Vector):
-        self.lower = _vector("lower", lower)
-        self.upper = _vector("upper", upper, len(self.lower))
-        if not bool((self.lower < self.upper).all()):
-            raise ValueError(
-                f"lower must be below upper on every axis, got {self.lower.tolist()} and {self.upper.tolist()}"
-            )
-        self.volume = float((self.upper - self.lower).prod())
-
-    def inside(self, x: Tensor) -> Tensor:
-        return ((x >= self.lower) & (x <= self.upper)).all(1)
-
-
-class Sphere:
-    """Ball (disc in 2-D) around ``center`` with ``radius`` [m]."""
-
-    def __init__(self, center: Vector, radius: float):
-        self.center, self.radius = _vector("center", center), _positive("radius", radius)
-        self.lower, self.upper = self.center - self.radius, self.center + self.radius
-        self.volume = _ball_volume(len(self.center), self.radius)
-
-    def inside(self, x: Tensor) -> Tensor:
-        return (x - self.center).square().sum(1) <= self.radius * self.radius
-
-
-class _Axial:
-    def __init__(self, a: Vector, b: Vector, radius: float):
-        self.a, self.radius = _vector("a", a), _positive("radius", radius)
-        self.b = _vector("b", b, len(self.a))
-        self.length = _positive("the distance from a to b", float((self.b - self.a).norm()))
-        self.axis = (self.b - self.a) / self.length
-
-    def _along_and_away(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Coordinate along the axis and squared distance from it."""
-        r = x - self.a
-        along = r @ self.axis
-        return along, r.square().sum(1) - along.square()
-
-
-class Cylinder(_Axial):
-    """Solid cylinder with flat ends between ``a`` and ``b`` [m]; 3-D only."""
-
-    def __init__(self, a: Vector, b: Vector, radius: float):
-        super().__init__(a, b, radius)
-        if len(self.a) != 3:
-            raise ValueError("a cylinder needs three dimensions; in 2-D use a sphere (a disc) or a box")
-        reach = self.radius * (1 - self.axis.square()).clamp(min=0).sqrt()
-        self.lower, self.upper = (
-            torch.minimum(self.a, self.b) - reach,
-            torch.maximum(self.a, self.b) + reach,
-        )
-        self.volume = _ball_volume(2, self.radius) * self.length
-
-    def inside(self, x: Tensor) -> Tensor:
-        along, away = self._along_and_away(x)
-        return (along >= 0) & (along <= self.length) & (away <= self.radius * self.radius)
-
-
-class Capsule(_Axial):
-    """All points within ``radius`` of the segment from ``a`` to ``b`` [m]."""
-
-    def __init__(self, a: Vector, b: Vector, radius: float):
-        super().__init__(a, b, radius)
-        self.lower, self.upper = (
-            torch.minimum(self.a, self.b) - self.radius,
-            torch.maximum(self.a, self.b) + self.radius,
-        )
-        dim = len(self.a)
-        self.volume = _ball_volume(dim - 1, self.radius) * self.length + _ball_volume(dim, self.radius)
-
-    def inside(self, x: Tensor) -> Tensor:
-        along, away = self._along_and_away(x)
-        beyond = along - along.clamp(0, self.length)
-        return away + beyond.square() <= self.radius * self.radius
-
-
-class Mesh:
-    """The inside of a closed triangle mesh: a file that trimesh reads (.obj, .ply, .stl, ...) or a ``trimesh.Trimesh``.
-
-    The mesh is scaled about its origin, then moved by ``offset`` [m]. Raises ValueError for a mesh that is not closed.
-    """
-
-    def __init__(self, source: str | Path | Any, scale: float = 1.0, offset: Vector = (0.0, 0.0, 0.0)):
-        with HOST:
-            self._set(_load_mesh(source), source, scale, offset)
-
-    def _set(self, mesh: Any, source: Any, scale: float, offset: Vector) -> None:
-        if not mesh.is_watertight:
-            raise ValueError(
-                f"mesh {source} is not closed: {_open_edges(mesh)} of its edges do not join two triangles; "
-                "close the holes (trimesh.repair.fill_holes, or a modelling program) before filling it"
-            )
-        vertices = torch.as_tensor(mesh.vertices.copy(), dtype=torch.float64) * _positive("scale", scale) + _vector(
-            "offset", offset, 3
-        )
-        self.triangles = vertices[torch.as_tensor(mesh.faces.copy(), dtype=torch.int64)]
-        self.lower, self.upper = vertices.amin(0), vertices.amax(0)
-        self.volume = _positive(f"the volume of mesh {source}", abs(float(mesh.volume)) * scale * scale * scale)
-
-    def inside(self, x: Tensor) -> Tensor:
-        """Where the winding number is above 1/2 (Jacobson et al. 2013; angles: Van Oosterom and Strackee 1983)."""
-        chunk = max(1, 2**22 // len(self.triangles))
-        return torch.cat([self._winding(part).abs() > 0.5 for part in x.split(chunk)])
-
-    def _winding(self, x: Tensor) -> Tensor:
-        a, b, c = (self.triangles[None, :, k] - x[:, None] for k in range(3))
-        la, lb, lc = a.norm(dim=-1), b.norm(dim=-1), c.norm(dim=-1)
-        determinant = (a * torch.linalg.cross(b, c)).sum(-1)
-        denominator = la * lb * lc + (a * b).sum(-1) * lc + (b * c).sum(-1) * la + (c * a).sum(-1) * lb
-        return torch.atan2(determinant, denominator).sum(1) / (2 * math.pi)
-
-
-def check_file(path: str | Path, kind: str) -> None:
-    """Raise for a file that is not there, is a folder, or cannot be read.
-
-    Raises:
-        OSError: FileNotFoundError, IsADirectoryError or PermissionError, with the path.
-    """
-    path = Path(path)
-    try:
-        if path.is_dir():
-            raise IsADirectoryError(f"{kind} file {path} is a folder")
-        path.open("rb").close()
-    except FileNotFoundError:
-        raise FileNotFoundError(f"{kind} file {path} does not exist") from None
-    except IsADirectoryError:
-        raise
-    except (OSError, ValueError) as error:  # ValueError: a null character in the name
-        raise PermissionError(f"{kind} file {path} cannot be read: {error}") from None
-
-
-def _load_mesh(source: str | Path | Any) -> Any:
-    try:
-        import trimesh
-    except ImportError as error:
-        raise ImportError("a mesh shape needs trimesh: pip install torch-mpm[mesh]") from error
-    if isinstance(source, trimesh.Trimesh):
-        return source
-    check_file(source, "mesh")
-    try:
-        mesh = trimesh.load(source, force="mesh")
-    except Exception as error:  # readers of many formats raise anything
-        raise ValueError(f"mesh file {source} cannot be read: {type(error).__name__}: {error}") from error
-    if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
-        raise ValueError(f"mesh file {source} holds no triangles")
-    return mesh
-
-
-def _open_edges(mesh: Any) -> int:
-    _, uses = torch.as_tensor(mesh.edges_sorted.copy()).unique(dim=0, return_counts=True)
-    return int((uses != 2).sum())
-
-
-def _ball_volume(dim: int, radius: float) -> float:
-    # Products become infinite where a power raises.
-    return {1: 2.0, 2: math.pi, 3: 4 / 3 * math.pi}[dim] * math.prod([radius] * dim)
+def _segment(a: Vector, b: Vector, radius: float) -> tuple[Tensor, Tensor]:
+    """Middle of a segment, and half of it."""
+    first = _vector("a", a)
+    _positive("radius", radius)
+    last = _vector("b", b, len(first))
+    _positive("the distance from a to b", float((last - first).norm()))
+    return 0.5 * (first + last), 0.5 * (last - first)
 
 
 def fill(
-    shape: Shape,
+    shape: Region,
     grid: Any,
     per_cell: float = 8,
     *,
@@ -242,7 +152,7 @@ def fill(
     """Points inside ``shape``, all of the volume ``shape.volume / P``.
 
     Args:
-        shape: region to fill; any object with ``lower`` [D], ``upper`` [D], ``volume`` and ``inside(x)``.
+        shape: region to fill; any object with ``lower`` [D], ``upper`` [D], ``volume`` and ``inside(x)`` as `Region`.
         grid: a grid or its node spacing dx [m].
         per_cell: mean number of particles in a cell of volume dx^D.
         method: "lattice" or "poisson".
@@ -263,7 +173,7 @@ def fill(
     return Points(x.to(device=device, dtype=dtype), volume.to(device=device, dtype=dtype))
 
 
-def _points_in(shape: Shape, grid: Any, per_cell: float, method: str, seed: int) -> Tensor:
+def _points_in(shape: Region, grid: Any, per_cell: float, method: str, seed: int) -> Tensor:
     """[P, D], float64, on the CPU."""
     dx = _positive("the grid's dx", getattr(grid, "dx", grid))
     dim = len(shape.lower)
@@ -283,7 +193,7 @@ def _points_in(shape: Shape, grid: Any, per_cell: float, method: str, seed: int)
     return x
 
 
-def _check_size(shape: Shape, spacing: float, method: str) -> None:
+def _check_size(shape: Region, spacing: float, method: str) -> None:
     """Raise ValueError before the points of a shape's bounding box fill the memory."""
     sides = ((shape.upper - shape.lower).double() / spacing).clamp(min=1).tolist()
     points = math.prod(sides)

@@ -82,14 +82,14 @@ class _Calls:
         walls = ([2, 4] + [1, 3] * (D - 1), [0.0, 1.0] * D, [0.1] * 2 * D)
         rows, velocity = self.uniform(self.N, 1 + D), self.normal(self.N, D)
         update = (rows, self.normal(2, D), self.dt, 0.1, *walls, *top)
-        table = self.uniform(2, 4, 10 if D == 2 else 17)
-        kinds = ([0, 1, 2, 3], [1, 2, 3, 2], [-1, -1, 0, 1], [0.0] * 4, [float("inf")] * 4)
-        obstacles = (velocity, table, *kinds, self.uniform(2), 0.1, *top)
+        table, outline = self.uniform(2, 5, 10 if D == 2 else 17), self.uniform(4, 2)
+        kinds = ([0, 1, 2, 3, 4], [0, 0, 0, 0, 4], [1, 2, 3, 2, 3], [-1, -1, 0, 1, -1], [0.0] * 5, [float("inf")] * 5)
+        obstacles = (velocity, table, outline, *kinds, self.uniform(2), 0.1, *top)
         return [
             ("grid_update", update),
             ("grid_update_backward", (self.uniform(self.N, 1 + D), True, *update)),
             ("contact", obstacles),
-            ("contact_backward", (self.normal(self.N, D), *obstacles)),
+            ("contact_backward", (self.normal(self.N, D), True, *obstacles)),
         ]
 
     def heat(self) -> list[tuple[str, tuple[Any, ...]]]:

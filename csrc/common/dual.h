@@ -48,6 +48,16 @@ MPM_HD Dual<T> sqrt(const Dual<T>& a) {
   return {root, T(0.5) * a.derivative / root};
 }
 
+template <class T>
+MPM_HD Dual<T> sin(const Dual<T>& a) {
+  return {sin(a.value), cos(a.value) * a.derivative};
+}
+
+template <class T>
+MPM_HD Dual<T> cos(const Dual<T>& a) {
+  return {cos(a.value), T(0) - sin(a.value) * a.derivative};
+}
+
 // ln a; see common/elementary.h for its arguments.
 template <class T>
 MPM_HD Dual<T> log_1p(const Dual<T>& a, const Dual<T>& a_minus_1) {

@@ -15,6 +15,10 @@ MPM_HD float expm1(float x) { return ::expm1f(x); }
 MPM_HD double expm1(double x) { return ::expm1(x); }
 MPM_HD float sqrt(float x) { return ::sqrtf(x); }
 MPM_HD double sqrt(double x) { return ::sqrt(x); }
+MPM_HD float sin(float x) { return ::sinf(x); }
+MPM_HD double sin(double x) { return ::sin(x); }
+MPM_HD float cos(float x) { return ::cosf(x); }
+MPM_HD double cos(double x) { return ::cos(x); }
 MPM_HD float abs(float x) { return ::fabsf(x); }
 MPM_HD double abs(double x) { return ::fabs(x); }
 MPM_HD float max(float a, float b) { return a > b ? a : b; }

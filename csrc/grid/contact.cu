@@ -7,13 +7,23 @@ namespace {
 constexpr int kThreads = 128;
 constexpr int kLanes = 16;  // threads that share a slot
 
+// The lanes of a slot are half a warp and take the same branches; the other half may take others.
+struct SumLanes {
+  template <class T>
+  __device__ T operator()(T x) const {
+    const unsigned mask = 0xffffu << (threadIdx.x & kLanes);
+    for (int step = kLanes / 2; step > 0; step /= 2) x += __shfl_down_sync(mask, x, step, kLanes);
+    return x;
+  }
+};
+
 template <bool Backward, class T, int D>
 __global__ void __launch_bounds__(kThreads) contact_kernel(const ContactArguments<T, D> a) {
   const int64_t thread = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   const int64_t slot = thread / kLanes;
   if (slot >= a.capacity) return;
   if constexpr (Backward)
-    slot_contact_backward<kLanes>(a, int(slot), int(thread % kLanes));
+    slot_contact_backward<kLanes>(a, int(slot), int(thread % kLanes), SumLanes());
   else
     slot_contact<kLanes>(a, int(slot), int(thread % kLanes));
 }

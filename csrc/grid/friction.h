@@ -1,7 +1,6 @@
 #pragma once
 
-#include <cmath>
-
+#include "common/dual.h"
 #include "common/matrix.h"
 
 namespace mpm {
@@ -19,6 +18,16 @@ struct ContactSplit {
   T kept;   // part of the tangential velocity that friction leaves
 };
 
+// Whether friction makes a difference: it is not zero, or its derivative at zero is asked for.
+template <class T>
+MPM_HD bool has_friction(const T& friction) {
+  return friction > T(0);
+}
+template <class T>
+MPM_HD bool has_friction(const Dual<T>& friction) {
+  return friction.value > T(0) || friction.derivative != T(0);
+}
+
 // Coulomb friction takes at most `friction` times the normal velocity that the contact takes. It acts under pressure
 // only: a slip surface that holds back material moving away does so without friction.
 template <class T, int D>
@@ -28,8 +37,8 @@ MPM_HD ContactSplit<T, D> split_contact(const Vector<T, D>& u, const Vector<T, D
   s.tangential = u + s.approach * normal;
   s.speed = T(0);
   s.kept = T(1);
-  if (friction > T(0) && s.approach > T(0)) {
-    s.speed = std::sqrt(dot(s.tangential, s.tangential));
+  if (has_friction(friction) && s.approach > T(0)) {
+    s.speed = sqrt(dot(s.tangential, s.tangential));
     const T lost = friction * s.approach;
     s.kept = lost < s.speed ? T(1) - lost / s.speed : T(0);
   }

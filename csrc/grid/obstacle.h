@@ -1,15 +1,15 @@
 #pragma once
 
-#include <cmath>
 #include <cstdint>
+#include <limits>
 
 #include "grid/friction.h"
 #include "grid/geometry.h"
 
-// Rigid obstacles: which nodes are inside, and the velocity of those after contact.
+// Rigid obstacles: which nodes are inside, the velocity of those after contact, and its adjoints.
 namespace mpm {
 
-enum class ObstacleShape : int { plane = 0, sphere = 1, box = 2, capsule = 3 };
+enum class ObstacleShape : int { plane = 0, sphere = 1, box = 2, capsule = 3, revolved = 4 };
 
 constexpr int kMaxObstacles = 16;  // of one call
 
@@ -17,8 +17,9 @@ constexpr int kMaxObstacles = 16;  // of one call
 struct ObstacleKind {
   ObstacleShape shape;
   Contact contact;
-  int scene;          // -1 for all
-  double start, end;  // acts while start <= time < end [s]
+  int scene;                  // -1 for all
+  double start, end;          // acts while start <= time < end [s]
+  int first_corner, corners;  // of the outline of a revolved shape
 };
 
 // A row of the table of obstacles, all of it numbers of the nodes' type (torch_mpm/ops/contact.py writes it).
@@ -28,8 +29,9 @@ struct ObstacleRow {
   T friction;
   T position[D], velocity[D];                    // of the centre at time `start`
   T rotation[angles], angular_velocity[angles];  // an angle in 2-D, a vector in 3-D; about the centre
-  T extent[D];                                   // plane: normal; box: edge lengths; capsule: half axis
+  T extent[D];                                   // plane: normal; box: edge lengths; capsule: half axis; revolved: axis
   T radius;                                      // of a sphere or capsule
+  static constexpr int width = 3 * D + 2 * angles + 2;
 };
 
 template <class T, int D>
@@ -43,69 +45,115 @@ struct ContactArguments {
   ObstacleKind kind[kMaxObstacles];
   const ObstacleRow<T, D>* row = nullptr;  // [rows, obstacles]; one row for all scenes, or one per scene
   int rows = 0;
+  const T* outline = nullptr;     // corners (distance from the axis, position along it) [corners, 2], anticlockwise
   const T* scene_time = nullptr;  // [times], one for all scenes or one per scene; or null
   int times = 0;
   double time = 0;              // where scene_time is null
   const T* velocity = nullptr;  // node i at velocity + i * stride
   const T* grad = nullptr;      // likewise; backward only
   int64_t stride = 0, grad_stride = 0;
-  T* result = nullptr;  // rows [capacity * 4^D, 1 + D] as of the grid update, the first column zero
+  T* result = nullptr;    // rows [capacity * 4^D, 1 + D] as of the grid update, the first column zero
+  T* row_grad = nullptr;  // adjoint of the rows by each slot [capacity, obstacles, width], or null; backward only
 };
 
 inline namespace TORCH_MPM_ISA {
 
+// With derivative zero at the zero vector.
+template <class T, int D>
+MPM_HD T length(const Vector<T, D>& v) {
+  const T squared = dot(v, v);
+  return squared > T(0) ? sqrt(squared) : T(0);
+}
+
+template <class T, int D>
+MPM_HD Vector<T, D> direction(const Vector<T, D>& v) {
+  const T norm = length(v);
+  return (norm > T(0) ? T(1) / norm : T(0)) * v;
+}
+
 // Rotation by an angle, or by a vector (Rodrigues).
 template <class T>
-MPM_HD Matrix<T, 2> rotation_matrix(const T (&angle)[1], T factor) {
-  const T c = std::cos(angle[0] * factor), s = std::sin(angle[0] * factor);
+MPM_HD Matrix<T, 2> rotation_matrix(const T (&angle)[1], const T& factor) {
+  const T c = cos(angle[0] * factor), s = sin(angle[0] * factor);
   return {{{c, T(0) - s}, {s, c}}};
 }
 
 template <class T>
-MPM_HD Matrix<T, 3> rotation_matrix(const T (&vector)[3], T factor) {
+MPM_HD Matrix<T, 3> rotation_matrix(const T (&vector)[3], const T& factor) {
   const T x = vector[0] * factor, y = vector[1] * factor, z = vector[2] * factor;
-  const T half = T(0.5) * std::sqrt(x * x + y * y + z * z);
-  const T s = half > T(0) ? std::sin(half) / half : T(1);  // sin(θ/2)/(θ/2)
-  const T first = s * std::cos(half), second = T(0.5) * s * s;
+  const T half = T(0.5) * length(Vector<T, 3>{{x, y, z}});
+  const T s = half > T(0) ? sin(half) / half : T(1);  // sin(θ/2)/(θ/2)
+  const T first = s * cos(half), second = T(0.5) * s * s;
   const Matrix<T, 3> cross = {{{T(0), T(0) - z, y}, {z, T(0), T(0) - x}, {T(0) - y, x, T(0)}}};
   return identity<T, 3>() + first * cross + second * (cross * cross);
 }
 
-// An obstacle at a time.
-template <class T, int D>
+// An obstacle at a time. S is the scalar of its parameters, T or a dual number.
+template <class S, int D>
 struct ObstaclePose {
   bool acts;
   ObstacleShape shape;
   Contact contact;
-  const ObstacleRow<T, D>* row;
-  Vector<T, D> centre;
-  Matrix<T, D> rotation;  // world = centre + rotation body
+  const ObstacleRow<S, D>* row;
+  const ValueOf<S>* outline;
+  int corners;
+  Vector<S, D> centre;
+  Matrix<S, D> rotation;  // world = centre + rotation body
 };
 
-template <class T, int D>
-MPM_HD ObstaclePose<T, D> obstacle_pose(const ContactArguments<T, D>& a, const ObstacleKind& kind,
-                                        const ObstacleRow<T, D>& row, int scene) {
+template <class S, class T, int D>
+MPM_HD ObstaclePose<S, D> obstacle_pose(const ContactArguments<T, D>& a, const ObstacleKind& kind,
+                                        const ObstacleRow<S, D>& row, int scene) {
   const double time = a.scene_time ? double(a.scene_time[a.times == 1 ? 0 : scene]) : a.time;
-  ObstaclePose<T, D> p;
+  ObstaclePose<S, D> p;
   p.acts = (kind.scene < 0 || kind.scene == scene) && time >= kind.start && time < kind.end;
   if (!p.acts) return p;
   p.shape = kind.shape;
   p.contact = kind.contact;
   p.row = &row;
-  const T elapsed = T(time - kind.start);
+  p.outline = a.outline + 2 * kind.first_corner;
+  p.corners = kind.corners;
+  const S elapsed = lift<S>(T(time - kind.start));
   MPM_UNROLL for (int i = 0; i < D; i++)
     p.centre[i] = row.position[i] + row.velocity[i] * elapsed;
-  p.rotation = rotation_matrix(row.angular_velocity, elapsed) * rotation_matrix(row.rotation, T(1));
+  p.rotation = rotation_matrix(row.angular_velocity, elapsed) * rotation_matrix(row.rotation, S(1));
   return p;
 }
 
-template <class T, int D>
-MPM_HD T length(const Vector<T, D>& v) {
-  return std::sqrt(dot(v, v));
+// Signed distance of a point (distance from the axis, position along it) from a closed polygon, and the outward normal
+// of its nearest edge; among equals, the first counts.
+template <class S>
+MPM_HD S polygon_surface(const ValueOf<S>* corner, int corners, const Vector<S, 2>& p, Vector<S, 2>& normal) {
+  using T = ValueOf<S>;
+  S nearest = S(std::numeric_limits<T>::max());
+  normal = zero_vector<S, 2>();
+  bool inside = false;
+  for (int k = 0; k < corners; k++) {
+    const T *const a = corner + 2 * k, *const b = corner + 2 * (k + 1 < corners ? k + 1 : 0);
+    const Vector<S, 2> edge = {{lift<S>(b[0] - a[0]), lift<S>(b[1] - a[1])}};
+    const Vector<S, 2> arm = {{p[0] - lift<S>(a[0]), p[1] - lift<S>(a[1])}};
+    // An odd number of edges is crossed by the ray from the point away from the axis.
+    const S side = edge[0] * arm[1] - edge[1] * arm[0];
+    if ((a[1] > value_of(p[1])) != (b[1] > value_of(p[1])) && (edge[1] > S(0) ? side > S(0) : side < S(0)))
+      inside = !inside;
+    if (a[0] == T(0) && b[0] == T(0)) continue;  // an edge on the axis is inside the body
+    const S along = dot(arm, edge) / dot(edge, edge);
+    Vector<S, 2> offset;
+    if (!(along < S(1)))  // exactly as from the next edge
+      offset = {{p[0] - lift<S>(b[0]), p[1] - lift<S>(b[1])}};
+    else
+      offset = arm + (along > S(0) ? S(0) - along : S(0)) * edge;
+    const S distance = length(offset);
+    if (distance < nearest) {
+      nearest = distance;
+      normal = direction(Vector<S, 2>{{edge[1], S(0) - edge[0]}});
+    }
+  }
+  return inside ? S(0) - nearest : nearest;
 }
 
 // Signed distance of a point in body coordinates, and the unit normal out of the body: right inside, zero where the
-// shape has none.
+// shape has none. Outside, the distance is a lower bound.
 template <class T, int D>
 MPM_HD T surface(const ObstaclePose<T, D>& o, const Vector<T, D>& body, Vector<T, D>& normal) {
   Vector<T, D> extent;
@@ -119,12 +167,21 @@ MPM_HD T surface(const ObstaclePose<T, D>& o, const Vector<T, D>& body, Vector<T
     T deepest = T(0);
     int axis = -1;
     MPM_UNROLL for (int i = 0; i < D; i++) {
-      const T distance = std::fabs(body[i]) - T(0.5) * extent[i];
+      const T distance = abs(body[i]) - T(0.5) * extent[i];
       if (axis < 0 || distance > deepest) deepest = distance, axis = i;
     }
     MPM_UNROLL for (int i = 0; i < D; i++)
       normal[i] = i != axis ? T(0) : body[i] < T(0) ? T(-1) : T(1);
     return deepest;
+  }
+  if (o.shape == ObstacleShape::revolved) {
+    const Vector<T, D> axis = direction(extent);
+    const T along = dot(body, axis);
+    const Vector<T, D> across = body + (T(0) - along) * axis;
+    Vector<T, 2> plane_normal;
+    const T distance = polygon_surface(o.outline, o.corners, Vector<T, 2>{{length(across), along}}, plane_normal);
+    normal = plane_normal[0] * direction(across) + plane_normal[1] * axis;
+    return distance;
   }
   Vector<T, D> offset = body;
   if (o.shape == ObstacleShape::capsule) {
@@ -139,29 +196,31 @@ MPM_HD T surface(const ObstaclePose<T, D>& o, const Vector<T, D>& body, Vector<T
 }
 
 // A node seen by an obstacle.
-template <class T, int D>
+template <class S, int D>
 struct Touch {
   bool touching;
-  Vector<T, D> normal, surface_velocity;
+  Vector<S, D> normal, surface_velocity;
 };
 
-template <class T, int D>
-MPM_HD Touch<T, D> touch(const ContactArguments<T, D>& a, const ObstaclePose<T, D>& o, const Vector<T, D>& position) {
-  Touch<T, D> t;
-  const Vector<T, D> arm = position + T(-1) * o.centre;
-  Vector<T, D> normal;
-  t.touching = surface(o, transpose(o.rotation) * arm, normal) <= a.rounding;
+template <class S, class T, int D>
+MPM_HD Touch<S, D> touch(const ContactArguments<T, D>& a, const ObstaclePose<S, D>& o, const Vector<T, D>& position) {
+  Touch<S, D> t;
+  Vector<S, D> arm, normal;
+  MPM_UNROLL for (int i = 0; i < D; i++)
+    arm[i] = lift<S>(position[i]) - o.centre[i];
+  t.touching = value_of(surface(o, transpose(o.rotation) * arm, normal)) <= a.rounding;
   if (!t.touching) return t;
   t.normal = o.rotation * normal;
+  const auto& rate = o.row->angular_velocity;
   MPM_UNROLL for (int i = 0; i < D; i++)
     t.surface_velocity[i] = o.row->velocity[i];
   if constexpr (D == 2) {
-    t.surface_velocity[0] -= o.row->angular_velocity[0] * arm[1];
-    t.surface_velocity[1] += o.row->angular_velocity[0] * arm[0];
+    t.surface_velocity[0] = t.surface_velocity[0] - rate[0] * arm[1];
+    t.surface_velocity[1] = t.surface_velocity[1] + rate[0] * arm[0];
   } else {
     MPM_UNROLL for (int i = 0; i < 3; i++) {
       const int j = (i + 1) % 3, k = (i + 2) % 3;
-      t.surface_velocity[i] += o.row->angular_velocity[j] * arm[k] - o.row->angular_velocity[k] * arm[j];
+      t.surface_velocity[i] = t.surface_velocity[i] + (rate[j] * arm[k] - rate[k] * arm[j]);
     }
   }
   return t;
@@ -279,24 +338,65 @@ MPM_HD Vector<T, D> velocity_before(const ContactArguments<T, D>& a, const Conta
   return v;
 }
 
-template <int Lanes, class T, int D>
-MPM_HD void slot_contact_backward(const ContactArguments<T, D>& a, int slot, int lane) {
-  constexpr int count = kBlockNodes<D> / Lanes;
+// The nodes of a slot that an obstacle touches, as the backward pass needs them.
+template <int count, class T, int D>
+struct TouchedNodes {
+  bool touching[count];
+  Vector<T, D> position[count], before[count], grad[count];  // velocity before the contact, adjoint of that after it
+};
+
+// Adjoint of a parameter of an obstacle by some nodes: one directional derivative of the velocities after contact.
+template <int count, class T, int D>
+MPM_HD T parameter_adjoint(const ContactArguments<T, D>& a, const ContactSlot<T, D>& s, int k, int parameter,
+                           const TouchedNodes<count, T, D>& nodes) {
+  using S = Dual<T>;
+  ObstacleRow<S, D> row;
+  const T* const values = reinterpret_cast<const T*>(s.row + k);
+  S* const lifted = reinterpret_cast<S*>(&row);
+  for (int i = 0; i < ObstacleRow<T, D>::width; i++) lifted[i] = S(values[i], i == parameter ? T(1) : T(0));
+  const ObstaclePose<S, D> pose = obstacle_pose(a, a.kind[k], row, s.scene);
+  T sum = T(0);
+  for (int n = 0; n < count; n++) {
+    if (!nodes.touching[n]) continue;
+    Vector<S, D> v;
+    MPM_UNROLL for (int i = 0; i < D; i++)
+      v[i] = lift<S>(nodes.before[n][i]);
+    const Vector<S, D> after = after_contact(pose, touch(a, pose, nodes.position[n]), v);
+    MPM_UNROLL for (int i = 0; i < D; i++)
+      sum += nodes.grad[n][i] * after[i].derivative;
+  }
+  return sum;
+}
+
+// `sum_lanes` adds a number over the lanes of a slot; the first lane gets the sum.
+template <int Lanes, class T, int D, class SumLanes>
+MPM_HD void slot_contact_backward(const ContactArguments<T, D>& a, int slot, int lane, SumLanes&& sum_lanes) {
+  constexpr int count = kBlockNodes<D> / Lanes, width = ObstacleRow<T, D>::width;
   const ContactSlot<T, D> s = contact_slot(a, slot);
   const int64_t first = int64_t(slot) * kBlockNodes<D> + lane;
-  Vector<T, D> grad[count];
-  for (int n = 0; n < count; n++) grad[n] = load_node<T, D>(a.grad, a.grad_stride, first + n * Lanes);
-  for (int k = s.active ? a.obstacles - 1 : -1; k >= 0; k--) {
-    const ObstaclePose<T, D> pose = pose_at(a, s, k);
+  TouchedNodes<count, T, D> nodes;
+  for (int n = 0; n < count; n++) nodes.grad[n] = load_node<T, D>(a.grad, a.grad_stride, first + n * Lanes);
+  for (int k = a.obstacles - 1; k >= 0; k--) {
+    ObstaclePose<T, D> pose;
+    pose.acts = false;
+    if (s.active) pose = pose_at(a, s, k);
     for (int n = 0; pose.acts && n < count; n++) {
-      const Vector<T, D> position = node_position(a, s.corner, lane + n * Lanes);
-      const Touch<T, D> t = touch(a, pose, position);
-      if (!t.touching) continue;
-      const Vector<T, D> u = relative_velocity(t, velocity_before(a, s, k, first + n * Lanes, position));
-      grad[n] = contact_adjoint(pose.contact, u, t.normal, pose.row->friction, grad[n]);
+      nodes.position[n] = node_position(a, s.corner, lane + n * Lanes);
+      nodes.touching[n] = touch(a, pose, nodes.position[n]).touching;
+      if (nodes.touching[n]) nodes.before[n] = velocity_before(a, s, k, first + n * Lanes, nodes.position[n]);
+    }
+    for (int i = 0; a.row_grad && i < width; i++) {
+      const T sum = pose.acts ? sum_lanes(parameter_adjoint(a, s, k, i, nodes)) : T(0);
+      if (lane == 0) a.row_grad[(int64_t(slot) * a.obstacles + k) * width + i] = sum;
+    }
+    for (int n = 0; pose.acts && n < count; n++) {
+      if (!nodes.touching[n]) continue;
+      const Touch<T, D> t = touch(a, pose, nodes.position[n]);
+      const Vector<T, D> u = relative_velocity(t, nodes.before[n]);
+      nodes.grad[n] = contact_adjoint(pose.contact, u, t.normal, pose.row->friction, nodes.grad[n]);
     }
   }
-  for (int n = 0; n < count; n++) store_node(a.result, first + n * Lanes, grad[n]);
+  for (int n = 0; n < count; n++) store_node(a.result, first + n * Lanes, nodes.grad[n]);
 }
 
 }  // namespace TORCH_MPM_ISA

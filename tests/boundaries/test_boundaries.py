@@ -67,7 +67,7 @@ def surface_velocity(obstacle: Obstacle, positions: Tensor, time: float) -> Tens
 def inside_by_brute_force(shape: str, obstacle: Obstacle, positions: np.ndarray) -> np.ndarray:
     pose = obstacle.pose(0.0)
     body = (positions - pose.centre.numpy()) @ pose.rotation.numpy()
-    sizes = obstacle.extents()
+    sizes = vars(obstacle.shape)
     if shape == "plane":
         return body @ np.array(sizes["normal"]) <= 0
     if shape == "sphere":
@@ -100,12 +100,13 @@ def test_which_nodes_are_inside(dim, shape):
 def test_normals_are_gradients_of_the_distance(dim, shape):
     obstacle = shapes(dim)[SHAPES.index(shape)]
     positions, _ = cloud(dim)
-    distance, normal = obstacle.surface(positions, None)
+    distance, normal = obstacle.shape.surface(positions, None)
     inside = distance < 0
     h = 1e-6
     differences = torch.stack(
         [
-            (obstacle.surface(positions + h * e, None)[0] - obstacle.surface(positions - h * e, None)[0]) / (2 * h)
+            (obstacle.shape.surface(positions + h * e, None)[0] - obstacle.shape.surface(positions - h * e, None)[0])
+            / (2 * h)
             for e in torch.eye(dim, dtype=torch.float64)
         ],
         1,
@@ -139,7 +140,7 @@ def test_coulomb_friction_in_the_frame_of_the_surface(dim, device, shape, kind, 
     time = 0.13
     after = act(obstacle, velocity.to(device), positions.to(device), time=time).cpu()
     pose = obstacle.pose(time)
-    distance, normal = obstacle.surface((positions - pose.centre) @ pose.rotation, None)
+    distance, normal = obstacle.shape.surface((positions - pose.centre) @ pose.rotation, None)
     normal = normal @ pose.rotation.mT
     inside = distance <= 0
     assert torch.equal(after[~inside], velocity[~inside])

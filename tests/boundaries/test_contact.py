@@ -1,4 +1,4 @@
-"""The contact op against `Obstacle.apply` in plain torch, of one obstacle after another."""
+"""The contact op against `Obstacle.forward` in torch operations, of one obstacle after another, and by cases."""
 
 import math
 
@@ -10,6 +10,8 @@ from torch import Tensor
 import torch_mpm as mpm
 from torch_mpm.boundaries import Obstacle
 from torch_mpm.ops import contact, fusible
+from torch_mpm.reference.contact import contact_velocity
+from torch_mpm.shapes import Cylinder, Shape
 
 KINDS = ["sticky", "slip", "separate"]
 
@@ -29,7 +31,13 @@ def shapes(dim: int, **options: object) -> list[Obstacle]:
         mpm.Sphere(at, 0.25, **options),
         mpm.Box(at, vector(dim, 0.5, 0.3, 0.6), **options),
         mpm.Capsule(at, vector(dim, 0.15, 0.2, -0.1), 0.15, **options),
+        mpm.Revolved(at, DRUM, vector(dim, 0.2, 1.0, -0.4), **options),
     ]
+
+
+NAMES = ["plane", "sphere", "box", "capsule", "revolved"]
+DRUM = ((0.1, -0.2), (0.2, 0.05), (0.12, 0.2), (0.3, 0.3), (0.35, -0.3))
+"""Walls of a vessel with a hole along its axis, an edge that looks inwards, and a reentrant corner."""
 
 
 def inputs(dim: int, device: str, scenes: int = 1) -> tuple[mpm.Blocks, Tensor]:
@@ -58,18 +66,48 @@ def assert_same(blocks: mpm.Blocks, velocity: Tensor, obstacles: list[Obstacle],
     return int((~untouched & active).sum())
 
 
-@pytest.mark.parametrize("shape", [0, 1, 2, 3], ids=["plane", "sphere", "box", "capsule"])
+def moving(dim: int) -> dict[str, object]:
+    return {
+        "velocity": vector(dim, 0.2, -0.1, 0.3), "rotation": turn(dim, 0.7, -0.3, 0.8),
+        "angular_velocity": turn(dim, -1.3, 1.1, -0.7), "start": -0.2,
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("shape", NAMES)
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("friction", [0.0, 0.4])
 def test_is_the_contact_of_the_obstacle(device, dim, shape, kind, friction):
     blocks, velocity = inputs(dim, device)
-    moving = {
-        "velocity": vector(dim, 0.2, -0.1, 0.3), "rotation": turn(dim, 0.7, -0.3, 0.8),
-        "angular_velocity": turn(dim, -1.3, 1.1, -0.7), "start": -0.2,
-    }  # fmt: skip
-    for motion in ({}, moving):
-        (obstacle,) = shapes(dim, kind=kind, friction=friction, **motion)[shape : shape + 1]
+    for motion in ({}, moving(dim)):
+        obstacle = shapes(dim, kind=kind, friction=friction, **motion)[NAMES.index(shape)]
         assert assert_same(blocks, velocity, [obstacle], 0.13) > 5
+
+
+@pytest.mark.parametrize("shape", NAMES)
+@pytest.mark.parametrize("kind", KINDS)
+def test_is_coulomb_friction_case_by_case(device, dim, shape, kind):
+    """With the normal from differences of the distance, and the velocity of the surface from those of the pose."""
+    blocks, velocity = inputs(dim, device)
+    obstacle = shapes(dim, kind=kind, friction=0.4, **moving(dim))[NAMES.index(shape)]
+    x, time, h = blocks.node_positions(torch.float64), 0.13, 1e-6
+
+    def distance(points: Tensor) -> Tensor:
+        return obstacle.signed_distance(points, None, time)
+
+    axes = torch.eye(dim, dtype=torch.float64, device=device)
+    normal = torch.stack([(distance(x + h * e) - distance(x - h * e)) / (2 * h) for e in axes], 1)
+    pose, ahead, behind = (obstacle.pose(time + t, x) for t in (0.0, h, -h))
+    body = (x - pose.centre) @ pose.rotation
+    surface = ((ahead.centre + body @ ahead.rotation.mT) - (behind.centre + body @ behind.rotation.mT)) / (2 * h)
+    after = contact(blocks, velocity, [obstacle], time)
+    bent = (normal.norm(dim=1) - 1).abs() > 1e-7  # where two faces are equally near, or a corner is nearest
+    inside = (distance(x) <= 0) & blocks.active_nodes() & ~bent
+    if shape == "revolved":  # from a reentrant corner the normal is that of an edge
+        faces = obstacle.shape.surface(body, None)[1] @ pose.rotation.mT
+        inside &= (faces - normal).norm(dim=1) < 1e-6
+    expected = surface + contact_velocity(velocity - surface, normal, kind, 0.4)
+    assert int(inside.sum()) > 5
+    torch.testing.assert_close(after[inside], expected[inside], rtol=0, atol=1e-7)
 
 
 def test_obstacles_act_one_after_another(device, dim):
@@ -158,6 +196,29 @@ def test_degenerate_nodes_are_finite(device, dim, kind):
 # ---- derivatives
 
 
+def leaves_of(dim: int, device: str, scenes: int | None = None) -> dict[str, Tensor]:
+    """What contact is differentiated by, the same for all scenes or different."""
+    values = {
+        "position": vector(dim, 0.55, 0.35, 0.4), "velocity": vector(dim, 0.2, -0.1, 0.3),
+        "rotation": turn(dim, 0.7, -0.3, 0.8), "angular_velocity": turn(dim, -1.3, 1.1, -0.7), "friction": 0.3,
+        "direction": vector(dim, 0.15, 0.2, -0.1),
+    }  # fmt: skip
+    tensors = {name: torch.tensor(value, dtype=torch.float64) for name, value in values.items()}
+    if scenes is not None:
+        tensors = {n: t + 0.05 * torch.rand(scenes, *t.shape, dtype=torch.float64) for n, t in tensors.items()}
+    return {name: t.to(device).requires_grad_() for name, t in tensors.items()}
+
+
+def made(shape: str, dim: int, direction: Tensor, **options: object) -> Obstacle:
+    return {
+        "plane": lambda: mpm.Plane(normal=direction, **options),
+        "sphere": lambda: mpm.Sphere(radius=0.25, **options),
+        "box": lambda: mpm.Box(size=vector(dim, 0.5, 0.3, 0.6), **options),
+        "capsule": lambda: mpm.Capsule(half_axis=direction, radius=0.15, **options),
+        "revolved": lambda: mpm.Revolved(outline=DRUM, axis=direction, **options),
+    }[shape]()
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_gradients(device, dim, kind):
     blocks, velocity = inputs(dim, device)
@@ -169,33 +230,98 @@ def test_gradients(device, dim, kind):
     torch.testing.assert_close(grad, expected, rtol=0, atol=1e-12)
 
 
-def test_gradcheck(dim):
+@pytest.mark.parametrize("shape", NAMES)
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("scenes", [1, 3])
+def test_gradients_of_the_obstacle(device, dim, shape, kind, scenes):
+    """Two obstacles, so that the second sees what the first has done; one of them shared by the scenes."""
+    blocks, velocity = inputs(dim, device, scenes)
+    velocity = velocity.clone().requires_grad_()
+    leaves = leaves_of(dim, device, None if scenes == 1 else scenes)
+    options = {name: leaf for name, leaf in leaves.items() if name != "direction"}
+    body = made(shape, dim, leaves["direction"], kind=kind, **options)
+    mu = torch.tensor(0.2, dtype=torch.float64, device=device, requires_grad=True)
+    floor = mpm.Plane(vector(dim, 0.5, 0.5, 0.5), vector(dim, 0.3, 1.0, 0.2), "slip", friction=mu, scene=0)
+    active = blocks.active_nodes()
+    weight = torch.randn_like(velocity) * active[:, None]
+    time = 0.1 if scenes == 1 else torch.tensor([0.1, 0.2, 0.3], dtype=torch.float64, device=device)
+    wanted = [velocity, mu, *leaves.values()]
+    results = []
+    for after in (in_turn, contact):
+        value = (after(blocks, velocity, [body, floor], time) * weight).sum()
+        results.append(torch.autograd.grad(value, wanted, allow_unused=True, materialize_grads=True))
+    for name, expected, grad in zip(("velocity", "mu", *leaves), *results, strict=True):
+        torch.testing.assert_close(grad, expected, rtol=1e-12, atol=1e-12, msg=lambda m, name=name: f"{name}: {m}")
+    assert all(grad.abs().max() > 0 for grad in results[1][2:4])  # position and velocity
+
+
+@pytest.mark.parametrize("kind", ["slip", "separate"])
+def test_friction_of_zero_has_a_gradient(device, kind):
+    grid = mpm.Grid(0.25, (0.0, 0.0), (0.5, 0.5))
+    blocks = random_blocks(grid, device, share=1.0)
+    velocity = torch.tensor([2.0, -3.0], dtype=torch.float64, device=device).expand(blocks.node_count, 2)
+    mu = torch.zeros((), dtype=torch.float64, device=device, requires_grad=True)
+    ground = mpm.Plane((0.0, 9.0), (0.0, 1.0), kind, friction=mu)
+    after = contact(blocks, velocity, [ground], 0.0)[blocks.active_nodes()]
+    (grad,) = torch.autograd.grad(after[:, 0].mean(), mu)
+    assert float(grad) == pytest.approx(-3.0, rel=1e-14)  # the tangential velocity is 2 - 3 friction
+
+
+@pytest.mark.parametrize("shape", NAMES)
+def test_gradcheck(dim, shape):
     grid = mpm.Grid(0.25, (0.0,) * dim, (0.5,) * dim)
     blocks = random_blocks(grid, share=0.6)
     velocity = torch.randn(blocks.node_count, dim, dtype=torch.float64, requires_grad=True)
-    bodies = shapes(dim, kind="separate", friction=0.3, velocity=vector(dim, 0.1, -0.2, 0.3))[1:3]
+    leaves = leaves_of(dim, "cpu")
 
-    def function(velocity: Tensor) -> Tensor:
-        return contact(blocks, velocity, bodies, 0.1)
+    def function(velocity: Tensor, *values: Tensor) -> Tensor:
+        given = dict(zip(leaves, values, strict=True))
+        body = made(shape, dim, given.pop("direction"), kind="separate", **given)
+        other = mpm.Sphere((0.4,) * dim, 0.3, "slip", friction=given["friction"])
+        return contact(blocks, velocity, [body, other], 0.1)
 
-    assert torch.autograd.gradcheck(function, (velocity,), fast_mode=True)
-    assert torch.autograd.gradgradcheck(function, (velocity,), fast_mode=True)
+    arguments = (velocity, *leaves.values())
+    assert torch.autograd.gradcheck(function, arguments, fast_mode=True)
+    assert torch.autograd.gradgradcheck(function, arguments, fast_mode=True)
 
 
-def test_what_is_differentiated_otherwise_is_left_to_torch():
+def test_what_the_kernel_takes():
     ball = mpm.Sphere((0.5, 0.5), 0.1)
     assert fusible(ball, 0.0) and fusible(ball, torch.tensor(0.0))
     assert not fusible(ball, torch.tensor(0.0, requires_grad=True))
-    grad = torch.tensor([0.5, 0.5], requires_grad=True)
-    assert not fusible(mpm.Sphere(grad, 0.1), 0.0) and not fusible(mpm.Plane((0.0, 0.0), grad), 0.0)
-    assert not fusible(mpm.Sphere((0.5, 0.5), 0.1, friction=grad[0]), 0.0)
+    leaf = torch.tensor([0.5, 0.5], requires_grad=True)
+    assert fusible(mpm.Sphere(leaf, 0.1, friction=leaf[0]), 0.0) and fusible(mpm.Plane((0.0, 0.0), leaf), 0.0)
+    assert fusible(mpm.Revolved((0.5, 0.5), DRUM), 0.0) and fusible(Obstacle(Cylinder((0, 0, 1), 1), (0, 0, 0)), 0.0)
     assert not fusible(mpm.Sphere(lambda t: t[..., None].expand(2), 0.1), 0.0)
     assert not fusible(mpm.SDF(lambda x: x.norm(dim=1) - 1, (0.5, 0.5)), 0.0)
     assert not fusible(object(), 0.0)
 
+    class Soft(mpm.Sphere):
+        def forward(self, velocity, positions, scene, time, dt):
+            return velocity
+
+    assert not fusible(Soft((0.5, 0.5), 0.1), 0.0)
+
+
+def test_a_shape_of_ones_own_acts_by_torch_operations(dim, device):
+    class Ball(Shape):
+        def surface(self, x, scene=None):
+            return x.norm(dim=1) - 0.2, torch.nn.functional.normalize(x, dim=1)
+
+    blocks, velocity = inputs(dim, device)
+    own = Obstacle(Ball(), (0.5,) * dim, "slip", friction=0.3, velocity=vector(dim, 0.3, 0.1, 0.2))
+    ball = mpm.Sphere((0.5,) * dim, 0.2, "slip", friction=0.3, velocity=vector(dim, 0.3, 0.1, 0.2))
+    assert not fusible(own, 0.0)
+    with pytest.raises(TypeError, match=r"obstacles\[0\] must be an obstacle of one of plane, sphere"):
+        contact(blocks, velocity, [own], 0.0)
+    active = blocks.active_nodes()
+    expected = contact(blocks, velocity, [ball], 0.1)[active]
+    torch.testing.assert_close(in_turn(blocks, velocity, [own], 0.1)[active], expected, rtol=0, atol=1e-12)
+
 
 def test_a_step_takes_both_ways(dim, device):
-    """The same obstacles with and without a parameter that requires grad; a user's boundary between them."""
+    """The same obstacles in the kernel, in it with a parameter that requires grad, and with a hook; between them a
+    boundary of the user's."""
 
     class Brake:
         def apply(self, velocity, positions, scene, time, dt):
@@ -204,14 +330,22 @@ def test_a_step_takes_both_ways(dim, device):
     grid = mpm.Grid(0.1, (0.0,) * dim, (1.0,) * dim)
     points = mpm.seed.box((0.2,) * dim, (0.8,) * dim, grid, per_cell=2**dim)
     state = mpm.State.at_rest(points, 1000.0, (1.0,) * dim, dtype=torch.float64, device=device)
-    results = []
-    for leaf in (False, True):
+    results, grads = [], []
+    for leaf, hook in ((False, False), (True, False), (True, True)):
         mu = torch.tensor(0.3, dtype=torch.float64, device=device, requires_grad=leaf)
-        first, second, third = shapes(dim, kind="separate", friction=mu, velocity=vector(dim, 0.3, 0.1, 0.2))[1:]
-        step = mpm.Step(grid, mpm.NeoHookean(E=1e4, nu=0.3), boundaries=[first, second, Brake(), third])
+        bodies = shapes(dim, kind="separate", friction=mu, velocity=vector(dim, 0.3, 0.1, 0.2))[1:]
+        for body in bodies if hook else ():
+            body.register_forward_hook(lambda module, arguments, result: None)
+        assert all(fusible(body, 0.0) != hook for body in bodies)
+        step = mpm.Step(grid, mpm.NeoHookean(E=1e4, nu=0.3), boundaries=[*bodies[:2], Brake(), *bodies[2:]])
         results.append(mpm.rollout(step, state, 3, 1e-3))
-    torch.testing.assert_close(results[0].x, results[1].x, rtol=0, atol=1e-12)
-    torch.testing.assert_close(results[0].v, results[1].v, rtol=0, atol=1e-12)
+        if leaf:
+            grads += torch.autograd.grad(results[-1].v.square().sum(), mu)
+    for result in results[1:]:
+        torch.testing.assert_close(result.x, results[0].x, rtol=0, atol=1e-12)
+        torch.testing.assert_close(result.v, results[0].v, rtol=0, atol=1e-12)
+    torch.testing.assert_close(grads[0], grads[1], rtol=1e-9, atol=0)
+    assert grads[0] != 0
 
 
 @pytest.mark.cuda
@@ -236,17 +370,20 @@ def test_a_step_with_obstacles_is_captured(dim):
 
 def op_arguments(dim: int, device: str) -> list:
     blocks, velocity = inputs(dim, device)
-    table = torch.rand(1, 4, 10 if dim == 2 else 17, dtype=torch.float64).to(device)
-    kinds = [[0, 1, 2, 3], [1, 2, 3, 2], [-1, -1, 0, -1], [0.0] * 4, [math.inf] * 4]
-    return [velocity, table, *kinds, None, 0.1, *blocks.packed]
+    table = torch.rand(1, 5, 10 if dim == 2 else 17, dtype=torch.float64).to(device)
+    outline = torch.tensor(DRUM[::-1], dtype=torch.float64, device=device)
+    kinds = [[0, 1, 2, 3, 4], [0, 0, 0, 0, 5], [1, 2, 3, 2, 2], [-1, -1, 0, -1, -1], [0.0] * 5, [math.inf] * 5]
+    return [velocity, table, outline, *kinds, None, 0.1, *blocks.packed]
 
 
 def test_opcheck(device, dim):
     arguments = op_arguments(dim, device)
-    arguments[0] = arguments[0].clone().requires_grad_()
+    arguments[0], arguments[1] = arguments[0].clone().requires_grad_(), arguments[1].requires_grad_()
     torch.library.opcheck(torch.ops.torch_mpm.contact, tuple(arguments))
-    plain = [arguments[0].detach(), *arguments[1:]]
-    torch.library.opcheck(torch.ops.torch_mpm.contact_backward, (torch.randn_like(plain[0]), *plain))
+    plain = [arguments[0].detach(), arguments[1].detach(), *arguments[2:]]
+    for wants_rows in (False, True):
+        given = (torch.randn_like(plain[0]), wants_rows, *plain)
+        torch.library.opcheck(torch.ops.torch_mpm.contact_backward, given)
 
 
 def test_compile(dim):
@@ -258,13 +395,15 @@ def test_compile(dim):
 
 def test_the_op_checks_what_memory_safety_needs(dim):
     arguments = op_arguments(dim, "cpu")
-    velocity, table = arguments[:2]
+    velocity, table, outline = arguments[:3]
     op = torch.ops.torch_mpm.contact
     for position, value in [
         (0, velocity[:-1]), (0, velocity[:, 0]), (0, velocity.float()), (1, table[:, :, :-1]), (1, table[0]),
-        (1, table.float()), (1, table[:0]), (1, table.mT.contiguous().mT), (1, table.repeat(1, 5, 1)), (2, [0]),
-        (2, [0, 1, 2, 4]), (2, [-1, 1, 2, 3]), (3, [0, 1, 2, 3]), (3, [4, 1, 2, 3]), (4, []), (5, [0.0]), (6, [0.0]),
-        (7, torch.zeros(0, dtype=torch.float64)), (7, torch.zeros(1)), (9, []),
+        (1, table.float()), (1, table[:0]), (1, table.mT.contiguous().mT), (1, table.repeat(1, 4, 1)),
+        (2, outline[:-1]), (2, outline.float()), (2, outline[:, :1]), (2, outline.T.contiguous().T), (3, [0]),
+        (3, [0, 1, 2, 3, 5]), (3, [-1, 1, 2, 3, 4]), (4, [0, 0, 0, 0, 6]), (4, [0, 0, 0, 0, -1]), (4, [5, 0, 0, 0, 5]),
+        (5, [0, 1, 2, 3, 3]), (5, [4, 1, 2, 3, 3]), (6, []), (7, [0.0]), (8, [0.0]),
+        (9, torch.zeros(0, dtype=torch.float64)), (9, torch.zeros(1)), (11, []), (12, []), (13, []),
     ]:  # fmt: skip
         with pytest.raises(RuntimeError):
             op(*arguments[:position], value, *arguments[position + 1 :])

@@ -164,13 +164,13 @@ def test_obstacles_of_a_simulation_are_drawn_where_they_act(dim):
     time = 0.7
     for body in bodies:
         drawn = render.obstacle_shapes(body, time, bounds)
-        assert len(drawn) == (2 if body.shape == "revolved" and dim == 2 else 1)
+        assert len(drawn) == (2 if body.shape.name == "revolved" and dim == 2 else 1)
         pose = body.pose(time)
         local = (torch.as_tensor(np.concatenate([s.world() for s in drawn])) - pose.centre) @ pose.rotation
-        distance, _ = body.surface(local, None)
-        if body.shape == "plane" and dim == 2:
+        distance, _ = body.shape.surface(local)
+        if body.shape.name == "plane" and dim == 2:
             local, distance = local[2:], distance[2:]  # the plate has a thickness behind its surface
-        assert distance.abs().max() < (0.006 if body.shape == "sdf" else 1e-9)
+        assert distance.abs().max() < (0.006 if body.shape.name == "sdf" else 1e-9)
 
 
 def test_obstacles_that_do_not_act_are_not_drawn():

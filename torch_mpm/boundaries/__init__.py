@@ -16,7 +16,8 @@ Choose with `torch.where` rather than a mask as index, which synchronises with t
 """
 
 from .list import BoundaryList, call_boundary
-from .obstacles import SDF, Box, Capsule, Obstacle, Plane, Pose, Revolved, Sphere, rotation_matrix
+from .motion import Pose, rotation_matrix
+from .obstacles import SDF, Box, Capsule, Obstacle, Plane, Revolved, Sphere
 from .walls import CONTACTS, LEAST_BETWEEN_MIRRORS, WALL_KINDS, Face, Walls
 
 __all__ = [

@@ -15,14 +15,16 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from ..boundaries.obstacles import Obstacle, _norm, _per_node
+from ..boundaries import Obstacle
 from ..bspline import base_node, bspline
 from ..errors import NUMBER_OR_TENSOR, check_number, check_real, shape_of
 from ..grid import Blocks
 from ..laws.compiled import check_value
 from ..ops import scatter
 from ..parameters import TensorModule, Value, evaluate
+from ..per_scene import per_node
 from ..topology import PADDING
+from ..vectors import norm
 
 if TYPE_CHECKING:
     from ..state import State
@@ -86,7 +88,7 @@ class HeatNodes:
         scenes = self.blocks.grid.scenes
         if value.shape not in ((), (1,), (scenes,)):
             raise ValueError(f"a value at nodes must have shape [], [B] = [{scenes}] or [N], got {shape_of(value)}")
-        return _per_node(value.to(self.theta), 0, self.scene())
+        return per_node(value.to(self.theta), 0, self.scene())
 
     def add_source(self, power: Tensor) -> None:
         """Heat [N] [W] that goes into the nodes."""
@@ -194,7 +196,7 @@ class FreeSurface(TensorModule):
         P, D = x.shape
         axes = torch.eye(D, dtype=x.dtype, device=x.device)
         gradient = nodes.volume[:, None, None] * axes
-        return _norm(scatter(nodes.blocks, x, x.new_zeros(P, D), gradient=gradient)) * nodes.per_node(density)
+        return norm(scatter(nodes.blocks, x, x.new_zeros(P, D), gradient=gradient)) * nodes.per_node(density)
 
 
 def node_weights(blocks: Blocks, x: Tensor, scene: Tensor | None) -> tuple[Tensor, Tensor]:

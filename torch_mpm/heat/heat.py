@@ -29,7 +29,6 @@ from torch import Tensor, nn
 
 from ..activation_record import ActivationRecord
 from ..boundaries import BoundaryList
-from ..boundaries.obstacles import _norm
 from ..capture import outside_transforms, without_transforms
 from ..errors import check_like, check_number
 from ..failures import Failures, Problem, raise_failures, unsolved_heat
@@ -42,6 +41,7 @@ from ..ops.heat import METHODS
 from ..parameters import Value, evaluate, needed_temperature, store
 from ..pause import paused
 from ..state import State, check_state
+from ..vectors import norm
 from .boundaries import FixedSurface, HeatNodes
 
 TRANSFERS = ("hybrid", "apic", "flip", "pic")
@@ -245,7 +245,7 @@ class Heat(nn.Module):
         if velocity_gradient is not None:
             # Where matter is strained, g_p of the particle is forgotten for that of the grid.
             strain = 0.5 * (velocity_gradient + velocity_gradient.mT)
-            rate = rate + step * _norm(strain.flatten(1))
+            rate = rate + step * norm(strain.flatten(1))
         return rate.clamp(max=1)
 
     def _to_nodes(

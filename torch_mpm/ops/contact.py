@@ -1,33 +1,62 @@
-"""Contact of the grid with rigid obstacles, all of them in one op: Python face, fake kernels and autograd."""
+"""Contact of the grid with rigid obstacles, all of them in one op: Python face, fake kernels and autograd.
+
+The kernel knows the shapes of `KERNEL_SHAPES`. The obstacles of a call are rows of a table [1 or B, K, width], one for
+all scenes or one per scene, of the nodes' dtype:
+
+    friction, position [D], velocity [D], rotation [A], angular_velocity [A], direction or size [D], radius
+
+with A = 1 angle in 2-D and a vector of A = 3 in 3-D. What an obstacle does not have is zero. The corners of the
+outlines of revolved shapes follow one another in a second table [corners, 2].
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from ..boundaries import Box, Capsule, Obstacle, Plane, Sphere
+from .. import shapes
+from ..boundaries import Obstacle
 from ..errors import NUMBER_OR_TENSOR, check_like, check_real, shape_of
 from ..grid import Blocks, check_blocks
-from ..reference.obstacles import contact as reference
 from ..topology import Topology
 from .arguments import check_list, differentiate, refuse_vmap, sizes
 from .autograd import dispatch, register_autograd, save_with_topology, saved_with_topology
-from .grid_update import CONTACT_KINDS
+from .grid_update import CONTACT_KINDS, CONTACT_NAMES, sum_by_scene_of_blocks
 
 MAX_OBSTACLES = 16  # of one call, csrc/grid/obstacle.h
-SHAPES: dict[type, int] = {Plane: 0, Sphere: 1, Box: 2, Capsule: 3}
+
+
+class KernelShape(NamedTuple):
+    """How the kernel calls a shape, and the name of the shape's parameter in the column of directions and sizes."""
+
+    number: int
+    extent: str | None
+
+
+KERNEL_SHAPES: dict[type[shapes.Shape], KernelShape] = {
+    shapes.Plane: KernelShape(0, "normal"),
+    shapes.Sphere: KernelShape(1, None),
+    shapes.Box: KernelShape(2, "size"),
+    shapes.Capsule: KernelShape(3, "half_axis"),
+    shapes.Revolved: KernelShape(4, "axis"),
+    shapes.Cylinder: KernelShape(4, "axis"),
+}
 
 
 def fusible(obstacle: Any, time: float | Tensor) -> bool:
-    """Whether `contact` takes an obstacle: a built-in shape without hooks and without anything that requires grad.
+    """Whether `contact` takes an obstacle: a shape that the kernel knows, moving at constant rates, without hooks.
 
-    An `SDF`, a position as a function of time, a parameter or a time that requires grad need `Obstacle.apply`.
+    A position as a function of time, and a time that requires grad, need `Obstacle.apply`; so does any subclass with a
+    `forward` or an `apply` of its own.
     """
-    if type(obstacle) not in SHAPES or (callable(obstacle.position) and not isinstance(obstacle.position, Tensor)):
+    kind = type(obstacle)
+    if not isinstance(obstacle, Obstacle) or kind.forward is not Obstacle.forward or kind.apply is not Obstacle.apply:
+        return False
+    if type(obstacle.shape) not in KERNEL_SHAPES or obstacle.follows_path:
         return False
     if (
         obstacle._forward_hooks
@@ -36,7 +65,7 @@ def fusible(obstacle: Any, time: float | Tensor) -> bool:
         or obstacle._backward_pre_hooks
     ):
         return False
-    return not any(isinstance(value, Tensor) and value.requires_grad for value in (time, *_values(obstacle)))
+    return not (isinstance(time, Tensor) and time.requires_grad)
 
 
 def contact(blocks: Blocks, velocity: Tensor, obstacles: Sequence[Obstacle], time: float | Tensor) -> Tensor:
@@ -54,16 +83,17 @@ def contact(blocks: Blocks, velocity: Tensor, obstacles: Sequence[Obstacle], tim
     Raises:
         ValueError, TypeError: for wrong shapes, dtypes or devices.
 
-    Differentiable with respect to velocity, twice in eager mode.
+    Differentiable, twice in eager mode, with respect to velocity and, as `Obstacle.apply`, to the position, velocity,
+    rotation, angular_velocity and friction of the obstacles and the normal, half_axis and axis of their shapes.
     """
     check_blocks(blocks)
     grid = blocks.grid
     if not isinstance(velocity, Tensor) or velocity.shape != (blocks.node_count, grid.dim):
         raise ValueError(f"velocity must have shape [N, D] = {[blocks.node_count, grid.dim]}, got {shape_of(velocity)}")
     for k, obstacle in enumerate(check_list("obstacles", obstacles)):
-        if type(obstacle) not in SHAPES:
-            expected = ", ".join(shape.__name__ for shape in SHAPES)
-            raise TypeError(f"obstacles[{k}] must be one of {expected}, got {type(obstacle).__name__}")
+        if not isinstance(obstacle, Obstacle) or type(obstacle.shape) not in KERNEL_SHAPES:
+            expected = ", ".join(shape.name for shape in KERNEL_SHAPES)
+            raise TypeError(f"obstacles[{k}] must be an obstacle of one of {expected}, got {type(obstacle).__name__}")
     scene_time, number = None, 0.0
     if isinstance(time, Tensor):
         if time.dim() > 1 or time.numel() not in (1, grid.scenes):
@@ -78,8 +108,9 @@ def contact(blocks: Blocks, velocity: Tensor, obstacles: Sequence[Obstacle], tim
         rows = dispatch(
             torch.ops.torch_mpm.contact,
             _packed(velocity),
-            _table(group, velocity, grid.scenes),
-            [SHAPES[type(o)] for o in group],
+            *_tables(group, velocity, grid.scenes),
+            [KERNEL_SHAPES[type(o.shape)].number for o in group],
+            [_corners(o.shape) for o in group],
             [CONTACT_KINDS[o.kind] for o in group],
             [-1 if o.scene is None else o.scene for o in group],
             [o.start for o in group],
@@ -96,52 +127,68 @@ def _packed(velocity: Tensor) -> Tensor:
     return velocity if velocity.stride(1) == 1 else velocity.contiguous()
 
 
-# ---- the table of parameters
+# ---- the tables of parameters
 
 
 def _values(obstacle: Obstacle) -> tuple[Any, ...]:
-    """The numbers and tensors of an obstacle that go into the table."""
+    """The numbers and tensors of an obstacle that go into the tables."""
     motion = (obstacle.friction, obstacle.position, obstacle.velocity, obstacle.rotation, obstacle.angular_velocity)
-    return (*motion, *obstacle.extents().values())
+    names = (KERNEL_SHAPES[type(obstacle.shape)].extent, "radius", "outline")
+    return (*motion, *(getattr(obstacle.shape, name, None) for name in names if name))
 
 
-def _table(obstacles: Sequence[Obstacle], like: Tensor, scenes: int) -> Tensor:
-    """Parameters [1 or B, K, width] of the nodes' dtype, rows as `ObstacleRow`; kept while nothing has changed."""
+def _corners(shape: shapes.Shape) -> int:
+    return len(shape.outline) if isinstance(shape, shapes.Revolved) else 0
+
+
+def _tables(obstacles: Sequence[Obstacle], like: Tensor, scenes: int) -> tuple[Tensor, Tensor]:
+    """Parameters [1 or B, K, width] and outlines [corners, 2]; kept while nothing has changed."""
     if torch.compiler.is_compiling() or type(like) not in (Tensor, torch.nn.Parameter):
         return _build(obstacles, like, scenes)
     key: list[Any] = [like.dtype, like.device, scenes]
-    for value in (v for o in obstacles for v in (o, *_values(o))):
+    for value in (v for o in obstacles for v in (o, o.shape, *_values(o))):
+        if isinstance(value, Tensor) and value.requires_grad and torch.is_grad_enabled():
+            return _build(obstacles, like, scenes)
         key += [value, value._version if isinstance(value, Tensor) else None]
-    return obstacles[0].kept_table.get(tuple(key), lambda: _build(obstacles, like, scenes), like)
+    tables: tuple[Tensor, Tensor] = obstacles[0].kept_table.get(
+        tuple(key), lambda: _build(obstacles, like, scenes), like
+    )
+    return tables
 
 
-def _build(obstacles: Sequence[Obstacle], like: Tensor, scenes: int) -> Tensor:
+def _build(obstacles: Sequence[Obstacle], like: Tensor, scenes: int) -> tuple[Tensor, Tensor]:
     rows = [_row(o, like) for o in obstacles]
     count = max(row.shape[0] for row in rows)
     if count not in (1, scenes) or any(row.shape[0] not in (1, count) for row in rows):
         raise ValueError(f"parameters of obstacles must be given once or per scene, B = {scenes}, got {count} of them")
-    return torch.stack([row.expand(count, -1) for row in rows], 1).contiguous()
+    table = torch.stack([row.expand(count, -1) for row in rows], 1).contiguous()
+    outlines = [o.shape.parameter("outline", like, (n, 2)) for o in obstacles if (n := _corners(o.shape))]
+    return table, torch.cat(outlines) if outlines else like.new_zeros(0, 2)
 
 
 def _row(obstacle: Obstacle, like: Tensor) -> Tensor:
     """[1 or B, width]; what an obstacle does not have is zero."""
-    vector = (like.shape[1],)
+    vector, shape = (like.shape[1],), obstacle.shape
     turn = () if like.shape[1] == 2 else (3,)
-    shapes: dict[str, tuple[int, ...]] = {
+    motion: dict[str, tuple[int, ...]] = {
         "friction": (), "position": vector, "velocity": vector, "rotation": turn, "angular_velocity": turn,
     }  # fmt: skip
-    extent = next((name for name in ("normal", "size", "half_axis") if hasattr(obstacle, name)), None)
-    parts = [_part(obstacle, name, like, shape) for name, shape in shapes.items()]
-    parts += [_part(obstacle, extent, like, vector), _part(obstacle, "radius", like, ())]
+    parts = [_part(obstacle, name, like, size) for name, size in motion.items()]
+    extent = KERNEL_SHAPES[type(shape)].extent
+    if extent == "axis" and getattr(shape, "axis", None) is None:
+        parts.append(torch.eye(like.shape[1], dtype=like.dtype, device=like.device)[1:2])
+    else:
+        parts.append(_part(shape, extent, like, vector))
+    parts.append(_part(shape, "radius", like, ()))
     count = max(part.shape[0] for part in parts)
     return torch.cat([part.expand(count, -1) for part in parts], 1)
 
 
-def _part(obstacle: Obstacle, name: str | None, like: Tensor, shape: tuple[int, ...]) -> Tensor:
+def _part(owner: Obstacle | shapes.Shape, name: str | None, like: Tensor, shape: tuple[int, ...]) -> Tensor:
     """A parameter [1 or B, n]."""
-    if name is None or getattr(obstacle, name, None) is None:
+    if name is None or getattr(owner, name, None) is None:
         return like.new_zeros(1, math.prod(shape))
-    value = obstacle.parameter(name, like, shape)
+    value = owner.parameter(name, like, shape)
     return value.reshape(1 if value.dim() == len(shape) else value.shape[0], -1)
 
 
@@ -155,43 +202,108 @@ def _fake(velocity, *arguments):
 
 
 @torch.library.register_fake("torch_mpm::contact_backward")
-def _backward_fake(grad, velocity, *arguments):
+def _backward_fake(grad, wants_rows, velocity, obstacles, *arguments):
     N, D = sizes(velocity, "velocity", 2)
-    return velocity.new_empty(N, 1 + D)
+    _, count, width = sizes(obstacles, "obstacles", 3)
+    slots = N // 4**D if wants_rows else 0
+    return velocity.new_empty(N, 1 + D), velocity.new_empty(slots, count, width)
 
 
 def _setup(ctx: Any, inputs: Any, output: Any) -> None:
-    velocity, obstacles, *kinds, scene_time, time = inputs[:-3]
-    save_with_topology(ctx, (velocity, obstacles, scene_time), inputs[-3:], kinds=kinds, time=time)
+    velocity, obstacles, outline, *kinds, scene_time, time = inputs[:-3]
+    save_with_topology(ctx, (velocity, obstacles, outline, scene_time), inputs[-3:], kinds=kinds, time=time)
 
 
 def _backward(ctx, grad):
-    (velocity, obstacles, scene_time), topology = saved_with_topology(ctx)
-    rows = dispatch(
+    (velocity, obstacles, outline, scene_time), topology = saved_with_topology(ctx)
+    wants_rows = ctx.needs_input_grad[1]
+    grad_velocity, rows = dispatch(
         torch.ops.torch_mpm.contact_backward,
-        *(_packed(grad[:, 1:]), velocity, obstacles, *ctx.kinds, scene_time, ctx.time, *topology),
+        *(_packed(grad[:, 1:]), wants_rows, velocity, obstacles, outline, *ctx.kinds, scene_time, ctx.time, *topology),
     )
-    return (rows[:, 1:],) + (None,) * 11
+    rows = sum_by_scene_of_blocks(rows, Topology.unpack(*topology), obstacles.shape[0]) if wants_rows else None
+    return (grad_velocity[:, 1:], rows) + (None,) * 12
 
 
 def _backward_setup(ctx: Any, inputs: Any, output: Any) -> None:
-    grad, velocity, obstacles, *kinds, scene_time, time = inputs[:-3]
-    save_with_topology(ctx, (grad, velocity, obstacles, scene_time), inputs[-3:], kinds=kinds, time=time)
+    grad, wants_rows, velocity, obstacles, outline, *kinds, scene_time, time = inputs[:-3]
+    options = {"wants_rows": wants_rows, "kinds": kinds, "time": time}
+    save_with_topology(ctx, (grad, velocity, obstacles, outline, scene_time), inputs[-3:], **options)
 
 
-def _double_backward(ctx, grad_rows):
-    (grad, velocity, obstacles, scene_time), topology = saved_with_topology(ctx)
+def _double_backward(ctx, grad_velocity, grad_rows):
+    (grad, velocity, obstacles, outline, scene_time), topology = saved_with_topology(ctx)
     blocks = Topology.unpack(*topology)
-    shape, kind, scene, start, end = ctx.kinds
 
-    def adjoint(grad: Tensor, velocity: Tensor) -> Any:
-        def after(velocity: Tensor) -> Tensor:
-            return reference(blocks, velocity, obstacles, shape, kind, scene, start, end, scene_time, ctx.time)
+    def adjoint(grad: Tensor, velocity: Tensor, obstacles: Tensor) -> Any:
+        def after(velocity: Tensor, rows: Tensor) -> Tensor:
+            return _composed(blocks, velocity, rows, outline, ctx.kinds, scene_time, ctx.time)
 
-        return differentiate(after, [velocity], [grad])[0]
+        rows = _rows_of_slots(obstacles, blocks)
+        both = differentiate(after, [velocity, rows], [grad])
+        adjoints = [torch.zeros_like(t) if g is None else g for g, t in zip(both, (velocity, rows), strict=True)]
+        return tuple(adjoints) if ctx.wants_rows else adjoints[0]
 
-    grads = differentiate(adjoint, [grad, velocity], [grad_rows[:, 1:]])
-    return (*grads,) + (None,) * 11
+    given = [grad_velocity[:, 1:], grad_rows] if ctx.wants_rows else [grad_velocity[:, 1:]]
+    grads = differentiate(adjoint, [grad, velocity, obstacles], given)
+    return (grads[0], None, *grads[1:]) + (None,) * 12
+
+
+# ---- the same in torch operations, for second derivatives
+
+
+def _rows_of_slots(obstacles: Tensor, blocks: Topology) -> Tensor:
+    """A table [1 or B, K, width] as one of each slot [slots, K, width]."""
+    if obstacles.shape[0] == 1:
+        return obstacles.expand(blocks.block.shape[0], *obstacles.shape[1:])
+    return obstacles.index_select(0, blocks.block_scene().clamp(0, obstacles.shape[0] - 1))
+
+
+def _composed(
+    blocks: Topology,
+    velocity: Tensor,
+    rows: Tensor,
+    outline: Tensor,
+    kinds: Sequence[Any],
+    scene_time: Tensor | None,
+    time: float,
+) -> Tensor:
+    """Node velocities [N, D] by `Obstacle.forward` of obstacles with parameters of each slot [slots, K, width]."""
+    now: float | Tensor = time
+    if scene_time is not None:
+        now = scene_time[0] if len(scene_time) == 1 else scene_time[blocks.block_scene().clamp_min(0)]
+    positions, node_scene, active = blocks.node_positions(velocity.dtype), blocks.node_scene(), blocks.active_nodes()
+    slot = torch.arange(rows.shape[0], device=rows.device).repeat_interleave(blocks.grid.nodes_per_block)
+    first = 0
+    for k, (shape, corners, kind, scene, start, end) in enumerate(zip(*kinds, strict=True)):
+        parameters = _parameters(rows[:, k], velocity.shape[1])
+        form = _shape(shape, parameters.pop("extent"), parameters.pop("radius"), outline[first : first + corners])
+        obstacle = Obstacle(form, kind=CONTACT_NAMES[kind], start=start, end=end, **parameters)
+        acts = active if scene < 0 else active & (node_scene == scene)
+        velocity = torch.where(acts[:, None], obstacle.forward(velocity, positions, slot, now, 0.0), velocity)
+        first += corners
+    return velocity
+
+
+def _parameters(row: Tensor, dim: int) -> dict[str, Any]:
+    """The columns of a table [slots, width] by their names."""
+    turn = 1 if dim == 2 else 3
+    names = ("friction", "position", "velocity", "rotation", "angular_velocity", "extent", "radius")
+    values = dict(zip(names, row.split([1, dim, dim, turn, turn, dim, 1], 1), strict=True))
+    scalars = ("friction", "radius", *(("rotation", "angular_velocity") if dim == 2 else ()))
+    return {name: value[:, 0] if name in scalars else value for name, value in values.items()}
+
+
+def _shape(number: int, extent: Tensor, radius: Tensor, outline: Tensor) -> shapes.Shape:
+    if number == 0:
+        return shapes.Plane(extent)
+    if number == 1:
+        return shapes.Sphere(radius.detach())
+    if number == 2:
+        return shapes.Box(extent.detach())
+    if number == 3:
+        return shapes.Capsule(extent, radius.detach())
+    return shapes.Revolved(outline, extent)
 
 
 register_autograd("contact", _backward, _setup)

@@ -10,12 +10,13 @@ from torch import Tensor
 from ..boundaries import Face, Walls
 from ..errors import FLOATING, check_like, shape_of
 from ..grid import Blocks, check_blocks
-from ..reference import grid_update as reference
 from ..topology import Topology
 from .arguments import differentiate, refuse_vmap, sizes, split_dt
 from .autograd import dispatch, register_autograd, save_with_topology, saved_with_topology
+from .grid_update_composed import composed_grid_update
 
 CONTACT_KINDS = {"open": 0, "sticky": 1, "slip": 2, "separate": 3, "mirror": 4}  # csrc/grid/friction.h
+CONTACT_NAMES = list(CONTACT_KINDS)
 
 
 def grid_update(
@@ -114,7 +115,7 @@ def _backward(ctx, grad):
     )
     grad_gravity = grad_dt = None
     if need_gravity or need_dt:
-        change = _sum_by_scene(change, Topology.unpack(*topology), gravity.shape[0])
+        change = sum_by_scene_of_blocks(change, Topology.unpack(*topology), gravity.shape[0])
         if need_gravity:
             grad_gravity = ctx.dt * (change if scene_dt is None else scene_dt[:, None] * change)
         if need_dt:
@@ -122,12 +123,12 @@ def _backward(ctx, grad):
     return (grad_nodes if need_nodes else None, grad_gravity, grad_dt) + (None,) * 7
 
 
-def _sum_by_scene(change: Tensor, blocks: Topology, scenes: int) -> Tensor:
-    """Sum of slot values [max_blocks, D] over the slots of each scene, [B, D]."""
+def sum_by_scene_of_blocks(change: Tensor, blocks: Topology, scenes: int) -> Tensor:
+    """Sum of slot values [max_blocks, ...] over the slots of each scene, [B, ...]."""
     if scenes < 2:
         return change.sum(0, keepdim=True)[:scenes]
     scene = blocks.block_scene().clamp_min(0)
-    return change.new_zeros(scenes, change.shape[1]).index_add(0, scene, change)
+    return change.new_zeros(scenes, *change.shape[1:]).index_add(0, scene, change)
 
 
 def _backward_setup(ctx: Any, inputs: Any, output: Any) -> None:
@@ -139,15 +140,14 @@ def _backward_setup(ctx: Any, inputs: Any, output: Any) -> None:
 def _double_backward(ctx, grad_grad_nodes, grad_change):
     tensors, topology = saved_with_topology(ctx)
     blocks = Topology.unpack(*topology)
-    names = list(CONTACT_KINDS)
-    faces = [Face(names[kind], plane, friction) for kind, plane, friction in zip(*ctx.walls, strict=True)]
+    faces = [Face(CONTACT_NAMES[kind], plane, friction) for kind, plane, friction in zip(*ctx.walls, strict=True)]
 
     def adjoint(grad, nodes, gravity, scene_dt):
         def updated(nodes, change):
             mass, momentum = nodes.split([1, nodes.shape[1] - 1], 1)
             rows = torch.cat([mass, momentum + mass * change.repeat_interleave(blocks.grid.nodes_per_block, 0)], 1)
             dt = ctx.dt if scene_dt is None else ctx.dt * scene_dt
-            return reference.grid_update(blocks, rows, gravity, dt, faces)
+            return composed_grid_update(blocks, rows, gravity, dt, faces)
 
         change = nodes.new_zeros(blocks.block.shape[0], nodes.shape[1] - 1)
         both = differentiate(updated, (nodes, change), [grad])

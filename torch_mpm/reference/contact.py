@@ -1,4 +1,4 @@
-"""The contact condition in plain torch."""
+"""Contact with a surface, case by case."""
 
 from __future__ import annotations
 
@@ -6,28 +6,21 @@ import torch
 from torch import Tensor
 
 
-def contact_change(relative: Tensor, normal: Tensor, kind: str, friction: float | Tensor) -> Tensor:
-    """Change of velocity by contact with a surface: the rule of csrc/grid/friction.h. Zero for zero velocity.
+def contact_velocity(u: Tensor, normal: Tensor, kind: str, friction: float) -> Tensor:
+    """Velocity [N, D] relative to a surface after contact, from that before, u [N, D].
 
-    Args:
-        relative: velocity relative to the surface [..., D] [m/s].
-        normal: unit normal into the material [..., D]; a zero normal changes nothing, except under "sticky".
-        kind: "sticky", "slip" or "separate".
-        friction: Coulomb coefficient, broadcast to [..., 1].
-
-    Differentiable with respect to every floating tensor; gradients are finite also where nothing slides.
+    The surface gives an impulse per mass p n + f, with n its unit normal into the material [N, D]. Sticky: all that
+    stops the node. Otherwise p is what stops the normal velocity, for "separate" only where it points into the
+    surface; and f, against the tangential velocity, is as large as it may be: |f| = friction p where the node slides
+    on, less where it sticks (Coulomb).
     """
     if kind == "sticky":
-        return -relative
-    approach = -(relative * normal).sum(-1, keepdim=True)
-    pressure = approach.clamp_min(0)
-    change = (pressure if kind == "separate" else approach) * normal
-    if not isinstance(friction, Tensor) and friction == 0:
-        return change
-    tangential = relative + approach * normal
-    squared = (tangential * tangential).sum(-1, keepdim=True)
-    speed = torch.where(squared > 0, torch.where(squared > 0, squared, 1).sqrt(), 0)
-    lost = friction * pressure
-    slides = (speed > lost) & (speed > 0)
-    share = torch.where(slides, lost, 0) / torch.where(slides, speed, 1)
-    return change - torch.where(slides, share, torch.where(lost > 0, 1, 0)) * tangential
+        return torch.zeros_like(u)
+    p = -(u * normal).sum(1, keepdim=True)
+    tangential = u + p * normal
+    leaves = p[:, 0] <= 0
+    slides = ~leaves & (tangential.detach().norm(dim=1) > friction * p[:, 0])
+    after = torch.zeros_like(u)  # of the nodes that stick
+    after = after.index_put((leaves,), (u if kind == "separate" else tangential)[leaves])
+    t, p = tangential[slides], p[slides]
+    return after.index_put((slides,), t - friction * p * t / t.norm(dim=1, keepdim=True))

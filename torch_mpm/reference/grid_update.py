@@ -1,8 +1,7 @@
-"""The grid update in plain torch."""
+"""The grid update on whole lattices, one of each scene."""
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -10,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ..topology import BLOCK_WIDTH, PADDING
-from .contact import contact_change
+from .contact import contact_velocity
 
 if TYPE_CHECKING:
     from ..boundaries import Face
@@ -28,59 +27,50 @@ def grid_update(
     faces: Sequence[Face] = (),
 ) -> Tensor:
     """Node mass and velocity [N, 1 + D] from mass and momentum; see `torch_mpm.ops.grid_update` and `Walls.faces`."""
-    active = blocks.active_nodes()[:, None]
-    mass, momentum = torch.where(active, nodes, 0).split([1, nodes.shape[1] - 1], 1)
+    rows = blocks.active_nodes().nonzero()[:, 0]
+    dim, scene = nodes.shape[1] - 1, blocks.node_scene()[rows].long()
+    at = (scene, *blocks.node_indices()[rows].long().unbind(1))
+    mass, momentum = nodes[rows].split([1, dim], 1)
     if gravity is not None and dt is not None:
-        change = gravity * (dt[:, None] if isinstance(dt, Tensor) and dt.dim() == 1 else dt)
-        scene = blocks.node_scene().clamp_min(0)
-        momentum = momentum + mass * (change if change.dim() == 1 else change[scene])
-    summed, momentum = _mirror(faces, blocks, torch.cat([mass, momentum], 1)).split([1, nodes.shape[1] - 1], 1)
-    heavy = summed != 0
-    velocity = torch.where(heavy, momentum, 0) / torch.where(heavy, summed, 1)
-    velocity = _act(faces, blocks, velocity)
-    return torch.cat([mass, torch.where(heavy, velocity, 0)], 1)
-
-
-def _mirror(faces: Sequence[Face], blocks: Topology, rows: Tensor) -> Tensor:
-    """Rows of mass and momentum plus those of their images in every mirror and corner of mirrors."""
-    mirrors = [(number // 2, face.plane) for number, face in enumerate(faces) if face.kind == "mirror"]
-    result = rows
-    for count in range(1, len(mirrors) + 1):
-        for corner in itertools.combinations(mirrors, count):
-            node, near, sign = blocks.node_indices(), blocks.active_nodes(), torch.ones_like(rows[:1])
-            for axis, plane in corner:
-                twice = round(2 * ((plane - blocks.grid.lower[axis]) / blocks.grid.dx + PADDING))
-                distance = 2 * node[:, axis] - twice  # in half cells
-                near = near & (distance.abs() <= 2 * MIRROR_REACH)
-                node[:, axis] -= distance
-                sign[:, 1 + axis] *= -1
-            image = _rows_at(blocks, node)
-            near = near & (image >= 0)
-            result = result + torch.where(near[:, None], sign * rows[image.clamp_min(0)], 0)
-    return result
-
-
-def _rows_at(blocks: Topology, node: Tensor) -> Tensor:
-    """Row of the node at lattice indices [N, D] in the scene of each row, int64 [N]; -1 where there is none."""
-    per_axis = torch.tensor(blocks.grid.blocks, device=node.device)
-    inside = ((node >= 0) & (node < BLOCK_WIDTH * per_axis)).all(1) & blocks.active_nodes()
-    node = torch.where(inside[:, None], node, 0)
-    index, local = blocks.node_scene().clamp_min(0).long(), torch.zeros_like(node[:, 0])
-    for axis, count in enumerate(blocks.grid.blocks):
-        index = index * count + node[:, axis] // BLOCK_WIDTH
-        local = local * BLOCK_WIDTH + node[:, axis] % BLOCK_WIDTH
-    slot = torch.where(inside, blocks.table[index].long(), -1)
-    return torch.where(slot >= 0, slot * blocks.grid.nodes_per_block + local, -1)
-
-
-def _act(faces: Sequence[Face], blocks: Topology, velocity: Tensor) -> Tensor:
-    position = blocks.node_positions(torch.float64)
-    axes = torch.eye(velocity.shape[1], dtype=velocity.dtype, device=velocity.device)
+        t = dt.to(gravity) if isinstance(dt, Tensor) else gravity.new_tensor(dt)
+        change = gravity.expand(blocks.scenes, dim) * t.expand(blocks.scenes)[:, None]
+        momentum = momentum + mass * change[scene]
+    extent = [count * BLOCK_WIDTH for count in blocks.grid.blocks]
+    lattice = nodes.new_zeros(blocks.scenes, *extent, 1 + dim).index_put(at, torch.cat([mass, momentum], 1))
     for number, face in enumerate(faces):
-        if face.kind in ("open", "mirror"):
-            continue
-        axis, sign = number // 2, 1 - 2 * (number % 2)
-        beyond = sign * (position[:, axis : axis + 1] - face.plane) <= 1e-6 * blocks.grid.dx
-        touching = torch.where(beyond, velocity, 0)
-        velocity = velocity + contact_change(touching, sign * axes[axis], face.kind, face.friction)
-    return velocity
+        if face.kind == "mirror":
+            middle = 2 * ((face.plane - blocks.grid.lower[number // 2]) / blocks.grid.dx + PADDING)
+            lattice = lattice + _image(lattice, number // 2, round(middle))
+    summed, momentum = lattice[at].split([1, dim], 1)
+    heavy = summed[:, 0] != 0
+    velocity = momentum[heavy] / summed[heavy]
+    position = blocks.grid.dx * (blocks.node_indices()[rows][heavy].double() - PADDING)
+    position = position + torch.tensor(blocks.grid.lower, dtype=torch.float64, device=nodes.device)
+    for number, face in enumerate(faces):
+        velocity = _act(face, number, position, velocity, blocks.grid.dx)
+    result = torch.zeros_like(nodes).index_put((rows[heavy],), torch.cat([mass[heavy], velocity], 1))
+    return result.index_put((rows[~heavy],), torch.cat([mass[~heavy], torch.zeros_like(momentum[~heavy])], 1))
+
+
+def _image(lattice: Tensor, axis: int, twice: int) -> Tensor:
+    """What is behind a mirror at node twice/2 of an axis, seen in it: [B, ..., 1 + D]."""
+    count = lattice.shape[1 + axis]
+    node = torch.arange(count, device=lattice.device)
+    there = twice - node
+    seen = ((node - there).abs() <= 2 * MIRROR_REACH) & (there >= 0) & (there < count)
+    image = lattice.index_select(1 + axis, there.clamp(0, count - 1))
+    sign = lattice.new_ones(lattice.shape[-1])
+    sign[1 + axis] = -1
+    column = seen.reshape([-1 if a == axis else 1 for a in range(lattice.dim() - 2)] + [1])
+    return torch.where(column, sign * image, 0)
+
+
+def _act(face: Face, number: int, position: Tensor, velocity: Tensor, dx: float) -> Tensor:
+    """Velocities after one face."""
+    if face.kind in ("open", "mirror"):
+        return velocity
+    axis, sign = number // 2, 1 - 2 * (number % 2)
+    (beyond,) = (sign * (position[:, axis] - face.plane) <= 1e-6 * dx).nonzero(as_tuple=True)
+    normal = torch.zeros_like(velocity[beyond])
+    normal[:, axis] = sign
+    return velocity.index_put((beyond,), contact_velocity(velocity[beyond], normal, face.kind, face.friction))

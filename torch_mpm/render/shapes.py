@@ -1,14 +1,15 @@
-"""Obstacles as pictures see them: a triangle mesh (3-D) or an outline (2-D) in body coordinates, and a pose."""
+"""Rigid bodies as pictures see them: a triangle mesh (3-D) or an outline (2-D) in body coordinates, and a pose."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-Array = npt.NDArray[Any]
+from .. import surface_mesh
+from ..surface_mesh import Array, SurfaceMesh, frame_of
+
 GREY = (0.62, 0.64, 0.68)
 
 
@@ -18,7 +19,7 @@ class Shape:
 
     `vertices` [V, D] in metres, `faces` int [T, 3] (3-D triangles) or None (2-D, the vertices are a closed outline),
     `position` [D], `rotation` [D, D], `color` RGB and `opacity` in 0..1. Made by `plane`, `box`, `sphere`, `capsule`,
-    `cylinder`, `ring` and `mesh` below.
+    `cylinder` and `mesh` below.
     """
 
     vertices: Array
@@ -68,13 +69,7 @@ def rotation_matrix(rotation: npt.ArrayLike, dim: int) -> Array:
 def plane(point: npt.ArrayLike, normal: npt.ArrayLike, size: float, color: tuple[float, float, float] = GREY) -> Shape:
     """A plate of side `size` [m] around `point`, whose visible side looks along `normal`; a thick line in 2-D."""
     at, n = vector("point", point), vector("normal", normal)
-    n = n / np.linalg.norm(n)
-    if at.shape[0] == 2:
-        thick = 0.01 * size
-        flat = np.array([[-0.5 * size, -thick], [0.5 * size, -thick], [0.5 * size, 0], [-0.5 * size, 0]])
-        return Shape(flat, None, at, np.stack([np.array([n[1], -n[0]]), n], axis=1), color)
-    quad = 0.5 * size * np.array([[-1, 0, -1], [1, 0, -1], [1, 0, 1], [-1, 0, 1]], dtype=np.float64)
-    return Shape(quad, np.array([[0, 2, 1], [0, 3, 2]]), at, frame_of(n), color)
+    return _along(surface_mesh.plate(0 * at, _up(at), size), at, n / np.linalg.norm(n), color)
 
 
 def box(
@@ -86,41 +81,30 @@ def box(
     """A box with edge lengths `size` [D] in metres around `center` [D]."""
     at = vector("center", center)
     dim = at.shape[0]
-    half = 0.5 * vector("size", size, dim)
     turned = np.eye(dim) if rotation is None else rotation_matrix(rotation, dim)
-    if dim == 2:
-        return Shape(half * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]), None, at, turned, color)
-    corners = np.array([[(i & 1), (i >> 1) & 1, i >> 2] for i in range(8)]) * 2.0 - 1.0
-    quads = [(0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (2, 6, 7, 3), (0, 4, 6, 2), (1, 3, 7, 5)]
-    faces = np.array([t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))])
-    return Shape(half * corners, faces, at, turned, color)
+    vertices, faces = surface_mesh.cuboid(vector("size", size, dim))
+    return Shape(vertices, faces, at, turned, color)
 
 
 def sphere(center: npt.ArrayLike, radius: float, color: tuple[float, float, float] = GREY) -> Shape:
     """A sphere (a disc in 2-D) of `radius` [m] around `center` [D]."""
     at = vector("center", center)
-    return capsule(at, at, radius, color)
+    return _along(surface_mesh.capsule(0.0, radius, _up(at)), at, _up(at), color)
 
 
 def capsule(a: npt.ArrayLike, b: npt.ArrayLike, radius: float, color: tuple[float, float, float] = GREY) -> Shape:
     """All points within `radius` [m] of the segment from `a` to `b` ([D] each)."""
-    start, end = vector("a", a), vector("b", b)
-    length = float(np.linalg.norm(end - start))
-    angle = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 33)
-    # The cap's equator appears twice, at both ends of the straight part.
-    angle = np.concatenate([angle[:17], angle[16:]])
-    shift = np.where(np.arange(angle.size) < 17, -0.5 * length, 0.5 * length)
-    profile = np.stack([radius * np.cos(angle), radius * np.sin(angle) + shift], axis=1)
-    axis = (end - start) / length if length > 0 else np.eye(start.shape[0])[1]
-    return revolved(profile, 0.5 * (start + end), axis, color)
+    middle, axis, half = _segment(a, b)
+    return _along(surface_mesh.capsule(half, radius, _up(middle)), middle, axis, color)
 
 
 def cylinder(a: npt.ArrayLike, b: npt.ArrayLike, radius: float, color: tuple[float, float, float] = GREY) -> Shape:
     """A closed cylinder of `radius` [m] from `a` to `b` ([D] each); a rectangle in 2-D."""
-    start, end = vector("a", a), vector("b", b)
-    half = 0.5 * float(np.linalg.norm(end - start))
+    middle, axis, half = _segment(a, b)
+    if len(middle) == 2:
+        return _along(surface_mesh.cuboid(2 * np.array([radius, half])), middle, axis, color)
     profile = np.array([[0, -half], [radius, -half], [radius, half], [0, half]], dtype=np.float64)
-    return revolved(profile, 0.5 * (start + end), (end - start) / (2 * half), color)
+    return _along(surface_mesh.revolved(profile, _up(middle)), middle, axis, color)
 
 
 def mesh(
@@ -143,36 +127,21 @@ def mesh(
     return Shape(v, f, at, turned, color)
 
 
-def frame_of(axis: Array) -> Array:
-    """A rotation [3, 3] that takes the y axis to `axis`."""
-    helper = np.eye(3)[int(np.argmin(np.abs(axis)))]
-    u = np.cross(axis, helper)
-    u /= np.linalg.norm(u)
-    return np.stack([u, axis, np.cross(u, axis)], axis=1)
+def _up(like: Array) -> Array:
+    """The y axis."""
+    return np.eye(len(like))[1]
 
 
-def revolved(profile: Array, center: Array, axis: Array, color: tuple[float, float, float]) -> Shape:
-    """The profile (radius, height) [K, 2] turned around `axis`; mirrored into an outline in 2-D."""
-    if center.shape[0] == 2:
-        outline = np.concatenate([profile, profile[::-1] * [-1, 1]])
-        return Shape(outline, None, center, np.stack([np.array([axis[1], -axis[0]]), axis], axis=1), color)
-    turns, rings = 64, len(profile)
-    phi = 2 * np.pi * np.arange(turns) / turns
-    radius, height = profile[:, 0][:, None], profile[:, 1][:, None]
-    v = np.stack([radius * np.cos(phi), height + 0 * phi, radius * np.sin(phi)], axis=-1).reshape(-1, 3)
-    i, j = np.meshgrid(np.arange(rings - 1), np.arange(turns), indexing="ij")
-    k = (j + 1) % turns
-    a, b, c, d = i * turns + j, i * turns + k, (i + 1) * turns + k, (i + 1) * turns + j
-    faces = np.concatenate([np.stack([a, c, b], -1).reshape(-1, 3), np.stack([a, d, c], -1).reshape(-1, 3)])
-    return Shape(v, faces, center, frame_of(axis), color)
+def _along(piece: SurfaceMesh, center: Array, axis: Array, color: tuple[float, float, float]) -> Shape:
+    """A body made along the y axis, turned to the unit vector `axis`."""
+    return Shape(piece.vertices, piece.faces, center, frame_of(axis), color)
 
 
-def ring(outline: Array, center: Array, axis: Array, color: tuple[float, float, float] = GREY) -> list[Shape]:
-    """The closed polygon `outline` (radius, height) [K, 2] turned around `axis`; in 2-D itself and its mirror image."""
-    if center.shape[0] == 3:
-        return [revolved(np.concatenate([outline, outline[:1]]), center, axis, color)]
-    frame = np.stack([np.array([axis[1], -axis[0]]), axis], axis=1)
-    return [Shape(outline * [side, 1.0], None, center, frame, color) for side in (1.0, -1.0)]
+def _segment(a: npt.ArrayLike, b: npt.ArrayLike) -> tuple[Array, Array, float]:
+    """Middle, direction (y where there is none) and half length of a segment."""
+    start, end = vector("a", a), vector("b", b)
+    length = float(np.linalg.norm(end - start))
+    return 0.5 * (start + end), (end - start) / length if length > 0 else _up(start), 0.5 * length
 
 
 @dataclass(frozen=True)

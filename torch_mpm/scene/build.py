@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -19,6 +18,7 @@ from ..state import State
 from ..step import Step
 from . import check, heat, schema
 from .explain import SceneError
+from .places import obstacle, region
 
 GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
 
@@ -113,7 +113,7 @@ def build(scene: Any, device: torch.device) -> Built:
             material.append(torch.full((len(points),), mixture.number(index, body.material), dtype=torch.int32))
         for key, emitter in entry.keyed("emitter"):
             nozzles.append(_named(key, _nozzle, scene, entry, emitter, index, mixture, dtype, device))
-        obstacles += [(o, check.obstacle(o, index if len(entries) > 1 else None)) for o in entry.obstacle]
+        obstacles += [(o, obstacle(o, index if len(entries) > 1 else None)) for o in entry.obstacle]
     walls = None if words.walls is None else boundaries.Walls(words.walls, friction=words.friction)
     dim = len(words.lower)
     empty = seed.Points(
@@ -291,7 +291,7 @@ def _complete(state: State, mixture: _Mixture, material: Tensor, single: bool) -
 # ---- bodies
 
 
-Placed = list[tuple[str, Any, seed.Points, "seed.Shape | None"]]
+Placed = list[tuple[str, Any, seed.Points, "seed.Region | None"]]
 """(key, words, particles, region) of the bodies of a scene."""
 
 
@@ -322,23 +322,16 @@ def _is_good(key: str, problems: list[str]) -> bool:
     return not any(problem.startswith((f"{key}.", f"{key}:", f"{key} ")) for problem in problems)
 
 
-def _seeded(scene: Any, body: Any, number: int) -> tuple[seed.Points, seed.Shape | None]:
+def _seeded(scene: Any, body: Any, number: int) -> tuple[seed.Points, seed.Region | None]:
     if isinstance(body, schema.PointsBody):
         points = seed.file(scene.folder / body.file, body.volume, dtype=torch.float64)
         if points.x.shape[1] != scene.dim:
             raise ValueError(f"{body.file} has points in {points.x.shape[1]}-D, and the scene is in {scene.dim}-D")
         return points, None
-    shape = _shape(body, scene.folder)
+    shape = region(body, scene.folder)
+    assert shape is not None
     options = {"method": body.seeding, "seed": number, "dtype": torch.float64}
     return seed.fill(shape, scene.grid.dx, body.per_cell, **options), shape
-
-
-def _shape(body: Any, folder: Path) -> seed.Shape:
-    if isinstance(body, schema.MeshBody):
-        return seed.Mesh(folder / body.file, body.scale, body.offset)
-    shape = check.shape_of(body)
-    assert shape is not None
-    return shape
 
 
 def _matter(
@@ -438,11 +431,9 @@ def _overlaps(placed: Placed, obstacles: Sequence[tuple[str, Any]]) -> Iterator[
     for path, words in obstacles:
         if words.start > 0:
             continue
-        solid = check.obstacle(words, None)
-        pose = solid.pose(0.0)
+        solid = obstacle(words, None)
         for key, _, points, _ in placed:
-            distance, _ = solid.surface((points.x - pose.centre) @ pose.rotation, None)
-            inside = int((distance < 0).sum())
+            inside = int((solid.signed_distance(points.x, None, 0.0) < 0).sum())
             if inside:
                 where = f"{path}{check.called(words)}"
                 yield f"{key}: {inside} of its particles are inside {where}; move one of them"

@@ -14,8 +14,10 @@ import torch
 from torch import Tensor
 
 from .. import boundaries, memory, seed
+from ..errors import check_file
 from ..grid import Grid
 from . import heat, schema
+from .places import obstacle, region
 
 PARTICLE_BYTES = 400
 """Memory that a particle takes at least while a scene is built and simulated."""
@@ -50,7 +52,7 @@ def file_problems(entry: Any, folder: Path) -> Iterator[str]:
     for key, body in entry.keyed("body"):
         if isinstance(body, (schema.MeshBody, schema.PointsBody)):
             try:
-                seed.check_file(folder / body.file, body.shape)
+                check_file(folder / body.file, body.shape)
             except OSError as error:
                 yield f"{key}.file: {error}"
 
@@ -141,7 +143,7 @@ def _item_problems(key: str, item: Any, scene: Any) -> list[str]:
         if isinstance(item, schema.Obstacle):
             obstacle(item, None).pose(0.0)
             return []
-        shape = shape_of(item)
+        shape = region(item, None)
         return [] if shape is None else list(bounds_problems(key, item, shape, scene.grid))
     except (ValueError, TypeError) as error:
         return [f"{key}{called(item)}: {error}"]
@@ -164,45 +166,7 @@ def _dimension_problems(key: str, item: Any, dim: int) -> Iterator[str]:
 # ---- places
 
 
-def shape_of(body: Any) -> seed.Shape | None:
-    """The region of a body that needs no file; None for one that does."""
-    if isinstance(body, schema.BoxBody):
-        return seed.Box(body.lower, body.upper)
-    if isinstance(body, schema.SphereBody):
-        return seed.Sphere(body.center, body.radius)
-    if isinstance(body, schema.CylinderBody):
-        return seed.Cylinder(body.a, body.b, body.radius)
-    if isinstance(body, schema.CapsuleBody):
-        return seed.Capsule(body.a, body.b, body.radius)
-    return None
-
-
-def obstacle(words: Any, scene: int | None) -> boundaries.Obstacle:
-    """The boundary of the step that an obstacle of a scene names."""
-    motion = {
-        "kind": words.contact,
-        "friction": words.friction,
-        "velocity": words.velocity,
-        "rotation": words.rotation,
-        "angular_velocity": words.spin,
-        "start": words.start,
-        "end": math.inf if words.end is None else words.end,
-        "scene": scene,
-    }
-    if isinstance(words, schema.PlaneObstacle):
-        return boundaries.Plane(words.center, words.normal, **motion)
-    if isinstance(words, schema.BoxObstacle):
-        return boundaries.Box(words.center, words.size, **motion)
-    if isinstance(words, schema.SphereObstacle):
-        return boundaries.Sphere(words.center, words.radius, **motion)
-    if isinstance(words, schema.RevolvedObstacle):
-        return boundaries.Revolved(words.center, words.outline, words.axis, **motion)
-    center = [0.5 * (p + q) for p, q in zip(words.a, words.b, strict=True)]
-    half = [0.5 * (q - p) for p, q in zip(words.a, words.b, strict=True)]
-    return boundaries.Capsule(center, half, words.radius, **motion)
-
-
-def bounds_problems(key: str, item: Any, shape: seed.Shape, grid: schema.Grid) -> Iterator[str]:
+def bounds_problems(key: str, item: Any, shape: seed.Region, grid: schema.Grid) -> Iterator[str]:
     """A region that reaches out of the domain by more than its outermost particles keep away from its surface."""
     slack = 0.5 * _spacing(item, grid)
     if not inside(grid, shape.lower + slack) or not inside(grid, shape.upper - slack):
@@ -255,7 +219,7 @@ def _size_problems(scene: Any, entries: Sequence[Any]) -> Iterator[str]:
     counts: dict[str, float] = {}
     for entry in entries:
         for key, body in entry.keyed("body"):
-            shape = shape_of(body)
+            shape = region(body, None)
             if shape is not None:
                 counts[f"{entry.path}|{key}"] = _filling(shape.volume, len(shape.lower), _spacing(body, scene.grid))
         for key, words in entry.keyed("emitter") if scene.duration is not None else ():

@@ -12,8 +12,8 @@ import numpy as np
 
 from ..data.trajectory import Array, Trajectory
 from . import check, schema
-from .check import obstacle
 from .explain import SceneError
+from .places import obstacle
 from .run import FIELD_SHAPES
 from .scene import Scene
 

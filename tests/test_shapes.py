@@ -1,0 +1,151 @@
+"""Shapes: distance, normal, volume, bounds and mesh of one against each other, and against brute force."""
+
+import textwrap
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+import torch_mpm as mpm
+from torch_mpm import shapes
+from torch_mpm.boundaries import Obstacle
+from torch_mpm.seed import Region
+
+VASE = ((0.1, -0.5), (0.6, -0.4), (0.3, 0.1), (0.7, 0.5), (0.15, 0.45))
+REACH = 1.3
+
+
+def bounded(dim: int) -> list[shapes.Shape]:
+    """One of every shape that has a volume."""
+    axis = (0.3, 0.8, -0.2)[:dim]
+    made = [
+        shapes.Sphere(0.6),
+        shapes.Box((0.9, 0.5, 1.2)[:dim]),
+        shapes.Capsule(axis, 0.3),
+        shapes.Revolved(VASE, axis),
+        shapes.Revolved(VASE),
+    ]
+    return made + ([shapes.Cylinder(axis, 0.4)] if dim == 3 else [])
+
+
+def sample(dim: int, count: int) -> Tensor:
+    generator = torch.Generator().manual_seed(7)
+    return REACH * (2 * torch.rand(count, dim, generator=generator, dtype=torch.float64) - 1)
+
+
+def on_surface(pieces: list, count: int) -> Tensor:
+    """At least `count` points of each piece of a surface."""
+    points = []
+    for vertices, faces in pieces:
+        corners = vertices[faces] if faces is not None else np.stack([vertices, np.roll(vertices, -1, 0)], 1)
+        rng = np.random.default_rng(1)
+        weights = rng.dirichlet(np.ones(corners.shape[1]), (-(-count // len(corners)), len(corners)))
+        points.append(np.einsum("ctk,tkd->ctd", weights, corners).reshape(-1, vertices.shape[1]))
+    return torch.from_numpy(np.concatenate(points))
+
+
+def test_volume_is_the_share_of_points_inside(dim):
+    x = sample(dim, 200_000)
+    for shape in bounded(dim):
+        share = float(shape.contains(x).double().mean())
+        volume = (2 * REACH) ** dim
+        error = 4 * (share * (1 - share) / len(x)) ** 0.5 * volume
+        assert abs(share * volume - shape.volume(dim)) < error, shape.name
+
+
+def test_bounds_are_the_smallest_box(dim):
+    for shape in bounded(dim):
+        lower, upper = shape.bounds(dim)
+        points = on_surface(shape.mesh(np.full(dim, -1.0), np.full(dim, 1.0)), 1000)
+        vertices = np.concatenate([piece.vertices for piece in shape.mesh(np.full(dim, -1.0), np.full(dim, 1.0))])
+        assert ((points >= lower - 1e-12) & (points <= upper + 1e-12)).all(), shape.name
+        # Round bodies are drawn by 64 flat sides.
+        np.testing.assert_allclose(vertices.min(0), lower, atol=2e-3)
+        np.testing.assert_allclose(vertices.max(0), upper, atol=2e-3)
+    assert shapes.Plane((0.0, 1.0, 0.0)[:dim]).volume(dim) == np.inf
+
+
+def test_distance_is_that_to_the_surface(dim):
+    """Away from the surface too: to the nearest of many points of the mesh."""
+    x = sample(dim, 300)
+    for shape in bounded(dim):
+        spread = on_surface(shape.mesh(np.full(dim, -1.0), np.full(dim, 1.0)), 2000 if dim == 2 else 12_000)
+        distance, _ = shape.surface(x)
+        nearest = torch.cdist(x, spread).amin(1)
+        assert (nearest > distance.abs() - 5e-3).all() and (nearest < distance.abs() + 0.12).all(), shape.name
+        assert torch.equal(distance <= 0, shape.contains(x))
+
+
+def test_normal_is_the_gradient_of_the_distance_inside(dim):
+    x = sample(dim, 2000).requires_grad_()
+    for shape in [*bounded(dim), shapes.Plane((0.3, -1.0, 0.2)[:dim])]:
+        distance, normal = shape.surface(x)
+        (gradient,) = torch.autograd.grad(distance.sum(), x)
+        inside = distance < 0
+        agree = (normal - gradient).norm(dim=1)[inside] < 1e-10
+        corner = 0.85 if shape.name == "revolved" else 1.0  # from a reentrant corner the normal is that of an edge
+        assert agree.double().mean() >= corner, shape.name
+        assert inside.sum() > 30
+
+
+def test_parameters_of_each_scene(dim):
+    radius = torch.tensor([0.2, 0.5], dtype=torch.float64)
+    x, scene = sample(dim, 50), torch.arange(50) % 2
+    both, _ = shapes.Sphere(radius).surface(x, scene)
+    for b in range(2):
+        alone = shapes.Sphere(float(radius[b]))
+        torch.testing.assert_close(both[scene == b], alone.surface(x)[0][scene == b], rtol=0, atol=1e-15)
+        assert shapes.Sphere(radius).volume(dim, b) == alone.volume(dim)
+        assert torch.equal(shapes.Sphere(radius).bounds(dim, b)[1], alone.bounds(dim)[1])
+
+
+def test_a_mesh_is_the_body_that_it_bounds():
+    trimesh = pytest.importorskip("trimesh")
+    mesh = shapes.Mesh(trimesh.creation.box((0.9, 0.5, 1.2)))
+    box = shapes.Box((0.9, 0.5, 1.2))
+    x = sample(3, 500).requires_grad_()
+    (distance, normal), (expected, _) = mesh.surface(x), box.surface(x)
+    torch.testing.assert_close(distance, expected, rtol=0, atol=1e-12)
+    (gradient,) = torch.autograd.grad(expected.sum(), x)
+    torch.testing.assert_close(normal, gradient, rtol=0, atol=1e-9)
+    assert mesh.volume(3) == pytest.approx(box.volume(3), rel=1e-12)
+    velocity = torch.ones_like(x)
+    after = [Obstacle(s, (0.1, 0.0, 0.0), "slip").apply(velocity, x.detach(), None, 0.0, 0.1) for s in (mesh, box)]
+    torch.testing.assert_close(after[0], after[1], rtol=0, atol=1e-9)
+
+
+def test_any_shape_is_filled():
+    vase = Region(shapes.Revolved(VASE, (0.0, 0.0, 1.0)), (1.0, 2.0, 3.0))
+    points = mpm.seed.fill(vase, 0.1, dtype=torch.float64)
+    assert float(points.volume.sum()) == pytest.approx(vase.shape.volume(3), rel=1e-12)
+    assert len(points) * 0.1**3 / 8 == pytest.approx(vase.shape.volume(3), rel=0.02)
+    assert vase.shape.contains(points.x - vase.position).all()
+    with pytest.raises(NotImplementedError, match="the bounds of a sdf are not known"):
+        Region(shapes.SDF(lambda x: x.norm(dim=1) - 1), (0.0, 0.0))
+
+
+def test_the_shape_of_the_docstring():
+    """It acts as an obstacle, and its distance is that to a ring."""
+    text = shapes.__doc__.split("\n\n")[2]
+    namespace = {"torch": torch, "Shape": shapes.Shape, "norm": mpm.vectors.norm, "unit": mpm.vectors.unit}
+    exec(textwrap.dedent(text), namespace)
+    torus = namespace["Torus"](0.6, 0.2)
+    x = sample(3, 1000).requires_grad_()
+    distance, normal = torus.surface(x)
+    angle = torch.linspace(0, 2 * torch.pi, 4001, dtype=torch.float64)
+    ring = 0.6 * torch.stack([angle.cos(), 0 * angle, angle.sin()], 1)
+    torch.testing.assert_close(distance, torch.cdist(x, ring).amin(1) - 0.2, rtol=0, atol=1e-5)
+    (gradient,) = torch.autograd.grad(distance.sum(), x)
+    torch.testing.assert_close(normal, gradient, rtol=0, atol=1e-10)
+    stopped = Obstacle(torus, (0.0, 0.0, 0.0), "sticky").apply(torch.ones_like(x), x.detach(), None, 0.0, 0.1) == 0
+    assert torch.equal(stopped.all(1), distance <= 0)
+
+
+def test_messages():
+    with pytest.raises(TypeError, match=r"shape must be a shape of torch_mpm\.shapes, got float"):
+        Obstacle(0.3, (0.0, 0.0))
+    with pytest.raises(ValueError, match="a cylinder needs three dimensions"):
+        shapes.Cylinder((0.0, 1.0), 0.1)
+    with pytest.raises(ValueError, match="radius must be positive, got 0"):
+        shapes.Cylinder((0.0, 1.0, 0.0), 0.0)

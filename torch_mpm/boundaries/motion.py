@@ -1,0 +1,154 @@
+"""Rigid motion: where a body is at a time, and how fast its matter moves."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from ..per_scene import SceneParameters, Value, finite, floats, per_node
+from ..vectors import norm, transform
+
+Path = Callable[[Tensor], Tensor]
+"""A position as a function of time, [] or [B] to [D] or [B, D]."""
+
+
+class Pose(NamedTuple):
+    """Where a body is: world = centre + rotation @ body."""
+
+    centre: Tensor  # [D] or [B, D]
+    rotation: Tensor  # [D, D] or [B, D, D]
+
+
+class RigidMotion(SceneParameters):
+    """A body that moves and turns at constant rates from time `start` on, or along a path.
+
+    Args:
+        position: of its centre at time `start` [m]: D numbers, a tensor [D] or [B, D], or a function of the time, a
+            tensor [] or [B], that returns such a tensor.
+        velocity: of its centre [m/s]: D numbers, or a tensor [D] or [B, D]; None where position is a function.
+        rotation: orientation at time `start` [rad]: an angle (2-D) or a rotation vector (3-D), about the centre.
+        angular_velocity: [rad/s], in the same forms.
+        start: [s]
+    """
+
+    def __init__(
+        self,
+        position: Value | Path,
+        velocity: Value | None,
+        rotation: Value | None,
+        angular_velocity: Value | None,
+        start: float,
+    ) -> None:
+        if position is None:
+            raise TypeError("position must be numbers, a tensor or a function of time, got None")
+        if callable(position) and velocity is not None:
+            raise ValueError("velocity must be None where position is a function of time: it is its derivative")
+        self.position = position if callable(position) else finite("position", position)
+        self.velocity = finite("velocity", velocity)
+        self.rotation = finite("rotation", rotation)
+        self.angular_velocity = finite("angular_velocity", angular_velocity)
+        self.start = float(start)
+
+    @property
+    def follows_path(self) -> bool:
+        """Whether the position is a function of time."""
+        return not isinstance(self.position, Tensor) and callable(self.position)
+
+    @property
+    def moves(self) -> bool:
+        """Whether its surface ever has a velocity."""
+        return self.follows_path or self.velocity is not None or self.angular_velocity is not None
+
+    def pose(self, time: float | Tensor, like: Tensor | None = None) -> Pose:
+        """Centre and rotation at a time [s], a number or a tensor [] or [B]; with the dtype and device of `like`."""
+        like = torch.empty(0, dtype=torch.float64, device="cpu") if like is None else like
+        centre = self.centre_at(time, like)
+        dim = centre.shape[-1]
+        rotation = self.rotation_at(time, like, dim)
+        return Pose(centre, torch.eye(dim, dtype=like.dtype, device=like.device) if rotation is None else rotation)
+
+    def centre_at(self, time: float | Tensor, like: Tensor) -> Tensor:
+        """[D] or [B, D]."""
+        if self.follows_path:
+            return self._path(time, like)[0]
+        position = self.parameter("position", like, (_length(self.position),))
+        if self.velocity is None:
+            return position
+        return position + self.parameter("velocity", like, position.shape[-1:]) * _column(self._elapsed(time, like), 1)
+
+    def rotation_at(self, time: float | Tensor, like: Tensor, dim: int) -> Tensor | None:
+        """[D, D] or [B, D, D]; None where the body never turns."""
+        shape = () if dim == 2 else (3,)
+        rotation = None
+        if self.rotation is not None:
+            rotation = rotation_matrix(self.parameter("rotation", like, shape), dim)
+        if self.angular_velocity is not None:
+            rate = self.parameter("angular_velocity", like, shape)
+            turn = rotation_matrix(rate * _column(self._elapsed(time, like), len(shape)), dim)
+            rotation = turn if rotation is None else turn @ rotation
+        return rotation
+
+    def velocity_at(self, arm: Tensor, scene: Tensor | None, time: float | Tensor) -> Tensor | None:
+        """Velocity of the body's matter [N, D] at points `arm` [N, D] away from the centre; None at rest."""
+        result = None
+        if self.follows_path:
+            result = per_node(self._path(time, arm)[1], 1, scene)
+        elif self.velocity is not None:
+            result = self.at_nodes("velocity", arm, arm.shape[1:], scene)
+        if self.angular_velocity is None:
+            return result
+        if arm.shape[1] == 2:
+            rate = self.at_nodes("angular_velocity", arm, (), scene)[..., None]
+            swirl = rate * torch.stack([-arm[:, 1], arm[:, 0]], 1)
+        else:
+            rate = self.at_nodes("angular_velocity", arm, (3,), scene)
+            swirl = torch.linalg.cross(rate.expand_as(arm), arm)
+        return swirl if result is None else result + swirl
+
+    def _path(self, time: float | Tensor, like: Tensor) -> tuple[Tensor, Tensor]:
+        """Centre and its velocity where the position is a function of time."""
+        assert callable(self.position)
+        if not isinstance(time, Tensor):
+            time = torch.full((), time, dtype=like.dtype, device=like.device)
+        centre, velocity, *_ = torch.func.jvp(self.position, (time,), (torch.ones_like(time),))
+        return centre.to(like.dtype), velocity.to(like.dtype)
+
+    def _elapsed(self, time: float | Tensor, like: Tensor) -> float | Tensor:
+        """Time since `start`, [] or [B]."""
+        return (time - self.start).to(like.dtype) if isinstance(time, Tensor) else time - self.start
+
+
+def to_body(rotation: Tensor | None, arm: Tensor) -> Tensor:
+    """Vectors [N, D] of the world in coordinates of a body with a rotation [D, D] or [N, D, D]; None for no turn."""
+    return arm if rotation is None else transform(rotation.mT, arm)
+
+
+def rotation_matrix(angle: Tensor, dim: int) -> Tensor:
+    """Rotation by an angle [...] (2-D) or a rotation vector [..., 3] (3-D) [rad], as matrices [..., D, D].
+
+    3-D by the formula of Rodrigues; twice differentiable, also at the zero vector.
+    """
+    if dim == 2:
+        c, s = angle.cos(), angle.sin()
+        return torch.stack([torch.stack([c, -s], -1), torch.stack([s, c], -1)], -2)
+    half = 0.5 * norm(angle)[..., None, None]
+    x, y, z = angle.unbind(-1)
+    zero = torch.zeros_like(x)
+    rows = [torch.stack(row, -1) for row in ((zero, -z, y), (z, zero, -x), (-y, x, zero))]
+    cross = torch.stack(rows, -2)
+    turned = torch.where(half > 0, half, 1)
+    s = torch.where(half > 0, turned.sin() / turned, 1)
+    first, second = s * half.cos(), 0.5 * s * s
+    return torch.eye(3, dtype=angle.dtype, device=angle.device) + first * cross + second * (cross @ cross)
+
+
+def _column(time: float | Tensor, rank: int) -> float | Tensor:
+    """Times [] or [B] as factors of values [...] or [B, ...] of `rank` dimensions."""
+    return time.reshape(time.shape + (1,) * rank) if isinstance(time, Tensor) and time.dim() else time
+
+
+def _length(value: Any) -> int:
+    return int(value.shape[-1]) if isinstance(value, Tensor) and value.dim() else len(floats("position", value))

@@ -1,0 +1,72 @@
+"""The grid update composed of torch operations, for its second derivatives."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from ..boundaries.contact import contact_change
+from ..topology import PADDING, Topology
+
+if TYPE_CHECKING:
+    from ..boundaries import Face
+
+MIRROR_REACH = 2
+"""Nodes on both sides of a mirror that have images (csrc/grid/grid_update.h)."""
+
+
+def composed_grid_update(
+    blocks: Topology,
+    nodes: Tensor,
+    gravity: Tensor | None = None,
+    dt: float | Tensor | None = None,
+    faces: Sequence[Face] = (),
+) -> Tensor:
+    """Node mass and velocity [N, 1 + D] from mass and momentum; see `grid_update` and `Walls.faces`."""
+    active = blocks.active_nodes()[:, None]
+    mass, momentum = torch.where(active, nodes, 0).split([1, nodes.shape[1] - 1], 1)
+    if gravity is not None and dt is not None:
+        change = gravity * (dt[:, None] if isinstance(dt, Tensor) and dt.dim() == 1 else dt)
+        scene = blocks.node_scene().clamp_min(0)
+        momentum = momentum + mass * (change if change.dim() == 1 else change[scene])
+    summed, momentum = _mirror(faces, blocks, torch.cat([mass, momentum], 1)).split([1, nodes.shape[1] - 1], 1)
+    heavy = summed != 0
+    velocity = torch.where(heavy, momentum, 0) / torch.where(heavy, summed, 1)
+    velocity = _act(faces, blocks, velocity)
+    return torch.cat([mass, torch.where(heavy, velocity, 0)], 1)
+
+
+def _mirror(faces: Sequence[Face], blocks: Topology, rows: Tensor) -> Tensor:
+    """Rows of mass and momentum plus those of their images in every mirror and corner of mirrors."""
+    mirrors = [(number // 2, face.plane) for number, face in enumerate(faces) if face.kind == "mirror"]
+    result = rows
+    for count in range(1, len(mirrors) + 1):
+        for corner in itertools.combinations(mirrors, count):
+            node, near, sign = blocks.node_indices(), blocks.active_nodes(), torch.ones_like(rows[:1])
+            for axis, plane in corner:
+                twice = round(2 * ((plane - blocks.grid.lower[axis]) / blocks.grid.dx + PADDING))
+                distance = 2 * node[:, axis] - twice  # in half cells
+                near = near & (distance.abs() <= 2 * MIRROR_REACH)
+                node[:, axis] -= distance
+                sign[:, 1 + axis] *= -1
+            image = blocks.rows_at(node, blocks.node_scene().clamp_min(0))
+            near = near & (image >= 0)
+            result = result + torch.where(near[:, None], sign * rows[image.clamp_min(0)], 0)
+    return result
+
+
+def _act(faces: Sequence[Face], blocks: Topology, velocity: Tensor) -> Tensor:
+    position = blocks.node_positions(torch.float64)
+    axes = torch.eye(velocity.shape[1], dtype=velocity.dtype, device=velocity.device)
+    for number, face in enumerate(faces):
+        if face.kind in ("open", "mirror"):
+            continue
+        axis, sign = number // 2, 1 - 2 * (number % 2)
+        beyond = sign * (position[:, axis : axis + 1] - face.plane) <= 1e-6 * blocks.grid.dx
+        touching = torch.where(beyond, velocity, 0)
+        velocity = velocity + contact_change(touching, sign * axes[axis], face.kind, face.friction)
+    return velocity

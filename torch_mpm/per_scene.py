@@ -1,0 +1,117 @@
+"""Parameters of shapes and obstacles: numbers or tensors, one for all scenes of a batch or one per scene."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from .capture import GraphCache
+from .errors import check_number, shape_of
+from .parameters import TensorModule
+
+Value = float | Sequence[float] | Tensor
+
+
+class SceneParameters(TensorModule):
+    """A module whose parameters are numbers or tensors, one for all scenes or one per scene."""
+
+    _constants: dict[tuple[str, torch.device, torch.dtype], GraphCache]
+
+    def __new__(cls, *arguments: Any, **named: Any) -> Any:
+        module = super().__new__(cls, *arguments, **named)
+        module._constants = {}
+        return module
+
+    def parameter(self, name: str, like: Tensor, shape: tuple[int, ...]) -> Tensor:
+        """A parameter as a tensor of `shape` or [B, *shape], with the dtype and device of `like`.
+
+        Raises:
+            ValueError: for another shape, or a tensor on another device.
+        """
+        value = getattr(self, name)
+        if not isinstance(value, Tensor):
+            value = self._constant(name, value, like)
+        per_scene = value.dim() == len(shape) + 1 and value.shape[0] > 0
+        if not (per_scene or value.dim() == len(shape)) or tuple(value.shape)[value.dim() - len(shape) :] != shape:
+            alternatives = f"{list(shape)} or {['B', *shape]}".replace("'", "")
+            raise ValueError(f"{name} must have shape {alternatives}, got {shape_of(value)}")
+        if value.device != like.device:
+            raise ValueError(f"{name} must be on the device of the nodes, {like.device}, got {value.device}")
+        return value.to(like.dtype)
+
+    def at_nodes(self, name: str, like: Tensor, shape: tuple[int, ...], scene: Tensor | None) -> Tensor:
+        """A parameter as a tensor of `shape`, or one per node [N, *shape] where it differs from scene to scene."""
+        return per_node(self.parameter(name, like, shape), len(shape), scene)
+
+    def of_scene(self, name: str, rank: int, scene: int) -> Tensor:
+        """A parameter of `rank` dimensions of one scene, float64 on the CPU."""
+        value = getattr(self, name)
+        if not isinstance(value, Tensor):
+            return torch.tensor(value, dtype=torch.float64, device="cpu")
+        value = value.detach().to("cpu", torch.float64)
+        return value if value.dim() == rank else value[scene if len(value) > 1 else 0]
+
+    def _constant(self, name: str, value: Any, like: Tensor) -> Tensor:
+        """Numbers as a tensor; copied to a device once, so that later steps do not wait and can be captured."""
+        if torch.compiler.is_compiling() or type(like) not in (Tensor, torch.nn.Parameter):
+            return torch.tensor(value, dtype=like.dtype, device=like.device)
+        kept = self._constants.setdefault((name, like.device, like.dtype), GraphCache())
+        result: Tensor = kept.get((value,), lambda: torch.tensor(value, dtype=like.dtype, device=like.device), like)
+        return result
+
+
+def per_node(value: Tensor, rank: int, scene: Tensor | None) -> Tensor:
+    """A value of `rank` dimensions as it is, or one per scene as one per node."""
+    if value.dim() == rank:
+        return value
+    if scene is None or value.shape[0] == 1:
+        return value[0]
+    return value.index_select(0, scene.clamp_min(0))
+
+
+# ---- checks of what is given; tensors are kept as they are, and their values are not read
+
+
+def floats(name: str, value: Any) -> tuple[float, ...]:
+    """A number or a sequence of them."""
+    values = value if hasattr(value, "__len__") and not isinstance(value, (str, type)) else (value,)
+    return tuple(float(check_number(name, a, "a number", lambda v: True)) for a in values)
+
+
+def finite(name: str, value: Any) -> Any:
+    """Numbers checked and made immutable; None as it is."""
+    if value is None or isinstance(value, Tensor):
+        return value
+    numbers = floats(name, value)
+    if not all(math.isfinite(a) for a in numbers):
+        raise ValueError(f"{name} must be finite, got {value}")
+    return numbers if hasattr(value, "__len__") else numbers[0]
+
+
+def constant(name: str, value: Any) -> Any:
+    """Neither None nor a function."""
+    if value is None or callable(value):
+        raise TypeError(f"{name} must be numbers or a tensor, got {shape_of(value)}")
+    return finite(name, value)
+
+
+def direction(name: str, value: Any) -> Any:
+    """Numbers of which not all are zero."""
+    if not isinstance(constant(name, value), Tensor) and not any(floats(name, value)):
+        raise ValueError(f"{name} must not be zero, got {value}")
+    return finite(name, value)
+
+
+def extent(name: str, value: Any) -> Any:
+    """Lengths, not negative and without a gradient."""
+    value = constant(name, value)
+    if isinstance(value, Tensor):
+        if value.requires_grad:
+            raise ValueError(f"{name} must not require grad: which nodes are inside is not differentiable")
+    elif min(floats(name, value), default=-1) < 0:
+        raise ValueError(f"{name} must be >= 0, got {value}")
+    return value

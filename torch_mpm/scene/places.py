@@ -1,0 +1,58 @@
+"""From the words of a scene to the regions that bodies fill, and to obstacles."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+from .. import boundaries, seed, shapes
+from ..boundaries import Obstacle
+from ..shapes import Shape
+from . import schema
+
+
+def region(body: schema.Body, folder: Path | None) -> seed.Region | None:
+    """The region of a body; None for points, and without a folder for what is in a file."""
+    if isinstance(body, schema.BoxBody):
+        return seed.Box(body.lower, body.upper)
+    if isinstance(body, schema.SphereBody):
+        return seed.Sphere(body.center, body.radius)
+    if isinstance(body, schema.CylinderBody):
+        return seed.Cylinder(body.a, body.b, body.radius)
+    if isinstance(body, schema.CapsuleBody):
+        return seed.Capsule(body.a, body.b, body.radius)
+    if isinstance(body, schema.MeshBody) and folder is not None:
+        return seed.Mesh(folder / body.file, body.scale, body.offset)
+    return None
+
+
+def obstacle(words: Any, scene: int | None) -> Obstacle:
+    """The boundary of the step that an obstacle of a scene names."""
+    shape, position = _shape(words)
+    return boundaries.Obstacle(
+        shape,
+        position,
+        kind=words.contact,
+        friction=words.friction,
+        velocity=words.velocity,
+        rotation=words.rotation,
+        angular_velocity=words.spin,
+        start=words.start,
+        end=math.inf if words.end is None else words.end,
+        scene=scene,
+    )
+
+
+def _shape(words: Any) -> tuple[Shape, Any]:
+    """The shape of an obstacle, and where its origin is."""
+    if isinstance(words, schema.PlaneObstacle):
+        return shapes.Plane(words.normal), words.center
+    if isinstance(words, schema.BoxObstacle):
+        return shapes.Box(words.size), words.center
+    if isinstance(words, schema.SphereObstacle):
+        return shapes.Sphere(words.radius), words.center
+    if isinstance(words, schema.RevolvedObstacle):
+        return shapes.Revolved(words.outline, words.axis), words.center
+    half = [0.5 * (q - p) for p, q in zip(words.a, words.b, strict=True)]
+    return shapes.Capsule(half, words.radius), [0.5 * (p + q) for p, q in zip(words.a, words.b, strict=True)]

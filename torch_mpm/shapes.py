@@ -1,0 +1,452 @@
+"""Shapes: what bodies are filled from, what obstacles and held surfaces are made of, and what is drawn of them.
+
+A shape is described in its own coordinates; an `Obstacle` gives it a pose, a `seed.Region` a place. A shape of one's
+own is a subclass of `Shape` with a `surface`:
+
+    class Torus(Shape):
+        name = "torus"
+        def __init__(self, ring, radius):  # [m]
+            self.ring, self.radius = ring, radius
+        def surface(self, x, scene=None):
+            away = norm(x[:, ::2])
+            across = torch.stack([away - self.ring, x[:, 1]], 1)
+            u = unit(across)
+            radial = unit(x[:, ::2]) * u[:, :1]
+            return norm(across) - self.radius, torch.stack([radial[:, 0], u[:, 1], radial[:, 1]], 1)
+
+`Obstacle(Torus(0.3, 0.1), position)` is an obstacle, in torch operations; `torch_mpm.ops.contact` says which shapes act
+in a kernel.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.autograd.graph import saved_tensors_hooks
+
+from . import surface_mesh
+from .errors import check_number, shape_of
+from .per_scene import SceneParameters, Value, constant, direction, extent, floats
+from .surface_mesh import Array, SurfaceMesh
+from .vectors import norm, unit
+
+PAIRS = 2**20
+"""Pairs of a point and a triangle that are looked at together, which bounds the memory."""
+
+
+class Shape(SceneParameters):
+    """A closed region. The base of all shapes, of which only `surface` must be defined.
+
+    Parameters are numbers or tensors, one for all scenes or one per scene of a batch; `scene` says which.
+    """
+
+    name: str = "shape"
+    """As in a scene file."""
+
+    def surface(self, x: Tensor, scene: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Signed distance [N] [m], negative inside, and unit normal out of the shape [N, D], of points x [N, D] [m].
+
+        Differentiable. The distance is true near the surface on both sides, and away from it where the shape allows.
+        The normal is the gradient of the distance inside, where contact uses it; where it is zero (as at the centre of
+        a sphere), contact leaves a node alone.
+
+        Args:
+            x: points in the coordinates of the shape.
+            scene: scene of each point, int [N] (negative: none), or None for one scene.
+        """
+        raise NotImplementedError
+
+    def contains(self, x: Tensor) -> Tensor:
+        """Which points x [N, D] [m] are inside or on the surface, bool [N]."""
+        return self.surface(x)[0] <= 0
+
+    def volume(self, dim: int, scene: int = 0) -> float:
+        """[m³], in 2-D [m²]."""
+        raise NotImplementedError(f"the volume of a {self.name} is not known")
+
+    def bounds(self, dim: int, scene: int = 0) -> tuple[Tensor, Tensor]:
+        """Corners [D], [D] [m] of the smallest axis-aligned box around the shape, float64 on the CPU."""
+        raise NotImplementedError(f"the bounds of a {self.name} are not known")
+
+    def mesh(self, lower: Array, upper: Array, scene: int = 0) -> list[SurfaceMesh] | None:
+        """The surface in pieces, or None where it is only known by its distance.
+
+        Args:
+            lower, upper: corners [D] [m] of the region of interest, in which an infinite shape is cut off.
+            scene: whose parameters.
+        """
+        return None
+
+
+class Plane(Shape):
+    """A half-space: everything behind a plane through the origin.
+
+    Args:
+        normal: direction out of the half-space: D numbers, or a tensor [D] or [B, D]; of any length but zero.
+    """
+
+    name = "plane"
+
+    def __init__(self, normal: Value) -> None:
+        self.normal = direction("normal", normal)
+
+    def surface(self, x: Tensor, scene: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        normal = unit(self.at_nodes("normal", x, x.shape[1:], scene))
+        return (x * normal).sum(1), normal.expand_as(x)
+
+    def volume(self, dim: int, scene: int = 0) -> float:
+        return math.inf
+
+    def bounds(self, dim: int, scene: int = 0) -> tuple[Tensor, Tensor]:
+        return _around_origin(torch.full((dim,), math.inf, dtype=torch.float64))
+
+    def mesh(self, lower: Array, upper: Array, scene: int = 0) -> list[SurfaceMesh]:
+        normal = self.of_scene("normal", 1, scene).numpy()
+        middle = 0.5 * (lower + upper)
+        foot = middle - (middle @ normal) / (normal @ normal) * normal
+        return [surface_mesh.plate(foot, normal, float(np.linalg.norm(upper - lower)))]
+
+
+class Sphere(Shape):
+    """A ball around the origin; a disc in 2-D.
+
+    Args:
+        radius: [m], a number, or a tensor [] or [B].
+    """
+
+    name = "sphere"
+
+    def __init__(self, radius: float | Tensor) -> None:
+        self.radius = extent("radius", radius)
+
+    def surface(self, x: Tensor, scene: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        return norm(x) - self.at_nodes("radius", x, (), scene), unit(x)
+
+    def volume(self, dim: int, scene: int = 0) -> float:
+        return ball_volume(dim, float(self.of_scene("radius", 0, scene)))
+
+    def bounds(self, dim: int, scene: int = 0) -> tuple[Tensor, Tensor]:
+        return _around_origin(self.of_scene("radius", 0, scene).expand(dim))
+
+    def mesh(self, lower: Array, upper: Array, scene: int = 0) -> list[SurfaceMesh]:
+        return [surface_mesh.capsule(0.0, float(self.of_scene("radius", 0, scene)), np.eye(len(lower))[1])]
+
+
+class Box(Shape):
+    """A box around the origin with edges along the axes.
+
+    Args:
+        size: edge lengths [m]: D numbers, or a tensor [D] or [B, D].
+    """
+
+    name = "box"
+
+    def __init__(self, size: Value) -> None:
+        self.size = extent("size", size)
+
+    def surface(self, x: Tensor, scene: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """The normal is that of the nearest face, inside the one of the axis with the least negative distance."""
+        depth = x.abs() - 0.5 * self.at_nodes("size", x, x.shape[1:], scene)
+        nearest = torch.arange(x.shape[1], device=x.device) == depth.argmax(1, keepdim=True)
+        distance = norm(depth.clamp_min(0)) + depth.amax(1).clamp_max(0)
+        return distance, nearest * torch.where(x < 0, -1, 1).to(x.dtype)
+
+    def volume(self, dim: int, scene: int = 0) -> float:
+        return float(self.of_scene("size", 1, scene).prod())
+
+    def bounds(self, dim: int, scene: int = 0) -> tuple[Tensor, Tensor]:
+        return _around_origin(0.5 * self.of_scene("size", 1, scene))
+
+    def mesh(self, lower: Array, upper: Array, scene: int = 0) -> list[SurfaceMesh]:
+        return [surface_mesh.cuboid(self.of_scene("size", 1, scene).numpy())]
+
+
+class Capsule(Shape):
+    """All points within a radius of a segment around the origin.
+
+    Args:
+        half_axis: one end of the segment [m]: D numbers, or a tensor [D] or [B, D]. The other end is opposite.
+        radius: [m], a number, or a tensor [] or [B].
+    """
+
+    name = "capsule"
+
+    def __init__(self, half_axis: Value, radius: float | Tensor) -> None:
+        self.half_axis, self.radius = constant("half_axis", half_axis), extent("radius", radius)
+
+    def surface(self, x: Tensor, scene: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        axis = self.at_nodes("half_axis", x, x.shape[1:], scene)
+        squared = (axis * axis).sum(-1, keepdim=True)
+        along = (x * axis).sum(1, keepdim=True) / torch.where(squared > 0, squared, 1)
+        offset = x - along.clamp(-1, 1) * axis
+        return norm(offset) - self.at_nodes("radius", x, (), scene), unit(offset)
+
+    def volume(self, dim: int, scene: int = 0) -> float:
+        radius = float(self.of_scene("radius", 0, scene))
+        length = 2 * float(self.of_scene("half_axis", 1, scene).norm())
+        return ball_volume(dim - 1, radius) * length + ball_volume(dim, radius)
+
+    def bounds(self, dim: int, scene: int = 0) -> tuple[Tensor, Tensor]:
+        return _around_origin(self.of_scene("half_axis", 1, scene).abs() + self.of_scene("radius", 0, scene))
+
+    def mesh(self, lower: Array, upper: Array, scene: int = 0) -> list[SurfaceMesh]:
+        half = self.of_scene("half_axis", 1, scene).numpy()
+        length = float(np.linalg.norm(half))
+        axis = half / length if length > 0 else np.eye(len(lower))[1]
+        return [surface_mesh.capsule(length, float(self.of_scene("radius", 0, scene)), axis)]
+
+
+class Revolved(Shape):
+    """A polygon turned about an axis: a cone, a tube, a funnel, an hourglass, a drum. In 2-D, it and its mirror image.
+
+    Args:
+        outline: corners of the polygon, K pairs of distance from the axis (≥ 0) and position along it [m], counted from
+            the origin; not crossing itself. As a tensor [K, 2], anticlockwise.
+        axis: direction of the axis: D numbers, or a tensor [D] or [B, D]; y by default.
+    """
+
+    name = "revolved"
+
+    def __init__(self, outline: Sequence[Sequence[float]] | Tensor, axis: Value | None = None) -> None:
+        self.outline = extent("outline", outline) if isinstance(outline, Tensor) else _anticlockwise(outline)
+        self.axis = None if axis is None else direction("axis", axis)
+
+    def surface(self, x: Tensor, scene: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """The normal is that of the nearest edge of the polygon, also where a reentrant corner is nearest."""
+        if self.axis is None:
+            axis = torch.eye(x.shape[1], dtype=x.dtype, device=x.device)[1]
+        else:
+            axis = unit(self.at_nodes("axis", x, x.shape[1:], scene))
+        along = (x * axis).sum(1, keepdim=True)
+        across = x - along * axis
+        distance, normal = self._polygon(torch.cat([norm(across)[:, None], along], 1))
+        return distance, normal[:, :1] * unit(across) + normal[:, 1:] * axis
+
+    def _polygon(self, p: Tensor) -> tuple[Tensor, Tensor]:
+        """Signed distance [N] of points [N, 2] from the polygon, and outward normal [N, 2] of the nearest edge."""
+        a = self.parameter("outline", p, (len(self.outline), 2))
+        edge = a.roll(-1, 0) - a
+        arm = p[:, None] - a
+        along = ((arm * edge).sum(2) / (edge * edge).sum(1))[..., None]
+        # From a corner the distance is that to the next edge, so that both are the same and the first edge counts.
+        offset = norm(torch.where(along < 1, arm - along.clamp_min(0) * edge, arm.roll(-1, 1)))
+        # An edge on the axis is inside the body.
+        on_axis = (a[:, 0] == 0) & (edge[:, 0] == 0)
+        nearest = torch.where(on_axis, torch.inf, offset).argmin(1, keepdim=True)
+        # An odd number of edges is crossed by the ray from the point away from the axis.
+        straddles = (a[:, 1] > p[:, 1:]) != (a.roll(-1, 0)[:, 1] > p[:, 1:])
+        crossing = straddles & ((edge[:, 0] * arm[..., 1] - edge[:, 1] * arm[..., 0]) * edge[:, 1].sign() > 0)
+        inside = crossing.sum(1) % 2 == 1
+        distance = offset.gather(1, nearest)[:, 0]
+        normal = unit(torch.stack([edge[:, 1], -edge[:, 0]], 1))[nearest[:, 0]]
+        return torch.where(inside, -distance, distance), normal
+
+    def volume(self, dim: int, scene: int = 0) -> float:
+        corners = self.of_scene("outline", 2, 0).tolist()
+        if dim == 2:
+            return 2 * _polygon_area(corners)
+        # ∮ π r² dz over the edges
+        edges = zip(corners, corners[1:] + corners[:1], strict=True)
+        return math.pi / 3 * sum((q[1] - p[1]) * (p[0] * p[0] + p[0] * q[0] + q[0] * q[0]) for p, q in edges)
+
+    def bounds(self, dim: int, scene: int = 0) -> tuple[Tensor, Tensor]:
+        axis = torch.from_numpy(self._unit_axis(dim, scene))
+        radius, height = self.of_scene("outline", 2, 0)[:, :, None].unbind(1)
+        reach = radius * (1 - axis.square()).clamp_min(0).sqrt()
+        return (height * axis - reach).amin(0), (height * axis + reach).amax(0)
+
+    def mesh(self, lower: Array, upper: Array, scene: int = 0) -> list[SurfaceMesh]:
+        return surface_mesh.ring(self.of_scene("outline", 2, 0).numpy(), self._unit_axis(len(lower), scene))
+
+    def _unit_axis(self, dim: int, scene: int) -> Array:
+        if self.axis is None:
+            return np.eye(dim)[1]
+        axis = self.of_scene("axis", 1, scene).numpy()
+        return axis / np.linalg.norm(axis)
+
+
+class Cylinder(Revolved):
+    """A solid cylinder with flat ends around the origin; 3-D only.
+
+    Args:
+        half_axis: centre of one end [m], 3 numbers. The other end is opposite.
+        radius: [m], positive.
+    """
+
+    name = "cylinder"
+
+    def __init__(self, half_axis: Sequence[float], radius: float) -> None:
+        axis = floats("half_axis", direction("half_axis", half_axis))
+        if len(axis) != 3:
+            raise ValueError("a cylinder needs three dimensions; in 2-D use a sphere (a disc) or a box")
+        check_number("radius", radius, "positive", lambda v: 0 < v < math.inf)
+        half = math.hypot(*axis)
+        super().__init__(((0, -half), (radius, -half), (radius, half), (0, half)), axis)
+
+
+class Mesh(Shape):
+    """The inside of a closed triangle mesh, scaled about its origin.
+
+    Args:
+        source: a file that trimesh reads (.obj, .ply, .stl, ...) or a `trimesh.Trimesh`.
+        scale: factor on its coordinates.
+
+    Every point is compared with every triangle: for filling and for drawing, and as an obstacle of few triangles.
+
+    Raises:
+        ImportError: without trimesh.
+        OSError: for a file that cannot be read.
+        ValueError: for a mesh that is not closed, or a scale that is not positive.
+    """
+
+    name = "mesh"
+
+    def __init__(self, source: str | Path | Any, scale: float = 1.0) -> None:
+        mesh = surface_mesh.load(source)
+        scale = float(check_number("scale", scale, "positive", lambda v: 0 < v < math.inf))
+        self.vertices = torch.tensor(mesh.vertices, dtype=torch.float64, device="cpu") * scale
+        self.faces = torch.tensor(mesh.faces, dtype=torch.int64, device="cpu")
+        volume = abs(float(mesh.volume)) * scale * scale * scale
+        self._volume = check_number(f"the volume of mesh {source}", volume, "positive", lambda v: 0 < v < math.inf)
+
+    def surface(self, x: Tensor, scene: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        corners = self._corners(x)
+        nearest = torch.cat([_nearest_on_triangles(part, corners) for part in self._chunks(x)])
+        offset = x - nearest
+        side = torch.where(self.contains(x.detach()), -1, 1).to(x.dtype)
+        return side * norm(offset), side[:, None] * unit(offset)
+
+    def contains(self, x: Tensor) -> Tensor:
+        """Where the winding number is above 1/2 (Jacobson et al. 2013; angles: Van Oosterom and Strackee 1983)."""
+        corners = self._corners(x)
+        return torch.cat([_winding_number(part, corners).abs() > 0.5 for part in self._chunks(x)])
+
+    def volume(self, dim: int, scene: int = 0) -> float:
+        return self._volume
+
+    def bounds(self, dim: int, scene: int = 0) -> tuple[Tensor, Tensor]:
+        return self.vertices.cpu().amin(0), self.vertices.cpu().amax(0)
+
+    def mesh(self, lower: Array, upper: Array, scene: int = 0) -> list[SurfaceMesh]:
+        return [SurfaceMesh(self.vertices.cpu().numpy(), self.faces.cpu().numpy())]
+
+    def _corners(self, like: Tensor) -> Tensor:
+        """[T, 3, 3]"""
+        return self.vertices.to(like)[self.faces.to(like.device)]
+
+    def _chunks(self, x: Tensor) -> Sequence[Tensor]:
+        return x.split(max(1, PAIRS // len(self.faces)))
+
+
+class SDF(Shape):
+    """Any shape, from its signed distance.
+
+    Args:
+        distance: function of points [N, D] [m] that returns distances [N] [m], negative inside. Torch operations; it
+            need not be exact away from its zero level.
+        normal: function of the same points that returns outward normals [N, D]; None for the gradient of `distance` by
+            automatic differentiation. Of any length.
+    """
+
+    name = "sdf"
+
+    def __init__(self, distance: Callable[[Tensor], Tensor], normal: Callable[[Tensor], Tensor] | None = None) -> None:
+        for name, function in (("distance", distance), ("normal", normal)):
+            if not callable(function) and (name == "distance" or function is not None):
+                raise TypeError(f"{name} must be a function of positions [N, D], got {shape_of(function)}")
+        self.distance, self.normal = distance, normal
+
+    def surface(self, x: Tensor, scene: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        if self.normal is not None:
+            distance, normal = self.distance(x), self.normal(x)
+        else:
+            distance, normal = _with_gradient(self.distance, x)
+        if distance.shape != x.shape[:1] or normal.shape != x.shape:
+            raise ValueError(
+                f"distance and normal of an SDF must have shape [N] and [N, D] = {list(x.shape)}, "
+                f"got {shape_of(distance)} and {shape_of(normal)}"
+            )
+        return distance, unit(normal)
+
+
+# ---- geometry
+
+
+def ball_volume(dim: int, radius: float) -> float:
+    """Volume of a ball in 3-D, area of a disc in 2-D, length in 1-D; infinite where a power would raise."""
+    return {1: 2.0, 2: math.pi, 3: 4 / 3 * math.pi}[dim] * math.prod([radius] * dim)
+
+
+def _around_origin(upper: Tensor) -> tuple[Tensor, Tensor]:
+    return -upper, upper
+
+
+def _anticlockwise(outline: Any) -> tuple[tuple[float, ...], ...]:
+    """A polygon around the axis, checked."""
+    if not isinstance(outline, Sequence):
+        raise TypeError(f"outline must be at least 3 pairs, got {shape_of(outline)}")
+    corners = tuple(floats("outline", corner) for corner in outline)
+    if len(corners) < 3 or any(len(c) != 2 or c[0] < 0 or not all(map(math.isfinite, c)) for c in corners):
+        raise ValueError(f"outline must be at least 3 pairs (distance >= 0, position along the axis), got {outline}")
+    area = _polygon_area(corners)
+    if area == 0:
+        raise ValueError(f"outline must enclose an area, got {outline}")
+    return corners if area > 0 else corners[::-1]
+
+
+def _polygon_area(corners: Sequence[Sequence[float]]) -> float:
+    """Positive if anticlockwise."""
+    edges = zip(corners, [*corners[1:], corners[0]], strict=True)
+    return 0.5 * sum(a[0] * b[1] - b[0] * a[1] for a, b in edges)
+
+
+def _winding_number(x: Tensor, corners: Tensor) -> Tensor:
+    """Of triangles [T, 3, 3] around points [N, 3], [N]."""
+    a, b, c = (corners[None, :, k] - x[:, None] for k in range(3))
+    la, lb, lc = a.norm(dim=-1), b.norm(dim=-1), c.norm(dim=-1)
+    determinant = (a * torch.linalg.cross(b, c)).sum(-1)
+    denominator = la * lb * lc + (a * b).sum(-1) * lc + (b * c).sum(-1) * la + (c * a).sum(-1) * lb
+    return torch.atan2(determinant, denominator).sum(1) / (2 * math.pi)
+
+
+def _nearest_on_triangles(x: Tensor, corners: Tensor) -> Tensor:
+    """The point of triangles [T, 3, 3] that is nearest to each of the points [N, 3], [N, 3]."""
+    start = corners[None]  # [1, T, 3 corners, 3]
+    edge = corners.roll(-1, 1)[None] - start
+    arm = x[:, None, None] - start
+    along = (arm * edge).sum(-1) / (edge * edge).sum(-1)
+    on_edges = start + along.clamp(0, 1)[..., None] * edge
+    normal = torch.linalg.cross(edge[:, :, 0], edge[:, :, 1])
+    height = (arm[:, :, 0] * normal).sum(-1, keepdim=True) / (normal * normal).sum(-1, keepdim=True)
+    on_plane = x[:, None] - height * normal
+    left = (torch.linalg.cross(edge.expand_as(arm), arm) * normal[:, :, None]).sum(-1) >= 0  # of each edge, from above
+    candidates = torch.cat([on_edges, on_plane[:, :, None]], 2)
+    squared = (x[:, None, None] - candidates).square().sum(-1)
+    squared = torch.where(torch.cat([torch.ones_like(left), left.all(2, keepdim=True)], 2), squared, torch.inf)
+    nearest = squared.flatten(1).argmin(1)
+    return candidates.flatten(1, 2)[torch.arange(len(x), device=x.device), nearest]
+
+
+def _with_gradient(function: Callable[[Tensor], Tensor], points: Tensor) -> tuple[Tensor, Tensor]:
+    """Values [N] of a function of points [N, D], each of its own point, and their gradients; differentiable."""
+    if torch.compiler.is_compiling() or torch._C._autograd._top_saved_tensors_default_hooks(False) is None:
+        values, pull_back, *_ = torch.func.vjp(function, points)
+        return values, pull_back(torch.ones_like(values))[0]
+    # torch.func refuses the hooks of checkpointing, which would compute its steps again for a gradient taken in them.
+    differentiable = torch.is_grad_enabled()
+    with torch.enable_grad(), saved_tensors_hooks(_same, _same):
+        leaf = points.view_as(points)
+        leaf = leaf if leaf.requires_grad else leaf.requires_grad_()
+        values = function(leaf)
+        (gradient,) = torch.autograd.grad(values, leaf, torch.ones_like(values), create_graph=differentiable)
+    return values, gradient
+
+
+def _same(t: Tensor) -> Tensor:
+    return t

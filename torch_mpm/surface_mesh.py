@@ -1,0 +1,120 @@
+"""Surfaces of shapes as triangles (3-D) or closed outlines (2-D), for drawing, sampling and filling."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from .errors import check_file
+
+Array = npt.NDArray[Any]
+
+TURNS = 64
+"""Sides of a surface of revolution."""
+
+
+class SurfaceMesh(NamedTuple):
+    """Vertices [V, D] [m], and triangles int [T, 3] (3-D) or None (2-D: the vertices are a closed outline)."""
+
+    vertices: Array
+    faces: Array | None
+
+
+def plate(middle: Array, normal: Array, size: float) -> SurfaceMesh:
+    """A square of side `size` [m] around `middle`, whose visible side looks along `normal`; a thick line in 2-D."""
+    frame = frame_of(normal / np.linalg.norm(normal))
+    if len(middle) == 2:
+        thick = 0.01 * size
+        flat = np.array([[-0.5 * size, -thick], [0.5 * size, -thick], [0.5 * size, 0], [-0.5 * size, 0]])
+        return SurfaceMesh(middle + flat @ frame.T, None)
+    square = 0.5 * size * np.array([[-1, 0, -1], [1, 0, -1], [1, 0, 1], [-1, 0, 1]], dtype=np.float64)
+    return SurfaceMesh(middle + square @ frame.T, np.array([[0, 2, 1], [0, 3, 2]]))
+
+
+def cuboid(size: Array) -> SurfaceMesh:
+    """A box with edge lengths `size` [D] [m] around the origin."""
+    if len(size) == 2:
+        return SurfaceMesh(0.5 * size * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]), None)
+    corners = np.array([[(i & 1), (i >> 1) & 1, i >> 2] for i in range(8)]) * 2.0 - 1.0
+    quads = [(0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (2, 6, 7, 3), (0, 4, 6, 2), (1, 3, 7, 5)]
+    return SurfaceMesh(0.5 * size * corners, np.array([t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))]))
+
+
+def capsule(half_length: float, radius: float, axis: Array) -> SurfaceMesh:
+    """All points within `radius` of the segment of half length `half_length` [m] along the unit vector `axis` [D]."""
+    angle = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 33)
+    # The cap's equator appears twice, at both ends of the straight part.
+    angle = np.concatenate([angle[:17], angle[16:]])
+    shift = np.where(np.arange(angle.size) < 17, -half_length, half_length)
+    profile = np.stack([radius * np.cos(angle), radius * np.sin(angle) + shift], axis=1)
+    if len(axis) == 3:
+        return revolved(profile, axis)
+    outline = np.concatenate([profile, profile[::-1] * [-1, 1]])
+    return SurfaceMesh(outline @ frame_of(axis).T, None)
+
+
+def ring(outline: Array, axis: Array) -> list[SurfaceMesh]:
+    """The closed polygon (radius, height) [K, 2] turned around `axis` [D]; in 2-D itself and its mirror image."""
+    if len(axis) == 3:
+        return [revolved(np.concatenate([outline, outline[:1]]), axis)]
+    return [SurfaceMesh(outline * [side, 1.0] @ frame_of(axis).T, None) for side in (1.0, -1.0)]
+
+
+def revolved(profile: Array, axis: Array) -> SurfaceMesh:
+    """The profile (radius, height) [K, 2] turned about the unit vector `axis` [3], without edges on the axis."""
+    phi = 2 * np.pi * np.arange(TURNS) / TURNS
+    radius, height = profile[:, 0][:, None], profile[:, 1][:, None]
+    v = np.stack([radius * np.cos(phi), height + 0 * phi, radius * np.sin(phi)], axis=-1).reshape(-1, 3)
+    (edges,) = np.nonzero((profile[:-1, 0] > 0) | (profile[1:, 0] > 0))
+    i, j = np.meshgrid(edges, np.arange(TURNS), indexing="ij")
+    k = (j + 1) % TURNS
+    a, b, c, d = i * TURNS + j, i * TURNS + k, (i + 1) * TURNS + k, (i + 1) * TURNS + j
+    faces = np.concatenate([np.stack([a, c, b], -1).reshape(-1, 3), np.stack([a, d, c], -1).reshape(-1, 3)])
+    return SurfaceMesh(v @ frame_of(axis).T, faces)
+
+
+def frame_of(axis: Array) -> Array:
+    """A rotation [D, D] that takes the y axis to the unit vector `axis` [D]."""
+    if len(axis) == 2:
+        return np.stack([np.array([axis[1], -axis[0]]), axis], axis=1)
+    helper = np.eye(3)[int(np.argmin(np.abs(axis)))]
+    u = np.cross(axis, helper)
+    u /= np.linalg.norm(u)
+    return np.stack([u, axis, np.cross(u, axis)], axis=1)
+
+
+def load(source: str | Path | Any) -> Any:
+    """A closed `trimesh.Trimesh`, as it is or from a file that trimesh reads (.obj, .ply, .stl, ...).
+
+    Raises:
+        ImportError: without trimesh.
+        OSError: for a file that cannot be read.
+        ValueError: for a file without triangles, or a mesh that is not closed.
+    """
+    try:
+        import trimesh
+    except ImportError as error:
+        raise ImportError("a mesh shape needs trimesh: pip install torch-mpm[mesh]") from error
+    mesh: Any = source
+    if not isinstance(source, trimesh.Trimesh):
+        check_file(source, "mesh")
+        try:
+            mesh = trimesh.load(source, force="mesh")
+        except Exception as error:  # readers of many formats raise anything
+            raise ValueError(f"mesh file {source} cannot be read: {type(error).__name__}: {error}") from error
+        if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
+            raise ValueError(f"mesh file {source} holds no triangles")
+    if not mesh.is_watertight:
+        raise ValueError(
+            f"mesh {source} is not closed: {_open_edges(mesh)} of its edges do not join two triangles; "
+            "close the holes (trimesh.repair.fill_holes, or a modelling program) before filling it"
+        )
+    return mesh
+
+
+def _open_edges(mesh: Any) -> int:
+    _, uses = np.unique(mesh.edges_sorted, axis=0, return_counts=True)
+    return int((uses != 2).sum())

@@ -1,0 +1,23 @@
+"""Lengths and directions of vectors, with gradients that are finite everywhere."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+
+def norm(v: Tensor) -> Tensor:
+    """Length of vectors [..., D], with gradient zero at the zero vector."""
+    squared = (v * v).sum(-1)
+    return torch.where(squared > 0, torch.where(squared > 0, squared, 1).sqrt(), 0)
+
+
+def unit(v: Tensor) -> Tensor:
+    """Directions of vectors [..., D]; zero for the zero vector."""
+    length = norm(v)[..., None]
+    return torch.where(length > 0, v / torch.where(length > 0, length, 1), 0)
+
+
+def transform(matrix: Tensor, v: Tensor) -> Tensor:
+    """Matrix [D, D] or [N, D, D] times vectors [N, D]."""
+    return v @ matrix.mT if matrix.dim() == 2 else (matrix @ v[..., None])[..., 0]
