@@ -75,7 +75,8 @@ class VonMises(SolidLaw):
 
     Args:
         E, nu or mu, lam: as for `FixedCorotated`.
-        yield_stress: σ_y in uniaxial tension [Pa], not negative. The shear strength is σ_y/√3, also in 2-D.
+        yield_stress: yield stress σ_y in uniaxial tension [Pa], not negative. The shear strength is σ_y/√3, in 2-D
+            too.
         hardening: plastic modulus H [Pa], not negative.
 
     Raises:
@@ -111,9 +112,9 @@ class HerschelBulkley(SolidLaw):
     Args:
         E, nu or mu, lam: as for `FixedCorotated`, of the elastic strains. The wave speed and so the time step follow
             from them, not from the viscosity.
-        yield_stress: τ_y in shear [Pa], not negative; 0 is a power-law fluid.
-        consistency: η [Pa sⁿ], not negative; 0 is perfect plasticity.
-        exponent: n, positive: below 1 shear thinning, above 1 shear thickening.
+        yield_stress: yield stress τ_y in shear [Pa], not negative; 0 is a power-law fluid.
+        consistency: consistency η [Pa sⁿ], the viscosity for n = 1, not negative; 0 is perfect plasticity.
+        exponent: exponent n of the shear rate, positive: below 1 shear thinning, above 1 shear thickening.
 
     Raises:
         ValueError: for a value outside its range, or another combination of arguments.
@@ -188,9 +189,9 @@ class Snow(SolidLaw):
 
     Args:
         E, nu or mu, lam: as for `FixedCorotated`, of fresh snow (1.4e5 Pa and 0.2 in the paper, density 400 kg/m³).
-        critical_compression: θ_c in [0, 1).
-        critical_stretch: θ_s, not negative.
-        hardening: ξ, not negative.
+        critical_compression: compression θ_c beyond which it yields, in [0, 1).
+        critical_stretch: stretch θ_s beyond which it yields, not negative; smaller is more brittle.
+        hardening: growth ξ of the stiffness with plastic compaction, not negative.
 
     Raises:
         ValueError: for a value outside its range, or another combination of arguments.
@@ -231,11 +232,12 @@ class CamClay(SolidLaw):
 
     Args:
         E, nu or mu, lam: as for `FixedCorotated`.
-        critical_slope: M, positive: q/p in the critical state. From a friction angle φ it is 6 sin φ/(3 − sin φ) in
-            triaxial compression, and 2 sin φ in 2-D.
-        consolidation: p₀ [Pa], positive: the preconsolidation pressure at first.
-        hardening: Θ, positive: 1/(λ* − κ*) of the compression and swelling indices in ln v over ln p.
-        cohesion: β in [0, 1]: isotropic tensile strength over p_c.
+        critical_slope: ratio M = q/p of shear stress to pressure in the critical state, positive. From a friction
+            angle φ it is 6 sin φ/(3 − sin φ) in triaxial compression, and 2 sin φ in 2-D.
+        consolidation: initial preconsolidation pressure p₀ [Pa], positive.
+        hardening: growth Θ of ln p_c with plastic compaction, positive: 1/(λ* − κ*) of the compression and swelling
+            indices in ln v over ln p.
+        cohesion: isotropic tensile strength β over p_c, in [0, 1].
 
     Raises:
         ValueError: for a value outside its range, or another combination of arguments.
