@@ -341,7 +341,7 @@ MPM_HD Vector<T, D> velocity_before(const ContactArguments<T, D>& a, const Conta
 // The nodes of a slot that an obstacle touches, as the backward pass needs them.
 template <int count, class T, int D>
 struct TouchedNodes {
-  bool touching[count];
+  Touch<T, D> touch[count];
   Vector<T, D> position[count], before[count], grad[count];  // velocity before the contact, adjoint of that after it
 };
 
@@ -357,7 +357,7 @@ MPM_HD T parameter_adjoint(const ContactArguments<T, D>& a, const ContactSlot<T,
   const ObstaclePose<S, D> pose = obstacle_pose(a, a.kind[k], row, s.scene);
   T sum = T(0);
   for (int n = 0; n < count; n++) {
-    if (!nodes.touching[n]) continue;
+    if (!nodes.touch[n].touching) continue;
     Vector<S, D> v;
     MPM_UNROLL for (int i = 0; i < D; i++)
       v[i] = lift<S>(nodes.before[n][i]);
@@ -382,16 +382,16 @@ MPM_HD void slot_contact_backward(const ContactArguments<T, D>& a, int slot, int
     if (s.active) pose = pose_at(a, s, k);
     for (int n = 0; pose.acts && n < count; n++) {
       nodes.position[n] = node_position(a, s.corner, lane + n * Lanes);
-      nodes.touching[n] = touch(a, pose, nodes.position[n]).touching;
-      if (nodes.touching[n]) nodes.before[n] = velocity_before(a, s, k, first + n * Lanes, nodes.position[n]);
+      nodes.touch[n] = touch(a, pose, nodes.position[n]);
+      if (nodes.touch[n].touching) nodes.before[n] = velocity_before(a, s, k, first + n * Lanes, nodes.position[n]);
     }
     for (int i = 0; a.row_grad && i < width; i++) {
       const T sum = pose.acts ? sum_lanes(parameter_adjoint(a, s, k, i, nodes)) : T(0);
       if (lane == 0) a.row_grad[(int64_t(slot) * a.obstacles + k) * width + i] = sum;
     }
     for (int n = 0; pose.acts && n < count; n++) {
-      if (!nodes.touching[n]) continue;
-      const Touch<T, D> t = touch(a, pose, nodes.position[n]);
+      const Touch<T, D>& t = nodes.touch[n];
+      if (!t.touching) continue;
       const Vector<T, D> u = relative_velocity(t, nodes.before[n]);
       nodes.grad[n] = contact_adjoint(pose.contact, u, t.normal, pose.row->friction, nodes.grad[n]);
     }
