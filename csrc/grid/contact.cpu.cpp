@@ -11,14 +11,14 @@ constexpr int64_t kGrain = 64;  // slots below which a range is not split
 
 template <class T, int D>
 void contact(const ContactArguments<T, D>& a) {
-  parallel_ranges(a.capacity, kGrain, [&](int64_t begin, int64_t end) {
+  parallel_ranges(a.max_blocks, kGrain, [&](int64_t begin, int64_t end) {
     for (int64_t slot = begin; slot < end; slot++) slot_contact<1>(a, int(slot), 0);
   });
 }
 
 template <class T, int D>
 void contact_backward(const ContactArguments<T, D>& a) {
-  parallel_ranges(a.capacity, kGrain, [&](int64_t begin, int64_t end) {
+  parallel_ranges(a.max_blocks, kGrain, [&](int64_t begin, int64_t end) {
     for (int64_t slot = begin; slot < end; slot++) slot_contact_backward<1>(a, int(slot), 0, [](T x) { return x; });
   });
 }

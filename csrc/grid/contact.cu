@@ -21,7 +21,7 @@ template <bool Backward, class T, int D>
 __global__ void __launch_bounds__(kThreads) contact_kernel(const ContactArguments<T, D> a) {
   const int64_t thread = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   const int64_t slot = thread / kLanes;
-  if (slot >= a.capacity) return;
+  if (slot >= a.max_blocks) return;
   if constexpr (Backward)
     slot_contact_backward<kLanes>(a, int(slot), int(thread % kLanes), SumLanes());
   else
@@ -30,8 +30,8 @@ __global__ void __launch_bounds__(kThreads) contact_kernel(const ContactArgument
 
 template <bool Backward, class T, int D>
 void run(const ContactArguments<T, D>& a, Stream stream) {
-  if (a.capacity == 0) return;
-  const unsigned blocks = unsigned((int64_t(a.capacity) * kLanes + kThreads - 1) / kThreads);
+  if (a.max_blocks == 0) return;
+  const unsigned blocks = unsigned((int64_t(a.max_blocks) * kLanes + kThreads - 1) / kThreads);
   launch(contact_kernel<Backward, T, D>, blocks, kThreads, 0, stream, a);
 }
 

@@ -17,7 +17,7 @@ namespace {
       std::vector<int64_t> corners, std::vector<int64_t> contact_kind, std::vector<int64_t> scene,       \
       std::vector<double> start, std::vector<double> end, const OptionalTensor &scene_time, double time, \
       const std::vector<Tensor>&topology, const std::vector<double>&lattice, const std::vector<int64_t>&layout
-#define MPM_CONTACT_ARGUMENTS                                                                                          \
+#define MPM_CONTACT_ARGUMENTS                                                                                         \
   velocity, obstacles, outline, shape, corners, contact_kind, scene, start, end, scene_time, time, topology, lattice, \
       layout
 
@@ -40,7 +40,7 @@ ContactArguments<T, D> contact_arguments(MPM_CONTACT_PARAMETERS) {
     largest = std::fmax(largest, T(std::fmax(std::fabs(a.lower[i]), std::fabs(upper))));
   }
   a.rounding = 16 * std::numeric_limits<T>::epsilon() * largest;
-  a.capacity = blocks.max_blocks<D>();
+  a.max_blocks = blocks.max_blocks<D>();
   a.block = blocks.block_pointer(velocity);
   const auto v = node_input<T>(velocity, "velocity", velocity, blocks.node_count<D>());
   a.velocity = v.pointer;
@@ -119,7 +119,7 @@ std::tuple<Tensor, Tensor> contact_backward(const Tensor& grad, bool wants_rows,
     a.grad = g.pointer;
     a.grad_stride = g.stride;
     a.result = static_cast<T*>(grad_velocity.data_ptr());
-    rows = empty(velocity, {wants_rows ? a.capacity : 0, a.obstacles, ObstacleRow<T, D>::width});
+    rows = empty(velocity, {wants_rows ? a.max_blocks : 0, a.obstacles, ObstacleRow<T, D>::width});
     if (wants_rows) a.row_grad = static_cast<T*>(rows.data_ptr());
     backend::contact_backward(a, device.stream());
   });

@@ -12,7 +12,7 @@ constexpr int64_t kGrain = 4096 / kBlockNodes<D>;  // slots below which a range 
 
 template <class T, int D>
 void grid_update(const GridUpdateArguments<T, D>& a) {
-  parallel_ranges(a.capacity, kGrain<D>, [&](int64_t begin, int64_t end) {
+  parallel_ranges(a.max_blocks, kGrain<D>, [&](int64_t begin, int64_t end) {
     for (int64_t slot = begin; slot < end; slot++) {
       const SlotUpdate<T, D> s = slot_update(a, int(slot));
       const int64_t first = slot * kBlockNodes<D>;
@@ -24,7 +24,7 @@ void grid_update(const GridUpdateArguments<T, D>& a) {
 
 template <class T, int D>
 void grid_update_backward(const GridUpdateBackwardArguments<T, D>& a) {
-  parallel_ranges(a.forward.capacity, kGrain<D>, [&](int64_t begin, int64_t end) {
+  parallel_ranges(a.forward.max_blocks, kGrain<D>, [&](int64_t begin, int64_t end) {
     for (int64_t slot = begin; slot < end; slot++) {
       const SlotUpdate<T, D> s = slot_update(a.forward, int(slot));
       const int64_t first = slot * kBlockNodes<D>;

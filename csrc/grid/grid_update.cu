@@ -12,7 +12,7 @@ template <class T, int D>
 __global__ void __launch_bounds__(kThreads) grid_update_kernel(const GridUpdateArguments<T, D> a) {
   const int64_t node = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   const int slot = int(node / kBlockNodes<D>);
-  if (slot >= a.capacity) return;
+  if (slot >= a.max_blocks) return;
   a.updated[node] = update_node(a, slot_update(a, slot), int(node % kBlockNodes<D>), a.nodes[node]);
 }
 
@@ -23,7 +23,7 @@ __global__ void __launch_bounds__(kThreads) grid_update_backward_kernel(const Gr
   const int64_t slot = thread / kLanes<D>;
   const int lane = int(thread % kLanes<D>);
   Vector<T, D> sum = zero_vector<T, D>();
-  if (slot < a.forward.capacity) {
+  if (slot < a.forward.max_blocks) {
     const SlotUpdate<T, D> s = slot_update(a.forward, int(slot));
 #pragma unroll
     for (int local = lane; local < kBlockNodes<D>; local += kLanes<D>) {
@@ -39,25 +39,25 @@ __global__ void __launch_bounds__(kThreads) grid_update_backward_kernel(const Gr
 #pragma unroll
     for (int step = kLanes<D> / 2; step > 0; step /= 2)
       sum[i] += __shfl_down_sync(0xffffffffu, sum[i], step, kLanes<D>);
-  if (slot < a.forward.capacity && lane == 0) a.change[slot] = sum;
+  if (slot < a.forward.max_blocks && lane == 0) a.change[slot] = sum;
 }
 
-unsigned blocks_for(int64_t capacity, int64_t threads_per_slot) {
-  return unsigned((capacity * threads_per_slot + kThreads - 1) / kThreads);
+unsigned blocks_for(int64_t max_blocks, int64_t threads_per_slot) {
+  return unsigned((max_blocks * threads_per_slot + kThreads - 1) / kThreads);
 }
 
 }  // namespace
 
 template <class T, int D>
 void grid_update(const GridUpdateArguments<T, D>& a, Stream stream) {
-  if (a.capacity == 0) return;
-  launch(grid_update_kernel<T, D>, blocks_for(a.capacity, kBlockNodes<D>), kThreads, 0, stream, a);
+  if (a.max_blocks == 0) return;
+  launch(grid_update_kernel<T, D>, blocks_for(a.max_blocks, kBlockNodes<D>), kThreads, 0, stream, a);
 }
 
 template <class T, int D>
 void grid_update_backward(const GridUpdateBackwardArguments<T, D>& a, Stream stream) {
-  if (a.forward.capacity == 0) return;
-  launch(grid_update_backward_kernel<T, D>, blocks_for(a.forward.capacity, kLanes<D>), kThreads, 0, stream, a);
+  if (a.forward.max_blocks == 0) return;
+  launch(grid_update_backward_kernel<T, D>, blocks_for(a.forward.max_blocks, kLanes<D>), kThreads, 0, stream, a);
 }
 
 MPM_INSTANTIATE(grid_update, GridUpdateArguments)

@@ -50,9 +50,9 @@ struct alignas(D == 3 ? 16 : alignof(T)) NodeRow {
 template <class T, int D>
 struct GridUpdateArguments {
   Geometry<T, D> geometry;
-  int capacity = 0;
+  int max_blocks = 0;
   int block_count = 0;         // blocks of all scenes; entries of `block` outside are taken as unused
-  const int* block = nullptr;  // [capacity] block of a slot, -1 where unused
+  const int* block = nullptr;  // [max_blocks] block of a slot, -1 where unused
   const int* table = nullptr;  // slot of a block, -1 where inactive; has entries for block_count blocks
   const NodeRow<T, D>* nodes = nullptr;
   const T* gravity = nullptr;   // [scenes, D], or null
@@ -67,7 +67,8 @@ struct GridUpdateBackwardArguments {
   GridUpdateArguments<T, D> forward;  // its `updated` unused
   const NodeRow<T, D>* grad_updated = nullptr;
   NodeRow<T, D>* grad_nodes = nullptr;
-  Vector<T, D>* change = nullptr;  // [capacity] adjoint of the velocity change by gravity, summed over a block; or null
+  Vector<T, D>* change =
+      nullptr;  // [max_blocks] adjoint of the velocity change by gravity, summed over a block; or null
 };
 
 inline namespace TORCH_MPM_ISA {
@@ -141,7 +142,7 @@ MPM_HD int64_t row_of(const GridUpdateArguments<T, D>& a, const SlotUpdate<T, D>
     block[i] = node[i] / kBlockWidth;
   }
   const int slot = a.table[block_index(a.geometry, s.scene, block)];
-  return slot < 0 || slot >= a.capacity ? -1 : int64_t(slot) * kBlockNodes<D> + node_in_block<D>(node);
+  return slot < 0 || slot >= a.max_blocks ? -1 : int64_t(slot) * kBlockNodes<D> + node_in_block<D>(node);
 }
 
 // Calls f(row, sign) for a node and its images in the mirrors, 2^k of them where k mirrors meet; sign is the diagonal

@@ -72,7 +72,7 @@ GridUpdateArguments<T, D> grid_update_arguments(MPM_GRID_UPDATE_PARAMETERS) {
   const PackedTopology blocks(topology, lattice, layout);
   GridUpdateArguments<T, D> a;
   a.geometry = blocks.geometry<T, D>();
-  a.capacity = blocks.max_blocks<D>();
+  a.max_blocks = blocks.max_blocks<D>();
   a.block = blocks.block_pointer(nodes);
   check_shape(nodes, "nodes", {blocks.node_count<D>(), 1 + D});
   a.nodes = rows<T, D>(nodes, "nodes", nodes);
@@ -118,7 +118,7 @@ std::tuple<Tensor, Tensor> grid_update_backward(const Tensor& grad, bool wants_c
     a.forward.nodes = rows<T, D>(packed, "nodes", nodes);
     a.grad_updated = rows<T, D>(packed_grad, "grad", nodes);
     a.grad_nodes = static_cast<NodeRow<T, D>*>(grad_nodes.data_ptr());
-    change = empty(nodes, {wants_change ? a.forward.capacity : 0, D});
+    change = empty(nodes, {wants_change ? a.forward.max_blocks : 0, D});
     if (wants_change) a.change = static_cast<Vector<T, D>*>(change.data_ptr());
     backend::grid_update_backward(a, device.stream());
   });

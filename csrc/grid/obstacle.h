@@ -39,8 +39,8 @@ struct ContactArguments {
   Geometry<T, D> geometry;
   double dx, lower[D];
   T rounding;  // distance within which a node lies on a surface [m]
-  int capacity = 0;
-  const int* block = nullptr;  // [capacity] block of a slot, -1 where unused
+  int max_blocks = 0;
+  const int* block = nullptr;  // [max_blocks] block of a slot, -1 where unused
   int obstacles = 0;
   ObstacleKind kind[kMaxObstacles];
   const ObstacleRow<T, D>* row = nullptr;  // [rows, obstacles]; one row for all scenes, or one per scene
@@ -52,8 +52,8 @@ struct ContactArguments {
   const T* velocity = nullptr;  // node i at velocity + i * stride
   const T* grad = nullptr;      // likewise; backward only
   int64_t stride = 0, grad_stride = 0;
-  T* result = nullptr;    // rows [capacity * 4^D, 1 + D] as of the grid update, the first column zero
-  T* row_grad = nullptr;  // adjoint of the rows by each slot [capacity, obstacles, width], or null; backward only
+  T* result = nullptr;    // rows [max_blocks * 4^D, 1 + D] as of the grid update, the first column zero
+  T* row_grad = nullptr;  // adjoint of the rows by each slot [max_blocks, obstacles, width], or null; backward only
 };
 
 inline namespace TORCH_MPM_ISA {
