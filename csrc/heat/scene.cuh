@@ -250,7 +250,7 @@ struct SceneSolver {
 #pragma unroll
       for (int i = 0; i < D; i++) {
         low[i] = min(low[i], node[i]);
-        high[i] = max(high[i], node[i] + width);
+        high[i] = ::max(high[i], node[i] + width);
       }
     };
     for_particles([&](int, const int* base) { include(base, Order + 1); });
