@@ -9,14 +9,14 @@ namespace {
 
 using Tensors = std::vector<Tensor>;
 
-Law& law_of(const std::string& name) {
-  Law* law = find_law(name);
+LawEntry& law_of(const std::string& name) {
+  LawEntry* law = find_law(name);
   STD_TORCH_CHECK(law, "law must be one of ", law_names(), ", got ", name);
   return *law;
 }
 
 template <class T, int D>
-const LawKernels<T, D>& kernels_of(Law& law) {
+const LawKernels<T, D>& kernels_of(LawEntry& law) {
   STD_TORCH_CHECK(D == 3 || law.info.in_2d, "the law ", law.info.name, " is for 3-D alone");
   return law.kernels<T, D>();
 }
@@ -101,7 +101,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> law_update(const Tens
                                                                       const Tensors& parameters, const Tensors& history,
                                                                       const OptionalTensor& scene, std::string name,
                                                                       int64_t dim, int64_t options, int64_t details) {
-  Law& law = law_of(name);
+  LawEntry& law = law_of(name);
   check_state(law.info, state, dim);
   const int64_t P = state.size(0);
   Tensor moved, stress, kept, dissipated, multiplier, branch = empty_int(state, {details & kBranch ? P : 0});
@@ -125,7 +125,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> law_update_backward(
     const OptionalTensor& grad_dissipated, const OptionalTensor& grad_multiplier, const Tensor& state,
     const OptionalTensor& C, const Tensors& parameters, const Tensors& history, const OptionalTensor& scene,
     std::string name, int64_t dim, int64_t options, int64_t needs) {
-  Law& law = law_of(name);
+  LawEntry& law = law_of(name);
   check_state(law.info, state, dim);
   const int64_t P = state.size(0), n = int64_t(parameters.size()), m = history_size(law.info, history, dim);
   Tensor by_state, by_C, by_parameters, by_history;
@@ -155,7 +155,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> law_update_double_backward(
     const OptionalTensor& along_state, const OptionalTensor& along_C, const OptionalTensor& along_parameters,
     const Tensor& grad_stress, const Tensor& state, const OptionalTensor& C, const Tensors& parameters,
     const OptionalTensor& scene, std::string name, int64_t dim, int64_t needs) {
-  Law& law = law_of(name);
+  LawEntry& law = law_of(name);
   check_twice(law.info);
   check_state(law.info, state, dim);
   const int64_t P = state.size(0), n = int64_t(parameters.size());
@@ -179,7 +179,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> law_update_double_backward(
 
 Tensor law_scalar(LawScalar which, const Tensor& state, const Tensors& parameters, const Tensors& history,
                   const OptionalTensor& scene, const std::string& name, int64_t dim) {
-  Law& law = law_of(name);
+  LawEntry& law = law_of(name);
   check_state(law.info, state, dim);
   Tensor value = empty(state, {state.size(0)});
   const DeviceScope device(state);
@@ -210,7 +210,7 @@ std::tuple<Tensor, Tensor, Tensor> law_energy_backward(const Tensor& grad_energy
                                                        const Tensors& parameters, const Tensors& history,
                                                        const OptionalTensor& scene, std::string name, int64_t dim,
                                                        int64_t needs) {
-  Law& law = law_of(name);
+  LawEntry& law = law_of(name);
   check_state(law.info, state, dim);
   const int64_t P = state.size(0), n = int64_t(parameters.size()), m = history_size(law.info, history, dim);
   Tensor by_state, by_parameters, by_history;
@@ -232,7 +232,7 @@ std::tuple<Tensor, Tensor, Tensor> law_energy_double_backward(const OptionalTens
                                                               const Tensor& grad_energy, const Tensor& state,
                                                               const Tensors& parameters, const OptionalTensor& scene,
                                                               std::string name, int64_t dim, int64_t needs) {
-  Law& law = law_of(name);
+  LawEntry& law = law_of(name);
   check_twice(law.info);
   check_state(law.info, state, dim);
   const int64_t P = state.size(0), n = int64_t(parameters.size());

@@ -28,7 +28,7 @@ struct LawKernels {
   void (*energy_double_backward)(const LawEnergyDoubleBackwardArguments<T, D>&, void* stream) = nullptr;
 };
 
-struct Law {
+struct LawEntry {
   LawInfo info;
   int level = 0;  // instruction set, in the CPU library
   LawKernels<float, 2> float_2;
@@ -53,10 +53,10 @@ struct Law {
 };
 
 // Enters a law, or more kernels of one that is there.
-Law& enter_law(const LawInfo& info, int level);
+LawEntry& enter_law(const LawInfo& info, int level);
 
 // Null where there is none of this name for the instruction set in use.
-Law* find_law(const std::string& name);
+LawEntry* find_law(const std::string& name);
 
 // As Python reads it.
 std::string laws_as_json();
@@ -80,7 +80,7 @@ LawInfo info_of() {
 
 // Kernels<Law, T, D> has the functions of LawKernels as static members.
 template <template <class, class, int> class Kernels, class Law, class T, int D>
-void fill_kernels(mpm::Law& entry) {
+void fill_kernels(LawEntry& entry) {
   static_assert(kParameters<Law> <= kMostParameters && kHistory<Law> <= kMostHistory);
   if constexpr (D == 3 || Law::in_2d) {
     using K = Kernels<Law, T, D>;
@@ -98,7 +98,7 @@ void fill_kernels(mpm::Law& entry) {
 
 template <template <class, class, int> class Kernels, class Law>
 bool enter(int level) {
-  mpm::Law& entry = enter_law(info_of<Law>(), level);
+  LawEntry& entry = enter_law(info_of<Law>(), level);
   fill_kernels<Kernels, Law, float, 2>(entry);
   fill_kernels<Kernels, Law, float, 3>(entry);
   fill_kernels<Kernels, Law, double, 2>(entry);

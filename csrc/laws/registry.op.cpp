@@ -11,8 +11,8 @@ namespace mpm {
 namespace {
 
 // Not yet constructed when the first law is entered, were it not in a function.
-std::deque<Law>& entered() {
-  static std::deque<Law> laws;
+std::deque<LawEntry>& entered() {
+  static std::deque<LawEntry> laws;
   return laws;
 }
 
@@ -59,29 +59,29 @@ std::string law_as_json(const LawInfo& info) {
 
 }  // namespace
 
-Law& enter_law(const LawInfo& info, int level) {
-  for (Law& law : entered())
+LawEntry& enter_law(const LawInfo& info, int level) {
+  for (LawEntry& law : entered())
     if (law.level == level && std::strcmp(law.info.name, info.name) == 0) return law;
   entered().push_back({info, level, {}, {}, {}, {}});
   return entered().back();
 }
 
-Law* find_law(const std::string& name) {
-  for (Law& law : entered())
+LawEntry* find_law(const std::string& name) {
+  for (LawEntry& law : entered())
     if (law.level == level_in_use() && name == law.info.name) return &law;
   return nullptr;
 }
 
 std::string law_names() {
   std::string names;
-  for (const Law& law : entered())
+  for (const LawEntry& law : entered())
     if (law.level == level_in_use()) names += (names.empty() ? "" : ", ") + std::string(law.info.name);
   return names;
 }
 
 std::string laws_as_json() {
   std::vector<LawInfo> infos;
-  for (const Law& law : entered())
+  for (const LawEntry& law : entered())
     if (law.level == level_in_use()) infos.push_back(law.info);
   return json_list(infos, law_as_json);
 }
