@@ -135,9 +135,9 @@ def test_particles_without_a_scene_count_in_the_totals(device):
 
 def test_no_scenes_and_no_particles(device, dim):
     x = torch.empty((0, dim), device=device)
-    arguments = (0, 0.1, (0.0,) * dim, (3,) * dim, 2, 4, False)
+    arguments = (None, None, 0, 4, [0.1, *[0.0] * dim], [2, 0, *[3] * dim])
     for scene in (None, torch.zeros(0, dtype=torch.int32, device=device)):
-        table, block, offsets, index, _, status = torch.ops.torch_mpm.activate(x, scene, None, *arguments)
+        table, block, offsets, index, _, status = torch.ops.torch_mpm.activate(x, scene, *arguments)
         assert table.numel() == 0 and block.tolist() == [-1] * 4 and offsets.tolist() == [0] * 5
         assert index.numel() == 0 and status.tolist() == [[0, 0, -1, 0, -1, 1, -1, 0]]
     step, state = batch(3, device)

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 import torch_mpm as mpm  # noqa: F401  (registers the ops)
+from torch_mpm.ops.sand import law_name
 
 from .. import common
 from .timing import Clock
@@ -95,6 +96,7 @@ def times(device: str, count: int, clock: Clock) -> Iterator[dict[str, Any]]:
     warp = warp_arrays(rows_first)
     if warp is not None:
         runs.append(("Warp svd3", count, warp[0]))
+    zero = torch.zeros((), device=F.device)
     grads = (grad, grad, None, None, None)
     for energy, flow in (
         ("unilateral", "radial"),
@@ -103,14 +105,14 @@ def times(device: str, count: int, clock: Clock) -> Iterator[dict[str, Any]]:
         ("unilateral", "exact"),
         ("full", "exact"),
     ):
-        options = (F, mu, lam, alpha, None, None, None, energy, flow, "zero")
+        given = (F, None, [mu, lam, alpha, zero, zero], [], None, law_name(energy, flow, 3), 3, 0)
         name = energy if flow == "radial" else f"{energy}, exact flow"
-        runs.append((f"return map with stress, {name}", count, lambda o=options: ops.quartic_return_map(*o, False)))
+        runs.append((f"return map with stress, {name}", count, lambda g=given: ops.law_update(*g, 0)))
         runs.append(
             (
                 f"its backward, {name}",
                 count,
-                lambda o=options: ops.quartic_return_map_backward(*grads, *o, True, True),
+                lambda g=given: ops.law_update_backward(*grads, *g, 5),
             )
         )
     for name, matrices_in, run in runs:

@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 import torch_mpm as mpm  # noqa: F401  (registers the ops)
-from torch_mpm.ops.sand import friction_alpha
+from torch_mpm.ops.sand import friction_alpha, law_name
 
 from .. import common
 
@@ -69,16 +69,17 @@ def count_failures(dim: int, dtype: torch.dtype, energy: str, flow: str, apex: s
         random = torch.rand(3, BATCH, generator=generator, dtype=torch.float64)
         mu, nu, angle = 10 ** (8 * random[0]), 0.4999 * random[1], torch.deg2rad(89 * random[2])
         alpha = friction_alpha(angle, dim)
-        parameters = (mu.to(dtype), (mu * 2 * nu / (1 - 2 * nu)).to(dtype), alpha.to(dtype))
-        options = (F, *parameters, None, None, None, energy, flow, apex)
-        *values, code, multiplier, dissipated, _ = torch.ops.torch_mpm.quartic_return_map(*options, True)
+        zero = torch.zeros((), dtype=dtype)
+        parameters = [mu.to(dtype), (mu * 2 * nu / (1 - 2 * nu)).to(dtype), alpha.to(dtype), zero, zero]
+        rest = (parameters, [], None, law_name(energy, flow, dim), dim, int(apex == "keep"))
+        *values, _, dissipated, multiplier, code = torch.ops.torch_mpm.law_update(F, None, *rest, 7)
         finite = multiplier.isfinite() & dissipated.isfinite()
         for value in values:
             finite &= value.isfinite().all(2).all(1)
         size = F.double().abs().amax((1, 2))
         regular = torch.linalg.det(F.double() / size[:, None, None]) > 1e-12
         ones = torch.ones_like(F)
-        gradient = torch.ops.torch_mpm.quartic_return_map_backward(ones, *(None,) * 4, *options, True, True)[0]
+        gradient = torch.ops.torch_mpm.law_update_backward(ones, *(None,) * 4, F, None, *rest, 5)[0]
         smooth = gradient.isfinite().all(2).all(1)
         steep = (angle > STEEP_ANGLE) & (energy == "unilateral" and dim == 3)
         failed = (~finite, (code > 3) & ~steep, (code == 3) & regular, ~smooth, (code > 3) & steep)

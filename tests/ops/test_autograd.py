@@ -390,7 +390,7 @@ def test_jacobians_of_a_step(device):
     case = rollout_case("NeoHookean", device)
     E, x, v, F, temperature = case.inputs
     centre = lambda v: case.function(E, x, v, F, temperature)[0].mean(0)  # noqa: E731
-    with pytest.raises(NotImplementedError, match=r"torch.vmap over torch_mpm::.*in the place of torch.func.jacrev"):
+    with pytest.raises(NotImplementedError, match=r"torch.vmap over torch_mpm::.*instead of torch.func.jacrev"):
         torch.func.jacrev(centre)(v)
     rows = torch.autograd.functional.jacobian(centre, v)
     direction = torch.randn(v.shape, dtype=torch.float64).to(device)

@@ -62,8 +62,7 @@ def test_first_problem_stays_in_the_status(dim, kernel):
 def test_a_scene_that_does_not_exist_is_outside(dim, kernel, scene_value):
     p = uneven_particles(dim, kernel).to("cuda", torch.float32)
     scene = torch.full_like(p.scene, scene_value)
-    grid = p.grid
-    out = torch.ops.torch_mpm.activate(p.x, scene, None, 2, grid.dx, grid.lower, grid.blocks, grid.order, 3000, False)
+    out = torch.ops.torch_mpm.activate(p.x, scene, None, None, 2, 3000, *p.grid.packed)
     assert not out[5][1:, 1:5:2].any()
     status = out[5][0].tolist()
     assert status[1] == len(p.x) - 2 and status[3] == 2 and status[7] == 0 and out[2].eq(0).all()

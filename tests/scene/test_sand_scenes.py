@@ -157,7 +157,7 @@ def test_sand_of_a_scene_file():
     mu, lam = law.values()[:2]
     assert (mu, lam) == pytest.approx((1e7 / 2.6, 1e7 * 0.3 / (1.3 * 0.4)))
     assert float(built.state.mass.sum()) == pytest.approx(1600 * math.pi * 0.04)
-    assert (law.flow, law.cohesive, law.extra_fields) == ("radial", False, ())
+    assert (law.flow, law.cohesion, law.extra_fields) == ("radial", 0.0, ())
     words = {"law": "quartic_sand", "mu": 2e6, "lam": 3e6, "flow": "exact", "cohesion": 0.01, "volume_correction": True}
     words["hardening"] = (35, 9, 0.2, 10)
     law = mpm.Scene(**disc(material={"jelly": words})).build("cpu").step.law

@@ -30,7 +30,7 @@ BOX = {"shape": "box", "lower": (0.1, 0.1), "upper": (0.3, 0.3), "material": "je
         ({"body__0__shape": "spere"}, "body[0].shape: takes one of 'box', 'sphere', 'cylinder', 'capsule', 'mesh', 'points', "
          "got 'spere'; did you mean 'sphere'?"),
         ({"body": [{"radius": 1}]}, "body[0].shape: missing; takes one of 'box'"),
-        ({"material__jelly__law": "neo_hooke"}, "material.jelly.law: takes one of 'neo_hookean', 'weakly_compressible', 'quartic_sand', 'fixed_corotated',"),
+        ({"material__jelly__law": "neo_hooke"}, "material.jelly.law: takes one of 'neo_hookean', 'weakly_compressible', 'quartic_sand', 'cam_clay',"),
         ({"material__jelly__density": -1.0}, "material.jelly.density: should be greater than 0, got -1.0; takes: density at rest"),
         ({"material__jelly__nu": 0.5}, "material.jelly.nu: should be less than 0.5, got 0.5; takes: Poisson's ratio"),
         ({"material__jelly": {"law": "neo_hookean"}}, "material.jelly.E: missing; takes: Young's modulus [Pa]"),

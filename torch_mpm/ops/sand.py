@@ -260,6 +260,8 @@ def _composed(
     apex: str,
     details: bool,
 ) -> tuple[Tensor, ...]:
+    if F.dim() == 3:
+        check_like("volume", volume, F, (F.shape[0],), "[P]")
     r = quartic_return_map(
         F, mu, lam, None, alpha, scene, energy, apex, details, flow, cohesion, volume_correction=volume
     )
