@@ -178,7 +178,11 @@ class CompiledLaw(Material):
         x, particles = state.x, getattr(state, "particles", state.x.shape[0])
         result = []
         for value in self.values():
-            tensor = torch.as_tensor(value, dtype=x.dtype, device=x.device)
+            if isinstance(value, Tensor):
+                tensor = value.to(x.device, x.dtype)
+            else:
+                number = float(value)  # type: ignore[arg-type]
+                tensor = torch.full((), number, dtype=x.dtype, device=x.device)  # not a copy, which graphs refuse
             if state.ids is not None and particles > 1 and tensor.shape == (particles,):
                 tensor = tensor.index_select(0, state.ids)
             result.append(tensor)

@@ -232,7 +232,8 @@ def _check_number(name: str, value: Value | None, expected: str, most: float = m
 def _parameter(name: str, value: Value | None, F: Tensor, scene: Tensor | None) -> Tensor:
     if not isinstance(value, Tensor):
         check_real(name, value, NUMBER_OR_TENSOR)
-        return torch.tensor(value, dtype=F.dtype, device=F.device)
+        number = float(value)  # type: ignore[arg-type]
+        return torch.full((), number, dtype=F.dtype, device=F.device)  # not a copy from the host, which graphs refuse
     check_parameter(name, value, F, scene)
     return value
 
