@@ -116,33 +116,51 @@ py::dict evaluate(const std::string& law, const Array<double>& F_, const std::ve
   return result;
 }
 
+// The map of up to 8 strains in one pack; apart from what may throw, with which GCC 12 cannot align the stack.
+template <class Energy, class T>
+__attribute__((noinline)) MappedStrain<Pack<T, 8>, 3> map_pack(const T* h, const T* alpha, const T* ratio, int count) {
+  using P = Pack<T, 8>;
+  Vector<P, 3> strain;
+  Cone<P> cone;
+  for (int lane = 0; lane < 8; lane++) {
+    const int i = std::min(lane, count - 1);
+    for (int k = 0; k < 3; k++) strain[k].set(lane, h[3 * i + k]);
+    cone.alpha.set(lane, alpha[i]);
+    cone.ratio.set(lane, ratio[i]);
+  }
+  return return_map<Energy, P>(strain, cone, P(0) == P(0), P(0) < P(0), false);
+}
+
+// What is left of one lane: the strain, the branch plus 4 where the root was not found, and the evaluations of the
+// yield function.
+template <class T>
+__attribute__((noinline)) void read_lane(const MappedStrain<Pack<T, 8>, 3>& m, int lane, T* h, int* branch,
+                                         int* steps) {
+  for (int k = 0; k < 3; k++) h[k] = m.h[k][lane];
+  const int kind = m.cone[lane] ? kCone : m.apex[lane] ? kApex : kElastic;
+  *branch = kind + 4 * !m.converged[lane];
+  *steps = int(m.steps[lane]);
+}
+
+template <class Energy, class T>
+__attribute__((noinline)) void map_all(const T* h, const T* alpha, const T* ratio, py::ssize_t n, T* mapped,
+                                       int* branch, int* steps) {
+  for (py::ssize_t i = 0; i < n; i += 8) {
+    const int count = int(std::min<py::ssize_t>(8, n - i));
+    const MappedStrain<Pack<T, 8>, 3> m = map_pack<Energy>(h + 3 * i, alpha + i, ratio + i, count);
+    for (int lane = 0; lane < count; lane++)
+      read_lane(m, lane, mapped + 3 * (i + lane), branch + i + lane, steps + i + lane);
+  }
+}
+
 // Mapped strains [n, 3], branches and evaluations of the yield function [n] of trial strains, in packs of 8.
 template <class Energy, class T>
 py::tuple map_strains(const Array<T>& h, const Array<T>& alpha, const Array<T>& ratio) {
-  using P = Pack<T, 8>;
   const py::ssize_t n = alpha.size();
   Array<T> mapped({n, py::ssize_t(3)});
   Array<int> branch(n), steps(n);
-  for (py::ssize_t i = 0; i < n; i += 8) {
-    const int count = int(std::min<py::ssize_t>(8, n - i));
-    Vector<P, 3> strain;
-    Cone<P> cone;
-    for (int lane = 0; lane < 8; lane++) {
-      const py::ssize_t p = i + std::min(lane, count - 1);
-      for (int k = 0; k < 3; k++) strain[k].set(lane, h.data()[3 * p + k]);
-      cone.alpha.set(lane, alpha.data()[p]);
-      cone.ratio.set(lane, ratio.data()[p]);
-    }
-    const MappedStrain<P, 3> m = return_map<Energy, P>(strain, cone, P(0) == P(0), P(0) < P(0), false);
-    for (int lane = 0; lane < count; lane++) {
-      for (int k = 0; k < 3; k++) mapped.mutable_data()[3 * (i + lane) + k] = m.h[k][lane];
-      branch.mutable_data()[i + lane] = (m.cone[lane]   ? kCone
-                                         : m.apex[lane] ? kApex
-                                                        : kElastic) +
-                                        4 * !m.converged[lane];
-      steps.mutable_data()[i + lane] = int(m.steps[lane]);
-    }
-  }
+  map_all<Energy>(h.data(), alpha.data(), ratio.data(), n, mapped.mutable_data(), branch.mutable_data(),
+                  steps.mutable_data());
   return py::make_tuple(mapped, branch, steps);
 }
 
