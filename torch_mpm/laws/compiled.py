@@ -152,7 +152,7 @@ class CompiledLaw(Material):
     def _parameters_of(self, state: State) -> list[Tensor]:
         """Parameters in the dtype, on the device and in the particle order of the state.
 
-        GraphCache from call to call while nothing has changed and none requires grad.
+        Kept from call to call while nothing has changed and none requires grad.
         """
         if self._functions:
             in_order: Any = Overlay(state, ids=None)  # which evaluated parameters already are
