@@ -16,9 +16,6 @@ from benchmarks import common
 
 # ---- errors
 
-TOLERANCE = {torch.float32: 1e-6, torch.float64: 1e-13}
-"""Relative error of a result that only rounding changes."""
-
 
 def relative_error(value: Tensor, reference: Tensor) -> float:
     value, reference = value.detach().cpu().double(), reference.detach().cpu().double()
