@@ -195,13 +195,15 @@ class Ninja:
         self.lines.append(text + ("\n  depfile = $out.d\n  deps = gcc" if depfile else ""))
 
     def library(self, library: Library) -> None:
-        objects = []
+        """Edges are listed in reverse, since ninja starts the first ones first and the kernels take longest."""
+        objects, edges = [], []
         for source, rule, flags in library.objects:
             relative = source.relative_to(ROOT)
             variant = [Path(f.partition("=")[2].strip('"')).stem for f in flags if f.startswith(VARIANTS)]
             target = f"{library.name}.obj/{'.'.join([str(relative), *variant])}.o"
-            self.lines.append(f"build {target}: {rule} {UP}{relative}\n  flags = {shlex.join(flags)}")
+            edges.append(f"build {target}: {rule} {UP}{relative}\n  flags = {shlex.join(flags)}")
             objects.append(target)
+        self.lines += reversed(edges)
         self.lines.append(f"build {library.name}: {library.rule} {' '.join(objects)}")
 
     def run(self, targets: list[str]) -> None:

@@ -14,6 +14,8 @@ struct One {
   int64_t p;
 
   MPM_HD T load(const T* pointer, int64_t stride) const { return pointer[p * stride]; }
+  // Of a value that is often the same for all particles, which have the stride 0 then.
+  MPM_HD T load_shared(const T* pointer, int64_t stride) const { return load(pointer, stride); }
   MPM_HD void store(T* pointer, int64_t stride, const T& value) const { pointer[p * stride] = value; }
   // f(particle) of each particle.
   template <class F>

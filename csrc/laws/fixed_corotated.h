@@ -9,6 +9,7 @@ inline namespace TORCH_MPM_ISA {
 struct FixedCorotated : FixedCorotatedElasticity {
   static constexpr const char* name = "fixed_corotated";
   static constexpr std::array parameters = {not_negative("mu", "Pa"), real("lam", "Pa")};
+  static constexpr bool twice_differentiable_energy = true;
 };
 
 MPM_REGISTER_LAW(FixedCorotated)

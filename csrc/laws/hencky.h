@@ -9,6 +9,7 @@ inline namespace TORCH_MPM_ISA {
 struct HenckyElastic : HenckyElasticity {
   static constexpr const char* name = "hencky";
   static constexpr std::array parameters = {not_negative("mu", "Pa"), real("lam", "Pa")};
+  static constexpr bool twice_differentiable_energy = true;
 };
 
 MPM_REGISTER_LAW(HenckyElastic)

@@ -17,13 +17,11 @@ struct InvariantKernels;
 
 struct InvariantLaw {
   static constexpr bool viscous = false, plastic = false, twice_differentiable = true, optional_history = false,
-                        in_2d = true;
+                        twice_differentiable_energy = true, in_2d = true;
   static constexpr auto history = no_history;
   static constexpr auto options = no_options;
-  // The 18 arrays of F and τ may fall on the same cache sets (when P is a power of two), and then a cache line does not
-  // survive until its other half is read.
-  static constexpr bool packs_fill_cache_lines = true;
-  static constexpr int gpu_threads = 256, gpu_update_blocks = 1, gpu_backward_blocks = 1;
+  static constexpr bool memory_bound = true;
+  static constexpr int gpu_threads = 256, gpu_update_blocks = 0, gpu_backward_blocks = 0;
   template <class Law>
   using Kernels = InvariantKernels<Law>;
 };
@@ -247,7 +245,8 @@ struct InvariantKernels {
   MPM_HD static void update_backward(const LawBackwardArguments<T, D>& a, const At& at) {
     using V = typename At::Value;
     const InvariantNeeds needs = {a.state.pointer != nullptr, a.C.pointer != nullptr, a.parameters.pointer != nullptr};
-    const auto g = stress_adjoint(load_state<Law, V>(at, a.law), load_matrix_or_zero<D>(at, a.grad_stress), needs);
+    const Matrix<V, D> grad = load_matrix_or_zero<D>(at, a.grad_stress);
+    const auto g = stress_adjoint(load_state<Law, V>(at, a.law), grad, needs);
     store_state(at, g, a.state, a.C, a.parameters);
   }
 

@@ -12,7 +12,14 @@ inline namespace TORCH_MPM_ISA {
 template <class Law, class T, int D>
 struct LawLoops {
   using Kernels = typename Law::template Kernels<Law>;
-  static constexpr int kBytes = Law::packs_fill_cache_lines ? 64 : kRegisterBytes;
+  // Where memory is what a kernel waits for, packs fill cache lines: the 18 arrays of F and τ may fall on the same
+  // cache sets (when P is a power of two), and then a line does not survive until its other half is read.
+  static constexpr int kBytes = Law::memory_bound ? 64 : kRegisterBytes;
+
+  template <int Bytes, class F>
+  static void by_groups(int64_t particles, const F& body) {
+    for_groups<T, Bytes, Law::memory_bound>(particles, body);
+  }
 
   // Without packs: what is seldom called, and would take minutes to compile with dual numbers of packs.
   template <class F>
@@ -24,26 +31,30 @@ struct LawLoops {
   }
 
   static void update(const LawUpdateArguments<T, D>& a, void*) {
-    for_groups<T, kBytes>(a.law.particles, [&](const auto& at) { Kernels::update(a, at); });
+    by_groups<kBytes>(a.law.particles, [&](const auto& at) { Kernels::update(a, at); });
   }
   static void update_backward(const LawBackwardArguments<T, D>& a, void*) {
-    for_groups<T, kBytes>(a.law.particles, [&](const auto& at) { Kernels::update_backward(a, at); });
+    by_groups<kBytes>(a.law.particles, [&](const auto& at) { Kernels::update_backward(a, at); });
   }
   static void double_backward(const LawDoubleBackwardArguments<T, D>& a, void*) {
     one_by_one(a.law.particles, [&](const auto& at) { Kernels::double_backward(a, at); });
   }
   static void scalar(const LawScalarArguments<T, D>& a, void*) {
-    for_groups<T>(a.law.particles, [&](const auto& at) { Kernels::scalar(a, at); });
+    by_groups<kRegisterBytes>(a.law.particles, [&](const auto& at) { Kernels::scalar(a, at); });
+  }
+  // With a decomposition, which is written for packs; nested dual numbers of packs would take minutes without.
+  template <class F>
+  static void for_energies(int64_t particles, const F& body) {
+    if constexpr (Law::twice_differentiable)
+      one_by_one(particles, body);
+    else
+      by_groups<kRegisterBytes>(particles, body);
   }
   static void energy_backward(const LawEnergyBackwardArguments<T, D>& a, void*) {
-    const auto body = [&](const auto& at) { Kernels::energy_backward(a, at); };
-    if constexpr (Law::twice_differentiable)
-      one_by_one(a.law.particles, body);
-    else
-      for_groups<T>(a.law.particles, body);
+    for_energies(a.law.particles, [&](const auto& at) { Kernels::energy_backward(a, at); });
   }
   static void energy_double_backward(const LawEnergyDoubleBackwardArguments<T, D>& a, void*) {
-    one_by_one(a.law.particles, [&](const auto& at) { Kernels::energy_double_backward(a, at); });
+    for_energies(a.law.particles, [&](const auto& at) { Kernels::energy_double_backward(a, at); });
   }
 };
 

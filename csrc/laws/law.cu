@@ -6,7 +6,8 @@
 
 namespace mpm::cuda {
 
-// Thread blocks per multiprocessor, which bound the registers; float64 takes twice as many of them.
+// Thread blocks per multiprocessor, which bound the registers, or 0: as the compiler likes. float64 takes twice as many
+// registers.
 template <class Law, class T>
 constexpr int kUpdateBlocks = sizeof(T) == 4 ? Law::gpu_update_blocks : (Law::gpu_update_blocks + 1) / 2;
 

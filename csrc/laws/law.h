@@ -152,7 +152,7 @@ MPM_HD typename At::Value load_parameter(const At& at, const LawArguments<T, D>&
       return parameter.pointer[(id >= 0 && id < parameter.scenes ? id : 0) * parameter.stride];
     });
   }
-  return at.load(parameter.pointer, parameter.stride);
+  return at.load_shared(parameter.pointer, parameter.stride);
 }
 
 // Entry k of a field [P, n].

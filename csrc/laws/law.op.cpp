@@ -86,11 +86,12 @@ LawArguments<T, D> arguments(const LawInfo& law, const Tensor& state, const Opti
   return a;
 }
 
-// A result per particle, or an empty tensor where it is not wanted.
+// A result per particle; where it is not wanted it stays undefined, None in Python.
 template <class T>
 Field<T> result(const Tensor& like, bool wanted, const Shape& shape, Tensor& out) {
-  out = wanted ? empty_particles(like, shape) : empty(like, {0});
-  return wanted ? field<T>(out) : Field<T>{};
+  if (!wanted) return {};
+  out = empty_particles(like, shape);
+  return field<T>(out);
 }
 
 // Bits of `details` and of `needs`, as torch_mpm/ops/law.py has them.
@@ -104,7 +105,8 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> law_update(const Tens
   LawEntry& law = law_of(name);
   check_state(law.info, state, dim);
   const int64_t P = state.size(0);
-  Tensor moved, stress, kept, dissipated, multiplier, branch = empty_int(state, {details & kBranch ? P : 0});
+  Tensor moved, stress, kept, dissipated, multiplier, branch;
+  if (details & kBranch) branch = empty_int(state, {P});
   const DeviceScope device(state);
   dispatch(state, "the state", dim, [&]<class T, int D>() {
     LawUpdateArguments<T, D> a;
@@ -147,8 +149,8 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> law_update_backward(
   return {by_state, by_C, by_parameters, by_history};
 }
 
-void check_twice(const LawInfo& law) {
-  STD_TORCH_CHECK(law.twice_differentiable, "the law ", law.name, " has no second derivatives");
+void check_twice(bool differentiable, const char* what, const LawInfo& law) {
+  STD_TORCH_CHECK(differentiable, what, " of the law ", law.name, " has no second derivatives");
 }
 
 std::tuple<Tensor, Tensor, Tensor, Tensor> law_update_double_backward(
@@ -156,7 +158,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> law_update_double_backward(
     const Tensor& grad_stress, const Tensor& state, const OptionalTensor& C, const Tensors& parameters,
     const OptionalTensor& scene, std::string name, int64_t dim, int64_t needs) {
   LawEntry& law = law_of(name);
-  check_twice(law.info);
+  check_twice(law.info.twice_differentiable, "the stress", law.info);
   check_state(law.info, state, dim);
   const int64_t P = state.size(0), n = int64_t(parameters.size());
   Tensor by_grad, by_state, by_C, by_parameters;
@@ -233,7 +235,7 @@ std::tuple<Tensor, Tensor, Tensor> law_energy_double_backward(const OptionalTens
                                                               const Tensors& parameters, const OptionalTensor& scene,
                                                               std::string name, int64_t dim, int64_t needs) {
   LawEntry& law = law_of(name);
-  check_twice(law.info);
+  check_twice(law.info.twice_differentiable_energy, "the energy", law.info);
   check_state(law.info, state, dim);
   const int64_t P = state.size(0), n = int64_t(parameters.size());
   Tensor by_grad, by_state, by_parameters;

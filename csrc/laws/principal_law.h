@@ -12,8 +12,8 @@
 //                               rest volume: plastic work less what hardening stores (plastic laws only);
 //   energy, stress, tangent     ψ(h), τᵢ = ∂ψ/∂hᵢ and ∂τ/∂h, at given history;
 //   stress_quotient(a, b)       (τᵢ − τⱼ)/(hᵢ − hⱼ) at hᵢ = a, hⱼ = b.
-// Its derivatives, of first order, come from dual numbers. The map must be continuous; on a boundary between branches
-// its derivative is that of the branch which the comparison takes.
+// Its derivatives come from dual numbers: those of first order, and of second order of the energy alone. The map must
+// be continuous; on a boundary between branches its derivative is that of the branch which the comparison takes.
 namespace mpm {
 inline namespace TORCH_MPM_ISA {
 
@@ -24,10 +24,11 @@ struct PrincipalLaw {
   static constexpr Deformation field = Deformation::gradient;
   static constexpr bool viscous = false, plastic = false, twice_differentiable = false, optional_history = false,
                         in_2d = true;
+  static constexpr bool twice_differentiable_energy = false;  // history counts as constant
   static constexpr auto history = no_history;
   static constexpr auto options = no_options;
-  static constexpr bool packs_fill_cache_lines = false;
-  static constexpr int gpu_threads = 128, gpu_update_blocks = 1, gpu_backward_blocks = 1;
+  static constexpr bool memory_bound = false;
+  static constexpr int gpu_threads = 128, gpu_update_blocks = 0, gpu_backward_blocks = 0;
   template <class Law>
   using Kernels = PrincipalKernels<Law>;
 };
@@ -173,14 +174,18 @@ MPM_HD T poison(const Response<Law, T, D>& r) {
   return nan;
 }
 
-// Length of the plastic increment of the strains; its derivative is zero where there is none.
+// The plastic increment h − H of the strains: its length, and its direction, zero where there is none.
 template <class T, int D>
-MPM_HD T increment_norm(const Vector<T, D>& h, const Vector<T, D>& H) {
-  T square = T(0);
-  MPM_UNROLL for (int i = 0; i < D; i++)
-    square = square + (h[i] - H[i]) * (h[i] - H[i]);
-  const auto moved = square > T(0);
-  return select(moved, sqrt(select(moved, square, T(1))), T(0));
+struct PlasticIncrement {
+  T norm;
+  Vector<T, D> direction;
+};
+
+template <class T, int D>
+MPM_HD PlasticIncrement<T, D> plastic_increment(const Vector<T, D>& h, const Vector<T, D>& H) {
+  const Vector<T, D> lost = h + T(-1) * H;
+  const T norm = sqrt(dot(lost, lost));
+  return {norm, (T(1) / select(norm > T(0), norm, T(1))) * lost};
 }
 
 // Adjoints of what a law takes, from forward derivatives: `derivative(h, data)` gives the sum of the adjoints of the
@@ -223,8 +228,20 @@ struct PrincipalGrads {
   Matrix<V, D> F, stress;
   V history[kHistoryLength<Law>];
   V dissipated, multiplier;
-  bool has_multiplier;
 };
+
+// Absent ones are zero. They are loaded before the state, so that no load waits for the arithmetic on another.
+template <class Law, class At, class T, int D>
+MPM_HD PrincipalGrads<Law, typename At::Value, D> load_grads(const At& at, const LawBackwardArguments<T, D>& a) {
+  PrincipalGrads<Law, typename At::Value, D> r;
+  r.F = load_matrix_or_zero<D>(at, a.grad_state);
+  r.stress = load_matrix_or_zero<D>(at, a.grad_stress);
+  MPM_UNROLL for (int k = 0; k < kHistory<Law>; k++)
+    r.history[k] = a.grad_history.pointer ? load_entry(at, a.grad_history, k) : typename At::Value(0);
+  r.dissipated = load_scalar_or_zero(at, a.grad_dissipated);
+  r.multiplier = load_scalar_or_zero(at, a.grad_multiplier);
+  return r;
+}
 
 // The adjoint of F through the map and its stress; those of parameters and history go to where `differentiate` says.
 template <class Law, class V, int D, class StoreParameter, class StoreHistory>
@@ -234,22 +251,22 @@ MPM_HD Matrix<V, D> map_adjoint(const HenckyStrain<V, D>& s, const PrincipalData
                                 const StoreHistory& store_history) {
   const Matrix<V, D> right = right_axes(s);
   const Matrix<V, D> M = transpose(s.U) * grad.F * right, N = transpose(s.U) * symmetric_part(grad.stress) * s.U;
+  const Vector<V, D> by_multiplier = grad.multiplier * plastic_increment(s.h, r.h).direction;
   Vector<V, D> grad_h;
   MPM_UNROLL for (int i = 0; i < D; i++)
-    grad_h[i] = M[i][i] * exponential(r.h[i]);
+    grad_h[i] = M[i][i] * exponential(r.h[i]) - by_multiplier[i];
   const Vector<V, D> diagonal =
-      differentiate<Law>(s.h, data, parameters, history, store_parameter, store_history,
-                         [&](const Vector<Dual<V>, D>& h, const PrincipalData<Law, Dual<V>>& given) {
-                           const Response<Law, Dual<V>, D> moved = respond<Law>(h, given);
-                           V value = grad.dissipated * moved.dissipated.derivative;
-                           if (grad.has_multiplier)
-                             value = value + grad.multiplier * increment_norm(h, moved.h).derivative;
-                           MPM_UNROLL for (int i = 0; i < D; i++)
-                             value = value + grad_h[i] * moved.h[i].derivative + N[i][i] * moved.tau[i].derivative;
-                           MPM_UNROLL for (int k = 0; k < kHistory<Law>; k++)
-                             value = value + grad.history[k] * moved.history[k].derivative;
-                           return value;
-                         });
+      by_multiplier + differentiate<Law>(s.h, data, parameters, history, store_parameter, store_history,
+                                         [&](const Vector<Dual<V>, D>& h, const PrincipalData<Law, Dual<V>>& given) {
+                                           const Response<Law, Dual<V>, D> moved = respond<Law>(h, given);
+                                           V value = grad.dissipated * moved.dissipated.derivative;
+                                           MPM_UNROLL for (int i = 0; i < D; i++)
+                                             value = value + grad_h[i] * moved.h[i].derivative +
+                                                     N[i][i] * moved.tau[i].derivative;
+                                           MPM_UNROLL for (int k = 0; k < kHistory<Law>; k++)
+                                             value = value + grad.history[k] * moved.history[k].derivative;
+                                           return value;
+                                         });
   const Matrix<V, D> principal =
       principal_adjoint(s, r.h, diagonal, symmetric_part(M), skew_part(M), N, [&](int i, int j) {
         Quotients<V> q = {V(1), Law::stress_quotient(r.h[i], r.h[j], data.parameters, r.history)};
@@ -272,6 +289,33 @@ MPM_HD Matrix<V, D> energy_adjoint(const HenckyStrain<V, D>& s, const PrincipalD
   MPM_UNROLL for (int i = 0; i < D; i++)
     diagonal[i] = diagonal[i] * s.scale * s.inverse[i];
   return compose(s.U, diagonal, right_axes(s));
+}
+
+// The derivative of P = τ F⁻ᵀ = U diag(τᵢ/σᵢ) Vᵀ along A, in principal axes: M = Uᵀ A V, and `tau` carries the
+// derivatives of the stresses along it. Off the diagonal stand the divided difference and the divided sum of τᵢ/σᵢ
+// (Ogden 1997, section 6.1.4) with d = hᵢ − hⱼ, the mean stress m and the quotient q of the stresses,
+//   (Pᵢ − Pⱼ)/(σᵢ − σⱼ) = (q d/2 coth d/2 − m)/(σᵢσⱼ),   (Pᵢ + Pⱼ)/(σᵢ + σⱼ) = (m − q d/2 tanh d/2)/(σᵢσⱼ).
+template <class Law, class V, int D>
+MPM_HD Matrix<V, D> stress_derivative(const HenckyStrain<V, D>& s, const PrincipalData<Law, V>& data,
+                                      const Vector<Dual<V>, D>& h, const Vector<Dual<V>, D>& tau,
+                                      const Matrix<V, D>& M) {
+  Vector<V, D> inverse;  // of the stretches
+  Matrix<V, D> r;
+  MPM_UNROLL for (int i = 0; i < D; i++) {
+    inverse[i] = s.scale * s.inverse[i];
+    r[i][i] = (tau[i].derivative - tau[i].value * h[i].derivative) * inverse[i];
+  }
+  MPM_UNROLL for (int i = 0; i < D; i++) MPM_UNROLL
+    for (int j = i + 1; j < D; j++) {
+      const V half = V(0.5) * (s.h[i] - s.h[j]), mean = V(0.5) * (tau[i].value + tau[j].value);
+      const V quotient = Law::stress_quotient(s.h[i], s.h[j], data.parameters, data.history);
+      const Hyperbolic<V> of = hyperbolic(half);
+      const V even = (quotient * of.cosh / of.sinhc - mean) * V(0.5) * (M[i][j] + M[j][i]);
+      const V odd = (mean - quotient * half * half * of.sinhc / of.cosh) * V(0.5) * (M[i][j] - M[j][i]);
+      r[i][j] = inverse[i] * inverse[j] * (even + odd);
+      r[j][i] = inverse[i] * inverse[j] * (even - odd);
+    }
+  return r;
 }
 
 // Upper bound of |dτ/dF : G F| + max |τᵢ| ≥ the second variation of ψ, over velocity gradients G with |G| = 1. In
@@ -330,7 +374,7 @@ struct PrincipalKernels {
       store_entry(at, a.history, k, select(moved, r.history[k], data.history[k]));
     if (a.dissipated.pointer) at.store(a.dissipated.pointer, a.dissipated.stride[0], select(moved, r.dissipated, V(0)));
     if (a.multiplier.pointer)
-      at.store(a.multiplier.pointer, a.multiplier.stride[0], select(moved, increment_norm(s.h, r.h), V(0)));
+      at.store(a.multiplier.pointer, a.multiplier.stride[0], select(moved, plastic_increment(s.h, r.h).norm, V(0)));
     if (a.branch) {
       const V branch =
           select(r.flow.plastic, V(kPlasticFlow), V(kElasticFlow)) + select(r.flow.converged, V(0), V(kNotConverged));
@@ -348,18 +392,12 @@ struct PrincipalKernels {
   template <class At, class T, int D>
   MPM_HD static void update_backward(const LawBackwardArguments<T, D>& a, const At& at) {
     using V = typename At::Value;
-    const HenckyStrain<V, D> s = hencky_strain(load_matrix<D>(at, a.law.state));
+    const PrincipalGrads<Law, V, D> grad = load_grads<Law>(at, a);
+    const Matrix<V, D> F = load_matrix<D>(at, a.law.state);
     const PrincipalData<Law, V> data = load_data<Law>(at, a.law);
+    const HenckyStrain<V, D> s = hencky_strain(F);
     const Response<Law, V, D> r = respond<Law>(s.h, data);
     const auto valid = s.valid & (poison(r) == V(0));
-    PrincipalGrads<Law, V, D> grad;
-    grad.F = load_matrix_or_zero<D>(at, a.grad_state);
-    grad.stress = load_matrix_or_zero<D>(at, a.grad_stress);
-    grad.dissipated = load_scalar_or_zero(at, a.grad_dissipated);
-    grad.multiplier = load_scalar_or_zero(at, a.grad_multiplier);
-    grad.has_multiplier = a.grad_multiplier.pointer != nullptr;
-    MPM_UNROLL for (int k = 0; k < kHistory<Law>; k++)
-      grad.history[k] = a.grad_history.pointer ? load_entry(at, a.grad_history, k) : V(0);
     const Matrix<V, D> by_F = map_adjoint<Law>(
         s, data, r, grad, a.parameters.pointer != nullptr, a.history.pointer != nullptr,
         [&](int k, const V& value) { store_entry(at, a.parameters, k, select(valid, value, V(0))); },
@@ -396,6 +434,53 @@ struct PrincipalKernels {
         [&](int k, const V& value) { store_entry(at, a.parameters, k, select(valid, value, V(0))); },
         [&](int k, const V& value) { store_entry(at, a.history, k, select(valid, value, V(0))); });
     if (a.state.pointer) store_matrix<D>(at, a.state, select(valid, by_F, zero_matrix<V, D>()));
+  }
+
+  // Of g ψ(F, p) along a direction: the derivatives of g ∂ψ/∂F and g ∂ψ/∂p, and that of ψ, which is by g.
+  template <class At, class T, int D>
+  MPM_HD static void energy_double_backward(const LawEnergyDoubleBackwardArguments<T, D>& a, const At& at) {
+    using V = typename At::Value;
+    const HenckyStrain<V, D> s = hencky_strain(load_matrix<D>(at, a.law.state));
+    const PrincipalData<Law, V> data = load_data<Law>(at, a.law);
+    const V grad = at.load(a.grad_energy.pointer, a.grad_energy.stride[0]);
+    const Matrix<V, D> right = right_axes(s), M = transpose(s.U) * load_matrix_or_zero<D>(at, a.along_state) * right;
+
+    Vector<Dual<V>, D> h;
+    PrincipalData<Law, Dual<V>> moved;
+    MPM_UNROLL for (int i = 0; i < D; i++)
+      h[i] = {s.h[i], M[i][i] * s.scale * s.inverse[i]};
+    MPM_UNROLL for (int k = 0; k < kParameters<Law>; k++)
+      moved.parameters[k] = {data.parameters[k],
+                             a.along_parameters.pointer ? load_entry(at, a.along_parameters, k) : V(0)};
+    MPM_UNROLL for (int k = 0; k < kHistory<Law>; k++)
+      moved.history[k] = {data.history[k], V(0)};
+    const Dual<V> energy = Law::energy(h, moved.parameters, moved.history);
+    const auto valid = s.valid & (energy.value - energy.value == V(0));
+
+    if (a.energy.pointer) at.store(a.energy.pointer, a.energy.stride[0], select(valid, energy.derivative, V(0)));
+    if (a.state.pointer) {
+      const Vector<Dual<V>, D> tau = Law::stress(h, moved.parameters, moved.history);
+      const Matrix<V, D> by_F = grad * (s.U * stress_derivative<Law>(s, data, h, tau, M) * transpose(right));
+      store_matrix<D>(at, a.state, select(valid, by_F, zero_matrix<V, D>()));
+    }
+    if (a.parameters.pointer) MPM_UNROLL
+      for (int k = 0; k < kParameters<Law>; k++)
+        store_entry(at, a.parameters, k, select(valid, grad * energy_slope(h, moved, k).derivative, V(0)));
+  }
+
+ private:
+  // ∂ψ/∂pₖ.
+  template <class V, int D>
+  MPM_HD static V energy_slope(const Vector<V, D>& h, const PrincipalData<Law, V>& data, int k) {
+    Vector<Dual<V>, D> strain;
+    PrincipalData<Law, Dual<V>> given;
+    MPM_UNROLL for (int i = 0; i < D; i++)
+      strain[i] = {h[i], V(0.0)};
+    MPM_UNROLL for (int n = 0; n < kParameters<Law>; n++)
+      given.parameters[n] = {data.parameters[n], V(n == k ? 1.0 : 0.0)};
+    MPM_UNROLL for (int n = 0; n < kHistory<Law>; n++)
+      given.history[n] = {data.history[n], V(0.0)};
+    return Law::energy(strain, given.parameters, given.history).derivative;
   }
 };
 

@@ -12,7 +12,8 @@ namespace mpm {
 struct LawInfo {
   const char* name = "";
   Deformation field = Deformation::gradient;
-  bool viscous = false, plastic = false, optional_history = false, twice_differentiable = false, in_2d = true;
+  bool viscous = false, plastic = false, optional_history = false, twice_differentiable = false,
+       twice_differentiable_energy = false, in_2d = true;
   std::vector<Quantity> parameters, history;
   std::vector<const char*> options;
 };
@@ -72,6 +73,7 @@ LawInfo info_of() {
           Law::plastic,
           Law::optional_history,
           Law::twice_differentiable,
+          Law::twice_differentiable_energy,
           Law::in_2d,
           {Law::parameters.begin(), Law::parameters.end()},
           {Law::history.begin(), Law::history.end()},
@@ -89,10 +91,8 @@ void fill_kernels(LawEntry& entry) {
     kernels.update_backward = K::update_backward;
     kernels.scalar = K::scalar;
     kernels.energy_backward = K::energy_backward;
-    if constexpr (Law::twice_differentiable) {
-      kernels.double_backward = K::double_backward;
-      kernels.energy_double_backward = K::energy_double_backward;
-    }
+    if constexpr (Law::twice_differentiable) kernels.double_backward = K::double_backward;
+    if constexpr (Law::twice_differentiable_energy) kernels.energy_double_backward = K::energy_double_backward;
   }
 }
 

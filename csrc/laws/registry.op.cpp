@@ -51,10 +51,11 @@ std::string law_as_json(const LawInfo& info) {
          "\", \"field\": " + (info.field == Deformation::gradient ? "\"F\"" : "\"J\"") +
          ", \"viscous\": " + flag(info.viscous) + ", \"plastic\": " + flag(info.plastic) +
          ", \"optional_history\": " + flag(info.optional_history) +
-         ", \"twice_differentiable\": " + flag(info.twice_differentiable) + ", \"in_2d\": " + flag(info.in_2d) +
-         ", \"parameters\": " + json_list(info.parameters, quantity_as_json) +
+         ", \"twice_differentiable\": " + flag(info.twice_differentiable) +
+         ", \"twice_differentiable_energy\": " + flag(info.twice_differentiable_energy) +
+         ", \"in_2d\": " + flag(info.in_2d) + ", \"parameters\": " + json_list(info.parameters, quantity_as_json) +
          ", \"history\": " + json_list(info.history, quantity_as_json) +
-         ", \"options\": " + json_list(info.options, [](const char* o) { return "\"" + std::string(o) + "\""; }) + "}";
+         ", \"options\": " + json_list(info.options, [](const char* o) { return std::string("\"") + o + "\""; }) + "}";
 }
 
 }  // namespace

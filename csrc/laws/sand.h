@@ -25,6 +25,7 @@ struct Sand : PrincipalLaw {
                                             not_negative("smallest_strain", "")};
   static constexpr std::array history = {real("volume_correction", "")};
   static constexpr bool plastic = true, optional_history = true, in_2d = !Energy::exact_flow;
+  static constexpr bool twice_differentiable_energy = true;
   // keep_apex: see return_map; elastic: F is kept.
   static constexpr std::array options = {"keep_apex", "elastic"};
   // Those of the update matter to the exact flow alone, whose rare roots in float64 would take as many registers as
@@ -36,6 +37,16 @@ struct Sand : PrincipalLaw {
   template <class T, int D>
   MPM_HD static T energy(const Vector<T, D>& h, const T p[], const T[]) {
     return sand_energy<Energy>(h, p[0], p[1]);
+  }
+
+  template <class T, int D>
+  MPM_HD static Vector<T, D> stress(const Vector<T, D>& h, const T p[], const T[]) {
+    return sand_stress<Energy>(h, p[0], p[1]);
+  }
+
+  template <class T>
+  MPM_HD static T stress_quotient(const T& a, const T& b, const T p[], const T[]) {
+    return mpm::stress_quotient<Energy>(a, b, p[0]);
   }
 };
 
@@ -110,20 +121,6 @@ MPM_HD_LARGE SandState<V, D> sand_state(const HenckyStrain<V, D>& s, const SandP
   r.valid = s.valid & (finite == V(0));
   r.moved = r.valid & (r.m.cone | r.m.apex | (p.volume > V(0)) | (p.volume < V(0)));
   return r;
-}
-
-// Length and direction of the plastic increment of the strain.
-template <class T, int D>
-struct PlasticIncrement {
-  T norm;
-  Vector<T, D> direction;
-};
-
-template <class T, int D>
-MPM_HD PlasticIncrement<T, D> plastic_increment(const HenckyStrain<T, D>& s, const SandState<T, D>& state) {
-  const Vector<T, D> lost = s.h + T(-1) * state.h;
-  const T norm = sqrt(dot(lost, lost));
-  return {norm, (T(1) / select(norm > T(0), norm, T(1))) * lost};
 }
 
 // The energy that turns into heat, ψ(x) − ψ(H) + τ(x) · (h − x): plastic flow from the trial strain h under the stress
@@ -210,7 +207,7 @@ MPM_HD void add_adjoint_of_scalars(SandAdjoint<V, D>& r, const LawBackwardArgume
                                    const SandParameters<V>& p) {
   if (a.grad_multiplier.pointer) {
     const V g = load_where<V>(at, a.grad_multiplier, state.moved);
-    const Vector<V, D> along = g * plastic_increment(s, state).direction;
+    const Vector<V, D> along = g * plastic_increment(s.h, state.h).direction;
     r.trial = r.trial + along;
     r.mapped = r.mapped + V(-1) * along;
   }
@@ -270,7 +267,7 @@ struct SandKernels : PrincipalKernels<Law> {
     }
     if (a.multiplier.pointer)
       at.store(a.multiplier.pointer, a.multiplier.stride[0],
-               select(state.moved, plastic_increment(s, state).norm, V(0)));
+               select(state.moved, plastic_increment(s.h, state.h).norm, V(0)));
     if (a.dissipated.pointer) {
       const V lost = dissipated_energy<Energy>(dissipation<Energy>(s, state, p), state.h, p.mu, p.lam);
       at.store(a.dissipated.pointer, a.dissipated.stride[0], select(state.moved, lost, V(0)));

@@ -166,7 +166,7 @@ struct ViscoelasticKernels {
       at.store(a.dissipated.pointer, a.dissipated.stride[0], select(state.valid, state.r.dissipated, V(0)));
     if (a.multiplier.pointer)
       at.store(a.multiplier.pointer, a.multiplier.stride[0],
-               select(state.valid, increment_norm(state.s.h, state.r.h), V(0)));
+               select(state.valid, plastic_increment(state.s.h, state.r.h).norm, V(0)));
     const V branch = select(state.r.flow.plastic, V(kPlasticFlow), V(kElasticFlow));
     if (a.branch) at.store_integer(a.branch, select(state.valid, branch, V(kInvalidFlow)));
   }
@@ -191,8 +191,7 @@ struct ViscoelasticKernels {
                                                       grad_stress,
                                                       {V(0)},
                                                       load_scalar_or_zero(at, a.grad_dissipated),
-                                                      load_scalar_or_zero(at, a.grad_multiplier),
-                                                      a.grad_multiplier.pointer != nullptr};
+                                                      load_scalar_or_zero(at, a.grad_multiplier)};
     const Matrix<V, D> by_elastic = map_adjoint<MaxwellBranch>(
         state.s, p.branch, state.r, grad, a.parameters.pointer != nullptr, false,
         [&](int k, const V& value) { store_entry(at, a.parameters, 2 + k, select(state.valid, value, V(0))); },

@@ -1,12 +1,14 @@
 """Laws in principal strains against plain torch, closed forms, conservation, invariances and finite differences."""
 
 import math
+from collections.abc import Callable
 
 import pytest
 import torch
 from torch import Tensor
 
 import torch_mpm as mpm
+from torch_mpm import ops
 from torch_mpm.ops import law_energy, law_stiffness, law_update, law_wave_modulus
 from torch_mpm.ops.law import ELASTIC, INVALID, PLASTIC
 from torch_mpm.reference import principal as reference
@@ -511,6 +513,66 @@ def test_what_is_not_differentiable_says_so(device):
         law_stiffness("hencky", F, p).sum().backward()
     with pytest.raises(NotImplementedError, match="vmap"):
         torch.vmap(lambda F: law_update("hencky", F, p).stress)(F.detach()[None])
+
+
+# ---- second derivatives of the energies
+
+TWICE = [n for n, law in ops.LAWS.items() if law.twice_differentiable_energy and not law.twice_differentiable]
+
+
+def energy_of(law: str, count: int, device: str) -> tuple[list[Tensor], Callable[..., Tensor]]:
+    """Lamé parameters per particle, and the energy as a function of F and them; yield surfaces do not matter."""
+    rest = [torch.zeros(count, dtype=torch.float64, device=device) for _ in ops.LAWS[law].parameters[2:]]
+
+    def energy(F: Tensor, mu: Tensor, lam: Tensor) -> Tensor:
+        return law_energy(law, F, [mu, lam, *(r.to(F.dtype) for r in rest)])
+
+    return [p.to(device) for p in data("hencky", count)[0]], energy
+
+
+@pytest.mark.parametrize("law", TWICE)
+def test_energies_have_second_derivatives(law, dim, device):
+    """At separate, equal and nearly equal stretches; compressed, where the unilateral energies are smooth."""
+    if dim == 2 and not ops.LAWS[law].in_2d:
+        pytest.skip("3-D alone")
+    h = torch.tensor([[-0.3, -0.1, -0.2], [-0.2, -0.2, -0.2], [-0.1, -0.1, -0.4], [-0.2, -0.2 + 1e-7, -0.1]])
+    F = deformation(h[:, :dim].double()).to(device).requires_grad_()
+    parameters, energy = energy_of(law, len(F), device)
+    inputs = (F, *(p.requires_grad_() for p in parameters))
+    assert torch.autograd.gradcheck(energy, inputs)
+    assert torch.autograd.gradgradcheck(energy, inputs)
+
+
+def product(energy: Callable[..., Tensor], F: Tensor, along: Tensor, parameters: list[Tensor]) -> Tensor:
+    F = F.detach().requires_grad_()
+    (gradient,) = torch.autograd.grad(energy(F, *parameters).sum(), F, create_graph=True)
+    return torch.autograd.grad(gradient, F, along)[0]
+
+
+@pytest.mark.parametrize("law", TWICE)
+def test_second_derivatives_in_float32(law, device):
+    """Strains of 1e-4 to 1 of both signs, stretches apart by as little as rounding: float32 against float64."""
+    count = 200
+    h = 10 ** (-4 * torch.rand(count, 1, dtype=torch.float64)) * torch.randn(count, 3, dtype=torch.float64).clamp(-2, 2)
+    h[::3, 1] = h[::3, 0]
+    h[1::3, 1] = h[1::3, 0] * (1 + 1e-6)
+    F = deformation(h).float().to(device)
+    along = torch.randn_like(F)
+    parameters, energy = energy_of(law, count, device)
+    exact = product(energy, F.double(), along.double(), parameters)
+    scale = 2 * parameters[0] + 3 * parameters[1]
+    found = product(energy, F, along, [p.float() for p in parameters])
+    size = exact.abs().amax((1, 2)) + scale * 1e-3 * torch.linalg.matrix_norm(F.double(), 2)
+    assert float(((found - exact).abs().amax((1, 2)) / size).max()) < 1e-3
+
+
+@pytest.mark.parametrize("law", TWICE)
+def test_states_without_an_energy_have_no_second_derivatives(law, device):
+    F = torch.eye(3, dtype=torch.float64, device=device).repeat(4, 1, 1)
+    F[1, 0, 0], F[2, 0, 0], F[3, 0, 0] = -1.0, torch.nan, 0.0
+    parameters, energy = energy_of(law, 4, device)
+    result = product(energy, F, torch.ones_like(F), parameters)
+    assert not result[1:].any() and result[0].isfinite().all()
 
 
 # ---- bad input

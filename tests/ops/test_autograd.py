@@ -133,9 +133,9 @@ def law_op_case(name, device):
 
         return Case(update, list(names), twice=False)
     if name == "principal law_energy":
-        return Case(lambda F, *p: (ops.law_energy("hencky", F, list(p)),), [F, mu, lam], twice=False)
+        return Case(lambda F, *p: (ops.law_energy("hencky", F, list(p)),), [F, mu, lam])
     if name == "quartic_energy":
-        return Case(lambda F, mu, lam: (ops.quartic_energy(F, mu, lam, energy="full"),), [F, mu, lam], twice=False)
+        return Case(lambda F, mu, lam: (ops.quartic_energy(F, mu, lam, energy="full"),), [F, mu, lam])
     if name == "quartic_stress":
         return Case(lambda F, mu, lam: (ops.quartic_stress(F, mu, lam, energy="full"),), [F, mu, lam], twice=False)
     assert name == "quartic_return_map"

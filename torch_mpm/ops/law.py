@@ -219,23 +219,23 @@ def _update_fake(state, C, parameters, history, scene, law, dim, options, detail
     check_choice("law", law, LAWS)
     matrices = (P, dim, dim)
     return (
-        soa_empty(state, matrices) if LAWS[law].plastic else state.new_empty(0),
+        soa_empty(state, matrices) if LAWS[law].plastic else None,
         soa_empty(state, matrices),
-        soa_empty(state, (P, _entries(history))) if history else state.new_empty(0),
-        state.new_empty(P if details & DISSIPATED else 0),
-        state.new_empty(P if details & MULTIPLIER else 0),
-        state.new_empty(P if details & BRANCH else 0, dtype=torch.int32),
+        soa_empty(state, (P, _entries(history))) if history else None,
+        state.new_empty(P) if details & DISSIPATED else None,
+        state.new_empty(P) if details & MULTIPLIER else None,
+        state.new_empty(P, dtype=torch.int32) if details & BRANCH else None,
     )
 
 
 def _adjoints_fake(
     state: Tensor, C: Tensor | None, parameters: Tensors, history: Tensors, dim: int, needs: int
-) -> tuple[Tensor, ...]:
+) -> tuple[Tensor | None, ...]:
     P = _particles(state)
     shapes = (tuple(state.shape), (P, dim, dim), (P, len(parameters)), (P, _entries(history)))
     by_C, by_history = needs & VELOCITY_GRADIENT and C is not None, needs & HISTORY and history
     wanted = (needs & STATE, by_C, needs & PARAMETERS, by_history)
-    return tuple(soa_empty(state, s) if w else state.new_empty(0) for s, w in zip(shapes, wanted, strict=True))
+    return tuple(soa_empty(state, s) if w else None for s, w in zip(shapes, wanted, strict=True))
 
 
 @torch.library.register_fake("torch_mpm::law_update_backward")
@@ -295,11 +295,6 @@ def _of_history(grads: Tensor, history: Tensors, wanted: Sequence[bool]) -> list
     return [part if w else None for part, w in zip(parts, wanted, strict=True)]
 
 
-def _absent(grad: Tensor | None) -> Tensor | None:
-    """A gradient, or None for that of a result that was not wanted, which has no elements."""
-    return grad if grad is not None and grad.numel() else None
-
-
 class _Saved:
     """The tensors of a call in one order: state, C, scene, parameters, history."""
 
@@ -325,7 +320,7 @@ def _update_backward(ctx, *grads):
     by_parameter = _needed(need_parameters, len(saved.parameters))
     by_history = _needed(need_history, len(saved.history))
     needs = STATE * need_state + VELOCITY_GRADIENT * need_C + PARAMETERS * any(by_parameter) + HISTORY * any(by_history)
-    given = [_absent(g) for g in grads[:5]]
+    given = grads[:5]
     if not needs or all(g is None for g in given):
         return None, None, [None] * len(saved.parameters), [None] * len(saved.history), *(None,) * 5
     grad_state, grad_C, grad_parameters, grad_history = dispatch(
@@ -349,13 +344,13 @@ def _update_backward_setup(ctx: Any, inputs: Any, output: Any) -> None:
 
 
 def _update_double_backward(ctx, along_state, along_C, along_parameters, _):
-    _check_twice(ctx.law)
+    _check_twice(LAWS[ctx.law].twice_differentiable, "the stress", ctx.law)
     saved = _Saved(ctx)
     (grad_stress,) = saved.history
     _, need_grad, *_, need_state, need_C, need_parameters = ctx.needs_input_grad[:8]
     by_parameter = _needed(need_parameters, len(saved.parameters))
     nothing = (*(None,) * 7, [None] * len(saved.parameters), [None] * ctx.history, *(None,) * 5)
-    along = [_absent(t) for t in (along_state, along_C, along_parameters)]
+    along = (along_state, along_C, along_parameters)
     if grad_stress is None or all(t is None for t in along):
         return nothing
     needs = STATE * need_state + VELOCITY_GRADIENT * need_C + PARAMETERS * any(by_parameter)
@@ -406,12 +401,12 @@ def _energy_backward_setup(ctx: Any, inputs: Any, output: Any) -> None:
 
 
 def _energy_double_backward(ctx, along_state, along_parameters, _):
-    _check_twice(ctx.law)
+    _check_twice(LAWS[ctx.law].twice_differentiable_energy, "the energy", ctx.law)
     saved = _Saved(ctx)
     (grad,) = saved.history
     need_grad, need_state, need_parameters = ctx.needs_input_grad[:3]
     by_parameter = _needed(need_parameters, len(saved.parameters))
-    along = [_absent(t) for t in (along_state, along_parameters)]
+    along = (along_state, along_parameters)
     if all(t is None for t in along):
         return None, None, [None] * len(saved.parameters), [None] * ctx.history, *(None,) * 4
     needs = STATE * need_state + PARAMETERS * any(by_parameter)
@@ -428,9 +423,9 @@ def _energy_double_backward(ctx, along_state, along_parameters, _):
     )
 
 
-def _check_twice(law: str) -> None:
-    if not LAWS[law].twice_differentiable:
-        raise NotImplementedError(f"the law {law} has no second derivatives: differentiate it once")
+def _check_twice(differentiable: bool, what: str, law: str) -> None:
+    if not differentiable:
+        raise NotImplementedError(f"{what} of the law {law} has no second derivatives: differentiate it once")
 
 
 def _no_backward(ctx, grad):

@@ -56,7 +56,7 @@ class LawInfo:
         viscous: whether its stress reads C.
         plastic: whether it changes F.
         optional_history: whether it works without its history.
-        twice_differentiable: whether its stress and energy have second derivatives.
+        twice_differentiable, twice_differentiable_energy: whether its stress, and its energy, has second derivatives.
         in_2d: whether it exists in two dimensions.
         parameters, history: in the order of the ops.
         options: names of the bits of `options`.
@@ -68,6 +68,7 @@ class LawInfo:
     plastic: bool
     optional_history: bool
     twice_differentiable: bool
+    twice_differentiable_energy: bool
     in_2d: bool
     parameters: tuple[Quantity, ...]
     history: tuple[Quantity, ...]

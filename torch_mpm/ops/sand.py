@@ -182,7 +182,7 @@ def quartic_stress(F: Tensor, mu: Value, lam: Value, scene: Tensor | None = None
 def quartic_energy(F: Tensor, mu: Value, lam: Value, scene: Tensor | None = None, energy: str = "unilateral") -> Tensor:
     """Elastic energy per rest volume [P] [J/m³] of F itself; infinite where det F ≤ 0 or F is not finite.
 
-    Arguments as `quartic_return_map`; differentiable with respect to F, mu and lam.
+    Arguments as `quartic_return_map`; differentiable with respect to F, mu and lam, twice in eager mode.
     """
     return law_energy(f"sand_{energy}", F, _elastic(F, mu, lam, scene, energy), scene=scene)
 
