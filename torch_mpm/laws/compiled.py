@@ -114,6 +114,8 @@ class CompiledLaw(Material):
         return ()
 
     def _history(self, state: State) -> list[Tensor]:
+        if not self.extra_fields:
+            return []
         names = [q.name for q in LAWS[self.name].history if q.name in self.extra_fields]
         return [state.extra[n] if n in state.extra else self.initial(n, state) for n in names]
 

@@ -138,9 +138,10 @@ def check_list(name: str, values: Any) -> Sequence[Any]:
     return values
 
 
-def check_tensors(law: str, kind: str, names: Sequence[str], values: Sequence[Tensor]) -> None:
+def check_tensors(law: str, kind: str, quantities: Sequence[Any], values: Sequence[Tensor]) -> None:
     """Check that as many tensors are given as a law has parameters or history variables."""
-    if len(check_list(kind, values)) != len(names):
+    if len(check_list(kind, values)) != len(quantities):
+        names = [q.name for q in quantities]
         raise ValueError(f"{law} has the {kind} {', '.join(names) or 'none'}, got {len(values)} tensors")
 
 

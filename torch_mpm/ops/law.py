@@ -94,13 +94,13 @@ def law_update(
         torch.ops.torch_mpm.law_update, state, C, parameters, history, scene, law, dim, bits, wanted
     )
     return LawUpdate(
-        mapped if LAWS[law].plastic else state,
+        state if mapped is None else mapped,
         stress,
-        _split(moved, history),
-        dissipated if wanted & DISSIPATED else None,
-        multiplier if wanted & MULTIPLIER else None,
-        code & 3 if wanted & BRANCH else None,
-        code < NOT_CONVERGED if wanted & BRANCH else None,
+        _split(moved, history) if history else (),
+        dissipated,
+        multiplier,
+        None if code is None else code & 3,
+        None if code is None else code < NOT_CONVERGED,
     )
 
 
@@ -160,13 +160,13 @@ def _check(
     info = LAWS[law]
     dim = _check_state(info, state, dim)
     check_index("scene", scene, state, of="the state")
-    check_tensors(law, "parameters", [p.name for p in info.parameters], parameters)
+    check_tensors(law, "parameters", info.parameters, parameters)
     for quantity, value in zip(info.parameters, parameters, strict=True):
         check_parameter(quantity.name, value, state, scene)
     if history or not info.optional_history:
-        check_tensors(law, "history variables", [q.name for q in info.history], history)
-    P = state.shape[0]
+        check_tensors(law, "history variables", info.history, history)
     for quantity, value in zip(info.history, history, strict=False):
+        P = state.shape[0]
         if value is None:
             raise TypeError(f"{quantity.name} must be a tensor, got None")
         shape = (P, dim, dim) if quantity.matrix else (P,)
