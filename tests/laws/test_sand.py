@@ -362,7 +362,9 @@ def test_gap_opens_and_closes_without_stress(device, dim, energy, cohesion):
         torn = math.ceil(100 * dim * cohesion) / 100  # volume at which the step tears
         tension = reference.principal_stress(edge, *moduli, energy)[0, 0]
         expected = float(reference.energy_density(edge, *moduli, energy) + tension * (torn - dim * cohesion))
-    assert sum(heat) == pytest.approx(expected, rel=1e-9, abs=1e-14)
+    # Strains of a turned F are known to a few ε; the stress of that does work along the whole opening of 0.2.
+    rounding = 4 * torch.finfo(torch.float64).eps * (2 * 2.0 + dim * 3.0) * 0.2
+    assert sum(heat) == pytest.approx(expected, rel=1e-9, abs=rounding)
     assert float(volume) == 0
     compressed = torch.full((1, dim), total / dim, dtype=torch.float64)
     assert torch.allclose(torch.linalg.svdvals(F).log().cpu(), compressed, atol=1e-12)
