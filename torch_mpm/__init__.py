@@ -28,8 +28,9 @@ from .ops import (
     svd3,
 )
 from .parameters import PerMaterial, Table
+from .rollout import rollout
 from .state import State
-from .step import Step, rollout
+from .step import Step
 
 if TYPE_CHECKING:
     from .scene import Scene as Scene

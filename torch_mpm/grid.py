@@ -118,21 +118,41 @@ class Grid(Lattice):
         """
         check_positions(x, self.dim, scene, self.scenes)
         check_index("ids", ids, x, torch.int64)
+        max_blocks = self.pool(x, scene)
+        blocks = self._activate(x, scene, previous, max_blocks, ids)
+        if x.device.type == "cpu" and not is_traced(x):
+            wanted = blocks.wanted
+            if wanted > max_blocks:
+                blocks = self._activate(x, scene, previous, self.follow(wanted), ids)
+        return blocks
+
+    @property
+    def grows(self) -> bool:
+        """Whether `max_blocks` follows the scene."""
+        return self._grows
+
+    def pool(self, x: Tensor, scene: Tensor | None) -> int:
+        """The blocks of the pool of the next activation."""
         if self._grows:
             self._grow(x, scene)
         assert self.max_blocks is not None
-        blocks = self._activate(x, scene, previous, self.max_blocks, ids)
-        if x.device.type == "cpu" and not is_traced(x):
-            wanted = blocks.wanted
-            if wanted > self.max_blocks:
-                if not self._grows:
-                    raise GridOverflowError(
-                        f"{wanted} blocks are active but the grid has max_blocks={self.max_blocks}: "
-                        f"pass max_blocks={_with_headroom(wanted)} or more, or None to let it grow"
-                    )
-                self.max_blocks = min(_with_headroom(wanted), self._most_blocks)
-                blocks = self._activate(x, scene, previous, self.max_blocks, ids)
-        return blocks
+        return self.max_blocks
+
+    def follow(self, wanted: int) -> int:
+        """The blocks of a pool that has room for as many as an activation on the CPU wanted.
+
+        Raises:
+            GridOverflowError: where `max_blocks` is fixed and too small.
+        """
+        assert self.max_blocks is not None
+        if wanted > self.max_blocks:
+            if not self._grows:
+                raise GridOverflowError(
+                    f"{wanted} blocks are active but the grid has max_blocks={self.max_blocks}: "
+                    f"pass max_blocks={_with_headroom(wanted)} or more, or None to let it grow"
+                )
+            self.max_blocks = min(_with_headroom(wanted), self._most_blocks)
+        return self.max_blocks
 
     def _activate(
         self, x: Tensor, scene: Tensor | None, previous: Tensor | None, max_blocks: int, ids: Tensor | None = None

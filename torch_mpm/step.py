@@ -1,4 +1,4 @@
-"""One explicit MPM step, and rollouts of many."""
+"""One explicit MPM step."""
 
 from __future__ import annotations
 
@@ -8,13 +8,12 @@ from typing import Any, Protocol
 
 import torch
 from torch import Tensor
-from torch.utils.checkpoint import checkpoint as run_checkpointed
 
 from .activation_record import ActivationRecord
 from .boundaries import BoundaryList, Obstacle, Walls, call_boundary
 from .capture import GraphCache
 from .cfl import stable_dt
-from .errors import check_count, check_number, check_vector, shape_of
+from .errors import check_number, check_vector, shape_of
 from .failures import Failures, problems_of_state, raise_failures
 from .grid import Blocks, Grid, check_grid
 from .heat.heat import Heat
@@ -189,7 +188,7 @@ class Step(TensorModule):
         return state if self.heat is None else self.heat.prepare(state)
 
     def _update_grid(self, blocks: Blocks, nodes: Tensor, state: State, dt: float | Tensor) -> Tensor:
-        velocity = grid_update(blocks, nodes, self._gravity(state.x), dt, self.walls)
+        velocity = grid_update(blocks, nodes, self.gravity_like(state.x), dt, self.walls)
         if boundaries := self.boundaries.entries:
             velocity = _obstruct(blocks, velocity, boundaries, state, dt)
         if self.on_grid is not None:
@@ -208,7 +207,8 @@ class Step(TensorModule):
         change, _, _ = gather(blocks, state.x, velocity - before)
         return (1 - self._flip_share) * v + self._flip_share * (state.v + change)
 
-    def _gravity(self, x: Tensor) -> Tensor | None:
+    def gravity_like(self, x: Tensor) -> Tensor | None:
+        """Gravity as a tensor [D] or [B, D] of the dtype and on the device of x."""
         gravity = self.gravity
         if gravity is None:
             return None
@@ -278,6 +278,13 @@ class Step(TensorModule):
             GridOverflowError: if more blocks were active than the grid has room for, and nothing else is wrong.
         """
         raise_failures(self.failures(state), self._activations.all(), self.grid)
+
+    def explain(self, state: State, dt: float | Tensor = 1.0) -> str:
+        """How `rollout` takes steps from a state: all in one op, or one after another from Python, and why."""
+        from .rollout import obstacle_to_substeps  # which needs a Step
+
+        reason = obstacle_to_substeps(self, state, dt)
+        return "all steps in one op" if reason is None else f"step by step, because {reason}"
 
     def reset(self) -> None:
         """Forget the status of the steps so far."""
@@ -355,47 +362,3 @@ def _checked_gravity(gravity: Any, grid: Grid) -> tuple[float, ...] | Tensor:
         expected = f"[D] or [B, D] = [{grid.scenes}, {grid.dim}]"
         raise ValueError(f"gravity must have shape {expected}, got {shape_of(gravity)}")
     return gravity
-
-
-def rollout(
-    step: Callable[[State, float | Tensor], State],
-    state: State,
-    n: int,
-    dt: float | Tensor,
-    checkpoint: int | None = None,
-) -> State:
-    """The state n steps later.
-
-    Args:
-        step: a `Step`, or any function (state, dt) -> state.
-        state: the initial state.
-        n: number of steps.
-        dt: time step [s].
-        checkpoint: if given, keep for the backward pass only the state of every `checkpoint` steps and compute the
-            steps between again (memory n/checkpoint + checkpoint states instead of n steps; sqrt(n) is best).
-
-    Raises:
-        TypeError, ValueError: for an n or a checkpoint that is no whole number, a negative n, a checkpoint below 1, or
-            what `step` raises.
-    """
-    if not callable(step):
-        raise TypeError(f"step must be a Step or a function (state, dt) -> state, got {shape_of(step)}")
-    check_count("n", n)
-    if checkpoint is not None:
-        check_count("checkpoint", checkpoint, 1)
-
-    def steps(state: State, count: int) -> State:
-        for _ in range(count):
-            state = step(state, dt)
-        return state
-
-    if checkpoint is None or not torch.is_grad_enabled():
-        return steps(state, n)
-    if isinstance(step, Step):
-        state = step.prepare(state)
-    done = 0
-    while done < n:
-        count = min(checkpoint, n - done)
-        state = run_checkpointed(steps, state, count, use_reentrant=False)
-        done += count
-    return state

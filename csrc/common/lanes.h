@@ -6,6 +6,16 @@
 // Access of a kernel body to its particles: `One` is the particle of a CUDA thread; cpu/lanes.h has the particles in
 // the lanes of a pack.
 namespace mpm {
+
+// Some of the particles: those of one material, or all.
+struct Members {
+  const int* material = nullptr;  // [P], or null for all
+  int64_t stride = 0;
+  int member = 0;
+
+  MPM_HD bool has(int64_t p) const { return !material || material[p * stride] == member; }
+};
+
 inline namespace TORCH_MPM_ISA {
 
 template <class T>

@@ -1,18 +1,16 @@
 #include <algorithm>
 
 #include "grid/kernels.h"
-#include "grid/topology.op.h"
+#include "grid/walls.op.h"
 
 // Node mass and momentum to mass and velocity, with gravity and the walls of the domain.
 namespace mpm {
 namespace {
 
-#define MPM_GRID_UPDATE_SCHEMA                                                                               \
-  "Tensor nodes, Tensor? gravity, Tensor? scene_dt, float dt, int[] wall_kind, float[] wall_plane, float[] " \
-  "wall_friction, " MPM_TOPOLOGY_SCHEMA
-#define MPM_GRID_UPDATE_PARAMETERS                                                                       \
-  const Tensor &nodes, const OptionalTensor &gravity, const OptionalTensor &scene_dt, double dt,         \
-      std::vector<int64_t> wall_kind, std::vector<double> wall_plane, std::vector<double> wall_friction, \
+#define MPM_GRID_UPDATE_SCHEMA \
+  "Tensor nodes, Tensor? gravity, Tensor? scene_dt, float dt, " MPM_WALLS_SCHEMA ", " MPM_TOPOLOGY_SCHEMA
+#define MPM_GRID_UPDATE_PARAMETERS                                                                                     \
+  const Tensor &nodes, const OptionalTensor &gravity, const OptionalTensor &scene_dt, double dt, MPM_WALLS_PARAMETERS, \
       const std::vector<Tensor>&topology, const std::vector<double>&lattice, const std::vector<int64_t>&layout
 #define MPM_GRID_UPDATE_ARGUMENTS \
   nodes, gravity, scene_dt, dt, wall_kind, wall_plane, wall_friction, topology, lattice, layout
@@ -46,25 +44,6 @@ const T* scene_values(const OptionalTensor& t, const char* name, const Tensor& n
   check_like(*t, name, nodes);
   STD_TORCH_CHECK(t->is_contiguous(), name, " must be contiguous");
   return static_cast<const T*>(t->data_ptr());
-}
-
-template <class T, int D>
-Walls<T, D> walls(const std::vector<int64_t>& kind, const std::vector<double>& plane,
-                  const std::vector<double>& friction, const PackedLattice& lattice) {
-  STD_TORCH_CHECK(kind.empty() || kind.size() == 2 * D, "wall_kind must be empty or have ", 2 * D,
-                  " entries, two per axis, got ", kind.size());
-  STD_TORCH_CHECK(plane.size() == kind.size(), "wall_plane must have an entry per wall_kind, ", kind.size(), ", got ",
-                  plane.size());
-  STD_TORCH_CHECK(friction.size() == kind.size(), "wall_friction must have an entry per wall_kind, ", kind.size(),
-                  ", got ", friction.size());
-  Walls<T, D> w;
-  for (int face = 0; face < 2 * D; face++) {
-    const int64_t k = kind.empty() ? int64_t(Contact::open) : kind[face];
-    STD_TORCH_CHECK(k >= int64_t(Contact::open) && k <= int64_t(Contact::mirror), "wall_kind must be 0 to 4, got ", k);
-    const bool open = k == int64_t(Contact::open);
-    w.set(face, Contact(k), open ? 0 : friction[face], open ? 0 : plane[face], lattice.dx(), lattice.lower()[face / 2]);
-  }
-  return w;
 }
 
 template <class T, int D>

@@ -17,44 +17,45 @@ struct LawLoops {
   static constexpr int kBytes = Law::memory_bound ? 64 : kRegisterBytes;
 
   template <int Bytes, class F>
-  static void by_groups(int64_t particles, const F& body) {
-    for_groups<T, Bytes, Law::memory_bound>(particles, body);
+  static void by_groups(const LawArguments<T, D>& a, const F& body) {
+    for_groups<T, Bytes, Law::memory_bound>(a.particles, body, a.members);
   }
 
   // Without packs: what is seldom called, and would take minutes to compile with dual numbers of packs.
   template <class F>
-  static void one_by_one(int64_t particles, const F& body) {
+  static void one_by_one(const LawArguments<T, D>& a, const F& body) {
     constexpr int64_t grain = 256;  // particles below which a range is not split
-    parallel_ranges(particles, grain, [&](int64_t begin, int64_t end) {
-      for (int64_t p = begin; p < end; p++) body(One<T>{p});
+    parallel_ranges(a.particles, grain, [&](int64_t begin, int64_t end) {
+      for (int64_t p = begin; p < end; p++)
+        if (a.members.has(p)) body(One<T>{p});
     });
   }
 
   static void update(const LawUpdateArguments<T, D>& a, void*) {
-    by_groups<kBytes>(a.law.particles, [&](const auto& at) { Kernels::update(a, at); });
+    by_groups<kBytes>(a.law, [&](const auto& at) { Kernels::update(a, at); });
   }
   static void update_backward(const LawBackwardArguments<T, D>& a, void*) {
-    by_groups<kBytes>(a.law.particles, [&](const auto& at) { Kernels::update_backward(a, at); });
+    by_groups<kBytes>(a.law, [&](const auto& at) { Kernels::update_backward(a, at); });
   }
   static void double_backward(const LawDoubleBackwardArguments<T, D>& a, void*) {
-    one_by_one(a.law.particles, [&](const auto& at) { Kernels::double_backward(a, at); });
+    one_by_one(a.law, [&](const auto& at) { Kernels::double_backward(a, at); });
   }
   static void scalar(const LawScalarArguments<T, D>& a, void*) {
-    by_groups<kRegisterBytes>(a.law.particles, [&](const auto& at) { Kernels::scalar(a, at); });
+    by_groups<kRegisterBytes>(a.law, [&](const auto& at) { Kernels::scalar(a, at); });
   }
   // With a decomposition, which is written for packs; nested dual numbers of packs would take minutes without.
   template <class F>
-  static void for_energies(int64_t particles, const F& body) {
+  static void for_energies(const LawArguments<T, D>& a, const F& body) {
     if constexpr (Law::twice_differentiable)
-      one_by_one(particles, body);
+      one_by_one(a, body);
     else
-      by_groups<kRegisterBytes>(particles, body);
+      by_groups<kRegisterBytes>(a, body);
   }
   static void energy_backward(const LawEnergyBackwardArguments<T, D>& a, void*) {
-    for_energies(a.law.particles, [&](const auto& at) { Kernels::energy_backward(a, at); });
+    for_energies(a.law, [&](const auto& at) { Kernels::energy_backward(a, at); });
   }
   static void energy_double_backward(const LawEnergyDoubleBackwardArguments<T, D>& a, void*) {
-    for_energies(a.law.particles, [&](const auto& at) { Kernels::energy_double_backward(a, at); });
+    for_energies(a.law, [&](const auto& at) { Kernels::energy_double_backward(a, at); });
   }
 };
 

@@ -15,41 +15,41 @@ template <class Law, class T, int D>
 __global__ void __launch_bounds__(Law::gpu_threads, kUpdateBlocks<Law, T>)
     law_update_kernel(const LawUpdateArguments<T, D> a) {
   const int64_t p = int64_t(blockIdx.x) * Law::gpu_threads + threadIdx.x;
-  if (p < a.law.particles) Law::template Kernels<Law>::update(a, One<T>{p});
+  if (p < a.law.particles && a.law.members.has(p)) Law::template Kernels<Law>::update(a, One<T>{p});
 }
 
 template <class Law, class T, int D>
 __global__ void __launch_bounds__(Law::gpu_threads, Law::gpu_backward_blocks)
     law_backward_kernel(const LawBackwardArguments<T, D> a) {
   const int64_t p = int64_t(blockIdx.x) * Law::gpu_threads + threadIdx.x;
-  if (p < a.law.particles) Law::template Kernels<Law>::update_backward(a, One<T>{p});
+  if (p < a.law.particles && a.law.members.has(p)) Law::template Kernels<Law>::update_backward(a, One<T>{p});
 }
 
 template <class Law, class T, int D>
 __global__ void __launch_bounds__(Law::gpu_threads)
     law_double_backward_kernel(const LawDoubleBackwardArguments<T, D> a) {
   const int64_t p = int64_t(blockIdx.x) * Law::gpu_threads + threadIdx.x;
-  if (p < a.law.particles) Law::template Kernels<Law>::double_backward(a, One<T>{p});
+  if (p < a.law.particles && a.law.members.has(p)) Law::template Kernels<Law>::double_backward(a, One<T>{p});
 }
 
 template <class Law, class T, int D>
 __global__ void __launch_bounds__(Law::gpu_threads) law_scalar_kernel(const LawScalarArguments<T, D> a) {
   const int64_t p = int64_t(blockIdx.x) * Law::gpu_threads + threadIdx.x;
-  if (p < a.law.particles) Law::template Kernels<Law>::scalar(a, One<T>{p});
+  if (p < a.law.particles && a.law.members.has(p)) Law::template Kernels<Law>::scalar(a, One<T>{p});
 }
 
 template <class Law, class T, int D>
 __global__ void __launch_bounds__(Law::gpu_threads)
     law_energy_backward_kernel(const LawEnergyBackwardArguments<T, D> a) {
   const int64_t p = int64_t(blockIdx.x) * Law::gpu_threads + threadIdx.x;
-  if (p < a.law.particles) Law::template Kernels<Law>::energy_backward(a, One<T>{p});
+  if (p < a.law.particles && a.law.members.has(p)) Law::template Kernels<Law>::energy_backward(a, One<T>{p});
 }
 
 template <class Law, class T, int D>
 __global__ void __launch_bounds__(Law::gpu_threads)
     law_energy_double_backward_kernel(const LawEnergyDoubleBackwardArguments<T, D> a) {
   const int64_t p = int64_t(blockIdx.x) * Law::gpu_threads + threadIdx.x;
-  if (p < a.law.particles) Law::template Kernels<Law>::energy_double_backward(a, One<T>{p});
+  if (p < a.law.particles && a.law.members.has(p)) Law::template Kernels<Law>::energy_double_backward(a, One<T>{p});
 }
 
 template <class Law, class T, int D>

@@ -61,6 +61,7 @@ struct Parameter {
 template <class T, int D>
 struct LawArguments {
   int64_t particles = 0;
+  Members members;             // of a mixture: the particles of this law; others stay as they are
   Field<const T> state;        // trial F [P, D, D], or J [P]
   Field<const T> C;            // [P, D, D], may be absent; of viscous laws
   const int* scene = nullptr;  // int32 [P], where a parameter is per scene

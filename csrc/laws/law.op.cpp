@@ -1,90 +1,10 @@
 #include <string>
 
-#include "common/backend.h"
-#include "laws/registry.h"
+#include "laws/law.op.h"
 
 // Update, energy and moduli of every law, by name.
 namespace mpm {
 namespace {
-
-using Tensors = std::vector<Tensor>;
-
-LawEntry& law_of(const std::string& name) {
-  LawEntry* law = find_law(name);
-  STD_TORCH_CHECK(law, "law must be one of ", law_names(), ", got ", name);
-  return *law;
-}
-
-template <class T, int D>
-const LawKernels<T, D>& kernels_of(LawEntry& law) {
-  STD_TORCH_CHECK(D == 3 || law.info.in_2d, "the law ", law.info.name, " is for 3-D alone");
-  return law.kernels<T, D>();
-}
-
-template <class T>
-Parameter<T> parameter(const Tensor& t, const std::string& name, const Tensor& state, int64_t particles,
-                       bool has_scene) {
-  check_like(t, name.c_str(), state);
-  const bool uniform = t.dim() <= 1 && t.numel() == 1, per_particle = t.dim() == 1 && t.size(0) == particles;
-  STD_TORCH_CHECK(uniform || per_particle || (t.dim() == 1 && has_scene && t.size(0) > 0), name,
-                  " must be a scalar or have shape [1], [B] (with scene) or [P] = [", particles, "], got ",
-                  shape_of(t));
-  const T* pointer = static_cast<const T*>(t.data_ptr());
-  if (uniform) return {pointer, 0, 0};
-  return {pointer, t.stride(0), per_particle ? 0 : t.size(0)};
-}
-
-std::string element(const std::string& list, int k) { return list + "[" + std::to_string(k) + "]"; }
-
-Shape shape_of_state(const LawInfo& law, int64_t particles, int64_t dim) {
-  return law.field == Deformation::gradient ? Shape{particles, dim, dim} : Shape{particles};
-}
-
-void check_state(const LawInfo& law, const Tensor& state, int64_t dim) {
-  STD_TORCH_CHECK(dim == 2 || dim == 3, "dim must be 2 or 3, got ", dim);
-  STD_TORCH_CHECK(state.defined(), "the state must be a tensor, got None");
-  const bool gradient = law.field == Deformation::gradient;
-  STD_TORCH_CHECK(state.dim() == (gradient ? 3 : 1), "the state must have shape ", gradient ? "[P, D, D]" : "[P]",
-                  ", got ", shape_of(state));
-  check_shape(state, "the state", shape_of_state(law, state.size(0), dim));
-  check_count(state.size(0), "the state", "particles");
-}
-
-void check_number(const Tensors& given, const char* name, size_t expected, const LawInfo& law, bool optional = false) {
-  STD_TORCH_CHECK(given.size() == expected || (optional && given.empty()), name, " must be ", expected,
-                  " tensors for the law ", law.name, ", got ", given.size());
-}
-
-// Entries of all history variables of a particle, of those that are given.
-int64_t history_size(const LawInfo& law, const Tensors& history, int64_t dim) {
-  int64_t size = 0;
-  for (size_t k = 0; k < history.size() && k < law.history.size(); k++) size += law.history[k].matrix ? dim * dim : 1;
-  return size;
-}
-
-template <class T, int D>
-LawArguments<T, D> arguments(const LawInfo& law, const Tensor& state, const OptionalTensor& C,
-                             const Tensors& parameters, const Tensors& history, const OptionalTensor& scene,
-                             int64_t options = 0) {
-  const int64_t P = state.size(0);
-  LawArguments<T, D> a;
-  a.particles = P;
-  a.state = input<T>(state, "the state", state, shape_of_state(law, P, D));
-  STD_TORCH_CHECK(law.viscous || !has(C), "a law without viscosity takes no C");
-  a.C = input<T>(C, "C", state, {P, D, D});
-  set_scene(a, scene, state);
-  STD_TORCH_CHECK(options >= 0 && options < int64_t(1) << law.options.size(), "options must be bits of the ",
-                  law.options.size(), " options of the law ", law.name, ", got ", options);
-  a.options = int(options);
-  check_number(parameters, "parameters", law.parameters.size(), law);
-  check_number(history, "history", law.history.size(), law, law.optional_history);
-  for (size_t k = 0; k < parameters.size(); k++)
-    a.parameters[k] = parameter<T>(parameters[k], element("parameters", int(k)), state, P, has(scene));
-  for (size_t k = 0; k < history.size(); k++)
-    a.history[k] = input<T>(history[k], element("history", int(k)).c_str(), state,
-                            law.history[k].matrix ? Shape{P, D, D} : Shape{P});
-  return a;
-}
 
 // A result per particle; where it is not wanted it stays undefined, None in Python.
 template <class T>

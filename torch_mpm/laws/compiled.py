@@ -17,7 +17,15 @@ from torch import Tensor, nn
 from ..capture import GraphCache
 from ..errors import check_number, shape_of
 from ..ops.arguments import soa_empty
-from ..ops.law import DISSIPATED, LawUpdate, law_energy, law_stiffness, law_update, law_wave_modulus
+from ..ops.law import (
+    DISSIPATED,
+    LawUpdate,
+    law_energy,
+    law_stiffness,
+    law_update,
+    law_wave_modulus,
+    option_bits,
+)
 from ..ops.registry import LAWS
 from ..parameters import Overlay, PerMaterial, Value, evaluate
 from .material import Material
@@ -113,11 +121,20 @@ class CompiledLaw(Material):
     def _options(self) -> Sequence[str]:
         return ()
 
+    def history_names(self) -> list[str]:
+        """The history of the compiled law, in its order."""
+        return [q.name for q in LAWS[self.name].history if q.name in self.extra_fields] if self.extra_fields else []
+
     def _history(self, state: State) -> list[Tensor]:
-        if not self.extra_fields:
-            return []
-        names = [q.name for q in LAWS[self.name].history if q.name in self.extra_fields]
-        return [state.extra[n] if n in state.extra else self.initial(n, state) for n in names]
+        return [state.extra[n] if n in state.extra else self.initial(n, state) for n in self.history_names()]
+
+    def is_all_of_its_update(self) -> bool:
+        """Whether `update` does what the compiled law does and nothing else, so that a kernel may take its place."""
+        return type(self).update is CompiledLaw.update
+
+    def option_bits(self) -> int:
+        """The options of the compiled law as its op takes them."""
+        return option_bits(self.name, self._options())
 
     def initial(self, name: str, state: State) -> Tensor:
         P, D = state.x.shape

@@ -47,6 +47,7 @@ class Mixture(Material):
         self.extra_fields = tuple(sorted({field for law in parts for field in law.extra_fields}))
         self.viscous = any(law.viscous for law in parts)
         self._material: Tensor | None = None
+        self._checked: Tensor | None = None
         self._indices: list[Tensor] = []
 
     def update(self, state: State) -> tuple[dict[str, Tensor], Tensor]:
@@ -95,15 +96,26 @@ class Mixture(Material):
             result = result.index_copy(0, part.index, function(law, part))
         return result
 
-    def _parts(self, state: State) -> list[tuple[Any, Any]]:
+    def check_material(self, state: State) -> Tensor:
+        """The law of each particle; synchronises with the device once per tensor.
+
+        Raises:
+            ValueError: without state.material, or with an id outside 0 .. len(laws) − 1.
+        """
         material = state.material
         if material is None:
             raise ValueError("a Mixture needs state.material, int32 [P]")
-        if material is not self._material:
+        if material is not self._material and material is not self._checked:
             if material.numel() and not bool(((material >= 0) & (material < len(self.laws))).all()):
                 raise ValueError(
                     f"state.material must be in 0 .. {len(self.laws) - 1}, got {material.unique().tolist()}"
                 )
+            self._checked = material
+        return material
+
+    def _parts(self, state: State) -> list[tuple[Any, Any]]:
+        material = self.check_material(state)
+        if material is not self._material:
             indices = ((material == k).nonzero().squeeze(1) for k in range(len(self.laws)))
             self._indices = [without_transforms(index) for index in indices]
             self._material = material

@@ -148,6 +148,9 @@ class QuarticSand(SolidLaw):
         q = state.extra.get(HARDENING)
         return torch.zeros_like(state.mass) if q is None else q
 
+    def is_all_of_its_update(self) -> bool:
+        return type(self).update is QuarticSand.update and HARDENING not in self.extra_fields
+
     def update(self, state: State) -> tuple[dict[str, Tensor], Tensor]:
         hardens = HARDENING in self.extra_fields
         result = self.return_map(state, DISSIPATED * self.dissipation | MULTIPLIER * hardens)

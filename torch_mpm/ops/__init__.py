@@ -7,6 +7,7 @@ kernel read or write outside of its tensors.
 """
 
 from . import activation as activation
+from . import substeps as substeps
 from .advance import advance
 from .contact import contact, fusible
 from .g2p_advance import g2p_advance

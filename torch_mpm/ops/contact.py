@@ -108,19 +108,27 @@ def contact(blocks: Blocks, velocity: Tensor, obstacles: Sequence[Obstacle], tim
         rows = dispatch(
             torch.ops.torch_mpm.contact,
             _packed(velocity),
-            *_tables(group, velocity, grid.scenes),
-            [KERNEL_SHAPES[type(o.shape)].number for o in group],
-            [_corners(o.shape) for o in group],
-            [CONTACT_KINDS[o.kind] for o in group],
-            [-1 if o.scene is None else o.scene for o in group],
-            [o.start for o in group],
-            [o.end for o in group],
+            *obstacle_arguments(group, velocity, grid.scenes),
             scene_time,
             number,
             *blocks.packed,
         )
         velocity = rows[:, 1:]
     return velocity
+
+
+def obstacle_arguments(group: Sequence[Obstacle], like: Tensor, scenes: int) -> tuple[Any, ...]:
+    """Up to `MAX_OBSTACLES` obstacles as the ops take them; their tables are None where there are none."""
+    tables = _tables(group, like, scenes) if group else (None, None)
+    return (
+        *tables,
+        [KERNEL_SHAPES[type(o.shape)].number for o in group],
+        [_corners(o.shape) for o in group],
+        [CONTACT_KINDS[o.kind] for o in group],
+        [-1 if o.scene is None else o.scene for o in group],
+        [o.start for o in group],
+        [o.end for o in group],
+    )
 
 
 def _packed(velocity: Tensor) -> Tensor:

@@ -58,25 +58,28 @@ def grid_update(
         if dt is None:
             raise ValueError("gravity needs dt")
         number, scene_dt = split_dt(dt, grid.scenes, nodes)
-        gravity = _per_scene(gravity, nodes, grid.scenes, grid.dim)
-    if walls is not None and not isinstance(walls, Walls):
-        raise TypeError(f"walls must be Walls or None, got {type(walls).__name__}")
-    faces = () if walls is None else walls.faces(grid)
+        gravity = per_scene(gravity, nodes, grid.scenes, grid.dim)
     updated = dispatch(
         torch.ops.torch_mpm.grid_update,
         nodes,
         gravity,
         None if scene_dt is None else scene_dt.contiguous(),
         number,
-        [CONTACT_KINDS[face.kind] for face in faces],
-        [face.plane for face in faces],
-        [face.friction for face in faces],
+        *wall_arguments(walls, grid),
         *blocks.packed,
     )
     return updated[:, 1:]
 
 
-def _per_scene(gravity: Tensor, nodes: Tensor, scenes: int, dim: int) -> Tensor:
+def wall_arguments(walls: Walls | None, grid: Any) -> tuple[list[int], list[float], list[float]]:
+    """Kind, plane [m] and friction of each face, as the ops take them."""
+    if walls is not None and not isinstance(walls, Walls):
+        raise TypeError(f"walls must be Walls or None, got {type(walls).__name__}")
+    faces = () if walls is None else walls.faces(grid)
+    return [CONTACT_KINDS[f.kind] for f in faces], [f.plane for f in faces], [f.friction for f in faces]
+
+
+def per_scene(gravity: Tensor, nodes: Tensor, scenes: int, dim: int) -> Tensor:
     """Gravity as [B, D]."""
     if not isinstance(gravity, Tensor) or tuple(gravity.shape) not in ((dim,), (scenes, dim)):
         raise ValueError(f"gravity must have shape [D] or [B, D] = [{scenes}, {dim}], got {shape_of(gravity)}")

@@ -85,10 +85,7 @@ def law_update(
     if C is not None and not LAWS[law].viscous:
         raise ValueError(f"{law} has no viscosity: C must be None")
     check_like("C", C, state, (state.shape[0], dim, dim), "[P, D, D]")
-    bits = 0
-    for option in options:
-        check_choice("an option", option, LAWS[law].options)
-        bits |= 1 << LAWS[law].options.index(option)
+    bits = option_bits(law, options)
     wanted = (DISSIPATED | MULTIPLIER | BRANCH if details else 0) if isinstance(details, bool) else details
     mapped, stress, moved, dissipated, multiplier, code = dispatch(
         torch.ops.torch_mpm.law_update, state, C, parameters, history, scene, law, dim, bits, wanted
@@ -102,6 +99,15 @@ def law_update(
         None if code is None else code & 3,
         None if code is None else code < NOT_CONVERGED,
     )
+
+
+def option_bits(law: str, options: Sequence[str]) -> int:
+    """The names of switches as the bits of the compiled law."""
+    bits = 0
+    for option in options:
+        check_choice("an option", option, LAWS[law].options)
+        bits |= 1 << LAWS[law].options.index(option)
+    return bits
 
 
 def law_energy(

@@ -23,6 +23,7 @@ from ..data.trajectory import PARTIAL, Layout, Trajectory, TrajectoryWriter
 from ..errors import DamagedFileError, SimulationError
 from ..laws import Mixture
 from ..laws.thermal import LIQUID
+from ..rollout import rollout
 from ..state import State
 from . import checkpoint, heap
 from .build import Built
@@ -313,8 +314,7 @@ class Simulation:
         """Take some substeps, then check the state; a failure is located by repeating them."""
         good = self.state
         try:
-            for _ in range(steps):
-                self.state = self.step(self.state, dt)
+            self._roll(dt, steps)
             self.step.check()
             bad = wrong(self.step, self.state)
             if bad is None:
@@ -327,6 +327,16 @@ class Simulation:
         if failure is not None:
             self.state = failure.good
         raise SceneFailure(str(failure or message), failure)
+
+    def _roll(self, dt: float, steps: int) -> None:
+        """Take some substeps; again where the pool of blocks, which follows from a distance on CUDA, was too small."""
+        good, grid = self.state, self.step.grid
+        self.state = rollout(self.step, good, steps, dt)
+        wanted = 0 if self.step.status is None else int(self.step.status[0, 0])
+        if grid.grows and grid.max_blocks is not None and wanted > grid.max_blocks:
+            grid.follow(wanted)
+            self.step.reset()
+            self.state = rollout(self.step, good, steps, dt)
 
     def _emit(self, until: float) -> None:
         """Add the layers that are due."""

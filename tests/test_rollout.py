@@ -1,0 +1,276 @@
+"""Rollouts in one op against the same steps one after another, which other tests hold against oracles."""
+
+import dataclasses
+
+import pytest
+import torch
+from combinations import DT, F64, draw, make
+from torch import Tensor
+
+import torch_mpm as mpm
+
+SEEDS = range(40)
+
+
+def one_by_one(step: mpm.Step, state: mpm.State, n: int, dt: float = DT) -> mpm.State:
+    for _ in range(n):
+        state = step(state, dt)
+    return state
+
+
+def in_one_op(step: mpm.Step, state: mpm.State) -> bool:
+    return step.explain(state, DT) == "all steps in one op"
+
+
+def tensors(state: mpm.State) -> dict[str, Tensor]:
+    fields = {f.name: getattr(state, f.name) for f in dataclasses.fields(state) if f.name not in ("extra", "time")}
+    return {name: t for name, t in {**fields, **state.extra}.items() if isinstance(t, Tensor)}
+
+
+def assert_equal(a: mpm.State, b: mpm.State, text: str = "") -> None:
+    """Bit by bit on the CPU; on CUDA, where sums have no order, to rounding."""
+    assert a.time == b.time
+    left, right = tensors(a), tensors(b)
+    assert left.keys() == right.keys()
+    for name, value in left.items():
+        if value.is_cuda and value.is_floating_point():
+            scale = right[name].abs().max().clamp_min(1e-9)
+            assert float((value - right[name]).abs().max() / scale) < (1e-11 if value.dtype == F64 else 1e-4), name
+        else:
+            assert torch.equal(value, right[name]), f"{name} {text}"
+
+
+def blob(device: str, dim: int = 3, count: int = 300, dtype: torch.dtype = F64, **fields) -> mpm.State:
+    g = torch.Generator().manual_seed(3)
+    x = 0.3 + 0.4 * torch.rand(count, dim, generator=g, dtype=F64)
+    v = torch.randn(count, dim, generator=g, dtype=F64)
+    ones = torch.ones(count, dtype=F64)
+    state = mpm.State(x=x, v=v, mass=1e-3 * ones, volume=1e-6 * ones, **fields)
+    return state.to(device, dtype)
+
+
+def box(dim: int = 3, dx: float = 0.0625, **options) -> mpm.Grid:
+    return mpm.Grid(dx=dx, lower=(0.0,) * dim, upper=(1.0,) * dim, **options)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_random_simulations(seed, device):
+    c = draw(seed)
+    case, again = make(c, device), make(c, device)
+    case.step.heat = again.step.heat = None  # which goes step by step
+    with torch.no_grad():
+        reason = case.step.explain(case.state, DT)
+        assert_equal(mpm.rollout(case.step, case.state, 5, DT), one_by_one(again.step, again.state, 5), f"{c} {reason}")
+
+
+def test_random_simulations_are_taken_in_one_op(device):
+    """Not all of them go the other way, or the test above would compare nothing."""
+    with torch.no_grad():
+        cases = [make(draw(seed), device) for seed in SEEDS]
+        for case in cases:
+            case.step.heat = None
+        assert sum(in_one_op(case.step, case.state) for case in cases) > len(cases) / 3
+
+
+LAWS_HERE = {
+    "neo_hookean": lambda: mpm.NeoHookean(E=1e4, nu=0.3),
+    "fluid": lambda: mpm.WeaklyCompressible(1e4, viscosity=1.0),
+    "fixed_corotated": lambda: mpm.FixedCorotated(E=1e4, nu=0.3),
+    "hencky": lambda: mpm.Hencky(E=1e4, nu=0.3),
+    "von_mises": lambda: mpm.VonMises(E=1e4, nu=0.3, yield_stress=30.0, hardening=100.0),
+    "herschel_bulkley": lambda: mpm.HerschelBulkley(E=1e4, nu=0.3, yield_stress=10.0, consistency=5.0, exponent=0.7),
+    "snow": lambda: mpm.Snow(E=1e4, nu=0.3),
+    "cam_clay": lambda: mpm.CamClay(
+        E=1e4, nu=0.3, critical_slope=1.2, consolidation=500.0, hardening=8.0, cohesion=0.1
+    ),
+    "viscoelastic": lambda: mpm.Viscoelastic(E=1e4, nu=0.3, branch_modulus=3e3, relaxation_time=0.01),
+    "sand": lambda: mpm.QuarticSand(E=1e5, nu=0.3, volume_correction=True),
+    "sand_keep": lambda: mpm.QuarticSand(E=1e5, nu=0.3, apex="keep"),
+}
+
+
+@pytest.mark.parametrize("law", LAWS_HERE)
+@pytest.mark.parametrize("n", [1, 2, 5])
+def test_laws(law, n, dim, device):
+    step = mpm.Step(box(dim), LAWS_HERE[law](), gravity=(0.0, -9.8, 0.0)[:dim], walls="separate")
+    state = blob(device, dim)
+    assert in_one_op(step, state)
+    with torch.no_grad():
+        assert_equal(mpm.rollout(step, state, n, 1e-4), one_by_one(step, state, n, 1e-4))
+
+
+@pytest.mark.parametrize("transfer", ["apic", "pic"])
+@pytest.mark.parametrize("form", ["mls", "gradient"])
+@pytest.mark.parametrize("kernel", ["quadratic", "cubic"])
+@pytest.mark.parametrize("dtype", [torch.float32, F64])
+def test_transfers(transfer, form, kernel, dtype, device):
+    step = mpm.Step(
+        box(kernel=kernel), mpm.NeoHookean(E=1e4, nu=0.3), transfer=transfer, stress_form=form, walls="slip"
+    )
+    state = blob(device, dtype=dtype)
+    with torch.no_grad():
+        assert_equal(mpm.rollout(step, state, 4, 1e-4), one_by_one(step, state, 4, 1e-4))
+
+
+def mixture() -> mpm.Mixture:
+    """Histories of one name in two laws, and of laws with two; fields F and J."""
+    names = ("von_mises", "fluid", "cam_clay", "von_mises", "sand", "neo_hookean", "viscoelastic")
+    return mpm.Mixture([LAWS_HERE[name]() for name in names])
+
+
+def test_mixtures(dim, device):
+    laws = mixture()
+    state = blob(device, dim, 400, material=torch.randint(0, 7, (400,), dtype=torch.int32))
+    state = state.replace(material=state.material.int(), ids=torch.randperm(400).to(device))
+    step = mpm.Step(box(dim), laws, gravity=(0.0, -9.8, 0.0)[:dim], walls="sticky")
+    assert in_one_op(step, state)
+    with torch.no_grad():
+        assert_equal(mpm.rollout(step, state, 5, 1e-4), one_by_one(step, state, 5, 1e-4))
+        sorted_state = step.prepare(state).sorted(step.grid)
+        assert_equal(mpm.rollout(step, sorted_state, 3, 1e-4), one_by_one(step, sorted_state, 3, 1e-4))
+
+
+def test_a_material_without_a_law_is_refused(device):
+    state = blob(device, material=torch.full((300,), 7, dtype=torch.int32))
+    state = state.replace(material=state.material.int())
+    with torch.no_grad(), pytest.raises(ValueError, match=r"material must be in 0 \.\. 6"):
+        mpm.rollout(mpm.Step(box(), mixture()), state, 2, 1e-4)
+
+
+def test_batches_with_obstacles_and_parameters_of_scenes_and_particles(dim, device):
+    scenes = 3
+    state = blob(device, dim, scene=torch.arange(300, dtype=torch.int32) % scenes)
+    state = state.replace(scene=state.scene.int())
+    mu, lam = torch.linspace(1e3, 1e4, scenes, dtype=F64), torch.linspace(1e3, 2e3, 300, dtype=F64)
+    law = mpm.NeoHookean(mu=mu, lam=lam)
+    spin = {} if dim == 2 else {"angular_velocity": (0.0, 3.0, 0.0)}
+    obstacles = [
+        mpm.Sphere((0.5,) * dim, 0.15, velocity=(1.0,) + (0.0,) * (dim - 1), kind="slip", friction=0.3),
+        mpm.Box((0.3,) * dim, (0.1,) * dim, kind="sticky", start=2e-4, **spin),
+        mpm.Plane((0.0, 0.35, 0.0)[:dim], (0.0, 1.0, 0.0)[:dim], kind="separate", end=3e-4),
+    ]
+    gravity = torch.randn(scenes, dim, dtype=F64, device=device)
+    step = mpm.Step(box(dim, scenes=scenes), law.to(device), gravity, boundaries=obstacles, walls="slip")
+    assert in_one_op(step, state)
+    with torch.no_grad():
+        assert_equal(mpm.rollout(step, state, 6, 1e-4), one_by_one(step, state, 6, 1e-4))
+
+
+# ---- the pool of blocks
+
+
+def flying(device: str) -> tuple[mpm.State, float]:
+    """Particles that leave each other, so that more blocks become active in every step."""
+    state = blob(device, count=200)
+    return state.replace(x=0.5 + 0.1 * (state.x - 0.5), v=60 * (state.x - 0.5)), 2e-3
+
+
+def test_the_pool_grows_inside_the_op():
+    state, dt = flying("cpu")
+    grid, other = box(dx=1 / 64), box(dx=1 / 64)
+    law = mpm.NeoHookean(E=1.0, nu=0.3)
+    with torch.no_grad():
+        end = mpm.rollout(mpm.Step(grid, law), state, 8, dt)
+        assert_equal(end, one_by_one(mpm.Step(other, law), state, 8, dt))
+    assert grid.max_blocks >= grid.activate(end.x).wanted > 2 * grid.activate(state.x).wanted
+
+
+def test_a_full_pool_is_an_error_and_nothing_is_lost():
+    state, dt = flying("cpu")
+    step = mpm.Step(box(dx=1 / 64, max_blocks=40), mpm.NeoHookean(E=1.0, nu=0.3))
+    before = state.x.clone()
+    with torch.no_grad(), pytest.raises(mpm.GridOverflowError, match="max_blocks=40"):
+        mpm.rollout(step, state, 8, dt)
+    assert torch.equal(state.x, before)
+
+
+def test_problems_are_those_of_single_steps(device):
+    """A particle outside the grid and one that is not finite are counted in the same steps."""
+    state = blob(device)
+    x = state.x.clone()
+    x[5], x[7] = float("nan"), 3.0
+    failures = []
+    for move in (mpm.rollout, one_by_one):
+        step = mpm.Step(box(), mpm.NeoHookean(E=1e4, nu=0.3))
+        with torch.no_grad():
+            end = move(step, state.replace(x=x), 4, 1e-3)
+            failures.append((step.status.cpu(), end.x.isfinite().all(1).cpu()))
+            with pytest.raises(mpm.SimulationError, match=r"outside|NaN"):
+                step.check()
+    assert all(torch.equal(a, b) for a, b in zip(*failures, strict=True))
+
+
+def test_no_particles(device):
+    step = mpm.Step(box(), mpm.VonMises(E=1e4, nu=0.3, yield_stress=1.0), gravity=(0.0, -1.0, 0.0))
+    with torch.no_grad():
+        end = mpm.rollout(step, blob(device, count=0), 3, 1e-3)
+    assert len(end) == 0 and end.time == 1e-3 + 1e-3 + 1e-3
+
+
+# ---- which way a rollout goes
+
+
+def test_reasons_to_step_from_python(device):
+    state, law = blob(device), mpm.NeoHookean(E=1e4, nu=0.3)
+    reasons = {
+        "a tensor": (mpm.Step(box(), law), state, torch.tensor(1e-4, device=device)),
+        "FLIP": (mpm.Step(box(), law, flip=0.5), state, 1e-4),
+        "on_grid": (mpm.Step(box(), law, on_grid=lambda b, v, m, dt: v), state, 1e-4),
+        "CustomLaw": (mpm.Step(box(), lambda F: F), state, 1e-4),
+        "QuarticSand": (mpm.Step(box(), mpm.QuarticSand(E=1e4, nu=0.3, hardening=(0.6, 0.1, 0.2, 0.1))), state, 1e-4),
+        "gradient": (mpm.Step(box(), law), state.replace(v=state.v.clone().requires_grad_()), 1e-4),
+        "boundary": (mpm.Step(box(), law, boundaries=[Still()]), state, 1e-4),
+    }
+    for reason, (step, start, dt) in reasons.items():
+        assert reason in step.explain(start, dt)
+
+
+class Still:
+    def apply(self, velocity, positions, scene, time, dt):
+        return velocity
+
+
+def test_hooks_are_called_for_every_step(device):
+    step, called = mpm.Step(box(), mpm.NeoHookean(E=1e4, nu=0.3)), []
+    handle = step.law.register_forward_hook(lambda *arguments: called.append(1))
+    with torch.no_grad():
+        mpm.rollout(step, blob(device), 3, 1e-4)
+        assert len(called) == 3
+        handle.remove()
+        mpm.rollout(step, blob(device), 3, 1e-4)
+    assert len(called) == 3
+
+
+def test_a_law_with_its_own_update_is_not_replaced(device):
+    class Doubled(mpm.NeoHookean):
+        def update(self, state):
+            fields, stress = super().update(state)
+            return fields, 2 * stress
+
+    step = mpm.Step(box(), Doubled(E=1e4, nu=0.3))
+    assert "Doubled is more than a compiled law" in step.explain(blob(device))
+
+
+def test_the_raw_op(device):
+    state = blob(device, count=40)
+    x, scalar = state.x, torch.tensor(2e3, dtype=F64, device=device)
+    eye = torch.eye(3, dtype=F64, device=device).repeat(40, 1, 1)
+    grid = box(max_blocks=64)
+    particles = (x, state.v, state.mass, state.volume, None, eye, None, [state.mass * 0], None, None, None, None)
+    law = ("von_mises", [0], [scalar, scalar, 0.01 * scalar, scalar], [1])
+    rest = (None, [], [], [], None, None, [], [], [], [], [], [], 0.0, 1, 64, False, *grid.packed)
+    call = (*particles, *law, 2, 1e-4, True, True, 0, *rest)
+    checks = ("test_schema", "test_faketensor", "test_aot_dispatch_dynamic")
+    torch.library.opcheck(torch.ops.torch_mpm.substeps.default, call, test_utils=checks)
+    with pytest.raises(NotImplementedError, match="no gradient"):
+        given = (x.clone().requires_grad_(), *call[1:])
+        torch.ops.torch_mpm.substeps(*given)[0].sum().backward()
+    for wrong, place, message in (
+        ("sand", 12, "law must be one of"),
+        ([0, 0], 13, "options must have an entry per law"),
+        ([scalar], 14, "parameters and history must have those of all laws"),
+        (0, 16, "n must be positive"),
+        (-1.0, 17, "dt must be positive"),
+    ):
+        with pytest.raises(RuntimeError, match=message):
+            torch.ops.torch_mpm.substeps(*call[:place], wrong, *call[place + 1 :])

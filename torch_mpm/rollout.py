@@ -1,0 +1,208 @@
+"""Many steps in a row: in one op where a step is all of compiled parts, otherwise from Python."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.utils.checkpoint import checkpoint as run_checkpointed
+
+from .boundaries import Obstacle
+from .capture import is_captured, is_traced
+from .errors import check_count, check_number, shape_of
+from .laws import CompiledLaw, Mixture
+from .ops.contact import MAX_OBSTACLES, fusible, obstacle_arguments
+from .ops.grid_update import per_scene, wall_arguments
+from .ops.transfer import STRESS_FORMS
+from .parameters import Overlay
+from .state import State
+from .step import Step
+
+LawCall = tuple[CompiledLaw, list[Tensor], list[str]]
+"""A law, its parameters, and the names of its history."""
+
+
+def rollout(
+    step: Callable[[State, float | Tensor], State],
+    state: State,
+    n: int,
+    dt: float | Tensor,
+    checkpoint: int | None = None,
+) -> State:
+    """The state n steps later.
+
+    Args:
+        step: a `Step`, or any function (state, dt) -> state.
+        state: the initial state.
+        n: number of steps.
+        dt: time step [s].
+        checkpoint: if given, keep for the backward pass only the state of every `checkpoint` steps and compute the
+            steps between again (memory n/checkpoint + checkpoint states instead of n steps; sqrt(n) is best).
+
+    A `Step` of compiled laws without heat, FLIP and functions of the user's takes all steps in one op while nothing
+    requires a gradient; `Step.explain` tells. The results are those of single steps, to the last bit.
+
+    Raises:
+        TypeError, ValueError: for an n or a checkpoint that is no whole number, a negative n, a checkpoint below 1, or
+            what `step` raises.
+    """
+    if not callable(step):
+        raise TypeError(f"step must be a Step or a function (state, dt) -> state, got {shape_of(step)}")
+    check_count("n", n)
+    if checkpoint is not None:
+        check_count("checkpoint", checkpoint, 1)
+
+    def steps(state: State, count: int) -> State:
+        if isinstance(step, Step) and obstacle_to_substeps(step, state, dt) is None:
+            return in_chunks(step, state, count, dt)  # type: ignore[arg-type]
+        for _ in range(count):
+            state = step(state, dt)
+        return state
+
+    if checkpoint is None or not torch.is_grad_enabled():
+        return steps(state, n)
+    if isinstance(step, Step):
+        state = step.prepare(state)
+    done = 0
+    while done < n:
+        count = min(checkpoint, n - done)
+        state = run_checkpointed(steps, state, count, use_reentrant=False)
+        done += count
+    return state
+
+
+def obstacle_to_substeps(step: Step, state: State, dt: float | Tensor) -> str | None:
+    """Why `substeps` cannot take the steps from a state; None where it can."""
+    x, law = state.x, step.law
+    laws = list(law.laws) if type(law) is Mixture else [law]
+    if isinstance(dt, Tensor) or isinstance(state.time, Tensor):
+        return "dt or the time of the state is a tensor"
+    if torch.compiler.is_compiling() or is_traced(x) or is_captured(x) or torch._C._are_functorch_transforms_active():
+        return "it is compiled, captured or transformed"
+    if step.heat is not None:
+        return "it conducts heat"
+    if step.on_grid is not None:
+        return "it calls on_grid"
+    if step.transfer == "flip" or step.flip:
+        return "its transfer is FLIP"
+    for part in laws:
+        if not isinstance(part, CompiledLaw) or not part.is_all_of_its_update() or type(part).forward is not _FORWARD:
+            return f"{type(part).__name__} is more than a compiled law"
+    if any(_hooks(module) for module in (step, *law.modules())):
+        return "there are hooks"
+    boundaries = step.boundaries.entries
+    if not all(isinstance(b, Obstacle) and fusible(b, state.time) for b in boundaries):
+        return "a boundary acts by torch operations"
+    if len(boundaries) > MAX_OBSTACLES:
+        return f"there are more than {MAX_OBSTACLES} obstacles"
+    if torch.is_grad_enabled() and any(t.requires_grad for t in _tensors(step, state)):
+        return "something requires a gradient"
+    return None
+
+
+CHUNK = 64
+"""Steps of one op where the pool of blocks follows the scene on CUDA, which it does between two calls."""
+
+
+def in_chunks(step: Step, state: State, n: int, dt: float) -> State:
+    chunk = CHUNK if step.grid.grows and state.x.is_cuda else n
+    while n > 0:
+        count = min(n, chunk)
+        state, n = substeps(step, state, count, dt), n - count
+    return state
+
+
+_FORWARD = CompiledLaw.forward
+
+
+def _hooks(module: torch.nn.Module) -> bool:
+    return bool(
+        module._forward_hooks or module._forward_pre_hooks or module._backward_hooks or module._backward_pre_hooks
+    )
+
+
+def _tensors(step: Step, state: State) -> list[Tensor]:
+    """All tensors that a gradient of a step may pass to."""
+    fields = [value for value in vars(state).values() if isinstance(value, Tensor)]
+    values = [v for b in step.boundaries.entries for v in (*vars(b).values(), *vars(b.shape).values())]
+    gravity = [step.gravity] if isinstance(step.gravity, Tensor) else []
+    return [
+        *fields,
+        *state.extra.values(),
+        *gravity,
+        *(v for v in values if isinstance(v, Tensor)),
+        *step.parameters(),
+        *step.buffers(),
+    ]
+
+
+@torch.no_grad()
+def substeps(step: Step, state: State, n: int, dt: float) -> State:
+    """The state n steps later, by one op; `obstacle_to_substeps` must be None.
+
+    Raises:
+        ValueError: for a dt that is not positive and finite, or a material without a law.
+        GridOverflowError: on the CPU, where a grid of fixed `max_blocks` is full.
+    """
+    check_number("dt", dt, "positive and finite", lambda v: 0 < v < float("inf"))
+    state, grid, record = step.prepare(state), step.grid, step._activations
+    max_blocks = grid.pool(state.x, state.scene)
+    calls = _law_calls(step, state, dt)
+    apic = step.transfer == "apic"
+    x, v, C, F, J, history, status = torch.ops.torch_mpm.substeps(
+        *(state.x, state.v, state.mass, state.volume, state.C, state.F, state.J),
+        [state.extra[name] for _, _, names in calls for name in names],
+        *(state.scene, state.ids, state.material if len(calls) > 1 else None, record.status),
+        ",".join(law._name(state) for law, _, _ in calls),
+        [law.option_bits() for law, _, _ in calls],
+        [parameter for _, parameters, _ in calls for parameter in parameters],
+        [len(names) for _, _, names in calls],
+        *(int(n), float(dt), apic, apic or step.law.viscous, STRESS_FORMS[step.stress_form]),
+        _gravity(step, state.x),
+        *wall_arguments(step.walls, grid),
+        *obstacle_arguments(step.boundaries.entries, state.x, grid.scenes),
+        *(float(state.time), grid.scenes, max_blocks, grid.grows, *grid.packed),
+    )
+    record.status = status
+    grid.watch(status)
+    if status.device.type == "cpu":  # where the op has let the pool grow, or stopped
+        grid.follow(int(status[0, 0] if grid.grows else status[0, 7]))
+    time = state.time
+    for _ in range(n):
+        time = time + dt
+    extra = _history(state, calls, history)
+    return state.replace(x=x, v=v, C=C, F=F, J=J, extra=extra, time=time)
+
+
+def _law_calls(step: Step, state: State, dt: float) -> list[LawCall]:
+    law = step.law
+    if isinstance(law, Mixture):
+        law.check_material(state)
+    laws: Any = law.laws if isinstance(law, Mixture) else [law]
+    given: Any = Overlay(state, dt=dt)
+    return [(part, part._arguments(given)[1], part.history_names()) for part in laws]
+
+
+def _gravity(step: Step, x: Tensor) -> Tensor | None:
+    gravity = step.gravity_like(x)
+    return None if gravity is None else per_scene(gravity, x, step.grid.scenes, step.grid.dim)
+
+
+def _history(state: State, calls: list[LawCall], columns: Tensor | None) -> dict[str, Tensor]:
+    """The history of all laws by name; each particle has that of its law."""
+    extra, first = dict(state.extra), 0
+    for number, (_, _, names) in enumerate(calls):
+        for name in names:
+            before = extra[name]
+            width = 1 if before.dim() == 1 else before.shape[1] ** 2
+            assert columns is not None
+            value = columns[:, first] if before.dim() == 1 else columns[:, first : first + width].view_as(before)
+            if len(calls) > 1:
+                assert state.material is not None
+                own = (state.material == number).reshape(-1, *(1,) * (before.dim() - 1))
+                value = torch.where(own, value, before)
+            extra[name] = value
+            first += width
+    return extra
