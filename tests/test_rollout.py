@@ -27,13 +27,14 @@ def tensors(state: mpm.State) -> dict[str, Tensor]:
     return {name: t for name, t in {**fields, **state.extra}.items() if isinstance(t, Tensor)}
 
 
-def assert_equal(a: mpm.State, b: mpm.State, text: str = "") -> None:
-    """Bit by bit on the CPU; on CUDA, where sums have no order, to rounding."""
+def assert_equal(a: mpm.State, b: mpm.State, text: str = "", exactly: bool = True) -> None:
+    """Bit by bit on the CPU; on CUDA, where sums have no order, to rounding. So too for a mixture, whose laws see other
+    particles side by side: what iterates goes on until all lanes have converged."""
     assert a.time == b.time
     left, right = tensors(a), tensors(b)
     assert left.keys() == right.keys()
     for name, value in left.items():
-        if value.is_cuda and value.is_floating_point():
+        if value.is_floating_point() and (value.is_cuda or not exactly):
             scale = right[name].abs().max().clamp_min(1e-9)
             assert float((value - right[name]).abs().max() / scale) < (1e-11 if value.dtype == F64 else 1e-4), name
         else:
@@ -60,7 +61,8 @@ def test_random_simulations(seed, device):
     case.step.heat = again.step.heat = None  # which goes step by step
     with torch.no_grad():
         reason = case.step.explain(case.state, DT)
-        assert_equal(mpm.rollout(case.step, case.state, 5, DT), one_by_one(again.step, again.state, 5), f"{c} {reason}")
+        end, expected = mpm.rollout(case.step, case.state, 5, DT), one_by_one(again.step, again.state, 5)
+        assert_equal(end, expected, f"{c} {reason}", not isinstance(case.step.law, mpm.Mixture))
 
 
 def test_random_simulations_are_taken_in_one_op(device):
@@ -125,9 +127,8 @@ def test_mixtures(dim, device):
     step = mpm.Step(box(dim), laws, gravity=(0.0, -9.8, 0.0)[:dim], walls="sticky")
     assert in_one_op(step, state)
     with torch.no_grad():
-        assert_equal(mpm.rollout(step, state, 5, 1e-4), one_by_one(step, state, 5, 1e-4))
-        sorted_state = step.prepare(state).sorted(step.grid)
-        assert_equal(mpm.rollout(step, sorted_state, 3, 1e-4), one_by_one(step, sorted_state, 3, 1e-4))
+        for start in (state, step.prepare(state).sorted(step.grid)):
+            assert_equal(mpm.rollout(step, start, 5, 1e-4), one_by_one(step, start, 5, 1e-4), exactly=False)
 
 
 def test_a_material_without_a_law_is_refused(device):

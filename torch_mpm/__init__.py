@@ -28,7 +28,7 @@ from .ops import (
     svd3,
 )
 from .parameters import PerMaterial, Table
-from .rollout import rollout
+from .rollouts import rollout
 from .state import State
 from .step import Step
 

@@ -281,7 +281,7 @@ class Step(TensorModule):
 
     def explain(self, state: State, dt: float | Tensor = 1.0) -> str:
         """How `rollout` takes steps from a state: all in one op, or one after another from Python, and why."""
-        from .rollout import obstacle_to_substeps  # which needs a Step
+        from .rollouts import obstacle_to_substeps  # which needs a Step
 
         reason = obstacle_to_substeps(self, state, dt)
         return "all steps in one op" if reason is None else f"step by step, because {reason}"

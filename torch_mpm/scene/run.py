@@ -23,7 +23,7 @@ from ..data.trajectory import PARTIAL, Layout, Trajectory, TrajectoryWriter
 from ..errors import DamagedFileError, SimulationError
 from ..laws import Mixture
 from ..laws.thermal import LIQUID
-from ..rollout import rollout
+from ..rollouts import rollout
 from ..state import State
 from . import checkpoint, heap
 from .build import Built
