@@ -11,13 +11,14 @@ from torch.utils.checkpoint import checkpoint as run_checkpointed
 
 from .boundaries import Obstacle
 from .capture import is_captured, is_traced
-from .errors import check_count, check_number, shape_of
+from .errors import check_count, shape_of
 from .laws import CompiledLaw, Mixture
+from .ops.arguments import split_dt
 from .ops.contact import MAX_OBSTACLES, fusible, obstacle_arguments
 from .ops.grid_update import per_scene, wall_arguments
 from .ops.transfer import STRESS_FORMS
 from .parameters import Overlay
-from .state import State
+from .state import State, check_state
 from .step import Step
 
 LawCall = tuple[CompiledLaw, list[Tensor], list[str]]
@@ -75,6 +76,7 @@ def rollout(
 
 def obstacle_to_substeps(step: Step, state: State, dt: float | Tensor) -> str | None:
     """Why `substeps` cannot take the steps from a state; None where it can."""
+    check_state(state)
     x, law = state.x, step.law
     laws = list(law.laws) if type(law) is Mixture else [law]
     if isinstance(dt, Tensor) or isinstance(state.time, Tensor):
@@ -146,7 +148,7 @@ def substeps(step: Step, state: State, n: int, dt: float) -> State:
         ValueError: for a dt that is not positive and finite, or a material without a law.
         GridOverflowError: on the CPU, where a grid of fixed `max_blocks` is full.
     """
-    check_number("dt", dt, "positive and finite", lambda v: 0 < v < float("inf"))
+    dt, _ = split_dt(dt, step.grid.scenes, state.x)
     state, grid, record = step.prepare(state), step.grid, step._activations
     max_blocks = grid.pool(state.x, state.scene)
     calls = _law_calls(step, state, dt)
@@ -159,7 +161,7 @@ def substeps(step: Step, state: State, n: int, dt: float) -> State:
         [law.option_bits() for law, _, _ in calls],
         [parameter for _, parameters, _ in calls for parameter in parameters],
         [len(names) for _, _, names in calls],
-        *(int(n), float(dt), apic, apic or step.law.viscous, STRESS_FORMS[step.stress_form]),
+        *(int(n), dt, apic, apic or step.law.viscous, STRESS_FORMS[step.stress_form]),
         _gravity(step, state.x),
         *wall_arguments(step.walls, grid),
         *obstacle_arguments(step.boundaries.entries, state.x, grid.scenes),

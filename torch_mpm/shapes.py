@@ -20,6 +20,7 @@ in a kernel.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -31,7 +32,7 @@ from torch import Tensor
 from torch.autograd.graph import saved_tensors_hooks
 
 from . import surface_mesh
-from .errors import check_number, shape_of
+from .errors import check_number, check_vector, shape_of
 from .per_scene import SceneParameters, Value, constant, direction, extent, floats
 from .surface_mesh import Array, SurfaceMesh
 from .vectors import norm, unit
@@ -373,6 +374,83 @@ class SDF(Shape):
                 f"got {shape_of(distance)} and {shape_of(normal)}"
             )
         return distance, unit(normal)
+
+
+class Sampled(Shape):
+    """Any shape, from its signed distance at the nodes of a lattice, multilinear between them.
+
+    An obstacle of it acts in the kernel, where those of `SDF` and `Mesh` act by torch operations: `Sampled.of` makes it
+    of them. Its surface is off by some spacing²/(8 radius) where the surface is curved, and edges are rounded.
+
+    Args:
+        values: signed distances [m], negative inside, positive on the border: [X, Y] or [X, Y, Z], at least 2 of each.
+            Steeper ones than distances are flattened, which keeps their zero level.
+        lower: the first node in the coordinates of the shape [m], D numbers.
+        spacing: distance of the nodes [m].
+
+    Raises:
+        TypeError, ValueError: for values that are no such tensor, not finite, or not positive on the border.
+    """
+
+    name = "sampled"
+
+    def __init__(self, values: Tensor, lower: Sequence[float], spacing: float) -> None:
+        if not isinstance(values, Tensor) or values.dim() not in (2, 3) or min(values.shape) < 2:
+            raise ValueError(f"values must be a tensor [X, Y] or [X, Y, Z] of 2 or more each, got {shape_of(values)}")
+        self.lower = check_vector("lower", lower, values.dim())
+        self.spacing = float(check_number("spacing", spacing, "positive", lambda v: 0 < v < math.inf))
+        values = values.detach().to("cpu", torch.float64)
+        if not bool(values.isfinite().all()):
+            raise ValueError("values must be finite")
+        if any(bool((values.select(axis, end) <= 0).any()) for axis in range(values.dim()) for end in (0, -1)):
+            raise ValueError("values must be positive on the border of the lattice: enlarge it")
+        slopes = (float(values.diff(dim=axis).abs().max()) / self.spacing for axis in range(values.dim()))
+        self.values = values / max(1.0, math.hypot(*slopes))
+
+    @classmethod
+    def of(cls, shape: Shape, lower: Sequence[float], upper: Sequence[float], spacing: float) -> Sampled:
+        """A shape sampled between two corners [m] of a box around it."""
+        first, last = check_vector("lower", lower), check_vector("upper", upper, len(lower))
+        counts = [max(2, math.ceil((b - a) / spacing - 1e-9) + 1) for a, b in zip(first, last, strict=True)]
+        axes = [a + spacing * torch.arange(n, dtype=torch.float64) for a, n in zip(first, counts, strict=True)]
+        nodes = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1)
+        return cls(shape.surface(nodes.reshape(-1, len(counts)))[0].reshape(counts), first, spacing)
+
+    @classmethod
+    def from_data(cls, data: Tensor, dim: int) -> Sampled:
+        """The inverse of `data`."""
+        shape = cls.__new__(cls)
+        shape.lower, shape.spacing = tuple(data[:dim].tolist()), float(data[dim])
+        shape.values = data[2 * dim + 1 :].reshape([int(n) for n in data[dim + 1 : 2 * dim + 1]])
+        return shape
+
+    def data(self, like: Tensor) -> Tensor:
+        """Lower corner, spacing, numbers of nodes and values [n], as the kernel takes them."""
+        numbers = [*self.lower, self.spacing, *self.values.shape]
+        return torch.cat([self.values.new_tensor(numbers), self.values.reshape(-1)]).to(like)
+
+    def surface(self, x: Tensor, scene: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        values, counts = self.values.to(x), self.values.shape
+        along = (x - x.new_tensor(self.lower)) / self.spacing
+        last = x.new_tensor([n - 1 for n in counts])
+        inside = torch.minimum(along.clamp_min(0), last)
+        cell = torch.minimum(inside.detach().floor(), last - 1).long()
+        weight = inside - cell
+        distance, gradient = torch.zeros_like(x[:, 0]), [torch.zeros_like(x[:, 0]) for _ in counts]
+        for corner in itertools.product((0, 1), repeat=len(counts)):
+            value = values[tuple((cell + torch.tensor(corner, device=x.device)).unbind(1))]
+            parts = [weight[:, i] if upper else 1 - weight[:, i] for i, upper in enumerate(corner)]
+            distance = distance + math.prod(parts[1:], start=parts[0]) * value
+            for i, upper in enumerate(corner):
+                rest = math.prod(parts[:i] + parts[i + 1 :], start=torch.ones_like(value))
+                gradient[i] = gradient[i] + (value if upper else -value) * rest
+        beyond = (along - inside) * self.spacing
+        far, away = (beyond != 0).any(1), norm(torch.cat([distance[:, None], beyond], 1))
+        return torch.where(far, away, distance), unit(torch.stack(gradient, 1))
+
+    def bounds(self, dim: int, scene: int = 0) -> tuple[Tensor, Tensor]:
+        lower = torch.tensor(self.lower, dtype=torch.float64, device="cpu")
+        return lower, lower + self.spacing * (torch.tensor(self.values.shape, dtype=torch.float64, device="cpu") - 1)
 
 
 # ---- geometry

@@ -82,9 +82,11 @@ class _Calls:
         walls = ([2, 4] + [1, 3] * (D - 1), [0.0, 1.0] * D, [0.1] * 2 * D)
         rows, velocity = self.uniform(self.N, 1 + D), self.normal(self.N, D)
         update = (rows, self.normal(2, D), self.dt, 0.1, *walls, *top)
-        table, outline = self.uniform(2, 5, 10 if D == 2 else 17), self.uniform(4, 2)
-        kinds = ([0, 1, 2, 3, 4], [0, 0, 0, 0, 4], [1, 2, 3, 2, 3], [-1, -1, 0, 1, -1], [0.0] * 5, [float("inf")] * 5)
-        obstacles = (velocity, table, outline, *kinds, self.uniform(2), 0.1, *top)
+        table, data = self.uniform(2, 6, 10 if D == 2 else 17), self.uniform(8 + 2 * D + 1 + 2**D)
+        data[8 + D + 1 : 8 + 2 * D + 1] = 2.0  # samples along each axis
+        sizes = [0, 0, 0, 0, 8, 2 * D + 1 + 2**D]
+        kinds = ([0, 1, 2, 3, 4, 5], sizes, [1, 2, 3, 2, 3, 1], [-1, -1, 0, 1, -1, -1], [0.0] * 6, [float("inf")] * 6)
+        obstacles = (velocity, table, data, *kinds, self.uniform(2), 0.1, *top)
         return [
             ("grid_update", update),
             ("grid_update_backward", (self.uniform(self.N, 1 + D), True, *update)),

@@ -9,7 +9,7 @@
 // Rigid obstacles: which nodes are inside, the velocity of those after contact, and its adjoints.
 namespace mpm {
 
-enum class ObstacleShape : int { plane = 0, sphere = 1, box = 2, capsule = 3, revolved = 4 };
+enum class ObstacleShape : int { plane = 0, sphere = 1, box = 2, capsule = 3, revolved = 4, sampled = 5 };
 
 constexpr int kMaxObstacles = 16;  // of one call
 
@@ -19,7 +19,7 @@ struct ObstacleKind {
   Contact contact;
   int scene;                  // -1 for all
   double start, end;          // acts while start <= time < end [s]
-  int first_corner, corners;  // of the outline of a revolved shape
+  int first_number, numbers;  // of the data of its shape
 };
 
 // A row of the table of obstacles, all of it numbers of the nodes' type (torch_mpm/ops/contact.py writes it).
@@ -45,7 +45,10 @@ struct ContactArguments {
   ObstacleKind kind[kMaxObstacles];
   const ObstacleRow<T, D>* row = nullptr;  // [rows, obstacles]; one row for all scenes, or one per scene
   int rows = 0;
-  const T* outline = nullptr;     // corners (distance from the axis, position along it) [corners, 2], anticlockwise
+  // Of a revolved shape, corners (distance from the axis, position along it), anticlockwise; of a sampled one, the
+  // first node of the samples [D], their distance, numbers of them along each axis [D], and the samples, the last axis
+  // fastest.
+  const T* data = nullptr;
   const T* scene_time = nullptr;  // [times], one for all scenes or one per scene; or null
   int times = 0;
   double time = 0;              // where scene_time is null
@@ -95,8 +98,8 @@ struct ObstaclePose {
   ObstacleShape shape;
   Contact contact;
   const ObstacleRow<S, D>* row;
-  const ValueOf<S>* outline;
-  int corners;
+  const ValueOf<S>* data;
+  int numbers;
   Vector<S, D> centre;
   Matrix<S, D> rotation;  // world = centre + rotation body
 };
@@ -111,8 +114,8 @@ MPM_HD ObstaclePose<S, D> obstacle_pose(const ContactArguments<T, D>& a, const O
   p.shape = kind.shape;
   p.contact = kind.contact;
   p.row = &row;
-  p.outline = a.outline + 2 * kind.first_corner;
-  p.corners = kind.corners;
+  p.data = a.data + kind.first_number;
+  p.numbers = kind.numbers;
   const S elapsed = lift<S>(T(time - kind.start));
   MPM_UNROLL for (int i = 0; i < D; i++)
     p.centre[i] = row.position[i] + row.velocity[i] * elapsed;
@@ -152,6 +155,58 @@ MPM_HD S polygon_surface(const ValueOf<S>* corner, int corners, const Vector<S, 
   return inside ? S(0) - nearest : nearest;
 }
 
+// Signed distance by multilinear interpolation of samples, and the direction of its gradient; beyond the samples the
+// distance there and the way to there are legs of a right triangle, so that it is a lower bound. Far away where the
+// numbers are not those of samples.
+template <class S, int D>
+MPM_HD S sampled_surface(const ValueOf<S>* data, int numbers, const Vector<S, D>& p, Vector<S, D>& normal) {
+  using T = ValueOf<S>;
+  normal = zero_vector<S, D>();
+  int64_t samples = numbers > 2 * D ? 1 : 0;
+  int count[D];
+  MPM_UNROLL for (int i = 0; i < D && samples; i++) {
+    const T n = data[D + 1 + i];
+    count[i] = n >= T(2) && n < T(1 << 20) ? int(n) : 0;
+    samples *= count[i];
+  }
+  if (samples == 0 || samples > numbers - (2 * D + 1)) return S(std::numeric_limits<T>::max());
+  const T spacing = data[D];
+  int cell[D];
+  Vector<S, D> weight, beyond;  // of the upper node
+  MPM_UNROLL for (int i = 0; i < D; i++) {
+    const S along = (p[i] - lift<S>(data[i])) / lift<S>(spacing);
+    const S last = lift<S>(T(count[i] - 1));
+    const S inside = along > S(0) ? (along < last ? along : last) : S(0);
+    cell[i] = int(value_of(inside));
+    if (cell[i] > count[i] - 2) cell[i] = count[i] - 2;
+    weight[i] = inside - lift<S>(T(cell[i]));
+    beyond[i] = (along - inside) * lift<S>(spacing);
+  }
+  S distance = S(0);
+  MPM_UNROLL for (int corner = 0; corner < 1 << D; corner++) {
+    int64_t index = 0;
+    S product = S(1);
+    MPM_UNROLL for (int i = 0; i < D; i++) {
+      const int upper = corner >> i & 1;
+      index = index * count[i] + cell[i] + upper;
+      product = product * (upper ? weight[i] : S(1) - weight[i]);
+    }
+    const S value = lift<S>(data[2 * D + 1 + index]);
+    distance = distance + product * value;
+    MPM_UNROLL for (int i = 0; i < D; i++) {
+      S slope = value;
+      MPM_UNROLL for (int j = 0; j < D; j++) {
+        const int upper = corner >> j & 1;
+        slope = slope * (j == i ? S(upper ? 1 : -1) : upper ? weight[j] : S(1) - weight[j]);
+      }
+      normal[i] = normal[i] + slope;
+    }
+  }
+  normal = direction(normal);
+  const S far = dot(beyond, beyond);
+  return far > S(0) ? sqrt(distance * distance + far) : distance;
+}
+
 // Signed distance of a point in body coordinates, and the unit normal out of the body: right inside, zero where the
 // shape has none. Outside, the distance is a lower bound.
 template <class T, int D>
@@ -179,10 +234,11 @@ MPM_HD T surface(const ObstaclePose<T, D>& o, const Vector<T, D>& body, Vector<T
     const T along = dot(body, axis);
     const Vector<T, D> across = body + (T(0) - along) * axis;
     Vector<T, 2> plane_normal;
-    const T distance = polygon_surface(o.outline, o.corners, Vector<T, 2>{{length(across), along}}, plane_normal);
+    const T distance = polygon_surface(o.data, o.numbers / 2, Vector<T, 2>{{length(across), along}}, plane_normal);
     normal = plane_normal[0] * direction(across) + plane_normal[1] * axis;
     return distance;
   }
+  if (o.shape == ObstacleShape::sampled) return sampled_surface(o.data, o.numbers, body, normal);
   Vector<T, D> offset = body;
   if (o.shape == ObstacleShape::capsule) {
     const T squared = dot(extent, extent);

@@ -10,14 +10,14 @@
 // Obstacles as the ops take them, packed by torch_mpm/ops/contact.py and unpacked here.
 namespace mpm {
 
-#define MPM_OBSTACLES_SCHEMA                                                                            \
-  "Tensor obstacles, Tensor outline, int[] shape, int[] corners, int[] contact, int[] obstacle_scene, " \
+#define MPM_OBSTACLES_SCHEMA                                                                       \
+  "Tensor obstacles, Tensor data, int[] shape, int[] sizes, int[] contact, int[] obstacle_scene, " \
   "float[] start, float[] end, Tensor? scene_time, float time"
-#define MPM_OBSTACLES_PARAMETERS                                                                            \
-  const Tensor &obstacles, const Tensor &outline, std::vector<int64_t> shape, std::vector<int64_t> corners, \
-      std::vector<int64_t> contact_kind, std::vector<int64_t> scene, std::vector<double> start,             \
+#define MPM_OBSTACLES_PARAMETERS                                                                       \
+  const Tensor &obstacles, const Tensor &data, std::vector<int64_t> shape, std::vector<int64_t> sizes, \
+      std::vector<int64_t> contact_kind, std::vector<int64_t> scene, std::vector<double> start,        \
       std::vector<double> end, const OptionalTensor &scene_time, double time
-#define MPM_OBSTACLES_ARGUMENTS obstacles, outline, shape, corners, contact_kind, scene, start, end, scene_time, time
+#define MPM_OBSTACLES_ARGUMENTS obstacles, data, shape, sizes, contact_kind, scene, start, end, scene_time, time
 
 // What does not depend on the activation; `like` has the dtype and device of the nodes.
 template <class T, int D>
@@ -48,28 +48,28 @@ ContactArguments<T, D> obstacle_arguments(const Tensor& like, const PackedLattic
     STD_TORCH_CHECK(list.size() == count, name, " must have an entry per obstacle, ", count, ", got ", list.size());
   };
   check_entries(shape, "shape");
-  check_entries(corners, "corners");
+  check_entries(sizes, "sizes");
   check_entries(contact_kind, "contact");
   check_entries(scene, "scene");
   check_entries(start, "start");
   check_entries(end, "end");
-  int64_t corner = 0;
+  int64_t number = 0;
   for (size_t k = 0; k < count; k++) {
-    STD_TORCH_CHECK(shape[k] >= int64_t(ObstacleShape::plane) && shape[k] <= int64_t(ObstacleShape::revolved),
-                    "shape must be 0 to 4, got ", shape[k]);
-    STD_TORCH_CHECK(corners[k] >= 0 && corners[k] <= INT32_MAX / kMaxObstacles,
-                    "corners must not be negative nor too many, got ", corners[k]);
+    STD_TORCH_CHECK(shape[k] >= int64_t(ObstacleShape::plane) && shape[k] <= int64_t(ObstacleShape::sampled),
+                    "shape must be 0 to 5, got ", shape[k]);
+    STD_TORCH_CHECK(sizes[k] >= 0 && sizes[k] <= INT32_MAX / kMaxObstacles,
+                    "sizes must not be negative nor too large, got ", sizes[k]);
     STD_TORCH_CHECK(contact_kind[k] >= int64_t(Contact::sticky) && contact_kind[k] <= int64_t(Contact::separate),
                     "contact must be 1 to 3, got ", contact_kind[k]);
     STD_TORCH_CHECK(scene[k] >= -1 && scene[k] <= INT32_MAX, "scene must be -1 or a scene, got ", scene[k]);
-    a.kind[k] = {ObstacleShape(shape[k]), Contact(contact_kind[k]), int(scene[k]), start[k], end[k], int(corner),
-                 int(corners[k])};
-    corner += corners[k];
+    a.kind[k] = {
+        ObstacleShape(shape[k]), Contact(contact_kind[k]), int(scene[k]), start[k], end[k], int(number), int(sizes[k])};
+    number += sizes[k];
   }
-  check_shape(outline, "outline", {corner, 2});
-  check_like(outline, "outline", like);
-  STD_TORCH_CHECK(outline.is_contiguous(), "outline must be contiguous, got shape ", shape_of(outline));
-  a.outline = static_cast<const T*>(outline.data_ptr());
+  check_shape(data, "data", {number});
+  check_like(data, "data", like);
+  STD_TORCH_CHECK(data.is_contiguous(), "data must be contiguous, got shape ", shape_of(data));
+  a.data = static_cast<const T*>(data.data_ptr());
   a.time = time;
   if (has(scene_time)) {
     check_rank(*scene_time, "scene_time", 1);

@@ -17,8 +17,8 @@ namespace {
       const OptionalTensor &ids, const OptionalTensor &material, const OptionalTensor &previous_status,          \
       std::string laws, std::vector<int64_t> options, const Tensors &parameters, std::vector<int64_t> variables, \
       int64_t n, double dt, bool apic, bool wants_C, int64_t stress_form, const OptionalTensor &gravity,         \
-      MPM_WALLS_PARAMETERS, const OptionalTensor &obstacle_table, const OptionalTensor &outline,                 \
-      std::vector<int64_t> shape, std::vector<int64_t> corners, std::vector<int64_t> contact_kind,               \
+      MPM_WALLS_PARAMETERS, const OptionalTensor &obstacle_table, const OptionalTensor &obstacle_data,           \
+      std::vector<int64_t> shape, std::vector<int64_t> sizes, std::vector<int64_t> contact_kind,                 \
       std::vector<int64_t> obstacle_scene, std::vector<double> start, std::vector<double> end, double time,      \
       int64_t scenes, int64_t max_blocks, bool grows, const std::vector<double>&lattice,                         \
       const std::vector<int64_t>&layout
@@ -255,8 +255,8 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> substeps(MPM_
       s.update.gravity = static_cast<const T*>(gravity->data_ptr());
     }
     if (s.obstacles)
-      s.contact = obstacle_arguments<T, D>(x, packed, *obstacle_table, outline.value(), shape, corners, contact_kind,
-                                           obstacle_scene, start, end, {}, time);
+      s.contact = obstacle_arguments<T, D>(x, packed, *obstacle_table, obstacle_data.value(), shape, sizes,
+                                           contact_kind, obstacle_scene, start, end, {}, time);
     s.advance.gather.moment_scale = packed.inverse_inertia();
     s.advance.gather.lost = NAN;
     s.advance.gather.value = view<T>(velocity);
@@ -360,7 +360,7 @@ STABLE_TORCH_LIBRARY_FRAGMENT(torch_mpm, m) {
       "Tensor? scene, Tensor? ids, Tensor? material, Tensor? previous_status, str laws, int[] options, "
       "Tensor[] parameters, int[] variables, int n, float dt, bool apic, bool wants_C, int stress_form, "
       "Tensor? gravity, " MPM_WALLS_SCHEMA
-      ", Tensor? obstacles, Tensor? outline, int[] shape, int[] corners, int[] contact, int[] obstacle_scene, "
+      ", Tensor? obstacles, Tensor? data, int[] shape, int[] sizes, int[] contact, int[] obstacle_scene, "
       "float[] start, float[] end, float time, int scenes, int max_blocks, bool grows, " MPM_LATTICE_SCHEMA
       ") -> (Tensor x, Tensor v, Tensor C, Tensor F, Tensor J, Tensor history, Tensor status)");
 }

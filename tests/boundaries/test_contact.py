@@ -371,8 +371,8 @@ def test_a_step_with_obstacles_is_captured(dim):
 def op_arguments(dim: int, device: str) -> list:
     blocks, velocity = inputs(dim, device)
     table = torch.rand(1, 5, 10 if dim == 2 else 17, dtype=torch.float64).to(device)
-    outline = torch.tensor(DRUM[::-1], dtype=torch.float64, device=device)
-    kinds = [[0, 1, 2, 3, 4], [0, 0, 0, 0, 5], [1, 2, 3, 2, 2], [-1, -1, 0, -1, -1], [0.0] * 5, [math.inf] * 5]
+    outline = torch.tensor(DRUM[::-1], dtype=torch.float64, device=device).reshape(-1)
+    kinds = [[0, 1, 2, 3, 4], [0, 0, 0, 0, 10], [1, 2, 3, 2, 2], [-1, -1, 0, -1, -1], [0.0] * 5, [math.inf] * 5]
     return [velocity, table, outline, *kinds, None, 0.1, *blocks.packed]
 
 
@@ -400,9 +400,9 @@ def test_the_op_checks_what_memory_safety_needs(dim):
     for position, value in [
         (0, velocity[:-1]), (0, velocity[:, 0]), (0, velocity.float()), (1, table[:, :, :-1]), (1, table[0]),
         (1, table.float()), (1, table[:0]), (1, table.mT.contiguous().mT), (1, table.repeat(1, 4, 1)),
-        (2, outline[:-1]), (2, outline.float()), (2, outline[:, :1]), (2, outline.T.contiguous().T), (3, [0]),
-        (3, [0, 1, 2, 3, 5]), (3, [-1, 1, 2, 3, 4]), (4, [0, 0, 0, 0, 6]), (4, [0, 0, 0, 0, -1]), (4, [5, 0, 0, 0, 5]),
-        (5, [0, 1, 2, 3, 3]), (5, [4, 1, 2, 3, 3]), (6, []), (7, [0.0]), (8, [0.0]),
+        (2, outline[:-1]), (2, outline.float()), (2, outline.reshape(-1, 2)), (2, outline.repeat(2)[::2]), (3, [0]),
+        (3, [0, 1, 2, 3, 6]), (3, [-1, 1, 2, 3, 4]), (4, [0, 0, 0, 0, 9]), (4, [0, 0, 0, 0, -1]),
+        (4, [10, 0, 0, 0, 10]), (5, [0, 1, 2, 3, 3]), (5, [4, 1, 2, 3, 3]), (6, []), (7, [0.0]), (8, [0.0]),
         (9, torch.zeros(0, dtype=torch.float64)), (9, torch.zeros(1)), (11, []), (12, []), (13, []),
     ]:  # fmt: skip
         with pytest.raises(RuntimeError):

@@ -310,7 +310,8 @@ class SDF(Obstacle):
 
     Args:
         distance: function of body coordinates [N, D] [m], x − position turned back, that returns distances [N] [m],
-            negative inside. Torch operations; it need not be exact away from its zero level.
+            negative inside. Torch operations; it need not be exact away from its zero level. Of `shapes.Sampled.of` it
+            becomes a shape that acts in the kernel.
         normal: function of the same coordinates that returns outward normals [N, D]; None for the gradient of
             `distance` by automatic differentiation. Of any length; where it is zero, nodes are left alone.
         position, kind, friction, velocity, rotation, angular_velocity, start, end, scene: see `Obstacle`.

@@ -5,8 +5,9 @@ all scenes or one per scene, of the nodes' dtype:
 
     friction, position [D], velocity [D], rotation [A], angular_velocity [A], direction or size [D], radius
 
-with A = 1 angle in 2-D and a vector of A = 3 in 3-D. What an obstacle does not have is zero. The corners of the
-outlines of revolved shapes follow one another in a second table [corners, 2].
+with A = 1 angle in 2-D and a vector of A = 3 in 3-D. What an obstacle does not have is zero. Shapes of many numbers
+have them one after another in a second tensor: the corners of a revolved shape (distance from the axis, position along
+it), the samples of a sampled one (lower corner, spacing, numbers along the axes, values).
 """
 
 from __future__ import annotations
@@ -44,6 +45,7 @@ KERNEL_SHAPES: dict[type[shapes.Shape], KernelShape] = {
     shapes.Capsule: KernelShape(3, "half_axis"),
     shapes.Revolved: KernelShape(4, "axis"),
     shapes.Cylinder: KernelShape(4, "axis"),
+    shapes.Sampled: KernelShape(5, None),
 }
 
 
@@ -123,7 +125,7 @@ def obstacle_arguments(group: Sequence[Obstacle], like: Tensor, scenes: int) -> 
     return (
         *tables,
         [KERNEL_SHAPES[type(o.shape)].number for o in group],
-        [_corners(o.shape) for o in group],
+        [len(_data(o.shape, like)) for o in group],
         [CONTACT_KINDS[o.kind] for o in group],
         [-1 if o.scene is None else o.scene for o in group],
         [o.start for o in group],
@@ -141,16 +143,19 @@ def _packed(velocity: Tensor) -> Tensor:
 def _values(obstacle: Obstacle) -> tuple[Any, ...]:
     """The numbers and tensors of an obstacle that go into the tables."""
     motion = (obstacle.friction, obstacle.position, obstacle.velocity, obstacle.rotation, obstacle.angular_velocity)
-    names = (KERNEL_SHAPES[type(obstacle.shape)].extent, "radius", "outline")
+    names = (KERNEL_SHAPES[type(obstacle.shape)].extent, "radius", "outline", "values")
     return (*motion, *(getattr(obstacle.shape, name, None) for name in names if name))
 
 
-def _corners(shape: shapes.Shape) -> int:
-    return len(shape.outline) if isinstance(shape, shapes.Revolved) else 0
+def _data(shape: shapes.Shape, like: Tensor) -> Tensor:
+    """The numbers of a shape beside its row of the table [n]."""
+    if isinstance(shape, shapes.Revolved):
+        return shape.parameter("outline", like, (len(shape.outline), 2)).reshape(-1)
+    return shape.data(like) if isinstance(shape, shapes.Sampled) else like.new_zeros(0)
 
 
 def _tables(obstacles: Sequence[Obstacle], like: Tensor, scenes: int) -> tuple[Tensor, Tensor]:
-    """Parameters [1 or B, K, width] and outlines [corners, 2]; kept while nothing has changed."""
+    """Parameters [1 or B, K, width] and data [n] of the shapes; kept while nothing has changed."""
     if torch.compiler.is_compiling() or type(like) not in (Tensor, torch.nn.Parameter):
         return _build(obstacles, like, scenes)
     key: list[Any] = [like.dtype, like.device, scenes]
@@ -170,8 +175,7 @@ def _build(obstacles: Sequence[Obstacle], like: Tensor, scenes: int) -> tuple[Te
     if count not in (1, scenes) or any(row.shape[0] not in (1, count) for row in rows):
         raise ValueError(f"parameters of obstacles must be given once or per scene, B = {scenes}, got {count} of them")
     table = torch.stack([row.expand(count, -1) for row in rows], 1).contiguous()
-    outlines = [o.shape.parameter("outline", like, (n, 2)) for o in obstacles if (n := _corners(o.shape))]
-    return table, torch.cat(outlines) if outlines else like.new_zeros(0, 2)
+    return table, torch.cat([_data(o.shape, like) for o in obstacles])
 
 
 def _row(obstacle: Obstacle, like: Tensor) -> Tensor:
@@ -218,34 +222,34 @@ def _backward_fake(grad, wants_rows, velocity, obstacles, *arguments):
 
 
 def _setup(ctx: Any, inputs: Any, output: Any) -> None:
-    velocity, obstacles, outline, *kinds, scene_time, time = inputs[:-3]
-    save_with_topology(ctx, (velocity, obstacles, outline, scene_time), inputs[-3:], kinds=kinds, time=time)
+    velocity, obstacles, data, *kinds, scene_time, time = inputs[:-3]
+    save_with_topology(ctx, (velocity, obstacles, data, scene_time), inputs[-3:], kinds=kinds, time=time)
 
 
 def _backward(ctx, grad):
-    (velocity, obstacles, outline, scene_time), topology = saved_with_topology(ctx)
+    (velocity, obstacles, data, scene_time), topology = saved_with_topology(ctx)
     wants_rows = ctx.needs_input_grad[1]
     grad_velocity, rows = dispatch(
         torch.ops.torch_mpm.contact_backward,
-        *(_packed(grad[:, 1:]), wants_rows, velocity, obstacles, outline, *ctx.kinds, scene_time, ctx.time, *topology),
+        *(_packed(grad[:, 1:]), wants_rows, velocity, obstacles, data, *ctx.kinds, scene_time, ctx.time, *topology),
     )
     rows = sum_by_scene_of_blocks(rows, Topology.unpack(*topology), obstacles.shape[0]) if wants_rows else None
     return (grad_velocity[:, 1:], rows) + (None,) * 12
 
 
 def _backward_setup(ctx: Any, inputs: Any, output: Any) -> None:
-    grad, wants_rows, velocity, obstacles, outline, *kinds, scene_time, time = inputs[:-3]
+    grad, wants_rows, velocity, obstacles, data, *kinds, scene_time, time = inputs[:-3]
     options = {"wants_rows": wants_rows, "kinds": kinds, "time": time}
-    save_with_topology(ctx, (grad, velocity, obstacles, outline, scene_time), inputs[-3:], **options)
+    save_with_topology(ctx, (grad, velocity, obstacles, data, scene_time), inputs[-3:], **options)
 
 
 def _double_backward(ctx, grad_velocity, grad_rows):
-    (grad, velocity, obstacles, outline, scene_time), topology = saved_with_topology(ctx)
+    (grad, velocity, obstacles, data, scene_time), topology = saved_with_topology(ctx)
     blocks = Topology.unpack(*topology)
 
     def adjoint(grad: Tensor, velocity: Tensor, obstacles: Tensor) -> Any:
         def after(velocity: Tensor, rows: Tensor) -> Tensor:
-            return _composed(blocks, velocity, rows, outline, ctx.kinds, scene_time, ctx.time)
+            return _composed(blocks, velocity, rows, data, ctx.kinds, scene_time, ctx.time)
 
         rows = _rows_of_slots(obstacles, blocks)
         both = differentiate(after, [velocity, rows], [grad])
@@ -271,7 +275,7 @@ def _composed(
     blocks: Topology,
     velocity: Tensor,
     rows: Tensor,
-    outline: Tensor,
+    data: Tensor,
     kinds: Sequence[Any],
     scene_time: Tensor | None,
     time: float,
@@ -283,13 +287,13 @@ def _composed(
     positions, node_scene, active = blocks.node_positions(velocity.dtype), blocks.node_scene(), blocks.active_nodes()
     slot = torch.arange(rows.shape[0], device=rows.device).repeat_interleave(blocks.grid.nodes_per_block)
     first = 0
-    for k, (shape, corners, kind, scene, start, end) in enumerate(zip(*kinds, strict=True)):
+    for k, (shape, size, kind, scene, start, end) in enumerate(zip(*kinds, strict=True)):
         parameters = _parameters(rows[:, k], velocity.shape[1])
-        form = _shape(shape, parameters.pop("extent"), parameters.pop("radius"), outline[first : first + corners])
+        form = _shape(shape, parameters.pop("extent"), parameters.pop("radius"), data[first : first + size])
         obstacle = Obstacle(form, kind=CONTACT_NAMES[kind], start=start, end=end, **parameters)
         acts = active if scene < 0 else active & (node_scene == scene)
         velocity = torch.where(acts[:, None], obstacle.forward(velocity, positions, slot, now, 0.0), velocity)
-        first += corners
+        first += size
     return velocity
 
 
@@ -302,7 +306,7 @@ def _parameters(row: Tensor, dim: int) -> dict[str, Any]:
     return {name: value[:, 0] if name in scalars else value for name, value in values.items()}
 
 
-def _shape(number: int, extent: Tensor, radius: Tensor, outline: Tensor) -> shapes.Shape:
+def _shape(number: int, extent: Tensor, radius: Tensor, data: Tensor) -> shapes.Shape:
     if number == 0:
         return shapes.Plane(extent)
     if number == 1:
@@ -311,7 +315,9 @@ def _shape(number: int, extent: Tensor, radius: Tensor, outline: Tensor) -> shap
         return shapes.Box(extent.detach())
     if number == 3:
         return shapes.Capsule(extent, radius.detach())
-    return shapes.Revolved(outline, extent)
+    if number == 5:
+        return shapes.Sampled.from_data(data, extent.shape[-1])
+    return shapes.Revolved(data.reshape(-1, 2), extent)
 
 
 register_autograd("contact", _backward, _setup)

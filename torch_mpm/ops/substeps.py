@@ -2,7 +2,7 @@
 
     torch.ops.torch_mpm.substeps(x, v, mass, volume, C, F, J, history, scene, ids, material, previous_status, laws,
         options, parameters, variables, n, dt, apic, wants_C, stress_form, gravity, wall_kind, wall_plane,
-        wall_friction, obstacles, outline, shape, corners, contact, obstacle_scene, start, end, time, scenes,
+        wall_friction, obstacles, data, shape, sizes, contact, obstacle_scene, start, end, time, scenes,
         max_blocks, grows, lattice, layout) -> (x, v, C, F, J, history, status)
 
 Particles and their history are those of `State`, the grid's arguments those of `activate`, `grid_update` and
