@@ -270,7 +270,7 @@ def test_the_raw_op(device):
         ("sand", 12, "law must be one of"),
         ([0, 0], 13, "options must have an entry per law"),
         ([scalar], 14, "parameters and history must have those of all laws"),
-        (0, 16, "n must be positive"),
+        (0, 16, "n must be 1 to 65536"),
         (-1.0, 17, "dt must be positive"),
     ):
         with pytest.raises(RuntimeError, match=message):

@@ -104,12 +104,13 @@ def obstacle_to_substeps(step: Step, state: State, dt: float | Tensor) -> str | 
     return None
 
 
+MOST_STEPS = 2**16  # of one op, csrc/rollout/substeps.op.cpp
 CHUNK = 64
 """Steps of one op where the pool of blocks follows the scene on CUDA, which it does between two calls."""
 
 
 def in_chunks(step: Step, state: State, n: int, dt: float) -> State:
-    chunk = CHUNK if step.grid.grows and state.x.is_cuda else n
+    chunk = CHUNK if step.grid.grows and state.x.is_cuda else MOST_STEPS
     while n > 0:
         count = min(n, chunk)
         state, n = substeps(step, state, count, dt), n - count

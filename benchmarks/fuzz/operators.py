@@ -24,7 +24,7 @@ def operators() -> list[str]:
 def calls(dim: int, dtype: torch.dtype = torch.float64) -> list[tuple[str, dict[str, Any]]]:
     """(op, arguments by name) of at least one valid call of every op."""
     make = _Calls(dim, dtype)
-    found = [*make.transfers(), *make.grid(), *make.heat(), *make.laws(), *make.sand()]
+    found = [*make.transfers(), *make.grid(), *make.heat(), *make.laws(), *make.sand(), *make.rollouts()]
     return [(op, _named(op, values)) for op, values in found]
 
 
@@ -87,6 +87,7 @@ class _Calls:
         sizes = [0, 0, 0, 0, 8, 2 * D + 1 + 2**D]
         kinds = ([0, 1, 2, 3, 4, 5], sizes, [1, 2, 3, 2, 3, 1], [-1, -1, 0, 1, -1, -1], [0.0] * 6, [float("inf")] * 6)
         obstacles = (velocity, table, data, *kinds, self.uniform(2), 0.1, *top)
+        self.walls, self.obstacles = walls, obstacles[1 : -len(top) - 2]
         return [
             ("grid_update", update),
             ("grid_update_backward", (self.uniform(self.N, 1 + D), True, *update)),
@@ -134,6 +135,13 @@ class _Calls:
                 ("law_stiffness", (state, p, q, *tail)),
                 ("law_wave_modulus", (state, p, q, *tail)),
             ]
+            if info.twice_differentiable_energy and not info.twice_differentiable:
+                found.append(
+                    (
+                        "law_energy_double_backward",
+                        (self.normal(P, D, D), self.normal(P, len(p)), self.normal(P), state, p, *tail, 5),
+                    )
+                )
             if info.twice_differentiable:
                 along = (self.normal(*state.shape), C, self.normal(P, len(p)))
                 found += [
@@ -141,6 +149,18 @@ class _Calls:
                     ("law_energy_double_backward", (along[0], along[2], self.normal(P), state, p, *tail, 5)),
                 ]
         return found
+
+    def rollouts(self) -> list[tuple[str, tuple[Any, ...]]]:
+        """Three laws, of which one has a history and one reads J and C."""
+        P, D, ones = PARTICLES, self.dim, torch.ones((), dtype=self.dtype)
+        material, ids = torch.arange(P, dtype=torch.int32) % 3, torch.arange(P)
+        fields = (self.x, self.normal(P, D), 1 + self.uniform(P), self.uniform(P), self.normal(P, D, D), self.F)
+        who = (self.scene, ids, material, self.blocks.status)
+        laws = ("neo_hookean,von_mises,weakly_compressible", [0, 0, 0])
+        counts = [len(LAWS[name].parameters) for name in laws[0].split(",")]
+        how = ([ones] * sum(counts), [0, 1, 0], 3, 1e-3, True, True, 0, self.normal(2, D), *self.walls)
+        end = (*self.obstacles, 0.1, 2, 40, True, *self.lattice.packed)
+        return [("substeps", (*fields, 0.5 + self.uniform(P), [self.uniform(P)], *who, *laws, *how, *end))]
 
     def sand(self) -> list[tuple[str, tuple[Any, ...]]]:
         moduli = (0.5 + self.uniform(2), 0.5 + self.uniform(PARTICLES))

@@ -34,6 +34,8 @@ std::vector<std::string> words(const std::string& list) {
   return result;
 }
 
+constexpr int64_t kMostSteps = 1 << 16;  // of one call, which nothing interrupts
+
 int64_t with_headroom(int64_t blocks) { return blocks + blocks / 2 + 16; }
 
 // The laws of a mixture, or a single one, with their places in the lists of parameters and history.
@@ -211,15 +213,17 @@ struct Substeps {
 std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> substeps(MPM_SUBSTEPS_PARAMETERS) {
   const PackedLattice packed(lattice, layout);
   check_positions(x);
-  STD_TORCH_CHECK(n > 0, "n must be positive, got ", n);
+  STD_TORCH_CHECK(n > 0 && n <= kMostSteps, "n must be 1 to ", kMostSteps, ", got ", n);
   STD_TORCH_CHECK(dt > 0 && std::isfinite(dt), "dt must be positive and finite, got ", dt);
   const int64_t P = x.size(0), D_ = x.size(1);
   const std::vector<LawCall> calls = law_calls(laws, options, parameters, history, variables, D_);
   STD_TORCH_CHECK(has(material) || calls.size() == 1, "several laws need material");
+  STD_TORCH_CHECK(wants_C || !apic, "apic needs wants_C");
   bool plastic = false;
   int64_t columns = 0;
   for (const LawCall& call : calls) {
     plastic |= call.law->info.plastic;
+    STD_TORCH_CHECK(wants_C || !call.law->info.viscous, "the viscous law ", call.law->info.name, " needs wants_C");
     columns = call.first_column + history_size(call.law->info, call.history, D_);
   }
   Tensor positions[] = {empty_particles(x, {P, D_}), buffer(x, n > 1, {P, D_})};
@@ -234,7 +238,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> substeps(MPM_
     const backend::Stream stream = device.stream();
     Substeps<T, D> s;
     s.order = packed.order();
-    s.obstacles = has(obstacle_table) && obstacle_table->size(1) > 0;
+    s.obstacles = has(obstacle_table);
     activate_arguments(s.activation, packed, x, scene, ids, scenes, max_blocks);
     const int* before = nullptr;
     if (has(previous_status)) before = int_pointer(*previous_status, "previous_status", x, {1 + scenes, kStatusSize});
@@ -254,6 +258,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> substeps(MPM_
       STD_TORCH_CHECK(gravity->is_contiguous(), "gravity must be contiguous");
       s.update.gravity = static_cast<const T*>(gravity->data_ptr());
     }
+    STD_TORCH_CHECK(!s.obstacles || has(obstacle_data), "obstacles need data");
     if (s.obstacles)
       s.contact = obstacle_arguments<T, D>(x, packed, *obstacle_table, obstacle_data.value(), shape, sizes,
                                            contact_kind, obstacle_scene, start, end, {}, time);

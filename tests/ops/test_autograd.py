@@ -156,6 +156,7 @@ LAW_OPS = (
     *("quartic_energy", "quartic_stress", "quartic_return_map"),
 )
 NO_GRADIENT = {
+    "substeps",
     *("law_stiffness", "law_wave_modulus", "law_update_double_backward", "law_energy_double_backward"),
     *("heat_stencil", "heat_patches"),
 }
