@@ -1,5 +1,4 @@
-#include "grid/kernels.h"
-#include "grid/topology.op.h"
+#include "grid/activate.op.h"
 
 // Finds the blocks that particles touch and groups the particles by the block of their base node.
 namespace mpm {
@@ -9,51 +8,20 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> activate(
     const Tensor& x, const OptionalTensor& scene, const OptionalTensor& ids, const OptionalTensor& previous_status,
     int64_t scenes, int64_t max_blocks, const std::vector<double>& lattice, const std::vector<int64_t>& layout) {
   const PackedLattice packed(lattice, layout);
-  STD_TORCH_CHECK(scenes >= 0, "scenes must not be negative, got ", scenes);
-  STD_TORCH_CHECK(max_blocks >= 0, "max_blocks must not be negative, got ", max_blocks);
-  Tensor table, block, offsets, index, status, schedule;
+  ActivationTensors t;
+  Tensor status;
   const DeviceScope device(x);
   dispatch(x, [&]<class T, int D>() {
-    ActivateArguments<T, D> a;
-    a.geometry = packed.geometry<T, D>();
-    const int64_t per_scene = a.geometry.blocks_per_scene, most = INT32_MAX / kBlockNodes<D>;
-    STD_TORCH_CHECK(scenes <= INT32_MAX / per_scene, "scenes times blocks must be below 2^31, got ", scenes, " times ",
-                    per_scene);
-    STD_TORCH_CHECK(scenes > 0 || x.size(0) == 0, "x must have no particles where scenes is 0, got ", x.size(0));
-    STD_TORCH_CHECK(max_blocks <= most, "max_blocks must be at most ", most, ", got ", max_blocks);
-    a.scenes = int(scenes);
-    a.max_blocks = int(max_blocks);
-    a.particles = x.size(0);
-    a.deterministic = packed.deterministic();
+    auto a = activate_arguments<T, D>(packed, x, scene, ids, scenes, max_blocks);
     a.x = input<T>(x, "x", x, {x.size(0), D});
-    set_scene(a, scene, x);
-    if (has(ids)) {
-      check_shape(*ids, "ids", {x.size(0)});
-      check_type(*ids, "ids", ScalarType::Long, x);
-      a.id = static_cast<const int64_t*>(ids->data_ptr());
-      a.id_stride = ids->stride(0);
-    }
     if (has(previous_status))
       a.previous_status = int_pointer(*previous_status, "previous_status", x, {1 + scenes, kStatusSize});
-    a.schedule_size = schedule_size<D>(max_blocks, x.size(0));
-    table = empty_int(x, {scenes * per_scene});
-    block = empty_int(x, {max_blocks});
-    offsets = empty_int(x, {max_blocks + 1});
-    index = empty_int(x, {x.size(0)});
+    t.make(x, a, device.stream());
     status = empty_int(x, {1 + scenes, kStatusSize});
-    schedule = empty_int(x, {a.schedule_size});
-    a.workspace_size = backend::activate_workspace(a, device.stream());
-    const Tensor workspace = empty(x, {a.workspace_size}, ScalarType::Byte);
-    a.workspace = workspace.data_ptr();
-    a.table = static_cast<int*>(table.data_ptr());
-    a.block = static_cast<int*>(block.data_ptr());
-    a.offsets = static_cast<int*>(offsets.data_ptr());
-    a.index = static_cast<int*>(index.data_ptr());
-    a.schedule = static_cast<int*>(schedule.data_ptr());
     a.status = static_cast<int*>(status.data_ptr());
     backend::activate(packed.order(), a, device.stream());
   });
-  return {table, block, offsets, index, schedule, status};
+  return {t.table, t.block, t.offsets, t.index, t.schedule, status};
 }
 
 Tensor cell_order(const Tensor& x, const std::vector<Tensor>& topology, const std::vector<double>& lattice,

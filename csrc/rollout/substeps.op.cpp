@@ -1,6 +1,6 @@
 #include <string>
 
-#include "grid/kernels.h"
+#include "grid/activate.op.h"
 #include "grid/obstacle.op.h"
 #include "grid/walls.op.h"
 #include "laws/law.op.h"
@@ -79,30 +79,18 @@ std::vector<LawCall> law_calls(const std::string& names, const std::vector<int64
   return calls;
 }
 
-// Arrays of the activation, of one size of the pool.
+// The activation and the nodes, for one size of the pool of blocks.
 template <class T, int D>
 struct Pool {
-  Tensor table, block, offsets, index, schedule, workspace, nodes, updated, velocity;
+  ActivationTensors active;
+  Tensor nodes, updated, velocity;
 
-  void make(const Tensor& x, ActivateArguments<T, D>& a, bool obstacles, typename backend::Stream stream) {
-    const int64_t slots = a.max_blocks, rows = slots * kBlockNodes<D>;
-    a.schedule_size = schedule_size<D>(slots, a.particles);
-    if (!table.defined()) table = empty_int(x, {a.scenes * a.geometry.blocks_per_scene});
-    if (!index.defined()) index = empty_int(x, {a.particles});
-    block = empty_int(x, {slots});
-    offsets = empty_int(x, {slots + 1});
-    schedule = empty_int(x, {a.schedule_size});
-    a.workspace_size = backend::activate_workspace(a, stream);
-    workspace = empty(x, {a.workspace_size}, ScalarType::Byte);
+  void make(const Tensor& x, ActivateArguments<T, D>& a, bool obstacles, backend::Stream stream) {
+    const int64_t rows = int64_t(a.max_blocks) * kBlockNodes<D>;
+    active.make(x, a, stream);
     nodes = empty(x, {rows, 1 + D});
     updated = empty(x, {rows, 1 + D});
     if (obstacles) velocity = empty(x, {rows, 1 + D});
-    a.workspace = workspace.data_ptr();
-    a.table = static_cast<int*>(table.data_ptr());
-    a.block = static_cast<int*>(block.data_ptr());
-    a.offsets = static_cast<int*>(offsets.data_ptr());
-    a.index = static_cast<int*>(index.data_ptr());
-    a.schedule = static_cast<int*>(schedule.data_ptr());
   }
 };
 
@@ -120,28 +108,6 @@ Topology<T, D> topology_of(const ActivateArguments<T, D>& a) {
   t.schedule = a.schedule;
   t.schedule_size = a.schedule_size;
   return t;
-}
-
-template <class T, int D>
-void activate_arguments(ActivateArguments<T, D>& a, const PackedLattice& packed, const Tensor& x,
-                        const OptionalTensor& scene, const OptionalTensor& ids, int64_t scenes, int64_t max_blocks) {
-  a.geometry = packed.geometry<T, D>();
-  const int64_t per_scene = a.geometry.blocks_per_scene, most = INT32_MAX / kBlockNodes<D>;
-  STD_TORCH_CHECK(scenes >= 0 && scenes <= INT32_MAX / per_scene, "scenes times blocks must be below 2^31, got ",
-                  scenes, " times ", per_scene);
-  STD_TORCH_CHECK(scenes > 0 || x.size(0) == 0, "x must have no particles where scenes is 0, got ", x.size(0));
-  STD_TORCH_CHECK(max_blocks >= 0 && max_blocks <= most, "max_blocks must be 0 to ", most, ", got ", max_blocks);
-  a.scenes = int(scenes);
-  a.max_blocks = int(max_blocks);
-  a.particles = x.size(0);
-  a.deterministic = packed.deterministic();
-  set_scene(a, scene, x);
-  if (has(ids)) {
-    check_shape(*ids, "ids", {x.size(0)});
-    check_type(*ids, "ids", ScalarType::Long, x);
-    a.id = static_cast<const int64_t*>(ids->data_ptr());
-    a.id_stride = ids->stride(0);
-  }
 }
 
 // A result of the call: defined where it is wanted.
@@ -239,7 +205,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> substeps(MPM_
     Substeps<T, D> s;
     s.order = packed.order();
     s.obstacles = has(obstacle_table);
-    activate_arguments(s.activation, packed, x, scene, ids, scenes, max_blocks);
+    s.activation = activate_arguments<T, D>(packed, x, scene, ids, scenes, max_blocks);
     const int* before = nullptr;
     if (has(previous_status)) before = int_pointer(*previous_status, "previous_status", x, {1 + scenes, kStatusSize});
 

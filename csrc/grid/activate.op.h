@@ -1,0 +1,61 @@
+#pragma once
+
+#include "grid/kernels.h"
+#include "grid/topology.op.h"
+
+// An activation as the ops call it.
+namespace mpm {
+
+// What does not change from one activation of the same particles to the next.
+template <class T, int D>
+ActivateArguments<T, D> activate_arguments(const PackedLattice& packed, const Tensor& x, const OptionalTensor& scene,
+                                           const OptionalTensor& ids, int64_t scenes, int64_t max_blocks) {
+  STD_TORCH_CHECK(scenes >= 0, "scenes must not be negative, got ", scenes);
+  STD_TORCH_CHECK(max_blocks >= 0, "max_blocks must not be negative, got ", max_blocks);
+  ActivateArguments<T, D> a;
+  a.geometry = packed.geometry<T, D>();
+  const int64_t per_scene = a.geometry.blocks_per_scene, most = INT32_MAX / kBlockNodes<D>;
+  STD_TORCH_CHECK(scenes <= INT32_MAX / per_scene, "scenes times blocks must be below 2^31, got ", scenes, " times ",
+                  per_scene);
+  STD_TORCH_CHECK(scenes > 0 || x.size(0) == 0, "x must have no particles where scenes is 0, got ", x.size(0));
+  STD_TORCH_CHECK(max_blocks <= most, "max_blocks must be at most ", most, ", got ", max_blocks);
+  a.scenes = int(scenes);
+  a.max_blocks = int(max_blocks);
+  a.particles = x.size(0);
+  a.deterministic = packed.deterministic();
+  set_scene(a, scene, x);
+  if (has(ids)) {
+    check_shape(*ids, "ids", {x.size(0)});
+    check_type(*ids, "ids", ScalarType::Long, x);
+    a.id = static_cast<const int64_t*>(ids->data_ptr());
+    a.id_stride = ids->stride(0);
+  }
+  return a;
+}
+
+// The results of an activation but for its status, and its work space.
+struct ActivationTensors {
+  Tensor table, block, offsets, index, schedule, workspace;
+
+  // For the arguments' number of blocks, which then write here.
+  template <class T, int D>
+  void make(const Tensor& x, ActivateArguments<T, D>& a, backend::Stream stream) {
+    const int64_t slots = a.max_blocks;
+    a.schedule_size = schedule_size<D>(slots, a.particles);
+    table = empty_int(x, {a.scenes * a.geometry.blocks_per_scene});
+    block = empty_int(x, {slots});
+    offsets = empty_int(x, {slots + 1});
+    index = empty_int(x, {a.particles});
+    schedule = empty_int(x, {a.schedule_size});
+    a.workspace_size = backend::activate_workspace(a, stream);
+    workspace = empty(x, {a.workspace_size}, ScalarType::Byte);
+    a.workspace = workspace.data_ptr();
+    a.table = static_cast<int*>(table.data_ptr());
+    a.block = static_cast<int*>(block.data_ptr());
+    a.offsets = static_cast<int*>(offsets.data_ptr());
+    a.index = static_cast<int*>(index.data_ptr());
+    a.schedule = static_cast<int*>(schedule.data_ptr());
+  }
+};
+
+}  // namespace mpm
