@@ -5,6 +5,7 @@ import dataclasses
 import pytest
 import torch
 from combinations import DT, F64, draw, make
+from helpers import TOLERANCE
 from torch import Tensor
 
 import torch_mpm as mpm
@@ -36,7 +37,7 @@ def assert_equal(a: mpm.State, b: mpm.State, text: str = "", exactly: bool = Tru
     for name, value in left.items():
         if value.is_floating_point() and (value.is_cuda or not exactly):
             scale = right[name].abs().max().clamp_min(1e-9)
-            assert float((value - right[name]).abs().max() / scale) < (1e-11 if value.dtype == F64 else 1e-4), name
+            assert float((value - right[name]).abs().max() / scale) < TOLERANCE["rollout"][value.dtype], name
         else:
             assert torch.equal(value, right[name]), f"{name} {text}"
 

@@ -5,7 +5,7 @@ import math
 
 import pytest
 import torch
-from helpers import Particles, random_particles, relative_error
+from helpers import TOLERANCE, Particles, random_particles, relative_error
 from torch import Tensor
 
 import torch_mpm as mpm
@@ -270,7 +270,7 @@ def test_energy_after_any_number_of_iterations(device, dim, kernel, dtype, metho
         d = h.solve(False, max_iterations=most, method=method).increment.double()
         gained, given = h.scenes(h.heat_capacity.double() * d), h.dt.double() * h.scenes(h.source.double())
         scale = h.scenes(h.heat_capacity.double() * d.abs()) + h.dt.double() * h.scenes(h.source.double().abs())
-        assert ((gained - given).abs() <= (1e-12 if dtype == torch.float64 else 1e-6) * scale).all()
+        assert ((gained - given).abs() <= TOLERANCE["conservation"][dtype] * scale).all()
 
 
 def test_constant_temperature_stays(device, dim):

@@ -5,6 +5,7 @@ from collections.abc import Callable
 
 import pytest
 import torch
+from helpers import TOLERANCE
 from torch import Tensor
 
 import torch_mpm as mpm
@@ -82,7 +83,7 @@ def test_update_is_the_reference(device, dim, law, dtype):
     assert float(settled.double().mean()) > (0.998 if dtype == torch.float32 else 1 - 1e-9)
     if law in PLASTIC_LAWS:
         assert {ELASTIC, PLASTIC} == set(expected[4].tolist())
-    tolerance = 2e-5 if dtype == torch.float32 else 1e-11
+    tolerance = TOLERANCE["law"][dtype]
     assert error(result.state, expected[0]) < tolerance
     assert error(result.stress, expected[1]) < tolerance
     if law in PLASTIC_LAWS:  # rounding of the stress, times strains about one

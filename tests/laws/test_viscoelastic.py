@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from helpers import TOLERANCE
 from test_plasticity import data, error, random_states, rotations, state_of, to
 
 import torch_mpm as mpm
@@ -34,7 +35,7 @@ def test_update_is_the_reference(device, dim, dtype):
     expected = viscoelastic_update(F, *p, q)
     target = (device, dtype)
     result = law_update("viscoelastic", F.to(*target), to(p, *target), [q.to(*target)], details=True)
-    tolerance = 1e-11 if dtype == torch.float64 else 2e-5
+    tolerance = TOLERANCE["law"][dtype]
     assert error(result.stress, expected[0]) < tolerance
     assert error(result.history[0], expected[1]) < tolerance
     assert error(result.dissipated, expected[2]) < tolerance

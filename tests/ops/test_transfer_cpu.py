@@ -6,7 +6,7 @@ import sys
 
 import pytest
 import torch
-from helpers import relative_error
+from helpers import TOLERANCE, relative_error
 
 import torch_mpm as mpm
 from torch_mpm.info import info
@@ -85,7 +85,7 @@ def threads():
 @pytest.mark.parametrize("dim", DIMENSIONS)
 @pytest.mark.parametrize("kernel", KERNELS)
 @pytest.mark.parametrize("form", [MLS, GRADIENT])
-@pytest.mark.parametrize("dtype, tolerance", [(torch.float32, 1e-6), (torch.float64, 1e-14)])
+@pytest.mark.parametrize("dtype, tolerance", TOLERANCE["transfer"].items())
 def test_agrees_with_float64_reference(dim, kernel, form, dtype, tolerance):
     grid = make_grid(dim, kernel)
     inputs = particles(dim, 400, dtype)
@@ -198,7 +198,7 @@ def test_one_particle_and_none(dim):
     grid = make_grid(dim)
     inputs = particles(dim, 1, torch.float64)
     blocks = grid.activate(inputs[0])
-    assert_close(run_all(blocks, *inputs), reference_all(blocks, *inputs), 1e-14)
+    assert_close(run_all(blocks, *inputs), reference_all(blocks, *inputs), TOLERANCE["transfer"][torch.float64])
     none = [t[:0] for t in inputs]
     blocks = grid.activate(none[0])
     assert blocks.status.tolist() == [[0, 0, -1, 0, -1, 1, -1, 0], [0, 0, -1, 0, -1, 0, -1, 0]]

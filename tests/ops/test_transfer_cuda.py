@@ -4,7 +4,7 @@ import dataclasses
 
 import pytest
 import torch
-from helpers import Particles, random_particles, relative_error
+from helpers import TOLERANCE, Particles, random_particles, relative_error
 from torch import Tensor
 
 import torch_mpm as mpm
@@ -102,7 +102,7 @@ def test_uneven_particles_agree_with_the_cpu(dim, kernel, deterministic, form):
         loss = (nodes**2).sum() + (v**2).sum() + (C**2).sum() + (grad_v**2).sum()
         results[device, dtype] = [nodes, v, C, grad_v, *torch.autograd.grad(loss, leaves)]
     expected = results["cpu", torch.float64]
-    for dtype, tolerance in [(torch.float64, 1e-12), (torch.float32, 5e-5)]:
+    for dtype, tolerance in TOLERANCE["transfer on CUDA"].items():
         for value, reference in zip(results["cuda", dtype], expected, strict=True):
             assert relative_error(value, reference) < tolerance  # gradients of sums through three transfers
     assert finite.sum() == len(p.x) - 2
