@@ -227,6 +227,32 @@ def test_reasons_to_step_from_python(device):
         assert reason in step.explain(start, dt)
 
 
+def test_nothing_that_may_have_a_gradient_is_lost(device):
+    """A function's own tensors are not seen; no_grad says that none is wanted."""
+    stiffness = torch.tensor(1e4, dtype=F64, device=device, requires_grad=True)
+    law = mpm.NeoHookean(mu=lambda temperature: stiffness + temperature, lam=1e3)
+    step, state = mpm.Step(box(), law), blob(device)
+    state = state.replace(temperature=torch.zeros_like(state.mass))
+    assert "function" in step.explain(state, 1e-4)
+    end = mpm.rollout(step, state, 2, 1e-4)
+    assert float(torch.autograd.grad(end.v.square().sum(), stiffness)[0]) != 0
+    with torch.no_grad():
+        assert in_one_op(step, state)
+        assert_equal(mpm.rollout(step, state, 2, 1e-4), end)
+
+
+def test_a_step_of_the_users_own_is_called(device):
+    class Slower(mpm.Step):
+        def forward(self, state, dt):
+            state = super().forward(state, dt)
+            return state.replace(v=0.5 * state.v)
+
+    step, state = Slower(box(), mpm.NeoHookean(E=1e4, nu=0.3)), blob(device)
+    assert "Slower" in step.explain(state, 1e-4)
+    with torch.no_grad():
+        assert_equal(mpm.rollout(step, state, 2, 1e-4), one_by_one(step, state, 2, 1e-4))
+
+
 class Still:
     def apply(self, velocity, positions, scene, time, dt):
         return velocity

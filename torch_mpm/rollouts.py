@@ -7,6 +7,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.autograd import forward_ad
 from torch.utils.checkpoint import checkpoint as run_checkpointed
 
 from .boundaries import Obstacle
@@ -79,9 +80,12 @@ def obstacle_to_substeps(step: Step, state: State, dt: float | Tensor) -> str | 
     check_state(state)
     x, law = state.x, step.law
     laws = list(law.laws) if type(law) is Mixture else [law]
+    if type(step) is not Step:
+        return f"{type(step).__name__} may do more than a Step"
     if isinstance(dt, Tensor) or isinstance(state.time, Tensor):
         return "dt or the time of the state is a tensor"
-    if torch.compiler.is_compiling() or is_traced(x) or is_captured(x) or torch._C._are_functorch_transforms_active():
+    transformed = torch._C._are_functorch_transforms_active() or forward_ad._current_level >= 0
+    if torch.compiler.is_compiling() or is_traced(x) or is_captured(x) or transformed:
         return "it is compiled, captured or transformed"
     if step.heat is not None:
         return "it conducts heat"
@@ -99,8 +103,11 @@ def obstacle_to_substeps(step: Step, state: State, dt: float | Tensor) -> str | 
         return "a boundary acts by torch operations"
     if len(boundaries) > MAX_OBSTACLES:
         return f"there are more than {MAX_OBSTACLES} obstacles"
-    if torch.is_grad_enabled() and any(t.requires_grad for t in _tensors(step, state)):
-        return "something requires a gradient"
+    if torch.is_grad_enabled():
+        if any(t.requires_grad for t in _tensors(step, state)):
+            return "something requires a gradient"
+        if any(part.has_functions for part in laws):
+            return "a parameter is a function, which may have a gradient"
     return None
 
 

@@ -132,6 +132,11 @@ class CompiledLaw(Material):
         """Whether `update` does what the compiled law does and nothing else, so that a kernel may take its place."""
         return type(self).update is CompiledLaw.update
 
+    @property
+    def has_functions(self) -> bool:
+        """Whether a parameter is a function of temperature."""
+        return self._functions
+
     def option_bits(self) -> int:
         """The options of the compiled law as its op takes them."""
         return option_bits(self.name, self._options())
