@@ -1,3 +1,5 @@
+#include <cstring>
+
 #include "common/backend.h"
 
 #if MPM_BACKEND == MPM_BACKEND_IS_cpu
@@ -77,6 +79,14 @@ Tensor empty(const Tensor& like, const Shape& shape) { return empty(like, shape,
 
 Tensor zeros(const Tensor& like, const Shape& shape) {
   Tensor t = empty(like, shape);
+#if MPM_BACKEND == MPM_BACKEND_IS_cpu
+  constexpr int64_t few = 1 << 18;  // bytes that one thread clears sooner than the dispatcher is asked
+  const int64_t bytes = t.numel() * int64_t(t.element_size());
+  if (bytes <= few) {
+    if (bytes > 0) std::memset(t.data_ptr(), 0, size_t(bytes));
+    return t;
+  }
+#endif
   return torch::stable::zero_(t);
 }
 

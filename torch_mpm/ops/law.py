@@ -85,7 +85,7 @@ def law_update(
     if C is not None and not LAWS[law].viscous:
         raise ValueError(f"{law} has no viscosity: C must be None")
     check_like("C", C, state, (state.shape[0], dim, dim), "[P, D, D]")
-    bits = option_bits(law, options)
+    bits = option_bits(law, options) if options else 0
     wanted = (DISSIPATED | MULTIPLIER | BRANCH if details else 0) if isinstance(details, bool) else details
     mapped, stress, moved, dissipated, multiplier, code = dispatch(
         torch.ops.torch_mpm.law_update, state, C, parameters, history, scene, law, dim, bits, wanted
