@@ -167,6 +167,13 @@ def store(module: nn.Module, name: str, value: Any) -> None:
         setattr(module, name, value if callable(value) else float(value))
 
 
+def has_hooks(module: nn.Module) -> bool:
+    """Whether something else happens where a module is called."""
+    return bool(
+        module._forward_hooks or module._forward_pre_hooks or module._backward_hooks or module._backward_pre_hooks
+    )
+
+
 class TensorModule(nn.Module):
     """A module whose tensors are buffers, so that `.to` moves them and a `state_dict` has them.
 

@@ -18,7 +18,7 @@ from .ops.arguments import split_dt
 from .ops.contact import MAX_OBSTACLES, fusible, obstacle_arguments
 from .ops.grid_update import per_scene, wall_arguments
 from .ops.transfer import STRESS_FORMS
-from .parameters import Overlay
+from .parameters import Overlay, has_hooks
 from .state import State, check_state
 from .step import Step
 
@@ -96,7 +96,7 @@ def obstacle_to_substeps(step: Step, state: State, dt: float | Tensor) -> str | 
     for part in laws:
         if not isinstance(part, CompiledLaw) or not part.is_all_of_its_update() or type(part).forward is not _FORWARD:
             return f"{type(part).__name__} is more than a compiled law"
-    if any(_hooks(module) for module in (step, *law.modules())):
+    if any(has_hooks(module) for module in (step, *law.modules())):
         return "there are hooks"
     boundaries = step.boundaries.entries
     if not all(isinstance(b, Obstacle) and fusible(b, state.time) for b in boundaries):
@@ -125,12 +125,6 @@ def in_chunks(step: Step, state: State, n: int, dt: float) -> State:
 
 
 _FORWARD = CompiledLaw.forward
-
-
-def _hooks(module: torch.nn.Module) -> bool:
-    return bool(
-        module._forward_hooks or module._forward_pre_hooks or module._backward_hooks or module._backward_pre_hooks
-    )
 
 
 def _tensors(step: Step, state: State) -> list[Tensor]:

@@ -11,18 +11,6 @@
 namespace mpm {
 namespace {
 
-#define MPM_SUBSTEPS_PARAMETERS                                                                                  \
-  const Tensor &x, const Tensor &v, const Tensor &mass, const Tensor &volume, const OptionalTensor &C,           \
-      const OptionalTensor &F, const OptionalTensor &J, const Tensors &history, const OptionalTensor &scene,     \
-      const OptionalTensor &ids, const OptionalTensor &material, const OptionalTensor &previous_status,          \
-      std::string laws, std::vector<int64_t> options, const Tensors &parameters, std::vector<int64_t> variables, \
-      int64_t n, double dt, bool apic, bool wants_C, int64_t stress_form, const OptionalTensor &gravity,         \
-      MPM_WALLS_PARAMETERS, const OptionalTensor &obstacle_table, const OptionalTensor &obstacle_data,           \
-      std::vector<int64_t> shape, std::vector<int64_t> sizes, std::vector<int64_t> contact_kind,                 \
-      std::vector<int64_t> obstacle_scene, std::vector<double> start, std::vector<double> end, double time,      \
-      int64_t scenes, int64_t max_blocks, bool grows, const std::vector<double>&lattice,                         \
-      const std::vector<int64_t>&layout
-
 // The words of a list that commas part.
 std::vector<std::string> words(const std::string& list) {
   std::vector<std::string> result;
@@ -36,6 +24,7 @@ std::vector<std::string> words(const std::string& list) {
 
 constexpr int64_t kMostSteps = 1 << 16;  // of one call, which nothing interrupts
 
+// As a growing grid does in torch_mpm/grid.py.
 int64_t with_headroom(int64_t blocks) { return blocks + blocks / 2 + 16; }
 
 // The laws of a mixture, or a single one, with their places in the lists of parameters and history.
@@ -130,7 +119,7 @@ Field<T> column(const Tensor& columns, int64_t first, int64_t dim) {
   return f;
 }
 
-// The rest of a step after the laws, on buffers that two calls take in turns.
+// The kernels of a step with their arguments, of which a call makes most once.
 template <class T, int D>
 struct Substeps {
   ActivateArguments<T, D> activation;
@@ -176,7 +165,16 @@ struct Substeps {
   }
 };
 
-std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> substeps(MPM_SUBSTEPS_PARAMETERS) {
+std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> substeps(
+    const Tensor& x, const Tensor& v, const Tensor& mass, const Tensor& volume, const OptionalTensor& C,
+    const OptionalTensor& F, const OptionalTensor& J, const Tensors& history, const OptionalTensor& scene,
+    const OptionalTensor& ids, const OptionalTensor& material, const OptionalTensor& previous_status, std::string laws,
+    std::vector<int64_t> options, const Tensors& parameters, std::vector<int64_t> variables, int64_t n, double dt,
+    bool apic, bool wants_C, int64_t stress_form, const OptionalTensor& gravity, MPM_WALLS_PARAMETERS,
+    const OptionalTensor& obstacle_table, const OptionalTensor& obstacle_data, std::vector<int64_t> shape,
+    std::vector<int64_t> sizes, std::vector<int64_t> contact_kind, std::vector<int64_t> obstacle_scene,
+    std::vector<double> start, std::vector<double> end, double time, int64_t scenes, int64_t max_blocks, bool grows,
+    const std::vector<double>& lattice, const std::vector<int64_t>& layout) {
   const PackedLattice packed(lattice, layout);
   check_positions(x);
   STD_TORCH_CHECK(n > 0 && n <= kMostSteps, "n must be 1 to ", kMostSteps, ", got ", n);
@@ -295,16 +293,18 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> substeps(MPM_
       x_now = view<const T>(positions[into]);
       F_now = view<const T>(F_[into]);
       J_now = view<const T>(J_[into]);
-      for (size_t k = 0; k < s.laws.size(); k++) {
-        int64_t first = calls[k].first_column;
-        for (size_t q = 0; q < calls[k].history.size(); q++) {
-          const bool matrix = calls[k].law->info.history[q].matrix;
-          s.laws[k].law.history[q] = column<const T>(kept, first, matrix ? D : 1);
-          first += matrix ? D * D : 1;
+      if (step == 0) {  // from here on the call reads what it has written
+        for (size_t k = 0; k < s.laws.size(); k++) {
+          int64_t first = calls[k].first_column;
+          for (size_t q = 0; q < calls[k].history.size(); q++) {
+            const bool matrix = calls[k].law->info.history[q].matrix;
+            s.laws[k].law.history[q] = column<const T>(kept, first, matrix ? D : 1);
+            first += matrix ? D * D : 1;
+          }
         }
+        s.p2g.velocity = view<const T>(velocity);
+        C_now = view<const T>(affine);
       }
-      s.p2g.velocity = view<const T>(velocity);
-      C_now = view<const T>(affine);
       before = s.activation.status;
     }
   });

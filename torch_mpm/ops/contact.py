@@ -23,6 +23,7 @@ from .. import shapes
 from ..boundaries import Obstacle
 from ..errors import NUMBER_OR_TENSOR, check_like, check_real, shape_of
 from ..grid import Blocks, check_blocks
+from ..parameters import has_hooks
 from ..topology import Topology
 from .arguments import check_list, differentiate, refuse_vmap, sizes
 from .autograd import dispatch, register_autograd, save_with_topology, saved_with_topology
@@ -60,12 +61,7 @@ def fusible(obstacle: Any, time: float | Tensor) -> bool:
         return False
     if type(obstacle.shape) not in KERNEL_SHAPES or obstacle.follows_path:
         return False
-    if (
-        obstacle._forward_hooks
-        or obstacle._forward_pre_hooks
-        or obstacle._backward_hooks
-        or obstacle._backward_pre_hooks
-    ):
+    if has_hooks(obstacle):
         return False
     return not (isinstance(time, Tensor) and time.requires_grad)
 
@@ -125,7 +121,7 @@ def obstacle_arguments(group: Sequence[Obstacle], like: Tensor, scenes: int) -> 
     return (
         *tables,
         [KERNEL_SHAPES[type(o.shape)].number for o in group],
-        [len(_data(o.shape, like)) for o in group],
+        [_size(o.shape) for o in group],
         [CONTACT_KINDS[o.kind] for o in group],
         [-1 if o.scene is None else o.scene for o in group],
         [o.start for o in group],
@@ -143,8 +139,15 @@ def _packed(velocity: Tensor) -> Tensor:
 def _values(obstacle: Obstacle) -> tuple[Any, ...]:
     """The numbers and tensors of an obstacle that go into the tables."""
     motion = (obstacle.friction, obstacle.position, obstacle.velocity, obstacle.rotation, obstacle.angular_velocity)
-    names = (KERNEL_SHAPES[type(obstacle.shape)].extent, "radius", "outline", "values")
+    names = (KERNEL_SHAPES[type(obstacle.shape)].extent, "radius", "outline", "values", "lower", "spacing")
     return (*motion, *(getattr(obstacle.shape, name, None) for name in names if name))
+
+
+def _size(shape: shapes.Shape) -> int:
+    """The length of `_data`, without making it at every step."""
+    if isinstance(shape, shapes.Revolved):
+        return 2 * len(shape.outline)
+    return 2 * shape.values.dim() + 1 + shape.values.numel() if isinstance(shape, shapes.Sampled) else 0
 
 
 def _data(shape: shapes.Shape, like: Tensor) -> Tensor:
