@@ -101,6 +101,7 @@ inline void check_matrices(const Tensor& t, const char* name) {
 template <class T>
 Field<T> field(const Tensor& t) {
   Field<T> f;
+  if (!t.defined()) return f;
   f.pointer = static_cast<T*>(t.data_ptr());
   for (int64_t i = 0; i < t.dim() && i < 3; i++) f.stride[i] = t.stride(i);
   return f;
@@ -148,6 +149,11 @@ inline int64_t particle_pitch(const Tensor& like, int64_t particles) {
 
 // A [P, ...] tensor stored as structure of arrays: the particle index is contiguous.
 Tensor empty_particles(const Tensor& like, const Shape& shape);
+
+// A result per particle; where it is not wanted it stays undefined, None in Python.
+inline Tensor result(const Tensor& like, bool wanted, const Shape& shape) {
+  return wanted ? empty_particles(like, shape) : Tensor();
+}
 
 // Sets `scene` and `scene_stride` of the arguments of a kernel: the scene of each particle, [P] of any stride.
 template <class Arguments>

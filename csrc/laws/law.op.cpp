@@ -6,11 +6,9 @@
 namespace mpm {
 namespace {
 
-// A result per particle; where it is not wanted it stays undefined, None in Python.
 template <class T>
 Field<T> result(const Tensor& like, bool wanted, const Shape& shape, Tensor& out) {
-  if (!wanted) return {};
-  out = empty_particles(like, shape);
+  out = mpm::result(like, wanted, shape);
   return field<T>(out);
 }
 

@@ -99,16 +99,6 @@ Topology<T, D> topology_of(const ActivateArguments<T, D>& a) {
   return t;
 }
 
-// A result of the call: defined where it is wanted.
-Tensor buffer(const Tensor& x, bool wanted, const Shape& shape) {
-  return wanted ? empty_particles(x, shape) : Tensor();
-}
-
-template <class T>
-Field<T> view(const Tensor& t) {
-  return t.defined() ? field<T>(t) : Field<T>{};
-}
-
 // Columns of the history of all laws from the first one of a variable on, as [P, m]; as [P, D, D] with rows of `dim`.
 template <class T>
 Field<T> column(const Tensor& columns, int64_t first, int64_t dim) {
@@ -190,11 +180,11 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> substeps(
     STD_TORCH_CHECK(wants_C || !call.law->info.viscous, "the viscous law ", call.law->info.name, " needs wants_C");
     columns = call.first_column + history_size(call.law->info, call.history, D_);
   }
-  Tensor positions[] = {empty_particles(x, {P, D_}), buffer(x, n > 1, {P, D_})};
-  Tensor F_[] = {buffer(x, has(F), {P, D_, D_}), buffer(x, has(F) && (n > 1 || plastic), {P, D_, D_})};
-  Tensor J_[] = {buffer(x, has(J), {P}), buffer(x, has(J) && n > 1, {P})};
-  Tensor velocity = empty_particles(x, {P, D_}), affine = buffer(x, wants_C, {P, D_, D_});
-  Tensor kept = buffer(x, columns > 0, {P, columns}), stress = empty_particles(x, {P, D_, D_});
+  Tensor positions[] = {empty_particles(x, {P, D_}), result(x, n > 1, {P, D_})};
+  Tensor F_[] = {result(x, has(F), {P, D_, D_}), result(x, has(F) && (n > 1 || plastic), {P, D_, D_})};
+  Tensor J_[] = {result(x, has(J), {P}), result(x, has(J) && n > 1, {P})};
+  Tensor velocity = empty_particles(x, {P, D_}), affine = result(x, wants_C, {P, D_, D_});
+  Tensor kept = result(x, columns > 0, {P, columns}), stress = empty_particles(x, {P, D_, D_});
   Tensor status[] = {empty_int(x, {1 + scenes, kStatusSize}), empty_int(x, {1 + scenes, kStatusSize})};
   int64_t step = 0;
   const DeviceScope device(x);
@@ -209,7 +199,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> substeps(
 
     s.p2g.mass = input<T>(mass, "mass", x, {P});
     s.p2g.volume = input<T>(volume, "volume", x, {P});
-    s.p2g.stress = view<const T>(stress);
+    s.p2g.stress = field<const T>(stress);
     s.p2g.dt = s.update.dt = s.advance.dt = dt;
     s.p2g.form = s.advance.form = stress_form_of(stress_form);
     s.p2g.deterministic = packed.deterministic();
@@ -228,8 +218,8 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> substeps(
                                            contact_kind, obstacle_scene, start, end, {}, time);
     s.advance.gather.moment_scale = packed.inverse_inertia();
     s.advance.gather.lost = NAN;
-    s.advance.gather.value = view<T>(velocity);
-    s.advance.gather.moment = view<T>(affine);
+    s.advance.gather.value = field<T>(velocity);
+    s.advance.gather.moment = field<T>(affine);
 
     Field<const T> x_now = input<T>(x, "x", x, {P, D}), F_now = input<T>(F, "F", x, {P, D, D}),
                    J_now = input<T>(J, "J", x, {P}), C_now = input<T>(C, "C", x, {P, D, D});
@@ -248,14 +238,14 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> substeps(
       a.law = arguments<T, D>(info, *state, {}, calls[k].parameters, calls[k].history, scene, calls[k].options);
       if (has(material)) a.law.members = {static_cast<const int*>(material->data_ptr()), material->stride(0), int(k)};
       if (!calls[k].history.empty()) a.history = column<T>(kept, calls[k].first_column, 1);
-      a.stress = view<T>(stress);
+      a.stress = field<T>(stress);
       s.laws.push_back(a);
       s.entries.push_back(calls[k].law);
     }
     int into = 0;
     if (plastic && has(F)) {  // which laws change where it stands
       torch::stable::copy_(F_[1], *F);
-      F_now = view<const T>(F_[1]);
+      F_now = field<const T>(F_[1]);
     }
     s.pool.make(x, s.activation, s.obstacles, stream);
     s.use_pool();
@@ -285,14 +275,14 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> substeps(
       s.p2g.affine = apic ? C_now : Field<const T>{};
       s.advance.F = F_now;
       s.advance.J = J_now;
-      s.advance.x_next = view<T>(positions[into]);
-      s.advance.F_next = view<T>(F_[into]);
-      s.advance.J_next = view<T>(J_[into]);
+      s.advance.x_next = field<T>(positions[into]);
+      s.advance.F_next = field<T>(F_[into]);
+      s.advance.J_next = field<T>(J_[into]);
       s.contact.time = time;
       s.move(stream);
-      x_now = view<const T>(positions[into]);
-      F_now = view<const T>(F_[into]);
-      J_now = view<const T>(J_[into]);
+      x_now = field<const T>(positions[into]);
+      F_now = field<const T>(F_[into]);
+      J_now = field<const T>(J_[into]);
       if (step == 0) {  // from here on the call reads what it has written
         for (size_t k = 0; k < s.laws.size(); k++) {
           int64_t first = calls[k].first_column;
@@ -302,8 +292,8 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> substeps(
             first += matrix ? D * D : 1;
           }
         }
-        s.p2g.velocity = view<const T>(velocity);
-        C_now = view<const T>(affine);
+        s.p2g.velocity = field<const T>(velocity);
+        C_now = field<const T>(affine);
       }
       before = s.activation.status;
     }

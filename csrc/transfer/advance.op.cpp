@@ -33,8 +33,8 @@ std::tuple<Tensor, Tensor, Tensor> advance(const Tensor& x, const Tensor& v, con
                                            const OptionalTensor& scene, const OptionalTensor& scene_dt, double dt) {
   check_positions(x);
   const int64_t P = x.size(0), D_ = x.size(1);
-  Tensor x_next = empty_particles(x, {P, D_}), F_next = has(F) ? empty_particles(x, {P, D_, D_}) : empty(x, {0}),
-         J_next = has(J) ? empty_particles(x, {P}) : empty(x, {0});
+  Tensor x_next = empty_particles(x, {P, D_}), F_next = result(x, has(F), {P, D_, D_}),
+         J_next = result(x, has(J), {P});
   const DeviceScope device(x);
   dispatch(x, "x", x.size(1), [&]<class T, int D>() {
     auto a = advance_arguments<T, D>(x, v, C, F, J, scene, scene_dt, dt);
@@ -55,12 +55,9 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> advance_backward(
     const OptionalTensor& scene_dt, double dt, int64_t needs) {
   check_positions(x);
   const int64_t P = x.size(0), D_ = x.size(1);
-  const auto output = [&](int bit, bool present, const Shape& shape) {
-    return (needs & bit) && present ? empty_particles(x, shape) : empty(x, {0});
-  };
-  Tensor gv = output(kVelocity, true, {P, D_}), gC = output(kAffine, has(C), {P, D_, D_}),
-         gF = output(kDeformation, has(F), {P, D_, D_}), gJ = output(kVolumeRatio, has(J), {P}),
-         gt = output(kDt, true, {P});
+  Tensor gv = result(x, needs & kVelocity, {P, D_}), gC = result(x, (needs & kAffine) && has(C), {P, D_, D_}),
+         gF = result(x, (needs & kDeformation) && has(F), {P, D_, D_}),
+         gJ = result(x, (needs & kVolumeRatio) && has(J), {P}), gt = result(x, needs & kDt, {P});
   const DeviceScope device(x);
   dispatch(x, "x", x.size(1), [&]<class T, int D>() {
     AdvanceBackwardArguments<T, D> a;
@@ -69,14 +66,11 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> advance_backward(
     STD_TORCH_CHECK(has(grad_F) == has(F) && has(grad_J) == has(J), "grad_F and grad_J must come with F and J");
     a.grad_F = input<T>(grad_F, "grad_F", x, {P, D, D});
     a.grad_J = input<T>(grad_J, "grad_J", x, {P});
-    const auto wanted = [&](int bit, bool present, const Tensor& t) {
-      return (needs & bit) && present ? field<T>(t) : Field<T>{};
-    };
-    a.velocity = wanted(kVelocity, true, gv);
-    a.affine = wanted(kAffine, has(C), gC);
-    a.F = wanted(kDeformation, has(F), gF);
-    a.J = wanted(kVolumeRatio, has(J), gJ);
-    a.dt = wanted(kDt, true, gt);
+    a.velocity = field<T>(gv);
+    a.affine = field<T>(gC);
+    a.F = field<T>(gF);
+    a.J = field<T>(gJ);
+    a.dt = field<T>(gt);
     backend::advance_backward(a, device.stream());
   });
   return {gv, gC, gF, gJ, gt};

@@ -16,11 +16,8 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> g2p_advance(const Tensor& x, 
   const PackedTopology blocks(topology, lattice, layout);
   check_positions(x);
   const int64_t P = x.size(0), D_ = x.size(1);
-  const auto output = [&](bool wanted, const Shape& shape) {
-    return wanted ? empty_particles(x, shape) : empty(x, {0});
-  };
-  Tensor x_next = output(true, {P, D_}), v = output(true, {P, D_}), C = output(affine, {P, D_, D_}),
-         F_next = output(has(F), {P, D_, D_}), J_next = output(has(J), {P});
+  Tensor x_next = empty_particles(x, {P, D_}), v = empty_particles(x, {P, D_}), C = result(x, affine, {P, D_, D_}),
+         F_next = result(x, has(F), {P, D_, D_}), J_next = result(x, has(J), {P});
   const DeviceScope device(x);
   dispatch(x, [&]<class T, int D>() {
     G2PAdvanceArguments<T, D> a;
@@ -31,15 +28,15 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> g2p_advance(const Tensor& x, 
     a.gather.moment_scale = blocks.inverse_inertia();
     a.gather.lost = NAN;
     a.gather.value = field<T>(v);
-    if (affine) a.gather.moment = field<T>(C);
+    a.gather.moment = field<T>(C);
     a.F = input<T>(F, "F", x, {P, D, D});
     a.J = input<T>(J, "J", x, {P});
     a.scene_dt = input<T>(scene_dt, "scene_dt", x, {a.gather.topology.scenes});
     a.dt = dt;
     a.form = stress_form_of(stress_form);
     a.x_next = field<T>(x_next);
-    if (has(F)) a.F_next = field<T>(F_next);
-    if (has(J)) a.J_next = field<T>(J_next);
+    a.F_next = field<T>(F_next);
+    a.J_next = field<T>(J_next);
     backend::g2p_advance(blocks.order(), a, device.stream());
   });
   return {x_next, v, C, F_next, J_next};

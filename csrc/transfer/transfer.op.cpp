@@ -56,28 +56,24 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> p2g_backward(
   const PackedTopology blocks(topology, lattice, layout);
   check_positions(x);
   const int64_t P = x.size(0), D_ = x.size(1);
-  const auto output = [&](int bit, bool present, const Shape& shape) {
-    return (needs & bit) && present ? empty_particles(x, shape) : empty(x, {0});
-  };
-  Tensor gx = output(kX, true, {P, D_}), gm = output(kMass, true, {P}), gv = output(kVelocity, true, {P, D_}),
-         gC = output(kAffine, has(C), {P, D_, D_}), gs = output(kStress, has(stress), {P, D_, D_}),
-         gV = output(kVolume, has(stress), {P}), gt = output(kDt, has(stress), {P});
+  const int64_t of_stress = has(stress) ? needs : 0;
+  Tensor gx = result(x, needs & kX, {P, D_}), gm = result(x, needs & kMass, {P}),
+         gv = result(x, needs & kVelocity, {P, D_}), gC = result(x, (needs & kAffine) && has(C), {P, D_, D_}),
+         gs = result(x, of_stress & kStress, {P, D_, D_}), gV = result(x, of_stress & kVolume, {P}),
+         gt = result(x, of_stress & kDt, {P});
   const DeviceScope device(x);
   dispatch(x, [&]<class T, int D>() {
     P2GBackwardArguments<T, D> a;
     a.forward = p2g_arguments<T, D>(x, mass, v, C, stress, volume, scene_dt, dt, stress_form, blocks);
     a.grad_nodes = node_input<T>(grad_nodes, "grad_nodes", x, blocks.node_count<D>());
     STD_TORCH_CHECK(a.grad_nodes.channels == 1 + D, "grad_nodes must have 1 + D channels, got ", a.grad_nodes.channels);
-    const auto wanted = [&](int bit, const Tensor& t) {
-      return (needs & bit) && t.numel() > 0 ? field<T>(t) : Field<T>{};
-    };
-    a.x = wanted(kX, gx);
-    a.mass = wanted(kMass, gm);
-    a.velocity = wanted(kVelocity, gv);
-    a.affine = wanted(kAffine, gC);
-    a.stress = wanted(kStress, gs);
-    a.volume = wanted(kVolume, gV);
-    a.dt = wanted(kDt, gt);
+    a.x = field<T>(gx);
+    a.mass = field<T>(gm);
+    a.velocity = field<T>(gv);
+    a.affine = field<T>(gC);
+    a.stress = field<T>(gs);
+    a.volume = field<T>(gV);
+    a.dt = field<T>(gt);
     backend::p2g_backward(blocks.order(), a, device.stream());
   });
   return {gx, gm, gv, gC, gs, gV, gt};
@@ -114,8 +110,8 @@ std::tuple<Tensor, Tensor, Tensor> gather_with(const Tensor& x, const Tensor& no
   check_rank(nodes, "nodes", 2);
   check_count(nodes.size(1), "nodes", "channels");
   const int64_t P = x.size(0), K = nodes.size(1), D_ = x.size(1);
-  Tensor value = empty_particles(x, {P, K}), moments = moment ? empty_particles(x, {P, K, D_}) : empty(x, {0}),
-         gradients = gradient ? empty_particles(x, {P, K, D_}) : empty(x, {0});
+  Tensor value = empty_particles(x, {P, K}), moments = result(x, moment, {P, K, D_}),
+         gradients = result(x, gradient, {P, K, D_});
   const DeviceScope device(x);
   dispatch(x, [&]<class T, int D>() {
     GatherArguments<T, D> a;
@@ -125,8 +121,8 @@ std::tuple<Tensor, Tensor, Tensor> gather_with(const Tensor& x, const Tensor& no
     a.moment_scale = moment_scale;
     a.lost = lost;
     a.value = field<T>(value);
-    if (moment) a.moment = field<T>(moments);
-    if (gradient) a.gradient = field<T>(gradients);
+    a.moment = field<T>(moments);
+    a.gradient = field<T>(gradients);
     backend::gather(blocks.order(), a, device.stream());
   });
   return {value, moments, gradients};

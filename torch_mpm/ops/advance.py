@@ -52,8 +52,7 @@ def advance(
     if C is None and (F is not None or J is not None):
         raise ValueError("F and J need C")
     number, scene_dt = split_dt(dt, scenes, x)
-    next_x, next_F, next_J = dispatch(torch.ops.torch_mpm.advance, x, v, C, F, J, scene, scene_dt, number)
-    return next_x, None if F is None else next_F, None if J is None else next_J
+    return dispatch(torch.ops.torch_mpm.advance, x, v, C, F, J, scene, scene_dt, number)
 
 
 @torch.library.register_fake("torch_mpm::advance")
@@ -61,8 +60,8 @@ def _advance_fake(x, v, C, F, J, scene, scene_dt, dt):
     P, D = sizes(x, "x", 2)
     return (
         soa_empty(x, (P, D)),
-        x.new_empty(0) if F is None else soa_empty(x, (P, D, D)),
-        x.new_empty(0) if J is None else x.new_empty(P),
+        None if F is None else soa_empty(x, (P, D, D)),
+        None if J is None else x.new_empty(P),
     )
 
 
@@ -72,7 +71,7 @@ def _advance_backward_fake(grad_x, grad_F, grad_J, x, v, C, F, J, scene, scene_d
     shapes = ((P, D), (P, D, D), (P, D, D), (P,), (P,))
     present = (True, C is not None, F is not None, J is not None, True)
     return tuple(
-        soa_empty(x, shape) if needs >> i & 1 and here else x.new_empty(0)
+        soa_empty(x, shape) if needs >> i & 1 and here else None
         for i, (shape, here) in enumerate(zip(shapes, present, strict=True))
     )
 
@@ -87,8 +86,10 @@ def _backward(ctx, grad_x, grad_F, grad_J):
     x, v, C, F, J, scene, scene_dt = ctx.saved_tensors
     need = ctx.needs_input_grad
     needs = sum(1 << i for i, needed in enumerate((*need[1:5], need[6])) if needed)
-    given = (grad_x, None if F is None else grad_F, None if J is None else grad_J)
-    grads = dispatch(torch.ops.torch_mpm.advance_backward, *given, x, v, C, F, J, scene, scene_dt, ctx.dt, needs)
+    grads = dispatch(
+        torch.ops.torch_mpm.advance_backward,
+        *(grad_x, grad_F, grad_J, x, v, C, F, J, scene, scene_dt, ctx.dt, needs),
+    )
     grad_v, grad_C, grad_F, grad_J, grad_dt = (
         g if needs >> i & 1 and t is not None else None
         for i, (g, t) in enumerate(zip(grads, (v, C, F, J, scene_dt), strict=True))

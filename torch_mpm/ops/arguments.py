@@ -129,7 +129,8 @@ def check_parameter(name: str, value: Tensor, state: Tensor, scene: Tensor | Non
     if value.dim() > 1 or (value.numel() not in (1, P) and (scene is None or value.numel() == 0)):
         expected = f"[], [1] or [P] = [{P}]" + (" without scene" if scene is None else ", or [B]")
         raise ValueError(f"{name} must have shape {expected}, got {shape_of(value)}")
-    check_like(name, value, state, tuple(value.shape), "")
+    if value.dtype != state.dtype or value.device != state.device:
+        check_like(name, value, state, tuple(value.shape), "")
 
 
 def check_list(name: str, values: Any) -> Sequence[Any]:

@@ -55,11 +55,10 @@ def g2p_advance(
     check_choice("stress_form", stress_form, STRESS_FORMS)
     velocity = _check_nodes("velocity", velocity, blocks, x, D)
     number, scene_dt = split_dt(dt, grid.scenes, x)
-    next_x, v, C, next_F, next_J = dispatch(
+    return dispatch(
         torch.ops.torch_mpm.g2p_advance,
         *(x, velocity, F, J, scene_dt, number, affine, STRESS_FORMS[stress_form], *blocks.packed),
     )
-    return next_x, v, C if affine else None, None if F is None else next_F, None if J is None else next_J
 
 
 @torch.library.register_fake("torch_mpm::g2p_advance")
@@ -67,7 +66,7 @@ def _fake(x, velocity, F, J, scene_dt, dt, affine, stress_form, *topology):
     P, D = sizes(x, "x", 2)
     shapes = ((P, D), (P, D), (P, D, D), (P, D, D), (P,))
     present = (True, True, affine, F is not None, J is not None)
-    return tuple(soa_empty(x, shape) if here else x.new_empty(0) for shape, here in zip(shapes, present, strict=True))
+    return tuple(soa_empty(x, shape) if here else None for shape, here in zip(shapes, present, strict=True))
 
 
 def _setup(ctx: Any, inputs: Any, output: Any) -> None:
@@ -90,15 +89,15 @@ def _backward(ctx, grad_x, grad_v, grad_C, grad_F, grad_J):
     scene = blocks.particle_scene() if scene_dt is not None and scene_dt.shape[0] > 1 else None
     wanted = (need_nodes, need_nodes and moves, need_F, need_J, need_dt)
     needs = sum(1 << i for i, needed in enumerate(wanted) if needed)
-    given = (grad_x, None if F is None else grad_F, None if J is None else grad_J)
     L = L if moves else None
     more_v, grad_L, grad_F, grad_J, grad_dt = dispatch(
-        torch.ops.torch_mpm.advance_backward, *given, x, v, L, F, J, scene, scene_dt, ctx.dt, needs
+        torch.ops.torch_mpm.advance_backward,
+        *(grad_x, grad_F, grad_J, x, v, L, F, J, scene, scene_dt, ctx.dt, needs),
     )
     grad_velocity = None
     if need_nodes:
         grad_v = grad_v + more_v
-        moment, gradient = grad_C if ctx.affine else None, None
+        moment, gradient = grad_C, None
         if moves and ctx.mls:
             moment = grad_L if moment is None else moment + grad_L
         elif moves:

@@ -279,11 +279,6 @@ def _scalar_fake(state, parameters, history, scene, law, dim):
 # ---- autograd
 
 
-def _needed(need: bool | Sequence[bool], count: int) -> list[bool]:
-    """Which tensors of a list need a gradient."""
-    return [need] * count if isinstance(need, bool) else list(need)
-
-
 def _of_parameters(grads: Tensor, parameters: Tensors, wanted: Sequence[bool], scene: Tensor | None) -> list[Any]:
     """Gradients of the parameters: those per particle [P, n], summed over the particles that share a value."""
 
@@ -292,13 +287,16 @@ def _of_parameters(grads: Tensor, parameters: Tensors, wanted: Sequence[bool], s
             return grad.sum().reshape(parameter.shape)
         return grad if parameter.numel() == grad.numel() else sum_by_scene(grad, scene, parameter.numel())
 
+    if not any(wanted):
+        return [None] * len(parameters)
     pairs = zip(parameters, wanted, strict=True)
     return [shared(grads[:, k], p) if w else None for k, (p, w) in enumerate(pairs)]
 
 
 def _of_history(grads: Tensor, history: Tensors, wanted: Sequence[bool]) -> list[Any]:
-    parts = _split(grads, history) if any(wanted) else [None] * len(history)
-    return [part if w else None for part, w in zip(parts, wanted, strict=True)]
+    if not any(wanted):
+        return [None] * len(history)
+    return [part if w else None for part, w in zip(_split(grads, history), wanted, strict=True)]
 
 
 class _Saved:
@@ -323,9 +321,12 @@ def _update_setup(ctx: Any, inputs: Any, output: Any) -> None:
 def _update_backward(ctx, *grads):
     saved = _Saved(ctx)
     need_state, need_C, need_parameters, need_history = ctx.needs_input_grad[:4]
-    by_parameter = _needed(need_parameters, len(saved.parameters))
-    by_history = _needed(need_history, len(saved.history))
-    needs = STATE * need_state + VELOCITY_GRADIENT * need_C + PARAMETERS * any(by_parameter) + HISTORY * any(by_history)
+    needs = (
+        STATE * need_state
+        + VELOCITY_GRADIENT * need_C
+        + PARAMETERS * any(need_parameters)
+        + HISTORY * any(need_history)
+    )
     given = grads[:5]
     if not needs or all(g is None for g in given):
         return None, None, [None] * len(saved.parameters), [None] * len(saved.history), *(None,) * 5
@@ -337,8 +338,8 @@ def _update_backward(ctx, *grads):
     return (
         grad_state if need_state else None,
         grad_C if need_C else None,
-        _of_parameters(grad_parameters, saved.parameters, by_parameter, saved.scene),
-        _of_history(grad_history, saved.history, by_history),
+        _of_parameters(grad_parameters, saved.parameters, need_parameters, saved.scene),
+        _of_history(grad_history, saved.history, need_history),
         *(None,) * 5,
     )
 
@@ -354,12 +355,11 @@ def _update_double_backward(ctx, along_state, along_C, along_parameters, _):
     saved = _Saved(ctx)
     (grad_stress,) = saved.history
     _, need_grad, *_, need_state, need_C, need_parameters = ctx.needs_input_grad[:8]
-    by_parameter = _needed(need_parameters, len(saved.parameters))
     nothing = (*(None,) * 7, [None] * len(saved.parameters), [None] * ctx.history, *(None,) * 5)
     along = (along_state, along_C, along_parameters)
     if grad_stress is None or all(t is None for t in along):
         return nothing
-    needs = STATE * need_state + VELOCITY_GRADIENT * need_C + PARAMETERS * any(by_parameter)
+    needs = STATE * need_state + VELOCITY_GRADIENT * need_C + PARAMETERS * any(need_parameters)
     by_grad, by_state, by_C, grad_parameters = dispatch(
         torch.ops.torch_mpm.law_update_double_backward,
         *(*along, grad_stress, saved.state, saved.C, saved.parameters, saved.scene, ctx.law, ctx.dim, needs),
@@ -370,7 +370,7 @@ def _update_double_backward(ctx, along_state, along_C, along_parameters, _):
         *(None,) * 3,
         by_state if need_state else None,
         by_C if need_C else None,
-        _of_parameters(grad_parameters, saved.parameters, by_parameter, saved.scene),
+        _of_parameters(grad_parameters, saved.parameters, need_parameters, saved.scene),
         *nothing[8:],
     )
 
@@ -383,9 +383,7 @@ def _energy_setup(ctx: Any, inputs: Any, output: Any) -> None:
 def _energy_backward(ctx, grad):
     saved = _Saved(ctx)
     need_state, need_parameters, need_history = ctx.needs_input_grad[:3]
-    by_parameter = _needed(need_parameters, len(saved.parameters))
-    by_history = _needed(need_history, len(saved.history))
-    needs = STATE * need_state + PARAMETERS * any(by_parameter) + HISTORY * any(by_history)
+    needs = STATE * need_state + PARAMETERS * any(need_parameters) + HISTORY * any(need_history)
     if not needs or grad is None:
         return None, [None] * len(saved.parameters), [None] * len(saved.history), *(None,) * 3
     grad_state, grad_parameters, grad_history = dispatch(
@@ -394,8 +392,8 @@ def _energy_backward(ctx, grad):
     )
     return (
         grad_state if need_state else None,
-        _of_parameters(grad_parameters, saved.parameters, by_parameter, saved.scene),
-        _of_history(grad_history, saved.history, by_history),
+        _of_parameters(grad_parameters, saved.parameters, need_parameters, saved.scene),
+        _of_history(grad_history, saved.history, need_history),
         *(None,) * 3,
     )
 
@@ -411,11 +409,10 @@ def _energy_double_backward(ctx, along_state, along_parameters, _):
     saved = _Saved(ctx)
     (grad,) = saved.history
     need_grad, need_state, need_parameters = ctx.needs_input_grad[:3]
-    by_parameter = _needed(need_parameters, len(saved.parameters))
     along = (along_state, along_parameters)
     if all(t is None for t in along):
         return None, None, [None] * len(saved.parameters), [None] * ctx.history, *(None,) * 4
-    needs = STATE * need_state + PARAMETERS * any(by_parameter)
+    needs = STATE * need_state + PARAMETERS * any(need_parameters)
     by_grad, by_state, grad_parameters = dispatch(
         torch.ops.torch_mpm.law_energy_double_backward,
         *(*along, grad, saved.state, saved.parameters, saved.scene, ctx.law, ctx.dim, needs),
@@ -423,7 +420,7 @@ def _energy_double_backward(ctx, along_state, along_parameters, _):
     return (
         by_grad if need_grad else None,
         by_state if need_state else None,
-        _of_parameters(grad_parameters, saved.parameters, by_parameter, saved.scene),
+        _of_parameters(grad_parameters, saved.parameters, need_parameters, saved.scene),
         [None] * ctx.history,
         *(None,) * 4,
     )

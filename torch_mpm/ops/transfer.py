@@ -106,8 +106,7 @@ def g2p(
     check_blocks(blocks)
     check_positions(x, blocks.grid.dim, blocks.scene, blocks.grid.scenes)
     velocity = _check_nodes("velocity", velocity, blocks, x, blocks.grid.dim)
-    v, C, grad_v = dispatch(torch.ops.torch_mpm.g2p, x, velocity, affine, gradient, *blocks.packed)
-    return v, C if affine else None, grad_v if gradient else None
+    return dispatch(torch.ops.torch_mpm.g2p, x, velocity, affine, gradient, *blocks.packed)
 
 
 def scatter(
@@ -172,8 +171,7 @@ def gather(
     check_blocks(blocks)
     check_positions(x, blocks.grid.dim, blocks.scene, blocks.grid.scenes)
     nodes = _check_nodes("nodes", nodes, blocks, x, None)
-    a, b, c = dispatch(torch.ops.torch_mpm.gather, x, nodes, moment_scale, moment, gradient, *blocks.packed)
-    return a, b if moment else None, c if gradient else None
+    return dispatch(torch.ops.torch_mpm.gather, x, nodes, moment_scale, moment, gradient, *blocks.packed)
 
 
 def _check_nodes(name: str, nodes: Tensor, blocks: Blocks, x: Tensor, channels: int | None) -> Tensor:
@@ -198,7 +196,7 @@ def _p2g_backward_fake(grad_nodes, x, mass, v, C, stress, volume, scene_dt, dt, 
     shapes = ((P, D), (P,), (P, D), (P, D, D), (P, D, D), (P,), (P,))
     present = (True, True, True, C is not None) + 3 * (stress is not None,)
     return tuple(
-        soa_empty(x, shape) if needs >> i & 1 and here else x.new_empty(0)
+        soa_empty(x, shape) if needs >> i & 1 and here else None
         for i, (shape, here) in enumerate(zip(shapes, present, strict=True))
     )
 
@@ -211,7 +209,7 @@ def _scatter_fake(x, value, moment, gradient, moment_scale, *topology):
 @torch.library.register_fake("torch_mpm::gather")
 def _gather_fake(x, nodes, moment_scale, moment, gradient, *topology):
     (P, D), K = sizes(x, "x", 2), sizes(nodes, "nodes", 2)[1]
-    sums = [soa_empty(x, (P, K, D)) if wanted else x.new_empty(0) for wanted in (moment, gradient)]
+    sums = [soa_empty(x, (P, K, D)) if wanted else None for wanted in (moment, gradient)]
     return soa_empty(x, (P, K)), *sums
 
 
@@ -244,42 +242,36 @@ def _scatter_backward(ctx, grad):
         )
     if need[0]:
         grad_x = dispatch(torch.ops.torch_mpm.position_gradient, x, value, moment, gradient, grad, ctx.scale, *topology)
-    return (grad_x, grad_value, grad_moment if need[2] else None, grad_gradient if need[3] else None) + (None,) * 4
+    return (grad_x, grad_value, grad_moment, grad_gradient) + (None,) * 4
 
 
 def _gather_setup(ctx, inputs, output):
-    x, nodes, scale, moment, gradient, *topology = inputs
-    save_with_topology(ctx, (x, nodes), topology, scale=scale, moment=moment, gradient=gradient)
+    x, nodes, scale, _, _, *topology = inputs
+    save_with_topology(ctx, (x, nodes), topology, scale=scale)
 
 
-def _gather_backward(ctx, grad_value, grad_moment, grad_gradient):
-    grad_x, grad_nodes = _gather_adjoint(ctx, grad_value, grad_moment, grad_gradient)
-    return (grad_x, grad_nodes) + (None,) * 6
+def _gather_backward(ctx, *grads):
+    return _gather_adjoint(ctx, *grads) + (None,) * 6
 
 
-def _gather_adjoint(ctx, grad_value, grad_moment, grad_gradient):
+def _gather_adjoint(ctx, *grads):
     (x, nodes), topology = saved_with_topology(ctx)
-    moment = grad_moment if ctx.moment else None
-    gradient = grad_gradient if ctx.gradient else None
     grad_x = grad_nodes = None
     if ctx.needs_input_grad[0]:
-        grad_x = dispatch(
-            torch.ops.torch_mpm.position_gradient, x, grad_value, moment, gradient, nodes, ctx.scale, *topology
-        )
+        grad_x = dispatch(torch.ops.torch_mpm.position_gradient, x, *grads, nodes, ctx.scale, *topology)
     if ctx.needs_input_grad[1]:
-        grad_nodes = dispatch(torch.ops.torch_mpm.scatter, x, grad_value, moment, gradient, ctx.scale, *topology)
+        grad_nodes = dispatch(torch.ops.torch_mpm.scatter, x, *grads, ctx.scale, *topology)
     return grad_x, grad_nodes
 
 
 def _g2p_setup(ctx, inputs, output):
-    x, velocity, affine, gradient, *topology = inputs
+    x, velocity, _, _, *topology = inputs
     scale = Topology.unpack(*topology).grid.inverse_inertia
-    save_with_topology(ctx, (x, velocity), topology, scale=scale, moment=affine, gradient=gradient)
+    save_with_topology(ctx, (x, velocity), topology, scale=scale)
 
 
-def _g2p_backward(ctx, grad_v, grad_C, grad_gradient):
-    grad_x, grad_velocity = _gather_adjoint(ctx, grad_v, grad_C, grad_gradient)
-    return (grad_x, grad_velocity) + (None,) * 5
+def _g2p_backward(ctx, *grads):
+    return _gather_adjoint(ctx, *grads) + (None,) * 5
 
 
 def _position_gradient_setup(ctx, inputs, output):
