@@ -1,0 +1,324 @@
+#pragma once
+
+#include <string>
+
+#include "grid/activate.op.h"
+#include "grid/obstacle.op.h"
+#include "grid/walls.op.h"
+#include "laws/law.op.h"
+#include "transfer/kernels.h"
+
+// Many steps in one call: activation, laws, P2G, grid update, obstacles, G2P, one after another as the ops of one step
+// do them, in buffers that belong to the call. What the ops of rollouts share.
+namespace mpm {
+
+#define MPM_SUBSTEPS_SCHEMA                                                                                        \
+  "Tensor x, Tensor v, Tensor mass, Tensor volume, Tensor? C, Tensor? F, Tensor? J, Tensor[] history, Tensor? "    \
+  "scene, Tensor? ids, Tensor? material, Tensor? previous_status, str laws, int[] options, Tensor[] parameters, "  \
+  "int[] variables, int n, float dt, bool apic, bool wants_C, int stress_form, Tensor? gravity, " MPM_WALLS_SCHEMA \
+  ", Tensor? obstacles, Tensor? data, int[] shape, int[] sizes, int[] contact, int[] obstacle_scene, "             \
+  "float[] start, float[] end, float time, int scenes, int max_blocks, bool grows, " MPM_LATTICE_SCHEMA
+#define MPM_SUBSTEPS_PARAMETERS                                                                                        \
+  const Tensor &x, const Tensor &v, const Tensor &mass, const Tensor &volume, const OptionalTensor &C,                 \
+      const OptionalTensor &F, const OptionalTensor &J, const Tensors &history, const OptionalTensor &scene,           \
+      const OptionalTensor &ids, const OptionalTensor &material, const OptionalTensor &previous_status,                \
+      std::string laws, std::vector<int64_t> options, const Tensors &parameters, std::vector<int64_t> variables,       \
+      int64_t n, double dt, bool apic, bool wants_C, int64_t stress_form, const OptionalTensor &gravity,               \
+      std::vector<int64_t> wall_kind, std::vector<double> wall_plane, std::vector<double> wall_friction,               \
+      const OptionalTensor &obstacle_table, const OptionalTensor &obstacle_data, std::vector<int64_t> shape,           \
+      std::vector<int64_t> sizes, std::vector<int64_t> contact_kind, std::vector<int64_t> obstacle_scene,              \
+      std::vector<double> start, std::vector<double> end, double time, int64_t scenes, int64_t max_blocks, bool grows, \
+      const std::vector<double>&lattice, const std::vector<int64_t>&layout
+#define MPM_SUBSTEPS_ARGUMENTS                                                                                         \
+  x, v, mass, volume, C, F, J, history, scene, ids, material, previous_status, laws, options, parameters, variables,   \
+      n, dt, apic, wants_C, stress_form, gravity, wall_kind, wall_plane, wall_friction, obstacle_table, obstacle_data, \
+      shape, sizes, contact_kind, obstacle_scene, start, end, time, scenes, max_blocks, grows,                         \
+      PackedLattice(lattice, layout)
+
+// The arguments of a call.
+struct SubstepsInputs {
+  Tensor x, v, mass, volume;
+  OptionalTensor C, F, J;
+  Tensors history;
+  OptionalTensor scene, ids, material, previous_status;
+  std::string laws;
+  std::vector<int64_t> options;
+  Tensors parameters;
+  std::vector<int64_t> variables;
+  int64_t n;
+  double dt;
+  bool apic, wants_C;
+  int64_t stress_form;
+  OptionalTensor gravity;
+  std::vector<int64_t> wall_kind;
+  std::vector<double> wall_plane, wall_friction;
+  OptionalTensor obstacle_table, obstacle_data;
+  std::vector<int64_t> shape, sizes, contact_kind, obstacle_scene;
+  std::vector<double> start, end;
+  double time;
+  int64_t scenes, max_blocks;
+  bool grows;
+  PackedLattice lattice;
+};
+
+constexpr int64_t kMostSteps = 1 << 16;  // of one call, which nothing interrupts
+
+// The words of a list that commas part.
+inline std::vector<std::string> words(const std::string& list) {
+  std::vector<std::string> result;
+  for (size_t begin = 0; begin <= list.size();) {
+    const size_t comma = std::min(list.find(',', begin), list.size());
+    result.push_back(list.substr(begin, comma - begin));
+    begin = comma + 1;
+  }
+  return result;
+}
+
+// As a growing grid does in torch_mpm/grid.py.
+inline int64_t with_headroom(int64_t blocks) { return blocks + blocks / 2 + 16; }
+
+// The laws of a mixture, or a single one, with their places in the lists of parameters and history.
+struct LawCall {
+  LawEntry* law;
+  int64_t options;
+  Tensors parameters, history;
+  int64_t first_column;  // of the history of all laws
+};
+
+// `variables` are the numbers of history tensors: a law may go without.
+inline std::vector<LawCall> law_calls(const std::string& names, const std::vector<int64_t>& options,
+                                      const Tensors& parameters, const Tensors& history,
+                                      const std::vector<int64_t>& variables, int64_t dim) {
+  const std::vector<std::string> list = words(names);
+  STD_TORCH_CHECK(options.size() == list.size(), "options must have an entry per law, ", list.size(), ", got ",
+                  options.size());
+  STD_TORCH_CHECK(variables.size() == list.size(), "variables must have an entry per law, ", list.size(), ", got ",
+                  variables.size());
+  std::vector<LawCall> calls;
+  size_t parameter = 0, variable = 0;
+  int64_t column = 0;
+  for (size_t k = 0; k < list.size(); k++) {
+    LawEntry& law = law_of(list[k]);
+    const size_t count = law.info.parameters.size();
+    STD_TORCH_CHECK(variables[k] >= 0, "variables must not be negative, got ", variables[k]);
+    const size_t end = parameter + count, last = variable + size_t(variables[k]);
+    STD_TORCH_CHECK(end <= parameters.size() && last <= history.size(),
+                    "parameters and history must have those of all laws one after another, got ", parameters.size(),
+                    " and ", history.size(), " tensors");
+    LawCall call{&law, options[k], {}, {}, column};
+    call.parameters = {parameters.begin() + parameter, parameters.begin() + end};
+    call.history = {history.begin() + variable, history.begin() + last};
+    parameter = end;
+    variable = last;
+    column += history_size(law.info, call.history, dim);
+    calls.push_back(call);
+  }
+  STD_TORCH_CHECK(parameter == parameters.size() && variable == history.size(),
+                  "parameters and history must be those of all laws, ", parameter, " and ", variable, " tensors, got ",
+                  parameters.size(), " and ", history.size());
+  return calls;
+}
+
+// The activation and the nodes, for one size of the pool of blocks.
+template <class T, int D>
+struct Pool {
+  ActivationTensors active;
+  Tensor nodes, updated, velocity;
+
+  void make(const Tensor& x, ActivateArguments<T, D>& a, bool obstacles, backend::Stream stream) {
+    const int64_t rows = int64_t(a.max_blocks) * kBlockNodes<D>;
+    active.make(x, a, stream);
+    nodes = empty(x, {rows, 1 + D});
+    updated = empty(x, {rows, 1 + D});
+    if (obstacles) velocity = empty(x, {rows, 1 + D});
+  }
+};
+
+template <class T, int D>
+Topology<T, D> topology_of(const ActivateArguments<T, D>& a) {
+  Topology<T, D> t;
+  t.geometry = a.geometry;
+  t.scenes = a.scenes;
+  t.max_blocks = a.max_blocks;
+  t.particles = a.particles;
+  t.table = a.table;
+  t.block = a.block;
+  t.offsets = a.offsets;
+  t.index = a.index;
+  t.schedule = a.schedule;
+  t.schedule_size = a.schedule_size;
+  return t;
+}
+
+// Where the fields of the particles are; absent where a simulation has none.
+template <class T>
+struct Particles {
+  Field<T> x, v, C, F, J;
+  Field<T> history;  // [P, m], the entries of all laws
+};
+
+// A history variable from a column of all entries on: [P], or [P, D, D].
+template <class T, int D>
+Field<T> variable(const Field<T>& history, int64_t first, bool matrix) {
+  Field<T> f = history;
+  f.pointer += first * f.stride[1];
+  f.stride[2] = f.stride[1];
+  if (matrix) f.stride[1] *= D;
+  return f;
+}
+
+// The kernels of a step with their arguments, of which a call makes most once.
+template <class T, int D>
+struct Substeps {
+  const SubstepsInputs& in;
+  std::vector<LawCall> calls;
+  bool plastic = false;  // some law changes F
+  int64_t columns = 0;   // of the history of all laws
+  ActivateArguments<T, D> activation;
+  std::vector<LawUpdateArguments<T, D>> laws;
+  P2GArguments<T, D> p2g;
+  GridUpdateArguments<T, D> update;
+  ContactArguments<T, D> contact;
+  G2PAdvanceArguments<T, D> advance;
+  Pool<T, D> pool;
+  Tensor stress;
+  bool obstacles = false;
+
+  explicit Substeps(const SubstepsInputs& inputs);
+
+  // What the next substep reads, and where the laws put the deformation gradients after their return maps.
+  void read(const Particles<const T>& p, const Field<T>& mapped) {
+    for (size_t k = 0; k < laws.size(); k++) {
+      const LawInfo& info = calls[k].law->info;
+      LawUpdateArguments<T, D>& a = laws[k];
+      a.law.state = info.field == Deformation::gradient ? p.F : p.J;
+      if (info.viscous) a.law.C = p.C;
+      if (info.plastic) a.state = mapped;
+      int64_t first = calls[k].first_column;
+      for (size_t q = 0; q < calls[k].history.size(); q++) {
+        const bool matrix = info.history[q].matrix;
+        a.law.history[q] = variable<const T, D>(p.history, first, matrix);
+        first += matrix ? D * D : 1;
+      }
+    }
+    p2g.x = advance.gather.x = activation.x = p.x;
+    p2g.velocity = p.v;
+    p2g.affine = in.apic ? p.C : Field<const T>{};
+    advance.F = plastic ? Field<const T>{mapped.pointer, {mapped.stride[0], mapped.stride[1], mapped.stride[2]}} : p.F;
+    advance.J = p.J;
+  }
+
+  // Where it leaves its results.
+  void write(const Particles<T>& p) {
+    for (size_t k = 0; k < laws.size(); k++)
+      if (!calls[k].history.empty()) laws[k].history = variable<T, D>(p.history, calls[k].first_column, false);
+    advance.gather.value = p.v;
+    advance.gather.moment = p.C;
+    advance.x_next = p.x;
+    advance.F_next = p.F;
+    advance.J_next = p.J;
+  }
+
+  // Finds the active blocks; false where the pool has no room for them and must not grow. On CUDA nobody waits for the
+  // answer: the status tells.
+  bool activate(const int* previous_status, int* status, backend::Stream stream) {
+    activation.previous_status = previous_status;
+    activation.status = status;
+    backend::activate(in.lattice.order(), activation, stream);
+    if (MPM_BACKEND != MPM_BACKEND_IS_cpu || status[kBlocksNow] <= activation.max_blocks) return true;
+    if (!in.grows) return false;
+    const int64_t most = std::min<int64_t>(update.block_count, INT32_MAX / kBlockNodes<D>);
+    activation.max_blocks = int(std::min(with_headroom(status[kBlocksNow]), most));
+    make_pool(stream);
+    backend::activate(in.lattice.order(), activation, stream);
+    return true;
+  }
+
+  void move(backend::Stream stream) {
+    const int64_t order = in.lattice.order();
+    for (size_t k = 0; k < laws.size(); k++) calls[k].law->kernels<T, D>().update(laws[k], stream);
+    torch::stable::zero_(pool.nodes);
+    backend::p2g(order, p2g, stream);
+    backend::grid_update(update, stream);
+    if (obstacles) backend::contact(contact, stream);
+    backend::g2p_advance(order, advance, stream);
+  }
+
+  void make_pool(backend::Stream stream);
+};
+
+template <class T, int D>
+Substeps<T, D>::Substeps(const SubstepsInputs& inputs) : in(inputs) {
+  const Tensor& x = in.x;
+  const int64_t P = x.size(0);
+  STD_TORCH_CHECK(in.n > 0 && in.n <= kMostSteps, "n must be 1 to ", kMostSteps, ", got ", in.n);
+  STD_TORCH_CHECK(in.dt > 0 && std::isfinite(in.dt), "dt must be positive and finite, got ", in.dt);
+  STD_TORCH_CHECK(in.wants_C || !in.apic, "apic needs wants_C");
+  calls = law_calls(in.laws, in.options, in.parameters, in.history, in.variables, D);
+  STD_TORCH_CHECK(has(in.material) || calls.size() == 1, "several laws need material");
+  activation = activate_arguments<T, D>(in.lattice, x, in.scene, in.ids, in.scenes, in.max_blocks);
+  stress = empty_particles(x, {P, D, D});
+  if (has(in.material)) {
+    check_shape(*in.material, "material", {P});
+    check_type(*in.material, "material", ScalarType::Int, x);
+    torch::stable::zero_(stress);  // of particles without a law
+  }
+  for (size_t k = 0; k < calls.size(); k++) {
+    const LawInfo& info = calls[k].law->info;
+    STD_TORCH_CHECK(in.wants_C || !info.viscous, "the viscous law ", info.name, " needs wants_C");
+    const OptionalTensor& state = info.field == Deformation::gradient ? in.F : in.J;
+    STD_TORCH_CHECK(has(state), "the law ", info.name, " needs ", info.field == Deformation::gradient ? "F" : "J");
+    kernels_of<T, D>(*calls[k].law);
+    LawUpdateArguments<T, D> a;
+    a.law = arguments<T, D>(info, *state, {}, calls[k].parameters, calls[k].history, in.scene, calls[k].options);
+    if (has(in.material))
+      a.law.members = {static_cast<const int*>(in.material->data_ptr()), in.material->stride(0), int(k)};
+    a.stress = field<T>(stress);
+    laws.push_back(a);
+    plastic |= info.plastic;
+    columns = calls[k].first_column + history_size(info, calls[k].history, D);
+  }
+  p2g.mass = input<T>(in.mass, "mass", x, {P});
+  p2g.volume = input<T>(in.volume, "volume", x, {P});
+  p2g.stress = field<const T>(stress);
+  p2g.dt = update.dt = advance.dt = in.dt;
+  p2g.form = advance.form = stress_form_of(in.stress_form);
+  p2g.deterministic = in.lattice.deterministic();
+  update.geometry = activation.geometry;
+  update.block_count = activation.scenes * activation.geometry.blocks_per_scene;
+  update.walls = walls<T, D>(in.wall_kind, in.wall_plane, in.wall_friction, in.lattice);
+  if (has(in.gravity)) {
+    check_shape(*in.gravity, "gravity", {in.scenes, D});
+    check_like(*in.gravity, "gravity", x);
+    STD_TORCH_CHECK(in.gravity->is_contiguous(), "gravity must be contiguous");
+    update.gravity = static_cast<const T*>(in.gravity->data_ptr());
+  }
+  obstacles = has(in.obstacle_table);
+  STD_TORCH_CHECK(!obstacles || has(in.obstacle_data), "obstacles need data");
+  if (obstacles)
+    contact = obstacle_arguments<T, D>(x, in.lattice, *in.obstacle_table, in.obstacle_data.value(), in.shape, in.sizes,
+                                       in.contact_kind, in.obstacle_scene, in.start, in.end, {}, in.time);
+  advance.gather.moment_scale = in.lattice.inverse_inertia();
+  advance.gather.lost = NAN;
+}
+
+// For the arguments' number of blocks.
+template <class T, int D>
+void Substeps<T, D>::make_pool(backend::Stream stream) {
+  pool.make(in.x, activation, obstacles, stream);
+  const Topology<T, D> topology = topology_of(activation);
+  p2g.topology = advance.gather.topology = topology;
+  p2g.nodes = {static_cast<T*>(pool.nodes.data_ptr()), 1 + D, 1 + D};
+  update.max_blocks = contact.max_blocks = topology.max_blocks;
+  update.block = contact.block = topology.block;
+  update.table = topology.table;
+  update.nodes = static_cast<const NodeRow<T, D>*>(pool.nodes.data_ptr());
+  update.updated = static_cast<NodeRow<T, D>*>(pool.updated.data_ptr());
+  contact.velocity = static_cast<const T*>(pool.updated.data_ptr()) + 1;
+  contact.stride = 1 + D;
+  if (obstacles) contact.result = static_cast<T*>(pool.velocity.data_ptr());
+  const Tensor& velocity = obstacles ? pool.velocity : pool.updated;
+  advance.gather.nodes = {static_cast<const T*>(velocity.data_ptr()) + 1, 1 + D, D};
+}
+
+}  // namespace mpm
