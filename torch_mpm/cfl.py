@@ -32,14 +32,17 @@ fifth) this is no limit. It is a bound where neighbours are alike, and was measu
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
+from .boundaries import Obstacle
 from .errors import check_number
 from .grid import Grid, check_grid
 from .laws.custom import as_law
 from .laws.material import Material
+from .ops.survey import Survey, survey
 from .state import State, check_state
 
 GRADIENT_BOUND = {
@@ -50,9 +53,6 @@ GRADIENT_BOUND = {
     ("gradient", "quadratic"): 6.0,
     ("gradient", "cubic"): 3.137,
 }
-
-LARGEST_CHANGE = 0.5
-"""Of a stretch or of the volume of a particle in one step."""
 
 
 @torch.no_grad()
@@ -93,42 +93,34 @@ def stable_dt(
     check_number("cfl", cfl, "positive and finite", lambda v: 0 < v < math.inf)
     if stress_form not in ("mls", "gradient"):
         raise ValueError(f"stress_form must be 'gradient' or 'mls', got {stress_form!r}")
-    kept = 2.0 if transfer == "apic" and stress_form == "mls" else 1.0  # 1 + s
+    figures = look(grid, law, state, transfer, stress_form, speed)
+    return (cfl / figures.rate).to(state.x.dtype)
+
+
+@torch.no_grad()
+def look(
+    grid: Grid,
+    law: Material,
+    state: State,
+    transfer: str,
+    stress_form: str,
+    speed: Tensor | None = None,
+    obstacles: Sequence[Obstacle] = (),
+    judge: bool = False,
+) -> Survey:
+    """`survey` with what the law says of a state that has all fields; `judge` asks for its energy too."""
     bound = GRADIENT_BOUND[stress_form, grid.kernel] / grid.dx**2
-    fastest_near = state.v.norm(dim=1) if speed is None else torch.maximum(state.v.norm(dim=1), speed)
-    oscillation = _oscillation_rate(law, state, bound, kept) + fastest_near / grid.dx
-    deformation = _deformation_rate(law, state, bound, fastest_near)
-    rate = torch.maximum(_known(oscillation), _known(deformation))
-    if state.scene is None:
-        fastest = rate.amax().reshape(1) if len(rate) else rate.new_zeros(1)
-    else:
-        scene = state.scene.clamp(0, grid.scenes - 1).long()
-        fastest = rate.new_zeros(grid.scenes).scatter_reduce(0, scene, rate, "amax")
-    return cfl / fastest
-
-
-def _oscillation_rate(law: Material, state: State, bound: float, kept: float) -> Tensor:
-    """1/dt [P] of the linear limit: the positive root of kept/dt² − λ_v/dt − λ_e/2."""
-    inverse_inertia = bound * state.volume / state.mass
-    elastic = law.stiffness(state) * inverse_inertia
-    viscosity = law.viscosity(state)
-    if viscosity is None:
-        return (elastic / (2 * kept)).sqrt()
-    viscous = 2 * viscosity * inverse_inertia
-    return (viscous + (viscous.square() + 2 * kept * elastic).sqrt()) / (2 * kept)
-
-
-def _deformation_rate(law: Material, state: State, bound: float, speed: Tensor) -> Tensor:
-    """1/dt [P] of the largest change c: the positive root of c/dt² − g/dt − h."""
-    gradient = math.sqrt(bound) * speed
-    if state.C is not None:
-        gradient = torch.hypot(gradient, state.C.norm(dim=(1, 2)))
-    growth = bound * law.stress(state).norm(dim=(1, 2)) * state.volume / state.mass
-    if "J" in law.state_fields:
-        gradient, growth = (math.sqrt(state.x.shape[1]) * value for value in (gradient, growth))
-    return (gradient + torch.hypot(gradient, 2 * (LARGEST_CHANGE * growth).sqrt())) / (2 * LARGEST_CHANGE)
-
-
-def _known(rate: Tensor) -> Tensor:
-    """A rate that is not known limits nothing."""
-    return rate.nan_to_num(nan=0.0, posinf=torch.inf)
+    return survey(
+        grid,
+        state,
+        law.stress(state),
+        law.stiffness(state),
+        bound,
+        kept=2.0 if transfer == "apic" and stress_form == "mls" else 1.0,  # 1 + s
+        volumetric="J" in law.state_fields,
+        viscosity=law.viscosity(state),
+        energy=law.energy_density(state) if judge else None,
+        speed=speed,
+        obstacles=obstacles,
+        reach=2 * math.sqrt(grid.dim) * grid.dx,  # of a particle's nodes
+    )

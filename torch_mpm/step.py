@@ -12,15 +12,16 @@ from torch import Tensor
 from .activation_record import ActivationRecord
 from .boundaries import BoundaryList, Obstacle, Walls, call_boundary
 from .capture import GraphCache
-from .cfl import stable_dt
+from .cfl import look
 from .errors import check_number, check_vector, shape_of
 from .failures import Failures, problems_of_state, raise_failures
 from .grid import Blocks, Grid, check_grid
 from .heat.heat import Heat
 from .laws.custom import as_law
 from .laws.material import Material
-from .ops import contact, fusible, g2p, g2p_advance, gather, grid_update, p2g
+from .ops import Survey, contact, fusible, g2p, g2p_advance, gather, grid_update, p2g
 from .ops.arguments import check_choice
+from .ops.contact import MAX_OBSTACLES
 from .ops.transfer import STRESS_FORMS
 from .parameters import Overlay, TensorModule
 from .pause import paused
@@ -225,22 +226,32 @@ class Step(TensorModule):
 
         Moving obstacles count; what `on_grid` and other boundaries do to the velocities is not known.
         """
-        transfer = "flip" if self._flip_share else self.transfer
-        return stable_dt(
-            self.grid, self.law, self.prepare(state), cfl, transfer, self.stress_form, self._obstacle_speed(state)
-        )
+        check_number("cfl", cfl, "positive and finite", lambda v: 0 < v < math.inf)
+        return (cfl / self.survey(state, judge=False).rate).to(state.x.dtype)
 
     @torch.no_grad()
-    def _obstacle_speed(self, state: State) -> Tensor | None:
-        """Largest speed of the obstacles that a particle may touch [P] [m/s]; None where none moves."""
+    def survey(self, state: State, judge: bool = True) -> Survey:
+        """Limit of the time step, speed and validity of each scene, without synchronising.
+
+        Args:
+            state: the particles.
+            judge: whether the energy of the law is asked for too, which tells where the law has no meaning.
+        """
+        moving = [b for b in self.boundaries.entries if isinstance(b, Obstacle) and b.moves]
+        fused = [b for b in moving if fusible(b, state.time)][:MAX_OBSTACLES]
+        others = [b for b in moving if not any(b is kept for kept in fused)]
+        return look(
+            *(self.grid, self.law, self.prepare(state), "flip" if self._flip_share else self.transfer),
+            *(self.stress_form, self._obstacle_speed(others, state), fused, judge),
+        )
+
+    def _obstacle_speed(self, obstacles: list[Obstacle], state: State) -> Tensor | None:
+        """Largest speed of the obstacles that a particle may touch [P] [m/s]; None where there are none."""
+        if not obstacles:
+            return None
         scene = None if state.scene is None else state.scene.clamp(0, self.grid.scenes - 1)
         reach = 2 * math.sqrt(self.grid.dim) * self.grid.dx  # of a particle's nodes
-        speeds = [
-            boundary.speed(state.x, scene, state.time, reach)
-            for boundary in self.boundaries
-            if isinstance(boundary, Obstacle) and boundary.moves
-        ]
-        return torch.stack(speeds).amax(0) if speeds else None
+        return torch.stack([o.speed(state.x, scene, state.time, reach) for o in obstacles]).amax(0)
 
     @property
     def status(self) -> Tensor | None:

@@ -160,7 +160,11 @@ class _Calls:
         counts = [len(LAWS[name].parameters) for name in laws[0].split(",")]
         how = ([ones] * sum(counts), [0, 1, 0], 3, 1e-3, True, True, 0, self.normal(2, D), *self.walls)
         end = (*self.obstacles, 0.1, 2, 40, True, *self.lattice.packed)
-        return [("substeps", (*fields, 0.5 + self.uniform(P), [self.uniform(P)], *who, *laws, *how, *end))]
+        look = (*fields[:5], self.F, *self.uniform(4, P), self.scene, 50.0, 2.0, True, 0.1, self.lattice.upper, 2)
+        return [
+            ("substeps", (*fields, 0.5 + self.uniform(P), [self.uniform(P)], *who, *laws, *how, *end)),
+            ("survey", (*look, *self.obstacles, self.uniform(2), 0.1, *self.lattice.packed)),
+        ]
 
     def sand(self) -> list[tuple[str, tuple[Any, ...]]]:
         moduli = (0.5 + self.uniform(2), 0.5 + self.uniform(PARTICLES))

@@ -77,17 +77,22 @@ Tensor empty(const Tensor& like, const Shape& shape, ScalarType type) {
 
 Tensor empty(const Tensor& like, const Shape& shape) { return empty(like, shape, like.scalar_type()); }
 
-Tensor zeros(const Tensor& like, const Shape& shape) {
-  Tensor t = empty(like, shape);
+void clear(Tensor& t) {
 #if MPM_BACKEND == MPM_BACKEND_IS_cpu
   constexpr int64_t few = 1 << 18;  // bytes that one thread clears sooner than the dispatcher is asked
   const int64_t bytes = t.numel() * int64_t(t.element_size());
   if (bytes <= few) {
     if (bytes > 0) std::memset(t.data_ptr(), 0, size_t(bytes));
-    return t;
+    return;
   }
 #endif
-  return torch::stable::zero_(t);
+  torch::stable::zero_(t);
+}
+
+Tensor zeros(const Tensor& like, const Shape& shape) {
+  Tensor t = empty(like, shape);
+  clear(t);
+  return t;
 }
 
 Tensor empty_particles(const Tensor& like, const Shape& shape) {

@@ -17,6 +17,7 @@ namespace cpu {
 struct Stream {
   operator void*() const { return nullptr; }
 };
+inline void clear(Tensor& t, Stream) { mpm::clear(t); }
 }  // namespace cpu
 namespace backend = cpu;
 // Nothing to guard on the CPU; gives the kernels' stream argument.
@@ -49,6 +50,12 @@ struct DeviceScope {
   torch::stable::accelerator::DeviceGuard guard;
   cudaStream_t stream_ = nullptr;
 };
+namespace cuda {
+inline void clear(Tensor& t, Stream stream) {
+  const size_t bytes = size_t(t.numel()) * size_t(t.element_size());
+  STD_TORCH_CHECK(cudaMemsetAsync(t.data_ptr(), 0, bytes, stream) == cudaSuccess, "memory could not be cleared");
+}
+}  // namespace cuda
 }  // namespace mpm
 #endif
 

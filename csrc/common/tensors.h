@@ -137,6 +137,9 @@ Tensor empty(const Tensor& like, const Shape& shape);
 inline Tensor empty_int(const Tensor& like, const Shape& shape) { return empty(like, shape, ScalarType::Int); }
 Tensor zeros(const Tensor& like, const Shape& shape);
 
+// Sets a contiguous tensor to zero, on torch's current stream.
+void clear(Tensor& t);
+
 // Elements from row to row of a structure of arrays. On the CPU, rows of whole pages (P a power of two) would share
 // cache sets, and a load would wait for stores to other rows whose addresses end alike: 23 cache lines more than pages
 // spread the nine rows of a matrix evenly over a page of 64.

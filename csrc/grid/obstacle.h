@@ -51,7 +51,10 @@ struct ContactArguments {
   const T* data = nullptr;
   const T* scene_time = nullptr;  // [times], one for all scenes or one per scene; or null
   int times = 0;
-  double time = 0;              // where scene_time is null
+  double time = 0;                   // where scene_time is null: of the first substep of a call
+  const int* activations = nullptr;  // counted on the device, with this substep's and before the first's (or null)
+  const int* activations_before = nullptr;
+  double dt = 0;                // of the substeps counted
   const T* velocity = nullptr;  // node i at velocity + i * stride
   const T* grad = nullptr;      // likewise; backward only
   int64_t stride = 0, grad_stride = 0;
@@ -104,10 +107,18 @@ struct ObstaclePose {
   Matrix<S, D> rotation;  // world = centre + rotation body
 };
 
+// Many substeps of one call cannot tell a kernel that a graph replays what time it is: it counts activations.
+template <class T, int D>
+MPM_HD double contact_time(const ContactArguments<T, D>& a, int scene) {
+  if (a.scene_time) return double(a.scene_time[a.times == 1 ? 0 : scene]);
+  if (!a.activations) return a.time;
+  return a.time + a.dt * (*a.activations - 1 - (a.activations_before ? *a.activations_before : 0));
+}
+
 template <class S, class T, int D>
 MPM_HD ObstaclePose<S, D> obstacle_pose(const ContactArguments<T, D>& a, const ObstacleKind& kind,
                                         const ObstacleRow<S, D>& row, int scene) {
-  const double time = a.scene_time ? double(a.scene_time[a.times == 1 ? 0 : scene]) : a.time;
+  const double time = contact_time(a, scene);
   ObstaclePose<S, D> p;
   p.acts = (kind.scene < 0 || kind.scene == scene) && time >= kind.start && time < kind.end;
   if (!p.acts) return p;

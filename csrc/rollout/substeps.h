@@ -224,6 +224,7 @@ struct Substeps {
   bool activate(const int* previous_status, int* status, backend::Stream stream) {
     activation.previous_status = previous_status;
     activation.status = status;
+    if (MPM_BACKEND != MPM_BACKEND_IS_cpu) contact.activations = status + kActivations;
     backend::activate(in.lattice.order(), activation, stream);
     if (MPM_BACKEND != MPM_BACKEND_IS_cpu || status[kBlocksNow] <= activation.max_blocks) return true;
     if (!in.grows) return false;
@@ -234,13 +235,21 @@ struct Substeps {
     return true;
   }
 
+  // The time of obstacles: counted on the device, where the host may not be there at each substep.
+  void count_time(const int* status_before) {
+    if (MPM_BACKEND == MPM_BACKEND_IS_cpu) return;
+    contact.dt = in.dt;
+    if (status_before) contact.activations_before = status_before + kActivations;
+  }
+
   void move(backend::Stream stream) {
     const int64_t order = in.lattice.order();
     for (size_t k = 0; k < laws.size(); k++) calls[k].law->kernels<T, D>().update(laws[k], stream);
-    torch::stable::zero_(pool.nodes);
+    backend::clear(pool.nodes, stream);
     backend::p2g(order, p2g, stream);
     backend::grid_update(update, stream);
     if (obstacles) backend::contact(contact, stream);
+    if (MPM_BACKEND == MPM_BACKEND_IS_cpu) contact.time += in.dt;
     backend::g2p_advance(order, advance, stream);
   }
 

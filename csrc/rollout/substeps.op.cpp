@@ -1,4 +1,5 @@
 #include "rollout/substeps.h"
+#include "rollout/replay.h"
 
 // n steps of a simulation in one call.
 namespace mpm {
@@ -43,19 +44,24 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> substeps(MPM_
       from.F = field<const T>(F_[1]);
     }
     s.make_pool(stream);
-    for (; step < n; step++) {
-      const int into = int(step % 2);
+    s.count_time(before);
+    // A substep that reads and writes these buffers in turn, into the first or the second.
+    const auto take = [&](int into, backend::Stream on) {
       int* const now = static_cast<int*>(status[into].data_ptr());
       s.read(from, field<T>(F_[1 - into]));
       s.write(
           {field<T>(x_[into]), field<T>(v_), field<T>(C_), field<T>(F_[into]), field<T>(J_[into]), field<T>(history_)});
-      if (!s.activate(before, now, stream)) break;  // and the status tells
-      s.move(stream);
-      s.contact.time += dt;
+      if (!s.activate(before, now, on)) return false;  // and the status tells
+      s.move(on);
       before = now;
       // From here on the call reads what it has written.
       from = {field<const T>(x_[into]), field<const T>(v_),       field<const T>(C_),
               field<const T>(F_[into]), field<const T>(J_[into]), field<const T>(history_)};
+      return true;
+    };
+    while (step < n && take(int(step % 2), stream)) {
+      if (++step == 2)
+        step += 2 * replay((n - step) / 2, stream, [&](backend::Stream on) { take(0, on), take(1, on); });
     }
   });
   if (step == 0) {  // the first activation found no room

@@ -156,7 +156,7 @@ LAW_OPS = (
     *("quartic_energy", "quartic_stress", "quartic_return_map"),
 )
 NO_GRADIENT = {
-    "substeps",
+    *("substeps", "survey"),
     *("law_stiffness", "law_wave_modulus", "law_update_double_backward", "law_energy_double_backward"),
     *("heat_stencil", "heat_patches"),
 }

@@ -310,7 +310,7 @@ def test_an_unstable_run_says_that_dt_was_above_the_limit(tmp_path, monkeypatch)
     scene = Scene(**disc(device="cpu"))
     built = scene.build()
     simulation = module.Simulation(scene, built)
-    monkeypatch.setattr(simulation, "_choose_dt", lambda span: (0.05, 32))
+    monkeypatch.setattr(simulation, "_choose_dt", lambda span, rates: (0.05, 32))
     moving = built.state.x - 0.5
     simulation.state = built.state.replace(v=moving * 10)
     with pytest.raises(

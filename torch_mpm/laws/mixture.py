@@ -65,6 +65,9 @@ class Mixture(Material):
                 changes[name] = changes[name].index_copy(0, part.index, value)
         return changes, stress
 
+    def stress(self, state: State) -> Tensor:
+        return self._collect(state, lambda law, part: law.stress(part), (state.x.shape[1],) * 2)
+
     def initial(self, name: str, state: State) -> Tensor:
         return next(law.initial(name, state) for law in self.laws if name in law.extra_fields)  # type: ignore[operator]
 
@@ -90,10 +93,20 @@ class Mixture(Material):
 
         return self._collect(state, viscosity)
 
-    def _collect(self, state: State, function: Callable[[Any, Any], Tensor]) -> Tensor:
-        result = torch.zeros_like(state.mass)
-        for part, law in self._parts(state):
-            result = result.index_copy(0, part.index, function(law, part))
+    def _collect(self, state: State, function: Callable[[Any, Any], Tensor], shape: tuple[int, ...] = ()) -> Tensor:
+        """What a function says of each law and its particles, [P, *shape]."""
+        material = self.check_material(state)
+        # On a GPU each law looks at all particles: that takes less time than to ask which are its own. Not where there
+        # may be gradients: what a law says of others may be NaN.
+        whole = state.x.is_cuda and not torch.is_grad_enabled()
+        parts = [(state, law) for law in self.laws] if whole else self._parts(state)
+        result = state.x.new_zeros(len(state.x), *shape)
+        for k, (part, law) in enumerate(parts):
+            value = function(law, part)
+            if whole:
+                result = torch.where((material == k).reshape(-1, *(1,) * len(shape)), value, result)
+            else:
+                result = result.index_copy(0, part.index, value)
         return result
 
     def check_material(self, state: State) -> Tensor:

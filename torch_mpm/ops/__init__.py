@@ -16,6 +16,7 @@ from .heat import HeatSolve, heat_cg, heat_operator
 from .law import LawUpdate, law_energy, law_stiffness, law_update, law_wave_modulus
 from .registry import LAWS
 from .sand import quartic_energy, quartic_return_map, quartic_stiffness, quartic_stress
+from .survey import Survey, survey
 from .svd import polar, svd3
 from .transfer import g2p, gather, p2g, scatter
 
@@ -23,6 +24,7 @@ __all__ = [
     "LAWS",
     "HeatSolve",
     "LawUpdate",
+    "Survey",
     "advance",
     "contact",
     "fusible",
@@ -43,5 +45,6 @@ __all__ = [
     "quartic_stiffness",
     "quartic_stress",
     "scatter",
+    "survey",
     "svd3",
 ]

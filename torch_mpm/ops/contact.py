@@ -92,14 +92,8 @@ def contact(blocks: Blocks, velocity: Tensor, obstacles: Sequence[Obstacle], tim
         if not isinstance(obstacle, Obstacle) or type(obstacle.shape) not in KERNEL_SHAPES:
             expected = ", ".join(shape.name for shape in KERNEL_SHAPES)
             raise TypeError(f"obstacles[{k}] must be an obstacle of one of {expected}, got {type(obstacle).__name__}")
-    scene_time, number = None, 0.0
-    if isinstance(time, Tensor):
-        if time.dim() > 1 or time.numel() not in (1, grid.scenes):
-            raise ValueError(f"time must be a number or have shape [] or [B] = [{grid.scenes}], got {shape_of(time)}")
-        scene_time = time.detach().reshape(-1).to(velocity.dtype).contiguous()
-        check_like("time", scene_time, velocity, tuple(scene_time.shape), "")
-    else:
-        number = float(check_real("time", time, NUMBER_OR_TENSOR))
+    scene_time, number = time_arguments(time, velocity, grid.scenes)
+    if scene_time is None:
         obstacles = [o for o in obstacles if o.start <= number < o.end]
     for first in range(0, len(obstacles), MAX_OBSTACLES):
         group = obstacles[first : first + MAX_OBSTACLES]
@@ -127,6 +121,17 @@ def obstacle_arguments(group: Sequence[Obstacle], like: Tensor, scenes: int) -> 
         [o.start for o in group],
         [o.end for o in group],
     )
+
+
+def time_arguments(time: float | Tensor, like: Tensor, scenes: int) -> tuple[Tensor | None, float]:
+    """A time [s] as the ops take it: a tensor [1 or B], or a number."""
+    if not isinstance(time, Tensor):
+        return None, float(check_real("time", time, NUMBER_OR_TENSOR))
+    if time.dim() > 1 or time.numel() not in (1, scenes):
+        raise ValueError(f"time must be a number or have shape [] or [B] = [{scenes}], got {shape_of(time)}")
+    scene_time = time.detach().reshape(-1).to(like.dtype).contiguous()
+    check_like("time", scene_time, like, tuple(scene_time.shape), "")
+    return scene_time, 0.0
 
 
 def _packed(velocity: Tensor) -> Tensor:

@@ -34,6 +34,8 @@ from .writer import FrameWriter
 
 SEGMENT = 32
 """Substeps between two looks at the stability limit and the validity of the state, and between two reorderings."""
+BLOCKS_WANTED, PROBLEM = 0, 6
+"""Columns of the status: blocks that were wanted at most; step of the first problem, -1 for none."""
 FIELD_SHAPES = {"F": 2, "C": 2, "stress": 2, "J": 0, "temperature": 0, "liquid": 0}
 
 Progress = Callable[[dict[str, Any]], None]
@@ -118,6 +120,7 @@ class Simulation:
         self.emitted = 0
         self.fingerprint = ""
         self._figures: dict[str, Any] = {}
+        self._survey: list[list[float]] | None = None  # of the present state
 
     # -- output
 
@@ -279,29 +282,33 @@ class Simulation:
         rounding = 1e-9 * (end - begin)
         while now < end - rounding:
             self._emit(now + rounding)
+            rates, speeds, _ = self._survey or self._look()
             following = self.emissions[self.emitted][0] if self.emitted < len(self.emissions) else math.inf
             target = min(end, following) if following > now + rounding else end
             self.state = self.state.replace(time=now).sorted(self.step.grid)
-            dt, count = self._choose_dt(target - now)
+            dt, count = self._choose_dt(target - now, rates)
             steps = min(count, SEGMENT)
-            largest = max(largest, self._speed() * dt / self.step.grid.dx)
-            self._segment(dt, steps)
+            largest = max(largest, max(speeds, default=0.0) * dt / self.step.grid.dx)
+            now = target if steps == count else now + steps * dt
+            self._segment(dt, steps, now)
             if self.state.x.is_cpu:
                 heap.trim()
-            now = target if steps == count else now + steps * dt
             self.totals.substeps += steps
             self.totals.smallest_dt = min(self.totals.smallest_dt, dt)
-        self.state = self.state.replace(time=end)
+        self.state = self.state.replace(time=end)  # which `now` is but for rounding
         self.totals.largest_cfl = max(self.totals.largest_cfl, largest)
         return largest
 
-    def _choose_dt(self, span: float) -> tuple[float, int]:
-        """Time step and number of steps that fill ``span``."""
-        limits = self.step.stable_dt(self.state, 1.0)
-        worst = int(limits.argmin()) if len(limits) else 0
-        limit = float(limits[worst]) if len(limits) else math.inf
+    def _look(self) -> list[list[float]]:
+        """Rates, speeds and wrong particles of the scenes of the present state."""
+        return torch.stack(self.step.survey(self.state)).tolist()
+
+    def _choose_dt(self, span: float, rates: list[float]) -> tuple[float, int]:
+        """Time step and number of steps that fill ``span``, for the limits of the scenes [1/s]."""
+        rate = max(rates, default=0.0)
+        limit = 1 / rate if rate > 0 else math.inf
         if self.scene.dt is not None and self.scene.dt > limit:
-            scene = self.built.scenes[worst]
+            scene = self.built.scenes[rates.index(rate)]
             raise SceneFailure(
                 f"{scene + ', ' if scene else ''}step {self.totals.substeps}: dt = {self.scene.dt:g} s is above the "
                 f"stability limit {limit:.3g} s; use dt = {0.5 * limit:.2g}, or leave dt out and set cfl = 0.5."
@@ -310,13 +317,15 @@ class Simulation:
         count = max(1, math.ceil(span / wanted * (1 - 1e-9))) if math.isfinite(wanted) else 1
         return span / count, count
 
-    def _segment(self, dt: float, steps: int) -> None:
+    def _segment(self, dt: float, steps: int, until: float) -> None:
         """Take some substeps, then check the state; a failure is located by repeating them."""
         good = self.state
         try:
-            self._roll(dt, steps)
-            self.step.check()
-            bad = wrong(self.step, self.state)
+            if self._roll(dt, steps) or self.step.heat is not None:
+                self.step.check()
+            self.state = self.state.replace(time=until)
+            self._survey = self._look()
+            bad = wrong(self.step, self.state) if any(self._survey[2]) else None
             if bad is None:
                 return
             message = bad[1]
@@ -328,15 +337,21 @@ class Simulation:
             self.state = failure.good
         raise SceneFailure(str(failure or message), failure)
 
-    def _roll(self, dt: float, steps: int) -> None:
-        """Take some substeps; again where the pool of blocks, which follows from a distance on CUDA, was too small."""
+    def _roll(self, dt: float, steps: int) -> bool:
+        """Take some substeps; again where the pool of blocks, which follows from a distance on CUDA, was too small.
+
+        Returns:
+            Whether the status tells of a problem.
+        """
         good, grid = self.state, self.step.grid
         self.state = rollout(self.step, good, steps, dt)
-        wanted = 0 if self.step.status is None else int(self.step.status[0, 0])
-        if grid.grows and grid.max_blocks is not None and wanted > grid.max_blocks:
-            grid.follow(wanted)
+        status = [] if self.step.status is None else self.step.status.tolist()
+        if status and grid.grows and grid.max_blocks is not None and status[0][BLOCKS_WANTED] > grid.max_blocks:
+            grid.follow(status[0][BLOCKS_WANTED])
             self.step.reset()
             self.state = rollout(self.step, good, steps, dt)
+            status = self.step.status.tolist()
+        return any(row[PROBLEM] >= 0 for row in status)
 
     def _emit(self, until: float) -> None:
         """Add the layers that are due."""
@@ -345,9 +360,7 @@ class Simulation:
             ids = torch.arange(len(self.state), len(self.state) + len(layer), device=layer.x.device)
             self.state = joined(self.state, layer.replace(ids=ids))
             self.emitted += 1
-
-    def _speed(self) -> float:
-        return float(self.state.v.norm(dim=1).max()) if len(self.state) else 0.0
+            self._survey = None
 
     # -- the end
 
