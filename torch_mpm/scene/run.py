@@ -345,13 +345,17 @@ class Simulation:
         """
         good, grid = self.state, self.step.grid
         self.state = rollout(self.step, good, steps, dt)
-        status = [] if self.step.status is None else self.step.status.tolist()
+        status = self._status()
         if status and grid.grows and grid.max_blocks is not None and status[0][BLOCKS_WANTED] > grid.max_blocks:
             grid.follow(status[0][BLOCKS_WANTED])
             self.step.reset()
             self.state = rollout(self.step, good, steps, dt)
-            status = self.step.status.tolist()
+            status = self._status()
         return any(row[PROBLEM] >= 0 for row in status)
+
+    def _status(self) -> list[list[int]]:
+        """The status of the steps so far; synchronises."""
+        return [] if self.step.status is None else self.step.status.tolist()
 
     def _emit(self, until: float) -> None:
         """Add the layers that are due."""
