@@ -15,30 +15,60 @@ int64_t replay(int64_t, cpu::Stream, const Work&) {
 
 #else
 
-// Recorded by a stream of its own, since torch's default stream records nothing.
-class Recording {
+// The latest graph of a thread. The next one is mostly the same but for its pointers, and to change these takes a third
+// of the time of a new one. Its stream is its own, since torch's default stream records nothing.
+class Recorder {
  public:
+  static Recorder& of_this_thread() {
+    static thread_local Recorder recorder;  // has no end: CUDA may be gone by then
+    return recorder;
+  }
+
   template <class Work>
-  explicit Recording(const Work& work) {
-    check(cudaStreamCreateWithFlags(&stream_, cudaStreamNonBlocking));
+  void record(const Work& work) {
+    use_device();
     // Relaxed: what other threads do meanwhile is not in the recording, and may not fail for it.
     check(cudaStreamBeginCapture(stream_, cudaStreamCaptureModeRelaxed));
-    work(stream_);
-    check(cudaStreamEndCapture(stream_, &graph_));
-    check(cudaGraphInstantiate(&executable_, graph_, 0));
+    cudaGraph_t graph = nullptr;
+    try {
+      work(stream_);
+    } catch (...) {
+      cudaStreamEndCapture(stream_, &graph);
+      if (graph) cudaGraphDestroy(graph);
+      throw;
+    }
+    check(cudaStreamEndCapture(stream_, &graph));
+    cudaGraphExecUpdateResultInfo info;
+    if (executable_ && cudaGraphExecUpdate(executable_, graph, &info) != cudaSuccess) {
+      cudaGetLastError();  // of another shape, which is no error
+      forget();
+    }
+    if (!executable_) check(cudaGraphInstantiate(&executable_, graph, 0));
+    check(cudaGraphDestroy(graph));
   }
-  Recording(const Recording&) = delete;
-  ~Recording() {  // what still runs is freed when it has ended
-    if (executable_) cudaGraphExecDestroy(executable_);
-    if (graph_) cudaGraphDestroy(graph_);
-    if (stream_) cudaStreamDestroy(stream_);
-  }
+
   void launch(cudaStream_t stream) const { check(cudaGraphLaunch(executable_, stream)); }
 
  private:
   static void check(cudaError_t error) { STD_TORCH_CHECK(error == cudaSuccess, "CUDA: ", cudaGetErrorString(error)); }
+
+  void use_device() {
+    int device = 0;
+    check(cudaGetDevice(&device));
+    if (stream_ && device == device_) return;
+    forget();
+    if (stream_) check(cudaStreamDestroy(stream_));
+    check(cudaStreamCreateWithFlags(&stream_, cudaStreamNonBlocking));
+    device_ = device;
+  }
+
+  void forget() {  // what still runs is freed when it has ended
+    if (executable_) cudaGraphExecDestroy(executable_);
+    executable_ = nullptr;
+  }
+
+  int device_ = -1;
   cudaStream_t stream_ = nullptr;
-  cudaGraph_t graph_ = nullptr;
   cudaGraphExec_t executable_ = nullptr;
 };
 
@@ -52,8 +82,9 @@ int64_t replay(int64_t times, cudaStream_t stream, const Work& work) {
   if (times < kLeastReplays || cudaStreamIsCapturing(stream, &status) != cudaSuccess ||
       status != cudaStreamCaptureStatusNone)
     return 0;
-  const Recording recording(work);
-  for (int64_t k = 0; k < times; k++) recording.launch(stream);
+  Recorder& recorder = Recorder::of_this_thread();
+  recorder.record(work);
+  for (int64_t k = 0; k < times; k++) recorder.launch(stream);
   return times;
 }
 

@@ -282,10 +282,12 @@ class Simulation:
         rounding = 1e-9 * (end - begin)
         while now < end - rounding:
             self._emit(now + rounding)
-            rates, speeds, _ = self._survey or self._look()
+            if self._survey is None:
+                self.state = self.state.replace(time=now).sorted(self.step.grid)
+                self._survey = self._look().tolist()
+            rates, speeds, _ = self._survey
             following = self.emissions[self.emitted][0] if self.emitted < len(self.emissions) else math.inf
             target = min(end, following) if following > now + rounding else end
-            self.state = self.state.replace(time=now).sorted(self.step.grid)
             dt, count = self._choose_dt(target - now, rates)
             steps = min(count, SEGMENT)
             largest = max(largest, max(speeds, default=0.0) * dt / self.step.grid.dx)
@@ -299,9 +301,9 @@ class Simulation:
         self.totals.largest_cfl = max(self.totals.largest_cfl, largest)
         return largest
 
-    def _look(self) -> list[list[float]]:
+    def _look(self) -> Tensor:
         """Rates, speeds and wrong particles of the scenes of the present state."""
-        return torch.stack(self.step.survey(self.state)).tolist()
+        return torch.stack(self.step.survey(self.state))
 
     def _choose_dt(self, span: float, rates: list[float]) -> tuple[float, int]:
         """Time step and number of steps that fill ``span``, for the limits of the scenes [1/s]."""
@@ -318,15 +320,15 @@ class Simulation:
         return span / count, count
 
     def _segment(self, dt: float, steps: int, until: float) -> None:
-        """Take some substeps, then check the state; a failure is located by repeating them."""
+        """Take some substeps, then check the state and reorder it; a failure is located by repeating them."""
         good = self.state
         try:
-            if self._roll(dt, steps) or self.step.heat is not None:
+            survey, status, ordered = self._moved(good, dt, steps, until)
+            if any(row[PROBLEM] >= 0 for row in status) or self.step.heat is not None:
                 self.step.check()
-            self.state = self.state.replace(time=until)
-            self._survey = self._look()
-            bad = wrong(self.step, self.state) if any(self._survey[2]) else None
+            bad = wrong(self.step, self.state) if any(survey[2]) else None
             if bad is None:
+                self._survey, self.state = survey, ordered
                 return
             message = bad[1]
         except SimulationError as error:
@@ -337,25 +339,25 @@ class Simulation:
             self.state = failure.good
         raise SceneFailure(str(failure or message), failure)
 
-    def _roll(self, dt: float, steps: int) -> bool:
-        """Take some substeps; again where the pool of blocks, which follows from a distance on CUDA, was too small.
+    def _moved(
+        self, good: State, dt: float, steps: int, until: float
+    ) -> tuple[list[list[float]], list[list[int]], State]:
+        """Take substeps from a state; again where the pool of blocks, which follows on CUDA, was too small.
 
         Returns:
-            Whether the status tells of a problem.
+            The survey of the state then, the status, and the state in a better order. A device has all its work before the first
+            wait for it.
         """
-        good, grid = self.state, self.step.grid
-        self.state = rollout(self.step, good, steps, dt)
-        status = self._status()
+        grid = self.step.grid
+        self.state = rollout(self.step, good, steps, dt).replace(time=until)
+        survey, ordered = self._look(), self.state.sorted(grid)
+        figures = survey.tolist()
+        status = [] if self.step.status is None else self.step.status.tolist()
         if status and grid.grows and grid.max_blocks is not None and status[0][BLOCKS_WANTED] > grid.max_blocks:
             grid.follow(status[0][BLOCKS_WANTED])
             self.step.reset()
-            self.state = rollout(self.step, good, steps, dt)
-            status = self._status()
-        return any(row[PROBLEM] >= 0 for row in status)
-
-    def _status(self) -> list[list[int]]:
-        """The status of the steps so far; synchronises."""
-        return [] if self.step.status is None else self.step.status.tolist()
+            return self._moved(good, dt, steps, until)
+        return figures, status, ordered
 
     def _emit(self, until: float) -> None:
         """Add the layers that are due."""
