@@ -345,8 +345,8 @@ class Simulation:
         """Take substeps from a state; again where the pool of blocks, which follows on CUDA, was too small.
 
         Returns:
-            The survey of the state then, the status, and the state in a better order. A device has all its work before the first
-            wait for it.
+            The survey of the state then, the status, and the state in a better order. A device has all of its work
+            before the first wait for it.
         """
         grid = self.step.grid
         self.state = rollout(self.step, good, steps, dt).replace(time=until)
