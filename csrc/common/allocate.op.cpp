@@ -3,6 +3,7 @@
 #include "common/backend.h"
 
 #if MPM_BACKEND == MPM_BACKEND_IS_cpu
+#include "cpu/parallel.h"
 #include "cpu/pool.h"
 #endif
 
@@ -79,14 +80,16 @@ Tensor empty(const Tensor& like, const Shape& shape) { return empty(like, shape,
 
 void clear(Tensor& t) {
 #if MPM_BACKEND == MPM_BACKEND_IS_cpu
-  constexpr int64_t few = 1 << 18;  // bytes that one thread clears sooner than the dispatcher is asked
-  const int64_t bytes = t.numel() * int64_t(t.element_size());
-  if (bytes <= few) {
-    if (bytes > 0) std::memset(t.data_ptr(), 0, size_t(bytes));
-    return;
-  }
-#endif
+  constexpr int64_t grain = 1 << 18;  // bytes that one thread clears sooner than it calls others
+  cpu::parallel_for(
+      t.numel() * int64_t(t.element_size()), grain,
+      [](void* data, int64_t begin, int64_t end) {
+        std::memset(static_cast<char*>(data) + begin, 0, size_t(end - begin));
+      },
+      t.data_ptr());
+#else
   torch::stable::zero_(t);
+#endif
 }
 
 Tensor zeros(const Tensor& like, const Shape& shape) {

@@ -2,16 +2,137 @@
 
 #include <torch/csrc/stable/ops.h>
 
+#include <atomic>
+#include <chrono>
+#include <exception>
 #include <thread>
+#include <utility>
 
 namespace mpm::cpu {
+namespace {
 
-int thread_count() { return int(torch::stable::get_num_threads()); }
+using Body = void (*)(void* context, int64_t begin, int64_t end);
 
-void parallel_for(int64_t count, int64_t grain, void (*body)(void*, int64_t, int64_t), void* context) {
+void pause() {
+#if defined(__x86_64__)
+  __builtin_ia32_pause();
+#elif defined(__aarch64__)
+  asm volatile("yield");
+#endif
+}
+
+constexpr int kSpins = 2000;  // some ten microseconds, which waking a thread would take too
+
+// Threads that serve the loops of a leader. Nobody waits for a thread that has not begun: where another process has
+// its core, the others do its share. Who has begun is waited for asleep, which leaves a core to it.
+class Team {
+ public:
+  explicit Team(int members) : members_(members), shares_(chunks_, members) {}
+
+  int members() const { return members_; }
+
+  // Of the leader, member 0.
+  void run(int64_t count, int64_t grain, Body body, void* context) {
+    // More chunks than members, so that one that comes late leaves little.
+    const int64_t most = (count + grain - 1) / (grain > 0 ? grain : 1), wanted = 4 * int64_t(members_);
+    body_ = body, context_ = context, count_ = count;
+    chunks_[1] = int(most < wanted ? most : wanted);
+    shares_ = Shares<1>(chunks_, members_);
+    state_.store(kOpen, std::memory_order_release);
+    generation_.fetch_add(1, std::memory_order_release);
+    generation_.notify_all();
+    work(0);
+    state_.fetch_and(~kOpen, std::memory_order_acq_rel);
+    for (int spins = 0; state_.load(std::memory_order_acquire) > 0; spins++) spins < kSpins ? pause() : rest();
+    if (std::exception_ptr error = std::exchange(error_, nullptr)) std::rethrow_exception(error);
+  }
+
+  void serve(int member) {
+    for (unsigned seen = 0;;) {
+      for (int spins = 0; spins < kSpins && generation_.load(std::memory_order_acquire) == seen; spins++) pause();
+      generation_.wait(seen, std::memory_order_acquire);
+      seen = generation_.load(std::memory_order_acquire);
+      if (ended_.load(std::memory_order_acquire)) return;
+      int state = state_.load(std::memory_order_acquire);
+      while (state >= kOpen && !state_.compare_exchange_weak(state, state + 1, std::memory_order_acq_rel)) {
+      }
+      if (state < kOpen) continue;
+      work(member);
+      state_.fetch_sub(1, std::memory_order_release);
+    }
+  }
+
+  void end() {
+    ended_.store(true, std::memory_order_release);
+    generation_.fetch_add(1, std::memory_order_release);
+    generation_.notify_all();
+  }
+
+ private:
+  static constexpr int kOpen = 1 << 20;  // in the state, whose lower bits count those at work beside the leader
+
+  void work(int member) {
+    Shares<1>::Place place;
+    const int64_t chunks = chunks_[1];
+    try {
+      for (int64_t k; (k = shares_.take(member, place)) >= 0;)
+        body_(context_, count_ * k / chunks, count_ * (k + 1) / chunks);
+    } catch (...) {
+      if (!failed_.exchange(true)) error_ = std::current_exception();
+    }
+  }
+
+  const int members_;
+  int chunks_[2] = {0, 0};
+  Body body_ = nullptr;
+  void* context_ = nullptr;
+  int64_t count_ = 0;
+  Shares<1> shares_;
+  std::exception_ptr error_;
+  std::atomic<bool> failed_{false};
+  alignas(64) std::atomic<int> state_{0};
+  alignas(64) std::atomic<unsigned> generation_{0};
+  std::atomic<bool> ended_{false};
+};
+
+thread_local Team* led = nullptr;  // by this thread, while it is in no loop of the team
+
+}  // namespace
+
+int thread_count() { return led ? led->members() : int(torch::stable::get_num_threads()); }
+
+void parallel_for(int64_t count, int64_t grain, Body body, void* context) {
+  if (Team* team = led) {
+    if (count <= grain) return body(context, 0, count);
+    led = nullptr;  // loops inside of this one are not parallel
+    struct Restore {
+      Team* team;
+      ~Restore() { led = team; }
+    } restore{team};
+    return team->run(count, grain, body, context);
+  }
   torch::stable::parallel_for(0, count, grain, [=](int64_t begin, int64_t end) { body(context, begin, end); });
 }
 
-void yield() { std::this_thread::yield(); }
+void with_team(void (*body)(void* context), void* context) {
+  const int members = thread_count();
+  if (led || members == 1) return body(context);
+  Team team(members);
+  std::exception_ptr error;
+  torch::stable::parallel_for(0, members, 1, [&](int64_t member, int64_t) {
+    if (member > 0) return team.serve(int(member));
+    led = &team;
+    try {
+      body(context);
+    } catch (...) {  // which C functions on the way must not see
+      error = std::current_exception();
+    }
+    led = nullptr;
+    team.end();
+  });
+  if (error) std::rethrow_exception(error);
+}
+
+void rest() { std::this_thread::sleep_for(std::chrono::microseconds(20)); }
 
 }  // namespace mpm::cpu

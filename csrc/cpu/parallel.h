@@ -15,8 +15,12 @@ int thread_count();
 // split.
 void parallel_for(int64_t count, int64_t grain, void (*body)(void* context, int64_t begin, int64_t end), void* context);
 
-// Lets another thread run: for waits that may last where cores are shared.
-void yield();
+// Runs `body(context)` with the threads of torch at hand for all of its loops: one team for a call of many loops, whose
+// threads do not wait for each other longer than they must where other processes want the cores too.
+void with_team(void (*body)(void* context), void* context);
+
+// Sleeps some ten microseconds: a wait that lasts leaves its core to whoever is waited for.
+void rest();
 
 inline namespace TORCH_MPM_ISA {
 
@@ -85,7 +89,7 @@ struct PhaseCounter {
   void wait_before(int phase) {
     for (int p = 0; p < phase; p++)
       for (int spins = 0; __atomic_load_n(&finished[p], __ATOMIC_ACQUIRE) < start[p + 1] - start[p]; spins++)
-        if (spins > 1000) yield();
+        if (spins > 4000) rest();
   }
   void finish(int phase) { __atomic_fetch_add(&finished[phase], 1, __ATOMIC_RELEASE); }
 };

@@ -2,10 +2,22 @@
 
 #include "common/backend.h"
 
-// Work that a call repeats, from a CUDA graph: one launch by the host in place of a dozen.
+#if MPM_BACKEND == MPM_BACKEND_IS_cpu
+#include "cpu/parallel.h"
+#endif
+
+// What a call of many substeps saves: threads that come and go with each loop, and launches of kernels by the host.
 namespace mpm {
 
 #if MPM_BACKEND == MPM_BACKEND_IS_cpu
+
+// Runs `work()`, of many parallel loops over `particles`, with one team of threads.
+template <class Work>
+void with_team(int64_t particles, const Work& work) {
+  constexpr int64_t few = 1 << 14;  // of which a thread is faster alone than it calls the others
+  if (particles < few) return work();
+  cpu::with_team([](void* w) { (*static_cast<const Work*>(w))(); }, const_cast<Work*>(&work));
+}
 
 // How often `work` was replayed: never, where calls cost nothing.
 template <class Work>
@@ -14,6 +26,11 @@ int64_t replay(int64_t, cpu::Stream, const Work&) {
 }
 
 #else
+
+template <class Work>
+void with_team(int64_t, const Work& work) {
+  work();
+}
 
 // The latest graph of a thread. The next one is mostly the same but for its pointers, and to change these takes a third
 // of the time of a new one. Its stream is its own, since torch's default stream records nothing.

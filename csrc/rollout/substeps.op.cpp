@@ -59,10 +59,12 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> substeps(MPM_
               field<const T>(F_[into]), field<const T>(J_[into]), field<const T>(history_)};
       return true;
     };
-    while (step < n && take(int(step % 2), stream)) {
-      if (++step == 2)
-        step += 2 * replay((n - step) / 2, stream, [&](backend::Stream on) { take(0, on), take(1, on); });
-    }
+    with_team(P * n, [&] {
+      while (step < n && take(int(step % 2), stream)) {
+        if (++step == 2)
+          step += 2 * replay((n - step) / 2, stream, [&](backend::Stream on) { take(0, on), take(1, on); });
+      }
+    });
   });
   if (step == 0) {  // the first activation found no room
     torch::stable::copy_(x_[0], x);

@@ -62,7 +62,7 @@ Tensor survey(const Tensor& x, const Tensor& v, const Tensor& mass, const Tensor
 STABLE_TORCH_LIBRARY_FRAGMENT(torch_mpm, m) {
   m.def(
       "survey(Tensor x, Tensor v, Tensor mass, Tensor volume, Tensor? C, Tensor stress, Tensor stiffness, "
-      "Tensor? viscosity, Tensor? energy, Tensor? speed, Tensor? particle_scene, float bound, float kept, "
+      "Tensor? viscosity, Tensor? energy, Tensor? speed, Tensor? scene, float bound, float kept, "
       "bool volumetric, float reach, float[] upper, int scenes, Tensor? obstacles, Tensor? data, int[] shape, "
       "int[] sizes, int[] contact, int[] obstacle_scene, float[] start, float[] end, Tensor? scene_time, float "
       "time, " MPM_LATTICE_SCHEMA ") -> Tensor");
