@@ -129,8 +129,9 @@ CHUNK = 64
 """Steps of one op where the pool of blocks follows the scene on CUDA, which it does between two calls."""
 
 
-KEPT_BYTES = 2**26
-"""Of the states of one op that its backward pass may hold, where those of sqrt(n) steps take less."""
+KEPT_BYTES = {"cpu": 2**24, "cuda": 2**28}
+"""What the backward pass of one op may hold of its steps, even where sqrt(n) steps need less: what the caches of a CPU
+hold, and so much that kernels on CUDA hide the time of Python."""
 
 
 def in_chunks(step: Step, state: State, n: int, dt: float, checkpoint: int | None = None) -> State:
@@ -146,7 +147,7 @@ def in_chunks(step: Step, state: State, n: int, dt: float, checkpoint: int | Non
 def _steps_between_kept(state: State, n: int) -> int:
     P, D = state.x.shape
     step_bytes = P * (2 * D + 4 * D * D) * state.x.element_size()
-    return max(math.isqrt(n), KEPT_BYTES // max(step_bytes, 1), 1)
+    return max(math.isqrt(n), KEPT_BYTES[state.x.device.type] // max(step_bytes, 1), 1)
 
 
 _FORWARD = CompiledLaw.forward

@@ -117,8 +117,8 @@ def _backward(ctx: Any, *grads: Any) -> Any:
 
 def _no_second_derivatives(ctx: Any, *grads: Any) -> None:
     raise NotImplementedError(
-        "torch_mpm.rollout has no second derivatives where it takes all steps in one op: differentiate it once, or "
-        "take the steps in a loop, `state = step(state, dt)`, or as rollout(lambda state, dt: step(state, dt), ...)"
+        "steps of torch_mpm.rollout in one op have no second derivatives: differentiate them once, or take them one by "
+        "one, in a loop of `state = step(state, dt)` or by rollout(lambda state, dt: step(state, dt), ...)"
     )
 
 
