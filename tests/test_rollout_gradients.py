@@ -4,8 +4,10 @@ from collections.abc import Callable
 
 import pytest
 import torch
+from combinations import DT as CASE_DT
+from combinations import draw, make
 from helpers import TOLERANCE
-from test_rollouts import LAWS_HERE, assert_equal, blob, box, flying, in_one_op, mixture, one_by_one, tensors
+from test_rollouts import LAWS_HERE, SEEDS, assert_equal, blob, box, flying, in_one_op, mixture, one_by_one, tensors
 from torch import Tensor
 
 import torch_mpm as mpm
@@ -51,7 +53,9 @@ def gradients(run: Rollout, step: mpm.Step, state: mpm.State) -> dict[str, Tenso
     return dict(zip(wanted, torch.autograd.grad(loss(end), list(wanted.values()), allow_unused=True), strict=True))
 
 
-def assert_same(got: dict[str, Tensor | None], expected: dict[str, Tensor | None], tolerance: str = "") -> None:
+def assert_same(
+    got: dict[str, Tensor | None], expected: dict[str, Tensor | None], tolerance: str = "", text: str = ""
+) -> None:
     for name, reference in expected.items():
         value = got[name]
         if reference is None or float(reference.norm()) == 0:
@@ -60,7 +64,7 @@ def assert_same(got: dict[str, Tensor | None], expected: dict[str, Tensor | None
         assert value is not None and bool(value.isfinite().all()), name
         kind = tolerance or ("rollout" if value.is_cuda else "rollout gradient")
         error = float((value - reference).norm() / reference.norm())
-        assert error < TOLERANCE[kind][value.dtype], f"{name}: {error}"
+        assert error < TOLERANCE[kind][value.dtype], f"{name}: {error} {text}"
 
 
 def with_gradients(law: mpm.Material, dtype: torch.dtype = F64) -> mpm.Material:
@@ -84,6 +88,18 @@ def moving(step: mpm.Step, state: mpm.State) -> mpm.State:
 
 def pulled(dim: int, dtype: torch.dtype = F64) -> Tensor:
     return torch.tensor((1.0, -9.8, 0.5)[:dim], dtype=dtype, requires_grad=True)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_random_simulations(seed, device):
+    """Those that go another way too, with the reason why."""
+    case = make(draw(seed), device)
+    case.step.heat = None
+    state = case.step.prepare(case.state)
+    got = gradients(lambda step, state: mpm.rollout(step, state, 3, CASE_DT, 2), case.step, state)
+    reason = case.step.explain(state, CASE_DT)
+    expected = gradients(single(3, CASE_DT), case.step, state)
+    assert_same(got, expected, "rollout" if isinstance(case.step.law, mpm.Mixture) else "", reason)
 
 
 @pytest.mark.parametrize("law", LAWS_HERE)

@@ -209,6 +209,7 @@ struct Substeps {
   Pool<T, D> pool;
   Tensor stress;
   bool obstacles = false;
+  const int* previous_status = nullptr;
 
   explicit Substeps(const SubstepsInputs& inputs);
 
@@ -296,6 +297,8 @@ Substeps<T, D>::Substeps(const SubstepsInputs& inputs) : in(inputs) {
   calls = law_calls(in.laws, in.options, in.parameters, in.history, in.variables, D);
   STD_TORCH_CHECK(has(in.material) || calls.size() == 1, "several laws need material");
   activation = activate_arguments<T, D>(in.lattice, x, in.scene, in.ids, in.scenes, in.max_blocks);
+  if (has(in.previous_status))
+    previous_status = int_pointer(*in.previous_status, "previous_status", x, {1 + in.scenes, kStatusSize});
   stress = empty_particles(x, {P, D, D});
   if (has(in.material)) {
     check_shape(*in.material, "material", {P});
@@ -307,6 +310,7 @@ Substeps<T, D>::Substeps(const SubstepsInputs& inputs) : in(inputs) {
     STD_TORCH_CHECK(in.wants_C || !info.viscous, "the viscous law ", info.name, " needs wants_C");
     const OptionalTensor& state = info.field == Deformation::gradient ? in.F : in.J;
     STD_TORCH_CHECK(has(state), "the law ", info.name, " needs ", info.field == Deformation::gradient ? "F" : "J");
+    check_shape(*state, info.field == Deformation::gradient ? "F" : "J", shape_of_state(info, P, D));
     kernels_of<T, D>(*calls[k].law);
     LawUpdateArguments<T, D> a;
     a.law = arguments<T, D>(info, *state, {}, calls[k].parameters, calls[k].history, in.scene, calls[k].options);

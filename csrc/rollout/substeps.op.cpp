@@ -21,8 +21,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> substeps(MPM_
     Substeps<T, D> s(in);
     F_[1] = result(x, has(F) && (n > 1 || s.plastic), {P, D, D});
     history_ = packed_history(x, history, s.columns);
-    const int* before = nullptr;
-    if (has(previous_status)) before = int_pointer(*previous_status, "previous_status", x, {1 + scenes, kStatusSize});
+    const int* before = s.previous_status;
 
     Particles<const T> from = given_particles<T, D>(in, history_);
     if (s.plastic && has(F)) {  // which laws change where it stands

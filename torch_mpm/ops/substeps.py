@@ -42,8 +42,7 @@ MASS, VOLUME, PARAMETERS, GRAVITY = 1, 2, 4, 8
 
 _SCHEMA = {a.name: str(a.type) for a in torch.ops.torch_mpm.substeps.default._schema.arguments}
 _TENSORS = [name for name, kind in _SCHEMA.items() if kind in ("Tensor", "Optional[Tensor]")]
-_STATE = ("x", "v", "C", "F", "J")
-_ADJOINTS = (*_STATE, "history", "mass", "volume", "parameters", "gravity")
+_ADJOINTS = ("x", "v", "C", "F", "J", "history", "mass", "volume", "parameters", "gravity")
 
 
 # ---- fake kernels: shapes and strides only
@@ -72,10 +71,9 @@ def _backward_fake(grad_x, grad_v, grad_C, grad_F, grad_J, grad_history, needs, 
     x, history = given["x"], given["history"]
     P, D = sizes(x, "x", 2)
     blocks = given["scenes"] * math.prod(given["layout"][2:])
+    shapes = {"x": (P, D), "v": (P, D), "C": (P, D, D), "F": (P, D, D), "J": (P,)}
     return (
-        soa_empty(x, (P, D)),
-        soa_empty(x, (P, D)),
-        *(None if given[name] is None else soa_empty(x, tuple(given[name].shape)) for name in ("C", "F", "J")),
+        *(None if given[name] is None else soa_empty(x, shape) for name, shape in shapes.items()),
         soa_empty(x, (P, _entries(history))) if history else None,
         soa_empty(x, (P,)) if needs & MASS else None,
         soa_empty(x, (P,)) if needs & VOLUME else None,
