@@ -61,12 +61,13 @@ class SubstepsBackward {
   void run(Adjoints& adjoints, const Tensor& gravity) {
     record();
     nodes_ = empty(in_.x, {s_.pool.nodes.size(0), 1 + D});
-    set_time(in_.n - 1);
-    change_ = gravity.defined() ? empty(in_.x, {s_.activation.max_blocks, D}) : Tensor();
+    if (gravity.defined()) change_ = empty(in_.x, {s_.activation.max_blocks, D});
     for (int64_t i = in_.n - 1; i >= 0; i--) {
-      if (i + 1 < in_.n) {  // the nodes of the last step are still there
+      if (i + 1 < in_.n) {
         begin(i);
         s_.move_grid(stream_);
+      } else {
+        set_time(i);  // its nodes are still there
       }
       leave_advance(i, adjoints);
       leave_grid(adjoints, gravity);
@@ -117,6 +118,8 @@ class SubstepsBackward {
     }
   }
 
+  void make_records();
+  void make_terms(int64_t needs);
   void leave_advance(int64_t i, Adjoints& adjoints);
   void leave_grid(Adjoints& adjoints, const Tensor& gravity);
   void leave_laws(Adjoints& adjoints);
@@ -153,25 +156,36 @@ class SubstepsBackward {
 template <class T, int D>
 SubstepsBackward<T, D>::SubstepsBackward(const SubstepsInputs& in, int64_t needs, backend::Stream stream)
     : in_(in), stream_(stream), s_(in), mls_(s_.p2g.form == StressForm::mls), time_{in.time} {
-  const Tensor& x = in.x;
-  const int64_t P = x.size(0), n = in.n;
-  while (int64_t(time_.size()) < n) time_.push_back(time_.back() + in.dt);
-  first_history_ = packed_history(x, in.history, s_.columns);
+  while (int64_t(time_.size()) < in.n) time_.push_back(time_.back() + in.dt);
+  first_history_ = packed_history(in.x, in.history, s_.columns);
   first_ = given_particles<T, D>(in, first_history_);
-  status_ = empty_int(x, {n, 1 + in.scenes, kStatusSize});
   s_.make_pool(stream);
   s_.count_time(nullptr);
+  make_records();
+  make_terms(needs);
+}
 
+template <class T, int D>
+void SubstepsBackward<T, D>::make_records() {
+  const Tensor& x = in_.x;
+  const int64_t n = in_.n;
+  status_ = empty_int(x, {n, 1 + in_.scenes, kStatusSize});
   x_ = Record<T>(x, n + 1, D);
   v_ = Record<T>(x, n + 1, D);
-  if (mls_ || in.wants_C) C_ = Record<T>(x, n + 1, D, D);
-  if (has(in.F)) F_ = Record<T>(x, n + 1, D, D);
-  if (has(in.J)) J_ = Record<T>(x, n + 1);
+  if (mls_ || in_.wants_C) C_ = Record<T>(x, n + 1, D, D);
+  if (has(in_.F)) F_ = Record<T>(x, n + 1, D, D);
+  if (has(in_.J)) J_ = Record<T>(x, n + 1);
   if (s_.columns > 0) history_ = Record<T>(x, n + 1, s_.columns);
   stress_ = Record<T>(x, n, D, D);
   if (s_.plastic) mapped_ = Record<T>(x, n, D, D);
-  if (has(in.material)) stress_.clear();  // of particles without a law
+  if (has(in_.material)) stress_.clear();  // of particles without a law
+}
 
+// What each kind of kernel adds to the adjoints.
+template <class T, int D>
+void SubstepsBackward<T, D>::make_terms(int64_t needs) {
+  const Tensor& x = in_.x;
+  const int64_t P = x.size(0);
   by_advance_.v = empty_particles(x, {P, D});
   Tensor& moving = mls_ ? by_advance_.C : gradient_;
   moving = empty_particles(x, {P, D, D});
@@ -189,8 +203,8 @@ SubstepsBackward<T, D>::SubstepsBackward(const SubstepsInputs& in, int64_t needs
   by_laws_.C = result(x, viscous, {P, D, D});
   by_laws_.F = result(x, elastic, {P, D, D});
   by_laws_.J = result(x, fluid, {P});
-  by_laws_.parameters = result(x, needs & kParameters_, {P, int64_t(in.parameters.size())});
-  if (!has(in.material)) return;
+  by_laws_.parameters = result(x, needs & kParameters_, {P, int64_t(in_.parameters.size())});
+  if (!has(in_.material)) return;
   for (Tensor* term : by_laws_.all())  // of the particles of other laws
     if (term->defined()) torch::stable::zero_(*term);
 }
