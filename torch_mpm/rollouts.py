@@ -136,12 +136,17 @@ hold, and so much that kernels on CUDA hide the time of Python."""
 
 def in_chunks(step: Step, state: State, n: int, dt: float, checkpoint: int | None = None) -> State:
     chunk = CHUNK if step.grid.grows and state.x.is_cuda else MOST_STEPS
-    if torch.is_grad_enabled() and any(t.requires_grad for t in _differentiable(step, state)):
+    if wants_gradient(step, state):
         chunk = min(chunk, checkpoint or _steps_between_kept(state, n))
     while n > 0:
         count = min(n, chunk)
         state, n = substeps(step, state, count, dt), n - count
     return state
+
+
+def wants_gradient(step: Step, state: State) -> bool:
+    """Whether `substeps` is differentiated."""
+    return torch.is_grad_enabled() and any(t.requires_grad for t in _differentiable(step, state))
 
 
 def _steps_between_kept(state: State, n: int) -> int:
