@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
 import torch
 from torch import Tensor
 from torch.autograd import forward_ad
-from torch.utils.checkpoint import checkpoint as run_checkpointed
 
 from .boundaries import Obstacle
 from .capture import is_captured, is_traced
 from .errors import check_count, shape_of
 from .laws import CompiledLaw, Mixture
 from .ops.arguments import split_dt
+from .ops.autograd import dispatch
 from .ops.contact import MAX_OBSTACLES, fusible, obstacle_arguments
 from .ops.grid_update import per_scene, wall_arguments
 from .ops.transfer import STRESS_FORMS
@@ -43,8 +44,12 @@ def rollout(
         checkpoint: if given, keep for the backward pass only the state of every `checkpoint` steps and compute the
             steps between again (memory n/checkpoint + checkpoint states instead of n steps; sqrt(n) is best).
 
-    A `Step` of compiled laws without heat, FLIP and functions of the user's takes all steps in one op while nothing
-    requires a gradient; `Step.explain` tells. The results are those of single steps, to the last bit.
+    A `Step` of compiled laws without heat, FLIP and functions of the user's takes all steps in one op, or some, with
+    the results of single steps to the last bit; `Step.explain` tells. Its gradients take the steps again from kept
+    states, those of every `checkpoint` steps, sqrt(n) of them by default and more where states are small. A kept state
+    of a solid has 2 D + 2 D² numbers per particle (24 in 3-D, 96 bytes in float32) and its history; while the backward
+    pass goes through `checkpoint` steps, it holds about 2 D + 4 D² (42 in 3-D) for each of them. Second derivatives
+    need single steps.
 
     Raises:
         TypeError, ValueError: for an n or a checkpoint that is no whole number, a negative n, a checkpoint below 1, or
@@ -56,22 +61,30 @@ def rollout(
     if checkpoint is not None:
         check_count("checkpoint", checkpoint, 1)
 
+    if isinstance(step, Step) and obstacle_to_substeps(step, state, dt) is None:
+        return in_chunks(step, state, n, dt, checkpoint)  # type: ignore[arg-type]
+    if checkpoint is not None and torch.is_grad_enabled():
+        return checkpointed(step, state, n, dt, checkpoint)
+    for _ in range(n):
+        state = step(state, dt)
+    return state
+
+
+def checkpointed(
+    step: Callable[[State, float | Tensor], State], state: State, n: int, dt: float | Tensor, every: int
+) -> State:
+    """The state n steps later; of every so many steps only the first state is kept for the backward pass."""
+    from torch.utils.checkpoint import checkpoint  # whose first call imports for seconds
+
     def steps(state: State, count: int) -> State:
-        if isinstance(step, Step) and obstacle_to_substeps(step, state, dt) is None:
-            return in_chunks(step, state, count, dt)  # type: ignore[arg-type]
         for _ in range(count):
             state = step(state, dt)
         return state
 
-    if checkpoint is None or not torch.is_grad_enabled():
-        return steps(state, n)
     if isinstance(step, Step):
         state = step.prepare(state)
-    done = 0
-    while done < n:
-        count = min(checkpoint, n - done)
-        state = run_checkpointed(steps, state, count, use_reentrant=False)
-        done += count
+    for first in range(0, n, every):
+        state = checkpoint(steps, state, min(every, n - first), use_reentrant=False)
     return state
 
 
@@ -104,8 +117,8 @@ def obstacle_to_substeps(step: Step, state: State, dt: float | Tensor) -> str | 
     if len(boundaries) > MAX_OBSTACLES:
         return f"there are more than {MAX_OBSTACLES} obstacles"
     if torch.is_grad_enabled():
-        if any(t.requires_grad for t in _tensors(step, state)):
-            return "something requires a gradient"
+        if any(t.requires_grad for b in boundaries for t in _motion(b)):
+            return "an obstacle requires a gradient"
         if any(part.has_functions for part in laws):
             return "a parameter is a function, which may have a gradient"
     return None
@@ -116,33 +129,48 @@ CHUNK = 64
 """Steps of one op where the pool of blocks follows the scene on CUDA, which it does between two calls."""
 
 
-def in_chunks(step: Step, state: State, n: int, dt: float) -> State:
+KEPT_BYTES = {"cpu": 2**24, "cuda": 2**28}
+"""What the backward pass of one op may hold of its steps, even where sqrt(n) steps need less: what the caches of a CPU
+hold, and so much that kernels on CUDA hide the time of Python."""
+
+
+def in_chunks(step: Step, state: State, n: int, dt: float, checkpoint: int | None = None) -> State:
     chunk = CHUNK if step.grid.grows and state.x.is_cuda else MOST_STEPS
+    if wants_gradient(step, state):
+        chunk = min(chunk, checkpoint or _steps_between_kept(state, n))
     while n > 0:
         count = min(n, chunk)
         state, n = substeps(step, state, count, dt), n - count
     return state
 
 
+def wants_gradient(step: Step, state: State) -> bool:
+    """Whether `substeps` is differentiated."""
+    return torch.is_grad_enabled() and any(t.requires_grad for t in _differentiable(step, state))
+
+
+def _steps_between_kept(state: State, n: int) -> int:
+    P, D = state.x.shape
+    step_bytes = P * (2 * D + 4 * D * D) * state.x.element_size()
+    return max(math.isqrt(n), KEPT_BYTES[state.x.device.type] // max(step_bytes, 1), 1)
+
+
 _FORWARD = CompiledLaw.forward
 
 
-def _tensors(step: Step, state: State) -> list[Tensor]:
-    """All tensors that a gradient of a step may pass to."""
-    fields = [value for value in vars(state).values() if isinstance(value, Tensor)]
-    values = [v for b in step.boundaries.entries for v in (*vars(b).values(), *vars(b.shape).values())]
+def _motion(obstacle: Any) -> list[Tensor]:
+    """The tensors of an obstacle."""
+    values = (*vars(obstacle).values(), *vars(obstacle.shape).values())
+    return [v for v in values if isinstance(v, Tensor)] + [*obstacle.parameters(), *obstacle.buffers()]
+
+
+def _differentiable(step: Step, state: State) -> list[Tensor]:
+    """What `substeps` has gradients for."""
+    fields = (state.x, state.v, state.mass, state.volume, state.C, state.F, state.J, *state.extra.values())
     gravity = [step.gravity] if isinstance(step.gravity, Tensor) else []
-    return [
-        *fields,
-        *state.extra.values(),
-        *gravity,
-        *(v for v in values if isinstance(v, Tensor)),
-        *step.parameters(),
-        *step.buffers(),
-    ]
+    return [*(t for t in fields if t is not None), *gravity, *step.law.parameters(), *step.law.buffers()]
 
 
-@torch.no_grad()
 def substeps(step: Step, state: State, n: int, dt: float) -> State:
     """The state n steps later, by one op; `obstacle_to_substeps` must be None.
 
@@ -155,7 +183,8 @@ def substeps(step: Step, state: State, n: int, dt: float) -> State:
     max_blocks = grid.pool(state.x, state.scene)
     calls = _law_calls(step, state, dt)
     apic = step.transfer == "apic"
-    x, v, C, F, J, history, status = torch.ops.torch_mpm.substeps(
+    x, v, C, F, J, history, status = dispatch(
+        torch.ops.torch_mpm.substeps,
         *(state.x, state.v, state.mass, state.volume, state.C, state.F, state.J),
         [state.extra[name] for _, _, names in calls for name in names],
         *(state.scene, state.ids, state.material if len(calls) > 1 else None, record.status),

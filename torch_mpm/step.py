@@ -291,11 +291,13 @@ class Step(TensorModule):
         raise_failures(self.failures(state), self._activations.all(), self.grid)
 
     def explain(self, state: State, dt: float | Tensor = 1.0) -> str:
-        """How `rollout` takes steps from a state: all in one op, or one after another from Python, and why."""
-        from .rollouts import obstacle_to_substeps  # which needs a Step
+        """How `rollout` takes steps from a state: many in one op, or one after another from Python, and why."""
+        from .rollouts import obstacle_to_substeps, wants_gradient  # which need a Step
 
         reason = obstacle_to_substeps(self, state, dt)
-        return "all steps in one op" if reason is None else f"step by step, because {reason}"
+        if reason is not None:
+            return f"step by step, because {reason}"
+        return f"all steps {'between two kept states ' if wants_gradient(self, state) else ''}in one op"
 
     def reset(self) -> None:
         """Forget the status of the steps so far."""

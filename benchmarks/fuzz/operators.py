@@ -161,8 +161,11 @@ class _Calls:
         how = ([ones] * sum(counts), [0, 1, 0], 3, 1e-3, True, True, 0, self.normal(2, D), *self.walls)
         end = (*self.obstacles, 0.1, 2, 40, True, *self.lattice.packed)
         look = (*fields[:5], self.F, *self.uniform(4, P), self.scene, 50.0, 2.0, True, 0.1, self.lattice.upper, 2)
+        call = (*fields, 0.5 + self.uniform(P), [self.uniform(P)], *who, *laws, *how, *end)
+        grads = [self.normal(*t.shape) for t in torch.ops.torch_mpm.substeps(*call)[:6]]
         return [
-            ("substeps", (*fields, 0.5 + self.uniform(P), [self.uniform(P)], *who, *laws, *how, *end)),
+            ("substeps", call),
+            ("substeps_backward", (*grads, 15, *call)),
             ("survey", (*look, *self.obstacles, self.uniform(2), 0.1, *self.lattice.packed)),
         ]
 

@@ -150,12 +150,38 @@ Topology<T, D> topology_of(const ActivateArguments<T, D>& a) {
   return t;
 }
 
+template <class T>
+Field<const T> constant(const Field<T>& f) {
+  return {f.pointer, {f.stride[0], f.stride[1], f.stride[2]}};
+}
+
 // Where the fields of the particles are; absent where a simulation has none.
 template <class T>
 struct Particles {
   Field<T> x, v, C, F, J;
   Field<T> history;  // [P, m], the entries of all laws
 };
+
+template <class T, int D>
+Particles<const T> given_particles(const SubstepsInputs& in, const Tensor& history) {
+  const Tensor& x = in.x;
+  const int64_t P = x.size(0);
+  return {input<T>(x, "x", x, {P, D}),       input<T>(in.v, "v", x, {P, D}), input<T>(in.C, "C", x, {P, D, D}),
+          input<T>(in.F, "F", x, {P, D, D}), input<T>(in.J, "J", x, {P}),    field<const T>(history)};
+}
+
+// The history of all laws side by side, [P, m].
+inline Tensor packed_history(const Tensor& x, const Tensors& history, int64_t columns) {
+  Tensor packed = result(x, columns > 0, {x.size(0), columns});
+  int64_t first = 0;
+  for (const Tensor& variable : history) {
+    const int64_t width = variable.dim() == 1 ? 1 : variable.size(1) * variable.size(2);
+    Tensor part = torch::stable::narrow(packed, 1, first, width);
+    torch::stable::copy_(part, torch::stable::reshape(variable, {x.size(0), width}));
+    first += width;
+  }
+  return packed;
+}
 
 // A history variable from a column of all entries on: [P], or [P, D, D].
 template <class T, int D>
@@ -183,6 +209,7 @@ struct Substeps {
   Pool<T, D> pool;
   Tensor stress;
   bool obstacles = false;
+  const int* previous_status = nullptr;
 
   explicit Substeps(const SubstepsInputs& inputs);
 
@@ -204,7 +231,7 @@ struct Substeps {
     p2g.x = advance.gather.x = activation.x = p.x;
     p2g.velocity = p.v;
     p2g.affine = in.apic ? p.C : Field<const T>{};
-    advance.F = plastic ? Field<const T>{mapped.pointer, {mapped.stride[0], mapped.stride[1], mapped.stride[2]}} : p.F;
+    advance.F = plastic ? constant(mapped) : p.F;
     advance.J = p.J;
   }
 
@@ -243,14 +270,18 @@ struct Substeps {
   }
 
   void move(backend::Stream stream) {
-    const int64_t order = in.lattice.order();
     for (size_t k = 0; k < laws.size(); k++) calls[k].law->kernels<T, D>().update(laws[k], stream);
+    move_grid(stream);
+    if (MPM_BACKEND == MPM_BACKEND_IS_cpu) contact.time += in.dt;
+    backend::g2p_advance(in.lattice.order(), advance, stream);
+  }
+
+  // From a stress that is there to the velocities of the nodes.
+  void move_grid(backend::Stream stream) {
     backend::clear(pool.nodes, stream);
-    backend::p2g(order, p2g, stream);
+    backend::p2g(in.lattice.order(), p2g, stream);
     backend::grid_update(update, stream);
     if (obstacles) backend::contact(contact, stream);
-    if (MPM_BACKEND == MPM_BACKEND_IS_cpu) contact.time += in.dt;
-    backend::g2p_advance(order, advance, stream);
   }
 
   void make_pool(backend::Stream stream);
@@ -266,6 +297,8 @@ Substeps<T, D>::Substeps(const SubstepsInputs& inputs) : in(inputs) {
   calls = law_calls(in.laws, in.options, in.parameters, in.history, in.variables, D);
   STD_TORCH_CHECK(has(in.material) || calls.size() == 1, "several laws need material");
   activation = activate_arguments<T, D>(in.lattice, x, in.scene, in.ids, in.scenes, in.max_blocks);
+  if (has(in.previous_status))
+    previous_status = int_pointer(*in.previous_status, "previous_status", x, {1 + in.scenes, kStatusSize});
   stress = empty_particles(x, {P, D, D});
   if (has(in.material)) {
     check_shape(*in.material, "material", {P});
@@ -277,6 +310,7 @@ Substeps<T, D>::Substeps(const SubstepsInputs& inputs) : in(inputs) {
     STD_TORCH_CHECK(in.wants_C || !info.viscous, "the viscous law ", info.name, " needs wants_C");
     const OptionalTensor& state = info.field == Deformation::gradient ? in.F : in.J;
     STD_TORCH_CHECK(has(state), "the law ", info.name, " needs ", info.field == Deformation::gradient ? "F" : "J");
+    check_shape(*state, info.field == Deformation::gradient ? "F" : "J", shape_of_state(info, P, D));
     kernels_of<T, D>(*calls[k].law);
     LawUpdateArguments<T, D> a;
     a.law = arguments<T, D>(info, *state, {}, calls[k].parameters, calls[k].history, in.scene, calls[k].options);

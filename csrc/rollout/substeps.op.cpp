@@ -5,19 +5,6 @@
 namespace mpm {
 namespace {
 
-// The history of all laws side by side, [P, m].
-Tensor packed_history(const Tensor& x, const Tensors& history, int64_t columns) {
-  Tensor packed = result(x, columns > 0, {x.size(0), columns});
-  int64_t first = 0;
-  for (const Tensor& variable : history) {
-    const int64_t width = variable.dim() == 1 ? 1 : variable.size(1) * variable.size(2);
-    Tensor part = torch::stable::narrow(packed, 1, first, width);
-    torch::stable::copy_(part, torch::stable::reshape(variable, {x.size(0), width}));
-    first += width;
-  }
-  return packed;
-}
-
 std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> substeps(MPM_SUBSTEPS_PARAMETERS) {
   const SubstepsInputs in{MPM_SUBSTEPS_ARGUMENTS};
   check_positions(x);
@@ -34,11 +21,9 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> substeps(MPM_
     Substeps<T, D> s(in);
     F_[1] = result(x, has(F) && (n > 1 || s.plastic), {P, D, D});
     history_ = packed_history(x, history, s.columns);
-    const int* before = nullptr;
-    if (has(previous_status)) before = int_pointer(*previous_status, "previous_status", x, {1 + scenes, kStatusSize});
+    const int* before = s.previous_status;
 
-    Particles<const T> from{input<T>(x, "x", x, {P, D}),    input<T>(v, "v", x, {P, D}), input<T>(C, "C", x, {P, D, D}),
-                            input<T>(F, "F", x, {P, D, D}), input<T>(J, "J", x, {P}),    field<const T>(history_)};
+    Particles<const T> from = given_particles<T, D>(in, history_);
     if (s.plastic && has(F)) {  // which laws change where it stands
       torch::stable::copy_(F_[1], *F);
       from.F = field<const T>(F_[1]);

@@ -156,7 +156,7 @@ LAW_OPS = (
     *("quartic_energy", "quartic_stress", "quartic_return_map"),
 )
 NO_GRADIENT = {
-    *("substeps", "survey"),
+    "survey",
     *("law_stiffness", "law_wave_modulus", "law_update_double_backward", "law_energy_double_backward"),
     *("heat_stencil", "heat_patches"),
 }
@@ -215,10 +215,30 @@ def rollout_case(name, device, every=None, n=2):
     return Case(run, inputs, twice=name in TWICE)
 
 
-CASES = (*TRANSFER_OPS, *HEAT_OPS, *LAW_OPS, *LAWS)
+def one_op_case(device):
+    """Steps of particles with histories, on which gravity, walls and an obstacle act."""
+    p = random_particles(2, sizes=(9, 4), device=device, deterministic=True)
+    ball = mpm.Sphere((0.3, 0.3), 0.2, friction=0.4)
+
+    def run(x, v, mass, volume, C, F, history, E, limit, gravity):
+        law = mpm.VonMises(E=E, nu=0.3, yield_stress=limit, hardening=2.0)
+        step = mpm.Step(p.grid, law, gravity, walls="separate", boundaries=[ball])
+        extra = {"plastic_strain": history}
+        state = mpm.State(x=x, v=v, mass=mass, volume=volume, C=C, F=F, scene=p.scene, extra=extra)
+        end = mpm.rollout(step, state, 4, 1e-3)
+        return end.x, end.v, end.C, end.F, end.extra["plastic_strain"]
+
+    history = 0.1 * torch.ones_like(p.mass)
+    numbers = (number(10.0, device), number(0.5, device), torch.tensor([[0.0, -9.8], [1.0, 2.0]]).to(p.x))
+    return Case(run, [p.x, p.v, p.mass, p.volume, p.C, strained(2, device, 13), history, *numbers], twice=False)
+
+
+CASES = (*TRANSFER_OPS, *HEAT_OPS, *LAW_OPS, "substeps", *LAWS)
 
 
 def make_case(name, device):
+    if name == "substeps":
+        return one_op_case(device)
     if name in LAWS:
         return rollout_case(name, device)
     make = transfer_case if name in TRANSFER_OPS else heat_case if name in HEAT_OPS else law_op_case

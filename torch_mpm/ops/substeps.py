@@ -1,4 +1,4 @@
-"""The op behind `torch_mpm.rollout`: n steps in one call. Fake kernel and autograd.
+"""The ops behind `torch_mpm.rollout`: n steps in one call, and their adjoint. Fake kernels and autograd.
 
     torch.ops.torch_mpm.substeps(x, v, mass, volume, C, F, J, history, scene, ids, material, previous_status, laws,
         options, parameters, variables, n, dt, apic, wants_C, stress_form, gravity, wall_kind, wall_plane,
@@ -11,17 +11,41 @@ parameters and history variables follow one another, `variables` of the latter f
 part of the parameters of laws that flow in time. Results that a call does not have are None; `history` has the entries
 of all laws side by side, [P, m]. With `grows` the pool follows the scene on the CPU; otherwise the op stops there where
 the pool is full, and the status tells. On CUDA nothing is waited for.
+
+Differentiable once, with respect to x, v, mass, volume, C, F, J, history, parameters and gravity. Autograd keeps the
+arguments of a call, no more: 2 D + 2 D² numbers per particle of a solid (24 in 3-D) and its history.
+
+    torch.ops.torch_mpm.substeps_backward(grad_x, grad_v, grad_C, grad_F, grad_J, grad_history, needs,
+        *arguments of substeps) -> (x, v, C, F, J, history, mass, volume, parameters, gravity)
+
+takes the steps again and then goes back through them. Meanwhile it holds what each step has read: of a solid 2 D + 3 D²
+numbers per particle and step (33 in 3-D), D² more where a law is plastic, and the history. The adjoints are [P, ...],
+those of the parameters [P, number of parameters] and that of gravity, over the time step, a sum for each block of the
+grids of all scenes [B * blocks, D]. Of the last four the bits of `needs` (`MASS`, `VOLUME`, `PARAMETERS`, `GRAVITY`)
+tell which are wanted.
 """
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from .arguments import refuse_vmap, sizes, soa_empty
-from .autograd import register_autograd
+from .autograd import dispatch, register_autograd
+from .law import _entries, _of_history, _of_parameters
+
+MASS, VOLUME, PARAMETERS, GRAVITY = 1, 2, 4, 8
+"""Bits of `needs` in csrc/rollout/substeps_backward.op.cpp."""
+
+_SCHEMA = {a.name: str(a.type) for a in torch.ops.torch_mpm.substeps.default._schema.arguments}
+_TENSORS = [name for name, kind in _SCHEMA.items() if kind in ("Tensor", "Optional[Tensor]")]
+_ADJOINTS = ("x", "v", "C", "F", "J", "history", "mass", "volume", "parameters", "gravity")
+
+
+# ---- fake kernels: shapes and strides only
 
 
 @torch.library.register_fake("torch_mpm::substeps")
@@ -30,21 +54,73 @@ def _fake(
 ) -> tuple[Tensor | None, ...]:
     P, D = sizes(x, "x", 2)
     wants_C, scenes = rest[10], rest[-5]
-    entries = sum(h.shape[1] ** 2 if h.dim() == 3 else 1 for h in history)
     return (
         soa_empty(x, (P, D)),
         soa_empty(x, (P, D)),
         soa_empty(x, (P, D, D)) if wants_C else None,
         None if F is None else soa_empty(x, (P, D, D)),
         None if J is None else soa_empty(x, (P,)),
-        soa_empty(x, (P, entries)) if history else None,
+        soa_empty(x, (P, _entries(history))) if history else None,
         x.new_empty((1 + scenes, 8), dtype=torch.int32),
     )
 
 
-def _no_backward(ctx: Any, *grads: Any) -> None:
-    raise NotImplementedError("substeps has no gradient: take single steps, as torch_mpm.rollout does")
+@torch.library.register_fake("torch_mpm::substeps_backward")
+def _backward_fake(grad_x, grad_v, grad_C, grad_F, grad_J, grad_history, needs, *arguments):
+    given = dict(zip(_SCHEMA, arguments, strict=True))
+    x, history = given["x"], given["history"]
+    P, D = sizes(x, "x", 2)
+    blocks = given["scenes"] * math.prod(given["layout"][2:])
+    shapes = {"x": (P, D), "v": (P, D), "C": (P, D, D), "F": (P, D, D), "J": (P,)}
+    return (
+        *(None if given[name] is None else soa_empty(x, shape) for name, shape in shapes.items()),
+        soa_empty(x, (P, _entries(history))) if history else None,
+        soa_empty(x, (P,)) if needs & MASS else None,
+        soa_empty(x, (P,)) if needs & VOLUME else None,
+        soa_empty(x, (P, len(given["parameters"]))) if needs & PARAMETERS else None,
+        x.new_empty(blocks, D) if needs & GRAVITY and given["gravity"] is not None else None,
+    )
 
 
-register_autograd("substeps", _no_backward)
+# ---- autograd
+
+
+def _setup(ctx: Any, inputs: Any, output: Any) -> None:
+    given = dict(zip(_SCHEMA, inputs, strict=True)) | {"previous_status": None}  # which the adjoint does not read
+    history, parameters = given["history"], given["parameters"]
+    ctx.variables = len(history)
+    ctx.set_materialize_grads(False)
+    ctx.save_for_backward(*(given.pop(name) for name in _TENSORS), *history, *parameters)
+    ctx.given = given
+
+
+def _backward(ctx: Any, *grads: Any) -> Any:
+    saved = list(ctx.saved_tensors)  # once: a checkpointed region unpacks a tensor only once
+    tensors, rest = dict(zip(_TENSORS, saved, strict=False)), saved[len(_TENSORS) :]
+    history, parameters = rest[: ctx.variables], rest[ctx.variables :]
+    given = ctx.given | tensors | {"history": history, "parameters": parameters}
+    wanted = dict(zip(_SCHEMA, ctx.needs_input_grad, strict=True))
+    needs = MASS * wanted["mass"] + VOLUME * wanted["volume"] + GRAVITY * wanted["gravity"]
+    needs += PARAMETERS * any(wanted["parameters"])
+    adjoints = dispatch(torch.ops.torch_mpm.substeps_backward, *grads[:6], needs, *(given[name] for name in _SCHEMA))
+    found = dict(zip(_ADJOINTS, adjoints, strict=True))
+    found["history"] = _of_history(found["history"], history, wanted["history"])
+    found["parameters"] = _of_parameters(found["parameters"], parameters, wanted["parameters"], given["scene"])
+    if wanted["gravity"]:
+        scenes, dim = given["gravity"].shape
+        found["gravity"] = given["dt"] * found["gravity"].reshape(scenes, -1, dim).sum(1)
+    lists = ("history", "parameters")
+    return tuple(found.get(name) if name in lists or wanted[name] is True else None for name in _SCHEMA)
+
+
+def _no_second_derivatives(ctx: Any, *grads: Any) -> None:
+    raise NotImplementedError(
+        "steps of torch_mpm.rollout in one op have no second derivatives: differentiate them once, or take them one by "
+        "one, in a loop of `state = step(state, dt)` or by rollout(lambda state, dt: step(state, dt), ...)"
+    )
+
+
+register_autograd("substeps", _backward, _setup)
+register_autograd("substeps_backward", _no_second_derivatives)
 refuse_vmap("substeps")
+refuse_vmap("substeps_backward")

@@ -1,0 +1,41 @@
+#include "rollout/accumulate.h"
+
+#include <algorithm>
+
+#include "common/instantiate.h"
+#include "cpu/parallel.h"
+
+namespace mpm::cpu {
+inline namespace TORCH_MPM_ISA {
+namespace {
+
+constexpr int64_t kGrain = 1 << 14;  // elements below which a range is not split
+
+}  // namespace
+
+template <class T, int D>
+void accumulate(const AccumulateArguments<T, D>& a) {
+  parallel_ranges(a.longest, kGrain, [&](int64_t begin, int64_t end) {
+    for (int k = 0; k < a.addends; k++) {
+      const auto [sum, term, size] = a.addend[k];
+      const int64_t last = std::min(end, size);
+#pragma GCC ivdep
+      for (int64_t i = begin; i < last; i++) sum[i] += term[i];
+    }
+  });
+}
+
+template <class T, int D>
+void accumulate_slots(const AccumulateSlotsArguments<T, D>& a) {
+  for (int64_t slot = 0; slot < a.max_blocks; slot++) {
+    const int64_t block = a.block[slot];
+    if (block < 0 || block >= a.block_count) continue;
+    for (int i = 0; i < D; i++) a.sum[block * D + i] += a.value[slot * D + i];
+  }
+}
+
+MPM_INSTANTIATE(accumulate, AccumulateArguments)
+MPM_INSTANTIATE(accumulate_slots, AccumulateSlotsArguments)
+
+}  // namespace TORCH_MPM_ISA
+}  // namespace mpm::cpu

@@ -1,0 +1,44 @@
+#include "rollout/accumulate.h"
+
+#include "cuda/launch.cuh"
+
+namespace mpm::cuda {
+namespace {
+
+constexpr int kThreads = 256;
+
+unsigned blocks_for(int64_t count) { return unsigned((count + kThreads - 1) / kThreads); }
+
+// One thread has the same element of all addends, so that two may have one sum.
+template <class T, int D>
+__global__ void __launch_bounds__(kThreads) accumulate_kernel(const AccumulateArguments<T, D> a) {
+  const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
+  for (int k = 0; k < a.addends; k++)
+    if (i < a.addend[k].size) a.addend[k].sum[i] += a.addend[k].term[i];
+}
+
+template <class T, int D>
+__global__ void __launch_bounds__(kThreads) accumulate_slots_kernel(const AccumulateSlotsArguments<T, D> a) {
+  const int64_t slot = int64_t(blockIdx.x) * kThreads + threadIdx.x;
+  if (slot >= a.max_blocks) return;
+  const int64_t block = a.block[slot];
+  if (block < 0 || block >= a.block_count) return;
+  for (int i = 0; i < D; i++) a.sum[block * D + i] += a.value[slot * D + i];
+}
+
+}  // namespace
+
+template <class T, int D>
+void accumulate(const AccumulateArguments<T, D>& a, Stream stream) {
+  if (a.longest > 0) launch(accumulate_kernel<T, D>, blocks_for(a.longest), kThreads, 0, stream, a);
+}
+
+template <class T, int D>
+void accumulate_slots(const AccumulateSlotsArguments<T, D>& a, Stream stream) {
+  if (a.max_blocks > 0) launch(accumulate_slots_kernel<T, D>, blocks_for(a.max_blocks), kThreads, 0, stream, a);
+}
+
+MPM_INSTANTIATE(accumulate, AccumulateArguments)
+MPM_INSTANTIATE(accumulate_slots, AccumulateSlotsArguments)
+
+}  // namespace mpm::cuda

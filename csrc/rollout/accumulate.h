@@ -1,0 +1,37 @@
+#pragma once
+
+#include <cstdint>
+
+// Sums of adjoints over many steps.
+namespace mpm {
+
+constexpr int kMostAddends = 8;
+
+// sum_i += term_i for some arrays. Two of them may have one sum.
+template <class T, int D>
+struct AccumulateArguments {
+  struct Addend {
+    T* sum;
+    const T* term;
+    int64_t size;
+  };
+  Addend addend[kMostAddends];
+  int addends = 0;
+  int64_t longest = 0;  // size of an addend
+
+  void add(T* sum, const T* term, int64_t size) {
+    addend[addends++] = {sum, term, size};
+    longest = longest > size ? longest : size;
+  }
+};
+
+// Values of slots [max_blocks, D] to sums of the blocks [block_count, D] that the slots have.
+template <class T, int D>
+struct AccumulateSlotsArguments {
+  int max_blocks = 0, block_count = 0;
+  const int* block = nullptr;  // [max_blocks] block of a slot, -1 where unused
+  const T* value = nullptr;
+  T* sum = nullptr;
+};
+
+}  // namespace mpm

@@ -1,0 +1,329 @@
+"""Gradients of rollouts in one op against those of single steps, which other tests hold against oracles."""
+
+from collections.abc import Callable
+
+import pytest
+import torch
+from combinations import DT as CASE_DT
+from combinations import draw, make
+from helpers import TOLERANCE
+from test_rollouts import LAWS_HERE, SEEDS, assert_equal, blob, box, flying, in_one_op, mixture, one_by_one, tensors
+from torch import Tensor
+
+import torch_mpm as mpm
+from torch_mpm.ops.contact import obstacle_arguments
+from torch_mpm.ops.grid_update import wall_arguments
+
+F64 = torch.float64
+DT, STEPS = 1e-4, 5
+Rollout = Callable[[mpm.Step, mpm.State], mpm.State]
+
+
+def in_op(every: int | None = None, n: int = STEPS, dt: float = DT) -> Rollout:
+    def run(step: mpm.Step, state: mpm.State) -> mpm.State:
+        assert step.explain(state, dt) == "all steps between two kept states in one op"
+        return mpm.rollout(step, state, n, dt, checkpoint=every)
+
+    return run
+
+
+def single(n: int = STEPS, dt: float = DT) -> Rollout:
+    return lambda step, state: one_by_one(step, state, n, dt)
+
+
+def loss(end: mpm.State) -> Tensor:
+    """A random sum of all that is floating."""
+    generator = torch.Generator().manual_seed(1)
+    total = end.x.new_zeros(())
+    for value in tensors(end).values():
+        if value.is_floating_point() and value.requires_grad:
+            weights = torch.randn(value.shape, generator=generator, dtype=F64).to(value)
+            total = total + (weights * value).nan_to_num(0.0).sum()
+    return total
+
+
+def gradients(run: Rollout, step: mpm.Step, state: mpm.State) -> dict[str, Tensor | None]:
+    """By every floating field of a state and every tensor of a step that requires grad."""
+    leaves = {k: t.detach().clone().requires_grad_() for k, t in tensors(state).items() if t.is_floating_point()}
+    extra = {name: leaves.get(name, value) for name, value in state.extra.items()}
+    fields = {name: leaf for name, leaf in leaves.items() if name not in extra}
+    constants = {name: t for name, t in [*step.named_parameters(), *step.named_buffers()] if t.requires_grad}
+    end = run(step, state.replace(**fields, extra=extra))
+    wanted = leaves | constants
+    return dict(zip(wanted, torch.autograd.grad(loss(end), list(wanted.values()), allow_unused=True), strict=True))
+
+
+def assert_same(
+    got: dict[str, Tensor | None], expected: dict[str, Tensor | None], tolerance: str = "", text: str = ""
+) -> None:
+    for name, reference in expected.items():
+        value = got[name]
+        if reference is None or float(reference.norm()) == 0:
+            assert value is None or float(value.norm()) == 0, name
+            continue
+        assert value is not None and bool(value.isfinite().all()), name
+        kind = tolerance or ("rollout" if value.is_cuda else "rollout gradient")
+        error = float((value - reference).norm() / reference.norm())
+        assert error < TOLERANCE[kind][value.dtype], f"{name}: {error} {text}"
+
+
+def with_gradients(law: mpm.Material, dtype: torch.dtype = F64) -> mpm.Material:
+    """All numbers of a law, and of the laws of a mixture, as tensors that require grad."""
+    for part in law.modules():
+        for name, value in list(vars(part).items()):
+            if isinstance(value, float):
+                delattr(part, name)
+                part.register_buffer(name, torch.tensor(value, dtype=dtype, requires_grad=True))
+    return law
+
+
+def moving(step: mpm.Step, state: mpm.State) -> mpm.State:
+    """A state with C and a strain of a few per cent."""
+    state = step.prepare(state)
+    P, D = state.x.shape
+    noise = torch.randn(P, D, D, generator=torch.Generator().manual_seed(5), dtype=F64).to(state.x)
+    strained = {} if state.F is None else {"F": state.F + 0.02 * noise}
+    return state.replace(C=noise, **strained)
+
+
+def pulled(dim: int, dtype: torch.dtype = F64) -> Tensor:
+    return torch.tensor((1.0, -9.8, 0.5)[:dim], dtype=dtype, requires_grad=True)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_random_simulations(seed, device):
+    """Those that go another way too, with the reason why."""
+    case = make(draw(seed), device)
+    case.step.heat = None
+    state = case.step.prepare(case.state)
+    got = gradients(lambda step, state: mpm.rollout(step, state, 3, CASE_DT, 2), case.step, state)
+    reason = case.step.explain(state, CASE_DT)
+    expected = gradients(single(3, CASE_DT), case.step, state)
+    assert_same(got, expected, "rollout" if isinstance(case.step.law, mpm.Mixture) else "", reason)
+
+
+@pytest.mark.parametrize("law", LAWS_HERE)
+@pytest.mark.parametrize("every", [1, 2, 7])
+def test_laws(law, every, dim, device):
+    step = mpm.Step(box(dim), with_gradients(LAWS_HERE[law]()), pulled(dim), walls="separate").to(device)
+    state = moving(step, blob(device, dim))
+    assert_same(gradients(in_op(every), step, state), gradients(single(), step, state))
+
+
+@pytest.mark.parametrize("transfer", ["apic", "pic"])
+@pytest.mark.parametrize("form", ["mls", "gradient"])
+@pytest.mark.parametrize("law", ["fluid", "neo_hookean"])
+@pytest.mark.parametrize("dtype", [torch.float32, F64])
+def test_transfers(transfer, form, law, dtype, kernel, device):
+    """Viscous laws read C without APIC too."""
+    options = {"transfer": transfer, "stress_form": form, "walls": "slip"}
+    step = mpm.Step(box(kernel=kernel), with_gradients(LAWS_HERE[law](), dtype), pulled(3, dtype), **options).to(device)
+    state = moving(step, blob(device, dtype=dtype))
+    assert_same(gradients(in_op(2), step, state), gradients(single(), step, state))
+
+
+@pytest.mark.parametrize("deterministic", [False, True])
+def test_mixtures(deterministic, dim, device):
+    step = mpm.Step(box(dim, deterministic=deterministic), with_gradients(mixture()), walls="sticky").to(device)
+    material = torch.randint(0, 7, (400,), dtype=torch.int32, device=device)
+    state = moving(step, blob(device, dim, 400)).replace(material=material, ids=torch.randperm(400).to(device))
+    for start in (state, state.sorted(step.grid)):
+        assert_same(gradients(in_op(2), step, start), gradients(single(), step, start), "rollout")
+
+
+def batch(dim: int, device: str) -> tuple[mpm.Step, mpm.State]:
+    """Scenes with obstacles, gravity and a modulus of their own, and a modulus of each particle."""
+    scenes = 3
+    state = blob(device, dim, scene=torch.arange(300, dtype=torch.int32) % scenes)
+    state = state.replace(scene=state.scene.int(), ids=torch.randperm(300).to(device))
+    mu = torch.linspace(1e3, 1e4, scenes, dtype=F64, device=device).requires_grad_()
+    lam = torch.linspace(1e3, 2e3, 300, dtype=F64, device=device).requires_grad_()
+    obstacles = [
+        mpm.Sphere((0.5,) * dim, 0.15, velocity=(1.0,) + (0.0,) * (dim - 1), kind="slip", friction=0.3),
+        mpm.Box((0.3,) * dim, (0.1,) * dim, kind="sticky", start=2e-4),
+        mpm.Plane((0.0, 0.35, 0.0)[:dim], (0.0, 1.0, 0.0)[:dim], kind="separate", end=3e-4),
+    ]
+    gravity = torch.randn(scenes, dim, dtype=F64).to(device).requires_grad_()
+    grid = box(dim, scenes=scenes)
+    step = mpm.Step(grid, mpm.NeoHookean(mu=mu, lam=lam), gravity, boundaries=obstacles, walls="mirror")
+    return step, moving(step, state)
+
+
+@pytest.mark.parametrize("every", [None, 2])
+def test_batches_with_obstacles_and_parameters_of_scenes_and_particles(every, dim, device):
+    step, state = batch(dim, device)
+    expected = gradients(single(), step, state)
+    assert {"law.mu", "law.lam", "gravity"} <= expected.keys()
+    assert_same(gradients(in_op(every), step, state), expected)
+
+
+def test_the_state_is_that_without_gradients(device):
+    step, state = batch(2, device)
+    start = state.replace(v=state.v.clone().requires_grad_())
+    with torch.no_grad():
+        expected = mpm.rollout(step, state, STEPS, DT)
+    assert_equal(mpm.rollout(step, start, STEPS, DT, checkpoint=2), expected)
+
+
+@pytest.mark.parametrize("every,calls", [(1, 6), (4, 2), (6, 1), (100, 1), (None, 1)])
+def test_a_state_is_kept_every_so_many_steps(every, calls, device):
+    step, state = mpm.Step(box(2), mpm.NeoHookean(E=1e4, nu=0.3)), blob(device, 2)
+    node = mpm.rollout(step, state.replace(v=state.v.clone().requires_grad_()), 6, DT, checkpoint=every).x.grad_fn
+    count = 0
+    while node is not None and "substeps" in node.name():
+        count += 1
+        node = next((n for n, _ in node.next_functions if n is not None), None)
+    assert count == calls
+
+
+def test_large_states_are_kept_every_sqrt_n_steps(device, monkeypatch):
+    monkeypatch.setattr(mpm.rollouts, "KEPT_BYTES", {"cpu": 1, "cuda": 1})
+    test_a_state_is_kept_every_so_many_steps(None, 3, device)
+
+
+def lost(state: mpm.State) -> mpm.State:
+    """With particles outside the grid, without a position, turned inside out, and without a volume."""
+    x, F = state.x.clone(), state.F.clone()
+    x[5], x[7, 0] = 3.0, float("nan")
+    F[11, 0], F[13] = -F[11, 0], 0.0
+    return state.replace(x=x, F=F)
+
+
+@pytest.mark.parametrize("law", ["neo_hookean", "von_mises", "sand", "viscoelastic"])
+@pytest.mark.parametrize("form", ["mls", "gradient"])
+def test_lost_particles(law, form, device):
+    step = mpm.Step(box(), with_gradients(LAWS_HERE[law]()), walls="slip", stress_form=form).to(device)
+    state = lost(moving(step, blob(device)))
+    expected = gradients(single(), step, state)
+    assert all(bool(g.isfinite().all()) for g in expected.values() if g is not None)
+    assert_same(gradients(in_op(2), step, state), expected)
+
+
+def test_a_pool_that_grows(device):
+    state, dt = flying(device)
+    law = {"E": torch.tensor(1.0, dtype=F64, device=device, requires_grad=True), "nu": 0.3}
+    step = mpm.Step(box(dx=1 / 64), mpm.NeoHookean(**law))
+    expected = gradients(single(8, dt), mpm.Step(box(dx=1 / 64), mpm.NeoHookean(**law)), state)
+    assert_same(gradients(in_op(3, 8, dt), step, state), expected)
+
+
+def test_no_particles(device):
+    step = mpm.Step(box(), with_gradients(mpm.VonMises(E=1e4, nu=0.3, yield_stress=1.0)), pulled(3)).to(device)
+    for gradient in gradients(in_op(), step, step.prepare(blob(device, count=0))).values():
+        assert gradient is None or float(gradient.norm()) == 0
+
+
+# ---- against differences
+
+
+def few(device: str) -> tuple[mpm.State, Tensor]:
+    """Particles in contact with each other, and their deformation."""
+    state = blob(device, 2, 6)
+    F = torch.eye(2, dtype=F64, device=device) + 0.05 * torch.randn(6, 2, 2, dtype=F64).to(device)
+    return state.replace(x=0.45 + 0.2 * (state.x - 0.3)), F
+
+
+@pytest.mark.parametrize("law", ["neo_hookean", "von_mises", "viscoelastic"])
+def test_gradcheck(law, device):
+    state, F = few(device)
+    make = {"neo_hookean": mpm.NeoHookean, "von_mises": mpm.VonMises, "viscoelastic": mpm.Viscoelastic}[law]
+    others = {
+        "von_mises": {"yield_stress": 30.0, "hardening": 100.0},
+        "viscoelastic": {"branch_modulus": 3e3, "relaxation_time": 0.01},
+    }.get(law, {})
+
+    def run(x: Tensor, v: Tensor, F: Tensor, mass: Tensor, E: Tensor, gravity: Tensor) -> Tensor:
+        step = mpm.Step(box(2, 0.125), make(E=E, nu=0.3, **others), gravity, walls="slip")
+        return loss(mpm.rollout(step, state.replace(x=x, v=v, F=F, mass=mass), 3, 1e-2, checkpoint=2))
+
+    inputs = (
+        state.x,
+        state.v,
+        F,
+        1e-3 + state.mass,
+        torch.tensor(10.0, dtype=F64, device=device),
+        pulled(2).to(device),
+    )
+    leaves = [t.detach().clone().requires_grad_() for t in inputs]
+    assert torch.autograd.gradcheck(run, leaves, eps=1e-6, atol=1e-5, rtol=1e-5, nondet_tol=1e-8)
+
+
+def test_a_difference_of_many_steps(device):
+    """A drop on a ball, 40 steps: the derivative along a random direction."""
+    step = mpm.Step(box(2), mpm.FixedCorotated(E=1e3, nu=0.3), (0.0, -9.8), boundaries=[mpm.Sphere((0.5, 0.3), 0.1)])
+    state = blob(device, 2)
+    direction = torch.randn(state.x.shape, dtype=F64).to(device)
+
+    def height(share: Tensor) -> Tensor:
+        return mpm.rollout(step, state.replace(v=state.v + share * direction), 40, 5e-4).x[:, 1].square().sum()
+
+    share = torch.zeros((), dtype=F64, device=device, requires_grad=True)
+    (gradient,) = torch.autograd.grad(height(share), share)
+    with torch.no_grad():
+        difference = (height(share + 1e-6) - height(share - 1e-6)) / 2e-6
+    torch.testing.assert_close(gradient, difference, rtol=1e-6, atol=0)
+
+
+# ---- what goes another way
+
+
+def test_a_second_derivative_is_refused(device):
+    step, state = mpm.Step(box(2), mpm.NeoHookean(E=1e4, nu=0.3)), blob(device, 2)
+    v = state.v.clone().requires_grad_()
+
+    def second(move: Callable[..., mpm.State]) -> Tensor:
+        end = move(step, state.replace(v=v), 2, DT)
+        (gradient,) = torch.autograd.grad(end.x.pow(3).sum(), v, create_graph=True)
+        return torch.autograd.grad(gradient.square().sum(), v)[0]
+
+    with pytest.raises(NotImplementedError, match=r"no second derivatives: .*`state = step\(state, dt\)"):
+        second(mpm.rollout)
+    assert bool(second(one_by_one).isfinite().all())
+    by_function = second(lambda step, *rest: mpm.rollout(lambda state, dt: step(state, dt), *rest))
+    torch.testing.assert_close(by_function, second(one_by_one))
+
+
+def test_gradients_of_obstacles_come_from_single_steps(device):
+    position = torch.tensor((0.5, 0.3), dtype=F64, device=device, requires_grad=True)
+    ball = mpm.Sphere(position, 0.2, kind="slip")
+    step, state = mpm.Step(box(2), mpm.NeoHookean(E=1e4, nu=0.3), boundaries=[ball]), blob(device, 2)
+    assert "an obstacle requires a gradient" in step.explain(state, DT)
+    found = [
+        torch.autograd.grad(loss(end), position)[0]
+        for end in (mpm.rollout(step, state, 4, DT), mpm.rollout(step, state, 4, DT, 2), one_by_one(step, state, 4, DT))
+    ]
+    assert float(found[0].norm()) > 0
+    torch.testing.assert_close(found[0], found[2])
+    torch.testing.assert_close(found[1], found[2])
+    with torch.no_grad():
+        assert in_one_op(step, state)
+
+
+def raw_arguments(device: str) -> list:
+    """Of `substeps`: two laws, walls, an obstacle and gravity in two scenes."""
+    state, D = blob(device, 2, 40), 2
+    g = torch.Generator().manual_seed(2)
+    scene, material = (torch.arange(40) % 2).int().to(device), (torch.arange(40) // 2 % 2).int().to(device)
+    F = torch.eye(2, dtype=F64) + 0.05 * torch.randn(40, 2, 2, generator=g, dtype=F64)
+    scalar = torch.tensor(2e3, dtype=F64, device=device)
+    grid = box(2, scenes=2, max_blocks=64, deterministic=True)
+    ball = [mpm.Sphere((0.5, 0.4), 0.1)]
+    laws = ("von_mises,neo_hookean", [0, 0], [scalar, scalar, 0.01 * scalar, scalar, scalar, 0.5 * scalar], [1, 0])
+    particles = (state.x, state.v, state.mass, state.volume, 0.1 * F.to(device), F.to(device), None, [state.mass * 0])
+    how = (3, DT, True, True, 0, torch.randn(2, D, generator=g, dtype=F64).to(device))
+    walls = wall_arguments(mpm.Walls("slip"), grid)
+    obstacles = obstacle_arguments(ball, state.x, 2)
+    rest = (*walls, *obstacles, 0.0, 2, 64, False, *grid.packed)
+    return [*particles, scene, None, material, None, *laws, *how, *rest]
+
+
+def test_the_raw_ops(device):
+    call = raw_arguments(device)
+    wanted = (0, 1, 2, 3, 4, 5, 21)
+    given = [t.clone().requires_grad_() if i in wanted else t for i, t in enumerate(call)]
+    torch.library.opcheck(torch.ops.torch_mpm.substeps.default, tuple(given), raise_exception=True)
+    grads = [torch.randn_like(t) for t in torch.ops.torch_mpm.substeps(*call)[:6] if t is not None]
+    adjoint = (*grads[:4], None, grads[4], 15, *call)
+    torch.library.opcheck(torch.ops.torch_mpm.substeps_backward.default, adjoint, raise_exception=True)
+    with pytest.raises(RuntimeError, match=r"grad_x must have shape \[40, 2\]"):
+        torch.ops.torch_mpm.substeps_backward(grads[0][:3], *adjoint[1:])
