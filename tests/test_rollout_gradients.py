@@ -170,7 +170,7 @@ def test_a_state_is_kept_every_so_many_steps(every, calls, device):
     step, state = mpm.Step(box(2), mpm.NeoHookean(E=1e4, nu=0.3)), blob(device, 2)
     node = mpm.rollout(step, state.replace(v=state.v.clone().requires_grad_()), 6, DT, checkpoint=every).x.grad_fn
     count = 0
-    while node is not None and "substeps" in node.name():
+    while node is not None and "substeps" in type(node).__name__:
         count += 1
         node = next((n for n, _ in node.next_functions if n is not None), None)
     assert count == calls
@@ -199,9 +199,9 @@ def test_lost_particles(law, form, device):
     assert_same(gradients(in_op(2), step, state), expected)
 
 
-def test_a_pool_that_grows(device):
-    state, dt = flying(device)
-    law = {"E": torch.tensor(1.0, dtype=F64, device=device, requires_grad=True), "nu": 0.3}
+def test_a_pool_that_grows():
+    state, dt = flying("cpu")
+    law = {"E": torch.tensor(1.0, dtype=F64, requires_grad=True), "nu": 0.3}
     step = mpm.Step(box(dx=1 / 64), mpm.NeoHookean(**law))
     expected = gradients(single(8, dt), mpm.Step(box(dx=1 / 64), mpm.NeoHookean(**law)), state)
     assert_same(gradients(in_op(3, 8, dt), step, state), expected)

@@ -28,6 +28,7 @@ from .ops import (
     svd3,
 )
 from .parameters import PerMaterial, Table
+from .recording import Frames, frames
 from .rollouts import rollout
 from .state import State
 from .step import Step
@@ -43,6 +44,7 @@ __all__ = [
     "Capsule",
     "DamagedFileError",
     "Failures",
+    "Frames",
     "Grid",
     "GridOverflowError",
     "Heat",
@@ -58,6 +60,7 @@ __all__ = [
     "Trajectory",
     "Walls",
     "advance",
+    "frames",
     "g2p",
     "g2p_advance",
     "gather",

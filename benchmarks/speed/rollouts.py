@@ -1,0 +1,169 @@
+"""Time of what people run: example scenes, rollouts of many sizes, batches, large domains, and training.
+
+    python -m benchmarks.speed.rollouts                    # CPU, all cores; about 5 minutes
+    python -m benchmarks.speed.rollouts --device cuda      # about 2 minutes
+    python -m benchmarks.speed.rollouts --out DIRECTORY
+
+Scenes: `torch_mpm.scene.run` with its files; time of the simulation. The others are the neo-Hookean cube of
+`benchmarks/speed/work.py`, steps of one call of `torch_mpm.rollout`, wall clock, synchronised once. Training: forward
+and backward of a rollout, gradient by the velocities at the start.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import torch
+
+import torch_mpm as mpm
+from torch_mpm.scene import run
+
+from .. import common
+from . import work
+from .step import Setup, setup
+
+SCENES = {"cpu": ("demo", "batch"), "cuda": ("demo", "batch", "sand_column", "sand_drum", "spinner")}
+SIDES = {"cpu": (4, 10, 22, 46, 64), "cuda": (4, 10, 22, 46, 100, 200)}
+BATCHES = {"cpu": ((64, 512),), "cuda": ((4096, 512), (1024, 2197))}
+"""Scenes, and particles of each."""
+DOMAINS = {"cpu": (1, 4), "cuda": (1, 8, 16)}
+"""Cells along a side of the domain, in those of the cube of a million (CPU: of 262144) particles."""
+TRAINING = {"cpu": (22, 50), "cuda": (46, 1000)}
+"""Particles along a side of the cube, and steps."""
+SECONDS = 0.5
+"""Of steps in one measurement, about."""
+
+
+def seconds(device: str, program: Callable[[], object]) -> float:
+    if device == "cuda":
+        torch.cuda.synchronize()
+    start = time.perf_counter()
+    program()
+    if device == "cuda":
+        torch.cuda.synchronize()
+    return time.perf_counter() - start
+
+
+def per_step(s: Setup, device: str, samples: int) -> dict[str, Any]:
+    """Least time of a substep of a rollout."""
+    state = s.state.sorted(s.grid)
+
+    def rolled(steps: int) -> Callable[[], object]:
+        return lambda: mpm.rollout(s.step, state, steps, work.DT)
+
+    with torch.no_grad():
+        seconds(device, rolled(4))
+        steps = max(16, min(1000, int(SECONDS / (seconds(device, rolled(32)) / 32))))
+        best = min(seconds(device, rolled(steps)) for _ in range(samples)) / steps
+    return {"particles": len(state), "steps": steps, "us": best * 1e6, "rate": len(state) / best}
+
+
+def batched(scenes: int, particles: int, device: str) -> Setup:
+    """Many scenes of one small cube each."""
+    w = work.make(round(particles ** (1 / 3)))
+    one = setup(w, device)
+    grid = mpm.Grid(dx=1 / w.n, lower=(0, 0, 0), upper=(1, 1, 1), scenes=scenes)
+    scene = torch.arange(scenes, dtype=torch.int32, device=device).repeat_interleave(w.particles)
+    state = one.state.select(torch.arange(w.particles, device=device).repeat(scenes)).replace(scene=scene)
+    step = mpm.Step(grid, one.step.law, gravity=one.step.gravity, walls="sticky")
+    return Setup(step.prepare(state), step)
+
+
+def in_domain(side: int, times: int, device: str) -> Setup:
+    """The cube in a domain that is larger along each axis."""
+    s = setup(work.make(side), device)
+    grid = mpm.Grid(dx=s.grid.dx, lower=(0, 0, 0), upper=(times, times, times))
+    return Setup(s.state, mpm.Step(grid, s.step.law, gravity=s.step.gravity, walls="sticky"))
+
+
+def scenes(names: tuple[str, ...], device: str) -> Iterator[dict[str, Any]]:
+    for name in names:
+        scene = mpm.Scene.load(common.ROOT / "examples" / f"{name}.toml").model_copy(update={"device": device})
+        with tempfile.TemporaryDirectory() as folder:
+            summary = run(scene, Path(folder) / name)
+        substeps, spent = summary["substeps"], summary["seconds"]["simulation"]
+        yield {
+            "name": f"{name}, as run",
+            "particles": summary["particles"],
+            "steps": substeps,
+            "seconds": spent,
+            "us": spent / substeps * 1e6,
+            "rate": summary["particles"] * substeps / spent,
+        }
+
+
+def training(side: int, steps: int, device: str, samples: int) -> dict[str, Any]:
+    """Least time of a rollout forward and with its backward pass, and the most memory of tensors [bytes] on CUDA."""
+    s = setup(work.make(side), device)
+    state, best = s.state.sorted(s.grid), [float("inf")] * 2
+    if device == "cuda":
+        torch.cuda.reset_peak_memory_stats()
+    for _ in range(samples + 1):
+        v = state.v.detach().clone().requires_grad_()
+        end: list[mpm.State] = []
+        forward = seconds(device, lambda v=v, end=end: end.append(rolled(s, state, v, steps)))  # type: ignore[misc]
+        backward = seconds(device, lambda end=end: (end[0].x.square().sum() + end[0].v.square().sum()).backward())  # type: ignore[misc]
+        best = [min(best[0], forward), min(best[1], forward + backward)]
+    memory = torch.cuda.max_memory_allocated() if device == "cuda" else None
+    return {"particles": len(state), "steps": steps, "forward": best[0], "both": best[1], "memory": memory}
+
+
+def rolled(s: Setup, state: mpm.State, v: torch.Tensor, steps: int) -> mpm.State:
+    return mpm.rollout(s.step, state.replace(v=v), steps, work.DT)
+
+
+def measure(device: str, quick: bool = False) -> dict[str, Any]:
+    common.use_all_cores()
+    samples = 1 if quick else 5
+    result: dict[str, Any] = {"environment": common.environment(device), "scenes": [], "rollouts": [], "training": []}
+    sides = SIDES[device][:2] if quick else SIDES[device]
+    for side in sides:
+        s = setup(work.make(side), device)
+        result["rollouts"].append({"name": "one scene", **per_step(s, device, samples)})
+    for count, particles in [(4, 64)] if quick else BATCHES[device]:
+        row = per_step(batched(count, particles, device), device, samples)
+        result["rollouts"].append({"name": f"{count} scenes", **row})
+    largest = 10 if quick else 100 if device == "cuda" else 64
+    for times in DOMAINS[device]:
+        s = in_domain(largest, times, device)
+        row = per_step(s, device, samples)
+        result["rollouts"].append({"name": f"domain of {round(times / s.grid.dx)}^3 cells", **row})
+    side, steps = (6, 10) if quick else TRAINING[device]
+    result["training"].append(training(side, steps, device, samples))
+    result["scenes"] += scenes(() if quick else SCENES[device], device)
+    return result
+
+
+def text(result: dict[str, Any]) -> str:
+    """Tables of a result in Markdown."""
+    header = ("", "particles", "substeps", "us per substep", "M particles/s")
+    rows = [(r["name"], r["particles"], r["steps"], r["us"], r["rate"] * 1e-6) for r in result["rollouts"]]
+    lines = ["# Speed of what is run", "", common.describe(result["environment"]), "", common.table(header, rows), ""]
+    rows = [(r["name"], r["particles"], r["steps"], r["us"], r["rate"] * 1e-6, r["seconds"]) for r in result["scenes"]]
+    lines += [common.table((*header, "simulation, s"), rows), ""]
+    rows = [
+        (r["particles"], r["steps"], r["forward"], r["both"], r["memory"] and r["memory"] * 1e-9)
+        for r in result["training"]
+    ]
+    header = ("training: particles", "steps", "forward, s", "forward and backward, s", "memory, GB")
+    return "\n".join([*lines, common.table(header, rows), ""])
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--device", default="cpu", choices=["cpu", "cuda"])
+    parser.add_argument("--quick", action="store_true", help="small sizes, to see that it works")
+    parser.add_argument("--out", type=Path, default=common.RESULTS)
+    arguments = parser.parse_args()
+    result = measure(arguments.device, arguments.quick)
+    print(text(result))
+    common.write(arguments.out, f"rollouts_{common.slug(result['environment']['device'])}", result, text(result))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,101 @@
+"""Many steps in a row with what happens on the way: states that are kept, and what acts between steps."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from .errors import check_count, shape_of
+from .rollouts import rollout
+from .state import State
+from .step import Step
+
+Hook = Callable[[State, int], "State | None"]
+
+
+class Frames(NamedTuple):
+    """What `frames` kept: T = n // every + 1 frames, that of the start first."""
+
+    time: Tensor
+    """Times [T] or, where dt is a tensor, [T, B] [s]; float64 on the CPU for numbers."""
+    fields: dict[str, Tensor]
+    """Of each field asked for the values [T, P, ...] in the order of the particles of the state."""
+    end: State
+    """The state after all n steps."""
+
+
+def frames(
+    step: Callable[[State, float | Tensor], State],
+    state: State,
+    n: int,
+    dt: float | Tensor,
+    every: int = 1,
+    fields: Sequence[str] = ("x", "v"),
+    hook: Hook | None = None,
+    checkpoint: int | None = None,
+) -> Frames:
+    """A `rollout` that keeps some fields of every so many steps, and lets a hook act there.
+
+    Args:
+        step, state, n, dt, checkpoint: as `rollout`.
+        every: steps from one frame to the next.
+        fields: names of fields of `State` or of `state.extra`.
+        hook: called as `hook(state, k)` before step k = 0, every, 2 every, ..., after the frame of that step is kept.
+            It may return another state of as many particles, to push them with a control of that time, or set
+            gravity or obstacles of the step; None leaves the state as it is. For a loss on the way it may read the
+            state, and gradients pass.
+
+    Differentiable as `rollout`. The steps between two frames are one call of an op where `rollout` can do so.
+
+    Raises:
+        TypeError, ValueError: as `rollout`; for a field that the state lacks, or another result of the hook.
+    """
+    check_count("n", n)
+    check_count("every", every, 1)
+    if hook is not None and not callable(hook):
+        raise TypeError(f"hook must be a function (state, k) -> state or None, got {shape_of(hook)}")
+    if isinstance(step, Step):
+        state = step.prepare(state)
+    kept: dict[str, list[Tensor]] = {name: [] for name in _checked(fields, state)}
+    times: list[Any] = []
+
+    def keep() -> None:
+        times.append(state.time)
+        for name, values in kept.items():
+            values.append(_field(state, name))
+
+    for k in range(0, n, every):
+        keep()
+        if hook is not None:
+            state = _acted(hook, state, k)
+        state = rollout(step, state, min(every, n - k), dt, checkpoint)
+    if n % every == 0:
+        keep()  # of the end
+    time = torch.stack(times) if isinstance(times[0], Tensor) else torch.tensor(times, dtype=torch.float64)
+    return Frames(time, {name: torch.stack(values) for name, values in kept.items()}, state)
+
+
+def _checked(fields: Sequence[str], state: State) -> Sequence[str]:
+    if isinstance(fields, str) or not isinstance(fields, (list, tuple)):
+        raise TypeError(f"fields must be a list of names, got {shape_of(fields)}")
+    for name in fields:
+        if not isinstance(_field(state, name), Tensor):
+            present = [k for k, v in {**vars(state), **state.extra}.items() if isinstance(v, Tensor) and k[0] != "_"]
+            raise ValueError(f"fields must be names of fields that the state has, {', '.join(present)}, got {name!r}")
+    return fields
+
+
+def _field(state: State, name: str) -> Any:
+    return state.extra[name] if name in state.extra else getattr(state, name, None)
+
+
+def _acted(hook: Hook, state: State, k: int) -> State:
+    result = hook(state, k)
+    if result is None:
+        return state
+    if not isinstance(result, State) or len(result) != len(state):
+        raise TypeError(f"hook must return None or a State of {len(state)} particles, got {shape_of(result)}")
+    return result
