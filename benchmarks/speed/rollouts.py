@@ -21,7 +21,7 @@ from typing import Any
 import torch
 
 import torch_mpm as mpm
-from torch_mpm.scene import run
+from torch_mpm.scene.run import run
 
 from .. import common
 from . import work
