@@ -17,7 +17,7 @@ pytest.importorskip("pydantic")
 pytest.importorskip("h5py")
 
 from torch_mpm import SimulationError, Trajectory
-from torch_mpm.scene import Scene, folder, heap
+from torch_mpm.scene import Scene, folder, heap, writer
 from torch_mpm.scene import run as module
 from torch_mpm.scene.checkpoint import load
 from torch_mpm.scene.diagnose import SceneFailure, replay
@@ -159,6 +159,7 @@ def test_a_disk_that_fills_up_leaves_whole_frames(tmp_path, monkeypatch):
             raise OSError(28, "No space left on device")
         save(path, *arguments)
 
+    monkeypatch.setattr(writer, "CHECKPOINT_SECONDS", 0.0)
     monkeypatch.setattr(module.checkpoint, "save", full)
     with pytest.raises(OutputError, match=r"no room on the disk .*No space left.* frames written so far are whole"):
         scene.run(tmp_path / "out")

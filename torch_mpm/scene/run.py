@@ -101,7 +101,7 @@ def run(
             kept = _save_last_good(folder, simulation.state, failure)
             raise SceneFailure(f"{failure}\n{kept}", failure.failure) from None
         finally:
-            writer.close()
+            writer.close(finished=simulation.frame == scene.frames)
         summary = simulation.summary(writer, time.perf_counter() - begin)
         record_summary(folder, summary)
         (folder / CHECKPOINT).unlink(missing_ok=True)
@@ -188,8 +188,8 @@ class Simulation:
         if record.get("fingerprint") != self.fingerprint:
             return "is the checkpoint of another scene"
         frame, emitted, totals = (record.get(name) for name in ("frame", "emitted", "totals"))
-        # A frame is counted, then its checkpoint follows, and the disk may lack the last count.
-        if type(frame) is not int or not 0 <= frame < layout.frames or not frame <= written <= frame + 2:
+        # Checkpoints follow the frames now and then, and the disk may lack the last count.
+        if type(frame) is not int or not 0 <= frame < layout.frames or not frame <= written:
             return f"is of frame {frame}, which does not fit the {written} frames of the trajectory"
         known = isinstance(totals, dict) and totals.keys() == vars(self.totals).keys()
         if state.time != self.scene.time_of(frame) or not known:

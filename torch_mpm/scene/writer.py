@@ -5,7 +5,7 @@ from __future__ import annotations
 import queue
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,9 @@ from torch import Tensor
 
 from ..data.trajectory import TrajectoryWriter
 from . import checkpoint
+
+CHECKPOINT_SECONDS = 1.0
+"""Least time from one checkpoint to the next: what a killed run may have to compute again."""
 
 
 @dataclass(frozen=True)
@@ -33,8 +36,8 @@ class Job:
 class FrameWriter:
     """Queue of frames for a trajectory and its checkpoint; at most two wait, so that memory stays bounded.
 
-    A frame is counted in the trajectory first and the checkpoint follows, so a kill between the two repeats one frame
-    with the same bytes.
+    A frame is counted in the trajectory first and a checkpoint follows now and then, so a kill repeats the frames since
+    with the same bytes. What ends otherwise before its last frame leaves a checkpoint of the frame that it came to.
     """
 
     def __init__(self, trajectory: TrajectoryWriter, checkpoint_path: Path) -> None:
@@ -42,6 +45,9 @@ class FrameWriter:
         self.checkpoint_path = checkpoint_path
         self.seconds = 0.0
         self.waited = 0.0
+        self._saved = time.perf_counter()
+        self._unsaved: Job | None = None  # the latest frame, where it has no checkpoint
+        self._finished = False
         self._error: BaseException | None = None
         self._jobs: queue.Queue[Job | None] = queue.Queue(maxsize=2)
         self._thread = threading.Thread(target=self._work, name="torch_mpm frame writer", daemon=True)
@@ -64,13 +70,14 @@ class FrameWriter:
         self._jobs.put(job)
         self.waited += time.perf_counter() - begin
 
-    def close(self) -> None:
-        """Wait for all frames and close the trajectory.
+    def close(self, finished: bool = False) -> None:
+        """Wait for all frames and close the trajectory; `finished` where no checkpoint is wanted any more.
 
         Raises:
             OSError: what went wrong with a frame.
         """
         begin = time.perf_counter()
+        self._finished = finished
         self._jobs.put(None)
         self._thread.join()
         self.trajectory.close()
@@ -102,17 +109,29 @@ class FrameWriter:
 
     def _work(self) -> None:
         while (job := self._jobs.get()) is not None:
-            begin = time.perf_counter()
-            try:
-                if self._error is None:
-                    self._write(job)
-            except BaseException as error:
-                self._error = error
-            self.seconds += time.perf_counter() - begin
+            self._attempt(self._write, job)
+        if self._unsaved is not None and not self._finished:
+            self._attempt(self._save, self._unsaved)
+
+    def _attempt(self, action: Callable[[Job], None], job: Job) -> None:
+        """An action whose error the next call of the main thread raises; none after an error."""
+        begin = time.perf_counter()
+        try:
+            if self._error is None:
+                action(job)
+        except BaseException as error:
+            self._error = error
+        self.seconds += time.perf_counter() - begin
 
     def _write(self, job: Job) -> None:
         if job.ready is not None:
             job.ready.synchronize()
         values = {k: v.numpy() if isinstance(v, Tensor) else np.asarray(v) for k, v in job.values.items()}
         self.trajectory.write(job.frame, values)
+        self._unsaved = job
+        if time.perf_counter() - self._saved >= CHECKPOINT_SECONDS:
+            self._save(job)
+
+    def _save(self, job: Job) -> None:
         checkpoint.save(self.checkpoint_path, dict(job.state), job.record)
+        self._saved, self._unsaved = time.perf_counter(), None
