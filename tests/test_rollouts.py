@@ -186,6 +186,24 @@ def test_a_full_pool_is_an_error_and_nothing_is_lost():
     assert torch.equal(state.x, before)
 
 
+def test_a_domain_of_many_blocks_changes_nothing(device):
+    """Which is activated by parts of its table; blocks come and go, and a particle is lost."""
+    state, dt = flying(device)
+    x = state.x.clone()
+    x[7] = float("nan")
+    state, ends, counts = state.replace(x=x), [], []
+    for width in (1.0, 13.0):  # [m]; 54^3 blocks
+        grid = mpm.Grid(dx=0.0625, lower=(0.0,) * 3, upper=(width,) * 3, max_blocks=216)
+        step = mpm.Step(grid, mpm.NeoHookean(E=1.0, nu=0.3))
+        with torch.no_grad():
+            moved = mpm.rollout(step, state, 16, dt / 2)
+            ends.append(moved.replace(x=moved.x.nan_to_num(7.0), v=moved.v.nan_to_num(7.0), C=moved.C.nan_to_num(7.0)))
+        counts.append((grid.activate(moved.x).wanted, grid.activate(state.x).wanted, step.status[1:].tolist()))
+    assert counts[0] == counts[1]
+    assert counts[0][0] > counts[0][1]
+    assert_equal(*ends)
+
+
 def test_problems_are_those_of_single_steps(device):
     """A particle outside the grid and one that is not finite are counted in the same steps."""
     state = blob(device)

@@ -12,6 +12,8 @@
 //   slots      numbers the active blocks in the order of the table (one-pass scan)
 //   offsets    first particle and work items of every slot (one-pass scan)
 //   place      the index tensor, base blocks and neighbours, unused slots, status
+// The scans pass over tiles of the table. Where it has many, over those alone that have active blocks, which `classify`
+// marks and `list_tiles` lists in their order; what they wrote is taken back before the next activation.
 // Deterministic mode replaces the ranks, which depend on the order of atomics, by a stable sort.
 namespace mpm::cuda {
 namespace {
@@ -19,6 +21,7 @@ namespace {
 constexpr int kThreads = 256;
 // Every kSampling-th thread block counts the base blocks met by its warps. More than kScattered per warp on average,
 // and the gathers are faster in the order of memory than block by block.
+constexpr int kManyTiles = 512;  // which a list is worth two more kernels
 constexpr int kSampling = 64, kScattered = 2;
 using Packed = unsigned long long;
 
@@ -51,10 +54,14 @@ struct Workspace {
   Counters* counters;
   Trouble* trouble;                     // [1 + scenes] of all particles, and of each scene
   Packed *slot_states, *offset_states;  // one per tile of the scans
+  unsigned char* marked;                // [tiles], in whole vectors; null where there are few
+  int64_t zeroed;                       // bytes from the start before each activation, and
+  int64_t zeroed_once;                  // before the first one
   Tally* tally;                         // [table]
-  int64_t zeroed;                       // bytes from the start
-  int *key, *rank;                      // [P] table index (-1 outside) and rank among its particles
-  int *slot, *slot_sorted, *id;         // [P], for the stable sort
+  int *listed, *list;                   // number of tiles with active blocks, and which
+  int tiles;
+  int *key, *rank;               // [P] table index (-1 outside) and rank among its particles
+  int *slot, *slot_sorted, *id;  // [P], for the stable sort
   void* sort;
   size_t sort_size;
   int64_t size;
@@ -70,6 +77,7 @@ template <class T, int D>
 Workspace lay_out(const ActivateArguments<T, D>& a) {
   const int64_t table = int64_t(a.scenes) * a.geometry.blocks_per_scene, tiles = (table + kThreads - 1) / kThreads;
   Workspace w{};
+  w.tiles = int(tiles);
   char* const start = static_cast<char*>(a.workspace);
   const auto take = [&](int64_t bytes) {
     char* p = start + w.size;
@@ -80,8 +88,14 @@ Workspace lay_out(const ActivateArguments<T, D>& a) {
   w.trouble = reinterpret_cast<Trouble*>(take((1 + int64_t(a.scenes)) * sizeof(Trouble)));
   w.slot_states = reinterpret_cast<Packed*>(take(tiles * sizeof(Packed)));
   w.offset_states = reinterpret_cast<Packed*>(take(tiles * sizeof(Packed)));
-  w.tally = reinterpret_cast<Tally*>(take(table * sizeof(Tally)));
+  if (tiles > kManyTiles) w.marked = reinterpret_cast<unsigned char*>(take(tiles));
   w.zeroed = w.size;
+  if (w.marked) {
+    w.listed = reinterpret_cast<int*>(take(sizeof(int)));
+    w.list = reinterpret_cast<int*>(take(tiles * sizeof(int)));
+  }
+  w.tally = reinterpret_cast<Tally*>(take(table * sizeof(Tally)));
+  w.zeroed_once = w.size;
   w.key = reinterpret_cast<int*>(take(a.particles * sizeof(int)));
   w.rank = reinterpret_cast<int*>(take(a.particles * sizeof(int)));
   if (a.deterministic) {
@@ -107,6 +121,54 @@ __device__ void report(const ActivateArguments<T, D>& a, Trouble* trouble, bool 
   };
   count_in(0);
   if (unsigned(scene) < unsigned(a.scenes)) count_in(1 + scene);
+}
+
+// From a block to the one a block further along the axes of o.
+template <class T, int D>
+__device__ int further(const Geometry<T, D>& g, int o) {
+  int way = 0;
+#pragma unroll
+  for (int i = 0; i < D; i++) way = way * g.blocks[i] + (o >> (D - 1 - i) & 1);
+  return way;
+}
+
+// The tiles of the blocks that particles of a base block touch.
+template <class T, int D>
+__device__ void mark_tiles(const ActivateArguments<T, D>& a, const Workspace& w, int key, unsigned touched) {
+  for (int o = 0; o < 1 << D; o++)
+    if (touched >> o & 1) w.marked[(key + further(a.geometry, o)) / kThreads] = 1;
+}
+
+// What the activation before wrote in the table and the tally.
+template <class T, int D>
+__global__ void __launch_bounds__(kThreads) take_back(const ActivateArguments<T, D> a, const Workspace w, int table) {
+  for (int i = int(blockIdx.x); i < *w.listed; i += int(gridDim.x)) {
+    const int64_t b = int64_t(w.list[i]) * kThreads + threadIdx.x;
+    if (b >= table) continue;
+    a.table[b] = -1;
+    w.tally[b] = {0, 0};
+  }
+}
+
+// By one thread block: the marked tiles in their order.
+constexpr int kListers = 1024;
+__global__ void __launch_bounds__(kListers) list_tiles(const Workspace w) {
+  using Scan = cub::BlockScan<int, kListers>;
+  __shared__ typename Scan::TempStorage storage;
+  int listed = 0;
+  for (int64_t begin = 0; begin < w.tiles; begin += kListers * int64_t(sizeof(uint4))) {
+    const int64_t first = begin + threadIdx.x * int64_t(sizeof(uint4));
+    uint4 marks = first < w.tiles ? *reinterpret_cast<const uint4*>(w.marked + first) : uint4{};
+    int place, total;
+    Scan(storage).ExclusiveSum(__popc(marks.x) + __popc(marks.y) + __popc(marks.z) + __popc(marks.w), place, total);
+    const unsigned word[] = {marks.x, marks.y, marks.z, marks.w};
+    place += listed;
+    for (int k = 0; k < 16; k++)
+      if (word[k / 4] >> (8 * (k % 4)) & 1) w.list[place++] = int(first) + k;
+    listed += total;
+    __syncthreads();
+  }
+  if (threadIdx.x == 0) *w.listed = listed;
 }
 
 template <int Order, class T, int D>
@@ -151,8 +213,10 @@ __global__ void __launch_bounds__(kThreads) classify(const ActivateArguments<T, 
     } else {
       Tally* tally = w.tally + key;
       first = atomicAdd(&tally->count, __popc(group));
-      if (touched_by_group & ~*const_cast<volatile int*>(&tally->touched))
-        atomicOr(&tally->touched, int(touched_by_group));
+      if (touched_by_group & ~*const_cast<volatile int*>(&tally->touched)) {
+        const unsigned known = atomicOr(&tally->touched, int(touched_by_group));
+        if (w.marked) mark_tiles(a, w, key, touched_by_group & ~known);
+      }
     }
   }
   const int rank = __shfl_sync(~0u, first, __ffs(group) - 1) + __popc(before);
@@ -209,77 +273,79 @@ __device__ Packed exclusive_sum(Packed value, Packed* states, int tile) {
   return before + inside;
 }
 
-// Tiles are numbered in the order in which their blocks start, so that those before are always running or done.
+// Tiles are numbered in the order in which thread blocks ask, so that those before are always running or done.
 __device__ int next_tile(int* counter) {
   __shared__ int tile;
+  __syncthreads();
   if (threadIdx.x == 0) tile = atomicAdd(counter, 1);
   __syncthreads();
   return tile;
 }
 
+// Calls body(number, first) with the number and the first table entry of tile after tile.
+template <class F>
+__device__ void each_tile(const Workspace& w, int* counter, const F& body) {
+  const int count = w.marked ? *w.listed : w.tiles;
+  for (int tile; (tile = next_tile(counter)) < count;)
+    body(tile, (w.marked ? w.list[tile] : tile) * kThreads, tile == count - 1);
+}
+
 template <class T, int D>
 __global__ void __launch_bounds__(kThreads) slots(const ActivateArguments<T, D> a, const Workspace w, int table) {
-  const int tile = next_tile(&w.counters->tile[0]), b = tile * kThreads + int(threadIdx.x);
-  bool active = false;
-  if (b < table) {
-    int block[D];
-    block_coordinates(a.geometry, b, block);
+  each_tile(w, &w.counters->tile[0], [&](int tile, int first, bool last) {
+    const int b = first + int(threadIdx.x);
+    bool active = false;
+    if (b < table) {
+      int block[D];
+      block_coordinates(a.geometry, b, block);
 #pragma unroll
-    for (int o = 0; o < 1 << D; o++) {
-      int from = 0;
-      bool inside = true;
+      for (int o = 0; o < 1 << D; o++) {
+        bool inside = true;
 #pragma unroll
-      for (int i = 0; i < D; i++) {
-        const int step = o >> (D - 1 - i) & 1;
-        from = from * a.geometry.blocks[i] + step;
-        inside = inside && block[i] >= step;
+        for (int i = 0; i < D; i++) inside = inside && block[i] >= (o >> (D - 1 - i) & 1);
+        if (inside) active = active || w.tally[b - further(a.geometry, o)].touched >> o & 1;
       }
-      if (inside) active = active || w.tally[b - from].touched >> o & 1;
     }
-  }
-  const int slot = first_of(exclusive_sum(active, w.slot_states, tile));
-  if (b >= table) return;
-  const bool given = active && slot < a.max_blocks;
-  a.table[b] = given ? slot : -1;
-  if (given) a.block[slot] = b;
-  if (b == table - 1) w.counters->wanted = slot + active;
+    const int slot = first_of(exclusive_sum(active, w.slot_states, tile));
+    if (last && threadIdx.x == kThreads - 1) w.counters->wanted = slot + active;
+    if (b >= table) return;
+    const bool given = active && slot < a.max_blocks;
+    a.table[b] = given ? slot : -1;
+    if (given) a.block[slot] = b;
+  });
 }
 
 template <class T, int D>
 __global__ void __launch_bounds__(kThreads) offsets(const ActivateArguments<T, D> a, const Workspace w, int table) {
-  const int tile = next_tile(&w.counters->tile[1]), b = tile * kThreads + int(threadIdx.x);
-  int count = 0, items = 0, slot = -1;
-  if (b < table) {
-    const Tally tally = w.tally[b];
-    slot = a.table[b];
-    count = tally.count;
-    if (count > 0) {
+  each_tile(w, &w.counters->tile[1], [&](int tile, int first, bool last) {
+    const int b = first + int(threadIdx.x);
+    int count = 0, items = 0, slot = -1;
+    if (b < table) {
+      const Tally tally = w.tally[b];
+      slot = a.table[b];
+      count = tally.count;
       // Slots grow with the table, so the furthest neighbour touched tells whether all have one.
-      int furthest = 0;
-      const int o = 31 - __clz(tally.touched);
-#pragma unroll
-      for (int i = 0; i < D; i++) furthest = furthest * a.geometry.blocks[i] + (o >> (D - 1 - i) & 1);
-      if (a.table[b + furthest] < 0) {
+      if (count > 0 && a.table[b + further(a.geometry, 31 - __clz(tally.touched))] < 0) {
         w.tally[b].count = -1 - atomicAdd(&w.counters->tail, count);
         count = 0;
       }
+      items = (count + kItemParticles - 1) / kItemParticles;
     }
-    items = (count + kItemParticles - 1) / kItemParticles;
-  }
-  const Packed before = exclusive_sum(pack(count, items), w.offset_states, tile);
-  if (b >= table) return;
-  const int start = first_of(before), item = second_of(before);
-  if (slot >= 0) a.offsets[slot] = start;
-  if (count > 0) w.tally[b].count = start;
-  int4* const out = reinterpret_cast<int4*>(lay_out_schedule<D>(a.schedule, a.max_blocks, a.particles).items) + item;
-  for (int k = 0; k < items; k++) {
-    const int begin = start + int(int64_t(count) * k / items), end = start + int(int64_t(count) * (k + 1) / items);
-    out[k] = make_int4(slot, begin, end, b);
-  }
-  if (b == table - 1) {
-    w.counters->transferred = start + count;
-    w.counters->items = item + items;
-  }
+    const Packed before = exclusive_sum(pack(count, items), w.offset_states, tile);
+    const int start = first_of(before), item = second_of(before);
+    if (last && threadIdx.x == kThreads - 1) {
+      w.counters->transferred = start + count;
+      w.counters->items = item + items;
+    }
+    if (b >= table) return;
+    if (slot >= 0) a.offsets[slot] = start;
+    if (count > 0) w.tally[b].count = start;
+    int4* const out = reinterpret_cast<int4*>(lay_out_schedule<D>(a.schedule, a.max_blocks, a.particles).items) + item;
+    for (int k = 0; k < items; k++) {
+      const int begin = start + int(int64_t(count) * k / items), end = start + int(int64_t(count) * (k + 1) / items);
+      out[k] = make_int4(slot, begin, end, b);
+    }
+  });
 }
 
 template <class T, int D>
@@ -366,11 +432,18 @@ void activate(const ActivateArguments<T, D>& a, Stream stream) {
   const Workspace w = lay_out(a);
   const int table = a.scenes * a.geometry.blocks_per_scene;
   const auto blocks = [](int64_t count) { return unsigned((count + kThreads - 1) / kThreads); };
-  check(cudaMemsetAsync(a.workspace, 0, w.zeroed, stream));
+  // Of the tiles listed no more have to run at once than the device takes.
+  const unsigned tiles = w.marked ? std::min<unsigned>(blocks(table), grid_size(a.max_blocks + 1)) : blocks(table);
+  if (w.marked && !a.fresh)
+    launch(take_back<T, D>, tiles, kThreads, 0, stream, a, w, table);
+  else if (w.marked)
+    check(cudaMemsetAsync(a.table, 0xff, table * sizeof(int), stream));
+  check(cudaMemsetAsync(a.workspace, 0, a.fresh || !w.marked ? w.zeroed_once : w.zeroed, stream));
   if (a.particles > 0) launch(classify<Order, T, D>, blocks(a.particles), kThreads, 0, stream, a, w);
   if (table > 0) {
-    launch(slots<T, D>, blocks(table), kThreads, 0, stream, a, w, table);
-    launch(offsets<T, D>, blocks(table), kThreads, 0, stream, a, w, table);
+    if (w.marked) launch(list_tiles, 1, kListers, 0, stream, w);
+    launch(slots<T, D>, tiles, kThreads, 0, stream, a, w, table);
+    launch(offsets<T, D>, tiles, kThreads, 0, stream, a, w, table);
   }
   const int64_t rows = int64_t(std::max(a.max_blocks, a.scenes)) + 1;  // of slots with their end, or of the status
   launch(place<T, D>, blocks(std::max(a.particles, rows)), kThreads, 0, stream, a, w);

@@ -21,6 +21,7 @@ struct ActivateArguments {
   int *table = nullptr, *block = nullptr, *offsets = nullptr, *index = nullptr, *schedule = nullptr, *status = nullptr;
   int64_t schedule_size = 0;
   void* workspace = nullptr;  // bytes asked for by activate_workspace()
+  bool fresh = true;          // whether the table and the workspace are not those of an earlier call as they were left
   int64_t workspace_size = 0;
 };
 
