@@ -192,8 +192,8 @@ def test_a_domain_of_many_blocks_changes_nothing(device):
     x = state.x.clone()
     x[7] = float("nan")
     state, ends, counts = state.replace(x=x), [], []
-    for width in (1.0, 13.0):  # [m]; 54^3 blocks
-        grid = mpm.Grid(dx=0.0625, lower=(0.0,) * 3, upper=(width,) * 3, max_blocks=216)
+    for width in (1.0, 6.5):  # [m]; the table then has 54^3 blocks
+        grid = mpm.Grid(dx=1 / 32, lower=(0.0,) * 3, upper=(width,) * 3, max_blocks=1000)
         step = mpm.Step(grid, mpm.NeoHookean(E=1.0, nu=0.3))
         with torch.no_grad():
             moved = mpm.rollout(step, state, 16, dt / 2)
