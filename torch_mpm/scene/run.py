@@ -410,17 +410,19 @@ def energies(step: Any, state: Any) -> dict[str, Any]:
     """Kinetic, elastic and potential energy [J], momentum [kg m/s] and heat [J] of all particles, summed in float64."""
     mass, v = state.mass.double(), state.v.double()
     gravity = step.gravity
-    potential = 0.0
+    figures = {
+        "kinetic_energy": 0.5 * (mass * v.square().sum(1)).sum(),
+        "elastic_energy": step.law.energy(step.prepare(state)).double().sum(),
+    }
     if gravity is not None:
         rows = gravity if gravity.dim() == 1 else gravity[state.scene.long()]
-        potential = -float((mass[:, None] * state.x.double() * rows.double()).sum())
-    heat = {} if step.heat is None else {"heat": float(step.heat.heat_content(state).double().sum())}
-    return heat | {
-        "kinetic_energy": 0.5 * float((mass * v.square().sum(1)).sum()),
-        "elastic_energy": float(step.law.energy(step.prepare(state)).double().sum()),
-        "potential_energy": potential,
-        "momentum": (mass[:, None] * v).sum(0).tolist(),
-    }
+        figures["potential_energy"] = -(mass[:, None] * state.x.double() * rows.double()).sum()
+    if step.heat is not None:
+        figures["heat"] = step.heat.heat_content(state).double().sum()
+    *numbers, momentum = [*figures.values(), (mass[:, None] * v).sum(0)]
+    values = torch.cat([torch.stack(numbers), momentum]).tolist()  # at once, since a device is waited for
+    found = {"potential_energy": 0.0, **dict(zip(figures, values, strict=False))}
+    return {**found, "momentum": values[len(numbers) :]}
 
 
 def versions() -> dict[str, str]:
