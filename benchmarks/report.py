@@ -66,6 +66,45 @@ def speed_table(results: list[dict[str, Any]]) -> str:
     return "\n".join([intro, "", common.table(header, rows)])
 
 
+def as_run(results: list[dict[str, Any]]) -> str:
+    """Example scenes, rollouts and training as people run them."""
+    notes = [f"- {common.describe(result['environment'])}" for result in results]
+    rows = [
+        (
+            result["environment"]["device"],
+            r["name"],
+            r["particles"],
+            r["steps"],
+            r["us"],
+            r["rate"] * 1e-6,
+            r.get("seconds"),
+        )
+        for result in results
+        for r in (*result["rollouts"], *result["scenes"])
+    ]
+    header = ("device", "", "particles", "substeps", "us per substep", "M particles/s", "simulation, s")
+    training = [
+        (
+            result["environment"]["device"],
+            r["particles"],
+            r["steps"],
+            r["forward"],
+            r["both"],
+            r["memory"] and r["memory"] * 1e-9,
+        )
+        for result in results
+        for r in result["training"]
+    ]
+    of_training = ("device", "particles", "steps", "forward, s", "forward and backward, s", "memory, GB")
+    return "\n".join(
+        [
+            "Substeps of one call of `rollout` (the neo-Hookean cube above), scenes by `torch-mpm run` with their files, and",
+            "the gradient of a rollout by the velocities at its start (benchmarks/speed/rollouts.py).",
+            *("", common.table(header, rows), "", common.table(of_training, training), "", *notes),
+        ]
+    )
+
+
 def _ratio(value: float | None, base: float | None) -> str | None:
     return f"{value / base:.1f}x" if value and base else None
 
@@ -458,6 +497,7 @@ def sections(directory: Path) -> dict[str, str]:
     found = {}
     for pattern, title, section in (
         ("speed_*.json", "Speed", speed),
+        ("rollouts_*.json", "Speed of what is run", as_run),
         ("svd_*_*.json", "Small matrices and sand", small_matrices),
         ("heat_*_*.json", "Speed of the heat solve", heat_speed),
     ):
