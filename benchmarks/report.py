@@ -98,7 +98,7 @@ def as_run(results: list[dict[str, Any]]) -> str:
     of_training = ("device", "particles", "steps", "forward, s", "forward and backward, s", "memory, GB")
     return "\n".join(
         [
-            "Substeps of one call of `rollout` (the neo-Hookean cube above), scenes by `torch-mpm run` with their files, and",
+            "Substeps of one call of `rollout` (the neo-Hookean cube), scenes by `torch-mpm run` with their files, and",
             "the gradient of a rollout by the velocities at its start (benchmarks/speed/rollouts.py).",
             *("", common.table(header, rows), "", common.table(of_training, training), "", *notes),
         ]
