@@ -65,7 +65,9 @@ def frames(
     def keep() -> None:
         times.append(state.time)
         for name, values in kept.items():
-            values.append(_field(state, name))
+            value = _field(state, name)
+            # A hook may write into the tensors of the state.
+            values.append(value if value.requires_grad or hook is None else value.clone())
 
     for k in range(0, n, every):
         keep()

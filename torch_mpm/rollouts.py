@@ -124,7 +124,7 @@ def obstacle_to_substeps(step: Step, state: State, dt: float | Tensor) -> str | 
     return None
 
 
-MOST_STEPS = 2**16  # of one op, csrc/rollout/substeps.op.cpp
+MOST_STEPS = 2**16  # of one op, csrc/rollout/substeps.h
 CHUNK = 64
 """Steps of one op where the pool of blocks follows the scene on CUDA, which it does between two calls."""
 

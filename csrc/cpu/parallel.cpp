@@ -34,10 +34,11 @@ class Team {
   // Of the leader, member 0.
   void run(int64_t count, int64_t grain, Body body, void* context) {
     // More chunks than members, so that one that comes late leaves little.
-    const int64_t most = (count + grain - 1) / (grain > 0 ? grain : 1), wanted = 4 * int64_t(members_);
+    const int64_t least = grain > 0 ? grain : 1, most = (count + least - 1) / least, wanted = 4 * int64_t(members_);
     body_ = body, context_ = context, count_ = count;
     chunks_[1] = int(most < wanted ? most : wanted);
     shares_ = Shares<1>(chunks_, members_);
+    failed_.store(false, std::memory_order_relaxed);
     state_.store(kOpen, std::memory_order_release);
     generation_.fetch_add(1, std::memory_order_release);
     generation_.notify_all();

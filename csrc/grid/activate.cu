@@ -19,9 +19,9 @@ namespace mpm::cuda {
 namespace {
 
 constexpr int kThreads = 256;
+constexpr int kManyTiles = 512;  // of which a list is worth two more kernels
 // Every kSampling-th thread block counts the base blocks met by its warps. More than kScattered per warp on average,
 // and the gathers are faster in the order of memory than block by block.
-constexpr int kManyTiles = 512;  // which a list is worth two more kernels
 constexpr int kSampling = 64, kScattered = 2;
 using Packed = unsigned long long;
 

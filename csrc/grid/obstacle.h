@@ -51,10 +51,11 @@ struct ContactArguments {
   const T* data = nullptr;
   const T* scene_time = nullptr;  // [times], one for all scenes or one per scene; or null
   int times = 0;
-  double time = 0;                   // where scene_time is null: of the first substep of a call
-  const int* activations = nullptr;  // counted on the device, with this substep's and before the first's (or null)
-  const int* activations_before = nullptr;
-  double dt = 0;                // of the substeps counted
+  double time = 0;  // where scene_time is null, or
+  // the times of the substeps of a call, on the device; activations are counted with this substep's, and before the
+  // call (or null).
+  const double* step_time = nullptr;
+  const int *activations = nullptr, *activations_before = nullptr;
   const T* velocity = nullptr;  // node i at velocity + i * stride
   const T* grad = nullptr;      // likewise; backward only
   int64_t stride = 0, grad_stride = 0;
@@ -111,8 +112,8 @@ struct ObstaclePose {
 template <class T, int D>
 MPM_HD double contact_time(const ContactArguments<T, D>& a, int scene) {
   if (a.scene_time) return double(a.scene_time[a.times == 1 ? 0 : scene]);
-  if (!a.activations) return a.time;
-  return a.time + a.dt * (*a.activations - 1 - (a.activations_before ? *a.activations_before : 0));
+  if (!a.step_time) return a.time;
+  return a.step_time[*a.activations - 1 - (a.activations_before ? *a.activations_before : 0)];
 }
 
 template <class S, class T, int D>

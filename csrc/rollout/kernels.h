@@ -9,3 +9,10 @@
   PLAIN(accumulate, AccumulateArguments)          \
   PLAIN(accumulate_slots, AccumulateSlotsArguments)
 MPM_BACKEND_KERNELS(MPM_ROLLOUT_KERNELS)
+
+#if MPM_BACKEND == MPM_BACKEND_IS_cuda
+namespace mpm::cuda {
+// times[k + 1] = times[k] + dt, on the device.
+void add_up_times(double* times, double first, double dt, int64_t count, Stream stream);
+}  // namespace mpm::cuda
+#endif

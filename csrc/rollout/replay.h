@@ -1,5 +1,7 @@
 #pragma once
 
+#include <utility>
+
 #include "common/backend.h"
 
 #if MPM_BACKEND == MPM_BACKEND_IS_cpu
@@ -60,8 +62,9 @@ class Recorder {
       cudaGetLastError();  // of another shape, which is no error
       forget();
     }
-    if (!executable_) check(cudaGraphInstantiate(&executable_, graph, 0));
+    const cudaError_t made = executable_ ? cudaSuccess : cudaGraphInstantiate(&executable_, graph, 0);
     check(cudaGraphDestroy(graph));
+    check(made);
   }
 
   void launch(cudaStream_t stream) const { check(cudaGraphLaunch(executable_, stream)); }
@@ -74,7 +77,7 @@ class Recorder {
     check(cudaGetDevice(&device));
     if (stream_ && device == device_) return;
     forget();
-    if (stream_) check(cudaStreamDestroy(stream_));
+    if (stream_) check(cudaStreamDestroy(std::exchange(stream_, nullptr)));
     check(cudaStreamCreateWithFlags(&stream_, cudaStreamNonBlocking));
     device_ = device;
   }

@@ -7,6 +7,7 @@
 #include "grid/obstacle.op.h"
 #include "grid/walls.op.h"
 #include "laws/law.op.h"
+#include "rollout/kernels.h"
 #include "transfer/kernels.h"
 
 // Many steps in one call: activation, laws, P2G, grid update, obstacles, G2P, one after another as the ops of one step
@@ -208,7 +209,7 @@ struct Substeps {
   ContactArguments<T, D> contact;
   G2PAdvanceArguments<T, D> advance;
   Pool<T, D> pool;
-  Tensor stress;
+  Tensor stress, step_time;
   bool obstacles = false;
   bool fresh = true;  // whether no activation has used the pool yet
   const int* previous_status = nullptr;
@@ -266,11 +267,15 @@ struct Substeps {
     return true;
   }
 
-  // The time of obstacles: counted on the device, where the host may not be there at each substep.
-  void count_time(const int* status_before) {
-    if (MPM_BACKEND == MPM_BACKEND_IS_cpu) return;
-    contact.dt = in.dt;
+  // The time of obstacles, added up as single steps do: by a device itself, where the host may not be there.
+  void count_time(const int* status_before, backend::Stream stream) {
+#if MPM_BACKEND == MPM_BACKEND_IS_cuda
+    if (!obstacles) return;
+    step_time = empty(in.x, {in.n}, ScalarType::Double);
+    contact.step_time = static_cast<const double*>(step_time.data_ptr());
     if (status_before) contact.activations_before = status_before + kActivations;
+    backend::add_up_times(static_cast<double*>(step_time.data_ptr()), in.time, in.dt, in.n, stream);
+#endif
   }
 
   void move(backend::Stream stream) {

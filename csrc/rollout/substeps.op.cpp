@@ -29,7 +29,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> substeps(MPM_
       from.F = field<const T>(F_[1]);
     }
     s.make_pool(stream);
-    s.count_time(before);
+    s.count_time(before, stream);
     // A substep that reads and writes these buffers in turn, into the first or the second.
     const auto take = [&](int into, backend::Stream on) {
       int* const now = static_cast<int*>(status[into].data_ptr());

@@ -160,7 +160,7 @@ SubstepsBackward<T, D>::SubstepsBackward(const SubstepsInputs& in, int64_t needs
   first_history_ = packed_history(in.x, in.history, s_.columns);
   first_ = given_particles<T, D>(in, first_history_);
   s_.make_pool(stream);
-  s_.count_time(nullptr);
+  s_.count_time(nullptr, stream_);
   make_records();
   make_terms(needs);
 }

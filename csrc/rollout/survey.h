@@ -90,7 +90,7 @@ MPM_HD T oscillation_rate(const SurveyArguments<T, D>& a, const One<T>& at, cons
 // 1/dt of the largest change of a stretch or a volume in a step: the positive root of change/dt² − g/dt − h.
 template <class T, int D>
 MPM_HD T deformation_rate(const SurveyArguments<T, D>& a, const One<T>& at, const T& inverse_inertia, const T& speed) {
-  constexpr double change = 0.5;  // LARGEST_CHANGE of torch_mpm/cfl.py
+  constexpr double change = 0.5;  // of torch_mpm/cfl.py
   T gradient = T(std::sqrt(a.bound)) * speed;
   if (a.C.pointer) gradient = root_of_squares(gradient, norm(load_matrix<D>(at, a.C)));
   T growth = norm(load_matrix<D>(at, a.stress)) * inverse_inertia;

@@ -53,7 +53,8 @@ def _fake(
     x: Tensor, v: Tensor, mass: Tensor, volume: Tensor, C: Any, F: Any, J: Any, history: list[Tensor], *rest: Any
 ) -> tuple[Tensor | None, ...]:
     P, D = sizes(x, "x", 2)
-    wants_C, scenes = rest[10], rest[-5]
+    given = dict(zip(list(_SCHEMA)[8:], rest, strict=True))
+    wants_C, scenes = given["wants_C"], given["scenes"]
     return (
         soa_empty(x, (P, D)),
         soa_empty(x, (P, D)),
@@ -108,7 +109,7 @@ def _backward(ctx: Any, *grads: Any) -> Any:
     found["parameters"] = _of_parameters(found["parameters"], parameters, wanted["parameters"], given["scene"])
     if wanted["gravity"]:
         scenes, dim = given["gravity"].shape
-        found["gravity"] = given["dt"] * found["gravity"].reshape(scenes, -1, dim).sum(1)
+        found["gravity"] = given["dt"] * found["gravity"].reshape(scenes, math.prod(given["layout"][2:]), dim).sum(1)
     lists = ("history", "parameters")
     return tuple(found.get(name) if name in lists or wanted[name] is True else None for name in _SCHEMA)
 

@@ -120,7 +120,7 @@ class Simulation:
         self.emitted = 0
         self.fingerprint = ""
         self._figures: dict[str, Any] = {}
-        self._survey: list[list[float]] | None = None  # of the present state
+        self._survey: list[list[float]] | None = None  # rates, speeds and wrong particles of the present state
 
     # -- output
 
@@ -284,7 +284,7 @@ class Simulation:
             self._emit(now + rounding)
             if self._survey is None:
                 self.state = self.state.replace(time=now).sorted(self.step.grid)
-                self._survey = self._look().tolist()
+                self._survey = torch.stack(self.step.survey(self.state)).tolist()
             rates, speeds, _ = self._survey
             following = self.emissions[self.emitted][0] if self.emitted < len(self.emissions) else math.inf
             target = min(end, following) if following > now + rounding else end
@@ -300,10 +300,6 @@ class Simulation:
         self.state = self.state.replace(time=end)  # which `now` is but for rounding
         self.totals.largest_cfl = max(self.totals.largest_cfl, largest)
         return largest
-
-    def _look(self) -> Tensor:
-        """Rates, speeds and wrong particles of the scenes of the present state."""
-        return torch.stack(self.step.survey(self.state))
 
     def _choose_dt(self, span: float, rates: list[float]) -> tuple[float, int]:
         """Time step and number of steps that fill ``span``, for the limits of the scenes [1/s]."""
@@ -350,7 +346,8 @@ class Simulation:
         """
         grid = self.step.grid
         self.state = rollout(self.step, good, steps, dt).replace(time=until)
-        survey, ordered = self._look(), self.state.sorted(grid)
+        ordered = self.state.sorted(grid)
+        survey = torch.stack(self.step.survey(ordered))
         figures = survey.tolist()
         status = [] if self.step.status is None else self.step.status.tolist()
         if status and grid.grows and grid.max_blocks is not None and status[0][BLOCKS_WANTED] > grid.max_blocks:

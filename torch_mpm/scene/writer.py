@@ -47,7 +47,7 @@ class FrameWriter:
         self.waited = 0.0
         self._saved = time.perf_counter()
         self._unsaved: Job | None = None  # the latest frame, where it has no checkpoint
-        self._finished = False
+        self._finished = self._failed = False
         self._error: BaseException | None = None
         self._jobs: queue.Queue[Job | None] = queue.Queue(maxsize=2)
         self._thread = threading.Thread(target=self._work, name="torch_mpm frame writer", daemon=True)
@@ -114,18 +114,19 @@ class FrameWriter:
             self._attempt(self._save, self._unsaved)
 
     def _attempt(self, action: Callable[[Job], None], job: Job) -> None:
-        """An action whose error the next call of the main thread raises; none after an error."""
+        """An action whose error the next call of the main thread raises; no more frames after an error."""
         begin = time.perf_counter()
         try:
-            if self._error is None:
+            if not self._failed or action == self._save:
                 action(job)
         except BaseException as error:
-            self._error = error
+            self._error, self._failed = error, True
         self.seconds += time.perf_counter() - begin
 
     def _write(self, job: Job) -> None:
         if job.ready is not None:
             job.ready.synchronize()
+            job.sources.clear()
         values = {k: v.numpy() if isinstance(v, Tensor) else np.asarray(v) for k, v in job.values.items()}
         self.trajectory.write(job.frame, values)
         self._unsaved = job
