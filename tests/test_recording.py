@@ -52,6 +52,18 @@ def test_a_hook_acts_before_its_step(device):
     torch.testing.assert_close(found.end.x, end.x, rtol=tolerance, atol=tolerance)
 
 
+def test_a_hook_may_write_into_the_state(device):
+    step, state = fall(), blob(device)
+    before = state.v.clone()
+
+    def hook(state: mpm.State, k: int) -> None:
+        state.v.add_(1.0)
+
+    with torch.no_grad():
+        found = mpm.frames(step, state.replace(v=state.v.clone()), 2, DT, hook=hook)
+    assert torch.equal(found.fields["v"][0], before)
+
+
 @pytest.mark.parametrize("checkpoint", [None, 2])
 def test_gradients_pass_through_frames_and_controls(checkpoint, device):
     """A loss on every frame, by controls over time: as single steps give it."""

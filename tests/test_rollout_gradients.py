@@ -213,6 +213,16 @@ def test_a_pool_that_grows():
     assert_same(gradients(in_op(3, 8, dt), step, state), expected)
 
 
+def test_no_scenes(device):
+    gravity = torch.zeros(0, 2, dtype=F64, device=device, requires_grad=True)
+    step = mpm.Step(mpm.Grid(1 / 16, (0.0, 0.0), (1.0, 1.0), scenes=0), mpm.NeoHookean(E=1e4, nu=0.3), gravity)
+    state = blob(device, 2, 0)
+    state = state.replace(scene=torch.zeros(0, dtype=torch.int32, device=device))
+    end = mpm.rollout(step, state, 3, DT)
+    (found,) = torch.autograd.grad(end.x.sum() + end.v.sum(), [gravity], allow_unused=True)
+    assert found is None or found.shape == (0, 2)
+
+
 def test_no_particles(device):
     step = mpm.Step(box(), with_gradients(mpm.VonMises(E=1e4, nu=0.3, yield_stress=1.0)), pulled(3)).to(device)
     for gradient in gradients(in_op(), step, step.prepare(blob(device, count=0))).values():

@@ -158,6 +158,19 @@ def test_batches_with_obstacles_and_parameters_of_scenes_and_particles(dim, devi
         assert_equal(mpm.rollout(step, state, 6, 1e-4), one_by_one(step, state, 6, 1e-4))
 
 
+def test_obstacles_come_and_go_in_the_substeps_of_single_steps(device):
+    """0.1 added eight times is less than 0.8, by rounding: the time is added up in the op too."""
+    state, dt = blob(device), 0.1
+    state = state.replace(v=1e-3 * state.v)
+    assert sum(dt for _ in range(8)) < 0.8
+    wall = {"kind": "sticky", "start": 0.8, "end": 1.5}
+    step = mpm.Step(box(), mpm.NeoHookean(E=1e-9, nu=0.3), boundaries=[mpm.Sphere((0.5,) * 3, 0.3, **wall)])
+    assert in_one_op(step, state)
+    with torch.no_grad():
+        for n in (8, 9, 10, 14, 15, 16, 17, 20):
+            assert_equal(mpm.rollout(step, state, n, dt), one_by_one(step, state, n, dt), f"{n} steps")
+
+
 # ---- the pool of blocks
 
 
@@ -311,7 +324,9 @@ def test_the_raw_op(device):
     rest = (None, [], [], [], None, None, [], [], [], [], [], [], 0.0, 1, 64, False, *grid.packed)
     call = (*particles, *law, 2, 1e-4, True, True, 0, *rest)
     checks = ("test_schema", "test_faketensor", "test_aot_dispatch_dynamic")
-    torch.library.opcheck(torch.ops.torch_mpm.substeps.default, call, test_utils=checks)
+    for apic, wants_C in ((True, True), (False, True), (False, False)):
+        given = (*call[:18], apic, wants_C, *call[20:])
+        torch.library.opcheck(torch.ops.torch_mpm.substeps.default, given, test_utils=checks)
     for wrong, place, message in (
         ("sand", 12, "law must be one of"),
         ([0, 0], 13, "options must have an entry per law"),

@@ -78,7 +78,8 @@ class SubstepsBackward {
  private:
   Particles<const T> state(int64_t i) const {
     if (i == 0) return first_;
-    return {constant(x_[i]), constant(v_[i]), constant(C_[i]), constant(F_[i]), constant(J_[i]), constant(history_[i])};
+    const int64_t k = i - 1;
+    return {constant(x_[k]), constant(v_[k]), constant(C_[k]), constant(F_[k]), constant(J_[k]), constant(history_[k])};
   }
 
   // Of obstacles. On CUDA the statuses count it.
@@ -100,7 +101,7 @@ class SubstepsBackward {
   void record() {
     for (int64_t i = 0; i < in_.n; i++) {
       begin(i);
-      s_.write({x_[i + 1], v_[i + 1], C_[i + 1], F_[i + 1], J_[i + 1], history_[i + 1]});
+      s_.write({x_[i], v_[i], C_[i], F_[i], J_[i], history_[i]});
       if (has(in_.material)) keep_others(i);
       s_.move(stream_);
     }
@@ -110,11 +111,11 @@ class SubstepsBackward {
   void keep_others(int64_t i) {
     if (s_.plastic) {
       Tensor mapped = mapped_.view(i);
-      torch::stable::copy_(mapped, i == 0 ? in_.F.value() : F_.view(i));
+      torch::stable::copy_(mapped, i == 0 ? in_.F.value() : F_.view(i - 1));
     }
     if (s_.columns > 0) {
-      Tensor after = history_.view(i + 1);
-      torch::stable::copy_(after, i == 0 ? torch::stable::unsqueeze(first_history_, 2) : history_.view(i));
+      Tensor after = history_.view(i);
+      torch::stable::copy_(after, i == 0 ? torch::stable::unsqueeze(first_history_, 2) : history_.view(i - 1));
     }
   }
 
@@ -170,12 +171,12 @@ void SubstepsBackward<T, D>::make_records() {
   const Tensor& x = in_.x;
   const int64_t n = in_.n;
   status_ = empty_int(x, {n, 1 + in_.scenes, kStatusSize});
-  x_ = Record<T>(x, n + 1, D);
-  v_ = Record<T>(x, n + 1, D);
-  if (mls_ || in_.wants_C) C_ = Record<T>(x, n + 1, D, D);
-  if (has(in_.F)) F_ = Record<T>(x, n + 1, D, D);
-  if (has(in_.J)) J_ = Record<T>(x, n + 1);
-  if (s_.columns > 0) history_ = Record<T>(x, n + 1, s_.columns);
+  x_ = Record<T>(x, n, D);
+  v_ = Record<T>(x, n, D);
+  if (mls_ || in_.wants_C) C_ = Record<T>(x, n, D, D);
+  if (has(in_.F)) F_ = Record<T>(x, n, D, D);
+  if (has(in_.J)) J_ = Record<T>(x, n);
+  if (s_.columns > 0) history_ = Record<T>(x, n, s_.columns);
   stress_ = Record<T>(x, n, D, D);
   if (s_.plastic) mapped_ = Record<T>(x, n, D, D);
   if (has(in_.material)) stress_.clear();  // of particles without a law
@@ -222,8 +223,8 @@ void SubstepsBackward<T, D>::leave_advance(int64_t i, Adjoints& adjoints) {
   AdvanceBackwardArguments<T, D> a;
   a.forward.particles = in_.x.size(0);
   a.forward.x = s_.p2g.x;
-  a.forward.velocity = constant(v_[i + 1]);
-  a.forward.affine = mls_ ? constant(C_[i + 1]) : field<const T>(gradient_);
+  a.forward.velocity = constant(v_[i]);
+  a.forward.affine = mls_ ? constant(C_[i]) : field<const T>(gradient_);
   a.forward.F = s_.advance.F;
   a.forward.J = s_.advance.J;
   a.forward.dt = in_.dt;
