@@ -1,6 +1,7 @@
 #pragma once
 
 #include <utility>
+#include <vector>
 
 #include "common/backend.h"
 
@@ -39,8 +40,8 @@ void with_team(int64_t, const Work& work) {
 class Recorder {
  public:
   static Recorder& of_this_thread() {
-    static thread_local Recorder recorder;  // has no end: CUDA may be gone by then
-    return recorder;
+    static thread_local Recorder* const recorder = new Recorder;  // has no end: CUDA may be gone by then
+    return *recorder;
   }
 
   template <class Work>
@@ -57,9 +58,13 @@ class Recorder {
       throw;
     }
     check(cudaStreamEndCapture(stream_, &graph));
+    if (const auto shape = shape_of_graph(graph); shape != shape_) {
+      forget();
+      shape_ = shape;
+    }
     cudaGraphExecUpdateResultInfo info;
     if (executable_ && cudaGraphExecUpdate(executable_, graph, &info) != cudaSuccess) {
-      cudaGetLastError();  // of another shape, which is no error
+      cudaGetLastError();  // which is no error: another graph takes its place
       forget();
     }
     const cudaError_t made = executable_ ? cudaSuccess : cudaGraphInstantiate(&executable_, graph, 0);
@@ -82,6 +87,17 @@ class Recorder {
     device_ = device;
   }
 
+  // The kinds of its nodes, which an update cannot change.
+  static std::vector<cudaGraphNodeType> shape_of_graph(cudaGraph_t graph) {
+    size_t count = 0;
+    check(cudaGraphGetNodes(graph, nullptr, &count));
+    std::vector<cudaGraphNode_t> nodes(count);
+    check(cudaGraphGetNodes(graph, nodes.data(), &count));
+    std::vector<cudaGraphNodeType> shape(count);
+    for (size_t k = 0; k < count; k++) check(cudaGraphNodeGetType(nodes[k], &shape[k]));
+    return shape;
+  }
+
   void forget() {  // what still runs is freed when it has ended
     if (executable_) cudaGraphExecDestroy(executable_);
     executable_ = nullptr;
@@ -90,6 +106,7 @@ class Recorder {
   int device_ = -1;
   cudaStream_t stream_ = nullptr;
   cudaGraphExec_t executable_ = nullptr;
+  std::vector<cudaGraphNodeType> shape_;
 };
 
 constexpr int64_t kLeastReplays = 6;  // which a recording has to save its own time

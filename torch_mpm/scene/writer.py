@@ -80,6 +80,7 @@ class FrameWriter:
         self._finished = finished
         self._jobs.put(None)
         self._thread.join()
+        self._unsaved = None  # pinned memory must not outlive CUDA
         self.trajectory.close()
         self.waited += time.perf_counter() - begin
         self._raise()
