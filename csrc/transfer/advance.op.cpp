@@ -33,8 +33,7 @@ std::tuple<Tensor, Tensor, Tensor> advance(const Tensor& x, const Tensor& v, con
                                            const OptionalTensor& scene, const OptionalTensor& scene_dt, double dt) {
   check_positions(x);
   const int64_t P = x.size(0), D_ = x.size(1);
-  Tensor x_next = empty_particles(x, {P, D_}), F_next = result(x, has(F), {P, D_, D_}),
-         J_next = result(x, has(J), {P});
+  Tensor x_next = empty_particles(x, {P, D_}), F_next = result(x, has(F), {P, D_, D_}), J_next = result(x, has(J), {P});
   const DeviceScope device(x);
   dispatch(x, "x", x.size(1), [&]<class T, int D>() {
     auto a = advance_arguments<T, D>(x, v, C, F, J, scene, scene_dt, dt);
