@@ -16,6 +16,7 @@ from typing import Any
 from . import common
 from .accuracy.limits import tables as limit_tables
 from .accuracy.runout import PUBLISHED, published, slopes
+from .speed.rollouts import row_of_steps, row_of_training
 from .stability.adversarial import summary as rollouts
 from .stability.heat import cell as heat_cell
 from .stability.heat import kind as heat_kind
@@ -70,30 +71,13 @@ def as_run(results: list[dict[str, Any]]) -> str:
     """Example scenes, rollouts and training as people run them."""
     notes = [f"- {common.describe(result['environment'])}" for result in results]
     rows = [
-        (
-            result["environment"]["device"],
-            r["name"],
-            r["particles"],
-            r["steps"],
-            r["us"],
-            r["rate"] * 1e-6,
-            r.get("seconds"),
-        )
+        (result["environment"]["device"], *row_of_steps(r), r.get("seconds"))
         for result in results
         for r in (*result["rollouts"], *result["scenes"])
     ]
     header = ("device", "", "particles", "substeps", "us per substep", "M particles/s", "simulation, s")
     training = [
-        (
-            result["environment"]["device"],
-            r["particles"],
-            r["steps"],
-            r["forward"],
-            r["both"],
-            r["memory"] and r["memory"] * 1e-9,
-        )
-        for result in results
-        for r in result["training"]
+        (result["environment"]["device"], *row_of_training(r)) for result in results for r in result["training"]
     ]
     of_training = ("device", "particles", "steps", "forward, s", "forward and backward, s", "memory, GB")
     return "\n".join(

@@ -1,7 +1,7 @@
 """Time of what people run: example scenes, rollouts of many sizes, batches, large domains, and training.
 
-    python -m benchmarks.speed.rollouts                    # CPU, all cores; about 5 minutes
-    python -m benchmarks.speed.rollouts --device cuda      # about 2 minutes
+    python -m benchmarks.speed.rollouts                    # CPU, all cores
+    python -m benchmarks.speed.rollouts --device cuda      # either takes about a minute
     python -m benchmarks.speed.rollouts --out DIRECTORY
 
 Scenes: `torch_mpm.scene.run` with its files; time of the simulation. The others are the neo-Hookean cube of
@@ -139,17 +139,22 @@ def measure(device: str, quick: bool = False) -> dict[str, Any]:
     return result
 
 
+def row_of_steps(r: dict[str, Any]) -> tuple[Any, ...]:
+    return r["name"], r["particles"], r["steps"], r["us"], r["rate"] * 1e-6
+
+
+def row_of_training(r: dict[str, Any]) -> tuple[Any, ...]:
+    return r["particles"], r["steps"], r["forward"], r["both"], r["memory"] and r["memory"] * 1e-9
+
+
 def text(result: dict[str, Any]) -> str:
     """Tables of a result in Markdown."""
     header = ("", "particles", "substeps", "us per substep", "M particles/s")
-    rows = [(r["name"], r["particles"], r["steps"], r["us"], r["rate"] * 1e-6) for r in result["rollouts"]]
+    rows = [row_of_steps(r) for r in result["rollouts"]]
     lines = ["# Speed of what is run", "", common.describe(result["environment"]), "", common.table(header, rows), ""]
-    rows = [(r["name"], r["particles"], r["steps"], r["us"], r["rate"] * 1e-6, r["seconds"]) for r in result["scenes"]]
+    rows = [(*row_of_steps(r), r["seconds"]) for r in result["scenes"]]
     lines += [common.table((*header, "simulation, s"), rows), ""]
-    rows = [
-        (r["particles"], r["steps"], r["forward"], r["both"], r["memory"] and r["memory"] * 1e-9)
-        for r in result["training"]
-    ]
+    rows = [row_of_training(r) for r in result["training"]]
     header = ("training: particles", "steps", "forward, s", "forward and backward, s", "memory, GB")
     return "\n".join([*lines, common.table(header, rows), ""])
 

@@ -50,6 +50,7 @@ struct ActivationTensors {
     a.workspace_size = backend::activate_workspace(a, stream);
     workspace = empty(x, {a.workspace_size}, ScalarType::Byte);
     a.workspace = workspace.data_ptr();
+    a.fresh = true;
     a.table = static_cast<int*>(table.data_ptr());
     a.block = static_cast<int*>(block.data_ptr());
     a.offsets = static_cast<int*>(offsets.data_ptr());

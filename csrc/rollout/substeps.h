@@ -1,7 +1,6 @@
 #pragma once
 
 #include <string>
-#include <utility>
 
 #include "grid/activate.op.h"
 #include "grid/obstacle.op.h"
@@ -211,7 +210,6 @@ struct Substeps {
   Pool<T, D> pool;
   Tensor stress, step_time;
   bool obstacles = false;
-  bool fresh = true;  // whether no activation has used the pool yet
   const int* previous_status = nullptr;
 
   explicit Substeps(const SubstepsInputs& inputs);
@@ -254,17 +252,20 @@ struct Substeps {
   bool activate(const int* previous_status, int* status, backend::Stream stream) {
     activation.previous_status = previous_status;
     activation.status = status;
-    activation.fresh = std::exchange(fresh, false);
     if (MPM_BACKEND != MPM_BACKEND_IS_cpu) contact.activations = status + kActivations;
-    backend::activate(in.lattice.order(), activation, stream);
+    find_blocks(stream);
     if (MPM_BACKEND != MPM_BACKEND_IS_cpu || status[kBlocksNow] <= activation.max_blocks) return true;
     if (!in.grows) return false;
     const int64_t most = std::min<int64_t>(update.block_count, INT32_MAX / kBlockNodes<D>);
     activation.max_blocks = int(std::min(with_headroom(status[kBlocksNow]), most));
     make_pool(stream);
-    activation.fresh = std::exchange(fresh, false);
-    backend::activate(in.lattice.order(), activation, stream);
+    find_blocks(stream);
     return true;
+  }
+
+  void find_blocks(backend::Stream stream) {
+    backend::activate(in.lattice.order(), activation, stream);
+    activation.fresh = false;
   }
 
   // The time of obstacles, added up as single steps do: by a device itself, where the host may not be there.
@@ -358,7 +359,6 @@ Substeps<T, D>::Substeps(const SubstepsInputs& inputs) : in(inputs) {
 template <class T, int D>
 void Substeps<T, D>::make_pool(backend::Stream stream) {
   pool.make(in.x, activation, obstacles, stream);
-  fresh = true;
   const Topology<T, D> topology = topology_of(activation);
   p2g.topology = advance.gather.topology = topology;
   p2g.nodes = {static_cast<T*>(pool.nodes.data_ptr()), 1 + D, 1 + D};

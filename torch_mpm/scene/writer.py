@@ -110,16 +110,16 @@ class FrameWriter:
 
     def _work(self) -> None:
         while (job := self._jobs.get()) is not None:
-            self._attempt(self._write, job)
+            if not self._failed:
+                self._attempt(self._write, job)
         if self._unsaved is not None and not self._finished:
             self._attempt(self._save, self._unsaved)
 
     def _attempt(self, action: Callable[[Job], None], job: Job) -> None:
-        """An action whose error the next call of the main thread raises; no more frames after an error."""
+        """An action whose error the next call of the main thread raises."""
         begin = time.perf_counter()
         try:
-            if not self._failed or action == self._save:
-                action(job)
+            action(job)
         except BaseException as error:
             self._error, self._failed = error, True
         self.seconds += time.perf_counter() - begin
