@@ -26,6 +26,31 @@ __device__ bool locate_in_block(const Topology<T, D>& t, int scene, int base_blo
   return inside && block_index(t.geometry, scene, block) == base_block;
 }
 
+// The slot of the block with the base node of a particle, wherever that is, -1 where there is none; and the base node
+// relative to it, and the distances from that.
+template <int Order, class T, int D>
+__device__ int locate_slot(const Topology<T, D>& t, int scene, const Vector<T, D>& x, int* base, T* f) {
+  if (!locate<Order>(t.geometry, x.e, base, f)) return -1;
+  int block[D];
+#pragma unroll
+  for (int i = 0; i < D; i++) {
+    block[i] = base[i] / kBlockWidth;
+    base[i] %= kBlockWidth;
+  }
+  return t.table[block_index(t.geometry, scene, block)];
+}
+
+// The blocks that the support of a base node reaches, given relative to its own: a bit for each of the neighbours in
+// the schedule.
+template <int Order, int D>
+__device__ unsigned touched_blocks(const int* base) {
+  unsigned touched = 1;
+#pragma unroll
+  for (int i = D - 1; i >= 0; i--)
+    if (base[i] + Order >= kBlockWidth) touched |= touched << (1 << (D - 1 - i));
+  return touched;
+}
+
 // The base block of a thread block: its base nodes lie in [first, end), as numbers of type T.
 template <class T, int D>
 struct BaseBlock {

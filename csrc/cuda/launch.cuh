@@ -41,4 +41,16 @@ void launch(void (*kernel)(Parameters...), unsigned blocks, unsigned threads, si
   check(cudaGetLastError());
 }
 
+// Thread blocks that run all at once and may wait for each other, as many as the device takes of `blocks`.
+template <class... Parameters, class... Arguments>
+void launch_together(void (*kernel)(Parameters...), unsigned blocks, unsigned threads, cudaStream_t stream,
+                     Arguments... arguments) {
+  int fitting = 0;
+  check(cudaOccupancyMaxActiveBlocksPerMultiprocessor(&fitting, kernel, int(threads), 0));
+  const unsigned most = unsigned(fitting * device_attribute(cudaDevAttrMultiProcessorCount));
+  void* pointers[] = {&arguments...};
+  check(cudaLaunchCooperativeKernel(reinterpret_cast<const void*>(kernel), std::clamp(blocks, 1u, most), threads,
+                                    pointers, 0, stream));
+}
+
 }  // namespace mpm::cuda

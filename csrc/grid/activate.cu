@@ -1,9 +1,11 @@
+#include <cooperative_groups.h>
+
 #include <climits>
 #include <cub/block/block_scan.cuh>
 #include <cub/device/device_radix_sort.cuh>
 
+#include "cuda/base_block.cuh"
 #include "cuda/launch.cuh"
-#include "cuda/schedule.h"
 #include "grid/activate.h"
 #include "grid/status.h"
 
@@ -12,6 +14,7 @@
 //   slots      numbers the active blocks in the order of the table (one-pass scan)
 //   offsets    first particle and work items of every slot (one-pass scan)
 //   place      the index tensor, base blocks and neighbours, unused slots, status
+// One kernel does all of it where an activation may last several steps, if only to find that it still does.
 // The scans pass over tiles of the table. Where it has many, over those alone that have active blocks, which `classify`
 // marks and `list_tiles` lists in their order; what they wrote is taken back before the next activation.
 // Deterministic mode replaces the ranks, which depend on the order of atomics, by a stable sort.
@@ -29,7 +32,8 @@ using Packed = unsigned long long;
 struct Counters {
   int tile[2];  // tiles handed out by each scan
   int tail;     // particles that are not transferred
-  int wanted;   // active blocks
+  int wanted;   // active blocks, without
+  int margin;   // those around them
   int transferred, items;
   int groups, warps;  // of the thread blocks sampled
 };
@@ -103,7 +107,7 @@ Workspace lay_out(const ActivateArguments<T, D>& a) {
     w.slot_sorted = reinterpret_cast<int*>(take(a.particles * sizeof(int)));
     w.id = reinterpret_cast<int*>(take(a.particles * sizeof(int)));
     check(cub::DeviceRadixSort::SortPairs(nullptr, w.sort_size, w.slot, w.slot_sorted, w.id, a.index, int(a.particles),
-                                          0, bits_for(a.max_blocks)));
+                                          0, bits_for(a.slots())));
     w.sort = take(int64_t(w.sort_size));
   }
   return w;
@@ -132,16 +136,39 @@ __device__ int further(const Geometry<T, D>& g, int o) {
   return way;
 }
 
-// The tiles of the blocks that particles of a base block touch.
+// Calls f(block) for the blocks around one, itself included.
+template <class T, int D, class F>
+__device__ void for_surroundings(const Geometry<T, D>& g, int b, const F& f) {
+  int block[D];
+  block_coordinates(g, b, block);
+  constexpr int count = D == 2 ? 9 : 27;
+  for (int o = 0; o < count; o++) {
+    int way = 0;
+    bool inside = true;
+#pragma unroll
+    for (int i = 0, rest = o; i < D; i++, rest /= 3) {
+      const int step = rest % 3 - 1;
+      way = way * g.blocks[i] + step;
+      inside = inside && unsigned(block[i] + step) < unsigned(g.blocks[i]);
+    }
+    if (inside) f(b + way);
+  }
+}
+
+// The tiles of the blocks that particles of a base block touch, or of all around it.
 template <class T, int D>
 __device__ void mark_tiles(const ActivateArguments<T, D>& a, const Workspace& w, int key, unsigned touched) {
+  if (a.margin_blocks > 0) {
+    for_surroundings(a.geometry, key, [&](int b) { w.marked[b / kThreads] = 1; });
+    return;
+  }
   for (int o = 0; o < 1 << D; o++)
     if (touched >> o & 1) w.marked[(key + further(a.geometry, o)) / kThreads] = 1;
 }
 
 // What the activation before wrote in the table and the tally.
 template <class T, int D>
-__global__ void __launch_bounds__(kThreads) take_back(const ActivateArguments<T, D> a, const Workspace w, int table) {
+__device__ void take_back(const ActivateArguments<T, D>& a, const Workspace& w, int table) {
   for (int i = int(blockIdx.x); i < *w.listed; i += int(gridDim.x)) {
     const int64_t b = int64_t(w.list[i]) * kThreads + threadIdx.x;
     if (b >= table) continue;
@@ -151,12 +178,12 @@ __global__ void __launch_bounds__(kThreads) take_back(const ActivateArguments<T,
 }
 
 // By one thread block: the marked tiles in their order.
-constexpr int kListers = 1024;
-__global__ void __launch_bounds__(kListers) list_tiles(const Workspace w) {
-  using Scan = cub::BlockScan<int, kListers>;
+template <int Threads>
+__device__ void list_tiles(const Workspace& w) {
+  using Scan = cub::BlockScan<int, Threads>;
   __shared__ typename Scan::TempStorage storage;
   int listed = 0;
-  for (int64_t begin = 0; begin < w.tiles; begin += kListers * int64_t(sizeof(uint4))) {
+  for (int64_t begin = 0; begin < w.tiles; begin += Threads * int64_t(sizeof(uint4))) {
     const int64_t first = begin + threadIdx.x * int64_t(sizeof(uint4));
     uint4 marks = first < w.tiles ? *reinterpret_cast<const uint4*>(w.marked + first) : uint4{};
     int place, total;
@@ -171,9 +198,10 @@ __global__ void __launch_bounds__(kListers) list_tiles(const Workspace w) {
   if (threadIdx.x == 0) *w.listed = listed;
 }
 
+// Particles [kThreads piece, kThreads (piece + 1)).
 template <int Order, class T, int D>
-__global__ void __launch_bounds__(kThreads) classify(const ActivateArguments<T, D> a, const Workspace w) {
-  const int64_t p = int64_t(blockIdx.x) * kThreads + threadIdx.x;
+__device__ void classify(const ActivateArguments<T, D>& a, const Workspace& w, int64_t piece) {
+  const int64_t p = piece * kThreads + threadIdx.x;
   const bool exists = p < a.particles;
   T x[D], f[D];
   int base[D], key = -1;
@@ -184,13 +212,14 @@ __global__ void __launch_bounds__(kThreads) classify(const ActivateArguments<T, 
     const bool finite = is_finite<D>(x);
     const int scene = a.scene ? a.scene[p * a.scene_stride] : 0;
     if (finite && unsigned(scene) < unsigned(a.scenes) && locate<Order>(a.geometry, x, base, f)) {
-      touched = 1;
+      int block[D];
 #pragma unroll
-      for (int i = D - 1; i >= 0; i--) {
-        if ((base[i] & (kBlockWidth - 1)) + Order >= kBlockWidth) touched |= touched << (1 << (D - 1 - i));
-        base[i] /= kBlockWidth;
+      for (int i = 0; i < D; i++) {
+        block[i] = base[i] / kBlockWidth;
+        base[i] %= kBlockWidth;
       }
-      key = block_index(a.geometry, scene, base);
+      touched = touched_blocks<Order, D>(base);
+      key = block_index(a.geometry, scene, block);
     } else {
       report(a, w.trouble, finite, scene, int(p));
     }
@@ -199,7 +228,7 @@ __global__ void __launch_bounds__(kThreads) classify(const ActivateArguments<T, 
   const unsigned group = __match_any_sync(~0u, exists ? key : INT_MIN);
   const unsigned before = group & ((1u << threadIdx.x % 32) - 1);
   const unsigned touched_by_group = __reduce_or_sync(group, touched);
-  if (blockIdx.x % kSampling == 0) {
+  if (piece % kSampling == 0) {
     const int groups = __popc(__ballot_sync(~0u, exists && before == 0));
     if (threadIdx.x % 32 == 0) {
       atomicAdd(&w.counters->groups, groups);
@@ -214,8 +243,8 @@ __global__ void __launch_bounds__(kThreads) classify(const ActivateArguments<T, 
       Tally* tally = w.tally + key;
       first = atomicAdd(&tally->count, __popc(group));
       if (touched_by_group & ~*const_cast<volatile int*>(&tally->touched)) {
-        const unsigned known = atomicOr(&tally->touched, int(touched_by_group));
-        if (w.marked) mark_tiles(a, w, key, touched_by_group & ~known);
+        atomicOr(&tally->touched, int(touched_by_group));
+        if (w.marked) mark_tiles(a, w, key, touched_by_group);
       }
     }
   }
@@ -282,16 +311,28 @@ __device__ int next_tile(int* counter) {
   return tile;
 }
 
-// Calls body(number, first) with the number and the first table entry of tile after tile.
+// Calls body(number, first, last) with the number and the first table entry of tile after tile, of which a thread block
+// has one alone where as many run as there are tiles.
 template <class F>
 __device__ void each_tile(const Workspace& w, int* counter, const F& body) {
   const int count = w.marked ? *w.listed : w.tiles;
-  for (int tile; (tile = next_tile(counter)) < count;)
+  const bool more = w.marked || int(gridDim.x) < count;
+  for (int tile; (tile = next_tile(counter)) < count;) {
     body(tile, (w.marked ? w.list[tile] : tile) * kThreads, tile == count - 1);
+    if (!more) break;
+  }
+}
+
+// Whether particles lie in one of the blocks around a block.
+template <class T, int D>
+__device__ bool is_near_particles(const Geometry<T, D>& g, const Workspace& w, int b) {
+  bool near = false;
+  for_surroundings(g, b, [&](int c) { near = near || w.tally[c].count > 0; });
+  return near;
 }
 
 template <class T, int D>
-__global__ void __launch_bounds__(kThreads) slots(const ActivateArguments<T, D> a, const Workspace w, int table) {
+__device__ void slots(const ActivateArguments<T, D>& a, const Workspace& w, int table) {
   each_tile(w, &w.counters->tile[0], [&](int tile, int first, bool last) {
     const int b = first + int(threadIdx.x);
     bool active = false;
@@ -306,17 +347,22 @@ __global__ void __launch_bounds__(kThreads) slots(const ActivateArguments<T, D> 
         if (inside) active = active || w.tally[b - further(a.geometry, o)].touched >> o & 1;
       }
     }
-    const int slot = first_of(exclusive_sum(active, w.slot_states, tile));
-    if (last && threadIdx.x == kThreads - 1) w.counters->wanted = slot + active;
+    const bool margin = a.margin_blocks > 0 && b < table && !active && is_near_particles(a.geometry, w, b);
+    const Packed before = exclusive_sum(pack(active, margin), w.slot_states, tile);
+    if (last && threadIdx.x == kThreads - 1) {
+      w.counters->wanted = first_of(before) + active;
+      w.counters->margin = second_of(before) + margin;
+    }
     if (b >= table) return;
-    const bool given = active && slot < a.max_blocks;
+    const int slot = margin ? a.max_blocks + second_of(before) : first_of(before);
+    const bool given = (active && slot < a.max_blocks) || (margin && slot < a.slots());
     a.table[b] = given ? slot : -1;
     if (given) a.block[slot] = b;
   });
 }
 
 template <class T, int D>
-__global__ void __launch_bounds__(kThreads) offsets(const ActivateArguments<T, D> a, const Workspace w, int table) {
+__device__ void offsets(const ActivateArguments<T, D>& a, const Workspace& w, int table) {
   each_tile(w, &w.counters->tile[1], [&](int tile, int first, bool last) {
     const int b = first + int(threadIdx.x);
     int count = 0, items = 0, slot = -1;
@@ -338,9 +384,9 @@ __global__ void __launch_bounds__(kThreads) offsets(const ActivateArguments<T, D
       w.counters->items = item + items;
     }
     if (b >= table) return;
-    if (slot >= 0) a.offsets[slot] = start;
+    if (slot >= 0 && slot < a.max_blocks) a.offsets[slot] = start;
     if (count > 0) w.tally[b].count = start;
-    int4* const out = reinterpret_cast<int4*>(lay_out_schedule<D>(a.schedule, a.max_blocks, a.particles).items) + item;
+    int4* const out = reinterpret_cast<int4*>(lay_out_schedule<D>(a.schedule, a.slots(), a.particles).items) + item;
     for (int k = 0; k < items; k++) {
       const int begin = start + int(int64_t(count) * k / items), end = start + int(int64_t(count) * (k + 1) / items);
       out[k] = make_int4(slot, begin, end, b);
@@ -370,7 +416,7 @@ __device__ void write_status(const ActivateArguments<T, D>& a, const Workspace& 
   }
   if (row > 0) return;
   status[kActivations]++;
-  status[kBlocksWanted] = max(status[kBlocksWanted], wanted);
+  status[kBlocksWanted] = ::max(status[kBlocksWanted], wanted);
   status[kBlocksNow] = wanted;
 }
 
@@ -392,33 +438,97 @@ __device__ void write_neighbours(const ActivateArguments<T, D>& a, int b, int ne
   }
 }
 
+// Slot i, particle i, and row i of the status.
 template <class T, int D>
-__global__ void __launch_bounds__(kThreads) place(const ActivateArguments<T, D> a, const Workspace w) {
+__device__ void place(const ActivateArguments<T, D>& a, const Workspace& w, int64_t i) {
   const Counters& c = *w.counters;
-  const Schedule<int> schedule = lay_out_schedule<D>(a.schedule, a.max_blocks, a.particles);
-  const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
+  const Schedule<int> schedule = lay_out_schedule<D>(a.schedule, a.slots(), a.particles);
   if (i == 0) {
     *schedule.item_count = c.items;
     *schedule.scattered = c.groups > kScattered * c.warps;
   }
   if (i <= a.scenes) write_status(a, w, int(i));
-  if (i < min(c.wanted, a.max_blocks)) {
-    write_neighbours(a, a.block[i], schedule.neighbours + (i << D));
-  } else if (i <= a.max_blocks) {
-    a.offsets[i] = c.transferred;
-    if (i < a.max_blocks) a.block[i] = -1;
-  }
+  const bool with_particles = i < min(c.wanted, a.max_blocks);
+  const bool given = with_particles || (i >= a.max_blocks && i < a.slots() && i - a.max_blocks < c.margin);
+  if (given) write_neighbours(a, a.block[i], schedule.neighbours + (i << D));
+  if (!given && i < a.slots()) a.block[i] = -1;
+  if (!with_particles && i <= a.slots()) a.offsets[i] = c.transferred;
   if (i >= a.particles) return;
   const int key = w.key[i], first = key < 0 ? -1 : w.tally[key].count, base_slot = first < 0 ? -1 : a.table[key];
   schedule.base_slot[i] = base_slot;
   if (a.deterministic) {
-    w.slot[i] = base_slot < 0 ? a.max_blocks : base_slot;
+    w.slot[i] = base_slot < 0 ? a.slots() : base_slot;
     w.id[i] = int(i);
   } else {
     const int rank = w.rank[i];
     a.index[first < 0 ? a.particles + first - rank : first + rank] = int(i);
   }
 }
+
+// ---- Kernels
+
+template <class T, int D>
+__global__ void __launch_bounds__(kThreads) take_back_kernel(const ActivateArguments<T, D> a, const Workspace w, int n) {
+  take_back(a, w, n);
+}
+
+template <int Order, class T, int D>
+__global__ void __launch_bounds__(kThreads) classify_kernel(const ActivateArguments<T, D> a, const Workspace w) {
+  classify<Order>(a, w, blockIdx.x);
+}
+
+constexpr int kListers = 1024;
+__global__ void __launch_bounds__(kListers) list_tiles_kernel(const Workspace w) { list_tiles<kListers>(w); }
+
+template <class T, int D>
+__global__ void __launch_bounds__(kThreads) slots_kernel(const ActivateArguments<T, D> a, const Workspace w, int n) {
+  slots(a, w, n);
+}
+
+template <class T, int D>
+__global__ void __launch_bounds__(kThreads) offsets_kernel(const ActivateArguments<T, D> a, const Workspace w, int n) {
+  offsets(a, w, n);
+}
+
+template <class T, int D>
+__global__ void __launch_bounds__(kThreads) place_kernel(const ActivateArguments<T, D> a, const Workspace w) {
+  place(a, w, int64_t(blockIdx.x) * kThreads + threadIdx.x);
+}
+
+// All of it, in tensors as the activation before has left them; or another row of the status where that one lasts. The
+// thread blocks all run at once and wait for each other.
+template <int Order, class T, int D>
+__global__ void __launch_bounds__(kThreads)
+    activate_again(const ActivateArguments<T, D> a, const Workspace w, int table, int64_t rows) {
+  const int64_t start = int64_t(blockIdx.x) * kThreads + threadIdx.x, stride = int64_t(gridDim.x) * kThreads;
+  if (a.drift->lasts(a.particles)) {
+    for (int64_t row = start; row <= a.scenes; row += stride) {
+      int* const status = a.status + row * kStatusSize;
+      copy_status(a.previous_status + row * kStatusSize, status);
+      if (row == 0) status[kActivations]++;
+    }
+    return;
+  }
+  const auto all = cooperative_groups::this_grid();
+  if (w.marked) take_back(a, w, table);
+  int4* const workspace = static_cast<int4*>(a.workspace);
+  for (int64_t i = start; i < (w.marked ? w.zeroed : w.zeroed_once) / int64_t(sizeof(int4)); i += stride)
+    workspace[i] = {};
+  all.sync();
+  for (int64_t piece = blockIdx.x; piece * kThreads < a.particles; piece += gridDim.x) classify<Order>(a, w, piece);
+  all.sync();
+  if (w.marked) {
+    if (blockIdx.x == 0) list_tiles<kThreads>(w);
+    all.sync();
+  }
+  slots(a, w, table);
+  all.sync();
+  offsets(a, w, table);
+  all.sync();
+  for (int64_t i = start; i < rows; i += stride) place(a, w, i);
+}
+
+unsigned blocks_for(int64_t threads) { return unsigned((threads + kThreads - 1) / kThreads); }
 
 }  // namespace
 
@@ -431,26 +541,30 @@ template <int Order, class T, int D>
 void activate(const ActivateArguments<T, D>& a, Stream stream) {
   const Workspace w = lay_out(a);
   const int table = a.scenes * a.geometry.blocks_per_scene;
-  const auto blocks = [](int64_t count) { return unsigned((count + kThreads - 1) / kThreads); };
+  // Of slots with their end, or of the status; and of particles.
+  const int64_t rows = std::max(a.particles, int64_t(std::max(a.slots(), a.scenes)) + 1);
+  if (a.drift && !a.fresh) {
+    launch_together(activate_again<Order, T, D>, blocks_for(rows), kThreads, stream, a, w, table, rows);
+    return;
+  }
   // Of the tiles listed no more have to run at once than the device takes.
-  const unsigned tiles = w.marked ? std::min<unsigned>(blocks(table), grid_size(a.max_blocks + 1)) : blocks(table);
+  const unsigned tiles = w.marked ? std::min(blocks_for(table), grid_size(a.slots() + 1)) : blocks_for(table);
   if (w.marked && !a.fresh)
-    launch(take_back<T, D>, tiles, kThreads, 0, stream, a, w, table);
+    launch(take_back_kernel<T, D>, tiles, kThreads, 0, stream, a, w, table);
   else if (w.marked)
     check(cudaMemsetAsync(a.table, 0xff, table * sizeof(int), stream));
   check(cudaMemsetAsync(a.workspace, 0, a.fresh || !w.marked ? w.zeroed_once : w.zeroed, stream));
-  if (a.particles > 0) launch(classify<Order, T, D>, blocks(a.particles), kThreads, 0, stream, a, w);
+  if (a.particles > 0) launch(classify_kernel<Order, T, D>, blocks_for(a.particles), kThreads, 0, stream, a, w);
   if (table > 0) {
-    if (w.marked) launch(list_tiles, 1, kListers, 0, stream, w);
-    launch(slots<T, D>, tiles, kThreads, 0, stream, a, w, table);
-    launch(offsets<T, D>, tiles, kThreads, 0, stream, a, w, table);
+    if (w.marked) launch(list_tiles_kernel, 1, kListers, 0, stream, w);
+    launch(slots_kernel<T, D>, tiles, kThreads, 0, stream, a, w, table);
+    launch(offsets_kernel<T, D>, tiles, kThreads, 0, stream, a, w, table);
   }
-  const int64_t rows = int64_t(std::max(a.max_blocks, a.scenes)) + 1;  // of slots with their end, or of the status
-  launch(place<T, D>, blocks(std::max(a.particles, rows)), kThreads, 0, stream, a, w);
+  launch(place_kernel<T, D>, blocks_for(rows), kThreads, 0, stream, a, w);
   if (a.deterministic && a.particles > 0) {
     size_t size = w.sort_size;
     check(cub::DeviceRadixSort::SortPairs(w.sort, size, w.slot, w.slot_sorted, w.id, a.index, int(a.particles), 0,
-                                          bits_for(a.max_blocks), stream));
+                                          bits_for(a.slots()), stream));
   }
 }
 

@@ -1,6 +1,7 @@
 #pragma once
 
 #include "common/fields.h"
+#include "common/host_device.h"
 #include "grid/topology.h"
 
 namespace mpm {
@@ -10,6 +11,7 @@ struct ActivateArguments {
   Geometry<T, D> geometry;
   int scenes = 1;
   int max_blocks = 0;
+  int margin_blocks = 0;  // slots more, for blocks around those with particles that no particle touches yet
   int64_t particles = 0;
   bool deterministic = false;
   Field<const T> x;
@@ -23,6 +25,9 @@ struct ActivateArguments {
   void* workspace = nullptr;  // bytes asked for by activate_workspace()
   bool fresh = true;          // whether the table and the workspace are not those of an earlier call as they were left
   int64_t workspace_size = 0;
+  const Drift* drift = nullptr;  // since the activation in these tensors; null for a new one in any case
+
+  MPM_HD int slots() const { return max_blocks + margin_blocks; }
 };
 
 }  // namespace mpm

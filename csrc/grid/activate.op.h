@@ -40,7 +40,7 @@ struct ActivationTensors {
   // For the arguments' number of blocks, which then write here.
   template <class T, int D>
   void make(const Tensor& x, ActivateArguments<T, D>& a, backend::Stream stream) {
-    const int64_t slots = a.max_blocks;
+    const int64_t slots = a.slots();
     a.schedule_size = schedule_size<D>(slots, a.particles);
     table = empty_int(x, {a.scenes * a.geometry.blocks_per_scene});
     block = empty_int(x, {slots});

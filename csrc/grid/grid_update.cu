@@ -12,8 +12,13 @@ template <class T, int D>
 __global__ void __launch_bounds__(kThreads) grid_update_kernel(const GridUpdateArguments<T, D> a) {
   const int64_t node = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   const int slot = int(node / kBlockNodes<D>);
+  if (node == 0 && a.drift) *a.drift = {};
   if (slot >= a.max_blocks) return;
-  a.updated[node] = update_node(a, slot_update(a, slot), int(node % kBlockNodes<D>), a.nodes[node]);
+  const SlotUpdate<T, D> s = slot_update(a, slot);
+  if (a.emptied && !s.active) return;
+  const NodeRow<T, D> row = a.nodes[node];
+  a.updated[node] = update_node(a, s, int(node % kBlockNodes<D>), row);
+  if (a.emptied) a.emptied[node] = {};
 }
 
 // A whole warp, or half of one in 2-D, works on a slot and sums over its nodes in a fixed order.

@@ -6,6 +6,7 @@
 
 #include "grid/friction.h"
 #include "grid/geometry.h"
+#include "grid/topology.h"
 
 // Node momentum to node velocity, gravity and the walls of the domain.
 //
@@ -60,6 +61,10 @@ struct GridUpdateArguments {
   double dt = 0;
   Walls<T, D> walls;
   NodeRow<T, D>* updated = nullptr;
+  // Where nodes are written for one call alone, on CUDA: those of unused slots are left as they are, `emptied`, which is
+  // `nodes`, is zeroed on the way unless there are mirrors, and `drift` too, for the particles to come.
+  NodeRow<T, D>* emptied = nullptr;
+  Drift* drift = nullptr;
 };
 
 template <class T, int D>

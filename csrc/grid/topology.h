@@ -21,6 +21,15 @@ struct Topology {
   int64_t schedule_size = 0;
 };
 
+// Where particles are that have moved since their activation, which on CUDA may serve several steps: how many are in
+// other blocks than they were then, and whether one touches a block that is not active.
+struct Drift {
+  int strays, lost;
+
+  // A stray costs several times what another particle does: of a larger share an activation is cheaper.
+  MPM_HD bool lasts(int64_t particles) const { return lost == 0 && int64_t(strays) * 16 <= particles; }
+};
+
 // Entries of the schedule tensor: room for the work items of both backends, with the number of particles of each cell,
 // and for an entry for each particle (the fake kernel in torch_mpm/ops/activation.py has the same formula).
 template <int D>

@@ -127,7 +127,7 @@ struct Pool {
   Tensor nodes, updated, velocity;
 
   void make(const Tensor& x, ActivateArguments<T, D>& a, bool obstacles, backend::Stream stream) {
-    const int64_t rows = int64_t(a.max_blocks) * kBlockNodes<D>;
+    const int64_t rows = int64_t(a.slots()) * kBlockNodes<D>;
     active.make(x, a, stream);
     nodes = empty(x, {rows, 1 + D});
     updated = empty(x, {rows, 1 + D});
@@ -140,7 +140,7 @@ Topology<T, D> topology_of(const ActivateArguments<T, D>& a) {
   Topology<T, D> t;
   t.geometry = a.geometry;
   t.scenes = a.scenes;
-  t.max_blocks = a.max_blocks;
+  t.max_blocks = a.slots();
   t.particles = a.particles;
   t.table = a.table;
   t.block = a.block;
@@ -209,6 +209,7 @@ struct Substeps {
   G2PAdvanceArguments<T, D> advance;
   Pool<T, D> pool;
   Tensor stress, step_time;
+  Tensor drifts;           // one for each of two substeps in turn, where activations last
   bool obstacles = false;
   const int* previous_status = nullptr;
 
@@ -268,6 +269,24 @@ struct Substeps {
     activation.fresh = false;
   }
 
+  // On CUDA an activation may serve several substeps: blocks around those with particles are active too, and G2P tells
+  // when they no longer suffice. Not where sums have an order, which is that of blocks.
+  void let_activations_last() {
+    if (MPM_BACKEND == MPM_BACKEND_IS_cpu || in.lattice.deterministic()) return;
+    drifts = empty_int(in.x, {2, 2});
+    p2g.drifted = true;
+    const int64_t most = std::min<int64_t>(update.block_count, INT32_MAX / kBlockNodes<D>) - activation.max_blocks;
+    activation.margin_blocks = int(std::clamp<int64_t>(activation.max_blocks / 2 + 64, 0, std::max<int64_t>(most, 0)));
+  }
+
+  // Of the substeps that read what others of the same parity have written.
+  void take_turn(int parity) {
+    if (!drifts.defined()) return;
+    Drift* const drift = static_cast<Drift*>(drifts.data_ptr());
+    activation.drift = drift + parity;
+    update.drift = advance.drift = drift + (1 - parity);
+  }
+
   // The time of obstacles, added up as single steps do: by a device itself, where the host may not be there.
   void count_time(const int* status_before, backend::Stream stream) {
 #if MPM_BACKEND == MPM_BACKEND_IS_cuda
@@ -288,7 +307,7 @@ struct Substeps {
 
   // From a stress that is there to the velocities of the nodes.
   void move_grid(backend::Stream stream) {
-    backend::clear(pool.nodes, stream);
+    if (!update.emptied) backend::clear(pool.nodes, stream);
     backend::p2g(in.lattice.order(), p2g, stream);
     backend::grid_update(update, stream);
     if (obstacles) backend::contact(contact, stream);
@@ -367,6 +386,10 @@ void Substeps<T, D>::make_pool(backend::Stream stream) {
   update.table = topology.table;
   update.nodes = static_cast<const NodeRow<T, D>*>(pool.nodes.data_ptr());
   update.updated = static_cast<NodeRow<T, D>*>(pool.updated.data_ptr());
+  if (drifts.defined() && !update.walls.mirrored) {
+    backend::clear(pool.nodes, stream);
+    update.emptied = static_cast<NodeRow<T, D>*>(pool.nodes.data_ptr());
+  }
   contact.velocity = static_cast<const T*>(pool.updated.data_ptr()) + 1;
   contact.stride = 1 + D;
   if (obstacles) contact.result = static_cast<T*>(pool.velocity.data_ptr());

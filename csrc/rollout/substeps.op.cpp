@@ -28,11 +28,13 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> substeps(MPM_
       torch::stable::copy_(F_[1], *F);
       from.F = field<const T>(F_[1]);
     }
+    if (n > 1) s.let_activations_last();
     s.make_pool(stream);
     s.count_time(before, stream);
     // A substep that reads and writes these buffers in turn, into the first or the second.
     const auto take = [&](int into, backend::Stream on) {
       int* const now = static_cast<int*>(status[into].data_ptr());
+      s.take_turn(into);
       s.read(from, field<T>(F_[1 - into]));
       s.write(
           {field<T>(x_[into]), field<T>(v_), field<T>(C_), field<T>(F_[into]), field<T>(J_[into]), field<T>(history_)});

@@ -35,6 +35,8 @@ struct G2PAdvanceArguments {
   double dt = 0;
   StressForm form = StressForm::mls;
   Field<T> x_next, F_next, J_next;
+  // On CUDA: particles may be in other active blocks than they were activated in, and where they go now is added here.
+  Drift* drift = nullptr;
 };
 
 inline namespace TORCH_MPM_ISA {

@@ -15,7 +15,8 @@ struct P2GArguments {
   double dt = 0;
   StressForm form = StressForm::mls;
   bool deterministic = false;
-  NodeField<T> nodes;  // zero on entry; 1 + D channels: mass, momentum
+  bool drifted = false;  // particles may be in other active blocks than they were activated in; on CUDA
+  NodeField<T> nodes;    // zero on entry; 1 + D channels: mass, momentum
 };
 
 template <class T, int D>

@@ -8,6 +8,7 @@ template <int Order_, class T_, int D_, bool Gradient>
 struct AdvanceGather {
   using T = T_;
   static constexpr int Order = Order_, D = D_, K = D;
+  static constexpr bool moves = true;
   static constexpr int resident = Gradient ? 4 : 5;
   using Shape = SumShape<Order, T, D, K, 0, true, Gradient, SlopeForm::none>;
   struct Loaded {
@@ -27,6 +28,7 @@ struct AdvanceGather {
   Field<const T> scene_dt;
   T dt, moment_scale, gradient_scale;  // from cells
   T lost;
+  Drift* drift;
 
   explicit AdvanceGather(const G2PAdvanceArguments<T, D>& a)
       : topology(a.gather.topology),
@@ -43,7 +45,8 @@ struct AdvanceGather {
         dt(T(a.dt)),
         moment_scale(T(a.gather.moment_scale * double(topology.geometry.dx))),
         gradient_scale(topology.geometry.inverse_dx),
-        lost(T(a.gather.lost)) {}
+        lost(T(a.gather.lost)),
+        drift(a.drift) {}
 
   __device__ Loaded load(int p, int scene) const {
     Loaded l;
@@ -63,7 +66,8 @@ struct AdvanceGather {
     sum_axis<Shape, 0>(support, support.rows, 0, w, constant, linear, s);
     return s;
   }
-  __device__ void write(int p, const Loaded& l, const Result& s) const {
+  // Returns where the particle goes.
+  __device__ mpm::Vector<T, D> write(int p, const Loaded& l, const Result& s) const {
     mpm::Vector<T, D> v;
     Matrix<T, D> L;
 #pragma unroll
@@ -86,6 +90,7 @@ struct AdvanceGather {
       for (int j = 0; j < D; j++) F_next.write(p, i * D + j, deformed[i][j]);
     }
     J_next.write(p, 0, advance_volume_ratio(l.J, L, l.dt));
+    return x;
   }
   __device__ void leave_out(int p) const {
     const mpm::Vector<T, D> x = read_vector(position, p);

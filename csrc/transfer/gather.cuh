@@ -218,36 +218,109 @@ constexpr int kGatherThreads = 128;
 template <class Task>
 constexpr int kResident = Task::Order == 2 && sizeof(typename Task::T) == 4 ? Task::resident : 2;
 
+// Whether a particle that moves may stay in its activation for another step.
+template <int Order, class T, int D>
+class Follower {
+ public:
+  // To x from a base block whose neighbours are active where `active` has bits.
+  __device__ void follow(const Topology<T, D>& t, int scene, int base_block, unsigned active, const Vector<T, D>& x) {
+    int base[D];
+    T f[D];
+    if (!locate_in_block<Order>(t, scene, base_block, x, base, f)) {
+      const int slot = locate_slot<Order>(t, scene, x, base, f);
+      active = slot < 0 ? 0 : active_blocks(t, slot);
+      strays_++;
+    }
+    lost_ = lost_ || (touched_blocks<Order, D>(base) & ~active) != 0;
+  }
+
+  // Bits of the neighbours of a slot that are active.
+  __device__ static unsigned active_blocks(const Topology<T, D>& t, int slot) {
+    const int4* const neighbours = reinterpret_cast<const int4*>(schedule_of(t).neighbours + (slot << D));
+    unsigned active = 0;
+#pragma unroll
+    for (int q = 0; q < (1 << D) / 4; q++) {
+      const int4 v = neighbours[q];
+      active |= unsigned(v.x >= 0) << (4 * q) | unsigned(v.y >= 0) << (4 * q + 1) | unsigned(v.z >= 0) << (4 * q + 2) |
+                unsigned(v.w >= 0) << (4 * q + 3);
+    }
+    return active;
+  }
+
+  // By whole warps.
+  __device__ void tell(Drift* drift) const {
+    const int strays = __reduce_add_sync(~0u, strays_);
+    if (strays > 0 && threadIdx.x % 32 == 0) atomicAdd(&drift->strays, strays);
+    if (lost_) drift->lost = 1;
+  }
+
+ private:
+  int strays_ = 0;
+  bool lost_ = false;
+};
+
 // Task: topology, nodes, position; load(p, scene), what it needs of a particle; compute(loaded, weights, support), what
 // the particle gets; write(p, loaded, result), with a result of zeros where positions are not those of the activation;
-// leave_out(p) for a particle outside.
+// leave_out(p) for a particle outside. One that moves particles has write(...) return where they go, and a drift, or
+// null; with it particles may be in other active blocks than those of the activation.
+template <class Task>
+constexpr bool moves = requires { Task::moves; };
+template <class Task>
+using FollowerOf = Follower<Task::Order, typename Task::T, Task::D>;
+
+template <class Task>
+__device__ bool may_drift(const Task& task) {
+  if constexpr (moves<Task>)
+    return task.drift;
+  else
+    return false;
+}
+
+// From the nodes in global memory, for a particle with its base node in a slot.
+template <bool Quads, class Task, class T>
+__device__ auto gather_from_grid(const Task& task, const Schedule<const int>& schedule, int p, int scene, int slot,
+                                 GridSupport<T, Task::K, Task::D, Quads>& support, const T* f) {
+  constexpr int D = Task::D;
+  const auto loaded = task.load(p, scene);
+#pragma unroll
+  for (int q = 0; q < (1 << D) / 4; q++) {
+    const int4 v = reinterpret_cast<const int4*>(schedule.neighbours + (slot << D))[q];
+    support.set_slot(4 * q, v.x);
+    support.set_slot(4 * q + 1, v.y);
+    support.set_slot(4 * q + 2, v.z);
+    support.set_slot(4 * q + 3, v.w);
+  }
+  return task.write(p, loaded, task.compute(loaded, Weights<Task::Order, T, D>(f), support));
+}
+
 template <bool Quads, class Task>
-__device__ void gather_in_memory_order(const Task& task, const Schedule<const int>& schedule) {
+__device__ void gather_in_memory_order(const Task& task, const Schedule<const int>& schedule,
+                                       FollowerOf<Task>& follower) {
   using T = typename Task::T;
   constexpr int D = Task::D;
   const Topology<T, D>& t = task.topology;
   const int64_t stride = int64_t(gridDim.x) * kGatherThreads;
 #pragma unroll 1
   for (int64_t i = int64_t(blockIdx.x) * kGatherThreads + threadIdx.x; i < t.particles; i += stride) {
-    const int p = int(i), slot = schedule.base_slot[p];
+    const int p = int(i);
+    int slot = schedule.base_slot[p];
     const Vector<T, D> x = read_vector(task.position, p);
     const int base_block = slot < 0 ? -1 : t.block[slot], scene = scene_of(t, base_block);
     GridSupport<T, Task::K, D, Quads> support{task.nodes};
     T f[D];
-    if (slot < 0 || !locate_in_block<Task::Order>(t, scene, base_block, x, support.base, f)) {
+    if (slot >= 0 && !locate_in_block<Task::Order>(t, scene, base_block, x, support.base, f))
+      slot = may_drift(task) ? locate_slot<Task::Order>(t, scene, x, support.base, f) : -1;
+    if (slot < 0) {
       task.leave_out(p);
       continue;
     }
-    const auto loaded = task.load(p, scene);
-#pragma unroll
-    for (int q = 0; q < (1 << D) / 4; q++) {
-      const int4 v = reinterpret_cast<const int4*>(schedule.neighbours + (slot << D))[q];
-      support.set_slot(4 * q, v.x);
-      support.set_slot(4 * q + 1, v.y);
-      support.set_slot(4 * q + 2, v.z);
-      support.set_slot(4 * q + 3, v.w);
+    if constexpr (moves<Task>) {
+      const Vector<T, D> to = gather_from_grid<Quads>(task, schedule, p, scene, slot, support, f);
+      if (task.drift)
+        follower.follow(t, scene, base_block, FollowerOf<Task>::active_blocks(t, schedule.base_slot[p]), to);
+    } else {
+      gather_from_grid<Quads>(task, schedule, p, scene, slot, support, f);
     }
-    task.write(p, loaded, task.compute(loaded, Weights<Task::Order, T, D>(f), support));
   }
 }
 
@@ -272,10 +345,39 @@ __device__ void load_tile(const NodeField<const T>& nodes, const int* slots, Nod
   }
 }
 
+// Particles of an item, counted from its first, that are not in its base block: they wait for the others.
+template <class Task>
+struct Strays {
+  int count;
+  uint16_t particle[moves<Task> ? kItemParticles : 1];
+};
+
 template <bool Quads, class Task>
-__device__ void gather_by_items(const Task& task, const Schedule<const int>& schedule) {
+__device__ void gather_strays(const Task& task, const Schedule<const int>& schedule, const Strays<Task>& strays,
+                              int begin, int scene, int base_block, unsigned active, FollowerOf<Task>& follower) {
+  using T = typename Task::T;
+  const Topology<T, Task::D>& t = task.topology;
+  __syncthreads();
+#pragma unroll 1
+  for (int s = threadIdx.x; s < strays.count; s += kGatherThreads) {
+    const int p = t.index[begin + strays.particle[s]];
+    GridSupport<T, Task::K, Task::D, Quads> support{task.nodes};
+    T f[Task::D];
+    const int slot = locate_slot<Task::Order>(t, scene, read_vector(task.position, p), support.base, f);
+    if (slot < 0) {
+      task.leave_out(p);
+      continue;
+    }
+    const Vector<T, Task::D> to = gather_from_grid<Quads>(task, schedule, p, scene, slot, support, f);
+    follower.follow(t, scene, base_block, active, to);
+  }
+}
+
+template <bool Quads, class Task>
+__device__ void gather_by_items(const Task& task, const Schedule<const int>& schedule, FollowerOf<Task>& follower) {
   using T = typename Task::T;
   constexpr int D = Task::D, K = Task::K, width = kBlockWidth + Task::Order;
+  __shared__ Strays<Task> strays;
   __shared__ NodeValue<T, K> tile[D == 2 ? width * width : width * width * width];
   __shared__ int slots[1 << D];
   const Topology<T, D>& t = task.topology;
@@ -290,7 +392,9 @@ __device__ void gather_by_items(const Task& task, const Schedule<const int>& sch
     Vector<T, D> x = read_vector(task.position, p);
     __syncthreads();  // the tile before is done
     if (threadIdx.x < 1 << D) slots[threadIdx.x] = schedule.neighbours[(item.x << D) + threadIdx.x];
+    if (threadIdx.x == 0) strays.count = 0;
     __syncthreads();
+    const unsigned active = may_drift(task) ? FollowerOf<Task>::active_blocks(t, item.x) : 0;
     load_tile<Quads, Task::Order, T, K, D>(task.nodes, slots, tile);
     __syncthreads();
 #pragma unroll 1
@@ -305,11 +409,23 @@ __device__ void gather_by_items(const Task& task, const Schedule<const int>& sch
       for (int axis = 0; axis < D; axis++) corner = corner * width + base[axis];
       const TileSupport<Task::Order, T, K> support{tile + corner};
       const auto result = task.compute(loaded, Weights<Task::Order, T, D>(f), support);
-      task.write(p, loaded, in_block ? result : typename Task::Result{});
+      if (may_drift(task) && !in_block) {
+        strays.particle[atomicAdd(&strays.count, 1)] = uint16_t(k - begin);
+      } else {
+        const auto write = [&] { return task.write(p, loaded, in_block ? result : typename Task::Result{}); };
+        if constexpr (moves<Task>) {
+          const Vector<T, D> to = write();
+          if (task.drift) follower.follow(t, scene, base_block, active, to);
+        } else {
+          write();
+        }
+      }
       p = p_next;
       p_next = p_after;
       x = x_next;
     }
+    if constexpr (moves<Task>)
+      if (task.drift) gather_strays<Quads>(task, schedule, strays, begin, scene, base_block, active, follower);
   }
   const int64_t stride = int64_t(gridDim.x) * kGatherThreads;
   for (int64_t i = t.offsets[t.max_blocks] + int64_t(blockIdx.x) * kGatherThreads + threadIdx.x; i < t.particles;
@@ -320,10 +436,13 @@ __device__ void gather_by_items(const Task& task, const Schedule<const int>& sch
 template <bool Quads, class Task>
 __global__ void __launch_bounds__(kGatherThreads, kResident<Task>) gather_kernel(const Task task) {
   const Schedule<const int> schedule = schedule_of(task.topology);
+  FollowerOf<Task> follower;
   if (*schedule.scattered)
-    gather_in_memory_order<Quads>(task, schedule);
+    gather_in_memory_order<Quads>(task, schedule, follower);
   else
-    gather_by_items<Quads>(task, schedule);
+    gather_by_items<Quads>(task, schedule, follower);
+  if constexpr (moves<Task>)
+    if (task.drift) follower.tell(task.drift);
 }
 
 template <class Task>

@@ -259,6 +259,115 @@ __device__ void load_particles(const Source& source, const Topology<T, D>& t, in
   }
 }
 
+template <class T>
+__device__ void add_to_nodes(T* to, T value, bool in_order) {
+  if (in_order)
+    *to += value;
+  else
+    atomicAdd(to, value);
+}
+
+template <class T>
+__device__ void add_to_nodes(T* to, const T value[4], bool in_order) {
+#if __CUDA_ARCH__ >= 900
+  if constexpr (sizeof(T) == 4) {
+    if (!in_order) {
+      atomicAdd(reinterpret_cast<float4*>(to), make_float4(value[0], value[1], value[2], value[3]));
+      return;
+    }
+  }
+#endif
+#pragma unroll
+  for (int e = 0; e < 4; e++) add_to_nodes(to + e, value[e], in_order);
+}
+
+// Whether rows of nodes without a gap begin at whole vectors.
+template <class S, class T>
+__device__ bool is_dense(const NodeField<T>& nodes) {
+  return nodes.stride == S::channels && reinterpret_cast<uintptr_t>(nodes.pointer) % 16 == 0;
+}
+
+// What the node at `offset` from the base node gets from a particle in shared memory.
+template <class S, class T, int D>
+__device__ void node_value(const SharedParticles<S>& shared, int row, const T f[D], const int offset[D],
+                           T (&value)[S::channels]) {
+  T word[S::quads * 4 + 2], weight = T(1), slope[D];
+#pragma unroll
+  for (int q = 0; q < S::quads; q++) {
+    const Quad<T> v = shared.quads[q * S::batch + row];
+#pragma unroll
+    for (int e = 0; e < 4; e++) word[4 * q + e] = v.e[e];
+  }
+  if (S::pairs > 0) {
+    const Pair<T> v = shared.pairs[row];
+    word[4 * S::quads] = v.e[0];
+    word[4 * S::quads + 1] = v.e[1];
+  }
+#pragma unroll
+  for (int i = 0; i < D; i++) slope[i] = T(1);
+#pragma unroll
+  for (int i = 0; i < D; i++) {
+    const NodeWeight<S::Order, T> node(offset[i]);
+    weight *= node.at(f[i]);
+#pragma unroll
+    for (int j = 0; j < D; j++) slope[j] *= i == j ? node.slope(f[i]) : node.at(f[i]);
+  }
+#pragma unroll
+  for (int c = 0; c < S::Plain; c++) value[c] = weight * word[S::plain + c];
+#pragma unroll
+  for (int c = 0; c < S::Linear; c++) {
+    const T* const v = word + S::linear + c * S::linear_words;
+    T at = v[0], along = T(0);
+#pragma unroll
+    for (int i = 0; i < D; i++) {
+      at += v[1 + i] * T(offset[i]);
+      if (S::Gradient) along += slope[i] * v[1 + D + i];
+    }
+    value[S::Plain + c] = weight * at + along;
+  }
+}
+
+// The particles of a batch, index[begin, ...), that have left their base block go to the nodes without a tile: a warp
+// takes a particle, a lane a node.
+template <class S, class Source, class T, int D>
+__device__ void add_strays(const Source& source, const Topology<T, D>& t, const Schedule<const int>& schedule,
+                           int scene, const SharedParticles<S>& shared, int begin) {
+  constexpr int warps = S::threads / 32, nodes = D == 2 ? S::support * S::support : S::support * S::slab;
+  const int warp = threadIdx.x / 32, lane = threadIdx.x % 32;
+  const NodeField<T>& to = source.nodes;
+  int turn = 0;
+  for (int row = shared.head[S::lists]; row != SharedParticles<S>::end; row = shared.next[row]) {
+    if (turn++ % warps != warp) continue;
+    const int p = t.index[begin + SharedParticles<S>::row(row)];  // which is its own inverse
+    int base[D];
+    T f[D];
+    const int slot = locate_slot<S::Order>(t, scene, read_vector(source.position, p), base, f);
+    if (slot < 0) continue;
+    for (int n = lane; n < nodes; n += 32) {
+      int offset[D], node[D], neighbour = 0;
+#pragma unroll
+      for (int i = D - 1, rest = n; i >= 0; i--, rest /= S::support) {
+        offset[i] = rest % S::support;
+        node[i] = base[i] + offset[i];
+        neighbour |= int(node[i] >= kBlockWidth) << (D - 1 - i);
+      }
+      const int node_slot = schedule.neighbours[(slot << D) + neighbour];
+      if (node_slot < 0) continue;
+      T value[S::channels];
+      node_value<S, T, D>(shared, row, f, offset, value);
+      T* const at = to.pointer + (int64_t(node_slot) * kBlockNodes<D> + node_in_block<D>(node)) * to.stride;
+      if constexpr (S::channels == 4) {
+        if (is_dense<S>(to)) {
+          add_to_nodes(at, value, false);
+          continue;
+        }
+      }
+#pragma unroll
+      for (int c = 0; c < S::channels; c++) add_to_nodes(at + c, value[c], false);
+    }
+  }
+}
+
 // Adds the slabs of all threads to the planes. Threads of one plane add to different nodes at a time.
 template <class S, class T>
 __device__ void add_slabs(const Walker<S>& walker, const T (&sum)[S::slab][S::channels], Quad<T>* planes) {
@@ -301,34 +410,12 @@ __device__ Quad<T> tile_sum(const Quad<T>* planes, int leading, int row, int qua
   return sum;
 }
 
-template <class T>
-__device__ void add_to_nodes(T* to, T value, bool in_order) {
-  if (in_order)
-    *to += value;
-  else
-    atomicAdd(to, value);
-}
-
-template <class T>
-__device__ void add_to_nodes(T* to, const T value[4], bool in_order) {
-#if __CUDA_ARCH__ >= 900
-  if constexpr (sizeof(T) == 4) {
-    if (!in_order) {
-      atomicAdd(reinterpret_cast<float4*>(to), make_float4(value[0], value[1], value[2], value[3]));
-      return;
-    }
-  }
-#endif
-#pragma unroll
-  for (int e = 0; e < 4; e++) add_to_nodes(to + e, value[e], in_order);
-}
-
 // Adds the tile to the grid, four words at a time.
 template <class S, class T, int D>
 __device__ void flush_tile(const NodeField<T>& nodes, const int slots[1 << D], const Quad<T>* planes, bool in_order) {
   constexpr int K = S::channels, width = S::width;
   constexpr int tile_rows = D == 2 ? width : width * width;
-  const bool dense = nodes.stride == K && reinterpret_cast<uintptr_t>(nodes.pointer) % 16 == 0;
+  const bool dense = is_dense<S>(nodes);
   for (int t = threadIdx.x; t < tile_rows * S::row_quads; t += S::threads) {
     const int tile_row = t / S::row_quads, quad = t % S::row_quads, far = quad >= S::near_quads;
     const int first_word = (far ? quad - S::near_quads : quad) * 4;
@@ -395,6 +482,7 @@ __global__ void __launch_bounds__(Source::Shape::threads, Source::resident)
         add_particle(shared, walker, row, sum);
         row = following;
       }
+      if (source.drifted) add_strays<S>(source, t, schedule, base_block.scene, shared, begin);
       __syncthreads();
       add_slabs(walker, sum, planes);
       __syncthreads();
@@ -425,9 +513,10 @@ struct MomentumSource {
   NodeField<T> nodes;
   Columns<const T, D> position;
   MomentumFields<Order, T, D> fields;
+  bool drifted;
 
   explicit MomentumSource(const P2GArguments<T, D>& a)
-      : topology(a.topology), nodes(a.nodes), position(a.x), fields(a) {}
+      : topology(a.topology), nodes(a.nodes), position(a.x), fields(a), drifted(a.drifted) {}
 
   __device__ ParticleMomentum<T, D> load(int p, int scene) const { return fields.read(p, scene, with_stress); }
   __device__ Contribution<T, D, 1, D> contribution(const ParticleMomentum<T, D>& particle) const {
@@ -453,6 +542,7 @@ template <int Order, class T, int D, int K, bool Gradient>
 struct FieldSource {
   using Shape = ScatterShape<Order, T, D, 0, K, Gradient>;
   static constexpr int resident = 0;
+  static constexpr bool drifted = false;
   Topology<T, D> topology;
   NodeField<T> nodes;
   Columns<const T, D> position;
