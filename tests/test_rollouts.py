@@ -115,6 +115,43 @@ def test_transfers(transfer, form, kernel, dtype, device):
         assert_equal(mpm.rollout(step, state, 4, 1e-4), one_by_one(step, state, 4, 1e-4))
 
 
+@pytest.mark.parametrize("cells", [0.003, 0.06, 1.6])
+@pytest.mark.parametrize("kernel", ["quadratic", "cubic"])
+@pytest.mark.parametrize("shuffled", [False, True])
+def test_particles_leave_the_blocks_they_were_found_in(dim, device, cells, kernel, shuffled):
+    """`cells` per step at which a cloud moves and parts: some stay in the blocks of the first step, some go to others
+    that are active, or to others yet. On CUDA blocks are not found anew in every step."""
+    n, dt = 40 if cells < 1 else 6, 1e-4
+    step = mpm.Step(box(dim, dx=1 / 64, kernel=kernel), LAWS_HERE["sand"](), walls="slip")
+    state = blob(device, dim, 3000)
+    v = state.v * 0.2 + torch.tensor([1.0, -0.6, 0.3][:dim], dtype=F64, device=device)
+    state = step.prepare(state.replace(v=v * (cells * step.grid.dx / dt)))
+    state = state if shuffled else state.sorted(step.grid)
+    with torch.no_grad():
+        end, expected = mpm.rollout(step, state, n, dt), one_by_one(step, state, n, dt)
+    moved = (expected.x - state.x).norm(dim=1).median() / step.grid.dx
+    assert moved > 0.6 * n * cells
+    assert_equal(end, expected)
+
+
+@pytest.mark.parametrize("walls", ["mirror", "sticky"])
+def test_scenes_whose_particles_leave_the_domain(dim, device, walls):
+    """A batch in which one scene is empty and particles of others leave the domain at different steps, or are lost."""
+    step = mpm.Step(box(dim, scenes=3), mpm.NeoHookean(E=1e3, nu=0.3), walls=walls if walls == "mirror" else None)
+    state = blob(device, dim, 400, scene=torch.randint(0, 2, (400,)).int() * 2)
+    v = 30 * state.v
+    v[7] = float("nan")
+    state = state.replace(v=v, scene=state.scene.to(device))
+    with torch.no_grad():
+        end, statuses = mpm.rollout(step, state, 70, 2e-4), []
+        statuses.append(step.failures(end))
+        again = mpm.Step(box(dim, scenes=3), step.law, walls=step.walls)
+        expected = one_by_one(again, state, 70, 2e-4)
+        statuses.append(again.failures(expected))
+    assert str(statuses[0]) == str(statuses[1])
+    assert int((expected.x.isnan().any(dim=1)).sum()) < 400
+
+
 def mixture() -> mpm.Mixture:
     """Histories of one name in two laws, and of laws with two; fields F and J."""
     names = ("von_mises", "fluid", "cam_clay", "von_mises", "sand", "neo_hookean", "viscoelastic")

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Any
 from . import _library as _library
 from . import laws, ops, seed
 from .boundaries import SDF, Box, Capsule, Plane, Revolved, Sphere, Walls
+from .captured import captured
 from .cfl import stable_dt
 from .data.trajectory import Trajectory
 from .errors import DamagedFileError, GridOverflowError, SimulationError
@@ -60,6 +61,7 @@ __all__ = [
     "Trajectory",
     "Walls",
     "advance",
+    "captured",
     "frames",
     "g2p",
     "g2p_advance",

@@ -12,6 +12,7 @@ from torch.autograd import forward_ad
 
 from .boundaries import Obstacle
 from .capture import is_captured, is_traced
+from .captured import LEAST_STEPS, obstacle_to_replays, replayed
 from .errors import check_count, shape_of
 from .laws import CompiledLaw, Mixture
 from .ops.arguments import split_dt
@@ -49,7 +50,8 @@ def rollout(
     states, those of every `checkpoint` steps, sqrt(n) of them by default and more where states are small. A kept state
     of a solid has 2 D + 2 D² numbers per particle (24 in 3-D, 96 bytes in float32) and its history; while the backward
     pass goes through `checkpoint` steps, it holds about 2 D + 4 D² (42 in 3-D) for each of them. Second derivatives
-    need single steps.
+    need single steps. On CUDA and without gradients, other steps that call no function of the user's are replays of a
+    CUDA graph of one; see `captured` for what else there is.
 
     Raises:
         TypeError, ValueError: for an n or a checkpoint that is no whole number, a negative n, a checkpoint below 1, or
@@ -63,6 +65,8 @@ def rollout(
 
     if isinstance(step, Step) and obstacle_to_substeps(step, state, dt) is None:
         return in_chunks(step, state, n, dt, checkpoint)  # type: ignore[arg-type]
+    if isinstance(step, Step) and n > LEAST_STEPS and obstacle_to_replays(step, state, dt) is None:
+        return replayed(step, state, n, dt)  # type: ignore[arg-type]
     if checkpoint is not None and torch.is_grad_enabled():
         return checkpointed(step, state, n, dt, checkpoint)
     for _ in range(n):

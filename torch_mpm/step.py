@@ -291,12 +291,14 @@ class Step(TensorModule):
         raise_failures(self.failures(state), self._activations.all(), self.grid)
 
     def explain(self, state: State, dt: float | Tensor = 1.0) -> str:
-        """How `rollout` takes steps from a state: many in one op, or one after another from Python, and why."""
-        from .rollouts import obstacle_to_substeps, wants_gradient  # which need a Step
+        """How `rollout` takes steps from a state: many in one op, from a CUDA graph or from Python, and why."""
+        from .captured import obstacle_to_replays  # which needs a Step, as these do
+        from .rollouts import obstacle_to_substeps, wants_gradient
 
         reason = obstacle_to_substeps(self, state, dt)
         if reason is not None:
-            return f"step by step, because {reason}"
+            replays = obstacle_to_replays(self, state, dt) is None
+            return f"{'from a CUDA graph of one step' if replays else 'step by step'}, because {reason}"
         return f"all steps {'between two kept states ' if wants_gradient(self, state) else ''}in one op"
 
     def reset(self) -> None:

@@ -5,9 +5,14 @@
 // The schedule tensor of the CUDA kernels.
 namespace mpm::cuda {
 
-constexpr int kItemParticles = 576;
+constexpr int kItemParticles = 576;       // at most, of one base block; a crowded block makes several items
+constexpr int kLeastItemParticles = 128;  // where there are so few that every multiprocessor has an item anyway
 
-// At most kItemParticles particles of one base block; a crowded block makes several items.
+MPM_HD int item_particles(int64_t particles) {
+  const int64_t shared = particles / 512;
+  return int(shared < kLeastItemParticles ? kLeastItemParticles : shared > kItemParticles ? kItemParticles : shared);
+}
+
 struct Item {
   int slot, begin, end;  // particles index[begin, end)
   int block;             // table index of the base block
@@ -25,9 +30,9 @@ struct Schedule {
 };
 
 // Upper bound of the number of items: base blocks hold particles, and splitting adds less than one item per
-// kItemParticles.
+// item_particles().
 MPM_HD int64_t most_items(int64_t max_blocks, int64_t particles) {
-  return (max_blocks < particles ? max_blocks : particles) + particles / kItemParticles;
+  return (max_blocks < particles ? max_blocks : particles) + particles / item_particles(particles);
 }
 
 // Fits into schedule_size() ints.

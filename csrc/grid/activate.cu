@@ -375,7 +375,8 @@ __device__ void offsets(const ActivateArguments<T, D>& a, const Workspace& w, in
         w.tally[b].count = -1 - atomicAdd(&w.counters->tail, count);
         count = 0;
       }
-      items = (count + kItemParticles - 1) / kItemParticles;
+      const int most = item_particles(a.particles);
+      items = (count + most - 1) / most;
     }
     const Packed before = exclusive_sum(pack(count, items), w.offset_states, tile);
     const int start = first_of(before), item = second_of(before);

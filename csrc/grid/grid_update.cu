@@ -1,5 +1,6 @@
 #include "cuda/launch.cuh"
 #include "grid/grid_update.h"
+#include "grid/obstacle.h"
 
 namespace mpm::cuda {
 namespace {
@@ -8,16 +9,24 @@ constexpr int kThreads = 256;
 template <int D>
 constexpr int kLanes = kBlockNodes<D> < 32 ? kBlockNodes<D> : 32;  // lanes of a warp that share a slot
 
-template <class T, int D>
-__global__ void __launch_bounds__(kThreads) grid_update_kernel(const GridUpdateArguments<T, D> a) {
+template <bool Obstacles, class T, int D>
+__global__ void __launch_bounds__(kThreads)
+    grid_update_kernel(const GridUpdateArguments<T, D> a, const ContactArguments<T, D> contact) {
   const int64_t node = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   const int slot = int(node / kBlockNodes<D>);
-  if (node == 0 && a.drift) *a.drift = {};
+  if (node == 0 && a.drift) *a.next_drift = a.drift->next(a.particles);
   if (slot >= a.max_blocks) return;
   const SlotUpdate<T, D> s = slot_update(a, slot);
   if (a.emptied && !s.active) return;
-  const NodeRow<T, D> row = a.nodes[node];
-  a.updated[node] = update_node(a, s, int(node % kBlockNodes<D>), row);
+  const int local = int(node % kBlockNodes<D>);
+  NodeRow<T, D> row = update_node(a, s, local, a.nodes[node]);
+  if constexpr (Obstacles) {
+    const ContactSlot<T, D> there = contact_slot(contact, slot);
+    if (there.active)
+      row.value =
+          after_obstacles(contact, there, contact.obstacles, node_position(contact, there.corner, local), row.value);
+  }
+  a.updated[node] = row;
   if (a.emptied) a.emptied[node] = {};
 }
 
@@ -56,8 +65,19 @@ unsigned blocks_for(int64_t max_blocks, int64_t threads_per_slot) {
 template <class T, int D>
 void grid_update(const GridUpdateArguments<T, D>& a, Stream stream) {
   if (a.max_blocks == 0) return;
-  launch(grid_update_kernel<T, D>, blocks_for(a.max_blocks, kBlockNodes<D>), kThreads, 0, stream, a);
+  launch(grid_update_kernel<false, T, D>, blocks_for(a.max_blocks, kBlockNodes<D>), kThreads, 0, stream, a,
+         ContactArguments<T, D>());
 }
+
+template <class T, int D>
+void grid_update_and_contact(const GridUpdateArguments<T, D>& a, const ContactArguments<T, D>& contact, Stream stream) {
+  if (a.max_blocks == 0) return;
+  launch(grid_update_kernel<true, T, D>, blocks_for(a.max_blocks, kBlockNodes<D>), kThreads, 0, stream, a, contact);
+}
+
+#define MPM_INSTANTIATE_BOTH(T, D, name) \
+  template void name<T, D>(const GridUpdateArguments<T, D>&, const ContactArguments<T, D>&, Stream);
+MPM_EACH_SHAPE(MPM_INSTANTIATE_BOTH, grid_update_and_contact)
 
 template <class T, int D>
 void grid_update_backward(const GridUpdateBackwardArguments<T, D>& a, Stream stream) {

@@ -61,10 +61,12 @@ struct GridUpdateArguments {
   double dt = 0;
   Walls<T, D> walls;
   NodeRow<T, D>* updated = nullptr;
-  // Where nodes are written for one call alone, on CUDA: those of unused slots are left as they are, `emptied`, which is
-  // `nodes`, is zeroed on the way unless there are mirrors, and `drift` too, for the particles to come.
+  // In a call of many steps, on CUDA: rows of unused slots are left as they are, `emptied`, which is `nodes`, is zeroed
+  // on the way unless there are mirrors, and the drift of this step makes that of the next, for G2P to count.
   NodeRow<T, D>* emptied = nullptr;
-  Drift* drift = nullptr;
+  const Drift* drift = nullptr;
+  Drift* next_drift = nullptr;
+  int64_t particles = 0;
 };
 
 template <class T, int D>

@@ -374,7 +374,20 @@ MPM_HD void store_node(T* values, int64_t node, const Vector<T, D>& v) {
     row[1 + i] = v[i];
 }
 
-// The nodes lane, lane + Lanes, ... of a slot. Obstacles act one after another.
+// The velocity v of a node after the first `last` obstacles, which act one after another.
+template <class T, int D>
+MPM_HD Vector<T, D> after_obstacles(const ContactArguments<T, D>& a, const ContactSlot<T, D>& s, int last,
+                                    const Vector<T, D>& position, Vector<T, D> v) {
+  for (int k = 0; k < last; k++) {
+    const ObstaclePose<T, D> pose = pose_at(a, s, k);
+    if (!pose.acts) continue;
+    const Touch<T, D> t = touch(a, pose, position);
+    if (t.touching) v = after_contact(pose, t, v);
+  }
+  return v;
+}
+
+// The nodes lane, lane + Lanes, ... of a slot.
 template <int Lanes, class T, int D>
 MPM_HD void slot_contact(const ContactArguments<T, D>& a, int slot, int lane) {
   constexpr int count = kBlockNodes<D> / Lanes;
@@ -390,20 +403,6 @@ MPM_HD void slot_contact(const ContactArguments<T, D>& a, int slot, int lane) {
     }
   }
   for (int n = 0; n < count; n++) store_node(a.result, first + n * Lanes, v[n]);
-}
-
-// Velocity of a node after the first `last` obstacles.
-template <class T, int D>
-MPM_HD Vector<T, D> velocity_before(const ContactArguments<T, D>& a, const ContactSlot<T, D>& s, int last, int64_t node,
-                                    const Vector<T, D>& position) {
-  Vector<T, D> v = load_node<T, D>(a.velocity, a.stride, node);
-  for (int k = 0; k < last; k++) {
-    const ObstaclePose<T, D> pose = pose_at(a, s, k);
-    if (!pose.acts) continue;
-    const Touch<T, D> t = touch(a, pose, position);
-    if (t.touching) v = after_contact(pose, t, v);
-  }
-  return v;
 }
 
 // The nodes of a slot that an obstacle touches, as the backward pass needs them.
@@ -451,7 +450,9 @@ MPM_HD void slot_contact_backward(const ContactArguments<T, D>& a, int slot, int
     for (int n = 0; pose.acts && n < count; n++) {
       nodes.position[n] = node_position(a, s.corner, lane + n * Lanes);
       nodes.touch[n] = touch(a, pose, nodes.position[n]);
-      if (nodes.touch[n].touching) nodes.before[n] = velocity_before(a, s, k, first + n * Lanes, nodes.position[n]);
+      if (nodes.touch[n].touching)
+        nodes.before[n] =
+            after_obstacles(a, s, k, nodes.position[n], load_node<T, D>(a.velocity, a.stride, first + n * Lanes));
     }
     for (int i = 0; a.row_grad && i < width; i++) {
       const T sum = pose.acts ? sum_lanes(parameter_adjoint(a, s, k, i, nodes)) : T(0);

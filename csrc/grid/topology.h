@@ -21,13 +21,19 @@ struct Topology {
   int64_t schedule_size = 0;
 };
 
-// Where particles are that have moved since their activation, which on CUDA may serve several steps: how many are in
-// other blocks than they were then, and whether one touches a block that is not active.
+// Where particles are that have moved since their activation, which on CUDA may serve several steps.
 struct Drift {
-  int strays, lost;
+  int strays;   // particles in other blocks than they were then
+  int lost;     // whether one touches a block that is not active
+  int earlier;  // strays of the steps before, added up
 
-  // A stray costs several times what another particle does: of a larger share an activation is cheaper.
-  MPM_HD bool lasts(int64_t particles) const { return lost == 0 && int64_t(strays) * 16 <= particles; }
+  // A stray costs a step more than another particle does. Once all have cost what an activation does there is a new
+  // one, so that both together are at most twice the least possible.
+  MPM_HD bool lasts(int64_t particles) const {
+    constexpr int64_t strays_of_activation = 32;  // times as many cost what the activation of one particle does
+    return lost == 0 && (int64_t(earlier) + strays) * strays_of_activation <= particles;
+  }
+  MPM_HD Drift next(int64_t particles) const { return {0, 0, lasts(particles) ? earlier + strays : 0}; }
 };
 
 // Entries of the schedule tensor: room for the work items of both backends, with the number of particles of each cell,

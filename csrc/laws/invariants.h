@@ -21,7 +21,7 @@ struct InvariantLaw {
   static constexpr auto history = no_history;
   static constexpr auto options = no_options;
   static constexpr bool memory_bound = true;
-  static constexpr int gpu_threads = 256, gpu_update_blocks = 0, gpu_backward_blocks = 0;
+  static constexpr int gpu_threads = 256, gpu_update_blocks = 0, gpu_backward_blocks = 0, gpu_p2g_blocks = 4;
   template <class Law>
   using Kernels = InvariantKernels<Law>;
 };

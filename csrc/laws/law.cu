@@ -1,8 +1,8 @@
 // The CUDA kernels of the laws of one header, MPM_LAW_HEADER: one thread per particle.
 #define MPM_REGISTER_LAW(Law) static const bool Law##_is_entered = enter<cuda::LawLaunches, Law>(0);
 
-#include "cuda/launch.cuh"
 #include "laws/registry.h"
+#include "transfer/scatter.cuh"
 
 namespace mpm::cuda {
 
@@ -52,8 +52,43 @@ __global__ void __launch_bounds__(Law::gpu_threads)
   if (p < a.law.particles && a.law.members.has(p)) Law::template Kernels<Law>::energy_double_backward(a, One<T>{p});
 }
 
+// The momentum of particles whose stress is computed as they are loaded.
 template <class Law, class T, int D>
-struct LawLaunches {
+struct LawMomentumSource : MomentumSource<2, T, D, Stress::moment> {
+  using Base = MomentumSource<2, T, D, Stress::moment>;
+  static constexpr int resident = Law::gpu_p2g_blocks;
+  LawUpdateArguments<T, D> law;
+
+  LawMomentumSource(const P2GArguments<T, D>& a, const LawUpdateArguments<T, D>& law) : Base(a), law(law) {}
+
+  __device__ Matrix<T, D> update(int p) const {
+    Matrix<T, D> stress;
+    LawUpdateArguments<T, D> a = law;
+    a.stress = {&stress[0][0], {0, D, 1}};
+    Law::template Kernels<Law>::update(a, One<T>{p});
+    return stress;
+  }
+  __device__ ParticleMomentum<T, D> load(int p, int scene) const {
+    ParticleMomentum<T, D> m = Base::fields.read(p, scene, true);
+    m.stress = update(p);
+    return m;
+  }
+  __device__ void leave_out(int p) const { update(p); }
+};
+
+// Of float alone: in double the kernels would take all registers.
+template <class Law, class T, int D>
+struct FusedLaunch {};
+
+template <class Law, int D>
+struct FusedLaunch<Law, float, D> {
+  static void p2g(const LawUpdateArguments<float, D>& law, const P2GArguments<float, D>& a, void* stream) {
+    launch_scatter(LawMomentumSource<Law, float, D>(a, law), false, static_cast<Stream>(stream));
+  }
+};
+
+template <class Law, class T, int D>
+struct LawLaunches : FusedLaunch<Law, T, D> {
   template <class Arguments>
   static void for_particles(void (*kernel)(Arguments), const Arguments& a, void* stream) {
     if (a.law.particles == 0) return;

@@ -28,7 +28,7 @@ struct PrincipalLaw {
   static constexpr auto history = no_history;
   static constexpr auto options = no_options;
   static constexpr bool memory_bound = false;
-  static constexpr int gpu_threads = 128, gpu_update_blocks = 0, gpu_backward_blocks = 0;
+  static constexpr int gpu_threads = 128, gpu_update_blocks = 0, gpu_backward_blocks = 0, gpu_p2g_blocks = 3;
   template <class Law>
   using Kernels = PrincipalKernels<Law>;
 };

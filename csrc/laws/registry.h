@@ -4,6 +4,7 @@
 #include <vector>
 
 #include "laws/law.h"
+#include "transfer/arguments.h"
 
 // The laws that were compiled, with their kernels: the only list of them. Each object file of laws/law.cpu.cpp and
 // laws/law.cu enters its laws when the library is loaded; ops find them by name, and Python reads the whole list.
@@ -27,6 +28,8 @@ struct LawKernels {
   void (*scalar)(const LawScalarArguments<T, D>&, void* stream) = nullptr;
   void (*energy_backward)(const LawEnergyBackwardArguments<T, D>&, void* stream) = nullptr;
   void (*energy_double_backward)(const LawEnergyDoubleBackwardArguments<T, D>&, void* stream) = nullptr;
+  // Update and P2G in one, the stress in registers: of quadratic weights and the MLS form, on CUDA.
+  void (*p2g)(const LawUpdateArguments<T, D>&, const P2GArguments<T, D>&, void* stream) = nullptr;
 };
 
 struct LawEntry {
@@ -91,6 +94,7 @@ void fill_kernels(LawEntry& entry) {
     kernels.update_backward = K::update_backward;
     kernels.scalar = K::scalar;
     kernels.energy_backward = K::energy_backward;
+    if constexpr (requires { &K::p2g; }) kernels.p2g = &K::p2g;
     if constexpr (Law::twice_differentiable) kernels.double_backward = K::double_backward;
     if constexpr (Law::twice_differentiable_energy) kernels.energy_double_backward = K::energy_double_backward;
   }

@@ -210,7 +210,8 @@ struct Substeps {
   Pool<T, D> pool;
   Tensor stress, step_time;
   Tensor drifts;           // one for each of two substeps in turn, where activations last
-  bool obstacles = false;
+  bool obstacles = false, fused = false;
+  bool one_grid_pass = false;  // on CUDA, where nobody reads the velocities before contact
   const int* previous_status = nullptr;
 
   explicit Substeps(const SubstepsInputs& inputs);
@@ -273,22 +274,32 @@ struct Substeps {
   // when they no longer suffice. Not where sums have an order, which is that of blocks.
   void let_activations_last() {
     if (MPM_BACKEND == MPM_BACKEND_IS_cpu || in.lattice.deterministic()) return;
-    drifts = empty_int(in.x, {2, 2});
+    drifts = empty_int(in.x, {2, sizeof(Drift) / sizeof(int)});
+    torch::stable::zero_(drifts);
     p2g.drifted = true;
+    update.particles = in.x.size(0);
     const int64_t most = std::min<int64_t>(update.block_count, INT32_MAX / kBlockNodes<D>) - activation.max_blocks;
     activation.margin_blocks = int(std::clamp<int64_t>(activation.max_blocks / 2 + 64, 0, std::max<int64_t>(most, 0)));
+  }
+
+  // For a call that keeps nothing but its end. Where there is a kernel for it, P2G computes the stress itself.
+  void fuse() {
+    one_grid_pass = MPM_BACKEND == MPM_BACKEND_IS_cuda;
+    fused = calls.size() == 1 && !has(in.material) && in.lattice.order() == 2 && !in.lattice.deterministic() &&
+            p2g.form == StressForm::mls && calls[0].law->kernels<T, D>().p2g;
+    if (fused) stress = Tensor();
   }
 
   // Of the substeps that read what others of the same parity have written.
   void take_turn(int parity) {
     if (!drifts.defined()) return;
     Drift* const drift = static_cast<Drift*>(drifts.data_ptr());
-    activation.drift = drift + parity;
-    update.drift = advance.drift = drift + (1 - parity);
+    activation.drift = update.drift = drift + parity;
+    update.next_drift = advance.drift = drift + (1 - parity);
   }
 
   // The time of obstacles, added up as single steps do: by a device itself, where the host may not be there.
-  void count_time(const int* status_before, backend::Stream stream) {
+  void count_time([[maybe_unused]] const int* status_before, [[maybe_unused]] backend::Stream stream) {
 #if MPM_BACKEND == MPM_BACKEND_IS_cuda
     if (!obstacles) return;
     step_time = empty(in.x, {in.n}, ScalarType::Double);
@@ -299,16 +310,22 @@ struct Substeps {
   }
 
   void move(backend::Stream stream) {
-    for (size_t k = 0; k < laws.size(); k++) calls[k].law->kernels<T, D>().update(laws[k], stream);
+    for (size_t k = 0; k < laws.size() && !fused; k++) calls[k].law->kernels<T, D>().update(laws[k], stream);
     move_grid(stream);
     if (MPM_BACKEND == MPM_BACKEND_IS_cpu) contact.time += in.dt;
     backend::g2p_advance(in.lattice.order(), advance, stream);
   }
 
-  // From a stress that is there to the velocities of the nodes.
+  // From a stress that is there, or that P2G computes, to the velocities of the nodes.
   void move_grid(backend::Stream stream) {
     if (!update.emptied) backend::clear(pool.nodes, stream);
-    backend::p2g(in.lattice.order(), p2g, stream);
+    if (fused)
+      calls[0].law->kernels<T, D>().p2g(laws[0], p2g, stream);
+    else
+      backend::p2g(in.lattice.order(), p2g, stream);
+#if MPM_BACKEND == MPM_BACKEND_IS_cuda
+    if (obstacles && one_grid_pass) return backend::grid_update_and_contact(update, contact, stream);
+#endif
     backend::grid_update(update, stream);
     if (obstacles) backend::contact(contact, stream);
   }
@@ -377,7 +394,7 @@ Substeps<T, D>::Substeps(const SubstepsInputs& inputs) : in(inputs) {
 // For the arguments' number of blocks.
 template <class T, int D>
 void Substeps<T, D>::make_pool(backend::Stream stream) {
-  pool.make(in.x, activation, obstacles, stream);
+  pool.make(in.x, activation, obstacles && !one_grid_pass, stream);
   const Topology<T, D> topology = topology_of(activation);
   p2g.topology = advance.gather.topology = topology;
   p2g.nodes = {static_cast<T*>(pool.nodes.data_ptr()), 1 + D, 1 + D};
@@ -392,8 +409,9 @@ void Substeps<T, D>::make_pool(backend::Stream stream) {
   }
   contact.velocity = static_cast<const T*>(pool.updated.data_ptr()) + 1;
   contact.stride = 1 + D;
-  if (obstacles) contact.result = static_cast<T*>(pool.velocity.data_ptr());
-  const Tensor& velocity = obstacles ? pool.velocity : pool.updated;
+  const bool apart = obstacles && !one_grid_pass;
+  if (apart) contact.result = static_cast<T*>(pool.velocity.data_ptr());
+  const Tensor& velocity = apart ? pool.velocity : pool.updated;
   advance.gather.nodes = {static_cast<const T*>(velocity.data_ptr()) + 1, 1 + D, D};
 }
 

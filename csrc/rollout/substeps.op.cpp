@@ -29,6 +29,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> substeps(MPM_
       from.F = field<const T>(F_[1]);
     }
     if (n > 1) s.let_activations_last();
+    s.fuse();
     s.make_pool(stream);
     s.count_time(before, stream);
     // A substep that reads and writes these buffers in turn, into the first or the second.

@@ -374,16 +374,17 @@ __device__ void gather_strays(const Task& task, const Schedule<const int>& sched
 }
 
 template <bool Quads, class Task>
-__device__ void gather_by_items(const Task& task, const Schedule<const int>& schedule, FollowerOf<Task>& follower) {
+__device__ void gather_by_items(const Task& task, const Schedule<const int>& schedule, int count, const int4& first,
+                                FollowerOf<Task>& follower) {
   using T = typename Task::T;
   constexpr int D = Task::D, K = Task::K, width = kBlockWidth + Task::Order;
   __shared__ Strays<Task> strays;
   __shared__ NodeValue<T, K> tile[D == 2 ? width * width : width * width * width];
   __shared__ int slots[1 << D];
   const Topology<T, D>& t = task.topology;
-  const int items = *schedule.item_count;
-  for (int i = blockIdx.x; i < items; i += gridDim.x) {
-    const int4 item = reinterpret_cast<const int4*>(schedule.items)[i];
+  const int4* const items = reinterpret_cast<const int4*>(schedule.items);
+  for (int i = blockIdx.x; i < count; i += gridDim.x) {
+    const int4 item = i == int(blockIdx.x) ? first : items[i];
     const int begin = item.y, end = item.z, base_block = item.w, scene = scene_of(t, base_block);
     // Positions are loaded one round ahead and the particles' indices two, so that loads overlap.
     int k = begin + threadIdx.x;
@@ -437,10 +438,13 @@ template <bool Quads, class Task>
 __global__ void __launch_bounds__(kGatherThreads, kResident<Task>) gather_kernel(const Task task) {
   const Schedule<const int> schedule = schedule_of(task.topology);
   FollowerOf<Task> follower;
-  if (*schedule.scattered)
+  // Loads that do not wait for each other; there is room for as many items.
+  const int2 counts = *reinterpret_cast<const int2*>(schedule.item_count);
+  const int4 first = reinterpret_cast<const int4*>(schedule.items)[blockIdx.x];
+  if (counts.y)
     gather_in_memory_order<Quads>(task, schedule, follower);
   else
-    gather_by_items<Quads>(task, schedule, follower);
+    gather_by_items<Quads>(task, schedule, counts.x, first, follower);
   if constexpr (moves<Task>)
     if (task.drift) follower.tell(task.drift);
 }

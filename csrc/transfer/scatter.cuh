@@ -1,0 +1,585 @@
+#pragma once
+
+#include "cuda/launch.cuh"
+#include "cuda/quad.cuh"
+#include "transfer/momentum.cuh"
+
+// The kernel of P2G and scatter. One thread block takes the particles of one item, links them by cell in shared memory, and adds up
+// nodes in registers: each cell has one thread per leading node of the support, Order + 1 of them, which walks the
+// particles of the cell and adds to the slab of nodes behind that leading node. The slabs are then added to a tile of
+// nodes, and the tile to the grid: one vector reduction per node, however many particles there are.
+//
+// A node gets N_i (a + B · i) + G · ∇N_i from a particle, i being the distance from the base node in cells: `Linear`
+// channels of this kind after `Plain` ones with B = G = 0. Deterministic mode adds blocks of one colour at a time, no
+// two of which share a node, with the particles in the order of the index tensor.
+namespace mpm::cuda {
+
+template <class T>
+struct alignas(2 * sizeof(T)) Pair {
+  T e[2];
+};
+
+template <class T, int D, int Plain, int Linear>
+struct Contribution {
+  T plain[Plain > 0 ? Plain : 1];
+  T value[Linear];
+  T moment[Linear][D];    // per cell
+  T gradient[Linear][D];  // of the gradient per cell
+};
+
+template <int Order_, class T_, int D_, int Plain_, int Linear_, bool Gradient_>
+struct ScatterShape {
+  using T = T_;
+  static constexpr int Order = Order_, D = D_, Plain = Plain_, Linear = Linear_;
+  static constexpr bool Gradient = Gradient_;
+  static constexpr int channels = Plain + Linear, support = Order + 1;
+  static constexpr int width =
+      kBlockWidth + Order;  // nodes of the tile along an axis, from the first of the base block
+
+  // Threads.
+  static constexpr int cells = kBlockNodes<D>, slab = D == 2 ? support : support * support;
+  static constexpr int slices = D == 2 ? 4 : 1;  // threads that share the particles of one cell and leading node
+  static constexpr int lists = cells * slices, threads = lists * support;
+
+  // A particle in shared memory: its distance from the base node along the first axis, the weights along the others but
+  // for one, since they add up to one, and what it gives. In quads, and a pair where that leaves one or two words.
+  static constexpr int derivatives = Gradient ? 2 : 1, stored = support - 1;
+  static constexpr int weights = 1, plain = weights + (D - 1) * derivatives * stored, linear = plain + Plain;
+  static constexpr int linear_words = 1 + D * derivatives, words = linear + Linear * linear_words;
+  static constexpr int pairs = words % 4 == 1 || words % 4 == 2, quads = (words + 3) / 4 - pairs;
+  static constexpr int row_bytes = (quads * 4 + pairs * 2) * int(sizeof(T)) + 2;
+  static constexpr int fitting = 90 * 1024 / row_bytes / 32 * 32;
+  static constexpr int batch = fitting < kItemParticles ? fitting : kItemParticles;
+
+  // The sums, in the same memory: a plane of nodes for each slice, leading cell and leading node. The four nodes of a
+  // block along the last axis are contiguous, so rows of the tile are, too, and are handled four words at a time.
+  static constexpr int near_quads = channels, far_quads = (Order * channels + 3) / 4;
+  static constexpr int row_quads = near_quads + far_quads, plane_rows = D == 2 ? 1 : width;
+  static constexpr int plane_quads = plane_rows * row_quads + (11 - plane_rows * row_quads % 8) % 8;  // 3 modulo 8
+  static constexpr int planes = slices * kBlockWidth * support;
+
+  static constexpr size_t particle_bytes = size_t(batch) * row_bytes;
+  static constexpr size_t sum_bytes = size_t(planes) * plane_quads * 4 * sizeof(T);
+  static constexpr size_t shared_bytes = particle_bytes > sum_bytes ? particle_bytes : sum_bytes;
+};
+
+// The particles of a batch in shared memory, in linked lists of rows: one for each cell, or for each slice of it, and
+// one of particles that are not in their base block.
+template <class S>
+struct SharedParticles {
+  using T = typename S::T;
+  static constexpr uint16_t end = 0xffff;
+  Quad<T>* quads;  // [quads, batch]
+  Pair<T>* pairs;  // [pairs, batch]
+  uint16_t* next;  // [batch]
+  int* head;       // [lists + 1]
+
+  __device__ SharedParticles(char* memory, int* head) : head(head) {
+    quads = reinterpret_cast<Quad<T>*>(memory);
+    pairs = reinterpret_cast<Pair<T>*>(quads + S::quads * S::batch);
+    next = reinterpret_cast<uint16_t*>(pairs + S::pairs * S::batch);
+  }
+  // Row of particle k. Neighbouring cells use different banks when each holds eight particles in order.
+  __device__ static int row(int k) { return k ^ (k / 8 & 7); }
+};
+
+// The weights of an axis without those of node 1, which follow from the others.
+template <class S, class T>
+__device__ void pack_weights(const T& f, T* packed) {
+  T w[S::support];
+  BSpline<S::Order>::weights(f, w);
+#pragma unroll
+  for (int k = 0; k < S::stored; k++) packed[k] = w[k > 0 ? k + 1 : 0];
+  if constexpr (S::Gradient) {
+    BSpline<S::Order>::first_derivatives(f, w);
+#pragma unroll
+    for (int k = 0; k < S::stored; k++) packed[S::stored + k] = w[k > 0 ? k + 1 : 0];
+  }
+}
+
+template <class S, class T>
+__device__ void unpack_weights(const T* packed, const T& sum, T* w) {
+  w[0] = packed[0];
+  w[1] = sum - packed[0];
+#pragma unroll
+  for (int k = 1; k < S::stored; k++) {
+    w[k + 1] = packed[k];
+    w[1] -= packed[k];
+  }
+}
+
+template <class S, class T, int D>
+__device__ void store_particle(const SharedParticles<S>& shared, int row, const T f[D],
+                               const Contribution<T, D, S::Plain, S::Linear>& c) {
+  T word[S::quads * 4 + 2] = {};
+  word[0] = f[0];
+#pragma unroll
+  for (int i = 1; i < D; i++) pack_weights<S>(f[i], word + S::weights + (i - 1) * S::derivatives * S::stored);
+#pragma unroll
+  for (int k = 0; k < S::Plain; k++) word[S::plain + k] = c.plain[k];
+#pragma unroll
+  for (int k = 0; k < S::Linear; k++) {
+    T* const w = word + S::linear + k * S::linear_words;
+    w[0] = c.value[k];
+#pragma unroll
+    for (int i = 0; i < D; i++) {
+      w[0] -= c.moment[k][i] * f[i];
+      w[1 + i] = c.moment[k][i];
+      if (S::Gradient) w[1 + D + i] = c.gradient[k][i];
+    }
+  }
+#pragma unroll
+  for (int q = 0; q < S::quads; q++)
+    shared.quads[q * S::batch + row] = {word[4 * q], word[4 * q + 1], word[4 * q + 2], word[4 * q + 3]};
+  if (S::pairs > 0) shared.pairs[row] = {word[4 * S::quads], word[4 * S::quads + 1]};
+}
+
+// One thread of a cell: which list it walks, and which of the leading nodes it adds to.
+template <class S>
+struct Walker {
+  using T = typename S::T;
+  int list, lane;
+  NodeWeight<S::Order, T> leading;
+
+  __device__ Walker() : list(threadIdx.x / S::support), lane(threadIdx.x % S::support), leading(lane) {}
+  __device__ int cell() const { return list % S::cells; }
+  __device__ int slice() const { return list / S::cells; }
+};
+
+// A row of nodes along the last axis gets w_k (at + k step) + w'_k along.
+template <class S, class T>
+__device__ void add_row(const T (*w)[S::support], T at, const T& step, const T& along, int channel,
+                        T (*sum)[S::channels]) {
+#pragma unroll
+  for (int k = 0; k < S::support; k++) {
+    sum[k][channel] += w[0][k] * at;
+    if (S::Gradient) sum[k][channel] += w[1][k] * along;
+    at += step;
+  }
+}
+
+// What one thread adds to its slab from one particle.
+template <class S, class T>
+__device__ void add_particle(const SharedParticles<S>& shared, const Walker<S>& walker, int row,
+                             T (&sum)[S::slab][S::channels]) {
+  constexpr int D = S::D, rows = S::slab / S::support;
+  T word[S::quads * 4 + 2], weights[D - 1][S::derivatives][S::support];
+#pragma unroll
+  for (int q = 0; q < S::quads; q++) {
+    const Quad<T> v = shared.quads[q * S::batch + row];
+#pragma unroll
+    for (int e = 0; e < 4; e++) word[4 * q + e] = v.e[e];
+  }
+  if (S::pairs > 0) {
+    const Pair<T> v = shared.pairs[row];
+    word[4 * S::quads] = v.e[0];
+    word[4 * S::quads + 1] = v.e[1];
+  }
+#pragma unroll
+  for (int i = 0; i < D - 1; i++)
+#pragma unroll
+    for (int d = 0; d < S::derivatives; d++)
+      unpack_weights<S>(word + S::weights + (i * S::derivatives + d) * S::stored, d == 0 ? T(1) : T(0), weights[i][d]);
+  const T w = walker.leading.at(word[0]), slope = S::Gradient ? walker.leading.slope(word[0]) : T(0);
+  const auto& middle = weights[0];  // in 3-D
+  const auto& last = weights[D - 2];
+#pragma unroll
+  for (int c = 0; c < S::Plain; c++) {
+    const T v = w * word[S::plain + c];
+#pragma unroll
+    for (int j = 0; j < rows; j++) {
+      const T at = D == 2 ? v : middle[0][j] * v;
+#pragma unroll
+      for (int k = 0; k < S::support; k++) sum[j * S::support + k][c] += last[0][k] * at;
+    }
+  }
+#pragma unroll
+  for (int c = 0; c < S::Linear; c++) {
+    const T* const v = word + S::linear + c * S::linear_words;
+    const T* const g = v + 1 + D;
+    T at = w * (v[0] + v[1] * T(walker.lane));
+    if (S::Gradient) at += slope * g[0];
+    const T step = w * v[D], along = S::Gradient ? w * g[D - 1] : T(0);
+    if constexpr (D == 2) {
+      add_row<S>(last, at, step, along, S::Plain + c, sum);
+    } else {
+      const T across = w * v[2], tilt = S::Gradient ? w * g[1] : T(0);
+#pragma unroll
+      for (int j = 0; j < rows; j++) {
+        T start = middle[0][j] * at;
+        if (S::Gradient) start += middle[1][j] * tilt;
+        add_row<S>(last, start, middle[0][j] * step, middle[0][j] * along, S::Plain + c, sum + j * S::support);
+        at += across;
+      }
+    }
+  }
+}
+
+// Particles of a batch, counted from its first, that are not in their base block.
+template <class S>
+struct Strays {
+  int count;
+  uint16_t particle[S::batch];
+};
+
+// Links the lists in the order of the index tensor, from the last particle to the first; by one warp. `next` holds the
+// list of each particle before, and its successor after.
+template <class S>
+__device__ void link_in_order(const SharedParticles<S>& shared, int n) {
+  const int lane = threadIdx.x;
+  for (int first = (n - 1) / 32 * 32; first >= 0; first -= 32) {
+    const int row = SharedParticles<S>::row(first + lane), list = first + lane < n ? shared.next[row] : -1;
+    const unsigned group = __match_any_sync(~0u, list), after = group & ~((2u << lane) - 1);
+    const int head = list >= 0 ? shared.head[list] : 0;
+    __syncwarp();
+    if (list >= 0) {
+      shared.next[row] = uint16_t(after ? SharedParticles<S>::row(first + __ffs(after) - 1) : head);
+      if (__ffs(group) - 1 == lane) shared.head[list] = row;
+    }
+    __syncwarp();
+  }
+}
+
+// Loads the particles index[begin, begin + n) of a block into shared memory and links them by cell.
+template <class S, class Source, class T, int D>
+__device__ void load_particles(const Source& source, const Topology<T, D>& t, int block, BaseBlock<T, D>& base_block,
+                               const SharedParticles<S>& shared, Strays<S>& strays, int begin, int n, bool in_order) {
+  int following = int(threadIdx.x) < n ? t.index[begin + threadIdx.x] : 0;
+  if (threadIdx.x == 32) base_block.template set<S::Order>(t, block);
+  if (threadIdx.x == 0) strays.count = 0;
+  for (int c = threadIdx.x; c <= S::lists; c += S::threads) shared.head[c] = SharedParticles<S>::end;
+  __syncthreads();
+#pragma unroll 1
+  for (int k = threadIdx.x; k < n; k += S::threads) {
+    const int p = following;
+    if (k + S::threads < n) following = t.index[begin + k + S::threads];
+    int cell;
+    T f[D];
+    // Loaded and stored wherever the particle is, so that no load waits for another.
+    const Vector<T, D> x = read_vector(source.position, p);
+    const auto loaded = source.load(p, base_block.scene);
+    const bool in_block = base_block.template locate<S::Order>(t.geometry, x, cell, f);
+    const int row = SharedParticles<S>::row(k), list = in_block ? k % S::slices * S::cells + cell : S::lists;
+    store_particle<S, T, D>(shared, row, f, source.contribution(loaded));
+    if (source.drifted && !in_block) strays.particle[atomicAdd(&strays.count, 1)] = uint16_t(k);
+    shared.next[row] = uint16_t(in_order ? list : atomicExch(&shared.head[list], row));
+  }
+  __syncthreads();
+  if (in_order) {
+    if (threadIdx.x < 32) link_in_order(shared, n);
+    __syncthreads();
+  }
+}
+
+template <class T>
+__device__ void add_to_nodes(T* to, T value, bool in_order) {
+  if (in_order)
+    *to += value;
+  else
+    atomicAdd(to, value);
+}
+
+template <class T>
+__device__ void add_to_nodes(T* to, const T value[4], bool in_order) {
+#if __CUDA_ARCH__ >= 900
+  if constexpr (sizeof(T) == 4) {
+    if (!in_order) {
+      atomicAdd(reinterpret_cast<float4*>(to), make_float4(value[0], value[1], value[2], value[3]));
+      return;
+    }
+  }
+#endif
+#pragma unroll
+  for (int e = 0; e < 4; e++) add_to_nodes(to + e, value[e], in_order);
+}
+
+// Whether rows of nodes without a gap begin at whole vectors.
+template <class S, class T>
+__device__ bool is_dense(const NodeField<T>& nodes) {
+  return nodes.stride == S::channels && reinterpret_cast<uintptr_t>(nodes.pointer) % 16 == 0;
+}
+
+// What the node at `offset` from the base node gets from a particle in shared memory.
+template <class S, class T, int D>
+__device__ void node_value(const SharedParticles<S>& shared, int row, const T f[D], const int offset[D],
+                           T (&value)[S::channels]) {
+  T word[S::quads * 4 + 2], weight = T(1), slope[D];
+#pragma unroll
+  for (int q = 0; q < S::quads; q++) {
+    const Quad<T> v = shared.quads[q * S::batch + row];
+#pragma unroll
+    for (int e = 0; e < 4; e++) word[4 * q + e] = v.e[e];
+  }
+  if (S::pairs > 0) {
+    const Pair<T> v = shared.pairs[row];
+    word[4 * S::quads] = v.e[0];
+    word[4 * S::quads + 1] = v.e[1];
+  }
+#pragma unroll
+  for (int i = 0; i < D; i++) slope[i] = T(1);
+#pragma unroll
+  for (int i = 0; i < D; i++) {
+    const NodeWeight<S::Order, T> node(offset[i]);
+    weight *= node.at(f[i]);
+#pragma unroll
+    for (int j = 0; j < D; j++) slope[j] *= i == j ? node.slope(f[i]) : node.at(f[i]);
+  }
+#pragma unroll
+  for (int c = 0; c < S::Plain; c++) value[c] = weight * word[S::plain + c];
+#pragma unroll
+  for (int c = 0; c < S::Linear; c++) {
+    const T* const v = word + S::linear + c * S::linear_words;
+    T at = v[0], along = T(0);
+#pragma unroll
+    for (int i = 0; i < D; i++) {
+      at += v[1 + i] * T(offset[i]);
+      if (S::Gradient) along += slope[i] * v[1 + D + i];
+    }
+    value[S::Plain + c] = weight * at + along;
+  }
+}
+
+// What a warp adds to the nodes of one particle, a lane to a node: `first` is the row of its base node.
+template <class S, class T, int D>
+__device__ void add_stray(const NodeField<T>& nodes, const Schedule<const int>& schedule,
+                          const SharedParticles<S>& shared, int row, const T f[D], int first) {
+  constexpr int count = D == 2 ? S::support * S::support : S::support * S::slab;
+  const int slot = first / kBlockNodes<D>;
+  for (int n = threadIdx.x % 32; n < count; n += 32) {
+    int offset[D], node[D], neighbour = 0;
+#pragma unroll
+    for (int i = D - 1, rest = n, base = first; i >= 0; i--, rest /= S::support, base /= kBlockWidth) {
+      offset[i] = rest % S::support;
+      node[i] = base % kBlockWidth + offset[i];
+      neighbour |= int(node[i] >= kBlockWidth) << (D - 1 - i);
+    }
+    const int node_slot = schedule.neighbours[(slot << D) + neighbour];
+    if (node_slot < 0) continue;
+    T value[S::channels];
+    node_value<S, T, D>(shared, row, f, offset, value);
+    T* const to = nodes.pointer + (int64_t(node_slot) * kBlockNodes<D> + node_in_block<D>(node)) * nodes.stride;
+    if constexpr (S::channels == 4) {
+      if (is_dense<S>(nodes)) {
+        add_to_nodes(to, value, false);
+        continue;
+      }
+    }
+#pragma unroll
+    for (int c = 0; c < S::channels; c++) add_to_nodes(to + c, value[c], false);
+  }
+}
+
+// The strays of a batch index[begin, ...) go to the nodes without a tile. Each lane finds one, so that its loads do not
+// wait for those of others, and then the warp takes them in turn.
+template <class S, class Source, class T, int D>
+__device__ void add_strays(const Source& source, const Topology<T, D>& t, const Schedule<const int>& schedule,
+                           int scene, const SharedParticles<S>& shared, const Strays<S>& strays, int begin) {
+  constexpr int warps = S::threads / 32;
+  const int warp = threadIdx.x / 32, lane = threadIdx.x % 32;
+  for (int start = warp; start < strays.count; start += 32 * warps) {
+    const int s = start + warps * lane;
+    int first = -1, row = 0;
+    T f[D] = {};
+    if (s < strays.count) {
+      const int k = strays.particle[s], p = t.index[begin + k];
+      int base[D];
+      const int slot = locate_slot<S::Order>(t, scene, read_vector(source.position, p), base, f);
+      row = SharedParticles<S>::row(k);
+      if (slot >= 0) first = slot * kBlockNodes<D> + node_in_block<D>(base);
+    }
+    for (unsigned left = __ballot_sync(~0u, first >= 0); left; left &= left - 1) {
+      const int from = __ffs(left) - 1;
+      T at[D];
+#pragma unroll
+      for (int i = 0; i < D; i++) at[i] = __shfl_sync(~0u, f[i], from);
+      add_stray<S, T, D>(source.nodes, schedule, shared, __shfl_sync(~0u, row, from), at,
+                         __shfl_sync(~0u, first, from));
+    }
+  }
+}
+
+// Adds the slabs of all threads to the planes. Threads of one plane add to different nodes at a time.
+template <class S, class T>
+__device__ void add_slabs(const Walker<S>& walker, const T (&sum)[S::slab][S::channels], Quad<T>* planes) {
+  constexpr int D = S::D, K = S::channels;
+  for (int q = threadIdx.x; q < S::planes * S::plane_quads; q += S::threads) planes[q] = {};
+  const int cell = walker.cell(), leading = cell / (S::cells / kBlockWidth);
+  const int row = D == 2 ? 0 : cell / kBlockWidth % kBlockWidth;
+  const int plane = (walker.slice() * kBlockWidth + leading) * S::support + walker.lane;
+  T* const to = reinterpret_cast<T*>(planes + plane * S::plane_quads + row * S::row_quads) + cell % kBlockWidth * K;
+#pragma unroll
+  for (int n = 0; n < S::slab; n++) {
+    T* const node = to + n / S::support * S::row_quads * 4 + n % S::support * K;
+    __syncthreads();
+    if constexpr (K == 4) {
+      Quad<T>& v = *reinterpret_cast<Quad<T>*>(node);
+      v = {v.e[0] + sum[n][0], v.e[1] + sum[n][1], v.e[2] + sum[n][2], v.e[3] + sum[n][3]};
+    } else {
+#pragma unroll
+      for (int c = 0; c < K; c++) node[c] += sum[n][c];
+    }
+  }
+}
+
+// Four words of a row of the tile: the sum over the planes that reach it.
+template <class S, class T>
+__device__ Quad<T> tile_sum(const Quad<T>* planes, int leading, int row, int quad) {
+  Quad<T> sum = {};
+#pragma unroll
+  for (int lane = 0; lane < S::support; lane++) {
+    const int cell = leading - lane;
+    if (unsigned(cell) >= unsigned(kBlockWidth)) continue;
+#pragma unroll
+    for (int slice = 0; slice < S::slices; slice++) {
+      const int plane = (slice * kBlockWidth + cell) * S::support + lane;
+      const Quad<T> v = planes[plane * S::plane_quads + row * S::row_quads + quad];
+#pragma unroll
+      for (int e = 0; e < 4; e++) sum.e[e] += v.e[e];
+    }
+  }
+  return sum;
+}
+
+// Adds the tile to the grid, four words at a time.
+template <class S, class T, int D>
+__device__ void flush_tile(const NodeField<T>& nodes, const int slots[1 << D], const Quad<T>* planes, bool in_order) {
+  constexpr int K = S::channels, width = S::width;
+  constexpr int tile_rows = D == 2 ? width : width * width;
+  const bool dense = is_dense<S>(nodes);
+  for (int t = threadIdx.x; t < tile_rows * S::row_quads; t += S::threads) {
+    const int tile_row = t / S::row_quads, quad = t % S::row_quads, far = quad >= S::near_quads;
+    const int first_word = (far ? quad - S::near_quads : quad) * 4;
+    const int leading[2] = {D == 2 ? tile_row : tile_row / width, D == 2 ? 0 : tile_row % width};
+    int neighbour = 0, node[D] = {};
+#pragma unroll
+    for (int i = 0; i < D - 1; i++) {
+      neighbour = neighbour * 2 + (leading[i] >= kBlockWidth);
+      node[i] = leading[i];
+    }
+    const int slot = slots[neighbour * 2 + far];
+    if (slot < 0) continue;
+    const int64_t row = int64_t(slot) * kBlockNodes<D> + node_in_block<D>(node);
+    const Quad<T> value = tile_sum<S>(planes, leading[0], leading[1], quad);
+    if (value.e[0] == T(0) && value.e[1] == T(0) && value.e[2] == T(0) && value.e[3] == T(0)) continue;
+    if (dense) {
+      add_to_nodes(nodes.pointer + row * K + first_word, value.e, in_order);
+    } else {
+#pragma unroll
+      for (int e = 0; e < 4; e++) {
+        const int word = first_word + e;
+        if (value.e[e] != T(0))
+          add_to_nodes(nodes.pointer + (row + word / K) * nodes.stride + word % K, value.e[e], in_order);
+      }
+    }
+  }
+}
+
+// Source: topology, nodes, position, whether particles have drifted; load(p, scene), what it needs of a particle;
+// contribution(loaded), what the particle gives; and perhaps leave_out(p) for a particle outside.
+//
+// colour < 0: every item, with atomics. Otherwise the base blocks of that colour, whole, without atomics.
+template <class Source>
+__global__ void __launch_bounds__(Source::Shape::threads, Source::resident)
+    scatter_kernel(const Source source, int colour) {
+  using S = typename Source::Shape;
+  using T = typename S::T;
+  constexpr int D = S::D;
+  extern __shared__ __align__(16) char memory[];
+  __shared__ int slots[1 << D], head[S::lists + 1];
+  __shared__ BaseBlock<T, D> base_block;
+  __shared__ Strays<S> strays;
+  const SharedParticles<S> shared(memory, head);
+  Quad<T>* const planes = reinterpret_cast<Quad<T>*>(memory);
+  const Topology<T, D>& t = source.topology;
+  const Schedule<const int> schedule = schedule_of(t);
+  const bool in_order = colour >= 0;
+  const Walker<S> walker;
+  const int4* const items = reinterpret_cast<const int4*>(schedule.items);
+  const int count = *schedule.item_count;
+  int4 entries = items[blockIdx.x];  // without waiting for the count: there is room for as many
+  for (int i = blockIdx.x; i < count;) {
+    Item item{entries.x, entries.y, entries.z, entries.w};
+    i += gridDim.x;
+    if (i < count) entries = items[i];
+    if (in_order) {
+      if (block_colour(t.geometry, item.block) != colour || item.begin != t.offsets[item.slot]) continue;
+      item.end = t.offsets[item.slot + 1];
+    }
+    const int slot = threadIdx.x < 1 << D ? schedule.neighbours[(item.slot << D) + threadIdx.x] : -1;
+    for (int begin = item.begin; begin < item.end; begin += S::batch) {
+      load_particles<S>(source, t, item.block, base_block, shared, strays, begin, min(S::batch, item.end - begin),
+                        in_order);
+      if (threadIdx.x < 1 << D) slots[threadIdx.x] = slot;
+      T sum[S::slab][S::channels] = {};
+#pragma unroll 1
+      for (int row = head[walker.list]; row != SharedParticles<S>::end;) {
+        const int following = shared.next[row];
+        add_particle(shared, walker, row, sum);
+        row = following;
+      }
+      if (source.drifted) add_strays<S>(source, t, schedule, base_block.scene, shared, strays, begin);
+      __syncthreads();
+      add_slabs(walker, sum, planes);
+      __syncthreads();
+      flush_tile<S, T, D>(source.nodes, slots, planes, in_order);
+      __syncthreads();
+    }
+  }
+  if constexpr (requires { source.leave_out(0); }) {
+    const int64_t stride = int64_t(gridDim.x) * S::threads;
+    for (int64_t i = t.offsets[t.max_blocks] + int64_t(blockIdx.x) * S::threads + threadIdx.x; i < t.particles;
+         i += stride)
+      source.leave_out(t.index[i]);
+  }
+}
+
+template <class Source>
+void launch_scatter(const Source& source, bool deterministic, Stream stream) {
+  using S = typename Source::Shape;
+  const int64_t items = most_items(source.topology.max_blocks, source.topology.particles);
+  if (items == 0) return;
+  for (int colour = deterministic ? 0 : -1; colour < (deterministic ? 1 << S::D : 0); colour++)
+    launch(scatter_kernel<Source>, grid_size(items), S::threads, S::shared_bytes, stream, source, colour);
+}
+
+enum class Stress { none, moment, gradient };
+
+template <int Order, class T, int D, Stress Kind>
+struct MomentumSource {
+  static constexpr bool with_stress = Kind != Stress::none, gradient = Kind == Stress::gradient;
+  using Shape = ScatterShape<Order, T, D, 1, D, gradient>;
+  // With fewer registers the loads of the stress would wait for each other.
+  static constexpr int resident = !with_stress && Order == 2 && D == 3 && sizeof(T) == 4 ? 5 : 0;
+  Topology<T, D> topology;
+  NodeField<T> nodes;
+  Columns<const T, D> position;
+  MomentumFields<Order, T, D> fields;
+  bool drifted;
+
+  explicit MomentumSource(const P2GArguments<T, D>& a)
+      : topology(a.topology), nodes(a.nodes), position(a.x), fields(a), drifted(a.drifted) {}
+
+  __device__ ParticleMomentum<T, D> load(int p, int scene) const {
+    ParticleMomentum<T, D> m = fields.read(p, scene, with_stress);
+    if (with_stress) m.stress = fields.read_stress(p);
+    return m;
+  }
+  __device__ Contribution<T, D, 1, D> contribution(const ParticleMomentum<T, D>& particle) const {
+    const NodeMomentum<T, D> m =
+        fields.to_nodes(particle, gradient ? StressForm::gradient : StressForm::mls, with_stress);
+    Contribution<T, D, 1, D> c;
+    c.plain[0] = m.mass;
+#pragma unroll
+    for (int i = 0; i < D; i++) {
+      c.value[i] = m.momentum[i];
+#pragma unroll
+      for (int j = 0; j < D; j++) {
+        c.moment[i][j] = m.moment[i][j];
+        c.gradient[i][j] = m.gradient[i][j];
+      }
+    }
+    return c;
+  }
+};
+
+}  // namespace mpm::cuda

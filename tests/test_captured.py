@@ -1,0 +1,155 @@
+"""Steps from CUDA graphs against the same steps from Python, which other tests hold against oracles."""
+
+import pytest
+import torch
+from test_rollouts import F64, LAWS_HERE, assert_equal, blob, box, one_by_one, tensors
+
+import torch_mpm as mpm
+
+DT = 2e-4
+
+
+def heated(dim: int, device: str, **options) -> tuple[mpm.Step, mpm.State]:
+    grid = box(dim)
+    plate = mpm.heat_boundaries.Convection(mpm.heat_boundaries.FreeSurface(), coefficient=30.0, ambient=400.0)
+    heat = mpm.Heat(grid, conductivity=5.0, specific_heat=800.0, boundaries=[plate])
+    step = mpm.Step(grid, mpm.NeoHookean(E=1e4, nu=0.3), gravity=(0.0, -9.8, 0.0)[:dim], walls="slip", heat=heat)
+    state = blob(device, dim)
+    return step, state.replace(temperature=300 + 40 * state.x[:, 0])
+
+
+def mixed(dim: int, device: str) -> tuple[mpm.Step, mpm.State]:
+    """FLIP, a law that reads a temperature from a table, and an obstacle that moves."""
+    soft = mpm.NeoHookean(E=mpm.Table([280.0, 320.0], [2e4, 1e4]), nu=0.3)
+    ball = mpm.Sphere((0.5,) * dim, 0.15, velocity=(0.0, 4.0, 0.0)[:dim])
+    laws = mpm.Mixture([soft, LAWS_HERE["sand"]()])
+    step = mpm.Step(box(dim), laws, walls="slip", transfer="apic", flip=0.7, boundaries=[ball])
+    state = blob(device, dim, material=torch.arange(300, dtype=torch.int32) % 2)
+    step = step.to(device)
+    return step, state.replace(temperature=300 + 40 * state.x[:, 0])
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("make", [heated, mixed])
+def test_replays_are_single_steps(make, dim):
+    step, state = make(dim, "cuda")
+    again = make(dim, "cuda")[0]
+    with torch.no_grad():
+        assert "from a CUDA graph" in step.explain(state, DT)
+        end = state
+        for n in (3, 9, 20):
+            end = mpm.rollout(step, end, n, DT)
+        assert_equal(end, one_by_one(again, state, 32, DT))
+        step.check()
+        again.check()
+        assert int(step.status[0, 5]) == int(again.status[0, 5]) == 32
+        assert str(step.failures(end)) == str(again.failures(end))
+
+
+@pytest.mark.cuda
+def test_the_pool_follows_between_replays():
+    """Matter that flies apart wants more blocks than it began with."""
+    step, state = heated(3, "cuda")
+    state = state.replace(v=8 * (state.x - 0.5))
+    with torch.no_grad():
+        first = step(state, DT)
+        before = step.grid.max_blocks
+        end = mpm.rollout(step, first, 400, DT)
+        step.check()
+        again = heated(3, "cuda")[0]
+        expected = one_by_one(again, first, 400, DT)
+    assert step.grid.max_blocks > before
+    assert float((end.x - expected.x).abs().max()) < 1e-7
+
+
+@pytest.mark.cuda
+def test_what_happens_in_a_replay_is_reported():
+    step, state = heated(2, "cuda")
+    v = state.v.clone()
+    v[7] = torch.tensor([-80.0, 0.0], dtype=F64)  # and its domain ends .3 m away
+    step.walls = None
+    with torch.no_grad():
+        end = mpm.rollout(step, state.replace(v=v), 40, DT)
+        again = heated(2, "cuda")[0]
+        again.walls = None
+        expected = one_by_one(again, state.replace(v=v), 40, DT)
+        assert str(step.failures(end)) == str(again.failures(expected))
+
+
+@pytest.mark.cuda
+def test_functions_of_the_users_are_called_in_every_step():
+    step, state, calls = *heated(2, "cuda"), []
+    step.on_grid = lambda blocks, velocity, mass, dt: calls.append(1) or velocity
+    with torch.no_grad():
+        assert "step by step" in step.explain(state, DT)
+        mpm.rollout(step, state, 12, DT)
+    assert len(calls) == 12
+    step.on_grid = None
+    shape = mpm.SDF(lambda x: calls.append(1) or (x - 0.5).norm(dim=1) - 0.1, (0.0, 0.0))
+    for boundaries in ([shape], [mpm.Sphere(lambda t: torch.full((2,), 0.5), 0.1)]):
+        step.boundaries = boundaries
+        assert "something of the user's" in step.explain(state, DT)
+    step.boundaries = []
+    wanted = state.v.clone().requires_grad_()
+    end = mpm.rollout(step, state.replace(v=wanted), 12, DT)
+    assert torch.autograd.grad(end.v.square().sum(), wanted)[0].abs().max() > 0
+
+
+def network(dim: int, device: str) -> torch.nn.Module:
+    torch.manual_seed(5)
+    layers = torch.nn.Sequential(torch.nn.Linear(dim * dim, 16), torch.nn.Tanh(), torch.nn.Linear(16, dim * dim))
+
+    class Law(torch.nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.layers = layers
+
+        def forward(self, F):
+            eye = torch.eye(dim, dtype=F.dtype, device=F.device)
+            tau = 1e3 * (F @ F.mT - eye) + 1e2 * self.layers((F - eye).flatten(1)).view_as(F)
+            return 0.5 * (tau + tau.mT)
+
+    return Law().to(device, F64)
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("n", [1, 4])
+def test_training_from_graphs(dim, n):
+    """Values and gradients of state and network, in every call of a loop that changes both."""
+    step = mpm.Step(box(dim, max_blocks=36), network(dim, "cuda"), gravity=(0.0, -9.8, 0.0)[:dim], walls="slip")
+    state = step.prepare(blob("cuda", dim))
+    state = state.replace(v=state.v.clone().requires_grad_())
+    advance = mpm.captured(step, state, DT, n)
+    for k in range(3):
+        v = (state.v.detach() * (1 - 0.1 * k)).requires_grad_()
+        start = state.replace(v=v, time=0.1 * k)
+        leaves = [v, *step.parameters()]
+        ends = [advance(start), one_by_one(step, start, n, DT)]
+        grads = [torch.autograd.grad((end.x * end.v).sum(), leaves) for end in ends]
+        assert ends[0].time == pytest.approx(ends[1].time)
+        assert_equal(ends[0].replace(time=0.0), ends[1].replace(time=0.0))
+        for a, b in zip(*grads, strict=True):
+            assert float((a - b).abs().max()) < 1e-10 * float(b.abs().max())
+        with torch.no_grad():
+            for p in step.parameters():
+                p.mul_(0.9)
+    step.check()
+
+
+@pytest.mark.cuda
+def test_another_kind_of_state_is_refused():
+    step = mpm.Step(box(2, max_blocks=36), network(2, "cuda"))
+    state = step.prepare(blob("cuda", 2))
+    advance = mpm.captured(step, state, DT)
+    with pytest.raises(ValueError, match=r"state must be as it was captured, x \(300, 2\) torch.float64"):
+        advance(blob("cuda", 2, 200))
+    with pytest.raises(TypeError, match="step must be a Step or another module"):
+        mpm.captured(lambda state, dt: state, state, DT)
+
+
+def test_a_graph_needs_a_gpu():
+    step = mpm.Step(box(2), mpm.NeoHookean(E=1e4, nu=0.3))
+    state = blob("cpu", 2)
+    with pytest.raises(ValueError, match="state must be on a CUDA device, got cpu"):
+        mpm.captured(step, state, DT)
+    assert tensors(mpm.rollout(step, state, 0, DT)).keys() == tensors(state).keys()
