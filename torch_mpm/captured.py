@@ -90,6 +90,7 @@ def replayed(step: Step, state: State, n: int, dt: float) -> State:
     graph: _Replays | None = None
     while n >= LEAST_STEPS:
         count = min(n, CHUNK) if step.grid.grows else n
+        step.grid.wait()
         blocks = step.grid.pool(state.x, state.scene)
         if graph is None or graph.blocks != blocks:
             graph = _Replays(step, state, dt, blocks)

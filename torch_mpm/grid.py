@@ -198,6 +198,11 @@ class Grid(Lattice):
         self._pending = torch.cuda.Event()
         self._pending.record()
 
+    def wait(self) -> None:
+        """Wait for what `watch` has asked a device for, so that the next activation has room for what it told."""
+        if self._pending is not None:
+            self._pending.synchronize()
+
 
 def check_grid(grid: Any) -> None:
     if not isinstance(grid, Grid):

@@ -297,8 +297,11 @@ class Step(TensorModule):
 
         reason = obstacle_to_substeps(self, state, dt)
         if reason is not None:
-            replays = obstacle_to_replays(self, state, dt) is None
-            return f"{'from a CUDA graph of one step' if replays else 'step by step'}, because {reason}"
+            no_graph = obstacle_to_replays(self, state, dt)
+            if no_graph is None:
+                return f"from a CUDA graph of one step, because {reason}"
+            also = f"; not from a CUDA graph, because {no_graph}" if state.x.is_cuda and no_graph != reason else ""
+            return f"step by step, because {reason}{also}"
         return f"all steps {'between two kept states ' if wants_gradient(self, state) else ''}in one op"
 
     def reset(self) -> None:

@@ -31,12 +31,17 @@ inline unsigned grid_size(int64_t count) {
   return unsigned(std::clamp<int64_t>(count, 1, int64_t(processors) * 128));
 }
 
+// What exceeds 48 KB has to be asked for, and what a kernel declares itself counts too: up to 16 KB.
+template <class Kernel>
+void allow_shared_memory(Kernel* kernel, size_t shared_memory) {
+  if (shared_memory > 32 * 1024)
+    check(cudaFuncSetAttribute(kernel, cudaFuncAttributeMaxDynamicSharedMemorySize, int(shared_memory)));
+}
+
 template <class... Parameters, class... Arguments>
 void launch(void (*kernel)(Parameters...), unsigned blocks, unsigned threads, size_t shared_memory, cudaStream_t stream,
             const Arguments&... arguments) {
-  // What exceeds 48 KB has to be asked for, and what a kernel declares itself counts too: up to 16 KB.
-  if (shared_memory > 32 * 1024)
-    check(cudaFuncSetAttribute(kernel, cudaFuncAttributeMaxDynamicSharedMemorySize, int(shared_memory)));
+  allow_shared_memory(kernel, shared_memory);
   kernel<<<blocks, threads, shared_memory, stream>>>(arguments...);
   check(cudaGetLastError());
 }

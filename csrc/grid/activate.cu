@@ -469,7 +469,8 @@ __device__ void place(const ActivateArguments<T, D>& a, const Workspace& w, int6
 // ---- Kernels
 
 template <class T, int D>
-__global__ void __launch_bounds__(kThreads) take_back_kernel(const ActivateArguments<T, D> a, const Workspace w, int n) {
+__global__ void __launch_bounds__(kThreads)
+    take_back_kernel(const ActivateArguments<T, D> a, const Workspace w, int n) {
   take_back(a, w, n);
 }
 

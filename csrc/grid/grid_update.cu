@@ -1,4 +1,4 @@
-#include "cuda/launch.cuh"
+#include "cuda/chain.cuh"
 #include "grid/grid_update.h"
 #include "grid/obstacle.h"
 
@@ -12,6 +12,7 @@ constexpr int kLanes = kBlockNodes<D> < 32 ? kBlockNodes<D> : 32;  // lanes of a
 template <bool Obstacles, class T, int D>
 __global__ void __launch_bounds__(kThreads)
     grid_update_kernel(const GridUpdateArguments<T, D> a, const ContactArguments<T, D> contact) {
+  wait_for_kernel_before();
   const int64_t node = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   const int slot = int(node / kBlockNodes<D>);
   if (node == 0 && a.drift) *a.next_drift = a.drift->next(a.particles);
@@ -65,14 +66,15 @@ unsigned blocks_for(int64_t max_blocks, int64_t threads_per_slot) {
 template <class T, int D>
 void grid_update(const GridUpdateArguments<T, D>& a, Stream stream) {
   if (a.max_blocks == 0) return;
-  launch(grid_update_kernel<false, T, D>, blocks_for(a.max_blocks, kBlockNodes<D>), kThreads, 0, stream, a,
-         ContactArguments<T, D>());
+  launch_in_chain(grid_update_kernel<false, T, D>, blocks_for(a.max_blocks, kBlockNodes<D>), kThreads, 0, stream, a,
+                  ContactArguments<T, D>());
 }
 
 template <class T, int D>
 void grid_update_and_contact(const GridUpdateArguments<T, D>& a, const ContactArguments<T, D>& contact, Stream stream) {
   if (a.max_blocks == 0) return;
-  launch(grid_update_kernel<true, T, D>, blocks_for(a.max_blocks, kBlockNodes<D>), kThreads, 0, stream, a, contact);
+  launch_in_chain(grid_update_kernel<true, T, D>, blocks_for(a.max_blocks, kBlockNodes<D>), kThreads, 0, stream, a,
+                  contact);
 }
 
 #define MPM_INSTANTIATE_BOTH(T, D, name) \

@@ -54,8 +54,8 @@ __global__ void __launch_bounds__(Law::gpu_threads)
 
 // The momentum of particles whose stress is computed as they are loaded.
 template <class Law, class T, int D>
-struct LawMomentumSource : MomentumSource<2, T, D, Stress::moment> {
-  using Base = MomentumSource<2, T, D, Stress::moment>;
+struct LawMomentumSource : MomentumSource<2, T, D, Stress::moment, true> {
+  using Base = MomentumSource<2, T, D, Stress::moment, true>;
   static constexpr int resident = Law::gpu_p2g_blocks;
   LawUpdateArguments<T, D> law;
 

@@ -209,7 +209,7 @@ struct Substeps {
   G2PAdvanceArguments<T, D> advance;
   Pool<T, D> pool;
   Tensor stress, step_time;
-  Tensor drifts;           // one for each of two substeps in turn, where activations last
+  Tensor drifts;  // one for each of two substeps in turn, where activations last
   bool obstacles = false, fused = false;
   bool one_grid_pass = false;  // on CUDA, where nobody reads the velocities before contact
   const int* previous_status = nullptr;

@@ -15,7 +15,7 @@ struct P2GArguments {
   double dt = 0;
   StressForm form = StressForm::mls;
   bool deterministic = false;
-  bool drifted = false;  // particles may be in other active blocks than they were activated in; on CUDA
+  bool drifted = false;  // particles may be in other active blocks than they were activated in; with stress, on CUDA
   NodeField<T> nodes;    // zero on entry; 1 + D channels: mass, momentum
 };
 

@@ -4,11 +4,11 @@
 // G2P with the end of the step, so that v and C need not be read again.
 namespace mpm::cuda {
 
-template <int Order_, class T_, int D_, bool Gradient>
+template <int Order_, class T_, int D_, bool Gradient, bool Drifts>
 struct AdvanceGather {
   using T = T_;
   static constexpr int Order = Order_, D = D_, K = D;
-  static constexpr bool moves = true;
+  static constexpr bool drifts = Drifts;
   static constexpr int resident = Gradient ? 4 : 5;
   using Shape = SumShape<Order, T, D, K, 0, true, Gradient, SlopeForm::none>;
   struct Loaded {
@@ -111,10 +111,13 @@ struct AdvanceGather {
 
 template <int Order, class T, int D>
 void g2p_advance(const G2PAdvanceArguments<T, D>& a, Stream stream) {
+  const auto with = [&]<bool Gradient, bool Drifts>() {
+    launch_gather(AdvanceGather<Order, T, D, Gradient, Drifts>(a), stream);
+  };
   if (a.form == StressForm::gradient)
-    launch_gather(AdvanceGather<Order, T, D, true>(a), stream);
+    a.drift ? with.template operator()<true, true>() : with.template operator()<true, false>();
   else
-    launch_gather(AdvanceGather<Order, T, D, false>(a), stream);
+    a.drift ? with.template operator()<false, true>() : with.template operator()<false, false>();
 }
 
 MPM_INSTANTIATE_ORDERS(g2p_advance, G2PAdvanceArguments)

@@ -1,6 +1,6 @@
 #pragma once
 
-#include "cuda/launch.cuh"
+#include "cuda/chain.cuh"
 #include "cuda/quad.cuh"
 #include "transfer/momentum.cuh"
 
@@ -218,20 +218,31 @@ constexpr int kGatherThreads = 128;
 template <class Task>
 constexpr int kResident = Task::Order == 2 && sizeof(typename Task::T) == 4 ? Task::resident : 2;
 
-// Whether a particle that moves may stay in its activation for another step.
+// Whether particles that move may stay in their activation for another step.
 template <int Order, class T, int D>
 class Follower {
  public:
   // To x from a base block whose neighbours are active where `active` has bits.
-  __device__ void follow(const Topology<T, D>& t, int scene, int base_block, unsigned active, const Vector<T, D>& x) {
-    int base[D];
-    T f[D];
-    if (!locate_in_block<Order>(t, scene, base_block, x, base, f)) {
-      const int slot = locate_slot<Order>(t, scene, x, base, f);
-      active = slot < 0 ? 0 : active_blocks(t, slot);
-      strays_++;
+  __device__ void follow(const Topology<T, D>& t, const BaseBlock<T, D>& home, unsigned active, const Vector<T, D>& x) {
+    bool inside = true;
+    unsigned touched = 1;  // as touched_blocks()
+#pragma unroll
+    for (int i = D - 1; i >= 0; i--) {
+      const T node = base_node<Order>(t.geometry, i, x[i]);
+      inside = inside && node >= home.first[i] && node < home.end[i];  // false for NaN
+      if (node >= home.first[i] + T(kBlockWidth - Order)) touched |= touched << (1 << (D - 1 - i));
     }
-    lost_ = lost_ || (touched_blocks<Order, D>(base) & ~active) != 0;
+    if (inside)
+      lost_ = lost_ || (touched & ~active) != 0;
+    else
+      leave(t, home.scene, x);
+  }
+
+  // By whole warps.
+  __device__ void tell(Drift* drift) const {
+    const int strays = __reduce_add_sync(~0u, strays_);
+    if (strays > 0 && threadIdx.x % 32 == 0) atomicAdd(&drift->strays, strays);
+    if (lost_) drift->lost = 1;
   }
 
   // Bits of the neighbours of a slot that are active.
@@ -247,34 +258,27 @@ class Follower {
     return active;
   }
 
-  // By whole warps.
-  __device__ void tell(Drift* drift) const {
-    const int strays = __reduce_add_sync(~0u, strays_);
-    if (strays > 0 && threadIdx.x % 32 == 0) atomicAdd(&drift->strays, strays);
-    if (lost_) drift->lost = 1;
+ private:
+  __device__ void leave(const Topology<T, D>& t, int scene, const Vector<T, D>& x) {
+    int base[D];
+    T f[D];
+    const int slot = locate_slot<Order>(t, scene, x, base, f);
+    strays_++;
+    lost_ = lost_ || slot < 0 || (touched_blocks<Order, D>(base) & ~active_blocks(t, slot)) != 0;
   }
 
- private:
   int strays_ = 0;
   bool lost_ = false;
 };
 
 // Task: topology, nodes, position; load(p, scene), what it needs of a particle; compute(loaded, weights, support), what
 // the particle gets; write(p, loaded, result), with a result of zeros where positions are not those of the activation;
-// leave_out(p) for a particle outside. One that moves particles has write(...) return where they go, and a drift, or
-// null; with it particles may be in other active blocks than those of the activation.
+// leave_out(p) for a particle outside. Where it drifts, particles may be in other active blocks than those of the
+// activation, write(...) returns where they go, and there is a drift to add that to.
 template <class Task>
-constexpr bool moves = requires { Task::moves; };
+constexpr bool may_drift = requires { requires Task::drifts; };
 template <class Task>
 using FollowerOf = Follower<Task::Order, typename Task::T, Task::D>;
-
-template <class Task>
-__device__ bool may_drift(const Task& task) {
-  if constexpr (moves<Task>)
-    return task.drift;
-  else
-    return false;
-}
 
 // From the nodes in global memory, for a particle with its base node in a slot.
 template <bool Quads, class Task, class T>
@@ -309,15 +313,16 @@ __device__ void gather_in_memory_order(const Task& task, const Schedule<const in
     GridSupport<T, Task::K, D, Quads> support{task.nodes};
     T f[D];
     if (slot >= 0 && !locate_in_block<Task::Order>(t, scene, base_block, x, support.base, f))
-      slot = may_drift(task) ? locate_slot<Task::Order>(t, scene, x, support.base, f) : -1;
+      slot = may_drift<Task> ? locate_slot<Task::Order>(t, scene, x, support.base, f) : -1;
     if (slot < 0) {
       task.leave_out(p);
       continue;
     }
-    if constexpr (moves<Task>) {
+    if constexpr (may_drift<Task>) {
       const Vector<T, D> to = gather_from_grid<Quads>(task, schedule, p, scene, slot, support, f);
-      if (task.drift)
-        follower.follow(t, scene, base_block, FollowerOf<Task>::active_blocks(t, schedule.base_slot[p]), to);
+      BaseBlock<T, D> home;
+      home.template set<Task::Order>(t, base_block);
+      follower.follow(t, home, FollowerOf<Task>::active_blocks(t, schedule.base_slot[p]), to);
     } else {
       gather_from_grid<Quads>(task, schedule, p, scene, slot, support, f);
     }
@@ -349,12 +354,13 @@ __device__ void load_tile(const NodeField<const T>& nodes, const int* slots, Nod
 template <class Task>
 struct Strays {
   int count;
-  uint16_t particle[moves<Task> ? kItemParticles : 1];
+  uint16_t particle[may_drift<Task> ? kItemParticles : 1];
 };
 
 template <bool Quads, class Task>
 __device__ void gather_strays(const Task& task, const Schedule<const int>& schedule, const Strays<Task>& strays,
-                              int begin, int scene, int base_block, unsigned active, FollowerOf<Task>& follower) {
+                              int begin, const BaseBlock<typename Task::T, Task::D>& home, unsigned active,
+                              FollowerOf<Task>& follower) {
   using T = typename Task::T;
   const Topology<T, Task::D>& t = task.topology;
   __syncthreads();
@@ -363,13 +369,12 @@ __device__ void gather_strays(const Task& task, const Schedule<const int>& sched
     const int p = t.index[begin + strays.particle[s]];
     GridSupport<T, Task::K, Task::D, Quads> support{task.nodes};
     T f[Task::D];
-    const int slot = locate_slot<Task::Order>(t, scene, read_vector(task.position, p), support.base, f);
+    const int slot = locate_slot<Task::Order>(t, home.scene, read_vector(task.position, p), support.base, f);
     if (slot < 0) {
       task.leave_out(p);
       continue;
     }
-    const Vector<T, Task::D> to = gather_from_grid<Quads>(task, schedule, p, scene, slot, support, f);
-    follower.follow(t, scene, base_block, active, to);
+    follower.follow(t, home, active, gather_from_grid<Quads>(task, schedule, p, home.scene, slot, support, f));
   }
 }
 
@@ -379,6 +384,7 @@ __device__ void gather_by_items(const Task& task, const Schedule<const int>& sch
   using T = typename Task::T;
   constexpr int D = Task::D, K = Task::K, width = kBlockWidth + Task::Order;
   __shared__ Strays<Task> strays;
+  __shared__ BaseBlock<T, D> home;
   __shared__ NodeValue<T, K> tile[D == 2 ? width * width : width * width * width];
   __shared__ int slots[1 << D];
   const Topology<T, D>& t = task.topology;
@@ -393,9 +399,10 @@ __device__ void gather_by_items(const Task& task, const Schedule<const int>& sch
     Vector<T, D> x = read_vector(task.position, p);
     __syncthreads();  // the tile before is done
     if (threadIdx.x < 1 << D) slots[threadIdx.x] = schedule.neighbours[(item.x << D) + threadIdx.x];
-    if (threadIdx.x == 0) strays.count = 0;
+    if (may_drift<Task> && threadIdx.x == 32) home.template set<Task::Order>(t, base_block);
+    if (may_drift<Task> && threadIdx.x == 64) strays.count = 0;
     __syncthreads();
-    const unsigned active = may_drift(task) ? FollowerOf<Task>::active_blocks(t, item.x) : 0;
+    const unsigned active = may_drift<Task> ? FollowerOf<Task>::active_blocks(t, item.x) : 0;
     load_tile<Quads, Task::Order, T, K, D>(task.nodes, slots, tile);
     __syncthreads();
 #pragma unroll 1
@@ -410,23 +417,17 @@ __device__ void gather_by_items(const Task& task, const Schedule<const int>& sch
       for (int axis = 0; axis < D; axis++) corner = corner * width + base[axis];
       const TileSupport<Task::Order, T, K> support{tile + corner};
       const auto result = task.compute(loaded, Weights<Task::Order, T, D>(f), support);
-      if (may_drift(task) && !in_block) {
+      if constexpr (!may_drift<Task>)
+        task.write(p, loaded, in_block ? result : typename Task::Result{});
+      else if (in_block)
+        follower.follow(t, home, active, task.write(p, loaded, result));
+      else
         strays.particle[atomicAdd(&strays.count, 1)] = uint16_t(k - begin);
-      } else {
-        const auto write = [&] { return task.write(p, loaded, in_block ? result : typename Task::Result{}); };
-        if constexpr (moves<Task>) {
-          const Vector<T, D> to = write();
-          if (task.drift) follower.follow(t, scene, base_block, active, to);
-        } else {
-          write();
-        }
-      }
       p = p_next;
       p_next = p_after;
       x = x_next;
     }
-    if constexpr (moves<Task>)
-      if (task.drift) gather_strays<Quads>(task, schedule, strays, begin, scene, base_block, active, follower);
+    if constexpr (may_drift<Task>) gather_strays<Quads>(task, schedule, strays, begin, home, active, follower);
   }
   const int64_t stride = int64_t(gridDim.x) * kGatherThreads;
   for (int64_t i = t.offsets[t.max_blocks] + int64_t(blockIdx.x) * kGatherThreads + threadIdx.x; i < t.particles;
@@ -436,6 +437,7 @@ __device__ void gather_by_items(const Task& task, const Schedule<const int>& sch
 
 template <bool Quads, class Task>
 __global__ void __launch_bounds__(kGatherThreads, kResident<Task>) gather_kernel(const Task task) {
+  wait_for_kernel_before();
   const Schedule<const int> schedule = schedule_of(task.topology);
   FollowerOf<Task> follower;
   // Loads that do not wait for each other; there is room for as many items.
@@ -445,8 +447,7 @@ __global__ void __launch_bounds__(kGatherThreads, kResident<Task>) gather_kernel
     gather_in_memory_order<Quads>(task, schedule, follower);
   else
     gather_by_items<Quads>(task, schedule, counts.x, first, follower);
-  if constexpr (moves<Task>)
-    if (task.drift) follower.tell(task.drift);
+  if constexpr (may_drift<Task>) follower.tell(task.drift);
 }
 
 template <class Task>
@@ -456,9 +457,9 @@ void launch_gather(const Task& task, Stream stream) {
   const int64_t pieces = std::max(most_items(task.topology.max_blocks, particles), particles / kGatherThreads);
   if constexpr (Task::K == 3 || Task::K == 4) {
     if (is_vector<Task::K>(task.nodes))
-      return launch(gather_kernel<true, Task>, grid_size(pieces), kGatherThreads, 0, stream, task);
+      return launch_in_chain(gather_kernel<true, Task>, grid_size(pieces), kGatherThreads, 0, stream, task);
   }
-  launch(gather_kernel<false, Task>, grid_size(pieces), kGatherThreads, 0, stream, task);
+  launch_in_chain(gather_kernel<false, Task>, grid_size(pieces), kGatherThreads, 0, stream, task);
 }
 
 }  // namespace mpm::cuda

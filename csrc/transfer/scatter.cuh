@@ -1,13 +1,13 @@
 #pragma once
 
-#include "cuda/launch.cuh"
+#include "cuda/chain.cuh"
 #include "cuda/quad.cuh"
 #include "transfer/momentum.cuh"
 
-// The kernel of P2G and scatter. One thread block takes the particles of one item, links them by cell in shared memory, and adds up
-// nodes in registers: each cell has one thread per leading node of the support, Order + 1 of them, which walks the
-// particles of the cell and adds to the slab of nodes behind that leading node. The slabs are then added to a tile of
-// nodes, and the tile to the grid: one vector reduction per node, however many particles there are.
+// The kernel of P2G and scatter. One thread block takes the particles of one item, links them by cell in shared memory,
+// and adds up nodes in registers: each cell has one thread per leading node of the support, Order + 1 of them, which
+// walks the particles of the cell and adds to the slab of nodes behind that leading node. The slabs are then added to a
+// tile of nodes, and the tile to the grid: one vector reduction per node, however many particles there are.
 //
 // A node gets N_i (a + B · i) + G · ∇N_i from a particle, i being the distance from the base node in cells: `Linear`
 // channels of this kind after `Plain` ones with B = G = 0. Deterministic mode adds blocks of one colour at a time, no
@@ -216,10 +216,10 @@ __device__ void add_particle(const SharedParticles<S>& shared, const Walker<S>& 
 }
 
 // Particles of a batch, counted from its first, that are not in their base block.
-template <class S>
+template <int Most>
 struct Strays {
   int count;
-  uint16_t particle[S::batch];
+  uint16_t particle[Most];
 };
 
 // Links the lists in the order of the index tensor, from the last particle to the first; by one warp. `next` holds the
@@ -241,9 +241,10 @@ __device__ void link_in_order(const SharedParticles<S>& shared, int n) {
 }
 
 // Loads the particles index[begin, begin + n) of a block into shared memory and links them by cell.
-template <class S, class Source, class T, int D>
+template <class S, class Source, int Most, class T, int D>
 __device__ void load_particles(const Source& source, const Topology<T, D>& t, int block, BaseBlock<T, D>& base_block,
-                               const SharedParticles<S>& shared, Strays<S>& strays, int begin, int n, bool in_order) {
+                               const SharedParticles<S>& shared, Strays<Most>& strays, int begin, int n,
+                               bool in_order) {
   int following = int(threadIdx.x) < n ? t.index[begin + threadIdx.x] : 0;
   if (threadIdx.x == 32) base_block.template set<S::Order>(t, block);
   if (threadIdx.x == 0) strays.count = 0;
@@ -261,7 +262,7 @@ __device__ void load_particles(const Source& source, const Topology<T, D>& t, in
     const bool in_block = base_block.template locate<S::Order>(t.geometry, x, cell, f);
     const int row = SharedParticles<S>::row(k), list = in_block ? k % S::slices * S::cells + cell : S::lists;
     store_particle<S, T, D>(shared, row, f, source.contribution(loaded));
-    if (source.drifted && !in_block) strays.particle[atomicAdd(&strays.count, 1)] = uint16_t(k);
+    if (Source::drifts && !in_block) strays.particle[atomicAdd(&strays.count, 1)] = uint16_t(k);
     shared.next[row] = uint16_t(in_order ? list : atomicExch(&shared.head[list], row));
   }
   __syncthreads();
@@ -371,9 +372,9 @@ __device__ void add_stray(const NodeField<T>& nodes, const Schedule<const int>& 
 
 // The strays of a batch index[begin, ...) go to the nodes without a tile. Each lane finds one, so that its loads do not
 // wait for those of others, and then the warp takes them in turn.
-template <class S, class Source, class T, int D>
+template <class S, class Source, int Most, class T, int D>
 __device__ void add_strays(const Source& source, const Topology<T, D>& t, const Schedule<const int>& schedule,
-                           int scene, const SharedParticles<S>& shared, const Strays<S>& strays, int begin) {
+                           int scene, const SharedParticles<S>& shared, const Strays<Most>& strays, int begin) {
   constexpr int warps = S::threads / 32;
   const int warp = threadIdx.x / 32, lane = threadIdx.x % 32;
   for (int start = warp; start < strays.count; start += 32 * warps) {
@@ -474,7 +475,7 @@ __device__ void flush_tile(const NodeField<T>& nodes, const int slots[1 << D], c
   }
 }
 
-// Source: topology, nodes, position, whether particles have drifted; load(p, scene), what it needs of a particle;
+// Source: topology, nodes, position; whether particles may have drifted; load(p, scene), what it needs of a particle;
 // contribution(loaded), what the particle gives; and perhaps leave_out(p) for a particle outside.
 //
 // colour < 0: every item, with atomics. Otherwise the base blocks of that colour, whole, without atomics.
@@ -484,10 +485,11 @@ __global__ void __launch_bounds__(Source::Shape::threads, Source::resident)
   using S = typename Source::Shape;
   using T = typename S::T;
   constexpr int D = S::D;
+  wait_for_kernel_before();
   extern __shared__ __align__(16) char memory[];
   __shared__ int slots[1 << D], head[S::lists + 1];
   __shared__ BaseBlock<T, D> base_block;
-  __shared__ Strays<S> strays;
+  __shared__ Strays<Source::drifts ? S::batch : 1> strays;
   const SharedParticles<S> shared(memory, head);
   Quad<T>* const planes = reinterpret_cast<Quad<T>*>(memory);
   const Topology<T, D>& t = source.topology;
@@ -517,7 +519,7 @@ __global__ void __launch_bounds__(Source::Shape::threads, Source::resident)
         add_particle(shared, walker, row, sum);
         row = following;
       }
-      if (source.drifted) add_strays<S>(source, t, schedule, base_block.scene, shared, strays, begin);
+      if constexpr (Source::drifts) add_strays<S>(source, t, schedule, base_block.scene, shared, strays, begin);
       __syncthreads();
       add_slabs(walker, sum, planes);
       __syncthreads();
@@ -539,13 +541,15 @@ void launch_scatter(const Source& source, bool deterministic, Stream stream) {
   const int64_t items = most_items(source.topology.max_blocks, source.topology.particles);
   if (items == 0) return;
   for (int colour = deterministic ? 0 : -1; colour < (deterministic ? 1 << S::D : 0); colour++)
-    launch(scatter_kernel<Source>, grid_size(items), S::threads, S::shared_bytes, stream, source, colour);
+    launch_in_chain(scatter_kernel<Source>, grid_size(items), S::threads, S::shared_bytes, stream, source, colour);
 }
 
 enum class Stress { none, moment, gradient };
 
-template <int Order, class T, int D, Stress Kind>
+// Drifts: particles may be in other active blocks than they were activated in.
+template <int Order, class T, int D, Stress Kind, bool Drifts>
 struct MomentumSource {
+  static constexpr bool drifts = Drifts;
   static constexpr bool with_stress = Kind != Stress::none, gradient = Kind == Stress::gradient;
   using Shape = ScatterShape<Order, T, D, 1, D, gradient>;
   // With fewer registers the loads of the stress would wait for each other.
@@ -554,10 +558,9 @@ struct MomentumSource {
   NodeField<T> nodes;
   Columns<const T, D> position;
   MomentumFields<Order, T, D> fields;
-  bool drifted;
 
   explicit MomentumSource(const P2GArguments<T, D>& a)
-      : topology(a.topology), nodes(a.nodes), position(a.x), fields(a), drifted(a.drifted) {}
+      : topology(a.topology), nodes(a.nodes), position(a.x), fields(a) {}
 
   __device__ ParticleMomentum<T, D> load(int p, int scene) const {
     ParticleMomentum<T, D> m = fields.read(p, scene, with_stress);

@@ -1,0 +1,36 @@
+#pragma once
+
+#include "cuda/launch.cuh"
+
+// Kernels of a step, which mostly follow one another: each is launched while the one before it ends, and waits for that
+// where it begins. From compute capability 9.0 on; else they are launched as any other.
+namespace mpm::cuda {
+
+// What a kernel that is launched in a chain does first.
+__device__ inline void wait_for_kernel_before() {
+#if __CUDA_ARCH__ >= 900
+  cudaTriggerProgrammaticLaunchCompletion();  // the next one may come, and wait
+  cudaGridDependencySynchronize();
+#endif
+}
+
+template <class... Parameters, class... Arguments>
+void launch_in_chain(void (*kernel)(Parameters...), unsigned blocks, unsigned threads, size_t shared_memory,
+                     cudaStream_t stream, const Arguments&... arguments) {
+  if (device_attribute(cudaDevAttrComputeCapabilityMajor) < 9)
+    return launch(kernel, blocks, threads, shared_memory, stream, arguments...);
+  allow_shared_memory(kernel, shared_memory);
+  cudaLaunchAttribute overlap;
+  overlap.id = cudaLaunchAttributeProgrammaticStreamSerialization;
+  overlap.val.programmaticStreamSerializationAllowed = 1;
+  cudaLaunchConfig_t config{};
+  config.gridDim = blocks;
+  config.blockDim = threads;
+  config.dynamicSmemBytes = shared_memory;
+  config.stream = stream;
+  config.attrs = &overlap;
+  config.numAttrs = 1;
+  check(cudaLaunchKernelEx(&config, kernel, Parameters(arguments)...));
+}
+
+}  // namespace mpm::cuda
