@@ -199,7 +199,7 @@ __device__ void list_tiles(const Workspace& w) {
 }
 
 // Particles [kThreads piece, kThreads (piece + 1)).
-template <int Order, class T, int D>
+template <int Order, bool Marks, class T, int D>
 __device__ void classify(const ActivateArguments<T, D>& a, const Workspace& w, int64_t piece) {
   const int64_t p = piece * kThreads + threadIdx.x;
   const bool exists = p < a.particles;
@@ -215,8 +215,8 @@ __device__ void classify(const ActivateArguments<T, D>& a, const Workspace& w, i
       int block[D];
 #pragma unroll
       for (int i = 0; i < D; i++) {
-        block[i] = base[i] / kBlockWidth;
-        base[i] %= kBlockWidth;
+        block[i] = int(unsigned(base[i]) / kBlockWidth);
+        base[i] &= kBlockWidth - 1;
       }
       touched = touched_blocks<Order, D>(base);
       key = block_index(a.geometry, scene, block);
@@ -244,7 +244,7 @@ __device__ void classify(const ActivateArguments<T, D>& a, const Workspace& w, i
       first = atomicAdd(&tally->count, __popc(group));
       if (touched_by_group & ~*const_cast<volatile int*>(&tally->touched)) {
         atomicOr(&tally->touched, int(touched_by_group));
-        if (w.marked) mark_tiles(a, w, key, touched_by_group);
+        if constexpr (Marks) mark_tiles(a, w, key, touched_by_group);
       }
     }
   }
@@ -331,7 +331,7 @@ __device__ bool is_near_particles(const Geometry<T, D>& g, const Workspace& w, i
   return near;
 }
 
-template <class T, int D>
+template <bool Margin, class T, int D>
 __device__ void slots(const ActivateArguments<T, D>& a, const Workspace& w, int table) {
   each_tile(w, &w.counters->tile[0], [&](int tile, int first, bool last) {
     const int b = first + int(threadIdx.x);
@@ -347,7 +347,7 @@ __device__ void slots(const ActivateArguments<T, D>& a, const Workspace& w, int 
         if (inside) active = active || w.tally[b - further(a.geometry, o)].touched >> o & 1;
       }
     }
-    const bool margin = a.margin_blocks > 0 && b < table && !active && is_near_particles(a.geometry, w, b);
+    const bool margin = Margin && b < table && !active && is_near_particles(a.geometry, w, b);
     const Packed before = exclusive_sum(pack(active, margin), w.slot_states, tile);
     if (last && threadIdx.x == kThreads - 1) {
       w.counters->wanted = first_of(before) + active;
@@ -474,17 +474,17 @@ __global__ void __launch_bounds__(kThreads)
   take_back(a, w, n);
 }
 
-template <int Order, class T, int D>
+template <int Order, bool Marks, class T, int D>
 __global__ void __launch_bounds__(kThreads) classify_kernel(const ActivateArguments<T, D> a, const Workspace w) {
-  classify<Order>(a, w, blockIdx.x);
+  classify<Order, Marks>(a, w, blockIdx.x);
 }
 
 constexpr int kListers = 1024;
 __global__ void __launch_bounds__(kListers) list_tiles_kernel(const Workspace w) { list_tiles<kListers>(w); }
 
-template <class T, int D>
+template <bool Margin, class T, int D>
 __global__ void __launch_bounds__(kThreads) slots_kernel(const ActivateArguments<T, D> a, const Workspace w, int n) {
-  slots(a, w, n);
+  slots<Margin>(a, w, n);
 }
 
 template <class T, int D>
@@ -517,13 +517,18 @@ __global__ void __launch_bounds__(kThreads)
   for (int64_t i = start; i < (w.marked ? w.zeroed : w.zeroed_once) / int64_t(sizeof(int4)); i += stride)
     workspace[i] = {};
   all.sync();
-  for (int64_t piece = blockIdx.x; piece * kThreads < a.particles; piece += gridDim.x) classify<Order>(a, w, piece);
+  for (int64_t piece = blockIdx.x; piece * kThreads < a.particles; piece += gridDim.x) {
+    if (w.marked)
+      classify<Order, true>(a, w, piece);
+    else
+      classify<Order, false>(a, w, piece);
+  }
   all.sync();
   if (w.marked) {
     if (blockIdx.x == 0) list_tiles<kThreads>(w);
     all.sync();
   }
-  slots(a, w, table);
+  slots<true>(a, w, table);
   all.sync();
   offsets(a, w, table);
   all.sync();
@@ -556,10 +561,12 @@ void activate(const ActivateArguments<T, D>& a, Stream stream) {
   else if (w.marked)
     check(cudaMemsetAsync(a.table, 0xff, table * sizeof(int), stream));
   check(cudaMemsetAsync(a.workspace, 0, a.fresh || !w.marked ? w.zeroed_once : w.zeroed, stream));
-  if (a.particles > 0) launch(classify_kernel<Order, T, D>, blocks_for(a.particles), kThreads, 0, stream, a, w);
+  const auto classify = w.marked ? classify_kernel<Order, true, T, D> : classify_kernel<Order, false, T, D>;
+  if (a.particles > 0) launch(classify, blocks_for(a.particles), kThreads, 0, stream, a, w);
   if (table > 0) {
     if (w.marked) launch(list_tiles_kernel, 1, kListers, 0, stream, w);
-    launch(slots_kernel<T, D>, tiles, kThreads, 0, stream, a, w, table);
+    const auto slots = a.margin_blocks > 0 ? slots_kernel<true, T, D> : slots_kernel<false, T, D>;
+    launch(slots, tiles, kThreads, 0, stream, a, w, table);
     launch(offsets_kernel<T, D>, tiles, kThreads, 0, stream, a, w, table);
   }
   launch(place_kernel<T, D>, blocks_for(rows), kThreads, 0, stream, a, w);

@@ -9,17 +9,25 @@ constexpr int kThreads = 256;
 template <int D>
 constexpr int kLanes = kBlockNodes<D> < 32 ? kBlockNodes<D> : 32;  // lanes of a warp that share a slot
 
-template <bool Obstacles, class T, int D>
-__global__ void __launch_bounds__(kThreads)
-    grid_update_kernel(const GridUpdateArguments<T, D> a, const ContactArguments<T, D> contact) {
-  wait_for_kernel_before();
+template <class T, int D>
+__global__ void __launch_bounds__(kThreads) grid_update_kernel(const GridUpdateArguments<T, D> a) {
   const int64_t node = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   const int slot = int(node / kBlockNodes<D>);
-  if (node == 0 && a.drift) *a.next_drift = a.drift->next(a.particles);
+  if (slot >= a.max_blocks) return;
+  a.updated[node] = update_node(a, slot_update(a, slot), int(node % kBlockNodes<D>), a.nodes[node]);
+}
+
+// In a call of many steps, perhaps with obstacles.
+template <bool Obstacles, class T, int D>
+__global__ void __launch_bounds__(kThreads)
+    next_grid_kernel(const GridUpdateArguments<T, D> a, const ContactArguments<T, D> contact) {
+  wait_for_kernel_before();
+  const int64_t node = int64_t(blockIdx.x) * kThreads + threadIdx.x;
+  const int slot = int(node / kBlockNodes<D>), local = int(node % kBlockNodes<D>);
+  if (node == 0) *a.next_drift = a.drift->next(a.particles);
   if (slot >= a.max_blocks) return;
   const SlotUpdate<T, D> s = slot_update(a, slot);
-  if (a.emptied && !s.active) return;
-  const int local = int(node % kBlockNodes<D>);
+  if (!s.active) return;
   NodeRow<T, D> row = update_node(a, s, local, a.nodes[node]);
   if constexpr (Obstacles) {
     const ContactSlot<T, D> there = contact_slot(contact, slot);
@@ -66,15 +74,18 @@ unsigned blocks_for(int64_t max_blocks, int64_t threads_per_slot) {
 template <class T, int D>
 void grid_update(const GridUpdateArguments<T, D>& a, Stream stream) {
   if (a.max_blocks == 0) return;
-  launch_in_chain(grid_update_kernel<false, T, D>, blocks_for(a.max_blocks, kBlockNodes<D>), kThreads, 0, stream, a,
-                  ContactArguments<T, D>());
+  const unsigned blocks = blocks_for(a.max_blocks, kBlockNodes<D>);
+  if (a.next_drift)
+    launch_in_chain(next_grid_kernel<false, T, D>, blocks, kThreads, 0, stream, a, ContactArguments<T, D>());
+  else
+    launch(grid_update_kernel<T, D>, blocks, kThreads, 0, stream, a);
 }
 
 template <class T, int D>
 void grid_update_and_contact(const GridUpdateArguments<T, D>& a, const ContactArguments<T, D>& contact, Stream stream) {
   if (a.max_blocks == 0) return;
-  launch_in_chain(grid_update_kernel<true, T, D>, blocks_for(a.max_blocks, kBlockNodes<D>), kThreads, 0, stream, a,
-                  contact);
+  const unsigned blocks = blocks_for(a.max_blocks, kBlockNodes<D>);
+  launch_in_chain(next_grid_kernel<true, T, D>, blocks, kThreads, 0, stream, a, contact);
 }
 
 #define MPM_INSTANTIATE_BOTH(T, D, name) \

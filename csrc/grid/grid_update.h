@@ -61,8 +61,9 @@ struct GridUpdateArguments {
   double dt = 0;
   Walls<T, D> walls;
   NodeRow<T, D>* updated = nullptr;
-  // In a call of many steps, on CUDA: rows of unused slots are left as they are, `emptied`, which is `nodes`, is zeroed
-  // on the way unless there are mirrors, and the drift of this step makes that of the next, for G2P to count.
+  // Where `drift` is given, in a call of many steps on CUDA: rows of unused slots are left as they are, `emptied`,
+  // which is `nodes`, is zeroed on the way unless there are mirrors, and the drift of this step makes that of the next,
+  // for G2P to count.
   NodeRow<T, D>* emptied = nullptr;
   const Drift* drift = nullptr;
   Drift* next_drift = nullptr;

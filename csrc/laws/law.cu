@@ -69,7 +69,7 @@ struct LawMomentumSource : MomentumSource<2, T, D, Stress::moment, true> {
     return stress;
   }
   __device__ ParticleMomentum<T, D> load(int p, int scene) const {
-    ParticleMomentum<T, D> m = Base::fields.read(p, scene, true);
+    ParticleMomentum<T, D> m = Base::fields.read(p, scene, true, true);
     m.stress = update(p);
     return m;
   }

@@ -211,7 +211,7 @@ struct Substeps {
   Tensor stress, step_time;
   Tensor drifts;  // one for each of two substeps in turn, where activations last
   bool obstacles = false, fused = false;
-  bool one_grid_pass = false;  // on CUDA, where nobody reads the velocities before contact
+  bool one_grid_pass = false;  // where activations last and nobody reads the velocities before contact
   const int* previous_status = nullptr;
 
   explicit Substeps(const SubstepsInputs& inputs);
@@ -284,7 +284,7 @@ struct Substeps {
 
   // For a call that keeps nothing but its end. Where there is a kernel for it, P2G computes the stress itself.
   void fuse() {
-    one_grid_pass = MPM_BACKEND == MPM_BACKEND_IS_cuda;
+    one_grid_pass = drifts.defined();
     fused = calls.size() == 1 && !has(in.material) && in.lattice.order() == 2 && !in.lattice.deterministic() &&
             p2g.form == StressForm::mls && calls[0].law->kernels<T, D>().p2g;
     if (fused) stress = Tensor();

@@ -185,11 +185,7 @@ struct MomentumAdjoint {
         affine(a.affine, D),
         stress(a.stress, D) {}
 
-  __device__ Loaded load(int p, int scene) const {
-    Loaded m = fields.read(p, scene, fields.stress.present());
-    if (fields.stress.present()) m.stress = fields.read_stress(p);
-    return m;
-  }
+  __device__ Loaded load(int p, int scene) const { return fields.read(p, scene, fields.stress.present()); }
   template <class Support>
   __device__ Result compute(const Loaded& particle, const Weights<Order, T, D>& w, const Support& support) const {
     const NodeMomentum<T, D> m = fields.to_nodes(particle, fields.form, fields.stress.present());

@@ -379,8 +379,7 @@ __device__ void gather_strays(const Task& task, const Schedule<const int>& sched
 }
 
 template <bool Quads, class Task>
-__device__ void gather_by_items(const Task& task, const Schedule<const int>& schedule, int count, const int4& first,
-                                FollowerOf<Task>& follower) {
+__device__ void gather_by_items(const Task& task, const Schedule<const int>& schedule, FollowerOf<Task>& follower) {
   using T = typename Task::T;
   constexpr int D = Task::D, K = Task::K, width = kBlockWidth + Task::Order;
   __shared__ Strays<Task> strays;
@@ -388,9 +387,9 @@ __device__ void gather_by_items(const Task& task, const Schedule<const int>& sch
   __shared__ NodeValue<T, K> tile[D == 2 ? width * width : width * width * width];
   __shared__ int slots[1 << D];
   const Topology<T, D>& t = task.topology;
-  const int4* const items = reinterpret_cast<const int4*>(schedule.items);
-  for (int i = blockIdx.x; i < count; i += gridDim.x) {
-    const int4 item = i == int(blockIdx.x) ? first : items[i];
+  const int items = *schedule.item_count;
+  for (int i = blockIdx.x; i < items; i += gridDim.x) {
+    const int4 item = reinterpret_cast<const int4*>(schedule.items)[i];
     const int begin = item.y, end = item.z, base_block = item.w, scene = scene_of(t, base_block);
     // Positions are loaded one round ahead and the particles' indices two, so that loads overlap.
     int k = begin + threadIdx.x;
@@ -437,17 +436,22 @@ __device__ void gather_by_items(const Task& task, const Schedule<const int>& sch
 
 template <bool Quads, class Task>
 __global__ void __launch_bounds__(kGatherThreads, kResident<Task>) gather_kernel(const Task task) {
-  wait_for_kernel_before();
+  if constexpr (may_drift<Task>) wait_for_kernel_before();
   const Schedule<const int> schedule = schedule_of(task.topology);
   FollowerOf<Task> follower;
-  // Loads that do not wait for each other; there is room for as many items.
-  const int2 counts = *reinterpret_cast<const int2*>(schedule.item_count);
-  const int4 first = reinterpret_cast<const int4*>(schedule.items)[blockIdx.x];
-  if (counts.y)
+  if (*schedule.scattered)
     gather_in_memory_order<Quads>(task, schedule, follower);
   else
-    gather_by_items<Quads>(task, schedule, counts.x, first, follower);
+    gather_by_items<Quads>(task, schedule, follower);
   if constexpr (may_drift<Task>) follower.tell(task.drift);
+}
+
+template <class Task, class Kernel>
+void launch_gather(const Task& task, Kernel* kernel, int64_t pieces, Stream stream) {
+  if constexpr (may_drift<Task>)
+    launch_in_chain(kernel, grid_size(pieces), kGatherThreads, 0, stream, task);
+  else
+    launch(kernel, grid_size(pieces), kGatherThreads, 0, stream, task);
 }
 
 template <class Task>
@@ -456,10 +460,9 @@ void launch_gather(const Task& task, Stream stream) {
   if (particles == 0) return;
   const int64_t pieces = std::max(most_items(task.topology.max_blocks, particles), particles / kGatherThreads);
   if constexpr (Task::K == 3 || Task::K == 4) {
-    if (is_vector<Task::K>(task.nodes))
-      return launch_in_chain(gather_kernel<true, Task>, grid_size(pieces), kGatherThreads, 0, stream, task);
+    if (is_vector<Task::K>(task.nodes)) return launch_gather(task, gather_kernel<true, Task>, pieces, stream);
   }
-  launch_in_chain(gather_kernel<false, Task>, grid_size(pieces), kGatherThreads, 0, stream, task);
+  launch_gather(task, gather_kernel<false, Task>, pieces, stream);
 }
 
 }  // namespace mpm::cuda

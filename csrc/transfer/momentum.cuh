@@ -28,8 +28,8 @@ struct MomentumFields {
         inverse_dx(a.topology.geometry.inverse_dx),
         form(a.form) {}
 
-  // All but the stress, which is zero.
-  __device__ ParticleMomentum<T, D> read(int p, int scene, bool with_stress) const {
+  // Where the stress is `computed`, all else that goes with one.
+  __device__ ParticleMomentum<T, D> read(int p, int scene, bool with_stress, bool computed = false) const {
     ParticleMomentum<T, D> m;
     m.mass = mass.at(p);
 #pragma unroll
@@ -39,17 +39,18 @@ struct MomentumFields {
       for (int j = 0; j < D; j++) m.affine[i][j] = affine.present() ? affine.at(p, i * D + j) : T(0);
     }
     m.stress = zero_matrix<T, D>();
-    m.volume = with_stress ? volume.at(p) : T(0);
-    m.dt = !with_stress ? T(0) : scene_dt.pointer ? dt * scene_dt.pointer[scene * scene_dt.stride[0]] : dt;
+    m.volume = T(0);
+    m.dt = T(0);
+    if (with_stress) {
+      m.volume = volume.at(p);
+#pragma unroll
+      for (int i = 0; i < D; i++)
+#pragma unroll
+        for (int j = 0; j < D; j++)
+          if (!computed) m.stress[i][j] = stress.at(p, i * D + j);
+      m.dt = scene_dt.pointer ? dt * scene_dt.pointer[scene * scene_dt.stride[0]] : dt;
+    }
     return m;
-  }
-  __device__ Matrix<T, D> read_stress(int p) const {
-    Matrix<T, D> tau;
-#pragma unroll
-    for (int i = 0; i < D; i++)
-#pragma unroll
-      for (int j = 0; j < D; j++) tau[i][j] = stress.at(p, i * D + j);
-    return tau;
   }
   __device__ NodeMomentum<T, D> to_nodes(const ParticleMomentum<T, D>& m, StressForm known_form,
                                          bool with_stress) const {

@@ -485,7 +485,7 @@ __global__ void __launch_bounds__(Source::Shape::threads, Source::resident)
   using S = typename Source::Shape;
   using T = typename S::T;
   constexpr int D = S::D;
-  wait_for_kernel_before();
+  if constexpr (Source::drifts) wait_for_kernel_before();
   extern __shared__ __align__(16) char memory[];
   __shared__ int slots[1 << D], head[S::lists + 1];
   __shared__ BaseBlock<T, D> base_block;
@@ -541,7 +541,10 @@ void launch_scatter(const Source& source, bool deterministic, Stream stream) {
   const int64_t items = most_items(source.topology.max_blocks, source.topology.particles);
   if (items == 0) return;
   for (int colour = deterministic ? 0 : -1; colour < (deterministic ? 1 << S::D : 0); colour++)
-    launch_in_chain(scatter_kernel<Source>, grid_size(items), S::threads, S::shared_bytes, stream, source, colour);
+    if constexpr (Source::drifts)
+      launch_in_chain(scatter_kernel<Source>, grid_size(items), S::threads, S::shared_bytes, stream, source, colour);
+    else
+      launch(scatter_kernel<Source>, grid_size(items), S::threads, S::shared_bytes, stream, source, colour);
 }
 
 enum class Stress { none, moment, gradient };
@@ -562,11 +565,7 @@ struct MomentumSource {
   explicit MomentumSource(const P2GArguments<T, D>& a)
       : topology(a.topology), nodes(a.nodes), position(a.x), fields(a) {}
 
-  __device__ ParticleMomentum<T, D> load(int p, int scene) const {
-    ParticleMomentum<T, D> m = fields.read(p, scene, with_stress);
-    if (with_stress) m.stress = fields.read_stress(p);
-    return m;
-  }
+  __device__ ParticleMomentum<T, D> load(int p, int scene) const { return fields.read(p, scene, with_stress); }
   __device__ Contribution<T, D, 1, D> contribution(const ParticleMomentum<T, D>& particle) const {
     const NodeMomentum<T, D> m =
         fields.to_nodes(particle, gradient ? StressForm::gradient : StressForm::mls, with_stress);
