@@ -17,11 +17,12 @@ import torch
 import torch_mpm as mpm  # noqa: F401  (registers the ops)
 from torch_mpm.ops import LAWS
 
-from .. import common
+from .. import common, regressions
 from .svd import structure_of_arrays
 from .timing import Clock, memory_ms
 
 SIZES = {"cpu": 100_000, "cuda": 1_000_000}
+TIMED = ("update", "with details", "backward", "stiffness")
 PARAMETERS: dict[str, tuple[float, ...]] = {
     "hencky": (4e4, 6e4),
     "fixed_corotated": (4e4, 6e4),
@@ -62,12 +63,19 @@ def times(device: str, count: int, clock: Clock) -> Iterator[dict[str, Any]]:
 
 
 def text(result: dict[str, Any]) -> str:
-    columns = ("law", "flowing", "update", "with details", "backward", "stiffness", "of memory", "backward / update")
-    header = [f"{c} [ms]" if c in ("update", "with details", "backward", "stiffness") else c for c in columns]
+    columns = ("law", "flowing", *TIMED, "of memory", "backward / update")
+    header = [f"{c} [ms]" if c in TIMED else c for c in columns]
     rows = [[f"{row[c]:.0%}" if c == "of memory" else row[c] for c in columns] for row in result["laws"]]
     table = common.table(header, rows)
     title = f"# Laws in principal strains, {result['particles']} particles"
     return "\n\n".join((title, common.describe(result["environment"]), table))
+
+
+def timed(result: dict[str, Any]) -> Iterator[tuple[str, float]]:
+    """Milliseconds by law and op, for `regressions`."""
+    for row in result["laws"]:
+        for op in TIMED:
+            yield f"{row['law']}, {op}, {result['particles']} particles", row[op]
 
 
 def main() -> None:
@@ -87,7 +95,9 @@ def main() -> None:
             "laws": list(times(device, count, clock)),
         }
     print(text(result))
-    common.write(arguments.out, f"laws_{common.slug(result['environment']['device'])}", result, text(result))
+    name = f"laws_{common.slug(result['environment']['device'])}"
+    regressions.show(name, result, timed)
+    common.write(arguments.out, name, result, text(result))
 
 
 if __name__ == "__main__":

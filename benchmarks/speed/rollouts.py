@@ -23,7 +23,7 @@ import torch
 import torch_mpm as mpm
 from torch_mpm.scene.run import run
 
-from .. import common
+from .. import common, regressions
 from . import work
 from .step import Setup, setup
 
@@ -159,6 +159,12 @@ def text(result: dict[str, Any]) -> str:
     return "\n".join([*lines, common.table(header, rows), ""])
 
 
+def timed(result: dict[str, Any]) -> Iterator[tuple[str, float]]:
+    """Microseconds per substep, for `regressions`."""
+    for r in (*result["rollouts"], *result["scenes"]):
+        yield f"{r['name']}, {r['particles']} particles", r["us"]
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--device", default="cpu", choices=["cpu", "cuda"])
@@ -167,7 +173,9 @@ def main() -> None:
     arguments = parser.parse_args()
     result = measure(arguments.device, arguments.quick)
     print(text(result))
-    common.write(arguments.out, f"rollouts_{common.slug(result['environment']['device'])}", result, text(result))
+    name = f"rollouts_{common.slug(result['environment']['device'])}"
+    regressions.show(name, result, timed)
+    common.write(arguments.out, name, result, text(result))
 
 
 if __name__ == "__main__":

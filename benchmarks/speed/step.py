@@ -36,7 +36,7 @@ from torch import Tensor
 
 import torch_mpm as mpm
 
-from .. import common
+from .. import common, regressions
 from . import peers, work
 from .timing import Clock, Time, copy_ms, memory_ms
 
@@ -404,6 +404,13 @@ def _part_row(r: dict[str, Any], particles: int) -> tuple[Any, ...]:
     return r["name"], r["ms"], r["fastest_ms"], particles / r["ms"] * 1e-6, rate, share, timed
 
 
+def timed(result: dict[str, Any]) -> Iterator[tuple[str, float]]:
+    """Milliseconds of the steps and of the parts, for `regressions`."""
+    for entry in result["sizes"]:
+        for rows, key in (("steps", "ms"), ("parts", "fastest_ms")):
+            yield from ((f"{row['name']}, {entry['particles']} particles", row[key]) for row in entry[rows])
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--device", default="cpu", choices=["cpu", "cuda"])
@@ -416,7 +423,9 @@ def main() -> None:
     effort = {"samples": 3, "budget": 0.1} if arguments.quick else {}
     result = measure(arguments.device, sides, arguments.peers, **effort)
     print(text(result))
-    common.write(arguments.out, f"speed_{common.slug(result['environment']['device'])}", result, text(result))
+    name = f"speed_{common.slug(result['environment']['device'])}"
+    regressions.show(name, result, timed)
+    common.write(arguments.out, name, result, text(result))
     sys.exit(1 if result["failures"] else 0)
 
 
