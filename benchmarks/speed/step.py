@@ -129,7 +129,7 @@ class Op:
     inputs: tuple[Tensor, ...]
     differentiable: bool = True
     unread: tuple[int, ...] = ()
-    """Inputs whose values the backward pass does not need."""
+    """Inputs, by their place, whose values the backward pass does not need."""
 
 
 def parts(s: Setup) -> tuple[mpm.Blocks, list[Op]]:
