@@ -6,12 +6,14 @@
 
 Scenes: `torch_mpm.scene.run` with its files; time of the simulation. The others are the neo-Hookean cube of
 `benchmarks/speed/work.py`, steps of one call of `torch_mpm.rollout`, wall clock, synchronised once. Training: forward
-and backward of a rollout, gradient by the velocities at the start.
+and backward of a rollout, gradient by the velocities at the start. The figure has every device that has
+results in DIRECTORY.
 """
 
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import tempfile
 import time
 from collections.abc import Callable, Iterator
@@ -24,7 +26,7 @@ import torch_mpm as mpm
 from torch_mpm.scene.run import run
 
 from .. import common, regressions
-from . import work
+from . import scaling, work
 from .step import Setup, setup
 
 SCENES = {"cpu": ("demo", "batch"), "cuda": ("demo", "batch", "sand_column", "sand_drum", "spinner")}
@@ -176,6 +178,8 @@ def main() -> None:
     name = f"rollouts_{common.slug(result['environment']['device'])}"
     regressions.show(name, result, timed)
     common.write(arguments.out, name, result, text(result))
+    if importlib.util.find_spec("matplotlib"):
+        scaling.plot(common.read(arguments.out, "rollouts_*.json"), arguments.out / "rollouts.png")
 
 
 if __name__ == "__main__":
