@@ -99,6 +99,11 @@ def write(directory: Path, name: str, result: dict[str, Any], text: str) -> None
     print(f"wrote {directory / name}.json and .md")
 
 
+def read(directory: Path, pattern: str) -> list[dict[str, Any]]:
+    """The results in a directory whose file names match, in the order of these names."""
+    return [json.loads(file.read_text()) for file in sorted(directory.glob(pattern))]
+
+
 def describe(place: dict[str, Any]) -> str:
     """An environment as one line of a report."""
     return ", ".join(str(v) if k == "device" else f"{k} {v}" for k, v in place.items())

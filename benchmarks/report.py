@@ -1,7 +1,8 @@
 """The tables and figures of the documents, from the result files: `python -m benchmarks.report [--write]`.
 
 Prints the tables; with --write, puts them between the lines `<!-- benchmarks -->` and `<!-- /benchmarks -->` of
-docs/measured.md, which has all of them, and of README.md, which has one of speed and one of accuracy.
+docs/measured.md, which has all of them, and of README.md, which has one of speed and one of accuracy, and draws the
+figures of several devices beside the results. Each program draws its other figures itself.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from typing import Any
 from . import common
 from .accuracy.limits import tables as limit_tables
 from .accuracy.runout import PUBLISHED, published, slopes
+from .speed import roofline, scaling
 from .speed.rollouts import row_of_steps, row_of_training
 from .stability.adversarial import summary as rollouts
 from .stability.heat import cell as heat_cell
@@ -29,9 +31,15 @@ BOTH = ("step, forward and backward", "step, forward and backward, CUDA graph")
 
 
 def speed(results: list[dict[str, Any]]) -> str:
-    """Whole steps beside the peers, with where they were measured."""
+    """Whole steps beside the peers, with where they were measured, and the parts beside the memory."""
     notes = [f"- {common.describe(result['environment'])}" for result in results]
-    return "\n".join([speed_table(results), "", *notes])
+    figure = (
+        "The bytes that a part must move, over its time. The line is a copy of a tensor that is in no cache, which "
+        "writes half of its bytes: parts that mostly read, or on the CPU find some of their data in the cache, may "
+        "pass it. Marks, in results that have them, are the faster of a copy and a read of as many bytes as the part."
+    )
+    picture = "![bytes per second of each part, and of a copy](benchmarks/results/roofline.png)"
+    return "\n".join([speed_table(results), "", *notes, "", figure, "", picture])
 
 
 def speed_table(results: list[dict[str, Any]]) -> str:
@@ -84,7 +92,9 @@ def as_run(results: list[dict[str, Any]]) -> str:
         [
             "Substeps of one call of `rollout` (the neo-Hookean cube), scenes by `torch-mpm run` with their files, and",
             "the gradient of a rollout by the velocities at its start (benchmarks/speed/rollouts.py).",
-            *("", common.table(header, rows), "", common.table(of_training, training), "", *notes),
+            *("", common.table(header, rows), "", common.table(of_training, training), "", *notes, ""),
+            "One scene of any size; dotted lines: particles per second.",
+            *("", "![time per substep over particles](benchmarks/results/rollouts.png)"),
         ]
     )
 
@@ -472,7 +482,7 @@ def _gradient_errors(result: dict[str, Any]) -> Iterator[Row]:
 
 def overview(directory: Path) -> str:
     """The two tables of the README."""
-    results = [json.loads(file.read_text()) for file in sorted(directory.glob("speed_*.json"))]
+    results = common.read(directory, "speed_*.json")
     return "\n\n".join([*(["### Speed", speed_table(results)] if results else []), "### Accuracy", accuracy(directory)])
 
 
@@ -485,7 +495,7 @@ def sections(directory: Path) -> dict[str, str]:
         ("svd_*_*.json", "Small matrices and sand", small_matrices),
         ("heat_*_*.json", "Speed of the heat solve", heat_speed),
     ):
-        if results := [json.loads(file.read_text()) for file in sorted(directory.glob(pattern))]:
+        if results := common.read(directory, pattern):
             found[title] = section(results)
     for name, title, section_of_one in (
         ("convergence", "Convergence", convergence),
@@ -507,6 +517,16 @@ def sections(directory: Path) -> dict[str, str]:
         if (file := directory / f"{name}.json").exists():
             found[title] = section_of_one(json.loads(file.read_text()))
     return found
+
+
+def draw(directory: Path) -> None:
+    """The figures of several devices."""
+    for name, pattern, plot in (
+        ("roofline", "speed_*.json", roofline.plot),
+        ("rollouts", "rollouts_*.json", scaling.plot),
+    ):
+        if results := common.read(directory, pattern):
+            plot(results, directory / f"{name}.png")
 
 
 def documents(directory: Path) -> dict[Path, str]:
@@ -536,6 +556,8 @@ def main() -> None:
         print(tables)
         if arguments.write:
             document.write_text(insert(document.read_text(), tables))
+    if arguments.write:
+        draw(arguments.results)
 
 
 if __name__ == "__main__":

@@ -13,7 +13,7 @@ from __future__ import annotations
 import argparse
 import itertools
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,7 @@ import torch_mpm as mpm
 from torch_mpm.ops import gather, heat_operator, scatter
 from torch_mpm.reference.heat import HeatOperator
 
-from .. import common
+from .. import common, regressions
 from ..stability.heat import assembled
 from .timing import Clock
 
@@ -278,6 +278,15 @@ def ratio(one: dict[str, Any]) -> float:
     return one["iteration"] / (one["p2g"] + one["g2p"])
 
 
+def timed(result: dict[str, Any]) -> Iterator[tuple[str, float]]:
+    """Milliseconds of transfers, iterations and whole solves, for `regressions`."""
+    one = result["one"]
+    for key in ("p2g", "g2p", "iteration", "solve", "chebyshev"):
+        yield f"{key}, {one['particles']} particles", one[key]
+    for row in result["large"]:
+        yield from ((f"{key}, r = {row['r']:g}, {one['particles']} particles", row[key]) for key in ("cg", "multigrid"))
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--device", default="cpu", choices=["cpu", "cuda"])
@@ -296,7 +305,9 @@ def main() -> None:
         result["scenes"] = [] if device == "cpu" else many_scenes(device, clock, 16 if quick else SCENES)
         result["peers"] = [beside_scipy(p, clock, 10)] if device == "cpu" else beside_csr(p, clock, 20)
     print(text(result))
-    common.write(arguments.out, f"heat_{common.slug(result['environment']['device'])}", result, text(result))
+    name = f"heat_{common.slug(result['environment']['device'])}"
+    regressions.show(name, result, timed)
+    common.write(arguments.out, name, result, text(result))
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
 """Times of the laws: `python -m benchmarks.speed.laws [--device cuda]`.
 
 float32, 3-D, structure of arrays, states of which about half flow: return map with stress and history, with the
-dissipated energy, and its backward pass with the gradients of F, parameters and history. The ratio is to a copy of as
-many bytes as the update must read and write.
+dissipated energy, and its backward pass with the gradients of F, parameters and history. Of memory: the time in which
+as many bytes as the update must read and write are copied or read, whichever is faster, over that of the update.
 """
 
 from __future__ import annotations
@@ -17,11 +17,12 @@ import torch
 import torch_mpm as mpm  # noqa: F401  (registers the ops)
 from torch_mpm.ops import LAWS
 
-from .. import common
+from .. import common, regressions
 from .svd import structure_of_arrays
-from .timing import Clock, copy_bandwidth
+from .timing import Clock, memory_ms
 
 SIZES = {"cpu": 100_000, "cuda": 1_000_000}
+TIMED = ("update", "with details", "backward", "stiffness")
 PARAMETERS: dict[str, tuple[float, ...]] = {
     "hencky": (4e4, 6e4),
     "fixed_corotated": (4e4, 6e4),
@@ -32,7 +33,7 @@ PARAMETERS: dict[str, tuple[float, ...]] = {
 }
 
 
-def times(device: str, count: int, clock: Clock, bandwidth: float) -> Iterator[dict[str, Any]]:
+def times(device: str, count: int, clock: Clock) -> Iterator[dict[str, Any]]:
     """One row per law: milliseconds of update and backward, the share of particles that flow."""
     noise = torch.randn(count, 3, 3, generator=torch.Generator().manual_seed(0))
     F = structure_of_arrays((torch.eye(3) + 0.05 * noise).to(device))
@@ -56,17 +57,25 @@ def times(device: str, count: int, clock: Clock, bandwidth: float) -> Iterator[d
         for name, run in runs:
             row[name] = clock.op(run).ms
         moved = 4 * count * (18 + 9 * plastic + 2 * len(history))
-        row["copies"] = row["update"] / (moved / bandwidth * 1e-6)
+        row["of memory"] = memory_ms(clock, moved) / row["update"]
         row["backward / update"] = row["backward"] / row["update"]
         yield row
 
 
 def text(result: dict[str, Any]) -> str:
-    columns = ("law", "flowing", "update", "with details", "backward", "stiffness", "copies", "backward / update")
-    header = [f"{c} [ms]" if c in ("update", "with details", "backward", "stiffness") else c for c in columns]
-    table = common.table(header, [[row[c] for c in columns] for row in result["laws"]])
-    title = f"# Laws in principal strains, {result['particles']} particles, copy {result['bandwidth']:.0f} GB/s"
+    columns = ("law", "flowing", *TIMED, "of memory", "backward / update")
+    header = [f"{c} [ms]" if c in TIMED else c for c in columns]
+    rows = [[f"{row[c]:.0%}" if c == "of memory" else row[c] for c in columns] for row in result["laws"]]
+    table = common.table(header, rows)
+    title = f"# Laws in principal strains, {result['particles']} particles"
     return "\n\n".join((title, common.describe(result["environment"]), table))
+
+
+def timed(result: dict[str, Any]) -> Iterator[tuple[str, float]]:
+    """Milliseconds by law and op, for `regressions`."""
+    for row in result["laws"]:
+        for op in TIMED:
+            yield f"{row['law']}, {op}, {result['particles']} particles", row[op]
 
 
 def main() -> None:
@@ -80,15 +89,15 @@ def main() -> None:
         common.use_all_cores()
     clock = Clock(device, **({"samples": 3, "budget": 0.1} if arguments.quick else {}))
     with clock, torch.no_grad():
-        bandwidth = copy_bandwidth(clock, 16 if arguments.quick else 256 if device == "cpu" else 1024)
         result: dict[str, Any] = {
             "environment": common.environment(device),
             "particles": count,
-            "bandwidth": bandwidth,
-            "laws": list(times(device, count, clock, bandwidth)),
+            "laws": list(times(device, count, clock)),
         }
     print(text(result))
-    common.write(arguments.out, f"laws_{common.slug(result['environment']['device'])}", result, text(result))
+    name = f"laws_{common.slug(result['environment']['device'])}"
+    regressions.show(name, result, timed)
+    common.write(arguments.out, name, result, text(result))
 
 
 if __name__ == "__main__":

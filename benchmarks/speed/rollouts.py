@@ -6,12 +6,14 @@
 
 Scenes: `torch_mpm.scene.run` with its files; time of the simulation. The others are the neo-Hookean cube of
 `benchmarks/speed/work.py`, steps of one call of `torch_mpm.rollout`, wall clock, synchronised once. Training: forward
-and backward of a rollout, gradient by the velocities at the start.
+and backward of a rollout, gradient by the velocities at the start. The figure has every device that has
+results in DIRECTORY.
 """
 
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import tempfile
 import time
 from collections.abc import Callable, Iterator
@@ -23,8 +25,8 @@ import torch
 import torch_mpm as mpm
 from torch_mpm.scene.run import run
 
-from .. import common
-from . import work
+from .. import common, regressions
+from . import scaling, work
 from .step import Setup, setup
 
 SCENES = {"cpu": ("demo", "batch"), "cuda": ("demo", "batch", "sand_column", "sand_drum", "spinner")}
@@ -159,6 +161,12 @@ def text(result: dict[str, Any]) -> str:
     return "\n".join([*lines, common.table(header, rows), ""])
 
 
+def timed(result: dict[str, Any]) -> Iterator[tuple[str, float]]:
+    """Microseconds per substep, for `regressions`."""
+    for r in (*result["rollouts"], *result["scenes"]):
+        yield f"{r['name']}, {r['particles']} particles", r["us"]
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--device", default="cpu", choices=["cpu", "cuda"])
@@ -167,7 +175,11 @@ def main() -> None:
     arguments = parser.parse_args()
     result = measure(arguments.device, arguments.quick)
     print(text(result))
-    common.write(arguments.out, f"rollouts_{common.slug(result['environment']['device'])}", result, text(result))
+    name = f"rollouts_{common.slug(result['environment']['device'])}"
+    regressions.show(name, result, timed)
+    common.write(arguments.out, name, result, text(result))
+    if importlib.util.find_spec("matplotlib"):
+        scaling.plot(common.read(arguments.out, "rollouts_*.json"), arguments.out / "rollouts.png")
 
 
 if __name__ == "__main__":

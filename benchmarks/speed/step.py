@@ -11,8 +11,9 @@ fails is reported at the end and does not stop the others.
 Work: `benchmarks/speed/work.py`. Whole steps: wall clock of several steps in a row from particles in the order of their
 cells, synchronised once, everything included: activation, stress, P2G, grid update, G2P, positions and F. On CUDA they
 are replayed from a CUDA graph too.
-Parts: median of single calls; on CUDA from a graph with the cache emptied before. Bytes: every tensor of an op once,
-node tensors by their active rows. Errors: float32 against float64, the largest error over the largest value.
+Parts: median of single calls; on CUDA from a graph with the cache emptied before. Bytes: every tensor that an op needs
+or makes once, node tensors by their active rows. Of memory: the least time in which as many bytes are copied or read,
+whichever is faster, over that of the part. Errors: float32 against float64, the largest error over the largest value.
 """
 
 from __future__ import annotations
@@ -35,14 +36,15 @@ from torch import Tensor
 
 import torch_mpm as mpm
 
-from .. import common
+from .. import common, regressions
 from . import peers, work
-from .timing import Clock, Time, copy_bandwidth
+from .timing import Clock, Time, copy_ms, memory_ms
 
 SIDES = {"cpu": [64], "cuda": [100, 200]}
 STEPS = 10
 REORDER = 32  # steps between two reorderings in a scene
 SMALLEST = 4  # particles along a side of a cube that keeps no device busy
+LARGE = 2**30  # bytes of a tensor that is in no cache
 FIELDS = ("x", "v", "C", "F")
 
 
@@ -126,6 +128,8 @@ class Op:
     function: Callable[..., Any]
     inputs: tuple[Tensor, ...]
     differentiable: bool = True
+    unread: tuple[int, ...] = ()
+    """Inputs, by their place, whose values the backward pass does not need."""
 
 
 def parts(s: Setup) -> tuple[mpm.Blocks, list[Op]]:
@@ -155,7 +159,7 @@ def parts(s: Setup) -> tuple[mpm.Blocks, list[Op]]:
         Op("p2g with stress", p2g, (x, mass, v, C, stress, volume)),
         Op("grid update", update, (nodes,)),
         Op("g2p", lambda x, velocity: mpm.g2p(blocks, x, velocity)[:2], (x, update(nodes))),
-        Op("advance", lambda x, v, C, F: mpm.advance(x, v, work.DT, C, F)[:2], (x, v, C, F)),
+        Op("advance", lambda x, v, C, F: mpm.advance(x, v, work.DT, C, F)[:2], (x, v, C, F), unread=(1,)),
         Op("g2p and advance", g2p_advance, (x, update(nodes), F)),
     ]
 
@@ -170,7 +174,8 @@ def time_part(clock: Clock, op: Op, blocks: mpm.Blocks, active: int) -> Iterator
     """Forward, then backward for every input."""
 
     def entry(name: str, time: Time, *tensors: Tensor) -> dict[str, Any]:
-        return {"name": name, **dataclasses.asdict(time), "bytes": bytes_of(tensors, blocks, active)}
+        size = bytes_of(tensors, blocks, active)
+        return {"name": name, **dataclasses.asdict(time), "bytes": size, "memory_ms": memory_ms(clock, size)}
 
     with torch.no_grad():
         outputs = _tuple(op.function(*op.inputs))
@@ -184,8 +189,10 @@ def time_part(clock: Clock, op: Op, blocks: mpm.Blocks, active: int) -> Iterator
     def backward() -> tuple[Tensor, ...]:
         return torch.autograd.grad(outputs, leaves, grads, retain_graph=True)
 
-    # Inputs are read again and have a gradient each.
-    yield entry(f"{op.name}, backward", clock.op(backward), *leaves, *leaves, *grads)
+    read = [leaf for i, leaf in enumerate(leaves) if i not in op.unread]
+    given = {g.data_ptr() for g in grads}
+    made = [g for g in backward() if g.data_ptr() not in given]  # others are passed on as they are
+    yield entry(f"{op.name}, backward", clock.op(backward), *read, *grads, *made)
 
 
 def _tuple(value: Any) -> tuple[Tensor, ...]:
@@ -338,7 +345,8 @@ def measure(
 
     def copy() -> None:
         with clock:
-            report.result["copy_GB_s"] = max(copy_bandwidth(clock), report.result.get("copy_GB_s", 0.0))
+            rate = 2 * LARGE / copy_ms(clock, 2 * LARGE) * 1e-6
+            report.result["copy_GB_s"] = max(rate, report.result.get("copy_GB_s", 0.0))
 
     report.attempt("copy", copy)
     for side in sides:
@@ -363,7 +371,7 @@ def text(result: dict[str, Any]) -> str:
     lines += [f"The particles of {peer} are within {d['x']:.1e} m and {d['v']:.1e} m/s after {STEPS} steps."
               for peer, d in result["difference"].items()]  # fmt: skip
     for entry in result["sizes"]:
-        lines += ["", f"## {entry['particles']} particles", "", *_size_tables(entry, result["peers"], copy)]
+        lines += ["", f"## {entry['particles']} particles", "", *_size_tables(entry, result["peers"])]
     if result["host"]:
         lines += ["", f"## {result['host'][0]['particles']} particles: the host's part", ""]
         lines += [common.table(("whole step", "median ms", "least ms"),
@@ -372,7 +380,7 @@ def text(result: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def _size_tables(entry: dict[str, Any], others: list[dict[str, Any]], copy: float | None) -> Iterator[str]:
+def _size_tables(entry: dict[str, Any], others: list[dict[str, Any]]) -> Iterator[str]:
     P = entry["particles"]
     rows = [
         *entry["steps"],
@@ -384,17 +392,23 @@ def _size_tables(entry: dict[str, Any], others: list[dict[str, Any]], copy: floa
         header, [(r["name"], r["ms"], r["fastest_ms"], P / r["ms"] * 1e-3, ours and r["ms"] / ours) for r in rows]
     )
     yield ""
-    header = ("part", "median ms", "least ms", "G particles/s", "GB/s", "of copy", "timed")
-    yield common.table(header, [_part_row(r, P, copy) for r in entry["parts"]])
+    header = ("part", "median ms", "least ms", "G particles/s", "GB/s", "of memory", "timed")
+    yield common.table(header, [_part_row(r, P) for r in entry["parts"]])
     yield ""
     yield common.table(("float32 against float64", "largest error"), entry["errors"].items())
 
 
-def _part_row(r: dict[str, Any], particles: int, copy: float | None) -> tuple[Any, ...]:
-    rate = r["bytes"] / r["ms"] * 1e-6
-    share = f"{rate / copy:.0%}" if copy else None
+def _part_row(r: dict[str, Any], particles: int) -> tuple[Any, ...]:
+    rate, share = r["bytes"] / r["ms"] * 1e-6, f"{r['memory_ms'] / r['ms']:.0%}"
     timed = "graph" if r["graph"] else "call"
     return r["name"], r["ms"], r["fastest_ms"], particles / r["ms"] * 1e-6, rate, share, timed
+
+
+def timed(result: dict[str, Any]) -> Iterator[tuple[str, float]]:
+    """Milliseconds of the steps and of the parts, for `regressions`."""
+    for entry in result["sizes"]:
+        for rows, key in (("steps", "ms"), ("parts", "fastest_ms")):
+            yield from ((f"{row['name']}, {entry['particles']} particles", row[key]) for row in entry[rows])
 
 
 def main() -> None:
@@ -409,7 +423,9 @@ def main() -> None:
     effort = {"samples": 3, "budget": 0.1} if arguments.quick else {}
     result = measure(arguments.device, sides, arguments.peers, **effort)
     print(text(result))
-    common.write(arguments.out, f"speed_{common.slug(result['environment']['device'])}", result, text(result))
+    name = f"speed_{common.slug(result['environment']['device'])}"
+    regressions.show(name, result, timed)
+    common.write(arguments.out, name, result, text(result))
     sys.exit(1 if result["failures"] else 0)
 
 

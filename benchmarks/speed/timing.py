@@ -113,8 +113,20 @@ def _wall(run: Run) -> float:
     return (time.perf_counter() - begin) * 1e3
 
 
-def copy_bandwidth(clock: Clock, megabytes: int = 1024) -> float:
-    """Bytes read and written in a second by a copy between two large tensors [GB/s]."""
-    source = torch.ones(megabytes * 2**18, device=clock.device)
-    target = torch.empty_like(source)
-    return 2 * source.nbytes / clock.op(lambda: target.copy_(source)).fastest_ms * 1e-6
+def memory_ms(clock: Clock, size: int) -> float:
+    """Least time in which the memory moves `size` bytes: a copy, which writes half of them, or a read [ms]."""
+    return min(copy_ms(clock, size), read_ms(clock, size))
+
+
+def copy_ms(clock: Clock, size: int) -> float:
+    """Least time of a copy that reads and writes `size` bytes together [ms]."""
+    source = torch.ones(size // 8, device=clock.device)
+    target = torch.ones_like(source)
+    # A kernel as the parts are: of `copy_` a CUDA graph makes a transfer by the driver.
+    return clock.op(lambda: torch.neg(source, out=target)).fastest_ms
+
+
+def read_ms(clock: Clock, size: int) -> float:
+    """Least time of a sum over `size` bytes [ms]."""
+    values = torch.ones(size // 4, device=clock.device)
+    return clock.op(values.sum).fastest_ms
