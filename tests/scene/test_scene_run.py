@@ -340,3 +340,59 @@ def test_free_memory_goes_back_to_the_system() -> None:
     blocks.clear()
     heap.trim()
     assert resident() < full - 150e6 and float(last.sum()) == 200_000
+
+
+# ---- longer segments, which a GPU takes
+
+
+@pytest.fixture
+def long_segments(monkeypatch):
+    """The lengths of the segments that are tried."""
+    monkeypatch.setitem(module.LONGEST_SEGMENT, "cpu", 256)
+    taken, rollout = [], module.rollout
+
+    def counted(step, state, n, dt):
+        taken.append(n)
+        return rollout(step, state, n, dt)
+
+    monkeypatch.setattr(module, "rollout", counted)
+    return taken
+
+
+STEADY = {**PRECISE, "duration": 0.1, "fps": 10, "cfl": 0.01}
+
+
+def test_segments_grow_while_the_limit_is_steady(tmp_path, long_segments):
+    _, long, _ = simulate(tmp_path / "long", **STEADY)
+    lengths, substeps = list(long_segments), sum(long_segments)
+    assert lengths[:3] == [32, 64, 128] and max(lengths) <= 256
+    module.LONGEST_SEGMENT["cpu"] = module.SEGMENT
+    long_segments.clear()
+    _, short, _ = simulate(tmp_path / "short", **STEADY)
+    assert max(long_segments) == 32 and abs(sum(long_segments) - substeps) < 0.01 * substeps
+    np.testing.assert_allclose(long["position"], short["position"], atol=1e-6)
+
+
+def test_a_long_segment_that_goes_wrong_is_taken_again_in_short_ones(tmp_path, long_segments, monkeypatch):
+    """Where something is wrong at its end, and where dt was above the limit by then."""
+    wanted, counted = simulate(tmp_path / "as it is", **STEADY)[1], module.rollout
+    long_segments.clear()
+
+    def fails(step, state, n, dt):
+        end = counted(step, state, n, dt)
+        if n > 32:
+            raise SimulationError("too long")
+        return end
+
+    monkeypatch.setattr(module, "rollout", fails)
+    _, data, _ = simulate(tmp_path / "again", **STEADY)
+    assert set(long_segments) >= {32, 64} and max(long_segments) == 64
+    np.testing.assert_allclose(data["position"], wanted["position"], atol=1e-6)
+
+    def speeds_up(step, state, n, dt):
+        end = counted(step, state, n, dt)
+        return end.replace(v=1e6 * end.v) if n > 32 else end
+
+    monkeypatch.setattr(module, "rollout", speeds_up)
+    _, data, _ = simulate(tmp_path / "fast", **STEADY)
+    np.testing.assert_allclose(data["position"], wanted["position"], atol=1e-6)

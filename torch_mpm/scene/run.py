@@ -34,6 +34,10 @@ from .writer import FrameWriter
 
 SEGMENT = 32
 """Substeps between two looks at the stability limit and the validity of the state, and between two reorderings."""
+LONGEST_SEGMENT = {"cpu": SEGMENT, "cuda": 256}
+"""While the limit is steady: a GPU waits for each look."""
+STEADY = 1.02
+"""The limit is, where it has become smaller by no larger factor over a segment."""
 BLOCKS_WANTED, PROBLEM = 0, 6
 """Columns of the status: blocks that were wanted at most; step of the first problem, -1 for none."""
 FIELD_SHAPES = {"F": 2, "C": 2, "stress": 2, "J": 0, "temperature": 0, "liquid": 0}
@@ -53,6 +57,7 @@ class Totals:
     simulating: float = 0.0
     largest_cfl: float = 0.0
     smallest_dt: float = math.inf
+    segment: int = SEGMENT  # substeps of the next one, at most
     first: dict[str, Any] = field(default_factory=dict)
 
 
@@ -289,10 +294,14 @@ class Simulation:
             following = self.emissions[self.emitted][0] if self.emitted < len(self.emissions) else math.inf
             target = min(end, following) if following > now + rounding else end
             dt, count = self._choose_dt(target - now, rates)
-            steps = min(count, SEGMENT)
+            steps = min(count, self.totals.segment)
+            until = target if steps == count else now + steps * dt
+            if not self._segment(dt, steps, until):
+                self.totals.segment = SEGMENT
+                continue
+            now = until
+            self.totals.segment = self._most_after(rates)
             largest = max(largest, max(speeds, default=0.0) * dt / self.step.grid.dx)
-            now = target if steps == count else now + steps * dt
-            self._segment(dt, steps, now)
             if self.state.x.is_cpu:
                 heap.trim()
             self.totals.substeps += steps
@@ -315,21 +324,38 @@ class Simulation:
         count = max(1, math.ceil(span / wanted * (1 - 1e-9))) if math.isfinite(wanted) else 1
         return span / count, count
 
-    def _segment(self, dt: float, steps: int, until: float) -> None:
-        """Take some substeps, then check the state and reorder it; a failure is located by repeating them."""
+    def _most_after(self, rates: list[float]) -> int:
+        """Substeps of the next segment, at most, after one that began with these limits."""
+        assert self._survey is not None
+        before, after = max(rates, default=0.0), max(self._survey[0], default=0.0)
+        longer = min(2 * self.totals.segment, LONGEST_SEGMENT[self.state.x.device.type])
+        return longer if after <= STEADY * before else SEGMENT
+
+    def _segment(self, dt: float, steps: int, until: float) -> bool:
+        """Take some substeps, then check the state and reorder it; a failure is located by repeating them.
+
+        Returns:
+            Whether they were taken: a segment longer than SEGMENT in which something went wrong, or whose dt was above
+            the limit at its end, was not, since with shorter ones dt would have followed.
+        """
         good = self.state
         try:
             survey, status, ordered = self._moved(good, dt, steps, until)
+            if steps > SEGMENT and not dt * max(survey[0], default=0.0) <= 1:
+                raise SimulationError("dt is above the limit")
             if any(row[PROBLEM] >= 0 for row in status) or self.step.heat is not None:
                 self.step.check()
             bad = wrong(self.step, self.state) if any(survey[2]) else None
             if bad is None:
                 self._survey, self.state = survey, ordered
-                return
+                return True
             message = bad[1]
         except SimulationError as error:
             message = str(error)
         self.state = good
+        if steps > SEGMENT:
+            self.step.reset()
+            return False
         failure = replay(self.step, good, dt, steps, self.totals.substeps, self.built.scenes)
         if failure is not None:
             self.state = failure.good
