@@ -45,7 +45,8 @@ COMMON_FLAGS = ["-std=c++20", f"-DTORCH_TARGET_VERSION={TORCH_TARGET_VERSION}"]
 UP = "../../"
 HOST_FLAGS = ["-fPIC", "-fvisibility=hidden", "-Wall", f"-ffile-prefix-map={UP}="]
 # One thread of nvcc per architecture (--threads); template kernels make large fat binaries, so they are compressed.
-NVCC_FLAGS = ["-O3", "--expt-relaxed-constexpr", "--threads=2", "-Xfatbin=-compress-all"]
+NVCC_THREADS = 2
+NVCC_FLAGS = ["-O3", "--expt-relaxed-constexpr", f"--threads={NVCC_THREADS}", "-Xfatbin=-compress-all"]
 
 # Definitions that tell the objects of one source apart.
 VARIANTS = ("-DTORCH_MPM_ISA=", "-DMPM_SCALAR=", "-DMPM_DIMENSION=", "-DMPM_LAW_HEADER=")
@@ -164,7 +165,8 @@ class Ninja:
         # Functions that nobody defines fail the link. Not in the CUDA library, since a CPU torch has no CUDA functions,
         # nor with sanitizers, whose functions come from the process.
         defined = [] if sanitize else ["-Xlinker", "--no-undefined", "-ltorch_cpu"]
-        self.lines = ["ninja_required_version = 1.5", f"pool nvcc\n  depth = {max(1, max_jobs() // 2)}"]
+        compilers = max(1, max_jobs() // min(NVCC_THREADS, len(cuda_archs())))
+        self.lines = ["ninja_required_version = 1.5", f"pool nvcc\n  depth = {compilers}"]
         cxx = os.environ.get("CXX", "g++")
         # At -O3, instrumented kernels take more than ten minutes to compile.
         sanitizer = [f"-fsanitize={sanitize}", "-fno-omit-frame-pointer", "-g1", "-O1"] if sanitize else []
