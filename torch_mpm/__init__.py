@@ -5,11 +5,11 @@ from typing import TYPE_CHECKING, Any
 from . import _library as _library
 from . import laws, ops, seed
 from .boundaries import SDF, Box, Capsule, Plane, Revolved, Sphere, Walls
-from .captured import captured
 from .cfl import stable_dt
 from .data.trajectory import Trajectory
 from .errors import DamagedFileError, GridOverflowError, SimulationError
 from .failures import Failures
+from .graphs import captured
 from .grid import Blocks, Grid
 from .heat import Heat
 from .heat import boundaries as heat_boundaries

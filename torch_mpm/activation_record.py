@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator
+
 import torch
 from torch import Tensor
 
@@ -43,6 +46,15 @@ class ActivationRecord:
             before.copy_(status)
         remember(self._replayed, before)
         return blocks
+
+    @contextlib.contextmanager
+    def passing_graphs(self) -> Iterator[None]:
+        """Graphs that are captured meanwhile are not replayed afterwards: then the latest status is all they tell."""
+        known = list(self._replayed)
+        try:
+            yield
+        finally:
+            self._replayed = known
 
     def all(self) -> list[Tensor]:
         """The latest status, and those that graphs go on with."""

@@ -38,8 +38,9 @@ class Grid(Lattice):
             particle more than a cell outside is left out of the transfers and reported.
         scenes: number of scenes B in a batch; each has the whole lattice to itself.
         kernel: "quadratic" or "cubic" B-spline.
-        max_blocks: blocks in the pool. None measures it from the positions of the first activation, and lets it grow
-            with the scene: at once on the CPU; on CUDA, without synchronising, when less than a quarter is left.
+        max_blocks: blocks in the pool; rollouts on CUDA take half as many again for blocks around those. None measures
+            it from the positions of the first activation, and lets it grow with the scene: at once on the CPU; on CUDA,
+            without synchronising, when less than a quarter is left.
         deterministic: bit-identical results from run to run on CUDA too (the CPU always is).
 
     Raises:
@@ -196,7 +197,7 @@ class Grid(Lattice):
         with outside_transforms():
             self._on_host.copy_(status[0], non_blocking=True)
         self._pending = torch.cuda.Event()
-        self._pending.record()
+        self._pending.record(torch.cuda.current_stream(status.device))
 
     def wait(self) -> None:
         """Wait for what `watch` has asked a device for, so that the next activation has room for what it told."""

@@ -12,8 +12,8 @@ from torch.autograd import forward_ad
 
 from .boundaries import Obstacle
 from .capture import is_captured, is_traced
-from .captured import LEAST_STEPS, obstacle_to_replays, replayed
 from .errors import check_count, shape_of
+from .graphs import CHUNK, LEAST_STEPS, obstacle_to_replays, replayed, time_after
 from .laws import CompiledLaw, Mixture
 from .ops.arguments import split_dt
 from .ops.autograd import dispatch
@@ -46,12 +46,12 @@ def rollout(
             steps between again (memory n/checkpoint + checkpoint states instead of n steps; sqrt(n) is best).
 
     A `Step` of compiled laws without heat, FLIP and functions of the user's takes all steps in one op, or some, with
-    the results of single steps to the last bit; `Step.explain` tells. Its gradients take the steps again from kept
-    states, those of every `checkpoint` steps, sqrt(n) of them by default and more where states are small. A kept state
-    of a solid has 2 D + 2 D² numbers per particle (24 in 3-D, 96 bytes in float32) and its history; while the backward
-    pass goes through `checkpoint` steps, it holds about 2 D + 4 D² (42 in 3-D) for each of them. Second derivatives
-    need single steps. On CUDA and without gradients, other steps that call no function of the user's are replays of a
-    CUDA graph of one; see `captured` for what else there is.
+    the results of single steps (to the last bit on the CPU and on deterministic grids); `Step.explain` tells. Its
+    gradients take the steps again from kept states, those of every `checkpoint` steps, sqrt(n) of them by default and
+    more where states are small. A kept state of a solid has 2 D + 2 D² numbers per particle (24 in 3-D, 96 bytes in
+    float32) and its history; while the backward pass goes through `checkpoint` steps, it holds about 2 D + 4 D² (42 in
+    3-D) for each of them. Second derivatives need single steps. On CUDA and without gradients, other steps that call no
+    function of the user's are replays of a CUDA graph of one; see `captured` for what else there is.
 
     Raises:
         TypeError, ValueError: for an n or a checkpoint that is no whole number, a negative n, a checkpoint below 1, or
@@ -129,10 +129,6 @@ def obstacle_to_substeps(step: Step, state: State, dt: float | Tensor) -> str | 
 
 
 MOST_STEPS = 2**16  # of one op, csrc/rollout/substeps.h
-CHUNK = 64
-"""Steps of one op where the pool of blocks follows the scene on CUDA, which it does between two calls."""
-
-
 KEPT_BYTES = {"cpu": 2**24, "cuda": 2**28}
 """What the backward pass of one op may hold of its steps, even where sqrt(n) steps need less: what the caches of a CPU
 hold, and so much that kernels on CUDA hide the time of Python."""
@@ -206,11 +202,8 @@ def substeps(step: Step, state: State, n: int, dt: float) -> State:
     grid.watch(status)
     if status.device.type == "cpu":  # where the op has let the pool grow, or stopped
         grid.follow(int(status[0, 0] if grid.grows else status[0, 7]))
-    time = state.time
-    for _ in range(n):
-        time = time + dt
     extra = _history(state, calls, history)
-    return state.replace(x=x, v=v, C=C, F=F, J=J, extra=extra, time=time)
+    return state.replace(x=x, v=v, C=C, F=F, J=J, extra=extra, time=time_after(state.time, dt, n))
 
 
 def _law_calls(step: Step, state: State, dt: float) -> list[LawCall]:

@@ -292,7 +292,7 @@ class Step(TensorModule):
 
     def explain(self, state: State, dt: float | Tensor = 1.0) -> str:
         """How `rollout` takes steps from a state: many in one op, from a CUDA graph or from Python, and why."""
-        from .captured import obstacle_to_replays  # which needs a Step, as these do
+        from .graphs import obstacle_to_replays  # which needs a Step, as these do
         from .rollouts import obstacle_to_substeps, wants_gradient
 
         reason = obstacle_to_substeps(self, state, dt)

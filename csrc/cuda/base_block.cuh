@@ -51,6 +51,13 @@ __device__ unsigned touched_blocks(const int* base) {
   return touched;
 }
 
+// Particles of an item or a batch, counted from its first, that are not in their base block; in shared memory.
+template <int Most>
+struct Strays {
+  int count;
+  uint16_t particle[Most];
+};
+
 // The base block of a thread block: its base nodes lie in [first, end), as numbers of type T.
 template <class T, int D>
 struct BaseBlock {

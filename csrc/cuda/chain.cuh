@@ -3,8 +3,21 @@
 #include "cuda/launch.cuh"
 
 // Kernels of a step, which mostly follow one another: each is launched while the one before it ends, and waits for that
-// where it begins. From compute capability 9.0 on; else they are launched as any other.
+// where it begins. Compiled for compute capability 9.0 or later; else they are launched as any other.
 namespace mpm::cuda {
+
+// Whether a kernel was compiled to wait: PTX of an older architecture, which newer devices take too, was not. All
+// kernels are compiled for the same ones.
+template <class Kernel>
+bool waits_for_kernel_before(Kernel* kernel) {
+  const auto compiled_for = [&] {
+    cudaFuncAttributes attributes;
+    check(cudaFuncGetAttributes(&attributes, kernel));
+    return attributes.ptxVersion;
+  };
+  static const bool waits = compiled_for() >= 90;
+  return waits && device_attribute(cudaDevAttrComputeCapabilityMajor) >= 9;
+}
 
 // What a kernel that is launched in a chain does first.
 __device__ inline void wait_for_kernel_before() {
@@ -17,8 +30,7 @@ __device__ inline void wait_for_kernel_before() {
 template <class... Parameters, class... Arguments>
 void launch_in_chain(void (*kernel)(Parameters...), unsigned blocks, unsigned threads, size_t shared_memory,
                      cudaStream_t stream, const Arguments&... arguments) {
-  if (device_attribute(cudaDevAttrComputeCapabilityMajor) < 9)
-    return launch(kernel, blocks, threads, shared_memory, stream, arguments...);
+  if (!waits_for_kernel_before(kernel)) return launch(kernel, blocks, threads, shared_memory, stream, arguments...);
   allow_shared_memory(kernel, shared_memory);
   cudaLaunchAttribute overlap;
   overlap.id = cudaLaunchAttributeProgrammaticStreamSerialization;

@@ -5,8 +5,9 @@
 // The schedule tensor of the CUDA kernels.
 namespace mpm::cuda {
 
-constexpr int kItemParticles = 576;       // at most, of one base block; a crowded block makes several items
-constexpr int kLeastItemParticles = 128;  // where there are so few that every multiprocessor has an item anyway
+// Particles of an item at most, all of one base block: a crowded block makes several items. Fewer where there are few
+// particles, so that there are some four items for each of the 130 multiprocessors of a large device.
+constexpr int kItemParticles = 576, kLeastItemParticles = 128;
 
 MPM_HD int item_particles(int64_t particles) {
   const int64_t shared = particles / 512;

@@ -32,8 +32,8 @@ using Packed = unsigned long long;
 struct Counters {
   int tile[2];  // tiles handed out by each scan
   int tail;     // particles that are not transferred
-  int wanted;   // active blocks, without
-  int margin;   // those around them
+  int wanted;   // blocks that particles touch
+  int margin;   // blocks around those
   int transferred, items;
   int groups, warps;  // of the thread blocks sampled
 };

@@ -290,11 +290,13 @@ struct Substeps {
     if (fused) stress = Tensor();
   }
 
-  // Of the substeps that read what others of the same parity have written.
-  void take_turn(int parity) {
+  // Of the substeps that read what others of the same parity have written. The last one is activated in any case, so
+  // that the status tells how many blocks there are by then.
+  void take_turn(int parity, bool last) {
     if (!drifts.defined()) return;
     Drift* const drift = static_cast<Drift*>(drifts.data_ptr());
-    activation.drift = update.drift = drift + parity;
+    activation.drift = last ? nullptr : drift + parity;
+    update.drift = drift + parity;
     update.next_drift = advance.drift = drift + (1 - parity);
   }
 

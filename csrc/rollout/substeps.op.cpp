@@ -33,9 +33,9 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> substeps(MPM_
     s.make_pool(stream);
     s.count_time(before, stream);
     // A substep that reads and writes these buffers in turn, into the first or the second.
-    const auto take = [&](int into, backend::Stream on) {
+    const auto take = [&](int into, bool last, backend::Stream on) {
       int* const now = static_cast<int*>(status[into].data_ptr());
-      s.take_turn(into);
+      s.take_turn(into, last);
       s.read(from, field<T>(F_[1 - into]));
       s.write(
           {field<T>(x_[into]), field<T>(v_), field<T>(C_), field<T>(F_[into]), field<T>(J_[into]), field<T>(history_)});
@@ -48,9 +48,10 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> substeps(MPM_
       return true;
     };
     with_team(P * n, [&] {
-      while (step < n && take(int(step % 2), stream)) {
+      while (step < n && take(int(step % 2), step + 1 == n, stream)) {
         if (++step == 2)
-          step += 2 * replay((n - step) / 2, stream, [&](backend::Stream on) { take(0, on), take(1, on); });
+          step += 2 * replay((n - step - 1) / 2, stream,
+                             [&](backend::Stream on) { take(0, false, on), take(1, false, on); });
       }
     });
   });

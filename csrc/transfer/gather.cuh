@@ -350,15 +350,9 @@ __device__ void load_tile(const NodeField<const T>& nodes, const int* slots, Nod
   }
 }
 
-// Particles of an item, counted from its first, that are not in its base block: they wait for the others.
-template <class Task>
-struct Strays {
-  int count;
-  uint16_t particle[may_drift<Task> ? kItemParticles : 1];
-};
-
-template <bool Quads, class Task>
-__device__ void gather_strays(const Task& task, const Schedule<const int>& schedule, const Strays<Task>& strays,
+// The strays of an item, which wait for its other particles.
+template <bool Quads, class Task, int Most>
+__device__ void gather_strays(const Task& task, const Schedule<const int>& schedule, const Strays<Most>& strays,
                               int begin, const BaseBlock<typename Task::T, Task::D>& home, unsigned active,
                               FollowerOf<Task>& follower) {
   using T = typename Task::T;
@@ -382,7 +376,7 @@ template <bool Quads, class Task>
 __device__ void gather_by_items(const Task& task, const Schedule<const int>& schedule, FollowerOf<Task>& follower) {
   using T = typename Task::T;
   constexpr int D = Task::D, K = Task::K, width = kBlockWidth + Task::Order;
-  __shared__ Strays<Task> strays;
+  __shared__ Strays<may_drift<Task> ? kItemParticles : 1> strays;
   __shared__ BaseBlock<T, D> home;
   __shared__ NodeValue<T, K> tile[D == 2 ? width * width : width * width * width];
   __shared__ int slots[1 << D];

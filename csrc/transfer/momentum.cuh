@@ -28,7 +28,7 @@ struct MomentumFields {
         inverse_dx(a.topology.geometry.inverse_dx),
         form(a.form) {}
 
-  // Where the stress is `computed`, all else that goes with one.
+  // A stress that the caller computes is left zero.
   __device__ ParticleMomentum<T, D> read(int p, int scene, bool with_stress, bool computed = false) const {
     ParticleMomentum<T, D> m;
     m.mass = mass.at(p);

@@ -215,13 +215,6 @@ __device__ void add_particle(const SharedParticles<S>& shared, const Walker<S>& 
   }
 }
 
-// Particles of a batch, counted from its first, that are not in their base block.
-template <int Most>
-struct Strays {
-  int count;
-  uint16_t particle[Most];
-};
-
 // Links the lists in the order of the index tensor, from the last particle to the first; by one warp. `next` holds the
 // list of each particle before, and its successor after.
 template <class S>

@@ -138,11 +138,78 @@ def test_training_from_graphs(dim, n):
 
 
 @pytest.mark.cuda
+def test_gradients_of_calls_add_up():
+    """As a loop accumulates them, and as an optimizer leaves zeros for the next ones."""
+    step = mpm.Step(box(2, max_blocks=36), network(2, "cuda"))
+    state = step.prepare(blob("cuda", 2))
+    start = state.replace(F=state.F + 0.05 * torch.ones_like(state.F), v=state.v.clone().requires_grad_())
+    advance = mpm.captured(step, start, DT, 2)
+    starts = [start.replace(v=(k * state.v).requires_grad_()) for k in (1.0, 3.0)]
+
+    def gradients(take):
+        for p in step.parameters():
+            p.grad = None if p.grad is None else p.grad.zero_()
+        for s in starts:
+            take(s).v.square().sum().backward()
+        return [p.grad.clone() for p in step.parameters()]
+
+    for _ in range(2):
+        for a, b in zip(gradients(advance), gradients(lambda s: one_by_one(step, s, 2, DT)), strict=True):
+            assert float((a - b).abs().max()) < 1e-10 * float(b.abs().max())
+    first = torch.autograd.grad(advance(starts[0]).x.sum(), starts[0].v)[0]
+    kept = first.clone()
+    torch.autograd.grad(advance(starts[1]).v.square().sum(), starts[1].v)
+    assert torch.equal(first, kept)
+
+
+@pytest.mark.cuda
+def test_fields_by_name_and_fields_that_go():
+    """Histories in another order; and PIC, whose steps give no C."""
+    step = mpm.Step(box(2, max_blocks=36), network(2, "cuda"), transfer="pic")
+    state = step.prepare(blob("cuda", 2))
+    a, b = torch.ones(300, device="cuda"), torch.zeros(300, device="cuda")
+    state = state.replace(C=torch.zeros_like(state.F), extra={"a": a, "b": b})
+    with torch.no_grad():
+        advance = mpm.captured(step, state, DT)
+        end = advance(state.replace(extra={"b": b, "a": a}))
+    assert torch.equal(end.extra["a"], a) and torch.equal(end.extra["b"], b)
+    assert end.C is None
+
+
+@pytest.mark.cuda
+def test_what_does_not_go_into_a_graph():
+    step, state = heated(2, "cuda")
+    step.heat.method = "multigrid"
+    assert "multigrid" in step.explain(state, DT)
+    step, state = mixed(2, "cuda")
+    assert "a time in float32" in step.explain(state.to(dtype=torch.float32), DT)
+    law = network(2, "cuda")
+    law.register_forward_hook(lambda *arguments: None)
+    with pytest.raises(ValueError, match="must have no hooks"):
+        mpm.captured(mpm.Step(box(2), law), state, DT)
+
+
+@pytest.mark.cuda
+def test_rollouts_from_graphs_leave_nothing_behind():
+    """Neither statuses that would be looked at for ever, nor memory; and a mass that is one number for all is taken."""
+    step, state = heated(3, "cuda")
+    state = state.replace(mass=torch.tensor(1e-3, dtype=F64, device="cuda").expand(300))
+    with torch.no_grad():
+        sizes = []
+        for _ in range(6):
+            state = mpm.rollout(step, state, 10, DT)
+            sizes.append(torch.cuda.memory_reserved())
+    assert len(step._activations.all()) == 1
+    assert sizes[-1] == sizes[2]
+    step.check()
+
+
+@pytest.mark.cuda
 def test_another_kind_of_state_is_refused():
     step = mpm.Step(box(2, max_blocks=36), network(2, "cuda"))
     state = step.prepare(blob("cuda", 2))
     advance = mpm.captured(step, state, DT)
-    with pytest.raises(ValueError, match=r"state must be as it was captured, x \(300, 2\) torch.float64"):
+    with pytest.raises(ValueError, match=r"state must be as it was captured, x \(300, 2\) torch.float64 on cuda:0"):
         advance(blob("cuda", 2, 200))
     with pytest.raises(TypeError, match="step must be a Step or another module"):
         mpm.captured(lambda state, dt: state, state, DT)
