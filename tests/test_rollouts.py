@@ -166,7 +166,7 @@ def test_a_full_pool_is_reported_by_the_call_that_fills_it(device):
     """Also where the particles are still in blocks that are active for others."""
     step = mpm.Step(box(2, max_blocks=4), mpm.NeoHookean(E=1e3, nu=0.3))
     state = blob(device, 2, 200)
-    state = state.replace(x=0.45 + 0.1 * state.x, v=100 * (state.x - 0.5))
+    state = state.replace(x=0.45 + 0.1 * state.x, v=300 * (state.x - 0.5))
     with torch.no_grad(), pytest.raises(mpm.GridOverflowError, match="max_blocks=4"):
         step.check(mpm.rollout(step, state, 60, 2e-4))
 
