@@ -35,11 +35,21 @@ def assert_equal(a: mpm.State, b: mpm.State, text: str = "", exactly: bool = Tru
     left, right = tensors(a), tensors(b)
     assert left.keys() == right.keys()
     for name, value in left.items():
-        if value.is_floating_point() and (value.is_cuda or not exactly):
+        if value.is_cuda and value.dtype == torch.float32:
+            assert_close(value, right[name], f"{name} {text}")
+        elif value.is_floating_point() and (value.is_cuda or not exactly):
             scale = right[name].abs().max().clamp_min(1e-9)
             assert float((value - right[name]).abs().max() / scale) < TOLERANCE["rollout"][value.dtype], name
         else:
             assert torch.equal(value, right[name]), f"{name} {text}"
+
+
+def assert_close(value: Tensor, expected: Tensor, name: str) -> None:
+    """Strains are small differences of numbers near one: rounding may take a few particles to another branch."""
+    error = ((value - expected).abs().flatten(1) if value.dim() > 1 else (value - expected).abs()[:, None]).amax(1)
+    scale = float(expected.abs().max().clamp_min(1e-2))
+    assert float(error.quantile(0.95)) < 1e-3 * scale, f"{name}: most particles"
+    assert float(error.max()) < 3e-2 * scale, f"{name}: all particles"
 
 
 def blob(device: str, dim: int = 3, count: int = 300, dtype: torch.dtype = F64, **fields) -> mpm.State:
@@ -102,7 +112,12 @@ def test_laws(law, n, dim, dtype, device):
     state.x[5] = -3.0  # and outside the grid the law acts, too
     assert in_one_op(step, state)
     with torch.no_grad():
-        assert_equal(mpm.rollout(step, state, n, 1e-4), one_by_one(step, state, n, 1e-4))
+        end, expected = mpm.rollout(step, state, n, 1e-4), one_by_one(step, state, n, 1e-4)
+    assert_equal(end, expected)
+    for name, value in tensors(end).items():  # what is outside knows no sums over particles
+        if value.is_floating_point():
+            rounding = 10 * torch.finfo(dtype).eps * value[5].abs().max().clamp_min(1)
+            assert float((value[5] - tensors(expected)[name][5]).abs().max()) <= float(rounding), name
 
 
 @pytest.mark.parametrize("transfer", ["apic", "pic"])

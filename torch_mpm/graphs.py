@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import collections
 import contextlib
 import dataclasses
 import math
@@ -80,9 +81,9 @@ def _foreign(part: Any, device: torch.device, seen: list[Any]) -> str | None:
     if isinstance(part, Tensor):
         return None if part.device == device else f"a tensor of it is on {part.device}, the particles on {device}"
     seen.append(part)
-    if type(part).__module__ in ("builtins", "collections") and isinstance(part, dict):
+    if type(part) in (dict, collections.OrderedDict):
         members = list(part.values())
-    elif type(part) in (list, tuple, set):
+    elif type(part) in (list, tuple, set) or (_is_known(part) and isinstance(part, tuple)):
         members = list(part)
     elif _is_known(part):
         members = list(vars(part).values())

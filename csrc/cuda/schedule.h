@@ -24,7 +24,7 @@ template <class I>
 struct Schedule {
   I* item_count;
   I* scattered;   // whether particles that are neighbours in memory mostly lie in different blocks
-  I* items;       // [items, 4], each an Item
+  I* items;       // [room_for_items(), 4], each an Item
   I* neighbours;  // [max_blocks, 2^D] slots of a block and of the blocks after it, -1 where inactive; the bit of axis i
                   // is D - 1 - i
   I* base_slot;   // [P] slot of the base block of a particle, -1 if it is not transferred
@@ -36,6 +36,11 @@ MPM_HD int64_t most_items(int64_t max_blocks, int64_t particles) {
   return (max_blocks < particles ? max_blocks : particles) + particles / item_particles(particles);
 }
 
+// As many, without a division that each thread would have to do.
+MPM_HD int64_t room_for_items(int64_t max_blocks, int64_t particles) {
+  return (max_blocks < particles ? max_blocks : particles) + particles / kLeastItemParticles;
+}
+
 // Fits into schedule_size() ints.
 template <int D, class I>
 MPM_HD Schedule<I> lay_out_schedule(I* start, int64_t max_blocks, int64_t particles) {
@@ -43,7 +48,7 @@ MPM_HD Schedule<I> lay_out_schedule(I* start, int64_t max_blocks, int64_t partic
   s.item_count = start;
   s.scattered = start + 1;
   s.items = start + 4;
-  s.neighbours = s.items + 4 * most_items(max_blocks, particles);
+  s.neighbours = s.items + 4 * room_for_items(max_blocks, particles);
   s.base_slot = s.neighbours + (max_blocks << D);
   return s;
 }
