@@ -128,10 +128,11 @@ def replayed(step: Step, state: State, n: int, dt: float) -> State:
 
 
 class _Latest(threading.local):
-    """The latest graph on each device, of a thread: the next one takes the memory of its temporaries."""
+    """The latest graph of a thread on each stream of a device: the next one there, which runs after it, takes the memory
+    of its temporaries."""
 
     def __init__(self) -> None:
-        self.graphs: dict[torch.device, torch.cuda.CUDAGraph] = {}
+        self.graphs: dict[tuple[torch.device, int], torch.cuda.CUDAGraph] = {}
 
 
 _LATEST = _Latest()
@@ -147,7 +148,8 @@ class _Replays:
         self._graph = torch.cuda.CUDAGraph()
         device = state.x.device
         now, aside = torch.cuda.current_stream(device), torch.cuda.Stream(device)
-        latest = _LATEST.graphs.get(device)
+        place = device, now.cuda_stream
+        latest = _LATEST.graphs.get(place)
         aside.wait_stream(now)
         with torch.cuda.stream(aside):
             # Other threads may go on meanwhile.
@@ -155,7 +157,7 @@ class _Replays:
             self._graph.capture_begin(pool, capture_error_mode="thread_local")
             self._record(step, dt)
         now.wait_stream(aside)
-        _LATEST.graphs[device] = self._graph
+        _LATEST.graphs[place] = self._graph
 
     def _record(self, step: Step, dt: float) -> None:
         try:
