@@ -128,8 +128,7 @@ def replayed(step: Step, state: State, n: int, dt: float) -> State:
 
 
 class _Latest(threading.local):
-    """The latest graph of a thread on each stream of a device: the next one there, which runs after it, takes the memory
-    of its temporaries."""
+    """The latest graph of a thread on each stream: the next one there runs after it, and takes the same memory."""
 
     def __init__(self) -> None:
         self.graphs: dict[tuple[torch.device, int], torch.cuda.CUDAGraph] = {}
