@@ -23,7 +23,7 @@ from typing import Any
 import torch
 
 import torch_mpm as mpm
-from torch_mpm.scene.run import run
+from torch_mpm.scene.run import Simulation, run
 
 from .. import common, regressions
 from . import scaling, work
@@ -51,12 +51,12 @@ def seconds(device: str, program: Callable[[], object]) -> float:
     return time.perf_counter() - start
 
 
-def per_step(s: Setup, device: str, samples: int) -> dict[str, Any]:
+def per_step(s: Setup, device: str, samples: int, dt: float = work.DT) -> dict[str, Any]:
     """Least time of a substep of a rollout."""
     state = s.state.sorted(s.grid)
 
     def rolled(steps: int) -> Callable[[], object]:
-        return lambda: mpm.rollout(s.step, state, steps, work.DT)
+        return lambda: mpm.rollout(s.step, state, steps, dt)
 
     with torch.no_grad():
         seconds(device, rolled(4))
@@ -81,6 +81,17 @@ def in_domain(side: int, times: int, device: str) -> Setup:
     s = setup(work.make(side), device)
     grid = mpm.Grid(dx=s.grid.dx, lower=(0, 0, 0), upper=(times, times, times))
     return Setup(s.state, mpm.Step(grid, s.step.law, gravity=s.step.gravity, walls="sticky"))
+
+
+def on_its_way(name: str, device: str, frames: int = 6) -> tuple[Setup, float]:
+    """An example scene after some frames, and its time step."""
+    scene = mpm.Scene.load(common.ROOT / "examples" / f"{name}.toml").model_copy(update={"device": device})
+    simulation = Simulation(scene, scene.build(device))
+    with torch.no_grad():
+        for frame in range(frames):
+            simulation._advance(scene.time_of(frame), scene.time_of(frame + 1))
+    dt = float(simulation.step.stable_dt(simulation.state).min())
+    return Setup(simulation.state, simulation.step), dt
 
 
 def scenes(names: tuple[str, ...], device: str) -> Iterator[dict[str, Any]]:
@@ -135,6 +146,8 @@ def measure(device: str, quick: bool = False) -> dict[str, Any]:
         s = in_domain(largest, times, device)
         row = per_step(s, device, samples)
         result["rollouts"].append({"name": f"domain of {round(times / s.grid.dx)}^3 cells", **row})
+    s, dt = on_its_way("demo", device, frames=1 if quick else 6)
+    result["rollouts"].append({"name": "demo, one call", **per_step(s, device, samples, dt)})
     side, steps = (6, 10) if quick else TRAINING[device]
     result["training"].append(training(side, steps, device, samples))
     result["scenes"] += scenes(() if quick else SCENES[device], device)
