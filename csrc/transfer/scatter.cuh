@@ -108,10 +108,29 @@ __device__ void unpack_weights(const T* packed, const T& sum, T* w) {
   }
 }
 
+// Of a row, with those that quads and a pair may have in excess.
+template <class S>
+constexpr int kWords = S::quads * 4 + 2;
+
+template <class S, class T>
+__device__ void load_words(const SharedParticles<S>& shared, int row, T (&word)[kWords<S>]) {
+#pragma unroll
+  for (int q = 0; q < S::quads; q++) {
+    const Quad<T> v = shared.quads[q * S::batch + row];
+#pragma unroll
+    for (int e = 0; e < 4; e++) word[4 * q + e] = v.e[e];
+  }
+  if (S::pairs > 0) {
+    const Pair<T> v = shared.pairs[row];
+    word[4 * S::quads] = v.e[0];
+    word[4 * S::quads + 1] = v.e[1];
+  }
+}
+
 template <class S, class T, int D>
 __device__ void store_particle(const SharedParticles<S>& shared, int row, const T f[D],
                                const Contribution<T, D, S::Plain, S::Linear>& c) {
-  T word[S::quads * 4 + 2] = {};
+  T word[kWords<S>] = {};
   word[0] = f[0];
 #pragma unroll
   for (int i = 1; i < D; i++) pack_weights<S>(f[i], word + S::weights + (i - 1) * S::derivatives * S::stored);
@@ -163,18 +182,8 @@ template <class S, class T>
 __device__ void add_particle(const SharedParticles<S>& shared, const Walker<S>& walker, int row,
                              T (&sum)[S::slab][S::channels]) {
   constexpr int D = S::D, rows = S::slab / S::support;
-  T word[S::quads * 4 + 2], weights[D - 1][S::derivatives][S::support];
-#pragma unroll
-  for (int q = 0; q < S::quads; q++) {
-    const Quad<T> v = shared.quads[q * S::batch + row];
-#pragma unroll
-    for (int e = 0; e < 4; e++) word[4 * q + e] = v.e[e];
-  }
-  if (S::pairs > 0) {
-    const Pair<T> v = shared.pairs[row];
-    word[4 * S::quads] = v.e[0];
-    word[4 * S::quads + 1] = v.e[1];
-  }
+  T word[kWords<S>], weights[D - 1][S::derivatives][S::support];
+  load_words(shared, row, word);
 #pragma unroll
   for (int i = 0; i < D - 1; i++)
 #pragma unroll
@@ -297,18 +306,8 @@ __device__ bool is_dense(const NodeField<T>& nodes) {
 template <class S, class T, int D>
 __device__ void node_value(const SharedParticles<S>& shared, int row, const T f[D], const int offset[D],
                            T (&value)[S::channels]) {
-  T word[S::quads * 4 + 2], weight = T(1), slope[D];
-#pragma unroll
-  for (int q = 0; q < S::quads; q++) {
-    const Quad<T> v = shared.quads[q * S::batch + row];
-#pragma unroll
-    for (int e = 0; e < 4; e++) word[4 * q + e] = v.e[e];
-  }
-  if (S::pairs > 0) {
-    const Pair<T> v = shared.pairs[row];
-    word[4 * S::quads] = v.e[0];
-    word[4 * S::quads + 1] = v.e[1];
-  }
+  T word[kWords<S>], weight = T(1), slope[D];
+  load_words(shared, row, word);
 #pragma unroll
   for (int i = 0; i < D; i++) slope[i] = T(1);
 #pragma unroll
