@@ -17,7 +17,7 @@ from torch import Tensor
 import torch_mpm as mpm  # noqa: F401  (registers the ops)
 from torch_mpm.ops.sand import law_name
 
-from .. import common
+from .. import common, regressions
 from .timing import Clock
 
 SIZES = {"cpu": 100_000, "cuda": 1_000_000}
@@ -134,6 +134,12 @@ def text(result: dict[str, Any]) -> str:
     return "\n".join([*lines, common.table(header, rows)])
 
 
+def timed(result: dict[str, Any]) -> Iterator[tuple[str, float]]:
+    """Milliseconds by op, for `regressions`."""
+    for row in result["times"]:
+        yield f"{row['name']}, {row['matrices']} matrices", row["fastest_ms"]
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--device", default="cpu", choices=["cpu", "cuda"])
@@ -151,7 +157,9 @@ def main() -> None:
             "times": list(times(device, count, clock)),
         }
     print(text(result))
-    common.write(arguments.out, f"svd_{common.slug(result['environment']['device'])}", result, text(result))
+    name = f"svd_{common.slug(result['environment']['device'])}"
+    regressions.show(name, result, timed)
+    common.write(arguments.out, name, result, text(result))
 
 
 if __name__ == "__main__":
