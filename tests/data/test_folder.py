@@ -9,12 +9,13 @@ import pytest
 
 pytest.importorskip("h5py")
 
-import datasets  # noqa: E402
-from torch_mpm.data import folder as folders  # noqa: E402
-from torch_mpm.data.folder import DatasetFolder, DatasetRecord  # noqa: E402
-from torch_mpm.data.metadata import connectivity_radius, metadata  # noqa: E402
-from torch_mpm.data.shard import record_path, shard_path  # noqa: E402
-from torch_mpm.errors import DamagedFileError  # noqa: E402
+import small_dataset as datasets
+
+from torch_mpm.data import folder as folders
+from torch_mpm.data.folder import DatasetFolder, DatasetRecord
+from torch_mpm.data.metadata import connectivity_radius, metadata
+from torch_mpm.data.shard import record_path, shard_path
+from torch_mpm.errors import DamagedFileError
 
 
 @pytest.fixture(scope="module")
