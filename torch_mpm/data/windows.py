@@ -84,11 +84,12 @@ def pack(items: Sequence[Item]) -> Item:
 
     ``scene_id`` and ``first`` are [B].
     """
-    counts = torch.tensor([_count(item) for item in items])
+    counts = [_count(item) for item in items]
+    scene = torch.repeat_interleave(torch.arange(len(items)), torch.tensor(counts))
     batch = {
         name: torch.stack(values) if values[0].dim() == 0 else torch.cat(values) for name, values in _columns(items)
     }
-    return batch | {"scene": torch.repeat_interleave(torch.arange(len(items)), counts)}
+    return batch | {"scene": scene.to(_device(items[0]), non_blocking=True)}
 
 
 def pad(items: Sequence[Item]) -> Item:
@@ -108,11 +109,15 @@ def pad(items: Sequence[Item]) -> Item:
         return out
 
     batch = {name: padded(values) for name, values in _columns(items)}
-    return batch | {"mask": torch.arange(most) < counts[:, None]}
+    return batch | {"mask": (torch.arange(most) < counts[:, None]).to(_device(items[0]), non_blocking=True)}
 
 
 def _count(item: Item) -> int:
     return next((len(value) for value in item.values() if value.dim()), 0)
+
+
+def _device(item: Item) -> torch.device:
+    return next(value.device for value in item.values() if value.dim())
 
 
 def _columns(items: Sequence[Item]) -> Iterator[tuple[str, list[Tensor]]]:
