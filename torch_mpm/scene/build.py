@@ -100,7 +100,9 @@ def build(scene: Any, device: torch.device) -> Built:
     if problems:
         raise SceneError(list(dict.fromkeys(problems)))
     words = scene.grid
-    grid = Grid(words.dx, words.lower, words.upper, scenes=len(entries), kernel=words.kernel)
+    grid = Grid(
+        words.dx, words.lower, words.upper, scenes=len(entries), kernel=words.kernel, deterministic=words.deterministic
+    )
     reference = 0.0 if scene.heat is None else scene.heat.reference
     mixture = _Mixture(entries, reference)
     parts, material = [], []
@@ -304,7 +306,7 @@ def _placed(scene: Any, entry: Any, problems: list[str]) -> Placed:
         if not _is_good(key, problems):
             continue
         try:
-            points, shape = _seeded(scene, body, scene.seed + k)
+            points, shape = _seeded(scene, body, (scene.seed if entry.seed is None else entry.seed) + k)
         except (ValueError, OSError) as error:
             problems.append(f"{key}{check.called(body)}: {error}")
             continue
@@ -330,7 +332,7 @@ def _seeded(scene: Any, body: Any, number: int) -> tuple[seed.Points, seed.Regio
         return points, None
     shape = region(body, scene.folder)
     assert shape is not None
-    options = {"method": body.seeding, "seed": number, "dtype": torch.float64}
+    options = {"method": body.seeding, "seed": number, "count": body.particles, "dtype": torch.float64}
     return seed.fill(shape, scene.grid.dx, body.per_cell, **options), shape
 
 
