@@ -3,7 +3,7 @@
 Every function takes ``grid`` (a :class:`torch_mpm.Grid` or a node distance dx [m]) and ``per_cell``, the mean number of
 particles in a grid cell, and returns :class:`Points`. ``method="lattice"`` places points on a regular lattice of
 spacing ``dx / per_cell**(1/D)``, stretched to fit the bounding box of the shape; ``method="poisson"`` draws a
-Poisson-disk sample of the same mean density, which has no preferred direction; ``method="jittered"`` moves each point of
+Poisson-disk sample of the same mean density, without a preferred direction; ``method="jittered"`` moves each point of
 the lattice at random within its cell, which is faster. All depend on their arguments alone.
 """
 
