@@ -73,7 +73,7 @@ class Dataset(schema.Model):
     """frames of a scene, the first among them"""
     interval: schema.Positive
     """time from frame to frame [s]"""
-    fields: list[Literal["velocity", "F", "J", "C", "stress", "temperature", "liquid"]] = []
+    fields: list[Literal["velocity", "F", "J", "C", "stress", "temperature", "liquid"]] = Field(default_factory=list)
     """what is stored beside positions"""
     seed: Annotated[int, Field(ge=0)] = 0
     """seed of the data set"""
@@ -85,7 +85,9 @@ class Dataset(schema.Model):
     """scenes of a file, which are simulated together; as many as the device holds are fastest"""
     attempts: Annotated[int, Field(ge=1, le=10)] = 3
     """how often a scene is tried, each time with half of the time step, before it is recorded as failed"""
-    particle_type: dict[str, Code] = {}
+    obstacles: bool = True
+    """whether obstacles are in the data as particles of type 3, a layer below their surface that moves with them"""
+    particle_type: dict[str, Code] = Field(default_factory=dict)
     """particle types of materials; by default 5 (water), 6 (sand) or 7 (goop) by their laws"""
 
 
@@ -182,18 +184,21 @@ class Configuration:
         size = self.dataset.scenes_per_shard
         return range(shard * size, min((shard + 1) * size, self.scenes))
 
+    def scene_words(self, *contents: Words) -> Words:
+        """The scene file of one content, or of the batch of several, as `torch_mpm.data.sampling` draws them."""
+        dataset = self.dataset
+        time = {"duration": (dataset.frames - 1) * dataset.interval, "fps": 1 / dataset.interval}
+        shared = {key: value for key, value in self.words.items() if key not in (*VARIED, "dataset")}
+        own = contents[0] if len(contents) == 1 else {"scene": list(contents)}
+        return {**shared, **time, **own}
+
     def scene(self, *contents: Words) -> Scene:
-        """The scene of one content, or the batch of several, as `torch_mpm.data.sampling` draws them.
+        """The scene of `scene_words`.
 
         Raises:
             SceneError: for what is wrong in them.
         """
-        dataset = self.dataset
-        time = {"duration": (dataset.frames - 1) * dataset.interval, "fps": 1 / dataset.interval}
-        shared = {key: value for key, value in self.words.items() if key not in (*VARIED, "dataset")}
-        shared = {**shared, **time}
-        words = {**shared, **contents[0]} if len(contents) == 1 else {**shared, "scene": list(contents)}
-        return Scene.from_words(words, folder=self.folder, source=self.source)
+        return Scene.from_words(self.scene_words(*contents), folder=self.folder, source=self.source)
 
     def particle_type(self, material: Any) -> int:
         """DeepMind's code for a material (`scene.build.Material`)."""

@@ -48,7 +48,7 @@ def content(configuration: Configuration, scene_id: int) -> Words:
     Raises:
         NoRoom: where no place was found for a body.
     """
-    rng, dim, words = generator(configuration, scene_id), configuration.dim, configuration.words
+    rng, dim, words, full = generator(configuration, scene_id), configuration.dim, configuration.words, ""
     for _ in range(RESTARTS):
         drawn: Words = {key: sample(words[key], rng, dim) for key in ("gravity", "material") if key in words}
         drawn["seed"] = int(rng.integers(2**31))
@@ -57,24 +57,23 @@ def content(configuration: Configuration, scene_id: int) -> Words:
             for _, item in _repeated(words.get("obstacle", []), rng, dim)
         ]
         places = _Places(configuration, drawn["obstacle"])
-        for key, item in _repeated(words.get("body", []), rng, dim):
-            if not places.put(item, rng):
-                break
-        else:
+        bodies = _repeated(words.get("body", []), rng, dim)
+        full = next((f"body[{k}]" for k, item in bodies if not places.put(item, rng)), "")
+        if not full:
             drawn["body"] = places.bodies()
             return drawn
     raise NoRoom(
-        f"scene {scene_id}: no room for {key} in {RESTARTS} scenes with {TRIES} tries each; make bodies smaller or "
+        f"scene {scene_id}: no room for {full} in {RESTARTS} scenes with {TRIES} tries each; make bodies smaller or "
         "fewer, dataset.gap smaller or the domain larger"
     )
 
 
-def _repeated(items: Any, rng: np.random.Generator, dim: int) -> Iterator[tuple[str, Words]]:
-    """(key, words without their count) of all bodies, or obstacles, that a scene shall have."""
+def _repeated(items: Any, rng: np.random.Generator, dim: int) -> Iterator[tuple[int, Words]]:
+    """(number in the file, words without their count) of all bodies, or obstacles, that a scene shall have."""
     for k, item in enumerate(items):
         count = sample(item.get("count", 1), rng, dim)
         for _ in range(int(count)):
-            yield f"body[{k}]", {key: value for key, value in item.items() if key != "count"}
+            yield k, {key: value for key, value in item.items() if key != "count"}
 
 
 ALONG_OBSTACLES = {"capsule": "axis"}

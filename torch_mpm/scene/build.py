@@ -18,6 +18,7 @@ from ..state import State
 from ..step import Step
 from . import check, heat, schema
 from .explain import SceneError
+from .obstacles import obstacles
 from .places import obstacle, region
 
 GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
@@ -107,7 +108,6 @@ def build(scene: Any, device: torch.device) -> Built:
     mixture = _Mixture(entries, reference)
     parts, material = [], []
     nozzles: list[Nozzle] = []
-    obstacles: list[tuple[Any, boundaries.Obstacle]] = []
     for index, entry in enumerate(entries):
         for key, body, points, _ in placed[index]:
             density = entry.material[body.material].density
@@ -115,8 +115,8 @@ def build(scene: Any, device: torch.device) -> Built:
             material.append(torch.full((len(points),), mixture.number(index, body.material), dtype=torch.int32))
         for key, emitter in entry.keyed("emitter"):
             nozzles.append(_named(key, _nozzle, scene, entry, emitter, index, mixture, dtype, device))
-        obstacles += [(o, obstacle(o, index if len(entries) > 1 else None)) for o in entry.obstacle]
     walls = None if words.walls is None else boundaries.Walls(words.walls, friction=words.friction)
+    solids = obstacles(entries, words, dtype, device)
     dim = len(words.lower)
     empty = seed.Points(
         torch.empty(0, dim, dtype=dtype), torch.empty(0, dtype=dtype), torch.empty(0, dtype=torch.int32)
@@ -138,12 +138,12 @@ def build(scene: Any, device: torch.device) -> Built:
         mixture.law(dtype, device),
         gravity=_gravity(entries, dtype, device),
         walls=walls,
-        boundaries=[boundary for _, boundary in obstacles],
+        boundaries=[solid.boundary for solid in solids],
         transfer=scene.transfer,
         flip=scene.flip,
         heat=None
         if scene.heat is None
-        else _named("heat", heat.conduction, scene, entries, grid, mixture.words(), obstacles, device),
+        else _named("heat", heat.conduction, scene, entries, grid, mixture.words(), solids, device),
     )
     ids = torch.arange(len(first), device=device)
     state = step.prepare(first.replace(ids=ids))

@@ -13,8 +13,8 @@ import numpy as np
 from ..data.trajectory import Array, Trajectory
 from . import check, schema
 from .explain import SceneError
-from .places import obstacle
 from .fields import RANKS
+from .places import obstacle
 from .scene import Scene
 
 FOLDER, VIDEO = "frames", "video.mp4"
