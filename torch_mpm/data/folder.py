@@ -11,8 +11,10 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from ..errors import DamagedFileError
-from .shard import SceneRecord, Shard, ShardRecord, StoredScene, record_path, shard_path, write_whole
+from .shard import Array, SceneRecord, Shard, ShardRecord, StoredScene, record_path, shard_path, write_whole
 from .statistics import Motion, Sums
 
 FORMAT = 1
@@ -157,9 +159,26 @@ class DatasetFolder:
         zero = Motion(Sums.zero(self.record.dim), Sums.zero(self.record.dim))
         return functools.reduce(lambda a, b: a + b, (s.motion for s in self.scenes(split) if s.motion), zero)
 
+    def check(self) -> None:
+        """Compare all finished shards with their checksums.
+
+        Raises:
+            DamagedFileError: for one that has changed since it was written.
+        """
+        for index in self.finished:
+            Shard(shard_path(self.path, index), check=True).close()
+
     def close(self) -> None:
         """Close its files; reading opens them again."""
         self._cache.close()
+
+
+def velocity_of(scene: StoredScene, interval: float) -> Array:
+    """Velocities [T, N, D] (m/s) as stored, or differences of the positions of frames ``interval`` [s] apart."""
+    if "velocity" in scene:
+        return scene["velocity"]
+    position = scene["position"]
+    return np.gradient(position, interval, axis=0) if scene.frames > 1 else np.zeros_like(position)
 
 
 class _OpenFiles:

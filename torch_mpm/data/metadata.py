@@ -66,19 +66,22 @@ def gns_node_features(dim: int) -> int:
     return GNS_VELOCITIES * dim + 2 * dim + GNS_EMBEDDING
 
 
-def connectivity_radius(dataset: DatasetFolder) -> float:
-    """The radius [m] that the data set chose, or the one within which ``NEIGHBOURS`` particles lie at rest."""
-    record = dataset.record
-    if record.connectivity_radius is not None:
-        return record.connectivity_radius
-    volume = record.dx**record.dim / 4
+def particle_spacing(dataset: DatasetFolder) -> float:
+    """Distance of neighbours at rest [m]: the side of a cube of the mean rest volume of a particle."""
     for scene in dataset.scenes():
         stored = dataset.scene(scene.id)
         if scene.particles and "volume" in stored:
-            volume = float(stored["volume"].mean())
-            break
-    ball = math.pi if record.dim == 2 else 4 / 3 * math.pi
-    return (NEIGHBOURS * volume / ball) ** (1 / record.dim)
+            return float(stored["volume"].mean(dtype="f8") ** (1 / dataset.record.dim))
+    return dataset.record.dx / 2
+
+
+def connectivity_radius(dataset: DatasetFolder) -> float:
+    """The radius [m] that the data set chose, or the one within which ``NEIGHBOURS`` particles lie at rest."""
+    if dataset.record.connectivity_radius is not None:
+        return dataset.record.connectivity_radius
+    dim = dataset.record.dim
+    ball = math.pi if dim == 2 else 4 / 3 * math.pi
+    return float(particle_spacing(dataset) * (NEIGHBOURS / ball) ** (1 / dim))
 
 
 def write_metadata(folder: Path, words: dict[str, Any]) -> None:
