@@ -34,6 +34,7 @@ class DatasetRecord:
         lower, upper: bounds of the domain [D] (m).
         dx: distance of the nodes of the grid [m].
         fields: arrays [T, N, ...] of every scene, ``position`` among them.
+        device: "cpu" or "cuda", whose results differ by rounding.
         connectivity_radius: of neighbours in a graph of particles [m]; None where readers choose one.
     """
 
@@ -48,6 +49,7 @@ class DatasetRecord:
     dx: float
     fields: tuple[str, ...]
     title: str = ""
+    device: str = ""
     connectivity_radius: float | None = None
     versions: dict[str, str] = field(default_factory=dict)
 
