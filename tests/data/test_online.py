@@ -99,3 +99,25 @@ def test_what_cannot_be():
         next(iter(OnlineStream(numbers, 7, scenes=1)))
     with pytest.raises(RuntimeError, match="without workers"):
         next(iter(DataLoader(stream(), batch_size=None, num_workers=1)))
+
+
+def test_windows_of_a_configuration_are_those_of_its_data_set(tmp_path, device):
+    """From memory and from the disk: the same scenes, bit for bit, where a round is a shard."""
+    pytest.importorskip("pydantic")
+    from torch_mpm.data import WindowDataset, simulator
+    from torch_mpm.data.configuration import Configuration
+    from torch_mpm.data.generate import generate
+
+    words = ["dataset.frames=9", "dataset.splits={train=4}", "dataset.scenes_per_shard=4", "grid.dx=0.05"]
+    configuration = Configuration.preset("sand", words)
+    generate(configuration, tmp_path / "set", device=device)
+    windows = WindowDataset(tmp_path / "set", fields=("position",), constants=("particle_type", "mass"))
+    disk = {(int(w["scene_id"]), int(w["first"])): w for w in windows}
+    stream = OnlineStream(simulator(configuration, device), 1, scenes=4, device=device, ahead=0)
+    for batch in itertools.islice(stream, len(disk)):
+        (place,) = places(batch)
+        wanted = disk.pop(place)
+        for name in ("position", "particle_type", "mass"):
+            torch.testing.assert_close(batch[name].cpu(), wanted[name], rtol=0, atol=0)
+    assert not disk
+    assert places(next(iter(OnlineStream(simulator(configuration, device), 1, first=4, scenes=1))))[0][0] == 4

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from .exports.well import export_well as export_well
     from .folder import DatasetFolder as DatasetFolder
     from .online import OnlineStream as OnlineStream
+    from .scene_simulator import simulator as simulator
     from .windows import WindowDataset as WindowDataset
     from .windows import WindowStream as WindowStream
     from .windows import pack as pack
@@ -34,6 +35,7 @@ _MODULES = {
     "export_well": "exports.well",
     "pack": "windows",
     "pad": "windows",
+    "simulator": "scene_simulator",
 }
 """Imported where they are used: `import torch_mpm` should not wait for them."""
 
