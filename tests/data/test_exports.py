@@ -10,8 +10,8 @@ import pytest
 import small_dataset as datasets
 import torch
 
-from torch_mpm.data import exports
-from torch_mpm.data.exports import common
+from torch_mpm import data
+from torch_mpm.data.exports import common, lagrangebench
 from torch_mpm.data.folder import DatasetFolder
 from torch_mpm.data.rasterise import cell_centres, rasterise
 from torch_mpm.data.shard import record_path, shard_path
@@ -20,11 +20,11 @@ from torch_mpm.errors import DamagedFileError
 IDS = {"train": [0, 1, 2, 4], "valid": [5, 6], "test": [7, 8, 9]}
 FRAMES = datasets.FRAMES
 ALL = [
-    exports.export_gns,
-    exports.export_lagrangebench,
-    exports.export_neuralmpm,
-    exports.export_tfrecord,
-    exports.export_well,
+    data.export_gns,
+    data.export_lagrangebench,
+    data.export_neuralmpm,
+    data.export_tfrecord,
+    data.export_well,
 ]
 
 
@@ -70,7 +70,7 @@ def gns_samples(path, sequence=6):
 
 
 def test_gns_reads_it(source, tmp_path):
-    folder = exports.export_gns(source, tmp_path / "gns")
+    folder = data.export_gns(source, tmp_path / "gns")
     for split in IDS:
         given, samples = expected(source, split), list(gns_samples(folder / f"{split}.npz"))
         assert len(samples) == len(given) * (FRAMES - 6)
@@ -85,7 +85,7 @@ def test_gns_reads_it(source, tmp_path):
 
 
 def test_gns_with_a_material(source, tmp_path):
-    folder = exports.export_gns(source, tmp_path / "gns", material="friction_angle")
+    folder = data.export_gns(source, tmp_path / "gns", material="friction_angle")
     given = expected(source, "valid")
     *_, material = list(gns_samples(folder / "valid.npz"))[-1]
     np.testing.assert_allclose(material, given[-1]["friction_angle"])
@@ -100,14 +100,14 @@ def test_gns_of_equal_scenes_is_no_table(tmp_path, monkeypatch):
     source = datasets.make_dataset(tmp_path / "set")
     same = [common.ExportedScene(0, np.zeros((FRAMES, 4, 2), "f4"), np.zeros(4, "i1"), None)] * 2
     monkeypatch.setattr(common.Export, "scenes", lambda *_: iter(same))
-    with np.load(exports.export_gns(source) / "train.npz", allow_pickle=True) as file:
+    with np.load(data.export_gns(source) / "train.npz", allow_pickle=True) as file:
         assert file["gns_data"].shape == (2,) and file["gns_data"][1][0].shape == (FRAMES, 4, 2)
 
 
 def test_a_material_that_is_not_there(flat, tmp_path):
     for name in ("cohesion", "position"):
         with pytest.raises(ValueError, match="material must be the name of an array"):
-            exports.export_gns(flat, tmp_path / "gns", material=name)
+            data.export_gns(flat, tmp_path / "gns", material=name)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -115,7 +115,7 @@ def test_a_material_that_is_not_there(flat, tmp_path):
 
 
 def test_lagrangebench_reads_it(source, tmp_path):
-    folder = exports.export_lagrangebench(source, tmp_path / "out")
+    folder = data.export_lagrangebench(source, tmp_path / "out")
     words = metadata_of(folder)
     for split in IDS:
         with h5py.File(folder / f"{split}.h5", "r") as file:
@@ -137,7 +137,7 @@ def test_lagrangebench_codes():
     position = np.zeros((3, 4, 2), "f4")
     position[:, 1, 0] = position[:, 3, 0] = [0, 1, 2]
     scene = common.ExportedScene(0, position, np.array([3, 3, 0, 7]), None)
-    assert exports.lagrangebench._types(scene).tolist() == [1, 2, 3, 0]
+    assert lagrangebench._types(scene).tolist() == [1, 2, 3, 0]
 
 
 # ---- DeepMind, PhysicsNeMo
@@ -160,7 +160,7 @@ def physicsnemo_records(folder, split):
 
 def test_deepmind_and_physicsnemo_read_it(source, tmp_path, caplog):
     pytest.importorskip("tfrecord")
-    folder = exports.export_tfrecord(source, tmp_path / "out")
+    folder = data.export_tfrecord(source, tmp_path / "out")
     assert "bounds of the first axis" in caplog.text
     words = metadata_of(folder)
     for split in IDS:
@@ -175,17 +175,17 @@ def test_deepmind_and_physicsnemo_read_it(source, tmp_path, caplog):
 
 def test_checksums_are_those_of_tensorflow(flat, tmp_path):
     crc32c = pytest.importorskip("crc32c").crc32c
-    data = (exports.export_tfrecord(flat, tmp_path / "out") / "valid.tfrecord").read_bytes()
+    found = (data.export_tfrecord(flat, tmp_path / "out") / "valid.tfrecord").read_bytes()
 
     def unmasked(at):
-        rotated = (int.from_bytes(data[at : at + 4], "little") - 0xA282EAD8) & 0xFFFFFFFF
+        rotated = (int.from_bytes(found[at : at + 4], "little") - 0xA282EAD8) & 0xFFFFFFFF
         return ((rotated >> 17) | (rotated << 15)) & 0xFFFFFFFF
 
     at = records = 0
-    while at < len(data):
-        length = int.from_bytes(data[at : at + 8], "little")
-        assert crc32c(data[at : at + 8]) == unmasked(at + 8)
-        assert crc32c(data[at + 12 : at + 12 + length]) == unmasked(at + 12 + length)
+    while at < len(found):
+        length = int.from_bytes(found[at : at + 8], "little")
+        assert crc32c(found[at : at + 8]) == unmasked(at + 8)
+        assert crc32c(found[at + 12 : at + 12 + length]) == unmasked(at + 12 + length)
         at, records = at + 16 + length, records + 1
     assert records == 2 and crc32c(b"123456789") == 0xE3069283
 
@@ -195,7 +195,7 @@ def test_checksums_are_those_of_tensorflow(flat, tmp_path):
 
 def test_neuralmpm_reads_it(source, tmp_path):
     """The steps of its NMPMParser."""
-    folder = exports.export_neuralmpm(source, tmp_path / "WaterRamps")
+    folder = data.export_neuralmpm(source, tmp_path / "WaterRamps")
     for split in IDS:
         files = sorted((folder / split).glob("*.h5"))
         assert [int(p.name.split("_")[-1].split(".")[0]) for p in files] == list(range(len(IDS[split])))
@@ -237,7 +237,7 @@ def well_sample(file, sample, first, steps):
 
 
 def test_the_well_reads_it(source, tmp_path):
-    folder = exports.export_well(source, tmp_path / "out", dx=0.1)
+    folder = data.export_well(source, tmp_path / "out", dx=0.1)
     dim, statistics = dim_of(source), json.loads((folder / "stats.yaml").read_text())
     for split in IDS:
         with h5py.File(folder / "data" / split / "numbers.hdf5") as file:
@@ -288,7 +288,7 @@ def test_no_particles_have_no_density():
 
 def test_scenes_for_paraview(source, tmp_path):
     meshio = pytest.importorskip("meshio")
-    folder = exports.export_scenes_vtk(source, tmp_path / "out", scenes=[4, 7])
+    folder = data.export_scenes_vtk(source, tmp_path / "out", scenes=[4, 7])
     assert sorted(p.name for p in folder.iterdir()) == ["scene_0000004", "scene_0000007"]
     mesh = meshio.read(folder / "scene_0000007" / "frame_00003.vtu")
     given, dim = datasets.arrays(7, dim_of(source)), dim_of(source)
@@ -296,11 +296,11 @@ def test_scenes_for_paraview(source, tmp_path):
     np.testing.assert_array_equal(mesh.point_data["velocity"][:, :dim], given["velocity"][3])
     np.testing.assert_array_equal(mesh.point_data["particle_type"], given["particle_type"])
     assert 'timestep="0.0075"' in (folder / "scene_0000007" / "run.pvd").read_text()
-    clouds = exports.export_scenes_ply(source, tmp_path / "ply")
+    clouds = data.export_scenes_ply(source, tmp_path / "ply")
     cloud = meshio.read(clouds / "scene_0000000" / "frame_00011.ply")
     np.testing.assert_array_equal(cloud.points[:, :dim], datasets.arrays(0, dim)["position"][-1])
     with pytest.raises(KeyError, match="no finished and valid scene 3"):
-        exports.export_scenes_vtk(source, tmp_path / "none", scenes=[3])
+        data.export_scenes_vtk(source, tmp_path / "none", scenes=[3])
 
 
 # ---- all of them
@@ -336,7 +336,7 @@ def test_an_export_appears_whole_or_not_at_all(flat, tmp_path, export, monkeypat
 
 def test_unfinished_and_empty_splits_are_left_out(tmp_path):
     source = datasets.make_dataset(tmp_path / "set", shards=1)  # scenes 0 to 3, of which 3 failed
-    folder = exports.export_gns(source)
+    folder = data.export_gns(source)
     assert sorted(p.name for p in folder.iterdir()) == ["metadata.json", "train.npz"]
     assert len(list(gns_samples(folder / "train.npz"))) == 3 * (FRAMES - 6)
     for export in ALL[1:]:
@@ -350,24 +350,24 @@ def test_what_loaders_cannot_read_is_refused(tmp_path):
     (source / "shards").mkdir()
     datasets.write_shard(source, 0)
     with pytest.raises(ValueError, match="scene 0 must have the 13 frames of the data set, got 12"):
-        exports.export_gns(source)
+        data.export_gns(source)
 
 
 def test_a_damaged_shard_is_noticed(tmp_path):
     source = datasets.make_dataset(tmp_path / "set")
     path = shard_path(source, 1)
-    data = bytearray(path.read_bytes())
-    data[len(data) // 2] ^= 1
-    path.write_bytes(data)
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 1
+    path.write_bytes(content)
     with pytest.raises(DamagedFileError, match="checksum is wrong"):
-        exports.export_gns(source)
+        data.export_gns(source)
     assert not (source / "gns").exists()
     record_path(path).unlink()  # as `verify` leaves it, to be generated again
-    exports.export_gns(source)
+    data.export_gns(source)
 
 
 def test_a_disk_without_room(flat, tmp_path, monkeypatch):
     monkeypatch.setattr(common.shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(1, 1, 0))
     with pytest.raises(OSError, match="the positions need") as caught:
-        exports.export_gns(flat, tmp_path / "out")
+        data.export_gns(flat, tmp_path / "out")
     assert caught.value.errno == errno.ENOSPC and list(tmp_path.iterdir()) == []
