@@ -1,4 +1,4 @@
-"""The command line: ``torch-mpm run SCENE -o DIR``, check, info, schema, render, export."""
+"""The command line: ``torch-mpm run SCENE -o DIR``, check, info, schema, render, export, and those of data sets."""
 
 from __future__ import annotations
 
@@ -9,6 +9,9 @@ import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
+
+from .data import commands as data_sets
+from .data.commands import set_argument
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -26,7 +29,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
-TOLD = ("SceneError", "OutputError", "DamagedFileError", "SimulationError", "Interrupted", "RenderError")
+TOLD = (
+    "SceneError", "OutputError", "DamagedFileError", "SimulationError", "Interrupted", "RenderError", "WorkerError",
+    "IncompleteError", "VerifyError",
+)  # fmt: skip
 
 
 def _message(error: Exception) -> str | None:
@@ -70,7 +76,7 @@ def _parser() -> argparse.ArgumentParser:
 
     render = commands.add_parser("render", help="redraw the pictures and the video of a run")
     render.add_argument("run", type=Path, help="folder of a run")
-    _set_argument(render, "render.color_by=stress")
+    set_argument(render, "render.color_by=stress")
     render.set_defaults(command=_render)
 
     export = commands.add_parser("export", help="convert a run for other programs")
@@ -78,17 +84,14 @@ def _parser() -> argparse.ArgumentParser:
     export.add_argument("--vtk", action="store_true", help="VTK files for ParaView, in DIR/vtk")
     export.add_argument("--ply", action="store_true", help="PLY point clouds, in DIR/ply")
     export.set_defaults(command=_export)
+
+    data_sets.add(commands)
     return parser
 
 
 def _scene_arguments(parser: argparse.ArgumentParser, optional: bool = False) -> None:
     parser.add_argument("scene", type=Path, help="scene file (TOML)", nargs="?" if optional else None)
-    _set_argument(parser, "grid.dx=0.01")
-
-
-def _set_argument(parser: argparse.ArgumentParser, example: str) -> None:
-    text = f"override a key of the scene, such as {example}"
-    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="overrides", help=text)
+    set_argument(parser, "grid.dx=0.01")
 
 
 # ---- commands

@@ -146,9 +146,14 @@ class Claim:
             self._whole.add((shard, check))
         return good
 
-    def finished(self) -> int:
-        """Number of finished shards."""
-        return sum(self.is_finished(k) for k in range(self.record.shards))
+    def finished(self) -> list[int]:
+        """The finished shards."""
+        return [k for k in range(self.record.shards) if self.is_finished(k)]
+
+    def finished_scenes(self) -> int:
+        """Number of the scenes in finished shards."""
+        size, total = self.record.scenes_per_shard, self.record.scenes
+        return sum(min(size, total - k * size) for k in self.finished())
 
     def _clean(self, shard: int) -> None:
         """Remove what is left of a shard that is not whole."""

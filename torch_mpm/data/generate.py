@@ -47,7 +47,8 @@ def generate(
         out: folder, made where it does not exist.
         device: "auto", "cpu", "cuda" or "cuda:1"; see `torch_mpm.data.workers.take_device`.
         check: compare shards that are there with their checksums, and make damaged ones anew.
-        progress: called with a dictionary of figures while frames are computed.
+        progress: called with a dictionary of figures while frames are computed: scenes and those that failed so far,
+            frames of all scenes so far, and those that were missing at the start.
 
     Returns:
         A summary: of this process the scenes, those of them that failed, and seconds; and whether the data set is
@@ -68,7 +69,7 @@ def generate(
         line = _Line(configuration, claim, chosen, progress)
         with output_errors(folder):
             line.run(check)
-        complete = claim.finished() == record.shards
+        complete = len(claim.finished()) == record.shards
     return {**line.totals, "seconds": time.perf_counter() - begin, "complete": complete}
 
 
@@ -118,6 +119,7 @@ class _Line:
     ) -> None:
         self.configuration, self.claim, self.device, self.progress = configuration, claim, device, progress
         self.totals: dict[str, Any] = {"scenes": 0, "failed": 0, "simulating": 0.0, "waiting": 0.0}
+        self._missing = claim.record.scenes - claim.finished_scenes()
 
     def run(self, check: bool) -> None:
         """All shards that nobody else takes."""
@@ -131,7 +133,7 @@ class _Line:
                 shard, drawn = coming[0], self._wait(coming[1])
                 coming = self._next(shards)
                 begin = time.perf_counter()
-                simulate(self.configuration, drawn, self.device, lambda n, frame: self._tell(n, frame))
+                simulate(self.configuration, drawn, self.device, self._tell)
                 self.totals["simulating"] += time.perf_counter() - begin
                 if written is not None:
                     self._wait(written)
@@ -166,8 +168,9 @@ class _Line:
 
     def _tell(self, scenes: int, frame: int) -> None:
         if self.progress is not None:
-            share = (frame + 1) / self.configuration.dataset.frames
-            self.progress({**self.totals, "scenes": self.totals["scenes"] + scenes * share})
+            every = self.configuration.dataset.frames
+            done = self.totals["scenes"] * every + scenes * (frame + 1)
+            self.progress({**self.totals, "frames": done, "missing": self._missing * every})
 
     # -- writing
 
