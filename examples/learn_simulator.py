@@ -27,7 +27,7 @@ from torch_mpm.data.metadata import connectivity_radius
 from torch_mpm.data.statistics import Motion
 
 HISTORY = 6  # positions that the network sees: five velocities
-NOISE = 0.05  # of the velocities it is trained with, in units of their deviation, so that it bears its own errors
+NOISE = 0.01  # of the velocities it is trained with, in units of their deviation, so that it bears its own errors
 WIDTH, LAYERS = 64, 4
 
 
@@ -89,7 +89,7 @@ class Simulator(nn.Module):
         return self.decode(nodes)
 
     def loss(self, window: Tensor, scene: Tensor) -> Tensor:
-        """Mean squared error of the normalised acceleration for windows [N, HISTORY + 1, D], with noise."""
+        """Huber's loss of the normalised acceleration for windows [N, HISTORY + 1, D], with noise."""
         domain = self.domain
         steps = torch.randn_like(window[:, 1:-1]) * NOISE * domain.velocity / (HISTORY - 1) ** 0.5
         noise = torch.cat([torch.zeros_like(window[:, :1]), steps.cumsum(1).cumsum(1)], 1)
@@ -97,7 +97,7 @@ class Simulator(nn.Module):
         following = window[:, -1] + noise[:, -1]  # the noise in the last velocity is to be corrected
         acceleration = following - 2 * history[:, -1] + history[:, -2]
         wanted = (acceleration - domain.acceleration_mean) / domain.acceleration
-        return (self(history, scene) - wanted).square().mean()
+        return nn.functional.smooth_l1_loss(self(history, scene), wanted, beta=0.1)
 
     @torch.no_grad()
     def rollout(self, first: Tensor, frames: int) -> Tensor:

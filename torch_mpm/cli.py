@@ -21,7 +21,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         options.command(options)
     except KeyboardInterrupt:
         return _told("interrupted", 130)
-    except (ValueError, OSError, ImportError, RuntimeError, MemoryError) as error:
+    except (ValueError, OSError, ImportError, RuntimeError, MemoryError, KeyError) as error:
         message = _message(error)
         if message is None:
             raise
@@ -31,7 +31,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 TOLD = (
     "SceneError", "OutputError", "DamagedFileError", "SimulationError", "Interrupted", "RenderError", "WorkerError",
-    "IncompleteError", "VerifyError",
+    "IncompleteError", "VerifyError", "DatasetError", "MissingError",
 )  # fmt: skip
 
 

@@ -23,6 +23,17 @@ MOST_OPEN = 32
 """Shards, and scenes of them, that a reader keeps open."""
 
 
+class DatasetError(ValueError):
+    """A data set does not have what is asked for."""
+
+
+class MissingError(KeyError):
+    """There is no such split or scene."""
+
+    def __str__(self) -> str:
+        return str(self.args[0])  # KeyError would quote it
+
+
 @dataclass(frozen=True)
 class DatasetRecord:
     """What ``dataset.json`` says, written once, before the first scene.
@@ -69,12 +80,12 @@ class DatasetRecord:
     def split_of(self, scene_id: int) -> str:
         """
         Raises:
-            KeyError: for a scene of no split.
+            MissingError: for a scene of no split.
         """
         for name, (first, count) in self.splits.items():
             if first <= scene_id < first + count:
                 return name
-        raise KeyError(f"the data set has no scene {scene_id}")
+        raise MissingError(f"the data set has no scene {scene_id}")
 
     def write(self, folder: Path) -> None:
         """Write it; it appears when it is whole and on the disk."""
@@ -117,7 +128,7 @@ class DatasetFolder:
     Raises:
         FileNotFoundError: for a folder that holds no data set.
         DamagedFileError: for records that are damaged; later, where damaged scenes are read.
-        KeyError: of methods, for a split or a scene that is not there.
+        MissingError: a KeyError, of methods, for a split or a scene that is not there.
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -144,14 +155,14 @@ class DatasetFolder:
         if split is None:
             return [self._scenes[k][1] for k in sorted(self._scenes)]
         if split not in self.record.splits:
-            raise KeyError(f"split must be one of {', '.join(self.record.splits)}, got {split!r}")
+            raise MissingError(f"split must be one of {', '.join(self.record.splits)}, got {split!r}")
         first, count = self.record.splits[split]
         return [self._scenes[k][1] for k in range(first, first + count) if k in self._scenes]
 
     def scene(self, scene_id: int) -> StoredScene:
         """A valid scene, open for reading."""
         if scene_id not in self._scenes or not self._scenes[scene_id][1].valid:
-            raise KeyError(f"{self.path} has no finished and valid scene {scene_id}")
+            raise MissingError(f"{self.path} has no finished and valid scene {scene_id}")
         return self._cache.scene(shard_path(self.path, self._scenes[scene_id][0]), scene_id)
 
     def motion(self, split: str | None = None) -> Motion:

@@ -12,7 +12,7 @@ import math
 from pathlib import Path
 from typing import Any
 
-from .folder import DatasetFolder
+from .folder import DatasetError, DatasetFolder
 from .shard import write_whole
 
 METADATA = "metadata.json"
@@ -31,11 +31,11 @@ def metadata(dataset: DatasetFolder, split: str = "train", material: bool = Fals
         material: an export of geoelements/gns has a column of a material parameter.
 
     Raises:
-        ValueError: for a data set without a valid scene.
+        DatasetError: for a data set without a valid scene.
     """
     record, scenes = dataset.record, dataset.scenes()
     if not scenes:
-        raise ValueError(f"{dataset.path} has no valid scene yet")
+        raise DatasetError(f"{dataset.path} has no valid scene yet")
     known = split if split in record.splits and dataset.scenes(split) else None
     motion = dataset.motion(known)
     words: dict[str, Any] = {

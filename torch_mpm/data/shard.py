@@ -305,6 +305,15 @@ class StoredScene:
         self.frames, self.particles, self.dim = shape
 
     @property
+    def words(self) -> dict[str, Any]:
+        """The scene file of the scene; nothing where its attributes do not say it."""
+        try:
+            words = json.loads(str(self.attributes.get("scene", "")))
+        except (ValueError, RecursionError):
+            return {}
+        return words if isinstance(words, dict) else {}
+
+    @property
     def names(self) -> list[str]:
         """Of its arrays."""
         return list(self._group)

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..folder import DatasetFolder
+from ..folder import DatasetError, DatasetFolder
 from ..metadata import metadata, write_metadata
 from ..statistics import BOUNDARY
 
@@ -54,22 +54,22 @@ class Export:
         """The valid scenes of a split that have particles, by id.
 
         Raises:
-            ValueError: for a scene that loaders could not read: another number of frames, no or unknown types.
+            DatasetError: for a scene that loaders could not read: another number of frames, no or unknown types.
             DamagedFileError: for a scene that is damaged.
         """
         for number in exported_ids(self.dataset, split):
             stored = self.dataset.scene(number)
             position = np.ascontiguousarray(stored["position"], np.float32)
             if len(position) != self.dataset.record.frames:
-                raise ValueError(
+                raise DatasetError(
                     f"scene {number} must have the {self.dataset.record.frames} frames of the data set, "
                     f"got {len(position)}"
                 )
             if "particle_type" not in stored:
-                raise ValueError(f"scene {number} must have particle_type [N]")
+                raise DatasetError(f"scene {number} must have particle_type [N]")
             kind = stored["particle_type"]
             if kind.min() < 0 or kind.max() >= PARTICLE_TYPES:
-                raise ValueError(f"particle_type must be within 0 and {PARTICLE_TYPES - 1}, got {kind.max()}")
+                raise DatasetError(f"particle_type must be within 0 and {PARTICLE_TYPES - 1}, got {kind.max()}")
             yield ExportedScene(number, position, kind, stored)
 
 
@@ -92,7 +92,7 @@ def exporting(
     Raises:
         FileExistsError: when ``out`` is there already.
         OSError: when the disk has no room for the data, uncompressed.
-        ValueError: for a data set without a valid scene.
+        DatasetError: for a data set without a valid scene.
         DamagedFileError: for a data set that is damaged.
     """
     dataset = source if isinstance(source, DatasetFolder) else DatasetFolder(source)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..folder import DatasetFolder
+from ..folder import DatasetError, DatasetFolder
 from .common import Export, ExportedScene, exporting
 
 
@@ -27,8 +27,8 @@ def export_gns(dataset: str | Path | DatasetFolder, out: str | Path | None = Non
         The folder.
 
     Raises:
-        FileExistsError, OSError, ValueError, DamagedFileError: as :func:`torch_mpm.data.exports.common.exporting`;
-            ValueError also for a scene without the material.
+        FileExistsError, OSError, DatasetError, DamagedFileError: as :func:`torch_mpm.data.exports.common.exporting`;
+            DatasetError also for a scene without the material.
     """
     with exporting(dataset, out, "gns", material=material is not None) as export:
         for split in export.dataset.record.splits:
@@ -52,5 +52,5 @@ def _entry(scene: ExportedScene, material: str | None) -> tuple[np.ndarray, ...]
     if material is None:
         return scene.position, kind
     if material not in scene.arrays or scene.arrays.shape(material) != kind.shape:
-        raise ValueError(f"material must be the name of an array [N] of every scene, got {material!r}")
+        raise DatasetError(f"material must be the name of an array [N] of every scene, got {material!r}")
     return scene.position, kind, scene.arrays[material].astype(np.float32)
