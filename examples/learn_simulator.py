@@ -175,7 +175,17 @@ def main() -> None:
         t = time.perf_counter()
         ours = model.rollout(truth[:, :HISTORY], truth.shape[1])
         e, b = errors(ours, truth), errors(constant_velocity(truth[:, :HISTORY], truth.shape[1], domain), truth)
-        print(scene.id, scene.particles, "network", e[[10, 30, 60, -1]].tolist(), "baseline", b[[10, 30, 60, -1]].tolist(), "ratio of means", float(b.mean() / e.mean()), time.perf_counter() - t)
+        print(
+            scene.id,
+            scene.particles,
+            "network",
+            e[[10, 30, 60, -1]].tolist(),
+            "baseline",
+            b[[10, 30, 60, -1]].tolist(),
+            "ratio of means",
+            float(b.mean() / e.mean()),
+            time.perf_counter() - t,
+        )
 
 
 if __name__ == "__main__":

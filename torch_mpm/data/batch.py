@@ -11,7 +11,7 @@ from torch import Tensor
 from ..rollouts import rollout
 from ..scene import fields, heap
 from ..scene.build import Built
-from ..state import State
+from ..state import State, _take
 from .recording import Array, Recording
 
 LOOK = 8
@@ -114,7 +114,7 @@ def _run(
             surveys.append(torch.stack(step.survey(state)))
             if state.x.is_cpu:
                 heap.trim()
-        recording.put({name: _field(built, state, name)[order] for name in names})
+        recording.put({name: _take(_field(built, state, name), order) for name in names})
         if told is not None:
             told(frame)
     return torch.stack(surveys)
