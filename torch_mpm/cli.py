@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from .data import commands as data_sets
+from .data import reading_commands as reading
 from .data.commands import set_argument
 
 
@@ -74,17 +75,18 @@ def _parser() -> argparse.ArgumentParser:
     schema = commands.add_parser("schema", help="print the JSON schema of scene files, for editors")
     schema.set_defaults(command=_schema)
 
-    render = commands.add_parser("render", help="redraw the pictures and the video of a run")
-    render.add_argument("run", type=Path, help="folder of a run")
+    render = commands.add_parser("render", help="redraw the pictures and the video of a run; draw scenes of a data set")
+    render.add_argument("run", type=Path, help="folder of a run or of a data set")
     set_argument(render, "render.color_by=stress")
+    reading.add_render_options(render)
     render.set_defaults(command=_render)
 
-    export = commands.add_parser("export", help="convert a run for other programs")
-    export.add_argument("run", type=Path, help="folder of a run")
-    export.add_argument("--vtk", action="store_true", help="VTK files for ParaView, in DIR/vtk")
-    export.add_argument("--ply", action="store_true", help="PLY point clouds, in DIR/ply")
+    export = commands.add_parser("export", help="convert a run or a data set for other programs")
+    export.add_argument("run", type=Path, help="folder of a run or of a data set")
+    reading.add_export_options(export)
     export.set_defaults(command=_export)
 
+    reading.add(commands)
     data_sets.add(commands)
     return parser
 
@@ -206,6 +208,9 @@ def _schema(options: argparse.Namespace) -> None:
 
 
 def _render(options: argparse.Namespace) -> None:
+    if reading.is_dataset(options.run):
+        reading.render(options)
+        return
     from .scene.folder import load_run
 
     for path in _draw(options.run, load_run(options.run, options.overrides), quiet=False).values():
@@ -213,12 +218,10 @@ def _render(options: argparse.Namespace) -> None:
 
 
 def _export(options: argparse.Namespace) -> None:
-    from .data import export
-
-    if options.vtk or not options.ply:
-        print(export.export_vtk(options.run))
-    if options.ply:
-        print(export.export_ply(options.run))
+    if reading.is_dataset(options.run):
+        reading.export(options)
+    else:
+        reading.export_run(options)
 
 
 # ---- telling
