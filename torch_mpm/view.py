@@ -155,9 +155,15 @@ class Viewer:
                 continue
             if int(position) != self._frame.value:  # moved by hand
                 position = float(self._frame.value)
-            position = (position + passed * self._speed.value / self.clip.interval) % len(self.clip.position)
+            frames = len(self.clip.position)
+            position = following_frame(position, passed, self._speed.value, self.clip.interval, frames)
             if int(position) != self._frame.value:
                 self._frame.value = int(position)
+
+
+def following_frame(position: float, seconds: float, speed: float, interval: float, frames: int) -> float:
+    """The place in a clip some seconds later, at a multiple ``speed`` of real time; the clip begins anew at its end."""
+    return (position + seconds * speed / interval) % frames if frames > 1 else 0.0
 
 
 def _quantity(name: str) -> Quantity:
