@@ -1,8 +1,7 @@
 """A graph network learns to simulate sand, from a data set on disk or from scenes that are simulated meanwhile.
 
-    torch-mpm generate --preset sand -o out/sand ...      # or leave it to this script, which does so first
-    python examples/learn_simulator.py                    # some minutes on two cores; out/learn_simulator has the results
-    python examples/learn_simulator.py --online           # the same without a data set to train on
+    python examples/learn_simulator.py             # generates a small data set, trains for some minutes on two cores
+    python examples/learn_simulator.py --online    # trains on other scenes, without a data set of them
 
 The network sees the last five velocities of each particle and where its neighbours and the walls are, and predicts the
 acceleration (Sanchez-Gonzalez et al. 2020, smaller). It is rolled out beside the truth on scenes that it has not seen,
@@ -22,7 +21,10 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from torch_mpm.data import DatasetFolder, OnlineStream, WindowDataset, WindowStream
+from torch_mpm import render
+from torch_mpm.data import DatasetFolder, OnlineStream, WindowDataset, WindowStream, pack, simulator
+from torch_mpm.data.configuration import Configuration
+from torch_mpm.data.generate import generate
 from torch_mpm.data.metadata import connectivity_radius
 from torch_mpm.data.statistics import Motion
 
@@ -33,7 +35,7 @@ WIDTH, LAYERS = 64, 4
 
 @dataclass
 class Domain:
-    """What scales the inputs: bounds [D] and connectivity radius [m], deviations of velocities and accelerations [D]."""
+    """What scales the inputs: bounds [D] and radius of neighbours [m], moments of velocities and accelerations [D]."""
 
     lower: Tensor
     upper: Tensor
@@ -88,13 +90,13 @@ class Simulator(nn.Module):
             nodes = nodes + node_layer(torch.cat([nodes, gathered], 1))
         return self.decode(nodes)
 
-    def loss(self, window: Tensor, scene: Tensor) -> Tensor:
-        """Huber's loss of the normalised acceleration for windows [N, HISTORY + 1, D], with noise."""
+    def loss(self, window: Tensor, scene: Tensor, noise: float = NOISE) -> Tensor:
+        """Huber's loss of the normalised acceleration for windows [N, HISTORY + 1, D]."""
         domain = self.domain
-        steps = torch.randn_like(window[:, 1:-1]) * NOISE * domain.velocity / (HISTORY - 1) ** 0.5
-        noise = torch.cat([torch.zeros_like(window[:, :1]), steps.cumsum(1).cumsum(1)], 1)
-        history = window[:, :-1] + noise
-        following = window[:, -1] + noise[:, -1]  # the noise in the last velocity is to be corrected
+        steps = torch.randn_like(window[:, 1:-1]) * noise * domain.velocity / (HISTORY - 1) ** 0.5
+        moved = torch.cat([torch.zeros_like(window[:, :1]), steps.cumsum(1).cumsum(1)], 1)
+        history = window[:, :-1] + moved
+        following = window[:, -1] + moved[:, -1]  # the noise in the last velocity is to be corrected
         acceleration = following - 2 * history[:, -1] + history[:, -2]
         wanted = (acceleration - domain.acceleration_mean) / domain.acceleration
         return nn.functional.smooth_l1_loss(self(history, scene), wanted, beta=0.1)
@@ -155,37 +157,101 @@ def errors(predicted: Tensor, truth: Tensor) -> Tensor:
     return (predicted - truth).norm(dim=2).mean(0)
 
 
+@torch.no_grad()
+def mean_loss(model: Simulator, windows: WindowDataset, count: int = 64) -> float:
+    """Mean loss without noise over windows that are spread over a split."""
+    items = [windows[int(k)] for k in np.linspace(0, len(windows) - 1, count)]
+    device = model.domain.lower.device
+    batches = [pack(items[k : k + 8]) for k in range(0, count, 8)]
+    losses = [model.loss(b["position"].to(device), b["scene"].to(device), noise=0.0) for b in batches]
+    return float(torch.stack(losses).mean())
+
+
+def compare(model: Simulator, data: DatasetFolder, out: Path) -> dict[str, Tensor]:
+    """Roll out the test scenes; draws ``errors.png`` and ``rollout.mp4``, and returns mean errors [frames] (m)."""
+    found: dict[str, list[Tensor]] = {"network": [], "constant velocity": []}
+    clips: dict[str, Tensor] = {}
+    for scene in data.scenes("test"):
+        truth = torch.from_numpy(data.scene(scene.id)["position"]).transpose(0, 1).to(model.domain.lower.device)
+        first, frames = truth[:, :HISTORY], truth.shape[1]
+        rolled = {
+            "network": model.rollout(first, frames),
+            "constant velocity": constant_velocity(first, frames, model.domain),
+        }
+        for name, position in rolled.items():
+            found[name].append(errors(position, truth).cpu())
+        if not clips or len(truth) > len(clips["truth"]):
+            clips = {"truth": truth, **rolled}
+    draw_errors(found, data.record.frame_interval, out / "errors.png")
+    draw_video(clips, data, out / "rollout.mp4")
+    return {name: torch.stack(values).mean(0) for name, values in found.items()}
+
+
+def draw_errors(found: dict[str, list[Tensor]], interval: float, path: Path) -> None:
+    """Errors over time: a thin line for each scene, a thick one for their mean."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(7, 4.5), dpi=120)
+    axes = figure.add_subplot()
+    for (name, values), color in zip(found.items(), ("#0072B2", "#D55E00"), strict=True):
+        time_axis = interval * np.arange(len(values[0]))
+        for value in values:
+            axes.plot(time_axis, value, color=color, lw=0.6, alpha=0.5)
+        axes.plot(time_axis, torch.stack(values).mean(0), color=color, lw=2.5, label=name)
+    axes.set(xlabel="time [s]", ylabel="mean distance from the truth [m]", ylim=(0, None))
+    axes.legend()
+    figure.tight_layout()
+    figure.savefig(path)
+
+
+def draw_video(clips: dict[str, Tensor], data: DatasetFolder, path: Path) -> None:
+    """The truth and the predictions [N, frames, D] side by side."""
+    bounds = (data.record.lower, data.record.upper)
+    with render.VideoWriter(path, 0.5 / data.record.frame_interval) as video:
+        renderers = [render.Renderer(bounds, (420, 380), color_by=None) for _ in clips]
+        for k in range(data.record.frames):
+            shown = zip(renderers, clips.items(), strict=True)
+            pictures = [r.frame(x[:, k], title=name, time=k * data.record.frame_interval) for r, (name, x) in shown]
+            video.append(render.contact_sheet(pictures, len(pictures)))
+
+
+def configuration(scenes: int) -> Configuration:
+    """Small scenes of sand, coarser and with longer intervals than the preset."""
+    words = ["dataset.frames=81", "dataset.interval=0.01", "dataset.scenes_per_shard=20", "grid.dx=0.04"]
+    return Configuration.preset("sand", [*words, f"dataset.splits={{train={scenes}, valid=4, test=6}}"])
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", type=Path, default=Path("out/learn_simulator/data"), help="folder of the data set")
-    parser.add_argument("--out", type=Path, default=Path("out/learn_simulator"), help="folder of the results")
+    parser.add_argument("--out", type=Path, default=Path("out/learn_simulator"), help="folder of data set and results")
     parser.add_argument("--online", action="store_true", help="train on scenes that are simulated meanwhile")
+    parser.add_argument(
+        "--scenes", type=int, default=60, help="training scenes of the data set; of a round, online: 20"
+    )
     parser.add_argument("--steps", type=int, default=2000, help="training steps")
     parser.add_argument("--batch", type=int, default=4, help="windows of a batch")
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
     options = parser.parse_args()
     torch.manual_seed(0)
-    data = DatasetFolder(options.data)
+    config, folder = configuration(options.scenes), options.out / "data"
+    generate(config, folder, device=options.device)  # what is missing of it
+    data = DatasetFolder(folder)
     domain = Domain.of(data, data.motion("train"), torch.device(options.device))
     model = Simulator(domain).to(options.device)
-    stream = WindowStream(WindowDataset(data, "train", HISTORY + 1), options.batch)
-    train(model, stream.loader(), options.steps)
-    for scene in data.scenes("test"):
-        truth = torch.from_numpy(data.scene(scene.id)["position"]).transpose(0, 1).to(options.device)
-        t = time.perf_counter()
-        ours = model.rollout(truth[:, :HISTORY], truth.shape[1])
-        e, b = errors(ours, truth), errors(constant_velocity(truth[:, :HISTORY], truth.shape[1], domain), truth)
-        print(
-            scene.id,
-            scene.particles,
-            "network",
-            e[[10, 30, 60, -1]].tolist(),
-            "baseline",
-            b[[10, 30, 60, -1]].tolist(),
-            "ratio of means",
-            float(b.mean() / e.mean()),
-            time.perf_counter() - t,
-        )
+    if options.online:
+        made = simulator(config, options.device)
+        batches = iter(OnlineStream(made, options.batch, scenes=20, first=config.scenes, device=options.device))
+    else:
+        batches = WindowStream(WindowDataset(data, "train", HISTORY + 1), options.batch).loader()
+    train(model, batches, options.steps)
+    print(f"held-out loss {mean_loss(model, WindowDataset(data, 'valid', HISTORY + 1)):.4f}")
+    results = options.out / ("online" if options.online else "disk")
+    results.mkdir(parents=True, exist_ok=True)
+    found = compare(model, data, results)
+    means = {name: float(values[HISTORY:].mean()) for name, values in found.items()}
+    ratio = means["constant velocity"] / means["network"]
+    print("mean error over the rollouts: " + ", ".join(f"{name} {value:.4f} m" for name, value in means.items()))
+    print(f"the network is {ratio:.1f} times as accurate; see {results / 'errors.png'} and {results / 'rollout.mp4'}")
 
 
 if __name__ == "__main__":
