@@ -217,7 +217,7 @@ def test_a_scene_that_needs_too_many_steps_fails_alone(tmp_path):
 
 
 def test_a_scene_without_room_is_recorded(tmp_path):
-    made = configuration(body__0__count={"choice": [1, 30]}, dataset__gap=0.05)
+    made = configuration(body__0__count={"choice": [1, 30], "weights": [1, 12]})
     generate(made, tmp_path, device="cpu")
     told = DatasetFolder(tmp_path).attempted()
     assert {s.valid for s in told} == {True, False}
@@ -233,7 +233,7 @@ def test_a_data_set_without_a_good_scene_cannot_be_finalized(tmp_path):
 
 def test_impossible_configurations_are_refused(tmp_path):
     with pytest.raises(SceneError, match=r"no room for body\[0\]"):
-        generate(configuration(body__0__count=100), tmp_path, device="cpu")
+        generate(configuration(body__0__count=30, dataset__splits={"train": 1}), tmp_path, device="cpu")
     with pytest.raises(SceneError, match=r"scene 0: body\[0\].densty: unknown key; did you mean|body\[0\].densty"):
         generate(configuration(body__0__densty=1.0), tmp_path, device="cpu")
     assert list(tmp_path.iterdir()) == []

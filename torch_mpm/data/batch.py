@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
 
+from ..laws import Mixture
 from ..rollouts import rollout
 from ..scene import fields, heap
 from ..scene.build import Built
@@ -127,10 +129,31 @@ def step_ready(built: Built) -> State:
 
 
 def _field(built: Built, state: State, name: str) -> Tensor:
+    """A field of all particles, in whatever batch they are: what a material lacks follows from what it has."""
+    if name in ("F", "J"):
+        return _deformation(built, state, name)
     value = fields.field(built.step, state, name)
-    if value is None:  # which a batch has for the sake of its other scenes, or not at all
-        raise ValueError(f"dataset.fields: no material of these scenes has {name!r}")
-    return value
+    return state.mass.new_zeros(len(state)) if value is None else value  # nothing has melted
+
+
+def _deformation(built: Built, state: State, name: str) -> Tensor:
+    """F, which is J^(1/D) I of a law that has J alone, or J, which is det F of one that has F alone."""
+    law, dim = built.step.law, built.grid.dim
+    laws: list[Any] = list(law.laws) if isinstance(law, Mixture) else [law]
+    value: Tensor | None = getattr(state, name)
+    if value is not None and all(name in part.state_fields for part in laws):
+        return value
+    if name == "J":
+        assert state.F is not None
+        other = torch.linalg.det(state.F)
+    else:
+        assert state.J is not None
+        eye = torch.eye(dim, dtype=state.x.dtype, device=state.x.device)
+        other = state.J.clamp_min(0).pow(1 / dim)[:, None, None] * eye
+    if value is None or state.material is None:
+        return other
+    has = torch.tensor([name in part.state_fields for part in laws], device=state.x.device)[state.material.long()]
+    return torch.where(has.reshape(-1, *(1,) * (value.dim() - 1)), value, other)
 
 
 # ---- room for blocks

@@ -247,6 +247,8 @@ def _checked(words: Words) -> Dataset:
     if grid is None:
         Scene(**{key: value for key, value in words.items() if key not in (*VARIED, "dataset")})
         raise SceneError(["grid: missing"])
+    if "temperature" in dataset.fields and "heat" not in words:
+        raise SceneError(["dataset.fields: temperature needs a [heat] table"])
     if not sum(dataset.splits.values()):
         raise SceneError([f"dataset.splits: has no scenes, got {dataset.splits}"])
     return dataset

@@ -17,6 +17,7 @@ A distribution is a table with one key, its name:
 
 from __future__ import annotations
 
+import difflib
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -141,6 +142,9 @@ def problems(words: Any, path: str, dim: int) -> Iterator[str]:
             if not KINDS[name].fits(argument, dim):
                 yield f"{path}.{name}: takes {KINDS[name].takes}, got {argument!r}"
                 return
+        elif len(words) == 1 and (near := difflib.get_close_matches(str(*words), [CHOICE, *KINDS], 1, 0.7)):
+            if near[0] not in words:
+                yield f"{path}: unknown distribution {next(iter(words))!r}; did you mean {near[0]!r}?"
         for key, value in words.items():
             if key != WEIGHTS:
                 yield from problems(value, f"{path}.{key}" if path else key, dim)

@@ -119,6 +119,7 @@ class _Line:
     ) -> None:
         self.configuration, self.claim, self.device, self.progress = configuration, claim, device, progress
         self.totals: dict[str, Any] = {"scenes": 0, "failed": 0, "simulating": 0.0, "waiting": 0.0}
+        self._stream = torch.cuda.Stream(device) if device.type == "cuda" else None
         self._missing = claim.record.scenes - claim.finished_scenes()
 
     def run(self, check: bool) -> None:
@@ -160,10 +161,10 @@ class _Line:
         if self.device.type == "cpu":
             return draw(self.configuration, ids, self.device)
         torch.cuda.set_device(self.device)
-        stream = torch.cuda.Stream(self.device)
-        with torch.cuda.stream(stream):
+        assert self._stream is not None
+        with torch.cuda.stream(self._stream):
             drawn = draw(self.configuration, ids, self.device)
-        stream.synchronize()
+        self._stream.synchronize()
         return drawn
 
     def _tell(self, scenes: int, frame: int) -> None:

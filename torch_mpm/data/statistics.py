@@ -13,6 +13,8 @@ Array = npt.NDArray[Any]
 
 BOUNDARY = 3
 """Particle type of what moves as prescribed; its motion is not to be learned, and is in no statistics."""
+FRAMES = 16
+"""That are summed up at once: few calls, and what fits into caches."""
 
 
 @dataclass(frozen=True)
@@ -30,8 +32,9 @@ class Sums:
     @classmethod
     def of(cls, vectors: Array) -> Sums:
         """Of vectors [..., D]."""
-        rows = vectors.reshape(-1, vectors.shape[-1])
-        return cls(len(rows), tuple(rows.sum(0).tolist()), tuple(np.einsum("nd,nd->d", rows, rows).tolist()))
+        axes = np.ascontiguousarray(vectors.reshape(-1, vectors.shape[-1]).T)
+        squares = tuple(float(np.einsum("n,n->", axis, axis)) for axis in axes)
+        return cls(axes.shape[1], tuple(axes.sum(1).tolist()), squares)
 
     def __add__(self, other: Sums) -> Sums:
         def added(a: tuple[float, ...], b: tuple[float, ...]) -> tuple[float, ...]:
@@ -74,12 +77,10 @@ def motion_sums(position: Array, particle_type: Array | None = None) -> Motion:
         raise ValueError("position must be finite")
     free = position if particle_type is None else position[:, particle_type != BOUNDARY]
     motion = Motion(Sums.zero(position.shape[2]), Sums.zero(position.shape[2]))
-    before = velocity = None
-    for frame in free:
-        here = frame.astype(np.float64)
-        if before is not None:
-            step = here - before
-            motion += Motion(Sums.of(step), Sums.of(step - velocity if velocity is not None else step[:0]))
-            velocity = step
-        before = here
+    last = free[:0].astype(np.float64)  # velocity of the frame before
+    for first in range(0, len(free) - 1, FRAMES):
+        velocity = np.diff(free[first : first + FRAMES + 1].astype(np.float64), axis=0)
+        acceleration = np.diff(np.concatenate([last, velocity]), axis=0)
+        motion += Motion(Sums.of(velocity), Sums.of(acceleration))
+        last = velocity[-1:]
     return motion

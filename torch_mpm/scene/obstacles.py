@@ -1,4 +1,5 @@
-"""The obstacles of a batch. Those that are alike but for their numbers are one obstacle with numbers per scene.
+"""The obstacles of a batch. Those at one place of the lists of several scenes that are alike but for their numbers are
+one obstacle with numbers per scene.
 
 So a thousand scenes with two obstacles each cost as much as one scene with two.
 """
@@ -44,15 +45,12 @@ def obstacles(entries: Sequence[Any], grid: Any, dtype: torch.dtype, device: tor
     """
     if len(entries) == 1:
         return [Together(obstacle(words, None), [words]) for words in entries[0].obstacle]
-    groups: dict[tuple[Any, ...], list[Any]] = {}
+    groups: dict[tuple[int, str], list[Any]] = {}
     for index, entry in enumerate(entries):
-        ranks: dict[str, int] = {}
-        for words in entry.obstacle:
-            form = _form(words)
-            ranks[form] = ranks.get(form, -1) + 1
-            groups.setdefault((form, ranks[form]), [None] * len(entries))[index] = words
+        for place, words in enumerate(entry.obstacle):
+            groups.setdefault((place, _form(words)), [None] * len(entries))[index] = words
     made = []
-    for words in groups.values():
+    for _, words in sorted(groups.items(), key=lambda item: item[0]):  # one after another as in each scene
         having = [k for k, w in enumerate(words) if w is not None]
         if len(having) == 1:
             made.append(Together(obstacle(words[having[0]], having[0]), words))
