@@ -26,7 +26,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..errors import DamagedFileError
-from .hdf5 import h5py_module
+from .hdf5 import h5py_module, storage_problem
 from .statistics import Motion, Sums, motion_sums
 
 Array = npt.NDArray[Any]
@@ -36,8 +36,6 @@ FORMAT = 1
 CHUNK_BYTES = 2**17
 """Of a chunk before compression, about: a window of some frames reads little more than itself."""
 GZIP_LEVEL = 1
-MOST_EXPANSION = 1032
-"""Bytes that one compressed byte can become (zlib's own limit)."""
 REMEDY = "remove it and its .json, and generate again"
 
 
@@ -423,7 +421,7 @@ def _scene_problem(group: Any, size: int) -> tuple[str, dict[str, Any]]:
             data = group[name] if hard else None
             if not isinstance(data, h5py.Dataset) or data.dtype.kind not in "fiu":
                 return f"has {name!r}, which is no array of numbers", {}
-            if problem := _storage_problem(h5py, data, size):
+            if problem := storage_problem(h5py, data, size):
                 return f"has {name!r}, {problem}", {}
         attributes = dict(group.attrs)
         if not all(isinstance(v, (str, np.integer, np.floating)) for v in attributes.values()):
@@ -435,20 +433,3 @@ def _scene_problem(group: Any, size: int) -> tuple[str, dict[str, Any]]:
     except (OSError, RuntimeError, ValueError, KeyError, TypeError) as error:
         return f"cannot be read ({error})", {}
     return "", {name: v if isinstance(v, str) else v.item() for name, v in attributes.items()}
-
-
-def _storage_problem(h5py: Any, data: Any, size: int) -> str:
-    """Why the numbers of a dataset are not all in this file, or could fill the memory."""
-    properties = data.id.get_create_plist()
-    filters = {properties.get_filter(k)[0] for k in range(properties.get_nfilters())}
-    if properties.get_external_count() or not filters <= {h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_SHUFFLE}:
-        return "which is stored in another way than torch_mpm does"
-    if properties.get_layout() == h5py.h5d.CHUNKED:
-        wanted = math.prod(-(-n // c) for n, c in zip(data.shape, data.chunks, strict=True))
-        stored = data.id.get_storage_size()
-        whole = data.id.get_num_chunks() == wanted and stored <= size
-        return "" if whole and data.nbytes <= MOST_EXPANSION * stored else "which is not whole"
-    if properties.get_layout() != h5py.h5d.CONTIGUOUS:
-        return "which is stored in another way than torch_mpm does"
-    offset = data.id.get_offset()
-    return "which is larger than the file" if data.nbytes and (offset is None or offset + data.nbytes > size) else ""
