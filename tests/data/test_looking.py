@@ -33,6 +33,16 @@ def test_a_sheet_shows_the_particles(path, tmp_path):
     assert 0 < first < last
 
 
+@pytest.mark.parametrize("color_by", ["friction_angle", "velocity", "material"])
+def test_scenes_are_coloured_by_any_number_of_a_particle(path, tmp_path, color_by):
+    """One number per particle and frame, or per particle."""
+    if color_by == "velocity":
+        with pytest.raises(DatasetError, match="one number per particle"):
+            draw_scenes(path, tmp_path, scenes=[0], frames=1, video=False, color_by=color_by)
+        return
+    assert draw_scenes(path, tmp_path, scenes=[0], frames=1, width=300, video=False, color_by=color_by)[0].exists()
+
+
 def test_a_video_has_the_frames(path, tmp_path):
     iio = pytest.importorskip("imageio_ffmpeg")
     seen = []

@@ -191,7 +191,7 @@ def _foreign(h5py: Any, file: Any, size: int) -> str:
 
 
 def storage_problem(h5py: Any, data: Any, size: int) -> str:
-    """Why the numbers of a dataset, plain or in chunks, are not all in this file or could fill the memory; "" if not."""
+    """Why the numbers of a dataset, plain or chunked, are not all in this file or could fill the memory; "" if not."""
     properties = data.id.get_create_plist()
     filters = {properties.get_filter(k)[0] for k in range(properties.get_nfilters())}
     if properties.get_external_count() or not filters <= {h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_SHUFFLE}:

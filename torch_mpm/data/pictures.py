@@ -136,8 +136,9 @@ class _Artist:
 
         sampled = []
         for values in self.values:
-            for k in np.linspace(0, len(values) - 1, SAMPLES).round().astype(int):
-                sampled.append(scalar_of(color_by, values[k], len(values[k])))
+            numbers = np.linspace(0, len(values) - 1, SAMPLES).round().astype(int)
+            rows = [values] if values.ndim == 1 else [values[k] for k in numbers]
+            sampled += [scalar_of(color_by, row, len(row)) for row in rows]
         return value_range(np.concatenate(sampled), QUANTITIES.get(color_by, Quantity("", "", "")).from_zero)
 
 
@@ -151,6 +152,9 @@ def field_values(scene: StoredScene, name: str, interval: float) -> Array:
         return np.linalg.norm(velocity_of(scene, interval), axis=2)
     if name not in scene:
         raise DatasetError(f"color_by must be speed or one of {', '.join(sorted(scene.names))}, got {name!r}")
+    trailing = len(scene.shape(name)) - (2 if scene.shape(name)[:2] == (scene.frames, scene.particles) else 1)
+    if trailing and name != "stress":
+        raise DatasetError(f"color_by must be one number per particle, or stress, got {name!r}")
     return scene[name]
 
 
