@@ -4,16 +4,17 @@ import errno
 import json
 import shutil
 
-import h5py
 import numpy as np
 import pytest
 import small_dataset as datasets
 import torch
 
+h5py = pytest.importorskip("h5py")
+pytest.importorskip("google_crc32c")
+
 from torch_mpm import data
 from torch_mpm.data.exports import common, lagrangebench
 from torch_mpm.data.folder import DatasetFolder
-from torch_mpm.data.rasterise import cell_centres, rasterise
 from torch_mpm.data.shard import record_path, shard_path
 from torch_mpm.errors import DamagedFileError
 
@@ -258,29 +259,6 @@ def test_the_well_reads_it(source, tmp_path):
                 assert statistics["mean"]["density"] == pytest.approx(density.mean())
                 assert statistics["std_delta"]["density"] == pytest.approx(np.diff(density, axis=1).std(), rel=1e-6)
                 assert len(statistics["mean_delta"]["velocity"]) == dim
-
-
-def test_rasterised_fields(device):
-    """One particle at the centre of a cell; at a corner of the domain all its mass is kept; nothing in empty cells."""
-    x = torch.tensor([[[0.35, 0.45]], [[0.0, 0.8]]], device=device)
-    v = torch.tensor([[[1.0, -2.0]], [[3.0, 4.0]]], device=device)
-    density, velocity = rasterise(x, v, torch.tensor([2.0], device=device), (0.0, 0.0), (1.0, 0.8), 0.1)
-    assert density.shape == (2, 10, 8) and velocity.shape == (2, 10, 8, 2)
-    row = torch.tensor([0.125, 0.75, 0.125], device=device)
-    torch.testing.assert_close(density[0, 2:5, 3:6], 200 * row[:, None] * row, rtol=1e-5, atol=1e-3)
-    torch.testing.assert_close(velocity[0, 3, 4], v[0, 0])
-    assert density[1, 0, 7] == pytest.approx(200)
-    torch.testing.assert_close(density.sum((1, 2)), torch.full((2,), 200.0, device=device))
-    assert (velocity[1, 5:] == 0).all() and cell_centres((0.0,), (0.8,), 0.1)[0][[0, -1]].tolist() == pytest.approx(
-        [0.05, 0.75]
-    )
-
-
-def test_no_particles_have_no_density():
-    density, velocity = rasterise(
-        torch.zeros(3, 0, 2), torch.zeros(3, 0, 2), torch.zeros(0), (0.0, 0.0), (1.0, 1.0), 0.25
-    )
-    assert density.shape == (3, 4, 4) and not density.any() and not velocity.any()
 
 
 # ---- for people

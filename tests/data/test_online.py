@@ -103,6 +103,7 @@ def test_what_cannot_be():
 
 def test_windows_of_a_configuration_are_those_of_its_data_set(tmp_path, device):
     """From memory and from the disk: the same scenes, bit for bit, where a round is a shard."""
+    pytest.importorskip("h5py")
     pytest.importorskip("pydantic")
     from torch_mpm.data import WindowDataset, simulator
     from torch_mpm.data.configuration import Configuration
