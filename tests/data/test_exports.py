@@ -12,11 +12,11 @@ import torch
 h5py = pytest.importorskip("h5py")
 pytest.importorskip("google_crc32c")
 
-from torch_mpm import data
-from torch_mpm.data.exports import common, lagrangebench
-from torch_mpm.data.folder import DatasetFolder
-from torch_mpm.data.shard import record_path, shard_path
-from torch_mpm.errors import DamagedFileError
+from torch_mpm import data  # noqa: E402
+from torch_mpm.data.exports import common, lagrangebench  # noqa: E402
+from torch_mpm.data.folder import DatasetFolder  # noqa: E402
+from torch_mpm.data.shard import record_path, shard_path  # noqa: E402
+from torch_mpm.errors import DamagedFileError  # noqa: E402
 
 IDS = {"train": [0, 1, 2, 4], "valid": [5, 6], "test": [7, 8, 9]}
 FRAMES = datasets.FRAMES
