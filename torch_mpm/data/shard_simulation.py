@@ -179,8 +179,15 @@ def _complete(
         "material": number.astype(np.int8),
         "mass": own["mass"].astype(np.float32),
         "volume": own["volume"].astype(np.float32),
+        **{name: _parameter(materials, name)[number] for name in configuration.parameters},
     }
     if dataset.obstacles and outcome.words and outcome.words.get("obstacle"):
         words = configuration.scene(outcome.words)
         times = np.arange(dataset.frames) * dataset.interval
         outcome.arrays = obstacle_particles.add(outcome.arrays, words, times)
+
+
+def _parameter(materials: list[Any], name: str) -> Array:
+    """A number of each material, 0 for one that has none of this name."""
+    values = [getattr(m.words, name, None) for m in materials]
+    return np.array([v if isinstance(v, (int, float)) else 0.0 for v in values], np.float32)
