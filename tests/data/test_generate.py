@@ -95,19 +95,19 @@ def test_each_device_makes_the_same_again(device, tmp_path):
 
 @pytest.mark.parametrize("kills", [5, pytest.param(20, marks=pytest.mark.slow)])
 def test_a_data_set_that_is_killed_and_resumed_is_the_same(tmp_path, kills):
-    changes = {"dataset__splits": {"train": 3 * kills}, "dataset__scenes_per_shard": 1}
+    changes = {"dataset__splits": {"train": 8 * kills}, "dataset__scenes_per_shard": 1}
     generate(configuration(**changes), tmp_path / "whole", device="cpu")
     rng, survived = random.Random(kills), 0
     for _ in range(kills):
         process = start(tmp_path / "set", **changes)
-        process.join(rng.uniform(0.05, 0.7))
+        process.join(rng.uniform(0.1, 0.4))
         survived += process.exitcode is None
         process.kill()
         process.join()
         if (tmp_path / "set" / "dataset.json").exists():
             seen = DatasetFolder(tmp_path / "set")
             assert all(seen.scene(s.id)["position"].shape[0] == 12 for s in seen.scenes())  # nothing unfinished
-    assert survived
+    assert survived >= kills // 3  # a fast machine is done before the last kill
     generate(configuration(**changes), tmp_path / "set", device="cpu")
     assert_same(tmp_path / "whole", tmp_path / "set")
     assert list(verify(tmp_path / "set")) == [] and not list((tmp_path / "set" / "shards").glob(".*"))
