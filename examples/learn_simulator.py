@@ -230,7 +230,7 @@ def main() -> None:
     parser.add_argument(
         "--scenes", type=int, default=120, help="training scenes of the data set; of a round, online: 20"
     )
-    parser.add_argument("--steps", type=int, default=1500, help="training steps")
+    parser.add_argument("--steps", type=int, default=5000, help="training steps")
     parser.add_argument("--batch", type=int, default=4, help="windows of a batch")
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
     options = parser.parse_args()

@@ -27,6 +27,15 @@ WORDS = [
 ]
 
 
+@pytest.fixture(autouse=True)
+def one_thread():
+    """Tensors are so small that threads only wait for each other."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
 @pytest.fixture(scope="module")
 def configuration():
     return Configuration.preset("sand", WORDS)
