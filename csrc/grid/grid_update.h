@@ -6,7 +6,6 @@
 
 #include "grid/friction.h"
 #include "grid/geometry.h"
-#include "grid/topology.h"
 
 // Node momentum to node velocity, gravity and the walls of the domain.
 //
@@ -61,13 +60,6 @@ struct GridUpdateArguments {
   double dt = 0;
   Walls<T, D> walls;
   NodeRow<T, D>* updated = nullptr;
-  // Where `drift` is given, in a call of many steps on CUDA: rows of unused slots are left as they are, `emptied`,
-  // which is `nodes`, is zeroed on the way unless there are mirrors, and the drift of this step makes that of the next,
-  // for G2P to count.
-  NodeRow<T, D>* emptied = nullptr;
-  const Drift* drift = nullptr;
-  Drift* next_drift = nullptr;
-  int64_t particles = 0;
 };
 
 template <class T, int D>

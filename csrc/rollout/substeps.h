@@ -209,9 +209,9 @@ struct Substeps {
   G2PAdvanceArguments<T, D> advance;
   Pool<T, D> pool;
   Tensor stress, step_time;
-  Tensor drifts;  // one for each of two substeps in turn, where activations last
+  Tensor drifts;                 // one for each of two substeps in turn, where activations last
+  NextGridArguments<T, D> next;  // of these; its update and contact are those here
   bool obstacles = false, fused = false;
-  bool one_grid_pass = false;  // where activations last and nobody reads the velocities before contact
   const int* previous_status = nullptr;
 
   explicit Substeps(const SubstepsInputs& inputs);
@@ -277,14 +277,14 @@ struct Substeps {
     drifts = empty_int(in.x, {2, sizeof(Drift) / sizeof(int)});
     torch::stable::zero_(drifts);
     p2g.drifted = true;
-    update.particles = in.x.size(0);
+    next.particles = in.x.size(0);
+    next.obstacles = obstacles;
     const int64_t most = std::min<int64_t>(update.block_count, INT32_MAX / kBlockNodes<D>) - activation.max_blocks;
     activation.margin_blocks = int(std::clamp<int64_t>(activation.max_blocks / 2 + 64, 0, std::max<int64_t>(most, 0)));
   }
 
   // For a call that keeps nothing but its end. Where there is a kernel for it, P2G computes the stress itself.
   void fuse() {
-    one_grid_pass = drifts.defined();
     fused = calls.size() == 1 && !has(in.material) && in.lattice.order() == 2 && !in.lattice.deterministic() &&
             p2g.form == StressForm::mls && calls[0].law->kernels<T, D>().p2g;
     if (fused) stress = Tensor();
@@ -296,8 +296,8 @@ struct Substeps {
     if (!drifts.defined()) return;
     Drift* const drift = static_cast<Drift*>(drifts.data_ptr());
     activation.drift = last ? nullptr : drift + parity;
-    update.drift = drift + parity;
-    update.next_drift = advance.drift = drift + (1 - parity);
+    next.drift = drift + parity;
+    next.next_drift = advance.drift = drift + (1 - parity);
   }
 
   // The time of obstacles, added up as single steps do: by a device itself, where the host may not be there.
@@ -320,13 +320,17 @@ struct Substeps {
 
   // From a stress that is there, or that P2G computes, to the velocities of the nodes.
   void move_grid(backend::Stream stream) {
-    if (!update.emptied) backend::clear(pool.nodes, stream);
+    if (!next.emptied) backend::clear(pool.nodes, stream);
     if (fused)
       calls[0].law->kernels<T, D>().p2g(laws[0], p2g, stream);
     else
       backend::p2g(in.lattice.order(), p2g, stream);
 #if MPM_BACKEND == MPM_BACKEND_IS_cuda
-    if (obstacles && one_grid_pass) return backend::grid_update_and_contact(update, contact, stream);
+    if (drifts.defined()) {
+      next.update = update;
+      next.contact = contact;
+      return backend::next_grid(next, stream);
+    }
 #endif
     backend::grid_update(update, stream);
     if (obstacles) backend::contact(contact, stream);
@@ -396,7 +400,8 @@ Substeps<T, D>::Substeps(const SubstepsInputs& inputs) : in(inputs) {
 // For the arguments' number of blocks.
 template <class T, int D>
 void Substeps<T, D>::make_pool(backend::Stream stream) {
-  pool.make(in.x, activation, obstacles && !one_grid_pass, stream);
+  const bool apart = obstacles && !drifts.defined();  // contact from the grid update
+  pool.make(in.x, activation, apart, stream);
   const Topology<T, D> topology = topology_of(activation);
   p2g.topology = advance.gather.topology = topology;
   p2g.nodes = {static_cast<T*>(pool.nodes.data_ptr()), 1 + D, 1 + D};
@@ -407,11 +412,10 @@ void Substeps<T, D>::make_pool(backend::Stream stream) {
   update.updated = static_cast<NodeRow<T, D>*>(pool.updated.data_ptr());
   if (drifts.defined() && !update.walls.mirrored) {
     backend::clear(pool.nodes, stream);
-    update.emptied = static_cast<NodeRow<T, D>*>(pool.nodes.data_ptr());
+    next.emptied = static_cast<NodeRow<T, D>*>(pool.nodes.data_ptr());
   }
   contact.velocity = static_cast<const T*>(pool.updated.data_ptr()) + 1;
   contact.stride = 1 + D;
-  const bool apart = obstacles && !one_grid_pass;
   if (apart) contact.result = static_cast<T*>(pool.velocity.data_ptr());
   const Tensor& velocity = apart ? pool.velocity : pool.updated;
   advance.gather.nodes = {static_cast<const T*>(velocity.data_ptr()) + 1, 1 + D, D};
