@@ -10,39 +10,45 @@ from torch import Tensor, nn
 
 from ..boundaries import Box, Obstacle, Plane
 
-ON_SURFACE = 1e-2
-"""Cells by which a surface is moved, so that a node on it is outside here too, where the others compare with <."""
+
+def surface_margin(dtype: torch.dtype, extent: float) -> float:
+    """Distance [m] by which a surface is moved, so that nodes on it are outside, where the others compare with <.
+
+    An `Obstacle` counts nodes within 16 roundings of the largest coordinate as inside.
+    """
+    return 64 * torch.finfo(dtype).eps * extent
 
 
 def stopping_plane(
-    point: Sequence[float], normal: Sequence[float], dx: float, start: float, end: float, kind: str = "sticky"
+    point: Sequence[float], normal: Sequence[float], margin: float, start: float, end: float
 ) -> Obstacle:
-    """Acts on nodes behind a plane, those on it excluded."""
+    """Stops nodes behind a plane; those within a margin [m] behind it are not."""
     size = math.sqrt(sum(n * n for n in normal))
     if not 0 < size < math.inf:
         raise ValueError(f"normal must have a positive length, got {list(normal)}")
-    position = [float(p) - ON_SURFACE * dx * n / size for p, n in zip(point, normal, strict=True)]
-    return Plane(position, [n / size for n in normal], kind, start=start, end=end)
+    position = [float(p) - margin * n / size for p, n in zip(point, normal, strict=True)]
+    return Plane(position, [n / size for n in normal], "sticky", start=start, end=end)
 
 
 def moving_cuboid(
-    point: Sequence[float], half: Sequence[float], velocity: Sequence[float], dx: float, start: float, end: float
+    point: Sequence[float], half: Sequence[float], velocity: Sequence[float], margin: float, start: float, end: float
 ) -> Obstacle:
-    """Gives its velocity to the nodes inside, and moves with it from `start` on; nodes on its faces are outside."""
-    size = [2 * (float(h) - ON_SURFACE * dx) for h in half]
+    """Gives its velocity to the nodes inside, and moves with it from `start` on; those within a margin [m] of its faces
+    are outside."""
+    size = [2 * (float(h) - margin) for h in half]
     if min(size) <= 0:
-        raise ValueError(f"size must be more than {ON_SURFACE} cells of {dx} m on every axis, got {list(half)}")
+        raise ValueError(f"size must be more than {margin:.3g} m on every axis, got {list(half)}")
     moves = any(v != 0 for v in velocity)
     return Box(list(point), size, "sticky", velocity=list(velocity) if moves else None, start=start, end=end)
 
 
-def outer_planes(lower: float, upper: float, dim: int, dx: float, start: float, end: float) -> list[Obstacle]:
+def outer_planes(lower: float, upper: float, dim: int, start: float, end: float) -> list[Obstacle]:
     """Stop nodes at or beyond the faces of a cube from moving out, one axis after another."""
     planes: list[Obstacle] = []
     for axis in range(dim):
         normal = [float(k == axis) for k in range(dim)]
-        low = [lower + ON_SURFACE * dx if k == axis else 0.0 for k in range(dim)]
-        high = [upper - ON_SURFACE * dx if k == axis else 0.0 for k in range(dim)]
+        low = [lower if k == axis else 0.0 for k in range(dim)]
+        high = [upper if k == axis else 0.0 for k in range(dim)]
         planes.append(Plane(low, normal, "separate", start=start, end=end))
         planes.append(Plane(high, [-n for n in normal], "separate", start=start, end=end))
     return planes

@@ -1,4 +1,4 @@
-"""`MPM_Simulator_WARP` of PhysGaussian (Xie et al. 2024, arXiv 2311.12198) and its JSON configurations, on torch_mpm."""
+"""`MPM_Simulator_WARP` of PhysGaussian (Xie et al. 2024, arXiv 2311.12198) and its JSON configurations."""
 
 from .configuration import decode_param_json, set_boundary_conditions
 from .simulator import MPM_Simulator_WARP

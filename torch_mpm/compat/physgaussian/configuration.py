@@ -9,21 +9,21 @@ from typing import Any
 
 from .simulator import MPM_Simulator_WARP
 
-MATERIAL = {"material": "jelly", "grid_lim": 2.0, "n_grid": 50, "nu": 0.4, "E": 1e5, "density": 200.0}
+MATERIAL: dict[str, Any] = {"material": "jelly", "grid_lim": 2.0, "n_grid": 50, "nu": 0.4, "E": 1e5, "density": 200.0}
 MATERIAL_OPTIONS = (
     *("yield_stress", "hardening", "xi", "friction_angle", "plastic_viscosity", "g", "rpic_damping", "pic_damping"),
     *("softening", "opacity_threshold", "grid_v_damping_scale", "additional_material_params"),
 )
-TIME = {"substep_dt": 1e-4, "frame_dt": 1e-2, "frame_num": 100}
-PREPROCESSING = {
+TIME: dict[str, Any] = {"substep_dt": 1e-4, "frame_dt": 1e-2, "frame_num": 100}
+PREPROCESSING: dict[str, Any] = {
     **{"opacity_threshold": 0.02, "rotation_degree": [], "rotation_axis": [], "sim_area": None, "scale": 1.0},
     "particle_filling": None,
 }
-FILLING = {
+FILLING: dict[str, Any] = {
     **{"density_threshold": 5.0, "search_threshold": 3.0, "max_particles_num": 2000000, "max_partciels_per_cell": 1},
     **{"search_exclude_direction": 5, "ray_cast_direction": 4, "boundary": None, "smooth": False, "visualize": False},
 }
-CAMERA = {
+CAMERA: dict[str, Any] = {
     **{"mpm_space_viewpoint_center": [1.0, 1.0, 1.0], "mpm_space_vertical_upward_axis": [0, 0, 1]},
     **{"default_camera_index": 0, "show_hint": False, "init_azimuthm": None, "init_elevation": None},
     **{"init_radius": None, "delta_a": None, "delta_e": None, "delta_r": None, "move_camera": False},

@@ -68,6 +68,7 @@ class Metal(StretchPlasticity):
     """
 
     extra_fields = ("yield_stress",)
+    xi: Any
 
     def __init__(self, E: Any, nu: Any, yield_stress: Any, xi: float = 0.0) -> None:
         super().__init__(E, nu, yield_stress=yield_stress, xi=xi)
@@ -94,6 +95,7 @@ class Foam(StretchPlasticity):
     """
 
     rate_dependent = True
+    plastic_viscosity: Any
 
     def __init__(self, E: Any, nu: Any, yield_stress: Any, plastic_viscosity: float = 0.0) -> None:
         super().__init__(E, nu, yield_stress=yield_stress, plastic_viscosity=plastic_viscosity)
@@ -132,6 +134,8 @@ class Plasticine(StretchPlasticity):
     """
 
     extra_fields = ("yield_stress", "intact")
+    softening: Any
+    xi: Any
 
     def __init__(self, E: Any, nu: Any, yield_stress: Any, softening: float = 0.1, xi: float = 0.0) -> None:
         super().__init__(E, nu, yield_stress=yield_stress, softening=softening, xi=xi)

@@ -14,12 +14,12 @@ from ...boundaries import Obstacle
 from ...errors import check_count, check_like, check_number, shape_of
 from ...grid import Grid
 from ...laws import Material
-from ...ops.svd import polar
 from ...particle_operations import Hold, Operations, Push
 from ...rollouts import rollout
 from ...state import State, identity_deformation
 from ...step import Step
-from ..node_conditions import FreezeOutside, NodeDamping, moving_cuboid, outer_planes, stopping_plane
+from ..node_conditions import FreezeOutside, NodeDamping, moving_cuboid, outer_planes, stopping_plane, surface_margin
+from .exchange import Exchange
 from .materials import law_of
 from .particles import DampedAffine, Rotation, in_box, in_cylinder, release_times
 from .surfaces import Cut
@@ -33,7 +33,7 @@ FOREVER = 999.0
 Numbers = Sequence[float]
 
 
-class MPM_Simulator_WARP:
+class MPM_Simulator_WARP(Exchange):
     """Explicit MPM on the cube [0, grid_lim]³ with forces by the gradient of quadratic B-splines and APIC.
 
     Substeps asked for with `p2g2p` are taken together when something is read or changed, in one op where that is
@@ -193,7 +193,7 @@ class MPM_Simulator_WARP:
         if surface == "sticky" and friction != 0:
             raise ValueError(f"friction must be 0 on sticky surfaces, got {friction}")
         if surface == "cut":
-            self.add_boundary(Cut(point, normal, self._dx, start_time, end_time))
+            self.add_boundary(Cut(point, normal, self._margin, start_time, end_time))
             return
         if surface != "sticky":
             warnings.warn(
@@ -201,7 +201,7 @@ class MPM_Simulator_WARP:
                 "one that slips or separates call add_boundary(torch_mpm.Plane(point, normal, kind, friction))",
                 stacklevel=2,
             )
-        self.add_boundary(stopping_plane(point, normal, self._dx, start_time, end_time))
+        self.add_boundary(stopping_plane(point, normal, self._margin, start_time, end_time))
 
     def set_velocity_on_cuboid(
         self,
@@ -216,14 +216,14 @@ class MPM_Simulator_WARP:
 
         With `reset` 1 all nodes of the grid are at rest before `start_time`, and for 15 steps after `end_time`.
         """
-        self.add_boundary(moving_cuboid(point, size, velocity, self._dx, start_time, end_time))
+        self.add_boundary(moving_cuboid(point, size, velocity, self._margin, start_time, end_time))
         if reset == 1:
             self.add_boundary(FreezeOutside(start_time, end_time, RESET_STEPS))
 
     def add_bounding_box(self, start_time: float = 0.0, end_time: float = FOREVER) -> None:
         """Let nothing out of the domain: no node within 3 of a face moves outwards."""
         n, dx = self.parameters["n_grid"], self._dx
-        for plane in outer_planes((PADDING - 1) * dx, (n - PADDING) * dx, 3, dx, start_time, end_time):
+        for plane in outer_planes((PADDING - 1) * dx, (n - PADDING) * dx, 3, start_time, end_time):
             self.add_boundary(plane)
 
     def add_boundary(self, boundary: Any) -> None:
@@ -331,15 +331,6 @@ class MPM_Simulator_WARP:
             step = self._ready_step(first, first + (steps - 1) * dt, dt)
             self._state = rollout(step, self._loaded(), steps, dt)
 
-    def _flushed(self) -> State:
-        self._flush()
-        return self._loaded()
-
-    def _loaded(self) -> State:
-        if self._state is None:
-            raise ValueError("there are no particles: call load_initial_data_from_torch first")
-        return self._state
-
     @property
     def step(self) -> Step:
         """The step of torch_mpm that the substeps take; `simulator.step.check()` tells what went wrong."""
@@ -371,77 +362,12 @@ class MPM_Simulator_WARP:
         )
 
     @property
-    def _dx(self) -> float:
-        return float(self.parameters["grid_lim"]) / int(self.parameters["n_grid"])
-
-    # ---- exchange with torch
+    def _margin(self) -> float:
+        return surface_margin(self._loaded().x.dtype, float(self.parameters["grid_lim"]))
 
     @property
-    def state(self) -> State:
-        """The particles as torch_mpm has them; may be assigned."""
-        return self._flushed()
-
-    @state.setter
-    def state(self, state: State) -> None:
-        self._flush()
-        self._state = state
-
-    def _import(self, name: str, value: Tensor | None, rows: tuple[int, ...]) -> None:
-        if value is None:
-            return
-        state = self._flushed()
-        self._state = state.replace(**{name: value.to(state.x).reshape(len(state), *rows)})
-
-    def import_particle_x_from_torch(self, tensor_x: Tensor | None, clone: bool = True, device: Any = None) -> None:
-        """Positions [P, 3] [m]. Gradients pass; nothing is written to a tensor that was given."""
-        self._import("x", tensor_x, (3,))
-
-    def import_particle_v_from_torch(self, tensor_v: Tensor | None, clone: bool = True, device: Any = None) -> None:
-        """Velocities [P, 3] [m/s]."""
-        self._import("v", tensor_v, (3,))
-
-    def import_particle_F_from_torch(self, tensor_F: Tensor | None, clone: bool = True, device: Any = None) -> None:
-        """Deformation gradients, [P, 3, 3] or rows of nine."""
-        self._import("F", tensor_F, (3, 3))
-
-    def import_particle_C_from_torch(self, tensor_C: Tensor | None, clone: bool = True, device: Any = None) -> None:
-        """Affine velocity fields [1/s], [P, 3, 3] or rows of nine."""
-        self._import("C", tensor_C, (3, 3))
-
-    def export_particle_x_to_torch(self) -> Tensor:
-        """Positions [P, 3] [m]."""
-        return self._flushed().x
-
-    def export_particle_v_to_torch(self) -> Tensor:
-        """Velocities [P, 3] [m/s]."""
-        return self._flushed().v
-
-    def export_particle_F_to_torch(self) -> Tensor:
-        """Deformation gradients of the current positions, rows of nine [P, 9]."""
-        return self._rows(self._flushed().F)
-
-    def export_particle_C_to_torch(self) -> Tensor:
-        """Affine velocity fields, rows of nine [P, 9] [1/s]."""
-        return self._rows(self._flushed().C)
-
-    def export_particle_R_to_torch(self, device: Any = None) -> Tensor:
-        """The transposed rotations Rᵀ of the polar decomposition F = R S, rows of nine [P, 9]."""
-        state = self._flushed()
-        assert state.F is not None
-        return self._rows(polar(state.F).R.mT)
-
-    def export_particle_cov_to_torch(self, device: Any = None) -> Tensor:
-        """Covariances F Σ Fᵀ of the Gaussians, six numbers xx xy xz yy yz zz per particle in one row [6 P]."""
-        state = self._flushed()
-        assert state.F is not None
-        given = torch.zeros_like(state.x).repeat(1, 2) if self._covariance is None else self._covariance
-        full = given[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].unflatten(1, (3, 3))
-        moved = state.F @ full @ state.F.mT
-        return moved.flatten(1)[:, [0, 1, 2, 4, 5, 8]].reshape(-1)
-
-    def _rows(self, matrices: Tensor | None) -> Tensor:
-        assert matrices is not None
-        return matrices.reshape(-1, 9)
+    def _dx(self) -> float:
+        return float(self.parameters["grid_lim"]) / int(self.parameters["n_grid"])
 
 
 def _acts(boundary: Any, first: float, last: float, dt: float) -> bool:

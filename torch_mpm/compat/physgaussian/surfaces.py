@@ -17,9 +17,11 @@ KEPT = 0.3
 class Cut(nn.Module):
     """Stops the nodes behind a plane, but for those between two heights z, which keep 0.3 of v_x and v_z."""
 
-    def __init__(self, point: Sequence[float], normal: Sequence[float], dx: float, start: float, end: float) -> None:
+    def __init__(
+        self, point: Sequence[float], normal: Sequence[float], margin: float, start: float, end: float
+    ) -> None:
         super().__init__()
-        self.plane = stopping_plane(point, normal, dx, start, end)
+        self.plane = stopping_plane(point, normal, margin, start, end)
 
     def forward(self, velocity: Tensor, positions: Tensor, scene: Tensor | None, time: float, dt: float) -> Tensor:
         behind = (self.plane.signed_distance(positions, scene, time) < 0)[:, None]
