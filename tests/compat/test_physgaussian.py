@@ -124,7 +124,7 @@ def bounding_box(sim, v, dt):
         v[(index[:, k] >= N - 3) & (v[:, k] > 0), k] = 0
 
 
-def blob(count=6, low=0.35, high=0.6, seed=0):
+def blob(count=4, low=0.35, high=0.6, seed=0):
     """Jittered particles in a cube, positions [P, 3] and volumes [P]."""
     rng = np.random.default_rng(seed)
     axis = np.linspace(low, high, count)

@@ -20,14 +20,14 @@ def surface_margin(dtype: torch.dtype, extent: float) -> float:
 
 
 def stopping_plane(
-    point: Sequence[float], normal: Sequence[float], margin: float, start: float, end: float
-) -> Obstacle:
-    """Stops nodes behind a plane; those within a margin [m] behind it are not."""
+    point: Sequence[float], normal: Sequence[float], margin: float, start: float, end: float, kind: str = "sticky"
+) -> Plane:
+    """Acts on the nodes behind a plane, but for those within a margin [m] behind it."""
     size = math.sqrt(sum(n * n for n in normal))
     if not 0 < size < math.inf:
         raise ValueError(f"normal must have a positive length, got {list(normal)}")
     position = [float(p) - margin * n / size for p, n in zip(point, normal, strict=True)]
-    return Plane(position, [n / size for n in normal], "sticky", start=start, end=end)
+    return Plane(position, [n / size for n in normal], kind, start=start, end=end)
 
 
 def moving_cuboid(

@@ -1,4 +1,4 @@
-"""What PhysGaussian's simulator does to particles, and which ones it selects."""
+"""What only PhysGaussian's simulator does to particles."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from torch import Tensor
 
 from ...particle_operations import Timed
 from ...state import State
+from ..selections import in_box
 
 LAYERS = 50
 """Of a sequential release."""
@@ -29,69 +30,6 @@ class DampedAffine(Timed):
         return state.replace(C=state.C - self.share / 2 * (state.C + state.C.mT))
 
 
-class Rotation(Timed):
-    """Turns particles about an axis n through a point and moves them along it: v = ω (x − p) × n + s n.
-
-    Args:
-        point, normal: of the axis.
-        rotation: ω [rad/s], about −n.
-        translation: s [m/s]
-        start, end, particles: see `Timed`.
-    """
-
-    def __init__(
-        self,
-        point: Sequence[float],
-        normal: Sequence[float],
-        rotation: float,
-        translation: float,
-        start: float,
-        end: float,
-        particles: Tensor,
-    ) -> None:
-        super().__init__(start, end, particles)
-        self.point, self.axis = (_vector(v, particles.device) for v in (point, unit_vector(normal)))
-        self.rotation, self.translation = rotation, translation
-
-    def forward(self, state: State, dt: float | Tensor) -> State:
-        acting = self.acting(state)
-        if acting is False:
-            return state
-        point, axis = self.point.to(state.x.dtype), self.axis.to(state.x.dtype)
-        v = self.rotation * torch.linalg.cross(state.x - point, axis.expand_as(state.x)) + self.translation * axis
-        return state.replace(v=torch.where(acting[:, None], v, state.v))  # type: ignore[index]
-
-
-def unit_vector(v: Sequence[float]) -> list[float]:
-    """A vector of length one.
-
-    Raises:
-        ValueError: for the zero vector.
-    """
-    length = math.sqrt(sum(float(a) ** 2 for a in v))
-    if not 0 < length < math.inf:
-        raise ValueError(f"normal must have a positive length, got {list(v)}")
-    return [float(a) / length for a in v]
-
-
-def in_box(x: Tensor, point: Sequence[float], size: Sequence[float]) -> Tensor:
-    """Which positions are in a box of half edges `size` about a point, bool [P]."""
-    centre, half = _vector(point, x.device).to(x.dtype), _vector(size, x.device).to(x.dtype)
-    return ((x.detach() - centre).abs() < half).all(1)
-
-
-def in_cylinder(
-    x: Tensor, point: Sequence[float], normal: Sequence[float], half_height_and_radius: Sequence[float]
-) -> Tensor:
-    """Which positions are in a cylinder, bool [P]."""
-    offset = x.detach() - _vector(point, x.device).to(x.dtype)
-    axis = _vector(unit_vector(normal), x.device).to(x.dtype)
-    height = (offset * axis).sum(1)
-    radius = (offset - height[:, None] * axis).norm(dim=1)
-    half_height, largest = half_height_and_radius
-    return (height.abs() < half_height) & (radius < largest)
-
-
 def release_times(x: Tensor, normal: Sequence[float], start: float, end: float, end_time: float) -> Tensor:
     """When each particle is let go [P] [s]; at once where it is in no layer.
 
@@ -107,7 +45,3 @@ def release_times(x: Tensor, normal: Sequence[float], start: float, end: float, 
         size[axis] = abs(start - end) / LAYERS * (LAYERS - k)
         times = torch.where(in_box(x, point, size), end_time / LAYERS * (k + 1), times)
     return times
-
-
-def _vector(v: Sequence[float], device: torch.device) -> Tensor:
-    return torch.tensor([float(a) for a in v], dtype=torch.float64, device=device)

@@ -19,9 +19,10 @@ from ...rollouts import rollout
 from ...state import State, identity_deformation
 from ...step import Step
 from ..node_conditions import FreezeOutside, NodeDamping, moving_cuboid, outer_planes, stopping_plane, surface_margin
+from ..selections import Rotation, in_box, in_cylinder
 from .exchange import Exchange
 from .materials import law_of
-from .particles import DampedAffine, Rotation, in_box, in_cylinder, release_times
+from .particles import DampedAffine, release_times
 from .surfaces import Cut
 
 PADDING = 3
