@@ -248,7 +248,7 @@ def test_bad_input_is_named():
         set_boundary_conditions(solver, [{"type": "wind"}])
     with pytest.raises(TypeError, match="surface must be 'sticky', 'slip' or 'collide', got 'cut'"):
         set_boundary_conditions(solver, [FLOOR | {"surface": "cut"}])
-    with pytest.raises(ValueError, match="constitutive_name must be one of .*, got 'Jelly'"):
+    with pytest.raises(ValueError, match=r"constitutive_name must be one of .*, got 'Jelly'"):
         get_constitutive("Jelly")
     C = torch.zeros(4, 3, 3)
     with pytest.raises(ValueError, match=r"stress must have shape \[P, 3, 3\]"):
