@@ -212,7 +212,7 @@ def test_operations_on_particles_and_nodes(device):
         elif sim.time < 0.018 + 15 * DT:
             v[inside] = 0
 
-    error, _ = run(conditions, before=[project, push, slide], on_nodes=[cuboid], device=device)
+    error, _ = run(conditions, before=[push, slide, project], on_nodes=[cuboid], device=device)
     assert error < 1e-6
 
 

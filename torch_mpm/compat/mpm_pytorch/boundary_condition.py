@@ -9,7 +9,8 @@ import torch
 from torch import Tensor, nn
 
 from ...boundaries import Plane
-from ...particle_operations import Hold, Push
+from ...particle_operations import Hold, Push, Timed
+from ...state import State
 from ..node_conditions import stopping_plane, surface_margin
 from ..selections import Rotation, in_box, in_cylinder
 from .mpm_solver import MPMSolver
@@ -85,14 +86,7 @@ def add_sdf_collider(
     if dim not in (0, 1, 2):
         raise ValueError(f"dim must be 0, 1 or 2, got {dim}")
 
-    def project(x: Tensor, v: Tensor, time: float, dt: float) -> tuple[Tensor, Tensor]:
-        if not start_time <= time < end_time:
-            return x, v
-        axis = torch.arange(3, device=x.device) == dim
-        shift = torch.where(axis, x.clamp(bound, 1 - bound) - x, 0)
-        return x + shift, v + shift / dt
-
-    model.projections.append(project)
+    model.pre_particle_process.append(Projection(model, bound, dim, start_time, end_time))
 
 
 def add_impulse_on_particles(
@@ -143,6 +137,24 @@ CONDITIONS: dict[str, Callable[..., None]] = {
     "sdf_collider": add_sdf_collider,
     "surface_collider": add_surface_collider,
 }
+
+
+class Projection(Timed):
+    """What `add_sdf_collider` does; the solver moves particles by its `displacement` at the end of the step."""
+
+    def __init__(self, solver: MPMSolver, bound: float, dim: int, start: float, end: float) -> None:
+        super().__init__(start, end)
+        self.solver, self.bound, self.dim = solver, bound, dim
+
+    def forward(self, state: State, dt: float | Tensor) -> State:
+        if not self.acting(state):
+            return state
+        before = self.solver.displacement
+        x = state.x if before is None else state.x + before
+        axis = torch.arange(3, device=x.device) == self.dim
+        shift = torch.where(axis, x.clamp(self.bound, 1 - self.bound) - x, 0)
+        self.solver.displacement = shift if before is None else before + shift
+        return state.replace(v=state.v + shift / dt)
 
 
 class NodeVelocity(nn.Module):

@@ -75,7 +75,7 @@ class MPMSolver:
         self.time = 0.0
         self.pre_particle_process: list[Any] = []
         self.post_grid_process: list[Any] = []
-        self.projections: list[Any] = []
+        self.displacement: Tensor | None = None
         self.step = Step(
             Grid(self.dx, (0.0,) * 3, (1.0,) * 3), GivenStress(), gravity=tuple(gravity), stress_form="gradient"
         )
@@ -109,16 +109,15 @@ class MPMSolver:
         """
         check_like("x", x, x, (self.n_particles, 3), "[P, 3]")
         self._set_boundaries()
-        moved, projected = x, v
-        for projection in self.projections:
-            moved, projected = projection(moved, projected, self.time, self.dt)
+        self.displacement = None
         volume = self._volume.to(x)
         mass = volume * (self.p_mass / self.vol)
-        # Weights are those of the positions before the projection, as in MPM-PyTorch.
-        state = stepped(self.step, x, projected, C, F, stress, mass, volume, self.time, self.dt)
+        state = stepped(self.step, x, v, C, F, stress, mass, volume, self.time, self.dt)
         self.time += self.dt
         assert state.C is not None and state.F is not None
-        after = clamped(state.x + (moved - x), self.clip_bound, 1 - self.clip_bound)
+        # Weights are those of the positions before they are displaced, as in MPM-PyTorch.
+        after = state.x if self.displacement is None else state.x + self.displacement
+        after = clamped(after, self.clip_bound, 1 - self.clip_bound)
         return after, state.v, state.C, clamped(state.F, -LARGEST_ENTRY, LARGEST_ENTRY)
 
     def _set_boundaries(self) -> None:
