@@ -99,6 +99,26 @@ def test_absent_particles_are_as_if_they_were_not_there(device, dim):
     assert torch.equal(after.mass, start.mass)
 
 
+def test_absent_particles_take_no_part_in_heat_either(device):
+    """Temperatures and gradients are those of a state without them, to the tolerance of the heat solve."""
+    start = block_state(2, device)
+    start = make_step(2).prepare(start.replace(temperature=100 * start.x[:, 0]))
+    late = torch.arange(len(start), device=device) % 4 == 0
+    k = torch.tensor(50.0, dtype=torch.float64, device=device, requires_grad=True)
+    results = []
+    for here in (True, False):
+        step = make_step(2, on_particles=Present(1.0, particles=late) if here else None)
+        step.heat = mpm.Heat(step.grid, conductivity=k, specific_heat=1.0, tolerance=1e-12)
+        state = step.prepare(start)  # with the same temperature gradients
+        end = mpm.rollout(step, state if here else state.select((~late).nonzero().squeeze(1)), 3, DT)
+        theta = end.temperature[~late] if here else end.temperature
+        if here:
+            assert torch.equal(end.temperature[late], start.temperature[late])
+        results.append((theta.detach(), torch.autograd.grad(theta.square().sum(), k)[0]))
+    torch.testing.assert_close(results[0], results[1], rtol=1e-8, atol=1e-8)
+    assert float((results[0][0] - start.temperature[~late]).abs().max()) > 0.1
+
+
 def test_gradients_pass_and_absent_particles_have_none(device):
     start = block_state(2, device)
     late = torch.arange(len(start), device=device) < 5

@@ -353,6 +353,39 @@ def test_configuration_runs_as_it_stands(tmp_path, device):
     assert np.abs(run(sim, own) - own.x).max() < 1e-5
 
 
+def test_a_cut_and_reset_before_the_start(device):
+    """The surface "cut" lets part of the nodes move; a cuboid with reset holds all nodes before it starts."""
+    sim, own = pair({"E": 1e5, "nu": 0.3, "density": 500.0, "g": [20.0, 9.0, -60.0]}, shear, device)
+    sim.add_surface_collider((0.45, 0.5, 0.5), (-1.0, 0.0, 0.0), "cut")
+    sim.set_velocity_on_cuboid((0.1, 0.1, 0.1), (0.04, 0.04, 0.04), (0.0, 0.0, 0.0), 0.004, 0.014, reset=1)
+    sim.finalize_mu_lam()
+
+    def cut(sim, v, dt):
+        behind = 0.45 - sim.nodes[:, 0] < -1e-9
+        between = (sim.nodes[:, 2] >= 0.4 - 1e-9) & (sim.nodes[:, 2] <= 0.53)
+        v[behind & between] *= [0.3, 0, 0.3]
+        v[behind & ~between] = 0
+
+    def hold(sim, v, dt):
+        if not 0.004 <= sim.time < 0.014 and sim.time < 0.014 + 15 * dt:
+            v[:] = 0
+
+    own.on_nodes += [cut, hold]
+    assert np.abs(run(sim, own) - own.x).max() < 1e-8
+    assert np.abs(own.x - blob()[0]).max() > 1e-3
+
+
+def test_a_sampling_file_is_loaded(tmp_path):
+    h5py = pytest.importorskip("h5py")
+    x, volume = blob()
+    with h5py.File(tmp_path / "points.h5", "w") as file:
+        file["x"], file["particle_volume"] = x.T, volume[None]
+    sim = MPM_Simulator_WARP(10)
+    sim.load_from_sampling(str(tmp_path / "points.h5"), n_grid=N)
+    np.testing.assert_allclose(sim.export_particle_x_to_torch().numpy(), x, rtol=1e-6)
+    assert sim.state.volume.numpy() == pytest.approx(volume) and sim.parameters["n_grid"] == N
+
+
 def test_substeps_are_taken_together(device):
     """They take one op, whatever is asked for in between is right, and a change acts from its time on."""
     sim, _ = pair({"E": 1e5, "nu": 0.3, "density": 500.0}, shear, device)

@@ -57,6 +57,8 @@ def outer_planes(lower: float, upper: float, dim: int, start: float, end: float)
 class NodeDamping(nn.Module):
     """Multiplies the velocity of all nodes in every step."""
 
+    reads_time = False
+
     def __init__(self, scale: float) -> None:
         super().__init__()
         self.scale = float(scale)
@@ -77,5 +79,7 @@ class FreezeOutside(nn.Module):
         return first < self.start or (last >= self.end and first < self.end + self.steps * dt)
 
     def forward(self, velocity: Tensor, positions: Tensor, scene: Tensor | None, time: float, dt: float) -> Tensor:
-        stopped = time < self.start or self.end <= time < self.end + self.steps * dt
+        stopped = (time < self.start) | ((time >= self.end) & (time < self.end + self.steps * dt))
+        if isinstance(stopped, Tensor):  # of a step in a graph
+            return torch.where(stopped, 0, velocity)
         return torch.zeros_like(velocity) if stopped else velocity
