@@ -27,5 +27,6 @@ class Cut(nn.Module):
         behind = (self.plane.signed_distance(positions, scene, time) < 0)[:, None]
         height = positions[:, 2:3]
         between = (height >= LOW) & (height <= HIGH)
-        kept = KEPT * velocity * velocity.new_tensor([1.0, 0.0, 1.0])
+        x, y, z = (KEPT * velocity).unbind(1)
+        kept = torch.stack([x, torch.zeros_like(y), z], 1)
         return torch.where(behind, torch.where(between, kept, 0), velocity)
