@@ -33,7 +33,7 @@ def test_cube(name):
 
 
 def test_learned_law():
-    first, last = example("learned_law").main(epochs=3, steps=15)
+    first, last = example("learned_law").main(epochs=2, steps=15)
     assert last < 0.9 * first
 
 
