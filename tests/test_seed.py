@@ -160,7 +160,7 @@ def test_points_files_that_are_wrong(tmp_path):
         (lambda: seed.box((0, 0), (1, 1), 0.1, per_cell=0), "per_cell must be positive, got 0"),
         (
             lambda: seed.box((0, 0), (1, 1), 0.1, method="random"),
-            'method must be "lattice" or "poisson", got \'random\'',
+            'method must be "lattice", "jittered" or "poisson", got \'random\'',
         ),
         (lambda: seed.sphere((0, 0), math.inf, 0.1), "radius must be positive, got inf"),
         (lambda: seed.sphere((0, math.nan), 1, 0.1), "center must be finite"),
@@ -199,3 +199,25 @@ def test_more_points_than_memory_holds_are_refused_at_once(shape, method):
         seed.fill(shape, 0.1, method=method)
     with pytest.raises(ValueError, match=r"points at a spacing of .*; make the shape smaller, dx larger"):
         seed.fill(seed.Box([0.0] * 2, [1.0] * 2), 0.1, 1e9, method=method)
+
+
+def test_jittered_points_stay_in_their_cells_and_depend_on_the_seed():
+    box = seed.Box((0.0, 0.0), (1.0, 2.0))
+    lattice = seed.fill(box, 0.1, 4, dtype=torch.float64)
+    a, b = (seed.fill(box, 0.1, 4, method="jittered", seed=k, dtype=torch.float64) for k in (1, 2))
+    offsets = (a.x - lattice.x) / 0.05
+    assert offsets.abs().max() <= 0.5 and not torch.equal(a.x, b.x)
+    assert torch.equal(a.x, seed.fill(box, 0.1, 4, method="jittered", seed=1, dtype=torch.float64).x)
+    # uniform in [-1/2, 1/2]: mean 0 and variance 1/12, with the errors of 2 x 800 numbers
+    assert abs(offsets.mean()) < 4 * (1 / 12 / 1600) ** 0.5 and abs(offsets.var() * 12 - 1) < 0.15
+
+
+@pytest.mark.parametrize("method", ["lattice", "jittered", "poisson"])
+@pytest.mark.parametrize("shape", [seed.Sphere((0.0, 0.0, 0.0), 1.0), seed.Box((0.0, 0.0), (1.0, 0.3))])
+def test_an_exact_number_of_points(method, shape):
+    for count in (1, 7, 200):
+        points = seed.fill(shape, 0.1, count=count, method=method, seed=3, dtype=torch.float64)
+        assert len(points) == count and bool(shape.inside(points.x).all())
+        assert abs(float(points.volume.sum()) / shape.volume - 1) < 1e-12
+    with pytest.raises(ValueError, match="count must be at least 1"):
+        seed.fill(shape, 0.1, count=0)

@@ -1,4 +1,4 @@
-"""The command line: ``torch-mpm run SCENE -o DIR``, check, info, schema, render, export."""
+"""The command line: ``torch-mpm run SCENE -o DIR``, check, info, schema, render, export, and those of data sets."""
 
 from __future__ import annotations
 
@@ -10,6 +10,10 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+from .data import commands as data_sets
+from .data import reading_commands as reading
+from .data.commands import set_argument
+
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit status: 0, 1 for a problem (described on stderr), 130 when interrupted."""
@@ -18,7 +22,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         options.command(options)
     except KeyboardInterrupt:
         return _told("interrupted", 130)
-    except (ValueError, OSError, ImportError, RuntimeError, MemoryError) as error:
+    except (ValueError, OSError, ImportError, RuntimeError, MemoryError, KeyError) as error:
         message = _message(error)
         if message is None:
             raise
@@ -26,7 +30,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
-TOLD = ("SceneError", "OutputError", "DamagedFileError", "SimulationError", "Interrupted", "RenderError")
+TOLD = (
+    "SceneError", "OutputError", "DamagedFileError", "SimulationError", "Interrupted", "RenderError", "WorkerError",
+    "IncompleteError", "VerifyError", "DatasetError", "MissingError",
+)  # fmt: skip
 
 
 def _message(error: Exception) -> str | None:
@@ -68,27 +75,25 @@ def _parser() -> argparse.ArgumentParser:
     schema = commands.add_parser("schema", help="print the JSON schema of scene files, for editors")
     schema.set_defaults(command=_schema)
 
-    render = commands.add_parser("render", help="redraw the pictures and the video of a run")
-    render.add_argument("run", type=Path, help="folder of a run")
-    _set_argument(render, "render.color_by=stress")
+    render = commands.add_parser("render", help="redraw the pictures and the video of a run; draw scenes of a data set")
+    render.add_argument("run", type=Path, help="folder of a run or of a data set")
+    set_argument(render, "render.color_by=stress")
+    reading.add_render_options(render)
     render.set_defaults(command=_render)
 
-    export = commands.add_parser("export", help="convert a run for other programs")
-    export.add_argument("run", type=Path, help="folder of a run")
-    export.add_argument("--vtk", action="store_true", help="VTK files for ParaView, in DIR/vtk")
-    export.add_argument("--ply", action="store_true", help="PLY point clouds, in DIR/ply")
+    export = commands.add_parser("export", help="convert a run or a data set for other programs")
+    export.add_argument("run", type=Path, help="folder of a run or of a data set")
+    reading.add_export_options(export)
     export.set_defaults(command=_export)
+
+    reading.add(commands)
+    data_sets.add(commands)
     return parser
 
 
 def _scene_arguments(parser: argparse.ArgumentParser, optional: bool = False) -> None:
     parser.add_argument("scene", type=Path, help="scene file (TOML)", nargs="?" if optional else None)
-    _set_argument(parser, "grid.dx=0.01")
-
-
-def _set_argument(parser: argparse.ArgumentParser, example: str) -> None:
-    text = f"override a key of the scene, such as {example}"
-    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="overrides", help=text)
+    set_argument(parser, "grid.dx=0.01")
 
 
 # ---- commands
@@ -203,6 +208,9 @@ def _schema(options: argparse.Namespace) -> None:
 
 
 def _render(options: argparse.Namespace) -> None:
+    if reading.is_dataset(options.run):
+        reading.render(options)
+        return
     from .scene.folder import load_run
 
     for path in _draw(options.run, load_run(options.run, options.overrides), quiet=False).values():
@@ -210,12 +218,10 @@ def _render(options: argparse.Namespace) -> None:
 
 
 def _export(options: argparse.Namespace) -> None:
-    from .data import export
-
-    if options.vtk or not options.ply:
-        print(export.export_vtk(options.run))
-    if options.ply:
-        print(export.export_ply(options.run))
+    if reading.is_dataset(options.run):
+        reading.export(options)
+    else:
+        reading.export_run(options)
 
 
 # ---- telling

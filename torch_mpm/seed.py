@@ -3,11 +3,13 @@
 Every function takes ``grid`` (a :class:`torch_mpm.Grid` or a node distance dx [m]) and ``per_cell``, the mean number of
 particles in a grid cell, and returns :class:`Points`. ``method="lattice"`` places points on a regular lattice of
 spacing ``dx / per_cell**(1/D)``, stretched to fit the bounding box of the shape; ``method="poisson"`` draws a
-Poisson-disk sample of the same mean density, which has no preferred direction. Both depend on their arguments alone.
+Poisson-disk sample of the same mean density, without a preferred direction; ``method="jittered"`` moves each point of
+the lattice at random within its cell, which is faster. All depend on their arguments alone.
 """
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import itertools
 import math
@@ -21,7 +23,16 @@ import torch
 from torch import Tensor
 
 from . import memory, shapes
-from .errors import check_device, check_dtype, check_file, check_number, check_vector, default_dtype, shape_of
+from .errors import (
+    check_count,
+    check_device,
+    check_dtype,
+    check_file,
+    check_number,
+    check_vector,
+    default_dtype,
+    shape_of,
+)
 from .shapes import Shape
 
 Vector = Sequence[float] | Tensor
@@ -146,6 +157,7 @@ def fill(
     *,
     method: str = "lattice",
     seed: int = 0,
+    count: int | None = None,
     dtype: torch.dtype | None = None,
     device: torch.device | str | None = None,
 ) -> Points:
@@ -155,12 +167,15 @@ def fill(
         shape: region to fill; any object with ``lower`` [D], ``upper`` [D], ``volume`` and ``inside(x)`` as `Region`.
         grid: a grid or its node spacing dx [m].
         per_cell: mean number of particles in a cell of volume dx^D.
-        method: "lattice" or "poisson".
-        seed: seed of the Poisson-disk sample.
+        method: "lattice", "jittered" or "poisson".
+        seed: seed of what is random.
+        count: exact number of points, instead of per_cell: the spacing is the widest tried that gives so many, and of
+            what is too much a random choice is left out.
         dtype, device: of the result; by default torch's (float32 where that is a half).
 
     Raises:
         ValueError: for an unknown method, a shape too small to hold a point, or more points than memory holds.
+        TypeError: for a shape without a property of a `Region`, or a count that is no whole number.
     """
     if missing := [name for name in ("lower", "upper", "volume", "inside") if not hasattr(shape, name)]:
         raise TypeError(f"shape must be a shape of torch_mpm.seed, got {shape_of(shape)} without {missing[0]}")
@@ -168,26 +183,58 @@ def fill(
     check_device(device)
     dtype, device = dtype or default_dtype(), torch.get_default_device() if device is None else device
     with HOST:
-        x = _points_in(shape, grid, per_cell, method, seed)
+        if count is None:
+            x = _points_in(shape, _spacing(grid, per_cell, len(shape.lower)), method, seed)
+        else:
+            x = _exactly(check_count("count", count, 1), shape, method, seed)
         volume = torch.full((len(x),), shape.volume / len(x), dtype=torch.float64)
     return Points(x.to(device=device, dtype=dtype), volume.to(device=device, dtype=dtype))
 
 
-def _points_in(shape: Region, grid: Any, per_cell: float, method: str, seed: int) -> Tensor:
-    """[P, D], float64, on the CPU."""
+def _spacing(grid: Any, per_cell: float, dim: int) -> float:
+    """Distance of points [m]."""
     dx = _positive("the grid's dx", getattr(grid, "dx", grid))
-    dim = len(shape.lower)
-    spacing = dx / _positive("per_cell", per_cell) ** (1 / dim)
+    return float(dx / _positive("per_cell", per_cell) ** (1 / dim))
+
+
+CLOSER, ATTEMPTS = 0.98, 100
+"""Factor on the spacing until there are as many points as were asked for, and how often it is tried."""
+
+
+def _exactly(count: int, shape: Region, method: str, seed: int) -> Tensor:
+    """So many points [count, D], float64, on the CPU."""
+    spacing = (shape.volume / count) ** (1 / len(shape.lower))
+    x = torch.empty(0)
+    for _ in range(ATTEMPTS):
+        with contextlib.suppress(_TooSmall):
+            x = _points_in(shape, spacing, method, seed)
+        if len(x) >= count:
+            break
+        spacing *= CLOSER
+    else:
+        raise ValueError(f"the shape takes {len(x)} points where {count} should fill it; is its volume right?")
+    kept = torch.randperm(len(x), generator=torch.Generator().manual_seed(seed))[:count]
+    return x[kept.sort().values]
+
+
+class _TooSmall(ValueError):
+    """A shape between whose points there is more room than it has."""
+
+
+def _points_in(shape: Region, spacing: float, method: str, seed: int) -> Tensor:
+    """[P, D], float64, on the CPU."""
     _check_size(shape, spacing, method)
     if method == "lattice":
         x = _lattice(shape.lower, shape.upper, spacing)
+    elif method == "jittered":
+        x = _lattice(shape.lower, shape.upper, spacing, torch.Generator().manual_seed(seed))
     elif method == "poisson":
         x = _poisson_disk(shape.lower, shape.upper, spacing, seed)
     else:
-        raise ValueError(f'method must be "lattice" or "poisson", got {method!r}')
+        raise ValueError(f'method must be "lattice", "jittered" or "poisson", got {method!r}')
     x = x[shape.inside(x)]
     if len(x) == 0:
-        raise ValueError(
+        raise _TooSmall(
             f"the shape is too small for its particles: spacing {spacing:g} m; use a finer grid or a larger per_cell"
         )
     return x
@@ -212,14 +259,20 @@ def _check_size(shape: Region, spacing: float, method: str) -> None:
     )
 
 
-def _lattice(lower: Tensor, upper: Tensor, spacing: float) -> Tensor:
-    """Centres of equal cells that tile the box, as near to ``spacing`` as a whole number per axis allows."""
+def _lattice(lower: Tensor, upper: Tensor, spacing: float, jitter: torch.Generator | None = None) -> Tensor:
+    """Centres of equal cells that tile the box, as near to ``spacing`` as a whole number per axis allows.
+
+    With a generator, random points of the cells instead.
+    """
     counts = ((upper - lower) / spacing).round().clamp(min=1)
     axes = [
         lo + (torch.arange(int(n), dtype=torch.float64) + 0.5) * (hi - lo) / n
         for lo, hi, n in zip(lower, upper, counts, strict=True)
     ]
-    return torch.cartesian_prod(*axes)
+    x = torch.cartesian_prod(*axes)
+    if jitter is not None:
+        x = x + (torch.rand(x.shape, generator=jitter, dtype=torch.float64) - 0.5) * (upper - lower) / counts
+    return x
 
 
 def _poisson_disk(lower: Tensor, upper: Tensor, spacing: float, seed: int) -> Tensor:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -27,19 +28,8 @@ def export_vtk(run: str | Path, out: str | Path | None = None) -> Path:
         ImportError: when meshio is missing (extra ``data``).
     """
     folder = _folder(run, out, "vtk")
-    collection = ElementTree.Element("VTKFile", type="Collection", version="0.1")
-    listing = ElementTree.SubElement(collection, "Collection")
     with Trajectory(run) as trajectory:
-        for k, frame in enumerate(trajectory):
-            name = f"frame_{k:05d}.vtu"
-            count = len(frame["position"])
-            data = {key: _three_dimensional(value) for key, value in _per_particle(frame).items()}
-            cells = [("vertex", np.arange(count)[:, None])]
-            _write(folder / name, _mesh(frame["position"], cells, {**data, "id": np.arange(count)}), {})
-            ElementTree.SubElement(listing, "DataSet", timestep=f"{float(frame['time']):.9g}", file=name)
-    index = folder / "run.pvd"
-    ElementTree.ElementTree(collection).write(index, xml_declaration=True)
-    return index
+        return write_vtk(trajectory, folder)
 
 
 def export_ply(run: str | Path, out: str | Path | None = None) -> Path:
@@ -49,11 +39,32 @@ def export_ply(run: str | Path, out: str | Path | None = None) -> Path:
     """
     folder = _folder(run, out, "ply")
     with Trajectory(run) as trajectory:
-        for k, frame in enumerate(trajectory):
-            velocity = _three_dimensional(frame["velocity"])
-            data = {f"v{axis}": velocity[:, i] for i, axis in enumerate("xyz")}
-            data["speed"] = np.linalg.norm(velocity, axis=1).astype(velocity.dtype)
-            _write(folder / f"frame_{k:05d}.ply", _mesh(frame["position"], [], data), {"binary": True})
+        return write_ply(trajectory, folder)
+
+
+def write_vtk(frames: Iterable[dict[str, Array]], folder: Path) -> Path:
+    """Write frames, as :meth:`Trajectory.frame` gives them, into a folder; returns ``run.pvd``."""
+    collection = ElementTree.Element("VTKFile", type="Collection", version="0.1")
+    listing = ElementTree.SubElement(collection, "Collection")
+    for k, frame in enumerate(frames):
+        name = f"frame_{k:05d}.vtu"
+        count = len(frame["position"])
+        data = {key: _three_dimensional(value) for key, value in _per_particle(frame).items()}
+        cells = [("vertex", np.arange(count)[:, None])]
+        _write(folder / name, _mesh(frame["position"], cells, {**data, "id": np.arange(count)}), {})
+        ElementTree.SubElement(listing, "DataSet", timestep=f"{float(frame['time']):.9g}", file=name)
+    index = folder / "run.pvd"
+    ElementTree.ElementTree(collection).write(index, xml_declaration=True)
+    return index
+
+
+def write_ply(frames: Iterable[dict[str, Array]], folder: Path) -> Path:
+    """Write frames, as :meth:`Trajectory.frame` gives them, into a folder, which is returned."""
+    for k, frame in enumerate(frames):
+        velocity = _three_dimensional(frame["velocity"])
+        data = {f"v{axis}": velocity[:, i] for i, axis in enumerate("xyz")}
+        data["speed"] = np.linalg.norm(velocity, axis=1).astype(velocity.dtype)
+        _write(folder / f"frame_{k:05d}.ply", _mesh(frame["position"], [], data), {"binary": True})
     return folder
 
 

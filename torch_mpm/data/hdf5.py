@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+import math
 import os
 import struct
 from collections.abc import Sequence
@@ -24,6 +25,8 @@ MAGIC = b"torch_mpm seal 1"
 FOOTER = struct.Struct("<I32s16s")
 """The end of a seal: length of its JSON text, SHA-256, magic."""
 CHUNK = 1 << 20
+MOST_EXPANSION = 1032
+"""Bytes that one compressed byte can become (zlib's own limit)."""
 
 
 def h5py_module() -> Any:
@@ -185,3 +188,20 @@ def _foreign(h5py: Any, file: Any, size: int) -> str:
     except (OSError, RuntimeError, ValueError, KeyError, TypeError) as error:
         return f"it cannot be read ({error})"
     return ""
+
+
+def storage_problem(h5py: Any, data: Any, size: int) -> str:
+    """Why the numbers of a dataset, plain or chunked, are not all in this file or could fill the memory; "" if not."""
+    properties = data.id.get_create_plist()
+    filters = {properties.get_filter(k)[0] for k in range(properties.get_nfilters())}
+    if properties.get_external_count() or not filters <= {h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_SHUFFLE}:
+        return "which is stored in another way than torch_mpm does"
+    if properties.get_layout() == h5py.h5d.CHUNKED:
+        wanted = math.prod(-(-n // c) for n, c in zip(data.shape, data.chunks, strict=True))
+        stored = data.id.get_storage_size()
+        whole = data.id.get_num_chunks() == wanted and stored <= size
+        return "" if whole and data.nbytes <= MOST_EXPANSION * stored else "which is not whole"
+    if properties.get_layout() != h5py.h5d.CONTIGUOUS:
+        return "which is stored in another way than torch_mpm does"
+    offset = data.id.get_offset()
+    return "which is larger than the file" if data.nbytes and (offset is None or offset + data.nbytes > size) else ""

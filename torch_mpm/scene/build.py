@@ -18,6 +18,7 @@ from ..state import State
 from ..step import Step
 from . import check, heat, schema
 from .explain import SceneError
+from .obstacles import obstacles
 from .places import obstacle, region
 
 GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
@@ -100,12 +101,13 @@ def build(scene: Any, device: torch.device) -> Built:
     if problems:
         raise SceneError(list(dict.fromkeys(problems)))
     words = scene.grid
-    grid = Grid(words.dx, words.lower, words.upper, scenes=len(entries), kernel=words.kernel)
+    grid = Grid(
+        words.dx, words.lower, words.upper, scenes=len(entries), kernel=words.kernel, deterministic=words.deterministic
+    )
     reference = 0.0 if scene.heat is None else scene.heat.reference
     mixture = _Mixture(entries, reference)
     parts, material = [], []
     nozzles: list[Nozzle] = []
-    obstacles: list[tuple[Any, boundaries.Obstacle]] = []
     for index, entry in enumerate(entries):
         for key, body, points, _ in placed[index]:
             density = entry.material[body.material].density
@@ -113,8 +115,8 @@ def build(scene: Any, device: torch.device) -> Built:
             material.append(torch.full((len(points),), mixture.number(index, body.material), dtype=torch.int32))
         for key, emitter in entry.keyed("emitter"):
             nozzles.append(_named(key, _nozzle, scene, entry, emitter, index, mixture, dtype, device))
-        obstacles += [(o, obstacle(o, index if len(entries) > 1 else None)) for o in entry.obstacle]
     walls = None if words.walls is None else boundaries.Walls(words.walls, friction=words.friction)
+    solids = obstacles(entries, words, dtype, device)
     dim = len(words.lower)
     empty = seed.Points(
         torch.empty(0, dim, dtype=dtype), torch.empty(0, dtype=dtype), torch.empty(0, dtype=torch.int32)
@@ -136,12 +138,12 @@ def build(scene: Any, device: torch.device) -> Built:
         mixture.law(dtype, device),
         gravity=_gravity(entries, dtype, device),
         walls=walls,
-        boundaries=[boundary for _, boundary in obstacles],
+        boundaries=[solid.boundary for solid in solids],
         transfer=scene.transfer,
         flip=scene.flip,
         heat=None
         if scene.heat is None
-        else _named("heat", heat.conduction, scene, entries, grid, mixture.words(), obstacles, device),
+        else _named("heat", heat.conduction, scene, entries, grid, mixture.words(), solids, device),
     )
     ids = torch.arange(len(first), device=device)
     state = step.prepare(first.replace(ids=ids))
@@ -304,7 +306,7 @@ def _placed(scene: Any, entry: Any, problems: list[str]) -> Placed:
         if not _is_good(key, problems):
             continue
         try:
-            points, shape = _seeded(scene, body, scene.seed + k)
+            points, shape = _seeded(scene, body, (scene.seed if entry.seed is None else entry.seed) + k)
         except (ValueError, OSError) as error:
             problems.append(f"{key}{check.called(body)}: {error}")
             continue
@@ -330,7 +332,7 @@ def _seeded(scene: Any, body: Any, number: int) -> tuple[seed.Points, seed.Regio
         return points, None
     shape = region(body, scene.folder)
     assert shape is not None
-    options = {"method": body.seeding, "seed": number, "dtype": torch.float64}
+    options = {"method": body.seeding, "seed": number, "count": body.particles, "dtype": torch.float64}
     return seed.fill(shape, scene.grid.dx, body.per_cell, **options), shape
 
 

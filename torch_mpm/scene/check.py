@@ -143,6 +143,8 @@ def _item_problems(key: str, item: Any, scene: Any) -> list[str]:
         if isinstance(item, schema.Obstacle):
             obstacle(item, None).pose(0.0)
             return []
+        if isinstance(item, schema.PointsBody) and item.particles is not None:
+            return [f"{key}.particles: the particles of {item.file} are those of the file; leave it out"]
         shape = region(item, None)
         return [] if shape is None else list(bounds_problems(key, item, shape, scene.grid))
     except (ValueError, TypeError) as error:
@@ -220,7 +222,9 @@ def _size_problems(scene: Any, entries: Sequence[Any]) -> Iterator[str]:
     for entry in entries:
         for key, body in entry.keyed("body"):
             shape = region(body, None)
-            if shape is not None:
+            if body.particles is not None:
+                counts[f"{entry.path}|{key}"] = body.particles
+            elif shape is not None:
                 counts[f"{entry.path}|{key}"] = _filling(shape.volume, len(shape.lower), _spacing(body, scene.grid))
         for key, words in entry.keyed("emitter") if scene.duration is not None else ():
             counts[f"{entry.path}|{key}"] = _poured(words, scene)

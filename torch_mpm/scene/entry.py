@@ -34,6 +34,7 @@ class ResolvedEntry(schema.Entry):
             name=getattr(entry, "name", "") or f"scene {index}",
             path=f"scene[{index}].",
             own=own,
+            seed=getattr(entry, "seed", None),
             own_gravity=bool(entry.gravity),
             gravity=entry.gravity or shared.gravity,
             material=shared.material | entry.material,

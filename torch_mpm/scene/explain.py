@@ -22,13 +22,13 @@ class SceneError(ValueError):
         super().__init__("\n".join(f"{head}{problem}" for problem in self.problems))
 
 
-def explain(error: ValidationError) -> list[str]:
-    """One line per problem of a validation."""
-    return [_line(item) for item in error.errors(include_url=False)]
+def explain(error: ValidationError, root: type[BaseModel] = SceneData) -> list[str]:
+    """One line per problem of a validation against ``root``."""
+    return [_line(item, root) for item in error.errors(include_url=False)]
 
 
-def _line(item: Any) -> str:
-    model, path, annotation, description = _locate(item["loc"])
+def _line(item: Any, root: type[BaseModel]) -> str:
+    model, path, annotation, description = _locate(item["loc"], root)
     kind, given = item["type"], item["input"]
     if kind == "extra_forbidden":
         key = str(item["loc"][-1])
@@ -49,13 +49,13 @@ def _line(item: Any) -> str:
     return f"{path}: {message.removeprefix('input ')}, got {given!r}{takes}"
 
 
-def _locate(loc: Sequence[int | str]) -> tuple[type[BaseModel], str, Any, str]:
+def _locate(loc: Sequence[int | str], root: type[BaseModel]) -> tuple[type[BaseModel], str, Any, str]:
     """Model that holds the key, its path as written in a file, its type and its description.
 
     The location that pydantic reports has the tag of a union as one more entry, which a file does not have.
     """
-    model: type[BaseModel] = SceneData
-    annotation: Any = SceneData
+    model: type[BaseModel] = root
+    annotation: Any = root
     path, description = "", ""
     for entry in loc:
         tagged = _tagged(annotation, entry)

@@ -9,13 +9,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .. import boundaries, laws
+from .. import laws
 from ..grid import Grid
 from ..heat.boundaries import Convection, Fixed, FixedSurface, Flux, FreeSurface, Radiation, Surface
 from ..heat.heat import Heat
 from ..laws.thermal import Melting, ThermalExpansion
 from ..parameters import PerMaterial, Table
 from . import schema
+from .obstacles import Together
 
 THERMAL = tuple(schema.Thermal.model_fields)
 
@@ -83,7 +84,7 @@ def thermal(law: laws.Material, words: Any, reference: float) -> laws.Material:
     return law if words.expansion is None else ThermalExpansion(law, words.expansion)
 
 
-def conduction(scene: Any, entries: Sequence[Any], grid: Grid, laws: Sequence[Any], obstacles: Sequence[Any],
+def conduction(scene: Any, entries: Sequence[Any], grid: Grid, laws: Sequence[Any], obstacles: Sequence[Together],
                device: torch.device) -> Heat:  # fmt: skip
     """The `Heat` of a step.
 
@@ -91,7 +92,7 @@ def conduction(scene: Any, entries: Sequence[Any], grid: Grid, laws: Sequence[An
         scene, entries: the scene and what fills each domain of its batch.
         grid: the lattice.
         laws: the words of a material of each law of the step.
-        obstacles: (words, boundary) of all obstacles.
+        obstacles: those of all scenes.
         device: of the particles.
     """
     words, reference = scene.heat, scene.heat.reference
@@ -120,14 +121,13 @@ def conduction(scene: Any, entries: Sequence[Any], grid: Grid, laws: Sequence[An
     ).to(device)
 
 
-def _terms(
-    scene: Any, entries: Sequence[Any], obstacles: Sequence[tuple[Any, boundaries.Obstacle]], device: torch.device
-) -> Iterator[Any]:
+def _terms(scene: Any, entries: Sequence[Any], obstacles: Sequence[Together], device: torch.device) -> Iterator[Any]:
     reference = scene.heat.reference
-    for words, region in obstacles:
-        if words.temperature is not None:
-            hold = FixedSurface if words.held == "surface" else Fixed
-            yield hold(region, words.temperature - reference)
+    for solid in obstacles:
+        if solid.first.temperature is not None:
+            hold = FixedSurface if solid.first.held == "surface" else Fixed
+            rows = [0.0 if w is None else w.temperature - reference for w in solid.words]
+            yield hold(solid.boundary, rows[0] if len(set(rows)) == 1 else torch.tensor(rows, device=device))
     for exchange in scene.heat.exchange:
         if exchange.coefficient:
             yield Convection(FreeSurface(), exchange.coefficient, exchange.ambient - reference)

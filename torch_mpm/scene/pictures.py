@@ -13,8 +13,8 @@ import numpy as np
 from ..data.trajectory import Array, Trajectory
 from . import check, schema
 from .explain import SceneError
+from .fields import RANKS
 from .places import obstacle
-from .run import FIELD_SHAPES
 from .scene import Scene
 
 FOLDER, VIDEO = "frames", "video.mp4"
@@ -66,7 +66,7 @@ def _problems(scene: Scene, words: schema.Render, trajectory: Trajectory) -> Ite
     dim = trajectory.file["position"].shape[2]
     if scene.dim != dim:
         yield f"grid.lower: the trajectory has {dim} dimensions, got {scene.grid.lower}"
-    if words.color_by in FIELD_SHAPES and words.color_by not in trajectory.fields:
+    if words.color_by in RANKS and words.color_by not in trajectory.fields:
         yield f"render.color_by: the trajectory has no {words.color_by!r}; simulate with it in output.fields"
 
 

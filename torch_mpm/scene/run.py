@@ -22,10 +22,9 @@ from ..data.hdf5 import h5py_module
 from ..data.trajectory import PARTIAL, Layout, Trajectory, TrajectoryWriter
 from ..errors import DamagedFileError, SimulationError
 from ..laws import Mixture
-from ..laws.thermal import LIQUID
 from ..rollouts import rollout
 from ..state import State
-from . import checkpoint, heap
+from . import checkpoint, fields, heap
 from .build import Built
 from .diagnose import SceneFailure, replay, wrong
 from .folder import CHECKPOINT, LAST_GOOD, claim, locked, output_errors, prepare, record_summary
@@ -40,7 +39,6 @@ STEADY = 1.02
 """The limit is, where it has become smaller by no larger factor over a segment."""
 BLOCKS_WANTED, PROBLEM = 0, 6
 """Columns of the status: blocks that were wanted at most; step of the first problem, -1 for none."""
-FIELD_SHAPES = {"F": 2, "C": 2, "stress": 2, "J": 0, "temperature": 0, "liquid": 0}
 
 Progress = Callable[[dict[str, Any]], None]
 
@@ -133,8 +131,8 @@ class Simulation:
         """What the trajectory of this scene holds."""
         dim, dtype = self.scene.dim, str(self.state.x.numpy(force=True).dtype)
         vector = ((dim,), dtype)
-        fields: dict[str, tuple[tuple[int, ...], str]] = {"position": vector, "velocity": vector}
-        fields |= {name: ((dim,) * FIELD_SHAPES[name], dtype) for name in self.scene.trajectory_fields}
+        columns: dict[str, tuple[tuple[int, ...], str]] = {"position": vector, "velocity": vector}
+        columns |= {name: ((dim,) * fields.RANKS[name], dtype) for name in self.scene.trajectory_fields}
         number = ((), "f8")
         scalars = dict.fromkeys(("time", "kinetic_energy", "elastic_energy", "potential_energy", "cfl"), number)
         counts = dict.fromkeys(("particles", "substeps"), ((), "i8"))
@@ -146,7 +144,7 @@ class Simulation:
         return Layout(
             frames=self.scene.frames + 1,
             particles=self.built.particles,
-            fields=fields,
+            fields=columns,
             scalars={**scalars, **counts, "momentum": ((dim,), "f8")},
             statics={name: value.numpy() for name, value in self.built.statics().items()},
             names=names,
@@ -262,22 +260,12 @@ class Simulation:
         state = self.step.prepare(self.state)
         assert state.ids is not None
         order = torch.argsort(state.ids)
-        fields = {"position": state.x, "velocity": state.v}
-        for name in self.scene.trajectory_fields:
-            value = self._field(state, name)
+        kept = {}
+        for name in ("position", "velocity", *self.scene.trajectory_fields):
+            value = fields.field(self.step, state, name)
             assert value is not None, name  # `build` refuses fields that no material has
-            fields[name] = value
-        return {name: value[order] for name, value in fields.items()}
-
-    def _field(self, state: State, name: str) -> Tensor | None:
-        if name == "stress":
-            return self.step.law.stress(_with_C(state))
-        if name == "liquid":
-            return state.extra.get(LIQUID)
-        if name == "temperature" and state.temperature is not None and self.step.heat is not None:
-            return state.temperature + self.step.heat.reference
-        value: Tensor | None = getattr(state, name)
-        return _with_C(state).C if value is None and name == "C" else value
+            kept[name] = value[order]
+        return kept
 
     # -- time
 
@@ -417,11 +405,6 @@ class Simulation:
             "smallest_dt": self.totals.smallest_dt,
             "particles_lost": self.built.particles - len(self.state),
         }
-
-
-def _with_C(state: State) -> State:
-    """A viscous stress reads C, which is absent before the first step and without APIC."""
-    return state if state.C is not None else state.replace(C=state.x.new_zeros(*state.x.shape, state.x.shape[1]))
 
 
 def joined(state: State, layer: State) -> State:

@@ -62,15 +62,7 @@ class Scene(schema.SceneData):
             FileNotFoundError: when there is no such file.
         """
         path = Path(path)
-        if not path.exists():
-            raise FileNotFoundError(f"scene file {path} does not exist")
-        try:
-            words = tomllib.loads(path.read_text(encoding="utf-8"))
-        except OSError as error:
-            raise SceneError([f"cannot be read: {error.strerror}"], str(path)) from None
-        except (ValueError, RecursionError) as error:
-            raise SceneError([f"not a TOML file: {error}"], str(path)) from None
-        return cls.from_words(words, overrides, path.parent, str(path))
+        return cls.from_words(parsed(path)[1], overrides, path.parent, str(path))
 
     @classmethod
     def from_words(
@@ -85,8 +77,8 @@ class Scene(schema.SceneData):
             source: name of the file that the words are from, for messages.
         """
         try:
-            for override in overrides or []:
-                _override(words, override)
+            for item in overrides or []:
+                override(words, item)
         except SceneError as error:
             raise SceneError(error.problems, source) from None
         try:
@@ -187,19 +179,42 @@ class Scene(schema.SceneData):
         return run(self, out, **options)
 
 
-def _override(words: dict[str, Any], text: str) -> None:
+def parsed(path: Path) -> tuple[str, dict[str, Any]]:
+    """Text and words of a TOML file.
+
+    Raises:
+        SceneError: for what is wrong in the file, with its name.
+        FileNotFoundError: when there is no such file.
+    """
+    if not path.exists():
+        raise FileNotFoundError(f"scene file {path} does not exist")
+    try:
+        text = path.read_text(encoding="utf-8")
+        return text, tomllib.loads(text)
+    except OSError as error:
+        raise SceneError([f"cannot be read: {error.strerror}"], str(path)) from None
+    except (ValueError, RecursionError) as error:
+        raise SceneError([f"not a TOML file: {error}"], str(path)) from None
+
+
+def override(words: dict[str, Any], text: str) -> None:
+    """Set a value of nested dictionaries by ``key=value``, as for `Scene.load`.
+
+    Raises:
+        SceneError: for another text, or a key that is not there.
+    """
     key, equals, value = text.partition("=")
     steps = [s for part in key.strip().split(".") for s in part.replace("]", "").split("[")]
     if not equals or not all(steps):
         raise SceneError([f"override {text!r} must look like grid.dx=0.01"])
     try:
-        parsed = tomllib.loads(f"value = {value}")["value"]
+        given = tomllib.loads(f"value = {value}")["value"]
     except (ValueError, RecursionError):
-        parsed = value.strip()
+        given = value.strip()
     target: Any = words
     try:
         for step in steps[:-1]:
             target = target[int(step)] if isinstance(target, list) else target.setdefault(step, {})
-        target[int(steps[-1]) if isinstance(target, list) else steps[-1]] = parsed
+        target[int(steps[-1]) if isinstance(target, list) else steps[-1]] = given
     except (KeyError, IndexError, ValueError, TypeError):
         raise SceneError([f"override {text!r}: there is no {key.strip()}"]) from None

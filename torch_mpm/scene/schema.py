@@ -48,6 +48,8 @@ class Grid(Model):
     frictionless wall of second order, and needs a domain of a whole or half-integer number of cells"""
     friction: NotNegative = 0.0
     """Coulomb friction coefficient of the walls"""
+    deterministic: bool = False
+    """bit-identical results from run to run on a GPU too, which takes longer; on a CPU they always are"""
 
 
 # ---- materials
@@ -264,8 +266,10 @@ class Body(Seeding):
     """initial velocity [m/s]"""
     spin: Spin | None = None
     """initial angular velocity about the centre of mass [rad/s]: a number in 2-D, a vector in 3-D"""
-    seeding: Literal["lattice", "poisson"] = "lattice"
-    """regular lattice or Poisson-disk sample"""
+    seeding: Literal["lattice", "jittered", "poisson"] = "lattice"
+    """regular lattice, the same with each particle moved at random within its cell, or Poisson-disk sample"""
+    particles: Annotated[int, Field(ge=1)] | None = None
+    """exact number of particles, instead of per_cell"""
 
 
 class BoxBody(Body):
@@ -575,6 +579,8 @@ class Entry(Content):
 
     name: str = ""
     """name of the scene"""
+    seed: Annotated[int, Field(ge=0)] | None = None
+    """seed of its random numbers; by default that of the file"""
 
 
 class SceneData(Content):

@@ -1,0 +1,111 @@
+"""The folder of a data set: finished and valid scenes only, sums of splits, files of each process its own."""
+
+import json
+import pickle
+from multiprocessing import get_context
+
+import numpy as np
+import pytest
+
+pytest.importorskip("h5py")
+
+import small_dataset as datasets
+
+from torch_mpm.data import folder as folders
+from torch_mpm.data.folder import DatasetFolder, DatasetRecord
+from torch_mpm.data.metadata import connectivity_radius, metadata
+from torch_mpm.data.shard import record_path, shard_path
+from torch_mpm.errors import DamagedFileError
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory):
+    return datasets.make_dataset(tmp_path_factory.mktemp("data") / "set")
+
+
+def test_the_record_comes_back(path):
+    assert DatasetRecord.read(path) == datasets.record()
+    assert datasets.record().shards == 3 and datasets.record().split_of(6) == "valid"
+    with pytest.raises(KeyError, match="has no scene 10"):
+        datasets.record().split_of(10)
+
+
+def test_valid_scenes_of_splits(path):
+    data = DatasetFolder(path)
+    ids = {split: [s.id for s in data.scenes(split)] for split in datasets.SPLITS}
+    assert ids == {"train": [0, 1, 2, 4], "valid": [5, 6], "test": [7, 8, 9]}
+    assert [s.id for s in data.attempted("train") if not s.valid] == [3]
+    np.testing.assert_array_equal(data.scene(5)["position"], datasets.arrays(5)["position"])
+    with pytest.raises(KeyError, match="no finished and valid scene 3"):
+        data.scene(3)
+    with pytest.raises(KeyError, match="one of train, valid, test"):
+        data.scenes("dev")
+
+
+def test_an_unfinished_shard_does_not_appear(tmp_path):
+    path = datasets.make_dataset(tmp_path / "set")
+    record_path(shard_path(path, 1)).unlink()
+    assert [s.id for s in DatasetFolder(path).scenes()] == [0, 1, 2, 8, 9]
+
+
+def test_few_files_stay_open(path, monkeypatch):
+    monkeypatch.setattr(folders, "MOST_OPEN", 1)
+    data = DatasetFolder(path)
+    for k in (0, 9, 5, 0, 6, 9):
+        np.testing.assert_array_equal(data.scene(k)["mass"], datasets.arrays(k)["mass"])
+    data.close()
+    assert data.scene(0).particles == 20
+
+
+def _first_mass(data):
+    return float(data.scene(9)["mass"][0])
+
+
+@pytest.mark.parametrize("method", ["fork", "spawn"])
+def test_other_processes_open_files_of_their_own(path, method):
+    data = DatasetFolder(path)
+    expected = _first_mass(data)
+    with get_context(method).Pool(1) as pool:
+        assert pool.apply(_first_mass, (data,)) == expected
+    assert pickle.loads(pickle.dumps(data)).scene(9).particles == data.scene(9).particles
+
+
+def test_metadata_is_that_of_the_training_split(path):
+    words = metadata(DatasetFolder(path))
+    free = [datasets.arrays(k) for k in (0, 1, 2, 4)]
+    free = [a["position"][:, a["particle_type"] != 3].astype(np.float64) for a in free]
+    for name, order in (("vel", 1), ("acc", 2)):
+        values = np.concatenate([np.diff(x, n=order, axis=0).reshape(-1, 2) for x in free])
+        np.testing.assert_allclose(words[f"{name}_mean"], values.mean(0), rtol=1e-6)
+        np.testing.assert_allclose(words[f"{name}_std"], values.std(0), rtol=1e-9)
+    assert words["bounds"] == [[0.0, 1.0], [0.0, 2.0]] and words["num_particles_max"] == 47
+    assert words["statistics_of"] == "train"
+    assert metadata(DatasetFolder(path), split="dev")["statistics_of"] == "all splits"
+
+
+def test_the_radius_holds_some_neighbours(path, tmp_path):
+    """Particles on a lattice of the rest volume have about 20 within it."""
+    spacing = 0.05 / 2
+    lattice = np.stack(np.meshgrid(*[np.arange(-5, 6) * spacing] * 2), -1).reshape(-1, 2)
+    near = (np.linalg.norm(lattice, axis=1) <= connectivity_radius(DatasetFolder(path))).sum()
+    assert 17 <= near <= 25
+    chosen = datasets.make_dataset(tmp_path / "set", connectivity_radius=0.015, shards=1)
+    assert metadata(DatasetFolder(chosen))["default_connectivity_radius"] == 0.015
+
+
+def test_nothing_yet(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"no data set in .* no dataset\.json"):
+        DatasetFolder(tmp_path)
+    empty = DatasetFolder(datasets.make_dataset(tmp_path / "set", shards=0))
+    assert empty.scenes() == []
+    with pytest.raises(ValueError, match="has no valid scene yet"):
+        metadata(empty)
+
+
+@pytest.mark.parametrize("change", [{"format": 9}, {"frames": 0}, {"lower": [0.0]}, {"other": 1}, {"splits": [1]}])
+def test_a_damaged_record(tmp_path, change):
+    path = datasets.make_dataset(tmp_path / "set", shards=0)
+    words = json.loads((path / "dataset.json").read_text())
+    (path / "dataset.json").write_text(json.dumps({**words, **change}))
+    with pytest.raises(DamagedFileError):
+        DatasetFolder(path)

@@ -1,0 +1,300 @@
+"""Generation: the same content from any number of processes and after any kill; what can go wrong on the way."""
+
+import json
+import os
+import random
+import resource
+import shutil
+
+import numpy as np
+import pytest
+import torch
+
+pytest.importorskip("pydantic")
+pytest.importorskip("h5py")
+
+from generated import assert_same, configuration, decoded, start
+from helpers import command
+
+from torch_mpm.data import batch
+from torch_mpm.data.finish import IncompleteError, finalize, verify
+from torch_mpm.data.folder import DatasetFolder
+from torch_mpm.data.generate import generate
+from torch_mpm.data.sampling import content
+from torch_mpm.data.shard import record_path, shard_path
+from torch_mpm.data.workers import Worker, WorkerError, take_device, worker
+from torch_mpm.scene import SceneError
+from torch_mpm.scene.folder import OutputError
+
+FILES = ("shard_00000.h5", "shard_00000.json")
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """The small data set, made by this process."""
+    folder = tmp_path_factory.mktemp("whole") / "set"
+    summary = generate(configuration(), folder, device="cpu")
+    assert summary["complete"] and summary["scenes"] == 7 and summary["failed"] == 0
+    return folder
+
+
+@pytest.fixture
+def copy(whole, tmp_path):
+    return shutil.copytree(whole, tmp_path / "copy")
+
+
+def test_what_is_in_a_data_set(whole):
+    made = configuration()
+    assert list(verify(whole)) == []
+    dataset = DatasetFolder(whole)
+    assert [s.id for s in dataset.scenes("train")] == [0, 1, 2, 3, 4] and len(dataset.scenes("test")) == 2
+    for name, (arrays, attributes) in decoded(whole).items():
+        built = made.scene(content(made, int(attributes["id"]))).build("cpu")
+        # the first frame is the sampled scene, built anew, and later ones fall: x = x0 + v t + g t^2 / 2 in free flight
+        np.testing.assert_array_equal(arrays["position"][0], built.state.x.numpy(), err_msg=name)
+        x = arrays["position"].astype(np.float64)
+        free = x[:, :, 1].min() > 0.3
+        if free:
+            centre = x.mean(1)
+            t = 0.005 * np.arange(12)[:, None]
+            v = built.state.v.double().numpy().mean(0)
+            expected = centre[0] + v * t + 0.5 * np.array([0.0, -9.8]) * t**2
+            assert np.abs(centre - expected).max() < 0.03 * np.abs(expected - centre[0]).max() + 1e-3
+        assert arrays["mass"].sum() == pytest.approx(1000 * arrays["volume"].sum())
+        assert set(arrays["particle_type"]) == {7} and arrays["position"].dtype == np.float32
+        assert json.loads(attributes["scene"])["duration"] == pytest.approx(0.055)
+
+
+def test_one_and_three_processes_make_the_same(whole, tmp_path):
+    processes = [start(tmp_path / "set", rank, 3, threads=1 + rank % 2) for rank in range(3)]
+    for process in processes:
+        process.join()
+        assert process.exitcode == 0
+    assert_same(whole, tmp_path / "set")
+    assert finalize(tmp_path / "set") == finalize(whole)
+
+
+@pytest.mark.parametrize("kills", [5, pytest.param(20, marks=pytest.mark.slow)])
+def test_a_data_set_that_is_killed_and_resumed_is_the_same(tmp_path, kills):
+    changes = {"dataset__splits": {"train": 3 * kills}, "dataset__scenes_per_shard": 1}
+    generate(configuration(**changes), tmp_path / "whole", device="cpu")
+    rng, survived = random.Random(kills), 0
+    for _ in range(kills):
+        process = start(tmp_path / "set", **changes)
+        process.join(rng.uniform(0.05, 0.7))
+        survived += process.exitcode is None
+        process.kill()
+        process.join()
+        if (tmp_path / "set" / "dataset.json").exists():
+            seen = DatasetFolder(tmp_path / "set")
+            assert all(seen.scene(s.id)["position"].shape[0] == 12 for s in seen.scenes())  # nothing unfinished
+    assert survived
+    generate(configuration(**changes), tmp_path / "set", device="cpu")
+    assert_same(tmp_path / "whole", tmp_path / "set")
+    assert list(verify(tmp_path / "set")) == [] and not list((tmp_path / "set" / "shards").glob(".*"))
+
+
+def test_processes_without_ranks_share_a_folder(whole, tmp_path):
+    processes = [start(tmp_path / "set") for _ in range(2)]
+    for process in processes:
+        process.join()
+        assert process.exitcode == 0
+    assert_same(whole, tmp_path / "set")
+
+
+def test_a_finished_data_set_is_left_alone(copy):
+    before = {p: p.stat().st_mtime_ns for p in copy.rglob("shard_*")}
+    assert generate(configuration(), copy, device="cpu")["scenes"] == 0
+    assert {p: p.stat().st_mtime_ns for p in copy.rglob("shard_*")} == before
+
+
+def test_another_configuration_is_refused(copy):
+    with pytest.raises(OutputError, match="another configuration"):
+        generate(configuration(dataset__seed=1), copy, device="cpu")
+    (copy / "notes.txt").write_text("mine")
+    (copy / "dataset.json").unlink()
+    with pytest.raises(OutputError, match="no data set"):
+        generate(configuration(), copy, device="cpu")
+
+
+def test_another_device_is_refused(copy):
+    record = json.loads((copy / "dataset.json").read_text())
+    (copy / "dataset.json").write_text(json.dumps({**record, "device": "cuda"}))
+    with pytest.raises(OutputError, match="begun on cuda, and process 0 of 1 would go on with it on cpu"):
+        generate(configuration(), copy, device="cpu")
+
+
+# ---- damage
+
+
+@pytest.mark.parametrize("name", FILES)
+@pytest.mark.parametrize("damage", ["cut off", "a bit", "removed"])
+def test_a_corrupt_shard_is_found_and_made_anew(whole, copy, name, damage):
+    path = copy / "shards" / name
+    data = path.read_bytes()
+    if damage == "removed":
+        path.unlink()
+    else:
+        path.write_bytes(data[:-50] if damage == "cut off" else data[:900] + bytes([data[900] ^ 1]) + data[901:])
+    problems = list(verify(copy))
+    assert problems and all("shard_00000" in p for p in problems)
+    assert generate(configuration(), copy, device="cpu", check=True)["scenes"] == 2
+    assert list(verify(copy)) == []
+    assert_same(whole, copy)
+
+
+def test_a_full_disk_keeps_what_is_finished(whole, tmp_path):
+    (tmp_path / "set.toml").write_text(json_to_toml())
+    size = shard_path(whole, 0).stat().st_size
+
+    def small_disk():
+        resource.setrlimit(resource.RLIMIT_FSIZE, (size - 100, size - 100))
+
+    process = command("generate", tmp_path / "set.toml", "-o", tmp_path / "set", "--device", "cpu", "--quiet",
+                      preexec_fn=small_disk)  # fmt: skip
+    _, errors = process.communicate()
+    assert process.returncode == 1
+    assert errors.startswith("torch-mpm: no room on the disk of ") and len(errors.splitlines()) == 1
+    assert not list((tmp_path / "set" / "shards").glob(".*"))
+    generate(configuration(), tmp_path / "set", device="cpu")
+    arrays, others = decoded(whole), decoded(tmp_path / "set")
+    assert all(np.array_equal(a["position"], others[n][0]["position"]) for n, (a, _) in arrays.items())
+
+
+def json_to_toml() -> str:
+    """The small configuration as a file; JSON's inline tables need another sign between key and value."""
+    from generated import WORDS
+
+    def toml(value):
+        if isinstance(value, dict):
+            return "{" + ", ".join(f"{k} = {toml(v)}" for k, v in value.items()) + "}"
+        if isinstance(value, list):
+            return "[" + ", ".join(map(toml, value)) + "]"
+        return json.dumps(value)
+
+    return "\n".join(f"{key} = {toml(value)}" for key, value in WORDS.items())
+
+
+# ---- scenes that fail
+
+
+def test_a_scene_that_explodes_is_recorded_and_leaves_the_others_as_they_are(tmp_path):
+    fast = {"choice": [[0.0, 0.0], [500.0, 500.0]]}
+    made = configuration(
+        body__0__velocity=fast, body__0__count=1, grid__walls="open", dt=5e-4, dataset__scenes_per_shard=7
+    )
+    assert generate(made, tmp_path, device="cpu")["failed"] > 0
+    dataset = DatasetFolder(tmp_path)
+    good, bad = dataset.scenes(), [s for s in dataset.attempted() if not s.valid]
+    assert good and all("left the grid" in s.failure and s.attempts == 3 for s in bad)
+    assert all(decoded(tmp_path)[f"scene_{s.id:07d}"][0] == {} for s in bad)
+    built = made.scene(*(content(made, s.id) for s in good)).build("cpu")
+    alone, failures = batch.simulate(built, ["position"], 12, 0.005, 10)
+    assert failures == [""] * len(good)
+    for arrays, told in zip(alone, good, strict=True):
+        np.testing.assert_array_equal(arrays["position"], dataset.scene(told.id)["position"])
+    assert list(verify(tmp_path)) == []
+
+
+def test_a_scene_that_fails_is_tried_again_with_half_of_the_time_step(tmp_path):
+    made = configuration(material__jelly__E={"choice": [1e4, 1.2e7]}, dt=1e-3, dataset__scenes_per_shard=7)
+    generate(made, tmp_path, device="cpu")
+    stored = decoded(tmp_path)
+    stiff = {n: json.loads(a["scene"])["material"]["jelly"]["E"] == 1.2e7 for n, (_, a) in stored.items()}
+    assert set(stiff.values()) == {True, False}
+    for name, (arrays, attributes) in stored.items():
+        assert attributes["valid"] and len(arrays["position"]) == 12
+        assert attributes["attempts"] == (2 if stiff[name] else 1), name
+        assert attributes["dt"] * attributes["substeps_per_frame"] == pytest.approx(0.005)
+        assert attributes["dt"] == pytest.approx(5e-4 if stiff[name] else 1e-3)
+
+
+def test_a_scene_that_needs_too_many_steps_fails_alone(tmp_path):
+    generate(configuration(material__jelly__E={"choice": [1e4, 1e20]}), tmp_path, device="cpu")
+    told = DatasetFolder(tmp_path).attempted()
+    assert {s.valid for s in told} == {True, False}
+    assert all("substeps, more than" in s.failure for s in told if not s.valid)
+
+
+def test_a_scene_without_room_is_recorded(tmp_path):
+    made = configuration(body__0__count={"choice": [1, 30], "weights": [1, 12]})
+    generate(made, tmp_path, device="cpu")
+    told = DatasetFolder(tmp_path).attempted()
+    assert {s.valid for s in told} == {True, False}
+    assert all("no room for body[0]" in s.failure and s.attempts == 0 for s in told if not s.valid)
+
+
+def test_a_data_set_without_a_good_scene_cannot_be_finalized(tmp_path):
+    made = configuration(body__0__velocity=[500.0, 500.0], grid__walls="open", dataset__attempts=1)
+    assert generate(made, tmp_path, device="cpu")["failed"] == 7
+    with pytest.raises(IncompleteError, match=r"no valid scene: .*left the grid"):
+        finalize(tmp_path)
+
+
+def test_impossible_configurations_are_refused(tmp_path):
+    with pytest.raises(SceneError, match=r"no room for body\[0\]"):
+        generate(configuration(body__0__count=30, dataset__splits={"train": 1}), tmp_path, device="cpu")
+    with pytest.raises(SceneError, match=r"scene 0: body\[0\].densty: unknown key; did you mean|body\[0\].densty"):
+        generate(configuration(body__0__densty=1.0), tmp_path, device="cpu")
+    assert list(tmp_path.iterdir()) == []
+
+
+# ---- processes and devices
+
+
+@pytest.mark.parametrize(
+    ("environment", "expected"),
+    [
+        ({}, Worker(0, 1, 0)),
+        ({"RANK": "3", "WORLD_SIZE": "8", "LOCAL_RANK": "1"}, Worker(3, 8, 1)),
+        ({"SLURM_PROCID": "2", "SLURM_NTASKS": "4", "SLURM_LOCALID": "2"}, Worker(2, 4, 2)),
+        ({"SLURM_ARRAY_TASK_ID": "7", "SLURM_ARRAY_TASK_MIN": "5", "SLURM_ARRAY_TASK_COUNT": "3"}, Worker(2, 3, 0)),
+        (
+            {
+                "SLURM_ARRAY_TASK_ID": "4", "SLURM_ARRAY_TASK_MIN": "0", "SLURM_ARRAY_TASK_STEP": "2",
+                "SLURM_ARRAY_TASK_COUNT": "3", "SLURM_PROCID": "1", "SLURM_NTASKS": "2", "SLURM_LOCALID": "1",
+            },
+            Worker(5, 6, 1),
+        ),
+    ],
+)  # fmt: skip
+def test_what_the_environment_says(environment, expected):
+    assert worker(environment) == expected
+
+
+@pytest.mark.parametrize("environment", [{"RANK": "x"}, {"RANK": "4", "WORLD_SIZE": "4"}, {"SLURM_PROCID": "1"}])
+def test_an_environment_that_makes_no_sense(environment):
+    with pytest.raises(WorkerError, match="must be"):
+        worker(environment)
+
+
+def test_a_process_without_a_gpu_of_its_own(monkeypatch):
+    taken = []
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+    monkeypatch.setattr(torch.cuda, "set_device", taken.append)
+    assert take_device("auto", Worker(5, 8, 1)) == torch.device("cuda", 1) and taken == [1]
+    with pytest.raises(WorkerError, match="process 6 of 8 needs GPU 2 of its machine, and torch finds 2"):
+        take_device("cuda", Worker(6, 8, 2))
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
+    assert take_device("cuda", Worker(6, 8, 2)) == torch.device("cuda", 0)  # of those that each see one
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 0)
+    assert take_device("auto", Worker()) == torch.device("cpu")
+    with pytest.raises(WorkerError, match="process 3 of 4 needs 'cuda', and torch finds no such device"):
+        take_device("cuda", Worker(3, 4, 3))
+
+
+def test_the_command_line(whole, tmp_path, capsys):
+    from torch_mpm.cli import main
+
+    (tmp_path / "set.toml").write_text(json_to_toml())
+    assert main(["generate", str(tmp_path / "set.toml"), "-o", str(tmp_path / "set"), "--device", "cpu"]) == 0
+    out = capsys.readouterr()
+    assert "7 scenes in " in out.out and "is complete" in out.out
+    assert main(["finalize", str(tmp_path / "set")]) == 0 and main(["verify", str(tmp_path / "set")]) == 0
+    assert "7 of 7 scenes are valid" in capsys.readouterr().out
+    record_path(shard_path(tmp_path / "set", 2)).unlink()
+    assert main(["finalize", str(tmp_path / "set")]) == 1 and main(["verify", str(tmp_path / "set")]) == 1
+    assert "lacks 1 of 4 shards (2)" in capsys.readouterr().err
+    assert main(["generate", "-o", str(tmp_path / "other")]) == 1
+    assert "takes a configuration or --preset" in capsys.readouterr().err
+    assert (os.environ.get("RANK") is None) and (tmp_path / "set" / "config.toml").read_text() == json_to_toml()

@@ -1,0 +1,196 @@
+"""Scenes of a shard simulated together, with one time step, without waiting for the device on the way."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ..laws import Mixture
+from ..rollouts import rollout
+from ..scene import fields, heap
+from ..scene.build import Built
+from ..state import State, _take
+from .recording import Array, Recording
+
+LOOK = 8
+"""Frames between two looks at the stability limit and the validity of the particles, and between two reorderings."""
+MOST_SUBSTEPS = 100_000
+"""Of a frame; a scene that needs more fails."""
+BLOCKS_WANTED = 0
+"""Column of the status: blocks that were wanted at most."""
+
+Told = Callable[[int], None]
+"""What is called with the number of each frame."""
+
+
+def substeps(built: Built, interval: float, cfl: float, dt: float | None = None) -> list[float]:
+    """Substeps that each scene [B] needs from frame to frame, at the start and at the speed of a fall.
+
+    Args:
+        built: the scenes.
+        interval: time from frame to frame [s].
+        cfl: share of the stability limit.
+        dt: the longest step that is wanted [s], instead of `cfl`.
+    """
+    if dt is not None:
+        return [math.ceil(interval / dt * (1 - 1e-9))] * built.grid.scenes
+    rates: list[float] = built.step.survey(_falling(built)).rate.tolist()
+    return [max(1.0, math.ceil(interval * rate / cfl * (1 - 1e-9))) if rate < math.inf else rate for rate in rates]
+
+
+def _falling(built: Built) -> State:
+    """The state with the speed that a fall through the domain adds, so that a step is short enough later too."""
+    state, grid = built.state, built.grid
+    gravity = built.step.gravity_like(state.x)
+    if gravity is None or not len(state):
+        return state
+    rows = gravity.expand(grid.scenes, -1)
+    size = torch.tensor(grid.upper, dtype=state.x.dtype, device=state.x.device) - torch.tensor(
+        grid.lower, dtype=state.x.dtype, device=state.x.device
+    )
+    strength = rows.norm(dim=1, keepdim=True)
+    down = rows / strength.clamp_min(1e-30)
+    added = down * (2 * (rows.abs() * size).sum(1, keepdim=True)).sqrt()  # v² = 2 g h
+    return state.replace(v=state.v + (added[0] if state.scene is None else added[state.scene.long()]))
+
+
+def particles_of(built: Built) -> list[int]:
+    """Number of particles of each scene."""
+    if built.state.scene is None:
+        return [len(built.state)]
+    return torch.bincount(built.state.scene.long(), minlength=built.grid.scenes).tolist()
+
+
+def shapes_of(names: Sequence[str], dim: int) -> dict[str, tuple[int, ...]]:
+    """Shape per particle of fields by their names."""
+    return {name: (dim,) * (1 if name in ("position", "velocity") else fields.RANKS[name]) for name in names}
+
+
+@torch.inference_mode()
+def simulate(
+    built: Built, names: Sequence[str], frames: int, interval: float, count: int, told: Told | None = None
+) -> tuple[list[dict[str, Array]], list[str]]:
+    """Simulate all scenes of a batch.
+
+    Args:
+        built: the scenes; their step is used up.
+        names: fields to keep, as `torch_mpm.scene.fields` names them.
+        frames: T, the first among them.
+        interval: time from frame to frame [s].
+        count: substeps from frame to frame.
+        told: called after each frame has been queued.
+
+    Returns:
+        The fields [T, N, ...] of each scene, float32, and why it failed; "" for a scene that is good.
+    """
+    _leave_room(built)
+    while True:
+        recording = Recording(frames, particles_of(built), shapes_of(names, built.grid.dim), built.state.x.device)
+        try:
+            surveys = _run(built, recording, names, frames, interval, count, told)
+            arrays = recording.finish()
+        except BaseException:
+            recording.abandon()
+            raise
+        if _had_room(built):
+            return arrays, _failures(built, surveys, interval / count)
+
+
+def _run(
+    built: Built, recording: Recording, names: Sequence[str], frames: int, interval: float, count: int,
+    told: Told | None,
+) -> Tensor:  # fmt: skip
+    """Queue all frames; returns what surveys found, float64 [looks, 3, B] on the device."""
+    step, state, surveys = built.step, step_ready(built), []
+    order = torch.argsort(state.ids)  # type: ignore[arg-type]
+    for frame in range(frames):
+        if frame:
+            state = rollout(step, state, count, interval / count).replace(time=frame * interval)
+        if frame % LOOK == 0 or frame == frames - 1:
+            state = state.sorted(built.grid)
+            order = torch.argsort(state.ids)  # type: ignore[arg-type]
+            surveys.append(torch.stack(step.survey(state)))
+            if state.x.is_cpu:
+                heap.trim()
+        recording.put({name: _take(_field(built, state, name), order) for name in names})
+        if told is not None:
+            told(frame)
+    return torch.stack(surveys)
+
+
+def step_ready(built: Built) -> State:
+    """The first state, in a step that has not gone wrong yet."""
+    built.step.reset()
+    return built.step.prepare(built.state)
+
+
+def _field(built: Built, state: State, name: str) -> Tensor:
+    """A field of all particles, in whatever batch they are: what a material lacks follows from what it has."""
+    if name in ("F", "J"):
+        return _deformation(built, state, name)
+    value = fields.field(built.step, state, name)
+    return state.mass.new_zeros(len(state)) if value is None else value  # nothing has melted
+
+
+def _deformation(built: Built, state: State, name: str) -> Tensor:
+    """F, which is J^(1/D) I of a law that has J alone, or J, which is det F of one that has F alone."""
+    law, dim = built.step.law, built.grid.dim
+    laws: list[Any] = list(law.laws) if isinstance(law, Mixture) else [law]
+    value: Tensor | None = getattr(state, name)
+    if value is not None and all(name in part.state_fields for part in laws):
+        return value
+    if name == "J":
+        assert state.F is not None
+        other = torch.linalg.det(state.F)
+    else:
+        assert state.J is not None
+        eye = torch.eye(dim, dtype=state.x.dtype, device=state.x.device)
+        other = state.J.clamp_min(0).pow(1 / dim)[:, None, None] * eye
+    if value is None or state.material is None:
+        return other
+    has = torch.tensor([name in part.state_fields for part in laws], device=state.x.device)[state.material.long()]
+    return torch.where(has.reshape(-1, *(1,) * (value.dim() - 1)), value, other)
+
+
+# ---- room for blocks
+
+
+def _leave_room(built: Built) -> None:
+    """Blocks for bodies that come apart, so that a device has not to be asked on the way."""
+    if built.grid.grows and built.state.x.is_cuda:
+        built.grid.follow(2 * built.grid.pool(built.state.x, built.state.scene))
+
+
+def _had_room(built: Built) -> bool:
+    """Whether all particles had nodes in all steps; otherwise the pool has room for them now."""
+    grid, status = built.grid, built.step.status
+    if status is None or grid.max_blocks is None or not grid.grows:
+        return True
+    wanted = int(status[0, BLOCKS_WANTED])
+    if wanted <= grid.max_blocks:
+        return True
+    grid.follow(wanted)
+    return False
+
+
+# ---- what went wrong
+
+
+def _failures(built: Built, surveys: Tensor, dt: float) -> list[str]:
+    """Why each scene failed; "" for one that is good. Waits for the device."""
+    texts: list[list[str]] = [[] for _ in range(built.grid.scenes)]
+    for problem in built.step.failures().problems.values():
+        for scene, number in enumerate(problem.count.tolist()):
+            if number:
+                texts[scene].append(f"{number} {problem.what}")
+    for look, (rates, _, wrong) in enumerate(surveys.tolist()):
+        for scene, text in enumerate(texts):
+            if not text and wrong[scene]:
+                text.append(f"{wrong[scene]:.0f} particles were not finite, outside or inverted by frame {look * LOOK}")
+            elif not text and not dt * rates[scene] <= 1:
+                text.append(f"the time step {dt:.3g} s was above the limit by frame {look * LOOK}")
+    return ["; ".join(text) for text in texts]

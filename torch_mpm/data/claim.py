@@ -1,0 +1,184 @@
+"""Who works where in the folder of a data set: one configuration per folder, one process at a time per shard.
+
+A process that works on a shard has locked its byte of the file ``lock``. The lock ends with the process, however it
+ends. File systems without locks do not exclude other processes; then each takes the shards of its own rank alone.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import fcntl
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import IO, Any
+
+from ..errors import DamagedFileError
+from ..scene.folder import FULL, OutputError
+from .folder import DATASET, DatasetRecord
+from .shard import Shard, ShardRecord, record_path, shard_path, write_whole
+from .workers import Worker
+
+CONFIGURATION, LOCK = "config.toml", "lock"
+NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP, errno.EINVAL)
+TABLE = 2**40
+"""Byte that is locked while the folder is claimed, beyond those of all shards."""
+
+
+@contextlib.contextmanager
+def output_errors(folder: Path) -> Iterator[None]:
+    """What keeps this process from writing in a folder, as an OutputError."""
+    try:
+        yield
+    except OSError as error:
+        reason = error.strerror or str(error)
+        if error.errno not in FULL:
+            raise OutputError(f"cannot use {error.filename or folder} for the output: {reason}") from error
+        raise OutputError(
+            f"no room on the disk of {folder}: {reason}. The shards written so far are whole; free some space and "
+            "generate again to go on"
+        ) from error
+
+
+class Claim:
+    """A folder that a process works in: ``with Claim(folder, record, text, worker) as claim``.
+
+    Args:
+        folder: made where it does not exist.
+        record: what it holds, or shall hold.
+        text: of the configuration.
+        worker: this process.
+
+    Raises:
+        OutputError: for a folder that holds something else, or that cannot be written.
+        DamagedFileError: for a damaged dataset.json.
+    """
+
+    def __init__(self, folder: Path, record: DatasetRecord, text: str, worker: Worker) -> None:
+        self.folder, self.record, self.worker = folder, record, worker
+        self._text, self._whole = text, set[tuple[int, bool]]()
+        self._lock: IO[Any] | None = None
+        self._locks = True
+
+    def __enter__(self) -> Claim:
+        if self.folder.exists() and not self.folder.is_dir():
+            raise OutputError(f"{self.folder} is a file; choose a folder for the output")
+        with output_errors(self.folder):
+            self._refuse_others()
+            (self.folder / "shards").mkdir(parents=True, exist_ok=True)
+            self._lock = open(self.folder / LOCK, "a+b")
+            try:
+                self._locked(TABLE, wait=True)
+                self._refuse_others()
+                if not (self.folder / DATASET).exists():
+                    write_whole(self.folder / CONFIGURATION, self._text.encode())
+                    self.record.write(self.folder)
+                self._unlock(TABLE)
+            except BaseException:
+                self._lock.close()
+                raise
+        return self
+
+    def __exit__(self, *error: Any) -> None:
+        assert self._lock is not None
+        self._lock.close()
+
+    def _refuse_others(self) -> None:
+        """Raise for a folder that holds anything but this data set, or nothing."""
+        if not self.folder.exists():
+            return
+        if not (self.folder / DATASET).is_file():
+            known = (LOCK, CONFIGURATION, "shards")
+            others = [p.name for p in self.folder.iterdir() if p.name not in known and p.suffix != ".building"]
+            if others or next((self.folder / "shards").glob("shard_*"), None) is not None:
+                raise OutputError(f"{self.folder} holds files that are no data set of torch_mpm; choose another folder")
+            return
+        found = DatasetRecord.read(self.folder)
+        if found.configuration != self.record.configuration:
+            raise OutputError(
+                f"{self.folder} holds the data set of another configuration ({found.configuration[:12]}, this is "
+                f"{self.record.configuration[:12]}); choose another folder, or remove it first"
+            )
+        if found.device != self.record.device:
+            raise OutputError(
+                f"{self.folder} holds a data set that was begun on {found.device}, and process {self.worker.rank} of "
+                f"{self.worker.size} would go on with it on {self.record.device}, where results differ by rounding; "
+                f'use device "{found.device}", or choose another folder'
+            )
+
+    # -- shards
+
+    def unfinished(self, check: bool = False) -> Iterator[int]:
+        """The shards that nobody has finished or works on, each locked when it comes; `release` it.
+
+        Args:
+            check: compare finished shards with their checksums, and take those that are damaged.
+        """
+        count, rank, size = self.record.shards, self.worker.rank, self.worker.size
+        own = range(rank, count, size)
+        others = [k for k in range(count) if k % size != rank]
+        for k in [*own, *others]:
+            if self.is_finished(k, check) or (k not in own and not self._locks) or not self._locked(k):
+                continue
+            if self.is_finished(k, check):  # meanwhile, by another process
+                self.release(k)
+                continue
+            self._clean(k)
+            yield k
+
+    def release(self, shard: int) -> None:
+        self._unlock(shard)
+
+    def is_finished(self, shard: int, check: bool = False) -> bool:
+        """Whether a shard has a record, and a file of the length in it, or with `check` of the bytes."""
+        if (shard, check) in self._whole:
+            return True
+        path = shard_path(self.folder, shard)
+        try:
+            record = ShardRecord.read(record_path(path))
+            good = path.stat().st_size == record.bytes
+            if good and check:
+                Shard(path, check=True).close()
+        except (FileNotFoundError, DamagedFileError):
+            return False
+        if good:
+            self._whole.add((shard, check))
+        return good
+
+    def finished(self) -> list[int]:
+        """The finished shards."""
+        return [k for k in range(self.record.shards) if self.is_finished(k)]
+
+    def finished_scenes(self) -> int:
+        """Number of the scenes in finished shards."""
+        size, total = self.record.scenes_per_shard, self.record.scenes
+        return sum(min(size, total - k * size) for k in self.finished())
+
+    def _clean(self, shard: int) -> None:
+        """Remove what is left of a shard that is not whole."""
+        path = shard_path(self.folder, shard)
+        record_path(path).unlink(missing_ok=True)
+        for name in (path.name, record_path(path).name):
+            for building in path.parent.glob(f".{name}.*.building"):
+                building.unlink(missing_ok=True)
+
+    def _locked(self, byte: int, wait: bool = False) -> bool:
+        """Lock a byte of the lock; returns whether that was possible."""
+        assert self._lock is not None
+        if not self._locks:
+            return True
+        try:
+            fcntl.lockf(self._lock, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB), 1, byte, os.SEEK_SET)
+        except OSError as error:
+            if error.errno in (errno.EACCES, errno.EAGAIN):
+                return False
+            if error.errno not in NO_LOCKS:
+                raise
+            self._locks = False
+        return True
+
+    def _unlock(self, byte: int) -> None:
+        assert self._lock is not None
+        if self._locks:
+            fcntl.lockf(self._lock, fcntl.LOCK_UN, 1, byte, os.SEEK_SET)

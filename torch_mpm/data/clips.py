@@ -1,0 +1,89 @@
+"""What a viewer plays: the scenes of a run or of a data set, each as a whole."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ..render.colors import scalar_of
+from .folder import DATASET, DatasetError, DatasetFolder
+from .pictures import field_values
+from .trajectory import Array, Trajectory
+
+COLORLESS = ("F", "C", "momentum", "position", "velocity")
+"""Arrays of particles that are no colours."""
+
+
+@dataclass(frozen=True)
+class Clip:
+    """A scene as a whole.
+
+    Attributes:
+        position: [T, N, D] (m), NaN for particles that are not there yet.
+        fields: what colours particles, by name: [T, N, ...] or [N].
+        interval: time from frame to frame [s].
+    """
+
+    position: Array
+    fields: dict[str, Array]
+    interval: float
+
+    def values(self, name: str, frame: int) -> Array:
+        """Numbers [N] of a frame."""
+        values = self.fields[name]
+        row = values[frame] if values.shape[:2] == self.position.shape[:2] else values
+        return scalar_of(name, row, len(row))
+
+
+class Source:
+    """A run or a data set to look at: ``scenes`` are names to choose from, ``clip(name)`` one of them.
+
+    Raises:
+        FileNotFoundError: for a folder that holds neither.
+        DatasetError: for a data set without a valid scene.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        if (self.path / DATASET).is_file():
+            self.dataset = DatasetFolder(self.path)
+            self.bounds = (self.dataset.record.lower, self.dataset.record.upper)
+            self.scenes = {f"{self._split(s.id)} {s.id}": s.id for s in self.dataset.scenes()}
+            self.title = self.dataset.record.title
+        else:
+            self.trajectory = Trajectory(self.path)
+            named = "scene" in self.trajectory.file
+            names = self.trajectory.names("scene") if named else ["run"]
+            self.scenes = {name or f"scene {k}": k for k, name in enumerate(names)}
+            self.title = str(self.trajectory.attributes.get("title", ""))
+            position = self.trajectory["position"]
+            self.bounds = (np.nanmin(position, (0, 1)), np.nanmax(position, (0, 1)))
+        if not self.scenes:
+            raise DatasetError(f"{self.path} has no valid scene yet")
+
+    def _split(self, scene_id: int) -> str:
+        return self.dataset.record.split_of(scene_id)
+
+    def clip(self, name: str) -> Clip:
+        """A scene, read as a whole."""
+        return self._of_dataset(self.scenes[name]) if hasattr(self, "dataset") else self._of_run(self.scenes[name])
+
+    def _of_dataset(self, scene_id: int) -> Clip:
+        scene, interval = self.dataset.scene(scene_id), self.dataset.record.frame_interval
+        names = ["speed", *(name for name in scene.names if name not in COLORLESS)]
+        return Clip(scene["position"], {name: field_values(scene, name, interval) for name in names}, interval)
+
+    def _of_run(self, number: int) -> Clip:
+        data = self.trajectory
+        rows = data["scene"] == number if "scene" in data.file else slice(None)
+        position = data["position"]
+        names = [name for name in (*data.fields, "material", "mass") if name not in COLORLESS]
+        fields = {"speed": np.linalg.norm(data["velocity"], axis=2)} | {name: data[name] for name in names}
+        picked = {
+            name: (v[:, rows] if name in data.fields or name == "speed" else v[rows]) for name, v in fields.items()
+        }
+        times = data["time"]
+        interval = float(np.diff(times).mean()) if len(times) > 1 else 1.0
+        return Clip(position[:, rows], picked, interval)

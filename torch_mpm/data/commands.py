@@ -1,0 +1,123 @@
+"""Commands of data sets: ``torch-mpm generate CONFIG -o DIR``, finalize, verify."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+
+class VerifyError(ValueError):
+    """A data set in which something is wrong."""
+
+
+def add(commands: Any) -> None:
+    """Add the commands to those of the command line."""
+    generate = commands.add_parser(
+        "generate",
+        help="simulate a data set of random scenes; alone, under torchrun or as a SLURM array",
+        description="Simulate the scenes that a data set lacks. Any number of processes may work in one folder; "
+        "RANK and WORLD_SIZE, SLURM_PROCID and SLURM_NTASKS or SLURM_ARRAY_TASK_ID and _COUNT share out the work.",
+    )
+    generate.add_argument("config", type=Path, nargs="?", help="configuration (TOML)")
+    generate.add_argument(
+        "--preset", metavar="NAME", help="a configuration that comes with torch_mpm; 'list' names them"
+    )
+    generate.add_argument("-o", "--out", type=Path, help="folder of the data set")
+    generate.add_argument("--device", default="auto", help='"auto", "cpu", "cuda" or "cuda:1"; default: %(default)s')
+    generate.add_argument("--check", action="store_true", help="check finished shards, and make damaged ones anew")
+    generate.add_argument("--quiet", action="store_true", help="no progress bar")
+    set_argument(generate, "dataset.splits={train=100}")
+    generate.set_defaults(command=_generate)
+
+    finalize = commands.add_parser("finalize", help="merge the statistics of a complete data set into metadata.json")
+    finalize.add_argument("folder", type=Path, help="folder of the data set")
+    finalize.set_defaults(command=_finalize)
+
+    verify = commands.add_parser("verify", help="check all files and scenes of a data set")
+    verify.add_argument("folder", type=Path, help="folder of the data set")
+    verify.set_defaults(command=_verify)
+
+
+def set_argument(parser: argparse.ArgumentParser, example: str) -> None:
+    """An option that overrides keys of a file."""
+    text = f"override a key of the file, such as {example}"
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="overrides", help=text)
+
+
+def _generate(options: argparse.Namespace) -> None:
+    from ..scene import SceneError
+    from .configuration import Configuration, presets
+    from .generate import generate
+
+    if options.preset == "list":
+        print("\n".join(presets()))
+        return
+    if (options.config is None) == (options.preset is None):
+        raise SceneError(["takes a configuration or --preset NAME"], "generate")
+    if options.out is None:
+        raise SceneError(["takes a folder: -o DIR"], "generate")
+    if options.preset is not None:
+        configuration = Configuration.preset(options.preset, options.overrides)
+    else:
+        configuration = Configuration.load(options.config, options.overrides)
+    bar = None if options.quiet else _Bar()
+    try:
+        done = generate(
+            configuration,
+            options.out,
+            device=options.device,
+            check=options.check,
+            progress=None if bar is None else bar.show,
+        )
+    finally:
+        if bar is not None:
+            bar.close()
+    rate = done["scenes"] / max(done["seconds"], 1e-9)
+    print(
+        f"{done['scenes']} scenes in {done['seconds']:.1f} s ({rate:.3g} per second), of which simulation "
+        f"{done['simulating']:.1f} s; {done['failed']} failed"
+    )
+    rest = f"complete; torch-mpm finalize {options.out} writes its metadata"
+    print(f"{options.out} is {rest if done['complete'] else 'not complete: other processes work in it, or are to'}")
+
+
+def _finalize(options: argparse.Namespace) -> None:
+    from .finish import finalize
+    from .metadata import METADATA
+
+    words = finalize(options.folder)
+    print(f"{options.folder / METADATA}: statistics of {words['statistics_of']}")
+
+
+def _verify(options: argparse.Namespace) -> None:
+    from .finish import verify
+    from .folder import DatasetFolder
+
+    problems = list(verify(options.folder))
+    if problems:
+        raise VerifyError("\n".join(problems))
+    dataset = DatasetFolder(options.folder)
+    print(f"{options.folder}: good, {len(dataset.scenes())} of {len(dataset.attempted())} scenes are valid")
+
+
+class _Bar:
+    """Progress of a process: frames of scenes, their rate and the time left, if it makes all that is missing."""
+
+    def __init__(self) -> None:
+        try:
+            from tqdm import tqdm
+        except ImportError as error:
+            raise ImportError("the progress bar needs tqdm: pip install torch-mpm[scene], or use --quiet") from error
+        self._make = tqdm
+        self._bar: Any = None
+
+    def show(self, figures: dict[str, Any]) -> None:
+        if self._bar is None:
+            self._bar = self._make(total=figures["missing"], unit="frame", unit_scale=True)
+        self._bar.set_postfix_str(f"{figures['scenes']} scenes, {figures['failed']} failed", refresh=False)
+        self._bar.update(max(0, figures["frames"] - self._bar.n))
+
+    def close(self) -> None:
+        if self._bar is not None:
+            self._bar.close()

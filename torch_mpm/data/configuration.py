@@ -1,0 +1,291 @@
+"""Configurations of data sets: scene files whose values may be distributions, and a table `[dataset]`.
+
+    [dataset]
+    splits = { train = 1000, valid = 30, test = 30 }
+    frames = 321
+    interval = 0.0025
+
+    [grid] ...                       # and all other keys of a scene file that the scenes share
+
+    [material.sand]                  # what differs between scenes: gravity, materials, bodies and obstacles
+    law = "quartic_sand"
+    E = { log_uniform = [1e5, 1e6] }
+
+    [[body]]
+    count = { integers = [1, 3] }    # a body, or an obstacle, may be repeated
+    shape = "box"
+    center = { in_box = [[0.1, 0.1], [0.9, 0.9]] }
+    size = [{ uniform = [0.1, 0.3] }, 0.2]
+    material = "sand"
+
+Bodies and obstacles have the keys of scene files, and `count`. In place of the corners of a box there may be its
+`center` and `size`, and in place of the ends of a capsule or a cylinder its `center` and its `axis` from end to end.
+"""
+
+from __future__ import annotations
+
+import copy
+import hashlib
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, ValidationError
+
+from ..errors import check_file
+from ..scene import Scene, SceneError, schema
+from ..scene.explain import explain
+from ..scene.scene import override, parsed
+from . import distribution
+from .distribution import Words
+
+FORMAT = 1
+"""Raised where the same configuration would give other scenes."""
+VARIED = ("gravity", "material", "body", "obstacle")
+"""Keys of a scene file that may differ from scene to scene."""
+ABSENT = {
+    "duration": "give [dataset] frames and interval instead",
+    "fps": "give [dataset] frames and interval instead",
+    "seed": "give [dataset] seed instead",
+    "scene": "the scenes of a data set are samples of one distribution",
+    "emitter": "the scenes of a data set have all their particles from the start; use bodies",
+    "output": "give [dataset] fields instead",
+    "render": "export a scene and draw it instead",
+}
+COSMETIC = ("title", "device")
+PARTICLE_TYPES = {"weakly_compressible": 5, "quartic_sand": 6}
+"""DeepMind's codes by law: water and sand; whatever else is goop."""
+GOOP = 7
+
+Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$")]
+Code = Annotated[int, Field(ge=0, le=8)]
+
+
+class Dataset(schema.Model):
+    """What is generated of a distribution."""
+
+    splits: Annotated[dict[Name, Annotated[int, Field(ge=0)]], Field(min_length=1)]
+    """numbers of scenes by the name of a split, such as { train = 1000, valid = 30, test = 30 }"""
+    frames: Annotated[int, Field(ge=2)]
+    """frames of a scene, the first among them"""
+    interval: schema.Positive
+    """time from frame to frame [s]"""
+    fields: list[Literal["velocity", "F", "J", "C", "stress", "temperature", "liquid"]] = Field(default_factory=list)
+    """what is stored beside positions"""
+    seed: Annotated[int, Field(ge=0)] = 0
+    """seed of the data set"""
+    particles: Annotated[int, Field(ge=1)] | None = None
+    """exact number of particles of a scene, shared by its bodies by their volumes; by default per_cell decides"""
+    gap: schema.NotNegative | None = None
+    """least distance of bodies from each other and from obstacles [m]; by default grid.dx"""
+    scenes_per_shard: Annotated[int, Field(ge=1)] = 16
+    """scenes of a file, which are simulated together; as many as the device holds are fastest"""
+    attempts: Annotated[int, Field(ge=1, le=10)] = 3
+    """how often a scene is tried, each time with half of the time step, before it is recorded as failed"""
+    obstacles: bool = True
+    """whether obstacles are in the data as particles of type 3, a layer below their surface that moves with them"""
+    particle_type: dict[str, Code] = Field(default_factory=dict)
+    """particle types of materials; by default 5 (water), 6 (sand) or 7 (goop) by their laws"""
+
+
+@dataclass(frozen=True)
+class Configuration:
+    """A configuration that was read and checked.
+
+    Attributes:
+        words: all keys of the file.
+        dataset: its table `[dataset]`.
+        text: the file as given, or the same keys as JSON.
+        folder: where names of files start.
+        source: name of the file, for messages.
+        hash: of everything that determines the scenes; 64 hexadecimal digits.
+    """
+
+    words: Words
+    dataset: Dataset
+    text: str
+    folder: Path
+    source: str
+    hash: str
+
+    @classmethod
+    def load(cls, path: str | Path, overrides: list[str] | None = None) -> Configuration:
+        """Read a configuration.
+
+        Args:
+            path: a TOML file.
+            overrides: as for `Scene.load`, such as ``dataset.frames=20``.
+
+        Raises:
+            SceneError: with one line for each thing that is wrong.
+            FileNotFoundError: when there is no such file.
+        """
+        path = Path(path)
+        text, words = parsed(path)
+        return cls.from_words(words, overrides, path.parent, str(path), text)
+
+    @classmethod
+    def preset(cls, name: str, overrides: list[str] | None = None) -> Configuration:
+        """One of `presets`.
+
+        Raises:
+            SceneError: for an unknown name, or wrong overrides.
+        """
+        if name not in presets():
+            raise SceneError([f"takes one of {', '.join(presets())}, got {name!r}"], "preset")
+        with resources.as_file(_presets() / f"{name}.toml") as path:
+            return cls.load(path, overrides)
+
+    @classmethod
+    def from_words(
+        cls, words: Words, overrides: list[str] | None = None, folder: Path = Path(), source: str = "", text: str = ""
+    ) -> Configuration:
+        """A configuration from nested dictionaries; arguments and errors as for `load`."""
+        words = copy.deepcopy(words)
+        try:
+            for item in overrides or []:
+                override(words, item)
+            dataset = _checked(words)
+            digest = _hash(words, folder)
+        except SceneError as error:
+            raise SceneError(error.problems, source) from None
+        if overrides or not text:
+            text = json.dumps(words, indent=1)
+        return cls(words, dataset, text, folder, source, digest)
+
+    @property
+    def dim(self) -> int:
+        return len(self.words["grid"]["lower"])
+
+    @property
+    def scenes(self) -> int:
+        """Number of scenes of all splits."""
+        return sum(self.dataset.splits.values())
+
+    @property
+    def splits(self) -> dict[str, tuple[int, int]]:
+        """First id and number of scenes by the name of a split."""
+        first, found = 0, {}
+        for name, count in self.dataset.splits.items():
+            found[name] = (first, count)
+            first += count
+        return found
+
+    @property
+    def shards(self) -> int:
+        """Number of shards."""
+        return -(-self.scenes // self.dataset.scenes_per_shard)
+
+    def ids(self, shard: int) -> range:
+        """The scenes of a shard."""
+        size = self.dataset.scenes_per_shard
+        return range(shard * size, min((shard + 1) * size, self.scenes))
+
+    def scene_words(self, *contents: Words) -> Words:
+        """The scene file of one content, or of the batch of several, as `torch_mpm.data.sampling` draws them."""
+        dataset = self.dataset
+        time = {"duration": (dataset.frames - 1) * dataset.interval, "fps": 1 / dataset.interval}
+        shared = {key: value for key, value in self.words.items() if key not in (*VARIED, "dataset")}
+        own = contents[0] if len(contents) == 1 else {"scene": list(contents)}
+        return {**shared, **time, **own}
+
+    def scene(self, *contents: Words) -> Scene:
+        """The scene of `scene_words`.
+
+        Raises:
+            SceneError: for what is wrong in them.
+        """
+        return Scene.from_words(self.scene_words(*contents), folder=self.folder, source=self.source)
+
+    def particle_type(self, material: Any) -> int:
+        """DeepMind's code for a material (`scene.build.Material`)."""
+        return self.dataset.particle_type.get(material.name, PARTICLE_TYPES.get(material.words.law, GOOP))
+
+
+def presets() -> list[str]:
+    """Names of the configurations that come with torch_mpm."""
+    return sorted(p.name.removesuffix(".toml") for p in _presets().iterdir() if p.name.endswith(".toml"))
+
+
+def _presets() -> Any:
+    return resources.files(__package__) / "presets"
+
+
+# ---- checks
+
+
+def _checked(words: Words) -> Dataset:
+    """The table [dataset] of words in which nothing is wrong that can be seen without a sample.
+
+    Raises:
+        SceneError: for what is wrong.
+    """
+    problems = [f"{key}: is not for data sets; {remedy}" for key, remedy in ABSENT.items() if key in words]
+    dataset = None
+    try:
+        dataset = Dataset(**words["dataset"])
+    except ValidationError as error:
+        problems += [f"dataset.{line}" for line in explain(error, Dataset)]
+    except (KeyError, TypeError):
+        problems.append("dataset: missing; takes a table with splits, frames and interval")
+    shared = {key: value for key, value in words.items() if key not in VARIED}
+    for key in distribution.found(shared):
+        problems.append(f"{key}: takes no distribution; what may differ between scenes is {', '.join(VARIED)}")
+    try:
+        grid = schema.Grid(**words["grid"])
+    except (ValidationError, KeyError, TypeError):
+        grid = None  # which the first sample will tell
+    if grid is not None:
+        for key in VARIED:
+            problems += distribution.problems(words.get(key), key, len(grid.lower))
+    problems += _count_problems(words)
+    if problems or dataset is None:
+        raise SceneError(problems)
+    if grid is None:
+        Scene(**{key: value for key, value in words.items() if key not in (*VARIED, "dataset")})
+        raise SceneError(["grid: missing"])
+    if "temperature" in dataset.fields and "heat" not in words:
+        raise SceneError(["dataset.fields: temperature needs a [heat] table"])
+    if not sum(dataset.splits.values()):
+        raise SceneError([f"dataset.splits: has no scenes, got {dataset.splits}"])
+    return dataset
+
+
+def _count_problems(words: Words) -> Iterator[str]:
+    """Counts of bodies and obstacles that are no whole numbers."""
+    for key in ("body", "obstacle"):
+        items = words.get(key, [])
+        for k, item in enumerate(items if isinstance(items, list) else []):
+            count = item.get("count", 1) if isinstance(item, dict) else 1
+            drawn = distribution.is_distribution(count)
+            if not drawn and (isinstance(count, bool) or not isinstance(count, int) or count < 0):
+                yield f"{key}[{k}].count: takes a whole number that is not negative or a distribution, got {count!r}"
+
+
+def _hash(words: Words, folder: Path) -> str:
+    kept = {key: value for key, value in words.items() if key not in COSMETIC}
+    digest = hashlib.sha256(f"{FORMAT} {json.dumps(kept)}".encode())
+    for key, name in _files(words.get("body"), "body"):
+        try:
+            check_file(folder / name, "shape")
+        except OSError as error:
+            raise SceneError([f"{key}: {error}"]) from None
+        digest.update((folder / name).read_bytes())
+    return digest.hexdigest()
+
+
+def _files(words: Any, path: str) -> Iterator[tuple[str, str]]:
+    """(key, name) of all files in words."""
+    if isinstance(words, dict):
+        for key, value in words.items():
+            if key != "file":
+                yield from _files(value, f"{path}.{key}")
+            else:
+                names = value.get("choice", []) if isinstance(value, dict) else [value]
+                yield from ((f"{path}.file", name) for name in names if isinstance(name, str))
+    elif isinstance(words, list):
+        for k, item in enumerate(words):
+            yield from _files(item, f"{path}[{k}]")

@@ -1,0 +1,150 @@
+"""What all exports share: which scenes, checks of what loaders demand, a folder that appears when it is whole."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ..folder import DatasetError, DatasetFolder
+from ..metadata import metadata, write_metadata
+from ..statistics import BOUNDARY
+
+Array = npt.NDArray[Any]
+
+RIGID = 0
+PARTICLE_TYPES = 9
+"""Codes of particle types are smaller, in DeepMind's models and those after them."""
+
+
+@dataclass(frozen=True)
+class ExportedScene:
+    """A scene as exports write it: position [T, N, D] (m), particle_type [N], and the scene for whatever else."""
+
+    id: int
+    position: Array
+    particle_type: Array
+    arrays: Any
+
+    @property
+    def boundary(self) -> Array:
+        """Which particles move as prescribed, bool [N]."""
+        mask: Array = self.particle_type == BOUNDARY
+        return mask
+
+
+@dataclass(frozen=True)
+class Export:
+    """An export that is being made in ``folder``, which becomes ``target``."""
+
+    dataset: DatasetFolder
+    folder: Path
+    target: Path
+
+    def scenes(self, split: str) -> Iterator[ExportedScene]:
+        """The valid scenes of a split that have particles, by id.
+
+        Raises:
+            DatasetError: for a scene that loaders could not read: another number of frames, no or unknown types.
+            DamagedFileError: for a scene that is damaged.
+        """
+        for number in exported_ids(self.dataset, split):
+            stored = self.dataset.scene(number)
+            position = np.ascontiguousarray(stored["position"], np.float32)
+            if len(position) != self.dataset.record.frames:
+                raise DatasetError(
+                    f"scene {number} must have the {self.dataset.record.frames} frames of the data set, "
+                    f"got {len(position)}"
+                )
+            if "particle_type" not in stored:
+                raise DatasetError(f"scene {number} must have particle_type [N]")
+            kind = stored["particle_type"]
+            if kind.min() < 0 or kind.max() >= PARTICLE_TYPES:
+                raise DatasetError(f"particle_type must be within 0 and {PARTICLE_TYPES - 1}, got {kind.max()}")
+            yield ExportedScene(number, position, kind, stored)
+
+
+def exported_ids(dataset: DatasetFolder, split: str) -> list[int]:
+    return [scene.id for scene in dataset.scenes(split) if scene.particles]
+
+
+@contextlib.contextmanager
+def exporting(
+    source: str | Path | DatasetFolder,
+    out: str | Path | None,
+    name: str,
+    material: bool = False,
+    more: Mapping[str, Any] | None = None,
+) -> Iterator[Export]:
+    """An export into ``out``, by default the folder ``name`` of the data set, which appears when the block has ended.
+
+    Every shard is compared with its checksum first. ``metadata.json`` is written at the end, with ``more`` in it.
+
+    Raises:
+        FileExistsError: when ``out`` is there already.
+        OSError: when the disk has no room for the data, uncompressed.
+        DatasetError: for a data set without a valid scene.
+        DamagedFileError: for a data set that is damaged.
+    """
+    dataset = source if isinstance(source, DatasetFolder) else DatasetFolder(source)
+    target = dataset.path / name if out is None else Path(out)
+    words = {**metadata(dataset, material=material), **(more or {})}
+    dataset.check()
+    with new_folder(target) as folder:
+        _require_room(dataset, folder)
+        yield Export(dataset, folder, target)
+        write_metadata(folder, words)
+
+
+def _require_room(dataset: DatasetFolder, folder: Path) -> None:
+    particles = sum(scene.particles for scene in dataset.scenes())
+    wanted = 4 * particles * dataset.record.frames * dataset.record.dim
+    free = shutil.disk_usage(folder).free
+    if wanted > free:
+        room = f"the positions need {wanted / 1e9:.2f} GB, and {free / 1e9:.2f} GB are free"
+        raise OSError(errno.ENOSPC, room, str(folder.parent))
+
+
+@contextlib.contextmanager
+def new_folder(target: Path) -> Iterator[Path]:
+    """A folder beside ``target`` that takes its name when the block ends well, and vanishes when it does not.
+
+    Raises:
+        FileExistsError: when there is something of that name.
+    """
+    if target.exists():
+        raise FileExistsError(errno.EEXIST, "exists already; remove it, or choose another folder", str(target))
+    target.parent.mkdir(parents=True, exist_ok=True)
+    building = Path(tempfile.mkdtemp(prefix=f".{target.name}.", suffix=".building", dir=target.parent))
+    try:
+        yield building
+        for path in [*building.rglob("*"), building]:
+            _sync(path)
+        building.chmod(0o777 & ~_umask())  # mkdtemp makes private folders
+        building.rename(target)
+        _sync(target.parent)
+    finally:
+        shutil.rmtree(building, ignore_errors=True)
+
+
+def _sync(path: Path) -> None:
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def _umask() -> int:
+    umask = os.umask(0)
+    os.umask(umask)
+    return umask

@@ -1,0 +1,56 @@
+"""NumPy files for geoelements/gns (https://github.com/geoelements/gns): ``train.npz``, ``valid.npz``, ``test.npz``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from ..folder import DatasetError, DatasetFolder
+from .common import Export, ExportedScene, exporting
+
+
+def export_gns(dataset: str | Path | DatasetFolder, out: str | Path | None = None, material: str | None = None) -> Path:
+    """Write a data set for geoelements/gns.
+
+    Each split is one file with ``gns_data``, a one-dimensional array of (position float32 [T, N, D], particle type
+    int64 [N][, material float32 [N]]). The file is pickled, as its loader demands; a split is in memory as a whole,
+    in its loader too.
+
+    Args:
+        dataset: folder of the data set.
+        out: folder to make; ``gns`` in that of the data set by default.
+        material: name of an array [N] of every scene, such as "friction_angle", that becomes the material column;
+            ``metadata.json`` then counts it among the features of a node.
+
+    Returns:
+        The folder.
+
+    Raises:
+        FileExistsError, OSError, DatasetError, DamagedFileError: as :func:`torch_mpm.data.exports.common.exporting`;
+            DatasetError also for a scene without the material.
+    """
+    with exporting(dataset, out, "gns", material=material is not None) as export:
+        for split in export.dataset.record.splits:
+            _write(export, split, material)
+    return export.target
+
+
+def _write(export: Export, split: str, material: str | None) -> None:
+    scenes = [_entry(scene, material) for scene in export.scenes(split)]
+    # An array of tuples must be filled one by one: NumPy 2 refuses to make it of ragged ones, and would make a table
+    # of equal ones.
+    data = np.empty(len(scenes), dtype=object)
+    for k, scene in enumerate(scenes):
+        data[k] = scene
+    if scenes:
+        np.savez(export.folder / f"{split}.npz", gns_data=data)
+
+
+def _entry(scene: ExportedScene, material: str | None) -> tuple[np.ndarray, ...]:
+    kind = scene.particle_type.astype(np.int64)
+    if material is None:
+        return scene.position, kind
+    if material not in scene.arrays or scene.arrays.shape(material) != kind.shape:
+        raise DatasetError(f"material must be the name of an array [N] of every scene, got {material!r}")
+    return scene.position, kind, scene.arrays[material].astype(np.float32)

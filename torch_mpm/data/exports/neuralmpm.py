@@ -1,0 +1,35 @@
+"""HDF5 files for NeuralMPM (Rochman Sharabi et al. 2025, https://github.com/OmerRochman/NeuralMPM), one per scene."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from ..folder import DatasetFolder
+from ..hdf5 import h5py_module
+from .common import exporting
+
+
+def export_neuralmpm(dataset: str | Path | DatasetFolder, out: str | Path | None = None) -> Path:
+    """Write a data set for NeuralMPM.
+
+    ``train/sim_0.h5`` and so on have ``particles`` [T, N, D], ``boundary`` [T, M, D] and ``types`` [N].
+
+    Its parsers take material, bounds, interval and length from the name of the folder, so give ``out`` the name of one
+    of its data sets (``WaterRamps``, ``Sand``, ``Goop``, ...) and generate with that set's numbers, or write a parser.
+
+    Args, returns and errors as :func:`export_gns`, without ``material``.
+    """
+    h5py = h5py_module()
+    with exporting(dataset, out, "neuralmpm") as export:
+        for split in export.dataset.record.splits:
+            folder = export.folder / split
+            folder.mkdir()
+            for k, scene in enumerate(export.scenes(split)):
+                with h5py.File(folder / f"sim_{k}.h5", "w") as file:
+                    free = ~scene.boundary
+                    for name, rows in (("particles", free), ("boundary", scene.boundary)):
+                        values = scene.position[:, rows]
+                        options = {"compression": "gzip", "compression_opts": 1} if values.size else {}
+                        file.create_dataset(name, data=values, **options)
+                    file.create_dataset("types", data=scene.particle_type[free].astype("i8"))
+    return export.target

@@ -1,0 +1,70 @@
+"""Chosen scenes of a data set for programs that people look with: VTK for ParaView, PLY point clouds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..export import Array, write_ply, write_vtk
+from ..folder import DatasetFolder, velocity_of
+from ..shard import StoredScene, scene_name
+from .common import new_folder
+
+
+def export_scenes_vtk(
+    dataset: str | Path | DatasetFolder, out: str | Path | None = None, scenes: Sequence[int] | None = None
+) -> Path:
+    """Write scenes as ``scene_0000000/frame_00000.vtu``, ..., and ``run.pvd``, with all their fields.
+
+    Args:
+        dataset: folder of the data set.
+        out: folder to make; ``vtk`` in that of the data set by default.
+        scenes: ids; the first valid scene by default.
+
+    Returns:
+        The folder.
+
+    Raises:
+        FileExistsError: when ``out`` is there already.
+        KeyError: for a scene that is not there, failed, or is not finished.
+        DamagedFileError: for a scene that is damaged.
+        ImportError: when meshio is missing (extra ``data``).
+    """
+    return _export(dataset, out, scenes, "vtk", write_vtk)
+
+
+def export_scenes_ply(
+    dataset: str | Path | DatasetFolder, out: str | Path | None = None, scenes: Sequence[int] | None = None
+) -> Path:
+    """Write scenes as point clouds ``scene_0000000/frame_00000.ply``; all else as :func:`export_scenes_vtk`."""
+    return _export(dataset, out, scenes, "ply", write_ply)
+
+
+def _export(
+    source: str | Path | DatasetFolder,
+    out: str | Path | None,
+    scenes: Sequence[int] | None,
+    name: str,
+    write: Callable[[Iterable[dict[str, Array]], Path], Any],
+) -> Path:
+    dataset = source if isinstance(source, DatasetFolder) else DatasetFolder(source)
+    target = dataset.path / name if out is None else Path(out)
+    chosen = [scene.id for scene in dataset.scenes()[:1]] if scenes is None else scenes
+    stored = {number: dataset.scene(number) for number in chosen}
+    with new_folder(target) as folder:
+        for number, scene in stored.items():
+            (folder / scene_name(number)).mkdir()
+            write(scene_frames(scene, dataset.record.frame_interval), folder / scene_name(number))
+    return target
+
+
+def scene_frames(scene: StoredScene, interval: float) -> Iterator[dict[str, Array]]:
+    """The frames of a scene as those of a trajectory: fields, what does not change, and time."""
+    arrays = {name: scene[name] for name in scene.names} | {"velocity": velocity_of(scene, interval)}
+    moving = [name for name, a in arrays.items() if a.shape[:2] == (scene.frames, scene.particles)]
+    fixed = {name: a for name, a in arrays.items() if a.shape == (scene.particles,)}
+    for k in range(scene.frames):
+        yield {**{name: arrays[name][k] for name in moving}, **fixed, "time": np.array(k * interval)}

@@ -1,0 +1,130 @@
+"""Uniform grids in the format of The Well (Ohana et al. 2024, https://github.com/PolymathicAI/the_well)."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from ..folder import DatasetFolder, velocity_of
+from ..hdf5 import h5py_module
+from ..rasterise import cell_centres, rasterise
+from ..statistics import Sums
+from .common import Array, Export, ExportedScene, exported_ids, exporting
+
+AXES = ("x", "y", "z")
+
+
+def export_well(dataset: str | Path | DatasetFolder, out: str | Path | None = None, dx: float | None = None) -> Path:
+    """Write density and velocity on a uniform grid, for models on grids: ``data/train/NAME.hdf5``, ``stats.yaml``.
+
+    Args:
+        dataset: folder of the data set.
+        out: folder to make; ``well`` in that of the data set by default.
+        dx: size of a cell [m]; twice that of the simulation by default, about 16 particles a cell in 2-D.
+
+    Returns and errors as :func:`export_gns`; ValueError also for a dx that is not positive.
+    """
+    if dx is not None and not dx > 0:
+        raise ValueError(f"dx must be positive, got {dx}")
+    with exporting(dataset, out, "well") as export:
+        record = export.dataset.record
+        name = re.sub(r"\W+", "_", record.title).strip("_").lower() or "torch_mpm"
+        statistics: dict[str, _Statistics] = {}
+        for split in record.splits:
+            if exported_ids(export.dataset, split):
+                statistics[split] = _write(export, split, name, dx or 2 * record.dx)
+        chosen = statistics.get("train") or next(iter(statistics.values()))
+        (export.folder / "stats.yaml").write_text(json.dumps(chosen.words(), indent=1))  # JSON is YAML
+    return export.target
+
+
+class _Statistics:
+    """Of the fields and of their changes from frame to frame, over all cells."""
+
+    def __init__(self, dim: int) -> None:
+        self.sums = {name: [Sums.zero(n), Sums.zero(n)] for name, n in (("density", 1), ("velocity", dim))}
+
+    def add(self, fields: dict[str, Array]) -> None:
+        for name, values in fields.items():
+            vectors = values.astype(np.float64).reshape(len(values), -1, len(self.sums[name][0].sum))
+            for k, part in enumerate((vectors, np.diff(vectors, axis=0))):
+                self.sums[name][k] += Sums.of(part)
+
+    def words(self) -> dict[str, dict[str, float | list[float]]]:
+        def plain(values: list[float]) -> float | list[float]:
+            return values[0] if len(values) == 1 else values
+
+        return {
+            f"{statistic}{suffix}": {name: plain(getattr(sums[k], statistic)) for name, sums in self.sums.items()}
+            for k, suffix in enumerate(("", "_delta"))
+            for statistic in ("mean", "std")
+        }
+
+
+def _write(export: Export, split: str, name: str, dx: float) -> _Statistics:
+    record, count = export.dataset.record, len(exported_ids(export.dataset, split))
+    statistics = _Statistics(record.dim)
+    folder = export.folder / "data" / split
+    folder.mkdir(parents=True)
+    with h5py_module().File(folder / f"{name}.hdf5", "w") as file:
+        file.attrs.update(
+            {"dataset_name": name, "grid_type": "cartesian", "n_spatial_dims": record.dim, "n_trajectories": count}
+        )
+        file.attrs["simulation_parameters"] = _names([])
+        fields = _layout(file, export, dx, count)
+        for k, scene in enumerate(export.scenes(split)):
+            values = _fields(scene, export, dx)
+            statistics.add(values)
+            for field, data in values.items():
+                fields[field][k] = data
+    return statistics
+
+
+def _names(names: list[str]) -> Array:
+    return np.array(names, dtype=h5py_module().string_dtype())
+
+
+def _layout(file: Any, export: Export, dx: float, count: int) -> dict[str, Any]:
+    """All of a file but the numbers of its fields; returns the arrays that these are written to."""
+    record = export.dataset.record
+    axes, centres = list(AXES[: record.dim]), cell_centres(record.lower, record.upper, dx)
+    varying = {"sample_varying": False, "time_varying": False}
+    dimensions, walls = file.create_group("dimensions"), file.create_group("boundary_conditions")
+    dimensions.attrs["spatial_dims"] = _names(axes)
+    time = dimensions.create_dataset("time", data=record.frame_interval * np.arange(record.frames, dtype=np.float32))
+    time.attrs.update({"sample_varying": False})
+    for axis, coordinates in zip(axes, centres, strict=True):
+        dimensions.create_dataset(axis, data=coordinates.numpy().astype(np.float32)).attrs.update(varying)
+        wall = walls.create_group(f"{axis}_wall")
+        wall.attrs.update({"bc_type": "WALL", **varying})
+        wall.attrs["associated_dims"], wall.attrs["associated_fields"] = _names([axis]), _names([])
+        ends = np.zeros(len(coordinates), bool)
+        ends[[0, -1]] = True
+        wall.create_dataset("mask", data=ends)
+    file.create_group("scalars").attrs["field_names"] = _names([])
+    shape = (count, record.frames, *(len(c) for c in centres))
+    arrays = {}
+    for order, name in enumerate(("density", "velocity", "")):
+        group = file.create_group(f"t{order}_fields")
+        group.attrs["field_names"] = _names([name] if name else [])
+        if name:
+            full = shape + (record.dim,) * order
+            chunk = (1, 1, *full[2:])
+            data = group.create_dataset(name, full, "f4", chunks=chunk, compression="gzip", compression_opts=1)
+            data.attrs.update({"dim_varying": [True] * record.dim, "sample_varying": True, "time_varying": True})
+            arrays[name] = data
+    return arrays
+
+
+def _fields(scene: ExportedScene, export: Export, dx: float) -> dict[str, Array]:
+    """Of all particles that are not a boundary."""
+    record, free = export.dataset.record, ~scene.boundary
+    velocity, mass = velocity_of(scene.arrays, record.frame_interval), scene.arrays["mass"]
+    x, v, m = (torch.from_numpy(a.astype(np.float32)) for a in (scene.position[:, free], velocity[:, free], mass[free]))
+    density, mean = rasterise(x, v, m, record.lower, record.upper, dx)
+    return {"density": density.numpy(), "velocity": mean.numpy()}

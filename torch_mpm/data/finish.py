@@ -1,0 +1,132 @@
+"""What follows a data set that is complete: its metadata, and a check of all that is in it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..errors import DamagedFileError
+from .folder import DatasetFolder, DatasetRecord
+from .metadata import metadata, write_metadata
+from .shard import SceneRecord, Shard, StoredScene, content_hash, shard_path
+from .statistics import BOUNDARY
+
+GAIN = 0.05
+"""Of its mechanical energy above that of rest on the floor, a scene may gain no more than this share."""
+
+
+class IncompleteError(ValueError):
+    """A data set that lacks shards, or of which no scene is good."""
+
+
+def finalize(folder: str | Path) -> dict[str, Any]:
+    """Merge the statistics of all shards into ``metadata.json``; the same again gives the same file.
+
+    Returns:
+        What metadata.json says.
+
+    Raises:
+        IncompleteError: for a data set that is not complete.
+        FileNotFoundError, DamagedFileError: as `DatasetFolder`.
+    """
+    dataset = DatasetFolder(folder)
+    missing = sorted(set(range(dataset.record.shards)) - set(dataset.finished))
+    if missing:
+        named = ", ".join(map(str, missing[:10])) + (", ..." if len(missing) > 10 else "")
+        raise IncompleteError(
+            f"{folder} lacks {len(missing)} of {dataset.record.shards} shards ({named}); generate them"
+        )
+    if not dataset.scenes():
+        raise IncompleteError(f"{folder} has no valid scene: {dataset.attempted()[0].failure}")
+    try:
+        words = metadata(dataset)
+        write_metadata(dataset.path, words)
+    finally:
+        dataset.close()
+    return words
+
+
+def verify(folder: str | Path) -> Iterator[str]:
+    """All that is wrong with the finished shards of a data set, one line each.
+
+    Every file is compared with its checksum and every scene with its hash; the positions of a valid scene must be
+    finite and in the domain, other fields finite, and its energy must not grow.
+
+    Raises:
+        FileNotFoundError, DamagedFileError: for a folder without a readable ``dataset.json``.
+    """
+    record = DatasetRecord.read(Path(folder))
+    for index in range(record.shards):
+        path = shard_path(Path(folder), index)
+        try:
+            with Shard(path, check=True) as shard:
+                yield from _shard_problems(shard, record, index)
+        except FileNotFoundError:
+            yield f"{path}: is not there or not finished; generate again"
+        except DamagedFileError as error:
+            yield f"{error} (--check does so for all damaged shards)"
+
+
+def _shard_problems(shard: Shard, record: DatasetRecord, index: int) -> Iterator[str]:
+    first = index * record.scenes_per_shard
+    expected = list(range(first, min(first + record.scenes_per_shard, record.scenes)))
+    if shard.ids != expected:
+        yield f"{shard.path}: has the scenes {shard.ids}, not {expected[0]} to {expected[-1]}"
+    for told in shard.record.scenes:
+        stored = shard.scene(told.id)
+        for problem in _scene_problems(stored, told, record):
+            yield f"{shard.path}: scene {told.id} {problem}"
+
+
+def _scene_problems(stored: StoredScene, told: SceneRecord, record: DatasetRecord) -> Iterator[str]:
+    arrays = {name: stored[name] for name in stored.names}
+    if content_hash(arrays) != told.hash:
+        yield "has another hash than its record says"
+    if bool(stored.attributes.get("valid")) != told.valid or bool(arrays) != told.valid:
+        yield "is valid in its record or in its file, but not in both"
+    if not told.valid or not arrays:
+        return
+    if lacking := [name for name in record.fields if name not in arrays]:
+        yield f"lacks {', '.join(lacking)}"
+    if len(arrays["position"]) != record.frames:
+        yield f"has {len(arrays['position'])} frames, not {record.frames}"
+    broken = [name for name, values in arrays.items() if values.dtype.kind == "f" and not np.isfinite(values).all()]
+    if broken:
+        yield f"has numbers that are not finite in {', '.join(broken)}"
+        return
+    free = arrays.get("particle_type", np.zeros(stored.particles)) != BOUNDARY
+    x = arrays["position"][:, free]
+    slack = record.dx
+    if (x < np.array(record.lower) - slack).any() or (x > np.array(record.upper) + slack).any():
+        yield "has particles outside of the domain"
+    gain = energy_gain(stored, arrays, record)
+    if gain is not None and gain > GAIN:
+        yield f"gains {gain:.1%} of its energy"
+
+
+def energy_gain(stored: StoredScene, arrays: Any, record: DatasetRecord) -> float | None:
+    """Largest gain of kinetic and potential energy over the first frame, as a share of it; None where energy may come
+    in: by moving obstacles or heat.
+
+    A body starts without elastic energy, so that its mechanical energy can only fall. Heights are those above the
+    floor, the lowest corner of the domain. Without velocities those between frames are taken.
+    """
+    words = json.loads(stored.attributes["scene"])
+    if "heat" in words or any("velocity" in o or "spin" in o for o in words.get("obstacle", [])):
+        return None
+    gravity = np.array(words.get("gravity") or [0.0] * record.dim)
+    floor = np.where(gravity < 0, record.lower, record.upper)
+    x, mass = arrays["position"].astype(np.float64), arrays["mass"].astype(np.float64)
+    if "velocity" in arrays:
+        v = arrays["velocity"].astype(np.float64)
+    else:
+        v = np.diff(x, axis=0) / record.frame_interval
+        x = 0.5 * (x[1:] + x[:-1])
+    kinetic = 0.5 * np.einsum("n,tnd->t", mass, v**2)
+    potential = -np.einsum("n,tnd,d->t", mass, x - floor, gravity)
+    energy = kinetic + potential
+    return float((energy.max() - energy[0]) / max(energy[0], 1e-300))

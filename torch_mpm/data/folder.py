@@ -1,0 +1,225 @@
+"""The folder of a data set: what ``dataset.json`` says about it, and its finished scenes."""
+
+from __future__ import annotations
+
+import functools
+import json
+import os
+import re
+from collections import OrderedDict
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..errors import DamagedFileError
+from .shard import Array, SceneRecord, Shard, ShardRecord, StoredScene, record_path, shard_path, write_whole
+from .statistics import Motion, Sums
+
+FORMAT = 1
+DATASET = "dataset.json"
+MOST_OPEN = 32
+"""Shards, and scenes of them, that a reader keeps open."""
+
+
+class DatasetError(ValueError):
+    """A data set does not have what is asked for."""
+
+
+class MissingError(KeyError):
+    """There is no such split or scene."""
+
+    def __str__(self) -> str:
+        return str(self.args[0])  # KeyError would quote it
+
+
+@dataclass(frozen=True)
+class DatasetRecord:
+    """What ``dataset.json`` says, written once, before the first scene.
+
+    Attributes:
+        configuration: hash of all that decides the content.
+        splits: first scene id and number of scenes of each split.
+        frames: T of every scene, the first frame included; ``frame_interval`` [s] apart.
+        lower, upper: bounds of the domain [D] (m).
+        dx: distance of the nodes of the grid [m].
+        fields: arrays [T, N, ...] of every scene, ``position`` among them.
+        device: "cpu" or "cuda", whose results differ by rounding.
+        connectivity_radius: of neighbours in a graph of particles [m]; None where readers choose one.
+    """
+
+    configuration: str
+    seed: int
+    splits: dict[str, tuple[int, int]]
+    scenes_per_shard: int
+    frames: int
+    frame_interval: float
+    lower: tuple[float, ...]
+    upper: tuple[float, ...]
+    dx: float
+    fields: tuple[str, ...]
+    title: str = ""
+    device: str = ""
+    connectivity_radius: float | None = None
+    versions: dict[str, str] = field(default_factory=dict)
+
+    @property
+    def dim(self) -> int:
+        return len(self.lower)
+
+    @property
+    def scenes(self) -> int:
+        """Of all splits."""
+        return sum(count for _, count in self.splits.values())
+
+    @property
+    def shards(self) -> int:
+        return -(-self.scenes // self.scenes_per_shard)
+
+    def split_of(self, scene_id: int) -> str:
+        """
+        Raises:
+            MissingError: for a scene of no split.
+        """
+        for name, (first, count) in self.splits.items():
+            if first <= scene_id < first + count:
+                return name
+        raise MissingError(f"the data set has no scene {scene_id}")
+
+    def write(self, folder: Path) -> None:
+        """Write it; it appears when it is whole and on the disk."""
+        text = json.dumps({"format": FORMAT, **asdict(self)}, indent=1, allow_nan=False)
+        write_whole(folder / DATASET, text.encode())
+
+    @classmethod
+    def read(cls, folder: Path) -> DatasetRecord:
+        """
+        Raises:
+            FileNotFoundError: for a folder that holds no data set.
+            DamagedFileError: for a file that is not as it was written.
+        """
+        path, remedy = folder / DATASET, "restore it, or generate the data set again"
+        if not path.is_file():
+            raise FileNotFoundError(f"there is no data set in {folder}: it has no {DATASET}")
+        try:
+            words = json.loads(path.read_bytes())
+            if words.pop("format") != FORMAT:
+                raise DamagedFileError(path, "is not of this version of torch_mpm", remedy)
+            for name in ("lower", "upper", "fields"):
+                words[name] = tuple(words[name])
+            words["splits"] = {str(n): (int(first), int(count)) for n, (first, count) in words["splits"].items()}
+            record = cls(**words)
+            if not 2 <= len(record.lower) == len(record.upper) <= 3 or min(record.frames, record.scenes_per_shard) < 1:
+                raise ValueError("its numbers make no sense")
+        except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
+            if isinstance(error, DamagedFileError):
+                raise
+            raise DamagedFileError(path, f"is no record of a data set ({error})", remedy) from None
+        return record
+
+
+class DatasetFolder:
+    """A data set on disk, finished or still growing: ``DatasetFolder("out/sand")``.
+
+    Scenes that failed and shards that are not finished do not appear in it. It opens files when they are read, in each
+    process its own, so that it can be copied to the workers of a data loader.
+
+    Raises:
+        FileNotFoundError: for a folder that holds no data set.
+        DamagedFileError: for records that are damaged; later, where damaged scenes are read.
+        MissingError: a KeyError, of methods, for a split or a scene that is not there.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        self.record = DatasetRecord.read(self.path)
+        files = [p.name for p in (self.path / "shards").glob("shard_*.json")]
+        matches = [re.fullmatch(r"shard_(\d{5,})\.json", name) for name in sorted(files)]
+        self.finished = [int(m[1]) for m in matches if m]
+        self._scenes = {s.id: (k, s) for k in self.finished for s in self._record(k).scenes}
+        self._cache = _OpenFiles()
+
+    def _record(self, shard: int) -> ShardRecord:
+        return ShardRecord.read(record_path(shard_path(self.path, shard)))
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_cache": _OpenFiles()}
+
+    def scenes(self, split: str | None = None) -> list[SceneRecord]:
+        """The valid scenes of a split, or of all, by id."""
+        return [s for s in self.attempted(split) if s.valid]
+
+    def attempted(self, split: str | None = None) -> list[SceneRecord]:
+        """The same with those that failed."""
+        if split is None:
+            return [self._scenes[k][1] for k in sorted(self._scenes)]
+        if split not in self.record.splits:
+            raise MissingError(f"split must be one of {', '.join(self.record.splits)}, got {split!r}")
+        first, count = self.record.splits[split]
+        return [self._scenes[k][1] for k in range(first, first + count) if k in self._scenes]
+
+    def scene(self, scene_id: int) -> StoredScene:
+        """A valid scene, open for reading."""
+        if scene_id not in self._scenes or not self._scenes[scene_id][1].valid:
+            raise MissingError(f"{self.path} has no finished and valid scene {scene_id}")
+        return self._cache.scene(shard_path(self.path, self._scenes[scene_id][0]), scene_id)
+
+    def motion(self, split: str | None = None) -> Motion:
+        """Sums of the valid scenes of a split, or of all."""
+        zero = Motion(Sums.zero(self.record.dim), Sums.zero(self.record.dim))
+        return functools.reduce(lambda a, b: a + b, (s.motion for s in self.scenes(split) if s.motion), zero)
+
+    def check(self) -> None:
+        """Compare all finished shards with their checksums.
+
+        Raises:
+            DamagedFileError: for one that has changed since it was written.
+        """
+        for index in self.finished:
+            Shard(shard_path(self.path, index), check=True).close()
+
+    def close(self) -> None:
+        """Close its files; reading opens them again."""
+        self._cache.close()
+
+
+def velocity_of(scene: StoredScene, interval: float) -> Array:
+    """Velocities [T, N, D] (m/s) as stored, or differences of the positions of frames ``interval`` [s] apart."""
+    if "velocity" in scene:
+        return scene["velocity"]
+    position = scene["position"]
+    return np.gradient(position, interval, axis=0) if scene.frames > 1 else np.zeros_like(position)
+
+
+class _OpenFiles:
+    """The shards and scenes that this process has read last. A forked process starts with none."""
+
+    def __init__(self) -> None:
+        self._process = os.getpid()
+        self._shards: OrderedDict[Path, Shard] = OrderedDict()
+        self._scenes: OrderedDict[int, StoredScene] = OrderedDict()
+
+    def scene(self, path: Path, scene_id: int) -> StoredScene:
+        if self._process != os.getpid():  # files of the parent are left to it
+            self.__init__()  # type: ignore[misc]
+        if scene_id not in self._scenes:
+            self._scenes[scene_id] = self._shard(path).scene(scene_id)
+        self._scenes.move_to_end(scene_id)
+        while len(self._scenes) > MOST_OPEN:
+            self._scenes.popitem(last=False)
+        return self._scenes[scene_id]
+
+    def _shard(self, path: Path) -> Shard:
+        if path not in self._shards:
+            self._shards[path] = Shard(path)
+        self._shards.move_to_end(path)
+        while len(self._shards) > MOST_OPEN:
+            self._shards.popitem(last=False)[1].close()
+        return self._shards[path]
+
+    def close(self) -> None:
+        for shard in self._shards.values():
+            shard.close()
+        self._shards.clear()
+        self._scenes.clear()

@@ -1,0 +1,204 @@
+"""Generate a data set: shards that are drawn, simulated and written, each of these while the others go on.
+
+What a shard holds follows from the configuration and the number of the shard alone: its scenes are always simulated
+together, with one time step, so it does not matter which process makes it, or when. (On GPUs that is exact where
+``grid.deterministic`` is set.)
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from ..scene import SceneError
+from ..scene.run import versions
+from .claim import Claim, output_errors
+from .configuration import Configuration
+from .folder import DatasetRecord
+from .sampling import NoRoom, content
+from .shard import ShardWriter, prepare_scene, shard_path
+from .shard_simulation import Drawn, Outcome, draw, simulate
+from .workers import take_device, worker
+
+Progress = Callable[[dict[str, Any]], None]
+
+
+def generate(
+    configuration: Configuration,
+    out: str | Path,
+    *,
+    device: str = "auto",
+    check: bool = False,
+    progress: Progress | None = None,
+) -> dict[str, Any]:
+    """Generate what is missing of a data set, together with the other processes that do so.
+
+    Args:
+        configuration: what to generate.
+        out: folder, made where it does not exist.
+        device: "auto", "cpu", "cuda" or "cuda:1"; see `torch_mpm.data.workers.take_device`.
+        check: compare shards that are there with their checksums, and make damaged ones anew.
+        progress: called with a dictionary of figures while frames are computed: scenes and those that failed so far,
+            frames of all scenes so far, and those that were missing at the start.
+
+    Returns:
+        A summary: of this process the scenes, those of them that failed, and seconds; and whether the data set is
+        complete.
+
+    Raises:
+        WorkerError: for a process without a device or a sensible rank.
+        SceneError: for a configuration of which no scene can be made.
+        OutputError: for a folder that holds something else, or a full disk.
+        SimulationError: where the device has no memory for the scenes of a shard.
+    """
+    begin, one = time.perf_counter(), worker()
+    chosen = take_device(device, one)
+    check_samples(configuration)
+    folder = Path(out)
+    record = record_of(configuration, chosen)
+    with Claim(folder, record, configuration.text, one) as claim:
+        line = _Line(configuration, claim, chosen, progress)
+        with output_errors(folder):
+            line.run(check)
+        complete = len(claim.finished()) == record.shards
+    return {**line.totals, "seconds": time.perf_counter() - begin, "complete": complete}
+
+
+def check_samples(configuration: Configuration, count: int = 3) -> None:
+    """Draw the first scenes.
+
+    Raises:
+        SceneError: for what is wrong in one of them, or where there is no room in any.
+    """
+    ids, full = range(min(count, configuration.scenes)), []
+    for scene_id in ids:
+        try:
+            configuration.scene(content(configuration, scene_id))
+        except NoRoom as error:
+            full.append(str(error))
+        except SceneError as error:
+            raise SceneError([f"scene {scene_id}: {p}" for p in error.problems], configuration.source) from None
+    if len(full) == len(ids):
+        raise SceneError(full, configuration.source)
+
+
+def record_of(configuration: Configuration, device: torch.device) -> DatasetRecord:
+    """What dataset.json says of a data set."""
+    dataset, grid = configuration.dataset, configuration.words["grid"]
+    return DatasetRecord(
+        configuration=configuration.hash,
+        seed=dataset.seed,
+        splits=configuration.splits,
+        scenes_per_shard=dataset.scenes_per_shard,
+        frames=dataset.frames,
+        frame_interval=dataset.interval,
+        lower=tuple(map(float, grid["lower"])),
+        upper=tuple(map(float, grid["upper"])),
+        dx=float(grid["dx"]),
+        fields=("position", *dataset.fields),
+        title=configuration.words.get("title", ""),
+        device=device.type,
+        versions={**versions(), "numpy": np.__version__},
+    )
+
+
+class _Line:
+    """One shard is drawn, one simulated and one written at a time, each by a thread of its own."""
+
+    def __init__(
+        self, configuration: Configuration, claim: Claim, device: torch.device, progress: Progress | None
+    ) -> None:
+        self.configuration, self.claim, self.device, self.progress = configuration, claim, device, progress
+        self.totals: dict[str, Any] = {"scenes": 0, "failed": 0, "simulating": 0.0, "waiting": 0.0}
+        self._stream = torch.cuda.Stream(device) if device.type == "cuda" else None
+        self._missing = claim.record.scenes - claim.finished_scenes()
+
+    def run(self, check: bool) -> None:
+        """All shards that nobody else takes."""
+        with ExitStack() as stack:
+            self._drawer, self._writer = (stack.enter_context(ThreadPoolExecutor(1)) for _ in range(2))
+            self._packers = stack.enter_context(ThreadPoolExecutor(len(os.sched_getaffinity(0))))
+            shards = self.claim.unfinished(check)
+            coming: tuple[int, Future[Drawn]] | None = self._next(shards)
+            written: Future[None] | None = None
+            while coming is not None:
+                shard, drawn = coming[0], self._wait(coming[1])
+                coming = self._next(shards)
+                begin = time.perf_counter()
+                simulate(self.configuration, drawn, self.device, self._tell)
+                self.totals["simulating"] += time.perf_counter() - begin
+                if written is not None:
+                    self._wait(written)
+                self.totals["scenes"] += len(drawn.outcomes)
+                self.totals["failed"] += sum(bool(o.failure) for o in drawn.outcomes)
+                written = self._writer.submit(self._write, shard, drawn.outcomes)
+                del drawn
+            if written is not None:
+                self._wait(written)
+
+    def _wait(self, future: Future[Any]) -> Any:
+        begin = time.perf_counter()
+        result = future.result()
+        self.totals["waiting"] += time.perf_counter() - begin
+        return result
+
+    def _next(self, shards: Iterator[int]) -> tuple[int, Future[Drawn]] | None:
+        shard = next(shards, None)
+        return None if shard is None else (shard, self._drawer.submit(self._draw, shard))
+
+    def _draw(self, shard: int) -> Drawn:
+        """Beside what the device is doing, on a stream of its own."""
+        ids = self.configuration.ids(shard)
+        if self.device.type == "cpu":
+            return draw(self.configuration, ids, self.device)
+        torch.cuda.set_device(self.device)
+        assert self._stream is not None
+        with torch.cuda.stream(self._stream):
+            drawn = draw(self.configuration, ids, self.device)
+        self._stream.synchronize()
+        return drawn
+
+    def _tell(self, scenes: int, frame: int) -> None:
+        if self.progress is not None:
+            every = self.configuration.dataset.frames
+            done = self.totals["scenes"] * every + scenes * (frame + 1)
+            self.progress({**self.totals, "frames": done, "missing": self._missing * every})
+
+    # -- writing
+
+    def _write(self, shard: int, outcomes: list[Outcome]) -> None:
+        """Compress the scenes of a shard and write it, beside what the device is doing."""
+        writer = ShardWriter({"shard": shard, "device": _device_name(self.device), **versions()})
+        packed = self._packers.map(lambda o: prepare_scene(o.arrays), outcomes)
+        for outcome, scene in zip(outcomes, packed, strict=True):
+            writer.add(outcome.id, scene, self._attributes(outcome))
+            outcome.arrays = {}
+        with output_errors(self.claim.folder):
+            writer.finish(shard_path(self.claim.folder, shard))
+        self.claim.release(shard)
+
+    def _attributes(self, outcome: Outcome) -> dict[str, str | int | float]:
+        words = {} if outcome.words is None else self.configuration.scene_words(outcome.words)
+        return {
+            "seed": int(words.get("seed", -1)),
+            "scene": json.dumps(words),
+            "materials": json.dumps(outcome.materials),
+            "dt": outcome.dt,
+            "substeps_per_frame": outcome.substeps,
+            "attempts": outcome.attempts,
+            "valid": int(not outcome.failure),
+            "failure": outcome.failure,
+        }
+
+
+def _device_name(device: torch.device) -> str:
+    return torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu"

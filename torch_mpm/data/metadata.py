@@ -1,0 +1,89 @@
+"""``metadata.json`` beside a data set or an export, as the loaders of learned simulators read it.
+
+Two of its words have two meanings. ``sequence_length`` is the number of frames minus one for DeepMind's reader and
+PhysicsNeMo, and the number of frames for geoelements/gns; so it is the first at the top and the second in the blocks
+"train" and "rollout", which gns reads instead and the others ignore.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+from .folder import DatasetError, DatasetFolder
+from .shard import write_whole
+
+METADATA = "metadata.json"
+NEIGHBOURS = 20
+"""Particles within the connectivity radius, where a data set does not choose one."""
+GNS_VELOCITIES, GNS_EMBEDDING = 5, 16
+"""geoelements/gns: velocities that a node sees, and numbers that a particle type becomes."""
+
+
+def metadata(dataset: DatasetFolder, split: str = "train", material: bool = False) -> dict[str, Any]:
+    """What ``metadata.json`` says about a data set.
+
+    Args:
+        dataset: with at least one valid scene.
+        split: whose statistics normalise; all scenes where there is no such split.
+        material: an export of geoelements/gns has a column of a material parameter.
+
+    Raises:
+        DatasetError: for a data set without a valid scene.
+    """
+    record, scenes = dataset.record, dataset.scenes()
+    if not scenes:
+        raise DatasetError(f"{dataset.path} has no valid scene yet")
+    known = split if split in record.splits and dataset.scenes(split) else None
+    motion = dataset.motion(known)
+    words: dict[str, Any] = {
+        "title": record.title,
+        "dim": record.dim,
+        "bounds": [list(pair) for pair in zip(record.lower, record.upper, strict=True)],
+        "sequence_length": record.frames - 1,
+        "dt": record.frame_interval,
+        "dx": record.dx,
+        "default_connectivity_radius": connectivity_radius(dataset),
+        "num_particles_max": max(scene.particles for scene in scenes),
+        "periodic_boundary_conditions": [False] * record.dim,
+        "vel_mean": motion.velocity.mean,
+        "vel_std": motion.velocity.std,
+        "acc_mean": motion.acceleration.mean,
+        "acc_std": motion.acceleration.std,
+        "statistics_of": known or "all splits",
+        "configuration": record.configuration,
+    }
+    block = {**words, "sequence_length": record.frames}
+    if material:
+        block |= {"nnode_in": gns_node_features(record.dim) + 1, "nedge_in": record.dim + 1}
+    return {**words, "train": block, "rollout": block}
+
+
+def gns_node_features(dim: int) -> int:
+    """Numbers per node in geoelements/gns without a material column: velocities, distances to walls, particle type."""
+    return GNS_VELOCITIES * dim + 2 * dim + GNS_EMBEDDING
+
+
+def particle_spacing(dataset: DatasetFolder) -> float:
+    """Distance of neighbours at rest [m]: the side of a cube of the mean rest volume of a particle."""
+    for scene in dataset.scenes():
+        stored = dataset.scene(scene.id)
+        if scene.particles and "volume" in stored:
+            return float(stored["volume"].mean(dtype="f8") ** (1 / dataset.record.dim))
+    return dataset.record.dx / 2
+
+
+def connectivity_radius(dataset: DatasetFolder) -> float:
+    """The radius [m] that the data set chose, or the one within which ``NEIGHBOURS`` particles lie at rest."""
+    if dataset.record.connectivity_radius is not None:
+        return dataset.record.connectivity_radius
+    dim = dataset.record.dim
+    ball = math.pi if dim == 2 else 4 / 3 * math.pi
+    return float(particle_spacing(dataset) * (NEIGHBOURS / ball) ** (1 / dim))
+
+
+def write_metadata(folder: Path, words: dict[str, Any]) -> None:
+    """Write ``metadata.json``; it appears when it is whole and on the disk."""
+    write_whole(folder / METADATA, json.dumps(words, indent=1, allow_nan=False).encode())

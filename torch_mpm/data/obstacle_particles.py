@@ -1,0 +1,98 @@
+"""Particles of obstacles in the scenes of data sets, so that a learned simulator sees them: a layer below the surface.
+
+They move as the obstacle does, have the particle type ``BOUNDARY`` and no mass, and are of no material (-1).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..boundaries import Obstacle
+from ..boundaries.motion import to_body
+from ..scene.places import obstacle
+from .recording import Array
+from .statistics import BOUNDARY
+
+LAYER = 1.5
+"""Thickness of the layer, in distances of particles."""
+NEUTRAL = {"F": 1.0, "J": 1.0}
+"""Fields of what is not deformed: the identity, and one; the others are zero."""
+
+
+def add(arrays: Mapping[str, Array], words: Any, times: Array) -> dict[str, Array]:
+    """The arrays of a scene with the particles of its obstacles behind its own, at the mean distance of these.
+
+    What never moves has no particles outside of the domain.
+
+    Args:
+        arrays: of particles, as a shard has them.
+        words: of the scene, whose obstacles count.
+        times: of the frames [T] [s].
+    """
+    found, grid = dict(arrays), words.grid
+    spacing = float(arrays["volume"].mean()) ** (1 / words.dim)
+    for item in words.obstacle:
+        body = obstacle(item, None)
+        points = _layer(body, spacing, grid.lower, grid.upper)
+        if points is None or not len(points):
+            continue
+        fields = _motion(body, points, times)
+        warm = item.temperature if item.temperature is not None else words.heat.reference if words.heat else 0.0
+        found = {name: _joined(name, value, fields, len(points), spacing, warm) for name, value in found.items()}
+    return found
+
+
+def _layer(body: Obstacle, spacing: float, lower: Any, upper: Any) -> Tensor | None:
+    """Points [n, D] of the layer in coordinates of the body; None where a body has no end and moves."""
+    a, b = (torch.tensor(v, dtype=torch.float64) for v in (lower, upper))
+    first, last = body.shape.bounds(len(a))
+    still = not body.moves
+    if still:  # only what can be seen
+        pose = body.pose(0.0)
+        corners = to_body(pose.rotation, torch.cartesian_prod(*torch.stack([a, b], 1)) - pose.centre)
+        first, last = torch.maximum(first, corners.amin(0)), torch.minimum(last, corners.amax(0))
+    if not bool((first.isfinite() & last.isfinite()).all()) or not bool((first < last).all()):
+        return None
+    axes = [
+        lo + (torch.arange(n, dtype=torch.float64) + 0.5) * (hi - lo) / n
+        for lo, hi in zip(first.tolist(), last.tolist(), strict=True)
+        for n in [max(1, round((hi - lo) / spacing))]
+    ]
+    points = torch.cartesian_prod(*axes)
+    distance = body.shape.surface(points)[0]
+    points = points[(distance <= 0) & (distance >= -LAYER * spacing)]
+    if still:
+        x = points @ pose.rotation.mT + pose.centre
+        points = points[((x >= a) & (x <= b)).all(1)]
+    return points
+
+
+def _motion(body: Obstacle, points: Tensor, times: Array) -> dict[str, Array]:
+    """Positions and velocities [T, n, D]."""
+    x, v = [], []
+    for time in times.tolist():
+        pose = body.pose(time)
+        arm = points @ pose.rotation.mT
+        velocity = body.velocity_at(arm, None, time)
+        x.append(arm + pose.centre)
+        v.append(torch.zeros_like(arm) if velocity is None else velocity.expand_as(arm))
+    return {"position": torch.stack(x).numpy(), "velocity": torch.stack(v).numpy()}
+
+
+def _joined(name: str, values: Array, motion: Mapping[str, Array], count: int, spacing: float, warm: float) -> Array:
+    """An array with rows for ``count`` more particles."""
+    if values.ndim == 1:
+        one = {"particle_type": BOUNDARY, "material": -1, "volume": spacing ** motion["position"].shape[2]}.get(name, 0)
+        rows = np.full(count, one, values.dtype)
+    elif name in motion:
+        rows = motion[name].astype(values.dtype)
+    else:
+        rows = np.full((len(values), count, *values.shape[2:]), warm if name == "temperature" else 0.0, values.dtype)
+        if name in NEUTRAL:
+            rows[...] = np.eye(values.shape[-1]) if name == "F" else 1.0
+    return np.concatenate([values, rows], axis=min(values.ndim - 1, 1))

@@ -1,0 +1,118 @@
+"""Commands that read data sets: ``torch-mpm export DIR --format gns``, render, stats, view."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+from .folder import DATASET, DatasetError
+
+FORMATS = ("gns", "lagrangebench", "neuralmpm", "ply", "tfrecord", "vtk", "well")
+OF_RUNS = ("vtk", "ply")
+
+
+def is_dataset(folder: Path) -> bool:
+    return (folder / DATASET).is_file()
+
+
+def add(commands: Any) -> None:
+    """Add the commands that are for data sets alone, or for looking, to those of the command line."""
+    stats = commands.add_parser("stats", help="draw what is in a data set: sizes, motions, energies, failures")
+    stats.add_argument("folder", type=Path, help="folder of the data set")
+    stats.add_argument("-o", "--out", type=Path, help="the picture; statistics.png in the folder by default")
+    stats.set_defaults(command=_stats)
+
+    view = commands.add_parser("view", help="look at a run or a data set in the browser")
+    view.add_argument("folder", type=Path, help="folder of a run or of a data set")
+    view.add_argument("--port", type=int, default=8080, help="default: %(default)s")
+    view.add_argument("--host", default="127.0.0.1", help="address to listen at; default: %(default)s")
+    view.set_defaults(command=_view)
+
+
+def add_export_options(parser: argparse.ArgumentParser) -> None:
+    help = f"{', '.join(FORMATS)}; of a run {' or '.join(OF_RUNS)}; may be repeated"
+    parser.add_argument("--format", dest="formats", action="append", choices=FORMATS, metavar="FORMAT", help=help)
+    for name in OF_RUNS:
+        parser.add_argument(f"--{name}", dest="formats", action="append_const", const=name, help=f"--format {name}")
+    parser.add_argument("-o", "--out", type=Path, help="folder to make; by default one named after the format in DIR")
+    parser.add_argument("--material", metavar="NAME", help="gns: array [N] of the scenes for the material column")
+    parser.add_argument("--dx", type=float, help="well: size of a cell [m]")
+    _scenes_option(parser, "vtk, ply: scenes; the first by default")
+
+
+def add_render_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("-o", "--out", type=Path, help="data set: folder of the pictures; DIR/pictures by default")
+    parser.add_argument("--color-by", default="speed", metavar="FIELD", help="data set: default: %(default)s")
+    parser.add_argument("--no-video", action="store_true", help="data set: the contact sheet alone")
+    _scenes_option(parser, "data set: scenes; the first six by default")
+
+
+def _scenes_option(parser: argparse.ArgumentParser, text: str) -> None:
+    parser.add_argument("--scenes", type=_numbers, metavar="0,5,7", help=text)
+
+
+def _numbers(text: str) -> list[int]:
+    try:
+        return [int(part) for part in text.split(",")]
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"takes numbers of scenes such as 0,5,7, got {text!r}") from None
+
+
+def export(options: argparse.Namespace) -> None:
+    """Export a data set."""
+    from .. import data
+
+    formats = dict.fromkeys(options.formats or [])
+    if not formats:
+        raise DatasetError(f"export takes --format with one of {', '.join(FORMATS)}")
+    if options.out is not None and len(formats) > 1:
+        raise DatasetError("export takes -o with one format only")
+    for name in formats:
+        more: dict[str, Any] = {"material": options.material} if name == "gns" else {}
+        more |= {"dx": options.dx} if name == "well" else {}
+        more |= {"scenes": options.scenes} if name in OF_RUNS else {}
+        write = getattr(data, f"export_scenes_{name}" if name in OF_RUNS else f"export_{name}")
+        print(write(options.run, options.out, **more))
+
+
+def export_run(options: argparse.Namespace) -> None:
+    """Export a run."""
+    from .export import export_ply, export_vtk
+
+    formats = dict.fromkeys(options.formats or ["vtk"])
+    wrong = [name for name in formats if name not in OF_RUNS]
+    if wrong:
+        raise DatasetError(f"{options.run}: --format {wrong[0]} is for data sets; of a run {' or '.join(OF_RUNS)}")
+    for name in formats:
+        print({"vtk": export_vtk, "ply": export_ply}[name](options.run, options.out))
+
+
+def render(options: argparse.Namespace) -> None:
+    """Draw scenes of a data set."""
+    from .pictures import draw_scenes
+
+    if options.overrides:
+        raise DatasetError("render of a data set takes --color-by, --scenes and --no-video in place of --set")
+    made = draw_scenes(options.run, options.out, options.scenes, options.color_by, video=not options.no_video)
+    print("\n".join(map(str, made)))
+
+
+def _stats(options: argparse.Namespace) -> None:
+    from .figures import draw_statistics, summary
+
+    for name, words in summary(options.folder).items():
+        print(f"{name:>14}  {json.dumps(words)[1:-1]}")
+    print(draw_statistics(options.folder, options.out))
+
+
+def _view(options: argparse.Namespace) -> None:
+    from ..view import Viewer
+
+    viewer = Viewer(options.folder, options.port, options.host)
+    try:
+        print(f"{viewer.url} (Ctrl-C ends it)", flush=True)
+        viewer.wait()
+    finally:
+        viewer.close()

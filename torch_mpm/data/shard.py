@@ -1,0 +1,435 @@
+"""Shards: HDF5 files with the finished scenes of a data set, each beside a record that says what is in it.
+
+A shard is put together in memory and written as plain bytes, because HDF5 cannot handle a full disk. It appears under
+its name only when it is whole and on the disk, and its record after it: a shard without a record does not count.
+
+Layout: one group ``scene_0000000`` per scene, by its id in the data set. ``position`` [T, N, D] and other fields of
+every frame are compressed in chunks of some frames, so that a window of frames is read without the rest. Arrays of one
+dimension, such as ``particle_type`` [N], are stored as they are. A scene that failed has attributes and no arrays.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import math
+import os
+import zlib
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ..errors import DamagedFileError
+from .hdf5 import h5py_module, storage_problem
+from .statistics import Motion, Sums, motion_sums
+
+Array = npt.NDArray[Any]
+Attributes = Mapping[str, str | int | float]
+
+FORMAT = 1
+CHUNK_BYTES = 2**17
+"""Of a chunk before compression, about: a window of some frames reads little more than itself."""
+GZIP_LEVEL = 1
+REMEDY = "remove it and its .json, and generate again"
+
+
+def shard_path(folder: str | Path, index: int) -> Path:
+    """Where shard ``index`` of the data set ``folder`` is."""
+    return Path(folder) / "shards" / f"shard_{index:05d}.h5"
+
+
+def record_path(shard: Path) -> Path:
+    """The record beside a shard."""
+    return shard.with_suffix(".json")
+
+
+def scene_name(scene_id: int) -> str:
+    return f"scene_{scene_id:07d}"
+
+
+# ---- what a scene is made of
+
+
+@dataclass(frozen=True)
+class Compressed:
+    """An array as it lies in the file: chunks of ``chunk_frames`` rows, shuffled by bytes and compressed."""
+
+    shape: tuple[int, ...]
+    dtype: np.dtype[Any]
+    chunk_frames: int
+    chunks: list[bytes]
+
+
+def chunk_frames(shape: tuple[int, ...], dtype: npt.DTypeLike) -> int:
+    """Rows of the first axis that make a chunk."""
+    row = math.prod(shape[1:]) * np.dtype(dtype).itemsize
+    return max(1, min(shape[0], CHUNK_BYTES // max(row, 1)))
+
+
+def compress_chunk(rows: Array, frames: int) -> bytes:
+    """Up to ``frames`` rows as one chunk of a file, filled up with zeros. Other threads run meanwhile."""
+    if len(rows) < frames:
+        rows = np.concatenate([rows, np.zeros((frames - len(rows), *rows.shape[1:]), rows.dtype)])
+    data = np.ascontiguousarray(rows)
+    shuffled = np.ascontiguousarray(data.view(np.uint8).reshape(-1, data.itemsize).T)
+    return zlib.compress(shuffled.data, GZIP_LEVEL)
+
+
+def compress(values: Array) -> Compressed:
+    """An array [T, ...] with at least one element in compressed chunks."""
+    frames = chunk_frames(values.shape, values.dtype)
+    chunks = [compress_chunk(values[k : k + frames], frames) for k in range(0, len(values), frames)]
+    return Compressed(values.shape, values.dtype, frames, chunks)
+
+
+def content_hash(arrays: Mapping[str, Array]) -> str:
+    """SHA-256 of the arrays of a scene: of their names, types, shapes and numbers, however they are stored."""
+    digest = hashlib.sha256()
+    for name in sorted(arrays):
+        values = np.ascontiguousarray(arrays[name])
+        digest.update(f"{name} {values.dtype.str} {values.shape} ".encode())
+        digest.update(hashlib.sha256(values.data).digest())
+    return digest.hexdigest()
+
+
+@dataclass(frozen=True)
+class PreparedScene:
+    """A scene ready to be written: its arrays as they are stored, and what the record says about them."""
+
+    arrays: Mapping[str, Array | Compressed]
+    particles: int
+    hash: str
+    motion: Motion | None
+
+
+def prepare_scene(arrays: Mapping[str, Array]) -> PreparedScene:
+    """Compress, hash and sum up a scene; may run in any thread, and needs no h5py.
+
+    Args:
+        arrays: ``position`` [T, N, D] and the other arrays of the scene; none for a scene that failed.
+
+    Raises:
+        ValueError: for positions that are not finite, or arrays without ``position``.
+    """
+    if not arrays:
+        return PreparedScene({}, 0, content_hash({}), None)
+    if "position" not in arrays or arrays["position"].ndim != 3:
+        raise ValueError(f"arrays must have position [T, N, D], got {', '.join(arrays)}")
+    stored = {name: compress(a) if a.ndim > 1 and a.size else a for name, a in arrays.items()}
+    motion = motion_sums(arrays["position"], arrays.get("particle_type"))
+    return PreparedScene(stored, arrays["position"].shape[1], content_hash(arrays), motion)
+
+
+# ---- records
+
+
+@dataclass(frozen=True)
+class SceneRecord:
+    """What the record of a shard says about a scene; ``motion`` is None for one that failed."""
+
+    id: int
+    valid: bool
+    particles: int
+    hash: str
+    attempts: int
+    failure: str
+    motion: Motion | None
+
+
+@dataclass(frozen=True)
+class ShardRecord:
+    """What the record of a shard says: the size [bytes] and SHA-256 of its file, and its scenes."""
+
+    bytes: int
+    sha256: str
+    scenes: list[SceneRecord]
+
+    def write(self, path: Path) -> None:
+        """Write it to a file, which appears when it is whole and on the disk."""
+        text = json.dumps({"format": FORMAT, **asdict(self)}, indent=1, allow_nan=False)
+        write_whole(path, text.encode())
+
+    @classmethod
+    def read(cls, path: Path) -> ShardRecord:
+        """
+        Raises:
+            FileNotFoundError: for a shard that is not finished.
+            DamagedFileError: for a file that is no record.
+        """
+        data = path.read_bytes()
+        try:
+            words = json.loads(data)
+            if words["format"] != FORMAT:
+                raise DamagedFileError(path, "is not of this version of torch_mpm", REMEDY)
+            scenes = [SceneRecord(**{**s, "motion": _motion(s["motion"])}) for s in words["scenes"]]
+            record = cls(int(words["bytes"]), str(words["sha256"]), scenes)
+        except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
+            if isinstance(error, DamagedFileError):
+                raise
+            raise DamagedFileError(path, f"is no record of a shard ({error})", REMEDY) from None
+        return record
+
+
+def _motion(words: dict[str, Any] | None) -> Motion | None:
+    if words is None:
+        return None
+    sums = {n: Sums(int(s["count"]), tuple(s["sum"]), tuple(s["squares"])) for n, s in words.items()}
+    return Motion(**sums)
+
+
+# ---- writing
+
+
+class ShardWriter:
+    """A shard in memory, to which scenes are added in any order; :meth:`finish` writes it.
+
+    Args:
+        attributes: texts and numbers about the whole shard.
+
+    Raises:
+        ImportError: when h5py is missing (extra ``data``).
+    """
+
+    def __init__(self, attributes: Attributes | None = None) -> None:
+        self._image = io.BytesIO()
+        self._file = h5py_module().File(self._image, "w", libver="v110")
+        self._file.attrs.update({"format": FORMAT, **(attributes or {})})
+        self._scenes: list[SceneRecord] = []
+
+    def add(self, scene_id: int, scene: PreparedScene, attributes: Attributes) -> None:
+        """Add a scene.
+
+        Args:
+            scene_id: its number in the data set.
+            scene: from :func:`prepare_scene`.
+            attributes: must have ``valid`` (0 or 1); ``attempts`` and ``failure`` also go into the record.
+        """
+        group = self._file.create_group(scene_name(scene_id))
+        group.attrs.update({"id": scene_id, **attributes})
+        for name, values in scene.arrays.items():
+            if isinstance(values, Compressed):
+                _write_chunks(group, name, values)
+            else:
+                group.create_dataset(name, data=values)
+        record = SceneRecord(
+            scene_id,
+            bool(attributes["valid"]),
+            scene.particles,
+            scene.hash,
+            int(attributes.get("attempts", 1)),
+            str(attributes.get("failure", "")),
+            scene.motion,
+        )
+        self._scenes.append(record)
+
+    def finish(self, path: Path) -> ShardRecord:
+        """Write the shard to ``path`` and then its record; each appears when it is whole and on the disk.
+
+        Raises:
+            OSError: for a full disk, among others; nothing is left of what did not become whole.
+        """
+        self._file.close()
+        data = self._image.getbuffer()
+        scenes = sorted(self._scenes, key=lambda scene: scene.id)
+        record = ShardRecord(len(data), hashlib.sha256(data).hexdigest(), scenes)
+        write_whole(path, data)
+        record.write(record_path(path))
+        return record
+
+
+def _write_chunks(group: Any, name: str, values: Compressed) -> None:
+    chunk = (values.chunk_frames, *values.shape[1:])
+    options = {"chunks": chunk, "shuffle": True, "compression": "gzip", "compression_opts": GZIP_LEVEL}
+    data = group.create_dataset(name, values.shape, values.dtype, **options)
+    for k, packed in enumerate(values.chunks):
+        data.id.write_direct_chunk((k * values.chunk_frames, *(0,) * (len(chunk) - 1)), packed)
+
+
+def write_whole(path: Path, data: bytes | memoryview) -> None:
+    """Write a file that appears when all of it is on the disk, and stays there.
+
+    Raises:
+        OSError: when it cannot be written; nothing is left of it.
+    """
+    building = path.with_name(f".{path.name}.{os.getpid()}.building")
+    try:
+        with open(building, "wb") as handle:
+            handle.write(data)
+            handle.flush()
+            os.fsync(handle.fileno())
+        building.replace(path)
+    except BaseException:
+        building.unlink(missing_ok=True)
+        raise
+    folder = os.open(path.parent, os.O_RDONLY)
+    try:
+        os.fsync(folder)
+    finally:
+        os.close(folder)
+
+
+def file_hash(path: Path) -> str:
+    """SHA-256 of a file."""
+    digest = hashlib.sha256()
+    with open(path, "rb") as handle:
+        while data := handle.read(1 << 20):
+            digest.update(data)
+    return digest.hexdigest()
+
+
+# ---- reading
+
+
+class StoredScene:
+    """A scene of an open shard. ``scene["position"]`` reads an array, ``scene.window("position", k, 7)`` some frames.
+
+    Attributes:
+        attributes: texts and numbers about the scene.
+        frames, particles, dim: T, N and D; 0 for a scene that failed.
+    """
+
+    def __init__(self, path: Path, group: Any) -> None:
+        self.path, self._group = path, group
+        problem, self.attributes = _scene_problem(group, path.stat().st_size)
+        if problem:
+            raise DamagedFileError(path, f"{group.name[1:]} {problem}", REMEDY)
+        shape: tuple[int, ...] = group["position"].shape if "position" in group else (0, 0, 0)
+        self.frames, self.particles, self.dim = shape
+
+    @property
+    def words(self) -> dict[str, Any]:
+        """The scene file of the scene; nothing where its attributes do not say it."""
+        try:
+            words = json.loads(str(self.attributes.get("scene", "")))
+        except (ValueError, RecursionError):
+            return {}
+        return words if isinstance(words, dict) else {}
+
+    @property
+    def names(self) -> list[str]:
+        """Of its arrays."""
+        return list(self._group)
+
+    def shape(self, name: str) -> tuple[int, ...]:
+        shape: tuple[int, ...] = self._group[name].shape
+        return shape
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._group
+
+    def __getitem__(self, name: str) -> Array:
+        """All of an array. Raises KeyError for one that is not there, DamagedFileError for damaged bytes."""
+        return self._read(name, ...)
+
+    def window(self, name: str, first: int, frames: int) -> Array:
+        """Frames ``first`` to ``first + frames - 1`` of an array [T, ...], without reading the rest of it.
+
+        Raises:
+            IndexError: for frames that the scene does not have.
+            DamagedFileError: for damaged bytes.
+        """
+        if not 0 <= first <= first + frames <= self.frames:
+            raise IndexError(f"frames must be within 0 and {self.frames}, got {first} to {first + frames}")
+        return self._read(name, slice(first, first + frames))
+
+    def _read(self, name: str, part: Any) -> Array:
+        data = self._group[name]
+        try:
+            values: Array = data[part]
+        except (OSError, RuntimeError, ValueError) as error:
+            raise DamagedFileError(self.path, f"{data.name[1:]} cannot be read ({error})", REMEDY) from None
+        return values
+
+
+class Shard:
+    """A finished shard, open for reading; works as a context manager.
+
+    Args:
+        path: the .h5 file.
+        check: compare the whole file with its record first, which reads all of it; otherwise only its size is compared,
+            and damage to compressed arrays is noticed where they are read.
+
+    Raises:
+        FileNotFoundError: for a shard that is not there or not finished.
+        DamagedFileError: for a file that is no shard or is damaged; later, where damaged scenes are read.
+        ImportError: when h5py is missing (extra ``data``).
+    """
+
+    def __init__(self, path: str | Path, check: bool = False) -> None:
+        h5py = h5py_module()
+        self.path = Path(path)
+        self.record = ShardRecord.read(record_path(self.path))
+        if self.path.stat().st_size != self.record.bytes:
+            raise DamagedFileError(self.path, "is not as long as its record says", REMEDY)
+        if check and file_hash(self.path) != self.record.sha256:
+            raise DamagedFileError(self.path, "is damaged: its checksum is wrong", REMEDY)
+        try:
+            self._file = h5py.File(self.path, "r")
+        except (OSError, RuntimeError, ValueError, KeyError) as error:
+            raise DamagedFileError(self.path, f"is not an HDF5 file ({error})", REMEDY) from None
+
+    def __enter__(self) -> Shard:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        self._file.close()
+
+    @property
+    def ids(self) -> list[int]:
+        """Numbers of its scenes, those that failed among them."""
+        return [scene.id for scene in self.record.scenes]
+
+    def scene(self, scene_id: int) -> StoredScene:
+        """
+        Raises:
+            KeyError: for a scene that is not in this shard.
+            DamagedFileError: for one that holds anything but plain arrays of its own.
+        """
+        h5py, name = h5py_module(), scene_name(scene_id)
+        if scene_id not in self.ids:
+            raise KeyError(f"{self.path} has no scene {scene_id}")
+        try:
+            hard = isinstance(self._file.get(name, getlink=True), h5py.HardLink)
+            group = self._file[name] if hard else None
+        except (OSError, RuntimeError, ValueError, KeyError):
+            group = None
+        if not isinstance(group, h5py.Group):
+            raise DamagedFileError(self.path, f"lacks {name}", REMEDY)
+        return StoredScene(self.path, group)
+
+    def __iter__(self) -> Iterator[StoredScene]:
+        return (self.scene(scene_id) for scene_id in self.ids)
+
+
+def _scene_problem(group: Any, size: int) -> tuple[str, dict[str, Any]]:
+    """What keeps a group from being a scene, "" for nothing, and its attributes."""
+    h5py = h5py_module()
+    try:
+        for name in group:
+            hard = isinstance(group.get(name, getlink=True), h5py.HardLink)
+            data = group[name] if hard else None
+            if not isinstance(data, h5py.Dataset) or data.dtype.kind not in "fiu":
+                return f"has {name!r}, which is no array of numbers", {}
+            if problem := storage_problem(h5py, data, size):
+                return f"has {name!r}, {problem}", {}
+        attributes = dict(group.attrs)
+        if not all(isinstance(v, (str, np.integer, np.floating)) for v in attributes.values()):
+            return "has attributes that are neither text nor numbers", {}
+        if "position" in group and group["position"].ndim != 3:
+            return "has positions that are not [T, N, D]", {}
+        if len(group) and "position" not in group:
+            return "has no positions", {}
+    except (OSError, RuntimeError, ValueError, KeyError, TypeError) as error:
+        return f"cannot be read ({error})", {}
+    return "", {name: v if isinstance(v, str) else v.item() for name, v in attributes.items()}

@@ -1,0 +1,186 @@
+"""The scenes of a shard: drawn, seeded and simulated together, and again with smaller time steps where they failed.
+
+All of it follows from the configuration and the ids of the scenes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+
+from ..errors import SimulationError
+from ..scene import SceneError
+from ..scene.build import Built
+from . import batch, obstacle_particles
+from .configuration import Configuration
+from .distribution import Words
+from .recording import Array
+from .sampling import NoRoom, content
+
+Told = Callable[[int, int], None]
+"""What is called with the number of scenes that are simulated and the number of the frame that has been queued."""
+
+
+@dataclass
+class Outcome:
+    """What became of a scene.
+
+    Attributes:
+        id: of the scene.
+        words: what it has of its own; None where nothing could be drawn.
+        failure: why it failed; "" for a scene that is good.
+        attempts: how often it was simulated.
+        dt, substeps: time step [s] and number of them per frame of the last attempt.
+        arrays: of a scene that is good, as a shard has them.
+        materials: words of its materials, in the order of their numbers.
+    """
+
+    id: int
+    words: Words | None = None
+    failure: str = ""
+    attempts: int = 0
+    dt: float = 0.0
+    substeps: int = 0
+    arrays: dict[str, Array] = field(default_factory=dict)
+    materials: list[dict[str, Any]] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """Scenes that are ready to be simulated: what is known of all, and the batch of those that have not failed yet."""
+
+    outcomes: list[Outcome]
+    built: Built | None
+
+    @property
+    def alive(self) -> list[Outcome]:
+        return [o for o in self.outcomes if not o.failure]
+
+
+def draw(configuration: Configuration, ids: Iterable[int], device: torch.device) -> Drawn:
+    """Draw scenes and seed their particles. A scene without room, or that is no good scene, has failed."""
+    outcomes = [Outcome(k) for k in ids]
+    for outcome in outcomes:
+        try:
+            outcome.words = content(configuration, outcome.id)
+        except NoRoom as error:
+            outcome.failure = str(error)
+    return Drawn(outcomes, _built(configuration, outcomes, device))
+
+
+def _built(configuration: Configuration, outcomes: list[Outcome], device: torch.device) -> Built | None:
+    """The batch of all scenes that have not failed; those that cannot be built fail now."""
+    alive = [o for o in outcomes if not o.failure]
+    if not alive:
+        return None
+    try:
+        return _batch(configuration, alive, device)
+    except SceneError:
+        for outcome in alive:
+            try:
+                _batch(configuration, [outcome], torch.device("cpu"))
+            except SceneError as error:
+                outcome.failure = "; ".join(error.problems)
+        if not any(o.failure for o in alive):
+            raise  # each is right, but not all together
+        return _built(configuration, outcomes, device)
+
+
+def _batch(configuration: Configuration, outcomes: list[Outcome], device: torch.device) -> Built:
+    return configuration.scene(*(o.words for o in outcomes if o.words is not None)).build(device)
+
+
+def simulate(configuration: Configuration, drawn: Drawn, device: torch.device, told: Told | None = None) -> None:
+    """Simulate what was drawn; its outcomes tell the rest.
+
+    Raises:
+        SimulationError: where the device has no memory for the scenes.
+    """
+    dataset, built = configuration.dataset, drawn.built
+    if built is None:
+        return
+    count, built = _substeps(configuration, drawn, built, device)
+    rest = drawn.alive
+    for attempt in range(dataset.attempts):
+        if built is None or not rest:
+            return
+        _attempt(configuration, rest, built, count * 2**attempt, told)
+        rest = [o for o in rest if o.failure]
+        if rest and attempt + 1 < dataset.attempts:
+            for outcome in rest:
+                outcome.failure = ""
+            built = _built(configuration, rest, device)
+
+
+def _substeps(
+    configuration: Configuration, drawn: Drawn, built: Built, device: torch.device
+) -> tuple[int, Built | None]:
+    """Substeps per frame of the first attempt, and the batch without scenes that need too many."""
+    words = configuration.words
+    needed = batch.substeps(built, configuration.dataset.interval, float(words.get("cfl", 0.5)), words.get("dt"))
+    most = batch.MOST_SUBSTEPS
+    for outcome, count in zip(drawn.alive, needed, strict=True):
+        if not count <= most:
+            outcome.failure = f"a frame needs {count:.3g} substeps, more than {most}"
+    possible = [count for count in needed if count <= most]
+    if len(possible) < len(needed):
+        return int(max(possible, default=1)), _built(configuration, drawn.outcomes, device)
+    return int(max(possible)), built
+
+
+def _attempt(
+    configuration: Configuration, outcomes: list[Outcome], built: Built, count: int, told: Told | None
+) -> None:
+    """Simulate scenes and keep the arrays of those that are good."""
+    dataset, statics = configuration.dataset, built.statics()
+    names = ("position", *dataset.fields)
+
+    def frame_told(frame: int) -> None:
+        if told is not None:
+            told(len(outcomes), frame)
+
+    try:
+        recorded, failures = batch.simulate(built, names, dataset.frames, dataset.interval, count, frame_told)
+    except torch.OutOfMemoryError as error:
+        raise SimulationError(
+            f"the device has no memory for {len(outcomes)} scenes at once; make dataset.scenes_per_shard smaller"
+        ) from error
+    ends = np.cumsum([0, *batch.particles_of(built)])
+    for index, (outcome, failure) in enumerate(zip(outcomes, failures, strict=True)):
+        outcome.attempts, outcome.failure = outcome.attempts + 1, failure
+        outcome.dt, outcome.substeps = dataset.interval / count, count
+        if not failure:
+            rows = slice(ends[index], ends[index + 1])
+            own = {name: statics[name][rows].numpy() for name in ("mass", "volume", "material")}
+            _complete(configuration, outcome, recorded[index], own, built, index)
+
+
+def _complete(
+    configuration: Configuration, outcome: Outcome, recorded: dict[str, Array], own: dict[str, Array], built: Built,
+    index: int,
+) -> None:  # fmt: skip
+    """Take over the arrays of a scene that is good: fields, types, materials, masses, and particles of obstacles."""
+    dataset = configuration.dataset
+    first = [k for k, m in enumerate(built.materials) if m.scene == index]
+    materials = [built.materials[k] for k in first]
+    types = [configuration.particle_type(m) for m in materials]
+    number = own["material"] - (first[0] if first else 0)
+    outcome.materials = [
+        {"name": m.name, "particle_type": code, **m.words.model_dump(mode="json", exclude_none=True)}
+        for m, code in zip(materials, types, strict=True)
+    ]
+    outcome.arrays = {
+        **recorded,
+        "particle_type": np.array(types, np.int8)[number],
+        "material": number.astype(np.int8),
+        "mass": own["mass"].astype(np.float32),
+        "volume": own["volume"].astype(np.float32),
+    }
+    if dataset.obstacles and outcome.words and outcome.words.get("obstacle"):
+        words = configuration.scene(outcome.words)
+        times = np.arange(dataset.frames) * dataset.interval
+        outcome.arrays = obstacle_particles.add(outcome.arrays, words, times)

@@ -1,0 +1,235 @@
+"""Windows of frames for training: some frames in a row of one scene, and batches of them.
+
+An item is a dictionary: fields [N, T, ...] of the T frames of a window, particles first, what does not change [N], and
+``scene_id`` and ``first``, the scene and its first frame. Batches are packed, [sum N, T, ...] with ``scene`` [sum N],
+or padded, [B, N, T, ...] with ``mask`` [B, N].
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.utils.data import DataLoader, Dataset, IterableDataset, get_worker_info
+
+from ..errors import check_count
+from .folder import DatasetFolder
+
+Item = dict[str, Tensor]
+Collate = Callable[[Sequence[Item]], Item]
+
+
+class WindowDataset(Dataset[Item]):
+    """All windows of the valid scenes of a split, read from the files when they are asked for.
+
+    Args:
+        dataset: folder of the data set.
+        split: name of the split.
+        frames: T of a window, such as 7 for five velocities, the present and the next position.
+        fields: arrays [frames, N, ...] of the scenes to read.
+        constants: arrays [N] of the scenes to read.
+
+    Raises:
+        FileNotFoundError, DamagedFileError: as :class:`DatasetFolder`; the second also where damaged frames are read.
+        KeyError: for a split that is not there, or, where a window is read, for such an array.
+        ValueError: for windows longer than the scenes.
+
+    Works in workers of a data loader, forked or spawned.
+    """
+
+    def __init__(
+        self,
+        dataset: str | Path | DatasetFolder,
+        split: str = "train",
+        frames: int = 7,
+        fields: Sequence[str] = ("position",),
+        constants: Sequence[str] = ("particle_type",),
+    ) -> None:
+        self.dataset = dataset if isinstance(dataset, DatasetFolder) else DatasetFolder(dataset)
+        length = self.dataset.record.frames
+        if not 1 <= check_count("frames", frames) <= length:
+            raise ValueError(f"frames must be within 1 and {length}, the frames of a scene, got {frames}")
+        self.frames, self.fields, self.constants = frames, tuple(fields), tuple(constants)
+        self.scene_ids = [scene.id for scene in self.dataset.scenes(split)]
+        self.windows_per_scene = length - frames + 1
+
+    def __len__(self) -> int:
+        return len(self.scene_ids) * self.windows_per_scene
+
+    def __getitem__(self, index: int) -> Item:
+        if not -len(self) <= index < len(self):
+            raise IndexError(f"index must be within {-len(self)} and {len(self) - 1}, got {index}")
+        place, first = divmod(int(index) % len(self), self.windows_per_scene)
+        scene = self.dataset.scene(self.scene_ids[place])
+        item = {name: particles_first(scene.window(name, first, self.frames)) for name in self.fields}
+        item |= {name: torch.from_numpy(scene[name]) for name in self.constants}
+        return item | {"scene_id": torch.tensor(self.scene_ids[place]), "first": torch.tensor(first)}
+
+
+def particles_first(window: Any) -> Tensor:
+    """[T, N, ...] to [N, T, ...]."""
+    return torch.from_numpy(window).transpose(0, 1)
+
+
+# ---- batches
+
+
+def pack(items: Sequence[Item]) -> Item:
+    """Particles of all items behind one another: [sum N, ...], with ``scene`` int64 [sum N], the item of each particle.
+
+    ``scene_id`` and ``first`` are [B].
+    """
+    counts = [_count(item) for item in items]
+    scene = torch.repeat_interleave(torch.arange(len(items)), torch.tensor(counts))
+    batch = {
+        name: torch.stack(values) if values[0].dim() == 0 else torch.cat(values) for name, values in _columns(items)
+    }
+    return batch | {"scene": scene.to(_device(items[0]), non_blocking=True)}
+
+
+def pad(items: Sequence[Item]) -> Item:
+    """Items of N particles at most, filled up with zeros: [B, N, ...], with ``mask`` [B, N], true where a particle is.
+
+    ``scene_id`` and ``first`` are [B].
+    """
+    counts = torch.tensor([_count(item) for item in items])
+    most = int(counts.max())
+
+    def padded(values: list[Tensor]) -> Tensor:
+        if values[0].dim() == 0:
+            return torch.stack(values)
+        out = values[0].new_zeros(len(values), most, *values[0].shape[1:])
+        for row, value in zip(out, values, strict=True):
+            row[: len(value)] = value
+        return out
+
+    batch = {name: padded(values) for name, values in _columns(items)}
+    return batch | {"mask": (torch.arange(most) < counts[:, None]).to(_device(items[0]), non_blocking=True)}
+
+
+def _count(item: Item) -> int:
+    return next((len(value) for value in item.values() if value.dim()), 0)
+
+
+def _device(item: Item) -> torch.device:
+    return next(value.device for value in item.values() if value.dim())
+
+
+def _columns(items: Sequence[Item]) -> Iterator[tuple[str, list[Tensor]]]:
+    return ((name, [item[name] for item in items]) for name in items[0])
+
+
+# ---- order
+
+
+def rank_and_world() -> tuple[int, int]:
+    """Of torch.distributed where it is in use; (0, 1) otherwise."""
+    distributed = torch.distributed
+    if distributed.is_available() and distributed.is_initialized():
+        return distributed.get_rank(), distributed.get_world_size()
+    return 0, 1
+
+
+class WindowStream(IterableDataset[Item]):
+    """Batches of windows, epoch after epoch without end, in an order that depends on the seed alone.
+
+    Each rank has its share of every epoch, the same number of batches for each; what does not fill a batch on every
+    rank is left out of that epoch. Workers share the batches of their rank, in the same order for any number of them:
+
+        stream = WindowStream(WindowDataset("out/sand"), batch_size=8, seed=1)
+        for batch in stream.loader(num_workers=2):
+            ...
+            torch.save(stream.state_dict(), "order.pt")  # the batches that were taken, not those read ahead
+
+    Args:
+        windows: a map dataset, such as a `WindowDataset`.
+        batch_size: windows of a batch.
+        seed: of the order; None leaves the windows in theirs.
+        collate: `pack`, `pad`, or a function of your own of a list of items.
+        rank, world: this process among those that train together; those of torch.distributed by default.
+
+    Raises:
+        ValueError: where there is no batch for every rank.
+    """
+
+    def __init__(
+        self,
+        windows: Dataset[Item],
+        batch_size: int,
+        *,
+        seed: int | None = 0,
+        collate: Collate = pack,
+        rank: int | None = None,
+        world: int | None = None,
+    ) -> None:
+        here, of = rank_and_world()
+        self.windows, self.seed, self.collate = windows, seed, collate
+        self.batch_size = check_count("batch_size", batch_size, 1)
+        self.rank, self.world = here if rank is None else rank, of if world is None else world
+        if not 0 <= self.rank < self.world:
+            raise ValueError(f"rank must be within 0 and {self.world - 1}, got {self.rank}")
+        self.length = len(windows)  # type: ignore[arg-type]
+        self.batches_per_epoch = self.length // (batch_size * self.world)
+        if not self.batches_per_epoch:
+            raise ValueError(
+                f"batch_size must be at most {self.length // self.world}, the windows of each rank, got {batch_size}"
+            )
+        self.taken = 0
+        self._permutation: tuple[int, Any] = (-1, None)
+
+    def __iter__(self) -> Iterator[Item]:
+        """The batches of this worker; where there are no workers they count as taken."""
+        info = get_worker_info()
+        worker, workers = (info.id, info.num_workers) if info else (0, 1)
+        for number in itertools.count(self.taken + worker, workers):
+            batch = self.collate([self.windows[int(k)] for k in self._indices(number)])
+            if not info:
+                self.taken = number + 1
+            yield batch
+
+    def loader(self, num_workers: int = 0, **options: Any) -> Iterator[Item]:
+        """The batches from the first that was not taken on, read by ``num_workers`` processes.
+
+        ``options`` are those of `torch.utils.data.DataLoader`, such as ``pin_memory`` and ``multiprocessing_context``.
+        """
+        for batch in DataLoader(self, batch_size=None, num_workers=num_workers, **options):
+            if num_workers:
+                self.taken += 1
+            yield batch
+
+    def state_dict(self) -> dict[str, Any]:
+        """Where this stream stands; goes on from there after `load_state_dict`, with any number of workers."""
+        return {"taken": self.taken, **self._order()}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on where another stream stood.
+
+        Raises:
+            ValueError: for one of another order: data, seed, size of a batch or number of ranks.
+        """
+        different = [name for name, value in self._order().items() if state.get(name) != value]
+        if different:
+            raise ValueError(f"state is of a stream with another {', '.join(different)}")
+        self.taken = check_count("taken", state["taken"])
+
+    def _order(self) -> dict[str, Any]:
+        return {"seed": self.seed, "batch_size": self.batch_size, "world": self.world, "length": self.length}
+
+    def _indices(self, number: int) -> Any:
+        """The windows of batch ``number`` of this rank, counted over all epochs."""
+        epoch, batch = divmod(number, self.batches_per_epoch)
+        first = (batch * self.world + self.rank) * self.batch_size
+        return self._epoch(epoch)[first : first + self.batch_size]
+
+    def _epoch(self, epoch: int) -> Any:
+        if self.seed is None:
+            return range(self.length)
+        if self._permutation[0] != epoch:
+            rng = np.random.Generator(np.random.Philox(np.random.SeedSequence([self.seed, epoch])))
+            self._permutation = (epoch, rng.permutation(self.length))
+        return self._permutation[1]
