@@ -200,6 +200,16 @@ class Configuration:
         """
         return Scene.from_words(self.scene_words(*contents), folder=self.folder, source=self.source)
 
+    @property
+    def drawn_parameters(self) -> list[str]:
+        """Names of the parameters of materials that differ between scenes."""
+        names = set()
+        for material in self.words.get("material", {}).values():
+            names |= {key for key, value in material.items() if distribution.is_distribution(value)}
+            for chosen in material.get(distribution.CHOICE, []):
+                names |= {key for key, value in chosen.items() if value is not None}
+        return sorted(names - {distribution.CHOICE, distribution.WEIGHTS})
+
     def particle_type(self, material: Any) -> int:
         """DeepMind's code for a material (`scene.build.Material`)."""
         return self.dataset.particle_type.get(material.name, PARTICLE_TYPES.get(material.words.law, GOOP))
