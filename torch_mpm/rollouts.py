@@ -166,7 +166,7 @@ def _motion(obstacle: Any) -> list[Tensor]:
 
 def _differentiable(step: Step, state: State) -> list[Tensor]:
     """What `substeps` has gradients for."""
-    fields = (state.x, state.v, state.mass, state.volume, state.C, state.F, state.J, *state.extra.values())
+    fields = (state.x, state.v, state.mass, state.volume, state.C, state.F, state.J, *state.extra.values(), state.impulse)
     gravity = [step.gravity] if isinstance(step.gravity, Tensor) else []
     return [*(t for t in fields if t is not None), *gravity, *step.law.parameters(), *step.law.buffers()]
 
@@ -183,7 +183,7 @@ def substeps(step: Step, state: State, n: int, dt: float) -> State:
     max_blocks = grid.pool(state.x, state.scene)
     calls = _law_calls(step, state, dt)
     apic = step.transfer == "apic"
-    x, v, C, F, J, history, status = dispatch(
+    x, v, C, F, J, history, status, impulse = dispatch(
         torch.ops.torch_mpm.substeps,
         *(state.x, state.v, state.mass, state.volume, state.C, state.F, state.J),
         [state.extra[name] for _, _, names in calls for name in names],
@@ -196,14 +196,14 @@ def substeps(step: Step, state: State, n: int, dt: float) -> State:
         _gravity(step, state.x),
         *wall_arguments(step.walls, grid),
         *obstacle_arguments(step.boundaries.entries, state.x, grid.scenes),
-        *(float(state.time), grid.scenes, max_blocks, grid.grows, *grid.packed),
+        *(float(state.time), grid.scenes, max_blocks, grid.grows, state.impulse, *grid.packed),
     )
     record.status = status
     grid.watch(status)
     if status.device.type == "cpu":  # where the op has let the pool grow, or stopped
         grid.follow(int(status[0, 0] if grid.grows else status[0, 7]))
     extra = _history(state, calls, history)
-    return state.replace(x=x, v=v, C=C, F=F, J=J, extra=extra, time=time_after(state.time, dt, n))
+    return state.replace(x=x, v=v, C=C, F=F, J=J, extra=extra, time=time_after(state.time, dt, n), impulse=impulse)
 
 
 def _law_calls(step: Step, state: State, dt: float) -> list[LawCall]:

@@ -3,6 +3,7 @@
 #include <string>
 
 #include "grid/activate.op.h"
+#include "grid/impulse.op.h"
 #include "grid/obstacle.op.h"
 #include "grid/walls.op.h"
 #include "laws/law.op.h"
@@ -18,7 +19,8 @@ namespace mpm {
   "scene, Tensor? ids, Tensor? material, Tensor? previous_status, str laws, int[] options, Tensor[] parameters, "  \
   "int[] variables, int n, float dt, bool apic, bool wants_C, int stress_form, Tensor? gravity, " MPM_WALLS_SCHEMA \
   ", Tensor? obstacles, Tensor? data, int[] shape, int[] sizes, int[] contact, int[] obstacle_scene, "             \
-  "float[] start, float[] end, float time, int scenes, int max_blocks, bool grows, " MPM_LATTICE_SCHEMA
+  "float[] start, float[] end, float time, int scenes, int max_blocks, bool grows, Tensor? "                       \
+  "impulse, " MPM_LATTICE_SCHEMA
 #define MPM_SUBSTEPS_PARAMETERS                                                                                        \
   const Tensor &x, const Tensor &v, const Tensor &mass, const Tensor &volume, const OptionalTensor &C,                 \
       const OptionalTensor &F, const OptionalTensor &J, const Tensors &history, const OptionalTensor &scene,           \
@@ -29,11 +31,11 @@ namespace mpm {
       const OptionalTensor &obstacle_table, const OptionalTensor &obstacle_data, std::vector<int64_t> shape,           \
       std::vector<int64_t> sizes, std::vector<int64_t> contact_kind, std::vector<int64_t> obstacle_scene,              \
       std::vector<double> start, std::vector<double> end, double time, int64_t scenes, int64_t max_blocks, bool grows, \
-      const std::vector<double>&lattice, const std::vector<int64_t>&layout
+      const OptionalTensor &impulse, const std::vector<double>&lattice, const std::vector<int64_t>&layout
 #define MPM_SUBSTEPS_ARGUMENTS                                                                                         \
   x, v, mass, volume, C, F, J, history, scene, ids, material, previous_status, laws, options, parameters, variables,   \
       n, dt, apic, wants_C, stress_form, gravity, wall_kind, wall_plane, wall_friction, obstacle_table, obstacle_data, \
-      shape, sizes, contact_kind, obstacle_scene, start, end, time, scenes, max_blocks, grows,                         \
+      shape, sizes, contact_kind, obstacle_scene, start, end, time, scenes, max_blocks, grows, impulse,                \
       PackedLattice(lattice, layout)
 
 // The arguments of a call.
@@ -59,6 +61,7 @@ struct SubstepsInputs {
   double time;
   int64_t scenes, max_blocks;
   bool grows;
+  OptionalTensor impulse;
   PackedLattice lattice;
 };
 
@@ -209,8 +212,9 @@ struct Substeps {
   G2PAdvanceArguments<T, D> advance;
   Pool<T, D> pool;
   Tensor stress, step_time;
-  Tensor drifts;                 // one for each of two substeps in turn, where activations last
-  NextGridArguments<T, D> next;  // of these; its update and contact are those here
+  Tensor drifts;                  // one for each of two substeps in turn, where activations last
+  NextGridArguments<T, D> next;   // of these; its update and contact are those here
+  Tensor impulse, impulse_slots;  // on obstacles and walls so far; where someone asks, see `count_impulses`
   bool obstacles = false, fused = false;
   const int* previous_status = nullptr;
 
@@ -278,7 +282,7 @@ struct Substeps {
     torch::stable::zero_(drifts);
     p2g.drifted = true;
     next.particles = in.x.size(0);
-    next.obstacles = obstacles;
+    next.obstacles = obstacles && !impulse.defined();  // whose impulses want the velocities before contact
     const int64_t most = std::min<int64_t>(update.block_count, INT32_MAX / kBlockNodes<D>) - activation.max_blocks;
     activation.margin_blocks = int(std::clamp<int64_t>(activation.max_blocks / 2 + 64, 0, std::max<int64_t>(most, 0)));
   }
@@ -325,6 +329,15 @@ struct Substeps {
       calls[0].law->kernels<T, D>().p2g(laws[0], p2g, stream);
     else
       backend::p2g(in.lattice.order(), p2g, stream);
+    if (impulse.defined() && !in.wall_kind.empty()) backend::wall_impulses(wall_impulses(), stream);
+    update_grid(stream);
+    if (!obstacles || next.obstacles) return;
+    if (impulse.defined()) backend::contact_impulses(contact_impulses(), stream);
+    backend::contact(contact, stream);
+  }
+
+  // On CUDA, where activations last, perhaps with contact.
+  void update_grid(backend::Stream stream) {
 #if MPM_BACKEND == MPM_BACKEND_IS_cuda
     if (drifts.defined()) {
       next.update = update;
@@ -333,7 +346,26 @@ struct Substeps {
     }
 #endif
     backend::grid_update(update, stream);
-    if (obstacles) backend::contact(contact, stream);
+  }
+
+  // From now on the impulses on obstacles, and then on the faces of the domain, are added to `sums`.
+  void add_impulses_to(const Tensor& sums) {
+    check_shape(sums, "impulse", impulse_shape());
+    check_type(sums, "impulse", ScalarType::Double, in.x);
+    impulse = sums;
+  }
+
+  Shape impulse_shape() const { return {in.scenes, int64_t(in.shape.size()) + 2 * D, kImpulse<D>}; }
+
+  // Of some of these boundaries.
+  ImpulseArguments<D> impulses(int64_t first, int64_t count) {
+    return impulse_arguments<D>(in.lattice, impulse, first, count, activation.slots(), impulse_slots);
+  }
+
+  WallImpulsesArguments<T, D> wall_impulses() { return {update, impulses(int64_t(in.shape.size()), 2 * D)}; }
+
+  ContactImpulsesArguments<T, D> contact_impulses() {
+    return {contact, reinterpret_cast<const T*>(update.updated), 1 + D, impulses(0, int64_t(in.shape.size()))};
   }
 
   void make_pool(backend::Stream stream);
@@ -400,8 +432,10 @@ Substeps<T, D>::Substeps(const SubstepsInputs& inputs) : in(inputs) {
 // For the arguments' number of blocks.
 template <class T, int D>
 void Substeps<T, D>::make_pool(backend::Stream stream) {
-  const bool apart = obstacles && !drifts.defined();  // contact from the grid update
+  const bool apart = obstacles && !next.obstacles;  // contact from the grid update
   pool.make(in.x, activation, apart, stream);
+  if (impulse.defined() && (MPM_BACKEND == MPM_BACKEND_IS_cpu || in.lattice.deterministic()))
+    impulse_slots = empty(in.x, {activation.slots() + in.scenes, impulse_shape()[1] * kImpulse<D>}, ScalarType::Double);
   const Topology<T, D> topology = topology_of(activation);
   p2g.topology = advance.gather.topology = topology;
   p2g.nodes = {static_cast<T*>(pool.nodes.data_ptr()), 1 + D, 1 + D};

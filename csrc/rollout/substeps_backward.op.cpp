@@ -52,7 +52,8 @@ enum Need : int64_t { kMass = 1, kVolume = 2, kParameters_ = 4, kGravity = 8 };
 template <class T, int D>
 class SubstepsBackward {
  public:
-  SubstepsBackward(const SubstepsInputs& in, int64_t needs, backend::Stream stream);
+  // `grad_impulse` is the adjoint of the impulses at the end, or nothing.
+  SubstepsBackward(const SubstepsInputs& in, const OptionalTensor& grad_impulse, int64_t needs, backend::Stream stream);
 
   int64_t columns() const { return s_.columns; }  // of the history of all laws
   int64_t blocks() const { return s_.update.block_count; }
@@ -141,7 +142,13 @@ class SubstepsBackward {
     backend::accumulate(a, stream_);
   }
 
+  // The adjoint of the impulses on some boundaries.
+  ImpulseArguments<D> impulses(int64_t first, int64_t count) const {
+    return impulse_gradient<D>(in_.lattice, *grad_impulse_, first, count, s_.impulse_shape(), in_.x);
+  }
+
   const SubstepsInputs& in_;
+  OptionalTensor grad_impulse_;
   backend::Stream stream_;
   Substeps<T, D> s_;
   bool mls_;  // F and J move with the affine field, which is recorded then
@@ -155,8 +162,14 @@ class SubstepsBackward {
 };
 
 template <class T, int D>
-SubstepsBackward<T, D>::SubstepsBackward(const SubstepsInputs& in, int64_t needs, backend::Stream stream)
-    : in_(in), stream_(stream), s_(in), mls_(s_.p2g.form == StressForm::mls), time_{in.time} {
+SubstepsBackward<T, D>::SubstepsBackward(const SubstepsInputs& in, const OptionalTensor& grad_impulse, int64_t needs,
+                                         backend::Stream stream)
+    : in_(in),
+      grad_impulse_(grad_impulse),
+      stream_(stream),
+      s_(in),
+      mls_(s_.p2g.form == StressForm::mls),
+      time_{in.time} {
   while (int64_t(time_.size()) < in.n) time_.push_back(time_.back() + in.dt);
   first_history_ = packed_history(in.x, in.history, s_.columns);
   first_ = given_particles<T, D>(in, first_history_);
@@ -268,12 +281,22 @@ void SubstepsBackward<T, D>::leave_grid(Adjoints& adjoints, const Tensor& gravit
     ContactArguments<T, D> contact = s_.contact;
     contact.grad = nodes + 1;
     contact.grad_stride = 1 + D;
-    backend::contact_backward(contact, stream_);
+    if (has(grad_impulse_)) {
+      const T* const mass = reinterpret_cast<const T*>(s_.update.updated);
+      backend::contact_impulses_backward(
+          ContactImpulsesArguments<T, D>{contact, mass, 1 + D, impulses(0, int64_t(in_.shape.size()))}, stream_);
+    } else {
+      backend::contact_backward(contact, stream_);
+    }
     update.grad_updated = reinterpret_cast<const NodeRow<T, D>*>(contact.result);
   }
   update.grad_nodes = s_.update.updated;
   if (gravity.defined()) update.change = static_cast<Vector<T, D>*>(change_.data_ptr());
-  backend::grid_update_backward(update, stream_);
+  if (has(grad_impulse_) && !in_.wall_kind.empty())
+    backend::wall_impulses_backward(
+        WallImpulsesBackwardArguments<T, D>{update, impulses(int64_t(in_.shape.size()), 2 * D)}, stream_);
+  else
+    backend::grid_update_backward(update, stream_);
   if (gravity.defined())
     backend::accumulate_slots(
         AccumulateSlotsArguments<T, D>{s_.update.max_blocks, s_.update.block_count, s_.update.block,
@@ -336,8 +359,8 @@ void set(Tensor& adjoint, const OptionalTensor& grad, const char* name, const Te
 
 std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> substeps_backward(
     const OptionalTensor& grad_x, const OptionalTensor& grad_v, const OptionalTensor& grad_C,
-    const OptionalTensor& grad_F, const OptionalTensor& grad_J, const OptionalTensor& grad_history, int64_t needs,
-    MPM_SUBSTEPS_PARAMETERS) {
+    const OptionalTensor& grad_F, const OptionalTensor& grad_J, const OptionalTensor& grad_history,
+    const OptionalTensor& grad_impulse, int64_t needs, MPM_SUBSTEPS_PARAMETERS) {
   const SubstepsInputs in{MPM_SUBSTEPS_ARGUMENTS};
   check_positions(x);
   const int64_t P = x.size(0);
@@ -345,7 +368,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tenso
   Tensor gravity_sum;
   const DeviceScope device(x);
   dispatch(x, [&]<class T, int D>() {
-    SubstepsBackward<T, D> backward(in, needs, device.stream());
+    SubstepsBackward<T, D> backward(in, grad_impulse, needs, device.stream());
     adjoints.x = empty_particles(x, {P, D});
     adjoints.v = empty_particles(x, {P, D});
     adjoints.C = empty_particles(x, {P, D, D});
@@ -377,7 +400,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tenso
 STABLE_TORCH_LIBRARY_FRAGMENT(torch_mpm, m) {
   m.def(
       "substeps_backward(Tensor? grad_x, Tensor? grad_v, Tensor? grad_C, Tensor? grad_F, Tensor? grad_J, "
-      "Tensor? grad_history, int needs, " MPM_SUBSTEPS_SCHEMA
+      "Tensor? grad_history, Tensor? grad_impulse, int needs, " MPM_SUBSTEPS_SCHEMA
       ") -> (Tensor x, Tensor v, Tensor C, Tensor F, Tensor J, Tensor history, Tensor mass, Tensor volume, "
       "Tensor parameters, Tensor gravity)");
 }
