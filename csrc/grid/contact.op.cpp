@@ -92,7 +92,7 @@ Tensor contact_impulses(const Tensor& mass, MPM_CONTACT_PARAMETERS) {
 }
 
 // Rows [adjoint of the mass, that of the velocity]; `rows` as in the adjoint of contact.
-std::tuple<Tensor, Tensor> contact_impulses_backward(const Tensor& grad, bool wants_rows, const Tensor& mass,
+std::tuple<Tensor, Tensor> contact_impulses_backward(const Tensor& grad_impulse, bool wants_rows, const Tensor& mass,
                                                      MPM_CONTACT_PARAMETERS) {
   const DeviceScope device(velocity);
   check_velocity(velocity);
@@ -107,7 +107,7 @@ std::tuple<Tensor, Tensor> contact_impulses_backward(const Tensor& grad, bool wa
     c.result = static_cast<T*>(grad_nodes.data_ptr());
     rows = empty(velocity, {wants_rows ? c.max_blocks : 0, c.obstacles, ObstacleRow<T, D>::width});
     if (wants_rows) c.row_grad = static_cast<T*>(rows.data_ptr());
-    a.impulse = impulse_gradient<D>(PackedLattice(lattice, layout), grad, 0, c.obstacles,
+    a.impulse = impulse_gradient<D>(PackedLattice(lattice, layout), grad_impulse, 0, c.obstacles,
                                     {scenes, c.obstacles, kImpulse<D>}, velocity);
     backend::contact_impulses_backward(a, device.stream());
   });
@@ -122,7 +122,7 @@ STABLE_TORCH_LIBRARY_FRAGMENT(torch_mpm, m) {
   m.def("contact(" MPM_CONTACT_SCHEMA ") -> Tensor");
   m.def("contact_backward(Tensor grad, bool wants_rows, " MPM_CONTACT_SCHEMA ") -> (Tensor velocity, Tensor rows)");
   m.def("contact_impulses(Tensor mass, " MPM_CONTACT_SCHEMA ") -> Tensor");
-  m.def("contact_impulses_backward(Tensor grad, bool wants_rows, Tensor mass, " MPM_CONTACT_SCHEMA
+  m.def("contact_impulses_backward(Tensor grad_impulse, bool wants_rows, Tensor mass, " MPM_CONTACT_SCHEMA
         ") -> (Tensor nodes, Tensor rows)");
 }
 #endif

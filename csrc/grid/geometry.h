@@ -4,7 +4,6 @@
 #include <cstdint>
 
 #include "common/bspline.h"
-#include "common/matrix.h"
 
 // The node lattice of one scene: node i of an axis lies at lower + (i - padding) dx. Blocks are 4 nodes wide.
 namespace mpm {
@@ -120,20 +119,6 @@ MPM_HD int node_in_block(const int node[D]) {
   MPM_UNROLL for (int i = 0; i < D; i++)
     r = r * kBlockWidth + (node[i] & (kBlockWidth - 1));
   return r;
-}
-
-// Lattice index along an axis of a node of the block whose first node has the indices `corner`, the last axis fastest.
-template <int D>
-MPM_HD int lattice_index(const int corner[D], int axis, int local) {
-  return corner[axis] + ((local >> 2 * (D - 1 - axis)) & (kBlockWidth - 1));  // kBlockWidth is 4
-}
-
-template <int D>
-MPM_HD Vector<int, D> lattice_node(const int corner[D], int local) {
-  Vector<int, D> node;
-  MPM_UNROLL for (int i = 0; i < D; i++)
-    node[i] = lattice_index<D>(corner, i, local);
-  return node;
 }
 
 }  // namespace TORCH_MPM_ISA

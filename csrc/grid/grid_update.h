@@ -7,6 +7,7 @@
 #include "grid/friction.h"
 #include "grid/geometry.h"
 #include "grid/impulse.h"
+#include "grid/lattice_node.h"
 
 // Node momentum to node velocity, gravity and the walls of the domain.
 //
@@ -313,7 +314,8 @@ MPM_HD NodeRow<T, D> update_node_backward(const GridUpdateBackwardArguments<T, D
   const NodeRow<T, D> free = free_node(a, s, local, row);
   if (free.mass == T(0)) return result;
   Vector<T, D> sum = zero_vector<T, D>();  // adjoint of the free velocity
-  // Of a node that has the free velocity, reflected by `sign`.
+  // Of a node that has the free velocity, reflected by `sign`: first the node itself, which may be its own image, too.
+  bool itself = true;
   const auto add_member = [&](int64_t member, const Vector<T, D>& sign, const Vector<int, D>& node) {
     auto own = impulses(s.scene, member);
     Vector<T, D> grad = b.grad_updated[member].value, v, direct;
@@ -323,9 +325,10 @@ MPM_HD NodeRow<T, D> update_node_backward(const GridUpdateBackwardArguments<T, D
     if constexpr (decltype(own)::wanted) {
       if (s.mirrored) {
         grad = mirrors_adjoint(a.walls, node, s.gravity, v, grad, own, direct);
-        if (member == index) result.value = direct;
+        if (itself) result.value = direct;
       }
-      if (member == index) result.mass += own.mass_grad;
+      if (itself) result.mass += own.mass_grad;
+      itself = false;
     }
     MPM_UNROLL for (int i = 0; i < D; i++)
       sum[i] += sign[i] * grad[i];

@@ -129,7 +129,8 @@ Tensor wall_impulses(MPM_GRID_UPDATE_PARAMETERS) {
 }
 
 // `change` as in the adjoint of the grid update.
-std::tuple<Tensor, Tensor> wall_impulses_backward(const Tensor& grad, bool wants_change, MPM_GRID_UPDATE_PARAMETERS) {
+std::tuple<Tensor, Tensor> wall_impulses_backward(const Tensor& grad_impulse, bool wants_change,
+                                                  MPM_GRID_UPDATE_PARAMETERS) {
   check_nodes(nodes);
   const DeviceScope device(nodes);
   const Tensor packed = packed_rows(nodes), grad_updated = zeros(packed, {packed.size(0), packed.size(1)});
@@ -142,7 +143,7 @@ std::tuple<Tensor, Tensor> wall_impulses_backward(const Tensor& grad, bool wants
     a.update.grad_nodes = static_cast<NodeRow<T, D>*>(grad_nodes.data_ptr());
     change = empty(nodes, {wants_change ? a.update.forward.max_blocks : 0, D});
     if (wants_change) a.update.change = static_cast<Vector<T, D>*>(change.data_ptr());
-    a.impulse = impulse_gradient<D>(PackedLattice(lattice, layout), grad, 0, 2 * D,
+    a.impulse = impulse_gradient<D>(PackedLattice(lattice, layout), grad_impulse, 0, 2 * D,
                                     {scenes_of(a.update.forward), 2 * D, kImpulse<D>}, nodes);
     backend::wall_impulses_backward(a, device.stream());
   });
@@ -158,7 +159,7 @@ STABLE_TORCH_LIBRARY_FRAGMENT(torch_mpm, m) {
   m.def("grid_update_backward(Tensor grad, bool wants_change, " MPM_GRID_UPDATE_SCHEMA
         ") -> (Tensor nodes, Tensor change)");
   m.def("wall_impulses(" MPM_GRID_UPDATE_SCHEMA ") -> Tensor");
-  m.def("wall_impulses_backward(Tensor grad, bool wants_change, " MPM_GRID_UPDATE_SCHEMA
+  m.def("wall_impulses_backward(Tensor grad_impulse, bool wants_change, " MPM_GRID_UPDATE_SCHEMA
         ") -> (Tensor nodes, Tensor change)");
 }
 #endif

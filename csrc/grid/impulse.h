@@ -2,8 +2,7 @@
 
 #include <cstdint>
 
-#include "common/matrix.h"
-#include "grid/geometry.h"
+#include "grid/lattice_node.h"
 
 // The impulse that the material gives a boundary: at each node that a wall or obstacle slows down, mass times the
 // velocity that it takes. Of each boundary of each scene there are D numbers, the sum of these [N s], and then that of

@@ -6,6 +6,7 @@
 #include "grid/friction.h"
 #include "grid/geometry.h"
 #include "grid/impulse.h"
+#include "grid/lattice_node.h"
 
 // Rigid obstacles: which nodes are inside, the velocity of those after contact, and its adjoints.
 namespace mpm {

@@ -127,7 +127,7 @@ def _wall_fake(nodes, *arguments):
 
 
 @torch.library.register_fake("torch_mpm::wall_impulses_backward")
-def _wall_backward_fake(grad, wants_change, nodes, *arguments):
+def _wall_backward_fake(grad_impulse, wants_change, nodes, *arguments):
     slots = sizes(Topology.unpack(*arguments[-3:]).block, "block", 1)[0] if wants_change else 0
     return nodes.new_empty(nodes.shape), nodes.new_empty(slots, sizes(nodes, "nodes", 2)[1] - 1)
 
@@ -140,7 +140,7 @@ def _contact_fake(mass, velocity, obstacles, *arguments):
 
 
 @torch.library.register_fake("torch_mpm::contact_impulses_backward")
-def _contact_backward_fake(grad, wants_rows, mass, velocity, obstacles, *arguments):
+def _contact_backward_fake(grad_impulse, wants_rows, mass, velocity, obstacles, *arguments):
     N, D = sizes(velocity, "velocity", 2)
     _, count, width = sizes(obstacles, "obstacles", 3)
     return velocity.new_empty(N, 1 + D), velocity.new_empty(N // 4**D if wants_rows else 0, count, width)
