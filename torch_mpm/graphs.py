@@ -128,10 +128,11 @@ def replayed(step: Step, state: State, n: int, dt: float) -> State:
 
 
 class _Latest(threading.local):
-    """The latest graph of a thread on each stream: the next one there runs after it, and takes the same memory."""
+    """For each stream of a thread, the one that graphs for it are captured on, and the latest of these graphs: the next
+    one runs after it, and takes the same memory, which the allocator gives to the same stream alone."""
 
     def __init__(self) -> None:
-        self.graphs: dict[tuple[torch.device, int], torch.cuda.CUDAGraph] = {}
+        self.captures: dict[tuple[torch.device, int], tuple[torch.cuda.Stream, torch.cuda.CUDAGraph | None]] = {}
 
 
 _LATEST = _Latest()
@@ -147,9 +148,9 @@ class _Replays:
         self.state = self.state.replace(material=state.material, scene=state.scene, ids=state.ids, impulse=impulse)
         self._graph = torch.cuda.CUDAGraph()
         device = state.x.device
-        now, aside = torch.cuda.current_stream(device), torch.cuda.Stream(device)
+        now = torch.cuda.current_stream(device)
         place = device, now.cuda_stream
-        latest = _LATEST.graphs.get(place)
+        aside, latest = _LATEST.captures.get(place) or (torch.cuda.Stream(device), None)
         aside.wait_stream(now)
         with torch.cuda.stream(aside):
             # Other threads may go on meanwhile.
@@ -157,7 +158,7 @@ class _Replays:
             self._graph.capture_begin(pool, capture_error_mode="thread_local")
             self._record(step, dt)
         now.wait_stream(aside)
-        _LATEST.graphs[place] = self._graph
+        _LATEST.captures[place] = aside, self._graph
 
     def _record(self, step: Step, dt: float) -> None:
         try:
