@@ -15,7 +15,6 @@ from .grid import Blocks, Grid
 NO_PROBLEM = (0, 0, -1, 0, -1, 0, -1, 0)
 """A row of the status before the first activation (csrc/grid/status.h)."""
 
-
 class ActivationRecord:
     """The status of all activations of one user of a grid, also of those that CUDA graphs replay.
 
@@ -89,3 +88,14 @@ class ActivationRecord:
         with torch.inference_mode():
             for kept in self._replayed:
                 kept.copy_(torch.tensor(NO_PROBLEM, dtype=torch.int32, device="cpu"))
+
+    def forget(self, scenes: Tensor) -> None:
+        """Problems of scenes, bool [B], and those that are counted of all scenes together."""
+        if self.refused is not None:
+            self.refused.masked_fill_(scenes, 0)
+        with torch.inference_mode():
+            for status in self.all():
+                status[1:].masked_fill_(scenes[:, None], 0)
+                status[1:, 2:7:2].masked_fill_(scenes[:, None], -1)  # as NO_PROBLEM
+                status[0, 1:4:2].masked_fill_(scenes.any(), 0)
+                status[0, 2:7:2].masked_fill_(scenes.any(), -1)

@@ -60,12 +60,12 @@ def obstacle_to_replays(step: Any, state: State, dt: float | Tensor) -> str | No
         return "there are hooks"
     if step.heat is not None and step.heat.method == "multigrid":
         return "multigrid does all of its iterations in a graph"
-    if state.x.dtype != torch.float64 and any(_looks_at_time(b) for b in step.boundaries):
+    if state.x.dtype != torch.float64 and any(looks_at_time(b) for b in step.boundaries):
         return f"obstacles would look at a time in {str(state.x.dtype).removeprefix('torch.')}"
     return _foreign(step, state.x.device, [])
 
 
-def _looks_at_time(boundary: Any) -> bool:
+def looks_at_time(boundary: Any) -> bool:
     return not isinstance(boundary, Obstacle) or boundary.moves or boundary.start != 0 or boundary.end != math.inf
 
 

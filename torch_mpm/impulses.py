@@ -5,8 +5,7 @@
     on = step.impulses(end)
     on[paddle].linear                             # [B, D] [N s], by the boundary itself or its place in the list
     on["-y"].about((0.5, 0.2))                    # on the lower face of the axis y, moment about a point [N m s]
-    on[paddle].linear / (100 * 1e-4)              # mean force [N]
-    on - step.impulses(state)                     # of an interval
+    force = (on - step.impulses(state)) / (100 * 1e-4)    # mean forces [N] and torques [N m] of an interval
 
 They are exact: what boundaries and walls take and what gravity gives is the change of the momentum of the particles, to
 rounding; so too for the angular momentum, where the transfer keeps it. They are read where the boundaries act, between
@@ -81,6 +80,11 @@ class Impulses:
     def __sub__(self, earlier: Impulses) -> Impulses:
         """Those from an earlier state on."""
         return Impulses(self.values - earlier.values, self.boundaries)
+
+    def __truediv__(self, seconds: float | Tensor) -> Impulses:
+        """Mean forces [N] and torques [N m] over a time [s], a number or [B]."""
+        over = seconds.reshape(-1, 1, 1) if isinstance(seconds, Tensor) else seconds
+        return Impulses(self.values / over, self.boundaries)
 
     @property
     def total(self) -> Tensor:

@@ -66,7 +66,8 @@ class State:
         C: affine velocity field [P, D, D] [1/s].
         F: deformation gradient [P, D, D]; for laws that need only its determinant,
         J: volume ratio [P].
-        scene: scene of each particle, int32 [P]; None for one scene.
+        scene: scene of each particle, int32 [P]; None for one scene. A particle of scene -1 is absent: it takes part in
+            nothing, and stays where it is without a velocity.
         ids: stable identity of each particle, int64 [P], set once particles are reordered; 0 .. P − 1 in some order
             where parameters are given per particle.
         material: law of each particle, int32 [P], for a `Mixture`.

@@ -355,6 +355,12 @@ class Step(TensorModule):
         if self.heat is not None:
             self.heat.reset()
 
+    def forget_failures(self, scenes: Tensor) -> None:
+        """Forget the problems of scenes, bool [B] on the device of the particles, which is not waited for."""
+        self._activations.forget(scenes)
+        if self.heat is not None:
+            self.heat.forget(scenes)
+
 
 def _argument(step: Step, name: str, value: Any) -> Any:
     """An argument of a `Step` in the form that the step keeps.
