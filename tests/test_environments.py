@@ -155,7 +155,7 @@ def test_control_by_poses_and_forces(device):
     with pytest.raises(ValueError, match="impulses must be counted"):
         envs.forces()
     envs.count_impulses()
-    for k in range(3):
+    for _ in range(3):
         paddle.position = paddle.position + torch.tensor([[0.0, 0.01 * b] for b in range(3)], dtype=F64, device=device)
         before = envs.state.impulse.clone()
         envs.advance(N, DT)
@@ -213,6 +213,8 @@ def test_errors(device):
         mpm.Environments(step, [one(0, device)])
     with pytest.raises(ValueError, match=r"states\[1\] must have at most 16 particles"):
         mpm.Environments(step, [one(0, device), one(3, device)], room=16)
+    with pytest.raises(ValueError, match="states must have at least one particle each"):
+        mpm.Environments(step, [one(0, device), one(0, device).select(torch.arange(0, device=device))])
     with pytest.raises(TypeError, match="step must be a Step"):
         mpm.Environments(step.law, [one(0, device)] * 2)
     envs = mpm.Environments(step, [one(0, device), one(1, device)])
@@ -220,7 +222,7 @@ def test_errors(device):
         envs.reset([0, 1], [one(0, device)])
     with pytest.raises(ValueError, match=r"a mask of scenes must have shape \[B\] = \[2\], got \[3\]"):
         envs.reset(torch.ones(3, dtype=torch.bool, device=device))
-    with pytest.raises(ValueError, match="states must be torch.float64"):
+    with pytest.raises(ValueError, match=r"states must be torch\.float64"):
         envs.reset([0], [one(0, device).to(dtype=torch.float32)])
     with pytest.raises(ValueError, match="states must have no material"):
         envs.reset([0], [one(0, device).replace(material=torch.zeros(len(one(0)), dtype=torch.int32, device=device))])

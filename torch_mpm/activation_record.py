@@ -15,6 +15,7 @@ from .grid import Blocks, Grid
 NO_PROBLEM = (0, 0, -1, 0, -1, 0, -1, 0)
 """A row of the status before the first activation (csrc/grid/status.h)."""
 
+
 class ActivationRecord:
     """The status of all activations of one user of a grid, also of those that CUDA graphs replay.
 

@@ -1,4 +1,4 @@
-"""A batch as environments: scenes that run side by side, each with a clock of its own, and each of which may be replaced.
+"""A batch as environments: scenes side by side, each with a clock of its own, and each of which may be replaced.
 
     envs = mpm.Environments(step, [scene() for _ in range(1024)])    # step.grid.scenes = 1024
     for k in range(steps):
@@ -112,7 +112,8 @@ class Environments:
         """Packed scenes with the number of each, or those of an index [n], as the scene of its particles."""
         own = torch.arange(len(self), dtype=torch.int32, device=packed.x.device)
         own = (own if index is None else own[index]).repeat_interleave(self.room)
-        return packed.replace(scene=torch.where(packed.scene == ABSENT, ABSENT, own))  # type: ignore[arg-type]
+        assert packed.scene is not None
+        return packed.replace(scene=torch.where(packed.scene == ABSENT, ABSENT, own))
 
     # -- running
 
@@ -200,7 +201,8 @@ class Environments:
 
     def _rows(self, value: Any) -> Tensor:
         """A field [n R, ...] as [n, R, ...]."""
-        return value.unflatten(0, (-1, self.room))  # type: ignore[no-any-return]
+        rows: Tensor = value.unflatten(0, (-1, self.room))
+        return rows
 
     @property
     def present(self) -> Tensor:
@@ -261,10 +263,10 @@ class Environments:
 
         if k is None:
             clocks = {"time": self.time, f"extra.{FROZEN}": self.frozen.int().repeat_interleave(self.room)}
-            tensors, record = tensors_of(self.state) | clocks, {}
+            tensors, record = tensors_of(self.state) | clocks, {"time": 0.0}
         else:
             one = self.scene(k)
-            tensors, record = tensors_of(one), {"time": one.time}
+            tensors, record = tensors_of(one), {"time": float(one.time)}
         save(Path(path), {name: t.cpu() for name, t in tensors.items()}, record)
 
     @torch.no_grad()
@@ -277,7 +279,7 @@ class Environments:
         """
         from .scene.checkpoint import load
 
-        state, _ = load(Path(path), self.time.device)
+        state, _ = load(Path(path), self.time.device, "save the environments anew")
         frozen = state.extra.pop(FROZEN, None)
         if k is not None:
             if frozen is not None:
@@ -301,28 +303,24 @@ def _is_mask(which: Any) -> bool:
 
 def _in_room(state: State, room: int) -> State:
     """With absent particles at the end, which stand where the first one does."""
-    count, missing = len(state), room - len(state)
+    count = len(state)
     if count == 0:
         raise ValueError("states must have at least one particle each, got none")
-    scene = torch.zeros(count, dtype=torch.int32, device=state.x.device)
-    rows = torch.cat([torch.arange(count), torch.zeros(missing, dtype=torch.int64)]).to(scene.device)
-    there = (torch.arange(room) < count).to(scene.device)
-    padded = state.replace(scene=scene).select(rows)
-    zero = there[:, None].to(state.x.dtype)
+    rows = torch.arange(room, device=state.x.device)
+    there = rows < count
+    padded = state.select(torch.where(there, rows, 0))
     return padded.replace(
-        v=padded.v * zero,
-        volume=padded.volume * zero[:, 0],
+        v=torch.where(there[:, None], padded.v, 0.0),
+        volume=torch.where(there, padded.volume, 0.0),
         mass=torch.where(there, padded.mass, 1.0),
-        scene=torch.where(there, padded.scene, ABSENT),
+        scene=torch.where(there, 0, ABSENT).int(),
     )
 
 
 def _pairs(state: State, given: State) -> list[tuple[str, Tensor, Tensor]]:
     """The fields of two states of the same kind by name."""
     if (given.x.dtype, given.x.device) != (state.x.dtype, state.x.device):
-        raise ValueError(
-            f"states must be {state.x.dtype} on {state.x.device}, got {given.x.dtype} on {given.x.device}"
-        )
+        raise ValueError(f"states must be {state.x.dtype} on {state.x.device}, got {given.x.dtype} on {given.x.device}")
     old, new = ({name: getattr(s, name) for name in PARTICLE_FIELDS} | s.extra for s in (state, given))
     for name in dict.fromkeys([*old, *new]):
         if (old.get(name) is None) != (new.get(name) is None):

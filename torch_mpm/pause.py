@@ -30,7 +30,7 @@ def paused(
     dt, moving, refused = split_paused(dt, state, scenes)
     record.refuse(refused, scenes)
     after = standing(state, advanced(state, dt), moving)
-    if after.impulse is None:
+    if after.impulse is None or state.impulse is None:
         return after
     return after.replace(impulse=torch.where((dt > 0).reshape(-1, 1, 1), after.impulse, state.impulse))
 
@@ -78,4 +78,6 @@ def standing(before: State, after: State, moving: Tensor) -> State:
         return torch.where(rows, new, torch.zeros_like(new) if old is None else old)
 
     extra = {name: field(before.extra.get(name), new) for name, new in after.extra.items()}
-    return after.replace(**{name: field(getattr(before, name), getattr(after, name)) for name in PARTICLE_FIELDS}, extra=extra)
+    return after.replace(
+        **{name: field(getattr(before, name), getattr(after, name)) for name in PARTICLE_FIELDS}, extra=extra
+    )

@@ -166,7 +166,17 @@ def _motion(obstacle: Any) -> list[Tensor]:
 
 def _differentiable(step: Step, state: State) -> list[Tensor]:
     """What `substeps` has gradients for."""
-    fields = (state.x, state.v, state.mass, state.volume, state.C, state.F, state.J, *state.extra.values(), state.impulse)
+    fields = (
+        state.x,
+        state.v,
+        state.mass,
+        state.volume,
+        state.C,
+        state.F,
+        state.J,
+        *state.extra.values(),
+        state.impulse,
+    )
     gravity = [step.gravity] if isinstance(step.gravity, Tensor) else []
     return [*(t for t in fields if t is not None), *gravity, *step.law.parameters(), *step.law.buffers()]
 

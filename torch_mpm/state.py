@@ -78,8 +78,8 @@ class State:
         impulse: of the material on each boundary of the step and then on each face of the domain, added up over steps
             [B, K + 2 D, D + 1 or 3] [N s, N m s], float64; see `torch_mpm.impulses`.
 
-    All floating tensors of the particles have one dtype and device. Any strides work; those that the ops return keep the particle index
-    contiguous, which is fastest.
+    All floating tensors of the particles have one dtype and device. Any strides work; those that the ops return keep
+    the particle index contiguous, which is fastest.
     """
 
     x: Tensor

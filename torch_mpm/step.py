@@ -172,7 +172,7 @@ class Step(TensorModule):
         if self._flip_share:  # positions move with the grid all the same, so that FLIP's noise does not reach them
             v, impulse = self._blend_flip(blocks, state, affine, velocity, v, impulse)
         changes: dict[str, Any] = {**fields, "F": F, "J": J}
-        if state.impulse is not None:
+        if state.impulse is not None and impulse is not None:
             changes["impulse"] = state.impulse + impulse
         if self.heat is not None:
             motion = C if form == "mls" else g2p(blocks, state.x, velocity, affine=False, gradient=True)[2]

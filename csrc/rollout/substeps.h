@@ -349,11 +349,7 @@ struct Substeps {
   }
 
   // From now on the impulses on obstacles, and then on the faces of the domain, are added to `sums`.
-  void add_impulses_to(const Tensor& sums) {
-    check_shape(sums, "impulse", impulse_shape());
-    check_type(sums, "impulse", ScalarType::Double, in.x);
-    impulse = sums;
-  }
+  void add_impulses_to(const Tensor& sums) { impulse = sums; }
 
   Shape impulse_shape() const { return {in.scenes, int64_t(in.shape.size()) + 2 * D, kImpulse<D>}; }
 
@@ -425,6 +421,10 @@ Substeps<T, D>::Substeps(const SubstepsInputs& inputs) : in(inputs) {
   if (obstacles)
     contact = obstacle_arguments<T, D>(x, in.lattice, *in.obstacle_table, in.obstacle_data.value(), in.shape, in.sizes,
                                        in.contact_kind, in.obstacle_scene, in.start, in.end, {}, in.time);
+  if (has(in.impulse)) {
+    check_shape(*in.impulse, "impulse", impulse_shape());
+    check_type(*in.impulse, "impulse", ScalarType::Double, x);
+  }
   advance.gather.moment_scale = in.lattice.inverse_inertia();
   advance.gather.lost = NAN;
 }

@@ -44,7 +44,7 @@ def composed_grid_update(
     velocity = torch.where(heavy, momentum, 0) / torch.where(heavy, summed, 1)
     if see is not None:
         _see_mirrors(faces, blocks, torch.where(heavy, own - mass * velocity, 0), see)
-    velocity = _act(faces, blocks, velocity, None if see is None else lambda face, change: see(face, -mass * change))
+    velocity = _act(faces, blocks, velocity, mass, see)
     return torch.cat([mass, torch.where(heavy, velocity, 0)], 1)
 
 
@@ -81,12 +81,12 @@ def _see_mirrors(faces: Sequence[Face], blocks: Topology, momentum: Tensor, see:
     }
     for axis, unit in enumerate(torch.eye(momentum.shape[1], dtype=torch.bool, device=momentum.device)):
         free = torch.ones_like(node[:, 0], dtype=torch.bool)
-        for number in sorted(near, key=lambda number, axis=axis: (number // 2 != axis, number)):
+        for number in [n for n in near if n // 2 == axis] + [n for n in near if n // 2 != axis]:
             see(number, torch.where((near[number] & free)[:, None] & unit, momentum, 0))
             free = free & ~near[number]
 
 
-def _act(faces: Sequence[Face], blocks: Topology, velocity: Tensor, see: See | None) -> Tensor:
+def _act(faces: Sequence[Face], blocks: Topology, velocity: Tensor, mass: Tensor, see: See | None) -> Tensor:
     position = blocks.node_positions(torch.float64)
     axes = torch.eye(velocity.shape[1], dtype=velocity.dtype, device=velocity.device)
     for number, face in enumerate(faces):
@@ -97,6 +97,6 @@ def _act(faces: Sequence[Face], blocks: Topology, velocity: Tensor, see: See | N
         touching = torch.where(beyond, velocity, 0)
         change = contact_change(touching, sign * axes[axis], face.kind, face.friction)
         if see is not None:
-            see(number, change)
+            see(number, -mass * change)
         velocity = velocity + change
     return velocity

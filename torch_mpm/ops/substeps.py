@@ -9,11 +9,12 @@ Particles and their history are those of `State`, the grid's arguments those of 
 `contact`. `laws` are names of `LAWS` parted by commas, law k for the particles of material k; their options,
 parameters and history variables follow one another, `variables` of the latter for each law. The time step dt [s] is
 part of the parameters of laws that flow in time. Results that a call does not have are None; `history` has the entries
-of all laws side by side, [P, m]. The impulses on obstacles and walls are added to `impulse`, where it is given. With `grows` the pool follows the scene on the CPU; otherwise the op stops there where
-the pool is full, and the status tells. On CUDA nothing is waited for.
+of all laws side by side, [P, m]. The impulses on obstacles and walls are added to `impulse`, where it is given. With
+`grows` the pool follows the scene on the CPU; otherwise the op stops there where it is full, and the status tells.
+On CUDA nothing is waited for.
 
-Differentiable once, with respect to x, v, mass, volume, C, F, J, history, parameters, gravity and impulse. Autograd keeps the
-arguments of a call, no more: 2 D + 2 D² numbers per particle of a solid (24 in 3-D) and its history.
+Differentiable once, with respect to x, v, mass, volume, C, F, J, history, parameters, gravity and impulse. Autograd
+keeps the arguments of a call, no more: 2 D + 2 D² numbers per particle of a solid (24 in 3-D) and its history.
 
     torch.ops.torch_mpm.substeps_backward(grad_x, grad_v, grad_C, grad_F, grad_J, grad_history, grad_impulse, needs,
         *arguments of substeps) -> (x, v, C, F, J, history, mass, volume, parameters, gravity)
