@@ -226,6 +226,8 @@ def test_errors(device):
         envs.reset([0], [one(0, device).to(dtype=torch.float32)])
     with pytest.raises(ValueError, match="states must have no material"):
         envs.reset([0], [one(0, device).replace(material=torch.zeros(len(one(0)), dtype=torch.int32, device=device))])
+    with pytest.raises(ValueError, match=r"scenes must be from 0 to 1, got \[2\]"):
+        envs.reset([2])
     with pytest.raises(ValueError, match="name must be that of a field"):
         envs.observe("colour")
     with pytest.raises(ValueError, match="k must be a scene from 0 to 1"):

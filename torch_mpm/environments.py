@@ -111,7 +111,7 @@ class Environments:
     def _placed(self, packed: State, index: Tensor | None = None) -> State:
         """Packed scenes with the number of each, or those of an index [n], as the scene of its particles."""
         own = torch.arange(len(self), dtype=torch.int32, device=packed.x.device)
-        own = (own if index is None else own[index]).repeat_interleave(self.room)
+        own = (own if index is None else own[index])[:, None].expand(-1, self.room).reshape(-1)
         assert packed.scene is not None
         return packed.replace(scene=torch.where(packed.scene == ABSENT, ABSENT, own))
 
@@ -126,7 +126,7 @@ class Environments:
         state = self.state
         if any(looks_at_time(boundary) for boundary in self.step.boundaries):
             state = state.replace(time=self.time)
-        elapsed = torch.as_tensor(dt, dtype=torch.float64, device=self.time.device).expand(len(self))
+        elapsed = dt.double() if isinstance(dt, Tensor) else torch.full_like(self.time, dt)
         elapsed = torch.where(self.frozen | ~(elapsed > 0), 0.0, n * elapsed)
         impulse = state.impulse
         self.state = rollout(self.step, state, n, dt).replace(time=0.0)
@@ -162,7 +162,7 @@ class Environments:
             TypeError, ValueError: for states without room, or another number of them.
         """
         mask = self._mask(which)
-        index = None if _is_mask(which) else torch.as_tensor(which, device=mask.device).reshape(-1).long()
+        index = None if _is_mask(which) else self._index(which)
         given = self.first if states is None else states if isinstance(states, State) else self.pack(states)
         if index is not None and states is None:
             given = given.select(_rows_of(index, self.room))
@@ -190,12 +190,19 @@ class Environments:
 
     def _mask(self, which: Any) -> Tensor:
         """bool [B]."""
-        which = torch.as_tensor(which, device=self.time.device)
         if _is_mask(which):
             if which.shape != self.time.shape:
                 raise ValueError(f"a mask of scenes must have shape [B] = [{len(self)}], got {shape_of(which)}")
             return which
-        return torch.zeros_like(self.frozen).index_fill_(0, which.reshape(-1).long(), True)
+        return torch.zeros_like(self.frozen).index_fill_(0, self._index(which), True)
+
+    def _index(self, which: Any) -> Tensor:
+        """Scenes, int64 [n]; numbers go to a device without waiting for it."""
+        if not isinstance(which, Tensor):
+            which = torch.tensor(which, dtype=torch.int64)
+            if which.numel() and not (0 <= int(which.min()) and int(which.max()) < len(self)):
+                raise ValueError(f"scenes must be from 0 to {len(self) - 1}, got {which.tolist()}")
+        return which.reshape(-1).to(self.time.device, torch.int64, non_blocking=True)
 
     # -- looking
 
