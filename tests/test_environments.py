@@ -127,6 +127,7 @@ def test_clocks_of_moving_obstacles(device):
     paddle = mpm.Box((0.5, 0.0), (0.2, 0.2), velocity=(0.0, 5.0), end=2.5 * N * DT)
     step = step_of(3, device, boundaries=[paddle])
     envs = mpm.Environments(step, [one(0, device)] * 3)
+    assert step.explain(envs.state.replace(time=envs.time), DT) == "all steps in one op"
     envs.count_impulses()
     envs.advance(N, DT)
     envs.reset([1])

@@ -69,11 +69,11 @@ class ActivationRecord:
         return problems
 
     @torch.no_grad()
-    def refuse(self, entries: Tensor, scenes: int) -> None:
-        """Count entries of a tensor dt that could not be taken: bool of shape [], [1] or [B]."""
+    def refuse(self, entries: Tensor, scenes: int, steps: int = 1) -> None:
+        """Count entries of a tensor dt that could not be taken in some steps: bool of shape [], [1] or [B]."""
         refused = self.counts(scenes, entries.device)
         with outside_transforms():
-            refused += without_transforms(entries)
+            refused += steps * without_transforms(entries)
 
     def counts(self, scenes: int, device: torch.device) -> Tensor:
         """`refused`, made at the first tensor dt."""

@@ -119,13 +119,10 @@ class Environments:
 
     @torch.no_grad()
     def advance(self, n: int, dt: float | Tensor) -> None:
-        """Take n steps of dt [s], a number or a tensor [B]; see `rollout`. Frozen scenes stand still.
-
-        The steps are taken in one op where dt is a number and no boundary looks at the time of its scene.
-        """
+        """Take n steps of dt [s], a number or a tensor [B]; see `rollout`. Frozen scenes stand still."""
         state = self.state
         if any(looks_at_time(boundary) for boundary in self.step.boundaries):
-            state = state.replace(time=self.time)
+            state = state.replace(time=self.time.to(state.x.dtype))
         elapsed = dt.double() if isinstance(dt, Tensor) else torch.full_like(self.time, dt)
         elapsed = torch.where(self.frozen | ~(elapsed > 0), 0.0, n * elapsed)
         impulse = state.impulse

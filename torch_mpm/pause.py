@@ -20,15 +20,17 @@ def paused(
     state: State,
     dt: float | Tensor,
     scenes: int,
+    steps: int = 1,
 ) -> State:
-    """`advanced(state, dt)`, but for the scenes that a tensor dt pauses; `record` counts the entries it refuses."""
+    """`advanced(state, dt)`, but for the scenes that a tensor dt pauses; `record` counts the entries it refuses, once
+    for each of the steps that `advanced` takes."""
     if not isinstance(dt, Tensor):
         return advanced(state, dt)
     if _all_move(dt):
         record.counts(scenes, dt.device)  # that a compiled step finds it
         return advanced(state, dt)
     dt, moving, refused = split_paused(dt, state, scenes)
-    record.refuse(refused, scenes)
+    record.refuse(refused, scenes, steps)
     after = standing(state, advanced(state, dt), moving)
     if after.impulse is None or state.impulse is None:
         return after

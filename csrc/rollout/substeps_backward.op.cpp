@@ -86,6 +86,7 @@ class SubstepsBackward {
   // Of obstacles. On CUDA the statuses count it.
   void set_time(int64_t i) {
     if (MPM_BACKEND == MPM_BACKEND_IS_cpu) s_.contact.time = time_[i];
+    if (scene_times_.defined()) s_.contact.scene_time = scene_time(i);
   }
 
   int* status(int64_t i) const { return static_cast<int*>(status_.data_ptr()) + i * status_.stride(0); }
@@ -142,6 +143,19 @@ class SubstepsBackward {
     backend::accumulate(a, stream_);
   }
 
+  T* scene_time(int64_t i) const { return static_cast<T*>(scene_times_.data_ptr()) + i * in_.scenes; }
+
+  // The times of each scene at all steps.
+  void make_scene_times() {
+    scene_times_ = empty(in_.x, {in_.n, in_.scenes});
+    s_.contact.times = int(in_.scenes);
+    for (int64_t i = 0; i < in_.n; i++) {
+      Tensor now = torch::stable::select(scene_times_, 0, i);
+      torch::stable::copy_(now, i == 0 ? *in_.scene_time : torch::stable::select(scene_times_, 0, i - 1));
+      if (i > 0) s_.add_dt(scene_time(i), stream_);
+    }
+  }
+
   // The adjoint of the impulses on some boundaries.
   ImpulseArguments<D> impulses(int64_t first, int64_t count) const {
     return impulse_gradient<D>(in_.lattice, *grad_impulse_, first, count, s_.impulse_shape(), in_.x);
@@ -153,7 +167,7 @@ class SubstepsBackward {
   Substeps<T, D> s_;
   bool mls_;  // F and J move with the affine field, which is recorded then
   std::vector<double> time_;
-  Tensor first_history_, status_;
+  Tensor first_history_, status_, scene_times_;
   Particles<const T> first_;
   Record<T> x_, v_, C_, F_, J_, history_, stress_, mapped_;
   Adjoints by_advance_, by_g2p_, by_p2g_, by_laws_;
@@ -175,6 +189,7 @@ SubstepsBackward<T, D>::SubstepsBackward(const SubstepsInputs& in, const Optiona
   first_ = given_particles<T, D>(in, first_history_);
   s_.make_pool(stream);
   s_.count_time(nullptr, stream_);
+  if (has(in.scene_time)) make_scene_times();
   make_records();
   make_terms(needs);
 }
@@ -241,6 +256,9 @@ void SubstepsBackward<T, D>::leave_advance(int64_t i, Adjoints& adjoints) {
   a.forward.F = s_.advance.F;
   a.forward.J = s_.advance.J;
   a.forward.dt = in_.dt;
+  set_scene(a.forward, in_.scene, in_.x);
+  a.forward.scene_dt = s_.p2g.scene_dt;
+  a.forward.scenes = in_.scenes;
   a.grad_x = field<const T>(adjoints.x);
   a.grad_F = field<const T>(adjoints.F);
   a.grad_J = field<const T>(adjoints.J);

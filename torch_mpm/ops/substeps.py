@@ -3,15 +3,17 @@
     torch.ops.torch_mpm.substeps(x, v, mass, volume, C, F, J, history, scene, ids, material, previous_status, laws,
         options, parameters, variables, n, dt, apic, wants_C, stress_form, gravity, wall_kind, wall_plane,
         wall_friction, obstacles, data, shape, sizes, contact, obstacle_scene, start, end, time, scenes,
-        max_blocks, grows, impulse, lattice, layout) -> (x, v, C, F, J, history, status, impulse)
+        max_blocks, grows, impulse, scene_dt, scene_time, lattice, layout)
+        -> (x, v, C, F, J, history, status, impulse, time)
 
-Particles and their history are those of `State`, the grid's arguments those of `activate`, `grid_update` and
-`contact`. `laws` are names of `LAWS` parted by commas, law k for the particles of material k; their options,
-parameters and history variables follow one another, `variables` of the latter for each law. The time step dt [s] is
-part of the parameters of laws that flow in time. Results that a call does not have are None; `history` has the entries
-of all laws side by side, [P, m]. The impulses on obstacles and walls are added to `impulse`, where it is given. With
-`grows` the pool follows the scene on the CPU; otherwise the op stops there where it is full, and the status tells.
-On CUDA nothing is waited for.
+Particles and their history are those of `State`, the grid's arguments those of `activate`, `grid_update` and `contact`.
+`laws` are names of `LAWS` parted by commas, law k for the particles of material k; their options, parameters and
+history variables follow one another, `variables` of the latter for each law. The time step dt [s] is part of the
+parameters of laws that flow in time. Results that a call does not have are None; `history` has the entries of all laws
+side by side, [P, m]. The impulses on obstacles and walls are added to `impulse`, where it is given. Scenes with clocks
+of their own have the time steps dt times `scene_dt` and begin at `scene_time`, both [B]. With `grows` the pool follows
+the scene on the CPU; otherwise the op stops there where it is full, and the status tells. On CUDA nothing is waited
+for.
 
 Differentiable once, with respect to x, v, mass, volume, C, F, J, history, parameters, gravity and impulse. Autograd
 keeps the arguments of a call, no more: 2 D + 2 D² numbers per particle of a solid (24 in 3-D) and its history.
@@ -65,6 +67,7 @@ def _fake(
         soa_empty(x, (P, _entries(history))) if history else None,
         x.new_empty((1 + scenes, 8), dtype=torch.int32),
         None if impulse is None else impulse.new_empty(impulse.shape),
+        None if given["scene_time"] is None else x.new_empty(scenes),
     )
 
 
@@ -113,7 +116,8 @@ def _backward(ctx: Any, *grads: Any) -> Any:
     found["parameters"] = _of_parameters(found["parameters"], parameters, wanted["parameters"], given["scene"])
     if wanted["gravity"]:
         scenes, dim = given["gravity"].shape
-        found["gravity"] = given["dt"] * found["gravity"].reshape(scenes, math.prod(given["layout"][2:]), dim).sum(1)
+        dt = given["dt"] if given["scene_dt"] is None else given["dt"] * given["scene_dt"][:, None]
+        found["gravity"] = dt * found["gravity"].reshape(scenes, math.prod(given["layout"][2:]), dim).sum(1)
     lists = ("history", "parameters")
     return tuple(found.get(name) if name in lists or wanted[name] is True else None for name in _SCHEMA)
 
