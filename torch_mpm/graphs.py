@@ -66,7 +66,9 @@ def obstacle_to_replays(step: Any, state: State, dt: float | Tensor) -> str | No
 
 
 def looks_at_time(boundary: Any) -> bool:
-    return not isinstance(boundary, Obstacle) or boundary.moves or boundary.start != 0 or boundary.end != math.inf
+    if not isinstance(boundary, Obstacle):
+        return getattr(boundary, "reads_time", True)  # what the library has elsewhere may say that it does not
+    return boundary.moves or boundary.start != 0 or boundary.end != math.inf
 
 
 _NUMBERS = (type(None), bool, int, float, str, torch.dtype, torch.device)

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from .boundaries import call_boundary
+from .boundaries import Obstacle, call_boundary
 from .grid import Blocks
 from .ops import contact, contact_impulses, fusible
 from .ops.contact import MAX_OBSTACLES
 from .ops.impulses import impulse_of_nodes
+from .precision import from_half, full_precision
 from .state import State
 
 
@@ -46,7 +48,9 @@ def after_boundaries(
         if nodes is None:
             scene = None if state.scene is None else blocks.node_scene()
             nodes = (blocks.node_positions(state.x.dtype), scene)
-        before, velocity = velocity, call_boundary(group[0], velocity, *nodes, time, dt)
+        before, boundary = velocity, group[0]
+        with full_precision(before) if isinstance(boundary, Obstacle) else contextlib.nullcontext():
+            velocity = from_half(call_boundary(boundary, before, *nodes, time, dt), nodes[0])
         if mass is not None:
             # Where there is no mass a boundary of the user's may give any velocity.
             momentum = mass[:, None] * torch.where(mass[:, None] != 0, before - velocity, 0)

@@ -112,6 +112,8 @@ def obstacle_to_substeps(step: Step, state: State, dt: float | Tensor) -> str | 
         return "it conducts heat"
     if step.on_grid is not None:
         return "it calls on_grid"
+    if step.on_particles is not None:
+        return "it calls on_particles"
     if step.transfer == "flip" or step.flip:
         return "its transfer is FLIP"
     for part in laws:

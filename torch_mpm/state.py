@@ -217,6 +217,22 @@ class State:
         """In the order of `ids`, that is in the order before any `sorted`. Differentiable."""
         return self if self.ids is None else self.select(torch.argsort(self.ids))
 
+    def split(self, scenes: int | None = None) -> list[State]:
+        """A state for each scene of a batch, the inverse of `concatenate(states, scene=True)`; synchronises.
+
+        Args:
+            scenes: number of scenes; None for one more than the largest, or as many as the time has.
+
+        Returns:
+            States of one scene, in the order of the particles; differentiable.
+        """
+        (count,) = _scene_counts([self], None if scenes is None else [scenes])
+        of_particle = _scene_of(self)
+        parts = [self.select((of_particle == k).nonzero().squeeze(1)) for k in range(count)]
+        if isinstance(self.time, Tensor) and self.time.numel() > 1:
+            parts = [part.replace(time=self.time[k : k + 1]) for k, part in enumerate(parts)]
+        return [State.concatenate([part.replace(scene=None)]) for part in parts]
+
     @staticmethod
     def concatenate(states: Sequence[State], scene: bool = False, scenes: Sequence[int] | None = None) -> State:
         """Pack several states into one; differentiable.

@@ -26,7 +26,9 @@ from .ops.arguments import check_choice
 from .ops.contact import MAX_OBSTACLES
 from .ops.transfer import STRESS_FORMS
 from .parameters import Overlay, TensorModule
-from .pause import paused
+from .particle_operations import ParticleOperation, operated
+from .pause import paused, standing
+from .precision import from_half, full_precision
 from .state import State, check_state, identity_deformation
 
 TRANSFERS = ("apic", "pic", "flip")
@@ -59,6 +61,10 @@ class Step(TensorModule):
         stress_form: "mls" (Hu et al. 2018; F moves with C) or "gradient" (force −V τ ∇N; F moves with Σ v_i ∇N_i).
         on_grid: called as `velocity = on_grid(blocks, velocity, mass, dt)` with node tensors [N, D] and [N] after the
             boundaries: a network, a controller, a field of force.
+        on_particles: called as `state = on_particles(state, dt)` before the law and P2G: an impulse, a prescribed
+            velocity, a controller (`torch_mpm.particle_operations`). It may return a pair (state, enabled) with bool
+            [P]: particles that are not enabled take no part in the step and stay as they are. The time is that of the
+            start of the step, and the number of particles stays.
         heat: conduction of heat in the same particles, see `Heat`; the state then needs a temperature.
 
     A step without boundaries, walls, gravity, FLIP or heat does not pay for them. The arguments are attributes, which
@@ -80,6 +86,7 @@ class Step(TensorModule):
     boundaries: BoundaryList
     on_grid: Callable[[Blocks, Tensor, Tensor, float | Tensor], Tensor] | None
     heat: Heat | None
+    on_particles: ParticleOperation | None
 
     def __init__(
         self,
@@ -93,6 +100,7 @@ class Step(TensorModule):
         stress_form: str = "mls",
         on_grid: Callable[[Blocks, Tensor, Tensor, float | Tensor], Tensor] | None = None,
         heat: Heat | None = None,
+        on_particles: ParticleOperation | None = None,
     ) -> None:
         super().__init__()
         self.grid = grid
@@ -105,6 +113,7 @@ class Step(TensorModule):
         self.stress_form = stress_form
         self.on_grid = on_grid
         self.heat = heat
+        self.on_particles = on_particles
         self._activations = ActivationRecord()
         self._kept_gravity = GraphCache()
 
@@ -154,10 +163,22 @@ class Step(TensorModule):
 
     def _advanced(self, state: State, dt: float | Tensor) -> State:
         """A prepared state one step later."""
+        if self.on_particles is None:
+            return self._moved(state, dt)
+        state, enabled = operated(self.on_particles, state, dt)
+        state = self.prepare(state)  # of which a function may have made another
+        if enabled is None:
+            return self._moved(state, dt)
+        absent = state.replace(mass=torch.where(enabled, state.mass, 0), volume=torch.where(enabled, state.volume, 0))
+        return standing(state, self._moved(absent, dt), enabled)
+
+    def _moved(self, state: State, dt: float | Tensor) -> State:
+        """A prepared state one step later, without what acts on the particles before."""
         grid, scene = self.grid, state.scene
         blocks = self._activations.activate(grid, state.x, scene, state.ids)
         form, affine = self.stress_form, state.C if self.transfer == "apic" else None
         fields, stress = self.law(Overlay(state, dt=dt) if self._rate_dependent else state)
+        stress = from_half(stress, state.x)
         dissipated = fields.pop("dissipated", None)
         if self.law.extra_fields:
             history = {name: fields.pop(name) for name in self.law.extra_fields if name in fields}
@@ -176,7 +197,8 @@ class Step(TensorModule):
             changes["impulse"] = state.impulse + impulse
         if self.heat is not None:
             motion = C if form == "mls" else g2p(blocks, state.x, velocity, affine=False, gradient=True)[2]
-            changes |= self.heat.update(blocks, state, dt, motion, dissipated)
+            with full_precision(state.x):
+                changes |= self.heat.update(blocks, state, dt, motion, dissipated)
         return state.replace(x=x, v=v, C=C if keeps_C else None, time=state.time + dt, **changes)
 
     def prepare(self, state: State) -> State:
@@ -208,7 +230,7 @@ class Step(TensorModule):
         if state.impulse is not None:
             impulse = torch.cat([*on_boundaries, wall_impulses(blocks, nodes, gravity, dt, self.walls)], 1)
         if self.on_grid is not None:
-            velocity = self.on_grid(blocks, velocity, mass, dt)
+            velocity = from_half(self.on_grid(blocks, velocity, mass, dt), nodes)
         return velocity, impulse
 
     @property
@@ -285,10 +307,11 @@ class Step(TensorModule):
         moving = [b for b in self.boundaries.entries if isinstance(b, Obstacle) and b.moves]
         fused = [b for b in moving if fusible(b, state.time)][:MAX_OBSTACLES]
         others = [b for b in moving if not any(b is kept for kept in fused)]
-        return look(
-            *(self.grid, self.law, self.prepare(state), "flip" if self._flip_share else self.transfer),
-            *(self.stress_form, self._obstacle_speed(others, state), fused, judge),
-        )
+        with full_precision(state.x):
+            return look(
+                *(self.grid, self.law, self.prepare(state), "flip" if self._flip_share else self.transfer),
+                *(self.stress_form, self._obstacle_speed(others, state), fused, judge),
+            )
 
     def _obstacle_speed(self, obstacles: list[Obstacle], state: State) -> Tensor | None:
         """Largest speed of the obstacles that a particle may touch [P] [m/s]; None where there are none."""
@@ -388,6 +411,8 @@ def _argument(step: Step, name: str, value: Any) -> Any:
         return BoundaryList(value)
     if name == "on_grid" and value is not None and not callable(value):
         raise TypeError(f"on_grid must be a function, a module or None, got {shape_of(value)}")
+    if name == "on_particles" and value is not None and not callable(value):
+        raise TypeError(f"on_particles must be a function, a module or None, got {shape_of(value)}")
     if name == "heat" and value is not None and not isinstance(value, Heat):
         raise TypeError(f"heat must be a Heat or None, got {shape_of(value)}")
     return value
