@@ -7,6 +7,7 @@ from . import containers, laws, ops, particle_operations, seed
 from .boundaries import SDF, Box, Capsule, Plane, Revolved, Sphere, Walls
 from .cfl import stable_dt
 from .data.trajectory import Trajectory
+from .environments import Environments
 from .errors import DamagedFileError, GridOverflowError, SimulationError
 from .failures import Failures
 from .graphs import captured
@@ -44,6 +45,7 @@ __all__ = [
     "Box",
     "Capsule",
     "DamagedFileError",
+    "Environments",
     "Failures",
     "Frames",
     "Grid",

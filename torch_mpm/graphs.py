@@ -27,7 +27,7 @@ LEAST_STEPS = 6
 CHUNK = 64
 """Steps between two looks at how many blocks are active, where the pool follows the scene on CUDA."""
 
-_FIELDS = tuple(f.name for f in dataclasses.fields(State) if f.name not in ("extra", "time"))
+_FIELDS = tuple(f.name for f in dataclasses.fields(State) if f.name != "extra")
 
 
 def time_after(time: float | Tensor, dt: float | Tensor, n: int) -> float | Tensor:
@@ -60,12 +60,12 @@ def obstacle_to_replays(step: Any, state: State, dt: float | Tensor) -> str | No
         return "there are hooks"
     if step.heat is not None and step.heat.method == "multigrid":
         return "multigrid does all of its iterations in a graph"
-    if state.x.dtype != torch.float64 and any(_looks_at_time(b) for b in step.boundaries):
+    if state.x.dtype != torch.float64 and any(looks_at_time(b) for b in step.boundaries):
         return f"obstacles would look at a time in {str(state.x.dtype).removeprefix('torch.')}"
     return _foreign(step, state.x.device, [])
 
 
-def _looks_at_time(boundary: Any) -> bool:
+def looks_at_time(boundary: Any) -> bool:
     if not isinstance(boundary, Obstacle):
         return getattr(boundary, "reads_time", True)  # what the library has elsewhere may say that it does not
     return boundary.moves or boundary.start != 0 or boundary.end != math.inf
@@ -146,7 +146,8 @@ class _Replays:
     def __init__(self, step: Step, state: State, dt: float, blocks: int) -> None:
         self.blocks = blocks
         self.state = state.map(_copied).replace(time=_time_tensor(state))
-        self.state = self.state.replace(material=state.material, scene=state.scene, ids=state.ids)
+        impulse = None if state.impulse is None else _copied(state.impulse)
+        self.state = self.state.replace(material=state.material, scene=state.scene, ids=state.ids, impulse=impulse)
         self._graph = torch.cuda.CUDAGraph()
         device = state.x.device
         now = torch.cuda.current_stream(device)
@@ -193,7 +194,7 @@ def _time_tensor(state: State) -> Tensor:
 
 def _tensors(state: State) -> dict[str, Tensor]:
     """The tensors of a state by name, those of `extra` as "extra.name"."""
-    fields = {name: getattr(state, name) for name in (*_FIELDS, "time")}
+    fields = {name: getattr(state, name) for name in _FIELDS}
     fields |= {f"extra.{name}": value for name, value in state.extra.items()}
     return {name: value for name, value in fields.items() if isinstance(value, Tensor)}
 

@@ -220,7 +220,7 @@ __device__ void classify(const ActivateArguments<T, D>& a, const Workspace& w, i
       }
       touched = touched_blocks<Order, D>(base);
       key = block_index(a.geometry, scene, block);
-    } else {
+    } else if (scene != kAbsent) {
       report(a, w.trouble, finite, scene, int(p));
     }
   }

@@ -29,7 +29,7 @@ __global__ void __launch_bounds__(kThreads) grid_update_backward_kernel(const Gr
     for (int local = lane; local < kBlockNodes<D>; local += kLanes<D>) {
       const int64_t node = slot * kBlockNodes<D> + local;
       Vector<T, D> change;
-      a.grad_nodes[node] = update_node_backward(a, s, local, node, change);
+      a.grad_nodes[node] = update_node_backward(a, s, local, node, change, NoImpulses());
       sum = sum + change;
     }
   }

@@ -387,6 +387,13 @@ class Heat(nn.Module):
             if kept is not None:  # and CUDA graphs may write to it
                 kept.zero_()
 
+    def forget(self, scenes: Tensor) -> None:
+        """Forget that of scenes, bool [B] on the device of the particles."""
+        self._activations.forget(scenes)
+        for kept in (self.unsolved, self.residual):
+            if kept is not None:
+                kept.masked_fill_(scenes, 0)
+
 
 def _averages(
     blocks: Blocks, x: Tensor, weights: Tensor, theta: Tensor, gradient: Tensor | None
