@@ -126,7 +126,7 @@ def test_many_scenes_are_counted(device):
 def test_particles_without_a_scene_count_in_the_totals(device):
     step, state = batch(2, device)
     scene = state.scene.clone()
-    scene[[3, 8]], scene[5] = -1, 2
+    scene[[3, 8]], scene[5] = -2, 2
     step(state.replace(scene=scene), 1e-3)
     assert not step.failures().failed.any()
     with pytest.raises(mpm.SimulationError, match="3 particles have a scene id outside the 2 scenes of the grid"):

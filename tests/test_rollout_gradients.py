@@ -7,7 +7,19 @@ import torch
 from combinations import DT as CASE_DT
 from combinations import draw, make
 from helpers import TOLERANCE
-from test_rollouts import LAWS_HERE, SEEDS, assert_equal, blob, box, flying, in_one_op, mixture, one_by_one, tensors
+from test_rollouts import (
+    LAWS_HERE,
+    SEEDS,
+    assert_equal,
+    blob,
+    box,
+    each_scene,
+    flying,
+    in_one_op,
+    mixture,
+    one_by_one,
+    tensors,
+)
 from torch import Tensor
 
 import torch_mpm as mpm
@@ -315,6 +327,23 @@ def test_gradients_of_obstacles_come_from_single_steps(device):
         assert in_one_op(step, state)
 
 
+def test_gradients_of_scenes_with_time_steps_of_their_own(device):
+    step, state = each_scene(device)
+    step.gravity = torch.tensor([[0.5, -9.8], [0.0, 1.0], [2.0, 3.0]], dtype=F64, device=device, requires_grad=True)
+    dt = CASE_DT * torch.tensor([1.0, 0.0, 0.3], dtype=F64, device=device)
+    ends = [
+        gradients(lambda step, state: mpm.rollout(step, state, 5, dt, checkpoint=3), step, state),
+        gradients(lambda step, state: one_by_one(step, state, 5, dt), step, state),
+    ]
+    assert ends[0].keys() == ends[1].keys() and "gravity" in ends[0]
+    for name, grad in ends[0].items():
+        expected = ends[1][name]
+        assert (grad is None) == (expected is None), name
+        if grad is not None:
+            scale = expected.abs().max().clamp_min(1e-9)
+            assert float((grad - expected).abs().max() / scale) < TOLERANCE["rollout gradient"][F64], name
+
+
 def raw_arguments(device: str) -> list:
     """Of `substeps`: two laws, walls, an obstacle and gravity in two scenes."""
     state, D = blob(device, 2, 40), 2
@@ -329,17 +358,18 @@ def raw_arguments(device: str) -> list:
     how = (3, DT, True, True, 0, torch.randn(2, D, generator=g, dtype=F64).to(device))
     walls = wall_arguments(mpm.Walls("slip"), grid)
     obstacles = obstacle_arguments(ball, state.x, 2)
-    rest = (*walls, *obstacles, 0.0, 2, 64, False, *grid.packed)
+    impulse = torch.randn(2, 5, 3, generator=g, dtype=F64).to(device)
+    rest = (*walls, *obstacles, 0.0, 2, 64, False, impulse, None, None, *grid.packed)
     return [*particles, scene, None, material, None, *laws, *how, *rest]
 
 
 def test_the_raw_ops(device):
     call = raw_arguments(device)
-    wanted = (0, 1, 2, 3, 4, 5, 21)
+    wanted = (0, 1, 2, 3, 4, 5, 21, 37)
     given = [t.clone().requires_grad_() if i in wanted else t for i, t in enumerate(call)]
     torch.library.opcheck(torch.ops.torch_mpm.substeps.default, tuple(given), raise_exception=True)
     grads = [torch.randn_like(t) for t in torch.ops.torch_mpm.substeps(*call)[:6] if t is not None]
-    adjoint = (*grads[:4], None, grads[4], 15, *call)
+    adjoint = (*grads[:4], None, grads[4], torch.ones_like(call[37]), 15, *call)
     torch.library.opcheck(torch.ops.torch_mpm.substeps_backward.default, adjoint, raise_exception=True)
     with pytest.raises(RuntimeError, match=r"grad_x must have shape \[40, 2\]"):
         torch.ops.torch_mpm.substeps_backward(grads[0][:3], *adjoint[1:])

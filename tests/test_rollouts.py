@@ -36,7 +36,7 @@ def assert_equal(a: mpm.State, b: mpm.State, text: str = "", exactly: bool = Tru
     assert left.keys() == right.keys()
     for name, value in left.items():
         if value.is_cuda and value.dtype == torch.float32:
-            assert_close(value, right[name], f"{name} {text}")
+            assert_close(value, right[name], f"{name} {text}", most=0.3 if name in a.extra else 3e-2)
         elif value.is_floating_point() and (value.is_cuda or not exactly):
             scale = right[name].abs().max().clamp_min(1e-9)
             assert float((value - right[name]).abs().max() / scale) < TOLERANCE["rollout"][value.dtype], name
@@ -44,12 +44,13 @@ def assert_equal(a: mpm.State, b: mpm.State, text: str = "", exactly: bool = Tru
             assert torch.equal(value, right[name]), f"{name} {text}"
 
 
-def assert_close(value: Tensor, expected: Tensor, name: str) -> None:
-    """Strains are small differences of numbers near one: rounding may take a few particles to another branch."""
+def assert_close(value: Tensor, expected: Tensor, name: str, most: float) -> None:
+    """Strains are small differences of numbers near one: rounding may take a few particles to another branch, and
+    histories add up what came of it."""
     error = ((value - expected).abs().flatten(1) if value.dim() > 1 else (value - expected).abs()[:, None]).amax(1)
     scale = float(expected.abs().max().clamp_min(1e-2))
     assert float(error.quantile(0.95)) < 1e-3 * scale, f"{name}: most particles"
-    assert float(error.max()) < 3e-2 * scale, f"{name}: all particles"
+    assert float(error.max()) < most * scale, f"{name}: all particles"
 
 
 def blob(device: str, dim: int = 3, count: int = 300, dtype: torch.dtype = F64, **fields) -> mpm.State:
@@ -378,6 +379,49 @@ def test_hooks_are_called_for_every_step(device):
     assert len(called) == 3
 
 
+def each_scene(device: str, dtype: torch.dtype = F64) -> tuple[mpm.Step, mpm.State]:
+    """Three scenes, with an obstacle that moves and one that comes."""
+    ball = mpm.Sphere((0.5, 0.2), 0.2, velocity=(0.0, 2.0), friction=0.2)
+    late = mpm.Box((0.3, 0.5), (0.2, 0.2), start=2.5 * DT, kind="sticky")
+    law = mpm.HerschelBulkley(E=1e4, nu=0.3, yield_stress=10.0, consistency=5.0, exponent=0.7)
+    step = mpm.Step(box(2, scenes=3), law, (0.5, -9.8), "separate", [ball, late])
+    scene = (torch.arange(300) % 3).int().to(device)
+    state = blob(device, 2, dtype=dtype).replace(scene=scene)
+    return step, step.with_impulses(step.prepare(state))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, F64])
+def test_scenes_with_time_steps_and_clocks_of_their_own(device, dtype):
+    """One is paused, and one has a dt that is refused."""
+    for values in ([1.0, 0.5, 0.7], [1.0, 0.0, 0.5], [1.0, -1.0, 0.5]):
+        dt = DT * torch.tensor(values, dtype=dtype, device=device)
+        (step, state), (again, _) = each_scene(device, dtype), each_scene(device, dtype)
+        assert step.explain(state, dt) == "all steps in one op"
+        with torch.no_grad():
+            end, expected = mpm.rollout(step, state, 9, dt), one_by_one(again, state, 9, dt)
+        if device == "cpu":
+            assert torch.equal(end.time, expected.time)
+        torch.testing.assert_close(end.time, expected.time)
+        assert_equal(end.replace(time=0.0), expected.replace(time=0.0))
+        assert torch.equal(step.failures().problems["dt"].count, again.failures().problems["dt"].count)
+
+
+def test_a_clock_of_each_scene_with_one_time_step(device):
+    step, state = each_scene(device)
+    state = state.replace(time=torch.tensor([0.0, 2 * DT, -DT], dtype=F64, device=device))
+    assert in_one_op(step, state)
+    with torch.no_grad():
+        end, expected = mpm.rollout(step, state, 9, DT), one_by_one(step, state, 9, DT)
+    torch.testing.assert_close(end.time, expected.time)
+    assert_equal(end.replace(time=0.0), expected.replace(time=0.0))
+    for dt, reason in (
+        (torch.tensor([DT], dtype=F64, device=device), "dt is a tensor, but not one of each scene in float64"),
+        (torch.full((3,), DT, dtype=torch.float32, device=device), "dt is a tensor, but not one of each scene"),
+        (torch.full((3,), DT, dtype=F64, device=device, requires_grad=True), "dt requires a gradient"),
+    ):
+        assert reason in step.explain(state, dt)
+
+
 def test_a_law_with_its_own_update_is_not_replaced(device):
     class Doubled(mpm.NeoHookean):
         def update(self, state):
@@ -395,7 +439,7 @@ def test_the_raw_op(device):
     grid = box(max_blocks=64)
     particles = (x, state.v, state.mass, state.volume, None, eye, None, [state.mass * 0], None, None, None, None)
     law = ("von_mises", [0], [scalar, scalar, 0.01 * scalar, scalar], [1])
-    rest = (None, [], [], [], None, None, [], [], [], [], [], [], 0.0, 1, 64, False, *grid.packed)
+    rest = (None, [], [], [], None, None, [], [], [], [], [], [], 0.0, 1, 64, False, None, None, None, *grid.packed)
     call = (*particles, *law, 2, 1e-4, True, True, 0, *rest)
     checks = ("test_schema", "test_faketensor", "test_aot_dispatch_dynamic")
     for apic, wants_C in ((True, True), (False, True), (False, False)):

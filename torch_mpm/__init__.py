@@ -3,10 +3,11 @@
 from typing import TYPE_CHECKING, Any
 
 from . import _library as _library
-from . import laws, ops, seed
+from . import containers, laws, ops, particle_operations, seed
 from .boundaries import SDF, Box, Capsule, Plane, Revolved, Sphere, Walls
 from .cfl import stable_dt
 from .data.trajectory import Trajectory
+from .environments import Environments
 from .errors import DamagedFileError, GridOverflowError, SimulationError
 from .failures import Failures
 from .graphs import captured
@@ -44,6 +45,7 @@ __all__ = [
     "Box",
     "Capsule",
     "DamagedFileError",
+    "Environments",
     "Failures",
     "Frames",
     "Grid",
@@ -71,6 +73,7 @@ __all__ = [
     "heat_cg",
     "ops",
     "p2g",
+    "particle_operations",
     "polar",
     "quartic_return_map",
     "rollout",
@@ -79,6 +82,8 @@ __all__ = [
     "stable_dt",
     "svd3",
 ]
+
+containers.register()
 
 
 def __getattr__(name: str) -> Any:

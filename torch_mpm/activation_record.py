@@ -69,11 +69,11 @@ class ActivationRecord:
         return problems
 
     @torch.no_grad()
-    def refuse(self, entries: Tensor, scenes: int) -> None:
-        """Count entries of a tensor dt that could not be taken: bool of shape [], [1] or [B]."""
+    def refuse(self, entries: Tensor, scenes: int, steps: int = 1) -> None:
+        """Count entries of a tensor dt that could not be taken in some steps: bool of shape [], [1] or [B]."""
         refused = self.counts(scenes, entries.device)
         with outside_transforms():
-            refused += without_transforms(entries)
+            refused += steps * without_transforms(entries)
 
     def counts(self, scenes: int, device: torch.device) -> Tensor:
         """`refused`, made at the first tensor dt."""
@@ -89,3 +89,14 @@ class ActivationRecord:
         with torch.inference_mode():
             for kept in self._replayed:
                 kept.copy_(torch.tensor(NO_PROBLEM, dtype=torch.int32, device="cpu"))
+
+    def forget(self, scenes: Tensor) -> None:
+        """Problems of scenes, bool [B], and those that are counted of all scenes together."""
+        if self.refused is not None:
+            self.refused.masked_fill_(scenes, 0)
+        with torch.inference_mode():
+            for status in self.all():
+                status[1:].masked_fill_(scenes[:, None], 0)
+                status[1:, 2:7:2].masked_fill_(scenes[:, None], -1)  # as NO_PROBLEM
+                status[0, 1:4:2].masked_fill_(scenes.any(), 0)
+                status[0, 2:7:2].masked_fill_(scenes.any(), -1)

@@ -27,7 +27,7 @@ LEAST_STEPS = 6
 CHUNK = 64
 """Steps between two looks at how many blocks are active, where the pool follows the scene on CUDA."""
 
-_FIELDS = tuple(f.name for f in dataclasses.fields(State) if f.name not in ("extra", "time"))
+_FIELDS = tuple(f.name for f in dataclasses.fields(State) if f.name != "extra")
 
 
 def time_after(time: float | Tensor, dt: float | Tensor, n: int) -> float | Tensor:
@@ -60,13 +60,15 @@ def obstacle_to_replays(step: Any, state: State, dt: float | Tensor) -> str | No
         return "there are hooks"
     if step.heat is not None and step.heat.method == "multigrid":
         return "multigrid does all of its iterations in a graph"
-    if state.x.dtype != torch.float64 and any(_looks_at_time(b) for b in step.boundaries):
+    if state.x.dtype != torch.float64 and any(looks_at_time(b) for b in step.boundaries):
         return f"obstacles would look at a time in {str(state.x.dtype).removeprefix('torch.')}"
     return _foreign(step, state.x.device, [])
 
 
-def _looks_at_time(boundary: Any) -> bool:
-    return not isinstance(boundary, Obstacle) or boundary.moves or boundary.start != 0 or boundary.end != math.inf
+def looks_at_time(boundary: Any) -> bool:
+    if not isinstance(boundary, Obstacle):
+        return getattr(boundary, "reads_time", True)  # what the library has elsewhere may say that it does not
+    return boundary.moves or boundary.start != 0 or boundary.end != math.inf
 
 
 _NUMBERS = (type(None), bool, int, float, str, torch.dtype, torch.device)
@@ -128,10 +130,11 @@ def replayed(step: Step, state: State, n: int, dt: float) -> State:
 
 
 class _Latest(threading.local):
-    """The latest graph of a thread on each stream: the next one there runs after it, and takes the same memory."""
+    """For each stream of a thread, the one that graphs for it are captured on, and the latest of these graphs: the next
+    one runs after it, and takes the same memory, which the allocator gives to the same stream alone."""
 
     def __init__(self) -> None:
-        self.graphs: dict[tuple[torch.device, int], torch.cuda.CUDAGraph] = {}
+        self.captures: dict[tuple[torch.device, int], tuple[torch.cuda.Stream, torch.cuda.CUDAGraph | None]] = {}
 
 
 _LATEST = _Latest()
@@ -143,12 +146,13 @@ class _Replays:
     def __init__(self, step: Step, state: State, dt: float, blocks: int) -> None:
         self.blocks = blocks
         self.state = state.map(_copied).replace(time=_time_tensor(state))
-        self.state = self.state.replace(material=state.material, scene=state.scene, ids=state.ids)
+        impulse = None if state.impulse is None else _copied(state.impulse)
+        self.state = self.state.replace(material=state.material, scene=state.scene, ids=state.ids, impulse=impulse)
         self._graph = torch.cuda.CUDAGraph()
         device = state.x.device
-        now, aside = torch.cuda.current_stream(device), torch.cuda.Stream(device)
+        now = torch.cuda.current_stream(device)
         place = device, now.cuda_stream
-        latest = _LATEST.graphs.get(place)
+        aside, latest = _LATEST.captures.get(place) or (torch.cuda.Stream(device), None)
         aside.wait_stream(now)
         with torch.cuda.stream(aside):
             # Other threads may go on meanwhile.
@@ -156,7 +160,7 @@ class _Replays:
             self._graph.capture_begin(pool, capture_error_mode="thread_local")
             self._record(step, dt)
         now.wait_stream(aside)
-        _LATEST.graphs[place] = self._graph
+        _LATEST.captures[place] = aside, self._graph
 
     def _record(self, step: Step, dt: float) -> None:
         try:
@@ -190,7 +194,7 @@ def _time_tensor(state: State) -> Tensor:
 
 def _tensors(state: State) -> dict[str, Tensor]:
     """The tensors of a state by name, those of `extra` as "extra.name"."""
-    fields = {name: getattr(state, name) for name in (*_FIELDS, "time")}
+    fields = {name: getattr(state, name) for name in _FIELDS}
     fields |= {f"extra.{name}": value for name, value in state.extra.items()}
     return {name: value for name, value in fields.items() if isinstance(value, Tensor)}
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -12,9 +11,7 @@ from torch import Tensor
 from .activation_record import ActivationRecord
 from .capture import is_traced
 from .ops.arguments import per_particle, split_dt
-from .state import State
-
-FIELDS = tuple(f.name for f in dataclasses.fields(State) if f.name not in ("extra", "time"))
+from .state import PARTICLE_FIELDS, State
 
 
 def paused(
@@ -23,16 +20,21 @@ def paused(
     state: State,
     dt: float | Tensor,
     scenes: int,
+    steps: int = 1,
 ) -> State:
-    """`advanced(state, dt)`, but for the scenes that a tensor dt pauses; `record` counts the entries it refuses."""
+    """`advanced(state, dt)`, but for the scenes that a tensor dt pauses; `record` counts the entries it refuses, once
+    for each of the steps that `advanced` takes."""
     if not isinstance(dt, Tensor):
         return advanced(state, dt)
     if _all_move(dt):
         record.counts(scenes, dt.device)  # that a compiled step finds it
         return advanced(state, dt)
     dt, moving, refused = split_paused(dt, state, scenes)
-    record.refuse(refused, scenes)
-    return standing(state, advanced(state, dt), moving)
+    record.refuse(refused, scenes, steps)
+    after = standing(state, advanced(state, dt), moving)
+    if after.impulse is None or state.impulse is None:
+        return after
+    return after.replace(impulse=torch.where((dt > 0).reshape(-1, 1, 1), after.impulse, state.impulse))
 
 
 def _all_move(dt: Tensor) -> bool:
@@ -78,4 +80,6 @@ def standing(before: State, after: State, moving: Tensor) -> State:
         return torch.where(rows, new, torch.zeros_like(new) if old is None else old)
 
     extra = {name: field(before.extra.get(name), new) for name, new in after.extra.items()}
-    return after.replace(**{name: field(getattr(before, name), getattr(after, name)) for name in FIELDS}, extra=extra)
+    return after.replace(
+        **{name: field(getattr(before, name), getattr(after, name)) for name in PARTICLE_FIELDS}, extra=extra
+    )

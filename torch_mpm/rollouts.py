@@ -21,6 +21,7 @@ from .ops.contact import MAX_OBSTACLES, fusible, obstacle_arguments
 from .ops.grid_update import per_scene, wall_arguments
 from .ops.transfer import STRESS_FORMS
 from .parameters import Overlay, has_hooks
+from .pause import paused
 from .state import State, check_state
 from .step import Step
 
@@ -41,7 +42,7 @@ def rollout(
         step: a `Step`, or any function (state, dt) -> state.
         state: the initial state.
         n: number of steps.
-        dt: time step [s].
+        dt: time step [s], as `Step` takes it.
         checkpoint: if given, keep for the backward pass only the state of every `checkpoint` steps and compute the
             steps between again (memory n/checkpoint + checkpoint states instead of n steps; sqrt(n) is best).
 
@@ -64,7 +65,7 @@ def rollout(
         check_count("checkpoint", checkpoint, 1)
 
     if isinstance(step, Step) and obstacle_to_substeps(step, state, dt) is None:
-        return in_chunks(step, state, n, dt, checkpoint)  # type: ignore[arg-type]
+        return in_chunks(step, state, n, dt, checkpoint)
     if isinstance(step, Step) and n > LEAST_STEPS and obstacle_to_replays(step, state, dt) is None:
         return replayed(step, state, n, dt)  # type: ignore[arg-type]
     if checkpoint is not None and torch.is_grad_enabled():
@@ -99,8 +100,11 @@ def obstacle_to_substeps(step: Step, state: State, dt: float | Tensor) -> str | 
     laws = list(law.laws) if type(law) is Mixture else [law]
     if type(step) is not Step:
         return f"{type(step).__name__} may do more than a Step"
-    if isinstance(dt, Tensor) or isinstance(state.time, Tensor):
-        return "dt or the time of the state is a tensor"
+    for name, value in (("dt", dt), ("the time of the state", state.time)):
+        if isinstance(value, Tensor) and value.requires_grad and torch.is_grad_enabled():
+            return f"{name} requires a gradient"
+        if isinstance(value, Tensor) and (value.shape != (step.grid.scenes,) or value.dtype != x.dtype):
+            return f"{name} is a tensor, but not one of each scene in {str(x.dtype).removeprefix('torch.')}"
     transformed = torch._C._are_functorch_transforms_active() or forward_ad._current_level >= 0
     if torch.compiler.is_compiling() or is_traced(x) or is_captured(x) or transformed:
         return "it is compiled, captured or transformed"
@@ -108,6 +112,8 @@ def obstacle_to_substeps(step: Step, state: State, dt: float | Tensor) -> str | 
         return "it conducts heat"
     if step.on_grid is not None:
         return "it calls on_grid"
+    if step.on_particles is not None:
+        return "it calls on_particles"
     if step.transfer == "flip" or step.flip:
         return "its transfer is FLIP"
     for part in laws:
@@ -134,7 +140,7 @@ KEPT_BYTES = {"cpu": 2**24, "cuda": 2**28}
 hold, and so much that kernels on CUDA hide the time of Python."""
 
 
-def in_chunks(step: Step, state: State, n: int, dt: float, checkpoint: int | None = None) -> State:
+def in_chunks(step: Step, state: State, n: int, dt: float | Tensor, checkpoint: int | None = None) -> State:
     chunk = CHUNK if step.grid.grows and state.x.is_cuda else MOST_STEPS
     if wants_gradient(step, state):
         chunk = min(chunk, checkpoint or _steps_between_kept(state, n))
@@ -166,24 +172,55 @@ def _motion(obstacle: Any) -> list[Tensor]:
 
 def _differentiable(step: Step, state: State) -> list[Tensor]:
     """What `substeps` has gradients for."""
-    fields = (state.x, state.v, state.mass, state.volume, state.C, state.F, state.J, *state.extra.values())
+    fields = (
+        state.x,
+        state.v,
+        state.mass,
+        state.volume,
+        state.C,
+        state.F,
+        state.J,
+        *state.extra.values(),
+        state.impulse,
+    )
     gravity = [step.gravity] if isinstance(step.gravity, Tensor) else []
     return [*(t for t in fields if t is not None), *gravity, *step.law.parameters(), *step.law.buffers()]
 
 
-def substeps(step: Step, state: State, n: int, dt: float) -> State:
+def substeps(step: Step, state: State, n: int, dt: float | Tensor) -> State:
     """The state n steps later, by one op; `obstacle_to_substeps` must be None.
 
     Raises:
         ValueError: for a dt that is not positive and finite, or a material without a law.
         GridOverflowError: on the CPU, where a grid of fixed `max_blocks` is full.
     """
-    dt, _ = split_dt(dt, step.grid.scenes, state.x)
-    state, grid, record = step.prepare(state), step.grid, step._activations
+
+    def advanced(state: State, dt: float | Tensor) -> State:
+        return _substeps(step, state, n, dt)
+
+    return paused(advanced, step._activations, step.prepare(state), dt, step.grid.scenes, n)
+
+
+def _clocks(state: State, dt: float | Tensor, scenes: int) -> tuple[float, Tensor | None, Tensor | None]:
+    """The time step [s] as a number, or times that and a time for each scene [B]."""
+    number, scene_dt = split_dt(dt, scenes, state.x)
+    if scene_dt is None and not isinstance(state.time, Tensor):
+        return number, None, None
+
+    def each(value: float | Tensor) -> Tensor:
+        return (value if isinstance(value, Tensor) else state.x.new_full((scenes,), value)).contiguous()
+
+    return 1.0, each(dt), each(state.time)
+
+
+def _substeps(step: Step, state: State, n: int, dt: float | Tensor) -> State:
+    """`substeps` of a prepared state, where no scene is paused."""
+    grid, record = step.grid, step._activations
+    number, scene_dt, scene_time = _clocks(state, dt, grid.scenes)
     max_blocks = grid.pool(state.x, state.scene)
     calls = _law_calls(step, state, dt)
     apic = step.transfer == "apic"
-    x, v, C, F, J, history, status = dispatch(
+    x, v, C, F, J, history, status, impulse, time = dispatch(
         torch.ops.torch_mpm.substeps,
         *(state.x, state.v, state.mass, state.volume, state.C, state.F, state.J),
         [state.extra[name] for _, _, names in calls for name in names],
@@ -192,21 +229,23 @@ def substeps(step: Step, state: State, n: int, dt: float) -> State:
         [law.option_bits() for law, _, _ in calls],
         [parameter for _, parameters, _ in calls for parameter in parameters],
         [len(names) for _, _, names in calls],
-        *(int(n), dt, apic, apic or step.law.viscous, STRESS_FORMS[step.stress_form]),
+        *(int(n), number, apic, apic or step.law.viscous, STRESS_FORMS[step.stress_form]),
         _gravity(step, state.x),
         *wall_arguments(step.walls, grid),
         *obstacle_arguments(step.boundaries.entries, state.x, grid.scenes),
-        *(float(state.time), grid.scenes, max_blocks, grid.grows, *grid.packed),
+        *(0.0 if scene_time is not None else float(state.time), grid.scenes, max_blocks, grid.grows),
+        *(state.impulse, scene_dt, scene_time, *grid.packed),
     )
     record.status = status
     grid.watch(status)
     if status.device.type == "cpu":  # where the op has let the pool grow, or stopped
         grid.follow(int(status[0, 0] if grid.grows else status[0, 7]))
     extra = _history(state, calls, history)
-    return state.replace(x=x, v=v, C=C, F=F, J=J, extra=extra, time=time_after(state.time, dt, n))
+    time = time_after(state.time, dt, n) if scene_time is None else time
+    return state.replace(x=x, v=v, C=C, F=F, J=J, extra=extra, time=time, impulse=impulse)
 
 
-def _law_calls(step: Step, state: State, dt: float) -> list[LawCall]:
+def _law_calls(step: Step, state: State, dt: float | Tensor) -> list[LawCall]:
     law = step.law
     if isinstance(law, Mixture):
         law.check_material(state)

@@ -66,7 +66,8 @@ class State:
         C: affine velocity field [P, D, D] [1/s].
         F: deformation gradient [P, D, D]; for laws that need only its determinant,
         J: volume ratio [P].
-        scene: scene of each particle, int32 [P]; None for one scene.
+        scene: scene of each particle, int32 [P]; None for one scene. A particle of scene -1 is absent: it takes part in
+            nothing, and stays where it is without a velocity.
         ids: stable identity of each particle, int64 [P], set once particles are reordered; 0 .. P − 1 in some order
             where parameters are given per particle.
         material: law of each particle, int32 [P], for a `Mixture`.
@@ -74,9 +75,11 @@ class State:
         extra: further per-particle tensors [P, ...] that follow a reordering.
         time: simulated time [s]: a number, or a tensor [B] once dt is a tensor. Code compiled by `torch.compile` sees a
             number as a tensor [] of float64 on the CPU, so that it serves every time.
+        impulse: of the material on each boundary of the step and then on each face of the domain, added up over steps
+            [B, K + 2 D, D + 1 or 3] [N s, N m s], float64; see `torch_mpm.impulses`.
 
-    All floating tensors have one dtype and device. Any strides work; those that the ops return keep the particle index
-    contiguous, which is fastest.
+    All floating tensors of the particles have one dtype and device. Any strides work; those that the ops return keep
+    the particle index contiguous, which is fastest.
     """
 
     x: Tensor
@@ -92,6 +95,7 @@ class State:
     temperature: Tensor | None = None
     extra: dict[str, Tensor] = dataclasses.field(default_factory=dict)
     time: float | Tensor = Time()  # type: ignore[assignment]
+    impulse: Tensor | None = None
 
     def __post_init__(self) -> None:
         if not isinstance(self.x, Tensor) or self.x.dim() != 2 or self.x.shape[1] not in (2, 3):
@@ -106,6 +110,8 @@ class State:
             check_like(name, getattr(self, name), self.x, (P,), "[P]")
         for name, dtype in (("scene", torch.int32), ("material", torch.int32), ("ids", torch.int64)):
             check_index(name, getattr(self, name), self.x, dtype)
+        if self.impulse is not None:
+            _check_impulse(self.impulse, self.x)
         if not isinstance(self.extra, dict):
             raise TypeError(f"extra must be a dict of tensors [P, ...], got {shape_of(self.extra)}")
         for name, value in self.extra.items():
@@ -160,9 +166,7 @@ class State:
     def map(self, function: Callable[[Tensor], Tensor]) -> State:
         """A copy with a function applied to every per-particle tensor, absent fields staying None."""
         changes: dict[str, Any] = {
-            f.name: function(value)
-            for f in dataclasses.fields(self)
-            if f.name != "time" and isinstance(value := getattr(self, f.name), Tensor)
+            name: function(value) for name in PARTICLE_FIELDS if (value := getattr(self, name)) is not None
         }
         return self.replace(**changes, extra={k: function(t) for k, t in self.extra.items()})
 
@@ -173,6 +177,8 @@ class State:
         state = self.map(lambda t: t.to(device=device, dtype=dtype if t.is_floating_point() else None))
         if isinstance(self.time, Tensor):
             state.time = self.time.to(device=device, dtype=dtype)
+        if self.impulse is not None:
+            state.impulse = self.impulse.to(device)
         return state
 
     def detach(self) -> State:
@@ -180,6 +186,8 @@ class State:
         state = self.map(Tensor.detach)
         if isinstance(self.time, Tensor):
             state.time = self.time.detach()
+        if self.impulse is not None:
+            state.impulse = self.impulse.detach()
         return state
 
     def select(self, particles: Tensor) -> State:
@@ -209,6 +217,22 @@ class State:
         """In the order of `ids`, that is in the order before any `sorted`. Differentiable."""
         return self if self.ids is None else self.select(torch.argsort(self.ids))
 
+    def split(self, scenes: int | None = None) -> list[State]:
+        """A state for each scene of a batch, the inverse of `concatenate(states, scene=True)`; synchronises.
+
+        Args:
+            scenes: number of scenes; None for one more than the largest, or as many as the time has.
+
+        Returns:
+            States of one scene, in the order of the particles; differentiable.
+        """
+        (count,) = _scene_counts([self], None if scenes is None else [scenes])
+        of_particle = _scene_of(self)
+        parts = [self.select((of_particle == k).nonzero().squeeze(1)) for k in range(count)]
+        if isinstance(self.time, Tensor) and self.time.numel() > 1:
+            parts = [part.replace(time=self.time[k : k + 1]) for k, part in enumerate(parts)]
+        return [State.concatenate([part.replace(scene=None)]) for part in parts]
+
     @staticmethod
     def concatenate(states: Sequence[State], scene: bool = False, scenes: Sequence[int] | None = None) -> State:
         """Pack several states into one; differentiable.
@@ -217,7 +241,7 @@ class State:
             states: of one dimension, dtype and device. C, F and J that only some have are made as a step makes them:
                 zero, identity, one.
             scene: False packs parts of one batch, whose scenes stay as they are. True packs batches: the scenes of each
-                state follow those of the states before it, and each keeps its time.
+                state follow those of the states before it, and each keeps its time and its impulses.
             scenes: with scene=True, how many scenes each state holds. None counts those of its time [B], or else one
                 more than its largest scene, which synchronises with the device.
 
@@ -227,8 +251,8 @@ class State:
 
         Raises:
             TypeError: for anything but a list of states.
-            ValueError: for an empty list; states of one batch at different times; another field that is present in some
-                states only; counts that do not fit.
+            ValueError: for an empty list; states of one batch at different times or with different impulses; another
+                field that is present in some states only; counts that do not fit.
         """
         states, scene = _checked(states), check_flag("scene", scene)
         counts = [0] * len(states)
@@ -240,16 +264,31 @@ class State:
         if any(s.ids is not None for s in states):
             befores = itertools.accumulate([0, *(len(s) for s in states)])
             states = [s.replace(ids=_rank(s) + before) for s, before in zip(states, befores, strict=False)]
-        names = [f.name for f in dataclasses.fields(State) if f.name not in ("extra", "time")]
+        impulse = _impulses_of_scenes(states, counts) if scene else _one_impulse(states)
         keys = dict.fromkeys(key for s in states for key in s.extra)
-        joined: dict[str, Any] = {name: _joined(name, states) for name in names}
+        joined: dict[str, Any] = {name: _joined(name, states) for name in PARTICLE_FIELDS}
         extra = {key: _as_soa(torch.cat([_extra(key, s, k, states) for k, s in enumerate(states)])) for key in keys}
-        return State(**joined, extra=extra, time=time)
+        return State(**joined, extra=extra, time=time, impulse=impulse)
+
+
+PARTICLE_FIELDS = tuple(f.name for f in dataclasses.fields(State) if f.name not in ("extra", "time", "impulse"))
+"""Fields with a row for each particle, beside those in `extra`."""
 
 
 def check_state(state: Any) -> None:
     if not isinstance(state, State):
         raise TypeError(f"state must be a State, got {shape_of(state)}")
+
+
+def _check_impulse(impulse: Any, x: Tensor) -> None:
+    D = x.shape[1]
+    width = D + (1 if D == 2 else 3)
+    if not isinstance(impulse, Tensor) or impulse.dim() != 3 or impulse.shape[2] != width:
+        raise ValueError(f"impulse must have shape [B, K, {width}], got {shape_of(impulse)}")
+    if impulse.dtype != torch.float64:
+        raise TypeError(f"impulse must be float64, as a sum over many steps, got {impulse.dtype}")
+    if impulse.device != x.device:
+        raise ValueError(f"impulse must be on the device of x, {x.device}, got {impulse.device}")
 
 
 # ---- joining
@@ -321,6 +360,27 @@ def _one_time(states: Sequence[State]) -> float | Tensor:
                 "pass scene=True for states that are scenes of their own"
             )
     return first
+
+
+def _impulses_of_scenes(states: Sequence[State], counts: Sequence[int]) -> Tensor | None:
+    impulses = [s.impulse for s in states]
+    if all(i is None for i in impulses):
+        return None
+    shape = next(i.shape[1:] for i in impulses if i is not None)
+    for k, (impulse, count) in enumerate(zip(impulses, counts, strict=True)):
+        if impulse is None or impulse.shape != (count, *shape):
+            expected = [count, *shape]
+            raise ValueError(f"impulse of state {k} must have shape {expected} as that of others, got {impulse!r:.80}")
+    return torch.cat([i for i in impulses if i is not None])
+
+
+def _one_impulse(states: Sequence[State]) -> Tensor | None:
+    """That of the parts of one batch that have one."""
+    found = [s.impulse for s in states if s.impulse is not None]
+    for other in found[1:]:
+        if other is not found[0] and not torch.equal(other, found[0]):
+            raise ValueError("states of one batch must have one impulse: set that of all but one of them to None")
+    return found[0] if found else None
 
 
 def _rank(state: State) -> Tensor:

@@ -10,21 +10,25 @@ import torch
 from torch import Tensor
 
 from .activation_record import ActivationRecord
-from .boundaries import BoundaryList, Obstacle, Walls, call_boundary
+from .boundaries import BoundaryList, Obstacle, Walls
 from .capture import GraphCache
 from .cfl import look
 from .errors import check_number, check_vector, shape_of
 from .failures import Failures, problems_of_state, raise_failures
 from .grid import Blocks, Grid, check_grid
 from .heat.heat import Heat
+from .impulses import Impulses, check_impulse, impulses_of, no_impulse
 from .laws.custom import as_law
 from .laws.material import Material
-from .ops import Survey, contact, fusible, g2p, g2p_advance, gather, grid_update, p2g
+from .node_contact import after_boundaries
+from .ops import Survey, fusible, g2p, g2p_advance, gather, grid_update, p2g, wall_impulses
 from .ops.arguments import check_choice
 from .ops.contact import MAX_OBSTACLES
 from .ops.transfer import STRESS_FORMS
 from .parameters import Overlay, TensorModule
-from .pause import paused
+from .particle_operations import ParticleOperation, operated
+from .pause import paused, standing
+from .precision import from_half, full_precision
 from .state import State, check_state, identity_deformation
 
 TRANSFERS = ("apic", "pic", "flip")
@@ -57,6 +61,10 @@ class Step(TensorModule):
         stress_form: "mls" (Hu et al. 2018; F moves with C) or "gradient" (force −V τ ∇N; F moves with Σ v_i ∇N_i).
         on_grid: called as `velocity = on_grid(blocks, velocity, mass, dt)` with node tensors [N, D] and [N] after the
             boundaries: a network, a controller, a field of force.
+        on_particles: called as `state = on_particles(state, dt)` before the law and P2G: an impulse, a prescribed
+            velocity, a controller (`torch_mpm.particle_operations`). It may return a pair (state, enabled) with bool
+            [P]: particles that are not enabled take no part in the step and stay as they are. The time is that of the
+            start of the step, and the number of particles stays.
         heat: conduction of heat in the same particles, see `Heat`; the state then needs a temperature.
 
     A step without boundaries, walls, gravity, FLIP or heat does not pay for them. The arguments are attributes, which
@@ -78,6 +86,7 @@ class Step(TensorModule):
     boundaries: BoundaryList
     on_grid: Callable[[Blocks, Tensor, Tensor, float | Tensor], Tensor] | None
     heat: Heat | None
+    on_particles: ParticleOperation | None
 
     def __init__(
         self,
@@ -91,6 +100,7 @@ class Step(TensorModule):
         stress_form: str = "mls",
         on_grid: Callable[[Blocks, Tensor, Tensor, float | Tensor], Tensor] | None = None,
         heat: Heat | None = None,
+        on_particles: ParticleOperation | None = None,
     ) -> None:
         super().__init__()
         self.grid = grid
@@ -103,6 +113,7 @@ class Step(TensorModule):
         self.stress_form = stress_form
         self.on_grid = on_grid
         self.heat = heat
+        self.on_particles = on_particles
         self._activations = ActivationRecord()
         self._kept_gravity = GraphCache()
 
@@ -152,27 +163,42 @@ class Step(TensorModule):
 
     def _advanced(self, state: State, dt: float | Tensor) -> State:
         """A prepared state one step later."""
+        if self.on_particles is None:
+            return self._moved(state, dt)
+        state, enabled = operated(self.on_particles, state, dt)
+        state = self.prepare(state)  # of which a function may have made another
+        if enabled is None:
+            return self._moved(state, dt)
+        absent = state.replace(mass=torch.where(enabled, state.mass, 0), volume=torch.where(enabled, state.volume, 0))
+        return standing(state, self._moved(absent, dt), enabled)
+
+    def _moved(self, state: State, dt: float | Tensor) -> State:
+        """A prepared state one step later, without what acts on the particles before."""
         grid, scene = self.grid, state.scene
         blocks = self._activations.activate(grid, state.x, scene, state.ids)
         form, affine = self.stress_form, state.C if self.transfer == "apic" else None
         fields, stress = self.law(Overlay(state, dt=dt) if self._rate_dependent else state)
+        stress = from_half(stress, state.x)
         dissipated = fields.pop("dissipated", None)
         if self.law.extra_fields:
             history = {name: fields.pop(name) for name in self.law.extra_fields if name in fields}
             state = state.replace(extra={**state.extra, **history})
         nodes = p2g(blocks, state.x, state.mass, state.v, affine, stress, state.volume, dt, form)
-        velocity = self._update_grid(blocks, nodes, state, dt)
+        velocity, impulse = self._update_grid(blocks, nodes, state, dt)
         deformed = {name: fields.get(name, getattr(state, name)) for name in ("F", "J")}
         keeps_C = self.transfer == "apic" or self.law.viscous
         x, v, C, F, J = g2p_advance(
             blocks, state.x, velocity, dt, **deformed, affine=keeps_C or self.heat is not None, stress_form=form
         )
         if self._flip_share:  # positions move with the grid all the same, so that FLIP's noise does not reach them
-            v = self._blend_flip(blocks, state, affine, velocity, v)
+            v, impulse = self._blend_flip(blocks, state, affine, velocity, v, impulse)
         changes: dict[str, Any] = {**fields, "F": F, "J": J}
+        if state.impulse is not None and impulse is not None:
+            changes["impulse"] = state.impulse + impulse
         if self.heat is not None:
             motion = C if form == "mls" else g2p(blocks, state.x, velocity, affine=False, gradient=True)[2]
-            changes |= self.heat.update(blocks, state, dt, motion, dissipated)
+            with full_precision(state.x):
+                changes |= self.heat.update(blocks, state, dt, motion, dissipated)
         return state.replace(x=x, v=v, C=C if keeps_C else None, time=state.time + dt, **changes)
 
     def prepare(self, state: State) -> State:
@@ -185,28 +211,54 @@ class Step(TensorModule):
             changes["J"] = torch.ones_like(state.mass)
         if missing := [name for name in self.law.extra_fields if name not in state.extra]:
             changes["extra"] = {**state.extra, **{name: self.law.initial(name, state) for name in missing}}
+        if state.impulse is not None:
+            check_impulse(self, state)
         state = state.replace(**changes) if changes else state
         return state if self.heat is None else self.heat.prepare(state)
 
-    def _update_grid(self, blocks: Blocks, nodes: Tensor, state: State, dt: float | Tensor) -> Tensor:
-        velocity = grid_update(blocks, nodes, self.gravity_like(state.x), dt, self.walls)
+    def _update_grid(
+        self, blocks: Blocks, nodes: Tensor, state: State, dt: float | Tensor
+    ) -> tuple[Tensor, Tensor | None]:
+        """Node velocities, and the impulses on boundaries and walls where they are asked for."""
+        gravity, mass = self.gravity_like(state.x), nodes[:, 0]
+        velocity = grid_update(blocks, nodes, gravity, dt, self.walls)
+        impulse: Tensor | None = None
+        on_boundaries: list[Tensor] = []
         if boundaries := self.boundaries.entries:
-            velocity = _obstruct(blocks, velocity, boundaries, state, dt)
+            asked = mass if state.impulse is not None else None
+            velocity, on_boundaries = after_boundaries(blocks, velocity, boundaries, state, dt, asked)
+        if state.impulse is not None:
+            impulse = torch.cat([*on_boundaries, wall_impulses(blocks, nodes, gravity, dt, self.walls)], 1)
         if self.on_grid is not None:
-            velocity = self.on_grid(blocks, velocity, nodes[:, 0], dt)
-        return velocity
+            velocity = from_half(self.on_grid(blocks, velocity, mass, dt), nodes)
+        return velocity, impulse
 
     @property
     def _flip_share(self) -> float:
         return 1.0 if self.transfer == "flip" else self.flip
 
-    def _blend_flip(self, blocks: Blocks, state: State, affine: Tensor | None, velocity: Tensor, v: Tensor) -> Tensor:
-        """(1 − flip) v_pic + flip (v_p + Σ N_i (v_i − v_i before the forces)) (Zhu and Bridson 2005)."""
+    def _blend_flip(
+        self,
+        blocks: Blocks,
+        state: State,
+        affine: Tensor | None,
+        velocity: Tensor,
+        v: Tensor,
+        impulse: Tensor | None,
+    ) -> tuple[Tensor, Tensor | None]:
+        """(1 − flip) v_pic + flip (v_p + Σ N_i (v_i − v_i before the forces)) (Zhu and Bridson 2005).
+
+        FLIP's share of the particles knows no mirrors but by the change of the velocities, so that of what these take
+        before the forces it keeps its own.
+        """
         # P2G of the step has the impulse of the stress in it already, which is part of the change.
         mirrors = None if self.walls is None else self.walls.mirrors()
-        before = grid_update(blocks, p2g(blocks, state.x, state.mass, state.v, affine), walls=mirrors)
-        change, _, _ = gather(blocks, state.x, velocity - before)
-        return (1 - self._flip_share) * v + self._flip_share * (state.v + change)
+        nodes = p2g(blocks, state.x, state.mass, state.v, affine)
+        change, _, _ = gather(blocks, state.x, velocity - grid_update(blocks, nodes, walls=mirrors))
+        if impulse is not None and mirrors is not None:
+            on_faces = self._flip_share * wall_impulses(blocks, nodes, walls=mirrors)
+            impulse = impulse - torch.nn.functional.pad(on_faces, (0, 0, impulse.shape[1] - on_faces.shape[1], 0))
+        return (1 - self._flip_share) * v + self._flip_share * (state.v + change), impulse
 
     def gravity_like(self, x: Tensor) -> Tensor | None:
         """Gravity as a tensor [D] or [B, D] of the dtype and on the device of x."""
@@ -220,6 +272,21 @@ class Step(TensorModule):
             return torch.tensor(gravity, dtype=x.dtype, device=x.device).expand(self.grid.scenes, -1).contiguous()
 
         return self._kept_gravity.get((gravity, x.dtype, x.device), make, x)
+
+    def with_impulses(self, state: State) -> State:
+        """A state that counts impulses: from here on steps add up what the material gives boundaries and walls.
+
+        Read them with `impulses`. A state whose `impulse` is None counts none, and pays nothing.
+        """
+        return state.replace(impulse=no_impulse(self, state.x))
+
+    def impulses(self, state: State) -> Impulses:
+        """The impulses on boundaries and walls since `with_impulses`; see `Impulses`.
+
+        Raises:
+            ValueError: for a state that counts none, or those of another step.
+        """
+        return impulses_of(self, state)
 
     def stable_dt(self, state: State, cfl: float = 0.5) -> Tensor:
         """Largest stable time step of each scene [s], [B], times `cfl`; see `torch_mpm.cfl.stable_dt`.
@@ -240,10 +307,11 @@ class Step(TensorModule):
         moving = [b for b in self.boundaries.entries if isinstance(b, Obstacle) and b.moves]
         fused = [b for b in moving if fusible(b, state.time)][:MAX_OBSTACLES]
         others = [b for b in moving if not any(b is kept for kept in fused)]
-        return look(
-            *(self.grid, self.law, self.prepare(state), "flip" if self._flip_share else self.transfer),
-            *(self.stress_form, self._obstacle_speed(others, state), fused, judge),
-        )
+        with full_precision(state.x):
+            return look(
+                *(self.grid, self.law, self.prepare(state), "flip" if self._flip_share else self.transfer),
+                *(self.stress_form, self._obstacle_speed(others, state), fused, judge),
+            )
 
     def _obstacle_speed(self, obstacles: list[Obstacle], state: State) -> Tensor | None:
         """Largest speed of the obstacles that a particle may touch [P] [m/s]; None where there are none."""
@@ -310,34 +378,11 @@ class Step(TensorModule):
         if self.heat is not None:
             self.heat.reset()
 
-
-def _obstruct(blocks: Blocks, velocity: Tensor, boundaries: Sequence[Any], state: State, dt: float | Tensor) -> Tensor:
-    """The boundaries in turn; neighbours in the list that one op can take together."""
-    time = state.time
-    if isinstance(time, Tensor) and time.dim() == 0:
-        time = time.to(velocity.device)  # a number of a compiled step
-    nodes: tuple[Tensor, Tensor | None] | None = None
-    for together, group in _neighbours(boundaries, time):
-        if together:
-            velocity = contact(blocks, velocity, group, time)
-            continue
-        if nodes is None:
-            scene = None if state.scene is None else blocks.node_scene()
-            nodes = (blocks.node_positions(state.x.dtype), scene)
-        for boundary in group:
-            velocity = call_boundary(boundary, velocity, *nodes, time, dt)
-    return velocity
-
-
-def _neighbours(boundaries: Sequence[Any], time: float | Tensor) -> list[tuple[bool, list[Any]]]:
-    """Runs of boundaries that `contact` takes together, or not; `itertools.groupby` can't be compiled."""
-    runs: list[tuple[bool, list[Any]]] = []
-    for boundary in boundaries:
-        together = fusible(boundary, time)
-        if not runs or runs[-1][0] != together:
-            runs.append((together, []))
-        runs[-1][1].append(boundary)
-    return runs
+    def forget_failures(self, scenes: Tensor) -> None:
+        """Forget the problems of scenes, bool [B] on the device of the particles, which is not waited for."""
+        self._activations.forget(scenes)
+        if self.heat is not None:
+            self.heat.forget(scenes)
 
 
 def _argument(step: Step, name: str, value: Any) -> Any:
@@ -366,6 +411,8 @@ def _argument(step: Step, name: str, value: Any) -> Any:
         return BoundaryList(value)
     if name == "on_grid" and value is not None and not callable(value):
         raise TypeError(f"on_grid must be a function, a module or None, got {shape_of(value)}")
+    if name == "on_particles" and value is not None and not callable(value):
+        raise TypeError(f"on_particles must be a function, a module or None, got {shape_of(value)}")
     if name == "heat" and value is not None and not isinstance(value, Heat):
         raise TypeError(f"heat must be a Heat or None, got {shape_of(value)}")
     return value

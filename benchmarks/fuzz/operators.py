@@ -88,11 +88,16 @@ class _Calls:
         kinds = ([0, 1, 2, 3, 4, 5], sizes, [1, 2, 3, 2, 3, 1], [-1, -1, 0, 1, -1, -1], [0.0] * 6, [float("inf")] * 6)
         obstacles = (velocity, table, data, *kinds, self.uniform(2), 0.1, *top)
         self.walls, self.obstacles = walls, obstacles[1 : -len(top) - 2]
+        width, mass = D + (1 if D == 2 else 3), self.uniform(self.N)
         return [
             ("grid_update", update),
             ("grid_update_backward", (self.uniform(self.N, 1 + D), True, *update)),
             ("contact", obstacles),
             ("contact_backward", (self.normal(self.N, D), True, *obstacles)),
+            ("wall_impulses", update),
+            ("wall_impulses_backward", (self.normal(2, 2 * D, width).double(), True, *update)),
+            ("contact_impulses", (mass, *obstacles)),
+            ("contact_impulses_backward", (self.normal(2, 6, width).double(), True, mass, *obstacles)),
         ]
 
     def heat(self) -> list[tuple[str, tuple[Any, ...]]]:
@@ -159,13 +164,14 @@ class _Calls:
         laws = ("neo_hookean,von_mises,weakly_compressible", [0, 0, 0])
         counts = [len(LAWS[name].parameters) for name in laws[0].split(",")]
         how = ([ones] * sum(counts), [0, 1, 0], 3, 1e-3, True, True, 0, self.normal(2, D), *self.walls)
-        end = (*self.obstacles, 0.1, 2, 40, True, *self.lattice.packed)
+        impulse = self.normal(2, 6 + 2 * D, D + (1 if D == 2 else 3)).double()
+        end = (*self.obstacles, 0.1, 2, 40, True, impulse, self.dt, self.uniform(2), *self.lattice.packed)
         look = (*fields[:5], self.F, *self.uniform(4, P), self.scene, 50.0, 2.0, True, 0.1, self.lattice.upper, 2)
         call = (*fields, 0.5 + self.uniform(P), [self.uniform(P)], *who, *laws, *how, *end)
         grads = [self.normal(*t.shape) for t in torch.ops.torch_mpm.substeps(*call)[:6]]
         return [
             ("substeps", call),
-            ("substeps_backward", (*grads, 15, *call)),
+            ("substeps_backward", (*grads, torch.ones_like(impulse), 15, *call)),
             ("survey", (*look, *self.obstacles, self.uniform(2), 0.1, *self.lattice.packed)),
         ]
 

@@ -366,6 +366,7 @@ void write_status(const Activation<T, D>& s, int64_t wanted, int64_t transferred
     const int p = a.index[i];
     const Location place = place_of<Order>(a, p, scene, base);
     if (place == Location::inside) continue;  // left out because the grid is full
+    if (scene == kAbsent) continue;
     report(status, activation, place, p);
     if (scene < 0 || scene >= a.scenes) continue;
     int* row = status + (1 + int64_t(scene)) * kStatusSize;

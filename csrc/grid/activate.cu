@@ -220,7 +220,7 @@ __device__ void classify(const ActivateArguments<T, D>& a, const Workspace& w, i
       }
       touched = touched_blocks<Order, D>(base);
       key = block_index(a.geometry, scene, block);
-    } else {
+    } else if (scene != kAbsent) {
       report(a, w.trouble, finite, scene, int(p));
     }
   }
@@ -305,21 +305,24 @@ __device__ Packed exclusive_sum(Packed value, Packed* states, int tile) {
 // Tiles are numbered in the order in which thread blocks ask, so that those before are always running or done.
 __device__ int next_tile(int* counter) {
   __shared__ int tile;
-  __syncthreads();
   if (threadIdx.x == 0) tile = atomicAdd(counter, 1);
   __syncthreads();
   return tile;
 }
 
-// Calls body(number, first, last) with the number and the first table entry of tile after tile, of which a thread block
-// has one alone where as many run as there are tiles.
-template <class F>
+// Calls body(number, first, last) with the number and the first table entry of one tile; or of tile after tile of those
+// that are listed, or of all, where fewer thread blocks may run than there are tiles.
+template <bool Many, class F>
 __device__ void each_tile(const Workspace& w, int* counter, const F& body) {
-  const int count = w.marked ? *w.listed : w.tiles;
-  const bool more = w.marked || int(gridDim.x) < count;
-  for (int tile; (tile = next_tile(counter)) < count;) {
-    body(tile, (w.marked ? w.list[tile] : tile) * kThreads, tile == count - 1);
-    if (!more) break;
+  if constexpr (!Many) {
+    const int tile = next_tile(counter);
+    body(tile, tile * kThreads, tile == w.tiles - 1);
+  } else {
+    const int count = w.marked ? *w.listed : w.tiles;
+    for (int tile; (tile = next_tile(counter)) < count;) {
+      body(tile, (w.marked ? w.list[tile] : tile) * kThreads, tile == count - 1);
+      __syncthreads();  // all have read the number of this tile
+    }
   }
 }
 
@@ -331,9 +334,9 @@ __device__ bool is_near_particles(const Geometry<T, D>& g, const Workspace& w, i
   return near;
 }
 
-template <bool Margin, class T, int D>
+template <bool Margin, bool Many, class T, int D>
 __device__ void slots(const ActivateArguments<T, D>& a, const Workspace& w, int table) {
-  each_tile(w, &w.counters->tile[0], [&](int tile, int first, bool last) {
+  each_tile<Many>(w, &w.counters->tile[0], [&](int tile, int first, bool last) {
     const int b = first + int(threadIdx.x);
     bool active = false;
     if (b < table) {
@@ -361,9 +364,9 @@ __device__ void slots(const ActivateArguments<T, D>& a, const Workspace& w, int 
   });
 }
 
-template <class T, int D>
+template <bool Many, class T, int D>
 __device__ void offsets(const ActivateArguments<T, D>& a, const Workspace& w, int table) {
-  each_tile(w, &w.counters->tile[1], [&](int tile, int first, bool last) {
+  each_tile<Many>(w, &w.counters->tile[1], [&](int tile, int first, bool last) {
     const int b = first + int(threadIdx.x);
     int count = 0, items = 0, slot = -1;
     if (b < table) {
@@ -482,14 +485,14 @@ __global__ void __launch_bounds__(kThreads) classify_kernel(const ActivateArgume
 constexpr int kListers = 1024;
 __global__ void __launch_bounds__(kListers) list_tiles_kernel(const Workspace w) { list_tiles<kListers>(w); }
 
-template <bool Margin, class T, int D>
+template <bool Margin, bool Many, class T, int D>
 __global__ void __launch_bounds__(kThreads) slots_kernel(const ActivateArguments<T, D> a, const Workspace w, int n) {
-  slots<Margin>(a, w, n);
+  slots<Margin, Many>(a, w, n);
 }
 
-template <class T, int D>
+template <bool Many, class T, int D>
 __global__ void __launch_bounds__(kThreads) offsets_kernel(const ActivateArguments<T, D> a, const Workspace w, int n) {
-  offsets(a, w, n);
+  offsets<Many>(a, w, n);
 }
 
 template <class T, int D>
@@ -528,9 +531,9 @@ __global__ void __launch_bounds__(kThreads)
     if (blockIdx.x == 0) list_tiles<kThreads>(w);
     all.sync();
   }
-  slots<true>(a, w, table);
+  slots<true, true>(a, w, table);
   all.sync();
-  offsets(a, w, table);
+  offsets<true>(a, w, table);
   all.sync();
   for (int64_t i = start; i < rows; i += stride) place(a, w, i);
 }
@@ -565,9 +568,12 @@ void activate(const ActivateArguments<T, D>& a, Stream stream) {
   if (a.particles > 0) launch(classify, blocks_for(a.particles), kThreads, 0, stream, a, w);
   if (table > 0) {
     if (w.marked) launch(list_tiles_kernel, 1, kListers, 0, stream, w);
-    const auto slots = a.margin_blocks > 0 ? slots_kernel<true, T, D> : slots_kernel<false, T, D>;
+    const auto slots = a.margin_blocks > 0
+                           ? (w.marked ? slots_kernel<true, true, T, D> : slots_kernel<true, false, T, D>)
+                           : (w.marked ? slots_kernel<false, true, T, D> : slots_kernel<false, false, T, D>);
     launch(slots, tiles, kThreads, 0, stream, a, w, table);
-    launch(offsets_kernel<T, D>, tiles, kThreads, 0, stream, a, w, table);
+    const auto offsets = w.marked ? offsets_kernel<true, T, D> : offsets_kernel<false, T, D>;
+    launch(offsets, tiles, kThreads, 0, stream, a, w, table);
   }
   launch(place_kernel<T, D>, blocks_for(rows), kThreads, 0, stream, a, w);
   if (a.deterministic && a.particles > 0) {

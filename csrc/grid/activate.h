@@ -6,6 +6,8 @@
 
 namespace mpm {
 
+constexpr int kAbsent = -1;
+
 template <class T, int D>
 struct ActivateArguments {
   Geometry<T, D> geometry;
@@ -15,7 +17,7 @@ struct ActivateArguments {
   int64_t particles = 0;
   bool deterministic = false;
   Field<const T> x;
-  const int* scene = nullptr;  // [P] or null for one scene
+  const int* scene = nullptr;  // [P] or null for one scene; kAbsent of a particle that is not there
   int64_t scene_stride = 0;
   const int64_t* id = nullptr;  // [P] or null
   int64_t id_stride = 0;

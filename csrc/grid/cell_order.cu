@@ -3,11 +3,12 @@
 #include "cuda/launch.cuh"
 #include "grid/cell_order.h"
 
-// Orders the particles of each work item by cell with a stable counting sort in shared memory.
+// Orders the particles of each block by cell, so many at a time as fit in shared memory, with a stable counting sort.
 namespace mpm::cuda {
 namespace {
 
-// One thread per cell: each reads all cells of the item, which is a broadcast from shared memory.
+// One thread per cell: each reads the cells of all particles, which is a broadcast from shared memory. The work item in
+// which the particles begin stands for all of them.
 template <int Order, class T, int D>
 __global__ void __launch_bounds__(kBlockNodes<D>)
     cell_order_kernel(const Topology<T, D> t, const Columns<const T, D> position, int* order) {
@@ -18,8 +19,11 @@ __global__ void __launch_bounds__(kBlockNodes<D>)
   const int items = *schedule.item_count, own = threadIdx.x;
   for (int i = blockIdx.x; i < items; i += gridDim.x) {
     const int4 item = reinterpret_cast<const int4*>(schedule.items)[i];
-    const int begin = item.y, count = item.z - begin;
-    __syncthreads();  // the item before is done
+    const int start = t.offsets[item.x], whole = (item.y - start + kItemParticles - 1) / kItemParticles;
+    const int begin = start + whole * kItemParticles;
+    if (begin >= item.z) continue;
+    const int count = ::min(kItemParticles, t.offsets[item.x + 1] - begin);
+    __syncthreads();  // those before are done
     for (int k = own; k < count; k += cells) {
       int base[D];
       T f[D];

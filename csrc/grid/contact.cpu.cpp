@@ -19,7 +19,8 @@ void contact(const ContactArguments<T, D>& a) {
 template <class T, int D>
 void contact_backward(const ContactArguments<T, D>& a) {
   parallel_ranges(a.max_blocks, kGrain, [&](int64_t begin, int64_t end) {
-    for (int64_t slot = begin; slot < end; slot++) slot_contact_backward<1>(a, int(slot), 0, [](T x) { return x; });
+    for (int64_t slot = begin; slot < end; slot++)
+      slot_contact_backward<1>(a, int(slot), 0, [](T x) { return x; }, NoImpulses());
   });
 }
 

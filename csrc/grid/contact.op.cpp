@@ -1,7 +1,8 @@
+#include "grid/impulse.op.h"
 #include "grid/kernels.h"
 #include "grid/obstacle.op.h"
 
-// Contact of the grid with rigid obstacles.
+// Contact of the grid with rigid obstacles, and the impulses on these.
 namespace mpm {
 namespace {
 
@@ -60,6 +61,59 @@ std::tuple<Tensor, Tensor> contact_backward(const Tensor& grad, bool wants_rows,
   return {grad_velocity, rows};
 }
 
+// With the mass of nodes [N]. `scenes` becomes the number of scenes of the table.
+template <class T, int D>
+ContactImpulsesArguments<T, D> impulses_arguments(int64_t& scenes, const Tensor& mass, MPM_CONTACT_PARAMETERS) {
+  ContactImpulsesArguments<T, D> a;
+  a.contact = contact_arguments<T, D>(MPM_CONTACT_ARGUMENTS);
+  check_shape(mass, "mass", {velocity.size(0)});
+  check_like(mass, "mass", velocity);
+  a.mass = static_cast<const T*>(mass.data_ptr());
+  a.mass_stride = mass.stride(0);
+  int64_t table_size;
+  PackedTopology(topology, lattice, layout).table_pointer(velocity, table_size);
+  scenes = std::min<int64_t>(INT32_MAX, table_size) / a.contact.geometry.blocks_per_scene;
+  return a;
+}
+
+Tensor contact_impulses(const Tensor& mass, MPM_CONTACT_PARAMETERS) {
+  const DeviceScope device(velocity);
+  check_velocity(velocity);
+  Tensor sums, slots;
+  dispatch(velocity, "velocity", velocity.size(1), [&]<class T, int D>() {
+    int64_t scenes;
+    auto a = impulses_arguments<T, D>(scenes, mass, MPM_CONTACT_ARGUMENTS);
+    sums = no_impulses(velocity, scenes, a.contact.obstacles, D);
+    a.impulse =
+        impulse_arguments<D>(PackedLattice(lattice, layout), sums, 0, a.contact.obstacles, a.contact.max_blocks, slots);
+    backend::contact_impulses(a, device.stream());
+  });
+  return sums;
+}
+
+// Rows [adjoint of the mass, that of the velocity]; `rows` as in the adjoint of contact.
+std::tuple<Tensor, Tensor> contact_impulses_backward(const Tensor& grad_impulse, bool wants_rows, const Tensor& mass,
+                                                     MPM_CONTACT_PARAMETERS) {
+  const DeviceScope device(velocity);
+  check_velocity(velocity);
+  Tensor grad_nodes = empty(velocity, {velocity.size(0), 1 + velocity.size(1)}), rows;
+  const Tensor grad_after = zeros(velocity, {velocity.size(0), velocity.size(1)});
+  dispatch(velocity, "velocity", velocity.size(1), [&]<class T, int D>() {
+    int64_t scenes;
+    auto a = impulses_arguments<T, D>(scenes, mass, MPM_CONTACT_ARGUMENTS);
+    ContactArguments<T, D>& c = a.contact;
+    c.grad = static_cast<const T*>(grad_after.data_ptr());
+    c.grad_stride = D;
+    c.result = static_cast<T*>(grad_nodes.data_ptr());
+    rows = empty(velocity, {wants_rows ? c.max_blocks : 0, c.obstacles, ObstacleRow<T, D>::width});
+    if (wants_rows) c.row_grad = static_cast<T*>(rows.data_ptr());
+    a.impulse = impulse_gradient<D>(PackedLattice(lattice, layout), grad_impulse, 0, c.obstacles,
+                                    {scenes, c.obstacles, kImpulse<D>}, velocity);
+    backend::contact_impulses_backward(a, device.stream());
+  });
+  return {grad_nodes, rows};
+}
+
 }  // namespace
 }  // namespace mpm
 
@@ -67,10 +121,15 @@ std::tuple<Tensor, Tensor> contact_backward(const Tensor& grad, bool wants_rows,
 STABLE_TORCH_LIBRARY_FRAGMENT(torch_mpm, m) {
   m.def("contact(" MPM_CONTACT_SCHEMA ") -> Tensor");
   m.def("contact_backward(Tensor grad, bool wants_rows, " MPM_CONTACT_SCHEMA ") -> (Tensor velocity, Tensor rows)");
+  m.def("contact_impulses(Tensor mass, " MPM_CONTACT_SCHEMA ") -> Tensor");
+  m.def("contact_impulses_backward(Tensor grad_impulse, bool wants_rows, Tensor mass, " MPM_CONTACT_SCHEMA
+        ") -> (Tensor nodes, Tensor rows)");
 }
 #endif
 
 MPM_LIBRARY_IMPL(m) {
   m.impl("contact", TORCH_BOX(&mpm::contact));
   m.impl("contact_backward", TORCH_BOX(&mpm::contact_backward));
+  m.impl("contact_impulses", TORCH_BOX(&mpm::contact_impulses));
+  m.impl("contact_impulses_backward", TORCH_BOX(&mpm::contact_impulses_backward));
 }

@@ -30,7 +30,7 @@ void grid_update_backward(const GridUpdateBackwardArguments<T, D>& a) {
       const int64_t first = slot * kBlockNodes<D>;
       Vector<T, D> sum = zero_vector<T, D>(), change;
       for (int local = 0; local < kBlockNodes<D>; local++) {
-        a.grad_nodes[first + local] = update_node_backward(a, s, local, first + local, change);
+        a.grad_nodes[first + local] = update_node_backward(a, s, local, first + local, change, NoImpulses());
         sum = sum + change;
       }
       if (a.change) a.change[slot] = sum;

@@ -1,6 +1,5 @@
-#include "cuda/chain.cuh"
+#include "cuda/launch.cuh"
 #include "grid/grid_update.h"
-#include "grid/obstacle.h"
 
 namespace mpm::cuda {
 namespace {
@@ -17,28 +16,6 @@ __global__ void __launch_bounds__(kThreads) grid_update_kernel(const GridUpdateA
   a.updated[node] = update_node(a, slot_update(a, slot), int(node % kBlockNodes<D>), a.nodes[node]);
 }
 
-// In a call of many steps, perhaps with obstacles.
-template <bool Obstacles, class T, int D>
-__global__ void __launch_bounds__(kThreads)
-    next_grid_kernel(const GridUpdateArguments<T, D> a, const ContactArguments<T, D> contact) {
-  wait_for_kernel_before();
-  const int64_t node = int64_t(blockIdx.x) * kThreads + threadIdx.x;
-  const int slot = int(node / kBlockNodes<D>), local = int(node % kBlockNodes<D>);
-  if (node == 0) *a.next_drift = a.drift->next(a.particles);
-  if (slot >= a.max_blocks) return;
-  const SlotUpdate<T, D> s = slot_update(a, slot);
-  if (!s.active) return;
-  NodeRow<T, D> row = update_node(a, s, local, a.nodes[node]);
-  if constexpr (Obstacles) {
-    const ContactSlot<T, D> there = contact_slot(contact, slot);
-    if (there.active)
-      row.value =
-          after_obstacles(contact, there, contact.obstacles, node_position(contact, there.corner, local), row.value);
-  }
-  a.updated[node] = row;
-  if (a.emptied) a.emptied[node] = {};
-}
-
 // A whole warp, or half of one in 2-D, works on a slot and sums over its nodes in a fixed order.
 template <class T, int D>
 __global__ void __launch_bounds__(kThreads) grid_update_backward_kernel(const GridUpdateBackwardArguments<T, D> a) {
@@ -52,7 +29,7 @@ __global__ void __launch_bounds__(kThreads) grid_update_backward_kernel(const Gr
     for (int local = lane; local < kBlockNodes<D>; local += kLanes<D>) {
       const int64_t node = slot * kBlockNodes<D> + local;
       Vector<T, D> change;
-      a.grad_nodes[node] = update_node_backward(a, s, local, node, change);
+      a.grad_nodes[node] = update_node_backward(a, s, local, node, change, NoImpulses());
       sum = sum + change;
     }
   }
@@ -74,23 +51,8 @@ unsigned blocks_for(int64_t max_blocks, int64_t threads_per_slot) {
 template <class T, int D>
 void grid_update(const GridUpdateArguments<T, D>& a, Stream stream) {
   if (a.max_blocks == 0) return;
-  const unsigned blocks = blocks_for(a.max_blocks, kBlockNodes<D>);
-  if (a.next_drift)
-    launch_in_chain(next_grid_kernel<false, T, D>, blocks, kThreads, 0, stream, a, ContactArguments<T, D>());
-  else
-    launch(grid_update_kernel<T, D>, blocks, kThreads, 0, stream, a);
+  launch(grid_update_kernel<T, D>, blocks_for(a.max_blocks, kBlockNodes<D>), kThreads, 0, stream, a);
 }
-
-template <class T, int D>
-void grid_update_and_contact(const GridUpdateArguments<T, D>& a, const ContactArguments<T, D>& contact, Stream stream) {
-  if (a.max_blocks == 0) return;
-  const unsigned blocks = blocks_for(a.max_blocks, kBlockNodes<D>);
-  launch_in_chain(next_grid_kernel<true, T, D>, blocks, kThreads, 0, stream, a, contact);
-}
-
-#define MPM_INSTANTIATE_BOTH(T, D, name) \
-  template void name<T, D>(const GridUpdateArguments<T, D>&, const ContactArguments<T, D>&, Stream);
-MPM_EACH_SHAPE(MPM_INSTANTIATE_BOTH, grid_update_and_contact)
 
 template <class T, int D>
 void grid_update_backward(const GridUpdateBackwardArguments<T, D>& a, Stream stream) {

@@ -6,7 +6,8 @@
 
 #include "grid/friction.h"
 #include "grid/geometry.h"
-#include "grid/topology.h"
+#include "grid/impulse.h"
+#include "grid/lattice_node.h"
 
 // Node momentum to node velocity, gravity and the walls of the domain.
 //
@@ -61,13 +62,6 @@ struct GridUpdateArguments {
   double dt = 0;
   Walls<T, D> walls;
   NodeRow<T, D>* updated = nullptr;
-  // Where `drift` is given, in a call of many steps on CUDA: rows of unused slots are left as they are, `emptied`,
-  // which is `nodes`, is zeroed on the way unless there are mirrors, and the drift of this step makes that of the next,
-  // for G2P to count.
-  NodeRow<T, D>* emptied = nullptr;
-  const Drift* drift = nullptr;
-  Drift* next_drift = nullptr;
-  int64_t particles = 0;
 };
 
 template <class T, int D>
@@ -80,6 +74,20 @@ struct GridUpdateBackwardArguments {
 };
 
 inline namespace TORCH_MPM_ISA {
+
+// Whether a mirror may give the nodes of a block images.
+template <class T, int D>
+MPM_HD bool near_mirror(const Walls<T, D>& walls, const int corner[D], int face) {
+  const int first = 2 * corner[face / 2] - walls.mirror[face];  // twice the distance from the plane
+  return first <= 2 * kMirrorReach && first + 2 * (kBlockWidth - 1) >= -2 * kMirrorReach;
+}
+
+// Whether a contact face touches a block.
+template <class T, int D>
+MPM_HD bool near_wall(const Walls<T, D>& walls, const int corner[D], int face) {
+  const int first = corner[face / 2];
+  return face % 2 ? first + kBlockWidth > walls.node[face] : first <= walls.node[face];
+}
 
 // What the nodes of one slot share.
 template <class T, int D>
@@ -103,13 +111,11 @@ MPM_HD SlotUpdate<T, D> slot_update(const GridUpdateArguments<T, D>& a, int slot
   s.scene = block_coordinates(a.geometry, index, s.corner);
   MPM_UNROLL for (int i = 0; i < D; i++) {
     s.corner[i] *= kBlockWidth;
-    s.walled |= s.corner[i] <= a.walls.node[2 * i] || s.corner[i] + kBlockWidth > a.walls.node[2 * i + 1];
+    s.walled |= near_wall(a.walls, s.corner, 2 * i) || near_wall(a.walls, s.corner, 2 * i + 1);
   }
   if (a.walls.mirrored) {
-    MPM_UNROLL for (int face = 0; face < 2 * D; face++) {
-      const int first = 2 * s.corner[face / 2] - a.walls.mirror[face];  // twice the distance from the plane
-      s.mirrored |= first <= 2 * kMirrorReach && first + 2 * (kBlockWidth - 1) >= -2 * kMirrorReach;
-    }
+    MPM_UNROLL for (int face = 0; face < 2 * D; face++)
+      s.mirrored |= near_mirror(a.walls, s.corner, face);
   }
   if (a.gravity) {
     const T dt = a.scene_dt ? T(a.dt) * a.scene_dt[s.scene] : T(a.dt);
@@ -119,17 +125,9 @@ MPM_HD SlotUpdate<T, D> slot_update(const GridUpdateArguments<T, D>& a, int slot
   return s;
 }
 
-// Lattice index of a node of the slot along an axis.
+// The contact face that acts on a node with this lattice index along an axis, or -1.
 template <class T, int D>
-MPM_HD int node_index(const SlotUpdate<T, D>& s, int axis, int local) {
-  const int shift = 2 * (D - 1 - axis);  // kBlockWidth is 4, the last axis fastest
-  return s.corner[axis] + ((local >> shift) & (kBlockWidth - 1));
-}
-
-// The contact face that acts on a node along an axis, or -1.
-template <class T, int D>
-MPM_HD int wall_face(const Walls<T, D>& walls, const SlotUpdate<T, D>& s, int axis, int local) {
-  const int node = node_index(s, axis, local);
+MPM_HD int wall_face(const Walls<T, D>& walls, int axis, int node) {
   return node <= walls.node[2 * axis] ? 2 * axis : node >= walls.node[2 * axis + 1] ? 2 * axis + 1 : -1;
 }
 
@@ -141,44 +139,66 @@ MPM_HD Vector<T, D> wall_normal(int face) {
   return n;
 }
 
+// The velocity v of a lattice node after the contact faces, which act one after another in the order of the axes;
+// see(face, before, after) is called for each that acts.
+template <class T, int D, class See>
+MPM_HD Vector<T, D> after_walls(const Walls<T, D>& walls, const Vector<int, D>& node, Vector<T, D> v, See&& see) {
+  MPM_UNROLL for (int i = 0; i < D; i++) {
+    const int face = wall_face(walls, i, node[i]);
+    if (face < 0) continue;
+    const Vector<T, D> before = v;
+    v = contact_velocity(walls.kind[face], before, wall_normal<T, D>(face), walls.friction[face]);
+    see(face, before, v);
+  }
+  return v;
+}
+
 // Row of a lattice node in the scene of the slot, or -1 where its block is inactive.
 template <class T, int D>
-MPM_HD int64_t row_of(const GridUpdateArguments<T, D>& a, const SlotUpdate<T, D>& s, const int node[D]) {
+MPM_HD int64_t row_of(const GridUpdateArguments<T, D>& a, const SlotUpdate<T, D>& s, const Vector<int, D>& node) {
   int block[D];
   MPM_UNROLL for (int i = 0; i < D; i++) {
     if (node[i] < 0 || node[i] >= a.geometry.blocks[i] * kBlockWidth) return -1;
     block[i] = node[i] / kBlockWidth;
   }
   const int slot = a.table[block_index(a.geometry, s.scene, block)];
-  return slot < 0 || slot >= a.max_blocks ? -1 : int64_t(slot) * kBlockNodes<D> + node_in_block<D>(node);
+  return slot < 0 || slot >= a.max_blocks ? -1 : int64_t(slot) * kBlockNodes<D> + node_in_block<D>(node.e);
 }
 
-// Calls f(row, sign) for a node and its images in the mirrors, 2^k of them where k mirrors meet; sign is the diagonal
-// of the reflection. The images of an image are the same nodes.
+// The mirror along an axis in which a lattice node has an image, or -1.
+template <class T, int D>
+MPM_HD int mirror_face(const Walls<T, D>& walls, int axis, int node) {
+  int face = -1;
+  MPM_UNROLL for (int side = 0; side < 2; side++) {
+    const int twice = 2 * node - walls.mirror[2 * axis + side];
+    if (twice >= -2 * kMirrorReach && twice <= 2 * kMirrorReach) face = 2 * axis + side;
+  }
+  return face;
+}
+
+// Calls f(row, sign, at) for a node and its images in the mirrors, 2^k of them where k mirrors meet; sign is the
+// diagonal of the reflection, `at` its lattice index. The images of an image are the same nodes.
 template <class T, int D, class F>
 MPM_HD void for_images(const GridUpdateArguments<T, D>& a, const SlotUpdate<T, D>& s, int local, F&& f) {
-  int node[D], image[D], axes = 0;  // axes: bits of those along which there is an image
+  const Vector<int, D> node = lattice_node<D>(s.corner, local);
+  Vector<int, D> image;
+  int axes = 0;  // bits of those along which there is an image
   MPM_UNROLL for (int i = 0; i < D; i++) {
-    node[i] = node_index(s, i, local);
-    image[i] = node[i];
-    MPM_UNROLL for (int side = 0; side < 2; side++) {
-      const int there = a.walls.mirror[2 * i + side] - node[i], twice = node[i] - there;
-      if (twice < -2 * kMirrorReach || twice > 2 * kMirrorReach) continue;
-      image[i] = there;
-      axes |= 1 << i;
-    }
+    const int face = mirror_face(a.walls, i, node[i]);
+    image[i] = face < 0 ? node[i] : a.walls.mirror[face] - node[i];
+    axes |= (face >= 0) << i;
   }
   for (int subset = 0; subset < 1 << D; subset++) {
     if ((subset & axes) != subset) continue;
     Vector<T, D> sign;
-    int at[D];
+    Vector<int, D> at;
     MPM_UNROLL for (int i = 0; i < D; i++) {
       const bool reflected = subset >> i & 1;
       sign[i] = reflected ? T(-1) : T(1);
       at[i] = reflected ? image[i] : node[i];
     }
     const int64_t row = row_of(a, s, at);
-    if (row >= 0) f(row, sign);
+    if (row >= 0) f(row, sign, at);
   }
 }
 
@@ -193,7 +213,7 @@ MPM_HD NodeRow<T, D> free_node(const GridUpdateArguments<T, D>& a, const SlotUpd
     return r;
   }
   r.mass = T(0);
-  for_images(a, s, local, [&](int64_t member, const Vector<T, D>& sign) {
+  for_images(a, s, local, [&](int64_t member, const Vector<T, D>& sign, const Vector<int, D>&) {
     const NodeRow<T, D>& image = a.nodes[member];
     r.mass += image.mass;
     MPM_UNROLL for (int i = 0; i < D; i++)
@@ -204,7 +224,7 @@ MPM_HD NodeRow<T, D> free_node(const GridUpdateArguments<T, D>& a, const SlotUpd
   return r;
 }
 
-// A node without mass has no velocity. At edges and corners the faces act one after another, in the order of the axes.
+// A node without mass has no velocity.
 template <class T, int D>
 MPM_HD NodeRow<T, D> update_node(const GridUpdateArguments<T, D>& a, const SlotUpdate<T, D>& s, int local,
                                  const NodeRow<T, D>& row) {
@@ -212,55 +232,122 @@ MPM_HD NodeRow<T, D> update_node(const GridUpdateArguments<T, D>& a, const SlotU
   const NodeRow<T, D> free = free_node(a, s, local, row);
   Vector<T, D> v = free.value;
   if (s.walled && free.mass != T(0)) {
-    MPM_UNROLL for (int i = 0; i < D; i++) {
-      const int face = wall_face(a.walls, s, i, local);
-      if (face >= 0) v = contact_velocity(a.walls.kind[face], v, wall_normal<T, D>(face), a.walls.friction[face]);
-    }
+    const auto see = [](int, const Vector<T, D>&, const Vector<T, D>&) {};
+    v = after_walls(a.walls, lattice_node<D>(s.corner, local), v, see);
   }
   return {row.mass, v};
 }
 
-// Adjoint of row `index`; `change` becomes that of the velocity change by gravity. A node and its images depend on the
-// same sum, so the adjoint of the sum is that of all of them, reflected.
+// The mirror that takes a component of the momentum of a lattice node, or -1 for none: that along the axis, or where
+// there is none the first that the node has an image in, whose nodes exchange it.
 template <class T, int D>
+MPM_HD int mirror_of(const Walls<T, D>& walls, const Vector<int, D>& node, int axis) {
+  int face = mirror_face(walls, axis, node[axis]);
+  MPM_UNROLL for (int i = 0; i < D; i++)
+    if (face < 0) face = mirror_face(walls, i, node[i]);
+  return face;
+}
+
+// The impulse of a node on a face.
+template <class T, int D>
+MPM_HD Vector<T, D> wall_impulse(const GridUpdateArguments<T, D>& a, const SlotUpdate<T, D>& s, int local,
+                                 const NodeRow<T, D>& row, int face) {
+  const Vector<int, D> node = lattice_node<D>(s.corner, local);
+  Vector<T, D> impulse = zero_vector<T, D>();
+  const NodeRow<T, D> free = free_node(a, s, local, row);
+  if (free.mass == T(0)) return impulse;
+  after_walls(a.walls, node, free.value, [&](int acting, const Vector<T, D>& before, const Vector<T, D>& after) {
+    if (acting == face) impulse = row.mass * (before + T(-1) * after);
+  });
+  MPM_UNROLL for (int i = 0; i < D; i++)
+    if (s.mirrored && mirror_of(a.walls, node, i) == face)
+      impulse[i] += row.value[i] + row.mass * (s.gravity[i] - free.value[i]);
+  return impulse;
+}
+
+// Adjoint of the velocity v of a lattice node before the contact faces, from that after them.
+template <class T, int D, class Impulses>
+MPM_HD Vector<T, D> walls_adjoint(const Walls<T, D>& walls, const Vector<int, D>& node, const Vector<T, D>& v,
+                                  Vector<T, D> grad, Impulses& impulses) {
+  Vector<T, D> before[D], after[D];  // of each axis
+  MPM_UNROLL for (int i = 0; i < D; i++)
+    before[i] = after[i] = v;
+  after_walls(walls, node, v, [&](int face, const Vector<T, D>& from, const Vector<T, D>& to) {
+    before[face / 2] = from;
+    after[face / 2] = to;
+  });
+  MPM_UNROLL for (int i = D - 1; i >= 0; i--) {
+    const int face = wall_face(walls, i, node[i]);
+    if (face < 0) continue;
+    if constexpr (Impulses::wanted) grad = impulses.take(impulses.weight(face, node), before[i], after[i], grad);
+    grad = contact_adjoint(walls.kind[face], before[i], wall_normal<T, D>(face), walls.friction[face], grad);
+    if constexpr (Impulses::wanted) grad = grad + impulses.mass * impulses.weight(face, node);
+  }
+  return grad;
+}
+
+// The same for the mirrors, to the velocity v that the node and its images share; `momentum` becomes the adjoint of the
+// node's own momentum, whose difference from its mass times v is the impulse.
+template <class T, int D, class Impulses>
+MPM_HD Vector<T, D> mirrors_adjoint(const Walls<T, D>& walls, const Vector<int, D>& node, const Vector<T, D>& gravity,
+                                    const Vector<T, D>& v, const Vector<T, D>& grad, Impulses& impulses,
+                                    Vector<T, D>& momentum) {
+  momentum = zero_vector<T, D>();
+  MPM_UNROLL for (int i = 0; i < D; i++) {
+    const int face = mirror_of(walls, node, i);
+    if (face >= 0) momentum[i] = impulses.weight(face, node)[i];
+  }
+  return impulses.take(momentum, gravity, v, grad);
+}
+
+// Adjoint of row `index`; `change` becomes that of the velocity change by gravity. A node and its images depend on the
+// same sum, so the adjoint of the sum is that of all of them, reflected. `impulses(scene, row)` are `NodeImpulses` of a
+// row, or `NoImpulses`.
+template <class T, int D, class ImpulsesOf>
 MPM_HD NodeRow<T, D> update_node_backward(const GridUpdateBackwardArguments<T, D>& b, const SlotUpdate<T, D>& s,
-                                          int local, int64_t index, Vector<T, D>& change) {
+                                          int local, int64_t index, Vector<T, D>& change, ImpulsesOf&& impulses) {
   const GridUpdateArguments<T, D>& a = b.forward;
-  const NodeRow<T, D> row = a.nodes[index], grad = b.grad_updated[index];
+  const NodeRow<T, D> row = a.nodes[index];
+  NodeRow<T, D> result{b.grad_updated[index].mass, zero_vector<T, D>()};
   change = zero_vector<T, D>();
   if (!s.active) return {T(0), change};
   const NodeRow<T, D> free = free_node(a, s, local, row);
-  if (free.mass == T(0)) return {grad.mass, change};
+  if (free.mass == T(0)) return result;
+  Vector<T, D> sum = zero_vector<T, D>();  // adjoint of the free velocity
+  // Of a node that has the free velocity, reflected by `sign`: first the node itself, which may be its own image, too.
+  bool itself = true;
+  const auto add_member = [&](int64_t member, const Vector<T, D>& sign, const Vector<int, D>& node) {
+    auto own = impulses(s.scene, member);
+    Vector<T, D> grad = b.grad_updated[member].value, v, direct;
+    MPM_UNROLL for (int i = 0; i < D; i++)
+      v[i] = sign[i] * free.value[i];
+    if (s.walled || s.mirrored) grad = walls_adjoint(a.walls, node, v, grad, own);
+    if constexpr (decltype(own)::wanted) {
+      if (s.mirrored) {
+        grad = mirrors_adjoint(a.walls, node, s.gravity, v, grad, own, direct);
+        if (itself) result.value = direct;
+      }
+      if (itself) result.mass += own.mass_grad;
+      itself = false;
+    }
+    MPM_UNROLL for (int i = 0; i < D; i++)
+      sum[i] += sign[i] * grad[i];
+  };
   if (s.mirrored) {
-    for_images(a, s, local, [&](int64_t member, const Vector<T, D>& sign) {
-      MPM_UNROLL for (int i = 0; i < D; i++)
-        change[i] += sign[i] * b.grad_updated[member].value[i];
-    });
+    for_images(a, s, local, add_member);
   } else {
-    change = grad.value;
+    Vector<T, D> upright;
+    MPM_UNROLL for (int i = 0; i < D; i++)
+      upright[i] = T(1);
+    add_member(index, upright, lattice_node<D>(s.corner, local));
   }
-  if (s.walled) {
-    Vector<T, D> before[D];  // velocity before each axis
-    Vector<T, D> v = free.value;
-    MPM_UNROLL for (int i = 0; i < D; i++) {
-      before[i] = v;
-      const int face = wall_face(a.walls, s, i, local);
-      if (face >= 0) v = contact_velocity(a.walls.kind[face], v, wall_normal<T, D>(face), a.walls.friction[face]);
-    }
-    MPM_UNROLL for (int i = D - 1; i >= 0; i--) {
-      const int face = wall_face(a.walls, s, i, local);
-      if (face >= 0)
-        change =
-            contact_adjoint(a.walls.kind[face], before[i], wall_normal<T, D>(face), a.walls.friction[face], change);
-    }
-  }
-  NodeRow<T, D> result;
-  result.mass = grad.mass;
+  change = (row.mass / free.mass) * sum;
+  if constexpr (decltype(impulses(0, index))::wanted) change = change + row.mass * result.value;
   MPM_UNROLL for (int i = 0; i < D; i++) {
-    result.value[i] = change[i] / free.mass;
-    result.mass += result.value[i] * (s.gravity[i] - free.value[i]);
+    const T by_velocity = sum[i] / free.mass;
+    result.value[i] += by_velocity;
+    result.mass += by_velocity * (s.gravity[i] - free.value[i]);
   }
-  change = (row.mass / free.mass) * change;
   return result;
 }
 

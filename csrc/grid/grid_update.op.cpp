@@ -1,9 +1,10 @@
 #include <algorithm>
 
+#include "grid/impulse.op.h"
 #include "grid/kernels.h"
 #include "grid/walls.op.h"
 
-// Node mass and momentum to mass and velocity, with gravity and the walls of the domain.
+// Node mass and momentum to mass and velocity, with gravity and the walls of the domain, and the impulses on these.
 namespace mpm {
 namespace {
 
@@ -104,6 +105,51 @@ std::tuple<Tensor, Tensor> grid_update_backward(const Tensor& grad, bool wants_c
   return {grad_nodes, change};
 }
 
+// Scenes of the table.
+template <class T, int D>
+int64_t scenes_of(const GridUpdateArguments<T, D>& a) {
+  return a.block_count / a.geometry.blocks_per_scene;
+}
+
+Tensor wall_impulses(MPM_GRID_UPDATE_PARAMETERS) {
+  check_nodes(nodes);
+  const DeviceScope device(nodes);
+  const Tensor packed = packed_rows(nodes);
+  Tensor sums, slots;
+  dispatch(nodes, "nodes", nodes.size(1) - 1, [&]<class T, int D>() {
+    WallImpulsesArguments<T, D> a;
+    a.update = grid_update_arguments<T, D>(MPM_GRID_UPDATE_ARGUMENTS);
+    a.update.nodes = rows<T, D>(packed, "nodes", nodes);
+    sums = no_impulses(nodes, scenes_of(a.update), 2 * D, D);
+    a.impulse =
+        impulse_arguments<D>(PackedLattice(lattice, layout), sums, 0, 2 * D, int64_t(a.update.max_blocks), slots);
+    backend::wall_impulses(a, device.stream());
+  });
+  return sums;
+}
+
+// `change` as in the adjoint of the grid update.
+std::tuple<Tensor, Tensor> wall_impulses_backward(const Tensor& grad_impulse, bool wants_change,
+                                                  MPM_GRID_UPDATE_PARAMETERS) {
+  check_nodes(nodes);
+  const DeviceScope device(nodes);
+  const Tensor packed = packed_rows(nodes), grad_updated = zeros(packed, {packed.size(0), packed.size(1)});
+  Tensor grad_nodes = empty(packed, {packed.size(0), packed.size(1)}), change;
+  dispatch(nodes, "nodes", nodes.size(1) - 1, [&]<class T, int D>() {
+    WallImpulsesBackwardArguments<T, D> a;
+    a.update.forward = grid_update_arguments<T, D>(MPM_GRID_UPDATE_ARGUMENTS);
+    a.update.forward.nodes = rows<T, D>(packed, "nodes", nodes);
+    a.update.grad_updated = rows<T, D>(grad_updated, "grad", nodes);
+    a.update.grad_nodes = static_cast<NodeRow<T, D>*>(grad_nodes.data_ptr());
+    change = empty(nodes, {wants_change ? a.update.forward.max_blocks : 0, D});
+    if (wants_change) a.update.change = static_cast<Vector<T, D>*>(change.data_ptr());
+    a.impulse = impulse_gradient<D>(PackedLattice(lattice, layout), grad_impulse, 0, 2 * D,
+                                    {scenes_of(a.update.forward), 2 * D, kImpulse<D>}, nodes);
+    backend::wall_impulses_backward(a, device.stream());
+  });
+  return {grad_nodes, change};
+}
+
 }  // namespace
 }  // namespace mpm
 
@@ -112,10 +158,15 @@ STABLE_TORCH_LIBRARY_FRAGMENT(torch_mpm, m) {
   m.def("grid_update(" MPM_GRID_UPDATE_SCHEMA ") -> Tensor");
   m.def("grid_update_backward(Tensor grad, bool wants_change, " MPM_GRID_UPDATE_SCHEMA
         ") -> (Tensor nodes, Tensor change)");
+  m.def("wall_impulses(" MPM_GRID_UPDATE_SCHEMA ") -> Tensor");
+  m.def("wall_impulses_backward(Tensor grad_impulse, bool wants_change, " MPM_GRID_UPDATE_SCHEMA
+        ") -> (Tensor nodes, Tensor change)");
 }
 #endif
 
 MPM_LIBRARY_IMPL(m) {
   m.impl("grid_update", TORCH_BOX(&mpm::grid_update));
   m.impl("grid_update_backward", TORCH_BOX(&mpm::grid_update_backward));
+  m.impl("wall_impulses", TORCH_BOX(&mpm::wall_impulses));
+  m.impl("wall_impulses_backward", TORCH_BOX(&mpm::wall_impulses_backward));
 }

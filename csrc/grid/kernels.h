@@ -4,15 +4,20 @@
 #include "grid/activate.h"
 #include "grid/cell_order.h"
 #include "grid/grid_update.h"
+#include "grid/impulses.h"
 #include "grid/obstacle.h"
 #include "grid/status.h"
 
-#define MPM_GRID_KERNELS(PLAIN, ORDERED, SIZE)             \
-  SIZE(activate_workspace, ActivateArguments)              \
-  ORDERED(activate, ActivateArguments)                     \
-  ORDERED(cell_order, CellOrderArguments)                  \
-  PLAIN(grid_update, GridUpdateArguments)                  \
-  PLAIN(grid_update_backward, GridUpdateBackwardArguments) \
-  PLAIN(contact, ContactArguments)                         \
-  PLAIN(contact_backward, ContactArguments)
+#define MPM_GRID_KERNELS(PLAIN, ORDERED, SIZE)                 \
+  SIZE(activate_workspace, ActivateArguments)                  \
+  ORDERED(activate, ActivateArguments)                         \
+  ORDERED(cell_order, CellOrderArguments)                      \
+  PLAIN(grid_update, GridUpdateArguments)                      \
+  PLAIN(grid_update_backward, GridUpdateBackwardArguments)     \
+  PLAIN(contact, ContactArguments)                             \
+  PLAIN(contact_backward, ContactArguments)                    \
+  PLAIN(wall_impulses, WallImpulsesArguments)                  \
+  PLAIN(wall_impulses_backward, WallImpulsesBackwardArguments) \
+  PLAIN(contact_impulses, ContactImpulsesArguments)            \
+  PLAIN(contact_impulses_backward, ContactImpulsesArguments)
 MPM_BACKEND_KERNELS(MPM_GRID_KERNELS)

@@ -5,6 +5,8 @@
 
 #include "grid/friction.h"
 #include "grid/geometry.h"
+#include "grid/impulse.h"
+#include "grid/lattice_node.h"
 
 // Rigid obstacles: which nodes are inside, the velocity of those after contact, and its adjoints.
 namespace mpm {
@@ -59,7 +61,8 @@ struct ContactArguments {
   const T* velocity = nullptr;  // node i at velocity + i * stride
   const T* grad = nullptr;      // likewise; backward only
   int64_t stride = 0, grad_stride = 0;
-  T* result = nullptr;    // rows [max_blocks * 4^D, 1 + D] as of the grid update, the first column zero
+  T* result =
+      nullptr;  // rows [max_blocks * 4^D, 1 + D] as of the grid update, the first column zero or a mass' adjoint
   T* row_grad = nullptr;  // adjoint of the rows by each slot [max_blocks, obstacles, width], or null; backward only
 };
 
@@ -309,10 +312,8 @@ MPM_HD bool near_block(const ContactArguments<T, D>& a, const ObstaclePose<T, D>
 template <class T, int D>
 MPM_HD Vector<T, D> node_position(const ContactArguments<T, D>& a, const int corner[D], int local) {
   Vector<T, D> x;
-  MPM_UNROLL for (int i = 0; i < D; i++) {
-    const int node = corner[i] + ((local >> 2 * (D - 1 - i)) & (kBlockWidth - 1));
-    x[i] = T(a.lower[i] + double(node - kPadding) * a.dx);
-  }
+  MPM_UNROLL for (int i = 0; i < D; i++)
+    x[i] = T(a.lower[i] + double(lattice_index<D>(corner, i, local) - kPadding) * a.dx);
   return x;
 }
 
@@ -367,9 +368,9 @@ MPM_HD Vector<T, D> load_node(const T* values, int64_t stride, int64_t node) {
 }
 
 template <class T, int D>
-MPM_HD void store_node(T* values, int64_t node, const Vector<T, D>& v) {
+MPM_HD void store_node(T* values, int64_t node, const Vector<T, D>& v, const T& first = T(0)) {
   T* const row = values + node * (1 + D);
-  row[0] = T(0);
+  row[0] = first;
   MPM_UNROLL for (int i = 0; i < D; i++)
     row[1 + i] = v[i];
 }
@@ -435,13 +436,17 @@ MPM_HD T parameter_adjoint(const ContactArguments<T, D>& a, const ContactSlot<T,
   return sum;
 }
 
-// `sum_lanes` adds a number over the lanes of a slot; the first lane gets the sum.
-template <int Lanes, class T, int D, class SumLanes>
-MPM_HD void slot_contact_backward(const ContactArguments<T, D>& a, int slot, int lane, SumLanes&& sum_lanes) {
+// `sum_lanes` adds a number over the lanes of a slot; the first lane gets the sum. `impulses(scene, node)` are
+// `NodeImpulses` of a node, or `NoImpulses`.
+template <int Lanes, class T, int D, class SumLanes, class ImpulsesOf>
+MPM_HD void slot_contact_backward(const ContactArguments<T, D>& a, int slot, int lane, SumLanes&& sum_lanes,
+                                  ImpulsesOf&& impulses) {
   constexpr int count = kBlockNodes<D> / Lanes, width = ObstacleRow<T, D>::width;
+  constexpr bool with_impulses = decltype(impulses(0, 0))::wanted;
   const ContactSlot<T, D> s = contact_slot(a, slot);
   const int64_t first = int64_t(slot) * kBlockNodes<D> + lane;
   TouchedNodes<count, T, D> nodes;
+  T mass_grad[count] = {};
   for (int n = 0; n < count; n++) nodes.grad[n] = load_node<T, D>(a.grad, a.grad_stride, first + n * Lanes);
   for (int k = a.obstacles - 1; k >= 0; k--) {
     ObstaclePose<T, D> pose;
@@ -450,9 +455,16 @@ MPM_HD void slot_contact_backward(const ContactArguments<T, D>& a, int slot, int
     for (int n = 0; pose.acts && n < count; n++) {
       nodes.position[n] = node_position(a, s.corner, lane + n * Lanes);
       nodes.touch[n] = touch(a, pose, nodes.position[n]);
-      if (nodes.touch[n].touching)
-        nodes.before[n] =
-            after_obstacles(a, s, k, nodes.position[n], load_node<T, D>(a.velocity, a.stride, first + n * Lanes));
+      if (!nodes.touch[n].touching) continue;
+      nodes.before[n] =
+          after_obstacles(a, s, k, nodes.position[n], load_node<T, D>(a.velocity, a.stride, first + n * Lanes));
+      if constexpr (with_impulses) {
+        auto own = impulses(s.scene, first + n * Lanes);
+        const Vector<T, D> after = after_contact(pose, nodes.touch[n], nodes.before[n]);
+        nodes.grad[n] =
+            own.take(own.weight(k, lattice_node<D>(s.corner, lane + n * Lanes)), nodes.before[n], after, nodes.grad[n]);
+        mass_grad[n] += own.mass_grad;
+      }
     }
     for (int i = 0; a.row_grad && i < width; i++) {
       const T sum = pose.acts ? sum_lanes(parameter_adjoint(a, s, k, i, nodes)) : T(0);
@@ -463,9 +475,13 @@ MPM_HD void slot_contact_backward(const ContactArguments<T, D>& a, int slot, int
       if (!t.touching) continue;
       const Vector<T, D> u = relative_velocity(t, nodes.before[n]);
       nodes.grad[n] = contact_adjoint(pose.contact, u, t.normal, pose.row->friction, nodes.grad[n]);
+      if constexpr (with_impulses) {
+        const auto own = impulses(s.scene, first + n * Lanes);
+        nodes.grad[n] = nodes.grad[n] + own.mass * own.weight(k, lattice_node<D>(s.corner, lane + n * Lanes));
+      }
     }
   }
-  for (int n = 0; n < count; n++) store_node(a.result, first + n * Lanes, nodes.grad[n]);
+  for (int n = 0; n < count; n++) store_node(a.result, first + n * Lanes, nodes.grad[n], mass_grad[n]);
 }
 
 }  // namespace TORCH_MPM_ISA

@@ -3,6 +3,7 @@
 #include <string>
 
 #include "grid/activate.op.h"
+#include "grid/impulse.op.h"
 #include "grid/obstacle.op.h"
 #include "grid/walls.op.h"
 #include "laws/law.op.h"
@@ -18,7 +19,8 @@ namespace mpm {
   "scene, Tensor? ids, Tensor? material, Tensor? previous_status, str laws, int[] options, Tensor[] parameters, "  \
   "int[] variables, int n, float dt, bool apic, bool wants_C, int stress_form, Tensor? gravity, " MPM_WALLS_SCHEMA \
   ", Tensor? obstacles, Tensor? data, int[] shape, int[] sizes, int[] contact, int[] obstacle_scene, "             \
-  "float[] start, float[] end, float time, int scenes, int max_blocks, bool grows, " MPM_LATTICE_SCHEMA
+  "float[] start, float[] end, float time, int scenes, int max_blocks, bool grows, Tensor? "                       \
+  "impulse, Tensor? scene_dt, Tensor? scene_time, " MPM_LATTICE_SCHEMA
 #define MPM_SUBSTEPS_PARAMETERS                                                                                        \
   const Tensor &x, const Tensor &v, const Tensor &mass, const Tensor &volume, const OptionalTensor &C,                 \
       const OptionalTensor &F, const OptionalTensor &J, const Tensors &history, const OptionalTensor &scene,           \
@@ -29,12 +31,13 @@ namespace mpm {
       const OptionalTensor &obstacle_table, const OptionalTensor &obstacle_data, std::vector<int64_t> shape,           \
       std::vector<int64_t> sizes, std::vector<int64_t> contact_kind, std::vector<int64_t> obstacle_scene,              \
       std::vector<double> start, std::vector<double> end, double time, int64_t scenes, int64_t max_blocks, bool grows, \
+      const OptionalTensor &impulse, const OptionalTensor &scene_dt, const OptionalTensor &scene_time,                 \
       const std::vector<double>&lattice, const std::vector<int64_t>&layout
 #define MPM_SUBSTEPS_ARGUMENTS                                                                                         \
   x, v, mass, volume, C, F, J, history, scene, ids, material, previous_status, laws, options, parameters, variables,   \
       n, dt, apic, wants_C, stress_form, gravity, wall_kind, wall_plane, wall_friction, obstacle_table, obstacle_data, \
-      shape, sizes, contact_kind, obstacle_scene, start, end, time, scenes, max_blocks, grows,                         \
-      PackedLattice(lattice, layout)
+      shape, sizes, contact_kind, obstacle_scene, start, end, time, scenes, max_blocks, grows, impulse, scene_dt,      \
+      scene_time, PackedLattice(lattice, layout)
 
 // The arguments of a call.
 struct SubstepsInputs {
@@ -59,6 +62,7 @@ struct SubstepsInputs {
   double time;
   int64_t scenes, max_blocks;
   bool grows;
+  OptionalTensor impulse, scene_dt, scene_time;
   PackedLattice lattice;
 };
 
@@ -209,9 +213,11 @@ struct Substeps {
   G2PAdvanceArguments<T, D> advance;
   Pool<T, D> pool;
   Tensor stress, step_time;
-  Tensor drifts;  // one for each of two substeps in turn, where activations last
+  Tensor scene_time;              // the time of each scene now, where each has its own
+  Tensor drifts;                  // one for each of two substeps in turn, where activations last
+  NextGridArguments<T, D> next;   // of these; its update and contact are those here
+  Tensor impulse, impulse_slots;  // on obstacles and walls so far; where someone asks, see `count_impulses`
   bool obstacles = false, fused = false;
-  bool one_grid_pass = false;  // where activations last and nobody reads the velocities before contact
   const int* previous_status = nullptr;
 
   explicit Substeps(const SubstepsInputs& inputs);
@@ -277,14 +283,14 @@ struct Substeps {
     drifts = empty_int(in.x, {2, sizeof(Drift) / sizeof(int)});
     torch::stable::zero_(drifts);
     p2g.drifted = true;
-    update.particles = in.x.size(0);
+    next.particles = in.x.size(0);
+    next.obstacles = obstacles && !impulse.defined();  // whose impulses want the velocities before contact
     const int64_t most = std::min<int64_t>(update.block_count, INT32_MAX / kBlockNodes<D>) - activation.max_blocks;
     activation.margin_blocks = int(std::clamp<int64_t>(activation.max_blocks / 2 + 64, 0, std::max<int64_t>(most, 0)));
   }
 
   // For a call that keeps nothing but its end. Where there is a kernel for it, P2G computes the stress itself.
   void fuse() {
-    one_grid_pass = drifts.defined();
     fused = calls.size() == 1 && !has(in.material) && in.lattice.order() == 2 && !in.lattice.deterministic() &&
             p2g.form == StressForm::mls && calls[0].law->kernels<T, D>().p2g;
     if (fused) stress = Tensor();
@@ -296,14 +302,14 @@ struct Substeps {
     if (!drifts.defined()) return;
     Drift* const drift = static_cast<Drift*>(drifts.data_ptr());
     activation.drift = last ? nullptr : drift + parity;
-    update.drift = drift + parity;
-    update.next_drift = advance.drift = drift + (1 - parity);
+    next.drift = drift + parity;
+    next.next_drift = advance.drift = drift + (1 - parity);
   }
 
   // The time of obstacles, added up as single steps do: by a device itself, where the host may not be there.
   void count_time([[maybe_unused]] const int* status_before, [[maybe_unused]] backend::Stream stream) {
 #if MPM_BACKEND == MPM_BACKEND_IS_cuda
-    if (!obstacles) return;
+    if (!obstacles || has(in.scene_time)) return;
     step_time = empty(in.x, {in.n}, ScalarType::Double);
     contact.step_time = static_cast<const double*>(step_time.data_ptr());
     if (status_before) contact.activations_before = status_before + kActivations;
@@ -315,21 +321,63 @@ struct Substeps {
     for (size_t k = 0; k < laws.size() && !fused; k++) calls[k].law->kernels<T, D>().update(laws[k], stream);
     move_grid(stream);
     if (MPM_BACKEND == MPM_BACKEND_IS_cpu) contact.time += in.dt;
+    if (scene_time.defined()) add_dt(static_cast<T*>(scene_time.data_ptr()), stream);
     backend::g2p_advance(in.lattice.order(), advance, stream);
+  }
+
+  // Scenes with time steps and clocks of their own begin at `times`, which goes on with them.
+  void count_scene_times(const Tensor& times) {
+    scene_time = times;
+    contact.scene_time = static_cast<const T*>(times.data_ptr());
+    contact.times = int(in.scenes);
+  }
+
+  void add_dt(T* times, backend::Stream stream) const {
+    AccumulateArguments<T, D> a;
+    a.add(times, static_cast<const T*>(in.scene_dt->data_ptr()), in.scenes);
+    backend::accumulate(a, stream);
   }
 
   // From a stress that is there, or that P2G computes, to the velocities of the nodes.
   void move_grid(backend::Stream stream) {
-    if (!update.emptied) backend::clear(pool.nodes, stream);
+    if (!next.emptied) backend::clear(pool.nodes, stream);
     if (fused)
       calls[0].law->kernels<T, D>().p2g(laws[0], p2g, stream);
     else
       backend::p2g(in.lattice.order(), p2g, stream);
+    if (impulse.defined() && !in.wall_kind.empty()) backend::wall_impulses(wall_impulses(), stream);
+    update_grid(stream);
+    if (!obstacles || next.obstacles) return;
+    if (impulse.defined()) backend::contact_impulses(contact_impulses(), stream);
+    backend::contact(contact, stream);
+  }
+
+  // On CUDA, where activations last, perhaps with contact.
+  void update_grid(backend::Stream stream) {
 #if MPM_BACKEND == MPM_BACKEND_IS_cuda
-    if (obstacles && one_grid_pass) return backend::grid_update_and_contact(update, contact, stream);
+    if (drifts.defined()) {
+      next.update = update;
+      next.contact = contact;
+      return backend::next_grid(next, stream);
+    }
 #endif
     backend::grid_update(update, stream);
-    if (obstacles) backend::contact(contact, stream);
+  }
+
+  // From now on the impulses on obstacles, and then on the faces of the domain, are added to `sums`.
+  void add_impulses_to(const Tensor& sums) { impulse = sums; }
+
+  Shape impulse_shape() const { return {in.scenes, int64_t(in.shape.size()) + 2 * D, kImpulse<D>}; }
+
+  // Of some of these boundaries.
+  ImpulseArguments<D> impulses(int64_t first, int64_t count) {
+    return impulse_arguments<D>(in.lattice, impulse, first, count, activation.slots(), impulse_slots);
+  }
+
+  WallImpulsesArguments<T, D> wall_impulses() { return {update, impulses(int64_t(in.shape.size()), 2 * D)}; }
+
+  ContactImpulsesArguments<T, D> contact_impulses() {
+    return {contact, reinterpret_cast<const T*>(update.updated), 1 + D, impulses(0, int64_t(in.shape.size()))};
   }
 
   void make_pool(backend::Stream stream);
@@ -389,6 +437,20 @@ Substeps<T, D>::Substeps(const SubstepsInputs& inputs) : in(inputs) {
   if (obstacles)
     contact = obstacle_arguments<T, D>(x, in.lattice, *in.obstacle_table, in.obstacle_data.value(), in.shape, in.sizes,
                                        in.contact_kind, in.obstacle_scene, in.start, in.end, {}, in.time);
+  STD_TORCH_CHECK(has(in.scene_dt) == has(in.scene_time), "scene_dt must be given with scene_time");
+  if (has(in.scene_dt)) {
+    for (const auto& [tensor, name] : {std::pair(*in.scene_dt, "scene_dt"), std::pair(*in.scene_time, "scene_time")}) {
+      check_shape(tensor, name, {in.scenes});
+      check_like(tensor, name, x);
+      STD_TORCH_CHECK(tensor.is_contiguous(), name, " must be contiguous");
+    }
+    p2g.scene_dt = advance.scene_dt = field<const T>(*in.scene_dt);
+    update.scene_dt = p2g.scene_dt.pointer;
+  }
+  if (has(in.impulse)) {
+    check_shape(*in.impulse, "impulse", impulse_shape());
+    check_type(*in.impulse, "impulse", ScalarType::Double, x);
+  }
   advance.gather.moment_scale = in.lattice.inverse_inertia();
   advance.gather.lost = NAN;
 }
@@ -396,7 +458,10 @@ Substeps<T, D>::Substeps(const SubstepsInputs& inputs) : in(inputs) {
 // For the arguments' number of blocks.
 template <class T, int D>
 void Substeps<T, D>::make_pool(backend::Stream stream) {
-  pool.make(in.x, activation, obstacles && !one_grid_pass, stream);
+  const bool apart = obstacles && !next.obstacles;  // contact from the grid update
+  pool.make(in.x, activation, apart, stream);
+  if (impulse.defined() && (MPM_BACKEND == MPM_BACKEND_IS_cpu || in.lattice.deterministic()))
+    impulse_slots = empty(in.x, {activation.slots() + in.scenes, impulse_shape()[1] * kImpulse<D>}, ScalarType::Double);
   const Topology<T, D> topology = topology_of(activation);
   p2g.topology = advance.gather.topology = topology;
   p2g.nodes = {static_cast<T*>(pool.nodes.data_ptr()), 1 + D, 1 + D};
@@ -407,11 +472,10 @@ void Substeps<T, D>::make_pool(backend::Stream stream) {
   update.updated = static_cast<NodeRow<T, D>*>(pool.updated.data_ptr());
   if (drifts.defined() && !update.walls.mirrored) {
     backend::clear(pool.nodes, stream);
-    update.emptied = static_cast<NodeRow<T, D>*>(pool.nodes.data_ptr());
+    next.emptied = static_cast<NodeRow<T, D>*>(pool.nodes.data_ptr());
   }
   contact.velocity = static_cast<const T*>(pool.updated.data_ptr()) + 1;
   contact.stride = 1 + D;
-  const bool apart = obstacles && !one_grid_pass;
   if (apart) contact.result = static_cast<T*>(pool.velocity.data_ptr());
   const Tensor& velocity = apart ? pool.velocity : pool.updated;
   advance.gather.nodes = {static_cast<const T*>(velocity.data_ptr()) + 1, 1 + D, D};

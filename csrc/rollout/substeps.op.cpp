@@ -5,7 +5,15 @@
 namespace mpm {
 namespace {
 
-std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> substeps(MPM_SUBSTEPS_PARAMETERS) {
+Tensor copy_of(const Tensor& t) {
+  Shape shape(t.dim());
+  for (size_t i = 0; i < shape.size(); i++) shape[i] = t.size(int64_t(i));
+  Tensor copy = empty(t, shape);
+  torch::stable::copy_(copy, t);
+  return copy;
+}
+
+std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> substeps(MPM_SUBSTEPS_PARAMETERS) {
   const SubstepsInputs in{MPM_SUBSTEPS_ARGUMENTS};
   check_positions(x);
   const int64_t P = x.size(0), D_ = x.size(1);
@@ -14,6 +22,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> substeps(MPM_
   Tensor J_[] = {result(x, has(J), {P}), result(x, has(J) && n > 1, {P})};
   Tensor v_ = empty_particles(x, {P, D_}), C_ = result(x, wants_C, {P, D_, D_}), history_;
   Tensor status[] = {empty_int(x, {1 + scenes, kStatusSize}), empty_int(x, {1 + scenes, kStatusSize})};
+  Tensor impulse_, time_;
   int64_t step = 0;
   const DeviceScope device(x);
   dispatch(x, [&]<class T, int D>() {
@@ -27,6 +36,14 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> substeps(MPM_
     if (s.plastic && has(F)) {  // which laws change where it stands
       torch::stable::copy_(F_[1], *F);
       from.F = field<const T>(F_[1]);
+    }
+    if (has(impulse)) {
+      impulse_ = copy_of(*impulse);
+      s.add_impulses_to(impulse_);
+    }
+    if (has(scene_time)) {
+      time_ = copy_of(*scene_time);
+      s.count_scene_times(time_);
     }
     if (n > 1) s.let_activations_last();
     s.fuse();
@@ -61,10 +78,10 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> substeps(MPM_
     if (has(F)) torch::stable::copy_(F_[0], *F);
     if (has(J)) torch::stable::copy_(J_[0], *J);
     if (wants_C) has(C) ? torch::stable::copy_(C_, *C) : torch::stable::zero_(C_);
-    return {x_[0], v_, C_, F_[0], J_[0], history_, status[0]};
+    return {x_[0], v_, C_, F_[0], J_[0], history_, status[0], impulse_, time_};
   }
   const int last = int(step + 1) % 2;
-  return {x_[last], v_, C_, F_[last], J_[last], history_, status[step < n ? 1 - last : last]};
+  return {x_[last], v_, C_, F_[last], J_[last], history_, status[step < n ? 1 - last : last], impulse_, time_};
 }
 
 }  // namespace
@@ -73,7 +90,8 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> substeps(MPM_
 #if MPM_BACKEND == MPM_BACKEND_IS_cpu
 STABLE_TORCH_LIBRARY_FRAGMENT(torch_mpm, m) {
   m.def("substeps(" MPM_SUBSTEPS_SCHEMA
-        ") -> (Tensor x, Tensor v, Tensor C, Tensor F, Tensor J, Tensor history, Tensor status)");
+        ") -> (Tensor x, Tensor v, Tensor C, Tensor F, Tensor J, Tensor history, Tensor status, Tensor "
+        "impulse, Tensor time)");
 }
 #endif
 

@@ -52,7 +52,8 @@ enum Need : int64_t { kMass = 1, kVolume = 2, kParameters_ = 4, kGravity = 8 };
 template <class T, int D>
 class SubstepsBackward {
  public:
-  SubstepsBackward(const SubstepsInputs& in, int64_t needs, backend::Stream stream);
+  // `grad_impulse` is the adjoint of the impulses at the end, or nothing.
+  SubstepsBackward(const SubstepsInputs& in, const OptionalTensor& grad_impulse, int64_t needs, backend::Stream stream);
 
   int64_t columns() const { return s_.columns; }  // of the history of all laws
   int64_t blocks() const { return s_.update.block_count; }
@@ -85,6 +86,7 @@ class SubstepsBackward {
   // Of obstacles. On CUDA the statuses count it.
   void set_time(int64_t i) {
     if (MPM_BACKEND == MPM_BACKEND_IS_cpu) s_.contact.time = time_[i];
+    if (scene_times_.defined()) s_.contact.scene_time = scene_time(i);
   }
 
   int* status(int64_t i) const { return static_cast<int*>(status_.data_ptr()) + i * status_.stride(0); }
@@ -141,12 +143,31 @@ class SubstepsBackward {
     backend::accumulate(a, stream_);
   }
 
+  T* scene_time(int64_t i) const { return static_cast<T*>(scene_times_.data_ptr()) + i * in_.scenes; }
+
+  // The times of each scene at all steps.
+  void make_scene_times() {
+    scene_times_ = empty(in_.x, {in_.n, in_.scenes});
+    s_.contact.times = int(in_.scenes);
+    for (int64_t i = 0; i < in_.n; i++) {
+      Tensor now = torch::stable::select(scene_times_, 0, i);
+      torch::stable::copy_(now, i == 0 ? *in_.scene_time : torch::stable::select(scene_times_, 0, i - 1));
+      if (i > 0) s_.add_dt(scene_time(i), stream_);
+    }
+  }
+
+  // The adjoint of the impulses on some boundaries.
+  ImpulseArguments<D> impulses(int64_t first, int64_t count) const {
+    return impulse_gradient<D>(in_.lattice, *grad_impulse_, first, count, s_.impulse_shape(), in_.x);
+  }
+
   const SubstepsInputs& in_;
+  OptionalTensor grad_impulse_;
   backend::Stream stream_;
   Substeps<T, D> s_;
   bool mls_;  // F and J move with the affine field, which is recorded then
   std::vector<double> time_;
-  Tensor first_history_, status_;
+  Tensor first_history_, status_, scene_times_;
   Particles<const T> first_;
   Record<T> x_, v_, C_, F_, J_, history_, stress_, mapped_;
   Adjoints by_advance_, by_g2p_, by_p2g_, by_laws_;
@@ -155,13 +176,20 @@ class SubstepsBackward {
 };
 
 template <class T, int D>
-SubstepsBackward<T, D>::SubstepsBackward(const SubstepsInputs& in, int64_t needs, backend::Stream stream)
-    : in_(in), stream_(stream), s_(in), mls_(s_.p2g.form == StressForm::mls), time_{in.time} {
+SubstepsBackward<T, D>::SubstepsBackward(const SubstepsInputs& in, const OptionalTensor& grad_impulse, int64_t needs,
+                                         backend::Stream stream)
+    : in_(in),
+      grad_impulse_(grad_impulse),
+      stream_(stream),
+      s_(in),
+      mls_(s_.p2g.form == StressForm::mls),
+      time_{in.time} {
   while (int64_t(time_.size()) < in.n) time_.push_back(time_.back() + in.dt);
   first_history_ = packed_history(in.x, in.history, s_.columns);
   first_ = given_particles<T, D>(in, first_history_);
   s_.make_pool(stream);
   s_.count_time(nullptr, stream_);
+  if (has(in.scene_time)) make_scene_times();
   make_records();
   make_terms(needs);
 }
@@ -228,6 +256,9 @@ void SubstepsBackward<T, D>::leave_advance(int64_t i, Adjoints& adjoints) {
   a.forward.F = s_.advance.F;
   a.forward.J = s_.advance.J;
   a.forward.dt = in_.dt;
+  set_scene(a.forward, in_.scene, in_.x);
+  a.forward.scene_dt = s_.p2g.scene_dt;
+  a.forward.scenes = in_.scenes;
   a.grad_x = field<const T>(adjoints.x);
   a.grad_F = field<const T>(adjoints.F);
   a.grad_J = field<const T>(adjoints.J);
@@ -268,12 +299,22 @@ void SubstepsBackward<T, D>::leave_grid(Adjoints& adjoints, const Tensor& gravit
     ContactArguments<T, D> contact = s_.contact;
     contact.grad = nodes + 1;
     contact.grad_stride = 1 + D;
-    backend::contact_backward(contact, stream_);
+    if (has(grad_impulse_)) {
+      const T* const mass = reinterpret_cast<const T*>(s_.update.updated);
+      backend::contact_impulses_backward(
+          ContactImpulsesArguments<T, D>{contact, mass, 1 + D, impulses(0, int64_t(in_.shape.size()))}, stream_);
+    } else {
+      backend::contact_backward(contact, stream_);
+    }
     update.grad_updated = reinterpret_cast<const NodeRow<T, D>*>(contact.result);
   }
   update.grad_nodes = s_.update.updated;
   if (gravity.defined()) update.change = static_cast<Vector<T, D>*>(change_.data_ptr());
-  backend::grid_update_backward(update, stream_);
+  if (has(grad_impulse_) && !in_.wall_kind.empty())
+    backend::wall_impulses_backward(
+        WallImpulsesBackwardArguments<T, D>{update, impulses(int64_t(in_.shape.size()), 2 * D)}, stream_);
+  else
+    backend::grid_update_backward(update, stream_);
   if (gravity.defined())
     backend::accumulate_slots(
         AccumulateSlotsArguments<T, D>{s_.update.max_blocks, s_.update.block_count, s_.update.block,
@@ -336,8 +377,8 @@ void set(Tensor& adjoint, const OptionalTensor& grad, const char* name, const Te
 
 std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> substeps_backward(
     const OptionalTensor& grad_x, const OptionalTensor& grad_v, const OptionalTensor& grad_C,
-    const OptionalTensor& grad_F, const OptionalTensor& grad_J, const OptionalTensor& grad_history, int64_t needs,
-    MPM_SUBSTEPS_PARAMETERS) {
+    const OptionalTensor& grad_F, const OptionalTensor& grad_J, const OptionalTensor& grad_history,
+    const OptionalTensor& grad_impulse, int64_t needs, MPM_SUBSTEPS_PARAMETERS) {
   const SubstepsInputs in{MPM_SUBSTEPS_ARGUMENTS};
   check_positions(x);
   const int64_t P = x.size(0);
@@ -345,7 +386,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tenso
   Tensor gravity_sum;
   const DeviceScope device(x);
   dispatch(x, [&]<class T, int D>() {
-    SubstepsBackward<T, D> backward(in, needs, device.stream());
+    SubstepsBackward<T, D> backward(in, grad_impulse, needs, device.stream());
     adjoints.x = empty_particles(x, {P, D});
     adjoints.v = empty_particles(x, {P, D});
     adjoints.C = empty_particles(x, {P, D, D});
@@ -377,7 +418,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tenso
 STABLE_TORCH_LIBRARY_FRAGMENT(torch_mpm, m) {
   m.def(
       "substeps_backward(Tensor? grad_x, Tensor? grad_v, Tensor? grad_C, Tensor? grad_F, Tensor? grad_J, "
-      "Tensor? grad_history, int needs, " MPM_SUBSTEPS_SCHEMA
+      "Tensor? grad_history, Tensor? grad_impulse, int needs, " MPM_SUBSTEPS_SCHEMA
       ") -> (Tensor x, Tensor v, Tensor C, Tensor F, Tensor J, Tensor history, Tensor mass, Tensor volume, "
       "Tensor parameters, Tensor gravity)");
 }

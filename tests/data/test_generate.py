@@ -143,6 +143,13 @@ def test_another_device_is_refused(copy):
         generate(configuration(), copy, device="cpu")
 
 
+def test_parameters_that_differ_are_stored_by_particle(whole):
+    for arrays, attributes in decoded(whole).values():
+        E = json.loads(attributes["scene"])["material"]["jelly"]["E"]
+        np.testing.assert_array_equal(arrays["E"], np.full(len(arrays["mass"]), E, np.float32))
+        assert "nu" not in arrays
+
+
 # ---- damage
 
 

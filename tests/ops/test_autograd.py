@@ -90,6 +90,14 @@ def transfer_case(name, device):
     if name == "contact":
         balls = [mpm.Sphere((0.3, 0.3), 0.3, friction=0.4), mpm.Sphere((0.5, 0.2), 0.2, "slip")]
         return Case(lambda v: (ops.contact(blocks, v, balls, 0.0),), [nodes])
+    if name == "wall_impulses":
+        g = torch.randn(2, 2, generator=generator, dtype=torch.float64).to(device)
+        walls = mpm.Walls([("mirror", "slip"), "separate"], friction=[(0.0, 0.3), 0.3])
+        return Case(lambda n, g, dt: (ops.wall_impulses(blocks, n, g, dt, walls),), [mass_and_momentum, g, dt])
+    if name == "contact_impulses":
+        balls = [mpm.Sphere((0.3, 0.3), 0.3, friction=0.4), mpm.Sphere((0.5, 0.2), 0.2, "slip")]
+        function = lambda v, m: (ops.contact_impulses(blocks, v, m, balls, 0.0),)  # noqa: E731
+        return Case(function, [nodes, mass_and_momentum[:, 0]])
     assert name == "sdf"
     shape = mpm.SDF(lambda x: (x**2).sum(1) - 0.1, (0.3, 0.3), friction=0.4)
 
@@ -149,7 +157,10 @@ def law_op_case(name, device):
     return Case(return_map, given, twice=False)
 
 
-TRANSFER_OPS = ("p2g", "g2p", "scatter", "gather", "advance", "g2p_advance", "grid_update", "contact", "sdf")
+TRANSFER_OPS = (
+    *("p2g", "g2p", "scatter", "gather", "advance", "g2p_advance", "grid_update", "contact", "sdf"),
+    *("wall_impulses", "contact_impulses"),
+)
 HEAT_OPS = ("heat_operator", "heat_cg", "heat_multigrid")
 LAW_OPS = (
     *("svd3", "polar", "law_update", "law_energy", "plastic law_update", "principal law_energy"),

@@ -56,8 +56,6 @@ ABSENT = {
     "render": "export a scene and draw it instead",
 }
 COSMETIC = ("title", "device")
-RESERVED = ("position", "particle_type", "material", "mass", "volume")
-"""Arrays of all scenes."""
 PARTICLE_TYPES = {"weakly_compressible": 5, "quartic_sand": 6}
 """DeepMind's codes by law: water and sand; whatever else is goop."""
 GOOP = 7
@@ -203,11 +201,14 @@ class Configuration:
         return Scene.from_words(self.scene_words(*contents), folder=self.folder, source=self.source)
 
     @property
-    def parameters(self) -> list[str]:
-        """Names of the numbers of materials that differ from scene to scene."""
-        materials = self.words.get("material", {})
-        found = dict.fromkeys(name for words in materials.values() for name in _varied(words))
-        return [name for name in found if name not in ("law", *RESERVED)]
+    def drawn_parameters(self) -> list[str]:
+        """Names of the parameters of materials that differ between scenes."""
+        names = set()
+        for material in self.words.get("material", {}).values():
+            names |= {key for key, value in material.items() if distribution.is_distribution(value)}
+            for chosen in material.get(distribution.CHOICE, []):
+                names |= {key for key, value in chosen.items() if value is not None}
+        return sorted(names - {distribution.CHOICE, distribution.WEIGHTS})
 
     def particle_type(self, material: Any) -> int:
         """DeepMind's code for a material (`scene.build.Material`)."""
@@ -272,18 +273,6 @@ def _count_problems(words: Words) -> Iterator[str]:
             drawn = distribution.is_distribution(count)
             if not drawn and (isinstance(count, bool) or not isinstance(count, int) or count < 0):
                 yield f"{key}[{k}].count: takes a whole number that is not negative or a distribution, got {count!r}"
-
-
-def _varied(words: Any) -> Iterator[str]:
-    """Keys of a material whose numbers are drawn, or that differ between the materials that are drawn from."""
-    if not isinstance(words, dict):
-        return
-    for key, value in words.items():
-        if key == distribution.CHOICE:
-            for chosen in value:
-                yield from (chosen if isinstance(chosen, dict) else ())
-        elif distribution.is_distribution(value):
-            yield key
 
 
 def _hash(words: Words, folder: Path) -> str:

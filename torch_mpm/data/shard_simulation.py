@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import torch
 
 from ..errors import SimulationError
@@ -17,7 +18,7 @@ from ..scene import SceneError
 from ..scene.build import Built
 from . import batch, obstacle_particles
 from .configuration import Configuration
-from .distribution import Words
+from .distribution import Words, is_number
 from .recording import Array
 from .sampling import NoRoom, content
 
@@ -159,6 +160,18 @@ def _attempt(
             _complete(configuration, outcome, recorded[index], own, built, index)
 
 
+def _parameters(
+    configuration: Configuration, materials: list[dict[str, Any]], number: npt.NDArray[Any]
+) -> dict[str, Array]:
+    """Parameters [N] that differ between scenes, zero for particles of materials that have none of that name."""
+    arrays = {}
+    for name in configuration.drawn_parameters:
+        values = [m.get(name) for m in materials]
+        if all(value is None or is_number(value) for value in values):
+            arrays[name] = np.array([value or 0 for value in values], np.float32)[number]
+    return arrays
+
+
 def _complete(
     configuration: Configuration, outcome: Outcome, recorded: dict[str, Array], own: dict[str, Array], built: Built,
     index: int,
@@ -179,15 +192,9 @@ def _complete(
         "material": number.astype(np.int8),
         "mass": own["mass"].astype(np.float32),
         "volume": own["volume"].astype(np.float32),
-        **{name: _parameter(materials, name)[number] for name in configuration.parameters},
+        **_parameters(configuration, outcome.materials, number),
     }
     if dataset.obstacles and outcome.words and outcome.words.get("obstacle"):
         words = configuration.scene(outcome.words)
         times = np.arange(dataset.frames) * dataset.interval
         outcome.arrays = obstacle_particles.add(outcome.arrays, words, times)
-
-
-def _parameter(materials: list[Any], name: str) -> Array:
-    """A number of each material, 0 for one that has none of this name."""
-    values = [getattr(m.words, name, None) for m in materials]
-    return np.array([v if isinstance(v, (int, float)) else 0.0 for v in values], np.float32)

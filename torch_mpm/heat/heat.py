@@ -218,7 +218,7 @@ class Heat(nn.Module):
         if isinstance(conductivity, Tensor):
             conductivity = torch.where(conductivity >= 0, conductivity, torch.nan)
         conductance = conductivity * volume
-        number = step * conductance / (heat_capacity * self.grid.dx**2)
+        number = step * conductance / (torch.where(heat_capacity > 0, heat_capacity, 1) * self.grid.dx**2)
         blend = self._blend(number, step, velocity_gradient)
         nodes, smooth = self._to_nodes(blocks, state, volume, conductance, heat_capacity, theta, gradient, blend)
         initial = nodes.theta
@@ -386,6 +386,13 @@ class Heat(nn.Module):
         for kept in (self.unsolved, self.residual):
             if kept is not None:  # and CUDA graphs may write to it
                 kept.zero_()
+
+    def forget(self, scenes: Tensor) -> None:
+        """Forget that of scenes, bool [B] on the device of the particles."""
+        self._activations.forget(scenes)
+        for kept in (self.unsolved, self.residual):
+            if kept is not None:
+                kept.masked_fill_(scenes, 0)
 
 
 def _averages(

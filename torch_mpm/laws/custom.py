@@ -3,33 +3,43 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
-from ..errors import check_number, shape_of
-from ..ops.svd import svd3
+from ..errors import check_count, check_number, shape_of
+from ..precision import from_half
+from .isotropic import isotropic
 from .material import Material
 
 if TYPE_CHECKING:
     from ..state import State
 
-__all__ = ["CustomLaw", "CustomPrincipalLaw"]
+__all__ = ["CustomLaw", "CustomPrincipalLaw", "isotropic"]
+
+
+RESERVED = ("F", "J", "stress", "dissipated")
+"""Names of results of a law that are no history."""
 
 
 class CustomLaw(Material):
     """A law from any module or function: F [P, D, D] -> Kirchhoff stress [P, D, D] [Pa], in ordinary torch code.
 
     Args:
-        function: called with the state field. It may return a pair (F, stress) instead, with F what a plastic law makes
-            of its argument.
+        function: called with the state field, and the history if there is one. It may return a pair (F, stress)
+            instead, with F what a plastic law makes of its argument; with history a tuple (F, stress, new history ...).
         state_field: "F", or "J" [P] for a law of the volume ratio alone.
         stiffness: see `Material.stiffness`; a number, a tensor [P] or a function of the state. None takes it from the
             function by automatic differentiation, each time that `stable_dt` asks.
+        history: variables that the law carries along in `state.extra`, by name: the shape of one for a particle, which
+            begins as zeros, or its value at the start, a tensor of that shape. The function is called with each of them
+            [P, ...], in this order, after the state field.
 
-    A law that needs more than this (other fields, history) is a subclass of `Material`.
+    Under `torch.autocast` the function may return a half precision; it is cast to the dtype of the state, with
+    gradients, and all else is computed in that. A law that needs more (other fields, the time step) is a subclass of
+    `Material`.
 
     Raises:
         TypeError: for what is no function.
@@ -39,9 +49,10 @@ class CustomLaw(Material):
 
     def __init__(
         self,
-        function: Callable[[Tensor], Any],
+        function: Callable[..., Any],
         state_field: str = "F",
         stiffness: float | Tensor | Callable[[State], Tensor] | None = None,
+        history: Mapping[str, Sequence[int] | Tensor] | None = None,
     ) -> None:
         super().__init__()
         if state_field not in ("F", "J"):
@@ -49,17 +60,35 @@ class CustomLaw(Material):
         self.function = check_function(function)
         self.state_fields = (state_field,)
         self._stiffness = check_stiffness(stiffness)
+        self._start = _checked_history(history)
+        self.extra_fields = tuple(self._start)
+
+    def initial(self, name: str, state: State) -> Tensor:
+        start = self._start[name].to(state.x)
+        return start.expand(state.x.shape[0], *start.shape).clone()
 
     def update(self, state: State) -> tuple[dict[str, Tensor], Tensor]:
         (field,) = self.state_fields
         deformation = getattr(state, field)
-        result = self.function(deformation)
-        new, stress = result if isinstance(result, tuple) else (deformation, result)
+        history = [state.extra[n] if n in state.extra else self.initial(n, state) for n in self.extra_fields]
+        result = self.function(deformation, *history)
+        expected = 2 + len(history)
+        if history and (not isinstance(result, tuple) or len(result) != expected):
+            found = f"a tuple of {len(result)}" if isinstance(result, tuple) else shape_of(result)
+            raise ValueError(f"the law must return {field}, stress, {', '.join(self.extra_fields)}, got {found}")
+        new, stress, *moved = result if isinstance(result, tuple) else (deformation, result)
         P, D = state.x.shape
-        for name, value, shape in ((field, new, tuple(deformation.shape)), ("stress", stress, (P, D, D))):
+        fields = {}
+        shapes = [(field, new, tuple(deformation.shape)), ("stress", stress, (P, D, D))]
+        shapes += [(n, h, tuple(old.shape)) for n, h, old in zip(self.extra_fields, moved, history, strict=True)]
+        for name, value, shape in shapes:
             if not isinstance(value, Tensor) or tuple(value.shape) != shape:
                 raise ValueError(f"the law must return {name} of shape {list(shape)}, got {shape_of(value)}")
-        return {} if new is deformation else {field: new}, stress
+            fields[name] = from_half(value, state.x)
+        stress = fields.pop("stress")
+        if new is deformation:
+            del fields[field]
+        return fields, stress
 
     def stiffness(self, state: State) -> Tensor:
         return given_stiffness(self._stiffness, state) if self._stiffness is not None else super().stiffness(state)
@@ -69,6 +98,25 @@ class CustomLaw(Material):
         deformation: Tensor = getattr(state, field)
         J = deformation if field == "J" else torch.linalg.det(deformation.where(deformation.isfinite(), torch.nan))
         return ~((J > 0) & J.isfinite())
+
+
+def _checked_history(history: Any) -> dict[str, Tensor]:
+    """The start of each history variable of a particle."""
+    if history is None:
+        return {}
+    if not isinstance(history, Mapping):
+        raise TypeError(f"history must be a dict of shapes or tensors by name, got {shape_of(history)}")
+    start = {}
+    for name, given in history.items():
+        if not isinstance(name, str) or name in RESERVED:
+            raise ValueError(f"a history variable must have a name of its own, got {name!r}")
+        if isinstance(given, Tensor):
+            start[name] = given
+        elif isinstance(given, (list, tuple)):
+            start[name] = torch.zeros([check_count(f"history[{name!r}]", n) for n in given], device="cpu")
+        else:
+            raise TypeError(f"history[{name!r}] must be a shape or a tensor, got {shape_of(given)}")
+    return start
 
 
 def as_law(name: str, law: Any) -> Material:
@@ -117,9 +165,8 @@ class CustomPrincipalLaw(Material):
         stiffness: see `Material.stiffness`; a number, a tensor [P] or a function of the state. None takes it from the
             function by automatic differentiation, each time that `stable_dt` asks.
 
-    The gradient with respect to F holds at equal stretches: differences of the function over a gap of at least the cube
-    root of the rounding error stand for its derivative there (relative error about 1e-10 in float64, 1e-5 in float32).
-    Particles with det F ≤ 0 or F not finite have no stress, and the function sees them at rest.
+    It is `isotropic` of the function, whose gradient with respect to F holds at equal stretches. Particles with
+    det F ≤ 0 or F not finite have no stress, and the function sees them at rest.
 
     Raises:
         TypeError: for what is no function.
@@ -140,13 +187,10 @@ class CustomPrincipalLaw(Material):
             raise ValueError("CustomPrincipalLaw needs state.F, which is None")
         good = ~self.invalid(state)[:, None, None]
         F = state.F.where(good, torch.eye(state.x.shape[1], dtype=state.x.dtype, device=state.x.device))
-        with torch.no_grad():
-            U, _, V = svd3(F)
-        sigma = svd3(F).sigma
-        mapped, tau = self._evaluate(sigma)
-        new, stress = _IsotropicFunction.apply(F, U, sigma.detach(), V, mapped, tau, self._evaluate)
+        result = isotropic(F, self.function)
+        new, stress = result if isinstance(result, tuple) else (F, result)
         stress = stress.where(good, torch.zeros((), dtype=stress.dtype, device=stress.device))
-        return {} if mapped is sigma else {"F": new.where(good, state.F)}, stress
+        return {} if new is F else {"F": new.where(good, state.F)}, stress
 
     def stiffness(self, state: State) -> Tensor:
         return given_stiffness(self._stiffness, state) if self._stiffness is not None else super().stiffness(state)
@@ -155,83 +199,3 @@ class CustomPrincipalLaw(Material):
         assert state.F is not None
         J = torch.linalg.det(state.F.where(state.F.isfinite(), torch.nan))
         return ~((J > 0) & J.isfinite())
-
-    def _evaluate(self, sigma: Tensor) -> tuple[Tensor, Tensor]:
-        result = self.function(sigma)
-        mapped, tau = result if isinstance(result, tuple) else (sigma, result)
-        for name, value in (("stretches", mapped), ("stresses", tau)):
-            if not isinstance(value, Tensor) or value.shape != sigma.shape:
-                raise ValueError(f"the law must return {name} of shape {list(sigma.shape)}, got {shape_of(value)}")
-        return mapped, tau
-
-
-class _IsotropicFunction(torch.autograd.Function):
-    """U diag(mapped) Vᵀ and U diag(tau) Uᵀ for F = U diag(sigma) Vᵀ.
-
-    Its gradient of F is that of turning the principal axes; mapped and tau bring their own.
-    """
-
-    @staticmethod
-    def forward(
-        F: Tensor, U: Tensor, sigma: Tensor, V: Tensor, mapped: Tensor, tau: Tensor, evaluate: Any
-    ) -> tuple[Tensor, Tensor]:
-        return (U * mapped[:, None, :]) @ V.mT, (U * tau[:, None, :]) @ U.mT
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: Any, output: Any) -> None:
-        *tensors, ctx.evaluate = inputs
-        ctx.save_for_backward(*tensors)
-
-    @staticmethod
-    def backward(ctx: Any, grad_F: Tensor, grad_stress: Tensor) -> Any:
-        F, U, sigma, V, mapped, tau = ctx.saved_tensors
-        M, N = (_DifferentiatedOnce.apply(t, F) for t in (U.mT @ grad_F @ V, U.mT @ grad_stress @ U))
-        turned = None
-        if ctx.needs_input_grad[0]:
-            principal = torch.zeros_like(M)
-            for i in range(sigma.shape[1]):
-                for j in range(i + 1, sigma.shape[1]):
-                    with torch.no_grad():
-                        map_slope, stress_slope = _quotients(ctx.evaluate, sigma, mapped, tau, i, j)
-                    total = sigma[:, i] + sigma[:, j]
-                    even = map_slope * (M[:, i, j] + M[:, j, i]) / 2
-                    odd = (mapped[:, i] + mapped[:, j]) / total * (M[:, i, j] - M[:, j, i]) / 2
-                    stress = (N[:, i, j] + N[:, j, i]) * stress_slope / total
-                    principal[:, i, j] = even + odd + stress * sigma[:, j]
-                    principal[:, j, i] = even - odd + stress * sigma[:, i]
-            turned = _DifferentiatedOnce.apply(U @ principal @ V.mT, mapped, tau)
-        diagonals = (t.diagonal(dim1=1, dim2=2) for t in (M, N))
-        return turned, None, None, None, *diagonals, None
-
-
-class _DifferentiatedOnce(torch.autograd.Function):
-    """A gradient that depends on other tensors in a way that autograd does not see."""
-
-    @staticmethod
-    def forward(gradient: Tensor, *others: Tensor) -> Tensor:
-        return gradient.clone()
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: Any, output: Any) -> None:
-        pass
-
-    @staticmethod
-    def backward(ctx: Any, grad: Tensor) -> Any:
-        raise NotImplementedError("CustomPrincipalLaw has no second derivatives: differentiate it once")
-
-
-def _quotients(
-    evaluate: Callable[[Tensor], tuple[Tensor, Tensor]], sigma: Tensor, mapped: Tensor, tau: Tensor, i: int, j: int
-) -> tuple[Tensor, Tensor]:
-    """Differences of mapped stretches and stresses i and j over that of the stretches, which is widened where small."""
-    middle = (sigma[:, i] + sigma[:, j]) / 2
-    least = torch.finfo(sigma.dtype).eps ** (1 / 3) * middle
-    near = (sigma[:, i] - sigma[:, j]).abs() < least
-    spread = sigma.clone()
-    spread[:, i] = torch.where(near, middle + least / 2, sigma[:, i])
-    spread[:, j] = torch.where(near, middle - least / 2, sigma[:, j])
-    gap = spread[:, i] - spread[:, j]
-    wide = evaluate(spread)
-    return tuple(  # type: ignore[return-value]
-        torch.where(near, w[:, i] - w[:, j], v[:, i] - v[:, j]) / gap for w, v in zip(wide, (mapped, tau), strict=True)
-    )

@@ -13,6 +13,7 @@ from .contact import contact, fusible
 from .g2p_advance import g2p_advance
 from .grid_update import grid_update
 from .heat import HeatSolve, heat_cg, heat_operator
+from .impulses import contact_impulses, wall_impulses
 from .law import LawUpdate, law_energy, law_stiffness, law_update, law_wave_modulus
 from .registry import LAWS
 from .sand import quartic_energy, quartic_return_map, quartic_stiffness, quartic_stress
@@ -27,6 +28,7 @@ __all__ = [
     "Survey",
     "advance",
     "contact",
+    "contact_impulses",
     "fusible",
     "g2p",
     "g2p_advance",
@@ -47,4 +49,5 @@ __all__ = [
     "scatter",
     "survey",
     "svd3",
+    "wall_impulses",
 ]

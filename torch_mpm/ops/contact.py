@@ -13,7 +13,7 @@ it), the samples of a sampled one (lower corner, spacing, numbers along the axes
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -84,29 +84,37 @@ def contact(blocks: Blocks, velocity: Tensor, obstacles: Sequence[Obstacle], tim
     Differentiable, twice in eager mode, with respect to velocity and, as `Obstacle.apply`, to the position, velocity,
     rotation, angular_velocity and friction of the obstacles and the normal, half_axis and axis of their shapes.
     """
-    check_blocks(blocks)
-    grid = blocks.grid
-    if not isinstance(velocity, Tensor) or velocity.shape != (blocks.node_count, grid.dim):
-        raise ValueError(f"velocity must have shape [N, D] = {[blocks.node_count, grid.dim]}, got {shape_of(velocity)}")
-    for k, obstacle in enumerate(check_list("obstacles", obstacles)):
-        if not isinstance(obstacle, Obstacle) or type(obstacle.shape) not in KERNEL_SHAPES:
-            expected = ", ".join(shape.name for shape in KERNEL_SHAPES)
-            raise TypeError(f"obstacles[{k}] must be an obstacle of one of {expected}, got {type(obstacle).__name__}")
-    scene_time, number = time_arguments(time, velocity, grid.scenes)
-    if scene_time is None:
-        obstacles = [o for o in obstacles if o.start <= number < o.end]
+    check_contact(blocks, velocity, obstacles)
+    scene_time, number = time_arguments(time, velocity, blocks.grid.scenes)
+    obstacles = present(obstacles, scene_time, number)
     for first in range(0, len(obstacles), MAX_OBSTACLES):
         group = obstacles[first : first + MAX_OBSTACLES]
         rows = dispatch(
             torch.ops.torch_mpm.contact,
-            _packed(velocity),
-            *obstacle_arguments(group, velocity, grid.scenes),
+            packed_rows(velocity),
+            *obstacle_arguments(group, velocity, blocks.grid.scenes),
             scene_time,
             number,
             *blocks.packed,
         )
         velocity = rows[:, 1:]
     return velocity
+
+
+def check_contact(blocks: Blocks, velocity: Tensor, obstacles: Sequence[Obstacle]) -> None:
+    check_blocks(blocks)
+    nodes = [blocks.node_count, blocks.grid.dim]
+    if not isinstance(velocity, Tensor) or list(velocity.shape) != nodes:
+        raise ValueError(f"velocity must have shape [N, D] = {nodes}, got {shape_of(velocity)}")
+    for k, obstacle in enumerate(check_list("obstacles", obstacles)):
+        if not isinstance(obstacle, Obstacle) or type(obstacle.shape) not in KERNEL_SHAPES:
+            expected = ", ".join(shape.name for shape in KERNEL_SHAPES)
+            raise TypeError(f"obstacles[{k}] must be an obstacle of one of {expected}, got {type(obstacle).__name__}")
+
+
+def present(obstacles: Sequence[Obstacle], scene_time: Tensor | None, number: float) -> Sequence[Obstacle]:
+    """Those that are there at a time as `time_arguments` gives it; all where it is a tensor, which only ops read."""
+    return obstacles if scene_time is not None else [o for o in obstacles if o.start <= number < o.end]
 
 
 def obstacle_arguments(group: Sequence[Obstacle], like: Tensor, scenes: int) -> tuple[Any, ...]:
@@ -134,7 +142,7 @@ def time_arguments(time: float | Tensor, like: Tensor, scenes: int) -> tuple[Ten
     return scene_time, 0.0
 
 
-def _packed(velocity: Tensor) -> Tensor:
+def packed_rows(velocity: Tensor) -> Tensor:
     return velocity if velocity.stride(1) == 1 else velocity.contiguous()
 
 
@@ -239,7 +247,7 @@ def _backward(ctx, grad):
     wants_rows = ctx.needs_input_grad[1]
     grad_velocity, rows = dispatch(
         torch.ops.torch_mpm.contact_backward,
-        *(_packed(grad[:, 1:]), wants_rows, velocity, obstacles, data, *ctx.kinds, scene_time, ctx.time, *topology),
+        *(packed_rows(grad[:, 1:]), wants_rows, velocity, obstacles, data, *ctx.kinds, scene_time, ctx.time, *topology),
     )
     rows = sum_by_scene_of_blocks(rows, Topology.unpack(*topology), obstacles.shape[0]) if wants_rows else None
     return (grad_velocity[:, 1:], rows) + (None,) * 12
@@ -257,9 +265,9 @@ def _double_backward(ctx, grad_velocity, grad_rows):
 
     def adjoint(grad: Tensor, velocity: Tensor, obstacles: Tensor) -> Any:
         def after(velocity: Tensor, rows: Tensor) -> Tensor:
-            return _composed(blocks, velocity, rows, data, ctx.kinds, scene_time, ctx.time)
+            return composed_contact(blocks, velocity, rows, data, ctx.kinds, scene_time, ctx.time)
 
-        rows = _rows_of_slots(obstacles, blocks)
+        rows = rows_of_slots(obstacles, blocks)
         both = differentiate(after, [velocity, rows], [grad])
         adjoints = [torch.zeros_like(t) if g is None else g for g, t in zip(both, (velocity, rows), strict=True)]
         return tuple(adjoints) if ctx.wants_rows else adjoints[0]
@@ -272,14 +280,14 @@ def _double_backward(ctx, grad_velocity, grad_rows):
 # ---- the same in torch operations, for second derivatives
 
 
-def _rows_of_slots(obstacles: Tensor, blocks: Topology) -> Tensor:
+def rows_of_slots(obstacles: Tensor, blocks: Topology) -> Tensor:
     """A table [1 or B, K, width] as one of each slot [slots, K, width]."""
     if obstacles.shape[0] == 1:
         return obstacles.expand(blocks.block.shape[0], *obstacles.shape[1:])
     return obstacles.index_select(0, blocks.block_scene().clamp(0, obstacles.shape[0] - 1))
 
 
-def _composed(
+def composed_contact(
     blocks: Topology,
     velocity: Tensor,
     rows: Tensor,
@@ -287,8 +295,12 @@ def _composed(
     kinds: Sequence[Any],
     scene_time: Tensor | None,
     time: float,
+    see: Callable[[Tensor, Tensor], None] = lambda before, after: None,
 ) -> Tensor:
-    """Node velocities [N, D] by `Obstacle.forward` of obstacles with parameters of each slot [slots, K, width]."""
+    """Node velocities [N, D] by `Obstacle.forward` of obstacles with parameters of each slot [slots, K, width].
+
+    `see` is called with the velocities before and after each of them.
+    """
     now: float | Tensor = time
     if scene_time is not None:
         now = scene_time[0] if len(scene_time) == 1 else scene_time[blocks.block_scene().clamp_min(0)]
@@ -300,7 +312,9 @@ def _composed(
         form = _shape(shape, parameters.pop("extent"), parameters.pop("radius"), data[first : first + size])
         obstacle = Obstacle(form, kind=CONTACT_NAMES[kind], start=start, end=end, **parameters)
         acts = active if scene < 0 else active & (node_scene == scene)
-        velocity = torch.where(acts[:, None], obstacle.forward(velocity, positions, slot, now, 0.0), velocity)
+        before = velocity
+        velocity = torch.where(acts[:, None], obstacle.forward(before, positions, slot, now, 0.0), before)
+        see(before, velocity)
         first += size
     return velocity
 

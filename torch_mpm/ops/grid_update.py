@@ -44,31 +44,35 @@ def grid_update(
 
     Differentiable with respect to nodes, gravity and dt, twice in eager mode.
     """
+    check_nodes(blocks, nodes)
+    arguments = update_arguments(blocks, nodes, gravity, dt, walls)
+    updated = dispatch(torch.ops.torch_mpm.grid_update, nodes, *arguments, *blocks.packed)
+    return updated[:, 1:]
+
+
+def check_nodes(blocks: Blocks, nodes: Tensor) -> None:
     check_blocks(blocks)
-    grid = blocks.grid
-    if not isinstance(nodes, Tensor) or nodes.shape != (blocks.node_count, 1 + grid.dim):
-        expected = [blocks.node_count, 1 + grid.dim]
+    expected = [blocks.node_count, 1 + blocks.grid.dim]
+    if not isinstance(nodes, Tensor) or list(nodes.shape) != expected:
         raise ValueError(f"nodes must have shape [N, 1 + D] = {expected}, got {shape_of(nodes)}")
     if nodes.dtype not in FLOATING:
         raise TypeError(f"nodes must be float32 or float64, got {nodes.dtype}")
     if nodes.device != blocks.block.device:
         raise ValueError(f"nodes must be on the device of blocks, {blocks.block.device}, got {nodes.device}")
-    number, scene_dt = 0.0, None
+
+
+def update_arguments(
+    blocks: Blocks, nodes: Tensor, gravity: Tensor | None, dt: float | Tensor | None, walls: Walls | None
+) -> tuple[Any, ...]:
+    """Gravity, dt and walls as the ops take them after the nodes."""
+    grid, number, scene_dt = blocks.grid, 0.0, None
     if gravity is not None:
         if dt is None:
             raise ValueError("gravity needs dt")
         number, scene_dt = split_dt(dt, grid.scenes, nodes)
         gravity = per_scene(gravity, nodes, grid.scenes, grid.dim)
-    updated = dispatch(
-        torch.ops.torch_mpm.grid_update,
-        nodes,
-        gravity,
-        None if scene_dt is None else scene_dt.contiguous(),
-        number,
-        *wall_arguments(walls, grid),
-        *blocks.packed,
-    )
-    return updated[:, 1:]
+    scene_dt = None if scene_dt is None else scene_dt.contiguous()
+    return gravity, scene_dt, number, *wall_arguments(walls, grid)
 
 
 def wall_arguments(walls: Walls | None, grid: Any) -> tuple[list[int], list[float], list[float]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 import torch
@@ -15,6 +15,7 @@ from ..topology import PADDING, Topology
 if TYPE_CHECKING:
     from ..boundaries import Face
 
+See = Callable[[int, Tensor], None]
 MIRROR_REACH = 2
 """Nodes on both sides of a mirror that have images (csrc/grid/grid_update.h)."""
 
@@ -25,18 +26,25 @@ def composed_grid_update(
     gravity: Tensor | None = None,
     dt: float | Tensor | None = None,
     faces: Sequence[Face] = (),
+    see: See | None = None,
 ) -> Tensor:
-    """Node mass and velocity [N, 1 + D] from mass and momentum; see `grid_update` and `Walls.faces`."""
+    """Node mass and velocity [N, 1 + D] from mass and momentum; see `grid_update` and `Walls.faces`.
+
+    `see(face, momentum)` is called with what a face takes from each node [N, D] [N s], perhaps several times.
+    """
     active = blocks.active_nodes()[:, None]
     mass, momentum = torch.where(active, nodes, 0).split([1, nodes.shape[1] - 1], 1)
     if gravity is not None and dt is not None:
         change = gravity * (dt[:, None] if isinstance(dt, Tensor) and dt.dim() == 1 else dt)
         scene = blocks.node_scene().clamp_min(0)
         momentum = momentum + mass * (change if change.dim() == 1 else change[scene])
-    summed, momentum = _mirror(faces, blocks, torch.cat([mass, momentum], 1)).split([1, nodes.shape[1] - 1], 1)
+    own = momentum
+    summed, momentum = _mirror(faces, blocks, torch.cat([mass, own], 1)).split([1, nodes.shape[1] - 1], 1)
     heavy = summed != 0
     velocity = torch.where(heavy, momentum, 0) / torch.where(heavy, summed, 1)
-    velocity = _act(faces, blocks, velocity)
+    if see is not None:
+        _see_mirrors(faces, blocks, torch.where(heavy, own - mass * velocity, 0), see)
+    velocity = _act(faces, blocks, velocity, mass, see)
     return torch.cat([mass, torch.where(heavy, velocity, 0)], 1)
 
 
@@ -48,8 +56,7 @@ def _mirror(faces: Sequence[Face], blocks: Topology, rows: Tensor) -> Tensor:
         for corner in itertools.combinations(mirrors, count):
             node, near, sign = blocks.node_indices(), blocks.active_nodes(), torch.ones_like(rows[:1])
             for axis, plane in corner:
-                twice = round(2 * ((plane - blocks.grid.lower[axis]) / blocks.grid.dx + PADDING))
-                distance = 2 * node[:, axis] - twice  # in half cells
+                distance = _half_cells(blocks, node, axis, plane)
                 near = near & (distance.abs() <= 2 * MIRROR_REACH)
                 node[:, axis] -= distance
                 sign[:, 1 + axis] *= -1
@@ -59,7 +66,27 @@ def _mirror(faces: Sequence[Face], blocks: Topology, rows: Tensor) -> Tensor:
     return result
 
 
-def _act(faces: Sequence[Face], blocks: Topology, velocity: Tensor) -> Tensor:
+def _half_cells(blocks: Topology, node: Tensor, axis: int, plane: float) -> Tensor:
+    """Distance of lattice nodes from a mirror, twice that in cells."""
+    return 2 * node[:, axis] - round(2 * ((plane - blocks.grid.lower[axis]) / blocks.grid.dx + PADDING))
+
+
+def _see_mirrors(faces: Sequence[Face], blocks: Topology, momentum: Tensor, see: See) -> None:
+    """Each component goes to the mirror along its axis, or else to the first that the node has an image in."""
+    node = blocks.node_indices()
+    near = {
+        number: blocks.active_nodes() & (_half_cells(blocks, node, number // 2, face.plane).abs() <= 2 * MIRROR_REACH)
+        for number, face in enumerate(faces)
+        if face.kind == "mirror"
+    }
+    for axis, unit in enumerate(torch.eye(momentum.shape[1], dtype=torch.bool, device=momentum.device)):
+        free = torch.ones_like(node[:, 0], dtype=torch.bool)
+        for number in [n for n in near if n // 2 == axis] + [n for n in near if n // 2 != axis]:
+            see(number, torch.where((near[number] & free)[:, None] & unit, momentum, 0))
+            free = free & ~near[number]
+
+
+def _act(faces: Sequence[Face], blocks: Topology, velocity: Tensor, mass: Tensor, see: See | None) -> Tensor:
     position = blocks.node_positions(torch.float64)
     axes = torch.eye(velocity.shape[1], dtype=velocity.dtype, device=velocity.device)
     for number, face in enumerate(faces):
@@ -68,5 +95,8 @@ def _act(faces: Sequence[Face], blocks: Topology, velocity: Tensor) -> Tensor:
         axis, sign = number // 2, 1 - 2 * (number % 2)
         beyond = sign * (position[:, axis : axis + 1] - face.plane) <= 1e-6 * blocks.grid.dx
         touching = torch.where(beyond, velocity, 0)
-        velocity = velocity + contact_change(touching, sign * axes[axis], face.kind, face.friction)
+        change = contact_change(touching, sign * axes[axis], face.kind, face.friction)
+        if see is not None:
+            see(number, -mass * change)
+        velocity = velocity + change
     return velocity

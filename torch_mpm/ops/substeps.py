@@ -3,19 +3,22 @@
     torch.ops.torch_mpm.substeps(x, v, mass, volume, C, F, J, history, scene, ids, material, previous_status, laws,
         options, parameters, variables, n, dt, apic, wants_C, stress_form, gravity, wall_kind, wall_plane,
         wall_friction, obstacles, data, shape, sizes, contact, obstacle_scene, start, end, time, scenes,
-        max_blocks, grows, lattice, layout) -> (x, v, C, F, J, history, status)
+        max_blocks, grows, impulse, scene_dt, scene_time, lattice, layout)
+        -> (x, v, C, F, J, history, status, impulse, time)
 
-Particles and their history are those of `State`, the grid's arguments those of `activate`, `grid_update` and
-`contact`. `laws` are names of `LAWS` parted by commas, law k for the particles of material k; their options,
-parameters and history variables follow one another, `variables` of the latter for each law. The time step dt [s] is
-part of the parameters of laws that flow in time. Results that a call does not have are None; `history` has the entries
-of all laws side by side, [P, m]. With `grows` the pool follows the scene on the CPU; otherwise the op stops there where
-the pool is full, and the status tells. On CUDA nothing is waited for.
+Particles and their history are those of `State`, the grid's arguments those of `activate`, `grid_update` and `contact`.
+`laws` are names of `LAWS` parted by commas, law k for the particles of material k; their options, parameters and
+history variables follow one another, `variables` of the latter for each law. The time step dt [s] is part of the
+parameters of laws that flow in time. Results that a call does not have are None; `history` has the entries of all laws
+side by side, [P, m]. The impulses on obstacles and walls are added to `impulse`, where it is given. Scenes with clocks
+of their own have the time steps dt times `scene_dt` and begin at `scene_time`, both [B]. With `grows` the pool follows
+the scene on the CPU; otherwise the op stops there where it is full, and the status tells. On CUDA nothing is waited
+for.
 
-Differentiable once, with respect to x, v, mass, volume, C, F, J, history, parameters and gravity. Autograd keeps the
-arguments of a call, no more: 2 D + 2 D² numbers per particle of a solid (24 in 3-D) and its history.
+Differentiable once, with respect to x, v, mass, volume, C, F, J, history, parameters, gravity and impulse. Autograd
+keeps the arguments of a call, no more: 2 D + 2 D² numbers per particle of a solid (24 in 3-D) and its history.
 
-    torch.ops.torch_mpm.substeps_backward(grad_x, grad_v, grad_C, grad_F, grad_J, grad_history, needs,
+    torch.ops.torch_mpm.substeps_backward(grad_x, grad_v, grad_C, grad_F, grad_J, grad_history, grad_impulse, needs,
         *arguments of substeps) -> (x, v, C, F, J, history, mass, volume, parameters, gravity)
 
 takes the steps again and then goes back through them. Meanwhile it holds what each step has read: of a solid 2 D + 3 D²
@@ -54,7 +57,7 @@ def _fake(
 ) -> tuple[Tensor | None, ...]:
     P, D = sizes(x, "x", 2)
     given = dict(zip(list(_SCHEMA)[8:], rest, strict=True))
-    wants_C, scenes = given["wants_C"], given["scenes"]
+    wants_C, scenes, impulse = given["wants_C"], given["scenes"], given["impulse"]
     return (
         soa_empty(x, (P, D)),
         soa_empty(x, (P, D)),
@@ -63,11 +66,13 @@ def _fake(
         None if J is None else soa_empty(x, (P,)),
         soa_empty(x, (P, _entries(history))) if history else None,
         x.new_empty((1 + scenes, 8), dtype=torch.int32),
+        None if impulse is None else impulse.new_empty(impulse.shape),
+        None if given["scene_time"] is None else x.new_empty(scenes),
     )
 
 
 @torch.library.register_fake("torch_mpm::substeps_backward")
-def _backward_fake(grad_x, grad_v, grad_C, grad_F, grad_J, grad_history, needs, *arguments):
+def _backward_fake(grad_x, grad_v, grad_C, grad_F, grad_J, grad_history, grad_impulse, needs, *arguments):
     given = dict(zip(_SCHEMA, arguments, strict=True))
     x, history = given["x"], given["history"]
     P, D = sizes(x, "x", 2)
@@ -103,13 +108,16 @@ def _backward(ctx: Any, *grads: Any) -> Any:
     wanted = dict(zip(_SCHEMA, ctx.needs_input_grad, strict=True))
     needs = MASS * wanted["mass"] + VOLUME * wanted["volume"] + GRAVITY * wanted["gravity"]
     needs += PARAMETERS * any(wanted["parameters"])
-    adjoints = dispatch(torch.ops.torch_mpm.substeps_backward, *grads[:6], needs, *(given[name] for name in _SCHEMA))
-    found = dict(zip(_ADJOINTS, adjoints, strict=True))
+    by_impulse = None if grads[7] is None else grads[7].contiguous()
+    arguments = (given[name] for name in _SCHEMA)
+    adjoints = dispatch(torch.ops.torch_mpm.substeps_backward, *grads[:6], by_impulse, needs, *arguments)
+    found = dict(zip(_ADJOINTS, adjoints, strict=True)) | {"impulse": grads[7]}
     found["history"] = _of_history(found["history"], history, wanted["history"])
     found["parameters"] = _of_parameters(found["parameters"], parameters, wanted["parameters"], given["scene"])
     if wanted["gravity"]:
         scenes, dim = given["gravity"].shape
-        found["gravity"] = given["dt"] * found["gravity"].reshape(scenes, math.prod(given["layout"][2:]), dim).sum(1)
+        dt = given["dt"] if given["scene_dt"] is None else given["dt"] * given["scene_dt"][:, None]
+        found["gravity"] = dt * found["gravity"].reshape(scenes, math.prod(given["layout"][2:]), dim).sum(1)
     lists = ("history", "parameters")
     return tuple(found.get(name) if name in lists or wanted[name] is True else None for name in _SCHEMA)
 

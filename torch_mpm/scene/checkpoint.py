@@ -52,13 +52,13 @@ def save(path: Path, tensors: Host, record: dict[str, Any]) -> None:
         raise
 
 
-def load(path: Path, device: torch.device | str = "cpu") -> tuple[State, dict[str, Any]]:
-    """The state that `save` wrote, in the memory order it had, and the record.
+def load(path: Path, device: torch.device | str = "cpu", remedy: str = REMEDY) -> tuple[State, dict[str, Any]]:
+    """The state that `save` wrote, in the memory order it had, and the record; `remedy` is for messages.
 
     Raises:
         DamagedFileError: for a file that is damaged or holds something else.
     """
-    with open_sealed(path, REMEDY, in_memory=True) as source:
+    with open_sealed(path, remedy, in_memory=True) as source:
         try:
             record = json.loads(source.attrs["record"])
             tensors: dict[str, Any] = {name: torch.from_numpy(data[()]) for name, data in source.items()}
@@ -66,5 +66,5 @@ def load(path: Path, device: torch.device | str = "cpu") -> tuple[State, dict[st
             time = tensors.pop("time", record["time"])
             state = State(**tensors, extra=extra, time=time)
         except (KeyError, TypeError, ValueError, RecursionError) as error:
-            raise DamagedFileError(path, f"does not hold the state of a run ({error})", REMEDY) from None
+            raise DamagedFileError(path, f"does not hold the state of a run ({error})", remedy) from None
     return state.map(_as_soa).to(device), record

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import time
 from typing import Any
@@ -10,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..state import State
+from ..state import PARTICLE_FIELDS, State
 from .build import Built
 from .run import Simulation, joined
 from .scene import Scene
@@ -72,6 +71,6 @@ def _trial(built: Built, state: State, dt: float) -> tuple[State, float]:
 
 
 def _bytes_of(state: State) -> dict[str, int]:
-    fields = {f.name: getattr(state, f.name) for f in dataclasses.fields(state) if f.name != "time"} | state.extra
+    fields = {name: getattr(state, name) for name in PARTICLE_FIELDS} | state.extra
     tensors = {name: value for name, value in fields.items() if isinstance(value, Tensor)}
     return {name: t[0].numel() * t.element_size() if len(t) else 0 for name, t in tensors.items()}

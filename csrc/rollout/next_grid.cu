@@ -1,0 +1,44 @@
+#include "rollout/next_grid.h"
+
+#include "cuda/chain.cuh"
+
+namespace mpm::cuda {
+namespace {
+
+constexpr int kThreads = 256;
+
+template <bool Obstacles, class T, int D>
+__global__ void __launch_bounds__(kThreads) next_grid_kernel(const NextGridArguments<T, D> a) {
+  wait_for_kernel_before();
+  const int64_t node = int64_t(blockIdx.x) * kThreads + threadIdx.x;
+  const int slot = int(node / kBlockNodes<D>), local = int(node % kBlockNodes<D>);
+  if (node == 0) *a.next_drift = a.drift->next(a.particles);
+  if (slot >= a.update.max_blocks) return;
+  const SlotUpdate<T, D> s = slot_update(a.update, slot);
+  if (!s.active) return;
+  NodeRow<T, D> row = update_node(a.update, s, local, a.update.nodes[node]);
+  if constexpr (Obstacles) {
+    const ContactSlot<T, D> there = contact_slot(a.contact, slot);
+    if (there.active)
+      row.value = after_obstacles(a.contact, there, a.contact.obstacles, node_position(a.contact, there.corner, local),
+                                  row.value);
+  }
+  a.update.updated[node] = row;
+  if (a.emptied) a.emptied[node] = {};
+}
+
+}  // namespace
+
+template <class T, int D>
+void next_grid(const NextGridArguments<T, D>& a, Stream stream) {
+  if (a.update.max_blocks == 0) return;
+  const unsigned blocks = unsigned((int64_t(a.update.max_blocks) * kBlockNodes<D> + kThreads - 1) / kThreads);
+  if (a.obstacles)
+    launch_in_chain(next_grid_kernel<true, T, D>, blocks, kThreads, 0, stream, a);
+  else
+    launch_in_chain(next_grid_kernel<false, T, D>, blocks, kThreads, 0, stream, a);
+}
+
+MPM_INSTANTIATE(next_grid, NextGridArguments)
+
+}  // namespace mpm::cuda

@@ -1,0 +1,22 @@
+#pragma once
+
+#include "grid/grid_update.h"
+#include "grid/obstacle.h"
+#include "grid/topology.h"
+
+namespace mpm {
+
+// The pass over the nodes between P2G and G2P of a call of many steps, on CUDA: grid update and contact in one. Rows of
+// unused slots are left as they are, nodes are made ready for the next P2G, and the drift for the next G2P to count.
+template <class T, int D>
+struct NextGridArguments {
+  GridUpdateArguments<T, D> update;
+  bool obstacles = false;
+  ContactArguments<T, D> contact;    // its nodes unused
+  NodeRow<T, D>* emptied = nullptr;  // the nodes, which become zero; null where mirrors read those of others
+  const Drift* drift = nullptr;
+  Drift* next_drift = nullptr;
+  int64_t particles = 0;
+};
+
+}  // namespace mpm

@@ -1,0 +1,450 @@
+"""The class of PhysGaussian's simulator against its published step, restated in NumPy."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+import torch
+from compat.restated import EYE, Weights, corotated, from_grid, lame, nodes_of, rotations_svd, times, to_grid
+
+import torch_mpm as mpm
+from torch_mpm.compat.physgaussian import MPM_Simulator_WARP, decode_param_json, set_boundary_conditions
+
+N, LIM, DT = 20, 1.0, 2e-4
+DX = LIM / N
+
+
+class Restated:
+    """Return map and stress of the trial F, gradient-form P2G with APIC, gravity, conditions on nodes, G2P."""
+
+    def __init__(self, x, volume, density, material="jelly", E=1e5, nu=0.3, g=(0, 0, 0), **options):
+        self.x, self.v, self.C = x.copy(), np.zeros_like(x), np.zeros((len(x), 3, 3))
+        self.F, self.volume = np.tile(EYE, (len(x), 1, 1)), volume
+        self.mass, self.material, self.g, self.time = density * volume, material, np.array(g, float), 0.0
+        self.mu, self.lam = (np.broadcast_to(m, len(x)).copy() for m in lame(E, nu))
+        self.limit = np.broadcast_to(options.get("yield_stress", 0.0), len(x)).copy()
+        self.options = options
+        self.before, self.on_nodes = [], []
+        self.nodes = nodes_of(N, DX)
+
+    def metal(self, F, breaks):
+        U, s, Vh = rotations_svd(F)
+        e = np.log(np.maximum(s, 0.01))
+        mean = e.mean(1, keepdims=True)
+        dev = e - mean
+        for p in range(len(F)):
+            size = np.linalg.norm(dev[p])
+            if not 2 * self.mu[p] * size > self.limit[p] or (breaks and self.limit[p] <= 0):
+                continue
+            size += 1e-6
+            gamma = size - self.limit[p] / (2 * self.mu[p])
+            F[p] = U[p] @ np.diag(np.exp(e[p] - gamma / size * dev[p])) @ Vh[p]
+            if breaks:
+                self.limit[p] -= self.options["softening"] * np.linalg.norm(gamma / size * dev[p])
+                if self.limit[p] <= 0:
+                    self.mu[p] = self.lam[p] = 0
+            if self.options.get("hardening") == 1:
+                self.limit[p] += 2 * self.mu[p] * self.options["xi"] * gamma
+        return F
+
+    def foam(self, F, dt):
+        U, s, Vh = rotations_svd(F)
+        e = np.log(np.maximum(s, 0.01))
+        dev = e - e.mean(1, keepdims=True)
+        for p in range(len(F)):
+            trial = 2 * self.mu[p] * np.linalg.norm(dev[p])
+            beyond = trial - math.sqrt(2 / 3) * self.limit[p]
+            if beyond > 0:
+                rate = 2 * self.mu[p] * (s[p] ** 2).mean() * dt
+                new = trial - beyond / (1 + self.options["plastic_viscosity"] / rate)
+                F[p] = U[p] @ np.diag(np.exp(e[p].mean() + new / trial * dev[p])) @ Vh[p]
+        return F
+
+    def sand(self, F):
+        sin = math.sin(math.radians(self.options["friction_angle"]))
+        alpha = math.sqrt(2 / 3) * 2 * sin / (3 - sin)
+        U, s, Vh = rotations_svd(F)
+        e = np.log(np.abs(s))
+        for p in range(len(F)):
+            trace = e[p].sum()
+            dev = e[p] - trace / 3
+            gamma = np.linalg.norm(dev) + (3 * self.lam[p] + 2 * self.mu[p]) / (2 * self.mu[p]) * trace * alpha
+            if gamma > 0:
+                H = e[p] - gamma * dev / np.linalg.norm(dev) if trace <= 0 else np.zeros(3)
+                F[p] = U[p] @ np.diag(np.exp(H)) @ Vh[p]
+        return F
+
+    def stress(self, dt):
+        F = self.F
+        if self.material in ("metal", "plasticine"):
+            F = self.metal(F, self.material == "plasticine")
+        elif self.material == "foam":
+            F = self.foam(F, dt)
+        elif self.material == "sand":
+            F = self.sand(F)
+        self.F = F
+        mu, lam = self.mu[:, None], self.lam[:, None]
+        if self.material in ("jelly", "plasticine"):
+            return corotated(F, mu[:, :, None], self.lam)
+        U, s, Vh = rotations_svd(F)
+        e = np.log(np.maximum(s, 0.01)) if self.material != "sand" else np.log(s)
+        tau = 2 * mu * e + lam * e.sum(1, keepdims=True)
+        return times(U, tau / s if self.material == "sand" else tau, Vh) @ F.transpose(0, 2, 1)
+
+    def p2g2p(self, dt):
+        for act in self.before:
+            act(self, dt)
+        stress = self.stress(dt)
+        weights = Weights(self.x, DX, N)
+        d = self.options.get("rpic_damping", 0.0)
+        C = (1 - d) * self.C + d / 2 * (self.C - self.C.transpose(0, 2, 1))
+        m, mv = to_grid(weights, N, self.mass, self.v, 0 * C if d < 0 else C, self.volume, stress, dt, False, DX)
+        v = np.where(m[:, None] > 1e-15, mv / np.maximum(m, 1e-300)[:, None] + dt * self.g, 0)
+        v = v * min(self.options.get("grid_v_damping_scale", 1.0), 1.0)
+        for act in self.on_nodes:
+            act(self, v, dt)
+        self.v, self.C, grad = from_grid(weights, v, DX)
+        self.x = self.x + dt * self.v
+        self.F = (EYE + dt * grad) @ self.F
+        self.time += dt
+
+
+def floor(height):
+    def act(sim, v, dt):
+        v[sim.nodes[:, 2] < height - 1e-9] = 0
+
+    return act
+
+
+def bounding_box(sim, v, dt):
+    index = np.rint(sim.nodes / DX).astype(int)
+    for k in range(3):
+        v[(index[:, k] < 3) & (v[:, k] < 0), k] = 0
+        v[(index[:, k] >= N - 3) & (v[:, k] > 0), k] = 0
+
+
+def blob(count=4, low=0.35, high=0.6, seed=0):
+    """Jittered particles in a cube, positions [P, 3] and volumes [P]."""
+    rng = np.random.default_rng(seed)
+    axis = np.linspace(low, high, count)
+    x = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
+    x = x + 0.2 * (high - low) / count * rng.uniform(-1, 1, x.shape)
+    return x, np.full(len(x), ((high - low) / count) ** 3)
+
+
+def pair(parameters, velocity=None, device="cpu", dtype=torch.float64):
+    """Both simulators with the same particles and parameters."""
+    x, volume = blob()
+    sim = MPM_Simulator_WARP(10)
+    sim.load_initial_data_from_torch(
+        torch.tensor(x, dtype=dtype), torch.tensor(volume, dtype=dtype), n_grid=N, grid_lim=LIM, device=device
+    )
+    sim.set_parameters_dict(parameters)
+    own = Restated(x, volume, **{k: v for k, v in parameters.items() if k != "additional_material_params"})
+    if velocity is not None:
+        own.v = velocity(x)
+        sim.import_particle_v_from_torch(torch.tensor(own.v, dtype=dtype, device=device))
+    return sim, own
+
+
+def run(sim, own, steps=100, dt=DT):
+    for k in range(steps):
+        sim.p2g2p(k, dt)
+        own.p2g2p(dt)
+    return sim.export_particle_x_to_torch().detach().cpu().numpy()
+
+
+def shear(x):
+    c = x - x.mean(0)
+    return np.stack([4 * c[:, 2], -3 * c[:, 0], -2 - 2 * c[:, 2]], 1)
+
+
+MATERIALS = {
+    "jelly": {},
+    "metal": {"yield_stress": 2e3, "hardening": 1, "xi": 0.05},
+    "plasticine": {"yield_stress": 2e3, "softening": 2e4},
+    "foam": {"yield_stress": 1e3, "plastic_viscosity": 10.0},
+    "sand": {"friction_angle": 30},
+}
+
+
+@pytest.mark.parametrize("material", MATERIALS)
+def test_trajectories_of_the_materials(material, device):
+    """A sheared cube falls on a sticky floor: 100 substeps, much closer than 1e-4 of the domain."""
+    common = {"material": material, "E": 1e5, "nu": 0.3, "density": 500.0, "g": [0, 0, -9.8]}
+    sim, own = pair(common | MATERIALS[material], shear, device)
+    sim.add_surface_collider((0.5, 0.5, 0.33), (0.0, 0.0, 2.0))
+    sim.add_bounding_box()
+    sim.finalize_mu_lam()
+    own.on_nodes += [floor(0.33), bounding_box]
+    x = run(sim, own)
+    moved = np.abs(own.x - blob()[0]).max()
+    error = np.abs(x - own.x).max()
+    assert moved > 0.03 and error < 1e-11 * LIM
+    if material in ("metal", "plasticine"):
+        assert np.abs(own.limit - MATERIALS[material]["yield_stress"]).max() > 1  # it has flowed
+        np.testing.assert_allclose(sim.state.extra["yield_stress"].cpu().numpy(), own.limit, rtol=1e-6)
+    if material == "plasticine":
+        assert 0 < (own.mu == 0).sum() < len(x)  # and some of it is broken
+    sim.step.check(sim.state)
+
+
+def test_operations_on_particles_and_nodes(device):
+    """Impulses, held and turning particles, sequential release, a moving cuboid with reset, RPIC and damped nodes."""
+    parameters = {"E": 1e5, "nu": 0.3, "density": 500.0, "g": [0.0, 0.0, -3.0]}
+    damping = {"rpic_damping": 0.3, "grid_v_damping_scale": 0.998}
+    sim, own = pair(parameters | damping, shear, device)
+    x0 = own.x.copy()
+    sim.add_impulse_on_particles([0.5, 0.0, 0.2], DT, [0.4, 0.5, 0.5], [0.1, 1, 1], num_dt=10, start_time=0.002)
+    sim.enforce_particle_velocity_translation([0.5, 0.5, 0.6], [1, 1, 0.05], [0.0, 0.4, 0.0], 0.0, 0.01)
+    sim.enforce_particle_velocity_rotation([0.5, 0.5, 0.36], [0, 0, 3.0], [0.05, 0.2], 5.0, 0.3, 0.004, 0.016)
+    sim.release_particles_sequentially([0, 1, 0], 0.6, 0.35, 7, 0.0, 0.01)
+    sim.set_velocity_on_cuboid([0.3, 0.475, 0.475], [0.1, 0.1, 0.1], [1.0, 0, 0], 0.001, 0.012, reset=1)
+    sim.add_bounding_box()
+    sim.finalize_mu_lam()
+
+    def push(sim, dt):
+        if 0.002 <= sim.time < 0.002 + 10 * DT:
+            chosen = np.abs(x0[:, 0] - 0.4) < 0.1
+            sim.v[chosen] += dt * np.array([0.5, 0.0, 0.2]) / sim.mass[chosen, None]
+
+    def slide(sim, dt):
+        if sim.time < 0.01:
+            sim.v[np.abs(x0[:, 2] - 0.6) < 0.05] = [0, 0.4, 0]
+
+    def turn(sim, dt):
+        first = x0 - [0.5, 0.5, 0.36]
+        chosen = (np.abs(first[:, 2]) < 0.05) & (np.hypot(first[:, 0], first[:, 1]) < 0.2)
+        if 0.004 <= sim.time < 0.016:
+            arm = sim.x - [0.5, 0.5, 0.36]
+            turned = np.stack([5 * arm[:, 1], -5 * arm[:, 0], 0 * arm[:, 0] + 0.3], 1)
+            sim.v[chosen] = turned[chosen]
+
+    def layers(sim, dt):
+        for k in range(50):
+            inside = (np.abs(x0[:, 1] - 0.35) < 0.25 / 50 * (50 - k)) & (np.abs(x0[:, [0, 2]] - 1) < 1).all(1)
+            if sim.time < 0.01 / 50 * (k + 1):
+                sim.v[inside] = 0
+
+    def cuboid(sim, v, dt):
+        if 0.001 <= sim.time < 0.012:
+            centre = np.array([0.3 + (sim.time - 0.001), 0.475, 0.475])
+            v[(np.abs(sim.nodes - centre) < 0.1 - 1e-9).all(1)] = [1.0, 0, 0]
+        elif sim.time < 0.012 + 15 * dt:
+            v[:] = 0
+
+    own.options |= damping
+    own.before += [push, slide, turn, layers]
+    own.on_nodes += [cuboid, bounding_box]
+    x = run(sim, own)
+    assert np.abs(x - own.x).max() < 1e-8
+    assert np.abs(own.x - x0).max() > 5e-3
+    assert sim.time == pytest.approx(own.time, rel=1e-12)
+
+
+def test_pic_and_boxes_of_material(device):
+    """Without C in P2G, and with stiffness and density that differ in a box."""
+    box = {"point": [0.5, 0.5, 0.6], "size": [1.0, 1.0, 0.12], "E": 4e5, "nu": 0.2, "density": 900.0}
+    parameters = {"E": 1e5, "nu": 0.3, "density": 500.0, "rpic_damping": -1.0}
+    sim, own = pair(parameters | {"additional_material_params": [box]}, shear, device)
+    inside = np.abs(own.x[:, 2] - 0.6) < 0.12
+    assert 0 < inside.sum() < len(inside)
+    E, nu = np.where(inside, 4e5, 1e5), np.where(inside, 0.2, 0.3)
+    own.mu, own.lam = lame(E, nu)
+    own.mass = np.where(inside, 900.0, 500.0) * own.volume
+    sim.finalize_mu_lam()
+    assert np.abs(run(sim, own, 50) - own.x).max() < 1e-8
+
+
+def test_exports_for_gaussians(device):
+    """R transposed and F Σ Fᵀ of the current F, against NumPy; the pieces of the other exports."""
+    sim, own = pair({"E": 1e4, "nu": 0.3, "density": 500.0}, shear, device)
+    factors = np.random.default_rng(1).normal(size=(len(own.x), 3, 3))
+    sigma = factors @ factors.transpose(0, 2, 1)
+    upper = np.triu_indices(3)
+    six = torch.tensor(sigma[:, upper[0], upper[1]], device=device)
+    state = sim.state
+    sim.load_initial_data_from_torch(state.x, state.volume, six, n_grid=N, grid_lim=LIM)
+    sim.import_particle_v_from_torch(state.v)
+    sim.set_parameters_dict({"E": 1e4, "nu": 0.3, "density": 500.0})
+    sim.finalize_mu_lam()
+    run(sim, own, 60)
+    U, s, Vh = rotations_svd(own.F)
+    assert np.abs(s - 1).max() > 0.01
+    np.testing.assert_allclose(
+        sim.export_particle_R_to_torch().cpu().numpy(), (U @ Vh).transpose(0, 2, 1).reshape(-1, 9), atol=1e-9
+    )
+    expected = own.F @ sigma @ own.F.transpose(0, 2, 1)
+    np.testing.assert_allclose(
+        sim.export_particle_cov_to_torch().cpu().numpy(), expected[:, upper[0], upper[1]].reshape(-1), atol=1e-8
+    )
+    for name, value in (("v", own.v), ("C", own.C.reshape(-1, 9)), ("F", own.F.reshape(-1, 9))):
+        exported = getattr(sim, f"export_particle_{name}_to_torch")()
+        np.testing.assert_allclose(exported.cpu().numpy(), value, atol=1e-7)
+
+
+@pytest.mark.parametrize("material", ["jelly", "metal", "foam"])
+def test_gradients_reach_the_parameters_and_the_start(material, device):
+    """By E and by the initial velocity, against central differences of the whole run."""
+    x, volume = blob(4)
+    x, volume = torch.tensor(x, device=device), torch.tensor(volume, device=device)
+    start = torch.tensor(shear(x.cpu().numpy()), device=device)
+
+    def loss(E, push):
+        sim = MPM_Simulator_WARP(10)
+        sim.load_initial_data_from_torch(x, volume, n_grid=N, grid_lim=LIM)
+        sim.import_particle_v_from_torch(start * push)
+        options = {"E": E, "nu": 0.3, "density": 500.0, "yield_stress": 1e3, "plastic_viscosity": 10.0}
+        sim.set_parameters_dict({"material": material, **options})
+        sim.finalize_mu_lam()
+        for k in range(10):
+            sim.p2g2p(k, 2e-3)
+        return (sim.export_particle_x_to_torch() ** 2 * torch.arange(1.0, 4.0, device=device)).sum()
+
+    E = torch.tensor(1e5, dtype=torch.float64, device=device, requires_grad=True)
+    push = torch.tensor(1.0, dtype=torch.float64, device=device, requires_grad=True)
+    grads = torch.autograd.grad(loss(E, push), (E, push))
+    with torch.no_grad():
+        for k, (value, grad) in enumerate(zip((E, push), grads, strict=True)):
+            h = 1e-5 * value
+            arguments = [(E + h, push), (E - h, push)] if k == 0 else [(E, push + h), (E, push - h)]
+            plus, minus = (loss(*a) for a in arguments)
+            assert float(grad) == pytest.approx(float((plus - minus) / (2 * h)), rel=2e-4)
+
+
+def test_configuration_runs_as_it_stands(tmp_path, device):
+    """A JSON file in the published form, its defaults, and a float32 run beside the restated one."""
+    file = tmp_path / "config.json"
+    conditions = [
+        {"type": "bounding_box"},
+        {"type": "cuboid", "point": [0.5, 0.5, 0.35], "size": [0.5, 0.5, 0.05], "velocity": [0, 0, 0], "reset": 1},
+        {"type": "particle_impulse", "force": [-0.2, 0.0, 0.0], "num_dt": 3},
+    ]
+    words = {"E": 2e5, "n_grid": N, "grid_lim": LIM, "g": [0, 0, -1], "substep_dt": DT, "frame_dt": 5e-3}
+    file.write_text(json.dumps(words | {"boundary_conditions": conditions, "frame_num": 4}))
+    material, boundaries, time, preprocessing, camera = decode_param_json(file)
+    assert material["material"] == "jelly" and material["nu"] == 0.4 and material["density"] == 200.0
+    assert time == {"substep_dt": DT, "frame_dt": 5e-3, "frame_num": 4}
+    assert preprocessing["opacity_threshold"] == 0.02 and camera["default_camera_index"] == 0
+
+    x, volume = blob()
+    sim = MPM_Simulator_WARP(10)
+    sim.load_initial_data_from_torch(
+        torch.tensor(x, dtype=torch.float32, device=device),
+        torch.tensor(volume, dtype=torch.float32, device=device),
+        n_grid=material["n_grid"],
+        grid_lim=material["grid_lim"],
+    )
+    sim.set_parameters_dict(material)
+    set_boundary_conditions(sim, boundaries, time)
+    sim.finalize_mu_lam()
+    own = Restated(x, volume, 200.0, E=2e5, nu=0.4, g=(0, 0, -1))
+
+    def push(sim, dt):
+        if sim.time < 3 * DT:
+            sim.v += dt * np.array([-0.2, 0, 0]) / sim.mass[:, None]
+
+    def hold(sim, v, dt):
+        v[(np.abs(sim.nodes - [0.5, 0.5, 0.35]) < np.array([0.5, 0.5, 0.05]) - 1e-9).all(1)] = 0
+
+    own.before.append(push)
+    own.on_nodes += [bounding_box, hold]
+    assert np.abs(run(sim, own) - own.x).max() < 1e-5
+
+
+def test_a_cut_and_reset_before_the_start(device):
+    """The surface "cut" lets part of the nodes move; a cuboid with reset holds all nodes before it starts."""
+    sim, own = pair({"E": 1e5, "nu": 0.3, "density": 500.0, "g": [20.0, 9.0, -60.0]}, shear, device)
+    sim.add_surface_collider((0.45, 0.5, 0.5), (-1.0, 0.0, 0.0), "cut")
+    sim.set_velocity_on_cuboid((0.1, 0.1, 0.1), (0.04, 0.04, 0.04), (0.0, 0.0, 0.0), 0.004, 0.014, reset=1)
+    sim.finalize_mu_lam()
+
+    def cut(sim, v, dt):
+        behind = 0.45 - sim.nodes[:, 0] < -1e-9
+        between = (sim.nodes[:, 2] >= 0.4 - 1e-9) & (sim.nodes[:, 2] <= 0.53)
+        v[behind & between] *= [0.3, 0, 0.3]
+        v[behind & ~between] = 0
+
+    def hold(sim, v, dt):
+        if not 0.004 <= sim.time < 0.014 and sim.time < 0.014 + 15 * dt:
+            v[:] = 0
+
+    own.on_nodes += [cut, hold]
+    assert np.abs(run(sim, own) - own.x).max() < 1e-8
+    assert np.abs(own.x - blob()[0]).max() > 1e-3
+
+
+def test_a_sampling_file_is_loaded(tmp_path):
+    h5py = pytest.importorskip("h5py")
+    x, volume = blob()
+    with h5py.File(tmp_path / "points.h5", "w") as file:
+        file["x"], file["particle_volume"] = x.T, volume[None]
+    sim = MPM_Simulator_WARP(10)
+    sim.load_from_sampling(str(tmp_path / "points.h5"), n_grid=N)
+    np.testing.assert_allclose(sim.export_particle_x_to_torch().numpy(), x, rtol=1e-6)
+    assert sim.state.volume.numpy() == pytest.approx(volume) and sim.parameters["n_grid"] == N
+
+
+def test_substeps_are_taken_together(device):
+    """They take one op, whatever is asked for in between is right, and a change acts from its time on."""
+    sim, _ = pair({"E": 1e5, "nu": 0.3, "density": 500.0}, shear, device)
+    sim.finalize_mu_lam()
+    sim.add_bounding_box()
+    other, _ = pair({"E": 1e5, "nu": 0.3, "density": 500.0}, shear, device)
+    other.finalize_mu_lam()
+    other.add_bounding_box()
+    assert sim.step.explain(sim.state, DT) == "all steps in one op"
+    for k in range(30):
+        sim.p2g2p(k, DT)
+        other.p2g2p(k, DT)
+        other.export_particle_x_to_torch()
+        if k == 20:
+            for one in (sim, other):
+                one.set_parameters_dict({"g": [0, 0, -9.8]})
+    assert sim.time == pytest.approx(30 * DT)
+    torch.testing.assert_close(sim.export_particle_x_to_torch(), other.export_particle_x_to_torch(), rtol=0, atol=1e-13)
+
+
+def test_what_cannot_be_done_is_said():
+    x, volume = (torch.tensor(a) for a in blob(2))
+    sim = MPM_Simulator_WARP(10)
+    with pytest.raises(ValueError, match="call load_initial_data_from_torch first"):
+        sim.export_particle_x_to_torch()
+    with pytest.raises(ValueError, match=r"tensor_x must have shape \[P, 3\], got \[8, 2\]"):
+        sim.load_initial_data_from_torch(x[:, :2], volume)
+    sim.load_initial_data_from_torch(x, volume)
+    with pytest.raises(ValueError, match="call set_parameters_dict and finalize_mu_lam before p2g2p"):
+        sim.p2g2p(0, 1e-4)
+    sim.set_parameters_dict({"E": 1e4, "nu": 0.3, "material": "snow"})
+    with pytest.raises(ValueError, match="'snow' has no stress"):
+        sim.finalize_mu_lam()
+    sim.set_parameters_dict({"material": "jello"})
+    with pytest.raises(TypeError, match=r"material must be one of .*, got 'jello'"):
+        sim.finalize_mu_lam()
+    sim.set_parameters_dict({"material": mpm.Snow(E=1e4, nu=0.2)})
+    sim.finalize_mu_lam()
+    with pytest.raises(ValueError, match="no mass: give density"):
+        sim.p2g2p(0, 1e-4)
+    with pytest.raises(TypeError, match=r"g must be three numbers, got 9.8"):
+        sim.set_parameters_dict({"g": 9.8})
+    with pytest.raises(ValueError, match=r"friction must be 0 on sticky surfaces, got 0.5"):
+        sim.add_surface_collider((0, 0, 0), (0, 0, 1), friction=0.5)
+    with pytest.warns(UserWarning, match="stops the nodes behind it"):
+        sim.add_surface_collider((0, 0, 0), (0, 0, 1), "slip")
+    with pytest.raises(TypeError, match=r"type of a boundary condition must be one of .*, got 'wind'"):
+        set_boundary_conditions(sim, [{"type": "wind"}], {})
+    with pytest.raises(ValueError, match="a boundary condition cuboid must have size"):
+        set_boundary_conditions(sim, [{"type": "cuboid", "point": [0, 0, 0], "velocity": [0, 0, 0]}], {})
+
+
+def test_no_particles_at_all(device):
+    sim = MPM_Simulator_WARP(0)
+    nothing = torch.zeros(0, 3, device=device)
+    sim.load_initial_data_from_torch(nothing, nothing[:, 0])
+    sim.set_parameters_dict({"E": 1e4, "nu": 0.3, "density": 1.0})
+    sim.add_impulse_on_particles([1, 0, 0], 1e-4)
+    sim.finalize_mu_lam()
+    sim.p2g2p(0, 1e-4)
+    assert sim.export_particle_x_to_torch().shape == (0, 3) and sim.export_particle_R_to_torch().shape == (0, 9)
+    assert sim.export_particle_cov_to_torch().shape == (0,)

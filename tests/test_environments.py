@@ -1,0 +1,235 @@
+"""Scenes side by side: each with its own size, clock and end; replaced where they stand."""
+
+import pytest
+import torch
+from torch import Tensor
+
+import torch_mpm as mpm
+
+F64 = torch.float64
+DT, N = 1e-3, 8
+
+
+def one(k: int, device: str = "cpu", **options) -> mpm.State:
+    """A block of its own size and throw."""
+    points = mpm.seed.box((0.2, 0.3), (0.4 + 0.05 * k, 0.5), 0.1, per_cell=4)
+    return mpm.State.at_rest(points, 1000.0, (1.0 - k, 0.5 * k), dtype=F64, device=device, **options)
+
+
+def step_of(scenes: int, device: str = "cpu", law: mpm.Material | None = None, **options) -> mpm.Step:
+    grid = mpm.Grid(0.1, (0.0, 0.0), (1.0, 1.0), scenes=scenes, deterministic=True)
+    gravity = torch.tensor([[0.5 * k, -9.8] for k in range(scenes)], dtype=F64, device=device)
+    E = torch.tensor([1e4 * (1 + k) for k in range(scenes)], dtype=F64, device=device)
+    law = mpm.NeoHookean(E, 0.3) if law is None else law
+    given = {"walls": "separate", "boundaries": [mpm.Sphere((0.5, 0.1), 0.2, friction=0.3)]} | options
+    return mpm.Step(grid, law, gravity, **given)
+
+
+def alone(step: mpm.Step, k: int, state: mpm.State, n: int, dt: float = DT) -> mpm.State:
+    """Scene k by itself."""
+    law = mpm.NeoHookean(step.law.E[k : k + 1], 0.3)
+    grid = mpm.Grid(0.1, (0.0, 0.0), (1.0, 1.0), deterministic=True)
+    single = mpm.Step(grid, law, step.gravity[k], walls=step.walls, boundaries=list(step.boundaries))
+    return mpm.rollout(single, single.with_impulses(state), n, dt)
+
+
+def fields(state: mpm.State) -> dict[str, Tensor]:
+    found = {name: getattr(state, name) for name in ("x", "v", "mass", "volume", "C", "F", "impulse")}
+    return {name: t for name, t in (found | state.extra).items() if t is not None}
+
+
+def assert_equal(a: mpm.State, b: mpm.State, exactly: bool = True) -> None:
+    left, right = fields(a), fields(b)
+    assert left.keys() == right.keys()
+    for name, value in left.items():
+        if exactly:
+            assert torch.equal(value, right[name]), name
+        else:
+            torch.testing.assert_close(value, right[name], rtol=1e-9, atol=1e-9, msg=name)
+
+
+def environments(device: str, count: int = 4) -> mpm.Environments:
+    envs = mpm.Environments(step_of(count, device), [one(k, device) for k in range(count)])
+    envs.count_impulses()
+    return envs
+
+
+def test_scenes_of_any_size_are_what_they_are_alone(device):
+    """Size, throw, stiffness and gravity of their own; absent particles are not noticed, nor told of."""
+    envs = environments(device)
+    assert envs.step.explain(envs.state) == "all steps in one op"
+    envs.advance(N, DT)
+    for k in range(4):
+        assert_equal(envs.scene(k), alone(envs.step, k, one(k, device), N), exactly=False)
+    envs.step.check(envs.state)
+    assert not envs.failed.any()
+    assert envs.present.sum(1).tolist() == [len(one(k)) for k in range(4)]
+    x = envs.observe("x")
+    assert x.shape == (4, envs.room, 2) and (x[~envs.present] == 0).all()
+    assert torch.equal(envs.observe("x", padded=False), torch.cat([envs.scene(k).x for k in range(4)]))
+
+
+@pytest.mark.parametrize("form", ["mask", "indices", "states", "packed"])
+def test_a_reset_replaces_scenes_and_leaves_the_others(device, form):
+    envs, other = environments(device), environments(device)
+    for e in (envs, other):
+        e.advance(N, DT)
+    storage = envs.state.x.data_ptr()
+    new = [one(0, device), one(3, device)]  # of other sizes than those they replace
+    if form == "mask":
+        envs.reset(torch.tensor([False, True, False, True], device=device))
+    elif form == "indices":
+        envs.reset([3, 1])
+    elif form == "states":
+        envs.reset([1, 3], new)
+    else:
+        envs.reset(torch.tensor([1, 3], device=device), envs.pack(new))
+    assert envs.state.x.data_ptr() == storage
+    assert torch.equal(envs.time, other.time * torch.tensor([1.0, 0.0, 1.0, 0.0], dtype=F64, device=device))
+    for e in (envs, other):
+        e.advance(N, DT)
+    for k in (0, 2):
+        assert_equal(envs.scene(k), other.scene(k), exactly=device == "cpu")
+    for k, state in zip((1, 3), new if form in ("states", "packed") else (one(1, device), one(3, device)), strict=True):
+        assert_equal(envs.scene(k), alone(envs.step, k, state, N), exactly=False)
+    assert envs.time.tolist() == pytest.approx([2 * N * DT, N * DT, 2 * N * DT, N * DT])
+
+
+def test_a_lost_scene_is_frozen_told_of_and_reset(device):
+    envs, other = environments(device), environments(device)
+    v = envs.observe("v").clone()
+    v[2] = torch.nan
+    envs.state = envs.state.replace(v=v.reshape(-1, 2))
+    for e in (envs, other):
+        e.advance(2, DT)
+    assert envs.failed.tolist() == [False, False, True, False]
+    envs.freeze()
+    still = envs.scene(2).x.clone()
+    for e in (envs, other):
+        e.advance(N, DT)
+    torch.testing.assert_close(envs.scene(2).x, still, rtol=0, atol=0, equal_nan=True)
+    assert envs.frozen.tolist() == [False, False, True, False]
+    assert envs.time.tolist() == pytest.approx([(N + 2) * DT, (N + 2) * DT, 2 * DT, (N + 2) * DT])
+    with pytest.raises(mpm.SimulationError, match="in scene 2"):
+        envs.step.check()
+    envs.reset(envs.frozen)
+    assert not envs.failed.any() and not envs.frozen.any()
+    envs.step.check(envs.state)
+    for e in (envs, other):
+        e.advance(N, DT)
+    assert_equal(envs.scene(2), alone(envs.step, 2, one(2, device), N), exactly=False)
+    for k in (0, 1, 3):
+        assert_equal(envs.scene(k), other.scene(k), exactly=device == "cpu")
+
+
+def test_clocks_of_moving_obstacles(device):
+    """A reset scene sees its paddle begin anew."""
+    paddle = mpm.Box((0.5, 0.0), (0.2, 0.2), velocity=(0.0, 5.0), end=2.5 * N * DT)
+    step = step_of(3, device, boundaries=[paddle])
+    envs = mpm.Environments(step, [one(0, device)] * 3)
+    assert step.explain(envs.state.replace(time=envs.time), DT) == "all steps in one op"
+    envs.count_impulses()
+    envs.advance(N, DT)
+    envs.reset([1])
+    envs.advance(N, DT)
+    for k, n in ((0, 2 * N), (1, N), (2, 2 * N)):
+        assert_equal(envs.scene(k), alone(step, k, one(0, device), n), exactly=False)
+
+
+def test_time_steps_of_each_scene(device):
+    dt = torch.tensor([DT, 0.0, 0.5 * DT], dtype=F64, device=device)
+    envs = mpm.Environments(step_of(3, device), [one(k, device) for k in range(3)])
+    before = envs.scene(1)
+    envs.count_impulses()
+    envs.advance(N, dt)
+    assert envs.time.tolist() == pytest.approx([N * DT, 0.0, 0.5 * N * DT])
+    assert torch.equal(envs.scene(1).x, before.x)
+    assert_equal(envs.scene(0), alone(envs.step, 0, one(0, device), N), exactly=False)
+    assert_equal(envs.scene(2), alone(envs.step, 2, one(2, device), N, 0.5 * DT), exactly=False)
+
+
+def test_control_by_poses_and_forces(device):
+    """A pose for each scene at each control step; the force is impulse over time, and zero where a scene was reset."""
+    paddle = mpm.Sphere(torch.tensor([[0.3, 0.2]] * 3, dtype=F64, device=device), 0.15, kind="sticky")
+    step = step_of(3, device, boundaries=[paddle])
+    envs = mpm.Environments(step, [one(k, device) for k in range(3)])
+    with pytest.raises(ValueError, match="impulses must be counted"):
+        envs.forces()
+    envs.count_impulses()
+    for _ in range(3):
+        paddle.position = paddle.position + torch.tensor([[0.0, 0.01 * b] for b in range(3)], dtype=F64, device=device)
+        before = envs.state.impulse.clone()
+        envs.advance(N, DT)
+        force = envs.forces()
+        change = (envs.state.impulse - before) / (N * DT)
+        torch.testing.assert_close(force.values, change)
+    assert torch.equal(force[paddle].linear, force.values[:, 0, :2])
+    assert float(force["-y"].linear.abs().max()) >= 0
+    envs.reset([2])
+    assert (envs.forces().values[2] == 0).all() and (envs.state.impulse[2] == 0).all()
+
+
+def test_materials_histories_and_heat(device):
+    """Fields that a step makes are there from the beginning, and are reset too."""
+    grid = mpm.Grid(0.1, (0.0, 0.0), (1.0, 1.0), scenes=2, deterministic=True)
+    law = mpm.VonMises(E=1e4, nu=0.3, yield_stress=1.0, hardening=100.0)
+    step = mpm.Step(grid, law, (0.0, -9.8), "sticky", heat=mpm.Heat(grid, 1e3, 100.0))
+    states = [one(k, device).replace(temperature=torch.ones_like(one(k, device).mass)) for k in (0, 2)]
+    envs = mpm.Environments(step, states)
+    first = {name: t.clone() for name, t in fields(envs.state).items()}
+    envs.advance(250, DT)
+    assert float(envs.observe("plastic_strain").max()) > 0
+    envs.reset([0, 1])
+    for name, value in fields(envs.state).items():
+        assert torch.equal(value, first[name]), name
+
+
+def test_files(device, tmp_path):
+    pytest.importorskip("h5py")
+    envs, again = environments(device), environments(device)
+    envs.advance(N, DT)
+    envs.freeze([3])
+    envs.save(tmp_path / "all.h5")
+    envs.save(tmp_path / "one.h5", 2)
+    again.load(tmp_path / "all.h5")
+    for e in (envs, again):
+        e.advance(N, DT)
+    assert torch.equal(envs.time, again.time) and torch.equal(envs.frozen, again.frozen)
+    for k in range(4):
+        assert_equal(envs.scene(k), again.scene(k), exactly=device == "cpu")
+    other = environments(device)
+    other.load(tmp_path / "one.h5", 2)
+    assert other.time.tolist() == pytest.approx([0.0, 0.0, N * DT, 0.0])
+    other.advance(N, DT)
+    assert_equal(envs.scene(2), other.scene(2), exactly=False)
+    with pytest.raises(ValueError, match="must hold one scene"):
+        other.load(tmp_path / "all.h5", 1)
+    with pytest.raises(ValueError, match="must hold 4 scenes"):
+        other.load(tmp_path / "one.h5")
+
+
+def test_errors(device):
+    step = step_of(2, device)
+    with pytest.raises(ValueError, match="states must be a list of the 2 scenes of the grid, got 1"):
+        mpm.Environments(step, [one(0, device)])
+    with pytest.raises(ValueError, match=r"states\[1\] must have at most 16 particles"):
+        mpm.Environments(step, [one(0, device), one(3, device)], room=16)
+    with pytest.raises(ValueError, match="states must have at least one particle each"):
+        mpm.Environments(step, [one(0, device), one(0, device).select(torch.arange(0, device=device))])
+    with pytest.raises(TypeError, match="step must be a Step"):
+        mpm.Environments(step.law, [one(0, device)] * 2)
+    envs = mpm.Environments(step, [one(0, device), one(1, device)])
+    with pytest.raises(ValueError, match="states must be 2, one for each scene to reset, got 1"):
+        envs.reset([0, 1], [one(0, device)])
+    with pytest.raises(ValueError, match=r"a mask of scenes must have shape \[B\] = \[2\], got \[3\]"):
+        envs.reset(torch.ones(3, dtype=torch.bool, device=device))
+    with pytest.raises(ValueError, match=r"states must be torch\.float64"):
+        envs.reset([0], [one(0, device).to(dtype=torch.float32)])
+    with pytest.raises(ValueError, match="states must have no material"):
+        envs.reset([0], [one(0, device).replace(material=torch.zeros(len(one(0)), dtype=torch.int32, device=device))])
+    with pytest.raises(ValueError, match=r"scenes must be from 0 to 1, got \[2\]"):
+        envs.reset([2])
+    with pytest.raises(ValueError, match="name must be that of a field"):
+        envs.observe("colour")
+    with pytest.raises(ValueError, match="k must be a scene from 0 to 1"):
+        envs.scene(2)

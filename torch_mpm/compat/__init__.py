@@ -1,0 +1,9 @@
+"""The interfaces of other simulators on top of torch_mpm, so that their scripts run with another import.
+
+- `torch_mpm.compat.physgaussian`: `MPM_Simulator_WARP` of PhysGaussian and its descendants, with JSON configurations.
+- `torch_mpm.compat.nclaw`: simulator and laws of NCLaw.
+- `torch_mpm.compat.mpm_pytorch`: `MPMSolver`, constitutive models and boundary conditions of MPM-PyTorch.
+
+Names of arguments, units and the order of operations are those of the other simulator; names in CamelCase are theirs.
+docs/migrating tells what differs.
+"""

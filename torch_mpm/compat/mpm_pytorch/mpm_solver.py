@@ -1,0 +1,132 @@
+"""The solver of MPM-PyTorch, on a `Step` of torch_mpm."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ...errors import check_count, check_like, check_number, shape_of
+from ...grid import Grid
+from ...particle_operations import Operations
+from ...step import Step
+from ..given_stress import GivenStress, clamped, stepped
+from ..node_conditions import NodeDamping
+
+LARGEST_ENTRY = 2.0
+"""To which entries of F are clamped."""
+
+
+class MPMSolver:
+    """A step of explicit MPM on the unit cube: forces by the gradient of quadratic B-splines, APIC, positions and F
+    clamped.
+
+        x, v, C, F = solver(x, v, C, F, stress)
+
+    Every particle has the volume prod(size)/P and the density rho. Gradients pass to all five tensors, which may be
+    float32 or float64.
+
+    Args:
+        init_pos: positions [P, 3] [m] by which boundary conditions choose particles.
+        rho: density [kg/m³].
+        num_grids: cells along each axis.
+        dt: time step [s].
+        gravity: [m/s²]
+        clip_bound: distance that positions keep from the faces of the cube, in cells.
+        damping: factor of all node velocities in each step, in [0, 1].
+        center: not used.
+        size: edges of the box whose volume the particles share [m].
+        enable_train: not used: gradients pass where a tensor requires them.
+        device: None for that of init_pos.
+
+    Raises:
+        TypeError, ValueError: for a wrong argument.
+    """
+
+    def __init__(
+        self,
+        init_pos: Tensor,
+        rho: float = 1000.0,
+        num_grids: int = 25,
+        dt: float = 3e-4,
+        gravity: Sequence[float] = (0.0, 0.0, -9.8),
+        clip_bound: float = 0.5,
+        damping: float = 1.0,
+        center: Sequence[float] = (0.5, 0.5, 0.5),
+        size: Sequence[float] = (1.0, 1.0, 1.0),
+        enable_train: bool = False,
+        device: torch.device | str | None = None,
+    ) -> None:
+        if not isinstance(init_pos, Tensor) or init_pos.dim() != 2 or init_pos.shape[1] != 3:
+            raise ValueError(f"init_pos must have shape [P, 3], got {shape_of(init_pos)}")
+        self.init_pos = init_pos.detach().to(device=device)
+        self.device = self.init_pos.device
+        self.n_particles = len(init_pos)
+        self.num_grids = check_count("num_grids", num_grids, 1)
+        self.dt = float(check_number("dt", dt, "positive and finite", lambda v: 0 < v < math.inf))
+        self.dx, self.inv_dx = 1 / num_grids, float(num_grids)
+        self.clip_bound = self.dx * check_number("clip_bound", clip_bound, "not negative", lambda v: v >= 0)
+        self.damping = check_number("damping", damping, "between 0 and 1", lambda v: 0 <= v <= 1)
+        self.vol = math.prod(float(s) for s in size) / max(self.n_particles, 1)
+        self.p_mass = rho * self.vol
+        self.time = 0.0
+        self.pre_particle_process: list[Any] = []
+        self.post_grid_process: list[Any] = []
+        self.displacement: Tensor | None = None
+        self.step = Step(
+            Grid(self.dx, (0.0,) * 3, (1.0,) * 3), GivenStress(), gravity=tuple(gravity), stress_form="gradient"
+        )
+        self._acting: tuple[list[Any], list[Any]] | None = None
+        self._volume = torch.full((self.n_particles,), self.vol, dtype=torch.float64, device=self.device)
+
+    def reset(self) -> None:
+        """Set the time to zero."""
+        self.time = 0.0
+
+    def __call__(
+        self, x: Tensor, v: Tensor, C: Tensor, F: Tensor, stress: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """`p2g2p`"""
+        return self.p2g2p(x, v, C, F, stress)
+
+    def p2g2p(
+        self, x: Tensor, v: Tensor, C: Tensor, F: Tensor, stress: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """The particles a time step later.
+
+        Args:
+            x: positions [P, 3] [m].
+            v: velocities [P, 3] [m/s].
+            C: affine velocity field [P, 3, 3] [1/s].
+            F: deformation gradient [P, 3, 3].
+            stress: Kirchhoff stress [P, 3, 3] [Pa].
+
+        Returns:
+            x, v, C and F.
+        """
+        check_like("x", x, x, (self.n_particles, 3), "[P, 3]")
+        self._set_boundaries()
+        self.displacement = None
+        volume = self._volume.to(x)
+        mass = volume * (self.p_mass / self.vol)
+        state = stepped(self.step, x, v, C, F, stress, mass, volume, self.time, self.dt)
+        self.time += self.dt
+        assert state.C is not None and state.F is not None
+        # Weights are those of the positions before they are displaced, as in MPM-PyTorch.
+        after = state.x if self.displacement is None else state.x + self.displacement
+        after = clamped(after, self.clip_bound, 1 - self.clip_bound)
+        return after, state.v, state.C, clamped(state.F, -LARGEST_ENTRY, LARGEST_ENTRY)
+
+    def _set_boundaries(self) -> None:
+        """Give the step what was added to the lists since the last one."""
+        lists = (list(self.pre_particle_process), list(self.post_grid_process))
+        if self._acting == lists:
+            return
+        self._acting = lists
+        operations, nodes = lists
+        self.step.on_particles = Operations(operations) if operations else None
+        damping = [NodeDamping(self.damping)] if self.damping < 1 else []
+        self.step.boundaries = [*damping, *nodes]  # type: ignore[assignment]

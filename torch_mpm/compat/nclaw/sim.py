@@ -1,0 +1,205 @@
+"""NCLaw's simulator: MLS-MPM on the unit cube with a stress that is given, on a `Step` of torch_mpm."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from ...boundaries import Walls
+from ...errors import check_count, check_number, shape_of
+from ...grid import Blocks, Grid
+from ...state import State
+from ...step import Step
+from ..given_stress import GivenStress, clamped, stepped
+from ..settings import setting
+from .particles import MPMInitData, MPMState, MPMStateInitializer, MPMStatics, MPMStaticsInitializer
+
+__all__ = [
+    "MPMCacheDiffSim",
+    "MPMDiffSim",
+    "MPMForwardSim",
+    "MPMInitData",
+    "MPMModel",
+    "MPMModelBuilder",
+    "MPMState",
+    "MPMStateInitializer",
+    "MPMStatics",
+    "MPMStaticsInitializer",
+]
+
+Particles = tuple[Tensor, Tensor, Tensor, Tensor]
+"""x, v, C and F."""
+
+
+class MPMModel:
+    """The numbers of a simulation; `MPMModelBuilder` makes it.
+
+    Args:
+        num_grids: cells along each axis of the unit cube.
+        dt: time step [s].
+        bound: nodes with an index below it, or above num_grids − bound, have no velocity out of the cube.
+        gravity: [m/s²]
+        eps: added to the mass of a node [kg], which makes light nodes slow.
+        device: of the particles that it makes.
+    """
+
+    def __init__(
+        self,
+        num_grids: int,
+        dt: float,
+        bound: int,
+        gravity: Sequence[float],
+        eps: float = 0.0,
+        device: torch.device | str | None = None,
+    ) -> None:
+        self.num_grids = check_count("num_grids", num_grids, 1)
+        self.dt = float(check_number("dt", dt, "positive and finite", lambda v: 0 < v < math.inf))
+        self.bound, self.dx, self.device = check_count("bound", bound), 1 / num_grids, device
+        self.gravity, self.eps = tuple(float(g) for g in gravity), float(eps)
+        lower, upper = (bound - 1) * self.dx, (num_grids - bound + 1) * self.dx
+        step = Step(Grid(self.dx, (0.0,) * 3, (1.0,) * 3), GivenStress(), on_particles=self._present)
+        if eps == 0:
+            step.gravity = self.gravity
+            step.walls = Walls("separate", (lower,) * 3, (upper,) * 3) if bound > 0 else None
+        else:
+            step.on_grid = HeavyNodes(eps, self.gravity, lower, upper)
+        self.step = step
+        self._enabled: Tensor | None = None
+
+    def _present(self, state: State, dt: float | Tensor) -> tuple[State, Tensor]:
+        assert self._enabled is not None
+        return state, self._enabled
+
+    def advance(self, statics: MPMStatics, x: Tensor, v: Tensor, C: Tensor, F: Tensor, stress: Tensor) -> Particles:
+        """The particles a time step later. Those that are not enabled stay as they are."""
+        if not isinstance(statics, MPMStatics):
+            raise TypeError(f"statics must be an MPMStatics, got {shape_of(statics)}")
+        volume = statics.vol.to(x)
+        self._enabled = statics.enabled.to(x.device) != 0
+        state = stepped(self.step, x, v, C, F, stress, statics.rho.to(x) * volume, volume, 0.0, self.dt)
+        margin = statics.clip_bound.to(x)[:, None] * self.dx
+        after = torch.where(self._enabled[:, None], clamped(state.x, margin, 1 - margin), x)
+        assert state.C is not None and state.F is not None
+        return after, state.v, state.C, state.F
+
+    def state(self, shape: int, requires_grad: bool | None = None) -> MPMState:
+        """Particles at rest in the origin."""
+        return MPMState(shape, self.device)
+
+    def statics(self, shape: int) -> MPMStatics:
+        """Statics of particles without volume."""
+        return MPMStatics(shape, self.device)
+
+
+class HeavyNodes(nn.Module):
+    """Node velocities of NCLaw's grid step from those of a step without gravity and walls.
+
+    Args:
+        eps: [kg], see `MPMModel`.
+        gravity: [m/s²]
+        lower, upper: planes beyond which no node moves outwards [m].
+    """
+
+    def __init__(self, eps: float, gravity: Sequence[float], lower: float, upper: float) -> None:
+        super().__init__()
+        self.eps, self.gravity, self.lower, self.upper = eps, gravity, lower, upper
+
+    def forward(self, blocks: Blocks, velocity: Tensor, mass: Tensor, dt: float) -> Tensor:
+        share = mass / (mass + self.eps)
+        rounding = 1e-6 * blocks.grid.dx
+        columns = []
+        for v, g, x in zip(
+            velocity.unbind(1), self.gravity, blocks.node_positions(velocity.dtype).unbind(1), strict=True
+        ):
+            v = share * v + g * dt
+            out = ((x <= self.lower + rounding) & (v < 0)) | ((x >= self.upper - rounding) & (v > 0))
+            columns.append(torch.where(out, 0, v))
+        return torch.stack(columns, 1)
+
+
+class MPMModelBuilder:
+    """Makes a model of a configuration: `MPMModelBuilder().parse_cfg(cfg).finalize(device, requires_grad=True)`."""
+
+    def __init__(self) -> None:
+        self.config: dict[str, Any] = {}
+
+    def parse_cfg(self, cfg: Any) -> MPMModelBuilder:
+        """Read num_grids, dt, bound, gravity, eps and bc, of an object or a mapping.
+
+        Raises:
+            ValueError: for a missing value, or another bc than "freeslip".
+        """
+        boundary = setting(cfg, "bc", "freeslip")
+        if boundary != "freeslip":
+            raise ValueError(
+                f"bc must be 'freeslip', got {boundary!r}: in NCLaw 'noslip' sets no velocity at all, so that nothing "
+                "moves"
+            )
+        names = ("num_grids", "dt", "bound", "gravity", "eps")
+        self.config = {name: setting(cfg, name) for name in names}
+        return self
+
+    def finalize(self, device: Any = None, requires_grad: bool = False) -> MPMModel:
+        """The model. Gradients pass wherever a tensor requires them, whatever `requires_grad` says."""
+        if not self.config:
+            raise ValueError("there is no configuration: call parse_cfg first")
+        return MPMModel(**self.config, device=None if device is None else str(device))
+
+
+class MPMSim(nn.Module):
+    """What the simulators have in common.
+
+    Args:
+        model: see `MPMModelBuilder`.
+    """
+
+    def __init__(self, model: MPMModel) -> None:
+        super().__init__()
+        self.model = model
+
+    def state(
+        self, x: Tensor, v: Tensor, C: Tensor, F: Tensor, stress: Tensor, state: MPMState | None = None
+    ) -> MPMState:
+        """The tensors as a state."""
+        state = self.model.state(len(x)) if state is None else state
+        state.from_torch(x, v, C, F, stress)
+        return state
+
+
+class MPMDiffSim(MPMSim):
+    """`x, v, C, F = sim(statics, x, v, C, F, stress)`, differentiable by all five tensors."""
+
+    def forward(self, statics: MPMStatics, x: Tensor, v: Tensor, C: Tensor, F: Tensor, stress: Tensor) -> Particles:
+        return self.model.advance(statics, x, v, C, F, stress)
+
+
+class MPMCacheDiffSim(MPMSim):
+    """`x, v, C, F = sim(statics, step, x, v, C, F, stress)`; nothing is kept between calls, whatever num_steps is.
+
+    Args:
+        model: see `MPMModelBuilder`.
+        num_steps: not used.
+    """
+
+    def __init__(self, model: MPMModel, num_steps: int) -> None:
+        super().__init__(model)
+        check_count("num_steps", num_steps)
+
+    def forward(
+        self, statics: MPMStatics, step: int, x: Tensor, v: Tensor, C: Tensor, F: Tensor, stress: Tensor
+    ) -> Particles:
+        return self.model.advance(statics, x, v, C, F, stress)
+
+
+class MPMForwardSim(MPMSim):
+    """`x, v, C, F = sim(statics, state)`, which also become those of the state."""
+
+    @torch.no_grad()
+    def forward(self, statics: MPMStatics, state: MPMState) -> Particles:
+        after = self.model.advance(statics, *state.to_torch())
+        state.from_torch(*after)
+        return after

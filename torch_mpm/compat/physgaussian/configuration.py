@@ -1,0 +1,114 @@
+"""JSON configurations of PhysGaussian: their defaults, and the boundary conditions that they list."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from .simulator import MPM_Simulator_WARP
+
+MATERIAL: dict[str, Any] = {"material": "jelly", "grid_lim": 2.0, "n_grid": 50, "nu": 0.4, "E": 1e5, "density": 200.0}
+MATERIAL_OPTIONS = (
+    *("yield_stress", "hardening", "xi", "friction_angle", "plastic_viscosity", "g", "rpic_damping", "pic_damping"),
+    *("softening", "opacity_threshold", "grid_v_damping_scale", "additional_material_params"),
+)
+TIME: dict[str, Any] = {"substep_dt": 1e-4, "frame_dt": 1e-2, "frame_num": 100}
+PREPROCESSING: dict[str, Any] = {
+    **{"opacity_threshold": 0.02, "rotation_degree": [], "rotation_axis": [], "sim_area": None, "scale": 1.0},
+    "particle_filling": None,
+}
+FILLING: dict[str, Any] = {
+    **{"density_threshold": 5.0, "search_threshold": 3.0, "max_particles_num": 2000000, "max_partciels_per_cell": 1},
+    **{"search_exclude_direction": 5, "ray_cast_direction": 4, "boundary": None, "smooth": False, "visualize": False},
+}
+CAMERA: dict[str, Any] = {
+    **{"mpm_space_viewpoint_center": [1.0, 1.0, 1.0], "mpm_space_vertical_upward_axis": [0, 0, 1]},
+    **{"default_camera_index": 0, "show_hint": False, "init_azimuthm": None, "init_elevation": None},
+    **{"init_radius": None, "delta_a": None, "delta_e": None, "delta_r": None, "move_camera": False},
+}
+CONDITIONS: dict[str, tuple[str, tuple[str, ...], tuple[str, ...]]] = {
+    "bounding_box": ("add_bounding_box", (), ()),
+    "cuboid": ("set_velocity_on_cuboid", ("point", "size", "velocity"), ("start_time", "end_time", "reset")),
+    "particle_impulse": ("add_impulse_on_particles", ("force",), ("point", "size", "num_dt", "start_time")),
+    "enforce_particle_translation": (
+        "enforce_particle_velocity_translation",
+        ("point", "size", "velocity", "start_time", "end_time"),
+        (),
+    ),
+    "surface_collider": (
+        "add_surface_collider",
+        ("point", "normal", "surface", "friction", "start_time", "end_time"),
+        (),
+    ),
+    "release_particles_sequentially": (
+        "release_particles_sequentially",
+        ("normal", "start_position", "end_position", "num_layers", "start_time", "end_time"),
+        (),
+    ),
+    "enforce_particle_velocity_rotation": (
+        "enforce_particle_velocity_rotation",
+        ("point", "normal", "half_height_and_radius", "rotation_scale", "translation_scale", "start_time", "end_time"),
+        (),
+    ),
+}
+"""Of each type in a configuration the method of the simulator, the keys that it must have and those that it may."""
+
+
+def decode_param_json(
+    json_file: str | Path,
+) -> tuple[dict[str, Any], Any, dict[str, Any], dict[str, Any], dict[str, Any]]:
+    """The parts of a configuration with their defaults.
+
+    Returns:
+        Parameters of `set_parameters_dict`; the list of boundary conditions; substep_dt, frame_dt [s] and frame_num;
+        parameters of the preparation of Gaussians, and of the camera, which torch_mpm does not use.
+
+    Raises:
+        ValueError: for a Poisson's ratio outside [0, 0.5], or a box of material parameters that lacks one.
+    """
+    given = json.loads(Path(json_file).read_text())
+
+    def part(defaults: Mapping[str, Any]) -> dict[str, Any]:
+        return {name: given.get(name, value) for name, value in defaults.items()}
+
+    material = part(MATERIAL) | {name: given[name] for name in MATERIAL_OPTIONS if name in given}
+    if not 0 <= material["nu"] <= 0.5:
+        raise ValueError(f"nu must be between 0 and 0.5, got {material['nu']}")
+    for box in material.get("additional_material_params", []):
+        _need("a box of additional_material_params", box, ("point", "size", "E", "nu"))
+        box.setdefault("density", material["density"])
+    preprocessing = part(PREPROCESSING)
+    if preprocessing["particle_filling"] is not None:
+        filling = {"n_grid": 4 * material["n_grid"], **FILLING}
+        preprocessing["particle_filling"] = filling | preprocessing["particle_filling"]
+    return material, given.get("boundary_conditions", {}), part(TIME), preprocessing, part(CAMERA)
+
+
+def set_boundary_conditions(
+    mpm_solver: MPM_Simulator_WARP, bc_params: Iterable[Mapping[str, Any]], time_params: Mapping[str, Any]
+) -> None:
+    """Add the boundary conditions of a configuration to a simulator, in their order.
+
+    Raises:
+        TypeError: for an unknown type.
+        ValueError: for a missing key.
+    """
+    for condition in bc_params:
+        kind = condition["type"]
+        if kind not in CONDITIONS:
+            raise TypeError(f"type of a boundary condition must be one of {sorted(CONDITIONS)}, got {kind!r}")
+        method, needed, optional = CONDITIONS[kind]
+        _need(f"a boundary condition {kind}", condition, needed)
+        arguments = {name: condition[name] for name in (*needed, *optional) if name in condition}
+        if kind == "particle_impulse":
+            arguments["dt"] = time_params["substep_dt"]
+        if kind == "cuboid":
+            arguments.setdefault("end_time", 1e3)
+        getattr(mpm_solver, method)(**arguments)
+
+
+def _need(what: str, given: Mapping[str, Any], names: Iterable[str]) -> None:
+    if missing := [name for name in names if name not in given]:
+        raise ValueError(f"{what} must have {', '.join(missing)}, got {sorted(given)}")

@@ -1,0 +1,47 @@
+"""What only PhysGaussian's simulator does to particles."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from ...particle_operations import Timed
+from ...state import State
+from ..selections import in_box
+
+LAYERS = 50
+"""Of a sequential release."""
+
+
+class DampedAffine(Timed):
+    """RPIC: the symmetric part of C less a share; without C, which is PIC, for a negative share."""
+
+    def __init__(self, share: float) -> None:
+        super().__init__()
+        self.share = share
+
+    def forward(self, state: State, dt: float | Tensor) -> State:
+        assert state.C is not None
+        if self.share < 0:
+            return state.replace(C=torch.zeros_like(state.C))
+        return state.replace(C=state.C - self.share / 2 * (state.C + state.C.mT))
+
+
+def release_times(x: Tensor, normal: Sequence[float], start: float, end: float, end_time: float) -> Tensor:
+    """When each particle is let go [P] [s]; at once where it is in no layer.
+
+    Layer k of n holds the particles nearer to `end` than (n − k)/n of the way from `start` until (k + 1)/n of the time,
+    and on the axes without a normal those within 1 m of 1 m.
+    """
+    point, size, axis = [1.0] * 3, [1.0] * 3, -1
+    for i in range(3):
+        if normal[i] != 0:
+            axis, point[i], size[i] = i, end, 0.0
+    times = torch.full_like(x[:, 0], -math.inf, dtype=torch.float64)
+    for k in range(LAYERS):
+        size[axis] = abs(start - end) / LAYERS * (LAYERS - k)
+        times = torch.where(in_box(x, point, size), end_time / LAYERS * (k + 1), times)
+    return times

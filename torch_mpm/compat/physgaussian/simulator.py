@@ -1,0 +1,378 @@
+"""PhysGaussian's simulator (Xie et al. 2024): its class, on a `Step` of torch_mpm."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ...boundaries import Obstacle
+from ...errors import check_count, check_like, check_number, shape_of
+from ...grid import Grid
+from ...laws import Material
+from ...particle_operations import Hold, Operations, Push
+from ...rollouts import rollout
+from ...state import State, identity_deformation
+from ...step import Step
+from ..node_conditions import FreezeOutside, NodeDamping, moving_cuboid, outer_planes, stopping_plane, surface_margin
+from ..selections import Rotation, in_box, in_cylinder
+from .exchange import Exchange
+from .materials import law_of
+from .particles import DampedAffine, release_times
+from .surfaces import Cut
+
+PADDING = 3
+"""Nodes at each face of the domain on which a bounding box acts."""
+RESET_STEPS = 15
+"""Steps for which a cuboid with `reset` holds all nodes after its end."""
+FOREVER = 999.0
+
+Numbers = Sequence[float]
+
+
+class MPM_Simulator_WARP(Exchange):
+    """Explicit MPM on the cube [0, grid_lim]³ with forces by the gradient of quadratic B-splines and APIC.
+
+    Substeps asked for with `p2g2p` are taken together when something is read or changed, in one op where that is
+    possible. Gradients pass from the exports to whatever tensors were given: positions, velocities, E, nu,
+    yield_stress, density. Tensors stay in their dtype, float32 or float64, and on their device.
+
+    Args:
+        n_particles: not used before data are loaded.
+        n_grid: cells along each axis.
+        grid_lim: edge of the domain [m].
+        device: None for that of the data.
+    """
+
+    def __init__(
+        self, n_particles: int, n_grid: int = 100, grid_lim: float = 1.0, device: torch.device | str | None = None
+    ) -> None:
+        check_count("n_particles", n_particles)
+        self.initialize(n_particles, n_grid, grid_lim, device)
+
+    def initialize(
+        self, n_particles: int, n_grid: int = 100, grid_lim: float = 1.0, device: torch.device | str | None = None
+    ) -> None:
+        """Forget everything but the size of the grid."""
+        self.n_particles = n_particles
+        self.parameters: dict[str, Any] = {"n_grid": n_grid, "grid_lim": grid_lim}
+        self._state: State | None = None
+        self._step: Step | None = None
+        self._law: Material | None = None
+        self._covariance: Tensor | None = None
+        self._damping: NodeDamping | None = None
+        self._nodes: list[Any] = []
+        self._acting: list[Any] = []
+        self._pushes: list[Any] = []
+        self._holds: list[Any] = []
+        self._queue: list[Any] = [0, 0.0, True]  # substeps, dt, whether gradients are wanted
+
+    # ---- data
+
+    def load_initial_data_from_torch(
+        self,
+        tensor_x: Tensor,
+        tensor_volume: Tensor,
+        tensor_cov: Tensor | None = None,
+        n_grid: int = 100,
+        grid_lim: float = 1.0,
+        device: torch.device | str | None = None,
+    ) -> None:
+        """Particles at rest, and a new simulation.
+
+        Args:
+            tensor_x: positions [P, 3] [m] in [0, grid_lim].
+            tensor_volume: [P] [m³].
+            tensor_cov: covariance of a Gaussian on each particle, six numbers xx xy xz yy yz zz: [P, 6] or [6 P].
+            n_grid, grid_lim, device: as of the class.
+        """
+        if not isinstance(tensor_x, Tensor) or tensor_x.dim() != 2 or tensor_x.shape[1] != 3:
+            raise ValueError(f"tensor_x must have shape [P, 3], got {shape_of(tensor_x)}")
+        self.initialize(len(tensor_x), n_grid, grid_lim)
+        x = tensor_x.to(device=device)
+        volume = tensor_volume.to(x)
+        check_like("tensor_volume", volume, x, (len(x),), "[P]")
+        motion = torch.zeros(len(x), 3, 3, dtype=x.dtype, device=x.device)
+        self._state = State(
+            x=x, v=torch.zeros_like(x), mass=0 * volume, volume=volume, C=motion, F=identity_deformation(x)
+        )
+        if tensor_cov is not None:
+            self._covariance = tensor_cov.to(x).reshape(-1, 6)
+            check_like("tensor_cov", self._covariance, x, (len(x), 6), "[P, 6]")
+
+    def load_from_sampling(
+        self, sampling_h5: str, n_grid: int = 100, grid_lim: float = 1.0, device: torch.device | str | None = None
+    ) -> None:
+        """Particles at rest of an HDF5 file with x [3, P] and particle_volume [1, P] (needs h5py)."""
+        import h5py
+
+        with h5py.File(sampling_h5, "r") as file:
+            x, volume = (torch.as_tensor(file[name][()], dtype=torch.float32) for name in ("x", "particle_volume"))
+        self.load_initial_data_from_torch(x.T.contiguous(), volume.reshape(-1), None, n_grid, grid_lim, device)
+
+    def set_parameters(self, device: torch.device | str | None = None, **kwargs: Any) -> None:
+        """`set_parameters_dict` of keywords."""
+        self.set_parameters_dict(kwargs)
+
+    def set_parameters_dict(
+        self, kwargs: Mapping[str, Any] | None = None, device: torch.device | str | None = None
+    ) -> None:
+        """Material and numbers of the simulation; what is not given stays as it was.
+
+        Args:
+            kwargs: material ("jelly", "metal", "sand", "foam", "plasticine", or a `torch_mpm.Material`), E [Pa], nu,
+                density [kg/m³], yield_stress [Pa] (numbers, or tensors [] or [P] that may require grad), hardening (1
+                for on), xi, friction_angle [degrees], softening, plastic_viscosity, g (three numbers [m/s²]),
+                rpic_damping, grid_v_damping_scale, n_grid, grid_lim, and additional_material_params: boxes with point,
+                size, E, nu and density. Other keys are kept and not used.
+
+        E and nu act from the next `finalize_mu_lam` on.
+        """
+        given = dict(kwargs or {})
+        state = self._flushed()
+        extra = given.pop("additional_material_params", [])
+        self.parameters.update(given)
+        if "g" in given and isinstance(given["g"], (int, float)):
+            raise TypeError(f"g must be three numbers, got {given['g']}")
+        for box in extra:
+            self._set_in_box(state, box)
+        if extra or "density" in given:
+            density = self._of_particles("density", self.parameters.get("density", 0.0), state)
+            self._state = state.replace(mass=density * state.volume)
+        if "yield_stress" in given and "yield_stress" in state.extra:
+            limit = self._of_particles("yield_stress", given["yield_stress"], state)
+            self._state = self._loaded().replace(extra={**state.extra, "yield_stress": limit})
+        scale = float(self.parameters.get("grid_v_damping_scale", 1.0))
+        self._damping, self._step = NodeDamping(scale) if scale < 1 else None, None
+
+    def _set_in_box(self, state: State, box: Mapping[str, Any]) -> None:
+        """E, nu and density of the particles in a box."""
+        inside = in_box(state.x, box["point"], box["size"])
+        for name in ("E", "nu", "density"):
+            before = self._of_particles(name, self.parameters.get(name, 0.0), state)
+            self.parameters[name] = torch.where(inside, self._of_particles(name, box[name], state), before)
+
+    def _of_particles(self, name: str, value: Any, state: State) -> Tensor:
+        value = torch.as_tensor(value, dtype=state.x.dtype, device=state.x.device)
+        if tuple(value.shape) not in ((), (1,), (len(state),)):
+            raise ValueError(
+                f"{name} must be a number, or have shape [] or [P] = [{len(state)}], got {shape_of(value)}"
+            )
+        return value.expand(len(state))
+
+    def finalize_mu_lam(self, device: torch.device | str | None = None) -> None:
+        """Make the material of E and nu as they are now."""
+        self._flushed()
+        self._law, self._step = law_of(self.parameters), None
+
+    def reset_densities_and_update_masses(
+        self, all_particle_densities: Tensor, device: torch.device | str | None = None
+    ) -> None:
+        """Density of each particle [P] [kg/m³]."""
+        self.set_parameters_dict({"density": all_particle_densities})
+
+    # ---- what acts on nodes and particles
+
+    def add_surface_collider(
+        self,
+        point: Numbers,
+        normal: Numbers,
+        surface: str = "sticky",
+        friction: float = 0.0,
+        start_time: float = 0.0,
+        end_time: float = FOREVER,
+    ) -> None:
+        """Stop the nodes behind a plane, whatever `surface` says: so does the simulator that this class stands for.
+
+        A surface that slips, separates or has friction is `add_boundary(torch_mpm.Plane(...))`. "cut" is that
+        simulator's own, with heights that are fixed.
+        """
+        if surface == "sticky" and friction != 0:
+            raise ValueError(f"friction must be 0 on sticky surfaces, got {friction}")
+        if surface == "cut":
+            self.add_boundary(Cut(point, normal, self._margin, start_time, end_time))
+            return
+        if surface != "sticky":
+            warnings.warn(
+                f"a surface collider stops the nodes behind it, as in PhysGaussian, also with surface={surface!r}: for "
+                "one that slips or separates call add_boundary(torch_mpm.Plane(point, normal, kind, friction))",
+                stacklevel=2,
+            )
+        self.add_boundary(stopping_plane(point, normal, self._margin, start_time, end_time))
+
+    def set_velocity_on_cuboid(
+        self,
+        point: Numbers,
+        size: Numbers,
+        velocity: Numbers,
+        start_time: float = 0.0,
+        end_time: float = FOREVER,
+        reset: int = 0,
+    ) -> None:
+        """Velocity of the nodes in a box of half edges `size`, which moves with it from `start_time` on.
+
+        With `reset` 1 all nodes of the grid are at rest before `start_time`, and for 15 steps after `end_time`.
+        """
+        self.add_boundary(moving_cuboid(point, size, velocity, self._margin, start_time, end_time))
+        if reset == 1:
+            self.add_boundary(FreezeOutside(start_time, end_time, RESET_STEPS))
+
+    def add_bounding_box(self, start_time: float = 0.0, end_time: float = FOREVER) -> None:
+        """Let nothing out of the domain: no node within 3 of a face moves outwards."""
+        n, dx = self.parameters["n_grid"], self._dx
+        for plane in outer_planes((PADDING - 1) * dx, (n - PADDING) * dx, 3, start_time, end_time):
+            self.add_boundary(plane)
+
+    def add_boundary(self, boundary: Any) -> None:
+        """Append anything with the interface of `torch_mpm.boundaries`."""
+        self._flush()
+        self._nodes.append(boundary)
+
+    def add_impulse_on_particles(
+        self,
+        force: Numbers,
+        dt: float,
+        point: Numbers = (1, 1, 1),
+        size: Numbers = (1, 1, 1),
+        num_dt: int = 1,
+        start_time: float = 0.0,
+        device: torch.device | str | None = None,
+    ) -> None:
+        """A force [N] on each particle that is now in a box of half edges `size`, for num_dt steps of dt."""
+        inside = in_box(self._flushed().x, point, size)
+        self._pushes.append(Push(force, start_time, start_time + dt * num_dt, inside))
+        self._step = None
+
+    def enforce_particle_velocity_translation(
+        self,
+        point: Numbers,
+        size: Numbers,
+        velocity: Numbers,
+        start_time: float,
+        end_time: float,
+        device: torch.device | str | None = None,
+    ) -> None:
+        """Velocity of the particles that are now in a box of half edges `size`."""
+        self._hold(Hold(velocity, start_time, end_time, in_box(self._flushed().x, point, size)))
+
+    def enforce_particle_velocity_rotation(
+        self,
+        point: Numbers,
+        normal: Numbers,
+        half_height_and_radius: Numbers,
+        rotation_scale: float,
+        translation_scale: float,
+        start_time: float,
+        end_time: float,
+        device: torch.device | str | None = None,
+    ) -> None:
+        """Turn the particles that are now in a cylinder about its axis, at −rotation_scale [rad/s] about `normal`, and
+        move them along it at translation_scale [m/s]."""
+        inside = in_cylinder(self._flushed().x, point, normal, half_height_and_radius)
+        self._hold(Rotation(point, normal, rotation_scale, translation_scale, start_time, end_time, inside))
+
+    def release_particles_sequentially(
+        self,
+        normal: Numbers,
+        start_position: float,
+        end_position: float,
+        num_layers: int,
+        start_time: float,
+        end_time: float,
+    ) -> None:
+        """Hold the particles between two positions on an axis at rest, and let them go layer by layer, those at
+        `end_position` last. There are 50 layers, whatever num_layers says: so does the simulator."""
+        x = self._flushed().x
+        self._hold(Hold((0.0, 0.0, 0.0), start_time, release_times(x, normal, start_position, end_position, end_time)))
+
+    def _hold(self, operation: Any) -> None:
+        self._holds.append(operation)
+        self._step = None
+
+    # ---- time
+
+    @property
+    def time(self) -> float:
+        """[s]"""
+        steps, dt, _ = self._queue
+        return self._start_time + steps * dt
+
+    @property
+    def _start_time(self) -> float:
+        return 0.0 if self._state is None else float(self._state.time)
+
+    def p2g2p(self, step: int, dt: float, device: torch.device | str | None = None) -> None:
+        """A substep of dt [s]; `step` is not used."""
+        check_number("dt", dt, "positive", lambda v: v > 0)
+        grad = torch.is_grad_enabled()
+        if self._queue[1:] != [dt, grad]:
+            self._flush()
+            self._check_ready()
+            self._queue[1:] = [dt, grad]
+        self._queue[0] += 1
+
+    def _check_ready(self) -> None:
+        self._loaded()
+        if self._law is None:
+            raise ValueError("the material is not known: call set_parameters_dict and finalize_mu_lam before p2g2p")
+        if "density" not in self.parameters:
+            raise ValueError("the particles have no mass: give density in set_parameters_dict")
+
+    def _flush(self) -> None:
+        """Take the substeps that were asked for."""
+        (steps, dt, grad), self._queue = self._queue, [0, 0.0, True]
+        if steps == 0:
+            return
+        with torch.set_grad_enabled(grad):
+            first = self._start_time
+            step = self._ready_step(first, first + (steps - 1) * dt, dt)
+            self._state = rollout(step, self._loaded(), steps, dt)
+
+    @property
+    def step(self) -> Step:
+        """The step of torch_mpm that the substeps take; `simulator.step.check()` tells what went wrong."""
+        self._flushed()
+        self._check_ready()
+        return self._ready_step(self._start_time, math.inf, 0.0)
+
+    def _ready_step(self, first: float, last: float, dt: float) -> Step:
+        """The step with what acts at times from `first` to `last`."""
+        acting = [b for b in self._nodes if _acts(b, first, last, dt)]
+        if self._damping is not None:
+            acting.insert(0, self._damping)
+        if self._step is None:
+            self._step, self._acting = self._made_step(), []
+        if acting != self._acting:
+            self._step.boundaries = self._acting = acting  # type: ignore[assignment]
+        return self._step
+
+    def _made_step(self) -> Step:
+        assert self._law is not None
+        gravity, damping = self.parameters.get("g"), float(self.parameters.get("rpic_damping", 0.0))
+        operations = [*self._pushes, *self._holds, *([DampedAffine(damping)] if damping != 0 else [])]
+        return Step(
+            Grid(self._dx, (0.0,) * 3, (float(self.parameters["grid_lim"]),) * 3),
+            self._law,
+            gravity=None if gravity is None else tuple(float(g) for g in gravity),
+            stress_form="gradient",
+            on_particles=Operations(operations) if operations else None,
+        )
+
+    @property
+    def _margin(self) -> float:
+        return surface_margin(self._loaded().x.dtype, float(self.parameters["grid_lim"]))
+
+    @property
+    def _dx(self) -> float:
+        return float(self.parameters["grid_lim"]) / int(self.parameters["n_grid"])
+
+
+def _acts(boundary: Any, first: float, last: float, dt: float) -> bool:
+    """Whether something on the nodes acts at a time from `first` to `last`."""
+    if isinstance(boundary, Obstacle):
+        return boundary.start <= last and first < boundary.end
+    return boundary.acts_within(first, last, dt) if isinstance(boundary, FreezeOutside) else True

@@ -1,0 +1,23 @@
+"""Configurations: objects with attributes, as those of OmegaConf, or mappings."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+_NEEDED = object()
+
+
+def setting(configuration: Any, name: str, default: Any = _NEEDED) -> Any:
+    """A value of a configuration.
+
+    Raises:
+        ValueError: where it is missing and has no default.
+    """
+    if isinstance(configuration, Mapping):
+        value = configuration.get(name, default)
+    else:
+        value = getattr(configuration, name, default)
+    if value is _NEEDED:
+        raise ValueError(f"the configuration must have {name}")
+    return value

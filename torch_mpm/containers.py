@@ -1,0 +1,67 @@
+"""A `State` where torch expects its own containers: as a pytree, in files and in the batches of a `DataLoader`."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.utils import _pytree
+from torch.utils.data._utils.collate import default_collate_fn_map
+
+from .state import State
+
+FIELDS = tuple(f.name for f in dataclasses.fields(State) if f.name not in ("extra", "time"))
+Layout = tuple[tuple[str, ...], tuple[str, ...], "float | None"]
+"""Names of the fields and of the entries of `extra` that are leaves, and the time where it is a number."""
+
+
+def _flatten(state: State) -> tuple[list[Any], Layout]:
+    """The tensors of a state are leaves, absent fields are not."""
+    names = tuple(name for name in FIELDS if getattr(state, name) is not None)
+    time = state.time
+    leaves = [getattr(state, name) for name in names] + list(state.extra.values())
+    number = None if isinstance(time, Tensor) else time
+    return (leaves if number is not None else [*leaves, time]), (names, tuple(state.extra), number)
+
+
+def _flatten_with_keys(state: State) -> tuple[list[tuple[Any, Any]], Layout]:
+    leaves, layout = _flatten(state)
+    names, extra, time = layout
+    keys = [*names, *(f"extra.{name}" for name in extra), *(["time"] if time is None else [])]
+    return [(_pytree.GetAttrKey(key), leaf) for key, leaf in zip(keys, leaves, strict=True)], layout
+
+
+def _unflatten(leaves: Any, layout: Layout) -> State:
+    """A state of any leaves, which a function of the tree may have made: nothing is checked."""
+    names, extra, time = layout
+    values = list(leaves)
+    state: State = object.__new__(State)
+    state.__dict__.update(dict.fromkeys(FIELDS))
+    state.__dict__.update(zip(names, values, strict=False))
+    state.extra = dict(zip(extra, values[len(names) :], strict=False))
+    if time is None:
+        state.__dict__["_time"] = values[-1]
+    else:
+        state.time = time
+    return state
+
+
+def _collate(batch: Sequence[State], *, collate_fn_map: dict[type, Callable[..., Any]] | None = None) -> State:
+    """States as the scenes of one batch."""
+    return State.concatenate(batch, scene=True)
+
+
+def register() -> None:
+    """Make `State` known to torch: its pytrees, `torch.load(weights_only=True)` and `default_collate`."""
+    _pytree.register_pytree_node(
+        State,
+        _flatten,
+        _unflatten,
+        serialized_type_name="torch_mpm.State",
+        flatten_with_keys_fn=_flatten_with_keys,
+    )
+    torch.serialization.add_safe_globals([State])
+    default_collate_fn_map[State] = _collate

@@ -1,0 +1,338 @@
+"""A batch as environments: scenes side by side, each with a clock of its own, and each of which may be replaced.
+
+    envs = mpm.Environments(step, [scene() for _ in range(1024)])    # step.grid.scenes = 1024
+    for k in range(steps):
+        paddle.position = policy(envs.observe("x"))                  # [B, D], read at the next call
+        envs.advance(20, dt=1e-4)
+        force = envs.forces()[paddle].linear                         # [B, D] [N], the mean over these 20 steps
+        envs.freeze()                                                # scenes that went wrong stand still from here on
+        envs.reset(envs.frozen | done(force))                        # bool [B] on the device: as they were at first
+
+The particles of scene b have the rows [b R, (b + 1) R) of the state. Those of them that a scene does not need are
+absent: their `scene` is -1, they take part in nothing, and cost little. So a scene may be replaced by one of another
+size where it stands, without a new allocation and without waiting for the device. The step may differ between scenes
+by parameters, gravity and poses of obstacles per scene [B], and by obstacles that are in one scene alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from .errors import check_count, shape_of
+from .graphs import looks_at_time
+from .impulses import Impulses
+from .rollouts import rollout
+from .state import PARTICLE_FIELDS, State, check_state
+from .step import Step
+
+ABSENT = -1
+"""`State.scene` of a particle that is not there (csrc/grid/activate.h)."""
+
+
+FROZEN = "frozen rows"
+"""Of a file: whether the scene of each row is frozen."""
+
+
+class Environments:
+    """B scenes in one state.
+
+    Args:
+        step: of a grid of B scenes.
+        states: that of each scene, B states of one scene each; they may differ in size, and have the fields that any
+            of them has. What they share with the caller is copied.
+        room: rows of each scene R; None for the largest number of particles of a state.
+
+    Attributes:
+        state: of all scenes, which may be replaced by one of as many particles, by another velocity say. Absent
+            particles have no volume, and a mass of one.
+        time: of each scene since it began [B] [s], float64.
+        frozen: scenes that stand still until they are reset, bool [B].
+
+    Without gradients: use `rollout` for these.
+
+    Raises:
+        TypeError, ValueError: for another number of states than the grid has scenes, or a state without room.
+    """
+
+    def __init__(self, step: Step, states: Sequence[State], room: int | None = None) -> None:
+        if not isinstance(step, Step):
+            raise TypeError(f"step must be a Step, got {shape_of(step)}")
+        if not isinstance(states, (list, tuple)) or len(states) != step.grid.scenes:
+            count = len(states) if isinstance(states, (list, tuple)) else shape_of(states)
+            raise ValueError(f"states must be a list of the {step.grid.scenes} scenes of the grid, got {count}")
+        if step.grid.scenes == 0:
+            raise ValueError("states must have at least one scene, got none")
+        for state in states:
+            check_state(state)
+        self.step = step
+        self.room = max(len(s) for s in states) if room is None else check_count("room", room)
+        self.first = self.pack(states)
+        """The scenes as `reset` makes them where it is given no others."""
+        self.state = self._placed(self.first.map(torch.clone))
+        device = self.state.x.device
+        self.time = torch.zeros(step.grid.scenes, dtype=torch.float64, device=device)
+        self.frozen = torch.zeros(step.grid.scenes, dtype=torch.bool, device=device)
+        self._before: tuple[Tensor, Tensor] | None = None
+
+    def __len__(self) -> int:
+        return self.step.grid.scenes
+
+    @torch.no_grad()
+    def pack(self, states: Sequence[State]) -> State:
+        """Scenes as `reset` takes them many times: n states of one scene each, R rows for each, `scene` 0 or -1.
+
+        Raises:
+            TypeError, ValueError: for a state of several scenes or without room, or of another dtype or device.
+        """
+        rows = []
+        for k, state in enumerate(states):
+            if len(state) > self.room:
+                raise ValueError(f"states[{k}] must have at most {self.room} particles, the room of a scene, "
+                                 f"got {len(state)}")  # fmt: skip
+            if isinstance(state.time, Tensor) and state.time.numel() > 1:
+                raise ValueError(f"states[{k}] must be of one scene, got {state.time.numel()}")
+            rows.append(_in_room(state.detach().replace(impulse=None, ids=None, time=0.0), self.room))
+        packed = State.concatenate(rows)
+        return self._with_fields(packed)
+
+    def _with_fields(self, state: State) -> State:
+        """All fields that a step makes, so that the fields of a scene are those of the others."""
+        present = state.scene
+        state = self.step.prepare(state.replace(scene=torch.zeros_like(present)))  # type: ignore[arg-type]
+        if state.C is None and (self.step.transfer == "apic" or self.step.law.viscous):
+            state = state.replace(C=torch.zeros_like(state.x[:, :, None].expand(-1, -1, state.x.shape[1])))
+        return state.replace(scene=present)
+
+    def _placed(self, packed: State, index: Tensor | None = None) -> State:
+        """Packed scenes with the number of each, or those of an index [n], as the scene of its particles."""
+        own = torch.arange(len(self), dtype=torch.int32, device=packed.x.device)
+        own = (own if index is None else own[index])[:, None].expand(-1, self.room).reshape(-1)
+        assert packed.scene is not None
+        return packed.replace(scene=torch.where(packed.scene == ABSENT, ABSENT, own))
+
+    # -- running
+
+    @torch.no_grad()
+    def advance(self, n: int, dt: float | Tensor) -> None:
+        """Take n steps of dt [s], a number or a tensor [B]; see `rollout`. Frozen scenes stand still."""
+        state = self.state
+        if any(looks_at_time(boundary) for boundary in self.step.boundaries):
+            state = state.replace(time=self.time.to(state.x.dtype))
+        elapsed = dt.double() if isinstance(dt, Tensor) else torch.full_like(self.time, dt)
+        elapsed = torch.where(self.frozen | ~(elapsed > 0), 0.0, n * elapsed)
+        impulse = state.impulse
+        self.state = rollout(self.step, state, n, dt).replace(time=0.0)
+        self.time = self.time + elapsed
+        self._before = None if impulse is None else (impulse, elapsed)
+
+    @property
+    def failed(self) -> Tensor:
+        """Scenes with any problem since they began, bool [B] on the device; see `Step.failures`."""
+        return self.step.failures(self.state).failed
+
+    @torch.no_grad()
+    def freeze(self, which: Any = None) -> None:
+        """Let scenes stand still until they are reset: those of a bool [B] or of indices; None for all that failed.
+
+        Their particles take part in nothing and cost little. They keep their positions and deformations, and lose
+        their velocities.
+        """
+        self.frozen = self.frozen | (self.failed if which is None else self._mask(which))
+        scene = self._rows(self.state.scene)
+        scene.masked_fill_(self.frozen[:, None], ABSENT)
+
+    @torch.no_grad()
+    def reset(self, which: Any, states: State | Sequence[State] | None = None) -> None:
+        """Replace scenes by others, where they stand; the rest stays as it is, bit by bit. Clocks begin anew.
+
+        Args:
+            which: bool [B], which may be on the device, or indices of scenes.
+            states: None for those of the beginning. A list, or what `pack` has made of one, of a state for each index
+                in turn; with a mask, of one for each of the B scenes, of which those of the mask are taken.
+
+        Raises:
+            TypeError, ValueError: for states without room, or another number of them.
+        """
+        mask = self._mask(which)
+        index = None if _is_mask(which) else self._index(which)
+        given = self.first if states is None else states if isinstance(states, State) else self.pack(states)
+        if index is not None and states is None:
+            given = given.select(_rows_of(index, self.room))
+        count = len(self) if index is None else len(index)
+        if len(given) != count * self.room:
+            raise ValueError(f"states must be {count}, one for each scene to reset, got {len(given) // self.room}")
+        for _, old, new in _pairs(self.state, self._placed(given, index)):
+            rows = self._rows(old)
+            if index is None:
+                torch.where(mask.reshape(-1, *(1,) * (rows.dim() - 1)), self._rows(new), rows, out=rows)
+            else:
+                rows.index_copy_(0, index, self._rows(new))
+        self._begin_anew(mask)
+
+    def _begin_anew(self, mask: Tensor) -> None:
+        """Clocks, impulses and records of scenes."""
+        self.time = torch.where(mask, 0.0, self.time)
+        self.frozen = self.frozen & ~mask
+        if self.state.impulse is not None:
+            self.state.impulse.masked_fill_(mask[:, None, None], 0.0)
+        if self._before is not None:
+            before, elapsed = self._before
+            self._before = torch.where(mask[:, None, None], 0.0, before), torch.where(mask, 0.0, elapsed)
+        self.step.forget_failures(mask)
+
+    def _mask(self, which: Any) -> Tensor:
+        """bool [B]."""
+        if _is_mask(which):
+            if which.shape != self.time.shape:
+                raise ValueError(f"a mask of scenes must have shape [B] = [{len(self)}], got {shape_of(which)}")
+            return which
+        return torch.zeros_like(self.frozen).index_fill_(0, self._index(which), True)
+
+    def _index(self, which: Any) -> Tensor:
+        """Scenes, int64 [n]; numbers go to a device without waiting for it."""
+        if not isinstance(which, Tensor):
+            which = torch.tensor(which, dtype=torch.int64)
+            if which.numel() and not (0 <= int(which.min()) and int(which.max()) < len(self)):
+                raise ValueError(f"scenes must be from 0 to {len(self) - 1}, got {which.tolist()}")
+        return which.reshape(-1).to(self.time.device, torch.int64, non_blocking=True)
+
+    # -- looking
+
+    def _rows(self, value: Any) -> Tensor:
+        """A field [n R, ...] as [n, R, ...]."""
+        rows: Tensor = value.unflatten(0, (-1, self.room))
+        return rows
+
+    @property
+    def present(self) -> Tensor:
+        """Which rows are particles that are there, bool [B, R]; none of a frozen scene."""
+        return self._rows(self.state.scene) != ABSENT
+
+    def observe(self, name: str, padded: bool = True) -> Tensor:
+        """A field of the particles, of `State` or `state.extra`.
+
+        Args:
+            name: of the field.
+            padded: [B, R, ...] with zero for absent particles, see `present`; or packed [P, ...], scene after scene,
+                which waits for the device.
+
+        Raises:
+            ValueError: where there is no such field.
+        """
+        value = self.state.extra.get(name, getattr(self.state, name, None) if name in PARTICLE_FIELDS else None)
+        if value is None:
+            raise ValueError(f"name must be that of a field of the particles, got {name!r}")
+        if not padded:
+            return value[self.present.reshape(-1)]
+        rows = self._rows(value)
+        return torch.where(self.present.reshape(*rows.shape[:2], *(1,) * (rows.dim() - 2)), rows, 0)
+
+    def count_impulses(self) -> None:
+        """From here on count the impulses of the material on boundaries and walls; see `torch_mpm.impulses`."""
+        self.state = self.step.with_impulses(self.state)
+
+    def forces(self) -> Impulses:
+        """Mean force [N] and torque [N m] on boundaries and walls over the latest `advance`; zero in frozen scenes.
+
+        Raises:
+            ValueError: where impulses are not counted, or nothing has been advanced since they are.
+        """
+        if self._before is None:
+            raise ValueError("impulses must be counted (count_impulses) when scenes are advanced, got none")
+        before, elapsed = self._before
+        rate = torch.where(elapsed > 0, 1 / elapsed, 0.0)[:, None, None]
+        change = self.step.impulses(self.state).values - before
+        return Impulses(torch.where(rate > 0, rate * change, 0.0), tuple(self.step.boundaries.entries))
+
+    def scene(self, k: int) -> State:
+        """A copy of one scene, without its absent particles; waits for the device."""
+        if not isinstance(k, int) or not 0 <= k < len(self):
+            raise ValueError(f"k must be a scene from 0 to {len(self) - 1}, got {k!r}")
+        rows = torch.arange(k * self.room, (k + 1) * self.room, device=self.time.device)
+        rows = rows[self.state.volume[rows] != 0]
+        impulse = None if self.state.impulse is None else self.state.impulse[k : k + 1].clone()
+        one = self.state.replace(impulse=None).select(rows)
+        return one.replace(scene=None, time=float(self.time[k]), impulse=impulse)
+
+    # -- files
+
+    def save(self, path: str | Path, k: int | None = None) -> None:
+        """All scenes, or scene k alone, in an HDF5 file with checksums; needs h5py."""
+        from .scene.checkpoint import save, tensors_of
+
+        if k is None:
+            clocks = {"time": self.time, f"extra.{FROZEN}": self.frozen.int().repeat_interleave(self.room)}
+            tensors, record = tensors_of(self.state) | clocks, {"time": 0.0}
+        else:
+            one = self.scene(k)
+            tensors, record = tensors_of(one), {"time": float(one.time)}
+        save(Path(path), {name: t.cpu() for name, t in tensors.items()}, record)
+
+    @torch.no_grad()
+    def load(self, path: str | Path, k: int | None = None) -> None:
+        """What `save` wrote: all scenes, of as many rows; or one, which takes the place of scene k.
+
+        Raises:
+            DamagedFileError: for a file that is damaged or holds something else.
+            ValueError: for another number of particles or other fields.
+        """
+        from .scene.checkpoint import load
+
+        state, _ = load(Path(path), self.time.device, "save the environments anew")
+        frozen = state.extra.pop(FROZEN, None)
+        if k is not None:
+            if frozen is not None:
+                raise ValueError(f"{path} must hold one scene, got all scenes of a batch")
+            self.reset([k], [state])
+            self.time[k] = state.time
+            if state.impulse is not None and self.state.impulse is not None:
+                self.state.impulse[k] = state.impulse[0]
+            return
+        if frozen is None or len(state) != len(self.state):
+            raise ValueError(f"{path} must hold {len(self)} scenes of {self.room} particles, got {len(state)}")
+        _pairs(self.state, state)
+        self.time, self.frozen = torch.as_tensor(state.time), self._rows(frozen)[:, 0] != 0
+        self.state, self._before = state.replace(time=0.0), None
+        self.step.forget_failures(torch.ones_like(self.frozen))
+
+
+def _is_mask(which: Any) -> bool:
+    return isinstance(which, Tensor) and which.dtype == torch.bool
+
+
+def _in_room(state: State, room: int) -> State:
+    """With absent particles at the end, which stand where the first one does."""
+    count = len(state)
+    if count == 0:
+        raise ValueError("states must have at least one particle each, got none")
+    rows = torch.arange(room, device=state.x.device)
+    there = rows < count
+    padded = state.select(torch.where(there, rows, 0))
+    return padded.replace(
+        v=torch.where(there[:, None], padded.v, 0.0),
+        volume=torch.where(there, padded.volume, 0.0),
+        mass=torch.where(there, padded.mass, 1.0),
+        scene=torch.where(there, 0, ABSENT).int(),
+    )
+
+
+def _pairs(state: State, given: State) -> list[tuple[str, Tensor, Tensor]]:
+    """The fields of two states of the same kind by name."""
+    if (given.x.dtype, given.x.device) != (state.x.dtype, state.x.device):
+        raise ValueError(f"states must be {state.x.dtype} on {state.x.device}, got {given.x.dtype} on {given.x.device}")
+    old, new = ({name: getattr(s, name) for name in PARTICLE_FIELDS} | s.extra for s in (state, given))
+    for name in dict.fromkeys([*old, *new]):
+        if (old.get(name) is None) != (new.get(name) is None):
+            which = "have no" if new.get(name) is None else "must have no"
+            raise ValueError(f"states {which} {name}, unlike those of the other scenes")
+    return [(name, value, new[name]) for name, value in old.items() if value is not None]
+
+
+def _rows_of(index: Tensor, room: int) -> Tensor:
+    """The rows of scenes [n] as one index [n R]."""
+    return (index[:, None] * room + torch.arange(room, device=index.device)).reshape(-1)
