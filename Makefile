@@ -48,6 +48,9 @@ format: $(STAMP)
 demo: libraries
 	rm -rf out/demo
 	$(PY) -m torch_mpm run examples/demo.toml -o out/demo
+	rm -rf out/demo_dataset
+	$(PY) -m torch_mpm generate examples/datasets/demo.toml -o out/demo_dataset
+	$(PY) -m torch_mpm finalize out/demo_dataset
 
 # Each scene in a folder of its own. A scene that is done is skipped, an unfinished one goes on.
 examples: $(patsubst examples/%.toml,out/%/trajectory.h5,$(wildcard examples/*.toml))

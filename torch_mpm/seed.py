@@ -44,10 +44,18 @@ _POISSON_TRIALS = 12
 HOST = torch.device("cpu")
 """Shapes and points are made here, whatever torch's default device, and moved when they are whole."""
 
+
+def on_host() -> Any:
+    """A context in which tensors are made on the CPU; none where they are anyway, as it would slow down each call."""
+    return contextlib.nullcontext() if torch.get_default_device() == HOST else HOST
+
+
 MOST = 2**31 - 1
 """Particles that can be numbered."""
 CELL_BYTES = 150
 """Memory per point of a lattice, or per cell of a Poisson-disk sample, while a shape is filled."""
+FEW_BYTES = 2**26
+"""Memory that is there without asking how much there is."""
 CHUNK = 2**18
 """Points that a shape is asked for at once."""
 
@@ -182,7 +190,7 @@ def fill(
     check_dtype(dtype)
     check_device(device)
     dtype, device = dtype or default_dtype(), torch.get_default_device() if device is None else device
-    with HOST:
+    with on_host():
         if count is None:
             x = _points_in(shape, _spacing(grid, per_cell, len(shape.lower)), method, seed)
         else:
@@ -249,7 +257,7 @@ def _check_size(shape: Region, spacing: float, method: str) -> None:
         cells *= (_POISSON_SPACING[len(sides)] * math.sqrt(len(sides))) ** len(sides)
     if points > MOST:
         room = f"{MOST} can be numbered"
-    elif cells * CELL_BYTES > (free := memory.available()):
+    elif cells * CELL_BYTES > FEW_BYTES and cells * CELL_BYTES > (free := memory.available()):
         room = f"filling it takes {cells * CELL_BYTES / 1e9:.3g} GB, and {free / 1e9:.3g} GB are free"
     else:
         return
@@ -356,7 +364,7 @@ def file(
     """
     check_dtype(dtype)
     check_device(device)
-    with HOST:
+    with on_host():
         x, volumes = _read_points(Path(path))
     if x.dim() != 2 or x.shape[1] not in (2, 3) or len(x) == 0:
         raise ValueError(f"points in {path} must have shape [P, 2] or [P, 3] with P > 0, got {list(x.shape)}")

@@ -211,6 +211,12 @@ def test_random_rollouts_program(tmp_path: Path) -> None:
     assert not any(row["inverted"] or row["flattened"] or row["not finite"] for row in rows)
 
 
+def test_data_sets_program(tmp_path: Path) -> None:
+    run_quick("benchmarks.datasets", tmp_path, "--only", "Water", "--work", str(tmp_path))
+    (row,) = result(tmp_path, "datasets_*.json")["sets"]
+    assert row["valid"] == 4 and row["complete"] and row["bytes"] > 0 and row["frames"] == 4
+
+
 def test_svd_program(tmp_path: Path) -> None:
     run_quick("benchmarks.accuracy.svd", tmp_path)
     for row in result(tmp_path, "svd_accuracy.json")["rows"]:

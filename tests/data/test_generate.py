@@ -62,6 +62,8 @@ def test_what_is_in_a_data_set(whole):
             assert np.abs(centre - expected).max() < 0.03 * np.abs(expected - centre[0]).max() + 1e-3
         assert arrays["mass"].sum() == pytest.approx(1000 * arrays["volume"].sum())
         assert set(arrays["particle_type"]) == {7} and arrays["position"].dtype == np.float32
+        (jelly,) = json.loads(attributes["materials"])
+        assert jelly["name"] == "jelly" and (arrays["E"] == np.float32(jelly["E"])).all() and "nu" not in arrays
         assert json.loads(attributes["scene"])["duration"] == pytest.approx(0.055)
 
 
@@ -74,21 +76,38 @@ def test_one_and_three_processes_make_the_same(whole, tmp_path):
     assert finalize(tmp_path / "set") == finalize(whole)
 
 
+def test_each_device_makes_the_same_again(device, tmp_path):
+    """To the last bit on one device, and to rounding on the other."""
+    changes = {"grid__deterministic": True, "dataset__fields": ["velocity", "F", "stress"]}
+    for name in ("one", "other"):
+        assert generate(configuration(**changes), tmp_path / name, device=device)["failed"] == 0
+    record_path(shard_path(tmp_path / "other", 1)).unlink()
+    assert generate(configuration(**changes), tmp_path / "other", device=device)["scenes"] == 2
+    assert_same(tmp_path / "one", tmp_path / "other")
+    generate(configuration(**changes), tmp_path / "cpu", device="cpu")
+    reference = decoded(tmp_path / "cpu")
+    for name, (arrays, attributes) in decoded(tmp_path / "one").items():
+        assert attributes["dt"] == reference[name][1]["dt"]
+        for key in ("position", "velocity", "F"):
+            error = np.abs(arrays[key] - reference[name][0][key]).max() / np.abs(reference[name][0][key]).max()
+            assert error < 1e-4, (name, key, error)
+
+
 @pytest.mark.parametrize("kills", [5, pytest.param(20, marks=pytest.mark.slow)])
 def test_a_data_set_that_is_killed_and_resumed_is_the_same(tmp_path, kills):
-    changes = {"dataset__splits": {"train": 3 * kills}, "dataset__scenes_per_shard": 1}
+    changes = {"dataset__splits": {"train": 8 * kills}, "dataset__scenes_per_shard": 1}
     generate(configuration(**changes), tmp_path / "whole", device="cpu")
     rng, survived = random.Random(kills), 0
     for _ in range(kills):
         process = start(tmp_path / "set", **changes)
-        process.join(rng.uniform(0.05, 0.7))
+        process.join(rng.uniform(0.1, 0.4))
         survived += process.exitcode is None
         process.kill()
         process.join()
         if (tmp_path / "set" / "dataset.json").exists():
             seen = DatasetFolder(tmp_path / "set")
             assert all(seen.scene(s.id)["position"].shape[0] == 12 for s in seen.scenes())  # nothing unfinished
-    assert survived
+    assert survived >= kills // 3  # a fast machine is done before the last kill
     generate(configuration(**changes), tmp_path / "set", device="cpu")
     assert_same(tmp_path / "whole", tmp_path / "set")
     assert list(verify(tmp_path / "set")) == [] and not list((tmp_path / "set" / "shards").glob(".*"))

@@ -11,6 +11,7 @@ from typing import Any
 import torch
 from pydantic import PrivateAttr, ValidationError
 
+from ..seed import on_host
 from . import check, partial, schema
 from .build import Built, build
 from .entry import ResolvedEntry
@@ -167,7 +168,7 @@ class Scene(schema.SceneData):
                 than memory holds, ...
         """
         try:
-            with torch.device("cpu"):  # where a scene is put together, whatever torch's default device
+            with on_host():  # where a scene is put together, whatever torch's default device
                 return build(self, self.torch_device() if device is None else torch.device(device))
         except SceneError as error:
             raise SceneError(error.problems, self.source) from None

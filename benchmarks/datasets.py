@@ -1,0 +1,176 @@
+"""Time of generating data sets, files included, and how busy the device is meanwhile.
+
+    python -m benchmarks.datasets                      # CPU: some scenes of the presets
+    python -m benchmarks.datasets --device cuda        # also the size of DeepMind's Sand set: 1000 scenes of 2000
+                                                       # particles, 320 frames of 2.5 ms and the first
+    python -m benchmarks.datasets --out DIRECTORY --work FOLDER
+
+Each data set is generated in a process of its own, from the start of Python to the last byte on the disk of FOLDER. The
+share of time in which the GPU runs a kernel is what nvidia-smi samples every 100 ms between the first and the last
+frame (its utilization), where there is nvidia-smi.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from . import common, regressions
+
+SAND = ["dataset.splits={train=1000}", "dataset.particles=2000"]
+SETS: dict[str, list[tuple[str, str, list[str]]]] = {
+    "cuda": [
+        ("Sand, 1000 x 2000", "sand", SAND),
+        ("Sand, 1000 x 2000, not deterministic", "sand", [*SAND, "grid.deterministic=false"]),
+        ("Sand, 1000 x 2000, 125 a shard", "sand", [*SAND, "dataset.scenes_per_shard=125"]),
+        ("Water, 3-D, 64 scenes", "water_3d", ["dataset.splits={train=64}", "dataset.scenes_per_shard=32"]),
+        ("Melting, 128 scenes", "melting", ["dataset.splits={train=128}"]),
+    ],
+    "cpu": [
+        ("Water drop, 32 scenes", "water_drop", ["dataset.splits={train=32}", "dataset.scenes_per_shard=16",
+                                                 "dataset.frames=101"]),
+        ("Sand, 32 x 2000", "sand", ["dataset.splits={train=32}", "dataset.particles=2000",
+                                     "dataset.scenes_per_shard=16", "dataset.frames=101"]),
+    ],
+}  # fmt: skip
+"""Name, preset and overrides of the data sets by device."""
+QUICK = ["dataset.splits={train=4}", "dataset.scenes_per_shard=2", "dataset.frames=4"]
+
+
+def generate(preset: str, overrides: list[str], device: str, folder: Path) -> dict[str, Any]:
+    """Generate a data set in this process; what the others read from its output."""
+    from torch_mpm.data.configuration import Configuration
+    from torch_mpm.data.folder import DatasetFolder
+    from torch_mpm.data.generate import generate
+
+    marks: list[float] = []
+
+    def progress(figures: dict[str, Any]) -> None:
+        marks[1:] = [time.time()]
+
+    configuration = Configuration.preset(preset, overrides)
+    summary = generate(configuration, folder, device=device, progress=progress)
+    dataset = DatasetFolder(folder)
+    scenes = dataset.scenes()
+    substeps = [dataset.scene(s.id).attributes["substeps_per_frame"] for s in scenes[:: max(1, len(scenes) // 8)]]
+    return {
+        **summary,
+        "between": marks,
+        "valid": len(scenes),
+        "again": sum(s.attempts > 1 for s in dataset.attempted()),
+        "particles": sum(s.particles for s in scenes),
+        "frames": dataset.record.frames,
+        "substeps": sum(substeps) / max(len(substeps), 1),
+        "bytes": sum(p.stat().st_size for p in (folder / "shards").glob("*.h5")),
+    }
+
+
+def measured(name: str, preset: str, overrides: list[str], device: str, work: Path) -> dict[str, Any]:
+    """One data set in a process of its own."""
+    folder = work / "set"
+    shutil.rmtree(folder, ignore_errors=True)
+    words = ["--one", json.dumps([preset, overrides, device, str(folder)])]
+    sampler = _sampler() if device == "cuda" else None
+    begin = time.perf_counter()
+    done = subprocess.run([sys.executable, "-m", "benchmarks.datasets", *words], cwd=common.ROOT, capture_output=True,
+                          text=True)  # fmt: skip
+    seconds = time.perf_counter() - begin
+    samples = _samples(sampler)
+    if done.returncode:
+        raise RuntimeError(f"{name}: {done.stderr}")
+    row = json.loads(done.stdout.splitlines()[-1])
+    first, last = row.pop("between")
+    busy = [value for when, value in samples if first <= when <= last]
+    shutil.rmtree(folder)
+    return {"name": name, **row, "process": seconds, "busy": sum(busy) / len(busy) / 100 if busy else None}
+
+
+def _sampler() -> subprocess.Popen[str] | None:
+    """nvidia-smi, which tells its utilization every 100 ms."""
+    query = ["nvidia-smi", "--query-gpu=timestamp,utilization.gpu", "--format=csv,noheader,nounits", "-lms", "100"]
+    try:
+        return subprocess.Popen([*query, "-i", "0"], stdout=subprocess.PIPE, text=True)
+    except OSError:
+        return None
+
+
+def _samples(sampler: subprocess.Popen[str] | None) -> list[tuple[float, float]]:
+    """(time, percent) of all samples."""
+    if sampler is None:
+        return []
+    sampler.terminate()
+    found = []
+    for line in sampler.communicate()[0].splitlines():
+        when, _, value = line.partition(",")
+        try:
+            moment = time.mktime(time.strptime(when.strip().partition(".")[0], "%Y/%m/%d %H:%M:%S"))
+            found.append((moment + float("0." + when.strip().partition(".")[2]), float(value)))
+        except ValueError:
+            continue  # a line that was cut off, or a device that does not tell
+    return found
+
+
+HEADER = (
+    "data set", "scenes", "tried again", "particles a scene", "frames", "substeps a frame", "s", "with start of Python",
+    "simulating, s", "waiting, s", "scenes/s", "M particle steps/s", "GPU busy", "GB",
+)  # fmt: skip
+
+
+def row_of(r: dict[str, Any]) -> tuple[Any, ...]:
+    steps = r["particles"] * (r["frames"] - 1) * r["substeps"]
+    scenes = max(r["valid"], 1)
+    return (
+        r["name"], r["valid"], r["again"], r["particles"] // scenes, r["frames"], r["substeps"], r["seconds"],
+        r["process"], r["simulating"], r["waiting"], r["valid"] / r["seconds"], steps / r["seconds"] * 1e-6, r["busy"],
+        r["bytes"] * 1e-9,
+    )  # fmt: skip
+
+
+def text(result: dict[str, Any]) -> str:
+    """The table of a result in Markdown."""
+    rows = [row_of(r) for r in result["sets"]]
+    lines = ["# Generating data sets", "", common.describe(result["environment"]), "", common.table(HEADER, rows), ""]
+    return "\n".join([*lines, "Simulating: time in which the host simulates; waiting: for scenes or files, beside it."])
+
+
+def timed(result: dict[str, Any]) -> Iterator[tuple[str, float]]:
+    """Milliseconds per scene, for `regressions`."""
+    for r in result["sets"]:
+        yield r["name"], 1e3 * r["seconds"] / max(r["valid"], 1)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--device", default="cpu", choices=["cpu", "cuda"])
+    parser.add_argument("--quick", action="store_true", help="small sets, to see that it works")
+    parser.add_argument("--out", type=Path, default=common.RESULTS)
+    parser.add_argument("--work", type=Path, help="where the data sets are written; by default a temporary folder")
+    parser.add_argument("--only", default="", metavar="TEXT", help="data sets whose name has this text")
+    parser.add_argument("--one", help=argparse.SUPPRESS)
+    arguments = parser.parse_args()
+    if arguments.one:
+        preset, overrides, device, folder = json.loads(arguments.one)
+        print(json.dumps(generate(preset, overrides, device, Path(folder))))
+        return
+    result: dict[str, Any] = {"environment": common.environment(arguments.device), "sets": []}
+    with tempfile.TemporaryDirectory(dir=arguments.work) as work:
+        for name, preset, overrides in SETS[arguments.device]:
+            if arguments.only in name:
+                more = QUICK if arguments.quick else []
+                result["sets"].append(measured(name, preset, [*overrides, *more], arguments.device, Path(work)))
+                print(common.table(HEADER, [row_of(result["sets"][-1])]), flush=True)
+    name = f"datasets_{common.slug(result['environment']['device'])}"
+    regressions.show(name, result, timed)
+    common.write(arguments.out, name, result, text(result))
+
+
+if __name__ == "__main__":
+    main()
