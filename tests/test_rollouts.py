@@ -36,21 +36,21 @@ def assert_equal(a: mpm.State, b: mpm.State, text: str = "", exactly: bool = Tru
     assert left.keys() == right.keys()
     for name, value in left.items():
         if value.is_cuda and value.dtype == torch.float32:
-            assert_close(value, right[name], f"{name} {text}", most=0.3 if name in a.extra else 3e-2)
+            assert_close(value, right[name], f"{name} {text}", share=0.99 if name in a.extra else 1.0)
         elif value.is_floating_point() and (value.is_cuda or not exactly):
             scale = right[name].abs().max().clamp_min(1e-9)
-            assert float((value - right[name]).abs().max() / scale) < TOLERANCE["rollout"][value.dtype], name
+            assert float((value - right[name]).abs().max() / scale) < TOLERANCE["rollout"][a.x.dtype], name
         else:
             assert torch.equal(value, right[name]), f"{name} {text}"
 
 
-def assert_close(value: Tensor, expected: Tensor, name: str, most: float) -> None:
-    """Strains are small differences of numbers near one: rounding may take a few particles to another branch, and
-    histories add up what came of it."""
+def assert_close(value: Tensor, expected: Tensor, name: str, share: float) -> None:
+    """Strains are small differences of numbers near one: rounding may take a few particles to another branch. Histories
+    add up what came of it, so of these a share of the particles is looked at."""
     error = ((value - expected).abs().flatten(1) if value.dim() > 1 else (value - expected).abs()[:, None]).amax(1)
     scale = float(expected.abs().max().clamp_min(1e-2))
     assert float(error.quantile(0.95)) < 1e-3 * scale, f"{name}: most particles"
-    assert float(error.max()) < most * scale, f"{name}: all particles"
+    assert float(error.quantile(share)) < 3e-2 * scale, f"{name}: {share:.0%} of the particles"
 
 
 def blob(device: str, dim: int = 3, count: int = 300, dtype: torch.dtype = F64, **fields) -> mpm.State:

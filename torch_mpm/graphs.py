@@ -110,6 +110,8 @@ def replayed(step: Step, state: State, n: int, dt: float) -> State:
     The first step from Python makes what steps keep, and asks about these tensors what would be a wait in the graph.
     """
     time = time_after(state.time, dt, n)
+    if n > LEAST_STEPS:  # what begins later is made now, too: in a graph, nobody knows what time it is
+        state = state.replace(time=_time_tensor(state))
     if n > 0:
         state, n = step(state, dt), n - 1
     graph: _Replays | None = None

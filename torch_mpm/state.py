@@ -174,12 +174,11 @@ class State:
         """Move to a device, and floating tensors to a dtype."""
         check_device(device)
         check_dtype(dtype)
-        state = self.map(lambda t: t.to(device=device, dtype=dtype if t.is_floating_point() else None))
+        state = self.replace(impulse=None)  # which is on the device of x, and in float64
+        state = state.map(lambda t: t.to(device=device, dtype=dtype if t.is_floating_point() else None))
         if isinstance(self.time, Tensor):
             state.time = self.time.to(device=device, dtype=dtype)
-        if self.impulse is not None:
-            state.impulse = self.impulse.to(device)
-        return state
+        return state if self.impulse is None else state.replace(impulse=self.impulse.to(state.x.device))
 
     def detach(self) -> State:
         """The same values outside the autograd graph."""

@@ -101,8 +101,11 @@ def test_forward_simulator_keeps_its_state(device):
         state.from_torch(stress=law(state.particle.F).detach())
         after = sim.MPMForwardSim(model)(statics, state)
         x, v, C, F = sim.MPMDiffSim(model)(statics, x, v, C, F, law(F).detach())
-    assert all(torch.equal(a, b) for a, b in zip(after, (x, v, C, F), strict=True))
-    assert torch.equal(state.particle.x, x) and not after[0].requires_grad and x.dtype == torch.float32
+    assert torch.equal(state.particle.x, after[0])
+    noise = 0 if device == "cpu" else 1e-5  # sums on CUDA have no order
+    for a, b in zip(after, (x, v, C, F), strict=True):
+        torch.testing.assert_close(a, b, rtol=noise, atol=noise * float(b.abs().max()))
+    assert not after[0].requires_grad and x.dtype == torch.float32
     assert len(own.x) == len(x)
 
 

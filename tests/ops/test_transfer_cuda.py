@@ -58,7 +58,7 @@ def test_first_problem_stays_in_the_status(dim, kernel):
     assert status[1:5] == problem and status[5:7] == [3, 1] and status[0] > 0 and status[7] == 0
 
 
-@pytest.mark.parametrize("scene_value", [-1, 2, 2**31 - 1, -(2**31)])
+@pytest.mark.parametrize("scene_value", [-2, 2, 2**31 - 1, -(2**31)])
 def test_a_scene_that_does_not_exist_is_outside(dim, kernel, scene_value):
     p = uneven_particles(dim, kernel).to("cuda", torch.float32)
     scene = torch.full_like(p.scene, scene_value)
