@@ -300,49 +300,73 @@ MPM_HD Vector<T, D> mirrors_adjoint(const Walls<T, D>& walls, const Vector<int, 
   return impulses.take(momentum, gravity, v, grad);
 }
 
+// Adjoint of the velocity that a node and its images share, reflected, from those of their velocities after the walls.
+template <class T, int D>
+MPM_HD Vector<T, D> shared_adjoint(const GridUpdateBackwardArguments<T, D>& b, const SlotUpdate<T, D>& s, int local,
+                                   const Vector<T, D>& free, Vector<T, D> grad) {
+  if (s.mirrored) {
+    grad = zero_vector<T, D>();
+    for_images(b.forward, s, local, [&](int64_t member, const Vector<T, D>& sign, const Vector<int, D>&) {
+      MPM_UNROLL for (int i = 0; i < D; i++)
+        grad[i] += sign[i] * b.grad_updated[member].value[i];
+    });
+  }
+  NoImpulses none;
+  return s.walled ? walls_adjoint(b.forward.walls, lattice_node<D>(s.corner, local), free, grad, none) : grad;
+}
+
+// The same with those of impulses, which differ from image to image; `own` becomes what the node's own row gets of
+// them.
+template <class T, int D, class ImpulsesOf>
+MPM_HD Vector<T, D> shared_adjoint(const GridUpdateBackwardArguments<T, D>& b, const SlotUpdate<T, D>& s, int local,
+                                   int64_t index, const Vector<T, D>& free, ImpulsesOf&& impulses, NodeRow<T, D>& own) {
+  const GridUpdateArguments<T, D>& a = b.forward;
+  Vector<T, D> sum = zero_vector<T, D>();
+  bool itself = true;  // the node comes first, which may be its own image, too
+  const auto add_member = [&](int64_t member, const Vector<T, D>& sign, const Vector<int, D>& node) {
+    auto on_boundaries = impulses(s.scene, member);
+    Vector<T, D> grad = b.grad_updated[member].value, v, direct = zero_vector<T, D>();
+    MPM_UNROLL for (int i = 0; i < D; i++)
+      v[i] = sign[i] * free[i];
+    grad = walls_adjoint(a.walls, node, v, grad, on_boundaries);
+    if (s.mirrored) grad = mirrors_adjoint(a.walls, node, s.gravity, v, grad, on_boundaries, direct);
+    if (itself) own = {on_boundaries.mass_grad, direct};
+    itself = false;
+    MPM_UNROLL for (int i = 0; i < D; i++)
+      sum[i] += sign[i] * grad[i];
+  };
+  Vector<T, D> upright;
+  MPM_UNROLL for (int i = 0; i < D; i++)
+    upright[i] = T(1);
+  if (s.mirrored)
+    for_images(a, s, local, add_member);
+  else
+    add_member(index, upright, lattice_node<D>(s.corner, local));
+  return sum;
+}
+
 // Adjoint of row `index`; `change` becomes that of the velocity change by gravity. A node and its images depend on the
 // same sum, so the adjoint of the sum is that of all of them, reflected. `impulses(scene, row)` are `NodeImpulses` of a
 // row, or `NoImpulses`.
 template <class T, int D, class ImpulsesOf>
 MPM_HD NodeRow<T, D> update_node_backward(const GridUpdateBackwardArguments<T, D>& b, const SlotUpdate<T, D>& s,
                                           int local, int64_t index, Vector<T, D>& change, ImpulsesOf&& impulses) {
+  constexpr bool with_impulses = decltype(impulses(0, index))::wanted;
   const GridUpdateArguments<T, D>& a = b.forward;
-  const NodeRow<T, D> row = a.nodes[index];
-  NodeRow<T, D> result{b.grad_updated[index].mass, zero_vector<T, D>()};
+  const NodeRow<T, D> row = a.nodes[index], grad = b.grad_updated[index];
   change = zero_vector<T, D>();
   if (!s.active) return {T(0), change};
   const NodeRow<T, D> free = free_node(a, s, local, row);
-  if (free.mass == T(0)) return result;
-  Vector<T, D> sum = zero_vector<T, D>();  // adjoint of the free velocity
-  // Of a node that has the free velocity, reflected by `sign`: first the node itself, which may be its own image, too.
-  bool itself = true;
-  const auto add_member = [&](int64_t member, const Vector<T, D>& sign, const Vector<int, D>& node) {
-    auto own = impulses(s.scene, member);
-    Vector<T, D> grad = b.grad_updated[member].value, v, direct;
-    MPM_UNROLL for (int i = 0; i < D; i++)
-      v[i] = sign[i] * free.value[i];
-    if (s.walled || s.mirrored) grad = walls_adjoint(a.walls, node, v, grad, own);
-    if constexpr (decltype(own)::wanted) {
-      if (s.mirrored) {
-        grad = mirrors_adjoint(a.walls, node, s.gravity, v, grad, own, direct);
-        if (itself) result.value = direct;
-      }
-      if (itself) result.mass += own.mass_grad;
-      itself = false;
-    }
-    MPM_UNROLL for (int i = 0; i < D; i++)
-      sum[i] += sign[i] * grad[i];
-  };
-  if (s.mirrored) {
-    for_images(a, s, local, add_member);
-  } else {
-    Vector<T, D> upright;
-    MPM_UNROLL for (int i = 0; i < D; i++)
-      upright[i] = T(1);
-    add_member(index, upright, lattice_node<D>(s.corner, local));
-  }
+  if (free.mass == T(0)) return {grad.mass, change};
+  NodeRow<T, D> own{T(0), zero_vector<T, D>()};
+  Vector<T, D> sum;  // adjoint of the free velocity
+  if constexpr (with_impulses)
+    sum = shared_adjoint(b, s, local, index, free.value, impulses, own);
+  else
+    sum = shared_adjoint(b, s, local, free.value, grad.value);
+  NodeRow<T, D> result{grad.mass + own.mass, own.value};
   change = (row.mass / free.mass) * sum;
-  if constexpr (decltype(impulses(0, index))::wanted) change = change + row.mass * result.value;
+  if constexpr (with_impulses) change = change + row.mass * result.value;
   MPM_UNROLL for (int i = 0; i < D; i++) {
     const T by_velocity = sum[i] / free.mass;
     result.value[i] += by_velocity;
