@@ -5,6 +5,7 @@ import torch
 from torch import Tensor
 
 import torch_mpm as mpm
+from torch_mpm import particle_operations
 
 F64 = torch.float64
 DT, N = 1e-3, 8
@@ -233,3 +234,92 @@ def test_errors(device):
         envs.observe("colour")
     with pytest.raises(ValueError, match="k must be a scene from 0 to 1"):
         envs.scene(2)
+
+
+# ---- absent particles and clocks in what acts on particles
+
+
+def test_each_scene_is_prepared_by_itself(device):
+    """Scenes at one place, with temperatures that would cancel."""
+    grid = mpm.Grid(0.1, (0.0, 0.0), (1.0, 1.0), scenes=2)
+    heat = mpm.Heat(grid, conductivity=5.0, specific_heat=800.0)
+    step = mpm.Step(grid, mpm.NeoHookean(1e4, 0.3), heat=heat)
+    states = [one(1, device), one(1, device)]
+    states = [s.replace(temperature=sign * 100 * s.x[:, 0]) for s, sign in zip(states, (1, -1), strict=True)]
+    envs = mpm.Environments(step, states, room=len(states[0]) + 3)
+    gradient = envs.first.extra["temperature_gradient"].reshape(2, envs.room, 2)
+    torch.testing.assert_close(gradient[0], -gradient[1])
+    assert float(gradient[0, :, 0].max()) > 50
+    envs.advance(3, torch.tensor([DT, 2 * DT], dtype=F64, device=device))
+    assert all(bool(envs.scene(k).temperature.isfinite().all()) for k in range(2))
+
+
+def test_operations_on_particles_see_the_clocks(device):
+    push = particle_operations.Push((1.0, 0.0), start=2.5 * DT, end=6.5 * DT)
+    step = step_of(2, device, on_particles=push, boundaries=[], walls=None)
+    envs = mpm.Environments(step, [one(0, device), one(1, device)])
+    plain = mpm.Environments(step_of(2, device, boundaries=[], walls=None), [one(0, device), one(1, device)])
+    for _ in range(4):
+        envs.advance(2, torch.tensor([DT, DT / 2], dtype=F64, device=device))
+        plain.advance(2, torch.tensor([DT, DT / 2], dtype=F64, device=device))
+    for k, (steps, dt) in enumerate(((4, DT), (3, DT / 2))):  # 3, 4, 5, 6; and 5, 6, 7 half steps
+        gained = envs.scene(k).mass[:, None] * (envs.scene(k).v - plain.scene(k).v)
+        expected = torch.tensor([steps * dt * len(one(k)), 0.0], dtype=F64, device=device)
+        torch.testing.assert_close(gained.sum(0), expected, rtol=1e-6, atol=1e-9)
+
+
+def test_absent_particles_have_no_part_in_gradients_and_batches(device):
+    envs = mpm.Environments(step_of(3, device), [one(k, device) for k in range(3)])
+    E = torch.tensor([1e4, 2e4, 3e4], dtype=F64, device=device, requires_grad=True)
+    step = step_of(3, device, mpm.NeoHookean(E, 0.3))
+    mpm.rollout(step, envs.state, 3, DT).x.square().sum().backward()
+    for k in range(3):
+        own = E.detach()[k : k + 1].clone().requires_grad_()
+        single = alone_step(step, k, mpm.NeoHookean(own, 0.3))
+        mpm.rollout(single, one(k, device), 3, DT).x.square().sum().backward()
+        torch.testing.assert_close(E.grad[k], own.grad[0], rtol=1e-9, atol=0)
+    joined = mpm.State.concatenate([envs.state, envs.state], scene=True, scenes=[3, 3])
+    assert int((joined.scene == -1).sum()) == 2 * int((envs.state.scene == -1).sum())
+    parts = joined.replace(impulse=torch.zeros(6, 5, 3, dtype=F64, device=device)).split(6)
+    assert [len(p) for p in parts] == [len(one(k % 3)) for k in range(6)]
+    assert all(p.impulse.shape[0] == 1 for p in parts)
+
+
+def alone_step(step: mpm.Step, k: int, law: mpm.Material) -> mpm.Step:
+    grid = mpm.Grid(0.1, (0.0, 0.0), (1.0, 1.0), deterministic=True)
+    return mpm.Step(grid, law, step.gravity[k], walls=step.walls, boundaries=list(step.boundaries))
+
+
+def test_frozen_scenes_stand_still_whatever_their_law(device):
+    law = mpm.Viscoelastic(E=1e4, nu=0.3, branch_modulus=1e4, relaxation_time=1e-2)
+    envs = mpm.Environments(step_of(2, device, law), [one(0, device), one(1, device)])
+    envs.advance(5, DT)
+    envs.freeze([1])
+    before = envs.state.map(torch.clone)
+    envs.advance(5, DT)
+    frozen = slice(envs.room, None)
+    for name, value in fields(envs.state).items():
+        assert torch.equal(value[frozen], fields(before)[name][frozen]), name
+    assert not torch.equal(envs.state.x[: envs.room], before.x[: envs.room])
+
+
+def test_scenes_are_named_by_masks_or_whole_numbers(device):
+    envs = environments(device)
+    envs.advance(2, DT)
+    envs.forces()
+    envs.reset([False, False, False, True])
+    assert envs.time.tolist() == pytest.approx([2 * DT] * 3 + [0.0])
+    with pytest.raises(TypeError, match="must be a mask or whole numbers"):
+        envs.freeze(torch.tensor([1.7]))
+    with pytest.raises(ValueError, match="from 0 to 3"):
+        envs.reset(torch.tensor([-1]))
+    envs.reset([2], one(2, device))
+    x = envs.state.x.clone()
+    envs.state.extra["a"] = torch.zeros(len(envs.state), device=device)
+    wrong = one(1, device).replace(extra={"a": torch.zeros(len(one(1)), 2, device=device)})
+    with pytest.raises(ValueError, match="a of a particle must be"):
+        envs.reset([1], [wrong])
+    assert torch.equal(x, envs.state.x)
+    envs.count_impulses()
+    with pytest.raises(ValueError, match="impulses must be counted"):
+        envs.forces()

@@ -160,6 +160,14 @@ def test_operations_of_the_library_are_replayed_from_a_graph():
     torch.testing.assert_close(end.x, single.x, rtol=0, atol=1e-5)
 
 
+def test_who_waits_is_not_pushed(device):
+    """In whichever order the operations are."""
+    state = block_state(2, device)
+    for operations in ([Push((1.0, 0.0)), Present(start=1.0)], [Present(start=1.0), Push((1.0, 0.0))]):
+        end = mpm.rollout(make_step(2, on_particles=Operations(operations)), state, 5, DT)
+        assert torch.equal(end.v, state.v) and torch.equal(end.x, state.x)
+
+
 def test_an_empty_scene(device):
     start = block_state(2, device).select(torch.zeros(0, dtype=torch.int64, device=device))
     step = make_step(2, on_particles=Operations([Push((1.0, 0.0)), Hold((0.0, 0.0)), Present(1.0)]))

@@ -406,6 +406,15 @@ def test_scenes_with_time_steps_and_clocks_of_their_own(device, dtype):
         assert torch.equal(step.failures().problems["dt"].count, again.failures().problems["dt"].count)
 
 
+def test_clocks_take_no_gradients(device):
+    """So that the next call of a training loop goes in one op, too."""
+    step, state = each_scene(device, F64)
+    dt = DT * torch.tensor([1.0, 0.5, 0.7], dtype=F64, device=device)
+    end = mpm.rollout(step, state.replace(v=state.v.clone().requires_grad_()), 3, dt)
+    assert end.v.requires_grad and not end.time.requires_grad
+    assert step.explain(end, dt) == "all steps in one op"
+
+
 def test_a_clock_of_each_scene_with_one_time_step(device):
     step, state = each_scene(device)
     state = state.replace(time=torch.tensor([0.0, 2 * DT, -DT], dtype=F64, device=device))

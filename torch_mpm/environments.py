@@ -26,6 +26,7 @@ from torch import Tensor
 from .errors import check_count, shape_of
 from .graphs import looks_at_time
 from .impulses import Impulses
+from .pause import standing
 from .rollouts import rollout
 from .state import PARTICLE_FIELDS, State, check_state
 from .step import Step
@@ -48,8 +49,8 @@ class Environments:
         room: rows of each scene R; None for the largest number of particles of a state.
 
     Attributes:
-        state: of all scenes, which may be replaced by one of as many particles, by another velocity say. Absent
-            particles have no volume, and a mass of one.
+        state: of all scenes, whose fields `reset` overwrites: clone what shall stay. It may be replaced by one of as
+            many particles, with another velocity say. Absent particles have no volume, and a mass of one.
         time: of each scene since it began [B] [s], float64.
         frozen: scenes that stand still until they are reset, bool [B].
 
@@ -77,6 +78,7 @@ class Environments:
         device = self.state.x.device
         self.time = torch.zeros(step.grid.scenes, dtype=torch.float64, device=device)
         self.frozen = torch.zeros(step.grid.scenes, dtype=torch.bool, device=device)
+        self._froze = False  # whether a scene was ever frozen, whose laws go on all the same
         self._before: tuple[Tensor, Tensor] | None = None
 
     def __len__(self) -> int:
@@ -101,17 +103,25 @@ class Environments:
         return self._with_fields(packed)
 
     def _with_fields(self, state: State) -> State:
-        """All fields that a step makes, so that the fields of a scene are those of the others."""
-        present = state.scene
-        state = self.step.prepare(state.replace(scene=torch.zeros_like(present)))  # type: ignore[arg-type]
-        if state.C is None and (self.step.transfer == "apic" or self.step.law.viscous):
-            state = state.replace(C=torch.zeros_like(state.x[:, :, None].expand(-1, -1, state.x.shape[1])))
-        return state.replace(scene=present)
+        """The fields that steps make and keep, so that those of a scene are those of the others.
+
+        Scenes are prepared side by side, as the first ones of the grid, since what a step makes may come from a grid.
+        """
+        present, B = state.scene, len(self) * self.room
+        groups = [state.select(rows) for rows in torch.arange(len(state), device=state.x.device).split(B)]
+        state = State.concatenate([self.step.prepare(self._placed(group)) for group in groups])
+        made = {name: value.nan_to_num(nan=0.0) for name, value in state.extra.items()}  # of absent particles
+        keeps_C = self.step.transfer == "apic" or self.step.law.viscous
+        C = state.C if keeps_C else None
+        if keeps_C and C is None:
+            C = torch.zeros_like(state.x[:, :, None].expand(-1, -1, state.x.shape[1]))
+        return state.replace(scene=present, C=C, extra=made)
 
     def _placed(self, packed: State, index: Tensor | None = None) -> State:
         """Packed scenes with the number of each, or those of an index [n], as the scene of its particles."""
         own = torch.arange(len(self), dtype=torch.int32, device=packed.x.device)
-        own = (own if index is None else own[index])[:, None].expand(-1, self.room).reshape(-1)
+        own = own[: len(packed) // self.room] if index is None else own[index]
+        own = own[:, None].expand(-1, self.room).reshape(-1)
         assert packed.scene is not None
         return packed.replace(scene=torch.where(packed.scene == ABSENT, ABSENT, own))
 
@@ -121,12 +131,13 @@ class Environments:
     def advance(self, n: int, dt: float | Tensor) -> None:
         """Take n steps of dt [s], a number or a tensor [B]; see `rollout`. Frozen scenes stand still."""
         state = self.state
-        if any(looks_at_time(boundary) for boundary in self.step.boundaries):
+        if self.step.on_particles is not None or any(looks_at_time(boundary) for boundary in self.step.boundaries):
             state = state.replace(time=self.time.to(state.x.dtype))
         elapsed = dt.double() if isinstance(dt, Tensor) else torch.full_like(self.time, dt)
         elapsed = torch.where(self.frozen | ~(elapsed > 0), 0.0, n * elapsed)
         impulse = state.impulse
-        self.state = rollout(self.step, state, n, dt).replace(time=0.0)
+        after = rollout(self.step, state, n, dt).replace(time=0.0)
+        self.state = standing(self.state, after, self.present.reshape(-1)) if self._froze else after
         self.time = self.time + elapsed
         self._before = None if impulse is None else (impulse, elapsed)
 
@@ -142,9 +153,10 @@ class Environments:
         Their particles take part in nothing and cost little. They keep their positions and deformations, and lose
         their velocities.
         """
-        self.frozen = self.frozen | (self.failed if which is None else self._mask(which))
-        scene = self._rows(self.state.scene)
-        scene.masked_fill_(self.frozen[:, None], ABSENT)
+        self.frozen = self.frozen | (self.failed if which is None else self._mask(self._which(which)))
+        absent = self.frozen.repeat_interleave(self.room)
+        self.state = self.state.replace(scene=self.state.scene.masked_fill(absent, ABSENT))  # type: ignore[union-attr]
+        self._froze = True
 
     @torch.no_grad()
     def reset(self, which: Any, states: State | Sequence[State] | None = None) -> None:
@@ -158,8 +170,11 @@ class Environments:
         Raises:
             TypeError, ValueError: for states without room, or another number of them.
         """
+        which = self._which(which)
         mask = self._mask(which)
-        index = None if _is_mask(which) else self._index(which)
+        index = None if which.dtype == torch.bool else which
+        if isinstance(states, State) and states.scene is None:
+            states = [states]
         given = self.first if states is None else states if isinstance(states, State) else self.pack(states)
         if index is not None and states is None:
             given = given.select(_rows_of(index, self.room))
@@ -179,27 +194,28 @@ class Environments:
         self.time = torch.where(mask, 0.0, self.time)
         self.frozen = self.frozen & ~mask
         if self.state.impulse is not None:
-            self.state.impulse.masked_fill_(mask[:, None, None], 0.0)
+            self.state = self.state.replace(impulse=self.state.impulse.masked_fill(mask[:, None, None], 0.0))
         if self._before is not None:
             before, elapsed = self._before
             self._before = torch.where(mask[:, None, None], 0.0, before), torch.where(mask, 0.0, elapsed)
         self.step.forget_failures(mask)
 
-    def _mask(self, which: Any) -> Tensor:
-        """bool [B]."""
-        if _is_mask(which):
+    def _which(self, which: Any) -> Tensor:
+        """Scenes as a mask bool [B] or as indices int64 [n] on the device, where numbers go without waiting for it."""
+        which = which if isinstance(which, Tensor) else torch.as_tensor(which, device="cpu")
+        if which.dtype == torch.bool:
             if which.shape != self.time.shape:
                 raise ValueError(f"a mask of scenes must have shape [B] = [{len(self)}], got {shape_of(which)}")
-            return which
-        return torch.zeros_like(self.frozen).index_fill_(0, self._index(which), True)
-
-    def _index(self, which: Any) -> Tensor:
-        """Scenes, int64 [n]; numbers go to a device without waiting for it."""
-        if not isinstance(which, Tensor):
-            which = torch.tensor(which, dtype=torch.int64)
-            if which.numel() and not (0 <= int(which.min()) and int(which.max()) < len(self)):
-                raise ValueError(f"scenes must be from 0 to {len(self) - 1}, got {which.tolist()}")
+            return which.to(self.time.device, non_blocking=True)
+        if which.numel() and (which.is_floating_point() or which.is_complex()):
+            raise TypeError(f"scenes must be a mask or whole numbers, got {which.dtype}")
+        if which.is_cpu and which.numel() and not (0 <= int(which.min()) and int(which.max()) < len(self)):
+            raise ValueError(f"scenes must be from 0 to {len(self) - 1}, got {which.tolist()}")
         return which.reshape(-1).to(self.time.device, torch.int64, non_blocking=True)
+
+    def _mask(self, which: Tensor) -> Tensor:
+        """bool [B]."""
+        return which if which.dtype == torch.bool else torch.zeros_like(self.frozen).index_fill_(0, which, True)
 
     # -- looking
 
@@ -211,7 +227,7 @@ class Environments:
     @property
     def present(self) -> Tensor:
         """Which rows are particles that are there, bool [B, R]; none of a frozen scene."""
-        return self._rows(self.state.scene) != ABSENT
+        return torch.ne(self._rows(self.state.scene), ABSENT)
 
     def observe(self, name: str, padded: bool = True) -> Tensor:
         """A field of the particles, of `State` or `state.extra`.
@@ -234,7 +250,7 @@ class Environments:
 
     def count_impulses(self) -> None:
         """From here on count the impulses of the material on boundaries and walls; see `torch_mpm.impulses`."""
-        self.state = self.step.with_impulses(self.state)
+        self.state, self._before = self.step.with_impulses(self.state), None
 
     def forces(self) -> Impulses:
         """Mean force [N] and torque [N m] on boundaries and walls over the latest `advance`; zero in frozen scenes.
@@ -295,14 +311,15 @@ class Environments:
             return
         if frozen is None or len(state) != len(self.state):
             raise ValueError(f"{path} must hold {len(self)} scenes of {self.room} particles, got {len(state)}")
+        own = torch.arange(len(self), device=self.time.device).repeat_interleave(self.room)
+        time = torch.as_tensor(state.time)
+        scene = torch.as_tensor(state.scene)
+        if time.shape != self.time.shape or not bool((scene.eq(own) | scene.eq(ABSENT)).all()):
+            raise ValueError(f"{path} must hold {len(self)} scenes of {self.room} particles, got others")
         _pairs(self.state, state)
-        self.time, self.frozen = torch.as_tensor(state.time), self._rows(frozen)[:, 0] != 0
+        self.time, self.frozen, self._froze = time, self._rows(frozen)[:, 0] != 0, True
         self.state, self._before = state.replace(time=0.0), None
         self.step.forget_failures(torch.ones_like(self.frozen))
-
-
-def _is_mask(which: Any) -> bool:
-    return isinstance(which, Tensor) and which.dtype == torch.bool
 
 
 def _in_room(state: State, room: int) -> State:
@@ -330,6 +347,12 @@ def _pairs(state: State, given: State) -> list[tuple[str, Tensor, Tensor]]:
         if (old.get(name) is None) != (new.get(name) is None):
             which = "have no" if new.get(name) is None else "must have no"
             raise ValueError(f"states {which} {name}, unlike those of the other scenes")
+    for name, value in old.items():
+        if value is not None and (value.shape[1:], value.dtype) != (new[name].shape[1:], new[name].dtype):
+            expected = f"{list(value.shape[1:])} {value.dtype}"
+            raise ValueError(
+                f"{name} of a particle must be {expected}, got {list(new[name].shape[1:])} {new[name].dtype}"
+            )
     return [(name, value, new[name]) for name, value in old.items() if value is not None]
 
 

@@ -47,7 +47,7 @@ class Impulse:
     def about(self, point: Sequence[float] | Tensor) -> Tensor:
         """Angular impulse about a point [D] or [B, D] [m]: [B] (2-D) or [B, 3] [N m s]."""
         dim = self.linear.shape[1]
-        at = torch.as_tensor(point, dtype=self.linear.dtype, device=self.linear.device)
+        at = torch.as_tensor(point, dtype=self.linear.dtype).to(self.linear.device, non_blocking=True)
         if tuple(at.shape) not in ((dim,), tuple(self.linear.shape)):
             expected = f"[D] or [B, D] = {list(self.linear.shape)}"
             raise ValueError(f"point must have shape {expected}, got {shape_of(at)}")

@@ -241,7 +241,7 @@ def _substeps(step: Step, state: State, n: int, dt: float | Tensor) -> State:
     if status.device.type == "cpu":  # where the op has let the pool grow, or stopped
         grid.follow(int(status[0, 0] if grid.grows else status[0, 7]))
     extra = _history(state, calls, history)
-    time = time_after(state.time, dt, n) if scene_time is None else time
+    time = time_after(state.time, dt, n) if scene_time is None else time.detach()
     return state.replace(x=x, v=v, C=C, F=F, J=J, extra=extra, time=time, impulse=impulse)
 
 

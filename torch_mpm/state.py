@@ -230,6 +230,8 @@ class State:
         parts = [self.select((of_particle == k).nonzero().squeeze(1)) for k in range(count)]
         if isinstance(self.time, Tensor) and self.time.numel() > 1:
             parts = [part.replace(time=self.time[k : k + 1]) for k, part in enumerate(parts)]
+        if self.impulse is not None:
+            parts = [part.replace(impulse=self.impulse[k : k + 1]) for k, part in enumerate(parts)]
         return [State.concatenate([part.replace(scene=None)]) for part in parts]
 
     @staticmethod
@@ -258,7 +260,7 @@ class State:
         if scene:
             counts = _scene_counts(states, scenes)
             firsts = itertools.accumulate([0, *counts])
-            states = [s.replace(scene=_scene_of(s) + first) for s, first in zip(states, firsts, strict=False)]
+            states = [s.replace(scene=_shifted(_scene_of(s), first)) for s, first in zip(states, firsts, strict=False)]
         time = _times_of_scenes(states, counts) if scene else _one_time(states)
         if any(s.ids is not None for s in states):
             befores = itertools.accumulate([0, *(len(s) for s in states)])
@@ -291,6 +293,11 @@ def _check_impulse(impulse: Any, x: Tensor) -> None:
 
 
 # ---- joining
+
+
+def _shifted(scene: Tensor, first: int) -> Tensor:
+    """Scenes as those that follow others; absent particles, of scene -1, stay absent."""
+    return torch.where(scene < 0, scene, scene + first)
 
 
 def _checked(states: Sequence[State]) -> list[State]:

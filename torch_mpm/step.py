@@ -165,12 +165,13 @@ class Step(TensorModule):
         """A prepared state one step later."""
         if self.on_particles is None:
             return self._moved(state, dt)
+        before = state
         state, enabled = operated(self.on_particles, state, dt)
         state = self.prepare(state)  # of which a function may have made another
         if enabled is None:
             return self._moved(state, dt)
         absent = state.replace(mass=torch.where(enabled, state.mass, 0), volume=torch.where(enabled, state.volume, 0))
-        return standing(state, self._moved(absent, dt), enabled)
+        return standing(before, self._moved(absent, dt), enabled)
 
     def _moved(self, state: State, dt: float | Tensor) -> State:
         """A prepared state one step later, without what acts on the particles before."""

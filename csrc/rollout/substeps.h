@@ -216,7 +216,7 @@ struct Substeps {
   Tensor scene_time;              // the time of each scene now, where each has its own
   Tensor drifts;                  // one for each of two substeps in turn, where activations last
   NextGridArguments<T, D> next;   // of these; its update and contact are those here
-  Tensor impulse, impulse_slots;  // on obstacles and walls so far; where someone asks, see `count_impulses`
+  Tensor impulse, impulse_slots;  // on obstacles and walls so far; where someone asks, see `add_impulses_to`
   bool obstacles = false, fused = false;
   const int* previous_status = nullptr;
 

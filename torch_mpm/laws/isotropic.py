@@ -80,6 +80,11 @@ class _IsotropicFunction(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, grad_F: Tensor, grad_stress: Tensor) -> Any:
+        with full_precision(grad_F):
+            return _IsotropicFunction._adjoint(ctx, grad_F, grad_stress)
+
+    @staticmethod
+    def _adjoint(ctx: Any, grad_F: Tensor, grad_stress: Tensor) -> Any:
         F, U, sigma, V, mapped, tau = ctx.saved_tensors
         M, N = (_DifferentiatedOnce.apply(t, F) for t in (U.mT @ grad_F @ V, U.mT @ grad_stress @ U))
         turned = None

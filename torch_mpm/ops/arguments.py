@@ -37,11 +37,11 @@ def split_dt(dt: float | Tensor, scenes: int, x: Tensor) -> tuple[float, Tensor 
 
 
 def per_particle(value: Tensor, scene: Tensor | None, particles: int) -> Tensor:
-    """A per-scene tensor [B, ...] as one row per particle."""
+    """A per-scene tensor [B, ...] as one row per particle; that of absent particles, of scene -1, has no meaning."""
     if value.shape[0] == 1:
         return value.expand(particles, *value.shape[1:])
     assert scene is not None
-    return value.index_select(0, scene)
+    return value.index_select(0, scene.clamp(min=0))
 
 
 def per_parameter(value: Tensor, scene: Tensor | None, particles: int) -> Tensor:
@@ -55,7 +55,8 @@ def sum_by_scene(value: Tensor, scene: Tensor | None, scenes: int) -> Tensor:
     """Sum of a per-particle tensor [P, ...] over the particles of each scene, [B, ...]."""
     if scene is None:
         return value.sum(0, keepdim=True)
-    return value.new_zeros(scenes, *value.shape[1:]).index_add_(0, scene, value)
+    value = torch.where((scene >= 0).reshape(-1, *(1,) * (value.dim() - 1)), value, 0)  # absent particles
+    return value.new_zeros(scenes, *value.shape[1:]).index_add_(0, scene.clamp(min=0), value)
 
 
 def soa_empty(like: Tensor, shape: Sequence[int]) -> Tensor:
