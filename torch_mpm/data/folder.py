@@ -157,7 +157,7 @@ class DatasetFolder:
         if split not in self.record.splits:
             raise MissingError(f"split must be one of {', '.join(self.record.splits)}, got {split!r}")
         first, count = self.record.splits[split]
-        return [self._scenes[k][1] for k in range(first, first + count) if k in self._scenes]
+        return [self._scenes[k][1] for k in sorted(self._scenes) if first <= k < first + count]
 
     def scene(self, scene_id: int) -> StoredScene:
         """A valid scene, open for reading."""
