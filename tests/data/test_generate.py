@@ -143,6 +143,14 @@ def test_another_device_is_refused(copy):
         generate(configuration(), copy, device="cpu")
 
 
+def test_another_version_is_refused(copy):
+    record = json.loads((copy / "dataset.json").read_text())
+    record["versions"]["torch_mpm"] = "0.0.1"
+    (copy / "dataset.json").write_text(json.dumps(record))
+    with pytest.raises(OutputError, match=r"begun with torch_mpm 0\.0\.1, and this is"):
+        generate(configuration(), copy, device="cpu")
+
+
 def test_parameters_that_differ_are_stored_by_particle(whole):
     for arrays, attributes in decoded(whole).values():
         E = json.loads(attributes["scene"])["material"]["jelly"]["E"]
