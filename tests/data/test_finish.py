@@ -8,11 +8,13 @@ import pytest
 pytest.importorskip("pydantic")
 pytest.importorskip("h5py")
 
+import small_dataset as datasets
 from generated import configuration, decoded
 
 from torch_mpm.data.finish import finalize, verify
 from torch_mpm.data.generate import generate
-from torch_mpm.data.shard import ShardWriter, prepare_scene, shard_path
+from torch_mpm.data.shard import ShardWriter, prepare_scene, record_path, shard_path
+from torch_mpm.errors import DamagedFileError
 
 OBSTACLES = [
     {"shape": "box", "center": [0.5, 0.05], "size": [0.6, 0.08], "rotation": 0.2},
@@ -132,6 +134,22 @@ def test_what_is_wrong_with_a_scene(folder, tmp_path, change, message):
     changed(copy, change)
     problems = list(verify(copy))
     assert len(problems) == 2 and all(message in p and "shard_00000.h5: scene" in p for p in problems), problems
+
+
+@pytest.mark.parametrize("damage", ["gone", "cut off", "too much", "other scenes"])
+def test_shards_that_are_not_those_of_the_data_set_are_not_finalized(tmp_path, damage):
+    path = datasets.make_dataset(tmp_path / "set")
+    file = shard_path(path, 1)
+    if damage == "gone":
+        file.unlink()
+    elif damage == "cut off":
+        file.write_bytes(file.read_bytes()[:-9])
+    else:
+        other = shard_path(path, 3 if damage == "too much" else 0)
+        other.write_bytes(file.read_bytes())
+        record_path(other).write_bytes(record_path(file).read_bytes())
+    with pytest.raises(DamagedFileError, match=r"is gone, or|is beyond the 3 shards|has other scenes"):
+        finalize(path)
 
 
 def test_a_folder_without_a_data_set(tmp_path):

@@ -57,6 +57,19 @@ def test_few_files_stay_open(path, monkeypatch):
     assert data.scene(0).particles == 20
 
 
+def test_scenes_leave_with_their_shards(path, monkeypatch):
+    """Scenes of a shard are read again after others have taken its place, and those that are held stay readable."""
+    monkeypatch.setattr(folders, "MOST_OPEN", 2)
+    data = DatasetFolder(path)
+    held = {k: data.scene(k) for k in (0, 4, 0, 1, 8, 0, 5, 4, 9, 1)}
+    assert len(data._cache._shards) == 2
+    for k, scene in held.items():
+        np.testing.assert_array_equal(scene["position"], datasets.arrays(k)["position"])
+        np.testing.assert_array_equal(data.scene(k).window("mass", 0, 5), datasets.arrays(k)["mass"][:5])
+    with pytest.raises(KeyError, match="has no 'nothing'"):
+        held[0]["nothing"]
+
+
 def _first_mass(data):
     return float(data.scene(9)["mass"][0])
 

@@ -19,7 +19,7 @@ from helpers import command
 from torch_mpm.data import batch
 from torch_mpm.data.finish import IncompleteError, finalize, verify
 from torch_mpm.data.folder import DatasetFolder
-from torch_mpm.data.generate import generate
+from torch_mpm.data.generate import check_samples, generate
 from torch_mpm.data.sampling import content
 from torch_mpm.data.shard import record_path, shard_path
 from torch_mpm.data.workers import Worker, WorkerError, take_device, worker
@@ -143,6 +143,14 @@ def test_another_device_is_refused(copy):
         generate(configuration(), copy, device="cpu")
 
 
+def test_another_version_is_refused(copy):
+    record = json.loads((copy / "dataset.json").read_text())
+    record["versions"]["torch_mpm"] = "0.0.1"
+    (copy / "dataset.json").write_text(json.dumps(record))
+    with pytest.raises(OutputError, match=r"begun with torch_mpm 0\.0\.1, and this is"):
+        generate(configuration(), copy, device="cpu")
+
+
 def test_parameters_that_differ_are_stored_by_particle(whole):
     for arrays, attributes in decoded(whole).values():
         E = json.loads(attributes["scene"])["material"]["jelly"]["E"]
@@ -243,7 +251,7 @@ def test_a_scene_that_needs_too_many_steps_fails_alone(tmp_path):
 
 
 def test_a_scene_without_room_is_recorded(tmp_path):
-    made = configuration(body__0__count={"choice": [1, 30], "weights": [1, 12]})
+    made = configuration(body__0__count={"choice": [1, 30], "weights": [1, 8]})
     generate(made, tmp_path, device="cpu")
     told = DatasetFolder(tmp_path).attempted()
     assert {s.valid for s in told} == {True, False}
@@ -263,6 +271,22 @@ def test_impossible_configurations_are_refused(tmp_path):
     with pytest.raises(SceneError, match=r"scene 0: body\[0\].densty: unknown key; did you mean|body\[0\].densty"):
         generate(configuration(body__0__densty=1.0), tmp_path, device="cpu")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_first_scene_that_is_wrong_fails_alone(monkeypatch):
+    made, drawn = configuration(), content
+
+    def wrong_at_first(configuration, scene_id):
+        words = drawn(configuration, scene_id)
+        return {**words, "body": [{**b, "density": -1.0} for b in words["body"]]} if scene_id in wrong else words
+
+    monkeypatch.setattr("torch_mpm.data.generate.content", wrong_at_first)
+    wrong = {0, 1}
+    check_samples(made)
+    wrong = {0, 1, 2}
+    with pytest.raises(SceneError) as error:
+        check_samples(made)
+    assert [p[:8] for p in error.value.problems[:1]] == ["scene 0:"] and len(error.value.problems) >= 3
 
 
 # ---- processes and devices

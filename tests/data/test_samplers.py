@@ -1,5 +1,6 @@
 """Distributions against their laws, and scenes that are drawn from them."""
 
+import datetime
 import itertools
 import math
 
@@ -82,6 +83,10 @@ def test_words_around_distributions_stay():
         ({"integers": [0.5, 2]}, "x.integers: takes two whole numbers"),
         ({"in_box": [[0, 0, 0], [1, 1, 1]]}, "x.in_box: takes a lower and an upper corner"),
         ({"direction": "up"}, "x.direction: takes a length"),
+        ({"direction": 0.0}, "x.direction: takes a length"),
+        ({"direction": {"choice": ["up", 1.0]}}, "x.direction: takes a length"),
+        ({"direction": {"in_box": [[0, 0], [1, 1]]}}, "x.direction: takes a length"),
+        ({"direction": {"direction": 1.0}}, "x.direction: takes a length"),
         ({"direction": {"uniform": [1, 0]}}, "x.direction.uniform: takes two numbers"),
         ({"choice": []}, "x.choice: takes a list with at least one entry"),
         ({"choice": [1, 2], "weights": [1]}, "x.weights: takes 2 numbers"),
@@ -113,6 +118,23 @@ def test_distributions_that_cannot_be(words, message):
         ({"duration": 1.0}, "duration: is not for data sets; give [dataset] frames and interval"),
         ({"emitter": []}, "emitter: is not for data sets"),
         ({"body__0__count": -1}, "body[0].count: takes a whole number"),
+        ({"body__0__count": {"integers": [-1, 2]}}, "body[0].count: takes a whole number"),
+        ({"body__0__count": {"uniform": [1, 2]}}, "body[0].count: takes a whole number"),
+        ({"body__0__count": {"choice": [1, 1.5]}}, "body[0].count: takes a whole number"),
+        ({"body": {"shape": "sphere"}}, "body: takes a list of tables"),
+        ({"body": {"choice": [[]]}}, "body: takes a list of tables"),
+        ({"body": ["sphere"]}, "body[0]: takes a table"),
+        ({"body": [{"choice": ["sphere"]}]}, "body[0]: takes a table"),
+        ({"obstacle": 3}, "obstacle: takes a list of tables"),
+        ({"material": [1]}, "material: takes a table"),
+        ({"material": {"choice": [{}]}}, "material: takes a table"),
+        ({"material__jelly": "sand"}, "material.jelly: takes a table"),
+        ({"material__jelly": {"choice": ["sand"]}}, "material.jelly: takes a table"),
+        ({"title": datetime.date(2026, 1, 1)}, "title: takes no date"),
+        ({"body__0__density": datetime.datetime(2026, 1, 1)}, "body[0].density: takes no date"),
+        ({"dataset__particles": 9, "body__0__choice": [{"shape": "points"}]}, "body[0].shape: points have"),
+        ({"obstacle": [{"shape": "sphere", "start": 0.1}]}, "obstacle[0]: start and end are not"),
+        ({"obstacle": [{"shape": "sphere", "end": {"uniform": [1, 2]}}]}, "obstacle[0]: start and end are not"),
         ({"body__0__center": {"in_box": [[0, 0]]}}, "body[0].center.in_box: takes a lower and an upper corner"),
     ],
 )
@@ -166,14 +188,29 @@ def test_bodies_keep_their_distance():
     for scene_id in range(8):
         drawn = content(made, scene_id)
         assert len(drawn["body"]) == 3
-        # Points of the shapes against each other: none nearer than the gap, to the spacing of the points.
+        # Points of the shapes against each other: none nearer than the gap.
         points = [_outline(body) for body in drawn["body"]] + [_outline(drawn["obstacle"][0])]
         for a, b in itertools.combinations(points, 2):
             nearest = np.linalg.norm(a[:, None] - b[None], axis=2).min()
-            assert nearest > 0.07 - 0.03, (scene_id, nearest)  # probes are half a cell, 0.05, apart
+            assert nearest > 0.07, (scene_id, nearest)
         for x in points[:3]:
             assert x.min() >= -1e-9 and x.max() <= 1 + 1e-9
         made.scene(drawn).build("cpu")  # whose own checks find no overlap
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_spheres_keep_the_gap(dim):
+    """Exactly: the distance of their centres less their radii."""
+    least = math.inf
+    for scene_id in range(6):
+        made = configuration(
+            grid__lower=[0.0] * dim, grid__upper=[1.0] * dim, gravity=[0.0] * dim, dataset__gap=0.03,
+            body=[{"count": 9, "material": "jelly", "shape": "sphere", "radius": {"uniform": [0.04, 0.12]},
+                   "center": {"in_box": [[0.0] * dim, [1.0] * dim]}}],
+        )  # fmt: skip
+        for a, b in itertools.combinations(content(made, scene_id)["body"], 2):
+            least = min(least, math.dist(a["center"], b["center"]) - a["radius"] - b["radius"])
+    assert 0.03 <= least < 0.12  # and they come near each other
 
 
 def _outline(words):

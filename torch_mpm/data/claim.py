@@ -100,6 +100,12 @@ class Claim:
                 f"{self.folder} holds the data set of another configuration ({found.configuration[:12]}, this is "
                 f"{self.record.configuration[:12]}); choose another folder, or remove it first"
             )
+        ours, theirs = (r.versions.get("torch_mpm") for r in (self.record, found))
+        if theirs != ours:
+            raise OutputError(
+                f"{self.folder} holds a data set that was begun with torch_mpm {theirs}, and this is {ours}, whose "
+                f"results may differ; use version {theirs}, or choose another folder"
+            )
         if found.device != self.record.device:
             raise OutputError(
                 f"{self.folder} holds a data set that was begun on {found.device}, and process {self.worker.rank} of "

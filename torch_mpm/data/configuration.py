@@ -40,9 +40,10 @@ from ..scene import Scene, SceneError, schema
 from ..scene.explain import explain
 from ..scene.scene import override, parsed
 from . import distribution
+from .content_checks import shape_problems, value_problems
 from .distribution import Words
 
-FORMAT = 1
+FORMAT = 2
 """Raised where the same configuration would give other scenes."""
 VARIED = ("gravity", "material", "body", "obstacle")
 """Keys of a scene file that may differ from scene to scene."""
@@ -234,6 +235,8 @@ def _checked(words: Words) -> Dataset:
         SceneError: for what is wrong.
     """
     problems = [f"{key}: is not for data sets; {remedy}" for key, remedy in ABSENT.items() if key in words]
+    misshapen = list(shape_problems(words))
+    problems += misshapen
     dataset = None
     try:
         dataset = Dataset(**words["dataset"])
@@ -251,7 +254,8 @@ def _checked(words: Words) -> Dataset:
     if grid is not None:
         for key in VARIED:
             problems += distribution.problems(words.get(key), key, len(grid.lower))
-    problems += _count_problems(words)
+    if not misshapen:
+        problems += value_problems(words, bool(dataset and dataset.particles), bool(dataset and dataset.obstacles))
     if problems or dataset is None:
         raise SceneError(problems)
     if grid is None:
@@ -262,17 +266,6 @@ def _checked(words: Words) -> Dataset:
     if not sum(dataset.splits.values()):
         raise SceneError([f"dataset.splits: has no scenes, got {dataset.splits}"])
     return dataset
-
-
-def _count_problems(words: Words) -> Iterator[str]:
-    """Counts of bodies and obstacles that are no whole numbers."""
-    for key in ("body", "obstacle"):
-        items = words.get(key, [])
-        for k, item in enumerate(items if isinstance(items, list) else []):
-            count = item.get("count", 1) if isinstance(item, dict) else 1
-            drawn = distribution.is_distribution(count)
-            if not drawn and (isinstance(count, bool) or not isinstance(count, int) or count < 0):
-                yield f"{key}[{k}].count: takes a whole number that is not negative or a distribution, got {count!r}"
 
 
 def _hash(words: Words, folder: Path) -> str:

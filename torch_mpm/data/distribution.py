@@ -53,6 +53,14 @@ def _box(value: Any, dim: int) -> bool:
     return points and all(a <= b for a, b in zip(*value, strict=True))
 
 
+def _length(value: Any) -> bool:
+    if is_distribution(value):
+        if CHOICE in value:
+            return not isinstance(value[CHOICE], list) or all(map(_length, value[CHOICE]))
+        return value.keys().isdisjoint({"in_box", "direction"})
+    return is_number(value) and value > 0
+
+
 def _direction(length: Any, rng: np.random.Generator, dim: int) -> list[float]:
     vector = rng.standard_normal(dim)
     scale = sample(length, rng, dim) / np.linalg.norm(vector)
@@ -86,8 +94,8 @@ KINDS = {
         lambda v, rng, dim: [float(a) for a in rng.uniform(*v)],
     ),
     "direction": Kind(
-        "a length, or a distribution of it",
-        lambda v, dim: is_number(v) or is_distribution(v),
+        "a length: a positive number, or a distribution of numbers",
+        lambda v, dim: _length(v),
         _direction,
     ),
 }

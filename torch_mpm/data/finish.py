@@ -12,7 +12,7 @@ import numpy as np
 from ..errors import DamagedFileError
 from .folder import DatasetFolder, DatasetRecord
 from .metadata import metadata, write_metadata
-from .shard import SceneRecord, Shard, StoredScene, content_hash, shard_path
+from .shard import REMEDY, SceneRecord, Shard, ShardRecord, StoredScene, content_hash, record_path, shard_path
 from .statistics import BOUNDARY
 
 GAIN = 0.05
@@ -40,6 +40,7 @@ def finalize(folder: str | Path) -> dict[str, Any]:
         raise IncompleteError(
             f"{folder} lacks {len(missing)} of {dataset.record.shards} shards ({named}); generate them"
         )
+    _check_files(dataset)
     if not dataset.scenes():
         raise IncompleteError(f"{folder} has no valid scene: {dataset.attempted()[0].failure}")
     try:
@@ -48,6 +49,30 @@ def finalize(folder: str | Path) -> dict[str, Any]:
     finally:
         dataset.close()
     return words
+
+
+def _check_files(dataset: DatasetFolder) -> None:
+    """Compare the finished shards with what they should be, without reading them.
+
+    Raises:
+        DamagedFileError: for one that is gone, of another size, of other scenes, or too much.
+    """
+    record = dataset.record
+    for index in dataset.finished:
+        path = shard_path(dataset.path, index)
+        told = ShardRecord.read(record_path(path))
+        if index >= record.shards:
+            raise DamagedFileError(path, f"is beyond the {record.shards} shards of the data set", REMEDY)
+        if not path.is_file() or path.stat().st_size != told.bytes:
+            raise DamagedFileError(path, "is gone, or not as long as its record says", REMEDY)
+        if [scene.id for scene in told.scenes] != _expected(record, index):
+            raise DamagedFileError(path, "has other scenes than those of its number", REMEDY)
+
+
+def _expected(record: DatasetRecord, index: int) -> list[int]:
+    """Ids of the scenes of a shard."""
+    first = index * record.scenes_per_shard
+    return list(range(first, min(first + record.scenes_per_shard, record.scenes)))
 
 
 def verify(folder: str | Path) -> Iterator[str]:
@@ -72,8 +97,7 @@ def verify(folder: str | Path) -> Iterator[str]:
 
 
 def _shard_problems(shard: Shard, record: DatasetRecord, index: int) -> Iterator[str]:
-    first = index * record.scenes_per_shard
-    expected = list(range(first, min(first + record.scenes_per_shard, record.scenes)))
+    expected = _expected(record, index)
     if shard.ids != expected:
         yield f"{shard.path}: has the scenes {shard.ids}, not {expected[0]} to {expected[-1]}"
     for told in shard.record.scenes:

@@ -157,7 +157,7 @@ class DatasetFolder:
         if split not in self.record.splits:
             raise MissingError(f"split must be one of {', '.join(self.record.splits)}, got {split!r}")
         first, count = self.record.splits[split]
-        return [self._scenes[k][1] for k in range(first, first + count) if k in self._scenes]
+        return [self._scenes[k][1] for k in sorted(self._scenes) if first <= k < first + count]
 
     def scene(self, scene_id: int) -> StoredScene:
         """A valid scene, open for reading."""
@@ -203,8 +203,9 @@ class _OpenFiles:
     def scene(self, path: Path, scene_id: int) -> StoredScene:
         if self._process != os.getpid():  # files of the parent are left to it
             self.__init__()  # type: ignore[misc]
+        shard = self._shard(path)
         if scene_id not in self._scenes:
-            self._scenes[scene_id] = self._shard(path).scene(scene_id)
+            self._scenes[scene_id] = shard.scene(scene_id)
         self._scenes.move_to_end(scene_id)
         while len(self._scenes) > MOST_OPEN:
             self._scenes.popitem(last=False)
@@ -215,7 +216,9 @@ class _OpenFiles:
             self._shards[path] = Shard(path)
         self._shards.move_to_end(path)
         while len(self._shards) > MOST_OPEN:
-            self._shards.popitem(last=False)[1].close()
+            # Not closed here: HDF5 closes the file after the last of its scenes that somebody still reads.
+            for scene_id in self._shards.popitem(last=False)[1].ids:
+                self._scenes.pop(scene_id, None)
         return self._shards[path]
 
     def close(self) -> None:

@@ -77,18 +77,20 @@ def check_samples(configuration: Configuration, count: int = 3) -> None:
     """Draw the first scenes.
 
     Raises:
-        SceneError: for what is wrong in one of them, or where there is no room in any.
+        SceneError: where all of them are wrong, or have no room; others fail alone.
     """
-    ids, full = range(min(count, configuration.scenes)), []
+    ids, failed, wrong = range(min(count, configuration.scenes)), 0, []
     for scene_id in ids:
         try:
             configuration.scene(content(configuration, scene_id))
         except NoRoom as error:
-            full.append(str(error))
+            failed += 1
+            wrong.append(str(error))
         except SceneError as error:
-            raise SceneError([f"scene {scene_id}: {p}" for p in error.problems], configuration.source) from None
-    if len(full) == len(ids):
-        raise SceneError(full, configuration.source)
+            failed += 1
+            wrong += [f"scene {scene_id}: {p}" for p in error.problems]
+    if failed == len(ids):
+        raise SceneError(wrong, configuration.source)
 
 
 def record_of(configuration: Configuration, device: torch.device) -> DatasetRecord:

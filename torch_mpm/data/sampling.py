@@ -156,10 +156,11 @@ class _Places:
         near = [shape for _, shape in self.placed if shape is not None and self._boxes_meet(shape, lower, upper)]
         if not near and not self.obstacles:
             return True
-        probes = _probes(body, 0.5 * self.dx)
-        if any(bool((other.shape.surface(probes - other.position)[0] < self.gap).any()) for other in near):
+        probes, missed = _probes(body, 0.25 * self.dx)
+        least = self.gap + missed  # distances from a shape change by no more than one moves
+        if any(bool((other.shape.surface(probes - other.position)[0] < least).any()) for other in near):
             return False
-        return not any(bool((o.signed_distance(probes, None, 0.0) < self.gap).any()) for o in self.obstacles)
+        return not any(bool((o.signed_distance(probes, None, 0.0) < least).any()) for o in self.obstacles)
 
     def _boxes_meet(self, other: Region, lower: Sequence[float], upper: Sequence[float]) -> bool:
         """Whether the box around a region comes nearer than the gap to the box around another."""
@@ -174,17 +175,17 @@ def _mesh(path: Path) -> Any:
     return trimesh.load(path, force="mesh")
 
 
-def _probes(body: Region, spacing: float) -> Tensor:
-    """Points [N, D] [m] all over a region, on its bounding box where it holds none of them."""
+def _probes(body: Region, spacing: float) -> tuple[Tensor, float]:
+    """Points [N, D] [m] all over a region and just outside, and a distance [m]: none of the region is further away."""
     sides = (body.upper - body.lower).tolist()
     spacing = max(spacing, (math.prod(sides) / PROBES) ** (1 / len(sides)))
     axes = [
         torch.linspace(a, b, max(2, math.ceil((b - a) / spacing) + 1), dtype=torch.float64)
         for a, b in zip(body.lower.tolist(), body.upper.tolist(), strict=True)
     ]
+    missed = 0.5 * math.hypot(*(float(axis[1] - axis[0]) for axis in axes))
     points = torch.cartesian_prod(*axes)
-    inside = points[body.inside(points)]
-    return inside if len(inside) else points
+    return points[body.shape.surface(points - body.position)[0] <= missed * (1 + 1e-9)], missed
 
 
 def divided(total: int, shares: Sequence[float]) -> list[int]:

@@ -295,7 +295,7 @@ class StoredScene:
     """
 
     def __init__(self, path: Path, group: Any) -> None:
-        self.path, self._group = path, group
+        self.path, self._group, self._name = path, group, group.name[1:]
         problem, self.attributes = _scene_problem(group, path.stat().st_size)
         if problem:
             raise DamagedFileError(path, f"{group.name[1:]} {problem}", REMEDY)
@@ -339,11 +339,13 @@ class StoredScene:
         return self._read(name, slice(first, first + frames))
 
     def _read(self, name: str, part: Any) -> Array:
-        data = self._group[name]
         try:
-            values: Array = data[part]
-        except (OSError, RuntimeError, ValueError) as error:
-            raise DamagedFileError(self.path, f"{data.name[1:]} cannot be read ({error})", REMEDY) from None
+            there = name in self._group
+            values: Array = self._group[name][part] if there else None
+        except (OSError, RuntimeError, ValueError, KeyError) as error:
+            raise DamagedFileError(self.path, f"{self._name}/{name} cannot be read ({error})", REMEDY) from None
+        if not there:
+            raise KeyError(f"{self._name} of {self.path} has no {name!r}")
         return values
 
 
