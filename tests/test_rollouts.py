@@ -412,7 +412,7 @@ def test_clocks_take_no_gradients(device):
     dt = DT * torch.tensor([1.0, 0.5, 0.7], dtype=F64, device=device)
     end = mpm.rollout(step, state.replace(v=state.v.clone().requires_grad_()), 3, dt)
     assert end.v.requires_grad and not end.time.requires_grad
-    assert step.explain(end, dt) .endswith("in one op")
+    assert step.explain(end, dt).endswith("in one op")
 
 
 def test_a_clock_of_each_scene_with_one_time_step(device):

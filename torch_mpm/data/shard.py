@@ -340,13 +340,12 @@ class StoredScene:
 
     def _read(self, name: str, part: Any) -> Array:
         try:
-            there = name in self._group
-            values: Array = self._group[name][part] if there else None
+            if name in self._group:
+                values: Array = self._group[name][part]
+                return values
         except (OSError, RuntimeError, ValueError, KeyError) as error:
             raise DamagedFileError(self.path, f"{self._name}/{name} cannot be read ({error})", REMEDY) from None
-        if not there:
-            raise KeyError(f"{self._name} of {self.path} has no {name!r}")
-        return values
+        raise KeyError(f"{self._name} of {self.path} has no {name!r}")
 
 
 class Shard:
