@@ -15,7 +15,8 @@ from pathlib import Path
 from typing import IO, Any
 
 from ..errors import DamagedFileError
-from ..scene.folder import FULL, OutputError
+from ..scene.folder import OutputError
+from ..scene.folder import output_errors as folder_errors
 from .folder import DATASET, DatasetRecord
 from .shard import Shard, ShardRecord, record_path, shard_path, write_whole
 from .workers import Worker
@@ -26,19 +27,10 @@ TABLE = 2**40
 """Byte that is locked while the folder is claimed, beyond those of all shards."""
 
 
-@contextlib.contextmanager
-def output_errors(folder: Path) -> Iterator[None]:
+def output_errors(folder: Path) -> contextlib.AbstractContextManager[None]:
     """What keeps this process from writing in a folder, as an OutputError."""
-    try:
-        yield
-    except OSError as error:
-        reason = error.strerror or str(error)
-        if error.errno not in FULL:
-            raise OutputError(f"cannot use {error.filename or folder} for the output: {reason}") from error
-        raise OutputError(
-            f"no room on the disk of {folder}: {reason}. The shards written so far are whole; free some space and "
-            "generate again to go on"
-        ) from error
+    kept = "The shards written so far are whole; free some space and generate again to go on"
+    return folder_errors(folder, kept)
 
 
 class Claim:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -99,13 +100,7 @@ def _fake(nodes, *arguments):
     return nodes.new_empty(nodes.shape)
 
 
-@torch.library.register_fake("torch_mpm::grid_update_backward")
-def _backward_fake(grad, wants_change, nodes, gravity, scene_dt, dt, kind, plane, friction, *topology):
-    slots = sizes(Topology.unpack(*topology).block, "block", 1)[0] if wants_change else 0
-    return nodes.new_empty(nodes.shape), nodes.new_empty(slots, sizes(nodes, "nodes", 2)[1] - 1)
-
-
-# ---- autograd
+# ---- autograd of ops with these arguments
 
 
 def _setup(ctx: Any, inputs: Any, output: Any) -> None:
@@ -113,21 +108,10 @@ def _setup(ctx: Any, inputs: Any, output: Any) -> None:
     save_with_topology(ctx, (nodes, gravity, scene_dt), topology, dt=dt, walls=(kind, plane, friction))
 
 
-def _backward(ctx, grad):
-    (nodes, gravity, scene_dt), topology = saved_with_topology(ctx)
-    need_nodes, need_gravity, need_dt, *_ = ctx.needs_input_grad
-    grad_nodes, change = dispatch(
-        torch.ops.torch_mpm.grid_update_backward,
-        *(grad, need_gravity or need_dt, nodes, gravity, scene_dt, ctx.dt, *ctx.walls, *topology),
-    )
-    grad_gravity = grad_dt = None
-    if need_gravity or need_dt:
-        change = sum_by_scene_of_blocks(change, Topology.unpack(*topology), gravity.shape[0])
-        if need_gravity:
-            grad_gravity = ctx.dt * (change if scene_dt is None else scene_dt[:, None] * change)
-        if need_dt:
-            grad_dt = ctx.dt * (gravity * change).sum(1)
-    return (grad_nodes if need_nodes else None, grad_gravity, grad_dt) + (None,) * 7
+def _backward_setup(ctx: Any, inputs: Any, output: Any) -> None:
+    grad, wants_change, nodes, gravity, scene_dt, dt, kind, plane, friction, *topology = inputs
+    options = {"wants_change": wants_change, "dt": dt, "walls": (kind, plane, friction)}
+    save_with_topology(ctx, (grad, nodes, gravity, scene_dt), topology, **options)
 
 
 def sum_by_scene_of_blocks(change: Tensor, blocks: Topology, scenes: int) -> Tensor:
@@ -138,34 +122,60 @@ def sum_by_scene_of_blocks(change: Tensor, blocks: Topology, scenes: int) -> Ten
     return change.new_zeros(scenes, *change.shape[1:]).index_add(0, scene, change)
 
 
-def _backward_setup(ctx: Any, inputs: Any, output: Any) -> None:
-    grad, wants_change, nodes, gravity, scene_dt, dt, kind, plane, friction, *topology = inputs
-    options = {"wants_change": wants_change, "dt": dt, "walls": (kind, plane, friction)}
-    save_with_topology(ctx, (grad, nodes, gravity, scene_dt), topology, **options)
+def register_update(name: str, composed: Callable[..., Tensor]) -> None:
+    """The adjoint of an op with the arguments of `grid_update`, first and second, and the fake kernel of the first.
+
+    Args:
+        name: of the op; that of its adjoint is NAME_backward.
+        composed: the op in torch operations, as `composed_grid_update`.
+    """
+    adjoint_op = getattr(torch.ops.torch_mpm, f"{name}_backward")
+
+    def fake(grad, wants_change, nodes, *arguments):
+        slots = sizes(Topology.unpack(*arguments[-3:]).block, "block", 1)[0] if wants_change else 0
+        return nodes.new_empty(nodes.shape), nodes.new_empty(slots, sizes(nodes, "nodes", 2)[1] - 1)
+
+    def backward(ctx, grad):
+        (nodes, gravity, scene_dt), topology = saved_with_topology(ctx)
+        need_nodes, need_gravity, need_dt, *_ = ctx.needs_input_grad
+        grad_nodes, change = dispatch(
+            adjoint_op,
+            *(grad.contiguous(), need_gravity or need_dt, nodes, gravity, scene_dt, ctx.dt, *ctx.walls, *topology),
+        )
+        grad_gravity = grad_dt = None
+        if need_gravity or need_dt:
+            change = sum_by_scene_of_blocks(change, Topology.unpack(*topology), gravity.shape[0])
+            if need_gravity:
+                grad_gravity = ctx.dt * (change if scene_dt is None else scene_dt[:, None] * change)
+            if need_dt:
+                grad_dt = ctx.dt * (gravity * change).sum(1)
+        return (grad_nodes if need_nodes else None, grad_gravity, grad_dt) + (None,) * 7
+
+    def double_backward(ctx, grad_grad_nodes, grad_change):
+        tensors, topology = saved_with_topology(ctx)
+        blocks = Topology.unpack(*topology)
+        faces = [Face(CONTACT_NAMES[kind], plane, friction) for kind, plane, friction in zip(*ctx.walls, strict=True)]
+
+        def adjoint(grad, nodes, gravity, scene_dt):
+            def update(nodes, change):
+                mass, momentum = nodes.split([1, nodes.shape[1] - 1], 1)
+                rows = torch.cat([mass, momentum + mass * change.repeat_interleave(blocks.grid.nodes_per_block, 0)], 1)
+                dt = ctx.dt if scene_dt is None else ctx.dt * scene_dt
+                return composed(blocks, rows, gravity, dt, faces)
+
+            change = nodes.new_zeros(blocks.block.shape[0], nodes.shape[1] - 1)
+            both = differentiate(update, (nodes, change), [grad])
+            return tuple(both) if ctx.wants_change else both[0]
+
+        given = [grad_grad_nodes, grad_change] if ctx.wants_change else [grad_grad_nodes]
+        grad, nodes, gravity, scene_dt = differentiate(adjoint, tensors, given)
+        return (grad, None, nodes, gravity, scene_dt) + (None,) * 7
+
+    torch.library.register_fake(f"torch_mpm::{name}_backward")(fake)
+    register_autograd(name, backward, _setup)
+    register_autograd(f"{name}_backward", double_backward, _backward_setup)
+    refuse_vmap(name)
+    refuse_vmap(f"{name}_backward")
 
 
-def _double_backward(ctx, grad_grad_nodes, grad_change):
-    tensors, topology = saved_with_topology(ctx)
-    blocks = Topology.unpack(*topology)
-    faces = [Face(CONTACT_NAMES[kind], plane, friction) for kind, plane, friction in zip(*ctx.walls, strict=True)]
-
-    def adjoint(grad, nodes, gravity, scene_dt):
-        def updated(nodes, change):
-            mass, momentum = nodes.split([1, nodes.shape[1] - 1], 1)
-            rows = torch.cat([mass, momentum + mass * change.repeat_interleave(blocks.grid.nodes_per_block, 0)], 1)
-            dt = ctx.dt if scene_dt is None else ctx.dt * scene_dt
-            return composed_grid_update(blocks, rows, gravity, dt, faces)
-
-        change = nodes.new_zeros(blocks.block.shape[0], nodes.shape[1] - 1)
-        both = differentiate(updated, (nodes, change), [grad])
-        return tuple(both) if ctx.wants_change else both[0]
-
-    given = [grad_grad_nodes, grad_change] if ctx.wants_change else [grad_grad_nodes]
-    grad, nodes, gravity, scene_dt = differentiate(adjoint, tensors, given)
-    return (grad, None, nodes, gravity, scene_dt) + (None,) * 7
-
-
-register_autograd("grid_update", _backward, _setup)
-register_autograd("grid_update_backward", _double_backward, _backward_setup)
-refuse_vmap("grid_update")
-refuse_vmap("grid_update_backward")
+register_update("grid_update", composed_grid_update)

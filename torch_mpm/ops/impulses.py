@@ -28,7 +28,7 @@ from .contact import (
     rows_of_slots,
     time_arguments,
 )
-from .grid_update import CONTACT_NAMES, check_nodes, sum_by_scene_of_blocks, update_arguments
+from .grid_update import check_nodes, register_update, sum_by_scene_of_blocks, update_arguments
 from .grid_update_composed import composed_grid_update
 
 
@@ -126,12 +126,6 @@ def _wall_fake(nodes, *arguments):
     return nodes.new_empty(scenes, 2 * dim, impulse_size(dim), dtype=torch.float64)
 
 
-@torch.library.register_fake("torch_mpm::wall_impulses_backward")
-def _wall_backward_fake(grad_impulse, wants_change, nodes, *arguments):
-    slots = sizes(Topology.unpack(*arguments[-3:]).block, "block", 1)[0] if wants_change else 0
-    return nodes.new_empty(nodes.shape), nodes.new_empty(slots, sizes(nodes, "nodes", 2)[1] - 1)
-
-
 @torch.library.register_fake("torch_mpm::contact_impulses")
 def _contact_fake(mass, velocity, obstacles, *arguments):
     dim, count = sizes(velocity, "velocity", 2)[1], sizes(obstacles, "obstacles", 3)[1]
@@ -149,53 +143,6 @@ def _contact_backward_fake(grad_impulse, wants_rows, mass, velocity, obstacles, 
 # ---- autograd of the walls
 
 
-def _wall_setup(ctx: Any, inputs: Any, output: Any) -> None:
-    nodes, gravity, scene_dt, dt, kind, plane, friction, *topology = inputs
-    save_with_topology(ctx, (nodes, gravity, scene_dt), topology, dt=dt, walls=(kind, plane, friction))
-
-
-def _wall_backward(ctx, grad):
-    (nodes, gravity, scene_dt), topology = saved_with_topology(ctx)
-    need_nodes, need_gravity, need_dt, *_ = ctx.needs_input_grad
-    grad_nodes, change = dispatch(
-        torch.ops.torch_mpm.wall_impulses_backward,
-        *(grad.contiguous(), need_gravity or need_dt, nodes, gravity, scene_dt, ctx.dt, *ctx.walls, *topology),
-    )
-    grad_gravity = grad_dt = None
-    if need_gravity or need_dt:
-        change = sum_by_scene_of_blocks(change, Topology.unpack(*topology), gravity.shape[0])
-        grad_gravity = ctx.dt * (change if scene_dt is None else scene_dt[:, None] * change) if need_gravity else None
-        grad_dt = ctx.dt * (gravity * change).sum(1) if need_dt else None
-    return (grad_nodes if need_nodes else None, grad_gravity, grad_dt) + (None,) * 7
-
-
-def _wall_backward_setup(ctx: Any, inputs: Any, output: Any) -> None:
-    grad, wants_change, nodes, gravity, scene_dt, dt, kind, plane, friction, *topology = inputs
-    options = {"wants_change": wants_change, "dt": dt, "walls": (kind, plane, friction)}
-    save_with_topology(ctx, (grad, nodes, gravity, scene_dt), topology, **options)
-
-
-def _wall_double_backward(ctx, grad_grad_nodes, grad_change):
-    tensors, topology = saved_with_topology(ctx)
-    blocks = Topology.unpack(*topology)
-    faces = [Face(CONTACT_NAMES[kind], plane, friction) for kind, plane, friction in zip(*ctx.walls, strict=True)]
-
-    def adjoint(grad, nodes, gravity, scene_dt):
-        def impulses(nodes, change):
-            mass, momentum = nodes.split([1, nodes.shape[1] - 1], 1)
-            rows = torch.cat([mass, momentum + mass * change.repeat_interleave(blocks.grid.nodes_per_block, 0)], 1)
-            dt = ctx.dt if scene_dt is None else ctx.dt * scene_dt
-            return _composed_wall_impulses(blocks, rows, gravity, dt, faces)
-
-        change = nodes.new_zeros(blocks.block.shape[0], nodes.shape[1] - 1)
-        both = differentiate(impulses, (nodes, change), [grad])
-        return tuple(both) if ctx.wants_change else both[0]
-
-    given = [grad_grad_nodes, grad_change] if ctx.wants_change else [grad_grad_nodes]
-    grad, nodes, gravity, scene_dt = differentiate(adjoint, tensors, given)
-    return (grad, None, nodes, gravity, scene_dt) + (None,) * 7
-
-
 def _composed_wall_impulses(
     blocks: Topology, nodes: Tensor, gravity: Tensor | None, dt: float | Tensor | None, faces: Sequence[Face]
 ) -> Tensor:
@@ -207,6 +154,9 @@ def _composed_wall_impulses(
 
     composed_grid_update(blocks, nodes, gravity, dt, faces, see)
     return torch.stack([impulse_of_nodes(blocks, momentum) for momentum in taken], 1)
+
+
+register_update("wall_impulses", _composed_wall_impulses)
 
 
 # ---- autograd of obstacles
@@ -260,10 +210,7 @@ def _contact_double_backward(ctx, grad_nodes, grad_rows):
     return (grads[0], None, *grads[1:]) + (None,) * 12
 
 
-register_autograd("wall_impulses", _wall_backward, _wall_setup)
-register_autograd("wall_impulses_backward", _wall_double_backward, _wall_backward_setup)
 register_autograd("contact_impulses", _contact_backward, _contact_setup)
 register_autograd("contact_impulses_backward", _contact_double_backward, _contact_backward_setup)
-for _name in ("wall_impulses", "contact_impulses"):
-    refuse_vmap(_name)
-    refuse_vmap(f"{_name}_backward")
+refuse_vmap("contact_impulses")
+refuse_vmap("contact_impulses_backward")

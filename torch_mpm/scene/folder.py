@@ -85,19 +85,19 @@ def prepare(folder: Path, scene: Scene, layout: Layout, fingerprint: str) -> Non
         create(folder / PARTIAL, layout)
 
 
+KEPT = "The frames written so far are whole; free some space and add --resume to continue"
+
+
 @contextlib.contextmanager
-def output_errors(folder: Path) -> Iterator[None]:
-    """What keeps this process from writing in a folder, as an OutputError."""
+def output_errors(folder: Path, kept: str = KEPT) -> Iterator[None]:
+    """What keeps this process from writing in a folder, as an OutputError; `kept` says what a full disk leaves."""
     try:
         yield
     except OSError as error:
         reason = error.strerror or str(error)
         if error.errno not in FULL:
             raise OutputError(f"cannot use {error.filename or folder} for the output: {reason}") from error
-        raise OutputError(
-            f"no room on the disk of {folder}: {reason}. The frames written so far are whole; "
-            "free some space and add --resume to continue"
-        ) from error
+        raise OutputError(f"no room on the disk of {folder}: {reason}. {kept}") from error
 
 
 # ---- run.json
