@@ -161,6 +161,8 @@ def main() -> None:
         print(json.dumps(generate(preset, overrides, device, Path(folder))))
         return
     result: dict[str, Any] = {"environment": common.environment(arguments.device), "sets": []}
+    if arguments.work:
+        arguments.work.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=arguments.work) as work:
         for name, preset, overrides in SETS[arguments.device]:
             if arguments.only in name:

@@ -31,7 +31,8 @@ from . import common
 COUNTS = ("tests", "failures", "errors", "skipped")
 SANITIZED_TESTS = {"memcheck": 16, "racecheck": 4, "initcheck": 16, "synccheck": 16}
 """Tests of one process; racecheck takes some .1 GB per second."""
-Outcome = tuple[int, dict[str, str] | None]
+Counts = dict[str, Any]
+Outcome = tuple[int, Counts | None]
 """The exit status of pytest, and the counts of its tests, None if it crashed."""
 
 
@@ -95,16 +96,22 @@ def run_side_by_side(
         unfinished = [number for number, (_, counts) in outcomes.items() if counts is None]
 
 
-def counts_of(report: Path) -> dict[str, str]:
-    return next(ElementTree.parse(report).getroot().iter("testsuite")).attrib
+def counts_of(report: Path) -> Counts:
+    """The counts of a report, and the names of its tests that did not pass."""
+    suite = next(ElementTree.parse(report).getroot().iter("testsuite"))
+    cases = [case for case in suite.iter("testcase") if {"failure", "error"} & {part.tag for part in case}]
+    return {
+        **{name: int(suite.attrib[name]) for name in COUNTS},
+        "failed": [f"{case.get('classname')}.{case.get('name')}" for case in cases],
+    }
 
 
-def summary(outcomes: dict[int, Outcome]) -> dict[str, int]:
-    """The worst exit status of the hands, and their counts together."""
-    total = dict.fromkeys(COUNTS, 0)
-    for _, counts in outcomes.values():
-        for name in COUNTS:
-            total[name] += int(counts[name]) if counts else int(name == "errors")
+def summary(outcomes: dict[int, Outcome]) -> dict[str, Any]:
+    """The worst exit status of the hands, their counts together, and the tests that did not pass."""
+    total: Counts = {**dict.fromkeys(COUNTS, 0), "failed": []}
+    for number, (_, counts) in outcomes.items():
+        for name, value in (counts or {"errors": 1, "failed": [f"hand {number}"]}).items():
+            total[name] += value
     return {"exit_status": max((status for status, _ in outcomes.values()), key=abs), **total}
 
 
@@ -115,6 +122,7 @@ def write(out: Path, result: dict[str, Any]) -> None:
         common.describe(result["environment"]),
         f"`pytest {' '.join(result['selection'])}`: exit status {result['exit_status']}",
         common.table(columns, [[result[name] for name in columns]]),
+        *(f"Did not pass: {name}" for name in result["failed"]),
     ]
     device = common.slug(result["environment"]["device"])
     common.write(out, "_".join(filter(None, ("tests", tool, device))), result, "\n\n".join(lines))
@@ -144,6 +152,7 @@ def main() -> None:
         for outcomes in run_side_by_side(tool, command, hands, arguments.processes, Path(name)):
             result |= summary(outcomes) | {"seconds": time.monotonic() - start}
             write(arguments.out, result)  # after each hand: what an interrupted run has found is kept
+    print("\n".join(f"Did not pass: {name}" for name in result.get("failed", [])))
     sys.exit(result["exit_status"])
 
 

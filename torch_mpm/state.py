@@ -38,20 +38,22 @@ class Time:
     def __get__(self, state: State | None, owner: type) -> float | Tensor:
         if state is None:
             return 0.0  # of a new state
-        time: Tensor | tuple[Tensor] = state.__dict__["_time"]
+        time: Tensor | tuple[Tensor] = state.__dict__["time"]
         if isinstance(time, Tensor):
             return time
         return time[0] if torch.compiler.is_compiling() else time[0].item()
 
-    def __set__(self, state: State, time: float | Tensor) -> None:
+    def __set__(self, state: State, time: float | Tensor | tuple[Tensor]) -> None:
         kept: Tensor | tuple[Tensor]
-        if isinstance(time, Tensor):
+        if type(time) is tuple:  # of another state
+            kept = time
+        elif isinstance(time, Tensor):
             number = torch.compiler.is_compiling() and time.dim() == 0 and time.dtype == torch.float64
             kept = (time,) if number and time.device.type == "cpu" and not time.requires_grad else time
         else:
             seconds = float(check_real("time", time, "a number or a tensor [B]"))
             kept = (torch.scalar_tensor(seconds, dtype=torch.float64, device="cpu"),)
-        state.__dict__["_time"] = kept
+        state.__dict__["time"] = kept
 
 
 @dataclasses.dataclass(eq=False)
@@ -161,7 +163,7 @@ class State:
 
     def replace(self, **changes: Any) -> State:
         """A copy with some fields changed."""
-        return dataclasses.replace(self, **changes)
+        return type(self)(**{**vars(self), **changes})  # `dataclasses.replace` takes 5 µs more
 
     def map(self, function: Callable[[Tensor], Tensor]) -> State:
         """A copy with a function applied to every per-particle tensor, absent fields staying None."""

@@ -221,17 +221,17 @@ class Step(TensorModule):
         self, blocks: Blocks, nodes: Tensor, state: State, dt: float | Tensor
     ) -> tuple[Tensor, Tensor | None]:
         """Node velocities, and the impulses on boundaries and walls where they are asked for."""
-        gravity, mass = self.gravity_like(state.x), nodes[:, 0]
+        gravity = self.gravity_like(state.x)
         velocity = grid_update(blocks, nodes, gravity, dt, self.walls)
         impulse: Tensor | None = None
         on_boundaries: list[Tensor] = []
         if boundaries := self.boundaries.entries:
-            asked = mass if state.impulse is not None else None
+            asked = nodes[:, 0] if state.impulse is not None else None
             velocity, on_boundaries = after_boundaries(blocks, velocity, boundaries, state, dt, asked)
         if state.impulse is not None:
             impulse = torch.cat([*on_boundaries, wall_impulses(blocks, nodes, gravity, dt, self.walls)], 1)
         if self.on_grid is not None:
-            velocity = from_half(self.on_grid(blocks, velocity, mass, dt), nodes)
+            velocity = from_half(self.on_grid(blocks, velocity, nodes[:, 0], dt), nodes)
         return velocity, impulse
 
     @property
