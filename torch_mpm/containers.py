@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -11,16 +10,16 @@ from torch import Tensor
 from torch.utils import _pytree
 from torch.utils.data._utils.collate import default_collate_fn_map
 
-from .state import State
+from .state import FIELDS, State
 
-FIELDS = tuple(f.name for f in dataclasses.fields(State) if f.name not in ("extra", "time"))
+TENSORS = tuple(name for name in FIELDS if name not in ("extra", "time"))
 Layout = tuple[tuple[str, ...], tuple[str, ...], "float | None"]
 """Names of the fields and of the entries of `extra` that are leaves, and the time where it is a number."""
 
 
 def _flatten(state: State) -> tuple[list[Any], Layout]:
     """The tensors of a state are leaves, absent fields are not."""
-    names = tuple(name for name in FIELDS if getattr(state, name) is not None)
+    names = tuple(name for name in TENSORS if getattr(state, name) is not None)
     time = state.time
     leaves = [getattr(state, name) for name in names] + list(state.extra.values())
     number = None if isinstance(time, Tensor) else time
@@ -39,7 +38,7 @@ def _unflatten(leaves: Any, layout: Layout) -> State:
     names, extra, time = layout
     values = list(leaves)
     state: State = object.__new__(State)
-    state.__dict__.update(dict.fromkeys(FIELDS))
+    state.__dict__.update(dict.fromkeys(TENSORS))
     state.__dict__.update(zip(names, values, strict=False))
     state.extra = dict(zip(extra, values[len(names) :], strict=False))
     if time is None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import collections
 import contextlib
-import dataclasses
 import math
 import threading
 from typing import Any
@@ -19,15 +18,13 @@ from .errors import check_count, shape_of
 from .grid import Grid
 from .laws.custom import CustomLaw
 from .parameters import has_hooks
-from .state import State, check_state
+from .state import FIELDS, State, check_state
 from .step import Step
 
 LEAST_STEPS = 6
 """For which a step is recorded: that takes the host as long as one or two steps."""
 CHUNK = 64
 """Steps between two looks at how many blocks are active, where the pool follows the scene on CUDA."""
-
-_FIELDS = tuple(f.name for f in dataclasses.fields(State) if f.name != "extra")
 
 
 def time_after(time: float | Tensor, dt: float | Tensor, n: int) -> float | Tensor:
@@ -196,7 +193,7 @@ def _time_tensor(state: State) -> Tensor:
 
 def _tensors(state: State) -> dict[str, Tensor]:
     """The tensors of a state by name, those of `extra` as "extra.name"."""
-    fields = {name: getattr(state, name) for name in _FIELDS}
+    fields = {name: getattr(state, name) for name in FIELDS if name != "extra"}
     fields |= {f"extra.{name}": value for name, value in state.extra.items()}
     return {name: value for name, value in fields.items() if isinstance(value, Tensor)}
 

@@ -43,11 +43,9 @@ class Time:
             return time
         return time[0] if torch.compiler.is_compiling() else time[0].item()
 
-    def __set__(self, state: State, time: float | Tensor | tuple[Tensor]) -> None:
+    def __set__(self, state: State, time: float | Tensor) -> None:
         kept: Tensor | tuple[Tensor]
-        if type(time) is tuple:  # of another state
-            kept = time
-        elif isinstance(time, Tensor):
+        if isinstance(time, Tensor):
             number = torch.compiler.is_compiling() and time.dim() == 0 and time.dtype == torch.float64
             kept = (time,) if number and time.device.type == "cpu" and not time.requires_grad else time
         else:
@@ -163,7 +161,10 @@ class State:
 
     def replace(self, **changes: Any) -> State:
         """A copy with some fields changed."""
-        return type(self)(**{**vars(self), **changes})  # `dataclasses.replace` takes 5 µs more
+        if "time" not in changes:
+            changes["time"] = self.time
+        kept = {name: self.__dict__[name] for name in FIELDS}  # `dataclasses.replace` takes 5 µs more
+        return State(**{**kept, **changes})
 
     def map(self, function: Callable[[Tensor], Tensor]) -> State:
         """A copy with a function applied to every per-particle tensor, absent fields staying None."""
@@ -274,7 +275,8 @@ class State:
         return State(**joined, extra=extra, time=time, impulse=impulse)
 
 
-PARTICLE_FIELDS = tuple(f.name for f in dataclasses.fields(State) if f.name not in ("extra", "time", "impulse"))
+FIELDS = tuple(f.name for f in dataclasses.fields(State))
+PARTICLE_FIELDS = tuple(name for name in FIELDS if name not in ("extra", "time", "impulse"))
 """Fields with a row for each particle, beside those in `extra`."""
 
 

@@ -70,6 +70,7 @@ def test_it_learns_from_the_disk_and_online_alike(data, configuration, tmp_path,
         losses[name] = sum(history[-50:]) / 50
         assert losses[name] < 0.92 * sum(history[:5]) / 5
     assert losses["online"] == pytest.approx(losses["disk"], rel=0.1)
+    pytest.importorskip("imageio_ffmpeg")  # for the video
     found = example.compare(model, data, tmp_path)
     assert found["network"][-1] < 0.9 * found["constant velocity"][-1]
     assert {p.name for p in tmp_path.iterdir()} == {"errors.png", "rollout.mp4"}
