@@ -7,13 +7,14 @@
 
 Each data set is generated in a process of its own, from the start of Python to the last byte on the disk of FOLDER. The
 share of time in which the GPU runs a kernel is what nvidia-smi samples every 100 ms between the first and the last
-frame (its utilization), where there is nvidia-smi.
+frame (its utilization), where there is nvidia-smi, over all GPUs.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -23,25 +24,27 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from . import common, regressions
 
 SAND = ["dataset.splits={train=1000}", "dataset.particles=2000"]
-SETS: dict[str, list[tuple[str, str, list[str]]]] = {
+SETS: dict[str, list[tuple[str, str, list[str], int]]] = {
     "cuda": [
-        ("Sand, 1000 x 2000", "sand", SAND),
-        ("Sand, 1000 x 2000, not deterministic", "sand", [*SAND, "grid.deterministic=false"]),
-        ("Sand, 1000 x 2000, 125 a shard", "sand", [*SAND, "dataset.scenes_per_shard=125"]),
-        ("Water, 3-D, 64 scenes", "water_3d", ["dataset.splits={train=64}", "dataset.scenes_per_shard=32"]),
-        ("Melting, 128 scenes", "melting", ["dataset.splits={train=128}"]),
+        ("Sand, 1000 x 2000", "sand", SAND, 1),
+        ("Sand, 1000 x 2000, 4 processes a GPU", "sand", [*SAND, "dataset.scenes_per_shard=125"], 4),
+        ("Sand, 1000 x 2000, not deterministic", "sand", [*SAND, "grid.deterministic=false"], 1),
+        ("Water, 3-D, 64 scenes", "water_3d", ["dataset.splits={train=64}", "dataset.scenes_per_shard=32"], 1),
+        ("Melting, 128 scenes", "melting", ["dataset.splits={train=128}"], 1),
     ],
     "cpu": [
         ("Water drop, 32 scenes", "water_drop", ["dataset.splits={train=32}", "dataset.scenes_per_shard=16",
-                                                 "dataset.frames=101"]),
+                                                 "dataset.frames=101"], 1),
         ("Sand, 32 x 2000", "sand", ["dataset.splits={train=32}", "dataset.particles=2000",
-                                     "dataset.scenes_per_shard=16", "dataset.frames=101"]),
+                                     "dataset.scenes_per_shard=16", "dataset.frames=101"], 1),
     ],
 }  # fmt: skip
-"""Name, preset and overrides of the data sets by device."""
+"""Name, preset and overrides of the data sets by device, and processes that generate them, of each GPU."""
 QUICK = ["dataset.splits={train=4}", "dataset.scenes_per_shard=2", "dataset.frames=4"]
 
 
@@ -73,31 +76,46 @@ def generate(preset: str, overrides: list[str], device: str, folder: Path) -> di
     }
 
 
-def measured(name: str, preset: str, overrides: list[str], device: str, work: Path) -> dict[str, Any]:
-    """One data set in a process of its own."""
+def measured(name: str, preset: str, overrides: list[str], device: str, work: Path, processes: int) -> dict[str, Any]:
+    """One data set in processes of its own."""
     folder = work / "set"
     shutil.rmtree(folder, ignore_errors=True)
-    words = ["--one", json.dumps([preset, overrides, device, str(folder)])]
+    words = [sys.executable, "-m", "benchmarks.datasets", "--one", json.dumps([preset, overrides, device, str(folder)])]
     sampler = _sampler() if device == "cuda" else None
     begin = time.perf_counter()
-    done = subprocess.run([sys.executable, "-m", "benchmarks.datasets", *words], cwd=common.ROOT, capture_output=True,
-                          text=True)  # fmt: skip
+    pipe = subprocess.PIPE
+    started = [
+        subprocess.Popen(words, cwd=common.ROOT, env=environment, stdout=pipe, stderr=pipe, text=True)
+        for environment in _environments(processes)
+    ]
+    outputs = [one.communicate() for one in started]
     seconds = time.perf_counter() - begin
     samples = _samples(sampler)
-    if done.returncode:
-        raise RuntimeError(f"{name}: {done.stderr}")
-    row = json.loads(done.stdout.splitlines()[-1])
-    first, last = row.pop("between")
-    busy = [value for when, value in samples if first <= when <= last]
+    for one, (_, errors) in zip(started, outputs, strict=True):
+        if one.returncode:
+            raise RuntimeError(f"{name}: {errors}")
+    rows = [json.loads(output.splitlines()[-1]) for output, _ in outputs]
+    marks = [when for row in rows for when in row.pop("between")]
+    row = {**rows[-1], "processes": len(rows)}  # the data set as it is at the end, and the time of the slowest
+    row |= {key: max(r[key] for r in rows) for key in ("seconds", "simulating", "waiting", "valid", "again", "bytes")}
+    busy = [value for when, value in samples if min(marks) <= when <= max(marks)]
     shutil.rmtree(folder)
     return {"name": name, **row, "process": seconds, "busy": sum(busy) / len(busy) / 100 if busy else None}
 
 
+def _environments(processes: int) -> list[dict[str, str]]:
+    """As torchrun sets them."""
+    if processes == 1:
+        return [dict(os.environ)]
+    counts = {"WORLD_SIZE": str(processes), "LOCAL_WORLD_SIZE": str(processes), "OMP_NUM_THREADS": "1"}
+    return [{**os.environ, **counts, "RANK": str(k), "LOCAL_RANK": str(k)} for k in range(processes)]
+
+
 def _sampler() -> subprocess.Popen[str] | None:
-    """nvidia-smi, which tells its utilization every 100 ms."""
+    """nvidia-smi, which tells the utilization of each GPU every 100 ms."""
     query = ["nvidia-smi", "--query-gpu=timestamp,utilization.gpu", "--format=csv,noheader,nounits", "-lms", "100"]
     try:
-        return subprocess.Popen([*query, "-i", "0"], stdout=subprocess.PIPE, text=True)
+        return subprocess.Popen(query, stdout=subprocess.PIPE, text=True)
     except OSError:
         return None
 
@@ -119,8 +137,8 @@ def _samples(sampler: subprocess.Popen[str] | None) -> list[tuple[float, float]]
 
 
 HEADER = (
-    "data set", "scenes", "tried again", "particles a scene", "frames", "substeps a frame", "s", "with start of Python",
-    "simulating, s", "waiting, s", "scenes/s", "M particle steps/s", "GPU busy", "GB",
+    "data set", "processes", "scenes", "tried again", "particles a scene", "frames", "substeps a frame", "s",
+    "with start of Python", "simulating, s", "waiting, s", "scenes/s", "M particle steps/s", "GPU busy", "GB",
 )  # fmt: skip
 
 
@@ -128,8 +146,9 @@ def row_of(r: dict[str, Any]) -> tuple[Any, ...]:
     steps = r["particles"] * (r["frames"] - 1) * r["substeps"]
     scenes = max(r["valid"], 1)
     return (
-        r["name"], r["valid"], r["again"], r["particles"] // scenes, r["frames"], r["substeps"], r["seconds"],
-        r["process"], r["simulating"], r["waiting"], r["valid"] / r["seconds"], steps / r["seconds"] * 1e-6, r["busy"],
+        r["name"], r["processes"], r["valid"], r["again"], r["particles"] // scenes, r["frames"], r["substeps"],
+        r["seconds"], r["process"], r["simulating"], r["waiting"], r["valid"] / r["seconds"],
+        steps / r["seconds"] * 1e-6, r["busy"],
         r["bytes"] * 1e-9,
     )  # fmt: skip
 
@@ -161,13 +180,15 @@ def main() -> None:
         print(json.dumps(generate(preset, overrides, device, Path(folder))))
         return
     result: dict[str, Any] = {"environment": common.environment(arguments.device), "sets": []}
+    gpus = torch.cuda.device_count() if arguments.device == "cuda" else 1
     if arguments.work:
         arguments.work.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=arguments.work) as work:
-        for name, preset, overrides in SETS[arguments.device]:
+        for name, preset, overrides, processes in SETS[arguments.device]:
             if arguments.only in name:
                 more = QUICK if arguments.quick else []
-                result["sets"].append(measured(name, preset, [*overrides, *more], arguments.device, Path(work)))
+                set_of = (name, preset, [*overrides, *more], arguments.device, Path(work), processes * gpus)
+                result["sets"].append(measured(*set_of))
                 print(common.table(HEADER, [row_of(result["sets"][-1])]), flush=True)
     name = f"datasets_{common.slug(result['environment']['device'])}"
     regressions.show(name, result, timed)

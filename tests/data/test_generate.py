@@ -297,6 +297,7 @@ def test_a_first_scene_that_is_wrong_fails_alone(monkeypatch):
     [
         ({}, Worker(0, 1, 0)),
         ({"RANK": "3", "WORLD_SIZE": "8", "LOCAL_RANK": "1"}, Worker(3, 8, 1)),
+        ({"RANK": "3", "WORLD_SIZE": "8", "LOCAL_RANK": "1", "LOCAL_WORLD_SIZE": "2"}, Worker(3, 8, 1, 2)),
         ({"SLURM_PROCID": "2", "SLURM_NTASKS": "4", "SLURM_LOCALID": "2"}, Worker(2, 4, 2)),
         ({"SLURM_ARRAY_TASK_ID": "7", "SLURM_ARRAY_TASK_MIN": "5", "SLURM_ARRAY_TASK_COUNT": "3"}, Worker(2, 3, 0)),
         (
@@ -312,7 +313,15 @@ def test_what_the_environment_says(environment, expected):
     assert worker(environment) == expected
 
 
-@pytest.mark.parametrize("environment", [{"RANK": "x"}, {"RANK": "4", "WORLD_SIZE": "4"}, {"SLURM_PROCID": "1"}])
+@pytest.mark.parametrize(
+    "environment",
+    [
+        {"RANK": "x"},
+        {"RANK": "4", "WORLD_SIZE": "4"},
+        {"SLURM_PROCID": "1"},
+        {"RANK": "3", "WORLD_SIZE": "4", "LOCAL_RANK": "2", "LOCAL_WORLD_SIZE": "2"},
+    ],
+)
 def test_an_environment_that_makes_no_sense(environment):
     with pytest.raises(WorkerError, match="must be"):
         worker(environment)
@@ -325,6 +334,10 @@ def test_a_process_without_a_gpu_of_its_own(monkeypatch):
     assert take_device("auto", Worker(5, 8, 1)) == torch.device("cuda", 1) and taken == [1]
     with pytest.raises(WorkerError, match="process 6 of 8 needs GPU 2 of its machine, and torch finds 2"):
         take_device("cuda", Worker(6, 8, 2))
+    with pytest.raises(WorkerError, match="two, three, "):
+        take_device("cuda", Worker(2, 3, 2, 3))
+    found = [take_device("cuda", Worker(rank, 4, rank, 4)) for rank in range(4)]  # two processes on each GPU
+    assert found == [torch.device("cuda", index) for index in (0, 1, 0, 1)]
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
     assert take_device("cuda", Worker(6, 8, 2)) == torch.device("cuda", 0)  # of those that each see one
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 0)

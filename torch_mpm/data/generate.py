@@ -66,7 +66,8 @@ def generate(
     folder = Path(out)
     record = record_of(configuration, chosen)
     with Claim(folder, record, configuration.text, one) as claim:
-        line = _Line(configuration, claim, chosen, progress)
+        cores = max(1, len(os.sched_getaffinity(0)) // max(1, one.beside))
+        line = _Line(configuration, claim, chosen, cores, progress)
         with output_errors(folder):
             line.run(check)
         complete = len(claim.finished()) == record.shards
@@ -117,9 +118,15 @@ class _Line:
     """One shard is drawn, one simulated and one written at a time, each by a thread of its own."""
 
     def __init__(
-        self, configuration: Configuration, claim: Claim, device: torch.device, progress: Progress | None
+        self,
+        configuration: Configuration,
+        claim: Claim,
+        device: torch.device,
+        cores: int,
+        progress: Progress | None,
     ) -> None:
         self.configuration, self.claim, self.device, self.progress = configuration, claim, device, progress
+        self._cores = cores
         self.totals: dict[str, Any] = {"scenes": 0, "failed": 0, "simulating": 0.0, "waiting": 0.0}
         self._stream = torch.cuda.Stream(device) if device.type == "cuda" else None
         self._missing = claim.record.scenes - claim.finished_scenes()
@@ -128,7 +135,7 @@ class _Line:
         """All shards that nobody else takes."""
         with ExitStack() as stack:
             self._drawer, self._writer = (stack.enter_context(ThreadPoolExecutor(1)) for _ in range(2))
-            self._packers = stack.enter_context(ThreadPoolExecutor(len(os.sched_getaffinity(0))))
+            self._packers = stack.enter_context(ThreadPoolExecutor(self._cores))
             shards = self.claim.unfinished(check)
             coming: tuple[int, Future[Drawn]] | None = self._next(shards)
             written: Future[None] | None = None

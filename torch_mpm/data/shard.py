@@ -15,7 +15,6 @@ import io
 import json
 import math
 import os
-import zlib
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -72,13 +71,22 @@ def chunk_frames(shape: tuple[int, ...], dtype: npt.DTypeLike) -> int:
     return max(1, min(shape[0], CHUNK_BYTES // max(row, 1)))
 
 
+def isal_zlib_module() -> Any:
+    """A zlib that is some ten times as fast, and compresses a tenth less."""
+    try:
+        from isal import isal_zlib
+    except ImportError as error:
+        raise ImportError("data sets need isal: pip install torch-mpm[data]") from error
+    return isal_zlib
+
+
 def compress_chunk(rows: Array, frames: int) -> bytes:
     """Up to ``frames`` rows as one chunk of a file, filled up with zeros. Other threads run meanwhile."""
     if len(rows) < frames:
         rows = np.concatenate([rows, np.zeros((frames - len(rows), *rows.shape[1:]), rows.dtype)])
     data = np.ascontiguousarray(rows)
     shuffled = np.ascontiguousarray(data.view(np.uint8).reshape(-1, data.itemsize).T)
-    return zlib.compress(shuffled.data, GZIP_LEVEL)
+    return isal_zlib_module().compress(shuffled.data, GZIP_LEVEL)
 
 
 def compress(values: Array) -> Compressed:

@@ -31,8 +31,8 @@ class Sums:
 
     @classmethod
     def of(cls, vectors: Array) -> Sums:
-        """Of vectors [..., D]."""
-        axes = np.ascontiguousarray(vectors.reshape(-1, vectors.shape[-1]).T)
+        """Of vectors [D, ...]."""
+        axes = vectors.reshape(len(vectors), -1)
         squares = tuple(float(np.einsum("n,n->", axis, axis)) for axis in axes)
         return cls(axes.shape[1], tuple(axes.sum(1).tolist()), squares)
 
@@ -76,11 +76,13 @@ def motion_sums(position: Array, particle_type: Array | None = None) -> Motion:
     if not np.isfinite(position).all():
         raise ValueError("position must be finite")
     free = position if particle_type is None else position[:, particle_type != BOUNDARY]
-    motion = Motion(Sums.zero(position.shape[2]), Sums.zero(position.shape[2]))
-    last = free[:0].astype(np.float64)  # velocity of the frame before
+    dim = position.shape[2]
+    motion = Motion(Sums.zero(dim), Sums.zero(dim))
+    last = np.zeros((dim, 0, free.shape[1]))  # velocity [D, 1, N] of the frame before
     for first in range(0, len(free) - 1, FRAMES):
-        velocity = np.diff(free[first : first + FRAMES + 1].astype(np.float64), axis=0)
-        acceleration = np.diff(np.concatenate([last, velocity]), axis=0)
+        axes = free[first : first + FRAMES + 1].transpose(2, 0, 1).astype(np.float64, order="C")
+        velocity = np.diff(axes, axis=1)
+        acceleration = np.diff(np.concatenate([last, velocity], 1), axis=1)
         motion += Motion(Sums.of(velocity), Sums.of(acceleration))
-        last = velocity[-1:]
+        last = velocity[:, -1:]
     return motion

@@ -15,16 +15,21 @@ class WorkerError(ValueError):
 
 @dataclass(frozen=True)
 class Worker:
-    """One of ``size`` processes; ``local`` is its number among those of its machine."""
+    """One of ``size`` processes.
+
+    ``local`` is its number among the ``beside`` processes of its machine, of which there are 0 where that is unknown.
+    """
 
     rank: int = 0
     size: int = 1
     local: int = 0
+    beside: int = 0
 
 
 def worker(environment: Mapping[str, str] = os.environ) -> Worker:
-    """What the environment says: RANK, WORLD_SIZE and LOCAL_RANK (torchrun); SLURM_PROCID, SLURM_NTASKS and
-    SLURM_LOCALID (tasks), SLURM_ARRAY_TASK_ID, _MIN, _STEP and _COUNT (an array, of whose jobs each may have tasks).
+    """What the environment says: RANK, WORLD_SIZE, LOCAL_RANK and LOCAL_WORLD_SIZE (torchrun); SLURM_PROCID,
+    SLURM_NTASKS, SLURM_LOCALID and SLURM_NTASKS_PER_NODE (tasks), SLURM_ARRAY_TASK_ID, _MIN, _STEP and _COUNT (an
+    array, of whose jobs each may have tasks).
 
     Raises:
         WorkerError: for what is no number, or a rank that is not below the number of processes.
@@ -38,15 +43,17 @@ def worker(environment: Mapping[str, str] = os.environ) -> Worker:
             raise WorkerError(f"{name} must be a whole number, got {text!r}") from None
 
     if "RANK" in environment:
-        found = Worker(number("RANK", 0), number("WORLD_SIZE", 1), number("LOCAL_RANK", 0))
+        beside = number("LOCAL_WORLD_SIZE", 0)
+        found = Worker(number("RANK", 0), number("WORLD_SIZE", 1), number("LOCAL_RANK", 0), beside)
     else:
         tasks, array = number("SLURM_NTASKS", 1), number("SLURM_ARRAY_TASK_COUNT", 1)
         first, step = number("SLURM_ARRAY_TASK_MIN", 0), number("SLURM_ARRAY_TASK_STEP", 1)
         job = (number("SLURM_ARRAY_TASK_ID", first) - first) // max(step, 1)
         rank = job * tasks + number("SLURM_PROCID", 0)
-        found = Worker(rank, array * tasks, number("SLURM_LOCALID", 0))
-    if not 0 <= found.rank < found.size or found.local < 0:
-        raise WorkerError(f"the rank of a process must be below their number, got rank {found.rank} of {found.size}")
+        found = Worker(rank, array * tasks, number("SLURM_LOCALID", 0), number("SLURM_NTASKS_PER_NODE", 0))
+    for rank, size in ((found.rank, found.size), (found.local, found.beside or found.local + 1)):
+        if not 0 <= rank < size:
+            raise WorkerError(f"the rank of a process must be below their number, got rank {rank} of {size}")
     return found
 
 
@@ -55,7 +62,8 @@ def take_device(name: str, one: Worker) -> torch.device:
 
     Args:
         name: "cpu", "cuda", "cuda:1", ... or "auto": a GPU if torch finds one. Without a number, processes take the GPU
-            of their number on the machine; where each sees one alone, all take that.
+            of their number on the machine, in turn where there are two, three, ... times as many; where each sees one
+            GPU alone, all take that.
         one: this process.
 
     Raises:
@@ -72,11 +80,15 @@ def take_device(name: str, one: Worker) -> torch.device:
         return device
     if device.type != "cuda" or not count:
         raise WorkerError(f"process {one.rank} of {one.size} needs {name!r}, and torch finds no such device")
-    index = device.index if device.index is not None else 0 if count == 1 else one.local
+    if device.index is not None:
+        index = device.index
+    else:
+        shared = count == 1 or (one.beside and one.beside % count == 0)
+        index = one.local % count if shared else one.local
     if index >= count:
         raise WorkerError(
             f"process {one.rank} of {one.size} needs GPU {index} of its machine, and torch finds {count}; start as "
-            "many processes per machine as it has GPUs"
+            "many processes per machine as it has GPUs, or two, three, ... times as many"
         )
     torch.cuda.set_device(index)
     return torch.device("cuda", index)

@@ -53,7 +53,7 @@ class _Statistics:
         for name, values in fields.items():
             vectors = values.astype(np.float64).reshape(len(values), -1, len(self.sums[name][0].sum))
             for k, part in enumerate((vectors, np.diff(vectors, axis=0))):
-                self.sums[name][k] += Sums.of(part)
+                self.sums[name][k] += Sums.of(np.moveaxis(part, -1, 0))
 
     def words(self) -> dict[str, dict[str, float | list[float]]]:
         def plain(values: list[float]) -> float | list[float]:
