@@ -45,6 +45,8 @@ SETS: dict[str, list[tuple[str, str, list[str], int]]] = {
     ],
 }  # fmt: skip
 """Name, preset and overrides of the data sets by device, and processes that generate them, of each GPU."""
+PEER = {"water_drop": "water", "sand": "sand"}
+"""Presets of which `datasets_peer` makes scenes one by one, and what of."""
 QUICK = ["dataset.splits={train=4}", "dataset.scenes_per_shard=2", "dataset.frames=4"]
 
 
@@ -103,6 +105,17 @@ def measured(name: str, preset: str, overrides: list[str], device: str, work: Pa
     return {"name": name, **row, "process": seconds, "busy": sum(busy) / len(busy) / 100 if busy else None}
 
 
+def peer(row: dict[str, Any], material: str, device: str) -> float | None:
+    """Time per frame and scene of a script in Taichi [s]; None where Taichi is not there."""
+    particles = str(row["particles"] // max(row["valid"], 1))
+    words = [sys.executable, "-m", "benchmarks.datasets_peer", material, "--device", device, "--particles", particles]
+    done = subprocess.run(words, cwd=common.ROOT, capture_output=True, text=True)
+    if done.returncode:
+        print(done.stderr, file=sys.stderr)
+        return None
+    return json.loads(done.stdout.splitlines()[-1])["s_per_frame"]
+
+
 def _environments(processes: int) -> list[dict[str, str]]:
     """As torchrun sets them."""
     if processes == 1:
@@ -139,17 +152,19 @@ def _samples(sampler: subprocess.Popen[str] | None) -> list[tuple[float, float]]
 HEADER = (
     "data set", "processes", "scenes", "tried again", "particles a scene", "frames", "substeps a frame", "s",
     "with start of Python", "simulating, s", "waiting, s", "scenes/s", "M particle steps/s", "GPU busy", "GB",
+    "us a frame and scene", "Taichi", "times",
 )  # fmt: skip
 
 
 def row_of(r: dict[str, Any]) -> tuple[Any, ...]:
     steps = r["particles"] * (r["frames"] - 1) * r["substeps"]
     scenes = max(r["valid"], 1)
+    per_frame, there = r["seconds"] / scenes / (r["frames"] - 1), r.get("peer")
     return (
         r["name"], r["processes"], r["valid"], r["again"], r["particles"] // scenes, r["frames"], r["substeps"],
         r["seconds"], r["process"], r["simulating"], r["waiting"], r["valid"] / r["seconds"],
-        steps / r["seconds"] * 1e-6, r["busy"],
-        r["bytes"] * 1e-9,
+        steps / r["seconds"] * 1e-6, r["busy"], r["bytes"] * 1e-9, 1e6 * per_frame, there and 1e6 * there,
+        there and there / per_frame,
     )  # fmt: skip
 
 
@@ -157,7 +172,13 @@ def text(result: dict[str, Any]) -> str:
     """The table of a result in Markdown."""
     rows = [row_of(r) for r in result["sets"]]
     lines = ["# Generating data sets", "", common.describe(result["environment"]), "", common.table(HEADER, rows), ""]
-    return "\n".join([*lines, "Simulating: time in which the host simulates; waiting: for scenes or files, beside it."])
+    return "\n".join(
+        [
+            *lines,
+            "Simulating: time in which the host simulates; waiting: for scenes or files, beside it. "
+            "Taichi: time a frame of scenes one by one, files included, compilation not.",
+        ]
+    )
 
 
 def timed(result: dict[str, Any]) -> Iterator[tuple[str, float]]:
@@ -169,6 +190,7 @@ def timed(result: dict[str, Any]) -> Iterator[tuple[str, float]]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--device", default="cpu", choices=["cpu", "cuda"])
+    parser.add_argument("--peers", action="store_true", help="also scenes one by one in Taichi")
     parser.add_argument("--quick", action="store_true", help="small sets, to see that it works")
     parser.add_argument("--out", type=Path, default=common.RESULTS)
     parser.add_argument("--work", type=Path, help="where the data sets are written; by default a temporary folder")
@@ -188,7 +210,9 @@ def main() -> None:
             if arguments.only in name:
                 more = QUICK if arguments.quick else []
                 set_of = (name, preset, [*overrides, *more], arguments.device, Path(work), processes * gpus)
-                result["sets"].append(measured(*set_of))
+                result["sets"].append(row := measured(*set_of))
+                if preset in PEER and arguments.peers:
+                    row["peer"] = peer(row, PEER[preset], arguments.device)
                 print(common.table(HEADER, [row_of(result["sets"][-1])]), flush=True)
     name = f"datasets_{common.slug(result['environment']['device'])}"
     regressions.show(name, result, timed)
