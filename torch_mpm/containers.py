@@ -42,7 +42,7 @@ def _unflatten(leaves: Any, layout: Layout) -> State:
     state.__dict__.update(zip(names, values, strict=False))
     state.extra = dict(zip(extra, values[len(names) :], strict=False))
     if time is None:
-        state.__dict__["time"] = values[-1]
+        state.__dict__["_time"] = values[-1]
     else:
         state.time = time
     return state
