@@ -175,19 +175,19 @@ class Step(TensorModule):
 
     def _moved(self, state: State, dt: float | Tensor) -> State:
         """A prepared state one step later, without what acts on the particles before."""
-        grid, scene = self.grid, state.scene
+        grid, law, scene = self.grid, self.law, state.scene
         blocks = self._activations.activate(grid, state.x, scene, state.ids)
         form, affine = self.stress_form, state.C if self.transfer == "apic" else None
-        fields, stress = self.law(Overlay(state, dt=dt) if self._rate_dependent else state)
+        fields, stress = law(Overlay(state, dt=dt) if self._rate_dependent else state)
         stress = from_half(stress, state.x)
         dissipated = fields.pop("dissipated", None)
-        if self.law.extra_fields:
-            history = {name: fields.pop(name) for name in self.law.extra_fields if name in fields}
+        if law.extra_fields:
+            history = {name: fields.pop(name) for name in law.extra_fields if name in fields}
             state = state.replace(extra={**state.extra, **history})
         nodes = p2g(blocks, state.x, state.mass, state.v, affine, stress, state.volume, dt, form)
         velocity, impulse = self._update_grid(blocks, nodes, state, dt)
         deformed = {name: fields.get(name, getattr(state, name)) for name in ("F", "J")}
-        keeps_C = self.transfer == "apic" or self.law.viscous
+        keeps_C = self.transfer == "apic" or law.viscous
         x, v, C, F, J = g2p_advance(
             blocks, state.x, velocity, dt, **deformed, affine=keeps_C or self.heat is not None, stress_form=form
         )
@@ -205,13 +205,14 @@ class Step(TensorModule):
     def prepare(self, state: State) -> State:
         """Give a state the fields that this step needs and that it lacks."""
         check_state(state)
+        law = self.law
         changes: dict[str, Any] = {}
-        if "F" in self.law.state_fields and state.F is None:
+        if "F" in law.state_fields and state.F is None:
             changes["F"] = identity_deformation(state.x)
-        if "J" in self.law.state_fields and state.J is None:
+        if "J" in law.state_fields and state.J is None:
             changes["J"] = torch.ones_like(state.mass)
-        if missing := [name for name in self.law.extra_fields if name not in state.extra]:
-            changes["extra"] = {**state.extra, **{name: self.law.initial(name, state) for name in missing}}
+        if missing := [name for name in law.extra_fields if name not in state.extra]:
+            changes["extra"] = {**state.extra, **{name: law.initial(name, state) for name in missing}}
         if state.impulse is not None:
             check_impulse(self, state)
         state = state.replace(**changes) if changes else state

@@ -94,6 +94,7 @@ class Viewer:
         with self._lock:
             self.clip = clip
             self._measure()
+        self._color.options = tuple(clip.fields)  # of which this scene may have others
         self._frame.max = max(1, len(clip.position) - 1)
         self._frame.value = 0
         self.show()
@@ -108,7 +109,8 @@ class Viewer:
     def show(self) -> None:
         """Put the chosen frame on the page."""
         with self._lock:
-            frame, name = min(self._frame.value, len(self.clip.position) - 1), self._color.value
+            frame = min(self._frame.value, len(self.clip.position) - 1)
+            name = self._color.value if self._color.value in self.clip.fields else "speed"
             x, values = self.clip.position[frame], self.clip.values(name, frame)
             there = np.isfinite(x).all(1)
             with self._server.atomic():

@@ -102,8 +102,6 @@ def test_the_radius_holds_some_neighbours(path, tmp_path):
     lattice = np.stack(np.meshgrid(*[np.arange(-5, 6) * spacing] * 2), -1).reshape(-1, 2)
     near = (np.linalg.norm(lattice, axis=1) <= connectivity_radius(DatasetFolder(path))).sum()
     assert 17 <= near <= 25
-    chosen = datasets.make_dataset(tmp_path / "set", connectivity_radius=0.015, shards=1)
-    assert metadata(DatasetFolder(chosen))["default_connectivity_radius"] == 0.015
 
 
 def test_nothing_yet(tmp_path):

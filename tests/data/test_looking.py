@@ -1,5 +1,6 @@
 """Looking at data sets: contact sheets, videos, statistics, the viewer, and the commands for them."""
 
+import dataclasses
 import json
 import urllib.request
 
@@ -120,6 +121,11 @@ def test_the_viewer_serves_a_page_and_shows_frames(path):
             viewer._color.value = name
             viewer.show()
             assert len(viewer._cloud.colors) == 47
+        viewer.source.clip = lambda name, clip=viewer.clip: dataclasses.replace(
+            clip, fields={"speed": clip.fields["speed"]}
+        )
+        viewer._choose()  # a scene without the colour that was chosen
+        assert viewer._color.value == "speed" and len(viewer._cloud.colors) == 47
     finally:
         viewer.close()
 

@@ -23,7 +23,8 @@ def places(batch):
 
 
 def stream(**options):
-    return OnlineStream(options.pop("simulate", numbers), 4, **{"scenes": 3, "seed": 1, **options})
+    given = {"simulate": numbers, "batch_size": 4, "scenes": 3, "seed": 1, **options}
+    return OnlineStream(given.pop("simulate"), given.pop("batch_size"), **given)
 
 
 def test_batches_hold_the_windows_of_the_scenes(device):
@@ -50,6 +51,14 @@ def test_every_round_has_new_scenes_and_all_windows_of_the_good_ones():
         assert sorted(found) == sorted([(k, first) for k in good for first in range(6)] * 2)
 
 
+def test_a_round_with_too_few_good_scenes_for_a_batch_is_left_out():
+    def simulate(ids):
+        return [None if k in (0, 2) else scene for k, scene in zip(ids, numbers(ids), strict=True)]
+
+    found = {k for batch in itertools.islice(stream(simulate=simulate, batch_size=9), 2) for k, _ in places(batch)}
+    assert found <= set(range(4, 9)) and 1 not in found
+
+
 def test_ranks_have_scenes_of_their_own():
     ids = [stream(rank=r, world=2).scene_ids(n) for n in range(2) for r in range(2)]
     assert [k for part in ids for k in part] == list(range(12))
@@ -64,7 +73,7 @@ def test_order_and_resumption(ahead):
     resumed = stream(ahead=ahead)
     resumed.load_state_dict(begun.state_dict())
     assert begin + [places(b) for b in itertools.islice(resumed, 8)] == whole
-    with pytest.raises(ValueError, match="state is of 1 ranks, got 2"):
+    with pytest.raises(ValueError, match="state is of a stream with world 1, got 2"):
         stream(rank=0, world=2).load_state_dict(begun.state_dict())
 
 
@@ -88,7 +97,7 @@ def test_what_goes_wrong_in_the_simulation_is_raised():
 
     with pytest.raises(SimulationError, match="scene 0 went wrong"):
         next(iter(stream(simulate=broken)))
-    with pytest.raises(SimulationError, match="all scenes of 3 rounds have failed, up to 8"):
+    with pytest.raises(SimulationError, match="too many scenes have failed in 3 rounds for a batch of each, up to 8"):
         next(iter(stream(simulate=lambda ids: [None] * len(ids))))
 
 
@@ -97,6 +106,8 @@ def test_what_cannot_be():
         stream(rank=1, world=1)
     with pytest.raises(ValueError, match="batch_size must be at most 6"):
         next(iter(OnlineStream(numbers, 7, scenes=1)))
+    with pytest.raises(ValueError, match="frames must be at most 12, those of a scene, got 13"):
+        next(iter(OnlineStream(numbers, 1, scenes=1, frames=13)))
     with pytest.raises(RuntimeError, match="without workers"):
         next(iter(DataLoader(stream(), batch_size=None, num_workers=1)))
 

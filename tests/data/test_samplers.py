@@ -278,3 +278,11 @@ def test_every_preset_gives_scenes_that_run(name, tmp_path):
 def test_an_unknown_preset():
     with pytest.raises(SceneError, match=r"takes one of elastic, .*got 'lava'"):
         Configuration.preset("lava")
+
+
+def test_the_text_of_a_configuration_gives_it_again(tmp_path):
+    overrides = ["dataset.frames=9", "material.sand.E=1e6"]
+    changed = Configuration.preset("sand", overrides)
+    assert changed.text.splitlines()[:2] == [f"# --set {item}" for item in overrides]
+    (tmp_path / "config.toml").write_text(changed.text)
+    assert Configuration.load(tmp_path / "config.toml", overrides).hash == changed.hash

@@ -97,7 +97,7 @@ def simulate(
             recording.abandon()
             raise
         if _had_room(built):
-            return arrays, _failures(built, surveys, interval / count)
+            return arrays, _failures(built, surveys, interval / count, frames)
 
 
 def _run(
@@ -180,7 +180,7 @@ def _had_room(built: Built) -> bool:
 # ---- what went wrong
 
 
-def _failures(built: Built, surveys: Tensor, dt: float) -> list[str]:
+def _failures(built: Built, surveys: Tensor, dt: float, frames: int) -> list[str]:
     """Why each scene failed; "" for one that is good. Waits for the device."""
     texts: list[list[str]] = [[] for _ in range(built.grid.scenes)]
     for problem in built.step.failures().problems.values():
@@ -188,9 +188,10 @@ def _failures(built: Built, surveys: Tensor, dt: float) -> list[str]:
             if number:
                 texts[scene].append(f"{number} {problem.what}")
     for look, (rates, _, wrong) in enumerate(surveys.tolist()):
+        frame = min(look * LOOK, frames - 1)
         for scene, text in enumerate(texts):
             if not text and wrong[scene]:
-                text.append(f"{wrong[scene]:.0f} particles were not finite, outside or inverted by frame {look * LOOK}")
+                text.append(f"{wrong[scene]:.0f} particles were not finite, outside or inverted by frame {frame}")
             elif not text and not dt * rates[scene] <= 1:
-                text.append(f"the time step {dt:.3g} s was above the limit by frame {look * LOOK}")
+                text.append(f"the time step {dt:.3g} s was above the limit by frame {frame}")
     return ["; ".join(text) for text in texts]

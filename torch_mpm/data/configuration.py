@@ -99,7 +99,7 @@ class Configuration:
     Attributes:
         words: all keys of the file.
         dataset: its table `[dataset]`.
-        text: the file as given, or the same keys as JSON.
+        text: the file as given, below comments with the overrides; or the words as JSON where there is no file.
         folder: where names of files start.
         source: name of the file, for messages.
         hash: of everything that determines the scenes; 64 hexadecimal digits.
@@ -153,7 +153,9 @@ class Configuration:
             digest = _hash(words, folder)
         except SceneError as error:
             raise SceneError(error.problems, source) from None
-        if overrides or not text:
+        if text:
+            text = "".join(f"# --set {item}\n" for item in overrides or []) + text
+        else:
             text = json.dumps(words, indent=1)
         return cls(words, dataset, text, folder, source, digest)
 

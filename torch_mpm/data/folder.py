@@ -46,7 +46,6 @@ class DatasetRecord:
         dx: distance of the nodes of the grid [m].
         fields: arrays [T, N, ...] of every scene, ``position`` among them.
         device: "cpu" or "cuda", whose results differ by rounding.
-        connectivity_radius: of neighbours in a graph of particles [m]; None where readers choose one.
     """
 
     configuration: str
@@ -61,7 +60,6 @@ class DatasetRecord:
     fields: tuple[str, ...]
     title: str = ""
     device: str = ""
-    connectivity_radius: float | None = None
     versions: dict[str, str] = field(default_factory=dict)
 
     @property
@@ -106,8 +104,13 @@ class DatasetRecord:
             words = json.loads(path.read_bytes())
             if words.pop("format") != FORMAT:
                 raise DamagedFileError(path, "is not of this version of torch_mpm", remedy)
-            for name in ("lower", "upper", "fields"):
-                words[name] = tuple(words[name])
+            for name in ("seed", "scenes_per_shard", "frames"):
+                words[name] = int(words[name])
+            for name in ("frame_interval", "dx"):
+                words[name] = float(words[name])
+            for name in ("lower", "upper"):
+                words[name] = tuple(map(float, words[name]))
+            words["fields"] = tuple(map(str, words["fields"]))
             words["splits"] = {str(n): (int(first), int(count)) for n, (first, count) in words["splits"].items()}
             record = cls(**words)
             if not 2 <= len(record.lower) == len(record.upper) <= 3 or min(record.frames, record.scenes_per_shard) < 1:

@@ -77,8 +77,6 @@ def particle_spacing(dataset: DatasetFolder) -> float:
 
 def connectivity_radius(dataset: DatasetFolder) -> float:
     """The radius [m] that the data set chose, or the one within which ``NEIGHBOURS`` particles lie at rest."""
-    if dataset.record.connectivity_radius is not None:
-        return dataset.record.connectivity_radius
     dim = dataset.record.dim
     ball = math.pi if dim == 2 else 4 / 3 * math.pi
     return float(particle_spacing(dataset) * (NEIGHBOURS / ball) ** (1 / dim))

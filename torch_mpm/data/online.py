@@ -21,6 +21,8 @@ Simulated = dict[str, Tensor]
 Simulate = Callable[[Sequence[int]], Sequence["Simulated | None"]]
 """Simulates the scenes of some ids together, on any device; None for a scene that failed."""
 MOST_FAILED_ROUNDS = 3
+ARGUMENTS = ("batch_size", "scenes", "frames", "passes", "first", "seed", "world")
+"""That decide what comes after a state."""
 
 
 class OnlineStream(IterableDataset[Item]):
@@ -48,7 +50,7 @@ class OnlineStream(IterableDataset[Item]):
         rank, world: this process among those that train together; those of torch.distributed by default.
 
     Raises:
-        SimulationError: where all scenes of three rounds in a row have failed.
+        SimulationError: where so many scenes have failed in each of three rounds in a row that there was no batch.
         ValueError: for a round without a batch, or a rank that is not one.
 
     It has a thread of its own in the place of workers; in a worker of a data loader it raises RuntimeError.
@@ -89,58 +91,73 @@ class OnlineStream(IterableDataset[Item]):
         if get_worker_info() is not None:
             raise RuntimeError("OnlineStream must be used without workers of a data loader; it has a thread of its own")
         failed = 0
+        stream = torch.cuda.Stream(self.device) if self.device.type == "cuda" else None
         with ThreadPoolExecutor(1, "torch_mpm online") as pool:
             rounds: deque[Future[_Round]] = deque()
             try:
                 while True:
                     while len(rounds) <= self.ahead:
-                        rounds.append(pool.submit(self._simulated, self.round + len(rounds)))
+                        rounds.append(pool.submit(self._simulated, self.round + len(rounds), stream))
                     made = rounds.popleft().result()
-                    failed = 0 if made.scenes else failed + 1
+                    places = self._places(made.scenes)
+                    failed = 0 if places else failed + 1
                     if failed == MOST_FAILED_ROUNDS:
-                        raise SimulationError(f"all scenes of {failed} rounds have failed, up to {made.ids[-1]}")
-                    if made.scenes:
-                        yield from self._batches(made.arrived())
+                        raise SimulationError(
+                            f"too many scenes have failed in {failed} rounds for a batch of each, up to {made.ids[-1]}"
+                        )
+                    if places:
+                        yield from self._batches(made.arrived(), places)
                     self.round, self.taken = self.round + 1, 0
             finally:
                 pool.shutdown(cancel_futures=True)
 
     def state_dict(self) -> dict[str, int]:
         """Where this stream stands; the round is simulated again after `load_state_dict`."""
-        return {"round": self.round, "taken": self.taken, "world": self.world}
+        return {"round": self.round, "taken": self.taken, **{name: getattr(self, name) for name in ARGUMENTS}}
 
     def load_state_dict(self, state: dict[str, int]) -> None:
         """Go on where another stream of the same arguments stood.
 
         Raises:
-            ValueError: for one of another number of ranks.
+            ValueError: for one of other arguments.
         """
-        if state["world"] != self.world:
-            raise ValueError(f"state is of {state['world']} ranks, got {self.world}")
+        for name in ARGUMENTS:
+            if state[name] != getattr(self, name):
+                raise ValueError(f"state is of a stream with {name} {state[name]}, got {getattr(self, name)}")
         self.round, self.taken = check_count("round", state["round"]), check_count("taken", state["taken"])
 
-    def _simulated(self, number: int) -> _Round:
+    def _simulated(self, number: int, stream: torch.cuda.Stream | None) -> _Round:
         """A round, in the thread of the simulation."""
         ids = self.scene_ids(number)
-        if self.device.type != "cuda":
+        if stream is None:
             return _Round(ids, _good(ids, self.simulate(ids)), None)
-        with torch.cuda.device(self.device), torch.cuda.stream(torch.cuda.Stream(self.device)):
+        with torch.cuda.device(self.device), torch.cuda.stream(stream):
             scenes = _good(ids, self.simulate(ids))
             ready = torch.cuda.Event()
             ready.record()
         return _Round(ids, scenes, ready)
 
-    def _batches(self, scenes: dict[int, Simulated]) -> Iterator[Item]:
-        places = [
-            (number, first)
-            for number, scene in scenes.items()
-            for first in range(len(scene["position"]) - self.frames + 1)
-        ]
+    def _places(self, scenes: dict[int, Simulated]) -> list[tuple[int, int]]:
+        """Scene and first frame of all windows of a round; none where scenes that failed leave too few for a batch.
+
+        Raises:
+            ValueError: where no scene has failed, and there are too few all the same.
+        """
+        places = []
+        for number, scene in scenes.items():
+            length = len(scene["position"])
+            if length < self.frames:
+                raise ValueError(f"frames must be at most {length}, those of a scene, got {self.frames}")
+            places += [(number, first) for first in range(length - self.frames + 1)]
+        windows = self.passes * len(places)
+        if windows < self.batch_size and len(scenes) == self.scenes:
+            raise ValueError(f"batch_size must be at most {windows}, the windows of a round, got {self.batch_size}")
+        return places if windows >= self.batch_size else []
+
+    def _batches(self, scenes: dict[int, Simulated], places: list[tuple[int, int]]) -> Iterator[Item]:
         rng = np.random.Generator(np.random.Philox(np.random.SeedSequence([self.seed, self.rank, self.round])))
         order = np.concatenate([rng.permutation(len(places)) for _ in range(self.passes)])
         count = len(order) // self.batch_size
-        if not count:
-            raise ValueError(f"batch_size must be at most {len(order)}, the windows of a round, got {self.batch_size}")
         for number in range(self.taken, count):
             chosen = order[number * self.batch_size : (number + 1) * self.batch_size]
             batch = self.collate([self._item(scenes, *places[k]) for k in chosen])

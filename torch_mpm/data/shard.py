@@ -149,6 +149,19 @@ class SceneRecord:
     failure: str
     motion: Motion | None
 
+    @classmethod
+    def of(cls, words: dict[str, Any]) -> SceneRecord:
+        """From the words of a record; what they lack is a KeyError."""
+        return cls(
+            id=int(words["id"]),
+            valid=bool(words["valid"]),
+            particles=int(words["particles"]),
+            hash=str(words["hash"]),
+            attempts=int(words["attempts"]),
+            failure=str(words["failure"]),
+            motion=_motion(words["motion"]),
+        )
+
 
 @dataclass(frozen=True)
 class ShardRecord:
@@ -175,7 +188,7 @@ class ShardRecord:
             words = json.loads(data)
             if words["format"] != FORMAT:
                 raise DamagedFileError(path, "is not of this version of torch_mpm", REMEDY)
-            scenes = [SceneRecord(**{**s, "motion": _motion(s["motion"])}) for s in words["scenes"]]
+            scenes = [SceneRecord.of(s) for s in words["scenes"]]
             record = cls(int(words["bytes"]), str(words["sha256"]), scenes)
         except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
             if isinstance(error, DamagedFileError):

@@ -127,7 +127,10 @@ def _terms(scene: Any, entries: Sequence[Any], obstacles: Sequence[Together], de
         if solid.first.temperature is not None:
             hold = FixedSurface if solid.first.held == "surface" else Fixed
             rows = [0.0 if w is None else w.temperature - reference for w in solid.words]
-            yield hold(solid.boundary, rows[0] if len(set(rows)) == 1 else torch.tensor(rows, device=device))
+            yield hold(
+                solid.boundary,
+                rows[0] if len(set(rows)) == 1 else torch.tensor(rows, dtype=torch.float64, device=device),
+            )
     for exchange in scene.heat.exchange:
         if exchange.coefficient:
             yield Convection(FreeSurface(), exchange.coefficient, exchange.ambient - reference)
