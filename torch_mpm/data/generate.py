@@ -26,7 +26,7 @@ from .configuration import Configuration
 from .folder import DatasetRecord
 from .sampling import NoRoom, content
 from .shard import ShardWriter, prepare_scene, shard_path
-from .shard_simulation import Drawn, Outcome, draw, simulate
+from .shard_simulation import Drawn, Outcome, draw, simulate, with_obstacles
 from .workers import take_device, worker
 
 Progress = Callable[[dict[str, Any]], None]
@@ -187,7 +187,7 @@ class _Line:
     def _write(self, shard: int, outcomes: list[Outcome]) -> None:
         """Compress the scenes of a shard and write it, beside what the device is doing."""
         writer = ShardWriter({"shard": shard, "device": _device_name(self.device), **versions()})
-        packed = self._packers.map(lambda o: prepare_scene(o.arrays), outcomes)
+        packed = self._packers.map(lambda o: prepare_scene(with_obstacles(self.configuration, o)), outcomes)
         for outcome, scene in zip(outcomes, packed, strict=True):
             writer.add(outcome.id, scene, self._attributes(outcome))
             outcome.arrays = {}

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from .configuration import Configuration
-from .shard_simulation import draw, simulate
+from .shard_simulation import draw, simulate, with_obstacles
 
 
 def simulator(
@@ -33,9 +33,7 @@ def simulator(
     def simulated(ids: Sequence[int]) -> list[dict[str, Tensor] | None]:
         drawn = draw(configuration, ids, target)
         simulate(configuration, drawn, target)
-        return [
-            None if outcome.failure else {name: torch.from_numpy(a).to(target) for name, a in outcome.arrays.items()}
-            for outcome in drawn.outcomes
-        ]
+        scenes = [None if o.failure else with_obstacles(configuration, o) for o in drawn.outcomes]
+        return [s and {name: torch.from_numpy(array).to(target) for name, array in s.items()} for s in scenes]
 
     return simulated

@@ -36,7 +36,7 @@ class Outcome:
         failure: why it failed; "" for a scene that is good.
         attempts: how often it was simulated.
         dt, substeps: time step [s] and number of them per frame of the last attempt.
-        arrays: of a scene that is good, as a shard has them.
+        arrays: of a scene that is good, as a shard has them, but for particles of obstacles (`with_obstacles`).
         materials: words of its materials, in the order of their numbers.
     """
 
@@ -176,8 +176,7 @@ def _complete(
     configuration: Configuration, outcome: Outcome, recorded: dict[str, Array], own: dict[str, Array], built: Built,
     index: int,
 ) -> None:  # fmt: skip
-    """Take over the arrays of a scene that is good: fields, types, materials, masses, and particles of obstacles."""
-    dataset = configuration.dataset
+    """Take over the arrays of a scene that is good: fields, types, materials and masses of its particles."""
     first = [k for k, m in enumerate(built.materials) if m.scene == index]
     materials = [built.materials[k] for k in first]
     types = [configuration.particle_type(m) for m in materials]
@@ -194,7 +193,12 @@ def _complete(
         "volume": own["volume"].astype(np.float32),
         **_parameters(configuration, outcome.materials, number),
     }
-    if dataset.obstacles and outcome.words and outcome.words.get("obstacle"):
-        words = configuration.scene(outcome.words)
-        times = np.arange(dataset.frames) * dataset.interval
-        outcome.arrays = obstacle_particles.add(outcome.arrays, words, times)
+
+
+def with_obstacles(configuration: Configuration, outcome: Outcome) -> dict[str, Array]:
+    """The arrays of an outcome, with the particles of its obstacles where the data set wants them."""
+    dataset = configuration.dataset
+    if not (outcome.arrays and dataset.obstacles and outcome.words and outcome.words.get("obstacle")):
+        return outcome.arrays
+    times = np.arange(dataset.frames) * dataset.interval
+    return obstacle_particles.add(outcome.arrays, configuration.scene(outcome.words), times)
