@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from .configuration import Configuration
-from .shard_simulation import draw, simulate, with_obstacles
+from .shard_simulation import Outcome, draw, simulate, with_obstacles
 
 
 def simulator(
@@ -33,7 +33,10 @@ def simulator(
     def simulated(ids: Sequence[int]) -> list[dict[str, Tensor] | None]:
         drawn = draw(configuration, ids, target)
         simulate(configuration, drawn, target)
-        scenes = [None if o.failure else with_obstacles(configuration, o) for o in drawn.outcomes]
-        return [s and {name: torch.from_numpy(array).to(target) for name, array in s.items()} for s in scenes]
+        return [None if outcome.failure else tensors(outcome) for outcome in drawn.outcomes]
+
+    def tensors(outcome: Outcome) -> dict[str, Tensor]:
+        arrays = with_obstacles(configuration, outcome)
+        return {name: torch.from_numpy(array).to(target) for name, array in arrays.items()}
 
     return simulated
