@@ -99,6 +99,27 @@ def as_run(results: list[dict[str, Any]]) -> str:
     )
 
 
+def data_sets(results: list[dict[str, Any]]) -> str:
+    """Generating data sets."""
+    notes = [f"- {common.describe(result['environment'])}" for result in results]
+    rows = []
+    for result in results:
+        for r in result["sets"]:
+            per_frame = r["seconds"] / max(r["valid"], 1) / (r["frames"] - 1)
+            rows.append(
+                (
+                    *(result["environment"]["device"], r["name"], r["processes"], r["frames"], r["seconds"]),
+                    *(r["busy"], 1e6 * per_frame, _ratio(r.get("peer"), per_frame)),
+                )
+            )
+    header = ("device", "data set", "processes", "frames", "s", "GPU busy", "us a frame and scene", "Taichi")
+    intro = (
+        "`torch-mpm generate` with its files (benchmarks/datasets.py); the last column is the time of a frame of scenes "
+        "one by one in a plain script in Taichi, with files and without compilation (benchmarks/datasets_peer.py)."
+    )
+    return "\n".join([intro, "", common.table(header, rows), "", *notes])
+
+
 def _ratio(value: float | None, base: float | None) -> str | None:
     return f"{value / base:.1f}x" if value and base else None
 
@@ -492,6 +513,7 @@ def sections(directory: Path) -> dict[str, str]:
     for pattern, title, section in (
         ("speed_*.json", "Speed", speed),
         ("rollouts_*.json", "Speed of what is run", as_run),
+        ("datasets_*.json", "Data sets", data_sets),
         ("svd_*_*.json", "Small matrices and sand", small_matrices),
         ("heat_*_*.json", "Speed of the heat solve", heat_speed),
     ):
