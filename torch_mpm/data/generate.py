@@ -29,6 +29,8 @@ from .shard import ShardWriter, prepare_scene, shard_path
 from .shard_simulation import Drawn, Outcome, draw, simulate, with_obstacles
 from .workers import take_device, worker
 
+MOST_PACKERS = 6
+"""Threads that compress: enough for one GPU, and more take Python's lock from the one that simulates."""
 Progress = Callable[[dict[str, Any]], None]
 
 
@@ -66,7 +68,7 @@ def generate(
     folder = Path(out)
     record = record_of(configuration, chosen)
     with Claim(folder, record, configuration.text, one) as claim:
-        cores = max(1, len(os.sched_getaffinity(0)) // max(1, one.beside))
+        cores = len(os.sched_getaffinity(0)) // max(1, one.beside)
         line = _Line(configuration, claim, chosen, cores, progress)
         with output_errors(folder):
             line.run(check)
@@ -126,7 +128,7 @@ class _Line:
         progress: Progress | None,
     ) -> None:
         self.configuration, self.claim, self.device, self.progress = configuration, claim, device, progress
-        self._cores = cores
+        self._threads = max(1, min(cores, MOST_PACKERS))
         self.totals: dict[str, Any] = {"scenes": 0, "failed": 0, "simulating": 0.0, "waiting": 0.0}
         self._stream = torch.cuda.Stream(device) if device.type == "cuda" else None
         self._missing = claim.record.scenes - claim.finished_scenes()
@@ -135,7 +137,7 @@ class _Line:
         """All shards that nobody else takes."""
         with ExitStack() as stack:
             self._drawer, self._writer = (stack.enter_context(ThreadPoolExecutor(1)) for _ in range(2))
-            self._packers = stack.enter_context(ThreadPoolExecutor(self._cores))
+            self._packers = stack.enter_context(ThreadPoolExecutor(self._threads))
             shards = self.claim.unfinished(check)
             coming: tuple[int, Future[Drawn]] | None = self._next(shards)
             written: Future[None] | None = None

@@ -80,20 +80,21 @@ def isal_zlib_module() -> Any:
     return isal_zlib
 
 
-def compress_chunk(rows: Array, frames: int) -> bytes:
-    """Up to ``frames`` rows as one chunk of a file, filled up with zeros. Other threads run meanwhile."""
-    if len(rows) < frames:
-        rows = np.concatenate([rows, np.zeros((frames - len(rows), *rows.shape[1:]), rows.dtype)])
-    data = np.ascontiguousarray(rows)
-    shuffled = np.ascontiguousarray(data.view(np.uint8).reshape(-1, data.itemsize).T)
-    return isal_zlib_module().compress(shuffled.data, GZIP_LEVEL)
-
-
 def compress(values: Array) -> Compressed:
-    """An array [T, ...] with at least one element in compressed chunks."""
+    """An array [T, ...] with at least one element in compressed chunks, the last of them filled up with zeros.
+
+    Other threads run meanwhile: there are few calls, since each has to wait for Python's lock.
+    """
     frames = chunk_frames(values.shape, values.dtype)
-    chunks = [compress_chunk(values[k : k + frames], frames) for k in range(0, len(values), frames)]
-    return Compressed(values.shape, values.dtype, frames, chunks)
+    count = -(-len(values) // frames)
+    if missing := count * frames - len(values):
+        values_of_chunks = np.concatenate([values, np.zeros((missing, *values.shape[1:]), values.dtype)])
+    else:
+        values_of_chunks = np.ascontiguousarray(values)
+    bytes_of_chunks = values_of_chunks.view(np.uint8).reshape(count, -1, values.itemsize)
+    shuffled = np.ascontiguousarray(bytes_of_chunks.transpose(0, 2, 1)).reshape(count, -1)
+    pack = isal_zlib_module().compress
+    return Compressed(values.shape, values.dtype, frames, [pack(chunk, GZIP_LEVEL) for chunk in shuffled])
 
 
 def content_hash(arrays: Mapping[str, Array]) -> str:

@@ -13,8 +13,8 @@ Array = npt.NDArray[Any]
 
 BOUNDARY = 3
 """Particle type of what moves as prescribed; its motion is not to be learned, and is in no statistics."""
-FRAMES = 16
-"""That are summed up at once: few calls, and what fits into caches."""
+FRAMES = 64
+"""That are summed up at once: few calls, each of which waits for Python's lock, and what nearly fits into caches."""
 
 
 @dataclass(frozen=True)
