@@ -115,7 +115,7 @@ def data_sets(results: list[dict[str, Any]]) -> str:
     header = ("device", "data set", "processes", "frames", "s", "GPU busy", "us a frame and scene", "Taichi")
     intro = (
         "`torch-mpm generate` with its files (benchmarks/datasets.py); the last column is the time of a frame of "
-        "scenes one by one in a plain script in Taichi, with files and without compilation (benchmarks/datasets_peer.py)."
+        "scenes one by one in a script in Taichi, with files, without compilation (benchmarks/datasets_peer.py)."
     )
     return "\n".join([intro, "", common.table(header, rows), "", *notes])
 
