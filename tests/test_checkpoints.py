@@ -68,7 +68,7 @@ def test_gradients_are_those_without(kind, kept, device, monkeypatch):
 
 
 def test_pools_that_grow_are_those_of_the_first_time(device):
-    """A block that flies apart wants more blocks in each segment; steps are taken again with the pools that they had."""
+    """A block that flies apart wants more blocks in each segment; steps that are taken again have those they had."""
     found, sizes = [], []
     for checkpoint in (None, 5, mpm.Checkpoints(states=3)):
         grid = mpm.Grid(0.02, (0, 0), (1, 1), deterministic=True)

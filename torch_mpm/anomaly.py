@@ -1,4 +1,4 @@
-"""Anomaly detection of autograd, told of the substep and the scene: which operation made the first NaN of a gradient."""
+"""Anomaly detection of autograd with substep and scene: which operation made the first NaN of a gradient, and where."""
 
 from __future__ import annotations
 
@@ -15,7 +15,8 @@ from .state import State
 
 def detecting() -> bool:
     """Whether the user has asked for it, by `torch.autograd.set_detect_anomaly` or `detect_anomaly`."""
-    return torch.is_anomaly_enabled() and torch.is_anomaly_check_nan_enabled() and torch.is_grad_enabled()
+    asked = not torch.compiler.is_compiling() and torch.is_anomaly_enabled()
+    return asked and torch.is_anomaly_check_nan_enabled() and torch.is_grad_enabled()
 
 
 def begin() -> int:
@@ -87,11 +88,10 @@ def _check(name: str, place: _Place) -> Any:
         for number, gradient in enumerate(grad_inputs):
             if isinstance(gradient, Tensor) and gradient.dim() > 0 and bool(gradient.isnan().any()):
                 given = any(isinstance(g, Tensor) and bool(g.isnan().any()) for g in grad_outputs)
-                came = ", which was NaN in what came to it already" if given else ""
+                came = "; what came to it was NaN already" if given else ""
                 raise RuntimeError(
                     f"the gradient of {name} is NaN (of its input {number}) in substep {place.substep} of the rollout, "
-                    f"{place.scenes(gradient)}{came}; outside a rollout torch.autograd.detect_anomaly tells where it "
-                    "was called"
+                    f"{place.scenes(gradient)}{came}"
                 )
 
     return check

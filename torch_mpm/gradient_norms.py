@@ -72,7 +72,9 @@ class GradientNorms:
             norms = self._fields[name]
 
             @torch.no_grad()
-            def record(grad: Tensor) -> None:
+            def record(grad: Tensor | None) -> None:
+                if grad is None:  # which autograd says for zero, of an output among others
+                    return
                 squares = grad.double().square().reshape(len(grad), -1).sum(1)
                 norms[row] = sum_by_scene(squares, scene, self._scenes).sqrt().nan_to_num(math.inf, posinf=math.inf)
 
@@ -133,14 +135,11 @@ class GradientNorms:
 
 def _length(norms: Tensor, steps: Sequence[int], growth: float) -> int | None:
     """Steps back from the end to the first state whose gradient is too large, or stays too small."""
-    values = [(steps[-1] - k, v) for k, v in zip(steps, norms.tolist(), strict=True) if v == v][::-1]
-    values = values[next((i for i, (_, v) in enumerate(values) if v > 0), len(values)) :]
-    if not values:
-        return None
-    reference = values[0][1]
-    large = next((back for back, v in values if v > growth * reference), None)
-    small = next(
-        (back for i, (back, _) in enumerate(values) if all(v * growth < reference for _, v in values[i:])), None
-    )
-    found = [max(back, 1) for back in (large, small) if back is not None]
-    return min(found) if found else None
+    back = [(steps[-1] - k, v) for k, v in zip(steps, norms.tolist(), strict=True) if v == v][::-1]
+    reference = next((v for _, v in back if v > 0), 0.0)
+    lengths = [length for length, v in back if v > growth * reference][:1]
+    tail = 0  # of gradients that stay small
+    while tail < len(back) and back[len(back) - 1 - tail][1] * growth < reference:
+        tail += 1
+    lengths += [length for length, _ in back[len(back) - tail :]][:1]
+    return max(min(lengths), 1) if lengths else None

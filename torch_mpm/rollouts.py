@@ -55,9 +55,9 @@ def rollout(
         state: the initial state.
         n: number of steps.
         dt: time step [s], as `Step` takes it.
-        checkpoint: if given, what is kept for the backward pass, which takes the steps between again: the state of every
-            so many steps (memory n/checkpoint + checkpoint states instead of n steps; sqrt(n) is best), or what
-            `Checkpoints` says: so many states, a budget of memory, states that wait on the host.
+        checkpoint: what is kept for the backward pass, which takes the steps between again: the state of every so many
+            steps (memory n/checkpoint + checkpoint states instead of n steps; sqrt(n) is best), or what `Checkpoints`
+            says: so many states, a budget of memory, states that wait on the host. None: all steps.
         prefix: number of first steps that are taken without gradients.
         truncate: if given, gradients pass back through so many steps at most: the graph is cut before the steps
             n - truncate, n - 2 truncate, ... Without a hook that is a prefix of n - truncate steps.
