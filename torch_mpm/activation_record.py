@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import torch
 from torch import Tensor
 
-from .capture import is_captured, outside_transforms, remember, without_transforms
+from .capture import is_captured, is_exported, outside_transforms, remember, without_transforms
 from .failures import Problem, problems_of_status, refused_steps
 from .grid import Blocks, Grid
 
@@ -35,6 +35,8 @@ class ActivationRecord:
 
     def activate(self, grid: Grid, x: Tensor, scene: Tensor | None, ids: Tensor | None = None) -> Blocks:
         """As `Grid.activate`; `max_blocks` of the grid follows."""
+        if is_exported():
+            return grid.activate(x, scene, None, ids)
         before = self.status
         blocks = grid.activate(x, scene, before, ids)
         status = without_transforms(blocks.status)

@@ -13,7 +13,8 @@ from torch.utils.data._utils.collate import default_collate_fn_map
 
 from .state import State
 
-FIELDS = tuple(f.name for f in dataclasses.fields(State) if f.name not in ("extra", "time"))
+FIELDS = sorted((f.name for f in dataclasses.fields(State) if f.name not in ("extra", "time")), reverse=True)
+"""A name comes before those that it begins with, which `torch.export` needs to tell `v` from `volume`."""
 Layout = tuple[tuple[str, ...], tuple[str, ...], "float | None"]
 """Names of the fields and of the entries of `extra` that are leaves, and the time where it is a number."""
 
@@ -22,9 +23,10 @@ def _flatten(state: State) -> tuple[list[Any], Layout]:
     """The tensors of a state are leaves, absent fields are not."""
     names = tuple(name for name in FIELDS if getattr(state, name) is not None)
     time = state.time
-    leaves = [getattr(state, name) for name in names] + list(state.extra.values())
+    extra = tuple(sorted(state.extra, reverse=True))
+    leaves = [getattr(state, name) for name in names] + [state.extra[name] for name in extra]
     number = None if isinstance(time, Tensor) else time
-    return (leaves if number is not None else [*leaves, time]), (names, tuple(state.extra), number)
+    return (leaves if number is not None else [*leaves, time]), (names, extra, number)
 
 
 def _flatten_with_keys(state: State) -> tuple[list[tuple[Any, Any]], Layout]:
@@ -61,6 +63,8 @@ def register() -> None:
         _flatten,
         _unflatten,
         serialized_type_name="torch_mpm.State",
+        to_dumpable_context=list,
+        from_dumpable_context=lambda read: (tuple(read[0]), tuple(read[1]), read[2]),  # lists of a file
         flatten_with_keys_fn=_flatten_with_keys,
     )
     torch.serialization.add_safe_globals([State])

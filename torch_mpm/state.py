@@ -26,7 +26,7 @@ from .errors import (
     shape_of,
 )
 from .grid import Grid, check_grid
-from .ops.arguments import soa_empty
+from .ops.arguments import refuse_batched, soa_empty
 
 if TYPE_CHECKING:
     from .seed import Points
@@ -279,6 +279,8 @@ PARTICLE_FIELDS = tuple(f.name for f in dataclasses.fields(State) if f.name not 
 def check_state(state: Any) -> None:
     if not isinstance(state, State):
         raise TypeError(f"state must be a State, got {shape_of(state)}")
+    for name in ("x", "v", "mass", "F"):
+        refuse_batched(f"state.{name}", getattr(state, name))
 
 
 def _check_impulse(impulse: Any, x: Tensor) -> None:
