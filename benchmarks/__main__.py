@@ -31,6 +31,7 @@ PROGRAMS = (
     "benchmarks.accuracy.ritter",
     "benchmarks.accuracy.runout",
     "benchmarks.accuracy.limits",
+    "benchmarks.accuracy.rollout_gradients",
     "benchmarks.stability.stable_dt",
     "benchmarks.stability.law_dt",
     "benchmarks.stability.adversarial",

@@ -130,7 +130,7 @@ def test_limits_program(tmp_path: Path) -> None:
     assert all(row["polar"] < 1e-6 for row in errors.values())
 
 
-@pytest.mark.parametrize("program", ["convergence", "precision", "ritter"])
+@pytest.mark.parametrize("program", ["convergence", "precision", "ritter", "rollout_gradients"])
 def test_accuracy_program(program: str, tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     run_quick(f"benchmarks.accuracy.{program}", tmp_path)
