@@ -23,9 +23,8 @@ class GradientNorms:
     Args:
         every: steps from one recorded state to the next. A rollout keeps every recorded state.
 
-    The backward pass fills it, without waiting for a device; the next rollout with it begins anew. A norm is NaN where
-    a backward pass has not come: before one, and for what needs no gradient; it is infinite for a gradient that is not
-    finite.
+    The backward pass fills it, without waiting for a device; the next rollout with it begins anew. A norm is NaN for
+    what needs no gradient, zero where no gradient has come, and infinite for a gradient that is not finite.
 
     Raises:
         TypeError, ValueError: for an `every` that is no whole number from 1 on.
@@ -70,10 +69,11 @@ class GradientNorms:
                 shape = len(self._steps), self._scenes
                 self._fields[name] = torch.full(shape, torch.nan, dtype=torch.float64, device=t.device)
             norms = self._fields[name]
+            norms[row] = 0
 
             @torch.no_grad()
             def record(grad: Tensor | None) -> None:
-                if grad is None:  # which autograd says for zero, of an output among others
+                if grad is None:  # of an output among others that have one
                     return
                 squares = grad.double().square().reshape(len(grad), -1).sum(1)
                 norms[row] = sum_by_scene(squares, scene, self._scenes).sqrt().nan_to_num(math.inf, posinf=math.inf)
@@ -102,13 +102,13 @@ class GradientNorms:
         """Root of the sum of squares over x, v, C, F, J, temperature and history [K, B], in units of the loss.
 
         They are made comparable by what a step can change: of x a node distance, of v a node distance over a time step,
-        of C one over a time step, of all others one.
+        of C one over a time step, of all others one. NaN where a field that has a gradient elsewhere needs none, as at
+        the start.
         """
         if not self._fields:
             return torch.full((len(self._steps), self._scenes), torch.nan, dtype=torch.float64, device="cpu")
         scaled = torch.stack([self._units.get(name, 1.0) * norms for name, norms in self._fields.items()])
-        total = scaled.nan_to_num(0.0, posinf=math.inf).square().sum(0).sqrt()
-        return torch.where(scaled.isnan().all(0), torch.nan, total)
+        return scaled.square().sum(0).sqrt()
 
     def truncation(self, growth: float = 100.0) -> int | None:
         """A `truncate` for such rollouts: steps back from the end after which gradients tell little.
@@ -127,7 +127,7 @@ class GradientNorms:
         check_number("growth", growth, "a number above 1", lambda v: 1 < v < math.inf)
         total = self.total().cpu()
         found = [_length(total[:, b], self._steps, growth) for b in range(self._scenes)]
-        if total.isnan().all():
+        if not bool((total > 0).any()):
             raise ValueError("GradientNorms must have seen a backward pass, which found a gradient, before it can tell")
         lengths = [length for length in found if length is not None]
         return min(lengths) if lengths else None
