@@ -26,6 +26,9 @@ def test_a_state_is_a_pytree_of_its_tensors(device):
     assert torch.equal(doubled.x, 2 * state.x) and torch.equal(doubled.extra["h"], 2 * state.extra["h"])
     keys = [str(path[0]) for path, _ in _pytree.tree_flatten_with_path(state)[0]]
     assert keys == [".x", ".volume", ".v", ".mass", ".F", ".extra.h"]
+    several = state.replace(extra={"v": state.mass, "volume": 2 * state.mass, "b": 3 * state.mass})
+    same = _pytree.tree_map(lambda t: t, several)
+    assert list(same.extra) == ["v", "volume", "b"] and all(same.extra[k] is several.extra[k] for k in same.extra)
     timed = state.replace(time=torch.tensor([0.5], dtype=torch.float64, device=device))
     assert float(_pytree.tree_map(lambda t: 2 * t, timed).time) == 1.0
     assert _pytree.tree_map(lambda t: tuple(t.shape), state).extra == {"h": (len(state), 2, 3)}

@@ -23,16 +23,15 @@ def _flatten(state: State) -> tuple[list[Any], Layout]:
     """The tensors of a state are leaves, absent fields are not."""
     names = tuple(name for name in FIELDS if getattr(state, name) is not None)
     time = state.time
-    extra = tuple(sorted(state.extra, reverse=True))
-    leaves = [getattr(state, name) for name in names] + [state.extra[name] for name in extra]
+    leaves = [getattr(state, name) for name in names] + [state.extra[name] for name in sorted(state.extra, reverse=True)]
     number = None if isinstance(time, Tensor) else time
-    return (leaves if number is not None else [*leaves, time]), (names, extra, number)
+    return (leaves if number is not None else [*leaves, time]), (names, tuple(state.extra), number)
 
 
 def _flatten_with_keys(state: State) -> tuple[list[tuple[Any, Any]], Layout]:
     leaves, layout = _flatten(state)
     names, extra, time = layout
-    keys = [*names, *(f"extra.{name}" for name in extra), *(["time"] if time is None else [])]
+    keys = [*names, *(f"extra.{name}" for name in sorted(extra, reverse=True)), *(["time"] if time is None else [])]
     return [(_pytree.GetAttrKey(key), leaf) for key, leaf in zip(keys, leaves, strict=True)], layout
 
 
@@ -43,7 +42,8 @@ def _unflatten(leaves: Any, layout: Layout) -> State:
     state: State = object.__new__(State)
     state.__dict__.update(dict.fromkeys(FIELDS))
     state.__dict__.update(zip(names, values, strict=False))
-    state.extra = dict(zip(extra, values[len(names) :], strict=False))
+    kept = dict(zip(sorted(extra, reverse=True), values[len(names) :], strict=False))
+    state.extra = {name: kept[name] for name in extra}
     if time is None:
         state.__dict__["_time"] = values[-1]
     else:
