@@ -64,7 +64,7 @@ def test_gradients_are_those_without(kind, kept, device, monkeypatch):
             torch.autograd.grad(loss, [v, *(t for t in (*step.parameters(), *step.buffers()) if t.requires_grad)])
         )
     for value, expected in zip(found[1], found[0], strict=True):
-        assert float(expected.norm()) > 0 and relative_error(value, expected) < 1e-12
+        assert float(expected.norm()) > 0 and relative_error(value, expected) < (1e-12 if device == "cpu" else 1e-9)
 
 
 def test_pools_that_grow_are_those_of_the_first_time(device):
@@ -85,6 +85,21 @@ def test_pools_that_grow_are_those_of_the_first_time(device):
         assert sizes[0] > first.max_blocks
     assert relative_error(found[1], found[0]) < 1e-12
     assert relative_error(found[2], found[0]) < 1e-12
+
+
+@pytest.mark.parametrize("checkpoint", [None, 4, mpm.Checkpoints(states=3)])
+def test_steps_that_are_taken_again_do_not_count_again(checkpoint, device):
+    """A solver of heat that misses its tolerance says so once for each step, and a refused dt too."""
+    step, state = make("heat", device)
+    step.heat.max_iterations = 1
+    dt = torch.tensor([-DT], dtype=torch.float64, device=device)
+    v = state.v.clone().requires_grad_()
+    end = mpm.rollout(step, state.replace(v=v), N, DT, checkpoint=checkpoint)
+    end = mpm.rollout(step, end, 3, dt, checkpoint=checkpoint)
+    before = {kind: int(problem.count.sum()) for kind, problem in step.failures().problems.items()}
+    end.x.sum().backward()
+    assert before["heat"] >= N and before["dt"] == 3
+    assert {kind: int(problem.count.sum()) for kind, problem in step.failures().problems.items()} == before
 
 
 # ---- binomial

@@ -7,11 +7,13 @@ import dataclasses
 import functools
 import math
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import torch
 from torch import Tensor
 from torch.utils import _pytree
 
+from .activation_record import aside
 from .errors import check_count, check_flag, check_number
 from .grid import Grid
 from .state import State
@@ -115,25 +117,35 @@ def fitting(memory: float, n: int, state_bytes: int, step_bytes: int, offload: b
 # ---- every so many steps
 
 
-def in_segments(advance: Advance, state: State, n: int, checkpoints: Checkpoints, grid: Grid | None) -> State:
+def in_segments(advance: Advance, state: State, n: int, checkpoints: Checkpoints, step: Any) -> State:
     """The state n steps later; of every so many steps only the first state is kept for the backward pass."""
     assert checkpoints.every is not None
     with offloaded(state) if checkpoints.offload else contextlib.nullcontext():
         for first in range(0, n, checkpoints.every):
-            state = recomputed(advance, state, min(checkpoints.every, n - first), first, grid)
+            state = recomputed(advance, state, min(checkpoints.every, n - first), first, step)
     return state
 
 
-def recomputed(advance: Advance, state: State, count: int, first: int, grid: Grid | None) -> State:
-    """`advance(state, count, first)`, of which the backward pass keeps the arguments and takes the steps again."""
+def recomputed(advance: Advance, state: State, count: int, first: int, step: Any) -> State:
+    """`advance(state, count, first)`, of which the backward pass keeps the arguments and takes the steps again.
+
+    A second time the steps find the pools of the first one, and do not count for `check` of the step.
+    """
     from torch.utils.checkpoint import checkpoint  # whose first call imports for seconds
 
     leaves, layout = _pytree.tree_flatten(state)
-    pools: list[int] = []
+    grid = getattr(step, "grid", None)
+    again, pools = False, list[int]()
 
     def steps(*tensors: Tensor) -> State:
+        nonlocal again
         given = _pytree.tree_unflatten(tensors, layout)
-        with contextlib.nullcontext() if grid is None else grid.same_pools(pools):
+        with contextlib.ExitStack() as stack:
+            if isinstance(grid, Grid):
+                stack.enter_context(grid.same_pools(pools))
+            if again:
+                stack.enter_context(aside(step, given.x))
+            again = True
             return advance(given, count, first)
 
     result: State = checkpoint(steps, *leaves, use_reentrant=False)
@@ -143,7 +155,7 @@ def recomputed(advance: Advance, state: State, count: int, first: int, grid: Gri
 # ---- binomial
 
 
-def binomial(advance: Advance, state: State, n: int, states: int, unit: int, grid: Grid | None) -> State:
+def binomial(advance: Advance, state: State, n: int, states: int, unit: int, step: Any) -> State:
     """The state n steps later, in units of so many, with at most so many states kept at a time.
 
     The first part of a rollout is taken again from its first state, with as many states, once the rest of it is done
@@ -158,7 +170,7 @@ def binomial(advance: Advance, state: State, n: int, states: int, unit: int, gri
         if count == 1:
             return steps(state, first, 1)
         part = _split(count, states)
-        middle = recomputed(lambda now, *_: run(now, first, part, states), state, part, first, grid)
+        middle = recomputed(lambda now, *_: run(now, first, part, states), state, part, first, step)
         return run(middle, first + part, count - part, states - 1)
 
     return run(state, 0, units, states)

@@ -23,7 +23,9 @@ def _flatten(state: State) -> tuple[list[Any], Layout]:
     """The tensors of a state are leaves, absent fields are not."""
     names = tuple(name for name in FIELDS if getattr(state, name) is not None)
     time = state.time
-    leaves = [getattr(state, name) for name in names] + [state.extra[name] for name in sorted(state.extra, reverse=True)]
+    leaves = [getattr(state, name) for name in names] + [
+        state.extra[name] for name in sorted(state.extra, reverse=True)
+    ]
     number = None if isinstance(time, Tensor) else time
     return (leaves if number is not None else [*leaves, time]), (names, tuple(state.extra), number)
 

@@ -9,13 +9,14 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from .activation_record import aside
 from .checkpoints import Checkpoints, as_checkpoints
 from .errors import check_count
 from .rollout_parts import Parts
 from .rollouts import bytes_kept, obstacle_to_substeps, resolved, rollout, steps_of_a_call
 from .state import State
 from .step import Step
-from .step_cost import aside, differentiable, seconds
+from .step_cost import differentiable, seconds
 
 TRIAL = 4
 """Steps that are taken to measure their time."""
@@ -73,7 +74,7 @@ def estimate_rollout(
     parts, kept = Parts(n, prefix, truncate), as_checkpoints(checkpoint)
     first = parts.first_with_gradient()
     start = differentiable(step.prepare(state) if isinstance(step, Step) else state)
-    with aside(step, start), torch.enable_grad():
+    with aside(step, start.x), torch.enable_grad():
         if kept is not None and kept.memory is not None:
             kept = resolved(kept, step, start, n - first, dt)
         return _estimate(step, start, n - first, first, dt, kept)

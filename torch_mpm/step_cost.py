@@ -2,23 +2,19 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from .activation_record import ActivationRecord
+from .activation_record import aside
 from .checkpoints import CONSTANT
 from .state import State
 
 StepFunction = Callable[[State, "float | Tensor"], State]
-
-RECORDS = ("_activations", "unsolved", "residual")
-"""Attributes in which steps and heat keep what became of them."""
 
 
 def state_bytes(state: State) -> int:
@@ -41,7 +37,7 @@ def step_bytes(step: StepFunction, state: State, dt: float | Tensor) -> int:
             kept[place] = max(kept.get(place, 0), t.untyped_storage().nbytes())
         return t
 
-    with aside(step, state), torch.enable_grad(), torch.autograd.graph.saved_tensors_hooks(pack, lambda t: t):
+    with aside(step, state.x), torch.enable_grad(), torch.autograd.graph.saved_tensors_hooks(pack, lambda t: t):
         end = step(start, dt)
     del end
     return sum(kept.values())
@@ -64,22 +60,6 @@ def seconds(work: Callable[[], Any], device: torch.device) -> float:
         _wait(device)
         times.append(time.perf_counter() - begin)
     return min(times)
-
-
-@contextlib.contextmanager
-def aside(step: StepFunction, state: State) -> Iterator[None]:
-    """Where steps leave nothing behind: not in what a step tells of the steps so far, nor in random numbers."""
-    modules = list(step.modules()) if isinstance(step, torch.nn.Module) else []
-    kept = [(m, name, getattr(m, name)) for m in modules for name in RECORDS if hasattr(m, name)]
-    for module, name, _ in kept:
-        setattr(module, name, ActivationRecord() if name == "_activations" else None)
-    devices = [state.x.device] if state.x.is_cuda else []
-    try:
-        with torch.random.fork_rng(devices):
-            yield
-    finally:
-        for module, name, value in kept:
-            setattr(module, name, value)
 
 
 def _wait(device: torch.device) -> None:

@@ -127,7 +127,9 @@ def _steps() -> dict[str, Callable[[], Call]]:
                 raise mpm.SimulationError("n is too large for this program")
             return step(state, dt)
 
-        return mpm.rollout, dict(step=at_most_five, state=w.state, n=2, dt=1e-4, checkpoint=1, prefix=0, truncate=1, every=1)
+        return mpm.rollout, dict(
+            step=at_most_five, state=w.state, n=2, dt=1e-4, checkpoint=1, prefix=0, truncate=1, every=1
+        )
 
     def stable_dt() -> Call:
         w = _World()
