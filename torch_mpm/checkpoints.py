@@ -35,7 +35,8 @@ class Checkpoints:
         states: at most so many states are kept at a time, 2 or more, where taking steps again costs least (binomial
             checkpoints, Griewank and Walther 2000). Memory: so many states, and what one step needs; with s states and
             r repetitions of each step at most, n ≤ (s + r)!/(s! r!).
-        memory: [bytes], the largest `every` that fits, or where none does as many `states`.
+        memory: [bytes], the largest `every` that fits, or where none does as many `states`. A step from Python is taken
+            aside once, to measure it.
         offload: whether kept states wait in the memory of the host, as far as they are on a CUDA device; `memory` then
             is that of the steps which are taken again. Not with `states`.
 
@@ -92,7 +93,7 @@ def fitting(memory: float, n: int, state_bytes: int, step_bytes: int, offload: b
     Raises:
         ValueError: where two states and a step need more.
     """
-    if state_bytes + n * step_bytes <= memory:
+    if n == 0 or state_bytes + n * step_bytes <= memory:
         return None
     on_device = 0 if offload else state_bytes
 

@@ -73,7 +73,7 @@ def rollout(
     float32) and its history; while the backward pass goes through `checkpoint` steps, it holds about 2 D + 4 D² (42 in
     3-D) for each of them. Second derivatives need single steps. On CUDA and without gradients, other steps that call no
     function of the user's are replays of a CUDA graph of one; see `captured` for what else there is, and
-    `estimate` for what a rollout will take. Under `torch.autograd.detect_anomaly` a gradient that is NaN is
+    `estimate_rollout` for what a rollout will take. Under `torch.autograd.detect_anomaly` a gradient that is NaN is
     reported with its operation, substep and scene.
 
     Raises:
@@ -88,7 +88,7 @@ def rollout(
         return _taken(step, state, n, dt, kept)
     if isinstance(step, Step):
         state = step.prepare(state)
-    if kept is not None and kept.memory is not None:  # the same for all parts
+    if kept is not None and kept.memory is not None and torch.is_grad_enabled():  # the same for all parts
         kept = resolved(kept, step, state, n - parts.first_with_gradient(), dt)
     grid = step.grid if isinstance(step, Step) else None
     scales = (1, 1.0, dt) if grid is None else (grid.scenes, grid.dx, dt)
