@@ -4,9 +4,9 @@
     python -m benchmarks.speed.checkpoints --quick              # seconds
 
 A block of a neo-Hookean solid falls in three dimensions for some steps, and the gradient of where it ends is taken by
-its velocities: once with the compiled law, whose steps are taken in one op, and once with the same law in torch code, a
-step at a time. Memory is the peak above that before the rollout: on CUDA that of PyTorch's allocator, on the CPU that of
-the tensors that ops return, which does not show what the op of many steps holds inside. The estimate is that of
+its velocities: once with the compiled law, whose steps are taken in one op, and once with that law in torch code, a
+step at a time. Memory is the peak above that before the rollout: on CUDA that of PyTorch's allocator, on the CPU that
+of the tensors that ops return, which does not show what the op of many steps holds inside. The estimate is that of
 `estimate_rollout` with the same arguments; it knows neither the loss nor the working memory of the backward pass of a
 step.
 """

@@ -228,4 +228,4 @@ def test_memory_of_checkpoints_is_what_was_estimated() -> None:
     cases = {name: checkpoints.case("torch code", name, 4, 20, "cpu") for name in ("all steps", "5 states")}
     one_step = cases["all steps"]["estimated_memory"] / 20
     for case in cases.values():
-        assert case["estimated_memory"] <= case["memory"] < case["estimated_memory"] + 3 * one_step
+        assert 0.9 * case["estimated_memory"] < case["memory"] < case["estimated_memory"] + 4 * one_step
