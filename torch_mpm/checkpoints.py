@@ -63,17 +63,16 @@ class Checkpoints:
         if check_flag("offload", self.offload) and self.states is not None:
             raise ValueError("offload must be False with states: with every or memory, states may wait on the host")
 
-    def repetitions(self, n: int, unit: int = 1) -> int:
-        """Steps that the backward pass of n steps takes again, in units of so many; without those inside a unit."""
+    def repetitions(self, n: int) -> int:
+        """Steps that the backward pass of n steps takes again."""
         if self.every is not None:
             return n
         assert self.states is not None
-        units = -(-n // unit)
-        return unit * (_evaluations(units, min(self.states, units)) - units)
+        return _evaluations(n, min(self.states, n)) - n
 
-    def kept(self, n: int, unit: int = 1) -> int:
+    def kept(self, n: int) -> int:
         """States that are kept at a time at most."""
-        return -(-n // self.every) if self.every is not None else min(self.states or 0, -(-n // unit))
+        return -(-n // self.every) if self.every is not None else min(self.states or 0, n)
 
 
 def as_checkpoints(checkpoint: int | Checkpoints | None) -> Checkpoints | None:
@@ -156,25 +155,21 @@ def recomputed(advance: Advance, state: State, count: int, first: int, step: Any
 # ---- binomial
 
 
-def binomial(advance: Advance, state: State, n: int, states: int, unit: int, step: Any) -> State:
-    """The state n steps later, in units of so many, with at most so many states kept at a time.
+def binomial(advance: Advance, state: State, n: int, states: int, step: Any) -> State:
+    """The state n steps later, with at most so many states kept at a time; n is 1 or more.
 
     The first part of a rollout is taken again from its first state, with as many states, once the rest of it is done
     with one less; Griewank and Walther 2000 say where to part them (algorithm 799, "revolve").
     """
-    units = -(-n // unit)
-
-    def steps(state: State, first: int, count: int) -> State:
-        return advance(state, min(count * unit, n - first * unit), first * unit)
 
     def run(state: State, first: int, count: int, states: int) -> State:
         if count == 1:
-            return steps(state, first, 1)
+            return advance(state, 1, first)
         part = _split(count, states)
         middle = recomputed(lambda now, *_: run(now, first, part, states), state, part, first, step)
         return run(middle, first + part, count - part, states - 1)
 
-    return run(state, 0, units, states)
+    return run(state, 0, n, states)
 
 
 def _reach(states: int, repetitions: int) -> int:

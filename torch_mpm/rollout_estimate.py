@@ -106,14 +106,12 @@ def _estimate(
         return RolloutEstimate(0, 0, prefix * once, 0, prefix)
     if kept is None and not in_op:
         return RolloutEstimate(of_state + n * of_step, 0, prefix * once + n * twice, 1, prefix + n)
-    unit = steps_of_a_call(start, n) if in_op else 1
     if kept is None:
-        kept = Checkpoints(every=min(unit, n))
-    states = kept.kept(n, unit)
-    # The op takes its own steps again in any case, and so they are in the time of both ways.
-    again = kept.repetitions(n, unit)
-    held = min(kept.every or unit, n)
-    extra = again - n if in_op and kept.every is not None else again
+        kept = Checkpoints(every=min(steps_of_a_call(start, n), n))
+    states, again, held = kept.kept(n), kept.repetitions(n), min(kept.every or 1, n)
+    extra = again
+    if in_op:  # which takes its own steps again in any case: the time of both ways has them
+        extra, again = (0, n) if kept.every is not None else (again, again + n)
     spent = prefix * once + n * twice + extra * once
     on_host = kept.offload and start.x.is_cuda
     return RolloutEstimate(

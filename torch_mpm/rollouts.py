@@ -127,7 +127,7 @@ def _taken(
     if isinstance(step, Step):
         state = step.prepare(state)
     if kept.states is not None:
-        return binomial(single, state, n, kept.states, 1, step)
+        return binomial(single, state, n, kept.states, step)
     return in_segments(single, state, n, kept, step)
 
 
@@ -211,7 +211,7 @@ def in_chunks(step: Step, state: State, n: int, dt: float | Tensor, kept: Checkp
         return advance(state, n)
     chunk = min(chunk, kept.every if kept is not None and kept.every else steps_of_a_call(state, n))
     if kept is not None and kept.states is not None and n > 0:
-        return binomial(advance, step.prepare(state), n, kept.states, chunk, step)
+        return binomial(advance, step.prepare(state), n, kept.states, step)
     with offloaded(state) if kept is not None and kept.offload else contextlib.nullcontext():
         return advance(state, n)
 

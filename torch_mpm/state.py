@@ -279,8 +279,9 @@ PARTICLE_FIELDS = tuple(f.name for f in dataclasses.fields(State) if f.name not 
 def check_state(state: Any) -> None:
     if not isinstance(state, State):
         raise TypeError(f"state must be a State, got {shape_of(state)}")
-    for name in ("x", "v", "mass", "F"):
-        refuse_batched(f"state.{name}", getattr(state, name))
+    if not torch.compiler.is_compiling() and torch._C._are_functorch_transforms_active():
+        for name in ("x", "v", "mass", "F"):
+            refuse_batched(f"state.{name}", getattr(state, name))
 
 
 def _check_impulse(impulse: Any, x: Tensor) -> None:

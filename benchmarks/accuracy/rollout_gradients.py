@@ -224,7 +224,7 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="short rollouts of small blocks, to see that it works")
     parser.add_argument("--out", type=Path, default=common.RESULTS)
     arguments = parser.parse_args()
-    result = measure([5, 10], 3) if arguments.quick else measure([10, 20, 50, 100, 200, 400], 6)
+    result = measure([4], 3) if arguments.quick else measure([10, 20, 50, 100, 200, 400], 6)
     common.write(arguments.out, "rollout_gradients", result, text(result))
     plot(result, arguments.out / "rollout_gradients.png")
 
