@@ -214,8 +214,10 @@ def test_an_estimate_of_memory_is_what_autograd_keeps(device):
     step, state = make("network", device)
     state = state.replace(v=state.v.clone().requires_grad_())
     before = step.status
+    random = torch.get_rng_state()
     estimate = mpm.estimate_rollout(step, state, 20, DT)
-    assert step.status is before
+    assert step.status is before and torch.equal(torch.get_rng_state(), random)
+    assert all(p.grad is None for p in (state.v, *step.parameters()))
     found, _ = kept_bytes(lambda: mpm.rollout(step, state, 20, DT))
     assert estimate.memory == pytest.approx(found, rel=0.1)
     assert estimate.steps == 20 and estimate.seconds > 0

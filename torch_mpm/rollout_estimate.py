@@ -97,9 +97,12 @@ def _estimate(
     def forward() -> None:
         rollout(step, start, trial, dt)
 
+    tensors = [*step.parameters(), *step.buffers()] if isinstance(step, torch.nn.Module) else []
+    leaves = [start.x, start.v, *(t for t in tensors if t.requires_grad)]
+
     def both() -> None:
         end = rollout(step, start, trial, dt)
-        (end.x.sum() + end.v.sum()).backward()
+        torch.autograd.grad(end.x.sum() + end.v.sum(), leaves, allow_unused=True)
 
     once, twice = (seconds(work, start.x.device) / trial for work in (forward, both))
     if n == 0:
