@@ -43,11 +43,6 @@ class Parts:
         if self.norms is not None and not isinstance(self.norms, GradientNorms):
             raise TypeError(f"norms must be GradientNorms or None, got {shape_of(self.norms)}")
 
-    @property
-    def whole(self) -> bool:
-        """Whether nothing happens."""
-        return self.prefix == 0 and self.truncate is None and self.hook is None and self.norms is None
-
     def first_with_gradient(self) -> int:
         """The first step that a gradient may reach: without a hook the loss knows the end alone."""
         prefix = min(self.prefix, self.n)

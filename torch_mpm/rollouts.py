@@ -83,9 +83,9 @@ def rollout(
         raise TypeError(f"step must be a Step or a function (state, dt) -> state, got {shape_of(step)}")
     check_count("n", n)
     kept = as_checkpoints(checkpoint)
-    parts = Parts(n, prefix, truncate, hook, every, norms)
-    if parts.whole:
+    if prefix == 0 and every == 1 and truncate is None and hook is None and norms is None:
         return _taken(step, state, n, dt, kept)
+    parts = Parts(n, prefix, truncate, hook, every, norms)
     if isinstance(step, Step):
         state = step.prepare(state)
     if kept is not None and kept.memory is not None and torch.is_grad_enabled():  # the same for all parts
