@@ -92,16 +92,23 @@ def _estimate(
     in_op = isinstance(step, Step) and obstacle_to_substeps(step, start, dt) is None
     of_state, of_step = bytes_kept(step, start, dt)
     trial = max(min(n, TRIAL), 1)
+    calls = trial if kept is not None and kept.states is not None else 1  # between kept states
+
+    def taken() -> State:
+        state = start
+        for _ in range(calls):
+            state = rollout(step, state, trial // calls, dt)
+        return state
 
     @torch.no_grad()
     def forward() -> None:
-        rollout(step, start, trial, dt)
+        taken()
 
     tensors = [*step.parameters(), *step.buffers()] if isinstance(step, torch.nn.Module) else []
     leaves = [start.x, start.v, *(t for t in tensors if t.requires_grad)]
 
     def both() -> None:
-        end = rollout(step, start, trial, dt)
+        end = taken()
         torch.autograd.grad(end.x.sum() + end.v.sum(), leaves, allow_unused=True)
 
     once, twice = (seconds(work, start.x.device) / trial for work in (forward, both))

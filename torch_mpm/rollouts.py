@@ -83,7 +83,7 @@ def rollout(
         raise TypeError(f"step must be a Step or a function (state, dt) -> state, got {shape_of(step)}")
     check_count("n", n)
     kept = as_checkpoints(checkpoint)
-    if prefix == 0 and every == 1 and truncate is None and hook is None and norms is None:
+    if truncate is None and hook is None and norms is None and prefix == 0 and every == 1 and every is not True:
         return _taken(step, state, n, dt, kept)
     parts = Parts(n, prefix, truncate, hook, every, norms)
     if isinstance(step, Step):
