@@ -220,7 +220,7 @@ class Loss(nn.Module):
         self.step = trained(scenes=scenes)
 
     def forward(self, states):
-        return distance(self.step, states, 4, checkpoint=2)
+        return distance(self.step, states, 4)
 
 
 def _rank(rank, world, place, scenes):
