@@ -117,7 +117,7 @@ def aside(step: Any, x: Tensor) -> Iterator[None]:
         step: a module, whose parts are meant too, or a function, which has no records.
         x: a tensor on the device of the particles.
     """
-    modules = list(step.modules()) if isinstance(step, torch.nn.Module) else []
+    modules = [m for m in step.modules() if hasattr(m, "_activations")] if isinstance(step, torch.nn.Module) else []
     kept = [(m, name, getattr(m, name)) for m in modules for name in RECORDS if hasattr(m, name)]
     for module, name, _ in kept:
         setattr(module, name, ActivationRecord() if name == "_activations" else None)
