@@ -24,8 +24,8 @@ ACTIVATION = "activation"
 class Active(Material):
     """A law with an active stress along fibres: τ + a (F d) (F d)ᵀ.
 
-    That is the stress of the energy a (|F d|² − 1)/2 per rest volume, a spring along the fibre, for a constant a (as in
-    Min et al. 2019, "SoftCon", and Hu et al. 2019, "ChainQueen", whose actuators are such stresses).
+    That is the stress of the energy a (|F d|² − 1)/2 per rest volume, a spring along the fibre, for a constant a; the
+    actuation F A Fᵀ of ChainQueen (Hu et al. 2019) with A = a d dᵀ.
 
     The activation a [P] [Pa] is `state.extra["activation"]`, zero where it was not set: a > 0 contracts. A controller
     sets it in `Step(on_particles=)` for each step, or a hook of `rollout` now and then; gradients pass to it.
