@@ -25,7 +25,10 @@ def test_a_state_is_a_pytree_of_its_tensors(device):
     doubled = _pytree.tree_map(lambda t: 2 * t, {"start": state})["start"]
     assert torch.equal(doubled.x, 2 * state.x) and torch.equal(doubled.extra["h"], 2 * state.extra["h"])
     keys = [str(path[0]) for path, _ in _pytree.tree_flatten_with_path(state)[0]]
-    assert keys == [".x", ".v", ".mass", ".volume", ".F", ".extra.h"]
+    assert keys == [".x", ".volume", ".v", ".mass", ".F", ".extra.h"]
+    several = state.replace(extra={"v": state.mass, "volume": 2 * state.mass, "b": 3 * state.mass})
+    same = _pytree.tree_map(lambda t: t, several)
+    assert list(same.extra) == ["v", "volume", "b"] and all(same.extra[k] is several.extra[k] for k in same.extra)
     timed = state.replace(time=torch.tensor([0.5], dtype=torch.float64, device=device))
     assert float(_pytree.tree_map(lambda t: 2 * t, timed).time) == 1.0
     assert _pytree.tree_map(lambda t: tuple(t.shape), state).extra == {"h": (len(state), 2, 3)}
@@ -62,11 +65,12 @@ class Throws(Dataset):
         return {"start": state.replace(v=state.v + k), "target": torch.tensor(float(k))}
 
 
-@pytest.mark.parametrize("workers", [0, 2])
-def test_a_data_loader_makes_batches_of_scenes(workers):
+@pytest.mark.parametrize(("workers", "context"), [(0, None), (2, "fork"), (1, "spawn")])
+def test_a_data_loader_makes_batches_of_scenes(workers, context):
     """Also from worker processes; each scene moves as it does alone."""
     step = make_step(2, scenes=2)
-    for number, batch in enumerate(DataLoader(Throws(), batch_size=2, num_workers=workers)):
+    loader = DataLoader(Throws(), batch_size=2, num_workers=workers, multiprocessing_context=context)
+    for number, batch in enumerate(loader):
         assert batch["target"].tolist() == [2.0 * number, 2.0 * number + 1]
         ends = mpm.rollout(step, batch["start"], 3, 1e-3).split()
         for k, end in enumerate(ends):

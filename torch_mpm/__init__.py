@@ -6,10 +6,12 @@ from . import _library as _library
 from . import containers, laws, ops, particle_operations, seed
 from .boundaries import SDF, Box, Capsule, Plane, Revolved, Sphere, Walls
 from .cfl import stable_dt
+from .checkpoints import Checkpoints
 from .data.trajectory import Trajectory
 from .environments import Environments
 from .errors import DamagedFileError, GridOverflowError, SimulationError
 from .failures import Failures
+from .gradient_norms import GradientNorms
 from .graphs import captured
 from .grid import Blocks, Grid
 from .heat import Heat
@@ -31,6 +33,7 @@ from .ops import (
 )
 from .parameters import PerMaterial, Table
 from .recording import Frames, frames
+from .rollout_estimate import RolloutEstimate, estimate_rollout
 from .rollouts import rollout
 from .state import State
 from .step import Step
@@ -44,10 +47,12 @@ __all__ = [
     "Blocks",
     "Box",
     "Capsule",
+    "Checkpoints",
     "DamagedFileError",
     "Environments",
     "Failures",
     "Frames",
+    "GradientNorms",
     "Grid",
     "GridOverflowError",
     "Heat",
@@ -55,6 +60,7 @@ __all__ = [
     "PerMaterial",
     "Plane",
     "Revolved",
+    "RolloutEstimate",
     "SimulationError",
     "Sphere",
     "State",
@@ -64,6 +70,7 @@ __all__ = [
     "Walls",
     "advance",
     "captured",
+    "estimate_rollout",
     "frames",
     "g2p",
     "g2p_advance",

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from .capture import is_captured, outside_transforms, remember, without_transforms
+from .capture import is_captured, is_exported, outside_transforms, remember, without_transforms
 from .failures import Problem, problems_of_status, refused_steps
 from .grid import Blocks, Grid
 
@@ -35,6 +36,8 @@ class ActivationRecord:
 
     def activate(self, grid: Grid, x: Tensor, scene: Tensor | None, ids: Tensor | None = None) -> Blocks:
         """As `Grid.activate`; `max_blocks` of the grid follows."""
+        if is_exported():
+            return grid.activate(x, scene, None, ids)
         before = self.status
         blocks = grid.activate(x, scene, before, ids)
         status = without_transforms(blocks.status)
@@ -100,3 +103,27 @@ class ActivationRecord:
                 status[1:, 2:7:2].masked_fill_(scenes[:, None], -1)  # as NO_PROBLEM
                 status[0, 1:4:2].masked_fill_(scenes.any(), 0)
                 status[0, 2:7:2].masked_fill_(scenes.any(), -1)
+
+
+RECORDS = ("_activations", "unsolved", "residual")
+"""Attributes in which steps and heat keep what became of them."""
+
+
+@contextlib.contextmanager
+def aside(step: Any, x: Tensor) -> Iterator[None]:
+    """Where steps leave nothing behind: not in what they tell of the steps so far, nor in random numbers.
+
+    Args:
+        step: a module, whose parts are meant too, or a function, which has no records.
+        x: a tensor on the device of the particles.
+    """
+    modules = [m for m in step.modules() if hasattr(m, "_activations")] if isinstance(step, torch.nn.Module) else []
+    kept = [(m, name, getattr(m, name)) for m in modules for name in RECORDS if hasattr(m, name)]
+    for module, name, _ in kept:
+        setattr(module, name, ActivationRecord() if name == "_activations" else None)
+    try:
+        with torch.random.fork_rng([x.device] if x.is_cuda else []):
+            yield
+    finally:
+        for module, name, value in kept:
+            setattr(module, name, value)

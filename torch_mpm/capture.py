@@ -17,7 +17,12 @@ def is_captured(x: Tensor) -> bool:
 
 def is_traced(x: Tensor) -> bool:
     """Whether a compiler or a fake tensor stands for values, which cannot be read."""
-    return torch.compiler.is_compiling() or isinstance(x, torch._subclasses.FakeTensor)
+    return torch.compiler.is_compiling() or is_exported() or isinstance(x, torch._subclasses.FakeTensor)
+
+
+def is_exported() -> bool:
+    """Whether `torch.export` runs the code: what it writes to outlives the export, but not the values."""
+    return torch.compiler.is_exporting()
 
 
 def without_transforms(t: Tensor) -> Tensor:

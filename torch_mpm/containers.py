@@ -12,7 +12,8 @@ from torch.utils.data._utils.collate import default_collate_fn_map
 
 from .state import FIELDS, State
 
-TENSORS = tuple(name for name in FIELDS if name not in ("extra", "time"))
+TENSORS = sorted((name for name in FIELDS if name not in ("extra", "time")), reverse=True)
+"""A name comes before those that it begins with, which `torch.export` needs to tell `v` from `volume`."""
 Layout = tuple[tuple[str, ...], tuple[str, ...], "float | None"]
 """Names of the fields and of the entries of `extra` that are leaves, and the time where it is a number."""
 
@@ -21,7 +22,9 @@ def _flatten(state: State) -> tuple[list[Any], Layout]:
     """The tensors of a state are leaves, absent fields are not."""
     names = tuple(name for name in TENSORS if getattr(state, name) is not None)
     time = state.time
-    leaves = [getattr(state, name) for name in names] + list(state.extra.values())
+    leaves = [getattr(state, name) for name in names] + [
+        state.extra[name] for name in sorted(state.extra, reverse=True)
+    ]
     number = None if isinstance(time, Tensor) else time
     return (leaves if number is not None else [*leaves, time]), (names, tuple(state.extra), number)
 
@@ -29,7 +32,7 @@ def _flatten(state: State) -> tuple[list[Any], Layout]:
 def _flatten_with_keys(state: State) -> tuple[list[tuple[Any, Any]], Layout]:
     leaves, layout = _flatten(state)
     names, extra, time = layout
-    keys = [*names, *(f"extra.{name}" for name in extra), *(["time"] if time is None else [])]
+    keys = [*names, *(f"extra.{name}" for name in sorted(extra, reverse=True)), *(["time"] if time is None else [])]
     return [(_pytree.GetAttrKey(key), leaf) for key, leaf in zip(keys, leaves, strict=True)], layout
 
 
@@ -40,7 +43,8 @@ def _unflatten(leaves: Any, layout: Layout) -> State:
     state: State = object.__new__(State)
     state.__dict__.update(dict.fromkeys(TENSORS))
     state.__dict__.update(zip(names, values, strict=False))
-    state.extra = dict(zip(extra, values[len(names) :], strict=False))
+    kept = dict(zip(sorted(extra, reverse=True), values[len(names) :], strict=False))
+    state.extra = {name: kept[name] for name in extra}
     if time is None:
         state.__dict__["_time"] = values[-1]
     else:
@@ -60,6 +64,8 @@ def register() -> None:
         _flatten,
         _unflatten,
         serialized_type_name="torch_mpm.State",
+        to_dumpable_context=list,
+        from_dumpable_context=lambda read: (tuple(read[0]), tuple(read[1]), read[2]),  # lists of a file
         flatten_with_keys_fn=_flatten_with_keys,
     )
     torch.serialization.add_safe_globals([State])

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import torch
@@ -87,10 +88,12 @@ class Grid(Lattice):
         self._grows = max_blocks is None
         self._pending: torch.cuda.Event | None = None
         self._on_host: Tensor | None = None
+        self._replayed: Iterator[int] | None = None
+        self._recordings: list[list[int]] = []
 
     def __getstate__(self) -> dict[str, Any]:
         """For copies: without what is on its way from the device, which neither copies nor pickles."""
-        return {**self.__dict__, "_pending": None, "_on_host": None}
+        return {**self.__dict__, "_pending": None, "_on_host": None, "_replayed": None, "_recordings": []}
 
     def __repr__(self) -> str:
         return (
@@ -134,9 +137,13 @@ class Grid(Lattice):
 
     def pool(self, x: Tensor, scene: Tensor | None) -> int:
         """The blocks of the pool of the next activation."""
-        if self._grows:
+        if self._replayed is not None:
+            self.max_blocks = next(self._replayed, self.max_blocks)
+        elif self._grows:
             self._grow(x, scene)
         assert self.max_blocks is not None
+        for sizes in self._recordings:
+            sizes.append(self.max_blocks)
         return self.max_blocks
 
     def follow(self, wanted: int) -> int:
@@ -198,6 +205,26 @@ class Grid(Lattice):
             self._on_host.copy_(status[0], non_blocking=True)
         self._pending = torch.cuda.Event()
         self._pending.record(torch.cuda.current_stream(status.device))
+
+    @contextlib.contextmanager
+    def same_pools(self, sizes: list[int]) -> Iterator[None]:
+        """Where the pools of all activations get the sizes in a list, or are written into it where it is empty.
+
+        So steps that the backward pass takes again find pools of the size they had, whatever came later.
+        """
+        replayed, latest = self._replayed, self.max_blocks
+        if sizes:
+            self._replayed = iter(sizes)
+        else:
+            self._recordings.append(sizes)
+        try:
+            yield
+        finally:
+            if self._replayed is replayed:
+                self._recordings.pop()
+            else:
+                self._replayed = replayed
+                self.max_blocks = max(self.max_blocks or 0, latest or 0)
 
     def wait(self) -> None:
         """Wait for what `watch` has asked a device for, so that the next activation has room for what it told."""

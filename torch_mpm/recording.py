@@ -8,12 +8,12 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from .checkpoints import Checkpoints
 from .errors import check_count, shape_of
+from .rollout_parts import Hook, Parts
 from .rollouts import rollout
 from .state import State
 from .step import Step
-
-Hook = Callable[[State, int], "State | None"]
 
 
 class Frames(NamedTuple):
@@ -35,12 +35,15 @@ def frames(
     every: int = 1,
     fields: Sequence[str] = ("x", "v"),
     hook: Hook | None = None,
-    checkpoint: int | None = None,
+    checkpoint: int | Checkpoints | None = None,
+    *,
+    prefix: int = 0,
+    truncate: int | None = None,
 ) -> Frames:
     """A `rollout` that keeps some fields of every so many steps, and lets a hook act there.
 
     Args:
-        step, state, n, dt, checkpoint: as `rollout`.
+        step, state, n, dt, checkpoint, prefix, truncate: as `rollout`.
         every: steps from one frame to the next.
         fields: names of fields of `State` or of `state.extra`.
         hook: called as `hook(state, k)` before step k = 0, every, 2 every, ..., after the frame of that step is kept.
@@ -55,29 +58,29 @@ def frames(
     """
     check_count("n", n)
     check_count("every", every, 1)
-    if hook is not None and not callable(hook):
-        raise TypeError(f"hook must be a function (state, k) -> state or None, got {shape_of(hook)}")
     if isinstance(step, Step):
         state = step.prepare(state)
     kept: dict[str, list[Tensor]] = {name: [] for name in _checked(fields, state)}
     times: list[Any] = []
 
-    def keep() -> None:
+    def keep(state: State) -> None:
         times.append(state.time)
         for name, values in kept.items():
             value = _field(state, name)
             # A hook may write into the tensors of the state.
             values.append(value if value.requires_grad or hook is None else value.clone())
 
-    for k in range(0, n, every):
-        keep()
-        if hook is not None:
-            state = _acted(hook, state, k)
-        state = rollout(step, state, min(every, n - k), dt, checkpoint)
+    def seen(state: State, k: int) -> State | None:
+        keep(state)
+        return None if hook is None else hook(state, k)
+
+    Parts(n, hook=hook)  # which refuses what is no hook
+    options: dict[str, Any] = {"prefix": prefix, "truncate": truncate}
+    end = rollout(step, state, n, dt, checkpoint, hook=seen, every=every, **options)
     if n % every == 0:
-        keep()  # of the end
+        keep(end)
     time = torch.stack(times) if isinstance(times[0], Tensor) else torch.tensor(times, dtype=torch.float64)
-    return Frames(time, {name: torch.stack(values) for name, values in kept.items()}, state)
+    return Frames(time, {name: torch.stack(values) for name, values in kept.items()}, end)
 
 
 def _checked(fields: Sequence[str], state: State) -> Sequence[str]:
@@ -92,12 +95,3 @@ def _checked(fields: Sequence[str], state: State) -> Sequence[str]:
 
 def _field(state: State, name: str) -> Any:
     return state.extra[name] if name in state.extra else getattr(state, name, None)
-
-
-def _acted(hook: Hook, state: State, k: int) -> State:
-    result = hook(state, k)
-    if result is None:
-        return state
-    if not isinstance(result, State) or len(result) != len(state):
-        raise TypeError(f"hook must return None or a State of {len(state)} particles, got {shape_of(result)}")
-    return result

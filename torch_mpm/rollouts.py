@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Callable
 from typing import Any
@@ -10,9 +11,12 @@ import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
+from .anomaly import begin, detecting, watch
 from .boundaries import Obstacle
 from .capture import is_captured, is_traced
+from .checkpoints import Checkpoints, as_checkpoints, binomial, fitting, in_segments, offloaded
 from .errors import check_count, shape_of
+from .gradient_norms import GradientNorms
 from .graphs import CHUNK, LEAST_STEPS, obstacle_to_replays, replayed, time_after
 from .laws import CompiledLaw, Mixture
 from .ops.arguments import split_dt
@@ -22,8 +26,10 @@ from .ops.grid_update import per_scene, wall_arguments
 from .ops.transfer import STRESS_FORMS
 from .parameters import Overlay, has_hooks
 from .pause import paused
+from .rollout_parts import Hook, Parts
 from .state import State, check_state
 from .step import Step
+from .step_cost import state_bytes, step_bytes
 
 LawCall = tuple[CompiledLaw, list[Tensor], list[str]]
 """A law, its parameters, and the names of its history."""
@@ -34,7 +40,13 @@ def rollout(
     state: State,
     n: int,
     dt: float | Tensor,
-    checkpoint: int | None = None,
+    checkpoint: int | Checkpoints | None = None,
+    *,
+    prefix: int = 0,
+    truncate: int | None = None,
+    hook: Hook | None = None,
+    every: int = 1,
+    norms: GradientNorms | None = None,
 ) -> State:
     """The state n steps later.
 
@@ -43,8 +55,16 @@ def rollout(
         state: the initial state.
         n: number of steps.
         dt: time step [s], as `Step` takes it.
-        checkpoint: if given, keep for the backward pass only the state of every `checkpoint` steps and compute the
-            steps between again (memory n/checkpoint + checkpoint states instead of n steps; sqrt(n) is best).
+        checkpoint: what is kept for the backward pass, which takes the steps between again: the state of every so many
+            steps (memory n/checkpoint + checkpoint states instead of n steps; sqrt(n) is best), or what `Checkpoints`
+            says: so many states, a budget of memory, states that wait on the host. None: all steps.
+        prefix: number of first steps that are taken without gradients.
+        truncate: if given, gradients pass back through so many steps at most: the graph is cut before the steps
+            n - truncate, n - 2 truncate, ... Without a hook that is a prefix of n - truncate steps.
+        hook: called as `hook(state, k)` before step k = 0, every, 2 every, ...; it may look at the state, add to a
+            loss, or return another state of as many particles. Where a hook acts a state is kept.
+        every: steps from one call of the hook to the next.
+        norms: records the norm of the gradient at states on the way; see `GradientNorms`.
 
     A `Step` of compiled laws without heat, FLIP and functions of the user's takes all steps in one op, or some, with
     the results of single steps (to the last bit on the CPU and on deterministic grids); `Step.explain` tells. Its
@@ -52,45 +72,80 @@ def rollout(
     more where states are small. A kept state of a solid has 2 D + 2 D² numbers per particle (24 in 3-D, 96 bytes in
     float32) and its history; while the backward pass goes through `checkpoint` steps, it holds about 2 D + 4 D² (42 in
     3-D) for each of them. Second derivatives need single steps. On CUDA and without gradients, other steps that call no
-    function of the user's are replays of a CUDA graph of one; see `captured` for what else there is.
+    function of the user's are replays of a CUDA graph of one; see `captured` for what else there is, and
+    `estimate_rollout` for what a rollout will take. Under `torch.autograd.detect_anomaly` a gradient that is NaN is
+    reported with its operation, substep and scene.
 
     Raises:
-        TypeError, ValueError: for an n or a checkpoint that is no whole number, a negative n, a checkpoint below 1, or
-            what `step` raises.
+        TypeError, ValueError: for a number of steps that is no whole number or out of range, or what `step` raises.
     """
     if not callable(step):
         raise TypeError(f"step must be a Step or a function (state, dt) -> state, got {shape_of(step)}")
     check_count("n", n)
-    if checkpoint is not None:
-        check_count("checkpoint", checkpoint, 1)
-
-    if isinstance(step, Step) and obstacle_to_substeps(step, state, dt) is None:
-        return in_chunks(step, state, n, dt, checkpoint)
-    if isinstance(step, Step) and n > LEAST_STEPS and obstacle_to_replays(step, state, dt) is None:
-        return replayed(step, state, n, dt)  # type: ignore[arg-type]
-    if checkpoint is not None and torch.is_grad_enabled():
-        return checkpointed(step, state, n, dt, checkpoint)
-    for _ in range(n):
-        state = step(state, dt)
-    return state
-
-
-def checkpointed(
-    step: Callable[[State, float | Tensor], State], state: State, n: int, dt: float | Tensor, every: int
-) -> State:
-    """The state n steps later; of every so many steps only the first state is kept for the backward pass."""
-    from torch.utils.checkpoint import checkpoint  # whose first call imports for seconds
-
-    def steps(state: State, count: int) -> State:
-        for _ in range(count):
-            state = step(state, dt)
-        return state
-
+    kept = as_checkpoints(checkpoint)
+    if truncate is None and hook is None and norms is None and prefix == 0 and every == 1 and every is not True:
+        return _taken(step, state, n, dt, kept)
+    parts = Parts(n, prefix, truncate, hook, every, norms)
     if isinstance(step, Step):
         state = step.prepare(state)
-    for first in range(0, n, every):
-        state = checkpoint(steps, state, min(every, n - first), use_reentrant=False)
-    return state
+    if kept is not None and kept.memory is not None and torch.is_grad_enabled():  # the same for all parts
+        kept = resolved(kept, step, state, n - parts.first_with_gradient(), dt)
+    grid = step.grid if isinstance(step, Step) else None
+    scales = (1, 1.0, dt) if grid is None else (grid.scenes, grid.dx, dt)
+    return parts.run(lambda state, count, k: _taken(step, state, count, dt, kept, k), state, scales)
+
+
+def _taken(
+    step: Callable[[State, float | Tensor], State],
+    state: State,
+    n: int,
+    dt: float | Tensor,
+    kept: Checkpoints | None = None,
+    first: int = 0,
+) -> State:
+    """The state n steps later, of which the first is step `first` of a rollout."""
+    if kept is not None and not torch.is_grad_enabled():
+        kept = None
+    if kept is not None and kept.memory is not None:
+        kept = resolved(kept, step, state, n, dt)
+    if isinstance(step, Step) and obstacle_to_substeps(step, state, dt) is None:
+        return in_chunks(step, state, n, dt, kept)
+    if isinstance(step, Step) and n > LEAST_STEPS and obstacle_to_replays(step, state, dt) is None:
+        return replayed(step, state, n, dt)  # type: ignore[arg-type]
+    grid = step.grid if isinstance(step, Step) else None
+
+    def single(state: State, count: int, begins: int) -> State:
+        for k in range(first + begins, first + begins + count):
+            mark = begin() if detecting() else None
+            before, state = state, step(state, dt)
+            if mark is not None:
+                watch(before, state, mark, k, grid)
+        return state
+
+    if kept is None or n == 0:
+        return single(state, n, 0)
+    if isinstance(step, Step):
+        state = step.prepare(state)
+    if kept.states is not None:
+        return binomial(single, state, n, kept.states, step)
+    return in_segments(single, state, n, kept, step)
+
+
+def resolved(
+    kept: Checkpoints, step: Callable[[State, float | Tensor], State], state: State, n: int, dt: float | Tensor
+) -> Checkpoints | None:
+    """Checkpoints of n steps that fit into the memory that some say [bytes]; None where all of them do."""
+    assert kept.memory is not None
+    return fitting(kept.memory, n, *bytes_kept(step, state, dt), kept.offload)
+
+
+def bytes_kept(step: Callable[[State, float | Tensor], State], state: State, dt: float | Tensor) -> tuple[int, int]:
+    """Of a kept state, and of each step that the backward pass has taken again [bytes]."""
+    if isinstance(step, Step):
+        state = step.prepare(state)
+        if obstacle_to_substeps(step, state, dt) is None:
+            return state_bytes(state), bytes_of_a_substep(state)
+    return state_bytes(state), step_bytes(step, state, dt)
 
 
 def obstacle_to_substeps(step: Step, state: State, dt: float | Tensor) -> str | None:
@@ -108,6 +163,8 @@ def obstacle_to_substeps(step: Step, state: State, dt: float | Tensor) -> str | 
     transformed = torch._C._are_functorch_transforms_active() or forward_ad._current_level >= 0
     if torch.compiler.is_compiling() or is_traced(x) or is_captured(x) or transformed:
         return "it is compiled, captured or transformed"
+    if detecting():
+        return "anomaly detection looks at every step"
     if step.heat is not None:
         return "it conducts heat"
     if step.on_grid is not None:
@@ -140,14 +197,23 @@ KEPT_BYTES = {"cpu": 2**24, "cuda": 2**28}
 hold, and so much that kernels on CUDA hide the time of Python."""
 
 
-def in_chunks(step: Step, state: State, n: int, dt: float | Tensor, checkpoint: int | None = None) -> State:
+def in_chunks(step: Step, state: State, n: int, dt: float | Tensor, kept: Checkpoints | None = None) -> State:
+    """The state n steps later, by calls of one op; `obstacle_to_substeps` must be None."""
     chunk = CHUNK if step.grid.grows and state.x.is_cuda else MOST_STEPS
-    if wants_gradient(step, state):
-        chunk = min(chunk, checkpoint or _steps_between_kept(state, n))
-    while n > 0:
-        count = min(n, chunk)
-        state, n = substeps(step, state, count, dt), n - count
-    return state
+
+    def advance(state: State, count: int, first: int = 0) -> State:
+        while count > 0:
+            now = min(count, chunk)
+            state, count = substeps(step, state, now, dt), count - now
+        return state
+
+    if not wants_gradient(step, state):
+        return advance(state, n)
+    chunk = min(chunk, kept.every if kept is not None and kept.every else steps_of_a_call(state, n))
+    if kept is not None and kept.states is not None and n > 0:
+        return binomial(advance, step.prepare(state), n, kept.states, step)
+    with offloaded(state) if kept is not None and kept.offload else contextlib.nullcontext():
+        return advance(state, n)
 
 
 def wants_gradient(step: Step, state: State) -> bool:
@@ -155,10 +221,15 @@ def wants_gradient(step: Step, state: State) -> bool:
     return torch.is_grad_enabled() and any(t.requires_grad for t in _differentiable(step, state))
 
 
-def _steps_between_kept(state: State, n: int) -> int:
+def steps_of_a_call(state: State, n: int) -> int:
+    """Between two kept states of a rollout in one op that says nothing else."""
+    return max(math.isqrt(n), KEPT_BYTES[state.x.device.type] // max(bytes_of_a_substep(state), 1), 1)
+
+
+def bytes_of_a_substep(state: State) -> int:
+    """What the backward pass of the op holds of each step of a solid [bytes]."""
     P, D = state.x.shape
-    step_bytes = P * (2 * D + 4 * D * D) * state.x.element_size()
-    return max(math.isqrt(n), KEPT_BYTES[state.x.device.type] // max(step_bytes, 1), 1)
+    return P * (2 * D + 4 * D * D) * state.x.element_size()
 
 
 _FORWARD = CompiledLaw.forward

@@ -26,7 +26,7 @@ from .errors import (
     shape_of,
 )
 from .grid import Grid, check_grid
-from .ops.arguments import soa_empty
+from .ops.arguments import refuse_batched, soa_empty
 
 if TYPE_CHECKING:
     from .seed import Points
@@ -283,6 +283,9 @@ PARTICLE_FIELDS = tuple(name for name in FIELDS if name not in ("extra", "time",
 def check_state(state: Any) -> None:
     if not isinstance(state, State):
         raise TypeError(f"state must be a State, got {shape_of(state)}")
+    if not torch.compiler.is_compiling() and torch._C._are_functorch_transforms_active():
+        for name in ("x", "v", "mass", "F"):
+            refuse_batched(f"state.{name}", getattr(state, name))
 
 
 def _check_impulse(impulse: Any, x: Tensor) -> None:

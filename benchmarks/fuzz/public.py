@@ -127,7 +127,9 @@ def _steps() -> dict[str, Callable[[], Call]]:
                 raise mpm.SimulationError("n is too large for this program")
             return step(state, dt)
 
-        return mpm.rollout, dict(step=at_most_five, state=w.state, n=2, dt=1e-4, checkpoint=1)
+        return mpm.rollout, dict(
+            step=at_most_five, state=w.state, n=2, dt=1e-4, checkpoint=1, prefix=0, truncate=1, every=1
+        )
 
     def stable_dt() -> Call:
         w = _World()
@@ -181,6 +183,7 @@ def _laws() -> dict[str, Callable[[], Call]]:
         ),
         "CustomLaw": applied(mpm.CustomLaw, function=stress, state_field="F", stiffness=1.0),
         "CustomPrincipalLaw": applied(mpm.CustomPrincipalLaw, function=principal_stress, stiffness=1.0),
+        "Active": applied(mpm.Active, law=mpm.NeoHookean(**moduli), direction=(1.0, 0.0)),
         "ThermalExpansion": applied(mpm.ThermalExpansion, law=mpm.NeoHookean(**moduli), coefficient=1e-5),
         "HerschelBulkley": lambda: (
             mpm.HerschelBulkley, dict(**moduli, yield_stress=10.0, consistency=1.0, exponent=1.0)

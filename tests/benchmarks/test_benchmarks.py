@@ -10,7 +10,7 @@ from helpers import result, run_quick
 
 from benchmarks import common, report
 from benchmarks.accuracy import convergence, manufactured, ritter
-from benchmarks.speed import peers, step, work
+from benchmarks.speed import checkpoints, peers, step, work
 from benchmarks.stability.stable_dt import LAWS
 
 
@@ -130,7 +130,7 @@ def test_limits_program(tmp_path: Path) -> None:
     assert all(row["polar"] < 1e-6 for row in errors.values())
 
 
-@pytest.mark.parametrize("program", ["convergence", "precision", "ritter"])
+@pytest.mark.parametrize("program", ["convergence", "precision", "ritter", "rollout_gradients"])
 def test_accuracy_program(program: str, tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     run_quick(f"benchmarks.accuracy.{program}", tmp_path)
@@ -221,3 +221,11 @@ def test_svd_program(tmp_path: Path) -> None:
     run_quick("benchmarks.accuracy.svd", tmp_path)
     for row in result(tmp_path, "svd_accuracy.json")["rows"]:
         assert row["errors"]["svd3"]["product"][1] < 1e-6
+
+
+def test_memory_of_checkpoints_is_what_was_estimated() -> None:
+    """Of live tensors, counted apart; beside the estimate is what the backward pass of one step works with."""
+    cases = {name: checkpoints.case("torch code", name, 4, 20, "cpu") for name in ("all steps", "5 states")}
+    one_step = cases["all steps"]["estimated_memory"] / 20
+    for case in cases.values():
+        assert 0.9 * case["estimated_memory"] < case["memory"] < case["estimated_memory"] + 4 * one_step

@@ -173,6 +173,7 @@ NO_GRADIENT = {
 }
 
 LAWS = {
+    "Active": lambda E: mpm.Active(mpm.NeoHookean(E=E, nu=0.3), (0.6, 0.8)),
     "NeoHookean": lambda E: mpm.NeoHookean(E=E, nu=0.3),
     "FixedCorotated": lambda E: mpm.FixedCorotated(E=E, nu=0.3),
     "Hencky": lambda E: mpm.Hencky(E=E, nu=0.3),
@@ -192,7 +193,7 @@ LAWS = {
     "ThermalExpansion": lambda E: mpm.ThermalExpansion(mpm.Hencky(E=E, nu=0.3), 1e-3),
     "Melting": lambda E: mpm.Melting(mpm.QuarticSand(E=E, nu=0.3), mpm.WeaklyCompressible(E)),
 }
-TWICE = {"NeoHookean", "CustomLaw", "WeaklyCompressible"}
+TWICE = {"Active", "NeoHookean", "CustomLaw", "WeaklyCompressible"}
 
 
 def rollout_case(name, device, every=None, n=2):

@@ -25,6 +25,26 @@ class LearnedLaw(torch.nn.Module):
         return modulus[:, :, None] * strain
 
 
+class LearnedStretches(torch.nn.Module):
+    """Principal stresses with a small network in them."""
+
+    def __init__(self):
+        super().__init__()
+        self.net = torch.nn.Sequential(torch.nn.Linear(2, 4), torch.nn.Tanh(), torch.nn.Linear(4, 1))
+
+    def forward(self, sigma):
+        volume = sigma.prod(1, keepdim=True).expand_as(sigma)
+        return 1e4 * (sigma - 1) + 1e3 * self.net(torch.stack([sigma, volume], -1))[..., 0]
+
+
+def law_of(name, device):
+    if name == "learned law":
+        return mpm.CustomLaw(LearnedLaw().double().to(device))
+    if name == "learned stretches":
+        return mpm.CustomPrincipalLaw(LearnedStretches().double().to(device))
+    return mpm.NeoHookean(E=1e4, nu=0.3)
+
+
 @pytest.fixture(autouse=True)
 def fresh_compiler():
     torch._dynamo.reset()
@@ -35,7 +55,7 @@ def make_step(name, device):
     """A step that was taken once, so that its grid has `max_blocks`, and the state after it."""
     grid = mpm.Grid(0.1, (0, 0), (1, 1), deterministic=True)
     torch.manual_seed(0)
-    law = mpm.CustomLaw(LearnedLaw().double().to(device)) if name == "learned law" else mpm.NeoHookean(E=1e4, nu=0.3)
+    law = law_of(name, device)
     obstacles = {
         "moving obstacles": [
             mpm.Sphere((0.45, 0.15), 0.1, velocity=(0.2, 0.5), friction=0.3, start=0.02, end=0.08),
@@ -72,7 +92,7 @@ def test_a_rollout_compiles_once(name, device):
     step.check(got)
 
 
-@pytest.mark.parametrize("name", ["tensor dt", "learned law"])
+@pytest.mark.parametrize("name", ["tensor dt", "learned law", "learned stretches"])
 def test_gradients_of_a_compiled_rollout(name, device):
     """Recorded by AOTAutograd, in one compilation: of the state, and of the weights of a network."""
     step, state, dt = make_step(name, device)

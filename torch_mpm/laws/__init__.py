@@ -4,7 +4,8 @@ A law is a `Material`. Most are compiled (`CompiledLaw`); `CustomLaw` makes one 
 several in one state. A new compiled law is a class in `solids` or `fluids`, named in the `__all__` of that module.
 """
 
-from . import custom, fluids, mixture, sand, solids, thermal
+from . import active, custom, fluids, mixture, sand, solids, thermal
+from .active import *  # noqa: F403
 from .compiled import CompiledLaw as CompiledLaw
 from .compiled import SolidLaw as SolidLaw
 from .custom import *  # noqa: F403
@@ -17,6 +18,7 @@ from .thermal import *  # noqa: F403
 
 __all__ = [
     "Material",
+    *active.__all__,
     *custom.__all__,
     *fluids.__all__,
     *mixture.__all__,

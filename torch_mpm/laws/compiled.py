@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from ..capture import GraphCache
 from ..errors import check_number, shape_of
-from ..ops.arguments import soa_empty
+from ..ops.arguments import refuse_batched, soa_empty
 from ..ops.law import (
     DISSIPATED,
     LawUpdate,
@@ -262,6 +262,7 @@ def check_value(name: str, value: Value, expected: str, holds: Callable[[Any], A
     if callable(value) and not isinstance(value, Tensor):
         return value
     if isinstance(value, Tensor):
+        refuse_batched(name, value)
         if value.dim() > 1 or value.numel() == 0 or not value.is_floating_point():
             raise ValueError(
                 f"{name} must be a number or a floating tensor of shape [], [1], [B] or [P], got {shape_of(value)}"

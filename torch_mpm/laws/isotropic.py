@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from ..errors import shape_of
+from ..ops.arguments import no_vmap
 from ..ops.svd import svd3
 from ..precision import from_half, full_precision
 
@@ -79,6 +80,10 @@ class _IsotropicFunction(torch.autograd.Function):
         ctx.save_for_backward(*tensors)
 
     @staticmethod
+    def vmap(info: Any, in_dims: Any, *arguments: Any) -> Any:
+        raise no_vmap("an isotropic function or CustomPrincipalLaw")
+
+    @staticmethod
     def backward(ctx: Any, grad_F: Tensor, grad_stress: Tensor) -> Any:
         with full_precision(grad_F):
             return _IsotropicFunction._adjoint(ctx, grad_F, grad_stress)
@@ -86,7 +91,7 @@ class _IsotropicFunction(torch.autograd.Function):
     @staticmethod
     def _adjoint(ctx: Any, grad_F: Tensor, grad_stress: Tensor) -> Any:
         F, U, sigma, V, mapped, tau = ctx.saved_tensors
-        M, N = (_DifferentiatedOnce.apply(t, F) for t in (U.mT @ grad_F @ V, U.mT @ grad_stress @ U))
+        M, N = (_once(t, F) for t in (U.mT @ grad_F @ V, U.mT @ grad_stress @ U))
         turned = None
         if ctx.needs_input_grad[0]:
             principal = torch.zeros_like(M)
@@ -100,9 +105,14 @@ class _IsotropicFunction(torch.autograd.Function):
                     stress = (N[:, i, j] + N[:, j, i]) * stress_slope / total
                     principal[:, i, j] = even + odd + stress * sigma[:, j]
                     principal[:, j, i] = even - odd + stress * sigma[:, i]
-            turned = _DifferentiatedOnce.apply(U @ principal @ V.mT, mapped, tau)
+            turned = _once(U @ principal @ V.mT, mapped, tau)
         diagonals = (t.diagonal(dim1=1, dim2=2) for t in (M, N))
         return turned, None, None, None, *diagonals, None
+
+
+def _once(gradient: Tensor, *others: Tensor) -> Tensor:
+    """A gradient that refuses to be differentiated; compiled code has no second derivatives of any function."""
+    return gradient if torch.compiler.is_compiling() else _DifferentiatedOnce.apply(gradient, *others)
 
 
 class _DifferentiatedOnce(torch.autograd.Function):

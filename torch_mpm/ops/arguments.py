@@ -158,10 +158,23 @@ def refuse_vmap(name: str) -> None:
     """Make `torch.vmap` over an op, and so `torch.func.jacrev` and `hessian`, say what to do instead."""
 
     def vmap(info: Any, in_dims: Any, *args: Any, **kwargs: Any) -> Any:
-        raise NotImplementedError(
-            f"torch.vmap over torch_mpm::{name} is not supported: pack the scenes into one call with `scene` and "
-            "Grid(scenes=B); instead of torch.func.jacrev or hessian use those of torch.autograd.functional, or a "
-            "loop over rows"
-        )
+        raise no_vmap(f"torch_mpm::{name}")
 
     torch.library.register_vmap(f"torch_mpm::{name}", vmap)
+
+
+def no_vmap(name: str) -> NotImplementedError:
+    """The error of what `torch.vmap` should not be used for."""
+    return NotImplementedError(
+        f"torch.vmap over {name} is not supported: pack the scenes into one call with `scene` and Grid(scenes=B), with "
+        "parameters, gravity and dt of shape [B]; instead of torch.func.jacrev or hessian use those of "
+        "torch.autograd.functional, or a loop over rows"
+    )
+
+
+def refuse_batched(name: str, value: Any) -> None:
+    """Raise for a tensor that stands for many, inside `torch.vmap`."""
+    if torch.compiler.is_compiling() or not isinstance(value, Tensor):
+        return
+    if torch._C._functorch.is_batchedtensor(value):
+        raise no_vmap(name)

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ..errors import FLOATING, NUMBER_OR_TENSOR, check_index, check_like, check_number, check_real, shape_of
+from ..errors import FLOATING, NUMBER_OR_TENSOR, check_flag, check_index, check_like, check_number, check_real, shape_of
 from .arguments import check_choice, check_parameter
 from .law import APEX, BRANCH, ELASTIC, INVALID, NOT_CONVERGED, law_energy, law_stiffness, law_update
 from .law import PLASTIC as CONE
@@ -141,7 +141,7 @@ def quartic_return_map(
         history,
         scene=scene,
         options=["keep_apex"] if apex == "keep" else [],
-        details=True if details else BRANCH,
+        details=True if check_flag("details", details) else BRANCH,
     )
     assert result.branch is not None and result.converged is not None
     return ReturnMap(

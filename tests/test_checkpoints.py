@@ -1,0 +1,237 @@
+"""What a rollout keeps for its backward pass: gradients are those without, and memory is what was said."""
+
+import math
+
+import pytest
+import torch
+from helpers import relative_error
+from test_step import block_state, make_step
+from torch import nn
+
+import torch_mpm as mpm
+from torch_mpm import checkpoints
+
+N, DT = 13, 1e-3
+
+
+class Stress(nn.Module):
+    """A linear law with a learned part, and dropout, which must fall on the same particles again."""
+
+    def __init__(self):
+        super().__init__()
+        self.layer, self.dropout = nn.Linear(4, 4).double(), nn.Dropout(0.5)
+        self.residual = nn.Linear(4, 4).double()  # a name that parts of the library have for something else
+
+    def forward(self, F):
+        strain = 0.5 * (F.mT @ F - torch.eye(2, dtype=F.dtype, device=F.device))
+        return 1e4 * strain + 1e3 * self.dropout(
+            (self.layer(strain.flatten(1)) + self.residual(strain.flatten(1))).unflatten(1, (2, 2))
+        )
+
+
+def make(kind, device):
+    step = make_step(2, gravity=(0.0, -9.8), walls="separate", grid={"deterministic": True})
+    if kind == "network":
+        step.law = Stress().to(device)
+    if kind == "heat":
+        step.heat = mpm.Heat(step.grid, conductivity=50.0, specific_heat=100.0)
+    if kind == "one op":
+        step.law = mpm.NeoHookean(E=torch.tensor(1e4, dtype=torch.float64, device=device, requires_grad=True), nu=0.3)
+    state = block_state(2, device)
+    state = state.replace(temperature=state.x[:, 0].clone()) if kind == "heat" else state
+    return step, step.with_impulses(state)
+
+
+KEPT = {
+    "every": 4,
+    "every, offloaded": mpm.Checkpoints(every=4, offload=True),
+    "two states": mpm.Checkpoints(states=2),
+    "four states": mpm.Checkpoints(states=4),
+    "little memory": mpm.Checkpoints(memory=2.5e5),
+    "much memory": mpm.Checkpoints(memory=1e9),
+}
+
+
+@pytest.mark.parametrize("kept", KEPT)
+@pytest.mark.parametrize("kind", ["one op", "network", "heat"])
+def test_gradients_are_those_without(kind, kept, device, monkeypatch):
+    monkeypatch.setattr("torch_mpm.rollouts.KEPT_BYTES", {"cpu": 0, "cuda": 0})  # of a scene that is so small
+    found = []
+    for checkpoint in (None, KEPT[kept]):
+        torch.manual_seed(1)
+        step, state = make(kind, device)
+        v = state.v.clone().requires_grad_()
+        end = mpm.rollout(step, state.replace(v=v), N, DT, checkpoint=checkpoint)
+        loss = end.x.square().sum() + 1e-2 * end.v[:, 1].sum() + 1e-3 * end.impulse.sum()
+        found.append(
+            torch.autograd.grad(loss, [v, *(t for t in (*step.parameters(), *step.buffers()) if t.requires_grad)])
+        )
+    for value, expected in zip(found[1], found[0], strict=True):
+        assert float(expected.norm()) > 0 and relative_error(value, expected) < (1e-12 if device == "cpu" else 1e-9)
+
+
+def test_pools_that_grow_are_those_of_the_first_time(device):
+    """A block that flies apart wants more blocks in each segment; steps that are taken again have those they had."""
+    found, sizes = [], []
+    for checkpoint in (None, 5, mpm.Checkpoints(states=3)):
+        grid = mpm.Grid(0.02, (0, 0), (1, 1), deterministic=True)
+        step = mpm.Step(grid, lambda F: 1e2 * (F @ F.mT - torch.eye(2, dtype=F.dtype, device=F.device)))
+        state = block_state(2, device, low=0.45, high=0.55, dx=0.02)
+        v = (150 * (state.x - 0.5)).requires_grad_()
+        end = mpm.rollout(step, state.replace(v=v), 40, 1e-3, checkpoint=checkpoint)
+        found.append(torch.autograd.grad(end.x.square().sum(), v)[0])
+        sizes.append(grid.max_blocks)
+    step.check(end)
+    if device == "cpu":
+        first = mpm.Grid(0.02, (0, 0), (1, 1))
+        first.activate(state.x)
+        assert sizes[0] > first.max_blocks
+    assert relative_error(found[1], found[0]) < 1e-12
+    assert relative_error(found[2], found[0]) < 1e-12
+
+
+@pytest.mark.parametrize("checkpoint", [None, 4, mpm.Checkpoints(states=3)])
+def test_steps_that_are_taken_again_do_not_count_again(checkpoint, device):
+    """A solver of heat that misses its tolerance says so once for each step, and a refused dt too."""
+    step, state = make("heat", device)
+    step.heat.max_iterations = 1
+    dt = torch.tensor([-DT], dtype=torch.float64, device=device)
+    v = state.v.clone().requires_grad_()
+    end = mpm.rollout(step, state.replace(v=v), N, DT, checkpoint=checkpoint)
+    end = mpm.rollout(step, end, 3, dt, checkpoint=checkpoint)
+    before = {kind: int(problem.count.sum()) for kind, problem in step.failures().problems.items()}
+    end.x.sum().backward()
+    assert before["heat"] >= N and before["dt"] == 3
+    assert {kind: int(problem.count.sum()) for kind, problem in step.failures().problems.items()} == before
+
+
+# ---- binomial
+
+
+@pytest.mark.parametrize(("n", "states"), [(10, 3), (200, 4), (57, 2), (8, 8)])
+def test_binomial_work_is_the_least(n, states):
+    """Steps that are taken again are as few as can be: r n − C(s + r, r − 1) (Griewank and Walther 2000)."""
+    repetitions = next(r for r in range(n) if math.comb(states + r, states) >= n)
+    least = repetitions * n - math.comb(states + repetitions, repetitions - 1)
+    assert mpm.Checkpoints(states=states).repetitions(n) == least
+
+
+class Held:
+    """A tensor that autograd keeps, and how many there are of them, now and at most."""
+
+    now, most = 0, 0
+
+    def __init__(self, t):
+        self.t = t
+        Held.now += 1
+        Held.most = max(Held.most, Held.now)
+
+    def __del__(self):
+        Held.now -= 1
+
+
+@pytest.mark.parametrize(("n", "states"), [(24, 3), (24, 2), (60, 5)])
+def test_steps_and_kept_states_are_as_many_as_was_said(n, states):
+    """Counted in the step, and in what autograd keeps over the forward and the backward pass."""
+    taken, state = [], block_state(2)
+
+    def step(state, dt):
+        taken.append(None)
+        return state.replace(x=1.01 * state.x.sin())
+
+    x = state.x.clone().requires_grad_()
+    Held.now = Held.most = 0
+    with torch.autograd.graph.saved_tensors_hooks(Held, lambda held: held.t):
+        end = mpm.rollout(step, state.replace(x=x), n, 1.0, checkpoint=mpm.Checkpoints(states=states))
+        end.x.sum().backward()
+    assert len(taken) == n + mpm.Checkpoints(states=states).repetitions(n)
+    fields = 4  # x, v, mass and volume of each kept state, and x of a step
+    assert 0 < Held.most <= states * fields + 1
+    del end
+    expected = x.detach().requires_grad_()
+    now = expected
+    for _ in range(n):
+        now = 1.01 * now.sin()
+    torch.testing.assert_close(x.grad, torch.autograd.grad(now.sum(), expected)[0], rtol=1e-13, atol=0)
+
+
+# ---- memory
+
+
+@pytest.mark.parametrize("memory", [3_000, 10_000, 50_000, 10_000_000])
+def test_what_fits_into_memory(memory):
+    """Kept states and the steps that are held beside them are no more than was asked for."""
+    state, step = 100, 700
+    kept = checkpoints.fitting(memory, 1000, state, step)
+    if kept is None:
+        assert memory >= state + 1000 * step
+    elif kept.states is not None:
+        assert kept.states * state + step <= memory
+    else:
+        assert math.ceil(1000 / kept.every) * state + kept.every * step <= memory
+    assert (kept is not None and kept.states is not None) == (memory < 16_000)
+    away = checkpoints.fitting(memory, 1000, state, step, offload=True)
+    assert away is None or away.every * step <= memory
+
+
+def test_too_little_memory_is_said():
+    with pytest.raises(ValueError, match="memory must be at least 900 bytes, of a step and of kept states, got 500"):
+        checkpoints.fitting(500, 10, 100, 700)
+    with pytest.raises(ValueError, match="memory must be at least"):
+        step, state = make("network", "cpu")
+        mpm.rollout(step, state, 5, DT, checkpoint=mpm.Checkpoints(memory=10))
+
+
+def test_wrong_checkpoints():
+    for arguments, message in (
+        ({}, "must have one of every, states and memory, got none"),
+        ({"every": 3, "states": 4}, "got every and states"),
+        ({"every": 0}, "every must be at least 1"),
+        ({"states": 1}, "states must be at least 2"),
+        ({"memory": -1.0}, "memory must be a positive number of bytes"),
+        ({"states": 3, "offload": True}, "offload must be False with states"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            mpm.Checkpoints(**arguments)
+    with pytest.raises(TypeError, match="every must be a whole number"):
+        mpm.Checkpoints(every=1.5)
+
+
+# ---- estimates
+
+
+def kept_bytes(run):
+    """Of what autograd keeps of a computation."""
+    kept = {}
+
+    def pack(t):
+        kept[t.untyped_storage().data_ptr()] = t.untyped_storage().nbytes()
+        return t
+
+    with torch.autograd.graph.saved_tensors_hooks(pack, lambda t: t):
+        result = run()
+    return sum(kept.values()), result
+
+
+def test_an_estimate_of_memory_is_what_autograd_keeps(device):
+    step, state = make("network", device)
+    state = state.replace(v=state.v.clone().requires_grad_())
+    before = step.status
+    random = torch.get_rng_state()
+    estimate = mpm.estimate_rollout(step, state, 20, DT)
+    assert step.status is before and torch.equal(torch.get_rng_state(), random)
+    assert all(p.grad is None for p in (state.v, *step.parameters()))
+    found, _ = kept_bytes(lambda: mpm.rollout(step, state, 20, DT))
+    assert estimate.memory == pytest.approx(found, rel=0.1)
+    assert estimate.steps == 20 and estimate.seconds > 0
+    less = mpm.estimate_rollout(step, state, 20, DT, checkpoint=mpm.Checkpoints(states=3), prefix=4)
+    assert less.memory < estimate.memory / 5 and less.kept_states == 3
+    assert less.steps == 20 + mpm.Checkpoints(states=3).repetitions(16)
+
+
+def test_an_estimate_of_a_rollout_in_one_op(device):
+    step, state = make("one op", device)
+    words = str(mpm.estimate_rollout(step, state, 20, DT, checkpoint=5))
+    assert "4 kept states, 40 steps with those taken again" in words
+    assert mpm.estimate_rollout(step, state, 20, DT, truncate=5).steps == 15 + 2 * 5
+    assert mpm.estimate_rollout(step, state, 0, DT).steps == 0

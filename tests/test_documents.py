@@ -1,0 +1,23 @@
+"""Programs of the documents that say that they run, one after another."""
+
+import re
+import sys
+import types
+from pathlib import Path
+
+import pytest
+
+DOCS = Path(__file__).parent.parent / "docs"
+
+
+@pytest.mark.filterwarnings("ignore:Anomaly Detection")
+@pytest.mark.parametrize("name", ["training.md"])
+def test_programs_of_a_document(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    text = (DOCS / name).read_text()
+    module = types.ModuleType("document")  # which compilers look for
+    monkeypatch.setitem(sys.modules, "document", module)
+    programs = list(re.finditer(r"```python\n(.*?)```", text, re.DOTALL))
+    assert programs
+    for found in programs:
+        line = text.count("\n", 0, found.start(1))  # so that errors tell the line of the document
+        exec(compile("\n" * line + found[1], name, "exec"), vars(module))

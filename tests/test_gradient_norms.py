@@ -1,0 +1,115 @@
+"""Norms of gradients inside rollouts: those of autograd at each state, and what they say about a truncation."""
+
+import math
+
+import pytest
+import torch
+from test_step import block_state, make_step
+
+import torch_mpm as mpm
+
+N, DT = 8, 1e-3
+
+
+def batch(device):
+    """Three scenes of one block, of which the second is at another place and the third is empty."""
+    states = [block_state(2, device), block_state(2, device, low=0.35, high=0.6)]
+    return mpm.State.concatenate(states, scene=True)
+
+
+def make(kind):
+    step = make_step(2, scenes=3, gravity=(0.0, -9.8), walls="separate")
+    if kind == "from Python":
+        step.law = lambda F: 1e4 * (F @ F.mT - torch.eye(2, dtype=F.dtype, device=F.device))
+    return step
+
+
+@pytest.mark.parametrize("checkpoint", [None, 1])
+@pytest.mark.parametrize("kind", ["in one op", "from Python"])
+def test_norms_are_those_of_the_states_on_the_way(kind, checkpoint, device):
+    step, state = make(kind), batch(device)
+    norms = mpm.GradientNorms(every=3)
+    v = state.v.clone().requires_grad_()
+    end = mpm.rollout(step, state.replace(v=v), N, DT, checkpoint, norms=norms)
+    assert norms.steps == [0, 3, 6, 8] and float(norms.total()[1:].abs().max()) == 0
+    end.x.pow(3).sum().backward()
+
+    step = make(kind)
+    now, before = step.prepare(state.replace(v=v.detach().requires_grad_())), []
+    for k in range(N):
+        if k in norms.steps:
+            before.append(now)
+        now = step(now, DT)
+    for name in ("x", "v", "F", "C"):
+        states = [s for s in (*before, now) if getattr(s, name) is not None and getattr(s, name).requires_grad]
+        grads = torch.autograd.grad(
+            now.x.pow(3).sum(), [getattr(s, name) for s in states], retain_graph=True, allow_unused=True
+        )
+        rows = len(norms.steps) - len(grads)
+        for row, grad in enumerate(grads, rows):
+            found = norms.fields[name][row]
+            if grad is None:
+                assert float(found.abs().max()) == 0
+                continue
+            expected = torch.stack([grad[state.scene == b].norm() for b in range(3)])
+            torch.testing.assert_close(found, expected, rtol=1e-9, atol=0)
+    total = norms.total()
+    assert total.shape == (4, 3) and float(total[1:, 2].max()) == 0  # of the empty scene
+    assert bool(total[0].isnan().all()) and bool(norms.fields["F"][0].isnan().all())  # where F needs no gradient
+    assert total[-1, 0] == pytest.approx(0.1 * float(norms.fields["x"][-1, 0]))
+    assert v.grad is not None and len(v._backward_hooks or ()) == 0  # nothing stays with the user
+
+
+def spring(rate, device, n=60, scenes=2):
+    """Rollouts of x ← rate x of each scene, whose gradients are powers of the rate."""
+    rates = torch.tensor(rate, dtype=torch.float64, device=device)
+    state = block_state(2, device)
+    state = state.replace(scene=(torch.arange(len(state), device=device) % scenes).int())
+    norms = mpm.GradientNorms()
+
+    class Scaled(mpm.Step):
+        def forward(self, state, dt):
+            return state.replace(x=rates[state.scene.long()][:, None] * state.x)
+
+    step = Scaled(mpm.Grid(0.1, (0, 0), (1, 1), scenes=scenes), mpm.NeoHookean(E=1.0, nu=0.3))
+    end = mpm.rollout(step, state.replace(x=state.x.clone().requires_grad_()), n, DT, norms=norms)
+    end.x.sum().backward()
+    return norms
+
+
+def test_a_truncation_for_gradients_that_grow_or_vanish(device):
+    norms = spring([1.5, 1.0], device)
+    growing = math.floor(math.log(100) / math.log(1.5)) + 1
+    assert norms.truncation() == growing
+    assert norms.truncation(growth=10) == math.floor(math.log(10) / math.log(1.5)) + 1
+    assert spring([1.0, 0.7], device).truncation() == math.floor(math.log(100) / -math.log(0.7)) + 1
+    assert spring([1.0, 0.999], device).truncation() is None
+    assert spring([1e200, 1.0], device).truncation() == 1  # of a gradient that is infinite
+
+
+def test_a_record_begins_anew_and_needs_a_backward_pass(device):
+    step, state, norms = make("in one op"), batch(device), mpm.GradientNorms()
+    with pytest.raises(ValueError, match="GradientNorms must have seen a backward pass"):
+        norms.truncation()
+    for n in (3, 5):
+        v = state.v.clone().requires_grad_()
+        mpm.rollout(step, state.replace(v=v), n, DT, norms=norms).x.sum().backward()
+        assert norms.steps == list(range(n + 1))
+    with torch.no_grad():
+        mpm.rollout(step, state, 2, DT, norms=norms)
+    assert norms.fields == {}
+    for wrong in (0, 1.5):
+        with pytest.raises((TypeError, ValueError), match="every must be"):
+            mpm.GradientNorms(every=wrong)
+    with pytest.raises(ValueError, match="growth must be a number above 1"):
+        norms.truncation(growth=1.0)
+
+
+def test_norms_of_scenes_with_time_steps_of_their_own(device):
+    """Of a paused scene too, whose gradient stays as it is."""
+    step, state, norms = make("in one op"), batch(device), mpm.GradientNorms(every=4)
+    dt = torch.tensor([1e-3, 0.0, 1e-3], dtype=torch.float64, device=device)
+    v = state.v.clone().requires_grad_()
+    mpm.rollout(step, state.replace(v=v), N, dt, norms=norms).v.sum().backward()
+    assert bool(norms.total()[1:].isfinite().all())
+    torch.testing.assert_close(norms.fields["v"][0, 1], norms.fields["v"][-1, 1])

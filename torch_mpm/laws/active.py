@@ -1,0 +1,101 @@
+"""Muscles: a material that contracts along fibres as it is told to."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from ..errors import check_vector, shape_of
+from ..particle_operations import of_particles
+from .custom import as_law
+from .material import Material
+
+if TYPE_CHECKING:
+    from ..state import State
+
+__all__ = ["Active"]
+
+ACTIVATION = "activation"
+"""Key of `State.extra` with the active stress of each particle [P] [Pa]."""
+
+
+class Active(Material):
+    """A law with an active stress along fibres: τ + a (F d) (F d)ᵀ.
+
+    That is the stress of the energy a (|F d|² − 1)/2 per rest volume, a spring along the fibre, for a constant a; the
+    actuation F A Fᵀ of ChainQueen (Hu et al. 2019) with A = a d dᵀ.
+
+    The activation a [P] [Pa] is `state.extra["activation"]`, zero where it was not set: a > 0 contracts. A controller
+    sets it in `Step(on_particles=)` for each step, or a hook of `rollout` now and then; gradients pass to it.
+
+    Args:
+        law: any law that moves F; a function or module F -> Kirchhoff stress too.
+        direction: of the fibres at rest, unit vectors d, or zero where there are none: D numbers, or a tensor [D] or
+            [P, D], in the order of `state.ids` where particles were reordered; it may require grad.
+
+    Raises:
+        TypeError, ValueError: for a law without F, or a direction of another shape.
+    """
+
+    direction: Any
+
+    def __init__(self, law: Any, direction: Any) -> None:
+        super().__init__()
+        self.law = law = as_law("law", law)
+        if "F" not in law.state_fields:
+            raise ValueError(f"law must move F, of which fibres have their direction, got {type(law).__name__}")
+        if not isinstance(direction, Tensor):
+            direction = torch.tensor(check_vector("direction", direction), dtype=torch.float64, device="cpu")
+        if direction.dim() not in (1, 2) or direction.shape[-1] not in (2, 3) or not direction.is_floating_point():
+            raise ValueError(f"direction must be a floating tensor of shape [D] or [P, D], got {shape_of(direction)}")
+        self.state_fields, self.extra_fields = law.state_fields, (*law.extra_fields, ACTIVATION)
+        self.viscous = law.viscous
+        if isinstance(direction, torch.nn.Parameter):
+            self.direction = direction
+        else:
+            self.register_buffer("direction", direction)
+
+    def update(self, state: State) -> tuple[dict[str, Tensor], Tensor]:
+        fields, stress = self.law(state)
+        fibre = self._fibre(state, fields.get("F", state.F))
+        return fields, stress + self._activation(state)[:, None, None] * fibre[:, :, None] * fibre[:, None, :]
+
+    def initial(self, name: str, state: State) -> Tensor:
+        return torch.zeros_like(state.mass) if name == ACTIVATION else self.law.initial(name, state)
+
+    def energy_density(self, state: State) -> Tensor:
+        square = self._fibre(state, state.F).square().sum(1)
+        return self.law.energy_density(state) + self._activation(state) * (square - 1) / 2
+
+    def stiffness(self, state: State) -> Tensor:
+        return self.law.stiffness(state) + 2 * self._stretched(state)
+
+    def wave_modulus(self, state: State) -> Tensor:
+        return self.law.wave_modulus(state) + self._stretched(state)
+
+    def viscosity(self, state: State) -> Tensor | None:
+        return self.law.viscosity(state)
+
+    def invalid(self, state: State) -> Tensor:
+        return self.law.invalid(state)
+
+    def _stretched(self, state: State) -> Tensor:
+        """|a| |F d|² [P] [Pa], which bounds the second variation of the active energy."""
+        return self._activation(state).abs() * self._fibre(state, state.F).square().sum(1)
+
+    def _fibre(self, state: State, F: Tensor | None) -> Tensor:
+        """F d [P, D]."""
+        assert F is not None
+        direction = of_particles("direction", self.direction, state, tuple(state.x.shape)).to(F.dtype)
+        return (F * direction[..., None, :]).sum(-1)
+
+    def _activation(self, state: State) -> Tensor:
+        if ACTIVATION not in state.extra:
+            return torch.zeros_like(state.mass)
+        a = state.extra[ACTIVATION]
+        if a.shape != state.mass.shape or a.dtype != state.mass.dtype:
+            kind = f"{str(state.mass.dtype).removeprefix('torch.')} [P] = [{len(state.mass)}]"
+            raise ValueError(f"state.extra['activation'] must be {kind}, got {a.dtype} {shape_of(a)}")
+        return a

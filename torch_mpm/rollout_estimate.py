@@ -1,0 +1,138 @@
+"""What a rollout and its backward pass will take, before they start."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from .activation_record import aside
+from .checkpoints import Checkpoints, as_checkpoints
+from .errors import check_count
+from .rollout_parts import Parts
+from .rollouts import bytes_kept, obstacle_to_substeps, resolved, rollout, steps_of_a_call
+from .state import State
+from .step import Step
+from .step_cost import differentiable, seconds
+
+TRIAL = 4
+"""Steps that are taken to measure their time."""
+
+
+@dataclasses.dataclass(frozen=True)
+class RolloutEstimate:
+    """Of a rollout with gradients and its backward pass.
+
+    Attributes:
+        memory: of kept states and of the steps that the backward pass holds at a time, on the device [bytes].
+        host_memory: of kept states that wait on the host [bytes].
+        seconds: run time [s], as that of a few steps tells.
+        kept_states: states that are kept at a time at most.
+        steps: steps that are taken, with those that are taken again.
+    """
+
+    memory: int
+    host_memory: int
+    seconds: float
+    kept_states: int
+    steps: int
+
+    def __str__(self) -> str:
+        host = f" and {_words(self.host_memory)} on the host" if self.host_memory else ""
+        return (
+            f"{_words(self.memory)}{host}, {self.seconds:.3g} s: {self.kept_states} kept states, {self.steps} steps "
+            "with those taken again"
+        )
+
+
+def estimate_rollout(
+    step: Callable[[State, float | Tensor], State],
+    state: State,
+    n: int,
+    dt: float | Tensor,
+    checkpoint: int | Checkpoints | None = None,
+    *,
+    prefix: int = 0,
+    truncate: int | None = None,
+) -> RolloutEstimate:
+    """What `rollout` with these arguments, and the backward pass of a loss of its end, will take.
+
+    It takes a few steps and goes back through them, twice, which `Step.check` does not see. The memory is that of the
+    largest scene to come if `state` is it: pools that grow on the way are not foreseen. Functions of the user's are
+    called.
+
+    Args:
+        step, state, n, dt, checkpoint, prefix, truncate: as `rollout`.
+
+    Raises:
+        TypeError, ValueError: as `rollout`.
+    """
+    check_count("n", n)
+    parts, kept = Parts(n, prefix, truncate), as_checkpoints(checkpoint)
+    first = parts.first_with_gradient()
+    start = differentiable(step.prepare(state) if isinstance(step, Step) else state)
+    with aside(step, start.x), torch.enable_grad():
+        if kept is not None and kept.memory is not None:
+            kept = resolved(kept, step, start, n - first, dt)
+        return _estimate(step, start, n - first, first, dt, kept)
+
+
+def _estimate(
+    step: Callable[[State, float | Tensor], State],
+    start: State,
+    n: int,
+    prefix: int,
+    dt: float | Tensor,
+    kept: Checkpoints | None,
+) -> RolloutEstimate:
+    """Of n steps with gradients after so many without."""
+    in_op = isinstance(step, Step) and obstacle_to_substeps(step, start, dt) is None
+    of_state, of_step = bytes_kept(step, start, dt)
+    trial = max(min(n, TRIAL), 1)
+    calls = trial if kept is not None and kept.states is not None else 1  # between kept states
+
+    def taken() -> State:
+        state = start
+        for _ in range(calls):
+            state = rollout(step, state, trial // calls, dt)
+        return state
+
+    @torch.no_grad()
+    def forward() -> None:
+        taken()
+
+    tensors = [*step.parameters(), *step.buffers()] if isinstance(step, torch.nn.Module) else []
+    leaves = [start.x, start.v, *(t for t in tensors if t.requires_grad)]
+
+    def both() -> None:
+        end = taken()
+        torch.autograd.grad(end.x.sum() + end.v.sum(), leaves, allow_unused=True)
+
+    once, twice = (seconds(work, start.x.device) / trial for work in (forward, both))
+    if n == 0:
+        return RolloutEstimate(0, 0, prefix * once, 0, prefix)
+    if kept is None and not in_op:
+        return RolloutEstimate(of_state + n * of_step, 0, prefix * once + n * twice, 1, prefix + n)
+    if kept is None:
+        kept = Checkpoints(every=min(steps_of_a_call(start, n), n))
+    states, again, held = kept.kept(n), kept.repetitions(n), min(kept.every or 1, n)
+    extra = again
+    if in_op:  # which takes its own steps again in any case: the time of both ways has them
+        extra, again = (0, n) if kept.every is not None else (again, again + n)
+    spent = prefix * once + n * twice + extra * once
+    on_host = kept.offload and start.x.is_cuda
+    return RolloutEstimate(
+        held * of_step + (0 if on_host else states * of_state),
+        states * of_state if on_host else 0,
+        spent,
+        states,
+        prefix + n + again,
+    )
+
+
+def _words(size: float) -> str:
+    power = min(int(math.log10(max(size, 1)) / 3), 3)
+    return f"{size / 1000**power:.3g} {('bytes', 'kB', 'MB', 'GB')[power]}"

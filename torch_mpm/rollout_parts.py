@@ -1,0 +1,111 @@
+"""Rollouts in parts: hooks between steps, a beginning without gradients, gradients that are cut, and their norms."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from .errors import check_count, shape_of
+from .gradient_norms import GradientNorms
+from .state import State
+
+Hook = Callable[[State, int], "State | None"]
+"""Called with a state and the number of steps before it; may return another state to go on from."""
+
+
+@dataclasses.dataclass
+class Parts:
+    """What happens between the n steps of a rollout; see `rollout` for the arguments.
+
+    Raises:
+        TypeError, ValueError: for a wrong one.
+    """
+
+    n: int
+    prefix: int = 0
+    truncate: int | None = None
+    hook: Hook | None = None
+    every: int = 1
+    norms: GradientNorms | None = None
+
+    def __post_init__(self) -> None:
+        check_count("prefix", self.prefix)
+        check_count("every", self.every, 1)
+        if self.truncate is not None:
+            check_count("truncate", self.truncate, 1)
+        if self.hook is not None and not callable(self.hook):
+            raise TypeError(f"hook must be a function (state, k) -> state or None, got {shape_of(self.hook)}")
+        if self.norms is not None and not isinstance(self.norms, GradientNorms):
+            raise TypeError(f"norms must be GradientNorms or None, got {shape_of(self.norms)}")
+
+    def first_with_gradient(self) -> int:
+        """The first step that a gradient may reach: without a hook the loss knows the end alone."""
+        prefix = min(self.prefix, self.n)
+        return prefix if self.truncate is None or self.hook is not None else max(prefix, self.n - self.truncate)
+
+    def cuts(self) -> set[int]:
+        """Steps before which the gradient is cut, counted from the end."""
+        if self.truncate is None:
+            return set()
+        return set(range(self.n - self.truncate, self.first_with_gradient(), -self.truncate))
+
+    def run(self, advance: Callable[[State, int, int], State], state: State, scales: Any) -> State:
+        """The state n steps later.
+
+        Args:
+            advance: (state, count, k) to the state so many steps later, of which the first is step k.
+            state: the state of the start.
+            scales: of the gradient norms, see `GradientNorms.start`.
+        """
+        prefix, cuts = self.first_with_gradient(), self.cuts()
+        acting = set() if self.hook is None else set(range(0, self.n, self.every))
+        seen = set() if self.norms is None else set(self.norms.points(prefix, self.n))
+        if self.norms is not None:
+            self.norms.start(sorted(seen), *scales)
+        stops = sorted({0, prefix, self.n} | cuts | acting | seen)
+        began = state
+        for k, end in zip(stops, [*stops[1:], self.n], strict=True):
+            with torch.no_grad() if k < prefix else contextlib.nullcontext():
+                if k in acting:
+                    acted = self._acted(state, k)
+                    if acted is not state and k in cuts:
+                        raise ValueError(
+                            f"hook must not return a state before step {k}, where truncate={self.truncate} cuts the "
+                            f"gradient, of what it returned too: choose truncate and every={self.every} such that "
+                            "n - truncate, n - 2 truncate, ... are no multiples of every"
+                        )
+                    if acted is not state:
+                        began = state = acted
+                if k in cuts:
+                    began = state = _cut(state, began)
+                if k in seen:
+                    assert self.norms is not None
+                    state = self.norms.watched(state, k)
+                state = advance(state, end - k, k) if end > k else state
+        return state
+
+    def _acted(self, state: State, k: int) -> State:
+        assert self.hook is not None
+        result = self.hook(state, k)
+        if result is None:
+            return state
+        if not isinstance(result, State) or len(result) != len(state):
+            raise TypeError(f"hook must return None or a State of {len(state)} particles, got {shape_of(result)}")
+        return result
+
+
+def _cut(state: State, began: State) -> State:
+    """A state without the gradient of what steps have changed in it; what is the same as in `began` keeps its own."""
+
+    def changed(name: str) -> Any:
+        value = getattr(state, name)
+        return value.detach() if isinstance(value, Tensor) and value is not getattr(began, name) else value
+
+    names = [f.name for f in dataclasses.fields(state) if f.name != "extra"]
+    extra = {name: t if t is began.extra.get(name) else t.detach() for name, t in state.extra.items()}
+    return state.replace(**{name: changed(name) for name in names}, extra=extra)

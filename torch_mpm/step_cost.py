@@ -1,0 +1,71 @@
+"""What a step costs, measured by taking one aside: memory for the backward pass, and time."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from .activation_record import aside
+from .checkpoints import CONSTANT
+from .state import State
+
+StepFunction = Callable[[State, "float | Tensor"], State]
+
+
+def state_bytes(state: State) -> int:
+    """Of the tensors that steps change [bytes]."""
+    fields = [getattr(state, f.name) for f in dataclasses.fields(state) if f.name not in (*CONSTANT, "extra")]
+    return sum(_bytes(t) for t in [*fields, *state.extra.values()] if isinstance(t, Tensor))
+
+
+def step_bytes(step: StepFunction, state: State, dt: float | Tensor) -> int:
+    """What autograd keeps of one step from Python, its state among it, beside what all steps share [bytes]."""
+    start = differentiable(state)
+    parameters = [*step.parameters(), *step.buffers()] if isinstance(step, torch.nn.Module) else []
+    constants = [t for name in CONSTANT if (t := getattr(start, name)) is not None]
+    known = {t.untyped_storage().data_ptr() for t in [*constants, *parameters]}
+    kept: dict[int, int] = {}
+
+    def pack(t: Tensor) -> Tensor:
+        place = t.untyped_storage().data_ptr()
+        if place not in known:
+            kept[place] = max(kept.get(place, 0), t.untyped_storage().nbytes())
+        return t
+
+    with aside(step, state.x), torch.enable_grad(), torch.autograd.graph.saved_tensors_hooks(pack, lambda t: t):
+        end = step(start, dt)
+    del end
+    return sum(kept.values())
+
+
+def differentiable(state: State) -> State:
+    """A state of its own whose positions and velocities, and what follows from them, have gradients."""
+    state = state.detach()
+    return state.replace(x=state.x.clone().requires_grad_(), v=state.v.clone().requires_grad_())
+
+
+def seconds(work: Callable[[], Any], device: torch.device) -> float:
+    """Least time of two calls after a first one [s]."""
+    work()
+    times = []
+    for _ in range(2):
+        _wait(device)
+        begin = time.perf_counter()
+        work()
+        _wait(device)
+        times.append(time.perf_counter() - begin)
+    return min(times)
+
+
+def _wait(device: torch.device) -> None:
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+
+
+def _bytes(t: Tensor) -> int:
+    return t.numel() * t.element_size()
