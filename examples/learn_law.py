@@ -133,7 +133,7 @@ def draw(truth: Tensor, learnt: Tensor, errors: dict[str, Tensor], network: Ener
     for name, values in errors.items():
         error.plot(DT * EVERY * torch.arange(len(values)), 100 * values.cpu(), label=name)
     error.set(
-        title="error of the ring, which training has not seen",
+        title="error of the ring",
         xlabel="time [s]",
         ylabel="mean distance / diameter [%]",
         ylim=(0, None),

@@ -1,8 +1,9 @@
 """Find the stiffness of every particle of a plate from how it moved in four experiments.
 
-The plate is stiffer in one disc and softer in another. It is set in motion four times, each time with other velocities, as
-the four scenes of one batch, and the positions of its particles are measured at some times. The stiffness of every
-particle is an unknown; the gradient of the misfit with respect to all of them comes from one backward pass.
+The plate is stiffer in one disc and softer in another. It is set in motion four times, each time with other
+velocities, as the four scenes of one batch, and the positions of its particles are measured at some times. The
+stiffness of every particle is an unknown; the gradient of the misfit with respect to all of them comes from one
+backward pass.
 """
 
 from __future__ import annotations
