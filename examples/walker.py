@@ -103,7 +103,14 @@ def draw(walked: mpm.Frames, speeds: list[float], part: Tensor, path: Path) -> N
     for k in range(0, len(x), round(0.8 / DT / EVERY)):
         drawn = gait.scatter(*x[k].T, c=length[k], s=4, cmap="coolwarm", vmin=1 - STRETCH, vmax=1 + STRETCH)
     figure.colorbar(drawn, ax=gait, label="muscle length", fraction=0.02, pad=0.01)
-    gait.set(title="every 0.8 s", xlabel="x [m]", ylabel="y [m]", aspect="equal", xlim=(0, float(x.max()) + 0.2), ylim=(0, 0.4))
+    gait.set(
+        title="every 0.8 s",
+        xlabel="x [m]",
+        ylabel="y [m]",
+        aspect="equal",
+        xlim=(0, float(x.max()) + 0.2),
+        ylim=(0, 0.4),
+    )
     growth.plot(speeds)
     growth.set(title="training", xlabel="iteration", ylabel="speed [m/s]")
     shown = walked.time < 1
@@ -124,14 +131,14 @@ def film(walked: mpm.Frames, path: Path) -> None:
             video.append(renderer.frame(x, length, time=float(now)))
 
 
-def main(out: Path, device: str = "cpu", iterations: int = 100, seconds: float = 1.0) -> float:
-    """Returns how far the walker comes [m] in twice the time that it was trained for."""
+def main(out: Path, device: str = "cpu", iterations: int = 100, seconds: float = 1.0, shown: float = 4.0) -> float:
+    """Returns how far the walker comes [m] in the seconds that are shown, twice as many as it was trained for."""
     torch.manual_seed(0)
     start = walker(device)
     controller = Controller(start).to(device)
     speeds = train(controller, start, iterations, seconds)
     with torch.no_grad():
-        walked = walk(controller, start, 4 * seconds)
+        walked = walk(controller, start, shown)
     out.mkdir(parents=True, exist_ok=True)
     draw(walked, speeds, start.extra["part"], out / "walker.png")
     film(walked, out / "walker.mp4")
