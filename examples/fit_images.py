@@ -110,7 +110,7 @@ def draw(data: Tensor, seen: dict[str, Tensor], found: list[dict[str, float]], p
     figure = Figure(figsize=(10, 3.4), dpi=100)
     shown, errors = figure.subplots(1, 2, width_ratios=(2.4, 1))
     strips = [torch.cat(list(frames[4::2]), 1) for frames in (data, *seen.values())]
-    shown.imshow(torch.cat(strips).cpu(), cmap="gray", vmin=0, vmax=1)
+    shown.imshow(torch.cat(strips).cpu().numpy(), cmap="gray", vmin=0, vmax=1)
     shown.set(title="pictures in the course of time", xticks=[], yticks=[(k + 0.5) * HEIGHT for k in range(3)])
     shown.set_yticklabels(["camera", *seen])
     for name, true in TRUE.items():

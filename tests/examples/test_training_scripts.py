@@ -58,20 +58,20 @@ def test_learnt_law_has_an_energy():
 
 def test_walker_learns(device, tmp_path, capsys):
     """Before training it comes 5 mm far in a second."""
-    assert example("walker").main(tmp_path, device, iterations=20, shown=1.0) > 0.05
+    assert example("walker").main(tmp_path, device, iterations=20, shown=1.0) > 0.03
     assert drawn(tmp_path / "walker.png") and (tmp_path / "walker.mp4").stat().st_size > 1000
 
 
 def test_friction_is_learnt(device, tmp_path, capsys):
-    """Before training, the law is off by 59%."""
-    assert example("learn_friction").main(tmp_path, device, iterations=6, steps=150) < 0.2
+    """No constant coefficient comes nearer than 27%."""
+    assert example("learn_friction").main(tmp_path, device, iterations=6, steps=150) < 0.1
     assert drawn(tmp_path / "learn_friction.png")
 
 
 def test_pictures_are_fitted(device, tmp_path, capsys):
     script = example("fit_images")
     script.STEPS = 160
-    errors = script.main(tmp_path, device, iterations=9)
+    errors = script.main(tmp_path, device, iterations=11)
     assert max(errors[name] for name in ("E", "vx", "vy", "vz")) < 0.1
     assert drawn(tmp_path / "fit_images.png")
 
