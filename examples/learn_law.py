@@ -135,7 +135,7 @@ def draw(truth: Tensor, learnt: Tensor, errors: dict[str, Tensor], network: Ener
     error.set(
         title="error of the ring",
         xlabel="time [s]",
-        ylabel="mean distance / diameter [%]",
+        ylabel="distance / diameter [%]",
         ylim=(0, None),
     )
     strain = torch.linspace(0, 1.2, 50, dtype=truth.dtype, device=truth.device)
