@@ -23,6 +23,7 @@ STEPS, EVERY = 240, 20  # of which a picture is taken every so many
 HEIGHT, WIDTH = 64, 96  # of the pictures [pixels]
 NOISE = 0.05  # deviation of the noise of each pixel, between 0 and 1
 TRUE = {"E": 3e4, "nu": 0.35, "vx": 2.0, "vy": -0.5, "vz": 0.6}  # [Pa], –, [m/s]
+BOUNDS = {"E": 1e5, "nu": 0.5}  # above; 0 below
 GUESS = {"E": 1e4, "nu": 0.2, "vx": 1.0, "vy": 0.0, "vz": 0.0}
 
 
@@ -82,13 +83,13 @@ def pictures(start: mpm.State, E: Tensor, nu: Tensor, *velocity: Tensor) -> Tens
 
 def fit(start: mpm.State, data: Tensor, iterations: int) -> list[dict[str, float]]:
     """The unknowns after each iteration, from the guess on."""
-    guess = start.x.new_tensor(list(GUESS.values()))
-    change = torch.zeros_like(guess).requires_grad_()  # of the logarithms of E and nu, and of the velocity
+    guess, bounds = (start.x.new_tensor(list(values.values())) for values in (GUESS, BOUNDS))
+    change = torch.zeros_like(guess).requires_grad_()  # of the logits of E and nu, and of the velocity
     optimizer = torch.optim.LBFGS([change], max_iter=1, max_eval=10, line_search_fn="strong_wolfe")
     found = [GUESS]
 
     def values() -> Tensor:
-        return torch.cat([guess[:2] * change[:2].exp(), guess[2:] + change[2:]])
+        return torch.cat([bounds * ((guess[:2] / bounds).logit() + change[:2]).sigmoid(), guess[2:] + change[2:]])
 
     def closure() -> Tensor:
         optimizer.zero_grad()
@@ -121,7 +122,7 @@ def draw(data: Tensor, seen: dict[str, Tensor], found: list[dict[str, float]], p
     figure.savefig(path)
 
 
-def main(out: Path, device: str = "cpu", iterations: int = 20) -> dict[str, float]:
+def main(out: Path, device: str = "cpu", iterations: int = 25) -> dict[str, float]:
     """Returns the relative error of each unknown."""
     torch.manual_seed(0)
     cube = mpm.seed.box((0.15, 0.4, 0.35), (0.45, 0.7, 0.65), DX, per_cell=8)
@@ -143,7 +144,7 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("out/fit_images"), help="folder of the picture")
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
-    parser.add_argument("--iterations", type=int, default=20)
+    parser.add_argument("--iterations", type=int, default=25)
     torch.set_num_threads(1)  # a thousand particles: more threads would only wait for each other
     options, begin = parser.parse_args(), time.perf_counter()
     found = main(options.out, options.device, options.iterations)

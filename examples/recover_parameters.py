@@ -26,13 +26,14 @@ NOISE = 1e-3  # deviation of the measured positions [m]: a thirtieth of a cell
 
 @dataclass
 class Experiment:
-    """Something that moves, and the parameters of its law by name: true ones, and what they are taken for at first."""
+    """Something that moves, and the parameters of its law by name: true ones, guesses, and bounds above (0 below)."""
 
     name: str
     start: mpm.State
     law: Callable[..., mpm.Material]
     true: dict[str, float]
     guess: dict[str, float]
+    bounds: dict[str, float]
     seconds: float
     data: Tensor = field(init=False)
     found: list[dict[str, float]] = field(init=False)
@@ -50,21 +51,21 @@ class Experiment:
         self.data = exact + NOISE * torch.randn_like(exact)
 
     def recover(self, iterations: int) -> None:
-        """Minimise the misfit over the logarithms of the parameters, by L-BFGS."""
-        guess = torch.tensor(list(self.guess.values())).to(self.start.x)
-        logarithms = guess.log().requires_grad_()
-        optimizer = torch.optim.LBFGS([logarithms], max_iter=1, max_eval=20, line_search_fn="strong_wolfe")
+        """Minimise the misfit by L-BFGS over the logits of the parameters, so that these stay within their bounds."""
+        guess, bounds = (self.start.x.new_tensor(list(values.values())) for values in (self.guess, self.bounds))
+        logits = (guess / bounds).logit().requires_grad_()
+        optimizer = torch.optim.LBFGS([logits], max_iter=1, max_eval=20, line_search_fn="strong_wolfe")
         self.found = [self.guess]
 
         def closure() -> Tensor:
             optimizer.zero_grad()
-            misfit = (self.observed(logarithms.exp().unbind()) - self.data).square().mean() / NOISE**2
+            misfit = (self.observed((bounds * logits.sigmoid()).unbind()) - self.data).square().mean() / NOISE**2
             misfit.backward()
             return misfit
 
         for k in range(iterations):
             misfit = optimizer.step(closure).item()
-            self.found.append(dict(zip(self.guess, logarithms.detach().exp().tolist(), strict=True)))
+            self.found.append(dict(zip(self.guess, (bounds * logits.sigmoid()).tolist(), strict=True)))
             values = "  ".join(f"{name} {value:.5g}" for name, value in self.found[-1].items())
             print(f"{self.name} {k:3d}  misfit {misfit:9.3f}  {values}", flush=True)
 
@@ -76,7 +77,8 @@ class Experiment:
 def jelly(device: str) -> Experiment:
     points = mpm.seed.box((0.2, 0.15), (0.5, 0.45), GRID, per_cell=4)
     start = mpm.State.at_rest(points, density=1000.0, velocity=(1.0, -1.0), dtype=torch.float64, device=device)
-    return Experiment("jelly", start, mpm.NeoHookean, {"E": 3e4, "nu": 0.3}, {"E": 1e4, "nu": 0.15}, 0.36)
+    true, guess, bounds = {"E": 3e4, "nu": 0.3}, {"E": 1e4, "nu": 0.15}, {"E": 1e5, "nu": 0.5}
+    return Experiment("jelly", start, mpm.NeoHookean, true, guess, bounds, 0.36)
 
 
 def sand(device: str) -> Experiment:
@@ -86,8 +88,8 @@ def sand(device: str) -> Experiment:
     def law(friction_angle: float | Tensor) -> mpm.Material:
         return mpm.QuarticSand(E=1e5, nu=0.3, friction_angle=friction_angle)
 
-    angles = {"friction_angle": math.radians(35)}, {"friction_angle": math.radians(20)}
-    return Experiment("sand", start, law, *angles, 0.6)
+    true, guess, bound = ({"friction_angle": math.radians(angle)} for angle in (35, 20, 90))
+    return Experiment("sand", start, law, true, guess, bound, 0.6)
 
 
 def draw(experiments: Sequence[Experiment], path: Path) -> None:
