@@ -70,7 +70,7 @@ def test_friction_is_learnt(device, tmp_path, capsys):
 
 def test_pictures_are_fitted(device, tmp_path, capsys):
     script = example("fit_images")
-    script.STEPS = 160
+    script.STEPS = 200
     errors = script.main(tmp_path, device, iterations=11)
     assert max(errors[name] for name in ("E", "vx", "vy", "vz")) < 0.1
     assert drawn(tmp_path / "fit_images.png")
