@@ -29,6 +29,11 @@ def test_throw(device, tmp_path, capsys):
     assert drawn(tmp_path / "throw.png")
 
 
+def test_network_on_the_grid_learns(capsys):
+    first, last = example("grid_network").main(iterations=3)
+    assert last < 0.75 * first
+
+
 def test_parameters_are_recovered(device, tmp_path, capsys):
     errors = example("recover_parameters").main(tmp_path, device, iterations=10)
     assert errors.keys() == {"E", "nu", "friction_angle"} and max(errors.values()) < 0.01
