@@ -38,7 +38,7 @@ def main(iterations: int = 15) -> tuple[float, float]:
     for k in range(iterations):
         landed = mpm.rollout(step, drop, n=100, dt=3e-3, checkpoint=10)
         loss = (landed.x.mean(0) - target).square().sum()
-        misses.append(float(loss) ** 0.5)
+        misses.append(loss.item() ** 0.5)
         print(f"{k:3d}  miss {misses[-1]:.4f} m", flush=True)
         optimizer.zero_grad()
         loss.backward()

@@ -1,12 +1,14 @@
-"""What several tests share: errors and tolerances, random particles and nodes, small scenes, benchmark programs."""
+"""What several tests share: errors and tolerances, random particles and nodes, small scenes, programs."""
 
 import copy
 import dataclasses
+import importlib.util
 import json
 import os
 import subprocess
 import sys
 from pathlib import Path
+from types import ModuleType
 
 import torch
 from torch import Tensor
@@ -174,7 +176,18 @@ def command(*arguments, **options):
     return subprocess.Popen(line, env=env, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **options)
 
 
-# ---- benchmark programs
+# ---- examples and benchmark programs
+
+
+def example(name: str) -> ModuleType:
+    """A script of examples/ as a module of its own, whose constants a test may change."""
+    spec = importlib.util.spec_from_file_location(Path(name).name, common.ROOT / "examples" / f"{name}.py")
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module  # where dataclasses look for their annotations
+    spec.loader.exec_module(module)
+    return module
+
 
 # Threads that wait without spinning: tests share their machine.
 PASSIVE = {**os.environ, "OMP_WAIT_POLICY": "PASSIVE"}

@@ -38,9 +38,11 @@ def test_links_lead_to_files(document: Path) -> None:
     assert missing == []
 
 
-def test_every_scene_is_in_the_gallery() -> None:
+def test_every_scene_and_script_is_in_the_gallery() -> None:
     gallery = (ROOT / "docs" / "gallery.md").read_text()
     scenes = {path.stem for path in (ROOT / "examples").glob("*.toml")}
     assert {name for name in scenes if f"`{name}`" not in gallery} == set()
+    scripts = {path.name for path in (ROOT / "examples").glob("*.py")}
+    assert {name for name in scripts if f"(../examples/{name})" not in gallery} == set()
     pictures = set(re.findall(r"docs/pictures/(\w+)\.png", README))
     assert pictures <= scenes and all(f"`{name}`" in README for name in pictures - {"demo"})

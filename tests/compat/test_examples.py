@@ -1,39 +1,30 @@
 """Scripts in the published style run with only their imports changed: the examples and those of the documentation."""
 
-import importlib.util
 import re
 from pathlib import Path
-from types import ModuleType
 
 import pytest
+from helpers import example
 
 ROOT = Path(__file__).parents[2]
 
 
-def example(name: str) -> ModuleType:
-    spec = importlib.util.spec_from_file_location(name, ROOT / "examples" / "compat" / f"{name}.py")
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
 def test_gaussians():
-    module = example("gaussians")
+    module = example("compat/gaussians")
     x = module.main(ROOT / "examples" / "compat" / "gaussians.json", frames=1)
     assert x.shape == (4608, 3) and 1.0 < float(x[x[:, 2] > 1.3, 0].mean()) < 1.02
 
 
 @pytest.mark.parametrize("name", ["jelly", "sand"])
 def test_cube(name):
-    x = example("cube").main(name, frames=1, steps_per_frame=20)
+    x = example("compat/cube").main(name, frames=1, steps_per_frame=20)
     fallen = 0.4 - float(x[:, 2].mean())
     time = 20 * 3e-4
     assert fallen == pytest.approx(0.5 * time + 9.8 * time**2 / 2, rel=0.05)
 
 
 def test_learned_law():
-    first, last = example("learned_law").main(epochs=2, steps=15)
+    first, last = example("compat/learned_law").main(epochs=2, steps=15)
     assert last < 0.9 * first
 
 
