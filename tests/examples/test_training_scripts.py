@@ -35,7 +35,7 @@ def test_network_on_the_grid_learns(capsys):
 
 
 def test_parameters_are_recovered(device, tmp_path, capsys):
-    errors = example("recover_parameters").main(tmp_path, device, iterations=10)
+    errors = example("recover_parameters").main(tmp_path, device, iterations=9)
     assert errors.keys() == {"E", "nu", "friction_angle"} and max(errors.values()) < 0.01
     assert drawn(tmp_path / "recover_parameters.png")
 
@@ -76,7 +76,7 @@ def test_friction_is_learnt(device, tmp_path, capsys):
 def test_pictures_are_fitted(device, tmp_path, capsys):
     script = example("fit_images")
     script.STEPS = 200
-    errors = script.main(tmp_path, device, iterations=11)
+    errors = script.main(tmp_path, device, iterations=9)
     assert max(errors[name] for name in ("E", "vx", "vy", "vz")) < 0.1
     assert drawn(tmp_path / "fit_images.png")
 
