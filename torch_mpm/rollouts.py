@@ -110,6 +110,8 @@ def obstacle_to_substeps(step: Step, state: State, dt: float | Tensor) -> str | 
         return "it is compiled, captured or transformed"
     if step.heat is not None:
         return "it conducts heat"
+    if step.integrator is not None:
+        return "it is implicit"
     if step.on_grid is not None:
         return "it calls on_grid"
     if step.on_particles is not None:

@@ -21,7 +21,9 @@ from ..ops.law import (
     DISSIPATED,
     LawUpdate,
     law_energy,
+    law_energy_gradient,
     law_stiffness,
+    law_tangent,
     law_update,
     law_wave_modulus,
     option_bits,
@@ -101,6 +103,27 @@ class CompiledLaw(Material):
             moved = self.return_map(state)
             deformation, history = moved.state, moved.history
         return law_energy(self._name(state), deformation, parameters, history, state.scene, state.x.shape[1])
+
+    def trial_energy(self, state: State) -> Tensor:
+        return law_energy(*self._trial(state))
+
+    def trial_stress(self, state: State, before: State) -> Tensor:
+        gradient = law_energy_gradient(*self._trial(state))
+        if self.state_fields == ("J",):
+            assert before.J is not None
+            eye = torch.eye(state.x.shape[1], dtype=gradient.dtype, device=gradient.device)
+            return (gradient * before.J)[:, None, None] * eye
+        assert before.F is not None
+        return gradient @ before.F.mT
+
+    def trial_tangent(self, state: State, before: State, weight: Tensor, projected: bool) -> Tensor:
+        name, deformation, *others = self._trial(state)
+        return law_tangent(name, deformation, getattr(before, self.state_fields[0]), weight, *others, projected)
+
+    def _trial(self, state: State) -> tuple[str, Tensor, list[Tensor], list[Tensor], Tensor | None, int]:
+        """What the ops of energy take."""
+        deformation, parameters = self._arguments(state)
+        return self._name(state), deformation, parameters, self._history(state), state.scene, state.x.shape[1]
 
     def wave_modulus(self, state: State) -> Tensor:
         """Upper bound of rest density times squared wave speed after the return map [P] [Pa]; exact at rest."""

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from ..capture import without_transforms
 from ..errors import shape_of
 from ..ops.arguments import soa_empty
+from ..ops.implicit import tangent_entries
 from ..state import _take
 from .custom import as_law
 from .material import Material
@@ -73,6 +74,22 @@ class Mixture(Material):
 
     def energy_density(self, state: State) -> Tensor:
         return self._collect(state, lambda law, part: law.energy_density(part))
+
+    def trial_energy(self, state: State) -> Tensor:
+        return self._collect(state, lambda law, part: law.trial_energy(part))
+
+    def trial_stress(self, state: State, before: State) -> Tensor:
+        result = state.x.new_zeros(len(state.x), *(state.x.shape[1],) * 2)
+        for part, law in self._parts(state):
+            result = result.index_copy(0, part.index, law.trial_stress(part, _Part(before, part.index)))
+        return result
+
+    def trial_tangent(self, state: State, before: State, weight: Tensor, projected: bool) -> Tensor:
+        result = soa_empty(state.x, (len(state.x), tangent_entries(state.x.shape[1]))).zero_()
+        for part, law in self._parts(state):
+            own = law.trial_tangent(part, _Part(before, part.index), weight[part.index], projected)
+            result.index_copy_(0, part.index, own)
+        return result
 
     def stiffness(self, state: State) -> Tensor:
         return self._collect(state, lambda law, part: law.stiffness(part))

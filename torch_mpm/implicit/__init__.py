@@ -1,0 +1,5 @@
+"""Implicit steps: backward Euler on the velocities of the nodes."""
+
+from .implicit import Implicit, ImplicitReport
+
+__all__ = ["Implicit", "ImplicitReport"]

@@ -1,0 +1,217 @@
+"""The minimum of an implicit step's energy: Newton's method with line search and conjugate gradients."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import torch
+from torch import Tensor
+
+from ..ops import implicit_cg
+from .bounds import NodeBounds
+from .system import ImplicitSystem
+
+LOOSEST, TIGHTEST = 0.1, 1e-12
+"""Relative tolerances of conjugate gradients within Newton's method."""
+SUFFICIENT = 1e-4
+"""Share of the decrease that the slope promises, which a step must bring (Nocedal and Wright 2006, section 3.1)."""
+MOST_HALVINGS = 30
+
+
+@dataclasses.dataclass
+class Options:
+    """Numbers of `Implicit`."""
+
+    tolerance: float
+    max_iterations: int
+    max_cg_iterations: int
+
+
+@dataclasses.dataclass
+class Minimum:
+    """Where Newton's method ended.
+
+    Attributes:
+        v: node velocities [N, D] [m/s], finite.
+        free: components that may move, in the axes of the nodes, bool [N, D].
+        converged: bool [B].
+        residual: √(g · B⁻¹ g / Σ m) [m/s], float64 [B].
+        iterations, cg_iterations: int32 [B].
+    """
+
+    v: Tensor
+    free: Tensor
+    converged: Tensor
+    residual: Tensor
+    iterations: Tensor
+    cg_iterations: Tensor
+
+
+def free_components(system: ImplicitSystem, bounds: NodeBounds | None, v: Tensor, gradient: Tensor) -> Tensor:
+    """Components of the node velocities that the step is to find, in the axes of the nodes, bool [N, D]."""
+    massive = (system.mass > 0)[:, None].expand_as(v)
+    return massive if bounds is None else massive & bounds.free(v, gradient)
+
+
+def inverse_blocks(
+    system: ImplicitSystem, bounds: NodeBounds | None, tangent: Tensor, free: Tensor
+) -> Tensor:
+    """B⁻¹ of the node blocks of the free components [N, D, D] [1/kg], zero for the others."""
+    blocks = system.diagonal(tangent).double()
+    if bounds is not None:
+        blocks = bounds.turned_blocks(blocks)
+    both = free[:, :, None] & free[:, None, :]
+    blocks = torch.where(both, blocks, 0) + torch.diag_embed((~free).double())
+    inverse = torch.where(both, _inverse(blocks), 0)
+    if bounds is not None:
+        inverse = bounds.turned_blocks(inverse)
+    inverse = (inverse + inverse.mT) / 2
+    return inverse.to(system.mass.dtype)
+
+
+def _inverse(a: Tensor) -> Tensor:
+    """Of symmetric matrices [N, 2 or 3, 2 or 3]."""
+    scale = a.diagonal(dim1=1, dim2=2).rsqrt()
+    a = a * scale[:, :, None] * scale[:, None, :]
+    if a.shape[-1] == 2:
+        rows = [[a[:, 1, 1], -a[:, 0, 1]], [-a[:, 1, 0], a[:, 0, 0]]]
+        cofactors = torch.stack([torch.stack(row, -1) for row in rows], -2)
+        determinant = a[:, 0, 0] * a[:, 1, 1] - a[:, 0, 1] * a[:, 1, 0]
+    else:
+        first, second, third = a.unbind(-1)
+        rows3 = [torch.linalg.cross(second, third), torch.linalg.cross(third, first), torch.linalg.cross(first, second)]
+        cofactors = torch.stack(rows3, -2)
+        determinant = (first * rows3[0]).sum(-1)
+    return cofactors / determinant[:, None, None] * scale[:, :, None] * scale[:, None, :]
+
+
+@torch.no_grad()
+def minimise(system: ImplicitSystem, bounds: NodeBounds | None, options: Options) -> Minimum:
+    """The node velocities of least energy within bounds, for each scene apart.
+
+    The host waits for the device once per iteration to learn whether all scenes are done, and once per halving of a
+    step. A scene is done when its residual is `tolerance` times that of v*, or of the size of rounding; or when no step
+    lowers its energy. Projected Newton of Bertsekas (1982): components at a bound that the gradient holds there are left
+    out of the linear solve, and steps are clamped.
+    """
+    v, energy, size = _start(system, bounds)
+    scenes = len(energy)
+    zeros = torch.zeros(scenes, dtype=torch.int32, device=v.device)
+    total_mass = system.node_sum(system.mass)
+    total_mass = torch.where(total_mass > 0, total_mass, 1)
+    floor = _rounding(system, total_mass)
+    iterations, cg_iterations = zeros.clone(), zeros.clone()
+    first: Tensor | None = None
+    previous = forcing = None
+    stalled = torch.zeros(scenes, dtype=torch.bool, device=v.device)
+    while True:
+        gradient = system.residual(v)
+        tangent = system.tangent(v)
+        free = free_components(system, bounds, v, gradient)
+        inverse = inverse_blocks(system, bounds, tangent, free)
+        change = torch.bmm(inverse, gradient[:, :, None])[:, :, 0]
+        residual = (system.node_sum(gradient * change).clamp_min(0) / total_mass).sqrt()
+        if first is None:
+            first = residual
+        target = torch.maximum(options.tolerance * first, floor)
+        small = residual <= target
+        done = stalled | small
+        if bool(done.all()) or _spent(iterations, options):
+            break
+        forcing = _forcing(residual, previous, forcing, target)
+        previous = residual
+        relative = torch.where(done, 1.0, forcing).to(v.dtype)
+        solve = implicit_cg(
+            *(system.blocks, system.state.x, torch.where(system.of_nodes(done), 0, -gradient), system.mass, inverse),
+            *(tangent, relative, options.max_cg_iterations, system.stress_form),
+        )
+        cg_iterations += solve.iterations
+        iterations += (~done).int()
+        v, energy, size, moved = _search(system, bounds, v, energy, size, gradient, solve.solution, done)
+        stalled = stalled | ~(moved | done)
+    finite = residual.isfinite() & energy.isfinite()
+    return Minimum(v, free, small & finite, residual, iterations, cg_iterations)
+
+
+def _spent(iterations: Tensor, options: Options) -> bool:
+    return iterations.numel() == 0 or int(iterations.max()) >= options.max_iterations
+
+
+def _forcing(residual: Tensor, previous: Tensor | None, forcing: Tensor | None, target: Tensor) -> Tensor:
+    """Relative tolerances of the linear solves, that of the second choice of Eisenstat and Walker (1996): as tight as
+    Newton's method converges, and no tighter than what is left to do."""
+    if previous is None or forcing is None:
+        rate = torch.full_like(residual, LOOSEST)
+    else:
+        rate = 0.9 * (residual / torch.where(previous > 0, previous, 1)).square()
+        kept = 0.9 * forcing * forcing
+        rate = torch.where(kept > 0.1, torch.maximum(rate, kept), rate).clamp_max(LOOSEST)
+    enough = 0.5 * target / torch.where(residual > 0, residual, 1)
+    return torch.maximum(rate, enough).clamp(TIGHTEST, 0.9).nan_to_num(LOOSEST)
+
+
+def _rounding(system: ImplicitSystem, total_mass: Tensor) -> Tensor:
+    """The residual that rounding leaves [m/s], [B]: strains of the size of one unit move waves of speed √(Σ V K/Σ m)."""
+    x = system.state.x
+    eps = torch.finfo(x.dtype).eps
+    stiffness = torch.where(system.volume > 0, system.volume * system.law.stiffness(system.state), 0).double()
+    wave = (system.particle_sum(stiffness[:, None])[:, 0] / total_mass).clamp_min(0).sqrt()
+    speed = (system.node_sum(system.mass[:, None] * system.start.square()) / total_mass).sqrt()
+    return 4 * eps * (wave + speed)
+
+
+def _start(system: ImplicitSystem, bounds: NodeBounds | None) -> tuple[Tensor, Tensor, Tensor]:
+    """v* within bounds, or a share of it for which the energy is finite."""
+
+    def allowed(v: Tensor) -> Tensor:
+        return v if bounds is None else bounds.clamped(v)
+
+    share = torch.ones(system.blocks.grid.scenes, dtype=torch.float64, device=system.mass.device)
+    v = allowed(system.start)
+    energy, size = system.energy(v)
+    for _ in range(MOST_HALVINGS):
+        lost = ~energy.isfinite()
+        if not bool(lost.any()):
+            break
+        share = torch.where(lost, share / 2, share)
+        v = allowed(system.of_nodes(share).to(v.dtype) * system.start)
+        energy, size = system.energy(v)
+    lost = ~energy.isfinite()
+    if bool(lost.any()):  # of which zero is known to have an energy, without bounds that move
+        v = allowed(torch.where(system.of_nodes(lost), 0, v))
+        energy, size = system.energy(v)
+    return v, energy, size
+
+
+def _search(
+    system: ImplicitSystem,
+    bounds: NodeBounds | None,
+    v: Tensor,
+    energy: Tensor,
+    size: Tensor,
+    gradient: Tensor,
+    step: Tensor,
+    done: Tensor,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Velocities after the longest of the steps 1, ½, ¼ ... that lowers the energy of each scene enough; their energy
+    and its size; and which scenes moved, bool [B]."""
+    rounding = 32 * torch.finfo(v.dtype).eps
+    share = torch.where(done, 0.0, 1.0).double()
+    best, best_energy, best_size = v, energy, size
+    for _ in range(MOST_HALVINGS):
+        trial = v + system.of_nodes(share).to(v.dtype) * step
+        trial = trial if bounds is None else bounds.clamped(trial)
+        trial_energy, trial_size = system.energy(trial)
+        slope = system.node_sum(gradient * (trial - v))
+        enough = trial_energy <= energy + SUFFICIENT * slope + rounding * (size + trial_size)
+        enough = (enough & trial_energy.isfinite() & (slope <= 0)) | (share == 0)
+        best, best_energy, best_size = trial, trial_energy, trial_size
+        if bool(enough.all()):
+            break
+        share = torch.where(enough, share, share / 2)
+    else:  # scenes that no step helps stay where they were
+        share = torch.where(enough, share, 0.0)
+        best = v + system.of_nodes(share).to(v.dtype) * step
+        best = torch.where(system.of_nodes(share > 0), best if bounds is None else bounds.clamped(best), v)
+        best_energy, best_size = system.energy(best)
+    return best, best_energy, best_size, share > 0
