@@ -8,11 +8,14 @@ import torch
 from torch import Tensor
 
 from ..ops import implicit_cg
+from ..ops.implicit import NEGATIVE_CURVATURE
 from .bounds import NodeBounds
 from .system import ImplicitSystem
 
 LOOSEST, TIGHTEST = 0.1, 1e-12
 """Relative tolerances of conjugate gradients within Newton's method."""
+NEAR, PATIENCE = 0.05, 6
+"""Share of the first residual, and number of iterations, from which the Hessian is not projected any more."""
 SUFFICIENT = 1e-4
 """Share of the decrease that the slope promises, which a step must bring (Nocedal and Wright 2006, section 3.1)."""
 MOST_HALVINGS = 30
@@ -103,12 +106,12 @@ def minimise(system: ImplicitSystem, bounds: NodeBounds | None, options: Options
     iterations, cg_iterations = zeros.clone(), zeros.clone()
     first: Tensor | None = None
     previous = forcing = None
-    stalled = torch.zeros(scenes, dtype=torch.bool, device=v.device)
+    stalled = indefinite = torch.zeros(scenes, dtype=torch.bool, device=v.device)
     while True:
         gradient = system.residual(v)
-        tangent = system.tangent(v)
+        convex = system.tangent(v)
         free = free_components(system, bounds, v, gradient)
-        inverse = inverse_blocks(system, bounds, tangent, free)
+        inverse = inverse_blocks(system, bounds, convex, free)
         change = torch.bmm(inverse, gradient[:, :, None])[:, :, 0]
         residual = (system.node_sum(gradient * change).clamp_min(0) / total_mass).sqrt()
         if first is None:
@@ -121,13 +124,17 @@ def minimise(system: ImplicitSystem, bounds: NodeBounds | None, options: Options
         forcing = _forcing(residual, previous, forcing, target)
         previous = residual
         relative = torch.where(done, 1.0, forcing).to(v.dtype)
+        exact = ~indefinite & ((residual <= NEAR * first) | (iterations >= PATIENCE))
+        tangent = torch.where(system.of_particles(exact), system.tangent(v, projected=False), convex)
         solve = implicit_cg(
             *(system.blocks, system.state.x, torch.where(system.of_nodes(done), 0, -gradient), system.mass, inverse),
             *(tangent, relative, options.max_cg_iterations, system.stress_form),
         )
+        indefinite = solve.state == NEGATIVE_CURVATURE
+        direction = torch.where(system.of_nodes(indefinite & (solve.iterations == 0)), -change, solve.solution)
         cg_iterations += solve.iterations
         iterations += (~done).int()
-        v, energy, size, moved = _search(system, bounds, v, energy, size, gradient, solve.solution, done)
+        v, energy, size, moved = _search(system, bounds, v, energy, size, gradient, direction, done)
         stalled = stalled | ~(moved | done)
     finite = residual.isfinite() & energy.isfinite()
     return Minimum(v, free, small & finite, residual, iterations, cg_iterations)

@@ -133,3 +133,7 @@ class ImplicitSystem:
     def of_nodes(self, value: Tensor) -> Tensor:
         """A tensor [B] as one value per node [N, 1]."""
         return value[self.slot_scene].repeat_interleave(self.blocks.grid.nodes_per_block)[:, None]
+
+    def of_particles(self, value: Tensor) -> Tensor:
+        """A tensor [B] as one value per particle [P, 1]."""
+        return per_particle(value, self.blocks.particle_scene(), self.state.x.shape[0])[:, None]
