@@ -142,6 +142,7 @@ MPM_HD double cg_step(const ConjugateGradientsArguments<T, D>& a, int64_t node, 
   double sum = 0;
   MPM_UNROLL for (int i = 0; i < D; i++) {
     const int64_t k = node * D + i;
+    if (step == 0) continue;  // of a scene whose directions may not be finite
     a.x[k] += T(step) * a.p[k];
     a.r[k] -= T(step) * a.q[k];
   }

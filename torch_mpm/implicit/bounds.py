@@ -46,7 +46,7 @@ class NodeBounds:
         """Components in the axes of the nodes that may move, bool [N, D]: not at a bound, or with a gradient of the
         energy that pulls them off it."""
         u, slope = self.turned(v), self.turned(gradient)
-        rounding = 8 * torch.finfo(v.dtype).eps * v.abs().amax()
+        rounding = 8 * torch.finfo(v.dtype).eps * v.abs().amax(-1, keepdim=True)
         at_lower = (u <= self.lower + rounding) & (slope >= 0)
         at_upper = (u >= self.upper - rounding) & (slope <= 0)
         return ~(at_lower | at_upper | (self.lower == self.upper))

@@ -102,7 +102,7 @@ def minimise(system: ImplicitSystem, bounds: NodeBounds | None, options: Options
     zeros = torch.zeros(scenes, dtype=torch.int32, device=v.device)
     total_mass = system.node_sum(system.mass)
     total_mass = torch.where(total_mass > 0, total_mass, 1)
-    floor = _rounding(system, total_mass)
+    wave, momentum = _wave_speed_squared(system, total_mass), system.mass[:, None] * system.start
     iterations, cg_iterations = zeros.clone(), zeros.clone()
     first: Tensor | None = None
     previous = forcing = None
@@ -112,11 +112,12 @@ def minimise(system: ImplicitSystem, bounds: NodeBounds | None, options: Options
         convex = system.tangent(v)
         free = free_components(system, bounds, v, gradient)
         inverse = inverse_blocks(system, bounds, convex, free)
-        change = torch.bmm(inverse, gradient[:, :, None])[:, :, 0]
+        change = _times(inverse, gradient)
         residual = (system.node_sum(gradient * change).clamp_min(0) / total_mass).sqrt()
-        if first is None:
-            first = residual
-        target = torch.maximum(options.tolerance * first, floor)
+        first = residual if first is None else first
+        floor = _rounding(system, inverse, v, wave, momentum, total_mass)
+        # One iteration at least: a smooth load may be smaller than the rounding of stresses, which averages out.
+        target = torch.maximum(options.tolerance * first, torch.where(iterations > 0, floor, 0))
         small = residual <= target
         done = stalled | small
         if bool(done.all()) or _spent(iterations, options):
@@ -157,36 +158,48 @@ def _forcing(residual: Tensor, previous: Tensor | None, forcing: Tensor | None, 
     return torch.maximum(rate, enough).clamp(TIGHTEST, 0.9).nan_to_num(LOOSEST)
 
 
-def _rounding(system: ImplicitSystem, total_mass: Tensor) -> Tensor:
-    """The residual that rounding leaves [m/s], [B]: strains of the size of one unit move waves of speed √(Σ V K/Σ m)."""
-    x = system.state.x
-    eps = torch.finfo(x.dtype).eps
+def _rounding(
+    system: ImplicitSystem, inverse: Tensor, v: Tensor, wave: Tensor, momentum: Tensor, total_mass: Tensor
+) -> Tensor:
+    """The residual that rounding leaves [m/s], [B]: of momenta, and of stresses, where strains of the size of one unit
+    move waves of the given speed, and as much again for each cell that the material moves in the step."""
+    speed = system.node_sum(system.mass[:, None] * v.square()) / total_mass
+    cells = speed * (torch.as_tensor(system.dt, device=v.device).double() / system.blocks.grid.dx).square()
+    moved = system.node_sum(momentum * _times(inverse, momentum)).clamp_min(0) / total_mass
+    return 4 * torch.finfo(v.dtype).eps * (wave * (1 + cells) + moved).sqrt()
+
+
+def _wave_speed_squared(system: ImplicitSystem, total_mass: Tensor) -> Tensor:
+    """Σ V K/Σ m [m²/s²], [B]."""
     stiffness = torch.where(system.volume > 0, system.volume * system.law.stiffness(system.state), 0).double()
-    wave = (system.particle_sum(stiffness[:, None])[:, 0] / total_mass).clamp_min(0).sqrt()
-    speed = (system.node_sum(system.mass[:, None] * system.start.square()) / total_mass).sqrt()
-    return 4 * eps * (wave + speed)
+    return (system.particle_sum(stiffness[:, None])[:, 0] / total_mass).clamp_min(0)
+
+
+def _times(matrices: Tensor, vectors: Tensor) -> Tensor:
+    """[N, D, D] times [N, D]."""
+    return (matrices * vectors[:, None, :]).sum(-1)
 
 
 def _start(system: ImplicitSystem, bounds: NodeBounds | None) -> tuple[Tensor, Tensor, Tensor]:
-    """v* within bounds, or a share of it for which the energy is finite."""
+    """v* within bounds, or no motion at all, whichever has less energy; where both have none, a share of v* that has."""
 
-    def allowed(v: Tensor) -> Tensor:
+    def allowed(share: Tensor) -> Tensor:
+        v = system.of_nodes(share).to(system.start.dtype) * system.start
+        v = torch.where(system.of_nodes(share > 0), v, 0)
         return v if bounds is None else bounds.clamped(v)
 
     share = torch.ones(system.blocks.grid.scenes, dtype=torch.float64, device=system.mass.device)
-    v = allowed(system.start)
-    energy, size = system.energy(v)
+    energy, _ = system.energy(allowed(share))
+    at_rest, _ = system.energy(allowed(0 * share))
+    lower = at_rest < torch.where(energy.isfinite(), energy, torch.inf)
+    share, lost = torch.where(lower, 0.0, share), ~(lower | energy.isfinite())
     for _ in range(MOST_HALVINGS):
-        lost = ~energy.isfinite()
         if not bool(lost.any()):
             break
         share = torch.where(lost, share / 2, share)
-        v = allowed(system.of_nodes(share).to(v.dtype) * system.start)
-        energy, size = system.energy(v)
-    lost = ~energy.isfinite()
-    if bool(lost.any()):  # of which zero is known to have an energy, without bounds that move
-        v = allowed(torch.where(system.of_nodes(lost), 0, v))
-        energy, size = system.energy(v)
+        lost = lost & ~system.energy(allowed(share))[0].isfinite()
+    v = allowed(torch.where(lost, 0.0, share))
+    energy, size = system.energy(v)
     return v, energy, size
 
 
