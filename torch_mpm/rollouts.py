@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.autograd import forward_ad
 
 from .boundaries import Obstacle
+from .boundaries.obstacles import motion_tensors
 from .capture import is_captured, is_traced
 from .errors import check_count, shape_of
 from .graphs import CHUNK, LEAST_STEPS, obstacle_to_replays, replayed, time_after
@@ -129,7 +130,7 @@ def obstacle_to_substeps(step: Step, state: State, dt: float | Tensor) -> str | 
     if len(boundaries) > MAX_OBSTACLES:
         return f"there are more than {MAX_OBSTACLES} obstacles"
     if torch.is_grad_enabled():
-        if any(t.requires_grad for b in boundaries for t in _motion(b)):
+        if any(t.requires_grad for b in boundaries for t in motion_tensors(b)):
             return "an obstacle requires a gradient"
         if any(part.has_functions for part in laws):
             return "a parameter is a function, which may have a gradient"
@@ -164,12 +165,6 @@ def _steps_between_kept(state: State, n: int) -> int:
 
 
 _FORWARD = CompiledLaw.forward
-
-
-def _motion(obstacle: Any) -> list[Tensor]:
-    """The tensors of an obstacle."""
-    values = (*vars(obstacle).values(), *vars(obstacle.shape).values())
-    return [v for v in values if isinstance(v, Tensor)] + [*obstacle.parameters(), *obstacle.buffers()]
 
 
 def _differentiable(step: Step, state: State) -> list[Tensor]:

@@ -178,7 +178,9 @@ def test_hessian_is_that_of_the_energy(dim, kernel, stress_form, device):
         def density(F: Tensor) -> Tensor:
             return material.energy("neo_hookean", F, case.parameters)
 
-        return oracle.energy(case.blocks, p.x, v, torch.zeros_like(along), case.mass, case.F, p.volume, case.dt, density, stress_form)
+        return oracle.energy(
+            case.blocks, p.x, v, torch.zeros_like(along), case.mass, case.F, p.volume, case.dt, density, stress_form
+        )
 
     (reference,) = oracle.hessian(energy, v, [along])
     result = ops.implicit_apply(case.blocks, p.x, along, case.tangent, case.mass, stress_form)
@@ -189,7 +191,8 @@ def test_hessian_is_that_of_the_energy(dim, kernel, stress_form, device):
 def test_hessian_in_float32_and_its_symmetry(dim, stress_form, device):
     double, single = (Case(dim, "quadratic", device, dtype) for dtype in (torch.float64, torch.float32))
     results = [
-        ops.implicit_apply(c.blocks, c.particles.x, c.nodes(1), c.tangent, c.mass, stress_form) for c in (double, single)
+        ops.implicit_apply(c.blocks, c.particles.x, c.nodes(1), c.tangent, c.mass, stress_form)
+        for c in (double, single)
     ]
     assert relative_error(results[1], results[0]) < ERROR[torch.float32]
     other = ops.implicit_apply(

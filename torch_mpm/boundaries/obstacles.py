@@ -220,6 +220,12 @@ class Obstacle(RigidMotion):
         return distance.detach() <= rounding * positions.detach().abs().amax()
 
 
+def motion_tensors(obstacle: Obstacle) -> list[Tensor]:
+    """The tensors of an obstacle: of its shape, where it is and how it moves."""
+    values = (*vars(obstacle).values(), *vars(obstacle.shape).values())
+    return [v for v in values if isinstance(v, Tensor)] + [*obstacle.parameters(), *obstacle.buffers()]
+
+
 # ---- obstacles of one shape each
 
 

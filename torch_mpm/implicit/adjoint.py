@@ -68,4 +68,3 @@ def _solve(
     )
     owner.adjoint_converged = solve.state == CONVERGED
     return torch.where(system.of_nodes(owner.adjoint_converged), solve.solution, torch.nan)
-

@@ -46,7 +46,7 @@ class NodeBounds:
         """Components in the axes of the nodes that may move, bool [N, D]: not at a bound, or with a gradient of the
         energy that pulls them off it."""
         u, slope = self.turned(v), self.turned(gradient)
-        rounding = 8 * torch.finfo(v.dtype).eps * v.abs().amax(-1, keepdim=True)
+        rounding = 64 * torch.finfo(v.dtype).eps * v.abs().amax(-1, keepdim=True)  # of two reflections
         at_lower = (u <= self.lower + rounding) & (slope >= 0)
         at_upper = (u >= self.upper - rounding) & (slope <= 0)
         return ~(at_lower | at_upper | (self.lower == self.upper))
@@ -114,7 +114,9 @@ def _add_obstacle(
     bounds: NodeBounds, obstacle: Any, positions: Tensor, scene: Tensor | None, time: float | Tensor
 ) -> None:
     if not isinstance(obstacle, Obstacle):
-        raise NotImplementedError(f"an implicit step takes obstacles alone as boundaries, got {type(obstacle).__name__}")
+        raise NotImplementedError(
+            f"an implicit step takes obstacles alone as boundaries, got {type(obstacle).__name__}"
+        )
     if isinstance(obstacle.friction, Tensor) or obstacle.friction != 0:
         raise NotImplementedError("an implicit step has no friction of obstacles yet: use slip, separate or sticky")
     contact = obstacle.contact_at(positions, scene, time)
@@ -146,5 +148,3 @@ def _add_obstacle(
     entry = rows & (axis > 0)
     bounds.lower = torch.where(entry & ((sign < 0) | fixed), limit, torch.where(entry, -math.inf, bounds.lower))
     bounds.upper = torch.where(entry & ((sign > 0) | fixed), limit, torch.where(entry, math.inf, bounds.upper))
-
-

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import torch
 from torch import Tensor
 
+from ..boundaries.obstacles import Obstacle, motion_tensors
 from ..capture import outside_transforms, without_transforms
 from ..errors import check_count, check_number
 from ..failures import Problem, unsolved_steps
@@ -101,9 +102,7 @@ class Implicit:
         return differentiable(self, system, fixed, bounds, minimum)
 
     def _record(self, minimum: Minimum) -> None:
-        self.report = ImplicitReport(
-            minimum.converged, minimum.residual, minimum.iterations, minimum.cg_iterations
-        )
+        self.report = ImplicitReport(minimum.converged, minimum.residual, minimum.iterations, minimum.cg_iterations)
         with outside_transforms(), torch.inference_mode(False):
             missed = without_transforms(~minimum.converged).to(torch.int32)
             residual = without_transforms(minimum.residual)
@@ -134,12 +133,15 @@ def check_implicit(step: Step, state: State) -> None:
     """What an implicit step does not have yet.
 
     Raises:
-        NotImplementedError: for viscosity, heat, counted impulses.
+        NotImplementedError: for viscosity, heat, counted impulses, and obstacles with gradients.
     """
+    obstacles = [b for b in step.boundaries.entries if isinstance(b, Obstacle)]
+    motions = [t for b in obstacles for t in motion_tensors(b)]
     reasons = {
         "a viscous law": step.law.viscous,
         "heat": step.heat is not None,
         "impulses on boundaries": state.impulse is not None,
+        "obstacles that require a gradient": torch.is_grad_enabled() and any(t.requires_grad for t in motions),
     }
     for what, present in reasons.items():
         if present:
@@ -162,5 +164,3 @@ def as_integrator(value: Any) -> Implicit | None:
     if value not in INTEGRATORS:
         raise ValueError(f"integrator must be one of {sorted(INTEGRATORS)} or an Implicit, got {value!r}")
     return Implicit() if value == "implicit" else None
-
-

@@ -18,6 +18,8 @@ NEAR, PATIENCE = 0.05, 6
 """Share of the first residual, and number of iterations, from which the Hessian is not projected any more."""
 SUFFICIENT = 1e-4
 """Share of the decrease that the slope promises, which a step must bring (Nocedal and Wright 2006, section 3.1)."""
+ROUNDING = 32
+"""Units in the last place by which sums of energies may be wrong."""
 MOST_HALVINGS = 30
 
 
@@ -56,9 +58,7 @@ def free_components(system: ImplicitSystem, bounds: NodeBounds | None, v: Tensor
     return massive if bounds is None else massive & bounds.free(v, gradient)
 
 
-def inverse_blocks(
-    system: ImplicitSystem, bounds: NodeBounds | None, tangent: Tensor, free: Tensor
-) -> Tensor:
+def inverse_blocks(system: ImplicitSystem, bounds: NodeBounds | None, tangent: Tensor, free: Tensor) -> Tensor:
     """B⁻¹ of the node blocks of the free components [N, D, D] [1/kg], zero for the others."""
     blocks = system.diagonal(tangent).double()
     if bounds is not None:
@@ -137,8 +137,23 @@ def minimise(system: ImplicitSystem, bounds: NodeBounds | None, options: Options
         iterations += (~done).int()
         v, energy, size, moved = _search(system, bounds, v, energy, size, gradient, direction, done)
         stalled = stalled | ~(moved | done)
+    # No step lowers the energy where what is left to gain is less than its rounding.
+    small = small | (stalled & (residual.square() * total_mass <= ROUNDING * torch.finfo(v.dtype).eps * size))
     finite = residual.isfinite() & energy.isfinite()
+    v = _with_momentum(system, bounds, v, total_mass)
     return Minimum(v, free, small & finite, residual, iterations, cg_iterations)
+
+
+def _with_momentum(system: ImplicitSystem, bounds: NodeBounds | None, v: Tensor, total_mass: Tensor) -> Tensor:
+    """The velocities with the momentum of v* in scenes that nothing bounds: what an early end of the solve has left of
+    its error that is a translation, which has no elastic energy."""
+    missing = system.mass[:, None] * (system.start - v)
+    change = torch.stack([system.node_sum(column) for column in missing.unbind(1)], 1) / total_mass[:, None]
+    if bounds is not None:
+        bounded = (bounds.lower.isfinite() | bounds.upper.isfinite()).any(1) & (system.mass > 0)
+        change = torch.where((system.node_sum(bounded) > 0)[:, None], 0, change)
+    change = change.to(v.dtype)[system.slot_scene].repeat_interleave(system.blocks.grid.nodes_per_block, 0)
+    return torch.where((system.mass > 0)[:, None], v + change, v)
 
 
 def _spent(iterations: Tensor, options: Options) -> bool:
@@ -215,7 +230,7 @@ def _search(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Velocities after the longest of the steps 1, ½, ¼ ... that lowers the energy of each scene enough; their energy
     and its size; and which scenes moved, bool [B]."""
-    rounding = 32 * torch.finfo(v.dtype).eps
+    rounding = ROUNDING * torch.finfo(v.dtype).eps
     share = torch.where(done, 0.0, 1.0).double()
     best, best_energy, best_size = v, energy, size
     for _ in range(MOST_HALVINGS):

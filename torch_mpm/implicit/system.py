@@ -98,7 +98,8 @@ class ImplicitSystem:
         """∂E/∂v [N, D] [kg m/s]; differentiable by everything."""
         grid, x = self.blocks.grid, self.state.x
         stress = self.law.trial_stress(self.trial(v), self.state)
-        impulse = self.impulse_weight[:, None, None] * stress
+        meant = (self.volume > 0)[:, None, None]  # the stress of others may be NaN
+        impulse = torch.where(meant, self.impulse_weight[:, None, None] * torch.where(meant, stress, 0), 0)
         mls = self.stress_form == "mls"
         nothing = x.new_zeros(()).expand(x.shape)
         forces = scatter(

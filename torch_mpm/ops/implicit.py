@@ -76,9 +76,7 @@ def implicit_node_blocks(blocks: Blocks, x: Tensor, tangent: Tensor, stress_form
     Not differentiable.
     """
     _check(blocks, x, tangent, stress_form)
-    upper = dispatch(
-        torch.ops.torch_mpm.implicit_node_blocks, x, tangent, STRESS_FORMS[stress_form], *blocks.packed
-    )
+    upper = dispatch(torch.ops.torch_mpm.implicit_node_blocks, x, tangent, STRESS_FORMS[stress_form], *blocks.packed)
     return from_upper(upper, blocks.grid.dim)
 
 
