@@ -1,5 +1,7 @@
 """Implicit steps: against explicit ones, analytic solutions, conservation laws, and what may go wrong."""
 
+import itertools
+
 import pytest
 import torch
 from helpers import relative_error
@@ -160,7 +162,7 @@ def test_steps_far_beyond_the_explicit_limit(E, nu, cfl, dtype, device):
         state = step(state, dt)
         assert bool(step.solve_report.converged.all()), step.solve_report
         energies.append(energy(state))
-    assert all(b <= a * (1 + 1e-5) for a, b in zip(energies, energies[1:], strict=False))
+    assert all(b <= a * (1 + 1e-5) for a, b in itertools.pairwise(energies))
     step.check(state)
 
 
@@ -223,7 +225,7 @@ def test_separate_lets_go(device):
 
 @pytest.mark.parametrize("kind", ["sticky", "slip", "separate"])
 def test_moving_obstacles(kind, device):
-    """An inclined plane that pushes the block: its nodes have the velocity of the plane, or none less along the normal."""
+    """An inclined plane that pushes the block: its nodes have its velocity, or no less along the normal."""
     grid, state = bar(2, device)
     n = torch.tensor([0.6, 0.8], dtype=torch.float64, device=device)
     velocity = (0.9, 0.4)
@@ -326,7 +328,7 @@ def test_fluid_and_solid_in_one_step(device):
     ids=lambda law: type(law).__name__,
 )
 def test_plastic_laws_flow_after_the_solve(law, device):
-    """A block falls on the floor at 50 times the explicit limit; the state that the next step begins with has flowed."""
+    """A block falls on the floor at 50 times the explicit limit; the next step begins with what has flowed."""
     grid, state = bar(2, device, lower=0.0)
     state = state.replace(v=state.v + torch.tensor([0.0, -3.0], dtype=torch.float64, device=device))
     step = mpm.Step(grid, law, (0.0, -9.8), walls="sticky", integrator="implicit")

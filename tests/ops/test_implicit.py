@@ -1,5 +1,7 @@
 """The tangents of laws, and the Hessian of an implicit step: against automatic differentiation in float64."""
 
+import itertools
+
 import pytest
 import torch
 from helpers import random_particles, relative_error
@@ -33,7 +35,7 @@ def product(tangent: Tensor, L: Tensor) -> Tensor:
     diagonal, even, odd = rest.split([D * (D + 1) // 2, D * (D - 1) // 2, D * (D - 1) // 2], 1)
     M = U.mT @ L @ B
     result = torch.diag_embed((from_upper(diagonal, D) @ M.diagonal(dim1=1, dim2=2)[:, :, None])[:, :, 0])
-    for k, (i, j) in enumerate([(i, j) for i in range(D) for j in range(i + 1, D)]):
+    for k, (i, j) in enumerate(itertools.combinations(range(D), 2)):
         symmetric, skew = even[:, k] * (M[:, i, j] + M[:, j, i]) / 2, odd[:, k] * (M[:, i, j] - M[:, j, i]) / 2
         result[:, i, j], result[:, j, i] = symmetric + skew, symmetric - skew
     return U @ result @ B.mT

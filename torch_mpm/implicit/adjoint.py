@@ -40,14 +40,14 @@ class _Solution(torch.autograd.Function):
     """v as a function of the residual that it makes zero."""
 
     @staticmethod
-    def forward(ctx, residual, v, owner, system, bounds, free):  # type: ignore[no-untyped-def]
+    def forward(ctx, residual, v, owner, system, bounds, free):
         ctx.owner, ctx.system, ctx.bounds, ctx.free = owner, system, bounds, free
         ctx.save_for_backward(v)
         return v.clone()
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx, grad):  # type: ignore[no-untyped-def]
+    def backward(ctx, grad):
         (v,) = ctx.saved_tensors
         adjoint = _solve(ctx.owner, ctx.system, ctx.bounds, ctx.free, v, grad)
         return -adjoint, None, None, None, None, None

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 def equilibrium(step: Step, state: State, dt: float) -> State:
-    """The state at rest under gravity, walls and obstacles: one implicit step from rest, so long that inertia is nothing.
+    """The state at rest under gravity, walls and obstacles: one implicit step, so long that inertia is nothing.
 
     The shape functions are those of the given positions, so that the displacements may be any (total Lagrangian on the
     lattice). A body that nothing holds falls as far as it does in dt.

@@ -38,10 +38,10 @@ class ImplicitReport(NamedTuple):
 class Implicit:
     """Backward Euler: `Step(integrator=Implicit(...))`, or `integrator="implicit"` for the defaults.
 
-    The node velocities minimise ½ Σ m |v − v*|² + Σ V ψ((I + dt L(v)) F) (Martin et al. 2011; Gast et al. 2015), scene by
-    scene, by Newton's method with a projected tangent, line search, and conjugate gradients preconditioned by the blocks
-    of the nodes. Any dt is stable. Walls and obstacles bound the velocities of their nodes in the solve. Laws with an
-    elastic energy take part; where they are plastic the flow follows the solve, at the start of the next step.
+    The node velocities minimise ½ Σ m |v − v*|² + Σ V ψ((I + dt L(v)) F) (Martin et al. 2011; Gast et al. 2015), scene
+    by scene, by Newton's method with line search and conjugate gradients preconditioned by the blocks of the nodes. Any
+    dt is stable. Walls and obstacles bound the velocities of their nodes in the solve. Laws with an elastic energy take
+    part; where they are plastic the flow follows the solve, at the start of the next step.
 
     Args:
         tolerance: of the residual relative to that of v*, the velocities without elastic forces, in (0, 1).
@@ -52,7 +52,7 @@ class Implicit:
     Attributes:
         report: `ImplicitReport` of the latest step, None before the first.
         adjoint_converged: bool [B], whether the solve of the latest backward pass converged; None before the first.
-        Where it did not, the gradients of that scene are NaN.
+            Where it did not, the gradients of that scene are NaN.
 
     Raises:
         TypeError, ValueError: for a wrong argument.

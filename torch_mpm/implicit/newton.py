@@ -94,8 +94,8 @@ def minimise(system: ImplicitSystem, bounds: NodeBounds | None, options: Options
 
     The host waits for the device once per iteration to learn whether all scenes are done, and once per halving of a
     step. A scene is done when its residual is `tolerance` times that of v*, or of the size of rounding; or when no step
-    lowers its energy. Projected Newton of Bertsekas (1982): components at a bound that the gradient holds there are left
-    out of the linear solve, and steps are clamped.
+    lowers its energy. Projected Newton of Bertsekas (1982): components at a bound that the gradient holds there are
+    left out of the linear solve, and steps are clamped.
     """
     v, energy, size = _start(system, bounds)
     scenes = len(energy)
@@ -196,7 +196,7 @@ def _times(matrices: Tensor, vectors: Tensor) -> Tensor:
 
 
 def _start(system: ImplicitSystem, bounds: NodeBounds | None) -> tuple[Tensor, Tensor, Tensor]:
-    """v* within bounds, or no motion at all, whichever has less energy; where both have none, a share of v* that has."""
+    """v* within bounds or no motion, whichever has less energy; where both have none, a share of v* that has one."""
 
     def allowed(share: Tensor) -> Tensor:
         v = system.of_nodes(share).to(system.start.dtype) * system.start

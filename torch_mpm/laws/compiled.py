@@ -117,8 +117,9 @@ class CompiledLaw(Material):
         return gradient @ before.F.mT
 
     def trial_tangent(self, state: State, before: State, weight: Tensor, projected: bool) -> Tensor:
-        name, deformation, *others = self._trial(state)
-        return law_tangent(name, deformation, getattr(before, self.state_fields[0]), weight, *others, projected)
+        name, deformation, parameters, history, scene, dim = self._trial(state)
+        before_field = getattr(before, self.state_fields[0])
+        return law_tangent(name, deformation, before_field, weight, parameters, history, scene, dim, projected)
 
     def _trial(self, state: State) -> tuple[str, Tensor, list[Tensor], list[Tensor], Tensor | None, int]:
         """What the ops of energy take."""

@@ -166,7 +166,7 @@ def law_energy_gradient(
     scene: Tensor | None = None,
     dim: int | None = None,
 ) -> Tensor:
-    """∂ψ/∂F [P, D, D], or ∂ψ/∂J [P], [Pa] of the state itself, without a return map; zero where `law_energy` is infinite.
+    """∂ψ/∂F [P, D, D] or ∂ψ/∂J [P] [Pa] of the state itself, without a return map; zero where ψ is infinite.
 
     Arguments as `law_update`. Differentiable with respect to state and parameters where the law says that its energy is
     twice differentiable.
