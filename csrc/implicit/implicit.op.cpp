@@ -98,6 +98,8 @@ std::tuple<Tensor, Tensor> implicit_cg(const Tensor& x, const Tensor& rhs, const
                                        int64_t stress_form, const std::vector<Tensor>& topology,
                                        const std::vector<double>& lattice, const std::vector<int64_t>& layout) {
   const PackedTopology blocks(topology, lattice, layout);
+  STD_TORCH_CHECK(max_iterations >= 0 && max_iterations <= INT32_MAX, "max_iterations must be 0 to 2^31 - 1, got ",
+                  max_iterations);
   Tensor solution, scalars;
   const DeviceScope device(x);
   dispatch(x, [&]<class T, int D>() {

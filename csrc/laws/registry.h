@@ -28,9 +28,9 @@ struct LawKernels {
   void (*scalar)(const LawScalarArguments<T, D>&, void* stream) = nullptr;
   void (*energy_backward)(const LawEnergyBackwardArguments<T, D>&, void* stream) = nullptr;
   void (*energy_double_backward)(const LawEnergyDoubleBackwardArguments<T, D>&, void* stream) = nullptr;
-  void (*tangent)(const LawTangentArguments<T, D>&, void* stream) = nullptr;
   // Update and P2G in one, the stress in registers: of quadratic weights and the MLS form, on CUDA.
   void (*p2g)(const LawUpdateArguments<T, D>&, const P2GArguments<T, D>&, void* stream) = nullptr;
+  void (*tangent)(const LawTangentArguments<T, D>&, void* stream) = nullptr;
 };
 
 struct LawEntry {
