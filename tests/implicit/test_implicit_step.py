@@ -39,6 +39,10 @@ def momentum(state):
     return (state.mass[:, None] * state.v).sum(0)
 
 
+def step_of(grid, law):
+    return mpm.Step(grid, law, integrator="implicit")
+
+
 # ---- accuracy
 
 
@@ -435,6 +439,8 @@ def test_wrong_arguments_are_named():
         Implicit(max_iterations=0)
     with pytest.raises(ValueError, match="equilibrium needs a step with integrator='implicit'"):
         equilibrium(mpm.Step(grid, law), state, 1.0)
+    with pytest.raises(NotImplementedError, match="transformed by torch.func"):
+        torch.func.grad(lambda v: step_of(grid, law)(state.replace(v=v), 1e-3).x.sum())(state.v)
     explicit = mpm.Step(grid, law)
     assert explicit.solve_report is None
     assert "it is implicit" in mpm.Step(grid, law, integrator="implicit").explain(state)

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ..boundaries.obstacles import Obstacle, motion_tensors
-from ..capture import outside_transforms, without_transforms
+from ..capture import is_captured, is_traced, outside_transforms, without_transforms
 from ..errors import check_count, check_number
 from ..failures import Problem, unsolved_steps
 from .adjoint import differentiable
@@ -133,10 +133,16 @@ def check_implicit(step: Step, state: State) -> None:
     """What an implicit step does not have yet.
 
     Raises:
-        NotImplementedError: for viscosity, heat, counted impulses, and obstacles with gradients.
+        NotImplementedError: for viscosity, heat, counted impulses, obstacles with gradients, and steps that are
+            compiled, captured or transformed.
     """
     obstacles = [b for b in step.boundaries.entries if isinstance(b, Obstacle)]
     motions = [t for b in obstacles for t in motion_tensors(b)]
+    if is_traced(state.x) or is_captured(state.x) or torch._C._are_functorch_transforms_active():
+        raise NotImplementedError(
+            "an implicit step looks at how far its solve is: it cannot be compiled, captured in a CUDA graph, or "
+            "transformed by torch.func; its gradients are those of backward() and torch.autograd.grad"
+        )
     reasons = {
         "a viscous law": step.law.viscous,
         "heat": step.heat is not None,
