@@ -10,12 +10,14 @@
 // (MLS) or Σ v_i ∇N_iᵀ. It is never assembled: a product is a gather, the tangents, and a scatter.
 namespace mpm {
 
-// gradient_p ← dP F₀ᵀ along gradient_p.
+// nodes += Σ_p (∇N)ᵀ T_p L_p of velocity gradients L.
 template <class T, int D>
-struct TangentProductArguments {
-  int64_t particles = 0;
-  Field<const T> tangent;  // [P, kTangentEntries<D>]
-  Field<T> gradient;       // [P, D, D]
+struct TangentScatterArguments {
+  Topology<T, D> topology;
+  Field<const T> x, tangent, gradient;  // [P, kTangentEntries<D>], [P, D, D]
+  StressForm form = StressForm::mls;
+  bool deterministic = false;
+  NodeField<T> nodes;  // zero on entry, D channels
 };
 
 // The diagonal blocks of Σ_p (∇N)ᵀ T_p ∇N.

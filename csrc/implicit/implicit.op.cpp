@@ -6,26 +6,22 @@
 namespace mpm {
 namespace {
 
-// The product of the tangents alone, with buffers that are made once for many products.
+// The product of the tangents alone: a gather, and a scatter with the tangents in it. The velocity gradients between
+// them have a buffer for many products.
 template <class T, int D>
 class TangentProduct {
  public:
   TangentProduct(const Tensor& x, const Tensor& tangent, int64_t stress_form, const PackedTopology& blocks)
-      : order_(blocks.order()), gradient_(empty_particles(x, {x.size(0), D, D})), zero_(zeros(x, {1})) {
+      : order_(blocks.order()), gradient_(empty_particles(x, {x.size(0), D, D})) {
     const int64_t P = x.size(0);
-    const bool mls = stress_form_of(stress_form) == StressForm::mls;
-    const Field<T> all = field<T>(gradient_);
-    const Field<const T> read = {all.pointer, {all.stride[0], all.stride[1], all.stride[2]}};
+    scatter_.form = stress_form_of(stress_form);
     gather_.topology = scatter_.topology = blocks.unpack<T, D>(x);
     gather_.x = scatter_.x = input<T>(x, "x", x, {P, D});
-    gather_.moment_scale = scatter_.moment_scale = blocks.inverse_inertia();
-    (mls ? gather_.moment : gather_.gradient) = all;
-    (mls ? scatter_.moment : scatter_.gradient) = read;
-    scatter_.value = {static_cast<const T*>(zero_.data_ptr()), {0, 0, 0}};
+    gather_.moment_scale = blocks.inverse_inertia();
+    (scatter_.form == StressForm::mls ? gather_.moment : gather_.gradient) = field<T>(gradient_);
+    scatter_.gradient = field<const T>(gradient_);
+    scatter_.tangent = input<T>(tangent, "tangent", x, {P, kTangentEntries<D>});
     scatter_.deterministic = blocks.deterministic();
-    product_.particles = P;
-    product_.tangent = input<T>(tangent, "tangent", x, {P, kTangentEntries<D>});
-    product_.gradient = all;
   }
 
   // Adds to `to`.
@@ -33,16 +29,14 @@ class TangentProduct {
     gather_.nodes = {direction, D, D};
     scatter_.nodes = {to, D, D};
     backend::gather(order_, gather_, device.stream());
-    backend::tangent_product(product_, device.stream());
-    backend::scatter(order_, scatter_, device.stream());
+    backend::tangent_scatter(order_, scatter_, device.stream());
   }
 
  private:
   int64_t order_;
-  Tensor gradient_, zero_;
+  Tensor gradient_;
   GatherArguments<T, D> gather_;
-  TangentProductArguments<T, D> product_;
-  ScatterArguments<T, D> scatter_;
+  TangentScatterArguments<T, D> scatter_;
 };
 
 // A contiguous node tensor [N, ...].

@@ -1,19 +1,11 @@
-#include "cpu/chunk.h"
 #include "cpu/tile.h"
 #include "implicit/arguments.h"
+#include "implicit/grouped.cpu.h"
 #include "transfer/gather.cpu.h"
 
 namespace mpm::cpu {
 inline namespace TORCH_MPM_ISA {
 namespace {
-
-// The particles of a group as a kernel body reads them.
-template <class T>
-struct Grouped {
-  using Value = Lanes<T>;
-  const Group& group;
-  Value load(const T* pointer, int64_t stride) const { return load_row(pointer, stride, group); }
-};
 
 // Adds the blocks of a group, whose particles share their nodes, to the tiles of the first four channels and the rest.
 template <int Order, class T, int D>
@@ -65,7 +57,7 @@ void node_blocks(const NodeBlocksArguments<T, D>& a) {
             Lanes<T> f[D];
             for (int k = 0; k < D; k++)
               f[k] = distance_in_cells(t.geometry, k, load(a.x, g, k), Lanes<T>(T(base_block.corner[k] + base[k])));
-            add_group<Order, T, D>(load_tangent<Grouped<T>, T, D>(Grouped<T>{g}, a.tangent), f, a.form,
+            add_group<Order, T, D>(load_tangent<Grouped<T, kLanes>, T, D>(Grouped<T, kLanes>{g}, a.tangent), f, a.form,
                                    Lanes<T>(t.geometry.inverse_dx), g.count, tiles[0].value + at, tiles[1].value + at);
           }
           i = chunk.cell_end[cell];

@@ -49,7 +49,8 @@ class ImplicitSystem:
         dt = self.dt
         if isinstance(dt, Tensor):
             dt = per_particle(dt.to(self.state.x.dtype).reshape(-1), scene, P)
-        meant = self.law.trial_energy(self.state).detach().isfinite()
+        self.step = dt
+        meant = self.law.trial_energy(Overlay(self.state, C=None), self.state).detach().isfinite()
         self.volume = torch.where(meant, self.state.volume, 0)
         self.impulse_weight = self.volume * dt
         self.tangent_weight = (self.impulse_weight * dt).detach()
@@ -80,14 +81,14 @@ class ImplicitSystem:
         )
         motion = moment if mls else gradient
         _, F, J = advance(state.x, value, self.dt, motion, state.F, state.J, self.blocks.particle_scene(), grid.scenes)
-        trial = Overlay(state, F=F, J=J)
+        trial = Overlay(state, F=F, J=J, C=motion, step=self.step)
         if not v.requires_grad and not torch.is_grad_enabled():
             self._trial = v, trial
         return trial
 
     def energy(self, v: Tensor) -> tuple[Tensor, Tensor]:
         """E of each scene, float64 [B] [J], infinite where a particle has none; and the size of what was added up."""
-        stored = self.law.trial_energy(self.trial(v))
+        stored = self.law.trial_energy(self.trial(v), self.state)
         stored = torch.where(self.volume > 0, self.volume * stored, 0).double()
         change = (v - self.start).double()
         kinetic = 0.5 * self.node_sum(self.mass[:, None].double() * change * change)

@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from ..capture import GraphCache
 from ..errors import check_number, shape_of
 from ..ops.arguments import soa_empty
+from ..ops.implicit import add_deviator
 from ..ops.law import (
     DISSIPATED,
     LawUpdate,
@@ -104,24 +105,36 @@ class CompiledLaw(Material):
             deformation, history = moved.state, moved.history
         return law_energy(self._name(state), deformation, parameters, history, state.scene, state.x.shape[1])
 
-    def trial_energy(self, state: State) -> Tensor:
-        return law_energy(*self._trial(state))
+    def trial_energy(self, state: Any, before: Any) -> Tensor:
+        energy = law_energy(*self._trial(state))
+        if not self.viscous or state.C is None:
+            return energy
+        return energy + 0.5 * state.step * (self._viscous_stress(state, before) * state.C).sum((1, 2))
 
-    def trial_stress(self, state: State, before: State) -> Tensor:
+    def trial_stress(self, state: Any, before: Any) -> Tensor:
         gradient = law_energy_gradient(*self._trial(state))
-        if self.state_fields == ("J",):
-            assert before.J is not None
-            eye = torch.eye(state.x.shape[1], dtype=gradient.dtype, device=gradient.device)
-            return (gradient * before.J)[:, None, None] * eye
-        assert before.F is not None
-        return gradient @ before.F.mT
+        if self.state_fields != ("J",):
+            return gradient @ before.F.mT
+        eye = torch.eye(state.x.shape[1], dtype=gradient.dtype, device=gradient.device)
+        stress = (gradient * before.J)[:, None, None] * eye
+        return stress + self._viscous_stress(state, before) if self.viscous else stress
 
-    def trial_tangent(self, state: State, before: State, weight: Tensor, projected: bool) -> Tensor:
+    def trial_tangent(self, state: Any, before: Any, weight: Tensor, projected: bool) -> Tensor:
         name, deformation, parameters, history, scene, dim = self._trial(state)
         before_field = getattr(before, self.state_fields[0])
-        return law_tangent(name, deformation, before_field, weight, parameters, history, scene, dim, projected)
+        tangent = law_tangent(name, deformation, before_field, weight, parameters, history, scene, dim, projected)
+        viscosity = self.viscosity(before)
+        if viscosity is not None:  # of a fluid, whose frames are the identity: 2 η dev sym L
+            add_deviator(tangent, dim, 2 * viscosity * torch.where(weight > 0, weight / state.step, 0))
+        return tangent
 
-    def _trial(self, state: State) -> tuple[str, Tensor, list[Tensor], list[Tensor], Tensor | None, int]:
+    def _viscous_stress(self, state: Any, before: Any) -> Tensor:
+        """What the velocity gradient of a step adds to the stress, at the volume before it [P, D, D] [Pa]."""
+        name, J, parameters, history, scene, dim = self._trial(before)
+        moving, still = (law_update(name, J, parameters, history, C, scene, dim).stress for C in (state.C, None))
+        return moving - still
+
+    def _trial(self, state: Any) -> tuple[str, Tensor, list[Tensor], list[Tensor], Tensor | None, int]:
         """What the ops of energy take."""
         deformation, parameters = self._arguments(state)
         return self._name(state), deformation, parameters, self._history(state), state.scene, state.x.shape[1]

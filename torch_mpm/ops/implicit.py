@@ -158,6 +158,15 @@ def from_upper(upper: Tensor, dim: int) -> Tensor:
     return torch.stack(entries, 1).unflatten(1, (dim, dim))
 
 
+def add_deviator(tangent: Tensor, dim: int, modulus: Tensor) -> None:
+    """Adds modulus [P] times dev sym L to tangents [P, n] whose frames are the identity, in place."""
+    first = 2 * dim * dim
+    for k, (i, j) in enumerate(zip(*_triangle(dim), strict=True)):
+        tangent[:, first + k] += modulus * ((1.0 if i == j else 0.0) - 1.0 / dim)
+    shears = first + dim * (dim + 1) // 2
+    tangent[:, shears : shears + dim * (dim - 1) // 2] += modulus[:, None]
+
+
 def _triangle(dim: int) -> tuple[list[int], list[int]]:
     pairs = [(a, b) for a in range(dim) for b in range(a, dim)]
     return [a for a, _ in pairs], [b for _, b in pairs]
