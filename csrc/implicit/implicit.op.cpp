@@ -1,5 +1,6 @@
 #include "grid/topology.op.h"
 #include "implicit/kernels.h"
+#include "rollout/replay.h"
 #include "transfer/kernels.h"
 
 // The Hessian of an implicit step: its product with node vectors, its diagonal blocks, and the solve.
@@ -86,6 +87,8 @@ Tensor implicit_node_blocks(const Tensor& x, const Tensor& tangent, int64_t stre
 
 // Iterations between two looks of the host at how many scenes are not done.
 constexpr int kIterationsPerLook = MPM_BACKEND == MPM_BACKEND_IS_cpu ? 1 : 8;
+// Iterations that a solve has at least where it matters how long it takes.
+constexpr int kWorthATeam = 16;
 
 std::tuple<Tensor, Tensor> implicit_cg(const Tensor& x, const Tensor& rhs, const Tensor& mass, const Tensor& inverse,
                                        const Tensor& tangent, const Tensor& relative, int64_t max_iterations,
@@ -125,15 +128,17 @@ std::tuple<Tensor, Tensor> implicit_cg(const Tensor& x, const Tensor& rhs, const
     a.unfinished_on_host = &left;
     TangentProduct<T, D> product(x, tangent, stress_form, blocks);
     backend::cg_begin(a, device.stream());
-    for (int64_t k = 0; k < max_iterations; k++) {
-      if (k % kIterationsPerLook == 0) {
-        backend::cg_look(a, device.stream());
-        if (left == 0) break;
+    with_team(x.size(0) * kWorthATeam, [&] {
+      for (int64_t k = 0; k < max_iterations; k++) {
+        if (k % kIterationsPerLook == 0) {
+          backend::cg_look(a, device.stream());
+          if (left == 0) break;
+        }
+        backend::clear(q, device.stream());
+        product(a.p, a.q, device);
+        backend::cg_advance(a, device.stream());
       }
-      backend::clear(q, device.stream());
-      product(a.p, a.q, device);
-      backend::cg_advance(a, device.stream());
-    }
+    });
   });
   return {solution, scalars};
 }

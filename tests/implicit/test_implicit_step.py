@@ -323,7 +323,7 @@ def test_fluid_and_solid_in_one_step(device):
 
 
 def test_viscosity_is_inside_the_solve(dim, device):
-    """A short step is an explicit one to second order; in a long step of a thick fluid all shear ends, and momentum stays."""
+    """A short step is an explicit one to second order; a long one of a thick fluid ends all shear and keeps momentum."""
     grid, state = bar(dim, device)
     C = 0.5 * torch.randn(dim, dim, dtype=torch.float64).to(device)
     r = state.x - state.x.mean(0)
