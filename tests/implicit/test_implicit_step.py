@@ -323,7 +323,7 @@ def test_fluid_and_solid_in_one_step(device):
 
 
 def test_viscosity_is_inside_the_solve(dim, device):
-    """A short step is an explicit one to second order; a long one of a thick fluid ends all shear and keeps momentum."""
+    """A short step is an explicit one to second order; a long one of a thick fluid ends shear and keeps momentum."""
     grid, state = bar(dim, device)
     C = 0.5 * torch.randn(dim, dim, dtype=torch.float64).to(device)
     r = state.x - state.x.mean(0)
@@ -364,6 +364,21 @@ def test_plastic_laws_flow_after_the_solve(law, device):
         flowed = flowed or not torch.equal(law.update(state)[0]["F"], state.F)
     step.check(state)
     assert flowed and float(state.v.norm(dim=1).max()) < 3.2
+
+
+def test_heat_in_an_implicit_step(device):
+    """Conduction in a body at rest is that of an explicit step, and no heat is lost."""
+    grid, state = bar(2, device)
+    state = state.replace(temperature=100 * torch.sin(5 * state.x[:, 0]))
+    ends = []
+    for integrator in ("explicit", "implicit"):
+        heat = mpm.Heat(grid, conductivity=50.0, specific_heat=400.0)
+        step = mpm.Step(grid, mpm.NeoHookean(E=1e5, nu=0.3), heat=heat, integrator=integrator)
+        ends.append(step(state, 1e-3).temperature)
+        step.check()
+    assert relative_error(ends[1], ends[0]) < 1e-12
+    assert float((ends[1] - state.temperature).abs().max()) > 0
+    assert abs(float((state.mass * (ends[1] - state.temperature)).sum())) < 1e-9 * float((state.mass * 100).sum())
 
 
 def test_sand_feels_trial_tension_with_the_full_energy_alone(device):

@@ -133,7 +133,7 @@ def check_implicit(step: Step, state: State) -> None:
     """What an implicit step does not have yet.
 
     Raises:
-        NotImplementedError: for heat, counted impulses, obstacles with gradients, and steps that are
+        NotImplementedError: for counted impulses, obstacles with gradients, and steps that are
             compiled, captured or transformed.
     """
     obstacles = [b for b in step.boundaries.entries if isinstance(b, Obstacle)]
@@ -144,7 +144,6 @@ def check_implicit(step: Step, state: State) -> None:
             "transformed by torch.func; its gradients are those of backward() and torch.autograd.grad"
         )
     reasons = {
-        "heat": step.heat is not None,
         "impulses on boundaries": state.impulse is not None,
         "obstacles that require a gradient": torch.is_grad_enabled() and any(t.requires_grad for t in motions),
     }
