@@ -186,8 +186,7 @@ def _rounding(
 
 def _wave_speed_squared(system: ImplicitSystem, total_mass: Tensor) -> Tensor:
     """Σ V K/Σ m [m²/s²], [B]."""
-    stiffness = torch.where(system.volume > 0, system.volume * system.law.stiffness(system.state), 0).double()
-    return (system.particle_sum(stiffness[:, None])[:, 0] / total_mass).clamp_min(0)
+    return (system.particle_sum(system.stiffness[:, None])[:, 0] / total_mass).clamp_min(0)
 
 
 def _times(matrices: Tensor, vectors: Tensor) -> Tensor:

@@ -9,6 +9,7 @@ with the stress of the trial deformation. The ops are differentiable, so that th
 from __future__ import annotations
 
 import dataclasses
+import functools
 from typing import Any
 
 import torch
@@ -33,6 +34,7 @@ class ImplicitSystem:
         start: v* [N, D] [m/s].
         dt: [s], a number or a tensor [], [1] or [B].
         stress_form: "mls" or "gradient".
+        volume: of the particles that have an energy, zero for the others [P] [m³].
     """
 
     blocks: Blocks
@@ -56,6 +58,12 @@ class ImplicitSystem:
         self.tangent_weight = (self.impulse_weight * dt).detach()
         slots = self.blocks.block_scene()
         self.slot_scene = slots.clamp_min(0).long()
+
+    @functools.cached_property
+    def stiffness(self) -> Tensor:
+        """V times an upper bound of the moduli at the start, float64 [P] [J]."""
+        with torch.no_grad():
+            return torch.where(self.volume > 0, self.volume * self.law.stiffness(self.state), 0).double()
 
     def detached(self) -> ImplicitSystem:
         """The same for no gradients."""
@@ -87,13 +95,18 @@ class ImplicitSystem:
         return trial
 
     def energy(self, v: Tensor) -> tuple[Tensor, Tensor]:
-        """E of each scene, float64 [B] [J], infinite where a particle has none; and the size of what was added up."""
+        """E of each scene, float64 [B] [J], infinite where a particle has none; and a size, of which E has an error of
+        some units in the last place: E, and the work of stresses V √(2 K ψ) and momenta on strains and velocities that
+        are rounded.
+        """
         stored = self.law.trial_energy(self.trial(v), self.state)
         stored = torch.where(self.volume > 0, self.volume * stored, 0).double()
-        change = (v - self.start).double()
-        kinetic = 0.5 * self.node_sum(self.mass[:, None].double() * change * change)
-        total, size = self.particle_sum(torch.stack([stored, stored.abs()], 1)).unbind(1)
-        return kinetic + total, kinetic + size
+        strained = stored.abs() + (2 * self.stiffness * stored.abs()).sqrt()
+        mass, change = self.mass[:, None].double(), (v - self.start).double()
+        kinetic = 0.5 * self.node_sum(mass * change * change)
+        moved = self.node_sum(mass * change.abs() * v.abs())
+        total, size = self.particle_sum(torch.stack([stored, strained], 1)).unbind(1)
+        return kinetic + total, kinetic + moved + size
 
     def residual(self, v: Tensor) -> Tensor:
         """∂E/∂v [N, D] [kg m/s]; differentiable by everything."""
