@@ -1,5 +1,7 @@
-#include "implicit/arguments.h"
 #include "transfer/scatter.cuh"
+
+// After it: mpm::min of laws/hencky_strain.h would take the place of CUDA's.
+#include "implicit/arguments.h"
 
 namespace mpm::cuda {
 
