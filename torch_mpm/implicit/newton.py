@@ -120,7 +120,7 @@ def minimise(system: ImplicitSystem, bounds: NodeBounds | None, options: Options
         target = torch.maximum(options.tolerance * first, torch.where(iterations > 0, floor, 0))
         small = residual <= target
         done = stalled | small
-        if bool(done.all()) or _spent(iterations, options):
+        if bool((done | (iterations >= options.max_iterations)).all()):
             break
         forcing = _forcing(residual, previous, forcing, target)
         previous = residual
@@ -152,12 +152,9 @@ def _with_momentum(system: ImplicitSystem, bounds: NodeBounds | None, v: Tensor,
     if bounds is not None:
         bounded = (bounds.lower.isfinite() | bounds.upper.isfinite()).any(1) & (system.mass > 0)
         change = torch.where((system.node_sum(bounded) > 0)[:, None], 0, change)
+    change = torch.where(change.isfinite(), change, 0)
     change = change.to(v.dtype)[system.slot_scene].repeat_interleave(system.blocks.grid.nodes_per_block, 0)
     return torch.where((system.mass > 0)[:, None], v + change, v)
-
-
-def _spent(iterations: Tensor, options: Options) -> bool:
-    return iterations.numel() == 0 or int(iterations.max()) >= options.max_iterations
 
 
 def _forcing(residual: Tensor, previous: Tensor | None, forcing: Tensor | None, target: Tensor) -> Tensor:
