@@ -14,7 +14,8 @@ void for_slots(const ConjugateGradientsArguments<T, D>& a, const F& node) {
       if (a.block[slot] < 0) continue;
       const ConjugateGradients& scene = a.scene[a.block[slot] / a.blocks_per_scene];
       double sum = 0;
-      for (int64_t n = slot * kBlockNodes<D>; n < (slot + 1) * kBlockNodes<D>; n++) sum += node(n, scene);
+      for (int64_t n = slot * kBlockNodes<D>; n < (slot + 1) * kBlockNodes<D>; n++)
+        if (a.mass[n] != T(0)) sum += node(n, scene);  // the vectors of others stay zero
       a.slots[slot] = sum;
     }
   });

@@ -18,6 +18,7 @@ __global__ void __launch_bounds__(kThreads) cg_pass_kernel(const ConjugateGradie
     const ConjugateGradients scene = a.scene[block / a.blocks_per_scene];
     for (int local = lane; local < kBlockNodes<D>; local += kLanes) {
       const int64_t node = slot * kBlockNodes<D> + local;
+      if (a.mass[node] == T(0)) continue;  // its vectors stay zero
       if (pass == Pass::start) sum += cg_start(a, node);
       if (pass == Pass::curvature) sum += cg_curvature(a, node);
       if (pass == Pass::step) sum += cg_step(a, node, scene.step);
