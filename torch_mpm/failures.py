@@ -191,6 +191,19 @@ def unsolved_heat(unsolved: Tensor, residual: Tensor, iterations: int) -> dict[s
     }
 
 
+def unsolved_steps(unsolved: Tensor, residual: Tensor) -> dict[str, Problem]:
+    """Implicit steps of each scene [B] that missed their tolerance, and their largest residual [B] [m/s]."""
+    return {
+        "implicit": Problem(
+            unsolved,
+            "implicit steps missed their tolerance",
+            "reduce dt, or raise max_iterations or tolerance of the integrator",
+            size=residual,
+            size_in_words="a residual of {:.3g} m/s was left",
+        )
+    }
+
+
 def raise_failures(failures: Failures, statuses: Iterable[Tensor], grid: Grid) -> None:
     """Raise one error for all problems of scenes, particles without a scene and a full grid; synchronises.
 

@@ -55,6 +55,8 @@ def obstacle_to_replays(step: Any, state: State, dt: float | Tensor) -> str | No
         return "it is differentiated"
     if any(has_hooks(module) for module in step.modules()):
         return "there are hooks"
+    if step.integrator is not None:
+        return "an implicit step waits for its solve"
     if step.heat is not None and step.heat.method == "multigrid":
         return "multigrid does all of its iterations in a graph"
     if state.x.dtype != torch.float64 and any(looks_at_time(b) for b in step.boundaries):

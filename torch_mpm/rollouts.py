@@ -13,6 +13,7 @@ from torch.autograd import forward_ad
 
 from .anomaly import begin, detecting, watch
 from .boundaries import Obstacle
+from .boundaries.obstacles import motion_tensors
 from .capture import is_captured, is_traced
 from .checkpoints import Checkpoints, as_checkpoints, binomial, fitting, in_segments, offloaded
 from .errors import check_count, shape_of
@@ -167,6 +168,8 @@ def obstacle_to_substeps(step: Step, state: State, dt: float | Tensor) -> str | 
         return "anomaly detection looks at every step"
     if step.heat is not None:
         return "it conducts heat"
+    if step.integrator is not None:
+        return "it is implicit"
     if step.on_grid is not None:
         return "it calls on_grid"
     if step.on_particles is not None:
@@ -184,7 +187,7 @@ def obstacle_to_substeps(step: Step, state: State, dt: float | Tensor) -> str | 
     if len(boundaries) > MAX_OBSTACLES:
         return f"there are more than {MAX_OBSTACLES} obstacles"
     if torch.is_grad_enabled():
-        if any(t.requires_grad for b in boundaries for t in _motion(b)):
+        if any(t.requires_grad for b in boundaries for t in motion_tensors(b)):
             return "an obstacle requires a gradient"
         if any(part.has_functions for part in laws):
             return "a parameter is a function, which may have a gradient"
@@ -233,12 +236,6 @@ def bytes_of_a_substep(state: State) -> int:
 
 
 _FORWARD = CompiledLaw.forward
-
-
-def _motion(obstacle: Any) -> list[Tensor]:
-    """The tensors of an obstacle."""
-    values = (*vars(obstacle).values(), *vars(obstacle.shape).values())
-    return [v for v in values if isinstance(v, Tensor)] + [*obstacle.parameters(), *obstacle.buffers()]
 
 
 def _differentiable(step: Step, state: State) -> list[Tensor]:

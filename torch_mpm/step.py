@@ -1,4 +1,4 @@
-"""One explicit MPM step."""
+"""One MPM step."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from .errors import check_number, check_vector, shape_of
 from .failures import Failures, problems_of_state, raise_failures
 from .grid import Blocks, Grid, check_grid
 from .heat.heat import Heat
+from .implicit.implicit import Implicit, ImplicitReport, as_integrator, check_implicit
 from .impulses import Impulses, check_impulse, impulses_of, no_impulse
 from .laws.custom import as_law
 from .laws.material import Material
@@ -66,6 +67,8 @@ class Step(TensorModule):
             [P]: particles that are not enabled take no part in the step and stay as they are. The time is that of the
             start of the step, and the number of particles stays.
         heat: conduction of heat in the same particles, see `Heat`; the state then needs a temperature.
+        integrator: "explicit"; or "implicit" or an `Implicit`, which solves for the node velocities with the forces at
+            the end of the step (backward Euler), so that stiffness does not limit dt.
 
     A step without boundaries, walls, gravity, FLIP or heat does not pay for them. The arguments are attributes, which
     may be assigned in the forms of the arguments. Forward hooks act on the step, its law and its boundaries; backward
@@ -87,6 +90,7 @@ class Step(TensorModule):
     on_grid: Callable[[Blocks, Tensor, Tensor, float | Tensor], Tensor] | None
     heat: Heat | None
     on_particles: ParticleOperation | None
+    integrator: Implicit | None
 
     def __init__(
         self,
@@ -101,6 +105,7 @@ class Step(TensorModule):
         on_grid: Callable[[Blocks, Tensor, Tensor, float | Tensor], Tensor] | None = None,
         heat: Heat | None = None,
         on_particles: ParticleOperation | None = None,
+        integrator: str | Implicit = "explicit",
     ) -> None:
         super().__init__()
         self.grid = grid
@@ -114,6 +119,7 @@ class Step(TensorModule):
         self.on_grid = on_grid
         self.heat = heat
         self.on_particles = on_particles
+        self.integrator = integrator  # type: ignore[assignment]
         self._activations = ActivationRecord()
         self._kept_gravity = GraphCache()
 
@@ -184,8 +190,12 @@ class Step(TensorModule):
         if law.extra_fields:
             history = {name: fields.pop(name) for name in law.extra_fields if name in fields}
             state = state.replace(extra={**state.extra, **history})
-        nodes = p2g(blocks, state.x, state.mass, state.v, affine, stress, state.volume, dt, form)
-        velocity, impulse = self._update_grid(blocks, nodes, state, dt)
+        if self.integrator is None:
+            nodes = p2g(blocks, state.x, state.mass, state.v, affine, stress, state.volume, dt, form)
+            velocity, impulse = self._update_grid(blocks, nodes, state, dt)
+        else:
+            check_implicit(self, state)
+            velocity, impulse = self._implicit_velocity(blocks, Overlay(state, dt=dt, **fields), affine, dt), None
         deformed = {name: fields.get(name, getattr(state, name)) for name in ("F", "J")}
         keeps_C = self.transfer == "apic" or law.viscous
         x, v, C, F, J = g2p_advance(
@@ -234,6 +244,19 @@ class Step(TensorModule):
         if self.on_grid is not None:
             velocity = from_half(self.on_grid(blocks, velocity, nodes[:, 0], dt), nodes)
         return velocity, impulse
+
+    def _implicit_velocity(self, blocks: Blocks, state: Any, affine: Tensor | None, dt: float | Tensor) -> Tensor:
+        """Node velocities with the forces at the end of the step, of particles after the return map."""
+        assert self.integrator is not None
+        nodes = p2g(blocks, state.x, state.mass, state.v, affine)
+        start = grid_update(blocks, nodes, self.gravity_like(state.x), dt)
+        velocity = self.integrator.velocities(self, blocks, state, nodes[:, 0], start, dt)
+        return velocity if self.on_grid is None else from_half(self.on_grid(blocks, velocity, nodes[:, 0], dt), nodes)
+
+    @property
+    def solve_report(self) -> ImplicitReport | None:
+        """How the latest implicit step was solved; None before the first, and of explicit steps."""
+        return None if self.integrator is None else self.integrator.report
 
     @property
     def _flip_share(self) -> float:
@@ -341,6 +364,8 @@ class Step(TensorModule):
         problems = self._activations.problems(self.grid)
         if self.heat is not None:
             problems |= self.heat.problems()
+        if self.integrator is not None:
+            problems |= self.integrator.problems()
         if state is not None:
             problems |= problems_of_state(self.law, self.prepare(state), self.grid.scenes)
         return Failures.of(problems, self.grid.scenes)
@@ -379,12 +404,16 @@ class Step(TensorModule):
         self._activations.reset()
         if self.heat is not None:
             self.heat.reset()
+        if self.integrator is not None:
+            self.integrator.reset()
 
     def forget_failures(self, scenes: Tensor) -> None:
         """Forget the problems of scenes, bool [B] on the device of the particles, which is not waited for."""
         self._activations.forget(scenes)
         if self.heat is not None:
             self.heat.forget(scenes)
+        if self.integrator is not None:
+            self.integrator.forget(scenes)
 
 
 def _argument(step: Step, name: str, value: Any) -> Any:
@@ -415,6 +444,8 @@ def _argument(step: Step, name: str, value: Any) -> Any:
         raise TypeError(f"on_grid must be a function, a module or None, got {shape_of(value)}")
     if name == "on_particles" and value is not None and not callable(value):
         raise TypeError(f"on_particles must be a function, a module or None, got {shape_of(value)}")
+    if name == "integrator" and value is not None:
+        return as_integrator(value)
     if name == "heat" and value is not None and not isinstance(value, Heat):
         raise TypeError(f"heat must be a Heat or None, got {shape_of(value)}")
     return value

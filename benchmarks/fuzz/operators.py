@@ -11,6 +11,7 @@ from torch import Tensor
 import torch_mpm as mpm
 from torch_mpm.ops import LAWS
 from torch_mpm.ops.heat_patches import Patches
+from torch_mpm.ops.implicit import tangent_entries
 
 PARTICLES = 37
 
@@ -24,7 +25,15 @@ def operators() -> list[str]:
 def calls(dim: int, dtype: torch.dtype = torch.float64) -> list[tuple[str, dict[str, Any]]]:
     """(op, arguments by name) of at least one valid call of every op."""
     make = _Calls(dim, dtype)
-    found = [*make.transfers(), *make.grid(), *make.heat(), *make.laws(), *make.sand(), *make.rollouts()]
+    found = [
+        *make.transfers(),
+        *make.grid(),
+        *make.heat(),
+        *make.laws(),
+        *make.sand(),
+        *make.implicit(),
+        *make.rollouts(),
+    ]
     return [(op, _named(op, values)) for op, values in found]
 
 
@@ -154,6 +163,20 @@ class _Calls:
                     ("law_energy_double_backward", (along[0], along[2], self.normal(P), state, p, *tail, 5)),
                 ]
         return found
+
+    def implicit(self) -> list[tuple[str, tuple[Any, ...]]]:
+        P, D, N, top, x = PARTICLES, self.dim, self.N, self.topology, self.x
+        tangent, along = 0.1 * self.uniform(P, tangent_entries(D)), self.normal(N, D)
+        inverse = torch.zeros(N, D * (D + 1) // 2, dtype=self.dtype)
+        inverse[:, 0] = inverse[:, -1] = 1.0
+        solve = (x, along, self.uniform(N), inverse, tangent, 0.1 * self.uniform(2), 20, 0)
+        moduli = [self.uniform(P), self.uniform(2)]
+        return [
+            ("law_tangent", (self.F, self.F, self.uniform(P), moduli, [], self.scene, "neo_hookean", D, True)),
+            ("implicit_apply", (x, along, tangent, 0, *top)),
+            ("implicit_node_blocks", (x, tangent, 1, *top)),
+            ("implicit_cg", (*solve, *top)),
+        ]
 
     def rollouts(self) -> list[tuple[str, tuple[Any, ...]]]:
         """Three laws, of which one has a history and one reads J and C."""

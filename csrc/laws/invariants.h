@@ -3,6 +3,7 @@
 #include "common/wide.h"
 #include "laws/law.h"
 #include "laws/strain.h"
+#include "laws/tangent.h"
 
 // Laws without a decomposition: stress and energy follow from F Fᵀ, J and the velocity gradient. Such a law gives
 //   energy(s, p), stress(s, p)          ψ and the Kirchhoff stress τ of a Strain s, with its parameters p;
@@ -17,7 +18,7 @@ struct InvariantKernels;
 
 struct InvariantLaw {
   static constexpr bool viscous = false, plastic = false, twice_differentiable = true, optional_history = false,
-                        twice_differentiable_energy = true, in_2d = true;
+                        twice_differentiable_energy = true, in_2d = true, has_tangent = true;
   static constexpr auto history = no_history;
   static constexpr auto options = no_options;
   static constexpr bool memory_bound = true;
@@ -223,6 +224,56 @@ MPM_HD InvariantState<Law, V, D> derivative_of(const InvariantState<Law, Dual<V>
   return r;
 }
 
+// The tangent of a law with shear: dual numbers at diag(σ), along each strain and along each shear of the principal
+// axes, which turns the axes of the stress by as much as the stretches do: dτᵢⱼ = (τᵢ − τⱼ) σⱼ²/(σᵢ² − σⱼ²).
+template <class Law, class V, int D>
+MPM_HD Tangent<V, D> tangent_of_deformation(const InvariantState<Law, V, D>& state, const HenckyStrain<V, D>& s,
+                                            const Matrix<V, D>& before, const V& weight) {
+  Vector<V, D> stretch, tau;
+  InvariantState<Law, Dual<V>, D> at_rest;
+  at_rest.C = zero_matrix<Dual<V>, D>();
+  at_rest.F = zero_matrix<Dual<V>, D>();
+  MPM_UNROLL for (int k = 0; k < kParameters<Law>; k++)
+    at_rest.parameters[k] = {state.parameters[k], V(0)};
+  MPM_UNROLL for (int i = 0; i < D; i++) {
+    stretch[i] = exponential(s.h[i]);
+    at_rest.F[i][i].value = stretch[i];
+  }
+  Matrix<V, D> moduli;
+  MPM_UNROLL for (int j = 0; j < D; j++) {
+    InvariantState<Law, Dual<V>, D> moved = at_rest;
+    moved.F[j][j].derivative = stretch[j];
+    const Matrix<Dual<V>, D> stress = Law::stress(moved.strain(), moved.parameters);
+    MPM_UNROLL for (int i = 0; i < D; i++) {
+      moduli[i][j] = stress[i][i].derivative;
+      tau[i] = stress[i][i].value;
+    }
+  }
+  return principal_tangent(s, tau, moduli, before, weight, [&](int i, int j) {
+    InvariantState<Law, Dual<V>, D> sheared = at_rest;
+    sheared.F[i][j].derivative = stretch[j];
+    const V turned = Law::stress(sheared.strain(), sheared.parameters)[i][j].derivative;
+    return V(2) * turned * stretch[i] / stretch[j] * sinhc(s.h[i] - s.h[j]);
+  });
+}
+
+// Of a fluid, with dJ = J₀ tr L: the same number between all diagonal entries.
+template <class Law, class V, int D>
+MPM_HD Tangent<V, D> tangent_of_volume(const InvariantState<Law, V, D>& state, const V& before, const V& weight) {
+  Dual<V> p[kParameters<Law>];
+  MPM_UNROLL for (int k = 0; k < kParameters<Law>; k++)
+    p[k] = {state.parameters[k], V(0)};
+  const Dual<V> tension = Law::stress(vary_volume(state.strain()), p)[0][0];  // J ∂ψ/∂J
+  const V curvature = (tension.derivative - tension.value / state.J) / state.J;
+  Tangent<V, D> t;
+  t.U = t.B = identity<V, D>();
+  MPM_UNROLL for (int i = 0; i < D; i++) MPM_UNROLL
+    for (int j = 0; j < D; j++) t.diagonal[i][j] = weight * curvature * before * before;
+  MPM_UNROLL for (int k = 0; k < kShears<D>; k++)
+    t.even[k] = t.odd[k] = V(0);
+  return t;
+}
+
 // The bodies of the kernels. Energies are small differences of large terms near rest: they are evaluated in float64 for
 // either scalar type.
 template <class Law>
@@ -293,6 +344,24 @@ struct InvariantKernels {
     const InvariantNeeds needs = {a.state.pointer != nullptr, false, a.parameters.pointer != nullptr};
     const W grad = convert<W>(at.load(a.grad_energy.pointer, a.grad_energy.stride[0]));
     store_state(at, energy_adjoint(load_state<Law, W>(at, a.law), grad, needs), a.state, {}, a.parameters);
+  }
+
+  template <class At, class T, int D>
+  MPM_HD static void tangent(const LawTangentArguments<T, D>& a, const At& at) {
+    using V = typename At::Value;
+    InvariantState<Law, V, D> state = load_state<Law, V>(at, a.law);
+    state.C = zero_matrix<V, D>();
+    const V weight = load_scalar(at, a.weight);
+    if constexpr (kShear<Law>) {
+      const HenckyStrain<V, D> s = hencky_strain(state.F);
+      Tangent<V, D> t = tangent_of_deformation(state, s, load_matrix<D>(at, a.before), weight);
+      if (a.projected) project(t);
+      store_tangent(at, a.tangent, s.valid, t);
+    } else {
+      Tangent<V, D> t = tangent_of_volume(state, load_scalar(at, a.before), weight);
+      if (a.projected) project(t);
+      store_tangent(at, a.tangent, state.J > V(0), t);
+    }
   }
 
   template <class At, class T, int D>

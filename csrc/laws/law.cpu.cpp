@@ -40,6 +40,9 @@ struct LawLoops {
   static void double_backward(const LawDoubleBackwardArguments<T, D>& a, void*) {
     one_by_one(a.law, [&](const auto& at) { Kernels::double_backward(a, at); });
   }
+  static void tangent(const LawTangentArguments<T, D>& a, void*) {
+    by_groups<kRegisterBytes>(a.law, [&](const auto& at) { Kernels::tangent(a, at); });
+  }
   static void scalar(const LawScalarArguments<T, D>& a, void*) {
     by_groups<kRegisterBytes>(a.law, [&](const auto& at) { Kernels::scalar(a, at); });
   }

@@ -33,6 +33,12 @@ __global__ void __launch_bounds__(Law::gpu_threads)
 }
 
 template <class Law, class T, int D>
+__global__ void __launch_bounds__(Law::gpu_threads) law_tangent_kernel(const LawTangentArguments<T, D> a) {
+  const int64_t p = int64_t(blockIdx.x) * Law::gpu_threads + threadIdx.x;
+  if (p < a.law.particles && a.law.members.has(p)) Law::template Kernels<Law>::tangent(a, One<T>{p});
+}
+
+template <class Law, class T, int D>
 __global__ void __launch_bounds__(Law::gpu_threads) law_scalar_kernel(const LawScalarArguments<T, D> a) {
   const int64_t p = int64_t(blockIdx.x) * Law::gpu_threads + threadIdx.x;
   if (p < a.law.particles && a.law.members.has(p)) Law::template Kernels<Law>::scalar(a, One<T>{p});
@@ -104,6 +110,9 @@ struct LawLaunches : FusedLaunch<Law, T, D> {
   }
   static void double_backward(const LawDoubleBackwardArguments<T, D>& a, void* stream) {
     for_particles(law_double_backward_kernel<Law, T, D>, a, stream);
+  }
+  static void tangent(const LawTangentArguments<T, D>& a, void* stream) {
+    for_particles(law_tangent_kernel<Law, T, D>, a, stream);
   }
   static void scalar(const LawScalarArguments<T, D>& a, void* stream) {
     for_particles(law_scalar_kernel<Law, T, D>, a, stream);

@@ -129,6 +129,16 @@ struct LawEnergyDoubleBackwardArguments {
   Field<T> state, parameters;
 };
 
+// The second derivative of the energy at a trial deformation (laws/tangent.h).
+template <class T, int D>
+struct LawTangentArguments {
+  LawArguments<T, D> law;
+  Field<const T> before;   // F₀ [P, D, D], or J₀ [P], from which the trial deformation moves
+  Field<const T> weight;   // [P]
+  bool projected = false;  // whether it is made positive semi-definite
+  Field<T> tangent;        // [P, kTangentEntries<D>]
+};
+
 inline namespace TORCH_MPM_ISA {
 
 template <class Law>

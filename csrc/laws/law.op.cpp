@@ -1,6 +1,7 @@
 #include <string>
 
 #include "laws/law.op.h"
+#include "laws/tangent.h"
 
 // Update, energy and moduli of every law, by name.
 namespace mpm {
@@ -172,6 +173,26 @@ std::tuple<Tensor, Tensor, Tensor> law_energy_double_backward(const OptionalTens
   return {by_grad, by_state, by_parameters};
 }
 
+Tensor law_tangent(const Tensor& state, const Tensor& before, const Tensor& weight, const Tensors& parameters,
+                   const Tensors& history, const OptionalTensor& scene, std::string name, int64_t dim, bool projected) {
+  LawEntry& law = law_of(name);
+  STD_TORCH_CHECK(law.info.has_tangent, "the law ", law.info.name, " has no tangent");
+  check_state(law.info, state, dim);
+  const int64_t P = state.size(0);
+  Tensor tangent;
+  const DeviceScope device(state);
+  dispatch(state, "the state", dim, [&]<class T, int D>() {
+    LawTangentArguments<T, D> a;
+    a.law = arguments<T, D>(law.info, state, {}, parameters, history, scene);
+    a.before = input<T>(before, "before", state, shape_of_state(law.info, P, D));
+    a.weight = input<T>(weight, "weight", state, {P});
+    a.projected = projected;
+    a.tangent = result<T>(state, true, {P, kTangentEntries<D>}, tangent);
+    kernels_of<T, D>(law).tangent(a, device.stream());
+  });
+  return tangent;
+}
+
 }  // namespace
 }  // namespace mpm
 
@@ -200,6 +221,9 @@ STABLE_TORCH_LIBRARY_FRAGMENT(torch_mpm, m) {
   m.def(
       "law_stiffness(Tensor state, Tensor[] parameters, Tensor[] history, Tensor? scene, str law, int dim) -> Tensor");
   m.def(
+      "law_tangent(Tensor state, Tensor before, Tensor weight, Tensor[] parameters, Tensor[] history, Tensor? scene, "
+      "str law, int dim, bool projected) -> Tensor");
+  m.def(
       "law_wave_modulus(Tensor state, Tensor[] parameters, Tensor[] history, Tensor? scene, str law, int dim) -> "
       "Tensor");
 }
@@ -212,6 +236,7 @@ MPM_LIBRARY_IMPL(m) {
   m.impl("law_energy", TORCH_BOX(&mpm::law_energy));
   m.impl("law_energy_backward", TORCH_BOX(&mpm::law_energy_backward));
   m.impl("law_energy_double_backward", TORCH_BOX(&mpm::law_energy_double_backward));
+  m.impl("law_tangent", TORCH_BOX(&mpm::law_tangent));
   m.impl("law_stiffness", TORCH_BOX(&mpm::law_stiffness));
   m.impl("law_wave_modulus", TORCH_BOX(&mpm::law_wave_modulus));
 }

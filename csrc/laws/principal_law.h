@@ -3,6 +3,7 @@
 #include "common/dual.h"
 #include "laws/hencky_strain.h"
 #include "laws/law.h"
+#include "laws/tangent.h"
 
 // Laws in principal strains: one decomposition of F, the map of the Hencky strains h, stress. Such a law gives
 //   flow(h, p, q)               the return map: moves the Hencky strains h and the history q of a particle with the
@@ -25,6 +26,7 @@ struct PrincipalLaw {
   static constexpr bool viscous = false, plastic = false, twice_differentiable = false, optional_history = false,
                         in_2d = true;
   static constexpr bool twice_differentiable_energy = false;  // history counts as constant
+  static constexpr bool has_tangent = true;
   static constexpr auto history = no_history;
   static constexpr auto options = no_options;
   static constexpr bool memory_bound = false;
@@ -292,9 +294,7 @@ MPM_HD Matrix<V, D> energy_adjoint(const HenckyStrain<V, D>& s, const PrincipalD
 }
 
 // The derivative of P = τ F⁻ᵀ = U diag(τᵢ/σᵢ) Vᵀ along A, in principal axes: M = Uᵀ A V, and `tau` carries the
-// derivatives of the stresses along it. Off the diagonal stand the divided difference and the divided sum of τᵢ/σᵢ
-// (Ogden 1997, section 6.1.4) with d = hᵢ − hⱼ, the mean stress m and the quotient q of the stresses,
-//   (Pᵢ − Pⱼ)/(σᵢ − σⱼ) = (q d/2 coth d/2 − m)/(σᵢσⱼ),   (Pᵢ + Pⱼ)/(σᵢ + σⱼ) = (m − q d/2 tanh d/2)/(σᵢσⱼ).
+// derivatives of the stresses along it. Off the diagonal stand the moduli of shear of laws/tangent.h.
 template <class Law, class V, int D>
 MPM_HD Matrix<V, D> stress_derivative(const HenckyStrain<V, D>& s, const PrincipalData<Law, V>& data,
                                       const Vector<Dual<V>, D>& h, const Vector<Dual<V>, D>& tau,
@@ -309,13 +309,34 @@ MPM_HD Matrix<V, D> stress_derivative(const HenckyStrain<V, D>& s, const Princip
     for (int j = i + 1; j < D; j++) {
       const V half = V(0.5) * (s.h[i] - s.h[j]), mean = V(0.5) * (tau[i].value + tau[j].value);
       const V quotient = Law::stress_quotient(s.h[i], s.h[j], data.parameters, data.history);
-      const Hyperbolic<V> of = hyperbolic(half);
-      const V even = (quotient * of.cosh / of.sinhc - mean) * V(0.5) * (M[i][j] + M[j][i]);
-      const V odd = (mean - quotient * half * half * of.sinhc / of.cosh) * V(0.5) * (M[i][j] - M[j][i]);
+      const ShearModuli<V> shear = shear_moduli(half, mean, quotient);
+      const V even = shear.even * V(0.5) * (M[i][j] + M[j][i]), odd = shear.odd * V(0.5) * (M[i][j] - M[j][i]);
       r[i][j] = inverse[i] * inverse[j] * (even + odd);
       r[j][i] = inverse[i] * inverse[j] * (even - odd);
     }
   return r;
+}
+
+// ∂τ/∂h of the energy's own stress, without the return map.
+template <class Law, class V, int D>
+MPM_HD Matrix<V, D> principal_moduli(const Vector<V, D>& h, const PrincipalData<Law, V>& data, Vector<V, D>& tau) {
+  PrincipalData<Law, Dual<V>> constant_data;
+  MPM_UNROLL for (int k = 0; k < kParameters<Law>; k++)
+    constant_data.parameters[k] = {data.parameters[k], V(0)};
+  MPM_UNROLL for (int k = 0; k < kHistory<Law>; k++)
+    constant_data.history[k] = {data.history[k], V(0)};
+  Matrix<V, D> moduli;
+  MPM_UNROLL for (int j = 0; j < D; j++) {
+    Vector<Dual<V>, D> strain;
+    MPM_UNROLL for (int i = 0; i < D; i++)
+      strain[i] = {h[i], V(i == j ? 1.0 : 0.0)};
+    const Vector<Dual<V>, D> stress = Law::stress(strain, constant_data.parameters, constant_data.history);
+    MPM_UNROLL for (int i = 0; i < D; i++) {
+      moduli[i][j] = stress[i].derivative;
+      tau[i] = stress[i].value;
+    }
+  }
+  return moduli;
 }
 
 // Upper bound of |dτ/dF : G F| + max |τᵢ| ≥ the second variation of ψ, over velocity gradients G with |G| = 1. In
@@ -434,6 +455,20 @@ struct PrincipalKernels {
         [&](int k, const V& value) { store_entry(at, a.parameters, k, select(valid, value, V(0))); },
         [&](int k, const V& value) { store_entry(at, a.history, k, select(valid, value, V(0))); });
     if (a.state.pointer) store_matrix<D>(at, a.state, select(valid, by_F, zero_matrix<V, D>()));
+  }
+
+  template <class At, class T, int D>
+  MPM_HD static void tangent(const LawTangentArguments<T, D>& a, const At& at) {
+    using V = typename At::Value;
+    const HenckyStrain<V, D> s = hencky_strain(load_matrix<D>(at, a.law.state));
+    const PrincipalData<Law, V> data = load_data<Law>(at, a.law);
+    Vector<V, D> tau;
+    const Matrix<V, D> moduli = principal_moduli<Law>(s.h, data, tau);
+    Tangent<V, D> t = principal_tangent(
+        s, tau, moduli, load_matrix<D>(at, a.before), load_scalar(at, a.weight),
+        [&](int i, int j) { return Law::stress_quotient(s.h[i], s.h[j], data.parameters, data.history); });
+    if (a.projected) project(t);
+    store_tangent(at, a.tangent, s.valid, t);
   }
 
   // Of g ψ(F, p) along a direction: the derivatives of g ∂ψ/∂F and g ∂ψ/∂p, and that of ψ, which is by g.

@@ -14,7 +14,7 @@ struct LawInfo {
   const char* name = "";
   Deformation field = Deformation::gradient;
   bool viscous = false, plastic = false, optional_history = false, twice_differentiable = false,
-       twice_differentiable_energy = false, in_2d = true;
+       twice_differentiable_energy = false, has_tangent = false, in_2d = true;
   std::vector<Quantity> parameters, history;
   std::vector<const char*> options;
 };
@@ -30,6 +30,7 @@ struct LawKernels {
   void (*energy_double_backward)(const LawEnergyDoubleBackwardArguments<T, D>&, void* stream) = nullptr;
   // Update and P2G in one, the stress in registers: of quadratic weights and the MLS form, on CUDA.
   void (*p2g)(const LawUpdateArguments<T, D>&, const P2GArguments<T, D>&, void* stream) = nullptr;
+  void (*tangent)(const LawTangentArguments<T, D>&, void* stream) = nullptr;
 };
 
 struct LawEntry {
@@ -77,6 +78,7 @@ LawInfo info_of() {
           Law::optional_history,
           Law::twice_differentiable,
           Law::twice_differentiable_energy,
+          Law::has_tangent,
           Law::in_2d,
           {Law::parameters.begin(), Law::parameters.end()},
           {Law::history.begin(), Law::history.end()},
@@ -94,6 +96,7 @@ void fill_kernels(LawEntry& entry) {
     kernels.update_backward = K::update_backward;
     kernels.scalar = K::scalar;
     kernels.energy_backward = K::energy_backward;
+    if constexpr (Law::has_tangent) kernels.tangent = K::tangent;
     if constexpr (requires { &K::p2g; }) kernels.p2g = &K::p2g;
     if constexpr (Law::twice_differentiable) kernels.double_backward = K::double_backward;
     if constexpr (Law::twice_differentiable_energy) kernels.energy_double_backward = K::energy_double_backward;

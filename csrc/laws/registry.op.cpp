@@ -53,7 +53,8 @@ std::string law_as_json(const LawInfo& info) {
          ", \"optional_history\": " + flag(info.optional_history) +
          ", \"twice_differentiable\": " + flag(info.twice_differentiable) +
          ", \"twice_differentiable_energy\": " + flag(info.twice_differentiable_energy) +
-         ", \"in_2d\": " + flag(info.in_2d) + ", \"parameters\": " + json_list(info.parameters, quantity_as_json) +
+         ", \"has_tangent\": " + flag(info.has_tangent) + ", \"in_2d\": " + flag(info.in_2d) +
+         ", \"parameters\": " + json_list(info.parameters, quantity_as_json) +
          ", \"history\": " + json_list(info.history, quantity_as_json) +
          ", \"options\": " + json_list(info.options, [](const char* o) { return std::string("\"") + o + "\""; }) + "}";
 }

@@ -81,6 +81,7 @@ struct Viscoelastic : PrincipalLaw {
   static constexpr std::array parameters = {NeoHookean::parameters[0], NeoHookean::parameters[1],
                                             MaxwellBranch::parameters[0], MaxwellBranch::parameters[1], time_step};
   static constexpr std::array history = {matrix("inverse_viscous_deformation", "")};
+  static constexpr bool has_tangent = false;
   template <class Law>
   using Kernels = ViscoelasticKernels<Law>;
 };

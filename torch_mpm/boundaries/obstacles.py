@@ -123,24 +123,39 @@ class Obstacle(RigidMotion):
                 "velocity and positions must both have shape [N, D], "
                 f"got {shape_of(velocity)} and {shape_of(positions)}"
             )
-        if velocity.shape[0] == 0 or self._absent(scene, time):
+        contact = self.contact_at(positions, scene, time)
+        if contact is None:
             return velocity
-        centre, turn = self.centre_at(time, velocity), self.rotation_at(time, velocity, velocity.shape[1])
-        if centre.shape[-1] != velocity.shape[1]:
-            raise ValueError(f"position must have {velocity.shape[1]} numbers per point, got {shape_of(centre)}")
-        arm = positions - per_node(centre, 1, scene)
-        turn = None if turn is None else per_node(turn, 2, scene)
-        distance, normal = self.shape.surface(to_body(turn, arm), scene)
-        if turn is not None:
-            normal = transform(turn, normal)
-        touching = self._touching(distance, positions, scene, time)[:, None]
-        surface_velocity = self.velocity_at(arm, scene, time)
+        touching, normal, surface_velocity = contact
+        touching = touching[:, None]
         friction = self.friction
         if isinstance(friction, Tensor):
             friction = self.at_nodes("friction", velocity, (), scene)[..., None]
         # Zero velocity stays zero; a NaN outside does not reach the gradient of the parameters.
         relative = torch.where(touching, velocity if surface_velocity is None else velocity - surface_velocity, 0)
         return velocity + contact_change(relative, normal, self.kind, friction)
+
+    def contact_at(
+        self, positions: Tensor, scene: Tensor | None, time: float | Tensor
+    ) -> tuple[Tensor, Tensor, Tensor | None] | None:
+        """What nodes meet: which of them touch, bool [N]; the outward normals [N, D]; and the velocity of the surface
+        [N, D] or [D] [m/s], None at rest. None where the obstacle is not there. Arguments as `forward`.
+
+        Raises:
+            ValueError: for wrong shapes or devices.
+        """
+        if positions.shape[0] == 0 or self._absent(scene, time):
+            return None
+        dim = positions.shape[1]
+        centre, turn = self.centre_at(time, positions), self.rotation_at(time, positions, dim)
+        if centre.shape[-1] != dim:
+            raise ValueError(f"position must have {dim} numbers per point, got {shape_of(centre)}")
+        arm = positions - per_node(centre, 1, scene)
+        turn = None if turn is None else per_node(turn, 2, scene)
+        distance, normal = self.shape.surface(to_body(turn, arm), scene)
+        if turn is not None:
+            normal = transform(turn, normal)
+        return self._touching(distance, positions, scene, time), normal, self.velocity_at(arm, scene, time)
 
     # -- as a region
 
@@ -203,6 +218,12 @@ class Obstacle(RigidMotion):
             return torch.zeros_like(distance, dtype=torch.bool)
         rounding = 16 * torch.finfo(positions.dtype).eps
         return distance.detach() <= rounding * positions.detach().abs().amax()
+
+
+def motion_tensors(obstacle: Obstacle) -> list[Tensor]:
+    """The tensors of an obstacle: of its shape, where it is and how it moves."""
+    values = (*vars(obstacle).values(), *vars(obstacle.shape).values())
+    return [v for v in values if isinstance(v, Tensor)] + [*obstacle.parameters(), *obstacle.buffers()]
 
 
 # ---- obstacles of one shape each

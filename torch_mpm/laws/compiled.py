@@ -17,11 +17,14 @@ from torch import Tensor, nn
 from ..capture import GraphCache
 from ..errors import check_number, shape_of
 from ..ops.arguments import refuse_batched, soa_empty
+from ..ops.implicit import add_deviator
 from ..ops.law import (
     DISSIPATED,
     LawUpdate,
     law_energy,
+    law_energy_gradient,
     law_stiffness,
+    law_tangent,
     law_update,
     law_wave_modulus,
     option_bits,
@@ -101,6 +104,40 @@ class CompiledLaw(Material):
             moved = self.return_map(state)
             deformation, history = moved.state, moved.history
         return law_energy(self._name(state), deformation, parameters, history, state.scene, state.x.shape[1])
+
+    def trial_energy(self, state: Any, before: Any) -> Tensor:
+        energy = law_energy(*self._trial(state))
+        if not self.viscous or state.C is None:
+            return energy
+        return energy + 0.5 * state.step * (self._viscous_stress(state, before) * state.C).sum((1, 2))
+
+    def trial_stress(self, state: Any, before: Any) -> Tensor:
+        gradient = law_energy_gradient(*self._trial(state))
+        if self.state_fields != ("J",):
+            return gradient @ before.F.mT
+        eye = torch.eye(state.x.shape[1], dtype=gradient.dtype, device=gradient.device)
+        stress = (gradient * before.J)[:, None, None] * eye
+        return stress + self._viscous_stress(state, before) if self.viscous else stress
+
+    def trial_tangent(self, state: Any, before: Any, weight: Tensor, projected: bool) -> Tensor:
+        name, deformation, parameters, history, scene, dim = self._trial(state)
+        before_field = getattr(before, self.state_fields[0])
+        tangent = law_tangent(name, deformation, before_field, weight, parameters, history, scene, dim, projected)
+        viscosity = self.viscosity(before)
+        if viscosity is not None:  # of a fluid, whose frames are the identity: 2 η dev sym L
+            add_deviator(tangent, dim, 2 * viscosity * torch.where(weight > 0, weight / state.step, 0))
+        return tangent
+
+    def _viscous_stress(self, state: Any, before: Any) -> Tensor:
+        """What the velocity gradient of a step adds to the stress, at the volume before it [P, D, D] [Pa]."""
+        name, J, parameters, history, scene, dim = self._trial(before)
+        moving, still = (law_update(name, J, parameters, history, C, scene, dim).stress for C in (state.C, None))
+        return moving - still
+
+    def _trial(self, state: Any) -> tuple[str, Tensor, list[Tensor], list[Tensor], Tensor | None, int]:
+        """What the ops of energy take."""
+        deformation, parameters = self._arguments(state)
+        return self._name(state), deformation, parameters, self._history(state), state.scene, state.x.shape[1]
 
     def wave_modulus(self, state: State) -> Tensor:
         """Upper bound of rest density times squared wave speed after the return map [P] [Pa]; exact at rest."""

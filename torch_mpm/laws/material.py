@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor, nn
@@ -56,6 +56,25 @@ class Material(nn.Module):
         """Elastic energy per rest volume [P] [J/m³]; infinite where the law has no meaning."""
         raise NotImplementedError(f"{type(self).__name__} has no energy")
 
+    def trial_energy(self, state: Any, before: Any) -> Tensor:
+        """Energy per rest volume [P] [J/m³] that an implicit step minimises, of a trial state that does not flow.
+
+        Args:
+            state: with the trial F or J, and, of a viscous law, the velocity gradient of the step as C and dt of each
+                particle as `step` [s].
+            before: the state at the start of the step, after the return map.
+        """
+        raise _not_implicit(self)
+
+    def trial_stress(self, state: Any, before: Any) -> Tensor:
+        """dP F₀ᵀ: derivative of `trial_energy` by velocity gradients that move the deformation by dF = L F₀ or
+        dJ = J₀ tr L from that of `before` [P, D, D] [Pa]. The Kirchhoff stress where both states are one."""
+        raise _not_implicit(self)
+
+    def trial_tangent(self, state: Any, before: Any, weight: Tensor, projected: bool) -> Tensor:
+        """Derivative of `trial_stress` as `torch_mpm.ops.law_tangent` has it, times a weight [P]."""
+        raise _not_implicit(self)
+
     def energy(self, state: State) -> Tensor:
         """Elastic energy of each particle [P] [J]."""
         return self.energy_density(state) * state.volume
@@ -83,3 +102,7 @@ class Material(nn.Module):
     def invalid(self, state: State) -> Tensor:
         """Particles where the law has no meaning, bool [P]: not finite, overflowed, or turned inside out (J ≤ 0)."""
         return ~self.energy_density(state).isfinite()
+
+
+def _not_implicit(law: Material) -> NotImplementedError:
+    return NotImplementedError(f"{type(law).__name__} has no energy of a trial state, which an implicit step needs")

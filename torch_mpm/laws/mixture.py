@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from ..capture import without_transforms
 from ..errors import shape_of
 from ..ops.arguments import soa_empty
+from ..ops.implicit import tangent_entries
 from ..state import _take
 from .custom import as_law
 from .material import Material
@@ -73,6 +74,28 @@ class Mixture(Material):
 
     def energy_density(self, state: State) -> Tensor:
         return self._collect(state, lambda law, part: law.energy_density(part))
+
+    def trial_energy(self, state: Any, before: Any) -> Tensor:
+        return self._collect_trial(state, before, (), lambda law, part, old: law.trial_energy(part, old))
+
+    def trial_stress(self, state: Any, before: Any) -> Tensor:
+        shape = (state.x.shape[1],) * 2
+        return self._collect_trial(state, before, shape, lambda law, part, old: law.trial_stress(part, old))
+
+    def trial_tangent(self, state: Any, before: Any, weight: Tensor, projected: bool) -> Tensor:
+        def tangent(law: Any, part: Any, old: Any) -> Tensor:
+            return law.trial_tangent(part, old, weight.index_select(0, part.index), projected)
+
+        return self._collect_trial(state, before, (tangent_entries(state.x.shape[1]),), tangent)
+
+    def _collect_trial(
+        self, state: Any, before: Any, shape: tuple[int, ...], function: Callable[[Any, Any, Any], Tensor]
+    ) -> Tensor:
+        """As `_collect`, of each law with its particles in a trial state and before."""
+        result = soa_empty(state.x, (len(state.x), *shape)).zero_()
+        for part, law in self._parts(state):
+            result = result.index_copy(0, part.index, function(law, part, _Part(before, part.index)))
+        return result
 
     def stiffness(self, state: State) -> Tensor:
         return self._collect(state, lambda law, part: law.stiffness(part))

@@ -13,8 +13,17 @@ from .contact import contact, fusible
 from .g2p_advance import g2p_advance
 from .grid_update import grid_update
 from .heat import HeatSolve, heat_cg, heat_operator
+from .implicit import ImplicitSolve, implicit_apply, implicit_cg, implicit_node_blocks
 from .impulses import contact_impulses, wall_impulses
-from .law import LawUpdate, law_energy, law_stiffness, law_update, law_wave_modulus
+from .law import (
+    LawUpdate,
+    law_energy,
+    law_energy_gradient,
+    law_stiffness,
+    law_tangent,
+    law_update,
+    law_wave_modulus,
+)
 from .registry import LAWS
 from .sand import quartic_energy, quartic_return_map, quartic_stiffness, quartic_stress
 from .survey import Survey, survey
@@ -24,6 +33,7 @@ from .transfer import g2p, gather, p2g, scatter
 __all__ = [
     "LAWS",
     "HeatSolve",
+    "ImplicitSolve",
     "LawUpdate",
     "Survey",
     "advance",
@@ -36,8 +46,13 @@ __all__ = [
     "grid_update",
     "heat_cg",
     "heat_operator",
+    "implicit_apply",
+    "implicit_cg",
+    "implicit_node_blocks",
     "law_energy",
+    "law_energy_gradient",
     "law_stiffness",
+    "law_tangent",
     "law_update",
     "law_wave_modulus",
     "p2g",

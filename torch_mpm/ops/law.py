@@ -158,6 +158,68 @@ def law_wave_modulus(
     return torch.ops.torch_mpm.law_wave_modulus(state, parameters, history, scene, law, dim)
 
 
+def law_energy_gradient(
+    law: str,
+    state: Tensor,
+    parameters: Tensors,
+    history: Tensors = (),
+    scene: Tensor | None = None,
+    dim: int | None = None,
+) -> Tensor:
+    """∂ψ/∂F [P, D, D] or ∂ψ/∂J [P] [Pa] of the state itself, without a return map; zero where ψ is infinite.
+
+    Arguments as `law_update`. Differentiable with respect to state and parameters where the law says that its energy is
+    twice differentiable.
+    """
+    dim = _check(law, state, parameters, history, scene, dim)
+    by_state, _, _ = dispatch(
+        torch.ops.torch_mpm.law_energy_backward,
+        *(torch.ones_like(state[:, 0, 0] if state.dim() == 3 else state), state, parameters, history, scene),
+        *(law, dim, STATE),
+    )
+    return by_state
+
+
+def law_tangent(
+    law: str,
+    state: Tensor,
+    before: Tensor,
+    weight: Tensor,
+    parameters: Tensors,
+    history: Tensors = (),
+    scene: Tensor | None = None,
+    dim: int | None = None,
+    projected: bool = True,
+) -> Tensor:
+    """Second derivative of the energy of each particle by velocity gradients L, in the form of csrc/laws/tangent.h.
+
+    A trial deformation F moves with dF = L F₀, or J with dJ = J₀ tr L; the second derivative maps L to dP F₀ᵀ. It is
+    kept in principal axes (Teran et al. 2005): [P, 30] in 3-D, [P, 13] in 2-D, zero where the law has no meaning.
+
+    Args:
+        law: as `law_update` takes it.
+        state: trial F [P, D, D], or J [P].
+        before: F₀ or J₀, from which the trial moves; of the same shape.
+        weight: factor [P]: dt² V for the Hessian of an implicit step.
+        parameters, history, scene, dim: as `law_update` takes them. History counts as constant, and nothing flows.
+        projected: whether negative eigenvalues are left out.
+
+    Raises:
+        NotImplementedError: for a law without a tangent.
+        ValueError, TypeError: as `law_update`.
+
+    Not differentiable.
+    """
+    dim = _check(law, state, parameters, history, scene, dim)
+    if not LAWS[law].has_tangent:
+        raise NotImplementedError(f"the law {law} has no tangent, which an implicit step needs")
+    check_like("before", before, state, tuple(state.shape), "as the state")
+    check_like("weight", weight, state, tuple(state.shape[:1]), "[P]")
+    return dispatch(
+        torch.ops.torch_mpm.law_tangent, state, before, weight, parameters, history, scene, law, dim, projected
+    )
+
+
 def _check(
     law: str, state: Tensor, parameters: Tensors, history: Tensors, scene: Tensor | None, dim: int | None
 ) -> int:
@@ -270,6 +332,11 @@ def _energy_backward_fake(grad_energy, state, parameters, history, scene, law, d
 def _energy_double_backward_fake(along_state, along_parameters, grad_energy, state, parameters, scene, law, dim, needs):
     by_state, _, by_parameters, _ = _adjoints_fake(state, None, parameters, (), dim, needs)
     return state.new_empty(_particles(state)), by_state, by_parameters
+
+
+@torch.library.register_fake("torch_mpm::law_tangent")
+def _tangent_fake(state, before, weight, parameters, history, scene, law, dim, projected):
+    return soa_empty(state, (_particles(state), 2 * dim * dim + dim * (dim + 1) // 2 + dim * (dim - 1)))
 
 
 def _scalar_fake(state, parameters, history, scene, law, dim):
@@ -433,7 +500,7 @@ def _check_twice(differentiable: bool, what: str, law: str) -> None:
 
 def _no_backward(ctx, grad):
     raise NotImplementedError(
-        "wave speeds and stiffness bounds are not differentiable: compute them under torch.no_grad()"
+        "wave speeds, stiffness bounds and tangents are not differentiable: compute them under torch.no_grad()"
     )
 
 
@@ -453,6 +520,7 @@ for _name, _backward, _context in (
     ("law_energy_backward", _energy_double_backward, _energy_backward_setup),
     ("law_energy_double_backward", _no_third_derivative, _no_setup),
     ("law_stiffness", _no_backward, _no_setup),
+    ("law_tangent", _no_backward, _no_setup),
     ("law_wave_modulus", _no_backward, _no_setup),
 ):
     register_autograd(_name, _backward, _context)

@@ -57,6 +57,7 @@ class LawInfo:
         plastic: whether it changes F.
         optional_history: whether it works without its history.
         twice_differentiable, twice_differentiable_energy: whether its stress, and its energy, has second derivatives.
+        has_tangent: whether it has `law_tangent`, which implicit steps need.
         in_2d: whether it exists in two dimensions.
         parameters, history: in the order of the ops.
         options: names of the bits of `options`.
@@ -69,6 +70,7 @@ class LawInfo:
     optional_history: bool
     twice_differentiable: bool
     twice_differentiable_energy: bool
+    has_tangent: bool
     in_2d: bool
     parameters: tuple[Quantity, ...]
     history: tuple[Quantity, ...]

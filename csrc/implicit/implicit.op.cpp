@@ -1,0 +1,164 @@
+#include "grid/topology.op.h"
+#include "implicit/kernels.h"
+#include "rollout/replay.h"
+#include "transfer/kernels.h"
+
+// The Hessian of an implicit step: its product with node vectors, its diagonal blocks, and the solve.
+namespace mpm {
+namespace {
+
+// The product of the tangents alone: a gather, and a scatter with the tangents in it. The velocity gradients between
+// them have a buffer for many products.
+template <class T, int D>
+class TangentProduct {
+ public:
+  TangentProduct(const Tensor& x, const Tensor& tangent, int64_t stress_form, const PackedTopology& blocks)
+      : order_(blocks.order()), gradient_(empty_particles(x, {x.size(0), D, D})) {
+    const int64_t P = x.size(0);
+    scatter_.form = stress_form_of(stress_form);
+    gather_.topology = scatter_.topology = blocks.unpack<T, D>(x);
+    gather_.x = scatter_.x = input<T>(x, "x", x, {P, D});
+    gather_.moment_scale = blocks.inverse_inertia();
+    (scatter_.form == StressForm::mls ? gather_.moment : gather_.gradient) = field<T>(gradient_);
+    scatter_.gradient = field<const T>(gradient_);
+    scatter_.tangent = input<T>(tangent, "tangent", x, {P, kTangentEntries<D>});
+    scatter_.deterministic = blocks.deterministic();
+  }
+
+  // Adds to `to`.
+  void operator()(const T* direction, T* to, const DeviceScope& device) {
+    gather_.nodes = {direction, D, D};
+    scatter_.nodes = {to, D, D};
+    backend::gather(order_, gather_, device.stream());
+    backend::tangent_scatter(order_, scatter_, device.stream());
+  }
+
+ private:
+  int64_t order_;
+  Tensor gradient_;
+  GatherArguments<T, D> gather_;
+  TangentScatterArguments<T, D> scatter_;
+};
+
+// A contiguous node tensor [N, ...].
+template <class T>
+const T* node_pointer(const Tensor& t, const char* name, const Tensor& x, const Shape& shape) {
+  check_shape(t, name, shape);
+  check_like(t, name, x);
+  STD_TORCH_CHECK(t.is_contiguous(), name, " must be contiguous");
+  return static_cast<const T*>(t.data_ptr());
+}
+
+Tensor implicit_apply(const Tensor& x, const Tensor& direction, const Tensor& tangent, int64_t stress_form,
+                      const std::vector<Tensor>& topology, const std::vector<double>& lattice,
+                      const std::vector<int64_t>& layout) {
+  const PackedTopology blocks(topology, lattice, layout);
+  Tensor result;
+  const DeviceScope device(x);
+  dispatch(x, [&]<class T, int D>() {
+    const int64_t N = blocks.node_count<D>();
+    const T* along = node_pointer<T>(direction, "direction", x, {N, D});
+    result = zeros(x, {N, D});
+    TangentProduct<T, D>(x, tangent, stress_form, blocks)(along, static_cast<T*>(result.data_ptr()), device);
+  });
+  return result;
+}
+
+Tensor implicit_node_blocks(const Tensor& x, const Tensor& tangent, int64_t stress_form,
+                            const std::vector<Tensor>& topology, const std::vector<double>& lattice,
+                            const std::vector<int64_t>& layout) {
+  const PackedTopology blocks(topology, lattice, layout);
+  Tensor result;
+  const DeviceScope device(x);
+  dispatch(x, [&]<class T, int D>() {
+    const int64_t P = x.size(0);
+    result = zeros(x, {blocks.node_count<D>(), kSymmetric<D>});
+    NodeBlocksArguments<T, D> a;
+    a.topology = blocks.unpack<T, D>(x);
+    a.x = input<T>(x, "x", x, {P, D});
+    a.tangent = input<T>(tangent, "tangent", x, {P, kTangentEntries<D>});
+    a.form = stress_form_of(stress_form);
+    a.deterministic = blocks.deterministic();
+    a.nodes = {static_cast<T*>(result.data_ptr()), kSymmetric<D>, kSymmetric<D>};
+    backend::node_blocks(blocks.order(), a, device.stream());
+  });
+  return result;
+}
+
+// Iterations between two looks of the host at how many scenes are not done.
+constexpr int kIterationsPerLook = MPM_BACKEND == MPM_BACKEND_IS_cpu ? 1 : 8;
+// Iterations that a solve has at least where it matters how long it takes.
+constexpr int kWorthATeam = 16;
+
+std::tuple<Tensor, Tensor> implicit_cg(const Tensor& x, const Tensor& rhs, const Tensor& mass, const Tensor& inverse,
+                                       const Tensor& tangent, const Tensor& relative, int64_t max_iterations,
+                                       int64_t stress_form, const std::vector<Tensor>& topology,
+                                       const std::vector<double>& lattice, const std::vector<int64_t>& layout) {
+  const PackedTopology blocks(topology, lattice, layout);
+  STD_TORCH_CHECK(max_iterations >= 0 && max_iterations <= INT32_MAX, "max_iterations must be 0 to 2^31 - 1, got ",
+                  max_iterations);
+  Tensor solution, scalars;
+  const DeviceScope device(x);
+  dispatch(x, [&]<class T, int D>() {
+    const int64_t N = blocks.node_count<D>();
+    const Topology<T, D> t = blocks.unpack<T, D>(x);
+    ConjugateGradientsArguments<T, D> a;
+    a.max_blocks = t.max_blocks;
+    a.scenes = t.scenes;
+    a.blocks_per_scene = t.geometry.blocks_per_scene;
+    a.block = t.block;
+    a.mass = node_pointer<T>(mass, "mass", x, {N});
+    a.inverse = node_pointer<T>(inverse, "inverse", x, {N, kSymmetric<D>});
+    a.rhs = node_pointer<T>(rhs, "rhs", x, {N, D});
+    a.relative = node_pointer<T>(relative, "relative", x, {t.scenes});
+    static_assert(sizeof(ConjugateGradients) == 5 * sizeof(double));
+    solution = zeros(x, {N, D});
+    scalars = empty(x, {t.scenes, 5}, ScalarType::Double);
+    Tensor r = zeros(x, {N, D}), p = zeros(x, {N, D}), q = zeros(x, {N, D});
+    const Tensor slots = empty(x, {int64_t(t.max_blocks) + t.scenes}, ScalarType::Double),
+                 unfinished = empty_int(x, {1});
+    int left = 0;
+    a.x = static_cast<T*>(solution.data_ptr());
+    a.r = static_cast<T*>(r.data_ptr());
+    a.p = static_cast<T*>(p.data_ptr());
+    a.q = static_cast<T*>(q.data_ptr());
+    a.slots = static_cast<double*>(slots.data_ptr());
+    a.scene = static_cast<ConjugateGradients*>(scalars.data_ptr());
+    a.unfinished = static_cast<int*>(unfinished.data_ptr());
+    a.unfinished_on_host = &left;
+    TangentProduct<T, D> product(x, tangent, stress_form, blocks);
+    backend::cg_begin(a, device.stream());
+    with_team(x.size(0) * kWorthATeam, [&] {
+      for (int64_t k = 0; k < max_iterations; k++) {
+        if (k % kIterationsPerLook == 0) {
+          backend::cg_look(a, device.stream());
+          if (left == 0) break;
+        }
+        backend::clear(q, device.stream());
+        product(a.p, a.q, device);
+        backend::cg_advance(a, device.stream());
+      }
+    });
+  });
+  return {solution, scalars};
+}
+
+}  // namespace
+}  // namespace mpm
+
+#if MPM_BACKEND == MPM_BACKEND_IS_cpu
+STABLE_TORCH_LIBRARY_FRAGMENT(torch_mpm, m) {
+  m.def("implicit_apply(Tensor x, Tensor direction, Tensor tangent, int stress_form, " MPM_TOPOLOGY_SCHEMA
+        ") -> Tensor");
+  m.def("implicit_node_blocks(Tensor x, Tensor tangent, int stress_form, " MPM_TOPOLOGY_SCHEMA ") -> Tensor");
+  m.def(
+      "implicit_cg(Tensor x, Tensor rhs, Tensor mass, Tensor inverse, Tensor tangent, Tensor relative, "
+      "int max_iterations, int stress_form, " MPM_TOPOLOGY_SCHEMA ") -> (Tensor solution, Tensor scalars)");
+}
+#endif
+
+MPM_LIBRARY_IMPL(m) {
+  m.impl("implicit_apply", TORCH_BOX(&mpm::implicit_apply));
+  m.impl("implicit_node_blocks", TORCH_BOX(&mpm::implicit_node_blocks));
+  m.impl("implicit_cg", TORCH_BOX(&mpm::implicit_cg));
+}

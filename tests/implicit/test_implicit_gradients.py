@@ -1,0 +1,185 @@
+"""Gradients through implicit steps: against differences of tightly solved steps, and what their memory does."""
+
+import pytest
+import torch
+from helpers import relative_error
+from torch.autograd.graph import saved_tensors_hooks
+
+import torch_mpm as mpm
+from torch_mpm.implicit import Implicit, equilibrium
+
+TIGHT = {"tolerance": 1e-12, "adjoint_tolerance": 1e-12}
+NAMES = ("x", "v", "F", "C", "mass", "volume", "mu", "lam", "gravity", "dt")
+
+
+def inputs(dim, device, dtype=torch.float64):
+    """A deformed block on the floor, with all that a step reads."""
+    grid = mpm.Grid(0.25, (0,) * dim, (1.5,) * dim)
+    points = mpm.seed.box((0.25, 0.0, 0.25)[:dim], (0.75, 0.5, 0.5)[:dim], grid, per_cell=2**dim)
+    state = mpm.State.at_rest(points, density=1000.0, dtype=torch.float64)
+
+    def normal(*shape):
+        return torch.randn(*shape, dtype=torch.float64)
+
+    P = len(state)
+    values = {
+        "x": state.x + 0.02 * normal(P, dim),
+        "v": 0.5 * normal(P, dim),
+        "F": torch.eye(dim, dtype=torch.float64) + 0.05 * normal(P, dim, dim),
+        "C": 0.5 * normal(P, dim, dim),
+        "mass": state.mass,
+        "volume": state.volume,
+        "mu": torch.tensor(3e4, dtype=torch.float64),
+        "lam": torch.tensor(5e4, dtype=torch.float64),
+        "gravity": torch.tensor([0.0, -9.8, 0.0][:dim], dtype=torch.float64),
+        "dt": torch.tensor(0.02, dtype=torch.float64),
+    }
+    return grid, {name: value.to(device, dtype) for name, value in values.items()}
+
+
+def run(grid, values, law=mpm.NeoHookean, n=1, options=None, **arguments):
+    step = mpm.Step(
+        grid,
+        law(mu=values["mu"], lam=values["lam"]),
+        gravity=values["gravity"],
+        integrator=Implicit(**(options or TIGHT)),
+        **arguments,
+    )
+    fields = {name: values[name] for name in ("x", "v", "F", "C", "mass", "volume")}
+    state = mpm.State(**fields)
+    for _ in range(n):
+        state = step(state, values["dt"])
+    assert bool(step.solve_report.converged.all())
+    return step, state
+
+
+def check_gradients(grid, values, limit, names=NAMES, **arguments):
+    """Of a random sum of the results along a random direction of each input, against central differences."""
+    leaves = {name: values[name].clone().requires_grad_() for name in names}
+    weights = [torch.randn_like(values[name]) for name in ("x", "v", "F")]
+
+    def loss(given):
+        _, end = run(grid, given, **arguments)
+        return sum((w * t).sum() for w, t in zip(weights, (end.x, end.v, end.F), strict=True))
+
+    grads = torch.autograd.grad(loss({**values, **leaves}), list(leaves.values()))
+    for name, grad in zip(leaves, grads, strict=True):
+        direction = torch.randn_like(values[name]) * values[name].abs().mean()
+        with torch.no_grad():
+            ends = [loss({**values, name: values[name] + h * direction}) for h in (1e-5, -1e-5)]
+        difference = (ends[0] - ends[1]) / 2e-5
+        assert relative_error((grad * direction).sum(), difference) < limit, name
+
+
+FORMS_AND_WALLS = [
+    *((2, form, walls) for form in ("mls", "gradient") for walls in (None, "sticky", "slip", "separate")),
+    (3, "mls", "separate"),
+    (3, "gradient", "sticky"),
+]
+
+
+@pytest.mark.parametrize(("dim", "stress_form", "walls"), FORMS_AND_WALLS)
+def test_gradients_of_every_input(dim, stress_form, walls, device):
+    grid, values = inputs(dim, device)
+    check_gradients(grid, values, 1e-6, walls=walls, stress_form=stress_form)
+
+
+@pytest.mark.parametrize("law", [mpm.Hencky, mpm.FixedCorotated])
+def test_gradients_of_laws_in_principal_axes(law, device):
+    grid, values = inputs(2, device)
+    check_gradients(grid, values, 1e-6, walls="sticky", law=law)
+
+
+@pytest.mark.parametrize("kind", ["sticky", "slip", "separate"])
+def test_gradients_beside_an_obstacle(kind, device):
+    grid, values = inputs(2, device)
+    check_gradients(
+        grid, values, 1e-6, walls="slip", boundaries=[mpm.Sphere((0.5, 0.6), 0.2, kind, velocity=(0.2, -1.0))]
+    )
+
+
+def test_gradients_of_twenty_steps(device):
+    grid, values = inputs(2, device)
+    values["dt"] = values["dt"] / 4
+    check_gradients(grid, values, 1e-6, ("v", "F", "mu", "dt"), walls="sticky", n=20)
+
+
+def test_gradients_in_float32(dim, device):
+    """Against float64, of a loss without large terms that cancel."""
+    grads = []
+    for dtype in (torch.float64, torch.float32):
+        torch.manual_seed(0)
+        grid, values = inputs(dim, device, dtype)
+        leaves = {name: values[name].requires_grad_() for name in ("v", "F", "mu")}
+        _, end = run(grid, {**values, **leaves}, options={"tolerance": 1e-6}, walls="sticky")
+        grads.append(torch.autograd.grad(end.v.square().sum(), list(leaves.values())))
+    for exact, single in zip(*grads, strict=True):
+        assert relative_error(single, exact) < 1e-3
+
+
+def test_each_scene_has_its_own_adjoint(device):
+    """The gradients of a batch are those of its scenes alone."""
+    grid, values = inputs(2, device)
+    pair = mpm.Grid(grid.dx, grid.lower, grid.upper, scenes=2)
+    mu = torch.tensor([3e4, 3e6], dtype=torch.float64, device=device, requires_grad=True)
+    fields = {name: torch.cat([values[name]] * 2) for name in ("x", "v", "F", "C", "mass", "volume")}
+    scene = torch.arange(2, device=device).repeat_interleave(len(values["x"])).int()
+    step = mpm.Step(pair, mpm.NeoHookean(mu=mu, lam=values["lam"]), walls="sticky", integrator=Implicit(**TIGHT))
+    end = step(mpm.State(**fields, scene=scene), 0.02)
+    (together,) = torch.autograd.grad(end.x.square().sum(), mu)
+    assert step.integrator.adjoint_converged.tolist() == [True, True]
+    for b in range(2):
+        own = mu[b].detach().clone().requires_grad_()
+        alone = {**values, "mu": own, "dt": values["dt"] * 0 + 0.02, "gravity": values["gravity"] * 0}
+        _, end = run(grid, alone, walls="sticky")
+        (grad,) = torch.autograd.grad(end.x.square().sum(), own)
+        assert relative_error(together[b], grad) < 1e-7
+
+
+def test_memory_does_not_grow_with_the_iterations(device):
+    """What autograd keeps of a step that takes one iteration and of one that takes many."""
+    kept, iterations = [], []
+    for tolerance in (0.5, 1e-12):
+        grid, values = inputs(2, device)
+        values["mu"].requires_grad_()
+        sizes = []
+
+        def pack(t, sizes=sizes):
+            sizes.append(t.numel())
+            return t
+
+        with saved_tensors_hooks(pack, lambda t: t):
+            step, _ = run(grid, values, options={"tolerance": tolerance}, walls="sticky")
+        kept.append(sum(sizes))
+        iterations.append(int(step.solve_report.cg_iterations[0]))
+    assert iterations[1] > 2 * iterations[0] and kept[0] == kept[1]
+
+
+def test_a_solve_of_the_adjoint_that_fails_is_told(device):
+    """With too few iterations the gradient is NaN, not wrong."""
+    grid, values = inputs(2, device)
+    values["mu"].requires_grad_()
+    step, end = run(grid, values, walls="sticky")
+    step.integrator.options.max_cg_iterations = 1
+    (grad,) = torch.autograd.grad(end.x.sum(), values["mu"])
+    assert step.integrator.adjoint_converged.tolist() == [False] and bool(grad.isnan())
+
+
+def test_stiffness_from_the_sag_of_a_column(device):
+    """u is proportional to 1/E: d u/dE = −u/E, and one Newton step of ln E finds the stiffness that gives a sag."""
+    grid = mpm.Grid(0.125, (0, 0), (0.75, 1.5))
+    points = mpm.seed.box((0.25, 0.0), (0.5, 1.0), grid, per_cell=4)
+    state = mpm.State.at_rest(points, density=1000.0, dtype=torch.float64, device=device)
+
+    def sag(log_E):
+        law = mpm.Hencky(E=log_E.exp(), nu=0.0)
+        step = mpm.Step(grid, law, (0.0, -1.0), walls="sticky", integrator=Implicit(1e-10))
+        return (state.x - equilibrium(step, state, 1e3).x)[:, 1].mean()
+
+    log_E = torch.tensor(14.0, dtype=torch.float64, device=device, requires_grad=True)
+    value = sag(log_E)
+    (slope,) = torch.autograd.grad(value, log_E)
+    assert relative_error(slope, -value) < 0.01
+    target = sag(torch.tensor(13.9, dtype=torch.float64, device=device))
+    found = log_E + (target.log() - value.log()) * value / slope
+    assert abs(found.item() - 13.9) < 1e-4

@@ -1,0 +1,150 @@
+"""What walls and obstacles allow the velocities of nodes: bounds of their components, in axes of each node."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ..boundaries import Obstacle, Walls
+from ..grid import Blocks
+
+ON_FACE = 1e-6
+"""Share of dx within which a node is at a wall, as the grid update has it."""
+
+
+@dataclasses.dataclass
+class NodeBounds:
+    """`lower` ≤ u ≤ `upper` for the components u = v − 2 w (w · v) of each node's velocity.
+
+    The reflection by the unit vector w (none where it is zero) takes one axis to the normal of an obstacle and leaves
+    alone those that walls hold, so that all bounds are those of components.
+
+    Attributes:
+        lower, upper: [N, D] [m/s], equal where a component is given, infinite where it is free.
+        mirror: w [N, D], or None where there are no obstacles.
+    """
+
+    lower: Tensor
+    upper: Tensor
+    mirror: Tensor | None = None
+
+    def turned(self, v: Tensor) -> Tensor:
+        """Velocities [N, D] to the axes of the nodes, and back: the same reflection."""
+        if self.mirror is None:
+            return v
+        return v - 2 * self.mirror * (self.mirror * v).sum(-1, keepdim=True)
+
+    def clamped(self, v: Tensor) -> Tensor:
+        """The nearest velocities within the bounds."""
+        return self.turned(self.turned(v).clamp(self.lower, self.upper))
+
+    def free(self, v: Tensor, gradient: Tensor) -> Tensor:
+        """Components in the axes of the nodes that may move, bool [N, D]: not at a bound, or with a gradient of the
+        energy that pulls them off it."""
+        u, slope = self.turned(v), self.turned(gradient)
+        rounding = 64 * torch.finfo(v.dtype).eps * v.abs().amax(-1, keepdim=True)  # of two reflections
+        at_lower = (u <= self.lower + rounding) & (slope >= 0)
+        at_upper = (u >= self.upper - rounding) & (slope <= 0)
+        return ~(at_lower | at_upper | (self.lower == self.upper))
+
+    def turned_blocks(self, blocks: Tensor) -> Tensor:
+        """Matrices [N, D, D] to the axes of the nodes, and back."""
+        if self.mirror is None:
+            return blocks
+        eye = torch.eye(blocks.shape[-1], dtype=blocks.dtype, device=blocks.device)
+        w = self.mirror.to(blocks.dtype)
+        turn = eye - 2 * w[:, :, None] * w[:, None, :]
+        return turn @ blocks @ turn
+
+
+def node_bounds(
+    blocks: Blocks, walls: Walls | None, obstacles: list[Any], like: Tensor, time: float | Tensor
+) -> NodeBounds | None:
+    """The bounds that walls and obstacles set; None without any.
+
+    Of several obstacles at a node, one that is sticky counts, otherwise the first.
+
+    Args:
+        blocks: the active blocks.
+        walls, obstacles: as a `Step` has them.
+        like: gives dtype and device.
+        time: [s].
+
+    Raises:
+        NotImplementedError: for friction, mirrors, and boundaries that are no obstacles.
+    """
+    if walls is None and not obstacles:
+        return None
+    positions = blocks.node_positions(like.dtype)
+    lower = torch.full_like(positions, -math.inf)
+    bounds = NodeBounds(lower, torch.full_like(positions, math.inf))
+    if walls is not None:
+        _add_walls(bounds, blocks, walls, positions)
+    scene = blocks.node_scene() if blocks.grid.scenes > 1 else None
+    for obstacle in obstacles:
+        _add_obstacle(bounds, obstacle, positions, scene, time)
+    return bounds
+
+
+def _add_walls(bounds: NodeBounds, blocks: Blocks, walls: Walls, positions: Tensor) -> None:
+    for number, face in enumerate(walls.faces(blocks.grid)):
+        axis, above = divmod(number, 2)
+        if face.kind == "open":
+            continue
+        if face.kind == "mirror" or face.friction != 0:
+            what = "mirrors" if face.kind == "mirror" else "friction of walls"
+            raise NotImplementedError(f"an implicit step has no {what} yet: use slip, separate or sticky walls")
+        at = positions[:, axis]
+        near = ON_FACE * blocks.grid.dx
+        touching = at >= face.plane - near if above else at <= face.plane + near
+        axes = slice(None) if face.kind == "sticky" else slice(axis, axis + 1)
+        rows = touching[:, None]
+        low, high = bounds.lower[:, axes], bounds.upper[:, axes]
+        if face.kind != "separate" or not above:
+            low.copy_(torch.where(rows, low.clamp_min(0), low))
+        if face.kind != "separate" or above:
+            high.copy_(torch.where(rows, high.clamp_max(0), high))
+
+
+def _add_obstacle(
+    bounds: NodeBounds, obstacle: Any, positions: Tensor, scene: Tensor | None, time: float | Tensor
+) -> None:
+    if not isinstance(obstacle, Obstacle):
+        raise NotImplementedError(
+            f"an implicit step takes obstacles alone as boundaries, got {type(obstacle).__name__}"
+        )
+    if isinstance(obstacle.friction, Tensor) or obstacle.friction != 0:
+        raise NotImplementedError("an implicit step has no friction of obstacles yet: use slip, separate or sticky")
+    contact = obstacle.contact_at(positions, scene, time)
+    if contact is None:
+        return
+    touching, normal, surface_velocity = contact
+    surface = torch.zeros_like(positions) if surface_velocity is None else surface_velocity.expand_as(positions)
+    if obstacle.kind == "sticky":
+        rows = touching[:, None] & (bounds.lower != bounds.upper)  # what a wall holds stays
+        surface = bounds.turned(surface)
+        bounds.lower = torch.where(rows, surface, bounds.lower)
+        bounds.upper = torch.where(rows, surface, bounds.upper)
+        return
+    normal = torch.where(bounds.lower.isfinite() | bounds.upper.isfinite(), 0, normal)
+    length = normal.norm(dim=-1, keepdim=True)
+    taken = torch.zeros_like(touching) if bounds.mirror is None else (bounds.mirror != 0).any(-1)
+    rows = (touching & ~taken)[:, None] & (length > 1e-3)
+    normal = normal / torch.where(length > 0, length, 1)
+    axis = torch.nn.functional.one_hot(normal.abs().argmax(-1), positions.shape[1]).to(normal.dtype)
+    sign = torch.where((normal * axis).sum(-1, keepdim=True) < 0, -1.0, 1.0).to(normal.dtype)
+    # The reflection that takes the axis to −sign times the normal, whose difference does not cancel.
+    w = axis * sign + normal
+    w = w / w.norm(dim=-1, keepdim=True)
+    old = torch.zeros_like(w) if bounds.mirror is None else bounds.mirror
+    bounds.mirror = torch.where(rows, w, old)
+    speed = (surface * normal).sum(-1, keepdim=True)
+    limit = torch.where(sign > 0, -speed, speed)  # of the component along the axis, u = −sign v · n
+    fixed = obstacle.kind == "slip"
+    entry = rows & (axis > 0)
+    bounds.lower = torch.where(entry & ((sign < 0) | fixed), limit, torch.where(entry, -math.inf, bounds.lower))
+    bounds.upper = torch.where(entry & ((sign > 0) | fixed), limit, torch.where(entry, math.inf, bounds.upper))

@@ -1,0 +1,42 @@
+"""Static equilibrium: an implicit step that inertia does not hinder."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+
+from ..errors import check_number
+
+if TYPE_CHECKING:
+    from ..state import State
+    from ..step import Step
+
+
+def equilibrium(step: Step, state: State, dt: float) -> State:
+    """The state at rest under gravity, walls and obstacles: one implicit step, so long that inertia is nothing.
+
+    The shape functions are those of the given positions, so that the displacements may be any (total Lagrangian on the
+    lattice). A body that nothing holds falls as far as it does in dt.
+
+    Args:
+        step: with `integrator="implicit"`; static loads want a tolerance of 1e-6 or less.
+        state: particles; their velocities do not count.
+        dt: [s], at least some hundred periods of the slowest vibration: inertia counts as 1/(ω dt)² beside the
+            stiffness.
+
+    Returns:
+        The particles where they come to rest, of velocity zero, at the time of `state`. `step.solve_report` tells
+        whether the solve converged.
+
+    Raises:
+        ValueError: for an explicit step, or a dt that is not positive.
+
+    Differentiable as the step is: a stiffness can be found from a sag (examples/beam_stiffness.py).
+    """
+    if step.integrator is None:
+        raise ValueError("equilibrium needs a step with integrator='implicit'")
+    check_number("dt", dt, "a positive number of seconds", lambda v: v > 0)
+    nothing = torch.zeros_like(state.v)
+    rest = step(state.replace(v=nothing, C=None), dt)
+    return rest.replace(v=nothing, C=None if rest.C is None else torch.zeros_like(rest.C), time=state.time)

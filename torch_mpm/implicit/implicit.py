@@ -1,0 +1,170 @@
+"""Backward Euler on the node velocities as the integrator of a `Step`."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from ..boundaries.obstacles import Obstacle, motion_tensors
+from ..capture import is_captured, is_traced, outside_transforms, without_transforms
+from ..errors import check_count, check_number
+from ..failures import Problem, unsolved_steps
+from .adjoint import differentiable
+from .bounds import node_bounds
+from .newton import Minimum, Options, minimise
+from .system import ImplicitSystem
+
+if TYPE_CHECKING:
+    from ..grid import Blocks
+    from ..state import State
+    from ..step import Step
+
+
+class ImplicitReport(NamedTuple):
+    """How the latest step was solved; tensors [B] on the device of the particles."""
+
+    converged: Tensor
+    """bool: whether the residual came down to its tolerance, or to rounding."""
+    residual: Tensor
+    """√(g · B⁻¹ g / Σ m) [m/s] of what is left of the gradient g of the energy, with the node blocks B; float64."""
+    iterations: Tensor
+    """Of Newton's method, int32."""
+    cg_iterations: Tensor
+    """Of conjugate gradients, in all of these, int32."""
+
+
+class Implicit:
+    """Backward Euler: `Step(integrator=Implicit(...))`, or `integrator="implicit"` for the defaults.
+
+    The node velocities minimise ½ Σ m |v − v*|² + Σ V ψ((I + dt L(v)) F) (Martin et al. 2011; Gast et al. 2015), scene
+    by scene, by Newton's method with line search and conjugate gradients preconditioned by the blocks of the nodes. Any
+    dt is stable. Walls and obstacles bound the velocities of their nodes in the solve. Laws with an elastic energy take
+    part; where they are plastic the flow follows the solve, at the start of the next step.
+
+    Args:
+        tolerance: of the residual relative to that of v*, the velocities without elastic forces, in (0, 1).
+        max_iterations: of Newton's method in a step.
+        max_cg_iterations: of conjugate gradients in each of these.
+        adjoint_tolerance: relative, of the one linear solve of a backward pass.
+
+    Attributes:
+        report: `ImplicitReport` of the latest step, None before the first.
+        adjoint_converged: bool [B], whether the solve of the latest backward pass converged; None before the first.
+            Where it did not, the gradients of that scene are NaN.
+
+    Raises:
+        TypeError, ValueError: for a wrong argument.
+    """
+
+    def __init__(
+        self,
+        tolerance: float = 1e-4,
+        max_iterations: int = 30,
+        max_cg_iterations: int = 1000,
+        adjoint_tolerance: float = 1e-8,
+    ) -> None:
+        for name, value in (("tolerance", tolerance), ("adjoint_tolerance", adjoint_tolerance)):
+            check_number(name, value, "between 0 and 1", lambda v: 0 < v < 1)
+        check_count("max_iterations", max_iterations, 1)
+        check_count("max_cg_iterations", max_cg_iterations, 1)
+        self.options = Options(float(tolerance), int(max_iterations), int(max_cg_iterations))
+        self.adjoint_tolerance = float(adjoint_tolerance)
+        self.report: ImplicitReport | None = None
+        self.adjoint_converged: Tensor | None = None
+        self._unsolved: Tensor | None = None
+        self._residual: Tensor | None = None
+
+    def velocities(
+        self, step: Step, blocks: Blocks, state: Any, mass: Tensor, start: Tensor, dt: float | Tensor
+    ) -> Tensor:
+        """The node velocities at the end of a step [N, D] [m/s].
+
+        Args:
+            step: whose law, walls and boundaries count.
+            blocks: the active blocks.
+            state: particles after the return map.
+            mass: of the nodes [N] [kg].
+            start: node velocities after gravity [N, D] [m/s].
+            dt: [s], a number or a tensor [], [1] or [B].
+
+        Differentiable by everything that the state, the law and `start` depend on, by one linear solve.
+        """
+        system = ImplicitSystem(blocks, step.law, state, mass, start, dt, step.stress_form)
+        with torch.no_grad():
+            fixed = system.detached()
+            bounds = node_bounds(blocks, step.walls, step.boundaries.entries, start, state.time)
+            minimum = minimise(fixed, bounds, self.options)
+        self._record(minimum)
+        if not torch.is_grad_enabled():
+            return minimum.v
+        return differentiable(self, system, fixed, bounds, minimum)
+
+    def _record(self, minimum: Minimum) -> None:
+        self.report = ImplicitReport(minimum.converged, minimum.residual, minimum.iterations, minimum.cg_iterations)
+        with outside_transforms(), torch.inference_mode(False):
+            missed = without_transforms(~minimum.converged).to(torch.int32)
+            residual = without_transforms(minimum.residual)
+            kept = self._unsolved
+            same = kept is not None and kept.device == missed.device and kept.shape == missed.shape
+            self._unsolved = kept + missed if same and kept is not None else missed
+            largest = self._residual if same and self._residual is not None else torch.zeros_like(residual)
+            self._residual = torch.where(missed > 0, torch.maximum(largest, residual), largest)
+
+    def problems(self) -> dict[str, Problem]:
+        """Scenes whose steps missed their tolerance, for `Step.check`."""
+        if self._unsolved is None or self._residual is None:
+            return {}
+        return unsolved_steps(self._unsolved, self._residual)
+
+    def reset(self) -> None:
+        """Forget the steps so far."""
+        self.report = self._unsolved = self._residual = self.adjoint_converged = None
+
+    def forget(self, scenes: Tensor) -> None:
+        """Forget the steps of scenes, bool [B]."""
+        for kept in (self._unsolved, self._residual):
+            if kept is not None:
+                kept.masked_fill_(scenes, 0)
+
+
+def check_implicit(step: Step, state: State) -> None:
+    """What an implicit step does not have yet.
+
+    Raises:
+        NotImplementedError: for counted impulses, obstacles with gradients, and steps that are
+            compiled, captured or transformed.
+    """
+    obstacles = [b for b in step.boundaries.entries if isinstance(b, Obstacle)]
+    motions = [t for b in obstacles for t in motion_tensors(b)]
+    if is_traced(state.x) or is_captured(state.x) or torch._C._are_functorch_transforms_active():
+        raise NotImplementedError(
+            "an implicit step looks at how far its solve is: it cannot be compiled, captured in a CUDA graph, or "
+            "transformed by torch.func; its gradients are those of backward() and torch.autograd.grad"
+        )
+    reasons = {
+        "impulses on boundaries": state.impulse is not None,
+        "obstacles that require a gradient": torch.is_grad_enabled() and any(t.requires_grad for t in motions),
+    }
+    for what, present in reasons.items():
+        if present:
+            raise NotImplementedError(f"an implicit step does not take {what} yet: use integrator='explicit'")
+
+
+INTEGRATORS = ("explicit", "implicit")
+
+
+def as_integrator(value: Any) -> Implicit | None:
+    """The integrator of a step, None for the explicit one.
+
+    Raises:
+        TypeError, ValueError: for what is none.
+    """
+    if isinstance(value, Implicit):
+        return value
+    if not isinstance(value, str):
+        raise TypeError(f"integrator must be 'explicit', 'implicit' or an Implicit, got {type(value).__name__}")
+    if value not in INTEGRATORS:
+        raise ValueError(f"integrator must be one of {sorted(INTEGRATORS)} or an Implicit, got {value!r}")
+    return Implicit() if value == "implicit" else None

@@ -1,0 +1,154 @@
+"""The energy of an implicit step as a function of the node velocities, and its derivatives.
+
+    E(v) = ½ Σ_i m_i |v_i − v*_i|² + Σ_p V_p ψ((I + dt L_p(v)) F_p),
+
+with v* the velocities after gravity. Its gradient is the residual of backward Euler: the scatter of an explicit step,
+with the stress of the trial deformation. The ops are differentiable, so that the residual is, by all that it reads.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ..grid import Blocks
+from ..laws.material import Material
+from ..ops import advance, gather, implicit_node_blocks, scatter
+from ..ops.arguments import per_particle
+from ..parameters import Overlay
+
+
+@dataclasses.dataclass
+class ImplicitSystem:
+    """What a step asks of its nodes.
+
+    Attributes:
+        blocks: the active blocks.
+        law: the material.
+        state: particles after the return map.
+        mass: of the nodes [N] [kg].
+        start: v* [N, D] [m/s].
+        dt: [s], a number or a tensor [], [1] or [B].
+        stress_form: "mls" or "gradient".
+        volume: of the particles that have an energy, zero for the others [P] [m³].
+    """
+
+    blocks: Blocks
+    law: Material
+    state: Any
+    mass: Tensor
+    start: Tensor
+    dt: float | Tensor
+    stress_form: str
+    _trial: tuple[Tensor, Any] | None = None
+
+    def __post_init__(self) -> None:
+        scene, P = self.blocks.particle_scene(), self.state.x.shape[0]
+        dt = self.dt
+        if isinstance(dt, Tensor):
+            dt = per_particle(dt.to(self.state.x.dtype).reshape(-1), scene, P)
+        self.step = dt
+        meant = self.law.trial_energy(Overlay(self.state, C=None), self.state).detach().isfinite()
+        self.volume = torch.where(meant, self.state.volume, 0)
+        self.impulse_weight = self.volume * dt
+        self.tangent_weight = (self.impulse_weight * dt).detach()
+        slots = self.blocks.block_scene()
+        self.slot_scene = slots.clamp_min(0).long()
+
+    @functools.cached_property
+    def stiffness(self) -> Tensor:
+        """V times an upper bound of the moduli at the start, float64 [P] [J]."""
+        with torch.no_grad():
+            return torch.where(self.volume > 0, self.volume * self.law.stiffness(self.state), 0).double()
+
+    def detached(self) -> ImplicitSystem:
+        """The same for no gradients."""
+        fields = {}
+        for name in ("F", "J", "volume"):
+            value = getattr(self.state, name)
+            fields[name] = None if value is None else value.detach()
+        extra = {name: value.detach() for name, value in self.state.extra.items()}
+        state = Overlay(self.state, x=self.state.x.detach(), extra=extra, **fields)
+        dt = self.dt.detach() if isinstance(self.dt, Tensor) else self.dt
+        return ImplicitSystem(
+            self.blocks, self.law, state, self.mass.detach(), self.start.detach(), dt, self.stress_form
+        )
+
+    def trial(self, v: Tensor) -> Any:
+        """The particles with the deformation to which node velocities bring them."""
+        if self._trial is not None and self._trial[0] is v:
+            return self._trial[1]
+        state, grid = self.state, self.blocks.grid
+        mls = self.stress_form == "mls"
+        value, moment, gradient = gather(
+            self.blocks, state.x, v, moment=mls, gradient=not mls, moment_scale=grid.inverse_inertia
+        )
+        motion = moment if mls else gradient
+        _, F, J = advance(state.x, value, self.dt, motion, state.F, state.J, self.blocks.particle_scene(), grid.scenes)
+        trial = Overlay(state, F=F, J=J, C=motion, step=self.step)
+        if not v.requires_grad and not torch.is_grad_enabled():
+            self._trial = v, trial
+        return trial
+
+    def energy(self, v: Tensor) -> tuple[Tensor, Tensor]:
+        """E of each scene, float64 [B] [J], infinite where a particle has none; and a size, of which E has an error of
+        some units in the last place: E, and the work of stresses V √(2 K ψ) and momenta on strains and velocities that
+        are rounded.
+        """
+        stored = self.law.trial_energy(self.trial(v), self.state)
+        stored = torch.where(self.volume > 0, self.volume * stored, 0).double()
+        strained = stored.abs() + (2 * self.stiffness * stored.abs()).sqrt()
+        mass, change = self.mass[:, None].double(), (v - self.start).double()
+        kinetic = 0.5 * self.node_sum(mass * change * change)
+        moved = self.node_sum(mass * change.abs() * v.abs())
+        total, size = self.particle_sum(torch.stack([stored, strained], 1)).unbind(1)
+        return kinetic + total, kinetic + moved + size
+
+    def residual(self, v: Tensor) -> Tensor:
+        """∂E/∂v [N, D] [kg m/s]; differentiable by everything."""
+        grid, x = self.blocks.grid, self.state.x
+        stress = self.law.trial_stress(self.trial(v), self.state)
+        meant = (self.volume > 0)[:, None, None]  # the stress of others may be NaN
+        impulse = torch.where(meant, self.impulse_weight[:, None, None] * torch.where(meant, stress, 0), 0)
+        mls = self.stress_form == "mls"
+        nothing = x.new_zeros(()).expand(x.shape)
+        forces = scatter(
+            *(self.blocks, x, nothing, impulse if mls else None, None if mls else impulse, grid.inverse_inertia)
+        )
+        return self.mass[:, None] * (v - self.start) + forces
+
+    def tangent(self, v: Tensor, projected: bool = True) -> Tensor:
+        """The tangents of the particles with their weights, as the ops of the Hessian take them [P, n]."""
+        return self.law.trial_tangent(self.trial(v), self.state, self.tangent_weight, projected)
+
+    def diagonal(self, tangent: Tensor) -> Tensor:
+        """The node blocks of the Hessian [N, D, D] [kg]."""
+        blocks = implicit_node_blocks(self.blocks, self.state.x, tangent, self.stress_form)
+        return blocks + torch.diag_embed(self.mass[:, None].expand(-1, blocks.shape[1]))
+
+    # -- sums over scenes
+
+    def node_sum(self, value: Tensor) -> Tensor:
+        """Sum of a node tensor [N, ...] over each scene, float64 [B]."""
+        by_slot = value.double().reshape(len(self.slot_scene), -1).sum(1)
+        return by_slot.new_zeros(self.blocks.grid.scenes).index_add_(0, self.slot_scene, by_slot)
+
+    def particle_sum(self, value: Tensor) -> Tensor:
+        """Sum of a particle tensor [P, K] over each scene [B, K]."""
+        scene, scenes = self.blocks.scene, self.blocks.grid.scenes
+        if scene is None:
+            return value.sum(0, keepdim=True)
+        value = torch.where((scene >= 0)[:, None], value, 0)
+        return value.new_zeros(scenes, value.shape[1]).index_add_(0, scene.clamp(0, scenes - 1), value)
+
+    def of_nodes(self, value: Tensor) -> Tensor:
+        """A tensor [B] as one value per node [N, 1]."""
+        return value[self.slot_scene].repeat_interleave(self.blocks.grid.nodes_per_block)[:, None]
+
+    def of_particles(self, value: Tensor) -> Tensor:
+        """A tensor [B] as one value per particle [P, 1]."""
+        return per_particle(value, self.blocks.particle_scene(), self.state.x.shape[0])[:, None]
