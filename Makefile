@@ -31,8 +31,11 @@ $(STAMP): pyproject.toml
 	TORCH_MPM_SKIP_BUILD=1 $(PY) -m pip install -q --no-build-isolation -e '.[dev]'
 	touch $@
 
+# A process per core, with one thread each; then those with loops of every kind again, with all threads in one process.
+THREADED := tests/test_rollouts.py tests/test_topology.py tests/ops/test_transfer_cpu.py tests/boundaries/test_contact.py
 test: build
-	$(PY) -m pytest $(QUICK)
+	OMP_NUM_THREADS=1 $(PY) -m pytest $(QUICK) -n auto --dist worksteal
+	$(PY) -m pytest $(QUICK) $(THREADED)
 
 check: $(STAMP)
 	$(PY) -m ruff check .

@@ -170,6 +170,7 @@ NO_GRADIENT = {
     "survey",
     *("law_stiffness", "law_wave_modulus", "law_update_double_backward", "law_energy_double_backward"),
     *("heat_stencil", "heat_patches"),
+    *("law_tangent", "implicit_apply", "implicit_node_blocks", "implicit_cg"),  # they refuse: see the adjoint of a step
 }
 
 LAWS = {
