@@ -29,6 +29,7 @@ import torch
 from . import common, regressions
 
 SAND = ["dataset.splits={train=1000}", "dataset.particles=2000"]
+WATER = ["dataset.splits={train=32}", "dataset.scenes_per_shard=8", "dataset.frames=101"]
 SETS: dict[str, list[tuple[str, str, list[str], int]]] = {
     "cuda": [
         ("Sand, 1000 x 2000", "sand", SAND, 1),
@@ -38,8 +39,8 @@ SETS: dict[str, list[tuple[str, str, list[str], int]]] = {
         ("Melting, 128 scenes", "melting", ["dataset.splits={train=128}"], 1),
     ],
     "cpu": [
-        ("Water drop, 32 scenes", "water_drop", ["dataset.splits={train=32}", "dataset.scenes_per_shard=16",
-                                                 "dataset.frames=101"], 1),
+        ("Water drop, 32 scenes", "water_drop", WATER, 1),
+        ("Water drop, 32 scenes, a process per core", "water_drop", WATER, len(os.sched_getaffinity(0))),
         ("Sand, 32 x 2000", "sand", ["dataset.splits={train=32}", "dataset.particles=2000",
                                      "dataset.scenes_per_shard=16", "dataset.frames=101"], 1),
     ],
