@@ -10,6 +10,7 @@ from torch import nn
 
 import torch_mpm as mpm
 from torch_mpm import checkpoints
+from torch_mpm.implicit import Implicit
 
 N, DT = 13, 1e-3
 
@@ -103,6 +104,21 @@ def test_steps_that_are_taken_again_do_not_count_again(checkpoint, device):
     end.x.sum().backward()
     assert before["heat"] >= N and before["dt"] == 3
     assert {kind: int(problem.count.sum()) for kind, problem in step.failures().problems.items()} == before
+
+
+@pytest.mark.parametrize("checkpoint", [4, mpm.Checkpoints(states=3)])
+def test_implicit_steps_that_are_taken_again_do_not_count_again(checkpoint, device):
+    grid = mpm.Grid(0.1, (0.0, 0.0), (1.0, 1.0))
+    solver = Implicit(tolerance=1e-12, max_iterations=1)
+    step = mpm.Step(grid, mpm.NeoHookean(E=1e6, nu=0.3), (0.0, -9.8), walls="sticky", integrator=solver)
+    state = block_state(2, device)
+    v = state.v.clone().requires_grad_()
+    end = mpm.rollout(step, state.replace(v=v), N, 1e-2, checkpoint=checkpoint)
+    before = int(solver._unsolved.sum())
+    end.x.sum().backward()
+    assert before > 0 and int(solver._unsolved.sum()) == before
+    mpm.estimate_rollout(step, state, N, 1e-2)
+    assert int(solver._unsolved.sum()) == before
 
 
 # ---- binomial

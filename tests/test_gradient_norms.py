@@ -60,6 +60,28 @@ def test_norms_are_those_of_the_states_on_the_way(kind, checkpoint, device):
     assert v.grad is not None and len(v._backward_hooks or ()) == 0  # nothing stays with the user
 
 
+def test_no_particles_and_no_time(device):
+    step, state = make("in one op"), batch(device)
+    none = state.select(torch.zeros(0, dtype=torch.int64, device=device))
+    norms, v = mpm.GradientNorms(), none.v.clone().requires_grad_()
+    mpm.rollout(step, none.replace(v=v), 3, 1e-3, norms=norms).x.sum().backward()
+    assert float(norms.fields["v"].nan_to_num().abs().max()) == 0
+    with pytest.raises(ValueError, match="dt"):
+        mpm.rollout(step, state, 3, 0.0, norms=mpm.GradientNorms())
+
+
+def test_a_start_that_is_used_elsewhere_is_recorded_as_a_start(device):
+    step, state = make("in one op"), batch(device)
+    norms, scale = mpm.GradientNorms(), torch.ones((), dtype=torch.float64, device=device, requires_grad=True)
+    v = scale * torch.ones_like(state.v)
+    found = []
+    for other in (0.0, 1e6):
+        end = mpm.rollout(step, state.replace(v=v), 3, 1e-3, norms=norms)
+        (end.x.sum() + other * v.sum()).backward(retain_graph=True)
+        found.append(norms.fields["v"].clone())
+    torch.testing.assert_close(found[1], found[0], rtol=1e-12, atol=0)
+
+
 def spring(rate, device, n=60, scenes=2):
     """Rollouts of x ← rate x of each scene, whose gradients are powers of the rate."""
     rates = torch.tensor(rate, dtype=torch.float64, device=device)

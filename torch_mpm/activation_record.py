@@ -105,8 +105,8 @@ class ActivationRecord:
                 status[0, 2:7:2].masked_fill_(scenes.any(), -1)
 
 
-RECORDS = ("_activations", "unsolved", "residual")
-"""Attributes in which steps and heat keep what became of them."""
+RECORDS = ("_activations", "unsolved", "residual", "_unsolved", "_residual", "report", "adjoint_converged")
+"""Attributes in which steps, heat and integrators keep what became of them."""
 
 
 @contextlib.contextmanager
@@ -118,12 +118,13 @@ def aside(step: Any, x: Tensor) -> Iterator[None]:
         x: a tensor on the device of the particles.
     """
     modules = [m for m in step.modules() if hasattr(m, "_activations")] if isinstance(step, torch.nn.Module) else []
-    kept = [(m, name, getattr(m, name)) for m in modules for name in RECORDS if hasattr(m, name)]
-    for module, name, _ in kept:
-        setattr(module, name, ActivationRecord() if name == "_activations" else None)
+    integrators = [i for m in modules if (i := getattr(m, "integrator", None)) is not None]
+    kept = [(m, name, getattr(m, name)) for m in (*modules, *integrators) for name in RECORDS if hasattr(m, name)]
+    for owner, name, _ in kept:
+        setattr(owner, name, ActivationRecord() if name == "_activations" else None)
     try:
         with torch.random.fork_rng([x.device] if x.is_cuda else []):
             yield
     finally:
-        for module, name, value in kept:
-            setattr(module, name, value)
+        for owner, name, value in kept:
+            setattr(owner, name, value)

@@ -210,6 +210,7 @@ def offloaded(state: State) -> Iterator[None]:
         moves = t.is_cuda and t.is_floating_point() and t.dim() > 0 and t.shape[0] == P
         if not moves or t.untyped_storage().data_ptr() in shared:
             return t.device, t
+        t = t.contiguous() if 0 in t.stride() else t  # one that was expanded
         there = torch.empty_strided(t.shape, t.stride(), dtype=t.dtype, device="cpu", pin_memory=True)
         return t.device, there.copy_(t.detach(), non_blocking=True)
 

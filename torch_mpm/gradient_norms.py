@@ -53,8 +53,10 @@ class GradientNorms:
             dt: time step [s].
         """
         self._steps, self._scenes, self._fields = list(steps), scenes, {}
-        rate: Any = 1 / dt
-        if isinstance(dt, Tensor):  # of which paused scenes have zero
+        rate: Any
+        if not isinstance(dt, Tensor):
+            rate = 1 / dt if dt else 0.0  # which the step refuses
+        else:  # of which paused scenes have zero
             rate = torch.where(dt > 0, 1 / dt.double(), 0).detach().reshape(-1)
         self._units = {"x": dx, "v": dx * rate, "C": rate}
 
@@ -75,10 +77,11 @@ class GradientNorms:
             def record(grad: Tensor | None) -> None:
                 if grad is None:  # of an output among others that have one
                     return
-                squares = grad.double().square().reshape(len(grad), -1).sum(1)
+                squares = grad.double().square().reshape(len(grad), math.prod(grad.shape[1:])).sum(1)
                 norms[row] = sum_by_scene(squares, scene, self._scenes).sqrt().nan_to_num(math.inf, posinf=math.inf)
 
-            t = t.view_as(t) if t.is_leaf else t  # whose hooks would stay with the user
+            if t.is_leaf or k == self._steps[0]:  # the user's, with whom hooks would stay, and who may use it elsewhere
+                t = t.view_as(t)
             t.register_hook(record)
             return t
 

@@ -95,7 +95,7 @@ enum class CGPhase : int { start, curvature, step };
 
 MPM_HD void advance_scene(ConjugateGradients& s, CGPhase phase, double sum, double relative) {
   if (phase == CGPhase::start) {
-    s = {sum, sum, 0, 0, 0, sum > 0 ? kSolving : kConverged};
+    s = {sum, sum, 0, 0, 0, sum > 0 ? kSolving : sum < 0 ? kNegativeCurvature : kConverged};
   } else if (s.state != kSolving) {
     s.step = s.turn = 0;
   } else if (phase == CGPhase::curvature) {
@@ -105,7 +105,12 @@ MPM_HD void advance_scene(ConjugateGradients& s, CGPhase phase, double sum, doub
     s.turn = sum / s.square;
     s.square = sum;
     s.iterations++;
-    if (sum <= relative * relative * s.first) s.state = kConverged;
+    if (sum < 0) {  // a preconditioner that rounding has left indefinite
+      s.state = kNegativeCurvature;
+      s.turn = 0;
+    } else if (sum <= relative * relative * s.first) {
+      s.state = kConverged;
+    }
   }
   if (!(sum - sum == 0)) {
     s.state = kNotFinite;

@@ -366,6 +366,43 @@ def test_plastic_laws_flow_after_the_solve(law, device):
     assert flowed and float(state.v.norm(dim=1).max()) < 3.2
 
 
+def test_stiff_fluids_in_float32_never_pass_for_solved(device):
+    """Where node blocks are rank one to rounding a residual of zero would be a lie."""
+    grid = mpm.Grid(0.05, (0.0,) * 3, (1.0,) * 3)
+    points = mpm.seed.box((0.4,) * 3, (0.6, 0.6, 0.55), grid, per_cell=8)
+    state = mpm.State.at_rest(points, density=1000.0, dtype=torch.float32, device=device)
+    generator = torch.Generator().manual_seed(0)
+    state = state.replace(v=torch.randn(len(state), 3, generator=generator).to(device))
+    step = mpm.Step(grid, mpm.WeaklyCompressible(2.2e9), integrator="implicit")
+    after = step(state, 3e4 * 0.05 / 1483)
+    report = step.solve_report
+    assert float(report.residual) > 0 and (int(report.iterations) > 0 or not bool(report.converged))
+    assert bool(after.x.isfinite().all())
+
+
+def test_gradients_through_plastic_laws_are_refused_at_once():
+    grid, state = bar(2)
+    v = state.v.clone().requires_grad_()
+    with pytest.raises(NotImplementedError, match="second derivatives of the energy, which von_mises has not"):
+        step_of(grid, mpm.VonMises(E=1e6, nu=0.3, yield_stress=1e3))(state.replace(v=v), 1e-3)
+
+
+def test_no_scene(device):
+    grid = mpm.Grid(0.125, (0.0, 0.0), (1.0, 1.0), scenes=0)
+    empty = mpm.State(**{name: torch.zeros(0, *shape, device=device) for name, shape in
+                         {"x": (2,), "v": (2,), "mass": (), "volume": ()}.items()},
+                      scene=torch.zeros(0, dtype=torch.int32, device=device))  # fmt: skip
+    assert len(step_of(grid, mpm.NeoHookean(E=1e5, nu=0.3))(empty, 1e-3)) == 0
+
+
+def test_an_equilibrium_does_not_conduct(device):
+    grid, state = bar(2, device)
+    heat = mpm.Heat(grid, conductivity=50.0, specific_heat=400.0)
+    step = mpm.Step(grid, mpm.NeoHookean(E=1e5, nu=0.3), heat=heat, integrator="implicit")
+    with pytest.raises(ValueError, match="equilibrium needs a step without heat"):
+        equilibrium(step, state, 1e3)
+
+
 def test_heat_in_an_implicit_step(device):
     """Conduction in a body at rest is that of an explicit step, and no heat is lost."""
     grid, state = bar(2, device)

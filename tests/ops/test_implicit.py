@@ -277,6 +277,22 @@ def test_scenes_are_solved_apart(device):
     assert solve.solution.isfinite().all()
 
 
+@pytest.mark.parametrize("sign", [-1.0, 0.0])
+def test_an_indefinite_preconditioner_is_no_convergence(sign, device):
+    """As rounding leaves one of stiff blocks: r · B⁻¹ r is negative, at the start or later."""
+    case = Case(2, "quadratic", device)
+    rhs = case.nodes(4) * case.mass[:, None]
+    inverse = case.inverse()
+    inverse[..., 1, 1] *= sign
+    if sign:
+        inverse[..., 0, 0] *= sign
+    else:  # of both signs
+        inverse[..., 1, 1] = -2 * inverse[..., 0, 0]
+    relative = torch.full((1,), 1e-10, dtype=torch.float64, device=device)
+    solve = ops.implicit_cg(case.blocks, case.particles.x, rhs, case.mass, inverse, case.tangent, relative, 1000)
+    assert solve.state.tolist() == [NEGATIVE_CURVATURE]
+
+
 def test_wrong_arguments_are_named():
     case = Case(2, "quadratic", "cpu")
     x, along = case.particles.x, case.nodes(0)

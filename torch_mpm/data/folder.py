@@ -104,6 +104,7 @@ class DatasetRecord:
             words = json.loads(path.read_bytes())
             if words.pop("format") != FORMAT:
                 raise DamagedFileError(path, "is not of this version of torch_mpm", remedy)
+            words.pop("connectivity_radius", None)  # of some folders; it was never set
             for name in ("seed", "scenes_per_shard", "frames"):
                 words[name] = int(words[name])
             for name in ("frame_interval", "dx"):

@@ -15,8 +15,10 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from ..laws.compiled import CompiledLaw
 from ..ops import implicit_cg
 from ..ops.implicit import CONVERGED
+from ..ops.registry import LAWS
 from .bounds import NodeBounds
 from .newton import Minimum, inverse_blocks
 from .system import ImplicitSystem
@@ -32,6 +34,12 @@ def differentiable(
     residual = system.residual(minimum.v.detach())
     if not residual.requires_grad:
         return minimum.v
+    for part in system.law.modules():
+        if isinstance(part, CompiledLaw) and not LAWS[part.name].twice_differentiable_energy:
+            raise NotImplementedError(
+                f"gradients of implicit steps need second derivatives of the energy, which {part.name} has not: "
+                "use integrator='explicit', or torch.no_grad()"
+            )
     result: Tensor = _Solution.apply(residual, minimum.v, owner, fixed, bounds, minimum.free)
     return result
 

@@ -91,11 +91,14 @@ class Implicit:
 
         Differentiable by everything that the state, the law and `start` depend on, by one linear solve.
         """
+        if not blocks.grid.scenes:
+            return start
         system = ImplicitSystem(blocks, step.law, state, mass, start, dt, step.stress_form)
         with torch.no_grad():
             fixed = system.detached()
             bounds = node_bounds(blocks, step.walls, step.boundaries.entries, start, state.time)
             minimum = minimise(fixed, bounds, self.options)
+            fixed.forget()
         self._record(minimum)
         if not torch.is_grad_enabled():
             return minimum.v

@@ -61,6 +61,9 @@ def free_components(system: ImplicitSystem, bounds: NodeBounds | None, v: Tensor
 def inverse_blocks(system: ImplicitSystem, bounds: NodeBounds | None, tangent: Tensor, free: Tensor) -> Tensor:
     """B⁻¹ of the node blocks of the free components [N, D, D] [1/kg], zero for the others."""
     blocks = system.diagonal(tangent).double()
+    # Rounding of stiff blocks may leave a negative eigenvalue, with which a residual could seem to be zero.
+    ridge = 16 * torch.finfo(system.mass.dtype).eps * blocks.diagonal(dim1=1, dim2=2).sum(1)
+    blocks = blocks + torch.diag_embed(ridge[:, None].expand(blocks.shape[:2]))
     if bounds is not None:
         blocks = bounds.turned_blocks(blocks)
     both = free[:, :, None] & free[:, None, :]
@@ -113,7 +116,7 @@ def minimise(system: ImplicitSystem, bounds: NodeBounds | None, options: Options
         free = free_components(system, bounds, v, gradient)
         inverse = inverse_blocks(system, bounds, convex, free)
         change = _times(inverse, gradient)
-        residual = (system.node_sum(gradient * change).clamp_min(0) / total_mass).sqrt()
+        residual = (system.node_sum(gradient * change).abs() / total_mass).sqrt()
         first = residual if first is None else first
         floor = _rounding(system, inverse, v, wave, momentum, total_mass)
         # One iteration at least: a smooth load may be smaller than the rounding of stresses, which averages out.

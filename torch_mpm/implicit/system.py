@@ -59,6 +59,11 @@ class ImplicitSystem:
         slots = self.blocks.block_scene()
         self.slot_scene = slots.clamp_min(0).long()
 
+    def forget(self) -> None:
+        """Let go of what only the search for the minimum reads."""
+        self._trial = None
+        self.__dict__.pop("stiffness", None)
+
     @functools.cached_property
     def stiffness(self) -> Tensor:
         """V times an upper bound of the moduli at the start, float64 [P] [J]."""
