@@ -132,6 +132,16 @@ def test_binomial_work_is_the_least(n, states):
     assert mpm.Checkpoints(states=states).repetitions(n) == least
 
 
+def test_a_thousand_states_and_more():
+    state = block_state(2)
+    x = state.x.clone().requires_grad_()
+    double = lambda now, dt: now.replace(x=1.001 * now.x)  # noqa: E731
+    end = mpm.rollout(double, state.replace(x=x), 1200, 1.0, checkpoint=mpm.Checkpoints(states=1200))
+    end.x.sum().backward()
+    torch.testing.assert_close(x.grad, torch.full_like(x, 1.001**1200), rtol=1e-12, atol=0)
+    assert mpm.Checkpoints(states=2000).repetitions(5000) == 2 * 5000 - math.comb(2002, 1)
+
+
 class Held:
     """A tensor that autograd keeps, and how many there are of them, now and at most."""
 

@@ -162,12 +162,15 @@ def binomial(advance: Advance, state: State, n: int, states: int, step: Any) -> 
     with one less; Griewank and Walther 2000 say where to part them (algorithm 799, "revolve").
     """
 
+    def part_of(first: int, count: int, states: int) -> Advance:
+        return lambda now, *_: run(now, first, count, states)
+
     def run(state: State, first: int, count: int, states: int) -> State:
-        if count == 1:
-            return advance(state, 1, first)
-        part = _split(count, states)
-        middle = recomputed(lambda now, *_: run(now, first, part, states), state, part, first, step)
-        return run(middle, first + part, count - part, states - 1)
+        while count > 1:
+            part = _split(count, states)
+            state = recomputed(part_of(first, part, states), state, part, first, step)
+            first, count, states = first + part, count - part, states - 1
+        return advance(state, 1, first)
 
     return run(state, 0, n, states)
 
@@ -188,10 +191,12 @@ def _split(n: int, states: int) -> int:
 @functools.lru_cache(maxsize=1 << 16)
 def _evaluations(n: int, states: int) -> int:
     """Steps that a rollout and its backward pass take."""
-    if n == 1:
-        return 1
-    part = _split(n, states)
-    return part + _evaluations(n - part, states - 1) + _evaluations(part, states)
+    taken = 1
+    while n > 1:
+        part = _split(n, states)
+        taken += part + _evaluations(part, states)
+        n, states = n - part, states - 1
+    return taken
 
 
 # ---- on the host
