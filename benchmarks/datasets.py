@@ -97,10 +97,10 @@ def measured(name: str, preset: str, overrides: list[str], device: str, work: Pa
     for one, (_, errors) in zip(started, outputs, strict=True):
         if one.returncode:
             raise RuntimeError(f"{name}: {errors}")
-    rows = [json.loads(output.splitlines()[-1]) for output, _ in outputs]
+    rows = sorted((json.loads(output.splitlines()[-1]) for output, _ in outputs), key=lambda r: r["valid"])
     marks = [when for row in rows for when in row.pop("between")]
-    row = {**rows[-1], "processes": len(rows)}  # the data set as it is at the end, and the time of the slowest
-    row |= {key: max(r[key] for r in rows) for key in ("seconds", "simulating", "waiting", "valid", "again", "bytes")}
+    row = {**rows[-1], "processes": len(rows)}  # the data set as the last one saw it, and the time of the slowest
+    row |= {key: max(r[key] for r in rows) for key in ("seconds", "simulating", "waiting")}
     busy = [value for when, value in samples if min(marks) <= when <= max(marks)]
     shutil.rmtree(folder)
     return {"name": name, **row, "process": seconds, "busy": sum(busy) / len(busy) / 100 if busy else None}
