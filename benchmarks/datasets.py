@@ -97,7 +97,8 @@ def measured(name: str, preset: str, overrides: list[str], device: str, work: Pa
     for one, (_, errors) in zip(started, outputs, strict=True):
         if one.returncode:
             raise RuntimeError(f"{name}: {errors}")
-    rows = sorted((json.loads(output.splitlines()[-1]) for output, _ in outputs), key=lambda r: r["valid"])
+    rows = [json.loads(output.splitlines()[-1]) for output, _ in outputs]
+    rows.sort(key=lambda r: (r["valid"], r["complete"]))
     marks = [when for row in rows for when in row.pop("between")]
     row = {**rows[-1], "processes": len(rows)}  # the data set as the last one saw it, and the time of the slowest
     row |= {key: max(r[key] for r in rows) for key in ("seconds", "simulating", "waiting")}

@@ -2,6 +2,7 @@
 
 import json
 import math
+import os
 from pathlib import Path
 
 import pytest
@@ -213,8 +214,10 @@ def test_random_rollouts_program(tmp_path: Path) -> None:
 
 def test_data_sets_program(tmp_path: Path) -> None:
     run_quick("benchmarks.datasets", tmp_path, "--only", "Water", "--work", str(tmp_path))
-    (row,) = result(tmp_path, "datasets_*.json")["sets"]
-    assert row["valid"] == 4 and row["complete"] and row["bytes"] > 0 and row["frames"] == 4
+    alone, together = result(tmp_path, "datasets_*.json")["sets"]
+    assert alone["processes"] == 1 and together["processes"] == len(os.sched_getaffinity(0))
+    for row in (alone, together):
+        assert row["valid"] == 4 and row["complete"] and row["bytes"] > 0 and row["frames"] == 4
 
 
 def test_svd_program(tmp_path: Path) -> None:
