@@ -6,16 +6,8 @@ import torch
 from benchmarks.accuracy import rollout_gradients
 from benchmarks.accuracy.rollout_gradients import PROBLEMS
 
+pytestmark = pytest.mark.usefixtures("one_thread")
 STEPS = 200
-
-
-@pytest.fixture(autouse=True)
-def one_thread():
-    """Scenes so small that threads would wait for each other most of the time."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
 
 
 @pytest.mark.parametrize("name", PROBLEMS)

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from .errors import check_count, shape_of
 from .gradient_norms import GradientNorms
-from .state import State
+from .state import FIELDS, State
 
 Hook = Callable[[State, int], "State | None"]
 """Called with a state and the number of steps before it; may return another state to go on from."""
@@ -106,6 +106,6 @@ def _cut(state: State, began: State) -> State:
         value = getattr(state, name)
         return value.detach() if isinstance(value, Tensor) and value is not getattr(began, name) else value
 
-    names = [f.name for f in dataclasses.fields(state) if f.name != "extra"]
+    names = [name for name in FIELDS if name != "extra"]
     extra = {name: t if t is began.extra.get(name) else t.detach() for name, t in state.extra.items()}
     return state.replace(**{name: changed(name) for name in names}, extra=extra)

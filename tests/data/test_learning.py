@@ -16,6 +16,8 @@ from torch_mpm.data import DatasetFolder, OnlineStream, WindowDataset, WindowStr
 from torch_mpm.data.configuration import Configuration
 from torch_mpm.data.generate import generate
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 WORDS = [
     "dataset.frames=15",
     "dataset.seed=1",
@@ -26,15 +28,6 @@ WORDS = [
     "body[0].count=1",
     "material.sand.E=1e5",
 ]
-
-
-@pytest.fixture(autouse=True)
-def one_thread():
-    """Tensors are so small that threads only wait for each other."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
 
 
 @pytest.fixture(scope="module")

@@ -1,7 +1,6 @@
 """The scripts that train and fit, in short: each gets most of the way to its result, and draws its picture."""
 
 import math
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -9,15 +8,7 @@ import torch
 from helpers import example
 
 pytest.importorskip("matplotlib")
-
-
-@pytest.fixture(autouse=True)
-def one_thread() -> Iterator[None]:
-    """As the scripts run: more threads would wait for each other, on a busy machine for long."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
+pytestmark = pytest.mark.usefixtures("one_thread")  # as the scripts run
 
 
 def drawn(path: Path) -> bool:

@@ -68,8 +68,7 @@ def generate(
     folder = Path(out)
     record = record_of(configuration, chosen)
     with Claim(folder, record, configuration.text, one) as claim:
-        cores = len(os.sched_getaffinity(0)) // max(1, one.beside)
-        line = _Line(configuration, claim, chosen, cores, progress)
+        line = _Line(configuration, claim, chosen, progress)
         with output_errors(folder):
             line.run(check)
         complete = len(claim.finished()) == record.shards
@@ -120,15 +119,9 @@ class _Line:
     """One shard is drawn, one simulated and one written at a time, each by a thread of its own."""
 
     def __init__(
-        self,
-        configuration: Configuration,
-        claim: Claim,
-        device: torch.device,
-        cores: int,
-        progress: Progress | None,
+        self, configuration: Configuration, claim: Claim, device: torch.device, progress: Progress | None
     ) -> None:
         self.configuration, self.claim, self.device, self.progress = configuration, claim, device, progress
-        self._threads = max(1, min(cores, MOST_PACKERS))
         self.totals: dict[str, Any] = {"scenes": 0, "failed": 0, "simulating": 0.0, "waiting": 0.0}
         self._stream = torch.cuda.Stream(device) if device.type == "cuda" else None
         self._missing = claim.record.scenes - claim.finished_scenes()
@@ -137,7 +130,7 @@ class _Line:
         """All shards that nobody else takes."""
         with ExitStack() as stack:
             self._drawer, self._writer = (stack.enter_context(ThreadPoolExecutor(1)) for _ in range(2))
-            self._packers = stack.enter_context(ThreadPoolExecutor(self._threads))
+            self._packers = stack.enter_context(ThreadPoolExecutor(min(len(os.sched_getaffinity(0)), MOST_PACKERS)))
             shards = self.claim.unfinished(check)
             coming: tuple[int, Future[Drawn]] | None = self._next(shards)
             written: Future[None] | None = None

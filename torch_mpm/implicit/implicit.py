@@ -93,14 +93,15 @@ class Implicit:
         """
         if not blocks.grid.scenes:
             return start
+        wants_gradient = torch.is_grad_enabled()
         system = ImplicitSystem(blocks, step.law, state, mass, start, dt, step.stress_form)
         with torch.no_grad():
-            fixed = system.detached()
+            fixed = system.detached() if wants_gradient else system
             bounds = node_bounds(blocks, step.walls, step.boundaries.entries, start, state.time)
             minimum = minimise(fixed, bounds, self.options)
             fixed.forget()
         self._record(minimum)
-        if not torch.is_grad_enabled():
+        if not wants_gradient:
             return minimum.v
         return differentiable(self, system, fixed, bounds, minimum)
 

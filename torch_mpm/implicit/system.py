@@ -18,7 +18,7 @@ from torch import Tensor
 from ..grid import Blocks
 from ..laws.material import Material
 from ..ops import advance, gather, implicit_node_blocks, scatter
-from ..ops.arguments import per_particle
+from ..ops.arguments import per_particle, sum_by_scene
 from ..parameters import Overlay
 
 
@@ -145,10 +145,7 @@ class ImplicitSystem:
     def particle_sum(self, value: Tensor) -> Tensor:
         """Sum of a particle tensor [P, K] over each scene [B, K]."""
         scene, scenes = self.blocks.scene, self.blocks.grid.scenes
-        if scene is None:
-            return value.sum(0, keepdim=True)
-        value = torch.where((scene >= 0)[:, None], value, 0)
-        return value.new_zeros(scenes, value.shape[1]).index_add_(0, scene.clamp(0, scenes - 1), value)
+        return sum_by_scene(value, None if scene is None else scene.clamp_max(scenes - 1), scenes)
 
     def of_nodes(self, value: Tensor) -> Tensor:
         """A tensor [B] as one value per node [N, 1]."""

@@ -98,21 +98,20 @@ class CompiledLaw(Material):
 
     def energy_density(self, state: State) -> Tensor:
         """Elastic energy per rest volume [P] [J/m³] after the return map."""
-        deformation, parameters = self._arguments(state)
-        history: Sequence[Tensor] = self._history(state)
+        name, deformation, parameters, history, scene, dim = self._of_the_ops(state)
         if LAWS[self.name].plastic or history:
             moved = self.return_map(state)
             deformation, history = moved.state, moved.history
-        return law_energy(self._name(state), deformation, parameters, history, state.scene, state.x.shape[1])
+        return law_energy(name, deformation, parameters, history, scene, dim)
 
     def trial_energy(self, state: Any, before: Any) -> Tensor:
-        energy = law_energy(*self._trial(state))
+        energy = law_energy(*self._of_the_ops(state))
         if not self.viscous or state.C is None:
             return energy
         return energy + 0.5 * state.step * (self._viscous_stress(state, before) * state.C).sum((1, 2))
 
     def trial_stress(self, state: Any, before: Any) -> Tensor:
-        gradient = law_energy_gradient(*self._trial(state))
+        gradient = law_energy_gradient(*self._of_the_ops(state))
         if self.state_fields != ("J",):
             return gradient @ before.F.mT
         eye = torch.eye(state.x.shape[1], dtype=gradient.dtype, device=gradient.device)
@@ -120,7 +119,7 @@ class CompiledLaw(Material):
         return stress + self._viscous_stress(state, before) if self.viscous else stress
 
     def trial_tangent(self, state: Any, before: Any, weight: Tensor, projected: bool) -> Tensor:
-        name, deformation, parameters, history, scene, dim = self._trial(state)
+        name, deformation, parameters, history, scene, dim = self._of_the_ops(state)
         before_field = getattr(before, self.state_fields[0])
         tangent = law_tangent(name, deformation, before_field, weight, parameters, history, scene, dim, projected)
         viscosity = self.viscosity(before)
@@ -130,12 +129,12 @@ class CompiledLaw(Material):
 
     def _viscous_stress(self, state: Any, before: Any) -> Tensor:
         """What the velocity gradient of a step adds to the stress, at the volume before it [P, D, D] [Pa]."""
-        name, J, parameters, history, scene, dim = self._trial(before)
+        name, J, parameters, history, scene, dim = self._of_the_ops(before)
         moving, still = (law_update(name, J, parameters, history, C, scene, dim).stress for C in (state.C, None))
         return moving - still
 
-    def _trial(self, state: Any) -> tuple[str, Tensor, list[Tensor], list[Tensor], Tensor | None, int]:
-        """What the ops of energy take."""
+    def _of_the_ops(self, state: Any) -> tuple[str, Tensor, list[Tensor], Sequence[Tensor], Tensor | None, int]:
+        """What the ops of energy and moduli take: law, state, parameters, history, scene and dimension."""
         deformation, parameters = self._arguments(state)
         return self._name(state), deformation, parameters, self._history(state), state.scene, state.x.shape[1]
 
@@ -148,8 +147,7 @@ class CompiledLaw(Material):
         return self._modulus(law_stiffness, state)
 
     def _modulus(self, op: Callable[..., Tensor], state: State) -> Tensor:
-        deformation, parameters = self._arguments(state)
-        return op(self._name(state), deformation, parameters, self._history(state), state.scene, state.x.shape[1])
+        return op(*self._of_the_ops(state))
 
     def _name(self, state: State) -> str:
         """The compiled law, which may depend on the dimension."""

@@ -11,6 +11,7 @@ from torch import Tensor
 from ..errors import FLOATING, check_index, check_like, shape_of
 from .arguments import check_choice, check_parameter, check_tensors, refuse_vmap, sizes, soa_empty, sum_by_scene
 from .autograd import dispatch, register_autograd
+from .implicit import tangent_entries
 from .registry import LAWS, LawInfo
 
 ELASTIC, PLASTIC, APEX, INVALID = 0, 1, 2, 3
@@ -336,7 +337,7 @@ def _energy_double_backward_fake(along_state, along_parameters, grad_energy, sta
 
 @torch.library.register_fake("torch_mpm::law_tangent")
 def _tangent_fake(state, before, weight, parameters, history, scene, law, dim, projected):
-    return soa_empty(state, (_particles(state), 2 * dim * dim + dim * (dim + 1) // 2 + dim * (dim - 1)))
+    return soa_empty(state, (_particles(state), tangent_entries(dim)))
 
 
 def _scalar_fake(state, parameters, history, scene, law, dim):
