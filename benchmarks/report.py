@@ -17,8 +17,9 @@ from typing import Any
 from . import common
 from .accuracy.limits import tables as limit_tables
 from .accuracy.runout import PUBLISHED, published, slopes
-from .speed import roofline, scaling
-from .speed.rollouts import row_of_steps, row_of_training
+from .speed import network_steps, roofline, scaling
+from .speed import training as speed_of_training
+from .speed.rollouts import row_of_steps
 from .stability.adversarial import summary as rollouts
 from .stability.heat import cell as heat_cell
 from .stability.heat import kind as heat_kind
@@ -76,7 +77,7 @@ def speed_table(results: list[dict[str, Any]]) -> str:
 
 
 def as_run(results: list[dict[str, Any]]) -> str:
-    """Example scenes, rollouts and training as people run them."""
+    """Example scenes and rollouts as people run them."""
     notes = [f"- {common.describe(result['environment'])}" for result in results]
     rows = [
         (result["environment"]["device"], *row_of_steps(r), r.get("seconds"))
@@ -84,15 +85,11 @@ def as_run(results: list[dict[str, Any]]) -> str:
         for r in (*result["rollouts"], *result["scenes"])
     ]
     header = ("device", "", "particles", "substeps", "us per substep", "M particles/s", "simulation, s")
-    training = [
-        (result["environment"]["device"], *row_of_training(r)) for result in results for r in result["training"]
-    ]
-    of_training = ("device", "particles", "steps", "forward, s", "forward and backward, s", "memory, GB")
     return "\n".join(
         [
-            "Substeps of one call of `rollout` (the neo-Hookean cube), scenes by `torch-mpm run` with their files, and",
-            "the gradient of a rollout by the velocities at its start (benchmarks/speed/rollouts.py).",
-            *("", common.table(header, rows), "", common.table(of_training, training), "", *notes, ""),
+            "Substeps of one call of `rollout` (the neo-Hookean cube), and scenes by `torch-mpm run` with their files",
+            "(benchmarks/speed/rollouts.py).",
+            *("", common.table(header, rows), "", *notes, ""),
             "One scene of any size; dotted lines: particles per second.",
             *("", "![time per substep over particles](benchmarks/results/rollouts.png)"),
         ]
