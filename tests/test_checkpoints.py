@@ -71,17 +71,22 @@ def test_gradients_are_those_without(kind, kept, device, monkeypatch):
         assert float(expected.norm()) > 0 and relative_error(value, expected) < (1e-12 if device == "cpu" else 1e-9)
 
 
-def test_pools_that_grow_are_those_of_the_first_time(device):
-    """A block that flies apart wants more blocks in each segment; steps that are taken again have those they had."""
+@pytest.mark.parametrize("function", [False, True])
+def test_pools_that_grow_are_those_of_the_first_time(function, device):
+    """A block that flies apart wants more blocks in each segment; steps that are taken again have those they had, also
+    where a function of the user's takes them on a grid that nobody else knows of."""
     found, sizes = [], []
     for checkpoint in (None, 5, mpm.Checkpoints(states=3)):
         grid = mpm.Grid(0.02, (0, 0), (1, 1), deterministic=True)
         step = mpm.Step(grid, lambda F: 1e2 * (F @ F.mT - torch.eye(2, dtype=F.dtype, device=F.device)))
         state = block_state(2, device, low=0.45, high=0.55, dx=0.02)
         v = (150 * (state.x - 0.5)).requires_grad_()
-        end = mpm.rollout(step, state.replace(v=v), 40, 1e-3, checkpoint=checkpoint)
+        taken = (lambda state, dt, step=step: step(step(state, dt / 2), dt / 2)) if function else step
+        end = mpm.rollout(taken, state.replace(v=v), 40, 1e-3, checkpoint=checkpoint)
+        size = grid.max_blocks
         found.append(torch.autograd.grad(end.x.square().sum(), v)[0])
-        sizes.append(grid.max_blocks)
+        assert grid.max_blocks == size
+        sizes.append(size)
     step.check(end)
     if device == "cpu":
         first = mpm.Grid(0.02, (0, 0), (1, 1))

@@ -15,7 +15,7 @@ from torch.utils import _pytree
 
 from .activation_record import aside
 from .errors import check_count, check_flag, check_number
-from .grid import Grid
+from .grid import same_pools
 from .state import State
 
 Advance = Callable[[State, int, int], State]
@@ -134,15 +134,13 @@ def recomputed(advance: Advance, state: State, count: int, first: int, step: Any
     from torch.utils.checkpoint import checkpoint  # whose first call imports for seconds
 
     leaves, layout = _pytree.tree_flatten(state)
-    grid = getattr(step, "grid", None)
     again, pools = False, list[int]()
 
     def steps(*tensors: Tensor) -> State:
         nonlocal again
         given = _pytree.tree_unflatten(tensors, layout)
         with contextlib.ExitStack() as stack:
-            if isinstance(grid, Grid):
-                stack.enter_context(grid.same_pools(pools))
+            stack.enter_context(same_pools(pools))
             if again:
                 stack.enter_context(aside(step, given.x))
             again = True
