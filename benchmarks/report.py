@@ -1,8 +1,8 @@
 """The tables and figures of the documents, from the result files: `python -m benchmarks.report [--write]`.
 
 Prints the tables; with --write, puts them between the lines `<!-- benchmarks -->` and `<!-- /benchmarks -->` of
-docs/measured.md, which has all of them, and of README.md, which has one of speed and one of accuracy, and draws the
-figures of several devices beside the results. Each program draws its other figures itself.
+docs/measured.md, which has all of them, of README.md, which has one of speed and one of accuracy, and of the pages for
+users of other projects, and draws the figures of several devices beside the results. Each program draws its other figures itself.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 import argparse
 import json
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,12 +20,14 @@ from .accuracy.runout import PUBLISHED, published, slopes
 from .speed import network_steps, roofline, scaling
 from .speed import training as speed_of_training
 from .speed.rollouts import row_of_steps
+from .speed.training_scripts import PROJECTS
 from .stability.adversarial import summary as rollouts
 from .stability.heat import cell as heat_cell
 from .stability.heat import kind as heat_kind
 from .stability.heat_step import table as heat_step_table
 
 README, MEASURED = common.ROOT / "README.md", common.ROOT / "docs" / "measured.md"
+MIGRATING = common.ROOT / "docs" / "migrating"
 BEGIN, END = "<!-- benchmarks -->", "<!-- /benchmarks -->"
 FORWARD = ("step", "step, CUDA graph")
 BOTH = ("step, forward and backward", "step, forward and backward, CUDA graph")
@@ -94,6 +96,53 @@ def as_run(results: list[dict[str, Any]]) -> str:
             *("", "![time per substep over particles](benchmarks/results/rollouts.png)"),
         ]
     )
+
+
+def training(results: list[dict[str, Any]]) -> str:
+    """Gradients through rollouts, beside peers, and steps with networks."""
+
+    def rows(part: Callable[[dict[str, Any]], Iterable[tuple[Any, ...]]]) -> Iterator[tuple[Any, ...]]:
+        return ((result["environment"]["device"], *row) for result in results for row in part(result))
+
+    notes = [f"- {common.describe(result['environment'])}" for result in results]
+    held = rows(lambda result: map(speed_of_training.row_of_rollout, result["rollouts"]))
+    networks = rows(lambda result: network_steps.table_rows(result["networks"]))
+    parts = [
+        "The gradient of a rollout of the neo-Hookean cube by the velocities at its start "
+        "(benchmarks/speed/training.py), by how many steps the backward pass holds at a time:",
+        common.table(("device", *speed_of_training.HELD), held),
+        peers_of_training(results, list(PROJECTS)),
+        f"Steps with a network as their law, {network_steps.STEPS} in a row:",
+        common.table(("device", *network_steps.HEADER), networks),
+        "\n".join(notes),
+    ]
+    return "\n\n".join(parts)
+
+
+def peers_of_training(results: list[dict[str, Any]], projects: Sequence[str]) -> str:
+    """Gradients through the work of some projects, in a rollout, in their scripts and by their algorithms."""
+    rows = [
+        (result["environment"]["device"], *row)
+        for result in results
+        for row in speed_of_training.rows_of_peers(result)
+        if row[0] in projects
+    ]
+    intro = (
+        "A fixed corotated cube in a rollout, in a script that calls the solver for every step, and by the algorithm of "
+        "the project that the script is for (benchmarks/speed/training_peer.py and training_peer_warp.py), with the "
+        "gradient by the velocities at the start; times are multiples of the rollout of the same work."
+    )
+    return "\n\n".join([intro, common.table(("device", *speed_of_training.BESIDE), rows)])
+
+
+def migrating(directory: Path) -> dict[Path, str]:
+    """What the pages for other projects' users say of speed and memory."""
+    results, steps = common.read(directory, "training_*.json"), common.read(directory, "speed_*.json")
+    notes = "\n".join(f"- {common.describe(result['environment'])}" for result in results)
+    pages = {f"{page}.md": [peers_of_training(results, [project]), notes] for page, project in
+             (("mpm_pytorch", "MPM-PyTorch"), ("nclaw", "NCLaw"))}  # fmt: skip
+    pages["physgaussian.md"] = [speed_table(steps)]
+    return {MIGRATING / name: "\n\n".join(parts) for name, parts in pages.items()}
 
 
 def data_sets(results: list[dict[str, Any]]) -> str:
@@ -510,6 +559,7 @@ def sections(directory: Path) -> dict[str, str]:
     for pattern, title, section in (
         ("speed_*.json", "Speed", speed),
         ("rollouts_*.json", "Speed of what is run", as_run),
+        ("training_*.json", "Training", training),
         ("datasets_*.json", "Data sets", data_sets),
         ("svd_*_*.json", "Small matrices and sand", small_matrices),
         ("heat_*_*.json", "Speed of the heat solve", heat_speed),
@@ -551,7 +601,8 @@ def draw(directory: Path) -> None:
 def documents(directory: Path) -> dict[Path, str]:
     """The text between the marks of each document."""
     details = "\n\n".join(f"### {title}\n\n{text}" for title, text in sections(directory).items())
-    return {README: overview(directory), MEASURED: details.replace("](benchmarks/", "](../benchmarks/")}
+    measured = details.replace("](benchmarks/", "](../benchmarks/")
+    return {README: overview(directory), MEASURED: measured, **migrating(directory)}
 
 
 def insert(text: str, tables: str) -> str:
@@ -569,7 +620,7 @@ def insert(text: str, tables: str) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--results", type=Path, default=common.RESULTS)
-    parser.add_argument("--write", action="store_true", help="update README.md and docs/measured.md")
+    parser.add_argument("--write", action="store_true", help="update the documents")
     arguments = parser.parse_args()
     for document, tables in documents(arguments.results).items():
         print(tables)

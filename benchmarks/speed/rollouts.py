@@ -5,8 +5,8 @@
     python -m benchmarks.speed.rollouts --out DIRECTORY
 
 Scenes: `torch_mpm.scene.run` with its files; time of the simulation. The others are the neo-Hookean cube of
-`benchmarks/speed/work.py`, steps of one call of `torch_mpm.rollout`, wall clock, synchronised once. The figure has every
-device that has results in DIRECTORY.
+`benchmarks/speed/work.py`, steps of one call of `torch_mpm.rollout`, wall clock, synchronised once. The figure has
+every device that has results in DIRECTORY.
 """
 
 from __future__ import annotations

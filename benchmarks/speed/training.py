@@ -1,4 +1,4 @@
-"""Time and memory of gradients through rollouts: checkpoints, a peer in plain torch, networks compiled and captured.
+"""Time and memory of gradients through rollouts: checkpoints, peers, networks compiled and captured.
 
     python -m benchmarks.speed.training [--device cuda]      # minutes
     python -m benchmarks.speed.training --quick              # seconds
@@ -7,20 +7,24 @@ Rollouts: the neo-Hookean cube of `benchmarks/speed/work.py`, float32, one call 
 gradients, and with the gradient of its end by the velocities at its start. The op of many steps takes them again in the
 backward pass in any case; what is held at a time differs.
 
-Peer: the same cube with a fixed corotated law and forces by the gradient of the B-splines, in a rollout, in a script
-for MPM-PyTorch whose import names `torch_mpm.compat`, and by that project's algorithm
-(`benchmarks/speed/training_peer.py`). Checkpoints of scripts are those of torch around every step.
+Peers: the same cube with a fixed corotated law, in a rollout, in a script of another project whose import names
+`torch_mpm.compat`, and by that project's algorithm: that of MPM-PyTorch in plain torch
+(`benchmarks/speed/training_peer.py`), that of NCLaw by kernels of Warp inside an autograd Function
+(`benchmarks/speed/training_peer_warp.py`), where Warp is installed. Checkpoints are those of torch around every step.
 
 Networks: a network is the law of a step; some steps in a row, one by one, compiled, and as one CUDA graph.
 
-Memory is the peak above that before: on CUDA that of PyTorch's allocator, on the CPU resident memory above that before
-the first case.
+Memory is the peak above that before both passes: on CUDA that of PyTorch's allocator, on the CPU resident memory, in a
+process for each case.
 """
 
 from __future__ import annotations
 
 import argparse
+import concurrent.futures
+import dataclasses
 import gc
+import multiprocessing
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -29,66 +33,27 @@ import torch
 from torch import Tensor
 
 import torch_mpm as mpm
-from torch_mpm.compat import mpm_pytorch
 
 from .. import common, regressions
 from . import memory, network_steps, work
 from .rollouts import seconds
 from .step import Setup, setup
-from .training_peer import DenseSolver, Particles, steps
+from .training_scripts import PROJECTS, Make, Project, taken
 
 ROLLOUT = {"cpu": (22, 50), "cuda": (46, 1000)}
 """Particles along a side of the cube, and steps."""
 PEER = {"cpu": (22, 20, 20), "cuda": (46, 1000, 100)}
 """Particles along a side, steps, and steps of which a script keeps all in a second row."""
-NETWORK = {"cpu": (2048, 32768), "cuda": (2048, 32768)}
-"""Particles."""
-E, NU = work.MU * (3 * work.LAM + 2 * work.MU) / (work.LAM + work.MU), work.LAM / (2 * (work.LAM + work.MU))
+NETWORKS = ((8, 8, 4), (16, 16, 16))
+"""Cells along the edges of the block, of 8 particles each."""
+AGREEMENT = {torch.float32: 1e-5, torch.float64: 1e-8}
+"""Of velocities after 20 steps, relative."""
 
 Forward = Callable[[Tensor], tuple[Tensor, Tensor]]
 """Velocities at the start -> positions and velocities at the end."""
 
 
-# ---- one rollout or script
-
-
-class Meter:
-    """Time and memory of forward and backward passes on a device."""
-
-    def __init__(self, device: str, samples: int) -> None:
-        self.device, self.samples = device, samples
-        self._resident = memory.Resident() if device == "cpu" and memory.Resident.available else None
-
-    def peak(self, program: Callable[[], object]) -> int | None:
-        """Memory of a program [bytes], or None where the system does not tell."""
-        if self.device == "cuda":
-            return memory.of_cuda(program)
-        return None if self._resident is None else self._resident.peak(program)
-
-    def row(self, forward: Forward, v: Tensor) -> dict[str, Any]:
-        """Least times [s] and the memory [bytes] of a forward pass without gradients and of both passes; None for what
-        does not fit into the memory of the device."""
-
-        def alone() -> None:
-            with torch.no_grad():
-                forward(v)
-
-        def both() -> None:
-            start = v.clone().requires_grad_()
-            x, speed = forward(start)
-            torch.autograd.grad(x.square().sum() + speed.square().sum(), start)
-
-        row: dict[str, Any] = {"forward": None, "both": None, "memory": None}
-        try:
-            alone()
-            row["forward"] = min(seconds(self.device, alone) for _ in range(self.samples))
-            row["memory"] = self.peak(both)
-            row["both"] = min(seconds(self.device, both) for _ in range(self.samples))
-        except torch.OutOfMemoryError as error:
-            print(str(error).splitlines()[0])
-            row["memory"] = None
-        gc.collect()  # of the graph that an error has left
-        return row
+# ---- the work
 
 
 def with_room(s: Setup, law: mpm.Material, **options: Any) -> Setup:
@@ -96,8 +61,17 @@ def with_room(s: Setup, law: mpm.Material, **options: Any) -> Setup:
     wanted = s.grid.activate(s.state.x).wanted
     grid = mpm.Grid(s.grid.dx, s.grid.lower, s.grid.upper, max_blocks=2 * wanted)
     step = mpm.Step(grid, law, gravity=s.step.gravity, **options)
-    state = s.state.sorted(grid)
-    return Setup(step.prepare(state), step)
+    return Setup(step.prepare(s.state.sorted(grid)), step)
+
+
+def elastic(w: work.Work, device: str) -> Setup:
+    return with_room(setup(w, device), mpm.NeoHookean(mu=work.MU, lam=work.LAM), walls="sticky")
+
+
+def corotated(project: Project, w: work.Work, device: str, dtype: torch.dtype = torch.float32) -> Setup:
+    """The work of a project."""
+    law = mpm.FixedCorotated(mu=work.MU, lam=work.LAM)
+    return with_room(setup(w, device, dtype), law, stress_form=project.stress_form)
 
 
 def rolled(s: Setup, n: int, checkpoint: int | None = None) -> Forward:
@@ -108,116 +82,135 @@ def rolled(s: Setup, n: int, checkpoint: int | None = None) -> Forward:
     return forward
 
 
-def rollouts(side: int, n: int, meter: Meter) -> Iterator[dict[str, Any]]:
-    """What is held at a time."""
-    s = with_room(setup(work.make(side), meter.device), mpm.NeoHookean(mu=work.MU, lam=work.LAM), walls="sticky")
-    for name, checkpoint in (("by default", None), ("32 steps", 32), ("all steps", n)):
-        yield {"held": name, "particles": len(s.state), "steps": n, **meter.row(rolled(s, n, checkpoint), s.state.v)}
-
-
-# ---- beside the peer
-
-
-def start_of(s: Setup) -> Particles:
+def scripted(make: Make, w: work.Work, s: Setup, n: int, checkpoints: bool) -> Forward:
     assert s.state.C is not None and s.state.F is not None
-    return s.state.x, s.state.v, s.state.C.contiguous(), s.state.F.contiguous()
+    x, C, F = s.state.x, s.state.C.contiguous(), s.state.F.contiguous()
+    take = make(w, x)
 
-
-def corotated(w: work.Work, device: str, dtype: torch.dtype = torch.float32) -> Setup:
-    """The work of the peer."""
-    law = mpm.FixedCorotated(mu=work.MU, lam=work.LAM)
-    return with_room(setup(w, device, dtype), law, stress_form="gradient")
-
-
-def dense(w: work.Work, s: Setup) -> Callable[..., Particles]:
-    return DenseSolver(w.n, w.mass, w.volume, work.MU, work.LAM, (0, -work.GRAVITY, 0), work.DT, s.state.x)
-
-
-def migrated(w: work.Work, s: Setup) -> Callable[..., Particles]:
-    """A step of a script for MPM-PyTorch."""
-    x = s.state.x
-    edge = (w.particles * w.volume) ** (1 / 3)
-    solver = mpm_pytorch.MPMSolver(
-        x, work.DENSITY, w.n, work.DT, (0.0, -work.GRAVITY, 0.0), size=(edge,) * 3, device=x.device
-    )
-    elasticity = mpm_pytorch.constitutive_models.CorotatedElasticity(E, NU).to(x.device)
-
-    def step(x: Tensor, v: Tensor, C: Tensor, F: Tensor) -> Particles:
-        return solver(x, v, C, F, elasticity(F))
-
-    return step
-
-
-SCRIPTS: dict[str, Callable[[work.Work, Setup], Callable[..., Particles]]] = {
-    "script, torch_mpm.compat": migrated,
-    "script, MPM-PyTorch's algorithm": dense,
-}
-
-
-def scripted(step: Callable[..., Particles], s: Setup, n: int, checkpoints: bool) -> Forward:
     def forward(v: Tensor) -> tuple[Tensor, Tensor]:
-        x, _, C, F = start_of(s)
-        end = steps(step, (x, v, C, F), n, checkpoints and torch.is_grad_enabled())
+        end = taken(take, (x, v, C, F), n, checkpoints and torch.is_grad_enabled())
         return end[0], end[1]
 
     return forward
 
 
-def disagreement(w: work.Work, device: str, n: int) -> dict[str, float]:
-    """Largest difference of positions from those of the rollout after some steps, over their largest way; in float64,
-    of which the way is more than rounding."""
-    s = corotated(w, device, torch.float64)
+def disagreement(project: Project, w: work.Work, device: str, n: int) -> dict[str, float]:
+    """Largest difference of velocities from those of the rollout after some steps, over the largest velocity."""
+    s = corotated(project, w, device, project.precision)
     with torch.no_grad():
-        x, _ = rolled(s, n)(s.state.v)
-        way = (x - s.state.x).abs().max()
-        ends = {name: scripted(make(w, s), s, n, False)(s.state.v)[0] for name, make in SCRIPTS.items()}
-    return {name: float((end - x).abs().max() / way) for name, end in ends.items()}
+        _, v = rolled(s, n)(s.state.v)
+        ends = {name: scripted(make, w, s, n, False)(s.state.v)[1] for name, make in project.scripts().items()}
+    return {name: float((end - v).abs().max() / v.abs().max()) for name, end in ends.items()}
 
 
-def beside_peer(side: int, n: int, kept: int, meter: Meter) -> Iterator[dict[str, Any]]:
-    w = work.make(side)
-    s = corotated(w, meter.device)
-    about = {"particles": w.particles, "steps": n}
-    yield {"name": "rollout", "kept": "by default", **about, **meter.row(rolled(s, n), s.state.v)}
-    for name, make in SCRIPTS.items():
-        step = make(w, s)
-        yield {"name": name, "kept": "checkpoints", **about, **meter.row(scripted(step, s, n, True), s.state.v)}
-        for count in dict.fromkeys((n, kept)):
-            row = meter.row(scripted(step, s, count, False), s.state.v)
-            yield {"name": name, "kept": "all steps", **about, "steps": count, **row}
+# ---- time and memory
+
+
+@dataclasses.dataclass(frozen=True)
+class Case:
+    """A rollout of the neo-Hookean cube, or a program that does the work of a project; what it keeps of its steps."""
+
+    name: str
+    kept: str
+    side: int
+    steps: int
+    checkpoint: int | None = None
+    project: str | None = None
+
+    def program(self, device: str) -> tuple[Forward, Tensor]:
+        """The forward pass, and velocities to begin with."""
+        w = work.make(self.side)
+        s = elastic(w, device) if self.project is None else corotated(PROJECTS[self.project], w, device)
+        scripts = {} if self.project is None else PROJECTS[self.project].scripts()
+        if self.name in scripts:
+            return scripted(scripts[self.name], w, s, self.steps, self.checkpoint is not None), s.state.v
+        return rolled(s, self.steps, self.checkpoint), s.state.v
+
+
+def rollout_cases(side: int, n: int) -> list[Case]:
+    held = {"by default": None, "32 steps": 32, "all steps": n}
+    return [Case("rollout", name, side, n, checkpoint) for name, checkpoint in held.items()]
+
+
+def peer_cases(side: int, n: int, kept: int) -> Iterator[Case]:
+    for key, project in PROJECTS.items():
+        yield Case("rollout", "by default", side, n, project=key)
+        for name in project.scripts():
+            if project.checkpoints:
+                yield Case(name, "checkpoints", side, n, 1, key)
+            for count in dict.fromkeys((n, kept)):
+                yield Case(name, "all steps", side, count, project=key)
+
+
+def both(forward: Forward, v: Tensor) -> None:
+    start = v.clone().requires_grad_()
+    x, speed = forward(start)
+    torch.autograd.grad(x.square().sum() + speed.square().sum(), start)
+
+
+def alone(forward: Forward, v: Tensor) -> None:
+    with torch.no_grad():
+        forward(v)
+
+
+def measured(case: Case, device: str, samples: int, with_memory: bool = True) -> dict[str, Any]:
+    """Least times [s] and the memory [bytes] of a forward pass without gradients and of both passes; None for what does
+    not fit into the memory of the device."""
+    about = {"project": case.project, "name": case.name, "kept": case.kept}
+    row: dict[str, Any] = {**about, "particles": case.side**3, "steps": case.steps}
+    row |= {"forward": None, "both": None, "memory": None}
+    program = case.program(device)
+    try:
+        alone(*program)
+        row["forward"] = min(seconds(device, lambda: alone(*program)) for _ in range(samples))
+        both(*program)
+        row["both"] = min(seconds(device, lambda: both(*program)) for _ in range(samples))
+        if with_memory:
+            row["memory"] = memory.of_cuda(lambda: both(*program)) if device == "cuda" else resident(case)
+    except torch.OutOfMemoryError as error:
+        print(str(error).splitlines()[0])
+    gc.collect()  # of the graph that an error has left
+    return row
+
+
+def resident(case: Case) -> int | None:
+    """Resident memory of a case on the CPU in a process of its own, where allocators keep nothing of others."""
+    if not memory.Resident.available:
+        return None
+    with concurrent.futures.ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
+        return pool.submit(_resident, case).result()
+
+
+def _resident(case: Case) -> int:
+    common.use_all_cores()
+    both(*dataclasses.replace(case, side=4, steps=1).program("cpu"))  # first calls import what they need
+    program = case.program("cpu")
+    return memory.Resident().peak(lambda: both(*program))
 
 
 # ---- the program
 
 
-def warm_up(device: str) -> None:
-    """First calls import what they need, for seconds and with memory."""
-    w = work.make(4)
-    s = corotated(w, device)
-    x, _ = scripted(dense(w, s), s, 1, True)(s.state.v.clone().requires_grad_())
-    x.sum().backward()
-
-
 def measure(device: str, quick: bool = False) -> dict[str, Any]:
     common.use_all_cores()
-    warm_up(device)
-    meter = Meter(device, 1 if quick else 3)
-    result: dict[str, Any] = {"environment": common.environment(device), "rollouts": [], "peer": [], "networks": []}
-    side, n = (6, 10) if quick else ROLLOUT[device]
-    for row in rollouts(side, n, meter):
-        result["rollouts"].append(row)
-        print(row, flush=True)
-    side, n, kept = (8, 4, 2) if quick else PEER[device]
-    w = work.make(side)
-    result["disagreement"] = disagreement(w, device, 4 if quick else 20)
-    assert max(result["disagreement"].values()) < 1e-6, f"this is not the same physics: {result['disagreement']}"
-    for row in beside_peer(side, n, kept, meter):
-        result["peer"].append(row)
-        print(row, flush=True)
-    for particles in (64,) if quick else NETWORK[device]:
-        for row in network_steps.rows(particles, device, meter.samples, "aot_eager" if quick else "inductor"):
-            result["networks"].append(row)
-            print(row, flush=True)
+    samples, with_memory = (1, device == "cuda") if quick else (3, True)
+    result: dict[str, Any] = {"environment": common.environment(device)}
+    cases = {
+        "rollouts": rollout_cases(*((6, 10) if quick else ROLLOUT[device])),
+        "peers": list(peer_cases(*((8, 4, 2) if quick else PEER[device]))),
+    }
+    w = work.make(cases["peers"][0].side)
+    result["disagreement"] = {key: disagreement(project, w, device, 20) for key, project in PROJECTS.items()}
+    for key, found in result["disagreement"].items():
+        assert max(found.values()) < AGREEMENT[PROJECTS[key].precision], f"{key} is not the same physics: {found}"
+    for part, of_part in cases.items():
+        result[part] = [measured(case, device, samples, with_memory) for case in of_part]
+    backend = "aot_eager" if quick else "inductor"
+    result["networks"] = [
+        row
+        for cells in (((2, 2, 2),) if quick else NETWORKS)
+        for row in network_steps.rows(cells, device, samples, backend)
+    ]
     return result
 
 
@@ -236,27 +229,26 @@ HELD = (
 
 def row_of_rollout(r: dict[str, Any]) -> tuple[Any, ...]:
     return (
-        r["held"], r["particles"], r["steps"], r["forward"], r["both"], _ratio(r["both"], r["forward"]),
+        r["kept"], r["particles"], r["steps"], r["forward"], r["both"], _ratio(r["both"], r["forward"]),
         _scaled(r["memory"], 1e-9),
     )  # fmt: skip
 
 
 BESIDE = (
-    "", "kept", "particles", "steps", "forward, ms a step", "forward and backward, ms a step", "times",
-    "memory, MB a step", "times",
+    "work of", "program", "kept", "particles", "steps", "forward, ms a step", "forward and backward, ms a step",
+    "times", "memory, MB a step", "times",
 )  # fmt: skip
 
 
-def rows_of_peer(result: dict[str, Any]) -> Iterator[tuple[Any, ...]]:
-    """Those of a result, with multiples of the time and the memory of the first."""
-    first = result["peer"][0]
-    for r in result["peer"]:
-        both, own = _ratio(r["both"], r["steps"]), _ratio(first["both"], first["steps"])
-        taken, least = _ratio(r["memory"], r["steps"]), _ratio(first["memory"], first["steps"])
+def rows_of_peers(result: dict[str, Any]) -> Iterator[tuple[Any, ...]]:
+    """Those of a result, with multiples of the time and the memory of the rollout of the same work."""
+    for r in result["peers"]:
+        (own,) = (o for o in result["peers"] if (o["project"], o["name"]) == (r["project"], "rollout"))
+        times, memories = ([_ratio(row[key], row["steps"]) for row in (r, own)] for key in ("both", "memory"))
         yield (
-            r["name"], r["kept"], r["particles"], r["steps"], _scaled(r["forward"], 1e3 / r["steps"]),
-            "does not fit" if both is None else 1e3 * both, _times(both, own),
-            "does not fit" if both is None else _scaled(taken, 1e-6), _times(taken, least),
+            r["project"], r["name"], r["kept"], r["particles"], r["steps"], _scaled(r["forward"], 1e3 / r["steps"]),
+            "does not fit" if r["both"] is None else _scaled(times[0], 1e3), _times(*times),
+            "does not fit" if r["both"] is None else _scaled(memories[0], 1e-6), _times(*memories),
         )  # fmt: skip
 
 
@@ -265,15 +257,19 @@ def _times(value: float | None, base: float | None) -> str | None:
     return None if ratio is None else f"{ratio:.3g}x"
 
 
+def agreement(result: dict[str, Any]) -> str:
+    """How far programs are from the rollout."""
+    return "; ".join(f"{key} {max(found.values()):.1e}" for key, found in result["disagreement"].items())
+
+
 def text(result: dict[str, Any]) -> str:
     """Tables of a result in Markdown."""
     lines = ["# Training", "", common.describe(result["environment"]), ""]
     lines += [(__doc__ or "").split("\n\n", 2)[2].strip(), ""]
     lines += [common.table(HELD, [row_of_rollout(r) for r in result["rollouts"]]), ""]
-    worst = max(result["disagreement"].values())
-    lines += [common.table(BESIDE, rows_of_peer(result)), ""]
+    lines += [common.table(BESIDE, rows_of_peers(result)), ""]
     lines += [
-        f"Positions of the scripts differ from those of the rollout by at most {worst:.1e} of the way, in float64.",
+        f"Largest differences of velocities from those of the rollout, over the largest: {agreement(result)}.",
         "",
     ]
     return "\n".join([*lines, network_steps.text(result["networks"])])
@@ -283,7 +279,7 @@ def timed(result: dict[str, Any]) -> Iterator[tuple[str, float]]:
     """Seconds, for `regressions`."""
     for r in result["rollouts"]:
         if r["both"] is not None:
-            yield f"{r['held']}, forward and backward", r["both"]
+            yield f"{r['kept']}, forward and backward", r["both"]
     yield from network_steps.timed(result["networks"])
 
 

@@ -8,11 +8,10 @@ library's, in place of Warp's there, so that it costs the peer next to nothing.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
-from torch.utils.checkpoint import checkpoint
 
 import torch_mpm as mpm
 
@@ -78,10 +77,3 @@ class DenseSolver:
 def _products(a: Tensor, b: Tensor, c: Tensor) -> Tensor:
     """Of values [P, axis, node] along the three axes, for all 27 nodes [P, 27]."""
     return torch.einsum("pi,pj,pk->pijk", a[:, 0], b[:, 1], c[:, 2]).flatten(1)
-
-
-def steps(step: Callable[..., Particles], particles: Particles, n: int, checkpoints: bool) -> Particles:
-    """n steps; with checkpoints each is taken again by the backward pass, as users of the peer do."""
-    for _ in range(n):
-        particles = checkpoint(step, *particles, use_reentrant=False) if checkpoints else step(*particles)
-    return particles
