@@ -2,7 +2,8 @@
 
 Prints the tables; with --write, puts them between the lines `<!-- benchmarks -->` and `<!-- /benchmarks -->` of
 docs/measured.md, which has all of them, of README.md, which has one of speed and one of accuracy, and of the pages for
-users of other projects, and draws the figures of several devices beside the results. Each program draws its other figures itself.
+users of other projects, and draws the figures of several devices beside the results. Each program draws its other
+figures itself.
 """
 
 from __future__ import annotations
@@ -128,9 +129,9 @@ def peers_of_training(results: list[dict[str, Any]], projects: Sequence[str]) ->
         if row[0] in projects
     ]
     intro = (
-        "A fixed corotated cube in a rollout, in a script that calls the solver for every step, and by the algorithm of "
-        "the project that the script is for (benchmarks/speed/training_peer.py and training_peer_warp.py), with the "
-        "gradient by the velocities at the start; times are multiples of the rollout of the same work."
+        "A fixed corotated cube in a rollout, in a script that calls the solver for every step, and by the algorithm "
+        "of the project that the script is for (benchmarks/speed/training_peer.py and training_peer_warp.py), with the "
+        "gradient by the velocities at the start; columns with x are multiples of the rollout of the same work."
     )
     return "\n\n".join([intro, common.table(("device", *speed_of_training.BESIDE), rows)])
 
