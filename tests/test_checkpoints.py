@@ -7,6 +7,7 @@ import torch
 from helpers import relative_error
 from test_step import block_state, make_step
 from torch import nn
+from torch.utils.checkpoint import checkpoint as torch_checkpoint
 
 import torch_mpm as mpm
 from torch_mpm import checkpoints
@@ -94,6 +95,25 @@ def test_pools_that_grow_are_those_of_the_first_time(function, device):
         assert sizes[0] > first.max_blocks
     assert relative_error(found[1], found[0]) < 1e-12
     assert relative_error(found[2], found[0]) < 1e-12
+
+
+def test_checkpoints_of_torch_around_steps_of_a_grid_that_grows(device):
+    """As scripts of other projects have them."""
+    found = []
+    for kept in (False, True):
+        grid = mpm.Grid(0.02, (0, 0), (1, 1), deterministic=True)
+        step = mpm.Step(grid, mpm.NeoHookean(E=1e2, nu=0.3))
+        state = block_state(2, device, low=0.45, high=0.55, dx=0.02)
+        v = (150 * (state.x - 0.5)).requires_grad_()
+        state = state.replace(v=v)
+        for _ in range(40):
+            state = (
+                torch_checkpoint(step, state, 1e-3, use_reentrant=False, context_fn=checkpoints.contexts)
+                if kept
+                else step(state, 1e-3)
+            )
+        found.append(torch.autograd.grad(state.x.square().sum(), v)[0])
+    assert relative_error(*found) < 1e-12
 
 
 @pytest.mark.parametrize("checkpoint", [None, 4, mpm.Checkpoints(states=3)])

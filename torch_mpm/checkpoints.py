@@ -150,6 +150,13 @@ def recomputed(advance: Advance, state: State, count: int, first: int, step: Any
     return result
 
 
+def contexts() -> tuple[contextlib.AbstractContextManager[None], contextlib.AbstractContextManager[None]]:
+    """For `torch.utils.checkpoint.checkpoint(..., use_reentrant=False, context_fn=contexts)` around steps: on grids
+    without `max_blocks`, steps that are taken again find pools of the size they had. `rollout` sees to that itself."""
+    sizes = list[int]()
+    return same_pools(sizes), same_pools(sizes)
+
+
 # ---- binomial
 
 
