@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
+from torch_mpm.checkpoints import contexts
 from torch_mpm.compat import mpm_pytorch, nclaw
 
 from . import work
@@ -94,5 +95,8 @@ PROJECTS = {
 def taken(take: Take, particles: Particles, n: int, checkpoints: bool) -> Particles:
     """n steps; with checkpoints each is taken again by the backward pass."""
     for _ in range(n):
-        particles = checkpoint(take, *particles, use_reentrant=False) if checkpoints else take(*particles)
+        if checkpoints:
+            particles = checkpoint(take, *particles, use_reentrant=False, context_fn=contexts)
+        else:
+            particles = take(*particles)
     return particles

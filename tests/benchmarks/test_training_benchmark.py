@@ -13,10 +13,10 @@ from benchmarks.speed.training_scripts import PROJECTS
 SCRIPTS = [(key, name) for key, project in PROJECTS.items() for name in project.scripts()]
 
 
-def strained(key: str) -> tuple[work.Work, training.Setup]:
+def strained(key: str, device: str) -> tuple[work.Work, training.Setup]:
     """The work of a project with strains of every kind, fast enough that particles change their cell."""
     w, project = work.make(6), PROJECTS[key]
-    s = training.corotated(project, w, "cpu", project.precision)
+    s = training.corotated(project, w, device, project.precision)
     F = torch.eye(3) + 0.1 * torch.randn(w.particles, 3, 3)
     C = 5 * torch.randn(w.particles, 3, 3)
     return w, training.Setup(s.state.replace(F=F.to(s.state.x), C=C.to(s.state.x), v=150 * s.state.v), s.step)
@@ -24,10 +24,10 @@ def strained(key: str) -> tuple[work.Work, training.Setup]:
 
 @pytest.mark.parametrize("checkpoints", [False, True])
 @pytest.mark.parametrize(("key", "name"), SCRIPTS)
-def test_scripts_do_the_physics_of_the_rollout(key: str, name: str, checkpoints: bool) -> None:
+def test_scripts_do_the_physics_of_the_rollout(key: str, name: str, checkpoints: bool, device: str) -> None:
     """Positions, and gradients through the steps; moduli of scripts may be logarithms in float32."""
     project, n = PROJECTS[key], 20
-    w, s = strained(key)
+    w, s = strained(key, device)
     v = s.state.v.clone().requires_grad_()
     expected, _ = training.rolled(s, n)(v)
     before, after = (torch.floor(x.detach() * w.n - 0.5) for x in (s.state.x, expected))
@@ -41,7 +41,7 @@ def test_scripts_do_the_physics_of_the_rollout(key: str, name: str, checkpoints:
 
 def test_stress_moves_the_particles_of_the_peer() -> None:
     """With another modulus they are elsewhere, so that the agreement says something of the law."""
-    s = strained("MPM-PyTorch")[1]
+    s = strained("MPM-PyTorch", "cpu")[1]
     stiff = training.with_room(s, mpm.FixedCorotated(mu=1.1 * work.MU, lam=work.LAM), stress_form="gradient")
     found, other = (training.rolled(setup, 20)(s.state.v)[0] - s.state.x for setup in (s, stiff))
     assert relative_error(other, found) > 1e-3
