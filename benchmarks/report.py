@@ -129,20 +129,19 @@ def peers_of_training(results: list[dict[str, Any]], projects: Sequence[str]) ->
         if row[0] in projects
     ]
     intro = (
-        "A fixed corotated cube in a rollout, in a script that calls the solver for every step, and by the algorithm "
-        "of the project that the script is for (benchmarks/speed/training_peer.py and training_peer_warp.py), with the "
-        "gradient by the velocities at the start; columns with x are multiples of the rollout of the same work."
+        "A fixed corotated cube in a rollout, in a script of another project, and by the algorithm of that project "
+        "(benchmarks/speed/training_scripts.py), with the gradient by the velocities at the start; columns with x are "
+        "multiples of the rollout of the same work."
     )
     return "\n\n".join([intro, common.table(("device", *speed_of_training.BESIDE), rows)])
 
 
 def migrating(directory: Path) -> dict[Path, str]:
     """What the pages for other projects' users say of speed and memory."""
-    results, steps = common.read(directory, "training_*.json"), common.read(directory, "speed_*.json")
+    results = common.read(directory, "training_*.json")
     notes = "\n".join(f"- {common.describe(result['environment'])}" for result in results)
     pages = {f"{page}.md": [peers_of_training(results, [project]), notes] for page, project in
-             (("mpm_pytorch", "MPM-PyTorch"), ("nclaw", "NCLaw"))}  # fmt: skip
-    pages["physgaussian.md"] = [speed_table(steps)]
+             (("mpm_pytorch", "MPM-PyTorch"), ("nclaw", "NCLaw"), ("physgaussian", "PhysGaussian"))}  # fmt: skip
     return {MIGRATING / name: "\n\n".join(parts) for name, parts in pages.items()}
 
 

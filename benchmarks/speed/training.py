@@ -10,12 +10,13 @@ backward pass in any case; what is held at a time differs.
 Peers: the same cube with a fixed corotated law, in a rollout, in a script of another project whose import names
 `torch_mpm.compat`, and by that project's algorithm: that of MPM-PyTorch in plain torch
 (`benchmarks/speed/training_peer.py`), that of NCLaw by kernels of Warp inside an autograd Function
-(`benchmarks/speed/training_peer_warp.py`), where Warp is installed. Checkpoints are those of torch around every step.
+(`benchmarks/speed/training_peer_warp.py`), and that of PhysGaussian by kernels of Warp, without gradients
+(`benchmarks/speed/inference_peer_warp.py`), where Warp is installed. Checkpoints are those of torch around every step.
 
 Networks: a network is the law of a step; some steps in a row, one by one, compiled, and as one CUDA graph.
 
-Memory is the peak above that before both passes: on CUDA that of PyTorch's allocator, on the CPU resident memory, in a
-process for each case.
+Memory is the peak above that before both passes, or the forward pass where there is no other: on CUDA that of PyTorch's
+allocator, on the CPU resident memory, in a process for each case.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ from .. import common, regressions
 from . import memory, network_steps, work
 from .rollouts import seconds
 from .step import Setup, setup
-from .training_scripts import PROJECTS, Make, Project, taken
+from .training_scripts import PROJECTS, Make, Project
 
 ROLLOUT = {"cpu": (22, 50), "cuda": (46, 1000)}
 """Particles along a side of the cube, and steps."""
@@ -85,10 +86,10 @@ def rolled(s: Setup, n: int, checkpoint: int | None = None) -> Forward:
 def scripted(make: Make, w: work.Work, s: Setup, n: int, checkpoints: bool) -> Forward:
     assert s.state.C is not None and s.state.F is not None
     x, C, F = s.state.x, s.state.C.contiguous(), s.state.F.contiguous()
-    take = make(w, x)
+    run = make(w, x)
 
     def forward(v: Tensor) -> tuple[Tensor, Tensor]:
-        end = taken(take, (x, v, C, F), n, checkpoints and torch.is_grad_enabled())
+        end = run((x, v, C, F), n, checkpoints and torch.is_grad_enabled())
         return end[0], end[1]
 
     return forward
@@ -126,6 +127,10 @@ class Case:
             return scripted(scripts[self.name], w, s, self.steps, self.checkpoint is not None), s.state.v
         return rolled(s, self.steps, self.checkpoint), s.state.v
 
+    def work(self) -> Callable[[Forward, Tensor], None]:
+        """Both passes, or the forward pass of a project without gradients."""
+        return both if self.project is None or PROJECTS[self.project].gradients else alone
+
 
 def rollout_cases(side: int, n: int) -> list[Case]:
     held = {"by default": None, "32 steps": 32, "all steps": n}
@@ -134,8 +139,11 @@ def rollout_cases(side: int, n: int) -> list[Case]:
 
 def peer_cases(side: int, n: int, kept: int) -> Iterator[Case]:
     for key, project in PROJECTS.items():
-        yield Case("rollout", "by default", side, n, project=key)
+        yield Case("rollout", "by default" if project.gradients else "nothing", side, n, project=key)
         for name in project.scripts():
+            if not project.gradients:
+                yield Case(name, "nothing", side, n, project=key)
+                continue
             if project.checkpoints:
                 yield Case(name, "checkpoints", side, n, 1, key)
             for count in dict.fromkeys((n, kept)):
@@ -154,21 +162,23 @@ def alone(forward: Forward, v: Tensor) -> None:
 
 
 def measured(case: Case, device: str, samples: int, with_memory: bool = True) -> dict[str, Any]:
-    """Least times [s] and the memory [bytes] of a forward pass without gradients and of both passes; None for what does
-    not fit into the memory of the device."""
+    """Least times [s] of a forward pass without gradients and of both passes, and the memory [bytes]; None for what a
+    project does not have, and what does not fit into the memory of the device."""
     about = {"project": case.project, "name": case.name, "kept": case.kept}
     row: dict[str, Any] = {**about, "particles": case.side**3, "steps": case.steps}
-    row |= {"forward": None, "both": None, "memory": None}
-    program = case.program(device)
+    row |= {"forward": None, "both": None, "memory": None, "fits": True}
+    program, work = case.program(device), case.work()
     try:
-        alone(*program)
-        row["forward"] = min(seconds(device, lambda: alone(*program)) for _ in range(samples))
-        both(*program)
-        row["both"] = min(seconds(device, lambda: both(*program)) for _ in range(samples))
+        for key, passes in {"forward": alone, "both": both}.items():
+            if passes is both and work is alone:
+                continue
+            passes(*program)
+            row[key] = min(seconds(device, lambda passes=passes: passes(*program)) for _ in range(samples))
         if with_memory:
-            row["memory"] = memory.of_cuda(lambda: both(*program)) if device == "cuda" else resident(case)
+            row["memory"] = memory.of_cuda(lambda: work(*program)) if device == "cuda" else resident(case)
     except torch.OutOfMemoryError as error:
         print(str(error).splitlines()[0])
+        row["fits"] = False
     gc.collect()  # of the graph that an error has left
     return row
 
@@ -183,9 +193,9 @@ def resident(case: Case) -> int | None:
 
 def _resident(case: Case) -> int:
     common.use_all_cores()
-    both(*dataclasses.replace(case, side=4, steps=1).program("cpu"))  # first calls import what they need
+    case.work()(*dataclasses.replace(case, side=4, steps=1).program("cpu"))  # first calls import what they need
     program = case.program("cpu")
-    return memory.Resident().peak(lambda: both(*program))
+    return memory.Resident().peak(lambda: case.work()(*program))
 
 
 # ---- the program
@@ -235,21 +245,20 @@ def row_of_rollout(r: dict[str, Any]) -> tuple[Any, ...]:
 
 
 BESIDE = (
-    "work of", "program", "kept", "particles", "steps", "forward, ms a step", "forward and backward, ms a step",
-    "times", "memory, MB a step", "times",
+    "work of", "program", "kept", "particles", "steps", "forward, ms a step", "times",
+    "forward and backward, ms a step", "times", "memory, MB a step", "times",
 )  # fmt: skip
 
 
 def rows_of_peers(result: dict[str, Any]) -> Iterator[tuple[Any, ...]]:
-    """Those of a result, with multiples of the time and the memory of the rollout of the same work."""
+    """Those of a result, with multiples of the times and the memory of the rollout of the same work."""
     for r in result["peers"]:
         (own,) = (o for o in result["peers"] if (o["project"], o["name"]) == (r["project"], "rollout"))
-        times, memories = ([_ratio(row[key], row["steps"]) for row in (r, own)] for key in ("both", "memory"))
-        yield (
-            r["project"], r["name"], r["kept"], r["particles"], r["steps"], _scaled(r["forward"], 1e3 / r["steps"]),
-            "does not fit" if r["both"] is None else _scaled(times[0], 1e3), _times(*times),
-            "does not fit" if r["both"] is None else _scaled(memories[0], 1e-6), _times(*memories),
-        )  # fmt: skip
+        cells: list[Any] = [r["project"], r["name"], r["kept"], r["particles"], r["steps"]]
+        for key, unit in (("forward", 1e3), ("both", 1e3), ("memory", 1e-6)):
+            value, base = (_ratio(row[key], row["steps"]) for row in (r, own))
+            cells += [_scaled(value, unit) if r["fits"] or value else "does not fit", _times(value, base)]
+        yield tuple(cells)
 
 
 def _times(value: float | None, base: float | None) -> str | None:

@@ -25,7 +25,7 @@ def kernels() -> tuple[Any, Any, Any]:
     wp.init()
 
     @wp.func
-    def weight(f: float, i: int):  # type: ignore[no-untyped-def]
+    def weight(f: float, i: int):
         result = 0.5 * (1.5 - f) * (1.5 - f)
         if i == 1:
             result = 0.75 - (f - 1.0) * (f - 1.0)
@@ -34,7 +34,7 @@ def kernels() -> tuple[Any, Any, Any]:
         return result
 
     @wp.kernel
-    def p2g(  # type: ignore[no-untyped-def]
+    def p2g(
         x: wp.array(dtype=wp.vec3), v: wp.array(dtype=wp.vec3),
         C: wp.array(dtype=wp.mat33), stress: wp.array(dtype=wp.mat33),
         inv: float, dt: float, mass: float, volume: float,
@@ -54,7 +54,7 @@ def kernels() -> tuple[Any, Any, Any]:
                     wp.atomic_add(node_mass, i0 + i, j0 + j, k0 + k, N * mass)
 
     @wp.kernel
-    def update(  # type: ignore[no-untyped-def]
+    def update(
         momentum: wp.array(dtype=wp.vec3, ndim=3), node_mass: wp.array(dtype=float, ndim=3), change: wp.vec3,
         velocity: wp.array(dtype=wp.vec3, ndim=3),
     ):  # fmt: skip
@@ -63,7 +63,7 @@ def kernels() -> tuple[Any, Any, Any]:
             velocity[i, j, k] = momentum[i, j, k] / node_mass[i, j, k] + change
 
     @wp.kernel
-    def g2p(  # type: ignore[no-untyped-def]
+    def g2p(
         x: wp.array(dtype=wp.vec3), F: wp.array(dtype=wp.mat33), velocity: wp.array(dtype=wp.vec3, ndim=3),
         inv: float, dt: float,
         new_x: wp.array(dtype=wp.vec3), new_v: wp.array(dtype=wp.vec3),
@@ -127,19 +127,20 @@ def _array(t: Tensor, kind: Any, recorded: bool) -> Any:
     return wp.from_torch(t, dtype=kind, requires_grad=recorded, grad=grad)
 
 
-def _arrays(tensors: Sequence[Tensor], recorded: bool) -> list[Any]:
+def arrays(tensors: Sequence[Tensor], recorded: bool) -> list[Any]:
+    """Vectors [P, 3] and matrices [P, 3, 3] as arrays of Warp."""
     import warp as wp
 
     return [_array(t.detach().contiguous(), wp.vec3 if t.dim() == 2 else wp.mat33, recorded) for t in tensors]
 
 
-def _stream(like: Tensor) -> contextlib.AbstractContextManager[Any]:
+def stream_of(like: Tensor) -> contextlib.AbstractContextManager[Any]:
     """Where Warp works on the stream of torch."""
     import warp as wp
 
     if not like.is_cuda:
         return contextlib.nullcontext()
-    return wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(like.device)))
+    return wp.ScopedStream(wp.stream_from_torch(torch.cuda.currentstream_of(like.device)))
 
 
 class _Step(torch.autograd.Function):
@@ -147,8 +148,8 @@ class _Step(torch.autograd.Function):
     def forward(ctx: Any, solver: WarpSolver, *inputs: Tensor) -> tuple[Tensor, ...]:
         kernels()
         outputs = tuple(torch.empty_like(t, memory_format=torch.contiguous_format) for t in inputs[:4])
-        with _stream(inputs[0]):
-            solver.launch(_arrays(inputs, False), _arrays(outputs, False))
+        with stream_of(inputs[0]):
+            solver.launch(arrays(inputs, False), arrays(outputs, False))
         ctx.solver = solver
         ctx.save_for_backward(*inputs)
         return outputs
@@ -158,10 +159,10 @@ class _Step(torch.autograd.Function):
         import warp as wp
 
         saved = ctx.saved_tensors
-        with _stream(saved[0]):
-            inputs = _arrays(saved, True)
-            outputs = _arrays([torch.empty_like(g) for g in grads], True)
+        with stream_of(saved[0]):
+            inputs = arrays(saved, True)
+            outputs = arrays([torch.empty_like(g) for g in grads], True)
             with wp.Tape() as tape:
                 ctx.solver.launch(inputs, outputs)
-            tape.backward(grads=dict(zip(outputs, _arrays(grads, False), strict=True)))
+            tape.backward(grads=dict(zip(outputs, arrays(grads, False), strict=True)))
         return None, *(wp.to_torch(array.grad) for array in inputs)

@@ -32,9 +32,12 @@ def test_scripts_do_the_physics_of_the_rollout(key: str, name: str, checkpoints:
     expected, _ = training.rolled(s, n)(v)
     before, after = (torch.floor(x.detach() * w.n - 0.5) for x in (s.state.x, expected))
     assert int((before != after).sum()) > 20
-    found, _ = training.scripted(project.scripts()[name], w, s, n, checkpoints)(v)
+    with torch.set_grad_enabled(project.gradients):
+        found, _ = training.scripted(project.scripts()[name], w, s, n, checkpoints)(v)
     tolerance = 1e-6 if project.precision == torch.float64 else 2e-5
     assert relative_error(found - s.state.x, expected - s.state.x) < tolerance
+    if not project.gradients:
+        return
     grads = [torch.autograd.grad(x[:, 0].sin().sum(), v)[0] for x in (found, expected)]
     assert relative_error(*grads) < tolerance
 
@@ -63,7 +66,7 @@ def test_resident_memory_of_a_case_is_that_of_its_tensors() -> None:
     case = training.Case("its algorithm", "all steps", 12, 4, project="MPM-PyTorch")
     program = case.program("cpu")
     counted = memory.of_returned_tensors(lambda: training.both(*program))
-    assert 0.8 * counted < training.resident(case) < 1.5 * counted
+    assert 0.8 * counted < training.resident(case) < 1.2 * counted + 2**24  # of threads and allocators
 
 
 def test_a_way_that_fails_is_reported() -> None:
@@ -77,6 +80,6 @@ def test_training_program(tmp_path: Path) -> None:
     found = result(tmp_path, "training_*.json")
     assert [row["kept"] for row in found["rollouts"]] == ["by default", "32 steps", "all steps"]
     assert found["disagreement"].keys() == {row["project"] for row in found["peers"]} == PROJECTS.keys()
-    assert all(row["both"] > 0 for row in found["peers"])
+    assert all((row["both"] or row["forward"]) > 0 and row["fits"] for row in found["peers"])
     eager, compiled = found["networks"]
     assert eager["error"] < 1e-5 and compiled["error"] < 1e-5 and compiled["particles"] == 64
