@@ -24,6 +24,7 @@ from __future__ import annotations
 import argparse
 import concurrent.futures
 import dataclasses
+import functools
 import gc
 import multiprocessing
 from collections.abc import Callable, Iterator
@@ -170,10 +171,9 @@ def measured(case: Case, device: str, samples: int, with_memory: bool = True) ->
     program, work = case.program(device), case.work()
     try:
         for key, passes in {"forward": alone, "both": both}.items():
-            if passes is both and work is alone:
-                continue
-            passes(*program)
-            row[key] = min(seconds(device, lambda passes=passes: passes(*program)) for _ in range(samples))
+            if passes is alone or work is both:
+                passes(*program)
+                row[key] = min(seconds(device, functools.partial(passes, *program)) for _ in range(samples))
         if with_memory:
             row["memory"] = memory.of_cuda(lambda: work(*program)) if device == "cuda" else resident(case)
     except torch.OutOfMemoryError as error:

@@ -140,7 +140,7 @@ def stream_of(like: Tensor) -> contextlib.AbstractContextManager[Any]:
 
     if not like.is_cuda:
         return contextlib.nullcontext()
-    return wp.ScopedStream(wp.stream_from_torch(torch.cuda.currentstream_of(like.device)))
+    return wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(like.device)))
 
 
 class _Step(torch.autograd.Function):

@@ -22,7 +22,7 @@ from .training_peer_warp import WarpSolver
 GRAVITY = (0.0, -work.GRAVITY, 0.0)
 E, NU = work.MU * (3 * work.LAM + 2 * work.MU) / (work.LAM + work.MU), work.LAM / (2 * (work.LAM + work.MU))
 
-Take = Callable[..., Particles]
+Take = Callable[..., tuple[Tensor, ...]]
 """x, v, C and F a step later."""
 Run = Callable[[Particles, int, bool], Particles]
 """x, v, C and F some steps later; whether torch's checkpoints are around each of them."""
@@ -36,9 +36,10 @@ def stepwise(take: Take) -> Run:
     def run(particles: Particles, n: int, checkpoints: bool) -> Particles:
         for _ in range(n):
             if checkpoints:
-                particles = checkpoint(take, *particles, use_reentrant=False, context_fn=contexts)
+                x, v, C, F = checkpoint(take, *particles, use_reentrant=False, context_fn=contexts)
             else:
-                particles = take(*particles)
+                x, v, C, F = take(*particles)
+            particles = x, v, C, F
         return particles
 
     return run
@@ -77,9 +78,8 @@ def nclaw_here(w: work.Work, x: Tensor) -> Run:
 def nclaw_there(w: work.Work, x: Tensor) -> Run:
     solver = WarpSolver(w.n, w.mass, w.volume, GRAVITY, work.DT)
 
-    def take(x: Tensor, v: Tensor, C: Tensor, F: Tensor) -> Particles:
-        x, v, C, F = solver(x, v, C, F, corotated(F, work.MU, work.LAM))
-        return x, v, C, F
+    def take(x: Tensor, v: Tensor, C: Tensor, F: Tensor) -> tuple[Tensor, ...]:
+        return solver(x, v, C, F, corotated(F, work.MU, work.LAM))
 
     return stepwise(take)
 
