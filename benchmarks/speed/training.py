@@ -246,18 +246,19 @@ def row_of_rollout(r: dict[str, Any]) -> tuple[Any, ...]:
 
 BESIDE = (
     "work of", "program", "kept", "particles", "steps", "forward, ms a step", "times",
-    "forward and backward, ms a step", "times", "memory, MB a step", "times",
+    "forward and backward, ms a step", "times", "memory, MB", "times, a step",
 )  # fmt: skip
 
 
 def rows_of_peers(result: dict[str, Any]) -> Iterator[tuple[Any, ...]]:
-    """Those of a result, with multiples of the times and the memory of the rollout of the same work."""
+    """Those of a result, with multiples, for each step, of the times and the memory of the rollout of the same work."""
     for r in result["peers"]:
         (own,) = (o for o in result["peers"] if (o["project"], o["name"]) == (r["project"], "rollout"))
         cells: list[Any] = [r["project"], r["name"], r["kept"], r["particles"], r["steps"]]
         for key, unit in (("forward", 1e3), ("both", 1e3), ("memory", 1e-6)):
             value, base = (_ratio(row[key], row["steps"]) for row in (r, own))
-            cells += [_scaled(value, unit) if r["fits"] or value else "does not fit", _times(value, base)]
+            shown = _scaled(r[key] if key == "memory" else value, unit)
+            cells += [shown if r["fits"] or value else "does not fit", _times(value, base)]
         yield tuple(cells)
 
 
