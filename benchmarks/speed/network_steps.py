@@ -12,7 +12,7 @@ from torch import Tensor, nn
 import torch_mpm as mpm
 
 from .. import common
-from .rollouts import seconds
+from .rollouts import least
 
 DX, DT, STEPS = 1 / 32, 1e-4, 8
 """[m], [s], and steps in a row."""
@@ -103,8 +103,7 @@ def _measured(
     found = both()
     forward()
     started = time.perf_counter() - begin
-    times = {name: min(seconds(device, run) for _ in range(samples)) for name, run in
-             (("forward", forward), ("both", both))}  # fmt: skip
+    times = {name: least(device, run, samples) for name, run in (("forward", forward), ("both", both))}
     return {"begins": started, **times, "error": error(found, reference)}
 
 

@@ -38,7 +38,7 @@ import torch_mpm as mpm
 
 from .. import common, regressions
 from . import memory, network_steps, work
-from .rollouts import seconds
+from .rollouts import least
 from .step import Setup, setup
 from .training_scripts import PROJECTS, Make, Project
 
@@ -173,7 +173,7 @@ def measured(case: Case, device: str, samples: int, with_memory: bool = True) ->
         for key, passes in {"forward": alone, "both": both}.items():
             if passes is alone or work is both:
                 passes(*program)
-                row[key] = min(seconds(device, functools.partial(passes, *program)) for _ in range(samples))
+                row[key] = least(device, functools.partial(passes, *program), samples)
         if with_memory:
             row["memory"] = memory.of_cuda(lambda: work(*program)) if device == "cuda" else resident(case)
     except torch.OutOfMemoryError as error:
