@@ -131,8 +131,8 @@ def peers_of_training(results: list[dict[str, Any]], projects: Sequence[str]) ->
     intro = (
         "A fixed corotated cube in a rollout, in a script of another project, and by the algorithm of that project "
         "(benchmarks/speed/training_scripts.py), with the gradient by the velocities at the start; columns with x are "
-        "multiples of the rollout of the same work. Warp, by which the algorithms of NCLaw and PhysGaussian run, has one "
-        "thread on CPUs."
+        "multiples of the rollout of the same work. Warp, by which the algorithms of NCLaw and PhysGaussian run, has "
+        "one thread on CPUs."
     )
     return "\n\n".join([intro, common.table(("device", *speed_of_training.BESIDE), rows)])
 
