@@ -249,8 +249,7 @@ class Step(TensorModule):
         """Node velocities with the forces at the end of the step, of particles after the return map."""
         assert self.integrator is not None
         nodes = p2g(blocks, state.x, state.mass, state.v, affine)
-        start = grid_update(blocks, nodes, self.gravity_like(state.x), dt)
-        velocity = self.integrator.velocities(self, blocks, state, nodes[:, 0], start, dt)
+        velocity = self.integrator.velocities(self, blocks, state, nodes, dt)
         return velocity if self.on_grid is None else from_half(self.on_grid(blocks, velocity, nodes[:, 0], dt), nodes)
 
     @property

@@ -66,7 +66,7 @@ def _solve(
 ) -> Tensor:
     """λ of the free components; NaN in scenes whose solve does not converge."""
     tangent = system.tangent(v, projected=False)
-    inverse = inverse_blocks(system, bounds, system.tangent(v), free)
+    inverse = inverse_blocks(system, bounds, system.diagonal(system.tangent(v)), free)
     relative = grad.new_full((system.blocks.grid.scenes,), owner.adjoint_tolerance)
     if grad.dtype == torch.float32:
         relative = relative.clamp_min(1e-5)

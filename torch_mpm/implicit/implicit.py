@@ -11,6 +11,7 @@ from ..boundaries.obstacles import Obstacle, motion_tensors
 from ..capture import is_captured, is_traced, outside_transforms, without_transforms
 from ..errors import check_count, check_number
 from ..failures import Problem, unsolved_steps
+from ..ops import grid_update
 from .adjoint import differentiable
 from .bounds import node_bounds
 from .newton import Minimum, Options, minimise
@@ -76,25 +77,25 @@ class Implicit:
         self._unsolved: Tensor | None = None
         self._residual: Tensor | None = None
 
-    def velocities(
-        self, step: Step, blocks: Blocks, state: Any, mass: Tensor, start: Tensor, dt: float | Tensor
-    ) -> Tensor:
+    def velocities(self, step: Step, blocks: Blocks, state: Any, nodes: Tensor, dt: float | Tensor) -> Tensor:
         """The node velocities at the end of a step [N, D] [m/s].
 
         Args:
-            step: whose law, walls and boundaries count.
+            step: whose law, gravity, walls and boundaries count.
             blocks: the active blocks.
             state: particles after the return map.
-            mass: of the nodes [N] [kg].
-            start: node velocities after gravity [N, D] [m/s].
+            nodes: mass and momentum before gravity [N, 1 + D] [kg, kg m/s].
             dt: [s], a number or a tensor [], [1] or [B].
 
-        Differentiable by everything that the state, the law and `start` depend on, by one linear solve.
+        Differentiable by everything that the state, the law, gravity and the nodes depend on, by one linear solve.
         """
+        gravity = step.gravity_like(state.x)
+        start = grid_update(blocks, nodes, gravity, dt)
         if not blocks.grid.scenes:
             return start
         wants_gradient = torch.is_grad_enabled()
-        system = ImplicitSystem(blocks, step.law, state, mass, start, dt, step.stress_form)
+        before = None if gravity is None else grid_update(blocks, nodes.detach())
+        system = ImplicitSystem(blocks, step.law, state, nodes[:, 0], start, dt, step.stress_form, before)
         with torch.no_grad():
             fixed = system.detached() if wants_gradient else system
             bounds = node_bounds(blocks, step.walls, step.boundaries.entries, start, state.time)

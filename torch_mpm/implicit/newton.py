@@ -12,7 +12,7 @@ from ..ops.implicit import NEGATIVE_CURVATURE
 from .bounds import NodeBounds
 from .system import ImplicitSystem
 
-LOOSEST, TIGHTEST = 0.1, 1e-12
+LOOSEST, TIGHTEST = 0.03, 1e-12
 """Relative tolerances of conjugate gradients within Newton's method."""
 NEAR, PATIENCE = 0.05, 6
 """Share of the first residual, and number of iterations, from which the Hessian is not projected any more."""
@@ -58,9 +58,9 @@ def free_components(system: ImplicitSystem, bounds: NodeBounds | None, v: Tensor
     return massive if bounds is None else massive & bounds.free(v, gradient)
 
 
-def inverse_blocks(system: ImplicitSystem, bounds: NodeBounds | None, tangent: Tensor, free: Tensor) -> Tensor:
-    """B⁻¹ of the node blocks of the free components [N, D, D] [1/kg], zero for the others."""
-    blocks = system.diagonal(tangent).double()
+def inverse_blocks(system: ImplicitSystem, bounds: NodeBounds | None, diagonal: Tensor, free: Tensor) -> Tensor:
+    """B⁻¹ of the node blocks B [N, D, D] [kg] of the free components [1/kg], zero for the others."""
+    blocks = diagonal.double()
     # Rounding of stiff blocks may leave a negative eigenvalue, with which a residual could seem to be zero.
     ridge = 16 * torch.finfo(system.mass.dtype).eps * blocks.diagonal(dim1=1, dim2=2).sum(1)
     blocks = blocks + torch.diag_embed(ridge[:, None].expand(blocks.shape[:2]))
@@ -110,11 +110,15 @@ def minimise(system: ImplicitSystem, bounds: NodeBounds | None, options: Options
     first: Tensor | None = None
     previous = forcing = None
     stalled = indefinite = torch.zeros(scenes, dtype=torch.bool, device=v.device)
+    diagonal: Tensor | None = None
     while True:
         gradient = system.residual(v)
-        convex = system.tangent(v)
+        convex: Tensor | None = None
+        if diagonal is None:
+            convex = system.tangent(v)
+            diagonal = system.diagonal(convex)
         free = free_components(system, bounds, v, gradient)
-        inverse = inverse_blocks(system, bounds, convex, free)
+        inverse = inverse_blocks(system, bounds, diagonal, free)
         change = _times(inverse, gradient)
         residual = (system.node_sum(gradient * change).abs() / total_mass).sqrt()
         first = residual if first is None else first
@@ -123,13 +127,22 @@ def minimise(system: ImplicitSystem, bounds: NodeBounds | None, options: Options
         target = torch.maximum(options.tolerance * first, torch.where(iterations > 0, floor, 0))
         small = residual <= target
         done = stalled | small
-        if bool((done | (iterations >= options.max_iterations)).all()):
+        near = residual <= NEAR * first
+        exact = ~indefinite & (near | (iterations >= PATIENCE))
+        looks = done | (iterations >= options.max_iterations), done | exact, ~exact, done | near
+        finished, all_exact, none_exact, all_near = torch.stack(looks).all(1).tolist()
+        if finished:
             break
         forcing = _forcing(residual, previous, forcing, target)
         previous = residual
         relative = torch.where(done, 1.0, forcing).to(v.dtype)
-        exact = ~indefinite & ((residual <= NEAR * first) | (iterations >= PATIENCE))
-        tangent = torch.where(system.of_particles(exact), system.tangent(v, projected=False), convex)
+        if not all_exact and convex is None:
+            convex = system.tangent(v)
+        tangent = convex if none_exact else system.tangent(v, projected=False)
+        if not all_exact and not none_exact:
+            tangent = torch.where(system.of_particles(exact), tangent, convex)
+        if not all_near:  # where little changes any more, the preconditioner is kept
+            diagonal = None
         solve = implicit_cg(
             *(system.blocks, system.state.x, torch.where(system.of_nodes(done), 0, -gradient), system.mass, inverse),
             *(tangent, relative, options.max_cg_iterations, system.stress_form),
@@ -195,26 +208,34 @@ def _times(matrices: Tensor, vectors: Tensor) -> Tensor:
 
 
 def _start(system: ImplicitSystem, bounds: NodeBounds | None) -> tuple[Tensor, Tensor, Tensor]:
-    """v* within bounds or no motion, whichever has less energy; where both have none, a share of v* that has one."""
+    """Of v*, the velocities before gravity and no motion, those of least energy within bounds; where all of them have
+    none, a share of v* that has one. A body that hangs or is pushed slowly goes on as it did, which is the second."""
 
-    def allowed(share: Tensor) -> Tensor:
-        v = system.of_nodes(share).to(system.start.dtype) * system.start
-        v = torch.where(system.of_nodes(share > 0), v, 0)
+    def allowed(v: Tensor, share: Tensor) -> Tensor:
+        v = torch.where(system.of_nodes(share > 0), system.of_nodes(share).to(v.dtype) * v, 0)
         return v if bounds is None else bounds.clamped(v)
 
     share = torch.ones(system.blocks.grid.scenes, dtype=torch.float64, device=system.mass.device)
-    energy, _ = system.energy(allowed(share))
-    at_rest, _ = system.energy(allowed(0 * share))
-    lower = at_rest < torch.where(energy.isfinite(), energy, torch.inf)
-    share, lost = torch.where(lower, 0.0, share), ~(lower | energy.isfinite())
+    v = allowed(system.start, share)
+    energy, size = system.energy(v)
+    others = [allowed(system.start, 0 * share)]
+    if system.before_gravity is not None:
+        others.insert(0, allowed(system.before_gravity, share))
+    for other in others:
+        other_energy, other_size = system.energy(other)
+        lower = other_energy < torch.where(energy.isfinite(), energy, torch.inf)
+        v = torch.where(system.of_nodes(lower), other, v)
+        energy, size = torch.where(lower, other_energy, energy), torch.where(lower, other_size, size)
+    lost = ~energy.isfinite()
+    if not bool(lost.any()):
+        return v, energy, size
     for _ in range(MOST_HALVINGS):
+        share = torch.where(lost, share / 2, share)
+        lost = lost & ~system.energy(allowed(system.start, share))[0].isfinite()
         if not bool(lost.any()):
             break
-        share = torch.where(lost, share / 2, share)
-        lost = lost & ~system.energy(allowed(share))[0].isfinite()
-    v = allowed(torch.where(lost, 0.0, share))
-    energy, size = system.energy(v)
-    return v, energy, size
+    v = torch.where(system.of_nodes(share < 1), allowed(system.start, torch.where(lost, 0.0, share)), v)
+    return v, *system.energy(v)
 
 
 def _search(

@@ -34,6 +34,7 @@ class ImplicitSystem:
         start: v* [N, D] [m/s].
         dt: [s], a number or a tensor [], [1] or [B].
         stress_form: "mls" or "gradient".
+        before_gravity: velocities of the nodes before gravity [N, D] [m/s], None without gravity: a place to start.
         volume: of the particles that have an energy, zero for the others [P] [m³].
     """
 
@@ -44,6 +45,7 @@ class ImplicitSystem:
     start: Tensor
     dt: float | Tensor
     stress_form: str
+    before_gravity: Tensor | None = None
     _trial: tuple[Tensor, Any] | None = None
 
     def __post_init__(self) -> None:
@@ -61,7 +63,7 @@ class ImplicitSystem:
 
     def forget(self) -> None:
         """Let go of what only the search for the minimum reads."""
-        self._trial = None
+        self._trial = self.before_gravity = None
         self.__dict__.pop("stiffness", None)
 
     @functools.cached_property
@@ -80,7 +82,8 @@ class ImplicitSystem:
         state = Overlay(self.state, x=self.state.x.detach(), extra=extra, **fields)
         dt = self.dt.detach() if isinstance(self.dt, Tensor) else self.dt
         return ImplicitSystem(
-            self.blocks, self.law, state, self.mass.detach(), self.start.detach(), dt, self.stress_form
+            *(self.blocks, self.law, state, self.mass.detach(), self.start.detach(), dt),
+            *(self.stress_form, self.before_gravity),
         )
 
     def trial(self, v: Tensor) -> Any:
