@@ -100,7 +100,7 @@ def minimise(system: ImplicitSystem, bounds: NodeBounds | None, options: Options
     lowers its energy. Projected Newton of Bertsekas (1982): components at a bound that the gradient holds there are
     left out of the linear solve, and steps are clamped.
     """
-    v, energy, size = _start(system, bounds)
+    v, energy, size, plain = _start(system, bounds)
     scenes = len(energy)
     zeros = torch.zeros(scenes, dtype=torch.int32, device=v.device)
     total_mass = system.node_sum(system.mass)
@@ -121,7 +121,12 @@ def minimise(system: ImplicitSystem, bounds: NodeBounds | None, options: Options
         inverse = inverse_blocks(system, bounds, diagonal, free)
         change = _times(inverse, gradient)
         residual = (system.node_sum(gradient * change).abs() / total_mass).sqrt()
-        first = residual if first is None else first
+        if first is None:
+            first = residual
+            if plain is not v:  # a good start saves work, and does not ask for more accuracy
+                slope = system.residual(plain)
+                slope = system.node_sum(slope * _times(inverse, slope)).abs()
+                first = torch.fmax(first, (slope / total_mass).sqrt())
         floor = _rounding(system, inverse, v, wave, momentum, total_mass)
         # One iteration at least: a smooth load may be smaller than the rounding of stresses, which averages out.
         target = torch.maximum(options.tolerance * first, torch.where(iterations > 0, floor, 0))
@@ -207,35 +212,37 @@ def _times(matrices: Tensor, vectors: Tensor) -> Tensor:
     return (matrices * vectors[:, None, :]).sum(-1)
 
 
-def _start(system: ImplicitSystem, bounds: NodeBounds | None) -> tuple[Tensor, Tensor, Tensor]:
-    """Of v*, the velocities before gravity and no motion, those of least energy within bounds; where all of them have
-    none, a share of v* that has one. A body that hangs or is pushed slowly goes on as it did, which is the second."""
+def _start(system: ImplicitSystem, bounds: NodeBounds | None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Where the search begins, its energy and size; and the velocities whose residual the tolerance is relative to.
+
+    These are v* within bounds or no motion, whichever has less energy; where both have none, a share of v* that has
+    one. The search begins there, or at the velocities before gravity where these have less energy still, as they do in
+    a body that is held and moves slowly.
+    """
 
     def allowed(v: Tensor, share: Tensor) -> Tensor:
         v = torch.where(system.of_nodes(share > 0), system.of_nodes(share).to(v.dtype) * v, 0)
         return v if bounds is None else bounds.clamped(v)
 
     share = torch.ones(system.blocks.grid.scenes, dtype=torch.float64, device=system.mass.device)
-    v = allowed(system.start, share)
-    energy, size = system.energy(v)
-    others = [allowed(system.start, 0 * share)]
-    if system.before_gravity is not None:
-        others.insert(0, allowed(system.before_gravity, share))
-    for other in others:
-        other_energy, other_size = system.energy(other)
-        lower = other_energy < torch.where(energy.isfinite(), energy, torch.inf)
-        v = torch.where(system.of_nodes(lower), other, v)
-        energy, size = torch.where(lower, other_energy, energy), torch.where(lower, other_size, size)
-    lost = ~energy.isfinite()
-    if not bool(lost.any()):
-        return v, energy, size
+    energy, _ = system.energy(allowed(system.start, share))
+    at_rest, _ = system.energy(allowed(system.start, 0 * share))
+    lower = at_rest < torch.where(energy.isfinite(), energy, torch.inf)
+    share, lost = torch.where(lower, 0.0, share), ~(lower | energy.isfinite())
     for _ in range(MOST_HALVINGS):
-        share = torch.where(lost, share / 2, share)
-        lost = lost & ~system.energy(allowed(system.start, share))[0].isfinite()
         if not bool(lost.any()):
             break
-    v = torch.where(system.of_nodes(share < 1), allowed(system.start, torch.where(lost, 0.0, share)), v)
-    return v, *system.energy(v)
+        share = torch.where(lost, share / 2, share)
+        lost = lost & ~system.energy(allowed(system.start, share))[0].isfinite()
+    plain = allowed(system.start, torch.where(lost, 0.0, share))
+    energy, size = system.energy(plain)
+    if system.before_gravity is None:
+        return plain, energy, size, plain
+    steady = allowed(system.before_gravity, torch.ones_like(share))
+    steady_energy, steady_size = system.energy(steady)
+    lower = steady_energy < energy
+    v = torch.where(system.of_nodes(lower), steady, plain)
+    return v, torch.where(lower, steady_energy, energy), torch.where(lower, steady_size, size), plain
 
 
 def _search(
