@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -100,7 +101,7 @@ def minimise(system: ImplicitSystem, bounds: NodeBounds | None, options: Options
     lowers its energy. Projected Newton of Bertsekas (1982): components at a bound that the gradient holds there are
     left out of the linear solve, and steps are clamped.
     """
-    v, energy, size, plain = _start(system, bounds)
+    (v, energy, size), plain = _start(system, bounds)
     scenes = len(energy)
     zeros = torch.zeros(scenes, dtype=torch.int32, device=v.device)
     total_mass = system.node_sum(system.mass)
@@ -141,11 +142,10 @@ def minimise(system: ImplicitSystem, bounds: NodeBounds | None, options: Options
         forcing = _forcing(residual, previous, forcing, target)
         previous = residual
         relative = torch.where(done, 1.0, forcing).to(v.dtype)
-        if not all_exact and convex is None:
-            convex = system.tangent(v)
-        tangent = convex if none_exact else system.tangent(v, projected=False)
-        if not all_exact and not none_exact:
-            tangent = torch.where(system.of_particles(exact), tangent, convex)
+        tangent = None if none_exact and not all_exact else system.tangent(v, projected=False)
+        if tangent is None or not all_exact:
+            convex = system.tangent(v) if convex is None else convex
+            tangent = convex if tangent is None else torch.where(system.of_particles(exact), tangent, convex)
         if not all_near:  # where little changes any more, the preconditioner is kept
             diagonal = None
         solve = implicit_cg(
@@ -212,37 +212,45 @@ def _times(matrices: Tensor, vectors: Tensor) -> Tensor:
     return (matrices * vectors[:, None, :]).sum(-1)
 
 
-def _start(system: ImplicitSystem, bounds: NodeBounds | None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Where the search begins, its energy and size; and the velocities whose residual the tolerance is relative to.
+class _Point(NamedTuple):
+    """Velocities [N, D], and their energy and its size, `ImplicitSystem.energy` [B]."""
+
+    v: Tensor
+    energy: Tensor
+    size: Tensor
+
+
+def _point(system: ImplicitSystem, bounds: NodeBounds | None, v: Tensor) -> _Point:
+    """The nearest velocities within bounds."""
+    v = v if bounds is None else bounds.clamped(v)
+    return _Point(v, *system.energy(v))
+
+
+def _lower(system: ImplicitSystem, a: _Point, b: _Point) -> _Point:
+    """Of each scene the one of less energy."""
+    lower = b.energy < torch.where(a.energy.isfinite(), a.energy, torch.inf)
+    rest = (torch.where(lower, y, x) for x, y in zip(a[1:], b[1:], strict=True))
+    return _Point(torch.where(system.of_nodes(lower), b.v, a.v), *rest)
+
+
+def _start(system: ImplicitSystem, bounds: NodeBounds | None) -> tuple[_Point, Tensor]:
+    """Where the search begins, and the velocities whose residual the tolerance is relative to.
 
     These are v* within bounds or no motion, whichever has less energy; where both have none, a share of v* that has
     one. The search begins there, or at the velocities before gravity where these have less energy still, as they do in
     a body that is held and moves slowly.
     """
-
-    def allowed(v: Tensor, share: Tensor) -> Tensor:
-        v = torch.where(system.of_nodes(share > 0), system.of_nodes(share).to(v.dtype) * v, 0)
-        return v if bounds is None else bounds.clamped(v)
-
-    share = torch.ones(system.blocks.grid.scenes, dtype=torch.float64, device=system.mass.device)
-    energy, _ = system.energy(allowed(system.start, share))
-    at_rest, _ = system.energy(allowed(system.start, 0 * share))
-    lower = at_rest < torch.where(energy.isfinite(), energy, torch.inf)
-    share, lost = torch.where(lower, 0.0, share), ~(lower | energy.isfinite())
+    plain = _lower(system, _point(system, bounds, system.start), _point(system, bounds, torch.zeros_like(system.start)))
+    lost, share = ~plain.energy.isfinite(), 1.0
     for _ in range(MOST_HALVINGS):
         if not bool(lost.any()):
             break
-        share = torch.where(lost, share / 2, share)
-        lost = lost & ~system.energy(allowed(system.start, share))[0].isfinite()
-    plain = allowed(system.start, torch.where(lost, 0.0, share))
-    energy, size = system.energy(plain)
+        share /= 2
+        plain = _lower(system, plain, _point(system, bounds, share * system.start))
+        lost = ~plain.energy.isfinite()
     if system.before_gravity is None:
-        return plain, energy, size, plain
-    steady = allowed(system.before_gravity, torch.ones_like(share))
-    steady_energy, steady_size = system.energy(steady)
-    lower = steady_energy < energy
-    v = torch.where(system.of_nodes(lower), steady, plain)
-    return v, torch.where(lower, steady_energy, energy), torch.where(lower, steady_size, size), plain
+        return plain, plain.v
+    return _lower(system, plain, _point(system, bounds, system.before_gravity)), plain.v
 
 
 def _search(
