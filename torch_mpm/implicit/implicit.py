@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+import dataclasses
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
@@ -52,8 +54,11 @@ class Implicit:
 
     Attributes:
         report: `ImplicitReport` of the latest step, None before the first.
-        adjoint_converged: bool [B], whether the solve of the latest backward pass converged; None before the first.
-            Where it did not, the gradients of that scene are NaN.
+        adjoint_converged: bool [B], whether all solves of backward passes since the latest step converged; None before
+            the first. Where one did not, the gradients of that scene are NaN.
+
+    A step takes a copy, so that one `Implicit` may be given to several steps: the reports are those of
+    `step.integrator`.
 
     Raises:
         TypeError, ValueError: for a wrong argument.
@@ -74,6 +79,7 @@ class Implicit:
         self.adjoint_tolerance = float(adjoint_tolerance)
         self.report: ImplicitReport | None = None
         self.adjoint_converged: Tensor | None = None
+        self._adjoint_begins = True
         self._unsolved: Tensor | None = None
         self._residual: Tensor | None = None
 
@@ -106,7 +112,15 @@ class Implicit:
             return minimum.v
         return differentiable(self, system, fixed, bounds, minimum)
 
+    def record_adjoint(self, converged: Tensor) -> None:
+        """One solve of a backward pass, bool [B]."""
+        kept = None if self._adjoint_begins else self.adjoint_converged
+        self.adjoint_converged = converged if kept is None else kept & converged
+        self._adjoint_begins = False
+
     def _record(self, minimum: Minimum) -> None:
+        if torch._C._current_graph_task_id() == -1:  # not taken again in a backward pass
+            self._adjoint_begins = True
         self.report = ImplicitReport(minimum.converged, minimum.residual, minimum.iterations, minimum.cg_iterations)
         with outside_transforms(), torch.inference_mode(False):
             missed = without_transforms(~minimum.converged).to(torch.int32)
@@ -122,6 +136,13 @@ class Implicit:
         if self._unsolved is None or self._residual is None:
             return {}
         return unsolved_steps(self._unsolved, self._residual)
+
+    def fresh(self) -> Implicit:
+        """The same with no record."""
+        result = copy.copy(self)
+        result.options = dataclasses.replace(self.options)
+        result.reset()
+        return result
 
     def reset(self) -> None:
         """Forget the steps so far."""
@@ -161,13 +182,13 @@ INTEGRATORS = ("explicit", "implicit")
 
 
 def as_integrator(value: Any) -> Implicit | None:
-    """The integrator of a step, None for the explicit one.
+    """The integrator of a step, its own and without a record; None for the explicit one.
 
     Raises:
         TypeError, ValueError: for what is none.
     """
     if isinstance(value, Implicit):
-        return value
+        return value.fresh()
     if not isinstance(value, str):
         raise TypeError(f"integrator must be 'explicit', 'implicit' or an Implicit, got {type(value).__name__}")
     if value not in INTEGRATORS:
