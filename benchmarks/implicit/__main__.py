@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from .. import common
-from . import cost, figures, order, quasistatic, sand, stability, vibration
+from . import cost, crossover, figures, order, quasistatic, sand, stability, vibration
 
 Result = dict[str, Any]
 
@@ -33,6 +33,11 @@ def of_quasistatic(quick: bool, device: str, out: Path) -> Result:
     figures.draw_work(rows, out / "implicit_work.png")
     return {"Gripper": rows, "Gripper, at equal error": quasistatic.at_equal_error(rows),
             "Settling": quasistatic.settling(quick)}  # fmt: skip
+
+
+def of_crossover(quick: bool, device: str, out: Path) -> Result:
+    rows = crossover.crossover(quick)
+    return {"Steps of slow motion": rows, "Costs": crossover.fitted(rows)}
 
 
 def of_order(quick: bool, device: str, out: Path) -> Result:
@@ -57,6 +62,7 @@ STUDIES: dict[str, tuple[Any, Callable[[bool, str, Path], Result]]] = {
     "stability": (stability, of_stability),
     "vibration": (vibration, of_vibration),
     "quasistatic": (quasistatic, of_quasistatic),
+    "crossover": (crossover, of_crossover),
     "order": (order, of_order),
     "sand": (sand, of_sand),
     "cost": (cost, of_cost),

@@ -23,6 +23,13 @@ def _pyplot() -> Any:
 
 
 def _saved(figure: Any, path: Path) -> None:
+    from matplotlib.ticker import NullFormatter
+
+    for panel in figure.axes:  # labels between decades overlap
+        if panel.get_xscale() == "log":
+            panel.xaxis.set_minor_formatter(NullFormatter())
+        if panel.get_yscale() == "log":
+            panel.yaxis.set_minor_formatter(NullFormatter())
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=90)
     _pyplot().close(figure)
@@ -86,7 +93,7 @@ def draw_order(in_time: Rows, in_space: Rows, path: Path) -> None:
 
 def draw_sand(clump: Rows, collapse: Rows, path: Path) -> None:
     """Above the clump, below the collapse: particles at the end of one length of the step, and all lengths."""
-    figure, panels = _pyplot().subplots(2, 4, figsize=(15, 6), layout="constrained", width_ratios=(1, 1, 1, 1.1))
+    figure, panels = _pyplot().subplots(2, 4, figsize=(16, 5.5), layout="constrained", width_ratios=(1.2, 1.2, 1.2, 1))
     _, start = pulled((8, 4), 0.025, 2.0)
     _draw_bodies(panels[0, :3], clump, 1e-2, start.x)
     _draw_bodies(panels[1, :3], collapse, 2e-3, None)
@@ -114,9 +121,10 @@ def _draw_bodies(panels: Any, rows: Rows, dt: float, start: torch.Tensor | None)
     shown += [row for energy in COLORS for row in implicit if row["energy"] == energy and row["dt [s]"] == near]
     for panel, row in zip(panels, shown, strict=True):
         if start is not None:
-            panel.plot(*start.T, ".", color="lightgray", markersize=2)
+            panel.plot(*start.T, "x", color="silver", markersize=3)
         explicit = row["return map"] == "explicit"
-        panel.plot(*row["end"].x.T, ".", color="black" if explicit else COLORS[row["energy"]], markersize=2)
+        size = 2 if start is None else 4
+        panel.plot(*row["end"].x.T, ".", color="black" if explicit else COLORS[row["energy"]], markersize=size)
         panel.set_aspect("equal")
         panel.set_title("explicit" if explicit else f"implicit, dt = {near:.2g} s, {row['energy']}")
         panel.sharex(panels[0])

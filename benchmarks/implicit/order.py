@@ -17,7 +17,7 @@ import torch
 import torch_mpm as mpm
 from torch_mpm.implicit import Implicit, equilibrium
 
-from ..common import order_of
+from ..common import one_thread, order_of
 from .stability import bar
 
 KERNELS = ("quadratic", "cubic")
@@ -68,6 +68,7 @@ def beam(cells: int, kernel: str) -> float:
     return abs(sag / (q / (8 * E * h**3 / 12) + q / (2 * 5 / 6 * E / 2 * h)) - 1)
 
 
+@one_thread()
 def in_space(quick: bool) -> list[dict[str, Any]]:
     rows: list[dict[str, Any]] = []
     for body, measure, most in (("column", column, 64), ("beam", beam, 16)):

@@ -16,9 +16,8 @@ that period. `equilibrium` is one step of 1000 s.
 
 from __future__ import annotations
 
-import contextlib
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -26,6 +25,8 @@ from torch import Tensor
 
 import torch_mpm as mpm
 from torch_mpm.implicit import Implicit, equilibrium
+
+from ..common import one_thread
 
 SIDE, DENSITY, NU, SPEED = 0.2, 1000.0, 0.45, 0.01
 MODULI = (1e6, 1e7, 1e8, 1e9)
@@ -35,17 +36,18 @@ STEPS = (5, 10, 20, 50, 100)
 StepOf = Callable[..., mpm.Step]
 
 
-def gripper(E: float, cells: int = CELLS, dtype: torch.dtype = torch.float64) -> tuple[mpm.State, StepOf]:
+def gripper(E: float, cells: int = CELLS, dtype: torch.dtype = torch.float64, dim: int = 2) -> tuple[mpm.State, StepOf]:
     """A block between two plates that close, and its steps by integrator."""
-    grid = mpm.Grid(SIDE / cells, (-SIDE, -SIDE), (SIDE, SIDE))
-    half = SIDE / 2
-    state = mpm.State.at_rest(mpm.seed.box((-half, -half), (half, half), grid, per_cell=4), DENSITY, dtype=dtype)
+    half, rest = SIDE / 2, (0.0,) * (dim - 1)
+    grid = mpm.Grid(SIDE / cells, (-SIDE,) * dim, (SIDE,) * dim)
+    points = mpm.seed.box((-half,) * dim, (half,) * dim, grid, per_cell=2**dim)
+    state = mpm.State.at_rest(points, DENSITY, dtype=dtype)
     plates = [
-        mpm.Plane((-half, 0.0), (1.0, 0.0), kind="sticky", velocity=(SPEED, 0.0)),
-        mpm.Plane((half, 0.0), (-1.0, 0.0), kind="sticky", velocity=(-SPEED, 0.0)),
+        mpm.Plane((-half, *rest), (1.0, *rest), kind="sticky", velocity=(SPEED, *rest)),
+        mpm.Plane((half, *rest), (-1.0, *rest), kind="sticky", velocity=(-SPEED, *rest)),
     ]
-    law = mpm.NeoHookean(E=E, nu=NU)
-    return state, lambda integrator: mpm.Step(grid, law, (0.0, -9.8), boundaries=plates, integrator=integrator)
+    law, gravity = mpm.NeoHookean(E=E, nu=NU), (0.0, -9.8, 0.0)[:dim]
+    return state, lambda integrator: mpm.Step(grid, law, gravity, boundaries=plates, integrator=integrator)
 
 
 def taken(step: mpm.Step, state: mpm.State, n: int, duration: float = 1.0) -> tuple[mpm.State, float]:
@@ -84,14 +86,6 @@ def on_coarse(fine: mpm.State, values: Tensor, coarse: mpm.State) -> Tensor:
 
 def relative(a: Tensor, b: Tensor) -> float:
     return float((a - b).norm() / b.norm())
-
-
-@contextlib.contextmanager
-def one_thread() -> Iterator[None]:
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
 
 
 @one_thread()

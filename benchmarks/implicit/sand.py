@@ -9,7 +9,7 @@ its extent grows by a half; share of that growth, 1 without cohesion. Explicit s
 
 Collapse: a column of 10 × 20 cells of 1 cm (φ = 30°), as stiff as a compression of 2% at its foot needs, is let go on
 a rough floor and spreads for 6 √(H/g); run-out (half the width that holds 98% of the mass, less the half width at the
-start, over it) and height of the deposit, and whether all steps converged.
+start, over it) and height of the deposit. Times are those of the processor, on one thread.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ import torch_mpm as mpm
 from torch_mpm.implicit import Implicit
 
 from ..accuracy.runout import DENSITY, GRAVITY, stiffness
+from ..common import one_thread
 
 ENERGIES = ("full", "unilateral")
 CLUMP_DT = (1e-3, 2.5e-3, 5e-3, 1e-2, 2.5e-2, 5e-2)
@@ -92,6 +93,7 @@ def runs(
     return rows
 
 
+@one_thread()
 def clump(quick: bool) -> list[dict[str, Any]]:
     grid, state = pulled((8, 4), 0.025, 2.0)
     rows = runs(grid, state, 0.25, CLUMP_DT[3:4] if quick else CLUMP_DT, {"E": 1e7, "nu": 0.3})
@@ -100,6 +102,7 @@ def clump(quick: bool) -> list[dict[str, Any]]:
     return rows
 
 
+@one_thread()
 def collapse(quick: bool) -> list[dict[str, Any]]:
     dx, half, height = 0.01, 0.05, 0.2
     grid = mpm.Grid(dx, (-0.6, 0.0), (0.6, 0.3))

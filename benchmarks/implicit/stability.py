@@ -14,6 +14,8 @@ import torch
 
 import torch_mpm as mpm
 
+from ..common import one_thread
+
 MODULI, RATIOS = (1e3, 1e6, 1e10), (0.0, 0.3, 0.499)
 MULTIPLES = (1.0, 10.0, 100.0, 1e4)
 STARTS = ("compressed", "stretched", "spinning")
@@ -46,6 +48,7 @@ def started(state: mpm.State, start: str, dt: float) -> mpm.State:
     return state.replace(x=x, F=F)
 
 
+@one_thread()
 def stability(quick: bool) -> list[dict[str, Any]]:
     rows = []
     choices = itertools.product(MODULI[1:2] if quick else MODULI, RATIOS[1:2] if quick else RATIOS, STARTS)

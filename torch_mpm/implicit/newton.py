@@ -13,10 +13,12 @@ from ..ops.implicit import NEGATIVE_CURVATURE
 from .bounds import NodeBounds
 from .system import ImplicitSystem
 
-LOOSEST, TIGHTEST = 0.03, 1e-12
+LOOSEST, TIGHTEST = 0.1, 1e-12
 """Relative tolerances of conjugate gradients within Newton's method."""
 NEAR, PATIENCE = 0.05, 6
 """Share of the first residual, and number of iterations, from which the Hessian is not projected any more."""
+KEPT = 0.01
+"""Share of the first residual from which the preconditioner stays: so little changes any more."""
 SUFFICIENT = 1e-4
 """Share of the decrease that the slope promises, which a step must bring (Nocedal and Wright 2006, section 3.1)."""
 ROUNDING = 32
@@ -133,10 +135,10 @@ def minimise(system: ImplicitSystem, bounds: NodeBounds | None, options: Options
         target = torch.maximum(options.tolerance * first, torch.where(iterations > 0, floor, 0))
         small = residual <= target
         done = stalled | small
-        near = residual <= NEAR * first
-        exact = ~indefinite & (near | (iterations >= PATIENCE))
-        looks = done | (iterations >= options.max_iterations), done | exact, ~exact, done | near
-        finished, all_exact, none_exact, all_near = torch.stack(looks).all(1).tolist()
+        exact = ~indefinite & ((residual <= NEAR * first) | (iterations >= PATIENCE))
+        kept = done | (residual <= KEPT * first)
+        looks = done | (iterations >= options.max_iterations), done | exact, ~exact, kept
+        finished, all_exact, none_exact, all_kept = torch.stack(looks).all(1).tolist()
         if finished:
             break
         forcing = _forcing(residual, previous, forcing, target)
@@ -146,7 +148,7 @@ def minimise(system: ImplicitSystem, bounds: NodeBounds | None, options: Options
         if tangent is None or not all_exact:
             convex = system.tangent(v) if convex is None else convex
             tangent = convex if tangent is None else torch.where(system.of_particles(exact), tangent, convex)
-        if not all_near:  # where little changes any more, the preconditioner is kept
+        if not all_kept:
             diagonal = None
         solve = implicit_cg(
             *(system.blocks, system.state.x, torch.where(system.of_nodes(done), 0, -gradient), system.mass, inverse),
