@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from .. import common
-from . import cost, crossover, figures, order, quadrature, quasistatic, sand, stability, vibration
+from . import cost, crossover, figures, order, quasistatic, sand, stability, vibration
 
 Result = dict[str, Any]
 
@@ -53,10 +53,6 @@ def of_sand(quick: bool, device: str, out: Path) -> Result:
             "Collapse": sand.without_states(collapse)}  # fmt: skip
 
 
-def of_quadrature(quick: bool, device: str, out: Path) -> Result:
-    return {"Quadrature": quadrature.quadrature(quick)}
-
-
 def of_cost(quick: bool, device: str, out: Path) -> Result:
     return {"Cost, in units of a gather and a scatter": cost.cost(device, quick),
             "Batches": cost.batches(device, quick)}  # fmt: skip
@@ -69,7 +65,6 @@ STUDIES: dict[str, tuple[Any, Callable[[bool, str, Path], Result]]] = {
     "crossover": (crossover, of_crossover),
     "order": (order, of_order),
     "sand": (sand, of_sand),
-    "quadrature": (quadrature, of_quadrature),
     "cost": (cost, of_cost),
 }
 ON_DEVICE = ("cost",)
