@@ -110,7 +110,7 @@ def draw_sand(clump: Rows, collapse: Rows, path: Path) -> None:
         panel.set_ylim(0)
         panel.set_xlabel("dt [s]")
         panel.set_title("share of the growth" if measure == "spread" else "run-out / half width")
-        panel.legend(fontsize=8)
+        panel.legend(fontsize=8, loc="center right" if measure == "spread" else "lower left")
     _saved(figure, path)
 
 
@@ -127,5 +127,9 @@ def _draw_bodies(panels: Any, rows: Rows, dt: float, start: torch.Tensor | None)
         panel.plot(*row["end"].x.T, ".", color="black" if explicit else COLORS[row["energy"]], markersize=size)
         panel.set_aspect("equal")
         panel.set_title("explicit" if explicit else f"implicit, dt = {near:.2g} s, {row['energy']}")
-        panel.sharex(panels[0])
-        panel.sharey(panels[0])
+    ends = torch.cat([row["end"].x for row in shown])
+    margin = 0.05 * (ends.amax(0) - ends.amin(0)).max()
+    (left, bottom), (right, top) = (ends.amin(0) - margin).tolist(), (ends.amax(0) + margin).tolist()
+    for panel in panels:
+        panel.set_xlim(left, right)
+        panel.set_ylim(bottom, top)
