@@ -72,6 +72,8 @@ def draw_order(in_time: Rows, in_space: Rows, path: Path) -> None:
     figure, (left, right) = _pyplot().subplots(1, 2, figsize=(10, 4.2), layout="constrained")
     left.loglog(*points(in_time, "dt [s]", "error"), "o-", label="vibrating bar, FLIP")
     left.loglog([1.5e-4, 6e-3], [1.5e-3, 6e-2], color="gray", label="order 1")
+    left.set_xlim(1e-4, 1e-2)
+    left.set_ylim(1e-3, 1e-1)
     left.set_xlabel("dt [s]")
     left.set_ylabel("relative error against explicit steps")
     bodies = dict.fromkeys((row["body"], row["kernel"]) for row in in_space)
@@ -83,6 +85,7 @@ def draw_order(in_time: Rows, in_space: Rows, path: Path) -> None:
     for order, style in ((1, "-"), (2, ":")):
         right.loglog(cells, [0.4 * (2 / n) ** order for n in cells], style, color="gray", label=f"order {order}")
     right.set_ylim(1e-3, 0.6)
+    right.set_xticks([2, 4, 8, 16, 32, 64], ["2", "4", "8", "16", "32", "64"])
     right.set_xlabel("cells of the column, and of the beam's height")
     right.set_ylabel("relative error against analytic solutions")
     for panel in (left, right):
