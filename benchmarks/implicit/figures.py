@@ -113,7 +113,7 @@ def draw_sand(clump: Rows, collapse: Rows, path: Path) -> None:
         panel.set_ylim(0)
         panel.set_xlabel("dt [s]")
         panel.set_title("share of the growth" if measure == "spread" else "run-out / half width")
-        panel.legend(fontsize=8, loc="center right" if measure == "spread" else "lower left")
+    panels[1, 3].legend(fontsize=8, loc="lower left")
     _saved(figure, path)
 
 
@@ -129,7 +129,8 @@ def _draw_bodies(panels: Any, rows: Rows, dt: float, start: torch.Tensor | None)
         size = 2 if start is None else 4
         panel.plot(*row["end"].x.T, ".", color="black" if explicit else COLORS[row["energy"]], markersize=size)
         panel.set_aspect("equal")
-        panel.set_title("explicit" if explicit else f"implicit, dt = {near:.2g} s, {row['energy']}")
+        starts = "" if start is None else " (crosses: at the start)"
+        panel.set_title(f"explicit{starts}" if explicit else f"implicit, dt = {near:.2g} s, {row['energy']}")
     ends = torch.cat([row["end"].x for row in shown])
     margin = 0.05 * (ends.amax(0) - ends.amin(0)).max()
     (left, bottom), (right, top) = (ends.amin(0) - margin).tolist(), (ends.amax(0) + margin).tolist()
