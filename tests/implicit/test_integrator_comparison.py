@@ -60,3 +60,5 @@ def test_what_cannot_be_compared_says_so():
     none = state.replace(**{n: getattr(state, n)[:0] for n in ("x", "v", "mass", "volume")})
     with pytest.raises(ValueError, match="state must have particles"):
         step.explain(none, speed=1.0)
+    with pytest.raises(ValueError, match="state must have a stable time step"):
+        step.explain(state.replace(mass=0 * state.mass), speed=1.0)

@@ -63,7 +63,7 @@ def compare(step: Step, state: State, speed: float) -> Comparison:
         speed: of the motion [m/s], of moving boundaries too.
 
     Raises:
-        TypeError, ValueError: for a speed that is not positive and finite, or a state without particles.
+        TypeError, ValueError: for a speed that is not positive and finite, or a state without particles or a stable dt.
         NotImplementedError: for a law that implicit steps do not take.
     """
     check_number("speed", speed, "positive and finite", lambda v: 0 < v < math.inf)
@@ -73,6 +73,8 @@ def compare(step: Step, state: State, speed: float) -> Comparison:
     with torch.no_grad():
         step.law.trial_energy(Overlay(state, C=None), state)
         limits = step.stable_dt(state, cfl=0.5).double()
-    limit, length = float(limits[limits.isfinite()].min()), MOVED * step.grid.dx / speed
+    limit, length = float(limits.min()), MOVED * step.grid.dx / speed
+    if not 0 < limit < math.inf:
+        raise ValueError(f"state must have a stable time step, positive and finite, got {limit}")
     explicit, implicit = EXPLICIT[step.grid.dim].of(len(state)), IMPLICIT[step.grid.dim].of(len(state))
     return Comparison(limit, length, explicit / limit * length / implicit)
