@@ -134,9 +134,9 @@ def test_steps_that_are_taken_again_do_not_count_again(checkpoint, device):
 @pytest.mark.parametrize("checkpoint", [4, mpm.Checkpoints(states=3)])
 def test_implicit_steps_that_are_taken_again_do_not_count_again(checkpoint, device):
     grid = mpm.Grid(0.1, (0.0, 0.0), (1.0, 1.0))
-    solver = Implicit(tolerance=1e-12, max_iterations=1)
-    step = mpm.Step(grid, mpm.NeoHookean(E=1e6, nu=0.3), (0.0, -9.8), walls="sticky", integrator=solver)
-    state = block_state(2, device)
+    integrator = Implicit(tolerance=1e-12, max_iterations=1)
+    step = mpm.Step(grid, mpm.NeoHookean(E=1e6, nu=0.3), (0.0, -9.8), walls="sticky", integrator=integrator)
+    solver, state = step.integrator, block_state(2, device)
     v = state.v.clone().requires_grad_()
     end = mpm.rollout(step, state.replace(v=v), N, 1e-2, checkpoint=checkpoint)
     before = int(solver._unsolved.sum())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -16,6 +17,8 @@ LOOSEST, TIGHTEST = 0.1, 1e-12
 """Relative tolerances of conjugate gradients within Newton's method."""
 NEAR, PATIENCE = 0.05, 6
 """Share of the first residual, and number of iterations, from which the Hessian is not projected any more."""
+KEPT = 0.01
+"""Share of the first residual from which the preconditioner stays: so little changes any more."""
 SUFFICIENT = 1e-4
 """Share of the decrease that the slope promises, which a step must bring (Nocedal and Wright 2006, section 3.1)."""
 ROUNDING = 32
@@ -58,9 +61,9 @@ def free_components(system: ImplicitSystem, bounds: NodeBounds | None, v: Tensor
     return massive if bounds is None else massive & bounds.free(v, gradient)
 
 
-def inverse_blocks(system: ImplicitSystem, bounds: NodeBounds | None, tangent: Tensor, free: Tensor) -> Tensor:
-    """B⁻¹ of the node blocks of the free components [N, D, D] [1/kg], zero for the others."""
-    blocks = system.diagonal(tangent).double()
+def inverse_blocks(system: ImplicitSystem, bounds: NodeBounds | None, diagonal: Tensor, free: Tensor) -> Tensor:
+    """B⁻¹ of the node blocks B [N, D, D] [kg] of the free components [1/kg], zero for the others."""
+    blocks = diagonal.double()
     # Rounding of stiff blocks may leave a negative eigenvalue, with which a residual could seem to be zero.
     ridge = 16 * torch.finfo(system.mass.dtype).eps * blocks.diagonal(dim1=1, dim2=2).sum(1)
     blocks = blocks + torch.diag_embed(ridge[:, None].expand(blocks.shape[:2]))
@@ -100,7 +103,7 @@ def minimise(system: ImplicitSystem, bounds: NodeBounds | None, options: Options
     lowers its energy. Projected Newton of Bertsekas (1982): components at a bound that the gradient holds there are
     left out of the linear solve, and steps are clamped.
     """
-    v, energy, size = _start(system, bounds)
+    (v, energy, size), plain = _start(system, bounds)
     scenes = len(energy)
     zeros = torch.zeros(scenes, dtype=torch.int32, device=v.device)
     total_mass = system.node_sum(system.mass)
@@ -110,26 +113,43 @@ def minimise(system: ImplicitSystem, bounds: NodeBounds | None, options: Options
     first: Tensor | None = None
     previous = forcing = None
     stalled = indefinite = torch.zeros(scenes, dtype=torch.bool, device=v.device)
+    diagonal: Tensor | None = None
     while True:
         gradient = system.residual(v)
-        convex = system.tangent(v)
+        convex: Tensor | None = None
+        if diagonal is None:
+            convex = system.tangent(v)
+            diagonal = system.diagonal(convex)
         free = free_components(system, bounds, v, gradient)
-        inverse = inverse_blocks(system, bounds, convex, free)
+        inverse = inverse_blocks(system, bounds, diagonal, free)
         change = _times(inverse, gradient)
         residual = (system.node_sum(gradient * change).abs() / total_mass).sqrt()
-        first = residual if first is None else first
+        if first is None:
+            first = residual
+            if plain is not v:  # a good start saves work, and does not ask for more accuracy
+                slope = system.residual(plain)
+                slope = system.node_sum(slope * _times(inverse, slope)).abs()
+                first = torch.fmax(first, (slope / total_mass).sqrt())
         floor = _rounding(system, inverse, v, wave, momentum, total_mass)
         # One iteration at least: a smooth load may be smaller than the rounding of stresses, which averages out.
         target = torch.maximum(options.tolerance * first, torch.where(iterations > 0, floor, 0))
         small = residual <= target
         done = stalled | small
-        if bool((done | (iterations >= options.max_iterations)).all()):
+        exact = ~indefinite & ((residual <= NEAR * first) | (iterations >= PATIENCE))
+        kept = done | (residual <= KEPT * first)
+        looks = done | (iterations >= options.max_iterations), done | exact, ~exact, kept
+        finished, all_exact, none_exact, all_kept = torch.stack(looks).all(1).tolist()
+        if finished:
             break
         forcing = _forcing(residual, previous, forcing, target)
         previous = residual
         relative = torch.where(done, 1.0, forcing).to(v.dtype)
-        exact = ~indefinite & ((residual <= NEAR * first) | (iterations >= PATIENCE))
-        tangent = torch.where(system.of_particles(exact), system.tangent(v, projected=False), convex)
+        tangent = None if none_exact and not all_exact else system.tangent(v, projected=False)
+        if tangent is None or not all_exact:
+            convex = system.tangent(v) if convex is None else convex
+            tangent = convex if tangent is None else torch.where(system.of_particles(exact), tangent, convex)
+        if not all_kept:
+            diagonal = None
         solve = implicit_cg(
             *(system.blocks, system.state.x, torch.where(system.of_nodes(done), 0, -gradient), system.mass, inverse),
             *(tangent, relative, options.max_cg_iterations, system.stress_form),
@@ -194,27 +214,45 @@ def _times(matrices: Tensor, vectors: Tensor) -> Tensor:
     return (matrices * vectors[:, None, :]).sum(-1)
 
 
-def _start(system: ImplicitSystem, bounds: NodeBounds | None) -> tuple[Tensor, Tensor, Tensor]:
-    """v* within bounds or no motion, whichever has less energy; where both have none, a share of v* that has one."""
+class _Point(NamedTuple):
+    """Velocities [N, D], and their energy and its size, `ImplicitSystem.energy` [B]."""
 
-    def allowed(share: Tensor) -> Tensor:
-        v = system.of_nodes(share).to(system.start.dtype) * system.start
-        v = torch.where(system.of_nodes(share > 0), v, 0)
-        return v if bounds is None else bounds.clamped(v)
+    v: Tensor
+    energy: Tensor
+    size: Tensor
 
-    share = torch.ones(system.blocks.grid.scenes, dtype=torch.float64, device=system.mass.device)
-    energy, _ = system.energy(allowed(share))
-    at_rest, _ = system.energy(allowed(0 * share))
-    lower = at_rest < torch.where(energy.isfinite(), energy, torch.inf)
-    share, lost = torch.where(lower, 0.0, share), ~(lower | energy.isfinite())
+
+def _point(system: ImplicitSystem, bounds: NodeBounds | None, v: Tensor) -> _Point:
+    """The nearest velocities within bounds."""
+    v = v if bounds is None else bounds.clamped(v)
+    return _Point(v, *system.energy(v))
+
+
+def _lower(system: ImplicitSystem, a: _Point, b: _Point) -> _Point:
+    """Of each scene the one of less energy."""
+    lower = b.energy < torch.where(a.energy.isfinite(), a.energy, torch.inf)
+    rest = (torch.where(lower, y, x) for x, y in zip(a[1:], b[1:], strict=True))
+    return _Point(torch.where(system.of_nodes(lower), b.v, a.v), *rest)
+
+
+def _start(system: ImplicitSystem, bounds: NodeBounds | None) -> tuple[_Point, Tensor]:
+    """Where the search begins, and the velocities whose residual the tolerance is relative to.
+
+    These are v* within bounds or no motion, whichever has less energy; where both have none, a share of v* that has
+    one. The search begins there, or at the velocities before gravity where these have less energy still, as they do in
+    a body that is held and moves slowly.
+    """
+    plain = _lower(system, _point(system, bounds, system.start), _point(system, bounds, torch.zeros_like(system.start)))
+    lost, share = ~plain.energy.isfinite(), 1.0
     for _ in range(MOST_HALVINGS):
         if not bool(lost.any()):
             break
-        share = torch.where(lost, share / 2, share)
-        lost = lost & ~system.energy(allowed(share))[0].isfinite()
-    v = allowed(torch.where(lost, 0.0, share))
-    energy, size = system.energy(v)
-    return v, energy, size
+        share /= 2
+        plain = _lower(system, plain, _point(system, bounds, share * system.start))
+        lost = ~plain.energy.isfinite()
+    if system.before_gravity is None:
+        return plain, plain.v
+    return _lower(system, plain, _point(system, bounds, system.before_gravity)), plain.v
 
 
 def _search(
