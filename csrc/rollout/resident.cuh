@@ -29,20 +29,20 @@ template <class T, int D>
 struct SceneBlocks {
   static constexpr int nodes_of_block = kBlockNodes<D>, neighbours = 1 << D;
   static constexpr size_t bytes =  // of a block, in whole vectors
-      (nodes_of_block * ((1 + D) * sizeof(T) + 2 * sizeof(int)) + (neighbours + 1) * sizeof(int) + 15) / 16 * 16;
+      (nodes_of_block * ((1 + D) * sizeof(T) + sizeof(int)) + (neighbours + 2) * sizeof(int) + 15) / 16 * 16;
   int room;
-  T* node;         // [room, nodes, 1 + D]
-  int* head;       // [room, nodes] first row in the list of a cell
-  int* cell;       // [room * nodes] cells with particles
-  int* neighbour;  // [room, 2^D] as in the schedule
-  int* block;      // [room] in the table of all scenes
+  T* node;          // [room, nodes, 1 + D]
+  int* head;        // [room, nodes] first row in the list of a cell
+  int* neighbour;   // [room, 2^D] as in the schedule
+  int* block;       // [room] in the table of all scenes
+  unsigned* known;  // [room] bits of the neighbours that are numbered
 
   __device__ SceneBlocks(char* memory, int room) : room(room) {
     node = reinterpret_cast<T*>(memory);
     head = reinterpret_cast<int*>(node + int64_t(room) * nodes_of_block * (1 + D));
-    cell = head + int64_t(room) * nodes_of_block;
-    neighbour = cell + int64_t(room) * nodes_of_block;
+    neighbour = head + int64_t(room) * nodes_of_block;
     block = neighbour + int64_t(room) * neighbours;
+    known = reinterpret_cast<unsigned*>(block + room);
   }
 };
 
@@ -76,6 +76,7 @@ class SceneStep {
   SceneState& state;
   int* const table;  // [blocks_per_scene]
   Rows rows;
+  int* const cells;  // [particles] those that have particles
   Blocks blocks;
   GridUpdateArguments<T, D>& update;  // with the blocks of this scene
   ContactArguments<T, D>& contact;
@@ -106,8 +107,9 @@ class SceneStep {
     int base[D];
     T f[D];
     if (!locate<Order>(geometry(), x.e, base, f)) return;
-    const int block = block_of(base);
+    const int block = block_of(base), number = table[block];
     const unsigned touched = touched_blocks<Order, D>(base);
+    if (number >= 0 && (touched & ~blocks.known[number]) == 0) return;
     for (int o = 0; o < 1 << D; o++) {
       if (!(touched >> o & 1)) continue;
       const int b = block + further(geometry(), o);
@@ -155,10 +157,15 @@ class SceneStep {
       number();
       if (state.blocks > blocks.room && !take_more()) return false;
     }
-    for (int i = threadIdx.x; i < state.blocks * (1 << D); i += blockDim.x) {
-      const int b = blocks.block[i >> D] - scene * geometry().blocks_per_scene;
-      const int to = b + further(geometry(), i & ((1 << D) - 1));
-      blocks.neighbour[i] = to < geometry().blocks_per_scene ? table[to] : -1;
+    for (int i = threadIdx.x; i < state.blocks; i += blockDim.x) {
+      const int b = blocks.block[i] - scene * geometry().blocks_per_scene;
+      unsigned known = 0;
+      for (int o = 0; o < 1 << D; o++) {
+        const int to = b + further(geometry(), o), number = to < geometry().blocks_per_scene ? table[to] : -1;
+        blocks.neighbour[(i << D) + o] = number;
+        known |= unsigned(number >= 0) << o;
+      }
+      blocks.known[i] = known;
     }
     for (int i = threadIdx.x; i < state.blocks * count; i += blockDim.x) blocks.head[i] = Rows::end;
     update.block = contact.block = blocks.block;
@@ -238,14 +245,16 @@ class SceneStep {
   }
 
   __device__ void list_cells() const {
-    const int cells = state.blocks * count, warps = blockDim.x / 32, warp = threadIdx.x / 32, lane = threadIdx.x % 32;
-    const int share = (cells + warps * 32 - 1) / (warps * 32) * 32;
-    const int begin = ::min(warp * share, cells), end = ::min(begin + share, cells);
+    const int of_blocks = state.blocks * count, warps = blockDim.x / 32, warp = threadIdx.x / 32,
+              lane = threadIdx.x % 32;
+    const int share = (of_blocks + warps * 32 - 1) / (warps * 32) * 32;
+    const int begin = ::min(warp * share, of_blocks), end = ::min(begin + share, of_blocks);
     int mine = 0;
     for (int first = begin; first < end; first += 32)
       mine += __popc(__ballot_sync(~0u, first + lane < end && blocks.head[first + lane] != Rows::end));
     if (lane == 0) state.cells_before[warp] = mine;
-    for (int i = threadIdx.x; i < cells * (1 + D); i += blockDim.x) blocks.node[i] = T(0);
+    for (int i = threadIdx.x; i < state.blocks * (count * (1 + D) / 4); i += blockDim.x)
+      store_quad(blocks.node + 4 * i, Quad<T>{});
     __syncthreads();
     int number = 0;
     for (int w = 0; w < warp; w++) number += state.cells_before[w];
@@ -253,13 +262,12 @@ class SceneStep {
       const int cell = first + lane;
       const bool with = cell < end && blocks.head[cell] != Rows::end;
       const unsigned others = __ballot_sync(~0u, with);
-      if (with) {
-        blocks.cell[number + __popc(others & ((1u << lane) - 1))] = cell;
-        sort_list(cell);
-      }
+      if (with) cells[number + __popc(others & ((1u << lane) - 1))] = cell;
       number += __popc(others);
     }
     if (warp == warps - 1 && lane == 0) state.cells = number;
+    __syncthreads();
+    for (int i = threadIdx.x; i < state.cells; i += blockDim.x) sort_list(cells[i]);
     __syncthreads();
   }
 
@@ -294,7 +302,7 @@ class SceneStep {
     for (int first = 0; first < walkers; first += blockDim.x) {
       const Walker<S> walker(first + int(threadIdx.x));
       const bool walks = first + int(threadIdx.x) < walkers;
-      const int cell = walks ? blocks.cell[walker.list] : 0;
+      const int cell = walks ? cells[walker.list] : 0;
       T sum[S::slab][S::channels] = {};
       if (walks) {
 #pragma unroll 1
@@ -321,8 +329,12 @@ class SceneStep {
       const int slot = i / count, local = i % count;
       NodeRow<T, D>& node = reinterpret_cast<NodeRow<T, D>*>(blocks.node)[i];
       blocks.head[i] = Rows::end;
+      if (node.mass == T(0)) {
+        node = {T(0), zero_vector<T, D>()};
+        continue;
+      }
       NodeRow<T, D> row = update_node(update, slot_update(update, slot), local, node);
-      if (a.obstacles && row.mass != T(0)) {
+      if (a.obstacles) {
         const ContactSlot<T, D> there = contact_slot(contact, slot);
         if (there.active)
           row.value = after_obstacles(contact, there, contact.obstacles, node_position(contact, there.corner, local),
@@ -378,9 +390,10 @@ __device__ int first_slot(const Topology<T, D>& t, int block) {
   return begin;
 }
 
+// Of some particles: an array of SharedParticles, and their cells.
 template <class S>
-MPM_HD size_t row_bytes(int64_t particles) {  // of an array of SharedParticles
-  return size_t((particles + 63) / 64 * 64) * S::row_bytes;
+MPM_HD int64_t bytes_of_particles(int64_t particles) {
+  return (particles + 63) / 64 * 64 * (S::row_bytes + int64_t(sizeof(int)));
 }
 
 // One thread block per scene, and one for particles outside. `shared` are the bytes of dynamic shared memory.
@@ -413,10 +426,12 @@ __global__ void __launch_bounds__(kResidentThreads)
   const int particles = state.end - state.begin;
   if (particles == 0) return;
   char* free = memory + (per_scene + 3) / 4 * 4 * sizeof(int);
-  const int64_t left = shared - (free - memory), rows = int64_t(row_bytes<S>(particles));
+  const int64_t left = shared - (free - memory), rows = bytes_of_particles<S>(particles);
   const bool fits = rows + int64_t(Blocks::bytes) <= left;
-  char* const row_memory = fits ? free : a.rows + (state.begin + int64_t(64) * scene) * S::row_bytes / 16 * 16;
+  char* const row_memory =
+      fits ? free : a.rows + (state.begin + int64_t(64) * scene) * (S::row_bytes + int64_t(sizeof(int))) / 16 * 16;
   if (fits) free += rows;
+  const int batch = (particles + 63) / 64 * 64;
   const int room = int((shared - (free - memory)) / int64_t(Blocks::bytes));
   SceneStep<Source, Task> s{source,
                             task,
@@ -424,7 +439,8 @@ __global__ void __launch_bounds__(kResidentThreads)
                             scene,
                             state,
                             table,
-                            SharedParticles<S>(row_memory, nullptr, (particles + 63) / 64 * 64),
+                            SharedParticles<S>(row_memory, nullptr, batch),
+                            reinterpret_cast<int*>(row_memory + size_t(batch) * S::row_bytes),
                             Blocks(free, room),
                             update,
                             contact};
@@ -452,21 +468,24 @@ __global__ void __launch_bounds__(kResidentThreads)
 template <class Source, class Task, class T, int D>
 void launch_resident(const Source& source, const Task& task, const ResidentArguments<T, D>& a, Stream stream) {
   using S = ResidentShape<typename Source::Shape>;
-  static_assert(S::row_bytes <= kMostResidentRow && int64_t(SceneBlocks<T, D>::bytes) <= kMostResidentBlock);
+  static_assert(S::row_bytes + sizeof(int) <= kMostResidentRow &&
+                int64_t(SceneBlocks<T, D>::bytes) <= kMostResidentBlock);
   if (source.topology.particles == 0 || a.scenes == 0) return;
   const int most = device_attribute(cudaDevAttrMaxSharedMemoryPerBlockOptin) - 4096;
   const int all = device_attribute(cudaDevAttrMaxSharedMemoryPerMultiprocessor);
   const int processors = device_attribute(cudaDevAttrMultiProcessorCount);
   const int64_t particles = (source.topology.particles + a.scenes - 1) / a.scenes;
-  const int64_t blocks =
-      std::min<int64_t>(a.update.geometry.blocks_per_scene, (source.topology.max_blocks + a.scenes - 1) / a.scenes + 2);
+  // A pool that has grown has a half more than was wanted.
+  const int64_t blocks = std::min<int64_t>(a.update.geometry.blocks_per_scene,
+                                           3 * int64_t(source.topology.max_blocks) / (4 * a.scenes) + 2);
   const int64_t wanted = a.update.geometry.blocks_per_scene * int64_t(sizeof(int)) +
-                         int64_t(row_bytes<S>(particles + particles / 16)) +
+                         bytes_of_particles<S>(particles + particles / 16) +
                          blocks * int64_t(SceneBlocks<T, D>::bytes) + 5 * 1024;  // and what the kernel declares itself
-  const int64_t beside = std::min<int64_t>({all / wanted, (a.scenes + processors - 1) / processors, 8});
+  const int64_t beside = std::min<int64_t>({all / wanted, (a.scenes + processors - 1) / processors, 4});
   const int together = int(std::max<int64_t>(beside, 1));
   const int shared = std::min(most, all / together - 5 * 1024);
-  const int threads = std::max(64, kResidentThreads / together / 32 * 32);
+  const int64_t useful = std::max<int64_t>(128, (particles + 31) / 32 * 32);
+  const int threads = int(std::min<int64_t>(kResidentThreads / together / 32 * 32, useful));
   launch(resident_kernel<Source, Task, T, D>, unsigned(a.scenes + 1), unsigned(threads), size_t(shared), stream, source,
          task, a, shared);
 }

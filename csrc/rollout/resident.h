@@ -11,8 +11,11 @@
 // through all substeps of a call, its nodes in shared memory, and nobody waits for other scenes.
 namespace mpm {
 
-// A scene larger than that is left to kernels of whole grids.
-constexpr int kMostResidentParticles = 4096, kMostResidentBlocks = 4096;
+// Scenes of a deterministic grid are resident up to that size, whatever other scenes there are: what becomes of a scene
+// must not depend on them.
+template <int D>
+constexpr int kMostResidentParticles = D == 2 ? 4096 : 2560;
+constexpr int kMostResidentBlocks = 4096;  // of the domain of a scene
 
 // Whether they are faster than kernels of whole grids, by the time that both take on a large device [µs].
 template <int D>

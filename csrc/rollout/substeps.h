@@ -296,16 +296,14 @@ struct Substeps {
     if (fused) stress = Tensor();
   }
 
-  // Whether scenes are taken through the call one by one. Where sums have an order, that does not depend on how many
-  // scenes there are.
+  // Whether scenes are taken through the call one by one.
   bool resides() {
     const int64_t P = in.x.size(0);
     if (!calls[0].law->kernels<T, D>().resident || calls.size() > 1 || has(in.material) || in.n < 2) return false;
     if (in.lattice.order() != 2 || p2g.form != StressForm::mls || has(in.impulse) || update.walls.mirrored)
       return false;
-    if (activation.geometry.blocks_per_scene > kMostResidentBlocks || P > kMostResidentParticles * in.scenes)
-      return false;
-    return in.lattice.deterministic() || resident_pays<D>(P, in.scenes);
+    if (P == 0 || activation.geometry.blocks_per_scene > kMostResidentBlocks) return false;
+    return in.lattice.deterministic() ? P <= kMostResidentParticles<D> * in.scenes : resident_pays<D>(P, in.scenes);
   }
 
   // Of the substeps that read what others of the same parity have written. The last one is activated in any case, so
