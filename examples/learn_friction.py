@@ -107,7 +107,7 @@ def main(out: Path, device: str = "cpu", iterations: int = 30, steps: int = 300)
     start = sliding_blocks(device)
     with torch.no_grad():
         data = measured(Experiment(stribeck, steps), start)
-    data = data + NOISE * torch.randn_like(data)
+    data = data + NOISE * torch.randn(data.shape, dtype=data.dtype).to(device)  # the same on any device
     network = Friction().to(device, torch.float64)
     experiment = Experiment(network, steps).to(device)
     # As one CUDA graph, where launching the kernels of each step takes longer than running them.

@@ -58,8 +58,6 @@ struct SceneState {
   int more_room;
 };
 
-constexpr int kUntouched = -1, kTouched = -2;  // in the table of a scene: numbers of blocks are not negative
-
 template <class Source, class Task>
 class SceneStep {
  public:
@@ -74,7 +72,8 @@ class SceneStep {
   const ResidentArguments<T, D>& a;
   const int scene;
   SceneState& state;
-  int* const table;  // [blocks_per_scene]
+  int* const table;        // [blocks_per_scene] numbers of blocks, -1 where there is none
+  unsigned* const wanted;  // a bit for each block that wants a number
   Rows rows;
   int* const cells;  // [particles] those that have particles
   Blocks blocks;
@@ -113,7 +112,9 @@ class SceneStep {
     for (int o = 0; o < 1 << D; o++) {
       if (!(touched >> o & 1)) continue;
       const int b = block + further(geometry(), o);
-      if (table[b] == kUntouched) table[b] = kTouched, state.grown = 1;
+      if (table[b] >= 0) continue;
+      atomicOr(&wanted[b / 32], 1u << b % 32);
+      atomicOr(&state.grown, 1);
     }
   }
 
@@ -127,7 +128,7 @@ class SceneStep {
     int number = 0;
     for (int first = 0; first < geometry().blocks_per_scene; first += 32) {
       const int b = first + lane;
-      const bool touched = b < geometry().blocks_per_scene && table[b] != kUntouched;
+      const bool touched = b < geometry().blocks_per_scene && (table[b] >= 0 || wanted[first / 32] >> lane & 1);
       const unsigned with = __ballot_sync(~0u, touched);
       const int mine = number + __popc(with & ((1u << lane) - 1));
       if (touched) {
@@ -135,6 +136,8 @@ class SceneStep {
         if (mine < blocks.room) blocks.block[mine] = scene * geometry().blocks_per_scene + b;
       }
       number += __popc(with);
+      __syncwarp();
+      if (lane == 0) wanted[first / 32] = 0;
     }
     if (lane == 0) state.blocks = number, state.grown = 0;
   }
@@ -151,7 +154,7 @@ class SceneStep {
     if (!state.grown) return true;
     number();
     if (state.blocks > blocks.room) {
-      for (int b = threadIdx.x; b < geometry().blocks_per_scene; b += blockDim.x) table[b] = kUntouched;
+      for (int b = threadIdx.x; b < geometry().blocks_per_scene; b += blockDim.x) table[b] = -1;
       __syncthreads();
       touch_all();
       number();
@@ -396,6 +399,11 @@ MPM_HD int64_t bytes_of_particles(int64_t particles) {
   return (particles + 63) / 64 * 64 * (S::row_bytes + int64_t(sizeof(int)));
 }
 
+// With a bit for each block.
+MPM_HD int64_t bytes_of_table(int64_t blocks) {
+  return (blocks + (blocks + 31) / 32 + 3) / 4 * 4 * int64_t(sizeof(int));
+}
+
 // One thread block per scene, and one for particles outside. `shared` are the bytes of dynamic shared memory.
 template <class Source, class Task, class T, int D>
 __global__ void __launch_bounds__(kResidentThreads)
@@ -421,11 +429,13 @@ __global__ void __launch_bounds__(kResidentThreads)
     contact.time = a.time;
   }
   int* const table = reinterpret_cast<int*>(memory);
-  for (int b = threadIdx.x; b < per_scene; b += blockDim.x) table[b] = kUntouched;
+  unsigned* const wanted = reinterpret_cast<unsigned*>(table + per_scene);
+  for (int b = threadIdx.x; b < per_scene; b += blockDim.x) table[b] = -1;
+  for (int b = threadIdx.x; b < (per_scene + 31) / 32; b += blockDim.x) wanted[b] = 0;
   __syncthreads();
   const int particles = state.end - state.begin;
   if (particles == 0) return;
-  char* free = memory + (per_scene + 3) / 4 * 4 * sizeof(int);
+  char* free = memory + bytes_of_table(per_scene);
   const int64_t left = shared - (free - memory), rows = bytes_of_particles<S>(particles);
   const bool fits = rows + int64_t(Blocks::bytes) <= left;
   char* const row_memory =
@@ -439,6 +449,7 @@ __global__ void __launch_bounds__(kResidentThreads)
                             scene,
                             state,
                             table,
+                            wanted,
                             SharedParticles<S>(row_memory, nullptr, batch),
                             reinterpret_cast<int*>(row_memory + size_t(batch) * S::row_bytes),
                             Blocks(free, room),
@@ -478,7 +489,7 @@ void launch_resident(const Source& source, const Task& task, const ResidentArgum
   // A pool that has grown has a half more than was wanted.
   const int64_t blocks = std::min<int64_t>(a.update.geometry.blocks_per_scene,
                                            3 * int64_t(source.topology.max_blocks) / (4 * a.scenes) + 2);
-  const int64_t wanted = a.update.geometry.blocks_per_scene * int64_t(sizeof(int)) +
+  const int64_t wanted = bytes_of_table(a.update.geometry.blocks_per_scene) +
                          bytes_of_particles<S>(particles + particles / 16) +
                          blocks * int64_t(SceneBlocks<T, D>::bytes) + 5 * 1024;  // and what the kernel declares itself
   const int64_t beside = std::min<int64_t>({all / wanted, (a.scenes + processors - 1) / processors, 4});

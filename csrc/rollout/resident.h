@@ -17,12 +17,12 @@ template <int D>
 constexpr int kMostResidentParticles = D == 2 ? 4096 : 2560;
 constexpr int kMostResidentBlocks = 4096;  // of the domain of a scene
 
-// Whether they are faster than kernels of whole grids, by the time that both take on a large device [µs].
+// Whether they are faster than kernels of whole grids, by what both took on an H200 [µs].
 template <int D>
 bool resident_pays(int64_t particles, int64_t scenes) {
-  const double turns = std::ceil(double(scenes) / 132);
-  const double resident = turns * (6 + (D == 2 ? 0.01 : 0.02) * double(particles) / double(scenes));
-  const double together = 16 + double(particles) / 3000;
+  const double turns = std::fmax(1, double(scenes) / 132), size = double(particles) / double(scenes);
+  const double resident = 8 + turns * (2.5 + (D == 2 ? 0.019 : 0.024) * size);
+  const double together = 14 + double(particles) / 3500 + 0.07 * double(scenes);
   return resident < together;
 }
 
