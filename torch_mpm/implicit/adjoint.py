@@ -10,28 +10,34 @@ The memory does not depend on the iterations.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from ..laws.compiled import CompiledLaw
-from ..ops import implicit_cg
+from ..ops import implicit_apply, implicit_cg
 from ..ops.implicit import CONVERGED
 from ..ops.registry import LAWS
 from .bounds import NodeBounds
+from .contact import Friction, contact_at
 from .newton import Minimum, inverse_blocks
 from .system import ImplicitSystem
 
 if TYPE_CHECKING:
     from .implicit import Implicit
 
+MOST_SOLVES = 60
+"""Of an adjoint with friction."""
+
 
 def differentiable(
     owner: Implicit, system: ImplicitSystem, fixed: ImplicitSystem, bounds: NodeBounds | None, minimum: Minimum
 ) -> Tensor:
     """The velocities of a minimum, with the derivatives that the residual gives them."""
-    residual = system.residual(minimum.v.detach())
+    v = minimum.v.detach()
+    residual = contact_at(system, bounds, v, system.residual(v)).gradient
     if not residual.requires_grad:
         return minimum.v
     for part in system.law.modules():
@@ -66,13 +72,54 @@ def _solve(
 ) -> Tensor:
     """λ of the free components; NaN in scenes whose solve does not converge."""
     tangent = system.tangent(v, projected=False)
-    inverse = inverse_blocks(system, bounds, system.tangent(v), free)
+    gradient = system.residual(v)
+    friction = contact_at(system, bounds, v, gradient).friction
+    across = None if friction is None else friction.curvature()
+    inverse = inverse_blocks(system, bounds, system.tangent(v), free, across)
     relative = grad.new_full((system.blocks.grid.scenes,), owner.adjoint_tolerance)
     if grad.dtype == torch.float32:
         relative = relative.clamp_min(1e-5)
-    solve = implicit_cg(
-        *(system.blocks, system.state.x, grad, system.mass, inverse, tangent, relative),
-        *(4 * owner.options.max_cg_iterations, system.stress_form),
-    )
-    owner.adjoint_converged = solve.state == CONVERGED
-    return torch.where(system.of_nodes(owner.adjoint_converged), solve.solution, torch.nan)
+
+    def solved(right: Tensor) -> tuple[Tensor, Tensor]:
+        solve = implicit_cg(
+            *(system.blocks, system.state.x, right, system.mass, inverse, tangent, relative),
+            *(4 * owner.options.max_cg_iterations, system.stress_form, across),
+        )
+        return solve.solution, solve.state == CONVERGED
+
+    adjoint, converged = solved(grad)
+    if friction is not None:
+        adjoint, converged = _with_normal_forces(system, friction, tangent, gradient, grad, adjoint, relative, solved)
+    owner.adjoint_converged = converged
+    return torch.where(system.of_nodes(converged), adjoint, torch.nan)
+
+
+def _with_normal_forces(
+    system: ImplicitSystem,
+    friction: Friction,
+    tangent: Tensor,
+    gradient: Tensor,
+    grad: Tensor,
+    adjoint: Tensor,
+    relative: Tensor,
+    solved: Callable[[Tensor], tuple[Tensor, Tensor]],
+) -> tuple[Tensor, Tensor]:
+    """The adjoint, and where it converged, with what velocities do to friction by way of the normal forces: the
+    Hessian is not symmetric there, and the solves with its symmetric part are repeated until they agree."""
+    coupling = friction.coupling(gradient)
+    direction = friction.bounds.turned(friction.direction)
+
+    def size(vectors: Tensor) -> Tensor:
+        return system.node_sum(system.mass[:, None] * vectors.square()).sqrt()
+
+    converged = torch.zeros_like(relative, dtype=torch.bool)
+    for _ in range(MOST_SOLVES):
+        held = coupling * (direction * adjoint).sum(1, keepdim=True)
+        pulled = implicit_apply(system.blocks, system.state.x, held, tangent, system.mass, system.stress_form)
+        before = adjoint
+        adjoint, converged = solved(grad - pulled)
+        settled = size(adjoint - before) <= 10 * relative * size(adjoint)
+        converged = converged & settled
+        if bool(converged.all()):
+            break
+    return adjoint, converged

@@ -95,9 +95,9 @@ class Implicit:
             return start
         wants_gradient = torch.is_grad_enabled()
         system = ImplicitSystem(blocks, step.law, state, mass, start, dt, step.stress_form)
+        bounds = node_bounds(blocks, step.walls, step.boundaries.entries, start, state.time)
         with torch.no_grad():
             fixed = system.detached() if wants_gradient else system
-            bounds = node_bounds(blocks, step.walls, step.boundaries.entries, start, state.time)
             minimum = minimise(fixed, bounds, self.options)
             fixed.forget()
         self._record(minimum)
@@ -141,7 +141,7 @@ def check_implicit(step: Step, state: State) -> None:
             compiled, captured or transformed.
     """
     obstacles = [b for b in step.boundaries.entries if isinstance(b, Obstacle)]
-    motions = [t for b in obstacles for t in motion_tensors(b)]
+    motions = [t for b in obstacles for t in motion_tensors(b) if t is not b.friction]
     if is_traced(state.x) or is_captured(state.x) or torch._C._are_functorch_transforms_active():
         raise NotImplementedError(
             "an implicit step looks at how far its solve is: it cannot be compiled, captured in a CUDA graph, or "
@@ -149,7 +149,7 @@ def check_implicit(step: Step, state: State) -> None:
         )
     reasons = {
         "impulses on boundaries": state.impulse is not None,
-        "obstacles that require a gradient": torch.is_grad_enabled() and any(t.requires_grad for t in motions),
+        "motions and shapes of obstacles that require a gradient": torch.is_grad_enabled() and any(t.requires_grad for t in motions),
     }
     for what, present in reasons.items():
         if present:

@@ -10,6 +10,7 @@ from torch import Tensor
 from ..ops import implicit_cg
 from ..ops.implicit import NEGATIVE_CURVATURE
 from .bounds import NodeBounds
+from .contact import Contact, contact_at
 from .system import ImplicitSystem
 
 LOOSEST, TIGHTEST = 0.1, 1e-12
@@ -52,15 +53,13 @@ class Minimum:
     cg_iterations: Tensor
 
 
-def free_components(system: ImplicitSystem, bounds: NodeBounds | None, v: Tensor, gradient: Tensor) -> Tensor:
-    """Components of the node velocities that the step is to find, in the axes of the nodes, bool [N, D]."""
-    massive = (system.mass > 0)[:, None].expand_as(v)
-    return massive if bounds is None else massive & bounds.free(v, gradient)
-
-
-def inverse_blocks(system: ImplicitSystem, bounds: NodeBounds | None, tangent: Tensor, free: Tensor) -> Tensor:
-    """B⁻¹ of the node blocks of the free components [N, D, D] [1/kg], zero for the others."""
+def inverse_blocks(
+    system: ImplicitSystem, bounds: NodeBounds | None, tangent: Tensor, free: Tensor, local: Tensor | None = None
+) -> Tensor:
+    """B⁻¹ of the node blocks of the free components [N, D, D] [1/kg], zero for the others; `local` belongs to them."""
     blocks = system.diagonal(tangent).double()
+    if local is not None:
+        blocks = blocks + local
     # Rounding of stiff blocks may leave a negative eigenvalue, with which a residual could seem to be zero.
     ridge = 16 * torch.finfo(system.mass.dtype).eps * blocks.diagonal(dim1=1, dim2=2).sum(1)
     blocks = blocks + torch.diag_embed(ridge[:, None].expand(blocks.shape[:2]))
@@ -111,10 +110,9 @@ def minimise(system: ImplicitSystem, bounds: NodeBounds | None, options: Options
     previous = forcing = None
     stalled = indefinite = torch.zeros(scenes, dtype=torch.bool, device=v.device)
     while True:
-        gradient = system.residual(v)
-        convex = system.tangent(v)
-        free = free_components(system, bounds, v, gradient)
-        inverse = inverse_blocks(system, bounds, convex, free)
+        contact = contact_at(system, bounds, v, system.residual(v))
+        gradient, convex = contact.gradient, system.tangent(v)
+        inverse = inverse_blocks(system, bounds, convex, contact.free)
         change = _times(inverse, gradient)
         residual = (system.node_sum(gradient * change).abs() / total_mass).sqrt()
         first = residual if first is None else first
@@ -130,21 +128,24 @@ def minimise(system: ImplicitSystem, bounds: NodeBounds | None, options: Options
         relative = torch.where(done, 1.0, forcing).to(v.dtype)
         exact = ~indefinite & ((residual <= NEAR * first) | (iterations >= PATIENCE))
         tangent = torch.where(system.of_particles(exact), system.tangent(v, projected=False), convex)
+        across = None if contact.friction is None else contact.friction.curvature(change.norm(dim=1, keepdim=True))
+        if across is not None:
+            inverse = inverse_blocks(system, bounds, convex, contact.free, across)
         solve = implicit_cg(
             *(system.blocks, system.state.x, torch.where(system.of_nodes(done), 0, -gradient), system.mass, inverse),
-            *(tangent, relative, options.max_cg_iterations, system.stress_form),
+            *(tangent, relative, options.max_cg_iterations, system.stress_form, across),
         )
         indefinite = solve.state == NEGATIVE_CURVATURE
         direction = torch.where(system.of_nodes(indefinite & (solve.iterations == 0)), -change, solve.solution)
         cg_iterations += solve.iterations
         iterations += (~done).int()
-        v, energy, size, moved = _search(system, bounds, v, energy, size, gradient, direction, done)
+        v, energy, size, moved = _search(system, bounds, contact, v, energy, size, direction, done)
         stalled = stalled | ~(moved | done)
     # No step lowers the energy where what is left to gain is less than its rounding.
     small = small | (stalled & (residual.square() * total_mass <= ROUNDING * torch.finfo(v.dtype).eps * size))
     finite = residual.isfinite() & energy.isfinite()
     v = _with_momentum(system, bounds, v, total_mass)
-    return Minimum(v, free, small & finite, residual, iterations, cg_iterations)
+    return Minimum(v, contact.free, small & finite, residual, iterations, cg_iterations)
 
 
 def _with_momentum(system: ImplicitSystem, bounds: NodeBounds | None, v: Tensor, total_mass: Tensor) -> Tensor:
@@ -220,24 +221,33 @@ def _start(system: ImplicitSystem, bounds: NodeBounds | None) -> tuple[Tensor, T
 def _search(
     system: ImplicitSystem,
     bounds: NodeBounds | None,
+    contact: Contact,
     v: Tensor,
     energy: Tensor,
     size: Tensor,
-    gradient: Tensor,
     step: Tensor,
     done: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Velocities after the longest of the steps 1, ½, ¼ ... that lowers the energy of each scene enough; their energy
-    and its size; and which scenes moved, bool [B]."""
+    """Velocities after the longest of the steps 1, ½, ¼ ... that lowers the energy of each scene enough, what friction
+    dissipates counted; their energy and its size; and which scenes moved, bool [B]."""
     rounding = ROUNDING * torch.finfo(v.dtype).eps
+    friction = contact.friction
+
+    def moved(share: Tensor) -> Tensor:
+        trial = v + system.of_nodes(share).to(v.dtype) * step
+        trial = trial if friction is None else friction.clamped(trial)
+        return trial if bounds is None else bounds.clamped(trial)
+
     share = torch.where(done, 0.0, 1.0).double()
     best, best_energy, best_size = v, energy, size
     for _ in range(MOST_HALVINGS):
-        trial = v + system.of_nodes(share).to(v.dtype) * step
-        trial = trial if bounds is None else bounds.clamped(trial)
+        trial = moved(share)
         trial_energy, trial_size = system.energy(trial)
-        slope = system.node_sum(gradient * (trial - v))
-        enough = trial_energy <= energy + SUFFICIENT * slope + rounding * (size + trial_size)
+        gain = trial_energy - energy
+        if friction is not None:
+            gain = gain + system.node_sum(friction.gain(trial))
+        slope = system.node_sum(contact.gradient * (trial - v))
+        enough = gain <= SUFFICIENT * slope + rounding * (size + trial_size)
         enough = (enough & trial_energy.isfinite() & (slope <= 0)) | (share == 0)
         best, best_energy, best_size = trial, trial_energy, trial_size
         if bool(enough.all()):
@@ -245,7 +255,6 @@ def _search(
         share = torch.where(enough, share, share / 2)
     else:  # scenes that no step helps stay where they were
         share = torch.where(enough, share, 0.0)
-        best = v + system.of_nodes(share).to(v.dtype) * step
-        best = torch.where(system.of_nodes(share > 0), best if bounds is None else bounds.clamped(best), v)
+        best = torch.where(system.of_nodes(share > 0), moved(share), v)
         best_energy, best_size = system.energy(best)
     return best, best_energy, best_size, share > 0
