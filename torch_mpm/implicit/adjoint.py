@@ -75,7 +75,8 @@ def _solve(
     gradient = system.residual(v)
     friction = contact_at(system, bounds, v, gradient).friction
     across = None if friction is None else friction.curvature()
-    inverse = inverse_blocks(system, bounds, system.tangent(v), free, across)
+    blocks = system.diagonal(system.tangent(v))
+    inverse = inverse_blocks(bounds, blocks if across is None else blocks + across, free)
     relative = grad.new_full((system.blocks.grid.scenes,), owner.adjoint_tolerance)
     if grad.dtype == torch.float32:
         relative = relative.clamp_min(1e-5)

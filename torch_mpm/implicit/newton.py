@@ -10,7 +10,7 @@ from torch import Tensor
 from ..ops import implicit_cg
 from ..ops.implicit import NEGATIVE_CURVATURE
 from .bounds import NodeBounds
-from .contact import Contact, contact_at
+from .contact import Contact, Limit, contact_at
 from .system import ImplicitSystem
 
 LOOSEST, TIGHTEST = 0.1, 1e-12
@@ -22,6 +22,9 @@ SUFFICIENT = 1e-4
 ROUNDING = 32
 """Units in the last place by which sums of energies may be wrong."""
 MOST_HALVINGS = 30
+SETTLED, OLDEST = 0.3, 5
+"""Where renewing friction has raised the residual, it is kept until the share of the residual is left that does not
+follow from its change; for this many iterations at most."""
 
 
 @dataclasses.dataclass
@@ -53,15 +56,11 @@ class Minimum:
     cg_iterations: Tensor
 
 
-def inverse_blocks(
-    system: ImplicitSystem, bounds: NodeBounds | None, tangent: Tensor, free: Tensor, local: Tensor | None = None
-) -> Tensor:
-    """B⁻¹ of the node blocks of the free components [N, D, D] [1/kg], zero for the others; `local` belongs to them."""
-    blocks = system.diagonal(tangent).double()
-    if local is not None:
-        blocks = blocks + local
+def inverse_blocks(bounds: NodeBounds | None, blocks: Tensor, free: Tensor) -> Tensor:
+    """B⁻¹ of the free components of node blocks [N, D, D] [1/kg], zero for the others."""
+    dtype, blocks = blocks.dtype, blocks.double()
     # Rounding of stiff blocks may leave a negative eigenvalue, with which a residual could seem to be zero.
-    ridge = 16 * torch.finfo(system.mass.dtype).eps * blocks.diagonal(dim1=1, dim2=2).sum(1)
+    ridge = 16 * torch.finfo(dtype).eps * blocks.diagonal(dim1=1, dim2=2).sum(1)
     blocks = blocks + torch.diag_embed(ridge[:, None].expand(blocks.shape[:2]))
     if bounds is not None:
         blocks = bounds.turned_blocks(blocks)
@@ -71,7 +70,7 @@ def inverse_blocks(
     if bounds is not None:
         inverse = bounds.turned_blocks(inverse)
     inverse = (inverse + inverse.mT) / 2
-    return inverse.to(system.mass.dtype)
+    return inverse.to(dtype)
 
 
 def _inverse(a: Tensor) -> Tensor:
@@ -108,13 +107,13 @@ def minimise(system: ImplicitSystem, bounds: NodeBounds | None, options: Options
     iterations, cg_iterations = zeros.clone(), zeros.clone()
     first: Tensor | None = None
     previous = forcing = None
-    stalled = indefinite = torch.zeros(scenes, dtype=torch.bool, device=v.device)
+    stalled = indefinite = still = careful = torch.zeros(scenes, dtype=torch.bool, device=v.device)
+    limit, age = None, zeros
     while True:
-        contact = contact_at(system, bounds, v, system.residual(v))
-        gradient, convex = contact.gradient, system.tangent(v)
-        inverse = inverse_blocks(system, bounds, convex, contact.free)
-        change = _times(inverse, gradient)
-        residual = (system.node_sum(gradient * change).abs() / total_mass).sqrt()
+        elastic, convex = system.residual(v), system.tangent(v)
+        blocks = system.diagonal(convex)
+        contact = contact_at(system, bounds, v, elastic)
+        inverse, change, residual = _preconditioned(system, bounds, blocks, contact, total_mass)
         first = residual if first is None else first
         floor = _rounding(system, inverse, v, wave, momentum, total_mass)
         # One iteration at least: a smooth load may be smaller than the rounding of stresses, which averages out.
@@ -124,28 +123,49 @@ def minimise(system: ImplicitSystem, bounds: NodeBounds | None, options: Options
         if bool((done | (iterations >= options.max_iterations)).all()):
             break
         forcing = _forcing(residual, previous, forcing, target)
+        if previous is not None:
+            careful = careful | (residual > previous)
         previous = residual
         relative = torch.where(done, 1.0, forcing).to(v.dtype)
         exact = ~indefinite & ((residual <= NEAR * first) | (iterations >= PATIENCE))
         tangent = torch.where(system.of_particles(exact), system.tangent(v, projected=False), convex)
-        across = None if contact.friction is None else contact.friction.curvature(change.norm(dim=1, keepdim=True))
-        if across is not None:
-            inverse = inverse_blocks(system, bounds, convex, contact.free, across)
+        model, across, renewed = contact, None, ~done
+        if contact.friction is not None:
+            if limit is not None:
+                model = contact_at(system, bounds, v, elastic, limit)
+                left = _preconditioned(system, bounds, blocks, model, total_mass)[2]
+                renewed = still | ~careful | (age >= OLDEST) | ~(left > SETTLED * residual)
+                limit = limit.renewed(contact.friction.limit, system.of_nodes(renewed))
+            model = contact_at(system, bounds, v, elastic, limit)
+            limit = model.friction.limit
+            across = model.friction.curvature(change.norm(dim=1, keepdim=True))
+            blocks = blocks if across is None else blocks + across
+            inverse, change, _ = _preconditioned(system, bounds, blocks, model, total_mass)
         solve = implicit_cg(
-            *(system.blocks, system.state.x, torch.where(system.of_nodes(done), 0, -gradient), system.mass, inverse),
-            *(tangent, relative, options.max_cg_iterations, system.stress_form, across),
+            *(system.blocks, system.state.x, torch.where(system.of_nodes(done), 0, -model.gradient), system.mass),
+            *(inverse, tangent, relative, options.max_cg_iterations, system.stress_form, across),
         )
         indefinite = solve.state == NEGATIVE_CURVATURE
         direction = torch.where(system.of_nodes(indefinite & (solve.iterations == 0)), -change, solve.solution)
         cg_iterations += solve.iterations
         iterations += (~done).int()
-        v, energy, size, moved = _search(system, bounds, contact, v, energy, size, direction, done)
-        stalled = stalled | ~(moved | done)
+        v, energy, size, moved = _search(system, bounds, model, v, energy, size, direction, done)
+        still, age = ~(moved | done), torch.where(renewed, 0, age + 1)
+        stalled = stalled | (still & renewed)
     # No step lowers the energy where what is left to gain is less than its rounding.
     small = small | (stalled & (residual.square() * total_mass <= ROUNDING * torch.finfo(v.dtype).eps * size))
     finite = residual.isfinite() & energy.isfinite()
     v = _with_momentum(system, bounds, v, total_mass)
     return Minimum(v, contact.free, small & finite, residual, iterations, cg_iterations)
+
+
+def _preconditioned(
+    system: ImplicitSystem, bounds: NodeBounds | None, blocks: Tensor, contact: Contact, total_mass: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """B⁻¹ of the free components, its product with the gradient, and the residual of each scene [m/s]."""
+    inverse = inverse_blocks(bounds, blocks, contact.free)
+    change = _times(inverse, contact.gradient)
+    return inverse, change, (system.node_sum(contact.gradient * change).abs() / total_mass).sqrt()
 
 
 def _with_momentum(system: ImplicitSystem, bounds: NodeBounds | None, v: Tensor, total_mass: Tensor) -> Tensor:
