@@ -40,6 +40,10 @@ def differentiable(
     residual = contact_at(system, bounds, v, system.residual(v)).gradient
     if not residual.requires_grad:
         return minimum.v
+    if system.flows:
+        raise NotImplementedError(
+            "an implicit step with plasticity='inside' has no gradients: use plasticity='after', or torch.no_grad()"
+        )
     for part in system.law.modules():
         if isinstance(part, CompiledLaw) and not LAWS[part.name].twice_differentiable_energy:
             raise NotImplementedError(
@@ -82,6 +86,7 @@ def _solve(
         relative = relative.clamp_min(1e-5)
 
     def solved(right: Tensor) -> tuple[Tensor, Tensor]:
+        right = right if bounds is None else bounds.kept(right, free)
         solve = implicit_cg(
             *(system.blocks, system.state.x, right, system.mass, inverse, tangent, relative),
             *(4 * owner.options.max_cg_iterations, system.stress_form, across),

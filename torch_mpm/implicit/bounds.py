@@ -58,6 +58,11 @@ class NodeBounds:
         at_upper = (u >= self.upper - rounding) & (slope <= 0)
         return ~(at_lower | at_upper | (self.lower == self.upper))
 
+    def kept(self, v: Tensor, free: Tensor) -> Tensor:
+        """Vectors of nodes [N, D] without their components that are not free. What a solve is given in held components
+        would leak into it by rounding, and grow."""
+        return self.turned(torch.where(free, self.turned(v), 0))
+
     def turned_blocks(self, blocks: Tensor) -> Tensor:
         """Matrices [N, D, D] to the axes of the nodes, and back."""
         if self.mirror is None:

@@ -103,7 +103,7 @@ class Contact:
 
     Attributes:
         free: components that the step is to find, in the axes of the nodes, bool [N, D].
-        gradient: of the energy and of friction [N, D] [kg m/s].
+        gradient: of the energy and of friction, without the components that are not free [N, D] [kg m/s].
         friction: None where there is none.
     """
 
@@ -122,9 +122,10 @@ def contact_at(
         return Contact(massive, gradient)
     free = massive & bounds.free(v, gradient)
     if bounds.friction is None:
-        return Contact(free, gradient)
+        return Contact(free, bounds.kept(gradient, free))
     friction = _friction(bounds, v, gradient, free, _limit(bounds, gradient, free) if limit is None else limit)
-    return Contact(free & ~(friction.limit.along & friction.sticks), gradient + friction.force(), friction)
+    free = free & ~(friction.limit.along & friction.sticks)
+    return Contact(free, bounds.kept(gradient + friction.force(), free), friction)
 
 
 def _limit(bounds: NodeBounds, gradient: Tensor, free: Tensor) -> Limit:

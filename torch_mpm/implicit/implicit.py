@@ -35,19 +35,26 @@ class ImplicitReport(NamedTuple):
     """Of conjugate gradients, in all of these, int32."""
 
 
+PLASTICITY = ("after", "inside")
+
+
 class Implicit:
     """Backward Euler: `Step(integrator=Implicit(...))`, or `integrator="implicit"` for the defaults.
 
     The node velocities minimise ½ Σ m |v − v*|² + Σ V ψ((I + dt L(v)) F) (Martin et al. 2011; Gast et al. 2015), scene
     by scene, by Newton's method with line search and conjugate gradients preconditioned by the blocks of the nodes. Any
-    dt is stable. Walls and obstacles bound the velocities of their nodes in the solve. Laws with an elastic energy take
-    part; where they are plastic the flow follows the solve, at the start of the next step.
+    dt is stable. Walls and obstacles bound the velocities of their nodes in the solve, and rub them. Laws with an
+    elastic energy take part; where they are plastic the flow follows the solve, at the start of the next step, or is a
+    part of it.
 
     Args:
         tolerance: of the residual relative to that of v*, the velocities without elastic forces, in (0, 1).
         max_iterations: of Newton's method in a step.
         max_cg_iterations: of conjugate gradients in each of these.
         adjoint_tolerance: relative, of the one linear solve of a backward pass.
+        plasticity: "after": the solve sees the elastic stress of the trial deformation, and the flow follows. "inside":
+            it sees the stress after the flow, so that no more trial stress than the material bears acts on the motion.
+            No gradients.
 
     Attributes:
         report: `ImplicitReport` of the latest step, None before the first.
@@ -64,11 +71,15 @@ class Implicit:
         max_iterations: int = 30,
         max_cg_iterations: int = 1000,
         adjoint_tolerance: float = 1e-8,
+        plasticity: str = "after",
     ) -> None:
         for name, value in (("tolerance", tolerance), ("adjoint_tolerance", adjoint_tolerance)):
             check_number(name, value, "between 0 and 1", lambda v: 0 < v < 1)
         check_count("max_iterations", max_iterations, 1)
         check_count("max_cg_iterations", max_cg_iterations, 1)
+        if plasticity not in PLASTICITY:
+            raise ValueError(f"plasticity must be one of {sorted(PLASTICITY)}, got {plasticity!r}")
+        self.plasticity = plasticity
         self.options = Options(float(tolerance), int(max_iterations), int(max_cg_iterations))
         self.adjoint_tolerance = float(adjoint_tolerance)
         self.report: ImplicitReport | None = None
@@ -94,7 +105,8 @@ class Implicit:
         if not blocks.grid.scenes:
             return start
         wants_gradient = torch.is_grad_enabled()
-        system = ImplicitSystem(blocks, step.law, state, mass, start, dt, step.stress_form)
+        flows = self.plasticity == "inside"
+        system = ImplicitSystem(blocks, step.law, state, mass, start, dt, step.stress_form, flows)
         bounds = node_bounds(blocks, step.walls, step.boundaries.entries, start, state.time)
         with torch.no_grad():
             fixed = system.detached() if wants_gradient else system

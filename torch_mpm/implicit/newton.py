@@ -149,7 +149,7 @@ def minimise(system: ImplicitSystem, bounds: NodeBounds | None, options: Options
         direction = torch.where(system.of_nodes(indefinite & (solve.iterations == 0)), -change, solve.solution)
         cg_iterations += solve.iterations
         iterations += (~done).int()
-        v, energy, size, moved = _search(system, bounds, model, v, energy, size, direction, done)
+        v, energy, size, moved = _search(system, bounds, model, elastic, v, energy, size, direction, done)
         still, age = ~(moved | done), torch.where(renewed, 0, age + 1)
         stalled = stalled | (still & renewed)
     # No step lowers the energy where what is left to gain is less than its rounding.
@@ -242,6 +242,7 @@ def _search(
     system: ImplicitSystem,
     bounds: NodeBounds | None,
     contact: Contact,
+    residual: Tensor,
     v: Tensor,
     energy: Tensor,
     size: Tensor,
@@ -263,7 +264,7 @@ def _search(
     for _ in range(MOST_HALVINGS):
         trial = moved(share)
         trial_energy, trial_size = system.energy(trial)
-        gain = trial_energy - energy
+        gain = system.gain(v, residual, trial, trial_energy - energy)
         if friction is not None:
             gain = gain + system.node_sum(friction.gain(trial))
         slope = system.node_sum(contact.gradient * (trial - v))

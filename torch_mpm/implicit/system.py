@@ -34,6 +34,7 @@ class ImplicitSystem:
         start: v* [N, D] [m/s].
         dt: [s], a number or a tensor [], [1] or [B].
         stress_form: "mls" or "gradient".
+        flows: whether the stress is that after the return map of the trial deformation; no energy has it then.
         volume: of the particles that have an energy, zero for the others [P] [m³].
     """
 
@@ -44,6 +45,7 @@ class ImplicitSystem:
     start: Tensor
     dt: float | Tensor
     stress_form: str
+    flows: bool = False
     _trial: tuple[Tensor, Any] | None = None
 
     def __post_init__(self) -> None:
@@ -80,7 +82,7 @@ class ImplicitSystem:
         state = Overlay(self.state, x=self.state.x.detach(), extra=extra, **fields)
         dt = self.dt.detach() if isinstance(self.dt, Tensor) else self.dt
         return ImplicitSystem(
-            self.blocks, self.law, state, self.mass.detach(), self.start.detach(), dt, self.stress_form
+            *(self.blocks, self.law, state, self.mass.detach(), self.start.detach(), dt, self.stress_form, self.flows)
         )
 
     def trial(self, v: Tensor) -> Any:
@@ -113,10 +115,18 @@ class ImplicitSystem:
         total, size = self.particle_sum(torch.stack([stored, strained], 1)).unbind(1)
         return kinetic + total, kinetic + moved + size
 
+    def gain(self, v: Tensor, residual: Tensor, trial: Tensor, change: Tensor) -> Tensor:
+        """What a step from v, where the residual is given, to a trial adds to E, float64 [B] [J]: the change of E, or
+        where plastic flow leaves no energy, the work of the residuals along the step by the trapezoidal rule."""
+        if not self.flows:
+            return change
+        work = self.node_sum(0.5 * (residual + self.residual(trial)) * (trial - v))
+        return torch.where(change.isfinite(), work, torch.inf)
+
     def residual(self, v: Tensor) -> Tensor:
         """∂E/∂v [N, D] [kg m/s]; differentiable by everything."""
         grid, x = self.blocks.grid, self.state.x
-        stress = self.law.trial_stress(self.trial(v), self.state)
+        stress = self.law.trial_stress(self.trial(v), self.state, self.flows)
         meant = (self.volume > 0)[:, None, None]  # the stress of others may be NaN
         impulse = torch.where(meant, self.impulse_weight[:, None, None] * torch.where(meant, stress, 0), 0)
         mls = self.stress_form == "mls"
@@ -128,7 +138,7 @@ class ImplicitSystem:
 
     def tangent(self, v: Tensor, projected: bool = True) -> Tensor:
         """The tangents of the particles with their weights, as the ops of the Hessian take them [P, n]."""
-        return self.law.trial_tangent(self.trial(v), self.state, self.tangent_weight, projected)
+        return self.law.trial_tangent(self.trial(v), self.state, self.tangent_weight, projected, self.flows)
 
     def diagonal(self, tangent: Tensor) -> Tensor:
         """The node blocks of the Hessian [N, D, D] [kg]."""
