@@ -155,7 +155,8 @@ STABLE_TORCH_LIBRARY_FRAGMENT(torch_mpm, m) {
   m.def("implicit_node_blocks(Tensor x, Tensor tangent, int stress_form, " MPM_TOPOLOGY_SCHEMA ") -> Tensor");
   m.def(
       "implicit_cg(Tensor x, Tensor rhs, Tensor mass, Tensor inverse, Tensor? local, Tensor tangent, "
-      "Tensor relative, int max_iterations, int stress_form, " MPM_TOPOLOGY_SCHEMA ") -> (Tensor solution, Tensor scalars)");
+      "Tensor relative, int max_iterations, int stress_form, " MPM_TOPOLOGY_SCHEMA
+      ") -> (Tensor solution, Tensor scalars)");
 }
 #endif
 

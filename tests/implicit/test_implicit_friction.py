@@ -116,9 +116,7 @@ def test_a_belt_takes_the_block_along(dim, device):
     """A moving surface gives μ g until the block has its velocity."""
     grid, start = block(dim, device, lower=0.25)
     belt = mpm.Plane((0.0, 0.25, 0.0)[:dim], (0, 1, 0)[:dim], friction=0.3, velocity=(0.3, 0.0, 0.4)[:dim])
-    step = mpm.Step(
-        grid, mpm.NeoHookean(E=1e6, nu=0.3), (0, -G, 0)[:dim], boundaries=[belt], integrator=Implicit(1e-6)
-    )
+    step = mpm.Step(grid, mpm.NeoHookean(E=1e6, nu=0.3), (0, -G, 0)[:dim], boundaries=[belt], integrator=Implicit(1e-6))
     speed = 0.3 if dim == 2 else 0.5
     state = run(step, start, 4, 1e-2)
     along = torch.tensor((0.3, 0.0, 0.4)[:dim], dtype=torch.float64, device=device) / speed

@@ -176,7 +176,7 @@ def _add_obstacle(
     entry = rows & (axis > 0)
     bounds.lower = torch.where(entry & ((sign < 0) | fixed), limit, torch.where(entry, -math.inf, bounds.lower))
     bounds.upper = torch.where(entry & ((sign > 0) | fixed), limit, torch.where(entry, math.inf, bounds.upper))
-    if bounds.friction is not None and rubs(obstacle):
+    if bounds.friction is not None and bounds.surface is not None and rubs(obstacle):
         friction = obstacle.friction
         if isinstance(friction, Tensor):
             friction = obstacle.at_nodes("friction", positions, (), scene)[..., None]

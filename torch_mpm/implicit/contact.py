@@ -4,10 +4,11 @@ Friction at a node adds to the energy of a step what it would dissipate,
 
     D(v) = c |u_T − s_T|,   c = Σ μ λ,
 
-with the components T of its velocity u that no bound holds, the velocity s of the surface, and the impulses λ with which
-the bounds hold the others: the gradient of the energy there. c counts as constant while E + D is minimised, and is
-renewed once that is done well enough to tell that c is wrong. D is not smoothed: a node at rest on its surface sticks, as
-an equality, while the gradient along it is at most c, and a step that would turn the motion of a node round ends at rest.
+with the components T of its velocity u that no bound holds, the velocity s of the surface, and the impulses λ with
+which the bounds hold the others: the gradient of the energy there. c counts as constant while E + D is minimised, and
+follows the gradient from iterate to iterate (lagged friction, as in Li et al. 2020), so that the residual is that of
+Coulomb's law itself. D is not smoothed: a node at rest on its surface sticks, as an equality, while the gradient along
+it is at most c, and a step that would turn the motion of a node round ends at rest.
 """
 
 from __future__ import annotations
@@ -79,7 +80,9 @@ class Friction:
         speed = self.relative.norm(dim=1, keepdim=True)
         speed = speed if starting is None else torch.where(speed > 0, speed, starting)
         modulus = torch.where(self.sticks | (speed == 0), 0, self.limit.size / torch.where(speed > 0, speed, 1))
-        across = torch.diag_embed(self.limit.along.to(modulus.dtype)) - self.direction[:, :, None] * self.direction[:, None]
+        across = (
+            torch.diag_embed(self.limit.along.to(modulus.dtype)) - self.direction[:, :, None] * self.direction[:, None]
+        )
         return self.bounds.turned_blocks(modulus[:, :, None] * across)
 
     def coupling(self, gradient: Tensor) -> Tensor:
@@ -87,7 +90,9 @@ class Friction:
         friction = self.bounds.friction
         assert friction is not None
         pressed = (friction * self.bounds.turned(gradient) > 0) & ~self.limit.along
-        return self.bounds.turned(torch.where(pressed & ~self.sticks & self.limit.along.any(1, keepdim=True), friction, 0))
+        return self.bounds.turned(
+            torch.where(pressed & ~self.sticks & self.limit.along.any(1, keepdim=True), friction, 0)
+        )
 
     def _surface(self) -> Tensor:
         assert self.bounds.surface is not None

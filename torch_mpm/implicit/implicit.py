@@ -161,7 +161,8 @@ def check_implicit(step: Step, state: State) -> None:
         )
     reasons = {
         "impulses on boundaries": state.impulse is not None,
-        "motions and shapes of obstacles that require a gradient": torch.is_grad_enabled() and any(t.requires_grad for t in motions),
+        "motions and shapes of obstacles that require a gradient": torch.is_grad_enabled()
+        and any(t.requires_grad for t in motions),
     }
     for what, present in reasons.items():
         if present:

@@ -107,8 +107,8 @@ def minimise(system: ImplicitSystem, bounds: NodeBounds | None, options: Options
     iterations, cg_iterations = zeros.clone(), zeros.clone()
     first: Tensor | None = None
     previous = forcing = None
-    stalled = indefinite = still = careful = torch.zeros(scenes, dtype=torch.bool, device=v.device)
-    limit, age = None, zeros
+    stalled = indefinite = torch.zeros(scenes, dtype=torch.bool, device=v.device)
+    lag = _Lag(scenes, v.device)
     while True:
         elastic, convex = system.residual(v), system.tangent(v)
         blocks = system.diagonal(convex)
@@ -123,40 +123,75 @@ def minimise(system: ImplicitSystem, bounds: NodeBounds | None, options: Options
         if bool((done | (iterations >= options.max_iterations)).all()):
             break
         forcing = _forcing(residual, previous, forcing, target)
-        if previous is not None:
-            careful = careful | (residual > previous)
         previous = residual
         relative = torch.where(done, 1.0, forcing).to(v.dtype)
-        exact = ~indefinite & ((residual <= NEAR * first) | (iterations >= PATIENCE))
+        near = (residual <= NEAR * first) | (iterations >= PATIENCE)
+        exact = near & ~indefinite & (not system.flows)
         tangent = torch.where(system.of_particles(exact), system.tangent(v, projected=False), convex)
-        model, across, renewed = contact, None, ~done
+        model, across = contact, None
         if contact.friction is not None:
-            if limit is not None:
-                model = contact_at(system, bounds, v, elastic, limit)
-                left = _preconditioned(system, bounds, blocks, model, total_mass)[2]
-                renewed = still | ~careful | (age >= OLDEST) | ~(left > SETTLED * residual)
-                limit = limit.renewed(contact.friction.limit, system.of_nodes(renewed))
-            model = contact_at(system, bounds, v, elastic, limit)
-            limit = model.friction.limit
-            across = model.friction.curvature(change.norm(dim=1, keepdim=True))
+            model = lag.contact(system, bounds, v, elastic, blocks, contact, residual, total_mass)
+            across = None if model.friction is None else model.friction.curvature(change.norm(dim=1, keepdim=True))
             blocks = blocks if across is None else blocks + across
             inverse, change, _ = _preconditioned(system, bounds, blocks, model, total_mass)
+        right = torch.where(system.of_nodes(done), 0, -model.gradient)
         solve = implicit_cg(
-            *(system.blocks, system.state.x, torch.where(system.of_nodes(done), 0, -model.gradient), system.mass),
-            *(inverse, tangent, relative, options.max_cg_iterations, system.stress_form, across),
+            *(system.blocks, system.state.x, right, system.mass, inverse, tangent, relative),
+            *(options.max_cg_iterations, system.stress_form),
+            local=across,
         )
         indefinite = solve.state == NEGATIVE_CURVATURE
         direction = torch.where(system.of_nodes(indefinite & (solve.iterations == 0)), -change, solve.solution)
         cg_iterations += solve.iterations
         iterations += (~done).int()
         v, energy, size, moved = _search(system, bounds, model, elastic, v, energy, size, direction, done)
-        still, age = ~(moved | done), torch.where(renewed, 0, age + 1)
-        stalled = stalled | (still & renewed)
+        lag.still = ~(moved | done)
+        stalled = stalled | (lag.still & lag.renewed)
     # No step lowers the energy where what is left to gain is less than its rounding.
     small = small | (stalled & (residual.square() * total_mass <= ROUNDING * torch.finfo(v.dtype).eps * size))
     finite = residual.isfinite() & energy.isfinite()
     v = _with_momentum(system, bounds, v, total_mass)
     return Minimum(v, contact.free, small & finite, residual, iterations, cg_iterations)
+
+
+class _Lag:
+    """The limits of friction that Newton's method works with, those of an earlier iterate in some scenes.
+
+    Attributes:
+        renewed: scenes whose limits are those of this iterate, bool [B].
+        still: scenes that the step before did not move, bool [B].
+    """
+
+    def __init__(self, scenes: int, device: torch.device) -> None:
+        self.renewed = torch.ones(scenes, dtype=torch.bool, device=device)
+        self.still = self._careful = ~self.renewed
+        self._age = torch.zeros(scenes, dtype=torch.int32, device=device)
+        self._limit: Limit | None = None
+        self._residual: Tensor | None = None
+
+    def contact(
+        self,
+        system: ImplicitSystem,
+        bounds: NodeBounds | None,
+        v: Tensor,
+        elastic: Tensor,
+        blocks: Tensor,
+        now: Contact,
+        residual: Tensor,
+        total_mass: Tensor,
+    ) -> Contact:
+        """Contact with the limits of friction to go on with, of contact with those of this iterate."""
+        assert now.friction is not None
+        if self._limit is None or self._residual is None:
+            self._limit, self._residual = now.friction.limit, residual
+            return now
+        self._careful = self._careful | (residual > self._residual)
+        before = contact_at(system, bounds, v, elastic, self._limit)
+        left = _preconditioned(system, bounds, blocks, before, total_mass)[2]
+        self.renewed = self.still | ~self._careful | (self._age >= OLDEST) | ~(left > SETTLED * residual)
+        self._age = torch.where(self.renewed, 0, self._age + 1)
+        self._limit, self._residual = self._limit.renewed(now.friction.limit, system.of_nodes(self.renewed)), residual
+        return contact_at(system, bounds, v, elastic, self._limit)
 
 
 def _preconditioned(

@@ -31,7 +31,7 @@ def flowing_tangent(law: Material, state: Any, before: Any, weight: Tensor, proj
 
     Of a flow that is not associated, as that of sand, the symmetric part. Zero where it is not finite.
     """
-    P, dim = state.x.shape
+    dim = state.x.shape[1]
     U, stretch, V = svd3(state.F)
     stress, moduli, quotients = _principal_derivatives(law, state, stretch)
     scale = weight[:, None, None] / (stretch[:, :, None] * stretch[:, None, :])
@@ -49,7 +49,7 @@ def flowing_tangent(law: Material, state: Any, before: Any, weight: Tensor, proj
         diagonal, even, odd = _positive_part(diagonal), even.clamp_min(0), odd.clamp_min(0)
     upper = [diagonal[:, i, j] for i in range(dim) for j in range(i, dim)]
     B = before.F @ V
-    entries = torch.cat([U.reshape(P, -1), B.reshape(P, -1), torch.stack(upper, 1), even, odd], 1)
+    entries = torch.cat([U.flatten(1), B.flatten(1), torch.stack(upper, 1), even, odd], 1)
     finite = entries.isfinite().all(1) & (stretch > 0).all(1)
     return torch.where(finite[:, None], entries, 0)
 
@@ -61,7 +61,8 @@ def _principal_derivatives(law: Material, state: Any, stretch: Tensor) -> tuple[
     dim = stretch.shape[1]
     with torch.inference_mode(False), torch.enable_grad():
         F = torch.diag_embed(stretch.detach()).requires_grad_()
-        stress = law.update(Overlay(state, F=F))[1]
+        moved: Any = Overlay(state, F=F)
+        stress = law.update(moved)[1]
 
         def by_F(i: int, j: int) -> Tensor:
             return torch.autograd.grad(stress[:, i, j].sum(), F, retain_graph=True)[0]
