@@ -40,16 +40,17 @@ def run(step, state, n, dt):
 
 
 SLOPES = [
-    (2, "wall", torch.float32),
-    (2, "obstacle", torch.float64),
-    (2, "slip", torch.float64),
-    (3, "obstacle", torch.float32),
-    (3, "wall", torch.float64),
+    (2, "wall", torch.float32, "mls"),
+    (2, "wall", torch.float64, "gradient"),
+    (2, "obstacle", torch.float64, "mls"),
+    (2, "slip", torch.float64, "mls"),
+    (3, "obstacle", torch.float32, "gradient"),
+    (3, "wall", torch.float64, "mls"),
 ]
 
 
-@pytest.mark.parametrize(("dim", "boundary", "dtype"), SLOPES)
-def test_block_on_a_slope(dim, boundary, dtype, device):
+@pytest.mark.parametrize(("dim", "boundary", "dtype", "stress_form"), SLOPES)
+def test_block_on_a_slope(dim, boundary, dtype, stress_form, device):
     """tan α > μ slides with g (sin α − μ cos α); else the block comes to rest, and stays there."""
     angle, E = 0.4, 1e6
     lower = 0.0 if boundary == "wall" else 0.25
@@ -59,6 +60,7 @@ def test_block_on_a_slope(dim, boundary, dtype, device):
             grid,
             mpm.NeoHookean(E=E, nu=0.3),
             slope_gravity(angle, dim),
+            stress_form=stress_form,
             integrator=Implicit(1e-6 if dtype == torch.float64 else 1e-4),
         )
         if boundary == "wall":

@@ -132,13 +132,13 @@ def test_sand_that_is_pulled_apart_bears_no_tension(energy, dim, device):
 def tension(dim, steps, device, plasticity="inside", dtype=torch.float64):
     """A bar of von Mises' material between two clamps, pulled by 3% in a second: stress in its middle."""
     grid = mpm.Grid(0.125, (-0.5,) * dim, (3.0,) + (1.5,) * (dim - 1))
-    points = mpm.seed.box((0.0, 0.5, 0.5)[:dim], (2.0, 0.75, 0.75)[:dim], grid, per_cell=2**dim)
+    points = mpm.seed.box((0.0, 0.5, 0.5)[:dim], (1.5, 0.75, 0.75)[:dim], grid, per_cell=2**dim)
     state = mpm.State.at_rest(points, density=1000.0, dtype=dtype, device=device)
     law = mpm.VonMises(E=1e6, nu=0.3, yield_stress=1e4, hardening=1e4)
     along, back = (1.0, 0.0, 0.0)[:dim], (-1.0, 0.0, 0.0)[:dim]
     clamps = [
         mpm.Plane((0.2, 0.0, 0.0)[:dim], along, "sticky"),
-        mpm.Plane((1.8, 0.0, 0.0)[:dim], back, "sticky", velocity=(0.05, 0.0, 0.0)[:dim]),
+        mpm.Plane((1.3, 0.0, 0.0)[:dim], back, "sticky", velocity=(0.035, 0.0, 0.0)[:dim]),
     ]
     integrator = Implicit(1e-8 if dtype == torch.float64 else 1e-4, plasticity=plasticity)
     step = mpm.Step(grid, law, boundaries=clamps, integrator=integrator)
@@ -146,7 +146,7 @@ def tension(dim, steps, device, plasticity="inside", dtype=torch.float64):
         state = step(state, 1.0 / steps)
         assert bool(step.solve_report.converged.all())
     fields, stress = law.update(state)
-    middle = (state.x[:, 0] - 1.0).abs() < 0.2
+    middle = (state.x[:, 0] - 0.75).abs() < 0.15
     return stress[middle].mean(0), float(fields["plastic_strain"][middle].mean())
 
 
@@ -163,23 +163,24 @@ def test_a_bar_yields_at_its_yield_stress_in_one_long_step(dim, dtype, device):
 
 
 def test_many_steps_yield_as_one(device):
-    one, many = (tension(2, steps, device) for steps in (1, 8))
-    assert relative_error(many[0][0, 0], one[0][0, 0]) < 0.01 and abs(many[1] / one[1] - 1) < 0.1
+    one, many = (tension(2, steps, device) for steps in (1, 4))
+    assert relative_error(many[0][0, 0], one[0][0, 0]) < 0.01 and abs(many[1] / one[1] - 1) < 0.15
 
 
-@pytest.mark.parametrize("name", [name for name in LAWS if name != "sand_hencky"])
+@pytest.mark.parametrize("name", LAWS)
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_every_plastic_law_converges(name, dtype, device):
-    """A block falls on the floor, with friction there, at 40 times the explicit limit."""
+    """A block falls on the floor, with friction there, at five times the explicit limit of elastic waves."""
     grid, state = body(2, device, dtype)
-    state = state.replace(x=state.x - state.x.new_tensor([0.0, 0.5]), v=state.v + state.v.new_tensor([0.0, -3.0]))
+    state = state.replace(x=state.x - state.x.new_tensor([0.0, 0.5]), v=state.v + state.v.new_tensor([0.0, -2.0]))
+    tolerance = 1e-3 if dtype == torch.float32 else 1e-6
     walls = mpm.Walls(("open", ("separate", "open")), friction=(0.0, (0.4, 0.0)))
-    step = mpm.Step(grid, LAWS[name], (0.0, -9.8), walls, integrator=Implicit(1e-3, plasticity="inside"))
+    step = mpm.Step(grid, LAWS[name], (0.0, -9.8), walls, integrator=Implicit(tolerance, plasticity="inside"))
     flowed = False
     for _ in range(3):
-        state = step(state, 4e-3)
+        state = step(state, 2e-2)
         assert bool(step.solve_report.converged.all()), step.solve_report
-        flowed = flowed or bool((step.law.return_map(Overlay(state, dt=4e-3), details=True).branch > 0).any())
+        flowed = flowed or bool((step.law.return_map(Overlay(state, dt=2e-2), details=True).branch > 0).any())
     step.check(state)
     assert flowed
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 
 import torch
 from torch import Tensor
@@ -11,6 +12,7 @@ from ..ops import implicit_cg
 from ..ops.implicit import NEGATIVE_CURVATURE
 from .bounds import NodeBounds
 from .contact import Contact, Limit, contact_at
+from .gmres import gmres
 from .system import ImplicitSystem
 
 LOOSEST, TIGHTEST = 0.1, 1e-12
@@ -22,6 +24,8 @@ SUFFICIENT = 1e-4
 ROUNDING = 32
 """Units in the last place by which sums of energies may be wrong."""
 MOST_HALVINGS = 30
+SYMMETRIC = 1e-3
+"""Skew part of the tangents, relative to the rest, up to which they count as symmetric."""
 SETTLED, OLDEST = 0.3, 5
 """Where renewing friction has raised the residual, it is kept until the share of the residual is left that does not
 follow from its change; for this many iterations at most."""
@@ -126,7 +130,9 @@ def minimise(system: ImplicitSystem, bounds: NodeBounds | None, options: Options
         previous = residual
         relative = torch.where(done, 1.0, forcing).to(v.dtype)
         near = (residual <= NEAR * first) | (iterations >= PATIENCE)
-        exact = near & ~indefinite & (not system.flows)
+        skew = system.skew(v) if system.flows else None
+        whole = torch.zeros_like(done) if skew is None else ~(done | lag.still) & skewed(system, skew, convex)
+        exact = near & ~(indefinite | whole)
         tangent = torch.where(system.of_particles(exact), system.tangent(v, projected=False), convex)
         model, across = contact, None
         if contact.friction is not None:
@@ -134,7 +140,7 @@ def minimise(system: ImplicitSystem, bounds: NodeBounds | None, options: Options
             across = None if model.friction is None else model.friction.curvature(change.norm(dim=1, keepdim=True))
             blocks = blocks if across is None else blocks + across
             inverse, change, _ = _preconditioned(system, bounds, blocks, model, total_mass)
-        right = torch.where(system.of_nodes(done), 0, -model.gradient)
+        right = torch.where(system.of_nodes(done | whole), 0, -model.gradient)
         solve = implicit_cg(
             *(system.blocks, system.state.x, right, system.mass, inverse, tangent, relative),
             *(options.max_cg_iterations, system.stress_form),
@@ -143,6 +149,14 @@ def minimise(system: ImplicitSystem, bounds: NodeBounds | None, options: Options
         indefinite = solve.state == NEGATIVE_CURVATURE
         direction = torch.where(system.of_nodes(indefinite & (solve.iterations == 0)), -change, solve.solution)
         cg_iterations += solve.iterations
+        if skew is not None and bool(whole.any()):
+            right = torch.where(system.of_nodes(whole), -model.gradient, 0)
+            derivative = _free_derivative(system, bounds, system.derivative(v, skew), model, across)
+            step, more = gmres(system, derivative, inverse, right, relative, options.max_cg_iterations)
+            descends = system.node_sum(model.gradient * step) < 0
+            step = torch.where(system.of_nodes(descends), step, -change)
+            direction = torch.where(system.of_nodes(whole), step, direction)
+            cg_iterations += more
         iterations += (~done).int()
         v, energy, size, moved = _search(system, bounds, model, elastic, v, energy, size, direction, done)
         lag.still = ~(moved | done)
@@ -152,6 +166,31 @@ def minimise(system: ImplicitSystem, bounds: NodeBounds | None, options: Options
     finite = residual.isfinite() & energy.isfinite()
     v = _with_momentum(system, bounds, v, total_mass)
     return Minimum(v, contact.free, small & finite, residual, iterations, cg_iterations)
+
+
+def skewed(system: ImplicitSystem, skew: Tensor, tangent: Tensor) -> Tensor:
+    """Scenes whose tangents are not symmetric, bool [B]."""
+    dim = skew.shape[1]
+    moduli = tangent[:, 2 * dim * dim :]
+    sizes = torch.stack([skew.square().sum((1, 2)), moduli.square().sum(1)], 1).double()
+    skew_size, size = system.particle_sum(sizes).unbind(1)
+    return skew_size > SYMMETRIC**2 * size
+
+
+def _free_derivative(
+    system: ImplicitSystem,
+    bounds: NodeBounds | None,
+    derivative: Callable[[Tensor], Tensor],
+    model: Contact,
+    across: Tensor | None,
+) -> Callable[[Tensor], Tensor]:
+    """The derivative of the residual with that of friction, of what is free."""
+
+    def product(d: Tensor) -> Tensor:
+        result = derivative(d) if across is None else derivative(d) + _times(across, d)
+        return result if bounds is None else bounds.kept(result, model.free)
+
+    return product
 
 
 class _Lag:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -17,7 +18,7 @@ from torch import Tensor
 
 from ..grid import Blocks
 from ..laws.material import Material
-from ..ops import advance, gather, implicit_node_blocks, scatter
+from ..ops import advance, gather, implicit_apply, implicit_node_blocks, scatter
 from ..ops.arguments import per_particle, sum_by_scene
 from ..parameters import Overlay
 
@@ -90,11 +91,7 @@ class ImplicitSystem:
         if self._trial is not None and self._trial[0] is v:
             return self._trial[1]
         state, grid = self.state, self.blocks.grid
-        mls = self.stress_form == "mls"
-        value, moment, gradient = gather(
-            self.blocks, state.x, v, moment=mls, gradient=not mls, moment_scale=grid.inverse_inertia
-        )
-        motion = moment if mls else gradient
+        value, motion = self._motion(v)
         _, F, J = advance(state.x, value, self.dt, motion, state.F, state.J, self.blocks.particle_scene(), grid.scenes)
         trial = Overlay(state, F=F, J=J, C=motion, step=self.step)
         if not v.requires_grad and not torch.is_grad_enabled():
@@ -125,20 +122,46 @@ class ImplicitSystem:
 
     def residual(self, v: Tensor) -> Tensor:
         """∂E/∂v [N, D] [kg m/s]; differentiable by everything."""
-        grid, x = self.blocks.grid, self.state.x
         stress = self.law.trial_stress(self.trial(v), self.state, self.flows)
         meant = (self.volume > 0)[:, None, None]  # the stress of others may be NaN
         impulse = torch.where(meant, self.impulse_weight[:, None, None] * torch.where(meant, stress, 0), 0)
-        mls = self.stress_form == "mls"
-        nothing = x.new_zeros(()).expand(x.shape)
-        forces = scatter(
-            *(self.blocks, x, nothing, impulse if mls else None, None if mls else impulse, grid.inverse_inertia)
-        )
-        return self.mass[:, None] * (v - self.start) + forces
+        return self.mass[:, None] * (v - self.start) + self._scattered(impulse)
+
+    def _motion(self, v: Tensor) -> tuple[Tensor, Tensor]:
+        """Velocities of the particles [P, D] and their gradients [P, D, D]."""
+        mls, scale = self.stress_form == "mls", self.blocks.grid.inverse_inertia
+        value, moment, gradient = gather(self.blocks, self.state.x, v, moment=mls, gradient=not mls, moment_scale=scale)
+        motion = moment if mls else gradient
+        assert motion is not None
+        return value, motion
+
+    def _scattered(self, impulse: Tensor) -> Tensor:
+        """Node forces [N, D] of stresses times volume and time step [P, D, D]."""
+        mls, x = self.stress_form == "mls", self.state.x
+        nothing, scale = x.new_zeros(()).expand(x.shape), self.blocks.grid.inverse_inertia
+        return scatter(self.blocks, x, nothing, impulse if mls else None, None if mls else impulse, scale)
 
     def tangent(self, v: Tensor, projected: bool = True) -> Tensor:
         """The tangents of the particles with their weights, as the ops of the Hessian take them [P, n]."""
         return self.law.trial_tangent(self.trial(v), self.state, self.tangent_weight, projected, self.flows)
+
+    def skew(self, v: Tensor) -> Tensor:
+        """What flows that are not associated add to the tangents: skew matrices in their axes [P, D, D]."""
+        return self.law.trial_skew(self.trial(v), self.tangent_weight)
+
+    def derivative(self, v: Tensor, skew: Tensor) -> Callable[[Tensor], Tensor]:
+        """The derivative of the residual as a function of node velocities [N, D] -> [N, D]."""
+        tangent = self.tangent(v, projected=False)
+        dim = self.state.x.shape[1]
+        U, B = (tangent[:, k * dim * dim : (k + 1) * dim * dim].unflatten(1, (dim, dim)) for k in (0, 1))
+
+        def product(direction: Tensor) -> Tensor:
+            result = implicit_apply(self.blocks, self.state.x, direction, tangent, self.mass, self.stress_form)
+            along = (U.mT @ self._motion(direction)[1] @ B).diagonal(dim1=1, dim2=2)
+            turned = (skew @ along[:, :, None]) * B.mT
+            return result + self._scattered(U @ turned)
+
+        return product
 
     def diagonal(self, tangent: Tensor) -> Tensor:
         """The node blocks of the Hessian [N, D, D] [kg]."""

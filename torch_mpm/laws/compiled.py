@@ -31,7 +31,7 @@ from ..ops.law import (
 )
 from ..ops.registry import LAWS
 from ..parameters import Overlay, PerMaterial, Value, evaluate
-from .flowing import flowing_stress, flowing_tangent
+from .flowing import flowing_skew, flowing_stress, flowing_tangent
 from .material import Material
 
 if TYPE_CHECKING:
@@ -131,6 +131,9 @@ class CompiledLaw(Material):
         if viscosity is not None:  # of a fluid, whose frames are the identity: 2 η dev sym L
             add_deviator(tangent, dim, 2 * viscosity * torch.where(weight > 0, weight / state.step, 0))
         return tangent
+
+    def trial_skew(self, state: Any, weight: Tensor) -> Tensor:
+        return flowing_skew(self, state, weight) if LAWS[self.name].plastic else super().trial_skew(state, weight)
 
     def _viscous_stress(self, state: Any, before: Any) -> Tensor:
         """What the velocity gradient of a step adds to the stress, at the volume before it [P, D, D] [Pa]."""

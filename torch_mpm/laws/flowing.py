@@ -54,7 +54,19 @@ def flowing_tangent(law: Material, state: Any, before: Any, weight: Tensor, proj
     return torch.where(finite[:, None], entries, 0)
 
 
-def _principal_derivatives(law: Material, state: Any, stretch: Tensor) -> tuple[Tensor, Tensor, list[Tensor]]:
+def flowing_skew(law: Material, state: Any, weight: Tensor) -> Tensor:
+    """What is not symmetric in the derivative of `flowing_stress`: the skew part of the block between the stretches, in
+    the axes of the tangent, times a weight [P, D, D]. Zero where it is not finite."""
+    stretch = svd3(state.F)[1]
+    _, moduli, _ = _principal_derivatives(law, state, stretch, shears=False)
+    skew = 0.5 * weight[:, None, None] * (moduli - moduli.mT) / (stretch[:, :, None] * stretch[:, None, :])
+    valid = skew.isfinite().all((1, 2), True) & (stretch > 0).all(1)[:, None, None]
+    return torch.where(valid, skew, 0)
+
+
+def _principal_derivatives(
+    law: Material, state: Any, stretch: Tensor, shears: bool = True
+) -> tuple[Tensor, Tensor, list[Tensor]]:
     """Principal stresses [P, D], their derivatives by the Hencky strains [P, D, D], and (τᵢ − τⱼ)/(hᵢ − hⱼ) [P] of each
     pair: how the stress turns where diag(σ) is sheared, dτᵢⱼ = (τᵢ − τⱼ) σⱼ²/(σᵢ² − σⱼ²), which has a limit at equal
     stretches."""
@@ -69,7 +81,7 @@ def _principal_derivatives(law: Material, state: Any, stretch: Tensor) -> tuple[
 
         rows = [by_F(i, i).diagonal(dim1=1, dim2=2) * stretch for i in range(dim)]
         quotients = []
-        for i in range(dim):
+        for i in range(dim if shears else 0):
             for j in range(i + 1, dim):
                 gap = stretch[:, i].abs().log() - stretch[:, j].abs().log()
                 quotients.append(2 * stretch[:, i] * by_F(i, j)[:, i, j] * _sinhc(gap))

@@ -77,6 +77,11 @@ class Material(nn.Module):
         """Derivative of `trial_stress` as `torch_mpm.ops.law_tangent` has it, times a weight [P]."""
         raise _not_implicit(self)
 
+    def trial_skew(self, state: Any, weight: Tensor) -> Tensor:
+        """What is not symmetric in the derivative of `trial_stress` where the trial flows: the skew part of the block
+        between the stretches, in the axes of the tangent, times a weight [P, D, D]."""
+        return state.x.new_zeros(state.x.shape[0], *(state.x.shape[1],) * 2)
+
     def energy(self, state: State) -> Tensor:
         """Elastic energy of each particle [P] [J]."""
         return self.energy_density(state) * state.volume

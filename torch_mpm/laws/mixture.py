@@ -88,6 +88,12 @@ class Mixture(Material):
 
         return self._collect_trial(state, before, (tangent_entries(state.x.shape[1]),), tangent)
 
+    def trial_skew(self, state: Any, weight: Tensor) -> Tensor:
+        def skew(law: Any, part: Any, old: Any) -> Tensor:
+            return law.trial_skew(part, weight.index_select(0, part.index))
+
+        return self._collect_trial(state, state, (state.x.shape[1],) * 2, skew)
+
     def _collect_trial(
         self, state: Any, before: Any, shape: tuple[int, ...], function: Callable[[Any, Any, Any], Tensor]
     ) -> Tensor:
