@@ -131,7 +131,7 @@ def minimise(system: ImplicitSystem, bounds: NodeBounds | None, options: Options
         relative = torch.where(done, 1.0, forcing).to(v.dtype)
         near = (residual <= NEAR * first) | (iterations >= PATIENCE)
         skew = system.skew(v) if system.flows else None
-        whole = torch.zeros_like(done) if skew is None else ~(done | lag.still) & skewed(system, skew, convex)
+        whole = torch.zeros_like(done) if skew is None else ~(done | lag.still) & _skewed(system, skew, convex)
         exact = near & ~(indefinite | whole)
         tangent = torch.where(system.of_particles(exact), system.tangent(v, projected=False), convex)
         model, across = contact, None
@@ -150,17 +150,14 @@ def minimise(system: ImplicitSystem, bounds: NodeBounds | None, options: Options
         direction = torch.where(system.of_nodes(indefinite & (solve.iterations == 0)), -change, solve.solution)
         cg_iterations += solve.iterations
         if skew is not None and bool(whole.any()):
-            right = torch.where(system.of_nodes(whole), -model.gradient, 0)
             derivative = _free_derivative(system, bounds, system.derivative(v, skew), model, across)
-            step, more = gmres(system, derivative, inverse, right, relative, options.max_cg_iterations)
-            descends = system.node_sum(model.gradient * step) < 0
-            step = torch.where(system.of_nodes(descends), step, -change)
+            step, more = _not_symmetric(system, derivative, inverse, change, model, whole, relative, options)
             direction = torch.where(system.of_nodes(whole), step, direction)
             cg_iterations += more
         iterations += (~done).int()
         v, energy, size, moved = _search(system, bounds, model, elastic, v, energy, size, direction, done)
         lag.still = ~(moved | done)
-        stalled = stalled | (lag.still & lag.renewed)
+        stalled = stalled | (lag.still & lag.renewed & ~whole)
     # No step lowers the energy where what is left to gain is less than its rounding.
     small = small | (stalled & (residual.square() * total_mass <= ROUNDING * torch.finfo(v.dtype).eps * size))
     finite = residual.isfinite() & energy.isfinite()
@@ -168,7 +165,7 @@ def minimise(system: ImplicitSystem, bounds: NodeBounds | None, options: Options
     return Minimum(v, contact.free, small & finite, residual, iterations, cg_iterations)
 
 
-def skewed(system: ImplicitSystem, skew: Tensor, tangent: Tensor) -> Tensor:
+def _skewed(system: ImplicitSystem, skew: Tensor, tangent: Tensor) -> Tensor:
     """Scenes whose tangents are not symmetric, bool [B]."""
     dim = skew.shape[1]
     moduli = tangent[:, 2 * dim * dim :]
@@ -191,6 +188,24 @@ def _free_derivative(
         return result if bounds is None else bounds.kept(result, model.free)
 
     return product
+
+
+def _not_symmetric(
+    system: ImplicitSystem,
+    derivative: Callable[[Tensor], Tensor],
+    inverse: Tensor,
+    change: Tensor,
+    model: Contact,
+    scenes: Tensor,
+    relative: Tensor,
+    options: Options,
+) -> tuple[Tensor, Tensor]:
+    """Newton steps with the whole derivative in some scenes, bool [B], or −B⁻¹ g where they do not descend; and the
+    iterations that they took."""
+    right = torch.where(system.of_nodes(scenes), -model.gradient, 0)
+    step, iterations = gmres(system, derivative, inverse, right, relative, options.max_cg_iterations)
+    descends = system.node_sum(model.gradient * step) < 0
+    return torch.where(system.of_nodes(descends), step, -change), iterations
 
 
 class _Lag:
