@@ -203,3 +203,29 @@ def test_gradients_with_friction(dim, slides, device):
             assert float(grad.abs()) == 0 and float(difference.abs()) < 1e-8
         else:
             assert relative_error((grad * direction).sum(), difference) < 1e-5, k
+
+
+def test_a_bad_scene_leaves_the_others_alone(device):
+    grid, one = block(2, device, scenes=2)
+    scenes = [one.replace(scene=torch.full((len(one),), b, dtype=torch.int32, device=device)) for b in range(2)]
+    together = mpm.State.concatenate(scenes)
+    step = mpm.Step(
+        grid, mpm.NeoHookean(E=1e6, nu=0.3), slope_gravity(0.4, 2), floor(2, 0.3), integrator=Implicit(1e-8)
+    )
+    good = step(together, 1e-2)
+    v = together.v.clone()
+    v[len(one) + 3] = torch.nan
+    bad = step(together.replace(v=v), 1e-2)
+    assert step.solve_report.converged.tolist() == [True, False]
+    assert torch.equal(bad.x[: len(one)], good.x[: len(one)])
+
+
+@pytest.mark.parametrize("count", [0, 1])
+def test_no_particle_and_one(count, dim, device):
+    grid, state = block(dim, device)
+    state = state.replace(**{n: getattr(state, n)[:count] for n in ("x", "v", "mass", "volume")})
+    step = mpm.Step(
+        grid, mpm.NeoHookean(E=1e5, nu=0.3), slope_gravity(0.4, dim), floor(dim, 0.3), integrator=Implicit(1e-6)
+    )
+    after = step(state, 0.1)
+    assert len(after) == count and bool(step.solve_report.converged.all()) and bool(after.x.isfinite().all())
