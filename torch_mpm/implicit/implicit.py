@@ -32,7 +32,7 @@ class ImplicitReport(NamedTuple):
     iterations: Tensor
     """Of Newton's method, int32."""
     cg_iterations: Tensor
-    """Of conjugate gradients, in all of these, int32."""
+    """Of conjugate gradients and GMRES, in all of these, int32."""
 
 
 PLASTICITY = ("after", "inside")
