@@ -1,8 +1,9 @@
 """The tables and figures of the documents, from the result files: `python -m benchmarks.report [--write]`.
 
 Prints the tables; with --write, puts them between the lines `<!-- benchmarks -->` and `<!-- /benchmarks -->` of
-docs/measured.md, which has all of them, and of README.md, which has one of speed and one of accuracy, and draws the
-figures of several devices beside the results. Each program draws its other figures itself.
+docs/measured.md, which has all of them, of README.md, which has one of speed and one of accuracy, and of the pages for
+users of other projects, and draws the figures of several devices beside the results. Each program draws its other
+figures itself.
 """
 
 from __future__ import annotations
@@ -10,21 +11,24 @@ from __future__ import annotations
 import argparse
 import json
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 from . import common
 from .accuracy.limits import tables as limit_tables
 from .accuracy.runout import PUBLISHED, published, slopes
-from .speed import roofline, scaling
-from .speed.rollouts import row_of_steps, row_of_training
+from .speed import network_steps, roofline, scaling
+from .speed import training as speed_of_training
+from .speed.rollouts import row_of_steps
+from .speed.training_scripts import PROJECTS
 from .stability.adversarial import summary as rollouts
 from .stability.heat import cell as heat_cell
 from .stability.heat import kind as heat_kind
 from .stability.heat_step import table as heat_step_table
 
 README, MEASURED = common.ROOT / "README.md", common.ROOT / "docs" / "measured.md"
+MIGRATING = common.ROOT / "docs" / "migrating"
 BEGIN, END = "<!-- benchmarks -->", "<!-- /benchmarks -->"
 FORWARD = ("step", "step, CUDA graph")
 BOTH = ("step, forward and backward", "step, forward and backward, CUDA graph")
@@ -76,7 +80,7 @@ def speed_table(results: list[dict[str, Any]]) -> str:
 
 
 def as_run(results: list[dict[str, Any]]) -> str:
-    """Example scenes, rollouts and training as people run them."""
+    """Example scenes and rollouts as people run them."""
     notes = [f"- {common.describe(result['environment'])}" for result in results]
     rows = [
         (result["environment"]["device"], *row_of_steps(r), r.get("seconds"))
@@ -84,19 +88,62 @@ def as_run(results: list[dict[str, Any]]) -> str:
         for r in (*result["rollouts"], *result["scenes"])
     ]
     header = ("device", "", "particles", "substeps", "us per substep", "M particles/s", "simulation, s")
-    training = [
-        (result["environment"]["device"], *row_of_training(r)) for result in results for r in result["training"]
-    ]
-    of_training = ("device", "particles", "steps", "forward, s", "forward and backward, s", "memory, GB")
     return "\n".join(
         [
-            "Substeps of one call of `rollout` (the neo-Hookean cube), scenes by `torch-mpm run` with their files, and",
-            "the gradient of a rollout by the velocities at its start (benchmarks/speed/rollouts.py).",
-            *("", common.table(header, rows), "", common.table(of_training, training), "", *notes, ""),
+            "Substeps of one call of `rollout` (the neo-Hookean cube), and scenes by `torch-mpm run` with their files",
+            "(benchmarks/speed/rollouts.py).",
+            *("", common.table(header, rows), "", *notes, ""),
             "One scene of any size; dotted lines: particles per second.",
             *("", "![time per substep over particles](benchmarks/results/rollouts.png)"),
         ]
     )
+
+
+def training(results: list[dict[str, Any]]) -> str:
+    """Gradients through rollouts, beside peers, and steps with networks."""
+
+    def rows(part: Callable[[dict[str, Any]], Iterable[tuple[Any, ...]]]) -> Iterator[tuple[Any, ...]]:
+        return ((result["environment"]["device"], *row) for result in results for row in part(result))
+
+    notes = [f"- {common.describe(result['environment'])}" for result in results]
+    held = rows(lambda result: map(speed_of_training.row_of_rollout, result["rollouts"]))
+    networks = rows(lambda result: network_steps.table_rows(result["networks"]))
+    parts = [
+        "The gradient of a rollout of the neo-Hookean cube by the velocities at its start "
+        "(benchmarks/speed/training.py), by how many steps the backward pass holds at a time:",
+        common.table(("device", *speed_of_training.HELD), held),
+        peers_of_training(results, list(PROJECTS)),
+        f"Steps with a network as their law, {network_steps.STEPS} in a row:",
+        common.table(("device", *network_steps.HEADER), networks),
+        "\n".join(notes),
+    ]
+    return "\n\n".join(parts)
+
+
+def peers_of_training(results: list[dict[str, Any]], projects: Sequence[str]) -> str:
+    """Gradients through the work of some projects, in a rollout, in their scripts and by their algorithms."""
+    rows = [
+        (result["environment"]["device"], *row)
+        for result in results
+        for row in speed_of_training.rows_of_peers(result)
+        if row[0] in projects
+    ]
+    intro = (
+        "A fixed corotated cube in a rollout, in a script of another project, and by the algorithm of that project "
+        "(benchmarks/speed/training_scripts.py), with the gradient by the velocities at the start; columns with x are "
+        "multiples of the rollout of the same work. Warp, by which the algorithms of NCLaw and PhysGaussian run, has "
+        "one thread on CPUs."
+    )
+    return "\n\n".join([intro, common.table(("device", *speed_of_training.BESIDE), rows)])
+
+
+def migrating(directory: Path) -> dict[Path, str]:
+    """What the pages for other projects' users say of speed and memory."""
+    results = common.read(directory, "training_*.json")
+    notes = "\n".join(f"- {common.describe(result['environment'])}" for result in results)
+    pages = {f"{page}.md": [peers_of_training(results, [project]), notes] for page, project in
+             (("mpm_pytorch", "MPM-PyTorch"), ("nclaw", "NCLaw"), ("physgaussian", "PhysGaussian"))}  # fmt: skip
+    return {MIGRATING / name: "\n\n".join(parts) for name, parts in pages.items()}
 
 
 def data_sets(results: list[dict[str, Any]]) -> str:
@@ -513,6 +560,7 @@ def sections(directory: Path) -> dict[str, str]:
     for pattern, title, section in (
         ("speed_*.json", "Speed", speed),
         ("rollouts_*.json", "Speed of what is run", as_run),
+        ("training_*.json", "Training", training),
         ("datasets_*.json", "Data sets", data_sets),
         ("svd_*_*.json", "Small matrices and sand", small_matrices),
         ("heat_*_*.json", "Speed of the heat solve", heat_speed),
@@ -554,7 +602,8 @@ def draw(directory: Path) -> None:
 def documents(directory: Path) -> dict[Path, str]:
     """The text between the marks of each document."""
     details = "\n\n".join(f"### {title}\n\n{text}" for title, text in sections(directory).items())
-    return {README: overview(directory), MEASURED: details.replace("](benchmarks/", "](../benchmarks/")}
+    measured = details.replace("](benchmarks/", "](../benchmarks/")
+    return {README: overview(directory), MEASURED: measured, **migrating(directory)}
 
 
 def insert(text: str, tables: str) -> str:
@@ -572,7 +621,7 @@ def insert(text: str, tables: str) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--results", type=Path, default=common.RESULTS)
-    parser.add_argument("--write", action="store_true", help="update README.md and docs/measured.md")
+    parser.add_argument("--write", action="store_true", help="update the documents")
     arguments = parser.parse_args()
     for document, tables in documents(arguments.results).items():
         print(tables)

@@ -63,11 +63,24 @@ def sliding_blocks(device: str) -> mpm.State:
     return mpm.State.concatenate(scenes, scene=True)
 
 
-def measured(law: Law, start: mpm.State, steps: int) -> Tensor:
+class Experiment(nn.Module):
+    """What is measured when blocks slide by a law of friction: positions [P, steps / EVERY + 1, 2] [m]."""
+
+    def __init__(self, law: Law, steps: int) -> None:
+        super().__init__()
+        grid = mpm.Grid(DX, lower=(0, 0), upper=(3, 0.5), scenes=len(SPEEDS), max_blocks=85 * len(SPEEDS))  # all
+        self.step = mpm.Step(grid, mpm.NeoHookean(E=1e5, nu=0.3), gravity=(0, -9.8), on_grid=Floor(law))
+        self.steps = steps
+
+    def forward(self, start: mpm.State, dt: float = DT) -> mpm.State:
+        """The state at the end, with the measurements in `extra`."""
+        frames = mpm.frames(self.step, start, self.steps, dt, EVERY, fields=["x"])
+        return frames.end.replace(extra={"measured": frames.fields["x"].movedim(0, 1)})
+
+
+def measured(simulated: Callable[[mpm.State], mpm.State], start: mpm.State) -> Tensor:
     """Positions [steps / EVERY + 1, P, 2] [m]."""
-    grid = mpm.Grid(DX, lower=(0, 0), upper=(3, 0.5), scenes=len(SPEEDS))
-    step = mpm.Step(grid, mpm.NeoHookean(E=1e5, nu=0.3), gravity=(0, -9.8), on_grid=Floor(law))
-    return mpm.frames(step, start, steps, DT, EVERY, fields=["x"]).fields["x"]
+    return simulated(start).extra["measured"].movedim(1, 0)
 
 
 def draw(x: Tensor, speeds: Tensor, laws: dict[str, Tensor], path: Path) -> None:
@@ -93,9 +106,12 @@ def main(out: Path, device: str = "cpu", iterations: int = 30, steps: int = 300)
     torch.manual_seed(0)
     start = sliding_blocks(device)
     with torch.no_grad():
-        data = measured(stribeck, start, steps)
+        data = measured(Experiment(stribeck, steps), start)
     data = data + NOISE * torch.randn_like(data)
     network = Friction().to(device, torch.float64)
+    experiment = Experiment(network, steps).to(device)
+    # As one CUDA graph, where launching the kernels of each step takes longer than running them.
+    simulated = mpm.captured(experiment, start, DT) if start.x.is_cuda else experiment
     speeds = torch.linspace(0, max(SPEEDS), 100, dtype=torch.float64, device=device)
     laws = {"true": stribeck(speeds), "before training": network(speeds).detach()}
     options = {"max_iter": 1, "max_eval": 10, "history_size": 30, "line_search_fn": "strong_wolfe"}
@@ -103,7 +119,7 @@ def main(out: Path, device: str = "cpu", iterations: int = 30, steps: int = 300)
 
     def closure() -> Tensor:
         optimizer.zero_grad()
-        misfit = (measured(network, start, steps) - data).square().mean() / NOISE**2
+        misfit = (measured(simulated, start) - data).square().mean() / NOISE**2
         misfit.backward()
         return misfit
 

@@ -7,6 +7,7 @@ import torch
 from helpers import relative_error
 from test_step import block_state, make_step
 from torch import nn
+from torch.utils.checkpoint import checkpoint as torch_checkpoint
 
 import torch_mpm as mpm
 from torch_mpm import checkpoints
@@ -71,17 +72,22 @@ def test_gradients_are_those_without(kind, kept, device, monkeypatch):
         assert float(expected.norm()) > 0 and relative_error(value, expected) < (1e-12 if device == "cpu" else 1e-9)
 
 
-def test_pools_that_grow_are_those_of_the_first_time(device):
-    """A block that flies apart wants more blocks in each segment; steps that are taken again have those they had."""
+@pytest.mark.parametrize("function", [False, True])
+def test_pools_that_grow_are_those_of_the_first_time(function, device):
+    """A block that flies apart wants more blocks in each segment; steps that are taken again have those they had, also
+    where a function of the user's takes them on a grid that nobody else knows of."""
     found, sizes = [], []
     for checkpoint in (None, 5, mpm.Checkpoints(states=3)):
         grid = mpm.Grid(0.02, (0, 0), (1, 1), deterministic=True)
         step = mpm.Step(grid, lambda F: 1e2 * (F @ F.mT - torch.eye(2, dtype=F.dtype, device=F.device)))
         state = block_state(2, device, low=0.45, high=0.55, dx=0.02)
         v = (150 * (state.x - 0.5)).requires_grad_()
-        end = mpm.rollout(step, state.replace(v=v), 40, 1e-3, checkpoint=checkpoint)
+        taken = (lambda state, dt, step=step: step(step(state, dt / 2), dt / 2)) if function else step
+        end = mpm.rollout(taken, state.replace(v=v), 40, 1e-3, checkpoint=checkpoint)
+        size = grid.max_blocks
         found.append(torch.autograd.grad(end.x.square().sum(), v)[0])
-        sizes.append(grid.max_blocks)
+        assert grid.max_blocks == size
+        sizes.append(size)
     step.check(end)
     if device == "cpu":
         first = mpm.Grid(0.02, (0, 0), (1, 1))
@@ -89,6 +95,25 @@ def test_pools_that_grow_are_those_of_the_first_time(device):
         assert sizes[0] > first.max_blocks
     assert relative_error(found[1], found[0]) < 1e-12
     assert relative_error(found[2], found[0]) < 1e-12
+
+
+def test_checkpoints_of_torch_around_steps_of_a_grid_that_grows(device):
+    """As scripts of other projects have them."""
+    found = []
+    for kept in (False, True):
+        grid = mpm.Grid(0.02, (0, 0), (1, 1), deterministic=True)
+        step = mpm.Step(grid, mpm.NeoHookean(E=1e2, nu=0.3))
+        state = block_state(2, device, low=0.45, high=0.55, dx=0.02)
+        v = (150 * (state.x - 0.5)).requires_grad_()
+        state = state.replace(v=v)
+        for _ in range(40):
+            state = (
+                torch_checkpoint(step, state, 1e-3, use_reentrant=False, context_fn=checkpoints.contexts)
+                if kept
+                else step(state, 1e-3)
+            )
+        found.append(torch.autograd.grad(state.x.square().sum(), v)[0])
+    assert relative_error(*found) < 1e-12
 
 
 @pytest.mark.parametrize("checkpoint", [None, 4, mpm.Checkpoints(states=3)])
@@ -109,9 +134,9 @@ def test_steps_that_are_taken_again_do_not_count_again(checkpoint, device):
 @pytest.mark.parametrize("checkpoint", [4, mpm.Checkpoints(states=3)])
 def test_implicit_steps_that_are_taken_again_do_not_count_again(checkpoint, device):
     grid = mpm.Grid(0.1, (0.0, 0.0), (1.0, 1.0))
-    solver = Implicit(tolerance=1e-12, max_iterations=1)
-    step = mpm.Step(grid, mpm.NeoHookean(E=1e6, nu=0.3), (0.0, -9.8), walls="sticky", integrator=solver)
-    state = block_state(2, device)
+    integrator = Implicit(tolerance=1e-12, max_iterations=1)
+    step = mpm.Step(grid, mpm.NeoHookean(E=1e6, nu=0.3), (0.0, -9.8), walls="sticky", integrator=integrator)
+    solver, state = step.integrator, block_state(2, device)
     v = state.v.clone().requires_grad_()
     end = mpm.rollout(step, state.replace(v=v), N, 1e-2, checkpoint=checkpoint)
     before = int(solver._unsolved.sum())

@@ -15,7 +15,7 @@ from torch.utils import _pytree
 
 from .activation_record import aside
 from .errors import check_count, check_flag, check_number
-from .grid import Grid
+from .grid import same_pools
 from .state import State
 
 Advance = Callable[[State, int, int], State]
@@ -134,15 +134,13 @@ def recomputed(advance: Advance, state: State, count: int, first: int, step: Any
     from torch.utils.checkpoint import checkpoint  # whose first call imports for seconds
 
     leaves, layout = _pytree.tree_flatten(state)
-    grid = getattr(step, "grid", None)
     again, pools = False, list[int]()
 
     def steps(*tensors: Tensor) -> State:
         nonlocal again
         given = _pytree.tree_unflatten(tensors, layout)
         with contextlib.ExitStack() as stack:
-            if isinstance(grid, Grid):
-                stack.enter_context(grid.same_pools(pools))
+            stack.enter_context(same_pools(pools))
             if again:
                 stack.enter_context(aside(step, given.x))
             again = True
@@ -150,6 +148,13 @@ def recomputed(advance: Advance, state: State, count: int, first: int, step: Any
 
     result: State = checkpoint(steps, *leaves, use_reentrant=False)
     return result
+
+
+def contexts() -> tuple[contextlib.AbstractContextManager[None], contextlib.AbstractContextManager[None]]:
+    """For `torch.utils.checkpoint.checkpoint(..., use_reentrant=False, context_fn=contexts)` around steps: on grids
+    without `max_blocks`, steps that are taken again find pools of the size they had. `rollout` sees to that itself."""
+    sizes = list[int]()
+    return same_pools(sizes), same_pools(sizes)
 
 
 # ---- binomial

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import math
+import threading
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -26,6 +27,18 @@ from .topology import BLOCK_WIDTH, PADDING, Lattice, Topology
 
 INT32_MAX = 2**31 - 1
 KERNEL_ORDERS = {"quadratic": 2, "cubic": 3}
+
+
+class _Pools(threading.local):
+    """In a thread: sizes of pools that `same_pools` replays, the lists that it writes, and what grids had before."""
+
+    def __init__(self) -> None:
+        self.replayed: Iterator[int] | None = None
+        self.before: dict[Grid, int | None] = {}
+        self.recordings: list[list[int]] = []
+
+
+_POOLS = _Pools()
 
 
 class Grid(Lattice):
@@ -88,12 +101,10 @@ class Grid(Lattice):
         self._grows = max_blocks is None
         self._pending: torch.cuda.Event | None = None
         self._on_host: Tensor | None = None
-        self._replayed: Iterator[int] | None = None
-        self._recordings: list[list[int]] = []
 
     def __getstate__(self) -> dict[str, Any]:
         """For copies: without what is on its way from the device, which neither copies nor pickles."""
-        return {**self.__dict__, "_pending": None, "_on_host": None, "_replayed": None, "_recordings": []}
+        return {**self.__dict__, "_pending": None, "_on_host": None}
 
     def __repr__(self) -> str:
         return (
@@ -137,13 +148,16 @@ class Grid(Lattice):
 
     def pool(self, x: Tensor, scene: Tensor | None) -> int:
         """The blocks of the pool of the next activation."""
-        if self._replayed is not None:
-            self.max_blocks = next(self._replayed, self.max_blocks)
+        compiling = torch.compiler.is_compiling()
+        if not compiling and _POOLS.replayed is not None:
+            _POOLS.before.setdefault(self, self.max_blocks)
+            self.max_blocks = next(_POOLS.replayed, self.max_blocks)
         elif self._grows:
             self._grow(x, scene)
         assert self.max_blocks is not None
-        for sizes in self._recordings:
-            sizes.append(self.max_blocks)
+        if not compiling:
+            for sizes in _POOLS.recordings:
+                sizes.append(self.max_blocks)
         return self.max_blocks
 
     def follow(self, wanted: int) -> int:
@@ -206,30 +220,33 @@ class Grid(Lattice):
         self._pending = torch.cuda.Event()
         self._pending.record(torch.cuda.current_stream(status.device))
 
-    @contextlib.contextmanager
-    def same_pools(self, sizes: list[int]) -> Iterator[None]:
-        """Where the pools of all activations get the sizes in a list, or are written into it where it is empty.
-
-        So steps that the backward pass takes again find pools of the size they had, whatever came later.
-        """
-        replayed, latest = self._replayed, self.max_blocks
-        if sizes:
-            self._replayed = iter(sizes)
-        else:
-            self._recordings.append(sizes)
-        try:
-            yield
-        finally:
-            if self._replayed is replayed:
-                self._recordings.pop()
-            else:
-                self._replayed = replayed
-                self.max_blocks = max(self.max_blocks or 0, latest or 0)
-
     def wait(self) -> None:
         """Wait for what `watch` has asked a device for, so that the next activation has room for what it told."""
         if self._pending is not None:
             self._pending.synchronize()
+
+
+@contextlib.contextmanager
+def same_pools(sizes: list[int]) -> Iterator[None]:
+    """Where the pools of all activations get the sizes in a list, or are written into it where it is empty.
+
+    So steps that the backward pass takes again find pools of the size they had, whatever came later.
+    """
+    if not sizes:
+        _POOLS.recordings.append(sizes)
+        try:
+            yield
+        finally:
+            _POOLS.recordings.pop()
+        return
+    outer, before = _POOLS.replayed, _POOLS.before
+    _POOLS.replayed, _POOLS.before = iter(sizes), {}
+    try:
+        yield
+    finally:
+        for grid, latest in _POOLS.before.items():
+            grid.max_blocks = max(grid.max_blocks or 0, latest or 0)
+        _POOLS.replayed, _POOLS.before = outer, before
 
 
 def check_grid(grid: Any) -> None:

@@ -60,9 +60,9 @@ def estimate_rollout(
 ) -> RolloutEstimate:
     """What `rollout` with these arguments, and the backward pass of a loss of its end, will take.
 
-    It takes a few steps and goes back through them, twice, which `Step.check` does not see. The memory is that of the
-    largest scene to come if `state` is it: pools that grow on the way are not foreseen. Functions of the user's are
-    called.
+    It takes a few steps three times, and three times more with their backward pass, which `Step.check` does not see.
+    The memory is that of the largest scene to come if `state` is it: pools that grow on the way are not foreseen.
+    Functions of the user's are called.
 
     Args:
         step, state, n, dt, checkpoint, prefix, truncate: as `rollout`.

@@ -17,6 +17,7 @@ from .errors import check_number, check_vector, shape_of
 from .failures import Failures, problems_of_state, raise_failures
 from .grid import Blocks, Grid, check_grid
 from .heat.heat import Heat
+from .implicit.comparison import compare
 from .implicit.implicit import Implicit, ImplicitReport, as_integrator, check_implicit
 from .impulses import Impulses, check_impulse, impulses_of, no_impulse
 from .laws.custom import as_law
@@ -249,8 +250,7 @@ class Step(TensorModule):
         """Node velocities with the forces at the end of the step, of particles after the return map."""
         assert self.integrator is not None
         nodes = p2g(blocks, state.x, state.mass, state.v, affine)
-        start = grid_update(blocks, nodes, self.gravity_like(state.x), dt)
-        velocity = self.integrator.velocities(self, blocks, state, nodes[:, 0], start, dt)
+        velocity = self.integrator.velocities(self, blocks, state, nodes, dt)
         return velocity if self.on_grid is None else from_half(self.on_grid(blocks, velocity, nodes[:, 0], dt), nodes)
 
     @property
@@ -385,8 +385,21 @@ class Step(TensorModule):
         """
         raise_failures(self.failures(state), self._activations.all(), self.grid)
 
-    def explain(self, state: State, dt: float | Tensor = 1.0) -> str:
-        """How `rollout` takes steps from a state: many in one op, from a CUDA graph or from Python, and why."""
+    def explain(self, state: State, dt: float | Tensor = 1.0, speed: float | None = None) -> str:
+        """How `rollout` takes steps from a state: many in one op, from a CUDA graph or from Python, and why.
+
+        Args:
+            state: the particles.
+            dt: time step [s].
+            speed: of slow motion [m/s], for which explicit and implicit steps are compared too; waits for the device.
+
+        Raises:
+            TypeError, ValueError, NotImplementedError: as `torch_mpm.implicit.compare`, for a speed.
+        """
+        way = self._way(state, dt)
+        return way if speed is None else f"{way}; {compare(self, state, speed)}"
+
+    def _way(self, state: State, dt: float | Tensor) -> str:
         from .graphs import obstacle_to_replays  # which needs a Step, as these do
         from .rollouts import obstacle_to_substeps, wants_gradient
 

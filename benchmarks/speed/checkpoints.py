@@ -15,19 +15,17 @@ from __future__ import annotations
 
 import argparse
 import time
-import weakref
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
-from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils._pytree import tree_leaves
 
 import torch_mpm as mpm
 
 from .. import common
+from . import memory
 
 KEPT: dict[str, Any] = {
     "all steps": None,
@@ -59,45 +57,6 @@ def setup(law: str, cells: int, device: str) -> tuple[mpm.Step, mpm.State]:
     return step, step(state, DT).detach()
 
 
-class LiveTensors(TorchDispatchMode):
-    """The largest sum of the sizes of tensors that ops have returned and that are still there [bytes]."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.now, self.most = 0, 0
-        self._known: set[int] = set()
-
-    def __torch_dispatch__(self, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        result = function(*args, **(kwargs or {}))
-        for t in tree_leaves(result):
-            if isinstance(t, Tensor) and t.untyped_storage()._cdata not in self._known:
-                storage = t.untyped_storage()
-                self._known.add(storage._cdata)
-                self.now += storage.nbytes()
-                self.most = max(self.most, self.now)
-                weakref.finalize(storage, self._gone, storage._cdata, storage.nbytes())
-        return result
-
-    def _gone(self, key: int, size: int) -> None:
-        self._known.discard(key)
-        self.now -= size
-
-
-def peak(work: Callable[[], Any], device: str) -> int:
-    """Of the memory of some work, above that before it [bytes]."""
-    if device == "cpu":
-        with LiveTensors() as tensors:
-            work()
-        return tensors.most
-    torch.cuda.synchronize()
-    torch.cuda.empty_cache()
-    torch.cuda.reset_peak_memory_stats()
-    before = torch.cuda.memory_allocated()
-    work()
-    torch.cuda.synchronize()
-    return torch.cuda.max_memory_allocated() - before
-
-
 def case(law: str, name: str, cells: int, n: int, device: str) -> dict[str, Any]:
     step, state = setup(law, cells, device)
     kept = KEPT[name]
@@ -109,12 +68,15 @@ def case(law: str, name: str, cells: int, n: int, device: str) -> dict[str, Any]
         (gradient,) = torch.autograd.grad(end.x.square().sum(), v)
         return gradient
 
-    memory = peak(run, device) if device == "cuda" or law != "compiled" else None
+    if device == "cuda":
+        taken: int | None = memory.of_cuda(run)
+    else:
+        taken = memory.of_returned_tensors(run) if law != "compiled" else None
     begin = time.perf_counter()
     assert bool(run().isfinite().all())  # which waits for the device
     seconds = time.perf_counter() - begin
     return {
-        "law": law, "kept": name, "particles": len(state), "memory": memory, "seconds": seconds,
+        "law": law, "kept": name, "particles": len(state), "memory": taken, "seconds": seconds,
         "estimated_memory": estimate.memory, "estimated_seconds": estimate.seconds, "steps": estimate.steps,
     }  # fmt: skip
 

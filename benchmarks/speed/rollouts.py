@@ -1,13 +1,12 @@
-"""Time of what people run: example scenes, rollouts of many sizes, batches, large domains, and training.
+"""Time of what people run: example scenes, rollouts of many sizes, batches and large domains.
 
     python -m benchmarks.speed.rollouts                    # CPU, all cores
     python -m benchmarks.speed.rollouts --device cuda      # either takes about a minute
     python -m benchmarks.speed.rollouts --out DIRECTORY
 
 Scenes: `torch_mpm.scene.run` with its files; time of the simulation. The others are the neo-Hookean cube of
-`benchmarks/speed/work.py`, steps of one call of `torch_mpm.rollout`, wall clock, synchronised once. Training: forward
-and backward of a rollout, gradient by the velocities at the start. The figure has every device that has
-results in DIRECTORY.
+`benchmarks/speed/work.py`, steps of one call of `torch_mpm.rollout`, wall clock, synchronised once. The figure has
+every device that has results in DIRECTORY.
 """
 
 from __future__ import annotations
@@ -35,8 +34,6 @@ BATCHES = {"cpu": ((64, 512),), "cuda": ((4096, 512), (1024, 2197))}
 """Scenes, and particles of each."""
 DOMAINS = {"cpu": (1, 4), "cuda": (1, 8, 16)}
 """Cells along a side of the domain, in those of the cube of a million (CPU: of 262144) particles."""
-TRAINING = {"cpu": (22, 50), "cuda": (46, 1000)}
-"""Particles along a side of the cube, and steps."""
 SECONDS = 0.5
 """Of steps in one measurement, about."""
 
@@ -49,6 +46,14 @@ def seconds(device: str, program: Callable[[], object]) -> float:
     if device == "cuda":
         torch.cuda.synchronize()
     return time.perf_counter() - start
+
+
+def least(device: str, program: Callable[[], object], samples: int) -> float:
+    """Of the times of so many calls [s]; of more of them, until they have taken SECONDS together, unless it is one."""
+    times = [seconds(device, program) for _ in range(samples)]
+    while samples > 1 and sum(times) < SECONDS:
+        times.append(seconds(device, program))
+    return min(times)
 
 
 def per_step(s: Setup, device: str, samples: int, dt: float = work.DT) -> dict[str, Any]:
@@ -110,30 +115,10 @@ def scenes(names: tuple[str, ...], device: str) -> Iterator[dict[str, Any]]:
         }
 
 
-def training(side: int, steps: int, device: str, samples: int) -> dict[str, Any]:
-    """Least time of a rollout forward and with its backward pass, and the most memory of tensors [bytes] on CUDA."""
-    s = setup(work.make(side), device)
-    state, best = s.state.sorted(s.grid), [float("inf")] * 2
-    if device == "cuda":
-        torch.cuda.reset_peak_memory_stats()
-    for _ in range(samples + 1):
-        v = state.v.detach().clone().requires_grad_()
-        end: list[mpm.State] = []
-        forward = seconds(device, lambda v=v, end=end: end.append(rolled(s, state, v, steps)))  # type: ignore[misc]
-        backward = seconds(device, lambda end=end: (end[0].x.square().sum() + end[0].v.square().sum()).backward())  # type: ignore[misc]
-        best = [min(best[0], forward), min(best[1], forward + backward)]
-    memory = torch.cuda.max_memory_allocated() if device == "cuda" else None
-    return {"particles": len(state), "steps": steps, "forward": best[0], "both": best[1], "memory": memory}
-
-
-def rolled(s: Setup, state: mpm.State, v: torch.Tensor, steps: int) -> mpm.State:
-    return mpm.rollout(s.step, state.replace(v=v), steps, work.DT)
-
-
 def measure(device: str, quick: bool = False) -> dict[str, Any]:
     common.use_all_cores()
     samples = 1 if quick else 5
-    result: dict[str, Any] = {"environment": common.environment(device), "scenes": [], "rollouts": [], "training": []}
+    result: dict[str, Any] = {"environment": common.environment(device), "scenes": [], "rollouts": []}
     sides = SIDES[device][:2] if quick else SIDES[device]
     for side in sides:
         s = setup(work.make(side), device)
@@ -148,8 +133,6 @@ def measure(device: str, quick: bool = False) -> dict[str, Any]:
         result["rollouts"].append({"name": f"domain of {round(times / s.grid.dx)}^3 cells", **row})
     s, dt = on_its_way("demo", device, frames=1 if quick else 6)
     result["rollouts"].append({"name": "demo, one call", **per_step(s, device, samples, dt)})
-    side, steps = (6, 10) if quick else TRAINING[device]
-    result["training"].append(training(side, steps, device, samples))
     result["scenes"] += scenes(() if quick else SCENES[device], device)
     return result
 
@@ -158,20 +141,13 @@ def row_of_steps(r: dict[str, Any]) -> tuple[Any, ...]:
     return r["name"], r["particles"], r["steps"], r["us"], r["rate"] * 1e-6
 
 
-def row_of_training(r: dict[str, Any]) -> tuple[Any, ...]:
-    return r["particles"], r["steps"], r["forward"], r["both"], r["memory"] and r["memory"] * 1e-9
-
-
 def text(result: dict[str, Any]) -> str:
     """Tables of a result in Markdown."""
     header = ("", "particles", "substeps", "us per substep", "M particles/s")
     rows = [row_of_steps(r) for r in result["rollouts"]]
     lines = ["# Speed of what is run", "", common.describe(result["environment"]), "", common.table(header, rows), ""]
     rows = [(*row_of_steps(r), r["seconds"]) for r in result["scenes"]]
-    lines += [common.table((*header, "simulation, s"), rows), ""]
-    rows = [row_of_training(r) for r in result["training"]]
-    header = ("training: particles", "steps", "forward, s", "forward and backward, s", "memory, GB")
-    return "\n".join([*lines, common.table(header, rows), ""])
+    return "\n".join([*lines, common.table((*header, "simulation, s"), rows), ""])
 
 
 def timed(result: dict[str, Any]) -> Iterator[tuple[str, float]]:

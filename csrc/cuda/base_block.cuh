@@ -51,6 +51,15 @@ __device__ unsigned touched_blocks(const int* base) {
   return touched;
 }
 
+// From a block to the one a block further along the axes of o, as neighbours in the schedule.
+template <class T, int D>
+__device__ int further(const Geometry<T, D>& g, int o) {
+  int way = 0;
+#pragma unroll
+  for (int i = 0; i < D; i++) way = way * g.blocks[i] + (o >> (D - 1 - i) & 1);
+  return way;
+}
+
 // Particles of an item or a batch, counted from its first, that are not in their base block; in shared memory.
 template <int Most>
 struct Strays {

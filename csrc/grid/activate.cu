@@ -127,15 +127,6 @@ __device__ void report(const ActivateArguments<T, D>& a, Trouble* trouble, bool 
   if (unsigned(scene) < unsigned(a.scenes)) count_in(1 + scene);
 }
 
-// From a block to the one a block further along the axes of o.
-template <class T, int D>
-__device__ int further(const Geometry<T, D>& g, int o) {
-  int way = 0;
-#pragma unroll
-  for (int i = 0; i < D; i++) way = way * g.blocks[i] + (o >> (D - 1 - i) & 1);
-  return way;
-}
-
 // Calls f(block) for the blocks around one, itself included.
 template <class T, int D, class F>
 __device__ void for_surroundings(const Geometry<T, D>& g, int b, const F& f) {

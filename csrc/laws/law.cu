@@ -2,7 +2,7 @@
 #define MPM_REGISTER_LAW(Law) static const bool Law##_is_entered = enter<cuda::LawLaunches, Law>(0);
 
 #include "laws/registry.h"
-#include "transfer/scatter.cuh"
+#include "rollout/resident.cuh"
 
 namespace mpm::cuda {
 
@@ -90,6 +90,10 @@ template <class Law, int D>
 struct FusedLaunch<Law, float, D> {
   static void p2g(const LawUpdateArguments<float, D>& law, const P2GArguments<float, D>& a, void* stream) {
     launch_scatter(LawMomentumSource<Law, float, D>(a, law), false, static_cast<Stream>(stream));
+  }
+  static void resident(const LawUpdateArguments<float, D>& law, const ResidentArguments<float, D>& a, void* stream) {
+    launch_resident(LawMomentumSource<Law, float, D>(a.p2g, law), AdvanceGather<2, float, D, false, false>(a.advance),
+                    a, static_cast<Stream>(stream));
   }
 };
 

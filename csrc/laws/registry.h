@@ -4,7 +4,7 @@
 #include <vector>
 
 #include "laws/law.h"
-#include "transfer/arguments.h"
+#include "rollout/resident.h"
 
 // The laws that were compiled, with their kernels: the only list of them. Each object file of laws/law.cpu.cpp and
 // laws/law.cu enters its laws when the library is loaded; ops find them by name, and Python reads the whole list.
@@ -30,6 +30,8 @@ struct LawKernels {
   void (*energy_double_backward)(const LawEnergyDoubleBackwardArguments<T, D>&, void* stream) = nullptr;
   // Update and P2G in one, the stress in registers: of quadratic weights and the MLS form, on CUDA.
   void (*p2g)(const LawUpdateArguments<T, D>&, const P2GArguments<T, D>&, void* stream) = nullptr;
+  // All substeps of small scenes, of quadratic weights and the MLS form, on CUDA.
+  void (*resident)(const LawUpdateArguments<T, D>&, const ResidentArguments<T, D>&, void* stream) = nullptr;
   void (*tangent)(const LawTangentArguments<T, D>&, void* stream) = nullptr;
 };
 
@@ -98,6 +100,7 @@ void fill_kernels(LawEntry& entry) {
     kernels.energy_backward = K::energy_backward;
     if constexpr (Law::has_tangent) kernels.tangent = K::tangent;
     if constexpr (requires { &K::p2g; }) kernels.p2g = &K::p2g;
+    if constexpr (requires { &K::resident; }) kernels.resident = &K::resident;
     if constexpr (Law::twice_differentiable) kernels.double_backward = K::double_backward;
     if constexpr (Law::twice_differentiable_energy) kernels.energy_double_backward = K::energy_double_backward;
   }

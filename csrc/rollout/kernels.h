@@ -3,6 +3,7 @@
 #include "common/backend.h"
 #include "rollout/accumulate.h"
 #include "rollout/next_grid.h"
+#include "rollout/resident.h"
 #include "rollout/survey.h"
 
 #define MPM_ROLLOUT_KERNELS(PLAIN, ORDERED, SIZE) \
@@ -15,6 +16,7 @@ MPM_BACKEND_KERNELS(MPM_ROLLOUT_KERNELS)
 namespace mpm::cuda {
 // times[k + 1] = times[k] + dt, on the device.
 void add_up_times(double* times, double first, double dt, int64_t count, Stream stream);
+void resident_status(const ResidentStatusArguments& a, Stream stream);
 template <class T, int D>
 void next_grid(const NextGridArguments<T, D>& a, Stream stream);
 }  // namespace mpm::cuda

@@ -296,6 +296,18 @@ struct Substeps {
     if (fused) stress = Tensor();
   }
 
+  // Whether scenes are taken through the call one by one. Where sums have an order, that does not depend on how many
+  // scenes there are.
+  bool resides() {
+    const int64_t P = in.x.size(0);
+    if (!calls[0].law->kernels<T, D>().resident || calls.size() > 1 || has(in.material) || in.n < 2) return false;
+    if (in.lattice.order() != 2 || p2g.form != StressForm::mls || has(in.impulse) || update.walls.mirrored)
+      return false;
+    if (activation.geometry.blocks_per_scene > kMostResidentBlocks || P > kMostResidentParticles * in.scenes)
+      return false;
+    return in.lattice.deterministic() || resident_pays<D>(P, in.scenes);
+  }
+
   // Of the substeps that read what others of the same parity have written. The last one is activated in any case, so
   // that the status tells how many blocks there are by then.
   void take_turn(int parity, bool last) {

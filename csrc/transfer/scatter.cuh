@@ -47,7 +47,8 @@ struct ScatterShape {
   static constexpr int weights = 1, plain = weights + (D - 1) * derivatives * stored, linear = plain + Plain;
   static constexpr int linear_words = 1 + D * derivatives, words = linear + Linear * linear_words;
   static constexpr int pairs = words % 4 == 1 || words % 4 == 2, quads = (words + 3) / 4 - pairs;
-  static constexpr int row_bytes = (quads * 4 + pairs * 2) * int(sizeof(T)) + 2;
+  using Link = uint16_t;  // the number of a row
+  static constexpr int row_bytes = (quads * 4 + pairs * 2) * int(sizeof(T)) + int(sizeof(Link));
   static constexpr int fitting = 90 * 1024 / row_bytes / 32 * 32;
   static constexpr int batch = fitting < kItemParticles ? fitting : kItemParticles;
 
@@ -68,17 +69,20 @@ struct ScatterShape {
 template <class S>
 struct SharedParticles {
   using T = typename S::T;
-  static constexpr uint16_t end = 0xffff;
+  using Link = typename S::Link;
+  static constexpr Link end = Link(-1);
   Quad<T>* quads;  // [quads, batch]
   Pair<T>* pairs;  // [pairs, batch]
-  uint16_t* next;  // [batch]
+  Link* next;      // [batch]
   int* head;       // [lists + 1]
+  int room;        // where S::batch is 0, in its place
 
-  __device__ SharedParticles(char* memory, int* head) : head(head) {
+  __device__ SharedParticles(char* memory, int* head, int room = S::batch) : head(head), room(room) {
     quads = reinterpret_cast<Quad<T>*>(memory);
-    pairs = reinterpret_cast<Pair<T>*>(quads + S::quads * S::batch);
-    next = reinterpret_cast<uint16_t*>(pairs + S::pairs * S::batch);
+    pairs = reinterpret_cast<Pair<T>*>(quads + S::quads * batch());
+    next = reinterpret_cast<Link*>(pairs + S::pairs * batch());
   }
+  __device__ int batch() const { return S::batch > 0 ? S::batch : room; }
   // Row of particle k. Neighbouring cells use different banks when each holds eight particles in order.
   __device__ static int row(int k) { return k ^ (k / 8 & 7); }
 };
@@ -116,7 +120,7 @@ template <class S, class T>
 __device__ void load_words(const SharedParticles<S>& shared, int row, T (&word)[kWords<S>]) {
 #pragma unroll
   for (int q = 0; q < S::quads; q++) {
-    const Quad<T> v = shared.quads[q * S::batch + row];
+    const Quad<T> v = shared.quads[q * shared.batch() + row];
 #pragma unroll
     for (int e = 0; e < 4; e++) word[4 * q + e] = v.e[e];
   }
@@ -149,7 +153,7 @@ __device__ void store_particle(const SharedParticles<S>& shared, int row, const 
   }
 #pragma unroll
   for (int q = 0; q < S::quads; q++)
-    shared.quads[q * S::batch + row] = {word[4 * q], word[4 * q + 1], word[4 * q + 2], word[4 * q + 3]};
+    shared.quads[q * shared.batch() + row] = {word[4 * q], word[4 * q + 1], word[4 * q + 2], word[4 * q + 3]};
   if (S::pairs > 0) shared.pairs[row] = {word[4 * S::quads], word[4 * S::quads + 1]};
 }
 
@@ -160,7 +164,8 @@ struct Walker {
   int list, lane;
   NodeWeight<S::Order, T> leading;
 
-  __device__ Walker() : list(threadIdx.x / S::support), lane(threadIdx.x % S::support), leading(lane) {}
+  __device__ Walker() : Walker(threadIdx.x) {}
+  __device__ explicit Walker(int number) : list(number / S::support), lane(number % S::support), leading(lane) {}
   __device__ int cell() const { return list % S::cells; }
   __device__ int slice() const { return list / S::cells; }
 };

@@ -54,6 +54,7 @@ def test_learnt_law_has_an_energy():
 
 def test_walker_learns(device, tmp_path, capsys):
     """Before training it comes 5 mm far in a second."""
+    pytest.importorskip("imageio_ffmpeg")
     assert example("walker").main(tmp_path, device, iterations=20, shown=1.0) > 0.03
     assert drawn(tmp_path / "walker.png") and (tmp_path / "walker.mp4").stat().st_size > 1000
 

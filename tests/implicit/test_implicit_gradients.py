@@ -1,5 +1,7 @@
 """Gradients through implicit steps: against differences of tightly solved steps, and what their memory does."""
 
+import gc
+
 import pytest
 import torch
 from helpers import relative_error
@@ -153,6 +155,91 @@ def test_memory_does_not_grow_with_the_iterations(device):
         kept.append(sum(sizes))
         iterations.append(int(step.solve_report.cg_iterations[0]))
     assert iterations[1] > 2 * iterations[0] and kept[0] == kept[1]
+
+
+@pytest.mark.parametrize("rubs", [False, True])
+def test_all_that_waits_for_the_backward_pass_is_saved_by_autograd(rubs, device):
+    """Where hooks put saved tensors aside, no tensor of particles or nodes is left; and the gradient is the same."""
+
+    def graph(device):
+        grid, values = inputs(2, device)
+        friction = torch.tensor(0.3, dtype=torch.float64, device=device, requires_grad=True)
+        sphere = mpm.Sphere((0.5, 0.6), 0.2, "slip", friction=friction if rubs else 0.0)
+        _, end = run(grid, {**values, "mu": values["mu"].requires_grad_()}, walls="slip", boundaries=[sphere], n=2)
+        return end.x.square().sum(), [values["mu"], friction][: 1 + rubs]
+
+    def large():
+        gc.collect()
+        found = [t for t in gc.get_objects() if type(t) is torch.Tensor and t.numel() >= 16]
+        return {id(t) for t in found}
+
+    loss, leaves = graph(device)
+    expected = torch.autograd.grad(loss, leaves)
+    del loss, leaves
+    torch.manual_seed(0)
+    before = large()
+    with saved_tensors_hooks(lambda t: (t.device, t.detach().cpu().numpy().copy()), unpacked):
+        loss, leaves = graph(device)
+    assert not large() - before
+    for grad, wanted in zip(torch.autograd.grad(loss, leaves), expected, strict=True):
+        assert bool(wanted != 0) and relative_error(grad, wanted) < 1e-12
+
+
+def unpacked(kept):
+    device, array = kept
+    return torch.from_numpy(array).to(device)
+
+
+@pytest.mark.parametrize("checkpoint", [2, mpm.Checkpoints(states=2)])
+def test_gradients_of_steps_that_are_taken_again(checkpoint, device):
+    grid, values = inputs(2, device)
+    grads = []
+    for kept in (None, checkpoint):
+        mu = values["mu"].clone().requires_grad_()
+        step = mpm.Step(grid, mpm.NeoHookean(mu=mu, lam=values["lam"]), walls="sticky", integrator=Implicit(**TIGHT))
+        state = mpm.State(**{name: values[name] for name in ("x", "v", "F", "C", "mass", "volume")})
+        end = mpm.rollout(step, state, 5, 0.01, checkpoint=kept)
+        grads += torch.autograd.grad(end.x.square().sum(), mu)
+        assert step.integrator.adjoint_converged.tolist() == [True]
+    assert relative_error(*grads) < 1e-10
+
+
+def test_every_solve_of_a_backward_pass_counts(device):
+    """Two steps in one backward pass: the solve of the second fails, and that of the first, which comes last, does not;
+    the next step begins anew."""
+    grid, values = inputs(2, device)
+    values["mu"].requires_grad_()
+    step, first = run(grid, values, walls="sticky")
+    options = step.integrator.options
+
+    def enough(grad):
+        options.max_cg_iterations = 1000
+        return grad
+
+    start = mpm.State(**{name: values[name] for name in ("x", "v", "F", "C", "mass", "volume")})
+    second = step(start.replace(v=2 * start.v), values["dt"])
+    first.x.register_hook(enough)
+    loss = first.x.sum() + second.x.sum()
+    options.max_cg_iterations = 1
+    loss.backward()
+    assert options.max_cg_iterations == 1000 and step.integrator.adjoint_converged.tolist() == [False]
+    again = step(start, values["dt"])
+    again.x.sum().backward()
+    assert step.integrator.adjoint_converged.tolist() == [True]
+
+
+def test_an_integrator_given_to_two_steps(device):
+    """Each has a record of its own."""
+    grid, values = inputs(2, device)
+    integrator = Implicit(**TIGHT)
+    steps = [mpm.Step(grid, mpm.NeoHookean(E=E, nu=0.3), integrator=integrator) for E in (1e4, 1e6)]
+    state = mpm.State(**{name: values[name] for name in ("x", "v", "F", "C", "mass", "volume")})
+    steps[0](state, 0.02)
+    assert steps[1].solve_report is None and integrator.report is None
+    kept = steps[0].solve_report
+    steps[1](state, 0.02)
+    assert steps[0].solve_report is kept and steps[1].solve_report is not kept
+    assert steps[0].integrator.options == steps[1].integrator.options
 
 
 def test_a_solve_of_the_adjoint_that_fails_is_told(device):

@@ -1,6 +1,7 @@
 """Implicit steps: backward Euler on the velocities of the nodes."""
 
+from .comparison import Comparison, compare
 from .equilibrium import equilibrium
 from .implicit import Implicit, ImplicitReport
 
-__all__ = ["Implicit", "ImplicitReport", "equilibrium"]
+__all__ = ["Comparison", "Implicit", "ImplicitReport", "compare", "equilibrium"]

@@ -5,7 +5,7 @@ At the solution the free components of the residual vanish, g(v, θ) = 0, so tha
     v̄ · dv = −λ · ∂g/∂θ dθ   with   H λ = v̄,
 
 where H is the Hessian itself, not its projection: one linear solve, and one vector-Jacobian product of the residual.
-The memory does not depend on the iterations.
+The memory does not depend on the iterations, and all of it is in the care of autograd.
 """
 
 from __future__ import annotations
@@ -22,7 +22,9 @@ from ..ops.implicit import CONVERGED
 from ..ops.registry import LAWS
 from .bounds import NodeBounds
 from .contact import Friction, contact_at
-from .newton import Minimum, inverse_blocks
+from .newton import Minimum
+from .preconditioner import inverse_blocks
+from .saved import joined, separated
 from .system import ImplicitSystem
 
 if TYPE_CHECKING:
@@ -37,7 +39,9 @@ def differentiable(
 ) -> Tensor:
     """The velocities of a minimum, with the derivatives that the residual gives them."""
     v = minimum.v.detach()
-    residual = contact_at(system, bounds, v, system.residual(v)).gradient
+    gradient = system.residual(v)
+    contact = contact_at(system, bounds, v, gradient)
+    residual = contact.gradient
     if not residual.requires_grad:
         return minimum.v
     if system.flows:
@@ -50,34 +54,47 @@ def differentiable(
                 f"gradients of implicit steps need second derivatives of the energy, which {part.name} has not: "
                 "use integrator='explicit', or torch.no_grad()"
             )
-    result: Tensor = _Solution.apply(residual, minimum.v, owner, fixed, bounds, minimum.free)
+    # Start is nothing that the Hessian depends on; friction depends on the gradient.
+    pressing = None if contact.friction is None else gradient.detach()
+    parts = (fixed.blocks, fixed.state, fixed.mass, fixed.dt, bounds, minimum.free, pressing)
+    parts, tensors = separated(parts)
+    result: Tensor = _Solution.apply(residual, minimum.v, owner, (fixed.law, fixed.stress_form, parts), *tensors)
     return result
 
 
 class _Solution(torch.autograd.Function):
-    """v as a function of the residual that it makes zero."""
+    """v as a function of the residual that it makes zero. What the Hessian needs is saved, and the Hessian is not."""
 
     @staticmethod
-    def forward(ctx, residual, v, owner, system, bounds, free):
-        ctx.owner, ctx.system, ctx.bounds, ctx.free = owner, system, bounds, free
-        ctx.save_for_backward(v)
+    def forward(ctx, residual, v, owner, rest, *tensors):
+        ctx.owner, ctx.rest = owner, rest
+        ctx.save_for_backward(v, *tensors)
         return v.clone()
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, grad):
-        (v,) = ctx.saved_tensors
-        adjoint = _solve(ctx.owner, ctx.system, ctx.bounds, ctx.free, v, grad)
-        return -adjoint, None, None, None, None, None
+        v, *tensors = ctx.saved_tensors
+        law, stress_form, parts = ctx.rest
+        blocks, state, mass, dt, bounds, free, gradient = joined(parts, tensors)
+        system = ImplicitSystem(blocks, law, state, mass, v, dt, stress_form)
+        adjoint = _solve(ctx.owner, system, bounds, free, gradient, v, grad)
+        return -adjoint, None, None, None, *(None for _ in tensors)
 
 
 def _solve(
-    owner: Implicit, system: ImplicitSystem, bounds: NodeBounds | None, free: Tensor, v: Tensor, grad: Tensor
+    owner: Implicit,
+    system: ImplicitSystem,
+    bounds: NodeBounds | None,
+    free: Tensor,
+    gradient: Tensor | None,
+    v: Tensor,
+    grad: Tensor,
 ) -> Tensor:
-    """λ of the free components; NaN in scenes whose solve does not converge."""
+    """λ of the free components; NaN in scenes whose solve does not converge. The gradient of the energy is given where
+    there is friction."""
     tangent = system.tangent(v, projected=False)
-    gradient = system.residual(v)
-    friction = contact_at(system, bounds, v, gradient).friction
+    friction = None if gradient is None else contact_at(system, bounds, v, gradient).friction
     across = None if friction is None else friction.curvature()
     blocks = system.diagonal(system.tangent(v))
     inverse = inverse_blocks(bounds, blocks if across is None else blocks + across, free)
@@ -94,9 +111,9 @@ def _solve(
         return solve.solution, solve.state == CONVERGED
 
     adjoint, converged = solved(grad)
-    if friction is not None:
+    if friction is not None and gradient is not None:
         adjoint, converged = _with_normal_forces(system, friction, tangent, gradient, grad, adjoint, relative, solved)
-    owner.adjoint_converged = converged
+    owner.record_adjoint(converged)
     return torch.where(system.of_nodes(converged), adjoint, torch.nan)
 
 

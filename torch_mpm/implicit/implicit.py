@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+import dataclasses
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
@@ -11,6 +13,7 @@ from ..boundaries.obstacles import Obstacle, motion_tensors
 from ..capture import is_captured, is_traced, outside_transforms, without_transforms
 from ..errors import check_count, check_number
 from ..failures import Problem, unsolved_steps
+from ..ops import grid_update
 from .adjoint import differentiable
 from .bounds import node_bounds
 from .newton import Minimum, Options, minimise
@@ -58,8 +61,11 @@ class Implicit:
 
     Attributes:
         report: `ImplicitReport` of the latest step, None before the first.
-        adjoint_converged: bool [B], whether the solve of the latest backward pass converged; None before the first.
-            Where it did not, the gradients of that scene are NaN.
+        adjoint_converged: bool [B], whether all solves of backward passes since the latest step converged; None before
+            the first. Where one did not, the gradients of that scene are NaN.
+
+    A step takes a copy, so that one `Implicit` may be given to several steps: the reports are those of
+    `step.integrator`.
 
     Raises:
         TypeError, ValueError: for a wrong argument.
@@ -84,29 +90,30 @@ class Implicit:
         self.adjoint_tolerance = float(adjoint_tolerance)
         self.report: ImplicitReport | None = None
         self.adjoint_converged: Tensor | None = None
+        self._adjoint_begins = True
         self._unsolved: Tensor | None = None
         self._residual: Tensor | None = None
 
-    def velocities(
-        self, step: Step, blocks: Blocks, state: Any, mass: Tensor, start: Tensor, dt: float | Tensor
-    ) -> Tensor:
+    def velocities(self, step: Step, blocks: Blocks, state: Any, nodes: Tensor, dt: float | Tensor) -> Tensor:
         """The node velocities at the end of a step [N, D] [m/s].
 
         Args:
-            step: whose law, walls and boundaries count.
+            step: whose law, gravity, walls and boundaries count.
             blocks: the active blocks.
             state: particles after the return map.
-            mass: of the nodes [N] [kg].
-            start: node velocities after gravity [N, D] [m/s].
+            nodes: mass and momentum before gravity [N, 1 + D] [kg, kg m/s].
             dt: [s], a number or a tensor [], [1] or [B].
 
-        Differentiable by everything that the state, the law and `start` depend on, by one linear solve.
+        Differentiable by everything that the state, the law, gravity and the nodes depend on, by one linear solve.
         """
+        gravity = step.gravity_like(state.x)
+        start = grid_update(blocks, nodes, gravity, dt)
         if not blocks.grid.scenes:
             return start
         wants_gradient = torch.is_grad_enabled()
+        before = None if gravity is None else grid_update(blocks, nodes.detach())
         flows = self.plasticity == "inside"
-        system = ImplicitSystem(blocks, step.law, state, mass, start, dt, step.stress_form, flows)
+        system = ImplicitSystem(blocks, step.law, state, nodes[:, 0], start, dt, step.stress_form, flows, before)
         bounds = node_bounds(blocks, step.walls, step.boundaries.entries, start, state.time)
         with torch.no_grad():
             fixed = system.detached() if wants_gradient else system
@@ -117,7 +124,15 @@ class Implicit:
             return minimum.v
         return differentiable(self, system, fixed, bounds, minimum)
 
+    def record_adjoint(self, converged: Tensor) -> None:
+        """One solve of a backward pass, bool [B]."""
+        kept = None if self._adjoint_begins else self.adjoint_converged
+        self.adjoint_converged = converged if kept is None else kept & converged
+        self._adjoint_begins = False
+
     def _record(self, minimum: Minimum) -> None:
+        if torch._C._current_graph_task_id() == -1:  # not taken again in a backward pass
+            self._adjoint_begins = True
         self.report = ImplicitReport(minimum.converged, minimum.residual, minimum.iterations, minimum.cg_iterations)
         with outside_transforms(), torch.inference_mode(False):
             missed = without_transforms(~minimum.converged).to(torch.int32)
@@ -133,6 +148,13 @@ class Implicit:
         if self._unsolved is None or self._residual is None:
             return {}
         return unsolved_steps(self._unsolved, self._residual)
+
+    def fresh(self) -> Implicit:
+        """The same with no record."""
+        result = copy.copy(self)
+        result.options = dataclasses.replace(self.options)
+        result.reset()
+        return result
 
     def reset(self) -> None:
         """Forget the steps so far."""
@@ -173,13 +195,13 @@ INTEGRATORS = ("explicit", "implicit")
 
 
 def as_integrator(value: Any) -> Implicit | None:
-    """The integrator of a step, None for the explicit one.
+    """The integrator of a step, its own and without a record; None for the explicit one.
 
     Raises:
         TypeError, ValueError: for what is none.
     """
     if isinstance(value, Implicit):
-        return value
+        return value.fresh()
     if not isinstance(value, str):
         raise TypeError(f"integrator must be 'explicit', 'implicit' or an Implicit, got {type(value).__name__}")
     if value not in INTEGRATORS:

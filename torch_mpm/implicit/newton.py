@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -13,12 +14,15 @@ from ..ops.implicit import NEGATIVE_CURVATURE
 from .bounds import NodeBounds
 from .contact import Contact, Limit, contact_at
 from .gmres import gmres
+from .preconditioner import preconditioned, times
 from .system import ImplicitSystem
 
 LOOSEST, TIGHTEST = 0.1, 1e-12
 """Relative tolerances of conjugate gradients within Newton's method."""
 NEAR, PATIENCE = 0.05, 6
 """Share of the first residual, and number of iterations, from which the Hessian is not projected any more."""
+KEPT = 0.01
+"""Share of the first residual from which the preconditioner stays: so little changes any more."""
 SUFFICIENT = 1e-4
 """Share of the decrease that the slope promises, which a step must bring (Nocedal and Wright 2006, section 3.1)."""
 ROUNDING = 32
@@ -60,39 +64,6 @@ class Minimum:
     cg_iterations: Tensor
 
 
-def inverse_blocks(bounds: NodeBounds | None, blocks: Tensor, free: Tensor) -> Tensor:
-    """B⁻¹ of the free components of node blocks [N, D, D] [1/kg], zero for the others."""
-    dtype, blocks = blocks.dtype, blocks.double()
-    # Rounding of stiff blocks may leave a negative eigenvalue, with which a residual could seem to be zero.
-    ridge = 16 * torch.finfo(dtype).eps * blocks.diagonal(dim1=1, dim2=2).sum(1)
-    blocks = blocks + torch.diag_embed(ridge[:, None].expand(blocks.shape[:2]))
-    if bounds is not None:
-        blocks = bounds.turned_blocks(blocks)
-    both = free[:, :, None] & free[:, None, :]
-    blocks = torch.where(both, blocks, 0) + torch.diag_embed((~free).double())
-    inverse = torch.where(both, _inverse(blocks), 0)
-    if bounds is not None:
-        inverse = bounds.turned_blocks(inverse)
-    inverse = (inverse + inverse.mT) / 2
-    return inverse.to(dtype)
-
-
-def _inverse(a: Tensor) -> Tensor:
-    """Of symmetric matrices [N, 2 or 3, 2 or 3]."""
-    scale = a.diagonal(dim1=1, dim2=2).rsqrt()
-    a = a * scale[:, :, None] * scale[:, None, :]
-    if a.shape[-1] == 2:
-        rows = [[a[:, 1, 1], -a[:, 0, 1]], [-a[:, 1, 0], a[:, 0, 0]]]
-        cofactors = torch.stack([torch.stack(row, -1) for row in rows], -2)
-        determinant = a[:, 0, 0] * a[:, 1, 1] - a[:, 0, 1] * a[:, 1, 0]
-    else:
-        first, second, third = a.unbind(-1)
-        rows3 = [torch.linalg.cross(second, third), torch.linalg.cross(third, first), torch.linalg.cross(first, second)]
-        cofactors = torch.stack(rows3, -2)
-        determinant = (first * rows3[0]).sum(-1)
-    return cofactors / determinant[:, None, None] * scale[:, :, None] * scale[:, None, :]
-
-
 @torch.no_grad()
 def minimise(system: ImplicitSystem, bounds: NodeBounds | None, options: Options) -> Minimum:
     """The node velocities of least energy within bounds, for each scene apart.
@@ -102,7 +73,7 @@ def minimise(system: ImplicitSystem, bounds: NodeBounds | None, options: Options
     lowers its energy. Projected Newton of Bertsekas (1982): components at a bound that the gradient holds there are
     left out of the linear solve, and steps are clamped.
     """
-    v, energy, size = _start(system, bounds)
+    (v, energy, size), plain = _start(system, bounds)
     scenes = len(energy)
     zeros = torch.zeros(scenes, dtype=torch.int32, device=v.device)
     total_mass = system.node_sum(system.mass)
@@ -111,35 +82,47 @@ def minimise(system: ImplicitSystem, bounds: NodeBounds | None, options: Options
     iterations, cg_iterations = zeros.clone(), zeros.clone()
     first: Tensor | None = None
     previous = forcing = None
-    stalled = indefinite = torch.zeros(scenes, dtype=torch.bool, device=v.device)
+    stalled = indefinite = kept = torch.zeros(scenes, dtype=torch.bool, device=v.device)
+    diagonal: Tensor | None = None
+    all_kept = False
     lag = _Lag(scenes, v.device)
     while True:
-        elastic, convex = system.residual(v), system.tangent(v)
-        blocks = system.diagonal(convex)
+        elastic = system.residual(v)
+        convex: Tensor | None = None
+        if diagonal is None or not all_kept:
+            convex = system.tangent(v)
+            fresh = system.diagonal(convex)
+            diagonal = fresh if diagonal is None else torch.where(system.of_nodes(kept)[:, :, None], diagonal, fresh)
         contact = contact_at(system, bounds, v, elastic)
-        inverse, change, residual = _preconditioned(system, bounds, blocks, contact, total_mass)
-        first = residual if first is None else first
+        inverse, change, residual = preconditioned(system, bounds, diagonal, contact, total_mass)
+        if first is None:
+            first = residual
+            if plain is not v:  # a good start saves work, and does not ask for more accuracy
+                there = contact_at(system, bounds, plain, system.residual(plain))
+                first = torch.fmax(first, preconditioned(system, bounds, diagonal, there, total_mass)[2])
         floor = _rounding(system, inverse, v, wave, momentum, total_mass)
         # One iteration at least: a smooth load may be smaller than the rounding of stresses, which averages out.
         target = torch.maximum(options.tolerance * first, torch.where(iterations > 0, floor, 0))
         small = residual <= target
         done = stalled | small
-        if bool((done | (iterations >= options.max_iterations)).all()):
+        exact = ~indefinite & ((residual <= NEAR * first) | (iterations >= PATIENCE))
+        kept = done | (residual <= KEPT * first)
+        looks = done | (iterations >= options.max_iterations), done | exact, ~exact, kept
+        finished, all_exact, none_exact, all_kept = torch.stack(looks).all(1).tolist()
+        if finished:
             break
         forcing = _forcing(residual, previous, forcing, target)
         previous = residual
         relative = torch.where(done, 1.0, forcing).to(v.dtype)
-        near = (residual <= NEAR * first) | (iterations >= PATIENCE)
+        tangent = _tangent(system, v, convex, exact, all_exact, none_exact)
         skew = system.skew(v) if system.flows else None
-        whole = torch.zeros_like(done) if skew is None else ~(done | lag.still) & _skewed(system, skew, convex)
-        exact = near & ~(indefinite | whole)
-        tangent = torch.where(system.of_particles(exact), system.tangent(v, projected=False), convex)
-        model, across = contact, None
+        whole = torch.zeros_like(done) if skew is None else ~(done | lag.still) & _skewed(system, skew, tangent)
+        model, blocks, across = contact, diagonal, None
         if contact.friction is not None:
-            model = lag.contact(system, bounds, v, elastic, blocks, contact, residual, total_mass)
+            model = lag.contact(system, bounds, v, elastic, diagonal, contact, residual, total_mass)
             across = None if model.friction is None else model.friction.curvature(change.norm(dim=1, keepdim=True))
             blocks = blocks if across is None else blocks + across
-            inverse, change, _ = _preconditioned(system, bounds, blocks, model, total_mass)
+            inverse, change, _ = preconditioned(system, bounds, blocks, model, total_mass)
         right = torch.where(system.of_nodes(done | whole), 0, -model.gradient)
         solve = implicit_cg(
             *(system.blocks, system.state.x, right, system.mass, inverse, tangent, relative),
@@ -165,6 +148,19 @@ def minimise(system: ImplicitSystem, bounds: NodeBounds | None, options: Options
     return Minimum(v, contact.free, small & finite, residual, iterations, cg_iterations)
 
 
+def _tangent(
+    system: ImplicitSystem, v: Tensor, convex: Tensor | None, exact: Tensor, all_exact: bool, none_exact: bool
+) -> Tensor:
+    """Tangents of the particles, not projected in scenes that are exact, bool [B], and with the projected ones if these
+    are known."""
+    if all_exact:
+        return system.tangent(v, projected=False)
+    convex = system.tangent(v) if convex is None else convex
+    if none_exact:
+        return convex
+    return torch.where(system.of_particles(exact), system.tangent(v, projected=False), convex)
+
+
 def _skewed(system: ImplicitSystem, skew: Tensor, tangent: Tensor) -> Tensor:
     """Scenes whose tangents are not symmetric, bool [B]."""
     dim = skew.shape[1]
@@ -184,7 +180,7 @@ def _free_derivative(
     """The derivative of the residual with that of friction, of what is free."""
 
     def product(d: Tensor) -> Tensor:
-        result = derivative(d) if across is None else derivative(d) + _times(across, d)
+        result = derivative(d) if across is None else derivative(d) + times(across, d)
         return result if bounds is None else bounds.kept(result, model.free)
 
     return product
@@ -241,20 +237,11 @@ class _Lag:
             return now
         self._careful = self._careful | (residual > self._residual)
         before = contact_at(system, bounds, v, elastic, self._limit)
-        left = _preconditioned(system, bounds, blocks, before, total_mass)[2]
+        left = preconditioned(system, bounds, blocks, before, total_mass)[2]
         self.renewed = self.still | ~self._careful | (self._age >= OLDEST) | ~(left > SETTLED * residual)
         self._age = torch.where(self.renewed, 0, self._age + 1)
         self._limit, self._residual = self._limit.renewed(now.friction.limit, system.of_nodes(self.renewed)), residual
         return contact_at(system, bounds, v, elastic, self._limit)
-
-
-def _preconditioned(
-    system: ImplicitSystem, bounds: NodeBounds | None, blocks: Tensor, contact: Contact, total_mass: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
-    """B⁻¹ of the free components, its product with the gradient, and the residual of each scene [m/s]."""
-    inverse = inverse_blocks(bounds, blocks, contact.free)
-    change = _times(inverse, contact.gradient)
-    return inverse, change, (system.node_sum(contact.gradient * change).abs() / total_mass).sqrt()
 
 
 def _with_momentum(system: ImplicitSystem, bounds: NodeBounds | None, v: Tensor, total_mass: Tensor) -> Tensor:
@@ -290,7 +277,7 @@ def _rounding(
     move waves of the given speed, and as much again for each cell that the material moves in the step."""
     speed = system.node_sum(system.mass[:, None] * v.square()) / total_mass
     cells = speed * (torch.as_tensor(system.dt, device=v.device).double() / system.blocks.grid.dx).square()
-    moved = system.node_sum(momentum * _times(inverse, momentum)).clamp_min(0) / total_mass
+    moved = system.node_sum(momentum * times(inverse, momentum)).clamp_min(0) / total_mass
     return 4 * torch.finfo(v.dtype).eps * (wave * (1 + cells) + moved).sqrt()
 
 
@@ -299,32 +286,46 @@ def _wave_speed_squared(system: ImplicitSystem, total_mass: Tensor) -> Tensor:
     return (system.particle_sum(system.stiffness[:, None])[:, 0] / total_mass).clamp_min(0)
 
 
-def _times(matrices: Tensor, vectors: Tensor) -> Tensor:
-    """[N, D, D] times [N, D]."""
-    return (matrices * vectors[:, None, :]).sum(-1)
+class _Point(NamedTuple):
+    """Velocities [N, D], and their energy and its size, `ImplicitSystem.energy` [B]."""
+
+    v: Tensor
+    energy: Tensor
+    size: Tensor
 
 
-def _start(system: ImplicitSystem, bounds: NodeBounds | None) -> tuple[Tensor, Tensor, Tensor]:
-    """v* within bounds or no motion, whichever has less energy; where both have none, a share of v* that has one."""
+def _point(system: ImplicitSystem, bounds: NodeBounds | None, v: Tensor) -> _Point:
+    """The nearest velocities within bounds."""
+    v = v if bounds is None else bounds.clamped(v)
+    return _Point(v, *system.energy(v))
 
-    def allowed(share: Tensor) -> Tensor:
-        v = system.of_nodes(share).to(system.start.dtype) * system.start
-        v = torch.where(system.of_nodes(share > 0), v, 0)
-        return v if bounds is None else bounds.clamped(v)
 
-    share = torch.ones(system.blocks.grid.scenes, dtype=torch.float64, device=system.mass.device)
-    energy, _ = system.energy(allowed(share))
-    at_rest, _ = system.energy(allowed(0 * share))
-    lower = at_rest < torch.where(energy.isfinite(), energy, torch.inf)
-    share, lost = torch.where(lower, 0.0, share), ~(lower | energy.isfinite())
+def _lower(system: ImplicitSystem, a: _Point, b: _Point) -> _Point:
+    """Of each scene the one of less energy."""
+    lower = b.energy < torch.where(a.energy.isfinite(), a.energy, torch.inf)
+    rest = (torch.where(lower, y, x) for x, y in zip(a[1:], b[1:], strict=True))
+    return _Point(torch.where(system.of_nodes(lower), b.v, a.v), *rest)
+
+
+def _start(system: ImplicitSystem, bounds: NodeBounds | None) -> tuple[_Point, Tensor]:
+    """Where the search begins, and the velocities whose residual the tolerance is relative to.
+
+    These are v* within bounds or no motion, whichever has less energy; where both have none, a share of v* that has
+    one. The search begins there, or at the velocities before gravity where these have less energy still, as they do in
+    a body that is held and moves slowly.
+    """
+    plain = _lower(system, _point(system, bounds, system.start), _point(system, bounds, torch.zeros_like(system.start)))
+    lost, share = ~plain.energy.isfinite(), 1.0
     for _ in range(MOST_HALVINGS):
         if not bool(lost.any()):
             break
-        share = torch.where(lost, share / 2, share)
-        lost = lost & ~system.energy(allowed(share))[0].isfinite()
-    v = allowed(torch.where(lost, 0.0, share))
-    energy, size = system.energy(v)
-    return v, energy, size
+        share /= 2
+        part = _point(system, bounds, share * system.start)
+        plain = _lower(system, plain, part._replace(energy=torch.where(lost, part.energy, torch.inf)))
+        lost = ~plain.energy.isfinite()
+    if system.before_gravity is None:
+        return plain, plain.v
+    return _lower(system, plain, _point(system, bounds, system.before_gravity)), plain.v
 
 
 def _search(

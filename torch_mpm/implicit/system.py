@@ -22,6 +22,9 @@ from ..ops import advance, gather, implicit_apply, implicit_node_blocks, scatter
 from ..ops.arguments import per_particle, sum_by_scene
 from ..parameters import Overlay
 
+READ = ("x", "mass", "volume", "F", "J", "scene", "ids", "material", "temperature", "time", "dt", "particles")
+"""What laws may read of a state: velocities are those of the nodes."""
+
 
 @dataclasses.dataclass
 class ImplicitSystem:
@@ -36,6 +39,7 @@ class ImplicitSystem:
         dt: [s], a number or a tensor [], [1] or [B].
         stress_form: "mls" or "gradient".
         flows: whether the stress is that after the return map of the trial deformation; no energy has it then.
+        before_gravity: velocities of the nodes before gravity [N, D] [m/s], None without gravity: a place to start.
         volume: of the particles that have an energy, zero for the others [P] [m³].
     """
 
@@ -47,6 +51,7 @@ class ImplicitSystem:
     dt: float | Tensor
     stress_form: str
     flows: bool = False
+    before_gravity: Tensor | None = None
     _trial: tuple[Tensor, Any] | None = None
 
     def __post_init__(self) -> None:
@@ -64,7 +69,7 @@ class ImplicitSystem:
 
     def forget(self) -> None:
         """Let go of what only the search for the minimum reads."""
-        self._trial = None
+        self._trial = self.before_gravity = None
         self.__dict__.pop("stiffness", None)
 
     @functools.cached_property
@@ -74,16 +79,16 @@ class ImplicitSystem:
             return torch.where(self.volume > 0, self.volume * self.law.stiffness(self.state), 0).double()
 
     def detached(self) -> ImplicitSystem:
-        """The same for no gradients."""
-        fields = {}
-        for name in ("F", "J", "volume"):
-            value = getattr(self.state, name)
-            fields[name] = None if value is None else value.detach()
-        extra = {name: value.detach() for name, value in self.state.extra.items()}
-        state = Overlay(self.state, x=self.state.x.detach(), extra=extra, **fields)
-        dt = self.dt.detach() if isinstance(self.dt, Tensor) else self.dt
+        """The same for no gradients, with no more of the state than laws may read."""
+
+        def still(value: Any) -> Any:
+            return value.detach() if isinstance(value, Tensor) else value
+
+        fields = {name: still(getattr(self.state, name)) for name in READ if hasattr(self.state, name)}
+        extra = {name: still(value) for name, value in self.state.extra.items()}
         return ImplicitSystem(
-            *(self.blocks, self.law, state, self.mass.detach(), self.start.detach(), dt, self.stress_form, self.flows)
+            *(self.blocks, self.law, Overlay(None, **fields, extra=extra), still(self.mass), still(self.start)),
+            *(still(self.dt), self.stress_form, self.flows, self.before_gravity),
         )
 
     def trial(self, v: Tensor) -> Any:

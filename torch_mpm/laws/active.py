@@ -46,6 +46,7 @@ class Active(Material):
         self.law = law = as_law("law", law)
         if "F" not in law.state_fields:
             raise ValueError(f"law must move F, of which fibres have their direction, got {type(law).__name__}")
+        self._everywhere = not isinstance(direction, Tensor)  # numbers are at home on any device
         if not isinstance(direction, Tensor):
             direction = torch.tensor(check_vector("direction", direction), dtype=torch.float64, device="cpu")
         if direction.dim() not in (1, 2) or direction.shape[-1] not in (2, 3) or not direction.is_floating_point():
@@ -88,6 +89,8 @@ class Active(Material):
     def _fibre(self, state: State, F: Tensor | None) -> Tensor:
         """F d [P, D]."""
         assert F is not None
+        if self._everywhere and self.direction.device != state.x.device:
+            self.direction = self.direction.to(state.x.device)
         direction = of_particles("direction", self.direction, state, tuple(state.x.shape)).to(F.dtype)
         return (F * direction[..., None, :]).sum(-1)
 

@@ -1,0 +1,474 @@
+#pragma once
+
+#include "rollout/resident.h"
+#include "transfer/advance_gather.cuh"
+#include "transfer/scatter.cuh"
+
+// The kernel of resident scenes, for any source of P2G and task of G2P. A substep of a scene is
+//   particles   law and contribution of each particle, in lists by cell
+//   cells       the cells that have particles, in their order, with their lists in that of the index tensor; empty
+//   nodes walk        each cell's particles summed up by a thread per leading node, then added to the nodes in turns,
+//   no two
+//               threads to the same node at a time
+//   nodes       grid update and contact
+//   particles   G2P, and the blocks that the particles touch next.
+// No sum depends on which thread comes first, so that results are always the same.
+namespace mpm::cuda {
+
+constexpr int kResidentThreads = 512;  // at most
+
+template <class Shape>
+struct ResidentShape : Shape {
+  static constexpr int batch = 0;  // known at run time alone
+  using Link = int;
+  static constexpr int row_bytes = Shape::row_bytes + int(sizeof(Link) - sizeof(typename Shape::Link));
+};
+
+// Blocks that a scene has touched since they were numbered, and the nodes and cells of these.
+template <class T, int D>
+struct SceneBlocks {
+  static constexpr int nodes_of_block = kBlockNodes<D>, neighbours = 1 << D;
+  static constexpr size_t bytes =  // of a block, in whole vectors
+      (nodes_of_block * ((1 + D) * sizeof(T) + 2 * sizeof(int)) + (neighbours + 1) * sizeof(int) + 15) / 16 * 16;
+  int room;
+  T* node;         // [room, nodes, 1 + D]
+  int* head;       // [room, nodes] first row in the list of a cell
+  int* cell;       // [room * nodes] cells with particles
+  int* neighbour;  // [room, 2^D] as in the schedule
+  int* block;      // [room] in the table of all scenes
+
+  __device__ SceneBlocks(char* memory, int room) : room(room) {
+    node = reinterpret_cast<T*>(memory);
+    head = reinterpret_cast<int*>(node + int64_t(room) * nodes_of_block * (1 + D));
+    cell = head + int64_t(room) * nodes_of_block;
+    neighbour = cell + int64_t(room) * nodes_of_block;
+    block = neighbour + int64_t(room) * neighbours;
+  }
+};
+
+// What the threads of a scene share beside its particles and nodes.
+struct SceneState {
+  int begin, end;                                            // particles index[begin, end)
+  int blocks;                                                // numbered
+  int cells;                                                 // with particles
+  int grown;                                                 // whether a particle touches a block without a number
+  int outside, first_outside, not_finite, first_not_finite;  // of this substep; first as largest complement
+  int cells_before[kResidentThreads / 32];                   // each warp
+  char* more_blocks;
+  int more_room;
+};
+
+constexpr int kUntouched = -1, kTouched = -2;  // in the table of a scene: numbers of blocks are not negative
+
+template <class Source, class Task>
+class SceneStep {
+ public:
+  using T = typename Source::Shape::T;
+  using S = ResidentShape<typename Source::Shape>;
+  static constexpr int D = S::D, Order = S::Order, count = kBlockNodes<D>;
+  using Blocks = SceneBlocks<T, D>;
+  using Rows = SharedParticles<S>;
+
+  const Source& source;
+  const Task& task;
+  const ResidentArguments<T, D>& a;
+  const int scene;
+  SceneState& state;
+  int* const table;  // [blocks_per_scene]
+  Rows rows;
+  Blocks blocks;
+  GridUpdateArguments<T, D>& update;  // with the blocks of this scene
+  ContactArguments<T, D>& contact;
+
+  __device__ const Topology<T, D>& topology() const { return source.topology; }
+  __device__ const Geometry<T, D>& geometry() const { return source.topology.geometry; }
+  __device__ int particles() const { return state.end - state.begin; }
+  __device__ int particle(int k) const { return topology().index[state.begin + k]; }
+
+  // Cell of a base node in the numbered blocks; `base` becomes that in its block.
+  __device__ int cell_of(int (&base)[D]) const {
+    const int local = node_in_block<D>(base);
+    return table[block_of(base)] * count + local;
+  }
+
+  // Block of a base node in this scene's table; `base` becomes that in its block.
+  __device__ int block_of(int (&base)[D]) const {
+    int block[D];
+#pragma unroll
+    for (int i = 0; i < D; i++) {
+      block[i] = base[i] / kBlockWidth;
+      base[i] &= kBlockWidth - 1;
+    }
+    return block_index(geometry(), 0, block);
+  }
+
+  __device__ void touch(const Vector<T, D>& x) const {
+    int base[D];
+    T f[D];
+    if (!locate<Order>(geometry(), x.e, base, f)) return;
+    const int block = block_of(base);
+    const unsigned touched = touched_blocks<Order, D>(base);
+    for (int o = 0; o < 1 << D; o++) {
+      if (!(touched >> o & 1)) continue;
+      const int b = block + further(geometry(), o);
+      if (table[b] == kUntouched) table[b] = kTouched, state.grown = 1;
+    }
+  }
+
+  __device__ void touch_all() const {
+    for (int k = threadIdx.x; k < particles(); k += blockDim.x) touch(read_vector(source.position, particle(k)));
+  }
+
+  // By one warp: numbers the touched blocks, as many as there is room for.
+  __device__ void number_blocks() const {
+    const int lane = threadIdx.x;
+    int number = 0;
+    for (int first = 0; first < geometry().blocks_per_scene; first += 32) {
+      const int b = first + lane;
+      const bool touched = b < geometry().blocks_per_scene && table[b] != kUntouched;
+      const unsigned with = __ballot_sync(~0u, touched);
+      const int mine = number + __popc(with & ((1u << lane) - 1));
+      if (touched) {
+        table[b] = mine;
+        if (mine < blocks.room) blocks.block[mine] = scene * geometry().blocks_per_scene + b;
+      }
+      number += __popc(with);
+    }
+    if (lane == 0) state.blocks = number, state.grown = 0;
+  }
+
+  __device__ void number() const {
+    __syncthreads();
+    if (threadIdx.x < 32) number_blocks();
+    __syncthreads();
+  }
+
+  // Numbers the blocks anew where particles touch others. Where there is no room any more blocks that nobody touches
+  // are given up, and then shared memory for global. False where there is no room at all.
+  __device__ bool make_room() {
+    if (!state.grown) return true;
+    number();
+    if (state.blocks > blocks.room) {
+      for (int b = threadIdx.x; b < geometry().blocks_per_scene; b += blockDim.x) table[b] = kUntouched;
+      __syncthreads();
+      touch_all();
+      number();
+      if (state.blocks > blocks.room && !take_more()) return false;
+    }
+    for (int i = threadIdx.x; i < state.blocks * (1 << D); i += blockDim.x) {
+      const int b = blocks.block[i >> D] - scene * geometry().blocks_per_scene;
+      const int to = b + further(geometry(), i & ((1 << D) - 1));
+      blocks.neighbour[i] = to < geometry().blocks_per_scene ? table[to] : -1;
+    }
+    for (int i = threadIdx.x; i < state.blocks * count; i += blockDim.x) blocks.head[i] = Rows::end;
+    update.block = contact.block = blocks.block;
+    __syncthreads();
+    return true;
+  }
+
+  __device__ bool take_more() {
+    const int most = source.topology.max_blocks, wanted = state.blocks + state.blocks / 4;
+    if (threadIdx.x == 0) {
+      const int first = atomicAdd(a.blocks_taken, wanted);
+      state.more_room = first + wanted <= most ? wanted : 0;
+      state.more_blocks = a.blocks + int64_t(first) * int64_t(Blocks::bytes);
+      if (state.more_room == 0) a.trouble[scene].wanted = state.blocks;
+    }
+    __syncthreads();
+    if (state.more_room == 0) return false;
+    blocks = Blocks(state.more_blocks, state.more_room);
+    number();
+    return true;
+  }
+
+  __device__ void load_particles() const {
+#pragma unroll 1
+    for (int k = threadIdx.x; k < particles(); k += blockDim.x) {
+      const int p = particle(k);
+      const Vector<T, D> x = read_vector(source.position, p);
+      const auto loaded = source.load(p, scene);
+      int base[D];
+      T f[D];
+      if (!locate<Order>(geometry(), x.e, base, f)) {
+        leave_out(p, x);
+        continue;
+      }
+      const int row = Rows::row(k), cell = cell_of(base);
+      store_particle<S, T, D>(rows, row, f, source.contribution(loaded));
+      rows.next[row] = atomicExch(&blocks.head[cell], row);
+    }
+  }
+
+  __device__ void leave_out(int p, const Vector<T, D>& x) const {
+    const bool finite = is_finite<D>(x.e);
+    atomicAdd(finite ? &state.outside : &state.not_finite, 1);
+    atomicMax(finite ? &state.first_outside : &state.first_not_finite, INT_MAX - p);
+  }
+
+  // Of the first substep with trouble.
+  __device__ void tell(int64_t step) const {
+    SceneTrouble& t = a.trouble[scene];
+    if (threadIdx.x > 0 || state.outside + state.not_finite == 0) return;
+    if (t.step == 0)
+      t = {int(step) + 1,
+           state.outside,
+           INT_MAX - state.first_outside,
+           state.not_finite,
+           INT_MAX - state.first_not_finite,
+           t.wanted};
+    state.outside = state.not_finite = state.first_outside = state.first_not_finite = 0;
+  }
+
+  // Puts the list of a cell into the order of its particles. It comes nearly in the reverse order, which takes one
+  // pass.
+  __device__ void sort_list(int cell) const {
+    int first = Rows::end;
+    for (int row = blocks.head[cell]; row != Rows::end;) {
+      const int following = rows.next[row], k = Rows::row(row);  // its own inverse
+      int before = Rows::end, after = first;
+      while (after != Rows::end && Rows::row(after) < k) before = after, after = rows.next[after];
+      rows.next[row] = after;
+      if (before == Rows::end)
+        first = row;
+      else
+        rows.next[before] = row;
+      row = following;
+    }
+    blocks.head[cell] = first;
+  }
+
+  __device__ void list_cells() const {
+    const int cells = state.blocks * count, warps = blockDim.x / 32, warp = threadIdx.x / 32, lane = threadIdx.x % 32;
+    const int share = (cells + warps * 32 - 1) / (warps * 32) * 32;
+    const int begin = ::min(warp * share, cells), end = ::min(begin + share, cells);
+    int mine = 0;
+    for (int first = begin; first < end; first += 32)
+      mine += __popc(__ballot_sync(~0u, first + lane < end && blocks.head[first + lane] != Rows::end));
+    if (lane == 0) state.cells_before[warp] = mine;
+    for (int i = threadIdx.x; i < cells * (1 + D); i += blockDim.x) blocks.node[i] = T(0);
+    __syncthreads();
+    int number = 0;
+    for (int w = 0; w < warp; w++) number += state.cells_before[w];
+    for (int first = begin; first < end; first += 32) {
+      const int cell = first + lane;
+      const bool with = cell < end && blocks.head[cell] != Rows::end;
+      const unsigned others = __ballot_sync(~0u, with);
+      if (with) {
+        blocks.cell[number + __popc(others & ((1u << lane) - 1))] = cell;
+        sort_list(cell);
+      }
+      number += __popc(others);
+    }
+    if (warp == warps - 1 && lane == 0) state.cells = number;
+    __syncthreads();
+  }
+
+  // What one thread has summed up for the n-th node behind a leading one.
+  __device__ void add_to_node(int cell, int lane, int n, const T (&value)[S::channels]) const {
+    const int offset[3] = {lane, D == 2 ? n : n / S::support, n % S::support};
+    int node[D], neighbour = 0;
+#pragma unroll
+    for (int i = 0; i < D; i++) {
+      node[i] = lattice_index_in_block(cell, i) + offset[i];
+      neighbour = neighbour * 2 + (node[i] >= kBlockWidth);
+    }
+    const int slot = blocks.neighbour[(cell / count << D) + neighbour];
+    T* const to = blocks.node + (slot * count + node_in_block<D>(node)) * (1 + D);
+    if constexpr (D == 3 && sizeof(T) == 4) {
+      Quad<T> v = load_quad(to);
+#pragma unroll
+      for (int c = 0; c < 4; c++) v.e[c] += value[c];
+      store_quad(to, v);
+    } else {
+#pragma unroll
+      for (int c = 0; c <= D; c++) to[c] += value[c];
+    }
+  }
+
+  __device__ static int lattice_index_in_block(int cell, int axis) {
+    return cell >> 2 * (D - 1 - axis) & (kBlockWidth - 1);
+  }
+
+  __device__ void walk() const {
+    const int walkers = state.cells * S::support;
+    for (int first = 0; first < walkers; first += blockDim.x) {
+      const Walker<S> walker(first + int(threadIdx.x));
+      const bool walks = first + int(threadIdx.x) < walkers;
+      const int cell = walks ? blocks.cell[walker.list] : 0;
+      T sum[S::slab][S::channels] = {};
+      if (walks) {
+#pragma unroll 1
+        for (int row = blocks.head[cell]; row != Rows::end;) {
+          const int following = rows.next[row];
+          add_particle(rows, walker, row, sum);
+          row = following;
+        }
+      }
+#pragma unroll
+      for (int lane = 0; lane < S::support; lane++) {
+#pragma unroll
+        for (int n = 0; n < S::slab; n++) {
+          if (walks && walker.lane == lane) add_to_node(cell, lane, n, sum[n]);
+          __syncthreads();
+        }
+      }
+    }
+  }
+
+  __device__ void update_nodes() const {
+#pragma unroll 1
+    for (int i = threadIdx.x; i < state.blocks * count; i += blockDim.x) {
+      const int slot = i / count, local = i % count;
+      NodeRow<T, D>& node = reinterpret_cast<NodeRow<T, D>*>(blocks.node)[i];
+      blocks.head[i] = Rows::end;
+      NodeRow<T, D> row = update_node(update, slot_update(update, slot), local, node);
+      if (a.obstacles && row.mass != T(0)) {
+        const ContactSlot<T, D> there = contact_slot(contact, slot);
+        if (there.active)
+          row.value = after_obstacles(contact, there, contact.obstacles, node_position(contact, there.corner, local),
+                                      row.value);
+      }
+      node = row;
+    }
+    __syncthreads();
+  }
+
+  __device__ void move_particles() const {
+    constexpr bool quads = D == 3 && sizeof(T) == 4;
+    const NodeField<const T> velocity{blocks.node + 1, 1 + D, D};
+#pragma unroll 1
+    for (int k = threadIdx.x; k < particles(); k += blockDim.x) {
+      const int p = particle(k);
+      const auto loaded = task.load(p, scene);
+      GridSupport<T, Task::K, D, quads> support{velocity};
+      T f[D];
+      if (!locate<Order>(geometry(), loaded.x.e, support.base, f)) {
+        task.leave_out(p);
+        continue;
+      }
+      const int slot = table[block_of(support.base)];
+#pragma unroll
+      for (int o = 0; o < 1 << D; o++) support.set_slot(o, blocks.neighbour[(slot << D) + o]);
+      touch(task.write(p, loaded, task.compute(loaded, Weights<Order, T, D>(f), support)));
+    }
+    __syncthreads();
+  }
+};
+
+// Of particles outside the grid, which nothing moves, all substeps.
+template <class Source, class Task>
+__device__ void leave_out_tail(const Source& source, const Task& task, int64_t steps) {
+  const auto& t = source.topology;
+  for (int64_t i = t.offsets[t.max_blocks] + threadIdx.x; i < t.particles; i += blockDim.x) {
+    for (int64_t step = 0; step < steps; step++) source.leave_out(t.index[i]), task.leave_out(t.index[i]);
+  }
+}
+
+// First slot of the blocks from one of the table on; unused slots come last.
+template <class T, int D>
+__device__ int first_slot(const Topology<T, D>& t, int block) {
+  int begin = 0, end = t.max_blocks;
+  while (begin < end) {
+    const int middle = (begin + end) / 2;
+    if (unsigned(t.block[middle]) < unsigned(block))
+      begin = middle + 1;
+    else
+      end = middle;
+  }
+  return begin;
+}
+
+template <class S>
+MPM_HD size_t row_bytes(int64_t particles) {  // of an array of SharedParticles
+  return size_t((particles + 63) / 64 * 64) * S::row_bytes;
+}
+
+// One thread block per scene, and one for particles outside. `shared` are the bytes of dynamic shared memory.
+template <class Source, class Task, class T, int D>
+__global__ void __launch_bounds__(kResidentThreads)
+    resident_kernel(const Source source, const Task task, const ResidentArguments<T, D> a, int shared) {
+  using S = ResidentShape<typename Source::Shape>;
+  using Blocks = SceneBlocks<T, D>;
+  extern __shared__ __align__(16) char memory[];
+  __shared__ SceneState state;
+  __shared__ alignas(16) char update_memory[sizeof(GridUpdateArguments<T, D>)];
+  __shared__ alignas(16) char contact_memory[sizeof(ContactArguments<T, D>)];
+  const int scene = blockIdx.x;
+  if (scene == a.scenes) return leave_out_tail(source, task, a.steps);
+  auto& update = *reinterpret_cast<GridUpdateArguments<T, D>*>(update_memory);
+  auto& contact = *reinterpret_cast<ContactArguments<T, D>*>(contact_memory);
+  const Topology<T, D>& t = source.topology;
+  const int per_scene = t.geometry.blocks_per_scene;
+  if (threadIdx.x == 0) {
+    state = {};
+    state.begin = t.offsets[first_slot(t, scene * per_scene)];
+    state.end = t.offsets[first_slot(t, (scene + 1) * per_scene)];
+    update = a.update;
+    contact = a.contact;
+    contact.time = a.time;
+  }
+  int* const table = reinterpret_cast<int*>(memory);
+  for (int b = threadIdx.x; b < per_scene; b += blockDim.x) table[b] = kUntouched;
+  __syncthreads();
+  const int particles = state.end - state.begin;
+  if (particles == 0) return;
+  char* free = memory + (per_scene + 3) / 4 * 4 * sizeof(int);
+  const int64_t left = shared - (free - memory), rows = int64_t(row_bytes<S>(particles));
+  const bool fits = rows + int64_t(Blocks::bytes) <= left;
+  char* const row_memory = fits ? free : a.rows + (state.begin + int64_t(64) * scene) * S::row_bytes / 16 * 16;
+  if (fits) free += rows;
+  const int room = int((shared - (free - memory)) / int64_t(Blocks::bytes));
+  SceneStep<Source, Task> s{source,
+                            task,
+                            a,
+                            scene,
+                            state,
+                            table,
+                            SharedParticles<S>(row_memory, nullptr, (particles + 63) / 64 * 64),
+                            Blocks(free, room),
+                            update,
+                            contact};
+  s.touch_all();
+  __syncthreads();
+#pragma unroll 1
+  for (int64_t step = 0; step < a.steps; step++) {
+    if (!s.make_room()) return;
+    s.load_particles();
+    __syncthreads();
+    s.tell(step);
+    s.list_cells();
+    s.walk();
+    s.update_nodes();
+    s.move_particles();
+    if (threadIdx.x == 0) {
+      contact.time += a.dt;
+      if (a.scene_time) a.scene_time[scene] += a.scene_dt[scene];
+    }
+    __syncthreads();
+  }
+}
+
+// Where scenes are few, each has a multiprocessor of its own; else as many share one as there is room for.
+template <class Source, class Task, class T, int D>
+void launch_resident(const Source& source, const Task& task, const ResidentArguments<T, D>& a, Stream stream) {
+  using S = ResidentShape<typename Source::Shape>;
+  static_assert(S::row_bytes <= kMostResidentRow && int64_t(SceneBlocks<T, D>::bytes) <= kMostResidentBlock);
+  if (source.topology.particles == 0 || a.scenes == 0) return;
+  const int most = device_attribute(cudaDevAttrMaxSharedMemoryPerBlockOptin) - 4096;
+  const int all = device_attribute(cudaDevAttrMaxSharedMemoryPerMultiprocessor);
+  const int processors = device_attribute(cudaDevAttrMultiProcessorCount);
+  const int64_t particles = (source.topology.particles + a.scenes - 1) / a.scenes;
+  const int64_t blocks =
+      std::min<int64_t>(a.update.geometry.blocks_per_scene, (source.topology.max_blocks + a.scenes - 1) / a.scenes + 2);
+  const int64_t wanted = a.update.geometry.blocks_per_scene * int64_t(sizeof(int)) +
+                         int64_t(row_bytes<S>(particles + particles / 16)) +
+                         blocks * int64_t(SceneBlocks<T, D>::bytes) + 5 * 1024;  // and what the kernel declares itself
+  const int64_t beside = std::min<int64_t>({all / wanted, (a.scenes + processors - 1) / processors, 8});
+  const int together = int(std::max<int64_t>(beside, 1));
+  const int shared = std::min(most, all / together - 5 * 1024);
+  const int threads = std::max(64, kResidentThreads / together / 32 * 32);
+  launch(resident_kernel<Source, Task, T, D>, unsigned(a.scenes + 1), unsigned(threads), size_t(shared), stream, source,
+         task, a, shared);
+}
+
+}  // namespace mpm::cuda

@@ -1,0 +1,65 @@
+#include <climits>
+
+#include "cuda/launch.cuh"
+#include "grid/status.h"
+#include "rollout/kernels.h"
+
+// The status after a call of resident scenes, as activations of all its substeps would have left it.
+namespace mpm::cuda {
+namespace {
+
+constexpr int kThreads = 256;
+
+__device__ void write_trouble(const ResidentStatusArguments& a, const SceneTrouble& t, int row, int before) {
+  int* const status = a.status + row * int64_t(kStatusSize);
+  status[kProblemActivation] = before + t.step - 1;
+  const auto write = [&](int particles, int p, int count, int first, int id) {
+    if (particles == 0) return;
+    status[count] = particles;
+    status[first] = p;
+    if (row > 0) status[id] = a.id ? int(a.id[p * a.id_stride]) : p;
+  };
+  write(t.outside, t.first_outside, kOutsideCount, kOutsideFirst, kOutsideId);
+  write(t.not_finite, t.first_not_finite, kNonFiniteCount, kNonFiniteFirst, kNonFiniteId);
+}
+
+// By one thread: row 0 tells of the first activation with trouble in any scene.
+__device__ void tell_of_all(const ResidentStatusArguments& a, int before) {
+  SceneTrouble all{INT_MAX, 0, INT_MAX, 0, INT_MAX, 0};
+  for (int b = 0; b < a.scenes; b++) {
+    const SceneTrouble& t = a.trouble[b];
+    all.wanted += t.wanted;
+    if (t.step == 0 || t.step > all.step) continue;
+    if (t.step < all.step) all = {t.step, 0, INT_MAX, 0, INT_MAX, all.wanted};
+    if (t.outside > 0) all.outside += t.outside, all.first_outside = ::min(all.first_outside, t.first_outside);
+    if (t.not_finite > 0)
+      all.not_finite += t.not_finite, all.first_not_finite = ::min(all.first_not_finite, t.first_not_finite);
+  }
+  if (a.status[kProblemActivation] < 0 && all.step < INT_MAX) write_trouble(a, all, 0, before);
+  if (all.wanted == 0) return;
+  if (a.status[kProblemActivation] < 0) a.status[kProblemActivation] = before;
+  a.status[kBlocksWanted] = ::max(a.status[kBlocksWanted], a.max_blocks + all.wanted);
+}
+
+__global__ void __launch_bounds__(kThreads) resident_status_kernel(const ResidentStatusArguments a) {
+  const int before = a.activated[kActivations] - 1;
+  for (int64_t row = threadIdx.x; row <= a.scenes; row += kThreads) {
+    const int64_t start = row * kStatusSize;
+    copy_status(a.activated + start, a.status + start);
+    if (row == 0) continue;
+    const SceneTrouble& t = a.trouble[row - 1];
+    if (t.step > 0 && a.status[start + kProblemActivation] < 0) write_trouble(a, t, int(row), before);
+  }
+  __syncthreads();
+  if (threadIdx.x > 0) return;
+  a.status[kActivations] += int(a.steps) - 1;
+  tell_of_all(a, before);
+}
+
+}  // namespace
+
+void resident_status(const ResidentStatusArguments& a, Stream stream) {
+  launch(resident_status_kernel, 1, kThreads, 0, stream, a);
+}
+
+}  // namespace mpm::cuda

@@ -1,0 +1,80 @@
+"""Which integrator is faster for slow motion, from what steps were measured to cost."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, NamedTuple
+
+import torch
+
+from ..errors import check_number
+from ..parameters import Overlay
+
+if TYPE_CHECKING:
+    from ..state import State
+    from ..step import Step
+
+MOVED = 0.05
+"""Share of dx by which material moves in an implicit step whose error is about 2%, as in a gripper that squeezes rubber
+(benchmarks/results/implicit_quasistatic_*.md)."""
+
+
+class Cost(NamedTuple):
+    """Of a step [s]."""
+
+    fixed: float
+    per_particle: float
+
+    def of(self, particles: int) -> float:
+        return self.fixed + self.per_particle * particles
+
+
+EXPLICIT = {2: Cost(5e-6, 48e-9), 3: Cost(5e-6, 88e-9)}
+IMPLICIT = {2: Cost(9e-3, 5e-6), 3: Cost(20e-3, 9e-6)}
+"""By dimension, on one thread of a CPU, explicit steps in one op (benchmarks/results/implicit_crossover_*.md). An
+implicit step costs about as much as a hundred explicit ones of as many particles; small ones, more."""
+
+
+class Comparison(NamedTuple):
+    """Explicit and implicit steps for the same motion."""
+
+    limit: float
+    """Length of explicit steps, half the stable one [s]."""
+    length: float
+    """Length of implicit steps, with errors of some 2% [s]."""
+    faster: float
+    """Time of the explicit steps over that of the implicit ones."""
+
+    def __str__(self) -> str:
+        given = f"{self.length:.2g} s (errors of some 2%) beside explicit ones of {self.limit:.2g} s"
+        if self.faster > 1:
+            return f"implicit steps of {given} would be about {self.faster:.2g} times as fast"
+        return f"implicit steps of {given} would be about {1 / self.faster:.2g} times as slow"
+
+
+def compare(step: Step, state: State, speed: float) -> Comparison:
+    """The integrators for motion whose elastic waves do not matter; where they do, explicit steps are faster.
+
+    Waits for the device. Costs were measured on a CPU; on CUDA they are much lower, in about the same ratio.
+
+    Args:
+        step: with either integrator; its grid, law and boundaries count.
+        state: particles, whose number and stiffness count.
+        speed: of the motion [m/s], of moving boundaries too.
+
+    Raises:
+        TypeError, ValueError: for a speed that is not positive and finite, or a state without particles or a stable dt.
+        NotImplementedError: for a law that implicit steps do not take.
+    """
+    check_number("speed", speed, "positive and finite", lambda v: 0 < v < math.inf)
+    if not len(state):
+        raise ValueError("state must have particles to compare integrators, got none")
+    state = step.prepare(state)
+    with torch.no_grad():
+        step.law.trial_energy(Overlay(state, C=None), state)
+        limits = step.stable_dt(state, cfl=0.5).double()
+    limit, length = float(limits.min()), MOVED * step.grid.dx / speed
+    if not 0 < limit < math.inf:
+        raise ValueError(f"state must have a stable time step, positive and finite, got {limit}")
+    explicit, implicit = EXPLICIT[step.grid.dim].of(len(state)), IMPLICIT[step.grid.dim].of(len(state))
+    return Comparison(limit, length, explicit / limit * length / implicit)
