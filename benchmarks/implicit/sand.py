@@ -29,7 +29,10 @@ from ..common import one_thread
 ENERGIES = ("full", "unilateral")
 CLUMP_DT = (1e-3, 2.5e-3, 5e-3, 1e-2, 2.5e-2, 5e-2)
 COLLAPSE_DT = (2.5e-4, 5e-4, 1e-3, 2e-3, 4e-3)
-INTEGRATORS = {"after the solve": lambda: Implicit(1e-4)}
+INTEGRATORS = {
+    "after the solve": lambda: Implicit(1e-4),
+    "inside the solve": lambda: Implicit(1e-4, plasticity="inside"),
+}
 """Where the return map acts, and how."""
 
 

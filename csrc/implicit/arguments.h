@@ -48,6 +48,7 @@ struct ConjugateGradientsArguments {
   const int* block = nullptr;  // [max_blocks]
   const T* mass = nullptr;     // [N]
   const T* inverse = nullptr;  // [N, kSymmetric<D>], upper triangles
+  const T* local = nullptr;    // likewise, what a node adds to its own part of the Hessian; or null
   const T* rhs = nullptr;      // [N, D]
   T* x = nullptr;              // [N, D], and the others
   T* r = nullptr;
@@ -77,9 +78,9 @@ MPM_HD Vector<T, D> gradient_weight(StressForm form, const T (*w)[Order + 1], co
   return a;
 }
 
-// B⁻¹ r of a node.
+// The product of a symmetric matrix, by its upper triangle, and a vector of a node.
 template <class T, int D>
-MPM_HD Vector<T, D> precondition(const T* upper, const T* r) {
+MPM_HD Vector<T, D> symmetric_times(const T* upper, const T* r) {
   Vector<T, D> z = zero_vector<T, D>();
   int n = 0;
   MPM_UNROLL for (int i = 0; i < D; i++) MPM_UNROLL
@@ -122,7 +123,7 @@ MPM_HD void advance_scene(ConjugateGradients& s, CGPhase phase, double sum, doub
 template <class T, int D>
 MPM_HD double cg_start(const ConjugateGradientsArguments<T, D>& a, int64_t node) {
   double sum = 0;
-  const Vector<T, D> z = precondition<T, D>(a.inverse + node * kSymmetric<D>, a.rhs + node * D);
+  const Vector<T, D> z = symmetric_times<T, D>(a.inverse + node * kSymmetric<D>, a.rhs + node * D);
   MPM_UNROLL for (int i = 0; i < D; i++) {
     const int64_t k = node * D + i;
     a.x[k] = T(0);
@@ -136,9 +137,11 @@ MPM_HD double cg_start(const ConjugateGradientsArguments<T, D>& a, int64_t node)
 template <class T, int D>
 MPM_HD double cg_curvature(const ConjugateGradientsArguments<T, D>& a, int64_t node) {
   double sum = 0;
+  Vector<T, D> local = zero_vector<T, D>();
+  if (a.local) local = symmetric_times<T, D>(a.local + node * kSymmetric<D>, a.p + node * D);
   MPM_UNROLL for (int i = 0; i < D; i++) {
     const int64_t k = node * D + i;
-    a.q[k] += a.mass[node] * a.p[k];
+    a.q[k] += a.mass[node] * a.p[k] + local[i];
     sum += double(a.q[k]) * double(a.p[k]);
   }
   return sum;
@@ -153,7 +156,7 @@ MPM_HD double cg_step(const ConjugateGradientsArguments<T, D>& a, int64_t node, 
     a.x[k] += T(step) * a.p[k];
     a.r[k] -= T(step) * a.q[k];
   }
-  const Vector<T, D> z = precondition<T, D>(a.inverse + node * kSymmetric<D>, a.r + node * D);
+  const Vector<T, D> z = symmetric_times<T, D>(a.inverse + node * kSymmetric<D>, a.r + node * D);
   MPM_UNROLL for (int i = 0; i < D; i++)
     sum += double(a.r[node * D + i]) * double(z[i]);
   return sum;
@@ -161,7 +164,7 @@ MPM_HD double cg_step(const ConjugateGradientsArguments<T, D>& a, int64_t node, 
 
 template <class T, int D>
 MPM_HD void cg_turn(const ConjugateGradientsArguments<T, D>& a, int64_t node, const ConjugateGradients& s) {
-  const Vector<T, D> z = precondition<T, D>(a.inverse + node * kSymmetric<D>, a.r + node * D);
+  const Vector<T, D> z = symmetric_times<T, D>(a.inverse + node * kSymmetric<D>, a.r + node * D);
   MPM_UNROLL for (int i = 0; i < D; i++) {
     T& p = a.p[node * D + i];
     p = s.state == kSolving ? z[i] + T(s.turn) * p : T(0);

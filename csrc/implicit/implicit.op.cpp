@@ -91,8 +91,8 @@ constexpr int kIterationsPerLook = MPM_BACKEND == MPM_BACKEND_IS_cpu ? 1 : 8;
 constexpr int kWorthATeam = 16;
 
 std::tuple<Tensor, Tensor> implicit_cg(const Tensor& x, const Tensor& rhs, const Tensor& mass, const Tensor& inverse,
-                                       const Tensor& tangent, const Tensor& relative, int64_t max_iterations,
-                                       int64_t stress_form, const std::vector<Tensor>& topology,
+                                       const OptionalTensor& local, const Tensor& tangent, const Tensor& relative,
+                                       int64_t max_iterations, int64_t stress_form, const std::vector<Tensor>& topology,
                                        const std::vector<double>& lattice, const std::vector<int64_t>& layout) {
   const PackedTopology blocks(topology, lattice, layout);
   STD_TORCH_CHECK(max_iterations >= 0 && max_iterations <= INT32_MAX, "max_iterations must be 0 to 2^31 - 1, got ",
@@ -109,6 +109,7 @@ std::tuple<Tensor, Tensor> implicit_cg(const Tensor& x, const Tensor& rhs, const
     a.block = t.block;
     a.mass = node_pointer<T>(mass, "mass", x, {N});
     a.inverse = node_pointer<T>(inverse, "inverse", x, {N, kSymmetric<D>});
+    if (local) a.local = node_pointer<T>(*local, "local", x, {N, kSymmetric<D>});
     a.rhs = node_pointer<T>(rhs, "rhs", x, {N, D});
     a.relative = node_pointer<T>(relative, "relative", x, {t.scenes});
     static_assert(sizeof(ConjugateGradients) == 5 * sizeof(double));
@@ -152,8 +153,9 @@ STABLE_TORCH_LIBRARY_FRAGMENT(torch_mpm, m) {
         ") -> Tensor");
   m.def("implicit_node_blocks(Tensor x, Tensor tangent, int stress_form, " MPM_TOPOLOGY_SCHEMA ") -> Tensor");
   m.def(
-      "implicit_cg(Tensor x, Tensor rhs, Tensor mass, Tensor inverse, Tensor tangent, Tensor relative, "
-      "int max_iterations, int stress_form, " MPM_TOPOLOGY_SCHEMA ") -> (Tensor solution, Tensor scalars)");
+      "implicit_cg(Tensor x, Tensor rhs, Tensor mass, Tensor inverse, Tensor? local, Tensor tangent, "
+      "Tensor relative, int max_iterations, int stress_form, " MPM_TOPOLOGY_SCHEMA
+      ") -> (Tensor solution, Tensor scalars)");
 }
 #endif
 

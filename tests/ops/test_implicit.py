@@ -277,6 +277,22 @@ def test_scenes_are_solved_apart(device):
     assert solve.solution.isfinite().all()
 
 
+def test_a_part_of_each_node_belongs_to_the_hessian(dim, device):
+    """Symmetric matrices of the nodes, such as friction adds."""
+    case = Case(dim, "quadratic", device)
+    root = torch.stack([case.nodes(k) for k in range(dim)], 2)
+    local = case.mass[:, None, None] * root @ root.mT
+    rhs = case.nodes(9) * case.mass[:, None]
+    relative = torch.full((1,), 1e-11, dtype=torch.float64, device=device)
+    arguments = (case.blocks, case.particles.x, rhs, case.mass, case.inverse(), case.tangent, relative, 1000)
+    solve = ops.implicit_cg(*arguments, local=local)
+    assert solve.state.tolist() == [CONVERGED]
+    left = ops.implicit_apply(case.blocks, case.particles.x, solve.solution, case.tangent, case.mass)
+    assert relative_error(left + (local @ solve.solution[:, :, None])[:, :, 0], rhs) < 1e-8
+    with pytest.raises(ValueError, match="local must have shape"):
+        ops.implicit_cg(*arguments, local=local[:-1])
+
+
 @pytest.mark.parametrize("sign", [-1.0, 0.0])
 def test_an_indefinite_preconditioner_is_no_convergence(sign, device):
     """As rounding leaves one of stiff blocks: r · B⁻¹ r is negative, at the start or later."""
@@ -328,6 +344,6 @@ def test_opcheck(dim, device):
     torch.library.opcheck(namespace.implicit_node_blocks.default, (x, case.tangent, 0, *packed), test_utils=checks)
     torch.library.opcheck(
         namespace.implicit_cg.default,
-        (x, case.nodes(1), case.mass.contiguous(), upper, case.tangent, relative, 5, 0, *packed),
+        (x, case.nodes(1), case.mass.contiguous(), upper, upper, case.tangent, relative, 5, 0, *packed),
         test_utils=("test_schema",),
     )

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from ..boundaries import Obstacle, Walls
+from ..boundaries.walls import Face
 from ..grid import Blocks
 
 ON_FACE = 1e-6
@@ -26,11 +28,16 @@ class NodeBounds:
     Attributes:
         lower, upper: [N, D] [m/s], equal where a component is given, infinite where it is free.
         mirror: w [N, D], or None where there are no obstacles.
+        friction: Coulomb's coefficient of the surface that bounds a component [N, D], negative where it presses down on
+            the component from above, zero where none does; None without friction.
+        surface: velocity of the surface that rubs a node, in its axes [N, D] [m/s]; with friction alone.
     """
 
     lower: Tensor
     upper: Tensor
     mirror: Tensor | None = None
+    friction: Tensor | None = None
+    surface: Tensor | None = None
 
     def turned(self, v: Tensor) -> Tensor:
         """Velocities [N, D] to the axes of the nodes, and back: the same reflection."""
@@ -44,12 +51,17 @@ class NodeBounds:
 
     def free(self, v: Tensor, gradient: Tensor) -> Tensor:
         """Components in the axes of the nodes that may move, bool [N, D]: not at a bound, or with a gradient of the
-        energy that pulls them off it."""
+        energy that pulls them off it. Friction, which may hold them too, is not looked at."""
         u, slope = self.turned(v), self.turned(gradient)
-        rounding = 64 * torch.finfo(v.dtype).eps * v.abs().amax(-1, keepdim=True)  # of two reflections
+        rounding = rounding_of(v)
         at_lower = (u <= self.lower + rounding) & (slope >= 0)
         at_upper = (u >= self.upper - rounding) & (slope <= 0)
         return ~(at_lower | at_upper | (self.lower == self.upper))
+
+    def kept(self, v: Tensor, free: Tensor) -> Tensor:
+        """Vectors of nodes [N, D] without their components that are not free. What a solve is given in held components
+        would leak into it by rounding, and grow."""
+        return self.turned(torch.where(free, self.turned(v), 0))
 
     def turned_blocks(self, blocks: Tensor) -> Tensor:
         """Matrices [N, D, D] to the axes of the nodes, and back."""
@@ -61,12 +73,18 @@ class NodeBounds:
         return turn @ blocks @ turn
 
 
+def rounding_of(v: Tensor) -> Tensor:
+    """How far two reflections may take a component of node velocities [N, D] from where it was [N, 1] [m/s]."""
+    return 64 * torch.finfo(v.dtype).eps * v.abs().amax(-1, keepdim=True)
+
+
 def node_bounds(
     blocks: Blocks, walls: Walls | None, obstacles: list[Any], like: Tensor, time: float | Tensor
 ) -> NodeBounds | None:
     """The bounds that walls and obstacles set; None without any.
 
-    Of several obstacles at a node, one that is sticky counts, otherwise the first.
+    Of several obstacles at a node, one that is sticky counts, otherwise the first. Where walls and an obstacle rub a
+    node, its velocity relative to the obstacle counts.
 
     Args:
         blocks: the active blocks.
@@ -75,29 +93,39 @@ def node_bounds(
         time: [s].
 
     Raises:
-        NotImplementedError: for friction, mirrors, and boundaries that are no obstacles.
+        NotImplementedError: for mirrors, and boundaries that are no obstacles.
+
+    Differentiable by the friction of obstacles alone.
     """
     if walls is None and not obstacles:
         return None
     positions = blocks.node_positions(like.dtype)
     lower = torch.full_like(positions, -math.inf)
     bounds = NodeBounds(lower, torch.full_like(positions, math.inf))
+    faces = () if walls is None else walls.faces(blocks.grid)
+    if any(f.friction != 0 for f in faces) or any(rubs(o) for o in obstacles):
+        bounds.friction, bounds.surface = torch.zeros_like(lower), torch.zeros_like(lower)
     if walls is not None:
-        _add_walls(bounds, blocks, walls, positions)
+        _add_walls(bounds, blocks, faces, positions)
     scene = blocks.node_scene() if blocks.grid.scenes > 1 else None
     for obstacle in obstacles:
         _add_obstacle(bounds, obstacle, positions, scene, time)
     return bounds
 
 
-def _add_walls(bounds: NodeBounds, blocks: Blocks, walls: Walls, positions: Tensor) -> None:
-    for number, face in enumerate(walls.faces(blocks.grid)):
+def rubs(obstacle: Any) -> bool:
+    """Whether an obstacle has friction."""
+    friction = getattr(obstacle, "friction", 0.0)
+    return isinstance(friction, Tensor) or friction != 0
+
+
+def _add_walls(bounds: NodeBounds, blocks: Blocks, faces: Sequence[Face], positions: Tensor) -> None:
+    for number, face in enumerate(faces):
         axis, above = divmod(number, 2)
         if face.kind == "open":
             continue
-        if face.kind == "mirror" or face.friction != 0:
-            what = "mirrors" if face.kind == "mirror" else "friction of walls"
-            raise NotImplementedError(f"an implicit step has no {what} yet: use slip, separate or sticky walls")
+        if face.kind == "mirror":
+            raise NotImplementedError("an implicit step has no mirrors yet: use slip, separate or sticky walls")
         at = positions[:, axis]
         near = ON_FACE * blocks.grid.dx
         touching = at >= face.plane - near if above else at <= face.plane + near
@@ -108,6 +136,8 @@ def _add_walls(bounds: NodeBounds, blocks: Blocks, walls: Walls, positions: Tens
             low.copy_(torch.where(rows, low.clamp_min(0), low))
         if face.kind != "separate" or above:
             high.copy_(torch.where(rows, high.clamp_max(0), high))
+        if bounds.friction is not None:
+            bounds.friction[:, axis].masked_fill_(touching, -face.friction if above else face.friction)
 
 
 def _add_obstacle(
@@ -117,8 +147,6 @@ def _add_obstacle(
         raise NotImplementedError(
             f"an implicit step takes obstacles alone as boundaries, got {type(obstacle).__name__}"
         )
-    if isinstance(obstacle.friction, Tensor) or obstacle.friction != 0:
-        raise NotImplementedError("an implicit step has no friction of obstacles yet: use slip, separate or sticky")
     contact = obstacle.contact_at(positions, scene, time)
     if contact is None:
         return
@@ -148,3 +176,9 @@ def _add_obstacle(
     entry = rows & (axis > 0)
     bounds.lower = torch.where(entry & ((sign < 0) | fixed), limit, torch.where(entry, -math.inf, bounds.lower))
     bounds.upper = torch.where(entry & ((sign > 0) | fixed), limit, torch.where(entry, math.inf, bounds.upper))
+    if bounds.friction is not None and bounds.surface is not None and rubs(obstacle):
+        friction = obstacle.friction
+        if isinstance(friction, Tensor):
+            friction = obstacle.at_nodes("friction", positions, (), scene)[..., None]
+        bounds.friction = torch.where(entry, -sign * friction, bounds.friction)
+        bounds.surface = torch.where(rows, bounds.turned(surface), bounds.surface)

@@ -35,7 +35,10 @@ class ImplicitReport(NamedTuple):
     iterations: Tensor
     """Of Newton's method, int32."""
     cg_iterations: Tensor
-    """Of conjugate gradients, in all of these, int32."""
+    """Of conjugate gradients and GMRES, in all of these, int32."""
+
+
+PLASTICITY = ("after", "inside")
 
 
 class Implicit:
@@ -43,14 +46,18 @@ class Implicit:
 
     The node velocities minimise ½ Σ m |v − v*|² + Σ V ψ((I + dt L(v)) F) (Martin et al. 2011; Gast et al. 2015), scene
     by scene, by Newton's method with line search and conjugate gradients preconditioned by the blocks of the nodes. Any
-    dt is stable. Walls and obstacles bound the velocities of their nodes in the solve. Laws with an elastic energy take
-    part; where they are plastic the flow follows the solve, at the start of the next step.
+    dt is stable. Walls and obstacles bound the velocities of their nodes in the solve, and rub them. Laws with an
+    elastic energy take part; where they are plastic the flow follows the solve, at the start of the next step, or is a
+    part of it.
 
     Args:
         tolerance: of the residual relative to that of v*, the velocities without elastic forces, in (0, 1).
         max_iterations: of Newton's method in a step.
         max_cg_iterations: of conjugate gradients in each of these.
         adjoint_tolerance: relative, of the one linear solve of a backward pass.
+        plasticity: "after": the solve sees the elastic stress of the trial deformation, and the flow follows. "inside":
+            it sees the stress after the flow, so that no more trial stress than the material bears acts on the motion.
+            No gradients.
 
     Attributes:
         report: `ImplicitReport` of the latest step, None before the first.
@@ -70,11 +77,15 @@ class Implicit:
         max_iterations: int = 30,
         max_cg_iterations: int = 1000,
         adjoint_tolerance: float = 1e-8,
+        plasticity: str = "after",
     ) -> None:
         for name, value in (("tolerance", tolerance), ("adjoint_tolerance", adjoint_tolerance)):
             check_number(name, value, "between 0 and 1", lambda v: 0 < v < 1)
         check_count("max_iterations", max_iterations, 1)
         check_count("max_cg_iterations", max_cg_iterations, 1)
+        if plasticity not in PLASTICITY:
+            raise ValueError(f"plasticity must be one of {sorted(PLASTICITY)}, got {plasticity!r}")
+        self.plasticity = plasticity
         self.options = Options(float(tolerance), int(max_iterations), int(max_cg_iterations))
         self.adjoint_tolerance = float(adjoint_tolerance)
         self.report: ImplicitReport | None = None
@@ -101,10 +112,11 @@ class Implicit:
             return start
         wants_gradient = torch.is_grad_enabled()
         before = None if gravity is None else grid_update(blocks, nodes.detach())
-        system = ImplicitSystem(blocks, step.law, state, nodes[:, 0], start, dt, step.stress_form, before)
+        flows = self.plasticity == "inside"
+        system = ImplicitSystem(blocks, step.law, state, nodes[:, 0], start, dt, step.stress_form, flows, before)
+        bounds = node_bounds(blocks, step.walls, step.boundaries.entries, start, state.time)
         with torch.no_grad():
             fixed = system.detached() if wants_gradient else system
-            bounds = node_bounds(blocks, step.walls, step.boundaries.entries, start, state.time)
             minimum = minimise(fixed, bounds, self.options)
             fixed.forget()
         self._record(minimum)
@@ -163,7 +175,7 @@ def check_implicit(step: Step, state: State) -> None:
             compiled, captured or transformed.
     """
     obstacles = [b for b in step.boundaries.entries if isinstance(b, Obstacle)]
-    motions = [t for b in obstacles for t in motion_tensors(b)]
+    motions = [t for b in obstacles for t in motion_tensors(b) if t is not b.friction]
     if is_traced(state.x) or is_captured(state.x) or torch._C._are_functorch_transforms_active():
         raise NotImplementedError(
             "an implicit step looks at how far its solve is: it cannot be compiled, captured in a CUDA graph, or "
@@ -171,7 +183,8 @@ def check_implicit(step: Step, state: State) -> None:
         )
     reasons = {
         "impulses on boundaries": state.impulse is not None,
-        "obstacles that require a gradient": torch.is_grad_enabled() and any(t.requires_grad for t in motions),
+        "motions and shapes of obstacles that require a gradient": torch.is_grad_enabled()
+        and any(t.requires_grad for t in motions),
     }
     for what, present in reasons.items():
         if present:

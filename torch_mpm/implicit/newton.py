@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -11,6 +12,9 @@ from torch import Tensor
 from ..ops import implicit_cg
 from ..ops.implicit import NEGATIVE_CURVATURE
 from .bounds import NodeBounds
+from .contact import Contact, Limit, contact_at
+from .gmres import gmres
+from .preconditioner import preconditioned, times
 from .system import ImplicitSystem
 
 LOOSEST, TIGHTEST = 0.1, 1e-12
@@ -24,6 +28,11 @@ SUFFICIENT = 1e-4
 ROUNDING = 32
 """Units in the last place by which sums of energies may be wrong."""
 MOST_HALVINGS = 30
+SYMMETRIC = 1e-3
+"""Skew part of the tangents, relative to the rest, up to which they count as symmetric."""
+SETTLED, OLDEST = 0.3, 5
+"""Where renewing friction has raised the residual, it is kept until the share of the residual is left that does not
+follow from its change; for this many iterations at most."""
 
 
 @dataclasses.dataclass
@@ -55,45 +64,6 @@ class Minimum:
     cg_iterations: Tensor
 
 
-def free_components(system: ImplicitSystem, bounds: NodeBounds | None, v: Tensor, gradient: Tensor) -> Tensor:
-    """Components of the node velocities that the step is to find, in the axes of the nodes, bool [N, D]."""
-    massive = (system.mass > 0)[:, None].expand_as(v)
-    return massive if bounds is None else massive & bounds.free(v, gradient)
-
-
-def inverse_blocks(system: ImplicitSystem, bounds: NodeBounds | None, diagonal: Tensor, free: Tensor) -> Tensor:
-    """B⁻¹ of the node blocks B [N, D, D] [kg] of the free components [1/kg], zero for the others."""
-    blocks = diagonal.double()
-    # Rounding of stiff blocks may leave a negative eigenvalue, with which a residual could seem to be zero.
-    ridge = 16 * torch.finfo(system.mass.dtype).eps * blocks.diagonal(dim1=1, dim2=2).sum(1)
-    blocks = blocks + torch.diag_embed(ridge[:, None].expand(blocks.shape[:2]))
-    if bounds is not None:
-        blocks = bounds.turned_blocks(blocks)
-    both = free[:, :, None] & free[:, None, :]
-    blocks = torch.where(both, blocks, 0) + torch.diag_embed((~free).double())
-    inverse = torch.where(both, _inverse(blocks), 0)
-    if bounds is not None:
-        inverse = bounds.turned_blocks(inverse)
-    inverse = (inverse + inverse.mT) / 2
-    return inverse.to(system.mass.dtype)
-
-
-def _inverse(a: Tensor) -> Tensor:
-    """Of symmetric matrices [N, 2 or 3, 2 or 3]."""
-    scale = a.diagonal(dim1=1, dim2=2).rsqrt()
-    a = a * scale[:, :, None] * scale[:, None, :]
-    if a.shape[-1] == 2:
-        rows = [[a[:, 1, 1], -a[:, 0, 1]], [-a[:, 1, 0], a[:, 0, 0]]]
-        cofactors = torch.stack([torch.stack(row, -1) for row in rows], -2)
-        determinant = a[:, 0, 0] * a[:, 1, 1] - a[:, 0, 1] * a[:, 1, 0]
-    else:
-        first, second, third = a.unbind(-1)
-        rows3 = [torch.linalg.cross(second, third), torch.linalg.cross(third, first), torch.linalg.cross(first, second)]
-        cofactors = torch.stack(rows3, -2)
-        determinant = (first * rows3[0]).sum(-1)
-    return cofactors / determinant[:, None, None] * scale[:, :, None] * scale[:, None, :]
-
-
 @torch.no_grad()
 def minimise(system: ImplicitSystem, bounds: NodeBounds | None, options: Options) -> Minimum:
     """The node velocities of least energy within bounds, for each scene apart.
@@ -112,24 +82,24 @@ def minimise(system: ImplicitSystem, bounds: NodeBounds | None, options: Options
     iterations, cg_iterations = zeros.clone(), zeros.clone()
     first: Tensor | None = None
     previous = forcing = None
-    stalled = indefinite = torch.zeros(scenes, dtype=torch.bool, device=v.device)
+    stalled = indefinite = kept = torch.zeros(scenes, dtype=torch.bool, device=v.device)
     diagonal: Tensor | None = None
+    all_kept = False
+    lag = _Lag(scenes, v.device)
     while True:
-        gradient = system.residual(v)
+        elastic = system.residual(v)
         convex: Tensor | None = None
-        if diagonal is None:
+        if diagonal is None or not all_kept:
             convex = system.tangent(v)
-            diagonal = system.diagonal(convex)
-        free = free_components(system, bounds, v, gradient)
-        inverse = inverse_blocks(system, bounds, diagonal, free)
-        change = _times(inverse, gradient)
-        residual = (system.node_sum(gradient * change).abs() / total_mass).sqrt()
+            fresh = system.diagonal(convex)
+            diagonal = fresh if diagonal is None else torch.where(system.of_nodes(kept)[:, :, None], diagonal, fresh)
+        contact = contact_at(system, bounds, v, elastic)
+        inverse, change, residual = preconditioned(system, bounds, diagonal, contact, total_mass)
         if first is None:
             first = residual
             if plain is not v:  # a good start saves work, and does not ask for more accuracy
-                slope = system.residual(plain)
-                slope = system.node_sum(slope * _times(inverse, slope)).abs()
-                first = torch.fmax(first, (slope / total_mass).sqrt())
+                there = contact_at(system, bounds, plain, system.residual(plain))
+                first = torch.fmax(first, preconditioned(system, bounds, diagonal, there, total_mass)[2])
         floor = _rounding(system, inverse, v, wave, momentum, total_mass)
         # One iteration at least: a smooth load may be smaller than the rounding of stresses, which averages out.
         target = torch.maximum(options.tolerance * first, torch.where(iterations > 0, floor, 0))
@@ -144,27 +114,134 @@ def minimise(system: ImplicitSystem, bounds: NodeBounds | None, options: Options
         forcing = _forcing(residual, previous, forcing, target)
         previous = residual
         relative = torch.where(done, 1.0, forcing).to(v.dtype)
-        tangent = None if none_exact and not all_exact else system.tangent(v, projected=False)
-        if tangent is None or not all_exact:
-            convex = system.tangent(v) if convex is None else convex
-            tangent = convex if tangent is None else torch.where(system.of_particles(exact), tangent, convex)
-        if not all_kept:
-            diagonal = None
+        tangent = _tangent(system, v, convex, exact, all_exact, none_exact)
+        skew = system.skew(v) if system.flows else None
+        whole = torch.zeros_like(done) if skew is None else ~(done | lag.still) & _skewed(system, skew, tangent)
+        model, blocks, across = contact, diagonal, None
+        if contact.friction is not None:
+            model = lag.contact(system, bounds, v, elastic, diagonal, contact, residual, total_mass)
+            across = None if model.friction is None else model.friction.curvature(change.norm(dim=1, keepdim=True))
+            blocks = blocks if across is None else blocks + across
+            inverse, change, _ = preconditioned(system, bounds, blocks, model, total_mass)
+        right = torch.where(system.of_nodes(done | whole), 0, -model.gradient)
         solve = implicit_cg(
-            *(system.blocks, system.state.x, torch.where(system.of_nodes(done), 0, -gradient), system.mass, inverse),
-            *(tangent, relative, options.max_cg_iterations, system.stress_form),
+            *(system.blocks, system.state.x, right, system.mass, inverse, tangent, relative),
+            *(options.max_cg_iterations, system.stress_form),
+            local=across,
         )
         indefinite = solve.state == NEGATIVE_CURVATURE
         direction = torch.where(system.of_nodes(indefinite & (solve.iterations == 0)), -change, solve.solution)
         cg_iterations += solve.iterations
+        if skew is not None and bool(whole.any()):
+            derivative = _free_derivative(system, bounds, system.derivative(v, skew), model, across)
+            step, more = _not_symmetric(system, derivative, inverse, change, model, whole, relative, options)
+            direction = torch.where(system.of_nodes(whole), step, direction)
+            cg_iterations += more
         iterations += (~done).int()
-        v, energy, size, moved = _search(system, bounds, v, energy, size, gradient, direction, done)
-        stalled = stalled | ~(moved | done)
+        v, energy, size, moved = _search(system, bounds, model, elastic, v, energy, size, direction, done)
+        lag.still = ~(moved | done)
+        stalled = stalled | (lag.still & lag.renewed & ~whole)
     # No step lowers the energy where what is left to gain is less than its rounding.
     small = small | (stalled & (residual.square() * total_mass <= ROUNDING * torch.finfo(v.dtype).eps * size))
     finite = residual.isfinite() & energy.isfinite()
     v = _with_momentum(system, bounds, v, total_mass)
-    return Minimum(v, free, small & finite, residual, iterations, cg_iterations)
+    return Minimum(v, contact.free, small & finite, residual, iterations, cg_iterations)
+
+
+def _tangent(
+    system: ImplicitSystem, v: Tensor, convex: Tensor | None, exact: Tensor, all_exact: bool, none_exact: bool
+) -> Tensor:
+    """Tangents of the particles, not projected in scenes that are exact, bool [B], and with the projected ones if these
+    are known."""
+    if all_exact:
+        return system.tangent(v, projected=False)
+    convex = system.tangent(v) if convex is None else convex
+    if none_exact:
+        return convex
+    return torch.where(system.of_particles(exact), system.tangent(v, projected=False), convex)
+
+
+def _skewed(system: ImplicitSystem, skew: Tensor, tangent: Tensor) -> Tensor:
+    """Scenes whose tangents are not symmetric, bool [B]."""
+    dim = skew.shape[1]
+    moduli = tangent[:, 2 * dim * dim :]
+    sizes = torch.stack([skew.square().sum((1, 2)), moduli.square().sum(1)], 1).double()
+    skew_size, size = system.particle_sum(sizes).unbind(1)
+    return skew_size > SYMMETRIC**2 * size
+
+
+def _free_derivative(
+    system: ImplicitSystem,
+    bounds: NodeBounds | None,
+    derivative: Callable[[Tensor], Tensor],
+    model: Contact,
+    across: Tensor | None,
+) -> Callable[[Tensor], Tensor]:
+    """The derivative of the residual with that of friction, of what is free."""
+
+    def product(d: Tensor) -> Tensor:
+        result = derivative(d) if across is None else derivative(d) + times(across, d)
+        return result if bounds is None else bounds.kept(result, model.free)
+
+    return product
+
+
+def _not_symmetric(
+    system: ImplicitSystem,
+    derivative: Callable[[Tensor], Tensor],
+    inverse: Tensor,
+    change: Tensor,
+    model: Contact,
+    scenes: Tensor,
+    relative: Tensor,
+    options: Options,
+) -> tuple[Tensor, Tensor]:
+    """Newton steps with the whole derivative in some scenes, bool [B], or −B⁻¹ g where they do not descend; and the
+    iterations that they took."""
+    right = torch.where(system.of_nodes(scenes), -model.gradient, 0)
+    step, iterations = gmres(system, derivative, inverse, right, relative, options.max_cg_iterations)
+    descends = system.node_sum(model.gradient * step) < 0
+    return torch.where(system.of_nodes(descends), step, -change), iterations
+
+
+class _Lag:
+    """The limits of friction that Newton's method works with, those of an earlier iterate in some scenes.
+
+    Attributes:
+        renewed: scenes whose limits are those of this iterate, bool [B].
+        still: scenes that the step before did not move, bool [B].
+    """
+
+    def __init__(self, scenes: int, device: torch.device) -> None:
+        self.renewed = torch.ones(scenes, dtype=torch.bool, device=device)
+        self.still = self._careful = ~self.renewed
+        self._age = torch.zeros(scenes, dtype=torch.int32, device=device)
+        self._limit: Limit | None = None
+        self._residual: Tensor | None = None
+
+    def contact(
+        self,
+        system: ImplicitSystem,
+        bounds: NodeBounds | None,
+        v: Tensor,
+        elastic: Tensor,
+        blocks: Tensor,
+        now: Contact,
+        residual: Tensor,
+        total_mass: Tensor,
+    ) -> Contact:
+        """Contact with the limits of friction to go on with, of contact with those of this iterate."""
+        assert now.friction is not None
+        if self._limit is None or self._residual is None:
+            self._limit, self._residual = now.friction.limit, residual
+            return now
+        self._careful = self._careful | (residual > self._residual)
+        before = contact_at(system, bounds, v, elastic, self._limit)
+        left = preconditioned(system, bounds, blocks, before, total_mass)[2]
+        self.renewed = self.still | ~self._careful | (self._age >= OLDEST) | ~(left > SETTLED * residual)
+        self._age = torch.where(self.renewed, 0, self._age + 1)
+        self._limit, self._residual = self._limit.renewed(now.friction.limit, system.of_nodes(self.renewed)), residual
+        return contact_at(system, bounds, v, elastic, self._limit)
 
 
 def _with_momentum(system: ImplicitSystem, bounds: NodeBounds | None, v: Tensor, total_mass: Tensor) -> Tensor:
@@ -200,18 +277,13 @@ def _rounding(
     move waves of the given speed, and as much again for each cell that the material moves in the step."""
     speed = system.node_sum(system.mass[:, None] * v.square()) / total_mass
     cells = speed * (torch.as_tensor(system.dt, device=v.device).double() / system.blocks.grid.dx).square()
-    moved = system.node_sum(momentum * _times(inverse, momentum)).clamp_min(0) / total_mass
+    moved = system.node_sum(momentum * times(inverse, momentum)).clamp_min(0) / total_mass
     return 4 * torch.finfo(v.dtype).eps * (wave * (1 + cells) + moved).sqrt()
 
 
 def _wave_speed_squared(system: ImplicitSystem, total_mass: Tensor) -> Tensor:
     """Σ V K/Σ m [m²/s²], [B]."""
     return (system.particle_sum(system.stiffness[:, None])[:, 0] / total_mass).clamp_min(0)
-
-
-def _times(matrices: Tensor, vectors: Tensor) -> Tensor:
-    """[N, D, D] times [N, D]."""
-    return (matrices * vectors[:, None, :]).sum(-1)
 
 
 class _Point(NamedTuple):
@@ -248,7 +320,8 @@ def _start(system: ImplicitSystem, bounds: NodeBounds | None) -> tuple[_Point, T
         if not bool(lost.any()):
             break
         share /= 2
-        plain = _lower(system, plain, _point(system, bounds, share * system.start))
+        part = _point(system, bounds, share * system.start)
+        plain = _lower(system, plain, part._replace(energy=torch.where(lost, part.energy, torch.inf)))
         lost = ~plain.energy.isfinite()
     if system.before_gravity is None:
         return plain, plain.v
@@ -258,24 +331,34 @@ def _start(system: ImplicitSystem, bounds: NodeBounds | None) -> tuple[_Point, T
 def _search(
     system: ImplicitSystem,
     bounds: NodeBounds | None,
+    contact: Contact,
+    residual: Tensor,
     v: Tensor,
     energy: Tensor,
     size: Tensor,
-    gradient: Tensor,
     step: Tensor,
     done: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Velocities after the longest of the steps 1, ½, ¼ ... that lowers the energy of each scene enough; their energy
-    and its size; and which scenes moved, bool [B]."""
+    """Velocities after the longest of the steps 1, ½, ¼ ... that lowers the energy of each scene enough, what friction
+    dissipates counted; their energy and its size; and which scenes moved, bool [B]."""
     rounding = ROUNDING * torch.finfo(v.dtype).eps
+    friction = contact.friction
+
+    def moved(share: Tensor) -> Tensor:
+        trial = v + system.of_nodes(share).to(v.dtype) * step
+        trial = trial if friction is None else friction.clamped(trial)
+        return trial if bounds is None else bounds.clamped(trial)
+
     share = torch.where(done, 0.0, 1.0).double()
     best, best_energy, best_size = v, energy, size
     for _ in range(MOST_HALVINGS):
-        trial = v + system.of_nodes(share).to(v.dtype) * step
-        trial = trial if bounds is None else bounds.clamped(trial)
+        trial = moved(share)
         trial_energy, trial_size = system.energy(trial)
-        slope = system.node_sum(gradient * (trial - v))
-        enough = trial_energy <= energy + SUFFICIENT * slope + rounding * (size + trial_size)
+        gain = system.gain(v, residual, trial, trial_energy - energy)
+        if friction is not None:
+            gain = gain + system.node_sum(friction.gain(trial))
+        slope = system.node_sum(contact.gradient * (trial - v))
+        enough = gain <= SUFFICIENT * slope + rounding * (size + trial_size)
         enough = (enough & trial_energy.isfinite() & (slope <= 0)) | (share == 0)
         best, best_energy, best_size = trial, trial_energy, trial_size
         if bool(enough.all()):
@@ -283,7 +366,6 @@ def _search(
         share = torch.where(enough, share, share / 2)
     else:  # scenes that no step helps stay where they were
         share = torch.where(enough, share, 0.0)
-        best = v + system.of_nodes(share).to(v.dtype) * step
-        best = torch.where(system.of_nodes(share > 0), best if bounds is None else bounds.clamped(best), v)
+        best = torch.where(system.of_nodes(share > 0), moved(share), v)
         best_energy, best_size = system.energy(best)
     return best, best_energy, best_size, share > 0

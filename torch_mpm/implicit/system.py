@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -17,7 +18,7 @@ from torch import Tensor
 
 from ..grid import Blocks
 from ..laws.material import Material
-from ..ops import advance, gather, implicit_node_blocks, scatter
+from ..ops import advance, gather, implicit_apply, implicit_node_blocks, scatter
 from ..ops.arguments import per_particle, sum_by_scene
 from ..parameters import Overlay
 
@@ -37,6 +38,7 @@ class ImplicitSystem:
         start: v* [N, D] [m/s].
         dt: [s], a number or a tensor [], [1] or [B].
         stress_form: "mls" or "gradient".
+        flows: whether the stress is that after the return map of the trial deformation; no energy has it then.
         before_gravity: velocities of the nodes before gravity [N, D] [m/s], None without gravity: a place to start.
         volume: of the particles that have an energy, zero for the others [P] [m³].
     """
@@ -48,6 +50,7 @@ class ImplicitSystem:
     start: Tensor
     dt: float | Tensor
     stress_form: str
+    flows: bool = False
     before_gravity: Tensor | None = None
     _trial: tuple[Tensor, Any] | None = None
 
@@ -85,7 +88,7 @@ class ImplicitSystem:
         extra = {name: still(value) for name, value in self.state.extra.items()}
         return ImplicitSystem(
             *(self.blocks, self.law, Overlay(None, **fields, extra=extra), still(self.mass), still(self.start)),
-            *(still(self.dt), self.stress_form, self.before_gravity),
+            *(still(self.dt), self.stress_form, self.flows, self.before_gravity),
         )
 
     def trial(self, v: Tensor) -> Any:
@@ -93,11 +96,7 @@ class ImplicitSystem:
         if self._trial is not None and self._trial[0] is v:
             return self._trial[1]
         state, grid = self.state, self.blocks.grid
-        mls = self.stress_form == "mls"
-        value, moment, gradient = gather(
-            self.blocks, state.x, v, moment=mls, gradient=not mls, moment_scale=grid.inverse_inertia
-        )
-        motion = moment if mls else gradient
+        value, motion = self._motion(v)
         _, F, J = advance(state.x, value, self.dt, motion, state.F, state.J, self.blocks.particle_scene(), grid.scenes)
         trial = Overlay(state, F=F, J=J, C=motion, step=self.step)
         if not v.requires_grad and not torch.is_grad_enabled():
@@ -118,22 +117,56 @@ class ImplicitSystem:
         total, size = self.particle_sum(torch.stack([stored, strained], 1)).unbind(1)
         return kinetic + total, kinetic + moved + size
 
+    def gain(self, v: Tensor, residual: Tensor, trial: Tensor, change: Tensor) -> Tensor:
+        """What a step from v, where the residual is given, to a trial adds to E, float64 [B] [J]: the change of E, or
+        where plastic flow leaves no energy, the work of the residuals along the step by the trapezoidal rule."""
+        if not self.flows:
+            return change
+        work = self.node_sum(0.5 * (residual + self.residual(trial)) * (trial - v))
+        return torch.where(change.isfinite(), work, torch.inf)
+
     def residual(self, v: Tensor) -> Tensor:
         """∂E/∂v [N, D] [kg m/s]; differentiable by everything."""
-        grid, x = self.blocks.grid, self.state.x
-        stress = self.law.trial_stress(self.trial(v), self.state)
+        stress = self.law.trial_stress(self.trial(v), self.state, self.flows)
         meant = (self.volume > 0)[:, None, None]  # the stress of others may be NaN
         impulse = torch.where(meant, self.impulse_weight[:, None, None] * torch.where(meant, stress, 0), 0)
-        mls = self.stress_form == "mls"
-        nothing = x.new_zeros(()).expand(x.shape)
-        forces = scatter(
-            *(self.blocks, x, nothing, impulse if mls else None, None if mls else impulse, grid.inverse_inertia)
-        )
-        return self.mass[:, None] * (v - self.start) + forces
+        return self.mass[:, None] * (v - self.start) + self._scattered(impulse)
+
+    def _motion(self, v: Tensor) -> tuple[Tensor, Tensor]:
+        """Velocities of the particles [P, D] and their gradients [P, D, D]."""
+        mls, scale = self.stress_form == "mls", self.blocks.grid.inverse_inertia
+        value, moment, gradient = gather(self.blocks, self.state.x, v, moment=mls, gradient=not mls, moment_scale=scale)
+        motion = moment if mls else gradient
+        assert motion is not None
+        return value, motion
+
+    def _scattered(self, impulse: Tensor) -> Tensor:
+        """Node forces [N, D] of stresses times volume and time step [P, D, D]."""
+        mls, x = self.stress_form == "mls", self.state.x
+        nothing, scale = x.new_zeros(()).expand(x.shape), self.blocks.grid.inverse_inertia
+        return scatter(self.blocks, x, nothing, impulse if mls else None, None if mls else impulse, scale)
 
     def tangent(self, v: Tensor, projected: bool = True) -> Tensor:
         """The tangents of the particles with their weights, as the ops of the Hessian take them [P, n]."""
-        return self.law.trial_tangent(self.trial(v), self.state, self.tangent_weight, projected)
+        return self.law.trial_tangent(self.trial(v), self.state, self.tangent_weight, projected, self.flows)
+
+    def skew(self, v: Tensor) -> Tensor:
+        """What flows that are not associated add to the tangents: skew matrices in their axes [P, D, D]."""
+        return self.law.trial_skew(self.trial(v), self.tangent_weight)
+
+    def derivative(self, v: Tensor, skew: Tensor) -> Callable[[Tensor], Tensor]:
+        """The derivative of the residual as a function of node velocities [N, D] -> [N, D]."""
+        tangent = self.tangent(v, projected=False)
+        dim = self.state.x.shape[1]
+        U, B = (tangent[:, k * dim * dim : (k + 1) * dim * dim].unflatten(1, (dim, dim)) for k in (0, 1))
+
+        def product(direction: Tensor) -> Tensor:
+            result = implicit_apply(self.blocks, self.state.x, direction, tangent, self.mass, self.stress_form)
+            along = (U.mT @ self._motion(direction)[1] @ B).diagonal(dim1=1, dim2=2)
+            turned = (skew @ along[:, :, None]) * B.mT
+            return result + self._scattered(U @ turned)
+
+        return product
 
     def diagonal(self, tangent: Tensor) -> Tensor:
         """The node blocks of the Hessian [N, D, D] [kg]."""

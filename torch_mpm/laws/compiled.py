@@ -31,6 +31,7 @@ from ..ops.law import (
 )
 from ..ops.registry import LAWS
 from ..parameters import Overlay, PerMaterial, Value, evaluate
+from .flowing import flowing_skew, flowing_stress, flowing_tangent
 from .material import Material
 
 if TYPE_CHECKING:
@@ -110,7 +111,9 @@ class CompiledLaw(Material):
             return energy
         return energy + 0.5 * state.step * (self._viscous_stress(state, before) * state.C).sum((1, 2))
 
-    def trial_stress(self, state: Any, before: Any) -> Tensor:
+    def trial_stress(self, state: Any, before: Any, flows: bool = False) -> Tensor:
+        if flows and LAWS[self.name].plastic:
+            return flowing_stress(self, state, before)
         gradient = law_energy_gradient(*self._of_the_ops(state))
         if self.state_fields != ("J",):
             return gradient @ before.F.mT
@@ -118,7 +121,9 @@ class CompiledLaw(Material):
         stress = (gradient * before.J)[:, None, None] * eye
         return stress + self._viscous_stress(state, before) if self.viscous else stress
 
-    def trial_tangent(self, state: Any, before: Any, weight: Tensor, projected: bool) -> Tensor:
+    def trial_tangent(self, state: Any, before: Any, weight: Tensor, projected: bool, flows: bool = False) -> Tensor:
+        if flows and LAWS[self.name].plastic:
+            return flowing_tangent(self, state, before, weight, projected)
         name, deformation, parameters, history, scene, dim = self._of_the_ops(state)
         before_field = getattr(before, self.state_fields[0])
         tangent = law_tangent(name, deformation, before_field, weight, parameters, history, scene, dim, projected)
@@ -126,6 +131,9 @@ class CompiledLaw(Material):
         if viscosity is not None:  # of a fluid, whose frames are the identity: 2 η dev sym L
             add_deviator(tangent, dim, 2 * viscosity * torch.where(weight > 0, weight / state.step, 0))
         return tangent
+
+    def trial_skew(self, state: Any, weight: Tensor) -> Tensor:
+        return flowing_skew(self, state, weight) if LAWS[self.name].plastic else super().trial_skew(state, weight)
 
     def _viscous_stress(self, state: Any, before: Any) -> Tensor:
         """What the velocity gradient of a step adds to the stress, at the volume before it [P, D, D] [Pa]."""

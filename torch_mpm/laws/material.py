@@ -66,14 +66,21 @@ class Material(nn.Module):
         """
         raise _not_implicit(self)
 
-    def trial_stress(self, state: Any, before: Any) -> Tensor:
+    def trial_stress(self, state: Any, before: Any, flows: bool = False) -> Tensor:
         """dP F₀ᵀ: derivative of `trial_energy` by velocity gradients that move the deformation by dF = L F₀ or
-        dJ = J₀ tr L from that of `before` [P, D, D] [Pa]. The Kirchhoff stress where both states are one."""
+        dJ = J₀ tr L from that of `before` [P, D, D] [Pa]. The Kirchhoff stress where both states are one. With `flows`,
+        P is that of the stress after the return map of the trial state, and no energy need have it as its derivative.
+        """
         raise _not_implicit(self)
 
-    def trial_tangent(self, state: Any, before: Any, weight: Tensor, projected: bool) -> Tensor:
+    def trial_tangent(self, state: Any, before: Any, weight: Tensor, projected: bool, flows: bool = False) -> Tensor:
         """Derivative of `trial_stress` as `torch_mpm.ops.law_tangent` has it, times a weight [P]."""
         raise _not_implicit(self)
+
+    def trial_skew(self, state: Any, weight: Tensor) -> Tensor:
+        """What is not symmetric in the derivative of `trial_stress` where the trial flows: the skew part of the block
+        between the stretches, in the axes of the tangent, times a weight [P, D, D]."""
+        return state.x.new_zeros(state.x.shape[0], *(state.x.shape[1],) * 2)
 
     def energy(self, state: State) -> Tensor:
         """Elastic energy of each particle [P] [J]."""

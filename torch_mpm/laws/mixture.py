@@ -78,15 +78,21 @@ class Mixture(Material):
     def trial_energy(self, state: Any, before: Any) -> Tensor:
         return self._collect_trial(state, before, (), lambda law, part, old: law.trial_energy(part, old))
 
-    def trial_stress(self, state: Any, before: Any) -> Tensor:
+    def trial_stress(self, state: Any, before: Any, flows: bool = False) -> Tensor:
         shape = (state.x.shape[1],) * 2
-        return self._collect_trial(state, before, shape, lambda law, part, old: law.trial_stress(part, old))
+        return self._collect_trial(state, before, shape, lambda law, part, old: law.trial_stress(part, old, flows))
 
-    def trial_tangent(self, state: Any, before: Any, weight: Tensor, projected: bool) -> Tensor:
+    def trial_tangent(self, state: Any, before: Any, weight: Tensor, projected: bool, flows: bool = False) -> Tensor:
         def tangent(law: Any, part: Any, old: Any) -> Tensor:
-            return law.trial_tangent(part, old, weight.index_select(0, part.index), projected)
+            return law.trial_tangent(part, old, weight.index_select(0, part.index), projected, flows)
 
         return self._collect_trial(state, before, (tangent_entries(state.x.shape[1]),), tangent)
+
+    def trial_skew(self, state: Any, weight: Tensor) -> Tensor:
+        def skew(law: Any, part: Any, old: Any) -> Tensor:
+            return law.trial_skew(part, weight.index_select(0, part.index))
+
+        return self._collect_trial(state, state, (state.x.shape[1],) * 2, skew)
 
     def _collect_trial(
         self, state: Any, before: Any, shape: tuple[int, ...], function: Callable[[Any, Any, Any], Tensor]

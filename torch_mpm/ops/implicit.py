@@ -103,6 +103,7 @@ def implicit_cg(
     relative: Tensor,
     max_iterations: int,
     stress_form: str = "mls",
+    local: Tensor | None = None,
 ) -> ImplicitSolve:
     """Solves H d = rhs by conjugate gradients, preconditioned by node blocks; scenes apart, each with its own scalars.
 
@@ -120,6 +121,7 @@ def implicit_cg(
         relative: a scene is done when √(r · B⁻¹ r) is this share of what it was at the start, [B].
         max_iterations: of each scene.
         stress_form: "mls" or "gradient".
+        local: what each node adds to its own part of H [N, D, D] [kg], symmetric; None for nothing.
 
     Raises:
         ValueError, TypeError: for wrong shapes, dtypes or devices.
@@ -132,10 +134,12 @@ def implicit_cg(
     check_like("mass", mass, x, (N,), "[N]")
     check_like("inverse", inverse, x, (N, D, D), "[N, D, D]")
     check_like("relative", relative, x, (B,), "[B]")
+    check_like("local", local, x, (N, D, D), "[N, D, D]")
     check_count("max_iterations", max_iterations)
     solution, scalars = dispatch(
         torch.ops.torch_mpm.implicit_cg,
-        *(x, rhs.contiguous(), mass.contiguous(), to_upper(inverse), tangent, relative.contiguous()),
+        *(x, rhs.contiguous(), mass.contiguous(), to_upper(inverse)),
+        *(None if local is None else to_upper(local), tangent, relative.contiguous()),
         *(max_iterations, STRESS_FORMS[stress_form], *blocks.packed),
     )
     integers = scalars.view(torch.int32)
@@ -196,7 +200,7 @@ def _node_blocks_fake(x, tangent, stress_form, *topology):
 
 
 @torch.library.register_fake("torch_mpm::implicit_cg")
-def _cg_fake(x, rhs, mass, inverse, tangent, relative, max_iterations, stress_form, *topology):
+def _cg_fake(x, rhs, mass, inverse, local, tangent, relative, max_iterations, stress_form, *topology):
     blocks = Topology.unpack(*topology)
     solution = x.new_empty(blocks.node_count, sizes(x, "x", 2)[1])
     return solution, x.new_empty(blocks.scenes, 5, dtype=torch.float64)
