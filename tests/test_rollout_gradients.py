@@ -359,17 +359,17 @@ def raw_arguments(device: str) -> list:
     walls = wall_arguments(mpm.Walls("slip"), grid)
     obstacles = obstacle_arguments(ball, state.x, 2)
     impulse = torch.randn(2, 5, 3, generator=g, dtype=F64).to(device)
-    rest = (*walls, *obstacles, 0.0, 2, 64, False, impulse, None, None, *grid.packed)
+    rest = (*walls, *obstacles, 0.0, 2, 64, False, False, impulse, None, None, *grid.packed)
     return [*particles, scene, None, material, None, *laws, *how, *rest]
 
 
 def test_the_raw_ops(device):
     call = raw_arguments(device)
-    wanted = (0, 1, 2, 3, 4, 5, 21, 37)
+    wanted = (0, 1, 2, 3, 4, 5, 21, 38)
     given = [t.clone().requires_grad_() if i in wanted else t for i, t in enumerate(call)]
     torch.library.opcheck(torch.ops.torch_mpm.substeps.default, tuple(given), raise_exception=True)
     grads = [torch.randn_like(t) for t in torch.ops.torch_mpm.substeps(*call)[:6] if t is not None]
-    adjoint = (*grads[:4], None, grads[4], torch.ones_like(call[37]), 15, *call)
+    adjoint = (*grads[:4], None, grads[4], torch.ones_like(call[38]), 15, *call)
     torch.library.opcheck(torch.ops.torch_mpm.substeps_backward.default, adjoint, raise_exception=True)
     with pytest.raises(RuntimeError, match=r"grad_x must have shape \[40, 2\]"):
         torch.ops.torch_mpm.substeps_backward(grads[0][:3], *adjoint[1:])

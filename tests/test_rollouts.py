@@ -448,7 +448,29 @@ def test_the_raw_op(device):
     grid = box(max_blocks=64)
     particles = (x, state.v, state.mass, state.volume, None, eye, None, [state.mass * 0], None, None, None, None)
     law = ("von_mises", [0], [scalar, scalar, 0.01 * scalar, scalar], [1])
-    rest = (None, [], [], [], None, None, [], [], [], [], [], [], 0.0, 1, 64, False, None, None, None, *grid.packed)
+    rest = (
+        None,
+        [],
+        [],
+        [],
+        None,
+        None,
+        [],
+        [],
+        [],
+        [],
+        [],
+        [],
+        0.0,
+        1,
+        64,
+        False,
+        True,
+        None,
+        None,
+        None,
+        *grid.packed,
+    )
     call = (*particles, *law, 2, 1e-4, True, True, 0, *rest)
     checks = ("test_schema", "test_faketensor", "test_aot_dispatch_dynamic")
     for apic, wants_C in ((True, True), (False, True), (False, False)):

@@ -1,4 +1,7 @@
-"""Batches of small float32 scenes, which CUDA takes through a call one by one, against single steps in float64."""
+"""Batches of small float32 scenes, which CUDA takes through a call one by one, against single steps in float64.
+
+Deterministic grids of few particles per scene always go that way there, others where it is faster.
+"""
 
 import dataclasses
 
@@ -74,22 +77,25 @@ def test_a_scene_with_more_particles_than_the_others_together(device):
     large = block_state(2, low=0.1, high=0.9, dx=0.0125)
     state = joined([block_state(2), large] + [block_state(2, low=0.4)] * 6, device)
     assert len(large) > 8000
-    end, expected = both(make(2, 8, "neo_hookean", dx=0.05), make(2, 8, "neo_hookean", dx=0.05), state)
+    assert len(state) < 8 * 4096
+    step, single = (make(2, 8, "neo_hookean", dx=0.05, grid={"deterministic": True}) for _ in range(2))
+    end, expected = both(step, single, state)
     assert_same(end, expected)
 
 
 @pytest.mark.parametrize("dim", [2, 3])
 def test_a_scene_that_flies_apart(dim, device):
     """It comes to touch more blocks than there is room for on a multiprocessor, and leaves others behind."""
-    cloud = block_state(dim, low=0.45, high=0.55, dx=0.025, spin=0.0)
-    cloud = cloud.replace(v=60 * (cloud.x - 0.5) + torch.tensor([3.0] + [0.0] * (dim - 1)))
+    dx, rate, blocks = (0.00625, 520, 600) if dim == 2 else (0.02, 300, 150)
+    cloud = block_state(dim, low=0.45, high=0.55, dx=dx, spin=0.0)
+    cloud = cloud.replace(v=rate * (cloud.x - 0.5) + torch.tensor([3.0] + [0.0] * (dim - 1)))
     state = joined([cloud, block_state(dim)], device)
-    dx = 0.0125 if dim == 2 else 0.04
-    grid = {"max_blocks": 900}
-    step, single = (make(dim, 2, "neo_hookean", dx=dx, grid=grid) for _ in range(2))
-    end, expected = both(step, single, state, 14)
+    step, single = (make(dim, 2, "fluid", dx=dx, grid={"deterministic": True, "max_blocks": 3000}) for _ in range(2))
+    end, expected = both(step, single, state, 40, 2.5e-4)
     step.check(end)
-    assert_same(end, expected, 1e-4)
+    assert int(single._activations.status[0, 0]) > blocks  # wanted at most
+    assert torch.equal(step._activations.status[0, 7], single._activations.status[0, 7])  # and by the last step
+    assert_same(end, expected, 1e-3)
 
 
 @pytest.mark.parametrize("dim", [2, 3])
@@ -99,7 +105,7 @@ def test_an_obstacle_that_moves(dim, device):
         return mpm.Sphere(centre, 0.25, friction=0.3, velocity=(0.0, 1.0) + (0.0,) * (dim - 2))
 
     blocks = [block_state(dim), None, block_state(dim, low=0.5, high=0.8)]
-    step, single = (make(dim, 3, "neo_hookean", boundaries=[ball()]) for _ in range(2))
+    step, single = (make(dim, 3, "neo_hookean", boundaries=[ball()], grid={"deterministic": True}) for _ in range(2))
     end, expected = both(step, single, joined(blocks, device))
     assert_same(end, expected)
 
@@ -107,9 +113,9 @@ def test_an_obstacle_that_moves(dim, device):
 @pytest.mark.parametrize("obstacle", [False, True])
 def test_scenes_with_time_steps_of_their_own(obstacle, device):
     balls = [mpm.Sphere((0.5, 0.1), 0.25, velocity=(0.0, 1.0), kind="slip")] if obstacle else []
-    state = joined([block_state(2), block_state(2, low=0.4)], device)
-    step, single = (make(2, 2, "neo_hookean", boundaries=balls) for _ in range(2))
-    dt = torch.tensor([1e-3, 4e-4], device=device)
+    state = joined([block_state(2), None, block_state(2, low=0.4)], device)
+    step, single = (make(2, 3, "neo_hookean", boundaries=balls, grid={"deterministic": True}) for _ in range(2))
+    dt = torch.tensor([1e-3, 2e-3, 4e-4], device=device)
     with torch.no_grad():
         end = mpm.rollout(step, step.prepare(state.to(dtype=F32)), N, dt)
         expected = single.prepare(state.to(dtype=F64))
@@ -134,8 +140,7 @@ def test_particles_that_leave_on_the_way(deterministic, device):
     grid = {"deterministic": deterministic}
     step, single = make(2, 3, "neo_hookean", grid=grid), make(2, 3, "neo_hookean", grid=grid)
     end, expected = both(step, single, state)
-    columns = slice(1, 7)  # but for the numbers of blocks
-    assert torch.equal(step._activations.status[:, columns], single._activations.status[:, columns])
+    assert torch.equal(step._activations.status[:, 1:], single._activations.status[:, 1:])
     assert torch.equal(step._activations.status[1:, 0], single._activations.status[1:, 0])
     there = expected.x.isfinite().all(1)
     assert torch.equal(end.x.isfinite().all(1), there) and torch.equal(end.v.isfinite(), expected.v.isfinite())

@@ -302,6 +302,7 @@ def _substeps(step: Step, state: State, n: int, dt: float | Tensor) -> State:
         *wall_arguments(step.walls, grid),
         *obstacle_arguments(step.boundaries.entries, state.x, grid.scenes),
         *(0.0 if scene_time is not None else float(state.time), grid.scenes, max_blocks, grid.grows),
+        not wants_gradient(step, state),
         *(state.impulse, scene_dt, scene_time, *grid.packed),
     )
     record.status = status

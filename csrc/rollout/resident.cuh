@@ -12,7 +12,7 @@
 //               threads to the same node at a time
 //   nodes       grid update and contact
 //   particles   G2P, and the blocks that the particles touch next.
-// No sum depends on which thread comes first, so that results are always the same.
+// Sums have the order of the index tensor, so that those of a deterministic activation are always the same.
 namespace mpm::cuda {
 
 constexpr int kResidentThreads = 512;  // at most
@@ -150,7 +150,7 @@ class SceneStep {
 
   // Numbers the blocks anew where particles touch others. Where there is no room any more blocks that nobody touches
   // are given up, and then shared memory for global. False where there is no room at all.
-  __device__ bool make_room() {
+  __device__ bool make_room(int64_t step) {
     if (!state.grown) return true;
     number();
     if (state.blocks > blocks.room) {
@@ -158,7 +158,7 @@ class SceneStep {
       __syncthreads();
       touch_all();
       number();
-      if (state.blocks > blocks.room && !take_more()) return false;
+      if (state.blocks > blocks.room && !take_more(step)) return false;
     }
     for (int i = threadIdx.x; i < state.blocks; i += blockDim.x) {
       const int b = blocks.block[i] - scene * geometry().blocks_per_scene;
@@ -176,13 +176,25 @@ class SceneStep {
     return true;
   }
 
-  __device__ bool take_more() {
-    const int most = source.topology.max_blocks, wanted = state.blocks + state.blocks / 4;
+  // By one thread: spare blocks with some headroom, where there is none with just those wanted, or none.
+  __device__ void take_spare_blocks() const {
+    int first = *const_cast<volatile int*>(a.blocks_taken), room, found;
+    do {
+      found = first;
+      const int with_headroom = state.blocks + state.blocks / 4;
+      room = found + with_headroom <= a.spare_blocks  ? with_headroom
+             : found + state.blocks <= a.spare_blocks ? state.blocks
+                                                      : 0;
+      first = room > 0 ? atomicCAS(a.blocks_taken, found, found + room) : found;
+    } while (first != found);
+    state.more_room = room;
+    state.more_blocks = a.blocks + int64_t(found) * int64_t(Blocks::bytes);
+  }
+
+  __device__ bool take_more(int64_t step) {
     if (threadIdx.x == 0) {
-      const int first = atomicAdd(a.blocks_taken, wanted);
-      state.more_room = first + wanted <= most ? wanted : 0;
-      state.more_blocks = a.blocks + int64_t(first) * int64_t(Blocks::bytes);
-      if (state.more_room == 0) a.trouble[scene].wanted = state.blocks;
+      take_spare_blocks();
+      if (state.more_room == 0) a.trouble[scene].full = int(step) + 1, a.trouble[scene].wanted = state.blocks;
     }
     __syncthreads();
     if (state.more_room == 0) return false;
@@ -225,6 +237,7 @@ class SceneStep {
            INT_MAX - state.first_outside,
            state.not_finite,
            INT_MAX - state.first_not_finite,
+           t.full,
            t.wanted};
     state.outside = state.not_finite = state.first_outside = state.first_not_finite = 0;
   }
@@ -379,6 +392,12 @@ __device__ void leave_out_tail(const Source& source, const Task& task, int64_t s
   }
 }
 
+template <class T, int D>
+__device__ void move_clock(const ResidentArguments<T, D>& a, int scene, int64_t steps) {
+  if (threadIdx.x > 0 || !a.scene_time) return;
+  for (int64_t step = 0; step < steps; step++) a.scene_time[scene] += a.scene_dt[scene];
+}
+
 // First slot of the blocks from one of the table on; unused slots come last.
 template <class T, int D>
 __device__ int first_slot(const Topology<T, D>& t, int block) {
@@ -434,7 +453,7 @@ __global__ void __launch_bounds__(kResidentThreads)
   for (int b = threadIdx.x; b < (per_scene + 31) / 32; b += blockDim.x) wanted[b] = 0;
   __syncthreads();
   const int particles = state.end - state.begin;
-  if (particles == 0) return;
+  if (particles == 0) return move_clock(a, scene, a.steps);
   char* free = memory + bytes_of_table(per_scene);
   const int64_t left = shared - (free - memory), rows = bytes_of_particles<S>(particles);
   const bool fits = rows + int64_t(Blocks::bytes) <= left;
@@ -459,7 +478,7 @@ __global__ void __launch_bounds__(kResidentThreads)
   __syncthreads();
 #pragma unroll 1
   for (int64_t step = 0; step < a.steps; step++) {
-    if (!s.make_room()) return;
+    if (!s.make_room(step)) return move_clock(a, scene, a.steps - step);
     s.load_particles();
     __syncthreads();
     s.tell(step);
@@ -467,10 +486,8 @@ __global__ void __launch_bounds__(kResidentThreads)
     s.walk();
     s.update_nodes();
     s.move_particles();
-    if (threadIdx.x == 0) {
-      contact.time += a.dt;
-      if (a.scene_time) a.scene_time[scene] += a.scene_dt[scene];
-    }
+    if (threadIdx.x == 0) contact.time += a.dt;
+    move_clock(a, scene, 1);
     __syncthreads();
   }
 }
@@ -492,11 +509,16 @@ void launch_resident(const Source& source, const Task& task, const ResidentArgum
   const int64_t wanted = bytes_of_table(a.update.geometry.blocks_per_scene) +
                          bytes_of_particles<S>(particles + particles / 16) +
                          blocks * int64_t(SceneBlocks<T, D>::bytes) + 5 * 1024;  // and what the kernel declares itself
-  const int64_t beside = std::min<int64_t>({all / wanted, (a.scenes + processors - 1) / processors, 4});
+  // The order of sums depends on the number of threads, so that of deterministic scenes is always the same.
+  const bool in_order = a.p2g.deterministic;
+  const int threads_in_order = D == 2 ? kResidentThreads / 2 : kResidentThreads;
+  const int64_t beside = std::min<int64_t>(
+      {all / wanted, (a.scenes + processors - 1) / processors, in_order ? kResidentThreads / threads_in_order : 4});
   const int together = int(std::max<int64_t>(beside, 1));
   const int shared = std::min(most, all / together - 5 * 1024);
   const int64_t useful = std::max<int64_t>(128, (particles + 31) / 32 * 32);
-  const int threads = int(std::min<int64_t>(kResidentThreads / together / 32 * 32, useful));
+  const int threads =
+      in_order ? threads_in_order : int(std::min<int64_t>(kResidentThreads / together / 32 * 32, useful));
   launch(resident_kernel<Source, Task, T, D>, unsigned(a.scenes + 1), unsigned(threads), size_t(shared), stream, source,
          task, a, shared);
 }

@@ -11,11 +11,11 @@
 // through all substeps of a call, its nodes in shared memory, and nobody waits for other scenes.
 namespace mpm {
 
-// Scenes of a deterministic grid are resident up to that size, whatever other scenes there are: what becomes of a scene
-// must not depend on them.
+// Where scenes are larger than that on average, or their domains, kernels of whole grids take them.
 template <int D>
-constexpr int kMostResidentParticles = D == 2 ? 4096 : 2560;
-constexpr int kMostResidentBlocks = 4096;  // of the domain of a scene
+constexpr int kMostResidentParticles = D == 2 ? 4096 : 2304;
+constexpr int kMostResidentBlocks = 4096;
+constexpr int64_t kLeastResidentSteps = 4;
 
 // Whether they are faster than kernels of whole grids, by what both took on an H200 [µs].
 template <int D>
@@ -33,7 +33,7 @@ constexpr int64_t kMostResidentRow = 96, kMostResidentBlock = 1600;
 struct SceneTrouble {
   int step;  // 1 + the substep, or 0
   int outside, first_outside, not_finite, first_not_finite;
-  int wanted;  // blocks for which there was no room, or 0
+  int full, wanted;  // 1 + the substep whose blocks had no room, or 0, and how many they were
 };
 
 // The fields of the particles are those that `p2g` and `advance` read, and move in place. The activation is that of the
@@ -47,11 +47,12 @@ struct ResidentArguments {
   bool obstacles = false;
   int scenes = 1;
   int64_t steps = 0;
-  double time = 0, dt = 0;          // of obstacles, where scenes have no time of their own
-  T* scene_time = nullptr;          // [scenes], goes on with each substep
-  const T* scene_dt = nullptr;      // [scenes]
-  char* rows = nullptr;             // for scenes with more particles than shared memory holds
-  char* blocks = nullptr;           // [max_blocks], for those that reach more blocks
+  double time = 0, dt = 0;      // of obstacles, where scenes have no time of their own
+  T* scene_time = nullptr;      // [scenes], goes on with each substep
+  const T* scene_dt = nullptr;  // [scenes]
+  char* rows = nullptr;         // for scenes with more particles than shared memory holds
+  char* blocks = nullptr;       // [spare_blocks], for those that reach more blocks
+  int spare_blocks = 0;
   int* blocks_taken = nullptr;      // of these, zero before the call
   SceneTrouble* trouble = nullptr;  // [scenes]
 };

@@ -25,19 +25,21 @@ __device__ void write_trouble(const ResidentStatusArguments& a, const SceneTroub
 
 // By one thread: row 0 tells of the first activation with trouble in any scene.
 __device__ void tell_of_all(const ResidentStatusArguments& a, int before) {
-  SceneTrouble all{INT_MAX, 0, INT_MAX, 0, INT_MAX, 0};
+  SceneTrouble all{INT_MAX, 0, INT_MAX, 0, INT_MAX, INT_MAX, 0};
   for (int b = 0; b < a.scenes; b++) {
     const SceneTrouble& t = a.trouble[b];
     all.wanted += t.wanted;
+    if (t.full > 0) all.full = ::min(all.full, t.full);
     if (t.step == 0 || t.step > all.step) continue;
-    if (t.step < all.step) all = {t.step, 0, INT_MAX, 0, INT_MAX, all.wanted};
+    if (t.step < all.step) all = {t.step, 0, INT_MAX, 0, INT_MAX, all.full, all.wanted};
     if (t.outside > 0) all.outside += t.outside, all.first_outside = ::min(all.first_outside, t.first_outside);
     if (t.not_finite > 0)
       all.not_finite += t.not_finite, all.first_not_finite = ::min(all.first_not_finite, t.first_not_finite);
   }
   if (a.status[kProblemActivation] < 0 && all.step < INT_MAX) write_trouble(a, all, 0, before);
   if (all.wanted == 0) return;
-  if (a.status[kProblemActivation] < 0) a.status[kProblemActivation] = before;
+  const int full = before + all.full - 1;
+  if (a.status[kProblemActivation] < 0 || full < a.status[kProblemActivation]) a.status[kProblemActivation] = full;
   a.status[kBlocksWanted] = ::max(a.status[kBlocksWanted], a.max_blocks + all.wanted);
 }
 

@@ -19,7 +19,7 @@ namespace mpm {
   "scene, Tensor? ids, Tensor? material, Tensor? previous_status, str laws, int[] options, Tensor[] parameters, "  \
   "int[] variables, int n, float dt, bool apic, bool wants_C, int stress_form, Tensor? gravity, " MPM_WALLS_SCHEMA \
   ", Tensor? obstacles, Tensor? data, int[] shape, int[] sizes, int[] contact, int[] obstacle_scene, "             \
-  "float[] start, float[] end, float time, int scenes, int max_blocks, bool grows, Tensor? "                       \
+  "float[] start, float[] end, float time, int scenes, int max_blocks, bool grows, bool resident, Tensor? "        \
   "impulse, Tensor? scene_dt, Tensor? scene_time, " MPM_LATTICE_SCHEMA
 #define MPM_SUBSTEPS_PARAMETERS                                                                                        \
   const Tensor &x, const Tensor &v, const Tensor &mass, const Tensor &volume, const OptionalTensor &C,                 \
@@ -31,13 +31,13 @@ namespace mpm {
       const OptionalTensor &obstacle_table, const OptionalTensor &obstacle_data, std::vector<int64_t> shape,           \
       std::vector<int64_t> sizes, std::vector<int64_t> contact_kind, std::vector<int64_t> obstacle_scene,              \
       std::vector<double> start, std::vector<double> end, double time, int64_t scenes, int64_t max_blocks, bool grows, \
-      const OptionalTensor &impulse, const OptionalTensor &scene_dt, const OptionalTensor &scene_time,                 \
+      bool resident, const OptionalTensor &impulse, const OptionalTensor &scene_dt, const OptionalTensor &scene_time,  \
       const std::vector<double>&lattice, const std::vector<int64_t>&layout
 #define MPM_SUBSTEPS_ARGUMENTS                                                                                         \
   x, v, mass, volume, C, F, J, history, scene, ids, material, previous_status, laws, options, parameters, variables,   \
       n, dt, apic, wants_C, stress_form, gravity, wall_kind, wall_plane, wall_friction, obstacle_table, obstacle_data, \
-      shape, sizes, contact_kind, obstacle_scene, start, end, time, scenes, max_blocks, grows, impulse, scene_dt,      \
-      scene_time, PackedLattice(lattice, layout)
+      shape, sizes, contact_kind, obstacle_scene, start, end, time, scenes, max_blocks, grows, resident, impulse,      \
+      scene_dt, scene_time, PackedLattice(lattice, layout)
 
 // The arguments of a call.
 struct SubstepsInputs {
@@ -61,7 +61,7 @@ struct SubstepsInputs {
   std::vector<double> start, end;
   double time;
   int64_t scenes, max_blocks;
-  bool grows;
+  bool grows, resident;
   OptionalTensor impulse, scene_dt, scene_time;
   PackedLattice lattice;
 };
@@ -296,14 +296,15 @@ struct Substeps {
     if (fused) stress = Tensor();
   }
 
-  // Whether scenes are taken through the call one by one.
+  // Whether scenes are taken through the call one by one, by their average size.
   bool resides() {
     const int64_t P = in.x.size(0);
-    if (!calls[0].law->kernels<T, D>().resident || calls.size() > 1 || has(in.material) || in.n < 2) return false;
+    if (!in.resident || in.n < kLeastResidentSteps || P > kMostResidentParticles<D> * in.scenes) return false;
+    if (!calls[0].law->kernels<T, D>().resident || calls.size() > 1 || has(in.material)) return false;
     if (in.lattice.order() != 2 || p2g.form != StressForm::mls || has(in.impulse) || update.walls.mirrored)
       return false;
     if (P == 0 || activation.geometry.blocks_per_scene > kMostResidentBlocks) return false;
-    return in.lattice.deterministic() ? P <= kMostResidentParticles<D> * in.scenes : resident_pays<D>(P, in.scenes);
+    return in.lattice.deterministic() || resident_pays<D>(P, in.scenes);
   }
 
   // Of the substeps that read what others of the same parity have written. The last one is activated in any case, so

@@ -14,28 +14,32 @@ Tensor copy_of(const Tensor& t) {
 }
 
 #if MPM_BACKEND == MPM_BACKEND_IS_cuda
-// All substeps, after the activation of the first one, of particles that move in place.
+// Substeps after the activation of the first one, of particles that move in place.
 template <class T, int D>
-void take_resident(Substeps<T, D>& s, const int* activated, int* status, backend::Stream stream) {
+void take_resident(Substeps<T, D>& s, int64_t n, double time, const int* activated, int* status,
+                   backend::Stream stream) {
   const SubstepsInputs& in = s.in;
   const int64_t P = in.x.size(0), rows = (P + 64 * in.scenes) * kMostResidentRow;
   const Tensor row_memory = empty(in.x, {rows}, ScalarType::Byte);
-  const Tensor block_memory = empty(in.x, {s.activation.max_blocks * kMostResidentBlock}, ScalarType::Byte);
+  // A scene that grows takes new ones each time; all of them together, twice what they should want.
+  const int64_t spare = std::min<int64_t>(2 * int64_t(s.activation.max_blocks), s.update.block_count);
+  const Tensor block_memory = empty(in.x, {spare * kMostResidentBlock}, ScalarType::Byte);
   Tensor trouble = empty_int(in.x, {1 + in.scenes * int64_t(sizeof(SceneTrouble) / sizeof(int))});
   backend::clear(trouble, stream);
   int* const first = static_cast<int*>(trouble.data_ptr());
-  ResidentArguments<T, D> a{s.p2g, s.advance, s.update, s.contact, s.obstacles, int(in.scenes), in.n, in.time, in.dt};
+  ResidentArguments<T, D> a{s.p2g, s.advance, s.update, s.contact, s.obstacles, int(in.scenes), n, time, in.dt};
   if (s.scene_time.defined()) {
     a.scene_time = static_cast<T*>(s.scene_time.data_ptr());
     a.scene_dt = static_cast<const T*>(in.scene_dt->data_ptr());
   }
   a.rows = static_cast<char*>(row_memory.data_ptr());
   a.blocks = static_cast<char*>(block_memory.data_ptr());
+  a.spare_blocks = int(spare);
   a.blocks_taken = first;
   a.trouble = reinterpret_cast<SceneTrouble*>(first + 1);
   s.calls[0].law->template kernels<T, D>().resident(s.laws[0], a, stream);
-  backend::resident_status({int(in.scenes), s.activation.max_blocks, in.n, a.trouble, activated, status,
-                            s.activation.id, s.activation.id_stride},
+  backend::resident_status({int(in.scenes), s.activation.max_blocks, n, a.trouble, activated, status, s.activation.id,
+                            s.activation.id_stride},
                            stream);
 }
 #endif
@@ -51,7 +55,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tenso
   Tensor status[] = {empty_int(x, {1 + scenes, kStatusSize}), empty_int(x, {1 + scenes, kStatusSize})};
   Tensor impulse_, time_;
   int64_t step = 0;
-  bool resident = false;
+  bool taken = false;
   const DeviceScope device(x);
   dispatch(x, [&]<class T, int D>() {
     const backend::Stream stream = device.stream();
@@ -85,9 +89,16 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tenso
               field<const T>(J_[0]), field<const T>(history_)},
              field<T>(F_[0]));
       s.write({field<T>(x_[0]), field<T>(v_), field<T>(C_), field<T>(F_[0]), field<T>(J_[0]), field<T>(history_)});
-      s.activate(before, static_cast<int*>(status[1].data_ptr()), stream);
-      take_resident(s, static_cast<const int*>(status[1].data_ptr()), static_cast<int*>(status[0].data_ptr()), stream);
-      resident = true;
+      // The last one has an activation of its own, so that the status tells how many blocks there are by then.
+      int* const activated = static_cast<int*>(status[1].data_ptr());
+      int* const now = static_cast<int*>(status[0].data_ptr());
+      double last_time = time;
+      for (int64_t k = 1; k < n; k++) last_time += dt;
+      s.activate(before, activated, stream);
+      take_resident(s, n - 1, time, activated, now, stream);
+      s.activate(now, activated, stream);
+      take_resident(s, 1, last_time, activated, now, stream);
+      taken = true;
       return;
     }
 #endif
@@ -118,7 +129,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tenso
       }
     });
   });
-  if (resident) return {x_[0], v_, C_, F_[0], J_[0], history_, status[0], impulse_, time_};
+  if (taken) return {x_[0], v_, C_, F_[0], J_[0], history_, status[0], impulse_, time_};
   if (step == 0) {  // the first activation found no room
     torch::stable::copy_(x_[0], x);
     torch::stable::copy_(v_, v);

@@ -3,7 +3,7 @@
     torch.ops.torch_mpm.substeps(x, v, mass, volume, C, F, J, history, scene, ids, material, previous_status, laws,
         options, parameters, variables, n, dt, apic, wants_C, stress_form, gravity, wall_kind, wall_plane,
         wall_friction, obstacles, data, shape, sizes, contact, obstacle_scene, start, end, time, scenes,
-        max_blocks, grows, impulse, scene_dt, scene_time, lattice, layout)
+        max_blocks, grows, resident, impulse, scene_dt, scene_time, lattice, layout)
         -> (x, v, C, F, J, history, status, impulse, time)
 
 Particles and their history are those of `State`, the grid's arguments those of `activate`, `grid_update` and `contact`.
@@ -13,7 +13,8 @@ parameters of laws that flow in time. Results that a call does not have are None
 side by side, [P, m]. The impulses on obstacles and walls are added to `impulse`, where it is given. Scenes with clocks
 of their own have the time steps dt times `scene_dt` and begin at `scene_time`, both [B]. With `grows` the pool follows
 the scene on the CPU; otherwise the op stops there where it is full, and the status tells. On CUDA nothing is waited
-for.
+for. With `resident` batches of small scenes may go another way there, each on a multiprocessor of its own; gradients
+take it as any other, whose sums may round differently.
 
 Differentiable once, with respect to x, v, mass, volume, C, F, J, history, parameters, gravity and impulse. Autograd
 keeps the arguments of a call, no more: 2 D + 2 D² numbers per particle of a solid (24 in 3-D) and its history.
