@@ -154,7 +154,21 @@ def contexts() -> tuple[contextlib.AbstractContextManager[None], contextlib.Abst
     """For `torch.utils.checkpoint.checkpoint(..., use_reentrant=False, context_fn=contexts)` around steps: on grids
     without `max_blocks`, steps that are taken again find pools of the size they had. `rollout` sees to that itself."""
     sizes = list[int]()
-    return same_pools(sizes), same_pools(sizes)
+    return same_pools(sizes), _EachTime(sizes)
+
+
+class _EachTime(contextlib.AbstractContextManager[None]):
+    """`same_pools` as often as a graph is gone back through."""
+
+    def __init__(self, sizes: list[int]) -> None:
+        self._sizes = sizes
+
+    def __enter__(self) -> None:
+        self._now = same_pools(self._sizes)
+        self._now.__enter__()
+
+    def __exit__(self, *error: Any) -> None:
+        self._now.__exit__(*error)
 
 
 # ---- binomial
