@@ -55,20 +55,22 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tenso
   Tensor status[] = {empty_int(x, {1 + scenes, kStatusSize}), empty_int(x, {1 + scenes, kStatusSize})};
   Tensor impulse_, time_;
   int64_t step = 0;
-  bool taken = false;
+  bool taken = false;  // by resident scenes, all steps
   const DeviceScope device(x);
+  const auto start_in_results = [&] {
+    torch::stable::copy_(x_[0], x);
+    torch::stable::copy_(v_, v);
+    if (has(F)) torch::stable::copy_(F_[0], *F);
+    if (has(J)) torch::stable::copy_(J_[0], *J);
+    if (wants_C) has(C) ? torch::stable::copy_(C_, *C) : torch::stable::zero_(C_);
+  };
   dispatch(x, [&]<class T, int D>() {
     const backend::Stream stream = device.stream();
     Substeps<T, D> s(in);
-    F_[1] = result(x, has(F) && (n > 1 || s.plastic), {P, D, D});
     history_ = packed_history(x, history, s.columns);
     const int* before = s.previous_status;
 
     Particles<const T> from = given_particles<T, D>(in, history_);
-    if (s.plastic && has(F)) {  // which laws change where it stands
-      torch::stable::copy_(F_[1], *F);
-      from.F = field<const T>(F_[1]);
-    }
     if (has(impulse)) {
       impulse_ = copy_of(*impulse);
       s.add_impulses_to(impulse_);
@@ -79,11 +81,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tenso
     }
 #if MPM_BACKEND == MPM_BACKEND_IS_cuda
     if (s.resides()) {
-      torch::stable::copy_(x_[0], x);
-      torch::stable::copy_(v_, v);
-      if (has(F)) torch::stable::copy_(F_[0], *F);
-      if (has(J)) torch::stable::copy_(J_[0], *J);
-      if (wants_C) has(C) ? torch::stable::copy_(C_, *C) : torch::stable::zero_(C_);
+      start_in_results();
       s.make_pool(stream);
       s.read({field<const T>(x_[0]), field<const T>(v_), field<const T>(C_), field<const T>(F_[0]),
               field<const T>(J_[0]), field<const T>(history_)},
@@ -102,6 +100,11 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tenso
       return;
     }
 #endif
+    F_[1] = result(x, has(F) && (n > 1 || s.plastic), {P, D, D});
+    if (s.plastic && has(F)) {  // which laws change where it stands
+      torch::stable::copy_(F_[1], *F);
+      from.F = field<const T>(F_[1]);
+    }
     if (n > 1) s.let_activations_last();
     s.fuse();
     s.make_pool(stream);
@@ -129,13 +132,8 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tenso
       }
     });
   });
-  if (taken) return {x_[0], v_, C_, F_[0], J_[0], history_, status[0], impulse_, time_};
-  if (step == 0) {  // the first activation found no room
-    torch::stable::copy_(x_[0], x);
-    torch::stable::copy_(v_, v);
-    if (has(F)) torch::stable::copy_(F_[0], *F);
-    if (has(J)) torch::stable::copy_(J_[0], *J);
-    if (wants_C) has(C) ? torch::stable::copy_(C_, *C) : torch::stable::zero_(C_);
+  if (step == 0) {
+    if (!taken) start_in_results();  // the first activation found no room
     return {x_[0], v_, C_, F_[0], J_[0], history_, status[0], impulse_, time_};
   }
   const int last = int(step + 1) % 2;
