@@ -392,6 +392,7 @@ struct Substeps {
   }
 
   void make_pool(backend::Stream stream);
+  void use_pool();
 };
 
 template <class T, int D>
@@ -473,6 +474,16 @@ void Substeps<T, D>::make_pool(backend::Stream stream) {
   pool.make(in.x, activation, apart, stream);
   if (impulse.defined() && (MPM_BACKEND == MPM_BACKEND_IS_cpu || in.lattice.deterministic()))
     impulse_slots = empty(in.x, {activation.slots() + in.scenes, impulse_shape()[1] * kImpulse<D>}, ScalarType::Double);
+  use_pool();
+  if (drifts.defined() && !update.walls.mirrored) {
+    backend::clear(pool.nodes, stream);
+    next.emptied = static_cast<NodeRow<T, D>*>(pool.nodes.data_ptr());
+  }
+}
+
+// The kernels read and write the activation and the pool that are there.
+template <class T, int D>
+void Substeps<T, D>::use_pool() {
   const Topology<T, D> topology = topology_of(activation);
   p2g.topology = advance.gather.topology = topology;
   p2g.nodes = {static_cast<T*>(pool.nodes.data_ptr()), 1 + D, 1 + D};
@@ -481,14 +492,10 @@ void Substeps<T, D>::make_pool(backend::Stream stream) {
   update.table = topology.table;
   update.nodes = static_cast<const NodeRow<T, D>*>(pool.nodes.data_ptr());
   update.updated = static_cast<NodeRow<T, D>*>(pool.updated.data_ptr());
-  if (drifts.defined() && !update.walls.mirrored) {
-    backend::clear(pool.nodes, stream);
-    next.emptied = static_cast<NodeRow<T, D>*>(pool.nodes.data_ptr());
-  }
   contact.velocity = static_cast<const T*>(pool.updated.data_ptr()) + 1;
   contact.stride = 1 + D;
-  if (apart) contact.result = static_cast<T*>(pool.velocity.data_ptr());
-  const Tensor& velocity = apart ? pool.velocity : pool.updated;
+  if (pool.velocity.defined()) contact.result = static_cast<T*>(pool.velocity.data_ptr());
+  const Tensor& velocity = pool.velocity.defined() ? pool.velocity : pool.updated;
   advance.gather.nodes = {static_cast<const T*>(velocity.data_ptr()) + 1, 1 + D, D};
 }
 

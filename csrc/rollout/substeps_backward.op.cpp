@@ -2,9 +2,10 @@
 #include "rollout/substeps.h"
 
 // The adjoint of n steps in one call. The steps are taken once more, and what each of them reads is recorded; then the
-// adjoint kernels go through them from the last to the first. Where sums have a fixed order, on the CPU and in
-// deterministic grids, the second time is the first bit by bit. Elsewhere it differs by rounding, and the gradient is
-// that of the second time.
+// adjoint kernels go through them from the last to the first. The active blocks and nodes of each step are kept as well
+// where they take less memory than its particles, and made once more elsewhere. Where sums have a fixed order, on the
+// CPU and in deterministic grids, the second time is the first bit by bit. Elsewhere it differs by rounding, and the
+// gradient is that of the second time.
 namespace mpm {
 namespace {
 
@@ -64,12 +65,8 @@ class SubstepsBackward {
     nodes_ = empty(in_.x, {s_.pool.nodes.size(0), 1 + D});
     if (gravity.defined()) change_ = empty(in_.x, {s_.activation.max_blocks, D});
     for (int64_t i = in_.n - 1; i >= 0; i--) {
-      if (i + 1 < in_.n) {
-        begin(i);
-        s_.move_grid(stream_);
-      } else {
-        set_time(i);  // its nodes are still there
-      }
+      if (i + 1 < in_.n) return_to(i);
+      set_time(i);
       leave_advance(i, adjoints);
       leave_grid(adjoints, gravity);
       leave_laws(adjoints);
@@ -91,21 +88,46 @@ class SubstepsBackward {
 
   int* status(int64_t i) const { return static_cast<int*>(status_.data_ptr()) + i * status_.stride(0); }
 
-  void begin(int64_t i) {
+  void read(int64_t i) {
     s_.read(state(i), mapped_[i]);
     for (LawUpdateArguments<T, D>& law : s_.laws) law.stress = stress_[i];
     s_.p2g.stress = constant(stress_[i]);
-    set_time(i);
+  }
+
+  // The active blocks of a step.
+  void activate(int64_t i) {
     STD_TORCH_CHECK(s_.activate(i == 0 ? nullptr : status(i - 1), status(i), stream_),
                     "max_blocks must be as many as the steps need, got ", in_.max_blocks);
   }
 
   void record() {
     for (int64_t i = 0; i < in_.n; i++) {
-      begin(i);
+      if (keeps_grids_ && i > 0) s_.make_pool(stream_);
+      read(i);
+      set_time(i);
+      activate(i);
       s_.write({x_[i], v_[i], C_[i], F_[i], J_[i], history_[i]});
       if (has(in_.material)) keep_others(i);
       s_.move(stream_);
+      if (!keeps_grids_) continue;
+      s_.pool.active.workspace = Tensor();
+      grids_.push_back({s_.activation, s_.pool});
+    }
+  }
+
+  // Everything as it was after the grid update of a step.
+  void return_to(int64_t i) {
+    read(i);
+    if (keeps_grids_) {
+      grids_.pop_back();  // of the step after it
+      s_.activation = grids_.back().activation;
+      s_.pool = grids_.back().pool;
+      s_.use_pool();
+      if (MPM_BACKEND != MPM_BACKEND_IS_cpu) s_.contact.activations = status(i) + kActivations;
+    } else {
+      set_time(i);
+      activate(i);
+      s_.move_grid(stream_);
     }
   }
 
@@ -121,6 +143,13 @@ class SubstepsBackward {
     }
   }
 
+  // Blocks and nodes of a step, for its adjoint.
+  struct Grid {
+    ActivateArguments<T, D> activation;
+    Pool<T, D> pool;
+  };
+
+  bool grid_is_small() const;
   void make_records();
   void make_terms(int64_t needs);
   void leave_advance(int64_t i, Adjoints& adjoints);
@@ -166,6 +195,8 @@ class SubstepsBackward {
   backend::Stream stream_;
   Substeps<T, D> s_;
   bool mls_;  // F and J move with the affine field, which is recorded then
+  bool keeps_grids_;
+  std::vector<Grid> grids_;
   std::vector<double> time_;
   Tensor first_history_, status_, scene_times_;
   Particles<const T> first_;
@@ -190,8 +221,20 @@ SubstepsBackward<T, D>::SubstepsBackward(const SubstepsInputs& in, const Optiona
   s_.make_pool(stream);
   s_.count_time(nullptr, stream_);
   if (has(in.scene_time)) make_scene_times();
+  keeps_grids_ = grid_is_small();
   make_records();
   make_terms(needs);
+}
+
+// Whether the grid of a step takes at most half of what the particles do; torch_mpm/rollouts.py counts on it.
+template <class T, int D>
+bool SubstepsBackward<T, D>::grid_is_small() const {
+  const Pool<T, D>& pool = s_.pool;
+  int64_t bytes = 0;
+  for (const Tensor* t : {&pool.active.table, &pool.active.block, &pool.active.offsets, &pool.active.index,
+                          &pool.active.schedule, &pool.nodes, &pool.updated, &pool.velocity})
+    if (t->defined()) bytes += t->numel() * t->element_size();
+  return 2 * bytes <= in_.x.size(0) * (2 * D + 4 * D * D) * int64_t(sizeof(T));
 }
 
 template <class T, int D>
