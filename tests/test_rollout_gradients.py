@@ -32,7 +32,11 @@ DT, STEPS = 1e-4, 5
 Rollout = Callable[[mpm.Step, mpm.State], mpm.State]
 
 
-def in_op(every: int | None = None, n: int = STEPS, dt: float = DT) -> Rollout:
+ALL = mpm.Checkpoints(memory=1e9)
+"""No step is taken again."""
+
+
+def in_op(every: int | mpm.Checkpoints | None = None, n: int = STEPS, dt: float = DT) -> Rollout:
     def run(step: mpm.Step, state: mpm.State) -> mpm.State:
         assert step.explain(state, dt) == "all steps between two kept states in one op"
         return mpm.rollout(step, state, n, dt, checkpoint=every)
@@ -116,7 +120,7 @@ def test_random_simulations(seed, device):
 
 
 @pytest.mark.parametrize("law", LAWS_HERE)
-@pytest.mark.parametrize("every", [1, 2, 7])
+@pytest.mark.parametrize("every", [1, 2, 7, ALL], ids=str)
 def test_laws(law, every, dim, device):
     step = mpm.Step(box(dim), with_gradients(LAWS_HERE[law]()), pulled(dim), walls="separate").to(device)
     state = moving(step, blob(device, dim))
@@ -141,7 +145,9 @@ def test_mixtures(deterministic, dim, device):
     material = torch.randint(0, 7, (400,), dtype=torch.int32, device=device)
     state = moving(step, blob(device, dim, 400)).replace(material=material, ids=torch.randperm(400).to(device))
     for start in (state, state.sorted(step.grid)):
-        assert_same(gradients(in_op(2), step, start), gradients(single(), step, start), "rollout")
+        expected = gradients(single(), step, start)
+        assert_same(gradients(in_op(2), step, start), expected, "rollout")
+        assert_same(gradients(in_op(ALL), step, start), expected, "rollout")
 
 
 def batch(dim: int, device: str) -> tuple[mpm.Step, mpm.State]:
@@ -162,7 +168,7 @@ def batch(dim: int, device: str) -> tuple[mpm.Step, mpm.State]:
     return step, moving(step, state)
 
 
-@pytest.mark.parametrize("every", [None, 2])
+@pytest.mark.parametrize("every", [None, 2, ALL], ids=str)
 def test_batches_with_obstacles_and_parameters_of_scenes_and_particles(every, dim, device):
     step, state = batch(dim, device)
     expected = gradients(single(), step, state)
@@ -175,7 +181,33 @@ def test_the_state_is_that_without_gradients(device):
     start = state.replace(v=state.v.clone().requires_grad_())
     with torch.no_grad():
         expected = mpm.rollout(step, state, STEPS, DT)
-    assert_equal(mpm.rollout(step, start, STEPS, DT, checkpoint=2), expected)
+    for every in (2, ALL):
+        step.reset()
+        assert_equal(mpm.rollout(step, start, STEPS, DT, checkpoint=every), expected)
+
+
+def test_a_record_of_all_steps_may_be_gone_through_twice(device):
+    step, state = batch(3, device)
+    v = state.v.clone().requires_grad_()
+    end = mpm.rollout(step, state.replace(v=v), STEPS, DT, checkpoint=ALL)
+    assert end.x.grad_fn.saved_tensors[0].numel() > 1000  # nothing is taken again
+    first, second = (torch.autograd.grad(loss(end), v, retain_graph=True)[0] for _ in range(2))
+    assert_same({"v": second}, {"v": first})
+    again = mpm.rollout(step, state.replace(v=v), STEPS, DT, checkpoint=2)
+    assert again.x.grad_fn.saved_tensors[0] is None
+    assert_same({"v": first}, {"v": torch.autograd.grad(loss(again), v)[0]})
+
+
+def test_the_status_goes_on_from_call_to_call_of_recorded_steps(device):
+    step, state = mpm.Step(box(2), mpm.NeoHookean(E=1e4, nu=0.3)), blob(device, 2)
+    start = state.replace(v=state.v.clone().requires_grad_())
+    middle = mpm.rollout(step, start, 3, DT, checkpoint=ALL)
+    x = middle.x.clone()
+    x[4] = 7.0
+    mpm.rollout(step, middle.replace(x=x), 3, DT, checkpoint=ALL)
+    assert int(step.status[0, 5]) == 6
+    with pytest.raises(mpm.SimulationError, match="step 3"):
+        step.check()
 
 
 @pytest.mark.parametrize("every,calls", [(1, 6), (4, 2), (6, 1), (100, 1), (None, 1)])
@@ -215,6 +247,7 @@ def test_lost_particles(law, form, device):
     expected = gradients(single(), step, state)
     assert all(bool(g.isfinite().all()) for g in expected.values() if g is not None)
     assert_same(gradients(in_op(2), step, state), expected)
+    assert_same(gradients(in_op(ALL), step, state), expected)
 
 
 def test_a_pool_that_grows():
@@ -223,6 +256,8 @@ def test_a_pool_that_grows():
     step = mpm.Step(box(dx=1 / 64), mpm.NeoHookean(**law))
     expected = gradients(single(8, dt), mpm.Step(box(dx=1 / 64), mpm.NeoHookean(**law)), state)
     assert_same(gradients(in_op(3, 8, dt), step, state), expected)
+    step = mpm.Step(box(dx=1 / 64), mpm.NeoHookean(**law))
+    assert_same(gradients(in_op(ALL, 8, dt), step, state), expected)
 
 
 def test_no_scenes(device):
@@ -335,6 +370,8 @@ def test_gradients_of_scenes_with_time_steps_of_their_own(device):
         gradients(lambda step, state: mpm.rollout(step, state, 5, dt, checkpoint=3), step, state),
         gradients(lambda step, state: one_by_one(step, state, 5, dt), step, state),
     ]
+    recorded = gradients(lambda step, state: mpm.rollout(step, state, 5, dt, checkpoint=ALL), step, state)
+    assert_same(recorded, ends[0])
     assert ends[0].keys() == ends[1].keys() and "gravity" in ends[0]
     for name, grad in ends[0].items():
         expected = ends[1][name]
@@ -359,17 +396,17 @@ def raw_arguments(device: str) -> list:
     walls = wall_arguments(mpm.Walls("slip"), grid)
     obstacles = obstacle_arguments(ball, state.x, 2)
     impulse = torch.randn(2, 5, 3, generator=g, dtype=F64).to(device)
-    rest = (*walls, *obstacles, 0.0, 2, 64, False, False, impulse, None, None, *grid.packed)
+    rest = (*walls, *obstacles, 0.0, 2, 64, False, False, False, impulse, None, None, *grid.packed)
     return [*particles, scene, None, material, None, *laws, *how, *rest]
 
 
 def test_the_raw_ops(device):
     call = raw_arguments(device)
-    wanted = (0, 1, 2, 3, 4, 5, 21, 38)
+    wanted = (0, 1, 2, 3, 4, 5, 21, 39)
     given = [t.clone().requires_grad_() if i in wanted else t for i, t in enumerate(call)]
     torch.library.opcheck(torch.ops.torch_mpm.substeps.default, tuple(given), raise_exception=True)
     grads = [torch.randn_like(t) for t in torch.ops.torch_mpm.substeps(*call)[:6] if t is not None]
-    adjoint = (*grads[:4], None, grads[4], torch.ones_like(call[38]), 15, *call)
+    adjoint = (*grads[:4], None, grads[4], torch.ones_like(call[39]), 15, None, *call)
     torch.library.opcheck(torch.ops.torch_mpm.substeps_backward.default, adjoint, raise_exception=True)
     with pytest.raises(RuntimeError, match=r"grad_x must have shape \[40, 2\]"):
         torch.ops.torch_mpm.substeps_backward(grads[0][:3], *adjoint[1:])

@@ -466,6 +466,7 @@ def test_the_raw_op(device):
         64,
         False,
         True,
+        False,
         None,
         None,
         None,

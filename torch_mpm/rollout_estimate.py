@@ -13,7 +13,7 @@ from .activation_record import aside
 from .checkpoints import Checkpoints, as_checkpoints
 from .errors import check_count
 from .rollout_parts import Parts
-from .rollouts import bytes_kept, obstacle_to_substeps, resolved, rollout, steps_of_a_call
+from .rollouts import EVERYTHING, bytes_kept, obstacle_to_substeps, resolved, rollout, steps_of_a_call
 from .state import State
 from .step import Step
 from .step_cost import differentiable, seconds
@@ -75,9 +75,11 @@ def estimate_rollout(
     first = parts.first_with_gradient()
     start = differentiable(step.prepare(state) if isinstance(step, Step) else state)
     with aside(step, start.x), torch.enable_grad():
+        keeps_all = False
         if kept is not None and kept.memory is not None:
             kept = resolved(kept, step, start, n - first, dt)
-        return _estimate(step, start, n - first, first, dt, kept)
+            keeps_all = kept is None
+        return _estimate(step, start, n - first, first, dt, kept, keeps_all)
 
 
 def _estimate(
@@ -87,6 +89,7 @@ def _estimate(
     prefix: int,
     dt: float | Tensor,
     kept: Checkpoints | None,
+    keeps_all: bool,
 ) -> RolloutEstimate:
     """Of n steps with gradients after so many without."""
     in_op = isinstance(step, Step) and obstacle_to_substeps(step, start, dt) is None
@@ -97,7 +100,7 @@ def _estimate(
     def taken() -> State:
         state = start
         for _ in range(calls):
-            state = rollout(step, state, trial // calls, dt)
+            state = rollout(step, state, trial // calls, dt, EVERYTHING if keeps_all else None)
         return state
 
     @torch.no_grad()
@@ -114,7 +117,7 @@ def _estimate(
     once, twice = (seconds(work, start.x.device) / trial for work in (forward, both))
     if n == 0:
         return RolloutEstimate(0, 0, prefix * once, 0, prefix)
-    if kept is None and not in_op:
+    if kept is None and (keeps_all or not in_op):
         return RolloutEstimate(of_state + n * of_step, 0, prefix * once + n * twice, 1, prefix + n)
     if kept is None:
         kept = Checkpoints(every=min(steps_of_a_call(start, n), n))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
+import sys
 from collections.abc import Callable
 from typing import Any
 
@@ -69,7 +70,7 @@ def rollout(
 
     A `Step` of compiled laws without heat, FLIP and functions of the user's takes all steps in one op, or some, with
     the results of single steps (to the last bit on the CPU and on deterministic grids); `Step.explain` tells. Its
-    gradients take the steps again from kept states, those of every `checkpoint` steps, sqrt(n) of them by default and
+    gradients take the steps again (unless all that they need fits into `Checkpoints(memory=...)`) from kept states, those of every `checkpoint` steps, sqrt(n) of them by default and
     more where states are small. A kept state of a solid has 2 D + 2 D² numbers per particle (24 in 3-D, 96 bytes in
     float32) and its history; while the backward pass goes through `checkpoint` steps, it holds about 2 D + 4 D² (42 in
     3-D) for each of them. Second derivatives need single steps. On CUDA and without gradients, other steps that call no
@@ -90,7 +91,7 @@ def rollout(
     if isinstance(step, Step):
         state = step.prepare(state)
     if kept is not None and kept.memory is not None and torch.is_grad_enabled():  # the same for all parts
-        kept = resolved(kept, step, state, n - parts.first_with_gradient(), dt)
+        kept = resolved(kept, step, state, n - parts.first_with_gradient(), dt) or EVERYTHING
     grid = step.grid if isinstance(step, Step) else None
     scales = (1, 1.0, dt) if grid is None else (grid.scenes, grid.dx, dt)
     return parts.run(lambda state, count, k: _taken(step, state, count, dt, kept, k), state, scales)
@@ -107,10 +108,12 @@ def _taken(
     """The state n steps later, of which the first is step `first` of a rollout."""
     if kept is not None and not torch.is_grad_enabled():
         kept = None
+    keeps_all = False
     if kept is not None and kept.memory is not None:
-        kept = resolved(kept, step, state, n, dt)
+        kept = None if kept == EVERYTHING else resolved(kept, step, state, n, dt)
+        keeps_all = kept is None
     if isinstance(step, Step) and obstacle_to_substeps(step, state, dt) is None:
-        return in_chunks(step, state, n, dt, kept)
+        return in_chunks(step, state, n, dt, kept, keeps_all)
     if isinstance(step, Step) and n > LEAST_STEPS and obstacle_to_replays(step, state, dt) is None:
         return replayed(step, state, n, dt)  # type: ignore[arg-type]
     grid = step.grid if isinstance(step, Step) else None
@@ -130,6 +133,10 @@ def _taken(
     if kept.states is not None:
         return binomial(single, state, n, kept.states, step)
     return in_segments(single, state, n, kept, step)
+
+
+EVERYTHING = Checkpoints(memory=sys.float_info.max)
+"""Of a memory into which all steps fit."""
 
 
 def resolved(
@@ -200,17 +207,22 @@ KEPT_BYTES = {"cpu": 2**24, "cuda": 2**28}
 hold, and so much that kernels on CUDA hide the time of Python."""
 
 
-def in_chunks(step: Step, state: State, n: int, dt: float | Tensor, kept: Checkpoints | None = None) -> State:
-    """The state n steps later, by calls of one op; `obstacle_to_substeps` must be None."""
+def in_chunks(
+    step: Step, state: State, n: int, dt: float | Tensor, kept: Checkpoints | None = None, keeps_all: bool = False
+) -> State:
+    """The state n steps later, by calls of one op; `obstacle_to_substeps` must be None. The op takes steps again where
+    it may not keep all that their gradient needs."""
     chunk = CHUNK if step.grid.grows and state.x.is_cuda else MOST_STEPS
 
     def advance(state: State, count: int, first: int = 0) -> State:
         while count > 0:
             now = min(count, chunk)
-            state, count = substeps(step, state, now, dt), count - now
+            state, count = substeps(step, state, now, dt, keeps_all), count - now
         return state
 
     if not wants_gradient(step, state):
+        return advance(state, n)
+    if keeps_all:
         return advance(state, n)
     chunk = min(chunk, kept.every if kept is not None and kept.every else steps_of_a_call(state, n))
     if kept is not None and kept.states is not None and n > 0:
@@ -256,8 +268,9 @@ def _differentiable(step: Step, state: State) -> list[Tensor]:
     return [*(t for t in fields if t is not None), *gravity, *step.law.parameters(), *step.law.buffers()]
 
 
-def substeps(step: Step, state: State, n: int, dt: float | Tensor) -> State:
-    """The state n steps later, by one op; `obstacle_to_substeps` must be None.
+def substeps(step: Step, state: State, n: int, dt: float | Tensor, records: bool = False) -> State:
+    """The state n steps later, by one op; `obstacle_to_substeps` must be None. It `records` what gradients need, if it
+    has any, or takes the steps again.
 
     Raises:
         ValueError: for a dt that is not positive and finite, or a material without a law.
@@ -265,7 +278,7 @@ def substeps(step: Step, state: State, n: int, dt: float | Tensor) -> State:
     """
 
     def advanced(state: State, dt: float | Tensor) -> State:
-        return _substeps(step, state, n, dt)
+        return _substeps(step, state, n, dt, records)
 
     return paused(advanced, step._activations, step.prepare(state), dt, step.grid.scenes, n)
 
@@ -282,14 +295,15 @@ def _clocks(state: State, dt: float | Tensor, scenes: int) -> tuple[float, Tenso
     return 1.0, each(dt), each(state.time)
 
 
-def _substeps(step: Step, state: State, n: int, dt: float | Tensor) -> State:
+def _substeps(step: Step, state: State, n: int, dt: float | Tensor, records: bool) -> State:
     """`substeps` of a prepared state, where no scene is paused."""
     grid, record = step.grid, step._activations
     number, scene_dt, scene_time = _clocks(state, dt, grid.scenes)
     max_blocks = grid.pool(state.x, state.scene)
     calls = _law_calls(step, state, dt)
     apic = step.transfer == "apic"
-    x, v, C, F, J, history, status, impulse, time = dispatch(
+    with_gradient = wants_gradient(step, state)
+    x, v, C, F, J, history, status, impulse, time, _ = dispatch(
         torch.ops.torch_mpm.substeps,
         *(state.x, state.v, state.mass, state.volume, state.C, state.F, state.J),
         [state.extra[name] for _, _, names in calls for name in names],
@@ -303,7 +317,7 @@ def _substeps(step: Step, state: State, n: int, dt: float | Tensor) -> State:
         *wall_arguments(step.walls, grid),
         *obstacle_arguments(step.boundaries.entries, state.x, grid.scenes),
         *(0.0 if scene_time is not None else float(state.time), grid.scenes, max_blocks, grid.grows),
-        not wants_gradient(step, state),
+        *(not with_gradient, with_gradient and records),
         *(state.impulse, scene_dt, scene_time, *grid.packed),
     )
     record.status = status

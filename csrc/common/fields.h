@@ -13,6 +13,11 @@ struct Field {
   int64_t stride[3] = {0, 0, 0};
 };
 
+template <class T>
+Field<const T> constant(const Field<T>& f) {
+  return {f.pointer, {f.stride[0], f.stride[1], f.stride[2]}};
+}
+
 // Node values [max_blocks * 4^D, channels] with unit channel stride.
 template <class T>
 struct NodeField {

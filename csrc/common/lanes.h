@@ -35,6 +35,16 @@ struct One {
   MPM_HD void store_integer(int* pointer, const T& value) const { pointer[p] = int(value); }
 };
 
+// What is stored is added to what is there.
+template <class At>
+struct Adding : At {
+  MPM_HD explicit Adding(const At& at) : At(at) {}
+  template <class T>
+  MPM_HD void store(T* pointer, int64_t stride, const typename At::Value& value) const {
+    At::store(pointer, stride, At::load(pointer, stride) + value);
+  }
+};
+
 template <class At, class T>
 MPM_HD typename At::Value load_scalar(const At& at, const Field<const T>& f) {
   return at.load(f.pointer, f.stride[0]);

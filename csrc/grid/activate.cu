@@ -14,7 +14,8 @@
 //   slots      numbers the active blocks in the order of the table (one-pass scan)
 //   offsets    first particle and work items of every slot (one-pass scan)
 //   place      the index tensor, base blocks and neighbours, unused slots, status
-// One kernel does all of it where an activation may last several steps, if only to find that it still does.
+// One kernel does all of it where there are few tiles, or where an activation may last several steps, if only to find
+// that it still does.
 // The scans pass over tiles of the table. Where it has many, over those alone that have active blocks, which `classify`
 // marks and `list_tiles` lists in their order; what they wrote is taken back before the next activation.
 // Deterministic mode replaces the ranks, which depend on the order of atomics, by a stable sort.
@@ -341,7 +342,7 @@ __device__ void slots(const ActivateArguments<T, D>& a, const Workspace& w, int 
         if (inside) active = active || w.tally[b - further(a.geometry, o)].touched >> o & 1;
       }
     }
-    const bool margin = Margin && b < table && !active && is_near_particles(a.geometry, w, b);
+    const bool margin = Margin && a.margin_blocks > 0 && b < table && !active && is_near_particles(a.geometry, w, b);
     const Packed before = exclusive_sum(pack(active, margin), w.slot_states, tile);
     if (last && threadIdx.x == kThreads - 1) {
       w.counters->wanted = first_of(before) + active;
@@ -491,13 +492,13 @@ __global__ void __launch_bounds__(kThreads) place_kernel(const ActivateArguments
   place(a, w, int64_t(blockIdx.x) * kThreads + threadIdx.x);
 }
 
-// All of it, in tensors as the activation before has left them; or another row of the status where that one lasts. The
-// thread blocks all run at once and wait for each other.
+// All of it, in fresh tensors where the table has few tiles, or as the activation before has left them; or another row
+// of the status where that one lasts. The thread blocks all run at once and wait for each other.
 template <int Order, class T, int D>
 __global__ void __launch_bounds__(kThreads)
-    activate_again(const ActivateArguments<T, D> a, const Workspace w, int table, int64_t rows) {
+    activate_at_once(const ActivateArguments<T, D> a, const Workspace w, int table, int64_t rows) {
   const int64_t start = int64_t(blockIdx.x) * kThreads + threadIdx.x, stride = int64_t(gridDim.x) * kThreads;
-  if (a.drift->lasts(a.particles)) {
+  if (a.drift && !a.fresh && a.drift->lasts(a.particles)) {
     for (int64_t row = start; row <= a.scenes; row += stride) {
       int* const status = a.status + row * kStatusSize;
       copy_status(a.previous_status + row * kStatusSize, status);
@@ -544,8 +545,8 @@ void activate(const ActivateArguments<T, D>& a, Stream stream) {
   const int table = a.scenes * a.geometry.blocks_per_scene;
   // Of slots with their end, or of the status; and of particles.
   const int64_t rows = std::max(a.particles, int64_t(std::max(a.slots(), a.scenes)) + 1);
-  if (a.drift && !a.fresh) {
-    launch_together(activate_again<Order, T, D>, blocks_for(rows), kThreads, stream, a, w, table, rows);
+  if ((a.drift && !a.fresh) || (!w.marked && !a.deterministic)) {
+    launch_together(activate_at_once<Order, T, D>, blocks_for(rows), kThreads, stream, a, w, table, rows);
     return;
   }
   // Of the tiles listed no more have to run at once than the device takes.

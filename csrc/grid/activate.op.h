@@ -37,18 +37,29 @@ ActivateArguments<T, D> activate_arguments(const PackedLattice& packed, const Te
 struct ActivationTensors {
   Tensor table, block, offsets, index, schedule, workspace;
 
-  // For the arguments' number of blocks, which then write here.
-  template <class T, int D>
-  void make(const Tensor& x, ActivateArguments<T, D>& a, backend::Stream stream) {
+  // For the arguments' number of blocks, by allocate(shape).
+  template <class T, int D, class Allocate>
+  void lay_out(ActivateArguments<T, D>& a, const Allocate& allocate) {
     const int64_t slots = a.slots();
     a.schedule_size = schedule_size<D>(slots, a.particles);
-    table = empty_int(x, {a.scenes * a.geometry.blocks_per_scene});
-    block = empty_int(x, {slots});
-    offsets = empty_int(x, {slots + 1});
-    index = empty_int(x, {a.particles});
-    schedule = empty_int(x, {a.schedule_size});
+    table = allocate({a.scenes * a.geometry.blocks_per_scene});
+    block = allocate({slots});
+    offsets = allocate({slots + 1});
+    index = allocate({a.particles});
+    schedule = allocate({a.schedule_size});
+  }
+
+  template <class T, int D>
+  void make(const Tensor& x, ActivateArguments<T, D>& a, backend::Stream stream) {
+    lay_out(a, [&](const Shape& shape) { return empty_int(x, shape); });
     a.workspace_size = backend::activate_workspace(a, stream);
-    workspace = empty(x, {a.workspace_size}, ScalarType::Byte);
+    use(a, empty(x, {a.workspace_size}, ScalarType::Byte));
+  }
+
+  // The arguments write here from now on.
+  template <class T, int D>
+  void use(ActivateArguments<T, D>& a, const Tensor& memory) {
+    workspace = memory;
     a.workspace = workspace.data_ptr();
     a.fresh = true;
     a.table = static_cast<int*>(table.data_ptr());

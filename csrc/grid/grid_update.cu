@@ -1,4 +1,4 @@
-#include "cuda/launch.cuh"
+#include "cuda/chain.cuh"
 #include "grid/grid_update.h"
 
 namespace mpm::cuda {
@@ -10,6 +10,7 @@ constexpr int kLanes = kBlockNodes<D> < 32 ? kBlockNodes<D> : 32;  // lanes of a
 
 template <class T, int D>
 __global__ void __launch_bounds__(kThreads) grid_update_kernel(const GridUpdateArguments<T, D> a) {
+  wait_for_kernel_before();
   const int64_t node = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   const int slot = int(node / kBlockNodes<D>);
   if (slot >= a.max_blocks) return;
@@ -19,6 +20,7 @@ __global__ void __launch_bounds__(kThreads) grid_update_kernel(const GridUpdateA
 // A whole warp, or half of one in 2-D, works on a slot and sums over its nodes in a fixed order.
 template <class T, int D>
 __global__ void __launch_bounds__(kThreads) grid_update_backward_kernel(const GridUpdateBackwardArguments<T, D> a) {
+  wait_for_kernel_before();
   const int64_t thread = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   const int64_t slot = thread / kLanes<D>;
   const int lane = int(thread % kLanes<D>);
@@ -51,13 +53,14 @@ unsigned blocks_for(int64_t max_blocks, int64_t threads_per_slot) {
 template <class T, int D>
 void grid_update(const GridUpdateArguments<T, D>& a, Stream stream) {
   if (a.max_blocks == 0) return;
-  launch(grid_update_kernel<T, D>, blocks_for(a.max_blocks, kBlockNodes<D>), kThreads, 0, stream, a);
+  launch_in_chain(grid_update_kernel<T, D>, blocks_for(a.max_blocks, kBlockNodes<D>), kThreads, 0, stream, a);
 }
 
 template <class T, int D>
 void grid_update_backward(const GridUpdateBackwardArguments<T, D>& a, Stream stream) {
   if (a.forward.max_blocks == 0) return;
-  launch(grid_update_backward_kernel<T, D>, blocks_for(a.forward.max_blocks, kLanes<D>), kThreads, 0, stream, a);
+  launch_in_chain(grid_update_backward_kernel<T, D>, blocks_for(a.forward.max_blocks, kLanes<D>), kThreads, 0, stream,
+                  a);
 }
 
 MPM_INSTANTIATE(grid_update, GridUpdateArguments)

@@ -20,6 +20,13 @@ struct TangentScatterArguments {
   NodeField<T> nodes;  // zero on entry, D channels
 };
 
+// Stresses T_p L_p, in the place of the moments or gradients of a gather.
+template <class T, int D>
+struct TangentGatherArguments {
+  GatherArguments<T, D> gather;
+  Field<const T> tangent;  // [P, kTangentEntries<D>]
+};
+
 // The diagonal blocks of Σ_p (∇N)ᵀ T_p ∇N.
 template <class T, int D>
 struct NodeBlocksArguments {

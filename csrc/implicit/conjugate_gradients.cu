@@ -4,7 +4,7 @@
 namespace mpm::cuda {
 namespace {
 
-constexpr int kThreads = 128, kSumThreads = 256, kLanes = 16;  // lanes that share a slot
+constexpr int kThreads = 128, kSumThreads = 1024, kLanes = 16;  // lanes that share a slot
 
 enum class Pass : int { start, curvature, step, turn };
 

@@ -7,37 +7,58 @@
 namespace mpm {
 namespace {
 
-// The product of the tangents alone: a gather, and a scatter with the tangents in it. The velocity gradients between
-// them have a buffer for many products.
+// The product of the tangents alone: a gather and a scatter, on the CPU with the tangents in the scatter, on CUDA in
+// the gather, where their loads wait beside others. What is between them has a buffer for many products.
 template <class T, int D>
 class TangentProduct {
  public:
   TangentProduct(const Tensor& x, const Tensor& tangent, int64_t stress_form, const PackedTopology& blocks)
-      : order_(blocks.order()), gradient_(empty_particles(x, {x.size(0), D, D})) {
+      : order_(blocks.order()), between_(empty_particles(x, {x.size(0), D, D})) {
     const int64_t P = x.size(0);
-    scatter_.form = stress_form_of(stress_form);
-    gather_.topology = scatter_.topology = blocks.unpack<T, D>(x);
-    gather_.x = scatter_.x = input<T>(x, "x", x, {P, D});
-    gather_.moment_scale = blocks.inverse_inertia();
-    (scatter_.form == StressForm::mls ? gather_.moment : gather_.gradient) = field<T>(gradient_);
-    scatter_.gradient = field<const T>(gradient_);
-    scatter_.tangent = input<T>(tangent, "tangent", x, {P, kTangentEntries<D>});
+    const StressForm form = stress_form_of(stress_form);
+    const Field<const T> tangents = input<T>(tangent, "tangent", x, {P, kTangentEntries<D>});
+    GatherArguments<T, D> gather;
+    gather.topology = scatter_.topology = blocks.unpack<T, D>(x);
+    gather.x = scatter_.x = input<T>(x, "x", x, {P, D});
+    gather.moment_scale = blocks.inverse_inertia();
+    (form == StressForm::mls ? gather.moment : gather.gradient) = field<T>(between_);
     scatter_.deterministic = blocks.deterministic();
+#if MPM_BACKEND == MPM_BACKEND_IS_cpu
+    gather_ = gather;
+    scatter_.form = form;
+    scatter_.gradient = field<const T>(between_);
+    scatter_.tangent = tangents;
+#else
+    gather_ = {gather, tangents};
+    scatter_.moment_scale = gather.moment_scale;
+    (form == StressForm::mls ? scatter_.moment : scatter_.gradient) = field<const T>(between_);
+#endif
   }
 
   // Adds to `to`.
   void operator()(const T* direction, T* to, const DeviceScope& device) {
-    gather_.nodes = {direction, D, D};
     scatter_.nodes = {to, D, D};
+#if MPM_BACKEND == MPM_BACKEND_IS_cpu
+    gather_.nodes = {direction, D, D};
     backend::gather(order_, gather_, device.stream());
     backend::tangent_scatter(order_, scatter_, device.stream());
+#else
+    gather_.gather.nodes = {direction, D, D};
+    backend::tangent_gather(order_, gather_, device.stream());
+    backend::scatter(order_, scatter_, device.stream());
+#endif
   }
 
  private:
   int64_t order_;
-  Tensor gradient_;
+  Tensor between_;
+#if MPM_BACKEND == MPM_BACKEND_IS_cpu
   GatherArguments<T, D> gather_;
   TangentScatterArguments<T, D> scatter_;
+#else
+  TangentGatherArguments<T, D> gather_;
+  ScatterArguments<T, D> scatter_;
+#endif
 };
 
 // A contiguous node tensor [N, ...].

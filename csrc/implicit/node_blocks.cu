@@ -19,6 +19,28 @@ __device__ int locate_particle(const NodeBlocksArguments<T, D>& a, const Schedul
   return locate_in_block<Order>(a.topology, scene_of(a.topology, block), block, x, base, f) ? slot : -1;
 }
 
+// Two entries at a time where there are vector atomics: rows of six begin at whole pairs.
+template <int D, class T>
+__device__ void add_upper(T* row, const T (&upper)[kSymmetric<D>], bool alone) {
+#if __CUDA_ARCH__ >= 900
+  if constexpr (sizeof(T) == 4 && kSymmetric<D> % 2 == 0) {
+    if (!alone) {
+#pragma unroll
+      for (int k = 0; k < kSymmetric<D>; k += 2)
+        atomicAdd(reinterpret_cast<float2*>(row + k), make_float2(upper[k], upper[k + 1]));
+      return;
+    }
+  }
+#endif
+#pragma unroll
+  for (int k = 0; k < kSymmetric<D>; k++) {
+    if (alone)
+      row[k] += upper[k];
+    else
+      atomicAdd(row + k, upper[k]);
+  }
+}
+
 template <int Order, class T, int D>
 __device__ void add_particle(const NodeBlocksArguments<T, D>& a, const Schedule<const int>& s, int p, bool alone) {
   constexpr int S = Order + 1, nodes = D == 2 ? S * S : S * S * S;
@@ -45,16 +67,13 @@ __device__ void add_particle(const NodeBlocksArguments<T, D>& a, const Schedule<
     const Matrix<T, D> block =
         node_block(tangent, gradient_weight<Order, T, D>(a.form, w, slope, offset, f, a.topology.geometry.inverse_dx));
     T* const row = a.nodes.pointer + (int64_t(to) * kBlockNodes<D> + node_in_block<D>(node)) * a.nodes.stride;
+    T upper[kSymmetric<D>];
     int channel = 0;
 #pragma unroll
     for (int i = 0; i < D; i++)
 #pragma unroll
-      for (int j = i; j < D; j++, channel++) {
-        if (alone)
-          row[channel] += block[i][j];
-        else
-          atomicAdd(row + channel, block[i][j]);
-      }
+      for (int j = i; j < D; j++, channel++) upper[channel] = block[i][j];
+    add_upper<D>(row, upper, alone);
   }
 }
 

@@ -35,6 +35,8 @@ struct LawLoops {
     by_groups<kBytes>(a.law, [&](const auto& at) { Kernels::update(a, at); });
   }
   static void update_backward(const LawBackwardArguments<T, D>& a, void*) {
+    if constexpr (kChangesNothing<Law>)
+      if (a.adds) return by_groups<kBytes>(a.law, [&](const auto& at) { Kernels::update_backward(a, Adding(at)); });
     by_groups<kBytes>(a.law, [&](const auto& at) { Kernels::update_backward(a, at); });
   }
   static void double_backward(const LawDoubleBackwardArguments<T, D>& a, void*) {

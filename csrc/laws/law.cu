@@ -14,15 +14,18 @@ constexpr int kUpdateBlocks = sizeof(T) == 4 ? Law::gpu_update_blocks : (Law::gp
 template <class Law, class T, int D>
 __global__ void __launch_bounds__(Law::gpu_threads, kUpdateBlocks<Law, T>)
     law_update_kernel(const LawUpdateArguments<T, D> a) {
+  wait_for_kernel_before();
   const int64_t p = int64_t(blockIdx.x) * Law::gpu_threads + threadIdx.x;
   if (p < a.law.particles && a.law.members.has(p)) Law::template Kernels<Law>::update(a, One<T>{p});
 }
 
-template <class Law, class T, int D>
+template <class Law, bool Adds, class T, int D>
 __global__ void __launch_bounds__(Law::gpu_threads, Law::gpu_backward_blocks)
     law_backward_kernel(const LawBackwardArguments<T, D> a) {
+  wait_for_kernel_before();
+  using At = std::conditional_t<Adds, Adding<One<T>>, One<T>>;
   const int64_t p = int64_t(blockIdx.x) * Law::gpu_threads + threadIdx.x;
-  if (p < a.law.particles && a.law.members.has(p)) Law::template Kernels<Law>::update_backward(a, One<T>{p});
+  if (p < a.law.particles && a.law.members.has(p)) Law::template Kernels<Law>::update_backward(a, At(One<T>{p}));
 }
 
 template <class Law, class T, int D>
@@ -99,18 +102,26 @@ struct FusedLaunch<Law, float, D> {
 
 template <class Law, class T, int D>
 struct LawLaunches : FusedLaunch<Law, T, D> {
+  static unsigned blocks(int64_t particles) { return unsigned((particles + Law::gpu_threads - 1) / Law::gpu_threads); }
   template <class Arguments>
   static void for_particles(void (*kernel)(Arguments), const Arguments& a, void* stream) {
-    if (a.law.particles == 0) return;
-    const unsigned blocks = unsigned((a.law.particles + Law::gpu_threads - 1) / Law::gpu_threads);
-    launch(kernel, blocks, Law::gpu_threads, 0, static_cast<Stream>(stream), a);
+    if (a.law.particles > 0)
+      launch(kernel, blocks(a.law.particles), Law::gpu_threads, 0, static_cast<Stream>(stream), a);
+  }
+  // Of a kernel that waits for the one before it.
+  template <class Arguments>
+  static void in_chain(void (*kernel)(Arguments), const Arguments& a, void* stream) {
+    if (a.law.particles > 0)
+      launch_in_chain(kernel, blocks(a.law.particles), Law::gpu_threads, 0, static_cast<Stream>(stream), a);
   }
 
   static void update(const LawUpdateArguments<T, D>& a, void* stream) {
-    for_particles(law_update_kernel<Law, T, D>, a, stream);
+    in_chain(law_update_kernel<Law, T, D>, a, stream);
   }
   static void update_backward(const LawBackwardArguments<T, D>& a, void* stream) {
-    for_particles(law_backward_kernel<Law, T, D>, a, stream);
+    if constexpr (kChangesNothing<Law>)
+      if (a.adds) return in_chain(law_backward_kernel<Law, true, T, D>, a, stream);
+    in_chain(law_backward_kernel<Law, false, T, D>, a, stream);
   }
   static void double_backward(const LawDoubleBackwardArguments<T, D>& a, void* stream) {
     for_particles(law_double_backward_kernel<Law, T, D>, a, stream);

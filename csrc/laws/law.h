@@ -92,6 +92,7 @@ struct LawBackwardArguments {
   LawArguments<T, D> law;
   Field<const T> grad_state, grad_stress, grad_history, grad_dissipated, grad_multiplier;  // each may be absent
   Field<T> state, C, parameters, history;  // adjoints per particle, parameters [P, n], history [P, m]; or absent
+  bool adds = false;                       // to what is there; of laws that change nothing
 };
 
 // The derivative of the adjoints of the stress, along a direction in (state, C, parameters).
@@ -145,6 +146,9 @@ template <class Law>
 constexpr int kParameters = int(Law::parameters.size());
 template <class Law>
 constexpr int kHistory = int(Law::history.size());
+// Whether a law changes neither deformation nor history.
+template <class Law>
+constexpr bool kChangesNothing = !Law::plastic && kHistory<Law> == 0;
 // Length of arrays that hold it.
 template <class Law>
 constexpr int kHistoryLength = kHistory<Law> > 0 ? kHistory<Law> : 1;

@@ -17,6 +17,8 @@ struct LawInfo {
        twice_differentiable_energy = false, has_tangent = false, in_2d = true;
   std::vector<Quantity> parameters, history;
   std::vector<const char*> options;
+
+  bool changes() const { return plastic || !history.empty(); }  // deformation or history
 };
 
 // Of one scalar and dimension; the stream is that of CUDA, or null. Kernels that a law has not are null.
@@ -91,6 +93,8 @@ LawInfo info_of() {
 template <template <class, class, int> class Kernels, class Law, class T, int D>
 void fill_kernels(LawEntry& entry) {
   static_assert(kParameters<Law> <= kMostParameters && kHistory<Law> <= kMostHistory);
+  static_assert(kChangesNothing<Law> || (!Law::viscous && Law::field == Deformation::gradient),
+                "rollout/substeps_backward.op.cpp has no term for it");
   if constexpr (D == 3 || Law::in_2d) {
     using K = Kernels<Law, T, D>;
     LawKernels<T, D>& kernels = entry.template kernels<T, D>();

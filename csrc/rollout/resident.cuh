@@ -511,14 +511,13 @@ void launch_resident(const Source& source, const Task& task, const ResidentArgum
                          blocks * int64_t(SceneBlocks<T, D>::bytes) + 5 * 1024;  // and what the kernel declares itself
   // The order of sums depends on the number of threads, so that of deterministic scenes is always the same.
   const bool in_order = a.p2g.deterministic;
-  const int threads_in_order = D == 2 ? kResidentThreads / 2 : kResidentThreads;
-  const int64_t beside = std::min<int64_t>(
-      {all / wanted, (a.scenes + processors - 1) / processors, in_order ? kResidentThreads / threads_in_order : 4});
+  const int64_t beside = std::min<int64_t>({all / wanted, (a.scenes + processors - 1) / processors, in_order ? 1 : 4});
   const int together = int(std::max<int64_t>(beside, 1));
   const int shared = std::min(most, all / together - 5 * 1024);
-  const int64_t useful = std::max<int64_t>(128, (particles + 31) / 32 * 32);
+  // Alone on its multiprocessor, a scene of a few particles is faster with all threads, for the nodes.
+  const int64_t useful = together == 1 ? kResidentThreads : std::max<int64_t>(128, (particles + 31) / 32 * 32);
   const int threads =
-      in_order ? threads_in_order : int(std::min<int64_t>(kResidentThreads / together / 32 * 32, useful));
+      in_order ? kResidentThreads : int(std::min<int64_t>(kResidentThreads / together / 32 * 32, useful));
   launch(resident_kernel<Source, Task, T, D>, unsigned(a.scenes + 1), unsigned(threads), size_t(shared), stream, source,
          task, a, shared);
 }

@@ -19,7 +19,8 @@ namespace mpm {
   "scene, Tensor? ids, Tensor? material, Tensor? previous_status, str laws, int[] options, Tensor[] parameters, "  \
   "int[] variables, int n, float dt, bool apic, bool wants_C, int stress_form, Tensor? gravity, " MPM_WALLS_SCHEMA \
   ", Tensor? obstacles, Tensor? data, int[] shape, int[] sizes, int[] contact, int[] obstacle_scene, "             \
-  "float[] start, float[] end, float time, int scenes, int max_blocks, bool grows, bool resident, Tensor? "        \
+  "float[] start, float[] end, float time, int scenes, int max_blocks, bool grows, bool resident, bool records, "  \
+  "Tensor? "                                                                                                       \
   "impulse, Tensor? scene_dt, Tensor? scene_time, " MPM_LATTICE_SCHEMA
 #define MPM_SUBSTEPS_PARAMETERS                                                                                        \
   const Tensor &x, const Tensor &v, const Tensor &mass, const Tensor &volume, const OptionalTensor &C,                 \
@@ -31,13 +32,13 @@ namespace mpm {
       const OptionalTensor &obstacle_table, const OptionalTensor &obstacle_data, std::vector<int64_t> shape,           \
       std::vector<int64_t> sizes, std::vector<int64_t> contact_kind, std::vector<int64_t> obstacle_scene,              \
       std::vector<double> start, std::vector<double> end, double time, int64_t scenes, int64_t max_blocks, bool grows, \
-      bool resident, const OptionalTensor &impulse, const OptionalTensor &scene_dt, const OptionalTensor &scene_time,  \
-      const std::vector<double>&lattice, const std::vector<int64_t>&layout
+      bool resident, bool records, const OptionalTensor &impulse, const OptionalTensor &scene_dt,                      \
+      const OptionalTensor &scene_time, const std::vector<double>&lattice, const std::vector<int64_t>&layout
 #define MPM_SUBSTEPS_ARGUMENTS                                                                                         \
   x, v, mass, volume, C, F, J, history, scene, ids, material, previous_status, laws, options, parameters, variables,   \
       n, dt, apic, wants_C, stress_form, gravity, wall_kind, wall_plane, wall_friction, obstacle_table, obstacle_data, \
-      shape, sizes, contact_kind, obstacle_scene, start, end, time, scenes, max_blocks, grows, resident, impulse,      \
-      scene_dt, scene_time, PackedLattice(lattice, layout)
+      shape, sizes, contact_kind, obstacle_scene, start, end, time, scenes, max_blocks, grows, resident, records,      \
+      impulse, scene_dt, scene_time, PackedLattice(lattice, layout)
 
 // The arguments of a call.
 struct SubstepsInputs {
@@ -61,7 +62,7 @@ struct SubstepsInputs {
   std::vector<double> start, end;
   double time;
   int64_t scenes, max_blocks;
-  bool grows, resident;
+  bool grows, resident, records;
   OptionalTensor impulse, scene_dt, scene_time;
   PackedLattice lattice;
 };
@@ -131,11 +132,24 @@ struct Pool {
   Tensor nodes, updated, velocity;
 
   void make(const Tensor& x, ActivateArguments<T, D>& a, bool obstacles, backend::Stream stream) {
-    const int64_t rows = int64_t(a.slots()) * kBlockNodes<D>;
     active.make(x, a, stream);
-    nodes = empty(x, {rows, 1 + D});
-    updated = empty(x, {rows, 1 + D});
-    if (obstacles) velocity = empty(x, {rows, 1 + D});
+    lay_out_nodes(a, obstacles, [&](const Shape& shape) { return empty(x, shape); });
+  }
+
+  // By allocate(shape, type), but for the workspace.
+  template <class Allocate>
+  void lay_out(const Tensor& x, ActivateArguments<T, D>& a, bool obstacles, const Allocate& allocate) {
+    active.lay_out(a, [&](const Shape& shape) { return allocate(shape, ScalarType::Int); });
+    lay_out_nodes(a, obstacles, [&](const Shape& shape) { return allocate(shape, x.scalar_type()); });
+  }
+
+ private:
+  template <class Allocate>
+  void lay_out_nodes(const ActivateArguments<T, D>& a, bool obstacles, const Allocate& allocate) {
+    const Shape shape{int64_t(a.slots()) * kBlockNodes<D>, 1 + D};
+    nodes = allocate(shape);
+    updated = allocate(shape);
+    if (obstacles) velocity = allocate(shape);
   }
 };
 
@@ -153,11 +167,6 @@ Topology<T, D> topology_of(const ActivateArguments<T, D>& a) {
   t.schedule = a.schedule;
   t.schedule_size = a.schedule_size;
   return t;
-}
-
-template <class T>
-Field<const T> constant(const Field<T>& f) {
-  return {f.pointer, {f.stride[0], f.stride[1], f.stride[2]}};
 }
 
 // Where the fields of the particles are; absent where a simulation has none.

@@ -1,4 +1,4 @@
-#include "rollout/substeps.h"
+#include "rollout/recorded.h"
 #include "rollout/replay.h"
 
 // n steps of a simulation in one call.
@@ -44,7 +44,42 @@ void take_resident(Substeps<T, D>& s, int64_t n, double time, const int* activat
 }
 #endif
 
-std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> substeps(MPM_SUBSTEPS_PARAMETERS) {
+using Results = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
+
+// Everything that the adjoint reads is kept. Nothing where there is no room, and it has to be told when that was.
+template <class T, int D>
+std::optional<Results> take_recorded(const SubstepsInputs& in, const int* status_before, backend::Stream stream) {
+  Recorded<T, D> r(in, {}, status_before, stream);
+  bool room = false;
+  with_team(in.x.size(0) * in.n, [&] { room = r.take(); });
+  if (!room) return {};
+  const int64_t last = in.n - 1;
+  Tensor status = empty_int(in.x, {1 + in.scenes, kStatusSize});
+  torch::stable::copy_(status, torch::stable::from_blob(r.status(last), Shape{1 + in.scenes, kStatusSize},
+                                                        Shape{kStatusSize, 1}, in.x.device(), ScalarType::Int));
+  const auto copy = [&](bool wanted, const auto& record, auto view) {
+    if (!wanted) return Tensor();
+    const Tensor from = (record.*view)(last);
+    Shape shape(from.dim());
+    for (size_t i = 0; i < shape.size(); i++) shape[i] = from.size(int64_t(i));
+    Tensor to = empty_particles(in.x, shape);
+    torch::stable::copy_(to, from);
+    return to;
+  };
+  using R = Record<T>;
+  return Results{copy(true, r.x, &R::vector),
+                 copy(true, r.v, &R::vector),
+                 copy(in.wants_C, r.C, &R::matrix),
+                 copy(has(in.F), r.F, &R::matrix),
+                 copy(has(in.J), r.J, &R::scalar),
+                 copy(r.steps.columns > 0, r.history, &R::vector),
+                 status,
+                 Tensor(),
+                 has(in.scene_time) ? r.scene_time_after() : Tensor(),
+                 r.memory()};
+}
+
+Results substeps(MPM_SUBSTEPS_PARAMETERS) {
   const SubstepsInputs in{MPM_SUBSTEPS_ARGUMENTS};
   check_positions(x);
   const int64_t P = x.size(0), D_ = x.size(1);
@@ -54,6 +89,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tenso
   Tensor v_ = empty_particles(x, {P, D_}), C_ = result(x, wants_C, {P, D_, D_}), history_;
   Tensor status[] = {empty_int(x, {1 + scenes, kStatusSize}), empty_int(x, {1 + scenes, kStatusSize})};
   Tensor impulse_, time_;
+  std::optional<Results> recorded;
   int64_t step = 0;
   bool taken = false;  // by resident scenes, all steps
   const DeviceScope device(x);
@@ -66,6 +102,13 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tenso
   };
   dispatch(x, [&]<class T, int D>() {
     const backend::Stream stream = device.stream();
+    if (records && !has(impulse) && P > 0) {
+      const int* const before = has(previous_status)
+                                    ? int_pointer(*previous_status, "previous_status", x, {1 + scenes, kStatusSize})
+                                    : nullptr;
+      recorded = take_recorded<T, D>(in, before, stream);
+      if (recorded) return;
+    }
     Substeps<T, D> s(in);
     history_ = packed_history(x, history, s.columns);
     const int* before = s.previous_status;
@@ -132,12 +175,14 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tenso
       }
     });
   });
+  if (recorded) return *recorded;
   if (step == 0) {
     if (!taken) start_in_results();  // the first activation found no room
-    return {x_[0], v_, C_, F_[0], J_[0], history_, status[0], impulse_, time_};
+    return {x_[0], v_, C_, F_[0], J_[0], history_, status[0], impulse_, time_, Tensor()};
   }
   const int last = int(step + 1) % 2;
-  return {x_[last], v_, C_, F_[last], J_[last], history_, status[step < n ? 1 - last : last], impulse_, time_};
+  return {x_[last], v_,    C_,      F_[last], J_[last], history_, status[step < n ? 1 - last : last],
+          impulse_, time_, Tensor()};
 }
 
 }  // namespace
@@ -147,7 +192,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tenso
 STABLE_TORCH_LIBRARY_FRAGMENT(torch_mpm, m) {
   m.def("substeps(" MPM_SUBSTEPS_SCHEMA
         ") -> (Tensor x, Tensor v, Tensor C, Tensor F, Tensor J, Tensor history, Tensor status, Tensor "
-        "impulse, Tensor time)");
+        "impulse, Tensor time, Tensor record)");
 }
 #endif
 

@@ -1,50 +1,15 @@
-#include "rollout/kernels.h"
-#include "rollout/substeps.h"
+#include "rollout/recorded.h"
 
-// The adjoint of n steps in one call. The steps are taken once more, and what each of them reads is recorded; then the
-// adjoint kernels go through them from the last to the first. The active blocks and nodes of each step are kept as well
-// where they take less memory than its particles, and made once more elsewhere. Where sums have a fixed order, on the
-// CPU and in deterministic grids, the second time is the first bit by bit. Elsewhere it differs by rounding, and the
-// gradient is that of the second time.
+// The adjoint of n steps in one call. The steps are taken once more, and what each of them reads is recorded, or it has
+// been when they were taken first; then the adjoint kernels go through them from the last to the first. Where sums have
+// a fixed order, on the CPU and in deterministic grids, the second time is the first bit by bit. Elsewhere it differs
+// by rounding, and the gradient is that of the second time.
 namespace mpm {
 namespace {
-
-// A field of the particles at many steps, structures of arrays one after another.
-template <class T>
-class Record {
- public:
-  Record() = default;  // of an absent field
-  Record(const Tensor& x, int64_t steps, int64_t rows = 1, int64_t columns = 1)
-      : shape_{x.size(0), rows, columns},
-        pitch_(particle_pitch(x, x.size(0))),
-        tensor_(empty(x, {steps, rows * columns, pitch_})) {}
-
-  Field<T> operator[](int64_t step) const {
-    if (!tensor_.defined()) return {};
-    return {pointer(step), {1, shape_[2] * pitch_, pitch_}};
-  }
-
-  // The same as a tensor [P, rows, columns], which must not outlive this.
-  Tensor view(int64_t step) const {
-    return torch::stable::from_blob(pointer(step), shape_, Shape{1, shape_[2] * pitch_, pitch_}, tensor_.device(),
-                                    tensor_.scalar_type());
-  }
-
-  void clear() { torch::stable::zero_(tensor_); }
-
- private:
-  T* pointer(int64_t step) const { return static_cast<T*>(tensor_.data_ptr()) + step * tensor_.stride(0); }
-
-  Shape shape_;
-  int64_t pitch_ = 0;
-  Tensor tensor_;
-};
 
 // Per particle; undefined where there is none.
 struct Adjoints {
   Tensor x, v, C, F, J, history, mass, volume, parameters;  // the last [P, n], of all laws
-
-  std::vector<Tensor*> all() { return {&x, &v, &C, &F, &J, &history, &mass, &volume, &parameters}; }
 };
 
 // Bits of `needs`, in the order of the returned tensors after those of the state.
@@ -53,20 +18,22 @@ enum Need : int64_t { kMass = 1, kVolume = 2, kParameters_ = 4, kGravity = 8 };
 template <class T, int D>
 class SubstepsBackward {
  public:
-  // `grad_impulse` is the adjoint of the impulses at the end, or nothing.
-  SubstepsBackward(const SubstepsInputs& in, const OptionalTensor& grad_impulse, int64_t needs, backend::Stream stream);
+  // `grad_impulse` is the adjoint of the impulses at the end, or nothing; `record` is of the steps, or nothing.
+  SubstepsBackward(const SubstepsInputs& in, const OptionalTensor& grad_impulse, const OptionalTensor& record,
+                   int64_t needs, backend::Stream stream);
 
   int64_t columns() const { return s_.columns; }  // of the history of all laws
   int64_t blocks() const { return s_.update.block_count; }
 
   // The adjoints of the state at the end become those of the state at the beginning, and the others are added up.
   void run(Adjoints& adjoints, const Tensor& gravity) {
-    record();
-    nodes_ = empty(in_.x, {s_.pool.nodes.size(0), 1 + D});
-    if (gravity.defined()) change_ = empty(in_.x, {s_.activation.max_blocks, D});
+    if (!recorded_) check_room(r_.take());
+    const int64_t slots = s_.activation.slots(), rows = slots * kBlockNodes<D>;
+    for (Tensor* t : {&motion_, &update_}) *t = empty(in_.x, {rows, 1 + D});
+    if (s_.obstacles) contact_ = empty(in_.x, {rows, 1 + D});
+    if (gravity.defined()) change_ = empty(in_.x, {slots, D});
     for (int64_t i = in_.n - 1; i >= 0; i--) {
-      if (i + 1 < in_.n) return_to(i);
-      set_time(i);
+      check_room(r_.return_to(i));
       leave_advance(i, adjoints);
       leave_grid(adjoints, gravity);
       leave_laws(adjoints);
@@ -74,115 +41,27 @@ class SubstepsBackward {
   }
 
  private:
-  Particles<const T> state(int64_t i) const {
-    if (i == 0) return first_;
-    const int64_t k = i - 1;
-    return {constant(x_[k]), constant(v_[k]), constant(C_[k]), constant(F_[k]), constant(J_[k]), constant(history_[k])};
+  void check_room(bool room) const {
+    STD_TORCH_CHECK(room, "max_blocks must be as many as the steps need, got ", in_.max_blocks);
   }
 
-  // Of obstacles. On CUDA the statuses count it.
-  void set_time(int64_t i) {
-    if (MPM_BACKEND == MPM_BACKEND_IS_cpu) s_.contact.time = time_[i];
-    if (scene_times_.defined()) s_.contact.scene_time = scene_time(i);
-  }
-
-  int* status(int64_t i) const { return static_cast<int*>(status_.data_ptr()) + i * status_.stride(0); }
-
-  void read(int64_t i) {
-    s_.read(state(i), mapped_[i]);
-    for (LawUpdateArguments<T, D>& law : s_.laws) law.stress = stress_[i];
-    s_.p2g.stress = constant(stress_[i]);
-  }
-
-  // The active blocks of a step.
-  void activate(int64_t i) {
-    STD_TORCH_CHECK(s_.activate(i == 0 ? nullptr : status(i - 1), status(i), stream_),
-                    "max_blocks must be as many as the steps need, got ", in_.max_blocks);
-  }
-
-  void record() {
-    for (int64_t i = 0; i < in_.n; i++) {
-      if (keeps_grids_ && i > 0) s_.make_pool(stream_);
-      read(i);
-      set_time(i);
-      activate(i);
-      s_.write({x_[i], v_[i], C_[i], F_[i], J_[i], history_[i]});
-      if (has(in_.material)) keep_others(i);
-      s_.move(stream_);
-      if (!keeps_grids_) continue;
-      s_.pool.active.workspace = Tensor();
-      grids_.push_back({s_.activation, s_.pool});
-    }
-  }
-
-  // Everything as it was after the grid update of a step.
-  void return_to(int64_t i) {
-    read(i);
-    if (keeps_grids_) {
-      grids_.pop_back();  // of the step after it
-      s_.activation = grids_.back().activation;
-      s_.pool = grids_.back().pool;
-      s_.use_pool();
-      if (MPM_BACKEND != MPM_BACKEND_IS_cpu) s_.contact.activations = status(i) + kActivations;
-    } else {
-      set_time(i);
-      activate(i);
-      s_.move_grid(stream_);
-    }
-  }
-
-  // What the laws of a mixture write for their particles alone.
-  void keep_others(int64_t i) {
-    if (s_.plastic) {
-      Tensor mapped = mapped_.view(i);
-      torch::stable::copy_(mapped, i == 0 ? in_.F.value() : F_.view(i - 1));
-    }
-    if (s_.columns > 0) {
-      Tensor after = history_.view(i);
-      torch::stable::copy_(after, i == 0 ? torch::stable::unsqueeze(first_history_, 2) : history_.view(i - 1));
-    }
-  }
-
-  // Blocks and nodes of a step, for its adjoint.
-  struct Grid {
-    ActivateArguments<T, D> activation;
-    Pool<T, D> pool;
-  };
-
-  bool grid_is_small() const;
-  void make_records();
   void make_terms(int64_t needs);
   void leave_advance(int64_t i, Adjoints& adjoints);
   void leave_grid(Adjoints& adjoints, const Tensor& gravity);
   void leave_laws(Adjoints& adjoints);
 
-  // total += term, for all that each of the terms has.
-  void add(Adjoints& total, const std::vector<Adjoints*>& terms) {
+  // What laws that change deformation or history give beside the adjoints of these.
+  void add_terms(Adjoints& adjoints) {
     AccumulateArguments<T, D> a;
-    const std::vector<Tensor*> sums = total.all();
-    for (Adjoints* term : terms) {
-      const std::vector<Tensor*> tensors = term->all();
-      for (size_t k = 0; k < sums.size(); k++) {
-        if (!tensors[k]->defined()) continue;
-        int64_t size = 1;  // with the gaps between rows
-        for (int64_t i = 0; i < sums[k]->dim(); i++) size += (sums[k]->size(i) - 1) * sums[k]->stride(i);
-        a.add(static_cast<T*>(sums[k]->data_ptr()), static_cast<const T*>(tensors[k]->data_ptr()), size);
-      }
-    }
+    const auto add = [&](const Tensor& sum, const Tensor& term) {
+      if (!term.defined()) return;
+      int64_t size = 1;  // with the gaps between rows
+      for (int64_t i = 0; i < sum.dim(); i++) size += (sum.size(i) - 1) * sum.stride(i);
+      a.add(static_cast<T*>(sum.data_ptr()), static_cast<const T*>(term.data_ptr()), size);
+    };
+    add(adjoints.F, F_term_);
+    add(adjoints.parameters, parameters_term_);
     backend::accumulate(a, stream_);
-  }
-
-  T* scene_time(int64_t i) const { return static_cast<T*>(scene_times_.data_ptr()) + i * in_.scenes; }
-
-  // The times of each scene at all steps.
-  void make_scene_times() {
-    scene_times_ = empty(in_.x, {in_.n, in_.scenes});
-    s_.contact.times = int(in_.scenes);
-    for (int64_t i = 0; i < in_.n; i++) {
-      Tensor now = torch::stable::select(scene_times_, 0, i);
-      torch::stable::copy_(now, i == 0 ? *in_.scene_time : torch::stable::select(scene_times_, 0, i - 1));
-      if (i > 0) s_.add_dt(scene_time(i), stream_);
-    }
   }
 
   // The adjoint of the impulses on some boundaries.
@@ -193,91 +72,46 @@ class SubstepsBackward {
   const SubstepsInputs& in_;
   OptionalTensor grad_impulse_;
   backend::Stream stream_;
-  Substeps<T, D> s_;
-  bool mls_;  // F and J move with the affine field, which is recorded then
-  bool keeps_grids_;
-  std::vector<Grid> grids_;
-  std::vector<double> time_;
-  Tensor first_history_, status_, scene_times_;
-  Particles<const T> first_;
-  Record<T> x_, v_, C_, F_, J_, history_, stress_, mapped_;
-  Adjoints by_advance_, by_g2p_, by_p2g_, by_laws_;
+  bool recorded_;
+  Recorded<T, D> r_;
+  Substeps<T, D>& s_;
+  bool mls_;  // F and J move with the affine field
+  Tensor F_term_, parameters_term_;
   Tensor gradient_;  // the velocity gradient that moves F and J where that is not the affine field, or its adjoint
-  Tensor nodes_, change_;  // adjoints on the nodes [N, 1 + D], and of the velocity change by gravity, by slots
+  // Adjoints on the nodes [N, 1 + D], of their motion, before contact and before the grid update; and of the velocity
+  // change by gravity, by slots.
+  Tensor motion_, contact_, update_, change_;
 };
 
 template <class T, int D>
-SubstepsBackward<T, D>::SubstepsBackward(const SubstepsInputs& in, const OptionalTensor& grad_impulse, int64_t needs,
-                                         backend::Stream stream)
+SubstepsBackward<T, D>::SubstepsBackward(const SubstepsInputs& in, const OptionalTensor& grad_impulse,
+                                         const OptionalTensor& record, int64_t needs, backend::Stream stream)
     : in_(in),
       grad_impulse_(grad_impulse),
       stream_(stream),
-      s_(in),
-      mls_(s_.p2g.form == StressForm::mls),
-      time_{in.time} {
-  while (int64_t(time_.size()) < in.n) time_.push_back(time_.back() + in.dt);
-  first_history_ = packed_history(in.x, in.history, s_.columns);
-  first_ = given_particles<T, D>(in, first_history_);
-  s_.make_pool(stream);
-  s_.count_time(nullptr, stream_);
-  if (has(in.scene_time)) make_scene_times();
-  keeps_grids_ = grid_is_small();
-  make_records();
+      recorded_(has(record)),
+      r_(in, record, has(in.previous_status) ? static_cast<const int*>(in.previous_status->data_ptr()) : nullptr,
+         stream),
+      s_(r_.steps),
+      mls_(s_.p2g.form == StressForm::mls) {
   make_terms(needs);
 }
 
-// Whether the grid of a step takes at most half of what the particles do; torch_mpm/rollouts.py counts on it.
-template <class T, int D>
-bool SubstepsBackward<T, D>::grid_is_small() const {
-  const Pool<T, D>& pool = s_.pool;
-  int64_t bytes = 0;
-  for (const Tensor* t : {&pool.active.table, &pool.active.block, &pool.active.offsets, &pool.active.index,
-                          &pool.active.schedule, &pool.nodes, &pool.updated, &pool.velocity})
-    if (t->defined()) bytes += t->numel() * t->element_size();
-  return 2 * bytes <= in_.x.size(0) * (2 * D + 4 * D * D) * int64_t(sizeof(T));
-}
-
-template <class T, int D>
-void SubstepsBackward<T, D>::make_records() {
-  const Tensor& x = in_.x;
-  const int64_t n = in_.n;
-  status_ = empty_int(x, {n, 1 + in_.scenes, kStatusSize});
-  x_ = Record<T>(x, n, D);
-  v_ = Record<T>(x, n, D);
-  if (mls_ || in_.wants_C) C_ = Record<T>(x, n, D, D);
-  if (has(in_.F)) F_ = Record<T>(x, n, D, D);
-  if (has(in_.J)) J_ = Record<T>(x, n);
-  if (s_.columns > 0) history_ = Record<T>(x, n, s_.columns);
-  stress_ = Record<T>(x, n, D, D);
-  if (s_.plastic) mapped_ = Record<T>(x, n, D, D);
-  if (has(in_.material)) stress_.clear();  // of particles without a law
-}
-
-// What each kind of kernel adds to the adjoints.
+// Laws that change nothing add to the adjoints, and others have these terms.
 template <class T, int D>
 void SubstepsBackward<T, D>::make_terms(int64_t needs) {
   const Tensor& x = in_.x;
   const int64_t P = x.size(0);
-  by_advance_.v = empty_particles(x, {P, D});
-  Tensor& moving = mls_ ? by_advance_.C : gradient_;
-  moving = empty_particles(x, {P, D, D});
-  by_g2p_.x = empty_particles(x, {P, D});
-  by_p2g_.x = empty_particles(x, {P, D});
-  by_p2g_.mass = result(x, needs & kMass, {P});
-  by_p2g_.volume = result(x, needs & kVolume, {P});
-  bool viscous = false, elastic = false, fluid = false;
+  if (!mls_) gradient_ = empty_particles(x, {P, D, D});
+  bool history = false, changing = false;
   for (const LawCall& call : s_.calls) {
     const LawInfo& info = call.law->info;
-    viscous |= info.viscous;
-    elastic |= info.field == Deformation::gradient && !info.plastic;
-    fluid |= info.field == Deformation::volume_ratio;
+    history |= !info.plastic && !info.history.empty();
+    changing |= info.changes();
   }
-  by_laws_.C = result(x, viscous, {P, D, D});
-  by_laws_.F = result(x, elastic, {P, D, D});
-  by_laws_.J = result(x, fluid, {P});
-  by_laws_.parameters = result(x, needs & kParameters_, {P, int64_t(in_.parameters.size())});
-  if (!has(in_.material)) return;
-  for (Tensor* term : by_laws_.all())  // of the particles of other laws
+  F_term_ = result(x, history, {P, D, D});
+  parameters_term_ = result(x, changing && (needs & kParameters_), {P, int64_t(in_.parameters.size())});
+  for (Tensor* term : {&F_term_, &parameters_term_})  // zero for the particles of other laws
     if (term->defined()) torch::stable::zero_(*term);
 }
 
@@ -294,8 +128,8 @@ void SubstepsBackward<T, D>::leave_advance(int64_t i, Adjoints& adjoints) {
   AdvanceBackwardArguments<T, D> a;
   a.forward.particles = in_.x.size(0);
   a.forward.x = s_.p2g.x;
-  a.forward.velocity = constant(v_[i]);
-  a.forward.affine = mls_ ? constant(C_[i]) : field<const T>(gradient_);
+  a.forward.velocity = constant(r_.v[i]);
+  a.forward.affine = mls_ ? constant(r_.C[i]) : field<const T>(gradient_);
   a.forward.F = s_.advance.F;
   a.forward.J = s_.advance.J;
   a.forward.dt = in_.dt;
@@ -305,19 +139,20 @@ void SubstepsBackward<T, D>::leave_advance(int64_t i, Adjoints& adjoints) {
   a.grad_x = field<const T>(adjoints.x);
   a.grad_F = field<const T>(adjoints.F);
   a.grad_J = field<const T>(adjoints.J);
-  a.velocity = field<T>(by_advance_.v);
-  a.affine = field<T>(mls_ ? by_advance_.C : gradient_);
+  a.velocity = field<T>(adjoints.v);
+  a.adds_velocity = true;
+  a.affine = field<T>(mls_ ? adjoints.C : gradient_);
+  a.adds_affine = mls_;
   a.F = field<T>(adjoints.F);
   a.J = field<T>(adjoints.J);
   backend::advance_backward(a, stream_);
-  add(adjoints, {&by_advance_});
 }
 
-// Through G2P, obstacles, grid update and P2G. Node tensors that no one reads any more take the adjoints.
+// Through G2P, obstacles, grid update and P2G.
 template <class T, int D>
 void SubstepsBackward<T, D>::leave_grid(Adjoints& adjoints, const Tensor& gravity) {
   const int64_t order = in_.lattice.order();
-  T* const nodes = static_cast<T*>(nodes_.data_ptr());
+  T* const nodes = static_cast<T*>(motion_.data_ptr());
   ScatterArguments<T, D> motion;
   motion.topology = s_.p2g.topology;
   motion.x = s_.p2g.x;
@@ -327,12 +162,12 @@ void SubstepsBackward<T, D>::leave_grid(Adjoints& adjoints, const Tensor& gravit
   motion.moment_scale = in_.lattice.inverse_inertia();
   motion.deterministic = in_.lattice.deterministic();
   motion.nodes = {nodes + 1, 1 + D, D};
-  backend::clear(nodes_, stream_);
+  backend::clear(motion_, stream_);
   backend::scatter(order, motion, stream_);
   backend::position_gradient(
       order,
       PositionGradientArguments<T, D>{motion.topology, motion.x, motion.value, motion.moment, motion.gradient,
-                                      s_.advance.gather.nodes, motion.moment_scale, field<T>(by_g2p_.x)},
+                                      s_.advance.gather.nodes, motion.moment_scale, field<T>(adjoints.x), true},
       stream_);
 
   GridUpdateBackwardArguments<T, D> update;
@@ -342,6 +177,7 @@ void SubstepsBackward<T, D>::leave_grid(Adjoints& adjoints, const Tensor& gravit
     ContactArguments<T, D> contact = s_.contact;
     contact.grad = nodes + 1;
     contact.grad_stride = 1 + D;
+    contact.result = static_cast<T*>(contact_.data_ptr());
     if (has(grad_impulse_)) {
       const T* const mass = reinterpret_cast<const T*>(s_.update.updated);
       backend::contact_impulses_backward(
@@ -351,7 +187,7 @@ void SubstepsBackward<T, D>::leave_grid(Adjoints& adjoints, const Tensor& gravit
     }
     update.grad_updated = reinterpret_cast<const NodeRow<T, D>*>(contact.result);
   }
-  update.grad_nodes = s_.update.updated;
+  update.grad_nodes = static_cast<NodeRow<T, D>*>(update_.data_ptr());
   if (gravity.defined()) update.change = static_cast<Vector<T, D>*>(change_.data_ptr());
   if (has(grad_impulse_) && !in_.wall_kind.empty())
     backend::wall_impulses_backward(
@@ -367,20 +203,21 @@ void SubstepsBackward<T, D>::leave_grid(Adjoints& adjoints, const Tensor& gravit
   P2GBackwardArguments<T, D> p2g;
   p2g.forward = s_.p2g;
   p2g.grad_nodes = {reinterpret_cast<const T*>(update.grad_nodes), 1 + D, 1 + D};
-  p2g.x = field<T>(by_p2g_.x);
-  p2g.mass = field<T>(by_p2g_.mass);
+  p2g.x = field<T>(adjoints.x);
+  p2g.mass = field<T>(adjoints.mass);
   p2g.velocity = field<T>(adjoints.v);
   if (s_.p2g.affine.pointer)
     p2g.affine = field<T>(adjoints.C);
   else
     torch::stable::zero_(adjoints.C);
   p2g.stress = field<T>(s_.stress);
-  p2g.volume = field<T>(by_p2g_.volume);
+  p2g.volume = field<T>(adjoints.volume);
+  p2g.adds = true;
   backend::p2g_backward(order, p2g, stream_);
 }
 
 // From F after the laws, their stress and history to F and history before. A law changes the adjoints of what it maps
-// where they stand; what it only reads gets a term more.
+// where they stand, and adds to those of what it only reads.
 template <class T, int D>
 void SubstepsBackward<T, D>::leave_laws(Adjoints& adjoints) {
   int64_t parameter = 0;
@@ -390,18 +227,22 @@ void SubstepsBackward<T, D>::leave_laws(Adjoints& adjoints) {
     LawBackwardArguments<T, D> a;
     a.law = s_.laws[k].law;
     a.grad_stress = field<const T>(s_.stress);
+    a.adds = !info.changes();
     if (info.plastic) a.grad_state = field<const T>(adjoints.F);
-    a.state = field<T>(info.plastic ? adjoints.F : info.field == Deformation::volume_ratio ? by_laws_.J : by_laws_.F);
-    if (info.viscous) a.C = field<T>(by_laws_.C);
+    a.state = field<T>(info.field == Deformation::volume_ratio ? adjoints.J
+                       : info.plastic || a.adds                ? adjoints.F
+                                                               : F_term_);
+    if (info.viscous) a.C = field<T>(adjoints.C);
     if (!call.history.empty()) {
       a.grad_history = variable<const T, D>(field<const T>(adjoints.history), call.first_column, false);
       a.history = variable<T, D>(field<T>(adjoints.history), call.first_column, false);
     }
-    if (by_laws_.parameters.defined()) a.parameters = variable<T, D>(field<T>(by_laws_.parameters), parameter, false);
+    if (adjoints.parameters.defined())
+      a.parameters = variable<T, D>(field<T>(a.adds ? adjoints.parameters : parameters_term_), parameter, false);
     parameter += int64_t(call.parameters.size());
     call.law->template kernels<T, D>().update_backward(a, stream_);
   }
-  add(adjoints, {&by_g2p_, &by_p2g_, &by_laws_});
+  if (F_term_.defined() || parameters_term_.defined()) add_terms(adjoints);
 }
 
 // Zero where there is no gradient.
@@ -421,7 +262,7 @@ void set(Tensor& adjoint, const OptionalTensor& grad, const char* name, const Te
 std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> substeps_backward(
     const OptionalTensor& grad_x, const OptionalTensor& grad_v, const OptionalTensor& grad_C,
     const OptionalTensor& grad_F, const OptionalTensor& grad_J, const OptionalTensor& grad_history,
-    const OptionalTensor& grad_impulse, int64_t needs, MPM_SUBSTEPS_PARAMETERS) {
+    const OptionalTensor& grad_impulse, int64_t needs, const OptionalTensor& record, MPM_SUBSTEPS_PARAMETERS) {
   const SubstepsInputs in{MPM_SUBSTEPS_ARGUMENTS};
   check_positions(x);
   const int64_t P = x.size(0);
@@ -429,7 +270,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tenso
   Tensor gravity_sum;
   const DeviceScope device(x);
   dispatch(x, [&]<class T, int D>() {
-    SubstepsBackward<T, D> backward(in, grad_impulse, needs, device.stream());
+    SubstepsBackward<T, D> backward(in, grad_impulse, record, needs, device.stream());
     adjoints.x = empty_particles(x, {P, D});
     adjoints.v = empty_particles(x, {P, D});
     adjoints.C = empty_particles(x, {P, D, D});
@@ -461,7 +302,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tenso
 STABLE_TORCH_LIBRARY_FRAGMENT(torch_mpm, m) {
   m.def(
       "substeps_backward(Tensor? grad_x, Tensor? grad_v, Tensor? grad_C, Tensor? grad_F, Tensor? grad_J, "
-      "Tensor? grad_history, Tensor? grad_impulse, int needs, " MPM_SUBSTEPS_SCHEMA
+      "Tensor? grad_history, Tensor? grad_impulse, int needs, Tensor? record, " MPM_SUBSTEPS_SCHEMA
       ") -> (Tensor x, Tensor v, Tensor C, Tensor F, Tensor J, Tensor history, Tensor mass, Tensor volume, "
       "Tensor parameters, Tensor gravity)");
 }

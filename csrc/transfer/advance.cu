@@ -1,7 +1,5 @@
-#include "cuda/launch.cuh"
+#include "cuda/chain.cuh"
 #include "transfer/advance.h"
-
-#include <torch/headeronly/util/Exception.h>
 
 namespace mpm::cuda {
 namespace {
@@ -10,37 +8,32 @@ constexpr int kThreads = 256;
 
 template <class T, int D>
 __global__ void __launch_bounds__(kThreads) advance_kernel(const AdvanceArguments<T, D> a) {
+  wait_for_kernel_before();
   const int64_t p = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   if (p < a.particles) advance_particle(a, One<T>{p});
 }
 
 template <class T, int D>
 __global__ void __launch_bounds__(kThreads) advance_backward_kernel(const AdvanceBackwardArguments<T, D> a) {
+  wait_for_kernel_before();
   const int64_t p = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   if (p < a.forward.particles) advance_particle_backward(a, One<T>{p});
 }
 
 unsigned blocks_for(int64_t particles) { return unsigned((particles + kThreads - 1) / kThreads); }
 
-void check_launch() {
-  const cudaError_t error = cudaGetLastError();
-  STD_TORCH_CHECK(error == cudaSuccess, "kernel launch failed: ", cudaGetErrorString(error));
-}
-
 }  // namespace
 
 template <class T, int D>
 void advance(const AdvanceArguments<T, D>& a, Stream stream) {
   if (a.particles == 0) return;
-  advance_kernel<<<blocks_for(a.particles), kThreads, 0, stream>>>(a);
-  check_launch();
+  launch_in_chain(advance_kernel<T, D>, blocks_for(a.particles), kThreads, 0, stream, a);
 }
 
 template <class T, int D>
 void advance_backward(const AdvanceBackwardArguments<T, D>& a, Stream stream) {
   if (a.forward.particles == 0) return;
-  advance_backward_kernel<<<blocks_for(a.forward.particles), kThreads, 0, stream>>>(a);
-  check_launch();
+  launch_in_chain(advance_backward_kernel<T, D>, blocks_for(a.forward.particles), kThreads, 0, stream, a);
 }
 
 MPM_INSTANTIATE(advance, AdvanceArguments)

@@ -21,9 +21,10 @@ struct AdvanceArguments {
 
 template <class T, int D>
 struct AdvanceBackwardArguments {
-  AdvanceArguments<T, D> forward;         // its outputs unused
-  Field<const T> grad_x, grad_F, grad_J;  // adjoints of the outputs; the last two absent with F and J
-  Field<T> velocity, affine, F, J, dt;    // adjoints per particle; absent where not needed
+  AdvanceArguments<T, D> forward;                   // its outputs unused
+  Field<const T> grad_x, grad_F, grad_J;            // adjoints of the outputs; the last two absent with F and J
+  Field<T> velocity, affine, F, J, dt;              // adjoints per particle; absent where not needed
+  bool adds_velocity = false, adds_affine = false;  // to what is there
 };
 
 // G2P and the end of the step in one: the velocity gradient that moves F and J is the affine field (MLS) or ∇v.
@@ -95,7 +96,11 @@ MPM_HD void advance_particle_backward(const AdvanceBackwardArguments<T, D>& a, c
   Vector<T, D> v;
   Matrix<T, D> C, grad_affine = zero_matrix<T, D>();
   load_motion(a.forward, at, v, C);
-  if (a.velocity.pointer) store_vector<D>(at, a.velocity, dt * grad_x);
+  const Adding<One<T>> adding(at);
+  if (a.adds_velocity)
+    store_vector<D>(adding, a.velocity, dt * grad_x);
+  else if (a.velocity.pointer)
+    store_vector<D>(at, a.velocity, dt * grad_x);
   T grad_dt = dot(v, grad_x);
   if (a.forward.F.pointer) {
     const Matrix<T, D> F = load_matrix<D>(at, a.forward.F), G = load_matrix<D>(at, a.grad_F);
@@ -110,7 +115,10 @@ MPM_HD void advance_particle_backward(const AdvanceBackwardArguments<T, D>& a, c
       grad_affine[i][i] = grad_affine[i][i] + dt * J * g;
     grad_dt = grad_dt + rate * J * g;
   }
-  if (a.affine.pointer) store_matrix<D>(at, a.affine, grad_affine);
+  if (a.adds_affine)
+    store_matrix<D>(adding, a.affine, grad_affine);
+  else if (a.affine.pointer)
+    store_matrix<D>(at, a.affine, grad_affine);
   if (a.dt.pointer) store_scalar(at, a.dt, grad_dt);
 }
 

@@ -24,7 +24,8 @@ struct P2GBackwardArguments {
   P2GArguments<T, D> forward;  // its `nodes` unused
   NodeField<const T> grad_nodes;
   Field<T> x, mass, velocity, affine, stress, volume,
-      dt;  // adjoints per particle, dt with respect to the product dt * scene_dt; absent where not needed
+      dt;             // adjoints per particle, dt with respect to the product dt * scene_dt; absent where not needed
+  bool adds = false;  // x, mass and volume to what is there
 };
 
 // nodes_i += Σ_p N_i (value_p + scale moment_p · (x_i − x_p)) + gradient_p · ∇N_i, for any number of channels. The
@@ -58,6 +59,7 @@ struct PositionGradientArguments {
   NodeField<const T> nodes;  // g
   double moment_scale = 1;
   Field<T> position_gradient;  // [P, D], zero for particles outside
+  bool adds = false;           // to what is there
 };
 
 }  // namespace mpm

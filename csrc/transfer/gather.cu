@@ -96,7 +96,7 @@ struct FieldPositionGradient {
   Columns<const T, K * D> moment, gradient;
   Columns<T, D> out;
   T moment_scale, inverse_dx;
-  bool more;  // adds to the channels before
+  bool adds;  // to what is there, or to the channels before
 
   FieldPositionGradient(const PositionGradientArguments<T, D>& a, int first)
       : topology(a.topology),
@@ -108,7 +108,7 @@ struct FieldPositionGradient {
         out(a.position_gradient),
         moment_scale(T(a.moment_scale * double(a.topology.geometry.dx))),
         inverse_dx(a.topology.geometry.inverse_dx),
-        more(first > 0) {}
+        adds(a.adds || first > 0) {}
 
   __device__ Loaded load(int p, int) const {
     Loaded l;
@@ -139,7 +139,7 @@ struct FieldPositionGradient {
   }
   __device__ void write(int p, const Loaded&, const Result& r) const {
 #pragma unroll
-    for (int i = 0; i < D; i++) out.at(p, i) = more ? out.at(p, i) + r[i] : r[i];
+    for (int i = 0; i < D; i++) out.at(p, i) = adds ? out.at(p, i) + r[i] : r[i];
   }
   __device__ void leave_out(int p) const { write(p, {}, {}); }
 };
@@ -171,6 +171,7 @@ struct MomentumAdjoint {
   Columns<T, 1> mass, volume, dt;
   Columns<T, D> x, velocity;
   Columns<T, D * D> affine, stress;
+  bool adds;
 
   explicit MomentumAdjoint(const P2GBackwardArguments<T, D>& a)
       : topology(a.forward.topology),
@@ -183,7 +184,8 @@ struct MomentumAdjoint {
         x(a.x),
         velocity(a.velocity),
         affine(a.affine, D),
-        stress(a.stress, D) {}
+        stress(a.stress, D),
+        adds(a.adds) {}
 
   __device__ Loaded load(int p, int scene) const { return fields.read(p, scene, fields.stress.present()); }
   template <class Support>
@@ -222,13 +224,17 @@ struct MomentumAdjoint {
     r.particle = fields.adjoint(particle, sums);
     return r;
   }
+  template <int N>
+  __device__ void write(const Columns<T, N>& sum, int p, int k, const T& value) const {
+    if (sum.present()) sum.at(p, k) = adds ? sum.at(p, k) + value : value;
+  }
   __device__ void write(int p, const Loaded&, const Result& r) const {
-    mass.write(p, 0, r.particle.mass);
-    volume.write(p, 0, r.particle.volume);
+    write(mass, p, 0, r.particle.mass);
+    write(volume, p, 0, r.particle.volume);
     dt.write(p, 0, r.particle.dt);
 #pragma unroll
     for (int i = 0; i < D; i++) {
-      x.write(p, i, r.x[i]);
+      write(x, p, i, r.x[i]);
       velocity.write(p, i, r.particle.velocity[i]);
 #pragma unroll
       for (int j = 0; j < D; j++) {

@@ -430,7 +430,7 @@ __device__ void gather_by_items(const Task& task, const Schedule<const int>& sch
 
 template <bool Quads, class Task>
 __global__ void __launch_bounds__(kGatherThreads, kResident<Task>) gather_kernel(const Task task) {
-  if constexpr (may_drift<Task>) wait_for_kernel_before();
+  wait_for_kernel_before();
   const Schedule<const int> schedule = schedule_of(task.topology);
   FollowerOf<Task> follower;
   if (*schedule.scattered)
@@ -442,10 +442,7 @@ __global__ void __launch_bounds__(kGatherThreads, kResident<Task>) gather_kernel
 
 template <class Task, class Kernel>
 void launch_gather(const Task& task, Kernel* kernel, int64_t pieces, Stream stream) {
-  if constexpr (may_drift<Task>)
-    launch_in_chain(kernel, grid_size(pieces), kGatherThreads, 0, stream, task);
-  else
-    launch(kernel, grid_size(pieces), kGatherThreads, 0, stream, task);
+  launch_in_chain(kernel, grid_size(pieces), kGatherThreads, 0, stream, task);
 }
 
 template <class Task>

@@ -4,6 +4,9 @@
 namespace mpm::cpu {
 inline namespace TORCH_MPM_ISA {
 
+// Those of x, mass and volume.
+constexpr bool is_sum(int field) { return field == 0 || field == 1 || field == 5; }
+
 template <class P, int D, class Store>
 MPM_HD void for_wanted(const ParticleMomentum<P, D>& grad, const P x[D], const Store& store) {
   store(0, grad.mass, 0, 0);
@@ -50,7 +53,12 @@ void p2g_backward_with(const P2GBackwardArguments<T, D>& a, const Field<T> wante
         }
         for_wanted(adjoint<Order>(p, sum, in.form, in.affine.pointer, in.stress.pointer, dx, inverse_dx), x,
                    [&](int field, const P& v, int i, int j) {
-                     if (wanted[field].pointer) store(v, wanted[field], g, i, j);
+                     const Field<T>& to = wanted[field];
+                     if (!to.pointer) return;
+                     if (a.adds && is_sum(field))
+                       store_exactly(load(constant(to), g, i, j) + v, to, g, i, j);
+                     else
+                       store(v, to, g, i, j);
                    });
       });
 }
@@ -69,7 +77,7 @@ void p2g_backward(const P2GBackwardArguments<T, D>& a) {
   const T zero_x[D] = {};
   for_outside(in.topology, [&](int64_t p) {
     for_wanted(zero, zero_x, [&](int field, const T& v, int i, int j) {
-      if (wanted[field].pointer) at(wanted[field], p, i, j) = v;
+      if (wanted[field].pointer && !(a.adds && is_sum(field))) at(wanted[field], p, i, j) = v;
     });
   });
 }

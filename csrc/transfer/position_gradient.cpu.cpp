@@ -9,8 +9,7 @@ template <int Order, bool Slope, bool Gradient, class T, int D>
 void position_gradient_with(const PositionGradientArguments<T, D>& a, int first, int count) {
   using P = Lanes<T>;
   const P inverse_dx(a.topology.geometry.inverse_dx);
-  const Field<const T> before = {a.position_gradient.pointer,
-                                 {a.position_gradient.stride[0], a.position_gradient.stride[1], 0}};
+  const Field<const T> before = constant(a.position_gradient);
   gather_groups<Order>(a.topology, a.x, a.nodes, first, count, [&](const Group& g, const P f[D], int, const T* tile) {
     P gathered[kChannels], x[D];
     if (Slope) {
@@ -26,7 +25,7 @@ void position_gradient_with(const PositionGradientArguments<T, D>& a, int first,
     add_position_gradient<Order, kChannels, Slope, Gradient>(w, contribution, tile, gathered, x);
     MPM_UNROLL for (int i = 0; i < D; i++) {
       x[i] = inverse_dx * x[i];
-      if (first == 0)
+      if (first == 0 && !a.adds)
         store(x[i], a.position_gradient, g, i);
       else
         store_exactly(load(before, g, i) + x[i], a.position_gradient, g, i);
@@ -39,7 +38,7 @@ void position_gradient(const PositionGradientArguments<T, D>& a) {
   const auto zero = [&](int64_t p) {
     for (int i = 0; i < D; i++) at(a.position_gradient, p, i) = 0;
   };
-  if (a.nodes.channels == 0)
+  if (a.nodes.channels == 0 && !a.adds)
     for (int64_t p = 0; p < a.topology.particles; p++) zero(p);
   for (int first = 0; first < a.nodes.channels; first += kChannels) {
     const int rest = a.nodes.channels - first, count = rest < kChannels ? rest : kChannels;
@@ -50,7 +49,7 @@ void position_gradient(const PositionGradientArguments<T, D>& a) {
     else
       position_gradient_with<Order, false, false>(a, first, count);
   }
-  for_outside(a.topology, zero);
+  if (!a.adds) for_outside(a.topology, zero);
 }
 
 MPM_INSTANTIATE_ORDERS(position_gradient, PositionGradientArguments)

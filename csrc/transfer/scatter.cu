@@ -31,7 +31,7 @@ struct FieldSource {
     Contribution<T, D, 0, K> c;
 #pragma unroll
     for (int k = 0; k < K; k++) {
-      c.value[k] = value.at(p, k);
+      c.value[k] = value.present() ? value.at(p, k) : T(0);
 #pragma unroll
       for (int i = 0; i < D; i++) {
         c.moment[k][i] = moment.present() ? moment_scale * moment.at(p, k * D + i) : T(0);

@@ -482,7 +482,7 @@ __global__ void __launch_bounds__(Source::Shape::threads, Source::resident)
   using S = typename Source::Shape;
   using T = typename S::T;
   constexpr int D = S::D;
-  if constexpr (Source::drifts) wait_for_kernel_before();
+  wait_for_kernel_before();
   extern __shared__ __align__(16) char memory[];
   __shared__ int slots[1 << D], head[S::lists + 1];
   __shared__ BaseBlock<T, D> base_block;
@@ -538,10 +538,7 @@ void launch_scatter(const Source& source, bool deterministic, Stream stream) {
   const int64_t items = most_items(source.topology.max_blocks, source.topology.particles);
   if (items == 0) return;
   for (int colour = deterministic ? 0 : -1; colour < (deterministic ? 1 << S::D : 0); colour++)
-    if constexpr (Source::drifts)
-      launch_in_chain(scatter_kernel<Source>, grid_size(items), S::threads, S::shared_bytes, stream, source, colour);
-    else
-      launch(scatter_kernel<Source>, grid_size(items), S::threads, S::shared_bytes, stream, source, colour);
+    launch_in_chain(scatter_kernel<Source>, grid_size(items), S::threads, S::shared_bytes, stream, source, colour);
 }
 
 enum class Stress { none, moment, gradient };

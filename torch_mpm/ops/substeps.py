@@ -3,8 +3,8 @@
     torch.ops.torch_mpm.substeps(x, v, mass, volume, C, F, J, history, scene, ids, material, previous_status, laws,
         options, parameters, variables, n, dt, apic, wants_C, stress_form, gravity, wall_kind, wall_plane,
         wall_friction, obstacles, data, shape, sizes, contact, obstacle_scene, start, end, time, scenes,
-        max_blocks, grows, resident, impulse, scene_dt, scene_time, lattice, layout)
-        -> (x, v, C, F, J, history, status, impulse, time)
+        max_blocks, grows, resident, records, impulse, scene_dt, scene_time, lattice, layout)
+        -> (x, v, C, F, J, history, status, impulse, time, record)
 
 Particles and their history are those of `State`, the grid's arguments those of `activate`, `grid_update` and `contact`.
 `laws` are names of `LAWS` parted by commas, law k for the particles of material k; their options, parameters and
@@ -14,16 +14,18 @@ side by side, [P, m]. The impulses on obstacles and walls are added to `impulse`
 of their own have the time steps dt times `scene_dt` and begin at `scene_time`, both [B]. With `grows` the pool follows
 the scene on the CPU; otherwise the op stops there where it is full, and the status tells. On CUDA nothing is waited
 for. With `resident` batches of small scenes may go another way there, each on a multiprocessor of its own; gradients
-take it as any other, whose sums may round differently.
+take it as any other, whose sums may round differently. With `records` everything that the adjoint reads is kept in
+`record`, bytes of no other use, and no step is taken again; not where impulses are counted, or the pool had to grow.
 
 Differentiable once, with respect to x, v, mass, volume, C, F, J, history, parameters, gravity and impulse. Autograd
 keeps the arguments of a call, no more: 2 D + 2 D² numbers per particle of a solid (24 in 3-D) and its history.
 
     torch.ops.torch_mpm.substeps_backward(grad_x, grad_v, grad_C, grad_F, grad_J, grad_history, grad_impulse, needs,
-        *arguments of substeps) -> (x, v, C, F, J, history, mass, volume, parameters, gravity)
+        record, *arguments of substeps) -> (x, v, C, F, J, history, mass, volume, parameters, gravity)
 
-takes the steps again and then goes back through them. Meanwhile it holds what each step has read: of a solid 2 D + 3 D²
-numbers per particle and step (33 in 3-D), D² more where a law is plastic, and the history. The adjoints are [P, ...],
+takes the steps again, where there is no record, and then goes back through them. Meanwhile it holds what each step has
+read: of a solid 2 D + 3 D² numbers per particle and step (33 in 3-D), D² more where a law is plastic, and the history;
+and the grid of each step where that is at most half as much. The adjoints are [P, ...],
 those of the parameters [P, number of parameters] and that of gravity, over the time step, a sum for each block of the
 grids of all scenes [B * blocks, D]. Of the last four the bits of `needs` (`MASS`, `VOLUME`, `PARAMETERS`, `GRAVITY`)
 tell which are wanted.
@@ -69,11 +71,16 @@ def _fake(
         x.new_empty((1 + scenes, 8), dtype=torch.int32),
         None if impulse is None else impulse.new_empty(impulse.shape),
         None if given["scene_time"] is None else x.new_empty(scenes),
+        _fake_record(x) if given["records"] else None,
     )
 
 
+def _fake_record(x: Tensor) -> Tensor:
+    return x.new_empty(torch.library.get_ctx().new_dynamic_size(), dtype=torch.uint8)
+
+
 @torch.library.register_fake("torch_mpm::substeps_backward")
-def _backward_fake(grad_x, grad_v, grad_C, grad_F, grad_J, grad_history, grad_impulse, needs, *arguments):
+def _backward_fake(grad_x, grad_v, grad_C, grad_F, grad_J, grad_history, grad_impulse, needs, record, *arguments):
     given = dict(zip(_SCHEMA, arguments, strict=True))
     x, history = given["x"], given["history"]
     P, D = sizes(x, "x", 2)
@@ -93,16 +100,18 @@ def _backward_fake(grad_x, grad_v, grad_C, grad_F, grad_J, grad_history, grad_im
 
 
 def _setup(ctx: Any, inputs: Any, output: Any) -> None:
-    given = dict(zip(_SCHEMA, inputs, strict=True)) | {"previous_status": None}  # which the adjoint does not read
+    given, record = dict(zip(_SCHEMA, inputs, strict=True)), output[-1]
+    if record is None:
+        given["previous_status"] = None  # which the adjoint does not read
     history, parameters = given["history"], given["parameters"]
     ctx.variables = len(history)
     ctx.set_materialize_grads(False)
-    ctx.save_for_backward(*(given.pop(name) for name in _TENSORS), *history, *parameters)
+    ctx.save_for_backward(record, *(given.pop(name) for name in _TENSORS), *history, *parameters)
     ctx.given = given
 
 
 def _backward(ctx: Any, *grads: Any) -> Any:
-    saved = list(ctx.saved_tensors)  # once: a checkpointed region unpacks a tensor only once
+    record, *saved = ctx.saved_tensors  # once: a checkpointed region unpacks a tensor only once
     tensors, rest = dict(zip(_TENSORS, saved, strict=False)), saved[len(_TENSORS) :]
     history, parameters = rest[: ctx.variables], rest[ctx.variables :]
     given = ctx.given | tensors | {"history": history, "parameters": parameters}
@@ -111,7 +120,7 @@ def _backward(ctx: Any, *grads: Any) -> Any:
     needs += PARAMETERS * any(wanted["parameters"])
     by_impulse = None if grads[7] is None else grads[7].contiguous()
     arguments = (given[name] for name in _SCHEMA)
-    adjoints = dispatch(torch.ops.torch_mpm.substeps_backward, *grads[:6], by_impulse, needs, *arguments)
+    adjoints = dispatch(torch.ops.torch_mpm.substeps_backward, *grads[:6], by_impulse, needs, record, *arguments)
     found = dict(zip(_ADJOINTS, adjoints, strict=True)) | {"impulse": grads[7]}
     found["history"] = _of_history(found["history"], history, wanted["history"])
     found["parameters"] = _of_parameters(found["parameters"], parameters, wanted["parameters"], given["scene"])

@@ -1,0 +1,266 @@
+#pragma once
+
+#include "rollout/substeps.h"
+
+// n steps with what their adjoint reads of each: the particles, and the active blocks and nodes where these take less
+// memory than the particles do.
+namespace mpm {
+
+// Pieces of one tensor of bytes, one after another; only counted where there is none yet.
+class Arena {
+ public:
+  Arena() = default;
+  explicit Arena(const Tensor& memory) : start_(static_cast<char*>(memory.data_ptr())) {}
+
+  template <class T>
+  T* take(int64_t count) {
+    char* const p = start_ ? start_ + size_ : nullptr;
+    size_ += (count * int64_t(sizeof(T)) + kAlignment - 1) / kAlignment * kAlignment;
+    return reinterpret_cast<T*>(p);
+  }
+
+  // A contiguous tensor, which must not outlive the memory; undefined while bytes are counted.
+  template <class T>
+  Tensor tensor(const Tensor& like, const Shape& shape, ScalarType type) {
+    int64_t count = 1;
+    for (int64_t size : shape) count *= size;
+    T* const data = take<T>(count);
+    if (!data) return {};
+    Shape strides(shape.size(), 1);
+    for (size_t i = shape.size(); i-- > 1;) strides[i - 1] = strides[i] * shape[i];
+    return torch::stable::from_blob(data, shape, strides, like.device(), type);
+  }
+
+  int64_t size() const { return size_; }
+
+ private:
+  static constexpr int64_t kAlignment = 256;
+  char* start_ = nullptr;
+  int64_t size_ = 0;
+};
+
+// A field of the particles at many steps, structures of arrays one after another.
+template <class T>
+class Record {
+ public:
+  Record() = default;  // of an absent field
+  Record(Arena& arena, const Tensor& x, int64_t steps, int64_t rows = 1, int64_t columns = 1)
+      : x_(x),
+        shape_{x.size(0), rows, columns},
+        pitch_(particle_pitch(x, x.size(0))),
+        size_(steps * rows * columns * pitch_),
+        data_(arena.take<T>(size_)) {}
+
+  Field<T> operator[](int64_t step) const {
+    if (!data_) return {};
+    return {pointer(step), {1, shape_[2] * pitch_, pitch_}};
+  }
+
+  // The same as a tensor, which must not outlive the memory.
+  Tensor matrix(int64_t step) const { return view(step, shape_, {1, shape_[2] * pitch_, pitch_}); }
+  Tensor vector(int64_t step) const { return view(step, {shape_[0], shape_[1]}, {1, pitch_}); }
+  Tensor scalar(int64_t step) const { return view(step, {shape_[0]}, {1}); }
+
+  void clear() {
+    Tensor all = torch::stable::from_blob(data_, Shape{size_}, Shape{1}, x_.device(), x_.scalar_type());
+    torch::stable::zero_(all);
+  }
+
+ private:
+  T* pointer(int64_t step) const { return data_ + step * shape_[1] * shape_[2] * pitch_; }
+  Tensor view(int64_t step, const Shape& shape, const Shape& strides) const {
+    return torch::stable::from_blob(pointer(step), shape, strides, x_.device(), x_.scalar_type());
+  }
+
+  Tensor x_;
+  Shape shape_;
+  int64_t pitch_ = 0, size_ = 0;
+  T* data_ = nullptr;
+};
+
+template <class T, int D>
+class Recorded {
+ public:
+  Substeps<T, D> steps;
+  Record<T> x, v, C, F, J, history, stress;
+  Record<T> mapped;  // F after the return maps
+
+  // In `memory`, from an earlier `take`, or in its own. The statuses go on from the one before where they are to.
+  Recorded(const SubstepsInputs& in, const OptionalTensor& memory, const int* status_before, backend::Stream stream);
+
+  // Takes all steps; false where the pool had no room, and must not grow.
+  bool take();
+
+  // Everything as it was after the grid update of a step, the last one or the one before the last that was asked for.
+  // False as `take`.
+  bool return_to(int64_t i);
+
+  // All of it in one piece; undefined where a pool has grown out of it.
+  Tensor memory() const { return steps.activation.max_blocks == in_.max_blocks ? memory_ : Tensor(); }
+
+  // Particles before a step, and the status after its activation.
+  Particles<const T> state(int64_t i) const {
+    if (i == 0) return first_;
+    const int64_t k = i - 1;
+    return {constant(x[k]), constant(v[k]), constant(C[k]), constant(F[k]), constant(J[k]), constant(history[k])};
+  }
+  int* status(int64_t i) const { return status_ + i * (1 + in_.scenes) * kStatusSize; }
+
+  // Of scenes with clocks of their own, after all steps.
+  Tensor scene_time_after() const {
+    Tensor after = empty(in_.x, {in_.scenes});
+    torch::stable::copy_(after, torch::stable::select(scene_times_, 0, in_.n - 1));
+    steps.add_dt(static_cast<T*>(after.data_ptr()), stream_);
+    return after;
+  }
+
+ private:
+  // Blocks and nodes of a step.
+  struct Grid {
+    ActivateArguments<T, D> activation;
+    Pool<T, D> pool;
+  };
+
+  void lay_out(Arena& arena);
+  Grid grid_in(Arena& arena) const;
+  void use(const Grid& grid) {
+    steps.activation = grid.activation;
+    steps.pool = grid.pool;
+    steps.use_pool();
+  }
+
+  void read(int64_t i) {
+    steps.read(state(i), mapped[i]);
+    for (LawUpdateArguments<T, D>& law : steps.laws) law.stress = stress[i];
+    steps.p2g.stress = constant(stress[i]);
+  }
+
+  // Of obstacles. On CUDA the statuses count it.
+  void set_time(int64_t i) {
+    if (MPM_BACKEND == MPM_BACKEND_IS_cpu) steps.contact.time = time_[i];
+    if (scene_times_.defined()) steps.contact.scene_time = scene_time(i);
+  }
+
+  bool activate(int64_t i) { return steps.activate(i == 0 ? status_before_ : status(i - 1), status(i), stream_); }
+
+  // What the laws of a mixture write for their particles alone.
+  void keep_others(int64_t i) {
+    if (steps.plastic) {
+      Tensor to = mapped.matrix(i);
+      torch::stable::copy_(to, i == 0 ? in_.F.value() : F.matrix(i - 1));
+    }
+    if (steps.columns > 0) {
+      Tensor to = history.matrix(i);
+      torch::stable::copy_(to, i == 0 ? torch::stable::unsqueeze(first_history_, 2) : history.matrix(i - 1));
+    }
+  }
+
+  T* scene_time(int64_t i) const { return static_cast<T*>(scene_times_.data_ptr()) + i * in_.scenes; }
+
+  // The times of each scene at all steps.
+  void make_scene_times() {
+    scene_times_ = empty(in_.x, {in_.n, in_.scenes});
+    steps.contact.times = int(in_.scenes);
+    for (int64_t i = 0; i < in_.n; i++) {
+      Tensor now = torch::stable::select(scene_times_, 0, i);
+      torch::stable::copy_(now, i == 0 ? *in_.scene_time : torch::stable::select(scene_times_, 0, i - 1));
+      if (i > 0) steps.add_dt(scene_time(i), stream_);
+    }
+  }
+
+  const SubstepsInputs& in_;
+  const int* status_before_;
+  backend::Stream stream_;
+  Tensor first_history_, memory_, workspace_, scene_times_;
+  Particles<const T> first_;
+  std::vector<double> time_;
+  bool keeps_grids_ = false, taken_ = false;
+  std::vector<Grid> grids_;
+  int* status_ = nullptr;
+};
+
+template <class T, int D>
+Recorded<T, D>::Recorded(const SubstepsInputs& in, const OptionalTensor& memory, const int* status_before,
+                         backend::Stream stream)
+    : steps(in), in_(in), status_before_(status_before), stream_(stream), time_{in.time} {
+  while (int64_t(time_.size()) < in.n) time_.push_back(time_.back() + in.dt);
+  first_history_ = packed_history(in.x, in.history, steps.columns);
+  first_ = given_particles<T, D>(in, first_history_);
+  steps.activation.workspace_size = backend::activate_workspace(steps.activation, stream);
+  Arena grid, counted;
+  grid_in(grid);
+  // At most half of what the particles take; torch_mpm/rollouts.py counts on it.
+  keeps_grids_ = 2 * grid.size() <= in.x.size(0) * (2 * D + 4 * D * D) * int64_t(sizeof(T));
+  lay_out(counted);
+  memory_ = has(memory) ? *memory : empty(in.x, {counted.size()}, ScalarType::Byte);
+  STD_TORCH_CHECK(memory_.numel() == counted.size(), "record must be that of the same steps");
+  Arena arena(memory_);
+  lay_out(arena);
+  if (keeps_grids_)
+    workspace_ = empty(in.x, {steps.activation.workspace_size}, ScalarType::Byte);
+  else
+    steps.make_pool(stream);
+  for (Grid& g : grids_) g.pool.active.use(g.activation, workspace_);
+  if (keeps_grids_) use(grids_.back());
+  steps.count_time(status_before, stream_);
+  if (has(in.scene_time)) make_scene_times();
+}
+
+template <class T, int D>
+void Recorded<T, D>::lay_out(Arena& arena) {
+  const Tensor& given = in_.x;
+  const int64_t n = in_.n;
+  const bool mls = steps.p2g.form == StressForm::mls;  // F and J move with the affine field, which is recorded then
+  x = Record<T>(arena, given, n, D);
+  v = Record<T>(arena, given, n, D);
+  if (mls || in_.wants_C) C = Record<T>(arena, given, n, D, D);
+  if (has(in_.F)) F = Record<T>(arena, given, n, D, D);
+  if (has(in_.J)) J = Record<T>(arena, given, n);
+  if (steps.columns > 0) history = Record<T>(arena, given, n, steps.columns);
+  stress = Record<T>(arena, given, n, D, D);
+  if (steps.plastic) mapped = Record<T>(arena, given, n, D, D);
+  status_ = arena.take<int>(n * (1 + in_.scenes) * kStatusSize);
+  grids_.clear();
+  for (int64_t i = 0; i < n && keeps_grids_; i++) grids_.push_back(grid_in(arena));
+}
+
+template <class T, int D>
+typename Recorded<T, D>::Grid Recorded<T, D>::grid_in(Arena& arena) const {
+  Grid grid{steps.activation, {}};
+  grid.pool.lay_out(in_.x, grid.activation, steps.obstacles, [&](const Shape& shape, ScalarType type) {
+    return type == ScalarType::Int ? arena.tensor<int>(in_.x, shape, type) : arena.tensor<T>(in_.x, shape, type);
+  });
+  return grid;
+}
+
+template <class T, int D>
+bool Recorded<T, D>::take() {
+  if (has(in_.material)) stress.clear();  // of particles without a law
+  for (int64_t i = 0; i < in_.n; i++) {
+    const bool grown = steps.activation.max_blocks != in_.max_blocks;
+    if (keeps_grids_ && !grown) use(grids_[size_t(i)]);
+    if (keeps_grids_ && grown) steps.make_pool(stream_);
+    read(i);
+    set_time(i);
+    if (!activate(i)) return false;
+    steps.write({x[i], v[i], C[i], F[i], J[i], history[i]});
+    if (has(in_.material)) keep_others(i);
+    steps.move(stream_);
+    if (keeps_grids_) grids_[size_t(i)] = {steps.activation, steps.pool};
+  }
+  return taken_ = true;
+}
+
+template <class T, int D>
+bool Recorded<T, D>::return_to(int64_t i) {
+  if (keeps_grids_) use(grids_[size_t(i)]);
+  read(i);
+  set_time(i);
+  if (MPM_BACKEND != MPM_BACKEND_IS_cpu) steps.contact.activations = status(i) + kActivations;
+  if (keeps_grids_ || (i + 1 == in_.n && taken_)) return true;
+  if (!activate(i)) return false;
+  steps.move_grid(stream_);
+  return true;
+}
+
+}  // namespace mpm
