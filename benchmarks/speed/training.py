@@ -5,7 +5,7 @@
 
 Rollouts: the neo-Hookean cube of `benchmarks/speed/work.py`, float32, one call of `torch_mpm.rollout` without
 gradients, and with the gradient of its end by the velocities at its start. The op of many steps takes them again in the
-backward pass in any case; what is held at a time differs.
+backward pass, some at a time, unless the forward pass has kept everything.
 
 Peers: the same cube with a fixed corotated law, in a rollout, in a script of another project whose import names
 `torch_mpm.compat`, and by that project's algorithm: that of MPM-PyTorch in plain torch
@@ -76,7 +76,7 @@ def corotated(project: Project, w: work.Work, device: str, dtype: torch.dtype = 
     return with_room(setup(w, device, dtype), law, stress_form=project.stress_form)
 
 
-def rolled(s: Setup, n: int, checkpoint: int | None = None) -> Forward:
+def rolled(s: Setup, n: int, checkpoint: int | mpm.Checkpoints | None = None) -> Forward:
     def forward(v: Tensor) -> tuple[Tensor, Tensor]:
         end = mpm.rollout(s.step, s.state.replace(v=v), n, work.DT, checkpoint)
         return end.x, end.v
@@ -116,7 +116,7 @@ class Case:
     kept: str
     side: int
     steps: int
-    checkpoint: int | None = None
+    checkpoint: int | mpm.Checkpoints | None = None
     project: str | None = None
 
     def program(self, device: str) -> tuple[Forward, Tensor]:
@@ -134,7 +134,8 @@ class Case:
 
 
 def rollout_cases(side: int, n: int) -> list[Case]:
-    held = {"by default": None, "32 steps": 32, "all steps": n}
+    everything = mpm.Checkpoints(memory=1e11)
+    held = {"by default": None, "32 steps": 32, "all steps": n, "everything, none again": everything}
     return [Case("rollout", name, side, n, checkpoint) for name, checkpoint in held.items()]
 
 
