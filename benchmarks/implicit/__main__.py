@@ -55,7 +55,7 @@ def of_sand(quick: bool, device: str, out: Path) -> Result:
 
 def of_cost(quick: bool, device: str, out: Path) -> Result:
     return {"Cost, in units of a gather and a scatter": cost.cost(device, quick),
-            "Batches": cost.batches(device, quick)}  # fmt: skip
+            "Steps": cost.steps(device, quick), "Batches": cost.batches(device, quick)}  # fmt: skip
 
 
 STUDIES: dict[str, tuple[Any, Callable[[bool, str, Path], Result]]] = {

@@ -44,7 +44,7 @@ from .training_scripts import PROJECTS, Make, Project
 
 ROLLOUT = {"cpu": (22, 50), "cuda": (46, 1000)}
 """Particles along a side of the cube, and steps."""
-PEER = {"cpu": (22, 20, 20), "cuda": (46, 1000, 100)}
+PEER = {"cpu": (22, 20, 20), "cuda": (46, 100, 100)}
 """Particles along a side, steps, and steps of which a script keeps all in a second row."""
 NETWORKS = ((8, 8, 4), (16, 16, 16))
 """Cells along the edges of the block, of 8 particles each."""
