@@ -24,8 +24,9 @@ from ..scene.run import versions
 from .claim import Claim, output_errors
 from .configuration import Configuration
 from .folder import DatasetRecord
+from .packing import prepare_scene
 from .sampling import NoRoom, content
-from .shard import ShardWriter, prepare_scene, shard_path
+from .shard import ShardWriter, shard_path
 from .shard_simulation import Drawn, Outcome, draw, simulate, with_obstacles
 from .workers import take_device, worker
 
