@@ -73,7 +73,7 @@ class Recording:
         self._ends = np.cumsum([0, *particles]).tolist()
         self._shapes, self._device, self._executor = shapes, device, executor
         row = sum(4 * self._ends[-1] * math.prod(shape) for shape in shapes.values())
-        most = frames if packed is None else -(-frames // LEAST_SLABS)
+        most = -(-frames // LEAST_SLABS) if any(packed or ()) else frames
         self._slab_frames = max(1, min(most, SLAB_BYTES // max(row, 1)))
         self._count = 0
         self._slab: dict[str, Tensor] = {}

@@ -162,7 +162,7 @@ def _attempt(
         if told is not None:
             told(len(outcomes), frame)
 
-    packed = [packers is not None and not _obstacle_particles(configuration, o) for o in outcomes]
+    packed = [packers is not None and not _wants_obstacles(configuration, o) for o in outcomes]
     try:
         recorded, failures = batch.simulate(
             built, names, dataset.frames, dataset.interval, count, frame_told, packers, packed
@@ -220,12 +220,12 @@ def _complete(
 def with_obstacles(configuration: Configuration, outcome: Outcome) -> dict[str, Array]:
     """The arrays of an outcome, with the particles of its obstacles where the data set wants them."""
     dataset = configuration.dataset
-    if not outcome.arrays or outcome.words is None or not _obstacle_particles(configuration, outcome):
+    if not outcome.arrays or outcome.words is None or not _wants_obstacles(configuration, outcome):
         return outcome.arrays
     times = np.arange(dataset.frames) * dataset.interval
     return obstacle_particles.add(outcome.arrays, configuration.scene(outcome.words), times)
 
 
-def _obstacle_particles(configuration: Configuration, outcome: Outcome) -> bool:
+def _wants_obstacles(configuration: Configuration, outcome: Outcome) -> bool:
     """Whether the arrays of a scene become longer by particles of obstacles, when it has been simulated."""
     return configuration.dataset.obstacles and outcome.words is not None and bool(outcome.words.get("obstacle"))
