@@ -221,3 +221,22 @@ def test_an_exact_number_of_points(method, shape):
         assert abs(float(points.volume.sum()) / shape.volume - 1) < 1e-12
     with pytest.raises(ValueError, match="count must be at least 1"):
         seed.fill(shape, 0.1, count=0)
+
+
+@pytest.mark.parametrize("method", ["lattice", "jittered", "poisson"])
+@pytest.mark.parametrize("shape", [seed.Sphere((0.3, 0.2, 0.1), 0.2), seed.Box((0.1, 0.2), (0.4, 0.9))])
+def test_an_exact_number_is_a_choice_from_the_widest_spacing_that_has_as_many(shape, method):
+    for count in (37, 150):
+        spacing, every = (shape.volume / count) ** (1 / len(shape.lower)), torch.empty(0)
+        while len(every) < count:
+            every = seed.fill(shape, spacing, 1, method=method, seed=5, **DOUBLE).x
+            spacing *= seed.CLOSER
+        chosen = seed.fill(shape, 1.0, count=count, method=method, seed=5, **DOUBLE).x
+        assert torch.equal(every[(every[:, None] == chosen).all(2).any(1)], chosen)  # in the same order, too
+
+
+def test_a_shape_that_is_smaller_than_its_volume_says():
+    box = seed.Box((0.0, 0.0), (1.0, 1.0))
+    box.volume = 1e6
+    with pytest.raises(ValueError, match=r"takes less than 200 points.*is its volume right"):
+        seed.fill(box, 0.1, count=200)

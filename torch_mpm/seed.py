@@ -99,12 +99,15 @@ class Box(Region):
     """Axis-aligned box (rectangle in 2-D) from ``lower`` to ``upper`` [m]."""
 
     def __init__(self, lower: Vector, upper: Vector):
-        a = _vector("lower", lower)
-        b = _vector("upper", upper, len(a))
-        if not bool((a < b).all()):
-            raise ValueError(f"lower must be below upper on every axis, got {a.tolist()} and {b.tolist()}")
-        super().__init__(shapes.Box((b - a).tolist()), 0.5 * (a + b))
-        self.lower, self.upper = a, b  # as given, not rounded
+        a = check_vector("lower", lower)
+        b = check_vector("upper", upper, len(a))
+        if not all(p < q for p, q in zip(a, b, strict=True)):
+            raise ValueError(f"lower must be below upper on every axis, got {list(a)} and {list(b)}")
+        self.shape = shapes.Box([q - p for p, q in zip(a, b, strict=True)])
+        middle = [0.5 * (p + q) for p, q in zip(a, b, strict=True)]
+        corners = torch.tensor([a, b, middle], dtype=torch.float64, device="cpu")
+        self.lower, self.upper, self.position = corners.unbind()  # as given, not rounded
+        self.volume = self.shape.volume(len(a))
 
 
 class Sphere(Region):
@@ -214,15 +217,17 @@ def _exactly(count: int, shape: Region, method: str, seed: int) -> Tensor:
     spacing = (shape.volume / count) ** (1 / len(shape.lower))
     x = torch.empty(0)
     for _ in range(ATTEMPTS):
-        with contextlib.suppress(_TooSmall):
-            x = _points_in(shape, spacing, method, seed)
+        if method == "poisson" or math.prod(_cells(shape.lower, shape.upper, spacing)) >= count:
+            with contextlib.suppress(_TooSmall):
+                x = _points_in(shape, spacing, method, seed)
         if len(x) >= count:
             break
         spacing *= CLOSER
     else:
-        raise ValueError(f"the shape takes {len(x)} points where {count} should fill it; is its volume right?")
-    kept = torch.randperm(len(x), generator=torch.Generator().manual_seed(seed))[:count]
-    return x[kept.sort().values]
+        raise ValueError(f"the shape takes less than {count} points however near they are; is its volume right?")
+    kept = torch.zeros(len(x), dtype=torch.bool)
+    kept[torch.randperm(len(x), generator=torch.Generator().manual_seed(seed))[:count]] = True
+    return x[kept]
 
 
 class _TooSmall(ValueError):
@@ -272,15 +277,20 @@ def _lattice(lower: Tensor, upper: Tensor, spacing: float, jitter: torch.Generat
 
     With a generator, random points of the cells instead.
     """
-    counts = ((upper - lower) / spacing).round().clamp(min=1)
-    axes = [
-        lo + (torch.arange(int(n), dtype=torch.float64) + 0.5) * (hi - lo) / n
-        for lo, hi, n in zip(lower, upper, counts, strict=True)
-    ]
+    counts = _cells(lower, upper, spacing)
+    sides = zip(lower.tolist(), upper.tolist(), counts, strict=True)
+    axes = [lo + (torch.arange(int(n), dtype=torch.float64) + 0.5) * (hi - lo) / n for lo, hi, n in sides]
     x = torch.cartesian_prod(*axes)
     if jitter is not None:
-        x = x + (torch.rand(x.shape, generator=jitter, dtype=torch.float64) - 0.5) * (upper - lower) / counts
+        places = torch.rand(x.shape, generator=jitter, dtype=torch.float64) - 0.5
+        x = x + places * (upper - lower) / torch.tensor(counts, dtype=torch.float64)
     return x
+
+
+def _cells(lower: Tensor, upper: Tensor, spacing: float) -> list[float]:
+    """Numbers of cells along the axes of a lattice in a box."""
+    counts: list[float] = ((upper - lower) / spacing).round().clamp(min=1).tolist()
+    return counts
 
 
 def _poisson_disk(lower: Tensor, upper: Tensor, spacing: float, seed: int) -> Tensor:

@@ -129,6 +129,9 @@ class Sphere(Shape):
     def surface(self, x: Tensor, scene: Tensor | None = None) -> tuple[Tensor, Tensor]:
         return norm(x) - self.at_nodes("radius", x, (), scene), unit(x)
 
+    def contains(self, x: Tensor) -> Tensor:
+        return norm(x) <= self.at_nodes("radius", x, (), None)
+
     def volume(self, dim: int, scene: int = 0) -> float:
         return ball_volume(dim, float(self.of_scene("radius", 0, scene)))
 
@@ -153,10 +156,17 @@ class Box(Shape):
 
     def surface(self, x: Tensor, scene: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """The normal is that of the nearest face, inside the one of the axis with the least negative distance."""
-        depth = x.abs() - 0.5 * self.at_nodes("size", x, x.shape[1:], scene)
+        depth = self._depth(x, scene)
         nearest = torch.arange(x.shape[1], device=x.device) == depth.argmax(1, keepdim=True)
         distance = norm(depth.clamp_min(0)) + depth.amax(1).clamp_max(0)
         return distance, nearest * torch.where(x < 0, -1, 1).to(x.dtype)
+
+    def contains(self, x: Tensor) -> Tensor:
+        return (self._depth(x, None) <= 0).all(1)
+
+    def _depth(self, x: Tensor, scene: Tensor | None) -> Tensor:
+        """How far points are behind the faces of each axis [N, D] [m], negative inside."""
+        return x.abs() - 0.5 * self.at_nodes("size", x, x.shape[1:], scene)
 
     def volume(self, dim: int, scene: int = 0) -> float:
         return float(self.of_scene("size", 1, scene).prod())

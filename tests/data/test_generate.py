@@ -5,6 +5,8 @@ import os
 import random
 import resource
 import shutil
+import threading
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -20,8 +22,10 @@ from torch_mpm.data import batch
 from torch_mpm.data.finish import IncompleteError, finalize, verify
 from torch_mpm.data.folder import DatasetFolder
 from torch_mpm.data.generate import check_samples, generate
+from torch_mpm.data.packing import prepare_scene
 from torch_mpm.data.sampling import content
 from torch_mpm.data.shard import record_path, shard_path
+from torch_mpm.data.shard_simulation import draw, simulate, with_obstacles
 from torch_mpm.data.workers import Worker, WorkerError, take_device, worker
 from torch_mpm.scene import SceneError
 from torch_mpm.scene.folder import OutputError
@@ -225,8 +229,8 @@ def test_a_scene_that_explodes_is_recorded_and_leaves_the_others_as_they_are(tmp
     built = made.scene(*(content(made, s.id) for s in good)).build("cpu")
     alone, failures = batch.simulate(built, ["position"], 12, 0.005, 10)
     assert failures == [""] * len(good)
-    for arrays, told in zip(alone, good, strict=True):
-        np.testing.assert_array_equal(arrays["position"], dataset.scene(told.id)["position"])
+    for recorded, told in zip(alone, good, strict=True):
+        np.testing.assert_array_equal(recorded.arrays["position"], dataset.scene(told.id)["position"])
     assert list(verify(tmp_path)) == []
 
 
@@ -241,6 +245,40 @@ def test_a_scene_that_fails_is_tried_again_with_half_of_the_time_step(tmp_path):
         assert attributes["attempts"] == (2 if stiff[name] else 1), name
         assert attributes["dt"] * attributes["substeps_per_frame"] == pytest.approx(0.005)
         assert attributes["dt"] == pytest.approx(5e-4 if stiff[name] else 1e-3)
+
+
+def test_what_is_packed_beside_the_simulation_is_the_same(device):
+    """Of scenes that failed at first, and of some with particles of obstacles, whose arrays are made later."""
+    made = configuration(
+        material__jelly__E={"choice": [1e4, 1.2e7]}, dt=1e-3, grid__deterministic=True,
+        obstacle=[{"count": {"choice": [0, 1]}, "shape": "sphere", "center": [0.5, 0.1], "radius": 0.08}],
+    )  # fmt: skip
+    prepared = []
+    with ThreadPoolExecutor(3) as pool:
+        for packers in (None, pool):
+            drawn = draw(made, range(7), torch.device(device))
+            simulate(made, drawn, torch.device(device), packers=packers)
+            assert {o.attempts for o in drawn.outcomes} == {1, 2} and not any(o.failure for o in drawn.outcomes)
+            standing = [bool(o.words["obstacle"]) for o in drawn.outcomes]
+            assert len(set(standing)) == 2
+            for outcome, stands in zip(drawn.outcomes, standing, strict=True):
+                assert set(outcome.packings) == (set() if stands or packers is None else {"position"})
+            prepared.append([prepare_scene(with_obstacles(made, o), o.packings) for o in drawn.outcomes])
+    for alone, beside in zip(*prepared, strict=True):
+        assert alone.hash == beside.hash and alone.motion == beside.motion
+        assert alone.arrays["position"] == beside.arrays["position"]
+
+
+def test_a_simulation_that_is_broken_off_leaves_no_threads(device):
+    made, drawn = configuration(), draw(configuration(), range(3), torch.device(device))
+
+    def broken(scenes, frame):
+        if frame == 5:
+            raise KeyboardInterrupt
+
+    with ThreadPoolExecutor(2) as pool, pytest.raises(KeyboardInterrupt):
+        simulate(made, drawn, torch.device(device), broken, pool)
+    assert not [t for t in threading.enumerate() if t.name == "torch_mpm recording"]
 
 
 def test_a_scene_that_needs_too_many_steps_fails_alone(tmp_path):

@@ -11,17 +11,16 @@ import pytest
 h5py = pytest.importorskip("h5py")
 
 from torch_mpm.data import shard  # noqa: E402
+from torch_mpm.data.packing import content_hash, prepare_scene  # noqa: E402
 from torch_mpm.data.shard import (  # noqa: E402
     Shard,
     ShardRecord,
     ShardWriter,
-    content_hash,
-    motion_sums,
-    prepare_scene,
     record_path,
     scene_name,
     shard_path,
 )
+from torch_mpm.data.statistics import motion_sums  # noqa: E402
 from torch_mpm.errors import DamagedFileError  # noqa: E402
 
 FRAMES, PARTICLES = 40, 500

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from concurrent.futures import Executor
 from typing import Any
 
 import torch
@@ -14,7 +15,7 @@ from ..rollouts import rollout
 from ..scene import fields, heap
 from ..scene.build import Built
 from ..state import State, _take
-from .recording import Array, Recording
+from .recording import Recorded, Recording
 
 LOOK = 8
 """Frames between two looks at the stability limit and the validity of the particles, and between two reorderings."""
@@ -72,8 +73,15 @@ def shapes_of(names: Sequence[str], dim: int) -> dict[str, tuple[int, ...]]:
 
 @torch.inference_mode()
 def simulate(
-    built: Built, names: Sequence[str], frames: int, interval: float, count: int, told: Told | None = None
-) -> tuple[list[dict[str, Array]], list[str]]:
+    built: Built,
+    names: Sequence[str],
+    frames: int,
+    interval: float,
+    count: int,
+    told: Told | None = None,
+    executor: Executor | None = None,
+    packed: Sequence[bool] | None = None,
+) -> tuple[list[Recorded], list[str]]:
     """Simulate all scenes of a batch.
 
     Args:
@@ -83,21 +91,23 @@ def simulate(
         interval: time from frame to frame [s].
         count: substeps from frame to frame.
         told: called after each frame has been queued.
+        executor, packed: of `Recording`.
 
     Returns:
-        The fields [T, N, ...] of each scene, float32, and why it failed; "" for a scene that is good.
+        The fields of each scene, and why it failed; "" for a scene that is good.
     """
     _leave_room(built)
     while True:
-        recording = Recording(frames, particles_of(built), shapes_of(names, built.grid.dim), built.state.x.device)
+        shapes = shapes_of(names, built.grid.dim)
+        recording = Recording(frames, particles_of(built), shapes, built.state.x.device, executor, packed)
         try:
             surveys = _run(built, recording, names, frames, interval, count, told)
-            arrays = recording.finish()
+            recorded = recording.finish()
         except BaseException:
             recording.abandon()
             raise
         if _had_room(built):
-            return arrays, _failures(built, surveys, interval / count, frames)
+            return recorded, _failures(built, surveys, interval / count, frames)
 
 
 def _run(

@@ -12,7 +12,8 @@ import numpy as np
 from ..errors import DamagedFileError
 from .folder import DatasetFolder, DatasetRecord
 from .metadata import metadata, write_metadata
-from .shard import REMEDY, SceneRecord, Shard, ShardRecord, StoredScene, content_hash, record_path, shard_path
+from .packing import content_hash
+from .shard import REMEDY, SceneRecord, Shard, ShardRecord, StoredScene, record_path, shard_path
 from .statistics import BOUNDARY
 
 GAIN = 0.05

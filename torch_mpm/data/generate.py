@@ -24,8 +24,9 @@ from ..scene.run import versions
 from .claim import Claim, output_errors
 from .configuration import Configuration
 from .folder import DatasetRecord
+from .packing import PreparedScene, prepare_scene
 from .sampling import NoRoom, content
-from .shard import ShardWriter, prepare_scene, shard_path
+from .shard import ShardWriter, shard_path
 from .shard_simulation import Drawn, Outcome, draw, simulate, with_obstacles
 from .workers import take_device, worker
 
@@ -131,6 +132,7 @@ class _Line:
         with ExitStack() as stack:
             self._drawer, self._writer = (stack.enter_context(ThreadPoolExecutor(1)) for _ in range(2))
             self._packers = stack.enter_context(ThreadPoolExecutor(min(len(os.sched_getaffinity(0)), MOST_PACKERS)))
+            beside = None if self.device.type == "cpu" else self._packers  # a CPU simulates with all its cores
             shards = self.claim.unfinished(check)
             coming: tuple[int, Future[Drawn]] | None = self._next(shards)
             written: Future[None] | None = None
@@ -138,7 +140,7 @@ class _Line:
                 shard, drawn = coming[0], self._wait(coming[1])
                 coming = self._next(shards)
                 begin = time.perf_counter()
-                simulate(self.configuration, drawn, self.device, self._tell)
+                simulate(self.configuration, drawn, self.device, self._tell, beside)
                 self.totals["simulating"] += time.perf_counter() - begin
                 if written is not None:
                     self._wait(written)
@@ -182,13 +184,15 @@ class _Line:
     def _write(self, shard: int, outcomes: list[Outcome]) -> None:
         """Compress the scenes of a shard and write it, beside what the device is doing."""
         writer = ShardWriter({"shard": shard, "device": _device_name(self.device), **versions()})
-        packed = self._packers.map(lambda o: prepare_scene(with_obstacles(self.configuration, o)), outcomes)
-        for outcome, scene in zip(outcomes, packed, strict=True):
+        for outcome, scene in zip(outcomes, self._packers.map(self._prepared, outcomes), strict=True):
             writer.add(outcome.id, scene, self._attributes(outcome))
-            outcome.arrays = {}
+            outcome.arrays, outcome.packings = {}, {}
         with output_errors(self.claim.folder):
             writer.finish(shard_path(self.claim.folder, shard))
         self.claim.release(shard)
+
+    def _prepared(self, outcome: Outcome) -> PreparedScene:
+        return prepare_scene(with_obstacles(self.configuration, outcome), outcome.packings)
 
     def _attributes(self, outcome: Outcome) -> dict[str, str | int | float]:
         words = {} if outcome.words is None else self.configuration.scene_words(outcome.words)

@@ -1,4 +1,4 @@
-"""Frames of a batch on their way to arrays in host memory, while the device computes the next ones."""
+"""Frames of a batch on their way to arrays in host memory, packed or not, while the device computes the next ones."""
 
 from __future__ import annotations
 
@@ -6,7 +6,8 @@ import math
 import queue
 import threading
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from concurrent.futures import Executor
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -14,50 +15,73 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from .packing import Packing
+
 Array = npt.NDArray[Any]
 SLAB_BYTES = 2**27
 """Of the frames that are copied from a device at once, about."""
+LEAST_SLABS = 8
+"""Where arrays are packed: the last slab comes when the simulation has ended, and should be a small part of all."""
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """The fields [T, N, ...] of a scene, float32, and those packings of them that were wanted."""
+
+    arrays: dict[str, Array]
+    packings: dict[str, Packing] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class _Slab:
-    """Some frames in pinned memory; `ready` comes behind their copies."""
+    """Some frames in host memory; `ready` comes behind their copies from a device."""
 
     first: int
     values: dict[str, Tensor]
-    ready: torch.cuda.Event
+    ready: torch.cuda.Event | None
 
 
 class Recording:
     """Arrays [T, N, ...] in float32 of each scene of a batch, filled frame by frame.
 
-    On CUDA, frames are gathered in slabs and copied to pinned memory by a stream of their own; a thread takes them from
-    there, so that neither the device nor the host waits.
+    On CUDA, and with an executor, frames are gathered in slabs; on CUDA a stream of its own copies these to pinned
+    memory. A thread takes them from there, so that neither the device nor the host waits.
 
     Args:
         frames: T.
         particles: N of each scene, whose particles follow one another.
         shapes: of a field the shape per particle, by name.
         device: of the values.
+        executor: whose threads take slabs apart, scene by scene; without one it is done in one thread.
+        packed: of each scene whether its arrays are packed on the way; by default none is.
     """
 
     def __init__(
-        self, frames: int, particles: Sequence[int], shapes: Mapping[str, tuple[int, ...]], device: torch.device
+        self,
+        frames: int,
+        particles: Sequence[int],
+        shapes: Mapping[str, tuple[int, ...]],
+        device: torch.device,
+        executor: Executor | None = None,
+        packed: Sequence[bool] | None = None,
     ) -> None:
-        self.arrays = [
-            {name: np.empty((frames, count, *shape), np.float32) for name, shape in shapes.items()}
-            for count in particles
-        ]
+        self._scenes = []
+        for count, wanted in zip(particles, packed or [False] * len(particles), strict=True):
+            arrays = {name: np.empty((frames, count, *shape), np.float32) for name, shape in shapes.items()}
+            packings = {name: Packing(values) for name, values in arrays.items() if wanted and values.size}
+            self._scenes.append(Recorded(arrays, packings))
         self._ends = np.cumsum([0, *particles]).tolist()
-        self._shapes, self._device = shapes, device
+        self._shapes, self._device, self._executor = shapes, device, executor
         row = sum(4 * self._ends[-1] * math.prod(shape) for shape in shapes.values())
-        self._slab_frames = max(1, min(frames, SLAB_BYTES // max(row, 1)))
+        most = -(-frames // LEAST_SLABS) if any(packed or ()) else frames
+        self._slab_frames = max(1, min(most, SLAB_BYTES // max(row, 1)))
         self._count = 0
         self._slab: dict[str, Tensor] = {}
         self._error: BaseException | None = None
+        self._abandoned = False
         self._thread: threading.Thread | None = None
-        if device.type == "cuda":
-            self._stream = torch.cuda.Stream(device)
+        self._stream = torch.cuda.Stream(device) if device.type == "cuda" else None
+        if self._stream is not None or executor is not None:
             self._jobs: queue.Queue[_Slab | None] = queue.Queue(maxsize=2)
             self._thread = threading.Thread(target=self._work, name="torch_mpm recording", daemon=True)
             self._thread.start()
@@ -81,8 +105,8 @@ class Recording:
         if place == self._slab_frames - 1:
             self._send()
 
-    def finish(self) -> list[dict[str, Array]]:
-        """Wait for all frames; returns the arrays of each scene.
+    def finish(self) -> list[Recorded]:
+        """Wait for all frames; returns what there is of each scene.
 
         Raises:
             what went wrong on the way.
@@ -94,38 +118,59 @@ class Recording:
             self._thread.join()
             if self._error is not None:
                 raise self._error
-        return self.arrays
+        return self._scenes
 
     def abandon(self) -> None:
         """End the thread without waiting for what is right."""
+        self._abandoned = True
         if self._thread is not None:
             self._jobs.put(None)
             self._thread.join()
 
     def _send(self) -> None:
-        """Copy the slab to pinned memory behind what the device is doing."""
+        """Hand on the slab, from a device behind what that is doing."""
         count = (self._count - 1) % self._slab_frames + 1
-        self._stream.wait_stream(torch.cuda.current_stream(self._device))
-        with torch.cuda.stream(self._stream):
+        if self._stream is None:
+            slab = _Slab(self._count - count, {name: slab[:count] for name, slab in self._slab.items()}, None)
+        else:
+            slab = self._copied(count, self._stream)
+        self._jobs.put(slab)
+        self._slab = {}
+
+    def _copied(self, count: int, stream: torch.cuda.Stream) -> _Slab:
+        """Copies of some frames in pinned memory."""
+        stream.wait_stream(torch.cuda.current_stream(self._device))
+        with torch.cuda.stream(stream):
             host = {}
             for name, slab in self._slab.items():
-                slab.record_stream(self._stream)
+                slab.record_stream(stream)
                 pinned = torch.empty((count, *slab.shape[1:]), dtype=slab.dtype, device="cpu", pin_memory=True)
                 host[name] = pinned.copy_(slab[:count], non_blocking=True)
             ready = torch.cuda.Event()
-            ready.record(self._stream)
-        self._jobs.put(_Slab(self._count - count, host, ready))
-        self._slab = {}
+            ready.record(stream)
+        return _Slab(self._count - count, host, ready)
 
     def _work(self) -> None:
         while (slab := self._jobs.get()) is not None:
+            if self._error is not None or self._abandoned:
+                continue  # nobody wants the rest, but who puts it must not wait
             try:
-                slab.ready.synchronize()
+                if slab.ready is not None:
+                    slab.ready.synchronize()
                 self._take(slab.first, {name: value.numpy() for name, value in slab.values.items()})
             except BaseException as error:
-                self._error = self._error or error
+                self._error = error
 
     def _take(self, first: int, values: Mapping[str, Array]) -> None:
-        for name, rows in values.items():
-            for k, arrays in enumerate(self.arrays):
-                arrays[name][first : first + len(rows)] = rows[:, self._ends[k] : self._ends[k + 1]]
+        """The next frames of all scenes. Returns when all are done, so that those of a scene come in order."""
+
+        def take(k: int) -> None:
+            scene = self._scenes[k]
+            for name, rows in values.items():
+                scene.arrays[name][first : first + len(rows)] = rows[:, self._ends[k] : self._ends[k + 1]]
+                if name in scene.packings:
+                    scene.packings[name].advance(first + len(rows))
+
+        scenes = range(len(self._scenes))
+        for _ in map(take, scenes) if self._executor is None else self._executor.map(take, scenes):
+            pass  # errors are raised here

@@ -13,9 +13,9 @@ from __future__ import annotations
 import hashlib
 import io
 import json
-import math
 import os
 from collections.abc import Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import TracebackType
@@ -26,15 +26,13 @@ import numpy.typing as npt
 
 from ..errors import DamagedFileError
 from .hdf5 import h5py_module, storage_problem
-from .statistics import Motion, Sums, motion_sums
+from .packing import GZIP_LEVEL, Compressed, PreparedScene
+from .statistics import Motion, Sums
 
 Array = npt.NDArray[Any]
 Attributes = Mapping[str, str | int | float]
 
 FORMAT = 1
-CHUNK_BYTES = 2**17
-"""Of a chunk before compression, about: a window of some frames reads little more than itself."""
-GZIP_LEVEL = 1
 REMEDY = "remove it and its .json, and generate again"
 
 
@@ -50,89 +48,6 @@ def record_path(shard: Path) -> Path:
 
 def scene_name(scene_id: int) -> str:
     return f"scene_{scene_id:07d}"
-
-
-# ---- what a scene is made of
-
-
-@dataclass(frozen=True)
-class Compressed:
-    """An array as it lies in the file: chunks of ``chunk_frames`` rows, shuffled by bytes and compressed."""
-
-    shape: tuple[int, ...]
-    dtype: np.dtype[Any]
-    chunk_frames: int
-    chunks: list[bytes]
-
-
-def chunk_frames(shape: tuple[int, ...], dtype: npt.DTypeLike) -> int:
-    """Rows of the first axis that make a chunk."""
-    row = math.prod(shape[1:]) * np.dtype(dtype).itemsize
-    return max(1, min(shape[0], CHUNK_BYTES // max(row, 1)))
-
-
-def isal_zlib_module() -> Any:
-    """A zlib that is some ten times as fast, and compresses a tenth less."""
-    try:
-        from isal import isal_zlib
-    except ImportError as error:
-        raise ImportError("data sets need isal: pip install torch-mpm[data]") from error
-    return isal_zlib
-
-
-def compress(values: Array) -> Compressed:
-    """An array [T, ...] with at least one element in compressed chunks, the last of them filled up with zeros.
-
-    Other threads run meanwhile: there are few calls, since each has to wait for Python's lock.
-    """
-    frames = chunk_frames(values.shape, values.dtype)
-    count = -(-len(values) // frames)
-    if missing := count * frames - len(values):
-        values_of_chunks = np.concatenate([values, np.zeros((missing, *values.shape[1:]), values.dtype)])
-    else:
-        values_of_chunks = np.ascontiguousarray(values)
-    bytes_of_chunks = values_of_chunks.view(np.uint8).reshape(count, -1, values.itemsize)
-    shuffled = np.ascontiguousarray(bytes_of_chunks.transpose(0, 2, 1)).reshape(count, -1)
-    pack = isal_zlib_module().compress
-    return Compressed(values.shape, values.dtype, frames, [pack(chunk, GZIP_LEVEL) for chunk in shuffled])
-
-
-def content_hash(arrays: Mapping[str, Array]) -> str:
-    """SHA-256 of the arrays of a scene: of their names, types, shapes and numbers, however they are stored."""
-    digest = hashlib.sha256()
-    for name in sorted(arrays):
-        values = np.ascontiguousarray(arrays[name])
-        digest.update(f"{name} {values.dtype.str} {values.shape} ".encode())
-        digest.update(hashlib.sha256(values.data).digest())
-    return digest.hexdigest()
-
-
-@dataclass(frozen=True)
-class PreparedScene:
-    """A scene ready to be written: its arrays as they are stored, and what the record says about them."""
-
-    arrays: Mapping[str, Array | Compressed]
-    particles: int
-    hash: str
-    motion: Motion | None
-
-
-def prepare_scene(arrays: Mapping[str, Array]) -> PreparedScene:
-    """Compress, hash and sum up a scene; may run in any thread, and needs no h5py.
-
-    Args:
-        arrays: ``position`` [T, N, D] and the other arrays of the scene; none for a scene that failed.
-
-    Raises:
-        ValueError: for positions that are not finite, or arrays without ``position``.
-    """
-    if not arrays:
-        return PreparedScene({}, 0, content_hash({}), None)
-    if "position" not in arrays or arrays["position"].ndim != 3:
-        raise ValueError(f"arrays must have position [T, N, D], got {', '.join(arrays)}")
-    stored = {name: compress(a) if a.ndim > 1 and a.size else a for name, a in arrays.items()}
-    motion = motion_sums(arrays["position"], arrays.get("particle_type"))
-    return PreparedScene(stored, arrays["position"].shape[1], content_hash(arrays), motion)
 
 
 # ---- records
@@ -229,7 +144,7 @@ class ShardWriter:
 
         Args:
             scene_id: its number in the data set.
-            scene: from :func:`prepare_scene`.
+            scene: from :func:`torch_mpm.data.packing.prepare_scene`.
             attributes: must have ``valid`` (0 or 1); ``attempts`` and ``failure`` also go into the record.
         """
         group = self._file.create_group(scene_name(scene_id))
@@ -259,8 +174,10 @@ class ShardWriter:
         self._file.close()
         data = self._image.getbuffer()
         scenes = sorted(self._scenes, key=lambda scene: scene.id)
-        record = ShardRecord(len(data), hashlib.sha256(data).hexdigest(), scenes)
-        write_whole(path, data)
+        with ThreadPoolExecutor(1) as beside:  # a disk and a hash take about as long
+            digest = beside.submit(hashlib.sha256, data)
+            write_whole(path, data)
+        record = ShardRecord(len(data), digest.result().hexdigest(), scenes)
         record.write(record_path(path))
         return record
 

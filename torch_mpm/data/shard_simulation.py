@@ -6,6 +6,7 @@ All of it follows from the configuration and the ids of the scenes.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from concurrent.futures import Executor
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -19,7 +20,8 @@ from ..scene.build import Built
 from . import batch, obstacle_particles
 from .configuration import Configuration
 from .distribution import Words, is_number
-from .recording import Array
+from .packing import Packing
+from .recording import Array, Recorded
 from .sampling import NoRoom, content
 
 Told = Callable[[int, int], None]
@@ -37,6 +39,7 @@ class Outcome:
         attempts: how often it was simulated.
         dt, substeps: time step [s] and number of them per frame of the last attempt.
         arrays: of a scene that is good, as a shard has them, but for particles of obstacles (`with_obstacles`).
+        packings: of those arrays that were packed while they came.
         materials: words of its materials, in the order of their numbers.
     """
 
@@ -47,6 +50,7 @@ class Outcome:
     dt: float = 0.0
     substeps: int = 0
     arrays: dict[str, Array] = field(default_factory=dict)
+    packings: dict[str, Packing] = field(default_factory=dict)
     materials: list[dict[str, Any]] = field(default_factory=list)
 
 
@@ -95,8 +99,21 @@ def _batch(configuration: Configuration, outcomes: list[Outcome], device: torch.
     return configuration.scene(*(o.words for o in outcomes if o.words is not None)).build(device)
 
 
-def simulate(configuration: Configuration, drawn: Drawn, device: torch.device, told: Told | None = None) -> None:
+def simulate(
+    configuration: Configuration,
+    drawn: Drawn,
+    device: torch.device,
+    told: Told | None = None,
+    packers: Executor | None = None,
+) -> None:
     """Simulate what was drawn; its outcomes tell the rest.
+
+    Args:
+        configuration: of the data set.
+        drawn: the scenes.
+        device: where they are simulated.
+        told: called after each frame has been queued.
+        packers: that pack the scenes on the way.
 
     Raises:
         SimulationError: where the device has no memory for the scenes.
@@ -109,7 +126,7 @@ def simulate(configuration: Configuration, drawn: Drawn, device: torch.device, t
     for attempt in range(dataset.attempts):
         if built is None or not rest:
             return
-        _attempt(configuration, rest, built, count * 2**attempt, told)
+        _attempt(configuration, rest, built, count * 2**attempt, told, packers)
         rest = [o for o in rest if o.failure]
         if rest and attempt + 1 < dataset.attempts:
             for outcome in rest:
@@ -134,8 +151,9 @@ def _substeps(
 
 
 def _attempt(
-    configuration: Configuration, outcomes: list[Outcome], built: Built, count: int, told: Told | None
-) -> None:
+    configuration: Configuration, outcomes: list[Outcome], built: Built, count: int, told: Told | None,
+    packers: Executor | None,
+) -> None:  # fmt: skip
     """Simulate scenes and keep the arrays of those that are good."""
     dataset, statics = configuration.dataset, built.statics()
     names = ("position", *dataset.fields)
@@ -144,8 +162,11 @@ def _attempt(
         if told is not None:
             told(len(outcomes), frame)
 
+    packed = [packers is not None and not _wants_obstacles(configuration, o) for o in outcomes]
     try:
-        recorded, failures = batch.simulate(built, names, dataset.frames, dataset.interval, count, frame_told)
+        recorded, failures = batch.simulate(
+            built, names, dataset.frames, dataset.interval, count, frame_told, packers, packed
+        )
     except torch.OutOfMemoryError as error:
         raise SimulationError(
             f"the device has no memory for {len(outcomes)} scenes at once; make dataset.scenes_per_shard smaller"
@@ -173,7 +194,7 @@ def _parameters(
 
 
 def _complete(
-    configuration: Configuration, outcome: Outcome, recorded: dict[str, Array], own: dict[str, Array], built: Built,
+    configuration: Configuration, outcome: Outcome, recorded: Recorded, own: dict[str, Array], built: Built,
     index: int,
 ) -> None:  # fmt: skip
     """Take over the arrays of a scene that is good: fields, types, materials and masses of its particles."""
@@ -185,8 +206,9 @@ def _complete(
         {"name": m.name, "particle_type": code, **m.words.model_dump(mode="json", exclude_none=True)}
         for m, code in zip(materials, types, strict=True)
     ]
+    outcome.packings = recorded.packings
     outcome.arrays = {
-        **recorded,
+        **recorded.arrays,
         "particle_type": np.array(types, np.int8)[number],
         "material": number.astype(np.int8),
         "mass": own["mass"].astype(np.float32),
@@ -198,7 +220,12 @@ def _complete(
 def with_obstacles(configuration: Configuration, outcome: Outcome) -> dict[str, Array]:
     """The arrays of an outcome, with the particles of its obstacles where the data set wants them."""
     dataset = configuration.dataset
-    if not (outcome.arrays and dataset.obstacles and outcome.words and outcome.words.get("obstacle")):
+    if not outcome.arrays or outcome.words is None or not _wants_obstacles(configuration, outcome):
         return outcome.arrays
     times = np.arange(dataset.frames) * dataset.interval
     return obstacle_particles.add(outcome.arrays, configuration.scene(outcome.words), times)
+
+
+def _wants_obstacles(configuration: Configuration, outcome: Outcome) -> bool:
+    """Whether the arrays of a scene become longer by particles of obstacles, when it has been simulated."""
+    return configuration.dataset.obstacles and outcome.words is not None and bool(outcome.words.get("obstacle"))

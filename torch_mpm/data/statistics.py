@@ -13,8 +13,8 @@ Array = npt.NDArray[Any]
 
 BOUNDARY = 3
 """Particle type of what moves as prescribed; its motion is not to be learned, and is in no statistics."""
-FRAMES = 64
-"""That are summed up at once: few calls, each of which waits for Python's lock, and what nearly fits into caches."""
+PIECE = 2**15
+"""Numbers summed up at once: they stay in the cache, and calls are few, since each waits for Python's lock."""
 
 
 @dataclass(frozen=True)
@@ -73,16 +73,42 @@ def motion_sums(position: Array, particle_type: Array | None = None) -> Motion:
     Raises:
         ValueError: for positions that are not finite.
     """
-    if not np.isfinite(position).all():
+    if position.size and not np.isfinite([position.min(), position.max()]).all():
         raise ValueError("position must be finite")
-    free = position if particle_type is None else position[:, particle_type != BOUNDARY]
-    dim = position.shape[2]
-    motion = Motion(Sums.zero(dim), Sums.zero(dim))
-    last = np.zeros((dim, 0, free.shape[1]))  # velocity [D, 1, N] of the frame before
-    for first in range(0, len(free) - 1, FRAMES):
-        axes = free[first : first + FRAMES + 1].transpose(2, 0, 1).astype(np.float64, order="C")
-        velocity = np.diff(axes, axis=1)
-        acceleration = np.diff(np.concatenate([last, velocity], 1), axis=1)
-        motion += Motion(Sums.of(velocity), Sums.of(acceleration))
-        last = velocity[:, -1:]
-    return motion
+    frames, _, dim = position.shape
+    free = slice(None) if particle_type is None or BOUNDARY not in particle_type else particle_type != BOUNDARY
+    count = position[:1, free].shape[1]
+    if frames < 2 or not count:
+        return Motion(Sums.zero(dim), Sums.zero(dim))
+    first, last = (np.diff(position[rows, free].astype(np.float64), axis=0)[0] for rows in (slice(2), slice(-2, None)))
+    travel = position[-1, free].astype(np.float64) - position[0, free]  # sums of differences are differences of ends
+    velocity, acceleration = _squares(position, free, first.reshape(-1))
+    return Motion(
+        Sums(count * (frames - 1), _totals(travel, dim), _totals(velocity, dim)),
+        Sums(count * (frames - 2), _totals(last - first, dim), _totals(acceleration, dim)),
+    )
+
+
+def _totals(values: Array, dim: int) -> tuple[float, ...]:
+    """Over all particles."""
+    return tuple(values.reshape(-1, dim).sum(0).tolist())
+
+
+def _squares(position: Array, free: Any, first: Array) -> Array:
+    """Sums over frames of the squares of velocities and accelerations [2, N D] of the particles that are free.
+
+    In pieces, and buffers that stay: large ones would be mapped and unmapped anew by each of many threads.
+    """
+    frames, width = len(position), len(first)
+    rows = max(1, min(frames - 1, PIECE // width))
+    velocity, acceleration, squares = np.empty((rows + 1, width)), np.empty((rows, width)), np.zeros((2, width))
+    velocity[0] = first  # no acceleration at the start, and from then on the velocity of the piece before
+    for start in range(0, frames - 1, rows):
+        x = position[start : start + rows + 1, free].reshape(-1, width)
+        steps = len(x) - 1
+        v = np.subtract(x[1:], x[:-1], out=velocity[1 : steps + 1], dtype=np.float64)
+        a = np.subtract(v, velocity[:steps], out=acceleration[:steps])
+        for total, vectors in zip(squares, (v, a), strict=True):
+            total += np.einsum("tk,tk->k", vectors, vectors)
+        velocity[0] = v[-1]
+    return squares

@@ -111,7 +111,7 @@ def build(scene: Any, device: torch.device) -> Built:
     for index, entry in enumerate(entries):
         for key, body, points, _ in placed[index]:
             density = entry.material[body.material].density
-            parts.append(_named(key, _matter, body, points, density, index, scene.heat, dtype, device))
+            parts.append(_named(key, _matter, body, points, density, index, scene.heat, dtype))
             material.append(torch.full((len(points),), mixture.number(index, body.material), dtype=torch.int32))
         for key, emitter in entry.keyed("emitter"):
             nozzles.append(_named(key, _nozzle, scene, entry, emitter, index, mixture, dtype, device))
@@ -122,10 +122,11 @@ def build(scene: Any, device: torch.device) -> Built:
         torch.empty(0, dim, dtype=dtype), torch.empty(0, dtype=dtype), torch.empty(0, dtype=torch.int32)
     )
     if not parts:
-        nothing = State.at_rest(empty, dtype=dtype, device=device)
+        nothing = State.at_rest(empty, dtype=dtype)
         parts = [nothing if scene.heat is None else nothing.replace(temperature=torch.zeros_like(nothing.mass))]
         material = [torch.empty(0, dtype=torch.int32)]
-    first = _complete(State.concatenate(parts), mixture, torch.cat(material), single=len(entries) == 1)
+    together = State.concatenate(parts).to(device)  # at once, as each copy to a device waits
+    first = _complete(together, mixture, torch.cat(material), single=len(entries) == 1)
     nozzles = [
         Nozzle(
             _complete(n.layer, mixture, torch.full((len(n.layer),), n.material), len(entries) == 1), n.material, n.times
@@ -310,7 +311,8 @@ def _placed(scene: Any, entry: Any, problems: list[str]) -> Placed:
         except (ValueError, OSError) as error:
             problems.append(f"{key}{check.called(body)}: {error}")
             continue
-        found = [] if shape is None else list(check.bounds_problems(key, body, shape, scene.grid))
+        file = isinstance(body, schema.MeshBody)  # other shapes were checked before
+        found = list(check.bounds_problems(key, body, shape, scene.grid)) if file and shape is not None else []
         if not found and not check.inside(scene.grid, points.x):
             lower, upper = points.x.amin(0), points.x.amax(0)
             found = [check.outside(f"{key}{check.called(body)}", lower, upper, scene.grid)]
@@ -343,17 +345,18 @@ def _matter(
     scene: int,
     heat: schema.Heat | None,
     dtype: torch.dtype,
-    device: torch.device,
 ) -> State:
-    """The particles of a body at rest in themselves."""
+    """The particles of a body at rest in themselves, on the host."""
     index = torch.full((len(points),), scene, dtype=torch.int32)
-    state = State.at_rest(seed.Points(points.x, points.volume, index), density, body.velocity, torch.float64)
-    if body.spin is not None:
-        gradient = _spin_matrix(body.spin, points.x.shape[1])
-        center = (points.x * points.volume[:, None]).sum(0) / points.volume.sum()
-        v = state.v + (points.x - center) @ gradient.T
-        state = state.replace(v=v, C=gradient.expand(len(points), -1, -1))
-    return _warmed(state.to(device, dtype), body, heat)
+    points = seed.Points(points.x, points.volume, index)
+    if body.spin is None:
+        return _warmed(State.at_rest(points, density, body.velocity, dtype), body, heat)
+    state = State.at_rest(points, density, body.velocity, torch.float64)
+    gradient = _spin_matrix(body.spin, points.x.shape[1])
+    center = (points.x * points.volume[:, None]).sum(0) / points.volume.sum()
+    v = state.v + (points.x - center) @ gradient.T
+    state = state.replace(v=v, C=gradient.expand(len(points), -1, -1))
+    return _warmed(state.to(dtype=dtype), body, heat)
 
 
 def _warmed(state: State, words: schema.Seeding, heat: schema.Heat | None) -> State:
@@ -424,7 +427,7 @@ def _overlaps(placed: Placed, obstacles: Sequence[tuple[str, Any]]) -> Iterator[
     seen = set()
     for i, (key, _, points, _) in enumerate(placed):
         for j, (other, _, _, shape) in enumerate(placed):
-            if i == j or shape is None or (j, i) in seen:
+            if i == j or shape is None or (j, i) in seen or _apart(points, shape):
                 continue
             inside = int(shape.inside(points.x).sum())
             if inside:
@@ -439,6 +442,14 @@ def _overlaps(placed: Placed, obstacles: Sequence[tuple[str, Any]]) -> Iterator[
             if inside:
                 where = f"{path}{check.called(words)}"
                 yield f"{key}: {inside} of its particles are inside {where}; move one of them"
+
+
+def _apart(points: seed.Points, shape: seed.Region) -> bool:
+    """Whether the boxes around points, of which there are some, and a shape have no point in common."""
+    lower, upper = (v.tolist() for v in points.x.aminmax(dim=0))
+    return any(
+        a > d or b < c for a, b, c, d in zip(lower, upper, shape.lower.tolist(), shape.upper.tolist(), strict=True)
+    )
 
 
 def _gravity(entries: Sequence[Any], dtype: torch.dtype, device: torch.device) -> Tensor | None:

@@ -171,7 +171,7 @@ def _dimension_problems(key: str, item: Any, dim: int) -> Iterator[str]:
 def bounds_problems(key: str, item: Any, shape: seed.Region, grid: schema.Grid) -> Iterator[str]:
     """A region that reaches out of the domain by more than its outermost particles keep away from its surface."""
     slack = 0.5 * _spacing(item, grid)
-    if not inside(grid, shape.lower + slack) or not inside(grid, shape.upper - slack):
+    if not inside(grid, torch.stack([shape.lower + slack, shape.upper - slack])):
         yield outside(f"{key}{called(item)}", shape.lower, shape.upper, grid)
 
 
@@ -221,10 +221,9 @@ def _size_problems(scene: Any, entries: Sequence[Any]) -> Iterator[str]:
     counts: dict[str, float] = {}
     for entry in entries:
         for key, body in entry.keyed("body"):
-            shape = region(body, None)
             if body.particles is not None:
                 counts[f"{entry.path}|{key}"] = body.particles
-            elif shape is not None:
+            elif (shape := region(body, None)) is not None:
                 counts[f"{entry.path}|{key}"] = _filling(shape.volume, len(shape.lower), _spacing(body, scene.grid))
         for key, words in entry.keyed("emitter") if scene.duration is not None else ():
             counts[f"{entry.path}|{key}"] = _poured(words, scene)

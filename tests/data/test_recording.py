@@ -1,0 +1,115 @@
+"""Recordings: frames arrive in the arrays of their scenes, and packed, by whatever threads; errors reach the caller."""
+
+import threading
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+import torch
+
+pytest.importorskip("isal")
+
+from torch_mpm.data import recording
+from torch_mpm.data.packing import Packing
+from torch_mpm.data.recording import Recording
+
+FRAMES, PARTICLES = 45, [300, 0, 1, 700]
+SHAPES = {"position": (2,), "F": (2, 2), "J": ()}
+ROW = 4 * sum(PARTICLES) * 7
+
+
+@pytest.fixture(params=["alone", "executor", "packed"])
+def threads(request):
+    """Arguments of a recording."""
+    with ThreadPoolExecutor(3) as pool:
+        packed = {"packed": [True, True, False, True]} if request.param == "packed" else {}
+        yield {} if request.param == "alone" else {"executor": pool, **packed}
+
+
+def frames_of(device):
+    """Frames whose numbers are all different."""
+    rng = np.random.default_rng(0)
+    values = {name: rng.standard_normal((FRAMES, sum(PARTICLES), *s)).astype(np.float32) for name, s in SHAPES.items()}
+    return values, [{name: torch.from_numpy(v[k]).to(device) for name, v in values.items()} for k in range(FRAMES)]
+
+
+@pytest.mark.parametrize("slab", [1, 7, 1000])
+def test_frames_arrive_in_the_arrays_of_their_scenes(monkeypatch, device, threads, slab):
+    monkeypatch.setattr(recording, "SLAB_BYTES", slab * ROW)
+    values, frames = frames_of(device)
+    recorder = Recording(FRAMES, PARTICLES, SHAPES, torch.device(device), **threads)
+    for frame in frames:
+        recorder.put(frame)
+    ends = np.cumsum(PARTICLES)[:-1]
+    for k, scene in enumerate(recorder.finish()):
+        for name, given in values.items():
+            expected = np.split(given, ends, axis=1)[k]
+            np.testing.assert_array_equal(scene.arrays[name], expected)
+            if name in scene.packings:
+                assert scene.packings[name].values is scene.arrays[name]
+                whole = Packing(np.ascontiguousarray(expected))
+                assert scene.packings[name].digest() == whole.digest()
+                assert scene.packings[name].compressed() == whole.compressed()
+        packed = "packed" in threads and threads["packed"][k] and PARTICLES[k] > 0
+        assert sorted(scene.packings) == (sorted(SHAPES) if packed else [])
+
+
+def test_what_goes_wrong_in_a_thread_is_raised_in_the_end(monkeypatch):
+    monkeypatch.setattr(recording, "SLAB_BYTES", ROW)
+    advance = Packing.advance
+
+    def broken(self, rows):
+        if rows > 10:
+            raise MemoryError("no room")
+        advance(self, rows)
+
+    monkeypatch.setattr(Packing, "advance", broken)
+    _, frames = frames_of("cpu")
+    with ThreadPoolExecutor(2) as pool:
+        recorder = Recording(FRAMES, PARTICLES, SHAPES, torch.device("cpu"), pool, [True] * 4)
+        for frame in frames:  # far more than the queue holds
+            recorder.put(frame)
+        with pytest.raises(MemoryError, match="no room"):
+            recorder.finish()
+        recorder.abandon()
+    assert not names_of_threads()
+
+
+def test_threads_that_are_gone_are_noticed():
+    _, frames = frames_of("cpu")
+    pool = ThreadPoolExecutor(1)
+    pool.shutdown()
+    recorder = Recording(FRAMES, PARTICLES, SHAPES, torch.device("cpu"), pool)
+    for frame in frames:
+        recorder.put(frame)
+    with pytest.raises(RuntimeError, match="shutdown"):
+        recorder.finish()
+
+
+def test_a_recording_that_is_abandoned_takes_nothing_more(monkeypatch, device):
+    monkeypatch.setattr(recording, "SLAB_BYTES", ROW)
+    _, frames = frames_of(device)
+    first, go_on, taken = threading.Event(), threading.Event(), []
+
+    def held(self, rows):
+        taken.append(rows)
+        first.set()
+        go_on.wait()
+
+    monkeypatch.setattr(Packing, "advance", held)
+    with ThreadPoolExecutor(1) as pool:
+        recorder = Recording(FRAMES, PARTICLES, SHAPES, torch.device(device), pool, [True] * 4)
+        for frame in frames[:3]:
+            recorder.put(frame)
+        first.wait()
+        ending = threading.Thread(target=recorder.abandon)
+        ending.start()
+        while not recorder._abandoned:
+            pass
+        go_on.set()
+        ending.join()
+    assert set(taken) == {1} and not names_of_threads()  # the frame that was under way
+
+
+def names_of_threads():
+    return [t.name for t in threading.enumerate() if t.name == "torch_mpm recording"]
