@@ -40,7 +40,8 @@ def test_scenes_against_dense_solves(kept, device, monkeypatch):
 
     inverse = torch.linspace(0.5, 2.0, len(right)).to(right)[:, None, None] * torch.eye(2).to(right)
     relative = torch.full((3,), 1e-9, dtype=torch.float64, device=device)
-    solution, iterations = gmres(system, product, inverse, right, relative, 400)
+    solution, iterations, converged = gmres(system, product, inverse, right, relative, 400)
+    assert bool(converged.all())
     assert iterations[1] == 0 and (solution[rows[1]] == 0).all()
     assert (iterations[0] > kept) == (kept == 5) and int(iterations.max()) < 400
     for b in (0, 2):

@@ -68,7 +68,8 @@ def _principal_derivatives(
     [2, P, pairs], from those of τ, which hold at equal stretches too."""
     with torch.inference_mode(False), torch.enable_grad():
         F = torch.diag_embed(stretch.detach()).requires_grad_()
-        stress = law.update(Overlay(state, F=F))[1]
+        moved: Any = Overlay(state, F=F)
+        stress = law.update(moved)[1]
 
         def by_F(i: int, j: int) -> Tensor:
             return torch.autograd.grad(stress[:, i, j].sum(), F, retain_graph=True)[0] / stretch[:, j, None, None]
