@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
+from ..ops.autograd import graph_at_once
 from ..ops.svd import svd3
 from ..parameters import Overlay
 from ..vectors import determinant
@@ -66,7 +67,7 @@ def _principal_derivatives(
 ) -> tuple[Tensor, Tensor]:
     """Derivatives of P = τ F⁻ᵀ at F = diag(σ) [Pa]: ∂Pᵢᵢ/∂Fⱼⱼ [P, D, D], and of pairs, ∂Pᵢⱼ/∂Fᵢⱼ and ∂Pᵢⱼ/∂Fⱼᵢ
     [2, P, pairs], from those of τ, which hold at equal stretches too."""
-    with torch.inference_mode(False), torch.enable_grad():
+    with torch.inference_mode(False), torch.enable_grad(), graph_at_once():
         F = torch.diag_embed(stretch.detach()).requires_grad_()
         moved: Any = Overlay(state, F=F)
         stress = law.update(moved)[1]
