@@ -1,4 +1,4 @@
-"""Linear solves of plastic flows that are not associated, whose Hessian is not symmetric."""
+"""Linear solves whose matrix is not symmetric: of plastic flows that are not associated, and adjoints with friction."""
 
 from __future__ import annotations
 
