@@ -24,7 +24,7 @@ class Solve(NamedTuple):
     iterations: Tensor
     """int32 [B]."""
     converged: Tensor
-    """bool [B]: whether the residual came down to its share."""
+    """bool [B]: whether the residual came down to its share, but for what rounding adds to it."""
 
 
 def gmres(
@@ -55,22 +55,24 @@ def gmres(
     iterations = torch.zeros(len(relative), dtype=torch.int32, device=right.device)
     cycle = _Cycle(system, inverse, left, precondition)
     residual, target = cycle.first, relative * cycle.first
-    solving = residual > target
+    solving, converged = residual > target, residual <= target
     for start in range(0, most, DIRECTIONS):
         if not bool(solving.any()):
             break
+        begun = solving
         for _ in range(min(DIRECTIONS, most - start)):
             iterations += solving.int()
             residual = torch.where(solving, cycle.add(product(cycle.direction())), residual)
             solving = solving & (residual > target)
             if not bool(solving.any()):
                 break
+        converged = torch.where(begun, residual <= target, converged)
         solution = solution + cycle.solution()
         left = right - product(solution)
         before, cycle = cycle.first, _Cycle(system, inverse, left, precondition)
         residual = cycle.first
         solving = (residual > target) & (residual < STUCK * before)
-    return Solve(solution, iterations, residual <= target)
+    return Solve(solution, iterations, converged)
 
 
 class _Cycle:
