@@ -11,6 +11,8 @@ from helpers import relative_error
 
 import torch_mpm as mpm
 from torch_mpm.implicit import Implicit, adjoint, implicit
+from torch_mpm.laws.compiled import CompiledLaw
+from torch_mpm.ops import LAWS as REGISTRY
 from torch_mpm.ops.law import law_energy_gradient
 from torch_mpm.parameters import Overlay
 
@@ -342,3 +344,10 @@ def test_trial_stress_is_that_of_the_energy(law, dim, device):
 
     inputs = [t.to(device).requires_grad_() for t in (F, q, E, nu)]
     assert torch.autograd.gradcheck(stress, inputs)
+
+
+def test_every_law_with_a_tangent_has_second_derivatives():
+    kinds = [kind for kind in vars(mpm).values() if isinstance(kind, type) and issubclass(kind, CompiledLaw)]
+    names = {kind.name: kind.elastic_name or kind.name for kind in kinds if "name" in vars(kind)}
+    assert set(PARAMETERS) <= set(kinds)
+    assert all(REGISTRY[names[n]].twice_differentiable_energy for n in names if REGISTRY[n].has_tangent)
