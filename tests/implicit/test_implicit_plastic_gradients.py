@@ -10,7 +10,7 @@ import torch
 from helpers import relative_error
 
 import torch_mpm as mpm
-from torch_mpm.implicit import Implicit, adjoint, implicit
+from torch_mpm.implicit import Implicit, adjoint, equilibrium, implicit
 from torch_mpm.laws.compiled import CompiledLaw
 from torch_mpm.ops import LAWS as REGISTRY
 from torch_mpm.ops.law import law_energy_gradient
@@ -344,6 +344,28 @@ def test_trial_stress_is_that_of_the_energy(law, dim, device):
 
     inputs = [t.to(device).requires_grad_() for t in (F, q, E, nu)]
     assert torch.autograd.gradcheck(stress, inputs)
+
+
+def test_a_static_sag_beyond_yield(device):
+    """Of a column that its weight makes flow, with gradients by its strength, against differences."""
+    grid = mpm.Grid(0.125, (0, 0), (1.5, 1.5))
+    points = mpm.seed.box((0.5, 0.0), (0.75, 1.0), grid, per_cell=4)
+    state = mpm.State.at_rest(points, density=1000.0, dtype=torch.float64, device=device)
+
+    def sag(strength, hardening):
+        law = mpm.VonMises(E=1e6, nu=0.3, yield_stress=strength, hardening=hardening)
+        integrator = Implicit(1e-11, adjoint_tolerance=1e-11, plasticity="inside")
+        end = equilibrium(mpm.Step(grid, law, (0.0, -9.8), walls="sticky", integrator=integrator), state, 10.0)
+        return (state.x - end.x)[:, 1].mean()
+
+    strength, hardening = torch.tensor([4e3, 2e5], dtype=torch.float64, device=device).requires_grad_().unbind()
+    grads = torch.autograd.grad(sag(strength, hardening), [strength, hardening])
+    with torch.no_grad():
+        assert sag(strength, hardening) > 1.05 * sag(1e9 * strength, hardening)
+        h = 1e-5
+        by_strength = (sag((1 + h) * strength, hardening) - sag((1 - h) * strength, hardening)) / (2 * h * strength)
+        by_hardening = (sag(strength, (1 + h) * hardening) - sag(strength, (1 - h) * hardening)) / (2 * h * hardening)
+    assert relative_error(grads[0], by_strength) < 1e-6 and relative_error(grads[1], by_hardening) < 1e-6
 
 
 def test_every_law_with_a_tangent_has_second_derivatives():
