@@ -135,7 +135,8 @@ def minimise(system: ImplicitSystem, bounds: NodeBounds | None, options: Options
         direction = torch.where(system.of_nodes(indefinite & (solve.iterations == 0)), -change, solve.solution)
         cg_iterations += solve.iterations
         if skew is not None and bool(whole.any()):
-            derivative = _free_derivative(system, bounds, v, skew, model, across)
+            unprojected = tangent if all_exact else system.tangent(v, projected=False)
+            derivative = _free_derivative(system, bounds, unprojected, skew, model, across)
             step, more = _not_symmetric(system, derivative, inverse, change, model, whole, relative, options)
             direction = torch.where(system.of_nodes(whole), step, direction)
             cg_iterations += more
@@ -175,13 +176,13 @@ def skewed(system: ImplicitSystem, skew: Tensor, tangent: Tensor, share: float |
 def _free_derivative(
     system: ImplicitSystem,
     bounds: NodeBounds | None,
-    v: Tensor,
+    tangent: Tensor,
     skew: Tensor,
     model: Contact,
     across: Tensor | None,
 ) -> Callable[[Tensor], Tensor]:
     """The derivative of the residual with that of friction, of what is free."""
-    derivative = system.derivative(system.tangent(v, projected=False), skew)
+    derivative = system.derivative(tangent, skew)
 
     def product(d: Tensor) -> Tensor:
         result = derivative(d) if across is None else derivative(d) + times(across, d)
