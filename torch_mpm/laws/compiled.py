@@ -47,7 +47,7 @@ class CompiledLaw(Material):
 
     name: str
     elastic_name: ClassVar[str | None] = None
-    """Of a plastic law the compiled law that has its energy, with second derivatives; None where it has them."""
+    """Of a plastic law without second derivatives of its energy, the law of μ and λ that has this energy, and them."""
     scene_defaults: ClassVar[dict[str, float]] = {}
     """Density [kg/m³] and other values that a scene file takes for what it does not say."""
 
@@ -146,8 +146,8 @@ class CompiledLaw(Material):
         return law_energy_gradient(self.elastic_name, deformation, moduli, (), scene, dim)
 
     def _elastic_moduli(self, state: Any, parameters: list[Tensor], history: Sequence[Tensor]) -> list[Tensor]:
-        """The parameters of the law `elastic_name` that has the energy of this one."""
-        return parameters[: len(LAWS[str(self.elastic_name)].parameters)]
+        """μ and λ with which the law `elastic_name` has the energy of this one."""
+        return parameters[:2]
 
     def _viscous_stress(self, state: Any, before: Any) -> Tensor:
         """What the velocity gradient of a step adds to the stress, at the volume before it [P, D, D] [Pa]."""
