@@ -29,10 +29,10 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
-from torch.autograd.graph import saved_tensors_hooks
 
 from . import surface_mesh
 from .errors import check_number, check_vector, shape_of
+from .ops.autograd import graph_at_once
 from .per_scene import SceneParameters, Value, constant, direction, extent, floats
 from .surface_mesh import Array, SurfaceMesh
 from .vectors import norm, unit
@@ -528,13 +528,9 @@ def _with_gradient(function: Callable[[Tensor], Tensor], points: Tensor) -> tupl
         return values, pull_back(torch.ones_like(values))[0]
     # torch.func refuses the hooks of checkpointing, which would compute its steps again for a gradient taken in them.
     differentiable = torch.is_grad_enabled()
-    with torch.enable_grad(), saved_tensors_hooks(_same, _same):
+    with torch.enable_grad(), graph_at_once():
         leaf = points.view_as(points)
         leaf = leaf if leaf.requires_grad else leaf.requires_grad_()
         values = function(leaf)
         (gradient,) = torch.autograd.grad(values, leaf, torch.ones_like(values), create_graph=differentiable)
     return values, gradient
-
-
-def _same(t: Tensor) -> Tensor:
-    return t

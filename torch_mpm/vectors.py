@@ -1,4 +1,4 @@
-"""Lengths and directions of vectors, with gradients that are finite everywhere."""
+"""Lengths and directions of vectors, with gradients that are finite everywhere, and products with small matrices."""
 
 from __future__ import annotations
 
@@ -21,3 +21,10 @@ def unit(v: Tensor) -> Tensor:
 def transform(matrix: Tensor, v: Tensor) -> Tensor:
     """Matrix [D, D] or [N, D, D] times vectors [N, D]."""
     return v @ matrix.mT if matrix.dim() == 2 else (matrix @ v[..., None])[..., 0]
+
+
+def determinant(F: Tensor) -> Tensor:
+    """det F of [P, D, D], without the factorisation of `torch.linalg.det`."""
+    if F.shape[1] == 2:
+        return F[:, 0, 0] * F[:, 1, 1] - F[:, 0, 1] * F[:, 1, 0]
+    return (F[:, 0] * torch.linalg.cross(F[:, 1], F[:, 2])).sum(1)

@@ -157,15 +157,21 @@ def test_memory_does_not_grow_with_the_iterations(device):
     assert iterations[1] > 2 * iterations[0] and kept[0] == kept[1]
 
 
-@pytest.mark.parametrize("rubs", [False, True])
-def test_all_that_waits_for_the_backward_pass_is_saved_by_autograd(rubs, device):
+def clay(mu, lam):
+    return mpm.CamClay(mu=mu, lam=lam, critical_slope=1.0, consolidation=1e3, hardening=5.0)
+
+
+@pytest.mark.parametrize(("rubs", "flows"), [(False, False), (True, False), (True, True)])
+def test_all_that_waits_for_the_backward_pass_is_saved_by_autograd(rubs, flows, device):
     """Where hooks put saved tensors aside, no tensor of particles or nodes is left; and the gradient is the same."""
 
     def graph(device):
         grid, values = inputs(2, device)
         friction = torch.tensor(0.3, dtype=torch.float64, device=device, requires_grad=True)
         sphere = mpm.Sphere((0.5, 0.6), 0.2, "slip", friction=friction if rubs else 0.0)
-        _, end = run(grid, {**values, "mu": values["mu"].requires_grad_()}, walls="slip", boundaries=[sphere], n=2)
+        values["mu"].requires_grad_()
+        law, options = (clay, {**TIGHT, "plasticity": "inside"}) if flows else (mpm.NeoHookean, TIGHT)
+        _, end = run(grid, values, law, 2, options, walls="slip", boundaries=[sphere])
         return end.x.square().sum(), [values["mu"], friction][: 1 + rubs]
 
     def large():

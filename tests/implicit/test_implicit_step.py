@@ -402,13 +402,6 @@ def test_stiff_fluids_in_float32_never_pass_for_solved(device):
     assert bool(after.x.isfinite().all())
 
 
-def test_gradients_through_plastic_laws_are_refused_at_once():
-    grid, state = bar(2)
-    v = state.v.clone().requires_grad_()
-    with pytest.raises(NotImplementedError, match="second derivatives of the energy, which von_mises has not"):
-        step_of(grid, mpm.VonMises(E=1e6, nu=0.3, yield_stress=1e3))(state.replace(v=v), 1e-3)
-
-
 def test_no_scene(device):
     grid = mpm.Grid(0.125, (0.0, 0.0), (1.0, 1.0), scenes=0)
     empty = mpm.State(**{name: torch.zeros(0, *shape, device=device) for name, shape in

@@ -203,3 +203,25 @@ def test_another_precision_is_still_refused(device):
     step.law = lambda F: F.double()
     with pytest.raises(TypeError, match=r"stress must have the dtype of x, torch.float32, got torch.float64"):
         step(block_state(2, device, dtype=torch.float32), 1e-3)
+
+
+def test_a_stiffness_inside_of_a_checkpoint(device):
+    """Its derivatives do not set off the checkpoint, which computes everything once more in the backward pass alone."""
+    state, calls = block_state(2, device), []
+    state = state.replace(F=torch.eye(2).to(state.x).repeat(len(state), 1, 1))
+
+    def stress(F):
+        calls.append(1)
+        return F @ F.mT
+
+    law = mpm.CustomLaw(stress)
+
+    def value(v):
+        moved = state.replace(F=state.F * v)
+        return (law.stiffness(moved) * law.stress(moved)[:, 0, 0]).sum()
+
+    v = torch.ones((), device=device, requires_grad=True)
+    plain = torch.autograd.grad(value(v), v)[0]
+    once = len(calls)
+    kept = torch.autograd.grad(torch.utils.checkpoint.checkpoint(value, v, use_reentrant=False), v)[0]
+    assert torch.allclose(kept, plain) and len(calls) == 3 * once

@@ -34,14 +34,14 @@ from ..errors import check_like, check_number
 from ..failures import Failures, Problem, raise_failures, unsolved_heat
 from ..grid import Blocks, Grid, check_grid
 from ..laws.compiled import check_value
-from ..laws.thermal import LIQUID, determinant
+from ..laws.thermal import LIQUID
 from ..ops import gather, heat_cg, scatter
 from ..ops.arguments import check_choice, per_particle
 from ..ops.heat import METHODS
 from ..parameters import Value, evaluate, needed_temperature, store
 from ..pause import paused
 from ..state import State, check_state
-from ..vectors import norm
+from ..vectors import determinant, norm
 from .boundaries import FixedSurface, HeatNodes
 
 TRANSFERS = ("hybrid", "apic", "flip", "pic")

@@ -2,36 +2,35 @@
 
 At the solution the free components of the residual vanish, g(v, θ) = 0, so that for any θ
 
-    v̄ · dv = −λ · ∂g/∂θ dθ   with   H λ = v̄,
+    v̄ · dv = −λ · ∂g/∂θ dθ   with   Jᵀ λ = v̄,   J = ∂g/∂v,
 
-where H is the Hessian itself, not its projection: one linear solve, and one vector-Jacobian product of the residual.
-The memory does not depend on the iterations, and all of it is in the care of autograd.
+where J is not projected: one linear solve, and one vector-Jacobian product of the residual. Without friction and flow
+inside the solve J is the Hessian of the energy. The memory does not depend on the iterations, and all of it is in the
+care of autograd.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
-from ..laws.compiled import CompiledLaw
-from ..ops import implicit_apply, implicit_cg
-from ..ops.implicit import CONVERGED
-from ..ops.registry import LAWS
+from ..ops import implicit_cg
+from ..ops.implicit import CONVERGED, ImplicitSolve
 from .bounds import NodeBounds
-from .contact import Friction, contact_at
-from .newton import Minimum
-from .preconditioner import inverse_blocks
+from .contact import contact_at
+from .gmres import gmres
+from .newton import Minimum, skewed
+from .preconditioner import inverse_blocks, times
 from .saved import joined, separated
 from .system import ImplicitSystem
 
 if TYPE_CHECKING:
     from .implicit import Implicit
 
-MOST_SOLVES = 60
-"""Of an adjoint with friction."""
+INNER = 1e-2
+"""Relative tolerance of the conjugate gradients that precondition GMRES."""
 
 
 def differentiable(
@@ -44,26 +43,17 @@ def differentiable(
     residual = contact.gradient
     if not residual.requires_grad:
         return minimum.v
-    if system.flows:
-        raise NotImplementedError(
-            "an implicit step with plasticity='inside' has no gradients: use plasticity='after', or torch.no_grad()"
-        )
-    for part in system.law.modules():
-        if isinstance(part, CompiledLaw) and not LAWS[part.name].twice_differentiable_energy:
-            raise NotImplementedError(
-                f"gradients of implicit steps need second derivatives of the energy, which {part.name} has not: "
-                "use integrator='explicit', or torch.no_grad()"
-            )
-    # Start is nothing that the Hessian depends on; friction depends on the gradient.
+    # Start is nothing that the derivative depends on; friction depends on the gradient.
     pressing = None if contact.friction is None else gradient.detach()
     parts = (fixed.blocks, fixed.state, fixed.mass, fixed.dt, bounds, minimum.free, pressing)
     parts, tensors = separated(parts)
-    result: Tensor = _Solution.apply(residual, minimum.v, owner, (fixed.law, fixed.stress_form, parts), *tensors)
+    rest = fixed.law, fixed.stress_form, fixed.flows, parts
+    result: Tensor = _Solution.apply(residual, minimum.v, owner, rest, *tensors)
     return result
 
 
 class _Solution(torch.autograd.Function):
-    """v as a function of the residual that it makes zero. What the Hessian needs is saved, and the Hessian is not."""
+    """v as a function of the residual that it makes zero. What the derivative J needs is saved, and J is not."""
 
     @staticmethod
     def forward(ctx, residual, v, owner, rest, *tensors):
@@ -75,74 +65,94 @@ class _Solution(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx, grad):
         v, *tensors = ctx.saved_tensors
-        law, stress_form, parts = ctx.rest
+        law, stress_form, flows, parts = ctx.rest
         blocks, state, mass, dt, bounds, free, gradient = joined(parts, tensors)
-        system = ImplicitSystem(blocks, law, state, mass, v, dt, stress_form)
-        adjoint = _solve(ctx.owner, system, bounds, free, gradient, v, grad)
+        system = ImplicitSystem(blocks, law, state, mass, v, dt, stress_form, flows)
+        adjoint, converged = _Adjoint(ctx.owner, system, bounds, free, gradient, v).solve(grad)
+        ctx.owner.record_adjoint(converged)
+        adjoint = torch.where(system.of_nodes(converged), adjoint, torch.nan)
         return -adjoint, None, None, None, *(None for _ in tensors)
 
 
-def _solve(
-    owner: Implicit,
-    system: ImplicitSystem,
-    bounds: NodeBounds | None,
-    free: Tensor,
-    gradient: Tensor | None,
-    v: Tensor,
-    grad: Tensor,
-) -> Tensor:
-    """λ of the free components; NaN in scenes whose solve does not converge. The gradient of the energy is given where
-    there is friction."""
-    tangent = system.tangent(v, projected=False)
-    friction = None if gradient is None else contact_at(system, bounds, v, gradient).friction
-    across = None if friction is None else friction.curvature()
-    blocks = system.diagonal(system.tangent(v))
-    inverse = inverse_blocks(bounds, blocks if across is None else blocks + across, free)
-    relative = grad.new_full((system.blocks.grid.scenes,), owner.adjoint_tolerance)
-    if grad.dtype == torch.float32:
-        relative = relative.clamp_min(1e-5)
+class _Adjoint:
+    """The linear solve Jᵀ λ = v̄ at a solution v, with the derivative J of the residual.
 
-    def solved(right: Tensor) -> tuple[Tensor, Tensor]:
-        right = right if bounds is None else bounds.kept(right, free)
-        solve = implicit_cg(
-            *(system.blocks, system.state.x, right, system.mass, inverse, tangent, relative),
-            *(4 * owner.options.max_cg_iterations, system.stress_form, across),
+    J is symmetric, and conjugate gradients solve it, but for flows that are not associated, and for what velocities do
+    to friction by way of the normal forces. GMRES solves for those scenes, preconditioned by conjugate gradients with
+    the projected tangents, so that its iterations are few and do not grow with the stiffness.
+
+    Args:
+        owner: whose tolerance and limit of iterations count.
+        system: at the solution.
+        bounds, free: of the nodes.
+        gradient: of the energy [N, D] [kg m/s], where there is friction.
+        v: the solution [N, D] [m/s].
+    """
+
+    def __init__(
+        self,
+        owner: Implicit,
+        system: ImplicitSystem,
+        bounds: NodeBounds | None,
+        free: Tensor,
+        gradient: Tensor | None,
+        v: Tensor,
+    ) -> None:
+        self._system, self._bounds, self._free = system, bounds, free
+        self._most = 4 * owner.options.max_cg_iterations
+        self._relative = v.new_full((system.blocks.grid.scenes,), owner.adjoint_tolerance)
+        if v.dtype == torch.float32:
+            self._relative = self._relative.clamp_min(1e-5)
+        self._tangent, self._convex = system.tangent(v, projected=False), system.tangent(v)
+        self._skew = system.skew(v) if system.flows else None
+        self._friction = None if gradient is None else contact_at(system, bounds, v, gradient).friction
+        self._across = self._coupling = None
+        if self._friction is not None and gradient is not None:
+            self._across, self._coupling = self._friction.curvature(), self._friction.coupling(gradient)
+        blocks = system.diagonal(self._convex)
+        self._inverse = inverse_blocks(bounds, blocks if self._across is None else blocks + self._across, free)
+
+    def solve(self, grad: Tensor) -> tuple[Tensor, Tensor]:
+        """λ of the free components [N, D], and the scenes whose solve converged, bool [B]."""
+        right = self._kept(grad)
+        whole = self._system.of_nodes(self._not_symmetric())
+        solve = self._symmetric(torch.where(whole, 0, right), self._tangent, self._relative)
+        adjoint, converged = solve.solution, solve.state == CONVERGED
+        if bool(whole.any()):
+            right = torch.where(whole, right, 0)
+            rest = gmres(
+                *(self._system, self._transposed, self._inverse, right, self._relative, self._most),
+                lambda r: self._symmetric(r, self._convex, torch.full_like(self._relative, INNER)).solution,
+            )
+            adjoint, converged = adjoint + rest.solution, converged & rest.converged
+        return adjoint, converged
+
+    def _not_symmetric(self) -> Tensor:
+        """Scenes, bool [B]."""
+        result = torch.zeros_like(self._relative, dtype=torch.bool)
+        if self._skew is not None:
+            result = result | skewed(self._system, self._skew, self._tangent, self._relative)
+        if self._coupling is not None:
+            result = result | (self._system.node_sum(self._coupling.abs()) > 0)
+        return result
+
+    def _symmetric(self, right: Tensor, tangent: Tensor, relative: Tensor) -> ImplicitSolve:
+        """The solve with the symmetric part of J, of given tangents."""
+        system = self._system
+        return implicit_cg(
+            *(system.blocks, system.state.x, right, system.mass, self._inverse, tangent, relative, self._most),
+            *(system.stress_form, self._across),
         )
-        return solve.solution, solve.state == CONVERGED
 
-    adjoint, converged = solved(grad)
-    if friction is not None and gradient is not None:
-        adjoint, converged = _with_normal_forces(system, friction, tangent, gradient, grad, adjoint, relative, solved)
-    owner.record_adjoint(converged)
-    return torch.where(system.of_nodes(converged), adjoint, torch.nan)
+    def _transposed(self, given: Tensor) -> Tensor:
+        """Jᵀ times free components. With friction c(g) d of the gradient g of the energy, J is (1 + d ∂c/∂g) ∂g/∂v and
+        the derivative of friction by its direction."""
+        derivative = self._system.derivative(self._tangent, None if self._skew is None else -self._skew)
+        if self._friction is None or self._coupling is None:
+            return self._kept(derivative(given))
+        direction = self._friction.bounds.turned(self._friction.direction)
+        result = derivative(given + self._coupling * (direction * given).sum(1, keepdim=True))
+        return self._kept(result if self._across is None else result + times(self._across, given))
 
-
-def _with_normal_forces(
-    system: ImplicitSystem,
-    friction: Friction,
-    tangent: Tensor,
-    gradient: Tensor,
-    grad: Tensor,
-    adjoint: Tensor,
-    relative: Tensor,
-    solved: Callable[[Tensor], tuple[Tensor, Tensor]],
-) -> tuple[Tensor, Tensor]:
-    """The adjoint, and where it converged, with what velocities do to friction by way of the normal forces: the
-    Hessian is not symmetric there, and the solves with its symmetric part are repeated until they agree."""
-    coupling = friction.coupling(gradient)
-    direction = friction.bounds.turned(friction.direction)
-
-    def size(vectors: Tensor) -> Tensor:
-        return system.node_sum(system.mass[:, None] * vectors.square()).sqrt()
-
-    converged = torch.zeros_like(relative, dtype=torch.bool)
-    for _ in range(MOST_SOLVES):
-        held = coupling * (direction * adjoint).sum(1, keepdim=True)
-        pulled = implicit_apply(system.blocks, system.state.x, held, tangent, system.mass, system.stress_form)
-        before = adjoint
-        adjoint, converged = solved(grad - pulled)
-        settled = size(adjoint - before) <= 10 * relative * size(adjoint)
-        converged = converged & settled
-        if bool(converged.all()):
-            break
-    return adjoint, converged
+    def _kept(self, vectors: Tensor) -> Tensor:
+        return vectors if self._bounds is None else self._bounds.kept(vectors, self._free)

@@ -1,8 +1,9 @@
-"""Linear solves of plastic flows that are not associated, whose Hessian is not symmetric."""
+"""Linear solves whose matrix is not symmetric: of plastic flows that are not associated, and adjoints with friction."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -11,6 +12,19 @@ from .system import ImplicitSystem
 
 DIRECTIONS = 40
 """Iterations between two restarts: as many pairs of node tensors are kept."""
+STUCK = 0.9
+"""Share of the residual that is left after as many iterations where more of them would take too long."""
+
+
+class Solve(NamedTuple):
+    """What `gmres` found, scenes apart."""
+
+    solution: Tensor
+    """d [N, D] [m/s]."""
+    iterations: Tensor
+    """int32 [B]."""
+    converged: Tensor
+    """bool [B]: whether the residual came down to its share, but for what rounding adds to it."""
 
 
 def gmres(
@@ -20,11 +34,12 @@ def gmres(
     right: Tensor,
     relative: Tensor,
     most: int,
-) -> tuple[Tensor, Tensor]:
+    precondition: Callable[[Tensor], Tensor] | None = None,
+) -> Solve:
     """Solves J d = right by the restarted generalised minimal residual method (Saad and Schultz 1986), scenes apart.
 
-    The residual r is least as √(r · B⁻¹ r), the norm of Newton's method, which preconditions too. The host waits for
-    the device once per iteration.
+    The residual r is least as √(r · B⁻¹ r), the norm of Newton's method. The host waits for the device once per
+    iteration. A scene is given up where it is not finite, or restarts help no more.
 
     Args:
         system: whose nodes they are.
@@ -33,27 +48,31 @@ def gmres(
         right: [N, D] [kg m/s].
         relative: share of the residual that may be left, [B].
         most: iterations.
-
-    Returns:
-        d [N, D] [m/s], and the iterations of each scene, int32 [B].
+        precondition: the inverse of something like J, times [N, D] of the free components; B⁻¹ without it. It need not
+            be linear (Saad 1993).
     """
     solution, left = torch.zeros_like(right), right
     iterations = torch.zeros(len(relative), dtype=torch.int32, device=right.device)
-    target: Tensor | None = None
+    cycle = _Cycle(system, inverse, left, precondition)
+    residual, target = cycle.first, relative * cycle.first
+    solving, converged = residual > target, residual <= target
     for start in range(0, most, DIRECTIONS):
-        cycle = _Cycle(system, inverse, left)
-        target = relative * cycle.first if target is None else target
-        solving = cycle.first > target
         if not bool(solving.any()):
             break
+        begun = solving
         for _ in range(min(DIRECTIONS, most - start)):
             iterations += solving.int()
-            solving = solving & (cycle.add(product(cycle.directions[-1])) > target)
+            residual = torch.where(solving, cycle.add(product(cycle.direction())), residual)
+            solving = solving & (residual > target)
             if not bool(solving.any()):
                 break
+        converged = torch.where(begun, residual <= target, converged)
         solution = solution + cycle.solution()
         left = right - product(solution)
-    return solution, iterations
+        before, cycle = cycle.first, _Cycle(system, inverse, left, precondition)
+        residual = cycle.first
+        solving = (residual > target) & (residual < STUCK * before)
+    return Solve(solution, iterations, converged)
 
 
 class _Cycle:
@@ -61,39 +80,54 @@ class _Cycle:
 
     Attributes:
         first: residual at the start, float64 [B].
-        directions: B⁻¹ times an orthonormal basis of residuals.
     """
 
-    def __init__(self, system: ImplicitSystem, inverse: Tensor, left: Tensor) -> None:
-        self._system, self._inverse = system, inverse
-        q, z, self.first = self._unit(left)
-        self._basis, self.directions = [q], [z]
+    def __init__(
+        self,
+        system: ImplicitSystem,
+        inverse: Tensor,
+        left: Tensor,
+        precondition: Callable[[Tensor], Tensor] | None,
+    ) -> None:
+        self._system, self._inverse, self._precondition = system, inverse, precondition
+        q, dual, self.first = self._unit(left)
+        finite = self.first.isfinite()
+        self._counts = system.of_nodes(finite)
+        self._basis, self._duals = [q], [dual]  # orthonormal residuals, and B⁻¹ times these
+        self._directions: list[Tensor] = []
         self._H = torch.zeros(len(self.first), DIRECTIONS + 1, DIRECTIONS, dtype=torch.float64, device=left.device)
         self._goal = torch.zeros_like(self._H[:, :, 0])
-        self._goal[:, 0] = self.first
+        self._goal[:, 0] = torch.where(finite, self.first, 0)
         self._weights = self._goal[:, :0]
+
+    def direction(self) -> Tensor:
+        """The next direction, of which the product is to be added."""
+        self._directions.append(self._duals[-1] if self._precondition is None else self._precondition(self._basis[-1]))
+        return self._directions[-1]
 
     def add(self, w: Tensor) -> Tensor:
         """Take in the product of the last direction; the residual that is left [B]."""
-        H, system, k = self._H, self._system, len(self.directions) - 1
+        H, system, k = self._H, self._system, len(self._directions) - 1
+        w = torch.where(self._counts, w, 0)
         for j in range(k + 1):
-            H[:, j, k] = system.node_sum(w * self.directions[j])
+            H[:, j, k] = system.node_sum(w * self._duals[j])
             w = w - system.of_nodes(H[:, j, k]).to(w.dtype) * self._basis[j]
-        q, z, H[:, k + 1, k] = self._unit(w)
+        q, dual, H[:, k + 1, k] = self._unit(w)
         self._basis.append(q)
-        self.directions.append(z)
+        self._duals.append(dual)
         # Scenes that are done have columns of zeros, which the pseudo-inverse bears.
         part, goal = H[:, : k + 2, : k + 1], self._goal[:, : k + 2, None]
         self._weights = (torch.linalg.pinv(part) @ goal)[:, :, 0]
         return (part @ self._weights[:, :, None] - goal)[:, :, 0].norm(dim=1)
 
     def solution(self) -> Tensor:
-        pairs = zip(self._weights.unbind(1), self.directions, strict=False)
+        pairs = zip(self._weights.unbind(1), self._directions, strict=True)
         return torch.stack([self._system.of_nodes(y).to(z.dtype) * z for y, z in pairs]).sum(0)
 
     def _unit(self, r: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """A residual of length one, B⁻¹ times it, and its length before."""
         z = (self._inverse * r[:, None, :]).sum(-1)
         size = self._system.node_sum(r * z).clamp_min(0).sqrt()
-        scale = self._system.of_nodes(torch.where(size > 0, 1 / torch.where(size > 0, size, 1), 0)).to(r.dtype)
-        return r * scale, z * scale, size
+        size_of_nodes = self._system.of_nodes(size).to(r.dtype)
+        q, z = (torch.where(size_of_nodes > 0, t / size_of_nodes, 0) for t in (r, z))
+        return q, z, size

@@ -54,10 +54,9 @@ class Implicit:
         tolerance: of the residual relative to that of v*, the velocities without elastic forces, in (0, 1).
         max_iterations: of Newton's method in a step.
         max_cg_iterations: of conjugate gradients in each of these.
-        adjoint_tolerance: relative, of the one linear solve of a backward pass.
+        adjoint_tolerance: relative, of the one linear solve of a backward pass; no less than 1e-5 in float32.
         plasticity: "after": the solve sees the elastic stress of the trial deformation, and the flow follows. "inside":
             it sees the stress after the flow, so that no more trial stress than the material bears acts on the motion.
-            No gradients.
 
     Attributes:
         report: `ImplicitReport` of the latest step, None before the first.

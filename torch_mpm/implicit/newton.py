@@ -116,7 +116,9 @@ def minimise(system: ImplicitSystem, bounds: NodeBounds | None, options: Options
         relative = torch.where(done, 1.0, forcing).to(v.dtype)
         tangent = _tangent(system, v, convex, exact, all_exact, none_exact)
         skew = system.skew(v) if system.flows else None
-        whole = torch.zeros_like(done) if skew is None else ~(done | lag.still) & _skewed(system, skew, tangent)
+        whole = torch.zeros_like(done)
+        if skew is not None:
+            whole = skewed(system, skew, tangent, SYMMETRIC) & ~(done | lag.still)
         model, blocks, across = contact, diagonal, None
         if contact.friction is not None:
             model = lag.contact(system, bounds, v, elastic, diagonal, contact, residual, total_mass)
@@ -133,7 +135,8 @@ def minimise(system: ImplicitSystem, bounds: NodeBounds | None, options: Options
         direction = torch.where(system.of_nodes(indefinite & (solve.iterations == 0)), -change, solve.solution)
         cg_iterations += solve.iterations
         if skew is not None and bool(whole.any()):
-            derivative = _free_derivative(system, bounds, system.derivative(v, skew), model, across)
+            unprojected = tangent if all_exact else system.tangent(v, projected=False)
+            derivative = _free_derivative(system, bounds, unprojected, skew, model, across)
             step, more = _not_symmetric(system, derivative, inverse, change, model, whole, relative, options)
             direction = torch.where(system.of_nodes(whole), step, direction)
             cg_iterations += more
@@ -161,23 +164,25 @@ def _tangent(
     return torch.where(system.of_particles(exact), system.tangent(v, projected=False), convex)
 
 
-def _skewed(system: ImplicitSystem, skew: Tensor, tangent: Tensor) -> Tensor:
-    """Scenes whose tangents are not symmetric, bool [B]."""
+def skewed(system: ImplicitSystem, skew: Tensor, tangent: Tensor, share: float | Tensor) -> Tensor:
+    """Scenes where the skew parts of the tangents are more than a share of the rest, bool [B]."""
     dim = skew.shape[1]
     moduli = tangent[:, 2 * dim * dim :]
     sizes = torch.stack([skew.square().sum((1, 2)), moduli.square().sum(1)], 1).double()
     skew_size, size = system.particle_sum(sizes).unbind(1)
-    return skew_size > SYMMETRIC**2 * size
+    return skew_size > share**2 * size
 
 
 def _free_derivative(
     system: ImplicitSystem,
     bounds: NodeBounds | None,
-    derivative: Callable[[Tensor], Tensor],
+    tangent: Tensor,
+    skew: Tensor,
     model: Contact,
     across: Tensor | None,
 ) -> Callable[[Tensor], Tensor]:
     """The derivative of the residual with that of friction, of what is free."""
+    derivative = system.derivative(tangent, skew)
 
     def product(d: Tensor) -> Tensor:
         result = derivative(d) if across is None else derivative(d) + times(across, d)
@@ -199,9 +204,9 @@ def _not_symmetric(
     """Newton steps with the whole derivative in some scenes, bool [B], or −B⁻¹ g where they do not descend; and the
     iterations that they took."""
     right = torch.where(system.of_nodes(scenes), -model.gradient, 0)
-    step, iterations = gmres(system, derivative, inverse, right, relative, options.max_cg_iterations)
-    descends = system.node_sum(model.gradient * step) < 0
-    return torch.where(system.of_nodes(descends), step, -change), iterations
+    solve = gmres(system, derivative, inverse, right, relative, options.max_cg_iterations)
+    descends = system.node_sum(model.gradient * solve.solution) < 0
+    return torch.where(system.of_nodes(descends), solve.solution, -change), solve.iterations
 
 
 class _Lag:

@@ -154,14 +154,16 @@ class ImplicitSystem:
         """What flows that are not associated add to the tangents: skew matrices in their axes [P, D, D]."""
         return self.law.trial_skew(self.trial(v), self.tangent_weight)
 
-    def derivative(self, v: Tensor, skew: Tensor) -> Callable[[Tensor], Tensor]:
-        """The derivative of the residual as a function of node velocities [N, D] -> [N, D]."""
-        tangent = self.tangent(v, projected=False)
+    def derivative(self, tangent: Tensor, skew: Tensor | None) -> Callable[[Tensor], Tensor]:
+        """The derivative of the residual as a function of node velocities [N, D] -> [N, D]; that with −skew is its
+        transpose."""
         dim = self.state.x.shape[1]
         U, B = (tangent[:, k * dim * dim : (k + 1) * dim * dim].unflatten(1, (dim, dim)) for k in (0, 1))
 
         def product(direction: Tensor) -> Tensor:
             result = implicit_apply(self.blocks, self.state.x, direction, tangent, self.mass, self.stress_form)
+            if skew is None:
+                return result
             along = (U.mT @ self._motion(direction)[1] @ B).diagonal(dim1=1, dim2=2)
             turned = (skew @ along[:, :, None]) * B.mT
             return result + self._scattered(U @ turned)

@@ -46,6 +46,8 @@ class CompiledLaw(Material):
     """
 
     name: str
+    elastic_name: ClassVar[str | None] = None
+    """Of a plastic law without second derivatives of its energy, the law of μ and λ that has this energy, and them."""
     scene_defaults: ClassVar[dict[str, float]] = {}
     """Density [kg/m³] and other values that a scene file takes for what it does not say."""
 
@@ -114,7 +116,7 @@ class CompiledLaw(Material):
     def trial_stress(self, state: Any, before: Any, flows: bool = False) -> Tensor:
         if flows and LAWS[self.name].plastic:
             return flowing_stress(self, state, before)
-        gradient = law_energy_gradient(*self._of_the_ops(state))
+        gradient = self._energy_gradient(state)
         if self.state_fields != ("J",):
             return gradient @ before.F.mT
         eye = torch.eye(state.x.shape[1], dtype=gradient.dtype, device=gradient.device)
@@ -134,6 +136,18 @@ class CompiledLaw(Material):
 
     def trial_skew(self, state: Any, weight: Tensor) -> Tensor:
         return flowing_skew(self, state, weight) if LAWS[self.name].plastic else super().trial_skew(state, weight)
+
+    def _energy_gradient(self, state: Any) -> Tensor:
+        """∂ψ/∂F or ∂ψ/∂J of the state itself, which can be differentiated once more."""
+        name, deformation, parameters, history, scene, dim = self._of_the_ops(state)
+        if self.elastic_name is None:
+            return law_energy_gradient(name, deformation, parameters, history, scene, dim)
+        moduli = self._elastic_moduli(state, parameters, history)
+        return law_energy_gradient(self.elastic_name, deformation, moduli, (), scene, dim)
+
+    def _elastic_moduli(self, state: Any, parameters: list[Tensor], history: Sequence[Tensor]) -> list[Tensor]:
+        """μ and λ with which the law `elastic_name` has the energy of this one."""
+        return parameters[:2]
 
     def _viscous_stress(self, state: Any, before: Any) -> Tensor:
         """What the velocity gradient of a step adds to the stress, at the volume before it [P, D, D] [Pa]."""

@@ -12,18 +12,24 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
+from ..ops.autograd import graph_at_once
 from ..ops.svd import svd3
 from ..parameters import Overlay
+from ..vectors import determinant
 
 if TYPE_CHECKING:
     from .material import Material
 
 
 def flowing_stress(law: Material, state: Any, before: Any) -> Tensor:
-    """τ F⁻ᵀ F₀ᵀ [P, D, D] [Pa] of the stress τ after the return map of a trial F."""
+    """τ F⁻ᵀ F₀ᵀ [P, D, D] [Pa] of the stress τ after the return map of a trial F; zero where F is not finite or has no
+    volume. Differentiable as `law.update` is."""
     stress = law.update(state)[1]
-    inverse = torch.linalg.inv_ex(state.F)[0]
-    return torch.where(state.F.isfinite().all((1, 2), True), stress @ (before.F @ inverse).mT, stress)
+    volume = determinant(state.F.detach())[:, None, None]
+    valid = (volume > 0) & (volume < torch.inf)
+    eye = torch.eye(state.F.shape[1], dtype=stress.dtype, device=stress.device)
+    inverse = torch.linalg.inv_ex(torch.where(valid, state.F, eye))[0]  # no NaN that a gradient could meet
+    return torch.where(valid, stress @ (before.F @ inverse).mT, 0)
 
 
 def flowing_tangent(law: Material, state: Any, before: Any, weight: Tensor, projected: bool) -> Tensor:
@@ -33,18 +39,10 @@ def flowing_tangent(law: Material, state: Any, before: Any, weight: Tensor, proj
     """
     dim = state.x.shape[1]
     U, stretch, V = svd3(state.F)
-    stress, moduli, quotients = _principal_derivatives(law, state, stretch)
-    scale = weight[:, None, None] / (stretch[:, :, None] * stretch[:, None, :])
-    diagonal = scale * (0.5 * (moduli + moduli.mT) - torch.diag_embed(stress))
     pairs = [(i, j) for i in range(dim) for j in range(i + 1, dim)]
-    h = stretch.abs().log()
-    evens, odds = [], []
-    for (i, j), quotient in zip(pairs, quotients, strict=True):
-        half, mean = 0.5 * (h[:, i] - h[:, j]), 0.5 * (stress[:, i] + stress[:, j])
-        sinhc = _sinhc(half)
-        evens.append(scale[:, i, j] * (quotient * half.cosh() / sinhc - mean))
-        odds.append(scale[:, i, j] * (mean - quotient * half * half * sinhc / half.cosh()))
-    even, odd = torch.stack(evens, 1), torch.stack(odds, 1)
+    moduli, shears = _principal_derivatives(law, state, stretch, pairs)
+    diagonal = weight[:, None, None] * 0.5 * (moduli + moduli.mT)
+    even, odd = (weight[:, None] * part for part in (shears[0] + shears[1], shears[0] - shears[1]))
     if projected:
         diagonal, even, odd = _positive_part(diagonal), even.clamp_min(0), odd.clamp_min(0)
     upper = [diagonal[:, i, j] for i in range(dim) for j in range(i, dim)]
@@ -58,40 +56,34 @@ def flowing_skew(law: Material, state: Any, weight: Tensor) -> Tensor:
     """What is not symmetric in the derivative of `flowing_stress`: the skew part of the block between the stretches, in
     the axes of the tangent, times a weight [P, D, D]. Zero where it is not finite."""
     stretch = svd3(state.F)[1]
-    _, moduli, _ = _principal_derivatives(law, state, stretch, shears=False)
-    skew = 0.5 * weight[:, None, None] * (moduli - moduli.mT) / (stretch[:, :, None] * stretch[:, None, :])
+    moduli, _ = _principal_derivatives(law, state, stretch, [])
+    skew = 0.5 * weight[:, None, None] * (moduli - moduli.mT)
     valid = skew.isfinite().all((1, 2), True) & (stretch > 0).all(1)[:, None, None]
     return torch.where(valid, skew, 0)
 
 
 def _principal_derivatives(
-    law: Material, state: Any, stretch: Tensor, shears: bool = True
-) -> tuple[Tensor, Tensor, list[Tensor]]:
-    """Principal stresses [P, D], their derivatives by the Hencky strains [P, D, D], and (τᵢ − τⱼ)/(hᵢ − hⱼ) [P] of each
-    pair: how the stress turns where diag(σ) is sheared, dτᵢⱼ = (τᵢ − τⱼ) σⱼ²/(σᵢ² − σⱼ²), which has a limit at equal
-    stretches."""
-    dim = stretch.shape[1]
-    with torch.inference_mode(False), torch.enable_grad():
+    law: Material, state: Any, stretch: Tensor, pairs: list[tuple[int, int]]
+) -> tuple[Tensor, Tensor]:
+    """Derivatives of P = τ F⁻ᵀ at F = diag(σ) [Pa]: ∂Pᵢᵢ/∂Fⱼⱼ [P, D, D], and of pairs, ∂Pᵢⱼ/∂Fᵢⱼ and ∂Pᵢⱼ/∂Fⱼᵢ
+    [2, P, pairs], from those of τ, which hold at equal stretches too."""
+    with torch.inference_mode(False), torch.enable_grad(), graph_at_once():
         F = torch.diag_embed(stretch.detach()).requires_grad_()
         moved: Any = Overlay(state, F=F)
         stress = law.update(moved)[1]
 
         def by_F(i: int, j: int) -> Tensor:
-            return torch.autograd.grad(stress[:, i, j].sum(), F, retain_graph=True)[0]
+            return torch.autograd.grad(stress[:, i, j].sum(), F, retain_graph=True)[0] / stretch[:, j, None, None]
 
-        rows = [by_F(i, i).diagonal(dim1=1, dim2=2) * stretch for i in range(dim)]
-        quotients = []
-        for i in range(dim if shears else 0):
-            for j in range(i + 1, dim):
-                gap = stretch[:, i].abs().log() - stretch[:, j].abs().log()
-                quotients.append(2 * stretch[:, i] * by_F(i, j)[:, i, j] * _sinhc(gap))
-    return stress.detach().diagonal(dim1=1, dim2=2), torch.stack(rows, 1), quotients
-
-
-def _sinhc(x: Tensor) -> Tensor:
-    """sinh x/x."""
-    small = x.abs() < 1e-3
-    return torch.where(small, 1 + x * x / 6, x.sinh() / torch.where(small, 1, x))
+        rows = [by_F(i, i).diagonal(dim1=1, dim2=2) for i in range(stretch.shape[1])]
+        shears = stretch.new_empty(2, len(stretch), len(pairs))
+        for k, (i, j) in enumerate(pairs):
+            gradient = by_F(i, j)
+            shears[0, :, k], shears[1, :, k] = gradient[:, i, j], gradient[:, j, i]
+    turned = stress.detach().diagonal(dim1=1, dim2=2) / stretch  # by F⁻ᵀ: dF⁻ᵀ = −F⁻ᵀ dFᵀ F⁻ᵀ
+    for k, (i, j) in enumerate(pairs):
+        shears[1, :, k] -= turned[:, i] / stretch[:, j]
+    return torch.stack(rows, 1) - torch.diag_embed(turned / stretch), shears
 
 
 def _positive_part(a: Tensor) -> Tensor:

@@ -2,8 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, ClassVar
 
+import torch
+from torch import Tensor
+
+from ..ops.arguments import per_parameter
+from ..ops.law import law_energy
 from ..parameters import Value
 from .compiled import SolidLaw
 
@@ -83,7 +89,7 @@ class VonMises(SolidLaw):
         ValueError: for a value outside its range, or another combination of arguments.
     """
 
-    name = "von_mises"
+    name, elastic_name = "von_mises", "hencky"
     yield_stress: Any
     hardening: Any
 
@@ -120,7 +126,7 @@ class HerschelBulkley(SolidLaw):
         ValueError: for a value outside its range, or another combination of arguments.
     """
 
-    name = "herschel_bulkley"
+    name, elastic_name = "herschel_bulkley", "hencky"
     yield_stress: Any
     consistency: Any
     exponent: Any
@@ -197,7 +203,7 @@ class Snow(SolidLaw):
         ValueError: for a value outside its range, or another combination of arguments.
     """
 
-    name = "snow"
+    name, elastic_name = "snow", "fixed_corotated"
     scene_defaults: ClassVar = {"density": 400.0, "E": 1.4e5, "nu": 0.2}
     critical_compression: Any
     critical_stretch: Any
@@ -218,6 +224,17 @@ class Snow(SolidLaw):
         self._add("critical_compression", critical_compression)
         self._add("critical_stretch", critical_stretch)
         self._add("hardening", hardening)
+
+    def _elastic_moduli(self, state: Any, parameters: list[Tensor], history: Sequence[Tensor]) -> list[Tensor]:
+        """μ and λ after hardening, whose factor is the energy that one of μ = 1 and λ = 0 has at the stretches 2, 1, 1:
+        that of the elastic law is 1 there."""
+        mu, lam, *rest = parameters
+        P, D = state.x.shape
+        stretches = state.x.new_ones(P, D)
+        stretches[:, 0] = 2
+        unit = [mu.new_ones(()), mu.new_zeros(()), *rest]
+        factor = law_energy(self.name, torch.diag_embed(stretches), unit, history, state.scene)
+        return [factor * per_parameter(modulus, state.scene, P) for modulus in (mu, lam)]
 
 
 class CamClay(SolidLaw):
@@ -243,7 +260,7 @@ class CamClay(SolidLaw):
         ValueError: for a value outside its range, or another combination of arguments.
     """
 
-    name = "cam_clay"
+    name, elastic_name = "cam_clay", "hencky"
     critical_slope: Any
     consolidation: Any
     hardening: Any

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
+from ..ops.autograd import graph_at_once
 from ..parameters import Overlay
 
 if TYPE_CHECKING:
@@ -31,7 +32,7 @@ def differentiated_stiffness(law: Material, state: State) -> Tensor:
         leaves = {name: changes.get(name, getattr(given, name)).detach().clone().requires_grad_() for name in fields}
         history = {name: value for name, value in changes.items() if name in law.extra_fields}
         moved: Any = Overlay(given, **leaves, extra={**state.extra, **history})
-        with torch.enable_grad():
+        with torch.enable_grad(), graph_at_once():
             _, stress = law.update(moved)
             tangent = _tangent(stress, leaves)
         eye = torch.eye(stress.shape[1], dtype=stress.dtype, device=stress.device)

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from ..errors import check_number
 from ..parameters import Overlay, Value, evaluate, needed_temperature, store
+from ..vectors import determinant
 from .compiled import check_value
 from .custom import as_law
 from .material import Material
@@ -180,10 +181,3 @@ class Melting(Material):
         return Overlay(
             state, F=torch.where(flows[:, None, None], isotropic, F), J=torch.where(flows, J, determinant(F))
         )
-
-
-def determinant(F: Tensor) -> Tensor:
-    """det F of [P, D, D], without the factorisation of `torch.linalg.det`."""
-    if F.shape[1] == 2:
-        return F[:, 0, 0] * F[:, 1, 1] - F[:, 0, 1] * F[:, 1, 0]
-    return (F[:, 0] * torch.linalg.cross(F[:, 1], F[:, 2])).sum(1)

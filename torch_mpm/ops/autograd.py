@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch._functorch.utils import enable_single_level_autograd_function
 from torch.autograd import forward_ad
+from torch.autograd.graph import saved_tensors_hooks
 
 from ..topology import PackedTopology
 
@@ -29,6 +30,16 @@ def dispatch(op: Any, *arguments: Any) -> Any:
 def _below_autograd(op: Any, arguments: Sequence[Any]) -> Any:
     with torch._C._AutoDispatchBelowAutograd():
         return op(*arguments)
+
+
+def graph_at_once() -> saved_tensors_hooks:
+    """Where a graph is recorded and gone back through at once: past the hooks of checkpoints, which would compute their
+    steps again for it, and those that move tensors to the host."""
+    return saved_tensors_hooks(_same, _same)
+
+
+def _same(t: torch.Tensor) -> torch.Tensor:
+    return t
 
 
 def register_autograd(
