@@ -203,7 +203,7 @@ def obstacle_to_substeps(step: Step, state: State, dt: float | Tensor) -> str | 
 
 
 MOST_STEPS = 2**16  # of one op, csrc/rollout/substeps.h
-KEPT_BYTES = {"cpu": 2**24, "cuda": 2**28}
+KEPT_BYTES = {"cpu": 2**24, "cuda": 2**29}
 """What the backward pass of one op may hold of its steps, even where sqrt(n) steps need less: what the caches of a CPU
 hold, and so much that kernels on CUDA hide the time of Python."""
 

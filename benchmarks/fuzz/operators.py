@@ -188,13 +188,13 @@ class _Calls:
         counts = [len(LAWS[name].parameters) for name in laws[0].split(",")]
         how = ([ones] * sum(counts), [0, 1, 0], 3, 1e-3, True, True, 0, self.normal(2, D), *self.walls)
         impulse = self.normal(2, 6 + 2 * D, D + (1 if D == 2 else 3)).double()
-        end = (*self.obstacles, 0.1, 2, 40, True, False, impulse, self.dt, self.uniform(2), *self.lattice.packed)
+        end = (*self.obstacles, 0.1, 2, 40, True, False, False, impulse, self.dt, self.uniform(2), *self.lattice.packed)
         look = (*fields[:5], self.F, *self.uniform(4, P), self.scene, 50.0, 2.0, True, 0.1, self.lattice.upper, 2)
         call = (*fields, 0.5 + self.uniform(P), [self.uniform(P)], *who, *laws, *how, *end)
         grads = [self.normal(*t.shape) for t in torch.ops.torch_mpm.substeps(*call)[:6]]
         return [
             ("substeps", call),
-            ("substeps_backward", (*grads, torch.ones_like(impulse), 15, *call)),
+            ("substeps_backward", (*grads, torch.ones_like(impulse), 15, None, *call)),
             ("survey", (*look, *self.obstacles, self.uniform(2), 0.1, *self.lattice.packed)),
         ]
 

@@ -44,8 +44,9 @@ from .training_scripts import PROJECTS, Make, Project
 
 ROLLOUT = {"cpu": (22, 50), "cuda": (46, 1000)}
 """Particles along a side of the cube, and steps."""
-PEER = {"cpu": (22, 20, 20), "cuda": (46, 100, 100)}
-"""Particles along a side, steps, and steps of which a script keeps all in a second row."""
+PEER = {"cpu": (22, 20, 20), "cuda": (46, 1000, 100)}
+"""Particles along a side, steps of rollouts, and of scripts."""
+EVERYTHING = mpm.Checkpoints(memory=1e11)
 NETWORKS = ((8, 8, 4), (16, 16, 16))
 """Cells along the edges of the block, of 8 particles each."""
 AGREEMENT = {torch.float32: 1e-4, torch.float64: 1e-7}
@@ -134,22 +135,19 @@ class Case:
 
 
 def rollout_cases(side: int, n: int) -> list[Case]:
-    everything = mpm.Checkpoints(memory=1e11)
-    held = {"by default": None, "32 steps": 32, "all steps": n, "everything, none again": everything}
+    held = {"by default": None, "32 steps": 32, "all steps": n, "everything, none again": EVERYTHING}
     return [Case("rollout", name, side, n, checkpoint) for name, checkpoint in held.items()]
 
 
-def peer_cases(side: int, n: int, kept: int) -> Iterator[Case]:
+def peer_cases(side: int, n: int, of_script: int) -> Iterator[Case]:
     for key, project in PROJECTS.items():
         yield Case("rollout", "by default" if project.gradients else "nothing", side, n, project=key)
+        if project.gradients:
+            yield Case("rollout", "everything", side, n, EVERYTHING, key)
         for name in project.scripts():
-            if not project.gradients:
-                yield Case(name, "nothing", side, n, project=key)
-                continue
             if project.checkpoints:
-                yield Case(name, "checkpoints", side, n, 1, key)
-            for count in dict.fromkeys((n, kept)):
-                yield Case(name, "all steps", side, count, project=key)
+                yield Case(name, "checkpoints", side, of_script, 1, key)
+            yield Case(name, "all steps" if project.gradients else "nothing", side, of_script, project=key)
 
 
 def both(forward: Forward, v: Tensor) -> None:
@@ -254,7 +252,7 @@ BESIDE = (
 def rows_of_peers(result: dict[str, Any]) -> Iterator[tuple[Any, ...]]:
     """Those of a result, with multiples, for each step, of the times and the memory of the rollout of the same work."""
     for r in result["peers"]:
-        (own,) = (o for o in result["peers"] if (o["project"], o["name"]) == (r["project"], "rollout"))
+        own = next(o for o in result["peers"] if (o["project"], o["name"]) == (r["project"], "rollout"))
         cells: list[Any] = [r["project"], r["name"], r["kept"], r["particles"], r["steps"]]
         for key, unit in (("forward", 1e3), ("both", 1e3), ("memory", 1e-6)):
             value, base = (_ratio(row[key], row["steps"]) for row in (r, own))

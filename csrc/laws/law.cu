@@ -61,7 +61,7 @@ __global__ void __launch_bounds__(Law::gpu_threads)
   if (p < a.law.particles && a.law.members.has(p)) Law::template Kernels<Law>::energy_double_backward(a, One<T>{p});
 }
 
-// The momentum of particles whose stress is computed as they are loaded.
+// The momentum of particles whose stress is computed as they are loaded, and kept where it has a place.
 template <class Law, class T, int D>
 struct LawMomentumSource : MomentumSource<2, T, D, Stress::moment, true> {
   using Base = MomentumSource<2, T, D, Stress::moment, true>;
@@ -75,6 +75,7 @@ struct LawMomentumSource : MomentumSource<2, T, D, Stress::moment, true> {
     LawUpdateArguments<T, D> a = law;
     a.stress = {&stress[0][0], {0, D, 1}};
     Law::template Kernels<Law>::update(a, One<T>{p});
+    if (law.stress.pointer) store_matrix<D>(One<T>{p}, law.stress, stress);
     return stress;
   }
   __device__ ParticleMomentum<T, D> load(int p, int scene) const {

@@ -186,6 +186,8 @@ Recorded<T, D>::Recorded(const SubstepsInputs& in, const OptionalTensor& memory,
   while (int64_t(time_.size()) < in.n) time_.push_back(time_.back() + in.dt);
   first_history_ = packed_history(in.x, in.history, steps.columns);
   first_ = given_particles<T, D>(in, first_history_);
+  steps.forget_stress();  // each step has its own
+  steps.fuse(true);
   steps.activation.workspace_size = backend::activate_workspace(steps.activation, stream);
   Arena grid, counted;
   grid_in(grid);
@@ -193,7 +195,9 @@ Recorded<T, D>::Recorded(const SubstepsInputs& in, const OptionalTensor& memory,
   keeps_grids_ = 2 * grid.size() <= in.x.size(0) * (2 * D + 4 * D * D) * int64_t(sizeof(T));
   lay_out(counted);
   memory_ = has(memory) ? *memory : empty(in.x, {counted.size()}, ScalarType::Byte);
-  STD_TORCH_CHECK(memory_.numel() == counted.size(), "record must be that of the same steps");
+  check_shape(memory_, "record", {counted.size()});
+  check_type(memory_, "record", ScalarType::Byte, in.x);
+  STD_TORCH_CHECK(memory_.is_contiguous(), "record must be contiguous");
   Arena arena(memory_);
   lay_out(arena);
   if (keeps_grids_)
@@ -259,6 +263,7 @@ bool Recorded<T, D>::return_to(int64_t i) {
   if (MPM_BACKEND != MPM_BACKEND_IS_cpu) steps.contact.activations = status(i) + kActivations;
   if (keeps_grids_ || (i + 1 == in_.n && taken_)) return true;
   if (!activate(i)) return false;
+  steps.fused = false;  // the stress is there
   steps.move_grid(stream_);
   return true;
 }

@@ -298,11 +298,16 @@ struct Substeps {
     activation.margin_blocks = int(std::clamp<int64_t>(activation.max_blocks / 2 + 64, 0, std::max<int64_t>(most, 0)));
   }
 
-  // For a call that keeps nothing but its end. Where there is a kernel for it, P2G computes the stress itself.
-  void fuse() {
+  // Where there is a kernel for it, P2G computes the stress itself.
+  void fuse(bool keeps_stress) {
     fused = calls.size() == 1 && !has(in.material) && in.lattice.order() == 2 && !in.lattice.deterministic() &&
             p2g.form == StressForm::mls && calls[0].law->kernels<T, D>().p2g;
-    if (fused) stress = Tensor();
+    if (fused && !keeps_stress) forget_stress();
+  }
+
+  void forget_stress() {
+    stress = Tensor();
+    for (LawUpdateArguments<T, D>& law : laws) law.stress = {};
   }
 
   // Whether scenes are taken through the call one by one, by their average size.

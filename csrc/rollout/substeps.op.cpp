@@ -125,6 +125,7 @@ Results substeps(MPM_SUBSTEPS_PARAMETERS) {
 #if MPM_BACKEND == MPM_BACKEND_IS_cuda
     if (s.resides()) {
       start_in_results();
+      s.forget_stress();
       s.make_pool(stream);
       s.read({field<const T>(x_[0]), field<const T>(v_), field<const T>(C_), field<const T>(F_[0]),
               field<const T>(J_[0]), field<const T>(history_)},
@@ -149,7 +150,7 @@ Results substeps(MPM_SUBSTEPS_PARAMETERS) {
       from.F = field<const T>(F_[1]);
     }
     if (n > 1) s.let_activations_last();
-    s.fuse();
+    s.fuse(false);
     s.make_pool(stream);
     s.count_time(before, stream);
     // A substep that reads and writes these buffers in turn, into the first or the second.

@@ -4,7 +4,7 @@
 namespace mpm::cuda {
 namespace {
 
-constexpr int kThreads = 256;
+constexpr int kThreads = 128;
 
 template <class T, int D>
 __global__ void __launch_bounds__(kThreads) advance_kernel(const AdvanceArguments<T, D> a) {
