@@ -198,6 +198,46 @@ def test_a_record_of_all_steps_may_be_gone_through_twice(device):
     assert_same({"v": first}, {"v": torch.autograd.grad(loss(again), v)[0]})
 
 
+@pytest.mark.parametrize("law", ["neo_hookean", "viscoelastic", "sand"])
+def test_grids_are_kept_where_particles_are_dense(law, device):
+    """With obstacles; gradients are those of steps that were taken again."""
+    one, _ = batch(2, device)
+    step = mpm.Step(box(2), with_gradients(LAWS_HERE[law]()), pulled(2), "slip", boundaries=one.boundaries.entries)
+    step, state = step.to(device), moving(step, blob(device, 2, 4000))
+    start = state.replace(v=state.v.clone().requires_grad_())
+    record = mpm.rollout(step, start, STEPS, DT, checkpoint=ALL).x.grad_fn.saved_tensors[0]
+    plastic, history = law == "sand", sum(t[0].numel() for t in state.extra.values())
+    of_particles = STEPS * 4000 * (4 + 12 + 4 * plastic + history) * 8
+    assert of_particles * 1.1 < record.numel() < of_particles * 1.7
+    expected = gradients(single(), step, state)
+    assert_same(gradients(in_op(ALL), step, state), expected)
+    assert_same(gradients(in_op(2), step, state), expected)
+
+
+def test_a_step_that_was_taken_in_inference_mode_is_trained(device):
+    step, state = mpm.Step(box(2), mpm.NeoHookean(E=1e4, nu=0.3)), blob(device, 2)
+    with torch.inference_mode():
+        mpm.rollout(step, state, 3, DT)
+    v = state.v.clone().requires_grad_()
+    end = mpm.rollout(step, state.replace(v=v), 3, DT, checkpoint=ALL)
+    assert float(torch.autograd.grad(end.x.sum(), v)[0].norm()) > 0
+
+
+def test_recorded_steps_in_checkpoints_of_torch(device):
+    def ends(around: bool) -> Tensor:
+        step, v = mpm.Step(box(2, max_blocks=36), mpm.NeoHookean(E=1e4, nu=0.3)), state.v.clone().requires_grad_()
+
+        def taken(v: Tensor) -> Tensor:
+            return mpm.rollout(step, state.replace(v=v), 3, DT, checkpoint=ALL).x
+
+        options = {"use_reentrant": False, "context_fn": mpm.checkpoints.contexts}
+        x = torch.utils.checkpoint.checkpoint(taken, v, **options) if around else taken(v)
+        return torch.autograd.grad(x.square().sum(), v)[0]
+
+    state = blob(device, 2)
+    assert_same({"v": ends(True)}, {"v": ends(False)})
+
+
 def test_the_status_goes_on_from_call_to_call_of_recorded_steps(device):
     step, state = mpm.Step(box(2), mpm.NeoHookean(E=1e4, nu=0.3)), blob(device, 2)
     start = state.replace(v=state.v.clone().requires_grad_())
@@ -405,6 +445,9 @@ def test_the_raw_ops(device):
     wanted = (0, 1, 2, 3, 4, 5, 21, 39)
     given = [t.clone().requires_grad_() if i in wanted else t for i, t in enumerate(call)]
     torch.library.opcheck(torch.ops.torch_mpm.substeps.default, tuple(given), raise_exception=True)
+    recorded = (*given[:38], True, None, *given[40:])
+    checks = ("test_schema", "test_faketensor")  # others compare bytes that nobody has written
+    torch.library.opcheck(torch.ops.torch_mpm.substeps.default, recorded, test_utils=checks, raise_exception=True)
     grads = [torch.randn_like(t) for t in torch.ops.torch_mpm.substeps(*call)[:6] if t is not None]
     adjoint = (*grads[:4], None, grads[4], torch.ones_like(call[39]), 15, None, *call)
     torch.library.opcheck(torch.ops.torch_mpm.substeps_backward.default, adjoint, raise_exception=True)

@@ -35,8 +35,9 @@ class Checkpoints:
         states: at most so many states are kept at a time, 2 or more, where taking steps again costs least (binomial
             checkpoints, Griewank and Walther 2000). Memory: so many states, and what one step needs; with s states and
             r repetitions of each step at most, n ≤ (s + r)!/(s! r!).
-        memory: [bytes]. Where all steps fit, none is taken again; else the largest `every` that fits, or as many
-            `states` where none does. A step from Python is taken aside once, to measure it.
+        memory: [bytes]. Where all steps fit, none is taken again, as long as no grid has to grow on the CPU; else the
+            largest `every` that fits, or as many `states` where none does. A step from Python is taken aside once, to
+            measure it.
         offload: whether kept states wait in the memory of the host, as far as they are on a CUDA device; `memory` then
             is that of the steps which are taken again. Not with `states`.
 

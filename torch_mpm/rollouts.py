@@ -136,6 +136,8 @@ def _taken(
     return in_segments(single, state, n, kept, step)
 
 
+PADDING = 87 * 64
+"""Between two rows of particles on the CPU at most [bytes], csrc/common/tensors.h."""
 EVERYTHING = Checkpoints(memory=sys.float_info.max)
 """Of a memory into which all steps fit."""
 
@@ -245,8 +247,10 @@ def steps_of_a_call(state: State, n: int) -> int:
 def bytes_of_a_substep(state: State) -> int:
     """What the backward pass of the op holds of each step of a solid, at most [bytes]: of particles, and half as much
     of the grid."""
-    P, D = state.x.shape
-    return P * (3 * D + 6 * D * D) * state.x.element_size()
+    D, size = state.x.shape[1], state.x.element_size()
+    rows = len(state) + (0 if state.x.is_cuda else PADDING // size)
+    history = sum(t[0].numel() for t in state.extra.values()) if len(state) else 0
+    return rows * (3 * (2 * D + 4 * D * D) // 2 + history) * size
 
 
 _FORWARD = CompiledLaw.forward

@@ -27,6 +27,7 @@ __device__ inline void wait_for_kernel_before() {
 #endif
 }
 
+// The kernel must call wait_for_kernel_before() first of all.
 template <class... Parameters, class... Arguments>
 void launch_in_chain(void (*kernel)(Parameters...), unsigned blocks, unsigned threads, size_t shared_memory,
                      cudaStream_t stream, const Arguments&... arguments) {

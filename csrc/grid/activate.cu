@@ -546,7 +546,8 @@ void activate(const ActivateArguments<T, D>& a, Stream stream) {
   // Of slots with their end, or of the status; and of particles.
   const int64_t rows = std::max(a.particles, int64_t(std::max(a.slots(), a.scenes)) + 1);
   if ((a.drift && !a.fresh) || (!w.marked && !a.deterministic)) {
-    launch_together(activate_at_once<Order, T, D>, blocks_for(rows), kThreads, stream, a, w, table, rows);
+    launch_together(activate_at_once<Order, T, D>, blocks_for(std::max<int64_t>(rows, w.marked ? 0 : table)), kThreads,
+                    stream, a, w, table, rows);
     return;
   }
   // Of the tiles listed no more have to run at once than the device takes.

@@ -85,8 +85,8 @@ class Recorded {
   Record<T> x, v, C, F, J, history, stress;
   Record<T> mapped;  // F after the return maps
 
-  // In `memory`, from an earlier `take`, or in its own. The statuses go on from the one before where they are to.
-  Recorded(const SubstepsInputs& in, const OptionalTensor& memory, const int* status_before, backend::Stream stream);
+  // In `memory`, from an earlier `take`, or in its own.
+  Recorded(const SubstepsInputs& in, const OptionalTensor& memory, backend::Stream stream);
 
   // Takes all steps; false where the pool had no room, and must not grow.
   bool take();
@@ -104,7 +104,11 @@ class Recorded {
     const int64_t k = i - 1;
     return {constant(x[k]), constant(v[k]), constant(C[k]), constant(F[k]), constant(J[k]), constant(history[k])};
   }
-  int* status(int64_t i) const { return status_ + i * (1 + in_.scenes) * kStatusSize; }
+  int* status(int64_t i) const { return status_ + (i + 1) * (1 + in_.scenes) * kStatusSize; }  // -1: before all
+  Tensor status_tensor(int64_t i) const {
+    return torch::stable::from_blob(status(i), Shape{1 + in_.scenes, kStatusSize}, Shape{kStatusSize, 1},
+                                    in_.x.device(), ScalarType::Int);
+  }
 
   // Of scenes with clocks of their own, after all steps.
   Tensor scene_time_after() const {
@@ -141,7 +145,7 @@ class Recorded {
     if (scene_times_.defined()) steps.contact.scene_time = scene_time(i);
   }
 
-  bool activate(int64_t i) { return steps.activate(i == 0 ? status_before_ : status(i - 1), status(i), stream_); }
+  bool activate(int64_t i) { return steps.activate(i == 0 && !goes_on_ ? nullptr : status(i - 1), status(i), stream_); }
 
   // What the laws of a mixture write for their particles alone.
   void keep_others(int64_t i) {
@@ -169,20 +173,19 @@ class Recorded {
   }
 
   const SubstepsInputs& in_;
-  const int* status_before_;
   backend::Stream stream_;
   Tensor first_history_, memory_, workspace_, scene_times_;
   Particles<const T> first_;
   std::vector<double> time_;
+  bool goes_on_;  // from a status before
   bool keeps_grids_ = false, taken_ = false;
   std::vector<Grid> grids_;
   int* status_ = nullptr;
 };
 
 template <class T, int D>
-Recorded<T, D>::Recorded(const SubstepsInputs& in, const OptionalTensor& memory, const int* status_before,
-                         backend::Stream stream)
-    : steps(in), in_(in), status_before_(status_before), stream_(stream), time_{in.time} {
+Recorded<T, D>::Recorded(const SubstepsInputs& in, const OptionalTensor& memory, backend::Stream stream)
+    : steps(in), in_(in), stream_(stream), time_{in.time}, goes_on_(has(memory) || steps.previous_status) {
   while (int64_t(time_.size()) < in.n) time_.push_back(time_.back() + in.dt);
   first_history_ = packed_history(in.x, in.history, steps.columns);
   first_ = given_particles<T, D>(in, first_history_);
@@ -206,7 +209,15 @@ Recorded<T, D>::Recorded(const SubstepsInputs& in, const OptionalTensor& memory,
     steps.make_pool(stream);
   for (Grid& g : grids_) g.pool.active.use(g.activation, workspace_);
   if (keeps_grids_) use(grids_.back());
-  steps.count_time(status_before, stream_);
+  if (!has(memory)) {
+    Tensor before = status_tensor(-1);
+    if (steps.previous_status)
+      torch::stable::copy_(before, *in.previous_status);
+    else
+      torch::stable::zero_(before);
+    if (has(in.material)) stress.clear();  // of particles without a law
+  }
+  steps.count_time(status(-1), stream_);
   if (has(in.scene_time)) make_scene_times();
 }
 
@@ -223,7 +234,7 @@ void Recorded<T, D>::lay_out(Arena& arena) {
   if (steps.columns > 0) history = Record<T>(arena, given, n, steps.columns);
   stress = Record<T>(arena, given, n, D, D);
   if (steps.plastic) mapped = Record<T>(arena, given, n, D, D);
-  status_ = arena.take<int>(n * (1 + in_.scenes) * kStatusSize);
+  status_ = arena.take<int>((1 + n) * (1 + in_.scenes) * kStatusSize);
   grids_.clear();
   for (int64_t i = 0; i < n && keeps_grids_; i++) grids_.push_back(grid_in(arena));
 }
@@ -239,14 +250,12 @@ typename Recorded<T, D>::Grid Recorded<T, D>::grid_in(Arena& arena) const {
 
 template <class T, int D>
 bool Recorded<T, D>::take() {
-  if (has(in_.material)) stress.clear();  // of particles without a law
   for (int64_t i = 0; i < in_.n; i++) {
-    const bool grown = steps.activation.max_blocks != in_.max_blocks;
-    if (keeps_grids_ && !grown) use(grids_[size_t(i)]);
-    if (keeps_grids_ && grown) steps.make_pool(stream_);
+    if (keeps_grids_) use(grids_[size_t(i)]);
     read(i);
     set_time(i);
     if (!activate(i)) return false;
+    if (!memory().defined()) keeps_grids_ = false;  // the one pool that has grown serves all
     steps.write({x[i], v[i], C[i], F[i], J[i], history[i]});
     if (has(in_.material)) keep_others(i);
     steps.move(stream_);

@@ -48,15 +48,13 @@ using Results = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tenso
 
 // Everything that the adjoint reads is kept. Nothing where there is no room, and it has to be told when that was.
 template <class T, int D>
-std::optional<Results> take_recorded(const SubstepsInputs& in, const int* status_before, backend::Stream stream) {
-  Recorded<T, D> r(in, {}, status_before, stream);
+std::optional<Results> take_recorded(const SubstepsInputs& in, backend::Stream stream) {
+  Recorded<T, D> r(in, {}, stream);
   bool room = false;
   with_team(in.x.size(0) * in.n, [&] { room = r.take(); });
   if (!room) return {};
   const int64_t last = in.n - 1;
-  Tensor status = empty_int(in.x, {1 + in.scenes, kStatusSize});
-  torch::stable::copy_(status, torch::stable::from_blob(r.status(last), Shape{1 + in.scenes, kStatusSize},
-                                                        Shape{kStatusSize, 1}, in.x.device(), ScalarType::Int));
+  const Tensor status = copy_of(r.status_tensor(last));
   const auto copy = [&](bool wanted, const auto& record, auto view) {
     if (!wanted) return Tensor();
     const Tensor from = (record.*view)(last);
@@ -83,16 +81,20 @@ Results substeps(MPM_SUBSTEPS_PARAMETERS) {
   const SubstepsInputs in{MPM_SUBSTEPS_ARGUMENTS};
   check_positions(x);
   const int64_t P = x.size(0), D_ = x.size(1);
+  const DeviceScope device(x);
+  if (records && !has(impulse) && P > 0) {
+    std::optional<Results> recorded;
+    dispatch(x, [&]<class T, int D>() { recorded = take_recorded<T, D>(in, device.stream()); });
+    if (recorded) return *recorded;
+  }
   Tensor x_[] = {empty_particles(x, {P, D_}), result(x, n > 1, {P, D_})};
   Tensor F_[] = {result(x, has(F), {P, D_, D_}), Tensor()};
   Tensor J_[] = {result(x, has(J), {P}), result(x, has(J) && n > 1, {P})};
   Tensor v_ = empty_particles(x, {P, D_}), C_ = result(x, wants_C, {P, D_, D_}), history_;
   Tensor status[] = {empty_int(x, {1 + scenes, kStatusSize}), empty_int(x, {1 + scenes, kStatusSize})};
   Tensor impulse_, time_;
-  std::optional<Results> recorded;
   int64_t step = 0;
   bool taken = false;  // by resident scenes, all steps
-  const DeviceScope device(x);
   const auto start_in_results = [&] {
     torch::stable::copy_(x_[0], x);
     torch::stable::copy_(v_, v);
@@ -102,13 +104,6 @@ Results substeps(MPM_SUBSTEPS_PARAMETERS) {
   };
   dispatch(x, [&]<class T, int D>() {
     const backend::Stream stream = device.stream();
-    if (records && !has(impulse) && P > 0) {
-      const int* const before = has(previous_status)
-                                    ? int_pointer(*previous_status, "previous_status", x, {1 + scenes, kStatusSize})
-                                    : nullptr;
-      recorded = take_recorded<T, D>(in, before, stream);
-      if (recorded) return;
-    }
     Substeps<T, D> s(in);
     history_ = packed_history(x, history, s.columns);
     const int* before = s.previous_status;
@@ -176,7 +171,6 @@ Results substeps(MPM_SUBSTEPS_PARAMETERS) {
       }
     });
   });
-  if (recorded) return *recorded;
   if (step == 0) {
     if (!taken) start_in_results();  // the first activation found no room
     return {x_[0], v_, C_, F_[0], J_[0], history_, status[0], impulse_, time_, Tensor()};

@@ -76,7 +76,7 @@ class SubstepsBackward {
   Recorded<T, D> r_;
   Substeps<T, D>& s_;
   bool mls_;  // F and J move with the affine field
-  Tensor F_term_, parameters_term_;
+  Tensor stress_, F_term_, parameters_term_;
   Tensor gradient_;  // the velocity gradient that moves F and J where that is not the affine field, or its adjoint
   // Adjoints on the nodes [N, 1 + D], of their motion, before contact and before the grid update; and of the velocity
   // change by gravity, by slots.
@@ -90,8 +90,7 @@ SubstepsBackward<T, D>::SubstepsBackward(const SubstepsInputs& in, const Optiona
       grad_impulse_(grad_impulse),
       stream_(stream),
       recorded_(has(record)),
-      r_(in, record, has(in.previous_status) ? static_cast<const int*>(in.previous_status->data_ptr()) : nullptr,
-         stream),
+      r_(in, record, stream),
       s_(r_.steps),
       mls_(s_.p2g.form == StressForm::mls) {
   make_terms(needs);
@@ -102,6 +101,7 @@ template <class T, int D>
 void SubstepsBackward<T, D>::make_terms(int64_t needs) {
   const Tensor& x = in_.x;
   const int64_t P = x.size(0);
+  stress_ = empty_particles(x, {P, D, D});
   if (!mls_) gradient_ = empty_particles(x, {P, D, D});
   bool history = false, changing = false;
   for (const LawCall& call : s_.calls) {
@@ -210,7 +210,7 @@ void SubstepsBackward<T, D>::leave_grid(Adjoints& adjoints, const Tensor& gravit
     p2g.affine = field<T>(adjoints.C);
   else
     torch::stable::zero_(adjoints.C);
-  p2g.stress = field<T>(s_.stress);
+  p2g.stress = field<T>(stress_);
   p2g.volume = field<T>(adjoints.volume);
   p2g.adds = true;
   backend::p2g_backward(order, p2g, stream_);
@@ -226,7 +226,7 @@ void SubstepsBackward<T, D>::leave_laws(Adjoints& adjoints) {
     const LawInfo& info = call.law->info;
     LawBackwardArguments<T, D> a;
     a.law = s_.laws[k].law;
-    a.grad_stress = field<const T>(s_.stress);
+    a.grad_stress = field<const T>(stress_);
     a.adds = !info.changes();
     if (info.plastic) a.grad_state = field<const T>(adjoints.F);
     a.state = field<T>(info.field == Deformation::volume_ratio ? adjoints.J

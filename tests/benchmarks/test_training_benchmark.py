@@ -78,7 +78,12 @@ def test_a_way_that_fails_is_reported() -> None:
 def test_training_program(tmp_path: Path) -> None:
     run_quick("benchmarks.speed.training", tmp_path)
     found = result(tmp_path, "training_*.json")
-    assert [row["kept"] for row in found["rollouts"]] == ["by default", "32 steps", "all steps", "everything, none again"]
+    assert [row["kept"] for row in found["rollouts"]] == [
+        "by default",
+        "32 steps",
+        "all steps",
+        "everything, none again",
+    ]
     assert found["disagreement"].keys() == {row["project"] for row in found["peers"]} == PROJECTS.keys()
     assert all((row["both"] or row["forward"]) > 0 and row["fits"] for row in found["peers"])
     eager, compiled = found["networks"]

@@ -18,14 +18,16 @@ take it as any other, whose sums may round differently. With `records` everythin
 `record`, bytes of no other use, and no step is taken again; not where impulses are counted, or the pool had to grow.
 
 Differentiable once, with respect to x, v, mass, volume, C, F, J, history, parameters, gravity and impulse. Autograd
-keeps the arguments of a call, no more: 2 D + 2 D² numbers per particle of a solid (24 in 3-D) and its history.
+keeps the arguments of a call and the record, mostly none: 2 D + 2 D² numbers per particle of a solid (24 in 3-D) and
+its history.
 
     torch.ops.torch_mpm.substeps_backward(grad_x, grad_v, grad_C, grad_F, grad_J, grad_history, grad_impulse, needs,
         record, *arguments of substeps) -> (x, v, C, F, J, history, mass, volume, parameters, gravity)
 
-takes the steps again, where there is no record, and then goes back through them. Meanwhile it holds what each step has
-read: of a solid 2 D + 3 D² numbers per particle and step (33 in 3-D), D² more where a law is plastic, and the history;
-and the grid of each step where that is at most half as much. The adjoints are [P, ...],
+takes the steps again, where there is no record, and then goes back through them; a record must be that of `substeps`,
+whose contents are not checked. Meanwhile it holds what each step has read: of a solid 2 D + 3 D² numbers per particle
+and step (33 in 3-D), D² more where a law is plastic, and the history; and the grid of each step where that is at most
+half as much. The adjoints are [P, ...],
 those of the parameters [P, number of parameters] and that of gravity, over the time step, a sum for each block of the
 grids of all scenes [B * blocks, D]. Of the last four the bits of `needs` (`MASS`, `VOLUME`, `PARAMETERS`, `GRAVITY`)
 tell which are wanted.
@@ -71,7 +73,7 @@ def _fake(
         x.new_empty((1 + scenes, 8), dtype=torch.int32),
         None if impulse is None else impulse.new_empty(impulse.shape),
         None if given["scene_time"] is None else x.new_empty(scenes),
-        _fake_record(x) if given["records"] else None,
+        _fake_record(x) if given["records"] and impulse is None else None,
     )
 
 
@@ -100,13 +102,11 @@ def _backward_fake(grad_x, grad_v, grad_C, grad_F, grad_J, grad_history, grad_im
 
 
 def _setup(ctx: Any, inputs: Any, output: Any) -> None:
-    given, record = dict(zip(_SCHEMA, inputs, strict=True)), output[-1]
-    if record is None:
-        given["previous_status"] = None  # which the adjoint does not read
+    given = dict(zip(_SCHEMA, inputs, strict=True)) | {"previous_status": None}  # which the adjoint does not read
     history, parameters = given["history"], given["parameters"]
     ctx.variables = len(history)
     ctx.set_materialize_grads(False)
-    ctx.save_for_backward(record, *(given.pop(name) for name in _TENSORS), *history, *parameters)
+    ctx.save_for_backward(output[-1], *(given.pop(name) for name in _TENSORS), *history, *parameters)
     ctx.given = given
 
 
