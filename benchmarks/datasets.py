@@ -34,6 +34,8 @@ SETS: dict[str, list[tuple[str, str, list[str], int]]] = {
     "cuda": [
         ("Sand, 1000 x 2000", "sand", SAND, 1),
         ("Sand, 1000 x 2000, 4 processes a GPU", "sand", [*SAND, "dataset.scenes_per_shard=125"], 4),
+        ("Sand, 4000 x 2000, 4 processes a GPU", "sand",
+         [*SAND, "dataset.splits={train=4000}", "dataset.scenes_per_shard=125"], 4),
         ("Sand, 1000 x 2000, not deterministic", "sand", [*SAND, "grid.deterministic=false"], 1),
         ("Water, 3-D, 64 scenes", "water_3d", ["dataset.splits={train=64}", "dataset.scenes_per_shard=32"], 1),
         ("Melting, 128 scenes", "melting", ["dataset.splits={train=128}"], 1),

@@ -126,7 +126,7 @@ class Recorded {
   };
 
   void lay_out(Arena& arena);
-  Grid grid_in(Arena& arena) const;
+  Grid grid_in(Arena& arena, const Tensor& nodes) const;
   void use(const Grid& grid) {
     steps.activation = grid.activation;
     steps.pool = grid.pool;
@@ -180,6 +180,7 @@ class Recorded {
   bool goes_on_;  // from a status before
   bool keeps_grids_ = false, taken_ = false;
   std::vector<Grid> grids_;
+  Tensor nodes_;  // of all grids
   int* status_ = nullptr;
 };
 
@@ -193,7 +194,7 @@ Recorded<T, D>::Recorded(const SubstepsInputs& in, const OptionalTensor& memory,
   steps.fuse(true);
   steps.activation.workspace_size = backend::activate_workspace(steps.activation, stream);
   Arena grid, counted;
-  grid_in(grid);
+  grid_in(grid, grid.template tensor<T>(in.x, Pool<T, D>::nodes_shape(steps.activation), in.x.scalar_type()));
   // At most half of what the particles take; torch_mpm/rollouts.py counts on it.
   keeps_grids_ = 2 * grid.size() <= in.x.size(0) * (2 * D + 4 * D * D) * int64_t(sizeof(T));
   lay_out(counted);
@@ -236,26 +237,33 @@ void Recorded<T, D>::lay_out(Arena& arena) {
   if (steps.plastic) mapped = Record<T>(arena, given, n, D, D);
   status_ = arena.take<int>((1 + n) * (1 + in_.scenes) * kStatusSize);
   grids_.clear();
-  for (int64_t i = 0; i < n && keeps_grids_; i++) grids_.push_back(grid_in(arena));
+  if (!keeps_grids_) return;
+  const Shape nodes = Pool<T, D>::nodes_shape(steps.activation);
+  nodes_ = arena.tensor<T>(given, {n, nodes[0], nodes[1]}, given.scalar_type());
+  for (int64_t i = 0; i < n; i++)
+    grids_.push_back(grid_in(arena, nodes_.defined() ? torch::stable::select(nodes_, 0, i) : Tensor()));
 }
 
 template <class T, int D>
-typename Recorded<T, D>::Grid Recorded<T, D>::grid_in(Arena& arena) const {
+typename Recorded<T, D>::Grid Recorded<T, D>::grid_in(Arena& arena, const Tensor& nodes) const {
   Grid grid{steps.activation, {}};
-  grid.pool.lay_out(in_.x, grid.activation, steps.obstacles, [&](const Shape& shape, ScalarType type) {
-    return type == ScalarType::Int ? arena.tensor<int>(in_.x, shape, type) : arena.tensor<T>(in_.x, shape, type);
-  });
+  grid.pool.lay_out(
+      nodes, grid.activation, steps.obstacles,
+      [&](const Shape& shape) { return arena.tensor<int>(in_.x, shape, ScalarType::Int); },
+      [&](const Shape& shape) { return arena.tensor<T>(in_.x, shape, in_.x.scalar_type()); });
   return grid;
 }
 
 template <class T, int D>
 bool Recorded<T, D>::take() {
+  if (keeps_grids_) backend::clear(nodes_, stream_);
   for (int64_t i = 0; i < in_.n; i++) {
+    steps.nodes_are_clear = keeps_grids_;
     if (keeps_grids_) use(grids_[size_t(i)]);
     read(i);
     set_time(i);
     if (!activate(i)) return false;
-    if (!memory().defined()) keeps_grids_ = false;  // the one pool that has grown serves all
+    if (!memory().defined()) keeps_grids_ = steps.nodes_are_clear = false;  // the one pool that has grown serves all
     steps.write({x[i], v[i], C[i], F[i], J[i], history[i]});
     if (has(in_.material)) keep_others(i);
     steps.move(stream_);
@@ -272,7 +280,7 @@ bool Recorded<T, D>::return_to(int64_t i) {
   if (MPM_BACKEND != MPM_BACKEND_IS_cpu) steps.contact.activations = status(i) + kActivations;
   if (keeps_grids_ || (i + 1 == in_.n && taken_)) return true;
   if (!activate(i)) return false;
-  steps.fused = false;  // the stress is there
+  steps.fused = steps.nodes_are_clear = false;  // the stress is there
   steps.move_grid(stream_);
   return true;
 }

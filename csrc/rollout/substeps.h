@@ -133,24 +133,22 @@ struct Pool {
 
   void make(const Tensor& x, ActivateArguments<T, D>& a, bool obstacles, backend::Stream stream) {
     active.make(x, a, stream);
-    lay_out_nodes(a, obstacles, [&](const Shape& shape) { return empty(x, shape); });
+    nodes = empty(x, nodes_shape(a));
+    updated = empty(x, nodes_shape(a));
+    if (obstacles) velocity = empty(x, nodes_shape(a));
   }
 
-  // By allocate(shape, type), but for the workspace.
-  template <class Allocate>
-  void lay_out(const Tensor& x, ActivateArguments<T, D>& a, bool obstacles, const Allocate& allocate) {
-    active.lay_out(a, [&](const Shape& shape) { return allocate(shape, ScalarType::Int); });
-    lay_out_nodes(a, obstacles, [&](const Shape& shape) { return allocate(shape, x.scalar_type()); });
+  // By ints(shape) and numbers(shape); the nodes and the workspace are given.
+  template <class Ints, class Numbers>
+  void lay_out(const Tensor& given, ActivateArguments<T, D>& a, bool obstacles, const Ints& ints,
+               const Numbers& numbers) {
+    active.lay_out(a, ints);
+    nodes = given;
+    updated = numbers(nodes_shape(a));
+    if (obstacles) velocity = numbers(nodes_shape(a));
   }
 
- private:
-  template <class Allocate>
-  void lay_out_nodes(const ActivateArguments<T, D>& a, bool obstacles, const Allocate& allocate) {
-    const Shape shape{int64_t(a.slots()) * kBlockNodes<D>, 1 + D};
-    nodes = allocate(shape);
-    updated = allocate(shape);
-    if (obstacles) velocity = allocate(shape);
-  }
+  static Shape nodes_shape(const ActivateArguments<T, D>& a) { return {int64_t(a.slots()) * kBlockNodes<D>, 1 + D}; }
 };
 
 template <class T, int D>
@@ -227,6 +225,7 @@ struct Substeps {
   NextGridArguments<T, D> next;   // of these; its update and contact are those here
   Tensor impulse, impulse_slots;  // on obstacles and walls so far; where someone asks, see `add_impulses_to`
   bool obstacles = false, fused = false;
+  bool nodes_are_clear = false;  // when a step begins
   const int* previous_status = nullptr;
 
   explicit Substeps(const SubstepsInputs& inputs);
@@ -365,7 +364,7 @@ struct Substeps {
 
   // From a stress that is there, or that P2G computes, to the velocities of the nodes.
   void move_grid(backend::Stream stream) {
-    if (!next.emptied) backend::clear(pool.nodes, stream);
+    if (!next.emptied && !nodes_are_clear) backend::clear(pool.nodes, stream);
     if (fused)
       calls[0].law->kernels<T, D>().p2g(laws[0], p2g, stream);
     else

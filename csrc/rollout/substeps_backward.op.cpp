@@ -29,13 +29,15 @@ class SubstepsBackward {
   void run(Adjoints& adjoints, const Tensor& gravity) {
     if (!recorded_) check_room(r_.take());
     const int64_t slots = s_.activation.slots(), rows = slots * kBlockNodes<D>;
-    for (Tensor* t : {&motion_, &update_}) *t = empty(in_.x, {rows, 1 + D});
+    motions_ = std::clamp<int64_t>(kCleared / std::max<int64_t>(rows * (1 + D) * int64_t(sizeof(T)), 1), 1, in_.n);
+    motion_ = empty(in_.x, {motions_, rows, 1 + D});
+    update_ = empty(in_.x, {rows, 1 + D});
     if (s_.obstacles) contact_ = empty(in_.x, {rows, 1 + D});
     if (gravity.defined()) change_ = empty(in_.x, {slots, D});
     for (int64_t i = in_.n - 1; i >= 0; i--) {
       check_room(r_.return_to(i));
       leave_advance(i, adjoints);
-      leave_grid(adjoints, gravity);
+      leave_grid(i, adjoints, gravity);
       leave_laws(adjoints);
     }
   }
@@ -47,7 +49,7 @@ class SubstepsBackward {
 
   void make_terms(int64_t needs);
   void leave_advance(int64_t i, Adjoints& adjoints);
-  void leave_grid(Adjoints& adjoints, const Tensor& gravity);
+  void leave_grid(int64_t i, Adjoints& adjoints, const Tensor& gravity);
   void leave_laws(Adjoints& adjoints);
 
   // What laws that change deformation or history give beside the adjoints of these.
@@ -78,8 +80,10 @@ class SubstepsBackward {
   bool mls_;  // F and J move with the affine field
   Tensor stress_, F_term_, parameters_term_;
   Tensor gradient_;  // the velocity gradient that moves F and J where that is not the affine field, or its adjoint
-  // Adjoints on the nodes [N, 1 + D], of their motion, before contact and before the grid update; and of the velocity
-  // change by gravity, by slots.
+  static constexpr int64_t kCleared = 1 << 26;  // bytes at once: a pass of memory costs a launch, too
+  int64_t motions_ = 1;
+  // Adjoints on the nodes [N, 1 + D], of their motion in some steps, before contact and before the grid update; and of
+  // the velocity change by gravity, by slots.
   Tensor motion_, contact_, update_, change_;
 };
 
@@ -150,9 +154,10 @@ void SubstepsBackward<T, D>::leave_advance(int64_t i, Adjoints& adjoints) {
 
 // Through G2P, obstacles, grid update and P2G.
 template <class T, int D>
-void SubstepsBackward<T, D>::leave_grid(Adjoints& adjoints, const Tensor& gravity) {
+void SubstepsBackward<T, D>::leave_grid(int64_t i, Adjoints& adjoints, const Tensor& gravity) {
   const int64_t order = in_.lattice.order();
-  T* const nodes = static_cast<T*>(motion_.data_ptr());
+  if (i % motions_ == motions_ - 1 || i == in_.n - 1) backend::clear(motion_, stream_);
+  T* const nodes = static_cast<T*>(motion_.data_ptr()) + i % motions_ * motion_.stride(0);
   ScatterArguments<T, D> motion;
   motion.topology = s_.p2g.topology;
   motion.x = s_.p2g.x;
@@ -162,7 +167,6 @@ void SubstepsBackward<T, D>::leave_grid(Adjoints& adjoints, const Tensor& gravit
   motion.moment_scale = in_.lattice.inverse_inertia();
   motion.deterministic = in_.lattice.deterministic();
   motion.nodes = {nodes + 1, 1 + D, D};
-  backend::clear(motion_, stream_);
   backend::scatter(order, motion, stream_);
   backend::position_gradient(
       order,
