@@ -169,7 +169,8 @@ class _Calls:
         tangent, along = 0.1 * self.uniform(P, tangent_entries(D)), self.normal(N, D)
         inverse = torch.zeros(N, D * (D + 1) // 2, dtype=self.dtype)
         inverse[:, 0] = inverse[:, -1] = 1.0
-        solve = (x, along, self.uniform(N), inverse, inverse, tangent, 0.1 * self.uniform(2), 20, 0)
+        images = torch.arange(3 << D, dtype=torch.int32).reshape(3, -1)
+        solve = (x, along, self.uniform(N), inverse, inverse, images, tangent, 0.1 * self.uniform(2), 20, 0)
         moduli = [self.uniform(P), self.uniform(2)]
         return [
             ("law_tangent", (self.F, self.F, self.uniform(P), moduli, [], self.scene, "neo_hookean", D, True)),

@@ -77,14 +77,15 @@ def draw_order(in_time: Rows, in_space: Rows, path: Path) -> None:
     left.set_xlabel("dt [s]")
     left.set_ylabel("relative error against explicit steps")
     bodies = dict.fromkeys((row["body"], row["kernel"]) for row in in_space)
+    colors = {body: f"C{k}" for k, body in enumerate(dict.fromkeys(body for body, _ in bodies))}
     for body, kernel in bodies:
         own = [row for row in in_space if (row["body"], row["kernel"]) == (body, kernel)]
         style = "o-" if kernel == "quadratic" else "s--"
-        right.loglog(*points(own, "cells", "error"), style, label=f"{body}, {kernel}")
+        right.loglog(*points(own, "cells", "error"), style, color=colors[body], label=f"{body}, {kernel}")
     cells = [2.0, 64.0]
     for order, style in ((1, "-"), (2, ":")):
         right.loglog(cells, [0.4 * (2 / n) ** order for n in cells], style, color="gray", label=f"order {order}")
-    right.set_ylim(1e-3, 0.6)
+    right.set_ylim(1e-5, 0.6)
     right.set_xticks([2, 4, 8, 16, 32, 64], ["2", "4", "8", "16", "32", "64"])
     right.set_xlabel("cells of the column, and of the beam's height")
     right.set_ylabel("relative error against analytic solutions")
@@ -102,7 +103,7 @@ def draw_sand(clump: Rows, collapse: Rows, path: Path) -> None:
     _draw_bodies(panels[1, :3], collapse, 2e-3, None)
     for panel, rows, measure in ((panels[0, 3], clump, "spread"), (panels[1, 3], collapse, "run-out")):
         for energy, color in COLORS.items():
-            own = [row for row in rows if row["energy"] == energy]
+            own = [row for row in rows if row["energy"] == energy and row.get("transfer", "apic") == "apic"]
             for number, name in enumerate(dict.fromkeys(row["return map"] for row in own)):
                 these = [row for row in own if row["return map"] == name]
                 if name == "explicit":
@@ -118,6 +119,7 @@ def draw_sand(clump: Rows, collapse: Rows, path: Path) -> None:
 
 
 def _draw_bodies(panels: Any, rows: Rows, dt: float, start: torch.Tensor | None) -> None:
+    rows = [row for row in rows if row.get("transfer", "apic") == "apic"]
     implicit = [row for row in rows if row["return map"] == "after the solve"]
     near = min({row["dt [s]"] for row in implicit}, key=lambda length: abs(length - dt))
     shown = [next(row for row in rows if row["return map"] == "explicit" and row["energy"] == "unilateral")]

@@ -57,7 +57,9 @@ struct ConjugateGradientsArguments {
   const T* inverse = nullptr;  // [N, kSymmetric<D>], upper triangles
   const T* local = nullptr;    // likewise, what a node adds to its own part of the Hessian; or null
   const T* rhs = nullptr;      // [N, D]
-  T* x = nullptr;              // [N, D], and the others
+  int image_groups = 0;
+  const int* images = nullptr;  // [image_groups, 2^D] rows of nodes that are images of one another, see `mirror_group`
+  T* x = nullptr;               // [N, D], and the others
   T* r = nullptr;
   T* p = nullptr;
   T* q = nullptr;                       // on entry of `curvature` the product of the tangents alone
@@ -175,6 +177,29 @@ MPM_HD void cg_turn(const ConjugateGradientsArguments<T, D>& a, int64_t node, co
   MPM_UNROLL for (int i = 0; i < D; i++) {
     T& p = a.p[node * D + i];
     p = s.state == kSolving ? z[i] + T(s.turn) * p : T(0);
+  }
+}
+
+// The products of nodes that mirrors make one become what they have in common: the mean of their reflections. Entry k
+// of a group is the row of the node that the axes of the bits of k reflect, -1 for none; a node on a plane is its own
+// image.
+template <class T, int D>
+MPM_HD void mirror_group(const ConjugateGradientsArguments<T, D>& a, int group) {
+  const int* rows = a.images + int64_t(group) * (1 << D);
+  const int64_t N = int64_t(a.max_blocks) * kBlockNodes<D>;
+  const auto present = [&](int k) { return rows[k] >= 0 && rows[k] < N; };
+  Vector<T, D> mean = zero_vector<T, D>();
+  int count = 0;
+  for (int k = 0; k < 1 << D; k++) {
+    if (!present(k)) continue;
+    count++;
+    MPM_UNROLL for (int i = 0; i < D; i++)
+      mean[i] += (k >> i & 1 ? T(-1) : T(1)) * a.q[rows[k] * int64_t(D) + i];
+  }
+  for (int k = 0; k < 1 << D; k++) {
+    if (!present(k)) continue;
+    MPM_UNROLL for (int i = 0; i < D; i++)
+      a.q[rows[k] * int64_t(D) + i] = (k >> i & 1 ? T(-1) : T(1)) * mean[i] / T(count);
   }
 }
 

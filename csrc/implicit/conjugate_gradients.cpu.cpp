@@ -41,6 +41,7 @@ void cg_begin(const ConjugateGradientsArguments<T, D>& a) {
 template <class T, int D>
 void cg_advance(const ConjugateGradientsArguments<T, D>& a) {
   for_slots(a, [&](int64_t node, const ConjugateGradients&) { return cg_curvature(a, node); });
+  for (int group = 0; group < a.image_groups; group++) mirror_group(a, group);
   advance_scenes(a, CGPhase::curvature, a.slots + a.max_blocks);
   for_slots(a, [&](int64_t node, const ConjugateGradients& s) { return cg_step(a, node, s.step); });
   advance_scenes(a, CGPhase::step, a.slots + a.max_blocks);

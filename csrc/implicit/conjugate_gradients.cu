@@ -60,6 +60,12 @@ __global__ void cg_look_kernel(const ConjugateGradientsArguments<T, D> a) {
 }
 
 template <class T, int D>
+__global__ void cg_mirror_kernel(const ConjugateGradientsArguments<T, D> a) {
+  const int group = int(blockIdx.x) * kThreads + int(threadIdx.x);
+  if (group < a.image_groups) mirror_group(a, group);
+}
+
+template <class T, int D>
 void run_pass(const ConjugateGradientsArguments<T, D>& a, Pass pass, Stream stream) {
   const int64_t threads = int64_t(a.max_blocks) * kLanes;
   launch(cg_pass_kernel<T, D>, unsigned((threads + kThreads - 1) / kThreads), kThreads, 0, stream, a, pass);
@@ -78,6 +84,8 @@ template <class T, int D>
 void cg_advance(const ConjugateGradientsArguments<T, D>& a, Stream stream) {
   if (a.max_blocks == 0 || a.scenes == 0) return;
   run_pass(a, Pass::curvature, stream);
+  if (a.image_groups > 0)
+    launch(cg_mirror_kernel<T, D>, unsigned((a.image_groups + kThreads - 1) / kThreads), kThreads, 0, stream, a);
   launch(cg_scene_kernel<T, D>, unsigned(a.scenes), kSumThreads, 0, stream, a, CGPhase::curvature);
   run_pass(a, Pass::step, stream);
   launch(cg_scene_kernel<T, D>, unsigned(a.scenes), kSumThreads, 0, stream, a, CGPhase::step);

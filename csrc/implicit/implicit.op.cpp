@@ -106,15 +106,24 @@ Tensor implicit_node_blocks(const Tensor& x, const Tensor& tangent, int64_t stre
   return result;
 }
 
+template <class T, int D>
+void set_images(ConjugateGradientsArguments<T, D>& a, const Tensor& images, const Tensor& x) {
+  check_rank(images, "images", 2);
+  check_count(images.size(0), "images", "groups");
+  a.image_groups = int(images.size(0));
+  a.images = int_pointer(images, "images", x, {images.size(0), 1 << D});
+}
+
 // Iterations between two looks of the host at how many scenes are not done.
 constexpr int kIterationsPerLook = MPM_BACKEND == MPM_BACKEND_IS_cpu ? 1 : 8;
 // Iterations that a solve has at least where it matters how long it takes.
 constexpr int kWorthATeam = 16;
 
 std::tuple<Tensor, Tensor> implicit_cg(const Tensor& x, const Tensor& rhs, const Tensor& mass, const Tensor& inverse,
-                                       const OptionalTensor& local, const Tensor& tangent, const Tensor& relative,
-                                       int64_t max_iterations, int64_t stress_form, const std::vector<Tensor>& topology,
-                                       const std::vector<double>& lattice, const std::vector<int64_t>& layout) {
+                                       const OptionalTensor& local, const OptionalTensor& images, const Tensor& tangent,
+                                       const Tensor& relative, int64_t max_iterations, int64_t stress_form,
+                                       const std::vector<Tensor>& topology, const std::vector<double>& lattice,
+                                       const std::vector<int64_t>& layout) {
   const PackedTopology blocks(topology, lattice, layout);
   STD_TORCH_CHECK(max_iterations >= 0 && max_iterations <= INT32_MAX, "max_iterations must be 0 to 2^31 - 1, got ",
                   max_iterations);
@@ -131,6 +140,7 @@ std::tuple<Tensor, Tensor> implicit_cg(const Tensor& x, const Tensor& rhs, const
     a.mass = node_pointer<T>(mass, "mass", x, {N});
     a.inverse = node_pointer<T>(inverse, "inverse", x, {N, kSymmetric<D>});
     if (local) a.local = node_pointer<T>(*local, "local", x, {N, kSymmetric<D>});
+    if (images) set_images(a, *images, x);
     a.rhs = node_pointer<T>(rhs, "rhs", x, {N, D});
     a.relative = node_pointer<T>(relative, "relative", x, {t.scenes});
     static_assert(sizeof(ConjugateGradients) == 5 * sizeof(double));
@@ -174,7 +184,7 @@ STABLE_TORCH_LIBRARY_FRAGMENT(torch_mpm, m) {
         ") -> Tensor");
   m.def("implicit_node_blocks(Tensor x, Tensor tangent, int stress_form, " MPM_TOPOLOGY_SCHEMA ") -> Tensor");
   m.def(
-      "implicit_cg(Tensor x, Tensor rhs, Tensor mass, Tensor inverse, Tensor? local, Tensor tangent, "
+      "implicit_cg(Tensor x, Tensor rhs, Tensor mass, Tensor inverse, Tensor? local, Tensor? images, Tensor tangent, "
       "Tensor relative, int max_iterations, int stress_form, " MPM_TOPOLOGY_SCHEMA
       ") -> (Tensor solution, Tensor scalars)");
 }

@@ -77,6 +77,8 @@ FORMS_AND_WALLS = [
     *((2, form, walls) for form in ("mls", "gradient") for walls in (None, "sticky", "slip", "separate")),
     (3, "mls", "separate"),
     (3, "gradient", "sticky"),
+    (2, "mls", "mirror"),
+    (2, "gradient", "mirror"),
 ]
 
 

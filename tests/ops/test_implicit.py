@@ -9,6 +9,7 @@ from torch import Tensor
 
 import torch_mpm as mpm
 from torch_mpm import ops
+from torch_mpm.implicit.mirrors import Mirrors
 from torch_mpm.ops.implicit import CONVERGED, NEGATIVE_CURVATURE, from_upper, tangent_entries, to_upper
 from torch_mpm.reference import implicit as oracle
 from torch_mpm.reference import material
@@ -293,6 +294,30 @@ def test_a_part_of_each_node_belongs_to_the_hessian(dim, device):
         ops.implicit_cg(*arguments, local=local[:-1])
 
 
+def test_images_are_one(dim, device):
+    """The solution is symmetric, and what the solve leaves has no symmetric part."""
+    case = Case(dim, "quadratic", device)
+    heavy = case.mass.nonzero()[:, 0]
+    groups = torch.full((2, 1 << dim), -1, dtype=torch.int32, device=device)
+    groups[0, 0], groups[0, 1] = heavy[0], heavy[5]  # images along x
+    groups[1, 0] = groups[1, 2] = heavy[7]  # a node on a mirror along y
+    mirrors = Mirrors(groups)
+    rhs, inverse = (mirrors.symmetric(t) for t in (case.nodes(3) * case.mass[:, None], case.inverse()))
+    relative = torch.full((1,), 1e-11, dtype=torch.float64, device=device)
+    arguments = (case.blocks, case.particles.x, rhs, case.mass, inverse, case.tangent, relative, 1000)
+    solve = ops.implicit_cg(*arguments, images=groups)
+    assert solve.state.tolist() == [CONVERGED]
+    first, second, alone = (solve.solution[heavy[k]] for k in (0, 5, 7))
+    assert first[0] == -second[0] and (first[1:] == second[1:]).all() and alone[1] == 0 and alone[0] != 0
+    left = ops.implicit_apply(case.blocks, case.particles.x, solve.solution, case.tangent, case.mass) - rhs
+    assert relative_error(mirrors.symmetric(left) + rhs, rhs) < 1e-9
+    assert left[heavy[7], 1].abs() > 1e-6 * rhs.abs().max()  # the force of the mirror
+    with pytest.raises(ValueError, match=r"images must have shape \[G, 2\^D\]"):
+        ops.implicit_cg(*arguments, images=groups[:, :1])
+    with pytest.raises(TypeError, match="images must be int32"):
+        ops.implicit_cg(*arguments, images=groups.long())
+
+
 @pytest.mark.parametrize("sign", [-1.0, 0.0])
 def test_an_indefinite_preconditioner_is_no_convergence(sign, device):
     """As rounding leaves one of stiff blocks: r · B⁻¹ r is negative, at the start or later."""
@@ -344,6 +369,6 @@ def test_opcheck(dim, device):
     torch.library.opcheck(namespace.implicit_node_blocks.default, (x, case.tangent, 0, *packed), test_utils=checks)
     torch.library.opcheck(
         namespace.implicit_cg.default,
-        (x, case.nodes(1), case.mass.contiguous(), upper, upper, case.tangent, relative, 5, 0, *packed),
+        (x, case.nodes(1), case.mass.contiguous(), upper, upper, None, case.tangent, relative, 5, 0, *packed),
         test_utils=("test_schema",),
     )

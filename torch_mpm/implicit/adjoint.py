@@ -45,7 +45,7 @@ def differentiable(
         return minimum.v
     # Start is nothing that the derivative depends on; friction depends on the gradient.
     pressing = None if contact.friction is None else gradient.detach()
-    parts = (fixed.blocks, fixed.state, fixed.mass, fixed.dt, bounds, minimum.free, pressing)
+    parts = (fixed.blocks, fixed.state, fixed.mass, fixed.dt, fixed.mirrors, bounds, minimum.free, pressing)
     parts, tensors = separated(parts)
     rest = fixed.law, fixed.stress_form, fixed.flows, parts
     result: Tensor = _Solution.apply(residual, minimum.v, owner, rest, *tensors)
@@ -66,8 +66,8 @@ class _Solution(torch.autograd.Function):
     def backward(ctx, grad):
         v, *tensors = ctx.saved_tensors
         law, stress_form, flows, parts = ctx.rest
-        blocks, state, mass, dt, bounds, free, gradient = joined(parts, tensors)
-        system = ImplicitSystem(blocks, law, state, mass, v, dt, stress_form, flows)
+        blocks, state, mass, dt, mirrors, bounds, free, gradient = joined(parts, tensors)
+        system = ImplicitSystem(blocks, law, state, mass, v, dt, stress_form, flows, mirrors=mirrors)
         adjoint, converged = _Adjoint(ctx.owner, system, bounds, free, gradient, v).solve(grad)
         ctx.owner.record_adjoint(converged)
         adjoint = torch.where(system.of_nodes(converged), adjoint, torch.nan)
@@ -141,7 +141,7 @@ class _Adjoint:
         system = self._system
         return implicit_cg(
             *(system.blocks, system.state.x, right, system.mass, self._inverse, tangent, relative, self._most),
-            *(system.stress_form, self._across),
+            *(system.stress_form, self._across, system.images),
         )
 
     def _transposed(self, given: Tensor) -> Tensor:
@@ -155,4 +155,5 @@ class _Adjoint:
         return self._kept(result if self._across is None else result + times(self._across, given))
 
     def _kept(self, vectors: Tensor) -> Tensor:
+        vectors = self._system.symmetric(vectors)
         return vectors if self._bounds is None else self._bounds.kept(vectors, self._free)

@@ -13,6 +13,7 @@ from torch import Tensor
 from ..boundaries import Obstacle, Walls
 from ..boundaries.walls import Face
 from ..grid import Blocks
+from .mirrors import reflected_inside
 
 ON_FACE = 1e-6
 """Share of dx within which a node is at a wall, as the grid update has it."""
@@ -93,7 +94,9 @@ def node_bounds(
         time: [s].
 
     Raises:
-        NotImplementedError: for mirrors, and boundaries that are no obstacles.
+        NotImplementedError: for boundaries that are no obstacles.
+
+    A mirror bounds the nodes on its plane alone; it shows obstacles to the nodes behind it as they are before it.
 
     Differentiable by the friction of obstacles alone.
     """
@@ -108,8 +111,9 @@ def node_bounds(
     if walls is not None:
         _add_walls(bounds, blocks, faces, positions)
     scene = blocks.node_scene() if blocks.grid.scenes > 1 else None
+    positions, sign = reflected_inside(blocks, walls, positions)
     for obstacle in obstacles:
-        _add_obstacle(bounds, obstacle, positions, scene, time)
+        _add_obstacle(bounds, obstacle, positions, sign, scene, time)
     return bounds
 
 
@@ -124,11 +128,11 @@ def _add_walls(bounds: NodeBounds, blocks: Blocks, faces: Sequence[Face], positi
         axis, above = divmod(number, 2)
         if face.kind == "open":
             continue
-        if face.kind == "mirror":
-            raise NotImplementedError("an implicit step has no mirrors yet: use slip, separate or sticky walls")
         at = positions[:, axis]
         near = ON_FACE * blocks.grid.dx
         touching = at >= face.plane - near if above else at <= face.plane + near
+        if face.kind == "mirror":
+            touching &= (at - face.plane).abs() <= near
         axes = slice(None) if face.kind == "sticky" else slice(axis, axis + 1)
         rows = touching[:, None]
         low, high = bounds.lower[:, axes], bounds.upper[:, axes]
@@ -141,7 +145,7 @@ def _add_walls(bounds: NodeBounds, blocks: Blocks, faces: Sequence[Face], positi
 
 
 def _add_obstacle(
-    bounds: NodeBounds, obstacle: Any, positions: Tensor, scene: Tensor | None, time: float | Tensor
+    bounds: NodeBounds, obstacle: Any, positions: Tensor, sign: Tensor, scene: Tensor | None, time: float | Tensor
 ) -> None:
     if not isinstance(obstacle, Obstacle):
         raise NotImplementedError(
@@ -151,7 +155,8 @@ def _add_obstacle(
     if contact is None:
         return
     touching, normal, surface_velocity = contact
-    surface = torch.zeros_like(positions) if surface_velocity is None else surface_velocity.expand_as(positions)
+    normal = sign * normal
+    surface = torch.zeros_like(positions) if surface_velocity is None else sign * surface_velocity
     if obstacle.kind == "sticky":
         rows = touching[:, None] & (bounds.lower != bounds.upper)  # what a wall holds stays
         surface = bounds.turned(surface)
@@ -164,21 +169,21 @@ def _add_obstacle(
     rows = (touching & ~taken)[:, None] & (length > 1e-3)
     normal = normal / torch.where(length > 0, length, 1)
     axis = torch.nn.functional.one_hot(normal.abs().argmax(-1), positions.shape[1]).to(normal.dtype)
-    sign = torch.where((normal * axis).sum(-1, keepdim=True) < 0, -1.0, 1.0).to(normal.dtype)
-    # The reflection that takes the axis to −sign times the normal, whose difference does not cancel.
-    w = axis * sign + normal
+    side = torch.where((normal * axis).sum(-1, keepdim=True) < 0, -1.0, 1.0).to(normal.dtype)
+    # The reflection that takes the axis to −side times the normal, whose difference does not cancel.
+    w = axis * side + normal
     w = w / w.norm(dim=-1, keepdim=True)
     old = torch.zeros_like(w) if bounds.mirror is None else bounds.mirror
     bounds.mirror = torch.where(rows, w, old)
     speed = (surface * normal).sum(-1, keepdim=True)
-    limit = torch.where(sign > 0, -speed, speed)  # of the component along the axis, u = −sign v · n
+    limit = torch.where(side > 0, -speed, speed)  # of the component along the axis, u = −side v · n
     fixed = obstacle.kind == "slip"
     entry = rows & (axis > 0)
-    bounds.lower = torch.where(entry & ((sign < 0) | fixed), limit, torch.where(entry, -math.inf, bounds.lower))
-    bounds.upper = torch.where(entry & ((sign > 0) | fixed), limit, torch.where(entry, math.inf, bounds.upper))
+    bounds.lower = torch.where(entry & ((side < 0) | fixed), limit, torch.where(entry, -math.inf, bounds.lower))
+    bounds.upper = torch.where(entry & ((side > 0) | fixed), limit, torch.where(entry, math.inf, bounds.upper))
     if bounds.friction is not None and bounds.surface is not None and rubs(obstacle):
         friction = obstacle.friction
         if isinstance(friction, Tensor):
             friction = obstacle.at_nodes("friction", positions, (), scene)[..., None]
-        bounds.friction = torch.where(entry, -sign * friction, bounds.friction)
+        bounds.friction = torch.where(entry, -side * friction, bounds.friction)
         bounds.surface = torch.where(rows, bounds.turned(surface), bounds.surface)

@@ -16,6 +16,7 @@ from ..failures import Problem, unsolved_steps
 from ..ops import grid_update
 from .adjoint import differentiable
 from .bounds import node_bounds
+from .mirrors import mirrors_of
 from .newton import Minimum, Options, minimise
 from .system import ImplicitSystem
 
@@ -106,13 +107,17 @@ class Implicit:
         Differentiable by everything that the state, the law, gravity and the nodes depend on, by one linear solve.
         """
         gravity = step.gravity_like(state.x)
-        start = grid_update(blocks, nodes, gravity, dt)
+        walls = None if step.walls is None else step.walls.mirrors()
+        start = grid_update(blocks, nodes, gravity, dt, walls)
         if not blocks.grid.scenes:
             return start
         wants_gradient = torch.is_grad_enabled()
-        before = None if gravity is None else grid_update(blocks, nodes.detach())
+        before = None if gravity is None else grid_update(blocks, nodes.detach(), walls=walls)
         flows = self.plasticity == "inside"
-        system = ImplicitSystem(blocks, step.law, state, nodes[:, 0], start, dt, step.stress_form, flows, before)
+        mirrors = mirrors_of(blocks, walls, nodes[:, 0].detach())
+        system = ImplicitSystem(
+            *(blocks, step.law, state, nodes[:, 0], start, dt, step.stress_form, flows, before, mirrors)
+        )
         bounds = node_bounds(blocks, step.walls, step.boundaries.entries, start, state.time)
         with torch.no_grad():
             fixed = system.detached() if wants_gradient else system

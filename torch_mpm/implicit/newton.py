@@ -130,6 +130,7 @@ def minimise(system: ImplicitSystem, bounds: NodeBounds | None, options: Options
             *(system.blocks, system.state.x, right, system.mass, inverse, tangent, relative),
             *(options.max_cg_iterations, system.stress_form),
             local=across,
+            images=system.images,
         )
         indefinite = solve.state == NEGATIVE_CURVATURE
         direction = torch.where(system.of_nodes(indefinite & (solve.iterations == 0)), -change, solve.solution)
@@ -256,6 +257,8 @@ def _with_momentum(system: ImplicitSystem, bounds: NodeBounds | None, v: Tensor,
     change = torch.stack([system.node_sum(column) for column in missing.unbind(1)], 1) / total_mass[:, None]
     if bounds is not None:
         bounded = (bounds.lower.isfinite() | bounds.upper.isfinite()).any(1) & (system.mass > 0)
+        if system.mirrors is not None:
+            bounded |= system.mirrors.has(len(bounded))
         change = torch.where((system.node_sum(bounded) > 0)[:, None], 0, change)
     change = torch.where(change.isfinite(), change, 0)
     change = change.to(v.dtype)[system.slot_scene].repeat_interleave(system.blocks.grid.nodes_per_block, 0)

@@ -21,6 +21,7 @@ from ..laws.material import Material
 from ..ops import advance, gather, implicit_apply, implicit_node_blocks, scatter
 from ..ops.arguments import per_particle, sum_by_scene
 from ..parameters import Overlay
+from .mirrors import Mirrors
 
 READ = ("x", "mass", "volume", "F", "J", "scene", "ids", "material", "temperature", "time", "dt", "particles")
 """What laws may read of a state: velocities are those of the nodes."""
@@ -40,6 +41,7 @@ class ImplicitSystem:
         stress_form: "mls" or "gradient".
         flows: whether the stress is that after the return map of the trial deformation; no energy has it then.
         before_gravity: velocities of the nodes before gravity [N, D] [m/s], None without gravity: a place to start.
+        mirrors: to whose symmetric velocities the system is restricted, None for all.
         volume: of the particles that have an energy, zero for the others [P] [m³].
     """
 
@@ -52,6 +54,7 @@ class ImplicitSystem:
     stress_form: str
     flows: bool = False
     before_gravity: Tensor | None = None
+    mirrors: Mirrors | None = None
     _trial: tuple[Tensor, Any] | None = None
 
     def __post_init__(self) -> None:
@@ -88,7 +91,7 @@ class ImplicitSystem:
         extra = {name: still(value) for name, value in self.state.extra.items()}
         return ImplicitSystem(
             *(self.blocks, self.law, Overlay(None, **fields, extra=extra), still(self.mass), still(self.start)),
-            *(still(self.dt), self.stress_form, self.flows, self.before_gravity),
+            *(still(self.dt), self.stress_form, self.flows, self.before_gravity, self.mirrors),
         )
 
     def trial(self, v: Tensor) -> Any:
@@ -130,7 +133,11 @@ class ImplicitSystem:
         stress = self.law.trial_stress(self.trial(v), self.state, self.flows)
         meant = (self.volume > 0)[:, None, None]  # the stress of others may be NaN
         impulse = torch.where(meant, self.impulse_weight[:, None, None] * torch.where(meant, stress, 0), 0)
-        return self.mass[:, None] * (v - self.start) + self._scattered(impulse)
+        return self.symmetric(self.mass[:, None] * (v - self.start) + self._scattered(impulse))
+
+    def symmetric(self, values: Tensor) -> Tensor:
+        """Vectors or matrices of nodes as mirrors want them."""
+        return values if self.mirrors is None else self.mirrors.symmetric(values)
 
     def _motion(self, v: Tensor) -> tuple[Tensor, Tensor]:
         """Velocities of the particles [P, D] and their gradients [P, D, D]."""
@@ -163,17 +170,22 @@ class ImplicitSystem:
         def product(direction: Tensor) -> Tensor:
             result = implicit_apply(self.blocks, self.state.x, direction, tangent, self.mass, self.stress_form)
             if skew is None:
-                return result
+                return self.symmetric(result)
             along = (U.mT @ self._motion(direction)[1] @ B).diagonal(dim1=1, dim2=2)
             turned = (skew @ along[:, :, None]) * B.mT
-            return result + self._scattered(U @ turned)
+            return self.symmetric(result + self._scattered(U @ turned))
 
         return product
 
     def diagonal(self, tangent: Tensor) -> Tensor:
         """The node blocks of the Hessian [N, D, D] [kg]."""
         blocks = implicit_node_blocks(self.blocks, self.state.x, tangent, self.stress_form)
-        return blocks + torch.diag_embed(self.mass[:, None].expand(-1, blocks.shape[1]))
+        return self.symmetric(blocks + torch.diag_embed(self.mass[:, None].expand(-1, blocks.shape[1])))
+
+    @property
+    def images(self) -> Tensor | None:
+        """Of nodes, as `implicit_cg` takes them."""
+        return None if self.mirrors is None else self.mirrors.groups
 
     # -- sums over scenes
 

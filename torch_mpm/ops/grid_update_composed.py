@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING
 
 import torch
@@ -50,20 +50,34 @@ def composed_grid_update(
 
 def _mirror(faces: Sequence[Face], blocks: Topology, rows: Tensor) -> Tensor:
     """Rows of mass and momentum plus those of their images in every mirror and corner of mirrors."""
-    mirrors = [(number // 2, face.plane) for number, face in enumerate(faces) if face.kind == "mirror"]
     result = rows
-    for count in range(1, len(mirrors) + 1):
-        for corner in itertools.combinations(mirrors, count):
-            node, near, sign = blocks.node_indices(), blocks.active_nodes(), torch.ones_like(rows[:1])
-            for axis, plane in corner:
-                distance = _half_cells(blocks, node, axis, plane)
-                near = near & (distance.abs() <= 2 * MIRROR_REACH)
-                node[:, axis] -= distance
-                sign[:, 1 + axis] *= -1
-            image = blocks.rows_at(node, blocks.node_scene().clamp_min(0))
-            near = near & (image >= 0)
-            result = result + torch.where(near[:, None], sign * rows[image.clamp_min(0)], 0)
+    for axes, image in images(faces, blocks):
+        sign = torch.ones_like(rows[:1])
+        sign[:, [1 + axis for axis in axes]] = -1
+        result = result + torch.where(image[:, None] >= 0, sign * rows[image.clamp_min(0)], 0)
     return result
+
+
+def images(faces: Sequence[Face], blocks: Topology) -> Iterator[tuple[tuple[int, ...], Tensor]]:
+    """For each set of axes that mirrors reflect, the row of each node's image, int64 [N], -1 for none."""
+    node, scene = blocks.node_indices(), blocks.node_scene().clamp_min(0)
+    distance, near = torch.zeros_like(node), torch.zeros_like(node, dtype=torch.bool)
+    mirrored = []
+    for number, face in enumerate(faces):
+        if face.kind != "mirror":
+            continue
+        axis = number // 2
+        cells = _half_cells(blocks, node, axis, face.plane)
+        has = blocks.active_nodes() & (cells.abs() <= 2 * MIRROR_REACH)
+        distance[:, axis] = torch.where(has, cells, distance[:, axis])
+        near[:, axis] |= has
+        mirrored += [axis] if axis not in mirrored else []
+    for count in range(1, len(mirrored) + 1):
+        for axes in itertools.combinations(mirrored, count):
+            reflected = node.clone()
+            reflected[:, axes] -= distance[:, axes]
+            row = blocks.rows_at(reflected, scene)
+            yield axes, torch.where(near[:, axes].all(1), row, -1)
 
 
 def _half_cells(blocks: Topology, node: Tensor, axis: int, plane: float) -> Tensor:

@@ -104,6 +104,7 @@ def implicit_cg(
     max_iterations: int,
     stress_form: str = "mls",
     local: Tensor | None = None,
+    images: Tensor | None = None,
 ) -> ImplicitSolve:
     """Solves H d = rhs by conjugate gradients, preconditioned by node blocks; scenes apart, each with its own scalars.
 
@@ -122,6 +123,9 @@ def implicit_cg(
         max_iterations: of each scene.
         stress_form: "mls" or "gradient".
         local: what each node adds to its own part of H [N, D, D] [kg], symmetric; None for nothing.
+        images: rows of nodes that mirrors make one, int32 [G, 2^D]: entry k of a group is the node that the axes of the
+            bits of k reflect, -1 for none. A node is in one group at most. H is then the Hessian of symmetric
+            velocities, and rhs and `inverse` must be symmetric, too. None without mirrors.
 
     Raises:
         ValueError, TypeError: for wrong shapes, dtypes or devices.
@@ -136,10 +140,16 @@ def implicit_cg(
     check_like("relative", relative, x, (B,), "[B]")
     check_like("local", local, x, (N, D, D), "[N, D, D]")
     check_count("max_iterations", max_iterations)
+    if images is not None:
+        if not isinstance(images, Tensor) or images.dim() != 2 or images.shape[1] != 2**D:
+            raise ValueError(f"images must have shape [G, 2^D] = [G, {2**D}], got {shape_of(images)}")
+        if images.dtype != torch.int32:
+            raise TypeError(f"images must be int32, got {images.dtype}")
+        images = images.contiguous()
     solution, scalars = dispatch(
         torch.ops.torch_mpm.implicit_cg,
         *(x, rhs.contiguous(), mass.contiguous(), to_upper(inverse)),
-        *(None if local is None else to_upper(local), tangent, relative.contiguous()),
+        *(None if local is None else to_upper(local), images, tangent, relative.contiguous()),
         *(max_iterations, STRESS_FORMS[stress_form], *blocks.packed),
     )
     integers = scalars.view(torch.int32)
@@ -200,7 +210,7 @@ def _node_blocks_fake(x, tangent, stress_form, *topology):
 
 
 @torch.library.register_fake("torch_mpm::implicit_cg")
-def _cg_fake(x, rhs, mass, inverse, local, tangent, relative, max_iterations, stress_form, *topology):
+def _cg_fake(x, rhs, mass, inverse, local, images, tangent, relative, max_iterations, stress_form, *topology):
     blocks = Topology.unpack(*topology)
     solution = x.new_empty(blocks.node_count, sizes(x, "x", 2)[1])
     return solution, x.new_empty(blocks.scenes, 5, dtype=torch.float64)

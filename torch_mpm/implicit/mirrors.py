@@ -1,0 +1,82 @@
+"""Mirrors in the solve: velocities that are symmetric about the planes of mirrors.
+
+What a mirror stands for is the body together with its image. The velocities of a node and of its images are one, each
+reflected on its side, and the energy of an implicit step is a function of symmetric velocities alone. Gradients,
+products of the Hessian and node blocks are those of all nodes, projected on what is symmetric.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import torch
+from torch import Tensor
+
+from ..boundaries import Walls
+from ..grid import Blocks
+from ..ops.grid_update_composed import images
+
+
+@dataclasses.dataclass
+class Mirrors:
+    """Nodes that are images of one another.
+
+    Attributes:
+        groups: int32 [G, 2^D]: entry k is the row of the node that the axes of the bits of k reflect, -1 for none. A
+            node on the plane of a mirror is its own image.
+    """
+
+    groups: Tensor
+
+    def symmetric(self, values: Tensor) -> Tensor:
+        """Vectors [N, D] or matrices [N, D, D] of nodes, projected on what is symmetric; differentiable."""
+        present = self.groups >= 0
+        rows = torch.where(present, self.groups, self.groups[:, :1]).long()
+        own = (rows[:, :, None] == rows[:, None, :]).logical_and_(present[:, None, :]).sum(-1)
+        sign = self._signs(values.shape[1]).to(values)
+        if values.dim() == 3:
+            sign = sign[:, :, None] * sign[:, None, :]
+        share = present.to(values.dtype).reshape(*present.shape, *[1] * (values.dim() - 1))
+        mean = (share * sign * values[rows]).sum(1, keepdim=True) / share.sum(1, keepdim=True)
+        parts = share * sign * mean / own.reshape(share.shape)
+        rest = values.index_fill(0, rows.flatten(), 0)
+        return rest.index_add(0, rows.flatten(), parts.flatten(0, 1))
+
+    def has(self, nodes: int) -> Tensor:
+        """Which of so many nodes have an image, bool [N]."""
+        result = torch.zeros(nodes, dtype=torch.bool, device=self.groups.device)
+        return result.index_fill_(0, self.groups.flatten().clamp_min(0).long(), True) if len(self.groups) else result
+
+    def _signs(self, dim: int) -> Tensor:
+        k = torch.arange(1 << dim, device=self.groups.device)
+        return 1 - 2 * ((k[:, None] >> torch.arange(dim, device=k.device)) & 1)
+
+
+def mirrors_of(blocks: Blocks, walls: Walls | None, mass: Tensor) -> Mirrors | None:
+    """The mirrors among walls, for nodes with masses [N]; None without any."""
+    if walls is None or walls.mirrors() is None:
+        return None
+    own = torch.arange(len(mass), device=mass.device)
+    groups = own.new_full((len(mass), 1 << blocks.grid.dim), -1)
+    groups[:, 0] = own
+    for axes, rows in images(walls.faces(blocks.grid), blocks):
+        groups[:, sum(1 << axis for axis in axes)] = rows
+    present = (groups >= 0) & (mass[groups.clamp_min(0)] > 0)
+    groups = torch.where(present, groups, -1)
+    first = torch.where(present, groups, len(mass)).amin(1) == own
+    return Mirrors(groups[first & present[:, 0] & (present.sum(1) > 1)].to(torch.int32))
+
+
+def reflected_inside(blocks: Blocks, walls: Walls | None, positions: Tensor) -> tuple[Tensor, Tensor]:
+    """Positions of nodes [N, D] [m], of those behind mirrors that of their images, and the signs of the axes of the
+    latter [N, D]."""
+    sign = torch.ones_like(positions)
+    if walls is not None:
+        for number, face in enumerate(walls.faces(blocks.grid)):
+            axis, above = divmod(number, 2)
+            if face.kind == "mirror":
+                behind = positions[:, axis] > face.plane if above else positions[:, axis] < face.plane
+                sign[:, axis] = torch.where(behind, -1, sign[:, axis])
+                image = torch.where(behind, 2 * face.plane - positions[:, axis], positions[:, axis])
+                positions = torch.cat([positions[:, :axis], image[:, None], positions[:, axis + 1 :]], 1)
+    return positions, sign
