@@ -1,9 +1,9 @@
 """The tables and figures of the documents, from the result files: `python -m benchmarks.report [--write]`.
 
 Prints the tables; with --write, puts them between the lines `<!-- benchmarks -->` and `<!-- /benchmarks -->` of
-docs/measured.md, which has all of them, of README.md, which has one of speed and one of accuracy, and of the pages for
-users of other projects, and draws the figures of several devices beside the results. Each program draws its other
-figures itself.
+docs/measured.md, which has all of them, of README.md, which has one of speed and one of accuracy, of docs/implicit.md,
+and of the pages for users of other projects, and draws the figures of several devices beside the results. Each program
+draws its other figures itself.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ from .stability.heat import kind as heat_kind
 from .stability.heat_step import table as heat_step_table
 
 README, MEASURED = common.ROOT / "README.md", common.ROOT / "docs" / "measured.md"
+IMPLICIT = common.ROOT / "docs" / "implicit.md"
 MIGRATING = common.ROOT / "docs" / "migrating"
 BEGIN, END = "<!-- benchmarks -->", "<!-- /benchmarks -->"
 FORWARD = ("step", "step, CUDA graph")
@@ -144,6 +145,17 @@ def migrating(directory: Path) -> dict[Path, str]:
     pages = {f"{page}.md": [peers_of_training(results, [project]), notes] for page, project in
              (("mpm_pytorch", "MPM-PyTorch"), ("nclaw", "NCLaw"), ("physgaussian", "PhysGaussian"))}  # fmt: skip
     return {MIGRATING / name: "\n\n".join(parts) for name, parts in pages.items()}
+
+
+def implicit_costs(results: list[dict[str, Any]]) -> str:
+    """What implicit steps cost on the devices where that was measured."""
+    parts = []
+    for result in results:
+        parts.append(f"{common.describe(result['environment'])}:")
+        for title, rows in result.items():
+            if title != "environment" and rows:
+                parts += [f"{title}:", common.table(list(rows[0]), [list(row.values()) for row in rows])]
+    return "\n\n".join(parts)
 
 
 def data_sets(results: list[dict[str, Any]]) -> str:
@@ -603,7 +615,8 @@ def documents(directory: Path) -> dict[Path, str]:
     """The text between the marks of each document."""
     details = "\n\n".join(f"### {title}\n\n{text}" for title, text in sections(directory).items())
     measured = details.replace("](benchmarks/", "](../benchmarks/")
-    return {README: overview(directory), MEASURED: measured, **migrating(directory)}
+    costs = implicit_costs(common.read(directory, "implicit_cost_*.json"))
+    return {README: overview(directory), MEASURED: measured, IMPLICIT: costs, **migrating(directory)}
 
 
 def insert(text: str, tables: str) -> str:

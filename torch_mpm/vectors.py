@@ -23,6 +23,14 @@ def transform(matrix: Tensor, v: Tensor) -> Tensor:
     return v @ matrix.mT if matrix.dim() == 2 else (matrix @ v[..., None])[..., 0]
 
 
+def product(A: Tensor, B: Tensor) -> Tensor:
+    """Product of small matrices [P, D, K] and [P, K, E], many of them, for which batched library calls are slow."""
+    result = A[:, :, 0, None] * B[:, 0, None, :]
+    for k in range(1, A.shape[2]):
+        result = torch.addcmul(result, A[:, :, k, None], B[:, k, None, :])
+    return result
+
+
 def determinant(F: Tensor) -> Tensor:
     """det F of [P, D, D], without the factorisation of `torch.linalg.det`."""
     if F.shape[1] == 2:

@@ -13,6 +13,7 @@ from torch import Tensor
 from ..boundaries import Obstacle, Walls
 from ..boundaries.walls import Face
 from ..grid import Blocks
+from ..vectors import product
 from .mirrors import reflected_inside
 
 ON_FACE = 1e-6
@@ -71,7 +72,7 @@ class NodeBounds:
         eye = torch.eye(blocks.shape[-1], dtype=blocks.dtype, device=blocks.device)
         w = self.mirror.to(blocks.dtype)
         turn = eye - 2 * w[:, :, None] * w[:, None, :]
-        return turn @ blocks @ turn
+        return product(product(turn, blocks), turn)
 
 
 def rounding_of(v: Tensor) -> Tensor:

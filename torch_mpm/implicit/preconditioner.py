@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import combinations, product
+
 import torch
 from torch import Tensor
 
@@ -20,36 +22,40 @@ def preconditioned(
 
 
 def inverse_blocks(bounds: NodeBounds | None, blocks: Tensor, free: Tensor) -> Tensor:
-    """B⁻¹ of the free components of node blocks [N, D, D] [1/kg], zero for the others."""
-    dtype, blocks = blocks.dtype, blocks.double()
+    """B⁻¹ of the free components of symmetric node blocks [N, D, D] [1/kg], zero for the others."""
+    dtype, dim, blocks = blocks.dtype, blocks.shape[1], blocks.double()
     # Rounding of stiff blocks may leave a negative eigenvalue, with which a residual could seem to be zero.
     ridge = 16 * torch.finfo(dtype).eps * blocks.diagonal(dim1=1, dim2=2).sum(1)
-    blocks = blocks + torch.diag_embed(ridge[:, None].expand(blocks.shape[:2]))
     if bounds is not None:
         blocks = bounds.turned_blocks(blocks)
-    both = free[:, :, None] & free[:, None, :]
-    blocks = torch.where(both, blocks, 0) + torch.diag_embed((~free).double())
-    inverse = torch.where(both, _inverse(blocks), 0)
+    diagonal = [torch.where(free[:, i], blocks[:, i, i] + ridge, 1) for i in range(dim)]
+    above = {(i, j): torch.where(free[:, i] & free[:, j], blocks[:, i, j], 0) for i, j in combinations(range(dim), 2)}
+    entries = _inverse(diagonal, above)
+    kept = [torch.where(free[:, i] & free[:, j], entries[i, j], 0) for i, j in product(range(dim), repeat=2)]
+    inverse = torch.stack(kept, 1).unflatten(1, (dim, dim))
     if bounds is not None:
         inverse = bounds.turned_blocks(inverse)
-    inverse = (inverse + inverse.mT) / 2
     return inverse.to(dtype)
 
 
-def _inverse(a: Tensor) -> Tensor:
-    """Of symmetric matrices [N, 2 or 3, 2 or 3]."""
-    scale = a.diagonal(dim1=1, dim2=2).rsqrt()
-    a = a * scale[:, :, None] * scale[:, None, :]
-    if a.shape[-1] == 2:
-        rows = [[a[:, 1, 1], -a[:, 0, 1]], [-a[:, 1, 0], a[:, 0, 0]]]
-        cofactors = torch.stack([torch.stack(row, -1) for row in rows], -2)
-        determinant = a[:, 0, 0] * a[:, 1, 1] - a[:, 0, 1] * a[:, 1, 0]
+def _inverse(diagonal: list[Tensor], above: dict[tuple[int, int], Tensor]) -> dict[tuple[int, int], Tensor]:
+    """Entries of the inverses of symmetric 2 × 2 or 3 × 3 matrices, from theirs on the diagonal and above it."""
+    dim = len(diagonal)
+    scale = [d.rsqrt() for d in diagonal]
+    unit = {(i, j): a * scale[i] * scale[j] for (i, j), a in above.items()}  # with ones on the diagonal
+    if dim == 2:
+        cofactors = {(0, 0): torch.ones_like(scale[0]), (0, 1): -unit[0, 1]}
+        cofactors[1, 1] = cofactors[0, 0]
+        determinant = 1 - unit[0, 1].square()
     else:
-        first, second, third = a.unbind(-1)
-        rows3 = [torch.linalg.cross(second, third), torch.linalg.cross(third, first), torch.linalg.cross(first, second)]
-        cofactors = torch.stack(rows3, -2)
-        determinant = (first * rows3[0]).sum(-1)
-    return cofactors / determinant[:, None, None] * scale[:, :, None] * scale[:, None, :]
+        cofactors = {}
+        for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+            a, b, c = (unit[min(pair), max(pair)] for pair in ((i, j), (j, k), (i, k)))
+            cofactors[i, i] = 1 - b.square()
+            cofactors[min(i, j), max(i, j)] = b * c - a
+        determinant = cofactors[0, 0] + unit[0, 1] * cofactors[0, 1] + unit[0, 2] * cofactors[0, 2]
+    upper = {(i, j): c * scale[i] * scale[j] / determinant for (i, j), c in cofactors.items()}
+    return {**upper, **{(j, i): value for (i, j), value in upper.items()}}
 
 
 def times(matrices: Tensor, vectors: Tensor) -> Tensor:

@@ -31,6 +31,7 @@ from ..ops.law import (
 )
 from ..ops.registry import LAWS
 from ..parameters import Overlay, PerMaterial, Value, evaluate
+from ..vectors import product
 from .flowing import flowing_skew, flowing_stress, flowing_tangent
 from .material import Material
 
@@ -118,7 +119,7 @@ class CompiledLaw(Material):
             return flowing_stress(self, state, before)
         gradient = self._energy_gradient(state)
         if self.state_fields != ("J",):
-            return gradient @ before.F.mT
+            return product(gradient, before.F.mT)
         eye = torch.eye(state.x.shape[1], dtype=gradient.dtype, device=gradient.device)
         stress = (gradient * before.J)[:, None, None] * eye
         return stress + self._viscous_stress(state, before) if self.viscous else stress
