@@ -103,7 +103,7 @@ def draw_sand(clump: Rows, collapse: Rows, path: Path) -> None:
     _draw_bodies(panels[1, :3], collapse, 2e-3, None)
     for panel, rows, measure in ((panels[0, 3], clump, "spread"), (panels[1, 3], collapse, "run-out")):
         for energy, color in COLORS.items():
-            own = [row for row in rows if row["energy"] == energy and row.get("transfer", "apic") == "apic"]
+            own = [row for row in rows if row["energy"] == energy and row.get("transfer", "flip") == "flip"]
             for number, name in enumerate(dict.fromkeys(row["return map"] for row in own)):
                 these = [row for row in own if row["return map"] == name]
                 if name == "explicit":
@@ -113,13 +113,13 @@ def draw_sand(clump: Rows, collapse: Rows, path: Path) -> None:
                     panel.semilogx(*points(these, "dt [s]", measure), style, color=color, label=f"{energy}, {name}")
         panel.set_ylim(0)
         panel.set_xlabel("dt [s]")
-        panel.set_title("share of the growth" if measure == "spread" else "run-out / half width")
-    panels[1, 3].legend(fontsize=8, loc="lower left")
+        panel.set_title("share of the growth" if measure == "spread" else "run-out / half width, FLIP")
+    panels[1, 3].legend(fontsize=7, loc="lower left")
     _saved(figure, path)
 
 
 def _draw_bodies(panels: Any, rows: Rows, dt: float, start: torch.Tensor | None) -> None:
-    rows = [row for row in rows if row.get("transfer", "apic") == "apic"]
+    rows = [row for row in rows if row.get("transfer", "flip") == "flip"]
     implicit = [row for row in rows if row["return map"] == "after the solve"]
     near = min({row["dt [s]"] for row in implicit}, key=lambda length: abs(length - dt))
     shown = [next(row for row in rows if row["return map"] == "explicit" and row["energy"] == "unilateral")]
