@@ -36,7 +36,7 @@ def of_quasistatic(quick: bool, device: str, out: Path) -> Result:
 
 
 def of_crossover(quick: bool, device: str, out: Path) -> Result:
-    rows = crossover.crossover(quick)
+    rows = crossover.crossover(device, quick)
     return {"Steps of slow motion": rows, "Costs": crossover.fitted(rows)}
 
 
@@ -67,7 +67,7 @@ STUDIES: dict[str, tuple[Any, Callable[[bool, str, Path], Result]]] = {
     "sand": (sand, of_sand),
     "cost": (cost, of_cost),
 }
-ON_DEVICE = ("cost",)
+ON_DEVICE = ("cost", "crossover")
 """Studies of speed alone, which run on CUDA; the others are of the method, on the CPU."""
 
 

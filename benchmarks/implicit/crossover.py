@@ -1,9 +1,9 @@
 """What explicit and implicit steps of slow motion cost by the size of the body, for `Step.explain`.
 
 The gripper of the quasi-static study in 2-D, and a cube in its place in 3-D, with E = 1e8 Pa and plates of 1 cm/s, in
-float32 on one thread; P particles. Implicit steps are those in which a plate moves by 5% of a cell. Least squares of
-relative errors: an explicit step takes a + b P, an implicit one A + B P; iterations of conjugate gradients grow little
-with the size. "faster": time of explicit steps for the same motion over that of implicit ones; "says": what
+float32, on CPUs on one thread; P particles. Implicit steps are those in which a plate moves by 5% of a cell. Least
+squares of relative errors: an explicit step takes a + b P, an implicit one A + B P; iterations of conjugate gradients
+grow little with the size. "faster": time of explicit steps for the same motion over that of implicit ones; "says": what
 `torch_mpm.implicit.compare` says.
 """
 
@@ -21,27 +21,35 @@ from torch_mpm.implicit.comparison import MOVED, compare
 from ..common import one_thread
 from .quasistatic import SPEED, StepOf, gripper
 
-CASES = {2: (8, 16, 32, 64, 96), 3: (6, 8, 12, 16, 24)}
+CASES = {
+    "cpu": {2: (8, 16, 32, 64, 96), 3: (6, 8, 12, 16, 24)},
+    "cuda": {2: (16, 64, 256, 1024), 3: (12, 24, 48, 96)},
+}
 E = 1e8
 
 
 def seconds_of(step: mpm.Step, state: mpm.State, n: int, dt: float) -> tuple[float, mpm.State]:
     """Of each of n steps, the less of two runs."""
+    cuda = state.x.is_cuda
+    clock = time.perf_counter if cuda else time.process_time
     times = []
     for _ in range(2):
-        start = time.process_time()
+        start = clock()
         end = mpm.rollout(step, state, n, dt)
-        times.append((time.process_time() - start) / n)
+        if cuda:
+            torch.cuda.synchronize()
+        times.append((clock() - start) / n)
     return min(times), end
 
 
 @one_thread()
-def crossover(quick: bool) -> list[dict[str, Any]]:
+def crossover(device: str, quick: bool) -> list[dict[str, Any]]:
     rows = []
-    for dim, sizes in CASES.items():
+    for dim, sizes in CASES[device].items():
         for cells in sizes[:2] if quick else sizes:
             made: tuple[mpm.State, StepOf] = gripper(E, cells, torch.float32, dim)
             state, step_of = made
+            state = state.to(device)
             explicit, implicit = step_of("explicit"), step_of("implicit")
             limit = float(explicit.stable_dt(state, cfl=0.5)[0])
             length = MOVED * explicit.grid.dx / SPEED
@@ -62,7 +70,7 @@ def crossover(quick: bool) -> list[dict[str, Any]]:
 def fitted(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """The constants, and the largest factor by which they miss a measured time."""
     found = []
-    for dim in CASES:
+    for dim in (2, 3):
         own = [row for row in rows if row["dim"] == dim]
         P = np.array([row["particles"] for row in own], dtype=float)
         explicit = np.array([row["explicit [us]"] for row in own]) * 1e-6

@@ -130,7 +130,7 @@ def collapse(quick: bool) -> list[dict[str, Any]]:
     duration = 6 * (height / GRAVITY) ** 0.5
     lengths = COLLAPSE_DT[-1:] if quick else COLLAPSE_DT
     rows = []
-    for transfer in ("apic", "flip"):
+    for transfer in ("flip",) if quick else ("apic", "flip"):
         about = {"gravity": (0.0, -GRAVITY), "walls": walls, "transfer": transfer}
         rows += [
             {"transfer": transfer, **row}

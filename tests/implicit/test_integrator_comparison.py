@@ -20,13 +20,25 @@ def block(dim=2, E=1e8):
 
 def test_costs_are_those_that_were_measured():
     """Within a factor of two, of steps of every size in the committed results."""
-    (file,) = common.RESULTS.glob("implicit_crossover_*.json")
-    rows = json.loads(file.read_text())["Steps of slow motion"]
+    rows = json.loads((common.RESULTS / "implicit_crossover_amd_epyc.json").read_text())["Steps of slow motion"]
     assert len(rows) == 10
     for row in rows:
         dim, P = row["dim"], row["particles"]
-        assert 0.5 < EXPLICIT[dim].of(P) / (1e-6 * row["explicit [us]"]) < 2
-        assert 0.5 < IMPLICIT[dim].of(P) / (1e-3 * row["implicit [ms]"]) < 2
+        assert 0.5 < EXPLICIT["cpu"][dim].of(P) / (1e-6 * row["explicit [us]"]) < 2
+        assert 0.5 < IMPLICIT["cpu"][dim].of(P) / (1e-3 * row["implicit [ms]"]) < 2
+
+
+def test_costs_on_a_gpu_are_those_that_were_measured():
+    """Within a factor of two, of the committed steps in 3-D."""
+    steps = json.loads((common.RESULTS / "implicit_cost_nvidia_h200.json").read_text())["Steps"]
+    assert steps
+    for row in steps:
+        assert 0.5 < IMPLICIT["cuda"][3].of(row["particles"]) / row["step [s]"] < 2
+    rollouts = json.loads((common.RESULTS / "rollouts_nvidia_h200.json").read_text())["rollouts"]
+    explicit = [row for row in rollouts if row["name"] == "one scene"]
+    assert len(explicit) == 6
+    for row in explicit:
+        assert 0.5 < EXPLICIT["cuda"][3].of(row["particles"]) / (1e-6 * row["us"]) < 2
 
 
 def test_stiff_and_slow_is_for_implicit_steps(dim):

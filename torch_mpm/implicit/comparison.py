@@ -29,10 +29,19 @@ class Cost(NamedTuple):
         return self.fixed + self.per_particle * particles
 
 
-EXPLICIT = {2: Cost(5e-6, 48e-9), 3: Cost(5e-6, 88e-9)}
-IMPLICIT = {2: Cost(9e-3, 5e-6), 3: Cost(20e-3, 9e-6)}
-"""By dimension, on one thread of a CPU, explicit steps in one op (benchmarks/results/implicit_crossover_*.md). An
-implicit step costs about as much as a hundred explicit ones of as many particles; small ones, more."""
+Costs = dict[str, dict[int, Cost]]
+EXPLICIT: Costs = {
+    "cpu": {2: Cost(5e-6, 48e-9), 3: Cost(5e-6, 88e-9)},
+    "cuda": {2: Cost(15e-6, 0.14e-9), 3: Cost(15e-6, 0.14e-9)},
+}
+IMPLICIT: Costs = {
+    "cpu": {2: Cost(9e-3, 5e-6), 3: Cost(20e-3, 9e-6)},
+    "cuda": {2: Cost(25e-3, 40e-9), 3: Cost(25e-3, 40e-9)},
+}
+"""By kind of device and dimension, explicit steps in one op. CPU: one thread (implicit_crossover_*.md of the results);
+an implicit step costs as much as a hundred explicit ones of as many particles; small ones, more. CUDA: an H200, in 3-D
+(rollouts_nvidia_h200.md, implicit_cost_nvidia_h200.md); an implicit step costs 300 explicit ones of millions of
+particles, and a thousand of few, for which the host is what takes the time."""
 
 
 class Comparison(NamedTuple):
@@ -55,7 +64,7 @@ class Comparison(NamedTuple):
 def compare(step: Step, state: State, speed: float) -> Comparison:
     """The integrators for motion whose elastic waves do not matter; where they do, explicit steps are faster.
 
-    Waits for the device. Costs were measured on a CPU; on CUDA they are much lower, in about the same ratio.
+    Waits for the device. Costs are those of the kind of device that has the state.
 
     Args:
         step: with either integrator; its grid, law and boundaries count.
@@ -76,5 +85,6 @@ def compare(step: Step, state: State, speed: float) -> Comparison:
     limit, length = float(limits.min()), MOVED * step.grid.dx / speed
     if not 0 < limit < math.inf:
         raise ValueError(f"state must have a stable time step, positive and finite, got {limit}")
-    explicit, implicit = EXPLICIT[step.grid.dim].of(len(state)), IMPLICIT[step.grid.dim].of(len(state))
+    kind = "cuda" if state.x.is_cuda else "cpu"
+    explicit, implicit = (costs[kind][step.grid.dim].of(len(state)) for costs in (EXPLICIT, IMPLICIT))
     return Comparison(limit, length, explicit / limit * length / implicit)
