@@ -11,6 +11,7 @@
 
 #if MPM_BACKEND == MPM_BACKEND_IS_cpu
 #include "cpu/isa.h"
+#include "cpu/parallel.h"
 #define MPM_DISPATCH_KEY CPU
 namespace mpm {
 namespace cpu {
@@ -20,10 +21,15 @@ struct Stream {
 inline void clear(Tensor& t, Stream) { mpm::clear(t); }
 }  // namespace cpu
 namespace backend = cpu;
-// Nothing to guard on the CPU; gives the kernels' stream argument.
-struct DeviceScope {
-  explicit DeviceScope(const Tensor&) {}
+// Keeps other threads away from what is short, by the rows of a tensor; gives the kernels' stream argument.
+class DeviceScope {
+ public:
+  explicit DeviceScope(const Tensor& t) : alone_(t.dim() > 0 && t.size(0) < kFew) {}
   cpu::Stream stream() const { return {}; }
+
+ private:
+  static constexpr int64_t kFew = 2048;  // which loops take some ten microseconds for
+  cpu::Alone alone_;
 };
 }  // namespace mpm
 #else

@@ -100,11 +100,11 @@ thread_local Team* led = nullptr;  // by this thread, while it is in no loop of 
 
 }  // namespace
 
-int thread_count() { return led ? led->members() : int(torch::stable::get_num_threads()); }
+int thread_count() { return int(torch::stable::get_num_threads()); }
 
 void parallel_for(int64_t count, int64_t grain, Body body, void* context) {
   if (Team* team = led) {
-    if (count <= grain) return body(context, 0, count);
+    if (count <= grain || team->members() == 1) return body(context, 0, count);
     led = nullptr;  // loops inside of this one are not parallel
     struct Restore {
       Team* team;
@@ -117,21 +117,30 @@ void parallel_for(int64_t count, int64_t grain, Body body, void* context) {
 
 void with_team(void (*body)(void* context), void* context) {
   const int members = thread_count();
-  if (led || members == 1) return body(context);
+  if ((led && led->members() > 1) || members == 1) return body(context);
   Team team(members);
   std::exception_ptr error;
   torch::stable::parallel_for(0, members, 1, [&](int64_t member, int64_t) {
     if (member > 0) return team.serve(int(member));
-    led = &team;
+    Team* const before = std::exchange(led, &team);
     try {
       body(context);
     } catch (...) {  // which C functions on the way must not see
       error = std::current_exception();
     }
-    led = nullptr;
+    led = before;
     team.end();
   });
   if (error) std::rethrow_exception(error);
+}
+
+Alone::Alone(bool wanted) : begins_(wanted && !led) {
+  static thread_local Team single(1);
+  if (begins_) led = &single;
+}
+
+Alone::~Alone() {
+  if (begins_) led = nullptr;
 }
 
 void rest() { std::this_thread::sleep_for(std::chrono::microseconds(20)); }

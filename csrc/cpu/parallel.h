@@ -19,6 +19,18 @@ void parallel_for(int64_t count, int64_t grain, void (*body)(void* context, int6
 // threads do not wait for each other longer than they must where other processes want the cores too.
 void with_team(void (*body)(void* context), void* context);
 
+// While it lives, this thread is alone in all of its loops, if wanted: what is short waits for nobody.
+class Alone {
+ public:
+  explicit Alone(bool wanted);
+  ~Alone();
+  Alone(const Alone&) = delete;
+  Alone& operator=(const Alone&) = delete;
+
+ private:
+  const bool begins_;
+};
+
 // Sleeps some ten microseconds: a wait that lasts leaves its core to whoever is waited for.
 void rest();
 

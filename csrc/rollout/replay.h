@@ -14,10 +14,11 @@ namespace mpm {
 
 #if MPM_BACKEND == MPM_BACKEND_IS_cpu
 
-// Runs `work()`, of many parallel loops over `particles`, with one team of threads.
+// Runs `work()`, of many parallel loops over `particles`, with one team of threads, or with none.
 template <class Work>
 void with_team(int64_t particles, const Work& work) {
-  constexpr int64_t few = 1 << 14;  // of which a thread is faster alone than it calls the others
+  constexpr int64_t few = 1 << 13;  // of which a thread is faster alone than it calls the others
+  const cpu::Alone alone(particles < few);
   if (particles < few) return work();
   cpu::with_team([](void* w) { (*static_cast<const Work*>(w))(); }, const_cast<Work*>(&work));
 }

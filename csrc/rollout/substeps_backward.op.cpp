@@ -1,4 +1,5 @@
 #include "rollout/recorded.h"
+#include "rollout/replay.h"
 
 // The adjoint of n steps in one call. The steps are taken once more, and what each of them reads is recorded, or it has
 // been when they were taken first; then the adjoint kernels go through them from the last to the first. Where sums have
@@ -292,7 +293,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tenso
     set(adjoints.history, grad_history, "grad_history", x);
     for (Tensor* sum : {&adjoints.mass, &adjoints.volume, &adjoints.parameters}) set(*sum, {}, "", x);
     if ((needs & kGravity) && has(gravity)) gravity_sum = zeros(x, {backward.blocks(), D});
-    if (P > 0) backward.run(adjoints, gravity_sum);
+    if (P > 0) with_team(P * n, [&] { backward.run(adjoints, gravity_sum); });
   });
   if (!has(C)) adjoints.C = Tensor();
   return {adjoints.x,       adjoints.v,    adjoints.C,      adjoints.F,          adjoints.J,
