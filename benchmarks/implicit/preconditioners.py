@@ -196,9 +196,9 @@ def added(levels: list[Level], r: Array) -> Array:
     return levels[0].smoother(r) + P @ added(levels[1:], P.T @ r)
 
 
-def patches(s: System) -> tuple[Linear, float]:
-    """Inverses on the nodes of cells with a light node, weighted by one over the root of their number on each side, and
-    the numbers that are read."""
+def patches(s: System, matrix: Array, outside: Array) -> tuple[Linear, int]:
+    """Inverses of a matrix on the nodes of cells with a light node, weighted by one over the root of their number on
+    each side, and `outside` for the other unknowns; and the number of cells."""
     dim = s.lattice.shape[1]
     lattice = s.lattice + 1
     number = np.full(lattice.max(0) + 3, -1)
@@ -213,7 +213,7 @@ def patches(s: System) -> tuple[Linear, float]:
     rows = np.where(inside, members, 0)
     count = np.bincount(members[inside], minlength=len(s.b))
     size = rows.shape[1]
-    A = np.asarray(s.A[np.repeat(rows, size, 1).ravel(), np.tile(rows, (1, size)).ravel()]).reshape(-1, size, size)
+    A = np.asarray(matrix[np.repeat(rows, size, 1).ravel(), np.tile(rows, (1, size)).ravel()]).reshape(-1, size, size)
     A = np.where(inside[:, :, None] & inside[:, None, :], A, 0)
     A[:, range(size), range(size)] += np.where(inside, 1e-12 * A.diagonal(axis1=1, axis2=2), 1)
     weight = np.where(inside, 1 / np.sqrt(np.maximum(count, 1))[rows], 0)
@@ -221,20 +221,56 @@ def patches(s: System) -> tuple[Linear, float]:
 
     def apply(r: Array) -> Array:
         z = np.bincount(rows.ravel(), np.einsum("pij,pj->pi", inverse, r[rows]).ravel(), minlength=len(r))
-        return np.where(count > 0, z, s.inverse @ r)
+        return np.where(count > 0, z, outside @ r)
 
-    return apply, len(cells) * size * (size + 1) / 2
+    return apply, len(cells)
+
+
+def correlation(s: System) -> Array:
+    """The mean of the components of A between two nodes, for each of them, with a diagonal of one [n, n]."""
+    entries = s.A.tocoo()
+    same = s.component[entries.row] == s.component[entries.col]
+    rows, columns = entries.row[same], entries.col[same]
+    size = (len(s.lattice),) * 2
+    places = s.node[rows], s.node[columns]
+    mean = sparse.csr_matrix((entries.data[same], places), size)
+    mean.data /= sparse.csr_matrix((np.ones(len(rows)), places), size).data
+    scale = 1 / np.sqrt(np.maximum(mean.diagonal(), 1e-300))
+    values = np.asarray(mean[places]).ravel() * scale[places[0]] * scale[places[1]]
+    return sparse.csr_matrix((values, (rows, columns)), s.A.shape)
+
+
+def root(s: System) -> Array:
+    """B^(-1/2) [n, n]."""
+    nodes, dim = s.lattice.shape
+    entries = s.inverse.tocoo()
+    full = np.zeros((nodes, dim, dim))
+    full[s.node[entries.row], s.component[entries.row], s.component[entries.col]] = entries.data
+    values, vectors = np.linalg.eigh(full)
+    roots = vectors * np.sqrt(np.maximum(values, 0))[:, None, :] @ vectors.swapaxes(1, 2)
+    place = s.node * dim + s.component
+    return sparse.bsr_matrix((roots, np.arange(nodes), np.arange(nodes + 1))).tocsr()[place][:, place]
+
+
+def smoother_of(s: System, name: str) -> tuple[Linear, float, float]:
+    """Node blocks or patches, the numbers of the patches, and their set-up."""
+    dim, matrix = s.lattice.shape[1], ASSEMBLY[s.lattice.shape[1]]
+    if "scalar" in name:
+        half = root(s)
+        apply, cells = patches(s, correlation(s), sparse.eye(len(s.b)))
+        return lambda r: half @ apply(half @ r), cells * 2**dim * (2**dim + 1) / 2, matrix / 2 / dim
+    if "patches" in name:
+        apply, cells = patches(s, s.A, s.inverse)
+        return apply, cells * dim * 2**dim * (dim * 2**dim + 1) / 2, matrix / 2
+    return s.inverse.dot, 0.0, 0.0
 
 
 def preconditioner(s: System, name: str) -> Preconditioner:
     dim = s.lattice.shape[1]
     matrix = ASSEMBLY[dim]
-    smoother, numbers, setup = s.inverse.dot, 0.0, 0.0
-    if "patches" in name:
-        smoother, numbers = patches(s)
-        setup = matrix / 2
+    smoother, numbers, setup = smoother_of(s, name)
     extra = numbers / s.product
-    if name in ("blocks", "patches"):
+    if not name.startswith(("V", "additive")):
         return Preconditioner(smoother, VECTORS + extra, setup)
     levels = levels_of(s, smoother)
     vectors = sum(4 * level.nodes * dim for level in levels) + levels[-1].A.shape[0] ** 2
