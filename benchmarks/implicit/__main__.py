@@ -1,6 +1,6 @@
 """Implicit steps: where they converge, what they cost, and how wrong they are.
 
-    python -m benchmarks.implicit               # all studies, some ten minutes on 2 cores
+    python -m benchmarks.implicit               # all studies, some half an hour on 2 cores
     python -m benchmarks.implicit --only cost   # one of them
     python -m benchmarks.implicit --quick       # seconds
 
@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from .. import common
-from . import cost, crossover, figures, order, quasistatic, sand, stability, vibration
+from . import cost, crossover, figures, multigrid, order, quasistatic, sand, stability, vibration
 
 Result = dict[str, Any]
 
@@ -58,6 +58,10 @@ def of_cost(quick: bool, device: str, out: Path) -> Result:
             "Steps": cost.steps(device, quick), "Batches": cost.batches(device, quick)}  # fmt: skip
 
 
+def of_multigrid(quick: bool, device: str, out: Path) -> Result:
+    return {"Linear solves": multigrid.linear_solves(quick), "Steps": multigrid.steps(quick)}
+
+
 STUDIES: dict[str, tuple[Any, Callable[[bool, str, Path], Result]]] = {
     "stability": (stability, of_stability),
     "vibration": (vibration, of_vibration),
@@ -66,6 +70,7 @@ STUDIES: dict[str, tuple[Any, Callable[[bool, str, Path], Result]]] = {
     "order": (order, of_order),
     "sand": (sand, of_sand),
     "cost": (cost, of_cost),
+    "multigrid": (multigrid, of_multigrid),
 }
 ON_DEVICE = ("cost", "crossover")
 """Studies of speed alone, which run on CUDA; the others are of the method, on the CPU."""
