@@ -262,8 +262,9 @@ def test_what_is_packed_beside_the_simulation_is_the_same(device):
             standing = [bool(o.words["obstacle"]) for o in drawn.outcomes]
             assert len(set(standing)) == 2
             for outcome, stands in zip(drawn.outcomes, standing, strict=True):
-                assert set(outcome.packings) == (set() if stands or packers is None else {"position"})
-            prepared.append([prepare_scene(with_obstacles(made, o), o.packings) for o in drawn.outcomes])
+                assert set(outcome.packed) == (set() if stands or packers is None else {"position"})
+                assert ("position" in outcome.arrays) != ("position" in outcome.packed)
+            prepared.append([prepare_scene(with_obstacles(made, o), o.packed, o.motion) for o in drawn.outcomes])
     for alone, beside in zip(*prepared, strict=True):
         assert alone.hash == beside.hash and alone.motion == beside.motion
         assert alone.arrays["position"] == beside.arrays["position"]

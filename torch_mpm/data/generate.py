@@ -186,13 +186,13 @@ class _Line:
         writer = ShardWriter({"shard": shard, "device": _device_name(self.device), **versions()})
         for outcome, scene in zip(outcomes, self._packers.map(self._prepared, outcomes), strict=True):
             writer.add(outcome.id, scene, self._attributes(outcome))
-            outcome.arrays, outcome.packings = {}, {}
+            outcome.arrays, outcome.packed = {}, {}
         with output_errors(self.claim.folder):
             writer.finish(shard_path(self.claim.folder, shard))
         self.claim.release(shard)
 
     def _prepared(self, outcome: Outcome) -> PreparedScene:
-        return prepare_scene(with_obstacles(self.configuration, outcome), outcome.packings)
+        return prepare_scene(with_obstacles(self.configuration, outcome), outcome.packed, outcome.motion)
 
     def _attributes(self, outcome: Outcome) -> dict[str, str | int | float]:
         words = {} if outcome.words is None else self.configuration.scene_words(outcome.words)

@@ -20,9 +20,10 @@ from ..scene.build import Built
 from . import batch, obstacle_particles
 from .configuration import Configuration
 from .distribution import Words, is_number
-from .packing import Packing
+from .packing import Compressed
 from .recording import Array, Recorded
 from .sampling import NoRoom, content
+from .statistics import Motion
 
 Told = Callable[[int, int], None]
 """What is called with the number of scenes that are simulated and the number of the frame that has been queued."""
@@ -39,7 +40,8 @@ class Outcome:
         attempts: how often it was simulated.
         dt, substeps: time step [s] and number of them per frame of the last attempt.
         arrays: of a scene that is good, as a shard has them, but for particles of obstacles (`with_obstacles`).
-        packings: of those arrays that were packed while they came.
+        packed: those of its arrays that were packed while they came.
+        motion: sums of its motion.
         materials: words of its materials, in the order of their numbers.
     """
 
@@ -50,7 +52,8 @@ class Outcome:
     dt: float = 0.0
     substeps: int = 0
     arrays: dict[str, Array] = field(default_factory=dict)
-    packings: dict[str, Packing] = field(default_factory=dict)
+    packed: dict[str, Compressed] = field(default_factory=dict)
+    motion: Motion | None = None
     materials: list[dict[str, Any]] = field(default_factory=list)
 
 
@@ -206,7 +209,7 @@ def _complete(
         {"name": m.name, "particle_type": code, **m.words.model_dump(mode="json", exclude_none=True)}
         for m, code in zip(materials, types, strict=True)
     ]
-    outcome.packings = recorded.packings
+    outcome.packed, outcome.motion = recorded.packed, recorded.motion
     outcome.arrays = {
         **recorded.arrays,
         "particle_type": np.array(types, np.int8)[number],
