@@ -58,10 +58,11 @@ def scene_attributes(scene_id: int, valid: bool = True) -> dict[str, str | int |
 
 def write_shard(folder: Path, index: int, dim: int = 2, frames: int = FRAMES) -> None:
     ids = range(index * PER_SHARD, min((index + 1) * PER_SHARD, 10))
-    writer = ShardWriter({"shard": index})
-    for k in ids:
-        writer.add(k, prepare_scene(arrays(k, dim, frames) if k != FAILED else {}), scene_attributes(k, k != FAILED))
-    writer.finish(shard_path(folder, index))
+    with ShardWriter(shard_path(folder, index), {"shard": index}) as writer:
+        for k in ids:
+            scene = prepare_scene(arrays(k, dim, frames) if k != FAILED else {})
+            writer.add(k, scene, scene_attributes(k, k != FAILED))
+        writer.finish()
 
 
 def make_dataset(folder: Path, dim: int = 2, shards: int = 3, **changes: object) -> Path:

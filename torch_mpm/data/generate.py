@@ -26,7 +26,7 @@ from .configuration import Configuration
 from .folder import DatasetRecord
 from .packing import PreparedScene, prepare_scene
 from .sampling import NoRoom, content
-from .shard import ShardWriter, shard_path
+from .shard import Attributes, ShardWriter, shard_path
 from .shard_simulation import Drawn, Outcome, draw, simulate, with_obstacles
 from .workers import take_device, worker
 
@@ -183,12 +183,13 @@ class _Line:
 
     def _write(self, shard: int, outcomes: list[Outcome]) -> None:
         """Compress the scenes of a shard and write it, beside what the device is doing."""
-        writer = ShardWriter({"shard": shard, "device": _device_name(self.device), **versions()})
-        for outcome, scene in zip(outcomes, self._packers.map(self._prepared, outcomes), strict=True):
-            writer.add(outcome.id, scene, self._attributes(outcome))
-            outcome.arrays, outcome.packed = {}, {}
-        with output_errors(self.claim.folder):
-            writer.finish(shard_path(self.claim.folder, shard))
+        path = shard_path(self.claim.folder, shard)
+        whole: Attributes = {"shard": shard, "device": _device_name(self.device), **versions()}
+        with output_errors(self.claim.folder), ShardWriter(path, whole) as writer:
+            for outcome, scene in zip(outcomes, self._packers.map(self._prepared, outcomes), strict=True):
+                writer.add(outcome.id, scene, self._attributes(outcome))
+                outcome.arrays, outcome.packed = {}, {}
+            writer.finish()
         self.claim.release(shard)
 
     def _prepared(self, outcome: Outcome) -> PreparedScene:
