@@ -6,7 +6,8 @@ import numpy as np
 
 from torch_mpm.data.folder import DatasetRecord
 from torch_mpm.data.packing import prepare_scene
-from torch_mpm.data.shard import ShardWriter, shard_path
+from torch_mpm.data.shard import shard_path
+from torch_mpm.data.shard_writer import ShardWriter
 
 SPLITS = {"train": (0, 5), "valid": (5, 2), "test": (7, 3)}
 FRAMES, PER_SHARD, FAILED = 12, 4, 3

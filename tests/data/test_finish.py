@@ -14,7 +14,8 @@ from generated import configuration, decoded
 from torch_mpm.data.finish import finalize, verify
 from torch_mpm.data.generate import generate
 from torch_mpm.data.packing import prepare_scene
-from torch_mpm.data.shard import ShardWriter, record_path, shard_path
+from torch_mpm.data.shard import record_path, shard_path
+from torch_mpm.data.shard_writer import ShardWriter
 from torch_mpm.errors import DamagedFileError
 
 OBSTACLES = [

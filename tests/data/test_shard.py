@@ -15,16 +15,16 @@ h5py = pytest.importorskip("h5py")
 
 from small_dataset import write_shard  # noqa: E402
 
-from torch_mpm.data import shard  # noqa: E402
+from torch_mpm.data import whole_files  # noqa: E402
 from torch_mpm.data.packing import content_hash, prepare_scene  # noqa: E402
 from torch_mpm.data.shard import (  # noqa: E402
     Shard,
     ShardRecord,
-    ShardWriter,
     record_path,
     scene_name,
     shard_path,
 )
+from torch_mpm.data.shard_writer import ShardWriter  # noqa: E402
 from torch_mpm.data.statistics import motion_sums  # noqa: E402
 from torch_mpm.errors import DamagedFileError  # noqa: E402
 
@@ -211,11 +211,11 @@ def test_a_writer_that_is_left_leaves_nothing(path):
 
 @pytest.mark.parametrize("size", [0, 1, 4096, 4097, 20_000])
 def test_a_file_is_hashed_in_parts(tmp_path, monkeypatch, size):
-    monkeypatch.setattr(shard, "PART_BYTES", 4096)
+    monkeypatch.setattr(whole_files, "PART_BYTES", 4096)
     data = np.random.default_rng(0).bytes(size)
     (tmp_path / "file").write_bytes(data)
     parts = [hashlib.sha256(data[k : k + 4096]).digest() for k in range(0, size, 4096)]
-    assert shard.file_hash(tmp_path / "file") == hashlib.sha256(b"".join(parts)).hexdigest()
+    assert whole_files.file_hash(tmp_path / "file") == hashlib.sha256(b"".join(parts)).hexdigest()
 
 
 def test_a_shard_without_a_record_is_not_finished(written):
@@ -295,7 +295,7 @@ def test_foreign_content_is_refused(path, tmp_path, attack):
         record = writer.finish()
     with h5py.File(path, "r+") as file:
         attack(file, tmp_path)
-    words = {"bytes": path.stat().st_size, "sha256": shard.file_hash(path), "scenes": record.scenes}
+    words = {"bytes": path.stat().st_size, "sha256": whole_files.file_hash(path), "scenes": record.scenes}
     ShardRecord(**words).write(record_path(path))
     with Shard(path, check=True) as read, pytest.raises(DamagedFileError, match=scene_name(0)):
         read.scene(0)

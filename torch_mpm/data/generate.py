@@ -26,8 +26,9 @@ from .configuration import Configuration
 from .folder import DatasetRecord
 from .packing import PreparedScene, prepare_scene
 from .sampling import NoRoom, content
-from .shard import Attributes, ShardWriter, shard_path
+from .shard import shard_path
 from .shard_simulation import Drawn, Outcome, draw, simulate, with_obstacles
+from .shard_writer import Attributes, ShardWriter
 from .workers import take_device, worker
 
 MOST_PACKERS = 6

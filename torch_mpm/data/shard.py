@@ -10,11 +10,8 @@ dimension, such as ``particle_type`` [N], are stored as they are. A scene that f
 
 from __future__ import annotations
 
-import hashlib
 import json
-import os
-from collections.abc import Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import TracebackType
@@ -24,17 +21,13 @@ import numpy as np
 import numpy.typing as npt
 
 from ..errors import DamagedFileError
-from .hdf5 import QuietFile, h5py_module, storage_problem
-from .packing import GZIP_LEVEL, Compressed, PreparedScene
+from .hdf5 import h5py_module, storage_problem
 from .statistics import Motion, Sums
+from .whole_files import file_hash, write_whole
 
 Array = npt.NDArray[Any]
-Attributes = Mapping[str, str | int | float]
 
 FORMAT = 2
-PART_BYTES = 2**25
-"""Of a file that is hashed in parts."""
-MOST_HASHERS = 4
 REMEDY = "remove it and its .json, and generate again"
 
 
@@ -120,147 +113,6 @@ def _motion(words: dict[str, Any] | None) -> Motion | None:
         return None
     sums = {n: Sums(int(s["count"]), tuple(s["sum"]), tuple(s["squares"])) for n, s in words.items()}
     return Motion(**sums)
-
-
-# ---- writing
-
-
-class ShardWriter:
-    """A shard that is being written, to which scenes are added in any order; :meth:`finish` makes it appear.
-
-    A context manager; without `finish`, nothing is left of it.
-
-    Args:
-        path: where it is to be.
-        attributes: texts and numbers about the whole shard.
-
-    Raises:
-        ImportError: when h5py is missing (extra ``data``).
-        OSError: where no file can be made.
-    """
-
-    def __init__(self, path: Path, attributes: Attributes | None = None) -> None:
-        h5py = h5py_module()
-        self._path, self._building = path, _building(path)
-        self._disk = QuietFile(self._building)
-        self._file = h5py.File(self._disk, "w", libver="v110")
-        self._file.attrs.update({"format": FORMAT, **(attributes or {})})
-        self._scenes: list[SceneRecord] = []
-
-    def __enter__(self) -> ShardWriter:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._file.close()
-        self._disk.close()
-        self._building.unlink(missing_ok=True)
-
-    def add(self, scene_id: int, scene: PreparedScene, attributes: Attributes) -> None:
-        """Add a scene.
-
-        Args:
-            scene_id: its number in the data set.
-            scene: from :func:`torch_mpm.data.packing.prepare_scene`.
-            attributes: must have ``valid`` (0 or 1); ``attempts`` and ``failure`` also go into the record.
-
-        Raises:
-            OSError: for a full disk, among others.
-        """
-        group = self._file.create_group(scene_name(scene_id))
-        group.attrs.update({"id": scene_id, **attributes})
-        for name, values in scene.arrays.items():
-            if isinstance(values, Compressed):
-                _write_chunks(group, name, values)
-            else:
-                group.create_dataset(name, data=values)
-        if self._disk.error is not None:
-            raise self._disk.error
-        record = SceneRecord(
-            scene_id,
-            bool(attributes["valid"]),
-            scene.particles,
-            scene.hash,
-            int(attributes.get("attempts", 1)),
-            str(attributes.get("failure", "")),
-            scene.motion,
-        )
-        self._scenes.append(record)
-
-    def finish(self) -> ShardRecord:
-        """Write the rest of the shard and then its record; each appears when it is whole and on the disk.
-
-        Raises:
-            OSError: for a full disk, among others.
-        """
-        self._file.close()
-        with ThreadPoolExecutor(1) as beside:  # a disk and a hash take about as long
-            digest = beside.submit(file_hash, self._building)
-            self._disk.sync()
-        _appear(self._building, self._path)
-        scenes = sorted(self._scenes, key=lambda scene: scene.id)
-        record = ShardRecord(self._path.stat().st_size, digest.result(), scenes)
-        record.write(record_path(self._path))
-        return record
-
-
-def _write_chunks(group: Any, name: str, values: Compressed) -> None:
-    chunk = (values.chunk_frames, *values.shape[1:])
-    options = {"chunks": chunk, "shuffle": True, "compression": "gzip", "compression_opts": GZIP_LEVEL}
-    data = group.create_dataset(name, values.shape, values.dtype, **options)
-    for k, packed in enumerate(values.chunks):
-        data.id.write_direct_chunk((k * values.chunk_frames, *(0,) * (len(chunk) - 1)), packed)
-
-
-def write_whole(path: Path, data: bytes) -> None:
-    """Write a file that appears when all of it is on the disk, and stays there.
-
-    Raises:
-        OSError: when it cannot be written; nothing is left of it.
-    """
-    building = _building(path)
-    try:
-        with open(building, "wb") as handle:
-            handle.write(data)
-            handle.flush()
-            os.fsync(handle.fileno())
-        _appear(building, path)
-    except BaseException:
-        building.unlink(missing_ok=True)
-        raise
-
-
-def _building(path: Path) -> Path:
-    """What a file is called that is not whole yet."""
-    return path.with_name(f".{path.name}.{os.getpid()}.building")
-
-
-def _appear(building: Path, path: Path) -> None:
-    """Give a file that is on the disk its name, for good."""
-    building.replace(path)
-    folder = os.open(path.parent, os.O_RDONLY)
-    try:
-        os.fsync(folder)
-    finally:
-        os.close(folder)
-
-
-def file_hash(path: Path) -> str:
-    """SHA-256 of the SHA-256 of all parts of ``PART_BYTES`` of a file, which are hashed side by side."""
-
-    def part(first: int) -> bytes:
-        digest = hashlib.sha256()
-        with open(path, "rb", buffering=0) as handle:
-            handle.seek(first)
-            left = PART_BYTES
-            while left and (data := handle.read(min(left, 1 << 20))):
-                digest.update(data)
-                left -= len(data)
-        return digest.digest()
-
-    with ThreadPoolExecutor(min(len(os.sched_getaffinity(0)), MOST_HASHERS)) as pool:
-        return hashlib.sha256(b"".join(pool.map(part, range(0, path.stat().st_size, PART_BYTES)))).hexdigest()
 
 
 # ---- reading
