@@ -58,6 +58,29 @@ def test_frames_arrive_in_the_arrays_of_their_scenes(monkeypatch, device, thread
             np.testing.assert_allclose(sums.squares, (vectors**2).sum(0), rtol=1e-12)
 
 
+@pytest.mark.parametrize("slab", [7, 1000])
+def test_particles_behind_those_of_a_scene(monkeypatch, device, threads, slab):
+    monkeypatch.setattr(recording, "SLAB_BYTES", slab * ROW)
+    frames = frames_of(device)[1]
+    rng, counts = np.random.default_rng(1), [20, 0, None, 5]
+    behind = [
+        {} if n is None else {k: rng.random((FRAMES, n, *s), np.float32) for k, s in SHAPES.items()} for n in counts
+    ]
+    recorder = Recording(FRAMES, PARTICLES, SHAPES, torch.device(device), **threads, behind=behind)
+    without = Recording(FRAMES, PARTICLES, SHAPES, torch.device(device))
+    for frame in frames:
+        recorder.put(frame)
+        without.put(frame)
+    for with_others, alone, others in zip(recorder.finish(), without.finish(), behind, strict=True):
+        assert with_others.motion == alone.motion
+        for name, own in alone.arrays.items():
+            expected = np.concatenate([own, others[name]], axis=1) if others else own
+            if name in with_others.packed:
+                assert with_others.packed[name] == packed(expected)
+            else:
+                np.testing.assert_array_equal(with_others.arrays[name], expected)
+
+
 def test_what_goes_wrong_in_a_thread_is_raised_in_the_end(monkeypatch):
     monkeypatch.setattr(recording, "SLAB_BYTES", ROW)
     append, calls = Packing.append, []

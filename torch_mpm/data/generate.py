@@ -27,7 +27,7 @@ from .folder import DatasetRecord
 from .packing import PreparedScene, prepare_scene
 from .sampling import NoRoom, content
 from .shard import shard_path
-from .shard_simulation import Drawn, Outcome, draw, simulate, with_obstacles
+from .shard_simulation import Drawn, Outcome, draw, simulate
 from .shard_writer import Attributes, ShardWriter
 from .workers import take_device, worker
 
@@ -189,12 +189,13 @@ class _Line:
         with output_errors(self.claim.folder), ShardWriter(path, whole) as writer:
             for outcome, scene in zip(outcomes, self._packers.map(self._prepared, outcomes), strict=True):
                 writer.add(outcome.id, scene, self._attributes(outcome))
-                outcome.arrays, outcome.packed = {}, {}
+                outcome.arrays, outcome.packed, outcome.behind = {}, {}, {}
             writer.finish()
         self.claim.release(shard)
 
-    def _prepared(self, outcome: Outcome) -> PreparedScene:
-        return prepare_scene(with_obstacles(self.configuration, outcome), outcome.packed, outcome.motion)
+    @staticmethod
+    def _prepared(outcome: Outcome) -> PreparedScene:
+        return prepare_scene(outcome.arrays, outcome.packed, outcome.motion)
 
     def _attributes(self, outcome: Outcome) -> dict[str, str | int | float]:
         words = {} if outcome.words is None else self.configuration.scene_words(outcome.words)

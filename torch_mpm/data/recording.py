@@ -59,6 +59,7 @@ class Recording:
         device: of the values.
         executor: whose threads take slabs apart, scene by scene; without one it is done in one thread.
         packed: of each scene whether it is packed on the way, from where it is; by default none is.
+        behind: of each scene the fields [T, n, ...] of particles that follow its own and are in no sums.
     """
 
     def __init__(
@@ -69,10 +70,13 @@ class Recording:
         device: torch.device,
         executor: Executor | None = None,
         packed: Sequence[bool] | None = None,
+        behind: Sequence[Mapping[str, Array]] | None = None,
     ) -> None:
         self._arrays: list[dict[str, Array]] = []
         self._packings: list[dict[str, Packing]] = []
-        for count, wanted in zip(particles, packed or [False] * len(particles), strict=True):
+        self._behind = behind or [{}] * len(particles)
+        for own, wanted, others in zip(particles, packed or [False] * len(particles), self._behind, strict=True):
+            count = own + (others["position"].shape[1] if others else 0)
             whole: dict[str, tuple[int, ...]] = {name: (frames, count, *shape) for name, shape in shapes.items()}
             begun = {name: Packing(shape, np.float32) for name, shape in whole.items() if wanted and 0 not in shape}
             self._packings.append(begun)
@@ -182,6 +186,8 @@ class Recording:
             for k in scenes:
                 for name, rows in values.items():
                     own = rows[:, self._ends[k] : self._ends[k + 1]]
+                    if self._behind[k]:
+                        own = np.concatenate([own, self._behind[k][name][first : first + len(rows)]], axis=1)
                     if name in self._packings[k]:
                         self._packings[k][name].append(own)
                     else:
