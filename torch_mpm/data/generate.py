@@ -187,15 +187,11 @@ class _Line:
         path = shard_path(self.claim.folder, shard)
         whole: Attributes = {"shard": shard, "device": _device_name(self.device), **versions()}
         with output_errors(self.claim.folder), ShardWriter(path, whole) as writer:
-            for outcome, scene in zip(outcomes, self._packers.map(self._prepared, outcomes), strict=True):
+            for outcome, scene in zip(outcomes, self._packers.map(_prepared, outcomes), strict=True):
                 writer.add(outcome.id, scene, self._attributes(outcome))
                 outcome.arrays, outcome.packed, outcome.behind = {}, {}, {}
             writer.finish()
         self.claim.release(shard)
-
-    @staticmethod
-    def _prepared(outcome: Outcome) -> PreparedScene:
-        return prepare_scene(outcome.arrays, outcome.packed, outcome.motion)
 
     def _attributes(self, outcome: Outcome) -> dict[str, str | int | float]:
         words = {} if outcome.words is None else self.configuration.scene_words(outcome.words)
@@ -213,3 +209,7 @@ class _Line:
 
 def _device_name(device: torch.device) -> str:
     return torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu"
+
+
+def _prepared(outcome: Outcome) -> PreparedScene:
+    return prepare_scene(outcome.arrays, outcome.packed, outcome.motion)
