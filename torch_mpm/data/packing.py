@@ -23,7 +23,7 @@ Array = npt.NDArray[Any]
 CHUNK_BYTES = 2**17
 """Of a chunk before compression, about: a window of some frames reads little more than itself."""
 GZIP_LEVEL = 1
-PIECE_BYTES = 2**19
+PIECE_BYTES = 2**20
 """Taken in at once, about: what stays in the cache, in few calls, each of which waits for Python's lock."""
 
 

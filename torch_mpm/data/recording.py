@@ -23,9 +23,8 @@ SLAB_BYTES = 2**27
 """Of the frames that are copied from a device at once, about."""
 LEAST_SLABS = 8
 """Where arrays are packed: the last slab comes when the simulation has ended, and should be a small part of all."""
-TASKS = 64
-"""Into which the scenes of a slab are divided for the threads of an executor: one for each scene takes the time of
-Python's lock."""
+TASKS = 24
+"""Into which the scenes of a slab are divided for the threads of an executor: few, since each takes Python's lock."""
 
 
 @dataclass(frozen=True)
