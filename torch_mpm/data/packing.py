@@ -65,12 +65,12 @@ class _Scratch(threading.local):
     def __init__(self) -> None:
         self._bytes = np.empty(0, np.uint8)
 
-    def take(self, *sizes: int) -> list[Array]:
+    def two(self, size: int) -> tuple[Array, Array]:
         """Arrays of so many bytes, whose contents are left from before."""
-        starts = np.cumsum([0, *(-(-size // 64) * 64 for size in sizes)]).tolist()
-        if len(self._bytes) < starts[-1]:
-            self._bytes = np.empty(starts[-1], np.uint8)
-        return [self._bytes[start : start + size] for start, size in zip(starts, sizes, strict=False)]
+        second = -(-size // 64) * 64
+        if len(self._bytes) < second + size:
+            self._bytes = np.empty(second + size, np.uint8)
+        return self._bytes[:size], self._bytes[second : second + size]
 
 
 _scratch = _Scratch()
@@ -118,7 +118,7 @@ class Packing:
         chunks = -(-count // every) if last else count // every
         whole = min(count, chunks * every)
         size = max(count, chunks * every) * self._row
-        fresh, planes = _scratch.take(size, size)
+        fresh, planes = _scratch.two(size)
         values = fresh.view(self.dtype).reshape(-1, *self.shape[1:])
         values[:before], values[before:count], values[count:] = self._rest, rows, 0
         self._rest, self._done = values[whole:count].copy(), self._done + whole

@@ -46,9 +46,11 @@ class ShardWriter:
     def __exit__(
         self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._file.close()
-        self._disk.close()
-        self._building.unlink(missing_ok=True)
+        try:
+            self._file.close()
+        finally:
+            self._disk.close()
+            self._building.unlink(missing_ok=True)
 
     def add(self, scene_id: int, scene: PreparedScene, attributes: Attributes) -> None:
         """Add a scene.
