@@ -6,7 +6,8 @@ import numpy as np
 
 from torch_mpm.data.folder import DatasetRecord
 from torch_mpm.data.packing import prepare_scene
-from torch_mpm.data.shard import ShardWriter, shard_path
+from torch_mpm.data.shard import shard_path
+from torch_mpm.data.shard_writer import ShardWriter
 
 SPLITS = {"train": (0, 5), "valid": (5, 2), "test": (7, 3)}
 FRAMES, PER_SHARD, FAILED = 12, 4, 3
@@ -58,10 +59,11 @@ def scene_attributes(scene_id: int, valid: bool = True) -> dict[str, str | int |
 
 def write_shard(folder: Path, index: int, dim: int = 2, frames: int = FRAMES) -> None:
     ids = range(index * PER_SHARD, min((index + 1) * PER_SHARD, 10))
-    writer = ShardWriter({"shard": index})
-    for k in ids:
-        writer.add(k, prepare_scene(arrays(k, dim, frames) if k != FAILED else {}), scene_attributes(k, k != FAILED))
-    writer.finish(shard_path(folder, index))
+    with ShardWriter(shard_path(folder, index), {"shard": index}) as writer:
+        for k in ids:
+            scene = prepare_scene(arrays(k, dim, frames) if k != FAILED else {})
+            writer.add(k, scene, scene_attributes(k, k != FAILED))
+        writer.finish()
 
 
 def make_dataset(folder: Path, dim: int = 2, shards: int = 3, **changes: object) -> Path:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import contextlib
 import csv
+import functools
 import itertools
 import math
 import zipfile
@@ -103,11 +104,16 @@ class Box(Region):
         b = check_vector("upper", upper, len(a))
         if not all(p < q for p, q in zip(a, b, strict=True)):
             raise ValueError(f"lower must be below upper on every axis, got {list(a)} and {list(b)}")
-        self.shape = shapes.Box([q - p for p, q in zip(a, b, strict=True)])
+        self._size = [q - p for p, q in zip(a, b, strict=True)]
         middle = [0.5 * (p + q) for p, q in zip(a, b, strict=True)]
         corners = torch.tensor([a, b, middle], dtype=torch.float64, device="cpu")
         self.lower, self.upper, self.position = corners.unbind()  # as given, not rounded
-        self.volume = self.shape.volume(len(a))
+        self.volume = math.prod(self._size)
+
+    @functools.cached_property
+    def shape(self) -> Shape:  # type: ignore[override]
+        """Made when it is asked for: most boxes that are tried for a scene do not come so far."""
+        return shapes.Box(self._size)
 
 
 class Sphere(Region):

@@ -10,7 +10,7 @@ import torch
 pytest.importorskip("isal")
 
 from torch_mpm.data import recording
-from torch_mpm.data.packing import Packing
+from torch_mpm.data.packing import Packing, packed
 from torch_mpm.data.recording import Recording
 
 FRAMES, PARTICLES = 45, [300, 0, 1, 700]
@@ -42,28 +42,56 @@ def test_frames_arrive_in_the_arrays_of_their_scenes(monkeypatch, device, thread
         recorder.put(frame)
     ends = np.cumsum(PARTICLES)[:-1]
     for k, scene in enumerate(recorder.finish()):
+        wanted = "packed" in threads and threads["packed"][k] and PARTICLES[k] > 0
+        assert sorted(scene.packed) == (sorted(SHAPES) if wanted else [])
+        assert sorted(scene.arrays) == ([] if wanted else sorted(SHAPES))
         for name, given in values.items():
             expected = np.split(given, ends, axis=1)[k]
-            np.testing.assert_array_equal(scene.arrays[name], expected)
-            if name in scene.packings:
-                assert scene.packings[name].values is scene.arrays[name]
-                whole = Packing(np.ascontiguousarray(expected))
-                assert scene.packings[name].digest() == whole.digest()
-                assert scene.packings[name].compressed() == whole.compressed()
-        packed = "packed" in threads and threads["packed"][k] and PARTICLES[k] > 0
-        assert sorted(scene.packings) == (sorted(SHAPES) if packed else [])
+            if wanted:
+                assert scene.packed[name] == packed(np.ascontiguousarray(expected))
+            else:
+                np.testing.assert_array_equal(scene.arrays[name], expected)
+        x = np.split(values["position"], ends, axis=1)[k].astype(np.float64)
+        for sums, order in ((scene.motion.velocity, 1), (scene.motion.acceleration, 2)):
+            vectors = np.diff(x, n=order, axis=0).reshape(-1, 2)
+            assert sums.count == len(vectors)
+            np.testing.assert_allclose(sums.squares, (vectors**2).sum(0), rtol=1e-12)
+
+
+@pytest.mark.parametrize("slab", [7, 1000])
+def test_particles_behind_those_of_a_scene(monkeypatch, device, threads, slab):
+    monkeypatch.setattr(recording, "SLAB_BYTES", slab * ROW)
+    frames = frames_of(device)[1]
+    rng, counts = np.random.default_rng(1), [20, 0, None, 5]
+    behind = [
+        {} if n is None else {k: rng.random((FRAMES, n, *s), np.float32) for k, s in SHAPES.items()} for n in counts
+    ]
+    recorder = Recording(FRAMES, PARTICLES, SHAPES, torch.device(device), **threads, behind=behind)
+    without = Recording(FRAMES, PARTICLES, SHAPES, torch.device(device))
+    for frame in frames:
+        recorder.put(frame)
+        without.put(frame)
+    for with_others, alone, others in zip(recorder.finish(), without.finish(), behind, strict=True):
+        assert with_others.motion == alone.motion
+        for name, own in alone.arrays.items():
+            expected = np.concatenate([own, others[name]], axis=1) if others else own
+            if name in with_others.packed:
+                assert with_others.packed[name] == packed(expected)
+            else:
+                np.testing.assert_array_equal(with_others.arrays[name], expected)
 
 
 def test_what_goes_wrong_in_a_thread_is_raised_in_the_end(monkeypatch):
     monkeypatch.setattr(recording, "SLAB_BYTES", ROW)
-    advance = Packing.advance
+    append, calls = Packing.append, []
 
     def broken(self, rows):
-        if rows > 10:
+        calls.append(self)
+        if len(calls) > 50:
             raise MemoryError("no room")
-        advance(self, rows)
+        append(self, rows)
 
-    monkeypatch.setattr(Packing, "advance", broken)
+    monkeypatch.setattr(Packing, "append", broken)
     _, frames = frames_of("cpu")
     with ThreadPoolExecutor(2) as pool:
         recorder = Recording(FRAMES, PARTICLES, SHAPES, torch.device("cpu"), pool, [True] * 4)
@@ -92,11 +120,11 @@ def test_a_recording_that_is_abandoned_takes_nothing_more(monkeypatch, device):
     first, go_on, taken = threading.Event(), threading.Event(), []
 
     def held(self, rows):
-        taken.append(rows)
+        taken.append(len(rows))
         first.set()
         go_on.wait()
 
-    monkeypatch.setattr(Packing, "advance", held)
+    monkeypatch.setattr(Packing, "append", held)
     with ThreadPoolExecutor(1) as pool:
         recorder = Recording(FRAMES, PARTICLES, SHAPES, torch.device(device), pool, [True] * 4)
         for frame in frames[:3]:

@@ -14,7 +14,8 @@ from generated import configuration, decoded
 from torch_mpm.data.finish import finalize, verify
 from torch_mpm.data.generate import generate
 from torch_mpm.data.packing import prepare_scene
-from torch_mpm.data.shard import ShardWriter, record_path, shard_path
+from torch_mpm.data.shard import record_path, shard_path
+from torch_mpm.data.shard_writer import ShardWriter
 from torch_mpm.errors import DamagedFileError
 
 OBSTACLES = [
@@ -96,12 +97,12 @@ def test_solids_and_fluids_have_the_same_fields(folder):
 def changed(folder, change):
     """Write the first shard again with other arrays or attributes, and a record that fits them."""
     scenes = {name: value for name, value in decoded(folder).items() if int(name[-7:]) < 2}
-    writer = ShardWriter({})
-    for name, (arrays, attributes) in scenes.items():
-        kept = {k: v.item() if hasattr(v, "item") else v for k, v in attributes.items() if k != "id"}
-        change(arrays, kept)
-        writer.add(int(name[-7:]), prepare_scene(arrays), kept)
-    writer.finish(shard_path(folder, 0))
+    with ShardWriter(shard_path(folder, 0)) as writer:
+        for name, (arrays, attributes) in scenes.items():
+            kept = {k: v.item() if hasattr(v, "item") else v for k, v in attributes.items() if k != "id"}
+            change(arrays, kept)
+            writer.add(int(name[-7:]), prepare_scene(arrays), kept)
+        writer.finish()
 
 
 def fill(name, value, part=...):

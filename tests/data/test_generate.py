@@ -25,7 +25,7 @@ from torch_mpm.data.generate import check_samples, generate
 from torch_mpm.data.packing import prepare_scene
 from torch_mpm.data.sampling import content
 from torch_mpm.data.shard import record_path, shard_path
-from torch_mpm.data.shard_simulation import draw, simulate, with_obstacles
+from torch_mpm.data.shard_simulation import draw, simulate
 from torch_mpm.data.workers import Worker, WorkerError, take_device, worker
 from torch_mpm.scene import SceneError
 from torch_mpm.scene.folder import OutputError
@@ -248,7 +248,7 @@ def test_a_scene_that_fails_is_tried_again_with_half_of_the_time_step(tmp_path):
 
 
 def test_what_is_packed_beside_the_simulation_is_the_same(device):
-    """Of scenes that failed at first, and of some with particles of obstacles, whose arrays are made later."""
+    """Of scenes that failed at first, and of some with particles of obstacles."""
     made = configuration(
         material__jelly__E={"choice": [1e4, 1.2e7]}, dt=1e-3, grid__deterministic=True,
         obstacle=[{"count": {"choice": [0, 1]}, "shape": "sphere", "center": [0.5, 0.1], "radius": 0.08}],
@@ -262,8 +262,10 @@ def test_what_is_packed_beside_the_simulation_is_the_same(device):
             standing = [bool(o.words["obstacle"]) for o in drawn.outcomes]
             assert len(set(standing)) == 2
             for outcome, stands in zip(drawn.outcomes, standing, strict=True):
-                assert set(outcome.packings) == (set() if stands or packers is None else {"position"})
-            prepared.append([prepare_scene(with_obstacles(made, o), o.packings) for o in drawn.outcomes])
+                assert set(outcome.packed) == (set() if packers is None else {"position"})
+                assert (3 in outcome.arrays["particle_type"]) == stands
+                assert ("position" in outcome.arrays) != ("position" in outcome.packed)
+            prepared.append([prepare_scene(o.arrays, o.packed, o.motion) for o in drawn.outcomes])
     for alone, beside in zip(*prepared, strict=True):
         assert alone.hash == beside.hash and alone.motion == beside.motion
         assert alone.arrays["position"] == beside.arrays["position"]

@@ -1,8 +1,11 @@
 """Shards: what is written is read, by plain h5py too; windows read no more than their frames; damage is noticed."""
 
 import errno
+import hashlib
 import json
 import os
+import subprocess
+import sys
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -10,16 +13,18 @@ import pytest
 
 h5py = pytest.importorskip("h5py")
 
-from torch_mpm.data import shard  # noqa: E402
+from small_dataset import write_shard  # noqa: E402
+
+from torch_mpm.data import whole_files  # noqa: E402
 from torch_mpm.data.packing import content_hash, prepare_scene  # noqa: E402
 from torch_mpm.data.shard import (  # noqa: E402
     Shard,
     ShardRecord,
-    ShardWriter,
     record_path,
     scene_name,
     shard_path,
 )
+from torch_mpm.data.shard_writer import ShardWriter  # noqa: E402
 from torch_mpm.data.statistics import motion_sums  # noqa: E402
 from torch_mpm.errors import DamagedFileError  # noqa: E402
 
@@ -48,12 +53,13 @@ def path(tmp_path):
 @pytest.fixture
 def written(path):
     """Scenes 3, 4 (failed), 5 (no particles) and 6."""
-    writer = ShardWriter({"version": "1"})
     with ThreadPoolExecutor(2) as pool:
         prepared = pool.map(prepare_scene, [arrays(6, dim=3), arrays(3), {}, arrays(5, particles=0)])
-    for number, scene, attributes in zip([6, 3, 4, 5], prepared, [VALID, VALID, FAILED, VALID], strict=True):
-        writer.add(number, scene, attributes)
-    writer.finish(path)
+    with ShardWriter(path, {"version": "1"}) as writer:
+        for number, scene, attributes in zip([6, 3, 4, 5], prepared, [VALID, VALID, FAILED, VALID], strict=True):
+            writer.add(number, scene, attributes)
+        assert not path.exists()
+        writer.finish()
     return path
 
 
@@ -157,12 +163,59 @@ def test_a_full_disk_leaves_nothing(path, monkeypatch):
     def full(fd):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    writer = ShardWriter()
-    writer.add(0, prepare_scene(arrays(0)), VALID)
-    monkeypatch.setattr(os, "fsync", full)
-    with pytest.raises(OSError, match="No space left"):
-        writer.finish(path)
+    with ShardWriter(path) as writer, monkeypatch.context() as patch:
+        writer.add(0, prepare_scene(arrays(0)), VALID)
+        patch.setattr(os, "fsync", full)
+        with pytest.raises(OSError, match="No space left"):
+            writer.finish()
     assert list(path.parent.iterdir()) == []
+
+
+LIMITED = """
+import resource, sys
+from pathlib import Path
+from small_dataset import write_shard
+path, first, last, step = Path(sys.argv[1]), *map(int, sys.argv[2:])
+for size in range(first, last, step):
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, resource.getrlimit(resource.RLIMIT_FSIZE)[1]))
+    try:
+        write_shard(path, 0)
+    except OSError as error:
+        assert "too large" in str(error), error
+        assert not list((path / "shards").iterdir())
+    else:
+        raise AssertionError(f"there was room in {size} bytes")
+print("survived")
+"""
+
+
+def test_hdf5_survives_a_disk_that_is_full_anywhere(path):
+    """HDF5 crashes, now or at the end of the process, when it learns of a write that failed."""
+    write_shard(path.parent.parent, 0)
+    whole = shard_path(path.parent.parent, 0)
+    size = whole.stat().st_size
+    for made in (whole, record_path(whole)):
+        made.unlink()
+    words = [sys.executable, "-c", LIMITED, str(path.parent.parent), "1", str(size), str(size // 60)]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    done = subprocess.run(words, capture_output=True, text=True, env=environment)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "survived\n", "")
+
+
+def test_a_writer_that_is_left_leaves_nothing(path):
+    with pytest.raises(KeyboardInterrupt), ShardWriter(path) as writer:
+        writer.add(0, prepare_scene(arrays(0)), VALID)
+        raise KeyboardInterrupt
+    assert list(path.parent.iterdir()) == []
+
+
+@pytest.mark.parametrize("size", [0, 1, 4096, 4097, 20_000])
+def test_a_file_is_hashed_in_parts(tmp_path, monkeypatch, size):
+    monkeypatch.setattr(whole_files, "PART_BYTES", 4096)
+    data = np.random.default_rng(0).bytes(size)
+    (tmp_path / "file").write_bytes(data)
+    parts = [hashlib.sha256(data[k : k + 4096]).digest() for k in range(0, size, 4096)]
+    assert whole_files.file_hash(tmp_path / "file") == hashlib.sha256(b"".join(parts)).hexdigest()
 
 
 def test_a_shard_without_a_record_is_not_finished(written):
@@ -178,7 +231,7 @@ def test_a_shard_without_a_record_is_not_finished(written):
         (b"[" * 100_000, "is no record"),
         (b"3", "is no record"),
         (b'{"format": 99}', "not of this version"),
-        (b'{"format": 1, "bytes": 1, "sha256": "", "scenes": [{"id": 1}]}', "is no record"),
+        (b'{"format": 2, "bytes": 1, "sha256": "", "scenes": [{"id": 1}]}', "is no record"),
     ],
 )
 def test_a_damaged_record(written, text, message):
@@ -237,12 +290,12 @@ def strange_attribute(file, tmp_path):
     "attack", [external, soft, raw, virtual, bomb, references, other_filter, a_group, strange_attribute]
 )
 def test_foreign_content_is_refused(path, tmp_path, attack):
-    writer = ShardWriter()
-    writer.add(0, prepare_scene(arrays(0)), VALID)
-    record = writer.finish(path)
+    with ShardWriter(path) as writer:
+        writer.add(0, prepare_scene(arrays(0)), VALID)
+        record = writer.finish()
     with h5py.File(path, "r+") as file:
         attack(file, tmp_path)
-    words = {"bytes": path.stat().st_size, "sha256": shard.file_hash(path), "scenes": record.scenes}
+    words = {"bytes": path.stat().st_size, "sha256": whole_files.file_hash(path), "scenes": record.scenes}
     ShardRecord(**words).write(record_path(path))
     with Shard(path, check=True) as read, pytest.raises(DamagedFileError, match=scene_name(0)):
         read.scene(0)

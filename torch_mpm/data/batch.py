@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from typing import Any
 
@@ -15,7 +15,7 @@ from ..rollouts import rollout
 from ..scene import fields, heap
 from ..scene.build import Built
 from ..state import State, _take
-from .recording import Recorded, Recording
+from .recording import Array, Recorded, Recording
 
 LOOK = 8
 """Frames between two looks at the stability limit and the validity of the particles, and between two reorderings."""
@@ -81,6 +81,7 @@ def simulate(
     told: Told | None = None,
     executor: Executor | None = None,
     packed: Sequence[bool] | None = None,
+    behind: Sequence[Mapping[str, Array]] | None = None,
 ) -> tuple[list[Recorded], list[str]]:
     """Simulate all scenes of a batch.
 
@@ -91,7 +92,7 @@ def simulate(
         interval: time from frame to frame [s].
         count: substeps from frame to frame.
         told: called after each frame has been queued.
-        executor, packed: of `Recording`.
+        executor, packed, behind: of `Recording`.
 
     Returns:
         The fields of each scene, and why it failed; "" for a scene that is good.
@@ -99,7 +100,7 @@ def simulate(
     _leave_room(built)
     while True:
         shapes = shapes_of(names, built.grid.dim)
-        recording = Recording(frames, particles_of(built), shapes, built.state.x.device, executor, packed)
+        recording = Recording(frames, particles_of(built), shapes, built.state.x.device, executor, packed, behind)
         try:
             surveys = _run(built, recording, names, frames, interval, count, told)
             recorded = recording.finish()

@@ -18,7 +18,8 @@ from ..errors import DamagedFileError
 from ..scene.folder import OutputError
 from ..scene.folder import output_errors as folder_errors
 from .folder import DATASET, DatasetRecord
-from .shard import Shard, ShardRecord, record_path, shard_path, write_whole
+from .shard import Shard, ShardRecord, record_path, shard_path
+from .whole_files import write_whole
 from .workers import Worker
 
 CONFIGURATION, LOCK = "config.toml", "lock"

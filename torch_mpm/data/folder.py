@@ -14,8 +14,9 @@ from typing import Any
 import numpy as np
 
 from ..errors import DamagedFileError
-from .shard import Array, SceneRecord, Shard, ShardRecord, StoredScene, record_path, shard_path, write_whole
+from .shard import Array, SceneRecord, Shard, ShardRecord, StoredScene, record_path, shard_path
 from .statistics import Motion, Sums
+from .whole_files import write_whole
 
 FORMAT = 1
 DATASET = "dataset.json"

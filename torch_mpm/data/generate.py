@@ -26,8 +26,9 @@ from .configuration import Configuration
 from .folder import DatasetRecord
 from .packing import PreparedScene, prepare_scene
 from .sampling import NoRoom, content
-from .shard import ShardWriter, shard_path
-from .shard_simulation import Drawn, Outcome, draw, simulate, with_obstacles
+from .shard import shard_path
+from .shard_simulation import Drawn, Outcome, draw, simulate
+from .shard_writer import Attributes, ShardWriter
 from .workers import take_device, worker
 
 MOST_PACKERS = 6
@@ -183,16 +184,14 @@ class _Line:
 
     def _write(self, shard: int, outcomes: list[Outcome]) -> None:
         """Compress the scenes of a shard and write it, beside what the device is doing."""
-        writer = ShardWriter({"shard": shard, "device": _device_name(self.device), **versions()})
-        for outcome, scene in zip(outcomes, self._packers.map(self._prepared, outcomes), strict=True):
-            writer.add(outcome.id, scene, self._attributes(outcome))
-            outcome.arrays, outcome.packings = {}, {}
-        with output_errors(self.claim.folder):
-            writer.finish(shard_path(self.claim.folder, shard))
+        path = shard_path(self.claim.folder, shard)
+        whole: Attributes = {"shard": shard, "device": _device_name(self.device), **versions()}
+        with output_errors(self.claim.folder), ShardWriter(path, whole) as writer:
+            for outcome, scene in zip(outcomes, self._packers.map(_prepared, outcomes), strict=True):
+                writer.add(outcome.id, scene, self._attributes(outcome))
+                outcome.arrays, outcome.packed, outcome.behind = {}, {}, {}
+            writer.finish()
         self.claim.release(shard)
-
-    def _prepared(self, outcome: Outcome) -> PreparedScene:
-        return prepare_scene(with_obstacles(self.configuration, outcome), outcome.packings)
 
     def _attributes(self, outcome: Outcome) -> dict[str, str | int | float]:
         words = {} if outcome.words is None else self.configuration.scene_words(outcome.words)
@@ -210,3 +209,7 @@ class _Line:
 
 def _device_name(device: torch.device) -> str:
     return torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu"
+
+
+def _prepared(outcome: Outcome) -> PreparedScene:
+    return prepare_scene(outcome.arrays, outcome.packed, outcome.motion)

@@ -1,6 +1,7 @@
 """HDF5 files made safe: against a full disk, which HDF5 cannot handle, damaged bytes, and links to other files.
 
-HDF5 crashes at exit after a write that failed, so files are made in memory and written as plain bytes. A *seal* at the
+HDF5 crashes at exit after a write that failed, so it does not learn of one: it writes to memory, or to a file that
+keeps the error for itself. A *seal* at the
 end of a file holds the SHA-256 of the bytes that will not change; it is checked before HDF5 reads any of them, and
 HDF5 ignores what follows its own end. A seal tells damage, not forgery, so what a file holds is looked at as well.
 """
@@ -35,6 +36,73 @@ def h5py_module() -> Any:
     except ImportError as error:
         raise ImportError("trajectories need h5py: pip install torch-mpm[data]") from error
     return h5py
+
+
+class QuietFile:
+    """A file on the disk for h5py; the first error in writing stays in ``error``, and what comes then is not written.
+
+    Args:
+        path: of a file, which begins anew.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.error: OSError | None = None
+        self._descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_TRUNC, 0o666)
+        self._at = self._size = 0
+
+    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
+        self._at = offset + {os.SEEK_SET: 0, os.SEEK_CUR: self._at, os.SEEK_END: self._size}[whence]
+        return self._at
+
+    def tell(self) -> int:
+        return self._at
+
+    def write(self, data: Any) -> int:
+        view = memoryview(data).cast("B")
+        count, self._at = len(view), self._at + len(view)
+        self._size = max(self._size, self._at)
+        try:
+            while self.error is None and len(view):
+                view = view[os.pwrite(self._descriptor, view, self._at - len(view)) :]
+        except OSError as error:
+            self.error = error
+        return count
+
+    def readinto(self, buffer: Any) -> int:
+        view = memoryview(buffer).cast("B")
+        found = os.preadv(self._descriptor, [view], self._at)
+        view[found:] = bytes(len(view) - found)
+        self._at += len(view)
+        return len(view)
+
+    def read(self, length: int) -> bytes:
+        buffer = bytearray(length)
+        self.readinto(buffer)
+        return bytes(buffer)
+
+    def truncate(self, size: int) -> None:
+        self._size = size
+        try:
+            os.ftruncate(self._descriptor, size)
+        except OSError as error:
+            self.error = self.error or error
+
+    def flush(self) -> None:
+        """Nothing waits."""
+
+    def sync(self) -> None:
+        """Return when all is on the disk.
+
+        Raises:
+            OSError: for what could not be written.
+        """
+        if self.error is None:
+            os.fsync(self._descriptor)
+        else:
+            raise self.error
+
+    def close(self) -> None:
+        os.close(self._descriptor)
 
 
 class SparseFile:

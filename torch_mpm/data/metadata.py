@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from .folder import DatasetError, DatasetFolder
-from .shard import write_whole
+from .whole_files import write_whole
 
 METADATA = "metadata.json"
 NEIGHBOURS = 20

@@ -24,8 +24,8 @@ NEUTRAL = {"F": 1.0, "J": 1.0}
 """Fields of what is not deformed: the identity, and one; the others are zero."""
 
 
-def add(arrays: Mapping[str, Array], words: Any, times: Array) -> dict[str, Array]:
-    """The arrays of a scene with the particles of its obstacles behind its own, at the mean distance of these.
+def add(arrays: Mapping[str, Array], words: Any, times: Array, spacing: float) -> dict[str, Array]:
+    """The arrays of a scene, which may have no particles yet, with the particles of its obstacles behind its own.
 
     What never moves has no particles outside of the domain.
 
@@ -33,9 +33,9 @@ def add(arrays: Mapping[str, Array], words: Any, times: Array) -> dict[str, Arra
         arrays: of particles, as a shard has them.
         words: of the scene, whose obstacles count.
         times: of the frames [T] [s].
+        spacing: distance of the particles [m].
     """
     found, grid = dict(arrays), words.grid
-    spacing = float(arrays["volume"].mean()) ** (1 / words.dim)
     for item in words.obstacle:
         body = obstacle(item, None)
         points = _layer(body, spacing, grid.lower, grid.upper)

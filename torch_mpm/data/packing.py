@@ -1,12 +1,14 @@
 """Arrays of scenes on their way into a shard: compressed, hashed and summed up, in whatever thread there is.
 
-The rows of an array [T, ...] may come one after another; what a shard stores does not depend on how.
+The rows of an array [T, ...] may come one after another, and are nowhere together; what a shard stores does not depend
+on how they come.
 """
 
 from __future__ import annotations
 
 import hashlib
 import math
+import threading
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -21,6 +23,8 @@ Array = npt.NDArray[Any]
 CHUNK_BYTES = 2**17
 """Of a chunk before compression, about: a window of some frames reads little more than itself."""
 GZIP_LEVEL = 1
+PIECE_BYTES = 2**20
+"""Taken in at once, about: what stays in the cache, in few calls, each of which waits for Python's lock."""
 
 
 def isal_zlib_module() -> Any:
@@ -39,13 +43,14 @@ def isal_zlib_module() -> Any:
 class Compressed:
     """An array as it lies in the file: chunks of ``chunk_frames`` rows, shuffled by bytes and compressed.
 
-    The last chunk is filled up with zeros.
+    The last chunk is filled up with zeros. ``digest`` is the SHA-256 of the numbers.
     """
 
     shape: tuple[int, ...]
     dtype: np.dtype[Any]
     chunk_frames: int
     chunks: list[bytes]
+    digest: bytes
 
 
 def chunk_frames(shape: tuple[int, ...], dtype: npt.DTypeLike) -> int:
@@ -54,75 +59,115 @@ def chunk_frames(shape: tuple[int, ...], dtype: npt.DTypeLike) -> int:
     return max(1, min(shape[0], CHUNK_BYTES // max(row, 1)))
 
 
+class _Scratch(threading.local):
+    """Memory of a thread that is used again: what is new for each piece would be mapped page by page."""
+
+    def __init__(self) -> None:
+        self._bytes = np.empty(0, np.uint8)
+
+    def two(self, size: int) -> tuple[Array, Array]:
+        """Arrays of so many bytes, whose contents are left from before."""
+        second = -(-size // 64) * 64
+        if len(self._bytes) < second + size:
+            self._bytes = np.empty(second + size, np.uint8)
+        return self._bytes[:size], self._bytes[second : second + size]
+
+
+_scratch = _Scratch()
+
+
 class Packing:
     """An array [T, ...] with at least one element that is compressed and hashed while its rows come.
 
-    Other threads run meanwhile, and one at a time may call `advance`.
+    Other threads run meanwhile, and one at a time may call `append`.
 
     Args:
-        values: the array; its rows may still be empty.
+        shape, dtype: of the array.
     """
 
-    def __init__(self, values: Array) -> None:
-        self.values = values
-        self._chunk_frames = chunk_frames(values.shape, values.dtype)
+    def __init__(self, shape: tuple[int, ...], dtype: npt.DTypeLike) -> None:
+        self.shape, self.dtype = shape, np.dtype(dtype)
+        self._chunk_frames = chunk_frames(shape, dtype)
         self._chunks: list[bytes] = []
         self._digest = hashlib.sha256()
+        self._row = math.prod(shape[1:]) * self.dtype.itemsize
+        self._rest = np.empty((0, *shape[1:]), self.dtype)
         self._done = 0
 
-    def advance(self, rows: int) -> None:
-        """Take in all whole chunks of the first ``rows`` rows, which stay as they are from now on.
+    def append(self, rows: Array) -> None:
+        """Take in the next rows [k, ...], which may lie anywhere.
 
         Raises:
-            ValueError: for rows that the array does not have.
+            ValueError: for rows of another shape or type, or too many.
         """
-        if not 0 <= rows <= len(self.values):
-            raise ValueError(f"rows must be within 0 and {len(self.values)}, got {rows}")
-        end = rows if rows == len(self.values) else rows - rows % self._chunk_frames
-        if end <= self._done:
-            return
-        fresh = np.ascontiguousarray(self.values[self._done : end])
-        self._digest.update(fresh.data)
-        self._compress(fresh)
-        self._done = end
+        left = self.shape[0] - self._done - len(self._rest)
+        if rows.shape[1:] != self.shape[1:] or rows.dtype != self.dtype or len(rows) > left:
+            expected = f"at most {left} of shape {list(self.shape[1:])} and type {self.dtype}"
+            raise ValueError(f"rows must be {expected}, got {list(rows.shape)} of type {rows.dtype}")
+        at_once = self._chunk_frames * max(1, PIECE_BYTES // (self._chunk_frames * self._row))
+        while len(rows):
+            count = at_once - len(self._rest)
+            self._take(rows[:count])
+            rows = rows[count:]
 
-    def _compress(self, fresh: Array) -> None:
-        """Append chunks. A buffer of one chunk stays in the cache, and is not mapped and unmapped by each thread."""
-        pack, size = isal_zlib_module().compress, fresh.itemsize
-        elements = fresh.reshape(len(fresh), -1).view(np.uint8).reshape(len(fresh), -1, size)
-        shuffled = np.empty((size, self._chunk_frames * elements.shape[1]), np.uint8)
-        for first in range(0, len(fresh), self._chunk_frames):
-            chunk = elements[first : first + self._chunk_frames].reshape(-1, size)
-            shuffled[:, : len(chunk)] = chunk.T
-            shuffled[:, len(chunk) :] = 0
-            self._chunks.append(pack(shuffled, GZIP_LEVEL))
+    def _take(self, rows: Array) -> None:
+        """Hash and compress the whole chunks of what rested and some rows; of the last rows, all."""
+        before, every = len(self._rest), self._chunk_frames
+        count = before + len(rows)
+        last = self._done + count == self.shape[0]
+        chunks = -(-count // every) if last else count // every
+        whole = min(count, chunks * every)
+        size = max(count, chunks * every) * self._row
+        fresh, planes = _scratch.two(size)
+        values = fresh.view(self.dtype).reshape(-1, *self.shape[1:])
+        values[:before], values[before:count], values[count:] = self._rest, rows, 0
+        self._rest, self._done = values[whole:count].copy(), self._done + whole
+        self._digest.update(values[:whole].data)
+        if chunks:
+            self._compress(values[: chunks * every], planes[: values[: chunks * every].nbytes], chunks)
 
-    def compressed(self) -> Compressed:
-        """What a shard stores of the array, all of whose rows are there."""
-        self.advance(len(self.values))
-        return Compressed(self.values.shape, self.values.dtype, self._chunk_frames, self._chunks)
+    def _compress(self, values: Array, planes: Array, chunks: int) -> None:
+        """Append chunks, shuffled by bytes; the values are used up."""
+        size, pack = self.dtype.itemsize, isal_zlib_module().compress
+        words = values.reshape(-1).view(f"<u{size}").reshape(chunks, -1)
+        planes = planes.reshape(chunks, size, -1)
+        for k in range(size):  # faster than a transposition
+            np.copyto(planes[:, k], words, casting="unsafe")
+            np.right_shift(words, 8, out=words)
+        self._chunks += [pack(chunk, GZIP_LEVEL) for chunk in planes]
 
-    def digest(self) -> bytes:
-        """SHA-256 of the array, all of whose rows are there."""
-        self.advance(len(self.values))
-        return self._digest.digest()
+    def finish(self) -> Compressed:
+        """The whole array.
+
+        Raises:
+            ValueError: where rows are missing.
+        """
+        if self._done < self.shape[0]:
+            raise ValueError(f"{self.shape[0]} rows must have come, got {self._done + len(self._rest)}")
+        return Compressed(self.shape, self.dtype, self._chunk_frames, self._chunks, self._digest.digest())
+
+
+def packed(values: Array) -> Compressed:
+    """An array [T, ...] that is there."""
+    packing = Packing(values.shape, values.dtype)
+    packing.append(values)
+    return packing.finish()
 
 
 # ---- one scene
 
 
-def content_hash(arrays: Mapping[str, Array], packings: Mapping[str, Packing] | None = None) -> str:
-    """SHA-256 of the arrays of a scene: of their names, types, shapes and numbers, however they are stored.
+def _digest(values: Array) -> bytes:
+    return hashlib.sha256(np.ascontiguousarray(values).data).digest()
 
-    Args:
-        arrays: by name.
-        packings: of some of the arrays, which know what these are hashed to.
-    """
-    digest, known = hashlib.sha256(), packings or {}
+
+def content_hash(arrays: Mapping[str, Array | Compressed]) -> str:
+    """SHA-256 of the arrays of a scene: of their names, types, shapes and numbers, however they are stored."""
+    digest = hashlib.sha256()
     for name in sorted(arrays):
-        values = np.ascontiguousarray(arrays[name])
+        values = arrays[name]
         digest.update(f"{name} {values.dtype.str} {values.shape} ".encode())
-        digest.update(known[name].digest() if name in known else hashlib.sha256(values.data).digest())
+        digest.update(values.digest if isinstance(values, Compressed) else _digest(values))
     return digest.hexdigest()
 
 
@@ -136,25 +181,27 @@ class PreparedScene:
     motion: Motion | None
 
 
-def prepare_scene(arrays: Mapping[str, Array], begun: Mapping[str, Packing] | None = None) -> PreparedScene:
+def prepare_scene(
+    arrays: Mapping[str, Array], before: Mapping[str, Compressed] | None = None, motion: Motion | None = None
+) -> PreparedScene:
     """Compress, hash and sum up a scene; may run in any thread, and needs no h5py.
 
     Args:
         arrays: ``position`` [T, N, D] and the other arrays of the scene; none for a scene that failed.
-        begun: packings to go on with, where they are of these arrays and not of others with their names.
+        before: those of its arrays that have been packed before.
+        motion: of its positions; needed where these have been packed.
 
     Raises:
         ValueError: for positions that are not finite, or arrays without ``position``.
     """
-    if not arrays:
+    stored: dict[str, Array | Compressed] = {**arrays, **(before or {})}
+    if not stored:
         return PreparedScene({}, 0, content_hash({}), None)
-    if "position" not in arrays or arrays["position"].ndim != 3:
-        raise ValueError(f"arrays must have position [T, N, D], got {', '.join(arrays)}")
-    motion = motion_sums(arrays["position"], arrays.get("particle_type"))
-    packings = {}
-    for name, values in arrays.items():
-        if values.ndim > 1 and values.size:
-            packing = (begun or {}).get(name)
-            packings[name] = packing if packing is not None and packing.values is values else Packing(values)
-    stored = {name: packings[name].compressed() if name in packings else values for name, values in arrays.items()}
-    return PreparedScene(stored, arrays["position"].shape[1], content_hash(arrays, packings), motion)
+    if "position" not in stored or len(stored["position"].shape) != 3:
+        raise ValueError(f"arrays must have position [T, N, D], got {', '.join(stored)}")
+    if motion is None:
+        motion = motion_sums(arrays["position"], arrays.get("particle_type"))
+    elif not motion.finite:
+        raise ValueError("position must be finite")
+    stored |= {name: packed(values) for name, values in arrays.items() if values.ndim > 1 and values.size}
+    return PreparedScene(stored, stored["position"].shape[1], content_hash(stored), motion)

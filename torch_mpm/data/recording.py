@@ -1,13 +1,13 @@
-"""Frames of a batch on their way to arrays in host memory, packed or not, while the device computes the next ones."""
+"""Frames of a batch on their way to host memory, as arrays or packed, while the device computes the next ones."""
 
 from __future__ import annotations
 
 import math
 import queue
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -15,21 +15,25 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from .packing import Packing
+from .packing import Compressed, Packing
+from .statistics import Motion, MotionSums
 
 Array = npt.NDArray[Any]
 SLAB_BYTES = 2**27
 """Of the frames that are copied from a device at once, about."""
 LEAST_SLABS = 8
 """Where arrays are packed: the last slab comes when the simulation has ended, and should be a small part of all."""
+TASKS = 24
+"""Into which the scenes of a slab are divided for the threads of an executor: few, since each takes Python's lock."""
 
 
 @dataclass(frozen=True)
 class Recorded:
-    """The fields [T, N, ...] of a scene, float32, and those packings of them that were wanted."""
+    """The fields [T, N, ...] of a scene, float32, each as an array or packed, and sums of its motion."""
 
     arrays: dict[str, Array]
-    packings: dict[str, Packing] = field(default_factory=dict)
+    packed: dict[str, Compressed]
+    motion: Motion
 
 
 @dataclass(frozen=True)
@@ -42,7 +46,7 @@ class _Slab:
 
 
 class Recording:
-    """Arrays [T, N, ...] in float32 of each scene of a batch, filled frame by frame.
+    """Fields [T, N, ...] in float32 of each scene of a batch, filled frame by frame.
 
     On CUDA, and with an executor, frames are gathered in slabs; on CUDA a stream of its own copies these to pinned
     memory. A thread takes them from there, so that neither the device nor the host waits.
@@ -50,10 +54,11 @@ class Recording:
     Args:
         frames: T.
         particles: N of each scene, whose particles follow one another.
-        shapes: of a field the shape per particle, by name.
+        shapes: of a field the shape per particle, by name; ``position`` is among them.
         device: of the values.
         executor: whose threads take slabs apart, scene by scene; without one it is done in one thread.
-        packed: of each scene whether its arrays are packed on the way; by default none is.
+        packed: of each scene whether it is packed on the way, from where it is; by default none is.
+        behind: of each scene the fields [T, n, ...] of particles that follow its own and are in no sums.
     """
 
     def __init__(
@@ -64,12 +69,18 @@ class Recording:
         device: torch.device,
         executor: Executor | None = None,
         packed: Sequence[bool] | None = None,
+        behind: Sequence[Mapping[str, Array]] | None = None,
     ) -> None:
-        self._scenes = []
-        for count, wanted in zip(particles, packed or [False] * len(particles), strict=True):
-            arrays = {name: np.empty((frames, count, *shape), np.float32) for name, shape in shapes.items()}
-            packings = {name: Packing(values) for name, values in arrays.items() if wanted and values.size}
-            self._scenes.append(Recorded(arrays, packings))
+        self._arrays: list[dict[str, Array]] = []
+        self._packings: list[dict[str, Packing]] = []
+        self._behind = behind or [{}] * len(particles)
+        for own, wanted, others in zip(particles, packed or [False] * len(particles), self._behind, strict=True):
+            count = own + (others["position"].shape[1] if others else 0)
+            whole: dict[str, tuple[int, ...]] = {name: (frames, count, *shape) for name, shape in shapes.items()}
+            begun = {name: Packing(shape, np.float32) for name, shape in whole.items() if wanted and 0 not in shape}
+            self._packings.append(begun)
+            self._arrays.append({name: np.empty(v, np.float32) for name, v in whole.items() if name not in begun})
+        self._motion = MotionSums()
         self._ends = np.cumsum([0, *particles]).tolist()
         self._shapes, self._device, self._executor = shapes, device, executor
         row = sum(4 * self._ends[-1] * math.prod(shape) for shape in shapes.values())
@@ -88,6 +99,7 @@ class Recording:
 
     def put(self, values: Mapping[str, Tensor]) -> None:
         """The next frame: fields [P, ...] of the particles of all scenes, scene by scene."""
+        self._motion.add(values["position"])
         if self._thread is None:
             self._take(self._count, {name: value.numpy()[None] for name, value in values.items()})
             self._count += 1
@@ -118,7 +130,12 @@ class Recording:
             self._thread.join()
             if self._error is not None:
                 raise self._error
-        return self._scenes
+        return [
+            Recorded(arrays, {name: packing.finish() for name, packing in packings.items()}, motion)
+            for arrays, packings, motion in zip(
+                self._arrays, self._packings, self._motion.of_scenes(self._ends), strict=True
+            )
+        ]
 
     def abandon(self) -> None:
         """End the thread without waiting for what is right."""
@@ -164,13 +181,20 @@ class Recording:
     def _take(self, first: int, values: Mapping[str, Array]) -> None:
         """The next frames of all scenes. Returns when all are done, so that those of a scene come in order."""
 
-        def take(k: int) -> None:
-            scene = self._scenes[k]
-            for name, rows in values.items():
-                scene.arrays[name][first : first + len(rows)] = rows[:, self._ends[k] : self._ends[k + 1]]
-                if name in scene.packings:
-                    scene.packings[name].advance(first + len(rows))
+        def take(scenes: Iterable[int]) -> None:
+            for k in scenes:
+                for name, rows in values.items():
+                    own = rows[:, self._ends[k] : self._ends[k + 1]]
+                    if self._behind[k]:
+                        own = np.concatenate([own, self._behind[k][name][first : first + len(rows)]], axis=1)
+                    if name in self._packings[k]:
+                        self._packings[k][name].append(own)
+                    else:
+                        self._arrays[k][name][first : first + len(rows)] = own
 
-        scenes = range(len(self._scenes))
-        for _ in map(take, scenes) if self._executor is None else self._executor.map(take, scenes):
-            pass  # errors are raised here
+        count = len(self._arrays)
+        if self._executor is None:
+            take(range(count))
+        else:
+            for _ in self._executor.map(take, [range(k, count, TASKS) for k in range(min(count, TASKS))]):
+                pass  # errors are raised here

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from .configuration import Configuration
-from .shard_simulation import Outcome, draw, simulate, with_obstacles
+from .shard_simulation import Outcome, draw, simulate
 
 
 def simulator(
@@ -36,7 +36,6 @@ def simulator(
         return [None if outcome.failure else tensors(outcome) for outcome in drawn.outcomes]
 
     def tensors(outcome: Outcome) -> dict[str, Tensor]:
-        arrays = with_obstacles(configuration, outcome)
-        return {name: torch.from_numpy(array).to(target) for name, array in arrays.items()}
+        return {name: torch.from_numpy(array).to(target) for name, array in outcome.arrays.items()}
 
     return simulated

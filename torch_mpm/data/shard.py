@@ -1,7 +1,7 @@
 """Shards: HDF5 files with the finished scenes of a data set, each beside a record that says what is in it.
 
-A shard is put together in memory and written as plain bytes, because HDF5 cannot handle a full disk. It appears under
-its name only when it is whole and on the disk, and its record after it: a shard without a record does not count.
+A shard appears under its name only when it is whole and on the disk, and its record after it: a shard without a record
+does not count.
 
 Layout: one group ``scene_0000000`` per scene, by its id in the data set. ``position`` [T, N, D] and other fields of
 every frame are compressed in chunks of some frames, so that a window of frames is read without the rest. Arrays of one
@@ -10,12 +10,8 @@ dimension, such as ``particle_type`` [N], are stored as they are. A scene that f
 
 from __future__ import annotations
 
-import hashlib
-import io
 import json
-import os
-from collections.abc import Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import TracebackType
@@ -26,13 +22,12 @@ import numpy.typing as npt
 
 from ..errors import DamagedFileError
 from .hdf5 import h5py_module, storage_problem
-from .packing import GZIP_LEVEL, Compressed, PreparedScene
 from .statistics import Motion, Sums
+from .whole_files import file_hash, write_whole
 
 Array = npt.NDArray[Any]
-Attributes = Mapping[str, str | int | float]
 
-FORMAT = 1
+FORMAT = 2
 REMEDY = "remove it and its .json, and generate again"
 
 
@@ -81,7 +76,7 @@ class SceneRecord:
 
 @dataclass(frozen=True)
 class ShardRecord:
-    """What the record of a shard says: the size [bytes] and SHA-256 of its file, and its scenes."""
+    """What the record of a shard says: the size [bytes] and the `file_hash` of its file, and its scenes."""
 
     bytes: int
     sha256: str
@@ -118,108 +113,6 @@ def _motion(words: dict[str, Any] | None) -> Motion | None:
         return None
     sums = {n: Sums(int(s["count"]), tuple(s["sum"]), tuple(s["squares"])) for n, s in words.items()}
     return Motion(**sums)
-
-
-# ---- writing
-
-
-class ShardWriter:
-    """A shard in memory, to which scenes are added in any order; :meth:`finish` writes it.
-
-    Args:
-        attributes: texts and numbers about the whole shard.
-
-    Raises:
-        ImportError: when h5py is missing (extra ``data``).
-    """
-
-    def __init__(self, attributes: Attributes | None = None) -> None:
-        self._image = io.BytesIO()
-        self._file = h5py_module().File(self._image, "w", libver="v110")
-        self._file.attrs.update({"format": FORMAT, **(attributes or {})})
-        self._scenes: list[SceneRecord] = []
-
-    def add(self, scene_id: int, scene: PreparedScene, attributes: Attributes) -> None:
-        """Add a scene.
-
-        Args:
-            scene_id: its number in the data set.
-            scene: from :func:`torch_mpm.data.packing.prepare_scene`.
-            attributes: must have ``valid`` (0 or 1); ``attempts`` and ``failure`` also go into the record.
-        """
-        group = self._file.create_group(scene_name(scene_id))
-        group.attrs.update({"id": scene_id, **attributes})
-        for name, values in scene.arrays.items():
-            if isinstance(values, Compressed):
-                _write_chunks(group, name, values)
-            else:
-                group.create_dataset(name, data=values)
-        record = SceneRecord(
-            scene_id,
-            bool(attributes["valid"]),
-            scene.particles,
-            scene.hash,
-            int(attributes.get("attempts", 1)),
-            str(attributes.get("failure", "")),
-            scene.motion,
-        )
-        self._scenes.append(record)
-
-    def finish(self, path: Path) -> ShardRecord:
-        """Write the shard to ``path`` and then its record; each appears when it is whole and on the disk.
-
-        Raises:
-            OSError: for a full disk, among others; nothing is left of what did not become whole.
-        """
-        self._file.close()
-        data = self._image.getbuffer()
-        scenes = sorted(self._scenes, key=lambda scene: scene.id)
-        with ThreadPoolExecutor(1) as beside:  # a disk and a hash take about as long
-            digest = beside.submit(hashlib.sha256, data)
-            write_whole(path, data)
-        record = ShardRecord(len(data), digest.result().hexdigest(), scenes)
-        record.write(record_path(path))
-        return record
-
-
-def _write_chunks(group: Any, name: str, values: Compressed) -> None:
-    chunk = (values.chunk_frames, *values.shape[1:])
-    options = {"chunks": chunk, "shuffle": True, "compression": "gzip", "compression_opts": GZIP_LEVEL}
-    data = group.create_dataset(name, values.shape, values.dtype, **options)
-    for k, packed in enumerate(values.chunks):
-        data.id.write_direct_chunk((k * values.chunk_frames, *(0,) * (len(chunk) - 1)), packed)
-
-
-def write_whole(path: Path, data: bytes | memoryview) -> None:
-    """Write a file that appears when all of it is on the disk, and stays there.
-
-    Raises:
-        OSError: when it cannot be written; nothing is left of it.
-    """
-    building = path.with_name(f".{path.name}.{os.getpid()}.building")
-    try:
-        with open(building, "wb") as handle:
-            handle.write(data)
-            handle.flush()
-            os.fsync(handle.fileno())
-        building.replace(path)
-    except BaseException:
-        building.unlink(missing_ok=True)
-        raise
-    folder = os.open(path.parent, os.O_RDONLY)
-    try:
-        os.fsync(folder)
-    finally:
-        os.close(folder)
-
-
-def file_hash(path: Path) -> str:
-    """SHA-256 of a file."""
-    digest = hashlib.sha256()
-    with open(path, "rb") as handle:
-        while data := handle.read(1 << 20):
-            digest.update(data)
-    return digest.hexdigest()
 
 
 # ---- reading

@@ -20,9 +20,10 @@ from ..scene.build import Built
 from . import batch, obstacle_particles
 from .configuration import Configuration
 from .distribution import Words, is_number
-from .packing import Packing
+from .packing import Compressed
 from .recording import Array, Recorded
 from .sampling import NoRoom, content
+from .statistics import Motion
 
 Told = Callable[[int, int], None]
 """What is called with the number of scenes that are simulated and the number of the frame that has been queued."""
@@ -38,8 +39,10 @@ class Outcome:
         failure: why it failed; "" for a scene that is good.
         attempts: how often it was simulated.
         dt, substeps: time step [s] and number of them per frame of the last attempt.
-        arrays: of a scene that is good, as a shard has them, but for particles of obstacles (`with_obstacles`).
-        packings: of those arrays that were packed while they came.
+        behind: arrays of the particles of its obstacles, where the data set wants these.
+        arrays: of a scene that is good, as a shard has them, but for those that are packed.
+        packed: those of its arrays that were packed while they came.
+        motion: sums of its motion.
         materials: words of its materials, in the order of their numbers.
     """
 
@@ -49,8 +52,10 @@ class Outcome:
     attempts: int = 0
     dt: float = 0.0
     substeps: int = 0
+    behind: dict[str, Array] = field(default_factory=dict)
     arrays: dict[str, Array] = field(default_factory=dict)
-    packings: dict[str, Packing] = field(default_factory=dict)
+    packed: dict[str, Compressed] = field(default_factory=dict)
+    motion: Motion | None = None
     materials: list[dict[str, Any]] = field(default_factory=list)
 
 
@@ -74,7 +79,30 @@ def draw(configuration: Configuration, ids: Iterable[int], device: torch.device)
             outcome.words = content(configuration, outcome.id)
         except NoRoom as error:
             outcome.failure = str(error)
-    return Drawn(outcomes, _built(configuration, outcomes, device))
+    drawn = Drawn(outcomes, _built(configuration, outcomes, device))
+    if drawn.built is not None and any(_wants_obstacles(configuration, outcome) for outcome in drawn.alive):
+        volumes = np.split(drawn.built.statics()["volume"].numpy(), np.cumsum(batch.particles_of(drawn.built))[:-1])
+        for outcome, volume in zip(drawn.alive, volumes, strict=True):
+            _add_obstacles(configuration, outcome, volume)
+    return drawn
+
+
+def _add_obstacles(configuration: Configuration, outcome: Outcome, volume: Array) -> None:
+    """Arrays of the particles of obstacles, at the mean distance of those of the scene, which have these volumes."""
+    if outcome.words is None or not _wants_obstacles(configuration, outcome):
+        return
+    dataset, dim = configuration.dataset, configuration.dim
+    shapes = batch.shapes_of(("position", *dataset.fields), dim)
+    statics = {name: np.float32 for name in ("mass", "volume", *configuration.drawn_parameters)}
+    nothing: dict[str, Array] = {
+        **{name: np.empty((dataset.frames, 0, *shape), np.float32) for name, shape in shapes.items()},
+        **{
+            name: np.empty(0, kind) for name, kind in {**statics, "particle_type": np.int8, "material": np.int8}.items()
+        },
+    }
+    times = np.arange(dataset.frames) * dataset.interval
+    spacing = float(volume.astype(np.float32).mean()) ** (1 / dim)
+    outcome.behind = obstacle_particles.add(nothing, configuration.scene(outcome.words), times, spacing)
 
 
 def _built(configuration: Configuration, outcomes: list[Outcome], device: torch.device) -> Built | None:
@@ -162,10 +190,10 @@ def _attempt(
         if told is not None:
             told(len(outcomes), frame)
 
-    packed = [packers is not None and not _wants_obstacles(configuration, o) for o in outcomes]
+    packed, behind = [packers is not None] * len(outcomes), [o.behind for o in outcomes]
     try:
         recorded, failures = batch.simulate(
-            built, names, dataset.frames, dataset.interval, count, frame_told, packers, packed
+            built, names, dataset.frames, dataset.interval, count, frame_told, packers, packed, behind
         )
     except torch.OutOfMemoryError as error:
         raise SimulationError(
@@ -206,26 +234,19 @@ def _complete(
         {"name": m.name, "particle_type": code, **m.words.model_dump(mode="json", exclude_none=True)}
         for m, code in zip(materials, types, strict=True)
     ]
-    outcome.packings = recorded.packings
-    outcome.arrays = {
-        **recorded.arrays,
+    outcome.packed, outcome.motion = recorded.packed, recorded.motion
+    constant = {
         "particle_type": np.array(types, np.int8)[number],
         "material": number.astype(np.int8),
         "mass": own["mass"].astype(np.float32),
         "volume": own["volume"].astype(np.float32),
         **_parameters(configuration, outcome.materials, number),
     }
-
-
-def with_obstacles(configuration: Configuration, outcome: Outcome) -> dict[str, Array]:
-    """The arrays of an outcome, with the particles of its obstacles where the data set wants them."""
-    dataset = configuration.dataset
-    if not outcome.arrays or outcome.words is None or not _wants_obstacles(configuration, outcome):
-        return outcome.arrays
-    times = np.arange(dataset.frames) * dataset.interval
-    return obstacle_particles.add(outcome.arrays, configuration.scene(outcome.words), times)
+    if outcome.behind:
+        constant = {name: np.concatenate([values, outcome.behind[name]]) for name, values in constant.items()}
+    outcome.arrays = {**recorded.arrays, **constant}
 
 
 def _wants_obstacles(configuration: Configuration, outcome: Outcome) -> bool:
-    """Whether the arrays of a scene become longer by particles of obstacles, when it has been simulated."""
+    """Whether there are particles of obstacles in the arrays of a scene."""
     return configuration.dataset.obstacles and outcome.words is not None and bool(outcome.words.get("obstacle"))

@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+import itertools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+import torch
+from torch import Tensor
 
 Array = npt.NDArray[Any]
 
 BOUNDARY = 3
 """Particle type of what moves as prescribed; its motion is not to be learned, and is in no statistics."""
-PIECE = 2**15
-"""Numbers summed up at once: they stay in the cache, and calls are few, since each waits for Python's lock."""
 
 
 @dataclass(frozen=True)
@@ -62,6 +64,52 @@ class Motion:
     def __add__(self, other: Motion) -> Motion:
         return Motion(self.velocity + other.velocity, self.acceleration + other.acceleration)
 
+    @property
+    def finite(self) -> bool:
+        """Whether all positions were."""
+        return all(math.isfinite(v) for s in (self.velocity, self.acceleration) for v in (*s.sum, *s.squares))
+
+
+class MotionSums:
+    """Sums of the motions of all particles while frames come, on the device of these. Positions count as they are
+    stored, in float32; each particle has sums of its own, so that they do not depend on what is simulated beside it.
+    """
+
+    def __init__(self) -> None:
+        self._frames = 0
+
+    def add(self, position: Tensor) -> None:
+        """The next frame [P, D] [m]."""
+        x = position.float()
+        if self._frames == 0:
+            self._first, self._last = x.double(), x.double()
+            self._v, self._start, self._free, *self._squares = (torch.zeros_like(self._first) for _ in range(5))
+        else:
+            v = torch.sub(x, self._last, out=self._free)
+            self._squares[0].addcmul_(v, v)
+            if self._frames == 1:
+                self._start.copy_(v)
+            else:
+                a = torch.sub(v, self._v, out=self._v)
+                self._squares[1].addcmul_(a, a)
+            self._v, self._free = v, self._v
+            self._last.copy_(x)
+        self._frames += 1
+
+    def of_scenes(self, ends: Sequence[int]) -> list[Motion]:
+        """Of each scene, whose particles lie between two ends. Waits for the device."""
+        steps = self._frames - 1
+        sums = [self._last - self._first, *self._squares[:1], self._v - self._start, *self._squares[1:]]
+        rows = torch.stack(sums, 1).cpu().numpy()  # sums of differences are differences of ends
+        motions = []
+        for first, end in itertools.pairwise(ends):
+            count = end - first
+            velocity, squares, acceleration, others = map(tuple, rows[first:end].sum(0).tolist())
+            motions.append(
+                Motion(Sums(count * steps, velocity, squares), Sums(count * max(steps - 1, 0), acceleration, others))
+            )
+        return motions
+
 
 def motion_sums(position: Array, particle_type: Array | None = None) -> Motion:
     """Sums over the particles of a scene that are not of type ``BOUNDARY``.
@@ -75,40 +123,10 @@ def motion_sums(position: Array, particle_type: Array | None = None) -> Motion:
     """
     if position.size and not np.isfinite([position.min(), position.max()]).all():
         raise ValueError("position must be finite")
-    frames, _, dim = position.shape
-    free = slice(None) if particle_type is None or BOUNDARY not in particle_type else particle_type != BOUNDARY
-    count = position[:1, free].shape[1]
-    if frames < 2 or not count:
-        return Motion(Sums.zero(dim), Sums.zero(dim))
-    first, last = (np.diff(position[rows, free].astype(np.float64), axis=0)[0] for rows in (slice(2), slice(-2, None)))
-    travel = position[-1, free].astype(np.float64) - position[0, free]  # sums of differences are differences of ends
-    velocity, acceleration = _squares(position, free, first.reshape(-1))
-    return Motion(
-        Sums(count * (frames - 1), _totals(travel, dim), _totals(velocity, dim)),
-        Sums(count * (frames - 2), _totals(last - first, dim), _totals(acceleration, dim)),
-    )
-
-
-def _totals(values: Array, dim: int) -> tuple[float, ...]:
-    """Over all particles."""
-    return tuple(values.reshape(-1, dim).sum(0).tolist())
-
-
-def _squares(position: Array, free: Any, first: Array) -> Array:
-    """Sums over frames of the squares of velocities and accelerations [2, N D] of the particles that are free.
-
-    In pieces, and buffers that stay: large ones would be mapped and unmapped anew by each of many threads.
-    """
-    frames, width = len(position), len(first)
-    rows = max(1, min(frames - 1, PIECE // width))
-    velocity, acceleration, squares = np.empty((rows + 1, width)), np.empty((rows, width)), np.zeros((2, width))
-    velocity[0] = first  # no acceleration at the start, and from then on the velocity of the piece before
-    for start in range(0, frames - 1, rows):
-        x = position[start : start + rows + 1, free].reshape(-1, width)
-        steps = len(x) - 1
-        v = np.subtract(x[1:], x[:-1], out=velocity[1 : steps + 1], dtype=np.float64)
-        a = np.subtract(v, velocity[:steps], out=acceleration[:steps])
-        for total, vectors in zip(squares, (v, a), strict=True):
-            total += np.einsum("tk,tk->k", vectors, vectors)
-        velocity[0] = v[-1]
-    return squares
+    free = np.ones(position.shape[1], bool) if particle_type is None else particle_type != BOUNDARY
+    if not len(position):
+        return Motion(*[Sums.zero(position.shape[2])] * 2)
+    sums = MotionSums()
+    for frame in position:
+        sums.add(torch.from_numpy(frame[free]))
+    return sums.of_scenes([0, int(free.sum())])[0]

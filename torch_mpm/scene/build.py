@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -201,11 +202,13 @@ class _Mixture:
             for name, words in entry.material.items()
             if name in used[index]
         ]
+        self._numbers = {(m.scene, m.name): number for number, m in enumerate(self.materials)}
         groups: dict[tuple[Any, ...], list[int]] = {}
+        before: Counter[tuple[Any, ...]] = Counter()  # materials of one form in one scene
         for number, m in enumerate(self.materials):
             form = _form(m.words)
-            rank = sum(o.scene == m.scene and _form(o.words) == form for o in self.materials[:number])
-            groups.setdefault((form, rank), []).append(number)
+            groups.setdefault((form, before[m.scene, form]), []).append(number)
+            before[m.scene, form] += 1
         self.groups = list(groups.values())
 
     def words(self) -> list[Any]:
@@ -213,7 +216,7 @@ class _Mixture:
         return [self.materials[group[0]].words for group in self.groups]
 
     def number(self, scene: int, name: str) -> int:
-        return next(k for k, m in enumerate(self.materials) if (m.scene, m.name) == (scene, name))
+        return self._numbers[scene, name]
 
     def law_of(self, material: Tensor) -> Tensor:
         """Index of the law [P] for the material numbers [P]."""

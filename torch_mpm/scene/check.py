@@ -155,12 +155,13 @@ def _dimension_problems(key: str, item: Any, dim: int) -> Iterator[str]:
     if dim == 2 and getattr(item, "shape", "") in ("mesh", "cylinder"):
         yield f"{key}.shape: a {item.shape} needs three dimensions; this scene has two"
         return
+    values = vars(item)
     for name in ("center", "lower", "upper", "a", "b", "size", "normal", "axis", "velocity", "offset"):
-        value = getattr(item, name, None)
+        value = values.get(name)
         if value is not None and len(value) != dim:
             yield f"{key}.{name}: must have {dim} numbers in this {dim}-D scene, got {value}"
     for name in ("spin", "rotation"):
-        value = getattr(item, name, None)
+        value = values.get(name)
         if value is not None and isinstance(value, (int, float)) != (dim == 2):
             yield f"{key}.{name}: takes {'one number' if dim == 2 else 'a vector of 3 numbers'} in {dim}-D, got {value}"
 

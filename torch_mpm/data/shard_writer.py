@@ -1,0 +1,143 @@
+"""Writing of shards, scene by scene."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+
+from .hdf5 import QuietFile, h5py_module
+from .packing import GZIP_LEVEL, Array, Compressed, PreparedScene
+from .shard import FORMAT, SceneRecord, ShardRecord, record_path, scene_name
+from .whole_files import appear, building_path, file_hash
+
+Attributes = Mapping[str, str | int | float]
+
+
+class ShardWriter:
+    """A shard that is being written, to which scenes are added in any order; :meth:`finish` makes it appear.
+
+    A context manager; without `finish`, nothing is left of it.
+
+    Args:
+        path: where it is to be.
+        attributes: texts and numbers about the whole shard.
+
+    Raises:
+        ImportError: when h5py is missing (extra ``data``).
+        OSError: where no file can be made.
+    """
+
+    def __init__(self, path: Path, attributes: Attributes | None = None) -> None:
+        h5py = h5py_module()
+        self._path, self._building = path, building_path(path)
+        self._disk = QuietFile(self._building)
+        self._file = h5py.File(self._disk, "w", libver="v110")
+        self._file.attrs.update({"format": FORMAT, **(attributes or {})})
+        self._scenes: list[SceneRecord] = []
+
+    def __enter__(self) -> ShardWriter:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        try:
+            self._file.close()
+        finally:
+            self._disk.close()
+            self._building.unlink(missing_ok=True)
+
+    def add(self, scene_id: int, scene: PreparedScene, attributes: Attributes) -> None:
+        """Add a scene.
+
+        Args:
+            scene_id: its number in the data set.
+            scene: from :func:`torch_mpm.data.packing.prepare_scene`.
+            attributes: must have ``valid`` (0 or 1); ``attempts`` and ``failure`` also go into the record.
+
+        Raises:
+            OSError: for a full disk, among others.
+        """
+        group = _new_group(self._file.id, scene_name(scene_id))
+        for name, value in {"id": scene_id, **attributes}.items():
+            _write_attribute(group, name, value)
+        for name, values in scene.arrays.items():
+            if isinstance(values, Compressed):
+                _write_chunks(group, name, values)
+            else:
+                _write_array(group, name, values)
+        if self._disk.error is not None:
+            raise self._disk.error
+        record = SceneRecord(
+            scene_id,
+            bool(attributes["valid"]),
+            scene.particles,
+            scene.hash,
+            int(attributes.get("attempts", 1)),
+            str(attributes.get("failure", "")),
+            scene.motion,
+        )
+        self._scenes.append(record)
+
+    def finish(self) -> ShardRecord:
+        """Write the rest of the shard and then its record; each appears when it is whole and on the disk.
+
+        Raises:
+            OSError: for a full disk, among others.
+        """
+        self._file.close()
+        with ThreadPoolExecutor(1) as beside:  # a disk and a hash take about as long
+            digest = beside.submit(file_hash, self._building)
+            self._disk.sync()
+        appear(self._building, self._path)
+        scenes = sorted(self._scenes, key=lambda scene: scene.id)
+        record = ShardRecord(self._path.stat().st_size, digest.result(), scenes)
+        record.write(record_path(self._path))
+        return record
+
+
+# ---- by the functions of HDF5 itself: those of h5py take twice as long, and Python's lock
+
+
+def _new_group(parent: Any, name: str) -> Any:
+    return h5py_module().h5g.create(parent, name.encode())
+
+
+def _write_attribute(group: Any, name: str, value: str | int | float) -> None:
+    h5py = h5py_module()
+    kind = h5py.string_dtype() if isinstance(value, str) else np.asarray(value).dtype
+    stored = h5py.h5t.py_create(kind, logical=True)
+    attribute = h5py.h5a.create(group, name.encode(), stored, h5py.h5s.create(h5py.h5s.SCALAR))
+    attribute.write(np.array(value, kind), mtype=h5py.h5t.py_create(kind))
+
+
+def _write_array(group: Any, name: str, values: Array) -> None:
+    values = np.ascontiguousarray(values)
+    data = _new_dataset(group, name, values.shape, values.dtype)
+    data.write(h5py_module().h5s.ALL, h5py_module().h5s.ALL, values)
+
+
+def _write_chunks(group: Any, name: str, values: Compressed) -> None:
+    chunk = (values.chunk_frames, *values.shape[1:])
+    data = _new_dataset(group, name, values.shape, values.dtype, chunk)
+    for k, packed in enumerate(values.chunks):
+        data.write_direct_chunk((k * values.chunk_frames, *(0,) * (len(chunk) - 1)), packed)
+
+
+def _new_dataset(
+    group: Any, name: str, shape: tuple[int, ...], dtype: np.dtype[Any], chunk: tuple[int, ...] | None = None
+) -> Any:
+    h5py = h5py_module()
+    properties = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+    properties.set_obj_track_times(False)
+    if chunk is not None:
+        properties.set_chunk(chunk)
+        properties.set_shuffle()
+        properties.set_deflate(GZIP_LEVEL)
+    space = h5py.h5s.create_simple(shape)
+    return h5py.h5d.create(group, name.encode(), h5py.h5t.py_create(dtype), space, dcpl=properties)
