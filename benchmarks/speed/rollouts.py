@@ -13,6 +13,8 @@ from __future__ import annotations
 
 import argparse
 import importlib.util
+import subprocess
+import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
@@ -70,6 +72,16 @@ def per_step(s: Setup, device: str, samples: int, dt: float = work.DT) -> dict[s
     return {"particles": len(state), "steps": steps, "us": best * 1e6, "rate": len(state) / best}
 
 
+def beside_a_busy_process(s: Setup, samples: int) -> dict[str, Any]:
+    """The time of a substep while a process that does nothing else wants a core."""
+    busy = subprocess.Popen([sys.executable, "-c", "while True: pass"])
+    try:
+        return per_step(s, "cpu", samples)
+    finally:
+        busy.kill()
+        busy.wait()
+
+
 def batched(scenes: int, particles: int, device: str) -> Setup:
     """Many scenes of one small cube each."""
     w = work.make(round(particles ** (1 / 3)))
@@ -123,6 +135,8 @@ def measure(device: str, quick: bool = False) -> dict[str, Any]:
     for side in sides:
         s = setup(work.make(side), device)
         result["rollouts"].append({"name": "one scene", **per_step(s, device, samples)})
+    if device == "cpu":
+        result["rollouts"].append({"name": "beside a busy process", **beside_a_busy_process(s, samples)})
     for count, particles in [(4, 64)] if quick else BATCHES[device]:
         row = per_step(batched(count, particles, device), device, samples)
         result["rollouts"].append({"name": f"{count} scenes", **row})

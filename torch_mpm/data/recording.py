@@ -29,11 +29,12 @@ TASKS = 24
 
 @dataclass(frozen=True)
 class Recorded:
-    """The fields [T, N, ...] of a scene, float32, each as an array or packed, and sums of its motion."""
+    """The fields [T, N, ...] of a scene, float32, each as an array or packed, and where these are packed on the way
+    sums of its motion."""
 
     arrays: dict[str, Array]
     packed: dict[str, Compressed]
-    motion: Motion
+    motion: Motion | None
 
 
 @dataclass(frozen=True)
@@ -80,7 +81,7 @@ class Recording:
             begun = {name: Packing(shape, np.float32) for name, shape in whole.items() if wanted and 0 not in shape}
             self._packings.append(begun)
             self._arrays.append({name: np.empty(v, np.float32) for name, v in whole.items() if name not in begun})
-        self._motion = MotionSums()
+        self._motion = MotionSums() if any(packed or ()) else None
         self._ends = np.cumsum([0, *particles]).tolist()
         self._shapes, self._device, self._executor = shapes, device, executor
         row = sum(4 * self._ends[-1] * math.prod(shape) for shape in shapes.values())
@@ -99,7 +100,8 @@ class Recording:
 
     def put(self, values: Mapping[str, Tensor]) -> None:
         """The next frame: fields [P, ...] of the particles of all scenes, scene by scene."""
-        self._motion.add(values["position"])
+        if self._motion is not None:
+            self._motion.add(values["position"])
         if self._thread is None:
             self._take(self._count, {name: value.numpy()[None] for name, value in values.items()})
             self._count += 1
@@ -130,11 +132,10 @@ class Recording:
             self._thread.join()
             if self._error is not None:
                 raise self._error
+        motions = [None] * len(self._arrays) if self._motion is None else self._motion.of_scenes(self._ends)
         return [
             Recorded(arrays, {name: packing.finish() for name, packing in packings.items()}, motion)
-            for arrays, packings, motion in zip(
-                self._arrays, self._packings, self._motion.of_scenes(self._ends), strict=True
-            )
+            for arrays, packings, motion in zip(self._arrays, self._packings, motions, strict=True)
         ]
 
     def abandon(self) -> None:
