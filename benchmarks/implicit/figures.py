@@ -96,14 +96,15 @@ def draw_order(in_time: Rows, in_space: Rows, path: Path) -> None:
 
 
 def draw_sand(clump: Rows, collapse: Rows, path: Path) -> None:
-    """Above the clump, below the collapse: particles at the end of one length of the step, and all lengths."""
+    """Above the clump, below the collapse by FLIP: particles at the end of one length of the step, and all lengths."""
+    collapse = [row for row in collapse if row["transfer"] == "flip"]
     figure, panels = _pyplot().subplots(2, 4, figsize=(16, 5.5), layout="constrained", width_ratios=(1.2, 1.2, 1.2, 1))
     _, start = pulled((8, 4), 0.025, 2.0)
     _draw_bodies(panels[0, :3], clump, 1e-2, start.x)
     _draw_bodies(panels[1, :3], collapse, 2e-3, None)
     for panel, rows, measure in ((panels[0, 3], clump, "spread"), (panels[1, 3], collapse, "run-out")):
         for energy, color in COLORS.items():
-            own = [row for row in rows if row["energy"] == energy and row.get("transfer", "flip") == "flip"]
+            own = [row for row in rows if row["energy"] == energy]
             for number, name in enumerate(dict.fromkeys(row["return map"] for row in own)):
                 these = [row for row in own if row["return map"] == name]
                 if name == "explicit":
@@ -119,7 +120,6 @@ def draw_sand(clump: Rows, collapse: Rows, path: Path) -> None:
 
 
 def _draw_bodies(panels: Any, rows: Rows, dt: float, start: torch.Tensor | None) -> None:
-    rows = [row for row in rows if row.get("transfer", "flip") == "flip"]
     implicit = [row for row in rows if row["return map"] == "after the solve"]
     near = min({row["dt [s]"] for row in implicit}, key=lambda length: abs(length - dt))
     shown = [next(row for row in rows if row["return map"] == "explicit" and row["energy"] == "unilateral")]

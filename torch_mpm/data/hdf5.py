@@ -1,9 +1,9 @@
 """HDF5 files made safe: against a full disk, which HDF5 cannot handle, damaged bytes, and links to other files.
 
 HDF5 crashes at exit after a write that failed, so it does not learn of one: it writes to memory, or to a file that
-keeps the error for itself. A *seal* at the
-end of a file holds the SHA-256 of the bytes that will not change; it is checked before HDF5 reads any of them, and
-HDF5 ignores what follows its own end. A seal tells damage, not forgery, so what a file holds is looked at as well.
+keeps the error for itself. A *seal* at the end of a file holds the SHA-256 of the bytes that will not change; it is
+checked before HDF5 reads any of them, and HDF5 ignores what follows its own end. A seal tells damage, not forgery, so
+what a file holds is looked at as well.
 """
 
 from __future__ import annotations
@@ -38,7 +38,32 @@ def h5py_module() -> Any:
     return h5py
 
 
-class QuietFile:
+class _File:
+    """What h5py asks of a file, but for reading, writing and truncating: a size, and a place that moves."""
+
+    def __init__(self) -> None:
+        self.size = self._at = 0
+
+    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
+        self._at = offset + {os.SEEK_SET: 0, os.SEEK_CUR: self._at, os.SEEK_END: self.size}[whence]
+        return self._at
+
+    def tell(self) -> int:
+        return self._at
+
+    def readinto(self, buffer: Any) -> int:
+        raise NotImplementedError
+
+    def read(self, length: int) -> bytes:
+        buffer = bytearray(length)
+        self.readinto(buffer)
+        return bytes(buffer)
+
+    def flush(self) -> None:
+        """Nothing waits."""
+
+
+class QuietFile(_File):
     """A file on the disk for h5py; the first error in writing stays in ``error``, and what comes then is not written.
 
     Args:
@@ -46,21 +71,14 @@ class QuietFile:
     """
 
     def __init__(self, path: Path) -> None:
+        super().__init__()
         self.error: OSError | None = None
         self._descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_TRUNC, 0o666)
-        self._at = self._size = 0
-
-    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
-        self._at = offset + {os.SEEK_SET: 0, os.SEEK_CUR: self._at, os.SEEK_END: self._size}[whence]
-        return self._at
-
-    def tell(self) -> int:
-        return self._at
 
     def write(self, data: Any) -> int:
         view = memoryview(data).cast("B")
         count, self._at = len(view), self._at + len(view)
-        self._size = max(self._size, self._at)
+        self.size = max(self.size, self._at)
         try:
             while self.error is None and len(view):
                 view = view[os.pwrite(self._descriptor, view, self._at - len(view)) :]
@@ -75,20 +93,12 @@ class QuietFile:
         self._at += len(view)
         return len(view)
 
-    def read(self, length: int) -> bytes:
-        buffer = bytearray(length)
-        self.readinto(buffer)
-        return bytes(buffer)
-
     def truncate(self, size: int) -> None:
-        self._size = size
+        self.size = size
         try:
             os.ftruncate(self._descriptor, size)
         except OSError as error:
             self.error = self.error or error
-
-    def flush(self) -> None:
-        """Nothing waits."""
 
     def sync(self) -> None:
         """Return when all is on the disk.
@@ -105,23 +115,15 @@ class QuietFile:
         os.close(self._descriptor)
 
 
-class SparseFile:
+class SparseFile(_File):
     """A file in memory of which only the pages written to take room: h5py makes an HDF5 file of any size in it."""
 
     PAGE = 4096
 
     def __init__(self) -> None:
-        self.size = 0
-        self._at = 0
+        super().__init__()
         self._pages: dict[int, bytearray] = {}
         self._written: list[tuple[int, int]] = []
-
-    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
-        self._at = offset + {os.SEEK_SET: 0, os.SEEK_CUR: self._at, os.SEEK_END: self.size}[whence]
-        return self._at
-
-    def tell(self) -> int:
-        return self._at
 
     def write(self, data: Any) -> int:
         view = memoryview(data).cast("B")
@@ -137,16 +139,8 @@ class SparseFile:
             part[:] = self._pages.get(page, bytes(self.PAGE))[inside : inside + len(part)]
         return len(view)
 
-    def read(self, length: int) -> bytes:
-        buffer = bytearray(length)
-        self.readinto(buffer)
-        return bytes(buffer)
-
     def truncate(self, size: int) -> None:
         self.size = size
-
-    def flush(self) -> None:
-        """Nothing waits."""
 
     def extents(self) -> list[tuple[int, int]]:
         """What was written, in order and without overlap."""

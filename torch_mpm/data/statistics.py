@@ -123,10 +123,11 @@ def motion_sums(position: Array, particle_type: Array | None = None) -> Motion:
     """
     if position.size and not np.isfinite([position.min(), position.max()]).all():
         raise ValueError("position must be finite")
-    free = np.ones(position.shape[1], bool) if particle_type is None else particle_type != BOUNDARY
+    boundary = particle_type is not None and BOUNDARY in particle_type
+    free: Any = particle_type != BOUNDARY if boundary else slice(None)
     if not len(position):
         return Motion(*[Sums.zero(position.shape[2])] * 2)
     sums = MotionSums()
     for frame in position:
         sums.add(torch.from_numpy(frame[free]))
-    return sums.of_scenes([0, int(free.sum())])[0]
+    return sums.of_scenes([0, len(position[0, free])])[0]

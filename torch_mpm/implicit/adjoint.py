@@ -114,7 +114,7 @@ class _Adjoint:
 
     def solve(self, grad: Tensor) -> tuple[Tensor, Tensor]:
         """λ of the free components [N, D], and the scenes whose solve converged, bool [B]."""
-        right = self._kept(grad)
+        right = self._kept(self._system.symmetric(grad))
         whole = self._system.of_nodes(self._not_symmetric())
         solve = self._symmetric(torch.where(whole, 0, right), self._tangent, self._relative)
         adjoint, converged = solve.solution, solve.state == CONVERGED
@@ -155,5 +155,4 @@ class _Adjoint:
         return self._kept(result if self._across is None else result + times(self._across, given))
 
     def _kept(self, vectors: Tensor) -> Tensor:
-        vectors = self._system.symmetric(vectors)
         return vectors if self._bounds is None else self._bounds.kept(vectors, self._free)

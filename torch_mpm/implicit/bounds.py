@@ -112,7 +112,9 @@ def node_bounds(
     if walls is not None:
         _add_walls(bounds, blocks, faces, positions)
     scene = blocks.node_scene() if blocks.grid.scenes > 1 else None
-    positions, sign = reflected_inside(blocks, walls, positions)
+    sign: Tensor | None = None
+    if obstacles and any(f.kind == "mirror" for f in faces):
+        positions, sign = reflected_inside(faces, positions)
     for obstacle in obstacles:
         _add_obstacle(bounds, obstacle, positions, sign, scene, time)
     return bounds
@@ -146,7 +148,12 @@ def _add_walls(bounds: NodeBounds, blocks: Blocks, faces: Sequence[Face], positi
 
 
 def _add_obstacle(
-    bounds: NodeBounds, obstacle: Any, positions: Tensor, sign: Tensor, scene: Tensor | None, time: float | Tensor
+    bounds: NodeBounds,
+    obstacle: Any,
+    positions: Tensor,
+    sign: Tensor | None,
+    scene: Tensor | None,
+    time: float | Tensor,
 ) -> None:
     if not isinstance(obstacle, Obstacle):
         raise NotImplementedError(
@@ -156,8 +163,9 @@ def _add_obstacle(
     if contact is None:
         return
     touching, normal, surface_velocity = contact
-    normal = sign * normal
-    surface = torch.zeros_like(positions) if surface_velocity is None else sign * surface_velocity
+    surface = torch.zeros_like(positions) if surface_velocity is None else surface_velocity.expand_as(positions)
+    if sign is not None:
+        normal, surface = sign * normal, sign * surface
     if obstacle.kind == "sticky":
         rows = touching[:, None] & (bounds.lower != bounds.upper)  # what a wall holds stays
         surface = bounds.turned(surface)

@@ -8,11 +8,13 @@ products of the Hessian and node blocks are those of all nodes, projected on wha
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
 from ..boundaries import Walls
+from ..boundaries.walls import Face
 from ..grid import Blocks
 from ..ops.grid_update_composed import images
 
@@ -53,8 +55,8 @@ class Mirrors:
 
 
 def mirrors_of(blocks: Blocks, walls: Walls | None, mass: Tensor) -> Mirrors | None:
-    """The mirrors among walls, for nodes with masses [N]; None without any."""
-    if walls is None or walls.mirrors() is None:
+    """Of walls that are mirrors alone, for nodes with masses [N]; None without any."""
+    if walls is None:
         return None
     own = torch.arange(len(mass), device=mass.device)
     groups = own.new_full((len(mass), 1 << blocks.grid.dim), -1)
@@ -67,16 +69,15 @@ def mirrors_of(blocks: Blocks, walls: Walls | None, mass: Tensor) -> Mirrors | N
     return Mirrors(groups[first & present[:, 0] & (present.sum(1) > 1)].to(torch.int32))
 
 
-def reflected_inside(blocks: Blocks, walls: Walls | None, positions: Tensor) -> tuple[Tensor, Tensor]:
+def reflected_inside(faces: Sequence[Face], positions: Tensor) -> tuple[Tensor, Tensor]:
     """Positions of nodes [N, D] [m], of those behind mirrors that of their images, and the signs of the axes of the
     latter [N, D]."""
-    sign = torch.ones_like(positions)
-    if walls is not None:
-        for number, face in enumerate(walls.faces(blocks.grid)):
-            axis, above = divmod(number, 2)
-            if face.kind == "mirror":
-                behind = positions[:, axis] > face.plane if above else positions[:, axis] < face.plane
-                sign[:, axis] = torch.where(behind, -1, sign[:, axis])
-                image = torch.where(behind, 2 * face.plane - positions[:, axis], positions[:, axis])
-                positions = torch.cat([positions[:, :axis], image[:, None], positions[:, axis + 1 :]], 1)
+    positions, sign = positions.clone(), torch.ones_like(positions)
+    for number, face in enumerate(faces):
+        axis, above = divmod(number, 2)
+        if face.kind == "mirror":
+            at = positions[:, axis]
+            behind = at > face.plane if above else at < face.plane
+            sign[:, axis].masked_fill_(behind, -1)
+            positions[:, axis] = torch.where(behind, 2 * face.plane - at, at)
     return positions, sign
