@@ -44,12 +44,16 @@ class SubstepsBackward {
   }
 
  private:
+  // The adjoints of the motion of the nodes in a step.
+  T* motion_of(int64_t i) const { return static_cast<T*>(motion_.data_ptr()) + i % motions_ * motion_.stride(0); }
+
   void check_room(bool room) const {
     STD_TORCH_CHECK(room, "max_blocks must be as many as the steps need, got ", in_.max_blocks);
   }
 
   void make_terms(int64_t needs);
   void leave_advance(int64_t i, Adjoints& adjoints);
+  AdvanceBackwardArguments<T, D> advance(int64_t i, Adjoints& adjoints) const;
   void leave_grid(int64_t i, Adjoints& adjoints, const Tensor& gravity);
   void leave_laws(Adjoints& adjoints);
 
@@ -120,7 +124,8 @@ void SubstepsBackward<T, D>::make_terms(int64_t needs) {
     if (term->defined()) torch::stable::zero_(*term);
 }
 
-// From x, F and J at the end of a step to F and J after the laws, and to the motion of the particles.
+// From x, F and J at the end of a step to F and J after the laws, to the motion of the particles, and through G2P to
+// that of the nodes.
 template <class T, int D>
 void SubstepsBackward<T, D>::leave_advance(int64_t i, Adjoints& adjoints) {
   if (!mls_) {
@@ -130,6 +135,22 @@ void SubstepsBackward<T, D>::leave_advance(int64_t i, Adjoints& adjoints) {
     g.lost = 0;
     backend::gather(in_.lattice.order(), g, stream_);
   }
+  if (i % motions_ == motions_ - 1 || i == in_.n - 1) backend::clear(motion_, stream_);
+  G2PAdvanceBackwardArguments<T, D> a;
+  a.advance = advance(i, adjoints);
+  a.scatter.topology = s_.p2g.topology;
+  a.scatter.x = s_.p2g.x;
+  a.scatter.value = field<const T>(adjoints.v);
+  if (mls_ || in_.wants_C) a.scatter.moment = field<const T>(adjoints.C);
+  a.scatter.gradient = field<const T>(gradient_);
+  a.scatter.moment_scale = in_.lattice.inverse_inertia();
+  a.scatter.deterministic = in_.lattice.deterministic();
+  a.scatter.nodes = {motion_of(i) + 1, 1 + D, D};
+  backend::g2p_advance_backward(in_.lattice.order(), a, stream_);
+}
+
+template <class T, int D>
+AdvanceBackwardArguments<T, D> SubstepsBackward<T, D>::advance(int64_t i, Adjoints& adjoints) const {
   AdvanceBackwardArguments<T, D> a;
   a.forward.particles = in_.x.size(0);
   a.forward.x = s_.p2g.x;
@@ -150,31 +171,13 @@ void SubstepsBackward<T, D>::leave_advance(int64_t i, Adjoints& adjoints) {
   a.adds_affine = mls_;
   a.F = field<T>(adjoints.F);
   a.J = field<T>(adjoints.J);
-  backend::advance_backward(a, stream_);
+  return a;
 }
 
-// Through G2P, obstacles, grid update and P2G.
+// Through obstacles, grid update and P2G.
 template <class T, int D>
 void SubstepsBackward<T, D>::leave_grid(int64_t i, Adjoints& adjoints, const Tensor& gravity) {
-  const int64_t order = in_.lattice.order();
-  if (i % motions_ == motions_ - 1 || i == in_.n - 1) backend::clear(motion_, stream_);
-  T* const nodes = static_cast<T*>(motion_.data_ptr()) + i % motions_ * motion_.stride(0);
-  ScatterArguments<T, D> motion;
-  motion.topology = s_.p2g.topology;
-  motion.x = s_.p2g.x;
-  motion.value = field<const T>(adjoints.v);
-  if (mls_ || in_.wants_C) motion.moment = field<const T>(adjoints.C);
-  motion.gradient = field<const T>(gradient_);
-  motion.moment_scale = in_.lattice.inverse_inertia();
-  motion.deterministic = in_.lattice.deterministic();
-  motion.nodes = {nodes + 1, 1 + D, D};
-  backend::scatter(order, motion, stream_);
-  backend::position_gradient(
-      order,
-      PositionGradientArguments<T, D>{motion.topology, motion.x, motion.value, motion.moment, motion.gradient,
-                                      s_.advance.gather.nodes, motion.moment_scale, field<T>(adjoints.x), true},
-      stream_);
-
+  T* const nodes = motion_of(i);
   GridUpdateBackwardArguments<T, D> update;
   update.forward = s_.update;
   update.grad_updated = reinterpret_cast<const NodeRow<T, D>*>(nodes);
@@ -207,6 +210,15 @@ void SubstepsBackward<T, D>::leave_grid(int64_t i, Adjoints& adjoints, const Ten
 
   P2GBackwardArguments<T, D> p2g;
   p2g.forward = s_.p2g;
+  p2g.motion.topology = s_.p2g.topology;
+  p2g.motion.x = s_.p2g.x;
+  p2g.motion.value = field<const T>(adjoints.v);
+  if (mls_ || in_.wants_C) p2g.motion.moment = field<const T>(adjoints.C);
+  p2g.motion.gradient = field<const T>(gradient_);
+  p2g.motion.nodes = s_.advance.gather.nodes;
+  p2g.motion.moment_scale = in_.lattice.inverse_inertia();
+  p2g.motion.position_gradient = field<T>(adjoints.x);
+  p2g.motion.adds = true;
   p2g.grad_nodes = {reinterpret_cast<const T*>(update.grad_nodes), 1 + D, 1 + D};
   p2g.x = field<T>(adjoints.x);
   p2g.mass = field<T>(adjoints.mass);
@@ -218,7 +230,7 @@ void SubstepsBackward<T, D>::leave_grid(int64_t i, Adjoints& adjoints, const Ten
   p2g.stress = field<T>(stress_);
   p2g.volume = field<T>(adjoints.volume);
   p2g.adds = true;
-  backend::p2g_backward(order, p2g, stream_);
+  backend::p2g_backward(in_.lattice.order(), p2g, stream_);
 }
 
 // From F after the laws, their stress and history to F and history before. A law changes the adjoints of what it maps

@@ -27,6 +27,14 @@ struct AdvanceBackwardArguments {
   bool adds_velocity = false, adds_affine = false;  // to what is there
 };
 
+// The adjoint of G2P and the end of the step in one: that of the end, and then the sums over the particles of what it
+// leaves at the adjoints of their motion.
+template <class T, int D>
+struct G2PAdvanceBackwardArguments {
+  AdvanceBackwardArguments<T, D> advance;  // its velocity and affine, or velocity gradient, are what is added up
+  ScatterArguments<T, D> scatter;          // D channels
+};
+
 // G2P and the end of the step in one: the velocity gradient that moves F and J is the affine field (MLS) or ∇v.
 template <class T, int D>
 struct G2PAdvanceArguments {
@@ -89,37 +97,42 @@ MPM_HD void load_motion(const AdvanceArguments<T, D>& a, const One<T>& at, Vecto
   }
 }
 
+// Adjoints of what moved a particle.
 template <class T, int D>
-MPM_HD void advance_particle_backward(const AdvanceBackwardArguments<T, D>& a, const One<T>& at) {
+struct MotionAdjoint {
+  Vector<T, D> velocity;
+  Matrix<T, D> affine;
+};
+
+// Returns what is at its places for those of the motion afterwards.
+template <class T, int D>
+MPM_HD MotionAdjoint<T, D> advance_particle_backward(const AdvanceBackwardArguments<T, D>& a, const One<T>& at) {
   const T dt = particle_dt(a.forward, at);
   const Vector<T, D> grad_x = load_vector<D>(at, a.grad_x);
   Vector<T, D> v;
-  Matrix<T, D> C, grad_affine = zero_matrix<T, D>();
+  Matrix<T, D> C;
   load_motion(a.forward, at, v, C);
-  const Adding<One<T>> adding(at);
-  if (a.adds_velocity)
-    store_vector<D>(adding, a.velocity, dt * grad_x);
-  else if (a.velocity.pointer)
-    store_vector<D>(at, a.velocity, dt * grad_x);
+  MotionAdjoint<T, D> motion{dt * grad_x, zero_matrix<T, D>()};
   T grad_dt = dot(v, grad_x);
   if (a.forward.F.pointer) {
     const Matrix<T, D> F = load_matrix<D>(at, a.forward.F), G = load_matrix<D>(at, a.grad_F);
     if (a.F.pointer) store_matrix<D>(at, a.F, G + dt * (transpose(C) * G));
-    grad_affine = dt * (G * transpose(F));
+    motion.affine = dt * (G * transpose(F));
     grad_dt = grad_dt + contract(C * F, G);
   }
   if (a.forward.J.pointer) {
     const T J = load_scalar(at, a.forward.J), g = load_scalar(at, a.grad_J), rate = trace(C);
     if (a.J.pointer) store_scalar(at, a.J, g + dt * rate * g);
     MPM_UNROLL for (int i = 0; i < D; i++)
-      grad_affine[i][i] = grad_affine[i][i] + dt * J * g;
+      motion.affine[i][i] = motion.affine[i][i] + dt * J * g;
     grad_dt = grad_dt + rate * J * g;
   }
-  if (a.adds_affine)
-    store_matrix<D>(adding, a.affine, grad_affine);
-  else if (a.affine.pointer)
-    store_matrix<D>(at, a.affine, grad_affine);
+  if (a.adds_velocity) motion.velocity = load_vector<D>(at, constant(a.velocity)) + motion.velocity;
+  if (a.velocity.pointer) store_vector<D>(at, a.velocity, motion.velocity);
+  if (a.adds_affine) motion.affine = load_matrix<D>(at, constant(a.affine)) + motion.affine;
+  if (a.affine.pointer) store_matrix<D>(at, a.affine, motion.affine);
   if (a.dt.pointer) store_scalar(at, a.dt, grad_dt);
+  return motion;
 }
 
 }  // namespace TORCH_MPM_ISA

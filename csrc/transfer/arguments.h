@@ -19,6 +19,18 @@ struct P2GArguments {
   NodeField<T> nodes;    // zero on entry; 1 + D channels: mass, momentum
 };
 
+// ∂Φ/∂x_p of the trilinear form Φ = Σ_p Σ_i g_i · [N_i (value_p + scale moment_p (x_i − x_p)) + gradient_p ∇N_i] that
+// has scatter as ∂Φ/∂g and gather as ∂Φ/∂(value, moment, gradient): the position gradient of both.
+template <class T, int D>
+struct PositionGradientArguments {
+  Topology<T, D> topology;
+  Field<const T> x, value, moment, gradient;
+  NodeField<const T> nodes;  // g
+  double moment_scale = 1;
+  Field<T> position_gradient;  // [P, D], zero for particles outside
+  bool adds = false;           // to what is there
+};
+
 template <class T, int D>
 struct P2GBackwardArguments {
   P2GArguments<T, D> forward;  // its `nodes` unused
@@ -26,6 +38,9 @@ struct P2GBackwardArguments {
   Field<T> x, mass, velocity, affine, stress, volume,
       dt;             // adjoints per particle, dt with respect to the product dt * scene_dt; absent where not needed
   bool adds = false;  // x, mass and volume to what is there
+  // Of the G2P of the same step, whose position gradient comes first: it may read what is written here. Absent without
+  // nodes.
+  PositionGradientArguments<T, D> motion;
 };
 
 // nodes_i += Σ_p N_i (value_p + scale moment_p · (x_i − x_p)) + gradient_p · ∇N_i, for any number of channels. The
@@ -48,18 +63,6 @@ struct GatherArguments {
   double moment_scale = 1;
   double lost = 0;                   // what a particle gets whose position is not finite
   Field<T> value, moment, gradient;  // absent where not wanted; zero for other particles outside
-};
-
-// ∂Φ/∂x_p of the trilinear form Φ = Σ_p Σ_i g_i · [N_i (value_p + scale moment_p (x_i − x_p)) + gradient_p ∇N_i] that
-// has scatter as ∂Φ/∂g and gather as ∂Φ/∂(value, moment, gradient): the position gradient of both.
-template <class T, int D>
-struct PositionGradientArguments {
-  Topology<T, D> topology;
-  Field<const T> x, value, moment, gradient;
-  NodeField<const T> nodes;  // g
-  double moment_scale = 1;
-  Field<T> position_gradient;  // [P, D], zero for particles outside
-  bool adds = false;           // to what is there
 };
 
 }  // namespace mpm

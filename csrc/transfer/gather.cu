@@ -79,6 +79,18 @@ void gather(const GatherArguments<T, D>& a, Stream stream) {
 
 // ---- Position gradient
 
+// Of Σ_i g_i · N_i (value + moment · r) + gradient · ∇N_i in cells, of a form with S::SlopeForm affine.
+template <class S, bool Gradient, class Support, class T>
+__device__ void position_slope(const Support& support, const Weights<S::Order, T, S::D>& w, const T (&value)[S::K],
+                               const T (&moment)[S::K][S::D], const T (&gradient)[S::K][S::D], Sums<S>& s) {
+  sum_axis<S, 0>(support, support.rows, 0, w, value, moment, s);
+  if (Gradient) add_hessian<S>(support, w, gradient, s.slope);
+#pragma unroll
+  for (int k = 0; k < S::K; k++)
+#pragma unroll
+    for (int i = 0; i < S::D; i++) s.slope[i] -= moment[k][i] * s.value[k];
+}
+
 template <int Order_, class T_, int D_, int K_, bool Gradient>
 struct FieldPositionGradient {
   using T = T_;
@@ -126,15 +138,10 @@ struct FieldPositionGradient {
   template <class Support>
   __device__ Result compute(const Loaded& l, const Weights<Order, T, D>& w, const Support& support) const {
     Sums<Shape> s;
-    sum_axis<Shape, 0>(support, support.rows, 0, w, l.value, l.moment, s);
-    if (Gradient) add_hessian<Shape>(support, w, l.gradient, s.slope);
+    position_slope<Shape, Gradient>(support, w, l.value, l.moment, l.gradient, s);
     Result r;
 #pragma unroll
-    for (int i = 0; i < D; i++) {
-#pragma unroll
-      for (int k = 0; k < K; k++) s.slope[i] -= l.moment[k][i] * s.value[k];
-      r[i] = inverse_dx * s.slope[i];
-    }
+    for (int i = 0; i < D; i++) r[i] = inverse_dx * s.slope[i];
     return r;
   }
   __device__ void write(int p, const Loaded&, const Result& r) const {
@@ -204,8 +211,7 @@ struct MomentumAdjoint {
       }
     }
     Sums<Shape> s;
-    sum_axis<Shape, 0>(support, support.rows, 0, w, value, moment, s);
-    if (Gradient) add_hessian<Shape>(support, w, gradient, s.slope);
+    position_slope<Shape, Gradient>(support, w, value, moment, gradient, s);
     Result r;
     NodeMomentum<T, D> sums;
     sums.mass = s.value[0];
@@ -214,7 +220,6 @@ struct MomentumAdjoint {
       sums.momentum[i] = s.value[1 + i];
 #pragma unroll
       for (int j = 0; j < D; j++) {
-        s.slope[j] -= moment[1 + i][j] * s.value[1 + i];
         sums.moment[i][j] = s.moment[1 + i][j];
         sums.gradient[i][j] = Gradient ? s.gradient[1 + i][j] : T(0);
       }
@@ -246,9 +251,41 @@ struct MomentumAdjoint {
   __device__ void leave_out(int p) const { write(p, {}, {}); }
 };
 
+// The same after the position gradient of the motion, in one pass.
+template <int Order, class T, int D>
+struct StepAdjoint : MomentumAdjoint<Order, T, D, false> {
+  using Momentum = MomentumAdjoint<Order, T, D, false>;
+  using Motion = FieldPositionGradient<Order, T, D, D, false>;
+  using Result = typename Momentum::Result;
+  static constexpr int Others = D, resident = 4;
+  struct Loaded {
+    typename Momentum::Loaded momentum;
+    typename Motion::Loaded motion;
+  };
+  Motion motion;
+  NodeField<const T> others;
+
+  explicit StepAdjoint(const P2GBackwardArguments<T, D>& a) : Momentum(a), motion(a.motion, 0), others(motion.nodes) {}
+
+  __device__ Loaded load(int p, int scene) const { return {Momentum::load(p, scene), motion.load(p, scene)}; }
+  template <class Support, class Others>
+  __device__ Result compute(const Loaded& l, const Weights<Order, T, D>& w, const Support& support,
+                            const Others& others) const {
+    const mpm::Vector<T, D> x = motion.compute(l.motion, w, others);
+    Result r = Momentum::compute(l.momentum, w, support);
+    r.x = x + r.x;
+    return r;
+  }
+  __device__ void write(int p, const Loaded& l, const Result& r) const { Momentum::write(p, l.momentum, r); }
+};
+
 template <int Order, class T, int D>
 void p2g_backward(const P2GBackwardArguments<T, D>& a, Stream stream) {
-  if (has_gradient(a.forward))
+  const bool motion = a.motion.nodes.pointer, gradient = has_gradient(a.forward);
+  const bool together = motion && !gradient && !a.motion.gradient.pointer && a.x.pointer && a.adds;
+  if (together) return launch_gather(StepAdjoint<Order, T, D>(a), stream);
+  if (motion) position_gradient<Order>(a.motion, stream);
+  if (gradient)
     launch_gather(MomentumAdjoint<Order, T, D, true>(a), stream);
   else
     launch_gather(MomentumAdjoint<Order, T, D, false>(a), stream);

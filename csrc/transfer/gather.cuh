@@ -96,6 +96,12 @@ struct GridSupport {
     for (int i = 0, step = 1; i < D; i++, step *= kBlockWidth) row -= (block >> i & 1) * kBlockWidth * step;
     rows.row[block] = row;
   }
+  template <class Other>
+  __device__ void copy_places(const Other& support) {
+    rows = support.rows;
+#pragma unroll
+    for (int i = 0; i < D; i++) base[i] = support.base[i];
+  }
   __device__ bool is_far(int axis, int node) const { return node > 0 && base[axis] + node >= kBlockWidth; }
   __device__ void load(int row, int offset, T (&node)[K]) const { load_node<Quads>(nodes, row, offset, node); }
 };
@@ -274,9 +280,15 @@ class Follower {
 // Task: topology, nodes, position; load(p, scene), what it needs of a particle; compute(loaded, weights, support), what
 // the particle gets; write(p, loaded, result), with a result of zeros where positions are not those of the activation;
 // leave_out(p) for a particle outside. Where it drifts, particles may be in other active blocks than those of the
-// activation, write(...) returns where they go, and there is a drift to add that to.
+// activation, write(...) returns where they go, and there is a drift to add that to. Where it has `Others`, that many
+// channels of the nodes `others` have a support of their own, the last argument of compute(...).
 template <class Task>
 constexpr bool may_drift = requires { requires Task::drifts; };
+template <class Task>
+constexpr int kOthers = 0;
+template <class Task>
+  requires requires { Task::Others; }
+constexpr int kOthers<Task> = Task::Others;
 template <class Task>
 using FollowerOf = Follower<Task::Order, typename Task::T, Task::D>;
 
@@ -294,7 +306,14 @@ __device__ auto gather_from_grid(const Task& task, const Schedule<const int>& sc
     support.set_slot(4 * q + 2, v.z);
     support.set_slot(4 * q + 3, v.w);
   }
-  return task.write(p, loaded, task.compute(loaded, Weights<Task::Order, T, D>(f), support));
+  const Weights<Task::Order, T, D> weights(f);
+  if constexpr (kOthers<Task> > 0) {
+    GridSupport<T, kOthers<Task>, D, Quads> others{task.others};
+    others.copy_places(support);
+    return task.write(p, loaded, task.compute(loaded, weights, support, others));
+  } else {
+    return task.write(p, loaded, task.compute(loaded, weights, support));
+  }
 }
 
 template <bool Quads, class Task>
@@ -375,10 +394,12 @@ __device__ void gather_strays(const Task& task, const Schedule<const int>& sched
 template <bool Quads, class Task>
 __device__ void gather_by_items(const Task& task, const Schedule<const int>& schedule, FollowerOf<Task>& follower) {
   using T = typename Task::T;
-  constexpr int D = Task::D, K = Task::K, width = kBlockWidth + Task::Order;
+  constexpr int D = Task::D, K = Task::K, others = kOthers<Task>, width = kBlockWidth + Task::Order;
+  constexpr int size = D == 2 ? width * width : width * width * width;
   __shared__ Strays<may_drift<Task> ? kItemParticles : 1> strays;
   __shared__ BaseBlock<T, D> home;
-  __shared__ NodeValue<T, K> tile[D == 2 ? width * width : width * width * width];
+  __shared__ NodeValue<T, K> tile[size];
+  __shared__ NodeValue<T, others ? others : 1> others_tile[others ? size : 1];
   __shared__ int slots[1 << D];
   const Topology<T, D>& t = task.topology;
   const int items = *schedule.item_count;
@@ -397,6 +418,7 @@ __device__ void gather_by_items(const Task& task, const Schedule<const int>& sch
     __syncthreads();
     const unsigned active = may_drift<Task> ? FollowerOf<Task>::active_blocks(t, item.x) : 0;
     load_tile<Quads, Task::Order, T, K, D>(task.nodes, slots, tile);
+    if constexpr (others > 0) load_tile<Quads, Task::Order, T, others, D>(task.others, slots, others_tile);
     __syncthreads();
 #pragma unroll 1
     for (; k < end; k += kGatherThreads) {
@@ -409,7 +431,13 @@ __device__ void gather_by_items(const Task& task, const Schedule<const int>& sch
 #pragma unroll
       for (int axis = 0; axis < D; axis++) corner = corner * width + base[axis];
       const TileSupport<Task::Order, T, K> support{tile + corner};
-      const auto result = task.compute(loaded, Weights<Task::Order, T, D>(f), support);
+      const Weights<Task::Order, T, D> weights(f);
+      const auto result = [&] {
+        if constexpr (others > 0)
+          return task.compute(loaded, weights, support, TileSupport<Task::Order, T, others>{others_tile + corner});
+        else
+          return task.compute(loaded, weights, support);
+      }();
       if constexpr (!may_drift<Task>)
         task.write(p, loaded, in_block ? result : typename Task::Result{});
       else if (in_block)
@@ -451,7 +479,9 @@ void launch_gather(const Task& task, Stream stream) {
   if (particles == 0) return;
   const int64_t pieces = std::max(most_items(task.topology.max_blocks, particles), particles / kGatherThreads);
   if constexpr (Task::K == 3 || Task::K == 4) {
-    if (is_vector<Task::K>(task.nodes)) return launch_gather(task, gather_kernel<true, Task>, pieces, stream);
+    bool vectors = is_vector<Task::K>(task.nodes);
+    if constexpr (kOthers<Task> > 0) vectors = vectors && is_vector<kOthers<Task>>(task.others);
+    if (vectors) return launch_gather(task, gather_kernel<true, Task>, pieces, stream);
   }
   launch_gather(task, gather_kernel<false, Task>, pieces, stream);
 }

@@ -12,13 +12,14 @@ inline StressForm stress_form_of(int64_t form) {
 }
 }  // namespace mpm
 
-#define MPM_TRANSFER_KERNELS(PLAIN, ORDERED, SIZE)      \
-  ORDERED(p2g, P2GArguments)                            \
-  ORDERED(p2g_backward, P2GBackwardArguments)           \
-  ORDERED(scatter, ScatterArguments)                    \
-  ORDERED(gather, GatherArguments)                      \
-  ORDERED(position_gradient, PositionGradientArguments) \
-  ORDERED(g2p_advance, G2PAdvanceArguments)             \
-  PLAIN(advance, AdvanceArguments)                      \
+#define MPM_TRANSFER_KERNELS(PLAIN, ORDERED, SIZE)           \
+  ORDERED(p2g, P2GArguments)                                 \
+  ORDERED(p2g_backward, P2GBackwardArguments)                \
+  ORDERED(scatter, ScatterArguments)                         \
+  ORDERED(gather, GatherArguments)                           \
+  ORDERED(position_gradient, PositionGradientArguments)      \
+  ORDERED(g2p_advance, G2PAdvanceArguments)                  \
+  ORDERED(g2p_advance_backward, G2PAdvanceBackwardArguments) \
+  PLAIN(advance, AdvanceArguments)                           \
   PLAIN(advance_backward, AdvanceBackwardArguments)
 MPM_BACKEND_KERNELS(MPM_TRANSFER_KERNELS)

@@ -64,8 +64,12 @@ void p2g_backward_with(const P2GBackwardArguments<T, D>& a, const Field<T> wante
 }
 
 template <int Order, class T, int D>
+void position_gradient(const PositionGradientArguments<T, D>&);
+
+template <int Order, class T, int D>
 void p2g_backward(const P2GBackwardArguments<T, D>& a) {
   const P2GArguments<T, D>& in = a.forward;
+  if (a.motion.nodes.pointer) position_gradient<Order>(a.motion);
   const Field<T> wanted[] = {a.mass, a.x, a.velocity, a.affine, a.stress, a.volume, a.dt};  // as in for_wanted
   if (in.stress.pointer && in.form == StressForm::gradient)
     p2g_backward_with<Order, true, true>(a, wanted);
