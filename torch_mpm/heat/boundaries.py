@@ -8,6 +8,7 @@ with areas A_s (`Surface`), h_i = Σ_s A_s η_s N_i(x_s), or by the free surface
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
@@ -75,6 +76,15 @@ class HeatNodes:
     def time(self) -> float | Tensor:
         """[s]"""
         return self.state.time
+
+    @functools.cached_property
+    def free_area(self) -> Tensor:
+        """|Σ_p V_p ∇N_i(x_p)| [N] [m²], see `FreeSurface`."""
+        x = self.state.x
+        P, D = x.shape
+        axes = torch.eye(D, dtype=x.dtype, device=x.device)
+        gradient = self.volume[:, None, None] * axes
+        return norm(scatter(self.blocks, x, x.new_zeros(P, D), gradient=gradient))
 
     def scene(self) -> Tensor | None:
         """Scene of each node, int32 [N]; None for one scene."""
@@ -192,11 +202,7 @@ class FreeSurface(TensorModule):
 
     def integrate(self, nodes: HeatNodes, density: Timed) -> Tensor:
         """∫ N_i density dA [N] of a density per area: a number, a tensor [], [B] or [N], or a function of the time."""
-        x = nodes.state.x
-        P, D = x.shape
-        axes = torch.eye(D, dtype=x.dtype, device=x.device)
-        gradient = nodes.volume[:, None, None] * axes
-        return norm(scatter(nodes.blocks, x, x.new_zeros(P, D), gradient=gradient)) * nodes.per_node(density)
+        return nodes.free_area * nodes.per_node(density)
 
 
 def node_weights(blocks: Blocks, x: Tensor, scene: Tensor | None) -> tuple[Tensor, Tensor]:
