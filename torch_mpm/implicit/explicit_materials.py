@@ -79,7 +79,6 @@ class SolvedNodes:
         return others.index_copy(0, self.rows_in_step, solution.index_select(0, self.rows))
 
 
-@torch.no_grad()
 def solved_nodes(blocks: Blocks, particles: Any) -> SolvedNodes:
     """The nodes of particles that are a part of those of a step, whose active blocks are given."""
     step_grid = blocks.grid
@@ -89,7 +88,7 @@ def solved_nodes(blocks: Blocks, particles: Any) -> SolvedNodes:
     )
     own = grid.activate(particles.x, particles.scene)
     slots = torch.where(own.block >= 0, blocks.table[own.block.clamp_min(0).long()], -1)
-    weights = scatter(own, particles.x, particles.mass[:, None])[:, 0]
+    weights = scatter(own, particles.x.detach(), particles.mass.detach()[:, None])[:, 0]
     in_block = torch.arange(grid.nodes_per_block, device=slots.device)
     rows = ((weights > 0).view(len(slots), -1) & (slots >= 0)[:, None]).flatten().nonzero().squeeze(1)
     rows_in_step = (slots[:, None].long() * grid.nodes_per_block + in_block).flatten().index_select(0, rows)
