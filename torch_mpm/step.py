@@ -18,8 +18,7 @@ from .failures import Failures, problems_of_state, raise_failures
 from .grid import Blocks, Grid, check_grid
 from .heat.heat import Heat
 from .implicit.comparison import compare
-from .implicit.explicit_materials import solved_materials
-from .implicit.implicit import Implicit, ImplicitReport, as_integrator, check_implicit
+from .implicit.implicit import Implicit, ImplicitReport, as_integrator, check_explicit_materials, check_implicit
 from .impulses import Impulses, check_impulse, impulses_of, no_impulse
 from .laws.custom import as_law
 from .laws.material import Material
@@ -130,8 +129,6 @@ class Step(TensorModule):
         super().__setattr__(name, _argument(self, name, value))
         if name in ("law", "heat"):
             self._fit_law()
-        if name in ("law", "integrator"):
-            self._check_explicit_materials()
 
     def _fit_law(self) -> None:
         """What the law reads of a step, and what the step wants of its law."""
@@ -142,11 +139,6 @@ class Step(TensorModule):
             for part in parts:
                 if isinstance(part, Material):
                     part.dissipation = True
-
-    def _check_explicit_materials(self) -> None:
-        integrator = getattr(self, "integrator", None)
-        if integrator is not None and integrator.explicit:
-            solved_materials(self.law, integrator.explicit)
 
     def register_full_backward_hook(self, *arguments: Any, **options: Any) -> Any:
         """Raises: PyTorch's hooks would never be called for a `State`.
@@ -348,7 +340,6 @@ class Step(TensorModule):
         moving = [b for b in self.boundaries.entries if isinstance(b, Obstacle) and b.moves]
         fused = [b for b in moving if fusible(b, state.time)][:MAX_OBSTACLES]
         others = [b for b in moving if not any(b is kept for kept in fused)]
-        state = self.prepare(state)
 
         def found(law: Material, particles: Any, judge: bool) -> Survey:
             return look(
@@ -357,6 +348,7 @@ class Step(TensorModule):
             )
 
         with full_precision(state.x):
+            state = self.prepare(state)
             figures = found(self.law, state, judge)
             if self.integrator is not None and self.integrator.explicit:
                 figures = figures._replace(rate=found(*self.integrator.unsolved(self.law, state), False).rate)
@@ -462,7 +454,9 @@ def _argument(step: Step, name: str, value: Any) -> Any:
     if name == "grid":
         check_grid(value)
     if name == "law":
-        return as_law("law", value)
+        law = as_law("law", value)
+        check_explicit_materials(getattr(step, "integrator", None), law)
+        return law
     if name == "transfer":
         check_choice("transfer", value, TRANSFERS)
     if name == "stress_form":
@@ -482,7 +476,9 @@ def _argument(step: Step, name: str, value: Any) -> Any:
     if name == "on_particles" and value is not None and not callable(value):
         raise TypeError(f"on_particles must be a function, a module or None, got {shape_of(value)}")
     if name == "integrator" and value is not None:
-        return as_integrator(value)
+        integrator = as_integrator(value)
+        check_explicit_materials(integrator, step.law)
+        return integrator
     if name == "heat" and value is not None and not isinstance(value, Heat):
         raise TypeError(f"heat must be a Heat or None, got {shape_of(value)}")
     return value

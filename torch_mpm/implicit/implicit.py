@@ -238,6 +238,16 @@ def check_implicit(step: Step, state: State) -> None:
             raise NotImplementedError(f"an implicit step does not take {what} yet: use integrator='explicit'")
 
 
+def check_explicit_materials(integrator: Implicit | None, law: Material) -> None:
+    """Check that the explicit materials of an integrator are laws of a mixture, and not all of them.
+
+    Raises:
+        ValueError: as `solved_materials`.
+    """
+    if integrator is not None and integrator.explicit:
+        solved_materials(law, integrator.explicit)
+
+
 INTEGRATORS = ("explicit", "implicit")
 
 
