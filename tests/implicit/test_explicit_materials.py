@@ -313,16 +313,19 @@ def test_gradients_with_the_flow_inside(device):
     check_gradients(grid, material, values, names, 1e-5, options={"plasticity": "inside"}, solid=sand)
 
 
-def test_gradcheck_of_a_step(device):
-    """Through v and the deformations of both materials, of every entry of the results."""
-    grid = mpm.Grid(0.5, (0.0, 0.0), (1.0, 1.0))
-    points = mpm.seed.box((0.25, 0.25), (0.75, 0.5), grid, per_cell=4)
+@pytest.mark.parametrize("solids", [1, 2])
+def test_gradcheck_of_a_step(solids, dim, device):
+    """Through v and the deformations of a fluid and one or two solids, of every entry of the results."""
+    grid = mpm.Grid(0.5, (0.0,) * dim, (1.0,) * dim)
+    points = mpm.seed.box((0.25,) * dim, (0.75, 0.5, 0.5)[:dim], grid, per_cell=2**dim)
     state = mpm.State.at_rest(points, density=1000.0, dtype=torch.float64, device=device)
-    eye = torch.eye(2, dtype=torch.float64, device=device)
-    material = torch.arange(len(state), device=device).remainder(2).int()
-    v, F = torch.randn_like(state.v), eye + 0.05 * torch.randn(len(state), 2, 2, dtype=torch.float64).to(device)
+    eye = torch.eye(dim, dtype=torch.float64, device=device)
+    material = torch.arange(len(state), device=device).remainder(1 + solids).int()
+    v, F = torch.randn_like(state.v), eye + 0.05 * torch.randn(len(state), dim, dim, dtype=torch.float64).to(device)
     J = 1 + 0.03 * torch.randn_like(state.mass)
-    step = mpm.Step(grid, mixture(), (0.0, -9.8), "slip", integrator=Implicit(**TIGHT, explicit=[FLUID]))
+    law = mpm.Mixture([*mixture().laws, mpm.Hencky(E=3e5, nu=0.2)][: 1 + solids])
+    gravity = (0.0, -9.8, 0.0)[:dim]
+    step = mpm.Step(grid, law, gravity, "slip", integrator=Implicit(**TIGHT, explicit=[FLUID]))
 
     def after(v, F, J):
         end = step(state.replace(v=v, F=F, J=J, material=material), 1e-3)
