@@ -18,7 +18,7 @@ from .failures import Failures, problems_of_state, raise_failures
 from .grid import Blocks, Grid, check_grid
 from .heat.heat import Heat
 from .implicit.comparison import compare
-from .implicit.implicit import Implicit, ImplicitReport, as_integrator, check_implicit
+from .implicit.implicit import Implicit, ImplicitReport, as_integrator, check_explicit_materials, check_implicit
 from .impulses import Impulses, check_impulse, impulses_of, no_impulse
 from .laws.custom import as_law
 from .laws.material import Material
@@ -193,10 +193,13 @@ class Step(TensorModule):
             state = state.replace(extra={**state.extra, **history})
         if self.integrator is None:
             nodes = p2g(blocks, state.x, state.mass, state.v, affine, stress, state.volume, dt, form)
-            velocity, impulse = self._update_grid(blocks, nodes, state, dt)
+            velocity, impulse = self.update_grid(blocks, nodes, state, dt)
         else:
             check_implicit(self, state)
-            velocity, impulse = self._implicit_velocity(blocks, Overlay(state, dt=dt, **fields), affine, dt), None
+            after: Any = Overlay(state, dt=dt, **fields)
+            nodes, velocity, impulse = *self._implicit_velocity(blocks, after, affine, stress, dt), None
+        if self.on_grid is not None:
+            velocity = from_half(self.on_grid(blocks, velocity, nodes[:, 0], dt), nodes)
         deformed = {name: fields.get(name, getattr(state, name)) for name in ("F", "J")}
         keeps_C = self.transfer == "apic" or law.viscous
         x, v, C, F, J = g2p_advance(
@@ -229,10 +232,11 @@ class Step(TensorModule):
         state = state.replace(**changes) if changes else state
         return state if self.heat is None else self.heat.prepare(state)
 
-    def _update_grid(
-        self, blocks: Blocks, nodes: Tensor, state: State, dt: float | Tensor
+    def update_grid(
+        self, blocks: Blocks, nodes: Tensor, state: Any, dt: float | Tensor
     ) -> tuple[Tensor, Tensor | None]:
-        """Node velocities, and the impulses on boundaries and walls where they are asked for."""
+        """Node velocities of an explicit step [N, D] [m/s] before `on_grid`, from mass and momentum [N, 1 + D], and the
+        impulses on boundaries and walls where the state counts them."""
         gravity = self.gravity_like(state.x)
         velocity = grid_update(blocks, nodes, gravity, dt, self.walls)
         impulse: Tensor | None = None
@@ -242,16 +246,18 @@ class Step(TensorModule):
             velocity, on_boundaries = after_boundaries(blocks, velocity, boundaries, state, dt, asked)
         if state.impulse is not None:
             impulse = torch.cat([*on_boundaries, wall_impulses(blocks, nodes, gravity, dt, self.walls)], 1)
-        if self.on_grid is not None:
-            velocity = from_half(self.on_grid(blocks, velocity, nodes[:, 0], dt), nodes)
         return velocity, impulse
 
-    def _implicit_velocity(self, blocks: Blocks, state: Any, affine: Tensor | None, dt: float | Tensor) -> Tensor:
-        """Node velocities with the forces at the end of the step, of particles after the return map."""
+    def _implicit_velocity(
+        self, blocks: Blocks, state: Any, affine: Tensor | None, stress: Tensor, dt: float | Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Mass and momentum of the nodes, and their velocities with the forces at the end of the step, of particles
+        after the return map; forces of explicit materials are those of their stress at its start."""
         assert self.integrator is not None
-        nodes = p2g(blocks, state.x, state.mass, state.v, affine)
-        velocity = self.integrator.velocities(self, blocks, state, nodes, dt)
-        return velocity if self.on_grid is None else from_half(self.on_grid(blocks, velocity, nodes[:, 0], dt), nodes)
+        early = self.integrator.explicit_stress(self.law, state, stress)
+        impulse = () if early is None else (early, state.volume, dt, self.stress_form)
+        nodes = p2g(blocks, state.x, state.mass, state.v, affine, *impulse)
+        return nodes, self.integrator.velocities(self, blocks, state, nodes, dt)
 
     @property
     def solve_report(self) -> ImplicitReport | None:
@@ -316,7 +322,9 @@ class Step(TensorModule):
     def stable_dt(self, state: State, cfl: float = 0.5) -> Tensor:
         """Largest stable time step of each scene [s], [B], times `cfl`; see `torch_mpm.cfl.stable_dt`.
 
-        Moving obstacles count; what `on_grid` and other boundaries do to the velocities is not known.
+        Moving obstacles count; what `on_grid` and other boundaries do to the velocities is not known. This is the limit
+        of explicit steps, which implicit ones may exceed; with explicit materials, that of these alone, which they may
+        not.
         """
         check_number("cfl", cfl, "positive and finite", lambda v: 0 < v < math.inf)
         return (cfl / self.survey(state, judge=False).rate).to(state.x.dtype)
@@ -332,13 +340,21 @@ class Step(TensorModule):
         moving = [b for b in self.boundaries.entries if isinstance(b, Obstacle) and b.moves]
         fused = [b for b in moving if fusible(b, state.time)][:MAX_OBSTACLES]
         others = [b for b in moving if not any(b is kept for kept in fused)]
-        with full_precision(state.x):
+
+        def found(law: Material, particles: Any, judge: bool) -> Survey:
             return look(
-                *(self.grid, self.law, self.prepare(state), "flip" if self._flip_share else self.transfer),
-                *(self.stress_form, self._obstacle_speed(others, state), fused, judge),
+                *(self.grid, law, particles, "flip" if self._flip_share else self.transfer),
+                *(self.stress_form, self._obstacle_speed(others, particles), fused, judge),
             )
 
-    def _obstacle_speed(self, obstacles: list[Obstacle], state: State) -> Tensor | None:
+        with full_precision(state.x):
+            state = self.prepare(state)
+            figures = found(self.law, state, judge)
+            if self.integrator is not None and self.integrator.explicit:
+                figures = figures._replace(rate=found(*self.integrator.unsolved(self.law, state), False).rate)
+            return figures
+
+    def _obstacle_speed(self, obstacles: list[Obstacle], state: Any) -> Tensor | None:
         """Largest speed of the obstacles that a particle may touch [P] [m/s]; None where there are none."""
         if not obstacles:
             return None
@@ -438,7 +454,9 @@ def _argument(step: Step, name: str, value: Any) -> Any:
     if name == "grid":
         check_grid(value)
     if name == "law":
-        return as_law("law", value)
+        law = as_law("law", value)
+        check_explicit_materials(getattr(step, "integrator", None), law)
+        return law
     if name == "transfer":
         check_choice("transfer", value, TRANSFERS)
     if name == "stress_form":
@@ -458,7 +476,9 @@ def _argument(step: Step, name: str, value: Any) -> Any:
     if name == "on_particles" and value is not None and not callable(value):
         raise TypeError(f"on_particles must be a function, a module or None, got {shape_of(value)}")
     if name == "integrator" and value is not None:
-        return as_integrator(value)
+        integrator = as_integrator(value)
+        check_explicit_materials(integrator, step.law)
+        return integrator
     if name == "heat" and value is not None and not isinstance(value, Heat):
         raise TypeError(f"heat must be a Heat or None, got {shape_of(value)}")
     return value

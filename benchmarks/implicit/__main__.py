@@ -55,7 +55,8 @@ def of_sand(quick: bool, device: str, out: Path) -> Result:
 
 def of_cost(quick: bool, device: str, out: Path) -> Result:
     return {"Cost, in units of a gather and a scatter": cost.cost(device, quick),
-            "Steps": cost.steps(device, quick), "Batches": cost.batches(device, quick)}  # fmt: skip
+            "Steps": cost.steps(device, quick), "Beside a fluid": cost.beside_a_fluid(device, quick),
+            "Batches": cost.batches(device, quick)}  # fmt: skip
 
 
 def of_multigrid(quick: bool, device: str, out: Path) -> Result:

@@ -2,7 +2,8 @@
 
 A product of the Hessian, an iteration of conjugate gradients and the node blocks, beside a gather and a scatter of D
 channels with their moments; whole steps of a cube of rubber that lands on its face, many times as long as explicit ones
-may be; and a batch of small scenes beside the same scenes one by one.
+may be; those of a cube of rubber that lands on water, with the water in the solve and explicit; and a batch of small
+scenes beside the same scenes one by one.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from torch import Tensor
 
 import torch_mpm as mpm
 from torch_mpm import ops
+from torch_mpm.implicit import Implicit
 
 from ..speed.timing import Clock
 
@@ -78,6 +80,33 @@ def steps(device: str, quick: bool) -> list[dict[str, Any]]:
         shown = {"particles": len(start), "dt [ms]": 1e3 * times * limit, "over the explicit limit": times}
         work = {"Newton": int(report.iterations), "CG": int(report.cg_iterations)}
         rows.append({**shown, "step [s]": seconds, **work})
+    return rows
+
+
+def beside_a_fluid(device: str, quick: bool) -> list[dict[str, Any]]:
+    """A cube of rubber that falls at 1 m/s on water of ten times its mass, in steps of half the limit of the water."""
+    cells = 16 if quick else 64 if device == "cpu" else 192
+    dx, side, level = 1.0 / cells, cells // 5 + 1, cells // 10
+    grid = mpm.Grid(dx, (0.0,) * 3, (1.0, 0.75, 1.0))
+    at, depth = dx * ((cells - side) // 2), dx * level
+    water = mpm.State.at_rest(mpm.seed.box((0.0,) * 3, (1.0, depth, 1.0), grid, per_cell=8), device=device)
+    ends = (at, depth, at), (at + dx * side, depth + dx * side, at + dx * side)
+    rubber = mpm.State.at_rest(mpm.seed.box(*ends, grid, per_cell=8), velocity=(0.0, -1.0, 0.0), device=device)
+    bodies = [s.replace(material=torch.full((len(s),), k).int().to(device)) for k, s in enumerate((rubber, water))]
+    state, rows = mpm.State.concatenate(bodies), []
+    for E in (1e7, 1e8, 1e9):
+        law = mpm.Mixture([mpm.NeoHookean(E=E, nu=0.3), mpm.WeaklyCompressible(1e5)])
+        steps = [
+            mpm.Step(grid, law, (0, -9.8, 0), "slip", integrator=integrator)
+            for integrator in ("implicit", Implicit(explicit=[1]), "explicit")
+        ]
+        dt, limit = (float(step.stable_dt(state)[0]) for step in steps[1:])
+        landed = mpm.rollout(steps[1], state, 3, dt)
+        whole, mixed, explicit = (seconds_of(s, landed, d) for s, d in zip(steps, (dt, dt, limit), strict=True))
+        assert all(s.solve_report is None or bool(s.solve_report.converged.all()) for s in steps)
+        counts = {"water": len(water), "rubber": len(rubber), "E [Pa]": E, "dt [ms]": 1e3 * dt}
+        rows.append({**counts, "all in the solve [s]": whole, "water explicit [s]": mixed, "ratio": whole / mixed,
+                     "explicit steps for the same time [s]": explicit * dt / limit})  # fmt: skip
     return rows
 
 

@@ -23,6 +23,6 @@ def test_implicit_steps(tmp_path):
     spread = {(row["return map"], row["energy"]): row["spread"] for row in rows("sand", "Clump")}
     assert spread.pop(("after the solve", "full")) < 0.5 and all(share > 0.98 for share in spread.values())
     assert len(rows("sand", "Collapse")) == 6 and len(rows("crossover", "Costs")) == 2
-    assert len(rows("cost", "Batches")) == 1
+    assert len(rows("cost", "Batches")) == 1 and len(rows("cost", "Beside a fluid")) == 3
     assert all(row["converged"] and row["difference"] < 1e-5 for row in rows("multigrid", "Steps"))
     assert {file.name for file in tmp_path.glob("*.png")} == {f"implicit_{n}.png" for n in ("work", "order", "sand")}

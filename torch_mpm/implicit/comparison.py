@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -50,12 +51,15 @@ class Comparison(NamedTuple):
     limit: float
     """Length of explicit steps, half the stable one [s]."""
     length: float
-    """Length of implicit steps, with errors of some 2% [s]."""
+    """Length of implicit steps, with errors of some 2%, or shorter where explicit materials limit it [s]."""
     faster: float
     """Time of the explicit steps over that of the implicit ones."""
+    limited: bool = False
+    """Whether explicit materials limit the length of implicit steps, to half the stable one."""
 
     def __str__(self) -> str:
-        given = f"{self.length:.2g} s (errors of some 2%) beside explicit ones of {self.limit:.2g} s"
+        why = "half the limit of the explicit materials" if self.limited else "errors of some 2%"
+        given = f"{self.length:.2g} s ({why}) beside explicit ones of {self.limit:.2g} s"
         if self.faster > 1:
             return f"implicit steps of {given} would be about {self.faster:.2g} times as fast"
         return f"implicit steps of {given} would be about {1 / self.faster:.2g} times as slow"
@@ -67,7 +71,7 @@ def compare(step: Step, state: State, speed: float) -> Comparison:
     Waits for the device. Costs are those of the kind of device that has the state.
 
     Args:
-        step: with either integrator; its grid, law and boundaries count.
+        step: with either integrator; its grid, law, boundaries and explicit materials count.
         state: particles, whose number and stiffness count.
         speed: of the motion [m/s], of moving boundaries too.
 
@@ -79,12 +83,25 @@ def compare(step: Step, state: State, speed: float) -> Comparison:
     if not len(state):
         raise ValueError("state must have particles to compare integrators, got none")
     state = step.prepare(state)
+    law, solved = (step.law, state) if step.integrator is None else step.integrator.solved(step.law, state)
     with torch.no_grad():
-        step.law.trial_energy(Overlay(state, C=None), state)
-        limits = step.stable_dt(state, cfl=0.5).double()
-    limit, length = float(limits.min()), MOVED * step.grid.dx / speed
+        law.trial_energy(Overlay(solved, C=None), solved)
+        limit, allowed = _stable_dt(step, state)
     if not 0 < limit < math.inf:
         raise ValueError(f"state must have a stable time step, positive and finite, got {limit}")
-    kind = "cuda" if state.x.is_cuda else "cpu"
-    explicit, implicit = (costs[kind][step.grid.dim].of(len(state)) for costs in (EXPLICIT, IMPLICIT))
-    return Comparison(limit, length, explicit / limit * length / implicit)
+    length = MOVED * step.grid.dx / speed
+    kind, dim, P = "cuda" if state.x.is_cuda else "cpu", step.grid.dim, solved.x.shape[0]
+    explicit, implicit = EXPLICIT[kind][dim], IMPLICIT[kind][dim]
+    cost = implicit.of(P) + explicit.per_particle * (len(state) - P)
+    faster = explicit.of(len(state)) / limit * min(length, allowed) / cost
+    return Comparison(limit, min(length, allowed), faster, allowed < length)
+
+
+def _stable_dt(step: Step, state: State) -> tuple[float, float]:
+    """Half the stable length of explicit steps, and of implicit ones with their explicit materials [s]."""
+    given = float(step.stable_dt(state, cfl=0.5).double().min())
+    if step.integrator is None or not step.integrator.explicit:
+        return given, math.inf
+    explicit = copy.copy(step)
+    explicit.integrator = None
+    return float(explicit.stable_dt(state, cfl=0.5).double().min()), given

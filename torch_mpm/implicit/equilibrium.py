@@ -30,12 +30,14 @@ def equilibrium(step: Step, state: State, dt: float) -> State:
         whether the solve converged.
 
     Raises:
-        ValueError: for an explicit step, one with heat, or a dt that is not positive.
+        ValueError: for an explicit step, one with heat or explicit materials, or a dt that is not positive.
 
     Differentiable as the step is: a stiffness can be found from a sag (examples/beam_stiffness.py).
     """
     if step.integrator is None:
         raise ValueError("equilibrium needs a step with integrator='implicit'")
+    if step.integrator.explicit:
+        raise ValueError(f"equilibrium needs a step without explicit materials, got {list(step.integrator.explicit)}")
     if step.heat is not None:
         raise ValueError("equilibrium needs a step without heat, which would be conducted for dt: set step.heat = None")
     check_number("dt", dt, "a positive number of seconds", lambda v: v > 0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
@@ -13,9 +14,12 @@ from ..boundaries.obstacles import Obstacle, motion_tensors
 from ..capture import is_captured, is_traced, outside_transforms, without_transforms
 from ..errors import check_count, check_number
 from ..failures import Problem, unsolved_steps
+from ..laws.material import Material
+from ..laws.mixture import Mixture
 from ..ops import grid_update
 from .adjoint import differentiable
 from .bounds import node_bounds
+from .explicit_materials import checked_materials, solved_materials, solved_nodes
 from .mirrors import mirrors_of
 from .newton import Minimum, Options, minimise
 from .system import ImplicitSystem
@@ -58,8 +62,12 @@ class Implicit:
         adjoint_tolerance: relative, of the one linear solve of a backward pass; no less than 1e-5 in float32.
         plasticity: "after": the solve sees the elastic stress of the trial deformation, and the flow follows. "inside":
             it sees the stress after the flow, so that no more trial stress than the material bears acts on the motion.
+        explicit: materials, numbers of laws of the step's `Mixture`, that take no part in the solve: their stress at
+            the start of the step acts on the nodes, as in an explicit step, which limits dt (`Step.stable_dt`). For
+            soft materials beside stiff ones, such as a fluid beside rubber.
 
     Attributes:
+        explicit: these materials, in order.
         report: `ImplicitReport` of the latest step, None before the first.
         adjoint_converged: bool [B], whether all solves of backward passes since the latest step converged; None before
             the first. Where one did not, the gradients of that scene are NaN.
@@ -78,6 +86,7 @@ class Implicit:
         max_cg_iterations: int = 1000,
         adjoint_tolerance: float = 1e-8,
         plasticity: str = "after",
+        explicit: Sequence[int] = (),
     ) -> None:
         for name, value in (("tolerance", tolerance), ("adjoint_tolerance", adjoint_tolerance)):
             check_number(name, value, "between 0 and 1", lambda v: 0 < v < 1)
@@ -86,6 +95,7 @@ class Implicit:
         if plasticity not in PLASTICITY:
             raise ValueError(f"plasticity must be one of {sorted(PLASTICITY)}, got {plasticity!r}")
         self.plasticity = plasticity
+        self.explicit = checked_materials(explicit)
         self.options = Options(float(tolerance), int(max_iterations), int(max_cg_iterations))
         self.adjoint_tolerance = float(adjoint_tolerance)
         self.report: ImplicitReport | None = None
@@ -101,7 +111,7 @@ class Implicit:
             step: whose law, gravity, walls and boundaries count.
             blocks: the active blocks.
             state: particles after the return map.
-            nodes: mass and momentum before gravity [N, 1 + D] [kg, kg m/s].
+            nodes: mass and momentum before gravity [N, 1 + D] [kg, kg m/s], with the impulse of `explicit_stress`.
             dt: [s], a number or a tensor [], [1] or [B].
 
         Differentiable by everything that the state, the law, gravity and the nodes depend on, by one linear solve.
@@ -111,14 +121,28 @@ class Implicit:
         start = grid_update(blocks, nodes, gravity, dt, walls)
         if not blocks.grid.scenes:
             return start
-        wants_gradient = torch.is_grad_enabled()
         before = None if gravity is None else grid_update(blocks, nodes.detach(), walls=walls)
-        flows = self.plasticity == "inside"
-        mirrors = mirrors_of(blocks, walls, nodes[:, 0].detach())
-        system = ImplicitSystem(
-            *(blocks, step.law, state, nodes[:, 0], start, dt, step.stress_form, flows, before, mirrors)
-        )
-        bounds = node_bounds(blocks, step.walls, step.boundaries.entries, start, state.time)
+        form, flows = step.stress_form, self.plasticity == "inside"
+        law, particles = self.solved(step.law, state)
+        if not self.explicit:
+            mirrors = mirrors_of(blocks, walls, nodes[:, 0].detach())
+            system = ImplicitSystem(blocks, law, state, nodes[:, 0], start, dt, form, flows, before, mirrors)
+            return self._solution(step, system)
+        part, mass = solved_nodes(blocks, particles), nodes[:, 0]
+        images = mirrors_of(blocks, walls, mass.detach())
+        if images is not None:
+            mass = images.gathered(mass, part.chosen)
+        mass, start = part.taken(mass), part.taken(start)
+        before = None if before is None else part.taken(before)
+        mirrors = mirrors_of(part.blocks, walls, mass.detach())
+        system = ImplicitSystem(part.blocks, law, particles, mass, start, dt, form, flows, before, mirrors)
+        velocity = part.placed(self._solution(step, system), step.update_grid(blocks, nodes, state, dt)[0])
+        return velocity if images is None else images.followed(velocity, part.chosen)
+
+    def _solution(self, step: Step, system: ImplicitSystem) -> Tensor:
+        """The minimum of a system within what the walls and boundaries of a step allow; differentiable."""
+        wants_gradient = torch.is_grad_enabled()
+        bounds = node_bounds(system.blocks, step.walls, step.boundaries.entries, system.start, system.state.time)
         with torch.no_grad():
             fixed = system.detached() if wants_gradient else system
             minimum = minimise(fixed, bounds, self.options)
@@ -127,6 +151,25 @@ class Implicit:
         if not wants_gradient:
             return minimum.v
         return differentiable(self, system, fixed, bounds, minimum)
+
+    def solved(self, law: Material, state: Any) -> tuple[Material, Any]:
+        """The law and the particles of the solve: those of a step without its explicit materials."""
+        if not self.explicit:
+            return law, state
+        assert isinstance(law, Mixture)
+        return law.only(state, solved_materials(law, self.explicit))
+
+    def unsolved(self, law: Material, state: Any) -> tuple[Material, Any]:
+        """The law of the explicit materials and their particles."""
+        assert isinstance(law, Mixture)
+        return law.only(state, self.explicit)
+
+    def explicit_stress(self, law: Material, state: Any, stress: Tensor) -> Tensor | None:
+        """The stress of all particles [P, D, D] [Pa], zero for those of the solve; None without explicit materials."""
+        if not self.explicit:
+            return None
+        assert isinstance(law, Mixture)
+        return stress.index_fill(0, law.particles_of(state, solved_materials(law, self.explicit)), 0)
 
     def record_adjoint(self, converged: Tensor) -> None:
         """One solve of a backward pass, bool [B]."""
@@ -193,6 +236,16 @@ def check_implicit(step: Step, state: State) -> None:
     for what, present in reasons.items():
         if present:
             raise NotImplementedError(f"an implicit step does not take {what} yet: use integrator='explicit'")
+
+
+def check_explicit_materials(integrator: Implicit | None, law: Material) -> None:
+    """Check that the explicit materials of an integrator are laws of a mixture, and not all of them.
+
+    Raises:
+        ValueError: as `solved_materials`.
+    """
+    if integrator is not None and integrator.explicit:
+        solved_materials(law, integrator.explicit)
 
 
 INTEGRATORS = ("explicit", "implicit")

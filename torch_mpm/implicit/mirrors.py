@@ -32,9 +32,7 @@ class Mirrors:
 
     def symmetric(self, values: Tensor) -> Tensor:
         """Vectors [N, D] or matrices [N, D, D] of nodes, projected on what is symmetric; differentiable."""
-        present = self.groups >= 0
-        rows = torch.where(present, self.groups, self.groups[:, :1]).long()
-        own = (rows[:, :, None] == rows[:, None, :]).logical_and_(present[:, None, :]).sum(-1)
+        rows, present, own = self._members()
         sign = self._signs(values.shape[1]).to(values)
         if values.dim() == 3:
             sign = sign[:, :, None] * sign[:, None, :]
@@ -44,6 +42,31 @@ class Mirrors:
         rest = values.index_fill(0, rows.flatten(), 0)
         return rest.index_add(0, rows.flatten(), parts.flatten(0, 1))
 
+    def gathered(self, mass: Tensor, chosen: Tensor) -> Tensor:
+        """Masses of nodes [N], those of each group shared evenly among its chosen ones, bool [N]; differentiable."""
+        rows, present, own = self._members()
+        share = (present / own).to(mass.dtype)
+        kept = share * chosen[rows]
+        count = kept.sum(1, keepdim=True)
+        each = (share * mass[rows]).sum(1, keepdim=True) / torch.where(count > 0, count, 1)
+        return _replaced(mass, rows, kept > 0, each / own)
+
+    def followed(self, v: Tensor, chosen: Tensor) -> Tensor:
+        """Velocities of nodes [N, D], for the rest of each group those of its chosen ones, bool [N], which are
+        symmetric already; differentiable."""
+        rows, present, own = self._members()
+        kept = (present & chosen[rows]).to(v.dtype)[:, :, None] / own[:, :, None]
+        sign, count = self._signs(v.shape[1]).to(v), kept.sum(1, keepdim=True)
+        mean = (kept * sign * v[rows]).sum(1, keepdim=True) / torch.where(count > 0, count, 1)
+        return _replaced(v, rows, present & ((kept == 0) & (count > 0))[:, :, 0], sign * mean / own[:, :, None])
+
+    def _members(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Rows of the nodes of each group int64 [G, 2^D], which of them are there, and how often each row is."""
+        present = self.groups >= 0
+        rows = torch.where(present, self.groups, self.groups[:, :1]).long()
+        own = (rows[:, :, None] == rows[:, None, :]).logical_and_(present[:, None, :]).sum(-1)
+        return rows, present, own
+
     def has(self, nodes: int) -> Tensor:
         """Which of so many nodes have an image, bool [N]."""
         result = torch.zeros(nodes, dtype=torch.bool, device=self.groups.device)
@@ -52,6 +75,11 @@ class Mirrors:
     def _signs(self, dim: int) -> Tensor:
         k = torch.arange(1 << dim, device=self.groups.device)
         return 1 - 2 * ((k[:, None] >> torch.arange(dim, device=k.device)) & 1)
+
+
+def _replaced(values: Tensor, rows: Tensor, where: Tensor, parts: Tensor) -> Tensor:
+    """Values of nodes [N, ...], in the rows [G, n] of some entries, bool [G, n], sums of their parts [G, n, ...]."""
+    return values.index_fill(0, rows[where], 0).index_add(0, rows[where], parts[where])
 
 
 def mirrors_of(blocks: Blocks, walls: Walls | None, mass: Tensor) -> Mirrors | None:

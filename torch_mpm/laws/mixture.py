@@ -138,6 +138,18 @@ class Mixture(Material):
                 result = result.index_copy(0, part.index, value)
         return result
 
+    def only(self, state: Any, laws: Sequence[int]) -> tuple[Material, Any]:
+        """Some of the laws as one, and their particles as a state of their own, whose fields are gathered when they are
+        asked for; differentiable."""
+        part = _Part(state, self.particles_of(state, laws))
+        return (self.laws[laws[0]] if len(laws) == 1 else self), part  # type: ignore[return-value]
+
+    def particles_of(self, state: Any, laws: Sequence[int]) -> Tensor:
+        """The particles of some of the laws, int64 [Q], in the order of the state."""
+        self._parts(state)
+        found = [self._indices[k] for k in laws]
+        return found[0] if len(found) == 1 else torch.cat(found).sort().values
+
     def check_material(self, state: State) -> Tensor:
         """The law of each particle; synchronises with the device once per tensor.
 
@@ -164,6 +176,10 @@ class Mixture(Material):
         return [(_Part(state, index), law) for index, law in zip(self._indices, self.laws, strict=True) if len(index)]
 
 
+OF_SCENES = ("dt", "time", "impulse")
+"""Fields without a row for each particle."""
+
+
 class _Part:
     """Some particles of a state: its fields, gathered when they are asked for."""
 
@@ -175,7 +191,7 @@ class _Part:
 
     def __getattr__(self, name: str) -> Any:
         value = getattr(self._state, name)
-        if isinstance(value, Tensor) and name != "dt":  # which is that of the scenes
+        if isinstance(value, Tensor) and name not in OF_SCENES:
             value = _take(value, self.index)
             setattr(self, name, value)
         elif name == "extra":
