@@ -2,6 +2,8 @@
 
 #include <cstdint>
 
+#include "common/host_device.h"
+
 // Particle and node values as the kernels see them: plain pointers and strides, shared by the CPU and CUDA kernels.
 // Only the files *.op.cpp know tensors.
 namespace mpm {
@@ -14,7 +16,7 @@ struct Field {
 };
 
 template <class T>
-Field<const T> constant(const Field<T>& f) {
+MPM_HD Field<const T> constant(const Field<T>& f) {
   return {f.pointer, {f.stride[0], f.stride[1], f.stride[2]}};
 }
 

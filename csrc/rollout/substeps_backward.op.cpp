@@ -223,14 +223,12 @@ void SubstepsBackward<T, D>::leave_grid(int64_t i, Adjoints& adjoints, const Ten
   p2g.x = field<T>(adjoints.x);
   p2g.mass = field<T>(adjoints.mass);
   p2g.velocity = field<T>(adjoints.v);
-  if (s_.p2g.affine.pointer)
-    p2g.affine = field<T>(adjoints.C);
-  else
-    torch::stable::zero_(adjoints.C);
+  if (s_.p2g.affine.pointer) p2g.affine = field<T>(adjoints.C);
   p2g.stress = field<T>(stress_);
   p2g.volume = field<T>(adjoints.volume);
   p2g.adds = true;
   backend::p2g_backward(in_.lattice.order(), p2g, stream_);
+  if (!s_.p2g.affine.pointer) torch::stable::zero_(adjoints.C);  // which the position gradient has read
 }
 
 // From F after the laws, their stress and history to F and history before. A law changes the adjoints of what it maps
