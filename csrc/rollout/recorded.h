@@ -31,6 +31,7 @@ class Arena {
     return torch::stable::from_blob(data, shape, strides, like.device(), type);
   }
 
+  void skip(int64_t bytes) { size_ += bytes; }
   int64_t size() const { return size_; }
 
  private:
@@ -127,6 +128,14 @@ class Recorded {
 
   void lay_out(Arena& arena);
   Grid grid_in(Arena& arena, const Tensor& nodes) const;
+  // That of a step, made where it is asked for: of many steps at once the device would wait for it.
+  Grid grid(int64_t i) const {
+    Arena arena = grids_;
+    arena.skip(i * grid_size_);
+    Grid grid = grid_in(arena, torch::stable::select(nodes_, 0, i));
+    grid.pool.active.use(grid.activation, workspace_);
+    return grid;
+  }
   void use(const Grid& grid) {
     steps.activation = grid.activation;
     steps.pool = grid.pool;
@@ -179,7 +188,8 @@ class Recorded {
   std::vector<double> time_;
   bool goes_on_;  // from a status before
   bool keeps_grids_ = false, taken_ = false;
-  std::vector<Grid> grids_;
+  Arena grids_;  // from the first one on
+  int64_t grid_size_ = 0;
   Tensor nodes_;  // of all grids
   int* status_ = nullptr;
 };
@@ -193,10 +203,12 @@ Recorded<T, D>::Recorded(const SubstepsInputs& in, const OptionalTensor& memory,
   steps.forget_stress();  // each step has its own
   steps.fuse(true);
   steps.activation.workspace_size = backend::activate_workspace(steps.activation, stream);
-  Arena grid, counted;
-  grid_in(grid, grid.template tensor<T>(in.x, Pool<T, D>::nodes_shape(steps.activation), in.x.scalar_type()));
+  Arena one, counted;
+  grid_in(one, {});
+  grid_size_ = one.size();
+  one.template tensor<T>(in.x, Pool<T, D>::nodes_shape(steps.activation), in.x.scalar_type());
   // At most half of what the particles take; torch_mpm/rollouts.py counts on it.
-  keeps_grids_ = 2 * grid.size() <= in.x.size(0) * (2 * D + 4 * D * D) * int64_t(sizeof(T));
+  keeps_grids_ = 2 * one.size() <= in.x.size(0) * (2 * D + 4 * D * D) * int64_t(sizeof(T));
   lay_out(counted);
   memory_ = has(memory) ? *memory : empty(in.x, {counted.size()}, ScalarType::Byte);
   check_shape(memory_, "record", {counted.size()});
@@ -204,12 +216,12 @@ Recorded<T, D>::Recorded(const SubstepsInputs& in, const OptionalTensor& memory,
   STD_TORCH_CHECK(memory_.is_contiguous(), "record must be contiguous");
   Arena arena(memory_);
   lay_out(arena);
-  if (keeps_grids_)
+  if (keeps_grids_) {
     workspace_ = empty(in.x, {steps.activation.workspace_size}, ScalarType::Byte);
-  else
+    use(grid(in.n - 1));
+  } else {
     steps.make_pool(stream);
-  for (Grid& g : grids_) g.pool.active.use(g.activation, workspace_);
-  if (keeps_grids_) use(grids_.back());
+  }
   if (!has(memory)) {
     Tensor before = status_tensor(-1);
     if (steps.previous_status)
@@ -236,12 +248,11 @@ void Recorded<T, D>::lay_out(Arena& arena) {
   stress = Record<T>(arena, given, n, D, D);
   if (steps.plastic) mapped = Record<T>(arena, given, n, D, D);
   status_ = arena.take<int>((1 + n) * (1 + in_.scenes) * kStatusSize);
-  grids_.clear();
   if (!keeps_grids_) return;
   const Shape nodes = Pool<T, D>::nodes_shape(steps.activation);
   nodes_ = arena.tensor<T>(given, {n, nodes[0], nodes[1]}, given.scalar_type());
-  for (int64_t i = 0; i < n; i++)
-    grids_.push_back(grid_in(arena, nodes_.defined() ? torch::stable::select(nodes_, 0, i) : Tensor()));
+  grids_ = arena;
+  arena.skip(n * grid_size_);
 }
 
 template <class T, int D>
@@ -259,7 +270,7 @@ bool Recorded<T, D>::take() {
   if (keeps_grids_) backend::clear(nodes_, stream_);
   for (int64_t i = 0; i < in_.n; i++) {
     steps.nodes_are_clear = keeps_grids_;
-    if (keeps_grids_) use(grids_[size_t(i)]);
+    if (keeps_grids_) use(grid(i));
     read(i);
     set_time(i);
     if (!activate(i)) return false;
@@ -267,14 +278,13 @@ bool Recorded<T, D>::take() {
     steps.write({x[i], v[i], C[i], F[i], J[i], history[i]});
     if (has(in_.material)) keep_others(i);
     steps.move(stream_);
-    if (keeps_grids_) grids_[size_t(i)] = {steps.activation, steps.pool};
   }
   return taken_ = true;
 }
 
 template <class T, int D>
 bool Recorded<T, D>::return_to(int64_t i) {
-  if (keeps_grids_) use(grids_[size_t(i)]);
+  if (keeps_grids_) use(grid(i));
   read(i);
   set_time(i);
   if (MPM_BACKEND != MPM_BACKEND_IS_cpu) steps.contact.activations = status(i) + kActivations;
