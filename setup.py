@@ -46,7 +46,15 @@ UP = "../../"
 HOST_FLAGS = ["-fPIC", "-fvisibility=hidden", "-Wall", f"-ffile-prefix-map={UP}="]
 # One thread of nvcc per architecture (--threads); template kernels make large fat binaries, so they are compressed.
 NVCC_THREADS = 2
-NVCC_FLAGS = ["-O3", "--expt-relaxed-constexpr", f"--threads={NVCC_THREADS}", "-Xfatbin=-compress-all"]
+# Device code that calls a function of the host alone would compile with a warning, and the call would do nothing.
+NVCC_FLAGS = [
+    "-O3",
+    "--expt-relaxed-constexpr",
+    "--Werror",
+    "cross-execution-space-call",
+    f"--threads={NVCC_THREADS}",
+    "-Xfatbin=-compress-all",
+]
 
 # Definitions that tell the objects of one source apart.
 VARIANTS = ("-DTORCH_MPM_ISA=", "-DMPM_SCALAR=", "-DMPM_DIMENSION=", "-DMPM_LAW_HEADER=")
