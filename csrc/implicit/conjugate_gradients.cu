@@ -71,6 +71,17 @@ void run_pass(const ConjugateGradientsArguments<T, D>& a, Pass pass, Stream stre
   launch(cg_pass_kernel<T, D>, unsigned((threads + kThreads - 1) / kThreads), kThreads, 0, stream, a, pass);
 }
 
+// Of a thread: to memory that is not pinned a copy takes as long as some ten iterations of a small scene.
+int* pinned_count() {
+  const auto allocate = [] {
+    int* count = nullptr;
+    check(cudaHostAlloc(&count, sizeof(int), cudaHostAllocPortable));
+    return count;
+  };
+  static thread_local int* const count = allocate();  // has no end: CUDA may be gone by then
+  return count;
+}
+
 }  // namespace
 
 template <class T, int D>
@@ -99,8 +110,10 @@ void cg_look(const ConjugateGradientsArguments<T, D>& a, Stream stream) {
   if (a.max_blocks == 0 || a.scenes == 0) return;
   check(cudaMemsetAsync(a.unfinished, 0, sizeof(int), stream));
   launch(cg_look_kernel<T, D>, unsigned((a.scenes + kThreads - 1) / kThreads), kThreads, 0, stream, a);
-  check(cudaMemcpyAsync(a.unfinished_on_host, a.unfinished, sizeof(int), cudaMemcpyDeviceToHost, stream));
+  int* const count = pinned_count();
+  check(cudaMemcpyAsync(count, a.unfinished, sizeof(int), cudaMemcpyDeviceToHost, stream));
   check(cudaStreamSynchronize(stream));
+  *a.unfinished_on_host = *count;
 }
 
 MPM_INSTANTIATE(cg_begin, ConjugateGradientsArguments)
