@@ -68,6 +68,8 @@ struct ConjugateGradientsArguments {
   const T* relative = nullptr;          // [scenes], of the preconditioned residual
   int* unfinished = nullptr;            // scenes that are not done
   int* unfinished_on_host = nullptr;
+  int max_iterations = 0;
+  unsigned long long loop = 0;  // on CUDA: the condition of a graph of one iteration, or none
 };
 
 inline namespace TORCH_MPM_ISA {

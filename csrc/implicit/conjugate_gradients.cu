@@ -59,6 +59,18 @@ __global__ void cg_look_kernel(const ConjugateGradientsArguments<T, D> a) {
   if (b < a.scenes && a.scene[b].state == kSolving) atomicAdd(a.unfinished, 1);
 }
 
+#if CUDART_VERSION >= 13000
+// One thread block.
+template <class T, int D>
+__global__ void cg_loop_kernel(const ConjugateGradientsArguments<T, D> a) {
+  bool unfinished = false;
+  for (int b = threadIdx.x; b < a.scenes; b += kSumThreads)
+    unfinished = unfinished || (a.scene[b].state == kSolving && a.scene[b].iterations < a.max_iterations);
+  unfinished = __syncthreads_or(unfinished);
+  if (threadIdx.x == 0) cudaGraphSetConditional(a.loop, unfinished);
+}
+#endif
+
 template <class T, int D>
 __global__ void cg_mirror_kernel(const ConjugateGradientsArguments<T, D> a) {
   const int group = int(blockIdx.x) * kThreads + int(threadIdx.x);
@@ -103,9 +115,12 @@ void cg_advance(const ConjugateGradientsArguments<T, D>& a, Stream stream) {
   run_pass(a, Pass::turn, stream);
 }
 
-// Waits for the device.
+// Waits for the device where no graph asks.
 template <class T, int D>
 void cg_look(const ConjugateGradientsArguments<T, D>& a, Stream stream) {
+#if CUDART_VERSION >= 13000
+  if (a.loop) return launch(cg_loop_kernel<T, D>, 1, kSumThreads, 0, stream, a);
+#endif
   *a.unfinished_on_host = 0;
   if (a.max_blocks == 0 || a.scenes == 0) return;
   check(cudaMemsetAsync(a.unfinished, 0, sizeof(int), stream));

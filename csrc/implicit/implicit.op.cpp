@@ -36,16 +36,16 @@ class TangentProduct {
   }
 
   // Adds to `to`.
-  void operator()(const T* direction, T* to, const DeviceScope& device) {
+  void operator()(const T* direction, T* to, backend::Stream stream) {
     scatter_.nodes = {to, D, D};
 #if MPM_BACKEND == MPM_BACKEND_IS_cpu
     gather_.nodes = {direction, D, D};
-    backend::gather(order_, gather_, device.stream());
-    backend::tangent_scatter(order_, scatter_, device.stream());
+    backend::gather(order_, gather_, stream);
+    backend::tangent_scatter(order_, scatter_, stream);
 #else
     gather_.gather.nodes = {direction, D, D};
-    backend::tangent_gather(order_, gather_, device.stream());
-    backend::scatter(order_, scatter_, device.stream());
+    backend::tangent_gather(order_, gather_, stream);
+    backend::scatter(order_, scatter_, stream);
 #endif
   }
 
@@ -80,7 +80,7 @@ Tensor implicit_apply(const Tensor& x, const Tensor& direction, const Tensor& ta
     const int64_t N = blocks.node_count<D>();
     const T* along = node_pointer<T>(direction, "direction", x, {N, D});
     result = zeros(x, {N, D});
-    TangentProduct<T, D>(x, tangent, stress_form, blocks)(along, static_cast<T*>(result.data_ptr()), device);
+    TangentProduct<T, D>(x, tangent, stress_form, blocks)(along, static_cast<T*>(result.data_ptr()), device.stream());
   });
   return result;
 }
@@ -114,10 +114,30 @@ void set_images(ConjugateGradientsArguments<T, D>& a, const Tensor& images, cons
   a.images = int_pointer(images, "images", x, {images.size(0), 1 << D});
 }
 
-// Iterations between two looks of the host at how many scenes are not done.
-constexpr int kIterationsPerLook = MPM_BACKEND == MPM_BACKEND_IS_cpu ? 1 : 8;
 // Iterations that a solve has at least where it matters how long it takes.
 constexpr int kWorthATeam = 16;
+
+// Iterations until all scenes are done: of a graph in which the device finds out, or with looks of the host.
+template <class T, int D, class Iteration>
+void iterate(ConjugateGradientsArguments<T, D>& a, backend::Stream stream, const Iteration& iteration) {
+#if MPM_BACKEND == MPM_BACKEND_IS_cuda && CUDART_VERSION >= 13000
+  if (a.max_iterations == 0 || a.max_blocks == 0 || a.scenes == 0) return;
+  repeat(stream, [&](cudaStream_t recorded, unsigned long long condition) {
+    iteration(recorded);
+    a.loop = condition;
+    backend::cg_look(a, recorded);
+  });
+#else
+  constexpr int between_looks = MPM_BACKEND == MPM_BACKEND_IS_cpu ? 1 : 8;
+  for (int k = 0; k < a.max_iterations; k++) {
+    if (k % between_looks == 0) {
+      backend::cg_look(a, stream);
+      if (*a.unfinished_on_host == 0) break;
+    }
+    iteration(stream);
+  }
+#endif
+}
 
 std::tuple<Tensor, Tensor> implicit_cg(const Tensor& x, const Tensor& rhs, const Tensor& mass, const Tensor& inverse,
                                        const OptionalTensor& local, const OptionalTensor& images, const Tensor& tangent,
@@ -159,17 +179,14 @@ std::tuple<Tensor, Tensor> implicit_cg(const Tensor& x, const Tensor& rhs, const
     a.unfinished = static_cast<int*>(unfinished.data_ptr());
     a.unfinished_on_host = &left;
     TangentProduct<T, D> product(x, tangent, stress_form, blocks);
+    a.max_iterations = int(max_iterations);
     backend::cg_begin(a, device.stream());
     with_team(x.size(0) * kWorthATeam, [&] {
-      for (int64_t k = 0; k < max_iterations; k++) {
-        if (k % kIterationsPerLook == 0) {
-          backend::cg_look(a, device.stream());
-          if (left == 0) break;
-        }
-        backend::clear(q, device.stream());
-        product(a.p, a.q, device);
-        backend::cg_advance(a, device.stream());
-      }
+      iterate(a, device.stream(), [&](backend::Stream stream) {
+        backend::clear(q, stream);
+        product(a.p, a.q, stream);
+        backend::cg_advance(a, stream);
+      });
     });
   });
   return {solution, scalars};

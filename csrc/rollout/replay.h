@@ -1,5 +1,7 @@
 #pragma once
 
+#include <memory>
+#include <type_traits>
 #include <utility>
 #include <vector>
 
@@ -75,6 +77,38 @@ class Recorder {
 
   void launch(cudaStream_t stream) const { check(cudaGraphLaunch(executable_, stream)); }
 
+#if CUDART_VERSION >= 13000
+  template <class Work>
+  void repeat(cudaStream_t stream, const Work& work) {
+    use_device();
+    cudaGraph_t graph = nullptr;
+    check(cudaGraphCreate(&graph, 0));
+    const std::unique_ptr<std::remove_pointer_t<cudaGraph_t>, decltype(&cudaGraphDestroy)> owner(graph,
+                                                                                                 &cudaGraphDestroy);
+    cudaGraphNodeParams loop{};
+    loop.type = cudaGraphNodeTypeConditional;
+    loop.conditional.type = cudaGraphCondTypeWhile;
+    loop.conditional.size = 1;
+    check(cudaGraphConditionalHandleCreate(&loop.conditional.handle, graph, 1, cudaGraphCondAssignDefault));
+    cudaGraphNode_t node;
+    check(cudaGraphAddNode(&node, graph, nullptr, nullptr, 0, &loop));
+    cudaGraph_t body = loop.conditional.phGraph_out[0];
+    check(cudaStreamBeginCaptureToGraph(stream_, body, nullptr, nullptr, 0, cudaStreamCaptureModeRelaxed));
+    try {
+      work(stream_, loop.conditional.handle);
+    } catch (...) {
+      cudaStreamEndCapture(stream_, &body);
+      throw;
+    }
+    check(cudaStreamEndCapture(stream_, &body));
+    cudaGraphExec_t executable = nullptr;
+    check(cudaGraphInstantiate(&executable, graph, 0));
+    const cudaError_t launched = cudaGraphLaunch(executable, stream);
+    check(cudaGraphExecDestroy(executable));  // when it has ended
+    check(launched);
+  }
+#endif
+
  private:
   static void check(cudaError_t error) { STD_TORCH_CHECK(error == cudaSuccess, "CUDA: ", cudaGetErrorString(error)); }
 
@@ -125,6 +159,15 @@ int64_t replay(int64_t times, cudaStream_t stream, const Work& work) {
   for (int64_t k = 0; k < times; k++) recorder.launch(stream);
   return times;
 }
+
+#if CUDART_VERSION >= 13000
+// Has the device do `work(stream, condition)` once, and again until a kernel of it sets the condition to zero. It must
+// be kernels and copies alone.
+template <class Work>
+void repeat(cudaStream_t stream, const Work& work) {
+  Recorder::of_this_thread().repeat(stream, work);
+}
+#endif
 
 #endif
 
