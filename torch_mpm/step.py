@@ -197,7 +197,8 @@ class Step(TensorModule):
         else:
             check_implicit(self, state)
             after: Any = Overlay(state, dt=dt, **fields)
-            nodes, velocity, impulse = *self._implicit_velocity(blocks, after, affine, stress, dt), None
+            nodes, velocity = self._implicit_velocity(blocks, after, affine, stress, dt)
+            impulse = None
         if self.on_grid is not None:
             velocity = from_half(self.on_grid(blocks, velocity, nodes[:, 0], dt), nodes)
         deformed = {name: fields.get(name, getattr(state, name)) for name in ("F", "J")}

@@ -69,7 +69,7 @@ struct ConjugateGradientsArguments {
   int* unfinished = nullptr;            // scenes that are not done
   int* unfinished_on_host = nullptr;
   int max_iterations = 0;
-  unsigned long long loop = 0;  // on CUDA: the condition of a graph of one iteration, or none
+  unsigned long long loop = 0;  // with CUDA 13: the condition of a graph of one iteration
 };
 
 inline namespace TORCH_MPM_ISA {

@@ -53,12 +53,6 @@ __global__ void __launch_bounds__(kSumThreads)
   if (threadIdx.x == 0) advance_scene(a.scene[scene], phase, parts[0], double(a.relative[scene]));
 }
 
-template <class T, int D>
-__global__ void cg_look_kernel(const ConjugateGradientsArguments<T, D> a) {
-  const int b = int(blockIdx.x) * kThreads + int(threadIdx.x);
-  if (b < a.scenes && a.scene[b].state == kSolving) atomicAdd(a.unfinished, 1);
-}
-
 #if CUDART_VERSION >= 13000
 // One thread block.
 template <class T, int D>
@@ -68,6 +62,12 @@ __global__ void cg_loop_kernel(const ConjugateGradientsArguments<T, D> a) {
     unfinished = unfinished || (a.scene[b].state == kSolving && a.scene[b].iterations < a.max_iterations);
   unfinished = __syncthreads_or(unfinished);
   if (threadIdx.x == 0) cudaGraphSetConditional(a.loop, unfinished);
+}
+#else
+template <class T, int D>
+__global__ void cg_look_kernel(const ConjugateGradientsArguments<T, D> a) {
+  const int b = int(blockIdx.x) * kThreads + int(threadIdx.x);
+  if (b < a.scenes && a.scene[b].state == kSolving) atomicAdd(a.unfinished, 1);
 }
 #endif
 
@@ -81,17 +81,6 @@ template <class T, int D>
 void run_pass(const ConjugateGradientsArguments<T, D>& a, Pass pass, Stream stream) {
   const int64_t threads = int64_t(a.max_blocks) * kLanes;
   launch(cg_pass_kernel<T, D>, unsigned((threads + kThreads - 1) / kThreads), kThreads, 0, stream, a, pass);
-}
-
-// Of a thread: to memory that is not pinned a copy takes as long as some ten iterations of a small scene.
-int* pinned_count() {
-  const auto allocate = [] {
-    int* count = nullptr;
-    check(cudaHostAlloc(&count, sizeof(int), cudaHostAllocPortable));
-    return count;
-  };
-  static thread_local int* const count = allocate();  // has no end: CUDA may be gone by then
-  return count;
 }
 
 }  // namespace
@@ -115,21 +104,23 @@ void cg_advance(const ConjugateGradientsArguments<T, D>& a, Stream stream) {
   run_pass(a, Pass::turn, stream);
 }
 
-// Waits for the device where no graph asks.
+#if CUDART_VERSION >= 13000
 template <class T, int D>
 void cg_look(const ConjugateGradientsArguments<T, D>& a, Stream stream) {
-#if CUDART_VERSION >= 13000
-  if (a.loop) return launch(cg_loop_kernel<T, D>, 1, kSumThreads, 0, stream, a);
-#endif
+  launch(cg_loop_kernel<T, D>, 1, kSumThreads, 0, stream, a);
+}
+#else
+// Waits for the device.
+template <class T, int D>
+void cg_look(const ConjugateGradientsArguments<T, D>& a, Stream stream) {
   *a.unfinished_on_host = 0;
   if (a.max_blocks == 0 || a.scenes == 0) return;
   check(cudaMemsetAsync(a.unfinished, 0, sizeof(int), stream));
   launch(cg_look_kernel<T, D>, unsigned((a.scenes + kThreads - 1) / kThreads), kThreads, 0, stream, a);
-  int* const count = pinned_count();
-  check(cudaMemcpyAsync(count, a.unfinished, sizeof(int), cudaMemcpyDeviceToHost, stream));
+  check(cudaMemcpyAsync(a.unfinished_on_host, a.unfinished, sizeof(int), cudaMemcpyDeviceToHost, stream));
   check(cudaStreamSynchronize(stream));
-  *a.unfinished_on_host = *count;
 }
+#endif
 
 MPM_INSTANTIATE(cg_begin, ConjugateGradientsArguments)
 MPM_INSTANTIATE(cg_advance, ConjugateGradientsArguments)

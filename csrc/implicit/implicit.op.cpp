@@ -119,7 +119,8 @@ constexpr int kWorthATeam = 16;
 
 // Iterations until all scenes are done: of a graph in which the device finds out, or with looks of the host.
 template <class T, int D, class Iteration>
-void iterate(ConjugateGradientsArguments<T, D>& a, backend::Stream stream, const Iteration& iteration) {
+void iterate(ConjugateGradientsArguments<T, D>& a, [[maybe_unused]] const Tensor& x, backend::Stream stream,
+             const Iteration& iteration) {
 #if MPM_BACKEND == MPM_BACKEND_IS_cuda && CUDART_VERSION >= 13000
   if (a.max_iterations == 0 || a.max_blocks == 0 || a.scenes == 0) return;
   repeat(stream, [&](cudaStream_t recorded, unsigned long long condition) {
@@ -128,11 +129,15 @@ void iterate(ConjugateGradientsArguments<T, D>& a, backend::Stream stream, const
     backend::cg_look(a, recorded);
   });
 #else
+  int left = 0;
+  const Tensor unfinished = empty_int(x, {1});
+  a.unfinished = static_cast<int*>(unfinished.data_ptr());
+  a.unfinished_on_host = &left;
   constexpr int between_looks = MPM_BACKEND == MPM_BACKEND_IS_cpu ? 1 : 8;
   for (int k = 0; k < a.max_iterations; k++) {
     if (k % between_looks == 0) {
       backend::cg_look(a, stream);
-      if (*a.unfinished_on_host == 0) break;
+      if (left == 0) break;
     }
     iteration(stream);
   }
@@ -167,22 +172,18 @@ std::tuple<Tensor, Tensor> implicit_cg(const Tensor& x, const Tensor& rhs, const
     solution = zeros(x, {N, D});
     scalars = empty(x, {t.scenes, 5}, ScalarType::Double);
     Tensor r = zeros(x, {N, D}), p = zeros(x, {N, D}), q = zeros(x, {N, D});
-    const Tensor slots = empty(x, {int64_t(t.max_blocks) + t.scenes}, ScalarType::Double),
-                 unfinished = empty_int(x, {1});
-    int left = 0;
+    const Tensor slots = empty(x, {int64_t(t.max_blocks) + t.scenes}, ScalarType::Double);
     a.x = static_cast<T*>(solution.data_ptr());
     a.r = static_cast<T*>(r.data_ptr());
     a.p = static_cast<T*>(p.data_ptr());
     a.q = static_cast<T*>(q.data_ptr());
     a.slots = static_cast<double*>(slots.data_ptr());
     a.scene = static_cast<ConjugateGradients*>(scalars.data_ptr());
-    a.unfinished = static_cast<int*>(unfinished.data_ptr());
-    a.unfinished_on_host = &left;
     TangentProduct<T, D> product(x, tangent, stress_form, blocks);
     a.max_iterations = int(max_iterations);
     backend::cg_begin(a, device.stream());
     with_team(x.size(0) * kWorthATeam, [&] {
-      iterate(a, device.stream(), [&](backend::Stream stream) {
+      iterate(a, x, device.stream(), [&](backend::Stream stream) {
         backend::clear(q, stream);
         product(a.p, a.q, stream);
         backend::cg_advance(a, stream);

@@ -5,7 +5,7 @@
 
 // tangent_scatter and tangent_gather: where a backend applies the tangents.
 // cg_begin: x, r, p and the scalars from rhs. cg_advance: one iteration, with the product of the tangents in q.
-// cg_look: how many scenes are not done, on the host; or whether a graph goes on, which the device finds out.
+// cg_look: how many scenes are not done, on the host; with CUDA 13 whether a graph goes on, which the device finds out.
 #if MPM_BACKEND == MPM_BACKEND_IS_cpu
 #define MPM_TANGENT_KERNEL(ORDERED) ORDERED(tangent_scatter, TangentScatterArguments)
 #else

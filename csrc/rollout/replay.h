@@ -38,8 +38,9 @@ void with_team(int64_t, const Work& work) {
   work();
 }
 
-// The latest graph of a thread. The next one is mostly the same but for its pointers, and to change these takes a third
-// of the time of a new one. Its stream is its own, since torch's default stream records nothing.
+// Makes the graphs of a thread, and keeps the latest one that is replayed. The next one is mostly the same but for its
+// pointers, and to change these takes a third of the time of a new one. Its stream is its own, since torch's default
+// stream records nothing.
 class Recorder {
  public:
   static Recorder& of_this_thread() {
@@ -147,7 +148,7 @@ class Recorder {
 constexpr int64_t kLeastReplays = 6;  // which a recording has to save its own time
 
 // How often `work(stream)` was replayed: `times`, or never where a recording would not pay or the stream is recorded
-// itself. It must be kernels and copies alone.
+// itself. It must be kernels, copies and memory that is set, alone.
 template <class Work>
 int64_t replay(int64_t times, cudaStream_t stream, const Work& work) {
   cudaStreamCaptureStatus status = cudaStreamCaptureStatusActive;
@@ -162,7 +163,7 @@ int64_t replay(int64_t times, cudaStream_t stream, const Work& work) {
 
 #if CUDART_VERSION >= 13000
 // Has the device do `work(stream, condition)` once, and again until a kernel of it sets the condition to zero. It must
-// be kernels and copies alone.
+// be kernels, copies and memory that is set, alone.
 template <class Work>
 void repeat(cudaStream_t stream, const Work& work) {
   Recorder::of_this_thread().repeat(stream, work);

@@ -54,6 +54,7 @@ class SubstepsBackward {
   void make_terms(int64_t needs);
   void leave_advance(int64_t i, Adjoints& adjoints);
   AdvanceBackwardArguments<T, D> advance(int64_t i, Adjoints& adjoints) const;
+  PositionGradientArguments<T, D> motion(const Adjoints& adjoints) const;
   void leave_grid(int64_t i, Adjoints& adjoints, const Tensor& gravity);
   void leave_laws(Adjoints& adjoints);
 
@@ -138,14 +139,15 @@ void SubstepsBackward<T, D>::leave_advance(int64_t i, Adjoints& adjoints) {
   if (i % motions_ == motions_ - 1 || i == in_.n - 1) backend::clear(motion_, stream_);
   G2PAdvanceBackwardArguments<T, D> a;
   a.advance = advance(i, adjoints);
-  a.scatter.topology = s_.p2g.topology;
-  a.scatter.x = s_.p2g.x;
-  a.scatter.value = field<const T>(adjoints.v);
-  if (mls_ || in_.wants_C) a.scatter.moment = field<const T>(adjoints.C);
-  a.scatter.gradient = field<const T>(gradient_);
-  a.scatter.moment_scale = in_.lattice.inverse_inertia();
-  a.scatter.deterministic = in_.lattice.deterministic();
-  a.scatter.nodes = {motion_of(i) + 1, 1 + D, D};
+  const PositionGradientArguments<T, D> of = motion(adjoints);
+  a.scatter = {of.topology,
+               of.x,
+               of.value,
+               of.moment,
+               of.gradient,
+               of.moment_scale,
+               in_.lattice.deterministic(),
+               {motion_of(i) + 1, 1 + D, D}};
   backend::g2p_advance_backward(in_.lattice.order(), a, stream_);
 }
 
@@ -171,6 +173,22 @@ AdvanceBackwardArguments<T, D> SubstepsBackward<T, D>::advance(int64_t i, Adjoin
   a.adds_affine = mls_;
   a.F = field<T>(adjoints.F);
   a.J = field<T>(adjoints.J);
+  return a;
+}
+
+// What the adjoint of G2P adds to the nodes, with its position gradient.
+template <class T, int D>
+PositionGradientArguments<T, D> SubstepsBackward<T, D>::motion(const Adjoints& adjoints) const {
+  PositionGradientArguments<T, D> a;
+  a.topology = s_.p2g.topology;
+  a.x = s_.p2g.x;
+  a.value = field<const T>(adjoints.v);
+  if (mls_ || in_.wants_C) a.moment = field<const T>(adjoints.C);
+  a.gradient = field<const T>(gradient_);
+  a.nodes = s_.advance.gather.nodes;
+  a.moment_scale = in_.lattice.inverse_inertia();
+  a.position_gradient = field<T>(adjoints.x);
+  a.adds = true;
   return a;
 }
 
@@ -210,15 +228,7 @@ void SubstepsBackward<T, D>::leave_grid(int64_t i, Adjoints& adjoints, const Ten
 
   P2GBackwardArguments<T, D> p2g;
   p2g.forward = s_.p2g;
-  p2g.motion.topology = s_.p2g.topology;
-  p2g.motion.x = s_.p2g.x;
-  p2g.motion.value = field<const T>(adjoints.v);
-  if (mls_ || in_.wants_C) p2g.motion.moment = field<const T>(adjoints.C);
-  p2g.motion.gradient = field<const T>(gradient_);
-  p2g.motion.nodes = s_.advance.gather.nodes;
-  p2g.motion.moment_scale = in_.lattice.inverse_inertia();
-  p2g.motion.position_gradient = field<T>(adjoints.x);
-  p2g.motion.adds = true;
+  p2g.motion = motion(adjoints);
   p2g.grad_nodes = {reinterpret_cast<const T*>(update.grad_nodes), 1 + D, 1 + D};
   p2g.x = field<T>(adjoints.x);
   p2g.mass = field<T>(adjoints.mass);

@@ -51,8 +51,8 @@ struct MotionAdjointSource {
 // In one pass where the affine field moves the deformation; in a fixed order P2G goes over some particles many times.
 template <int Order, class T, int D>
 void g2p_advance_backward(const G2PAdvanceBackwardArguments<T, D>& a, Stream stream) {
-  if (a.scatter.moment.pointer && !a.scatter.gradient.pointer && !a.scatter.deterministic)
-    return launch_scatter(MotionAdjointSource<Order, T, D>(a), false, stream);
+  const bool moves = a.scatter.moment.pointer && !a.scatter.gradient.pointer && a.scatter.topology.max_blocks > 0;
+  if (moves && !a.scatter.deterministic) return launch_scatter(MotionAdjointSource<Order, T, D>(a), false, stream);
   advance_backward(a.advance, stream);
   scatter<Order>(a.scatter, stream);
 }

@@ -268,10 +268,10 @@ struct StepAdjoint : MomentumAdjoint<Order, T, D, false> {
   explicit StepAdjoint(const P2GBackwardArguments<T, D>& a) : Momentum(a), motion(a.motion, 0), others(motion.nodes) {}
 
   __device__ Loaded load(int p, int scene) const { return {Momentum::load(p, scene), motion.load(p, scene)}; }
-  template <class Support, class Others>
+  template <class Support, class OtherSupport>
   __device__ Result compute(const Loaded& l, const Weights<Order, T, D>& w, const Support& support,
-                            const Others& others) const {
-    const mpm::Vector<T, D> x = motion.compute(l.motion, w, others);
+                            const OtherSupport& other) const {
+    const mpm::Vector<T, D> x = motion.compute(l.motion, w, other);
     Result r = Momentum::compute(l.momentum, w, support);
     r.x = x + r.x;
     return r;
@@ -282,8 +282,9 @@ struct StepAdjoint : MomentumAdjoint<Order, T, D, false> {
 template <int Order, class T, int D>
 void p2g_backward(const P2GBackwardArguments<T, D>& a, Stream stream) {
   const bool motion = a.motion.nodes.pointer, gradient = has_gradient(a.forward);
-  const bool together = motion && !gradient && !a.motion.gradient.pointer && a.x.pointer && a.adds;
-  if (together) return launch_gather(StepAdjoint<Order, T, D>(a), stream);
+  const bool adds = a.adds && a.motion.adds && a.x.pointer && a.motion.position_gradient.pointer == a.x.pointer;
+  if (motion && adds && !gradient && !a.motion.gradient.pointer)
+    return launch_gather(StepAdjoint<Order, T, D>(a), stream);
   if (motion) position_gradient<Order>(a.motion, stream);
   if (gradient)
     launch_gather(MomentumAdjoint<Order, T, D, true>(a), stream);

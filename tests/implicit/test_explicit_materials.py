@@ -253,6 +253,35 @@ def test_parameters_per_particle_and_another_order(device):
     assert relative_error(uniform.v, plain.v) > 1e-3
 
 
+@pytest.mark.parametrize("explicit", [[1], [0, 1], [2]])
+def test_parameters_per_particle_of_several_materials(explicit, device):
+    """Of two and of one in the solve: against an explicit step, and two scenes against each alone."""
+    grid, state = beside(2, device)
+    thirds = (torch.arange(len(state), device=device) % 3 == 2) & (state.material == SOLID)
+    state = state.replace(material=torch.where(thirds, 2, state.material).int())
+    E = torch.linspace(1e5, 1e6, 2 * len(state), dtype=torch.float64, device=device)
+
+    def step_of(E, integrator, scenes=1):
+        laws = [mpm.NeoHookean(E=E, nu=0.3), mpm.WeaklyCompressible(1e5), mpm.Hencky(E=E, nu=0.3)]
+        lattice = mpm.Grid(grid.dx, grid.lower, grid.upper, scenes=scenes, deterministic=True)
+        return mpm.Step(lattice, mpm.Mixture(laws), integrator=integrator)
+
+    def implicit():
+        return Implicit(1e-11, explicit=explicit)
+
+    own = E[: len(state)]
+    change = step_of(own, "explicit")(state, 1e-5).v - state.v
+    assert relative_error(step_of(own, implicit())(state, 1e-5).v - state.v, change) < 0.02
+    scenes = [state.replace(scene=torch.full((len(state),), b).int().to(device)) for b in range(2)]
+    together = mpm.State.concatenate(scenes)
+    step = step_of(E, implicit(), 2)
+    after, limits = step(together, 2e-3), step.stable_dt(together)
+    for b, part in enumerate((own, E[len(state) :])):
+        alone = step_of(part, implicit())
+        assert relative_error(after.v[together.scene == b], alone(state, 2e-3).v) < 1e-9
+        assert relative_error(limits[b], alone.stable_dt(state)[0]) < 1e-12
+
+
 # ---- gradients
 
 

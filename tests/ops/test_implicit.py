@@ -235,6 +235,33 @@ def test_conjugate_gradients_solve_the_system(dim, kernel, device):
         assert relative_error(left, rhs) < 10 * least
 
 
+@pytest.mark.parametrize("most", [0, 1, 3, 9])
+def test_iterations_end_at_their_limit(most, device):
+    """Against the textbook's conjugate gradients in torch; a right side of zero takes none."""
+    case = Case(2, "quadratic", device)
+    p, rhs, inverse = case.particles, case.nodes(4) * case.mass[:, None], case.inverse()
+    relative = torch.zeros(1, dtype=torch.float64, device=device)
+
+    def solved(right):
+        return ops.implicit_cg(case.blocks, p.x, right, case.mass, inverse, case.tangent, relative, most)
+
+    x, r = torch.zeros_like(rhs), rhs
+    direction = z = (inverse @ r[:, :, None])[:, :, 0]
+    for _ in range(most):
+        along = ops.implicit_apply(case.blocks, p.x, direction, case.tangent, case.mass)
+        square = (r * z).sum()
+        step = square / (direction * along).sum()
+        x, r = x + step * direction, r - step * along
+        z = (inverse @ r[:, :, None])[:, :, 0]
+        direction = z + (r * z).sum() / square * direction
+    solve = solved(rhs)
+    assert solve.iterations.tolist() == [most] and solve.state.tolist() == [0]
+    assert float((solve.solution - x).norm()) <= 1e-9 * float(x.norm())
+    nothing = solved(0 * rhs)
+    assert nothing.iterations.tolist() == [0] and nothing.state.tolist() == [CONVERGED]
+    assert bool((nothing.solution == 0).all())
+
+
 def test_the_solution_stays_in_the_range_of_the_preconditioner(dim, device):
     """Nodes that are held, and others that may slide along one axis: the residual of what is free vanishes."""
     case = Case(dim, "quadratic", device)

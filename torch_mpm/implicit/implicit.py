@@ -51,9 +51,9 @@ class Implicit:
 
     The node velocities minimise ½ Σ m |v − v*|² + Σ V ψ((I + dt L(v)) F) (Martin et al. 2011; Gast et al. 2015), scene
     by scene, by Newton's method with line search and conjugate gradients preconditioned by the blocks of the nodes. Any
-    dt is stable. Walls and obstacles bound the velocities of their nodes in the solve, and rub them. Laws with an
-    elastic energy take part; where they are plastic the flow follows the solve, at the start of the next step, or is a
-    part of it.
+    dt is stable but for explicit materials. Walls and obstacles bound the velocities of their nodes in the solve, and
+    rub them. Laws with an elastic energy take part; where they are plastic the flow follows the solve, at the start of
+    the next step, or is a part of it.
 
     Args:
         tolerance: of the residual relative to that of v*, the velocities without elastic forces, in (0, 1).

@@ -84,8 +84,8 @@ class ImplicitSystem:
     def detached(self) -> ImplicitSystem:
         """The same for no gradients, with no more of the state than laws may read."""
 
-        def still(value: Any) -> Any:
-            return value.detach() if isinstance(value, Tensor) else value
+        def still(value: Any) -> Any:  # others stay the same objects, of which a mixture knows the materials
+            return value.detach() if isinstance(value, Tensor) and value.requires_grad else value
 
         fields = {name: still(getattr(self.state, name)) for name in READ if hasattr(self.state, name)}
         extra = {name: still(value) for name, value in self.state.extra.items()}

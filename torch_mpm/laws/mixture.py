@@ -185,7 +185,7 @@ class _Part:
 
     def __init__(self, state: State, index: Tensor) -> None:
         self.index = index
-        self.particles = state.x.shape[0]
+        self.particles = getattr(state, "particles", state.x.shape[0])  # of the whole state, also in a part of a part
         self.ids = index if state.ids is None else state.ids.index_select(0, index)
         self._state = state
 

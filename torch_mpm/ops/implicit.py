@@ -108,8 +108,8 @@ def implicit_cg(
 ) -> ImplicitSolve:
     """Solves H d = rhs by conjugate gradients, preconditioned by node blocks; scenes apart, each with its own scalars.
 
-    On CUDA the host looks once in eight iterations at whether all scenes are done, so that the op cannot be captured in
-    a graph.
+    On CUDA a graph of one iteration is repeated by the device until all scenes are done (built with CUDA 12 the host
+    looks once in eight iterations), so that the op cannot be captured in a graph.
 
     Args:
         blocks: active blocks of these positions.
