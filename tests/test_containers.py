@@ -9,6 +9,7 @@ from torch.utils import _pytree
 from torch.utils.data import DataLoader, Dataset
 
 import torch_mpm as mpm
+from torch_mpm.containers import from_tensordict, to_tensordict
 
 
 def full_state(device="cpu"):
@@ -54,6 +55,24 @@ def test_files_without_code(device):
     loaded = torch.load(file, weights_only=True)["state"]
     assert torch.equal(loaded.x, state.x) and torch.equal(loaded.extra["h"], state.extra["h"]) and loaded.time == 0.25
     torch.testing.assert_close(make_step(2)(loaded, 1e-3).x, make_step(2)(state, 1e-3).x)
+
+
+def test_tensordicts(device):
+    """There and back, with gradients, after what TensorDicts are used for; a number and a tensor as the time."""
+    pytest.importorskip("tensordict")
+    for time in (0.25, torch.tensor([0.25], dtype=torch.float64, device=device)):
+        state = full_state(device).replace(time=time)
+        state = state.replace(v=state.v.clone().requires_grad_())
+        fields = to_tensordict(state)
+        assert fields["x"] is state.x and "C" not in fields.keys()
+        back = from_tensordict(fields.clone())
+        assert type(back.time) is type(time) and torch.as_tensor(back.time).tolist() == torch.as_tensor(time).tolist()
+        leaves = zip(_pytree.tree_leaves(back), _pytree.tree_leaves(state), strict=True)
+        assert all(torch.equal(torch.as_tensor(a), torch.as_tensor(b)) for a, b in leaves)
+        (grad,) = torch.autograd.grad(make_step(2)(back, 1e-3).x.sum(), state.v)
+        assert float(grad.abs().sum()) > 0
+    with pytest.raises(TypeError, match="colour"):
+        from_tensordict(fields.set("colour", state.x))
 
 
 class Throws(Dataset):

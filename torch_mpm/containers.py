@@ -1,4 +1,5 @@
-"""A `State` where torch expects its own containers: as a pytree, in files and in the batches of a `DataLoader`."""
+"""A `State` where torch expects its own containers: as a pytree, in files, in the batches of a `DataLoader`, and as a
+TensorDict."""
 
 from __future__ import annotations
 
@@ -55,6 +56,37 @@ def _unflatten(leaves: Any, layout: Layout) -> State:
 def _collate(batch: Sequence[State], *, collate_fn_map: dict[type, Callable[..., Any]] | None = None) -> State:
     """States as the scenes of one batch."""
     return State.concatenate(batch, scene=True)
+
+
+def to_tensordict(state: State) -> Any:
+    """The fields of a state as a TensorDict of no batch size, those of `extra` nested; needs the package tensordict.
+
+    Absent fields are left out, and a time that is a number is no tensor there. Tensors are the same, with their graphs.
+
+    Raises:
+        ModuleNotFoundError: without the package.
+    """
+    from tensordict import TensorDict
+
+    fields: dict[str, Any] = {name: value for name in TENSORS if (value := getattr(state, name)) is not None}
+    result = TensorDict({**fields, "extra": TensorDict(dict(state.extra), batch_size=[])}, batch_size=[])
+    if isinstance(state.time, Tensor):
+        result["time"] = state.time
+    else:
+        result.set_non_tensor("time", state.time)
+    return result
+
+
+def from_tensordict(fields: Any) -> State:
+    """The state of a TensorDict as `to_tensordict` makes it; what else is there is an unknown field.
+
+    Raises:
+        TypeError, ValueError: as `State`.
+    """
+    values = {name: fields.get(name) for name in fields.keys() if name not in ("extra", "time")}
+    extra = dict(fields["extra"].items()) if "extra" in fields.keys() else {}
+    time = fields.get("time", 0.0)
+    return State(**values, extra=extra, time=getattr(time, "data", time) if not isinstance(time, Tensor) else time)
 
 
 def register() -> None:
