@@ -146,8 +146,8 @@ class Mixture(Material):
 
     def particles_of(self, state: Any, laws: Sequence[int]) -> Tensor:
         """The particles of some of the laws, int64 [Q], in the order of the state."""
-        self._parts(state)
-        found = [self._indices[k] for k in laws]
+        indices = self._particles(state)
+        found = [indices[k] for k in laws]
         return found[0] if len(found) == 1 else torch.cat(found).sort().values
 
     def check_material(self, state: State) -> Tensor:
@@ -167,13 +167,18 @@ class Mixture(Material):
             self._checked = material
         return material
 
-    def _parts(self, state: State) -> list[tuple[Any, Any]]:
+    def _particles(self, state: Any) -> list[Tensor]:
+        """Those of each law, int64."""
         material = self.check_material(state)
         if material is not self._material:
             indices = ((material == k).nonzero().squeeze(1) for k in range(len(self.laws)))
             self._indices = [without_transforms(index) for index in indices]
             self._material = material
-        return [(_Part(state, index), law) for index, law in zip(self._indices, self.laws, strict=True) if len(index)]
+        return self._indices
+
+    def _parts(self, state: State) -> list[tuple[Any, Any]]:
+        indices = self._particles(state)
+        return [(_Part(state, index), law) for index, law in zip(indices, self.laws, strict=True) if len(index)]
 
 
 OF_SCENES = ("dt", "time", "impulse")
