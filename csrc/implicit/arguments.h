@@ -48,7 +48,8 @@ struct ConjugateGradients {
 enum SolveState : int { kSolving = 0, kConverged = 1, kNegativeCurvature = 2, kNotFinite = 3 };
 
 // The vectors of conjugate gradients with a preconditioner of node blocks B⁻¹. Where B⁻¹ maps to a subspace of a node's
-// velocities, as it does for nodes that are held, the solution stays in it.
+// velocities, as it does for nodes that are held, the solution stays in it. Where it does so to rounding alone, along
+// no axis, the forces that hold a node must not stay in the residual, of which they would soon be the most: `held`.
 template <class T, int D>
 struct ConjugateGradientsArguments {
   int max_blocks = 0, scenes = 1, blocks_per_scene = 1;
@@ -56,6 +57,7 @@ struct ConjugateGradientsArguments {
   const T* mass = nullptr;     // [N]
   const T* inverse = nullptr;  // [N, kSymmetric<D>], upper triangles
   const T* local = nullptr;    // likewise, what a node adds to its own part of the Hessian; or null
+  const T* held = nullptr;     // [N, D], unit vectors: directions in which nodes are held, zero for none; or null
   const T* rhs = nullptr;      // [N, D]
   int image_groups = 0;
   const int* images = nullptr;  // [image_groups, 2^D] rows of nodes that are images of one another, see `mirror_group`
@@ -155,6 +157,11 @@ MPM_HD double cg_curvature(const ConjugateGradientsArguments<T, D>& a, int64_t n
     a.q[k] += a.mass[node] * a.p[k] + local[i];
     sum += double(a.q[k]) * double(a.p[k]);
   }
+  if (!a.held) return sum;
+  const T* n = a.held + node * D;
+  T along = T(0);
+  MPM_UNROLL for (int i = 0; i < D; i++) along += n[i] * a.q[node * D + i];
+  MPM_UNROLL for (int i = 0; i < D; i++) a.q[node * D + i] -= along * n[i];
   return sum;
 }
 

@@ -145,8 +145,9 @@ void iterate(ConjugateGradientsArguments<T, D>& a, [[maybe_unused]] const Tensor
 }
 
 std::tuple<Tensor, Tensor> implicit_cg(const Tensor& x, const Tensor& rhs, const Tensor& mass, const Tensor& inverse,
-                                       const OptionalTensor& local, const OptionalTensor& images, const Tensor& tangent,
-                                       const Tensor& relative, int64_t max_iterations, int64_t stress_form,
+                                       const OptionalTensor& local, const OptionalTensor& held,
+                                       const OptionalTensor& images, const Tensor& tangent, const Tensor& relative,
+                                       int64_t max_iterations, int64_t stress_form,
                                        const std::vector<Tensor>& topology, const std::vector<double>& lattice,
                                        const std::vector<int64_t>& layout) {
   const PackedTopology blocks(topology, lattice, layout);
@@ -165,6 +166,7 @@ std::tuple<Tensor, Tensor> implicit_cg(const Tensor& x, const Tensor& rhs, const
     a.mass = node_pointer<T>(mass, "mass", x, {N});
     a.inverse = node_pointer<T>(inverse, "inverse", x, {N, kSymmetric<D>});
     if (local) a.local = node_pointer<T>(*local, "local", x, {N, kSymmetric<D>});
+    if (held) a.held = node_pointer<T>(*held, "held", x, {N, D});
     if (images) set_images(a, *images, x);
     a.rhs = node_pointer<T>(rhs, "rhs", x, {N, D});
     a.relative = node_pointer<T>(relative, "relative", x, {t.scenes});
@@ -202,8 +204,8 @@ STABLE_TORCH_LIBRARY_FRAGMENT(torch_mpm, m) {
         ") -> Tensor");
   m.def("implicit_node_blocks(Tensor x, Tensor tangent, int stress_form, " MPM_TOPOLOGY_SCHEMA ") -> Tensor");
   m.def(
-      "implicit_cg(Tensor x, Tensor rhs, Tensor mass, Tensor inverse, Tensor? local, Tensor? images, Tensor tangent, "
-      "Tensor relative, int max_iterations, int stress_form, " MPM_TOPOLOGY_SCHEMA
+      "implicit_cg(Tensor x, Tensor rhs, Tensor mass, Tensor inverse, Tensor? local, Tensor? held, Tensor? images, "
+      "Tensor tangent, Tensor relative, int max_iterations, int stress_form, " MPM_TOPOLOGY_SCHEMA
       ") -> (Tensor solution, Tensor scalars)");
 }
 #endif

@@ -280,6 +280,30 @@ def test_the_solution_stays_in_the_range_of_the_preconditioner(dim, device):
     assert relative_error(free * left, free * rhs) < 1e-10
 
 
+def test_nodes_are_held_along_any_direction(dim, device):
+    """Against a dense solve of what is free; what holds the nodes is not in the way of a tight tolerance."""
+    for dtype, least in ((torch.float64, 1e-12), (torch.float32, 3e-6)):
+        case = Case(dim, "quadratic", device, dtype)
+        normal = (
+            torch.nn.functional.normalize(case.nodes(5), dim=1)
+            * (torch.arange(len(case.mass)) % 2).to(case.mass)[:, None]
+        )
+        off = torch.eye(dim).to(normal) - normal[:, :, None] * normal[:, None, :]
+        rhs = (off @ (case.nodes(4) * case.mass[:, None])[:, :, None])[:, :, 0]
+        massive = (case.mass > 0)[:, None, None]
+        inner = torch.where(massive, torch.linalg.pinv(off @ torch.linalg.pinv(case.inverse()) @ off, rtol=1e-4), 0)
+        inverse = (inner + inner.mT) / 2
+        relative = torch.full((1,), least, dtype=dtype, device=device)
+        arguments = (case.blocks, case.particles.x, rhs, case.mass, inverse, case.tangent, relative, 1000)
+        solve = ops.implicit_cg(*arguments, held=normal)
+        assert solve.state.tolist() == [CONVERGED]
+        assert float((solve.solution * normal).sum(1).abs().max() / solve.solution.abs().max()) < 100 * least
+        left = ops.implicit_apply(case.blocks, case.particles.x, solve.solution, case.tangent, case.mass)
+        assert relative_error((off @ left[:, :, None])[:, :, 0], rhs) < 10 * least
+        with pytest.raises(ValueError, match=r"held must have shape \[N, D\]"):
+            ops.implicit_cg(*arguments, held=normal[:-1])
+
+
 def test_scenes_are_solved_apart(device):
     """Each as alone, with iterations of its own; one without particles, one of negative curvature, one with a NaN."""
     p = random_particles(2, sizes=(30, 0, 12, 20, 25), device=device, dx=0.25)
@@ -396,6 +420,19 @@ def test_opcheck(dim, device):
     torch.library.opcheck(namespace.implicit_node_blocks.default, (x, case.tangent, 0, *packed), test_utils=checks)
     torch.library.opcheck(
         namespace.implicit_cg.default,
-        (x, case.nodes(1), case.mass.contiguous(), upper, upper, None, case.tangent, relative, 5, 0, *packed),
+        (
+            x,
+            case.nodes(1),
+            case.mass.contiguous(),
+            upper,
+            upper,
+            case.nodes(2),
+            None,
+            case.tangent,
+            relative,
+            5,
+            0,
+            *packed,
+        ),
         test_utils=("test_schema",),
     )

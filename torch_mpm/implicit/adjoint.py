@@ -5,8 +5,9 @@ At the solution the free components of the residual vanish, g(v, θ) = 0, so tha
     v̄ · dv = −λ · ∂g/∂θ dθ   with   Jᵀ λ = v̄,   J = ∂g/∂v,
 
 where J is not projected: one linear solve, and one vector-Jacobian product of the residual. Without friction and flow
-inside the solve J is the Hessian of the energy. The memory does not depend on the iterations, and all of it is in the
-care of autograd.
+inside the solve J is the Hessian of the energy. Held components have the velocity b(θ) of what holds them: their
+residual is v − b, and their λ what Jᵀ λ of the free ones leaves of v̄. The memory does not depend on the iterations, and
+all of it is in the care of autograd.
 """
 
 from __future__ import annotations
@@ -41,11 +42,15 @@ def differentiable(
     gradient = system.residual(v)
     contact = contact_at(system, bounds, v, gradient)
     residual = contact.gradient
+    holds = None
+    if bounds is not None and bounds.moves():
+        residual, holds = residual + contact.missed(system, bounds, v), contact.holds(system)
     if not residual.requires_grad:
         return minimum.v
     # Start is nothing that the derivative depends on; friction depends on the gradient.
     pressing = None if contact.friction is None else gradient.detach()
-    parts = (fixed.blocks, fixed.state, fixed.mass, fixed.dt, fixed.mirrors, bounds, minimum.free, pressing)
+    still = None if bounds is None else bounds.detached()
+    parts = (fixed.blocks, fixed.state, fixed.mass, fixed.dt, fixed.mirrors, still, minimum.free, pressing, holds)
     parts, tensors = separated(parts)
     rest = fixed.law, fixed.stress_form, fixed.flows, parts
     result: Tensor = _Solution.apply(residual, minimum.v, owner, rest, *tensors)
@@ -66,9 +71,12 @@ class _Solution(torch.autograd.Function):
     def backward(ctx, grad):
         v, *tensors = ctx.saved_tensors
         law, stress_form, flows, parts = ctx.rest
-        blocks, state, mass, dt, mirrors, bounds, free, gradient = joined(parts, tensors)
+        blocks, state, mass, dt, mirrors, bounds, free, gradient, holds = joined(parts, tensors)
         system = ImplicitSystem(blocks, law, state, mass, v, dt, stress_form, flows, mirrors=mirrors)
-        adjoint, converged = _Adjoint(ctx.owner, system, bounds, free, gradient, v).solve(grad)
+        solve = _Adjoint(ctx.owner, system, bounds, free, gradient, v)
+        adjoint, converged = solve.solve(grad)
+        if holds is not None:
+            adjoint = adjoint + solve.held(grad, adjoint, holds)
         ctx.owner.record_adjoint(converged)
         adjoint = torch.where(system.of_nodes(converged), adjoint, torch.nan)
         return -adjoint, None, None, None, *(None for _ in tensors)
@@ -109,6 +117,7 @@ class _Adjoint:
         self._across = self._coupling = None
         if self._friction is not None and gradient is not None:
             self._across, self._coupling = self._friction.curvature(), self._friction.coupling(gradient)
+        self._normals = None if bounds is None else bounds.held_normals(free)
         blocks = system.diagonal(self._convex)
         self._inverse = inverse_blocks(bounds, blocks if self._across is None else blocks + self._across, free)
 
@@ -127,6 +136,11 @@ class _Adjoint:
             adjoint, converged = adjoint + rest.solution, converged & rest.converged
         return adjoint, converged
 
+    def held(self, grad: Tensor, adjoint: Tensor, holds: Tensor) -> Tensor:
+        """λ of the components that surfaces hold, bool [N, D], from that of the free ones [N, D]."""
+        assert self._bounds is not None
+        return self._bounds.kept(self._system.symmetric(grad) - self._product(adjoint), holds)
+
     def _not_symmetric(self) -> Tensor:
         """Scenes, bool [B]."""
         result = torch.zeros_like(self._relative, dtype=torch.bool)
@@ -141,18 +155,22 @@ class _Adjoint:
         system = self._system
         return implicit_cg(
             *(system.blocks, system.state.x, right, system.mass, self._inverse, tangent, relative, self._most),
-            *(system.stress_form, self._across, system.images),
+            *(system.stress_form, self._across, system.images, self._normals),
         )
 
     def _transposed(self, given: Tensor) -> Tensor:
+        """The free components of Jᵀ times free components."""
+        return self._kept(self._product(given))
+
+    def _product(self, given: Tensor) -> Tensor:
         """Jᵀ times free components. With friction c(g) d of the gradient g of the energy, J is (1 + d ∂c/∂g) ∂g/∂v and
         the derivative of friction by its direction."""
         derivative = self._system.derivative(self._tangent, None if self._skew is None else -self._skew)
         if self._friction is None or self._coupling is None:
-            return self._kept(derivative(given))
+            return derivative(given)
         direction = self._friction.bounds.turned(self._friction.direction)
         result = derivative(given + self._coupling * (direction * given).sum(1, keepdim=True))
-        return self._kept(result if self._across is None else result + times(self._across, given))
+        return result if self._across is None else result + times(self._across, given)
 
     def _kept(self, vectors: Tensor) -> Tensor:
         return vectors if self._bounds is None else self._bounds.kept(vectors, self._free)

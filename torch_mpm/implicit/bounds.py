@@ -41,6 +41,16 @@ class NodeBounds:
     friction: Tensor | None = None
     surface: Tensor | None = None
 
+    def detached(self) -> NodeBounds:
+        """The same for no gradients."""
+        fields = {name: None if value is None else value.detach() for name, value in vars(self).items()}
+        return NodeBounds(**fields)
+
+    def moves(self) -> bool:
+        """Whether a gradient is wanted of where the surfaces are and how they move."""
+        parts = (self.lower, self.upper, self.mirror, self.surface)
+        return any(part is not None and part.requires_grad for part in parts)
+
     def turned(self, v: Tensor) -> Tensor:
         """Velocities [N, D] to the axes of the nodes, and back: the same reflection."""
         if self.mirror is None:
@@ -64,6 +74,14 @@ class NodeBounds:
         """Vectors of nodes [N, D] without their components that are not free. What a solve is given in held components
         would leak into it by rounding, and grow."""
         return self.turned(torch.where(free, self.turned(v), 0))
+
+    def held_normals(self, free: Tensor) -> Tensor | None:
+        """Normals of obstacles along which nodes are not free, zero for the others [N, D]; None without obstacles."""
+        if self.mirror is None:
+            return None
+        axis = torch.nn.functional.one_hot(self.mirror.abs().argmax(-1), free.shape[1]).bool()
+        has_normal = (self.mirror != 0).any(-1, keepdim=True)
+        return self.turned((axis & ~free & has_normal).to(self.mirror.dtype))
 
     def turned_blocks(self, blocks: Tensor) -> Tensor:
         """Matrices [N, D, D] to the axes of the nodes, and back."""
@@ -99,7 +117,7 @@ def node_bounds(
 
     A mirror bounds the nodes on its plane alone; it shows obstacles to the nodes behind it as they are before it.
 
-    Differentiable by the friction of obstacles alone.
+    Differentiable as `Obstacle.forward` is.
     """
     if walls is None and not obstacles:
         return None

@@ -116,12 +116,26 @@ class Contact:
     gradient: Tensor
     friction: Friction | None = None
 
+    def holds(self, system: ImplicitSystem) -> Tensor:
+        """Components that a bound or friction gives the velocity of the surface, bool [N, D]."""
+        return ~self.free & (system.mass > 0)[:, None]
+
+    def missed(self, system: ImplicitSystem, bounds: NodeBounds, v: Tensor) -> Tensor:
+        """How far held components of node velocities v are from the velocity that holds them [N, D] [m/s]: nothing, but
+        for its derivatives by the bounds."""
+        u = bounds.turned(v)
+        given = torch.where((u - bounds.lower).abs() <= (u - bounds.upper).abs(), bounds.lower, bounds.upper)
+        if self.friction is not None and bounds.surface is not None:
+            given = torch.where(self.friction.limit.along & self.friction.sticks, bounds.surface, given)
+        holds = self.holds(system)
+        return bounds.turned(torch.where(holds, u - torch.where(holds, given, 0), 0))
+
 
 def contact_at(
     system: ImplicitSystem, bounds: NodeBounds | None, v: Tensor, gradient: Tensor, limit: Limit | None = None
 ) -> Contact:
     """Contact at node velocities v [N, D] [m/s], from the gradient of the energy there [N, D] [kg m/s]; differentiable
-    by that gradient and by the coefficients of friction. The limit of friction is that of the gradient, or as given."""
+    by that gradient and by the bounds. The limit of friction is that of the gradient, or as given."""
     massive = (system.mass > 0)[:, None].expand_as(v)
     if bounds is None:
         return Contact(massive, gradient)
@@ -142,7 +156,7 @@ def _limit(bounds: NodeBounds, gradient: Tensor, free: Tensor) -> Limit:
 
 def _friction(bounds: NodeBounds, v: Tensor, gradient: Tensor, free: Tensor, limit: Limit) -> Friction:
     assert bounds.surface is not None
-    relative = torch.where(limit.along, bounds.turned(v) - bounds.surface, 0).detach()
+    relative = torch.where(limit.along, bounds.turned(v) - bounds.surface, 0)
     speed = relative.norm(dim=1, keepdim=True)
     at_rest = speed <= rounding_of(torch.maximum(v.abs(), bounds.surface.abs()))
     relative = torch.where(at_rest, 0, relative)

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import torch
 from torch import Tensor
 
-from ..boundaries.obstacles import Obstacle, motion_tensors
 from ..capture import is_captured, is_traced, outside_transforms, without_transforms
 from ..errors import check_count, check_number
 from ..failures import Problem, unsolved_steps
@@ -114,7 +113,8 @@ class Implicit:
             nodes: mass and momentum before gravity [N, 1 + D] [kg, kg m/s], with the impulse of `explicit_stress`.
             dt: [s], a number or a tensor [], [1] or [B].
 
-        Differentiable by everything that the state, the law, gravity and the nodes depend on, by one linear solve.
+        Differentiable by everything that the state, the law, gravity, the obstacles and the nodes depend on, by one
+        linear solve.
         """
         gravity = step.gravity_like(state.x)
         walls = None if step.walls is None else step.walls.mirrors()
@@ -218,24 +218,17 @@ def check_implicit(step: Step, state: State) -> None:
     """What an implicit step does not have yet.
 
     Raises:
-        NotImplementedError: for counted impulses, obstacles with gradients, and steps that are
-            compiled, captured or transformed.
+        NotImplementedError: for counted impulses, and steps that are compiled, captured or transformed.
     """
-    obstacles = [b for b in step.boundaries.entries if isinstance(b, Obstacle)]
-    motions = [t for b in obstacles for t in motion_tensors(b) if t is not b.friction]
     if is_traced(state.x) or is_captured(state.x) or torch._C._are_functorch_transforms_active():
         raise NotImplementedError(
             "an implicit step looks at how far its solve is: it cannot be compiled, captured in a CUDA graph, or "
             "transformed by torch.func; its gradients are those of backward() and torch.autograd.grad"
         )
-    reasons = {
-        "impulses on boundaries": state.impulse is not None,
-        "motions and shapes of obstacles that require a gradient": torch.is_grad_enabled()
-        and any(t.requires_grad for t in motions),
-    }
-    for what, present in reasons.items():
-        if present:
-            raise NotImplementedError(f"an implicit step does not take {what} yet: use integrator='explicit'")
+    if state.impulse is not None:
+        raise NotImplementedError(
+            "an implicit step does not count impulses on boundaries yet: use integrator='explicit'"
+        )
 
 
 def check_explicit_materials(integrator: Implicit | None, law: Material) -> None:

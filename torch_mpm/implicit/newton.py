@@ -14,6 +14,7 @@ from ..ops.implicit import NEGATIVE_CURVATURE
 from .bounds import NodeBounds
 from .contact import Contact, Limit, contact_at
 from .gmres import gmres
+from .line_search import ROUNDING, Point, Search, starting_point
 from .preconditioner import preconditioned, times
 from .system import ImplicitSystem
 
@@ -23,11 +24,6 @@ NEAR, PATIENCE = 0.05, 6
 """Share of the first residual, and number of iterations, from which the Hessian is not projected any more."""
 KEPT = 0.01
 """Share of the first residual from which the preconditioner stays: so little changes any more."""
-SUFFICIENT = 1e-4
-"""Share of the decrease that the slope promises, which a step must bring (Nocedal and Wright 2006, section 3.1)."""
-ROUNDING = 32
-"""Units in the last place by which sums of energies may be wrong."""
-MOST_HALVINGS = 30
 SYMMETRIC = 1e-3
 """Skew part of the tangents, relative to the rest, up to which they count as symmetric."""
 SETTLED, OLDEST = 0.3, 5
@@ -68,88 +64,195 @@ class Minimum:
 def minimise(system: ImplicitSystem, bounds: NodeBounds | None, options: Options) -> Minimum:
     """The node velocities of least energy within bounds, for each scene apart.
 
-    The host waits for the device once per iteration to learn whether all scenes are done, and once per halving of a
-    step. A scene is done when its residual is `tolerance` times that of v*, or of the size of rounding; or when no step
-    lowers its energy. Projected Newton of Bertsekas (1982): components at a bound that the gradient holds there are
-    left out of the linear solve, and steps are clamped.
+    The host waits for the device once per iteration, to learn whether the last step has lowered the energy of all
+    scenes and whether all are done, and once per halving of a step. A scene is done when its residual is `tolerance`
+    times that of v*, or of the size of rounding; or when no step lowers its energy. Projected Newton of Bertsekas
+    (1982): components at a bound that the gradient holds there are left out of the linear solve, and steps are clamped.
     """
-    (v, energy, size), plain = _start(system, bounds)
-    scenes = len(energy)
-    zeros = torch.zeros(scenes, dtype=torch.int32, device=v.device)
-    total_mass = system.node_sum(system.mass)
-    total_mass = torch.where(total_mass > 0, total_mass, 1)
-    wave, momentum = _wave_speed_squared(system, total_mass), system.mass[:, None] * system.start
-    iterations, cg_iterations = zeros.clone(), zeros.clone()
-    first: Tensor | None = None
-    previous = forcing = None
-    stalled = indefinite = kept = torch.zeros(scenes, dtype=torch.bool, device=v.device)
-    diagonal: Tensor | None = None
-    all_kept = False
-    lag = _Lag(scenes, v.device)
-    while True:
+    return _Newton(system, bounds, options).minimum()
+
+
+@dataclasses.dataclass
+class _Iterate:
+    """Node velocities and what the method asks of them; flags of scenes are bool [B].
+
+    Attributes:
+        elastic: gradient of the energy [N, D] [kg m/s].
+        convex: projected tangents of the particles [P, n], None where the node blocks are those of the iterate before.
+        diagonal: node blocks of the Hessian [N, D, D] [kg].
+        inverse, change, residual: `preconditioned`.
+        target: residual that is small enough, float64 [B] [m/s].
+        small: whether the residual is.
+        done: small, or no step lowers the energy.
+        exact: whether the Hessian is not projected.
+        kept: whether the node blocks are those of the next iterate too.
+    """
+
+    point: Point
+    elastic: Tensor
+    convex: Tensor | None
+    diagonal: Tensor
+    contact: Contact
+    inverse: Tensor
+    change: Tensor
+    residual: Tensor
+    target: Tensor
+    small: Tensor
+    done: Tensor
+    exact: Tensor
+    kept: Tensor
+
+
+class _Look(NamedTuple):
+    """What the host learns of all scenes together."""
+
+    finished: bool
+    all_exact: bool
+    none_exact: bool
+    all_kept: bool
+    lowered: bool
+    """Whether the step that led here lowers the energy enough."""
+
+
+class _Newton:
+    """Newton's method for one system: what it knows from one iteration to the next."""
+
+    def __init__(self, system: ImplicitSystem, bounds: NodeBounds | None, options: Options) -> None:
+        self._system, self._bounds, self._options = system, bounds, options
+        self._begun, self._plain = starting_point(system, bounds)
+        device, scenes = self._plain.device, len(self._begun.energy)
+        self._iterations = torch.zeros(scenes, dtype=torch.int32, device=device)
+        self._cg_iterations = self._iterations.clone()
+        mass = system.node_sum(system.mass)
+        self._total_mass = torch.where(mass > 0, mass, 1)
+        self._wave = _wave_speed_squared(system, self._total_mass)
+        self._momentum = system.mass[:, None] * system.start
+        self._first: Tensor | None = None
+        self._previous: Tensor | None = None
+        self._forcing: Tensor | None = None
+        self._stalled = self._indefinite = self._whole = torch.zeros(scenes, dtype=torch.bool, device=device)
+        self._lag = _Lag(scenes, device)
+
+    def minimum(self) -> Minimum:
+        """Where the method ends."""
+        now, careful = self._at(self._begun), False
+        look = self._look(now)
+        while not look.finished:
+            search = self._step(now, look)
+            if careful:  # where one step was too long, the next often is, and an iterate there would be for nothing
+                careful = self._shortened(search, now)
+            after = self._at(search.point, now, look.all_kept)
+            next_look = self._look(after, search)
+            if not next_look.lowered:
+                careful = self._shortened(search, now)
+                after = self._at(search.point, now, look.all_kept)
+                next_look = self._look(after)
+            now, look = after, next_look
+        # No step lowers the energy where what is left to gain is less than its rounding.
+        v, energy, size = now.point
+        rounding = ROUNDING * torch.finfo(v.dtype).eps * size
+        small = now.small | (self._stalled & (now.residual.square() * self._total_mass <= rounding))
+        small = small & now.residual.isfinite() & energy.isfinite()
+        v = _with_momentum(self._system, self._bounds, v, self._total_mass)
+        return Minimum(v, now.contact.free, small, now.residual, self._iterations, self._cg_iterations)
+
+    def _at(self, point: Point, before: _Iterate | None = None, all_kept: bool = False) -> _Iterate:
+        """The iterate at a point, after another one whose node blocks may stay."""
+        system, bounds, v = self._system, self._bounds, point.v
         elastic = system.residual(v)
         convex: Tensor | None = None
-        if diagonal is None or not all_kept:
+        if before is not None and all_kept:
+            diagonal = before.diagonal
+        else:
             convex = system.tangent(v)
-            fresh = system.diagonal(convex)
-            diagonal = fresh if diagonal is None else torch.where(system.of_nodes(kept)[:, :, None], diagonal, fresh)
+            diagonal = system.diagonal(convex)
+            if before is not None:
+                diagonal = torch.where(system.of_nodes(before.kept)[:, :, None], before.diagonal, diagonal)
         contact = contact_at(system, bounds, v, elastic)
-        inverse, change, residual = preconditioned(system, bounds, diagonal, contact, total_mass)
-        if first is None:
-            first = residual
-            if plain is not v:  # a good start saves work, and does not ask for more accuracy
-                there = contact_at(system, bounds, plain, system.residual(plain))
-                first = torch.fmax(first, preconditioned(system, bounds, diagonal, there, total_mass)[2])
-        floor = _rounding(system, inverse, v, wave, momentum, total_mass)
+        inverse, change, residual = preconditioned(system, bounds, diagonal, contact, self._total_mass)
+        first = self._first_residual(point, diagonal, residual)
+        floor = _rounding(system, inverse, v, self._wave, self._momentum, self._total_mass)
         # One iteration at least: a smooth load may be smaller than the rounding of stresses, which averages out.
-        target = torch.maximum(options.tolerance * first, torch.where(iterations > 0, floor, 0))
+        target = torch.maximum(self._options.tolerance * first, torch.where(self._iterations > 0, floor, 0))
         small = residual <= target
-        done = stalled | small
-        exact = ~indefinite & ((residual <= NEAR * first) | (iterations >= PATIENCE))
+        done = self._stalled | small
+        exact = ~self._indefinite & ((residual <= NEAR * first) | (self._iterations >= PATIENCE))
         kept = done | (residual <= KEPT * first)
-        looks = done | (iterations >= options.max_iterations), done | exact, ~exact, kept
-        finished, all_exact, none_exact, all_kept = torch.stack(looks).all(1).tolist()
-        if finished:
-            break
-        forcing = _forcing(residual, previous, forcing, target)
-        previous = residual
-        relative = torch.where(done, 1.0, forcing).to(v.dtype)
-        tangent = _tangent(system, v, convex, exact, all_exact, none_exact)
-        skew = system.skew(v) if system.flows else None
-        whole = torch.zeros_like(done)
-        if skew is not None:
-            whole = skewed(system, skew, tangent, SYMMETRIC) & ~(done | lag.still)
-        model, blocks, across = contact, diagonal, None
-        if contact.friction is not None:
-            model = lag.contact(system, bounds, v, elastic, diagonal, contact, residual, total_mass)
-            across = None if model.friction is None else model.friction.curvature(change.norm(dim=1, keepdim=True))
-            blocks = blocks if across is None else blocks + across
-            inverse, change, _ = preconditioned(system, bounds, blocks, model, total_mass)
-        right = torch.where(system.of_nodes(done | whole), 0, -model.gradient)
-        solve = implicit_cg(
-            *(system.blocks, system.state.x, right, system.mass, inverse, tangent, relative),
-            *(options.max_cg_iterations, system.stress_form),
-            local=across,
-            images=system.images,
+        return _Iterate(
+            *(point, elastic, convex, diagonal, contact, inverse, change, residual, target, small, done, exact, kept)
         )
-        indefinite = solve.state == NEGATIVE_CURVATURE
-        direction = torch.where(system.of_nodes(indefinite & (solve.iterations == 0)), -change, solve.solution)
-        cg_iterations += solve.iterations
-        if skew is not None and bool(whole.any()):
-            unprojected = tangent if all_exact else system.tangent(v, projected=False)
+
+    def _first_residual(self, point: Point, diagonal: Tensor, residual: Tensor) -> Tensor:
+        """What the tolerance is relative to [m/s], [B]: a good start saves work, and does not ask for more accuracy."""
+        if self._first is None:
+            self._first = residual
+            if self._plain is not point.v:
+                system, bounds = self._system, self._bounds
+                there = contact_at(system, bounds, self._plain, system.residual(self._plain))
+                plain = preconditioned(system, bounds, diagonal, there, self._total_mass)[2]
+                self._first = torch.fmax(residual, plain)
+        return self._first
+
+    def _look(self, now: _Iterate, search: Search | None = None) -> _Look:
+        over = now.done | (self._iterations >= self._options.max_iterations)
+        lowered = torch.ones_like(over) if search is None else search.enough
+        looks = over, now.done | now.exact, ~now.exact, now.kept, lowered
+        return _Look(*torch.stack(looks).all(1).tolist())
+
+    def _shortened(self, search: Search, now: _Iterate) -> bool:
+        """Shorten steps from an iterate that are too long; whether there were any."""
+        if not search.shorten():
+            return False
+        self._lag.still = ~(search.moved() | now.done)
+        self._stalled = self._stalled | (self._lag.still & self._lag.renewed & ~self._whole)
+        return True
+
+    def _step(self, now: _Iterate, look: _Look) -> Search:
+        """The search along the direction of Newton's method."""
+        system, bounds, most, v = self._system, self._bounds, self._options.max_cg_iterations, now.point.v
+        self._forcing = _forcing(now.residual, self._previous, self._forcing, now.target)
+        self._previous = now.residual
+        relative = torch.where(now.done, 1.0, self._forcing).to(v.dtype)
+        tangent = _tangent(system, v, now.convex, now.exact, look.all_exact, look.none_exact)
+        now.convex = None
+        skew = system.skew(v) if system.flows else None
+        self._whole = torch.zeros_like(now.done)
+        if skew is not None:
+            self._whole = skewed(system, skew, tangent, SYMMETRIC) & ~(now.done | self._lag.still)
+        model, across, inverse, change = self._rubbed(now)
+        right = torch.where(system.of_nodes(now.done | self._whole), 0, -model.gradient)
+        solve = implicit_cg(
+            *(system.blocks, system.state.x, right, system.mass, inverse, tangent, relative, most),
+            *(system.stress_form, across, system.images, None if bounds is None else bounds.held_normals(model.free)),
+        )
+        self._indefinite = solve.state == NEGATIVE_CURVATURE
+        steepest = system.of_nodes(self._indefinite & (solve.iterations == 0))
+        direction = torch.where(steepest, -change, solve.solution)
+        self._cg_iterations += solve.iterations
+        if skew is not None and bool(self._whole.any()):
+            unprojected = tangent if look.all_exact else system.tangent(v, projected=False)
             derivative = _free_derivative(system, bounds, unprojected, skew, model, across)
-            step, more = _not_symmetric(system, derivative, inverse, change, model, whole, relative, options)
-            direction = torch.where(system.of_nodes(whole), step, direction)
-            cg_iterations += more
-        iterations += (~done).int()
-        v, energy, size, moved = _search(system, bounds, model, elastic, v, energy, size, direction, done)
-        lag.still = ~(moved | done)
-        stalled = stalled | (lag.still & lag.renewed & ~whole)
-    # No step lowers the energy where what is left to gain is less than its rounding.
-    small = small | (stalled & (residual.square() * total_mass <= ROUNDING * torch.finfo(v.dtype).eps * size))
-    finite = residual.isfinite() & energy.isfinite()
-    v = _with_momentum(system, bounds, v, total_mass)
-    return Minimum(v, contact.free, small & finite, residual, iterations, cg_iterations)
+            step, more = _not_symmetric(system, derivative, inverse, change, model, self._whole, relative, most)
+            direction = torch.where(system.of_nodes(self._whole), step, direction)
+            self._cg_iterations += more
+        self._iterations += (~now.done).int()
+        self._lag.still = torch.zeros_like(now.done)
+        return Search(system, bounds, model, now.elastic, now.point, direction, now.done)
+
+    def _rubbed(self, now: _Iterate) -> tuple[Contact, Tensor | None, Tensor, Tensor]:
+        """Contact with the limits of friction of this step, the second derivative of friction, B⁻¹ with it, and its
+        product with the gradient."""
+        contact = now.contact
+        if contact.friction is None:
+            return contact, None, now.inverse, now.change
+        system, bounds, total_mass = self._system, self._bounds, self._total_mass
+        model = self._lag.contact(
+            *(system, bounds, now.point.v, now.elastic, now.diagonal, contact, now.residual, total_mass)
+        )
+        across = None if model.friction is None else model.friction.curvature(now.change.norm(dim=1, keepdim=True))
+        blocks = now.diagonal if across is None else now.diagonal + across
+        inverse, change, _ = preconditioned(system, bounds, blocks, model, total_mass)
+        return model, across, inverse, change
 
 
 def _tangent(
@@ -200,12 +303,12 @@ def _not_symmetric(
     model: Contact,
     scenes: Tensor,
     relative: Tensor,
-    options: Options,
+    most: int,
 ) -> tuple[Tensor, Tensor]:
     """Newton steps with the whole derivative in some scenes, bool [B], or −B⁻¹ g where they do not descend; and the
     iterations that they took."""
     right = torch.where(system.of_nodes(scenes), -model.gradient, 0)
-    solve = gmres(system, derivative, inverse, right, relative, options.max_cg_iterations)
+    solve = gmres(system, derivative, inverse, right, relative, most)
     descends = system.node_sum(model.gradient * solve.solution) < 0
     return torch.where(system.of_nodes(descends), solve.solution, -change), solve.iterations
 
@@ -292,88 +395,3 @@ def _rounding(
 def _wave_speed_squared(system: ImplicitSystem, total_mass: Tensor) -> Tensor:
     """Σ V K/Σ m [m²/s²], [B]."""
     return (system.particle_sum(system.stiffness[:, None])[:, 0] / total_mass).clamp_min(0)
-
-
-class _Point(NamedTuple):
-    """Velocities [N, D], and their energy and its size, `ImplicitSystem.energy` [B]."""
-
-    v: Tensor
-    energy: Tensor
-    size: Tensor
-
-
-def _point(system: ImplicitSystem, bounds: NodeBounds | None, v: Tensor) -> _Point:
-    """The nearest velocities within bounds."""
-    v = v if bounds is None else bounds.clamped(v)
-    return _Point(v, *system.energy(v))
-
-
-def _lower(system: ImplicitSystem, a: _Point, b: _Point) -> _Point:
-    """Of each scene the one of less energy."""
-    lower = b.energy < torch.where(a.energy.isfinite(), a.energy, torch.inf)
-    rest = (torch.where(lower, y, x) for x, y in zip(a[1:], b[1:], strict=True))
-    return _Point(torch.where(system.of_nodes(lower), b.v, a.v), *rest)
-
-
-def _start(system: ImplicitSystem, bounds: NodeBounds | None) -> tuple[_Point, Tensor]:
-    """Where the search begins, and the velocities whose residual the tolerance is relative to.
-
-    These are v* within bounds or no motion, whichever has less energy; where both have none, a share of v* that has
-    one. The search begins there, or at the velocities before gravity where these have less energy still, as they do in
-    a body that is held and moves slowly.
-    """
-    plain = _lower(system, _point(system, bounds, system.start), _point(system, bounds, torch.zeros_like(system.start)))
-    lost, share = ~plain.energy.isfinite(), 1.0
-    for _ in range(MOST_HALVINGS):
-        if not bool(lost.any()):
-            break
-        share /= 2
-        part = _point(system, bounds, share * system.start)
-        plain = _lower(system, plain, part._replace(energy=torch.where(lost, part.energy, torch.inf)))
-        lost = ~plain.energy.isfinite()
-    if system.before_gravity is None:
-        return plain, plain.v
-    return _lower(system, plain, _point(system, bounds, system.before_gravity)), plain.v
-
-
-def _search(
-    system: ImplicitSystem,
-    bounds: NodeBounds | None,
-    contact: Contact,
-    residual: Tensor,
-    v: Tensor,
-    energy: Tensor,
-    size: Tensor,
-    step: Tensor,
-    done: Tensor,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Velocities after the longest of the steps 1, ½, ¼ ... that lowers the energy of each scene enough, what friction
-    dissipates counted; their energy and its size; and which scenes moved, bool [B]."""
-    rounding = ROUNDING * torch.finfo(v.dtype).eps
-    friction = contact.friction
-
-    def moved(share: Tensor) -> Tensor:
-        trial = v + system.of_nodes(share).to(v.dtype) * step
-        trial = trial if friction is None else friction.clamped(trial)
-        return trial if bounds is None else bounds.clamped(trial)
-
-    share = torch.where(done, 0.0, 1.0).double()
-    best, best_energy, best_size = v, energy, size
-    for _ in range(MOST_HALVINGS):
-        trial = moved(share)
-        trial_energy, trial_size = system.energy(trial)
-        gain = system.gain(v, residual, trial, trial_energy - energy)
-        if friction is not None:
-            gain = gain + system.node_sum(friction.gain(trial))
-        slope = system.node_sum(contact.gradient * (trial - v))
-        enough = gain <= SUFFICIENT * slope + rounding * (size + trial_size)
-        enough = (enough & trial_energy.isfinite() & (slope <= 0)) | (share == 0)
-        best, best_energy, best_size = trial, trial_energy, trial_size
-        if bool(enough.all()):
-            break
-        share = torch.where(enough, share, share / 2)
-    else:  # scenes that no step helps stay where they were
-        share = torch.where(enough, share, 0.0)
-        best = torch.where(system.of_nodes(share > 0), moved(share), v)
-        best_energy, best_size = system.energy(best)
-    return best, best_energy, best_size, share > 0

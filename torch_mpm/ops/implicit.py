@@ -105,6 +105,7 @@ def implicit_cg(
     stress_form: str = "mls",
     local: Tensor | None = None,
     images: Tensor | None = None,
+    held: Tensor | None = None,
 ) -> ImplicitSolve:
     """Solves H d = rhs by conjugate gradients, preconditioned by node blocks; scenes apart, each with its own scalars.
 
@@ -126,6 +127,9 @@ def implicit_cg(
         images: rows of nodes that mirrors make one, int32 [G, 2^D]: entry k of a group is the node that the axes of the
             bits of k reflect, -1 for none. A node is in one group at most. H is then the Hessian of symmetric
             velocities, and rhs and `inverse` must be symmetric, too. None without mirrors.
+        held: directions in which nodes are held, unit vectors [N, D], zero for none. Along them rhs and the range of
+            `inverse` have nothing but rounding, and what holds a node is left out of the residual. None where each node
+            is held along axes, in which `inverse` is exactly zero.
 
     Raises:
         ValueError, TypeError: for wrong shapes, dtypes or devices.
@@ -139,6 +143,7 @@ def implicit_cg(
     check_like("inverse", inverse, x, (N, D, D), "[N, D, D]")
     check_like("relative", relative, x, (B,), "[B]")
     check_like("local", local, x, (N, D, D), "[N, D, D]")
+    check_like("held", held, x, (N, D), "[N, D]")
     check_count("max_iterations", max_iterations)
     if images is not None:
         if not isinstance(images, Tensor) or images.dim() != 2 or images.shape[1] != 2**D:
@@ -149,8 +154,8 @@ def implicit_cg(
     solution, scalars = dispatch(
         torch.ops.torch_mpm.implicit_cg,
         *(x, rhs.contiguous(), mass.contiguous(), to_upper(inverse)),
-        *(None if local is None else to_upper(local), images, tangent, relative.contiguous()),
-        *(max_iterations, STRESS_FORMS[stress_form], *blocks.packed),
+        *(None if local is None else to_upper(local), None if held is None else held.contiguous(), images),
+        *(tangent, relative.contiguous(), max_iterations, STRESS_FORMS[stress_form], *blocks.packed),
     )
     integers = scalars.view(torch.int32)
     first, square = scalars[:, 0], scalars[:, 1]
@@ -210,7 +215,7 @@ def _node_blocks_fake(x, tangent, stress_form, *topology):
 
 
 @torch.library.register_fake("torch_mpm::implicit_cg")
-def _cg_fake(x, rhs, mass, inverse, local, images, tangent, relative, max_iterations, stress_form, *topology):
+def _cg_fake(x, rhs, mass, inverse, local, held, images, tangent, relative, max_iterations, stress_form, *topology):
     blocks = Topology.unpack(*topology)
     solution = x.new_empty(blocks.node_count, sizes(x, "x", 2)[1])
     return solution, x.new_empty(blocks.scenes, 5, dtype=torch.float64)

@@ -1,0 +1,186 @@
+"""Gradients of implicit steps by where obstacles are, how they move and which way they face."""
+
+import pytest
+import torch
+from helpers import relative_error
+from test_implicit_gradients import TIGHT, inputs, run
+
+import torch_mpm as mpm
+from torch_mpm.implicit import Implicit, equilibrium
+
+MOTION = ("position", "velocity", "rotation", "angular_velocity")
+SHAPES = {"sphere": (), "box": (), "plane": ("direction",), "capsule": ("direction",)}
+KINDS = [("sticky", False), ("slip", False), ("separate", False), ("slip", True), ("separate", True)]
+
+
+def parameters(dim, device):
+    """Of an obstacle that comes down on the block of `inputs` from above, turning."""
+    turn = (0.1,) if dim == 2 else (0.1, 0.2, 0.3)
+    given = {
+        "position": (0.55, 0.57, 0.4)[:dim],
+        "velocity": (0.4, -1.0, 0.3)[:dim],
+        "rotation": turn,
+        "angular_velocity": tuple(3 * w for w in turn),
+        "direction": (0.2, -0.8, 0.3)[:dim],
+        "friction": 0.2,
+    }
+    values = {name: torch.tensor(value, dtype=torch.float64, device=device) for name, value in given.items()}
+    if dim == 2:
+        values["rotation"], values["angular_velocity"] = (values[n][0] for n in ("rotation", "angular_velocity"))
+    return values
+
+
+def obstacle(shape, p, kind, rubs):
+    rest = {"velocity": p["velocity"], "rotation": p["rotation"], "angular_velocity": p["angular_velocity"]}
+    rest |= {"kind": kind, "friction": p["friction"] if rubs else 0.0}
+    if shape == "plane":
+        return mpm.Plane(p["position"], p["direction"], **rest)
+    if shape == "capsule":
+        return mpm.Capsule(p["position"], p["direction"] / 4, 0.13, **rest)
+    if shape == "box":
+        return mpm.Box(p["position"], (0.45, 0.3, 0.45)[: len(p["position"])], **rest)
+    return mpm.Sphere(p["position"], 0.2, **rest)
+
+
+def check(loss, values, names, limit=1e-6):
+    """The gradient of a loss by each name, along a random direction, against central differences."""
+    leaves = {name: values[name].clone().requires_grad_() for name in names}
+    grads = torch.autograd.grad(loss({**values, **leaves}), list(leaves.values()))
+    for name, grad in zip(leaves, grads, strict=True):
+        direction = torch.randn_like(values[name])
+        with torch.no_grad():
+            ends = [loss({**values, name: values[name] + h * direction}) for h in (1e-5, -1e-5)]
+        difference, terms = (ends[0] - ends[1]) / 2e-5, grad * direction
+        assert bool(terms.abs().sum() > 0), name
+        assert float((terms.sum() - difference).abs() / terms.norm()) < limit, name
+
+
+def weighed(device, dim):
+    """A loss of states: a random sum of their positions, velocities and deformation gradients."""
+    grid, values = inputs(dim, device)
+    weights = [torch.randn_like(values[name]) for name in ("x", "v", "F")]
+    return grid, values, lambda s: sum((w * t).sum() for w, t in zip(weights, (s.x, s.v, s.F), strict=True))
+
+
+@pytest.mark.parametrize(("kind", "rubs"), KINDS)
+@pytest.mark.parametrize("shape", SHAPES)
+def test_gradients_by_motion_and_shape(shape, kind, rubs, dim, device):
+    grid, values, weigh = weighed(device, dim)
+    walls = "slip" if dim == 2 else None
+
+    def loss(p):
+        return weigh(run(grid, values, walls=walls, boundaries=[obstacle(shape, p, kind, rubs)])[1])
+
+    names = [*MOTION, *SHAPES[shape], *(["friction"] if rubs else [])]
+    nothing = set()
+    if kind == "sticky":  # whichever way the surface faces
+        nothing |= {"rotation", "direction"}
+    if shape == "sphere":
+        nothing |= {"rotation"} if kind == "sticky" or (rubs and dim == 3) else {"rotation", "angular_velocity"}
+    check(loss, parameters(dim, device), [name for name in names if name not in nothing])
+
+
+@pytest.mark.parametrize("stress_form", ["mls", "gradient"])
+@pytest.mark.parametrize("walls", ["mirror", "sticky"])
+def test_gradients_beside_walls(walls, stress_form, device):
+    grid, values, weigh = weighed(device, 2)
+
+    def loss(p):
+        boundaries = [obstacle("plane", p, "separate", True)]
+        return weigh(run(grid, values, walls=walls, stress_form=stress_form, boundaries=boundaries)[1])
+
+    check(loss, parameters(2, device), (*MOTION, "direction", "friction"))
+
+
+def test_gradients_where_plastic_flow_is_inside_the_solve(device):
+    grid, values, weigh = weighed(device, 2)
+
+    def clay(mu, lam):
+        return mpm.CamClay(mu=mu, lam=lam, critical_slope=1.0, consolidation=1e3, hardening=5.0)
+
+    def loss(p):
+        boundaries = [obstacle("capsule", p, "slip", True)]
+        options = {**TIGHT, "plasticity": "inside"}
+        return weigh(run(grid, values, clay, options=options, walls="slip", boundaries=boundaries)[1])
+
+    check(loss, parameters(2, device), (*MOTION, "direction", "friction"), 1e-5)
+
+
+def test_gradients_of_a_path_over_ten_steps(device):
+    """A function of the time with parameters of its own, and the state beside it."""
+    grid, values, weigh = weighed(device, 2)
+    values["dt"] = values["dt"] / 4
+    p = {"speed": torch.tensor([0.3, -1.2], dtype=torch.float64, device=device), "v": values["v"]}
+    start = torch.tensor([0.55, 0.6], dtype=torch.float64, device=device)
+
+    def loss(p):
+        ball = mpm.Sphere(lambda t: start + torch.sin(20 * t)[..., None] * p["speed"] / 20, 0.2, "slip")
+        return weigh(run(grid, {**values, "v": p["v"]}, n=10, walls="sticky", boundaries=[ball])[1])
+
+    check(loss, p, ("speed", "v"))
+
+
+def test_each_scene_has_the_gradient_of_its_own_obstacle(device):
+    grid, values = inputs(2, device)
+    pair = mpm.Grid(grid.dx, grid.lower, grid.upper, scenes=2)
+    speeds = torch.tensor([[0.2, -1.0], [0.1, -0.5]], dtype=torch.float64, device=device, requires_grad=True)
+    fields = {name: torch.cat([values[name]] * 2) for name in ("x", "v", "F", "C", "mass", "volume")}
+    scene = torch.arange(2, device=device).repeat_interleave(len(values["x"])).int()
+    law = mpm.NeoHookean(mu=values["mu"], lam=values["lam"])
+
+    def end(grid, state, speed):
+        ball = mpm.Sphere((0.5, 0.6), 0.2, "sticky", velocity=speed)
+        step = mpm.Step(grid, law, walls="sticky", boundaries=[ball], integrator=Implicit(**TIGHT))
+        return step(state, 0.02).x.square().sum()
+
+    (together,) = torch.autograd.grad(end(pair, mpm.State(**fields, scene=scene), speeds), speeds)
+    alone = mpm.State(**{name: values[name] for name in ("x", "v", "F", "C", "mass", "volume")})
+    for b in range(2):
+        own = speeds[b].detach().clone().requires_grad_()
+        (grad,) = torch.autograd.grad(end(grid, alone, own), own)
+        assert relative_error(together[b], grad) < 1e-9
+
+
+def test_gradients_in_float32(device):
+    grads = []
+    for dtype in (torch.float64, torch.float32):
+        torch.manual_seed(0)
+        grid, values = inputs(2, device, dtype)
+        p = {name: value.to(dtype).requires_grad_() for name, value in parameters(2, device).items()}
+        _, end = run(
+            grid, values, options={"tolerance": 1e-6}, walls="slip", boundaries=[obstacle("plane", p, "slip", True)]
+        )
+        grads.append(torch.autograd.grad(end.v.square().sum(), list(p.values())))
+    for exact, single in zip(*grads, strict=True):
+        assert relative_error(single, exact) < 1e-3
+
+
+def test_gradients_of_a_state_do_not_depend_on_those_of_an_obstacle(device):
+    """Held components have an adjoint only where somebody asks for it."""
+    grid, values = inputs(2, device)
+    grads = []
+    for wanted in (False, True):
+        p = {name: value.requires_grad_(wanted) for name, value in parameters(2, device).items()}
+        v = values["v"].clone().requires_grad_()
+        _, end = run(grid, {**values, "v": v}, walls="slip", boundaries=[obstacle("box", p, "separate", True)])
+        grads.append(torch.autograd.grad(end.x.square().sum(), v)[0])
+    assert relative_error(*grads) < 1e-10
+
+
+def test_a_grip_in_equilibrium(device):
+    """The work of plates on a block that they squeeze: what the energy of the block gains with their distance is the
+    force, the same on both plates."""
+    grid, values = inputs(2, device)
+    state = mpm.State(**{name: values[name] for name in ("x", "v", "mass", "volume")})
+    law = mpm.NeoHookean(mu=values["mu"], lam=values["lam"])
+    speeds = torch.tensor([0.02, -0.03], dtype=torch.float64, device=device, requires_grad=True)
+    zero = torch.zeros_like(speeds[0])
+    plates = [
+        mpm.Plane(at, (0, up), "sticky", velocity=torch.stack([zero, speed]))
+        for at, up, speed in (((0, 0.1), 1.0, speeds[0]), ((0, 0.4), -1.0, speeds[1]))
+    ]
+    step = mpm.Step(grid, law, boundaries=plates, integrator=Implicit(**TIGHT))
+    end = equilibrium(step, state, 1.0)
+    energy = (values["volume"] * law.energy_density(end)).sum()
+    forces = torch.autograd.grad(energy, speeds)[0]
+    assert float(forces[0]) > 0 and relative_error(forces[0], -forces[1]) < 1e-6

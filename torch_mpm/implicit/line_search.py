@@ -1,0 +1,129 @@
+"""Where Newton's method begins, and how far it goes along its directions, for each scene apart."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from .bounds import NodeBounds
+from .contact import Contact
+from .system import ImplicitSystem
+
+SUFFICIENT = 1e-4
+"""Share of the decrease that the slope promises, which a step must bring (Nocedal and Wright 2006, section 3.1)."""
+ROUNDING = 32
+"""Units in the last place by which sums of energies may be wrong."""
+MOST_HALVINGS = 30
+
+
+class Point(NamedTuple):
+    """Velocities [N, D], and their energy and its size, `ImplicitSystem.energy` [B]."""
+
+    v: Tensor
+    energy: Tensor
+    size: Tensor
+
+
+def starting_point(system: ImplicitSystem, bounds: NodeBounds | None) -> tuple[Point, Tensor]:
+    """Where the search begins, and the velocities whose residual the tolerance is relative to.
+
+    These are v* within bounds or no motion, whichever has less energy; where both have none, a share of v* that has
+    one. The search begins there, or at the velocities before gravity where these have less energy still, as they do in
+    a body that is held and moves slowly.
+    """
+    plain = _lower(system, _point(system, bounds, system.start), _point(system, bounds, torch.zeros_like(system.start)))
+    lost, share = ~plain.energy.isfinite(), 1.0
+    for _ in range(MOST_HALVINGS):
+        if not bool(lost.any()):
+            break
+        share /= 2
+        part = _point(system, bounds, share * system.start)
+        plain = _lower(system, plain, part._replace(energy=torch.where(lost, part.energy, torch.inf)))
+        lost = ~plain.energy.isfinite()
+    if system.before_gravity is None:
+        return plain, plain.v
+    return _lower(system, plain, _point(system, bounds, system.before_gravity)), plain.v
+
+
+def _point(system: ImplicitSystem, bounds: NodeBounds | None, v: Tensor) -> Point:
+    """The nearest velocities within bounds."""
+    v = v if bounds is None else bounds.clamped(v)
+    return Point(v, *system.energy(v))
+
+
+def _lower(system: ImplicitSystem, a: Point, b: Point) -> Point:
+    """Of each scene the one of less energy."""
+    lower = b.energy < torch.where(a.energy.isfinite(), a.energy, torch.inf)
+    rest = (torch.where(lower, y, x) for x, y in zip(a[1:], b[1:], strict=True))
+    return Point(torch.where(system.of_nodes(lower), b.v, a.v), *rest)
+
+
+class Search:
+    """The longest of the steps 1, ½, ¼ ... that lowers the energy of each scene enough, what friction dissipates
+    counted. It begins with the whole step, and does not make the host wait until it is asked to `shorten`.
+
+    Args:
+        system, bounds: whose velocities they are.
+        contact: at the start, with the limits of friction that count.
+        residual: gradient of the energy there [N, D] [kg m/s].
+        start: where the step begins.
+        step: [N, D] [m/s].
+        done: scenes that stay where they are, bool [B].
+
+    Attributes:
+        point: after the step.
+        enough: scenes whose energy is low enough there, bool [B].
+    """
+
+    def __init__(
+        self,
+        system: ImplicitSystem,
+        bounds: NodeBounds | None,
+        contact: Contact,
+        residual: Tensor,
+        start: Point,
+        step: Tensor,
+        done: Tensor,
+    ) -> None:
+        self._system, self._bounds, self._contact, self._residual = system, bounds, contact, residual
+        self._start, self._step = start, step
+        self._share = torch.where(done, 0.0, 1.0).double()
+        self.point, self.enough = self._tried()
+
+    def shorten(self) -> bool:
+        """Shorten the steps of scenes where they are too long; whether there are any. Scenes that no step helps stay
+        where they were."""
+        for tried in range(MOST_HALVINGS):
+            if bool(self.enough.all()):
+                return tried > 0
+            self._share = torch.where(self.enough, self._share, self._share / 2)
+            self.point, self.enough = self._tried()
+        self._share = torch.where(self.enough, self._share, 0.0)
+        v = torch.where(self._system.of_nodes(self.moved()), self._moved(), self._start.v)
+        self.point = Point(v, *self._system.energy(v))
+        return True
+
+    def moved(self) -> Tensor:
+        """Scenes that are not where they were, bool [B]."""
+        return self._share > 0
+
+    def _moved(self) -> Tensor:
+        v = self._start.v + self._system.of_nodes(self._share).to(self._step.dtype) * self._step
+        friction = self._contact.friction
+        v = v if friction is None else friction.clamped(v)
+        return v if self._bounds is None else self._bounds.clamped(v)
+
+    def _tried(self) -> tuple[Point, Tensor]:
+        """The point after the shares of the step that are next, and where its energy is low enough."""
+        system, start, friction = self._system, self._start, self._contact.friction
+        v = self._moved()
+        point = Point(v, *system.energy(v))
+        gain = system.gain(start.v, self._residual, v, point.energy - start.energy)
+        if friction is not None:
+            gain = gain + system.node_sum(friction.gain(v))
+        slope = system.node_sum(self._contact.gradient * (v - start.v))
+        rounding = ROUNDING * torch.finfo(v.dtype).eps * (start.size + point.size)
+        enough = gain <= SUFFICIENT * slope + rounding
+        return point, (enough & point.energy.isfinite() & (slope <= 0)) | (self._share == 0)
