@@ -160,8 +160,10 @@ MPM_HD double cg_curvature(const ConjugateGradientsArguments<T, D>& a, int64_t n
   if (!a.held) return sum;
   const T* n = a.held + node * D;
   T along = T(0);
-  MPM_UNROLL for (int i = 0; i < D; i++) along += n[i] * a.q[node * D + i];
-  MPM_UNROLL for (int i = 0; i < D; i++) a.q[node * D + i] -= along * n[i];
+  MPM_UNROLL for (int i = 0; i < D; i++)
+    along += n[i] * a.q[node * D + i];
+  MPM_UNROLL for (int i = 0; i < D; i++)
+    a.q[node * D + i] -= along * n[i];
   return sum;
 }
 
