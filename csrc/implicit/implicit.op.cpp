@@ -147,9 +147,8 @@ void iterate(ConjugateGradientsArguments<T, D>& a, [[maybe_unused]] const Tensor
 std::tuple<Tensor, Tensor> implicit_cg(const Tensor& x, const Tensor& rhs, const Tensor& mass, const Tensor& inverse,
                                        const OptionalTensor& local, const OptionalTensor& held,
                                        const OptionalTensor& images, const Tensor& tangent, const Tensor& relative,
-                                       int64_t max_iterations, int64_t stress_form,
-                                       const std::vector<Tensor>& topology, const std::vector<double>& lattice,
-                                       const std::vector<int64_t>& layout) {
+                                       int64_t max_iterations, int64_t stress_form, const std::vector<Tensor>& topology,
+                                       const std::vector<double>& lattice, const std::vector<int64_t>& layout) {
   const PackedTopology blocks(topology, lattice, layout);
   STD_TORCH_CHECK(max_iterations >= 0 && max_iterations <= INT32_MAX, "max_iterations must be 0 to 2^31 - 1, got ",
                   max_iterations);
