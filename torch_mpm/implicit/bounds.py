@@ -43,8 +43,8 @@ class NodeBounds:
 
     def detached(self) -> NodeBounds:
         """The same for no gradients."""
-        fields = {name: None if value is None else value.detach() for name, value in vars(self).items()}
-        return NodeBounds(**fields)
+        rest = (None if t is None else t.detach() for t in (self.mirror, self.friction, self.surface))
+        return NodeBounds(self.lower.detach(), self.upper.detach(), *rest)
 
     def moves(self) -> bool:
         """Whether a gradient is wanted of where the surfaces are and how they move."""
