@@ -6,13 +6,12 @@
 
 // The kernel of resident scenes, for any source of P2G and task of G2P. A substep of a scene is
 //   particles   law and contribution of each particle, in lists by cell
-//   cells       the cells that have particles, in their order, with their lists in that of the index tensor; empty
-//   nodes walk        each cell's particles summed up by a thread per leading node, then added to the nodes in turns,
-//   no two
-//               threads to the same node at a time
+//   columns     the rows of cells of a block along the last axis that have particles, in their order; empty nodes
+//   walk        the particles of each column, or of each of its cells, summed up by a thread per leading node, then
+//               added to the nodes in turns, no two threads to the same node at a time
 //   nodes       grid update and contact
 //   particles   G2P, and the blocks that the particles touch next.
-// Sums have the order of the index tensor, so that those of a deterministic activation are always the same.
+// Where the activation is deterministic, lists have the order of the index tensor, and sums so, too.
 namespace mpm::cuda {
 
 constexpr int kResidentThreads = 512;  // at most
@@ -50,20 +49,22 @@ struct SceneBlocks {
 struct SceneState {
   int begin, end;                                            // particles index[begin, end)
   int blocks;                                                // numbered
-  int cells;                                                 // with particles
+  int columns;                                               // with particles
   int grown;                                                 // whether a particle touches a block without a number
   int outside, first_outside, not_finite, first_not_finite;  // of this substep; first as largest complement
-  int cells_before[kResidentThreads / 32];                   // each warp
+  int columns_before[kResidentThreads / 32];                 // each warp
   char* more_blocks;
   int more_room;
 };
 
-template <class Source, class Task>
+// Where all of a scene stays in shared memory, Spills is false, and all loads and stores are those of shared memory.
+template <class Source, class Task, bool Spills>
 class SceneStep {
  public:
   using T = typename Source::Shape::T;
   using S = ResidentShape<typename Source::Shape>;
   static constexpr int D = S::D, Order = S::Order, count = kBlockNodes<D>;
+  static constexpr int cells = kBlockWidth, rows_of_slab = S::slab / S::support;  // of a column
   using Blocks = SceneBlocks<T, D>;
   using Rows = SharedParticles<S>;
 
@@ -75,7 +76,7 @@ class SceneStep {
   int* const table;        // [blocks_per_scene] numbers of blocks, -1 where there is none
   unsigned* const wanted;  // a bit for each block that wants a number
   Rows rows;
-  int* const cells;  // [particles] those that have particles
+  int* const columns;  // [particles] those that have particles
   Blocks blocks;
   GridUpdateArguments<T, D>& update;  // with the blocks of this scene
   ContactArguments<T, D>& contact;
@@ -84,6 +85,9 @@ class SceneStep {
   __device__ const Geometry<T, D>& geometry() const { return source.topology.geometry; }
   __device__ int particles() const { return state.end - state.begin; }
   __device__ int particle(int k) const { return topology().index[state.begin + k]; }
+  // Those of the first round and of the one after, loaded early; some particle where there is none.
+  __device__ int first_particle() const { return particle(::min(int(threadIdx.x), particles() - 1)); }
+  __device__ int particle_after(int k) const { return particle(::min(k + int(blockDim.x), particles() - 1)); }
 
   // Cell of a base node in the numbered blocks; `base` becomes that in its block.
   __device__ int cell_of(int (&base)[D]) const {
@@ -149,7 +153,7 @@ class SceneStep {
   }
 
   // Numbers the blocks anew where particles touch others. Where there is no room any more blocks that nobody touches
-  // are given up, and then shared memory for global. False where there is no room at all.
+  // are given up, and then shared memory for global. False where there is no room at all, or none that is shared.
   __device__ bool make_room(int64_t step) {
     if (!state.grown) return true;
     number();
@@ -158,7 +162,7 @@ class SceneStep {
       __syncthreads();
       touch_all();
       number();
-      if (state.blocks > blocks.room && !take_more(step)) return false;
+      if (state.blocks > blocks.room && !find_more(step)) return false;
     }
     for (int i = threadIdx.x; i < state.blocks; i += blockDim.x) {
       const int b = blocks.block[i] - scene * geometry().blocks_per_scene;
@@ -191,6 +195,13 @@ class SceneStep {
     state.more_blocks = a.blocks + int64_t(found) * int64_t(Blocks::bytes);
   }
 
+  __device__ bool find_more(int64_t step) {
+    if constexpr (Spills) return take_more(step);
+    for (int b = threadIdx.x; b < geometry().blocks_per_scene; b += blockDim.x) table[b] = -1;
+    __syncthreads();
+    return false;
+  }
+
   __device__ bool take_more(int64_t step) {
     if (threadIdx.x == 0) {
       take_spare_blocks();
@@ -204,9 +215,11 @@ class SceneStep {
   }
 
   __device__ void load_particles() const {
+    int following = first_particle();
 #pragma unroll 1
     for (int k = threadIdx.x; k < particles(); k += blockDim.x) {
-      const int p = particle(k);
+      const int p = following;
+      following = particle_after(k);
       const Vector<T, D> x = read_vector(source.position, p);
       const auto loaded = source.load(p, scene);
       int base[D];
@@ -260,83 +273,178 @@ class SceneStep {
     blocks.head[cell] = first;
   }
 
-  __device__ void list_cells() const {
-    const int of_blocks = state.blocks * count, warps = blockDim.x / 32, warp = threadIdx.x / 32,
+  __device__ bool has_particles(int column) const {
+    const int4 first = reinterpret_cast<const int4*>(blocks.head)[column];
+    static_assert(kBlockWidth == 4 && Rows::end == -1);
+    return (first.x & first.y & first.z & first.w) != Rows::end;
+  }
+
+  __device__ void list_columns() const {
+    const int of_blocks = state.blocks * count / kBlockWidth, warps = blockDim.x / 32, warp = threadIdx.x / 32,
               lane = threadIdx.x % 32;
     const int share = (of_blocks + warps * 32 - 1) / (warps * 32) * 32;
     const int begin = ::min(warp * share, of_blocks), end = ::min(begin + share, of_blocks);
     int mine = 0;
     for (int first = begin; first < end; first += 32)
-      mine += __popc(__ballot_sync(~0u, first + lane < end && blocks.head[first + lane] != Rows::end));
-    if (lane == 0) state.cells_before[warp] = mine;
+      mine += __popc(__ballot_sync(~0u, first + lane < end && has_particles(first + lane)));
+    if (lane == 0) state.columns_before[warp] = mine;
     for (int i = threadIdx.x; i < state.blocks * (count * (1 + D) / 4); i += blockDim.x)
       store_quad(blocks.node + 4 * i, Quad<T>{});
     __syncthreads();
-    int number = 0;
-    for (int w = 0; w < warp; w++) number += state.cells_before[w];
+    int number = __reduce_add_sync(~0u, lane < warp ? state.columns_before[lane] : 0);
     for (int first = begin; first < end; first += 32) {
-      const int cell = first + lane;
-      const bool with = cell < end && blocks.head[cell] != Rows::end;
+      const int column = first + lane;
+      const bool with = column < end && has_particles(column);
       const unsigned others = __ballot_sync(~0u, with);
-      if (with) cells[number + __popc(others & ((1u << lane) - 1))] = cell;
+      if (with) columns[number + __popc(others & ((1u << lane) - 1))] = column;
       number += __popc(others);
     }
-    if (warp == warps - 1 && lane == 0) state.cells = number;
+    if (warp == warps - 1 && lane == 0) state.columns = number;
     __syncthreads();
-    for (int i = threadIdx.x; i < state.cells; i += blockDim.x) sort_list(cells[i]);
+    if (!a.p2g.deterministic) return;
+    for (int i = threadIdx.x; i < state.columns * kBlockWidth; i += blockDim.x)
+      sort_list(columns[i / kBlockWidth] * kBlockWidth + i % kBlockWidth);
     __syncthreads();
   }
 
-  // What one thread has summed up for the n-th node behind a leading one.
-  __device__ void add_to_node(int cell, int lane, int n, const T (&value)[S::channels]) const {
-    const int offset[3] = {lane, D == 2 ? n : n / S::support, n % S::support};
-    int node[D], neighbour = 0;
+  // Rows of the nodes that a thread adds to: of each row of nodes behind its leading one, the one beside the first cell
+  // of the column, and that beyond the block, -1 where no particle of the column touches it.
+  struct Places {
+    int near[rows_of_slab], far[rows_of_slab];
+  };
+
+  __device__ Places places_of(int column, int lane) const {
+    Places places;
+    const int first = column * cells;
 #pragma unroll
-    for (int i = 0; i < D; i++) {
-      node[i] = lattice_index_in_block(cell, i) + offset[i];
-      neighbour = neighbour * 2 + (node[i] >= kBlockWidth);
+    for (int across = 0; across < rows_of_slab; across++) {
+      const int offset[2] = {lane, across};
+      int node[D], neighbour = 0;
+      node[D - 1] = 0;
+#pragma unroll
+      for (int i = 0; i < D - 1; i++) {
+        node[i] = lattice_index_in_block(first, i) + offset[i];
+        neighbour = neighbour * 2 + (node[i] >= kBlockWidth);
+      }
+      const int* const slots = blocks.neighbour + (first / count << D) + neighbour * 2;
+      places.near[across] = slots[0] * count + node_in_block<D>(node);
+      places.far[across] = slots[1] < 0 ? -1 : slots[1] * count + node_in_block<D>(node);
     }
-    const int slot = blocks.neighbour[(cell / count << D) + neighbour];
-    T* const to = blocks.node + (slot * count + node_in_block<D>(node)) * (1 + D);
-    if constexpr (D == 3 && sizeof(T) == 4) {
-      Quad<T> v = load_quad(to);
-#pragma unroll
-      for (int c = 0; c < 4; c++) v.e[c] += value[c];
-      store_quad(to, v);
-    } else {
-#pragma unroll
-      for (int c = 0; c <= D; c++) to[c] += value[c];
-    }
+    return places;
   }
 
   __device__ static int lattice_index_in_block(int cell, int axis) {
     return cell >> 2 * (D - 1 - axis) & (kBlockWidth - 1);
   }
 
-  __device__ void walk() const {
-    const int walkers = state.cells * S::support;
-    for (int first = 0; first < walkers; first += blockDim.x) {
-      const Walker<S> walker(first + int(threadIdx.x));
-      const bool walks = first + int(threadIdx.x) < walkers;
-      const int cell = walks ? cells[walker.list] : 0;
-      T sum[S::slab][S::channels] = {};
+  template <int Nodes>
+  __device__ void add_to_nodes(int row, const T (*value)[S::channels]) const {
+    T* const to = blocks.node + row * (1 + D);
+    if constexpr (D == 3 && sizeof(T) == 4) {
+      Quad<T> v[Nodes];
+#pragma unroll
+      for (int n = 0; n < Nodes; n++) v[n] = load_quad(to + 4 * n);
+#pragma unroll
+      for (int n = 0; n < Nodes; n++) {
+#pragma unroll
+        for (int c = 0; c < 4; c++) v[n].e[c] += value[n][c];
+        store_quad(to + 4 * n, v[n]);
+      }
+    } else {
+#pragma unroll
+      for (int n = 0; n < Nodes; n++)
+#pragma unroll
+        for (int c = 0; c <= D; c++) to[n * (1 + D) + c] += value[n][c];
+    }
+  }
+
+  // Of rows of nodes behind a leading one, where each thread of a column has those of one cell, the n-th: what they
+  // give the node beside it, and the one beyond the block that is as far from the first of that.
+  __device__ static void exchange(int n, const T (*sum)[S::channels], T (&near)[S::channels], T (&far)[S::channels]) {
+#pragma unroll
+    for (int c = 0; c < S::channels; c++) near[c] = sum[0][c], far[c] = T(0);
+#pragma unroll
+    for (int k = 1; k <= Order; k++) {
+#pragma unroll
+      for (int c = 0; c < S::channels; c++) {
+        const T from = __shfl_sync(~0u, sum[k][c], (n - k) & (cells - 1), cells);
+        near[c] += n >= k ? from : T(0);
+        far[c] += n >= k ? T(0) : from;
+      }
+    }
+  }
+
+  // With a thread for each column and leading node.
+  __device__ void walk_columns() const {
+    constexpr int nodes = cells + Order;
+    const int walkers = state.columns * S::support;
+    for (int begin = 0; begin < walkers; begin += blockDim.x) {
+      const Walker<S> walker(begin + int(threadIdx.x));
+      const bool walks = begin + int(threadIdx.x) < walkers;
+      const int column = walks ? columns[walker.list] : 0;
+      T sum[rows_of_slab * nodes][S::channels] = {};
       if (walks) {
+#pragma unroll
+        for (int n = 0; n < cells; n++) {
 #pragma unroll 1
-        for (int row = blocks.head[cell]; row != Rows::end;) {
-          const int following = rows.next[row];
-          add_particle(rows, walker, row, sum);
-          row = following;
+          for (int row = blocks.head[column * cells + n]; row != Rows::end;) {
+            const int following = rows.next[row];
+            add_particle<S, nodes>(rows, walker, row, sum + n);
+            row = following;
+          }
         }
       }
+      const Places places = places_of(column, walker.lane);
 #pragma unroll
-      for (int lane = 0; lane < S::support; lane++) {
-#pragma unroll
-        for (int n = 0; n < S::slab; n++) {
-          if (walks && walker.lane == lane) add_to_node(cell, lane, n, sum[n]);
+      for (int across = 0; across < rows_of_slab; across++) {
+#pragma unroll 1
+        for (int lane = 0; lane < S::support; lane++) {
+          const bool adds = walks && walker.lane == lane;
+          if (adds) add_to_nodes<cells>(places.near[across], sum + across * nodes);
+          __syncthreads();
+          if (adds && places.far[across] >= 0) add_to_nodes<Order>(places.far[across], sum + across * nodes + cells);
           __syncthreads();
         }
       }
     }
+  }
+
+  // With a thread for each cell and leading node, for scenes that have no more of these than threads.
+  __device__ void walk_cells() const {
+    const int n = threadIdx.x % cells;
+    const Walker<S> walker(threadIdx.x / cells);
+    const bool walks = walker.list < state.columns;
+    const int column = walks ? columns[walker.list] : 0;
+    T sum[S::slab][S::channels] = {};
+    if (walks) {
+#pragma unroll 1
+      for (int row = blocks.head[column * cells + n]; row != Rows::end;) {
+        const int following = rows.next[row];
+        add_particle(rows, walker, row, sum);
+        row = following;
+      }
+    }
+    const Places places = places_of(column, walker.lane);
+#pragma unroll
+    for (int across = 0; across < rows_of_slab; across++) {
+      T near[1][S::channels], far[1][S::channels];
+      exchange(n, sum + across * S::support, near[0], far[0]);
+#pragma unroll 1
+      for (int lane = 0; lane < S::support; lane++) {
+        const bool adds = walks && walker.lane == lane;
+        if (adds) add_to_nodes<1>(places.near[across] + n, near);
+        __syncthreads();
+        if (adds && n < Order && places.far[across] >= 0) add_to_nodes<1>(places.far[across] + n, far);
+        __syncthreads();
+      }
+    }
+  }
+
+  __device__ void walk() const {
+    if (state.columns * S::support * cells <= int(blockDim.x))
+      walk_cells();
+    else
+      walk_columns();
   }
 
   __device__ void update_nodes() const {
@@ -361,13 +469,18 @@ class SceneStep {
     __syncthreads();
   }
 
-  __device__ void move_particles() const {
+  // What G2P reads of the particles of the first round, which may be loaded while the nodes are updated.
+  __device__ typename Task::Loaded load_first() const { return task.load(first_particle(), scene); }
+
+  __device__ void move_particles(typename Task::Loaded loaded) const {
     constexpr bool quads = D == 3 && sizeof(T) == 4;
     const NodeField<const T> velocity{blocks.node + 1, 1 + D, D};
+    int following = first_particle();
 #pragma unroll 1
     for (int k = threadIdx.x; k < particles(); k += blockDim.x) {
-      const int p = particle(k);
-      const auto loaded = task.load(p, scene);
+      const int p = following;
+      following = particle_after(k);
+      if (k >= int(blockDim.x)) loaded = task.load(p, scene);
       GridSupport<T, Task::K, D, quads> support{velocity};
       T f[D];
       if (!locate<Order>(geometry(), loaded.x.e, support.base, f)) {
@@ -423,12 +536,36 @@ MPM_HD int64_t bytes_of_table(int64_t blocks) {
   return (blocks + (blocks + 31) / 32 + 3) / 4 * 4 * int64_t(sizeof(int));
 }
 
+// Substeps of a scene from one on; returns where they end, before the last for want of shared memory alone.
+template <class Step>
+__device__ int64_t run_scene(Step& s, int64_t step) {
+  s.touch_all();
+  __syncthreads();
+#pragma unroll 1
+  for (; step < s.a.steps; step++) {
+    if (!s.make_room(step)) return step;
+    s.load_particles();
+    __syncthreads();
+    s.tell(step);
+    s.list_columns();
+    s.walk();
+    const auto loaded = s.load_first();
+    s.update_nodes();
+    s.move_particles(loaded);
+    if (threadIdx.x == 0) s.contact.time += s.a.dt;
+    move_clock(s.a, s.scene, 1);
+    __syncthreads();
+  }
+  return step;
+}
+
 // One thread block per scene, and one for particles outside. `shared` are the bytes of dynamic shared memory.
 template <class Source, class Task, class T, int D>
 __global__ void __launch_bounds__(kResidentThreads)
     resident_kernel(const Source source, const Task task, const ResidentArguments<T, D> a, int shared) {
   using S = ResidentShape<typename Source::Shape>;
   using Blocks = SceneBlocks<T, D>;
+  using Rows = SharedParticles<S>;
   extern __shared__ __align__(16) char memory[];
   __shared__ SceneState state;
   __shared__ alignas(16) char update_memory[sizeof(GridUpdateArguments<T, D>)];
@@ -454,42 +591,46 @@ __global__ void __launch_bounds__(kResidentThreads)
   __syncthreads();
   const int particles = state.end - state.begin;
   if (particles == 0) return move_clock(a, scene, a.steps);
-  char* free = memory + bytes_of_table(per_scene);
-  const int64_t left = shared - (free - memory), rows = bytes_of_particles<S>(particles);
-  const bool fits = rows + int64_t(Blocks::bytes) <= left;
-  char* const row_memory =
-      fits ? free : a.rows + (state.begin + int64_t(64) * scene) * (S::row_bytes + int64_t(sizeof(int))) / 16 * 16;
-  if (fits) free += rows;
+  const int64_t table_bytes = bytes_of_table(per_scene), row_bytes = bytes_of_particles<S>(particles);
+  const int64_t left = shared - table_bytes;
+  const bool fits = row_bytes + int64_t(Blocks::bytes) <= left;
   const int batch = (particles + 63) / 64 * 64;
-  const int room = int((shared - (free - memory)) / int64_t(Blocks::bytes));
-  SceneStep<Source, Task> s{source,
-                            task,
-                            a,
-                            scene,
-                            state,
-                            table,
-                            wanted,
-                            SharedParticles<S>(row_memory, nullptr, batch),
-                            reinterpret_cast<int*>(row_memory + size_t(batch) * S::row_bytes),
-                            Blocks(free, room),
-                            update,
-                            contact};
-  s.touch_all();
-  __syncthreads();
-#pragma unroll 1
-  for (int64_t step = 0; step < a.steps; step++) {
-    if (!s.make_room(step)) return move_clock(a, scene, a.steps - step);
-    s.load_particles();
-    __syncthreads();
-    s.tell(step);
-    s.list_cells();
-    s.walk();
-    s.update_nodes();
-    s.move_particles();
-    if (threadIdx.x == 0) contact.time += a.dt;
-    move_clock(a, scene, 1);
-    __syncthreads();
+  const auto columns_in = [&](char* rows) { return reinterpret_cast<int*>(rows + size_t(batch) * S::row_bytes); };
+  const int room = int((left - (fits ? row_bytes : 0)) / int64_t(Blocks::bytes));
+  int64_t step = 0;
+  if (fits) {
+    char* const rows = memory + table_bytes;
+    SceneStep<Source, Task, false> s{source,
+                                     task,
+                                     a,
+                                     scene,
+                                     state,
+                                     table,
+                                     wanted,
+                                     Rows(rows, nullptr, batch),
+                                     columns_in(rows),
+                                     Blocks(rows + row_bytes, room),
+                                     update,
+                                     contact};
+    step = run_scene(s, 0);
   }
+  if (step == a.steps) return;
+  const int64_t before = (state.begin + int64_t(64) * scene) * (S::row_bytes + int64_t(sizeof(int))) / 16 * 16;
+  char* const rows = a.rows + before;
+  SceneStep<Source, Task, true> s{source,
+                                  task,
+                                  a,
+                                  scene,
+                                  state,
+                                  table,
+                                  wanted,
+                                  Rows(rows, nullptr, batch),
+                                  columns_in(rows),
+                                  Blocks(memory + table_bytes, int(left / int64_t(Blocks::bytes))),
+                                  update,
+                                  contact};
+  step = run_scene(s, step);
+  move_clock(a, scene, a.steps - step);
 }
 
 // Where scenes are few, each has a multiprocessor of its own; else as many share one as there is room for.

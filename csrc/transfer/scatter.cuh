@@ -182,10 +182,10 @@ __device__ void add_row(const T (*w)[S::support], T at, const T& step, const T& 
   }
 }
 
-// What one thread adds to its slab from one particle.
-template <class S, class T>
+// What one thread adds to its slab from one particle; rows of nodes along the last axis are Pitch nodes apart.
+template <class S, int Pitch = S::support, class T>
 __device__ void add_particle(const SharedParticles<S>& shared, const Walker<S>& walker, int row,
-                             T (&sum)[S::slab][S::channels]) {
+                             T (*sum)[S::channels]) {
   constexpr int D = S::D, rows = S::slab / S::support;
   T word[kWords<S>], weights[D - 1][S::derivatives][S::support];
   load_words(shared, row, word);
@@ -204,7 +204,7 @@ __device__ void add_particle(const SharedParticles<S>& shared, const Walker<S>& 
     for (int j = 0; j < rows; j++) {
       const T at = D == 2 ? v : middle[0][j] * v;
 #pragma unroll
-      for (int k = 0; k < S::support; k++) sum[j * S::support + k][c] += last[0][k] * at;
+      for (int k = 0; k < S::support; k++) sum[j * Pitch + k][c] += last[0][k] * at;
     }
   }
 #pragma unroll
@@ -222,7 +222,7 @@ __device__ void add_particle(const SharedParticles<S>& shared, const Walker<S>& 
       for (int j = 0; j < rows; j++) {
         T start = middle[0][j] * at;
         if (S::Gradient) start += middle[1][j] * tilt;
-        add_row<S>(last, start, middle[0][j] * step, middle[0][j] * along, S::Plain + c, sum + j * S::support);
+        add_row<S>(last, start, middle[0][j] * step, middle[0][j] * along, S::Plain + c, sum + j * Pitch);
         at += across;
       }
     }
