@@ -48,8 +48,9 @@ struct ConjugateGradients {
 enum SolveState : int { kSolving = 0, kConverged = 1, kNegativeCurvature = 2, kNotFinite = 3 };
 
 // The vectors of conjugate gradients with a preconditioner of node blocks B⁻¹. Where B⁻¹ maps to a subspace of a node's
-// velocities, as it does for nodes that are held, the solution stays in it. Where it does so to rounding alone, along
-// no axis, the forces that hold a node must not stay in the residual, of which they would soon be the most: `held`.
+// velocities, as it does for nodes that are held, the solution stays in it. Where it does so only up to
+// rounding, because the direction is no axis, the forces that hold a node must not stay in the residual, of which they
+// would soon be the most: `held`.
 template <class T, int D>
 struct ConjugateGradientsArguments {
   int max_blocks = 0, scenes = 1, blocks_per_scene = 1;

@@ -85,7 +85,8 @@ class SceneStep {
   __device__ const Geometry<T, D>& geometry() const { return source.topology.geometry; }
   __device__ int particles() const { return state.end - state.begin; }
   __device__ int particle(int k) const { return topology().index[state.begin + k]; }
-  // Those of the first round and of the one after, loaded early; some particle where there is none.
+  // A thread's particle in the first round, and in the round after that of k; past the end the last one, so that the
+  // load is always valid.
   __device__ int first_particle() const { return particle(::min(int(threadIdx.x), particles() - 1)); }
   __device__ int particle_after(int k) const { return particle(::min(k + int(blockDim.x), particles() - 1)); }
 
@@ -152,8 +153,9 @@ class SceneStep {
     __syncthreads();
   }
 
-  // Numbers the blocks anew where particles touch others. Where there is no room any more blocks that nobody touches
-  // are given up, and then shared memory for global. False where there is no room at all, or none that is shared.
+  // Numbers the blocks anew where particles touch others. Where room runs out, blocks that nobody touches are given up
+  // first. If that is not enough, blocks move to global memory where the scene Spills, and false means that there is
+  // none left; else false means that the scene has to go on as one that does.
   __device__ bool make_room(int64_t step) {
     if (!state.grown) return true;
     number();
@@ -195,6 +197,7 @@ class SceneStep {
     state.more_blocks = a.blocks + int64_t(found) * int64_t(Blocks::bytes);
   }
 
+  // Without spilling it leaves an empty table for the one that spills.
   __device__ bool find_more(int64_t step) {
     if constexpr (Spills) return take_more(step);
     for (int b = threadIdx.x; b < geometry().blocks_per_scene; b += blockDim.x) table[b] = -1;
@@ -374,13 +377,20 @@ class SceneStep {
     }
   }
 
+  // Warps that have walkers wait for each other alone.
+  __device__ static bool has_walkers(int walkers) { return int(threadIdx.x) / 32 * 32 < walkers; }
+  __device__ static void wait_for_walkers(int walkers) {
+    const int threads = ::min((walkers + 31) / 32 * 32, int(blockDim.x));
+    asm volatile("bar.sync 1, %0;" ::"r"(threads) : "memory");
+  }
+
   // With a thread for each column and leading node.
   __device__ void walk_columns() const {
     constexpr int nodes = cells + Order;
-    const int walkers = state.columns * S::support;
-    for (int begin = 0; begin < walkers; begin += blockDim.x) {
+    const int all = state.columns * S::support;
+    for (int begin = 0, walkers = all; has_walkers(walkers); begin += blockDim.x, walkers -= blockDim.x) {
       const Walker<S> walker(begin + int(threadIdx.x));
-      const bool walks = begin + int(threadIdx.x) < walkers;
+      const bool walks = int(threadIdx.x) < walkers;
       const int column = walks ? columns[walker.list] : 0;
       T sum[rows_of_slab * nodes][S::channels] = {};
       if (walks) {
@@ -401,9 +411,9 @@ class SceneStep {
         for (int lane = 0; lane < S::support; lane++) {
           const bool adds = walks && walker.lane == lane;
           if (adds) add_to_nodes<cells>(places.near[across], sum + across * nodes);
-          __syncthreads();
+          wait_for_walkers(walkers);
           if (adds && places.far[across] >= 0) add_to_nodes<Order>(places.far[across], sum + across * nodes + cells);
-          __syncthreads();
+          wait_for_walkers(walkers);
         }
       }
     }
@@ -411,7 +421,8 @@ class SceneStep {
 
   // With a thread for each cell and leading node, for scenes that have no more of these than threads.
   __device__ void walk_cells() const {
-    const int n = threadIdx.x % cells;
+    const int n = threadIdx.x % cells, walkers = state.columns * S::support * cells;
+    if (!has_walkers(walkers)) return;
     const Walker<S> walker(threadIdx.x / cells);
     const bool walks = walker.list < state.columns;
     const int column = walks ? columns[walker.list] : 0;
@@ -433,9 +444,9 @@ class SceneStep {
       for (int lane = 0; lane < S::support; lane++) {
         const bool adds = walks && walker.lane == lane;
         if (adds) add_to_nodes<1>(places.near[across] + n, near);
-        __syncthreads();
+        wait_for_walkers(walkers);
         if (adds && n < Order && places.far[across] >= 0) add_to_nodes<1>(places.far[across] + n, far);
-        __syncthreads();
+        wait_for_walkers(walkers);
       }
     }
   }
@@ -445,6 +456,7 @@ class SceneStep {
       walk_cells();
     else
       walk_columns();
+    __syncthreads();
   }
 
   __device__ void update_nodes() const {
@@ -525,7 +537,7 @@ __device__ int first_slot(const Topology<T, D>& t, int block) {
   return begin;
 }
 
-// Of some particles: an array of SharedParticles, and their cells.
+// Of some particles: an array of SharedParticles, and room for their columns.
 template <class S>
 MPM_HD int64_t bytes_of_particles(int64_t particles) {
   return (particles + 63) / 64 * 64 * (S::row_bytes + int64_t(sizeof(int)));

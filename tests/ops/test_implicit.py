@@ -363,6 +363,15 @@ def test_images_are_one(dim, device):
     left = ops.implicit_apply(case.blocks, case.particles.x, solve.solution, case.tangent, case.mass) - rhs
     assert relative_error(mirrors.symmetric(left) + rhs, rhs) < 1e-9
     assert left[heavy[7], 1].abs() > 1e-6 * rhs.abs().max()  # the force of the mirror
+    normal = torch.zeros_like(rhs)
+    normal[heavy[0]], normal[heavy[5]] = (torch.tensor([s * 0.6, 0.8, 0.0][:dim]).to(rhs) for s in (1, -1))
+    off = torch.eye(dim).to(rhs) - normal[:, :, None] * normal[:, None, :]
+    rhs, inverse = (off @ rhs[:, :, None])[:, :, 0], off @ inverse @ off
+    arguments = (case.blocks, case.particles.x, rhs, case.mass, inverse, case.tangent, relative, 1000)
+    solve = ops.implicit_cg(*arguments, images=groups, held=normal)
+    assert solve.state.tolist() == [CONVERGED]
+    left = ops.implicit_apply(case.blocks, case.particles.x, solve.solution, case.tangent, case.mass) - rhs
+    assert relative_error((off @ mirrors.symmetric(left)[:, :, None])[:, :, 0] + rhs, rhs) < 1e-9
     with pytest.raises(ValueError, match=r"images must have shape \[G, 2\^D\]"):
         ops.implicit_cg(*arguments, images=groups[:, :1])
     with pytest.raises(TypeError, match="images must be int32"):

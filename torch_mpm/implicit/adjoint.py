@@ -6,8 +6,8 @@ At the solution the free components of the residual vanish, g(v, θ) = 0, so tha
 
 where J is not projected: one linear solve, and one vector-Jacobian product of the residual. Without friction and flow
 inside the solve J is the Hessian of the energy. Held components have the velocity b(θ) of what holds them: their
-residual is v − b, and their λ what Jᵀ λ of the free ones leaves of v̄. The memory does not depend on the iterations, and
-all of it is in the care of autograd.
+residual is v − b, and their λ is v̄ less Jᵀ applied to the λ of the free components. The memory does not depend on the
+iterations, and all of it is in the care of autograd.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ def differentiable(
     # Start is nothing that the derivative depends on; friction depends on the gradient.
     pressing = None if contact.friction is None else gradient.detach()
     still = None if bounds is None else bounds.detached()
-    parts = (fixed.blocks, fixed.state, fixed.mass, fixed.dt, fixed.mirrors, still, minimum.free, pressing, holds)
+    parts = (fixed.blocks, fixed.state, fixed.mass, fixed.dt, fixed.mirrors, still, contact.free, pressing, holds)
     parts, tensors = separated(parts)
     rest = fixed.law, fixed.stress_form, fixed.flows, parts
     result: Tensor = _Solution.apply(residual, minimum.v, owner, rest, *tensors)

@@ -42,7 +42,7 @@ class NodeBounds:
     surface: Tensor | None = None
 
     def detached(self) -> NodeBounds:
-        """The same for no gradients."""
+        """The same, detached."""
         rest = (None if t is None else t.detach() for t in (self.mirror, self.friction, self.surface))
         return NodeBounds(self.lower.detach(), self.upper.detach(), *rest)
 
@@ -79,6 +79,7 @@ class NodeBounds:
         """Normals of obstacles along which nodes are not free, zero for the others [N, D]; None without obstacles."""
         if self.mirror is None:
             return None
+        # w is the axis and ± the normal, so that its largest component is that of the axis.
         axis = torch.nn.functional.one_hot(self.mirror.abs().argmax(-1), free.shape[1]).bool()
         has_normal = (self.mirror != 0).any(-1, keepdim=True)
         return self.turned((axis & ~free & has_normal).to(self.mirror.dtype))

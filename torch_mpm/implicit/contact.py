@@ -121,8 +121,8 @@ class Contact:
         return ~self.free & (system.mass > 0)[:, None]
 
     def missed(self, system: ImplicitSystem, bounds: NodeBounds, v: Tensor) -> Tensor:
-        """How far held components of node velocities v are from the velocity that holds them [N, D] [m/s]: nothing, but
-        for its derivatives by the bounds."""
+        """How far held components of node velocities v are from the velocity that holds them [N, D] [m/s]: zero, but
+        its derivatives by the bounds are not."""
         u = bounds.turned(v)
         given = torch.where((u - bounds.lower).abs() <= (u - bounds.upper).abs(), bounds.lower, bounds.upper)
         if self.friction is not None and bounds.surface is not None:

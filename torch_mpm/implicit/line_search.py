@@ -62,7 +62,7 @@ def _lower(system: ImplicitSystem, a: Point, b: Point) -> Point:
 
 class Search:
     """The longest of the steps 1, ½, ¼ ... that lowers the energy of each scene enough, what friction dissipates
-    counted. It begins with the whole step, and does not make the host wait until it is asked to `shorten`.
+    counted. It begins with the whole step, and the host does not wait for it until it asks what is `too_long`.
 
     Args:
         system, bounds: whose velocities they are.
@@ -92,18 +92,21 @@ class Search:
         self._share = torch.where(done, 0.0, 1.0).double()
         self.point, self.enough = self._tried()
 
-    def shorten(self) -> bool:
-        """Shorten the steps of scenes where they are too long; whether there are any. Scenes that no step helps stay
-        where they were."""
-        for tried in range(MOST_HALVINGS):
-            if bool(self.enough.all()):
-                return tried > 0
+    def too_long(self) -> bool:
+        """Whether the step of any scene is too long."""
+        return not bool(self.enough.all())
+
+    def shorten(self) -> None:
+        """Halve the steps of scenes where they are too long until none is. Scenes that no step helps stay where they
+        were."""
+        for _ in range(MOST_HALVINGS):
             self._share = torch.where(self.enough, self._share, self._share / 2)
             self.point, self.enough = self._tried()
+            if not self.too_long():
+                return
         self._share = torch.where(self.enough, self._share, 0.0)
         v = torch.where(self._system.of_nodes(self.moved()), self._moved(), self._start.v)
-        self.point = Point(v, *self._system.energy(v))
-        return True
+        self.point, self.enough = Point(v, *self._system.energy(v)), torch.ones_like(self.enough)
 
     def moved(self) -> Tensor:
         """Scenes that are not where they were, bool [B]."""

@@ -65,9 +65,10 @@ def minimise(system: ImplicitSystem, bounds: NodeBounds | None, options: Options
     """The node velocities of least energy within bounds, for each scene apart.
 
     The host waits for the device once per iteration, to learn whether the last step has lowered the energy of all
-    scenes and whether all are done, and once per halving of a step. A scene is done when its residual is `tolerance`
-    times that of v*, or of the size of rounding; or when no step lowers its energy. Projected Newton of Bertsekas
-    (1982): components at a bound that the gradient holds there are left out of the linear solve, and steps are clamped.
+    scenes and whether all are done; where it has not, once for each halving and once more. A scene is done when its
+    residual is `tolerance` times that of v*, or of the size of rounding; or when no step lowers its energy. Projected
+    Newton of Bertsekas (1982): components at a bound that the gradient holds there are left out of the linear solve,
+    and steps are clamped.
     """
     return _Newton(system, bounds, options).minimum()
 
@@ -139,12 +140,16 @@ class _Newton:
         look = self._look(now)
         while not look.finished:
             search = self._step(now, look)
-            if careful:  # where one step was too long, the next often is, and an iterate there would be for nothing
-                careful = self._shortened(search, now)
+            # Where one step was too long the next often is, and to compute an iterate there would be wasted.
+            careful = careful and search.too_long()
+            if careful:
+                self._shorten(search, now)
             after = self._at(search.point, now, look.all_kept)
             next_look = self._look(after, search)
             if not next_look.lowered:
-                careful = self._shortened(search, now)
+                del after
+                careful = True
+                self._shorten(search, now)
                 after = self._at(search.point, now, look.all_kept)
                 next_look = self._look(after)
             now, look = after, next_look
@@ -178,8 +183,10 @@ class _Newton:
         done = self._stalled | small
         exact = ~self._indefinite & ((residual <= NEAR * first) | (self._iterations >= PATIENCE))
         kept = done | (residual <= KEPT * first)
+        found = {"small": small, "done": done, "exact": exact, "kept": kept}
+        matrices = {"convex": convex, "diagonal": diagonal, "inverse": inverse}
         return _Iterate(
-            *(point, elastic, convex, diagonal, contact, inverse, change, residual, target, small, done, exact, kept)
+            point, elastic, contact=contact, change=change, residual=residual, target=target, **matrices, **found
         )
 
     def _first_residual(self, point: Point, diagonal: Tensor, residual: Tensor) -> Tensor:
@@ -199,13 +206,11 @@ class _Newton:
         looks = over, now.done | now.exact, ~now.exact, now.kept, lowered
         return _Look(*torch.stack(looks).all(1).tolist())
 
-    def _shortened(self, search: Search, now: _Iterate) -> bool:
-        """Shorten steps from an iterate that are too long; whether there were any."""
-        if not search.shorten():
-            return False
+    def _shorten(self, search: Search, now: _Iterate) -> None:
+        """Shorten steps from an iterate that are too long."""
+        search.shorten()
         self._lag.still = ~(search.moved() | now.done)
         self._stalled = self._stalled | (self._lag.still & self._lag.renewed & ~self._whole)
-        return True
 
     def _step(self, now: _Iterate, look: _Look) -> Search:
         """The search along the direction of Newton's method."""

@@ -127,9 +127,9 @@ def implicit_cg(
         images: rows of nodes that mirrors make one, int32 [G, 2^D]: entry k of a group is the node that the axes of the
             bits of k reflect, -1 for none. A node is in one group at most. H is then the Hessian of symmetric
             velocities, and rhs and `inverse` must be symmetric, too. None without mirrors.
-        held: directions in which nodes are held, unit vectors [N, D], zero for none. Along them rhs and the range of
-            `inverse` have nothing but rounding, and what holds a node is left out of the residual. None where each node
-            is held along axes, in which `inverse` is exactly zero.
+        held: a direction in which each node is held, unit vectors [N, D], zero for none; symmetric as rhs where there
+            are images. Along it rhs and the range of `inverse` have nothing but rounding, and what holds a node is left
+            out of the residual. None where nodes are held along axes alone, in which `inverse` is exactly zero.
 
     Raises:
         ValueError, TypeError: for wrong shapes, dtypes or devices.
