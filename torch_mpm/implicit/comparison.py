@@ -37,11 +37,11 @@ EXPLICIT: Costs = {
 }
 IMPLICIT: Costs = {
     "cpu": {2: Cost(9e-3, 5e-6), 3: Cost(20e-3, 9e-6)},
-    "cuda": {2: Cost(15e-3, 66e-9), 3: Cost(20e-3, 22e-9)},
+    "cuda": {2: Cost(15e-3, 66e-9), 3: Cost(20e-3, 21e-9)},
 }
 """By kind of device and dimension, explicit steps in one op. CPU: one thread (implicit_crossover_*.md of the results);
 an implicit step costs as much as a hundred explicit ones of as many particles; small ones, more. CUDA: an H200
-(rollouts_nvidia_h200.md, implicit_crossover_nvidia_h200.md, implicit_cost_nvidia_h200.md); an implicit step costs 160
+(rollouts_nvidia_h200.md, implicit_crossover_nvidia_h200.md, implicit_cost_nvidia_h200.md); an implicit step costs 150
 explicit ones of millions of particles in 3-D, 470 in 2-D, and a thousand of few, for which the host is what takes the
 time."""
 

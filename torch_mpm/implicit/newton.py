@@ -183,11 +183,9 @@ class _Newton:
         done = self._stalled | small
         exact = ~self._indefinite & ((residual <= NEAR * first) | (self._iterations >= PATIENCE))
         kept = done | (residual <= KEPT * first)
-        found = {"small": small, "done": done, "exact": exact, "kept": kept}
-        matrices = {"convex": convex, "diagonal": diagonal, "inverse": inverse}
-        return _Iterate(
-            point, elastic, contact=contact, change=change, residual=residual, target=target, **matrices, **found
-        )
+        rest = {"inverse": inverse, "change": change, "residual": residual, "target": target}
+        flags = {"small": small, "done": done, "exact": exact, "kept": kept}
+        return _Iterate(point, elastic, convex, diagonal, contact, **rest, **flags)
 
     def _first_residual(self, point: Point, diagonal: Tensor, residual: Tensor) -> Tensor:
         """What the tolerance is relative to [m/s], [B]: a good start saves work, and does not ask for more accuracy."""
