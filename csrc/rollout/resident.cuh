@@ -377,20 +377,13 @@ class SceneStep {
     }
   }
 
-  // Warps that have walkers wait for each other alone.
-  __device__ static bool has_walkers(int walkers) { return int(threadIdx.x) / 32 * 32 < walkers; }
-  __device__ static void wait_for_walkers(int walkers) {
-    const int threads = ::min((walkers + 31) / 32 * 32, int(blockDim.x));
-    asm volatile("bar.sync 1, %0;" ::"r"(threads) : "memory");
-  }
-
   // With a thread for each column and leading node.
   __device__ void walk_columns() const {
     constexpr int nodes = cells + Order;
-    const int all = state.columns * S::support;
-    for (int begin = 0, walkers = all; has_walkers(walkers); begin += blockDim.x, walkers -= blockDim.x) {
+    const int walkers = state.columns * S::support;
+    for (int begin = 0; begin < walkers; begin += blockDim.x) {
       const Walker<S> walker(begin + int(threadIdx.x));
-      const bool walks = int(threadIdx.x) < walkers;
+      const bool walks = begin + int(threadIdx.x) < walkers;
       const int column = walks ? columns[walker.list] : 0;
       T sum[rows_of_slab * nodes][S::channels] = {};
       if (walks) {
@@ -411,9 +404,9 @@ class SceneStep {
         for (int lane = 0; lane < S::support; lane++) {
           const bool adds = walks && walker.lane == lane;
           if (adds) add_to_nodes<cells>(places.near[across], sum + across * nodes);
-          wait_for_walkers(walkers);
+          __syncthreads();
           if (adds && places.far[across] >= 0) add_to_nodes<Order>(places.far[across], sum + across * nodes + cells);
-          wait_for_walkers(walkers);
+          __syncthreads();
         }
       }
     }
@@ -421,8 +414,7 @@ class SceneStep {
 
   // With a thread for each cell and leading node, for scenes that have no more of these than threads.
   __device__ void walk_cells() const {
-    const int n = threadIdx.x % cells, walkers = state.columns * S::support * cells;
-    if (!has_walkers(walkers)) return;
+    const int n = threadIdx.x % cells;
     const Walker<S> walker(threadIdx.x / cells);
     const bool walks = walker.list < state.columns;
     const int column = walks ? columns[walker.list] : 0;
@@ -444,9 +436,9 @@ class SceneStep {
       for (int lane = 0; lane < S::support; lane++) {
         const bool adds = walks && walker.lane == lane;
         if (adds) add_to_nodes<1>(places.near[across] + n, near);
-        wait_for_walkers(walkers);
+        __syncthreads();
         if (adds && n < Order && places.far[across] >= 0) add_to_nodes<1>(places.far[across] + n, far);
-        wait_for_walkers(walkers);
+        __syncthreads();
       }
     }
   }
@@ -456,7 +448,6 @@ class SceneStep {
       walk_cells();
     else
       walk_columns();
-    __syncthreads();
   }
 
   __device__ void update_nodes() const {

@@ -123,7 +123,6 @@ class Simulation:
         self.emitted = 0
         self.fingerprint = ""
         self._figures: dict[str, Any] = {}
-        self._due: Callable[[], None] | None = None  # writes the last frame
         self._survey: list[list[float]] | None = None  # rates, speeds and wrong particles of the present state
 
     # -- output
@@ -218,61 +217,47 @@ class Simulation:
         return f"has a particle that is not meaningful: {bad[1]}" if bad else ""
 
     def run(self, writer: FrameWriter, progress: Progress | None, stop: Callable[[], bool]) -> None:
-        """All frames that are missing. A frame is written while a device has the first substeps after it."""
-        begin = time.perf_counter()
+        """All frames that are missing."""
         if self.frame < 0:
-            self._reach(writer, None, 0, 0.0, begin)
-        try:
-            while self.frame < self.scene.frames:
-                before = self.totals.substeps
-                self._check_stop(stop)
-                cfl = self._advance(self.scene.time_of(self.frame), self.scene.time_of(self.frame + 1))
-                begin = self._reach(writer, progress, self.totals.substeps - before, cfl, begin)
-        finally:
-            self._write_due()
-            self.totals.simulating += time.perf_counter() - begin
+            self._put(writer, 0, 0.0)
+        while self.frame < self.scene.frames:
+            begin, before = time.perf_counter(), self.totals.substeps
+            self._check_stop(stop)
+            cfl = self._advance(self.scene.time_of(self.frame), self.scene.time_of(self.frame + 1))
+            self._put(writer, self.totals.substeps - before, cfl)
+            seconds = time.perf_counter() - begin
+            self.totals.simulating += seconds
+            if progress is not None:
+                substeps = self.totals.substeps - before
+                rate = substeps * len(self.state) / seconds
+                progress({**self._figures, "frames": self.scene.frames, "substeps": substeps, "rate": rate})
 
     def _check_stop(self, stop: Callable[[], bool]) -> None:
         if stop():
             raise Interrupted(f"stopped after frame {self.frame} of {self.scene.frames}; add --resume to continue")
 
-    def _reach(self, writer: FrameWriter, progress: Progress | None, substeps: int, cfl: float, begin: float) -> float:
-        """The present state is the next frame, after substeps that began at a time, and is due; returns the time."""
-        self._write_due()
+    def _put(self, writer: FrameWriter, substeps: int, cfl: float) -> None:
+        """Submit the present state as the next frame."""
         self.frame += 1
-        now = time.perf_counter()
-        self.totals.simulating += now - begin
-        rate = substeps * len(self.state) / max(now - begin, 1e-9)
-        frame, state, emitted, totals = self.frame, self.state, self.emitted, dict(vars(self.totals))
+        state = self.state
+        scalars = {"time": self.scene.time_of(self.frame), "particles": len(state), "substeps": substeps, "cfl": cfl}
+        scalars |= energies(self.step, state)
+        if not self.totals.first:
+            self.totals.first = {k: v for k, v in scalars.items() if k.endswith("energy")}
+            self.totals.first |= {"mass": float(state.mass.double().sum())}
+        self._figures = {"frame": self.frame, **scalars}
+        record = {
+            "frame": self.frame,
+            "time": float(state.time),
+            "emitted": self.emitted,
+            "fingerprint": self.fingerprint,
+            "totals": vars(self.totals),
+        }
+        writer.submit(self.frame, self._fields(), scalars, checkpoint.tensors_of(state), json.loads(json.dumps(record)))
 
-        def write() -> None:
-            scalars = {"time": self.scene.time_of(frame), "particles": len(state), "substeps": substeps, "cfl": cfl}
-            scalars |= energies(self.step, state)
-            if not self.totals.first:
-                self.totals.first = {k: v for k, v in scalars.items() if k.endswith("energy")}
-                self.totals.first |= {"mass": float(state.mass.double().sum())}
-            self._figures = {"frame": frame, **scalars}
-            record = {"frame": frame, "time": float(state.time), "emitted": emitted, "fingerprint": self.fingerprint}
-            record |= {"totals": {**totals, "first": self.totals.first}}
-            copied = json.loads(json.dumps(record))
-            writer.submit(frame, self._fields(state), scalars, checkpoint.tensors_of(state), copied)
-            if progress is not None:
-                progress({**self._figures, "frames": self.scene.frames, "rate": rate})
-
-        self._due = write
-        if state.x.is_cpu:  # nothing to wait for
-            self._write_due()
-        return now
-
-    def _write_due(self) -> None:
-        """Submit the last frame, where that is still to be done."""
-        if self._due is not None:
-            write, self._due = self._due, None
-            write()
-
-    def _fields(self, state: State) -> dict[str, Tensor]:
+    def _fields(self) -> dict[str, Tensor]:
         """The fields of the trajectory in the order of ids."""
-        state = self.step.prepare(state)
+        state = self.step.prepare(self.state)
         assert state.ids is not None
         order = torch.argsort(state.ids)
         kept = {}
@@ -367,8 +352,7 @@ class Simulation:
     def _moved(
         self, good: State, dt: float, steps: int, until: float
     ) -> tuple[list[list[float]], list[list[int]], State]:
-        """Take substeps from a state, and write the frame that is due meanwhile; again where the pool of blocks, which
-        follows on CUDA, was too small.
+        """Take substeps from a state; again where the pool of blocks, which follows on CUDA, was too small.
 
         Returns:
             The survey of the state then, the status, and the state in a better order. A device has all of its work
@@ -378,7 +362,6 @@ class Simulation:
         self.state = rollout(self.step, good, steps, dt).replace(time=until)
         ordered = self.state.sorted(grid)
         survey = torch.stack(self.step.survey(ordered))
-        self._write_due()
         figures = survey.tolist()
         status = [] if self.step.status is None else self.step.status.tolist()
         if status and grid.grows and grid.max_blocks is not None and status[0][BLOCKS_WANTED] > grid.max_blocks:
