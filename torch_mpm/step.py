@@ -197,8 +197,7 @@ class Step(TensorModule):
         else:
             check_implicit(self, state)
             after: Any = Overlay(state, dt=dt, **fields)
-            nodes, velocity = self._implicit_velocity(blocks, after, affine, stress, dt)
-            impulse = None
+            nodes, velocity, impulse = self._implicit_velocity(blocks, after, affine, stress, dt)
         if self.on_grid is not None:
             velocity = from_half(self.on_grid(blocks, velocity, nodes[:, 0], dt), nodes)
         deformed = {name: fields.get(name, getattr(state, name)) for name in ("F", "J")}
@@ -251,14 +250,15 @@ class Step(TensorModule):
 
     def _implicit_velocity(
         self, blocks: Blocks, state: Any, affine: Tensor | None, stress: Tensor, dt: float | Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """Mass and momentum of the nodes, and their velocities with the forces at the end of the step, of particles
-        after the return map; forces of explicit materials are those of their stress at its start."""
+    ) -> tuple[Tensor, Tensor, Tensor | None]:
+        """Mass and momentum of the nodes, their velocities with the forces at the end of the step, and impulses as
+        `update_grid` has them, of particles after the return map; forces of explicit materials are those of their
+        stress at its start."""
         assert self.integrator is not None
         early = self.integrator.explicit_stress(self.law, state, stress)
         impulse = () if early is None else (early, state.volume, dt, self.stress_form)
         nodes = p2g(blocks, state.x, state.mass, state.v, affine, *impulse)
-        return nodes, self.integrator.velocities(self, blocks, state, nodes, dt)
+        return nodes, *self.integrator.velocities(self, blocks, state, nodes, dt)
 
     @property
     def solve_report(self) -> ImplicitReport | None:

@@ -50,7 +50,7 @@ def check(loss, values, names, nothing=()):
     grads = torch.autograd.grad(loss({**values, **leaves}), list(leaves.values()), materialize_grads=True)
     assert all(float(g.norm()) < 1e-9 * float(grads[0].norm()) for g in grads[len(names) :])
     for name, grad in zip(names, grads, strict=False):
-        direction = torch.randn_like(values[name])
+        direction = torch.randn_like(values[name]) * values[name].abs().mean()
         with torch.no_grad():
             ends = [loss({**values, name: values[name] + h * direction}) for h in (1e-5, -1e-5)]
         difference, terms = (ends[0] - ends[1]) / 2e-5, grad * direction

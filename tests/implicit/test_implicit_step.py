@@ -504,9 +504,6 @@ def test_what_is_not_there_says_so():
         step = mpm.Step(grid, **{"law": law, **arguments}, integrator="implicit")
         with pytest.raises(NotImplementedError, match=message):
             step(state, 1e-3)
-    step = mpm.Step(grid, law, integrator="implicit")
-    with pytest.raises(NotImplementedError, match="impulses"):
-        step(step.with_impulses(state), 1e-3)
 
 
 def test_wrong_arguments_are_named():

@@ -33,6 +33,8 @@ class NodeBounds:
         friction: Coulomb's coefficient of the surface that bounds a component [N, D], negative where it presses down on
             the component from above, zero where none does; None without friction.
         surface: velocity of the surface that rubs a node, in its axes [N, D] [m/s]; with friction alone.
+        owner: what bounds a component, int32 [N, D]: the number of an obstacle, or that of a face after them; -1 for
+            nothing. None where nobody asks.
     """
 
     lower: Tensor
@@ -40,11 +42,12 @@ class NodeBounds:
     mirror: Tensor | None = None
     friction: Tensor | None = None
     surface: Tensor | None = None
+    owner: Tensor | None = None
 
     def detached(self) -> NodeBounds:
         """The same, detached."""
-        rest = (None if t is None else t.detach() for t in (self.mirror, self.friction, self.surface))
-        return NodeBounds(self.lower.detach(), self.upper.detach(), *rest)
+        mirror, friction, surface = (None if t is None else t.detach() for t in (self.mirror, self.friction, self.surface))
+        return NodeBounds(self.lower.detach(), self.upper.detach(), mirror, friction, surface, self.owner)
 
     def moves(self) -> bool:
         """Whether a gradient is wanted of where the surfaces are and how they move."""
@@ -100,7 +103,7 @@ def rounding_of(v: Tensor) -> Tensor:
 
 
 def node_bounds(
-    blocks: Blocks, walls: Walls | None, obstacles: list[Any], like: Tensor, time: float | Tensor
+    blocks: Blocks, walls: Walls | None, obstacles: list[Any], like: Tensor, time: float | Tensor, owners: bool = False
 ) -> NodeBounds | None:
     """The bounds that walls and obstacles set; None without any.
 
@@ -112,6 +115,7 @@ def node_bounds(
         walls, obstacles: as a `Step` has them.
         like: gives dtype and device.
         time: [s].
+        owners: whether the bounds are to tell whose they are.
 
     Raises:
         NotImplementedError: for boundaries that are no obstacles.
@@ -128,14 +132,16 @@ def node_bounds(
     faces = () if walls is None else walls.faces(blocks.grid)
     if any(f.friction != 0 for f in faces) or any(rubs(o) for o in obstacles):
         bounds.friction, bounds.surface = torch.zeros_like(lower), torch.zeros_like(lower)
+    if owners:
+        bounds.owner = torch.full(positions.shape, -1, dtype=torch.int32, device=positions.device)
     if walls is not None:
-        _add_walls(bounds, blocks, faces, positions)
+        _add_walls(bounds, blocks, faces, positions, len(obstacles))
     scene = blocks.node_scene() if blocks.grid.scenes > 1 else None
     sign: Tensor | None = None
     if obstacles and any(f.kind == "mirror" for f in faces):
         positions, sign = reflected_inside(faces, positions)
-    for obstacle in obstacles:
-        _add_obstacle(bounds, obstacle, positions, sign, scene, time)
+    for number, obstacle in enumerate(obstacles):
+        _add_obstacle(bounds, obstacle, number, positions, sign, scene, time)
     return bounds
 
 
@@ -145,7 +151,8 @@ def rubs(obstacle: Any) -> bool:
     return isinstance(friction, Tensor) or friction != 0
 
 
-def _add_walls(bounds: NodeBounds, blocks: Blocks, faces: Sequence[Face], positions: Tensor) -> None:
+def _add_walls(bounds: NodeBounds, blocks: Blocks, faces: Sequence[Face], positions: Tensor, first: int) -> None:
+    """The faces, of which the first has the given number as an owner."""
     for number, face in enumerate(faces):
         axis, above = divmod(number, 2)
         if face.kind == "open":
@@ -162,6 +169,9 @@ def _add_walls(bounds: NodeBounds, blocks: Blocks, faces: Sequence[Face], positi
             low.copy_(torch.where(rows, low.clamp_min(0), low))
         if face.kind != "separate" or above:
             high.copy_(torch.where(rows, high.clamp_max(0), high))
+        if bounds.owner is not None:
+            owner = bounds.owner[:, axes]
+            owner.masked_fill_(rows & (owner < 0), first + number)
         if bounds.friction is not None:
             bounds.friction[:, axis].masked_fill_(touching, -face.friction if above else face.friction)
 
@@ -169,6 +179,7 @@ def _add_walls(bounds: NodeBounds, blocks: Blocks, faces: Sequence[Face], positi
 def _add_obstacle(
     bounds: NodeBounds,
     obstacle: Any,
+    number: int,
     positions: Tensor,
     sign: Tensor | None,
     scene: Tensor | None,
@@ -190,6 +201,8 @@ def _add_obstacle(
         surface = bounds.turned(surface)
         bounds.lower = torch.where(rows, surface, bounds.lower)
         bounds.upper = torch.where(rows, surface, bounds.upper)
+        if bounds.owner is not None:
+            bounds.owner.masked_fill_(rows, number)
         return
     normal = torch.where(bounds.lower.isfinite() | bounds.upper.isfinite(), 0, normal)
     length = normal.norm(dim=-1, keepdim=True)
@@ -209,6 +222,8 @@ def _add_obstacle(
     entry = rows & (axis > 0)
     bounds.lower = torch.where(entry & ((side < 0) | fixed), limit, torch.where(entry, -math.inf, bounds.lower))
     bounds.upper = torch.where(entry & ((side > 0) | fixed), limit, torch.where(entry, math.inf, bounds.upper))
+    if bounds.owner is not None:
+        bounds.owner.masked_fill_(entry, number)
     if bounds.friction is not None and bounds.surface is not None and rubs(obstacle):
         friction = obstacle.friction
         if isinstance(friction, Tensor):

@@ -19,6 +19,7 @@ from ..ops import grid_update
 from .adjoint import differentiable
 from .bounds import node_bounds
 from .explicit_materials import checked_materials, solved_materials, solved_nodes
+from .impulses import boundary_impulses
 from .mirrors import mirrors_of
 from .newton import Minimum, Options, minimise
 from .system import ImplicitSystem
@@ -103,8 +104,11 @@ class Implicit:
         self._unsolved: Tensor | None = None
         self._residual: Tensor | None = None
 
-    def velocities(self, step: Step, blocks: Blocks, state: Any, nodes: Tensor, dt: float | Tensor) -> Tensor:
-        """The node velocities at the end of a step [N, D] [m/s].
+    def velocities(
+        self, step: Step, blocks: Blocks, state: Any, nodes: Tensor, dt: float | Tensor
+    ) -> tuple[Tensor, Tensor | None]:
+        """The node velocities at the end of a step [N, D] [m/s], and the impulses on boundaries and walls where the
+        state counts them.
 
         Args:
             step: whose law, gravity, walls and boundaries count.
@@ -120,14 +124,14 @@ class Implicit:
         walls = None if step.walls is None else step.walls.mirrors()
         start = grid_update(blocks, nodes, gravity, dt, walls)
         if not blocks.grid.scenes:
-            return start
+            return start, state.impulse
         before = None if gravity is None else grid_update(blocks, nodes.detach(), walls=walls)
         form, flows = step.stress_form, self.plasticity == "inside"
         law, particles = self.solved(step.law, state)
         if not self.explicit:
             mirrors = mirrors_of(blocks, walls, nodes[:, 0].detach())
             system = ImplicitSystem(blocks, law, state, nodes[:, 0], start, dt, form, flows, before, mirrors)
-            return self._solution(step, system)
+            return self._solution(step, system, counts=state.impulse is not None)
         part, mass = solved_nodes(blocks, particles), nodes[:, 0]
         images = mirrors_of(blocks, walls, mass.detach())
         if images is not None:
@@ -136,21 +140,23 @@ class Implicit:
         before = None if before is None else part.taken(before)
         mirrors = mirrors_of(part.blocks, walls, mass.detach())
         system = ImplicitSystem(part.blocks, law, particles, mass, start, dt, form, flows, before, mirrors)
-        velocity = part.placed(self._solution(step, system), step.update_grid(blocks, nodes, state, dt)[0])
-        return velocity if images is None else images.followed(velocity, part.chosen)
+        velocity = part.placed(self._solution(step, system)[0], step.update_grid(blocks, nodes, state, dt)[0])
+        return velocity if images is None else images.followed(velocity, part.chosen), None
 
-    def _solution(self, step: Step, system: ImplicitSystem) -> Tensor:
-        """The minimum of a system within what the walls and boundaries of a step allow; differentiable."""
-        wants_gradient = torch.is_grad_enabled()
-        bounds = node_bounds(system.blocks, step.walls, step.boundaries.entries, system.start, system.state.time)
+    def _solution(self, step: Step, system: ImplicitSystem, counts: bool = False) -> tuple[Tensor, Tensor | None]:
+        """The minimum of a system within what the walls and boundaries of a step allow, and the impulses on them if
+        these are counted; differentiable."""
+        wants_gradient, boundaries = torch.is_grad_enabled(), step.boundaries.entries
+        bounds = node_bounds(system.blocks, step.walls, boundaries, system.start, system.state.time, counts)
         with torch.no_grad():
             fixed = system.detached() if wants_gradient else system
             minimum = minimise(fixed, bounds, self.options)
             fixed.forget()
         self._record(minimum)
-        if not wants_gradient:
-            return minimum.v
-        return differentiable(self, system, fixed, bounds, minimum)
+        v = differentiable(self, system, fixed, bounds, minimum) if wants_gradient else minimum.v
+        if not counts:
+            return v, None
+        return v, boundary_impulses(system, bounds, v, len(boundaries) + 2 * step.grid.dim)
 
     def solved(self, law: Material, state: Any) -> tuple[Material, Any]:
         """The law and the particles of the solve: those of a step without its explicit materials."""
@@ -218,16 +224,19 @@ def check_implicit(step: Step, state: State) -> None:
     """What an implicit step does not have yet.
 
     Raises:
-        NotImplementedError: for counted impulses, and steps that are compiled, captured or transformed.
+        NotImplementedError: for impulses counted beside mirrors or explicit materials, and steps that are compiled,
+            captured or transformed.
     """
     if is_traced(state.x) or is_captured(state.x) or torch._C._are_functorch_transforms_active():
         raise NotImplementedError(
             "an implicit step looks at how far its solve is: it cannot be compiled, captured in a CUDA graph, or "
             "transformed by torch.func; its gradients are those of backward() and torch.autograd.grad"
         )
-    if state.impulse is not None:
+    integrator, walls = step.integrator, step.walls
+    mirrors = walls is not None and any(face.kind == "mirror" for face in walls.faces(step.grid))
+    if state.impulse is not None and (mirrors or (integrator is not None and integrator.explicit)):
         raise NotImplementedError(
-            "an implicit step does not count impulses on boundaries yet: use integrator='explicit'"
+            f"an implicit step does not count impulses beside {'mirrors' if mirrors else 'explicit materials'} yet"
         )
 
 

@@ -1,0 +1,54 @@
+"""The impulses of the material on obstacles and walls in an implicit step.
+
+At the solution the gradient of the energy is, at a node that is held or rubbed, what its surfaces give to its momentum:
+along the components that a surface bounds it is that surface's, and across them friction, of which each surface that
+presses has the share of its own limit.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from ..ops.impulses import impulse_of_nodes
+from .bounds import NodeBounds
+from .contact import contact_at
+from .system import ImplicitSystem
+
+
+def boundary_impulses(system: ImplicitSystem, bounds: NodeBounds | None, v: Tensor, surfaces: int) -> Tensor:
+    """The impulses that obstacles and faces take from nodes with the velocities of a solution.
+
+    Args:
+        system: of the solve.
+        bounds: with the `owner` of each.
+        v: [N, D] [m/s].
+        surfaces: how many of these there are.
+
+    Returns:
+        [B, surfaces, D + 1 or 3] [N s, N m s], float64, exact to the tolerance of the solve. Differentiable by all that
+        the solution and the residual are.
+    """
+    if bounds is None or bounds.owner is None:
+        return impulse_of_nodes(system.blocks, torch.zeros_like(v))[:, None].expand(-1, surfaces, -1)
+    gradient = system.residual(v)
+    contact = contact_at(system, bounds, v, gradient)
+    held, across = contact.holds(system), torch.zeros_like(v)
+    given = bounds.turned(gradient)
+    shares = across
+    if contact.friction is not None and bounds.friction is not None:
+        limit = contact.friction.limit
+        across = torch.where(limit.along & (system.mass > 0)[:, None], given, 0)
+        held = held & ~limit.along
+        pressed = torch.where(held, bounds.friction * given, 0).clamp_min(0)
+        shares = torch.where(limit.size > 0, pressed / torch.where(limit.size > 0, limit.size, 1), 0)
+    along = torch.diag_embed(torch.where(held, given, 0))
+    taken = -(along + shares[:, :, None] * across[:, None, :])  # [N, component, D], in the axes of the nodes
+    parts = [bounds.turned(part) for part in taken.unbind(1)]
+    return torch.stack([_taken_by(system, bounds.owner, parts, number) for number in range(surfaces)], 1)
+
+
+def _taken_by(system: ImplicitSystem, owner: Tensor, parts: list[Tensor], number: int) -> Tensor:
+    """What one surface takes, of parts of the momentum for each component of the nodes."""
+    own = [torch.where(owner[:, k, None] == number, part, 0) for k, part in enumerate(parts)]
+    return impulse_of_nodes(system.blocks, torch.stack(own).sum(0))
