@@ -46,7 +46,8 @@ class NodeBounds:
 
     def detached(self) -> NodeBounds:
         """The same, detached."""
-        mirror, friction, surface = (None if t is None else t.detach() for t in (self.mirror, self.friction, self.surface))
+        rest = (self.mirror, self.friction, self.surface)
+        mirror, friction, surface = (None if t is None else t.detach() for t in rest)
         return NodeBounds(self.lower.detach(), self.upper.detach(), mirror, friction, surface, self.owner)
 
     def moves(self) -> bool:
