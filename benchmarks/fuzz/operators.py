@@ -170,7 +170,19 @@ class _Calls:
         inverse = torch.zeros(N, D * (D + 1) // 2, dtype=self.dtype)
         inverse[:, 0] = inverse[:, -1] = 1.0
         images = torch.arange(3 << D, dtype=torch.int32).reshape(3, -1)
-        solve = (x, along, self.uniform(N), inverse, inverse, images, tangent, 0.1 * self.uniform(2), 20, 0)
+        solve = (
+            x,
+            along,
+            self.uniform(N),
+            inverse,
+            inverse,
+            0.1 * along,
+            images,
+            tangent,
+            0.1 * self.uniform(2),
+            20,
+            0,
+        )
         moduli = [self.uniform(P), self.uniform(2)]
         return [
             ("law_tangent", (self.F, self.F, self.uniform(P), moduli, [], self.scene, "neo_hookean", D, True)),
