@@ -64,7 +64,7 @@ class Work:
     def __init__(self, name: str) -> None:
         self.name, self.iterations, self.cost, self.solves = name, 0, 0.0, 0
 
-    def __call__(self, *arguments: Any, local: Any = None, images: Any = None) -> ImplicitSolve:
+    def __call__(self, *arguments: Any, local: Any = None, images: Any = None, held: Any = None) -> ImplicitSolve:
         _, _, rhs, mass, _, _, relative, *_ = arguments
         s = assembled(*arguments[:6])
         p = preconditioner(s, self.name)

@@ -225,8 +225,10 @@ class _Newton:
         model, across, inverse, change = self._rubbed(now)
         right = torch.where(system.of_nodes(now.done | self._whole), 0, -model.gradient)
         solve = implicit_cg(
-            *(system.blocks, system.state.x, right, system.mass, inverse, tangent, relative, most),
-            *(system.stress_form, across, system.images, None if bounds is None else bounds.held_normals(model.free)),
+            *(system.blocks, system.state.x, right, system.mass, inverse, tangent, relative, most, system.stress_form),
+            local=across,
+            images=system.images,
+            held=None if bounds is None else bounds.held_normals(model.free),
         )
         self._indefinite = solve.state == NEGATIVE_CURVATURE
         steepest = system.of_nodes(self._indefinite & (solve.iterations == 0))
