@@ -9,8 +9,8 @@
 
 They are exact: what boundaries and walls take and what gravity gives is the change of the momentum of the particles, to
 rounding, in implicit steps to the tolerance of the solve; so too for the angular momentum, where explicit steps and the
-transfer keep it. They are read where the boundaries act, between
-P2G and G2P, so that `on_grid`, which acts after them, is not among them. Differentiable like any field of the state.
+transfer keep it. They are read where the boundaries act, between P2G and G2P, so that `on_grid`, which acts after them,
+is not among them. Differentiable like any field of the state.
 """
 
 from __future__ import annotations

@@ -147,10 +147,15 @@ def contact_at(
     return Contact(free, bounds.kept(gradient + friction.force(), free), friction)
 
 
-def _limit(bounds: NodeBounds, gradient: Tensor, free: Tensor) -> Limit:
+def pressed(bounds: NodeBounds, gradient: Tensor, free: Tensor) -> Tensor:
+    """What each component that is not free, held by a gradient [N, D] [kg m/s], adds to the friction of its node: μ λ
+    [N, D] [kg m/s]."""
     assert bounds.friction is not None
-    pressed = torch.where(free, 0, bounds.friction * bounds.turned(gradient)).clamp_min(0)
-    size = pressed.sum(1, keepdim=True)
+    return torch.where(free, 0, bounds.friction * bounds.turned(gradient)).clamp_min(0)
+
+
+def _limit(bounds: NodeBounds, gradient: Tensor, free: Tensor) -> Limit:
+    size = pressed(bounds, gradient, free).sum(1, keepdim=True)
     return Limit(size, free & (size > 0))
 
 

@@ -232,9 +232,10 @@ def check_implicit(step: Step, state: State) -> None:
             "an implicit step looks at how far its solve is: it cannot be compiled, captured in a CUDA graph, or "
             "transformed by torch.func; its gradients are those of backward() and torch.autograd.grad"
         )
-    integrator, walls = step.integrator, step.walls
-    mirrors = walls is not None and any(face.kind == "mirror" for face in walls.faces(step.grid))
-    if state.impulse is not None and (mirrors or (integrator is not None and integrator.explicit)):
+    if state.impulse is None:
+        return
+    mirrors = step.walls is not None and step.walls.mirrors() is not None
+    if mirrors or (step.integrator is not None and step.integrator.explicit):
         raise NotImplementedError(
             f"an implicit step does not count impulses beside {'mirrors' if mirrors else 'explicit materials'} yet"
         )

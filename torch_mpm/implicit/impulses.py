@@ -12,7 +12,7 @@ from torch import Tensor
 
 from ..ops.impulses import impulse_of_nodes
 from .bounds import NodeBounds
-from .contact import contact_at
+from .contact import contact_at, pressed
 from .system import ImplicitSystem
 
 
@@ -36,12 +36,11 @@ def boundary_impulses(system: ImplicitSystem, bounds: NodeBounds | None, v: Tens
     held, across = contact.holds(system), torch.zeros_like(v)
     given = bounds.turned(gradient)
     shares = across
-    if contact.friction is not None and bounds.friction is not None:
+    if contact.friction is not None:
         limit = contact.friction.limit
-        across = torch.where(limit.along & (system.mass > 0)[:, None], given, 0)
+        across = torch.where(limit.along, given, 0)
         held = held & ~limit.along
-        pressed = torch.where(held, bounds.friction * given, 0).clamp_min(0)
-        shares = torch.where(limit.size > 0, pressed / torch.where(limit.size > 0, limit.size, 1), 0)
+        shares = pressed(bounds, gradient, ~held) / torch.where(limit.size > 0, limit.size, 1)
     along = torch.diag_embed(torch.where(held, given, 0))
     taken = -(along + shares[:, :, None] * across[:, None, :])  # [N, component, D], in the axes of the nodes
     parts = [bounds.turned(part) for part in taken.unbind(1)]
