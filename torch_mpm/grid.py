@@ -194,8 +194,8 @@ class Grid(Lattice):
             wanted = self._activate(x, scene, None, 0).wanted
             self.max_blocks = min(_with_headroom(wanted), self._most_blocks)
         elif (
-            self._pending is not None
-            and not torch.compiler.is_compiling()
+            not torch.compiler.is_compiling()  # first: a compiled step would keep hold of an event that goes
+            and self._pending is not None
             and not is_captured(x)  # a query would break the capture
             and self._pending.query()
         ):
@@ -207,9 +207,9 @@ class Grid(Lattice):
 
     def watch(self, status: Tensor) -> None:
         """Let `max_blocks` follow `status`, an activation's, without waiting for the device."""
-        if not self._grows or self._pending is not None or status.device.type != "cuda":
+        if is_traced(status) or not self._grows or self._pending is not None or status.device.type != "cuda":
             return
-        if is_traced(status) or is_captured(status):
+        if is_captured(status):
             return
         if self._on_host is None:
             with torch.inference_mode(False):  # such that a later step may write to it
