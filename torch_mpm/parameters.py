@@ -62,8 +62,10 @@ class Table(nn.Module):
     def forward(self, temperature: Tensor) -> Tensor:
         """Values at temperatures of any shape."""
         knots, values = (t.to(temperature) for t in (self.temperature, self.value))
-        left = torch.bucketize(temperature.detach().contiguous(), knots[1:-1].contiguous())
-        share = ((temperature - knots[left]) / knots.diff()[left]).clamp(0, 1)
+        left: Tensor | int = 0  # the only interval of two knots
+        if len(knots) > 2:
+            left = torch.bucketize(temperature.detach().contiguous(), knots[1:-1].contiguous())
+        share = ((temperature - knots[left]) / (knots[left + 1] - knots[left])).clamp(0, 1)
         return torch.lerp(values[left], values[left + 1], share)
 
 

@@ -63,9 +63,13 @@ class Shape(SceneParameters):
         """
         raise NotImplementedError
 
+    def signed_distance(self, x: Tensor, scene: Tensor | None = None) -> Tensor:
+        """Signed distance of `surface` alone [N] [m]."""
+        return self.surface(x, scene)[0]
+
     def contains(self, x: Tensor) -> Tensor:
         """Which points x [N, D] [m] are inside or on the surface, bool [N]."""
-        return self.surface(x)[0] <= 0
+        return self.signed_distance(x) <= 0
 
     def volume(self, dim: int, scene: int = 0) -> float:
         """[m³], in 2-D [m²]."""
@@ -127,7 +131,10 @@ class Sphere(Shape):
         self.radius = extent("radius", radius)
 
     def surface(self, x: Tensor, scene: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        return norm(x) - self.at_nodes("radius", x, (), scene), unit(x)
+        return self.signed_distance(x, scene), unit(x)
+
+    def signed_distance(self, x: Tensor, scene: Tensor | None = None) -> Tensor:
+        return norm(x) - self.at_nodes("radius", x, (), scene)
 
     def contains(self, x: Tensor) -> Tensor:
         return norm(x) <= self.at_nodes("radius", x, (), None)
@@ -158,8 +165,10 @@ class Box(Shape):
         """The normal is that of the nearest face, inside the one of the axis with the least negative distance."""
         depth = self._depth(x, scene)
         nearest = torch.arange(x.shape[1], device=x.device) == depth.argmax(1, keepdim=True)
-        distance = norm(depth.clamp_min(0)) + depth.amax(1).clamp_max(0)
-        return distance, nearest * torch.where(x < 0, -1, 1).to(x.dtype)
+        return self._distance(depth), nearest * torch.where(x < 0, -1, 1).to(x.dtype)
+
+    def signed_distance(self, x: Tensor, scene: Tensor | None = None) -> Tensor:
+        return self._distance(self._depth(x, scene))
 
     def contains(self, x: Tensor) -> Tensor:
         return (self._depth(x, None) <= 0).all(1)
@@ -167,6 +176,10 @@ class Box(Shape):
     def _depth(self, x: Tensor, scene: Tensor | None) -> Tensor:
         """How far points are behind the faces of each axis [N, D] [m], negative inside."""
         return x.abs() - 0.5 * self.at_nodes("size", x, x.shape[1:], scene)
+
+    def _distance(self, depth: Tensor) -> Tensor:
+        """By the depth behind the faces."""
+        return norm(depth.clamp_min(0)) + depth.amax(1).clamp_max(0)
 
     def volume(self, dim: int, scene: int = 0) -> float:
         return float(self.of_scene("size", 1, scene).prod())
@@ -424,7 +437,7 @@ class Sampled(Shape):
         counts = [max(2, math.ceil((b - a) / spacing - 1e-9) + 1) for a, b in zip(first, last, strict=True)]
         axes = [a + spacing * torch.arange(n, dtype=torch.float64) for a, n in zip(first, counts, strict=True)]
         nodes = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1)
-        return cls(shape.surface(nodes.reshape(-1, len(counts)))[0].reshape(counts), first, spacing)
+        return cls(shape.signed_distance(nodes.reshape(-1, len(counts))).reshape(counts), first, spacing)
 
     @classmethod
     def from_data(cls, data: Tensor, dim: int) -> Sampled:

@@ -172,7 +172,7 @@ class Obstacle(RigidMotion):
             return positions.new_full(positions.shape[:1], torch.inf)
         pose = self.pose(time, positions)
         arm = positions - per_node(pose.centre, 1, scene)
-        distance, _ = self.shape.surface(to_body(per_node(pose.rotation, 2, scene), arm), scene)
+        distance = self.shape.signed_distance(to_body(per_node(pose.rotation, 2, scene), arm), scene)
         present = self._present(scene, time)
         return distance if present is None else torch.where(present, distance, torch.inf)
 

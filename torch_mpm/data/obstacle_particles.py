@@ -64,7 +64,7 @@ def _layer(body: Obstacle, spacing: float, lower: Any, upper: Any) -> Tensor | N
         for n in [max(1, round((hi - lo) / spacing))]
     ]
     points = torch.cartesian_prod(*axes)
-    distance = body.shape.surface(points)[0]
+    distance = body.shape.signed_distance(points)
     points = points[(distance <= 0) & (distance >= -LAYER * spacing)]
     if still:
         x = points @ pose.rotation.mT + pose.centre

@@ -158,7 +158,7 @@ class _Places:
             return True
         probes, missed = _probes(body, 0.25 * self.dx)
         least = self.gap + missed  # distances from a shape change by no more than one moves
-        if any(bool((other.shape.surface(probes - other.position)[0] < least).any()) for other in near):
+        if any(bool((other.shape.signed_distance(probes - other.position) < least).any()) for other in near):
             return False
         return not any(bool((o.signed_distance(probes, None, 0.0) < least).any()) for o in self.obstacles)
 
@@ -185,7 +185,7 @@ def _probes(body: Region, spacing: float) -> tuple[Tensor, float]:
     ]
     missed = 0.5 * math.hypot(*(float(axis[1] - axis[0]) for axis in axes))
     points = torch.cartesian_prod(*axes)
-    return points[body.shape.surface(points - body.position)[0] <= missed * (1 + 1e-9)], missed
+    return points[body.shape.signed_distance(points - body.position) <= missed * (1 + 1e-9)], missed
 
 
 def divided(total: int, shares: Sequence[float]) -> list[int]:

@@ -359,7 +359,7 @@ class Heat(nn.Module):
                     self.unsolved = torch.zeros(converged.shape, dtype=torch.int32, device=converged.device)
                     self.residual = torch.zeros(residual.shape, dtype=torch.float64, device=residual.device)
             self.unsolved += ~converged
-            self.residual.copy_(torch.where(converged, self.residual, torch.maximum(self.residual, residual.double())))
+            torch.maximum(self.residual, residual.masked_fill(converged, 0).double(), out=self.residual)
 
     def problems(self) -> dict[str, Problem]:
         """What became of the solves so far, by kind as in `Failures`, without synchronising."""

@@ -56,7 +56,7 @@ def _zero_level(shape: Any, lower: Array, upper: Array, at: Array, turn: Array) 
     nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
     with torch.no_grad():
         body = torch.as_tensor((nodes.reshape(-1, len(lower)) - at) @ turn, device="cpu")
-        field = numpy_of(shape.surface(body)[0]).reshape(nodes.shape[:-1])
+        field = numpy_of(shape.signed_distance(body)).reshape(nodes.shape[:-1])
     if len(lower) == 2:
         return [SurfaceMesh(ring, None) for ring in require("contourpy").contour_generator(*axes, field.T).lines(0.0)]
     vertices, faces, _, _ = contour(-field, 0.0, step, np.array([a[0] for a in axes]))
