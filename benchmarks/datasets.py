@@ -3,11 +3,12 @@
     python -m benchmarks.datasets                      # CPU: some scenes of the presets
     python -m benchmarks.datasets --device cuda        # also the size of DeepMind's Sand set: 1000 scenes of 2000
                                                        # particles, 320 frames of 2.5 ms and the first
+    python -m benchmarks.datasets --device cuda --large  # 32 such sets in one: a long run, several GPUs
     python -m benchmarks.datasets --out DIRECTORY --work FOLDER
 
 Each data set is generated in a process of its own, from the start of Python to the last byte on the disk of FOLDER. The
 share of time in which the GPU runs a kernel is what nvidia-smi samples every 100 ms between the first and the last
-frame (its utilization), where there is nvidia-smi, over all GPUs.
+frame (its utilization), where there is nvidia-smi, over the GPUs that CUDA_VISIBLE_DEVICES names, or all.
 """
 
 from __future__ import annotations
@@ -48,6 +49,11 @@ SETS: dict[str, list[tuple[str, str, list[str], int]]] = {
     ],
 }  # fmt: skip
 """Name, preset and overrides of the data sets by device, and processes that generate them, of each GPU."""
+LARGE = [
+    ("Sand, 32000 x 2000, 8 processes a GPU", "sand",
+     [*SAND, "dataset.splits={train=32000}", "dataset.scenes_per_shard=125"], 8),
+]  # fmt: skip
+"""As `SETS`; 126 GB."""
 PEER = {"water_drop": "water", "sand": "sand"}
 """Presets of which `datasets_peer` makes scenes one by one, and what of."""
 QUICK = ["dataset.splits={train=4}", "dataset.scenes_per_shard=2", "dataset.frames=4"]
@@ -131,6 +137,8 @@ def _environments(processes: int) -> list[dict[str, str]]:
 def _sampler() -> subprocess.Popen[str] | None:
     """nvidia-smi, which tells the utilization of each GPU every 100 ms."""
     query = ["nvidia-smi", "--query-gpu=timestamp,utilization.gpu", "--format=csv,noheader,nounits", "-lms", "100"]
+    if gpus := os.environ.get("CUDA_VISIBLE_DEVICES"):
+        query += ["--id", gpus]
     try:
         return subprocess.Popen(query, stdout=subprocess.PIPE, text=True)
     except OSError:
@@ -196,6 +204,7 @@ def main() -> None:
     parser.add_argument("--device", default="cpu", choices=["cpu", "cuda"])
     parser.add_argument("--peers", action="store_true", help="also scenes one by one in Taichi")
     parser.add_argument("--quick", action="store_true", help="small sets, to see that it works")
+    parser.add_argument("--large", action="store_true", help="the set of 32000 scenes alone; with a GPU")
     parser.add_argument("--out", type=Path, default=common.RESULTS)
     parser.add_argument("--work", type=Path, help="where the data sets are written; by default a temporary folder")
     parser.add_argument("--only", default="", metavar="TEXT", help="data sets whose name has this text")
@@ -207,10 +216,12 @@ def main() -> None:
         return
     result: dict[str, Any] = {"environment": common.environment(arguments.device), "sets": []}
     gpus = torch.cuda.device_count() if arguments.device == "cuda" else 1
+    if gpus > 1:
+        result["environment"]["device"] = f"{gpus} {result['environment']['device']}"
     if arguments.work:
         arguments.work.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=arguments.work) as work:
-        for name, preset, overrides, processes in SETS[arguments.device]:
+        for name, preset, overrides, processes in LARGE if arguments.large else SETS[arguments.device]:
             if arguments.only in name:
                 more = QUICK if arguments.quick else []
                 set_of = (name, preset, [*overrides, *more], arguments.device, Path(work), processes * gpus)
@@ -218,7 +229,7 @@ def main() -> None:
                 if preset in PEER and arguments.peers:
                     row["peer"] = peer(row, PEER[preset], arguments.device)
                 print(common.table(HEADER, [row_of(result["sets"][-1])]), flush=True)
-    name = f"datasets_{common.slug(result['environment']['device'])}"
+    name = f"datasets{'_large' if arguments.large else ''}_{common.slug(result['environment']['device'])}"
     regressions.show(name, result, timed)
     common.write(arguments.out, name, result, text(result))
 
