@@ -7,6 +7,7 @@ import torch
 from combinations import DT, F64, draw, make
 from helpers import TOLERANCE
 from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
 
 import torch_mpm as mpm
 
@@ -209,6 +210,38 @@ def test_a_material_without_a_law_is_refused(device):
     state = state.replace(material=state.material.int())
     with torch.no_grad(), pytest.raises(ValueError, match=r"material must be in 0 \.\. 6"):
         mpm.rollout(mpm.Step(box(), mixture()), state, 2, 1e-4)
+
+
+class Names(TorchDispatchMode):
+    """The ops that are called."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.found: set[str] = set()
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        self.found.add(func.overloadpacket.__name__)
+        return func(*args, **(kwargs or {}))
+
+
+@torch.no_grad()
+def test_materials_that_a_step_has_checked_stay_checked_when_it_sorts(device):
+    """To check them is to wait for the device."""
+    step, number = mpm.Step(box(), mixture()), torch.arange(300, dtype=torch.int32, device=device)
+    state = mpm.rollout(step, blob(device).replace(material=number % 7), 2, 1e-4)
+    for start, checked in ((step.sorted(state), False), (state.sorted(step.grid), True)):
+        with Names() as names:
+            step.survey(start)
+            mpm.rollout(step, start, 2, 1e-4)
+        assert ("all" in names.found) == checked and "substeps" in names.found
+
+
+@torch.no_grad()
+def test_materials_that_no_step_has_checked_are_checked_after_a_sort(device):
+    step, number = mpm.Step(box(), mixture()), torch.arange(300, dtype=torch.int32, device=device)
+    state = step.sorted(step.prepare(blob(device).replace(material=number % 8)))
+    with pytest.raises(ValueError, match=r"material must be in 0 \.\. 6"):
+        mpm.rollout(step, state, 2, 1e-4)
 
 
 def test_batches_with_obstacles_and_parameters_of_scenes_and_particles(dim, device):

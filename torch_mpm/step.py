@@ -22,6 +22,7 @@ from .implicit.implicit import Implicit, ImplicitReport, as_integrator, check_ex
 from .impulses import Impulses, check_impulse, impulses_of, no_impulse
 from .laws.custom import as_law
 from .laws.material import Material
+from .laws.mixture import Mixture
 from .node_contact import after_boundaries
 from .ops import Survey, fusible, g2p, g2p_advance, gather, grid_update, p2g, wall_impulses
 from .ops.arguments import check_choice
@@ -319,6 +320,17 @@ class Step(TensorModule):
             ValueError: for a state that counts none, or those of another step.
         """
         return impulses_of(self, state)
+
+    def sorted(self, state: State) -> State:
+        """`State.sorted` for this step: a `Mixture` that has checked the particles need not wait to check them again.
+
+        Raises:
+            GridOverflowError: on the CPU, where a grid of fixed `max_blocks` is full.
+        """
+        ordered = state.sorted(self.grid)
+        if isinstance(self.law, Mixture):
+            self.law.reordered(state.material, ordered.material)
+        return ordered
 
     def stable_dt(self, state: State, cfl: float = 0.5) -> Tensor:
         """Largest stable time step of each scene [s], [B], times `cfl`; see `torch_mpm.cfl.stable_dt`.

@@ -122,7 +122,7 @@ def _run(
         if frame:
             state = rollout(step, state, count, interval / count).replace(time=frame * interval)
         if frame % LOOK == 0 or frame == frames - 1:
-            state = state.sorted(built.grid)
+            state = step.sorted(state)
             order = torch.argsort(state.ids)  # type: ignore[arg-type]
             surveys.append(torch.stack(step.survey(state)))
             if state.x.is_cpu:

@@ -167,6 +167,11 @@ class Mixture(Material):
             self._checked = material
         return material
 
+    def reordered(self, before: Tensor | None, after: Tensor | None) -> None:
+        """Take a state.material for checked that has the entries of another, in any order, if that one was checked."""
+        if before is not None and (before is self._material or before is self._checked):
+            self._checked = after
+
     def _particles(self, state: Any) -> list[Tensor]:
         """Those of each law, int64."""
         material = self.check_material(state)

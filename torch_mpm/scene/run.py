@@ -276,7 +276,7 @@ class Simulation:
         while now < end - rounding:
             self._emit(now + rounding)
             if self._survey is None:
-                self.state = self.state.replace(time=now).sorted(self.step.grid)
+                self.state = self.step.sorted(self.state.replace(time=now))
                 self._survey = torch.stack(self.step.survey(self.state)).tolist()
             rates, speeds, _ = self._survey
             following = self.emissions[self.emitted][0] if self.emitted < len(self.emissions) else math.inf
@@ -360,7 +360,7 @@ class Simulation:
         """
         grid = self.step.grid
         self.state = rollout(self.step, good, steps, dt).replace(time=until)
-        ordered = self.state.sorted(grid)
+        ordered = self.step.sorted(self.state)
         survey = torch.stack(self.step.survey(ordered))
         figures = survey.tolist()
         status = [] if self.step.status is None else self.step.status.tolist()
