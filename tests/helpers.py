@@ -12,6 +12,7 @@ from types import ModuleType
 
 import torch
 from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
 
 import torch_mpm as mpm
 from benchmarks import common
@@ -206,3 +207,18 @@ def result(out: Path, pattern: str) -> dict:
     found = json.loads(file.read_text())
     assert {"device", "torch_mpm", "torch", "commit", "date"} <= found["environment"].keys()
     return found
+
+
+# ---- ops
+
+
+class OpNames(TorchDispatchMode):
+    """The names of the ops that are called, in their order, as "aten.add.Tensor"."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.seen: list[str] = []
+
+    def __torch_dispatch__(self, function, types, args=(), kwargs=None):
+        self.seen.append(str(function))
+        return function(*args, **(kwargs or {}))

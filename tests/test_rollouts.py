@@ -5,9 +5,8 @@ import dataclasses
 import pytest
 import torch
 from combinations import DT, F64, draw, make
-from helpers import TOLERANCE
+from helpers import TOLERANCE, OpNames
 from torch import Tensor
-from torch.utils._python_dispatch import TorchDispatchMode
 
 import torch_mpm as mpm
 
@@ -212,28 +211,16 @@ def test_a_material_without_a_law_is_refused(device):
         mpm.rollout(mpm.Step(box(), mixture()), state, 2, 1e-4)
 
 
-class Names(TorchDispatchMode):
-    """The ops that are called."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.found: set[str] = set()
-
-    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
-        self.found.add(func.overloadpacket.__name__)
-        return func(*args, **(kwargs or {}))
-
-
 @torch.no_grad()
 def test_materials_that_a_step_has_checked_stay_checked_when_it_sorts(device):
     """To check them is to wait for the device."""
     step, number = mpm.Step(box(), mixture()), torch.arange(300, dtype=torch.int32, device=device)
     state = mpm.rollout(step, blob(device).replace(material=number % 7), 2, 1e-4)
     for start, checked in ((step.sorted(state), False), (state.sorted(step.grid), True)):
-        with Names() as names:
+        with OpNames() as names:
             step.survey(start)
             mpm.rollout(step, start, 2, 1e-4)
-        assert ("all" in names.found) == checked and "substeps" in names.found
+        assert ("aten.all.default" in names.seen) == checked and "torch_mpm.substeps.default" in names.seen
 
 
 @torch.no_grad()

@@ -207,6 +207,7 @@ class Grid(Lattice):
 
     def watch(self, status: Tensor) -> None:
         """Let `max_blocks` follow `status`, an activation's, without waiting for the device."""
+        # As in `_grow`, a compiled step must not come to the event.
         if is_traced(status) or not self._grows or self._pending is not None or status.device.type != "cuda":
             return
         if is_captured(status):

@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from helpers import relative_error
+from helpers import OpNames, relative_error
 
 import torch_mpm as mpm
 from torch_mpm.heat.boundaries import Convection, Fixed, FixedSurface, Flux, FreeSurface, Radiation, Source, Surface
@@ -312,21 +312,12 @@ def test_stefan_front(stefan):
 def test_a_step_without_heat_does_nothing_for_it():
     """No op of heat, and with a temperature that nobody conducts the very same ops."""
 
-    class Names(torch.utils._python_dispatch.TorchDispatchMode):
-        def __init__(self):
-            super().__init__()
-            self.seen = []
-
-        def __torch_dispatch__(self, function, types, args=(), kwargs=None):
-            self.seen.append(str(function))
-            return function(*args, **(kwargs or {}))
-
     state = block()
     step = mpm.Step(grid_around(), mpm.NeoHookean(E=1e3, nu=0.3), walls="slip")
     runs = []
     for start in (state, state.replace(temperature=torch.zeros_like(state.mass))):
         start = step(start, 1e-3)
-        with Names() as names:
+        with OpNames() as names:
             end = step(start, 1e-3)
         runs.append(names.seen)
         assert end.extra == {}
