@@ -166,9 +166,8 @@ class _Replays:
     def _record(self, step: Step, dt: float) -> None:
         try:
             before, after = _tensors(self.state), _tensors(step(self.state, dt))
-            for name, value in after.items():
-                if value is not before[name]:
-                    before[name].copy_(value)
+            changed = [name for name, value in after.items() if value is not before[name]]
+            torch._foreach_copy_([before[name] for name in changed], [after[name] for name in changed])
         except BaseException:
             with contextlib.suppress(RuntimeError):  # the capture has failed, as what is raised says
                 self._graph.capture_end()

@@ -8,8 +8,10 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor, nn
 
+from .capture import GraphCache
 from .errors import check_numbers, check_real, shape_of
 from .ops.arguments import per_parameter
+from .ops.pointwise import pointwise
 
 if TYPE_CHECKING:
     from .state import State
@@ -53,6 +55,7 @@ class Table(nn.Module):
             raise ValueError(f"temperature of a table must increase, got {knots.tolist()}")
         if not bool(values.detach().isfinite().all()):
             raise ValueError(f"value of a table must be finite, got {values.tolist()}")
+        self._kept = GraphCache()
         self.register_buffer("temperature", knots)
         if isinstance(values, nn.Parameter):
             self.value = values
@@ -61,12 +64,25 @@ class Table(nn.Module):
 
     def forward(self, temperature: Tensor) -> Tensor:
         """Values at temperatures of any shape."""
-        knots, values = (t.to(temperature) for t in (self.temperature, self.value))
+        at = temperature.reshape(-1)
+        knots, values = self._like(at)
         left: Tensor | int = 0  # the only interval of two knots
         if len(knots) > 2:
-            left = torch.bucketize(temperature.detach().contiguous(), knots[1:-1].contiguous())
-        share = ((temperature - knots[left]) / (knots[left + 1] - knots[left])).clamp(0, 1)
-        return torch.lerp(values[left], values[left + 1], share)
+            left = torch.bucketize(at.detach().contiguous(), knots[1:-1].contiguous())
+        ends = knots[left], knots[left + 1], values[left], values[left + 1]
+        return pointwise("interpolated", 3, at, *ends)[0].reshape(temperature.shape)
+
+    def _like(self, temperature: Tensor) -> tuple[Tensor, Tensor]:
+        """Knots and values in the dtype and on the device of temperatures, kept from call to call."""
+        own = self.temperature, self.value
+
+        def make() -> tuple[Tensor, Tensor]:
+            return own[0].to(temperature), own[1].to(temperature)
+
+        if torch.compiler.is_compiling() or own[1].requires_grad:
+            return make()
+        key = *own, own[0]._version, own[1]._version, temperature.dtype, temperature.device
+        return self._kept.get(key, make, temperature)
 
 
 class PerMaterial(nn.Module):

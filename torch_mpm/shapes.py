@@ -33,6 +33,7 @@ from torch import Tensor
 from . import surface_mesh
 from .errors import check_number, check_vector, shape_of
 from .ops.autograd import graph_at_once
+from .ops.pointwise import pointwise
 from .per_scene import SceneParameters, Value, constant, direction, extent, floats
 from .surface_mesh import Array, SurfaceMesh
 from .vectors import norm, unit
@@ -179,7 +180,8 @@ class Box(Shape):
 
     def _distance(self, depth: Tensor) -> Tensor:
         """By the depth behind the faces."""
-        return norm(depth.clamp_min(0)) + depth.amax(1).clamp_max(0)
+        (distance,) = pointwise("box_distance", depth.shape[1], depth)
+        return distance
 
     def volume(self, dim: int, scene: int = 0) -> float:
         return float(self.of_scene("size", 1, scene).prod())

@@ -12,6 +12,7 @@ import torch_mpm as mpm
 from torch_mpm.ops import LAWS
 from torch_mpm.ops.heat_patches import Patches
 from torch_mpm.ops.implicit import tangent_entries
+from torch_mpm.ops.pointwise import FUNCTIONS
 
 PARTICLES = 37
 
@@ -29,6 +30,7 @@ def calls(dim: int, dtype: torch.dtype = torch.float64) -> list[tuple[str, dict[
         *make.transfers(),
         *make.grid(),
         *make.heat(),
+        *make.pointwise(),
         *make.laws(),
         *make.sand(),
         *make.implicit(),
@@ -124,6 +126,24 @@ class _Calls:
             ("heat_stencil", (x, conductance, *top)),
             ("heat_patches", (patches.inverse, patches.rows, patches.patches, self.normal(N))),
         ]
+
+    def pointwise(self) -> list[tuple[str, tuple[Any, ...]]]:
+        found = []
+        for function, info in FUNCTIONS.items():
+            rows, results = ([self.entries(shape) for shape in shapes] for shapes in (info.arguments, info.results))
+            tensors = [self.uniform() if k and shape == (0, 0) else t  # for all rows
+                       for k, (shape, t) in enumerate(zip(info.arguments, rows, strict=True))]  # fmt: skip
+            places, wanted = list(range(len(tensors))), list(range(len(results)))
+            call = function, self.dim, tensors, places, [0.5] * len(tensors)
+            found += [
+                ("pointwise", (*call, wanted)),
+                ("pointwise_backward", (*call, results, wanted, places)),
+                ("pointwise_second", (*call, results, wanted, rows, places, places)),
+            ]
+        return found
+
+    def entries(self, shape: tuple[int, int]) -> Tensor:
+        return self.uniform(PARTICLES, *(self.dim if size == -1 else size for size in shape if size))
 
     def laws(self) -> list[tuple[str, tuple[Any, ...]]]:
         P, D, found = PARTICLES, self.dim, []

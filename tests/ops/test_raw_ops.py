@@ -161,7 +161,7 @@ def test_the_dimension_of_a_law() -> None:
         yield {"parameters": []}, r"parameters must be \d tensors for the law \w+, got 0"
         yield {"parameters": [p.new_empty(0) for p in arguments["parameters"]]}, r"parameters\[0\] must"
 
-    refusals(taking("dim"), changes)
+    refusals(taking("law"), changes)
 
 
 def test_iterations_of_a_heat_solve() -> None:

@@ -170,9 +170,10 @@ class Obstacle(RigidMotion):
         """
         if positions.shape[0] == 0 or self._absent(scene, time):
             return positions.new_full(positions.shape[:1], torch.inf)
-        pose = self.pose(time, positions)
-        arm = positions - per_node(pose.centre, 1, scene)
-        distance = self.shape.signed_distance(to_body(per_node(pose.rotation, 2, scene), arm), scene)
+        centre, turn = self.centre_at(time, positions), self.rotation_at(time, positions, positions.shape[1])
+        arm = positions - per_node(centre, 1, scene)
+        turn = None if turn is None else per_node(turn, 2, scene)
+        distance = self.shape.signed_distance(to_body(turn, arm), scene)
         present = self._present(scene, time)
         return distance if present is None else torch.where(present, distance, torch.inf)
 

@@ -22,10 +22,10 @@ from ..errors import NUMBER_OR_TENSOR, check_number, check_real, shape_of
 from ..grid import Blocks
 from ..laws.compiled import check_value
 from ..ops import scatter
+from ..ops.pointwise import pointwise
 from ..parameters import TensorModule, Value, evaluate
 from ..per_scene import per_node
 from ..topology import PADDING
-from ..vectors import norm
 
 if TYPE_CHECKING:
     from ..state import State
@@ -80,11 +80,10 @@ class HeatNodes:
     @functools.cached_property
     def free_area(self) -> Tensor:
         """|Σ_p V_p ∇N_i(x_p)| [N] [m²], see `FreeSurface`."""
-        x = self.state.x
-        P, D = x.shape
-        axes = torch.eye(D, dtype=x.dtype, device=x.device)
-        gradient = self.volume[:, None, None] * axes
-        return norm(scatter(self.blocks, x, x.new_zeros(P, D), gradient=gradient))
+        dim = self.blocks.grid.dim
+        nothing, gradient = pointwise("surface_normals", dim, self.volume)
+        (area,) = pointwise("length", dim, scatter(self.blocks, self.state.x, nothing, gradient=gradient))
+        return area
 
     def scene(self) -> Tensor | None:
         """Scene of each node, int32 [N]; None for one scene."""
@@ -106,8 +105,12 @@ class HeatNodes:
 
     def add_exchange(self, coefficient: Tensor, ambient: Number) -> None:
         """Heat coefficient (ambient − θ) with coefficient [N] [W/K], taken at the end of the step."""
+        self.add_linear(coefficient, coefficient * ambient)
+
+    def add_linear(self, coefficient: Tensor, power: Tensor) -> None:
+        """Heat power − coefficient θ [N] [W], taken at the end of the step."""
         self.exchange = coefficient if self.exchange is None else self.exchange + coefficient
-        self.add_source(coefficient * ambient)
+        self.add_source(power)
 
     def hold(self, where: Tensor, temperature: Number) -> None:
         """Keep nodes, bool [N], at a temperature [K]; those held before stay as they are."""
@@ -134,16 +137,15 @@ class HeatNodes:
     def left_conductance(self) -> Tensor:
         """κ V of the particles [P] without what layers replace; adds their exchange.
 
-        At the nodes a particle exchanges with Σ_i N_i (θ_i − temperature)², which on a linear temperature is D |∇θ|²
-        more than at the particle. This is taken from its κ V, which may get negative; H + X stays positive.
+        It may be negative by their exchange; H + X stays positive.
         """
         if self.share is None:
             return self.conductance
-        rates = self.conductance[:, None] * torch.stack([rate for rate, _ in self.layers], 1)
-        exchange = scatter(self.blocks, self.state.x, rates)
-        for coefficient, (_, temperature) in zip(exchange.unbind(1), self.layers, strict=True):
-            self.add_exchange(coefficient, temperature)
-        return self.share * self.conductance - rates.sum(1) / self.blocks.grid.inverse_inertia
+        grid, left = self.blocks.grid, self.share * self.conductance
+        for rate, temperature in self.layers:
+            given, left = pointwise("heat_exchange", grid.dim, left, self.conductance, rate, grid.inverse_inertia)
+            self.add_exchange(scatter(self.blocks, self.state.x, given[:, None])[:, 0], temperature)
+        return left
 
 
 # ---- surfaces
@@ -279,12 +281,12 @@ class Radiation(Term):
         self.emissivity = _checked("emissivity", emissivity, "between 0 and 1", lambda v: (v >= 0) & (v <= 1))
 
     def apply(self, nodes: HeatNodes) -> None:  # type: ignore[override]
-        black = STEFAN_BOLTZMANN * self.surface.integrate(nodes, self.emissivity)
-        ambient = nodes.per_node(self.ambient) + nodes.reference
-        kelvin = (nodes.theta + nodes.reference).clamp_min(0)
-        slope, squared = 4 * kelvin**3, ambient * ambient  # a power of floats would raise where it is too large
-        nodes.add_exchange(black * slope, nodes.theta)
-        nodes.add_source(black * (squared * squared - kelvin**4))
+        emitting, ambient = self.surface.integrate(nodes, self.emissivity), nodes.per_node(self.ambient)
+        linear = pointwise(
+            *("heat_radiation", nodes.blocks.grid.dim),
+            *(emitting, STEFAN_BOLTZMANN, nodes.theta, ambient, nodes.reference),
+        )
+        nodes.add_linear(linear[0], linear[1])
 
 
 class Fixed(Term):
@@ -346,8 +348,8 @@ class FixedSurface(Term):
     def apply(self, nodes: HeatNodes) -> None:  # type: ignore[override]
         width, state = self.WIDTH * nodes.blocks.grid.dx, nodes.state
         distance = self.region.signed_distance(state.x, state.scene, nodes.time)
-        rest = 1 - (distance / width).clamp(0, 1) ** 2
-        nodes.add_layer(1 - rest**3, 6 / width**2 * rest**2, nodes.per_node(self.temperature))
+        share, rate = pointwise("heat_layer", nodes.blocks.grid.dim, distance, width)
+        nodes.add_layer(share, rate, nodes.per_node(self.temperature))
 
 
 class Source(Term):

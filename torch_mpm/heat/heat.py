@@ -38,10 +38,11 @@ from ..laws.thermal import LIQUID
 from ..ops import gather, heat_cg, scatter
 from ..ops.arguments import check_choice, per_particle
 from ..ops.heat import METHODS
+from ..ops.pointwise import pointwise
 from ..parameters import Value, evaluate, needed_temperature, store
 from ..pause import paused
 from ..state import State, check_state
-from ..vectors import determinant, norm
+from ..vectors import determinant
 from .boundaries import FixedSurface, HeatNodes
 
 TRANSFERS = ("hybrid", "apic", "flip", "pic")
@@ -211,17 +212,19 @@ class Heat(nn.Module):
             dissipated: energy that the law turned into heat in this step, per rest volume [P] [J/m³], or None.
         """
         theta, gradient = needed_temperature(state), state.extra.get(GRADIENT) if self.affine else None
-        volume = present_volume(state)
         step = dt if not isinstance(dt, Tensor) else per_particle(dt.reshape(-1).to(theta), state.scene, len(theta))
-        heat_capacity = evaluate("specific_heat", self.specific_heat, state) * state.mass
+        motion: Tensor | float = 0.0 if velocity_gradient is None else velocity_gradient
+        specific_heat = evaluate("specific_heat", self.specific_heat, state)
         conductivity = evaluate("conductivity", self.conductivity, state)
-        if isinstance(conductivity, Tensor):
-            conductivity = torch.where(conductivity >= 0, conductivity, torch.nan)
-        conductance = conductivity * volume
-        number = step * conductance / (torch.where(heat_capacity > 0, heat_capacity, 1) * self.grid.dx**2)
-        blend = self._blend(number, step, velocity_gradient)
-        nodes, smooth = self._to_nodes(blocks, state, volume, conductance, heat_capacity, theta, gradient, blend)
-        initial = nodes.theta
+        rest = state.volume, *_deformation(state)
+        volume, heat_capacity, conductance, rate = pointwise(
+            "heat_weights", self.grid.dim, *rest, specific_heat, conductivity, state.mass, step, motion, self.grid.dx
+        )
+        blend = rate if self.transfer == "hybrid" else 0.0 if self.transfer == "flip" else 1.0
+        weights = (heat_capacity,) if isinstance(blend, float) else (heat_capacity, blend)
+        (total, *_), (initial, *rest_of_means) = _averages(blocks, state.x, weights, theta, gradient)
+        smooth = rest_of_means[0] if rest_of_means else initial
+        nodes = HeatNodes(blocks, state, volume, conductance, total, initial, self.reference)
         for boundary in self.boundaries:
             boundary.apply(nodes)
         if self.plastic_heating and dissipated is not None:
@@ -229,43 +232,13 @@ class Heat(nn.Module):
             power = self.plastic_heating * dissipated * state.volume / seconds
             nodes.add_source(scatter(blocks, state.x, power[:, None])[:, 0])
         increment = self._solve(nodes, dt) - initial
-        theta, gradient = self._to_particles(nodes, increment, smooth, blend, theta, gradient)
+        theta, gradient = self._to_particles(nodes, increment, smooth, blend, theta, gradient, motion, step)
         extra = dict(state.extra)
         if gradient is not None:
-            extra[GRADIENT] = _convected(gradient, velocity_gradient, step)
+            extra[GRADIENT] = gradient
         if self.melts:
-            theta, extra[LIQUID] = self._melt(state, theta, extra[LIQUID])
+            theta, extra[LIQUID] = self._melt(state, specific_heat, theta, extra[LIQUID])
         return {"temperature": theta, "extra": extra} if extra else {"temperature": theta}
-
-    def _blend(self, number: Tensor, step: float | Tensor, velocity_gradient: Tensor | None) -> float | Tensor:
-        """β_p: a number for all particles, or [P]."""
-        if self.transfer != "hybrid":
-            return 0.0 if self.transfer == "flip" else 1.0
-        rate = 4 * number
-        if velocity_gradient is not None:
-            # Where matter is strained, g_p of the particle is forgotten for that of the grid.
-            strain = 0.5 * (velocity_gradient + velocity_gradient.mT)
-            rate = rate + step * norm(strain.flatten(1))
-        return rate.clamp(max=1)
-
-    def _to_nodes(
-        self,
-        blocks: Blocks,
-        state: State,
-        volume: Tensor,
-        conductance: Tensor,
-        heat_capacity: Tensor,
-        theta: Tensor,
-        gradient: Tensor | None,
-        blend: float | Tensor,
-    ) -> tuple[HeatNodes, Tensor]:
-        """Heat heat_capacity and temperature θ_i of the nodes, and what particles are smoothed to, θ̄_i [N]."""
-        weights = heat_capacity[:, None]
-        if isinstance(blend, Tensor):
-            weights = torch.stack([heat_capacity, heat_capacity * blend], 1)
-        totals, mean = _averages(blocks, state.x, weights, theta, gradient)
-        nodes = HeatNodes(blocks, state, volume, conductance, totals[:, 0], mean[:, 0], self.reference)
-        return nodes, mean[:, -1]
 
     def _solve(self, nodes: HeatNodes, dt: float | Tensor) -> Tensor:
         """Temperature of the nodes at the end of the step [N]."""
@@ -292,22 +265,20 @@ class Heat(nn.Module):
         blend: float | Tensor,
         theta: Tensor,
         gradient: Tensor | None,
+        motion: Tensor | float,
+        step: Tensor | float,
     ) -> tuple[Tensor, Tensor | None]:
-        """Temperature and gradient of the particles, as at the top of this file."""
-        varies = isinstance(blend, Tensor)
+        """Temperature and gradient of the particles, as at the top of this file; the gradient moves with the matter."""
+        varies, affine = isinstance(blend, Tensor), gradient is not None
         channels = torch.stack([increment, smooth], 1) if varies else (increment + blend * smooth)[:, None]
-        value, moment, _ = gather(
-            nodes.blocks, nodes.state.x, channels, moment=gradient is not None, moment_scale=self.grid.inverse_inertia
-        )
-
-        def blended(before: Tensor, change: Tensor) -> Tensor:
-            if isinstance(blend, Tensor):
-                return before + change[:, 0] + _column(blend, before) * (change[:, 1] - before)
-            return (1 - blend) * before + change[:, 0]
-
-        if gradient is None or moment is None:
-            return blended(theta, value), None
-        return blended(theta, value), blended(gradient, moment)
+        scale = self.grid.inverse_inertia
+        value, moment, _ = gather(nodes.blocks, nodes.state.x, channels, moment=affine, moment_scale=scale)
+        gathered = value, 0.0 if moment is None else moment, theta, 0.0 if gradient is None else gradient
+        after = pointwise(
+            f"heat_update_{channels.shape[1]}", self.grid.dim, *gathered, blend, motion, step,
+            wanted=(0, 1) if affine else (0,),
+        )  # fmt: skip
+        return after[0], after[1] if affine else None
 
     def _gradient(self, state: State, temperature: Tensor) -> Tensor:
         """The temperature gradient of particles that know none [P, D] [K/m]; zero where they do not conduct.
@@ -315,15 +286,16 @@ class Heat(nn.Module):
         Weights κ V are those of θ̄_i, β_p m_p C_p, in small steps: an insulator does not count for what touches it.
         """
         blocks = self.grid.activate(state.x, state.scene)
-        weights = (evaluate("conductivity", self.conductivity, state) * present_volume(state))[:, None]
+        weight = evaluate("conductivity", self.conductivity, state) * present_volume(state)
         gradient = None
         for _ in range(SWEEPS):
-            _, mean = _averages(blocks, state.x, weights, temperature, gradient)
-            _, moment, _ = gather(blocks, state.x, mean, moment=True, moment_scale=self.grid.inverse_inertia)
+            _, (mean,) = _averages(blocks, state.x, (weight,), temperature, gradient)
+            scale = self.grid.inverse_inertia
+            _, moment, _ = gather(blocks, state.x, mean[:, None], moment=True, moment_scale=scale)
             assert moment is not None
             gradient = moment[:, 0]
         assert gradient is not None
-        return torch.where(weights > 0, gradient, 0)
+        return torch.where(weight[:, None] > 0, gradient, 0)
 
     def _liquid(self, state: State) -> Tensor:
         """Liquid fraction [P]: that of the state, or by its temperature."""
@@ -332,12 +304,14 @@ class Heat(nn.Module):
         temperature = needed_temperature(state)
         return (temperature.detach() > evaluate("melting_point", self.melting_point, state)).to(temperature)
 
-    def _melt(self, state: State, theta: Tensor, liquid: Tensor) -> tuple[Tensor, Tensor]:
+    def _melt(
+        self, state: State, specific_heat: Tensor | float, theta: Tensor, liquid: Tensor
+    ) -> tuple[Tensor, Tensor]:
         """Temperature and liquid fraction with the excess over the melting point in the latent heat, or out of it."""
         melting_point = evaluate("melting_point", self.melting_point, state)
-        ratio = evaluate("specific_heat", self.specific_heat, state) / evaluate("latent_heat", self.latent_heat, state)
-        fraction = (liquid + ratio * (theta - melting_point)).clamp(0, 1)
-        return theta - (fraction - liquid) / ratio, fraction
+        latent_heat = evaluate("latent_heat", self.latent_heat, state)
+        theta, liquid = pointwise("heat_melt", self.grid.dim, theta, liquid, melting_point, specific_heat, latent_heat)
+        return theta, liquid
 
     def heat_content(self, state: State) -> Tensor:
         """m (C θ + L f) of each particle [P] [J], relative to the solid at the reference temperature.
@@ -359,7 +333,7 @@ class Heat(nn.Module):
                     self.unsolved = torch.zeros(converged.shape, dtype=torch.int32, device=converged.device)
                     self.residual = torch.zeros(residual.shape, dtype=torch.float64, device=residual.device)
             self.unsolved += ~converged
-            torch.maximum(self.residual, residual.masked_fill(converged, 0).double(), out=self.residual)
+            torch.maximum(self.residual, residual.masked_fill(converged, 0), out=self.residual)
 
     def problems(self) -> dict[str, Problem]:
         """What became of the solves so far, by kind as in `Failures`, without synchronising."""
@@ -396,20 +370,24 @@ class Heat(nn.Module):
 
 
 def _averages(
-    blocks: Blocks, x: Tensor, weights: Tensor, theta: Tensor, gradient: Tensor | None
-) -> tuple[Tensor, Tensor]:
-    """Σ_p N_i w_p and the averages Σ_p N_i w_p (θ_p + g_p · (x_i − x_p)) / Σ_p N_i w_p of weights [P, K], [N, K]."""
-    moment = None
-    if gradient is not None:
-        moment = nn.functional.pad(weights[:, :, None] * gradient[:, None], (0, 0, 0, weights.shape[1]))
-    total, weight = scatter(blocks, x, torch.cat([weights * theta[:, None], weights], 1), moment).chunk(2, 1)
-    full = weight > 0
-    return weight, torch.where(full, total / torch.where(full, weight, 1), 0)
+    blocks: Blocks, x: Tensor, weights: Sequence[Tensor], theta: Tensor, gradient: Tensor | None
+) -> tuple[list[Tensor], list[Tensor]]:
+    """Σ_p N_i w_p and the averages Σ_p N_i w_p (θ_p + g_p · (x_i − x_p)) / Σ_p N_i w_p on the nodes, [N] each, of one
+    weight [P], or of two, of which the second is given by its share in the first."""
+    count, dim = len(weights), blocks.grid.dim
+    share, wanted = weights[1] if count == 2 else 0.0, (0,) if gradient is None else (0, 1)
+    known = theta, 0.0 if gradient is None else gradient
+    values, *moment = pointwise(f"heat_moments_{count}", dim, *known, weights[0], share, wanted=wanted)
+    sums = scatter(blocks, x, values, moment[0] if moment else None)
+    weight, mean = pointwise(f"heat_means_{count}", dim, sums)
+    return list(weight.unbind(1)), list(mean.unbind(1))
 
 
-def _column(values: Tensor, like: Tensor) -> Tensor:
-    """Values [P] as factors of a tensor [P, ...]."""
-    return values.reshape([-1] + [1] * (like.dim() - 1))
+def _deformation(state: State) -> tuple[Tensor | float, Tensor | float]:
+    """J and F, of which one is the number one, as the other tells the volume."""
+    if state.J is not None:
+        return state.J, 1.0
+    return 1.0, 1.0 if state.F is None else state.F
 
 
 def present_volume(state: State) -> Tensor:
@@ -417,12 +395,3 @@ def present_volume(state: State) -> Tensor:
     if state.J is not None:
         return state.volume * state.J
     return state.volume if state.F is None else state.volume * determinant(state.F)
-
-
-def _convected(gradient: Tensor, velocity_gradient: Tensor | None, step: float | Tensor) -> Tensor:
-    """∇θ of matter that moved by 1 + dt ∇v: its inverse transpose times the gradient, to second order in dt."""
-    if velocity_gradient is None:
-        return gradient
-    rate = velocity_gradient.mT * (step[:, None, None] if isinstance(step, Tensor) else step)
-    first = (rate @ gradient[..., None])[..., 0]
-    return gradient - first + (rate @ first[..., None])[..., 0]

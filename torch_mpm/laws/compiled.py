@@ -58,7 +58,7 @@ class CompiledLaw(Material):
 
     def __init__(self) -> None:
         super().__init__()
-        self._kept_parameters = GraphCache()
+        self._kept_parameters, self._kept_scalars = GraphCache(), GraphCache()
         self._functions = False
 
     @staticmethod
@@ -257,18 +257,25 @@ class CompiledLaw(Material):
         return law
 
     def _convert(self, state: State) -> list[Tensor]:
-        x, particles = state.x, getattr(state, "particles", state.x.shape[0])
+        x, particles, values = state.x, getattr(state, "particles", state.x.shape[0]), self.values()
+        numbers = iter(self._scalars([float(v) for v in values if not isinstance(v, Tensor)], x))  # type: ignore[arg-type]
         result = []
-        for value in self.values():
-            if isinstance(value, Tensor):
-                tensor = value.to(x.device, x.dtype)
-            else:
-                number = float(value)  # type: ignore[arg-type]
-                tensor = torch.full((), number, dtype=x.dtype, device=x.device)  # not a copy, which graphs refuse
+        for value in values:
+            tensor = value.to(x.device, x.dtype) if isinstance(value, Tensor) else next(numbers)
             if state.ids is not None and particles > 1 and tensor.shape == (particles,):
                 tensor = tensor.index_select(0, state.ids)
             result.append(tensor)
         return result
+
+    def _scalars(self, numbers: list[float], x: Tensor) -> list[Tensor]:
+        """Numbers as tensors [] in the dtype and on the device of x, kept from call to call."""
+
+        def make() -> list[Tensor]:  # no copies from the host, which graphs refuse
+            return [torch.full((), number, dtype=x.dtype, device=x.device) for number in numbers]
+
+        if torch.compiler.is_compiling():
+            return make()
+        return self._kept_scalars.get((*numbers, x.dtype, x.device), make, x)
 
 
 class SolidLaw(CompiledLaw):
@@ -306,7 +313,7 @@ class SolidLaw(CompiledLaw):
         if not self._engineering:
             return self.mu, self.lam
         E, nu = self.E, self.nu
-        return E / (2 * (1 + nu)), E * nu / ((1 + nu) * (1 - 2 * nu))
+        return E * (0.5 / (1 + nu)), E * (nu / ((1 + nu) * (1 - 2 * nu)))  # products: of E by temperature alone
 
 
 def check_value(name: str, value: Value, expected: str, holds: Callable[[Any], Any], infinite: bool = False) -> Value:

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from ..errors import check_number
+from ..ops.pointwise import pointwise
 from ..parameters import Overlay, Value, evaluate, needed_temperature, store
-from ..vectors import determinant
 from .compiled import check_value
 from .custom import as_law
 from .material import Material
@@ -48,14 +48,9 @@ class ThermalExpansion(Material):
         store(self, "coefficient", check_value("coefficient", coefficient, "finite", lambda v: v == v))
 
     def update(self, state: State) -> tuple[dict[str, Tensor], Tensor]:
-        stretch = self._stretch(state)
-        fields, stress = self.law(self._elastic(state, stretch))
-        changes = dict(fields)
-        if "F" in fields:
-            changes["F"] = fields["F"] * stretch[:, None, None]
-        if "J" in fields:
-            changes["J"] = fields["J"] * stretch ** state.x.shape[1]
-        return changes, stress
+        fields, stress = self.law(self._elastic(state))
+        expanded = self._stretched(state, fields.get("J"), fields.get("F"), 1.0)
+        return fields | expanded, stress
 
     def initial(self, name: str, state: State) -> Tensor:
         return self.law.initial(name, state)
@@ -75,17 +70,21 @@ class ThermalExpansion(Material):
     def invalid(self, state: State) -> Tensor:
         return self.law.invalid(self._elastic(state))
 
-    def _stretch(self, state: State) -> Tensor:
-        return 1 + evaluate("coefficient", self.coefficient, state) * needed_temperature(state)
+    def _elastic(self, state: State) -> Any:
+        J, F = (getattr(state, name) if name in self.state_fields else None for name in ("J", "F"))
+        return Overlay(state, **self._stretched(state, J, F, 0.0))
 
-    def _elastic(self, state: State, stretch: Tensor | None = None) -> Any:
-        stretch = self._stretch(state) if stretch is None else stretch
-        changes = {}
-        if "F" in self.state_fields and state.F is not None:
-            changes["F"] = state.F / stretch[:, None, None]
-        if "J" in self.state_fields and state.J is not None:
-            changes["J"] = state.J / stretch ** state.x.shape[1]
-        return Overlay(state, **changes)
+    def _stretched(self, state: State, J: Tensor | None, F: Tensor | None, expand: float) -> dict[str, Tensor]:
+        """J and F, those that are given, with the expansion, or without it where `expand` is zero."""
+        given = {name: value for name, value in (("J", J), ("F", F)) if value is not None}
+        if not given:
+            return {}
+        coefficient = evaluate("coefficient", self.coefficient, state)
+        results = pointwise(
+            "thermal_stretch", state.x.shape[1], given.get("J", 1.0), given.get("F", 1.0), coefficient,
+            needed_temperature(state), expand, wanted=[("J", "F").index(name) for name in given],
+        )  # fmt: skip
+        return dict(zip(given, results, strict=True))
 
 
 class Melting(Material):
@@ -120,15 +119,14 @@ class Melting(Material):
         self.viscous = solid.viscous or liquid.viscous
 
     def update(self, state: State) -> tuple[dict[str, Tensor], Tensor]:
-        fraction, flows = self._phases(state)
-        part = self._consistent(state, flows)
+        fraction, part = self._fraction(state), self._consistent(state)
         fields, solid = self.solid(part)
         _, liquid = self.liquid(part)
         changes = {**fields, "F": fields.get("F", part.F), "J": part.J}
         if "dissipated" in fields:
-            changes["dissipated"] = torch.where(flows, 0, fields["dissipated"])
-        weight = fraction[:, None, None]
-        return changes, torch.where(flows[:, None, None], liquid, torch.lerp(solid, liquid, weight))
+            changes["dissipated"] = torch.where(self._flows(state), 0, fields["dissipated"])
+        (stress,) = pointwise("melting_stress", state.x.shape[1], solid, liquid, fraction, self.coherency)
+        return changes, stress
 
     def initial(self, name: str, state: State) -> Tensor:
         return self.solid.initial(name, state)
@@ -153,31 +151,29 @@ class Melting(Material):
         return self._mixed(state, viscosity)
 
     def invalid(self, state: State) -> Tensor:
-        _, flows = self._phases(state)
-        part = self._consistent(state, flows)
-        return torch.where(flows, self.liquid.invalid(part), self.solid.invalid(part))
+        part = self._consistent(state)
+        return torch.where(self._flows(state), self.liquid.invalid(part), self.solid.invalid(part))
 
     def _mixed(self, state: State, function: Callable[[Material, Any], Tensor]) -> Tensor:
         """A scalar of the two laws, mixed as the stress is."""
-        fraction, flows = self._phases(state)
-        part = self._consistent(state, flows)
+        fraction, flows, part = self._fraction(state), self._flows(state), self._consistent(state)
         solid, liquid = function(self.solid, part), function(self.liquid, part)
         return torch.where(flows, liquid, (1 - fraction) * solid + torch.where(fraction > 0, fraction * liquid, 0))
 
-    def _phases(self, state: State) -> tuple[Tensor, Tensor]:
-        """Liquid fraction [P], and which particles flow, bool [P]."""
+    def _fraction(self, state: State) -> Tensor:
+        """Liquid fraction [P]."""
         fraction = state.extra.get(LIQUID)
         if fraction is None:
             raise ValueError(f'Melting needs state.extra["{LIQUID}"], which a step keeps with Heat(latent_heat=...)')
-        return fraction, fraction >= self.coherency
+        return fraction
 
-    def _consistent(self, state: State, flows: Tensor) -> Any:
+    def _flows(self, state: State) -> Tensor:
+        """Which particles flow, bool [P]."""
+        return self._fraction(state) >= self.coherency
+
+    def _consistent(self, state: State) -> Any:
         """F and J of one volume: that of J where the particle flows, that of F elsewhere."""
-        F, J = state.F, state.J
-        assert F is not None and J is not None
-        dim = F.shape[1]
-        root = J.where(flows & (J > 0), 1) ** (1 / dim)
-        isotropic = torch.diag_embed(root[:, None].expand(-1, dim))
-        return Overlay(
-            state, F=torch.where(flows[:, None, None], isotropic, F), J=torch.where(flows, J, determinant(F))
-        )
+        assert state.F is not None and state.J is not None
+        dim, fraction = state.F.shape[1], self._fraction(state)
+        J, F = pointwise("melting_parts", dim, state.J, state.F, fraction, self.coherency)
+        return Overlay(state, F=F, J=J)

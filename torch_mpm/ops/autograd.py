@@ -63,7 +63,7 @@ def register_autograd(
         ctx.lengths = lengths
         if setup is not None:
             setup(ctx, arguments, output)
-        return output
+        return tuple(output) if isinstance(output, list) else output
 
     def nested_backward(ctx: Any, *grads: Any) -> Any:
         flat = ctx.needs_input_grad

@@ -1,0 +1,295 @@
+#pragma once
+
+#include "pointwise/function.h"
+
+// The particles' part of a step of heat, and what a step does node by node (torch_mpm/heat).
+namespace mpm {
+inline namespace TORCH_MPM_ISA {
+
+template <class T>
+MPM_HD T clamp_to_unit(const T& a) {
+  return select(a > T(1), T(1), select(a < T(0), T(0), a));
+}
+
+// Length with derivative zero at the zero vector, from its square.
+template <class T>
+MPM_HD T safe_root(const T& squared) {
+  const auto positive = squared > T(0);
+  return select(positive, sqrt(select(positive, squared, T(1))), T(0));
+}
+
+template <class T, int D>
+MPM_HD T determinant_of(const Matrix<T, D>& F) {
+  if constexpr (D == 2)
+    return F[0][0] * F[1][1] - F[0][1] * F[1][0];
+  else
+    return F[0][0] * (F[1][1] * F[2][2] - F[1][2] * F[2][1]) - F[0][1] * (F[1][0] * F[2][2] - F[1][2] * F[2][0]) +
+           F[0][2] * (F[1][0] * F[2][1] - F[1][1] * F[2][0]);
+}
+
+// Rest volume, J, F (either is the number one where the other tells the volume), C, κ, mass, dt, ∇v, dx to the present
+// volume V, heat capacity m C, conductance κ V, and the blend β = min(1, 4 r + dt |sym ∇v|) with the diffusion number
+// r. Where matter is strained, the gradient of the particle is forgotten for that of the grid.
+struct HeatWeights {
+  static constexpr const char* name = "heat_weights";
+  static constexpr bool of_nodes = false;
+  static constexpr Entries arguments[] = {kScalar, kScalar, kMatrix, kScalar, kScalar,
+                                          kScalar, kScalar, kMatrix, kScalar};
+  static constexpr Entries results[] = {kScalar, kScalar, kScalar, kScalar};
+
+  template <class T, int D>
+  MPM_HD static void evaluate(Reader<T, D>& in, Writer<T, D>& out) {
+    const T rest = in.scalar(), J = in.scalar();
+    const T volume = rest * J * determinant_of(in.matrix());
+    const T specific_heat = in.scalar(), given = in.scalar(), mass = in.scalar(), dt = in.scalar();
+    const Matrix<T, D> L = in.matrix();
+    const T dx = in.scalar();
+    const T conductivity = select(given >= T(0), given, T(NAN));
+    const T capacity = specific_heat * mass, conductance = conductivity * volume;
+    T squared = T(0);
+    MPM_UNROLL for (int i = 0; i < D; i++) MPM_UNROLL
+      for (int j = 0; j < D; j++) {
+        const T strain = T(0.5) * (L[i][j] + L[j][i]);
+        squared = squared + strain * strain;
+      }
+    const T r = dt * conductance / (select(capacity > T(0), capacity, T(1)) * dx * dx);
+    const T rate = T(4) * r + dt * safe_root(squared);
+    out.put(volume);
+    out.put(capacity);
+    out.put(conductance);
+    out.put(select(rate > T(1), T(1), rate));
+  }
+};
+
+// θ, g, weight w and the share of a second weight in it: w θ of each weight, then the weights, for `scatter`; and their
+// moments w g, of which those of the weights alone are zero.
+template <int Weights>
+struct HeatMoments {
+  static constexpr const char* name = Weights == 1 ? "heat_moments_1" : "heat_moments_2";
+  static constexpr bool of_nodes = false;
+  static constexpr Entries arguments[] = {kScalar, kVector, kScalar, kScalar};
+  static constexpr Entries results[] = {{2 * Weights}, {2 * Weights, kDimension}};
+
+  template <class T, int D>
+  MPM_HD static void evaluate(Reader<T, D>& in, Writer<T, D>& out) {
+    const T theta = in.scalar();
+    const Vector<T, D> gradient = in.vector();
+    T weight[2];
+    weight[0] = in.scalar();
+    weight[1] = weight[0] * in.scalar();
+    MPM_UNROLL for (int k = 0; k < Weights; k++)
+      out.put(weight[k] * theta);
+    MPM_UNROLL for (int k = 0; k < Weights; k++)
+      out.put(weight[k]);
+    MPM_UNROLL for (int k = 0; k < Weights; k++)
+      out.put(weight[k] * gradient);
+    MPM_UNROLL for (int k = 0; k < Weights; k++)
+      out.put(zero_vector<T, D>());
+  }
+};
+
+// Sums of w θ and of w for each weight: the sums of w, and the averages of θ, zero where there is no matter.
+template <int Weights>
+struct HeatMeans {
+  static constexpr const char* name = Weights == 1 ? "heat_means_1" : "heat_means_2";
+  static constexpr bool of_nodes = true;
+  static constexpr Entries arguments[] = {{2 * Weights}};
+  static constexpr Entries results[] = {{Weights}, {Weights}};
+
+  template <class T, int D>
+  MPM_HD static void evaluate(Reader<T, D>& in, Writer<T, D>& out) {
+    T total[Weights], weight[Weights];
+    MPM_UNROLL for (int k = 0; k < Weights; k++)
+      total[k] = in.scalar();
+    MPM_UNROLL for (int k = 0; k < Weights; k++)
+      out.put(weight[k] = in.scalar());
+    MPM_UNROLL for (int k = 0; k < Weights; k++) {
+      const auto full = weight[k] > T(0);
+      out.put(select(full, total[k] / select(full, weight[k], T(1)), T(0)));
+    }
+  }
+};
+
+// What particles gather, θ, g, β, ∇v and dt: θ and g after the step. Of two channels, the increments and θ̄, particles
+// take Σ N (d + β (θ̄ − θ)); of one, Σ N (d + β θ̄) − β θ, with the same β for all. Then g moves with matter that moves
+// by 1 + dt ∇v: the inverse transpose of that times g, to second order in dt.
+template <int Channels>
+struct HeatUpdate {
+  static constexpr const char* name = Channels == 1 ? "heat_update_1" : "heat_update_2";
+  static constexpr bool of_nodes = false;
+  static constexpr Entries arguments[] = {{Channels}, {Channels, kDimension}, kScalar, kVector, kScalar, kMatrix,
+                                          kScalar};
+  static constexpr Entries results[] = {kScalar, kVector};
+
+  template <class T>
+  MPM_HD static T blended(const T (&change)[Channels], const T& before, const T& blend) {
+    if constexpr (Channels == 2)
+      return before + change[0] + blend * (change[1] - before);
+    else
+      return (T(1) - blend) * before + change[0];
+  }
+
+  template <class T, int D>
+  MPM_HD static void evaluate(Reader<T, D>& in, Writer<T, D>& out) {
+    T value[Channels];
+    Vector<T, D> moment[Channels];
+    MPM_UNROLL for (T& v : value)
+      v = in.scalar();
+    MPM_UNROLL for (Vector<T, D>& m : moment)
+      m = in.vector();
+    const T theta = in.scalar();
+    const Vector<T, D> g = in.vector();
+    const T blend = in.scalar();
+    const Matrix<T, D> L = in.matrix();
+    const T dt = in.scalar();
+    out.put(blended(value, theta, blend));
+    Vector<T, D> after, first, second;
+    MPM_UNROLL for (int i = 0; i < D; i++) {
+      T change[Channels];
+      MPM_UNROLL for (int k = 0; k < Channels; k++)
+        change[k] = moment[k][i];
+      after[i] = blended(change, g[i], blend);
+    }
+    first = dt * (transpose(L) * after);
+    second = dt * (transpose(L) * first);
+    MPM_UNROLL for (int i = 0; i < D; i++)
+      out.put(after[i] - first[i] + second[i]);
+  }
+};
+
+// θ, liquid fraction f, melting point θ_m, C, L: θ and f with the excess over the melting point in the latent heat, or
+// out of it (enthalpy buffer; Stomakhin et al. 2014).
+struct HeatMelt {
+  static constexpr const char* name = "heat_melt";
+  static constexpr bool of_nodes = false;
+  static constexpr Entries arguments[] = {kScalar, kScalar, kScalar, kScalar, kScalar};
+  static constexpr Entries results[] = {kScalar, kScalar};
+
+  template <class T, int D>
+  MPM_HD static void evaluate(Reader<T, D>& in, Writer<T, D>& out) {
+    const T theta = in.scalar(), before = in.scalar(), melting_point = in.scalar();
+    const T specific_heat = in.scalar(), ratio = specific_heat / in.scalar();
+    const T liquid = clamp_to_unit(before + ratio * (theta - melting_point));
+    out.put(theta - (liquid - before) / ratio);
+    out.put(liquid);
+  }
+};
+
+// Distance a from a surface and width w of its layer: the share s = 1 − (1 − a²/w²)³ and s'/a.
+struct HeatLayer {
+  static constexpr const char* name = "heat_layer";
+  static constexpr bool of_nodes = false;
+  static constexpr Entries arguments[] = {kScalar, kScalar};
+  static constexpr Entries results[] = {kScalar, kScalar};
+
+  template <class T, int D>
+  MPM_HD static void evaluate(Reader<T, D>& in, Writer<T, D>& out) {
+    const T distance = in.scalar(), width = in.scalar();
+    const T ratio = clamp_to_unit(distance / width), rest = T(1) - ratio * ratio;
+    out.put(T(1) - rest * rest * rest);
+    out.put(T(6) / (width * width) * rest * rest);
+  }
+};
+
+// Conductance κ V that is left so far, κ V itself, s'/a of a layer and D⁻¹: what it exchanges, κ V s'/a, and what is
+// left then. At the nodes a particle exchanges with Σ_i N_i (θ_i − T)², which on a linear temperature is D |∇θ|² more
+// than at the particle; this is taken from its κ V.
+struct HeatExchange {
+  static constexpr const char* name = "heat_exchange";
+  static constexpr bool of_nodes = false;
+  static constexpr Entries arguments[] = {kScalar, kScalar, kScalar, kScalar};
+  static constexpr Entries results[] = {kScalar, kScalar};
+
+  template <class T, int D>
+  MPM_HD static void evaluate(Reader<T, D>& in, Writer<T, D>& out) {
+    const T left = in.scalar(), conductance = in.scalar(), exchange = conductance * in.scalar();
+    out.put(exchange);
+    out.put(left - exchange / in.scalar());
+  }
+};
+
+// Emissivity times area, σ, θ, ambient and reference: radiation linearised about θ, as coefficient and heat at θ = 0.
+struct HeatRadiation {
+  static constexpr const char* name = "heat_radiation";
+  static constexpr bool of_nodes = true;
+  static constexpr Entries arguments[] = {kScalar, kScalar, kScalar, kScalar, kScalar};
+  static constexpr Entries results[] = {kScalar, kScalar};
+
+  template <class T, int D>
+  MPM_HD static void evaluate(Reader<T, D>& in, Writer<T, D>& out) {
+    const T emitting = in.scalar(), black = emitting * in.scalar();
+    const T theta = in.scalar(), relative = in.scalar(), reference = in.scalar();
+    const T ambient = relative + reference, kelvin = theta + reference;
+    const T hot = select(kelvin > T(0), kelvin, T(0)), square = hot * hot, slope = T(4) * square * hot;
+    const T coefficient = black * slope;
+    out.put(coefficient);
+    out.put(coefficient * theta + black * (ambient * ambient * ambient * ambient - square * square));
+  }
+};
+
+// Volume V: zero, and V 1, with which `scatter` sums V ∇N on the nodes.
+struct SurfaceNormals {
+  static constexpr const char* name = "surface_normals";
+  static constexpr bool of_nodes = false;
+  static constexpr Entries arguments[] = {kScalar};
+  static constexpr Entries results[] = {kVector, kMatrix};
+
+  template <class T, int D>
+  MPM_HD static void evaluate(Reader<T, D>& in, Writer<T, D>& out) {
+    const T volume = in.scalar();
+    out.put(zero_vector<T, D>());
+    out.put(volume * identity<T, D>());
+  }
+};
+
+// Length of a vector.
+struct Length {
+  static constexpr const char* name = "length";
+  static constexpr bool of_nodes = true;
+  static constexpr Entries arguments[] = {kVector};
+  static constexpr Entries results[] = {kScalar};
+
+  template <class T, int D>
+  MPM_HD static void evaluate(Reader<T, D>& in, Writer<T, D>& out) {
+    const Vector<T, D> v = in.vector();
+    out.put(safe_root(dot(v, v)));
+  }
+};
+
+// Depth behind the faces of each axis of a box, negative inside: distance from its surface, negative inside.
+struct BoxDistance {
+  static constexpr const char* name = "box_distance";
+  static constexpr bool of_nodes = false;
+  static constexpr Entries arguments[] = {kVector};
+  static constexpr Entries results[] = {kScalar};
+
+  template <class T, int D>
+  MPM_HD static void evaluate(Reader<T, D>& in, Writer<T, D>& out) {
+    const Vector<T, D> depth = in.vector();
+    T squared = T(0), most = depth[0];
+    MPM_UNROLL for (int i = 0; i < D; i++) {
+      const T outside = select(depth[i] > T(0), depth[i], T(0));
+      squared = squared + outside * outside;
+      if (i > 0) most = select(depth[i] > most, depth[i], most);
+    }
+    out.put(safe_root(squared) + select(most < T(0), most, T(0)));
+  }
+};
+
+// Temperature, two knots and their values: linear between the knots, constant beyond.
+struct Interpolated {
+  static constexpr const char* name = "interpolated";
+  static constexpr bool of_nodes = false;
+  static constexpr Entries arguments[] = {kScalar, kScalar, kScalar, kScalar, kScalar};
+  static constexpr Entries results[] = {kScalar};
+
+  template <class T, int D>
+  MPM_HD static void evaluate(Reader<T, D>& in, Writer<T, D>& out) {
+    const T at = in.scalar(), low = in.scalar(), high = in.scalar(), first = in.scalar(), last = in.scalar();
+    const T share = clamp_to_unit((at - low) / (high - low)), rise = last - first;
+    out.put(select(share < T(0.5), first + share * rise, last - (T(1) - share) * rise));
+  }
+};
+
+}  // namespace TORCH_MPM_ISA
+}  // namespace mpm

@@ -1,0 +1,202 @@
+"""Functions of each particle or node alone (csrc/pointwise), fused: Python face, fake kernels and autograd."""
+
+from __future__ import annotations
+
+import ctypes
+import dataclasses
+import json
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from .. import _library
+from .arguments import refuse_vmap, soa_empty
+from .autograd import dispatch, register_autograd
+
+Places = list[int]
+
+
+@dataclasses.dataclass(frozen=True)
+class Function:
+    """What a function of csrc/pointwise says of itself.
+
+    Attributes:
+        name: as `pointwise` takes it.
+        of_nodes: whether rows are nodes, whose results are stored row by row.
+        arguments, results: entries of each in a row, (rows, columns): zero where it has none, -1 for D.
+    """
+
+    name: str
+    of_nodes: bool
+    arguments: tuple[tuple[int, int], ...]
+    results: tuple[tuple[int, int], ...]
+
+
+def _read() -> dict[str, Function]:
+    library = ctypes.CDLL(str(_library.CPU_LIBRARY))
+    library.torch_mpm_functions.restype = ctypes.c_char_p
+    found = {}
+    for entry in json.loads(library.torch_mpm_functions()):
+        lists = {key: tuple((rows, columns) for rows, columns in entry[key]) for key in ("arguments", "results")}
+        found[entry["name"]] = Function(entry["name"], entry["of_nodes"], **lists)
+    return found
+
+
+FUNCTIONS: dict[str, Function] = _read()
+"""Every function by its name."""
+
+
+def pointwise(function: str, dim: int, *arguments: Tensor | float, wanted: Sequence[int] | None = None) -> list[Tensor]:
+    """Results of a function of csrc/pointwise, one kernel for all rows.
+
+    Args:
+        function: a name in `FUNCTIONS`, which tells its arguments; what they are stands with the function.
+        dim: D.
+        arguments: a tensor with a row for each particle or node; a scalar also as a tensor [] or [1] or a number for
+            all. A number for a vector is each of its entries, for a matrix that many times the identity. All tensors
+            float32, or all float64, and one of them with rows.
+        wanted: numbers of the results to give; None for all.
+
+    Differentiable with respect to every tensor, twice.
+
+    Raises:
+        RuntimeError: for an unknown function, a wrong shape, dtype or device.
+    """
+    tensors = [a for a in arguments if isinstance(a, Tensor)]
+    places = [k for k, a in enumerate(arguments) if isinstance(a, Tensor)]
+    numbers = [0.0 if isinstance(a, Tensor) else float(a) for a in arguments]
+    results = list(range(len(FUNCTIONS[function].results))) if wanted is None else list(wanted)
+    return list(dispatch(torch.ops.torch_mpm.pointwise, function, dim, tensors, places, numbers, results))
+
+
+# ---- fake kernels
+
+
+def _rows(tensors: Sequence[Tensor]) -> tuple[Any, Tensor]:
+    """Rows of a call, and a tensor that has them."""
+    given = [t for t in tensors if t.dim() > 0]
+    torch._check(bool(given), lambda: "one of tensors must have a row for each particle")
+    most = given[0]
+    for t in given[1:]:
+        most = t if most.shape[0] == 1 or t.shape[0] == 0 else most
+    return most.shape[0], most
+
+
+def _shape(entries: tuple[int, int], rows: Any, dim: int) -> list[Any]:
+    return [rows, *(dim if size == -1 else size for size in entries if size != 0)]
+
+
+def _empty(
+    kinds: Sequence[tuple[int, int]], places: Places, tensors: Sequence[Tensor], dim: int, contiguous: bool
+) -> list[Tensor]:
+    rows, like = _rows(tensors)
+    make = like.new_empty if contiguous else (lambda shape: soa_empty(like, shape))
+    return [make(_shape(kinds[k], rows, dim)) for k in places]
+
+
+@torch.library.register_fake("torch_mpm::pointwise")
+def _pointwise_fake(
+    function: str, dim: int, tensors: list[Tensor], places: Places, numbers: list[float], wanted: Places
+) -> list[Tensor]:
+    info = FUNCTIONS[function]
+    return _empty(info.results, wanted, tensors, dim, info.of_nodes)
+
+
+@torch.library.register_fake("torch_mpm::pointwise_backward")
+def _pointwise_backward_fake(
+    function: str,
+    dim: int,
+    tensors: list[Tensor],
+    places: Places,
+    numbers: list[float],
+    adjoints: list[Tensor],
+    adjoint_places: Places,
+    wanted: Places,
+) -> list[Tensor]:
+    return _empty(FUNCTIONS[function].arguments, [places[i] for i in wanted], tensors, dim, False)
+
+
+@torch.library.register_fake("torch_mpm::pointwise_second")
+def _pointwise_second_fake(
+    function: str,
+    dim: int,
+    tensors: list[Tensor],
+    places: Places,
+    numbers: list[float],
+    adjoints: list[Tensor],
+    adjoint_places: Places,
+    tangents: list[Tensor],
+    tangent_places: Places,
+    wanted: Places,
+) -> list[Tensor]:
+    info = FUNCTIONS[function]
+    by_arguments = _empty(info.arguments, [places[i] for i in wanted], tensors, dim, False)
+    return by_arguments + _empty(info.results, adjoint_places, tensors, dim, False)
+
+
+# ---- autograd
+
+
+def _keep(ctx: Any, inputs: Any, output: Any) -> None:
+    function, dim, tensors, places, numbers, wanted = inputs
+    ctx.set_materialize_grads(False)
+    ctx.save_for_backward(*tensors)
+    ctx.call = function, dim, places, numbers, wanted
+
+
+def _backward(ctx: Any, *grads: Tensor | None) -> Any:
+    function, dim, places, numbers, results = ctx.call
+    tensors = list(ctx.saved_tensors)
+    given = [(g, k) for g, k in zip(grads, results, strict=True) if g is not None]
+    wanted = [i for i, needed in enumerate(ctx.needs_input_grad[2]) if needed]
+    if not given or not wanted:
+        return None, None, [None] * len(tensors), None, None, None
+    adjoints, adjoint_places = [g for g, _ in given], [k for _, k in given]
+    arguments = function, dim, tensors, places, numbers, adjoints, adjoint_places, wanted
+    found = dispatch(torch.ops.torch_mpm.pointwise_backward, *arguments)
+    return None, None, _placed(found, wanted, tensors), None, None, None
+
+
+def _placed(found: Sequence[Tensor], wanted: Places, tensors: Sequence[Tensor]) -> list[Tensor | None]:
+    """Gradients by rows as those of the tensors, of which some are for all rows."""
+    result: list[Tensor | None] = [None] * len(tensors)
+    for gradient, i in zip(found, wanted, strict=True):
+        same = gradient.shape == tensors[i].shape
+        result[i] = gradient if same else gradient.sum(0).reshape(tensors[i].shape)
+    return result
+
+
+def _keep_backward(ctx: Any, inputs: Any, output: Any) -> None:
+    function, dim, tensors, places, numbers, adjoints, adjoint_places, wanted = inputs
+    ctx.set_materialize_grads(False)
+    ctx.save_for_backward(*tensors, *adjoints)
+    ctx.call = function, dim, places, numbers, adjoint_places, wanted
+
+
+def _double_backward(ctx: Any, *along: Tensor | None) -> Any:
+    function, dim, places, numbers, adjoint_places, differentiated = ctx.call
+    saved = list(ctx.saved_tensors)
+    tensors, adjoints = saved[: len(places)], saved[len(places) :]
+    given = [(v, places[i]) for v, i in zip(along, differentiated, strict=True) if v is not None]
+    if not given:
+        return None, None, [None] * len(tensors), None, None, [None] * len(adjoints), None, None
+    wanted = [i for i, needed in enumerate(ctx.needs_input_grad[2]) if needed]
+    found = torch.ops.torch_mpm.pointwise_second(
+        *(function, dim, tensors, places, numbers, adjoints, adjoint_places),
+        *([v for v, _ in given], [k for _, k in given], wanted),
+    )
+    by_tensors = _placed(found[: len(wanted)], wanted, tensors)
+    return None, None, by_tensors, None, None, list(found[len(wanted) :]), None, None
+
+
+def _no_third_derivative(ctx: Any, *grads: Any) -> Any:
+    raise NotImplementedError("pointwise functions have no third derivatives: differentiate them twice")
+
+
+register_autograd("pointwise", _backward, _keep)
+register_autograd("pointwise_backward", _double_backward, _keep_backward)
+register_autograd("pointwise_second", _no_third_derivative)
+for _name in ("pointwise", "pointwise_backward", "pointwise_second"):
+    refuse_vmap(_name)
