@@ -167,7 +167,9 @@ class _Replays:
         try:
             before, after = _tensors(self.state), _tensors(step(self.state, dt))
             changed = [name for name, value in after.items() if value is not before[name]]
-            torch._foreach_copy_([before[name] for name in changed], [after[name] for name in changed])
+            for dtype in {before[name].dtype for name in changed}:  # of one, they are copied at once
+                alike = [name for name in changed if before[name].dtype == dtype]
+                torch._foreach_copy_([before[name] for name in alike], [after[name] for name in alike])
         except BaseException:
             with contextlib.suppress(RuntimeError):  # the capture has failed, as what is raised says
                 self._graph.capture_end()

@@ -164,12 +164,12 @@ class Box(Shape):
 
     def surface(self, x: Tensor, scene: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """The normal is that of the nearest face, inside the one of the axis with the least negative distance."""
-        depth = self._depth(x, scene)
-        nearest = torch.arange(x.shape[1], device=x.device) == depth.argmax(1, keepdim=True)
-        return self._distance(depth), nearest * torch.where(x < 0, -1, 1).to(x.dtype)
+        nearest = torch.arange(x.shape[1], device=x.device) == self._depth(x, scene).argmax(1, keepdim=True)
+        return self.signed_distance(x, scene), nearest * torch.where(x < 0, -1, 1).to(x.dtype)
 
     def signed_distance(self, x: Tensor, scene: Tensor | None = None) -> Tensor:
-        return self._distance(self._depth(x, scene))
+        (distance,) = pointwise("box_distance", x.shape[1], x, self.at_nodes("size", x, x.shape[1:], scene))
+        return distance
 
     def contains(self, x: Tensor) -> Tensor:
         return (self._depth(x, None) <= 0).all(1)
@@ -177,11 +177,6 @@ class Box(Shape):
     def _depth(self, x: Tensor, scene: Tensor | None) -> Tensor:
         """How far points are behind the faces of each axis [N, D] [m], negative inside."""
         return x.abs() - 0.5 * self.at_nodes("size", x, x.shape[1:], scene)
-
-    def _distance(self, depth: Tensor) -> Tensor:
-        """By the depth behind the faces."""
-        (distance,) = pointwise("box_distance", depth.shape[1], depth)
-        return distance
 
     def volume(self, dim: int, scene: int = 0) -> float:
         return float(self.of_scene("size", 1, scene).prod())

@@ -30,7 +30,7 @@ from .. import common, regressions
 from . import scaling, work
 from .step import Setup, setup
 
-SCENES = {"cpu": ("demo", "batch"), "cuda": ("demo", "batch", "sand_column", "sand_drum", "spinner")}
+SCENES = {"cpu": ("demo", "batch"), "cuda": ("demo", "batch", "sand_column", "sand_drum", "spinner", "melt")}
 SIDES = {"cpu": (4, 10, 22, 46, 64), "cuda": (4, 10, 22, 46, 100, 200)}
 BATCHES = {"cpu": ((64, 512),), "cuda": ((4096, 512), (1024, 2197))}
 """Scenes, and particles of each."""

@@ -32,7 +32,6 @@ MPM_HD T determinant_of(const Matrix<T, D>& F) {
 // r. Where matter is strained, the gradient of the particle is forgotten for that of the grid.
 struct HeatWeights {
   static constexpr const char* name = "heat_weights";
-  static constexpr bool of_nodes = false;
   static constexpr Entries arguments[] = {kScalar, kScalar, kMatrix, kScalar, kScalar,
                                           kScalar, kScalar, kMatrix, kScalar};
   static constexpr Entries results[] = {kScalar, kScalar, kScalar, kScalar};
@@ -66,7 +65,6 @@ struct HeatWeights {
 template <int Weights>
 struct HeatMoments {
   static constexpr const char* name = Weights == 1 ? "heat_moments_1" : "heat_moments_2";
-  static constexpr bool of_nodes = false;
   static constexpr Entries arguments[] = {kScalar, kVector, kScalar, kScalar};
   static constexpr Entries results[] = {{2 * Weights}, {2 * Weights, kDimension}};
 
@@ -92,7 +90,6 @@ struct HeatMoments {
 template <int Weights>
 struct HeatMeans {
   static constexpr const char* name = Weights == 1 ? "heat_means_1" : "heat_means_2";
-  static constexpr bool of_nodes = true;
   static constexpr Entries arguments[] = {{2 * Weights}};
   static constexpr Entries results[] = {{Weights}, {Weights}};
 
@@ -116,7 +113,6 @@ struct HeatMeans {
 template <int Channels>
 struct HeatUpdate {
   static constexpr const char* name = Channels == 1 ? "heat_update_1" : "heat_update_2";
-  static constexpr bool of_nodes = false;
   static constexpr Entries arguments[] = {{Channels}, {Channels, kDimension}, kScalar, kVector, kScalar, kMatrix,
                                           kScalar};
   static constexpr Entries results[] = {kScalar, kVector};
@@ -161,7 +157,6 @@ struct HeatUpdate {
 // out of it (enthalpy buffer; Stomakhin et al. 2014).
 struct HeatMelt {
   static constexpr const char* name = "heat_melt";
-  static constexpr bool of_nodes = false;
   static constexpr Entries arguments[] = {kScalar, kScalar, kScalar, kScalar, kScalar};
   static constexpr Entries results[] = {kScalar, kScalar};
 
@@ -178,7 +173,6 @@ struct HeatMelt {
 // Distance a from a surface and width w of its layer: the share s = 1 − (1 − a²/w²)³ and s'/a.
 struct HeatLayer {
   static constexpr const char* name = "heat_layer";
-  static constexpr bool of_nodes = false;
   static constexpr Entries arguments[] = {kScalar, kScalar};
   static constexpr Entries results[] = {kScalar, kScalar};
 
@@ -196,7 +190,6 @@ struct HeatLayer {
 // than at the particle; this is taken from its κ V.
 struct HeatExchange {
   static constexpr const char* name = "heat_exchange";
-  static constexpr bool of_nodes = false;
   static constexpr Entries arguments[] = {kScalar, kScalar, kScalar, kScalar};
   static constexpr Entries results[] = {kScalar, kScalar};
 
@@ -211,7 +204,6 @@ struct HeatExchange {
 // Emissivity times area, σ, θ, ambient and reference: radiation linearised about θ, as coefficient and heat at θ = 0.
 struct HeatRadiation {
   static constexpr const char* name = "heat_radiation";
-  static constexpr bool of_nodes = true;
   static constexpr Entries arguments[] = {kScalar, kScalar, kScalar, kScalar, kScalar};
   static constexpr Entries results[] = {kScalar, kScalar};
 
@@ -230,7 +222,6 @@ struct HeatRadiation {
 // Volume V: zero, and V 1, with which `scatter` sums V ∇N on the nodes.
 struct SurfaceNormals {
   static constexpr const char* name = "surface_normals";
-  static constexpr bool of_nodes = false;
   static constexpr Entries arguments[] = {kScalar};
   static constexpr Entries results[] = {kVector, kMatrix};
 
@@ -245,7 +236,6 @@ struct SurfaceNormals {
 // Length of a vector.
 struct Length {
   static constexpr const char* name = "length";
-  static constexpr bool of_nodes = true;
   static constexpr Entries arguments[] = {kVector};
   static constexpr Entries results[] = {kScalar};
 
@@ -256,21 +246,21 @@ struct Length {
   }
 };
 
-// Depth behind the faces of each axis of a box, negative inside: distance from its surface, negative inside.
+// Position in the frame of a box around the origin, and its edge lengths: distance from its surface, negative inside.
 struct BoxDistance {
   static constexpr const char* name = "box_distance";
-  static constexpr bool of_nodes = false;
-  static constexpr Entries arguments[] = {kVector};
+  static constexpr Entries arguments[] = {kVector, kVector};
   static constexpr Entries results[] = {kScalar};
 
   template <class T, int D>
   MPM_HD static void evaluate(Reader<T, D>& in, Writer<T, D>& out) {
-    const Vector<T, D> depth = in.vector();
-    T squared = T(0), most = depth[0];
+    const Vector<T, D> x = in.vector(), size = in.vector();
+    T squared = T(0), most = T(0);
     MPM_UNROLL for (int i = 0; i < D; i++) {
-      const T outside = select(depth[i] > T(0), depth[i], T(0));
+      const T depth = abs(x[i]) - T(0.5) * size[i];  // behind the faces of the axis, negative inside
+      const T outside = select(depth > T(0), depth, T(0));
       squared = squared + outside * outside;
-      if (i > 0) most = select(depth[i] > most, depth[i], most);
+      most = i == 0 ? depth : select(depth > most, depth, most);
     }
     out.put(safe_root(squared) + select(most < T(0), most, T(0)));
   }
@@ -279,7 +269,6 @@ struct BoxDistance {
 // Temperature, two knots and their values: linear between the knots, constant beyond.
 struct Interpolated {
   static constexpr const char* name = "interpolated";
-  static constexpr bool of_nodes = false;
   static constexpr Entries arguments[] = {kScalar, kScalar, kScalar, kScalar, kScalar};
   static constexpr Entries results[] = {kScalar};
 

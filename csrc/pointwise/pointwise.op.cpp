@@ -19,7 +19,6 @@ using Places = std::vector<int64_t>;
 struct FunctionInfo {
   int number = -1;
   const char* name = nullptr;
-  bool of_nodes = false;
   std::vector<Entries> arguments, results;
 };
 
@@ -27,7 +26,6 @@ template <class Function>
 FunctionInfo info_of(int number) {
   return {number,
           Function::name,
-          Function::of_nodes,
           {std::begin(Function::arguments), std::end(Function::arguments)},
           {std::begin(Function::results), std::end(Function::results)}};
 }
@@ -79,16 +77,20 @@ Shape shape_of_rows(const Entries& e, int64_t rows, int dim) {
   return shape;
 }
 
-bool is_shared(const Tensor& t, int64_t rows) { return t.dim() == 0 || (t.dim() == 1 && t.size(0) == 1 && rows != 1); }
+// Whether a tensor stands for all rows: one without the dimension of rows, and a scalar [1].
+bool is_shared(const Tensor& t, const Entries& e, int64_t rows) {
+  return t.dim() == rank_of(e) || (rank_of(e) == 0 && t.dim() == 1 && t.size(0) == 1 && rows != 1);
+}
 
 // Sets the columns of a tensor whose shape has been checked.
 template <class T>
 void set_columns(Column<T>* columns, const Tensor& t, const Entries& e, int64_t rows, int dim) {
-  const int64_t inner = rank_of(e) > 1 ? extent(e.columns, dim) : 1;
+  const bool shared = is_shared(t, e, rows);
+  const int64_t first = t.dim() - rank_of(e), inner = rank_of(e) > 1 ? extent(e.columns, dim) : 1;
   for (int64_t n = 0; n < size_of(e, dim); n++) {
-    const int64_t shift =
-        (rank_of(e) > 0 ? n / inner * t.stride(1) : 0) + (rank_of(e) > 1 ? n % inner * t.stride(2) : 0);
-    columns[n] = {static_cast<T*>(t.data_ptr()) + shift, is_shared(t, rows) ? 0 : t.stride(0)};
+    int64_t shift = rank_of(e) > 0 ? n / inner * t.stride(first) : 0;
+    if (rank_of(e) > 1) shift += n % inner * t.stride(first + 1);
+    columns[n] = {static_cast<T*>(t.data_ptr()) + shift, shared ? 0 : t.stride(0)};
   }
 }
 
@@ -111,16 +113,17 @@ struct Call {
                     places.size());
     STD_TORCH_CHECK(numbers.size() == function.arguments.size(), "numbers must have ", function.arguments.size(),
                     " entries for the function ", function.name, ", got ", numbers.size());
-    count_rows();
     check_places("places", places, function.arguments.size());
+    count_rows();
     for (size_t i = 0; i < tensors.size(); i++) check(tensors[i], "tensors", i, function.arguments, places[i], true);
   }
 
-  // Rows of the arguments: of one row are also those that all rows share.
+  // Rows of the arguments: a scalar of one row may be one that all rows share.
   void count_rows() {
     bool none = false;
-    for (const Tensor& t : tensors) {
-      if (t.dim() == 0) continue;
+    for (size_t i = 0; i < tensors.size(); i++) {
+      const Tensor& t = tensors[i];
+      if (t.dim() != rank_of(function.arguments[size_t(places[i])]) + 1) continue;
       none = none || t.size(0) == 0;
       if (!like.defined() || t.size(0) > like.size(0)) like = t;
     }
@@ -134,8 +137,12 @@ struct Call {
     const std::string name = std::string(list) + "[" + std::to_string(i) + "]";
     check_like(t, name.c_str(), like);
     const Entries& e = kinds[size_t(place)];
-    if (may_be_shared && rank_of(e) == 0 && is_shared(t, rows)) return;
-    check_shape(t, name.c_str(), shape_of_rows(e, rows, dim));
+    Shape shape = shape_of_rows(e, rows, dim);
+    if (may_be_shared && is_shared(t, e, rows)) {
+      if (rank_of(e) == 0) return;
+      shape.erase(shape.begin());
+    }
+    check_shape(t, name.c_str(), shape);
   }
 
   template <class T, int D>
@@ -159,12 +166,9 @@ struct Call {
   }
 
   // A tensor of rows for each place.
-  Tensors allocate(const std::vector<Entries>& kinds, const Places& at, bool contiguous) const {
+  Tensors allocate(const std::vector<Entries>& kinds, const Places& at) const {
     Tensors made;
-    for (int64_t place : at) {
-      const Shape shape = shape_of_rows(kinds[size_t(place)], rows, dim);
-      made.push_back(contiguous ? empty(like, shape) : empty_particles(like, shape));
-    }
+    for (int64_t place : at) made.push_back(empty_particles(like, shape_of_rows(kinds[size_t(place)], rows, dim)));
     return made;
   }
 
@@ -188,7 +192,7 @@ Tensors pointwise(std::string name, int64_t dim, Tensors tensors, Places places,
                   Places wanted) {
   const Call call(name, dim, tensors, places, numbers);
   check_places("wanted", wanted, call.function.results.size());
-  Tensors results = call.allocate(call.function.results, wanted, call.function.of_nodes);
+  Tensors results = call.allocate(call.function.results, wanted);
   const DeviceScope device(call.like);
   dispatch(call.like, "tensors", dim, [&]<class T, int D>() {
     PointwiseArguments<T, D> a;
@@ -204,7 +208,7 @@ Tensors pointwise_backward(std::string name, int64_t dim, Tensors tensors, Place
   const Call call(name, dim, tensors, places, numbers);
   call.check_rows("adjoints", adjoints, adjoint_places, call.function.results);
   const Places at = call.places_of(wanted);
-  Tensors gradients = call.allocate(call.function.arguments, at, false);
+  Tensors gradients = call.allocate(call.function.arguments, at);
   const DeviceScope device(call.like);
   dispatch(call.like, "tensors", dim, [&]<class T, int D>() {
     PointwiseBackwardArguments<T, D> a;
@@ -223,8 +227,8 @@ Tensors pointwise_second(std::string name, int64_t dim, Tensors tensors, Places 
   call.check_rows("adjoints", adjoints, adjoint_places, call.function.results);
   call.check_rows("tangents", tangents, tangent_places, call.function.arguments);
   const Places at = call.places_of(wanted);
-  Tensors gradients = call.allocate(call.function.arguments, at, false);
-  Tensors of_adjoints = call.allocate(call.function.results, adjoint_places, false);
+  Tensors gradients = call.allocate(call.function.arguments, at);
+  Tensors of_adjoints = call.allocate(call.function.results, adjoint_places);
   const DeviceScope device(call.like);
   dispatch(call.like, "tensors", dim, [&]<class T, int D>() {
     PointwiseSecondArguments<T, D> a;
@@ -250,8 +254,7 @@ std::string functions_as_json() {
   std::string text;
   for (const FunctionInfo& f : functions())
     text += (text.empty() ? "[" : ", ") + std::string("{\"name\": \"") + f.name +
-            "\", \"of_nodes\": " + (f.of_nodes ? "true" : "false") +
-            ", \"arguments\": " + entries_as_json(f.arguments) + ", \"results\": " + entries_as_json(f.results) + "}";
+            "\", \"arguments\": " + entries_as_json(f.arguments) + ", \"results\": " + entries_as_json(f.results) + "}";
   return text + "]";
 }
 #endif

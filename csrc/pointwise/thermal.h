@@ -9,7 +9,6 @@ inline namespace TORCH_MPM_ISA {
 // J, F, α, θ, and one to expand or zero to take the expansion off: J and F times (1 + α θ)^D and 1 + α θ, or divided.
 struct ThermalStretch {
   static constexpr const char* name = "thermal_stretch";
-  static constexpr bool of_nodes = false;
   static constexpr Entries arguments[] = {kScalar, kMatrix, kScalar, kScalar, kScalar};
   static constexpr Entries results[] = {kScalar, kMatrix};
 
@@ -31,7 +30,6 @@ struct ThermalStretch {
 // F = J^(1/D) 1, that of F elsewhere.
 struct MeltingParts {
   static constexpr const char* name = "melting_parts";
-  static constexpr bool of_nodes = false;
   static constexpr Entries arguments[] = {kScalar, kMatrix, kScalar, kScalar};
   static constexpr Entries results[] = {kScalar, kMatrix};
 
@@ -53,7 +51,6 @@ struct MeltingParts {
 // is coherent, then τ_liquid.
 struct MeltingStress {
   static constexpr const char* name = "melting_stress";
-  static constexpr bool of_nodes = false;
   static constexpr Entries arguments[] = {kMatrix, kMatrix, kScalar, kScalar};
   static constexpr Entries results[] = {kMatrix};
 

@@ -60,7 +60,8 @@ def test_numbers_stand_for_all_rows(function, device):
         eye = torch.eye(3, dtype=torch.float64, device=device)
         spread = 0.7 * eye if shape == (-1, -1) else given[k].new_tensor(0.7)
         rows = [*given[:k], spread.expand_as(given[k]), *given[k + 1 :]]
-        forms = [0.7] if shape != (0, 0) else [0.7, spread, spread.reshape(1)]
+        forms = [0.7, spread.reshape(1)] if shape == (0, 0) else [0.7]
+        forms.append(rows[k][0])  # one row without its dimension
         for form in forms:
             found = pointwise(function, 3, *given[:k], form, *given[k + 1 :])
             for a, b in zip(found, pointwise(function, 3, *rows), strict=True):
@@ -157,8 +158,8 @@ def test_bad_arguments(device):
         op("no_such", 3, [x], [0], [0.0], [0])
     with pytest.raises(RuntimeError, match=r"dim must be 2 or 3, got 4"):
         op("length", 4, [x], [0], [0.0], [0])
-    with pytest.raises(RuntimeError, match=r"tensors\[0\] must have shape \[4, 3\], got \[4\]"):
-        op("length", 3, [x], [0], [0.0], [0])
+    with pytest.raises(RuntimeError, match=r"tensors\[0\] must have shape \[4, 3\], got \[4, 2\]"):
+        op("length", 3, [torch.ones(4, 2, device=device)], [0], [0.0], [0])
     with pytest.raises(RuntimeError, match=r"numbers must have 2 entries for the function heat_layer, got 1"):
         op("heat_layer", 3, [x], [0], [0.0], [0])
     with pytest.raises(RuntimeError, match=r"places must be different numbers below 2, got \[2\]"):

@@ -204,7 +204,8 @@ class Obstacle(RigidMotion):
         if self.scene is not None and scene is not None:
             present = scene == self.scene
         if isinstance(time, Tensor):
-            now = per_node((time >= self.start) & (time < self.end), 0, scene)
+            begun = time >= self.start
+            now = per_node(begun if self.end == math.inf else begun & (time < self.end), 0, scene)
             present = now if present is None else present & now
         return present
 

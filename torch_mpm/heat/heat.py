@@ -333,7 +333,7 @@ class Heat(nn.Module):
                     self.unsolved = torch.zeros(converged.shape, dtype=torch.int32, device=converged.device)
                     self.residual = torch.zeros(residual.shape, dtype=torch.float64, device=residual.device)
             self.unsolved += ~converged
-            torch.maximum(self.residual, residual.masked_fill(converged, 0), out=self.residual)
+            torch.maximum(self.residual, torch.where(converged, 0, residual), out=self.residual)
 
     def problems(self) -> dict[str, Problem]:
         """What became of the solves so far, by kind as in `Failures`, without synchronising."""

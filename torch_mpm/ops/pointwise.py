@@ -24,12 +24,10 @@ class Function:
 
     Attributes:
         name: as `pointwise` takes it.
-        of_nodes: whether rows are nodes, whose results are stored row by row.
         arguments, results: entries of each in a row, (rows, columns): zero where it has none, -1 for D.
     """
 
     name: str
-    of_nodes: bool
     arguments: tuple[tuple[int, int], ...]
     results: tuple[tuple[int, int], ...]
 
@@ -40,7 +38,7 @@ def _read() -> dict[str, Function]:
     found = {}
     for entry in json.loads(library.torch_mpm_functions()):
         lists = {key: tuple((rows, columns) for rows, columns in entry[key]) for key in ("arguments", "results")}
-        found[entry["name"]] = Function(entry["name"], entry["of_nodes"], **lists)
+        found[entry["name"]] = Function(entry["name"], **lists)
     return found
 
 
@@ -54,9 +52,9 @@ def pointwise(function: str, dim: int, *arguments: Tensor | float, wanted: Seque
     Args:
         function: a name in `FUNCTIONS`, which tells its arguments; what they are stands with the function.
         dim: D.
-        arguments: a tensor with a row for each particle or node; a scalar also as a tensor [] or [1] or a number for
-            all. A number for a vector is each of its entries, for a matrix that many times the identity. All tensors
-            float32, or all float64, and one of them with rows.
+        arguments: a tensor with a row for each particle or node, or without that dimension (of a scalar also [1]) one
+            for all, or a number. A number for a vector is each of its entries, for a matrix that many times the
+            identity. All tensors float32, or all float64, and one of them with rows.
         wanted: numbers of the results to give; None for all.
 
     Differentiable with respect to every tensor, twice.
@@ -74,9 +72,10 @@ def pointwise(function: str, dim: int, *arguments: Tensor | float, wanted: Seque
 # ---- fake kernels
 
 
-def _rows(tensors: Sequence[Tensor]) -> tuple[Any, Tensor]:
+def _rows(info: Function, tensors: Sequence[Tensor], places: Places) -> tuple[Any, Tensor]:
     """Rows of a call, and a tensor that has them."""
-    given = [t for t in tensors if t.dim() > 0]
+    ranks = [sum(size != 0 for size in info.arguments[k]) for k in places]
+    given = [t for t, rank in zip(tensors, ranks, strict=True) if t.dim() == rank + 1]
     torch._check(bool(given), lambda: "one of tensors must have a row for each particle")
     most = given[0]
     for t in given[1:]:
@@ -88,12 +87,9 @@ def _shape(entries: tuple[int, int], rows: Any, dim: int) -> list[Any]:
     return [rows, *(dim if size == -1 else size for size in entries if size != 0)]
 
 
-def _empty(
-    kinds: Sequence[tuple[int, int]], places: Places, tensors: Sequence[Tensor], dim: int, contiguous: bool
-) -> list[Tensor]:
-    rows, like = _rows(tensors)
-    make = like.new_empty if contiguous else (lambda shape: soa_empty(like, shape))
-    return [make(_shape(kinds[k], rows, dim)) for k in places]
+def _empty(kinds: Sequence[tuple[int, int]], places: Places, of: tuple[Any, Tensor], dim: int) -> list[Tensor]:
+    rows, like = of
+    return [soa_empty(like, _shape(kinds[k], rows, dim)) for k in places]
 
 
 @torch.library.register_fake("torch_mpm::pointwise")
@@ -101,7 +97,7 @@ def _pointwise_fake(
     function: str, dim: int, tensors: list[Tensor], places: Places, numbers: list[float], wanted: Places
 ) -> list[Tensor]:
     info = FUNCTIONS[function]
-    return _empty(info.results, wanted, tensors, dim, info.of_nodes)
+    return _empty(info.results, wanted, _rows(info, tensors, places), dim)
 
 
 @torch.library.register_fake("torch_mpm::pointwise_backward")
@@ -115,7 +111,8 @@ def _pointwise_backward_fake(
     adjoint_places: Places,
     wanted: Places,
 ) -> list[Tensor]:
-    return _empty(FUNCTIONS[function].arguments, [places[i] for i in wanted], tensors, dim, False)
+    info = FUNCTIONS[function]
+    return _empty(info.arguments, [places[i] for i in wanted], _rows(info, tensors, places), dim)
 
 
 @torch.library.register_fake("torch_mpm::pointwise_second")
@@ -132,8 +129,9 @@ def _pointwise_second_fake(
     wanted: Places,
 ) -> list[Tensor]:
     info = FUNCTIONS[function]
-    by_arguments = _empty(info.arguments, [places[i] for i in wanted], tensors, dim, False)
-    return by_arguments + _empty(info.results, adjoint_places, tensors, dim, False)
+    rows = _rows(info, tensors, places)
+    by_arguments = _empty(info.arguments, [places[i] for i in wanted], rows, dim)
+    return by_arguments + _empty(info.results, adjoint_places, rows, dim)
 
 
 # ---- autograd

@@ -88,7 +88,8 @@ def length(v: Tensor) -> tuple[Tensor, ...]:
     return (norm(v),)
 
 
-def box_distance(depth: Tensor) -> tuple[Tensor, ...]:
+def box_distance(x: Tensor, size: Tensor) -> tuple[Tensor, ...]:
+    depth = x.abs() - 0.5 * size
     return (norm(depth.clamp_min(0)) + depth.amax(1).clamp_max(0),)
 
 
