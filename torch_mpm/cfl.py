@@ -40,9 +40,11 @@ from torch import Tensor
 from .boundaries import Obstacle
 from .errors import check_number
 from .grid import Grid, check_grid
+from .laws.calls import law_calls, laws_of
+from .laws.compiled import CompiledLaw
 from .laws.custom import as_law
 from .laws.material import Material
-from .ops.survey import Survey, survey
+from .ops.survey import Survey, law_figures, survey
 from .state import State, check_state
 
 GRADIENT_BOUND = {
@@ -110,17 +112,26 @@ def look(
 ) -> Survey:
     """`survey` with what the law says of a state that has all fields; `judge` asks for its energy too."""
     bound = GRADIENT_BOUND[stress_form, grid.kernel] / grid.dx**2
+    stress, stiffness, energy = figures_of(law, state, judge)
     return survey(
         grid,
         state,
-        law.stress(state),
-        law.stiffness(state),
+        stress,
+        stiffness,
         bound,
         kept=2.0 if transfer == "apic" and stress_form == "mls" else 1.0,  # 1 + s
         volumetric="J" in law.state_fields,
         viscosity=law.viscosity(state),
-        energy=law.energy_density(state) if judge else None,
+        energy=energy,
         speed=speed,
         obstacles=obstacles,
         reach=2 * math.sqrt(grid.dim) * grid.dx,  # of a particle's nodes
     )
+
+
+def figures_of(law: Material, state: State, judge: bool) -> tuple[Tensor, Tensor, Tensor | None]:
+    """Stress, stiffness and, with `judge`, energy density of a law."""
+    if all(isinstance(part, CompiledLaw) and part.has_its_figures() for part in laws_of(law)):
+        calls = law_calls(law, state)
+        return law_figures(state, *calls[:4], calls.variables, calls.material, judge)
+    return law.stress(state), law.stiffness(state), law.energy_density(state) if judge else None

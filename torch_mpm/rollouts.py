@@ -20,7 +20,8 @@ from .checkpoints import Checkpoints, as_checkpoints, binomial, fitting, in_segm
 from .errors import check_count, shape_of
 from .gradient_norms import GradientNorms
 from .graphs import CHUNK, LEAST_STEPS, obstacle_to_replays, replayed, time_after
-from .laws import CompiledLaw, Mixture
+from .laws import CompiledLaw
+from .laws.calls import law_calls, laws_of
 from .ops.arguments import split_dt
 from .ops.autograd import dispatch
 from .ops.contact import MAX_OBSTACLES, fusible, obstacle_arguments
@@ -33,7 +34,6 @@ from .state import State, check_state
 from .step import Step
 from .step_cost import state_bytes, step_bytes
 
-LawCall = tuple[CompiledLaw, list[Tensor], list[str]]
 """A law, its parameters, and the names of its history."""
 
 
@@ -163,7 +163,7 @@ def obstacle_to_substeps(step: Step, state: State, dt: float | Tensor) -> str | 
     """Why `substeps` cannot take the steps from a state; None where it can."""
     check_state(state)
     x, law = state.x, step.law
-    laws = list(law.laws) if type(law) is Mixture else [law]
+    laws = laws_of(law)
     if type(step) is not Step:
         return f"{type(step).__name__} may do more than a Step"
     for name, value in (("dt", dt), ("the time of the state", state.time)):
@@ -305,18 +305,15 @@ def _substeps(step: Step, state: State, n: int, dt: float | Tensor, records: boo
     grid, record = step.grid, step._activations
     number, scene_dt, scene_time = _clocks(state, dt, grid.scenes)
     max_blocks = grid.pool(state.x, state.scene)
-    calls = _law_calls(step, state, dt)
+    given: Any = Overlay(state, dt=dt)
+    calls = law_calls(step.law, given)
     apic = step.transfer == "apic"
     with_gradient = wants_gradient(step, state)
     x, v, C, F, J, history, status, impulse, time, _ = dispatch(
         torch.ops.torch_mpm.substeps,
         *(state.x, state.v, state.mass, state.volume, state.C, state.F, state.J),
-        [state.extra[name] for _, _, names in calls for name in names],
-        *(state.scene, state.ids, state.material if len(calls) > 1 else None, record.status),
-        ",".join(law._name(state) for law, _, _ in calls),
-        [law.option_bits() for law, _, _ in calls],
-        [parameter for _, parameters, _ in calls for parameter in parameters],
-        [len(names) for _, _, names in calls],
+        *(calls.history, state.scene, state.ids, calls.material, record.status),
+        *(calls.names, calls.options, calls.parameters, calls.variables),
         *(int(n), number, apic, apic or step.law.viscous, STRESS_FORMS[step.stress_form]),
         _gravity(step, state.x),
         *wall_arguments(step.walls, grid),
@@ -329,18 +326,9 @@ def _substeps(step: Step, state: State, n: int, dt: float | Tensor, records: boo
     grid.watch(status)
     if status.device.type == "cpu":  # where the op has let the pool grow, or stopped
         grid.follow(int(status[0, 0] if grid.grows else status[0, 7]))
-    extra = _history(state, calls, history)
+    extra = _history(state, calls.history_names, history)
     time = time_after(state.time, dt, n) if scene_time is None else time.detach()
     return state.replace(x=x, v=v, C=C, F=F, J=J, extra=extra, time=time, impulse=impulse)
-
-
-def _law_calls(step: Step, state: State, dt: float | Tensor) -> list[LawCall]:
-    law = step.law
-    if isinstance(law, Mixture):
-        law.check_material(state)
-    laws: Any = law.laws if isinstance(law, Mixture) else [law]
-    given: Any = Overlay(state, dt=dt)
-    return [(part, part._arguments(given)[1], part.history_names()) for part in laws]
 
 
 def _gravity(step: Step, x: Tensor) -> Tensor | None:
@@ -348,16 +336,16 @@ def _gravity(step: Step, x: Tensor) -> Tensor | None:
     return None if gravity is None else per_scene(gravity, x, step.grid.scenes, step.grid.dim)
 
 
-def _history(state: State, calls: list[LawCall], columns: Tensor | None) -> dict[str, Tensor]:
+def _history(state: State, names: list[list[str]], columns: Tensor | None) -> dict[str, Tensor]:
     """The history of all laws by name; each particle has that of its law."""
     extra, first = dict(state.extra), 0
-    for number, (_, _, names) in enumerate(calls):
-        for name in names:
+    for number, own_names in enumerate(names):
+        for name in own_names:
             before = extra[name]
             width = 1 if before.dim() == 1 else before.shape[1] ** 2
             assert columns is not None
             value = columns[:, first] if before.dim() == 1 else columns[:, first : first + width].view_as(before)
-            if len(calls) > 1:
+            if len(names) > 1:
                 assert state.material is not None
                 own = (state.material == number).reshape(-1, *(1,) * (before.dim() - 1))
                 value = torch.where(own, value, before)

@@ -224,10 +224,12 @@ class _Calls:
         end = (*self.obstacles, 0.1, 2, 40, True, False, False, impulse, self.dt, self.uniform(2), *self.lattice.packed)
         look = (*fields[:5], self.F, *self.uniform(4, P), self.scene, 50.0, 2.0, True, 0.1, self.lattice.upper, 2)
         call = (*fields, 0.5 + self.uniform(P), [self.uniform(P)], *who, *laws, *how, *end)
+        figures = (self.x, *call[4:7], call[7], self.scene, material, *laws, how[0], how[1], True)
         grads = [self.normal(*t.shape) for t in torch.ops.torch_mpm.substeps(*call)[:6]]
         return [
             ("substeps", call),
             ("substeps_backward", (*grads, torch.ones_like(impulse), 15, None, *call)),
+            ("law_figures", figures),
             ("survey", (*look, *self.obstacles, self.uniform(2), 0.1, *self.lattice.packed)),
         ]
 

@@ -7,6 +7,7 @@ import torch
 
 import torch_mpm as mpm
 from tests.helpers import TOLERANCE
+from torch_mpm.cfl import figures_of
 from torch_mpm.ops import survey
 from torch_mpm.reference import cfl as reference
 
@@ -138,3 +139,66 @@ def test_op_is_well_formed(device):
         *(obstacle, state.x.new_zeros(0), [1], [0], [1], [-1], [0.0], [1.0], None, 0.5, *box.packed),
     )
     torch.library.opcheck(torch.ops.torch_mpm.survey, arguments)
+
+
+LAWS = {
+    "neo_hookean": lambda: mpm.NeoHookean(E=2e4, nu=0.3),
+    "sand": lambda: mpm.QuarticSand(E=1e5, nu=0.25, friction_angle=0.5),
+    "hardening": lambda: mpm.QuarticSand(E=1e5, nu=0.25, hardening=(0.6, 0.1, 10.0, 0.2)),
+    "von_mises": lambda: mpm.VonMises(E=1e5, nu=0.3, yield_stress=2e3, hardening=1e4),
+    "snow": lambda: mpm.Snow(E=1e5, nu=0.2),
+    "fluid": lambda: mpm.WeaklyCompressible(bulk_modulus=1e4, viscosity=2.0),
+    "temperature": lambda: mpm.NeoHookean(E=mpm.Table([0.0, 1.0], [1e4, 2e4]), nu=0.3),
+}
+
+
+def deformed(law, dim, device, dtype, scenes=3):
+    """Particles of which some flow, and some have turned inside out."""
+    given = particles(dim, scenes, device, dtype)["state"]
+    random = torch.Generator().manual_seed(2)
+    F = torch.eye(dim, dtype=F64) + 0.15 * torch.randn(len(given), dim, dim, generator=random, dtype=F64)
+    F[7] *= -1 if dim == 3 else torch.tensor([1.0, -1.0])
+    theta = torch.rand(len(given), generator=random, dtype=F64)
+    state = given.replace(F=F.to(device, dtype), J=F.det().to(device, dtype), temperature=theta.to(device, dtype))
+    return state.replace(extra={name: law.initial(name, state) + 0.01 for name in law.extra_fields})
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, F64])
+@pytest.mark.parametrize("name", LAWS)
+def test_figures_of_a_law(name, dim, dtype, device):
+    """All at once are those of the law's own functions, also of what flows, is inside out or has functions."""
+    law = LAWS[name]()
+    state = deformed(law, dim, device, dtype)
+    with torch.no_grad():
+        stress, stiffness, energy = figures_of(law, state, True)
+        assert torch.equal(stress, law.stress(state))
+        assert torch.equal(stiffness, law.stiffness(state))
+        assert torch.equal(energy, law.energy_density(state))
+        assert figures_of(law, state, False)[2] is None
+    assert not bool(energy.isfinite().all())
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, F64])
+def test_figures_of_a_mixture(dim, dtype, device):
+    laws = [LAWS[name]() for name in ("neo_hookean", "von_mises", "fluid", "snow")]
+    law = mpm.Mixture(laws)
+    state = deformed(law, dim, device, dtype)
+    state = state.replace(material=(torch.arange(len(state), device=device) % 4).int())
+    with torch.no_grad():
+        found = figures_of(law, state, True)
+        for k, part in enumerate(laws):
+            of = state.material == k
+            expected = part.stress(state), part.stiffness(state), part.energy_density(state)
+            assert all(torch.equal(a[of], b[of]) for a, b in zip(found, expected, strict=True))
+
+
+def test_figures_of_what_a_law_adds(device):
+    """A law that changes its stress is asked itself."""
+
+    class Harder(mpm.NeoHookean):
+        def stiffness(self, state):
+            return 2 * super().stiffness(state)
+
+    state = deformed(LAWS["neo_hookean"](), 3, device, F64)
+    once, twice = (figures_of(law(E=2e4, nu=0.3), state, False)[1] for law in (mpm.NeoHookean, Harder))
+    assert torch.equal(2 * once, twice)

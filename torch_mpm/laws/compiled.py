@@ -39,6 +39,9 @@ if TYPE_CHECKING:
     from ..state import State
 
 
+FIGURES = ("stress", "stiffness", "energy_density")
+
+
 class CompiledLaw(Material):
     """A law of csrc/laws; subclasses say which, and convert their arguments to its parameters.
 
@@ -188,6 +191,14 @@ class CompiledLaw(Material):
 
     def is_all_of_its_update(self) -> bool:
         """Whether `update` does what the compiled law does and nothing else, so that a kernel may take its place."""
+        return self._has_its_update()
+
+    def has_its_figures(self) -> bool:
+        """Whether stress, stiffness and energy are those of the compiled law alone, which one op gives at once."""
+        own = (getattr(type(self), name) is getattr(CompiledLaw, name) for name in FIGURES)
+        return self._has_its_update() and all(own)
+
+    def _has_its_update(self) -> bool:
         return type(self).update is CompiledLaw.update
 
     @property

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import torch
 from torch import Tensor
 
-from .arguments import refuse_vmap
-from .autograd import register_autograd
+from .arguments import refuse_vmap, sizes, soa_empty
+from .autograd import dispatch, register_autograd
 from .contact import obstacle_arguments, time_arguments
 
 if TYPE_CHECKING:
@@ -71,15 +71,54 @@ def survey(
     return Survey(*result.unbind(1))
 
 
+def law_figures(
+    state: State,
+    names: str,
+    options: Sequence[int],
+    parameters: Sequence[Tensor],
+    history: Sequence[Tensor],
+    variables: Sequence[int],
+    material: Tensor | None,
+    energy: bool,
+) -> tuple[Tensor, Tensor, Tensor | None]:
+    """What a survey asks of compiled laws, of all in one call; not differentiable.
+
+    Args:
+        state: the particles, with the fields that the laws read.
+        names, options, parameters, history, variables, material: `torch_mpm.laws.calls.LawCalls`. A particle of none of
+            the laws has zeros.
+        energy: whether the energy is asked for, of the state after the return map.
+
+    Returns:
+        Kirchhoff stress [P, D, D], stiffness [P], energy density [P] or None [Pa].
+
+    Raises:
+        RuntimeError: for an unknown law, wrong shapes, dtypes or devices.
+    """
+    fields = state.x, state.C, state.F, state.J, history, state.scene, material
+    stress, stiffness, density = dispatch(
+        torch.ops.torch_mpm.law_figures, *fields, names, options, parameters, variables, energy
+    )
+    return stress, stiffness, density if energy else None
+
+
+@torch.library.register_fake("torch_mpm::law_figures")
+def _law_figures_fake(x: Tensor, *arguments: Any) -> tuple[Tensor, Tensor, Tensor | None]:
+    P, D = sizes(x, "x", 2)
+    energy = soa_empty(x, (P,)) if arguments[-1] else None
+    return soa_empty(x, (P, D, D)), soa_empty(x, (P,)), energy
+
+
 @torch.library.register_fake("torch_mpm::survey")
 def _fake(x: Tensor, *arguments) -> Tensor:
     scenes = arguments[15]
     return x.new_empty((scenes, 3), dtype=torch.float64)
 
 
-def _no_backward(ctx: Any, grad: Tensor) -> None:
+def _no_backward(ctx: Any, *grads: Tensor) -> None:
     raise NotImplementedError("what a survey finds is not differentiable: take it under torch.no_grad()")
 
 
-register_autograd("survey", _no_backward)
-refuse_vmap("survey")
+for _name in ("survey", "law_figures"):
+    register_autograd(_name, _no_backward)
+    refuse_vmap(_name)

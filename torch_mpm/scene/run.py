@@ -33,7 +33,7 @@ from .writer import FrameWriter
 
 SEGMENT = 32
 """Substeps between two looks at the stability limit and the validity of the state, and between two reorderings."""
-LONGEST_SEGMENT = {"cpu": SEGMENT, "cuda": 256}
+LONGEST_SEGMENT = {"cpu": SEGMENT, "cuda": 512}
 """While the limit is steady: a GPU waits for each look."""
 STEADY = 1.02
 """The limit is, where it has become smaller by no larger factor over a segment."""

@@ -1,0 +1,99 @@
+#include "rollout/substeps.h"
+
+// What a survey asks of the laws: stress, tangent modulus and energy of all particles, each by its own law.
+namespace mpm {
+namespace {
+
+struct FiguresInputs {
+  Tensor x;
+  OptionalTensor C, F, J;
+  OptionalTensor scene, material;
+};
+
+struct Figures {
+  Tensor stress, stiffness, energy;  // energy where it is wanted
+};
+
+template <class T, int D>
+LawArguments<T, D> law_arguments(const FiguresInputs& in, const LawCall& call, int number) {
+  const LawInfo& info = call.law->info;
+  const bool gradient = info.field == Deformation::gradient;
+  const OptionalTensor& state = gradient ? in.F : in.J;
+  STD_TORCH_CHECK(has(state), "the law ", info.name, " needs ", gradient ? "F" : "J");
+  const OptionalTensor C = info.viscous ? in.C : OptionalTensor{};
+  auto a = arguments<T, D>(info, *state, C, call.parameters, call.history, in.scene, call.options);
+  if (has(in.material)) a.members = {static_cast<const int*>(in.material->data_ptr()), in.material->stride(0), number};
+  return a;
+}
+
+template <class T, int D>
+void scalar_of(const LawKernels<T, D>& kernels, const LawArguments<T, D>& law, LawScalar which, Tensor& value,
+               backend::Stream stream) {
+  kernels.scalar({law, which, field<T>(value)}, stream);
+}
+
+template <class T, int D>
+void figures_of(const FiguresInputs& in, const LawCall& call, int number, Figures& out, backend::Stream stream) {
+  const LawKernels<T, D>& kernels = kernels_of<T, D>(*call.law);
+  LawUpdateArguments<T, D> a;
+  a.law = law_arguments<T, D>(in, call, number);
+  a.stress = field<T>(out.stress);
+  Tensor mapped, moved;  // deformation and history after the return map
+  if (call.law->info.plastic) a.state = field<T>(mapped = empty_particles(in.x, {in.x.size(0), D, D}));
+  const int64_t columns = history_size(call.law->info, call.history, D);
+  if (columns > 0) a.history = field<T>(moved = empty_particles(in.x, {in.x.size(0), columns}));
+  kernels.update(a, stream);
+  scalar_of(kernels, a.law, LawScalar::stiffness, out.stiffness, stream);
+  if (!out.energy.defined()) return;
+  if (mapped.defined()) a.law.state = field<const T>(mapped);
+  int64_t column = 0;
+  for (size_t k = 0; k < call.history.size(); k++) {
+    const bool matrix = call.law->info.history[k].matrix;
+    a.law.history[k] = constant(variable<T, D>(a.history, column, matrix));
+    column += matrix ? D * D : 1;
+  }
+  scalar_of(kernels, a.law, LawScalar::energy, out.energy, stream);
+}
+
+std::tuple<Tensor, Tensor, Tensor> law_figures(const Tensor& x, const OptionalTensor& C, const OptionalTensor& F,
+                                               const OptionalTensor& J, const Tensors& history,
+                                               const OptionalTensor& scene, const OptionalTensor& material,
+                                               std::string laws, std::vector<int64_t> options,
+                                               const Tensors& parameters, std::vector<int64_t> variables, bool energy) {
+  check_positions(x);
+  const int64_t P = x.size(0), D = x.size(1);
+  const std::vector<LawCall> calls = law_calls(laws, options, parameters, history, variables, D);
+  STD_TORCH_CHECK(calls.size() == 1 || has(material), "particles of ", calls.size(), " laws need a material");
+  if (has(material)) {
+    check_shape(*material, "material", {P});
+    check_type(*material, "material", ScalarType::Int, x);
+  }
+  const FiguresInputs in{x, C, F, J, scene, material};
+  Figures out{empty_particles(x, {P, D, D}), empty_particles(x, {P}), energy ? empty_particles(x, {P}) : Tensor()};
+  const DeviceScope device(x);
+  if (has(material)) {  // of no law
+    for (Tensor* t : {&out.stress, &out.stiffness, &out.energy})
+      if (t->defined()) torch::stable::zero_(*t);
+  }
+  dispatch(x, [&]<class T, int Dim>() {
+    input<T>(C, "C", x, {P, Dim, Dim});  // also where no law reads it
+    input<T>(F, "F", x, {P, Dim, Dim});
+    input<T>(J, "J", x, {P});
+    for (size_t k = 0; k < calls.size(); k++) figures_of<T, Dim>(in, calls[k], int(k), out, device.stream());
+  });
+  return {out.stress, out.stiffness, out.energy};
+}
+
+}  // namespace
+}  // namespace mpm
+
+#if MPM_BACKEND == MPM_BACKEND_IS_cpu
+STABLE_TORCH_LIBRARY_FRAGMENT(torch_mpm, m) {
+  m.def(
+      "law_figures(Tensor x, Tensor? C, Tensor? F, Tensor? J, Tensor[] history, Tensor? scene, Tensor? material, "
+      "str laws, int[] options, Tensor[] parameters, int[] variables, bool energy) -> (Tensor stress, "
+      "Tensor stiffness, Tensor energy)");
+}
+#endif
+
+MPM_LIBRARY_IMPL(m) { m.impl("law_figures", TORCH_BOX(&mpm::law_figures)); }
