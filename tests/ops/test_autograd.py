@@ -13,6 +13,7 @@ from torch.utils.checkpoint import checkpoint
 
 import torch_mpm as mpm
 from torch_mpm import ops
+from torch_mpm.ops.pointwise import pointwise
 
 # ---- what is differentiated
 
@@ -113,6 +114,11 @@ def heat_case(name, device):
     blocks = p.blocks()
     heat_capacity = ops.scatter(blocks, p.x, p.mass[:, None])[:, 0].detach()
     theta = torch.randn(heat_capacity.shape, generator=torch.Generator().manual_seed(2), dtype=torch.float64).to(device)
+    if name == "pointwise":
+        given = [p.mass, p.volume, theta[:30], p.x[:, 0] ** 2, 1 + p.v[:, 0] ** 2, number(0.3, device)]
+        return Case(
+            lambda *t: tuple(pointwise("heat_radiation", 2, *t[:5]) + pointwise("heat_layer", 2, *t[4:])), given
+        )
     if name == "heat_operator":
         return Case(lambda x, k, u: (ops.heat_operator(blocks, x, k, u),), [p.x, p.volume, theta])
     method = {"heat_cg": "cg", "heat_multigrid": "multigrid"}[name]
@@ -161,13 +167,13 @@ TRANSFER_OPS = (
     *("p2g", "g2p", "scatter", "gather", "advance", "g2p_advance", "grid_update", "contact", "sdf"),
     *("wall_impulses", "contact_impulses"),
 )
-HEAT_OPS = ("heat_operator", "heat_cg", "heat_multigrid")
+HEAT_OPS = ("pointwise", "heat_operator", "heat_cg", "heat_multigrid")
 LAW_OPS = (
     *("svd3", "polar", "law_update", "law_energy", "plastic law_update", "principal law_energy"),
     *("quartic_energy", "quartic_stress", "quartic_return_map"),
 )
 NO_GRADIENT = {
-    "survey",
+    *("survey", "law_figures", "pointwise_second"),
     *("law_stiffness", "law_wave_modulus", "law_update_double_backward", "law_energy_double_backward"),
     *("heat_stencil", "heat_patches"),
     *("law_tangent", "implicit_apply", "implicit_node_blocks", "implicit_cg"),  # they refuse: see the adjoint of a step
