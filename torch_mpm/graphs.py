@@ -6,6 +6,7 @@ import collections
 import contextlib
 import math
 import threading
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -167,9 +168,7 @@ class _Replays:
         try:
             before, after = _tensors(self.state), _tensors(step(self.state, dt))
             changed = [name for name, value in after.items() if value is not before[name]]
-            for dtype in {before[name].dtype for name in changed}:  # of one, they are copied at once
-                alike = [name for name in changed if before[name].dtype == dtype]
-                torch._foreach_copy_([before[name] for name in alike], [after[name] for name in alike])
+            _copy_all([before[name] for name in changed], [after[name] for name in changed])
         except BaseException:
             with contextlib.suppress(RuntimeError):  # the capture has failed, as what is raised says
                 self._graph.capture_end()
@@ -179,6 +178,13 @@ class _Replays:
     def replay(self, times: int) -> None:
         for _ in range(times):
             self._graph.replay()
+
+
+def _copy_all(to: Sequence[Tensor], of: Sequence[Tensor]) -> None:
+    """Copy tensors, those of one dtype in one kernel."""
+    for dtype in {t.dtype for t in to}:
+        alike = [k for k, t in enumerate(to) if t.dtype == dtype]
+        torch._foreach_copy_([to[k] for k in alike], [of[k] for k in alike])
 
 
 def _copied(t: Tensor) -> Tensor:
@@ -215,22 +221,31 @@ class Captured:
 
     def __init__(self, step: nn.Module, state: State, dt: float, n: int) -> None:
         self._steps = _Steps(step, state, dt, n)
-        inputs = self._steps.inputs(state)
+        inputs = self._steps.inputs(self._steps.prepared(state))
         self._given = {name: _kind(t) for name, t in inputs.items()}
-        samples = tuple(_copied(t.detach()).requires_grad_(t.requires_grad) for t in inputs.values())
-        self._call: Any = torch.cuda.make_graphed_callables(self._steps, samples, allow_unused_input=True)
+        self._read = tuple(_copied(t.detach()).requires_grad_(t.requires_grad) for t in inputs.values())
+        self._call: Any = torch.cuda.make_graphed_callables(self._steps, self._read, allow_unused_input=True)
 
     def __call__(self, state: State) -> State:
-        inputs = self._steps.inputs(state)
+        prepared = self._steps.prepared(state)
+        inputs = self._steps.inputs(prepared)
         kinds = {name: _kind(t) for name, t in inputs.items()}
         if kinds != self._given:
             expected, came = ("; ".join(f"{name} {kind}" for name, kind in k.items()) for k in (self._given, kinds))
             raise ValueError(f"state must be as it was captured, {expected}; got {came}")
-        outputs = self._call(*(_OwnGradient.apply(inputs[name]) for name in self._given))
+        given, differentiable = [inputs[name] for name in self._given], torch.is_grad_enabled()
+        with torch.no_grad():
+            _copy_all(self._read, given)
+        outputs = self._call(
+            *(
+                _OwnGradient.apply(t, (read,)) if differentiable and t.requires_grad else read
+                for t, read in zip(given, self._read, strict=True)
+            )
+        )
         results: dict[str, Any] = {name: t.clone() for name, t in zip(self._steps.changed, outputs, strict=True)}
         if not isinstance(state.time, Tensor):
             results["time"] = time_after(state.time, self._steps.dt, self._steps.n)
-        return _with(self._steps.prepared(state), results | dict.fromkeys(self._steps.dropped))
+        return _with(prepared, results | dict.fromkeys(self._steps.dropped))
 
 
 def _kind(t: Tensor) -> str:
@@ -238,16 +253,17 @@ def _kind(t: Tensor) -> str:
 
 
 class _OwnGradient(torch.autograd.Function):
-    """A tensor whose gradient is a copy: that of a graph is overwritten by its next replay."""
+    """What a graph reads in the place of a tensor. Its gradient is a copy: that of the graph is overwritten by the next
+    replay."""
 
     @staticmethod
-    def forward(ctx: Any, t: Tensor) -> Tensor:
+    def forward(ctx: Any, t: Tensor, read: tuple[Tensor]) -> Tensor:
         ctx.set_materialize_grads(False)
-        return t.view_as(t)
+        return read[0].detach()
 
     @staticmethod
     def backward(ctx: Any, *grads: Any) -> Any:
-        return None if grads[0] is None else grads[0].clone()
+        return None if grads[0] is None else grads[0].clone(), None
 
 
 class _Steps:
@@ -258,7 +274,7 @@ class _Steps:
         self.changed: list[str] = []
         self.dropped: list[str] = []
         self._like = self.prepared(state)
-        self._names = list(self.inputs(state))
+        self._names = list(self.inputs(self._like))
 
     def prepared(self, state: State) -> State:
         """With the fields that steps need, and its time as a tensor."""
@@ -266,9 +282,10 @@ class _Steps:
         state = state if prepare is None else prepare(state)
         return state.replace(time=_time_tensor(state))
 
-    def inputs(self, state: State) -> dict[str, Tensor]:
+    def inputs(self, prepared: State) -> dict[str, Tensor]:
+        """Of a prepared state and the step."""
         named = (*self.step.named_parameters(), *self.step.named_buffers())
-        return _tensors(self.prepared(state)) | {f"step.{name}": t for name, t in named if t.requires_grad}
+        return _tensors(prepared) | {f"step.{name}": t for name, t in named if t.requires_grad}
 
     def __call__(self, *tensors: Tensor) -> tuple[Tensor, ...]:
         given = dict(zip(self._names, tensors, strict=True))
