@@ -1,5 +1,6 @@
 """Shapes: distance, normal, volume, bounds and mesh of one against each other, and against brute force."""
 
+import math
 import textwrap
 
 import numpy as np
@@ -149,3 +150,19 @@ def test_messages():
         shapes.Cylinder((0.0, 1.0), 0.1)
     with pytest.raises(ValueError, match="radius must be positive, got 0"):
         shapes.Cylinder((0.0, 1.0, 0.0), 0.0)
+
+
+def test_gradient_of_the_distance_from_a_box(device):
+    """On a face it is the normal, also where the distance alone is asked for; a pose that is NaN touches nothing."""
+    box = shapes.Box((1.0, 1.0))
+    x = torch.tensor([[0.5, 0.1]], dtype=torch.float64, device=device).requires_grad_()
+    (gradient,) = torch.autograd.grad(box.signed_distance(x).sum(), x)
+    assert gradient.tolist() == [[1.0, 0.0]]
+    hessian = torch.func.hessian(lambda p: box.signed_distance(p[None])[0])(x.detach()[0] + 0.3)
+    assert bool(hessian.isfinite().all())
+    found = box.signed_distance(torch.tensor([[0.5, math.nan]], device=device))
+    assert bool(found.isnan().all())
+    apart = torch.rand(50, 3, dtype=torch.float64, device=device) * 3 - 1.5
+    solid = shapes.Box((1.0, 0.6, 1.4))
+    with_graph = solid.signed_distance(apart.clone().requires_grad_()).detach()
+    assert torch.allclose(solid.signed_distance(apart), with_graph, rtol=0, atol=1e-15)

@@ -40,6 +40,11 @@ def outside_transforms() -> contextlib.AbstractContextManager[Any]:
     return torch._C._DisableFuncTorch() if active else contextlib.nullcontext()
 
 
+def version(t: Tensor) -> int | None:
+    """Of the values of a tensor, which count what is written to it; None for those that do not."""
+    return None if t.is_inference() else t._version
+
+
 def remember(kept: list[Any], value: Any) -> None:
     """Keep a value, by identity, that a graph reads or writes."""
     if not any(value is known for known in kept):

@@ -131,7 +131,8 @@ def look(
 
 def figures_of(law: Material, state: State, judge: bool) -> tuple[Tensor, Tensor, Tensor | None]:
     """Stress, stiffness and, with `judge`, energy density of a law."""
-    if all(isinstance(part, CompiledLaw) and part.has_its_figures() for part in laws_of(law)):
+    if all(isinstance(part, CompiledLaw) and part.figures_are_compiled() for part in laws_of(law)):
         calls = law_calls(law, state)
-        return law_figures(state, *calls[:4], calls.variables, calls.material, judge)
+        how = calls.names, calls.options, calls.parameters, calls.history, calls.variables
+        return law_figures(state, *how, calls.material, judge)
     return law.stress(state), law.stiffness(state), law.energy_density(state) if judge else None

@@ -8,10 +8,9 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor, nn
 
-from .capture import GraphCache
+from .capture import GraphCache, is_traced, version
 from .errors import check_numbers, check_real, shape_of
 from .ops.arguments import per_parameter
-from .ops.pointwise import pointwise
 
 if TYPE_CHECKING:
     from .state import State
@@ -64,24 +63,25 @@ class Table(nn.Module):
 
     def forward(self, temperature: Tensor) -> Tensor:
         """Values at temperatures of any shape."""
-        at = temperature.reshape(-1)
-        knots, values = self._like(at)
+        knots, widths, values = self._like(temperature)
         left: Tensor | int = 0  # the only interval of two knots
         if len(knots) > 2:
-            left = torch.bucketize(at.detach().contiguous(), knots[1:-1].contiguous())
-        ends = knots[left], knots[left + 1], values[left], values[left + 1]
-        return pointwise("interpolated", 3, at, *ends)[0].reshape(temperature.shape)
+            left = torch.bucketize(temperature.detach().contiguous(), knots[1:-1].contiguous())
+        share = ((temperature - knots[left]) / widths[left]).clamp(0, 1)
+        return torch.lerp(values[left], values[left + 1], share)
 
-    def _like(self, temperature: Tensor) -> tuple[Tensor, Tensor]:
-        """Knots and values in the dtype and on the device of temperatures, kept from call to call."""
+    def _like(self, temperature: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Knots, the widths between them and values in the dtype and on the device of temperatures, kept from call to
+        call."""
         own = self.temperature, self.value
 
-        def make() -> tuple[Tensor, Tensor]:
-            return own[0].to(temperature), own[1].to(temperature)
+        def make() -> tuple[Tensor, Tensor, Tensor]:
+            knots = own[0].to(temperature)
+            return knots, knots.diff(), own[1].to(temperature)
 
-        if torch.compiler.is_compiling() or own[1].requires_grad:
+        if is_traced(temperature) or own[1].requires_grad:
             return make()
-        key = *own, own[0]._version, own[1]._version, temperature.dtype, temperature.device
+        key = *own, *map(version, own), temperature.dtype, temperature.device
         return self._kept.get(key, make, temperature)
 
 
@@ -138,10 +138,10 @@ def evaluate(name: str, value: Value, state: State) -> float | Tensor:
             raise ValueError(
                 f"{name} as a function of temperature must return shape [P] = [{P}], got {shape_of(result)}"
             )
-        return result
+        return result.to(state.x.dtype)
     value = value.to(state.x.dtype)
     if value.numel() == 1:
-        return value.reshape(())
+        return value.reshape(()).to(state.x.device)
     if value.device != state.x.device:
         raise ValueError(f"{name} must be on the device of x, {state.x.device}, got {value.device}")
     particles = getattr(state, "particles", P)

@@ -34,8 +34,6 @@ from .state import State, check_state
 from .step import Step
 from .step_cost import state_bytes, step_bytes
 
-"""A law, its parameters, and the names of its history."""
-
 
 def rollout(
     step: Callable[[State, float | Tensor], State],

@@ -33,7 +33,7 @@ from torch import Tensor
 from . import surface_mesh
 from .errors import check_number, check_vector, shape_of
 from .ops.autograd import graph_at_once
-from .ops.pointwise import pointwise
+from .ops.pointwise import fuses, pointwise
 from .per_scene import SceneParameters, Value, constant, direction, extent, floats
 from .surface_mesh import Array, SurfaceMesh
 from .vectors import norm, unit
@@ -168,8 +168,11 @@ class Box(Shape):
         return self.signed_distance(x, scene), nearest * torch.where(x < 0, -1, 1).to(x.dtype)
 
     def signed_distance(self, x: Tensor, scene: Tensor | None = None) -> Tensor:
-        (distance,) = pointwise("box_distance", x.shape[1], x, self.at_nodes("size", x, x.shape[1:], scene))
-        return distance
+        size = self.at_nodes("size", x, x.shape[1:], scene)
+        if fuses(x, size):
+            return pointwise("box_distance", x.shape[1], x, size)[0]
+        depth = self._depth(x, scene)
+        return norm(depth.clamp_min(0)) + depth.amax(1).clamp_max(0)
 
     def contains(self, x: Tensor) -> Tensor:
         return (self._depth(x, None) <= 0).all(1)

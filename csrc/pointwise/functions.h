@@ -8,10 +8,9 @@
 namespace mpm {
 inline namespace TORCH_MPM_ISA {
 
-using PointwiseFunctions =
-    std::tuple<HeatWeights, HeatMoments<1>, HeatMoments<2>, HeatMeans<1>, HeatMeans<2>, HeatUpdate<1>, HeatUpdate<2>,
-               HeatMelt, HeatLayer, HeatExchange, HeatRadiation, SurfaceNormals, Length, BoxDistance, Interpolated,
-               ThermalStretch, MeltingParts, MeltingStress>;
+using PointwiseFunctions = std::tuple<HeatWeights, HeatMoments<1>, HeatMoments<2>, HeatMeans<1>, HeatMeans<2>,
+                                      HeatUpdate<1>, HeatUpdate<2>, HeatMelt, HeatLayer, HeatExchange, HeatRadiation,
+                                      SurfaceNormals, Length, BoxDistance, ThermalStretch, MeltingParts, MeltingStress>;
 
 // f.operator()<Function>() of function number k.
 template <int First = 0, class F>

@@ -18,15 +18,6 @@ MPM_HD T safe_root(const T& squared) {
   return select(positive, sqrt(select(positive, squared, T(1))), T(0));
 }
 
-template <class T, int D>
-MPM_HD T determinant_of(const Matrix<T, D>& F) {
-  if constexpr (D == 2)
-    return F[0][0] * F[1][1] - F[0][1] * F[1][0];
-  else
-    return F[0][0] * (F[1][1] * F[2][2] - F[1][2] * F[2][1]) - F[0][1] * (F[1][0] * F[2][2] - F[1][2] * F[2][0]) +
-           F[0][2] * (F[1][0] * F[2][1] - F[1][1] * F[2][0]);
-}
-
 // Rest volume, J, F (either is the number one where the other tells the volume), C, κ, mass, dt, ∇v, dx to the present
 // volume V, heat capacity m C, conductance κ V, and the blend β = min(1, 4 r + dt |sym ∇v|) with the diffusion number
 // r. Where matter is strained, the gradient of the particle is forgotten for that of the grid.
@@ -39,7 +30,7 @@ struct HeatWeights {
   template <class T, int D>
   MPM_HD static void evaluate(Reader<T, D>& in, Writer<T, D>& out) {
     const T rest = in.scalar(), J = in.scalar();
-    const T volume = rest * J * determinant_of(in.matrix());
+    const T volume = rest * J * determinant(in.matrix());
     const T specific_heat = in.scalar(), given = in.scalar(), mass = in.scalar(), dt = in.scalar();
     const Matrix<T, D> L = in.matrix();
     const T dx = in.scalar();
@@ -246,7 +237,8 @@ struct Length {
   }
 };
 
-// Position in the frame of a box around the origin, and its edge lengths: distance from its surface, negative inside.
+// Position in the frame of a box around the origin, and its edge lengths: distance from its surface, negative inside,
+// NaN where a coordinate is. Its derivatives are not those of `Box.signed_distance` at ties and on the faces.
 struct BoxDistance {
   static constexpr const char* name = "box_distance";
   static constexpr Entries arguments[] = {kVector, kVector};
@@ -255,28 +247,15 @@ struct BoxDistance {
   template <class T, int D>
   MPM_HD static void evaluate(Reader<T, D>& in, Writer<T, D>& out) {
     const Vector<T, D> x = in.vector(), size = in.vector();
-    T squared = T(0), most = T(0);
+    T squared = T(0), most = T(0), sum = T(0);
     MPM_UNROLL for (int i = 0; i < D; i++) {
       const T depth = abs(x[i]) - T(0.5) * size[i];  // behind the faces of the axis, negative inside
       const T outside = select(depth > T(0), depth, T(0));
       squared = squared + outside * outside;
       most = i == 0 ? depth : select(depth > most, depth, most);
+      sum = sum + depth;
     }
-    out.put(safe_root(squared) + select(most < T(0), most, T(0)));
-  }
-};
-
-// Temperature, two knots and their values: linear between the knots, constant beyond.
-struct Interpolated {
-  static constexpr const char* name = "interpolated";
-  static constexpr Entries arguments[] = {kScalar, kScalar, kScalar, kScalar, kScalar};
-  static constexpr Entries results[] = {kScalar};
-
-  template <class T, int D>
-  MPM_HD static void evaluate(Reader<T, D>& in, Writer<T, D>& out) {
-    const T at = in.scalar(), low = in.scalar(), high = in.scalar(), first = in.scalar(), last = in.scalar();
-    const T share = clamp_to_unit((at - low) / (high - low)), rise = last - first;
-    out.put(select(share < T(0.5), first + share * rise, last - (T(1) - share) * rise));
+    out.put(select(sum == sum, safe_root(squared) + select(most < T(0), most, T(0)), sum));
   }
 };
 

@@ -26,6 +26,14 @@ struct ThermalStretch {
   }
 };
 
+// J^(1/D) for J > 0: of large and small J by the exponential of what is positive, which loses no digits.
+template <int D, class T>
+MPM_HD T root_of_volume(const T& J) {
+  if constexpr (D == 2) return sqrt(J);
+  const T power = log_1p(J, J - T(1)) * T(1.0 / 3), large = T(1) + expm1(abs(power));
+  return select(power < T(0), T(1) / large, large);
+}
+
 // J, F, liquid fraction and coherency: J and F of one volume, that of J where the particle flows and forgets its shear,
 // F = J^(1/D) 1, that of F elsewhere.
 struct MeltingParts {
@@ -40,8 +48,8 @@ struct MeltingParts {
     const T fraction = in.scalar();
     const auto flows = fraction >= in.scalar();
     const T safe = select(flows, select(J > T(0), J, T(1)), T(1));
-    const T root = T(1) + expm1(log_1p(safe, safe - T(1)) * T(1.0 / D));
-    out.put(select(flows, J, determinant_of(F)));
+    const T root = root_of_volume<D>(safe);
+    out.put(select(flows, J, determinant(F)));
     MPM_UNROLL for (int i = 0; i < D; i++) MPM_UNROLL
       for (int j = 0; j < D; j++) out.put(select(flows, i == j ? root : T(0), F[i][j]));
   }

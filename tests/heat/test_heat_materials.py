@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 from helpers import relative_error
+from test_heat import FLOAT, block, grid_around
 
 import torch_mpm as mpm
 from torch_mpm.parameters import evaluate
@@ -255,3 +256,31 @@ def test_bad_melting():
     state.F[1] = torch.diag(torch.tensor([-1.0, 1.0]))
     state.J[5] = -1
     assert mpm.Melting(solid, liquid).invalid(state).tolist() == [False, True, False, False, False, True, False]
+
+
+def test_functions_of_another_dtype(device):
+    """A function of the temperature may return integers or float32."""
+    state, grid = block(2, device=device), grid_around(2)
+    state = state.replace(temperature=torch.linspace(0, 1, len(state), dtype=FLOAT, device=device))
+
+    def steps(high, low, dtype):
+        specific_heat = lambda t: torch.where(t > 0.5, high, low).to(dtype)  # noqa: E731
+        heat = mpm.Heat(grid, lambda t: 1 + 0 * t.float(), specific_heat)
+        return heat(state, 0.01).temperature
+
+    assert torch.equal(steps(4, 2, torch.int64), steps(4.0, 2.0, torch.float64))
+
+
+def test_table_in_inference_mode():
+    with torch.inference_mode():
+        table = mpm.Table([0.0, 1.0], [1.0, 3.0])
+        assert float(table(torch.tensor([0.5]))) == 2.0
+    assert float(table(torch.tensor([0.25]))) == 1.5
+
+
+def test_table_as_a_path():
+    """Tables have forward mode, which the velocity of an obstacle on a path takes."""
+    table = mpm.Table([0.0, 1.0, 2.0], [0.0, 2.0, 2.0])
+    ball = mpm.Sphere(lambda t: torch.stack([table(t), 0 * t]), 0.1)
+    still = ball.velocity_at(torch.zeros(1, 2, dtype=torch.float64), None, 0.5)
+    assert still.reshape(-1).tolist() == [2.0, 0.0]

@@ -1,5 +1,7 @@
 """Functions of a row: their values and derivatives against plain torch, in all forms of their arguments."""
 
+import math
+
 import pytest
 import torch
 
@@ -20,8 +22,6 @@ def arguments(function, dim, device, dtype=torch.float64, rows=ROWS, seed=0):
         if shape == (-1, -1):
             value = 0.4 * (value - 0.7) + torch.eye(dim, dtype=torch.float64)
         made.append(value.to(device, dtype))
-    if function == "interpolated":
-        made[2] = made[1] + made[2]  # knots increase
     return made
 
 
@@ -85,7 +85,7 @@ def test_gradients(function, dim, device):
 
 @pytest.mark.parametrize("function", NAMES)
 def test_gradients_of_the_reference(function, device):
-    """Reverse mode of plain torch gives the same gradients, at switches too."""
+    """Reverse mode of plain torch gives the same gradients, on both sides of every switch."""
     ours = [a.requires_grad_() for a in arguments(function, 3, device)]
     theirs = [a.detach().clone().requires_grad_() for a in ours]
     found, wanted = pointwise(function, 3, *ours), expected(function, 3, theirs)
@@ -149,7 +149,37 @@ def test_opcheck(function, device):
     given = [a.requires_grad_() for a in arguments(function, 2, device, rows=3)]
     results = list(range(len(FUNCTIONS[function].results)))
     call = function, 2, given, list(range(len(given))), [0.0] * len(given), results
-    torch.library.opcheck(torch.ops.torch_mpm.pointwise.default, call)
+    ops = torch.ops.torch_mpm
+    torch.library.opcheck(ops.pointwise.default, call)
+    plain = function, 2, [a.detach() for a in given], *call[3:5]
+    adjoints = [torch.ones_like(a) for a in ops.pointwise(*plain, results)]
+    fake = ("test_schema", "test_faketensor")
+    torch.library.opcheck(ops.pointwise_backward.default, (*plain, adjoints, results, call[3]), test_utils=fake)
+    tangents = [torch.ones_like(a) for a in plain[2]]
+    second = *plain, adjoints, results, tangents, call[3], call[3]
+    torch.library.opcheck(ops.pointwise_second.default, second, test_utils=fake)
+
+
+def test_on_the_switches(device):
+    """Exactly on a boundary between cases, and what is not a number."""
+    nan = math.nan
+    rows = torch.tensor(
+        [[0.5, 0.1], [0.5, 0.5], [0.0, 0.0], [nan, 0.0], [0.0, nan]], dtype=torch.float64, device=device
+    )
+    (distance,) = pointwise("box_distance", 2, rows, torch.ones(2, dtype=torch.float64, device=device))
+    assert distance[:3].tolist() == [0.0, 0.0, -0.5] and bool(distance[3:].isnan().all())
+    J, f = (torch.tensor(v, dtype=torch.float64, device=device) for v in ([0.5, 0.5], [0.8, 0.7999]))
+    solid = torch.eye(2, dtype=torch.float64, device=device).expand(2, 2, 2)
+    volume, F = pointwise("melting_parts", 2, J, solid, f, 0.8)
+    assert volume.tolist() == [0.5, 1.0] and torch.allclose(F[:, 0, 0] ** 2, volume)
+
+
+@pytest.mark.parametrize("dtype,bound", [(torch.float64, 1e-14), (torch.float32, 1e-6)])
+def test_volumes_far_from_one(dim, dtype, bound, device):
+    """What flows keeps its volume, from 1e-30 to 1e30."""
+    J = torch.logspace(-30, 30, 61, dtype=dtype, device=device)
+    _, F = pointwise("melting_parts", dim, J, 1.0, 1.0, 0.8)
+    assert float((F[:, 0, 0].double() ** dim / J.double() - 1).abs().max()) < 10 * bound
 
 
 def test_bad_arguments(device):

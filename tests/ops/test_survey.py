@@ -202,3 +202,13 @@ def test_figures_of_what_a_law_adds(device):
     state = deformed(LAWS["neo_hookean"](), 3, device, F64)
     once, twice = (figures_of(law(E=2e4, nu=0.3), state, False)[1] for law in (mpm.NeoHookean, Harder))
     assert torch.equal(2 * once, twice)
+
+
+def test_mixture_of_one_law_asks_for_its_material(device):
+    law = mpm.Mixture([LAWS["neo_hookean"]()])
+    step = mpm.Step(grid(3), law)
+    state = deformed(law, 3, device, F64, scenes=1)
+    for material in (None, torch.full((len(state),), 5, dtype=torch.int32, device=device)):
+        for run in (step.stable_dt, lambda given: mpm.rollout(step, given, 20, 1e-6)):
+            with pytest.raises(ValueError, match=r"state\.material"):
+                run(state.replace(material=material))

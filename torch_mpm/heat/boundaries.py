@@ -93,7 +93,7 @@ class HeatNodes:
         """A number, or a tensor [], [B] or [N], or a function of the time that returns one, as a number or [N]."""
         value = _at(value, self.time)
         if not isinstance(value, Tensor) or value.shape == self.theta.shape:
-            return value
+            return value.to(self.theta) if isinstance(value, Tensor) else value
         scenes = self.blocks.grid.scenes
         if value.shape not in ((), (1,), (scenes,)):
             raise ValueError(f"a value at nodes must have shape [], [B] = [{scenes}] or [N], got {shape_of(value)}")
@@ -137,7 +137,7 @@ class HeatNodes:
     def left_conductance(self) -> Tensor:
         """κ V of the particles [P] without what layers replace; adds their exchange.
 
-        It may be negative by their exchange; H + X stays positive.
+        What is left gets negative where a layer exchanges more (csrc/pointwise/heat.h); H + X stays positive.
         """
         if self.share is None:
             return self.conductance
@@ -347,7 +347,7 @@ class FixedSurface(Term):
 
     def apply(self, nodes: HeatNodes) -> None:  # type: ignore[override]
         width, state = self.WIDTH * nodes.blocks.grid.dx, nodes.state
-        distance = self.region.signed_distance(state.x, state.scene, nodes.time)
+        distance = self.region.signed_distance(state.x, state.scene, nodes.time).to(state.x)
         share, rate = pointwise("heat_layer", nodes.blocks.grid.dim, distance, width)
         nodes.add_layer(share, rate, nodes.per_node(self.temperature))
 

@@ -216,14 +216,14 @@ class Heat(nn.Module):
         motion: Tensor | float = 0.0 if velocity_gradient is None else velocity_gradient
         specific_heat = evaluate("specific_heat", self.specific_heat, state)
         conductivity = evaluate("conductivity", self.conductivity, state)
-        rest = state.volume, *_deformation(state)
-        volume, heat_capacity, conductance, rate = pointwise(
-            "heat_weights", self.grid.dim, *rest, specific_heat, conductivity, state.mass, step, motion, self.grid.dx
+        matter = *_deformation(state), specific_heat, conductivity, state.mass
+        volume, heat_capacity, conductance, varying = pointwise(
+            "heat_weights", self.grid.dim, state.volume, *matter, step, motion, self.grid.dx
         )
-        blend = rate if self.transfer == "hybrid" else 0.0 if self.transfer == "flip" else 1.0
+        blend = varying if self.transfer == "hybrid" else 0.0 if self.transfer == "flip" else 1.0
         weights = (heat_capacity,) if isinstance(blend, float) else (heat_capacity, blend)
-        (total, *_), (initial, *rest_of_means) = _averages(blocks, state.x, weights, theta, gradient)
-        smooth = rest_of_means[0] if rest_of_means else initial
+        (total, *_), means = _averages(blocks, state.x, weights, theta, gradient)
+        initial, smooth = means[0], means[-1]
         nodes = HeatNodes(blocks, state, volume, conductance, total, initial, self.reference)
         for boundary in self.boundaries:
             boundary.apply(nodes)

@@ -43,11 +43,12 @@ def law_calls(law: Material, state: Any) -> LawCalls:
         ValueError: where the state has no material, or one that the mixture does not have, as `Mixture.check_material`.
     """
     laws: list[CompiledLaw] = laws_of(law)  # type: ignore[assignment]
+    material = law.check_material(state) if isinstance(law, Mixture) else None
     return LawCalls(
         ",".join(part._name(state) for part in laws),
         [part.option_bits() for part in laws],
         [parameter for part in laws for parameter in part._arguments(state)[1]],
         [variable for part in laws for variable in part._history(state)],
         [part.history_names() for part in laws],
-        law.check_material(state) if isinstance(law, Mixture) and len(laws) > 1 else None,
+        material if len(laws) > 1 else None,
     )

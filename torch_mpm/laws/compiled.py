@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import torch
 from torch import Tensor, nn
 
-from ..capture import GraphCache
+from ..capture import GraphCache, is_traced, version
 from ..errors import check_number, shape_of
 from ..ops.arguments import refuse_batched, soa_empty
 from ..ops.implicit import add_deviator
@@ -40,6 +40,7 @@ if TYPE_CHECKING:
 
 
 FIGURES = ("stress", "stiffness", "energy_density")
+"""What a survey asks of a law."""
 
 
 class CompiledLaw(Material):
@@ -191,14 +192,14 @@ class CompiledLaw(Material):
 
     def is_all_of_its_update(self) -> bool:
         """Whether `update` does what the compiled law does and nothing else, so that a kernel may take its place."""
-        return self._has_its_update()
+        return self._updates_as_compiled()
 
-    def has_its_figures(self) -> bool:
+    def figures_are_compiled(self) -> bool:
         """Whether stress, stiffness and energy are those of the compiled law alone, which one op gives at once."""
         own = (getattr(type(self), name) is getattr(CompiledLaw, name) for name in FIGURES)
-        return self._has_its_update() and all(own)
+        return self._updates_as_compiled() and all(own)
 
-    def _has_its_update(self) -> bool:
+    def _updates_as_compiled(self) -> bool:
         return type(self).update is CompiledLaw.update
 
     @property
@@ -254,7 +255,7 @@ class CompiledLaw(Material):
         if torch.compiler.is_compiling() or any(t.requires_grad for t in tensors):
             return self._convert(state)
         numbers = [value for value in vars(self).values() if isinstance(value, float)]
-        key = (state.x.dtype, state.x.device, state.ids, *numbers, *((t, t._version) for t in tensors))
+        key = (state.x.dtype, state.x.device, state.ids, *numbers, *((t, version(t)) for t in tensors))
         return self._kept_parameters.get(key, lambda: self._convert(state), state.x)
 
     def _at_temperature(self, state: State) -> CompiledLaw:
@@ -284,7 +285,7 @@ class CompiledLaw(Material):
         def make() -> list[Tensor]:  # no copies from the host, which graphs refuse
             return [torch.full((), number, dtype=x.dtype, device=x.device) for number in numbers]
 
-        if torch.compiler.is_compiling():
+        if is_traced(x):
             return make()
         return self._kept_scalars.get((*numbers, x.dtype, x.device), make, x)
 

@@ -149,9 +149,9 @@ class QuarticSand(SolidLaw):
         return torch.zeros_like(state.mass) if q is None else q
 
     def is_all_of_its_update(self) -> bool:
-        return self._has_its_update() and HARDENING not in self.extra_fields
+        return self._updates_as_compiled() and HARDENING not in self.extra_fields
 
-    def _has_its_update(self) -> bool:
+    def _updates_as_compiled(self) -> bool:
         return type(self).update is QuarticSand.update
 
     def update(self, state: State) -> tuple[dict[str, Tensor], Tensor]:

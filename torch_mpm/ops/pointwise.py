@@ -10,8 +10,10 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.autograd import forward_ad
 
 from .. import _library
+from ..errors import FLOATING
 from .arguments import refuse_vmap, soa_empty
 from .autograd import dispatch, register_autograd
 
@@ -46,6 +48,19 @@ FUNCTIONS: dict[str, Function] = _read()
 """Every function by its name."""
 
 
+def fuses(*tensors: Tensor) -> bool:
+    """Whether `pointwise` may take the place of torch operations, which have every derivative and transform: where
+    nothing is recorded, transformed or compiled, and all tensors are float32, or all float64."""
+    return not (
+        torch.compiler.is_compiling()
+        or torch._C._are_functorch_transforms_active()
+        or forward_ad._current_level >= 0
+        or (torch.is_grad_enabled() and torch._C._any_requires_grad(*tensors))
+        or tensors[0].dtype not in FLOATING
+        or any(t.dtype != tensors[0].dtype for t in tensors)
+    )
+
+
 def pointwise(function: str, dim: int, *arguments: Tensor | float, wanted: Sequence[int] | None = None) -> list[Tensor]:
     """Results of a function of csrc/pointwise, one kernel for all rows.
 
@@ -60,7 +75,8 @@ def pointwise(function: str, dim: int, *arguments: Tensor | float, wanted: Seque
     Differentiable with respect to every tensor, twice.
 
     Raises:
-        RuntimeError: for an unknown function, a wrong shape, dtype or device.
+        KeyError: for an unknown function.
+        RuntimeError: for a wrong shape, dtype or device.
     """
     tensors = [a for a in arguments if isinstance(a, Tensor)]
     places = [k for k, a in enumerate(arguments) if isinstance(a, Tensor)]

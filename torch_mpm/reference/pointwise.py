@@ -93,10 +93,6 @@ def box_distance(x: Tensor, size: Tensor) -> tuple[Tensor, ...]:
     return (norm(depth.clamp_min(0)) + depth.amax(1).clamp_max(0),)
 
 
-def interpolated(at: Tensor, low: Tensor, high: Tensor, first: Tensor, last: Tensor) -> tuple[Tensor, ...]:
-    return (torch.lerp(first, last, ((at - low) / (high - low)).clamp(0, 1)),)
-
-
 def thermal_stretch(J: Tensor, F: Tensor, alpha: Tensor, theta: Tensor, expand: Tensor) -> tuple[Tensor, ...]:
     stretch = 1 + alpha * theta
     factor = torch.where(expand > 0, stretch, 1 / stretch)
