@@ -255,7 +255,9 @@ class CompiledLaw(Material):
         if torch.compiler.is_compiling() or any(t.requires_grad for t in tensors):
             return self._convert(state)
         numbers = [value for value in vars(self).values() if isinstance(value, float)]
-        key = (state.x.dtype, state.x.device, state.ids, *numbers, *((t, version(t)) for t in tensors))
+        particles = getattr(state, "particles", state.x.shape[0])
+        order = state.ids if any(t.numel() == particles for t in tensors) else None  # of what differs by particle
+        key = (state.x.dtype, state.x.device, order, *numbers, *((t, version(t)) for t in tensors))
         return self._kept_parameters.get(key, lambda: self._convert(state), state.x)
 
     def _at_temperature(self, state: State) -> CompiledLaw:
