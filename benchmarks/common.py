@@ -47,13 +47,13 @@ def release_memory() -> None:
         libc.malloc_trim(0)
 
 
-def environment(device: str = "cpu") -> dict[str, Any]:
-    """Device, versions, commit and date of a result."""
+def environment(device: str = "cpu", devices: int = 1) -> dict[str, Any]:
+    """Device, or how many of it, versions, commit and date of a result."""
     import torch_mpm.info
 
     build = torch_mpm.info.info()
     place: dict[str, Any] = {
-        "device": device_name(device),
+        "device": f"{devices} " * (devices > 1) + device_name(device),
         "torch_mpm": build["version"],
         "commit": commit(),
         "date": datetime.datetime.now(datetime.timezone.utc).strftime("%Y-%m-%d %H:%M UTC"),

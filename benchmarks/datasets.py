@@ -214,10 +214,10 @@ def main() -> None:
         preset, overrides, device, folder = json.loads(arguments.one)
         print(json.dumps(generate(preset, overrides, device, Path(folder))))
         return
-    result: dict[str, Any] = {"environment": common.environment(arguments.device), "sets": []}
+    if arguments.large and arguments.device != "cuda":
+        parser.error("--large is for a GPU: --device cuda")
     gpus = torch.cuda.device_count() if arguments.device == "cuda" else 1
-    if gpus > 1:
-        result["environment"]["device"] = f"{gpus} {result['environment']['device']}"
+    result: dict[str, Any] = {"environment": common.environment(arguments.device, gpus), "sets": []}
     if arguments.work:
         arguments.work.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=arguments.work) as work:

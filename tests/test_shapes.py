@@ -152,6 +152,18 @@ def test_messages():
         shapes.Cylinder((0.0, 1.0, 0.0), 0.0)
 
 
+@pytest.mark.parametrize("dim", [2, 3])
+def test_distance_alone(dim, device):
+    """Without the normal it is the same, from shapes with a way of their own to it and from others."""
+    x = 2 * torch.rand(200, dim, dtype=torch.float64, generator=torch.Generator().manual_seed(1)).to(device) - 1
+    ring = shapes.SDF(lambda x: (x.square().sum(1).sqrt() - 0.5).abs() - 0.1)
+    for shape in [*bounded(dim), ring, shapes.Sampled.of(ring, (-1.0,) * dim, (1.0,) * dim, 0.1)]:
+        distance, _ = shape.surface(x)
+        assert torch.allclose(shape.signed_distance(x), distance, rtol=0, atol=1e-15)
+    with pytest.raises(ValueError, match=r"distance and normal of an SDF must have shape"):
+        shapes.SDF(lambda x: x).signed_distance(x)
+
+
 def test_gradient_of_the_distance_from_a_box(device):
     """On a face it is the normal, also where the distance alone is asked for; a pose that is NaN touches nothing."""
     box = shapes.Box((1.0, 1.0))

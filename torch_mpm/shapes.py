@@ -205,11 +205,17 @@ class Capsule(Shape):
         self.half_axis, self.radius = constant("half_axis", half_axis), extent("radius", radius)
 
     def surface(self, x: Tensor, scene: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        return self.signed_distance(x, scene), unit(self._offset(x, scene))
+
+    def signed_distance(self, x: Tensor, scene: Tensor | None = None) -> Tensor:
+        return norm(self._offset(x, scene)) - self.at_nodes("radius", x, (), scene)
+
+    def _offset(self, x: Tensor, scene: Tensor | None) -> Tensor:
+        """Of points from the nearest ones of the segment [N, D] [m]."""
         axis = self.at_nodes("half_axis", x, x.shape[1:], scene)
         squared = (axis * axis).sum(-1, keepdim=True)
         along = (x * axis).sum(1, keepdim=True) / torch.where(squared > 0, squared, 1)
-        offset = x - along.clamp(-1, 1) * axis
-        return norm(offset) - self.at_nodes("radius", x, (), scene), unit(offset)
+        return x - along.clamp(-1, 1) * axis
 
     def volume(self, dim: int, scene: int = 0) -> float:
         radius = float(self.of_scene("radius", 0, scene))
@@ -391,12 +397,21 @@ class SDF(Shape):
             distance, normal = self.distance(x), self.normal(x)
         else:
             distance, normal = _with_gradient(self.distance, x)
+        self._check(distance, normal, x)
+        return distance, unit(normal)
+
+    def signed_distance(self, x: Tensor, scene: Tensor | None = None) -> Tensor:
+        distance = self.distance(x)
+        self._check(distance, x, x)
+        return distance
+
+    @staticmethod
+    def _check(distance: Tensor, normal: Tensor, x: Tensor) -> None:
         if distance.shape != x.shape[:1] or normal.shape != x.shape:
             raise ValueError(
                 f"distance and normal of an SDF must have shape [N] and [N, D] = {list(x.shape)}, "
                 f"got {shape_of(distance)} and {shape_of(normal)}"
             )
-        return distance, unit(normal)
 
 
 class Sampled(Shape):
