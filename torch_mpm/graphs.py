@@ -231,7 +231,9 @@ class Captured:
         inputs = self._steps.inputs(prepared)
         kinds = {name: _kind(t) for name, t in inputs.items()}
         if kinds != self._given:
-            expected, came = ("; ".join(f"{name} {kind}" for name, kind in k.items()) for k in (self._given, kinds))
+            expected, came = (
+                "; ".join(f"{name} {_told(kind)}" for name, kind in k.items()) for k in (self._given, kinds)
+            )
             raise ValueError(f"state must be as it was captured, {expected}; got {came}")
         given, differentiable = [inputs[name] for name in self._given], torch.is_grad_enabled()
         with torch.no_grad():
@@ -248,8 +250,13 @@ class Captured:
         return _with(prepared, results | dict.fromkeys(self._steps.dropped))
 
 
-def _kind(t: Tensor) -> str:
-    return f"{tuple(t.shape)} {t.dtype} on {t.device}{' with a gradient' if t.requires_grad else ''}"
+def _kind(t: Tensor) -> tuple[Any, ...]:
+    return t.shape, t.dtype, t.device, t.requires_grad
+
+
+def _told(kind: tuple[Any, ...]) -> str:
+    shape, dtype, device, differentiable = kind
+    return f"{tuple(shape)} {dtype} on {device}{' with a gradient' if differentiable else ''}"
 
 
 class _OwnGradient(torch.autograd.Function):

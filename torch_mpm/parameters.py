@@ -141,7 +141,7 @@ def evaluate(name: str, value: Value, state: State) -> float | Tensor:
         return result.to(state.x.dtype)
     value = value.to(state.x.dtype)
     if value.numel() == 1:
-        return value.reshape(()).to(state.x.device)
+        return value.reshape(())
     if value.device != state.x.device:
         raise ValueError(f"{name} must be on the device of x, {state.x.device}, got {value.device}")
     particles = getattr(state, "particles", P)

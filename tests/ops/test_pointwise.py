@@ -116,6 +116,19 @@ def test_some_of_the_results(function, device):
         assert all(torch.equal(a, b) for a, b in zip(*gradients, strict=True))
 
 
+def test_scalars_on_the_cpu(device):
+    """A tensor [] may stay on the CPU beside tensors of a device, with a gradient too."""
+    distance = arguments("heat_layer", 3, device)[0]
+    width = torch.tensor(0.8, dtype=torch.float64)
+    expected = pointwise("heat_layer", 3, distance, 0.8)
+    for given in (width, width.clone().requires_grad_()):
+        found = pointwise("heat_layer", 3, distance, given)
+        assert all(torch.equal(a.detach(), b) for a, b in zip(found, expected, strict=True))
+    assert float(torch.autograd.grad(found[0].sum(), given)[0]) != 0
+    meta = pointwise("heat_layer", 3, distance.to("meta"), width)
+    assert all(a.is_meta and a.shape == b.shape for a, b in zip(meta, expected, strict=True))
+
+
 def test_third_derivatives_are_refused(device):
     theta = arguments("heat_radiation", 3, device)
     theta[1].requires_grad_()

@@ -13,6 +13,7 @@ from torch import Tensor
 from torch.autograd import forward_ad
 
 from .. import _library
+from ..capture import is_traced
 from ..errors import FLOATING
 from .arguments import refuse_vmap, soa_empty
 from .autograd import dispatch, register_autograd
@@ -69,7 +70,8 @@ def pointwise(function: str, dim: int, *arguments: Tensor | float, wanted: Seque
         dim: D.
         arguments: a tensor with a row for each particle or node, or without that dimension (of a scalar also [1]) one
             for all, or a number. A number for a vector is each of its entries, for a matrix that many times the
-            identity. All tensors float32, or all float64, and one of them with rows.
+            identity. All tensors float32, or all float64, and one of them with rows; a tensor [] may be on the CPU where
+            the others are not, as for torch's own operations.
         wanted: numbers of the results to give; None for all.
 
     Differentiable with respect to every tensor, twice.
@@ -78,11 +80,20 @@ def pointwise(function: str, dim: int, *arguments: Tensor | float, wanted: Seque
         KeyError: for an unknown function.
         RuntimeError: for a wrong shape, dtype or device.
     """
+    device = next((a.device for a in arguments if isinstance(a, Tensor) and a.dim() > 0), None)
+    arguments = tuple(_beside(a, device) if isinstance(a, Tensor) and a.dim() == 0 else a for a in arguments)
     tensors = [a for a in arguments if isinstance(a, Tensor)]
     places = [k for k, a in enumerate(arguments) if isinstance(a, Tensor)]
     numbers = [0.0 if isinstance(a, Tensor) else float(a) for a in arguments]
     results = list(range(len(FUNCTIONS[function].results))) if wanted is None else list(wanted)
     return list(dispatch(torch.ops.torch_mpm.pointwise, function, dim, tensors, places, numbers, results))
+
+
+def _beside(scalar: Tensor, device: torch.device | None) -> Tensor | float:
+    """A tensor [] for a call on a device: one that is on the CPU is a number there, so that graphs may capture it."""
+    if device is None or scalar.device == device:
+        return scalar
+    return scalar.to(device) if scalar.requires_grad or is_traced(scalar) or scalar.is_cuda else float(scalar)
 
 
 # ---- fake kernels
