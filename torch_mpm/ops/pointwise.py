@@ -70,7 +70,7 @@ def pointwise(function: str, dim: int, *arguments: Tensor | float, wanted: Seque
         dim: D.
         arguments: a tensor with a row for each particle or node, or without that dimension (of a scalar also [1]) one
             for all, or a number. A number for a vector is each of its entries, for a matrix that many times the
-            identity. All tensors float32, or all float64, and one of them with rows; a tensor [] may be on the CPU where
+            identity. All tensors float32, or all float64, and one of them with rows; one [] may be on the CPU where
             the others are not, as for torch's own operations.
         wanted: numbers of the results to give; None for all.
 
