@@ -121,8 +121,7 @@ def check_gradients(grid, values, law, groups, limit, **arguments):
 @pytest.mark.parametrize("law", LAWS, ids=name_of)
 def test_gradients_of_every_law(law, plasticity, device):
     grid, values = inputs(law, 2, device)
-    # Of quotients of differences, in which sums of any order on CUDA leave up to 1.1e-6.
-    check_gradients(grid, values, law, groups_of(law), 2e-6, plasticity=plasticity, walls="sticky")
+    check_gradients(grid, values, law, groups_of(law), 1e-6, plasticity=plasticity, walls="sticky")
 
 
 @pytest.mark.parametrize(("law", "plasticity"), [(LAWS[2], "after"), (LAWS[6], "inside")], ids=name_of)
