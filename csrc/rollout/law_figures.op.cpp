@@ -15,18 +15,6 @@ struct Figures {
 };
 
 template <class T, int D>
-LawArguments<T, D> law_arguments(const FiguresInputs& in, const LawCall& call, int number) {
-  const LawInfo& info = call.law->info;
-  const bool gradient = info.field == Deformation::gradient;
-  const OptionalTensor& state = gradient ? in.F : in.J;
-  STD_TORCH_CHECK(has(state), "the law ", info.name, " needs ", gradient ? "F" : "J");
-  const OptionalTensor C = info.viscous ? in.C : OptionalTensor{};
-  auto a = arguments<T, D>(info, *state, C, call.parameters, call.history, in.scene, call.options);
-  if (has(in.material)) a.members = {static_cast<const int*>(in.material->data_ptr()), in.material->stride(0), number};
-  return a;
-}
-
-template <class T, int D>
 void scalar_of(const LawKernels<T, D>& kernels, const LawArguments<T, D>& law, LawScalar which, Tensor& value,
                backend::Stream stream) {
   kernels.scalar({law, which, field<T>(value)}, stream);
@@ -36,7 +24,8 @@ template <class T, int D>
 void figures_of(const FiguresInputs& in, const LawCall& call, int number, Figures& out, backend::Stream stream) {
   const LawKernels<T, D>& kernels = kernels_of<T, D>(*call.law);
   LawUpdateArguments<T, D> a;
-  a.law = law_arguments<T, D>(in, call, number);
+  const OptionalTensor C = call.law->info.viscous ? in.C : OptionalTensor{};
+  a.law = law_arguments<T, D>(call, number, in.x, in.F, in.J, C, in.scene, in.material);
   a.stress = field<T>(out.stress);
   Tensor mapped, moved;  // deformation and history after the return map
   if (call.law->info.plastic) a.state = field<T>(mapped = empty_particles(in.x, {in.x.size(0), D, D}));
@@ -46,12 +35,7 @@ void figures_of(const FiguresInputs& in, const LawCall& call, int number, Figure
   scalar_of(kernels, a.law, LawScalar::stiffness, out.stiffness, stream);
   if (!out.energy.defined()) return;
   if (mapped.defined()) a.law.state = field<const T>(mapped);
-  int64_t column = 0;
-  for (size_t k = 0; k < call.history.size(); k++) {
-    const bool matrix = call.law->info.history[k].matrix;
-    a.law.history[k] = constant(variable<T, D>(a.history, column, matrix));
-    column += matrix ? D * D : 1;
-  }
+  set_history(a.law, call, constant(a.history), 0);
   scalar_of(kernels, a.law, LawScalar::energy, out.energy, stream);
 }
 
@@ -63,11 +47,7 @@ std::tuple<Tensor, Tensor, Tensor> law_figures(const Tensor& x, const OptionalTe
   check_positions(x);
   const int64_t P = x.size(0), D = x.size(1);
   const std::vector<LawCall> calls = law_calls(laws, options, parameters, history, variables, D);
-  STD_TORCH_CHECK(calls.size() == 1 || has(material), "particles of ", calls.size(), " laws need a material");
-  if (has(material)) {
-    check_shape(*material, "material", {P});
-    check_type(*material, "material", ScalarType::Int, x);
-  }
+  check_material(material, calls.size(), x);
   const FiguresInputs in{x, C, F, J, scene, material};
   Figures out{empty_particles(x, {P, D, D}), empty_particles(x, {P}), energy ? empty_particles(x, {P}) : Tensor()};
   const DeviceScope device(x);

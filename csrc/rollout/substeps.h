@@ -205,6 +205,39 @@ Field<T> variable(const Field<T>& history, int64_t first, bool matrix) {
   return f;
 }
 
+// The law of each particle, where there are several.
+inline void check_material(const OptionalTensor& material, size_t laws, const Tensor& x) {
+  STD_TORCH_CHECK(has(material) || laws == 1, "several laws need material");
+  if (!has(material)) return;
+  check_shape(*material, "material", {x.size(0)});
+  check_type(*material, "material", ScalarType::Int, x);
+}
+
+// The arguments of a law for its own particles.
+template <class T, int D>
+LawArguments<T, D> law_arguments(const LawCall& call, int number, const Tensor& x, const OptionalTensor& F,
+                                 const OptionalTensor& J, const OptionalTensor& C, const OptionalTensor& scene,
+                                 const OptionalTensor& material) {
+  const LawInfo& info = call.law->info;
+  const char* const name = info.field == Deformation::gradient ? "F" : "J";
+  const OptionalTensor& state = info.field == Deformation::gradient ? F : J;
+  STD_TORCH_CHECK(has(state), "the law ", info.name, " needs ", name);
+  check_shape(*state, name, shape_of_state(info, x.size(0), D));
+  auto a = arguments<T, D>(info, *state, C, call.parameters, call.history, scene, call.options);
+  if (has(material)) a.members = {static_cast<const int*>(material->data_ptr()), material->stride(0), number};
+  return a;
+}
+
+// Where a law finds its history: in columns from `first` on.
+template <class T, int D>
+void set_history(LawArguments<T, D>& a, const LawCall& call, const Field<const T>& history, int64_t first) {
+  for (size_t k = 0; k < call.history.size(); k++) {
+    const bool matrix = call.law->info.history[k].matrix;
+    a.history[k] = variable<const T, D>(history, first, matrix);
+    first += matrix ? D * D : 1;
+  }
+}
+
 // The kernels of a step with their arguments, of which a call makes most once.
 template <class T, int D>
 struct Substeps {
@@ -238,12 +271,7 @@ struct Substeps {
       a.law.state = info.field == Deformation::gradient ? p.F : p.J;
       if (info.viscous) a.law.C = p.C;
       if (info.plastic) a.state = mapped;
-      int64_t first = calls[k].first_column;
-      for (size_t q = 0; q < calls[k].history.size(); q++) {
-        const bool matrix = info.history[q].matrix;
-        a.law.history[q] = variable<const T, D>(p.history, first, matrix);
-        first += matrix ? D * D : 1;
-      }
+      set_history(a.law, calls[k], p.history, calls[k].first_column);
     }
     p2g.x = advance.gather.x = activation.x = p.x;
     p2g.velocity = p.v;
@@ -416,27 +444,18 @@ Substeps<T, D>::Substeps(const SubstepsInputs& inputs) : in(inputs) {
   STD_TORCH_CHECK(in.dt > 0 && std::isfinite(in.dt), "dt must be positive and finite, got ", in.dt);
   STD_TORCH_CHECK(in.wants_C || !in.apic, "apic needs wants_C");
   calls = law_calls(in.laws, in.options, in.parameters, in.history, in.variables, D);
-  STD_TORCH_CHECK(has(in.material) || calls.size() == 1, "several laws need material");
+  check_material(in.material, calls.size(), x);
   activation = activate_arguments<T, D>(in.lattice, x, in.scene, in.ids, in.scenes, in.max_blocks);
   if (has(in.previous_status))
     previous_status = int_pointer(*in.previous_status, "previous_status", x, {1 + in.scenes, kStatusSize});
   stress = empty_particles(x, {P, D, D});
-  if (has(in.material)) {
-    check_shape(*in.material, "material", {P});
-    check_type(*in.material, "material", ScalarType::Int, x);
-    torch::stable::zero_(stress);  // of particles without a law
-  }
+  if (has(in.material)) torch::stable::zero_(stress);  // of particles without a law
   for (size_t k = 0; k < calls.size(); k++) {
     const LawInfo& info = calls[k].law->info;
     STD_TORCH_CHECK(in.wants_C || !info.viscous, "the viscous law ", info.name, " needs wants_C");
-    const OptionalTensor& state = info.field == Deformation::gradient ? in.F : in.J;
-    STD_TORCH_CHECK(has(state), "the law ", info.name, " needs ", info.field == Deformation::gradient ? "F" : "J");
-    check_shape(*state, info.field == Deformation::gradient ? "F" : "J", shape_of_state(info, P, D));
     kernels_of<T, D>(*calls[k].law);
     LawUpdateArguments<T, D> a;
-    a.law = arguments<T, D>(info, *state, {}, calls[k].parameters, calls[k].history, in.scene, calls[k].options);
-    if (has(in.material))
-      a.law.members = {static_cast<const int*>(in.material->data_ptr()), in.material->stride(0), int(k)};
+    a.law = law_arguments<T, D>(calls[k], int(k), x, in.F, in.J, {}, in.scene, in.material);
     a.stress = field<T>(stress);
     laws.push_back(a);
     plastic |= info.plastic;
