@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import ctypes
+import json
 import os
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -22,6 +25,13 @@ def _load(path: Path) -> str | None:
     except OSError as error:
         return str(error.__cause__ or error)  # torch wraps the loader's message in one that leaves the reason out
     return None
+
+
+def listed(function: str) -> Any:
+    """What a function of the CPU library without arguments says of it in JSON."""
+    text = getattr(ctypes.CDLL(os.fspath(CPU_LIBRARY)), function)
+    text.restype = ctypes.c_char_p
+    return json.loads(text())
 
 
 def _load_cpu() -> None:

@@ -164,15 +164,15 @@ class Box(Shape):
 
     def surface(self, x: Tensor, scene: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """The normal is that of the nearest face, inside the one of the axis with the least negative distance."""
-        nearest = torch.arange(x.shape[1], device=x.device) == self._depth(x, scene).argmax(1, keepdim=True)
-        return self.signed_distance(x, scene), nearest * torch.where(x < 0, -1, 1).to(x.dtype)
+        depth = self._depth(x, scene)
+        nearest = torch.arange(x.shape[1], device=x.device) == depth.argmax(1, keepdim=True)
+        return self._distance(depth), nearest * torch.where(x < 0, -1, 1).to(x.dtype)
 
     def signed_distance(self, x: Tensor, scene: Tensor | None = None) -> Tensor:
         size = self.at_nodes("size", x, x.shape[1:], scene)
         if fuses(x, size):
             return pointwise("box_distance", x.shape[1], x, size)[0]
-        depth = self._depth(x, scene)
-        return norm(depth.clamp_min(0)) + depth.amax(1).clamp_max(0)
+        return self._distance(self._depth(x, scene))
 
     def contains(self, x: Tensor) -> Tensor:
         return (self._depth(x, None) <= 0).all(1)
@@ -180,6 +180,10 @@ class Box(Shape):
     def _depth(self, x: Tensor, scene: Tensor | None) -> Tensor:
         """How far points are behind the faces of each axis [N, D] [m], negative inside."""
         return x.abs() - 0.5 * self.at_nodes("size", x, x.shape[1:], scene)
+
+    def _distance(self, depth: Tensor) -> Tensor:
+        """By the depth behind the faces."""
+        return norm(depth.clamp_min(0)) + depth.amax(1).clamp_max(0)
 
     def volume(self, dim: int, scene: int = 0) -> float:
         return float(self.of_scene("size", 1, scene).prod())
@@ -205,10 +209,14 @@ class Capsule(Shape):
         self.half_axis, self.radius = constant("half_axis", half_axis), extent("radius", radius)
 
     def surface(self, x: Tensor, scene: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        return self.signed_distance(x, scene), unit(self._offset(x, scene))
+        offset = self._offset(x, scene)
+        return self._distance(offset, scene), unit(offset)
 
     def signed_distance(self, x: Tensor, scene: Tensor | None = None) -> Tensor:
-        return norm(self._offset(x, scene)) - self.at_nodes("radius", x, (), scene)
+        return self._distance(self._offset(x, scene), scene)
+
+    def _distance(self, offset: Tensor, scene: Tensor | None) -> Tensor:
+        return norm(offset) - self.at_nodes("radius", offset, (), scene)
 
     def _offset(self, x: Tensor, scene: Tensor | None) -> Tensor:
         """Of points from the nearest ones of the segment [N, D] [m]."""

@@ -12,7 +12,7 @@ import torch_mpm as mpm
 from torch_mpm.ops import LAWS
 from torch_mpm.ops.heat_patches import Patches
 from torch_mpm.ops.implicit import tangent_entries
-from torch_mpm.ops.pointwise import FUNCTIONS
+from torch_mpm.ops.pointwise import FUNCTIONS, row_shape
 
 PARTICLES = 37
 
@@ -143,7 +143,7 @@ class _Calls:
         return found
 
     def entries(self, shape: tuple[int, int]) -> Tensor:
-        return self.uniform(PARTICLES, *(self.dim if size == -1 else size for size in shape if size))
+        return self.uniform(*row_shape(shape, PARTICLES, self.dim))
 
     def laws(self) -> list[tuple[str, tuple[Any, ...]]]:
         P, D, found = PARTICLES, self.dim, []

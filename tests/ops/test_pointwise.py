@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from torch_mpm.ops.pointwise import FUNCTIONS, pointwise
+from torch_mpm.ops.pointwise import FUNCTIONS, pointwise, row_shape
 from torch_mpm.reference import pointwise as reference
 
 NAMES = sorted(FUNCTIONS)
@@ -17,8 +17,7 @@ def arguments(function, dim, device, dtype=torch.float64, rows=ROWS, seed=0):
     random = torch.Generator().manual_seed(seed)
     made = []
     for shape in FUNCTIONS[function].arguments:
-        sizes = [dim if size == -1 else size for size in shape if size]
-        value = 0.1 + 1.2 * torch.rand([rows, *sizes], generator=random, dtype=torch.float64)
+        value = 0.1 + 1.2 * torch.rand(row_shape(shape, rows, dim), generator=random, dtype=torch.float64)
         if shape == (-1, -1):
             value = 0.4 * (value - 0.7) + torch.eye(dim, dtype=torch.float64)
         made.append(value.to(device, dtype))

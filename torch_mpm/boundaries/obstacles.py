@@ -146,16 +146,22 @@ class Obstacle(RigidMotion):
         """
         if positions.shape[0] == 0 or self._absent(scene, time):
             return None
+        arm, turn = self._arm_and_turn(positions, scene, time)
+        distance, normal = self.shape.surface(to_body(turn, arm), scene)
+        if turn is not None:
+            normal = transform(turn, normal)
+        return self._touching(distance, positions, scene, time), normal, self.velocity_at(arm, scene, time)
+
+    def _arm_and_turn(
+        self, positions: Tensor, scene: Tensor | None, time: float | Tensor
+    ) -> tuple[Tensor, Tensor | None]:
+        """Positions from the centre [N, D] [m]; the rotation [D, D] or [N, D, D], None where the body never turns."""
         dim = positions.shape[1]
         centre, turn = self.centre_at(time, positions), self.rotation_at(time, positions, dim)
         if centre.shape[-1] != dim:
             raise ValueError(f"position must have {dim} numbers per point, got {shape_of(centre)}")
         arm = positions - per_node(centre, 1, scene)
-        turn = None if turn is None else per_node(turn, 2, scene)
-        distance, normal = self.shape.surface(to_body(turn, arm), scene)
-        if turn is not None:
-            normal = transform(turn, normal)
-        return self._touching(distance, positions, scene, time), normal, self.velocity_at(arm, scene, time)
+        return arm, None if turn is None else per_node(turn, 2, scene)
 
     # -- as a region
 
@@ -170,9 +176,7 @@ class Obstacle(RigidMotion):
         """
         if positions.shape[0] == 0 or self._absent(scene, time):
             return positions.new_full(positions.shape[:1], torch.inf)
-        centre, turn = self.centre_at(time, positions), self.rotation_at(time, positions, positions.shape[1])
-        arm = positions - per_node(centre, 1, scene)
-        turn = None if turn is None else per_node(turn, 2, scene)
+        arm, turn = self._arm_and_turn(positions, scene, time)
         distance = self.shape.signed_distance(to_body(turn, arm), scene)
         present = self._present(scene, time)
         return distance if present is None else torch.where(present, distance, torch.inf)

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import ctypes
 import dataclasses
-import json
 from collections.abc import Sequence
 from typing import Any
 
@@ -36,10 +34,8 @@ class Function:
 
 
 def _read() -> dict[str, Function]:
-    library = ctypes.CDLL(str(_library.CPU_LIBRARY))
-    library.torch_mpm_functions.restype = ctypes.c_char_p
     found = {}
-    for entry in json.loads(library.torch_mpm_functions()):
+    for entry in _library.listed("torch_mpm_functions"):
         lists = {key: tuple((rows, columns) for rows, columns in entry[key]) for key in ("arguments", "results")}
         found[entry["name"]] = Function(entry["name"], **lists)
     return found
@@ -110,13 +106,14 @@ def _rows(info: Function, tensors: Sequence[Tensor], places: Places) -> tuple[An
     return most.shape[0], most
 
 
-def _shape(entries: tuple[int, int], rows: Any, dim: int) -> list[Any]:
+def row_shape(entries: tuple[int, int], rows: Any, dim: int) -> list[Any]:
+    """Shape of an argument or result with so many rows."""
     return [rows, *(dim if size == -1 else size for size in entries if size != 0)]
 
 
 def _empty(kinds: Sequence[tuple[int, int]], places: Places, of: tuple[Any, Tensor], dim: int) -> list[Tensor]:
     rows, like = of
-    return [soa_empty(like, _shape(kinds[k], rows, dim)) for k in places]
+    return [soa_empty(like, row_shape(kinds[k], rows, dim)) for k in places]
 
 
 @torch.library.register_fake("torch_mpm::pointwise")
@@ -129,36 +126,19 @@ def _pointwise_fake(
 
 @torch.library.register_fake("torch_mpm::pointwise_backward")
 def _pointwise_backward_fake(
-    function: str,
-    dim: int,
-    tensors: list[Tensor],
-    places: Places,
-    numbers: list[float],
-    adjoints: list[Tensor],
-    adjoint_places: Places,
-    wanted: Places,
+    function: str, dim: int, tensors: list[Tensor], places: Places, *others: Any
 ) -> list[Tensor]:
-    info = FUNCTIONS[function]
+    info, wanted = FUNCTIONS[function], others[-1]
     return _empty(info.arguments, [places[i] for i in wanted], _rows(info, tensors, places), dim)
 
 
 @torch.library.register_fake("torch_mpm::pointwise_second")
 def _pointwise_second_fake(
-    function: str,
-    dim: int,
-    tensors: list[Tensor],
-    places: Places,
-    numbers: list[float],
-    adjoints: list[Tensor],
-    adjoint_places: Places,
-    tangents: list[Tensor],
-    tangent_places: Places,
-    wanted: Places,
+    function: str, dim: int, tensors: list[Tensor], places: Places, *others: Any
 ) -> list[Tensor]:
-    info = FUNCTIONS[function]
-    rows = _rows(info, tensors, places)
-    by_arguments = _empty(info.arguments, [places[i] for i in wanted], rows, dim)
-    return by_arguments + _empty(info.results, adjoint_places, rows, dim)
+    info, (_, _, adjoint_places, *_) = FUNCTIONS[function], others
+    by_arguments = _pointwise_backward_fake(function, dim, tensors, places, *others)
+    return by_arguments + _empty(info.results, adjoint_places, _rows(info, tensors, places), dim)
 
 
 # ---- autograd

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import ctypes
 import dataclasses
-import json
 import math
 from typing import Any
 
@@ -92,10 +90,8 @@ def _quantities(entries: list[dict[str, Any]]) -> tuple[Quantity, ...]:
 
 
 def _read() -> dict[str, LawInfo]:
-    library = ctypes.CDLL(str(_library.CPU_LIBRARY))
-    library.torch_mpm_laws.restype = ctypes.c_char_p
     laws = {}
-    for entry in json.loads(library.torch_mpm_laws()):
+    for entry in _library.listed("torch_mpm_laws"):
         lists = {key: _quantities(entry[key]) for key in ("parameters", "history")}
         laws[entry["name"]] = LawInfo(**{**entry, **lists, "options": tuple(entry["options"])})
     return dict(sorted(laws.items()))
