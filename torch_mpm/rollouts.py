@@ -20,6 +20,7 @@ from .checkpoints import Checkpoints, as_checkpoints, binomial, fitting, in_segm
 from .errors import check_count, shape_of
 from .gradient_norms import GradientNorms
 from .graphs import CHUNK, LEAST_STEPS, obstacle_to_replays, replayed, time_after
+from .grid import Grid
 from .laws import CompiledLaw
 from .laws.calls import law_calls, laws_of
 from .ops.arguments import split_dt
@@ -203,6 +204,10 @@ def obstacle_to_substeps(step: Step, state: State, dt: float | Tensor) -> str | 
 
 
 MOST_STEPS = 2**16  # of one op, csrc/rollout/substeps.h
+FEW_BLOCKS, FEW_ITEMS = 2**12, 140
+"""Of a domain, and of work in a step, for which a wave of thread blocks is enough."""
+LONG_CHUNK = 1024
+"""Steps between two looks at whether it still is."""
 KEPT_BYTES = {"cpu": 2**24, "cuda": 2**29}
 """What the backward pass of one op may hold of its steps, even where sqrt(n) steps need less: what the caches of a CPU
 hold, and so much that kernels on CUDA hide the time of Python."""
@@ -214,22 +219,31 @@ def in_chunks(
     """The state n steps later, by calls of one op; `obstacle_to_substeps` must be None. The op takes steps again where
     it may not keep all that their gradient needs."""
     chunk = CHUNK if step.grid.grows and state.x.is_cuda else MOST_STEPS
+    with_gradient = wants_gradient(step, state)
 
     def advance(state: State, count: int, first: int = 0) -> State:
         while count > 0:
-            now = min(count, chunk)
-            state, count = substeps(step, state, now, dt, keeps_all), count - now
+            all_blocks = not with_gradient and takes_all_blocks(step.grid, state)
+            now = min(count, LONG_CHUNK if all_blocks else chunk)
+            state, count = substeps(step, state, now, dt, keeps_all, all_blocks), count - now
         return state
 
-    if not wants_gradient(step, state):
-        return advance(state, n)
-    if keeps_all:
+    if not with_gradient or keeps_all:
         return advance(state, n)
     chunk = min(chunk, kept.every if kept is not None and kept.every else steps_of_a_call(state, n))
     if kept is not None and kept.states is not None and n > 0:
         return binomial(advance, step.prepare(state), n, kept.states, step)
     with offloaded(state) if kept is not None and kept.offload else contextlib.nullcontext():
         return advance(state, n)
+
+
+def takes_all_blocks(grid: Grid, state: State) -> bool:
+    """Whether the pool of a call without gradients has room for all blocks of the domain, so that nobody looks whether
+    it must grow: where there are few, and a kernel takes many steps of few particles (csrc/rollout/persistent.h)."""
+    if not (grid.grows and state.x.is_cuda and grid.block_count <= FEW_BLOCKS and grid.max_blocks is not None):
+        return False
+    # The pool has a half more than was active. Half of these blocks have particles, some of them more than one item.
+    return grid.max_blocks / 3 + len(state) / 160 <= FEW_ITEMS
 
 
 def wants_gradient(step: Step, state: State) -> bool:
@@ -271,9 +285,11 @@ def _differentiable(step: Step, state: State) -> list[Tensor]:
     return [*(t for t in fields if t is not None), *gravity, *step.law.parameters(), *step.law.buffers()]
 
 
-def substeps(step: Step, state: State, n: int, dt: float | Tensor, records: bool = False) -> State:
+def substeps(
+    step: Step, state: State, n: int, dt: float | Tensor, records: bool = False, all_blocks: bool = False
+) -> State:
     """The state n steps later, by one op; `obstacle_to_substeps` must be None. It `records` what gradients need, if it
-    has any, or takes the steps again.
+    has any, or takes the steps again. The pool has room for `all_blocks` of the domain, or follows the scene.
 
     Raises:
         ValueError: for a dt that is not positive and finite, or a material without a law.
@@ -281,7 +297,7 @@ def substeps(step: Step, state: State, n: int, dt: float | Tensor, records: bool
     """
 
     def advanced(state: State, dt: float | Tensor) -> State:
-        return _substeps(step, state, n, dt, records)
+        return _substeps(step, state, n, dt, records, all_blocks)
 
     return paused(advanced, step._activations, step.prepare(state), dt, step.grid.scenes, n)
 
@@ -298,11 +314,12 @@ def _clocks(state: State, dt: float | Tensor, scenes: int) -> tuple[float, Tenso
     return 1.0, each(dt), each(state.time)
 
 
-def _substeps(step: Step, state: State, n: int, dt: float | Tensor, records: bool) -> State:
+def _substeps(step: Step, state: State, n: int, dt: float | Tensor, records: bool, all_blocks: bool) -> State:
     """`substeps` of a prepared state, where no scene is paused."""
     grid, record = step.grid, step._activations
     number, scene_dt, scene_time = _clocks(state, dt, grid.scenes)
-    max_blocks = grid.pool(state.x, state.scene)
+    pool = grid.pool(state.x, state.scene)
+    max_blocks = grid.block_count if all_blocks else pool
     given: Any = Overlay(state, dt=dt)
     calls = law_calls(step.law, given)
     apic = step.transfer == "apic"

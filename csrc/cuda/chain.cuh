@@ -27,23 +27,48 @@ __device__ inline void wait_for_kernel_before() {
 #endif
 }
 
-// The kernel must call wait_for_kernel_before() first of all.
 template <class... Parameters, class... Arguments>
-void launch_in_chain(void (*kernel)(Parameters...), unsigned blocks, unsigned threads, size_t shared_memory,
-                     cudaStream_t stream, const Arguments&... arguments) {
-  if (!waits_for_kernel_before(kernel)) return launch(kernel, blocks, threads, shared_memory, stream, arguments...);
+void launch_with(cudaLaunchAttribute* attributes, unsigned count, void (*kernel)(Parameters...), unsigned blocks,
+                 unsigned threads, size_t shared_memory, cudaStream_t stream, const Arguments&... arguments) {
   allow_shared_memory(kernel, shared_memory);
-  cudaLaunchAttribute overlap;
-  overlap.id = cudaLaunchAttributeProgrammaticStreamSerialization;
-  overlap.val.programmaticStreamSerializationAllowed = 1;
   cudaLaunchConfig_t config{};
   config.gridDim = blocks;
   config.blockDim = threads;
   config.dynamicSmemBytes = shared_memory;
   config.stream = stream;
-  config.attrs = &overlap;
-  config.numAttrs = 1;
+  config.attrs = attributes;
+  config.numAttrs = count;
   check(cudaLaunchKernelEx(&config, kernel, Parameters(arguments)...));
+}
+
+inline cudaLaunchAttribute overlap_attribute() {
+  cudaLaunchAttribute overlap;
+  overlap.id = cudaLaunchAttributeProgrammaticStreamSerialization;
+  overlap.val.programmaticStreamSerializationAllowed = 1;
+  return overlap;
+}
+
+// The kernel must call wait_for_kernel_before() first of all.
+template <class... Parameters, class... Arguments>
+void launch_in_chain(void (*kernel)(Parameters...), unsigned blocks, unsigned threads, size_t shared_memory,
+                     cudaStream_t stream, const Arguments&... arguments) {
+  if (!waits_for_kernel_before(kernel)) return launch(kernel, blocks, threads, shared_memory, stream, arguments...);
+  cudaLaunchAttribute overlap = overlap_attribute();
+  launch_with(&overlap, 1, kernel, blocks, threads, shared_memory, stream, arguments...);
+}
+
+constexpr unsigned kLargestCluster = 16;
+
+// As launch_together(), for at most kLargestCluster thread blocks, whose barriers take a third of the time; in a chain
+// like launch_in_chain(). Of kernels for which waits_for_kernel_before().
+template <class... Parameters, class... Arguments>
+void launch_as_cluster(void (*kernel)(Parameters...), unsigned blocks, unsigned threads, size_t shared_memory,
+                       cudaStream_t stream, const Arguments&... arguments) {
+  check(cudaFuncSetAttribute(kernel, cudaFuncAttributeNonPortableClusterSizeAllowed, 1));
+  cudaLaunchAttribute attributes[2] = {overlap_attribute()};
+  attributes[1].id = cudaLaunchAttributeClusterDimension;
+  attributes[1].val.clusterDim = {blocks, 1, 1};
+  launch_with(attributes, 2, kernel, blocks, threads, shared_memory, stream, arguments...);
 }
 
 }  // namespace mpm::cuda

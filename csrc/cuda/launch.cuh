@@ -48,14 +48,15 @@ void launch(void (*kernel)(Parameters...), unsigned blocks, unsigned threads, si
 
 // Thread blocks that run all at once and may wait for each other, as many as the device takes of `blocks`.
 template <class... Parameters, class... Arguments>
-void launch_together(void (*kernel)(Parameters...), unsigned blocks, unsigned threads, cudaStream_t stream,
-                     Arguments... arguments) {
+void launch_together(void (*kernel)(Parameters...), unsigned blocks, unsigned threads, size_t shared_memory,
+                     cudaStream_t stream, Arguments... arguments) {
+  allow_shared_memory(kernel, shared_memory);
   int fitting = 0;
-  check(cudaOccupancyMaxActiveBlocksPerMultiprocessor(&fitting, kernel, int(threads), 0));
+  check(cudaOccupancyMaxActiveBlocksPerMultiprocessor(&fitting, kernel, int(threads), shared_memory));
   const unsigned most = unsigned(fitting * device_attribute(cudaDevAttrMultiProcessorCount));
   void* pointers[] = {&arguments...};
   check(cudaLaunchCooperativeKernel(reinterpret_cast<const void*>(kernel), std::clamp(blocks, 1u, most), threads,
-                                    pointers, 0, stream));
+                                    pointers, shared_memory, stream));
 }
 
 }  // namespace mpm::cuda

@@ -1,11 +1,10 @@
-#include <cooperative_groups.h>
-
 #include <climits>
 #include <cub/block/block_scan.cuh>
 #include <cub/device/device_radix_sort.cuh>
 
+#include "cuda/barrier.cuh"
 #include "cuda/base_block.cuh"
-#include "cuda/launch.cuh"
+#include "cuda/chain.cuh"
 #include "grid/activate.h"
 #include "grid/status.h"
 
@@ -24,9 +23,10 @@ namespace {
 
 constexpr int kThreads = 256;
 constexpr int kManyTiles = 512;  // of which a list is worth two more kernels
-// Every kSampling-th thread block counts the base blocks met by its warps. More than kScattered per warp on average,
-// and the gathers are faster in the order of memory than block by block.
-constexpr int kSampling = 64, kScattered = 2;
+// Every kSampling-th thread block counts the base blocks met by its warps. More than 7/5 per warp on average, and the
+// gathers are faster in the order of memory than block by block.
+constexpr int kSampling = 64;
+__device__ bool is_scattered(int groups, int warps) { return 5 * groups > 7 * warps; }
 using Packed = unsigned long long;
 
 // Zeroed before each activation.
@@ -441,7 +441,7 @@ __device__ void place(const ActivateArguments<T, D>& a, const Workspace& w, int6
   const Schedule<int> schedule = lay_out_schedule<D>(a.schedule, a.slots(), a.particles);
   if (i == 0) {
     *schedule.item_count = c.items;
-    *schedule.scattered = c.groups > kScattered * c.warps;
+    *schedule.scattered = is_scattered(c.groups, c.warps);
   }
   if (i <= a.scenes) write_status(a, w, int(i));
   const bool with_particles = i < min(c.wanted, a.max_blocks);
@@ -497,6 +497,7 @@ __global__ void __launch_bounds__(kThreads) place_kernel(const ActivateArguments
 template <int Order, class T, int D>
 __global__ void __launch_bounds__(kThreads)
     activate_at_once(const ActivateArguments<T, D> a, const Workspace w, int table, int64_t rows) {
+  wait_for_kernel_before();
   const int64_t start = int64_t(blockIdx.x) * kThreads + threadIdx.x, stride = int64_t(gridDim.x) * kThreads;
   if (a.drift && !a.fresh && a.drift->lasts(a.particles)) {
     for (int64_t row = start; row <= a.scenes; row += stride) {
@@ -506,27 +507,26 @@ __global__ void __launch_bounds__(kThreads)
     }
     return;
   }
-  const auto all = cooperative_groups::this_grid();
   if (w.marked) take_back(a, w, table);
   int4* const workspace = static_cast<int4*>(a.workspace);
   for (int64_t i = start; i < (w.marked ? w.zeroed : w.zeroed_once) / int64_t(sizeof(int4)); i += stride)
     workspace[i] = {};
-  all.sync();
+  wait_for_all();
   for (int64_t piece = blockIdx.x; piece * kThreads < a.particles; piece += gridDim.x) {
     if (w.marked)
       classify<Order, true>(a, w, piece);
     else
       classify<Order, false>(a, w, piece);
   }
-  all.sync();
+  wait_for_all();
   if (w.marked) {
     if (blockIdx.x == 0) list_tiles<kThreads>(w);
-    all.sync();
+    wait_for_all();
   }
   slots<true, true>(a, w, table);
-  all.sync();
+  wait_for_all();
   offsets<true>(a, w, table);
-  all.sync();
+  wait_for_all();
   for (int64_t i = start; i < rows; i += stride) place(a, w, i);
 }
 
@@ -546,8 +546,12 @@ void activate(const ActivateArguments<T, D>& a, Stream stream) {
   // Of slots with their end, or of the status; and of particles.
   const int64_t rows = std::max(a.particles, int64_t(std::max(a.slots(), a.scenes)) + 1);
   if ((a.drift && !a.fresh) || (!w.marked && !a.deterministic)) {
-    launch_together(activate_at_once<Order, T, D>, blocks_for(std::max<int64_t>(rows, w.marked ? 0 : table)), kThreads,
-                    stream, a, w, table, rows);
+    const auto kernel = activate_at_once<Order, T, D>;
+    const unsigned blocks = blocks_for(std::max<int64_t>(rows, w.marked ? 0 : table));
+    if (blocks <= kLargestCluster && waits_for_kernel_before(kernel))
+      launch_as_cluster(kernel, blocks, kThreads, 0, stream, a, w, table, rows);
+    else
+      launch_together(kernel, blocks, kThreads, 0, stream, a, w, table, rows);
     return;
   }
   // Of the tiles listed no more have to run at once than the device takes.

@@ -1,5 +1,6 @@
 #include <cooperative_groups.h>
 
+#include "cuda/barrier.cuh"
 #include "cuda/launch.cuh"
 #include "heat/operator.cuh"
 #include "heat/scene.cuh"
@@ -113,18 +114,7 @@ struct HeatKernel {
     return __syncthreads_or(any);
   }
 
-  // Barrier of the grid. That of cooperative groups asks for the last block without a pause, which slows down those
-  // that are still at work.
-  __device__ void wait_for_all() const {
-    __syncthreads();
-    if (threadIdx.x == 0) {
-      __threadfence();
-      const unsigned all = (atomicAdd(w.arrived, 1) / gridDim.x + 1) * gridDim.x;
-      while (int(*static_cast<volatile unsigned*>(w.arrived) - all) < 0) __nanosleep(50);
-      __threadfence();
-    }
-    __syncthreads();
-  }
+  __device__ void wait_for_all() const { wait_for_blocks(w.arrived, gridDim.x); }
 
   __device__ const Item* items() const { return reinterpret_cast<const Item*>(schedule_of(a.topology).items); }
   __device__ int scene_of_item(int item) const { return scene_of(a.topology, items()[item].block); }

@@ -2,6 +2,7 @@
 #define MPM_REGISTER_LAW(Law) static const bool Law##_is_entered = enter<cuda::LawLaunches, Law>(0);
 
 #include "laws/registry.h"
+#include "rollout/persistent.cuh"
 #include "rollout/resident.cuh"
 
 namespace mpm::cuda {
@@ -61,29 +62,102 @@ __global__ void __launch_bounds__(Law::gpu_threads)
   if (p < a.law.particles && a.law.members.has(p)) Law::template Kernels<Law>::energy_double_backward(a, One<T>{p});
 }
 
-// The momentum of particles whose stress is computed as they are loaded, and kept where it has a place.
-template <class Law, class T, int D>
+// Entries of the history of a law, side by side.
+template <class Law, int D>
+constexpr int history_entries() {
+  int entries = 0;
+  for (const Quantity& variable : Law::history) entries += variable.matrix ? D * D : 1;
+  return entries;
+}
+
+// The momentum of particles whose stress is computed as they are loaded, and kept where it has a place. Where it may
+// move them, F or J are moved first if the G2P before has left that.
+template <class Law, class T, int D, bool MayMove>
 struct LawMomentumSource : MomentumSource<2, T, D, Stress::moment, true> {
   using Base = MomentumSource<2, T, D, Stress::moment, true>;
-  static constexpr int resident = Law::gpu_p2g_blocks;
+  using Kernels = typename Law::template Kernels<Law>;
+  static constexpr bool moves_F = Law::field == Deformation::gradient;
+  static constexpr int resident = Law::gpu_p2g_blocks, entries = history_entries<Law, D>();
   LawUpdateArguments<T, D> law;
+  LateDeformation<T, D> late;
 
-  LawMomentumSource(const P2GArguments<T, D>& a, const LawUpdateArguments<T, D>& law) : Base(a), law(law) {}
+  // What the law leaves of a particle.
+  struct Changes {
+    Matrix<T, D> F;
+    T J, history[entries > 0 ? entries : 1];
+  };
 
-  __device__ Matrix<T, D> update(int p) const {
+  LawMomentumSource(const P2GArguments<T, D>& a, const LawUpdateArguments<T, D>& law,
+                    const LateDeformation<T, D>& late = {})
+      : Base(a), law(law), late(late) {}
+
+  // The stress, and what is to be kept.
+  __device__ Matrix<T, D> evaluate(int p, const Matrix<T, D>& C, const T& dt, Changes& changes) const {
+    const One<T> at{p};
     Matrix<T, D> stress;
     LawUpdateArguments<T, D> a = law;
     a.stress = {&stress[0][0], {0, D, 1}};
-    Law::template Kernels<Law>::update(a, One<T>{p});
-    if (law.stress.pointer) store_matrix<D>(One<T>{p}, law.stress, stress);
+    if constexpr (moves_F) {
+      changes.F = load_matrix<D>(at, law.law.state);
+      if (late.moves) changes.F = advance_deformation(changes.F, C, dt);
+      a.law.state = {&changes.F[0][0], {0, D, 1}};
+      if (Law::plastic) a.state = {&changes.F[0][0], {0, D, 1}};
+    } else {
+      changes.J = load_scalar(at, law.law.state);
+      if (late.moves) changes.J = advance_volume_ratio(changes.J, C, dt);
+      a.law.state = {&changes.J, {0}};
+    }
+    if (entries > 0 && law.history.pointer) a.history = {changes.history, {0, 1}};
+    Kernels::update(a, at);
+    if (law.stress.pointer) store_matrix<D>(at, law.stress, stress);
     return stress;
+  }
+  __device__ void keep(int p, const Changes& changes) const {
+    const One<T> at{p};
+    const Field<T>& state = Law::plastic ? law.state : late.state;
+    if (state.pointer) {
+      if constexpr (moves_F)
+        store_matrix<D>(at, state, changes.F);
+      else
+        store_scalar(at, state, changes.J);
+    }
+    if (!law.history.pointer) return;
+#pragma unroll
+    for (int k = 0; k < entries; k++) store_entry(at, law.history, k, changes.history[k]);
+  }
+  __device__ Matrix<T, D> update(int p, const Matrix<T, D>& C, const T& dt) const {
+    if constexpr (MayMove) {
+      Changes changes;
+      const Matrix<T, D> stress = evaluate(p, C, dt, changes);
+      keep(p, changes);
+      return stress;
+    } else {
+      Matrix<T, D> stress;
+      LawUpdateArguments<T, D> a = law;
+      a.stress = {&stress[0][0], {0, D, 1}};
+      Kernels::update(a, One<T>{p});
+      if (law.stress.pointer) store_matrix<D>(One<T>{p}, law.stress, stress);
+      return stress;
+    }
   }
   __device__ ParticleMomentum<T, D> load(int p, int scene) const {
     ParticleMomentum<T, D> m = Base::fields.read(p, scene, true, true);
-    m.stress = update(p);
+    m.stress = update(p, m.affine, m.dt);
     return m;
   }
-  __device__ void leave_out(int p) const { update(p); }
+  // The same, with what is to be kept left to the caller.
+  __device__ ParticleMomentum<T, D> load(int p, int scene, Changes& changes) const {
+    ParticleMomentum<T, D> m = Base::fields.read(p, scene, true, true);
+    m.stress = evaluate(p, m.affine, m.dt, changes);
+    return m;
+  }
+  // Outside the grid G2P has left an affine field of zero or, where a position is not finite, none that may move F.
+  __device__ void leave_out(int p) const {
+    const int scene = late.scene ? late.scene[p * late.scene_stride] : 0;
+    const auto m = Base::fields.read(p, unsigned(scene) < unsigned(Base::topology.scenes) ? scene : 0, true, true);
+    const bool finite = is_finite<D>(read_vector(Base::position, p).e);
+    update(p, finite ? m.affine : zero_matrix<T, D>(), m.dt);
+  }
 };
 
 // Of float alone: in double the kernels would take all registers.
@@ -92,12 +166,20 @@ struct FusedLaunch {};
 
 template <class Law, int D>
 struct FusedLaunch<Law, float, D> {
-  static void p2g(const LawUpdateArguments<float, D>& law, const P2GArguments<float, D>& a, void* stream) {
-    launch_scatter(LawMomentumSource<Law, float, D>(a, law), false, static_cast<Stream>(stream));
+  static void p2g(const LawUpdateArguments<float, D>& law, const LateDeformation<float, D>& late,
+                  const P2GArguments<float, D>& a, void* stream) {
+    launch_scatter(LawMomentumSource<Law, float, D, true>(a, law, late), false, static_cast<Stream>(stream));
   }
+#if CUDART_VERSION >= 13000
+  static void persistent(const LawUpdateArguments<float, D>& law, const PersistentArguments<float, D>& a,
+                         void* stream) {
+    launch_persistent(LawMomentumSource<Law, float, D, true>(a.p2g, law, a.late),
+                      AdvanceGather<2, float, D, false, true, false>(a.advance), a, static_cast<Stream>(stream));
+  }
+#endif
   static void resident(const LawUpdateArguments<float, D>& law, const ResidentArguments<float, D>& a, void* stream) {
-    launch_resident(LawMomentumSource<Law, float, D>(a.p2g, law), AdvanceGather<2, float, D, false, false>(a.advance),
-                    a, static_cast<Stream>(stream));
+    launch_resident(LawMomentumSource<Law, float, D, false>(a.p2g, law),
+                    AdvanceGather<2, float, D, false, false>(a.advance), a, static_cast<Stream>(stream));
   }
 };
 

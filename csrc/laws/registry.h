@@ -4,6 +4,7 @@
 #include <vector>
 
 #include "laws/law.h"
+#include "rollout/persistent.h"
 #include "rollout/resident.h"
 
 // The laws that were compiled, with their kernels: the only list of them. Each object file of laws/law.cpu.cpp and
@@ -30,8 +31,11 @@ struct LawKernels {
   void (*scalar)(const LawScalarArguments<T, D>&, void* stream) = nullptr;
   void (*energy_backward)(const LawEnergyBackwardArguments<T, D>&, void* stream) = nullptr;
   void (*energy_double_backward)(const LawEnergyDoubleBackwardArguments<T, D>&, void* stream) = nullptr;
-  // Update and P2G in one, the stress in registers: of quadratic weights and the MLS form, on CUDA.
-  void (*p2g)(const LawUpdateArguments<T, D>&, const P2GArguments<T, D>&, void* stream) = nullptr;
+  // Motion of F or J, update and P2G in one, the stress in registers: of quadratic weights and the MLS form, on CUDA.
+  void (*p2g)(const LawUpdateArguments<T, D>&, const LateDeformation<T, D>&, const P2GArguments<T, D>&,
+              void* stream) = nullptr;
+  // Substeps of few particles, of quadratic weights and the MLS form, on CUDA 13.
+  void (*persistent)(const LawUpdateArguments<T, D>&, const PersistentArguments<T, D>&, void* stream) = nullptr;
   // All substeps of small scenes, of quadratic weights and the MLS form, on CUDA.
   void (*resident)(const LawUpdateArguments<T, D>&, const ResidentArguments<T, D>&, void* stream) = nullptr;
   void (*tangent)(const LawTangentArguments<T, D>&, void* stream) = nullptr;
@@ -104,6 +108,7 @@ void fill_kernels(LawEntry& entry) {
     kernels.energy_backward = K::energy_backward;
     if constexpr (Law::has_tangent) kernels.tangent = K::tangent;
     if constexpr (requires { &K::p2g; }) kernels.p2g = &K::p2g;
+    if constexpr (requires { &K::persistent; }) kernels.persistent = &K::persistent;
     if constexpr (requires { &K::resident; }) kernels.resident = &K::resident;
     if constexpr (Law::twice_differentiable) kernels.double_backward = K::double_backward;
     if constexpr (Law::twice_differentiable_energy) kernels.energy_double_backward = K::energy_double_backward;

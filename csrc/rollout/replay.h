@@ -123,14 +123,22 @@ class Recorder {
     device_ = device;
   }
 
-  // The kinds of its nodes, which an update cannot change.
-  static std::vector<cudaGraphNodeType> shape_of_graph(cudaGraph_t graph) {
+  // The kinds of its nodes and the clusters of its kernels, which an update cannot change.
+  static std::vector<int> shape_of_graph(cudaGraph_t graph) {
     size_t count = 0;
     check(cudaGraphGetNodes(graph, nullptr, &count));
     std::vector<cudaGraphNode_t> nodes(count);
     check(cudaGraphGetNodes(graph, nodes.data(), &count));
-    std::vector<cudaGraphNodeType> shape(count);
-    for (size_t k = 0; k < count; k++) check(cudaGraphNodeGetType(nodes[k], &shape[k]));
+    std::vector<int> shape;
+    for (cudaGraphNode_t node : nodes) {
+      cudaGraphNodeType type;
+      check(cudaGraphNodeGetType(node, &type));
+      shape.push_back(int(type));
+      if (type != cudaGraphNodeTypeKernel) continue;
+      cudaLaunchAttributeValue cluster{};
+      check(cudaGraphKernelNodeGetAttribute(node, cudaLaunchAttributeClusterDimension, &cluster));
+      shape.push_back(int(cluster.clusterDim.x));
+    }
     return shape;
   }
 
@@ -142,19 +150,21 @@ class Recorder {
   int device_ = -1;
   cudaStream_t stream_ = nullptr;
   cudaGraphExec_t executable_ = nullptr;
-  std::vector<cudaGraphNodeType> shape_;
+  std::vector<int> shape_;
 };
 
 constexpr int64_t kLeastReplays = 6;  // which a recording has to save its own time
+
+inline bool is_recorded(cudaStream_t stream) {
+  cudaStreamCaptureStatus status = cudaStreamCaptureStatusActive;
+  return cudaStreamIsCapturing(stream, &status) != cudaSuccess || status != cudaStreamCaptureStatusNone;
+}
 
 // How often `work(stream)` was replayed: `times`, or never where a recording would not pay or the stream is recorded
 // itself. It must be kernels, copies and memory that is set, alone.
 template <class Work>
 int64_t replay(int64_t times, cudaStream_t stream, const Work& work) {
-  cudaStreamCaptureStatus status = cudaStreamCaptureStatusActive;
-  if (times < kLeastReplays || cudaStreamIsCapturing(stream, &status) != cudaSuccess ||
-      status != cudaStreamCaptureStatusNone)
-    return 0;
+  if (times < kLeastReplays || is_recorded(stream)) return 0;
   Recorder& recorder = Recorder::of_this_thread();
   recorder.record(work);
   for (int64_t k = 0; k < times; k++) recorder.launch(stream);

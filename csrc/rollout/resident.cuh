@@ -199,10 +199,13 @@ class SceneStep {
 
   // Without spilling it leaves an empty table for the one that spills.
   __device__ bool find_more(int64_t step) {
-    if constexpr (Spills) return take_more(step);
-    for (int b = threadIdx.x; b < geometry().blocks_per_scene; b += blockDim.x) table[b] = -1;
-    __syncthreads();
-    return false;
+    if constexpr (Spills) {
+      return take_more(step);
+    } else {
+      for (int b = threadIdx.x; b < geometry().blocks_per_scene; b += blockDim.x) table[b] = -1;
+      __syncthreads();
+      return false;
+    }
   }
 
   __device__ bool take_more(int64_t step) {
@@ -541,7 +544,7 @@ MPM_HD int64_t bytes_of_table(int64_t blocks) {
 
 // Substeps of a scene from one on; returns where they end, before the last for want of shared memory alone.
 template <class Step>
-__device__ int64_t run_scene(Step& s, int64_t step) {
+__device__ __forceinline__ int64_t run_scene(Step& s, int64_t step) {
   s.touch_all();
   __syncthreads();
 #pragma unroll 1
@@ -565,7 +568,8 @@ __device__ int64_t run_scene(Step& s, int64_t step) {
 // One thread block per scene, and one for particles outside. `shared` are the bytes of dynamic shared memory.
 template <class Source, class Task, class T, int D>
 __global__ void __launch_bounds__(kResidentThreads)
-    resident_kernel(const Source source, const Task task, const ResidentArguments<T, D> a, int shared) {
+    resident_kernel(const __grid_constant__ Source source, const __grid_constant__ Task task,
+                    const __grid_constant__ ResidentArguments<T, D> a, int shared) {
   using S = ResidentShape<typename Source::Shape>;
   using Blocks = SceneBlocks<T, D>;
   using Rows = SharedParticles<S>;

@@ -258,6 +258,7 @@ struct Substeps {
   NextGridArguments<T, D> next;   // of these; its update and contact are those here
   Tensor impulse, impulse_slots;  // on obstacles and walls so far; where someone asks, see `add_impulses_to`
   bool obstacles = false, fused = false;
+  LateDeformation<T, D> late;    // of P2G, where a G2P leaves F and J to the next one
   bool nodes_are_clear = false;  // when a step begins
   const int* previous_status = nullptr;
 
@@ -278,6 +279,16 @@ struct Substeps {
     p2g.affine = in.apic ? p.C : Field<const T>{};
     advance.F = plastic ? constant(mapped) : p.F;
     advance.J = p.J;
+  }
+
+  // In place of what read() and write() say of F and J: P2G moves them into `state` if a G2P `has_left` that, and G2P
+  // leaves them to the next P2G unless it is the last.
+  void move_late(const Field<T>& state, bool has_left, bool last) {
+    late = {state, has_left, activation.scene, activation.scene_stride};
+    advance.late = !last;
+    const bool is_F = calls[0].law->info.field == Deformation::gradient;
+    (is_F ? advance.F : advance.J) = constant(state);
+    (is_F ? advance.F_next : advance.J_next) = state;
   }
 
   // Where it leaves its results.
@@ -321,7 +332,7 @@ struct Substeps {
     p2g.drifted = true;
     next.particles = in.x.size(0);
     next.obstacles = obstacles && !impulse.defined();  // whose impulses want the velocities before contact
-    const int64_t most = std::min<int64_t>(update.block_count, INT32_MAX / kBlockNodes<D>) - activation.max_blocks;
+    const int64_t most = std::min<int64_t>(update.block_count, INT32_MAX / kBlockNodes<D> - activation.max_blocks);
     activation.margin_blocks = int(std::clamp<int64_t>(activation.max_blocks / 2 + 64, 0, std::max<int64_t>(most, 0)));
   }
 
@@ -330,6 +341,23 @@ struct Substeps {
     fused = calls.size() == 1 && !has(in.material) && in.lattice.order() == 2 && !in.lattice.deterministic() &&
             p2g.form == StressForm::mls && calls[0].law->kernels<T, D>().p2g;
     if (fused && !keeps_stress) forget_stress();
+  }
+
+  // Whether P2G moves F or J, which it needs the affine field and a kernel of the law for. Not of particles that caches
+  // do not hold: these drift apart in memory, where G2P can go in its order and P2G cannot.
+  bool may_move_late() const {
+    return fused && drifts.defined() && in.apic && has(in.F) != has(in.J) && in.x.size(0) <= kMostLateParticles;
+  }
+
+  // Whether a kernel takes many substeps of few particles, all but the first and the last of a call. It pays where a
+  // wave of thread blocks has an item each, as where the pool is small; one that grows and has room for all blocks is
+  // meant for it (`takes_all_blocks` in torch_mpm/rollouts.py).
+  bool persists() const {
+    const int64_t P = in.x.size(0);
+    if (!may_move_late() || !in.resident || in.n < kLeastPersistentSteps + 2) return false;
+    if (!next.emptied || (obstacles && !next.obstacles)) return false;
+    const bool few = in.grows ? in.max_blocks == update.block_count : in.max_blocks <= kMostPersistentBlocks;
+    return few && P > 0 && P <= kMostPersistentParticles && calls[0].law->kernels<T, D>().persistent;
   }
 
   void forget_stress() {
@@ -394,7 +422,7 @@ struct Substeps {
   void move_grid(backend::Stream stream) {
     if (!next.emptied && !nodes_are_clear) backend::clear(pool.nodes, stream);
     if (fused)
-      calls[0].law->kernels<T, D>().p2g(laws[0], p2g, stream);
+      calls[0].law->kernels<T, D>().p2g(laws[0], late, p2g, stream);
     else
       backend::p2g(in.lattice.order(), p2g, stream);
     if (impulse.defined() && !in.wall_kind.empty()) backend::wall_impulses(wall_impulses(), stream);

@@ -44,6 +44,44 @@ void take_resident(Substeps<T, D>& s, int64_t n, double time, const int* activat
 }
 #endif
 
+#if MPM_BACKEND == MPM_BACKEND_IS_cuda && CUDART_VERSION >= 13000
+// Substeps from the second on until the last alone is left, of particles that move in place. The status of the first is
+// in `status`, and is that of all of them in the end.
+template <class T, int D>
+void take_persistent(Substeps<T, D>& s, int* activated, int* status, backend::Stream stream) {
+  const SubstepsInputs& in = s.in;
+  PersistentArguments<T, D> a{s.p2g, s.late, s.advance, s.update, s.contact, s.obstacles, s.activation.max_blocks};
+  Tensor more = empty(in.x, {2 * s.pool.nodes.size(0), 1 + D});
+  backend::clear(more, stream);
+  a.nodes[0] = static_cast<T*>(s.pool.nodes.data_ptr());
+  a.nodes[1] = static_cast<T*>(more.data_ptr());
+  a.nodes[2] = a.nodes[1] + s.pool.nodes.size(0) * (1 + D);
+  a.steps = int(in.n - 2);
+  if (s.contact.step_time) a.step_time = s.contact.step_time + 1;
+  a.contact.step_time = nullptr;
+  if (s.scene_time.defined()) {
+    a.scene_time = static_cast<T*>(s.scene_time.data_ptr());
+    a.scene_dt = static_cast<const T*>(in.scene_dt->data_ptr());
+  }
+  Tensor state = empty_int(in.x, {int64_t(sizeof(PersistentState) / sizeof(int))}), arrived = empty_int(in.x, {1});
+  backend::clear(state, stream);
+  a.state = reinterpret_cast<PersistentState*>(state.data_ptr());
+  a.arrived = static_cast<unsigned*>(arrived.data_ptr());
+  a.drift = s.advance.drift;
+  a.activated = activated;
+  a.status = status;
+  s.activation.drift = a.drift;
+  s.activation.previous_status = status;
+  s.activation.status = activated;
+  repeat(stream, [&](cudaStream_t on, unsigned long long condition) {
+    a.loop = condition;
+    s.find_blocks(on);
+    backend::clear(arrived, on);
+    s.calls[0].law->template kernels<T, D>().persistent(s.laws[0], a, on);
+  });
+}
+#endif
+
 using Results = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
 
 // Everything that the adjoint reads is kept. Nothing where there is no room, and it has to be told when that was.
@@ -89,11 +127,12 @@ Results substeps(MPM_SUBSTEPS_PARAMETERS) {
   }
   Tensor x_[] = {empty_particles(x, {P, D_}), result(x, n > 1, {P, D_})};
   Tensor F_[] = {result(x, has(F), {P, D_, D_}), Tensor()};
-  Tensor J_[] = {result(x, has(J), {P}), result(x, has(J) && n > 1, {P})};
+  Tensor J_[] = {result(x, has(J), {P}), Tensor()};
   Tensor v_ = empty_particles(x, {P, D_}), C_ = result(x, wants_C, {P, D_, D_}), history_;
   Tensor status[] = {empty_int(x, {1 + scenes, kStatusSize}), empty_int(x, {1 + scenes, kStatusSize})};
   Tensor impulse_, time_;
   int64_t step = 0;
+  int last = 0;        // of the two buffers, that of the last step
   bool taken = false;  // by resident scenes, all steps
   const auto start_in_results = [&] {
     torch::stable::copy_(x_[0], x);
@@ -139,15 +178,18 @@ Results substeps(MPM_SUBSTEPS_PARAMETERS) {
       return;
     }
 #endif
-    F_[1] = result(x, has(F) && (n > 1 || s.plastic), {P, D, D});
-    if (s.plastic && has(F)) {  // which laws change where it stands
+    if (n > 1) s.let_activations_last();
+    s.fuse(false);
+    const bool late = s.may_move_late();  // where they stand
+    F_[1] = late ? F_[0] : result(x, has(F) && (n > 1 || s.plastic), {P, D, D});
+    J_[1] = late ? J_[0] : result(x, has(J) && n > 1, {P});
+    if (s.plastic && has(F) && !late) {  // which laws change where it stands
       torch::stable::copy_(F_[1], *F);
       from.F = field<const T>(F_[1]);
     }
-    if (n > 1) s.let_activations_last();
-    s.fuse(false);
     s.make_pool(stream);
     s.count_time(before, stream);
+    bool first = true;
     // A substep that reads and writes these buffers in turn, into the first or the second.
     const auto take = [&](int into, bool last, backend::Stream on) {
       int* const now = static_cast<int*>(status[into].data_ptr());
@@ -155,16 +197,34 @@ Results substeps(MPM_SUBSTEPS_PARAMETERS) {
       s.read(from, field<T>(F_[1 - into]));
       s.write(
           {field<T>(x_[into]), field<T>(v_), field<T>(C_), field<T>(F_[into]), field<T>(J_[into]), field<T>(history_)});
+      if (late) s.move_late(field<T>(has(F) ? F_[0] : J_[0]), !first, last);
       if (!s.activate(before, now, on)) return false;  // and the status tells
       s.move(on);
       before = now;
+      first = false;
       // From here on the call reads what it has written.
       from = {field<const T>(x_[into]), field<const T>(v_),       field<const T>(C_),
               field<const T>(F_[into]), field<const T>(J_[into]), field<const T>(history_)};
       return true;
     };
+#if MPM_BACKEND == MPM_BACKEND_IS_cuda && CUDART_VERSION >= 13000
+    if (s.persists() && !is_recorded(stream)) {
+      take(0, false, stream);
+      const Particles<T> in_place{field<T>(x_[0]), field<T>(v_),    field<T>(C_),
+                                  field<T>(F_[0]), field<T>(J_[0]), field<T>(history_)};
+      s.read(from, in_place.F);
+      s.write(in_place);
+      s.move_late(has(F) ? in_place.F : in_place.J, true, false);
+      take_persistent(s, static_cast<int*>(status[1].data_ptr()), static_cast<int*>(status[0].data_ptr()), stream);
+      take(1, true, stream);
+      last = 1;
+      step = n;
+      return;
+    }
+#endif
     with_team(P * n, [&] {
       while (step < n && take(int(step % 2), step + 1 == n, stream)) {
+        last = int(step % 2);
         if (++step == 2)
           step += 2 * replay((n - step - 1) / 2, stream,
                              [&](backend::Stream on) { take(0, false, on), take(1, false, on); });
@@ -175,7 +235,6 @@ Results substeps(MPM_SUBSTEPS_PARAMETERS) {
     if (!taken) start_in_results();  // the first activation found no room
     return {x_[0], v_, C_, F_[0], J_[0], history_, status[0], impulse_, time_, Tensor()};
   }
-  const int last = int(step + 1) % 2;
   return {x_[last], v_,    C_,      F_[last], J_[last], history_, status[step < n ? 1 - last : last],
           impulse_, time_, Tensor()};
 }

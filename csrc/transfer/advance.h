@@ -44,8 +44,21 @@ struct G2PAdvanceArguments {
   double dt = 0;
   StressForm form = StressForm::mls;
   Field<T> x_next, F_next, J_next;
+  bool late = false;  // F and J are left to P2G, where there is a LateDeformation; on CUDA
   // On CUDA: particles may be in other active blocks than they were activated in, and where they go now is added here.
   Drift* drift = nullptr;
+};
+
+constexpr int64_t kMostLateParticles = 1 << 18;
+
+// The motion of F or J that G2P leaves to the next P2G, which loads them anyway and has the affine field that moves
+// them.
+template <class T, int D>
+struct LateDeformation {
+  Field<T> state;              // where the moved F or J goes, perhaps where it was; absent where G2P moves it itself
+  bool moves = false;          // whether a G2P has left something
+  const int* scene = nullptr;  // [P], where scenes have time steps of their own
+  int64_t scene_stride = 0;
 };
 
 inline namespace TORCH_MPM_ISA {

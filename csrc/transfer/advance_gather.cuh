@@ -5,13 +5,13 @@
 
 namespace mpm::cuda {
 
-// G2P with the end of the step, so that v and C need not be read again.
-template <int Order_, class T_, int D_, bool Gradient, bool Drifts>
+// G2P with the end of the step, so that v and C need not be read again. Where it is not to Move F and J, P2G does.
+template <int Order_, class T_, int D_, bool Gradient, bool Drifts, bool Moves = true>
 struct AdvanceGather {
   using T = T_;
   static constexpr int Order = Order_, D = D_, K = D;
   static constexpr bool drifts = Drifts;
-  static constexpr int resident = Gradient ? 4 : 5;
+  static constexpr int resident = Gradient ? 4 : Moves ? 5 : 6;
   using Shape = SumShape<Order, T, D, K, 0, true, Gradient, SlopeForm::none>;
   struct Loaded {
     mpm::Vector<T, D> x;
@@ -51,14 +51,20 @@ struct AdvanceGather {
         drift(a.drift) {}
 
   __device__ Loaded load(int p, int scene) const {
-    Loaded l;
-    l.x = read_vector(position, p);
+    Loaded l = at(read_vector(position, p), scene);
+    if constexpr (!Moves) return l;
     l.J = J.present() ? J.at(p) : T(0);
-    l.dt = scene_dt.pointer ? dt * scene_dt.pointer[scene * scene_dt.stride[0]] : dt;
 #pragma unroll
     for (int i = 0; i < D; i++)
 #pragma unroll
       for (int j = 0; j < D; j++) l.F[i][j] = F.present() ? F.at(p, i * D + j) : T(0);
+    return l;
+  }
+  // Of a particle at x whose F and J are left alone.
+  __device__ Loaded at(const mpm::Vector<T, D>& x, int scene) const {
+    Loaded l;
+    l.x = x;
+    l.dt = scene_dt.pointer ? dt * scene_dt.pointer[scene * scene_dt.stride[0]] : dt;
     return l;
   }
   template <class Support>
@@ -84,13 +90,14 @@ struct AdvanceGather {
       }
     }
     const mpm::Vector<T, D> x = advance_position(l.x, v, l.dt);
+#pragma unroll
+    for (int i = 0; i < D; i++) x_next.at(p, i) = x[i];
+    if constexpr (!Moves) return x;
     const Matrix<T, D> deformed = advance_deformation(l.F, L, l.dt);
 #pragma unroll
-    for (int i = 0; i < D; i++) {
-      x_next.at(p, i) = x[i];
+    for (int i = 0; i < D; i++)
 #pragma unroll
       for (int j = 0; j < D; j++) F_next.write(p, i * D + j, deformed[i][j]);
-    }
     J_next.write(p, 0, advance_volume_ratio(l.J, L, l.dt));
     return x;
   }
@@ -105,9 +112,9 @@ struct AdvanceGather {
 #pragma unroll
     for (int k = 0; k < D * D; k++) {
       affine.write(p, k, rest);
-      if (F.present()) F_next.at(p, k) = F.at(p, k);
+      if (Moves && F.present()) F_next.at(p, k) = F.at(p, k);
     }
-    if (J.present()) J_next.at(p) = J.at(p);
+    if (Moves && J.present()) J_next.at(p) = J.at(p);
   }
 };
 

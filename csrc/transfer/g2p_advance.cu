@@ -7,6 +7,9 @@ void g2p_advance(const G2PAdvanceArguments<T, D>& a, Stream stream) {
   const auto with = [&]<bool Gradient, bool Drifts>() {
     launch_gather(AdvanceGather<Order, T, D, Gradient, Drifts>(a), stream);
   };
+  if constexpr (Order == 2 && sizeof(T) == sizeof(float)) {  // as there are kernels of laws in P2G
+    if (a.late) return launch_gather(AdvanceGather<Order, T, D, false, true, false>(a), stream);
+  }
   if (a.form == StressForm::gradient)
     a.drift ? with.template operator()<true, true>() : with.template operator()<true, false>();
   else

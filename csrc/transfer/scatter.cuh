@@ -27,7 +27,8 @@ struct Contribution {
   T gradient[Linear][D];  // of the gradient per cell
 };
 
-template <int Order_, class T_, int D_, int Plain_, int Linear_, bool Gradient_>
+// Slices: threads that share the particles of one cell and leading node.
+template <int Order_, class T_, int D_, int Plain_, int Linear_, bool Gradient_, int Slices = D_ == 2 ? 4 : 1>
 struct ScatterShape {
   using T = T_;
   static constexpr int Order = Order_, D = D_, Plain = Plain_, Linear = Linear_;
@@ -38,7 +39,7 @@ struct ScatterShape {
 
   // Threads.
   static constexpr int cells = kBlockNodes<D>, slab = D == 2 ? support : support * support;
-  static constexpr int slices = D == 2 ? 4 : 1;  // threads that share the particles of one cell and leading node
+  static constexpr int slices = Slices;
   static constexpr int lists = cells * slices, threads = lists * support;
 
   // A particle in shared memory: its distance from the base node along the first axis, the weights along the others but
@@ -247,6 +248,17 @@ __device__ void link_in_order(const SharedParticles<S>& shared, int n) {
   }
 }
 
+template <class S>
+__device__ void empty_lists(int* head) {
+  for (int c = threadIdx.x; c <= S::lists; c += S::threads) head[c] = SharedParticles<S>::end;
+}
+
+// Of particle k of a batch.
+template <class S>
+__device__ int list_of(int k, bool in_block, int cell) {
+  return in_block ? k % S::slices * S::cells + cell : S::lists;
+}
+
 // Loads the particles index[begin, begin + n) of a block into shared memory and links them by cell.
 template <class S, class Source, int Most, class T, int D>
 __device__ void load_particles(const Source& source, const Topology<T, D>& t, int block, BaseBlock<T, D>& base_block,
@@ -255,7 +267,7 @@ __device__ void load_particles(const Source& source, const Topology<T, D>& t, in
   int following = int(threadIdx.x) < n ? t.index[begin + threadIdx.x] : 0;
   if (threadIdx.x == 32) base_block.template set<S::Order>(t, block);
   if (threadIdx.x == 0) strays.count = 0;
-  for (int c = threadIdx.x; c <= S::lists; c += S::threads) shared.head[c] = SharedParticles<S>::end;
+  empty_lists<S>(shared.head);
   __syncthreads();
 #pragma unroll 1
   for (int k = threadIdx.x; k < n; k += S::threads) {
@@ -267,7 +279,7 @@ __device__ void load_particles(const Source& source, const Topology<T, D>& t, in
     const Vector<T, D> x = read_vector(source.position, p);
     const auto loaded = source.load(p, base_block.scene);
     const bool in_block = base_block.template locate<S::Order>(t.geometry, x, cell, f);
-    const int row = SharedParticles<S>::row(k), list = in_block ? k % S::slices * S::cells + cell : S::lists;
+    const int row = SharedParticles<S>::row(k), list = list_of<S>(k, in_block, cell);
     store_particle<S, T, D>(shared, row, f, source.contribution(loaded));
     if (Source::drifts && !in_block) strays.particle[atomicAdd(&strays.count, 1)] = uint16_t(k);
     shared.next[row] = uint16_t(in_order ? list : atomicExch(&shared.head[list], row));
@@ -472,6 +484,58 @@ __device__ void flush_tile(const NodeField<T>& nodes, const int slots[1 << D], c
   }
 }
 
+// Adds the particles in shared memory to the nodes, and lets `strays` add those that are in no list. All threads have
+// to wait before that memory is used again.
+template <class S, class T, class AddStrays>
+__device__ void add_particles(const NodeField<T>& nodes, const SharedParticles<S>& shared, const int* slots,
+                              bool in_order, const AddStrays& add_strays) {
+  Quad<T>* const planes = reinterpret_cast<Quad<T>*>(shared.quads);
+  const Walker<S> walker;
+  T sum[S::slab][S::channels] = {};
+#pragma unroll 1
+  for (int row = shared.head[walker.list]; row != SharedParticles<S>::end;) {
+    const int following = shared.next[row];
+    add_particle(shared, walker, row, sum);
+    row = following;
+  }
+  add_strays();
+  __syncthreads();
+  add_slabs(walker, sum, planes);
+  __syncthreads();
+  flush_tile<S, T, S::D>(nodes, slots, planes, in_order);
+}
+
+// What the thread blocks of P2G have in shared memory beside the particles and the sums, which follow one another
+// there.
+template <class S, bool Drifts>
+struct ScatterMemory {
+  int slots[1 << S::D], head[S::lists + 1];
+  BaseBlock<typename S::T, S::D> base_block;
+  Strays<Drifts ? S::batch : 1> strays;
+};
+
+// Adds the particles of an item to the nodes; `memory` is dynamic shared memory of S::shared_bytes.
+template <class Source>
+__device__ void scatter_item(const Source& source, const Topology<typename Source::Shape::T, Source::Shape::D>& t,
+                             const Item& item, bool in_order, char* memory,
+                             ScatterMemory<typename Source::Shape, Source::drifts>& m) {
+  using S = typename Source::Shape;
+  using T = typename S::T;
+  constexpr int D = S::D;
+  const SharedParticles<S> shared(memory, m.head);
+  const int slot = threadIdx.x < 1 << D ? schedule_of(t).neighbours[(item.slot << D) + threadIdx.x] : -1;
+  for (int begin = item.begin; begin < item.end; begin += S::batch) {
+    load_particles<S>(source, t, item.block, m.base_block, shared, m.strays, begin, min(S::batch, item.end - begin),
+                      in_order);
+    if (threadIdx.x < 1 << D) m.slots[threadIdx.x] = slot;
+    add_particles(source.nodes, shared, m.slots, in_order, [&] {
+      if constexpr (Source::drifts)
+        add_strays<S>(source, t, schedule_of(t), m.base_block.scene, shared, m.strays, begin);
+    });
+    __syncthreads();
+  }
+}
+
 // Source: topology, nodes, position; whether particles may have drifted; load(p, scene), what it needs of a particle;
 // contribution(loaded), what the particle gives; and perhaps leave_out(p) for a particle outside.
 //
@@ -484,15 +548,10 @@ __global__ void __launch_bounds__(Source::Shape::threads, Source::resident)
   constexpr int D = S::D;
   wait_for_kernel_before();
   extern __shared__ __align__(16) char memory[];
-  __shared__ int slots[1 << D], head[S::lists + 1];
-  __shared__ BaseBlock<T, D> base_block;
-  __shared__ Strays<Source::drifts ? S::batch : 1> strays;
-  const SharedParticles<S> shared(memory, head);
-  Quad<T>* const planes = reinterpret_cast<Quad<T>*>(memory);
+  __shared__ ScatterMemory<S, Source::drifts> shared;
   const Topology<T, D>& t = source.topology;
   const Schedule<const int> schedule = schedule_of(t);
   const bool in_order = colour >= 0;
-  const Walker<S> walker;
   const int4* const items = reinterpret_cast<const int4*>(schedule.items);
   const int count = *schedule.item_count;
   int4 entries = items[blockIdx.x];  // without waiting for the count: there is room for as many
@@ -504,25 +563,7 @@ __global__ void __launch_bounds__(Source::Shape::threads, Source::resident)
       if (block_colour(t.geometry, item.block) != colour || item.begin != t.offsets[item.slot]) continue;
       item.end = t.offsets[item.slot + 1];
     }
-    const int slot = threadIdx.x < 1 << D ? schedule.neighbours[(item.slot << D) + threadIdx.x] : -1;
-    for (int begin = item.begin; begin < item.end; begin += S::batch) {
-      load_particles<S>(source, t, item.block, base_block, shared, strays, begin, min(S::batch, item.end - begin),
-                        in_order);
-      if (threadIdx.x < 1 << D) slots[threadIdx.x] = slot;
-      T sum[S::slab][S::channels] = {};
-#pragma unroll 1
-      for (int row = head[walker.list]; row != SharedParticles<S>::end;) {
-        const int following = shared.next[row];
-        add_particle(shared, walker, row, sum);
-        row = following;
-      }
-      if constexpr (Source::drifts) add_strays<S>(source, t, schedule, base_block.scene, shared, strays, begin);
-      __syncthreads();
-      add_slabs(walker, sum, planes);
-      __syncthreads();
-      flush_tile<S, T, D>(source.nodes, slots, planes, in_order);
-      __syncthreads();
-    }
+    scatter_item(source, t, item, in_order, memory, shared);
   }
   if constexpr (requires { source.leave_out(0); }) {
     const int64_t stride = int64_t(gridDim.x) * S::threads;

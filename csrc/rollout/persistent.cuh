@@ -1,0 +1,366 @@
+#pragma once
+
+#include "cuda/barrier.cuh"
+#include "grid/status.h"
+#include "rollout/persistent.h"
+#include "transfer/advance_gather.cuh"
+#include "transfer/scatter.cuh"
+
+// The kernel of substeps that last in their activation. A substep is
+//   P2G     of each item by a thread block; then a barrier
+//   G2P     of the same item, with the grid update and contact of each node of its tile; then a barrier,
+//           after which all know whether the activation lasts.
+// What the particles give in the next P2G is computed before the second barrier, and kept after it.
+// A substep of few particles is one chain of loads and sums that wait for each other. So what an item needs of the grid
+// is loaded once where a thread block has no other item, and cells have more threads than in the kernel of P2G alone.
+#if CUDART_VERSION >= 13000
+namespace mpm::cuda {
+
+// The velocity of nodes after grid update and contact, computed where it is read.
+template <class T, int D>
+struct NodeVelocities {
+  const GridUpdateArguments<T, D>& update;
+  const ContactArguments<T, D>& contact;
+  bool obstacles;
+  const NodeRow<T, D>* nodes;
+
+  __device__ Vector<T, D> at(const SlotUpdate<T, D>& there, int slot, int local) const {
+    const NodeRow<T, D> node = nodes[int64_t(slot) * kBlockNodes<D> + local];
+    if (node.mass == T(0)) return zero_vector<T, D>();
+    Vector<T, D> v = update_node(update, there, local, node).value;
+    if (!obstacles) return v;
+    const ContactSlot<T, D> s = contact_slot(contact, slot);
+    return s.active ? after_obstacles(contact, s, contact.obstacles, node_position(contact, s.corner, local), v) : v;
+  }
+};
+
+// P2G with threads that share the particles of a cell and leading node.
+template <class S>
+using SharingShape = ScatterShape<S::Order, typename S::T, S::D, S::Plain, S::Linear, S::Gradient, S::D == 2 ? 4 : 2>;
+
+// What the threads of an item share beside its particles, sums and nodes.
+template <class S>
+struct ItemMemory {
+  static constexpr int D = S::D, most = kLeastItemParticles;
+  using T = typename S::T;
+  int slots[1 << D];
+  SlotUpdate<T, D> there[1 << D];
+  BaseBlock<T, D> home;
+  int head[S::lists + 1];
+  int strays;                 // particles that are not in the block of the item:
+  int row[most], base[most];  // of what they give, and of their base nodes, -1 where there is none;
+  T distance[most][D];        // from these
+};
+
+// The phases of a substep of one item, whose particles have a thread each.
+template <class Source, class Task>
+class ItemStep {
+ public:
+  using S = SharingShape<typename Source::Shape>;
+  using T = typename S::T;
+  static constexpr int D = S::D, Order = Task::Order, width = kBlockWidth + Order, threads = S::threads;
+  static constexpr int tile_nodes = D == 2 ? width * width : width * width * width;
+  // The support of a stray has rows as those of the tile, so that both are one for G2P.
+  static constexpr int support_nodes = S::support * S::slab,
+                       span = (D == 2 ? 0 : Order * width * width) + Order * width + Order + 1;
+  static constexpr int strays_at_once = (int(S::shared_bytes / sizeof(NodeValue<T, D>)) - tile_nodes) / span;
+  static_assert(threads >= kLeastItemParticles && S::batch >= kLeastItemParticles && strays_at_once > 0);
+
+  const Source& source;
+  const Task& task;
+  const GridUpdateArguments<T, D>& update;
+  ItemMemory<S>& m;
+  char* const memory;
+
+  __device__ ItemStep(const Source& source, const Task& task, const GridUpdateArguments<T, D>& update,
+                      ItemMemory<S>& memory_of_item, char* memory)
+      : source(source), task(task), update(update), m(memory_of_item), memory(memory) {}
+
+  // By all threads, which are done with the item before.
+  __device__ void begin(int number) {
+    const Schedule<const int> schedule = schedule_of(topology());
+    const int4 e = reinterpret_cast<const int4*>(schedule.items)[number];
+    exists_ = int(threadIdx.x) < e.z - e.y;
+    particle_ = exists_ ? topology().index[e.y + threadIdx.x] : 0;
+    if (threadIdx.x < 1 << D) {
+      const int slot = schedule.neighbours[(e.x << D) + threadIdx.x];
+      m.slots[threadIdx.x] = slot;
+      if (slot >= 0) m.there[threadIdx.x] = slot_update(update, slot);
+    }
+    if (threadIdx.x == 32) m.home.template set<Order>(topology(), e.w);
+    if (threadIdx.x == 64) m.strays = 0;
+    empty_lists<S>(m.head);
+    __syncthreads();
+    active_ = 0;
+#pragma unroll
+    for (int o = 0; o < 1 << D; o++) active_ |= unsigned(m.slots[o] >= 0) << o;
+  }
+
+  // What the particles give, in shared memory. What their law changes is not kept yet, so that it may be given up.
+  __device__ void link() {
+    const SharedParticles<S> shared(memory, m.head);
+    if (exists_) {
+      const auto loaded = source.load(particle_, m.home.scene, changes_);
+      find();
+      const int row = SharedParticles<S>::row(threadIdx.x);
+      store_particle<S, T, D>(shared, row, f_, source.contribution(loaded));
+      shared.next[row] = uint16_t(atomicExch(&m.head[list_of<S>(threadIdx.x, stray_ < 0, cell_)], row));
+    }
+    __syncthreads();
+  }
+
+  // Of linked particles.
+  __device__ void scatter(T* nodes) {
+    if (exists_) source.keep(particle_, changes_);
+    const SharedParticles<S> shared(memory, m.head);
+    const NodeField<T> field{nodes, 1 + D, 1 + D};
+    add_particles(field, shared, m.slots, false, [&] { add_strays(field, shared); });
+    empty_lists<S>(m.head);
+  }
+
+  // G2P of the particles that link() has found, or that it finds itself.
+  __device__ void gather(const NodeVelocities<T, D>& velocities, bool found, FollowerOf<Task>& follower) {
+    NodeValue<T, D>* const tile = reinterpret_cast<NodeValue<T, D>*>(memory);
+    if (!found) {
+      if (exists_) find();
+      __syncthreads();
+    }
+    const int strays = m.strays;
+    int first = 0;
+    do {
+      const int count = ::min(strays - first, strays_at_once);
+      load_velocities(velocities, tile, first, first == 0 ? tile_nodes : 0, count);
+      __syncthreads();
+      const bool mine = stray_ < 0 ? first == 0 : stray_ >= first && stray_ < first + count;
+      if (exists_ && mine) move(stray_ < 0 ? tile + corner() : tile + tile_nodes + (stray_ - first) * span, follower);
+      first += strays_at_once;
+      __syncthreads();
+    } while (first < strays);
+    if (threadIdx.x == 0) m.strays = 0;
+    __syncthreads();
+  }
+
+ private:
+  __device__ const Topology<T, D>& topology() const { return source.topology; }
+
+  // Where the particle is.
+  __device__ void find() {
+    x_ = read_vector(source.position, particle_);
+    stray_ = -1;
+    if (m.home.template locate<Order>(topology().geometry, x_, cell_, f_)) return;
+    int base[D];
+    const int slot = locate_slot<Order>(topology(), m.home.scene, x_, base, f_);
+    stray_ = atomicAdd(&m.strays, 1);
+    m.row[stray_] = SharedParticles<S>::row(threadIdx.x);
+    m.base[stray_] = slot < 0 ? -1 : slot * kBlockNodes<D> + node_in_block<D>(base);
+#pragma unroll
+    for (int axis = 0; axis < D; axis++) m.distance[stray_][axis] = f_[axis];
+  }
+
+  // A warp takes one at a time.
+  __device__ void add_strays(const NodeField<T>& nodes, const SharedParticles<S>& shared) const {
+    for (int s = threadIdx.x / 32; s < m.strays; s += threads / 32)
+      if (m.base[s] >= 0)
+        add_stray<S, T, D>(nodes, schedule_of(topology()), shared, m.row[s], m.distance[s], m.base[s]);
+  }
+
+  template <int Width>
+  __device__ static void split(int i, int (&offset)[D]) {
+#pragma unroll
+    for (int axis = D - 1; axis >= 0; axis--, i /= Width) offset[axis] = i % Width;
+  }
+
+  __device__ static int in_tile(const int (&offset)[D]) {
+    int place = 0;
+#pragma unroll
+    for (int axis = 0; axis < D; axis++) place = place * width + offset[axis];
+    return place;
+  }
+
+  // Of the first nodes of the tile, and of the supports of `count` strays from one on.
+  __device__ void load_velocities(const NodeVelocities<T, D>& velocities, NodeValue<T, D>* tile, int first_stray,
+                                  int of_tile, int count) const {
+#pragma unroll 1
+    for (int i = threadIdx.x; i < of_tile + count * support_nodes; i += threads) {
+      int offset[D], base = 0, place = i;
+      const int* slots = m.slots;
+      const bool is_stray = i >= of_tile;
+      if (is_stray) {
+        const int s = (i - of_tile) / support_nodes;
+        split<Order + 1>((i - of_tile) % support_nodes, offset);
+        place = tile_nodes + s * span + in_tile(offset);
+        base = m.base[first_stray + s];
+        slots = schedule_of(topology()).neighbours + (int64_t(base / kBlockNodes<D>) << D);
+      } else {
+        split<width>(i, offset);
+      }
+      if (base < 0) continue;
+      int node[D], neighbour = 0;
+#pragma unroll
+      for (int axis = D - 1, rest = base; axis >= 0; axis--, rest /= kBlockWidth) {
+        node[axis] = (is_stray ? rest % kBlockWidth : 0) + offset[axis];
+        neighbour |= (node[axis] >= kBlockWidth) << (D - 1 - axis);
+      }
+      const int slot = slots[neighbour];
+      Vector<T, D> v = zero_vector<T, D>();
+      if (slot >= 0) {
+        const SlotUpdate<T, D> there = is_stray ? slot_update(update, slot) : m.there[neighbour];
+        v = velocities.at(there, slot, node_in_block<D>(node));
+      }
+      NodeValue<T, D> value{};
+#pragma unroll
+      for (int axis = 0; axis < D; axis++) value.e[axis] = v[axis];
+      tile[place] = value;
+    }
+  }
+
+  __device__ int corner() const {
+    int offset[D];
+    split<kBlockWidth>(cell_, offset);
+    return in_tile(offset);
+  }
+
+  __device__ void move(const NodeValue<T, D>* corner, FollowerOf<Task>& follower) const {
+    if (stray_ >= 0 && m.base[stray_] < 0) return task.leave_out(particle_);
+    const auto loaded = task.at(x_, m.home.scene);
+    const auto sums = task.compute(loaded, Weights<Order, T, D>(f_), TileSupport<Order, T, D>{corner});
+    follower.follow(topology(), m.home, active_, task.write(particle_, loaded, sums));
+  }
+
+  bool exists_ = false;  // whether this thread has a particle
+  int particle_ = 0;
+  unsigned active_ = 0;  // bits of the neighbours of the block that are
+  Vector<T, D> x_;
+  T f_[D];
+  int cell_ = 0, stray_ = -1;
+  typename Source::Changes changes_;
+};
+
+// How many of the slots from `begin` to `end` are used, which come first.
+template <class T, int D>
+__device__ int used_slots(const Topology<T, D>& t, int begin, int end) {
+  const int first = begin;
+  while (begin < end) {
+    const int middle = (begin + end) / 2;
+    if (t.block[middle] >= 0)
+      begin = middle + 1;
+    else
+      end = middle;
+  }
+  return begin - first;
+}
+
+// The nodes of the slots in use: the first ones, and the first ones of the margin. By a grid of `blocks` thread blocks.
+template <class T, int D>
+struct UsedNodes {
+  int count, near, gap;  // gap: from the last one to the first one of the margin
+
+  __device__ UsedNodes(int used, int of_margin, int max_blocks)
+      : count((used + of_margin) * kBlockNodes<D>),
+        near(used * kBlockNodes<D>),
+        gap((max_blocks - used) * kBlockNodes<D>) {}
+  __device__ void empty(T* nodes, int blocks) const {
+    NodeRow<T, D>* const rows = reinterpret_cast<NodeRow<T, D>*>(nodes);
+    for (int i = int(blockIdx.x * blockDim.x + threadIdx.x); i < count; i += blocks * int(blockDim.x))
+      rows[i < near ? i : i + gap] = {};
+  }
+};
+
+template <class T, int D>
+__device__ void write_persistent_status(const PersistentArguments<T, D>& a, int scenes, int steps) {
+  for (int row = threadIdx.x; row <= scenes; row += blockDim.x) {
+    copy_status(a.activated + row * kStatusSize, a.status + row * kStatusSize);
+    if (row == 0) a.status[kActivations] += steps - 1;
+  }
+}
+
+template <class Source, class Task, class T, int D>
+__global__ void __launch_bounds__(ItemStep<Source, Task>::threads)
+    persistent_kernel(const __grid_constant__ Source source, const __grid_constant__ Task task,
+                      const __grid_constant__ PersistentArguments<T, D> a) {
+  using Step = ItemStep<Source, Task>;
+  constexpr int threads = Step::threads;
+  extern __shared__ __align__(16) char memory[];
+  __shared__ ItemMemory<typename Step::S> shared;
+  __shared__ int used_by[2];
+  __shared__ alignas(16) char contact_memory[sizeof(ContactArguments<T, D>)];
+  wait_for_kernel_before();
+  const Topology<T, D>& t = source.topology;
+  const bool cluster = is_cluster();
+  const int items = *schedule_of(t).item_count, first = a.state->step;
+  const int blocks = cluster ? int(gridDim.x) : ::max(1, ::min(items, int(gridDim.x)));
+  const bool leads = blockIdx.x == 0 && threadIdx.x == 0, alone = items <= blocks;
+  if (first >= a.steps && leads) cudaGraphSetConditional(a.loop, 0);
+  if (first >= a.steps || int(blockIdx.x) >= blocks) return;
+  auto& contact = *reinterpret_cast<ContactArguments<T, D>*>(contact_memory);
+  if (threadIdx.x == 0) contact = a.contact, used_by[0] = used_slots(t, 0, a.blocks);
+  if (threadIdx.x == 32) used_by[1] = used_slots(t, a.blocks, t.max_blocks);
+  __syncthreads();
+  const UsedNodes<T, D> used(used_by[0], used_by[1], a.blocks);
+  if (leads) a.state->counted[first % 2] = {};
+  Barrier barrier{a.arrived, unsigned(blocks)};
+  const auto wait = [&] { cluster ? wait_for_cluster() : barrier.wait(); };
+  Step item(source, task, a.update, shared, memory);
+  if (alone && int(blockIdx.x) < items) item.begin(blockIdx.x), item.link();
+  const auto each_item = [&](const auto& phase) {
+    for (int i = blockIdx.x; i < items; i += blocks) {
+      if (!alone) item.begin(i);
+      phase();
+      if (!alone) __syncthreads();
+    }
+  };
+  const int64_t tail = t.offsets[t.max_blocks] + int64_t(blockIdx.x) * threads + threadIdx.x;
+  const auto each_outside = [&](const auto& leave_out) {
+    for (int64_t i = tail; i < t.particles; i += int64_t(blocks) * threads) leave_out(t.index[i]);
+  };
+  int step = first;
+  bool lasts;
+  do {
+    used.empty(a.nodes[(step + 2) % 3], blocks);
+    each_item([&] {
+      if (!alone) item.link();
+      item.scatter(a.nodes[step % 3]);
+    });
+    each_outside([&](int p) { source.leave_out(p); });
+    wait();
+
+    if (threadIdx.x == 0 && a.step_time) contact.time = a.step_time[step];
+    if (a.step_time) __syncthreads();
+    if (leads) a.state->counted[(step + 1) % 2] = {};
+    const NodeVelocities<T, D> velocities{a.update, contact, a.obstacles,
+                                          reinterpret_cast<const NodeRow<T, D>*>(a.nodes[step % 3])};
+    FollowerOf<Task> follower;
+    each_item([&] { item.gather(velocities, alone, follower); });
+    each_outside([&](int p) { task.leave_out(p); });
+    follower.tell(&a.state->counted[step % 2]);
+    if (alone && int(blockIdx.x) < items) item.link();  // of the next substep, while others are at work
+    wait();
+
+    const Drift& counted = a.state->counted[step % 2];
+    lasts = counted.lost == 0 && counted.strays * kParticlesPerStray <= t.particles;
+    if (blockIdx.x == 0 && a.scene_time)
+      for (int b = threadIdx.x; b < t.scenes; b += threads) a.scene_time[b] += a.scene_dt[b];
+    step++;
+  } while (step < a.steps && lasts);
+  used.empty(a.nodes[(step - 1) % 3], blocks);
+  if (blockIdx.x == 0) write_persistent_status(a, t.scenes, step - first);
+  if (!leads) return;
+  a.state->step = step;
+  a.drift->lost = 1;  // so that there is a new activation
+  cudaGraphSetConditional(a.loop, step < a.steps);
+}
+
+template <class Source, class Task, class T, int D>
+void launch_persistent(const Source& source, const Task& task, const PersistentArguments<T, D>& a, Stream stream) {
+  using Step = ItemStep<Source, Task>;
+  const auto kernel = persistent_kernel<Source, Task, T, D>;
+  const int64_t particles = source.topology.particles, items = most_items(source.topology.max_blocks, particles);
+  if (particles <= kMostClusterParticles && waits_for_kernel_before(kernel))
+    launch_as_cluster(kernel, unsigned(std::min<int64_t>(items, kLargestCluster)), Step::threads, Step::S::shared_bytes,
+                      stream, source, task, a);
+  else
+    launch_together(kernel, unsigned(items), Step::threads, Step::S::shared_bytes, stream, source, task, a);
+}
+
+}  // namespace mpm::cuda
+#endif

@@ -1,0 +1,104 @@
+"""Many steps of few float32 particles, which one CUDA kernel takes where the pool of blocks is small or holds all of
+the domain, against single steps in float64. The particles cross several cells, so that activations are made anew."""
+
+import pytest
+import torch
+from helpers import relative_error
+from test_small_scenes import F64, LAWS, assert_same, both, joined
+from test_step import block_state
+
+import torch_mpm as mpm
+
+N, DT = 50, 1e-3
+
+
+def make(dim, law="neo_hookean", scenes=1, max_blocks=220, **options):
+    grid = mpm.Grid(0.05 if dim == 3 else 0.02, (0,) * dim, (1,) * dim, scenes=scenes, max_blocks=max_blocks)
+    return mpm.Step(grid, LAWS[law](), gravity=(0.0, -9.8, 0.0)[:dim], walls="separate", **options)
+
+
+def body(dim, device="cpu", speed=3.0, **options):
+    state = block_state(dim, dx=0.05 if dim == 3 else 0.02, **options)
+    along = torch.tensor([speed, -0.3 * speed, 0.5 * speed][:dim], dtype=F64)
+    return state.replace(v=state.v + along).to(device)
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_laws(law, dim, device):
+    end, expected = both(make(dim, law), make(dim, law), body(dim, device), N, DT)
+    cells = float((end.x.double() - body(dim, device).x).abs().amax()) / (0.05 if dim == 3 else 0.02)
+    assert cells > 2
+    assert_same(end, expected, 2e-3 if law == "sand" else 1e-4)
+
+
+def test_a_domain_whose_blocks_all_have_room(dim, device):
+    """The second call knows how few blocks are active."""
+    step, single, state = make(dim, max_blocks=None), make(dim), body(dim, device)
+    with torch.no_grad():
+        half, _ = both(step, single, state, N, DT)
+        end = mpm.rollout(step, half, N, DT)
+    _, expected = both(step, single, state, 2 * N, DT)
+    step.check(end)
+    assert_same(end, expected, 2e-4)
+
+
+@pytest.mark.parametrize("n", [1, 2, 9, 10, 11, 12])
+def test_numbers_of_steps(n, dim, device):
+    end, expected = both(make(dim), make(dim), body(dim, device), n, DT)
+    assert_same(end, expected, 1e-4)
+
+
+def test_an_obstacle_that_moves(dim, device):
+    def options():
+        centre = (0.6, 0.2, 0.5)[:dim]
+        return {"boundaries": [mpm.Sphere(centre, 0.2, friction=0.3, velocity=(-2.0, 1.0, 0.0)[:dim])]}
+
+    end, expected = both(make(dim, **options()), make(dim, **options()), body(dim, device), N, DT)
+    assert_same(end, expected, 1e-4)
+
+
+@pytest.mark.parametrize("obstacle", [False, True])
+def test_scenes_with_time_steps_of_their_own(obstacle, dim, device):
+    def options():
+        balls = [mpm.Sphere((0.5, 0.1, 0.5)[:dim], 0.25, velocity=(0.0, 1.0, 0.0)[:dim], kind="slip")]
+        return {"boundaries": balls} if obstacle else {}
+
+    state = joined([body(dim), None, body(dim, low=0.4)], device)
+    step, single = make(dim, scenes=3, **options()), make(dim, scenes=3, **options())
+    dt = torch.tensor([1e-3, 2e-3, 4e-4], device=device)
+    with torch.no_grad():
+        end = mpm.rollout(step, step.prepare(state.to(dtype=torch.float32)), N, dt)
+        expected = single.prepare(state.to(dtype=F64))
+        for _ in range(N):
+            expected = single(expected, dt.double())
+    assert relative_error(end.x.double(), expected.x) < 1e-4
+    assert relative_error(end.F.double(), expected.F) < 1e-4
+    torch.testing.assert_close(torch.as_tensor(end.time).double(), torch.as_tensor(expected.time), rtol=1e-5, atol=0)
+
+
+def test_particles_that_leave_on_the_way(dim, device):
+    """The status tells when the first one did, and what has left rests, with the deformation that it had."""
+    state = body(dim, device, speed=1.0)
+    v, x = state.v.clone(), state.x.clone()
+    v[5:8, 1] = 40.0
+    x[4] = torch.nan
+    state = state.replace(x=x, v=v)
+    step, single = make(dim), make(dim)
+    end, expected = both(step, single, state, N, DT)
+    assert torch.equal(step._activations.status[:, 1:7], single._activations.status[:, 1:7])
+    there = expected.x.isfinite().all(1)
+    assert torch.equal(end.x.isfinite().all(1), there) and torch.equal(end.v.isfinite(), expected.v.isfinite())
+    for name in ("x", "v", "F"):
+        value, right = getattr(end, name)[there], getattr(expected, name)[there]
+        assert relative_error(value.double(), right) < 1e-4, name
+    with pytest.raises(mpm.SimulationError):
+        step.check()
+
+
+def test_a_full_pool_is_reported(dim, device):
+    state = body(dim, device)
+    state = state.replace(v=60 * (state.x - 0.45))
+    step = make(dim, max_blocks=40 if dim == 2 else 45)
+    with torch.no_grad(), pytest.raises(mpm.GridOverflowError, match="max_blocks=4"):
+        mpm.rollout(step, step.prepare(state.to(dtype=torch.float32)), 30, DT)
+        step.check()
