@@ -36,6 +36,12 @@ BATCHES = {"cpu": ((64, 512),), "cuda": ((4096, 512), (1024, 2197))}
 """Scenes, and particles of each."""
 DOMAINS = {"cpu": (1, 4), "cuda": (1, 8, 16)}
 """Cells along a side of the domain, in those of the cube of a million (CPU: of 262144) particles."""
+LAWS: dict[str, Callable[[], mpm.Material]] = {
+    "fixed corotated": lambda: mpm.FixedCorotated(mu=work.MU, lam=work.LAM),
+    "quartic sand": lambda: mpm.QuarticSand(mu=work.MU, lam=work.LAM),
+    "fluid": lambda: mpm.WeaklyCompressible(work.LAM),
+}
+"""Of the largest cube beside the neo-Hookean one."""
 SECONDS = 0.5
 """Of steps in one measurement, about."""
 
@@ -100,6 +106,13 @@ def in_domain(side: int, times: int, device: str) -> Setup:
     return Setup(s.state, mpm.Step(grid, s.step.law, gravity=s.step.gravity, walls="sticky"))
 
 
+def made_of(law: mpm.Material, side: int, device: str) -> Setup:
+    """The cube of another material."""
+    s = setup(work.make(side), device)
+    step = mpm.Step(s.grid, law, gravity=s.step.gravity, walls="sticky")
+    return Setup(step.prepare(s.state.replace(C=None, F=None)), step)
+
+
 def on_its_way(name: str, device: str, frames: int = 6) -> tuple[Setup, float]:
     """An example scene after some frames, and its time step."""
     scene = mpm.Scene.load(common.ROOT / "examples" / f"{name}.toml").model_copy(update={"device": device})
@@ -137,6 +150,9 @@ def measure(device: str, quick: bool = False) -> dict[str, Any]:
         result["rollouts"].append({"name": "one scene", **per_step(s, device, samples)})
     if device == "cpu":
         result["rollouts"].append({"name": "beside a busy process", **beside_a_busy_process(s, samples)})
+    for name, law in LAWS.items():
+        row = per_step(made_of(law(), sides[-1], device), device, samples)
+        result["rollouts"].append({"name": name, **row})
     for count, particles in [(4, 64)] if quick else BATCHES[device]:
         row = per_step(batched(count, particles, device), device, samples)
         result["rollouts"].append({"name": f"{count} scenes", **row})
