@@ -168,6 +168,30 @@ class Copies {
   Stretch stretch_[kChunk + 1];
 };
 
+// What P2G reads of the particles beside their stress, by rows.
+template <class T, int D>
+struct GivenRows {
+  FieldRows<const T, D> x, v;
+  FieldRows<const T, D * D> affine;
+  FieldRows<const T, 1> mass, volume;
+
+  explicit GivenRows(const P2GArguments<T, D>& a)
+      : x(a.x), v(a.velocity), affine(a.affine, D), mass(a.mass), volume(a.volume) {}
+
+  template <class P, class G>
+  MPM_HD void read(ParticleMomentum<P, D>& p, P position[D], const G& g) const {
+    p.mass = load_row(mass.row[0], mass.stride, g);
+    p.volume = load_row(volume.row[0], volume.stride, g);
+    p.affine = zero_matrix<P, D>();
+    MPM_UNROLL for (int i = 0; i < D; i++) {
+      position[i] = load_row(x.row[i], x.stride, g);
+      p.velocity[i] = load_row(v.row[i], v.stride, g);
+    }
+    if (affine) MPM_UNROLL
+      for (int k = 0; k < D * D; k++) p.affine[k / D][k % D] = load_row(affine.row[k], affine.stride, g);
+  }
+};
+
 // The order of a chunk whose particles are in the order of cells.
 template <int D>
 void write_order(const uint16_t* cell_end, uint16_t order[kCopyLine]) {
@@ -186,8 +210,7 @@ void laws_p2g_with(const LawsP2GArguments<T, D>& a) {
   lay_out<D>(out, a.schedule, t.max_blocks, t.particles);
   const int64_t chunks = s.base_chunk[s.colour_start[kColours<D>]];
   const bool direct = unit_stride(a.p2g.x, a.p2g.mass, a.p2g.velocity, a.p2g.affine, a.p2g.volume);
-  P2GArguments<T, D> motion = a.p2g;  // without the stress
-  motion.stress = {};
+  const GivenRows<T, D> rows(a.p2g);
   int taken = 0;
   const auto memory = [&] { return a.copies + a.copy_size * __atomic_fetch_add(&taken, 1, __ATOMIC_RELAXED); };
   scatter_chunks<Order, true, Gradient>(t, a.p2g.nodes, 0, 1 + D, [&] {
@@ -200,17 +223,22 @@ void laws_p2g_with(const LawsP2GArguments<T, D>& a) {
       write_order<D>(chunk.cell_end, order);
       copies.fetch(place(chunk), chunk.count, place(next), next.count, &chunk);
       copies.apply_laws();
+      const Field<const T>& scene_dt = a.p2g.scene_dt;
+      const Pack<T, N> dt(T(a.p2g.dt) *
+                          (scene_dt.pointer ? scene_dt.pointer[base_block.scene * scene_dt.stride[0]] : T(1)));
       for (int i = 0; i < chunk.count; i += N) {
-        const GroupOf<N> g = copies.template group<N>(i);
-        const bool run = direct && g.consecutive;
-        ParticleMomentum<Pack<T, N>, D> p = run ? load_momentum(motion, RunOf<N>{g.id[0]}, base_block.scene)
-                                                : load_momentum(motion, g, base_block.scene);
-        Pack<T, N> f[D];
-        const auto entries = entries_of<N>(order + i, N);
-        run ? distances(t, base_block, entries, a.p2g.x, RunOf<N>{g.id[0]}, f)
-            : distances(t, base_block, entries, a.p2g.x, g, f);
+        Pack<T, N> x[D], f[D];
+        ParticleMomentum<Pack<T, N>, D> p;
+        const int rest = chunk.count - i;
+        if (direct && chunk.sorted && rest >= N) {
+          rows.read(p, x, RunOf<N>{chunk.id[0] + i});
+        } else {
+          const GroupOf<N> g = copies.template group<N>(i);
+          direct&& g.consecutive ? rows.read(p, x, RunOf<N>{g.id[0]}) : rows.read(p, x, g);
+        }
+        p.dt = dt;
         p.stress = load_matrix_or_zero<T, D>(copies.field(R::stress), RunOf<N>{i});
-        p.volume = run ? load(a.p2g.volume, RunOf<N>{g.id[0]}) : load(a.p2g.volume, g);
+        distances(t, base_block, entries_of<N>(order + i, N), x, f);
         contributions.put(i, f, momentum_contribution<Order, true>(a.p2g, p, f));
         copies.expect(i);
       }

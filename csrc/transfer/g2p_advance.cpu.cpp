@@ -107,8 +107,9 @@ void g2p_advance_with(const G2PAdvanceArguments<T, D>& a) {
   const bool direct = unit_stride(in.x, a.F, a.J, in.value, a.x_next, in.moment, a.F_next, a.J_next);
   const auto advance = [&](const Chunk& chunk, int scene, const Motion<Gradient, T, D>& motion) {
     const P dt(T(a.dt) * (a.scene_dt.pointer ? a.scene_dt.pointer[scene * a.scene_dt.stride[0]] : T(1)));
-    int id[kChunk];
-    for (int i = 0; i < chunk.count; i++) id[i] = chunk.id[chunk.sorted ? i : chunk.by_cell(i)];
+    int by_cell[kChunk];
+    for (int i = 0; i < chunk.count && !chunk.sorted; i++) by_cell[i] = chunk.id[chunk.by_cell(i)];
+    const int* const id = chunk.sorted ? chunk.id : by_cell;
     for (int i = 0; i < chunk.count; i += N) {
       Advanced<P, D> p;
       Matrix<P, D> L;
@@ -119,14 +120,15 @@ void g2p_advance_with(const G2PAdvanceArguments<T, D>& a) {
           L[c][k] = Gradient ? inverse_dx * P::load(motion.gradient[Gradient ? c : 0][k] + i) : p.affine[c][k];
         }
       }
-      // One arithmetic for both, so that rounding does not depend on what is consecutive.
-      const GroupOf<N> g = group_of<N>(id + i, chunk.count - i);
-      const bool run = direct && g.consecutive;
-      run ? read(p, rows, RunOf<N>{g.id[0]}) : read(p, rows, g);
+      // One arithmetic for all, so that rounding does not depend on what is consecutive.
+      const int rest = chunk.count - i;
+      const bool run = direct && chunk.sorted && rest >= N;
+      const GroupOf<N> g = run ? GroupOf<N>{} : group_of<N>(id + i, rest);
+      run ? read(p, rows, RunOf<N>{chunk.id[0] + i}) : read(p, rows, g);
       p.x = advance_position(p.x, p.v, dt);
       if (rows.F) p.F = advance_deformation(p.F, L, dt);
       if (rows.J) p.J = advance_volume_ratio(p.J, L, dt);
-      run ? write(p, rows, RunOf<N>{g.id[0]}) : write(p, rows, g);
+      run ? write(p, rows, RunOf<N>{chunk.id[0] + i}) : write(p, rows, g);
     }
   };
   gather_chunks<Order>(in.topology, in.nodes, 0, D, [&] {

@@ -155,9 +155,9 @@ MPM_HD typename EntriesOf<N>::Value entries_of(const uint16_t* order, int count)
 }
 
 // Distance of the particles of a group, whose cells are given, from their base nodes.
-template <class T, int D, int N, class G>
+template <class T, int D, int N>
 MPM_HD void distances(const Topology<T, D>& t, const BaseBlock<T, D>& base_block,
-                      const typename EntriesOf<N>::Value& entry, const Field<const T>& x, const G& g, Pack<T, N> f[D]) {
+                      const typename EntriesOf<N>::Value& entry, const Pack<T, N> x[D], Pack<T, N> f[D]) {
   using Integers = typename RegisterOf<float, N>::Integer;
   using Values = typename RegisterOf<T, N>::Value;
   const Integers cell = __builtin_convertvector(entry / kChunk, Integers);
@@ -166,7 +166,7 @@ MPM_HD void distances(const Topology<T, D>& t, const BaseBlock<T, D>& base_block
     const Values base = __builtin_convertvector(coordinate + base_block.corner[a], Values);
     Pack<T, N> node;
     __builtin_memcpy(&node, &base, sizeof(node));
-    f[a] = distance_in_cells(t.geometry, a, load(x, g, a), node);
+    f[a] = distance_in_cells(t.geometry, a, x[a], node);
   }
 }
 
@@ -223,8 +223,10 @@ void scatter_channels(const Topology<T, D>& t, const Field<const T>& x, const No
     const Chunk chunk(t, s, c);
     for (int i = 0; i < chunk.count; i += N) {
       const GroupOf<N> g = group_by_id<N>(chunk, i);
-      Pack<T, N> f[D];
-      distances(t, base_block, entries_of<N>(chunk.order + i, g.count), x, g, f);
+      Pack<T, N> position[D], f[D];
+      MPM_UNROLL for (int a = 0; a < D; a++)
+        position[a] = load(x, g, a);
+      distances(t, base_block, entries_of<N>(chunk.order + i, g.count), position, f);
       contributions.put(i, f, give(g, f, base_block.scene));
     }
     sum_cells(contributions, chunk.order, chunk.cell_end, tile);
