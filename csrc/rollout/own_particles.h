@@ -79,7 +79,8 @@ class OwnParticles {
   void find_laws();
   bool pays(int64_t following);
   void give_to_nodes(bool rearranges);
-  void expect();
+  void find_rows(bool rearranges);
+  void find_expected();
   void advance();
 
   // Calls visit(field, first row of the copy or -1, whether laws read it, whether they change it) for what changes
@@ -107,8 +108,10 @@ class OwnParticles {
   std::vector<ParticleRow<T>> rows_;
   std::vector<ParticleRow<int>> numbers_;
   std::vector<const T*> expected_;
+  LawsP2GArguments<T, D> a_;
   Tensor copies_;
   bool reads_F_ = false, reads_J_ = false, viscous_ = false, rearranged_ = false;
+  bool owned_ = false, moved_ = true;  // whether the fields have gone to buffers; whether some have since the last step
   int64_t breaks_ = 0, all_breaks_ = 0;  // of this substep, and since particles changed places
 };
 
@@ -131,6 +134,12 @@ OwnParticles<T, D>::OwnParticles(Substeps<T, D>& steps, const Tensor& packed_his
   s_.forget_stress();
   find_laws();
   s_.activation.breaks = &breaks_;
+  a_.has_material = has(in_.material);
+  a_.laws = laws_.data();
+  a_.law_count = int(laws_.size());
+  a_.copy_size = (R::rest + int64_t(s_.columns + parameters_.size())) * kCopyLine;
+  copies_ = empty(like, {cpu::thread_count(), a_.copy_size});
+  a_.copies = static_cast<T*>(copies_.data_ptr());
 }
 
 template <class T, int D>
@@ -190,45 +199,23 @@ bool OwnParticles<T, D>::step(const int* status_before, int* status, int64_t fol
 
 template <class T, int D>
 void OwnParticles<T, D>::give_to_nodes(bool rearranges) {
-  LawsP2GArguments<T, D> a;
-  rows_.clear();
-  numbers_.clear();
   if (rearranges && !rearranged_) {
     origin_ = OwnField<int>(empty_int(in_.x, {in_.x.size(0)}));
     int* const origin = origin_.next(false).pointer;
     for (int64_t p = 0; p < in_.x.size(0); p++) origin[p] = int(p);
   }
-  for_fields([&](OwnField<T>& f, int row, bool read, bool changes) {
-    if (read || rearranges) f.rows(rows_, row, changes || rearranges, rearranges);
-  });
-  if (viscous_ && C.now().pointer) C.rows(rows_, R::C, false, false);
-  expect();
-  if (rearranges) origin_.rows(numbers_, kOriginRow, true, true);
-  if (has(in_.scene)) scene_.rows(numbers_, kSceneRow, rearranges, true);
-  if (has(in_.material)) material_.rows(numbers_, kMaterialRow, rearranges, true);
-  a.p2g = s_.p2g;
-  a.p2g.x = x.now();
-  a.p2g.mass = mass_.now();
-  a.p2g.velocity = v.now();
-  a.p2g.affine = in_.apic ? C.now() : Field<const T>{};
-  a.p2g.volume = volume_.now();
-  a.rows = rows_.data();
-  a.row_count = int(rows_.size());
-  a.expected = expected_.data();
-  a.expected_count = int(expected_.size());
-  a.numbers = numbers_.data();
-  a.number_count = int(numbers_.size());
-  a.has_C = C.now().pointer;
-  a.has_material = has(in_.material);
-  a.laws = laws_.data();
-  a.law_count = int(laws_.size());
-  a.rearranges = rearranges;
-  a.index = s_.activation.index;
-  a.schedule = s_.activation.schedule;
-  a.copy_size = (R::rest + int64_t(s_.columns + parameters_.size())) * kCopyLine;
-  if (!copies_.defined()) copies_ = empty(in_.x, {cpu::thread_count(), a.copy_size});
-  a.copies = static_cast<T*>(copies_.data_ptr());
-  backend::laws_p2g(in_.lattice.order(), a, stream_);
+  if (rearranges || moved_) find_rows(rearranges);
+  moved_ = rearranges || !owned_;
+  owned_ = true;
+  a_.p2g = s_.p2g;
+  a_.p2g.x = x.now();
+  a_.p2g.mass = mass_.now();
+  a_.p2g.velocity = v.now();
+  a_.p2g.affine = in_.apic ? C.now() : Field<const T>{};
+  a_.p2g.volume = volume_.now();
+  a_.index = s_.activation.index;
+  a_.schedule = s_.activation.schedule;
+  backend::laws_p2g(in_.lattice.order(), a_, stream_);
   for_fields([&](OwnField<T>& f, int, bool, bool changes) {
     if (changes || rearranges) f.go(rearranges);
   });
@@ -240,9 +227,32 @@ void OwnParticles<T, D>::give_to_nodes(bool rearranges) {
   all_breaks_ = 0;
 }
 
+// Where the rows of the particles are, and go to.
+template <class T, int D>
+void OwnParticles<T, D>::find_rows(bool rearranges) {
+  rows_.clear();
+  numbers_.clear();
+  for_fields([&](OwnField<T>& f, int row, bool read, bool changes) {
+    if (read || rearranges) f.rows(rows_, row, changes || rearranges, rearranges);
+  });
+  if (viscous_ && C.now().pointer) C.rows(rows_, R::C, false, false);
+  if (rearranges) origin_.rows(numbers_, kOriginRow, true, true);
+  if (has(in_.scene)) scene_.rows(numbers_, kSceneRow, rearranges, true);
+  if (has(in_.material)) material_.rows(numbers_, kMaterialRow, rearranges, true);
+  find_expected();
+  a_.rows = rows_.data();
+  a_.row_count = int(rows_.size());
+  a_.expected = expected_.data();
+  a_.expected_count = int(expected_.size());
+  a_.numbers = numbers_.data();
+  a_.number_count = int(numbers_.size());
+  a_.has_C = C.now().pointer;
+  a_.rearranges = rearranges;
+}
+
 // The rows that laws and P2G read.
 template <class T, int D>
-void OwnParticles<T, D>::expect() {
+void OwnParticles<T, D>::find_expected() {
   std::vector<ParticleRow<T>> read;
   for_fields([&](OwnField<T>& f, int row, bool read_by_laws, bool) {
     if (row < 0 || read_by_laws) f.rows(read, row, false, false);
