@@ -68,7 +68,7 @@ def rollout(
         norms: records the norm of the gradient at states on the way; see `GradientNorms`.
 
     A `Step` of compiled laws without heat, FLIP and functions of the user's takes all steps in one op, or some, with
-    the results of single steps (to the last bit on the CPU and on deterministic grids); `Step.explain` tells. Its
+    the results of single steps (to rounding; on CUDA to the last bit on deterministic grids); `Step.explain` tells. Its
     gradients take the steps again from kept states, those of every `checkpoint` steps, sqrt(n) of them by default and
     more where states are small. A kept state of a solid has 2 D + 2 D² numbers per particle (24 in 3-D, 96 bytes in
     float32) and its history; while the backward pass goes through `checkpoint` steps, it holds about 2 D + 4 D² (42 in

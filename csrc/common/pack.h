@@ -85,9 +85,11 @@ struct Pack {
       r.part[0] = _mm512_mask_loadu_pd(part[0], __mmask8(lanes), from);
     return r;
   }
-  // Writes the lanes of a bit mask. For N = 8.
+  // Writes the lanes of a bit mask. For N = 8, and 16 in float.
   MPM_HD void store(T* to, unsigned lanes) const {
-    if constexpr (sizeof(T) == 4)
+    if constexpr (N == 16)
+      _mm512_mask_storeu_ps(to, __mmask16(lanes), part[0]);
+    else if constexpr (sizeof(T) == 4)
       _mm256_mask_storeu_ps(to, __mmask8(lanes), part[0]);
     else
       _mm512_mask_storeu_pd(to, __mmask8(lanes), part[0]);

@@ -84,6 +84,20 @@ MPM_HD GroupOf<N> group_by_id(const Chunk& c, int i) {
   return g;
 }
 
+// The particles whose numbers are given.
+template <int N>
+MPM_HD GroupOf<N> group_of(const int* id, int count) {
+  GroupOf<N> g;
+  g.count = count < N ? count : N;
+  g.consecutive = count >= N;
+  MPM_UNROLL for (int l = 0; l < N; l++)
+    g.id[l] = id[l < g.count ? l : 0];
+  MPM_UNROLL for (int l = 1; l < N; l++)
+    g.consecutive = g.consecutive & (g.id[l] == g.id[0] + l);
+  if (!g.consecutive) g.find_runs();
+  return g;
+}
+
 // Particles i, ..., end - 1 of a chunk in the order of cells. In a sorted chunk a group may write over the particles
 // after it, which are written later.
 MPM_HD Group group_by_cell(const Chunk& c, int i, int end) {
@@ -127,12 +141,12 @@ MPM_HD Pack<T, N> load_row(const T* row, int64_t stride, const GroupOf<N>& g) {
 }
 
 // Writes the lanes of the group only.
-template <class T>
-MPM_HD void store_row_exactly(const Lanes<T>& v, T* row, int64_t stride, const Group& g) {
-  T lanes[kLanes];
+template <class T, int N>
+MPM_HD void store_row_exactly(const Pack<T, N>& v, T* row, int64_t stride, const GroupOf<N>& g) {
+  T lanes[N];
   v.store(lanes);
-  if (g.count == kLanes && stride == 1) {
-    MPM_UNROLL for (int l = 0; l < kLanes; l++)
+  if (g.count == N && stride == 1) {
+    MPM_UNROLL for (int l = 0; l < N; l++)
       row[g.id[l]] = lanes[l];
   } else {
     for (int l = 0; l < g.count; l++) row[g.id[l] * stride] = lanes[l];
@@ -140,8 +154,8 @@ MPM_HD void store_row_exactly(const Lanes<T>& v, T* row, int64_t stride, const G
 }
 
 // May write over the particles after the group, see `group_by_cell`.
-template <class T>
-MPM_HD void store_row(const Lanes<T>& v, T* row, int64_t stride, const Group& g) {
+template <class T, int N>
+MPM_HD void store_row(const Pack<T, N>& v, T* row, int64_t stride, const GroupOf<N>& g) {
   if (g.consecutive && stride == 1) return v.store(row + g.id[0]);
 #ifdef __AVX512VL__
   if (stride == 1) {
@@ -182,8 +196,8 @@ template <class T, int N>
 MPM_HD Pack<T, N> load_row(const T* row, int64_t, const RunOf<N>& r) {
   return Pack<T, N>::load(row + r.first);
 }
-template <class T>
-MPM_HD void store_row(const Lanes<T>& v, T* row, int64_t, const Run& r) {
+template <class T, int N>
+MPM_HD void store_row(const Pack<T, N>& v, T* row, int64_t, const RunOf<N>& r) {
   v.store(row + r.first);
 }
 template <class T, int N>

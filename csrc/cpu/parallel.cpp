@@ -1,6 +1,9 @@
 #include "cpu/parallel.h"
 
 #include <torch/csrc/stable/ops.h>
+#ifdef __linux__
+#include <sched.h>
+#endif
 
 #include <atomic>
 #include <chrono>
@@ -23,11 +26,51 @@ void pause() {
 
 constexpr int kSpins = 2000;  // some ten microseconds, which waking a thread would take too
 
+// Where the members of a team are. Beside other processes the system may leave two of them on one core for long, and
+// the other process alone on another: a member that finds another one on its core goes to a free one, as free to be
+// moved as before.
+class Cores {
+ public:
+  explicit Cores(int members) : members_(members < kMost ? members : kMost) {
+    for (std::atomic<int>& core : core_) core.store(-1, std::memory_order_relaxed);
+  }
+
+  void keep_apart([[maybe_unused]] int member) {
+#ifdef __linux__
+    if (member >= members_) return;
+    const int here = sched_getcpu();
+    core_[member].store(here, std::memory_order_relaxed);
+    bool shared = false;
+    for (int k = 0; k < members_; k++) shared |= k != member && core_[k].load(std::memory_order_relaxed) == here;
+    if (shared && member > 0) leave(member);
+#endif
+  }
+
+ private:
+  static constexpr int kMost = 64;  // members beyond stay where they are
+
+#ifdef __linux__
+  void leave(int member) {
+    cpu_set_t all;
+    if (sched_getaffinity(0, sizeof(all), &all) != 0) return;
+    cpu_set_t free = all;
+    for (int k = 0; k < members_; k++)
+      if (const int core = core_[k].load(std::memory_order_relaxed); core >= 0) CPU_CLR(core, &free);
+    if (CPU_COUNT(&free) == 0 || sched_setaffinity(0, sizeof(free), &free) != 0) return;
+    sched_setaffinity(0, sizeof(all), &all);
+    core_[member].store(sched_getcpu(), std::memory_order_relaxed);
+  }
+#endif
+
+  const int members_;
+  std::atomic<int> core_[kMost];
+};
+
 // Threads that serve the loops of a leader. Nobody waits for a thread that has not begun: where another process has
 // its core, the others do its share. Who has begun is waited for asleep, which leaves a core to it.
 class Team {
  public:
-  explicit Team(int members) : members_(members), shares_(chunks_, members) {}
+  explicit Team(int members) : members_(members), cores_(members), shares_(chunks_, members) {}
 
   int members() const { return members_; }
 
@@ -42,9 +85,15 @@ class Team {
     state_.store(kOpen, std::memory_order_release);
     generation_.fetch_add(1, std::memory_order_release);
     generation_.notify_all();
+    cores_.keep_apart(0);
     work(0);
     state_.fetch_and(~kOpen, std::memory_order_acq_rel);
-    for (int spins = 0; state_.load(std::memory_order_acquire) > 0; spins++) spins < kSpins ? pause() : rest();
+    int spins = 0;
+    for (int at_work; (at_work = state_.load(std::memory_order_acquire)) > 0;)
+      if (spins++ < kSpins)
+        pause();
+      else
+        state_.wait(at_work, std::memory_order_acquire);
     if (std::exception_ptr error = std::exchange(error_, nullptr)) std::rethrow_exception(error);
   }
 
@@ -58,8 +107,10 @@ class Team {
       while (state >= kOpen && !state_.compare_exchange_weak(state, state + 1, std::memory_order_acq_rel)) {
       }
       if (state < kOpen) continue;
+      cores_.keep_apart(member);
       work(member);
       state_.fetch_sub(1, std::memory_order_release);
+      state_.notify_one();
     }
   }
 
@@ -84,6 +135,7 @@ class Team {
   }
 
   const int members_;
+  Cores cores_;
   int chunks_[2] = {0, 0};
   Body body_ = nullptr;
   void* context_ = nullptr;

@@ -316,9 +316,9 @@ int64_t list_base_blocks(const Activation<T, D>& s, int64_t slots) {
   return chunks;
 }
 
-// Order of a chunk's particles by cell.
+// Order of a chunk's particles by cell. Returns how often one does not follow the one before it in memory.
 template <class T, int D>
-void sort_chunk(const Activation<T, D>& s, int64_t chunk) {
+int sort_chunk(const Activation<T, D>& s, int64_t chunk) {
   const int begin = s.schedule.chunk_begin[chunk], slot_end = s.a.offsets[s.schedule.chunk_slot[chunk] + 1];
   const int count = slot_end - begin < kChunk ? slot_end - begin : kChunk;
   const uint8_t* cell = s.w.cell_at + begin;
@@ -339,21 +339,26 @@ void sort_chunk(const Activation<T, D>& s, int64_t chunk) {
   else
     for (int i = 0; i < count; i++) nth[i] = uint16_t(i);
   for (int i = 0; i < count; i++) order[i] = uint16_t(cell[i] * kChunk + nth[i]);
-  s.schedule.chunk_sorted[chunk] = !falls && id[count - 1] - id[0] == count - 1;
+  const bool sorted = !falls && id[count - 1] - id[0] == count - 1;
+  s.schedule.chunk_sorted[chunk] = sorted;
+  int breaks = 0;
+  if (!sorted)
+    for (int i = 1; i < count; i++) breaks += id[nth[i]] != id[nth[i - 1]] + 1;
+  return breaks;
 }
 
 // Counts a particle that is left out in a row of the status, unless an earlier activation has done so; whether it is
-// the first of the row.
+// the first of the row so far.
 bool report(int* row, int activation, Location place, int p) {
   if (row[kProblemActivation] >= 0 && row[kProblemActivation] != activation) return false;
   row[kProblemActivation] = activation;
   int* entry = row + (place == Location::outside ? kOutsideCount : kNonFiniteCount);
-  if (entry[0]++ > 0) return false;
+  if (entry[0]++ > 0 && entry[1] < p) return false;
   entry[1] = p;
   return true;
 }
 
-// Particles that are not transferred stand at the end of the index, in ascending order.
+// Particles that are not transferred stand at the end of the index.
 template <int Order, class T, int D>
 void write_status(const Activation<T, D>& s, int64_t wanted, int64_t transferred) {
   const ActivateArguments<T, D>& a = s.a;
@@ -363,8 +368,8 @@ void write_status(const Activation<T, D>& s, int64_t wanted, int64_t transferred
   const int activation = status[kActivations];
   for (int64_t i = transferred; i < a.particles; i++) {
     int scene, base[D];
-    const int p = a.index[i];
-    const Location place = place_of<Order>(a, p, scene, base);
+    const Location place = place_of<Order>(a, a.index[i], scene, base);
+    const int p = a.origin ? a.origin[a.index[i]] : a.index[i];
     if (place == Location::inside) continue;  // left out because the grid is full
     if (scene == kAbsent) continue;
     report(status, activation, place, p);
@@ -399,9 +404,13 @@ void activate(const ActivateArguments<T, D>& a) {
     fill_index(s, slice, begin, end, transferred + s.totals(slice)[W::kDropped]);
   });
   const int64_t chunks = list_base_blocks(s, slots);
+  int64_t breaks = 0;
   parallel_ranges(chunks, 16, [&](int64_t begin, int64_t end) {
-    for (int64_t chunk = begin; chunk < end; chunk++) sort_chunk(s, chunk);
+    int64_t found = 0;
+    for (int64_t chunk = begin; chunk < end; chunk++) found += sort_chunk(s, chunk);
+    __atomic_fetch_add(&breaks, found, __ATOMIC_RELAXED);
   });
+  if (a.breaks) *a.breaks = breaks;
   write_status<Order>(s, wanted, transferred);
 }
 

@@ -24,6 +24,10 @@ struct ActivateArguments {
   const int* previous_status = nullptr;  // [1 + scenes, 8] or null
   int *table = nullptr, *block = nullptr, *offsets = nullptr, *index = nullptr, *schedule = nullptr, *status = nullptr;
   int64_t schedule_size = 0;
+  // On the CPU: where the particles came from, whose numbers the status tells then; how often one does not follow the
+  // one before it in memory, in the order of cells. Both may be null.
+  const int* origin = nullptr;
+  int64_t* breaks = nullptr;
   void* workspace = nullptr;  // bytes asked for by activate_workspace()
   bool fresh = true;          // whether the table and the workspace are not those of an earlier call as they were left
   int64_t workspace_size = 0;

@@ -2,6 +2,7 @@
 
 #include "common/backend.h"
 #include "rollout/accumulate.h"
+#include "rollout/laws_p2g.h"
 #include "rollout/next_grid.h"
 #include "rollout/resident.h"
 #include "rollout/survey.h"
@@ -11,6 +12,13 @@
   PLAIN(accumulate, AccumulateArguments)          \
   PLAIN(accumulate_slots, AccumulateSlotsArguments)
 MPM_BACKEND_KERNELS(MPM_ROLLOUT_KERNELS)
+
+#if MPM_BACKEND == MPM_BACKEND_IS_cpu
+#define MPM_OWN_PARTICLES_KERNELS(PLAIN, ORDERED, SIZE) \
+  ORDERED(laws_p2g, LawsP2GArguments)                   \
+  PLAIN(permute, PermuteArguments)
+MPM_BACKEND_KERNELS(MPM_OWN_PARTICLES_KERNELS)
+#endif
 
 #if MPM_BACKEND == MPM_BACKEND_IS_cuda
 namespace mpm::cuda {

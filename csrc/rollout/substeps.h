@@ -400,9 +400,14 @@ struct Substeps {
   void move(backend::Stream stream) {
     for (size_t k = 0; k < laws.size() && !fused; k++) calls[k].law->kernels<T, D>().update(laws[k], stream);
     move_grid(stream);
+    end_time(stream);
+    backend::g2p_advance(in.lattice.order(), advance, stream);
+  }
+
+  // The time after a step, on the CPU and of scenes with clocks of their own.
+  void end_time(backend::Stream stream) {
     if (MPM_BACKEND == MPM_BACKEND_IS_cpu) contact.time += in.dt;
     if (scene_time.defined()) add_dt(static_cast<T*>(scene_time.data_ptr()), stream);
-    backend::g2p_advance(in.lattice.order(), advance, stream);
   }
 
   // Scenes with time steps and clocks of their own begin at `times`, which goes on with them.
@@ -420,11 +425,20 @@ struct Substeps {
 
   // From a stress that is there, or that P2G computes, to the velocities of the nodes.
   void move_grid(backend::Stream stream) {
-    if (!next.emptied && !nodes_are_clear) backend::clear(pool.nodes, stream);
+    clear_nodes(stream);
     if (fused)
       calls[0].law->kernels<T, D>().p2g(laws[0], late, p2g, stream);
     else
       backend::p2g(in.lattice.order(), p2g, stream);
+    move_nodes(stream);
+  }
+
+  void clear_nodes(backend::Stream stream) {
+    if (!next.emptied && !nodes_are_clear) backend::clear(pool.nodes, stream);
+  }
+
+  // From their momenta to their velocities.
+  void move_nodes(backend::Stream stream) {
     if (impulse.defined() && !in.wall_kind.empty()) backend::wall_impulses(wall_impulses(), stream);
     update_grid(stream);
     if (!obstacles || next.obstacles) return;

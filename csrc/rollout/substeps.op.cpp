@@ -1,5 +1,8 @@
 #include "rollout/recorded.h"
 #include "rollout/replay.h"
+#if MPM_BACKEND == MPM_BACKEND_IS_cpu
+#include "rollout/own_particles.h"
+#endif
 
 // n steps of a simulation in one call.
 namespace mpm {
@@ -115,16 +118,81 @@ std::optional<Results> take_recorded(const SubstepsInputs& in, backend::Stream s
                  r.memory()};
 }
 
+#if MPM_BACKEND == MPM_BACKEND_IS_cpu
+
+// As they were given, where the first activation finds no room.
+template <class T, int D>
+Results no_step(const SubstepsInputs& in, const Tensor& history, const Tensor& status, const Tensor& impulse,
+                const Tensor& time) {
+  const auto copy = [&](const OptionalTensor& t, bool wanted, const Shape& shape) {
+    Tensor r = result(in.x, wanted, shape);
+    if (wanted) has(t) ? torch::stable::copy_(r, *t) : torch::stable::zero_(r);
+    return r;
+  };
+  const int64_t P = in.x.size(0);
+  return {copy(in.x, true, {P, D}),
+          copy(in.v, true, {P, D}),
+          copy(in.C, in.wants_C, {P, D, D}),
+          copy(in.F, has(in.F), {P, D, D}),
+          copy(in.J, has(in.J), {P}),
+          history,
+          status,
+          impulse,
+          time,
+          Tensor()};
+}
+
+template <class T, int D>
+Results take_steps(const SubstepsInputs& in, backend::Stream stream) {
+  Substeps<T, D> s(in);
+  const Tensor history = packed_history(in.x, in.history, s.columns);
+  Tensor status[] = {empty_int(in.x, {1 + in.scenes, kStatusSize}), empty_int(in.x, {1 + in.scenes, kStatusSize})};
+  Tensor impulse, time;
+  if (has(in.impulse)) s.add_impulses_to(impulse = copy_of(*in.impulse));
+  if (has(in.scene_time)) s.count_scene_times(time = copy_of(*in.scene_time));
+  s.make_pool(stream);
+  OwnParticles<T, D> particles(s, history, stream);
+  const int* before = s.previous_status;
+  int64_t step = 0, last = 0;  // the last status
+  with_team(in.x.size(0) * in.n, [&] {
+    while (step < in.n) {
+      int* const now = static_cast<int*>(status[last = step % 2].data_ptr());
+      if (!particles.step(before, now, in.n - 1 - step)) break;  // and the status tells
+      before = now;
+      step++;
+    }
+    particles.give_back();
+  });
+  if (step == 0) return no_step<T, D>(in, history, status[0], impulse, time);
+  return {particles.x.tensor(),
+          particles.v.tensor(),
+          particles.C.tensor(),
+          particles.F.tensor(),
+          particles.J.tensor(),
+          particles.history.tensor(),
+          status[last],
+          impulse,
+          time,
+          Tensor()};
+}
+
+#endif
+
 Results substeps(MPM_SUBSTEPS_PARAMETERS) {
   const SubstepsInputs in{MPM_SUBSTEPS_ARGUMENTS};
   check_positions(x);
-  const int64_t P = x.size(0), D_ = x.size(1);
   const DeviceScope device(x);
-  if (records && !has(impulse) && P > 0) {
+  if (records && !has(impulse) && x.size(0) > 0) {
     std::optional<Results> recorded;
     dispatch(x, [&]<class T, int D>() { recorded = take_recorded<T, D>(in, device.stream()); });
     if (recorded) return *recorded;
   }
+#if MPM_BACKEND == MPM_BACKEND_IS_cpu
+  Results results;
+  dispatch(x, [&]<class T, int D>() { results = take_steps<T, D>(in, device.stream()); });
+  return results;
+#else
+  const int64_t P = x.size(0), D_ = x.size(1);
   Tensor x_[] = {empty_particles(x, {P, D_}), result(x, n > 1, {P, D_})};
   Tensor F_[] = {result(x, has(F), {P, D_, D_}), Tensor()};
   Tensor J_[] = {result(x, has(J), {P}), Tensor()};
@@ -237,6 +305,7 @@ Results substeps(MPM_SUBSTEPS_PARAMETERS) {
   }
   return {x_[last], v_,    C_,      F_[last], J_[last], history_, status[step < n ? 1 - last : last],
           impulse_, time_, Tensor()};
+#endif
 }
 
 }  // namespace

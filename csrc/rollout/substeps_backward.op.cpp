@@ -2,9 +2,9 @@
 #include "rollout/replay.h"
 
 // The adjoint of n steps in one call. The steps are taken once more, and what each of them reads is recorded, or it has
-// been when they were taken first; then the adjoint kernels go through them from the last to the first. Where sums have
-// a fixed order, on the CPU and in deterministic grids, the second time is the first bit by bit. Elsewhere it differs
-// by rounding, and the gradient is that of the second time.
+// been when they were taken first; then the adjoint kernels go through them from the last to the first. In
+// deterministic grids of CUDA the second time is the first bit by bit. Elsewhere it differs by rounding, and the
+// gradient is that of the second time.
 namespace mpm {
 namespace {
 

@@ -24,6 +24,26 @@ struct AdvancedRows {
         affine(a.gather.moment, D),
         F_next(a.F_next, D),
         J_next(a.J_next) {}
+
+  // Asks for the cache lines of a particle, where all strides are 1. GCC leaves out calls of functions that do no more.
+  MPM_HD void expect(int p) const {
+    if (x.row[0] != x_next.row[0]) {
+      expect<false>(x, p);
+      expect<false>(F, p);
+    }
+    expect<true>(x_next, p);
+    expect<true>(F_next, p);
+    expect<true>(v, p);
+    expect<true>(affine, p);
+  }
+
+ private:
+  template <bool Writes, class E, int N>
+  MPM_HD static void expect(const FieldRows<E, N>& f, int p) {
+    if (!f) return;
+    MPM_UNROLL for (int k = 0; k < N; k++)
+      __builtin_prefetch(f.row[k] + p, Writes, 2);
+  }
 };
 
 // What a step changes of a pack of particles.
@@ -34,18 +54,18 @@ struct Advanced {
   P J;
 };
 
-// The particles of a Group or a Run as they are; zero for absent fields.
-template <class T, int D, class G>
-MPM_HD void read(Advanced<Lanes<T>, D>& p, const AdvancedRows<T, D>& rows, const G& g) {
+// The particles of a group or a run as they are; zero for absent fields.
+template <class P, int D, class T, class G>
+MPM_HD void read(Advanced<P, D>& p, const AdvancedRows<T, D>& rows, const G& g) {
   MPM_UNROLL for (int i = 0; i < D; i++)
     p.x[i] = load_row(rows.x.row[i], rows.x.stride, g);
   MPM_UNROLL for (int k = 0; k < D * D; k++)
-    p.F[k / D][k % D] = rows.F ? load_row(rows.F.row[k], rows.F.stride, g) : Lanes<T>(0);
-  p.J = rows.J ? load_row(rows.J.row[0], rows.J.stride, g) : Lanes<T>(0);
+    p.F[k / D][k % D] = rows.F ? load_row(rows.F.row[k], rows.F.stride, g) : P(0);
+  p.J = rows.J ? load_row(rows.J.row[0], rows.J.stride, g) : P(0);
 }
 
-template <class T, int D, class G>
-MPM_HD void write(const Advanced<Lanes<T>, D>& p, const AdvancedRows<T, D>& rows, const G& g) {
+template <class P, int D, class T, class G>
+MPM_HD void write(const Advanced<P, D>& p, const AdvancedRows<T, D>& rows, const G& g) {
   MPM_UNROLL for (int i = 0; i < D; i++) {
     store_row(p.v[i], rows.v.row[i], rows.v.stride, g);
     store_row(p.x[i], rows.x_next.row[i], rows.x_next.stride, g);
@@ -57,34 +77,74 @@ MPM_HD void write(const Advanced<Lanes<T>, D>& p, const AdvancedRows<T, D>& rows
   if (rows.J) store_row(p.J, rows.J_next.row[0], rows.J_next.stride, g);
 }
 
+// The motion of the particles of a chunk in the order of cells: packs of a cell are seldom full, those of a chunk are.
+template <bool Gradient, class T, int D>
+struct Motion {
+  static constexpr int kLine = kChunk + 16;  // not a power of two, and room for a whole register at the end
+  alignas(64) T velocity[D][kLine], affine[D][D][kLine], gradient[Gradient ? D : 1][D][kLine];
+
+  Motion() {}  // nothing is set to zero
+
+  MPM_HD void put(int i, const Sums<Lanes<T>, D> s[D]) {
+    MPM_UNROLL for (int c = 0; c < D; c++) {
+      s[c].value.store(velocity[c] + i);
+      MPM_UNROLL for (int a = 0; a < D; a++) {
+        s[c].moment[a].store(affine[c][a] + i);
+        if (Gradient) s[c].gradient[a].store(gradient[c][a] + i);
+      }
+    }
+  }
+};
+
 template <int Order, bool Gradient, class T, int D>
 void g2p_advance_with(const G2PAdvanceArguments<T, D>& a) {
-  using P = Lanes<T>;
+  constexpr int N = kWideLanes<T>;
+  using P = Pack<T, N>;
   const GatherArguments<T, D>& in = a.gather;
   const Geometry<T, D>& geometry = in.topology.geometry;
   const P scale(in.moment_scale * double(geometry.dx)), inverse_dx(geometry.inverse_dx);
   const AdvancedRows<T, D> rows(a);
   const bool direct = unit_stride(in.x, a.F, a.J, in.value, a.x_next, in.moment, a.F_next, a.J_next);
-  gather_groups<Order>(in.topology, in.x, in.nodes, 0, D, [&](const Group& g, const P f[D], int scene, const T* tile) {
+  const auto advance = [&](const Chunk& chunk, int scene, const Motion<Gradient, T, D>& motion) {
     const P dt(T(a.dt) * (a.scene_dt.pointer ? a.scene_dt.pointer[scene * a.scene_dt.stride[0]] : T(1)));
-    Advanced<P, D> p;
-    Matrix<P, D> L;
-    Sums<P, D> s[D];
-    gather_channels<Order, D, true, Gradient, T, D>(f, tile, s);
-    MPM_UNROLL for (int i = 0; i < D; i++) {
-      p.v[i] = s[i].value;
-      MPM_UNROLL for (int j = 0; j < D; j++) {
-        p.affine[i][j] = scale * s[i].moment[j];
-        L[i][j] = Gradient ? inverse_dx * s[i].gradient[j] : p.affine[i][j];
+    int by_cell[kChunk];
+    for (int i = 0; i < chunk.count && !chunk.sorted; i++) by_cell[i] = chunk.id[chunk.by_cell(i)];
+    const int* const id = chunk.sorted ? chunk.id : by_cell;
+    for (int i = 0; i < chunk.count; i += N) {
+      Advanced<P, D> p;
+      Matrix<P, D> L;
+      MPM_UNROLL for (int c = 0; c < D; c++) {
+        p.v[c] = P::load(motion.velocity[c] + i);
+        MPM_UNROLL for (int k = 0; k < D; k++) {
+          p.affine[c][k] = scale * P::load(motion.affine[c][k] + i);
+          L[c][k] = Gradient ? inverse_dx * P::load(motion.gradient[Gradient ? c : 0][k] + i) : p.affine[c][k];
+        }
       }
+      // One arithmetic for all, so that rounding does not depend on what is consecutive.
+      const int rest = chunk.count - i;
+      const bool run = direct && chunk.sorted && rest >= N;
+      const GroupOf<N> g = run ? GroupOf<N>{} : group_of<N>(id + i, rest);
+      run ? read(p, rows, RunOf<N>{chunk.id[0] + i}) : read(p, rows, g);
+      p.x = advance_position(p.x, p.v, dt);
+      if (rows.F) p.F = advance_deformation(p.F, L, dt);
+      if (rows.J) p.J = advance_volume_ratio(p.J, L, dt);
+      run ? write(p, rows, RunOf<N>{chunk.id[0] + i}) : write(p, rows, g);
     }
-    // One arithmetic for both, so that rounding does not depend on what is consecutive.
-    const bool run = direct && g.consecutive;
-    run ? read(p, rows, Run{g.id[0]}) : read(p, rows, g);
-    p.x = advance_position(p.x, p.v, dt);
-    if (rows.F) p.F = advance_deformation(p.F, L, dt);
-    if (rows.J) p.J = advance_volume_ratio(p.J, L, dt);
-    run ? write(p, rows, Run{g.id[0]}) : write(p, rows, g);
+  };
+  gather_chunks<Order>(in.topology, in.nodes, 0, D, [&] {
+    return [&, motion = Motion<Gradient, T, D>()](const BaseBlock<T, D>& base_block, const Chunk& chunk,
+                                                  const Chunk& next, const Tile<Order, T, D>& tile) mutable {
+      int expected = 0;
+      const auto visit = [&](const Group&, int i, const Lanes<T> f[D], const T* at) {
+        Sums<Lanes<T>, D> s[D];
+        gather_channels<Order, D, true, Gradient, T, D>(f, at, s);
+        motion.put(i, s);
+        for (; direct && expected <= i && expected < next.count; expected += 64 / sizeof(T))
+          rows.expect(next.id[expected]);
+      };
+      for_groups_of_cells(in.topology, in.x, base_block, chunk, tile, visit);
+      advance(chunk, base_block.scene, motion);
+    };
   });
 }
 

@@ -82,6 +82,7 @@ MPM_HD Sums<Together<T>, D - Axis> sum_nodes(const Weights<Order, Together<T>, D
   using P = Together<T>;
   constexpr int N = D - Axis, stride = Tile<Order, T, D>::stride(Axis);
   Sums<P, N> r;
+  P first;
   MPM_UNROLL for (int k = 0; k <= Order; k++) {
     Sums<P, N - 1> line;
     if constexpr (Axis + 1 < D)
@@ -92,8 +93,8 @@ MPM_HD Sums<Together<T>, D - Axis> sum_nodes(const Weights<Order, Together<T>, D
     const P part = w * line.value;
     r.value = k ? r.value + part : part;
     if (Moment) {
-      if (k == 0) r.moment[0] = P(0) - part;
-      if (k == 2) r.moment[0] += part;
+      if (k == 0) first = part;
+      if (k == 2) r.moment[0] = part - first;
       if (k == 3) r.moment[0] += P(2) * part;
       MPM_UNROLL for (int a = 1; a < N; a++)
         r.moment[a] = k ? r.moment[a] + w * line.moment[a - 1] : w * line.moment[a - 1];
@@ -219,34 +220,58 @@ MPM_HD void add_position_gradient(const Weights<Order, Lanes<T>, D>& s, const Co
   }
 }
 
+// Chunk by chunk: begin() gives each thread a function of (base block, chunk, chunk that comes next, tile), where the
+// tile holds channels first, ..., first + count - 1.
+template <int Order, class T, int D, class F>
+void gather_chunks(const Topology<T, D>& t, const NodeField<const T>& nodes, int first, int count, const F& begin) {
+  const ScheduleIn s = schedule_of(t);
+  const int64_t chunks = s.base_chunk[s.colour_start[kColours<D>]];
+  parallel_base_blocks<D>(s, t.particles, [&](const auto& next) {
+    auto gather = begin();
+    Tile<Order, T, D> tile;
+    for (int64_t b; (b = next()) >= 0;) {
+      const BaseBlock<T, D> base_block(t, s.base_slot[b]);
+      tile.load_from(nodes, base_block, first, count);
+      for (int64_t c = s.base_chunk[b]; c < s.base_chunk[b + 1]; c++)
+        gather(base_block, Chunk(t, s, c), Chunk(t, s, c + 1 < chunks ? c + 1 : c), tile);
+    }
+  });
+}
+
+// visit(group, its first place in the order of cells, distances from the base node in cells, tile at the base node) for
+// groups of particles of a cell.
+template <int Order, class T, int D, class F>
+MPM_HD void for_groups_of_cells(const Topology<T, D>& t, const Field<const T>& x, const BaseBlock<T, D>& base_block,
+                                const Chunk& chunk, const Tile<Order, T, D>& tile, const F& visit) {
+  for (int cell = 0, i = 0; cell < kBlockNodes<D>; cell++) {
+    int base[D];
+    for (int a = 0; a < D; a++) base[a] = cell_coordinate<D>(cell, a);
+    for (const int end = chunk.cell_end[cell]; i < end; i += kLanes) {
+      const Group g = group_by_cell(chunk, i, end);
+      Lanes<T> f[D];
+      MPM_UNROLL for (int a = 0; a < D; a++)
+        f[a] = distance_in_cells(t.geometry, a, load(x, g, a), Lanes<T>(T(base_block.corner[a] + base[a])));
+      const T* at = tile.value + tile.at(base);
+      // Most cells have one group: what the compiler keeps of the nodes for a second one goes to the stack and back.
+      asm volatile("" : "+r"(at));
+      visit(g, i, f, at);
+    }
+    i = chunk.cell_end[cell];
+  }
+}
+
 // visit(group, distances from the base node in cells, scene, tile at the base node) for groups of particles of a cell;
 // the tile holds channels first, ..., first + count - 1.
 template <int Order, class T, int D, class F>
 void gather_groups(const Topology<T, D>& t, const Field<const T>& x, const NodeField<const T>& nodes, int first,
                    int count, const F& visit) {
-  const ScheduleIn s = schedule_of(t);
-  parallel_base_blocks<D>(s, t.particles, [&](const auto& next) {
-    Tile<Order, T, D> tile;
-    for (int64_t b; (b = next()) >= 0;) {
-      const BaseBlock<T, D> base_block(t, s.base_slot[b]);
-      tile.load_from(nodes, base_block, first, count);
-      for (int64_t c = s.base_chunk[b]; c < s.base_chunk[b + 1]; c++) {
-        const Chunk chunk(t, s, c);
-        for (int cell = 0, i = 0; cell < kBlockNodes<D>; cell++) {
-          int base[D];
-          for (int a = 0; a < D; a++) base[a] = cell_coordinate<D>(cell, a);
-          for (const int end = chunk.cell_end[cell]; i < end; i += kLanes) {
-            const Group g = group_by_cell(chunk, i, end);
-            Lanes<T> f[D];
-            MPM_UNROLL for (int a = 0; a < D; a++)
-              f[a] = distance_in_cells(t.geometry, a, load(x, g, a), Lanes<T>(T(base_block.corner[a] + base[a])));
-            visit(g, f, base_block.scene, tile.value + tile.at(base));
-          }
-          i = chunk.cell_end[cell];
-        }
-      }
-    }
-  });
+  const auto gather = [&](const BaseBlock<T, D>& base_block, const Chunk& chunk, const Chunk&,
+                          const Tile<Order, T, D>& tile) {
+    for_groups_of_cells(t, x, base_block, chunk, tile, [&](const Group& g, int, const Lanes<T> f[D], const T* at) {
+      visit(g, f, base_block.scene, at);
+    });
+  };
+  gather_chunks<Order>(t, nodes, first, count, [&] { return gather; });
 }
 
 }  // namespace TORCH_MPM_ISA

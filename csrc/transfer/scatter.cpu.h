@@ -144,15 +144,20 @@ struct EntriesOf {
   typedef uint16_t Value __attribute__((vector_size(N * sizeof(uint16_t))));
 };
 
-// Distance of the particles of a group from their base nodes; `particle` is the first one's number in the chunk.
-template <class T, int D, int N>
-MPM_HD void distances(const Topology<T, D>& t, const BaseBlock<T, D>& base_block, const Chunk& chunk,
-                      const Field<const T>& x, const GroupOf<N>& g, int particle, Pack<T, N> f[D]) {
+template <int N>
+MPM_HD typename EntriesOf<N>::Value entries_of(const uint16_t* order, int count) {
   typename EntriesOf<N>::Value entry = {};
-  if (g.count == N)
-    __builtin_memcpy(&entry, chunk.order + particle, sizeof(entry));
+  if (count >= N)
+    __builtin_memcpy(&entry, order, sizeof(entry));
   else
-    for (int l = 0; l < g.count; l++) entry[l] = chunk.order[particle + l];
+    for (int l = 0; l < count; l++) entry[l] = order[l];
+  return entry;
+}
+
+// Distance of the particles of a group, whose cells are given, from their base nodes.
+template <class T, int D, int N>
+MPM_HD void distances(const Topology<T, D>& t, const BaseBlock<T, D>& base_block,
+                      const typename EntriesOf<N>::Value& entry, const Pack<T, N> x[D], Pack<T, N> f[D]) {
   using Integers = typename RegisterOf<float, N>::Integer;
   using Values = typename RegisterOf<T, N>::Value;
   const Integers cell = __builtin_convertvector(entry / kChunk, Integers);
@@ -161,7 +166,7 @@ MPM_HD void distances(const Topology<T, D>& t, const BaseBlock<T, D>& base_block
     const Values base = __builtin_convertvector(coordinate + base_block.corner[a], Values);
     Pack<T, N> node;
     __builtin_memcpy(&node, &base, sizeof(node));
-    f[a] = distance_in_cells(t.geometry, a, load(x, g, a), node);
+    f[a] = distance_in_cells(t.geometry, a, x[a], node);
   }
 }
 
@@ -172,44 +177,61 @@ MPM_HD int nth_cell(int n) {
   return n % (kBlockNodes<D> / kBlockWidth) * kBlockWidth + n / (kBlockNodes<D> / kBlockWidth);
 }
 
-// Adds channels first, ..., first + count - 1. give(group, f, scene) makes the contributions of a group.
+// Sums the particles of a chunk, with the order that a Schedule has, cell by cell.
+template <int Order, class T, int D, bool Slope, bool Gradient>
+void sum_cells(const Contributions<Order, T, D, Slope, Gradient>& contributions, const uint16_t* order,
+               const uint16_t* cell_end, Tile<Order, T, D>& tile) {
+  for (int n = 0; n < kBlockNodes<D>; n++) {
+    const int cell = nth_cell<D>(n), begin = cell ? cell_end[cell - 1] : 0, end = cell_end[cell];
+    if (begin == end) continue;
+    int base[D];
+    for (int a = 0; a < D; a++) base[a] = cell_coordinate<D>(cell, a);
+    sum_cell(contributions, order + begin, end - begin, tile.value + tile.at(base));
+  }
+}
+
+// Adds channels first, ..., first + count - 1, chunk by chunk. begin() gives each thread a function of (base block,
+// chunk, contributions, tile), which adds a chunk to the tile.
 template <int Order, bool Slope, bool Gradient, class T, int D, class F>
-void scatter_channels(const Topology<T, D>& t, const Field<const T>& x, const NodeField<T>& nodes, int first, int count,
-                      const F& give) {
+void scatter_chunks(const Topology<T, D>& t, const NodeField<T>& nodes, int first, int count, const F& begin) {
   const ScheduleIn s = schedule_of(t);
-  const auto fill = [&](const BaseBlock<T, D>& base_block, const Chunk& chunk,
-                        Contributions<Order, T, D, Slope, Gradient>& contributions, Tile<Order, T, D>& tile) {
-    constexpr int N = kWideLanes<T>;
-    for (int i = 0; i < chunk.count; i += N) {
-      const GroupOf<N> g = group_by_id<N>(chunk, i);
-      Pack<T, N> f[D];
-      distances(t, base_block, chunk, x, g, i, f);
-      contributions.put(i, f, give(g, f, base_block.scene));
-    }
-    for (int n = 0; n < kBlockNodes<D>; n++) {
-      const int cell = nth_cell<D>(n), begin = cell ? chunk.cell_end[cell - 1] : 0, end = chunk.cell_end[cell];
-      if (begin == end) continue;
-      int base[D];
-      for (int a = 0; a < D; a++) base[a] = cell_coordinate<D>(cell, a);
-      sum_cell(contributions, chunk.order + begin, end - begin, tile.value + tile.at(base));
-    }
-  };
   PhaseCounter<kColours<D>> colours{s.colour_start};
   parallel_base_blocks<D>(s, t.particles, [&](const auto& next) {
+    auto add = begin();
     Contributions<Order, T, D, Slope, Gradient> contributions;
     Tile<Order, T, D> tile;
     int colour = 0;
     for (int64_t b; (b = next()) >= 0;) {
       const BaseBlock<T, D> base_block(t, s.base_slot[b]);
       tile.clear();
-      for (int64_t c = s.base_chunk[b]; c < s.base_chunk[b + 1]; c++)
-        fill(base_block, Chunk(t, s, c), contributions, tile);
+      for (int64_t c = s.base_chunk[b]; c < s.base_chunk[b + 1]; c++) add(base_block, c, contributions, tile);
       while (b >= s.colour_start[colour + 1]) colour++;
       colours.wait_before(colour);
       tile.add_to(nodes, base_block, first, count);
       colours.finish(colour);
     }
   });
+}
+
+// The same where give(group, f, scene) makes the contributions of a group.
+template <int Order, bool Slope, bool Gradient, class T, int D, class F>
+void scatter_channels(const Topology<T, D>& t, const Field<const T>& x, const NodeField<T>& nodes, int first, int count,
+                      const F& give) {
+  const ScheduleIn s = schedule_of(t);
+  const auto add = [&](const BaseBlock<T, D>& base_block, int64_t c, auto& contributions, auto& tile) {
+    constexpr int N = kWideLanes<T>;
+    const Chunk chunk(t, s, c);
+    for (int i = 0; i < chunk.count; i += N) {
+      const GroupOf<N> g = group_by_id<N>(chunk, i);
+      Pack<T, N> position[D], f[D];
+      MPM_UNROLL for (int a = 0; a < D; a++)
+        position[a] = load(x, g, a);
+      distances(t, base_block, entries_of<N>(chunk.order + i, g.count), position, f);
+      contributions.put(i, f, give(g, f, base_block.scene));
+    }
+    sum_cells(contributions, chunk.order, chunk.cell_end, tile);
+  };
+  scatter_chunks<Order, Slope, Gradient>(t, nodes, first, count, [&] { return add; });
 }
 
 }  // namespace TORCH_MPM_ISA

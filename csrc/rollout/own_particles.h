@@ -1,0 +1,309 @@
+#pragma once
+
+#include <type_traits>
+
+#include "rollout/substeps.h"
+
+// The particles of a call on the CPU. They move in place, and now and then change places in memory, so that they lie in
+// the order of their cells: packs of particles are loads and stores of whole registers then. At the end they are given
+// back in the order in which they came.
+namespace mpm {
+
+// A field of the particles, [P, ...]: where it was given, or in one of two buffers.
+template <class E>
+class OwnField {
+ public:
+  OwnField() = default;
+  OwnField(const Tensor& x, const Field<const E>& given, Shape shape) : x_(x), shape_(std::move(shape)), now_(given) {}
+  explicit OwnField(const Tensor& own) : x_(own), now_(field<const E>(own)), buffers_{own, {}}, owned_(true) {
+    for (int64_t i = 0; i < own.dim(); i++) shape_.push_back(own.size(i));
+  }
+
+  const Field<const E>& now() const { return now_; }
+  const Tensor& tensor() const { return buffers_[turn_]; }
+
+  // Where it is written: in the other buffer, or else in place if it is in one.
+  Field<E> next(bool elsewhere) {
+    Tensor& to = buffers_[other(elsewhere)];
+    if constexpr (std::is_same_v<E, int>) {
+      if (!to.defined()) to = empty_int(x_, shape_);
+    } else {
+      if (!to.defined()) to = empty_particles(x_, shape_);
+    }
+    return field<E>(to);
+  }
+  void go(bool elsewhere) {
+    turn_ = other(elsewhere);
+    owned_ = true;
+    now_ = field<const E>(buffers_[turn_]);
+  }
+
+  // Adds its components, which are written where `next` says, or stay.
+  void rows(std::vector<ParticleRow<E>>& list, int first, bool written, bool elsewhere) {
+    const Field<E> to = written ? next(elsewhere) : Field<E>{};
+    const int64_t m = shape_.size() > 1 ? shape_[1] : 1, n = shape_.size() > 2 ? shape_[2] : 1;
+    for (int64_t i = 0; i < m; i++)
+      for (int64_t j = 0; j < n; j++)
+        list.push_back({now_.pointer + i * now_.stride[1] + j * now_.stride[2], now_.stride[0],
+                        written ? to.pointer + i * to.stride[1] + j * to.stride[2] : nullptr,
+                        first < 0 ? -1 : first + int(i * n + j)});
+  }
+
+ private:
+  int other(bool elsewhere) const { return owned_ ? (elsewhere ? 1 - turn_ : turn_) : 0; }
+
+  Tensor x_;
+  Shape shape_;
+  Field<const E> now_;
+  Tensor buffers_[2];
+  int turn_ = 0;
+  bool owned_ = false;
+};
+
+template <class T, int D>
+class OwnParticles {
+ public:
+  OwnField<T> x, v, C, F, J, history;
+
+  OwnParticles(Substeps<T, D>& steps, const Tensor& packed_history, backend::Stream stream);
+
+  // One substep, of which so many follow; false as `Substeps::activate`.
+  bool step(const int* status_before, int* status, int64_t following);
+
+  // Takes them to the order in which they came.
+  void give_back();
+
+ private:
+  using R = ChunkRows<D>;
+
+  void find_laws();
+  bool pays(int64_t following);
+  void give_to_nodes(bool rearranges);
+  void find_rows(bool rearranges);
+  void find_expected();
+  void advance();
+
+  // Calls visit(field, first row of the copy or -1, whether laws read it, whether they change it) for what changes
+  // places together.
+  template <class Visit>
+  void for_fields(const Visit& visit) {
+    const bool gradient = has(in_.F), ratio = has(in_.J);
+    visit(x, -1, false, false);
+    if (gradient) visit(F, R::F, reads_F_, s_.plastic);
+    if (ratio) visit(J, R::J, reads_J_, false);
+    visit(mass_, -1, false, false);
+    visit(volume_, -1, false, false);
+    if (s_.columns > 0) visit(history, R::rest, true, true);
+    for (size_t k = 0; k < parameters_.size(); k++) visit(parameters_[k], parameter_row(k), true, false);
+  }
+  int parameter_row(size_t k) const { return R::rest + int(s_.columns) + int(k); }
+
+  Substeps<T, D>& s_;
+  const SubstepsInputs& in_;
+  backend::Stream stream_;
+  OwnField<T> mass_, volume_;
+  std::vector<OwnField<T>> parameters_;  // that particles have
+  OwnField<int> scene_, material_, origin_;
+  std::vector<ChunkLaw<T, D>> laws_;
+  std::vector<ParticleRow<T>> rows_;
+  std::vector<ParticleRow<int>> numbers_;
+  std::vector<const T*> expected_;
+  LawsP2GArguments<T, D> a_;
+  Tensor copies_;
+  bool reads_F_ = false, reads_J_ = false, viscous_ = false, rearranged_ = false;
+  bool owned_ = false, moved_ = true;  // whether the fields have gone to buffers; whether some have since the last step
+  int64_t breaks_ = 0, all_breaks_ = 0;  // of this substep, and since particles changed places
+};
+
+template <class T, int D>
+OwnParticles<T, D>::OwnParticles(Substeps<T, D>& steps, const Tensor& packed_history, backend::Stream stream)
+    : s_(steps), in_(steps.in), stream_(stream) {
+  const Tensor& like = in_.x;
+  const int64_t P = like.size(0);
+  const Particles<const T> given = given_particles<T, D>(in_, packed_history);
+  x = {like, given.x, {P, D}};
+  v = {like, given.v, {P, D}};
+  C = {like, given.C, {P, D, D}};
+  F = {like, given.F, {P, D, D}};
+  J = {like, given.J, {P}};
+  mass_ = {like, s_.p2g.mass, {P}};
+  volume_ = {like, s_.p2g.volume, {P}};
+  if (s_.columns > 0) history = OwnField<T>(packed_history);
+  if (has(in_.scene)) scene_ = {like, field<const int>(*in_.scene), {P}};
+  if (has(in_.material)) material_ = {like, field<const int>(*in_.material), {P}};
+  s_.forget_stress();
+  find_laws();
+  s_.activation.breaks = &breaks_;
+  a_.has_material = has(in_.material);
+  a_.laws = laws_.data();
+  a_.law_count = int(laws_.size());
+  a_.copy_size = (R::rest + int64_t(s_.columns + parameters_.size())) * kCopyLine;
+  copies_ = empty(like, {cpu::thread_count(), a_.copy_size});
+  a_.copies = static_cast<T*>(copies_.data_ptr());
+}
+
+template <class T, int D>
+void OwnParticles<T, D>::find_laws() {
+  for (size_t k = 0; k < s_.laws.size(); k++) {
+    const LawCall& call = s_.calls[k];
+    const LawInfo& info = call.law->info;
+    ChunkLaw<T, D> law;
+    law.update = call.law->template kernels<T, D>().update;
+    law.arguments = s_.laws[k];
+    law.gradient = info.field == Deformation::gradient;
+    law.viscous = info.viscous;
+    viscous_ |= info.viscous;
+    law.plastic = info.plastic;
+    (law.gradient ? reads_F_ : reads_J_) = true;
+    int row = R::rest + int(call.first_column);
+    for (int i = 0; i < kMostHistory; i++) {
+      law.history[i] = size_t(i) < call.history.size() ? row : -1;
+      if (law.history[i] < 0) continue;
+      law.matrix[i] = info.history[i].matrix;
+      row += law.matrix[i] ? D * D : 1;
+    }
+    for (int i = 0; i < kMostParameters; i++) {
+      const Parameter<T>& p = law.arguments.law.parameters[i];
+      law.parameters[i] = -1;
+      if (!p.pointer || p.stride == 0 || p.scenes > 0) continue;
+      law.parameters[i] = parameter_row(parameters_.size());
+      parameters_.push_back({in_.x, {p.pointer, {p.stride, 0, 0}}, {in_.x.size(0)}});
+    }
+    laws_.push_back(law);
+  }
+}
+
+// A break in the order of the particles costs every substep about as much as a particle does, and a particle that
+// changes places a quarter of that; the way back in the end costs a substep.
+template <class T, int D>
+bool OwnParticles<T, D>::pays(int64_t following) {
+  const int64_t P = in_.x.size(0);
+  all_breaks_ += breaks_;
+  return 4 * all_breaks_ > P && breaks_ * following > (rearranged_ ? P / 4 : P);
+}
+
+template <class T, int D>
+bool OwnParticles<T, D>::step(const int* status_before, int* status, int64_t following) {
+  s_.activation.x = x.now();
+  s_.activation.scene = scene_.now().pointer;
+  s_.activation.scene_stride = scene_.now().stride[0];
+  s_.activation.origin = origin_.now().pointer;
+  if (!s_.activate(status_before, status, stream_)) return false;
+  s_.clear_nodes(stream_);
+  give_to_nodes(pays(following));
+  s_.move_nodes(stream_);
+  s_.end_time(stream_);
+  advance();
+  return true;
+}
+
+template <class T, int D>
+void OwnParticles<T, D>::give_to_nodes(bool rearranges) {
+  if (rearranges && !rearranged_) {
+    origin_ = OwnField<int>(empty_int(in_.x, {in_.x.size(0)}));
+    int* const origin = origin_.next(false).pointer;
+    for (int64_t p = 0; p < in_.x.size(0); p++) origin[p] = int(p);
+  }
+  if (rearranges || moved_) find_rows(rearranges);
+  moved_ = rearranges || !owned_;
+  owned_ = true;
+  a_.p2g = s_.p2g;
+  a_.p2g.x = x.now();
+  a_.p2g.mass = mass_.now();
+  a_.p2g.velocity = v.now();
+  a_.p2g.affine = in_.apic ? C.now() : Field<const T>{};
+  a_.p2g.volume = volume_.now();
+  a_.index = s_.activation.index;
+  a_.schedule = s_.activation.schedule;
+  backend::laws_p2g(in_.lattice.order(), a_, stream_);
+  for_fields([&](OwnField<T>& f, int, bool, bool changes) {
+    if (changes || rearranges) f.go(rearranges);
+  });
+  if (!rearranges) return;
+  origin_.go(true);
+  if (has(in_.scene)) scene_.go(true);
+  if (has(in_.material)) material_.go(true);
+  rearranged_ = true;
+  all_breaks_ = 0;
+}
+
+// Where the rows of the particles are, and go to.
+template <class T, int D>
+void OwnParticles<T, D>::find_rows(bool rearranges) {
+  rows_.clear();
+  numbers_.clear();
+  for_fields([&](OwnField<T>& f, int row, bool read, bool changes) {
+    if (read || rearranges) f.rows(rows_, row, changes || rearranges, rearranges);
+  });
+  if (viscous_ && C.now().pointer) C.rows(rows_, R::C, false, false);
+  if (rearranges) origin_.rows(numbers_, kOriginRow, true, true);
+  if (has(in_.scene)) scene_.rows(numbers_, kSceneRow, rearranges, true);
+  if (has(in_.material)) material_.rows(numbers_, kMaterialRow, rearranges, true);
+  find_expected();
+  a_.rows = rows_.data();
+  a_.row_count = int(rows_.size());
+  a_.expected = expected_.data();
+  a_.expected_count = int(expected_.size());
+  a_.numbers = numbers_.data();
+  a_.number_count = int(numbers_.size());
+  a_.has_C = C.now().pointer;
+  a_.rearranges = rearranges;
+}
+
+// The rows that laws and P2G read.
+template <class T, int D>
+void OwnParticles<T, D>::find_expected() {
+  std::vector<ParticleRow<T>> read;
+  for_fields([&](OwnField<T>& f, int row, bool read_by_laws, bool) {
+    if (row < 0 || read_by_laws) f.rows(read, row, false, false);
+  });
+  v.rows(read, -1, false, false);
+  if (C.now().pointer) C.rows(read, -1, false, false);
+  expected_.clear();
+  for (const ParticleRow<T>& r : read)
+    if (r.stride == 1) expected_.push_back(r.from);
+}
+
+template <class T, int D>
+void OwnParticles<T, D>::advance() {
+  G2PAdvanceArguments<T, D>& a = s_.advance;
+  a.gather.x = x.now();
+  a.F = F.now();
+  a.J = J.now();
+  a.gather.value = v.next(false);
+  a.x_next = x.next(false);
+  if (in_.wants_C) a.gather.moment = C.next(false);
+  if (has(in_.F)) a.F_next = F.next(false);
+  if (has(in_.J)) a.J_next = J.next(false);
+  backend::g2p_advance(in_.lattice.order(), a, stream_);
+  v.go(false);
+  x.go(false);
+  if (in_.wants_C) C.go(false);
+  if (has(in_.F)) F.go(false);
+  if (has(in_.J)) J.go(false);
+}
+
+template <class T, int D>
+void OwnParticles<T, D>::give_back() {
+  if (!rearranged_) return;
+  rows_.clear();
+  const auto each = [&](const auto& visit) {
+    visit(x), visit(v);
+    if (in_.wants_C) visit(C);
+    if (has(in_.F)) visit(F);
+    if (has(in_.J)) visit(J);
+    if (s_.columns > 0) visit(history);
+  };
+  each([&](OwnField<T>& f) { f.rows(rows_, 0, true, true); });
+  const Tensor place = empty_int(in_.x, {in_.x.size(0)});
+  PermuteArguments<T, D> a;
+  a.rows = rows_.data();
+  a.row_count = int(rows_.size());
+  a.particles = in_.x.size(0);
+  a.origin = origin_.now().pointer;
+  a.place = static_cast<int*>(place.data_ptr());
+  backend::permute(a, stream_);
+  each([&](OwnField<T>& f) { f.go(true); });
+}
+
+}  // namespace mpm
