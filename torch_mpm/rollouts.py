@@ -20,7 +20,6 @@ from .checkpoints import Checkpoints, as_checkpoints, binomial, fitting, in_segm
 from .errors import check_count, shape_of
 from .gradient_norms import GradientNorms
 from .graphs import CHUNK, LEAST_STEPS, obstacle_to_replays, replayed, time_after
-from .grid import Grid
 from .laws import CompiledLaw
 from .laws.calls import law_calls, laws_of
 from .ops.arguments import split_dt
@@ -204,8 +203,10 @@ def obstacle_to_substeps(step: Step, state: State, dt: float | Tensor) -> str | 
 
 
 MOST_STEPS = 2**16  # of one op, csrc/rollout/substeps.h
+LEAST_PERSISTENT, MOST_PERSISTENT = 10, 2**14
+"""Steps and particles of a call that one kernel takes on CUDA, csrc/rollout/persistent.h."""
 FEW_BLOCKS, FEW_ITEMS = 2**12, 140
-"""Of a domain, and of work in a step, for which a wave of thread blocks is enough."""
+"""Of a domain, and of work in a step, for which about one wave of thread blocks is enough."""
 LONG_CHUNK = 1024
 """Steps between two looks at whether it still is."""
 KEPT_BYTES = {"cpu": 2**24, "cuda": 2**29}
@@ -223,7 +224,7 @@ def in_chunks(
 
     def advance(state: State, count: int, first: int = 0) -> State:
         while count > 0:
-            all_blocks = not with_gradient and takes_all_blocks(step.grid, state)
+            all_blocks = not with_gradient and takes_all_blocks(step, state, count)
             now = min(count, LONG_CHUNK if all_blocks else chunk)
             state, count = substeps(step, state, now, dt, keeps_all, all_blocks), count - now
         return state
@@ -237,10 +238,17 @@ def in_chunks(
         return advance(state, n)
 
 
-def takes_all_blocks(grid: Grid, state: State) -> bool:
+def takes_all_blocks(step: Step, state: State, n: int) -> bool:
     """Whether the pool of a call without gradients has room for all blocks of the domain, so that nobody looks whether
-    it must grow: where there are few, and a kernel takes many steps of few particles (csrc/rollout/persistent.h)."""
+    it must grow: where there are few, and a kernel takes many steps of few particles (`Substeps::persists`)."""
+    grid = step.grid
     if not (grid.grows and state.x.is_cuda and grid.block_count <= FEW_BLOCKS and grid.max_blocks is not None):
+        return False
+    mirrors = step.walls is not None and step.walls.mirrors() is not None
+    form = (step.transfer, step.stress_form, grid.kernel, grid.deterministic)
+    if form != ("apic", "mls", "quadratic", False) or mirrors or state.impulse is not None or n < LEAST_PERSISTENT:
+        return False
+    if state.x.dtype != torch.float32 or not isinstance(step.law, CompiledLaw) or len(state) > MOST_PERSISTENT:
         return False
     # The pool has a half more than was active. Half of these blocks have particles, some of them more than one item.
     return grid.max_blocks / 3 + len(state) / 160 <= FEW_ITEMS

@@ -35,7 +35,7 @@ struct Barrier {
   }
 };
 
-// Whether all thread blocks of a kernel are one cluster, as launch_as_cluster() makes them.
+// Whether all thread blocks of a kernel are one cluster, as launch_at_once() makes of few.
 __device__ inline bool is_cluster() {
 #if __CUDA_ARCH__ >= 900
   return cooperative_groups::this_cluster().num_blocks() == gridDim.x;
@@ -50,7 +50,7 @@ __device__ inline void wait_for_cluster() {
 #endif
 }
 
-// Barrier of all thread blocks of a kernel launched by launch_together() or launch_as_cluster().
+// Barrier of all thread blocks of a kernel launched by launch_at_once().
 __device__ inline void wait_for_all() {
   if (is_cluster())
     wait_for_cluster();

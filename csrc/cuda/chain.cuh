@@ -57,18 +57,48 @@ void launch_in_chain(void (*kernel)(Parameters...), unsigned blocks, unsigned th
   launch_with(&overlap, 1, kernel, blocks, threads, shared_memory, stream, arguments...);
 }
 
-constexpr unsigned kLargestCluster = 16;
+constexpr unsigned kLargestCluster = 16;  // of which not every device takes more than 8
 
-// As launch_together(), for at most kLargestCluster thread blocks, whose barriers take a third of the time; in a chain
-// like launch_in_chain(). Of kernels for which waits_for_kernel_before().
+// Thread blocks that run all at once and may wait for each other, by wait_for_all(): a few as one cluster, whose
+// barriers are faster, in a chain like launch_in_chain(). The kernel must call wait_for_kernel_before() first of all.
 template <class... Parameters, class... Arguments>
-void launch_as_cluster(void (*kernel)(Parameters...), unsigned blocks, unsigned threads, size_t shared_memory,
-                       cudaStream_t stream, const Arguments&... arguments) {
-  check(cudaFuncSetAttribute(kernel, cudaFuncAttributeNonPortableClusterSizeAllowed, 1));
+void launch_at_once(void (*kernel)(Parameters...), unsigned blocks, unsigned threads, size_t shared_memory,
+                    cudaStream_t stream, const Arguments&... arguments) {
+  if (blocks > kLargestCluster || !waits_for_kernel_before(kernel))
+    return launch_together(kernel, blocks, threads, shared_memory, stream, arguments...);
+  allow_shared_memory(kernel, shared_memory);
   cudaLaunchAttribute attributes[2] = {overlap_attribute()};
   attributes[1].id = cudaLaunchAttributeClusterDimension;
   attributes[1].val.clusterDim = {blocks, 1, 1};
-  launch_with(attributes, 2, kernel, blocks, threads, shared_memory, stream, arguments...);
+  const auto takes_cluster = [&] {
+    cudaLaunchConfig_t config{};
+    config.gridDim = blocks;
+    config.blockDim = threads;
+    config.dynamicSmemBytes = shared_memory;
+    config.attrs = attributes + 1;
+    config.numAttrs = 1;
+    int clusters = 0;
+    if (cudaFuncSetAttribute(kernel, cudaFuncAttributeNonPortableClusterSizeAllowed, 1) == cudaSuccess &&
+        cudaOccupancyMaxActiveClusters(&clusters, kernel, &config) == cudaSuccess)
+      return clusters > 0;
+    cudaGetLastError();  // which is no error: the device takes no such cluster
+    return false;
+  };
+  struct Answer {
+    void (*kernel)(Parameters...) = nullptr;
+    int device = -1;
+    unsigned blocks = 0;
+    bool yes = false;
+  };
+  static thread_local Answer last;
+  int device = 0;
+  check(cudaGetDevice(&device));
+  if (last.kernel != kernel || last.device != device || last.blocks != blocks)
+    last = {kernel, device, blocks, takes_cluster()};
+  if (last.yes)
+    launch_with(attributes, 2, kernel, blocks, threads, shared_memory, stream, arguments...);
+  else
+    launch_together(kernel, blocks, threads, shared_memory, stream, arguments...);
 }
 
 }  // namespace mpm::cuda

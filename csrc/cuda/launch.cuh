@@ -55,8 +55,8 @@ void launch_together(void (*kernel)(Parameters...), unsigned blocks, unsigned th
   check(cudaOccupancyMaxActiveBlocksPerMultiprocessor(&fitting, kernel, int(threads), shared_memory));
   const unsigned most = unsigned(fitting * device_attribute(cudaDevAttrMultiProcessorCount));
   void* pointers[] = {&arguments...};
-  check(cudaLaunchCooperativeKernel(reinterpret_cast<const void*>(kernel), std::clamp(blocks, 1u, most), threads,
-                                    pointers, shared_memory, stream));
+  check(cudaLaunchCooperativeKernel(reinterpret_cast<const void*>(kernel), std::clamp(blocks, 1u, std::max(most, 1u)),
+                                    threads, pointers, shared_memory, stream));
 }
 
 }  // namespace mpm::cuda

@@ -546,12 +546,8 @@ void activate(const ActivateArguments<T, D>& a, Stream stream) {
   // Of slots with their end, or of the status; and of particles.
   const int64_t rows = std::max(a.particles, int64_t(std::max(a.slots(), a.scenes)) + 1);
   if ((a.drift && !a.fresh) || (!w.marked && !a.deterministic)) {
-    const auto kernel = activate_at_once<Order, T, D>;
-    const unsigned blocks = blocks_for(std::max<int64_t>(rows, w.marked ? 0 : table));
-    if (blocks <= kLargestCluster && waits_for_kernel_before(kernel))
-      launch_as_cluster(kernel, blocks, kThreads, 0, stream, a, w, table, rows);
-    else
-      launch_together(kernel, blocks, kThreads, 0, stream, a, w, table, rows);
+    launch_at_once(activate_at_once<Order, T, D>, blocks_for(std::max<int64_t>(rows, w.marked ? 0 : table)), kThreads,
+                   0, stream, a, w, table, rows);
     return;
   }
   // Of the tiles listed no more have to run at once than the device takes.

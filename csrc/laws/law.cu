@@ -151,7 +151,8 @@ struct LawMomentumSource : MomentumSource<2, T, D, Stress::moment, true> {
     m.stress = evaluate(p, m.affine, m.dt, changes);
     return m;
   }
-  // Outside the grid G2P has left an affine field of zero or, where a position is not finite, none that may move F.
+  // Outside the grid, where F has to be moved once more after the particle has left; then its affine field is zero. Of
+  // a position that is not finite it may be NaN, and F stays.
   __device__ void leave_out(int p) const {
     const int scene = late.scene ? late.scene[p * late.scene_stride] : 0;
     const auto m = Base::fields.read(p, unsigned(scene) < unsigned(Base::topology.scenes) ? scene : 0, true, true);

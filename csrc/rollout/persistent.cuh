@@ -12,7 +12,7 @@
 //           after which all know whether the activation lasts.
 // What the particles give in the next P2G is computed before the second barrier, and kept after it.
 // A substep of few particles is one chain of loads and sums that wait for each other. So what an item needs of the grid
-// is loaded once where a thread block has no other item, and cells have more threads than in the kernel of P2G alone.
+// is loaded once where a thread block has no other item, and cells have more threads in 3-D than in P2G alone.
 #if CUDART_VERSION >= 13000
 namespace mpm::cuda {
 
@@ -282,7 +282,7 @@ __global__ void __launch_bounds__(ItemStep<Source, Task>::threads)
   constexpr int threads = Step::threads;
   extern __shared__ __align__(16) char memory[];
   __shared__ ItemMemory<typename Step::S> shared;
-  __shared__ int used_by[2];
+  __shared__ int of_margin;
   __shared__ alignas(16) char contact_memory[sizeof(ContactArguments<T, D>)];
   wait_for_kernel_before();
   const Topology<T, D>& t = source.topology;
@@ -290,13 +290,12 @@ __global__ void __launch_bounds__(ItemStep<Source, Task>::threads)
   const int items = *schedule_of(t).item_count, first = a.state->step;
   const int blocks = cluster ? int(gridDim.x) : ::max(1, ::min(items, int(gridDim.x)));
   const bool leads = blockIdx.x == 0 && threadIdx.x == 0, alone = items <= blocks;
-  if (first >= a.steps && leads) cudaGraphSetConditional(a.loop, 0);
-  if (first >= a.steps || int(blockIdx.x) >= blocks) return;
+  if (int(blockIdx.x) >= blocks) return;
   auto& contact = *reinterpret_cast<ContactArguments<T, D>*>(contact_memory);
-  if (threadIdx.x == 0) contact = a.contact, used_by[0] = used_slots(t, 0, a.blocks);
-  if (threadIdx.x == 32) used_by[1] = used_slots(t, a.blocks, t.max_blocks);
+  if (threadIdx.x == 0 && a.obstacles) contact = a.contact;
+  if (threadIdx.x == 32) of_margin = used_slots(t, a.blocks, t.max_blocks);
   __syncthreads();
-  const UsedNodes<T, D> used(used_by[0], used_by[1], a.blocks);
+  const UsedNodes<T, D> used(::min(a.activated[kBlocksNow], a.blocks), of_margin, a.blocks);
   if (leads) a.state->counted[first % 2] = {};
   Barrier barrier{a.arrived, unsigned(blocks)};
   const auto wait = [&] { cluster ? wait_for_cluster() : barrier.wait(); };
@@ -322,10 +321,9 @@ __global__ void __launch_bounds__(ItemStep<Source, Task>::threads)
       item.scatter(a.nodes[step % 3]);
     });
     each_outside([&](int p) { source.leave_out(p); });
+    if (threadIdx.x == 0 && a.step_time) contact.time = a.step_time[step];
     wait();
 
-    if (threadIdx.x == 0 && a.step_time) contact.time = a.step_time[step];
-    if (a.step_time) __syncthreads();
     if (leads) a.state->counted[(step + 1) % 2] = {};
     const NodeVelocities<T, D> velocities{a.update, contact, a.obstacles,
                                           reinterpret_cast<const NodeRow<T, D>*>(a.nodes[step % 3])};
@@ -341,7 +339,7 @@ __global__ void __launch_bounds__(ItemStep<Source, Task>::threads)
     if (blockIdx.x == 0 && a.scene_time)
       for (int b = threadIdx.x; b < t.scenes; b += threads) a.scene_time[b] += a.scene_dt[b];
     step++;
-  } while (step < a.steps && lasts);
+  } while (step < a.steps && lasts && step - first < kStepsOfALaunch);
   used.empty(a.nodes[(step - 1) % 3], blocks);
   if (blockIdx.x == 0) write_persistent_status(a, t.scenes, step - first);
   if (!leads) return;
@@ -353,13 +351,10 @@ __global__ void __launch_bounds__(ItemStep<Source, Task>::threads)
 template <class Source, class Task, class T, int D>
 void launch_persistent(const Source& source, const Task& task, const PersistentArguments<T, D>& a, Stream stream) {
   using Step = ItemStep<Source, Task>;
-  const auto kernel = persistent_kernel<Source, Task, T, D>;
   const int64_t particles = source.topology.particles, items = most_items(source.topology.max_blocks, particles);
-  if (particles <= kMostClusterParticles && waits_for_kernel_before(kernel))
-    launch_as_cluster(kernel, unsigned(std::min<int64_t>(items, kLargestCluster)), Step::threads, Step::S::shared_bytes,
-                      stream, source, task, a);
-  else
-    launch_together(kernel, unsigned(items), Step::threads, Step::S::shared_bytes, stream, source, task, a);
+  const int64_t most = particles <= kMostClusterParticles ? kLargestCluster : items;
+  launch_at_once(persistent_kernel<Source, Task, T, D>, unsigned(std::min(items, most)), Step::threads,
+                 Step::S::shared_bytes, stream, source, task, a);
 }
 
 }  // namespace mpm::cuda

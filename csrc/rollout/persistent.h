@@ -13,8 +13,9 @@ constexpr int64_t kLeastPersistentSteps = 8, kMostPersistentParticles = 1 << 14,
 // Strays have warps of their own, so that a new activation, and a launch, pay only where these are not enough: there
 // are so many particles for each of them.
 constexpr int kParticlesPerStray = 16;
-// Of which a cluster of thread blocks is enough.
+// So many particles are left to one cluster of thread blocks.
 constexpr int64_t kMostClusterParticles = 2048;
+constexpr int kStepsOfALaunch = 4096;  // at most
 
 // Zeroed before a call.
 struct PersistentState {

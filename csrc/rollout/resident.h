@@ -20,6 +20,7 @@ constexpr int64_t kLeastResidentSteps = 4;
 // Whether they are faster than kernels of whole grids, by what both took on an H200 [µs].
 template <int D>
 bool resident_pays(int64_t particles, int64_t scenes) {
+  if (scenes == 1) return particles <= 96;  // else a kernel with many thread blocks is (rollout/persistent.h)
   const double turns = std::fmax(1, double(scenes) / 132), size = double(particles) / double(scenes);
   const double resident = 8 + turns * (2.5 + (D == 2 ? 0.019 : 0.021) * size);
   const double together = 14 + double(particles) / 3500 + 0.07 * double(scenes);

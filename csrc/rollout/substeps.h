@@ -349,13 +349,13 @@ struct Substeps {
     return fused && drifts.defined() && in.apic && has(in.F) != has(in.J) && in.x.size(0) <= kMostLateParticles;
   }
 
-  // Whether a kernel takes many substeps of few particles, all but the first and the last of a call. It pays where a
-  // wave of thread blocks has an item each, as where the pool is small; one that grows and has room for all blocks is
-  // meant for it (`takes_all_blocks` in torch_mpm/rollouts.py).
+  // Whether a kernel takes many substeps of few particles, all but the first and the last of a call. It pays where some
+  // wave of thread blocks is enough for all items, as where the pool is small; one that grows and has room for all
+  // blocks is meant for it (`takes_all_blocks` in torch_mpm/rollouts.py).
   bool persists() const {
     const int64_t P = in.x.size(0);
     if (!may_move_late() || !in.resident || in.n < kLeastPersistentSteps + 2) return false;
-    if (!next.emptied || (obstacles && !next.obstacles)) return false;
+    if (!next.emptied || has(in.impulse)) return false;
     const bool few = in.grows ? in.max_blocks == update.block_count : in.max_blocks <= kMostPersistentBlocks;
     return few && P > 0 && P <= kMostPersistentParticles && calls[0].law->kernels<T, D>().persistent;
   }

@@ -1,3 +1,5 @@
+#include <atomic>
+
 #include "rollout/recorded.h"
 #include "rollout/replay.h"
 #if MPM_BACKEND == MPM_BACKEND_IS_cpu
@@ -49,9 +51,12 @@ void take_resident(Substeps<T, D>& s, int64_t n, double time, const int* activat
 
 #if MPM_BACKEND == MPM_BACKEND_IS_cuda && CUDART_VERSION >= 13000
 // Substeps from the second on until the last alone is left, of particles that move in place. The status of the first is
-// in `status`, and is that of all of them in the end.
+// in `status`, and is that of all of them in the end. False where the device takes no such graph: none, where processes
+// share it by MPS.
 template <class T, int D>
-void take_persistent(Substeps<T, D>& s, int* activated, int* status, backend::Stream stream) {
+bool take_persistent(Substeps<T, D>& s, int* activated, int* status, backend::Stream stream) {
+  static std::atomic<bool> refused = false;
+  if (refused) return false;
   const SubstepsInputs& in = s.in;
   PersistentArguments<T, D> a{s.p2g, s.late, s.advance, s.update, s.contact, s.obstacles, s.activation.max_blocks};
   Tensor more = empty(in.x, {2 * s.pool.nodes.size(0), 1 + D});
@@ -76,12 +81,18 @@ void take_persistent(Substeps<T, D>& s, int* activated, int* status, backend::St
   s.activation.drift = a.drift;
   s.activation.previous_status = status;
   s.activation.status = activated;
-  repeat(stream, [&](cudaStream_t on, unsigned long long condition) {
-    a.loop = condition;
-    s.find_blocks(on);
-    backend::clear(arrived, on);
-    s.calls[0].law->template kernels<T, D>().persistent(s.laws[0], a, on);
-  });
+  try {
+    repeat(stream, [&](cudaStream_t on, unsigned long long condition) {
+      a.loop = condition;
+      s.find_blocks(on);
+      backend::clear(arrived, on);
+      s.calls[0].law->template kernels<T, D>().persistent(s.laws[0], a, on);
+    });
+  } catch (const std::exception&) {  // before anything was launched
+    cudaGetLastError();
+    refused = true;
+  }
+  return !refused;
 }
 #endif
 
@@ -283,11 +294,14 @@ Results substeps(MPM_SUBSTEPS_PARAMETERS) {
       s.read(from, in_place.F);
       s.write(in_place);
       s.move_late(has(F) ? in_place.F : in_place.J, true, false);
-      take_persistent(s, static_cast<int*>(status[1].data_ptr()), static_cast<int*>(status[0].data_ptr()), stream);
-      take(1, true, stream);
-      last = 1;
-      step = n;
-      return;
+      step = 1;
+      if (take_persistent(s, static_cast<int*>(status[1].data_ptr()), static_cast<int*>(status[0].data_ptr()),
+                          stream)) {
+        take(1, true, stream);
+        last = 1;
+        step = n;
+        return;
+      }
     }
 #endif
     with_team(P * n, [&] {

@@ -114,10 +114,10 @@ struct alignas(K == 1   ? sizeof(T)
   T e[K == 3 ? 4 : K];
 };
 
-// Nodes in shared memory: those of the base block and the next Order along each axis, or of a support alone.
-template <int Order, class T, int K, int Width = kBlockWidth + Order>
+// Nodes in shared memory: those of the base block and the next Order along each axis.
+template <int Order, class T, int K>
 struct TileSupport {
-  static constexpr int blocks = 1, width = Width;
+  static constexpr int blocks = 1, width = kBlockWidth + Order;
   const NodeValue<T, K>* corner;  // the base node
   BlockRows<1> rows;
 
