@@ -185,7 +185,6 @@ Results substeps(MPM_SUBSTEPS_PARAMETERS) {
       time_ = copy_of(*scene_time);
       s.count_scene_times(time_);
     }
-#if MPM_BACKEND == MPM_BACKEND_IS_cuda
     if (s.resides()) {
       start_in_results();
       s.forget_stress();
@@ -206,7 +205,6 @@ Results substeps(MPM_SUBSTEPS_PARAMETERS) {
       taken = true;
       return;
     }
-#endif
     F_[1] = result(x, has(F) && (n > 1 || s.plastic), {P, D, D});
     if (s.plastic && has(F)) {  // which laws change where it stands
       torch::stable::copy_(F_[1], *F);
