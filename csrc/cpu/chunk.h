@@ -190,7 +190,6 @@ struct RunOf {
   static constexpr int kSize = N;
   int first;
 };
-using Run = RunOf<kLanes>;
 
 template <class T, int N>
 MPM_HD Pack<T, N> load_row(const T* row, int64_t, const RunOf<N>& r) {

@@ -25,12 +25,6 @@ void with_team(int64_t particles, const Work& work) {
   cpu::with_team([](void* w) { (*static_cast<const Work*>(w))(); }, const_cast<Work*>(&work));
 }
 
-// How often `work` was replayed: never, where calls cost nothing.
-template <class Work>
-int64_t replay(int64_t, cpu::Stream, const Work&) {
-  return 0;
-}
-
 #else
 
 template <class Work>

@@ -235,7 +235,6 @@ Results substeps(MPM_SUBSTEPS_PARAMETERS) {
       time_ = copy_of(*scene_time);
       s.count_scene_times(time_);
     }
-#if MPM_BACKEND == MPM_BACKEND_IS_cuda
     if (s.resides()) {
       start_in_results();
       s.forget_stress();
@@ -256,7 +255,6 @@ Results substeps(MPM_SUBSTEPS_PARAMETERS) {
       taken = true;
       return;
     }
-#endif
     if (n > 1) s.let_activations_last();
     s.fuse(false);
     const bool late = s.may_move_late();  // where they stand
@@ -286,7 +284,7 @@ Results substeps(MPM_SUBSTEPS_PARAMETERS) {
               field<const T>(F_[into]), field<const T>(J_[into]), field<const T>(history_)};
       return true;
     };
-#if MPM_BACKEND == MPM_BACKEND_IS_cuda && CUDART_VERSION >= 13000
+#if CUDART_VERSION >= 13000
     if (s.persists() && !is_recorded(stream)) {
       take(0, false, stream);
       const Particles<T> in_place{field<T>(x_[0]), field<T>(v_),    field<T>(C_),
