@@ -257,7 +257,7 @@ Results substeps(MPM_SUBSTEPS_PARAMETERS) {
     }
     if (n > 1) s.let_activations_last();
     s.fuse(false);
-    const bool late = s.may_move_late();  // where they stand
+    const bool late = s.may_move_late();  // then F and J stay where they are
     F_[1] = late ? F_[0] : result(x, has(F) && (n > 1 || s.plastic), {P, D, D});
     J_[1] = late ? J_[0] : result(x, has(J) && n > 1, {P});
     if (s.plastic && has(F) && !late) {  // which laws change where it stands
