@@ -195,6 +195,11 @@ Alone::~Alone() {
   if (begins_) led = nullptr;
 }
 
-void rest() { std::this_thread::sleep_for(std::chrono::microseconds(20)); }
+void rest(int spins) {
+  if (spins < kSpins)
+    pause();
+  else
+    std::this_thread::sleep_for(std::chrono::microseconds(20));
+}
 
 }  // namespace mpm::cpu

@@ -31,8 +31,9 @@ class Alone {
   const bool begins_;
 };
 
-// Sleeps some ten microseconds: a wait that lasts leaves its core to whoever is waited for.
-void rest();
+// For who asks again and again, and has done so `spins` times: a pause, and asleep after some ten microseconds, so that
+// a wait that lasts leaves its core to whoever is waited for.
+void rest(int spins);
 
 inline namespace TORCH_MPM_ISA {
 
@@ -101,7 +102,7 @@ struct PhaseCounter {
   void wait_before(int phase) {
     for (int p = 0; p < phase; p++)
       for (int spins = 0; __atomic_load_n(&finished[p], __ATOMIC_ACQUIRE) < start[p + 1] - start[p]; spins++)
-        if (spins > 4000) rest();
+        rest(spins);
   }
   void finish(int phase) { __atomic_fetch_add(&finished[phase], 1, __ATOMIC_RELEASE); }
 };
