@@ -27,10 +27,8 @@ __device__ inline void wait_for_kernel_before() {
 #endif
 }
 
-template <class... Parameters, class... Arguments>
-void launch_with(cudaLaunchAttribute* attributes, unsigned count, void (*kernel)(Parameters...), unsigned blocks,
-                 unsigned threads, size_t shared_memory, cudaStream_t stream, const Arguments&... arguments) {
-  allow_shared_memory(kernel, shared_memory);
+inline cudaLaunchConfig_t launch_config(cudaLaunchAttribute* attributes, unsigned count, unsigned blocks,
+                                        unsigned threads, size_t shared_memory, cudaStream_t stream) {
   cudaLaunchConfig_t config{};
   config.gridDim = blocks;
   config.blockDim = threads;
@@ -38,7 +36,7 @@ void launch_with(cudaLaunchAttribute* attributes, unsigned count, void (*kernel)
   config.stream = stream;
   config.attrs = attributes;
   config.numAttrs = count;
-  check(cudaLaunchKernelEx(&config, kernel, Parameters(arguments)...));
+  return config;
 }
 
 inline cudaLaunchAttribute overlap_attribute() {
@@ -53,8 +51,10 @@ template <class... Parameters, class... Arguments>
 void launch_in_chain(void (*kernel)(Parameters...), unsigned blocks, unsigned threads, size_t shared_memory,
                      cudaStream_t stream, const Arguments&... arguments) {
   if (!waits_for_kernel_before(kernel)) return launch(kernel, blocks, threads, shared_memory, stream, arguments...);
+  allow_shared_memory(kernel, shared_memory);
   cudaLaunchAttribute overlap = overlap_attribute();
-  launch_with(&overlap, 1, kernel, blocks, threads, shared_memory, stream, arguments...);
+  const cudaLaunchConfig_t config = launch_config(&overlap, 1, blocks, threads, shared_memory, stream);
+  check(cudaLaunchKernelEx(&config, kernel, Parameters(arguments)...));
 }
 
 constexpr unsigned kLargestCluster = 16;  // of which not every device takes more than 8
@@ -70,16 +70,14 @@ void launch_at_once(void (*kernel)(Parameters...), unsigned blocks, unsigned thr
   cudaLaunchAttribute attributes[2] = {overlap_attribute()};
   attributes[1].id = cudaLaunchAttributeClusterDimension;
   attributes[1].val.clusterDim = {blocks, 1, 1};
+  const cudaLaunchConfig_t config = launch_config(attributes, 2, blocks, threads, shared_memory, stream);
   const auto takes_cluster = [&] {
-    cudaLaunchConfig_t config{};
-    config.gridDim = blocks;
-    config.blockDim = threads;
-    config.dynamicSmemBytes = shared_memory;
-    config.attrs = attributes + 1;
-    config.numAttrs = 1;
+    cudaLaunchConfig_t cluster = config;  // without the chain
+    cluster.attrs = attributes + 1;
+    cluster.numAttrs = 1;
     int clusters = 0;
     if (cudaFuncSetAttribute(kernel, cudaFuncAttributeNonPortableClusterSizeAllowed, 1) == cudaSuccess &&
-        cudaOccupancyMaxActiveClusters(&clusters, kernel, &config) == cudaSuccess)
+        cudaOccupancyMaxActiveClusters(&clusters, kernel, &cluster) == cudaSuccess)
       return clusters > 0;
     cudaGetLastError();  // which is no error: the device takes no such cluster
     return false;
@@ -96,7 +94,7 @@ void launch_at_once(void (*kernel)(Parameters...), unsigned blocks, unsigned thr
   if (last.kernel != kernel || last.device != device || last.blocks != blocks)
     last = {kernel, device, blocks, takes_cluster()};
   if (last.yes)
-    launch_with(attributes, 2, kernel, blocks, threads, shared_memory, stream, arguments...);
+    check(cudaLaunchKernelEx(&config, kernel, Parameters(arguments)...));
   else
     launch_together(kernel, blocks, threads, shared_memory, stream, arguments...);
 }

@@ -210,9 +210,7 @@ Results substeps(MPM_SUBSTEPS_PARAMETERS) {
   Tensor v_ = empty_particles(x, {P, D_}), C_ = result(x, wants_C, {P, D_, D_}), history_;
   Tensor status[] = {empty_int(x, {1 + scenes, kStatusSize}), empty_int(x, {1 + scenes, kStatusSize})};
   Tensor impulse_, time_;
-  int64_t step = 0;
-  int last = 0;        // of the two buffers, that of the last step
-  bool taken = false;  // by resident scenes, all steps
+  int last = 0;  // of the two buffers, that of the last step
   const auto start_in_results = [&] {
     torch::stable::copy_(x_[0], x);
     torch::stable::copy_(v_, v);
@@ -252,7 +250,6 @@ Results substeps(MPM_SUBSTEPS_PARAMETERS) {
       take_resident(s, n - 1, time, activated, now, stream);
       s.activate(now, activated, stream);
       take_resident(s, 1, last_time, activated, now, stream);
-      taken = true;
       return;
     }
     if (n > 1) s.let_activations_last();
@@ -275,15 +272,15 @@ Results substeps(MPM_SUBSTEPS_PARAMETERS) {
       s.write(
           {field<T>(x_[into]), field<T>(v_), field<T>(C_), field<T>(F_[into]), field<T>(J_[into]), field<T>(history_)});
       if (late) s.move_late(field<T>(has(F) ? F_[0] : J_[0]), !first, last);
-      if (!s.activate(before, now, on)) return false;  // and the status tells
+      s.activate(before, now, on);
       s.move(on);
       before = now;
       first = false;
       // From here on the call reads what it has written.
       from = {field<const T>(x_[into]), field<const T>(v_),       field<const T>(C_),
               field<const T>(F_[into]), field<const T>(J_[into]), field<const T>(history_)};
-      return true;
     };
+    int64_t step = 0;
 #if CUDART_VERSION >= 13000
     if (s.persists() && !is_recorded(stream)) {
       take(0, false, stream);
@@ -295,28 +292,20 @@ Results substeps(MPM_SUBSTEPS_PARAMETERS) {
       step = 1;
       if (take_persistent(s, static_cast<int*>(status[1].data_ptr()), static_cast<int*>(status[0].data_ptr()),
                           stream)) {
-        take(1, true, stream);
-        last = 1;
-        step = n;
+        take(last = 1, true, stream);
         return;
       }
     }
 #endif
-    with_team(P * n, [&] {
-      while (step < n && take(int(step % 2), step + 1 == n, stream)) {
-        last = int(step % 2);
-        if (++step == 2)
-          step += 2 * replay((n - step - 1) / 2, stream,
-                             [&](backend::Stream on) { take(0, false, on), take(1, false, on); });
-      }
-    });
+    while (step < n) {
+      last = int(step % 2);
+      take(last, step + 1 == n, stream);
+      if (++step == 2)
+        step +=
+            2 * replay((n - step - 1) / 2, stream, [&](backend::Stream on) { take(0, false, on), take(1, false, on); });
+    }
   });
-  if (step == 0) {
-    if (!taken) start_in_results();  // the first activation found no room
-    return {x_[0], v_, C_, F_[0], J_[0], history_, status[0], impulse_, time_, Tensor()};
-  }
-  return {x_[last], v_,    C_,      F_[last], J_[last], history_, status[step < n ? 1 - last : last],
-          impulse_, time_, Tensor()};
+  return {x_[last], v_, C_, F_[last], J_[last], history_, status[last], impulse_, time_, Tensor()};
 #endif
 }
 
