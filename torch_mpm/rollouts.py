@@ -209,6 +209,9 @@ FEW_BLOCKS, FEW_ITEMS = 2**12, 140
 """Of a domain, and of work in a step, for which about one wave of thread blocks is enough."""
 LONG_CHUNK = 1024
 """Steps between two looks at whether it still is."""
+MANY_PARTICLES, PARTICLES_PER_BLOCK = 2**20, 32
+"""Of a call whose ends cost as much as a few steps (csrc/rollout/merged.h); and so many of them take as much memory as
+the nodes of a block do."""
 KEPT_BYTES = {"cpu": 2**24, "cuda": 2**29}
 """What the backward pass of one op may hold of its steps, even where sqrt(n) steps need less: what the caches of a CPU
 hold, and so much that kernels on CUDA hide the time of Python."""
@@ -240,9 +243,14 @@ def in_chunks(
 
 def takes_all_blocks(step: Step, state: State, n: int) -> bool:
     """Whether the pool of a call without gradients has room for all blocks of the domain, so that nobody looks whether
-    it must grow: where there are few, and a kernel takes many steps of few particles (`Substeps::persists`)."""
+    it must grow: where there are few, and a kernel takes many steps of few particles (`Substeps::persists`), or where
+    many particles take more memory than all blocks."""
     grid = step.grid
-    if not (grid.grows and state.x.is_cuda and grid.block_count <= FEW_BLOCKS and grid.max_blocks is not None):
+    if not (grid.grows and state.x.is_cuda):
+        return False
+    if len(state) >= max(MANY_PARTICLES, PARTICLES_PER_BLOCK * grid.block_count):
+        return True
+    if grid.block_count > FEW_BLOCKS or grid.max_blocks is None:
         return False
     mirrors = step.walls is not None and step.walls.mirrors() is not None
     form = (step.transfer, step.stress_form, grid.kernel, grid.deterministic)

@@ -117,7 +117,8 @@ Workspace lay_out(const ActivateArguments<T, D>& a) {
 // Counts a particle that is left out among all and in its scene, unless an earlier activation has told of that row: a
 // scene that is lost costs atomics only once.
 template <class T, int D>
-__device__ void report(const ActivateArguments<T, D>& a, Trouble* trouble, bool finite, int scene, int p) {
+__device__ void report(const ActivateArguments<T, D>& a, Trouble* trouble, bool finite, int scene, int row) {
+  const int p = a.origin ? a.origin[row] : row;
   const auto count_in = [&](int row) {
     if (a.previous_status && a.previous_status[row * int64_t(kStatusSize) + kProblemActivation] >= 0) return;
     LeftOut& out = finite ? trouble[row].outside : trouble[row].not_finite;
@@ -190,17 +191,24 @@ __device__ void list_tiles(const Workspace& w) {
   if (threadIdx.x == 0) *w.listed = listed;
 }
 
+// Row of the first particle.
+template <class T, int D>
+__device__ int first_row(const ActivateArguments<T, D>& a) {
+  return a.copy && *a.copy ? a.copy_rows : 0;
+}
+
 // Particles [kThreads piece, kThreads (piece + 1)).
 template <int Order, bool Marks, class T, int D>
 __device__ void classify(const ActivateArguments<T, D>& a, const Workspace& w, int64_t piece) {
   const int64_t p = piece * kThreads + threadIdx.x;
   const bool exists = p < a.particles;
+  const int64_t row = p + first_row(a);
   T x[D], f[D];
   int base[D], key = -1;
   unsigned touched = 0;
   if (exists) {
 #pragma unroll
-    for (int i = 0; i < D; i++) x[i] = a.x.pointer[p * a.x.stride[0] + i * a.x.stride[1]];
+    for (int i = 0; i < D; i++) x[i] = a.x.pointer[row * a.x.stride[0] + i * a.x.stride[1]];
     const bool finite = is_finite<D>(x);
     const int scene = a.scene ? a.scene[p * a.scene_stride] : 0;
     if (finite && unsigned(scene) < unsigned(a.scenes) && locate<Order>(a.geometry, x, base, f)) {
@@ -213,7 +221,7 @@ __device__ void classify(const ActivateArguments<T, D>& a, const Workspace& w, i
       touched = touched_blocks<Order, D>(base);
       key = block_index(a.geometry, scene, block);
     } else if (scene != kAbsent) {
-      report(a, w.trouble, finite, scene, int(p));
+      report(a, w.trouble, finite, scene, int(row));
     }
   }
   // One atomic per block and warp: neighbours in memory are mostly neighbours in space.
@@ -399,7 +407,8 @@ __device__ void write_status(const ActivateArguments<T, D>& a, const Workspace& 
   copy_status(a.previous_status ? a.previous_status + start : nullptr, status);
   const bool left_out = trouble.outside.count > 0 || trouble.not_finite.count > 0;
   if (status[kProblemActivation] < 0 && (left_out || (row == 0 && wanted > a.max_blocks))) {
-    status[kProblemActivation] = a.previous_status ? a.previous_status[kActivations] : 0;
+    const int missed = a.missed && (a.missed->lost & Drift::kMissed);
+    status[kProblemActivation] = a.previous_status ? a.previous_status[kActivations] - missed : 0;
     const auto write = [&](const LeftOut& out, int count, int first, int id) {
       if (out.count == 0) return;
       const int p = INT_MAX - out.first;
@@ -457,7 +466,7 @@ __device__ void place(const ActivateArguments<T, D>& a, const Workspace& w, int6
     w.id[i] = int(i);
   } else {
     const int rank = w.rank[i];
-    a.index[first < 0 ? a.particles + first - rank : first + rank] = int(i);
+    a.index[first < 0 ? a.particles + first - rank : first + rank] = int(i) + first_row(a);
   }
 }
 
@@ -499,7 +508,7 @@ __global__ void __launch_bounds__(kThreads)
     activate_at_once(const ActivateArguments<T, D> a, const Workspace w, int table, int64_t rows) {
   wait_for_kernel_before();
   const int64_t start = int64_t(blockIdx.x) * kThreads + threadIdx.x, stride = int64_t(gridDim.x) * kThreads;
-  if (a.drift && !a.fresh && a.drift->lasts(a.particles)) {
+  if (a.drift && !a.fresh && a.drift->lasts(a.particles, a.strays_of_activation)) {
     for (int64_t row = start; row <= a.scenes; row += stride) {
       int* const status = a.status + row * kStatusSize;
       copy_status(a.previous_status + row * kStatusSize, status);

@@ -24,14 +24,18 @@ struct ActivateArguments {
   const int* previous_status = nullptr;  // [1 + scenes, 8] or null
   int *table = nullptr, *block = nullptr, *offsets = nullptr, *index = nullptr, *schedule = nullptr, *status = nullptr;
   int64_t schedule_size = 0;
-  // On the CPU: where the particles came from, whose numbers the status tells then; how often one does not follow the
-  // one before it in memory, in the order of cells. Both may be null.
-  const int* origin = nullptr;
-  int64_t* breaks = nullptr;
+  const int* origin = nullptr;  // where the particles came from, whose numbers the status tells then; or null
+  int64_t* breaks = nullptr;    // on the CPU: how often one does not follow the one before it in memory, in the order
+                                // of cells; or null
+  // On CUDA: rows of each of two copies of x and origin, and which one counts; or null. Then the index has rows.
+  const int* copy = nullptr;
+  int copy_rows = 0;
   void* workspace = nullptr;  // bytes asked for by activate_workspace()
   bool fresh = true;          // whether the table and the workspace are not those of an earlier call as they were left
   int64_t workspace_size = 0;
   const Drift* drift = nullptr;  // since the activation in these tensors; null for a new one in any case
+  int strays_of_activation = kStraysOfActivation;
+  const Drift* missed = nullptr;  // where a particle may have been missed a step ago
 
   MPM_HD int slots() const { return max_blocks + margin_blocks; }
 };

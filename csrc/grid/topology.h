@@ -21,19 +21,26 @@ struct Topology {
   int64_t schedule_size = 0;
 };
 
+constexpr int kStraysOfActivation = 32;  // times as many cost what the activation of one particle does
+
 // Where particles are that have moved since their activation, which on CUDA may serve several steps.
 struct Drift {
   int strays;   // particles in other blocks than they were then
-  int lost;     // whether one touches a block that is not active
+  int lost;     // whether one touches a block that is not active, or may soon: bits of Loss
   int earlier;  // strays of the steps before, added up
 
+  // The second one where P2G of the same kernel has already missed a particle.
+  enum Loss : int { kLost = 1, kMissed = 2 };
+
   // A stray costs a step more than another particle does. Once all have cost what an activation does there is a new
-  // one, so that both together are at most twice the least possible.
-  MPM_HD bool lasts(int64_t particles) const {
-    constexpr int64_t strays_of_activation = 32;  // times as many cost what the activation of one particle does
+  // one, so that both together are at most twice the least possible: once `strays_of_activation` times as many as there
+  // are particles have been counted.
+  MPM_HD bool lasts(int64_t particles, int strays_of_activation = kStraysOfActivation) const {
     return lost == 0 && (int64_t(earlier) + strays) * strays_of_activation <= particles;
   }
-  MPM_HD Drift next(int64_t particles) const { return {0, 0, lasts(particles) ? earlier + strays : 0}; }
+  MPM_HD Drift next(int64_t particles, int strays_of_activation = kStraysOfActivation) const {
+    return {0, 0, lasts(particles, strays_of_activation) ? earlier + strays : 0};
+  }
 };
 
 // Entries of the schedule tensor: room for the work items of both backends, with the number of particles of each cell,

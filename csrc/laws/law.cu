@@ -2,6 +2,7 @@
 #define MPM_REGISTER_LAW(Law) static const bool Law##_is_entered = enter<cuda::LawLaunches, Law>(0);
 
 #include "laws/registry.h"
+#include "rollout/g2p2g.cuh"
 #include "rollout/persistent.cuh"
 #include "rollout/resident.cuh"
 
@@ -91,19 +92,25 @@ struct LawMomentumSource : MomentumSource<2, T, D, Stress::moment, true> {
                     const LateDeformation<T, D>& late = {})
       : Base(a), law(law), late(late) {}
 
-  // The stress, and what is to be kept.
-  __device__ Matrix<T, D> evaluate(int p, const Matrix<T, D>& C, const T& dt, Changes& changes) const {
+  // What the law needs of a particle but for its history.
+  __device__ void fetch(int p, Changes& changes) const {
+    if constexpr (moves_F)
+      changes.F = load_matrix<D>(One<T>{p}, law.law.state);
+    else
+      changes.J = load_scalar(One<T>{p}, law.law.state);
+  }
+  // The stress, from what was fetched, which becomes what is to be kept.
+  __device__ Matrix<T, D> stress(int p, const Matrix<T, D>& C, const T& dt, Changes& changes) const {
     const One<T> at{p};
     Matrix<T, D> stress;
     LawUpdateArguments<T, D> a = law;
     a.stress = {&stress[0][0], {0, D, 1}};
+    if (Law::viscous && Base::fields.affine.present()) a.law.C = {&C[0][0], {0, D, 1}};
     if constexpr (moves_F) {
-      changes.F = load_matrix<D>(at, law.law.state);
       if (late.moves) changes.F = advance_deformation(changes.F, C, dt);
       a.law.state = {&changes.F[0][0], {0, D, 1}};
       if (Law::plastic) a.state = {&changes.F[0][0], {0, D, 1}};
     } else {
-      changes.J = load_scalar(at, law.law.state);
       if (late.moves) changes.J = advance_volume_ratio(changes.J, C, dt);
       a.law.state = {&changes.J, {0}};
     }
@@ -111,6 +118,10 @@ struct LawMomentumSource : MomentumSource<2, T, D, Stress::moment, true> {
     Kernels::update(a, at);
     if (law.stress.pointer) store_matrix<D>(at, law.stress, stress);
     return stress;
+  }
+  __device__ Matrix<T, D> evaluate(int p, const Matrix<T, D>& C, const T& dt, Changes& changes) const {
+    fetch(p, changes);
+    return stress(p, C, dt, changes);
   }
   __device__ void keep(int p, const Changes& changes) const {
     const One<T> at{p};
@@ -141,23 +152,79 @@ struct LawMomentumSource : MomentumSource<2, T, D, Stress::moment, true> {
     }
   }
   __device__ ParticleMomentum<T, D> load(int p, int scene) const {
-    ParticleMomentum<T, D> m = Base::fields.read(p, scene, true, true);
+    ParticleMomentum<T, D> m = read(p, scene, p);
     m.stress = update(p, m.affine, m.dt);
     return m;
   }
   // The same, with what is to be kept left to the caller.
   __device__ ParticleMomentum<T, D> load(int p, int scene, Changes& changes) const {
-    ParticleMomentum<T, D> m = Base::fields.read(p, scene, true, true);
+    ParticleMomentum<T, D> m = read(p, scene, p);
     m.stress = evaluate(p, m.affine, m.dt, changes);
     return m;
   }
   // Outside the grid, where F has to be moved once more after the particle has left; then its affine field is zero. Of
   // a position that is not finite it may be NaN, and F stays.
   __device__ void leave_out(int p) const {
-    const int scene = late.scene ? late.scene[p * late.scene_stride] : 0;
-    const auto m = Base::fields.read(p, unsigned(scene) < unsigned(Base::topology.scenes) ? scene : 0, true, true);
+    const auto m = read(p, scene_of_late(p), p);
     const bool finite = is_finite<D>(read_vector(Base::position, p).e);
     update(p, finite ? m.affine : zero_matrix<T, D>(), m.dt);
+  }
+  __device__ void leave_out_at_rest(int p) const {
+    update(p, zero_matrix<T, D>(), Base::fields.time_step(scene_of_late(p)));
+  }
+
+ protected:
+  // Its stress is zero yet; `of_motion` is the row of its velocity and affine field.
+  __device__ ParticleMomentum<T, D> read(int p, int scene, int of_motion) const {
+    ParticleMomentum<T, D> m = Base::fields.read_at_rest(p, scene);
+    Base::fields.read_motion(of_motion, m);
+    return m;
+  }
+  __device__ int scene_of_late(int p) const {
+    const int scene = late.scene ? late.scene[p * late.scene_stride] : 0;
+    return unsigned(scene) < unsigned(Base::topology.scenes) ? scene : 0;
+  }
+};
+
+// The same of particles that P2G also puts in the order of its items, if the call owns them.
+template <class Law, class T, int D>
+struct SettlingSource : LawMomentumSource<Law, T, D, true> {
+  using Base = LawMomentumSource<Law, T, D, true>;
+  Settling<T, D> settling;
+
+  SettlingSource(const P2GArguments<T, D>& a, const LawUpdateArguments<T, D>& law, const LateDeformation<T, D>& late,
+                 const Settling<T, D>& settling)
+      : Base(a, law, late), settling(settling) {}
+
+  __device__ bool is_due() const { return settling.rows == 0 || settling.is_due(Base::topology.particles); }
+  __device__ ParticleMomentum<T, D> load(int p, int scene, int place) const {
+    ParticleMomentum<T, D> m = Base::read(p, scene, settling.rows ? settling.place(p) : p);
+    take(p, place, m, m.affine, m.stress);
+    return m;
+  }
+  __device__ void leave_out(int p, int place) const {
+    ParticleMomentum<T, D> m = Base::read(p, Base::scene_of_late(p), settling.rows ? settling.place(p) : p);
+    const bool finite = is_finite<D>(read_vector(Base::position, p).e);
+    take(p, place, m, finite ? m.affine : zero_matrix<T, D>(), m.stress);
+  }
+
+ private:
+  __device__ void take(int p, int place, const ParticleMomentum<T, D>& m, const Matrix<T, D>& C,
+                       Matrix<T, D>& stress) const {
+    typename Base::Changes changes;
+    stress = Base::evaluate(p, C, m.dt, changes);
+    const int to = settling.rows ? settling.in_other_copy(p, place) : p;
+    Base::keep(to, changes);
+    if (settling.rows) settle(p, place, to, m);
+  }
+  __device__ void settle(int p, int place, int to, const ParticleMomentum<T, D>& m) const {
+    const One<T> at{to};
+    store_vector<D>(at, settling.x, read_vector(Base::position, p));
+    store_scalar(at, settling.mass, m.mass);
+    store_scalar(at, settling.volume, m.volume);
+    settling.origin[to] = settling.given ? p : settling.origin[p];
+    settling.index[place] = to;
+    if (place == 0) *settling.copy = to >= settling.rows;
   }
 };
 
@@ -168,8 +235,12 @@ struct FusedLaunch {};
 template <class Law, int D>
 struct FusedLaunch<Law, float, D> {
   static void p2g(const LawUpdateArguments<float, D>& law, const LateDeformation<float, D>& late,
-                  const P2GArguments<float, D>& a, void* stream) {
-    launch_scatter(LawMomentumSource<Law, float, D, true>(a, law, late), false, static_cast<Stream>(stream));
+                  const P2GArguments<float, D>& a, const Settling<float, D>& settling, void* stream) {
+    launch_scatter(SettlingSource<Law, float, D>(a, law, late, settling), false, static_cast<Stream>(stream));
+  }
+  static void g2p2g(const LawUpdateArguments<float, D>& law, const G2P2GArguments<float, D>& a, void* stream) {
+    launch_g2p2g(LawMomentumSource<Law, float, D, true>(a.p2g, law, a.late),
+                 AdvanceGather<2, float, D, false, true, false>(a.advance), a, static_cast<Stream>(stream));
   }
 #if CUDART_VERSION >= 13000
   static void persistent(const LawUpdateArguments<float, D>& law, const PersistentArguments<float, D>& a,

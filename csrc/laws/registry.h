@@ -4,6 +4,7 @@
 #include <vector>
 
 #include "laws/law.h"
+#include "rollout/g2p2g.h"
 #include "rollout/persistent.h"
 #include "rollout/resident.h"
 
@@ -33,7 +34,9 @@ struct LawKernels {
   void (*energy_double_backward)(const LawEnergyDoubleBackwardArguments<T, D>&, void* stream) = nullptr;
   // Motion of F or J, update and P2G in one, the stress in registers: of quadratic weights and the MLS form, on CUDA.
   void (*p2g)(const LawUpdateArguments<T, D>&, const LateDeformation<T, D>&, const P2GArguments<T, D>&,
-              void* stream) = nullptr;
+              const Settling<T, D>&, void* stream) = nullptr;
+  // G2P and the P2G after it in one.
+  void (*g2p2g)(const LawUpdateArguments<T, D>&, const G2P2GArguments<T, D>&, void* stream) = nullptr;
   // Substeps of few particles, of quadratic weights and the MLS form, on CUDA 13.
   void (*persistent)(const LawUpdateArguments<T, D>&, const PersistentArguments<T, D>&, void* stream) = nullptr;
   // All substeps of small scenes, of quadratic weights and the MLS form, on CUDA.
@@ -108,6 +111,7 @@ void fill_kernels(LawEntry& entry) {
     kernels.energy_backward = K::energy_backward;
     if constexpr (Law::has_tangent) kernels.tangent = K::tangent;
     if constexpr (requires { &K::p2g; }) kernels.p2g = &K::p2g;
+    if constexpr (requires { &K::g2p2g; }) kernels.g2p2g = &K::g2p2g;
     if constexpr (requires { &K::persistent; }) kernels.persistent = &K::persistent;
     if constexpr (requires { &K::resident; }) kernels.resident = &K::resident;
     if constexpr (Law::twice_differentiable) kernels.double_backward = K::double_backward;

@@ -6,13 +6,23 @@ namespace mpm::cuda {
 namespace {
 
 constexpr int kThreads = 256;
+constexpr float kFar = 0.9f;  // cells in a step: particles go less than one
+
+template <class T, int D>
+__device__ bool goes_far(const GridUpdateArguments<T, D>& a, const SlotUpdate<T, D>& s, const NodeRow<T, D>& row) {
+  const T dt = a.scene_dt ? T(a.dt) * a.scene_dt[s.scene] : T(a.dt), cells = dt * a.geometry.inverse_dx;
+  bool near = true;
+#pragma unroll
+  for (int i = 0; i < D; i++) near = near && fabs(cells * row.value[i]) < T(kFar);  // false for NaN
+  return !near;
+}
 
 template <bool Obstacles, class T, int D>
 __global__ void __launch_bounds__(kThreads) next_grid_kernel(const NextGridArguments<T, D> a) {
   wait_for_kernel_before();
   const int64_t node = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   const int slot = int(node / kBlockNodes<D>), local = int(node % kBlockNodes<D>);
-  if (node == 0) *a.next_drift = a.drift->next(a.particles);
+  if (node == 0) *a.next_drift = a.drift->next(a.particles, a.strays_of_activation);
   if (slot >= a.update.max_blocks) return;
   const SlotUpdate<T, D> s = slot_update(a.update, slot);
   if (!s.active) return;
@@ -23,6 +33,7 @@ __global__ void __launch_bounds__(kThreads) next_grid_kernel(const NextGridArgum
       row.value = after_obstacles(a.contact, there, a.contact.obstacles, node_position(a.contact, there.corner, local),
                                   row.value);
   }
+  if (a.watched && goes_far(a.update, s, row)) atomicOr(&a.watched->lost, Drift::kLost);
   a.update.updated[node] = row;
   if (a.emptied) a.emptied[node] = {};
 }

@@ -16,7 +16,9 @@ struct NextGridArguments {
   NodeRow<T, D>* emptied = nullptr;  // the nodes, which become zero; null where mirrors read those of others
   const Drift* drift = nullptr;
   Drift* next_drift = nullptr;
+  Drift* watched = nullptr;  // told of nodes that go so far that particles may leave the active blocks; or null
   int64_t particles = 0;
+  int strays_of_activation = kStraysOfActivation;
 };
 
 }  // namespace mpm

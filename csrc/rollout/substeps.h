@@ -68,6 +68,8 @@ struct SubstepsInputs {
 };
 
 constexpr int64_t kMostSteps = 1 << 16;  // of one call, which nothing interrupts
+// Fewer particles are faster by kernels of their own: those that find nothing to do cost more than half of the bytes.
+constexpr int64_t kLeastMergedSteps = 4, kLeastMergedParticles = 1 << 20;
 
 // The words of a list that commas part.
 inline std::vector<std::string> words(const std::string& list) {
@@ -259,6 +261,7 @@ struct Substeps {
   Tensor impulse, impulse_slots;  // on obstacles and walls so far; where someone asks, see `add_impulses_to`
   bool obstacles = false, fused = false;
   LateDeformation<T, D> late;    // of P2G, where a G2P leaves F and J to the next one
+  Settling<T, D> settling;       // of P2G, where the call owns its particles
   bool nodes_are_clear = false;  // when a step begins
   const int* previous_status = nullptr;
 
@@ -343,10 +346,22 @@ struct Substeps {
     if (fused && !keeps_stress) forget_stress();
   }
 
-  // Whether P2G moves F or J, which it needs the affine field and a kernel of the law for. Not of particles that caches
-  // do not hold: these drift apart in memory, where G2P can go in its order and P2G cannot.
-  bool may_move_late() const {
-    return fused && drifts.defined() && in.apic && has(in.F) != has(in.J) && in.x.size(0) <= kMostLateParticles;
+  // Whether P2G can move F or J, which it needs the affine field and a kernel of the law for.
+  bool can_move_late() const { return fused && drifts.defined() && in.apic && has(in.F) != has(in.J); }
+
+  // Whether it does where particles stay where they are in memory. Not of those that caches do not hold: they drift
+  // apart, where G2P can go in the order of memory and P2G cannot.
+  bool may_move_late() const { return can_move_late() && in.x.size(0) <= kMostLateParticles; }
+
+  // Whether G2P and the next P2G are one kernel while activations last, which a call that owns its particles can do.
+  // They are of one scene and have one material.
+  bool merges() const {
+    if (!can_move_late() || !in.resident || in.n < kLeastMergedSteps || in.x.size(0) < kLeastMergedParticles)
+      return false;
+    if (!next.emptied || has(in.impulse) || has(in.scene) || !calls[0].law->kernels<T, D>().g2p2g) return false;
+    for (size_t k = 0; k < calls[0].parameters.size(); k++)
+      if (laws[0].law.parameters[k].stride != 0) return false;
+    return in.x.size(0) <= INT32_MAX / 2;
   }
 
   // Whether a kernel takes many substeps of few particles, all but the first and the last of a call. It pays where some
@@ -427,7 +442,7 @@ struct Substeps {
   void move_grid(backend::Stream stream) {
     clear_nodes(stream);
     if (fused)
-      calls[0].law->kernels<T, D>().p2g(laws[0], late, p2g, stream);
+      calls[0].law->kernels<T, D>().p2g(laws[0], late, p2g, settling, stream);
     else
       backend::p2g(in.lattice.order(), p2g, stream);
     move_nodes(stream);

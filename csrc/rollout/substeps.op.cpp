@@ -4,6 +4,8 @@
 #include "rollout/replay.h"
 #if MPM_BACKEND == MPM_BACKEND_IS_cpu
 #include "rollout/own_particles.h"
+#else
+#include "rollout/merged.h"
 #endif
 
 // n steps of a simulation in one call.
@@ -204,7 +206,7 @@ Results substeps(MPM_SUBSTEPS_PARAMETERS) {
   return results;
 #else
   const int64_t P = x.size(0), D_ = x.size(1);
-  Tensor x_[] = {empty_particles(x, {P, D_}), result(x, n > 1, {P, D_})};
+  Tensor x_[] = {empty_particles(x, {P, D_}), Tensor()};
   Tensor F_[] = {result(x, has(F), {P, D_, D_}), Tensor()};
   Tensor J_[] = {result(x, has(J), {P}), Tensor()};
   Tensor v_ = empty_particles(x, {P, D_}), C_ = result(x, wants_C, {P, D_, D_}), history_;
@@ -254,15 +256,21 @@ Results substeps(MPM_SUBSTEPS_PARAMETERS) {
     }
     if (n > 1) s.let_activations_last();
     s.fuse(false);
+    s.make_pool(stream);
+    s.count_time(before, stream);
+    if (s.merges()) {
+      const Particles<T> results{field<T>(x_[0]), field<T>(v_),    field<T>(C_),
+                                 field<T>(F_[0]), field<T>(J_[0]), field<T>(history_)};
+      return Merged<T, D>(s, results, status, stream).take_all(from, before);
+    }
     const bool late = s.may_move_late();  // then F and J stay where they are
+    x_[1] = result(x, n > 1, {P, D});
     F_[1] = late ? F_[0] : result(x, has(F) && (n > 1 || s.plastic), {P, D, D});
     J_[1] = late ? J_[0] : result(x, has(J) && n > 1, {P});
     if (s.plastic && has(F) && !late) {  // which laws change where it stands
       torch::stable::copy_(F_[1], *F);
       from.F = field<const T>(F_[1]);
     }
-    s.make_pool(stream);
-    s.count_time(before, stream);
     bool first = true;
     // A substep that reads and writes these buffers in turn, into the first or the second.
     const auto take = [&](int into, bool last, backend::Stream on) {

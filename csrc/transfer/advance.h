@@ -2,6 +2,7 @@
 
 #include "common/lanes.h"
 #include "transfer/arguments.h"
+#include "transfer/own_rows.h"
 
 // The end of a symplectic Euler step, with the velocity and the affine field just gathered:
 //   x ← x + dt v,   F ← (I + dt C) F,   J ← J (1 + dt tr C).
@@ -47,6 +48,7 @@ struct G2PAdvanceArguments {
   bool late = false;  // F and J are left to P2G, where there is a LateDeformation; on CUDA
   // On CUDA: particles may be in other active blocks than they were activated in, and where they go now is added here.
   Drift* drift = nullptr;
+  GivingBack<T> own;  // on CUDA
 };
 
 constexpr int64_t kMostLateParticles = 1 << 18;

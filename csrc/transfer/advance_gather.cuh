@@ -5,6 +5,12 @@
 
 namespace mpm::cuda {
 
+template <class T, int D>
+struct Motion {
+  Vector<T, D> velocity;
+  Matrix<T, D> affine;
+};
+
 // G2P with the end of the step, so that v and C need not be read again. Where it is not to Move F and J, P2G does.
 template <int Order_, class T_, int D_, bool Gradient, bool Drifts, bool Moves = true>
 struct AdvanceGather {
@@ -74,47 +80,90 @@ struct AdvanceGather {
     sum_axis<Shape, 0>(support, support.rows, 0, w, constant, linear, s);
     return s;
   }
+  // The velocity and the affine field.
+  __device__ Motion<T, D> motion(const Result& s) const {
+    Motion<T, D> m;
+#pragma unroll
+    for (int i = 0; i < D; i++) {
+      m.velocity[i] = s.value[i];
+#pragma unroll
+      for (int j = 0; j < D; j++) m.affine[i][j] = moment_scale * s.moment[i][j];
+    }
+    return m;
+  }
   // Returns where the particle goes.
-  __device__ mpm::Vector<T, D> write(int p, const Loaded& l, const Result& s) const {
-    mpm::Vector<T, D> v;
+  __device__ mpm::Vector<T, D> write(int p, const Loaded& l, const Result& s) const { return write(p, p, p, l, s); }
+  // The motion goes to a row of its own, the others to row `to`.
+  __device__ mpm::Vector<T, D> write(int p, int of_motion, int to, const Loaded& l, const Result& s) const {
+    const Motion<T, D> m = motion(s);
     Matrix<T, D> L;
 #pragma unroll
     for (int i = 0; i < D; i++) {
-      v[i] = s.value[i];
-      velocity.at(p, i) = v[i];
+      velocity.at(of_motion, i) = m.velocity[i];
 #pragma unroll
       for (int j = 0; j < D; j++) {
-        const T C = moment_scale * s.moment[i][j];
-        L[i][j] = Gradient ? gradient_scale * s.gradient[i][j] : C;
-        affine.write(p, i * D + j, C);
+        L[i][j] = Gradient ? gradient_scale * s.gradient[i][j] : m.affine[i][j];
+        affine.write(of_motion, i * D + j, m.affine[i][j]);
       }
     }
-    const mpm::Vector<T, D> x = advance_position(l.x, v, l.dt);
+    const mpm::Vector<T, D> x = advance_position(l.x, m.velocity, l.dt);
 #pragma unroll
-    for (int i = 0; i < D; i++) x_next.at(p, i) = x[i];
+    for (int i = 0; i < D; i++) x_next.at(to, i) = x[i];
     if constexpr (!Moves) return x;
     const Matrix<T, D> deformed = advance_deformation(l.F, L, l.dt);
 #pragma unroll
     for (int i = 0; i < D; i++)
 #pragma unroll
-      for (int j = 0; j < D; j++) F_next.write(p, i * D + j, deformed[i][j]);
-    J_next.write(p, 0, advance_volume_ratio(l.J, L, l.dt));
+      for (int j = 0; j < D; j++) F_next.write(to, i * D + j, deformed[i][j]);
+    J_next.write(to, 0, advance_volume_ratio(l.J, L, l.dt));
     return x;
   }
-  __device__ void leave_out(int p) const {
+  __device__ void leave_out(int p) const { leave_out(p, p, p); }
+  __device__ void leave_out(int p, int of_motion, int to) const {
     const mpm::Vector<T, D> x = read_vector(position, p);
     const T rest = is_finite<D>(x.e) ? T(0) : lost;
 #pragma unroll
     for (int i = 0; i < D; i++) {
-      velocity.at(p, i) = rest;
-      x_next.at(p, i) = x[i];
+      velocity.at(of_motion, i) = rest;
+      x_next.at(to, i) = x[i];
     }
 #pragma unroll
     for (int k = 0; k < D * D; k++) {
-      affine.write(p, k, rest);
-      if (Moves && F.present()) F_next.at(p, k) = F.at(p, k);
+      affine.write(of_motion, k, rest);
+      if (Moves && F.present()) F_next.at(to, k) = F.at(p, k);
     }
-    if (Moves && J.present()) J_next.at(p) = J.at(p);
+    if (Moves && J.present()) J_next.at(to) = J.at(p);
+  }
+};
+
+// Of particles that the call owns: before a new activation, with F and J left to P2G; or at the end, when they move and
+// all goes to the places in the given tensors.
+template <class T, int D, bool Ends>
+struct OwnAdvanceGather : AdvanceGather<2, T, D, false, true, Ends> {
+  using Base = AdvanceGather<2, T, D, false, true, Ends>;
+  GivingBack<T> own;
+
+  explicit OwnAdvanceGather(const G2PAdvanceArguments<T, D>& a) : Base(a), own(a.own) {}
+
+  __device__ bool is_due() const { return own.is_due(Base::topology.particles); }
+  __device__ mpm::Vector<T, D> write(int p, const typename Base::Loaded& l, const typename Base::Result& s) const {
+    const int to = target(p);
+    give_history(p, to);
+    return Base::write(p, to, Ends ? to : p, l, s);
+  }
+  __device__ void leave_out(int p) const {
+    const int to = target(p);
+    give_history(p, to);
+    Base::leave_out(p, to, Ends ? to : p);
+  }
+
+ private:
+  __device__ int target(int p) const { return Ends ? own.origin[p] : own.place(p); }
+  __device__ void give_history(int p, int to) const {
+    if constexpr (!Ends) return;
+    for (int k = 0; k < own.columns; k++)
+      own.history_next.pointer[to * own.history_next.stride[0] + k * own.history_next.stride[1]] =
+          own.history.pointer[p * own.history.stride[0] + k * own.history.stride[1]];
   }
 };
 

@@ -114,10 +114,10 @@ struct alignas(K == 1   ? sizeof(T)
   T e[K == 3 ? 4 : K];
 };
 
-// Nodes in shared memory: those of the base block and the next Order along each axis.
-template <int Order, class T, int K>
+// Nodes in shared memory: those of the base block and the next Order along each axis, and `Halo` more on either side.
+template <int Order, class T, int K, int Halo = 0>
 struct TileSupport {
-  static constexpr int blocks = 1, width = kBlockWidth + Order;
+  static constexpr int blocks = 1, width = kBlockWidth + Order + 2 * Halo;
   const NodeValue<T, K>* corner;  // the base node
   BlockRows<1> rows;
 
@@ -281,7 +281,8 @@ class Follower {
 // the particle gets; write(p, loaded, result), with a result of zeros where positions are not those of the activation;
 // leave_out(p) for a particle outside. Where it drifts, particles may be in other active blocks than those of the
 // activation, write(...) returns where they go, and there is a drift to add that to. Where it has `Others`, that many
-// channels of the nodes `others` have a support of their own, the last argument of compute(...).
+// channels of the nodes `others` have a support of their own, the last argument of compute(...). Where it tells whether
+// it is due, particles are in the order of items, but for one activation.
 template <class Task>
 constexpr bool may_drift = requires { requires Task::drifts; };
 template <class Task>
@@ -461,10 +462,14 @@ __global__ void __launch_bounds__(kGatherThreads, kResident<Task>) gather_kernel
   wait_for_kernel_before();
   const Schedule<const int> schedule = schedule_of(task.topology);
   FollowerOf<Task> follower;
-  if (*schedule.scattered)
-    gather_in_memory_order<Quads>(task, schedule, follower);
-  else
+  if constexpr (requires { task.is_due(); }) {
+    if (!task.is_due()) return;
     gather_by_items<Quads>(task, schedule, follower);
+  } else if (*schedule.scattered) {
+    gather_in_memory_order<Quads>(task, schedule, follower);
+  } else {
+    gather_by_items<Quads>(task, schedule, follower);
+  }
   if constexpr (may_drift<Task>) follower.tell(task.drift);
 }
 

@@ -28,29 +28,38 @@ struct MomentumFields {
         inverse_dx(a.topology.geometry.inverse_dx),
         form(a.form) {}
 
-  // A stress that the caller computes is left zero.
-  __device__ ParticleMomentum<T, D> read(int p, int scene, bool with_stress, bool computed = false) const {
-    ParticleMomentum<T, D> m;
+  __device__ ParticleMomentum<T, D> read(int p, int scene, bool with_stress) const {
+    ParticleMomentum<T, D> m{};
     m.mass = mass.at(p);
+    read_motion(p, m);
+    if (with_stress) {
+      m.volume = volume.at(p);
+#pragma unroll
+      for (int i = 0; i < D; i++)
+#pragma unroll
+        for (int j = 0; j < D; j++) m.stress[i][j] = stress.at(p, i * D + j);
+      m.dt = time_step(scene);
+    }
+    return m;
+  }
+  // But for its motion and the stress, which the caller has.
+  __device__ ParticleMomentum<T, D> read_at_rest(int p, int scene) const {
+    ParticleMomentum<T, D> m{};
+    m.mass = mass.at(p);
+    m.volume = volume.at(p);
+    m.dt = time_step(scene);
+    return m;
+  }
+  __device__ void read_motion(int p, ParticleMomentum<T, D>& m) const {
 #pragma unroll
     for (int i = 0; i < D; i++) {
       m.velocity[i] = velocity.at(p, i);
 #pragma unroll
       for (int j = 0; j < D; j++) m.affine[i][j] = affine.present() ? affine.at(p, i * D + j) : T(0);
     }
-    m.stress = zero_matrix<T, D>();
-    m.volume = T(0);
-    m.dt = T(0);
-    if (with_stress) {
-      m.volume = volume.at(p);
-#pragma unroll
-      for (int i = 0; i < D; i++)
-#pragma unroll
-        for (int j = 0; j < D; j++)
-          if (!computed) m.stress[i][j] = stress.at(p, i * D + j);
-      m.dt = scene_dt.pointer ? dt * scene_dt.pointer[scene * scene_dt.stride[0]] : dt;
-    }
-    return m;
+  }
+  __device__ T time_step(int scene) const {
+    return scene_dt.pointer ? dt * scene_dt.pointer[scene * scene_dt.stride[0]] : dt;
   }
   __device__ NodeMomentum<T, D> to_nodes(const ParticleMomentum<T, D>& m, StressForm known_form,
                                          bool with_stress) const {

@@ -277,7 +277,12 @@ __device__ void load_particles(const Source& source, const Topology<T, D>& t, in
     T f[D];
     // Loaded and stored wherever the particle is, so that no load waits for another.
     const Vector<T, D> x = read_vector(source.position, p);
-    const auto loaded = source.load(p, base_block.scene);
+    const auto loaded = [&] {
+      if constexpr (requires { source.load(p, 0, k); })
+        return source.load(p, base_block.scene, begin + k);
+      else
+        return source.load(p, base_block.scene);
+    }();
     const bool in_block = base_block.template locate<S::Order>(t.geometry, x, cell, f);
     const int row = SharedParticles<S>::row(k), list = list_of<S>(k, in_block, cell);
     store_particle<S, T, D>(shared, row, f, source.contribution(loaded));
@@ -536,8 +541,9 @@ __device__ void scatter_item(const Source& source, const Topology<typename Sourc
   }
 }
 
-// Source: topology, nodes, position; whether particles may have drifted; load(p, scene), what it needs of a particle;
-// contribution(loaded), what the particle gives; and perhaps leave_out(p) for a particle outside.
+// Source: topology, nodes, position; whether particles may have drifted; load(p, scene), or load(p, scene, place) with
+// its place in the index, what it needs of a particle; contribution(loaded), what the particle gives; and perhaps
+// is_due(), whether there is anything to do, and leave_out(p, place) for a particle outside.
 //
 // colour < 0: every item, with atomics. Otherwise the base blocks of that colour, whole, without atomics.
 template <class Source>
@@ -547,6 +553,8 @@ __global__ void __launch_bounds__(Source::Shape::threads, Source::resident)
   using T = typename S::T;
   constexpr int D = S::D;
   wait_for_kernel_before();
+  if constexpr (requires { source.is_due(); })
+    if (!source.is_due()) return;
   extern __shared__ __align__(16) char memory[];
   __shared__ ScatterMemory<S, Source::drifts> shared;
   const Topology<T, D>& t = source.topology;
@@ -565,11 +573,11 @@ __global__ void __launch_bounds__(Source::Shape::threads, Source::resident)
     }
     scatter_item(source, t, item, in_order, memory, shared);
   }
-  if constexpr (requires { source.leave_out(0); }) {
+  if constexpr (requires { source.leave_out(0, 0); }) {
     const int64_t stride = int64_t(gridDim.x) * S::threads;
     for (int64_t i = t.offsets[t.max_blocks] + int64_t(blockIdx.x) * S::threads + threadIdx.x; i < t.particles;
          i += stride)
-      source.leave_out(t.index[i]);
+      source.leave_out(t.index[i], int(i));
   }
 }
 

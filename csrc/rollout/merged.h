@@ -1,0 +1,174 @@
+#pragma once
+
+#include "rollout/replay.h"
+#include "rollout/substeps.h"
+
+// A call of many substeps on CUDA that owns its particles: G2P and the next P2G are one kernel while an activation
+// lasts. Between substeps
+//   G2P          of the substep before,     \
+//   activation,                              |  where particles have moved too far for that,
+//   P2G          into the order of items;   /
+//   G2P2G        where not.
+// All four are launched, and the device finds which of them have something to do.
+namespace mpm {
+
+// Renewing an activation costs about as much as a step does, four times an activation alone.
+constexpr int kStraysOfRenewal = kStraysOfActivation / 4;
+
+template <class T, int D>
+class Merged {
+ public:
+  // Of `s`, which merges; `results` get the particles in their given order, status[0] the last status.
+  Merged(Substeps<T, D>& s, const Particles<T>& results, Tensor status[2], backend::Stream stream);
+
+  void take_all(const Particles<const T>& given, const int* before);
+
+ private:
+  Substeps<T, D>& s_;
+  const Particles<T> results_;
+  int* const status_[2];
+  const backend::Stream stream_;
+  const int rows_;  // of a copy
+  Tensor x_, F_, J_, history_, mass_, volume_, origin_, copy_, nowhere_;
+  Particles<T> own_;
+
+  int* status(int64_t step) { return status_[(s_.in.n - 1 - step) % 2]; }  // the last one is the first of the two
+  Drift* drift(int64_t step) { return static_cast<Drift*>(s_.drifts.data_ptr()) + step % 2; }
+  Drift* nowhere() { return static_cast<Drift*>(nowhere_.data_ptr()); }
+  auto& kernels() { return s_.calls[0].law->template kernels<T, D>(); }
+
+  void begin(const Particles<const T>& given, const int* before);
+  void use_own();
+  void go_on(int64_t step, bool ends, backend::Stream stream);
+  void update_grid(int64_t step, backend::Stream stream);
+  void end();
+};
+
+template <class T, int D>
+Merged<T, D>::Merged(Substeps<T, D>& s, const Particles<T>& results, Tensor status[2], backend::Stream stream)
+    : s_(s),
+      results_(results),
+      status_{static_cast<int*>(status[0].data_ptr()), static_cast<int*>(status[1].data_ptr())},
+      stream_(stream),
+      rows_(int(s.in.x.size(0))) {
+  const SubstepsInputs& in = s.in;
+  const int64_t both = 2 * int64_t(rows_);
+  x_ = empty_particles(in.x, {both, D});
+  F_ = result(in.x, has(in.F), {both, D, D});
+  J_ = result(in.x, has(in.J), {both});
+  history_ = result(in.x, s.columns > 0, {both, s.columns});
+  mass_ = empty_particles(in.x, {both});
+  volume_ = empty_particles(in.x, {both});
+  origin_ = empty_int(in.x, {both});
+  copy_ = empty_int(in.x, {1});
+  nowhere_ = empty_int(in.x, {int64_t(sizeof(Drift) / sizeof(int))});
+  torch::stable::zero_(copy_);
+  torch::stable::zero_(nowhere_);
+  own_ = {field<T>(x_), results.v, results.C, field<T>(F_), field<T>(J_), field<T>(history_)};
+}
+
+template <class T, int D>
+void Merged<T, D>::take_all(const Particles<const T>& given, const int* before) {
+  begin(given, before);
+  use_own();
+  const int64_t last = s_.in.n - 1;
+  int64_t step = 1;
+  go_on(step++, false, stream_);
+  step += 2 * replay((last - step) / 2, stream_, [&](backend::Stream on) {
+            go_on(step, false, on);
+            go_on(step + 1, false, on);
+          });
+  for (; step <= last; step++) go_on(step, step == last, stream_);
+  end();
+}
+
+// The first substep but for its G2P, from given tensors.
+template <class T, int D>
+void Merged<T, D>::begin(const Particles<const T>& given, const int* before) {
+  s_.read(given, own_.F);
+  s_.write(own_);
+  s_.move_late(own_.F.pointer ? own_.F : own_.J, false, false);
+  Settling<T, D>& settling = s_.settling;
+  settling.rows = rows_;
+  settling.strays_of_activation = kStraysOfRenewal;
+  settling.given = true;
+  settling.x = own_.x;
+  settling.mass = field<T>(mass_);
+  settling.volume = field<T>(volume_);
+  settling.origin = static_cast<int*>(origin_.data_ptr());
+  settling.copy = static_cast<int*>(copy_.data_ptr());
+  settling.index = s_.activation.index;
+  s_.activation.drift = nullptr;
+  s_.activate(before, status(0), stream_);
+  kernels().p2g(s_.laws[0], s_.late, s_.p2g, settling, stream_);
+  update_grid(0, stream_);
+}
+
+// What the kernels read and write from the second substep on.
+template <class T, int D>
+void Merged<T, D>::use_own() {
+  const Particles<const T> own{constant(own_.x), constant(own_.v), constant(own_.C),
+                               constant(own_.F), constant(own_.J), constant(own_.history)};
+  s_.read(own, own_.F);
+  s_.move_late(own_.F.pointer ? own_.F : own_.J, true, false);
+  s_.p2g.mass = field<const T>(mass_);
+  s_.p2g.volume = field<const T>(volume_);
+  s_.settling.given = false;
+  ActivateArguments<T, D>& activation = s_.activation;
+  activation.origin = s_.settling.origin;
+  activation.copy = s_.settling.copy;
+  activation.copy_rows = rows_;
+  activation.strays_of_activation = kStraysOfRenewal;
+  GivingBack<T>& giving = s_.advance.own;
+  giving.rows = rows_;
+  giving.strays_of_activation = kStraysOfRenewal;
+  giving.origin = s_.settling.origin;
+  giving.columns = int(s_.columns);
+  giving.history = own.history;
+  giving.history_next = results_.history;
+}
+
+// From the grid of the step before to that of this one, the last of which has a new activation, so that the status
+// tells how many blocks there are by then.
+template <class T, int D>
+void Merged<T, D>::go_on(int64_t step, bool ends, backend::Stream stream) {
+  const Drift* const before = drift(step - 1);
+  s_.advance.own.drift = s_.settling.drift = s_.activation.drift = ends ? nullptr : before;
+  s_.activation.missed = before;
+  s_.advance.drift = nowhere();
+  backend::g2p_advance(s_.in.lattice.order(), s_.advance, stream);
+  s_.activate(status(step - 1), status(step), stream);
+  kernels().p2g(s_.laws[0], s_.late, s_.p2g, s_.settling, stream);
+  if (!ends) {
+    G2P2GArguments<T, D> a{s_.p2g, s_.late, s_.advance, s_.settling, s_.settling.copy};
+    a.advance.drift = drift(step);
+    kernels().g2p2g(s_.laws[0], a, stream);
+  }
+  update_grid(step, stream);
+}
+
+template <class T, int D>
+void Merged<T, D>::update_grid(int64_t step, backend::Stream stream) {
+  s_.next.drift = s_.next.watched = drift(step);
+  s_.next.next_drift = drift(step + 1);
+  s_.next.strays_of_activation = kStraysOfRenewal;
+  s_.move_nodes(stream);
+  s_.end_time(stream);
+}
+
+// G2P of the last substep, into the results.
+template <class T, int D>
+void Merged<T, D>::end() {
+  G2PAdvanceArguments<T, D> a = s_.advance;
+  a.late = false;
+  a.own.drift = nullptr;
+  a.drift = nowhere();
+  a.x_next = results_.x;
+  a.F = constant(own_.F);
+  a.J = constant(own_.J);
+  a.F_next = results_.F;
+  a.J_next = results_.J;
+  backend::g2p_advance(s_.in.lattice.order(), a, stream_);
+}
+
+}  // namespace mpm
