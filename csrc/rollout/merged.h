@@ -87,7 +87,7 @@ template <class T, int D>
 void Merged<T, D>::begin(const Particles<const T>& given, const int* before) {
   s_.read(given, own_.F);
   s_.write(own_);
-  s_.move_late(own_.F.pointer ? own_.F : own_.J, false, false);
+  s_.move_late(own_, false, false);
   Settling<T, D>& settling = s_.settling;
   settling.rows = rows_;
   settling.strays_of_activation = kStraysOfRenewal;
@@ -107,10 +107,9 @@ void Merged<T, D>::begin(const Particles<const T>& given, const int* before) {
 // What the kernels read and write from the second substep on.
 template <class T, int D>
 void Merged<T, D>::use_own() {
-  const Particles<const T> own{constant(own_.x), constant(own_.v), constant(own_.C),
-                               constant(own_.F), constant(own_.J), constant(own_.history)};
+  const Particles<const T> own = constant(own_);
   s_.read(own, own_.F);
-  s_.move_late(own_.F.pointer ? own_.F : own_.J, true, false);
+  s_.move_late(own_, true, false);
   s_.p2g.mass = field<const T>(mass_);
   s_.p2g.volume = field<const T>(volume_);
   s_.settling.given = false;

@@ -176,6 +176,11 @@ struct Particles {
   Field<T> history;  // [P, m], the entries of all laws
 };
 
+template <class T>
+Particles<const T> constant(const Particles<T>& p) {
+  return {constant(p.x), constant(p.v), constant(p.C), constant(p.F), constant(p.J), constant(p.history)};
+}
+
 template <class T, int D>
 Particles<const T> given_particles(const SubstepsInputs& in, const Tensor& history) {
   const Tensor& x = in.x;
@@ -284,12 +289,13 @@ struct Substeps {
     advance.J = p.J;
   }
 
-  // In place of what read() and write() say of F and J: P2G moves them into `state` if a G2P `has_left` that, and G2P
-  // leaves them to the next P2G unless it is the last.
-  void move_late(const Field<T>& state, bool has_left, bool last) {
+  // In place of what read() and write() say of F and J: P2G moves them into those of `p` if a G2P `has_left` that, and
+  // G2P leaves them to the next P2G unless it is the last.
+  void move_late(const Particles<T>& p, bool has_left, bool last) {
+    const bool is_F = calls[0].law->info.field == Deformation::gradient;
+    const Field<T>& state = is_F ? p.F : p.J;
     late = {state, has_left, activation.scene, activation.scene_stride};
     advance.late = !last;
-    const bool is_F = calls[0].law->info.field == Deformation::gradient;
     (is_F ? advance.F : advance.J) = constant(state);
     (is_F ? advance.F_next : advance.J_next) = state;
   }

@@ -21,6 +21,14 @@ Tensor copy_of(const Tensor& t) {
 }
 
 #if MPM_BACKEND == MPM_BACKEND_IS_cuda
+// To a kernel of many substeps: those of scenes that have their own.
+template <class T, int D, class Arguments>
+void give_clocks(const Substeps<T, D>& s, Arguments& a) {
+  if (!s.scene_time.defined()) return;
+  a.scene_time = static_cast<T*>(s.scene_time.data_ptr());
+  a.scene_dt = static_cast<const T*>(s.in.scene_dt->data_ptr());
+}
+
 // Substeps after the activation of the first one, of particles that move in place.
 template <class T, int D>
 void take_resident(Substeps<T, D>& s, int64_t n, double time, const int* activated, int* status,
@@ -35,10 +43,7 @@ void take_resident(Substeps<T, D>& s, int64_t n, double time, const int* activat
   backend::clear(trouble, stream);
   int* const first = static_cast<int*>(trouble.data_ptr());
   ResidentArguments<T, D> a{s.p2g, s.advance, s.update, s.contact, s.obstacles, int(in.scenes), n, time, in.dt};
-  if (s.scene_time.defined()) {
-    a.scene_time = static_cast<T*>(s.scene_time.data_ptr());
-    a.scene_dt = static_cast<const T*>(in.scene_dt->data_ptr());
-  }
+  give_clocks(s, a);
   a.rows = static_cast<char*>(row_memory.data_ptr());
   a.blocks = static_cast<char*>(block_memory.data_ptr());
   a.spare_blocks = int(spare);
@@ -69,10 +74,7 @@ bool take_persistent(Substeps<T, D>& s, int* activated, int* status, backend::St
   a.steps = int(in.n - 2);
   if (s.contact.step_time) a.step_time = s.contact.step_time + 1;
   a.contact.step_time = nullptr;
-  if (s.scene_time.defined()) {
-    a.scene_time = static_cast<T*>(s.scene_time.data_ptr());
-    a.scene_dt = static_cast<const T*>(in.scene_dt->data_ptr());
-  }
+  give_clocks(s, a);
   Tensor state = empty_int(in.x, {int64_t(sizeof(PersistentState) / sizeof(int))}), arrived = empty_int(in.x, {1});
   backend::clear(state, stream);
   a.state = reinterpret_cast<PersistentState*>(state.data_ptr());
@@ -227,6 +229,9 @@ Results substeps(MPM_SUBSTEPS_PARAMETERS) {
     const int* before = s.previous_status;
 
     Particles<const T> from = given_particles<T, D>(in, history_);
+    const auto buffers = [&](int k) -> Particles<T> {
+      return {field<T>(x_[k]), field<T>(v_), field<T>(C_), field<T>(F_[k]), field<T>(J_[k]), field<T>(history_)};
+    };
     if (has(impulse)) {
       impulse_ = copy_of(*impulse);
       s.add_impulses_to(impulse_);
@@ -239,10 +244,9 @@ Results substeps(MPM_SUBSTEPS_PARAMETERS) {
       start_in_results();
       s.forget_stress();
       s.make_pool(stream);
-      s.read({field<const T>(x_[0]), field<const T>(v_), field<const T>(C_), field<const T>(F_[0]),
-              field<const T>(J_[0]), field<const T>(history_)},
-             field<T>(F_[0]));
-      s.write({field<T>(x_[0]), field<T>(v_), field<T>(C_), field<T>(F_[0]), field<T>(J_[0]), field<T>(history_)});
+      const Particles<T> in_place = buffers(0);
+      s.read(constant(in_place), in_place.F);
+      s.write(in_place);
       // The last one has an activation of its own, so that the status tells how many blocks there are by then.
       int* const activated = static_cast<int*>(status[1].data_ptr());
       int* const now = static_cast<int*>(status[0].data_ptr());
@@ -258,11 +262,7 @@ Results substeps(MPM_SUBSTEPS_PARAMETERS) {
     s.fuse(false);
     s.make_pool(stream);
     s.count_time(before, stream);
-    if (s.merges()) {
-      const Particles<T> results{field<T>(x_[0]), field<T>(v_),    field<T>(C_),
-                                 field<T>(F_[0]), field<T>(J_[0]), field<T>(history_)};
-      return Merged<T, D>(s, results, status, stream).take_all(from, before);
-    }
+    if (s.merges()) return Merged<T, D>(s, buffers(0), status, stream).take_all(from, before);
     const bool late = s.may_move_late();  // then F and J stay where they are
     x_[1] = result(x, n > 1, {P, D});
     F_[1] = late ? F_[0] : result(x, has(F) && (n > 1 || s.plastic), {P, D, D});
@@ -277,26 +277,24 @@ Results substeps(MPM_SUBSTEPS_PARAMETERS) {
       int* const now = static_cast<int*>(status[into].data_ptr());
       s.take_turn(into, last);
       s.read(from, field<T>(F_[1 - into]));
-      s.write(
-          {field<T>(x_[into]), field<T>(v_), field<T>(C_), field<T>(F_[into]), field<T>(J_[into]), field<T>(history_)});
-      if (late) s.move_late(field<T>(has(F) ? F_[0] : J_[0]), !first, last);
+      const Particles<T> to = buffers(into);
+      s.write(to);
+      if (late) s.move_late(to, !first, last);
       s.activate(before, now, on);
       s.move(on);
       before = now;
       first = false;
       // From here on the call reads what it has written.
-      from = {field<const T>(x_[into]), field<const T>(v_),       field<const T>(C_),
-              field<const T>(F_[into]), field<const T>(J_[into]), field<const T>(history_)};
+      from = constant(to);
     };
     int64_t step = 0;
 #if CUDART_VERSION >= 13000
     if (s.persists() && !is_recorded(stream)) {
       take(0, false, stream);
-      const Particles<T> in_place{field<T>(x_[0]), field<T>(v_),    field<T>(C_),
-                                  field<T>(F_[0]), field<T>(J_[0]), field<T>(history_)};
+      const Particles<T> in_place = buffers(0);
       s.read(from, in_place.F);
       s.write(in_place);
-      s.move_late(has(F) ? in_place.F : in_place.J, true, false);
+      s.move_late(in_place, true, false);
       step = 1;
       if (take_persistent(s, static_cast<int*>(status[1].data_ptr()), static_cast<int*>(status[0].data_ptr()),
                           stream)) {
