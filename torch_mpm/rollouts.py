@@ -208,10 +208,13 @@ LEAST_PERSISTENT, MOST_PERSISTENT = 10, 2**14
 FEW_BLOCKS, FEW_ITEMS = 2**12, 140
 """Of a domain, and of work in a step, for which about one wave of thread blocks is enough."""
 LONG_CHUNK = 1024
-"""Steps between two looks at whether it still is."""
-MANY_PARTICLES, PARTICLES_PER_BLOCK = 2**20, 32
+"""Steps of a call whose pool has room for all blocks of the domain."""
+MANY_PARTICLES, PARTICLES_PER_BLOCK = 2**18, 32
 """Of a call whose ends cost as much as a few steps (csrc/rollout/merged.h); and so many of them take as much memory as
 the nodes of a block do."""
+ROOMY, ROOMY_CHUNK = 3, 256
+"""A pool with room for so many times the blocks of one that follows the scene, and steps of a call with it: four times
+as many as with the other."""
 KEPT_BYTES = {"cpu": 2**24, "cuda": 2**29}
 """What the backward pass of one op may hold of its steps, even where sqrt(n) steps need less: what the caches of a CPU
 hold, and so much that kernels on CUDA hide the time of Python."""
@@ -227,9 +230,9 @@ def in_chunks(
 
     def advance(state: State, count: int, first: int = 0) -> State:
         while count > 0:
-            all_blocks = not with_gradient and takes_all_blocks(step, state, count)
-            now = min(count, LONG_CHUNK if all_blocks else chunk)
-            state, count = substeps(step, state, now, dt, keeps_all, all_blocks), count - now
+            blocks, most = (None, chunk) if with_gradient else pool_of_call(step, state, count)
+            now = min(count, most)
+            state, count = substeps(step, state, now, dt, keeps_all, blocks), count - now
         return state
 
     if not with_gradient or keeps_all:
@@ -241,15 +244,27 @@ def in_chunks(
         return advance(state, n)
 
 
-def takes_all_blocks(step: Step, state: State, n: int) -> bool:
-    """Whether the pool of a call without gradients has room for all blocks of the domain, so that nobody looks whether
-    it must grow: where there are few, and a kernel takes many steps of few particles (`Substeps::persists`), or where
-    many particles take more memory than all blocks."""
+def pool_of_call(step: Step, state: State, n: int) -> tuple[int | None, int]:
+    """Blocks of the pool of a call without gradients, None where it follows the scene, and steps of the call at most.
+
+    Nobody looks whether a pool must grow that has room for all blocks of the domain: where there are few, and a kernel
+    takes many steps of few particles (`Substeps::persists`), or where many particles take more memory. They have a
+    roomier pool in any case.
+    """
     grid = step.grid
     if not (grid.grows and state.x.is_cuda):
-        return False
-    if len(state) >= max(MANY_PARTICLES, PARTICLES_PER_BLOCK * grid.block_count):
-        return True
+        return None, MOST_STEPS
+    room = len(state) // PARTICLES_PER_BLOCK if len(state) >= MANY_PARTICLES else 0
+    if room >= grid.block_count or takes_few_blocks(step, state, n):
+        return grid.block_count, LONG_CHUNK
+    if grid.max_blocks is not None and room >= ROOMY * grid.max_blocks:
+        return room, ROOMY_CHUNK
+    return None, CHUNK
+
+
+def takes_few_blocks(step: Step, state: State, n: int) -> bool:
+    """Whether a kernel takes many steps of few particles, if the pool has room for all blocks."""
+    grid = step.grid
     if grid.block_count > FEW_BLOCKS or grid.max_blocks is None:
         return False
     mirrors = step.walls is not None and step.walls.mirrors() is not None
@@ -302,10 +317,10 @@ def _differentiable(step: Step, state: State) -> list[Tensor]:
 
 
 def substeps(
-    step: Step, state: State, n: int, dt: float | Tensor, records: bool = False, all_blocks: bool = False
+    step: Step, state: State, n: int, dt: float | Tensor, records: bool = False, blocks: int | None = None
 ) -> State:
     """The state n steps later, by one op; `obstacle_to_substeps` must be None. It `records` what gradients need, if it
-    has any, or takes the steps again. The pool has room for `all_blocks` of the domain, or follows the scene.
+    has any, or takes the steps again. The pool has room for so many `blocks`, or follows the scene.
 
     Raises:
         ValueError: for a dt that is not positive and finite, or a material without a law.
@@ -313,7 +328,7 @@ def substeps(
     """
 
     def advanced(state: State, dt: float | Tensor) -> State:
-        return _substeps(step, state, n, dt, records, all_blocks)
+        return _substeps(step, state, n, dt, records, blocks)
 
     return paused(advanced, step._activations, step.prepare(state), dt, step.grid.scenes, n)
 
@@ -330,12 +345,12 @@ def _clocks(state: State, dt: float | Tensor, scenes: int) -> tuple[float, Tenso
     return 1.0, each(dt), each(state.time)
 
 
-def _substeps(step: Step, state: State, n: int, dt: float | Tensor, records: bool, all_blocks: bool) -> State:
+def _substeps(step: Step, state: State, n: int, dt: float | Tensor, records: bool, blocks: int | None) -> State:
     """`substeps` of a prepared state, where no scene is paused."""
     grid, record = step.grid, step._activations
     number, scene_dt, scene_time = _clocks(state, dt, grid.scenes)
     pool = grid.pool(state.x, state.scene)
-    max_blocks = grid.block_count if all_blocks else pool
+    max_blocks = pool if blocks is None else max(pool, blocks)
     given: Any = Overlay(state, dt=dt)
     calls = law_calls(step.law, given)
     apic = step.transfer == "apic"

@@ -17,21 +17,28 @@ __device__ inline void wait_for_blocks(unsigned* arrived, unsigned blocks) {
   __syncthreads();
 }
 
-// The same for a chain of barriers of one kernel, where nothing else is to be done meanwhile.
+// The same for a chain of barriers of one kernel, where nothing else is to be done meanwhile. What thread blocks have
+// counted is added up on the way, so that nobody has to ask for it once more.
 struct Barrier {
-  unsigned* arrived;  // zero before the kernel
+  unsigned long long* arrived;  // zero before the kernel; the counts are in its upper half
   unsigned blocks, all = 0;
 
-  __device__ void wait() {
+  // Returns all counts so far. `count()` is asked of thread 0 when all threads of its block are there.
+  template <class Count>
+  __device__ unsigned wait(const Count& count) {
+    __shared__ unsigned sum;
     __syncthreads();
     all += blocks;
     if (threadIdx.x == 0) {
-      asm volatile("red.release.gpu.global.add.u32 [%0], 1;" ::"l"(arrived) : "memory");
-      unsigned now;
-      do asm volatile("ld.acquire.gpu.global.u32 %0, [%1];" : "=r"(now) : "l"(arrived) : "memory");
-      while (int(now - all) < 0);
+      const unsigned long long one = 1 + (static_cast<unsigned long long>(count()) << 32);
+      asm volatile("red.release.gpu.global.add.u64 [%0], %1;" ::"l"(arrived), "l"(one) : "memory");
+      unsigned long long now;
+      do asm volatile("ld.acquire.gpu.global.u64 %0, [%1];" : "=l"(now) : "l"(arrived) : "memory");
+      while (int(unsigned(now) - all) < 0);
+      sum = unsigned(now >> 32);
     }
     __syncthreads();
+    return sum;
   }
 };
 
@@ -47,6 +54,15 @@ __device__ inline bool is_cluster() {
 __device__ inline void wait_for_cluster() {
 #if __CUDA_ARCH__ >= 900
   cooperative_groups::this_cluster().sync();
+#endif
+}
+
+// f(object) of what each thread block of a cluster has in the place of `mine`, in shared memory.
+template <class T, class F>
+__device__ void each_of_cluster(T* mine, const F& f) {
+#if __CUDA_ARCH__ >= 900
+  const auto cluster = cooperative_groups::this_cluster();
+  for (unsigned k = 0; k < cluster.num_blocks(); k++) f(*cluster.map_shared_rank(mine, k));
 #endif
 }
 

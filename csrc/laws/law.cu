@@ -81,30 +81,46 @@ struct LawMomentumSource : MomentumSource<2, T, D, Stress::moment, true> {
   static constexpr int resident = Law::gpu_p2g_blocks, entries = history_entries<Law, D>();
   LawUpdateArguments<T, D> law;
   LateDeformation<T, D> late;
+  Columns<const T, moves_F ? D * D : 1> state;  // F or J, as given
+  Columns<T, moves_F ? D * D : 1> kept;         // and as they are to be kept; perhaps absent
 
   // What the law leaves of a particle.
   struct Changes {
     Matrix<T, D> F;
     T J, history[entries > 0 ? entries : 1];
   };
+  struct Parameters {
+    T value[kParameters<Law>];
+  };
 
   LawMomentumSource(const P2GArguments<T, D>& a, const LawUpdateArguments<T, D>& law,
                     const LateDeformation<T, D>& late = {})
-      : Base(a), law(law), late(late) {}
+      : Base(a), law(law), late(late), state(law.law.state, D), kept(Law::plastic ? law.state : late.state, D) {}
 
   // What the law needs of a particle but for its history.
   __device__ void fetch(int p, Changes& changes) const {
-    if constexpr (moves_F)
-      changes.F = load_matrix<D>(One<T>{p}, law.law.state);
-    else
-      changes.J = load_scalar(One<T>{p}, law.law.state);
+    if constexpr (!moves_F) {
+      changes.J = state.at(p);
+      return;
+    }
+#pragma unroll
+    for (int k = 0; k < D * D; k++) changes.F[k / D][k % D] = state.at(p, k);
+  }
+  __device__ Parameters parameters(int p) const {
+    Parameters r;
+#pragma unroll
+    for (int k = 0; k < kParameters<Law>; k++) r.value[k] = load_parameter(One<T>{p}, law.law, k);
+    return r;
   }
   // The stress, from what was fetched, which becomes what is to be kept.
-  __device__ Matrix<T, D> stress(int p, const Matrix<T, D>& C, const T& dt, Changes& changes) const {
+  __device__ Matrix<T, D> stress(int p, const Matrix<T, D>& C, const T& dt, const Parameters& parameters,
+                                 Changes& changes) const {
     const One<T> at{p};
     Matrix<T, D> stress;
     LawUpdateArguments<T, D> a = law;
     a.stress = {&stress[0][0], {0, D, 1}};
+#pragma unroll
+    for (int k = 0; k < kParameters<Law>; k++) a.law.parameters[k] = {&parameters.value[k]};
     if (Law::viscous && Base::fields.affine.present()) a.law.C = {&C[0][0], {0, D, 1}};
     if constexpr (moves_F) {
       if (late.moves) changes.F = advance_deformation(changes.F, C, dt);
@@ -121,20 +137,17 @@ struct LawMomentumSource : MomentumSource<2, T, D, Stress::moment, true> {
   }
   __device__ Matrix<T, D> evaluate(int p, const Matrix<T, D>& C, const T& dt, Changes& changes) const {
     fetch(p, changes);
-    return stress(p, C, dt, changes);
+    return stress(p, C, dt, parameters(p), changes);
   }
   __device__ void keep(int p, const Changes& changes) const {
-    const One<T> at{p};
-    const Field<T>& state = Law::plastic ? law.state : late.state;
-    if (state.pointer) {
-      if constexpr (moves_F)
-        store_matrix<D>(at, state, changes.F);
-      else
-        store_scalar(at, state, changes.J);
+    if (kept.present()) {
+      if constexpr (!moves_F) kept.at(p) = changes.J;
+#pragma unroll
+      for (int k = 0; moves_F && k < D * D; k++) kept.at(p, k) = changes.F[k / D][k % D];
     }
     if (!law.history.pointer) return;
 #pragma unroll
-    for (int k = 0; k < entries; k++) store_entry(at, law.history, k, changes.history[k]);
+    for (int k = 0; k < entries; k++) store_entry(One<T>{p}, law.history, k, changes.history[k]);
   }
   __device__ Matrix<T, D> update(int p, const Matrix<T, D>& C, const T& dt) const {
     if constexpr (MayMove) {
@@ -156,10 +169,10 @@ struct LawMomentumSource : MomentumSource<2, T, D, Stress::moment, true> {
     m.stress = update(p, m.affine, m.dt);
     return m;
   }
-  // The same, with what is to be kept left to the caller.
-  __device__ ParticleMomentum<T, D> load(int p, int scene, Changes& changes) const {
-    ParticleMomentum<T, D> m = read(p, scene, p);
-    m.stress = evaluate(p, m.affine, m.dt, changes);
+  // Its stress is zero yet; `of_motion` is the row of its velocity and affine field.
+  __device__ ParticleMomentum<T, D> read(int p, int scene, int of_motion) const {
+    ParticleMomentum<T, D> m = Base::fields.read_at_rest(p, Base::fields.time_step(scene));
+    Base::fields.read_motion(of_motion, m);
     return m;
   }
   // Outside the grid, where F has to be moved once more after the particle has left; then its affine field is zero. Of
@@ -174,12 +187,6 @@ struct LawMomentumSource : MomentumSource<2, T, D, Stress::moment, true> {
   }
 
  protected:
-  // Its stress is zero yet; `of_motion` is the row of its velocity and affine field.
-  __device__ ParticleMomentum<T, D> read(int p, int scene, int of_motion) const {
-    ParticleMomentum<T, D> m = Base::fields.read_at_rest(p, scene);
-    Base::fields.read_motion(of_motion, m);
-    return m;
-  }
   __device__ int scene_of_late(int p) const {
     const int scene = late.scene ? late.scene[p * late.scene_stride] : 0;
     return unsigned(scene) < unsigned(Base::topology.scenes) ? scene : 0;
@@ -196,7 +203,9 @@ struct SettlingSource : LawMomentumSource<Law, T, D, true> {
                  const Settling<T, D>& settling)
       : Base(a, law, late), settling(settling) {}
 
+  bool is_mostly_idle() const { return settling.rows > 0 && settling.is_mostly_idle(); }
   __device__ bool is_due() const { return settling.rows == 0 || settling.is_due(Base::topology.particles); }
+  __device__ bool settles() const { return settling.rows > 0; }
   __device__ ParticleMomentum<T, D> load(int p, int scene, int place) const {
     ParticleMomentum<T, D> m = Base::read(p, scene, settling.rows ? settling.place(p) : p);
     take(p, place, m, m.affine, m.stress);

@@ -1,5 +1,7 @@
 #pragma once
 
+#include <cuda_pipeline.h>
+
 #include "rollout/g2p2g.h"
 #include "transfer/advance_gather.cuh"
 #include "transfer/scatter.cuh"
@@ -11,18 +13,51 @@ namespace mpm::cuda {
 
 constexpr int kHalo = 1;
 
-// The nodes around a base block, and where the particles of an item are.
-template <class S>
-struct G2P2GMemory {
-  static constexpr int D = S::D, width = S::width + 2 * kHalo, nodes = D == 2 ? width * width : width * width * width;
+// The nodes of a tile: those of the base block, the next Order along each axis, and kHalo more on either side. Rows are
+// apart so that neighbours along any axis, and most nodes of a cube of 4, lie in different banks.
+template <int Order, class T, int D>
+struct WideTile {
+  static constexpr int width = kBlockWidth + Order + 2 * kHalo, row = width + 2, plane = width * row + 4;
+  static constexpr int nodes = D == 2 ? width * width : width * width * width, room = D == 2 ? plane : width * plane;
+  static constexpr int blocks = 1;
+  using Node = Quad<T>;  // mass and velocity, as in the grid in 3-D
+  const Node* corner;    // the base node
+  BlockRows<1> rows;
+
+  static constexpr int step(int axes_after) { return axes_after == 0 ? 1 : axes_after == 1 ? row : plane; }
+  __device__ bool is_far(int, int) const { return false; }
+  __device__ void load(int, int offset, T (&node)[D]) const {
+    const Node v = corner[offset];
+#pragma unroll
+    for (int c = 0; c < D; c++) node[c] = v.e[1 + c];
+  }
+};
+
+// An item and where it is: its block and those around it.
+template <class T, int D>
+struct ItemPlace {
   static constexpr int around = D == 2 ? 9 : 27;
-  using T = typename S::T;
+  int begin, end;         // its particles
   int slots[around];      // of the blocks around, -1 where they are not active
   int following[1 << D];  // of those that P2G reaches
-  int head[S::lists + 1];
   BaseBlock<T, D> home;
-  Strays<S::batch> strays;  // after G2P
-  NodeValue<T, D> tile[nodes];
+};
+
+// Of the item at hand, and of the next one. Once its particles have moved the tile is that of the next one.
+template <class S>
+struct G2P2GMemory {
+  static constexpr int D = S::D;
+  using T = typename S::T;
+  using Tile = WideTile<S::Order, T, D>;
+  alignas(16) Item next;
+  int number;  // of the one after that
+  ItemPlace<T, D> places[2];
+  int head[S::lists + 1];
+  Strays<S::batch> far;                    // particles that have gone further than the blocks around, after G2P
+  int strays;                              // particles in these:
+  uint16_t row[S::batch], base[S::batch];  // of what they give, and of their base nodes, from the first block around
+  T x[D][S::batch];
+  alignas(16) typename Tile::Node tile[Tile::room];
 };
 
 template <class Source, class Task>
@@ -31,31 +66,49 @@ class G2P2G {
   using S = typename Source::Shape;
   using T = typename S::T;
   using Memory = G2P2GMemory<S>;
+  using Tile = typename Memory::Tile;
   static constexpr int D = S::D, Order = S::Order, threads = S::threads;
   static_assert(S::batch >= kItemParticles);
 
-  __device__ G2P2G(const Source& source, const Task& task, Memory& m, char* memory, int first_row)
-      : source(source), task(task), m(m), shared(memory, m.head), first_row_(first_row) {}
+  __device__ G2P2G(const Source& source, const Task& task, Memory& m, char* memory, int first_row, int* taken)
+      : source(source),
+        task(task),
+        m(m),
+        shared(memory, m.head),
+        first_row_(first_row),
+        taken_(taken),
+        dt_(source.fields.time_step(0)),
+        parameters_(source.parameters(0)) {}
 
-  // By all threads.
-  __device__ void take(const Item& item) {
-    const int n = item.end - item.begin, first = first_row_ + item.begin;
-    Vector<T, D> following;
-    if (int(threadIdx.x) < n) following = read_vector(source.position, first + int(threadIdx.x));
-    const bool complete = begin(item);
-    load_tile();
+  // Items until there are none left, by all threads. While the particles of one are moved the blocks around the next
+  // one are looked up, and while they are added up its tile is on its way.
+  __device__ void take_items(const Schedule<const int>& schedule) {
+    const int count = *schedule.item_count;
+    if (int(blockIdx.x) >= count) return;
+    int now = blockIdx.x;
+    load_item(schedule, now);
+    empty();
+    __pipeline_wait_prior(0);
     __syncthreads();
+    find(here());
+    __syncthreads();
+    load(here());
+    int next = m.number;
+    if (next < count) load_item(schedule, next);
 #pragma unroll 1
-    for (int k = threadIdx.x; k < n; k += threads) {
-      const Vector<T, D> x = following;
-      if (k + threads < n) following = read_vector(source.position, first + k + threads);
-      move(k, first + k, x, complete);
+    while (now < count) {
+      __pipeline_wait_prior(0);
+      __syncthreads();
+      move_all();
+      if (next < count) find(m.places[1 - turn_]);
+      __syncthreads();
+      if (next < count) load(m.places[1 - turn_]);
+      now = next;
+      next = m.number;
+      if (next < count) load_item(schedule, next);
+      add_particles(source.nodes, shared, here().following, false, [&] { add_all_strays(); }, [&] { empty(); });
+      turn_ = 1 - turn_;
     }
-    __syncthreads();
-    add_particles(source.nodes, shared, m.following, false, [&] {
-      add_strays<S>(source, topology(), schedule_of(topology()), m.home.scene, shared, m.strays, item.begin);
-    });
-    __syncthreads();
   }
 
   // Particles that are left out are at rest.
@@ -74,121 +127,188 @@ class G2P2G {
   Memory& m;
   const SharedParticles<S> shared;
   const int first_row_;
-  int strays_ = 0, lost_ = 0;
+  int* const taken_;
+  const T dt_;
+  const typename Source::Parameters parameters_;  // of all particles
+  int strays_ = 0, lost_ = 0, turn_ = 0;
 
   __device__ const Topology<T, D>& topology() const { return source.topology; }
 
-  // Whether all blocks around that the domain has are active.
-  __device__ bool begin(const Item& item) {
-    bool active = true;
-    if (threadIdx.x < Memory::around) {
+  __device__ ItemPlace<T, D>& here() const { return m.places[turn_]; }
+
+  __device__ void empty() {
+    empty_lists<S>(m.head);
+    if (threadIdx.x == 0) m.far.count = m.strays = 0;
+  }
+
+  __device__ void load_item(const Schedule<const int>& schedule, int i) {
+    if (threadIdx.x == 0) __pipeline_memcpy_async(&m.next, schedule.items + 4 * i, sizeof(Item));
+    __pipeline_commit();
+  }
+
+  // The place of the next item. All blocks around it should be active where the domain has them. By the last threads,
+  // which mostly have fewer particles to move.
+  __device__ void find(ItemPlace<T, D>& place) {
+    const int thread = int(threadIdx.x) - (threads - 64);
+    const Item item = m.next;
+    if (unsigned(thread) < unsigned(ItemPlace<T, D>::around)) {
       int block[D], way = 0;
       const Geometry<T, D>& g = topology().geometry;
       block_coordinates(g, item.block, block);
       bool inside = true;
 #pragma unroll
-      for (int i = D - 1, rest = threadIdx.x, step = 1; i >= 0; i--, rest /= 3) {
+      for (int i = D - 1, rest = thread, step = 1; i >= 0; i--, rest /= 3) {
         const int side = rest % 3 - 1;
         inside = inside && unsigned(block[i] + side) < unsigned(g.blocks[i]);
         way += side * step;
         step *= g.blocks[i];
       }
       const int slot = inside ? topology().table[item.block + way] : -1;
-      m.slots[threadIdx.x] = slot;
-      active = !inside || slot >= 0;
+      place.slots[thread] = slot;
+      if (inside && slot < 0) lost_ |= Drift::kLost;
+    } else if (thread >= 32 && thread < 32 + (1 << D)) {
+      place.following[thread - 32] = schedule_of(topology()).neighbours[(item.slot << D) + thread - 32];
+    } else if (thread == 62) {
+      m.number = int(gridDim.x) + atomicAdd(taken_, 1);
+    } else if (thread == 63) {
+      place.begin = item.begin;
+      place.end = item.end;
+      place.home.template set<Order>(topology(), item.block);
     }
-    if (threadIdx.x >= 32 && threadIdx.x < 32 + (1 << D))
-      m.following[threadIdx.x - 32] = schedule_of(topology()).neighbours[(item.slot << D) + threadIdx.x - 32];
-    if (threadIdx.x == 64) m.home.template set<Order>(topology(), item.block);
-    if (threadIdx.x == 96) m.strays.count = 0;
-    empty_lists<S>(m.head);
-    return __syncthreads_and(active);
   }
 
-  __device__ void load_tile() {
+  // The positions and the tile, on their way from memory, which __pipeline_wait_prior() waits for.
+  __device__ void load(const ItemPlace<T, D>& place) {
+    int thread = threadIdx.x;
+    asm volatile("" : "+r"(thread));  // or all addresses would be kept from item to item, in local memory
+    const int n = place.end - place.begin, first = first_row_ + place.begin;
+#pragma unroll 1
+    for (int k = thread; k < n; k += threads)
 #pragma unroll
-    for (int first = 0; first < Memory::nodes; first += threads) {
-      const int i = first + threadIdx.x;
-      if (i >= Memory::nodes) break;
-      int node[D], neighbour = 0;
+      for (int i = 0; i < D; i++) __pipeline_memcpy_async(&m.x[i][k], &source.position.at(first + k, i), sizeof(T));
+#pragma unroll 1
+    for (int i = thread; i < Tile::nodes; i += threads) {
+      int node[D], neighbour = 0, to = 0;
 #pragma unroll
-      for (int axis = D - 1, rest = i, step = 1; axis >= 0; axis--, rest /= Memory::width, step *= 3) {
-        const int at = rest % Memory::width + kBlockWidth - kHalo;  // from the first node of the block before
+      for (int axis = D - 1, rest = i, step = 1; axis >= 0; axis--, rest /= Tile::width, step *= 3) {
+        const int in_tile = rest % Tile::width;
+        to += in_tile * Tile::step(D - 1 - axis);
+        const int at = in_tile + kBlockWidth - kHalo;  // from the first node of the block before
         neighbour += at / kBlockWidth * step;
         node[axis] = at % kBlockWidth;
       }
-      const int slot = m.slots[neighbour];
-      T value[D] = {};
-      if (slot >= 0) load_node<D == 3>(task.nodes, slot * kBlockNodes<D> + node_in_block<D>(node), 0, value);
-      NodeValue<T, D> v{};
+      const int slot = place.slots[neighbour];
+      const int64_t row = int64_t(slot < 0 ? 0 : slot) * kBlockNodes<D> + node_in_block<D>(node);
+      const T* const velocity = task.nodes.pointer + row * (1 + D);
+      if constexpr (D == 3) {
+        __pipeline_memcpy_async(m.tile + to, velocity - 1, sizeof(Quad<T>), slot < 0 ? sizeof(Quad<T>) : 0);
+      } else {
 #pragma unroll
-      for (int c = 0; c < D; c++) v.e[c] = value[c];
-      m.tile[i] = v;
+        for (int c = 0; c < D; c++)
+          __pipeline_memcpy_async(&m.tile[to].e[1 + c], velocity + c, sizeof(T), slot < 0 ? sizeof(T) : 0);
+      }
     }
+    __pipeline_commit();
   }
 
   // What a particle at x gets from the nodes.
-  __device__ typename Task::Result gather(const Vector<T, D>& x, const typename Task::Loaded& loaded) const {
+  __device__ typename Task::Result gather(const Vector<T, D>& x) const {
     const Geometry<T, D>& g = topology().geometry;
     bool in_tile = true;
     int corner = 0;
     T f[D];
 #pragma unroll
     for (int i = 0; i < D; i++) {
-      const T node = base_node<Order>(g, i, x[i]), from = node - m.home.first[i];
+      const T node = base_node<Order>(g, i, x[i]), from = node - here().home.first[i];
       in_tile = in_tile && from >= T(-kHalo) && from < T(kBlockWidth + kHalo);  // false for NaN
-      corner = corner * Memory::width + int(from) + kHalo;
+      corner += (int(from) + kHalo) * Tile::step(D - 1 - i);
       f[i] = distance_in_cells(g, i, x[i], node);
     }
     const Weights<Order, T, D> weights(f);
-    if (in_tile) return task.compute(loaded, weights, TileSupport<Order, T, D, kHalo>{m.tile + corner});
+    if (in_tile) return task.compute(weights, Tile{m.tile + corner});
     GridSupport<T, D, D, D == 3> support{task.nodes};
-    const int slot = locate_slot<Order>(topology(), m.home.scene, x, support.base, f);
+    const int slot = locate_slot<Order>(topology(), here().home.scene, x, support.base, f);
     if (slot < 0) return {};
     const int* const neighbours = schedule_of(topology()).neighbours + (slot << D);
 #pragma unroll
     for (int o = 0; o < 1 << D; o++) support.set_slot(o, neighbours[o]);
-    return task.compute(loaded, weights, support);
+    return task.compute(weights, support);
+  }
+
+  __device__ void move_all() {
+    const int n = here().end - here().begin, first = first_row_ + here().begin;
+#pragma unroll 1
+    for (int k = threadIdx.x; k < n; k += threads) move(k, first + k);
   }
 
   // Particle k of the item, in row p, where it was.
-  __device__ void move(int k, int p, const Vector<T, D>& x, bool complete) {
+  __device__ void move(int k, int p) {
+    Vector<T, D> x;
+#pragma unroll
+    for (int i = 0; i < D; i++) x[i] = m.x[i][k];
     typename Source::Changes changes;
     source.fetch(p, changes);
-    auto particle = source.fields.read_at_rest(p, m.home.scene);
-    const auto loaded = task.at(x, m.home.scene);
-    const Motion<T, D> motion = task.motion(gather(x, loaded));
-    const Vector<T, D> to = advance_position(x, motion.velocity, loaded.dt);
+    auto particle = source.fields.read_at_rest(p, dt_);
+    const Motion<T, D> motion = task.motion(gather(x));
+    const Vector<T, D> to = advance_position(x, motion.velocity, dt_);
 #pragma unroll
     for (int i = 0; i < D; i++) task.x_next.at(p, i) = to[i];
     particle.velocity = motion.velocity;
     particle.affine = is_finite<D>(to.e) ? motion.affine : zero_matrix<T, D>();
-    particle.stress = source.stress(p, particle.affine, particle.dt, changes);
+    particle.stress = source.stress(p, particle.affine, dt_, parameters_, changes);
     source.keep(p, changes);
     int cell;
     T f[D];
-    const bool at_home = m.home.template locate<Order>(topology().geometry, to, cell, f);
     const int row = SharedParticles<S>::row(k);
+    const bool at_home = here().home.template locate<Order>(topology().geometry, to, cell, f);
     store_particle<S, T, D>(shared, row, f, source.contribution(particle));
     shared.next[row] = uint16_t(atomicExch(&shared.head[list_of<S>(k, at_home, cell)], row));
-    if (!complete) lost_ |= Drift::kLost;
-    if (!at_home) stray(k, to);
+    if (!at_home) stray(k, row, to);
   }
 
   // A particle that is not in its block any more. It may go less than a cell before it is looked at again.
-  __device__ void stray(int k, const Vector<T, D>& x) {
-    m.strays.particle[atomicAdd(&m.strays.count, 1)] = uint16_t(k);
+  __device__ void stray(int k, int row, const Vector<T, D>& x) {
     strays_++;
     const Geometry<T, D>& g = topology().geometry;
-    bool near = true, inside = true;
+    bool near = true, around = true, inside = true;
+    int base = 0;
 #pragma unroll
     for (int i = 0; i < D; i++) {
-      const T node = base_node<Order>(g, i, x[i]), from = node - m.home.first[i];
-      near = near && from > T(-kBlockWidth) && from + T(Order + 1) < T(2 * kBlockWidth);
+      const T node = base_node<Order>(g, i, x[i]), from = node - here().home.first[i] + T(kBlockWidth);
+      around = around && from >= T(0) && from + T(Order) < T(3 * kBlockWidth);  // false for NaN
+      near = near && from > T(0) && from + T(Order + 1) < T(3 * kBlockWidth);
       inside = inside && on_lattice<Order>(g, i, node);
+      base = base * 3 * kBlockWidth + int(from);
     }
     if (!near) lost_ |= Drift::kLost;
-    if (!inside) lost_ |= Drift::kLost | Drift::kMissed;
+    if (!inside) {
+      lost_ |= Drift::kLost | Drift::kMissed;
+    } else if (around) {
+      const int s = atomicAdd(&m.strays, 1);
+      m.row[s] = uint16_t(row);
+      m.base[s] = uint16_t(base);
+    } else {
+      m.far.particle[atomicAdd(&m.far.count, 1)] = uint16_t(k);
+    }
+  }
+
+  // A warp takes one at a time.
+  __device__ void add_all_strays() const {
+    for (int s = threadIdx.x / 32; s < m.strays; s += threads / 32) {
+      const int base = m.base[s];
+      add_stray<S>(source.nodes, shared, m.row[s], [&](const int (&offset)[D]) -> int64_t {
+        int node[D], block = 0;
+#pragma unroll
+        for (int i = D - 1, rest = base, step = 1; i >= 0; i--, rest /= 3 * kBlockWidth, step *= 3) {
+          const int at = rest % (3 * kBlockWidth) + offset[i];
+          block += at / kBlockWidth * step;
+          node[i] = at % kBlockWidth;
+        }
+        const int slot = here().slots[block];
+        return slot < 0 ? -1 : int64_t(slot) * kBlockNodes<D> + node_in_block<D>(node);
+      });
+    }
+    add_strays<S>(source, topology(), schedule_of(topology()), here().home.scene, shared, m.far, here().begin);
   }
 };
 
@@ -198,19 +318,15 @@ constexpr int kG2P2GBlocks = 3;
 template <class Source, class Task, class T, int D>
 __global__ void __launch_bounds__(Source::Shape::threads, kG2P2GBlocks)
     g2p2g_kernel(const __grid_constant__ Source source, const __grid_constant__ Task task, const OwnRows own,
-                 const int* copy) {
+                 const int* copy, int* taken) {
   wait_for_kernel_before();
   const Topology<T, D>& t = source.topology;
   if (own.is_due(t.particles)) return;  // and there is a new activation between G2P and P2G
   extern __shared__ __align__(16) char memory[];
   __shared__ G2P2GMemory<typename Source::Shape> shared;
-  G2P2G<Source, Task> g2p2g(source, task, shared, memory, *copy ? own.rows : 0);
+  G2P2G<Source, Task> g2p2g(source, task, shared, memory, *copy ? own.rows : 0, taken);
   const Schedule<const int> schedule = schedule_of(t);
-  const int count = *schedule.item_count;
-  for (int i = blockIdx.x; i < count; i += gridDim.x) {
-    const int4 e = reinterpret_cast<const int4*>(schedule.items)[i];
-    g2p2g.take({e.x, e.y, e.z, e.w});
-  }
+  g2p2g.take_items(schedule);
   const int64_t stride = int64_t(gridDim.x) * blockDim.x;
   for (int64_t i = t.offsets[t.max_blocks] + int64_t(blockIdx.x) * blockDim.x + threadIdx.x; i < t.particles;
        i += stride)
@@ -222,8 +338,9 @@ template <class Source, class Task, class T, int D>
 void launch_g2p2g(const Source& source, const Task& task, const G2P2GArguments<T, D>& a, Stream stream) {
   using S = typename Source::Shape;
   const int64_t items = most_items(source.topology.max_blocks, source.topology.particles);
-  launch_in_chain(g2p2g_kernel<Source, Task, T, D>, grid_size(items), S::threads, S::shared_bytes, stream, source, task,
-                  a.own, a.copy);
+  const auto resident = unsigned(kG2P2GBlocks * device_attribute(cudaDevAttrMultiProcessorCount));
+  launch_in_chain(g2p2g_kernel<Source, Task, T, D>, std::min(grid_size(items), resident), S::threads, S::shared_bytes,
+                  stream, source, task, a.own, a.copy, a.items_taken);
 }
 
 }  // namespace mpm::cuda

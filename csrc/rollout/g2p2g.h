@@ -16,7 +16,8 @@ struct G2P2GArguments {
   LateDeformation<T, D> late;
   G2PAdvanceArguments<T, D> advance;  // its drift counts where particles go
   OwnRows own;
-  const int* copy = nullptr;  // which one the particles are in
+  const int* copy = nullptr;   // which one the particles are in
+  int* items_taken = nullptr;  // by thread blocks beyond their first one, zeroed before
 };
 
 }  // namespace mpm

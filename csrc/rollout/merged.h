@@ -12,8 +12,9 @@
 // All four are launched, and the device finds which of them have something to do.
 namespace mpm {
 
-// Renewing an activation costs about as much as a step does, four times an activation alone.
-constexpr int kStraysOfRenewal = kStraysOfActivation / 4;
+// A new activation is due once strays, added up over the steps, are half as many as there are particles: it costs about
+// one step more, while a stray, whose velocity mostly comes from the tile as well, costs little.
+constexpr int kStraysOfRenewal = kStraysOfActivation / 16;
 
 template <class T, int D>
 class Merged {
@@ -29,7 +30,7 @@ class Merged {
   int* const status_[2];
   const backend::Stream stream_;
   const int rows_;  // of a copy
-  Tensor x_, F_, J_, history_, mass_, volume_, origin_, copy_, nowhere_;
+  Tensor x_, F_, J_, history_, mass_, volume_, origin_, copy_, items_taken_, nowhere_;
   Particles<T> own_;
 
   int* status(int64_t step) { return status_[(s_.in.n - 1 - step) % 2]; }  // the last one is the first of the two
@@ -61,6 +62,7 @@ Merged<T, D>::Merged(Substeps<T, D>& s, const Particles<T>& results, Tensor stat
   volume_ = empty_particles(in.x, {both});
   origin_ = empty_int(in.x, {both});
   copy_ = empty_int(in.x, {1});
+  items_taken_ = empty_int(in.x, {1});
   nowhere_ = empty_int(in.x, {int64_t(sizeof(Drift) / sizeof(int))});
   torch::stable::zero_(copy_);
   torch::stable::zero_(nowhere_);
@@ -139,7 +141,7 @@ void Merged<T, D>::go_on(int64_t step, bool ends, backend::Stream stream) {
   s_.activate(status(step - 1), status(step), stream);
   kernels().p2g(s_.laws[0], s_.late, s_.p2g, s_.settling, stream);
   if (!ends) {
-    G2P2GArguments<T, D> a{s_.p2g, s_.late, s_.advance, s_.settling, s_.settling.copy};
+    G2P2GArguments<T, D> a{s_.p2g, s_.late, s_.advance, s_.settling, s_.settling.copy, s_.next.items_taken};
     a.advance.drift = drift(step);
     kernels().g2p2g(s_.laws[0], a, stream);
   }
@@ -151,6 +153,7 @@ void Merged<T, D>::update_grid(int64_t step, backend::Stream stream) {
   s_.next.drift = s_.next.watched = drift(step);
   s_.next.next_drift = drift(step + 1);
   s_.next.strays_of_activation = kStraysOfRenewal;
+  s_.next.items_taken = static_cast<int*>(items_taken_.data_ptr());
   s_.move_nodes(stream);
   s_.end_time(stream);
 }

@@ -17,15 +17,12 @@ __device__ bool goes_far(const GridUpdateArguments<T, D>& a, const SlotUpdate<T,
   return !near;
 }
 
+// A node of a slot; false where the slot is not in use.
 template <bool Obstacles, class T, int D>
-__global__ void __launch_bounds__(kThreads) next_grid_kernel(const NextGridArguments<T, D> a) {
-  wait_for_kernel_before();
-  const int64_t node = int64_t(blockIdx.x) * kThreads + threadIdx.x;
-  const int slot = int(node / kBlockNodes<D>), local = int(node % kBlockNodes<D>);
-  if (node == 0) *a.next_drift = a.drift->next(a.particles, a.strays_of_activation);
-  if (slot >= a.update.max_blocks) return;
+__device__ bool take_node(const NextGridArguments<T, D>& a, int slot, int local) {
   const SlotUpdate<T, D> s = slot_update(a.update, slot);
-  if (!s.active) return;
+  if (!s.active) return false;
+  const int64_t node = int64_t(slot) * kBlockNodes<D> + local;
   NodeRow<T, D> row = update_node(a.update, s, local, a.update.nodes[node]);
   if constexpr (Obstacles) {
     const ContactSlot<T, D> there = contact_slot(a.contact, slot);
@@ -36,6 +33,24 @@ __global__ void __launch_bounds__(kThreads) next_grid_kernel(const NextGridArgum
   if (a.watched && goes_far(a.update, s, row)) atomicOr(&a.watched->lost, Drift::kLost);
   a.update.updated[node] = row;
   if (a.emptied) a.emptied[node] = {};
+  return true;
+}
+
+// In strides of the grid, so that a pool that is mostly unused costs nothing.
+template <bool Obstacles, class T, int D>
+__global__ void __launch_bounds__(kThreads) next_grid_kernel(const NextGridArguments<T, D> a) {
+  wait_for_kernel_before();
+  constexpr int slots = kThreads / kBlockNodes<D>;  // at a time
+  const int first = int(blockIdx.x) * slots + int(threadIdx.x) / kBlockNodes<D>, stride = int(gridDim.x) * slots,
+            local = int(threadIdx.x) % kBlockNodes<D>;
+  if (blockIdx.x == 0 && threadIdx.x == 0) {
+    *a.next_drift = a.drift->next(a.particles, a.strays_of_activation);
+    if (a.items_taken) *a.items_taken = 0;
+  }
+  for (int slot = first; slot < a.near_blocks; slot += stride)
+    if (!take_node<Obstacles>(a, slot, local)) break;
+  for (int slot = a.near_blocks + first; slot < a.update.max_blocks; slot += stride)
+    if (!take_node<Obstacles>(a, slot, local)) break;
 }
 
 }  // namespace
@@ -43,7 +58,7 @@ __global__ void __launch_bounds__(kThreads) next_grid_kernel(const NextGridArgum
 template <class T, int D>
 void next_grid(const NextGridArguments<T, D>& a, Stream stream) {
   if (a.update.max_blocks == 0) return;
-  const unsigned blocks = unsigned((int64_t(a.update.max_blocks) * kBlockNodes<D> + kThreads - 1) / kThreads);
+  const unsigned blocks = grid_size((int64_t(a.update.max_blocks) * kBlockNodes<D> + kThreads - 1) / kThreads) / 4 + 1;
   if (a.obstacles)
     launch_in_chain(next_grid_kernel<true, T, D>, blocks, kThreads, 0, stream, a);
   else

@@ -11,12 +11,14 @@ namespace mpm {
 template <class T, int D>
 struct NextGridArguments {
   GridUpdateArguments<T, D> update;
+  int near_blocks = 0;  // slots of the pool without the margin; of either those in use come first
   bool obstacles = false;
   ContactArguments<T, D> contact;    // its nodes unused
   NodeRow<T, D>* emptied = nullptr;  // the nodes, which become zero; null where mirrors read those of others
   const Drift* drift = nullptr;
   Drift* next_drift = nullptr;
-  Drift* watched = nullptr;  // told of nodes that go so far that particles may leave the active blocks; or null
+  Drift* watched = nullptr;    // told of nodes that go so far that particles may leave the active blocks; or null
+  int* items_taken = nullptr;  // which becomes zero; or null
   int64_t particles = 0;
   int strays_of_activation = kStraysOfActivation;
 };

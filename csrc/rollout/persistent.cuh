@@ -8,9 +8,10 @@
 
 // The kernel of substeps that last in their activation. A substep is
 //   P2G     of each item by a thread block; then a barrier
-//   G2P     of the same item, with the grid update and contact of each node of its tile; then a barrier,
-//           after which all know whether the activation lasts.
-// What the particles give in the next P2G is computed before the second barrier, and kept after it.
+//   G2P     of the same item, with the grid update and contact of each node of its tile.
+// Whether the activation still lasts all know after the barrier of the next P2G, which is given up if it does not: what
+// the law changes is kept only then. Where thread blocks have several items, or scenes clocks of their own, there is
+// a second barrier.
 // A substep of few particles is one chain of loads and sums that wait for each other. So what an item needs of the grid
 // is loaded once where a thread block has no other item, and cells have more threads in 3-D than in P2G alone.
 #if CUDART_VERSION >= 13000
@@ -48,8 +49,7 @@ struct ItemMemory {
   BaseBlock<T, D> home;
   int head[S::lists + 1];
   int strays;                 // particles that are not in the block of the item:
-  int row[most], base[most];  // of what they give, and of their base nodes, -1 where there is none;
-  T distance[most][D];        // from these
+  int row[most], base[most];  // of what they give, and of their base nodes, -1 where there is none
 };
 
 // The phases of a substep of one item, whose particles have a thread each.
@@ -90,17 +90,27 @@ class ItemStep {
     if (threadIdx.x == 32) m.home.template set<Order>(topology(), e.w);
     if (threadIdx.x == 64) m.strays = 0;
     empty_lists<S>(m.head);
+    if (exists_) x_ = read_vector(source.position, particle_);
     __syncthreads();
     active_ = 0;
 #pragma unroll
     for (int o = 0; o < 1 << D; o++) active_ |= unsigned(m.slots[o] >= 0) << o;
   }
 
+  // What link() needs of the particles, which stays in registers while they have a thread each.
+  __device__ void load() {
+    if (!exists_) return;
+    state_ = source.read(particle_, m.home.scene, particle_);
+    parameters_ = source.parameters(particle_);
+    source.fetch(particle_, changes_);
+  }
+
   // What the particles give, in shared memory. What their law changes is not kept yet, so that it may be given up.
   __device__ void link() {
     const SharedParticles<S> shared(memory, m.head);
     if (exists_) {
-      const auto loaded = source.load(particle_, m.home.scene, changes_);
+      auto loaded = state_;
+      loaded.stress = source.stress(particle_, loaded.affine, loaded.dt, parameters_, changes_);
       find();
       const int row = SharedParticles<S>::row(threadIdx.x);
       store_particle<S, T, D>(shared, row, f_, source.contribution(loaded));
@@ -109,9 +119,12 @@ class ItemStep {
     __syncthreads();
   }
 
+  __device__ void keep() const {
+    if (exists_) source.keep(particle_, changes_);
+  }
+
   // Of linked particles.
   __device__ void scatter(T* nodes) {
-    if (exists_) source.keep(particle_, changes_);
     const SharedParticles<S> shared(memory, m.head);
     const NodeField<T> field{nodes, 1 + D, 1 + D};
     add_particles(field, shared, m.slots, false, [&] { add_strays(field, shared); });
@@ -145,7 +158,6 @@ class ItemStep {
 
   // Where the particle is.
   __device__ void find() {
-    x_ = read_vector(source.position, particle_);
     stray_ = -1;
     if (m.home.template locate<Order>(topology().geometry, x_, cell_, f_)) return;
     int base[D];
@@ -153,15 +165,12 @@ class ItemStep {
     stray_ = atomicAdd(&m.strays, 1);
     m.row[stray_] = SharedParticles<S>::row(threadIdx.x);
     m.base[stray_] = slot < 0 ? -1 : slot * kBlockNodes<D> + node_in_block<D>(base);
-#pragma unroll
-    for (int axis = 0; axis < D; axis++) m.distance[stray_][axis] = f_[axis];
   }
 
   // A warp takes one at a time.
   __device__ void add_strays(const NodeField<T>& nodes, const SharedParticles<S>& shared) const {
     for (int s = threadIdx.x / 32; s < m.strays; s += threads / 32)
-      if (m.base[s] >= 0)
-        add_stray<S, T, D>(nodes, schedule_of(topology()), shared, m.row[s], m.distance[s], m.base[s]);
+      if (m.base[s] >= 0) add_stray(nodes, schedule_of(topology()), shared, m.row[s], m.base[s]);
   }
 
   template <int Width>
@@ -220,11 +229,18 @@ class ItemStep {
     return in_tile(offset);
   }
 
-  __device__ void move(const NodeValue<T, D>* corner, FollowerOf<Task>& follower) const {
-    if (stray_ >= 0 && m.base[stray_] < 0) return task.leave_out(particle_);
+  __device__ void move(const NodeValue<T, D>* corner, FollowerOf<Task>& follower) {
+    if (stray_ >= 0 && m.base[stray_] < 0) {
+      task.leave_out(particle_);
+      return source.fields.read_motion(particle_, state_);
+    }
     const auto loaded = task.at(x_, m.home.scene);
-    const auto sums = task.compute(loaded, Weights<Order, T, D>(f_), TileSupport<Order, T, D>{corner});
-    follower.follow(topology(), m.home, active_, task.write(particle_, loaded, sums));
+    const auto sums = task.compute(Weights<Order, T, D>(f_), TileSupport<Order, T, D>{corner});
+    const Motion<T, D> motion = task.motion(sums);
+    state_.velocity = motion.velocity;
+    state_.affine = motion.affine;
+    x_ = task.write(particle_, loaded, sums);
+    follower.follow(topology(), m.home, active_, x_);
   }
 
   bool exists_ = false;  // whether this thread has a particle
@@ -233,6 +249,8 @@ class ItemStep {
   Vector<T, D> x_;
   T f_[D];
   int cell_ = 0, stray_ = -1;
+  ParticleMomentum<T, D> state_;
+  typename Source::Parameters parameters_;
   typename Source::Changes changes_;
 };
 
@@ -274,6 +292,52 @@ __device__ void write_persistent_status(const PersistentArguments<T, D>& a, int 
   }
 }
 
+// Barriers of the kernel, and what thread blocks count of where particles go: in shared memory, from barrier to barrier
+// in turn, so that one can be read by the others of a cluster while they are at work on the next one.
+class CountingBarrier {
+ public:
+  __device__ CountingBarrier(unsigned long long* arrived, int blocks, bool cluster, Drift* counted)
+      : barrier_{arrived, unsigned(blocks)}, cluster_(cluster), counted_(counted) {
+    if (threadIdx.x < 2) counted[threadIdx.x] = {};
+  }
+
+  __device__ Drift* counted() { return counted_ + turn_; }
+  // Returns what all thread blocks have counted since the barrier before.
+  __device__ Drift wait() {
+    Drift* const mine = counted();
+    turn_ = 1 - turn_;
+    const Drift all = cluster_ ? sum_of_cluster(mine) : sum_of_grid(*mine);
+    if (threadIdx.x == 0) *counted() = {};
+    return all;
+  }
+
+ private:
+  __device__ Drift sum_of_cluster(Drift* mine) {
+    Drift all{};
+    wait_for_cluster();
+    each_of_cluster(mine, [&](const Drift& other) {
+      all.strays += other.strays;
+      all.lost |= other.lost;
+    });
+    return all;
+  }
+  __device__ Drift sum_of_grid(const Drift& mine) {
+    const unsigned sum = barrier_.wait([&] { return unsigned(mine.strays) + (mine.lost ? kLost : 0); });
+    const Drift all{int(sum % kLost) - strays_, sum >= kLost};
+    strays_ += all.strays;
+    return all;
+  }
+
+  static constexpr unsigned kLost = 1 << 24;  // more than all strays of a launch
+  static_assert(int64_t(kStepsOfALaunch) * kMostPersistentParticles / kParticlesPerStray + kMostPersistentParticles <
+                kLost);
+
+  Barrier barrier_;
+  const bool cluster_;
+  Drift* const counted_;
+  int turn_ = 0, strays_ = 0;
+};
+
 template <class Source, class Task, class T, int D>
 __global__ void __launch_bounds__(ItemStep<Source, Task>::threads)
     persistent_kernel(const __grid_constant__ Source source, const __grid_constant__ Task task,
@@ -283,24 +347,24 @@ __global__ void __launch_bounds__(ItemStep<Source, Task>::threads)
   extern __shared__ __align__(16) char memory[];
   __shared__ ItemMemory<typename Step::S> shared;
   __shared__ int of_margin;
+  __shared__ Drift counted[2];
   __shared__ alignas(16) char contact_memory[sizeof(ContactArguments<T, D>)];
   wait_for_kernel_before();
   const Topology<T, D>& t = source.topology;
   const bool cluster = is_cluster();
-  const int items = *schedule_of(t).item_count, first = a.state->step;
+  const int items = *schedule_of(t).item_count, first = *a.steps_so_far;
   const int blocks = cluster ? int(gridDim.x) : ::max(1, ::min(items, int(gridDim.x)));
   const bool leads = blockIdx.x == 0 && threadIdx.x == 0, alone = items <= blocks;
-  if (int(blockIdx.x) >= blocks) return;
+  if (first >= a.steps && leads && a.loop) cudaGraphSetConditional(a.loop, 0);
+  if (first >= a.steps || int(blockIdx.x) >= blocks) return;
   auto& contact = *reinterpret_cast<ContactArguments<T, D>*>(contact_memory);
   if (threadIdx.x == 0 && a.obstacles) contact = a.contact;
   if (threadIdx.x == 32) of_margin = used_slots(t, a.blocks, t.max_blocks);
   __syncthreads();
   const UsedNodes<T, D> used(::min(a.activated[kBlocksNow], a.blocks), of_margin, a.blocks);
-  if (leads) a.state->counted[first % 2] = {};
-  Barrier barrier{a.arrived, unsigned(blocks)};
-  const auto wait = [&] { cluster ? wait_for_cluster() : barrier.wait(); };
+  CountingBarrier barrier(a.arrived, blocks, cluster, counted);
   Step item(source, task, a.update, shared, memory);
-  if (alone && int(blockIdx.x) < items) item.begin(blockIdx.x), item.link();
+  if (alone && int(blockIdx.x) < items) item.begin(blockIdx.x), item.load(), item.link();
   const auto each_item = [&](const auto& phase) {
     for (int i = blockIdx.x; i < items; i += blocks) {
       if (!alone) item.begin(i);
@@ -312,40 +376,43 @@ __global__ void __launch_bounds__(ItemStep<Source, Task>::threads)
   const auto each_outside = [&](const auto& leave_out) {
     for (int64_t i = tail; i < t.particles; i += int64_t(blocks) * threads) leave_out(t.index[i]);
   };
+  const auto lasts = [&](const Drift& counted) {
+    return counted.lost == 0 && counted.strays * kParticlesPerStray <= t.particles;
+  };
+  const bool ahead = alone && !a.scene_time;
   int step = first;
-  bool lasts;
-  do {
-    used.empty(a.nodes[(step + 2) % 3], blocks);
+  for (bool more = true; more;) {
+    used.empty(a.nodes[(step + 1) % 3], blocks);
     each_item([&] {
-      if (!alone) item.link();
+      if (!alone) item.load(), item.link(), item.keep();
       item.scatter(a.nodes[step % 3]);
     });
-    each_outside([&](int p) { source.leave_out(p); });
     if (threadIdx.x == 0 && a.step_time) contact.time = a.step_time[step];
-    wait();
+    if (!lasts(barrier.wait())) break;
 
-    if (leads) a.state->counted[(step + 1) % 2] = {};
+    if (alone && int(blockIdx.x) < items) item.keep();
+    each_outside([&](int p) { source.leave_out(p); });
     const NodeVelocities<T, D> velocities{a.update, contact, a.obstacles,
                                           reinterpret_cast<const NodeRow<T, D>*>(a.nodes[step % 3])};
     FollowerOf<Task> follower;
     each_item([&] { item.gather(velocities, alone, follower); });
     each_outside([&](int p) { task.leave_out(p); });
-    follower.tell(&a.state->counted[step % 2]);
-    if (alone && int(blockIdx.x) < items) item.link();  // of the next substep, while others are at work
-    wait();
-
-    const Drift& counted = a.state->counted[step % 2];
-    lasts = counted.lost == 0 && counted.strays * kParticlesPerStray <= t.particles;
+    follower.tell(barrier.counted());
+    step++;
+    more = step < a.steps && step - first < kStepsOfALaunch;
+    if (alone && more && int(blockIdx.x) < items) item.link();  // of the next substep
+    if (ahead && more) continue;
+    more = lasts(barrier.wait()) && more;
     if (blockIdx.x == 0 && a.scene_time)
       for (int b = threadIdx.x; b < t.scenes; b += threads) a.scene_time[b] += a.scene_dt[b];
-    step++;
-  } while (step < a.steps && lasts && step - first < kStepsOfALaunch);
-  used.empty(a.nodes[(step - 1) % 3], blocks);
+  }
+  for (T* nodes : a.nodes) used.empty(nodes, blocks);
   if (blockIdx.x == 0) write_persistent_status(a, t.scenes, step - first);
+  if (cluster) wait_for_cluster();  // others may still read what this one has counted
   if (!leads) return;
-  a.state->step = step;
+  *a.steps_so_far = step;
   a.drift->lost = 1;  // so that there is a new activation
-  cudaGraphSetConditional(a.loop, step < a.steps);
+  if (a.loop) cudaGraphSetConditional(a.loop, step < a.steps);
 }
 
 template <class Source, class Task, class T, int D>

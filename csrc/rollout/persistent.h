@@ -12,16 +12,10 @@ namespace mpm {
 constexpr int64_t kLeastPersistentSteps = 8, kMostPersistentParticles = 1 << 14, kMostPersistentBlocks = 256;
 // Strays have warps of their own, so that a new activation, and a launch, pay only where these are not enough: there
 // are so many particles for each of them.
-constexpr int kParticlesPerStray = 16;
+constexpr int kParticlesPerStray = 32;
 // So many particles are left to one cluster of thread blocks.
 constexpr int64_t kMostClusterParticles = 2048;
 constexpr int kStepsOfALaunch = 4096;  // at most
-
-// Zeroed before a call.
-struct PersistentState {
-  int step;          // substeps so far
-  Drift counted[2];  // of two substeps in turn
-};
 
 // F or J of the particles, all of which move in place, is left to P2G in every substep. Nodes are zero before and
 // after.
@@ -33,18 +27,18 @@ struct PersistentArguments {
   GridUpdateArguments<T, D> update;
   ContactArguments<T, D> contact;
   bool obstacles = false;
-  int blocks = 0;                     // slots of the pool without the margin
-  T* nodes[3] = {};                   // P2G fills one, G2P reads it, and another is emptied
-  int steps = 0;                      // to be taken by all launches together
-  const double* step_time = nullptr;  // [steps] where obstacles act and scenes have no time of their own
-  T* scene_time = nullptr;            // [scenes], goes on with each substep
-  const T* scene_dt = nullptr;        // [scenes]
-  PersistentState* state = nullptr;
-  unsigned* arrived = nullptr;     // thread blocks at barriers, zeroed before each launch
-  Drift* drift = nullptr;          // tells the activation that there has to be a new one
-  const int* activated = nullptr;  // status of the activation, [1 + scenes, 8]
-  int* status = nullptr;           // that of all substeps
-  unsigned long long loop = 0;     // the condition of a graph that launches the kernel until all are taken
+  int blocks = 0;                         // slots of the pool without the margin
+  T* nodes[3] = {};                       // P2G fills one, G2P reads it, and another is emptied
+  int steps = 0;                          // to be taken by all launches together
+  const double* step_time = nullptr;      // [steps] where obstacles act and scenes have no time of their own
+  T* scene_time = nullptr;                // [scenes], goes on with each substep
+  const T* scene_dt = nullptr;            // [scenes]
+  int* steps_so_far = nullptr;            // zeroed before a call
+  unsigned long long* arrived = nullptr;  // thread blocks at barriers, zeroed before each launch
+  Drift* drift = nullptr;                 // tells the activation that there has to be a new one
+  const int* activated = nullptr;         // status of the activation, [1 + scenes, 8]
+  int* status = nullptr;                  // that of all substeps
+  unsigned long long loop = 0;  // the condition of a graph that launches the kernel until all are taken, or zero
 };
 
 }  // namespace mpm

@@ -69,7 +69,7 @@ struct SubstepsInputs {
 
 constexpr int64_t kMostSteps = 1 << 16;  // of one call, which nothing interrupts
 // Fewer particles are faster by kernels of their own: those that find nothing to do cost more than half of the bytes.
-constexpr int64_t kLeastMergedSteps = 4, kLeastMergedParticles = 1 << 20;
+constexpr int64_t kLeastMergedSteps = 4, kLeastMergedParticles = 1 << 18;
 
 // The words of a list that commas part.
 inline std::vector<std::string> words(const std::string& list) {
@@ -372,7 +372,7 @@ struct Substeps {
 
   // Whether a kernel takes many substeps of few particles, all but the first and the last of a call. It pays where some
   // wave of thread blocks is enough for all items, as where the pool is small; one that grows and has room for all
-  // blocks is meant for it (`takes_all_blocks` in torch_mpm/rollouts.py).
+  // blocks is meant for it (`pool_of_call` in torch_mpm/rollouts.py).
   bool persists() const {
     const int64_t P = in.x.size(0);
     if (!may_move_late() || !in.resident || in.n < kLeastPersistentSteps + 2) return false;
@@ -583,6 +583,7 @@ void Substeps<T, D>::use_pool() {
   p2g.topology = advance.gather.topology = topology;
   p2g.nodes = {static_cast<T*>(pool.nodes.data_ptr()), 1 + D, 1 + D};
   update.max_blocks = contact.max_blocks = topology.max_blocks;
+  next.near_blocks = activation.max_blocks;
   update.block = contact.block = topology.block;
   update.table = topology.table;
   update.nodes = static_cast<const NodeRow<T, D>*>(pool.nodes.data_ptr());

@@ -75,25 +75,30 @@ bool take_persistent(Substeps<T, D>& s, int* activated, int* status, backend::St
   if (s.contact.step_time) a.step_time = s.contact.step_time + 1;
   a.contact.step_time = nullptr;
   give_clocks(s, a);
-  Tensor state = empty_int(in.x, {int64_t(sizeof(PersistentState) / sizeof(int))}), arrived = empty_int(in.x, {1});
-  backend::clear(state, stream);
-  a.state = reinterpret_cast<PersistentState*>(state.data_ptr());
-  a.arrived = static_cast<unsigned*>(arrived.data_ptr());
+  Tensor steps_so_far = empty_int(in.x, {1}), arrived = empty(in.x, {1}, ScalarType::Long);
+  backend::clear(steps_so_far, stream);
+  a.steps_so_far = static_cast<int*>(steps_so_far.data_ptr());
+  a.arrived = static_cast<unsigned long long*>(arrived.data_ptr());
   a.drift = s.advance.drift;
   a.activated = activated;
   a.status = status;
   s.activation.drift = a.drift;
   s.activation.previous_status = status;
   s.activation.status = activated;
+  static std::atomic<bool> works = false;
+  const auto launch = [&](cudaStream_t on, unsigned long long condition) {
+    a.loop = condition;
+    s.find_blocks(on);
+    backend::clear(arrived, on);
+    s.calls[0].law->template kernels<T, D>().persistent(s.laws[0], a, on);
+  };
   try {
-    repeat(stream, [&](cudaStream_t on, unsigned long long condition) {
-      a.loop = condition;
-      s.find_blocks(on);
-      backend::clear(arrived, on);
-      s.calls[0].law->template kernels<T, D>().persistent(s.laws[0], a, on);
-    });
-  } catch (const std::exception&) {  // before anything was launched
-    cudaGetLastError();
+    if (works) launch(stream, 0);  // so that the device is at work while the host makes the graph
+    repeat(stream, launch);
+    works = true;
+  } catch (const std::exception&) {
+    if (works) throw;
+    cudaGetLastError();  // nothing was launched
     refused = true;
   }
   return !refused;

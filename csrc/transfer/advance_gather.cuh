@@ -75,6 +75,10 @@ struct AdvanceGather {
   }
   template <class Support>
   __device__ Result compute(const Loaded&, const Weights<Order, T, D>& w, const Support& support) const {
+    return compute(w, support);
+  }
+  template <class Support>
+  __device__ Result compute(const Weights<Order, T, D>& w, const Support& support) const {
     const T constant[K] = {}, linear[K][D] = {};
     Result s;
     sum_axis<Shape, 0>(support, support.rows, 0, w, constant, linear, s);
@@ -145,6 +149,7 @@ struct OwnAdvanceGather : AdvanceGather<2, T, D, false, true, Ends> {
 
   explicit OwnAdvanceGather(const G2PAdvanceArguments<T, D>& a) : Base(a), own(a.own) {}
 
+  bool is_mostly_idle() const { return own.is_mostly_idle(); }
   __device__ bool is_due() const { return own.is_due(Base::topology.particles); }
   __device__ mpm::Vector<T, D> write(int p, const typename Base::Loaded& l, const typename Base::Result& s) const {
     const int to = target(p);

@@ -3,6 +3,7 @@
 #include "cuda/chain.cuh"
 #include "cuda/quad.cuh"
 #include "transfer/momentum.cuh"
+#include "transfer/own_rows.h"
 
 // G2P, gather, and the two adjoints that read nodes. A thread takes a particle and sums over its support one axis at a
 // time. Particles come in one of two orders, which `activate` chooses: item by item, with the nodes of the base block
@@ -82,10 +83,13 @@ __device__ void load_node(const NodeField<const T>& nodes, int row, int offset, 
   }
 }
 
+// Nodes between a node and the next one along an axis with so many axes after it, in a cube.
+constexpr int step_in_cube(int width, int axes) { return axes > 0 ? width * step_in_cube(width, axes - 1) : 1; }
+
 // Nodes in global memory, in the base block and the blocks after it.
 template <class T, int K, int D, bool Quads>
 struct GridSupport {
-  static constexpr int blocks = 1 << D, width = kBlockWidth;
+  static constexpr int blocks = 1 << D;
   const NodeField<const T>& nodes;
   int base[D];  // base node in the base block
   BlockRows<blocks> rows;
@@ -102,6 +106,7 @@ struct GridSupport {
 #pragma unroll
     for (int i = 0; i < D; i++) base[i] = support.base[i];
   }
+  static constexpr int step(int axes_after) { return step_in_cube(kBlockWidth, axes_after); }
   __device__ bool is_far(int axis, int node) const { return node > 0 && base[axis] + node >= kBlockWidth; }
   __device__ void load(int row, int offset, T (&node)[K]) const { load_node<Quads>(nodes, row, offset, node); }
 };
@@ -114,13 +119,14 @@ struct alignas(K == 1   ? sizeof(T)
   T e[K == 3 ? 4 : K];
 };
 
-// Nodes in shared memory: those of the base block and the next Order along each axis, and `Halo` more on either side.
-template <int Order, class T, int K, int Halo = 0>
+// Nodes in shared memory: those of the base block and the next Order along each axis.
+template <int Order, class T, int K>
 struct TileSupport {
-  static constexpr int blocks = 1, width = kBlockWidth + Order + 2 * Halo;
+  static constexpr int blocks = 1, width = kBlockWidth + Order;
   const NodeValue<T, K>* corner;  // the base node
   BlockRows<1> rows;
 
+  static constexpr int step(int axes_after) { return step_in_cube(width, axes_after); }
   __device__ bool is_far(int, int) const { return false; }
   __device__ void load(int, int offset, T (&node)[K]) const {
     const NodeValue<T, K> v = corner[offset];
@@ -149,7 +155,7 @@ __device__ void sum_node(const Support& support, const BlockRows<Blocks>& rows, 
   for (int c = 0; c < S::K; c++)
     below[c] = S::Slope == SlopeForm::affine ? constant[c] + linear[c][Axis] * w.distance[Axis][Node] : constant[c];
   Sums<S> in;
-  sum_axis<S, Axis + 1>(support, side, offset * Support::width + Node, w, below, linear, in);
+  sum_axis<S, Axis + 1>(support, side, offset + Node * Support::step(S::D - 1 - Axis), w, below, linear, in);
   const T n = w.weight[Axis][Node], dn = w.first[Axis][Node];
 #pragma unroll
   for (int c = 0; c < S::K; c++) {
@@ -475,7 +481,10 @@ __global__ void __launch_bounds__(kGatherThreads, kResident<Task>) gather_kernel
 
 template <class Task, class Kernel>
 void launch_gather(const Task& task, Kernel* kernel, int64_t pieces, Stream stream) {
-  launch_in_chain(kernel, grid_size(pieces), kGatherThreads, 0, stream, task);
+  unsigned blocks = grid_size(pieces);
+  if constexpr (requires { task.is_mostly_idle(); })
+    if (task.is_mostly_idle()) blocks = std::max(blocks / kIdleShare, 1u);
+  launch_in_chain(kernel, blocks, kGatherThreads, 0, stream, task);
 }
 
 template <class Task>

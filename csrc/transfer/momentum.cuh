@@ -43,11 +43,11 @@ struct MomentumFields {
     return m;
   }
   // But for its motion and the stress, which the caller has.
-  __device__ ParticleMomentum<T, D> read_at_rest(int p, int scene) const {
+  __device__ ParticleMomentum<T, D> read_at_rest(int p, const T& dt) const {
     ParticleMomentum<T, D> m{};
     m.mass = mass.at(p);
     m.volume = volume.at(p);
-    m.dt = time_step(scene);
+    m.dt = dt;
     return m;
   }
   __device__ void read_motion(int p, ParticleMomentum<T, D>& m) const {

@@ -4,6 +4,9 @@
 #include "common/host_device.h"
 #include "grid/topology.h"
 
+// Kernels that mostly have nothing to do take so many times fewer thread blocks, each of which costs time.
+constexpr unsigned kIdleShare = 8;
+
 // Particles that a call of many substeps owns, on CUDA. There are two copies of what they keep from step to step, one
 // behind the other. P2G after an activation takes them from one to the other, in the order of its items, so that those
 // of an item are neighbours in memory until the next activation. Given tensors are the first copy of the first P2G.
@@ -14,6 +17,7 @@ struct OwnRows {
   const Drift* drift = nullptr;  // tells whether there is a new activation; null where there is in any case
   int strays_of_activation = kStraysOfActivation;
 
+  bool is_mostly_idle() const { return drift != nullptr; }
   MPM_HD bool is_due(int64_t particles) const { return !drift || !drift->lasts(particles, strays_of_activation); }
   // Of a row of either copy.
   MPM_HD int place(int row) const { return row >= rows ? row - rows : row; }

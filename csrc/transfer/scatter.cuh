@@ -3,6 +3,7 @@
 #include "cuda/chain.cuh"
 #include "cuda/quad.cuh"
 #include "transfer/momentum.cuh"
+#include "transfer/own_rows.h"
 
 // The kernel of P2G and scatter. One thread block takes the particles of one item, links them by cell in shared memory,
 // and adds up nodes in registers: each cell has one thread per leading node of the support, Order + 1 of them, which
@@ -53,15 +54,13 @@ struct ScatterShape {
   static constexpr int fitting = 90 * 1024 / row_bytes / 32 * 32;
   static constexpr int batch = fitting < kItemParticles ? fitting : kItemParticles;
 
-  // The sums, in the same memory: a plane of nodes for each slice, leading cell and leading node. The four nodes of a
-  // block along the last axis are contiguous, so rows of the tile are, too, and are handled four words at a time.
+  // The sums, in the same memory: the slab of each thread. The four nodes of a block along the last axis are contiguous
+  // in the grid, so rows of the tile are, too, and are handled four words at a time.
   static constexpr int near_quads = channels, far_quads = (Order * channels + 3) / 4;
-  static constexpr int row_quads = near_quads + far_quads, plane_rows = D == 2 ? 1 : width;
-  static constexpr int plane_quads = plane_rows * row_quads + (11 - plane_rows * row_quads % 8) % 8;  // 3 modulo 8
-  static constexpr int planes = slices * kBlockWidth * support;
+  static constexpr int row_quads = near_quads + far_quads;
 
   static constexpr size_t particle_bytes = size_t(batch) * row_bytes;
-  static constexpr size_t sum_bytes = size_t(planes) * plane_quads * 4 * sizeof(T);
+  static constexpr size_t sum_bytes = size_t(threads) * slab * channels * sizeof(T);
   static constexpr size_t shared_bytes = particle_bytes > sum_bytes ? particle_bytes : sum_bytes;
 };
 
@@ -259,32 +258,95 @@ __device__ int list_of(int k, bool in_block, int cell) {
   return in_block ? k % S::slices * S::cells + cell : S::lists;
 }
 
+struct NoCells {
+  static constexpr int cells = 0;
+};
+
+// Particles in the order of their cells: where those of each cell begin.
+template <class S>
+struct CellOrder {
+  int start[S::cells + 1];
+};
+
+// Finds the places of the particles index[begin, begin + n) in the order of their cells. Each thread leaves for its own
+// the number in `next`, counted in its cell, and the index in `pairs`, since places take the place of index.
+template <class S, class Source, class T, int D>
+__device__ void order_by_cell(const Source& source, const Topology<T, D>& t, const BaseBlock<T, D>& base_block,
+                              const SharedParticles<S>& shared, CellOrder<S>& order, int begin, int n) {
+  static_assert(S::pairs > 0 && sizeof(Pair<T>) >= sizeof(int));
+  for (int c = threadIdx.x; c <= S::cells; c += S::threads) order.start[c] = 0;
+  __syncthreads();
+  for (int k = threadIdx.x; k < n; k += S::threads) {
+    const int p = t.index[begin + k], row = SharedParticles<S>::row(k);
+    int cell;
+    T f[D];
+    base_block.template locate<S::Order>(t.geometry, read_vector(source.position, p), cell, f);
+    shared.next[row] = uint16_t(atomicAdd(&order.start[cell], 1));
+    *reinterpret_cast<int*>(shared.pairs + row) = p;
+  }
+  __syncthreads();
+  if (threadIdx.x < 32) {
+    constexpr int each = (S::cells + 1 + 31) / 32;
+    int count[each], sum = 0;
+#pragma unroll
+    for (int c = 0; c < each; c++) {
+      const int cell = int(threadIdx.x) * each + c;
+      count[c] = cell <= S::cells ? order.start[cell] : 0;
+      sum += count[c];
+    }
+    int before = sum;
+#pragma unroll
+    for (int o = 1; o < 32; o *= 2) {
+      const int v = __shfl_up_sync(~0u, before, o);
+      if (int(threadIdx.x) >= o) before += v;
+    }
+    before -= sum;
+#pragma unroll
+    for (int c = 0; c < each; c++) {
+      const int cell = int(threadIdx.x) * each + c;
+      if (cell <= S::cells) order.start[cell] = before;
+      before += count[c];
+    }
+  }
+  __syncthreads();
+}
+
 // Loads the particles index[begin, begin + n) of a block into shared memory and links them by cell.
 template <class S, class Source, int Most, class T, int D>
 __device__ void load_particles(const Source& source, const Topology<T, D>& t, int block, BaseBlock<T, D>& base_block,
                                const SharedParticles<S>& shared, Strays<Most>& strays, int begin, int n,
                                bool in_order) {
-  int following = int(threadIdx.x) < n ? t.index[begin + threadIdx.x] : 0;
+  constexpr bool may_settle = requires { source.settles(); };
+  __shared__ CellOrder<std::conditional_t<may_settle, S, NoCells>> order;
+  bool settles = false;
+  if constexpr (may_settle) settles = source.settles();
+  int following = int(threadIdx.x) < n && !settles ? t.index[begin + threadIdx.x] : 0;
   if (threadIdx.x == 32) base_block.template set<S::Order>(t, block);
   if (threadIdx.x == 0) strays.count = 0;
   empty_lists<S>(shared.head);
   __syncthreads();
+  if constexpr (may_settle)
+    if (settles) order_by_cell<S>(source, t, base_block, shared, order, begin, n);
 #pragma unroll 1
   for (int k = threadIdx.x; k < n; k += S::threads) {
-    const int p = following;
-    if (k + S::threads < n) following = t.index[begin + k + S::threads];
+    const int row = SharedParticles<S>::row(k);
+    int p = following;
+    if (settles)
+      p = *reinterpret_cast<const int*>(shared.pairs + row);
+    else if (k + S::threads < n)
+      following = t.index[begin + k + S::threads];
     int cell;
     T f[D];
     // Loaded and stored wherever the particle is, so that no load waits for another.
     const Vector<T, D> x = read_vector(source.position, p);
+    const bool in_block = base_block.template locate<S::Order>(t.geometry, x, cell, f);
     const auto loaded = [&] {
-      if constexpr (requires { source.load(p, 0, k); })
-        return source.load(p, base_block.scene, begin + k);
+      if constexpr (may_settle)
+        return source.load(p, base_block.scene, begin + (settles ? order.start[cell] + shared.next[row] : k));
       else
         return source.load(p, base_block.scene);
     }();
-    const bool in_block = base_block.template locate<S::Order>(t.geometry, x, cell, f);
-    const int row = SharedParticles<S>::row(k), list = list_of<S>(k, in_block, cell);
+    const int list = list_of<S>(k, in_block, cell);
     store_particle<S, T, D>(shared, row, f, source.contribution(loaded));
     if (Source::drifts && !in_block) strays.particle[atomicAdd(&strays.count, 1)] = uint16_t(k);
     shared.next[row] = uint16_t(in_order ? list : atomicExch(&shared.head[list], row));
@@ -324,23 +386,45 @@ __device__ bool is_dense(const NodeField<T>& nodes) {
   return nodes.stride == S::channels && reinterpret_cast<uintptr_t>(nodes.pointer) % 16 == 0;
 }
 
-// What the node at `offset` from the base node gets from a particle in shared memory.
-template <class S, class T, int D>
-__device__ void node_value(const SharedParticles<S>& shared, int row, const T f[D], const int offset[D],
-                           T (&value)[S::channels]) {
-  T word[kWords<S>], weight = T(1), slope[D];
-  load_words(shared, row, word);
+template <int N, class T>
+__device__ T pick(const T (&of)[N], int k) {
+  T r = of[0];
 #pragma unroll
-  for (int i = 0; i < D; i++) slope[i] = T(1);
+  for (int j = 1; j < N; j++) r = k == j ? of[j] : r;
+  return r;
+}
+
+// What the node at `offset` from the base node gets from a particle in shared memory.
+template <class S, class T>
+__device__ void node_value(const SharedParticles<S>& shared, int row, const int (&offset)[S::D],
+                           T (&value)[S::channels]) {
+  constexpr int D = S::D;
+  T word[kWords<S>], weight[D], derivative[D] = {};
+  load_words(shared, row, word);
+  const NodeWeight<S::Order, T> leading(offset[0]);
+  weight[0] = leading.at(word[0]);
+  if (S::Gradient) derivative[0] = leading.slope(word[0]);
+#pragma unroll
+  for (int i = 1; i < D; i++) {
+    const T* const packed = word + S::weights + (i - 1) * S::derivatives * S::stored;
+    T all[S::support];
+    unpack_weights<S>(packed, T(1), all);
+    weight[i] = pick(all, offset[i]);
+    if (!S::Gradient) continue;
+    unpack_weights<S>(packed + S::stored, T(0), all);
+    derivative[i] = pick(all, offset[i]);
+  }
+  T product = T(1), slope[D];
 #pragma unroll
   for (int i = 0; i < D; i++) {
-    const NodeWeight<S::Order, T> node(offset[i]);
-    weight *= node.at(f[i]);
+    product *= weight[i];
+    slope[i] = derivative[i];
 #pragma unroll
-    for (int j = 0; j < D; j++) slope[j] *= i == j ? node.slope(f[i]) : node.at(f[i]);
+    for (int j = 0; j < D; j++)
+      if (j != i) slope[i] *= weight[j];
   }
 #pragma unroll
-  for (int c = 0; c < S::Plain; c++) value[c] = weight * word[S::plain + c];
+  for (int c = 0; c < S::Plain; c++) value[c] = product * word[S::plain + c];
 #pragma unroll
   for (int c = 0; c < S::Linear; c++) {
     const T* const v = word + S::linear + c * S::linear_words;
@@ -350,29 +434,25 @@ __device__ void node_value(const SharedParticles<S>& shared, int row, const T f[
       at += v[1 + i] * T(offset[i]);
       if (S::Gradient) along += slope[i] * v[1 + D + i];
     }
-    value[S::Plain + c] = weight * at + along;
+    value[S::Plain + c] = product * at + along;
   }
 }
 
-// What a warp adds to the nodes of one particle, a lane to a node: `first` is the row of its base node.
-template <class S, class T, int D>
-__device__ void add_stray(const NodeField<T>& nodes, const Schedule<const int>& schedule,
-                          const SharedParticles<S>& shared, int row, const T f[D], int first) {
-  constexpr int count = D == 2 ? S::support * S::support : S::support * S::slab;
-  const int slot = first / kBlockNodes<D>;
+// The nodes of the support of one particle, by a warp, a lane to a node: node_row(offset) is the row of the node, -1 of
+// a block that is not active.
+template <class S, class T, class NodeRow>
+__device__ void add_stray(const NodeField<T>& nodes, const SharedParticles<S>& shared, int row,
+                          const NodeRow& node_row) {
+  constexpr int D = S::D, count = D == 2 ? S::support * S::support : S::support * S::slab;
   for (int n = threadIdx.x % 32; n < count; n += 32) {
-    int offset[D], node[D], neighbour = 0;
+    int offset[D];
 #pragma unroll
-    for (int i = D - 1, rest = n, base = first; i >= 0; i--, rest /= S::support, base /= kBlockWidth) {
-      offset[i] = rest % S::support;
-      node[i] = base % kBlockWidth + offset[i];
-      neighbour |= int(node[i] >= kBlockWidth) << (D - 1 - i);
-    }
-    const int node_slot = schedule.neighbours[(slot << D) + neighbour];
-    if (node_slot < 0) continue;
+    for (int i = D - 1, rest = n; i >= 0; i--, rest /= S::support) offset[i] = rest % S::support;
+    const int64_t at = node_row(offset);
+    if (at < 0) continue;
     T value[S::channels];
-    node_value<S, T, D>(shared, row, f, offset, value);
-    T* const to = nodes.pointer + (int64_t(node_slot) * kBlockNodes<D> + node_in_block<D>(node)) * nodes.stride;
+    node_value(shared, row, offset, value);
+    T* const to = nodes.pointer + at * nodes.stride;
     if constexpr (S::channels == 4) {
       if (is_dense<S>(nodes)) {
         add_to_nodes(to, value, false);
@@ -382,6 +462,24 @@ __device__ void add_stray(const NodeField<T>& nodes, const Schedule<const int>& 
 #pragma unroll
     for (int c = 0; c < S::channels; c++) add_to_nodes(to + c, value[c], false);
   }
+}
+
+// The same of a particle whose base node is in the row `first`.
+template <class S, class T>
+__device__ void add_stray(const NodeField<T>& nodes, const Schedule<const int>& schedule,
+                          const SharedParticles<S>& shared, int row, int first) {
+  constexpr int D = S::D;
+  const int slot = first / kBlockNodes<D>;
+  add_stray<S>(nodes, shared, row, [&](const int (&offset)[D]) -> int64_t {
+    int node[D], neighbour = 0;
+#pragma unroll
+    for (int i = D - 1, base = first; i >= 0; i--, base /= kBlockWidth) {
+      node[i] = base % kBlockWidth + offset[i];
+      neighbour |= int(node[i] >= kBlockWidth) << (D - 1 - i);
+    }
+    const int node_slot = schedule.neighbours[(slot << D) + neighbour];
+    return node_slot < 0 ? -1 : int64_t(node_slot) * kBlockNodes<D> + node_in_block<D>(node);
+  });
 }
 
 // The strays of a batch index[begin, ...) go to the nodes without a tile. Each lane finds one, so that its loads do not
@@ -394,62 +492,76 @@ __device__ void add_strays(const Source& source, const Topology<T, D>& t, const 
   for (int start = warp; start < strays.count; start += 32 * warps) {
     const int s = start + warps * lane;
     int first = -1, row = 0;
-    T f[D] = {};
     if (s < strays.count) {
       const int k = strays.particle[s], p = t.index[begin + k];
       int base[D];
+      T f[D];
       const int slot = locate_slot<S::Order>(t, scene, read_vector(source.position, p), base, f);
       row = SharedParticles<S>::row(k);
       if (slot >= 0) first = slot * kBlockNodes<D> + node_in_block<D>(base);
     }
     for (unsigned left = __ballot_sync(~0u, first >= 0); left; left &= left - 1) {
       const int from = __ffs(left) - 1;
-      T at[D];
-#pragma unroll
-      for (int i = 0; i < D; i++) at[i] = __shfl_sync(~0u, f[i], from);
-      add_stray<S, T, D>(source.nodes, schedule, shared, __shfl_sync(~0u, row, from), at,
-                         __shfl_sync(~0u, first, from));
+      add_stray(source.nodes, schedule, shared, __shfl_sync(~0u, row, from), __shfl_sync(~0u, first, from));
     }
   }
 }
 
-// Adds the slabs of all threads to the planes. Threads of one plane add to different nodes at a time.
+// The slab of a thread, in the place that only this one has.
 template <class S, class T>
-__device__ void add_slabs(const Walker<S>& walker, const T (&sum)[S::slab][S::channels], Quad<T>* planes) {
-  constexpr int D = S::D, K = S::channels;
-  for (int q = threadIdx.x; q < S::planes * S::plane_quads; q += S::threads) planes[q] = {};
-  const int cell = walker.cell(), leading = cell / (S::cells / kBlockWidth);
-  const int row = D == 2 ? 0 : cell / kBlockWidth % kBlockWidth;
-  const int plane = (walker.slice() * kBlockWidth + leading) * S::support + walker.lane;
-  T* const to = reinterpret_cast<T*>(planes + plane * S::plane_quads + row * S::row_quads) + cell % kBlockWidth * K;
+__device__ void put_slab(const T (&sum)[S::slab][S::channels], T* sums) {
+  T* const to = sums + threadIdx.x * (S::slab * S::channels);
 #pragma unroll
   for (int n = 0; n < S::slab; n++) {
-    T* const node = to + n / S::support * S::row_quads * 4 + n % S::support * K;
-    __syncthreads();
-    if constexpr (K == 4) {
-      Quad<T>& v = *reinterpret_cast<Quad<T>*>(node);
-      v = {v.e[0] + sum[n][0], v.e[1] + sum[n][1], v.e[2] + sum[n][2], v.e[3] + sum[n][3]};
+    if constexpr (S::channels == 4) {
+      reinterpret_cast<Quad<T>*>(to)[n] = {sum[n][0], sum[n][1], sum[n][2], sum[n][3]};
     } else {
 #pragma unroll
-      for (int c = 0; c < K; c++) node[c] += sum[n][c];
+      for (int c = 0; c < S::channels; c++) to[n * S::channels + c] = sum[n][c];
     }
   }
 }
 
-// Four words of a row of the tile: the sum over the planes that reach it.
+// f(place, reaches) of the slabs that may reach a node of the tile: where the node is in them, if it is.
+template <class S, class F>
+__device__ void each_slab(const int (&node)[S::D], const F& f) {
+  constexpr int D = S::D, count = D == 2 ? S::support * S::support : S::support * S::slab;
+#pragma unroll
+  for (int n = 0; n < count; n++) {
+    int cell = 0, offset[D];
+    bool reaches = true;
+#pragma unroll
+    for (int i = D - 1, rest = n; i >= 0; i--, rest /= S::support) offset[i] = rest % S::support;
+#pragma unroll
+    for (int i = 0; i < D; i++) {
+      reaches = reaches && unsigned(node[i] - offset[i]) < unsigned(kBlockWidth);
+      cell = cell * kBlockWidth + node[i] - offset[i];
+    }
+#pragma unroll
+    for (int slice = 0; slice < S::slices; slice++)
+      f(((slice * S::cells + cell) * S::support + n / S::slab) * S::slab + n % S::slab, reaches);
+  }
+}
+
+// Four words of a row of the tile, from one on.
 template <class S, class T>
-__device__ Quad<T> tile_sum(const Quad<T>* planes, int leading, int row, int quad) {
+__device__ Quad<T> tile_sum(const T* sums, int (&node)[S::D], int first_word) {
+  constexpr int K = S::channels, last = S::D - 1;
   Quad<T> sum = {};
-#pragma unroll
-  for (int lane = 0; lane < S::support; lane++) {
-    const int cell = leading - lane;
-    if (unsigned(cell) >= unsigned(kBlockWidth)) continue;
-#pragma unroll
-    for (int slice = 0; slice < S::slices; slice++) {
-      const int plane = (slice * kBlockWidth + cell) * S::support + lane;
-      const Quad<T> v = planes[plane * S::plane_quads + row * S::row_quads + quad];
+  if constexpr (K == 4) {
+    node[last] = first_word / K;
+    each_slab<S>(node, [&](int place, bool reaches) {
+      Quad<T> v{};
+      if (reaches) v = reinterpret_cast<const Quad<T>*>(sums)[place];
 #pragma unroll
       for (int e = 0; e < 4; e++) sum.e[e] += v.e[e];
+    });
+  } else {
+#pragma unroll
+    for (int e = 0; e < 4; e++) {
+      node[last] = (first_word + e) / K;
+      each_slab<S>(
+          node, [&](int place, bool reaches) { sum.e[e] += reaches ? sums[place * K + (first_word + e) % K] : T(0); });
     }
   }
   return sum;
@@ -457,24 +569,22 @@ __device__ Quad<T> tile_sum(const Quad<T>* planes, int leading, int row, int qua
 
 // Adds the tile to the grid, four words at a time.
 template <class S, class T, int D>
-__device__ void flush_tile(const NodeField<T>& nodes, const int slots[1 << D], const Quad<T>* planes, bool in_order) {
+__device__ void flush_tile(const NodeField<T>& nodes, const int slots[1 << D], const T* sums, bool in_order) {
   constexpr int K = S::channels, width = S::width;
   constexpr int tile_rows = D == 2 ? width : width * width;
   const bool dense = is_dense<S>(nodes);
   for (int t = threadIdx.x; t < tile_rows * S::row_quads; t += S::threads) {
     const int tile_row = t / S::row_quads, quad = t % S::row_quads, far = quad >= S::near_quads;
     const int first_word = (far ? quad - S::near_quads : quad) * 4;
-    const int leading[2] = {D == 2 ? tile_row : tile_row / width, D == 2 ? 0 : tile_row % width};
-    int neighbour = 0, node[D] = {};
+    int neighbour = 0, node[D] = {}, in_tile[D];
 #pragma unroll
-    for (int i = 0; i < D - 1; i++) {
-      neighbour = neighbour * 2 + (leading[i] >= kBlockWidth);
-      node[i] = leading[i];
-    }
+    for (int i = D - 2, rest = tile_row; i >= 0; i--, rest /= width) in_tile[i] = node[i] = rest % width;
+#pragma unroll
+    for (int i = 0; i < D - 1; i++) neighbour = neighbour * 2 + (node[i] >= kBlockWidth);
     const int slot = slots[neighbour * 2 + far];
     if (slot < 0) continue;
     const int64_t row = int64_t(slot) * kBlockNodes<D> + node_in_block<D>(node);
-    const Quad<T> value = tile_sum<S>(planes, leading[0], leading[1], quad);
+    const Quad<T> value = tile_sum<S>(sums, in_tile, first_word + far * kBlockWidth * K);
     if (value.e[0] == T(0) && value.e[1] == T(0) && value.e[2] == T(0) && value.e[3] == T(0)) continue;
     if (dense) {
       add_to_nodes(nodes.pointer + row * K + first_word, value.e, in_order);
@@ -489,12 +599,12 @@ __device__ void flush_tile(const NodeField<T>& nodes, const int slots[1 << D], c
   }
 }
 
-// Adds the particles in shared memory to the nodes, and lets `strays` add those that are in no list. All threads have
-// to wait before that memory is used again.
-template <class S, class T, class AddStrays>
+// Adds the particles in shared memory to the nodes, and lets `strays` add those that are in no list; `when_added` is
+// called when none of them is needed any more. All threads have to wait before that memory is used again.
+template <class S, class T, class AddStrays, class WhenAdded>
 __device__ void add_particles(const NodeField<T>& nodes, const SharedParticles<S>& shared, const int* slots,
-                              bool in_order, const AddStrays& add_strays) {
-  Quad<T>* const planes = reinterpret_cast<Quad<T>*>(shared.quads);
+                              bool in_order, const AddStrays& add_strays, const WhenAdded& when_added) {
+  T* const sums = reinterpret_cast<T*>(shared.quads);
   const Walker<S> walker;
   T sum[S::slab][S::channels] = {};
 #pragma unroll 1
@@ -505,9 +615,16 @@ __device__ void add_particles(const NodeField<T>& nodes, const SharedParticles<S
   }
   add_strays();
   __syncthreads();
-  add_slabs(walker, sum, planes);
+  put_slab<S>(sum, sums);
+  when_added();
   __syncthreads();
-  flush_tile<S, T, S::D>(nodes, slots, planes, in_order);
+  flush_tile<S, T, S::D>(nodes, slots, sums, in_order);
+}
+
+template <class S, class T, class AddStrays>
+__device__ void add_particles(const NodeField<T>& nodes, const SharedParticles<S>& shared, const int* slots,
+                              bool in_order, const AddStrays& add_strays) {
+  add_particles(nodes, shared, slots, in_order, add_strays, [] {});
 }
 
 // What the thread blocks of P2G have in shared memory beside the particles and the sums, which follow one another
@@ -586,8 +703,11 @@ void launch_scatter(const Source& source, bool deterministic, Stream stream) {
   using S = typename Source::Shape;
   const int64_t items = most_items(source.topology.max_blocks, source.topology.particles);
   if (items == 0) return;
+  unsigned blocks = grid_size(items);
+  if constexpr (requires { source.is_mostly_idle(); })
+    if (source.is_mostly_idle()) blocks = std::max(blocks / kIdleShare, 1u);
   for (int colour = deterministic ? 0 : -1; colour < (deterministic ? 1 << S::D : 0); colour++)
-    launch_in_chain(scatter_kernel<Source>, grid_size(items), S::threads, S::shared_bytes, stream, source, colour);
+    launch_in_chain(scatter_kernel<Source>, blocks, S::threads, S::shared_bytes, stream, source, colour);
 }
 
 enum class Stress { none, moment, gradient };
