@@ -33,6 +33,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -55,6 +56,17 @@ GRADIENT_BOUND = {
     ("gradient", "quadratic"): 6.0,
     ("gradient", "cubic"): 3.137,
 }
+
+
+class Figures(NamedTuple):
+    """What a law says of particles for a survey."""
+
+    stress: Tensor
+    """Kirchhoff stress [P, D, D] [Pa]."""
+    stiffness: Tensor
+    """Tangent modulus [P] [Pa]."""
+    energy: Tensor | None
+    """Energy density [P] [J/m³], where it is asked for."""
 
 
 @torch.no_grad()
@@ -95,8 +107,8 @@ def stable_dt(
     check_number("cfl", cfl, "positive and finite", lambda v: 0 < v < math.inf)
     if stress_form not in ("mls", "gradient"):
         raise ValueError(f"stress_form must be 'gradient' or 'mls', got {stress_form!r}")
-    figures = look(grid, law, state, transfer, stress_form, speed)
-    return (cfl / figures.rate).to(state.x.dtype)
+    found = look(grid, law, state, figures_of(law, state, False), transfer, stress_form, speed)
+    return (cfl / found.rate).to(state.x.dtype)
 
 
 @torch.no_grad()
@@ -104,35 +116,34 @@ def look(
     grid: Grid,
     law: Material,
     state: State,
+    figures: Figures,
     transfer: str,
     stress_form: str,
     speed: Tensor | None = None,
     obstacles: Sequence[Obstacle] = (),
-    judge: bool = False,
 ) -> Survey:
-    """`survey` with what the law says of a state that has all fields; `judge` asks for its energy too."""
+    """`survey` of a state that has all fields, of which the law has given figures."""
     bound = GRADIENT_BOUND[stress_form, grid.kernel] / grid.dx**2
-    stress, stiffness, energy = figures_of(law, state, judge)
     return survey(
         grid,
         state,
-        stress,
-        stiffness,
+        figures.stress,
+        figures.stiffness,
         bound,
         kept=2.0 if transfer == "apic" and stress_form == "mls" else 1.0,  # 1 + s
         volumetric="J" in law.state_fields,
         viscosity=law.viscosity(state),
-        energy=energy,
+        energy=figures.energy,
         speed=speed,
         obstacles=obstacles,
         reach=2 * math.sqrt(grid.dim) * grid.dx,  # of a particle's nodes
     )
 
 
-def figures_of(law: Material, state: State, judge: bool) -> tuple[Tensor, Tensor, Tensor | None]:
+def figures_of(law: Material, state: State, judge: bool) -> Figures:
     """Stress, stiffness and, with `judge`, energy density of a law."""
     if all(isinstance(part, CompiledLaw) and part.figures_are_compiled() for part in laws_of(law)):
         calls = law_calls(law, state)
         how = calls.names, calls.options, calls.parameters, calls.history, calls.variables
-        return law_figures(state, *how, calls.material, judge)
-    return law.stress(state), law.stiffness(state), law.energy_density(state) if judge else None
+        return Figures(*law_figures(state, *how, calls.material, judge))
+    return Figures(law.stress(state), law.stiffness(state), law.energy_density(state) if judge else None)

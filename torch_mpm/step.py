@@ -12,7 +12,7 @@ from torch import Tensor
 from .activation_record import ActivationRecord
 from .boundaries import BoundaryList, Obstacle, Walls
 from .capture import GraphCache
-from .cfl import look
+from .cfl import Figures, figures_of, look
 from .errors import check_number, check_vector, shape_of
 from .failures import Failures, problems_of_state, raise_failures
 from .grid import Blocks, Grid, check_grid
@@ -343,29 +343,37 @@ class Step(TensorModule):
         return (cfl / self.survey(state, judge=False).rate).to(state.x.dtype)
 
     @torch.no_grad()
-    def survey(self, state: State, judge: bool = True) -> Survey:
+    def figures(self, state: State, judge: bool = True) -> Figures:
+        """Stress, stiffness and, with `judge`, energy density of the law."""
+        with full_precision(state.x):
+            return figures_of(self.law, self.prepare(state), judge)
+
+    @torch.no_grad()
+    def survey(self, state: State, judge: bool = True, figures: Figures | None = None) -> Survey:
         """Limit of the time step, speed and validity of each scene, without synchronising.
 
         Args:
             state: the particles.
             judge: whether the energy of the law is asked for too, which tells where the law has no meaning.
+            figures: what `figures` gives for the state, where that is known.
         """
         moving = [b for b in self.boundaries.entries if isinstance(b, Obstacle) and b.moves]
         fused = [b for b in moving if fusible(b, state.time)][:MAX_OBSTACLES]
         others = [b for b in moving if not any(b is kept for kept in fused)]
 
-        def found(law: Material, particles: Any, judge: bool) -> Survey:
+        def found(law: Material, particles: Any, figures: Figures) -> Survey:
             return look(
-                *(self.grid, law, particles, "flip" if self._flip_share else self.transfer),
-                *(self.stress_form, self._obstacle_speed(others, particles), fused, judge),
+                *(self.grid, law, particles, figures, "flip" if self._flip_share else self.transfer),
+                *(self.stress_form, self._obstacle_speed(others, particles), fused),
             )
 
         with full_precision(state.x):
             state = self.prepare(state)
-            figures = found(self.law, state, judge)
+            survey = found(self.law, state, figures or figures_of(self.law, state, judge))
             if self.integrator is not None and self.integrator.explicit:
-                figures = figures._replace(rate=found(*self.integrator.unsolved(self.law, state), False).rate)
-            return figures
+                law, part = self.integrator.unsolved(self.law, state)
+                survey = survey._replace(rate=found(law, part, figures_of(law, part, False)).rate)
+            return survey
 
     def _obstacle_speed(self, obstacles: list[Obstacle], state: Any) -> Tensor | None:
         """Largest speed of the obstacles that a particle may touch [P] [m/s]; None where there are none."""

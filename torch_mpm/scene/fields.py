@@ -22,15 +22,15 @@ def field(step: Step, state: State, name: str) -> Tensor | None:
             "liquid".
     """
     if name == "stress":
-        return step.law.stress(_with_C(state))
+        return step.law.stress(with_C(state))
     if name == "liquid":
         return state.extra.get(LIQUID)
     if name == "temperature" and state.temperature is not None and step.heat is not None:
         return state.temperature + step.heat.reference
     value: Tensor | None = getattr(state, {"position": "x", "velocity": "v"}.get(name, name))
-    return _with_C(state).C if value is None and name == "C" else value
+    return with_C(state).C if value is None and name == "C" else value
 
 
-def _with_C(state: State) -> State:
+def with_C(state: State) -> State:
     """A viscous stress reads C, which is absent before the first step and without APIC."""
     return state if state.C is not None else state.replace(C=state.x.new_zeros(*state.x.shape, state.x.shape[1]))

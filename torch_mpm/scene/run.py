@@ -3,33 +3,33 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import math
 import platform
 import signal
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from importlib import metadata
 from pathlib import Path
 from types import FrameType
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
+from ..cfl import Figures
 from ..data.hdf5 import h5py_module
 from ..data.trajectory import PARTIAL, Layout, Trajectory, TrajectoryWriter
 from ..errors import DamagedFileError, SimulationError
 from ..laws import Mixture
 from ..rollouts import rollout
-from ..state import State
+from ..state import State, _take
 from . import checkpoint, fields, heap
 from .build import Built
 from .diagnose import SceneFailure, replay, wrong
 from .folder import CHECKPOINT, LAST_GOOD, claim, locked, output_errors, prepare, record_summary
 from .scene import Scene
-from .writer import FrameWriter
+from .writer import Copier, Copies, FrameWriter
 
 SEGMENT = 32
 """Substeps between two looks at the stability limit and the validity of the state, and between two reorderings."""
@@ -111,6 +111,24 @@ def run(
     return summary
 
 
+class Shown(NamedTuple):
+    """What a frame has of a state."""
+
+    copies: Copies
+    sums: dict[str, Any]
+
+
+class Moved(NamedTuple):
+    """A state after some substeps."""
+
+    survey: list[list[float]]
+    status: list[list[float]]
+    ordered: State
+    """In a better order."""
+    shown: Shown | None
+    """Where a frame shows it."""
+
+
 class Simulation:
     """The loop over frames. Everything it decides follows from the state at the last frame."""
 
@@ -124,6 +142,8 @@ class Simulation:
         self.fingerprint = ""
         self._figures: dict[str, Any] = {}
         self._survey: list[list[float]] | None = None  # rates, speeds and wrong particles of the present state
+        self._copier = Copier()
+        self._shown: Shown | None = None  # of the present state, at the end of a frame
 
     # -- output
 
@@ -219,6 +239,8 @@ class Simulation:
     def run(self, writer: FrameWriter, progress: Progress | None, stop: Callable[[], bool]) -> None:
         """All frames that are missing."""
         if self.frame < 0:
+            copies, sums = self._show(self.state, self._law_figures(self.state))
+            self._shown = Shown(copies, on_host(sums))
             self._put(writer, 0, 0.0)
         while self.frame < self.scene.frames:
             begin, before = time.perf_counter(), self.totals.substeps
@@ -238,10 +260,11 @@ class Simulation:
 
     def _put(self, writer: FrameWriter, substeps: int, cfl: float) -> None:
         """Submit the present state as the next frame."""
+        assert self._shown is not None
         self.frame += 1
-        state = self.state
+        state, (copies, sums), self._shown = self.state, self._shown, None
         scalars = {"time": self.scene.time_of(self.frame), "particles": len(state), "substeps": substeps, "cfl": cfl}
-        scalars |= energies(self.step, state)
+        scalars |= {"potential_energy": 0.0, **sums}
         if not self.totals.first:
             self.totals.first = {k: v for k, v in scalars.items() if k.endswith("energy")}
             self.totals.first |= {"mass": float(state.mass.double().sum())}
@@ -251,21 +274,25 @@ class Simulation:
             "time": float(state.time),
             "emitted": self.emitted,
             "fingerprint": self.fingerprint,
-            "totals": vars(self.totals),
+            "totals": dict(vars(self.totals)),
         }
-        writer.submit(self.frame, self._fields(), scalars, checkpoint.tensors_of(state), json.loads(json.dumps(record)))
+        writer.submit(self.frame, copies, scalars, record)
 
-    def _fields(self) -> dict[str, Tensor]:
-        """The fields of the trajectory in the order of ids."""
-        state = self.step.prepare(self.state)
-        assert state.ids is not None
-        order = torch.argsort(state.ids)
+    def _show(self, state: State, figures: Figures) -> tuple[Copies, dict[str, Tensor]]:
+        """Copies and sums of a state for the next frame, which are not waited for."""
+        given = self.step.prepare(state)
+        assert given.ids is not None
+        places = torch.arange(len(given), device=given.x.device)
+        order = torch.empty_like(places).scatter_(0, given.ids, places)
         kept = {}
         for name in ("position", "velocity", *self.scene.trajectory_fields):
-            value = fields.field(self.step, state, name)
+            value = figures.stress if name == "stress" else fields.field(self.step, given, name)
             assert value is not None, name  # `build` refuses fields that no material has
-            kept[name] = value[order]
-        return kept
+            kept[name] = _take(value, order)
+        return self._copier(kept, checkpoint.tensors_of(state)), energies(self.step, state, figures)
+
+    def _law_figures(self, state: State) -> Figures:
+        return self.step.figures(fields.with_C(state) if self.step.law.viscous else state)
 
     # -- time
 
@@ -284,7 +311,7 @@ class Simulation:
             dt, count = self._choose_dt(target - now, rates)
             steps = min(count, self.totals.segment)
             until = target if steps == count else now + steps * dt
-            if not self._segment(dt, steps, until):
+            if not self._segment(dt, steps, until, until >= end - rounding):
                 self.totals.segment = SEGMENT
                 continue
             now = until
@@ -319,8 +346,14 @@ class Simulation:
         longer = min(2 * self.totals.segment, LONGEST_SEGMENT[self.state.x.device.type])
         return longer if after <= STEADY * before else SEGMENT
 
-    def _segment(self, dt: float, steps: int, until: float) -> bool:
+    def _segment(self, dt: float, steps: int, until: float, shows: bool) -> bool:
         """Take some substeps, then check the state and reorder it; a failure is located by repeating them.
+
+        Args:
+            dt: time step [s].
+            steps: number of substeps.
+            until: time at their end [s].
+            shows: whether a frame ends with them.
 
         Returns:
             Whether they were taken: a segment longer than SEGMENT in which something went wrong, or whose dt was above
@@ -328,14 +361,14 @@ class Simulation:
         """
         good = self.state
         try:
-            survey, status, ordered = self._moved(good, dt, steps, until)
-            if steps > SEGMENT and not dt * max(survey[0], default=0.0) <= 1:
+            moved = self._moved(good, dt, steps, until, shows)
+            if steps > SEGMENT and not dt * max(moved.survey[0], default=0.0) <= 1:
                 raise SimulationError("dt is above the limit")
-            if any(row[PROBLEM] >= 0 for row in status) or self.step.heat is not None:
+            if any(row[PROBLEM] >= 0 for row in moved.status) or self.step.heat is not None:
                 self.step.check()
-            bad = wrong(self.step, self.state) if any(survey[2]) else None
+            bad = wrong(self.step, self.state) if any(moved.survey[2]) else None
             if bad is None:
-                self._survey, self.state = survey, ordered
+                self._survey, self.state, self._shown = moved.survey, moved.ordered, moved.shown
                 return True
             message = bad[1]
         except SimulationError as error:
@@ -349,26 +382,26 @@ class Simulation:
             self.state = failure.good
         raise SceneFailure(str(failure or message), failure)
 
-    def _moved(
-        self, good: State, dt: float, steps: int, until: float
-    ) -> tuple[list[list[float]], list[list[int]], State]:
+    def _moved(self, good: State, dt: float, steps: int, until: float, shows: bool) -> Moved:
         """Take substeps from a state; again where the pool of blocks, which follows on CUDA, was too small.
 
-        Returns:
-            The survey of the state then, the status, and the state in a better order. A device has all of its work
-            before the first wait for it.
+        A device has all of its work before the only wait for it, that of a frame too.
         """
         grid = self.step.grid
         self.state = rollout(self.step, good, steps, dt).replace(time=until)
         ordered = self.step.sorted(self.state)
-        survey = torch.stack(self.step.survey(ordered))
-        figures = survey.tolist()
-        status = [] if self.step.status is None else self.step.status.tolist()
+        figures = self._law_figures(ordered)
+        told = {"survey": torch.stack(self.step.survey(ordered, figures=figures))}
+        if self.step.status is not None:
+            told["status"] = self.step.status
+        copies, sums = self._show(ordered, figures) if shows else (None, {})
+        found = on_host(told | sums)
+        survey, status = found.pop("survey"), found.pop("status", [])
         if status and grid.grows and grid.max_blocks is not None and status[0][BLOCKS_WANTED] > grid.max_blocks:
-            grid.follow(status[0][BLOCKS_WANTED])
+            grid.follow(int(status[0][BLOCKS_WANTED]))
             self.step.reset()
-            return self._moved(good, dt, steps, until)
-        return figures, status, ordered
+            return self._moved(good, dt, steps, until, shows)
+        return Moved(survey, status, ordered, None if copies is None else Shown(copies, found))
 
     def _emit(self, until: float) -> None:
         """Add the layers that are due."""
@@ -412,23 +445,28 @@ def joined(state: State, layer: State) -> State:
     return State.concatenate([state, layer.replace(time=state.time)])
 
 
-def energies(step: Any, state: Any) -> dict[str, Any]:
+def energies(step: Any, state: Any, figures: Figures) -> dict[str, Tensor]:
     """Kinetic, elastic and potential energy [J], momentum [kg m/s] and heat [J] of all particles, summed in float64."""
-    mass, v = state.mass.double(), state.v.double()
+    v, momentum = state.v.double(), state.mass.double()[:, None] * state.v
     gravity = step.gravity
-    figures = {
-        "kinetic_energy": 0.5 * (mass * v.square().sum(1)).sum(),
-        "elastic_energy": step.law.energy(step.prepare(state)).double().sum(),
+    sums = {
+        "kinetic_energy": 0.5 * (momentum * v).sum(),
+        "elastic_energy": (state.volume * figures.energy).double().sum(),
+        "momentum": momentum.sum(0),
     }
     if gravity is not None:
         rows = gravity if gravity.dim() == 1 else gravity[state.scene.long()]
-        figures["potential_energy"] = -(mass[:, None] * state.x.double() * rows.double()).sum()
+        sums["potential_energy"] = -(state.mass.double()[:, None] * state.x * rows).sum()
     if step.heat is not None:
-        figures["heat"] = step.heat.heat_content(state).double().sum()
-    *numbers, momentum = [*figures.values(), (mass[:, None] * v).sum(0)]
-    values = torch.cat([torch.stack(numbers), momentum]).tolist()  # at once, since a device is waited for
-    found = {"potential_energy": 0.0, **dict(zip(figures, values, strict=False))}
-    return {**found, "momentum": values[len(numbers) :]}
+        sums["heat"] = step.heat.heat_content(state).double().sum()
+    return sums
+
+
+def on_host(tensors: Mapping[str, Tensor]) -> dict[str, Any]:
+    """Tensors on one device as numbers in float64, lists and lists of these, after one wait for the device."""
+    together = torch.cat([t.double().flatten() for t in tensors.values()]).cpu()
+    parts = together.split([t.numel() for t in tensors.values()])
+    return {name: part.view(t.shape).tolist() for (name, t), part in zip(tensors.items(), parts, strict=True)}
 
 
 def versions() -> dict[str, str]:

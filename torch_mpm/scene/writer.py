@@ -22,15 +22,53 @@ CHECKPOINT_SECONDS = 1.0
 
 
 @dataclass(frozen=True)
-class Job:
-    """One frame in host memory. ``ready`` comes behind the copies; ``sources`` keeps their origin alive until then."""
+class Copies:
+    """Fields and state of a frame in host memory. ``ready`` comes behind the copies; ``sources`` keeps their origin
+    alive until then."""
 
-    frame: int
-    values: Mapping[str, Any]
+    fields: Mapping[str, Tensor]
     state: Mapping[str, Tensor]
-    record: dict[str, Any]
     ready: torch.cuda.Event | None
     sources: list[Tensor]
+
+
+class Copier:
+    """Copies frames into host memory: on CUDA on a stream of their own, so that nothing waits."""
+
+    def __init__(self) -> None:
+        self._stream: Any = None
+
+    def __call__(self, fields: Mapping[str, Tensor], state: Mapping[str, Tensor]) -> Copies:
+        """Begin to copy fields in id order and the state for the checkpoint."""
+        sources = [*fields.values(), *state.values()]
+        device = sources[0].device
+        if device.type != "cuda":
+            return Copies(fields, state, None, sources)
+        if self._stream is None:
+            self._stream = torch.cuda.Stream(device)
+        self._stream.wait_stream(torch.cuda.current_stream(device))
+        with torch.cuda.stream(self._stream):
+            host = [_pinned(t).copy_(t, non_blocking=True) for t in sources]
+            ready = torch.cuda.Event()
+            ready.record(self._stream)
+        count = len(fields)
+        return Copies(dict(zip(fields, host[:count], strict=True)), dict(zip(state, host[count:], strict=True)), ready,
+                      sources)  # fmt: skip
+
+
+def _pinned(t: Tensor) -> Tensor:
+    """Room for a tensor in pinned memory, in its own memory order, so that a device has nothing to do but to copy."""
+    return torch.empty_like(t, device="cpu", pin_memory=True)
+
+
+@dataclass(frozen=True)
+class Job:
+    """One frame."""
+
+    frame: int
+    copies: Copies
+    scalars: Mapping[str, Any]
+    record: dict[str, Any]
 
 
 class FrameWriter:
@@ -51,23 +89,17 @@ class FrameWriter:
         self._error: BaseException | None = None
         self._jobs: queue.Queue[Job | None] = queue.Queue(maxsize=2)
         self._thread = threading.Thread(target=self._work, name="torch_mpm frame writer", daemon=True)
-        self._stream: Any = None
         self._thread.start()
 
-    def submit(self, frame: int, fields: Mapping[str, Tensor], scalars: Mapping[str, Any], state: Mapping[str, Tensor],
-               record: dict[str, Any]) -> None:  # fmt: skip
-        """Queue a frame: fields in id order, scalars, and the state for the checkpoint.
+    def submit(self, frame: int, copies: Copies, scalars: Mapping[str, Any], record: dict[str, Any]) -> None:
+        """Queue a frame.
 
         Raises:
             OSError: what went wrong with an earlier frame.
         """
         begin = time.perf_counter()
-        sources = [*fields.values(), *state.values()]
-        host, ready = self._to_host(sources)
-        values = {**dict(zip(fields, host, strict=False)), **scalars}
-        job = Job(frame, values, dict(zip(state, host[len(fields) :], strict=True)), record, ready, sources)
         self._raise()
-        self._jobs.put(job)
+        self._jobs.put(Job(frame, copies, scalars, record))
         self.waited += time.perf_counter() - begin
 
     def close(self, finished: bool = False) -> None:
@@ -90,24 +122,6 @@ class FrameWriter:
             error, self._error = self._error, None
             raise error
 
-    def _to_host(self, tensors: list[Tensor]) -> tuple[list[Tensor], torch.cuda.Event | None]:
-        """Copies in host memory. On CUDA into pinned memory on a stream of their own, so that nothing waits."""
-        if not tensors[0].is_cuda:
-            return tensors, None
-        device = tensors[0].device
-        if self._stream is None:
-            self._stream = torch.cuda.Stream(device)
-        self._stream.wait_stream(torch.cuda.current_stream(device))
-        with torch.cuda.stream(self._stream):
-            host = []
-            for tensor in tensors:
-                tensor.record_stream(self._stream)
-                pinned = torch.empty(tensor.shape, dtype=tensor.dtype, device="cpu", pin_memory=True)
-                host.append(pinned.copy_(tensor, non_blocking=True))
-            ready = torch.cuda.Event()
-            ready.record(self._stream)
-        return host, ready
-
     def _work(self) -> None:
         while (job := self._jobs.get()) is not None:
             if not self._failed:
@@ -125,15 +139,16 @@ class FrameWriter:
         self.seconds += time.perf_counter() - begin
 
     def _write(self, job: Job) -> None:
-        if job.ready is not None:
-            job.ready.synchronize()
-            job.sources.clear()
-        values = {k: v.numpy() if isinstance(v, Tensor) else np.asarray(v) for k, v in job.values.items()}
+        copies = job.copies
+        if copies.ready is not None:
+            copies.ready.synchronize()
+            copies.sources.clear()
+        values = {k: v.numpy() for k, v in copies.fields.items()} | {k: np.asarray(v) for k, v in job.scalars.items()}
         self.trajectory.write(job.frame, values)
         self._unsaved = job
         if time.perf_counter() - self._saved >= CHECKPOINT_SECONDS:
             self._save(job)
 
     def _save(self, job: Job) -> None:
-        checkpoint.save(self.checkpoint_path, dict(job.state), job.record)
+        checkpoint.save(self.checkpoint_path, dict(job.copies.state), job.record)
         self._saved, self._unsaved = time.perf_counter(), None
