@@ -213,7 +213,7 @@ class State:
         ids = torch.arange(len(self), device=self.x.device) if self.ids is None else self.ids
         blocks = grid.activate(self.x, self.scene)
         order = torch.ops.torch_mpm.cell_order(self.x.detach(), *blocks.packed)
-        return self.replace(ids=ids).select(order)
+        return (self if ids is self.ids else self.replace(ids=ids)).select(order)
 
     def restored(self) -> State:
         """In the order of `ids`, that is in the order before any `sorted`. Differentiable."""
@@ -471,9 +471,8 @@ def _take(t: Tensor, particles: Tensor) -> Tensor:
     """Rows of a [P, ...] tensor with the particle index contiguous."""
     if t.dim() == 1:
         return t.index_select(0, particles)
-    rows = t.permute(*range(1, t.dim()), 0).flatten(0, -2)  # of which `index_select` is ten times faster
-    taken = rows.index_select(1, particles).unflatten(0, t.shape[1:])
-    return taken.permute(t.dim() - 1, *range(t.dim() - 1))
+    taken = t.flatten(1).mT.index_select(1, particles).mT  # ten times faster than `index_select` of [P, ...]
+    return taken if t.dim() == 2 else taken.view(particles.shape[0], *t.shape[1:])
 
 
 def identity_deformation(x: Tensor) -> Tensor:

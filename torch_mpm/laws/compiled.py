@@ -255,10 +255,11 @@ class CompiledLaw(Material):
         if torch.compiler.is_compiling() or any(t.requires_grad for t in tensors):
             return self._convert(state)
         numbers = [value for value in vars(self).values() if isinstance(value, float)]
-        particles = getattr(state, "particles", state.x.shape[0])
-        order = state.ids if any(t.numel() == particles for t in tensors) else None  # of what differs by particle
-        key = (state.x.dtype, state.x.device, order, *numbers, *((t, version(t)) for t in tensors))
-        return self._kept_parameters.get(key, lambda: self._convert(state), state.x)
+        x, order = state.x, None
+        if tensors and any(t.numel() == getattr(state, "particles", x.shape[0]) for t in tensors):
+            order = state.ids  # of what differs by particle
+        key = (x.dtype, x.device, order, *numbers, *((t, version(t)) for t in tensors))
+        return self._kept_parameters.get(key, lambda: self._convert(state), x)
 
     def _at_temperature(self, state: State) -> CompiledLaw:
         """The law with its parameters at the temperature of each particle, in the order of the state."""

@@ -33,20 +33,22 @@ MAX_OBSTACLES = 16  # of one call, csrc/grid/obstacle.h
 
 
 class KernelShape(NamedTuple):
-    """How the kernel calls a shape, and the name of the shape's parameter in the column of directions and sizes."""
+    """How the kernel calls a shape, the name of the shape's parameter in the column of directions and sizes, and those
+    of its other parameters."""
 
     number: int
     extent: str | None
+    others: tuple[str, ...] = ()
 
 
 KERNEL_SHAPES: dict[type[shapes.Shape], KernelShape] = {
     shapes.Plane: KernelShape(0, "normal"),
-    shapes.Sphere: KernelShape(1, None),
+    shapes.Sphere: KernelShape(1, None, ("radius",)),
     shapes.Box: KernelShape(2, "size"),
-    shapes.Capsule: KernelShape(3, "half_axis"),
-    shapes.Revolved: KernelShape(4, "axis"),
-    shapes.Cylinder: KernelShape(4, "axis"),
-    shapes.Sampled: KernelShape(5, None),
+    shapes.Capsule: KernelShape(3, "half_axis", ("radius",)),
+    shapes.Revolved: KernelShape(4, "axis", ("outline",)),
+    shapes.Cylinder: KernelShape(4, "axis", ("outline",)),
+    shapes.Sampled: KernelShape(5, None, ("values", "lower", "spacing")),
 }
 
 
@@ -152,8 +154,10 @@ def packed_rows(velocity: Tensor) -> Tensor:
 def _values(obstacle: Obstacle) -> tuple[Any, ...]:
     """The numbers and tensors of an obstacle that go into the tables."""
     motion = (obstacle.friction, obstacle.position, obstacle.velocity, obstacle.rotation, obstacle.angular_velocity)
-    names = (KERNEL_SHAPES[type(obstacle.shape)].extent, "radius", "outline", "values", "lower", "spacing")
-    return (*motion, *(getattr(obstacle.shape, name, None) for name in names if name))
+    shape = obstacle.shape
+    kind = KERNEL_SHAPES[type(shape)]
+    extent = None if kind.extent is None else getattr(shape, kind.extent, None)
+    return (*motion, extent, *(getattr(shape, name) for name in kind.others))
 
 
 def _size(shape: shapes.Shape) -> int:

@@ -61,7 +61,8 @@ def survey(
     Raises:
         RuntimeError: for wrong shapes, dtypes or devices.
     """
-    result = torch.ops.torch_mpm.survey(
+    result = dispatch(
+        torch.ops.torch_mpm.survey,
         *(state.x, state.v, state.mass, state.volume, state.C, stress, stiffness, viscosity, energy, speed),
         *(state.scene, bound, kept, volumetric, reach, grid.upper, grid.scenes),
         *obstacle_arguments(obstacles, state.x, grid.scenes),
