@@ -276,7 +276,7 @@ class Simulation:
             "fingerprint": self.fingerprint,
             "totals": dict(vars(self.totals)),
         }
-        writer.submit(self.frame, copies, scalars, record)
+        writer.submit(self.frame, copies, scalars, checkpoint.tensors_of(state), record)
 
     def _show(self, state: State, figures: Figures) -> tuple[Copies, dict[str, Tensor]]:
         """Copies and sums of a state for the next frame, which are not waited for."""
@@ -289,7 +289,7 @@ class Simulation:
             value = figures.stress if name == "stress" else fields.field(self.step, given, name)
             assert value is not None, name  # `build` refuses fields that no material has
             kept[name] = _take(value, order)
-        return self._copier(kept, checkpoint.tensors_of(state)), energies(self.step, state, figures)
+        return self._copier.begin(kept), energies(self.step, state, figures)
 
     def _law_figures(self, state: State) -> Figures:
         return self.step.figures(fields.with_C(state) if self.step.law.viscous else state)

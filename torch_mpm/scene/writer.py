@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import queue
 import threading
 import time
@@ -23,37 +24,34 @@ CHECKPOINT_SECONDS = 1.0
 
 @dataclass(frozen=True)
 class Copies:
-    """Fields and state of a frame in host memory. ``ready`` comes behind the copies; ``sources`` keeps their origin
-    alive until then."""
+    """Fields of a frame in host memory. ``ready`` comes behind the copies; ``sources`` keeps their origin alive until
+    then."""
 
     fields: Mapping[str, Tensor]
-    state: Mapping[str, Tensor]
     ready: torch.cuda.Event | None
     sources: list[Tensor]
 
 
 class Copier:
-    """Copies frames into host memory: on CUDA on a stream of their own, so that nothing waits."""
+    """Copies tensors into host memory: on CUDA on a stream of their own, so that nothing waits."""
 
     def __init__(self) -> None:
         self._stream: Any = None
 
-    def __call__(self, fields: Mapping[str, Tensor], state: Mapping[str, Tensor]) -> Copies:
-        """Begin to copy fields in id order and the state for the checkpoint."""
-        sources = [*fields.values(), *state.values()]
+    def begin(self, fields: Mapping[str, Tensor]) -> Copies:
+        """Copies that may not have been made yet."""
+        sources = list(fields.values())
         device = sources[0].device
         if device.type != "cuda":
-            return Copies(fields, state, None, sources)
+            return Copies(fields, None, sources)
         if self._stream is None:
             self._stream = torch.cuda.Stream(device)
         self._stream.wait_stream(torch.cuda.current_stream(device))
         with torch.cuda.stream(self._stream):
-            host = [_pinned(t).copy_(t, non_blocking=True) for t in sources]
+            host = {name: _pinned(t).copy_(t, non_blocking=True) for name, t in fields.items()}
             ready = torch.cuda.Event()
             ready.record(self._stream)
-        count = len(fields)
-        return Copies(dict(zip(fields, host[:count], strict=True)), dict(zip(state, host[count:], strict=True)), ready,
-                      sources)  # fmt: skip
+        return Copies(host, ready, sources)
 
 
 def _pinned(t: Tensor) -> Tensor:
@@ -61,13 +59,22 @@ def _pinned(t: Tensor) -> Tensor:
     return torch.empty_like(t, device="cpu", pin_memory=True)
 
 
+def _on_host(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Tensors that a device has made, copied on a stream of their own, so that this thread alone waits."""
+    device = next(iter(tensors.values())).device
+    cuda = device.type == "cuda"
+    with torch.cuda.stream(torch.cuda.Stream(device)) if cuda else contextlib.nullcontext():
+        return {name: t.cpu() for name, t in tensors.items()}
+
+
 @dataclass(frozen=True)
 class Job:
-    """One frame."""
+    """One frame, and its state on the device for a checkpoint."""
 
     frame: int
     copies: Copies
     scalars: Mapping[str, Any]
+    state: Mapping[str, Tensor]
     record: dict[str, Any]
 
 
@@ -91,15 +98,16 @@ class FrameWriter:
         self._thread = threading.Thread(target=self._work, name="torch_mpm frame writer", daemon=True)
         self._thread.start()
 
-    def submit(self, frame: int, copies: Copies, scalars: Mapping[str, Any], record: dict[str, Any]) -> None:
-        """Queue a frame.
+    def submit(self, frame: int, copies: Copies, scalars: Mapping[str, Any], state: Mapping[str, Tensor],
+               record: dict[str, Any]) -> None:  # fmt: skip
+        """Queue a frame: copies of its fields in id order, scalars, and the state for the checkpoint.
 
         Raises:
             OSError: what went wrong with an earlier frame.
         """
         begin = time.perf_counter()
         self._raise()
-        self._jobs.put(Job(frame, copies, scalars, record))
+        self._jobs.put(Job(frame, copies, scalars, state, record))
         self.waited += time.perf_counter() - begin
 
     def close(self, finished: bool = False) -> None:
@@ -150,5 +158,5 @@ class FrameWriter:
             self._save(job)
 
     def _save(self, job: Job) -> None:
-        checkpoint.save(self.checkpoint_path, dict(job.copies.state), job.record)
+        checkpoint.save(self.checkpoint_path, _on_host(job.state), job.record)
         self._saved, self._unsaved = time.perf_counter(), None
