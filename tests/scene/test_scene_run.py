@@ -16,7 +16,7 @@ from helpers import FILE, command, disc
 pytest.importorskip("pydantic")
 pytest.importorskip("h5py")
 
-from torch_mpm import SimulationError, Trajectory
+from torch_mpm import SimulationError, State, Trajectory
 from torch_mpm.scene import Scene, folder, heap, writer
 from torch_mpm.scene import run as module
 from torch_mpm.scene.checkpoint import load
@@ -107,6 +107,23 @@ def test_the_trajectory_knows_where_it_comes_from(tmp_path):
     assert attributes["seed"] == 7 and attributes["torch"] == torch.__version__
     assert Scene(**json.loads(attributes["scene"])).seed == 7
     assert data["stress"].shape == (6, len(data["mass"]), 2, 2) and data["C"].shape == data["stress"].shape
+
+
+def test_frames_of_a_mixture_show_what_its_laws_say(tmp_path):
+    honey = {"law": "weakly_compressible", "bulk_modulus": 1e4, "viscosity": 5.0}
+    materials = {"jelly": {"law": "neo_hookean", "E": 1e4}, "honey": honey}
+    drop = {"shape": "sphere", "center": (0.5, 0.82), "radius": 0.1, "material": "honey"}
+    jelly = disc()["body"][0]
+    words = disc(**PRECISE, material=materials, body=[jelly, drop], output={"fields": ["stress", "F", "J", "C"]})
+    scene = Scene(**words)
+    scene.run(tmp_path / "out")
+    law = scene.build().step.law
+    with Trajectory(tmp_path / "out") as trajectory:
+        for frame in trajectory:
+            given = {name: torch.from_numpy(frame[name]) for name in ("mass", "volume", "F", "J", "C", "material")}
+            state = State(torch.from_numpy(frame["position"]), torch.from_numpy(frame["velocity"]), **given)
+            np.testing.assert_array_equal(frame["stress"], law.stress(state))
+            assert frame["elastic_energy"] == pytest.approx(float(law.energy(state).sum()), rel=1e-12, abs=1e-12)
 
 
 def test_every_device_writes_the_frames_of_the_cpu(tmp_path, device):
@@ -371,6 +388,15 @@ def test_segments_grow_while_the_limit_is_steady(tmp_path, long_segments):
     _, short, _ = simulate(tmp_path / "short", **STEADY)
     assert max(long_segments) == 32 and abs(sum(long_segments) - substeps) < 0.01 * substeps
     np.testing.assert_allclose(long["position"], short["position"], atol=1e-6)
+
+
+def test_a_device_is_waited_for_once_per_segment(tmp_path, long_segments, monkeypatch):
+    """The frame at its end is asked for with its survey."""
+    waits, on_host = [], module.on_host
+    monkeypatch.setattr(module, "on_host", lambda tensors: waits.append(list(tensors)) or on_host(tensors))
+    _, data, _ = simulate(tmp_path / "out", **STEADY)
+    assert len(waits) == len(long_segments) + 1
+    assert sum("momentum" in names for names in waits) == len(data["time"]) < len(waits)
 
 
 def test_a_long_segment_that_goes_wrong_is_taken_again_in_short_ones(tmp_path, long_segments, monkeypatch):
