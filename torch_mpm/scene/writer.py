@@ -55,8 +55,8 @@ class Copier:
 
 
 def _pinned(t: Tensor) -> Tensor:
-    """Room for a tensor in pinned memory, in its own memory order, so that a device has nothing to do but to copy."""
-    return torch.empty_like(t, device="cpu", pin_memory=True)
+    """Room for a tensor in pinned memory, row after row, as files have it."""
+    return torch.empty(t.shape, dtype=t.dtype, device="cpu", pin_memory=True)
 
 
 def _on_host(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
