@@ -5,8 +5,9 @@
     python -m benchmarks.speed.rollouts --out DIRECTORY
 
 Scenes: `torch_mpm.scene.run` with its files; time of the simulation. The others are the neo-Hookean cube of
-`benchmarks/speed/work.py`, steps of one call of `torch_mpm.rollout`, wall clock, synchronised once. The figure has
-every device that has results in DIRECTORY.
+`benchmarks/speed/work.py`, steps of one call of `torch_mpm.rollout`, wall clock, synchronised once. Warp and Taichi
+take steps of the same cube where they are installed (`pip install torch-mpm[bench]`). The figure has every device that
+has results in DIRECTORY.
 """
 
 from __future__ import annotations
@@ -27,8 +28,8 @@ import torch_mpm as mpm
 from torch_mpm.scene.run import Simulation, run
 
 from .. import common, regressions
-from . import scaling, work
-from .step import Setup, setup
+from . import peers, scaling, work
+from .step import Setup, run_peer, setup
 
 SCENES = {"cpu": ("demo", "batch"), "cuda": ("demo", "batch", "sand_column", "sand_drum", "spinner", "melt")}
 SIDES = {"cpu": (4, 10, 22, 46, 64), "cuda": (4, 10, 22, 46, 100, 200)}
@@ -42,6 +43,7 @@ LAWS: dict[str, Callable[[], mpm.Material]] = {
     "fluid": lambda: mpm.WeaklyCompressible(work.LAM),
 }
 """Of the largest cube beside the neo-Hookean one."""
+PEER_SIDES = {"cpu": (64,), "cuda": (22, 100, 200)}
 SECONDS = 0.5
 """Of steps in one measurement, about."""
 
@@ -140,16 +142,30 @@ def scenes(names: tuple[str, ...], device: str) -> Iterator[dict[str, Any]]:
         }
 
 
+def of_peers(device: str, rollouts: list[dict[str, Any]]) -> Iterator[dict[str, Any]]:
+    """Their least times of a step, and how many times as fast a rollout of the same cube is."""
+    ours = {r["particles"]: r["us"] for r in rollouts if r["name"] == "one scene"}
+    for peer, (_, module) in peers.PEERS.items():
+        if importlib.util.find_spec(module) is None:
+            continue
+        with tempfile.TemporaryDirectory() as folder:
+            for r in run_peer(peer, device, PEER_SIDES[device], 7, Path(folder) / "moved.npz"):
+                us = 1e3 * r["fastest_ms"]
+                name, count = f"{peer} {r['version']}", r["particles"]
+                yield {"name": name, "particles": count, "us": us, "rate": count / us * 1e6, "times": us / ours[count]}
+
+
 def measure(device: str, quick: bool = False) -> dict[str, Any]:
     common.use_all_cores()
     samples = 1 if quick else 5
-    result: dict[str, Any] = {"environment": common.environment(device), "scenes": [], "rollouts": []}
+    result: dict[str, Any] = {"environment": common.environment(device), "scenes": [], "rollouts": [], "peers": []}
     sides = SIDES[device][:2] if quick else SIDES[device]
     for side in sides:
         s = setup(work.make(side), device)
         result["rollouts"].append({"name": "one scene", **per_step(s, device, samples)})
     if device == "cpu":
         result["rollouts"].append({"name": "beside a busy process", **beside_a_busy_process(s, samples)})
+    result["peers"] += () if quick else of_peers(device, result["rollouts"])
     for name, law in LAWS.items():
         row = per_step(made_of(law(), sides[-1], device), device, samples)
         result["rollouts"].append({"name": name, **row})
@@ -177,7 +193,13 @@ def text(result: dict[str, Any]) -> str:
     rows = [row_of_steps(r) for r in result["rollouts"]]
     lines = ["# Speed of what is run", "", common.describe(result["environment"]), "", common.table(header, rows), ""]
     rows = [(*row_of_steps(r), r["seconds"]) for r in result["scenes"]]
-    return "\n".join([*lines, common.table((*header, "simulation, s"), rows), ""])
+    lines += [common.table((*header, "simulation, s"), rows), ""]
+    if peer_rows := [
+        (r["name"], r["particles"], r["us"], r["rate"] * 1e-6, r["times"]) for r in result.get("peers", ())
+    ]:
+        peer_header = ("a step", "particles", "us", "M particles/s", "rollout so many times as fast")
+        lines += [common.table(peer_header, peer_rows), ""]
+    return "\n".join(lines)
 
 
 def timed(result: dict[str, Any]) -> Iterator[tuple[str, float]]:
