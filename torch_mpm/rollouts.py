@@ -248,8 +248,8 @@ def pool_of_call(step: Step, state: State, n: int) -> tuple[int | None, int]:
     """Blocks of the pool of a call without gradients, None where it follows the scene, and steps of the call at most.
 
     Nobody looks whether a pool must grow that has room for all blocks of the domain: where there are few, and a kernel
-    takes many steps of few particles (`Substeps::persists`), or where many particles take more memory. They have a
-    roomier pool in any case.
+    takes many steps of few particles (`Substeps::persists`), or where many particles take more memory. A pool that they
+    leave room for is looked at less often, if steps do not pass over all of it.
     """
     grid = step.grid
     if not (grid.grows and state.x.is_cuda):
@@ -257,7 +257,8 @@ def pool_of_call(step: Step, state: State, n: int) -> tuple[int | None, int]:
     room = len(state) // PARTICLES_PER_BLOCK if len(state) >= MANY_PARTICLES else 0
     if room >= grid.block_count or takes_few_blocks(step, state, n):
         return grid.block_count, LONG_CHUNK
-    if grid.max_blocks is not None and room >= ROOMY * grid.max_blocks:
+    passes = grid.deterministic or (step.walls is not None and step.walls.mirrors() is not None)
+    if grid.max_blocks is not None and room >= ROOMY * grid.max_blocks and not passes:
         return room, ROOMY_CHUNK
     return None, CHUNK
 

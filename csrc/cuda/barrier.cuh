@@ -20,21 +20,26 @@ __device__ inline void wait_for_blocks(unsigned* arrived, unsigned blocks) {
 // The same for a chain of barriers of one kernel, where nothing else is to be done meanwhile. What thread blocks have
 // counted is added up on the way, so that nobody has to ask for it once more.
 struct Barrier {
-  unsigned long long* arrived;  // zero before the kernel; the counts are in its upper half
-  unsigned blocks, all = 0;
+  // Two that take turns, zero before the kernel, with the counts in the upper half: who is late still finds what was
+  // counted up to this barrier alone.
+  unsigned long long* arrived;
+  unsigned blocks, number = 0;
 
-  // Returns all counts so far. `count()` is asked of thread 0 when all threads of its block are there.
+  // Returns all counts of every other barrier up to this one. `count()` is asked of thread 0 when all threads of its
+  // block are there.
   template <class Count>
   __device__ unsigned wait(const Count& count) {
     __shared__ unsigned sum;
     __syncthreads();
-    all += blocks;
+    unsigned long long* const word = arrived + number % 2;
+    const unsigned expected = (number / 2 + 1) * blocks;
+    number++;
     if (threadIdx.x == 0) {
       const unsigned long long one = 1 + (static_cast<unsigned long long>(count()) << 32);
-      asm volatile("red.release.gpu.global.add.u64 [%0], %1;" ::"l"(arrived), "l"(one) : "memory");
+      asm volatile("red.release.gpu.global.add.u64 [%0], %1;" ::"l"(word), "l"(one) : "memory");
       unsigned long long now;
-      do asm volatile("ld.acquire.gpu.global.u64 %0, [%1];" : "=l"(now) : "l"(arrived) : "memory");
-      while (int(unsigned(now) - all) < 0);
+      do asm volatile("ld.acquire.gpu.global.u64 %0, [%1];" : "=l"(now) : "l"(word) : "memory");
+      while (int(unsigned(now) - expected) < 0);
       sum = unsigned(now >> 32);
     }
     __syncthreads();
@@ -57,12 +62,13 @@ __device__ inline void wait_for_cluster() {
 #endif
 }
 
-// f(object) of what each thread block of a cluster has in the place of `mine`, in shared memory.
-template <class T, class F>
-__device__ void each_of_cluster(T* mine, const F& f) {
+// What thread block `block` of a cluster has in the place of `mine`, in shared memory.
+template <class T>
+__device__ const T* in_block_of_cluster(T* mine, unsigned block) {
 #if __CUDA_ARCH__ >= 900
-  const auto cluster = cooperative_groups::this_cluster();
-  for (unsigned k = 0; k < cluster.num_blocks(); k++) f(*cluster.map_shared_rank(mine, k));
+  return cooperative_groups::this_cluster().map_shared_rank(mine, block);
+#else
+  return mine;
 #endif
 }
 

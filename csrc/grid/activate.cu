@@ -451,6 +451,7 @@ __device__ void place(const ActivateArguments<T, D>& a, const Workspace& w, int6
   if (i == 0) {
     *schedule.item_count = c.items;
     *schedule.scattered = is_scattered(c.groups, c.warps);
+    if (a.next_drift && c.margin > a.margin_blocks) a.next_drift->lost = Drift::kLost;
   }
   if (i <= a.scenes) write_status(a, w, int(i));
   const bool with_particles = i < min(c.wanted, a.max_blocks);

@@ -36,6 +36,7 @@ struct ActivateArguments {
   const Drift* drift = nullptr;  // since the activation in these tensors; null for a new one in any case
   int strays_of_activation = kStraysOfActivation;
   const Drift* missed = nullptr;  // where a particle may have been missed a step ago
+  Drift* next_drift = nullptr;    // told where there is no room for all blocks around those with particles; or null
 
   MPM_HD int slots() const { return max_blocks + margin_blocks; }
 };

@@ -101,6 +101,7 @@ void Merged<T, D>::begin(const Particles<const T>& given, const int* before) {
   settling.copy = static_cast<int*>(copy_.data_ptr());
   settling.index = s_.activation.index;
   s_.activation.drift = nullptr;
+  s_.activation.next_drift = drift(0);
   s_.activate(before, status(0), stream_);
   kernels().p2g(s_.laws[0], s_.late, s_.p2g, settling, stream_);
   update_grid(0, stream_);
@@ -136,6 +137,7 @@ void Merged<T, D>::go_on(int64_t step, bool ends, backend::Stream stream) {
   const Drift* const before = drift(step - 1);
   s_.advance.own.drift = s_.settling.drift = s_.activation.drift = ends ? nullptr : before;
   s_.activation.missed = before;
+  s_.activation.next_drift = drift(step);
   s_.advance.drift = nowhere();
   backend::g2p_advance(s_.in.lattice.order(), s_.advance, stream);
   s_.activate(status(step - 1), status(step), stream);

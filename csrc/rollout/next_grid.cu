@@ -58,7 +58,10 @@ __global__ void __launch_bounds__(kThreads) next_grid_kernel(const NextGridArgum
 template <class T, int D>
 void next_grid(const NextGridArguments<T, D>& a, Stream stream) {
   if (a.update.max_blocks == 0) return;
-  const unsigned blocks = grid_size((int64_t(a.update.max_blocks) * kBlockNodes<D> + kThreads - 1) / kThreads) / 4 + 1;
+  // A node for each thread, or for each that fits, and some more of them to go round.
+  const unsigned most = 4 * unsigned(2048 / kThreads * device_attribute(cudaDevAttrMultiProcessorCount));
+  const unsigned blocks =
+      std::min(grid_size((int64_t(a.update.max_blocks) * kBlockNodes<D> + kThreads - 1) / kThreads), most);
   if (a.obstacles)
     launch_in_chain(next_grid_kernel<true, T, D>, blocks, kThreads, 0, stream, a);
   else

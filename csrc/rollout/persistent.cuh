@@ -296,6 +296,8 @@ __device__ void write_persistent_status(const PersistentArguments<T, D>& a, int 
 // in turn, so that one can be read by the others of a cluster while they are at work on the next one.
 class CountingBarrier {
  public:
+  static_assert(kLargestCluster <= 32);
+
   __device__ CountingBarrier(unsigned long long* arrived, int blocks, bool cluster, Drift* counted)
       : barrier_{arrived, unsigned(blocks)}, cluster_(cluster), counted_(counted) {
     if (threadIdx.x < 2) counted[threadIdx.x] = {};
@@ -313,29 +315,32 @@ class CountingBarrier {
 
  private:
   __device__ Drift sum_of_cluster(Drift* mine) {
-    Drift all{};
+    __shared__ Drift all;
     wait_for_cluster();
-    each_of_cluster(mine, [&](const Drift& other) {
-      all.strays += other.strays;
-      all.lost |= other.lost;
-    });
+    if (threadIdx.x < 32) {
+      const Drift one = threadIdx.x < gridDim.x ? *in_block_of_cluster(mine, threadIdx.x) : Drift{};
+      const int strays = __reduce_add_sync(~0u, one.strays), lost = __reduce_or_sync(~0u, one.lost);
+      if (threadIdx.x == 0) all = {strays, lost};
+    }
+    __syncthreads();
     return all;
   }
   __device__ Drift sum_of_grid(const Drift& mine) {
     const unsigned sum = barrier_.wait([&] { return unsigned(mine.strays) + (mine.lost ? kLost : 0); });
-    const Drift all{int(sum % kLost) - strays_, sum >= kLost};
-    strays_ += all.strays;
-    return all;
+    const int strays = int(sum % kLost), before = strays_before_last_;  // of every other barrier
+    strays_before_last_ = strays_before_;
+    strays_before_ = strays;
+    return {strays - before, sum >= kLost};
   }
 
-  static constexpr unsigned kLost = 1 << 24;  // more than all strays of a launch
+  static constexpr unsigned kLost = 1 << 22;  // more than all strays of a launch; 1023 blocks may add as much
   static_assert(int64_t(kStepsOfALaunch) * kMostPersistentParticles / kParticlesPerStray + kMostPersistentParticles <
                 kLost);
 
   Barrier barrier_;
   const bool cluster_;
   Drift* const counted_;
-  int turn_ = 0, strays_ = 0;
+  int turn_ = 0, strays_before_ = 0, strays_before_last_ = 0;
 };
 
 template <class Source, class Task, class T, int D>
@@ -376,9 +381,7 @@ __global__ void __launch_bounds__(ItemStep<Source, Task>::threads)
   const auto each_outside = [&](const auto& leave_out) {
     for (int64_t i = tail; i < t.particles; i += int64_t(blocks) * threads) leave_out(t.index[i]);
   };
-  const auto lasts = [&](const Drift& counted) {
-    return counted.lost == 0 && counted.strays * kParticlesPerStray <= t.particles;
-  };
+  const auto lasts = [&](const Drift& all) { return all.lost == 0 && all.strays * kParticlesPerStray <= t.particles; };
   const bool ahead = alone && !a.scene_time;
   int step = first;
   for (bool more = true; more;) {

@@ -34,7 +34,7 @@ struct PersistentArguments {
   T* scene_time = nullptr;                // [scenes], goes on with each substep
   const T* scene_dt = nullptr;            // [scenes]
   int* steps_so_far = nullptr;            // zeroed before a call
-  unsigned long long* arrived = nullptr;  // thread blocks at barriers, zeroed before each launch
+  unsigned long long* arrived = nullptr;  // thread blocks at barriers, two words zeroed before each launch
   Drift* drift = nullptr;                 // tells the activation that there has to be a new one
   const int* activated = nullptr;         // status of the activation, [1 + scenes, 8]
   int* status = nullptr;                  // that of all substeps

@@ -75,7 +75,7 @@ bool take_persistent(Substeps<T, D>& s, int* activated, int* status, backend::St
   if (s.contact.step_time) a.step_time = s.contact.step_time + 1;
   a.contact.step_time = nullptr;
   give_clocks(s, a);
-  Tensor steps_so_far = empty_int(in.x, {1}), arrived = empty(in.x, {1}, ScalarType::Long);
+  Tensor steps_so_far = empty_int(in.x, {1}), arrived = empty(in.x, {2}, ScalarType::Long);
   backend::clear(steps_so_far, stream);
   a.steps_so_far = static_cast<int*>(steps_so_far.data_ptr());
   a.arrived = static_cast<unsigned long long*>(arrived.data_ptr());
@@ -85,7 +85,9 @@ bool take_persistent(Substeps<T, D>& s, int* activated, int* status, backend::St
   s.activation.drift = a.drift;
   s.activation.previous_status = status;
   s.activation.status = activated;
-  static std::atomic<bool> works = false;
+  static std::atomic<int> works_on = -1;  // a device that has taken one
+  int device = 0;
+  cudaGetDevice(&device);
   const auto launch = [&](cudaStream_t on, unsigned long long condition) {
     a.loop = condition;
     s.find_blocks(on);
@@ -93,11 +95,11 @@ bool take_persistent(Substeps<T, D>& s, int* activated, int* status, backend::St
     s.calls[0].law->template kernels<T, D>().persistent(s.laws[0], a, on);
   };
   try {
-    if (works) launch(stream, 0);  // so that the device is at work while the host makes the graph
+    if (works_on == device) launch(stream, 0);  // so that the device is at work while the host makes the graph
     repeat(stream, launch);
-    works = true;
+    works_on = device;
   } catch (const std::exception&) {
-    if (works) throw;
+    if (works_on == device) throw;
     cudaGetLastError();  // nothing was launched
     refused = true;
   }

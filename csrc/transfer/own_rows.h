@@ -4,13 +4,13 @@
 #include "common/host_device.h"
 #include "grid/topology.h"
 
-// Kernels that mostly have nothing to do take so many times fewer thread blocks, each of which costs time.
-constexpr unsigned kIdleShare = 8;
-
 // Particles that a call of many substeps owns, on CUDA. There are two copies of what they keep from step to step, one
 // behind the other. P2G after an activation takes them from one to the other, in the order of its items, so that those
 // of an item are neighbours in memory until the next activation. Given tensors are the first copy of the first P2G.
 namespace mpm {
+
+// Kernels that mostly have nothing to do take so many times fewer thread blocks, each of which costs time.
+constexpr unsigned kIdleShare = 8;
 
 struct OwnRows {
   int rows = 0;                  // of a copy; 0 where nobody owns the particles

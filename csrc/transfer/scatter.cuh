@@ -7,8 +7,9 @@
 
 // The kernel of P2G and scatter. One thread block takes the particles of one item, links them by cell in shared memory,
 // and adds up nodes in registers: each cell has one thread per leading node of the support, Order + 1 of them, which
-// walks the particles of the cell and adds to the slab of nodes behind that leading node. The slabs are then added to a
-// tile of nodes, and the tile to the grid: one vector reduction per node, however many particles there are.
+// walks the particles of the cell and adds to the slab of nodes behind that leading node. Each node of the tile around
+// the block then sums the slabs that reach it, and adds that to the grid: one vector reduction per node, however many
+// particles there are.
 //
 // A node gets N_i (a + B · i) + G · ∇N_i from a particle, i being the distance from the base node in cells: `Linear`
 // channels of this kind after `Plain` ones with B = G = 0. Deterministic mode adds blocks of one colour at a time, no
@@ -60,7 +61,10 @@ struct ScatterShape {
   static constexpr int row_quads = near_quads + far_quads;
 
   static constexpr size_t particle_bytes = size_t(batch) * row_bytes;
-  static constexpr size_t sum_bytes = size_t(threads) * slab * channels * sizeof(T);
+  // In two rounds, each of a half of every slab, where they would take more than most devices have.
+  static constexpr int rounds = size_t(threads) * slab * channels * sizeof(T) > 90 * 1024 ? 2 : 1, part = slab / rounds;
+  static_assert(slab % rounds == 0);
+  static constexpr size_t sum_bytes = size_t(threads) * part * channels * sizeof(T);
   static constexpr size_t shared_bytes = particle_bytes > sum_bytes ? particle_bytes : sum_bytes;
 };
 
@@ -166,8 +170,6 @@ struct Walker {
 
   __device__ Walker() : Walker(threadIdx.x) {}
   __device__ explicit Walker(int number) : list(number / S::support), lane(number % S::support), leading(lane) {}
-  __device__ int cell() const { return list % S::cells; }
-  __device__ int slice() const { return list / S::cells; }
 };
 
 // A row of nodes along the last axis gets w_k (at + k step) + w'_k along.
@@ -507,27 +509,29 @@ __device__ void add_strays(const Source& source, const Topology<T, D>& t, const 
   }
 }
 
-// The slab of a thread, in the place that only this one has.
-template <class S, class T>
+// The part of the slab of a thread that the round is of, in the place that only this thread has.
+template <class S, int Round, class T>
 __device__ void put_slab(const T (&sum)[S::slab][S::channels], T* sums) {
-  T* const to = sums + threadIdx.x * (S::slab * S::channels);
+  T* const to = sums + threadIdx.x * (S::part * S::channels);
 #pragma unroll
-  for (int n = 0; n < S::slab; n++) {
+  for (int n = 0; n < S::part; n++) {
+    const auto& node = sum[Round * S::part + n];
     if constexpr (S::channels == 4) {
-      reinterpret_cast<Quad<T>*>(to)[n] = {sum[n][0], sum[n][1], sum[n][2], sum[n][3]};
+      reinterpret_cast<Quad<T>*>(to)[n] = {node[0], node[1], node[2], node[3]};
     } else {
 #pragma unroll
-      for (int c = 0; c < S::channels; c++) to[n * S::channels + c] = sum[n][c];
+      for (int c = 0; c < S::channels; c++) to[n * S::channels + c] = node[c];
     }
   }
 }
 
 // f(place, reaches) of the slabs that may reach a node of the tile: where the node is in them, if it is.
-template <class S, class F>
+template <class S, int Round, class F>
 __device__ void each_slab(const int (&node)[S::D], const F& f) {
   constexpr int D = S::D, count = D == 2 ? S::support * S::support : S::support * S::slab;
 #pragma unroll
   for (int n = 0; n < count; n++) {
+    if (n % S::slab / S::part != Round) continue;
     int cell = 0, offset[D];
     bool reaches = true;
 #pragma unroll
@@ -539,53 +543,61 @@ __device__ void each_slab(const int (&node)[S::D], const F& f) {
     }
 #pragma unroll
     for (int slice = 0; slice < S::slices; slice++)
-      f(((slice * S::cells + cell) * S::support + n / S::slab) * S::slab + n % S::slab, reaches);
+      f(((slice * S::cells + cell) * S::support + n / S::slab) * S::part + n % S::part, reaches);
   }
 }
 
-// Four words of a row of the tile, from one on.
-template <class S, class T>
-__device__ Quad<T> tile_sum(const T* sums, int (&node)[S::D], int first_word) {
-  constexpr int K = S::channels, last = S::D - 1;
-  Quad<T> sum = {};
-  if constexpr (K == 4) {
-    node[last] = first_word / K;
-    each_slab<S>(node, [&](int place, bool reaches) {
+// One word of a row of the tile.
+template <class S, int Round, class T>
+__device__ T word_sum(const T* sums, int (&node)[S::D], int word) {
+  T sum = T(0);
+  node[S::D - 1] = word / S::channels;
+  each_slab<S, Round>(
+      node, [&](int place, bool reaches) { sum += reaches ? sums[place * S::channels + word % S::channels] : T(0); });
+  return sum;
+}
+
+// Four words of a row of the tile, from one on; where these are not those of a node, a lane has each of them, and the
+// first one all.
+template <class S, int Round, class T>
+__device__ Quad<T> quad_sum(const T* sums, int (&node)[S::D], int first_word, bool exists) {
+  Quad<T> sum{};
+  if constexpr (S::channels == 4) {
+    if (!exists) return sum;
+    node[S::D - 1] = first_word / 4;
+    each_slab<S, Round>(node, [&](int place, bool reaches) {
       Quad<T> v{};
       if (reaches) v = reinterpret_cast<const Quad<T>*>(sums)[place];
 #pragma unroll
       for (int e = 0; e < 4; e++) sum.e[e] += v.e[e];
     });
   } else {
+    const T word = exists ? word_sum<S, Round>(sums, node, first_word + int(threadIdx.x) % 4) : T(0);
 #pragma unroll
-    for (int e = 0; e < 4; e++) {
-      node[last] = (first_word + e) / K;
-      each_slab<S>(
-          node, [&](int place, bool reaches) { sum.e[e] += reaches ? sums[place * K + (first_word + e) % K] : T(0); });
-    }
+    for (int e = 0; e < 4; e++) sum.e[e] = __shfl_down_sync(~0u, word, e);
   }
   return sum;
 }
 
-// Adds the tile to the grid, four words at a time.
-template <class S, class T, int D>
+// Adds what nodes get in a round to the grid, four words at a time.
+template <class S, int Round, class T, int D>
 __device__ void flush_tile(const NodeField<T>& nodes, const int slots[1 << D], const T* sums, bool in_order) {
-  constexpr int K = S::channels, width = S::width;
-  constexpr int tile_rows = D == 2 ? width : width * width;
+  constexpr int K = S::channels, width = S::width, lanes = K == 4 ? 1 : 4;
+  constexpr int count = (D == 2 ? width : width * width) * S::row_quads * lanes;
   const bool dense = is_dense<S>(nodes);
-  for (int t = threadIdx.x; t < tile_rows * S::row_quads; t += S::threads) {
-    const int tile_row = t / S::row_quads, quad = t % S::row_quads, far = quad >= S::near_quads;
+  for (int t = threadIdx.x; t / 32 * 32 < count; t += S::threads) {  // by whole warps
+    const int tile_row = t / lanes / S::row_quads, quad = t / lanes % S::row_quads, far = quad >= S::near_quads;
     const int first_word = (far ? quad - S::near_quads : quad) * 4;
     int neighbour = 0, node[D] = {}, in_tile[D];
 #pragma unroll
     for (int i = D - 2, rest = tile_row; i >= 0; i--, rest /= width) in_tile[i] = node[i] = rest % width;
 #pragma unroll
     for (int i = 0; i < D - 1; i++) neighbour = neighbour * 2 + (node[i] >= kBlockWidth);
-    const int slot = slots[neighbour * 2 + far];
-    if (slot < 0) continue;
-    const int64_t row = int64_t(slot) * kBlockNodes<D> + node_in_block<D>(node);
-    const Quad<T> value = tile_sum<S>(sums, in_tile, first_word + far * kBlockWidth * K);
+    const int slot = t < count ? slots[neighbour * 2 + far] : -1;
+    const Quad<T> value = quad_sum<S, Round>(sums, in_tile, first_word + far * kBlockWidth * K, slot >= 0);
+    if (slot < 0 || t % lanes != 0) continue;
     if (value.e[0] == T(0) && value.e[1] == T(0) && value.e[2] == T(0) && value.e[3] == T(0)) continue;
+    const int64_t row = int64_t(slot) * kBlockNodes<D> + node_in_block<D>(node);
     if (dense) {
       add_to_nodes(nodes.pointer + row * K + first_word, value.e, in_order);
     } else {
@@ -615,10 +627,16 @@ __device__ void add_particles(const NodeField<T>& nodes, const SharedParticles<S
   }
   add_strays();
   __syncthreads();
-  put_slab<S>(sum, sums);
+  put_slab<S, 0>(sum, sums);
   when_added();
   __syncthreads();
-  flush_tile<S, T, S::D>(nodes, slots, sums, in_order);
+  flush_tile<S, 0, T, S::D>(nodes, slots, sums, in_order);
+  if constexpr (S::rounds == 2) {
+    __syncthreads();
+    put_slab<S, 1>(sum, sums);
+    __syncthreads();
+    flush_tile<S, 1, T, S::D>(nodes, slots, sums, in_order);
+  }
 }
 
 template <class S, class T, class AddStrays>

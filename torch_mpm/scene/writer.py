@@ -79,7 +79,8 @@ class Job:
 
 
 class FrameWriter:
-    """Queue of frames for a trajectory and its checkpoint; at most two wait, so that memory stays bounded.
+    """Queue of frames for a trajectory and its checkpoint; at most two wait, so that memory stays bounded: frames in
+    pinned memory, and their states, which stay on the device until there is a checkpoint.
 
     A frame is counted in the trajectory first and a checkpoint follows now and then, so a kill repeats the frames since
     with the same bytes. What ends otherwise before its last frame leaves a checkpoint of the frame that it came to.
@@ -158,5 +159,6 @@ class FrameWriter:
             self._save(job)
 
     def _save(self, job: Job) -> None:
-        checkpoint.save(self.checkpoint_path, _on_host(job.state), job.record)
+        with contextlib.suppress(torch.AcceleratorError):  # whose state is lost, and which the run fails with
+            checkpoint.save(self.checkpoint_path, _on_host(job.state), job.record)
         self._saved, self._unsaved = time.perf_counter(), None
