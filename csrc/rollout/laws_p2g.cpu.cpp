@@ -52,8 +52,7 @@ class Copies {
     next_ = next;
     next_count_ = next_count;
     next_first_ = next_count ? __atomic_load_n(a_.index + next, __ATOMIC_RELAXED) : 0;
-    for (int k = 0; k < a_.row_count; k++)
-      if (a_.rows[k].row >= 0) get(a_.rows[k], row(a_.rows[k].row), kCopyLine);
+    for (int k = 0; k < a_.row_count; k++) find_row(a_.rows[k]);
     for (int k = 0; k < a_.number_count; k++) get(a_.numbers[k], numbers_[a_.numbers[k].row], kCopyLine);
   }
 
@@ -106,11 +105,10 @@ class Copies {
 
  private:
   void find_stretches(const Chunk* order) {
-    const int* const index = a_.index + position_;
-    if (!order || order->sorted) {
-      for (int i = 0; i < count_; i++) id_[i] = index[i];
-    } else {
-      for (int i = 0; i < count_; i++) id_[i] = index[order->by_cell(i)];
+    id_ = a_.index + position_;
+    if (order && !order->sorted) {
+      for (int i = 0; i < count_; i++) by_cell_[i] = id_[order->by_cell(i)];
+      id_ = by_cell_;
     }
     stretches_ = 1;
     stretch_[0] = {id_[0], 0, count_};
@@ -122,6 +120,17 @@ class Copies {
     for (int k = 1; k < stretches_; k++) stretch_[k - 1].count = stretch_[k].at - stretch_[k - 1].at;
     stretch_[stretches_ - 1].count = count_ - stretch_[stretches_ - 1].at;
   }
+
+  // Rows that laws only read stay where they are if the particles lie one after another.
+  void find_row(const ParticleRow<T>& r) {
+    if (r.row < 0) return;
+    const bool stays = r.row < R::rest && !r.to && r.stride == 1 && stretches_ == 1;
+    if (r.row < R::rest) given_[r.row] = stays ? r.from + id_[0] : row(r.row);
+    if (!stays) get(r, row(r.row), kCopyLine);
+  }
+
+  // D x D rows from r on, as they are given.
+  Field<const T> given(int r) const { return {given_[r], {1, given_[r + D] - given_[r], given_[r + 1] - given_[r]}}; }
 
   template <class E>
   void get(const ParticleRow<E>& r, E* to, int room) const {
@@ -144,8 +153,8 @@ class Copies {
     LawArguments<T, D>& a = u.law;
     a.particles = count_;
     a.members = {};
-    a.state = law.gradient ? field(R::F) : field(R::J);
-    if (law.viscous && a_.has_C) a.C = field(R::C);
+    a.state = law.gradient ? given(R::F) : Field<const T>{given_[R::J], {1, 0, 0}};
+    if (law.viscous && a_.has_C) a.C = given(R::C);
     a.scene = numbers_[kSceneRow];
     a.scene_stride = 1;
     for (int k = 0; k < kMostParameters; k++)
@@ -164,7 +173,9 @@ class Copies {
   const LawsP2GArguments<T, D>& a_;
   T* const rows_;
   int position_ = 0, count_ = 0, stretches_ = 0, next_ = 0, next_first_ = 0, next_count_ = 0;
-  int id_[kChunk], numbers_[kNumberRows][kCopyLine];
+  const T* given_[R::rest];
+  const int* id_ = nullptr;  // in the order of cells
+  int by_cell_[kChunk], numbers_[kNumberRows][kCopyLine];
   Stretch stretch_[kChunk + 1];
 };
 
@@ -239,7 +250,7 @@ void laws_p2g_with(const LawsP2GArguments<T, D>& a) {
         p.dt = dt;
         p.stress = load_matrix_or_zero<T, D>(copies.field(R::stress), RunOf<N>{i});
         distances(t, base_block, entries_of<N>(order + i, N), x, f);
-        contributions.put(i, f, momentum_contribution<Order, true>(a.p2g, p, f));
+        contributions.put(i, f, momentum_contribution<Order, true, Gradient>(t.geometry, p, f));
         copies.expect(i);
       }
       copies.leave();

@@ -40,12 +40,12 @@ MPM_HD ParticleMomentum<Pack<T, G::kSize>, D> load_momentum(const P2GArguments<T
   return p;
 }
 
-template <int Order, bool Slope, class T, class P, int D>
-MPM_HD Contribution<P, D> momentum_contribution(const P2GArguments<T, D>& a, const ParticleMomentum<P, D>& p,
+// With the form and what there is known when compiling, all of it stays in registers; absent fields are zero.
+template <int Order, bool Slope, bool Gradient, class T, class P, int D>
+MPM_HD Contribution<P, D> momentum_contribution(const Geometry<T, D>& geometry, const ParticleMomentum<P, D>& p,
                                                 const P f[D]) {
-  const Geometry<T, D>& geometry = a.topology.geometry;
-  const NodeMomentum<P, D> n =
-      to_nodes<Order>(p, a.form, a.affine.pointer, a.stress.pointer, P(geometry.dx), P(geometry.inverse_dx));
+  constexpr StressForm form = Gradient ? StressForm::gradient : StressForm::mls;
+  const NodeMomentum<P, D> n = to_nodes<Order>(p, form, Slope, Slope, P(geometry.dx), P(geometry.inverse_dx));
   Contribution<P, D> contribution;
   MPM_UNROLL for (int c = 0; c < kChannels; c++) {
     const bool momentum = c >= 1 && c <= D;

@@ -10,16 +10,13 @@ void gather_with(const GatherArguments<T, D>& a, int first, int count) {
   const Geometry<T, D>& geometry = a.topology.geometry;
   const P scale(a.moment_scale * double(geometry.dx)), inverse_dx(geometry.inverse_dx);
   gather_groups<Order>(a.topology, a.x, a.nodes, first, count, [&](const Group& g, const P f[D], int, const T* tile) {
-    for (int c = 0; c < count; c += kTogether<T>) {
-      Sums<P, D> sums[kTogether<T>];
-      gather_channels<Order, kTogether<T>, Moment, Gradient, T, D>(f, tile + c, sums);
-      for (int k = 0; k < kTogether<T> && c + k < count; k++) {
-        const Sums<P, D>& s = sums[k];
-        if (a.value.pointer) store(s.value, a.value, g, first + c + k);
-        MPM_UNROLL for (int d = 0; d < D; d++) {
-          if (Moment) store(scale * s.moment[d], a.moment, g, first + c + k, d);
-          if (Gradient) store(inverse_dx * s.gradient[d], a.gradient, g, first + c + k, d);
-        }
+    for (int c = 0; c < count; c++) {
+      Sums<P, D> s;
+      gather_channels<Order, 1, Moment, Gradient, T, D>(f, tile + c, &s);
+      if (a.value.pointer) store(s.value, a.value, g, first + c);
+      MPM_UNROLL for (int d = 0; d < D; d++) {
+        if (Moment) store(scale * s.moment[d], a.moment, g, first + c, d);
+        if (Gradient) store(inverse_dx * s.gradient[d], a.gradient, g, first + c, d);
       }
     }
   });

@@ -32,54 +32,10 @@ struct Sums {
   P value, moment[N ? N : 1], gradient[N ? N : 1];
 };
 
-// Channels that are summed in one register: lane kTogether l + c for channel c of particle l.
-template <class T>
-constexpr int kTogether = kLanes * int(sizeof(T)) * 2 <= kRegisterBytes ? 2 : 1;
-template <class T>
-using Together = Pack<T, kLanes * kTogether<T>>;
-
-// The same for all channels.
-template <class T>
-MPM_HD Together<T> for_all_channels(const Lanes<T>& v) {
-  if constexpr (kTogether<T> == 1)
-    return v;
-  else {
-    Together<T> r;
-    r.part[0] = __builtin_shufflevector(v.part[0], v.part[0], 0, 0, 1, 1, 2, 2, 3, 3, 4, 4, 5, 5, 6, 6, 7, 7);
-    return r;
-  }
-}
-
-// kTogether channels of a node for all particles.
-template <class T>
-MPM_HD Together<T> node_channels(const T* node) {
-  if constexpr (kTogether<T> == 1) return Together<T>(node[0]);
-#ifdef __AVX512F__
-  else {
-    Together<T> r;
-    double both;
-    __builtin_memcpy(&both, node, sizeof(both));
-    r.part[0] = _mm512_castpd_ps(_mm512_set1_pd(both));
-    return r;
-  }
-#endif
-}
-
-template <class T>
-MPM_HD Lanes<T> one_channel(const Together<T>& v, int channel) {
-  if constexpr (kTogether<T> == 1)
-    return v;
-  else {
-    Lanes<T> r;
-    r.part[0] = channel ? __builtin_shufflevector(v.part[0], v.part[0], 1, 3, 5, 7, 9, 11, 13, 15)
-                        : __builtin_shufflevector(v.part[0], v.part[0], 0, 2, 4, 6, 8, 10, 12, 14);
-    return r;
-  }
-}
-
+// Of one channel.
 template <int Order, int Axis, bool Moment, bool Gradient, class T, int D>
-MPM_HD Sums<Together<T>, D - Axis> sum_nodes(const Weights<Order, Together<T>, D>& s, const T* tile) {
-  using P = Together<T>;
+MPM_HD Sums<Lanes<T>, D - Axis> sum_nodes(const Weights<Order, Lanes<T>, D>& s, const T* tile) {
+  using P = Lanes<T>;
   constexpr int N = D - Axis, stride = Tile<Order, T, D>::stride(Axis);
   Sums<P, N> r;
   P first;
@@ -88,7 +44,7 @@ MPM_HD Sums<Together<T>, D - Axis> sum_nodes(const Weights<Order, Together<T>, D
     if constexpr (Axis + 1 < D)
       line = sum_nodes<Order, Axis + 1, Moment, Gradient>(s, tile + k * stride);
     else
-      line.value = node_channels(tile + k * stride);
+      line.value = P(tile[k * stride]);
     const P& w = s.w[Axis][k];
     const P part = w * line.value;
     r.value = k ? r.value + part : part;
@@ -112,22 +68,12 @@ MPM_HD Sums<Together<T>, D - Axis> sum_nodes(const Weights<Order, Together<T>, D
 // Value Σ N g, moment Σ N g r and gradient Σ g ∂N of the first `Channels` channels, with distances r from the particle.
 template <int Order, int Channels, bool Moment, bool Gradient, class T, int D>
 MPM_HD void gather_channels(const Lanes<T> f[D], const T* tile, Sums<Lanes<T>, D> sums[Channels]) {
-  Together<T> distances[D];
-  MPM_UNROLL for (int a = 0; a < D; a++)
-    distances[a] = for_all_channels(f[a]);
-  const Weights<Order, Together<T>, D> s(distances, Gradient ? 1 : 0);
-  MPM_UNROLL for (int first = 0; first < Channels; first += kTogether<T>) {
-    Sums<Together<T>, D> r = sum_nodes<Order, 0, Moment, Gradient>(s, tile + first);
-    MPM_UNROLL for (int a = 0; a < D; a++)
-      if (Moment) r.moment[a] = r.moment[a] - (s.f[a] - Together<T>(1)) * r.value;
-    MPM_UNROLL for (int c = 0; c < kTogether<T>; c++) {
-      if (first + c >= Channels) continue;
-      sums[first + c].value = one_channel<T>(r.value, c);
-      MPM_UNROLL for (int a = 0; a < D; a++) {
-        if (Moment) sums[first + c].moment[a] = one_channel<T>(r.moment[a], c);
-        if (Gradient) sums[first + c].gradient[a] = one_channel<T>(r.gradient[a], c);
-      }
-    }
+  using P = Lanes<T>;
+  const Weights<Order, P, D> s(f, Gradient ? 1 : 0);
+  MPM_UNROLL for (int c = 0; c < Channels; c++) {
+    sums[c] = sum_nodes<Order, 0, Moment, Gradient>(s, tile + c);
+    if (Moment) MPM_UNROLL
+      for (int a = 0; a < D; a++) sums[c].moment[a] = sums[c].moment[a] - (f[a] - P(1)) * sums[c].value;
   }
 }
 

@@ -46,7 +46,8 @@ void p2g_backward_with(const P2GBackwardArguments<T, D>& a, const Field<T> wante
           x[i] = P(0);
         if (a.x.pointer) {
           const Weights<Order, P, D> w(f, Gradient ? 2 : 1);
-          const Contribution<P, D> contribution = momentum_contribution<Order, Moment>(in, p, f);
+          const Contribution<P, D> contribution =
+              momentum_contribution<Order, Moment, Gradient>(in.topology.geometry, p, f);
           add_position_gradient<Order, 1 + D, Moment, Gradient>(w, contribution, tile, gathered, x);
           MPM_UNROLL for (int i = 0; i < D; i++)
             x[i] = inverse_dx * x[i];

@@ -12,7 +12,7 @@ void p2g_with(const P2GArguments<T, D>& a) {
         // One contribution for both, so that rounding does not depend on what is consecutive.
         const bool run = direct && g.consecutive;
         const auto p = run ? load_momentum(a, RunOf<N>{g.id[0]}, scene) : load_momentum(a, g, scene);
-        return momentum_contribution<Order, Slope>(a, p, f);
+        return momentum_contribution<Order, Slope, Gradient>(a.topology.geometry, p, f);
       });
 }
 

@@ -18,31 +18,42 @@ struct Contributions {
   static constexpr int kFields = kGradient + (Gradient ? kChannels * D : 0);
   static constexpr int kPadded = (kFields + kLanes - 1) / kLanes * kLanes;
   static constexpr int kLine = kChunk + 16;  // not a power of two, so that the arrays do not share cache sets
-  alignas(64) T row[kChunk][kPadded];        // value, slopes, gradients
-  alignas(64) T weight[D][S][kLine];
-  alignas(64) T derivative[D][S][Gradient ? kLine : 1];
+  static constexpr int kPlanes = D == 3 ? S : 1, kSlopeLine = Gradient ? kLine : 1;
+  alignas(64) T row[kChunk][kPadded];  // value about the second node, slopes, gradients
+  // Of the lines of nodes along the last axis: products of the other axes, and with one derivative.
+  alignas(64) T line[kPlanes][S][kLine];
+  alignas(64) T slope_x[kPlanes][S][D == 3 ? kSlopeLine : 1], slope_y[kPlanes][S][kSlopeLine];
+  alignas(64) T weight[S][kLine], slope[S][kSlopeLine];  // of the last axis
 
   template <int N>
   void put(int i, const Pack<T, N> f[D], const Contribution<Pack<T, N>, D>& contribution) {
-    Pack<T, N> field[kPadded], w[S];
+    using P = Pack<T, N>;
+    P field[kPadded];
     MPM_UNROLL for (int c = 0; c < kChannels; c++) {
       field[c] = contribution.value[c];
       MPM_UNROLL for (int a = 0; a < D; a++) {
         if (Slope) field[kSlope + a * kChannels + c] = contribution.slope[a][c];
+        if (Slope) field[c] += contribution.slope[a][c];
         if (Gradient) field[kGradient + a * kChannels + c] = contribution.gradient[a][c];
       }
     }
     MPM_UNROLL for (int k = kFields; k < kPadded; k++)
-      field[k] = Pack<T, N>(0);
+      field[k] = P(0);
     store_transposed<kPadded>(field, row[i], kPadded);
+    P w[D][S], dw[D][S];
     MPM_UNROLL for (int a = 0; a < D; a++) {
-      BSpline<Order>::weights(f[a], w);
-      MPM_UNROLL for (int k = 0; k < S; k++)
-        w[k].store(&weight[a][k][i]);
-      if (!Gradient) continue;
-      BSpline<Order>::first_derivatives(f[a], w);
-      MPM_UNROLL for (int k = 0; k < S; k++)
-        w[k].store(&derivative[a][k][i]);
+      BSpline<Order>::weights(f[a], w[a]);
+      if (Gradient) BSpline<Order>::first_derivatives(f[a], dw[a]);
+    }
+    MPM_UNROLL for (int k = 0; k < S; k++) {
+      w[D - 1][k].store(&weight[k][i]);
+      if (Gradient) dw[D - 1][k].store(&slope[k][i]);
+      MPM_UNROLL for (int m = 0; m < kPlanes; m++) {
+        const P& x = D == 3 ? w[0][m] : P(1);
+        (x * w[D - 2][k]).store(&line[m][k][i]);
+        if (Gradient) (x * dw[D - 2][k]).store(&slope_y[m][k][i]);
+        if (Gradient && D == 3) (dw[0][m] * w[D - 2][k]).store(&slope_x[m][k][i]);
+      }
     }
   }
 };
@@ -84,14 +95,20 @@ MPM_HD FourNodes<T> spread(const T* value, int stride) {
   return r;
 }
 
+// At node k of an axis, from the value at the second one.
+template <class P>
+MPM_HD P at_node(int k, const P& value, const P& slope) {
+  return k == 0 ? value - slope : k == 1 ? value : k == 2 ? value + slope : value + P(k - 1) * slope;
+}
+
 // Sums the particles order[0 .. count) of one cell into the tile at its base node.
 template <int Order, class T, int D, bool Slope, bool Gradient>
 void sum_cell(const Contributions<Order, T, D, Slope, Gradient>& g, const uint16_t* order, int count, T* tile) {
   using Row = FourNodes<T>;
   using G = Contributions<Order, T, D, Slope, Gradient>;
-  constexpr int S = Order + 1, X = D - 3, Y = D - 2, Z = D - 1, kPlanes = D == 3 ? S : 1;
-  constexpr int kTileX = D == 3 ? Tile<Order, T, D>::stride(0) : 0, kTileY = Tile<Order, T, D>::stride(Y);
-  static constexpr T kOffset[4] = {0, 1, 2, 3};
+  constexpr int S = Order + 1, kPlanes = G::kPlanes;
+  constexpr int kTileX = D == 3 ? Tile<Order, T, D>::stride(0) : 0, kTileY = Tile<Order, T, D>::stride(D - 2);
+  static constexpr T kOffset[4] = {-1, 0, 1, 2};
   const Row offset = spread<4>(kOffset, 1);
   Row sum[kPlanes][S];
   MPM_UNROLL for (int i = 0; i < kPlanes; i++) MPM_UNROLL
@@ -99,38 +116,25 @@ void sum_cell(const Contributions<Order, T, D, Slope, Gradient>& g, const uint16
   for (int n = 0; n < count; n++) {
     const int p = order[n] % kChunk;
     const T* row = g.row[p];
-    const auto weight = [&](int axis, int k) { return Row(g.weight[axis][k][p]); };
-    const auto derivative = [&](int axis, int k) { return Row(g.derivative[axis][k][p]); };
     const auto slope = [&](int axis) { return repeat(row + G::kSlope + axis * kChannels); };
     const auto gradient = [&](int axis) { return repeat(row + G::kGradient + axis * kChannels); };
-    const Row wz = spread<S>(&g.weight[Z][0][p], G::kLine);
-    Row value = repeat(row), slope_y, slope_x, gradient_y, gradient_x;
-    if (Slope) value += offset * slope(Z);
-    value = wz * value;
-    if (Gradient) value += spread<S>(&g.derivative[Z][0][p], G::kLine) * gradient(Z);
-    if (Slope) slope_y = wz * slope(Y);
-    if (Gradient) gradient_y = wz * gradient(Y);
+    const Row w = spread<S>(&g.weight[0][p], G::kLine);
+    Row value = repeat(row), slope_x, slope_y, gradient_x, gradient_y;
+    if (Slope) value += offset * slope(D - 1);
+    value = w * value;
+    if (Gradient) value += spread<S>(&g.slope[0][p], G::kLine) * gradient(D - 1);
+    if (Slope) slope_y = w * slope(D - 2);
+    if (Gradient) gradient_y = w * gradient(D - 2);
     if constexpr (D == 3) {
-      if (Slope) slope_x = wz * slope(X);
-      if (Gradient) gradient_x = wz * gradient(X);
+      if (Slope) slope_x = w * slope(0);
+      if (Gradient) gradient_x = w * gradient(0);
     }
-    MPM_UNROLL for (int j = 0; j < S; j++) {
-      Row line = value;
-      if (Slope && j == 1) line += slope_y;
-      if (Slope && j > 1) line += Row(j) * slope_y;
-      line = weight(Y, j) * line;
-      if (Gradient) line += derivative(Y, j) * gradient_y;
-      if constexpr (D == 2) {
-        sum[0][j] += line;
-      } else {
-        const Row line_x = Slope ? weight(Y, j) * slope_x : line, line_g = Gradient ? weight(Y, j) * gradient_x : line;
-        MPM_UNROLL for (int i = 0; i < S; i++) {
-          Row plane = line;
-          if (Slope && i == 1) plane += line_x;
-          if (Slope && i > 1) plane += Row(i) * line_x;
-          sum[i][j] += weight(X, i) * plane;
-          if (Gradient) sum[i][j] += derivative(X, i) * line_g;
-        }
+    MPM_UNROLL for (int i = 0; i < kPlanes; i++) {
+      const Row plane = Slope && D == 3 ? at_node(i, value, slope_x) : value;
+      MPM_UNROLL for (int j = 0; j < S; j++) {
+        sum[i][j] += Row(g.line[i][j][p]) * (Slope ? at_node(j, plane, slope_y) : plane);
+        if (Gradient) sum[i][j] += Row(g.slope_y[i][j][p]) * gradient_y;
+        if constexpr (Gradient && D == 3) sum[i][j] += Row(g.slope_x[i][j][p]) * gradient_x;
       }
     }
   }
