@@ -43,7 +43,6 @@ struct MotionAdjointSource {
   __device__ const Contribution<T, D, 0, D>& contribution(const Contribution<T, D, 0, D>& loaded) const {
     return loaded;
   }
-  __device__ void leave_out(int p, int) const { advance_particle_backward(advance, One<T>{p}); }
 };
 
 }  // namespace
