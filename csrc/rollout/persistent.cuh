@@ -285,7 +285,7 @@ struct UsedNodes {
 };
 
 template <class T, int D>
-__device__ void write_persistent_status(const PersistentArguments<T, D>& a, int scenes, int steps) {
+__device__ void write_persistent_status(const PersistentLoop<T, D>& a, int scenes, int steps) {
   for (int row = threadIdx.x; row <= scenes; row += blockDim.x) {
     copy_status(a.activated + row * kStatusSize, a.status + row * kStatusSize);
     if (row == 0) a.status[kActivations] += steps - 1;
@@ -346,7 +346,7 @@ class CountingBarrier {
 template <class Source, class Task, class T, int D>
 __global__ void __launch_bounds__(ItemStep<Source, Task>::threads)
     persistent_kernel(const __grid_constant__ Source source, const __grid_constant__ Task task,
-                      const __grid_constant__ PersistentArguments<T, D> a) {
+                      const __grid_constant__ PersistentLoop<T, D> a) {
   using Step = ItemStep<Source, Task>;
   constexpr int threads = Step::threads;
   extern __shared__ __align__(16) char memory[];
@@ -424,7 +424,7 @@ void launch_persistent(const Source& source, const Task& task, const PersistentA
   const int64_t particles = source.topology.particles, items = most_items(source.topology.max_blocks, particles);
   const int64_t most = particles <= kMostClusterParticles ? kLargestCluster : items;
   launch_at_once(persistent_kernel<Source, Task, T, D>, unsigned(std::min(items, most)), Step::threads,
-                 Step::S::shared_bytes, stream, source, task, a);
+                 Step::S::shared_bytes, stream, source, task, static_cast<const PersistentLoop<T, D>&>(a));
 }
 
 }  // namespace mpm::cuda

@@ -17,13 +17,9 @@ constexpr int kParticlesPerStray = 32;
 constexpr int64_t kMostClusterParticles = 2048;
 constexpr int kStepsOfALaunch = 4096;  // at most
 
-// F or J of the particles, all of which move in place, is left to P2G in every substep. Nodes are zero before and
-// after.
+// What the kernel has beside the particles and the nodes of P2G and G2P. Nodes are zero before and after.
 template <class T, int D>
-struct PersistentArguments {
-  P2GArguments<T, D> p2g;
-  LateDeformation<T, D> late;
-  G2PAdvanceArguments<T, D> advance;
+struct PersistentLoop {
   GridUpdateArguments<T, D> update;
   ContactArguments<T, D> contact;
   bool obstacles = false;
@@ -39,6 +35,14 @@ struct PersistentArguments {
   const int* activated = nullptr;         // status of the activation, [1 + scenes, 8]
   int* status = nullptr;                  // that of all substeps
   unsigned long long loop = 0;  // the condition of a graph that launches the kernel until all are taken, or zero
+};
+
+// F or J of the particles, all of which move in place, is left to P2G in every substep.
+template <class T, int D>
+struct PersistentArguments : PersistentLoop<T, D> {
+  P2GArguments<T, D> p2g;
+  LateDeformation<T, D> late;
+  G2PAdvanceArguments<T, D> advance;
 };
 
 }  // namespace mpm

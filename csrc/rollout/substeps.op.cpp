@@ -65,7 +65,7 @@ bool take_persistent(Substeps<T, D>& s, int* activated, int* status, backend::St
   static std::atomic<bool> refused = false;
   if (refused) return false;
   const SubstepsInputs& in = s.in;
-  PersistentArguments<T, D> a{s.p2g, s.late, s.advance, s.update, s.contact, s.obstacles, s.activation.max_blocks};
+  PersistentArguments<T, D> a{{s.update, s.contact, s.obstacles, s.activation.max_blocks}, s.p2g, s.late, s.advance};
   Tensor more = empty(in.x, {2 * s.pool.nodes.size(0), 1 + D});
   backend::clear(more, stream);
   a.nodes[0] = static_cast<T*>(s.pool.nodes.data_ptr());
