@@ -14,7 +14,7 @@ import torch_mpm as mpm
 CELLS = {"cpu": {2: 64, 3: 24}, "cuda": {2: 528, 3: 72}}
 N = 24
 CLOSE = 5e-4
-"""Affine fields divide rounding errors of velocities by a cell of a thousandth. Where a bound is larger, single steps
+"""Affine fields divide rounding errors of velocities by a small cell. Where a bound is larger, single steps
 in float32 differ as much from those in float64: of jets and fast bodies, whose velocities are larger; beside an
 obstacle, which a node is in or not."""
 

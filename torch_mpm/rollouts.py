@@ -230,7 +230,7 @@ def in_chunks(
 
     def advance(state: State, count: int, first: int = 0) -> State:
         while count > 0:
-            blocks, most = (None, chunk) if with_gradient else pool_of_call(step, state, count)
+            blocks, most = (None if with_gradient else pool_of_call(step, state, count)) or (None, chunk)
             now = min(count, most)
             state, count = substeps(step, state, now, dt, keeps_all, blocks), count - now
         return state
@@ -244,8 +244,8 @@ def in_chunks(
         return advance(state, n)
 
 
-def pool_of_call(step: Step, state: State, n: int) -> tuple[int | None, int]:
-    """Blocks of the pool of a call without gradients, None where it follows the scene, and steps of the call at most.
+def pool_of_call(step: Step, state: State, n: int) -> tuple[int, int] | None:
+    """Blocks of the pool of a call without gradients and steps of the call at most; None where it follows the scene.
 
     Nobody looks whether a pool must grow that has room for all blocks of the domain: where there are few, and a kernel
     takes many steps of few particles (`Substeps::persists`), or where many particles take more memory. A pool that they
@@ -253,14 +253,19 @@ def pool_of_call(step: Step, state: State, n: int) -> tuple[int | None, int]:
     """
     grid = step.grid
     if not (grid.grows and state.x.is_cuda):
-        return None, MOST_STEPS
+        return None
     room = len(state) // PARTICLES_PER_BLOCK if len(state) >= MANY_PARTICLES else 0
     if room >= grid.block_count or takes_few_blocks(step, state, n):
         return grid.block_count, LONG_CHUNK
-    passes = grid.deterministic or (step.walls is not None and step.walls.mirrors() is not None)
+    passes = grid.deterministic or has_mirrors(step)
     if grid.max_blocks is not None and room >= ROOMY * grid.max_blocks and not passes:
         return room, ROOMY_CHUNK
-    return None, CHUNK
+    return None
+
+
+def has_mirrors(step: Step) -> bool:
+    """Whether some faces of the domain are mirrors, which read nodes of other blocks."""
+    return step.walls is not None and step.walls.mirrors() is not None
 
 
 def takes_few_blocks(step: Step, state: State, n: int) -> bool:
@@ -268,9 +273,8 @@ def takes_few_blocks(step: Step, state: State, n: int) -> bool:
     grid = step.grid
     if grid.block_count > FEW_BLOCKS or grid.max_blocks is None:
         return False
-    mirrors = step.walls is not None and step.walls.mirrors() is not None
-    form = (step.transfer, step.stress_form, grid.kernel, grid.deterministic)
-    if form != ("apic", "mls", "quadratic", False) or mirrors or state.impulse is not None or n < LEAST_PERSISTENT:
+    form = (step.transfer, step.stress_form, grid.kernel, grid.deterministic, has_mirrors(step))
+    if form != ("apic", "mls", "quadratic", False, False) or state.impulse is not None or n < LEAST_PERSISTENT:
         return False
     if state.x.dtype != torch.float32 or not isinstance(step.law, CompiledLaw) or len(state) > MOST_PERSISTENT:
         return False

@@ -8,6 +8,7 @@ JSON for each size. It runs in a process of its own, so that no peer can disturb
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import json
 import statistics
 import time
@@ -198,6 +199,10 @@ def taichi_program(w: work.Work, device: str) -> Program:
 
 
 PEERS = {"warp": (warp_program, "warp"), "taichi": (taichi_program, "taichi")}
+
+
+def is_installed(peer: str) -> bool:
+    return importlib.util.find_spec(PEERS[peer][1]) is not None
 
 
 def measure(peer: str, side: int, device: str, samples: int, steps: int, save: str | None) -> dict[str, Any]:

@@ -44,6 +44,7 @@ LAWS: dict[str, Callable[[], mpm.Material]] = {
 }
 """Of the largest cube beside the neo-Hookean one."""
 PEER_SIDES = {"cpu": (64,), "cuda": (22, 100, 200)}
+"""Of the cubes that peers take too, some of SIDES."""
 SECONDS = 0.5
 """Of steps in one measurement, about."""
 
@@ -145,9 +146,7 @@ def scenes(names: tuple[str, ...], device: str) -> Iterator[dict[str, Any]]:
 def of_peers(device: str, rollouts: list[dict[str, Any]]) -> Iterator[dict[str, Any]]:
     """Their least times of a step, and how many times as fast a rollout of the same cube is."""
     ours = {r["particles"]: r["us"] for r in rollouts if r["name"] == "one scene"}
-    for peer, (_, module) in peers.PEERS.items():
-        if importlib.util.find_spec(module) is None:
-            continue
+    for peer in filter(peers.is_installed, peers.PEERS):
         with tempfile.TemporaryDirectory() as folder:
             for r in run_peer(peer, device, PEER_SIDES[device], 7, Path(folder) / "moved.npz"):
                 us = 1e3 * r["fastest_ms"]
@@ -194,11 +193,9 @@ def text(result: dict[str, Any]) -> str:
     lines = ["# Speed of what is run", "", common.describe(result["environment"]), "", common.table(header, rows), ""]
     rows = [(*row_of_steps(r), r["seconds"]) for r in result["scenes"]]
     lines += [common.table((*header, "simulation, s"), rows), ""]
-    if peer_rows := [
-        (r["name"], r["particles"], r["us"], r["rate"] * 1e-6, r["times"]) for r in result.get("peers", ())
-    ]:
-        peer_header = ("a step", "particles", "us", "M particles/s", "rollout so many times as fast")
-        lines += [common.table(peer_header, peer_rows), ""]
+    if rows := [(r["name"], r["particles"], r["us"], r["rate"] * 1e-6, r["times"]) for r in result.get("peers", ())]:
+        header = ("a step", "particles", "us", "M particles/s", "rollout so many times as fast")
+        lines += [common.table(header, rows), ""]
     return "\n".join(lines)
 
 

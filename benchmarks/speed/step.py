@@ -20,7 +20,6 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import importlib.util
 import json
 import subprocess
 import sys
@@ -323,7 +322,7 @@ def measure_host(report: Report, clock: Clock) -> None:
 
 def measure_peer(report: Report, peer: str, device: str, sides: Sequence[int], samples: int) -> None:
     """The peer's times of all sizes, and how far its particles are from ours."""
-    if importlib.util.find_spec(peers.PEERS[peer][1]) is None:
+    if not peers.is_installed(peer):
         print(f"{peer} is not installed")
         return
     with tempfile.TemporaryDirectory() as folder:

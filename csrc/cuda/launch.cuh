@@ -31,6 +31,15 @@ inline unsigned grid_size(int64_t count) {
   return unsigned(std::clamp<int64_t>(count, 1, int64_t(processors) * 128));
 }
 
+// The same for a task that may say that it mostly has nothing to do: each thread block costs time then, too.
+template <class Task>
+unsigned grid_size(const Task& task, int64_t count) {
+  constexpr unsigned share = 8;  // one in so many is enough
+  if constexpr (requires { task.is_mostly_idle(); })
+    if (task.is_mostly_idle()) return std::max(grid_size(count) / share, 1u);
+  return grid_size(count);
+}
+
 // What exceeds 48 KB has to be asked for, and what a kernel declares itself counts too: up to 16 KB.
 template <class Kernel>
 void allow_shared_memory(Kernel* kernel, size_t shared_memory) {

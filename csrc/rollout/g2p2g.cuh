@@ -114,12 +114,7 @@ class G2P2G {
   // Particles that are left out are at rest.
   __device__ void leave_out(int p) const { source.leave_out_at_rest(p); }
 
-  // By whole warps.
-  __device__ void tell(Drift* drift) const {
-    const int strays = __reduce_add_sync(~0u, strays_);
-    if (strays > 0 && threadIdx.x % 32 == 0) atomicAdd(&drift->strays, strays);
-    if (lost_) atomicOr(&drift->lost, lost_);
-  }
+  __device__ void tell(Drift* drift) const { add_to_drift(drift, strays_, lost_); }
 
  private:
   const Source& source;

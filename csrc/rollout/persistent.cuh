@@ -369,7 +369,8 @@ __global__ void __launch_bounds__(ItemStep<Source, Task>::threads)
   const UsedNodes<T, D> used(::min(a.activated[kBlocksNow], a.blocks), of_margin, a.blocks);
   CountingBarrier barrier(a.arrived, blocks, cluster, counted);
   Step item(source, task, a.update, shared, memory);
-  if (alone && int(blockIdx.x) < items) item.begin(blockIdx.x), item.load(), item.link();
+  const bool keeps = alone && int(blockIdx.x) < items;  // an item of its own
+  if (keeps) item.begin(blockIdx.x), item.load(), item.link();
   const auto each_item = [&](const auto& phase) {
     for (int i = blockIdx.x; i < items; i += blocks) {
       if (!alone) item.begin(i);
@@ -393,7 +394,7 @@ __global__ void __launch_bounds__(ItemStep<Source, Task>::threads)
     if (threadIdx.x == 0 && a.step_time) contact.time = a.step_time[step];
     if (!lasts(barrier.wait())) break;
 
-    if (alone && int(blockIdx.x) < items) item.keep();
+    if (keeps) item.keep();
     each_outside([&](int p) { source.leave_out(p); });
     const NodeVelocities<T, D> velocities{a.update, contact, a.obstacles,
                                           reinterpret_cast<const NodeRow<T, D>*>(a.nodes[step % 3])};
@@ -403,7 +404,7 @@ __global__ void __launch_bounds__(ItemStep<Source, Task>::threads)
     follower.tell(barrier.counted());
     step++;
     more = step < a.steps && step - first < kStepsOfALaunch;
-    if (alone && more && int(blockIdx.x) < items) item.link();  // of the next substep
+    if (keeps && more) item.link();  // of the next substep
     if (ahead && more) continue;
     more = lasts(barrier.wait()) && more;
     if (blockIdx.x == 0 && a.scene_time)
@@ -414,7 +415,7 @@ __global__ void __launch_bounds__(ItemStep<Source, Task>::threads)
   if (cluster) wait_for_cluster();  // others may still read what this one has counted
   if (!leads) return;
   *a.steps_so_far = step;
-  a.drift->lost = 1;  // so that there is a new activation
+  a.drift->lost = Drift::kLost;  // so that there is a new activation
   if (a.loop) cudaGraphSetConditional(a.loop, step < a.steps);
 }
 

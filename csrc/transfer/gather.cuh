@@ -3,7 +3,6 @@
 #include "cuda/chain.cuh"
 #include "cuda/quad.cuh"
 #include "transfer/momentum.cuh"
-#include "transfer/own_rows.h"
 
 // G2P, gather, and the two adjoints that read nodes. A thread takes a particle and sums over its support one axis at a
 // time. Particles come in one of two orders, which `activate` chooses: item by item, with the nodes of the base block
@@ -230,6 +229,13 @@ constexpr int kGatherThreads = 128;
 template <class Task>
 constexpr int kResident = Task::Order == 2 && sizeof(typename Task::T) == 4 ? Task::resident : 2;
 
+// What the threads of whole warps have counted of where their particles go; `lost` are bits of Drift::Loss.
+__device__ inline void add_to_drift(Drift* drift, int strays, int lost) {
+  const int all = __reduce_add_sync(~0u, strays);
+  if (all > 0 && threadIdx.x % 32 == 0) atomicAdd(&drift->strays, all);
+  if (lost) atomicOr(&drift->lost, lost);
+}
+
 // Whether particles that move may stay in their activation for another step.
 template <int Order, class T, int D>
 class Follower {
@@ -250,12 +256,7 @@ class Follower {
       leave(t, home.scene, x);
   }
 
-  // By whole warps.
-  __device__ void tell(Drift* drift) const {
-    const int strays = __reduce_add_sync(~0u, strays_);
-    if (strays > 0 && threadIdx.x % 32 == 0) atomicAdd(&drift->strays, strays);
-    if (lost_) drift->lost = 1;
-  }
+  __device__ void tell(Drift* drift) const { add_to_drift(drift, strays_, lost_ ? Drift::kLost : 0); }
 
   // Bits of the neighbours of a slot that are active.
   __device__ static unsigned active_blocks(const Topology<T, D>& t, int slot) {
@@ -481,10 +482,7 @@ __global__ void __launch_bounds__(kGatherThreads, kResident<Task>) gather_kernel
 
 template <class Task, class Kernel>
 void launch_gather(const Task& task, Kernel* kernel, int64_t pieces, Stream stream) {
-  unsigned blocks = grid_size(pieces);
-  if constexpr (requires { task.is_mostly_idle(); })
-    if (task.is_mostly_idle()) blocks = std::max(blocks / kIdleShare, 1u);
-  launch_in_chain(kernel, blocks, kGatherThreads, 0, stream, task);
+  launch_in_chain(kernel, grid_size(task, pieces), kGatherThreads, 0, stream, task);
 }
 
 template <class Task>

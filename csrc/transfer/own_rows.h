@@ -9,9 +9,6 @@
 // of an item are neighbours in memory until the next activation. Given tensors are the first copy of the first P2G.
 namespace mpm {
 
-// Kernels that mostly have nothing to do take so many times fewer thread blocks, each of which costs time.
-constexpr unsigned kIdleShare = 8;
-
 struct OwnRows {
   int rows = 0;                  // of a copy; 0 where nobody owns the particles
   const Drift* drift = nullptr;  // tells whether there is a new activation; null where there is in any case

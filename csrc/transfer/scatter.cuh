@@ -3,7 +3,6 @@
 #include "cuda/chain.cuh"
 #include "cuda/quad.cuh"
 #include "transfer/momentum.cuh"
-#include "transfer/own_rows.h"
 
 // The kernel of P2G and scatter. One thread block takes the particles of one item, links them by cell in shared memory,
 // and adds up nodes in registers: each cell has one thread per leading node of the support, Order + 1 of them, which
@@ -721,9 +720,7 @@ void launch_scatter(const Source& source, bool deterministic, Stream stream) {
   using S = typename Source::Shape;
   const int64_t items = most_items(source.topology.max_blocks, source.topology.particles);
   if (items == 0) return;
-  unsigned blocks = grid_size(items);
-  if constexpr (requires { source.is_mostly_idle(); })
-    if (source.is_mostly_idle()) blocks = std::max(blocks / kIdleShare, 1u);
+  const unsigned blocks = grid_size(source, items);
   for (int colour = deterministic ? 0 : -1; colour < (deterministic ? 1 << S::D : 0); colour++)
     launch_in_chain(scatter_kernel<Source>, blocks, S::threads, S::shared_bytes, stream, source, colour);
 }

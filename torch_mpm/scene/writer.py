@@ -59,8 +59,8 @@ def _pinned(t: Tensor) -> Tensor:
     return torch.empty(t.shape, dtype=t.dtype, device="cpu", pin_memory=True)
 
 
-def _on_host(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Tensors that a device has made, copied on a stream of their own, so that this thread alone waits."""
+def _copied(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Tensors that a device has made, in host memory: on a stream of their own, so that this thread alone waits."""
     device = next(iter(tensors.values())).device
     cuda = device.type == "cuda"
     with torch.cuda.stream(torch.cuda.Stream(device)) if cuda else contextlib.nullcontext():
@@ -160,5 +160,5 @@ class FrameWriter:
 
     def _save(self, job: Job) -> None:
         with contextlib.suppress(torch.AcceleratorError):  # whose state is lost, and which the run fails with
-            checkpoint.save(self.checkpoint_path, _on_host(job.state), job.record)
+            checkpoint.save(self.checkpoint_path, _copied(job.state), job.record)
         self._saved, self._unsaved = time.perf_counter(), None
