@@ -78,6 +78,8 @@ def run_side_by_side(
     """The outcomes of all hands that have run so far, after each."""
     command = [*tool, *command]
     environment = {**os.environ, "OMP_NUM_THREADS": str(max(1, (os.cpu_count() or 1) // processes))}
+    if tool:  # memcheck loses a kernel that is loaded late and first launched by a graph: "misaligned address"
+        environment["CUDA_MODULE_LOADING"] = "EAGER"
     gpus = visible_gpus()
 
     def run(number: int) -> Outcome:

@@ -55,7 +55,8 @@ class Grid(Lattice):
         max_blocks: blocks in the pool; rollouts on CUDA take half as many again for blocks around those. None measures
             it from the positions of the first activation, and lets it grow with the scene: at once on the CPU; on CUDA,
             without synchronising, when less than a quarter is left.
-        deterministic: bit-identical results from run to run on CUDA too (the CPU always is).
+        deterministic: bit-identical results from run to run on CUDA too (the CPU always is). A pool that has grown with
+            a scene is part of what a run begins with: give each run a grid of its own.
 
     Raises:
         TypeError, ValueError: for a wrong argument, or a lattice of 2^31 blocks or more.

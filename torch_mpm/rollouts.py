@@ -67,15 +67,15 @@ def rollout(
         norms: records the norm of the gradient at states on the way; see `GradientNorms`.
 
     A `Step` of compiled laws without heat, FLIP and functions of the user's takes all steps in one op, or some, with
-    the results of single steps (to rounding; on CUDA to the last bit on deterministic grids); `Step.explain` tells. Its
-    gradients take the steps again from kept states, those of every `checkpoint` steps, sqrt(n) of them by default and
-    more where states are small. A kept state of a solid has 2 D + 2 D² numbers per particle (24 in 3-D, 96 bytes in
-    float32) and its history; while the backward pass goes through `checkpoint` steps, it holds about 2 D + 4 D² (42 in
-    3-D) for each of them, and half as much of the grid at most. Where all steps fit into `Checkpoints(memory=...)` that
-    is kept instead, and none is taken again. Second derivatives need single steps. On CUDA and without gradients, other
-    steps that call no function of the user's are replays of a CUDA graph of one; see `captured` for what else there is,
-    and `estimate_rollout` for what a rollout will take. Under `torch.autograd.detect_anomaly` a gradient that is NaN is
-    reported with its operation, substep and scene.
+    the results of single steps (to rounding; on CUDA and deterministic grids to the last bit, but for float32 without
+    gradients); `Step.explain` tells. Its gradients take the steps again from kept states, those of every `checkpoint`
+    steps, sqrt(n) of them by default and more where states are small. A kept state of a solid has 2 D + 2 D² numbers
+    per particle (24 in 3-D, 96 bytes in float32) and its history; while the backward pass goes through `checkpoint`
+    steps, it holds about 2 D + 4 D² (42 in 3-D) for each of them, and half as much of the grid at most. Where all steps
+    fit into `Checkpoints(memory=...)` that is kept instead, and none is taken again. Second derivatives need single
+    steps. On CUDA and without gradients, other steps that call no function of the user's are replays of a CUDA graph of
+    one; see `captured` for what else there is, and `estimate_rollout` for what a rollout will take. Under
+    `torch.autograd.detect_anomaly` a gradient that is NaN is reported with its operation, substep and scene.
 
     Raises:
         TypeError, ValueError: for a number of steps that is no whole number or out of range, or what `step` raises.
@@ -249,7 +249,8 @@ def pool_of_call(step: Step, state: State, n: int) -> tuple[int, int] | None:
 
     Nobody looks whether a pool must grow that has room for all blocks of the domain: where there are few, and a kernel
     takes many steps of few particles (`Substeps::persists`), or where many particles take more memory. A pool that they
-    leave room for is looked at less often, if steps do not pass over all of it.
+    leave room for is looked at less often, if steps do not pass over all of it. Of deterministic grids nothing depends
+    on how many blocks they have had, or a second run would not be the first one bit by bit.
     """
     grid = step.grid
     if not (grid.grows and state.x.is_cuda):
@@ -271,13 +272,15 @@ def has_mirrors(step: Step) -> bool:
 def takes_few_blocks(step: Step, state: State, n: int) -> bool:
     """Whether a kernel takes many steps of few particles, if the pool has room for all blocks."""
     grid = step.grid
-    if grid.block_count > FEW_BLOCKS or grid.max_blocks is None:
+    if grid.block_count > FEW_BLOCKS:
         return False
-    form = (step.transfer, step.stress_form, grid.kernel, grid.deterministic, has_mirrors(step))
-    if form != ("apic", "mls", "quadratic", False, False) or state.impulse is not None or n < LEAST_PERSISTENT:
+    form = (step.transfer, step.stress_form, grid.kernel, has_mirrors(step))
+    if form != ("apic", "mls", "quadratic", False) or state.impulse is not None or n < LEAST_PERSISTENT:
         return False
     if state.x.dtype != torch.float32 or not isinstance(step.law, CompiledLaw) or len(state) > MOST_PERSISTENT:
         return False
+    if grid.deterministic or grid.max_blocks is None:
+        return grid.deterministic
     # The pool has a half more than was active. Half of these blocks have particles, some of them more than one item.
     return grid.max_blocks / 3 + len(state) / 160 <= FEW_ITEMS
 

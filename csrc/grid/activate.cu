@@ -17,7 +17,7 @@
 // that it still does.
 // The scans pass over tiles of the table. Where it has many, over those alone that have active blocks, which `classify`
 // marks and `list_tiles` lists in their order; what they wrote is taken back before the next activation.
-// Deterministic mode replaces the ranks, which depend on the order of atomics, by a stable sort.
+// Deterministic mode replaces the ranks, which depend on the order of atomics, by the order of memory.
 namespace mpm::cuda {
 namespace {
 
@@ -66,7 +66,7 @@ struct Workspace {
   int *listed, *list;                   // number of tiles with active blocks, and which
   int tiles;
   int *key, *rank;               // [P] table index (-1 outside) and rank among its particles
-  int *slot, *slot_sorted, *id;  // [P], for the stable sort
+  int *slot, *slot_sorted, *id;  // [P], for the stable sort; slot_sorted is the index before it, too
   void* sort;
   size_t sort_size;
   int64_t size;
@@ -462,13 +462,30 @@ __device__ void place(const ActivateArguments<T, D>& a, const Workspace& w, int6
   if (i >= a.particles) return;
   const int key = w.key[i], first = key < 0 ? -1 : w.tally[key].count, base_slot = first < 0 ? -1 : a.table[key];
   schedule.base_slot[i] = base_slot;
+  const int rank = w.rank[i];
+  const int64_t position = first < 0 ? a.particles + first - rank : first + rank;
   if (a.deterministic) {
     w.slot[i] = base_slot < 0 ? a.slots() : base_slot;
-    w.id[i] = int(i);
+    w.id[i] = int(i) + first_row(a);
+    w.slot_sorted[position] = int(i);
   } else {
-    const int rank = w.rank[i];
-    a.index[first < 0 ? a.particles + first - rank : first + rank] = int(i) + first_row(a);
+    a.index[position] = int(i) + first_row(a);
   }
+}
+
+// In place of a sort, where one kernel does all: the particle at a position goes behind those of its block that are
+// before it in memory.
+template <class T, int D>
+__device__ void put_in_order(const ActivateArguments<T, D>& a, const Workspace& w, int64_t position) {
+  const int i = w.slot_sorted[position];
+  const int slot = lay_out_schedule<D>(a.schedule, a.slots(), a.particles).base_slot[i];
+  int64_t place = position;
+  if (slot >= 0) {
+    const int begin = a.offsets[slot], end = a.offsets[slot + 1];
+    place = begin;
+    for (int k = begin; k < end; k++) place += w.slot_sorted[k] < i;
+  }
+  a.index[place] = i + first_row(a);
 }
 
 // ---- Kernels
@@ -538,6 +555,9 @@ __global__ void __launch_bounds__(kThreads)
   offsets<true>(a, w, table);
   wait_for_all();
   for (int64_t i = start; i < rows; i += stride) place(a, w, i);
+  if (!a.deterministic) return;
+  wait_for_all();
+  for (int64_t i = start; i < a.particles; i += stride) put_in_order(a, w, i);
 }
 
 unsigned blocks_for(int64_t threads) { return unsigned((threads + kThreads - 1) / kThreads); }

@@ -102,10 +102,12 @@ class G2P2G {
       move_all();
       if (next < count) find(m.places[1 - turn_]);
       __syncthreads();
+      if (in_order() && threadIdx.x < 32) link_in_order(shared, here().end - here().begin);
       if (next < count) load(m.places[1 - turn_]);
       now = next;
       next = m.number;
       if (next < count) load_item(schedule, next);
+      if (in_order()) __syncthreads();
       add_particles(source.nodes, shared, here().following, false, [&] { add_all_strays(); }, [&] { empty(); });
       turn_ = 1 - turn_;
     }
@@ -128,6 +130,8 @@ class G2P2G {
   int strays_ = 0, lost_ = 0, turn_ = 0;
 
   __device__ const Topology<T, D>& topology() const { return source.topology; }
+
+  __device__ bool in_order() const { return is_fixed(source.nodes); }
 
   __device__ ItemPlace<T, D>& here() const { return m.places[turn_]; }
 
@@ -257,7 +261,8 @@ class G2P2G {
     const int row = SharedParticles<S>::row(k);
     const bool at_home = here().home.template locate<Order>(topology().geometry, to, cell, f);
     store_particle<S, T, D>(shared, row, f, source.contribution(particle));
-    shared.next[row] = uint16_t(atomicExch(&shared.head[list_of<S>(k, at_home, cell)], row));
+    const int list = list_of<S>(k, at_home, cell);
+    shared.next[row] = uint16_t(in_order() ? list : atomicExch(&shared.head[list], row));
     if (!at_home) stray(k, row, to);
   }
 

@@ -25,6 +25,8 @@ namespace mpm::cuda {
 // times[k + 1] = times[k] + dt, on the device.
 void add_up_times(double* times, double first, double dt, int64_t count, Stream stream);
 void resident_status(const ResidentStatusArguments& a, Stream stream);
+// The bits of the largest absolute value of `count` numbers; zero where there is none.
+void find_largest(const Field<const float>& numbers, int64_t count, int* bits, Stream stream);
 template <class T, int D>
 void next_grid(const NextGridArguments<T, D>& a, Stream stream);
 }  // namespace mpm::cuda

@@ -1,6 +1,7 @@
 #include "rollout/next_grid.h"
 
 #include "cuda/chain.cuh"
+#include "cuda/fixed_point.cuh"
 
 namespace mpm::cuda {
 namespace {
@@ -23,7 +24,7 @@ __device__ bool take_node(const NextGridArguments<T, D>& a, int slot, int local)
   const SlotUpdate<T, D> s = slot_update(a.update, slot);
   if (!s.active) return false;
   const int64_t node = int64_t(slot) * kBlockNodes<D> + local;
-  NodeRow<T, D> row = update_node(a.update, s, local, a.update.nodes[node]);
+  NodeRow<T, D> row = update_node(a.update, s, local, NodeRows<T, D>(a.update.nodes, a.fixed).at(node));
   if constexpr (Obstacles) {
     const ContactSlot<T, D> there = contact_slot(a.contact, slot);
     if (there.active)
@@ -32,7 +33,7 @@ __device__ bool take_node(const NextGridArguments<T, D>& a, int slot, int local)
   }
   if (a.watched && goes_far(a.update, s, row)) atomicOr(&a.watched->lost, Drift::kLost);
   a.update.updated[node] = row;
-  if (a.emptied) a.emptied[node] = {};
+  if (a.emptied) NodeRows<T, D>::empty(a.emptied, node, a.fixed);
   return true;
 }
 

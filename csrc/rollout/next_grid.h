@@ -1,5 +1,6 @@
 #pragma once
 
+#include "grid/fixed_point.h"
 #include "grid/grid_update.h"
 #include "grid/obstacle.h"
 #include "grid/topology.h"
@@ -11,6 +12,7 @@ namespace mpm {
 template <class T, int D>
 struct NextGridArguments {
   GridUpdateArguments<T, D> update;
+  FixedPoint fixed;     // of its nodes
   int near_blocks = 0;  // slots of the pool without the margin; of either those in use come first
   bool obstacles = false;
   ContactArguments<T, D> contact;    // its nodes unused

@@ -23,10 +23,10 @@ struct NodeVelocities {
   const GridUpdateArguments<T, D>& update;
   const ContactArguments<T, D>& contact;
   bool obstacles;
-  const NodeRow<T, D>* nodes;
+  NodeRows<T, D> nodes;
 
   __device__ Vector<T, D> at(const SlotUpdate<T, D>& there, int slot, int local) const {
-    const NodeRow<T, D> node = nodes[int64_t(slot) * kBlockNodes<D> + local];
+    const NodeRow<T, D> node = nodes.at(int64_t(slot) * kBlockNodes<D> + local);
     if (node.mass == T(0)) return zero_vector<T, D>();
     Vector<T, D> v = update_node(update, there, local, node).value;
     if (!obstacles) return v;
@@ -80,7 +80,8 @@ class ItemStep {
   __device__ void begin(int number) {
     const Schedule<const int> schedule = schedule_of(topology());
     const int4 e = reinterpret_cast<const int4*>(schedule.items)[number];
-    exists_ = int(threadIdx.x) < e.z - e.y;
+    count_ = e.z - e.y;
+    exists_ = int(threadIdx.x) < count_;
     particle_ = exists_ ? topology().index[e.y + threadIdx.x] : 0;
     if (threadIdx.x < 1 << D) {
       const int slot = schedule.neighbours[(e.x << D) + threadIdx.x];
@@ -114,8 +115,12 @@ class ItemStep {
       find();
       const int row = SharedParticles<S>::row(threadIdx.x);
       store_particle<S, T, D>(shared, row, f_, source.contribution(loaded));
-      shared.next[row] = uint16_t(atomicExch(&m.head[list_of<S>(threadIdx.x, stray_ < 0, cell_)], row));
+      const int list = list_of<S>(threadIdx.x, stray_ < 0, cell_);
+      shared.next[row] = uint16_t(in_order() ? list : atomicExch(&m.head[list], row));
     }
+    __syncthreads();
+    if (!in_order()) return;
+    if (threadIdx.x < 32) link_in_order(shared, count_);
     __syncthreads();
   }
 
@@ -126,7 +131,7 @@ class ItemStep {
   // Of linked particles.
   __device__ void scatter(T* nodes) {
     const SharedParticles<S> shared(memory, m.head);
-    const NodeField<T> field{nodes, 1 + D, 1 + D};
+    const NodeSums<T> field{{nodes, 1 + D, 1 + D}, source.nodes.fixed};
     add_particles(field, shared, m.slots, false, [&] { add_strays(field, shared); });
     empty_lists<S>(m.head);
   }
@@ -156,6 +161,8 @@ class ItemStep {
  private:
   __device__ const Topology<T, D>& topology() const { return source.topology; }
 
+  __device__ bool in_order() const { return is_fixed(source.nodes); }
+
   // Where the particle is.
   __device__ void find() {
     stray_ = -1;
@@ -168,7 +175,7 @@ class ItemStep {
   }
 
   // A warp takes one at a time.
-  __device__ void add_strays(const NodeField<T>& nodes, const SharedParticles<S>& shared) const {
+  __device__ void add_strays(const NodeSums<T>& nodes, const SharedParticles<S>& shared) const {
     for (int s = threadIdx.x / 32; s < m.strays; s += threads / 32)
       if (m.base[s] >= 0) add_stray(nodes, schedule_of(topology()), shared, m.row[s], m.base[s]);
   }
@@ -243,7 +250,8 @@ class ItemStep {
     follower.follow(topology(), m.home, active_, x_);
   }
 
-  bool exists_ = false;  // whether this thread has a particle
+  int count_ = 0;        // particles of the item
+  bool exists_ = false;  // whether this thread has one
   int particle_ = 0;
   unsigned active_ = 0;  // bits of the neighbours of the block that are
   Vector<T, D> x_;
@@ -277,10 +285,10 @@ struct UsedNodes {
       : count((used + of_margin) * kBlockNodes<D>),
         near(used * kBlockNodes<D>),
         gap((max_blocks - used) * kBlockNodes<D>) {}
-  __device__ void empty(T* nodes, int blocks) const {
+  __device__ void empty(T* nodes, const FixedPoint& fixed, int blocks) const {
     NodeRow<T, D>* const rows = reinterpret_cast<NodeRow<T, D>*>(nodes);
     for (int i = int(blockIdx.x * blockDim.x + threadIdx.x); i < count; i += blocks * int(blockDim.x))
-      rows[i < near ? i : i + gap] = {};
+      NodeRows<T, D>::empty(rows, i < near ? i : i + gap, fixed);
   }
 };
 
@@ -386,7 +394,7 @@ __global__ void __launch_bounds__(ItemStep<Source, Task>::threads)
   const bool ahead = alone && !a.scene_time;
   int step = first;
   for (bool more = true; more;) {
-    used.empty(a.nodes[(step + 1) % 3], blocks);
+    used.empty(a.nodes[(step + 1) % 3], source.nodes.fixed, blocks);
     each_item([&] {
       if (!alone) item.load(), item.link(), item.keep();
       item.scatter(a.nodes[step % 3]);
@@ -396,8 +404,11 @@ __global__ void __launch_bounds__(ItemStep<Source, Task>::threads)
 
     if (keeps) item.keep();
     each_outside([&](int p) { source.leave_out(p); });
-    const NodeVelocities<T, D> velocities{a.update, contact, a.obstacles,
-                                          reinterpret_cast<const NodeRow<T, D>*>(a.nodes[step % 3])};
+    const NodeVelocities<T, D> velocities{
+        a.update,
+        contact,
+        a.obstacles,
+        {reinterpret_cast<const NodeRow<T, D>*>(a.nodes[step % 3]), source.nodes.fixed}};
     FollowerOf<Task> follower;
     each_item([&] { item.gather(velocities, alone, follower); });
     each_outside([&](int p) { task.leave_out(p); });
@@ -410,7 +421,7 @@ __global__ void __launch_bounds__(ItemStep<Source, Task>::threads)
     if (blockIdx.x == 0 && a.scene_time)
       for (int b = threadIdx.x; b < t.scenes; b += threads) a.scene_time[b] += a.scene_dt[b];
   }
-  for (T* nodes : a.nodes) used.empty(nodes, blocks);
+  for (T* nodes : a.nodes) used.empty(nodes, source.nodes.fixed, blocks);
   if (blockIdx.x == 0) write_persistent_status(a, t.scenes, step - first);
   if (cluster) wait_for_cluster();  // others may still read what this one has counted
   if (!leads) return;

@@ -1,6 +1,8 @@
 #pragma once
 
+#include <cmath>
 #include <string>
+#include <type_traits>
 
 #include "grid/activate.op.h"
 #include "grid/impulse.op.h"
@@ -262,6 +264,7 @@ struct Substeps {
   Tensor stress, step_time;
   Tensor scene_time;              // the time of each scene now, where each has its own
   Tensor drifts;                  // one for each of two substeps in turn, where activations last
+  Tensor largest_mass;            // of a particle, where sums are fixed
   NextGridArguments<T, D> next;   // of these; its update and contact are those here
   Tensor impulse, impulse_slots;  // on obstacles and walls so far; where someone asks, see `add_impulses_to`
   bool obstacles = false, fused = false;
@@ -332,10 +335,18 @@ struct Substeps {
     activation.fresh = false;
   }
 
+  // Whether node sums do not depend on the order of their terms, in deterministic mode on CUDA. Of a call without
+  // gradients: the backward pass takes its steps again one by one.
+  bool sums_are_fixed() const {
+    return MPM_BACKEND == MPM_BACKEND_IS_cuda && sizeof(T) == sizeof(float) && in.lattice.deterministic() &&
+           in.resident && !has(in.impulse) && !has(in.scene_dt) && !update.walls.mirrored;
+  }
+
   // On CUDA an activation may serve several substeps: blocks around those with particles are active too, and G2P tells
-  // when they no longer suffice. Not where sums have an order, which is that of blocks.
-  void let_activations_last() {
-    if (MPM_BACKEND == MPM_BACKEND_IS_cpu || in.lattice.deterministic()) return;
+  // when they no longer suffice. Not where sums have an order, which is that of whole blocks.
+  void let_activations_last(backend::Stream stream) {
+    if (MPM_BACKEND == MPM_BACKEND_IS_cpu || (in.lattice.deterministic() && !sums_are_fixed())) return;
+    if (sums_are_fixed()) fix_sums(stream);
     drifts = empty_int(in.x, {2, sizeof(Drift) / sizeof(int)});
     torch::stable::zero_(drifts);
     p2g.drifted = true;
@@ -345,9 +356,23 @@ struct Substeps {
     activation.margin_blocks = int(std::clamp<int64_t>(activation.max_blocks / 2 + 64, 0, std::max<int64_t>(most, 0)));
   }
 
+  void fix_sums([[maybe_unused]] backend::Stream stream) {
+#if MPM_BACKEND == MPM_BACKEND_IS_cuda
+    if constexpr (std::is_same_v<T, float>) {
+      largest_mass = empty_int(in.x, {1});
+      int* const bits = static_cast<int*>(largest_mass.data_ptr());
+      backend::find_largest(p2g.mass, in.x.size(0), bits, stream);
+      const int of_mass = kUnitBits - std::ilogb(double(std::max<int64_t>(in.x.size(0), 1))) - 1;
+      const double most = kMostCellsPerStep * in.lattice.dx() / in.dt;
+      p2g.fixed = next.fixed = {bits, of_mass, of_mass - std::ilogb(most) - 1};
+      p2g.deterministic = false;
+    }
+#endif
+  }
+
   // Where there is a kernel for it, P2G computes the stress itself.
   void fuse(bool keeps_stress) {
-    fused = calls.size() == 1 && !has(in.material) && in.lattice.order() == 2 && !in.lattice.deterministic() &&
+    fused = calls.size() == 1 && !has(in.material) && in.lattice.order() == 2 && !p2g.deterministic &&
             p2g.form == StressForm::mls && calls[0].law->kernels<T, D>().p2g;
     if (fused && !keeps_stress) forget_stress();
   }
@@ -394,7 +419,7 @@ struct Substeps {
     if (in.lattice.order() != 2 || p2g.form != StressForm::mls || has(in.impulse) || update.walls.mirrored)
       return false;
     if (P == 0 || activation.geometry.blocks_per_scene > kMostResidentBlocks) return false;
-    return in.lattice.deterministic() || resident_pays<D>(P, in.scenes);
+    return (in.lattice.deterministic() && !sums_are_fixed()) || resident_pays<D>(P, in.scenes);
   }
 
   // Of the substeps that read what others of the same parity have written. The last one is activated in any case, so
@@ -567,6 +592,7 @@ template <class T, int D>
 void Substeps<T, D>::make_pool(backend::Stream stream) {
   const bool apart = obstacles && !next.obstacles;  // contact from the grid update
   pool.make(in.x, activation, apart, stream);
+  if (largest_mass.defined()) pool.nodes = empty(in.x, Pool<T, D>::nodes_shape(activation), ScalarType::Long);
   if (impulse.defined() && (MPM_BACKEND == MPM_BACKEND_IS_cpu || in.lattice.deterministic()))
     impulse_slots = empty(in.x, {activation.slots() + in.scenes, impulse_shape()[1] * kImpulse<D>}, ScalarType::Double);
   use_pool();

@@ -66,11 +66,12 @@ bool take_persistent(Substeps<T, D>& s, int* activated, int* status, backend::St
   if (refused) return false;
   const SubstepsInputs& in = s.in;
   PersistentArguments<T, D> a{{s.update, s.contact, s.obstacles, s.activation.max_blocks}, s.p2g, s.late, s.advance};
-  Tensor more = empty(in.x, {2 * s.pool.nodes.size(0), 1 + D});
+  const int64_t rows = s.pool.nodes.size(0);
+  Tensor more = empty(in.x, {2 * rows, 1 + D}, s.pool.nodes.scalar_type());
   backend::clear(more, stream);
   a.nodes[0] = static_cast<T*>(s.pool.nodes.data_ptr());
   a.nodes[1] = static_cast<T*>(more.data_ptr());
-  a.nodes[2] = a.nodes[1] + s.pool.nodes.size(0) * (1 + D);
+  a.nodes[2] = static_cast<T*>(torch::stable::narrow(more, 0, rows, rows).data_ptr());
   a.steps = int(in.n - 2);
   if (s.contact.step_time) a.step_time = s.contact.step_time + 1;
   a.contact.step_time = nullptr;
@@ -265,7 +266,7 @@ Results substeps(MPM_SUBSTEPS_PARAMETERS) {
       take_resident(s, 1, last_time, activated, now, stream);
       return;
     }
-    if (n > 1) s.let_activations_last();
+    if (n > 1) s.let_activations_last(stream);
     s.fuse(false);
     s.make_pool(stream);
     s.count_time(before, stream);

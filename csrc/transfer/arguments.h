@@ -1,6 +1,7 @@
 #pragma once
 
 #include "common/fields.h"
+#include "grid/fixed_point.h"
 #include "grid/topology.h"
 #include "transfer/momentum.h"
 
@@ -17,6 +18,7 @@ struct P2GArguments {
   bool deterministic = false;
   bool drifted = false;  // particles may be in other active blocks than they were activated in; with stress, on CUDA
   NodeField<T> nodes;    // zero on entry; 1 + D channels: mass, momentum
+  FixedPoint fixed;      // of the nodes, on CUDA
 };
 
 // ∂Φ/∂x_p of the trilinear form Φ = Σ_p Σ_i g_i · [N_i (value_p + scale moment_p (x_i − x_p)) + gradient_p ∇N_i] that

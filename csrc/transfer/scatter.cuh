@@ -1,6 +1,7 @@
 #pragma once
 
 #include "cuda/chain.cuh"
+#include "cuda/fixed_point.cuh"
 #include "cuda/quad.cuh"
 #include "transfer/momentum.cuh"
 
@@ -11,8 +12,9 @@
 // particles there are.
 //
 // A node gets N_i (a + B · i) + G · ∇N_i from a particle, i being the distance from the base node in cells: `Linear`
-// channels of this kind after `Plain` ones with B = G = 0. Deterministic mode adds blocks of one colour at a time, no
-// two of which share a node, with the particles in the order of the index tensor.
+// channels of this kind after `Plain` ones with B = G = 0. In deterministic mode particles are linked in the order of
+// the index tensor, and what an item gives is added in fixed point, or block by block: those of one colour at a time,
+// no two of which share a node.
 namespace mpm::cuda {
 
 template <class T>
@@ -269,11 +271,29 @@ struct CellOrder {
   int start[S::cells + 1];
 };
 
+// Numbers the particles of each cell in the order of the index tensor; by one warp. `next` holds the cell of each
+// particle before, and its number after.
+template <class S>
+__device__ void number_in_order(const SharedParticles<S>& shared, CellOrder<S>& order, int n) {
+  const int lane = threadIdx.x;
+  for (int first = 0; first < n; first += 32) {
+    const int row = SharedParticles<S>::row(first + lane), cell = first + lane < n ? shared.next[row] : -1;
+    const unsigned group = __match_any_sync(~0u, cell), before = group & ((1u << lane) - 1);
+    const int count = cell >= 0 ? order.start[cell] : 0;
+    __syncwarp();
+    if (cell >= 0) {
+      shared.next[row] = uint16_t(count + __popc(before));
+      if (before == 0) order.start[cell] = count + __popc(group);
+    }
+    __syncwarp();
+  }
+}
+
 // Finds the places of the particles index[begin, begin + n) in the order of their cells. Each thread leaves for its own
 // the number in `next`, counted in its cell, and the index in `pairs`, since places take the place of index.
 template <class S, class Source, class T, int D>
 __device__ void order_by_cell(const Source& source, const Topology<T, D>& t, const BaseBlock<T, D>& base_block,
-                              const SharedParticles<S>& shared, CellOrder<S>& order, int begin, int n) {
+                              const SharedParticles<S>& shared, CellOrder<S>& order, int begin, int n, bool in_order) {
   static_assert(S::pairs > 0 && sizeof(Pair<T>) >= sizeof(int));
   for (int c = threadIdx.x; c <= S::cells; c += S::threads) order.start[c] = 0;
   __syncthreads();
@@ -282,10 +302,14 @@ __device__ void order_by_cell(const Source& source, const Topology<T, D>& t, con
     int cell;
     T f[D];
     base_block.template locate<S::Order>(t.geometry, read_vector(source.position, p), cell, f);
-    shared.next[row] = uint16_t(atomicAdd(&order.start[cell], 1));
+    shared.next[row] = uint16_t(in_order ? cell : atomicAdd(&order.start[cell], 1));
     *reinterpret_cast<int*>(shared.pairs + row) = p;
   }
   __syncthreads();
+  if (in_order) {
+    if (threadIdx.x < 32) number_in_order(shared, order, n);
+    __syncthreads();
+  }
   if (threadIdx.x < 32) {
     constexpr int each = (S::cells + 1 + 31) / 32;
     int count[each], sum = 0;
@@ -327,7 +351,7 @@ __device__ void load_particles(const Source& source, const Topology<T, D>& t, in
   empty_lists<S>(shared.head);
   __syncthreads();
   if constexpr (may_settle)
-    if (settles) order_by_cell<S>(source, t, base_block, shared, order, begin, n);
+    if (settles) order_by_cell<S>(source, t, base_block, shared, order, begin, n, in_order);
 #pragma unroll 1
   for (int k = threadIdx.x; k < n; k += S::threads) {
     const int row = SharedParticles<S>::row(k);
@@ -356,6 +380,35 @@ __device__ void load_particles(const Source& source, const Topology<T, D>& t, in
   if (in_order) {
     if (threadIdx.x < 32) link_in_order(shared, n);
     __syncthreads();
+  }
+}
+
+// The nodes that P2G adds to, and whether in fixed point.
+template <class T>
+struct NodeSums : NodeField<T> {
+  FixedPoint fixed;
+};
+
+template <class T>
+__device__ bool is_fixed(const NodeField<T>&) {
+  return false;
+}
+template <class T>
+__device__ bool is_fixed(const NodeSums<T>& nodes) {
+  return sizeof(T) == sizeof(float) && nodes.fixed.largest_mass;
+}
+
+// Adds to words of rows of nodes in fixed point, from one of a row on.
+template <class S, int N, class T>
+__device__ void add_fixed_words(const NodeField<T>&, int64_t, int, const T (&)[N]) {}
+template <class S, int N>
+__device__ void add_fixed_words(const NodeSums<float>& nodes, int64_t row, int first, const float (&value)[N]) {
+  const FixedUnits units(nodes.fixed);
+  FixedRow<S::channels - 1>* const rows = reinterpret_cast<FixedRow<S::channels - 1>*>(nodes.pointer) + row;
+#pragma unroll
+  for (int e = 0; e < N; e++) {
+    const int word = first + e;
+    if (value[e] != 0) add_fixed(rows[word / S::channels].word, word % S::channels, value[e], units);
   }
 }
 
@@ -441,9 +494,9 @@ __device__ void node_value(const SharedParticles<S>& shared, int row, const int 
 
 // The nodes of the support of one particle, by a warp, a lane to a node: node_row(offset) is the row of the node, -1 of
 // a block that is not active.
-template <class S, class T, class NodeRow>
-__device__ void add_stray(const NodeField<T>& nodes, const SharedParticles<S>& shared, int row,
-                          const NodeRow& node_row) {
+template <class S, class Nodes, class NodeRow>
+__device__ void add_stray(const Nodes& nodes, const SharedParticles<S>& shared, int row, const NodeRow& node_row) {
+  using T = typename S::T;
   constexpr int D = S::D, count = D == 2 ? S::support * S::support : S::support * S::slab;
   for (int n = threadIdx.x % 32; n < count; n += 32) {
     int offset[D];
@@ -453,6 +506,10 @@ __device__ void add_stray(const NodeField<T>& nodes, const SharedParticles<S>& s
     if (at < 0) continue;
     T value[S::channels];
     node_value(shared, row, offset, value);
+    if (is_fixed(nodes)) {
+      add_fixed_words<S>(nodes, at, 0, value);
+      continue;
+    }
     T* const to = nodes.pointer + at * nodes.stride;
     if constexpr (S::channels == 4) {
       if (is_dense<S>(nodes)) {
@@ -466,9 +523,9 @@ __device__ void add_stray(const NodeField<T>& nodes, const SharedParticles<S>& s
 }
 
 // The same of a particle whose base node is in the row `first`.
-template <class S, class T>
-__device__ void add_stray(const NodeField<T>& nodes, const Schedule<const int>& schedule,
-                          const SharedParticles<S>& shared, int row, int first) {
+template <class S, class Nodes>
+__device__ void add_stray(const Nodes& nodes, const Schedule<const int>& schedule, const SharedParticles<S>& shared,
+                          int row, int first) {
   constexpr int D = S::D;
   const int slot = first / kBlockNodes<D>;
   add_stray<S>(nodes, shared, row, [&](const int (&offset)[D]) -> int64_t {
@@ -579,8 +636,8 @@ __device__ Quad<T> quad_sum(const T* sums, int (&node)[S::D], int first_word, bo
 }
 
 // Adds what nodes get in a round to the grid, four words at a time.
-template <class S, int Round, class T, int D>
-__device__ void flush_tile(const NodeField<T>& nodes, const int slots[1 << D], const T* sums, bool in_order) {
+template <class S, int Round, int D, class Nodes, class T>
+__device__ void flush_tile(const Nodes& nodes, const int slots[1 << D], const T* sums, bool in_order) {
   constexpr int K = S::channels, width = S::width, lanes = K == 4 ? 1 : 4;
   constexpr int count = (D == 2 ? width : width * width) * S::row_quads * lanes;
   const bool dense = is_dense<S>(nodes);
@@ -597,7 +654,9 @@ __device__ void flush_tile(const NodeField<T>& nodes, const int slots[1 << D], c
     if (slot < 0 || t % lanes != 0) continue;
     if (value.e[0] == T(0) && value.e[1] == T(0) && value.e[2] == T(0) && value.e[3] == T(0)) continue;
     const int64_t row = int64_t(slot) * kBlockNodes<D> + node_in_block<D>(node);
-    if (dense) {
+    if (is_fixed(nodes)) {
+      add_fixed_words<S>(nodes, row, first_word, value.e);
+    } else if (dense) {
       add_to_nodes(nodes.pointer + row * K + first_word, value.e, in_order);
     } else {
 #pragma unroll
@@ -612,9 +671,10 @@ __device__ void flush_tile(const NodeField<T>& nodes, const int slots[1 << D], c
 
 // Adds the particles in shared memory to the nodes, and lets `strays` add those that are in no list; `when_added` is
 // called when none of them is needed any more. All threads have to wait before that memory is used again.
-template <class S, class T, class AddStrays, class WhenAdded>
-__device__ void add_particles(const NodeField<T>& nodes, const SharedParticles<S>& shared, const int* slots,
-                              bool in_order, const AddStrays& add_strays, const WhenAdded& when_added) {
+template <class S, class Nodes, class AddStrays, class WhenAdded>
+__device__ void add_particles(const Nodes& nodes, const SharedParticles<S>& shared, const int* slots, bool in_order,
+                              const AddStrays& add_strays, const WhenAdded& when_added) {
+  using T = typename S::T;
   T* const sums = reinterpret_cast<T*>(shared.quads);
   const Walker<S> walker;
   T sum[S::slab][S::channels] = {};
@@ -629,18 +689,18 @@ __device__ void add_particles(const NodeField<T>& nodes, const SharedParticles<S
   put_slab<S, 0>(sum, sums);
   when_added();
   __syncthreads();
-  flush_tile<S, 0, T, S::D>(nodes, slots, sums, in_order);
+  flush_tile<S, 0, S::D>(nodes, slots, sums, in_order);
   if constexpr (S::rounds == 2) {
     __syncthreads();
     put_slab<S, 1>(sum, sums);
     __syncthreads();
-    flush_tile<S, 1, T, S::D>(nodes, slots, sums, in_order);
+    flush_tile<S, 1, S::D>(nodes, slots, sums, in_order);
   }
 }
 
-template <class S, class T, class AddStrays>
-__device__ void add_particles(const NodeField<T>& nodes, const SharedParticles<S>& shared, const int* slots,
-                              bool in_order, const AddStrays& add_strays) {
+template <class S, class Nodes, class AddStrays>
+__device__ void add_particles(const Nodes& nodes, const SharedParticles<S>& shared, const int* slots, bool in_order,
+                              const AddStrays& add_strays) {
   add_particles(nodes, shared, slots, in_order, add_strays, [] {});
 }
 
@@ -665,7 +725,7 @@ __device__ void scatter_item(const Source& source, const Topology<typename Sourc
   const int slot = threadIdx.x < 1 << D ? schedule_of(t).neighbours[(item.slot << D) + threadIdx.x] : -1;
   for (int begin = item.begin; begin < item.end; begin += S::batch) {
     load_particles<S>(source, t, item.block, m.base_block, shared, m.strays, begin, min(S::batch, item.end - begin),
-                      in_order);
+                      in_order || is_fixed(source.nodes));
     if (threadIdx.x < 1 << D) m.slots[threadIdx.x] = slot;
     add_particles(source.nodes, shared, m.slots, in_order, [&] {
       if constexpr (Source::drifts)
@@ -736,12 +796,12 @@ struct MomentumSource {
   // With fewer registers the loads of the stress would wait for each other.
   static constexpr int resident = !with_stress && Order == 2 && D == 3 && sizeof(T) == 4 ? 5 : 0;
   Topology<T, D> topology;
-  NodeField<T> nodes;
+  NodeSums<T> nodes;
   Columns<const T, D> position;
   MomentumFields<Order, T, D> fields;
 
   explicit MomentumSource(const P2GArguments<T, D>& a)
-      : topology(a.topology), nodes(a.nodes), position(a.x), fields(a) {}
+      : topology(a.topology), nodes{a.nodes, a.fixed}, position(a.x), fields(a) {}
 
   __device__ ParticleMomentum<T, D> load(int p, int scene) const { return fields.read(p, scene, with_stress); }
   __device__ Contribution<T, D, 1, D> contribution(const ParticleMomentum<T, D>& particle) const {
