@@ -123,6 +123,20 @@ def test_a_lost_scene_is_frozen_told_of_and_reset(device):
         assert_equal(envs.scene(k), other.scene(k), exactly=device == "cpu")
 
 
+def test_clocks_of_heat(device):
+    """What depends on the time gets that of each scene."""
+    seen = []
+    flux = mpm.heat_boundaries.Flux(mpm.heat_boundaries.FreeSurface(), lambda time: seen.append(time) or 0.0 * time)
+    step = step_of(2, device)
+    step.heat = mpm.Heat(step.grid, conductivity=1.0, specific_heat=1.0, boundaries=[flux])
+    states = [one(k, device) for k in range(2)]
+    envs = mpm.Environments(step, [state.replace(temperature=torch.ones_like(state.mass)) for state in states])
+    envs.advance(2, DT)
+    envs.time[1] = 0.5
+    envs.advance(1, DT)
+    assert seen[-1].tolist() == pytest.approx([2 * DT, 0.5])
+
+
 def test_clocks_of_moving_obstacles(device):
     """A reset scene sees its paddle begin anew."""
     paddle = mpm.Box((0.5, 0.0), (0.2, 0.2), velocity=(0.0, 5.0), end=2.5 * N * DT)

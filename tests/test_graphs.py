@@ -20,6 +20,21 @@ def heated(dim: int, device: str, **options) -> tuple[mpm.Step, mpm.State]:
     return step, state.replace(temperature=300 + 40 * state.x[:, 0])
 
 
+def held(dim: int, device: str) -> tuple[mpm.Step, mpm.State]:
+    """A hot ball that moves, in the list of the heat alone."""
+    step, state = heated(dim, device)
+    ball = mpm.Sphere((0.5,) * dim, 0.15, velocity=(0.0, 4.0, 0.0)[:dim])
+    step.heat.boundaries.append(mpm.heat_boundaries.FixedSurface(ball, 350.0))
+    return step, state
+
+
+def awaited(dim: int, device: str) -> tuple[mpm.Step, mpm.State]:
+    """An obstacle that is there from the time zero on, and a state before it."""
+    step, state = heated(dim, device)
+    step.boundaries.append(mpm.Sphere((0.5,) * dim, 0.15))
+    return step, state.replace(time=-15.5 * DT)
+
+
 def mixed(dim: int, device: str) -> tuple[mpm.Step, mpm.State]:
     """FLIP, a law that reads a temperature from a table, and an obstacle that moves."""
     soft = mpm.NeoHookean(E=mpm.Table([280.0, 320.0], [2e4, 1e4]), nu=0.3)
@@ -32,7 +47,7 @@ def mixed(dim: int, device: str) -> tuple[mpm.Step, mpm.State]:
 
 
 @pytest.mark.cuda
-@pytest.mark.parametrize("make", [heated, mixed])
+@pytest.mark.parametrize("make", [heated, held, awaited, mixed])
 def test_replays_are_single_steps(make, dim):
     step, state = make(dim, "cuda")
     again = make(dim, "cuda")[0]

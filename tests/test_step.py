@@ -279,6 +279,32 @@ def test_a_network_acts_on_the_grid_and_a_module_is_the_law(device):
     assert float(net.weight.grad.abs().min()) > 0 and float(stiffness.grad.abs()) > 0
 
 
+def test_who_looks_at_the_time():
+    """Moving obstacles and functions of the time do, in the heat too; and what the library does not know may."""
+    heat = mpm.heat_boundaries
+    still, moving = (mpm.Sphere((0.5, 0.5), 0.1, velocity=v) for v in (None, (1.0, 0.0)))
+    quiet = [heat.FixedSurface(still, 1.0), heat.Convection(heat.FreeSurface(), 1.0, 2.0), heat.Source(lambda T: T)]
+    watching = [
+        heat.Fixed(moving, 1.0),
+        heat.FixedSurface(mpm.Sphere((0.5, 0.5), 0.1, start=1.0), 1.0),
+        heat.Radiation(heat.FreeSurface(), 0.5, lambda time: time),
+        heat.Flux(heat.FreeSurface(), lambda time: time),
+    ]
+    step = make_step(2, boundaries=[still])
+    assert not step.reads_time
+    step.heat = mpm.Heat(step.grid, 1.0, 1.0, boundaries=quiet)
+    assert not step.reads_time
+    for term in watching:
+        step.heat.boundaries = [*quiet, term]
+        assert step.reads_time
+    step.heat = None
+    for boundaries in ([moving], [still, torch.nn.Identity()]):
+        step.boundaries = boundaries
+        assert step.reads_time
+    step.boundaries, step.on_particles = [], lambda state, dt: state
+    assert step.reads_time
+
+
 def test_problems_are_reported_with_the_particle_and_the_step(device):
     step = make_step(2)
     state = block_state(2, device)

@@ -24,7 +24,6 @@ import torch
 from torch import Tensor
 
 from .errors import check_count, shape_of
-from .graphs import looks_at_time
 from .impulses import Impulses
 from .pause import standing
 from .rollouts import rollout
@@ -131,7 +130,7 @@ class Environments:
     def advance(self, n: int, dt: float | Tensor) -> None:
         """Take n steps of dt [s], a number or a tensor [B]; see `rollout`. Frozen scenes stand still."""
         state = self.state
-        if self.step.on_particles is not None or any(looks_at_time(boundary) for boundary in self.step.boundaries):
+        if self.step.reads_time:
             state = state.replace(time=self.time.to(state.x.dtype))
         elapsed = dt.double() if isinstance(dt, Tensor) else torch.full_like(self.time, dt)
         elapsed = torch.where(self.frozen | ~(elapsed > 0), 0.0, n * elapsed)

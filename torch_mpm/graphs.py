@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import collections
 import contextlib
-import math
 import threading
 from collections.abc import Sequence
 from typing import Any
@@ -13,7 +12,6 @@ import torch
 from torch import Tensor, nn
 
 from .activation_record import ActivationRecord
-from .boundaries import Obstacle
 from .capture import GraphCache
 from .errors import check_count, shape_of
 from .grid import Grid
@@ -60,15 +58,9 @@ def obstacle_to_replays(step: Any, state: State, dt: float | Tensor) -> str | No
         return "an implicit step waits for its solve"
     if step.heat is not None and step.heat.method == "multigrid":
         return "multigrid does all of its iterations in a graph"
-    if state.x.dtype != torch.float64 and any(looks_at_time(b) for b in step.boundaries):
+    if state.x.dtype != torch.float64 and step.boundaries.reads_time:
         return f"obstacles would look at a time in {str(state.x.dtype).removeprefix('torch.')}"
     return _foreign(step, state.x.device, [])
-
-
-def looks_at_time(boundary: Any) -> bool:
-    if not isinstance(boundary, Obstacle):
-        return getattr(boundary, "reads_time", True)  # what the library has elsewhere may say that it does not
-    return boundary.moves or boundary.start != 0 or boundary.end != math.inf
 
 
 _NUMBERS = (type(None), bool, int, float, str, torch.dtype, torch.device)
@@ -110,7 +102,9 @@ def replayed(step: Step, state: State, n: int, dt: float) -> State:
     The first step from Python makes what steps keep, and asks about these tensors what would be a wait in the graph.
     """
     time = time_after(state.time, dt, n)
-    if n > LEAST_STEPS:  # what begins later is made now, too: in a graph, nobody knows what time it is
+    # What begins later is made now, too: in a graph, nobody knows what time it is. Where nobody asks it stays a number,
+    # but before the time zero, when obstacles begin that do not say otherwise.
+    if n > LEAST_STEPS and (step.reads_time or state.time < 0):
         state = state.replace(time=_time_tensor(state))
     if n > 0:
         state, n = step(state, dt), n - 1
@@ -147,7 +141,7 @@ class _Replays:
 
     def __init__(self, step: Step, state: State, dt: float, blocks: int) -> None:
         self.blocks = blocks
-        self.state = state.map(_copied).replace(time=_time_tensor(state))
+        self.state = state.map(_copied)
         impulse = None if state.impulse is None else _copied(state.impulse)
         self.state = self.state.replace(material=state.material, scene=state.scene, ids=state.ids, impulse=impulse)
         self._graph = torch.cuda.CUDAGraph()

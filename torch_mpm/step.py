@@ -262,6 +262,12 @@ class Step(TensorModule):
         return nodes, *self.integrator.velocities(self, blocks, state, nodes, dt)
 
     @property
+    def reads_time(self) -> bool:
+        """Whether something that acts on the particles or nodes may look at the time."""
+        lists = [self.boundaries] if self.heat is None else [self.boundaries, self.heat.boundaries]
+        return self.on_particles is not None or any(boundaries.reads_time for boundaries in lists)
+
+    @property
     def solve_report(self) -> ImplicitReport | None:
         """How the latest implicit step was solved; None before the first, and of explicit steps."""
         return None if self.integrator is None else self.integrator.report

@@ -26,6 +26,11 @@ class BoundaryList(nn.Module, MutableSequence[Any]):
             raise TypeError(f"boundaries must be a list of obstacles, got {shape_of(boundaries)}: put it in a list")
         self._keep(list(boundaries))
 
+    @property
+    def reads_time(self) -> bool:
+        """Whether an entry looks at the time; one that does not say whether it does may."""
+        return any(getattr(entry, "reads_time", True) for entry in self.entries)
+
     def __len__(self) -> int:
         return len(self.entries)
 

@@ -197,6 +197,11 @@ class Obstacle(RigidMotion):
 
     # -- when and where it is there
 
+    @property
+    def reads_time(self) -> bool:
+        """Whether it moves, or comes or goes after the time zero."""
+        return self.moves or self.start != 0 or self.end != math.inf
+
     def _absent(self, scene: Tensor | None, time: float | Tensor) -> bool:
         if scene is None and self.scene not in (None, 0):
             return True

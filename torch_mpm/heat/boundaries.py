@@ -222,7 +222,19 @@ def node_weights(blocks: Blocks, x: Tensor, scene: Tensor | None) -> tuple[Tenso
 
 
 class Term(TensorModule):
-    """What adds to the nodes by `apply(nodes)`, a module with the tensors and parameters of its arguments."""
+    """What adds to the nodes by `apply(nodes)`, a module with the tensors and parameters of its arguments.
+
+    Attributes:
+        timed: names of those that may be functions of the time, or obstacles that move.
+    """
+
+    timed: tuple[str, ...] = ()
+
+    @property
+    def reads_time(self) -> bool:
+        """Whether it looks at the time."""
+        values = (getattr(self, name) for name in self.timed)
+        return any(getattr(value, "reads_time", callable(value)) for value in values)
 
 
 class Flux(Term):
@@ -235,6 +247,8 @@ class Flux(Term):
     Raises:
         ValueError: for a flux that is not finite.
     """
+
+    timed = ("flux",)
 
     def __init__(self, surface: Surface | FreeSurface, flux: Timed) -> None:
         self.surface, self.flux = _surface(surface), _checked("flux", flux)
@@ -254,6 +268,8 @@ class Convection(Term):
     Raises:
         ValueError: for a negative coefficient, or values that are not finite.
     """
+
+    timed = ("coefficient", "ambient")
 
     def __init__(self, surface: Surface | FreeSurface, coefficient: Timed, ambient: Timed) -> None:
         self.surface, self.ambient = _surface(surface), _checked("ambient", ambient)
@@ -275,6 +291,8 @@ class Radiation(Term):
     Raises:
         ValueError: for an emissivity outside [0, 1], or an ambient temperature that is not finite.
     """
+
+    timed = ("emissivity", "ambient")
 
     def __init__(self, surface: Surface | FreeSurface, emissivity: Timed, ambient: Timed) -> None:
         self.surface, self.ambient = _surface(surface), _checked("ambient", ambient)
@@ -303,6 +321,8 @@ class Fixed(Term):
     Raises:
         ValueError: for a temperature that is not finite.
     """
+
+    timed = ("region", "temperature")
 
     def __init__(self, region: Obstacle | Callable[[Tensor], Tensor], temperature: Timed) -> None:
         if not callable(region):
@@ -336,6 +356,8 @@ class FixedSurface(Term):
     Raises:
         ValueError: for a region that is no obstacle, or a temperature that is not finite.
     """
+
+    timed = ("region", "temperature")
 
     WIDTH = 2.0
     """w in dx: below 1.5 the rows of particles show."""

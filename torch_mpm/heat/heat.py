@@ -93,6 +93,7 @@ class Heat(nn.Module):
             reports.
     """
 
+    boundaries: BoundaryList
     conductivity: Any
     specific_heat: Any
     melting_point: Any
@@ -126,7 +127,8 @@ class Heat(nn.Module):
         check_choice("method", method, METHODS)
         if method == "chebyshev" and any(isinstance(boundary, FixedSurface) for boundary in boundaries):
             raise ValueError('method must be "cg" or "multigrid" where a boundary is a FixedSurface, got "chebyshev"')
-        self.grid, self.boundaries, self.transfer = grid, boundaries, transfer
+        self.grid, self.transfer = grid, transfer
+        self.boundaries = boundaries  # type: ignore[assignment]
         self.plastic_heating, self.reference = float(plastic_heating), float(reference)
         self.tolerance, self.max_iterations, self.method = float(tolerance), int(max_iterations), method
         not_negative, positive = (lambda v: v >= 0), (lambda v: v > 0)
