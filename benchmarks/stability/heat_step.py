@@ -98,7 +98,7 @@ class Exact(mpm.Heat):
         decay = V.T * (sigma**2 / (1 + sigma**2)) @ V
         after = by_site(torch.where(free, nodes.theta, 0))
         after[:, rows] -= (after[:, rows] * root) @ decay / root
-        return blocks.from_dense(after.reshape(dense.shape))[:, 0]
+        return blocks.from_dense(after.reshape(dense.shape))[:, 0] - nodes.theta
 
 
 def positions(case: Case, dx: float) -> tuple[Tensor, int]:

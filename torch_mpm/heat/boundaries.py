@@ -109,6 +109,9 @@ class HeatNodes:
 
     def add_linear(self, coefficient: Tensor, power: Tensor) -> None:
         """Heat power − coefficient θ [N] [W], taken at the end of the step."""
+        if self.exchange is not None and self.source is not None:  # in one kernel
+            self.exchange, self.source = torch._foreach_add([self.exchange, self.source], [coefficient, power])
+            return
         self.exchange = coefficient if self.exchange is None else self.exchange + coefficient
         self.add_source(power)
 

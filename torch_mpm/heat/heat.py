@@ -225,15 +225,15 @@ class Heat(nn.Module):
         blend = varying if self.transfer == "hybrid" else 0.0 if self.transfer == "flip" else 1.0
         weights = (heat_capacity,) if isinstance(blend, float) else (heat_capacity, blend)
         (total, *_), means = _averages(blocks, state.x, weights, theta, gradient)
-        initial, smooth = means[0], means[-1]
-        nodes = HeatNodes(blocks, state, volume, conductance, total, initial, self.reference)
+        smooth = means[-1]
+        nodes = HeatNodes(blocks, state, volume, conductance, total, means[0], self.reference)
         for boundary in self.boundaries:
             boundary.apply(nodes)
         if self.plastic_heating and dissipated is not None:
             seconds = step.where(step > 0, 1) if isinstance(step, Tensor) else step
             power = self.plastic_heating * dissipated * state.volume / seconds
             nodes.add_source(scatter(blocks, state.x, power[:, None])[:, 0])
-        increment = self._solve(nodes, dt) - initial
+        increment = self._solve(nodes, dt)
         theta, gradient = self._to_particles(nodes, increment, smooth, blend, theta, gradient, motion, step)
         extra = dict(state.extra)
         if gradient is not None:
@@ -243,7 +243,7 @@ class Heat(nn.Module):
         return {"temperature": theta, "extra": extra} if extra else {"temperature": theta}
 
     def _solve(self, nodes: HeatNodes, dt: float | Tensor) -> Tensor:
-        """Temperature of the nodes at the end of the step [N]."""
+        """Change of the temperature of the nodes in the step [N]."""
         conductance = nodes.left_conductance()
         start = nodes.theta
         if nodes.fixed is not None and nodes.held is not None:
@@ -257,7 +257,7 @@ class Heat(nn.Module):
         if isinstance(dt, Tensor):
             solved = solved | (dt.detach() == 0)  # a scene that is paused has nothing to solve
         self._record(solved, solve.residual)
-        return start + solve.increment
+        return solve.increment if start is nodes.theta else solve.increment + (start - nodes.theta)
 
     def _to_particles(
         self,
@@ -335,7 +335,7 @@ class Heat(nn.Module):
                     self.unsolved = torch.zeros(converged.shape, dtype=torch.int32, device=converged.device)
                     self.residual = torch.zeros(residual.shape, dtype=torch.float64, device=residual.device)
             self.unsolved += ~converged
-            torch.maximum(self.residual, torch.where(converged, 0, residual), out=self.residual)
+            torch.maximum(self.residual, torch.where(converged, self.residual, residual), out=self.residual)
 
     def problems(self) -> dict[str, Problem]:
         """What became of the solves so far, by kind as in `Failures`, without synchronising."""
