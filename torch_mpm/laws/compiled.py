@@ -328,7 +328,11 @@ class SolidLaw(CompiledLaw):
         if not self._engineering:
             return self.mu, self.lam
         E, nu = self.E, self.nu
-        return E * (0.5 / (1 + nu)), E * (nu / ((1 + nu) * (1 - 2 * nu)))  # products: of E by temperature alone
+        factors = 0.5 / (1 + nu), nu / ((1 + nu) * (1 - 2 * nu))
+        if isinstance(E, Tensor) and not isinstance(nu, Tensor):  # as E by temperature: in one kernel
+            mu, lam = torch._foreach_mul([E, E], factors)
+            return mu, lam
+        return E * factors[0], E * factors[1]
 
 
 def check_value(name: str, value: Value, expected: str, holds: Callable[[Any], Any], infinite: bool = False) -> Value:
