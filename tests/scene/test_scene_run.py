@@ -6,6 +6,7 @@ import random
 import resource
 import signal
 import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -274,6 +275,12 @@ def test_twenty_sigkills_at_random_moments(tmp_path):
     # The scene takes longer than all the delays together, so that every kill meets a run at work.
     done = killed_and_resumed(tmp_path, 20, 200.0, lambda rng, k: rng.uniform(1.0, 4.0))
     assert done == 20
+
+
+def test_threads_take_turns_soon_while_a_run_lasts(tmp_path):
+    before, seen = sys.getswitchinterval(), []
+    Scene(**disc(device="cpu")).run(tmp_path / "out", progress=lambda figures: seen.append(sys.getswitchinterval()))
+    assert max(seen) < 1e-3 <= before == sys.getswitchinterval()
 
 
 # ---- what goes wrong

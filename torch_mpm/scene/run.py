@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
 import platform
-import signal
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from importlib import metadata
 from pathlib import Path
-from types import FrameType
 from typing import Any, NamedTuple
 
 import torch
@@ -28,6 +25,7 @@ from . import checkpoint, fields, heap
 from .build import Built
 from .diagnose import SceneFailure, replay, wrong
 from .folder import CHECKPOINT, LAST_GOOD, claim, locked, output_errors, prepare, record_summary
+from .process import prompt_turns, stop_signals
 from .scene import Scene
 from .writer import Copier, Copies, FrameWriter
 
@@ -94,7 +92,7 @@ def run(
         claim(folder, fingerprint, resume)
     simulation = Simulation(scene, scene.build())
     layout = simulation.layout(source, fingerprint)
-    with _stop_signals() as stop, output_errors(folder), locked(folder), torch.no_grad():
+    with stop_signals() as stop, prompt_turns(), output_errors(folder), locked(folder), torch.no_grad():
         claim(folder, fingerprint, resume)  # again: another process may have been here before the lock
         prepare(folder, scene, layout, fingerprint)
         writer = simulation.open(folder, layout)
@@ -478,28 +476,7 @@ def versions() -> dict[str, str]:
     return {"torch_mpm": own, "torch": str(torch.__version__), "python": platform.python_version()}
 
 
-# ---- signals and failures
-
-
-@contextlib.contextmanager
-def _stop_signals() -> Iterator[Callable[[], bool]]:
-    """SIGINT and SIGTERM ask to stop after the frame; a second SIGINT stops at once."""
-    asked: list[int] = []
-
-    def ask(number: int, frame: FrameType | None) -> None:
-        if asked and number == signal.SIGINT:
-            raise KeyboardInterrupt
-        asked.append(number)
-
-    try:
-        previous = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
-    except ValueError:  # not the main thread, which alone may handle signals
-        previous = {}
-    try:
-        yield lambda: bool(asked)
-    finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)
+# ---- failures
 
 
 def _save_last_good(folder: Path, state: State, failure: SceneFailure) -> str:
