@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from importlib import metadata
+from itertools import accumulate
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -445,16 +446,16 @@ def joined(state: State, layer: State) -> State:
 
 def energies(step: Any, state: Any, figures: Figures) -> dict[str, Tensor]:
     """Kinetic, elastic and potential energy [J], momentum [kg m/s] and heat [J] of all particles, summed in float64."""
-    v, momentum = state.v.double(), state.mass.double()[:, None] * state.v
-    gravity = step.gravity
+    mass = state.mass.double()[:, None]
+    momentum = mass * state.v
     sums = {
-        "kinetic_energy": 0.5 * (momentum * v).sum(),
-        "elastic_energy": (state.volume * figures.energy).double().sum(),
+        "kinetic_energy": 0.5 * (momentum * state.v).sum(),
+        "elastic_energy": (state.volume * figures.energy).sum(dtype=torch.float64),
         "momentum": momentum.sum(0),
     }
-    if gravity is not None:
-        rows = gravity if gravity.dim() == 1 else gravity[state.scene.long()]
-        sums["potential_energy"] = -(state.mass.double()[:, None] * state.x * rows).sum()
+    if step.gravity is not None:
+        rows = step.gravity if step.gravity.dim() == 1 else step.gravity.index_select(0, state.scene)
+        sums["potential_energy"] = -(mass * state.x * rows).sum()
     if step.heat is not None:
         sums["heat"] = step.heat.heat_content(state).double().sum()
     return sums
@@ -462,9 +463,12 @@ def energies(step: Any, state: Any, figures: Figures) -> dict[str, Tensor]:
 
 def on_host(tensors: Mapping[str, Tensor]) -> dict[str, Any]:
     """Tensors on one device as numbers in float64, lists and lists of these, after one wait for the device."""
-    together = torch.cat([t.double().flatten() for t in tensors.values()]).cpu()
-    parts = together.split([t.numel() for t in tensors.values()])
-    return {name: part.view(t.shape).tolist() for (name, t), part in zip(tensors.items(), parts, strict=True)}
+    numbers = torch.cat([t.double().flatten() for t in tensors.values()]).cpu().numpy()
+    ends = accumulate(t.numel() for t in tensors.values())
+    return {
+        name: numbers[end - t.numel() : end].reshape(t.shape).tolist()
+        for (name, t), end in zip(tensors.items(), ends, strict=True)
+    }
 
 
 def versions() -> dict[str, str]:
