@@ -195,10 +195,10 @@ def at_frame(frame: int, action: Callable[[], Any], work: Callable[[], int]) -> 
     """Do ``work``, and ``action`` when it hands over a frame. Only for a child process, which it leaves changed."""
     submit = writer.FrameWriter.submit
 
-    def and_act(self: Any, number: int, *arguments: Any) -> None:
-        if number == frame:
+    def and_act(self: Any, handed: writer.Frame) -> None:
+        if handed.number == frame:
             action()
-        submit(self, number, *arguments)
+        submit(self, handed)
 
     writer.FrameWriter.submit = and_act  # type: ignore[method-assign]
     return work()

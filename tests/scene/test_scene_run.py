@@ -35,6 +35,13 @@ def simulate(folder, **words):
         return summary, {name: read[name] for name in read.file}, read.attributes
 
 
+@pytest.fixture(params=[False, True], ids=["waits", "runs ahead"])
+def ahead(request, monkeypatch):
+    """Whether the host hands over a frame when the next substeps have begun, as it does beside a GPU."""
+    monkeypatch.setattr(module.Simulation, "_runs_ahead", lambda self: request.param)
+    return request.param
+
+
 # ---- physics
 
 
@@ -193,9 +200,12 @@ def test_a_disk_that_fills_up_leaves_whole_frames(tmp_path, monkeypatch):
 # ---- stops and kills
 
 
-def test_a_stop_signal_ends_after_a_whole_frame_and_resumes_bit_for_bit(tmp_path):
-    _, whole, _ = simulate(tmp_path / "whole")
-    scene = Scene(**disc(device="cpu"))
+JET = {"center": (0.2, 0.8), "radius": 0.07, "velocity": (1.0, 0.0), "material": "jelly"}
+
+
+def test_a_stop_signal_ends_after_a_whole_frame_and_resumes_bit_for_bit(tmp_path, ahead):
+    _, whole, _ = simulate(tmp_path / "whole", emitter=[JET])
+    scene = Scene(**disc(device="cpu", emitter=[JET]))
 
     def interrupt(figures):
         if figures["frame"] == 2:
@@ -207,6 +217,8 @@ def test_a_stop_signal_ends_after_a_whole_frame_and_resumes_bit_for_bit(tmp_path
         scene.run(tmp_path / "out")
     with Trajectory(tmp_path / "out") as read:
         assert len(read) == 3
+    _, record = load(tmp_path / "out" / "checkpoint.h5")
+    assert record["frame"] == 2 and record["totals"]["substeps"] == whole["substeps"][:3].sum()
     summary = scene.run(tmp_path / "out", resume=True)
     with Trajectory(tmp_path / "out") as read:
         for name in whole:
@@ -277,10 +289,91 @@ def test_twenty_sigkills_at_random_moments(tmp_path):
     assert done == 20
 
 
+# ---- frames that are handed over while the next substeps are taken
+
+
+def events_of(folder, monkeypatch, words):
+    """What a run does in its order, and what its checkpoints say of each frame."""
+    events, records = [], []
+    rollout, submit = module.rollout, writer.FrameWriter.submit
+
+    def taken(step, state, n, dt):
+        events.append("substeps")
+        return rollout(step, state, n, dt)
+
+    def handed(self, frame):
+        events.append(frame.number)
+        tensors = {name: t.clone() for name, t in frame.state.items()}
+        totals = {name: value for name, value in frame.record["totals"].items() if name != "simulating"}
+        records.append((tensors, {**frame.record, "totals": totals}))
+        submit(self, frame)
+
+    monkeypatch.setattr(module, "rollout", taken)
+    monkeypatch.setattr(writer.FrameWriter, "submit", handed)
+    Scene(**disc(device="cpu", **words)).run(folder)
+    return events, records
+
+
+def test_a_frame_is_handed_over_once_the_next_substeps_have_begun(tmp_path, ahead, monkeypatch):
+    events, _ = events_of(tmp_path / "out", monkeypatch, {})
+    frames = [[0, "substeps"], [1, "substeps"], [2, "substeps"], [3, "substeps"], [4, "substeps"]]
+    order = [event for pair in frames for event in (reversed(pair) if ahead else pair)]
+    assert events == [*order, 5]
+
+
+def test_a_frame_that_waits_is_told_of_as_it_was(tmp_path, monkeypatch):
+    """Its state and its record lack what was emitted and counted since."""
+    found = []
+    for waits in (True, False):
+        with monkeypatch.context() as patch:
+            patch.setattr(module.Simulation, "_runs_ahead", lambda self, waits=waits: not waits)
+            found.append(events_of(tmp_path / f"{waits}", patch, {"emitter": [JET]})[1])
+    for (tensors, record), (others, other) in zip(*found, strict=True):
+        assert record == other and tensors.keys() == others.keys()
+        for name, value in tensors.items():
+            assert torch.equal(value, others[name]), name
+    assert found[0][0][1]["emitted"] < found[0][-1][1]["emitted"]
+
+
+@pytest.mark.parametrize("where", ["_choose_dt", "_moved"])
+def test_the_frame_before_a_failure_is_written(tmp_path, ahead, monkeypatch, where):
+    work = getattr(module.Simulation, where)
+
+    def fails(self, *arguments):
+        result = work(self, *arguments)
+        if self.frame == 2:
+            raise SceneFailure("it went wrong")
+        return result
+
+    monkeypatch.setattr(module.Simulation, where, fails)
+    told = []
+    scene = Scene(**disc(device="cpu"))
+    with pytest.raises(SceneFailure, match="it went wrong"):
+        scene.run(tmp_path / "out", progress=told.append)
+    with Trajectory(tmp_path / "out") as read:
+        assert len(read) == 3
+        substeps = int(read["substeps"][:3].sum())
+    _, record = load(tmp_path / "out" / "checkpoint.h5")
+    assert record["frame"] == 2 and record["totals"]["substeps"] == substeps
+    assert [figures["frame"] for figures in told] == [1, 2]
+
+
 def test_threads_take_turns_soon_while_a_run_lasts(tmp_path):
     before, seen = sys.getswitchinterval(), []
     Scene(**disc(device="cpu")).run(tmp_path / "out", progress=lambda figures: seen.append(sys.getswitchinterval()))
     assert max(seen) < 1e-3 <= before == sys.getswitchinterval()
+
+
+def test_substeps_are_repeated_where_their_pool_was_too_small():
+    """Not those of a call that had more room, though the pool has to grow for what comes."""
+    scene = Scene(**disc(device="cpu"))
+    simulation = module.Simulation(scene, scene.build())
+    grid = simulation.step.grid
+    room = grid.pool(simulation.state.x, simulation.state.scene)
+    assert not simulation._overflowed([], room)
+    assert not simulation._overflowed([[room, 0, -1, 0, -1, 1, 4, room]], room) and grid.max_blocks == room
+    assert not simulation._overflowed([[room + 1, 0, -1, 0, -1, 1, -1, room]], room) and grid.max_blocks > room
+    assert simulation._overflowed([[room + 1, 0, -1, 0, -1, 1, 4, room]], room)
 
 
 # ---- what goes wrong

@@ -28,7 +28,7 @@ from .diagnose import SceneFailure, replay, wrong
 from .folder import CHECKPOINT, LAST_GOOD, claim, locked, output_errors, prepare, record_summary
 from .process import prompt_turns, stop_signals
 from .scene import Scene
-from .writer import Copier, Copies, FrameWriter
+from .writer import Copier, Copies, Frame, FrameWriter
 
 SEGMENT = 32
 """Substeps between two looks at the stability limit and the validity of the state, and between two reorderings."""
@@ -117,13 +117,24 @@ class Shown(NamedTuple):
     sums: dict[str, Any]
 
 
-class Moved(NamedTuple):
-    """A state after some substeps."""
+class Segment(NamedTuple):
+    """Substeps between two looks at the state."""
 
+    dt: float
+    """[s]"""
+    steps: int
+    until: float
+    """Time at their end [s]."""
+    shows: bool
+    """Whether a frame ends with them."""
+
+
+class Moved(NamedTuple):
+    """A state after a segment, in a better order."""
+
+    state: State
     survey: list[list[float]]
     status: list[list[float]]
-    ordered: State
-    """In a better order."""
     shown: Shown | None
     """Where a frame shows it."""
 
@@ -236,38 +247,55 @@ class Simulation:
         return f"has a particle that is not meaningful: {bad[1]}" if bad else ""
 
     def run(self, writer: FrameWriter, progress: Progress | None, stop: Callable[[], bool]) -> None:
-        """All frames that are missing."""
+        """All frames that are missing. A device has its next substeps before the host hands over the last frame."""
+        due: Frame | None = None
+
+        def deliver() -> None:
+            nonlocal due
+            if due is None:
+                return
+            frame, due = due, None
+            writer.submit(frame)
+            if progress is not None and frame.number > 0:
+                progress(self._figures)
+            self._check_stop(stop)
+
         if self.frame < 0:
             copies, sums = self._show(self.state, self._law_figures(self.state))
             self._shown = Shown(copies, on_host(sums))
-            self._put(writer, 0, 0.0)
-        while self.frame < self.scene.frames:
-            begin, before = time.perf_counter(), self.totals.substeps
+            due = self._complete(0, 0.0, 0.0)
+        try:
             self._check_stop(stop)
-            cfl = self._advance(self.scene.time_of(self.frame), self.scene.time_of(self.frame + 1))
-            self._put(writer, self.totals.substeps - before, cfl)
-            seconds = time.perf_counter() - begin
-            self.totals.simulating += seconds
-            if progress is not None:
-                substeps = self.totals.substeps - before
-                rate = substeps * len(self.state) / seconds
-                progress({**self._figures, "frames": self.scene.frames, "substeps": substeps, "rate": rate})
+            while self.frame < self.scene.frames:
+                if not self._runs_ahead():
+                    deliver()
+                begin, before = time.perf_counter(), self.totals.substeps
+                cfl = self._advance(self.scene.time_of(self.frame), self.scene.time_of(self.frame + 1), deliver)
+                due = self._complete(self.totals.substeps - before, cfl, time.perf_counter() - begin)
+        finally:  # also before a failure of what comes after the frame
+            deliver()
+
+    def _runs_ahead(self) -> bool:
+        """Whether the host goes on while substeps are taken."""
+        return self.state.x.is_cuda
 
     def _check_stop(self, stop: Callable[[], bool]) -> None:
-        if stop():
+        if self.frame < self.scene.frames and stop():
             raise Interrupted(f"stopped after frame {self.frame} of {self.scene.frames}; add --resume to continue")
 
-    def _put(self, writer: FrameWriter, substeps: int, cfl: float) -> None:
-        """Submit the present state as the next frame."""
+    def _complete(self, substeps: int, cfl: float, seconds: float) -> Frame:
+        """The present state as the next frame, with all that must not change until it is handed over."""
         assert self._shown is not None
         self.frame += 1
+        self.totals.simulating += seconds
         state, (copies, sums), self._shown = self.state, self._shown, None
         scalars = {"time": self.scene.time_of(self.frame), "particles": len(state), "substeps": substeps, "cfl": cfl}
         scalars |= {"potential_energy": 0.0, **sums}
         if not self.totals.first:
             self.totals.first = {k: v for k, v in scalars.items() if k.endswith("energy")}
             self.totals.first |= {"mass": float(state.mass.double().sum())}
-        self._figures = {"frame": self.frame, **scalars}
+        rate = substeps * len(state) / max(seconds, 1e-9)
+        self._figures = {"frame": self.frame, **scalars, "frames": self.scene.frames, "rate": rate}
         record = {
             "frame": self.frame,
             "time": float(state.time),
@@ -275,7 +303,7 @@ class Simulation:
             "fingerprint": self.fingerprint,
             "totals": dict(vars(self.totals)),
         }
-        writer.submit(self.frame, copies, scalars, checkpoint.tensors_of(state), record)
+        return Frame(self.frame, copies, scalars, checkpoint.tensors_of(state), record)
 
     def _show(self, state: State, figures: Figures) -> tuple[Copies, dict[str, Tensor]]:
         """Copies and sums of a state for the next frame, which are not waited for."""
@@ -295,8 +323,11 @@ class Simulation:
 
     # -- time
 
-    def _advance(self, begin: float, end: float) -> float:
-        """Move the state to time ``end``; returns the largest CFL number |v| dt / dx on the way."""
+    def _advance(self, begin: float, end: float, meanwhile: Callable[[], None] = lambda: None) -> float:
+        """Move the state to time ``end``; returns the largest CFL number |v| dt / dx on the way.
+
+        ``meanwhile`` is called whenever a device has work that the host would only wait for.
+        """
         now, largest = begin, 0.0
         rounding = 1e-9 * (end - begin)
         while now < end - rounding:
@@ -310,17 +341,18 @@ class Simulation:
             dt, count = self._choose_dt(target - now, rates)
             steps = min(count, self.totals.segment)
             until = target if steps == count else now + steps * dt
-            if not self._segment(dt, steps, until, until >= end - rounding):
+            shows = until >= end - rounding
+            segment = Segment(dt, steps, end if shows else until, shows)
+            if not self._take(segment, meanwhile):
                 self.totals.segment = SEGMENT
                 continue
-            now = until
+            now = segment.until
             self.totals.segment = self._most_after(rates)
             largest = max(largest, max(speeds, default=0.0) * dt / self.step.grid.dx)
             if self.state.x.is_cpu:
                 heap.trim()
             self.totals.substeps += steps
             self.totals.smallest_dt = min(self.totals.smallest_dt, dt)
-        self.state = self.state.replace(time=end)  # which `now` is but for rounding
         self.totals.largest_cfl = max(self.totals.largest_cfl, largest)
         return largest
 
@@ -345,34 +377,27 @@ class Simulation:
         longer = min(2 * self.totals.segment, LONGEST_SEGMENT[self.state.x.device.type])
         return longer if after <= STEADY * before else SEGMENT
 
-    def _segment(self, dt: float, steps: int, until: float, shows: bool) -> bool:
-        """Take some substeps, then check the state and reorder it; a failure is located by repeating them.
-
-        Args:
-            dt: time step [s].
-            steps: number of substeps.
-            until: time at their end [s].
-            shows: whether a frame ends with them.
+    def _take(self, segment: Segment, meanwhile: Callable[[], None]) -> bool:
+        """Take a segment, and check the state at its end; a failure is located by repeating the substeps.
 
         Returns:
             Whether they were taken: a segment longer than SEGMENT in which something went wrong, or whose dt was above
             the limit at its end, was not, since with shorter ones dt would have followed.
         """
-        good = self.state
+        good, dt, steps = self.state, segment.dt, segment.steps
         try:
-            moved = self._moved(good, dt, steps, until, shows)
+            moved = self._moved(segment, meanwhile)
             if steps > SEGMENT and not dt * max(moved.survey[0], default=0.0) <= 1:
                 raise SimulationError("dt is above the limit")
             if any(row[PROBLEM] >= 0 for row in moved.status) or self.step.heat is not None:
                 self.step.check()
-            bad = wrong(self.step, self.state) if any(moved.survey[2]) else None
+            bad = wrong(self.step, moved.state) if any(moved.survey[2]) else None
             if bad is None:
-                self._survey, self.state, self._shown = moved.survey, moved.ordered, moved.shown
+                self._survey, self.state, self._shown = moved.survey, moved.state, moved.shown
                 return True
             message = bad[1]
         except SimulationError as error:
             message = str(error)
-        self.state = good
         if steps > SEGMENT:
             self.step.reset()
             return False
@@ -381,26 +406,35 @@ class Simulation:
             self.state = failure.good
         raise SceneFailure(str(failure or message), failure)
 
-    def _moved(self, good: State, dt: float, steps: int, until: float, shows: bool) -> Moved:
-        """Take substeps from a state; again where the pool of blocks, which follows on CUDA, was too small.
+    def _moved(self, segment: Segment, meanwhile: Callable[[], None]) -> Moved:
+        """The state after a segment; taken again where the pool of blocks was too small, which follows on CUDA.
 
         A device has all of its work before the only wait for it, that of a frame too.
         """
-        grid = self.step.grid
-        self.state = rollout(self.step, good, steps, dt).replace(time=until)
-        ordered = self.step.sorted(self.state)
+        room = self.step.grid.max_blocks
+        end = rollout(self.step, self.state, segment.steps, segment.dt).replace(time=segment.until)
+        ordered = self.step.sorted(end)
         figures = self._law_figures(ordered)
         told = {"survey": torch.stack(self.step.survey(ordered, figures=figures))}
         if self.step.status is not None:
             told["status"] = self.step.status
-        copies, sums = self._show(ordered, figures) if shows else (None, {})
+        copies, sums = self._show(ordered, figures) if segment.shows else (None, {})
+        meanwhile()
         found = on_host(told | sums)
         survey, status = found.pop("survey"), found.pop("status", [])
-        if status and grid.grows and grid.max_blocks is not None and status[0][BLOCKS_WANTED] > grid.max_blocks:
-            grid.follow(int(status[0][BLOCKS_WANTED]))
+        if self._overflowed(status, room):
             self.step.reset()
-            return self._moved(good, dt, steps, until, shows)
-        return Moved(survey, status, ordered, None if copies is None else Shown(copies, found))
+            return self._moved(segment, meanwhile)
+        return Moved(ordered, survey, status, None if copies is None else Shown(copies, found))
+
+    def _overflowed(self, status: list[list[float]], room: int | None) -> bool:
+        """Whether a pool of blocks that follows the scene, with some room before a segment, was too small for it."""
+        grid = self.step.grid
+        if not status or not grid.grows or room is None:
+            return False
+        wanted = int(status[0][BLOCKS_WANTED])
+        grid.follow(wanted)
+        return wanted > room and status[0][PROBLEM] >= 0  # no problem where calls of the rollout had more room
 
     def _emit(self, until: float) -> None:
         """Add the layers that are due."""

@@ -68,10 +68,11 @@ def _copied(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
 
 
 @dataclass(frozen=True)
-class Job:
-    """One frame, and its state on the device for a checkpoint."""
+class Frame:
+    """One frame: copies of its fields in id order, its scalars, and for a checkpoint its state on the device, of which
+    the record says the rest."""
 
-    frame: int
+    number: int
     copies: Copies
     scalars: Mapping[str, Any]
     state: Mapping[str, Tensor]
@@ -92,23 +93,22 @@ class FrameWriter:
         self.seconds = 0.0
         self.waited = 0.0
         self._saved = time.perf_counter()
-        self._unsaved: Job | None = None  # the latest frame, where it has no checkpoint
+        self._unsaved: Frame | None = None  # the latest frame, where it has no checkpoint
         self._finished = self._failed = False
         self._error: BaseException | None = None
-        self._jobs: queue.Queue[Job | None] = queue.Queue(maxsize=2)
+        self._frames: queue.Queue[Frame | None] = queue.Queue(maxsize=2)
         self._thread = threading.Thread(target=self._work, name="torch_mpm frame writer", daemon=True)
         self._thread.start()
 
-    def submit(self, frame: int, copies: Copies, scalars: Mapping[str, Any], state: Mapping[str, Tensor],
-               record: dict[str, Any]) -> None:  # fmt: skip
-        """Queue a frame: copies of its fields in id order, scalars, and the state for the checkpoint.
+    def submit(self, frame: Frame) -> None:
+        """Queue a frame.
 
         Raises:
             OSError: what went wrong with an earlier frame.
         """
         begin = time.perf_counter()
         self._raise()
-        self._jobs.put(Job(frame, copies, scalars, state, record))
+        self._frames.put(frame)
         self.waited += time.perf_counter() - begin
 
     def close(self, finished: bool = False) -> None:
@@ -119,7 +119,7 @@ class FrameWriter:
         """
         begin = time.perf_counter()
         self._finished = finished
-        self._jobs.put(None)
+        self._frames.put(None)
         self._thread.join()
         self._unsaved = None  # pinned memory must not outlive CUDA
         self.trajectory.close()
@@ -132,33 +132,33 @@ class FrameWriter:
             raise error
 
     def _work(self) -> None:
-        while (job := self._jobs.get()) is not None:
+        while (frame := self._frames.get()) is not None:
             if not self._failed:
-                self._attempt(self._write, job)
+                self._attempt(self._write, frame)
         if self._unsaved is not None and not self._finished:
             self._attempt(self._save, self._unsaved)
 
-    def _attempt(self, action: Callable[[Job], None], job: Job) -> None:
+    def _attempt(self, action: Callable[[Frame], None], frame: Frame) -> None:
         """An action whose error the next call of the main thread raises."""
         begin = time.perf_counter()
         try:
-            action(job)
+            action(frame)
         except BaseException as error:
             self._error, self._failed = error, True
         self.seconds += time.perf_counter() - begin
 
-    def _write(self, job: Job) -> None:
-        copies = job.copies
+    def _write(self, frame: Frame) -> None:
+        copies = frame.copies
         if copies.ready is not None:
             copies.ready.synchronize()
             copies.sources.clear()
-        values = {k: v.numpy() for k, v in copies.fields.items()} | {k: np.asarray(v) for k, v in job.scalars.items()}
-        self.trajectory.write(job.frame, values)
-        self._unsaved = job
+        values = {k: v.numpy() for k, v in copies.fields.items()} | {k: np.asarray(v) for k, v in frame.scalars.items()}
+        self.trajectory.write(frame.number, values)
+        self._unsaved = frame
         if time.perf_counter() - self._saved >= CHECKPOINT_SECONDS:
-            self._save(job)
+            self._save(frame)
 
-    def _save(self, job: Job) -> None:
+    def _save(self, frame: Frame) -> None:
         with contextlib.suppress(torch.AcceleratorError):  # whose state is lost, and which the run fails with
-            checkpoint.save(self.checkpoint_path, _copied(job.state), job.record)
+            checkpoint.save(self.checkpoint_path, _copied(frame.state), frame.record)
         self._saved, self._unsaved = time.perf_counter(), None
