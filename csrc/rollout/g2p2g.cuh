@@ -60,13 +60,15 @@ struct G2P2GMemory {
   alignas(16) typename Tile::Node tile[Tile::room];
 };
 
-template <class Source, class Task>
+// Node sums in fixed point have kernels of their own: what these do once for each node costs the others 7%.
+template <bool Fixed, class Source, class Task>
 class G2P2G {
  public:
   using S = typename Source::Shape;
   using T = typename S::T;
   using Memory = G2P2GMemory<S>;
   using Tile = typename Memory::Tile;
+  using Nodes = std::conditional_t<Fixed, NodeSums<T>, NodeField<T>>;
   static constexpr int D = S::D, Order = S::Order, threads = S::threads;
   static_assert(S::batch >= kItemParticles);
 
@@ -102,13 +104,13 @@ class G2P2G {
       move_all();
       if (next < count) find(m.places[1 - turn_]);
       __syncthreads();
-      if (in_order() && threadIdx.x < 32) link_in_order(shared, here().end - here().begin);
+      if (Fixed && threadIdx.x < 32) link_in_order(shared, here().end - here().begin);
       if (next < count) load(m.places[1 - turn_]);
       now = next;
       next = m.number;
       if (next < count) load_item(schedule, next);
-      if (in_order()) __syncthreads();
-      add_particles(source.nodes, shared, here().following, false, [&] { add_all_strays(); }, [&] { empty(); });
+      if (Fixed) __syncthreads();
+      add_particles(nodes(), shared, here().following, false, [&] { add_all_strays(); }, [&] { empty(); });
       turn_ = 1 - turn_;
     }
   }
@@ -131,7 +133,7 @@ class G2P2G {
 
   __device__ const Topology<T, D>& topology() const { return source.topology; }
 
-  __device__ bool in_order() const { return is_fixed(source.nodes); }
+  __device__ const Nodes& nodes() const { return source.nodes; }
 
   __device__ ItemPlace<T, D>& here() const { return m.places[turn_]; }
 
@@ -262,7 +264,7 @@ class G2P2G {
     const bool at_home = here().home.template locate<Order>(topology().geometry, to, cell, f);
     store_particle<S, T, D>(shared, row, f, source.contribution(particle));
     const int list = list_of<S>(k, at_home, cell);
-    shared.next[row] = uint16_t(in_order() ? list : atomicExch(&shared.head[list], row));
+    shared.next[row] = uint16_t(Fixed ? list : atomicExch(&shared.head[list], row));
     if (!at_home) stray(k, row, to);
   }
 
@@ -296,7 +298,7 @@ class G2P2G {
   __device__ void add_all_strays() const {
     for (int s = threadIdx.x / 32; s < m.strays; s += threads / 32) {
       const int base = m.base[s];
-      add_stray<S>(source.nodes, shared, m.row[s], [&](const int (&offset)[D]) -> int64_t {
+      add_stray<S>(nodes(), shared, m.row[s], [&](const int (&offset)[D]) -> int64_t {
         int node[D], block = 0;
 #pragma unroll
         for (int i = D - 1, rest = base, step = 1; i >= 0; i--, rest /= 3 * kBlockWidth, step *= 3) {
@@ -308,14 +310,15 @@ class G2P2G {
         return slot < 0 ? -1 : int64_t(slot) * kBlockNodes<D> + node_in_block<D>(node);
       });
     }
-    add_strays<S>(source, topology(), schedule_of(topology()), here().home.scene, shared, m.far, here().begin);
+    add_strays<S>(source, nodes(), topology(), schedule_of(topology()), here().home.scene, shared, m.far,
+                  here().begin);
   }
 };
 
 // Thread blocks per multiprocessor: a fourth one leaves too few registers, and gains nothing.
 constexpr int kG2P2GBlocks = 3;
 
-template <class Source, class Task, class T, int D>
+template <bool Fixed, class Source, class Task, class T, int D>
 __global__ void __launch_bounds__(Source::Shape::threads, kG2P2GBlocks)
     g2p2g_kernel(const __grid_constant__ Source source, const __grid_constant__ Task task, const OwnRows own,
                  const int* copy, int* taken) {
@@ -324,7 +327,7 @@ __global__ void __launch_bounds__(Source::Shape::threads, kG2P2GBlocks)
   if (own.is_due(t.particles)) return;  // and there is a new activation between G2P and P2G
   extern __shared__ __align__(16) char memory[];
   __shared__ G2P2GMemory<typename Source::Shape> shared;
-  G2P2G<Source, Task> g2p2g(source, task, shared, memory, *copy ? own.rows : 0, taken);
+  G2P2G<Fixed, Source, Task> g2p2g(source, task, shared, memory, *copy ? own.rows : 0, taken);
   const Schedule<const int> schedule = schedule_of(t);
   g2p2g.take_items(schedule);
   const int64_t stride = int64_t(gridDim.x) * blockDim.x;
@@ -339,8 +342,10 @@ void launch_g2p2g(const Source& source, const Task& task, const G2P2GArguments<T
   using S = typename Source::Shape;
   const int64_t items = most_items(source.topology.max_blocks, source.topology.particles);
   const auto resident = unsigned(kG2P2GBlocks * device_attribute(cudaDevAttrMultiProcessorCount));
-  launch_in_chain(g2p2g_kernel<Source, Task, T, D>, std::min(grid_size(items), resident), S::threads, S::shared_bytes,
-                  stream, source, task, a.own, a.copy, a.items_taken);
+  const auto kernel = a.p2g.fixed.largest_mass ? g2p2g_kernel<true, Source, Task, T, D>
+                                               : g2p2g_kernel<false, Source, Task, T, D>;
+  launch_in_chain(kernel, std::min(grid_size(items), resident), S::threads, S::shared_bytes, stream, source, task,
+                  a.own, a.copy, a.items_taken);
 }
 
 }  // namespace mpm::cuda

@@ -542,9 +542,10 @@ __device__ void add_stray(const Nodes& nodes, const Schedule<const int>& schedul
 
 // The strays of a batch index[begin, ...) go to the nodes without a tile. Each lane finds one, so that its loads do not
 // wait for those of others, and then the warp takes them in turn.
-template <class S, class Source, int Most, class T, int D>
-__device__ void add_strays(const Source& source, const Topology<T, D>& t, const Schedule<const int>& schedule,
-                           int scene, const SharedParticles<S>& shared, const Strays<Most>& strays, int begin) {
+template <class S, class Source, class Nodes, int Most, class T, int D>
+__device__ void add_strays(const Source& source, const Nodes& nodes, const Topology<T, D>& t,
+                           const Schedule<const int>& schedule, int scene, const SharedParticles<S>& shared,
+                           const Strays<Most>& strays, int begin) {
   constexpr int warps = S::threads / 32;
   const int warp = threadIdx.x / 32, lane = threadIdx.x % 32;
   for (int start = warp; start < strays.count; start += 32 * warps) {
@@ -560,7 +561,7 @@ __device__ void add_strays(const Source& source, const Topology<T, D>& t, const 
     }
     for (unsigned left = __ballot_sync(~0u, first >= 0); left; left &= left - 1) {
       const int from = __ffs(left) - 1;
-      add_stray(source.nodes, schedule, shared, __shfl_sync(~0u, row, from), __shfl_sync(~0u, first, from));
+      add_stray(nodes, schedule, shared, __shfl_sync(~0u, row, from), __shfl_sync(~0u, first, from));
     }
   }
 }
@@ -729,7 +730,7 @@ __device__ void scatter_item(const Source& source, const Topology<typename Sourc
     if (threadIdx.x < 1 << D) m.slots[threadIdx.x] = slot;
     add_particles(source.nodes, shared, m.slots, in_order, [&] {
       if constexpr (Source::drifts)
-        add_strays<S>(source, t, schedule_of(t), m.base_block.scene, shared, m.strays, begin);
+        add_strays<S>(source, source.nodes, t, schedule_of(t), m.base_block.scene, shared, m.strays, begin);
     });
     __syncthreads();
   }
