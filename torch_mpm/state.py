@@ -27,6 +27,7 @@ from .errors import (
 )
 from .grid import Grid, check_grid
 from .ops.arguments import refuse_batched, soa_empty
+from .ops.autograd import dispatch, is_recorded
 
 if TYPE_CHECKING:
     from .seed import Points
@@ -213,7 +214,11 @@ class State:
         ids = torch.arange(len(self), device=self.x.device) if self.ids is None else self.ids
         blocks = grid.activate(self.x, self.scene)
         order = torch.ops.torch_mpm.cell_order(self.x.detach(), *blocks.packed)
-        return (self if ids is self.ids else self.replace(ids=ids)).select(order)
+        state = self if ids is self.ids else self.replace(ids=ids)
+        names = [name for name in PARTICLE_FIELDS if getattr(state, name) is not None]
+        taken = iter(_take_all([*(getattr(state, name) for name in names), *state.extra.values()], order))
+        changes: dict[str, Any] = {name: next(taken) for name in names}
+        return state.replace(**changes, extra={name: next(taken) for name in state.extra})
 
     def restored(self) -> State:
         """In the order of `ids`, that is in the order before any `sorted`. Differentiable."""
@@ -473,6 +478,14 @@ def _take(t: Tensor, particles: Tensor) -> Tensor:
         return t.index_select(0, particles)
     taken = t.flatten(1).mT.index_select(1, particles).mT  # ten times faster than `index_select` of [P, ...]
     return taken if t.dim() == 2 else taken.view(particles.shape[0], *t.shape[1:])
+
+
+def _take_all(fields: Sequence[Tensor], particles: Tensor) -> list[Tensor]:
+    """The same of many tensors in one call, for particles that are known to exist."""
+    if is_recorded(*fields) or any(t.element_size() > 8 or t.layout != torch.strided for t in fields):
+        return [_take(t, particles) for t in fields]
+    taken: list[Tensor] = dispatch(torch.ops.torch_mpm.take, fields, particles)
+    return taken
 
 
 def identity_deformation(x: Tensor) -> Tensor:

@@ -77,6 +77,7 @@ class _Calls:
         return [
             ("activate", activation),
             ("cell_order", (x, *top)),
+            ("take", ([x, C, self.scene, mass > 0.5], torch.arange(P).flip(0))),
             ("p2g", (*given, *top)),
             ("p2g_backward", (rows, *given, 127, *top)),
             ("scatter", (x, v, C, stress, 2.0, *top)),

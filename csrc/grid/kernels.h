@@ -7,6 +7,7 @@
 #include "grid/impulses.h"
 #include "grid/obstacle.h"
 #include "grid/status.h"
+#include "grid/take.h"
 
 #define MPM_GRID_KERNELS(PLAIN, ORDERED, SIZE)                 \
   SIZE(activate_workspace, ActivateArguments)                  \
@@ -21,3 +22,9 @@
   PLAIN(contact_impulses, ContactImpulsesArguments)            \
   PLAIN(contact_impulses_backward, ContactImpulsesArguments)
 MPM_BACKEND_KERNELS(MPM_GRID_KERNELS)
+
+#if MPM_BACKEND == MPM_BACKEND_IS_cuda
+namespace mpm::cuda {
+void take(const TakeArguments& a, Stream stream);
+}  // namespace mpm::cuda
+#endif

@@ -14,7 +14,7 @@ from ..laws import Mixture
 from ..rollouts import rollout
 from ..scene import fields, heap
 from ..scene.build import Built
-from ..state import State, _take
+from ..state import State, _take_all
 from .recording import Array, Recorded, Recording
 
 LOOK = 8
@@ -127,7 +127,8 @@ def _run(
             surveys.append(torch.stack(step.survey(state)))
             if state.x.is_cpu:
                 heap.trim()
-        recording.put({name: _take(_field(built, state, name), order) for name in names})
+        taken = _take_all([_field(built, state, name) for name in names], order)
+        recording.put(dict(zip(names, taken, strict=True)))
         if told is not None:
             told(frame)
     return torch.stack(surveys)

@@ -1,14 +1,16 @@
-"""The fake kernels of `activate` and `cell_order`; their Python faces are `Grid.activate` and `State.sorted`."""
+"""The fake kernels of `activate`, `cell_order` and `take`, which `Grid.activate` and `State.sorted` call."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from .arguments import refuse_vmap, sizes
+from .arguments import refuse_vmap, sizes, soa_empty
+from .autograd import register_autograd
 
 
 @torch.library.register_fake("torch_mpm::activate")
@@ -42,5 +44,15 @@ def _cell_order_fake(x: Tensor, *topology: object) -> Tensor:
     return x.new_empty(sizes(x, "x", 2)[0], dtype=torch.int32)
 
 
-refuse_vmap("activate")
-refuse_vmap("cell_order")
+@torch.library.register_fake("torch_mpm::take")
+def _take_fake(fields: Sequence[Tensor], particles: Tensor) -> list[Tensor]:
+    return [soa_empty(t, (particles.shape[0], *t.shape[1:])) for t in fields]
+
+
+def _no_backward(ctx: Any, *grads: Tensor) -> None:
+    raise NotImplementedError("fields that `take` gives are not differentiable: State.select is")
+
+
+register_autograd("take", _no_backward)
+for _name in ("activate", "cell_order", "take"):
+    refuse_vmap(_name)

@@ -27,6 +27,16 @@ def dispatch(op: Any, *arguments: Any) -> Any:
     return _below_autograd(op, arguments)
 
 
+def is_recorded(*tensors: torch.Tensor) -> bool:
+    """Whether more than values is asked for: something is recorded, transformed or compiled."""
+    return (
+        torch.compiler.is_compiling()
+        or _transformed()
+        or forward_ad._current_level >= 0
+        or (torch.is_grad_enabled() and torch._C._any_requires_grad(*tensors))
+    )
+
+
 def _below_autograd(op: Any, arguments: Sequence[Any]) -> Any:
     with torch._C._AutoDispatchBelowAutograd():
         return op(*arguments)

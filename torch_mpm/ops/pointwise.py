@@ -8,13 +8,12 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.autograd import forward_ad
 
 from .. import _library
 from ..capture import is_traced
 from ..errors import FLOATING
 from .arguments import refuse_vmap, soa_empty
-from .autograd import dispatch, register_autograd
+from .autograd import dispatch, is_recorded, register_autograd
 
 Places = list[int]
 
@@ -49,10 +48,7 @@ def fuses(*tensors: Tensor) -> bool:
     """Whether `pointwise` may take the place of torch operations, which have every derivative and transform: where
     nothing is recorded, transformed or compiled, and all tensors are float32, or all float64."""
     return not (
-        torch.compiler.is_compiling()
-        or torch._C._are_functorch_transforms_active()
-        or forward_ad._current_level >= 0
-        or (torch.is_grad_enabled() and torch._C._any_requires_grad(*tensors))
+        is_recorded(*tensors)
         or tensors[0].dtype not in FLOATING
         or any(t.dtype != tensors[0].dtype for t in tensors)
     )
