@@ -490,6 +490,13 @@ def test_segments_grow_while_the_limit_is_steady(tmp_path, long_segments):
     np.testing.assert_allclose(long["position"], short["position"], atol=1e-6)
 
 
+def test_segments_stay_short_while_the_limit_changes(tmp_path, long_segments, monkeypatch):
+    monkeypatch.setitem(module.UNSTEADY_SEGMENT, "cpu", 48)
+    monkeypatch.setattr(module, "STEADY", 0.0)
+    simulate(tmp_path / "out", **STEADY)
+    assert long_segments[:3] == [32, 48, 48] and max(long_segments) == 48
+
+
 def test_a_device_is_waited_for_once_per_segment(tmp_path, long_segments, monkeypatch):
     """The frame at its end is asked for with its survey."""
     waits, on_host = [], module.on_host

@@ -21,7 +21,7 @@ from ..data.trajectory import PARTIAL, Layout, Trajectory, TrajectoryWriter
 from ..errors import DamagedFileError, SimulationError
 from ..laws import Mixture
 from ..rollouts import rollout
-from ..state import State, _take
+from ..state import State, _take_all
 from . import checkpoint, fields, heap
 from .build import Built
 from .diagnose import SceneFailure, replay, wrong
@@ -34,6 +34,8 @@ SEGMENT = 32
 """Substeps between two looks at the stability limit and the validity of the state, and between two reorderings."""
 LONGEST_SEGMENT = {"cpu": SEGMENT, "cuda": 512}
 """While the limit is steady: a GPU waits for each look."""
+UNSTEADY_SEGMENT = {"cpu": SEGMENT, "cuda": 64}
+"""While it is not; where it was passed, the substeps are taken again in the shortest ones."""
 STEADY = 1.02
 """The limit is, where it has become smaller by no larger factor over a segment."""
 BLOCKS_WANTED, PROBLEM = 0, 6
@@ -311,11 +313,12 @@ class Simulation:
         assert given.ids is not None
         places = torch.arange(len(given), device=given.x.device)
         order = torch.empty_like(places).scatter_(0, given.ids, places)
-        kept = {}
+        values = {}
         for name in ("position", "velocity", *self.scene.trajectory_fields):
             value = figures.stress if name == "stress" else fields.field(self.step, given, name)
             assert value is not None, name  # `build` refuses fields that no material has
-            kept[name] = _take(value, order)
+            values[name] = value
+        kept = dict(zip(values, _take_all(list(values.values()), order), strict=True))
         return self._copier.begin(kept), energies(self.step, state, figures)
 
     def _law_figures(self, state: State) -> Figures:
@@ -374,8 +377,10 @@ class Simulation:
         """Substeps of the next segment, at most, after one that began with these limits."""
         assert self._survey is not None
         before, after = max(rates, default=0.0), max(self._survey[0], default=0.0)
-        longer = min(2 * self.totals.segment, LONGEST_SEGMENT[self.state.x.device.type])
-        return longer if after <= STEADY * before else SEGMENT
+        device = self.state.x.device.type
+        if after > STEADY * before:
+            return UNSTEADY_SEGMENT[device]
+        return min(2 * self.totals.segment, LONGEST_SEGMENT[device])
 
     def _take(self, segment: Segment, meanwhile: Callable[[], None]) -> bool:
         """Take a segment, and check the state at its end; a failure is located by repeating the substeps.
