@@ -14,8 +14,7 @@ __global__ void __launch_bounds__(kThreads) take_kernel(const __grid_constant__ 
   const bool exists = a.has(particle);
   uint64_t value[kAtOnce];
 #pragma unroll
-  for (int k = 0; k < kAtOnce; k++)
-    value[k] = exists && first + k < a.columns ? a.column[first + k].read(particle) : 0;
+  for (int k = 0; k < kAtOnce; k++) value[k] = exists && first + k < a.columns ? a.column[first + k].read(particle) : 0;
 #pragma unroll
   for (int k = 0; k < kAtOnce; k++)
     if (first + k < a.columns) a.column[first + k].write(i, value[k]);

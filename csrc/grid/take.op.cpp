@@ -74,8 +74,8 @@ std::vector<Tensor> take(const std::vector<Tensor>& fields, const Tensor& partic
                     "fields must be of one number of particles, got ", shape_of(fields[0]), " and ", shape_of(field));
     STD_TORCH_CHECK(field.device() == particles.device(), "fields must be on the device of particles");
     const int64_t size = int64_t(field.element_size());
-    STD_TORCH_CHECK(size == 1 || size == 2 || size == 4 || size == 8, "fields must have values of at most 8 bytes, got ",
-                    name_of(field.scalar_type()));
+    STD_TORCH_CHECK(size == 1 || size == 2 || size == 4 || size == 8,
+                    "fields must have values of at most 8 bytes, got ", name_of(field.scalar_type()));
   }
   std::vector<Tensor> results;
   if (fields.empty()) return results;

@@ -310,8 +310,7 @@ class G2P2G {
         return slot < 0 ? -1 : int64_t(slot) * kBlockNodes<D> + node_in_block<D>(node);
       });
     }
-    add_strays<S>(source, nodes(), topology(), schedule_of(topology()), here().home.scene, shared, m.far,
-                  here().begin);
+    add_strays<S>(source, nodes(), topology(), schedule_of(topology()), here().home.scene, shared, m.far, here().begin);
   }
 };
 
@@ -342,8 +341,8 @@ void launch_g2p2g(const Source& source, const Task& task, const G2P2GArguments<T
   using S = typename Source::Shape;
   const int64_t items = most_items(source.topology.max_blocks, source.topology.particles);
   const auto resident = unsigned(kG2P2GBlocks * device_attribute(cudaDevAttrMultiProcessorCount));
-  const auto kernel = a.p2g.fixed.largest_mass ? g2p2g_kernel<true, Source, Task, T, D>
-                                               : g2p2g_kernel<false, Source, Task, T, D>;
+  const auto kernel =
+      a.p2g.fixed.largest_mass ? g2p2g_kernel<true, Source, Task, T, D> : g2p2g_kernel<false, Source, Task, T, D>;
   launch_in_chain(kernel, std::min(grid_size(items), resident), S::threads, S::shared_bytes, stream, source, task,
                   a.own, a.copy, a.items_taken);
 }
