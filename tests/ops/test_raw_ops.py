@@ -107,11 +107,11 @@ def test_the_lattice() -> None:
 
 def test_expected_and_given_shapes_are_told() -> None:
     """One row fewer in each particle or node tensor: the message says which, what was expected, and what came. Of
-    images there may be any number."""
+    images, and of particles that are taken, there may be any number."""
 
     def changes(arguments: Arguments) -> Iterator[tuple[Arguments, str]]:
         for name, value in arguments.items():
-            if not isinstance(value, torch.Tensor) or name in (*COMPARED, *ANY_NUMBER, "images"):
+            if not isinstance(value, torch.Tensor) or name in (*COMPARED, *ANY_NUMBER, "images", "particles"):
                 continue
             shape = re.escape(str(list(value[1:].shape)))
             yield {name: value[1:]}, rf"{name} must .*got {shape}"

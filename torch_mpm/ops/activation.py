@@ -46,7 +46,8 @@ def _cell_order_fake(x: Tensor, *topology: object) -> Tensor:
 
 @torch.library.register_fake("torch_mpm::take")
 def _take_fake(fields: Sequence[Tensor], particles: Tensor) -> list[Tensor]:
-    return [soa_empty(t, (particles.shape[0], *t.shape[1:])) for t in fields]
+    (count,) = sizes(particles, "particles", 1)
+    return [soa_empty(t, (count, *t.shape[1:])) for t in fields]
 
 
 def _no_backward(ctx: Any, *grads: Tensor) -> None:
