@@ -48,9 +48,7 @@ def fuses(*tensors: Tensor) -> bool:
     """Whether `pointwise` may take the place of torch operations, which have every derivative and transform: where
     nothing is recorded, transformed or compiled, and all tensors are float32, or all float64."""
     return not (
-        is_recorded(*tensors)
-        or tensors[0].dtype not in FLOATING
-        or any(t.dtype != tensors[0].dtype for t in tensors)
+        is_recorded(*tensors) or tensors[0].dtype not in FLOATING or any(t.dtype != tensors[0].dtype for t in tensors)
     )
 
 
