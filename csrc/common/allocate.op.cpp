@@ -79,6 +79,7 @@ Tensor empty(const Tensor& like, const Shape& shape, ScalarType type) {
 Tensor empty(const Tensor& like, const Shape& shape) { return empty(like, shape, like.scalar_type()); }
 
 void clear(Tensor& t) {
+  if (t.numel() == 0) return;
 #if MPM_BACKEND == MPM_BACKEND_IS_cpu
   constexpr int64_t grain = 1 << 18;  // bytes that one thread clears sooner than it calls others
   cpu::parallel_for(

@@ -38,6 +38,7 @@ Tensor survey(const Tensor& x, const Tensor& v, const Tensor& mass, const Tensor
     a.viscosity = input<T>(viscosity, "viscosity", x, {P});
     a.energy = input<T>(energy, "energy", x, {P});
     a.speed = input<T>(speed, "speed", x, {P});
+    packed.geometry<T, D>();  // which checks it
     a.dx = packed.dx();
     for (int i = 0; i < D; i++) a.lower[i] = packed.lower()[i], a.upper[i] = upper[i];
     a.bound = bound;
