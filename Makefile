@@ -74,13 +74,14 @@ bench: build
 study: build
 	$(PY) -m pytest -q -m slow
 
-# The CPU library with the address and undefined-behaviour sanitizers, in a package tree of its own. The C++ library
-# comes with the first libraries of the process, or the sanitizer does not find the function that throws.
+# The CPU library with the address and undefined-behaviour sanitizers, for this machine's instruction set, in a package
+# tree of its own. The C++ library comes with the first libraries of the process, or the sanitizer does not find the
+# function that throws.
 SANITIZED := build/sanitized
 SANITIZERS := address,undefined
 PRELOAD = $(foreach name,libasan.so libstdc++.so.6,$(shell $(or $(CXX),g++) -print-file-name=$(name)))
 sanitize: $(STAMP)
-	TORCH_MPM_SANITIZE=$(SANITIZERS) TORCH_MPM_CUDA=0 $(PY) setup.py -q build --build-lib $(SANITIZED)
+	TORCH_MPM_SANITIZE=$(SANITIZERS) TORCH_MPM_CUDA=0 TORCH_MPM_ISA_LEVELS=native $(PY) setup.py -q build --build-lib $(SANITIZED)
 	LD_PRELOAD='$(PRELOAD)' ASAN_OPTIONS=detect_leaks=0 UBSAN_OPTIONS=halt_on_error=1:print_stacktrace=1 \
 	  TORCH_MPM_SANITIZE=$(SANITIZERS) TORCH_MPM_CUDA=0 PYTHONPATH=$(CURDIR)/$(SANITIZED):$(CURDIR) $(VENV)/bin/pytest $(QUICK)
 
