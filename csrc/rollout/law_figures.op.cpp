@@ -31,6 +31,10 @@ void figures_of(const FiguresInputs& in, const LawCall& call, int number, Figure
   if (call.law->info.plastic) a.state = field<T>(mapped = empty_particles(in.x, {in.x.size(0), D, D}));
   const int64_t columns = history_size(call.law->info, call.history, D);
   if (columns > 0) a.history = field<T>(moved = empty_particles(in.x, {in.x.size(0), columns}));
+  // The lanes of a pack that are of other laws are read, too, and a decomposition ends when all lanes are done: what
+  // was in memory must not decide how a member is rounded.
+  for (Tensor* t : {&mapped, &moved})
+    if (t->defined() && in.x.is_cpu() && has(in.material)) torch::stable::zero_(*t);
   kernels.update(a, stream);
   scalar_of(kernels, a.law, LawScalar::stiffness, out.stiffness, stream);
   if (!out.energy.defined()) return;
