@@ -169,10 +169,14 @@ class State:
 
     def map(self, function: Callable[[Tensor], Tensor]) -> State:
         """A copy with a function applied to every per-particle tensor, absent fields staying None."""
-        changes: dict[str, Any] = {
-            name: function(value) for name in PARTICLE_FIELDS if (value := getattr(self, name)) is not None
-        }
-        return self.replace(**changes, extra={k: function(t) for k, t in self.extra.items()})
+        return self._map_all(lambda fields: [function(t) for t in fields])
+
+    def _map_all(self, function: Callable[[list[Tensor]], list[Tensor]]) -> State:
+        """The same with a function of all of them."""
+        names = [name for name in PARTICLE_FIELDS if getattr(self, name) is not None]
+        results = iter(function([*(getattr(self, name) for name in names), *self.extra.values()]))
+        changes: dict[str, Any] = {name: next(results) for name in names}
+        return self.replace(**changes, extra={name: next(results) for name in self.extra})
 
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> State:
         """Move to a device, and floating tensors to a dtype."""
@@ -215,10 +219,7 @@ class State:
         blocks = grid.activate(self.x, self.scene)
         order = torch.ops.torch_mpm.cell_order(self.x.detach(), *blocks.packed)
         state = self if ids is self.ids else self.replace(ids=ids)
-        names = [name for name in PARTICLE_FIELDS if getattr(state, name) is not None]
-        taken = iter(_take_all([*(getattr(state, name) for name in names), *state.extra.values()], order))
-        changes: dict[str, Any] = {name: next(taken) for name in names}
-        return state.replace(**changes, extra={name: next(taken) for name in state.extra})
+        return state._map_all(lambda fields: _take_all(fields, order))
 
     def restored(self) -> State:
         """In the order of `ids`, that is in the order before any `sorted`. Differentiable."""

@@ -52,8 +52,8 @@ Field<T> channels_from(Field<T> f, int first) {
 }
 
 // Launches a kernel for all channels: run.operator()<K, Gradient>(first) for K channels from `first` on, D at a time
-// while there are as many, then one by one.
-template <int D, class Run>
+// while there are as many, then one by one; or all at once where there are AtOnce of them, without gradients.
+template <int D, int AtOnce = D, class Run>
 void for_channels(int channels, bool gradient, const Run& run) {
   const auto group = [&]<int K>(int first) {
     if (gradient)
@@ -61,6 +61,7 @@ void for_channels(int channels, bool gradient, const Run& run) {
     else
       run.template operator()<K, false>(first);
   };
+  if (channels == AtOnce && !gradient) return run.template operator()<AtOnce, false>(0);
   int first = 0;
   for (; first + D <= channels; first += D) group.template operator()<D>(first);
   for (; first < channels; first++) group.template operator()<1>(first);

@@ -1,7 +1,6 @@
 #pragma once
 
 #include <cstdint>
-#include <cstring>
 
 #include "common/host_device.h"
 
@@ -21,13 +20,13 @@ struct TakenColumn {
     const char* const at = from + row * stride;
     switch (size) {
       case 1:
-        return value_at<uint8_t>(at);
+        return *reinterpret_cast<const uint8_t*>(at);
       case 2:
-        return value_at<uint16_t>(at);
+        return *reinterpret_cast<const uint16_t*>(at);
       case 4:
-        return value_at<uint32_t>(at);
+        return *reinterpret_cast<const uint32_t*>(at);
       default:
-        return value_at<uint64_t>(at);
+        return *reinterpret_cast<const uint64_t*>(at);
     }
   }
   MPM_HD void write(int64_t row, uint64_t value) const {
@@ -45,12 +44,6 @@ struct TakenColumn {
       default:
         *reinterpret_cast<uint64_t*>(at) = value;
     }
-  }
-
- private:
-  template <class V>
-  MPM_HD static V value_at(const char* at) {
-    return *reinterpret_cast<const V*>(at);
   }
 };
 

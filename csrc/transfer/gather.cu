@@ -72,14 +72,10 @@ struct FieldGather {
 
 template <int Order, class T, int D>
 void gather(const GatherArguments<T, D>& a, Stream stream) {
-  const auto launch = [&]<int K, bool Gradient>(int first) {
-    launch_gather(FieldGather<Order, T, D, K, Gradient>(a, first), stream);
-  };
   constexpr int increment_and_mean = 2;  // the channels of a heat step
-  if (a.nodes.channels == increment_and_mean && !a.gradient.pointer)
-    launch.template operator()<increment_and_mean, false>(0);
-  else
-    for_channels<D>(a.nodes.channels, a.gradient.pointer, launch);
+  for_channels<D, increment_and_mean>(a.nodes.channels, a.gradient.pointer, [&]<int K, bool Gradient>(int first) {
+    launch_gather(FieldGather<Order, T, D, K, Gradient>(a, first), stream);
+  });
 }
 
 // ---- Position gradient

@@ -61,14 +61,10 @@ void p2g(const P2GArguments<T, D>& a, Stream stream) {
 
 template <int Order, class T, int D>
 void scatter(const ScatterArguments<T, D>& a, Stream stream) {
-  const auto launch = [&]<int K, bool Gradient>(int first) {
-    launch_scatter(FieldSource<Order, T, D, K, Gradient>(a, first), a.deterministic, stream);
-  };
   constexpr int two_averages = 4;  // the channels of a heat step
-  if (a.nodes.channels == two_averages && !a.gradient.pointer)
-    launch.template operator()<two_averages, false>(0);
-  else
-    for_channels<D>(a.nodes.channels, a.gradient.pointer, launch);
+  for_channels<D, two_averages>(a.nodes.channels, a.gradient.pointer, [&]<int K, bool Gradient>(int first) {
+    launch_scatter(FieldSource<Order, T, D, K, Gradient>(a, first), a.deterministic, stream);
+  });
 }
 
 MPM_INSTANTIATE_ORDERS(p2g, P2GArguments)

@@ -18,22 +18,20 @@ _LIBRARY = torch.library.Library("torch_mpm", "IMPL")
 
 def dispatch(op: Any, *arguments: Any) -> Any:
     """`op(*arguments)`, past the kernel of `register_autograd` where nothing requires grad or has a tangent."""
-    if (
-        torch.compiler.is_compiling()
-        or forward_ad._current_level >= 0
-        or (torch.is_grad_enabled() and torch._C._any_requires_grad(*arguments))
-    ):
-        return op(*arguments)
-    return _below_autograd(op, arguments)
+    return op(*arguments) if _is_differentiated(*arguments) else _below_autograd(op, arguments)
 
 
 def is_recorded(*tensors: torch.Tensor) -> bool:
     """Whether more than values is asked for: something is recorded, transformed or compiled."""
+    return _is_differentiated(*tensors) or _transformed()
+
+
+def _is_differentiated(*arguments: Any) -> bool:
+    """Whether something is recorded or has a tangent, or nobody knows yet."""
     return (
         torch.compiler.is_compiling()
-        or _transformed()
         or forward_ad._current_level >= 0
-        or (torch.is_grad_enabled() and torch._C._any_requires_grad(*tensors))
+        or (torch.is_grad_enabled() and torch._C._any_requires_grad(*arguments))
     )
 
 
