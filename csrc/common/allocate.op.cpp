@@ -78,16 +78,22 @@ Tensor empty(const Tensor& like, const Shape& shape, ScalarType type) {
 
 Tensor empty(const Tensor& like, const Shape& shape) { return empty(like, shape, like.scalar_type()); }
 
-void clear(Tensor& t) {
-  if (t.numel() == 0) return;
 #if MPM_BACKEND == MPM_BACKEND_IS_cpu
+void clear_memory(void* memory, int64_t bytes) {
   constexpr int64_t grain = 1 << 18;  // bytes that one thread clears sooner than it calls others
   cpu::parallel_for(
-      t.numel() * int64_t(t.element_size()), grain,
+      bytes, grain,
       [](void* data, int64_t begin, int64_t end) {
         std::memset(static_cast<char*>(data) + begin, 0, size_t(end - begin));
       },
-      t.data_ptr());
+      memory);
+}
+#endif
+
+void clear(Tensor& t) {
+  if (t.numel() == 0) return;
+#if MPM_BACKEND == MPM_BACKEND_IS_cpu
+  clear_memory(t.data_ptr(), t.numel() * int64_t(t.element_size()));
 #else
   torch::stable::zero_(t);
 #endif

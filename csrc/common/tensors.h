@@ -139,6 +139,7 @@ Tensor zeros(const Tensor& like, const Shape& shape);
 
 // Sets a contiguous tensor to zero, on torch's current stream.
 void clear(Tensor& t);
+void clear_memory(void* memory, int64_t bytes);  // of the CPU
 
 // Elements from row to row of a structure of arrays. On the CPU, rows of whole pages (P a power of two) would share
 // cache sets, and a load would wait for stores to other rows whose addresses end alike: 23 cache lines more than pages

@@ -1,3 +1,4 @@
+#include "cpu/cell_sort.h"
 #include "cpu/chunk.h"
 #include "cpu/parallel.h"
 #include "grid/activate_workspace.cpu.h"
@@ -44,7 +45,7 @@ struct Activation {
       : a(arguments),
         w(activate_layout(a, static_cast<char*>(a.workspace))),
         table_size(int64_t(a.scenes) * a.geometry.blocks_per_scene) {
-    lay_out<D>(schedule, a.schedule, a.max_blocks, a.particles);
+    lay_out<D>(schedule, a.schedule, a.slots(), a.particles);
     for (int o = 0; o < kColours<D>; o++) {
       neighbour[o] = 0;
       for (int i = 0; i < D; i++) neighbour[o] = neighbour[o] * a.geometry.blocks[i] + (o >> (D - 1 - i) & 1);
@@ -137,6 +138,15 @@ void classify_slice(const Activation<T, D>& s, int64_t begin, int64_t end) {
     else
       for (const int64_t stop = p + kLanes < end ? p + kLanes : end; p < stop; p++) classify<Order>(s, p);
   }
+}
+
+// visit(steps along the axes) for a block and all around it.
+template <int D, class F>
+void for_neighbours(const F& visit) {
+  int step[3] = {};
+  for (step[0] = -1; step[0] <= 1; step[0]++)
+    for (step[1] = -1; step[1] <= 1; step[1]++)
+      for (step[2] = D == 3 ? -1 : 0; step[2] <= (D == 3 ? 1 : 0); step[2]++) visit(step);
 }
 
 template <int Order, int D>
@@ -260,8 +270,8 @@ int64_t place_slots(const Activation<T, D>& s, int64_t slots) {
       }
     }
   });
-  for (int64_t slot = slots; slot < a.max_blocks; slot++) a.block[slot] = -1;
-  for (int64_t slot = slots; slot <= a.max_blocks; slot++) a.offsets[slot] = int(transferred);
+  for (int64_t slot = slots; slot < a.slots(); slot++) a.block[slot] = -1;
+  for (int64_t slot = slots; slot <= a.slots(); slot++) a.offsets[slot] = int(transferred);
   return transferred;
 }
 
@@ -325,19 +335,8 @@ int sort_chunk(const Activation<T, D>& s, int64_t chunk) {
   const int* id = s.a.index + begin;
   uint16_t* order = s.schedule.order + begin;
   uint16_t* end = s.schedule.cell_end + chunk * kBlockNodes<D>;
-  // Four counts of each cell, so that particles that follow each other do not wait for the same one.
-  uint16_t counts[4][kBlockNodes<D>] = {}, next[kBlockNodes<D>], nth[kChunk];
-  bool falls = false;
-  for (int i = 1; i < count; i++) falls |= cell[i - 1] > cell[i];
-  for (int i = 0; i < count; i++) counts[i % 4][cell[i]]++;
-  for (int c = 0, before = 0; c < kBlockNodes<D>; c++) {
-    next[c] = uint16_t(before);
-    end[c] = uint16_t(before += counts[0][c] + counts[1][c] + counts[2][c] + counts[3][c]);
-  }
-  if (falls)
-    for (int i = 0; i < count; i++) nth[next[cell[i]]++] = uint16_t(i);
-  else
-    for (int i = 0; i < count; i++) nth[i] = uint16_t(i);
+  uint16_t nth[kChunk];
+  const bool falls = sort_by_cell<kBlockNodes<D>>(cell, count, nth, end);
   for (int i = 0; i < count; i++) order[i] = uint16_t(cell[i] * kChunk + nth[i]);
   const bool sorted = !falls && id[count - 1] - id[0] == count - 1;
   s.schedule.chunk_sorted[chunk] = sorted;
@@ -345,6 +344,36 @@ int sort_chunk(const Activation<T, D>& s, int64_t chunk) {
   if (!sorted)
     for (int i = 1; i < count; i++) breaks += id[nth[i]] != id[nth[i - 1]] + 1;
   return breaks;
+}
+
+// Gives slots to blocks that particles may touch before the next activation: all neighbours of base blocks. Returns how
+// many slots have blocks then; tells where there is no room for all of them.
+template <class T, int D>
+int64_t add_margin(const Activation<T, D>& s, int64_t slots) {
+  const ActivateArguments<T, D>& a = s.a;
+  int64_t next = slots;
+  bool all = true;
+  for (int64_t slot = 0; slot < slots; slot++) {
+    if (a.offsets[slot] == a.offsets[slot + 1]) continue;
+    int block[D];
+    const int scene = block_coordinates(a.geometry, a.block[slot], block);
+    for_neighbours<D>([&](const int step[D]) {
+      int other[D];
+      for (int i = 0; i < D; i++) other[i] = block[i] + step[i];
+      for (int i = 0; i < D; i++)
+        if (other[i] < 0 || other[i] >= a.geometry.blocks[i]) return;
+      int& entry = a.table[block_index(a.geometry, scene, other)];
+      if (entry >= 0) return;
+      if (next == a.slots()) {
+        all = false;
+        return;
+      }
+      a.block[next] = block_index(a.geometry, scene, other);
+      entry = int(next++);
+    });
+  }
+  if (!all) a.next_drift->lost = Drift::kLost;
+  return next;
 }
 
 // Counts a particle that is left out in a row of the status, unless an earlier activation has done so; whether it is
@@ -403,6 +432,8 @@ void activate(const ActivateArguments<T, D>& a) {
   for_parts(s.w.slices, a.particles, [&](int slice, int64_t begin, int64_t end) {
     fill_index(s, slice, begin, end, transferred + s.totals(slice)[W::kDropped]);
   });
+  const int64_t used = a.next_drift ? add_margin(s, slots) : slots;
+  if (a.used_slots) *a.used_slots = int(used);
   const int64_t chunks = list_base_blocks(s, slots);
   int64_t breaks = 0;
   parallel_ranges(chunks, 16, [&](int64_t begin, int64_t end) {

@@ -27,6 +27,7 @@ struct ActivateArguments {
   const int* origin = nullptr;  // where the particles came from, whose numbers the status tells then; or null
   int64_t* breaks = nullptr;    // on the CPU: how often one does not follow the one before it in memory, in the order
                                 // of cells; or null
+  int* used_slots = nullptr;    // on the CPU: told how many slots have a block; or null
   // On CUDA: rows of each of two copies of x and origin, and which one counts; or null. Then the index has rows.
   const int* copy = nullptr;
   int copy_rows = 0;

@@ -2,6 +2,7 @@
 
 #include "common/backend.h"
 #include "rollout/accumulate.h"
+#include "rollout/g2p2g_chunks.h"
 #include "rollout/laws_p2g.h"
 #include "rollout/next_grid.h"
 #include "rollout/resident.h"
@@ -16,6 +17,8 @@ MPM_BACKEND_KERNELS(MPM_ROLLOUT_KERNELS)
 #if MPM_BACKEND == MPM_BACKEND_IS_cpu
 #define MPM_OWN_PARTICLES_KERNELS(PLAIN, ORDERED, SIZE) \
   ORDERED(laws_p2g, LawsP2GArguments)                   \
+  PLAIN(g2p2g_chunks, G2P2GChunksArguments)             \
+  PLAIN(largest_speed, LargestSpeedArguments)           \
   PLAIN(permute, PermuteArguments)
 MPM_BACKEND_KERNELS(MPM_OWN_PARTICLES_KERNELS)
 #endif

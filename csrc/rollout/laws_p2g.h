@@ -37,6 +37,12 @@ struct ChunkLaw {
   bool matrix[kMostHistory] = {};
 };
 
+// Of all particles, after a P2G.
+struct Whereabouts {
+  float slack;  // cells that every particle can go, on each axis, while the activation still serves it
+  int strays;   // particles in other blocks than they were in when they were activated
+};
+
 template <class T, int D>
 struct LawsP2GArguments {
   P2GArguments<T, D> p2g;                // its stress is not used
@@ -54,6 +60,7 @@ struct LawsP2GArguments {
   int *index = nullptr, *schedule = nullptr;
   T* copies = nullptr;  // [threads, copy_size]
   int64_t copy_size = 0;
+  Whereabouts* whereabouts = nullptr;  // told the least and the sum, where an activation may last
 };
 
 // Rows of one length, from[order[i]] to to[i].

@@ -2,6 +2,7 @@
 
 #include <type_traits>
 
+#include "cpu/schedule.h"
 #include "rollout/substeps.h"
 
 // The particles of a call on the CPU. They move in place, and now and then change places in memory, so that they lie in
@@ -67,6 +68,9 @@ class OwnParticles {
 
   OwnParticles(Substeps<T, D>& steps, const Tensor& packed_history, backend::Stream stream);
 
+  // Whether an activation may serve several substeps of a call. Where it does, G2P and the next P2G are one pass.
+  static bool may_last(const SubstepsInputs& in) { return in.lattice.order() == 2 && in.n > kLeastLastingSteps; }
+
   // One substep, of which so many follow; false as `Substeps::activate`.
   bool step(const int* status_before, int* status, int64_t following);
 
@@ -76,11 +80,27 @@ class OwnParticles {
  private:
   using R = ChunkRows<D>;
 
+  // Particles change places once for the first few substeps to gain from it, and come back in the end.
+  static constexpr int64_t kLeastLastingSteps = 8;
+  // Strays, added up over the substeps, that cost what an activation does, for each of so many particles.
+  static constexpr int kStraysOfActivation = 16;
+  static constexpr int kActivationsOfPatience = 16;  // after one that served a single substep
+
+  double longest_of(const OptionalTensor& scene_dt) const;
   void find_laws();
+  bool begin(const int* status_before, int* status, int64_t following);
+  void go_on(const int* status_before, int* status);
   bool pays(int64_t following);
+  bool tries_to_last(int64_t following);
+  bool lasts(int64_t following);
+  bool reaches();
   void give_to_nodes(bool rearranges);
+  void set_p2g();
+  void set_advance();
+  void make_order();
+  void pass(bool follows);
   void find_rows(bool rearranges);
-  void find_expected();
+  void find_expected(bool motion);
   void advance();
 
   // Calls visit(field, first row of the copy or -1, whether laws read it, whether they change it) for what changes
@@ -113,6 +133,13 @@ class OwnParticles {
   bool reads_F_ = false, reads_J_ = false, viscous_ = false, rearranged_ = false;
   bool owned_ = false, moved_ = true;  // whether the fields have gone to buffers; whether some have since the last step
   int64_t breaks_ = 0, all_breaks_ = 0;  // of this substep, and since particles changed places
+  Tensor order_, cell_end_;              // of chunks, while an activation lasts
+  Drift drift_{};
+  Whereabouts whereabouts_{};
+  double longest_step_ = 0;   // of all scenes
+  int64_t passes_ = 0;        // since the activation
+  int patience_ = 0;          // activations until the next one that is to last
+  bool tries_ = false, lasts_ = false;  // whether this activation is to last; whether a pass takes the next substep
 };
 
 template <class T, int D>
@@ -134,12 +161,23 @@ OwnParticles<T, D>::OwnParticles(Substeps<T, D>& steps, const Tensor& packed_his
   s_.forget_stress();
   find_laws();
   s_.activation.breaks = &breaks_;
+  s_.activation.used_slots = &s_.used_slots;
+  longest_step_ = in_.dt * longest_of(in_.scene_dt);
   a_.has_material = has(in_.material);
   a_.laws = laws_.data();
   a_.law_count = int(laws_.size());
   a_.copy_size = (R::rest + int64_t(s_.columns + parameters_.size())) * kCopyLine;
   copies_ = empty(like, {cpu::thread_count(), a_.copy_size});
   a_.copies = static_cast<T*>(copies_.data_ptr());
+}
+
+template <class T, int D>
+double OwnParticles<T, D>::longest_of(const OptionalTensor& scene_dt) const {
+  if (!has(scene_dt)) return 1;
+  const T* const dt = static_cast<const T*>(scene_dt->data_ptr());
+  double longest = 0;
+  for (int64_t b = 0; b < in_.scenes; b++) longest = std::max(longest, double(dt[b]));
+  return longest;
 }
 
 template <class T, int D>
@@ -184,17 +222,73 @@ bool OwnParticles<T, D>::pays(int64_t following) {
 
 template <class T, int D>
 bool OwnParticles<T, D>::step(const int* status_before, int* status, int64_t following) {
+  if (lasts_)
+    go_on(status_before, status);
+  else if (!begin(status_before, status, following))
+    return false;
+  s_.move_nodes(stream_);
+  s_.end_time(stream_);
+  lasts_ = lasts(following);
+  if (!lasts_) advance();
+  return true;
+}
+
+// From an activation to the nodes.
+template <class T, int D>
+bool OwnParticles<T, D>::begin(const int* status_before, int* status, int64_t following) {
   s_.activation.x = x.now();
   s_.activation.scene = scene_.now().pointer;
   s_.activation.scene_stride = scene_.now().stride[0];
   s_.activation.origin = origin_.now().pointer;
+  tries_ = tries_to_last(following);
+  drift_ = {};
+  s_.activation.next_drift = tries_ ? &drift_ : nullptr;
   if (!s_.activate(status_before, status, stream_)) return false;
   s_.clear_nodes(stream_);
-  give_to_nodes(pays(following));
-  s_.move_nodes(stream_);
-  s_.end_time(stream_);
-  advance();
+  passes_ = 0;
+  tries_ = tries_ && drift_.lost == 0;
+  give_to_nodes(tries_ || pays(following));
   return true;
+}
+
+// G2P, laws and P2G, while an activation lasts.
+template <class T, int D>
+void OwnParticles<T, D>::go_on(const int* status_before, int* status) {
+  for (int64_t k = 0; k < (1 + in_.scenes) * kStatusSize; k++) status[k] = status_before[k];
+  status[kActivations]++;
+  s_.clear_nodes(stream_);
+  pass(true);
+}
+
+template <class T, int D>
+bool OwnParticles<T, D>::tries_to_last(int64_t following) {
+  if (!may_last(in_) || (!rearranged_ && following < kLeastLastingSteps)) return false;
+  return patience_ == 0 || --patience_ == 0;
+}
+
+// Whether a pass can take the next substep. The last one has an activation of its own in any case, so that the status
+// tells how many blocks there are by then.
+template <class T, int D>
+bool OwnParticles<T, D>::lasts(int64_t following) {
+  if (!tries_ || following < 2) return false;
+  drift_ = {whereabouts_.strays, 0, drift_.earlier + drift_.strays};
+  const bool result = drift_.lasts(in_.x.size(0), kStraysOfActivation) && reaches();
+  if (!result && passes_ == 0) patience_ = kActivationsOfPatience;
+  return result;
+}
+
+// Whether all particles stay near their base blocks in the next G2P: none moves by more than the largest velocity of a
+// node, of which its own is a mean.
+template <class T, int D>
+bool OwnParticles<T, D>::reaches() {
+  T speed = 0;
+  LargestSpeedArguments<T, D> a;
+  a.nodes = reinterpret_cast<const NodeRow<T, D>*>(s_.advance.gather.nodes.pointer - 1);
+  a.count = int64_t(s_.used_slots) * kBlockNodes<D>;
+  a.largest = &speed;
+  backend::largest_speed(a, stream_);
+  constexpr double rounding = 1e-3;
+  return double(speed) * longest_step_ / in_.lattice.dx() * (1 + rounding) + rounding < double(whereabouts_.slack);
 }
 
 template <class T, int D>
@@ -207,14 +301,9 @@ void OwnParticles<T, D>::give_to_nodes(bool rearranges) {
   if (rearranges || moved_) find_rows(rearranges);
   moved_ = rearranges || !owned_;
   owned_ = true;
-  a_.p2g = s_.p2g;
-  a_.p2g.x = x.now();
-  a_.p2g.mass = mass_.now();
-  a_.p2g.velocity = v.now();
-  a_.p2g.affine = in_.apic ? C.now() : Field<const T>{};
-  a_.p2g.volume = volume_.now();
-  a_.index = s_.activation.index;
-  a_.schedule = s_.activation.schedule;
+  set_p2g();
+  a_.whereabouts = tries_ ? &whereabouts_ : nullptr;
+  whereabouts_ = {float(kBlockWidth), 0};
   backend::laws_p2g(in_.lattice.order(), a_, stream_);
   for_fields([&](OwnField<T>& f, int, bool, bool changes) {
     if (changes || rearranges) f.go(rearranges);
@@ -239,11 +328,9 @@ void OwnParticles<T, D>::find_rows(bool rearranges) {
   if (rearranges) origin_.rows(numbers_, kOriginRow, true, true);
   if (has(in_.scene)) scene_.rows(numbers_, kSceneRow, rearranges, true);
   if (has(in_.material)) material_.rows(numbers_, kMaterialRow, rearranges, true);
-  find_expected();
+  find_expected(true);
   a_.rows = rows_.data();
   a_.row_count = int(rows_.size());
-  a_.expected = expected_.data();
-  a_.expected_count = int(expected_.size());
   a_.numbers = numbers_.data();
   a_.number_count = int(numbers_.size());
   a_.has_C = C.now().pointer;
@@ -252,20 +339,34 @@ void OwnParticles<T, D>::find_rows(bool rearranges) {
 
 // The rows that laws and P2G read.
 template <class T, int D>
-void OwnParticles<T, D>::find_expected() {
+void OwnParticles<T, D>::find_expected(bool motion) {
   std::vector<ParticleRow<T>> read;
   for_fields([&](OwnField<T>& f, int row, bool read_by_laws, bool) {
     if (row < 0 || read_by_laws) f.rows(read, row, false, false);
   });
-  v.rows(read, -1, false, false);
-  if (C.now().pointer) C.rows(read, -1, false, false);
+  if (motion) v.rows(read, -1, false, false);
+  if (motion && C.now().pointer) C.rows(read, -1, false, false);
   expected_.clear();
   for (const ParticleRow<T>& r : read)
     if (r.stride == 1) expected_.push_back(r.from);
+  a_.expected = expected_.data();
+  a_.expected_count = int(expected_.size());
 }
 
 template <class T, int D>
-void OwnParticles<T, D>::advance() {
+void OwnParticles<T, D>::set_p2g() {
+  a_.p2g = s_.p2g;
+  a_.p2g.x = x.now();
+  a_.p2g.mass = mass_.now();
+  a_.p2g.velocity = v.now();
+  a_.p2g.affine = in_.apic ? C.now() : Field<const T>{};
+  a_.p2g.volume = volume_.now();
+  a_.index = s_.activation.index;
+  a_.schedule = s_.activation.schedule;
+}
+
+template <class T, int D>
+void OwnParticles<T, D>::set_advance() {
   G2PAdvanceArguments<T, D>& a = s_.advance;
   a.gather.x = x.now();
   a.F = F.now();
@@ -275,7 +376,47 @@ void OwnParticles<T, D>::advance() {
   if (in_.wants_C) a.gather.moment = C.next(false);
   if (has(in_.F)) a.F_next = F.next(false);
   if (has(in_.J)) a.J_next = J.next(false);
-  backend::g2p_advance(in_.lattice.order(), a, stream_);
+}
+
+template <class T, int D>
+void OwnParticles<T, D>::make_order() {
+  const int64_t P = in_.x.size(0), chunks = std::min<int64_t>(s_.activation.max_blocks, P) + P / cpu::kChunk;
+  const int64_t entries = P + 8, ends = chunks * kBlockNodes<D>;
+  if (!order_.defined()) order_ = empty_int(in_.x, {(entries + 1) / 2});
+  if (!cell_end_.defined() || cell_end_.size(0) < ends / 2) cell_end_ = empty_int(in_.x, {ends / 2});
+}
+
+// G2P of the substep before, and laws and P2G of this one if it follows.
+template <class T, int D>
+void OwnParticles<T, D>::pass(bool follows) {
+  set_advance();
+  if (passes_ == 0) {
+    make_order();
+    v.go(false);  // of particles outside; of others there is nothing to read before the last pass
+    if (in_.wants_C) C.go(false);
+    find_rows(false);
+    find_expected(false);
+    moved_ = true;
+  }
+  set_p2g();
+  whereabouts_ = {float(kBlockWidth), 0};
+  G2P2GChunksArguments<T, D> a{s_.advance, a_};
+  a.follows = follows;
+  a.fresh = passes_++ == 0;
+  a.affine = in_.apic;
+  a.order = static_cast<uint16_t*>(order_.data_ptr());
+  a.cell_end = static_cast<uint16_t*>(cell_end_.data_ptr());
+  backend::g2p2g_chunks(a, stream_);
+}
+
+template <class T, int D>
+void OwnParticles<T, D>::advance() {
+  if (passes_ > 0) {
+    pass(false);
+  } else {
+    set_advance();
+    backend::g2p_advance(in_.lattice.order(), s_.advance, stream_);
+  }
   v.go(false);
   x.go(false);
   if (in_.wants_C) C.go(false);

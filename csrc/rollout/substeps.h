@@ -271,6 +271,7 @@ struct Substeps {
   LateDeformation<T, D> late;    // of P2G, where a G2P leaves F and J to the next one
   Settling<T, D> settling;       // of P2G, where the call owns its particles
   bool nodes_are_clear = false;  // when a step begins
+  int used_slots = 0;            // on the CPU: that have a block, where the activation is asked to tell
   const int* previous_status = nullptr;
 
   explicit Substeps(const SubstepsInputs& inputs);
@@ -325,6 +326,7 @@ struct Substeps {
     if (!in.grows) return false;
     const int64_t most = std::min<int64_t>(update.block_count, INT32_MAX / kBlockNodes<D>);
     activation.max_blocks = int(std::min(with_headroom(status[kBlocksNow]), most));
+    if (MPM_BACKEND == MPM_BACKEND_IS_cpu && activation.margin_blocks > 0) make_margin();
     make_pool(stream);
     find_blocks(stream);
     return true;
@@ -333,6 +335,14 @@ struct Substeps {
   void find_blocks(backend::Stream stream) {
     backend::activate(in.lattice.order(), activation, stream);
     activation.fresh = false;
+    if (activation.used_slots) update.max_blocks = contact.max_blocks = used_slots;
+  }
+
+  // On the CPU an activation may serve several substeps of a call that owns its particles: blocks around those with
+  // particles are active too, as far as there is room.
+  void make_margin() {
+    const int64_t most = std::min<int64_t>(update.block_count, INT32_MAX / kBlockNodes<D> - activation.max_blocks);
+    activation.margin_blocks = int(std::clamp<int64_t>(2 * activation.max_blocks + 64, 0, std::max<int64_t>(most, 0)));
   }
 
   // Whether node sums do not depend on the order of their terms, in deterministic mode on CUDA. Of a call without
@@ -479,8 +489,14 @@ struct Substeps {
     move_nodes(stream);
   }
 
-  void clear_nodes(backend::Stream stream) {
+  void clear_nodes([[maybe_unused]] backend::Stream stream) {
+#if MPM_BACKEND == MPM_BACKEND_IS_cpu
+    const int64_t slots = activation.used_slots ? used_slots : activation.slots();
+    if (!nodes_are_clear)
+      clear_memory(pool.nodes.data_ptr(), slots * int64_t(kBlockNodes<D>) * int64_t(sizeof(NodeRow<T, D>)));
+#else
     if (!next.emptied && !nodes_are_clear) backend::clear(pool.nodes, stream);
+#endif
   }
 
   // From their momenta to their velocities.

@@ -173,6 +173,7 @@ Results take_steps(const SubstepsInputs& in, backend::Stream stream) {
   Tensor impulse, time;
   if (has(in.impulse)) s.add_impulses_to(impulse = copy_of(*in.impulse));
   if (has(in.scene_time)) s.count_scene_times(time = copy_of(*in.scene_time));
+  if (OwnParticles<T, D>::may_last(in)) s.make_margin();
   s.make_pool(stream);
   OwnParticles<T, D> particles(s, history, stream);
   const int* before = s.previous_status;

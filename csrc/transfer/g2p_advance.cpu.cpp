@@ -1,100 +1,8 @@
-#include "transfer/advance.h"
-#include "transfer/gather.cpu.h"
+#include "transfer/advance_chunk.cpu.h"
 
 // G2P with the end of the step, so that v and C need not be read again.
 namespace mpm::cpu {
 inline namespace TORCH_MPM_ISA {
-
-// The fields of the particles, by rows.
-template <class T, int D>
-struct AdvancedRows {
-  FieldRows<const T, D> x;
-  FieldRows<const T, D * D> F;
-  FieldRows<const T, 1> J;
-  FieldRows<T, D> v, x_next;
-  FieldRows<T, D * D> affine, F_next;
-  FieldRows<T, 1> J_next;
-
-  explicit AdvancedRows(const G2PAdvanceArguments<T, D>& a)
-      : x(a.gather.x),
-        F(a.F, D),
-        J(a.J),
-        v(a.gather.value),
-        x_next(a.x_next),
-        affine(a.gather.moment, D),
-        F_next(a.F_next, D),
-        J_next(a.J_next) {}
-
-  // Asks for the cache lines of a particle, where all strides are 1. GCC leaves out calls of functions that do no more.
-  MPM_HD void expect(int p) const {
-    if (x.row[0] != x_next.row[0]) {
-      expect<false>(x, p);
-      expect<false>(F, p);
-    }
-    expect<true>(x_next, p);
-    expect<true>(F_next, p);
-    expect<true>(v, p);
-    expect<true>(affine, p);
-  }
-
- private:
-  template <bool Writes, class E, int N>
-  MPM_HD static void expect(const FieldRows<E, N>& f, int p) {
-    if (!f) return;
-    MPM_UNROLL for (int k = 0; k < N; k++)
-      __builtin_prefetch(f.row[k] + p, Writes, 2);
-  }
-};
-
-// What a step changes of a pack of particles.
-template <class P, int D>
-struct Advanced {
-  Vector<P, D> x, v;
-  Matrix<P, D> affine, F;
-  P J;
-};
-
-// The particles of a group or a run as they are; zero for absent fields.
-template <class P, int D, class T, class G>
-MPM_HD void read(Advanced<P, D>& p, const AdvancedRows<T, D>& rows, const G& g) {
-  MPM_UNROLL for (int i = 0; i < D; i++)
-    p.x[i] = load_row(rows.x.row[i], rows.x.stride, g);
-  MPM_UNROLL for (int k = 0; k < D * D; k++)
-    p.F[k / D][k % D] = rows.F ? load_row(rows.F.row[k], rows.F.stride, g) : P(0);
-  p.J = rows.J ? load_row(rows.J.row[0], rows.J.stride, g) : P(0);
-}
-
-template <class P, int D, class T, class G>
-MPM_HD void write(const Advanced<P, D>& p, const AdvancedRows<T, D>& rows, const G& g) {
-  MPM_UNROLL for (int i = 0; i < D; i++) {
-    store_row(p.v[i], rows.v.row[i], rows.v.stride, g);
-    store_row(p.x[i], rows.x_next.row[i], rows.x_next.stride, g);
-  }
-  if (rows.affine) MPM_UNROLL
-    for (int k = 0; k < D * D; k++) store_row(p.affine[k / D][k % D], rows.affine.row[k], rows.affine.stride, g);
-  if (rows.F) MPM_UNROLL
-    for (int k = 0; k < D * D; k++) store_row(p.F[k / D][k % D], rows.F_next.row[k], rows.F_next.stride, g);
-  if (rows.J) store_row(p.J, rows.J_next.row[0], rows.J_next.stride, g);
-}
-
-// The motion of the particles of a chunk in the order of cells: packs of a cell are seldom full, those of a chunk are.
-template <bool Gradient, class T, int D>
-struct Motion {
-  static constexpr int kLine = kChunk + 16;  // not a power of two, and room for a whole register at the end
-  alignas(64) T velocity[D][kLine], affine[D][D][kLine], gradient[Gradient ? D : 1][D][kLine];
-
-  Motion() {}  // nothing is set to zero
-
-  MPM_HD void put(int i, const Sums<Lanes<T>, D> s[D]) {
-    MPM_UNROLL for (int c = 0; c < D; c++) {
-      s[c].value.store(velocity[c] + i);
-      MPM_UNROLL for (int a = 0; a < D; a++) {
-        s[c].moment[a].store(affine[c][a] + i);
-        if (Gradient) s[c].gradient[a].store(gradient[c][a] + i);
-      }
-    }
-  }
-};
 
 template <int Order, bool Gradient, class T, int D>
 void g2p_advance_with(const G2PAdvanceArguments<T, D>& a) {
@@ -113,21 +21,13 @@ void g2p_advance_with(const G2PAdvanceArguments<T, D>& a) {
     for (int i = 0; i < chunk.count; i += N) {
       Advanced<P, D> p;
       Matrix<P, D> L;
-      MPM_UNROLL for (int c = 0; c < D; c++) {
-        p.v[c] = P::load(motion.velocity[c] + i);
-        MPM_UNROLL for (int k = 0; k < D; k++) {
-          p.affine[c][k] = scale * P::load(motion.affine[c][k] + i);
-          L[c][k] = Gradient ? inverse_dx * P::load(motion.gradient[Gradient ? c : 0][k] + i) : p.affine[c][k];
-        }
-      }
+      motion.get(i, scale, inverse_dx, p, L);
       // One arithmetic for all, so that rounding does not depend on what is consecutive.
       const int rest = chunk.count - i;
       const bool run = direct && chunk.sorted && rest >= N;
       const GroupOf<N> g = run ? GroupOf<N>{} : group_of<N>(id + i, rest);
       run ? read(p, rows, RunOf<N>{chunk.id[0] + i}) : read(p, rows, g);
-      p.x = advance_position(p.x, p.v, dt);
-      if (rows.F) p.F = advance_deformation(p.F, L, dt);
-      if (rows.J) p.J = advance_volume_ratio(p.J, L, dt);
+      end_step(p, L, dt, rows);
       run ? write(p, rows, RunOf<N>{chunk.id[0] + i}) : write(p, rows, g);
     }
   };
@@ -154,19 +54,7 @@ void g2p_advance(const G2PAdvanceArguments<T, D>& a) {
     g2p_advance_with<Order, true>(a);
   else
     g2p_advance_with<Order, false>(a);
-  for_outside(a.gather.topology, [&](int64_t p) {
-    const Vector<T, D> x = load_vector<D>(One<T>{p}, a.gather.x);
-    const T rest = is_finite<D>(x.e) ? T(0) : T(a.gather.lost);
-    for (int i = 0; i < D; i++) {
-      at(a.gather.value, p, i) = rest;
-      at(a.x_next, p, i) = x[i];
-      for (int j = 0; j < D; j++) {
-        if (a.gather.moment.pointer) at(a.gather.moment, p, i, j) = rest;
-        if (a.F.pointer) at(a.F_next, p, i, j) = at(a.F, p, i, j);
-      }
-    }
-    if (a.J.pointer) at(a.J_next, p) = at(a.J, p);
-  });
+  leave_outside(a);
 }
 
 MPM_INSTANTIATE_ORDERS(g2p_advance, G2PAdvanceArguments)

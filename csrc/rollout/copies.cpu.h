@@ -1,0 +1,212 @@
+#pragma once
+
+#include "cpu/chunk.h"
+#include "cpu/parallel.h"
+#include "rollout/laws_p2g.h"
+
+// Copies of the rows of a chunk of particles, on which laws act.
+namespace mpm::cpu {
+inline namespace TORCH_MPM_ISA {
+
+static_assert(kCopyLine >= kChunk + kRegisterBytes / int(sizeof(float)));
+
+// Particles `first`, ... that follow each other in memory and in the order of cells, from place `at` of the chunk on.
+struct Stretch {
+  int first, at, count;
+};
+
+// Copies `count` values. Of the `room` places from the first on, those that come later may be written over.
+template <class T>
+MPM_HD void copy(const T* from, T* to, int count, int room) {
+#ifdef __AVX512VL__
+  constexpr int N = kRegisterBytes / sizeof(T);
+  for (int i = 0; i < count; i += N) {
+    const unsigned lanes = count - i < N ? (1u << (count - i)) - 1 : (2u << (N - 1)) - 1;
+    if constexpr (sizeof(T) == 4) {
+      const __m512i values = _mm512_maskz_loadu_epi32(__mmask16(lanes), from + i);
+      i + N <= room ? _mm512_storeu_si512(to + i, values) : _mm512_mask_storeu_epi32(to + i, __mmask16(lanes), values);
+    } else {
+      const __m512i values = _mm512_maskz_loadu_epi64(__mmask8(lanes), from + i);
+      i + N <= room ? _mm512_storeu_si512(to + i, values) : _mm512_mask_storeu_epi64(to + i, __mmask8(lanes), values);
+    }
+  }
+#else
+  for (int i = 0; i < count; i++) to[i] = from[i];
+#endif
+}
+
+// The particles of a chunk, or some that are outside, copied in the order of cells.
+template <class T, int D>
+class Copies {
+ public:
+  using R = ChunkRows<D>;
+
+  Copies(const LawsP2GArguments<T, D>& arguments, T* memory) : a_(arguments), rows_(memory) {}
+
+  T* row(int r) const { return rows_ + r * kCopyLine; }
+  Field<const T> field(int r, int inner = D) const { return {row(r), {1, inner * kCopyLine, kCopyLine}}; }
+
+  // Those at a place of the index, in the order of a chunk if there is one; the place and number of what comes next.
+  void fetch(int position, int count, int next, int next_count, const Chunk* order) {
+    position_ = position;
+    count_ = count;
+    find_stretches(order);
+    next_ = next;
+    next_count_ = next_count;
+    next_first_ = next_count ? __atomic_load_n(a_.index + next, __ATOMIC_RELAXED) : 0;
+    for (int k = 0; k < a_.row_count; k++) find_row(a_.rows[k]);
+    for (int k = 0; k < a_.number_count; k++) get(a_.numbers[k], numbers_[a_.numbers[k].row], kCopyLine);
+  }
+
+  // Those from a place on in memory, with rows of their affine fields.
+  void fetch_run(int position, int count, const T* affine, int line) {
+    position_ = position;
+    count_ = count;
+    stretches_ = 1;
+    stretch_[0] = {position, 0, count};
+    for (int k = 0; k < a_.row_count; k++) find_row(a_.rows[k]);
+    for (int k = 0; k < a_.number_count; k++) get(a_.numbers[k], numbers_[a_.numbers[k].row], kCopyLine);
+    for (int k = 0; k < D * D; k++) given_[R::C + k] = affine + k * line;
+  }
+
+  // Asks for the cache lines of the i-th particle of what is copied next, while there is other work. It may lie
+  // elsewhere, even beyond the end of a tensor: nothing is read. (GCC leaves out calls of functions that do no more.)
+  MPM_HD void expect(int i) const {
+    if (i >= next_count_) return;
+    for (int k = 0; k < a_.expected_count; k++) __builtin_prefetch(a_.expected[k] + (next_first_ + i), 0, 2);
+    for (int k = 0; a_.rearranges && k < a_.row_count; k++) __builtin_prefetch(a_.rows[k].to + next_ + i, 1, 2);
+  }
+
+  // Particles i, i + 1, ... of the chunk.
+  template <int N>
+  MPM_HD GroupOf<N> group(int i) const {
+    return group_of<N>(id_ + i, count_ - i);
+  }
+
+  // Stress, and what return maps change.
+  void apply_laws() {
+    const int* const material = a_.has_material ? numbers_[kMaterialRow] : nullptr;
+    bool mixed = false;
+    for (int i = 1; material && i < count_; i++) mixed |= material[i] != material[0];
+    const int only = material && !mixed ? material[0] : -1;
+    if (mixed || (material && (only < 0 || only >= a_.law_count))) {  // some may have no law
+      for (int k = 0; k < D * D; k++) __builtin_memset(row(R::stress + k), 0, count_ * sizeof(T));
+    }
+    for (int k = 0; k < a_.law_count; k++) {
+      if (material && !mixed && k != only) continue;
+      LawUpdateArguments<T, D> law = here(a_.laws[k]);
+      if (mixed) law.law.members = {material, 1, k};
+      a_.laws[k].update(law, nullptr);
+    }
+  }
+
+  // What goes elsewhere, or has changed.
+  void leave() const {
+    for (int k = 0; k < a_.row_count; k++) {
+      const ParticleRow<T>& r = a_.rows[k];
+      if (!r.to) continue;
+      if (r.row >= 0)
+        put(r, row(r.row));
+      else
+        get(r, r.to + position_, count_);  // which changes places
+    }
+    for (int k = 0; k < a_.number_count; k++)
+      if (a_.numbers[k].to) put(a_.numbers[k], numbers_[a_.numbers[k].row]);
+    if (a_.rearranges)
+      for (int i = 0; i < count_; i++) a_.index[position_ + i] = position_ + i;
+  }
+
+ private:
+  void find_stretches(const Chunk* order) {
+    id_ = a_.index + position_;
+    if (order && !order->sorted) {
+      for (int i = 0; i < count_; i++) by_cell_[i] = id_[order->by_cell(i)];
+      id_ = by_cell_;
+    }
+    stretches_ = 1;
+    stretch_[0] = {id_[0], 0, count_};
+    if (order && order->sorted) return;
+    for (int i = 1; i < count_; i++) {  // without a branch
+      stretch_[stretches_] = {id_[i], i, count_ - i};
+      stretches_ += id_[i] != id_[i - 1] + 1;
+    }
+    for (int k = 1; k < stretches_; k++) stretch_[k - 1].count = stretch_[k].at - stretch_[k - 1].at;
+    stretch_[stretches_ - 1].count = count_ - stretch_[stretches_ - 1].at;
+  }
+
+  // Rows that laws only read stay where they are if the particles lie one after another.
+  void find_row(const ParticleRow<T>& r) {
+    if (r.row < 0) return;
+    const bool stays = r.row < R::rest && !r.to && r.stride == 1 && stretches_ == 1;
+    if (r.row < R::rest) given_[r.row] = stays ? r.from + stretch_[0].first : row(r.row);
+    if (!stays) get(r, row(r.row), kCopyLine);
+  }
+
+  // D x D rows from r on, as they are given.
+  Field<const T> given(int r) const { return {given_[r], {1, given_[r + D] - given_[r], given_[r + 1] - given_[r]}}; }
+
+  template <class E>
+  void get(const ParticleRow<E>& r, E* to, int room) const {
+    if (r.stride == 1)
+      for (int k = 0; k < stretches_; k++)
+        copy(r.from + stretch_[k].first, to + stretch_[k].at, stretch_[k].count, room - stretch_[k].at);
+    else
+      for (int i = 0; i < count_; i++) to[i] = r.from[id_[i] * r.stride];
+  }
+
+  template <class E>
+  void put(const ParticleRow<E>& r, const E* from) const {
+    if (a_.rearranges) return copy(from, r.to + position_, count_, count_);
+    for (int k = 0; k < stretches_; k++)
+      copy(from + stretch_[k].at, r.to + stretch_[k].first, stretch_[k].count, stretch_[k].count);
+  }
+
+  LawUpdateArguments<T, D> here(const ChunkLaw<T, D>& law) const {
+    LawUpdateArguments<T, D> u = law.arguments;
+    LawArguments<T, D>& a = u.law;
+    a.particles = count_;
+    a.members = {};
+    a.state = law.gradient ? given(R::F) : Field<const T>{given_[R::J], {1, 0, 0}};
+    if (law.viscous && a_.has_C) a.C = given(R::C);
+    a.scene = numbers_[kSceneRow];
+    a.scene_stride = 1;
+    for (int k = 0; k < kMostParameters; k++)
+      if (law.parameters[k] >= 0) a.parameters[k] = {row(law.parameters[k]), 1, 0};
+    for (int k = 0; k < kMostHistory; k++) {
+      a.history[k] = {};
+      if (law.history[k] >= 0) a.history[k] = field(law.history[k], law.matrix[k] ? D : 1);
+    }
+    const auto written = [&](int r, int inner) { return Field<T>{row(r), {1, inner * kCopyLine, kCopyLine}}; };
+    u.stress = written(R::stress, D);
+    if (law.plastic) u.state = written(R::F, D);
+    if (law.history[0] >= 0) u.history = written(law.history[0], 1);
+    return u;
+  }
+
+  const LawsP2GArguments<T, D>& a_;
+  T* const rows_;
+  int position_ = 0, count_ = 0, stretches_ = 0, next_ = 0, next_first_ = 0, next_count_ = 0;
+  const T* given_[R::rest];
+  const int* id_ = nullptr;  // in the order of cells
+  int by_cell_[kChunk], numbers_[kNumberRows][kCopyLine];
+  Stretch stretch_[kChunk + 1];
+};
+
+// The laws act on particles outside of the grid, too.
+template <class T, int D>
+void laws_outside(const LawsP2GArguments<T, D>& a, int first) {
+  const int last = int(a.p2g.topology.particles), pieces[2] = {0, (last - first + kChunk - 1) / kChunk};
+  int taken = 0;
+  parallel_phases<1>(pieces, pieces[1], [&](const auto& next) {
+    Copies<T, D> copies(a, a.copies + a.copy_size * __atomic_fetch_add(&taken, 1, __ATOMIC_RELAXED));
+    for (int64_t piece; (piece = next()) >= 0;) {
+      const int begin = first + int(piece) * kChunk;
+      copies.fetch(begin, last - begin < kChunk ? last - begin : kChunk, begin, 0, nullptr);
+      copies.apply_laws();
+      copies.leave();
+    }
+  });
+}
+
+}  // namespace TORCH_MPM_ISA
+}  // namespace mpm::cpu

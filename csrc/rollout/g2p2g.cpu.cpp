@@ -1,0 +1,343 @@
+#include "rollout/g2p2g_chunks.h"
+
+#include <type_traits>
+
+#include "cpu/cell_sort.h"
+#include "rollout/copies.cpu.h"
+#include "rollout/slack.cpu.h"
+#include "transfer/advance_chunk.cpu.h"
+#include "transfer/scatter.cpu.h"
+
+namespace mpm::cpu {
+inline namespace TORCH_MPM_ISA {
+namespace {
+
+// Quadratic splines: the nodes of particles that are up to one cell outside of two base blocks of one colour never
+// overlap, and what is summed in turn of the colours has an order.
+constexpr int kOrder = 2;
+
+// The nodes of one particle in the corner of a tile, wherever it is; f(values of a node in the tile, row of the pool).
+template <class T, int D, class F>
+void for_nodes_of(const Topology<T, D>& t, int scene, const int base[D], Tile<kOrder, T, D>& tile, const F& f) {
+  constexpr int S = kOrder + 1;
+  for (int n = 0; n < (D == 3 ? S * S * S : S * S); n++) {
+    int at[D], node[D], block[D];
+    for (int a = D - 1, rest = n; a >= 0; a--, rest /= S) {
+      at[a] = rest % S;
+      node[a] = base[a] + at[a];
+      block[a] = node[a] / kBlockWidth;
+    }
+    const int slot = t.table[block_index(t.geometry, scene, block)];
+    f(tile.value + tile.at(at), int64_t(slot) * kBlockNodes<D> + node_in_block<D>(node));
+  }
+}
+
+// What a thread does to the chunks of its base blocks.
+template <bool Gradient, class T, int D>
+class ChunkPass {
+ public:
+  ChunkPass(const G2P2GChunksArguments<T, D>& a, T* copies)
+      : a_(a),
+        t_(a.advance.gather.topology),
+        schedule_(schedule_of(t_)),
+        rows_(a.advance),
+        mass_(a.to_nodes.p2g.mass),
+        volume_(a.to_nodes.p2g.volume),
+        slack_(t_.geometry, a.follows ? a.to_nodes.whereabouts : nullptr),
+        copies_(a.to_nodes, copies) {}
+  ~ChunkPass() {
+    if (a_.follows) __atomic_fetch_add(&a_.to_nodes.whereabouts->strays, strays_, __ATOMIC_RELAXED);
+  }
+
+  // `my_turn` waits until sums of other blocks that come first are done.
+  template <class F>
+  void take(const BaseBlock<T, D>& base_block, int64_t first, int64_t last, const F& my_turn) {
+    slack_.begin(base_block);
+    velocities_.load_from(a_.advance.gather.nodes, base_block, 0, D);
+    if (a_.follows) momenta_.clear();
+    const int64_t chunks = schedule_.base_chunk[schedule_.colour_start[kColours<D>]];
+    for (int64_t c = first; c < last; c++) {
+      const Chunk chunk(t_, schedule_, c), next(t_, schedule_, c + 1 < chunks ? c + 1 : c);
+      begin_ = int(chunk.id - t_.index);
+      count_ = chunk.count;
+      order_ = a_.order + begin_;
+      cell_end_ = a_.cell_end + c * kBlockNodes<D>;
+      if (a_.fresh) {
+        find_cells(base_block);
+        sort();
+      }
+      gather(base_block, next);
+      for (int k = cell_end_[kBlockNodes<D> - 1]; k < count_; k++) gather_stray(base_block.scene, order_[k]);
+      advance(base_block.scene);
+      if (!a_.follows) continue;
+      give(base_block);
+      sort();
+      sum_cells(contributions_, order_, cell_end_, momenta_);
+      for (int k = cell_end_[kBlockNodes<D> - 1]; k < count_; k++) {
+        my_turn();
+        add_stray(base_block.scene, order_ + k);
+      }
+    }
+    if (!a_.follows) return;
+    my_turn();
+    momenta_.add_to(a_.to_nodes.p2g.nodes, base_block, 0, 1 + D);
+  }
+
+ private:
+  static constexpr int N = kWideLanes<T>;
+  using P = Pack<T, N>;
+  using R = ChunkRows<D>;
+
+  // f(a whole pack of particles from the i-th on) or f(some of them)
+  template <class F>
+  MPM_HD void at_particles(int i, const F& f) const {
+    const int rest = count_ - i;
+    if (rest >= N) return f(RunOf<N>{begin_ + i});
+    int id[N];
+    for (int l = 0; l < N; l++) id[l] = begin_ + i + l;
+    f(group_of<N>(id, rest));
+  }
+
+  void load_positions(int i, P x[D]) const {
+    at_particles(i, [&](const auto& g) {
+      MPM_UNROLL for (int a = 0; a < D; a++)
+        x[a] = load_row(rows_.x_next.row[a], 1, g);
+    });
+  }
+
+  // Distances of particles i, i + 1, ... from their base nodes, and their cells in the base block; kBlockNodes if they
+  // are in none.
+  MPM_HD void locate(int i, const BaseBlock<T, D>& base_block, const P x[D], P f[D]) {
+    using Values = typename RegisterOf<T, N>::Value;
+    using Integers = typename RegisterOf<float, N>::Integer;
+    typedef uint8_t Bytes __attribute__((vector_size(N)));
+    Mask<T, N> inside;
+    P cell;
+    MPM_UNROLL for (int a = 0; a < D; a++) {
+      const P node = base_node<kOrder>(t_.geometry, a, x[a]), local = node - P(T(base_block.corner[a]));
+      f[a] = distance_in_cells(t_.geometry, a, x[a], node);
+      const auto in = (local >= P(0)) & (local < P(kBlockWidth));
+      inside = a ? inside & in : in;
+      cell = a ? cell * P(kBlockWidth) + local : local;
+    }
+    cell = select(inside, cell, P(kBlockNodes<D>));
+    Values values;
+    __builtin_memcpy(&values, &cell, sizeof(values));
+    const Bytes bytes = __builtin_convertvector(__builtin_convertvector(values, Integers), Bytes);
+    __builtin_memcpy(cell_ + i, &bytes, sizeof(bytes));
+  }
+
+  void find_cells(const BaseBlock<T, D>& base_block) {
+    for (int i = 0; i < count_; i += N) {
+      P x[D], f[D];
+      load_positions(i, x);
+      locate(i, base_block, x, f);
+    }
+  }
+
+  void sort() {
+    uint16_t end[kBlockNodes<D> + 1];
+    sort_by_cell<kBlockNodes<D> + 1>(cell_, count_, order_, end);
+    __builtin_memcpy(cell_end_, end, sizeof(*end) * kBlockNodes<D>);
+  }
+
+  // Sums of G2P for the particles that are in their base block.
+  void gather(const BaseBlock<T, D>& base_block, const Chunk& next) {
+    int expected = 0;
+    for (int cell = 0, i = 0; cell < kBlockNodes<D>; cell++) {
+      int base[D];
+      for (int a = 0; a < D; a++) base[a] = cell_coordinate<D>(cell, a);
+      for (const int end = cell_end_[cell]; i < end; i += kLanes) {
+        int id[kLanes];
+        MPM_UNROLL for (int l = 0; l < kLanes; l++)
+          id[l] = order_[i + l];
+        const Group g = group_of<kLanes>(id, end - i);
+        Lanes<T> f[D];
+        MPM_UNROLL for (int a = 0; a < D; a++)
+          f[a] = distance_in_cells(t_.geometry, a, load_row(rows_.x_next.row[a] + begin_, 1, g),
+                                   Lanes<T>(T(base_block.corner[a] + base[a])));
+        const T* at = velocities_.value + velocities_.at(base);
+        // Most cells have one group: what the compiler keeps of the nodes for a second one goes to the stack and back.
+        asm volatile("" : "+r"(at));
+        Sums<Lanes<T>, D> s[D];
+        gather_channels<kOrder, D, true, Gradient, T, D>(f, at, s);
+        motion_.put(g, s);
+        for (; expected <= i; expected += 64 / int(sizeof(T))) expect(next, expected);
+      }
+      i = cell_end_[cell];
+    }
+  }
+
+  // Asks for the cache lines of the i-th particle of the chunk that comes next. (GCC leaves out calls of functions that
+  // do no more.)
+  MPM_HD void expect(const Chunk& next, int i) const {
+    if (i >= next.count) return;
+    const int64_t p = next.id - t_.index + i;
+    for (int k = 0; k < a_.to_nodes.expected_count; k++) __builtin_prefetch(a_.to_nodes.expected[k] + p, 0, 2);
+  }
+
+  void base_of(int i, int base[D]) const {
+    for (int a = 0; a < D; a++) base[a] = int(base_node<kOrder>(t_.geometry, a, rows_.x_next.row[a][begin_ + i]));
+  }
+
+  void gather_stray(int scene, int i) {
+    int base[D];
+    base_of(i, base);
+    const NodeField<const T>& nodes = a_.advance.gather.nodes;
+    for_nodes_of(t_, scene, base, around_, [&](T* tile, int64_t row) {
+      for (int c = 0; c < D; c++) tile[c] = nodes.pointer[row * nodes.stride + c];
+    });
+    Lanes<T> f[D];
+    for (int a = 0; a < D; a++)
+      f[a] = Lanes<T>(distance_in_cells(t_.geometry, a, rows_.x_next.row[a][begin_ + i], T(base[a])));
+    Sums<Lanes<T>, D> s[D];
+    gather_channels<kOrder, D, true, Gradient, T, D>(f, around_.value, s);
+    motion_.put(group_of<kLanes>(&i, 1), s);
+  }
+
+  void add_stray(int scene, const uint16_t* order) {
+    int base[D];
+    base_of(*order, base);
+    around_.clear();
+    sum_cell(contributions_, order, 1, around_.value);
+    const NodeField<T>& nodes = a_.to_nodes.p2g.nodes;
+    for_nodes_of(t_, scene, base, around_, [&](const T* tile, int64_t row) {
+      for (int c = 0; c <= D; c++) nodes.pointer[row * nodes.stride + c] += tile[c];
+    });
+    strays_++;
+  }
+
+  P time_step(const Field<const T>& scene_dt, double dt, int scene) const {
+    return P(T(dt) * (scene_dt.pointer ? scene_dt.pointer[scene * scene_dt.stride[0]] : T(1)));
+  }
+
+  // The end of the step.
+  void advance(int scene) {
+    const P scale(a_.advance.gather.moment_scale * double(t_.geometry.dx)), inverse_dx(t_.geometry.inverse_dx);
+    const P dt = time_step(a_.advance.scene_dt, a_.advance.dt, scene);
+    for (int i = 0; i < count_; i += N)
+      at_particles(i, [&](const auto& g) {
+        Advanced<P, D> p;
+        Matrix<P, D> L;
+        motion_.get(i, scale, inverse_dx, p, L);
+        read(p, rows_, g);
+        end_step(p, L, dt, rows_);
+        write_moved(p, rows_, g);
+        if (!a_.follows) return write_motion(p, rows_, g);
+        MPM_UNROLL for (int k = 0; k < D * D; k++)
+          p.affine[k / D][k % D].store(motion_.affine[k / D][k % D] + i);
+      });
+  }
+
+  // Laws, and what the particles give to the nodes.
+  void give(const BaseBlock<T, D>& base_block) {
+    const P2GArguments<T, D>& p2g = a_.to_nodes.p2g;
+    copies_.fetch_run(begin_, count_, motion_.affine[0][0], motion_.kLine);
+    copies_.apply_laws();
+    const P dt = time_step(p2g.scene_dt, p2g.dt, base_block.scene);
+    for (int i = 0; i < count_; i += N)
+      at_particles(i, [&](const auto& g) {
+        P x[D], f[D];
+        ParticleMomentum<P, D> p;
+        p.mass = load_row(mass_.row[0], 1, g);
+        p.volume = load_row(volume_.row[0], 1, g);
+        p.dt = dt;
+        MPM_UNROLL for (int a = 0; a < D; a++) {
+          x[a] = load_row(rows_.x_next.row[a], 1, g);
+          p.velocity[a] = P::load(motion_.velocity[a] + i);
+          MPM_UNROLL for (int b = 0; b < D; b++)
+            p.affine[a][b] = a_.affine ? P::load(motion_.affine[a][b] + i) : P(0);
+        }
+        p.stress = load_matrix_or_zero<T, D>(copies_.field(R::stress), RunOf<N>{i});
+        locate(i, base_block, x, f);
+        slack_.add(x, count_ - i);
+        contributions_.put(i, f, momentum_contribution<kOrder, true, Gradient>(t_.geometry, p, f));
+      });
+    copies_.leave();
+  }
+
+  const G2P2GChunksArguments<T, D>& a_;
+  const Topology<T, D>& t_;
+  const ScheduleIn schedule_;
+  const AdvancedRows<T, D> rows_;
+  const FieldRows<const T, 1> mass_, volume_;
+  Slack<T, D> slack_;
+  int strays_ = 0, begin_ = 0, count_ = 0;
+  uint16_t *order_ = nullptr, *cell_end_ = nullptr;  // of the chunk
+  uint8_t cell_[kChunk + N];
+  Copies<T, D> copies_;
+  Motion<Gradient, T, D> motion_;
+  Contributions<kOrder, T, D, true, Gradient> contributions_;
+  Tile<kOrder, T, D> velocities_, momenta_, around_;
+};
+
+template <bool Gradient, class T, int D>
+void g2p2g_with(const G2P2GChunksArguments<T, D>& a) {
+  const Topology<T, D>& t = a.advance.gather.topology;
+  const ScheduleIn s = schedule_of(t);
+  PhaseCounter<kColours<D>> colours{s.colour_start};
+  int taken = 0;
+  parallel_base_blocks<D>(s, t.particles, [&](const auto& next) {
+    const LawsP2GArguments<T, D>& to = a.to_nodes;
+    ChunkPass<Gradient, T, D> pass(a, to.copies + to.copy_size * __atomic_fetch_add(&taken, 1, __ATOMIC_RELAXED));
+    int colour = 0;
+    for (int64_t b; (b = next()) >= 0;) {
+      while (b >= s.colour_start[colour + 1]) colour++;
+      pass.take(BaseBlock<T, D>(t, s.base_slot[b]), s.base_chunk[b], s.base_chunk[b + 1],
+                [&] { colours.wait_before(colour); });
+      colours.finish(colour);
+    }
+  });
+}
+
+}  // namespace
+
+template <class T, int D>
+void g2p2g_chunks(const G2P2GChunksArguments<T, D>& a) {
+  if (a.advance.form == StressForm::gradient)
+    g2p2g_with<true>(a);
+  else
+    g2p2g_with<false>(a);
+  const Topology<T, D>& t = a.advance.gather.topology;
+  const int first = t.offsets[t.max_blocks];
+  if (!a.follows || a.fresh) leave_outside(a.advance);
+  if (a.follows && first < t.particles) laws_outside(a.to_nodes, first);
+}
+
+template <class T, int D>
+void largest_speed(const LargestSpeedArguments<T, D>& a) {
+  constexpr int kRows = 16, kStride = 1 + D, kGroup = kRows * kStride;
+  constexpr int64_t grain = 1024;  // groups below which a range is not split
+  static_assert(kBlockNodes<D> % kRows == 0 && sizeof(NodeRow<T, D>) == kStride * sizeof(T));
+  using Bits = std::conditional_t<sizeof(T) == 4, int32_t, int64_t>;
+  *a.largest = T(0);
+  parallel_ranges(a.count / kRows, grain, [&](int64_t begin, int64_t end) {
+    T most[kGroup] = {}, nan[kGroup] = {};
+    for (int64_t g = begin; g < end; g++) {
+      const T* const from = reinterpret_cast<const T*>(a.nodes + g * kRows);
+      for (int k = 0; k < kGroup; k++) {
+        const T speed = from[k] < 0 ? -from[k] : from[k];
+        most[k] = speed > most[k] ? speed : most[k];
+        nan[k] += from[k] - from[k];  // NaN if it is not finite
+      }
+    }
+    T largest = 0;
+    for (int k = 0; k < kGroup; k++)
+      if (k % kStride > 0) {
+        largest = most[k] > largest ? most[k] : largest;
+        if (nan[k] != T(0)) largest = T(__builtin_inf());
+      }
+    // Numbers that are not negative are in the order of their bits.
+    Bits* const all = reinterpret_cast<Bits*>(a.largest);
+    const Bits own = __builtin_bit_cast(Bits, largest);
+    Bits now = __atomic_load_n(all, __ATOMIC_RELAXED);
+    while (now < own && !__atomic_compare_exchange_n(all, &now, own, false, __ATOMIC_RELAXED, __ATOMIC_RELAXED)) {
+    }
+  });
+}
+
+MPM_INSTANTIATE(g2p2g_chunks, G2P2GChunksArguments)
+MPM_INSTANTIATE(largest_speed, LargestSpeedArguments)
+
+}  // namespace TORCH_MPM_ISA
+}  // namespace mpm::cpu
