@@ -246,9 +246,32 @@ MPM_HD Pack<T, N> abs(const Pack<T, N>& a) {
   return select(a < Pack<T, N>(0), -a, a);
 }
 
+#ifdef __AVX2__
+// The instructions by name, which choose b where the order is not known, too.
+#define MPM_LARGER(Register, prefix, suffix) \
+  MPM_HD Register larger(Register a, Register b) { return prefix##_max_##suffix(a, b); }
+MPM_LARGER(__m128, _mm, ps)
+MPM_LARGER(__m128d, _mm, pd)
+MPM_LARGER(__m256, _mm256, ps)
+MPM_LARGER(__m256d, _mm256, pd)
+#ifdef __AVX512F__
+MPM_LARGER(__m512, _mm512, ps)
+MPM_LARGER(__m512d, _mm512, pd)
+#endif
+#undef MPM_LARGER
+#endif
+
+// a where a > b, else b.
 template <class T, int N>
 MPM_HD Pack<T, N> max(const Pack<T, N>& a, const Pack<T, N>& b) {
+#ifdef __AVX2__
+  Pack<T, N> r;
+  MPM_UNROLL for (int k = 0; k < r.kParts; k++)
+    r.part[k] = larger(a.part[k], b.part[k]);
+  return r;
+#else
   return select(a > b, a, b);
+#endif
 }
 
 template <class T, int N>

@@ -204,6 +204,32 @@ MPM_HD Pack<T, N> load(const Field<const T>& f, const RunOf<N>& r, int i = 0, in
   return load_row(row_of(f, i, j), 1, r);
 }
 
+// The same, of which only the first `count` are there.
+template <int N>
+struct PartOf {
+  static constexpr int kSize = N;
+  int first, count;
+};
+
+template <class T, int N>
+MPM_HD Pack<T, N> load_row(const T* row, int64_t, const PartOf<N>& r) {
+#ifdef __AVX512VL__
+  return Pack<T, N>(0).with(row + r.first, (1u << r.count) - 1);
+#else
+  T lanes[N] = {};
+  for (int l = 0; l < r.count; l++) lanes[l] = row[r.first + l];
+  return Pack<T, N>::load(lanes);
+#endif
+}
+template <class T, int N>
+MPM_HD void store_row(const Pack<T, N>& v, T* row, int64_t, const PartOf<N>& r) {
+#ifdef __AVX512VL__
+  v.store(row + r.first, (1u << r.count) - 1);
+#else
+  for (int l = 0; l < r.count; l++) row[r.first + l] = v[l];
+#endif
+}
+
 // Where the N components of a field begin. A store through a Field makes the compiler read its strides again.
 template <class T, int N>
 struct FieldRows {

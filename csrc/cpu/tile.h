@@ -1,6 +1,9 @@
 #pragma once
 
+#include <type_traits>
+
 #include "common/fields.h"
+#include "common/pack.h"
 #include "cpu/base_block.h"
 
 // Private copies of the nodes that the particles of one base block touch.
@@ -24,31 +27,33 @@ struct Tile {
     return r;
   }
 
-  // visit(tile values, node row of the pool, nodes) for every run of nodes in an active block
+  // visit(row, its first node in the pool, that kBlockWidth nodes further along the last axis); -1 in inactive blocks
   template <class F>
-  MPM_HD void for_runs(const BaseBlock<T, D>& base_block, const F& visit) {
+  MPM_HD static void for_rows(const BaseBlock<T, D>& base_block, const F& visit) {
     for (int row = 0; row < kRows; row++) {
       const int i = D == 3 ? row / kWidth : 0, j = row % kWidth;
       const int o = (D == 3 ? i / kBlockWidth * 4 : 0) + j / kBlockWidth * 2;
       const int inside = (i % kBlockWidth * kBlockWidth + j % kBlockWidth) * kBlockWidth;
-      const int low = base_block.slot[o], high = base_block.slot[o + 1];
-      if (low >= 0) visit(value + row * kRow, int64_t(low) * kBlockNodes<D> + inside, kBlockWidth);
-      if (high >= 0)
-        visit(value + row * kRow + kBlockWidth * kChannels, int64_t(high) * kBlockNodes<D> + inside, Order);
+      const auto node = [&](int slot) { return slot < 0 ? -1 : int64_t(slot) * kBlockNodes<D> + inside; };
+      visit(row, node(base_block.slot[o]), node(base_block.slot[o + 1]));
     }
+  }
+
+  // visit(tile values, first node in the pool, nodes) for every run of nodes in an active block, `nodes` a constant
+  template <class F>
+  MPM_HD void for_runs(const BaseBlock<T, D>& base_block, const F& visit) {
+    for_rows(base_block, [&](int row, int64_t low, int64_t high) {
+      if (low >= 0) visit(value + row * kRow, low, std::integral_constant<int, kBlockWidth>());
+      if (high >= 0) visit(value + row * kRow + kBlockWidth * kChannels, high, std::integral_constant<int, Order>());
+    });
   }
 
   void clear() { __builtin_memset(value, 0, sizeof(value)); }
 
   // Reads channels first, ..., first + count - 1 of the nodes; zero for the other channels and inactive blocks.
   void load_from(const NodeField<const T>& nodes, const BaseBlock<T, D>& base_block, int first, int count) {
-    clear();
     const auto copy = [&]<int Channels>() {
-      for_runs(base_block, [&](T* tile, int64_t row, int n) {
-        const T* from = nodes.pointer + row * nodes.stride + first;
-        for (int k = 0; k < n; k++)
-          __builtin_memcpy(tile + k * kChannels, from + k * nodes.stride, Channels * sizeof(T));
-      });
+      load_channels<Channels>({nodes.pointer + first, nodes.stride}, base_block);
     };
     if (count == 1) copy.template operator()<1>();
     if (count == 2) copy.template operator()<2>();
@@ -57,13 +62,43 @@ struct Tile {
   }
 
   void add_to(const NodeField<T>& nodes, const BaseBlock<T, D>& base_block, int first, int count) {
-    for_runs(base_block, [&](T* tile, int64_t row, int n) {
-      T* to = nodes.pointer + row * nodes.stride + first;
-      if (count == kChannels && nodes.stride == kChannels)
-        for (int k = 0; k < n * kChannels; k++) to[k] += tile[k];
-      else
+    const bool whole = count == kChannels && nodes.stride == kChannels;
+    for_runs(base_block, [&](const T* tile, int64_t node, auto n) {
+      T* to = nodes.pointer + node * nodes.stride + first;
+      if (whole) {
+        T sum[n * kChannels];
+        __builtin_memcpy(sum, to, sizeof(sum));
+        MPM_UNROLL for (int k = 0; k < n * kChannels; k++)
+          sum[k] += tile[k];
+        __builtin_memcpy(to, sum, sizeof(sum));
+      } else {
         for (int k = 0; k < n; k++)
           for (int c = 0; c < count; c++) to[k * nodes.stride + c] += tile[k * kChannels + c];
+      }
+    });
+  }
+
+ private:
+  template <int Channels>
+  void load_channels(const NodeField<const T>& nodes, const BaseBlock<T, D>& base_block) {
+#ifdef __AVX512VL__
+    if constexpr (sizeof(T) == 4)
+      if (nodes.stride == kChannels) {
+        constexpr unsigned channels = ((1u << Channels) - 1) * 0x1111, order = (1u << Order * kChannels) - 1;
+        using Half = Pack<T, kRow / 2>;
+        return for_rows(base_block, [&](int row, int64_t low, int64_t high) {
+          const auto load = [&](int64_t node, unsigned lanes) {
+            return node < 0 ? Half(0) : Half(0).with(nodes.pointer + node * kChannels, lanes);
+          };
+          load(low, channels).store(value + row * kRow);
+          load(high, channels & order).store(value + row * kRow + kRow / 2);
+        });
+      }
+#endif
+    clear();
+    for_runs(base_block, [&](T* tile, int64_t node, auto n) {
+      const T* from = nodes.pointer + node * nodes.stride;
+      for (int k = 0; k < n; k++) __builtin_memcpy(tile + k * kChannels, from + k * nodes.stride, Channels * sizeof(T));
     });
   }
 };

@@ -6,6 +6,7 @@
 #include "rollout/copies.cpu.h"
 #include "rollout/slack.cpu.h"
 #include "transfer/advance_chunk.cpu.h"
+#include "transfer/lines.cpu.h"
 #include "transfer/scatter.cpu.h"
 
 namespace mpm::cpu {
@@ -32,6 +33,44 @@ void for_nodes_of(const Topology<T, D>& t, int scene, const int base[D], Tile<kO
   }
 }
 
+// Up to kLanes particles of one cell, by their numbers in the chunk, which ascend.
+struct GroupOfChunk {
+  int first, count;
+  bool loads_run, stores_run, whole;
+  Group group;  // where they do not follow each other
+
+  MPM_HD GroupOfChunk(const uint16_t* order, int rest, int particles)
+      : first(order[0]), count(rest < kLanes ? rest : kLanes) {
+    stores_run = order[count - 1] - first == count - 1;
+    loads_run = stores_run && first + kLanes <= particles;
+    whole = count == kLanes;
+    if (loads_run && (whole || kMasks)) return;
+    int id[kLanes];
+    for (int l = 0; l < count; l++) id[l] = order[l];
+    group = group_of<kLanes>(id, count);
+  }
+
+  template <class T>
+  MPM_HD Lanes<T> load(const T* row) const {
+    return loads_run ? Lanes<T>::load(row + first) : load_row(row, 1, group);
+  }
+  template <class T>
+  MPM_HD void store(const Lanes<T>& v, T* row) const {
+    if (stores_run && whole) return v.store(row + first);
+#ifdef __AVX512VL__
+    if (stores_run) return v.store(row + first, (1u << count) - 1);
+#endif
+    store_row(v, row, 1, group);
+  }
+
+ private:
+#ifdef __AVX512VL__
+  static constexpr bool kMasks = true;
+#else
+  static constexpr bool kMasks = false;
+#endif
+};
+
 // What a thread does to the chunks of its base blocks.
 template <bool Gradient, class T, int D>
 class ChunkPass {
@@ -51,12 +90,14 @@ class ChunkPass {
 
   // `my_turn` waits until sums of other blocks that come first are done.
   template <class F>
-  void take(const BaseBlock<T, D>& base_block, int64_t first, int64_t last, const F& my_turn) {
+  void take(int64_t b, const F& my_turn) {
+    const BaseBlock<T, D> base_block(t_, schedule_.base_slot[b]);
     slack_.begin(base_block);
-    velocities_.load_from(a_.advance.gather.nodes, base_block, 0, D);
+    around_.load_from(a_.advance.gather.nodes, base_block, 0, D);
+    lines_.load_from(around_);
     if (a_.follows) momenta_.clear();
     const int64_t chunks = schedule_.base_chunk[schedule_.colour_start[kColours<D>]];
-    for (int64_t c = first; c < last; c++) {
+    for (int64_t c = schedule_.base_chunk[b]; c < schedule_.base_chunk[b + 1]; c++) {
       const Chunk chunk(t_, schedule_, c), next(t_, schedule_, c + 1 < chunks ? c + 1 : c);
       begin_ = int(chunk.id - t_.index);
       count_ = chunk.count;
@@ -88,21 +129,12 @@ class ChunkPass {
   using P = Pack<T, N>;
   using R = ChunkRows<D>;
 
-  // f(a whole pack of particles from the i-th on) or f(some of them)
+  // f(number in the chunk, pack of particles from there on) for all of them.
   template <class F>
-  MPM_HD void at_particles(int i, const F& f) const {
-    const int rest = count_ - i;
-    if (rest >= N) return f(RunOf<N>{begin_ + i});
-    int id[N];
-    for (int l = 0; l < N; l++) id[l] = begin_ + i + l;
-    f(group_of<N>(id, rest));
-  }
-
-  void load_positions(int i, P x[D]) const {
-    at_particles(i, [&](const auto& g) {
-      MPM_UNROLL for (int a = 0; a < D; a++)
-        x[a] = load_row(rows_.x_next.row[a], 1, g);
-    });
+  MPM_HD void for_packs(const F& f) const {
+    int i = 0;
+    for (; i + N <= count_; i += N) f(i, RunOf<N>{begin_ + i});
+    if (i < count_) f(i, PartOf<N>{begin_ + i, count_ - i});
   }
 
   // Distances of particles i, i + 1, ... from their base nodes, and their cells in the base block; kBlockNodes if they
@@ -128,11 +160,12 @@ class ChunkPass {
   }
 
   void find_cells(const BaseBlock<T, D>& base_block) {
-    for (int i = 0; i < count_; i += N) {
+    for_packs([&](int i, const auto& g) {
       P x[D], f[D];
-      load_positions(i, x);
+      MPM_UNROLL for (int a = 0; a < D; a++)
+        x[a] = load_row(rows_.x_next.row[a], 1, g);
       locate(i, base_block, x, f);
-    }
+    });
   }
 
   void sort() {
@@ -148,20 +181,17 @@ class ChunkPass {
       int base[D];
       for (int a = 0; a < D; a++) base[a] = cell_coordinate<D>(cell, a);
       for (const int end = cell_end_[cell]; i < end; i += kLanes) {
-        int id[kLanes];
-        MPM_UNROLL for (int l = 0; l < kLanes; l++)
-          id[l] = order_[i + l];
-        const Group g = group_of<kLanes>(id, end - i);
+        const GroupOfChunk g(order_ + i, end - i, count_);
         Lanes<T> f[D];
         MPM_UNROLL for (int a = 0; a < D; a++)
-          f[a] = distance_in_cells(t_.geometry, a, load_row(rows_.x_next.row[a] + begin_, 1, g),
+          f[a] = distance_in_cells(t_.geometry, a, g.load(rows_.x_next.row[a] + begin_),
                                    Lanes<T>(T(base_block.corner[a] + base[a])));
-        const T* at = velocities_.value + velocities_.at(base);
+        const T* at = lines_.value + lines_.at(base);
         // Most cells have one group: what the compiler keeps of the nodes for a second one goes to the stack and back.
         asm volatile("" : "+r"(at));
         Sums<Lanes<T>, D> s[D];
-        gather_channels<kOrder, D, true, Gradient, T, D>(f, at, s);
-        motion_.put(g, s);
+        gather_lines<Gradient, T, D>(f, at, s);
+        motion_.put_by([&](const Lanes<T>& v, T* row) { g.store(v, row); }, s);
         for (; expected <= i; expected += 64 / int(sizeof(T))) expect(next, expected);
       }
       i = cell_end_[cell];
@@ -192,7 +222,7 @@ class ChunkPass {
       f[a] = Lanes<T>(distance_in_cells(t_.geometry, a, rows_.x_next.row[a][begin_ + i], T(base[a])));
     Sums<Lanes<T>, D> s[D];
     gather_channels<kOrder, D, true, Gradient, T, D>(f, around_.value, s);
-    motion_.put(group_of<kLanes>(&i, 1), s);
+    motion_.put_by([&](const Lanes<T>& v, T* row) { row[i] = v[0]; }, s);
   }
 
   void add_stray(int scene, const uint16_t* order) {
@@ -215,18 +245,17 @@ class ChunkPass {
   void advance(int scene) {
     const P scale(a_.advance.gather.moment_scale * double(t_.geometry.dx)), inverse_dx(t_.geometry.inverse_dx);
     const P dt = time_step(a_.advance.scene_dt, a_.advance.dt, scene);
-    for (int i = 0; i < count_; i += N)
-      at_particles(i, [&](const auto& g) {
-        Advanced<P, D> p;
-        Matrix<P, D> L;
-        motion_.get(i, scale, inverse_dx, p, L);
-        read(p, rows_, g);
-        end_step(p, L, dt, rows_);
-        write_moved(p, rows_, g);
-        if (!a_.follows) return write_motion(p, rows_, g);
-        MPM_UNROLL for (int k = 0; k < D * D; k++)
-          p.affine[k / D][k % D].store(motion_.affine[k / D][k % D] + i);
-      });
+    for_packs([&](int i, const auto& g) {
+      Advanced<P, D> p;
+      Matrix<P, D> L;
+      motion_.get(i, scale, inverse_dx, p, L);
+      read(p, rows_, g);
+      end_step(p, L, dt, rows_);
+      write_moved(p, rows_, g);
+      if (!a_.follows) return write_motion(p, rows_, g);
+      MPM_UNROLL for (int k = 0; k < D * D; k++)
+        p.affine[k / D][k % D].store(motion_.affine[k / D][k % D] + i);
+    });
   }
 
   // Laws, and what the particles give to the nodes.
@@ -235,24 +264,23 @@ class ChunkPass {
     copies_.fetch_run(begin_, count_, motion_.affine[0][0], motion_.kLine);
     copies_.apply_laws();
     const P dt = time_step(p2g.scene_dt, p2g.dt, base_block.scene);
-    for (int i = 0; i < count_; i += N)
-      at_particles(i, [&](const auto& g) {
-        P x[D], f[D];
-        ParticleMomentum<P, D> p;
-        p.mass = load_row(mass_.row[0], 1, g);
-        p.volume = load_row(volume_.row[0], 1, g);
-        p.dt = dt;
-        MPM_UNROLL for (int a = 0; a < D; a++) {
-          x[a] = load_row(rows_.x_next.row[a], 1, g);
-          p.velocity[a] = P::load(motion_.velocity[a] + i);
-          MPM_UNROLL for (int b = 0; b < D; b++)
-            p.affine[a][b] = a_.affine ? P::load(motion_.affine[a][b] + i) : P(0);
-        }
-        p.stress = load_matrix_or_zero<T, D>(copies_.field(R::stress), RunOf<N>{i});
-        locate(i, base_block, x, f);
-        slack_.add(x, count_ - i);
-        contributions_.put(i, f, momentum_contribution<kOrder, true, Gradient>(t_.geometry, p, f));
-      });
+    for_packs([&](int i, const auto& g) {
+      P x[D], f[D];
+      ParticleMomentum<P, D> p;
+      p.mass = load_row(mass_.row[0], 1, g);
+      p.volume = load_row(volume_.row[0], 1, g);
+      p.dt = dt;
+      MPM_UNROLL for (int a = 0; a < D; a++) {
+        x[a] = load_row(rows_.x_next.row[a], 1, g);
+        p.velocity[a] = P::load(motion_.velocity[a] + i);
+        MPM_UNROLL for (int b = 0; b < D; b++)
+          p.affine[a][b] = a_.affine ? P::load(motion_.affine[a][b] + i) : P(0);
+      }
+      p.stress = load_matrix_or_zero<T, D>(copies_.field(R::stress), RunOf<N>{i});
+      locate(i, base_block, x, f);
+      slack_.add(x, count_ - i);
+      contributions_.put(i, f, momentum_contribution<kOrder, true, Gradient>(t_.geometry, p, f));
+    });
     copies_.leave();
   }
 
@@ -268,7 +296,8 @@ class ChunkPass {
   Copies<T, D> copies_;
   Motion<Gradient, T, D> motion_;
   Contributions<kOrder, T, D, true, Gradient> contributions_;
-  Tile<kOrder, T, D> velocities_, momenta_, around_;
+  Lines<T, D> lines_;  // of the velocities
+  Tile<kOrder, T, D> momenta_, around_;
 };
 
 template <bool Gradient, class T, int D>
@@ -283,8 +312,7 @@ void g2p2g_with(const G2P2GChunksArguments<T, D>& a) {
     int colour = 0;
     for (int64_t b; (b = next()) >= 0;) {
       while (b >= s.colour_start[colour + 1]) colour++;
-      pass.take(BaseBlock<T, D>(t, s.base_slot[b]), s.base_chunk[b], s.base_chunk[b + 1],
-                [&] { colours.wait_before(colour); });
+      pass.take(b, [&] { colours.wait_before(colour); });
       colours.finish(colour);
     }
   });

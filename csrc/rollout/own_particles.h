@@ -136,9 +136,9 @@ class OwnParticles {
   Tensor order_, cell_end_;              // of chunks, while an activation lasts
   Drift drift_{};
   Whereabouts whereabouts_{};
-  double longest_step_ = 0;   // of all scenes
-  int64_t passes_ = 0;        // since the activation
-  int patience_ = 0;          // activations until the next one that is to last
+  double longest_step_ = 0;             // of all scenes
+  int64_t passes_ = 0;                  // since the activation
+  int patience_ = 0;                    // activations until the next one that is to last
   bool tries_ = false, lasts_ = false;  // whether this activation is to last; whether a pass takes the next substep
 };
 

@@ -16,7 +16,7 @@ class Slack {
   using P = Pack<T, N>;
 
   // For `all`, which may be null.
-  Slack(const Geometry<T, D>& geometry, Whereabouts* all) : geometry_(geometry), all_(all), least_(kBlockWidth) {}
+  Slack(const Geometry<T, D>& geometry, Whereabouts* all) : geometry_(geometry), all_(all), most_(-kBlockWidth) {}
   ~Slack() {
     if (all_) tell();
   }
@@ -29,25 +29,26 @@ class Slack {
     }
   }
 
-  // Particles of which `count` count.
+  // Particles of which the first `count` are there.
   MPM_HD void add(const P x[D], int count) {
-    P least = least_;
+    P most = most_;
     MPM_UNROLL for (int a = 0; a < D; a++) {
-      const P place = (x[a] - P(geometry_.lower[a])) * P(geometry_.inverse_dx) +
-                      P(T(kPadding - BSpline<2>::base_offset));
-      least = min_of(least, min_of(place - low_[a], high_[a] - place));
+      const P place =
+          (x[a] - P(geometry_.lower[a])) * P(geometry_.inverse_dx) + P(T(kPadding - BSpline<2>::base_offset));
+      most = max(most, max(place - high_[a], low_[a] - place));
     }
-    T number[N];
-    MPM_UNROLL for (int l = 0; l < N; l++)
-      number[l] = T(l);
-    least_ = select(P::load(number) < P(T(count)), least, least_);
+    if (count >= N) {
+      most_ = most;
+    } else {
+      for (int l = 0; l < count; l++) most_.set(l, most[l]);
+    }
   }
 
  private:
   void tell() const {
-    T least = least_[0];
-    for (int l = 1; l < N; l++) least = least_[l] < least ? least_[l] : least;
-    const float own = float(least);
+    T most = most_[0];
+    for (int l = 1; l < N; l++) most = most_[l] > most ? most_[l] : most;
+    const float own = float(-most);
     float now;
     __atomic_load(&all_->slack, &now, __ATOMIC_RELAXED);
     while (own < now && !__atomic_compare_exchange(&all_->slack, &now, const_cast<float*>(&own), false,
@@ -55,11 +56,10 @@ class Slack {
     }
   }
 
-  MPM_HD static P min_of(const P& a, const P& b) { return select(a < b, a, b); }
-
   const Geometry<T, D>& geometry_;
   Whereabouts* const all_;
-  P low_[D], high_[D], least_;
+  P low_[D], high_[D];
+  P most_;  // of what particles are beyond these
 };
 
 }  // namespace TORCH_MPM_ISA

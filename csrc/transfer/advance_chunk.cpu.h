@@ -115,13 +115,14 @@ struct Motion {
     }
   }
 
-  // Of particles anywhere in the chunk.
-  MPM_HD void put(const Group& g, const Sums<Lanes<T>, D> s[D]) {
+  // By store(values of a group, row).
+  template <class F>
+  MPM_HD void put_by(const F& store, const Sums<Lanes<T>, D> s[D]) {
     MPM_UNROLL for (int c = 0; c < D; c++) {
-      store_row(s[c].value, velocity[c], 1, g);
+      store(s[c].value, velocity[c]);
       MPM_UNROLL for (int a = 0; a < D; a++) {
-        store_row(s[c].moment[a], affine[c][a], 1, g);
-        if (Gradient) store_row(s[c].gradient[a], gradient[c][a], 1, g);
+        store(s[c].moment[a], affine[c][a]);
+        if (Gradient) store(s[c].gradient[a], gradient[c][a]);
       }
     }
   }

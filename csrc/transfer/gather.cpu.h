@@ -32,37 +32,44 @@ struct Sums {
   P value, moment[N ? N : 1], gradient[N ? N : 1];
 };
 
-// Of one channel.
-template <int Order, int Axis, bool Moment, bool Gradient, class T, int D>
-MPM_HD Sums<Lanes<T>, D - Axis> sum_nodes(const Weights<Order, Lanes<T>, D>& s, const T* tile) {
-  using P = Lanes<T>;
-  constexpr int N = D - Axis, stride = Tile<Order, T, D>::stride(Axis);
+// From the sums line(k) over the axes after `Axis`.
+template <int Order, int Axis, bool Moment, bool Gradient, class P, int D, class F>
+MPM_HD Sums<P, D - Axis> sum_axis(const Weights<Order, P, D>& s, const F& line) {
+  constexpr int N = D - Axis;
   Sums<P, N> r;
   P first;
   MPM_UNROLL for (int k = 0; k <= Order; k++) {
-    Sums<P, N - 1> line;
-    if constexpr (Axis + 1 < D)
-      line = sum_nodes<Order, Axis + 1, Moment, Gradient>(s, tile + k * stride);
-    else
-      line.value = P(tile[k * stride]);
+    const Sums<P, N - 1> next = line(k);
     const P& w = s.w[Axis][k];
-    const P part = w * line.value;
+    const P part = w * next.value;
     r.value = k ? r.value + part : part;
     if (Moment) {
       if (k == 0) first = part;
       if (k == 2) r.moment[0] = part - first;
       if (k == 3) r.moment[0] += P(2) * part;
       MPM_UNROLL for (int a = 1; a < N; a++)
-        r.moment[a] = k ? r.moment[a] + w * line.moment[a - 1] : w * line.moment[a - 1];
+        r.moment[a] = k ? r.moment[a] + w * next.moment[a - 1] : w * next.moment[a - 1];
     }
     if (Gradient) {
-      const P slope = s.dw[Axis][k] * line.value;
+      const P slope = s.dw[Axis][k] * next.value;
       r.gradient[0] = k ? r.gradient[0] + slope : slope;
       MPM_UNROLL for (int a = 1; a < N; a++)
-        r.gradient[a] = k ? r.gradient[a] + w * line.gradient[a - 1] : w * line.gradient[a - 1];
+        r.gradient[a] = k ? r.gradient[a] + w * next.gradient[a - 1] : w * next.gradient[a - 1];
     }
   }
   return r;
+}
+
+// Of one channel.
+template <int Order, int Axis, bool Moment, bool Gradient, class T, int D>
+MPM_HD Sums<Lanes<T>, D - Axis> sum_nodes(const Weights<Order, Lanes<T>, D>& s, const T* tile) {
+  constexpr int stride = Tile<Order, T, D>::stride(Axis);
+  return sum_axis<Order, Axis, Moment, Gradient>(s, [&](int k) {
+    if constexpr (Axis + 1 < D)
+      return sum_nodes<Order, Axis + 1, Moment, Gradient>(s, tile + k * stride);
+    else
+      return Sums<Lanes<T>, 0>{Lanes<T>(tile[k * stride])};
+  });
 }
 
 // Value Σ N g, moment Σ N g r and gradient Σ g ∂N of the first `Channels` channels, with distances r from the particle.
