@@ -54,13 +54,14 @@ struct GroupOfChunk {
   MPM_HD Lanes<T> load(const T* row) const {
     return loads_run ? Lanes<T>::load(row + first) : load_row(row, 1, group);
   }
-  template <class T>
-  MPM_HD void store(const Lanes<T>& v, T* row) const {
-    if (stores_run && whole) return v.store(row + first);
+  template <bool Gradient, class T, int D>
+  MPM_HD void put(Motion<Gradient, T, D>& motion, const Sums<Lanes<T>, D> s[D]) const {
+    if (stores_run && whole) return motion.put_by([&](const Lanes<T>& v, T* row) { v.store(row + first); }, s);
 #ifdef __AVX512VL__
-    if (stores_run) return v.store(row + first, (1u << count) - 1);
+    if (stores_run)
+      return motion.put_by([&](const Lanes<T>& v, T* row) { v.store(row + first, (1u << count) - 1); }, s);
 #endif
-    store_row(v, row, 1, group);
+    motion.put_by([&](const Lanes<T>& v, T* row) { store_row(v, row, 1, group); }, s);
   }
 
  private:
@@ -191,7 +192,7 @@ class ChunkPass {
         asm volatile("" : "+r"(at));
         Sums<Lanes<T>, D> s[D];
         gather_lines<Gradient, T, D>(f, at, s);
-        motion_.put_by([&](const Lanes<T>& v, T* row) { g.store(v, row); }, s);
+        g.put(motion_, s);
         for (; expected <= i; expected += 64 / int(sizeof(T))) expect(next, expected);
       }
       i = cell_end_[cell];
