@@ -80,6 +80,7 @@ def run_side_by_side(
     environment = {**os.environ, "OMP_NUM_THREADS": str(max(1, (os.cpu_count() or 1) // processes))}
     if tool:  # memcheck loses a kernel that is loaded late and first launched by a graph: "misaligned address"
         environment["CUDA_MODULE_LOADING"] = "EAGER"
+        environment["TORCH_MPM_HOST_LOOPS"] = "1"  # loops of graphs are not followed (NVIDIA/warp issue 1406)
     gpus = visible_gpus()
 
     def run(number: int) -> Outcome:

@@ -61,7 +61,7 @@ __global__ void cg_loop_kernel(const ConjugateGradientsArguments<T, D> a) {
   for (int b = threadIdx.x; b < a.scenes; b += kSumThreads)
     unfinished = unfinished || (a.scene[b].state == kSolving && a.scene[b].iterations < a.max_iterations);
   unfinished = __syncthreads_or(unfinished);
-  if (threadIdx.x == 0) cudaGraphSetConditional(a.loop, unfinished);
+  if (threadIdx.x == 0 && a.loop) cudaGraphSetConditional(a.loop, unfinished);
 }
 #else
 template <class T, int D>

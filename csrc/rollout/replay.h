@@ -1,5 +1,6 @@
 #pragma once
 
+#include <cstdlib>
 #include <memory>
 #include <type_traits>
 #include <utility>
@@ -167,10 +168,23 @@ int64_t replay(int64_t times, cudaStream_t stream, const Work& work) {
 
 #if CUDART_VERSION >= 13000
 // Has the device do `work(stream, condition)` once, and again until a kernel of it sets the condition to zero. It must
-// be kernels, copies and memory that is set, alone.
-template <class Work>
-void repeat(cudaStream_t stream, const Work& work) {
-  Recorder::of_this_thread().repeat(stream, work);
+// be kernels, copies and memory that is set, alone. With TORCH_MPM_HOST_LOOPS the condition is null and the host asks
+// `goes_on()` each time: compute-sanitizer takes what kernels read in loops of graphs for memory that is not allocated.
+template <class Work, class GoesOn>
+void repeat(cudaStream_t stream, const Work& work, const GoesOn& goes_on) {
+  static const bool by_host = std::getenv("TORCH_MPM_HOST_LOOPS");
+  if (!by_host) return Recorder::of_this_thread().repeat(stream, work);
+  do work(stream, 0);
+  while (goes_on());
+}
+
+// `count` values of the device as they are once the stream is done.
+template <class T>
+std::vector<T> on_host(const T* values, int64_t count, cudaStream_t stream) {
+  std::vector<T> copy(count);
+  cudaMemcpyAsync(copy.data(), values, size_t(count) * sizeof(T), cudaMemcpyDeviceToHost, stream);
+  STD_TORCH_CHECK(cudaStreamSynchronize(stream) == cudaSuccess, "CUDA: ", cudaGetErrorString(cudaGetLastError()));
+  return copy;
 }
 #endif
 

@@ -2,6 +2,7 @@
 
 #include "common/pack.h"
 #include "cpu/base_block.h"
+#include "cpu/chunk.h"
 #include "rollout/laws_p2g.h"
 
 namespace mpm::cpu {
@@ -12,7 +13,7 @@ inline namespace TORCH_MPM_ISA {
 template <class T, int D>
 class Slack {
  public:
-  static constexpr int N = kRegisterBytes / sizeof(T);
+  static constexpr int N = kWideLanes<T>;
   using P = Pack<T, N>;
 
   // For `all`, which may be null.

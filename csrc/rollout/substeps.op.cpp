@@ -97,7 +97,7 @@ bool take_persistent(Substeps<T, D>& s, int* activated, int* status, backend::St
   };
   try {
     if (works_on == device) launch(stream, 0);  // so that the device is at work while the host makes the graph
-    repeat(stream, launch);
+    repeat(stream, launch, [&] { return on_host(a.steps_so_far, 1, stream)[0] < a.steps; });
     works_on = device;
   } catch (const std::exception&) {
     if (works_on == device) throw;

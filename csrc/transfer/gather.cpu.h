@@ -65,10 +65,13 @@ template <int Order, int Axis, bool Moment, bool Gradient, class T, int D>
 MPM_HD Sums<Lanes<T>, D - Axis> sum_nodes(const Weights<Order, Lanes<T>, D>& s, const T* tile) {
   constexpr int stride = Tile<Order, T, D>::stride(Axis);
   return sum_axis<Order, Axis, Moment, Gradient>(s, [&](int k) {
-    if constexpr (Axis + 1 < D)
+    if constexpr (Axis + 1 < D) {
       return sum_nodes<Order, Axis + 1, Moment, Gradient>(s, tile + k * stride);
-    else
-      return Sums<Lanes<T>, 0>{Lanes<T>(tile[k * stride])};
+    } else {
+      Sums<Lanes<T>, 0> node;
+      node.value = Lanes<T>(tile[k * stride]);
+      return node;
+    }
   });
 }
 
