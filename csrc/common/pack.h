@@ -68,10 +68,14 @@ struct Pack {
 
   MPM_HD static Pack load(const T* from) {
     Pack r;
-    __builtin_memcpy(r.part, from, sizeof(r.part));
+    MPM_UNROLL for (int k = 0; k < kParts; k++)  // in one, several registers would go over the stack
+      __builtin_memcpy(&r.part[k], from + k * kWidth, sizeof(r.part[k]));
     return r;
   }
-  MPM_HD void store(T* to) const { __builtin_memcpy(to, part, sizeof(part)); }
+  MPM_HD void store(T* to) const {
+    MPM_UNROLL for (int k = 0; k < kParts; k++)
+      __builtin_memcpy(to + k * kWidth, &part[k], sizeof(part[k]));
+  }
 
 #ifdef __AVX512VL__
   // Lanes of a bit mask from `from` on, the others of this pack; only the former are read. For N = 8, and 16 in float.

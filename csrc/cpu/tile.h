@@ -66,11 +66,12 @@ struct Tile {
     for_runs(base_block, [&](const T* tile, int64_t node, auto n) {
       T* to = nodes.pointer + node * nodes.stride + first;
       if (whole) {
-        T sum[n * kChannels];
-        __builtin_memcpy(sum, to, sizeof(sum));
-        MPM_UNROLL for (int k = 0; k < n * kChannels; k++)
-          sum[k] += tile[k];
-        __builtin_memcpy(to, sum, sizeof(sum));
+        if constexpr (n == 3) {  // of cubic splines, no pack
+          for (int k = 0; k < n * kChannels; k++) to[k] += tile[k];
+        } else {
+          using Run = Pack<T, n * kChannels>;
+          (Run::load(to) + Run::load(tile)).store(to);
+        }
       } else {
         for (int k = 0; k < n; k++)
           for (int c = 0; c < count; c++) to[k * nodes.stride + c] += tile[k * kChannels + c];

@@ -72,6 +72,12 @@ MPM_HD FourNodes<T> repeat(const T* channels) {
       r.part[k] = _mm512_maskz_broadcast_f32x4(__mmask16(-1), _mm_loadu_ps(channels));
     else
       r.part[k] = _mm512_maskz_broadcast_f64x4(__mmask8(-1), _mm256_loadu_pd(channels));
+#elif defined(__AVX2__)
+  MPM_UNROLL for (int k = 0; k < r.kParts; k++)
+    if constexpr (sizeof(T) == 4)
+      r.part[k] = _mm256_broadcast_ps(reinterpret_cast<const __m128*>(channels));
+    else
+      r.part[k] = _mm256_loadu_pd(channels);
 #else
   T lanes[4 * kChannels];
   MPM_UNROLL for (int k = 0; k < 4; k++)
