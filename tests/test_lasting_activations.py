@@ -120,6 +120,18 @@ def test_scenes_with_time_steps_of_their_own(dim):
 
 
 @torch.no_grad()
+def test_scenes_of_a_deterministic_grid_do_not_depend_on_each_other(dim):
+    scene = torch.arange(2000).remainder(2).int()
+    ends = []
+    for cells in (0.01, 0.4):
+        step = mpm.Step(box(dim, scenes=2, deterministic=True), LAWS_HERE["neo_hookean"](), walls="separate")
+        slow, fast = flow(dim, 0.05, scene=scene), flow(dim, cells, scene=scene)
+        state = slow.replace(v=torch.where(scene[:, None] == 0, slow.v, fast.v))
+        ends.append(mpm.rollout(step, state, N, DT).x[scene == 0])
+    assert torch.equal(*ends)
+
+
+@torch.no_grad()
 def test_threads_change_nothing_where_particles_stray(dim):
     step = mpm.Step(box(dim, dx=1 / 64), LAWS_HERE["neo_hookean"](), walls="separate")
     state = flow(dim, 0.15, count=20000, dtype=torch.float32)

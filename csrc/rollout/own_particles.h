@@ -68,8 +68,11 @@ class OwnParticles {
 
   OwnParticles(Substeps<T, D>& steps, const Tensor& packed_history, backend::Stream stream);
 
-  // Whether an activation may serve several substeps of a call. Where it does, G2P and the next P2G are one pass.
-  static bool may_last(const SubstepsInputs& in) { return in.lattice.order() == 2 && in.n > kLeastLastingSteps; }
+  // Whether an activation may serve several substeps of a call. Where it does, G2P and the next P2G are one pass. Not of
+  // deterministic grids: how long it lasts depends on all scenes, and on it how the sums of each are rounded.
+  static bool may_last(const SubstepsInputs& in) {
+    return in.lattice.order() == 2 && in.n > kLeastLastingSteps && !in.lattice.deterministic();
+  }
 
   // One substep, of which so many follow; false as `Substeps::activate`.
   bool step(const int* status_before, int* status, int64_t following);
@@ -85,6 +88,7 @@ class OwnParticles {
   // Strays, added up over the substeps, that cost what an activation does, for each of so many particles.
   static constexpr int kStraysOfActivation = 16;
   static constexpr int kActivationsOfPatience = 16;  // after one that served a single substep
+  static constexpr int kDeterministicSteps = 8;      // after which particles change places on deterministic grids
 
   double longest_of(const OptionalTensor& scene_dt) const;
   void find_laws();
@@ -215,6 +219,8 @@ void OwnParticles<T, D>::find_laws() {
 // changes places a quarter of that; the way back in the end costs a substep.
 template <class T, int D>
 bool OwnParticles<T, D>::pays(int64_t following) {
+  if (in_.lattice.deterministic())  // by nothing that depends on other scenes
+    return following >= kDeterministicSteps && (in_.n - 1 - following) % kDeterministicSteps == 0;
   const int64_t P = in_.x.size(0);
   all_breaks_ += breaks_;
   return 4 * all_breaks_ > P && breaks_ * following > (rearranged_ ? P / 4 : P);
