@@ -259,8 +259,9 @@ MPM_LARGER(__m128d, _mm, pd)
 MPM_LARGER(__m256, _mm256, ps)
 MPM_LARGER(__m256d, _mm256, pd)
 #ifdef __AVX512F__
-MPM_LARGER(__m512, _mm512, ps)
-MPM_LARGER(__m512d, _mm512, pd)
+// The masked form needs no undefined source.
+MPM_HD __m512 larger(__m512 a, __m512 b) { return _mm512_maskz_max_ps(__mmask16(-1), a, b); }
+MPM_HD __m512d larger(__m512d a, __m512d b) { return _mm512_maskz_max_pd(__mmask8(-1), a, b); }
 #endif
 #undef MPM_LARGER
 #endif

@@ -17,20 +17,35 @@ namespace {
 // overlap, and what is summed in turn of the colours has an order.
 constexpr int kOrder = 2;
 
+constexpr int kSupport = kOrder + 1;
+
 // The nodes of one particle in the corner of a tile, wherever it is; f(values of a node in the tile, row of the pool).
 template <class T, int D, class F>
-void for_nodes_of(const Topology<T, D>& t, int scene, const int base[D], Tile<kOrder, T, D>& tile, const F& f) {
-  constexpr int S = kOrder + 1;
-  for (int n = 0; n < (D == 3 ? S * S * S : S * S); n++) {
-    int at[D], node[D], block[D];
-    for (int a = D - 1, rest = n; a >= 0; a--, rest /= S) {
-      at[a] = rest % S;
-      node[a] = base[a] + at[a];
-      block[a] = node[a] / kBlockWidth;
+MPM_HD void for_nodes_of(const Topology<T, D>& t, int scene, const int base[D], Tile<kOrder, T, D>& tile, const F& f) {
+  int block[D][kSupport], inside[D][kSupport];  // what the nodes of an axis add to indices of the table and of a block
+  for (int a = D - 1, blocks = 1, nodes = 1; a >= 0; blocks *= t.geometry.blocks[a--], nodes *= kBlockWidth)
+    for (int k = 0; k < kSupport; k++) {
+      block[a][k] = (base[a] + k) / kBlockWidth * blocks;
+      inside[a][k] = (base[a] + k) % kBlockWidth * nodes;
     }
-    const int slot = t.table[block_index(t.geometry, scene, block)];
-    f(tile.value + tile.at(at), int64_t(slot) * kBlockNodes<D> + node_in_block<D>(node));
+  const int* const table = t.table + int64_t(scene) * t.geometry.blocks_per_scene;
+  for (int row = 0; row < (D == 3 ? kSupport * kSupport : kSupport); row++) {
+    const int i = D == 3 ? row / kSupport : 0, j = row % kSupport;
+    const int first = block[D - 2][j] + (D == 3 ? block[0][i] : 0);
+    const int local = inside[D - 2][j] + (D == 3 ? inside[0][i] : 0);
+    T* const values = tile.value + (D == 3 ? i * tile.stride(0) : 0) + j * tile.stride(D - 2);
+    for (int k = 0; k < kSupport; k++)
+      f(values + k * kChannels, int64_t(table[first + block[D - 1][k]]) * kBlockNodes<D> + local + inside[D - 1][k]);
   }
+}
+
+// Four nodes on each line there.
+template <class T, int D>
+MPM_HD void clear_corner(Tile<kOrder, T, D>& tile) {
+  for (int i = 0; i < (D == 3 ? kSupport : 1); i++)
+    for (int j = 0; j < kSupport; j++)
+      __builtin_memset(tile.value + (D == 3 ? i * tile.stride(0) : 0) + j * tile.stride(D - 2), 0,
+                       4 * kChannels * sizeof(T));
 }
 
 // Up to kLanes particles of one cell, by their numbers in the chunk, which ascend.
@@ -229,7 +244,7 @@ class ChunkPass {
   void add_stray(int scene, const uint16_t* order) {
     int base[D];
     base_of(*order, base);
-    around_.clear();
+    clear_corner(around_);
     sum_cell(contributions_, order, 1, around_.value);
     const NodeField<T>& nodes = a_.to_nodes.p2g.nodes;
     for_nodes_of(t_, scene, base, around_, [&](const T* tile, int64_t row) {

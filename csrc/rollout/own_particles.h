@@ -68,8 +68,8 @@ class OwnParticles {
 
   OwnParticles(Substeps<T, D>& steps, const Tensor& packed_history, backend::Stream stream);
 
-  // Whether an activation may serve several substeps of a call. Where it does, G2P and the next P2G are one pass. Not of
-  // deterministic grids: how long it lasts depends on all scenes, and on it how the sums of each are rounded.
+  // Whether an activation may serve several substeps of a call. Where it does, G2P and the next P2G are one pass. Not
+  // of deterministic grids: how long it lasts depends on all scenes, and on it how the sums of each are rounded.
   static bool may_last(const SubstepsInputs& in) {
     return in.lattice.order() == 2 && in.n > kLeastLastingSteps && !in.lattice.deterministic();
   }
