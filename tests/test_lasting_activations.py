@@ -8,6 +8,7 @@ from test_rollouts import LAWS_HERE, assert_equal, blob, box, one_by_one, tensor
 import torch_mpm as mpm
 
 N, DT = 24, 1e-4
+MOST_BLOCKS, ACTIVATIONS, PROBLEM, BLOCKS_NOW = 0, 5, 6, 7  # columns of the status, see csrc/grid/status.h
 
 
 def flow(dim, cells, count=2000, dtype=F64, **fields):
@@ -36,13 +37,17 @@ def test_calls_that_are_just_long_enough(n, dim):
 
 
 @torch.no_grad()
-def test_the_status_is_that_of_single_steps(dim):
-    """The last substep of a call has an activation of its own."""
+def test_the_status_tells_of_the_last_substep(dim):
+    """It has an activation of its own."""
     statuses = []
     for roll in (mpm.rollout, one_by_one):
         step = mpm.Step(box(dim), LAWS_HERE["neo_hookean"](), walls="slip")
         roll(step, flow(dim, 0.1), N, DT)
         statuses.append(step.status)
+    peaks = [int(s[0, MOST_BLOCKS]) for s in statuses]
+    assert int(statuses[0][0, BLOCKS_NOW]) <= peaks[0] <= peaks[1]
+    for status in statuses:
+        status[0, MOST_BLOCKS] = 0
     assert torch.equal(*statuses)
 
 
@@ -144,3 +149,113 @@ def test_threads_change_nothing_where_particles_stray(dim):
             torch.set_num_threads(threads)
     for other in ends[1:]:
         assert all(torch.equal(value, other[name]) for name, value in ends[0].items())
+
+
+@torch.no_grad()
+@pytest.mark.parametrize(
+    ("cells", "left"),
+    [(0.0114, 0.064), (0.0201, 0.022), (0.0292, 0.061), (0.0158, 0.14), (0.0471, 0.195), (0.0115, 0.147)],
+)
+def test_the_end_of_a_lattice_far_from_the_origin(cells, left):
+    """A particle goes so many cells a step and has so many left to the end. Its position in float32 is rounded to a
+    hundredth of a cell there, so that it may leave earlier than its velocity tells."""
+    dx, lower = 0.0137, 1000.0
+    x = torch.tensor([[lower + (154 - 2.5 - left) * dx, lower + 0.2]])
+    ends, statuses = [], []
+    for roll in (mpm.rollout, one_by_one):
+        step = mpm.Step(mpm.Grid(dx, (lower,) * 2, (lower + 2,) * 2), mpm.NeoHookean(E=1e-3, nu=0.3))
+        v = torch.tensor([[cells * dx / DT, 0.0]])
+        state = step.prepare(mpm.State(x=x, v=v, mass=torch.ones(1), volume=1e-9 * torch.ones(1)))
+        ends.append(roll(step, state, N, DT).x)
+        statuses.append(step.status)
+    assert torch.equal(*statuses)
+    assert int(statuses[0][0, PROBLEM]) >= 0
+    assert torch.equal(*ends)
+
+
+def test_gradients_with_as_many_blocks_as_the_pool_has():
+    """A block is there in some substeps alone: a pool without room for it is told of before gradients want it."""
+    dx = 1 / 32
+    x = torch.tensor([[10.1 * dx, 10.0 * dx]], dtype=F64)
+    v = torch.tensor([[0.1 * dx / DT, 0.0]], dtype=F64).requires_grad_()
+    ones = torch.ones(1, dtype=F64)
+    state = mpm.State(x=x, v=v, mass=ones, volume=1e-6 * ones)
+    with pytest.raises(mpm.GridOverflowError):
+        mpm.rollout(mpm.Step(box(2, dx, max_blocks=1), mpm.NeoHookean(E=1e-3, nu=0.3)), state, 46, DT)
+    end = mpm.rollout(mpm.Step(box(2, dx, max_blocks=2), mpm.NeoHookean(E=1e-3, nu=0.3)), state, 46, DT)
+    (grad,) = torch.autograd.grad(end.x.sum(), v)
+    assert torch.allclose(grad, torch.full_like(grad, 46 * DT))
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("scenes", [1, 3])
+def test_no_particles(scenes, dim):
+    step = mpm.Step(box(dim, scenes=scenes), LAWS_HERE["sand"](), walls="slip")
+    none = torch.zeros(0, dtype=torch.int32) if scenes > 1 else None
+    state = step.prepare(blob("cpu", dim).select(torch.arange(0)).replace(scene=none))
+    assert len(mpm.rollout(step, state, N, DT)) == 0
+    assert int(step.status[0, ACTIVATIONS]) == N
+
+
+@torch.no_grad()
+def test_the_pool_grows_while_activations_last(dim):
+    """Particles fly apart from a few blocks."""
+    ends = []
+    for roll in (mpm.rollout, one_by_one):
+        grid = box(dim, 1 / 64)
+        step = mpm.Step(grid, LAWS_HERE["neo_hookean"]())
+        state = blob("cpu", dim, 1000)
+        x = 0.5 + 0.1 * (state.x - 0.5)
+        state = state.replace(x=x, v=(x - 0.5) * (12 * grid.dx / (40 * DT)) / 0.02)
+        before = grid.max_blocks
+        ends.append(roll(step, state, 40, DT))
+        assert grid.max_blocks > (before or 0)
+    assert_equal(*ends)
+
+
+@torch.no_grad()
+def test_many_chunks_in_a_block(dim):
+    step = mpm.Step(box(dim, 1 / 8), LAWS_HERE["fluid"](), walls="separate")
+    state = step.prepare(flow(dim, 0.03, count=9000))
+    assert_equal(mpm.rollout(step, state, N, DT), one_by_one(step, state, N, DT))
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("walls", ["mirror", "separate"])
+def test_walls_and_impulses_of_what_strays(walls, dim):
+    ends = []
+    for roll in (mpm.rollout, one_by_one):
+        step = mpm.Step(box(dim, 1 / 32), LAWS_HERE["neo_hookean"](), walls=walls, gravity=(0.0, -9.8, 0.0)[:dim])
+        step.boundaries = [mpm.Box((0.62,) * dim, (0.1,) * dim, kind="slip", velocity=(-3.0, 1.0, 0.0)[:dim])]
+        state = flow(dim, 0.1)
+        state = state.replace(x=state.x - 0.28)
+        ends.append(roll(step, step.with_impulses(step.prepare(state)), N, DT))
+    assert float(ends[1].impulse.abs().max()) > 0
+    assert_equal(*ends)
+
+
+@torch.no_grad()
+def test_an_obstacle_that_comes_into_motion_later(dim):
+    """From a substep in which an activation lasts on it is faster than anything that particles could follow."""
+    spin = 1e6 if dim == 2 else (1e6, 0.0, 0.0)
+    obstacle = mpm.Sphere((0.5,) * dim, 0.1, kind="sticky", angular_velocity=spin, start=10.5 * DT)
+    statuses = []
+    for roll in (mpm.rollout, one_by_one):
+        step = mpm.Step(box(dim, 1 / 32), LAWS_HERE["neo_hookean"](), boundaries=[obstacle])
+        roll(step, flow(dim, 0.02), N, DT)
+        statuses.append(step.status)
+    assert torch.equal(*(s[:, PROBLEM] for s in statuses))
+    assert int(statuses[0][0, PROBLEM]) > 10
+
+
+@torch.no_grad()
+def test_a_paused_scene_that_is_fast(dim):
+    step = mpm.Step(box(dim, scenes=2), LAWS_HERE["neo_hookean"](), walls="separate")
+    scene = torch.arange(2000).remainder(2).int()
+    state = step.prepare(flow(dim, 0.1, scene=scene).to(dtype=torch.float32))
+    state.v[scene == 1] *= 1e5
+    dt = torch.tensor([DT, 0.0])
+    end, expected = mpm.rollout(step, state, N, dt), one_by_one(step, state, N, dt)
+    assert torch.equal(end.x[scene == 1], state.x[scene == 1])
+    here = scene == 0
+    assert torch.allclose(end.x[here], expected.x[here], rtol=0, atol=1e-6)

@@ -52,9 +52,9 @@ class Grid(Lattice):
             particle more than a cell outside is left out of the transfers and reported.
         scenes: number of scenes B in a batch; each has the whole lattice to itself.
         kernel: "quadratic" or "cubic" B-spline.
-        max_blocks: blocks in the pool; rollouts on CUDA take half as many again for blocks around those. None measures
-            it from the positions of the first activation, and lets it grow with the scene: at once on the CPU; on CUDA,
-            without synchronising, when less than a quarter is left.
+        max_blocks: blocks in the pool; rollouts take memory for blocks around those, too, half as many again on CUDA
+            and twice as many on the CPU. None measures it from the positions of the first activation, and lets it grow
+            with the scene: at once on the CPU; on CUDA, without synchronising, when less than a quarter is left.
         deterministic: bit-identical results from run to run on CUDA too (the CPU always is). A pool that has grown with
             a scene is part of what a run begins with: give each run a grid of its own.
 

@@ -114,6 +114,12 @@ MPM_HD Group group_by_cell(const Chunk& c, int i, int end) {
   return g;
 }
 
+// Of a scene: dt, or a multiple of it.
+template <class T>
+MPM_HD T time_step(const Field<const T>& scene_dt, double dt, int scene) {
+  return scene_dt.pointer ? T(dt) * scene_dt.pointer[scene * scene_dt.stride[0]] : T(dt);
+}
+
 // One value of one particle.
 template <class T>
 MPM_HD T& at(const Field<T>& f, int64_t p, int i = 0, int j = 0) {

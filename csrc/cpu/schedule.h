@@ -7,7 +7,7 @@
 // of at most kChunk particles of one base block, with the order of each chunk's particles by cell.
 namespace mpm::cpu {
 
-constexpr int kChunk = 512;
+constexpr int kChunk = 1024;
 template <int D>
 constexpr int kColours = 1 << D;
 

@@ -54,8 +54,7 @@ class Copies {
     next_ = next;
     next_count_ = next_count;
     next_first_ = next_count ? __atomic_load_n(a_.index + next, __ATOMIC_RELAXED) : 0;
-    for (int k = 0; k < a_.row_count; k++) find_row(a_.rows[k]);
-    for (int k = 0; k < a_.number_count; k++) get(a_.numbers[k], numbers_[a_.numbers[k].row], kCopyLine);
+    find_rows();
   }
 
   // Those from a place on in memory, with rows of their affine fields.
@@ -64,8 +63,7 @@ class Copies {
     count_ = count;
     stretches_ = 1;
     stretch_[0] = {position, 0, count};
-    for (int k = 0; k < a_.row_count; k++) find_row(a_.rows[k]);
-    for (int k = 0; k < a_.number_count; k++) get(a_.numbers[k], numbers_[a_.numbers[k].row], kCopyLine);
+    find_rows();
     for (int k = 0; k < D * D; k++) given_[R::C + k] = affine + k * line;
   }
 
@@ -132,6 +130,11 @@ class Copies {
     }
     for (int k = 1; k < stretches_; k++) stretch_[k - 1].count = stretch_[k].at - stretch_[k - 1].at;
     stretch_[stretches_ - 1].count = count_ - stretch_[stretches_ - 1].at;
+  }
+
+  void find_rows() {
+    for (int k = 0; k < a_.row_count; k++) find_row(a_.rows[k]);
+    for (int k = 0; k < a_.number_count; k++) get(a_.numbers[k], numbers_[a_.numbers[k].row], kCopyLine);
   }
 
   // Rows that laws only read stay where they are if the particles lie one after another.

@@ -7,7 +7,7 @@
 #include "rollout/slack.cpu.h"
 #include "transfer/advance_chunk.cpu.h"
 #include "transfer/lines.cpu.h"
-#include "transfer/scatter.cpu.h"
+#include "transfer/own_nodes.cpu.h"
 
 namespace mpm::cpu {
 inline namespace TORCH_MPM_ISA {
@@ -17,36 +17,8 @@ namespace {
 // overlap, and what is summed in turn of the colours has an order.
 constexpr int kOrder = 2;
 
-constexpr int kSupport = kOrder + 1;
-
-// The nodes of one particle in the corner of a tile, wherever it is; f(values of a node in the tile, row of the pool).
-template <class T, int D, class F>
-MPM_HD void for_nodes_of(const Topology<T, D>& t, int scene, const int base[D], Tile<kOrder, T, D>& tile, const F& f) {
-  int block[D][kSupport], inside[D][kSupport];  // what the nodes of an axis add to indices of the table and of a block
-  for (int a = D - 1, blocks = 1, nodes = 1; a >= 0; blocks *= t.geometry.blocks[a--], nodes *= kBlockWidth)
-    for (int k = 0; k < kSupport; k++) {
-      block[a][k] = (base[a] + k) / kBlockWidth * blocks;
-      inside[a][k] = (base[a] + k) % kBlockWidth * nodes;
-    }
-  const int* const table = t.table + int64_t(scene) * t.geometry.blocks_per_scene;
-  for (int row = 0; row < (D == 3 ? kSupport * kSupport : kSupport); row++) {
-    const int i = D == 3 ? row / kSupport : 0, j = row % kSupport;
-    const int first = block[D - 2][j] + (D == 3 ? block[0][i] : 0);
-    const int local = inside[D - 2][j] + (D == 3 ? inside[0][i] : 0);
-    T* const values = tile.value + (D == 3 ? i * tile.stride(0) : 0) + j * tile.stride(D - 2);
-    for (int k = 0; k < kSupport; k++)
-      f(values + k * kChannels, int64_t(table[first + block[D - 1][k]]) * kBlockNodes<D> + local + inside[D - 1][k]);
-  }
-}
-
-// Four nodes on each line there.
-template <class T, int D>
-MPM_HD void clear_corner(Tile<kOrder, T, D>& tile) {
-  for (int i = 0; i < (D == 3 ? kSupport : 1); i++)
-    for (int j = 0; j < kSupport; j++)
-      __builtin_memset(tile.value + (D == 3 ? i * tile.stride(0) : 0) + j * tile.stride(D - 2), 0,
-                       4 * kChannels * sizeof(T));
-}
+// Cells of an axis where the particles of a base block may be.
+constexpr int kNear = kBlockWidth + 2;
 
 // Up to kLanes particles of one cell, by their numbers in the chunk, which ascend.
 struct GroupOfChunk {
@@ -55,13 +27,13 @@ struct GroupOfChunk {
   Group group;  // where they do not follow each other
 
   MPM_HD GroupOfChunk(const uint16_t* order, int rest, int particles)
-      : first(order[0]), count(rest < kLanes ? rest : kLanes) {
-    stores_run = order[count - 1] - first == count - 1;
+      : first(order[0] % kChunk), count(rest < kLanes ? rest : kLanes) {
+    stores_run = order[count - 1] % kChunk - first == count - 1;
     loads_run = stores_run && first + kLanes <= particles;
     whole = count == kLanes;
     if (loads_run && (whole || kMasks)) return;
     int id[kLanes];
-    for (int l = 0; l < count; l++) id[l] = order[l];
+    for (int l = 0; l < count; l++) id[l] = order[l] % kChunk;
     group = group_of<kLanes>(id, count);
   }
 
@@ -99,7 +71,9 @@ class ChunkPass {
         mass_(a.to_nodes.p2g.mass),
         volume_(a.to_nodes.p2g.volume),
         slack_(t_.geometry, a.follows ? a.to_nodes.whereabouts : nullptr),
-        copies_(a.to_nodes, copies) {}
+        copies_(a.to_nodes, copies) {
+    lay_out<D>(written_, a.to_nodes.schedule, t_.max_blocks, t_.particles);
+  }
   ~ChunkPass() {
     if (a_.follows) __atomic_fetch_add(&a_.to_nodes.whereabouts->strays, strays_, __ATOMIC_RELAXED);
   }
@@ -109,22 +83,18 @@ class ChunkPass {
   void take(int64_t b, const F& my_turn) {
     const BaseBlock<T, D> base_block(t_, schedule_.base_slot[b]);
     slack_.begin(base_block);
-    around_.load_from(a_.advance.gather.nodes, base_block, 0, D);
-    lines_.load_from(around_);
+    velocities_.load_from(a_.advance.gather.nodes, base_block, 0, D);
+    lines_.load_from(velocities_);
     if (a_.follows) momenta_.clear();
     const int64_t chunks = schedule_.base_chunk[schedule_.colour_start[kColours<D>]];
     for (int64_t c = schedule_.base_chunk[b]; c < schedule_.base_chunk[b + 1]; c++) {
       const Chunk chunk(t_, schedule_, c), next(t_, schedule_, c + 1 < chunks ? c + 1 : c);
       begin_ = int(chunk.id - t_.index);
       count_ = chunk.count;
-      order_ = a_.order + begin_;
-      cell_end_ = a_.cell_end + c * kBlockNodes<D>;
-      if (a_.fresh) {
-        find_cells(base_block);
-        sort();
-      }
+      order_ = written_.order + begin_;
+      cell_end_ = written_.cell_end + c * kBlockNodes<D>;
       gather(base_block, next);
-      for (int k = cell_end_[kBlockNodes<D> - 1]; k < count_; k++) gather_stray(base_block.scene, order_[k]);
+      for (int k = cell_end_[kBlockNodes<D> - 1]; k < count_; k++) gather_stray(base_block.scene, order_[k] % kChunk);
       advance(base_block.scene);
       if (!a_.follows) continue;
       give(base_block);
@@ -132,7 +102,7 @@ class ChunkPass {
       sum_cells(contributions_, order_, cell_end_, momenta_);
       for (int k = cell_end_[kBlockNodes<D> - 1]; k < count_; k++) {
         my_turn();
-        add_stray(base_block.scene, order_ + k);
+        add_stray(base_block, order_[k]);
       }
     }
     if (!a_.follows) return;
@@ -153,35 +123,30 @@ class ChunkPass {
     if (i < count_) f(i, PartOf<N>{begin_ + i, count_ - i});
   }
 
-  // Distances of particles i, i + 1, ... from their base nodes, and their cells in the base block; kBlockNodes if they
-  // are in none.
-  MPM_HD void locate(int i, const BaseBlock<T, D>& base_block, const P x[D], P f[D]) {
-    using Values = typename RegisterOf<T, N>::Value;
-    using Integers = typename RegisterOf<float, N>::Integer;
-    typedef uint8_t Bytes __attribute__((vector_size(N)));
+  // Distances of particles i, i + 1, ... from their base nodes, and their cells, see below.
+  MPM_HD void find_cells(int i, const BaseBlock<T, D>& base_block, const P x[D], P f[D]) {
     Mask<T, N> inside;
-    P cell;
+    P cell, near;
     MPM_UNROLL for (int a = 0; a < D; a++) {
       const P node = base_node<kOrder>(t_.geometry, a, x[a]), local = node - P(T(base_block.corner[a]));
       f[a] = distance_in_cells(t_.geometry, a, x[a], node);
       const auto in = (local >= P(0)) & (local < P(kBlockWidth));
       inside = a ? inside & in : in;
       cell = a ? cell * P(kBlockWidth) + local : local;
+      near = a ? near * P(kNear) + (local + P(1)) : local + P(1);
     }
-    cell = select(inside, cell, P(kBlockNodes<D>));
-    Values values;
-    __builtin_memcpy(&values, &cell, sizeof(values));
-    const Bytes bytes = __builtin_convertvector(__builtin_convertvector(values, Integers), Bytes);
-    __builtin_memcpy(cell_ + i, &bytes, sizeof(bytes));
+    put_bytes(select(inside, cell, P(kBlockNodes<D>)), cell_ + i);
+    put_bytes(near, near_ + i);
   }
 
-  void find_cells(const BaseBlock<T, D>& base_block) {
-    for_packs([&](int i, const auto& g) {
-      P x[D], f[D];
-      MPM_UNROLL for (int a = 0; a < D; a++)
-        x[a] = load_row(rows_.x_next.row[a], 1, g);
-      locate(i, base_block, x, f);
-    });
+  MPM_HD static void put_bytes(const P& numbers, uint8_t* to) {
+    using Values = typename RegisterOf<T, N>::Value;
+    using Integers = typename RegisterOf<float, N>::Integer;
+    typedef uint8_t Bytes __attribute__((vector_size(N)));
+    Values values;
+    __builtin_memcpy(&values, &numbers, sizeof(values));
+    const Bytes bytes = __builtin_convertvector(__builtin_convertvector(values, Integers), Bytes);
+    __builtin_memcpy(to, &bytes, sizeof(bytes));
   }
 
   void sort() {
@@ -222,45 +187,40 @@ class ChunkPass {
     for (int k = 0; k < a_.to_nodes.expected_count; k++) __builtin_prefetch(a_.to_nodes.expected[k] + p, 0, 2);
   }
 
-  void base_of(int i, int base[D]) const {
-    for (int a = 0; a < D; a++) base[a] = int(base_node<kOrder>(t_.geometry, a, rows_.x_next.row[a][begin_ + i]));
-  }
-
   void gather_stray(int scene, int i) {
     int base[D];
-    base_of(i, base);
-    const NodeField<const T>& nodes = a_.advance.gather.nodes;
-    for_nodes_of(t_, scene, base, around_, [&](T* tile, int64_t row) {
-      for (int c = 0; c < D; c++) tile[c] = nodes.pointer[row * nodes.stride + c];
-    });
-    Lanes<T> f[D];
-    for (int a = 0; a < D; a++)
-      f[a] = Lanes<T>(distance_in_cells(t_.geometry, a, rows_.x_next.row[a][begin_ + i], T(base[a])));
-    Sums<Lanes<T>, D> s[D];
-    gather_channels<kOrder, D, true, Gradient, T, D>(f, around_.value, s);
-    motion_.put_by([&](const Lanes<T>& v, T* row) { row[i] = v[0]; }, s);
+    T f[D];
+    for (int a = 0; a < D; a++) {
+      const T x = rows_.x_next.row[a][begin_ + i], node = base_node<kOrder>(t_.geometry, a, x);
+      base[a] = int(node);
+      f[a] = distance_in_cells(t_.geometry, a, x, node);
+    }
+    const NodesOf<kOrder, T, D> nodes(t_, scene, base);
+    const Sums<Node<T>, D> own = gather_own_nodes<kOrder, Gradient>(f, a_.velocities, nodes);
+    Sums<T, D> s[D];
+    for (int c = 0; c < D; c++) {
+      s[c].value = own.value[1 + c];
+      for (int a = 0; a < D; a++) {
+        s[c].moment[a] = own.moment[a][1 + c];
+        if (Gradient) s[c].gradient[a] = own.gradient[a][1 + c];
+      }
+    }
+    motion_.put_by([&](const T& v, T* row) { row[i] = v; }, s);
   }
 
-  void add_stray(int scene, const uint16_t* order) {
+  // By what `find_cells` has found: its weights are of these nodes, however another program might round.
+  void add_stray(const BaseBlock<T, D>& base_block, int i) {
     int base[D];
-    base_of(*order, base);
-    clear_corner(around_);
-    sum_cell(contributions_, order, 1, around_.value);
-    const NodeField<T>& nodes = a_.to_nodes.p2g.nodes;
-    for_nodes_of(t_, scene, base, around_, [&](const T* tile, int64_t row) {
-      for (int c = 0; c <= D; c++) nodes.pointer[row * nodes.stride + c] += tile[c];
-    });
+    for (int a = D - 1, near = near_[i]; a >= 0; a--, near /= kNear) base[a] = base_block.corner[a] + near % kNear - 1;
+    const NodesOf<kOrder, T, D> nodes(t_, base_block.scene, base);
+    add_to_own_nodes(contributions_, i, a_.sums, nodes);
     strays_++;
-  }
-
-  P time_step(const Field<const T>& scene_dt, double dt, int scene) const {
-    return P(T(dt) * (scene_dt.pointer ? scene_dt.pointer[scene * scene_dt.stride[0]] : T(1)));
   }
 
   // The end of the step.
   void advance(int scene) {
     const P scale(a_.advance.gather.moment_scale * double(t_.geometry.dx)), inverse_dx(t_.geometry.inverse_dx);
-    const P dt = time_step(a_.advance.scene_dt, a_.advance.dt, scene);
+    const P dt(time_step(a_.advance.scene_dt, a_.advance.dt, scene));
     for_packs([&](int i, const auto& g) {
       Advanced<P, D> p;
       Matrix<P, D> L;
@@ -279,7 +239,7 @@ class ChunkPass {
     const P2GArguments<T, D>& p2g = a_.to_nodes.p2g;
     copies_.fetch_run(begin_, count_, motion_.affine[0][0], motion_.kLine);
     copies_.apply_laws();
-    const P dt = time_step(p2g.scene_dt, p2g.dt, base_block.scene);
+    const P dt(time_step(p2g.scene_dt, p2g.dt, base_block.scene));
     for_packs([&](int i, const auto& g) {
       P x[D], f[D];
       ParticleMomentum<P, D> p;
@@ -290,10 +250,10 @@ class ChunkPass {
         x[a] = load_row(rows_.x_next.row[a], 1, g);
         p.velocity[a] = P::load(motion_.velocity[a] + i);
         MPM_UNROLL for (int b = 0; b < D; b++)
-          p.affine[a][b] = a_.affine ? P::load(motion_.affine[a][b] + i) : P(0);
+          p.affine[a][b] = p2g.affine.pointer ? P::load(motion_.affine[a][b] + i) : P(0);
       }
       p.stress = load_matrix_or_zero<T, D>(copies_.field(R::stress), RunOf<N>{i});
-      locate(i, base_block, x, f);
+      find_cells(i, base_block, x, f);
       slack_.add(x, count_ - i);
       contributions_.put(i, f, momentum_contribution<kOrder, true, Gradient>(t_.geometry, p, f));
     });
@@ -307,13 +267,16 @@ class ChunkPass {
   const FieldRows<const T, 1> mass_, volume_;
   Slack<T, D> slack_;
   int strays_ = 0, begin_ = 0, count_ = 0;
-  uint16_t *order_ = nullptr, *cell_end_ = nullptr;  // of the chunk
-  uint8_t cell_[kChunk + N];
+  ScheduleOut written_;  // its orders and cells, chunk by chunk
+  uint16_t *order_ = nullptr, *cell_end_ = nullptr;
+  // Of the particles of the chunk their cell in the base block, kBlockNodes if it is in another one; and their cell
+  // among those where they may be.
+  uint8_t cell_[kChunk + N], near_[kChunk + N];
   Copies<T, D> copies_;
   Motion<Gradient, T, D> motion_;
   Contributions<kOrder, T, D, true, Gradient> contributions_;
   Lines<T, D> lines_;  // of the velocities
-  Tile<kOrder, T, D> momenta_, around_;
+  Tile<kOrder, T, D> momenta_, velocities_;
 };
 
 template <bool Gradient, class T, int D>
@@ -349,31 +312,34 @@ void g2p2g_chunks(const G2P2GChunksArguments<T, D>& a) {
 }
 
 template <class T, int D>
-void largest_speed(const LargestSpeedArguments<T, D>& a) {
+void longest_move(const LongestMoveArguments<T, D>& a) {
   constexpr int kRows = 16, kStride = 1 + D, kGroup = kRows * kStride;
-  constexpr int64_t grain = 1024;  // groups below which a range is not split
+  constexpr int64_t grain = 64;  // slots below which a range is not split
   static_assert(kBlockNodes<D> % kRows == 0 && sizeof(NodeRow<T, D>) == kStride * sizeof(T));
   using Bits = std::conditional_t<sizeof(T) == 4, int32_t, int64_t>;
-  *a.largest = T(0);
-  parallel_ranges(a.count / kRows, grain, [&](int64_t begin, int64_t end) {
-    T most[kGroup] = {}, nan[kGroup] = {};
-    for (int64_t g = begin; g < end; g++) {
-      const T* const from = reinterpret_cast<const T*>(a.nodes + g * kRows);
+  *a.longest = T(0);
+  parallel_ranges(a.slots, grain, [&](int64_t begin, int64_t end) {
+    T longest = 0;
+    for (int64_t slot = begin; slot < end; slot++) {
+      T most[kGroup] = {}, nan[kGroup] = {};
+      for (int first = 0; first < kBlockNodes<D>; first += kRows) {
+        const T* const from = reinterpret_cast<const T*>(a.nodes + slot * kBlockNodes<D> + first);
+        for (int k = 0; k < kGroup; k++) {
+          const T speed = from[k] < 0 ? -from[k] : from[k];
+          most[k] = speed > most[k] ? speed : most[k];
+          nan[k] += from[k] - from[k];  // NaN if it is not finite
+        }
+      }
+      const T dt = a.scene_dt ? a.scene_dt[a.block[slot] / a.blocks_per_scene] : T(1);
       for (int k = 0; k < kGroup; k++) {
-        const T speed = from[k] < 0 ? -from[k] : from[k];
-        most[k] = speed > most[k] ? speed : most[k];
-        nan[k] += from[k] - from[k];  // NaN if it is not finite
+        if (k % kStride == 0) continue;
+        const T move = nan[k] == T(0) ? most[k] * (dt < 0 ? -dt : dt) : T(__builtin_inf());
+        if (!(move <= longest)) longest = move > longest ? move : T(__builtin_inf());
       }
     }
-    T largest = 0;
-    for (int k = 0; k < kGroup; k++)
-      if (k % kStride > 0) {
-        largest = most[k] > largest ? most[k] : largest;
-        if (nan[k] != T(0)) largest = T(__builtin_inf());
-      }
     // Numbers that are not negative are in the order of their bits.
-    Bits* const all = reinterpret_cast<Bits*>(a.largest);
-    const Bits own = __builtin_bit_cast(Bits, largest);
+    Bits* const all = reinterpret_cast<Bits*>(a.longest);
+    const Bits own = __builtin_bit_cast(Bits, longest);
     Bits now = __atomic_load_n(all, __ATOMIC_RELAXED);
     while (now < own && !__atomic_compare_exchange_n(all, &now, own, false, __ATOMIC_RELAXED, __ATOMIC_RELAXED)) {
     }
@@ -381,7 +347,7 @@ void largest_speed(const LargestSpeedArguments<T, D>& a) {
 }
 
 MPM_INSTANTIATE(g2p2g_chunks, G2P2GChunksArguments)
-MPM_INSTANTIATE(largest_speed, LargestSpeedArguments)
+MPM_INSTANTIATE(longest_move, LongestMoveArguments)
 
 }  // namespace TORCH_MPM_ISA
 }  // namespace mpm::cpu

@@ -13,19 +13,21 @@ template <class T, int D>
 struct G2P2GChunksArguments {
   G2PAdvanceArguments<T, D> advance;  // x, F and J in place, with unit strides; v and C are written if nothing follows
   LawsP2GArguments<T, D> to_nodes;    // of the positions that G2P has found; rearranges nothing
-  bool follows = false;               // laws and P2G
-  bool affine = false;                // whether P2G uses the affine fields
-  bool fresh = false;                 // whether this is the first pass since the activation
-  uint16_t* order = nullptr;          // [particles + 8] of each chunk, its particles by cell, strays last
-  uint16_t* cell_end = nullptr;       // [chunks, kBlockNodes] as in the schedule
+  const NodeRow<T, D>* velocities = nullptr;  // rows of the pool before
+  NodeRow<T, D>* sums = nullptr;              // and after
+  bool follows = false;                       // laws and P2G
+  bool fresh = false;  // whether this is the first pass since the activation, which has left particles in order
 };
 
-// The largest component of the velocities of some nodes; not finite if one is not.
+// The longest way along an axis that nodes go in the time step of their scene, as a multiple of dt; infinite if one is
+// not finite.
 template <class T, int D>
-struct LargestSpeedArguments {
-  const NodeRow<T, D>* nodes = nullptr;
-  int64_t count = 0;
-  T* largest = nullptr;
+struct LongestMoveArguments {
+  const NodeRow<T, D>* nodes = nullptr;  // with velocities
+  const int* block = nullptr;            // of each slot
+  int64_t slots = 0, blocks_per_scene = 1;
+  const T* scene_dt = nullptr;  // [scenes], or null
+  T* longest = nullptr;
 };
 
 }  // namespace mpm

@@ -18,7 +18,7 @@ MPM_BACKEND_KERNELS(MPM_ROLLOUT_KERNELS)
 #define MPM_OWN_PARTICLES_KERNELS(PLAIN, ORDERED, SIZE) \
   ORDERED(laws_p2g, LawsP2GArguments)                   \
   PLAIN(g2p2g_chunks, G2P2GChunksArguments)             \
-  PLAIN(largest_speed, LargestSpeedArguments)           \
+  PLAIN(longest_move, LongestMoveArguments)             \
   PLAIN(permute, PermuteArguments)
 MPM_BACKEND_KERNELS(MPM_OWN_PARTICLES_KERNELS)
 #endif

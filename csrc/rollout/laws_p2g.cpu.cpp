@@ -64,9 +64,7 @@ void laws_p2g_with(const LawsP2GArguments<T, D>& a) {
       write_order<D>(chunk.cell_end, order);
       copies.fetch(place(chunk), chunk.count, place(next), next.count, &chunk);
       copies.apply_laws();
-      const Field<const T>& scene_dt = a.p2g.scene_dt;
-      const Pack<T, N> dt(T(a.p2g.dt) *
-                          (scene_dt.pointer ? scene_dt.pointer[base_block.scene * scene_dt.stride[0]] : T(1)));
+      const Pack<T, N> dt(time_step(a.p2g.scene_dt, a.p2g.dt, base_block.scene));
       for (int i = 0; i < chunk.count; i += N) {
         Pack<T, N> x[D], f[D];
         ParticleMomentum<Pack<T, N>, D> p;

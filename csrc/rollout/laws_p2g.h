@@ -17,7 +17,7 @@ struct ParticleRow {
   int row = -1;     // of the copy; -1 where laws do not read it
 };
 
-constexpr int kCopyLine = 512 + 16;  // of a row: kChunk, and room for a whole register at the end; no power of two
+constexpr int kCopyLine = 1024 + 16;  // of a row: kChunk, and room for a whole register at the end; no power of two
 
 // The rows of the copy of a chunk; after these the history of all laws, and parameters that particles have.
 template <int D>
@@ -60,7 +60,7 @@ struct LawsP2GArguments {
   int *index = nullptr, *schedule = nullptr;
   T* copies = nullptr;  // [threads, copy_size]
   int64_t copy_size = 0;
-  Whereabouts* whereabouts = nullptr;  // told the least and the sum, where an activation may last
+  Whereabouts* whereabouts = nullptr;  // gets the least slack and the sum of strays, where an activation may last
 };
 
 // Rows of one length, from[order[i]] to to[i].

@@ -1,5 +1,6 @@
 #pragma once
 
+#include <limits>
 #include <type_traits>
 
 #include "cpu/schedule.h"
@@ -69,9 +70,11 @@ class OwnParticles {
   OwnParticles(Substeps<T, D>& steps, const Tensor& packed_history, backend::Stream stream);
 
   // Whether an activation may serve several substeps of a call. Where it does, G2P and the next P2G are one pass. Not
-  // of deterministic grids: how long it lasts depends on all scenes, and on it how the sums of each are rounded.
+  // of deterministic grids: how long it lasts depends on all scenes, and on it how the sums of each are rounded. Nor
+  // where gradients go through a pool that does not grow: they need room for the blocks of every substep.
   static bool may_last(const SubstepsInputs& in) {
-    return in.lattice.order() == 2 && in.n > kLeastLastingSteps && !in.lattice.deterministic();
+    return in.lattice.order() == 2 && in.n > kLeastLastingSteps && !in.lattice.deterministic() &&
+           (in.grows || in.resident);
   }
 
   // One substep, of which so many follow; false as `Substeps::activate`.
@@ -85,12 +88,13 @@ class OwnParticles {
 
   // Particles change places once for the first few substeps to gain from it, and come back in the end.
   static constexpr int64_t kLeastLastingSteps = 8;
+  static constexpr int64_t kLeastPasses = 2;  // that follow, where some may be a pass
   // Strays, added up over the substeps, that cost what an activation does, for each of so many particles.
-  static constexpr int kStraysOfActivation = 16;
+  static constexpr int kStraysOfRenewal = 10;
   static constexpr int kActivationsOfPatience = 16;  // after one that served a single substep
   static constexpr int kDeterministicSteps = 8;      // after which particles change places on deterministic grids
 
-  double longest_of(const OptionalTensor& scene_dt) const;
+  double farthest() const;
   void find_laws();
   bool begin(const int* status_before, int* status, int64_t following);
   void go_on(const int* status_before, int* status);
@@ -101,7 +105,6 @@ class OwnParticles {
   void give_to_nodes(bool rearranges);
   void set_p2g();
   void set_advance();
-  void make_order();
   void pass(bool follows);
   void find_rows(bool rearranges);
   void find_expected(bool motion);
@@ -137,10 +140,9 @@ class OwnParticles {
   bool reads_F_ = false, reads_J_ = false, viscous_ = false, rearranged_ = false;
   bool owned_ = false, moved_ = true;  // whether the fields have gone to buffers; whether some have since the last step
   int64_t breaks_ = 0, all_breaks_ = 0;  // of this substep, and since particles changed places
-  Tensor order_, cell_end_;              // of chunks, while an activation lasts
   Drift drift_{};
   Whereabouts whereabouts_{};
-  double longest_step_ = 0;             // of all scenes
+  double rounding_;                     // of positions [cells]
   int64_t passes_ = 0;                  // since the activation
   int patience_ = 0;                    // activations until the next one that is to last
   bool tries_ = false, lasts_ = false;  // whether this activation is to last; whether a pass takes the next substep
@@ -166,7 +168,7 @@ OwnParticles<T, D>::OwnParticles(Substeps<T, D>& steps, const Tensor& packed_his
   find_laws();
   s_.activation.breaks = &breaks_;
   s_.activation.used_slots = &s_.used_slots;
-  longest_step_ = in_.dt * longest_of(in_.scene_dt);
+  rounding_ = 1e-3 + 4 * double(std::numeric_limits<T>::epsilon()) * farthest() / in_.lattice.dx();
   a_.has_material = has(in_.material);
   a_.laws = laws_.data();
   a_.law_count = int(laws_.size());
@@ -175,13 +177,14 @@ OwnParticles<T, D>::OwnParticles(Substeps<T, D>& steps, const Tensor& packed_his
   a_.copies = static_cast<T*>(copies_.data_ptr());
 }
 
+// Position on the lattice, along an axis.
 template <class T, int D>
-double OwnParticles<T, D>::longest_of(const OptionalTensor& scene_dt) const {
-  if (!has(scene_dt)) return 1;
-  const T* const dt = static_cast<const T*>(scene_dt->data_ptr());
-  double longest = 0;
-  for (int64_t b = 0; b < in_.scenes; b++) longest = std::max(longest, double(dt[b]));
-  return longest;
+double OwnParticles<T, D>::farthest() const {
+  const Geometry<T, D>& g = s_.activation.geometry;
+  double most = 0;
+  for (int a = 0; a < D; a++)
+    most = std::max(most, std::abs(double(g.lower[a])) + double(g.blocks[a]) * kBlockWidth * double(g.dx));
+  return most;
 }
 
 template <class T, int D>
@@ -252,6 +255,7 @@ bool OwnParticles<T, D>::begin(const int* status_before, int* status, int64_t fo
   if (!s_.activate(status_before, status, stream_)) return false;
   s_.clear_nodes(stream_);
   passes_ = 0;
+  if (tries_ && drift_.lost != 0) patience_ = kActivationsOfPatience;  // no room for the blocks around
   tries_ = tries_ && drift_.lost == 0;
   give_to_nodes(tries_ || pays(following));
   return true;
@@ -268,7 +272,7 @@ void OwnParticles<T, D>::go_on(const int* status_before, int* status) {
 
 template <class T, int D>
 bool OwnParticles<T, D>::tries_to_last(int64_t following) {
-  if (!may_last(in_) || (!rearranged_ && following < kLeastLastingSteps)) return false;
+  if (!may_last(in_) || following < (rearranged_ ? kLeastPasses : kLeastLastingSteps)) return false;
   return patience_ == 0 || --patience_ == 0;
 }
 
@@ -276,9 +280,9 @@ bool OwnParticles<T, D>::tries_to_last(int64_t following) {
 // tells how many blocks there are by then.
 template <class T, int D>
 bool OwnParticles<T, D>::lasts(int64_t following) {
-  if (!tries_ || following < 2) return false;
+  if (!tries_ || following < kLeastPasses) return false;
   drift_ = {whereabouts_.strays, 0, drift_.earlier + drift_.strays};
-  const bool result = drift_.lasts(in_.x.size(0), kStraysOfActivation) && reaches();
+  const bool result = drift_.lasts(in_.x.size(0), kStraysOfRenewal) && reaches();
   if (!result && passes_ == 0) patience_ = kActivationsOfPatience;
   return result;
 }
@@ -287,14 +291,17 @@ bool OwnParticles<T, D>::lasts(int64_t following) {
 // node, of which its own is a mean.
 template <class T, int D>
 bool OwnParticles<T, D>::reaches() {
-  T speed = 0;
-  LargestSpeedArguments<T, D> a;
-  a.nodes = reinterpret_cast<const NodeRow<T, D>*>(s_.advance.gather.nodes.pointer - 1);
-  a.count = int64_t(s_.used_slots) * kBlockNodes<D>;
-  a.largest = &speed;
-  backend::largest_speed(a, stream_);
-  constexpr double rounding = 1e-3;
-  return double(speed) * longest_step_ / in_.lattice.dx() * (1 + rounding) + rounding < double(whereabouts_.slack);
+  T longest = 0;
+  LongestMoveArguments<T, D> a;
+  a.nodes = s_.velocities();
+  a.block = s_.update.block;
+  a.slots = s_.used_slots;
+  a.blocks_per_scene = s_.update.geometry.blocks_per_scene;
+  a.scene_dt = s_.update.scene_dt;
+  a.longest = &longest;
+  backend::longest_move(a, stream_);
+  const double cells = double(longest) * in_.dt / in_.lattice.dx();
+  return cells * (1 + rounding_) + rounding_ < double(whereabouts_.slack);
 }
 
 template <class T, int D>
@@ -384,20 +391,11 @@ void OwnParticles<T, D>::set_advance() {
   if (has(in_.J)) a.J_next = J.next(false);
 }
 
-template <class T, int D>
-void OwnParticles<T, D>::make_order() {
-  const int64_t P = in_.x.size(0), chunks = std::min<int64_t>(s_.activation.max_blocks, P) + P / cpu::kChunk;
-  const int64_t entries = P + 8, ends = chunks * kBlockNodes<D>;
-  if (!order_.defined()) order_ = empty_int(in_.x, {(entries + 1) / 2});
-  if (!cell_end_.defined() || cell_end_.size(0) < ends / 2) cell_end_ = empty_int(in_.x, {ends / 2});
-}
-
 // G2P of the substep before, and laws and P2G of this one if it follows.
 template <class T, int D>
 void OwnParticles<T, D>::pass(bool follows) {
   set_advance();
   if (passes_ == 0) {
-    make_order();
     v.go(false);  // of particles outside; of others there is nothing to read before the last pass
     if (in_.wants_C) C.go(false);
     find_rows(false);
@@ -407,11 +405,10 @@ void OwnParticles<T, D>::pass(bool follows) {
   set_p2g();
   whereabouts_ = {float(kBlockWidth), 0};
   G2P2GChunksArguments<T, D> a{s_.advance, a_};
+  a.velocities = s_.velocities();
+  a.sums = static_cast<NodeRow<T, D>*>(s_.pool.nodes.data_ptr());
   a.follows = follows;
   a.fresh = passes_++ == 0;
-  a.affine = in_.apic;
-  a.order = static_cast<uint16_t*>(order_.data_ptr());
-  a.cell_end = static_cast<uint16_t*>(cell_end_.data_ptr());
   backend::g2p2g_chunks(a, stream_);
 }
 

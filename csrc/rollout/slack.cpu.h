@@ -16,7 +16,7 @@ class Slack {
   static constexpr int N = kWideLanes<T>;
   using P = Pack<T, N>;
 
-  // For `all`, which may be null.
+  // `all`, which may be null, gets it in the end.
   Slack(const Geometry<T, D>& geometry, Whereabouts* all) : geometry_(geometry), all_(all), most_(-kBlockWidth) {}
   ~Slack() {
     if (all_) tell();

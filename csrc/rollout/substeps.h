@@ -536,6 +536,11 @@ struct Substeps {
     return {contact, reinterpret_cast<const T*>(update.updated), 1 + D, impulses(0, int64_t(in.shape.size()))};
   }
 
+  // Of the nodes, after contact.
+  const NodeRow<T, D>* velocities() const {
+    return static_cast<const NodeRow<T, D>*>((pool.velocity.defined() ? pool.velocity : pool.updated).data_ptr());
+  }
+
   void make_pool(backend::Stream stream);
   void use_pool();
 };
@@ -633,8 +638,7 @@ void Substeps<T, D>::use_pool() {
   contact.velocity = static_cast<const T*>(pool.updated.data_ptr()) + 1;
   contact.stride = 1 + D;
   if (pool.velocity.defined()) contact.result = static_cast<T*>(pool.velocity.data_ptr());
-  const Tensor& velocity = pool.velocity.defined() ? pool.velocity : pool.updated;
-  advance.gather.nodes = {static_cast<const T*>(velocity.data_ptr()) + 1, 1 + D, D};
+  advance.gather.nodes = {velocities()->value.e, 1 + D, D};
 }
 
 }  // namespace mpm

@@ -106,18 +106,12 @@ struct Motion {
   Motion() {}  // nothing is set to zero
 
   MPM_HD void put(int i, const Sums<Lanes<T>, D> s[D]) {
-    MPM_UNROLL for (int c = 0; c < D; c++) {
-      s[c].value.store(velocity[c] + i);
-      MPM_UNROLL for (int a = 0; a < D; a++) {
-        s[c].moment[a].store(affine[c][a] + i);
-        if (Gradient) s[c].gradient[a].store(gradient[c][a] + i);
-      }
-    }
+    put_by([&](const Lanes<T>& v, T* row) { v.store(row + i); }, s);
   }
 
-  // By store(values of a group, row).
-  template <class F>
-  MPM_HD void put_by(const F& store, const Sums<Lanes<T>, D> s[D]) {
+  // By store(values, row), of a group or of one particle.
+  template <class F, class V>
+  MPM_HD void put_by(const F& store, const Sums<V, D> s[D]) {
     MPM_UNROLL for (int c = 0; c < D; c++) {
       store(s[c].value, velocity[c]);
       MPM_UNROLL for (int a = 0; a < D; a++) {

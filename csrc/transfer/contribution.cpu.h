@@ -34,7 +34,7 @@ MPM_HD ParticleMomentum<Pack<T, G::kSize>, D> load_momentum(const P2GArguments<T
   p.affine = load_matrix_or_zero<T, D>(a.affine, g);
   p.stress = load_matrix_or_zero<T, D>(a.stress, g);
   p.volume = a.stress.pointer ? load(a.volume, g) : P(0);
-  p.dt = P(T(a.dt) * (a.scene_dt.pointer ? a.scene_dt.pointer[scene * a.scene_dt.stride[0]] : T(1)));
+  p.dt = P(time_step(a.scene_dt, a.dt, scene));
   MPM_UNROLL for (int i = 0; i < D; i++)
     p.velocity[i] = load(a.velocity, g, i);
   return p;

@@ -14,7 +14,7 @@ void g2p_advance_with(const G2PAdvanceArguments<T, D>& a) {
   const AdvancedRows<T, D> rows(a);
   const bool direct = unit_stride(in.x, a.F, a.J, in.value, a.x_next, in.moment, a.F_next, a.J_next);
   const auto advance = [&](const Chunk& chunk, int scene, const Motion<Gradient, T, D>& motion) {
-    const P dt(T(a.dt) * (a.scene_dt.pointer ? a.scene_dt.pointer[scene * a.scene_dt.stride[0]] : T(1)));
+    const P dt(time_step(a.scene_dt, a.dt, scene));
     int by_cell[kChunk];
     for (int i = 0; i < chunk.count && !chunk.sorted; i++) by_cell[i] = chunk.id[chunk.by_cell(i)];
     const int* const id = chunk.sorted ? chunk.id : by_cell;

@@ -1,0 +1,114 @@
+#pragma once
+
+#include "grid/grid_update.h"
+#include "transfer/gather.cpu.h"
+#include "transfer/scatter.cpu.h"
+
+// Transfers of one particle, wherever it is, between its own fields and the nodes of the pool.
+namespace mpm::cpu {
+inline namespace TORCH_MPM_ISA {
+
+// The rows of the pool where the nodes of one particle are, wherever it is; line l has those that differ in the last
+// axis.
+template <int Order, class T, int D>
+struct NodesOf {
+  static constexpr int S = Order + 1, kLines = D == 3 ? S * S : S;
+  int64_t row[kLines][S];
+
+  NodesOf(const Topology<T, D>& t, int scene, const int base[D]) {
+    int block[D][S], inside[D][S];  // what nodes of an axis add to indices of the table and of a block
+    for (int a = D - 1, blocks = 1, nodes = 1; a >= 0; blocks *= t.geometry.blocks[a--], nodes *= kBlockWidth)
+      for (int k = 0; k < S; k++) {
+        block[a][k] = (base[a] + k) / kBlockWidth * blocks;
+        inside[a][k] = (base[a] + k) % kBlockWidth * nodes;
+      }
+    const int* const table = t.table + int64_t(scene) * t.geometry.blocks_per_scene;
+    for (int l = 0; l < kLines; l++) {
+      const int i = l / S, j = l % S;
+      const int first = block[D - 2][j] + (D == 3 ? block[0][i] : 0);
+      const int local = inside[D - 2][j] + (D == 3 ? inside[0][i] : 0);
+      for (int k = 0; k < S; k++)
+        row[l][k] = int64_t(table[first + block[D - 1][k]]) * kBlockNodes<D> + local + inside[D - 1][k];
+    }
+  }
+};
+
+// The channels of one node side by side.
+template <class T>
+using Node = Pack<T, kChannels>;
+
+template <class T, int D>
+MPM_HD Node<T> load_node(const NodeRow<T, D>& row) {
+  if constexpr (sizeof(row) == sizeof(Node<T>)) return Node<T>::load(&row.mass);
+  T channels[kChannels] = {};
+  __builtin_memcpy(channels, &row, sizeof(row));
+  return Node<T>::load(channels);
+}
+
+template <class T, int D>
+MPM_HD void add_to_node(NodeRow<T, D>& row, const Node<T>& sum) {
+  if constexpr (sizeof(row) == sizeof(sum)) return (load_node<T, D>(row) + sum).store(&row.mass);
+  row.mass += sum[0];
+  for (int i = 0; i < D; i++) row.value[i] += sum[1 + i];
+}
+
+// As sum_nodes, of one particle, all channels at once.
+template <int Order, int Axis, bool Gradient, class T, int D>
+MPM_HD Sums<Node<T>, D - Axis> sum_own_nodes(const Weights<Order, Node<T>, D>& s, const NodeRow<T, D>* rows,
+                                             const NodesOf<Order, T, D>& nodes, int line = 0) {
+  return sum_axis<Order, Axis, true, Gradient>(s, [&](int k) {
+    if constexpr (Axis + 1 < D) {
+      return sum_own_nodes<Order, Axis + 1, Gradient>(s, rows, nodes, nodes.S * line + k);
+    } else {
+      Sums<Node<T>, 0> node;
+      node.value = load_node<T, D>(rows[nodes.row[line][k]]);
+      return node;
+    }
+  });
+}
+
+// The same as gather_channels gives, about the particle.
+template <int Order, bool Gradient, class T, int D>
+MPM_HD Sums<Node<T>, D> gather_own_nodes(const T f[D], const NodeRow<T, D>* rows, const NodesOf<Order, T, D>& nodes) {
+  Node<T> distance[D];
+  MPM_UNROLL for (int a = 0; a < D; a++)
+    distance[a] = Node<T>(f[a]);
+  const Weights<Order, Node<T>, D> s(distance, Gradient ? 1 : 0);
+  Sums<Node<T>, D> sums = sum_own_nodes<Order, 0, Gradient>(s, rows, nodes);
+  MPM_UNROLL for (int a = 0; a < D; a++)
+    sums.moment[a] = sums.moment[a] - (distance[a] - Node<T>(1)) * sums.value;
+  return sums;
+}
+
+// As sum_cell, of particle p.
+template <int Order, bool Gradient, class T, int D>
+MPM_HD void add_to_own_nodes(const Contributions<Order, T, D, true, Gradient>& g, int p, NodeRow<T, D>* rows,
+                             const NodesOf<Order, T, D>& nodes) {
+  using G = Contributions<Order, T, D, true, Gradient>;
+  constexpr int S = Order + 1;
+  const T* const row = g.row[p];
+  const auto slope = [&](int axis) { return Node<T>::load(row + G::kSlope + axis * kChannels); };
+  const auto gradient = [&](int axis) { return Node<T>::load(row + G::kGradient + axis * kChannels); };
+  const auto about = [](int k, const Node<T>& s) { return Node<T>(k - 1) * s; };
+  for (int l = 0; l < nodes.kLines; l++) {
+    const int i = D == 3 ? l / S : 0, j = l % S;
+    Node<T> value = Node<T>::load(row) + about(j, slope(D - 2));
+    if (D == 3) value += about(i, slope(0));
+    const Node<T> weight(g.line[i][j][p]);
+    const Node<T> first = weight * value, last = weight * slope(D - 1);
+    Node<T> along(0), across(0);
+    if constexpr (Gradient) {
+      along = weight * gradient(D - 1);
+      across = Node<T>(g.slope_y[i][j][p]) * gradient(D - 2);
+      if constexpr (D == 3) across += Node<T>(g.slope_x[i][j][p]) * gradient(0);
+    }
+    for (int k = 0; k < S; k++) {
+      Node<T> sum = Node<T>(g.weight[k][p]) * (first + about(k, last) + across);
+      if constexpr (Gradient) sum += Node<T>(g.slope[k][p]) * along;
+      add_to_node<T, D>(rows[nodes.row[l][k]], sum);
+    }
+  }
+}
+
+}  // namespace TORCH_MPM_ISA
+}  // namespace mpm::cpu
