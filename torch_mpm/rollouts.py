@@ -67,14 +67,15 @@ def rollout(
         norms: records the norm of the gradient at states on the way; see `GradientNorms`.
 
     A `Step` of compiled laws without heat, FLIP and functions of the user's takes all steps in one op, or some, with
-    the results of single steps; `Step.explain` tells. On CUDA they are the same to the last bit, but for float32 without
-    gradients, which like all of a CPU rounds differently; the status does not count blocks that are there only between
-    two activations. Its gradients take the steps again from kept states, those of every `checkpoint` steps, sqrt(n) of them by default and more where states are small. A kept state of a solid has 2 D + 2 D² numbers
-    per particle (24 in 3-D, 96 bytes in float32) and its history; while the backward pass goes through `checkpoint`
-    steps, it holds about 2 D + 4 D² (42 in 3-D) for each of them, and half as much of the grid at most. Where all steps
-    fit into `Checkpoints(memory=...)` that is kept instead, and none is taken again. Second derivatives need single
-    steps. On CUDA and without gradients, other steps that call no function of the user's are replays of a CUDA graph of
-    one; see `captured` for what else there is, and `estimate_rollout` for what a rollout will take. Under
+    the results of single steps; `Step.explain` tells. On CUDA they are the same to the last bit, but for float32
+    without gradients, which like all of a CPU rounds differently; the status does not count blocks that are there only
+    between two activations. Its gradients take the steps again from kept states, those of every `checkpoint` steps,
+    sqrt(n) of them by default and more where states are small. A kept state of a solid has 2 D + 2 D² numbers per
+    particle (24 in 3-D, 96 bytes in float32) and its history; while the backward pass goes through `checkpoint` steps,
+    it holds about 2 D + 4 D² (42 in 3-D) for each of them, and half as much of the grid at most. Where all steps fit
+    into `Checkpoints(memory=...)` that is kept instead, and none is taken again. Second derivatives need single steps.
+    On CUDA and without gradients, other steps that call no function of the user's are replays of a CUDA graph of one;
+    see `captured` for what else there is, and `estimate_rollout` for what a rollout will take. Under
     `torch.autograd.detect_anomaly` a gradient that is NaN is reported with its operation, substep and scene.
 
     Raises:
