@@ -314,29 +314,29 @@ void g2p2g_chunks(const G2P2GChunksArguments<T, D>& a) {
 template <class T, int D>
 void longest_move(const LongestMoveArguments<T, D>& a) {
   constexpr int kRows = 16, kStride = 1 + D, kGroup = kRows * kStride;
-  constexpr int64_t grain = 64;  // slots below which a range is not split
+  constexpr int64_t grain = 256;  // slots below which a range is not split
   static_assert(kBlockNodes<D> % kRows == 0 && sizeof(NodeRow<T, D>) == kStride * sizeof(T));
   using Bits = std::conditional_t<sizeof(T) == 4, int32_t, int64_t>;
   *a.longest = T(0);
   parallel_ranges(a.slots, grain, [&](int64_t begin, int64_t end) {
-    T longest = 0;
+    T most[kGroup] = {}, nan[kGroup] = {};
     for (int64_t slot = begin; slot < end; slot++) {
-      T most[kGroup] = {}, nan[kGroup] = {};
+      const T dt = a.scene_dt ? a.scene_dt[a.block[slot] / a.blocks_per_scene] : T(1);
       for (int first = 0; first < kBlockNodes<D>; first += kRows) {
         const T* const from = reinterpret_cast<const T*>(a.nodes + slot * kBlockNodes<D> + first);
         for (int k = 0; k < kGroup; k++) {
-          const T speed = from[k] < 0 ? -from[k] : from[k];
-          most[k] = speed > most[k] ? speed : most[k];
-          nan[k] += from[k] - from[k];  // NaN if it is not finite
+          const T way = dt * from[k], move = way < 0 ? -way : way;
+          most[k] = move > most[k] ? move : most[k];
+          nan[k] += way - way;  // NaN if it is not finite
         }
       }
-      const T dt = a.scene_dt ? a.scene_dt[a.block[slot] / a.blocks_per_scene] : T(1);
-      for (int k = 0; k < kGroup; k++) {
-        if (k % kStride == 0) continue;
-        const T move = nan[k] == T(0) ? most[k] * (dt < 0 ? -dt : dt) : T(__builtin_inf());
-        if (!(move <= longest)) longest = move > longest ? move : T(__builtin_inf());
-      }
     }
+    T longest = 0;
+    for (int k = 0; k < kGroup; k++)
+      if (k % kStride > 0) {
+        longest = most[k] > longest ? most[k] : longest;
+        if (nan[k] != T(0)) longest = T(__builtin_inf());
+      }
     // Numbers that are not negative are in the order of their bits.
     Bits* const all = reinterpret_cast<Bits*>(a.longest);
     const Bits own = __builtin_bit_cast(Bits, longest);
