@@ -17,7 +17,7 @@ struct Stretch {
 
 // Copies `count` values. Of the `room` places from the first on, those that come later may be written over.
 template <class T>
-MPM_HD void copy(const T* from, T* to, int count, int room) {
+MPM_HD void copy(const T* from, T* to, int count, [[maybe_unused]] int room) {
 #ifdef __AVX512VL__
   constexpr int N = kRegisterBytes / sizeof(T);
   for (int i = 0; i < count; i += N) {
