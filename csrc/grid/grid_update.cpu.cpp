@@ -8,7 +8,7 @@ namespace {
 template <int D>
 constexpr int64_t kGrain = 4096 / kBlockNodes<D>;  // slots below which a range is not split
 
-// The same, of a slot that no face acts on: a loop that the compiler takes for several nodes at once.
+// Of a slot that no face acts on. The compiler knows it then, and takes several nodes at once.
 template <class T, int D>
 MPM_HD SlotUpdate<T, D> free_of_walls(SlotUpdate<T, D> s) {
   s.active = true;

@@ -89,11 +89,10 @@ MPM_HD void add_to_own_nodes(const Contributions<Order, T, D, true, Gradient>& g
   const T* const row = g.row[p];
   const auto slope = [&](int axis) { return Node<T>::load(row + G::kSlope + axis * kChannels); };
   const auto gradient = [&](int axis) { return Node<T>::load(row + G::kGradient + axis * kChannels); };
-  const auto about = [](int k, const Node<T>& s) { return Node<T>(k - 1) * s; };
   for (int l = 0; l < nodes.kLines; l++) {
     const int i = D == 3 ? l / S : 0, j = l % S;
-    Node<T> value = Node<T>::load(row) + about(j, slope(D - 2));
-    if (D == 3) value += about(i, slope(0));
+    Node<T> value = at_node(j, Node<T>::load(row), slope(D - 2));
+    if (D == 3) value = at_node(i, value, slope(0));
     const Node<T> weight(g.line[i][j][p]);
     const Node<T> first = weight * value, last = weight * slope(D - 1);
     Node<T> along(0), across(0);
@@ -103,7 +102,7 @@ MPM_HD void add_to_own_nodes(const Contributions<Order, T, D, true, Gradient>& g
       if constexpr (D == 3) across += Node<T>(g.slope_x[i][j][p]) * gradient(0);
     }
     for (int k = 0; k < S; k++) {
-      Node<T> sum = Node<T>(g.weight[k][p]) * (first + about(k, last) + across);
+      Node<T> sum = Node<T>(g.weight[k][p]) * (at_node(k, first, last) + across);
       if constexpr (Gradient) sum += Node<T>(g.slope[k][p]) * along;
       add_to_node<T, D>(rows[nodes.row[l][k]], sum);
     }
