@@ -128,7 +128,7 @@ def warp_program(w: work.Work, device: str) -> Program:
         def step() -> None:
             wp.capture_launch(capture.graph)
 
-        step.launch = launch  # type: ignore[attr-defined]  # keeps the arrays, which the graph does not
+        step.launch = launch  # type: ignore[attr-defined]  # `--launches`; keeps the arrays, which the graph does not
 
     return step, wp.synchronize, lambda: (x.numpy(), v.numpy())
 
@@ -205,11 +205,15 @@ def is_installed(peer: str) -> bool:
     return importlib.util.find_spec(PEERS[peer][1]) is not None
 
 
-def measure(peer: str, side: int, device: str, samples: int, steps: int, save: str | None) -> dict[str, Any]:
+def measure(
+    peer: str, side: int, device: str, samples: int, steps: int, save: str | None = None, launches: bool = False
+) -> dict[str, Any]:
     """Median and least time of one step, in samples of several steps that are synchronised together."""
     program, module = PEERS[peer]
     w = work.make(side)
     step, synchronize, result = program(w, device)
+    if launches:
+        step = getattr(step, "launch", step)
     for _ in range(steps):
         step()
     synchronize()
@@ -242,10 +246,13 @@ def main() -> None:
     parser.add_argument("--samples", type=int, default=7)
     parser.add_argument("--steps", type=int, default=10, help="steps in a sample, and before the first")
     parser.add_argument("--save", help="file for x and v of the first size after the first steps (.npz)")
+    parser.add_argument("--launches", action="store_true", help="from Python, where Warp would replay a CUDA graph")
     arguments = parser.parse_args()
     for i, side in enumerate(arguments.sides):
         save = arguments.save if i == 0 else None
-        result = measure(arguments.peer, side, arguments.device, arguments.samples, arguments.steps, save)
+        result = measure(
+            arguments.peer, side, arguments.device, arguments.samples, arguments.steps, save, arguments.launches
+        )
         print(json.dumps(result), flush=True)
 
 

@@ -6,8 +6,8 @@
 
 Scenes: `torch_mpm.scene.run` with its files; time of the simulation. The others are the neo-Hookean cube of
 `benchmarks/speed/work.py`, steps of one call of `torch_mpm.rollout`, wall clock, synchronised once. Warp and Taichi
-take steps of the same cube where they are installed (`pip install torch-mpm[bench]`). The figure has every device that
-has results in DIRECTORY.
+take steps of the same cube where they are installed (`pip install torch-mpm[bench]`), Warp's also launched one by one
+from Python beside each scene. The figure has every device that has results in DIRECTORY.
 """
 
 from __future__ import annotations
@@ -150,17 +150,28 @@ def of_peers(device: str, rollouts: list[dict[str, Any]]) -> Iterator[dict[str, 
     """Their least times of a step, and how many times as fast a rollout of the same cube is."""
     ours = {r["particles"]: r["us"] for r in rollouts if r["name"] == "one scene"}
     for peer in filter(peers.is_installed, peers.PEERS):
-        with tempfile.TemporaryDirectory() as folder:
-            for r in run_peer(peer, device, PEER_SIDES[device], 7, Path(folder) / "moved.npz"):
-                us = 1e3 * r["fastest_ms"]
-                name, count = f"{peer} {r['version']}", r["particles"]
-                yield {"name": name, "particles": count, "us": us, "rate": count / us * 1e6, "times": us / ours[count]}
+        for r in run_peer(peer, device, PEER_SIDES[device], 7):
+            us = 1e3 * r["fastest_ms"]
+            name, count = f"{peer} {r['version']}", r["particles"]
+            yield {"name": name, "particles": count, "us": us, "rate": count / us * 1e6, "times": us / ours[count]}
+
+
+def plain_programs(device: str, scenes: list[dict[str, Any]]) -> Iterator[dict[str, Any]]:
+    """A step of Warp launched from Python, three kernels for the neo-Hookean cube with about as many particles as a
+    scene has, and how many times as fast the scene is as run, with its laws, obstacles, heat and output."""
+    if device != "cuda" or not peers.is_installed("warp"):
+        return
+    sides = [round(scene["particles"] ** (1 / 3)) for scene in scenes]
+    for scene, r in zip(scenes, run_peer("warp", device, sides, 7, "--launches", steps=200), strict=True):
+        us = 1e3 * r["fastest_ms"]
+        yield {"name": scene["name"], "particles": r["particles"], "us": us, "times": us / scene["us"]}
 
 
 def measure(device: str, quick: bool = False) -> dict[str, Any]:
     common.use_all_cores()
     samples = 1 if quick else 5
-    result: dict[str, Any] = {"environment": common.environment(device), "scenes": [], "rollouts": [], "peers": []}
+    result: dict[str, Any] = {"environment": common.environment(device)}
+    result |= {"scenes": [], "rollouts": [], "peers": [], "plain": []}
     sides = SIDES[device][:2] if quick else SIDES[device]
     for side in sides:
         s = setup(work.make(side), device)
@@ -186,6 +197,7 @@ def measure(device: str, quick: bool = False) -> dict[str, Any]:
     s, dt = on_its_way("demo", device, frames=1 if quick else 6)
     result["rollouts"].append({"name": "demo, one call", **per_step(s, device, samples, dt)})
     result["scenes"] += scenes(() if quick else SCENES[device], device)
+    result["plain"] += () if quick else plain_programs(device, result["scenes"])
     return result
 
 
@@ -202,6 +214,9 @@ def text(result: dict[str, Any]) -> str:
     lines += [common.table((*header, "simulation, s"), rows), ""]
     if rows := [(r["name"], r["particles"], r["us"], r["rate"] * 1e-6, r["times"]) for r in result.get("peers", ())]:
         header = ("a step", "particles", "us", "M particles/s", "rollout so many times as fast")
+        lines += [common.table(header, rows), ""]
+    if rows := [(r["name"], r["particles"], r["us"], r["times"]) for r in result.get("plain", ())]:
+        header = ("scene", "particles of Warp's plain step", "us", "scene so many times as fast")
         lines += [common.table(header, rows), ""]
     return "\n".join(lines)
 

@@ -246,9 +246,11 @@ def _random_lattice(shape: Sequence[int], generator: torch.Generator, like: Tens
 # ---- peers, each in a process of its own
 
 
-def run_peer(peer: str, device: str, sides: Sequence[int], samples: int, save: Path) -> Iterator[dict[str, Any]]:
+def run_peer(
+    peer: str, device: str, sides: Sequence[int], samples: int, *options: str, steps: int = STEPS
+) -> Iterator[dict[str, Any]]:
     command = [sys.executable, "-m", peers.__name__, peer, "--device", device, "--samples", str(samples)]
-    command += ["--steps", str(STEPS), "--save", str(save), "--sides", *map(str, sides)]
+    command += ["--steps", str(steps), *options, "--sides", *map(str, sides)]
     done = subprocess.run(command, cwd=common.ROOT, capture_output=True, text=True, timeout=300)
     for line in done.stdout.splitlines():
         if line.startswith("{"):
@@ -327,7 +329,7 @@ def measure_peer(report: Report, peer: str, device: str, sides: Sequence[int], s
         return
     with tempfile.TemporaryDirectory() as folder:
         saved = Path(folder) / "moved.npz"
-        for result in run_peer(peer, device, sides, samples, saved):
+        for result in run_peer(peer, device, sides, samples, "--save", str(saved)):
             report.result["peers"].append(result)
         s = setup(work.make(sides[0]), device)
         with torch.no_grad():
