@@ -9,6 +9,7 @@ from test_small_scenes import F64, LAWS, assert_same, both, joined
 from test_step import block_state
 
 import torch_mpm as mpm
+from torch_mpm.rollouts import takes_few_blocks
 
 N, DT = 50, 1e-3
 
@@ -52,6 +53,22 @@ def test_more_particles_than_a_cluster_takes(transfer, dim, device):
     state = state.replace(v=state.v + jet[:, None] * torch.tensor([0.0, 25.0, 0.0][:dim], dtype=F64, device=device))
     options = {"transfer": transfer, "walls": "sticky"}
     end, expected = both(make(dim, **options), make(dim, **options), state, 30, 5e-4)
+    assert_same(end, expected, 1e-3)
+
+
+@pytest.mark.parametrize("high", [0.6, 0.65])
+def test_crowded_blocks(high, dim, device):
+    """Of which an item has more than in steps of single kernels, once a call knows how few blocks there are."""
+    state = block_state(dim, dx=0.025 if dim == 3 else 0.005, high=high)
+    state = state.replace(v=state.v + torch.tensor([3.0, -1.0, 1.5][:dim], dtype=F64)).to(device)
+    assert 13000 < len(state) < 2**15
+    step, single = make(dim, max_blocks=None), make(dim)
+    with torch.no_grad():
+        half, _ = both(step, single, state, 20, 5e-4)
+        assert device == "cpu" or takes_few_blocks(step, half, 30)
+        end = mpm.rollout(step, half, 30, 5e-4)
+    _, expected = both(make(dim), single, state, 50, 5e-4)
+    step.check(end)
     assert_same(end, expected, 1e-3)
 
 

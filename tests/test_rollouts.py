@@ -288,7 +288,9 @@ def test_materials_that_no_step_has_checked_are_checked_after_a_sort(device):
         mpm.rollout(step, state, 2, 1e-4)
 
 
-def test_batches_with_obstacles_and_parameters_of_scenes_and_particles(dim, device):
+@pytest.mark.parametrize("n", [6, 40])
+def test_batches_with_obstacles_and_parameters_of_scenes_and_particles(n, dim, device):
+    """Some nodes are in several obstacles, which act one after another."""
     scenes = 3
     state = blob(device, dim, scene=torch.arange(300, dtype=torch.int32) % scenes)
     state = state.replace(scene=state.scene.int())
@@ -304,7 +306,7 @@ def test_batches_with_obstacles_and_parameters_of_scenes_and_particles(dim, devi
     step = mpm.Step(box(dim, scenes=scenes), law.to(device), gravity, boundaries=obstacles, walls="slip")
     assert in_one_op(step, state)
     with torch.no_grad():
-        assert_equal(mpm.rollout(step, state, 6, 1e-4), one_by_one(step, state, 6, 1e-4))
+        assert_equal(mpm.rollout(step, state, n, 1e-4), one_by_one(step, state, n, 1e-4))
 
 
 def test_obstacles_come_and_go_in_the_substeps_of_single_steps(device):

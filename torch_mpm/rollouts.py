@@ -204,9 +204,9 @@ def obstacle_to_substeps(step: Step, state: State, dt: float | Tensor) -> str | 
 
 
 MOST_STEPS = 2**16  # of one op, csrc/rollout/substeps.h
-LEAST_PERSISTENT, MOST_PERSISTENT = 10, 2**14
+LEAST_PERSISTENT, MOST_PERSISTENT = 10, 2**15
 """Steps and particles of a call that one kernel takes on CUDA, csrc/rollout/persistent.h."""
-FEW_BLOCKS, FEW_ITEMS = 2**12, 140
+FEW_BLOCKS, FEW_ITEMS = 2**12, {2: 250, 3: 140}
 """Of a domain, and of work in a step, for which about one wave of thread blocks is enough."""
 LONG_CHUNK = 1024
 """Steps of a call whose pool has room for all blocks of the domain."""
@@ -281,9 +281,17 @@ def takes_few_blocks(step: Step, state: State, n: int) -> bool:
     if state.x.dtype != torch.float32 or not isinstance(step.law, CompiledLaw) or len(state) > MOST_PERSISTENT:
         return False
     if grid.deterministic or grid.max_blocks is None:
-        return grid.deterministic
-    # The pool has a half more than was active. Half of these blocks have particles, some of them more than one item.
-    return grid.max_blocks / 3 + len(state) / 160 <= FEW_ITEMS
+        return grid.deterministic and len(state) <= MOST_PERSISTENT // 2
+    return items_of_step(grid.dim, grid.max_blocks, len(state)) <= FEW_ITEMS[grid.dim]
+
+
+def items_of_step(dim: int, blocks: int, particles: int) -> float:
+    """About how many items so many particles make that a pool of `blocks` has room for (csrc/rollout/persistent.h)."""
+    active = blocks / 1.5  # of a pool that has grown
+    if dim == 2:  # most of these have particles, seldom more than one item
+        return max(0.8 * active, particles / 150)
+    most = 128 if particles <= 11000 else 256 if particles <= 20000 else 384
+    return 0.5 * active + particles / (1.25 * most)
 
 
 def wants_gradient(step: Step, state: State) -> bool:

@@ -2,8 +2,8 @@
 
 #include "cuda/launch.cuh"
 
-// Kernels of a step, which mostly follow one another: each is launched while the one before it ends, and waits for that
-// where it begins. Compiled for compute capability 9.0 or later; else they are launched as any other.
+// Kernels of a step, which mostly follow one another: each is launched while the one before it is at work, and waits
+// for that. Compiled for compute capability 9.0 or later; else they are launched as any other.
 namespace mpm::cuda {
 
 // Whether a kernel was compiled to wait: PTX of an older architecture, which newer devices take too, was not. All
@@ -19,12 +19,20 @@ bool waits_for_kernel_before(Kernel* kernel) {
   return waits && device_attribute(cudaDevAttrComputeCapabilityMajor) >= 9;
 }
 
-// What a kernel that is launched in a chain does first.
+__device__ inline void let_next_kernel_begin() {
+#if __CUDA_ARCH__ >= 900
+  cudaTriggerProgrammaticLaunchCompletion();
+#endif
+}
+
+// What every thread of a kernel that is launched in a chain does, once or more often: before it reads what the kernel
+// before has written, and before it ends. The next one comes after that, so what it does before it waits in turn may
+// read what was written before the kernel before it.
 __device__ inline void wait_for_kernel_before() {
 #if __CUDA_ARCH__ >= 900
-  cudaTriggerProgrammaticLaunchCompletion();  // the next one may come, and wait
   cudaGridDependencySynchronize();
 #endif
+  let_next_kernel_begin();
 }
 
 inline cudaLaunchConfig_t launch_config(cudaLaunchAttribute* attributes, unsigned count, unsigned blocks,
@@ -46,7 +54,7 @@ inline cudaLaunchAttribute overlap_attribute() {
   return overlap;
 }
 
-// The kernel must call wait_for_kernel_before() first of all.
+// The kernel must call wait_for_kernel_before().
 template <class... Parameters, class... Arguments>
 void launch_in_chain(void (*kernel)(Parameters...), unsigned blocks, unsigned threads, size_t shared_memory,
                      cudaStream_t stream, const Arguments&... arguments) {

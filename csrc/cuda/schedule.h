@@ -6,11 +6,11 @@
 namespace mpm::cuda {
 
 // Particles of an item at most, all of one base block: a crowded block makes several items. Fewer where there are few
-// particles, so that there are some four items for each of the 130 multiprocessors of a large device.
+// particles, so that there are some two items for each of the 130 multiprocessors of a large device.
 constexpr int kItemParticles = 576, kLeastItemParticles = 128;
 
 MPM_HD int item_particles(int64_t particles) {
-  const int64_t shared = particles / 512;
+  const int64_t shared = particles / 256;
   return int(shared < kLeastItemParticles ? kLeastItemParticles : shared > kItemParticles ? kItemParticles : shared);
 }
 

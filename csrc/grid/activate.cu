@@ -378,7 +378,7 @@ __device__ void offsets(const ActivateArguments<T, D>& a, const Workspace& w, in
         w.tally[b].count = -1 - atomicAdd(&w.counters->tail, count);
         count = 0;
       }
-      const int most = item_particles(a.particles);
+      const int most = a.most_of_item > 0 ? a.most_of_item : item_particles(a.particles);
       items = (count + most - 1) / most;
     }
     const Packed before = exclusive_sum(pack(count, items), w.offset_states, tile);
@@ -526,7 +526,7 @@ __global__ void __launch_bounds__(kThreads)
     activate_at_once(const ActivateArguments<T, D> a, const Workspace w, int table, int64_t rows) {
   wait_for_kernel_before();
   const int64_t start = int64_t(blockIdx.x) * kThreads + threadIdx.x, stride = int64_t(gridDim.x) * kThreads;
-  if (a.drift && !a.fresh && a.drift->lasts(a.particles, a.strays_of_activation)) {
+  if (a.drift && !a.fresh && a.drift->lasts(a.particles)) {
     for (int64_t row = start; row <= a.scenes; row += stride) {
       int* const status = a.status + row * kStatusSize;
       copy_status(a.previous_status + row * kStatusSize, status);

@@ -34,8 +34,8 @@ struct ActivateArguments {
   void* workspace = nullptr;  // bytes asked for by activate_workspace()
   bool fresh = true;          // whether the table and the workspace are not those of an earlier call as they were left
   int64_t workspace_size = 0;
-  const Drift* drift = nullptr;  // since the activation in these tensors; null for a new one in any case
-  int strays_of_activation = kStraysOfActivation;
+  const Drift* drift = nullptr;   // since the activation in these tensors; null for a new one in any case
+  int most_of_item = 0;           // on CUDA: particles of an item; 0 for as many as usual
   const Drift* missed = nullptr;  // where a particle may have been missed a step ago
   Drift* next_drift = nullptr;    // told where there is no room for all blocks around those with particles; or null
 

@@ -323,9 +323,14 @@ MPM_HD Vector<T, D> relative_velocity(const Touch<T, D>& t, const Vector<T, D>& 
 }
 
 template <class T, int D>
-MPM_HD Vector<T, D> after_contact(const ObstaclePose<T, D>& o, const Touch<T, D>& t, const Vector<T, D>& v) {
+MPM_HD Vector<T, D> after_contact(Contact contact, const T& friction, const Touch<T, D>& t, const Vector<T, D>& v) {
   const Vector<T, D> u = relative_velocity(t, v);
-  return v + (contact_velocity(o.contact, u, t.normal, o.row->friction) + T(-1) * u);
+  return v + (contact_velocity(contact, u, t.normal, friction) + T(-1) * u);
+}
+
+template <class T, int D>
+MPM_HD Vector<T, D> after_contact(const ObstaclePose<T, D>& o, const Touch<T, D>& t, const Vector<T, D>& v) {
+  return after_contact(o.contact, o.row->friction, t, v);
 }
 
 // What the nodes of a slot share.
@@ -337,18 +342,27 @@ struct ContactSlot {
   const ObstacleRow<T, D>* row;  // the obstacles of its scene
 };
 
+// Of an active block of a scene, with the lattice index of its first node.
+template <class T, int D>
+MPM_HD ContactSlot<T, D> contact_slot(const ContactArguments<T, D>& a, int scene, const int (&corner)[D]) {
+  ContactSlot<T, D> s;
+  s.scene = scene;
+  s.active = (a.rows == 1 || scene < a.rows) && (!a.scene_time || a.times == 1 || scene < a.times);
+  s.row = a.row + (a.rows == 1 ? 0 : int64_t(scene) * a.obstacles);
+  MPM_UNROLL for (int i = 0; i < D; i++)
+    s.corner[i] = corner[i];
+  return s;
+}
+
 template <class T, int D>
 MPM_HD ContactSlot<T, D> contact_slot(const ContactArguments<T, D>& a, int slot) {
-  ContactSlot<T, D> s;
   const int index = a.block[slot];
-  s.active = index >= 0;
-  if (!s.active) return s;
-  s.scene = block_coordinates(a.geometry, index, s.corner);
-  s.active = (a.rows == 1 || s.scene < a.rows) && (!a.scene_time || a.times == 1 || s.scene < a.times);
-  s.row = a.row + (a.rows == 1 ? 0 : int64_t(s.scene) * a.obstacles);
+  if (index < 0) return {false};
+  int corner[D];
+  const int scene = block_coordinates(a.geometry, index, corner);
   MPM_UNROLL for (int i = 0; i < D; i++)
-    s.corner[i] *= kBlockWidth;
-  return s;
+    corner[i] *= kBlockWidth;
+  return contact_slot(a, scene, corner);
 }
 
 // The pose of obstacle k; it does not act where it cannot touch the block.
@@ -375,17 +389,58 @@ MPM_HD void store_node(T* values, int64_t node, const Vector<T, D>& v, const T& 
     row[1 + i] = v[i];
 }
 
-// The velocity v of a node after the first `last` obstacles, which act one after another.
+// The first obstacle that touches a node.
 template <class T, int D>
-MPM_HD Vector<T, D> after_obstacles(const ContactArguments<T, D>& a, const ContactSlot<T, D>& s, int last,
+struct FirstTouch {
+  int obstacle;  // their number where none does
+  Contact contact;
+  T friction;
+  Touch<T, D> touch;
+};
+
+template <class T, int D>
+MPM_HD FirstTouch<T, D> first_touch(const ContactArguments<T, D>& a, const ContactSlot<T, D>& s,
+                                    const Vector<T, D>& position) {
+  FirstTouch<T, D> first;
+  for (first.obstacle = s.active ? 0 : a.obstacles; first.obstacle < a.obstacles; first.obstacle++) {
+    const ObstaclePose<T, D> pose = pose_at(a, s, first.obstacle);
+    if (!pose.acts) continue;
+    first.touch = touch(a, pose, position);
+    if (!first.touch.touching) continue;
+    first.contact = pose.contact;
+    first.friction = pose.row->friction;
+    break;
+  }
+  return first;
+}
+
+// The velocity v of a node after the obstacles from one on until `last`, which act one after another.
+template <class T, int D>
+MPM_HD Vector<T, D> after_obstacles(const ContactArguments<T, D>& a, const ContactSlot<T, D>& s, int first, int last,
                                     const Vector<T, D>& position, Vector<T, D> v) {
-  for (int k = 0; k < last; k++) {
+  for (int k = first; k < last; k++) {
     const ObstaclePose<T, D> pose = pose_at(a, s, k);
     if (!pose.acts) continue;
     const Touch<T, D> t = touch(a, pose, position);
     if (t.touching) v = after_contact(pose, t, v);
   }
   return v;
+}
+
+template <class T, int D>
+MPM_HD Vector<T, D> after_obstacles(const ContactArguments<T, D>& a, const ContactSlot<T, D>& s, int last,
+                                    const Vector<T, D>& position, const Vector<T, D>& v) {
+  return after_obstacles(a, s, 0, last, position, v);
+}
+
+// The same after all of them, of which the first one that touches the node is known.
+template <class T, int D>
+MPM_HD Vector<T, D> after_obstacles(const ContactArguments<T, D>& a, const ContactSlot<T, D>& s,
+                                    const FirstTouch<T, D>& first, const Vector<T, D>& position,
+                                    const Vector<T, D>& v) {
+  if (first.obstacle >= a.obstacles) return v;
+  return after_obstacles(a, s, first.obstacle + 1, a.obstacles, position,
+                         after_contact(first.contact, first.friction, first.touch, v));
 }
 
 // The nodes lane, lane + Lanes, ... of a slot.

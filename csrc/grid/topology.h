@@ -21,7 +21,7 @@ struct Topology {
   int64_t schedule_size = 0;
 };
 
-constexpr int kStraysOfActivation = 32;  // times as many cost what the activation of one particle does
+constexpr int kStraysOfActivation = 2;  // times as many cost what the activation of one particle does, on CUDA
 
 // Where particles are that have moved since their activation, which on CUDA may serve several steps.
 struct Drift {
@@ -33,14 +33,12 @@ struct Drift {
   enum Loss : int { kLost = 1, kMissed = 2 };
 
   // A stray costs a step more than another particle does. Once all have cost what an activation does there is a new
-  // one, so that both together are at most twice the least possible: once `strays_of_activation` times as many as there
-  // are particles have been counted.
+  // one, so that both together are at most twice the least possible: once those counted, `strays_of_activation` times,
+  // are as many as there are particles.
   MPM_HD bool lasts(int64_t particles, int strays_of_activation = kStraysOfActivation) const {
     return lost == 0 && (int64_t(earlier) + strays) * strays_of_activation <= particles;
   }
-  MPM_HD Drift next(int64_t particles, int strays_of_activation = kStraysOfActivation) const {
-    return {0, 0, lasts(particles, strays_of_activation) ? earlier + strays : 0};
-  }
+  MPM_HD Drift next(int64_t particles) const { return {0, 0, lasts(particles) ? earlier + strays : 0}; }
 };
 
 // Entries of the schedule tensor: room for the work items of both backends, with the number of particles of each cell,

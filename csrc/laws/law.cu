@@ -16,9 +16,13 @@ constexpr int kUpdateBlocks = sizeof(T) == 4 ? Law::gpu_update_blocks : (Law::gp
 template <class Law, class T, int D>
 __global__ void __launch_bounds__(Law::gpu_threads, kUpdateBlocks<Law, T>)
     law_update_kernel(const LawUpdateArguments<T, D> a) {
-  wait_for_kernel_before();
+  if (a.runs_beside)
+    let_next_kernel_begin();
+  else
+    wait_for_kernel_before();
   const int64_t p = int64_t(blockIdx.x) * Law::gpu_threads + threadIdx.x;
   if (p < a.law.particles && a.law.members.has(p)) Law::template Kernels<Law>::update(a, One<T>{p});
+  wait_for_kernel_before();  // since the next one waits for this alone
 }
 
 template <class Law, bool Adds, class T, int D>

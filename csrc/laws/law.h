@@ -85,6 +85,9 @@ struct LawUpdateArguments {
   Field<T> dissipated;    // [P], absent where not wanted
   Field<T> multiplier;    // [P], length of the plastic increment of the Hencky strains; absent where not wanted
   int* branch = nullptr;  // [P] FlowBranch, plus kNotConverged where a root was not found; absent where not wanted
+  // On CUDA: whether this has nothing to do with an activation just before, and laws of other particles after that, so
+  // that it can run beside them.
+  bool runs_beside = false;
 };
 
 template <class T, int D>

@@ -12,10 +12,6 @@
 // All four are launched, and the device finds which of them have something to do.
 namespace mpm {
 
-// A new activation is due once strays, added up over the steps, are half as many as there are particles: it costs about
-// one step more, while a stray, whose velocity mostly comes from the tile as well, costs little.
-constexpr int kStraysOfRenewal = kStraysOfActivation / 16;
-
 template <class T, int D>
 class Merged {
  public:
@@ -92,7 +88,6 @@ void Merged<T, D>::begin(const Particles<const T>& given, const int* before) {
   s_.move_late(own_, false, false);
   Settling<T, D>& settling = s_.settling;
   settling.rows = rows_;
-  settling.strays_of_activation = kStraysOfRenewal;
   settling.given = true;
   settling.x = own_.x;
   settling.mass = field<T>(mass_);
@@ -120,10 +115,8 @@ void Merged<T, D>::use_own() {
   activation.origin = s_.settling.origin;
   activation.copy = s_.settling.copy;
   activation.copy_rows = rows_;
-  activation.strays_of_activation = kStraysOfRenewal;
   GivingBack<T>& giving = s_.advance.own;
   giving.rows = rows_;
-  giving.strays_of_activation = kStraysOfRenewal;
   giving.origin = s_.settling.origin;
   giving.columns = int(s_.columns);
   giving.history = own.history;
@@ -154,7 +147,6 @@ template <class T, int D>
 void Merged<T, D>::update_grid(int64_t step, backend::Stream stream) {
   s_.next.drift = s_.next.watched = drift(step);
   s_.next.next_drift = drift(step + 1);
-  s_.next.strays_of_activation = kStraysOfRenewal;
   s_.next.items_taken = static_cast<int*>(items_taken_.data_ptr());
   s_.move_nodes(stream);
   s_.end_time(stream);

@@ -18,40 +18,73 @@ __device__ bool goes_far(const GridUpdateArguments<T, D>& a, const SlotUpdate<T,
   return !near;
 }
 
-// A node of a slot; false where the slot is not in use.
+// A node of a slot, and what is known of it before P2G is done.
 template <bool Obstacles, class T, int D>
-__device__ bool take_node(const NextGridArguments<T, D>& a, int slot, int local) {
-  const SlotUpdate<T, D> s = slot_update(a.update, slot);
-  if (!s.active) return false;
-  const int64_t node = int64_t(slot) * kBlockNodes<D> + local;
-  NodeRow<T, D> row = update_node(a.update, s, local, NodeRows<T, D>(a.update.nodes, a.fixed).at(node));
-  if constexpr (Obstacles) {
-    const ContactSlot<T, D> there = contact_slot(a.contact, slot);
-    if (there.active)
-      row.value = after_obstacles(a.contact, there, a.contact.obstacles, node_position(a.contact, there.corner, local),
-                                  row.value);
+struct Node {
+  int slot, local;
+  SlotUpdate<T, D> there;
+  ContactSlot<T, D> contact;
+  FirstTouch<T, D> touch;
+
+  __device__ int64_t row() const { return int64_t(slot) * kBlockNodes<D> + local; }
+  __device__ bool is_in_use() const { return there.active; }
+  __device__ NodeRow<T, D> sums(const NextGridArguments<T, D>& a) const {
+    return NodeRows<T, D>(a.update.nodes, a.fixed).at(row());
   }
-  if (a.watched && goes_far(a.update, s, row)) atomicOr(&a.watched->lost, Drift::kLost);
-  a.update.updated[node] = row;
-  if (a.emptied) NodeRows<T, D>::empty(a.emptied, node, a.fixed);
-  return true;
+
+  // Without its obstacles, which those alone need that have mass.
+  __device__ void find(const NextGridArguments<T, D>& a, int at) {
+    slot = at;
+    there = slot_update(a.update, slot);
+    touch.obstacle = a.contact.obstacles;
+  }
+  __device__ void find_obstacles(const NextGridArguments<T, D>& a) {
+    contact = contact_slot(a.contact, there.scene, there.corner);
+    touch = first_touch(a.contact, contact, node_position(a.contact, contact.corner, local));
+  }
+};
+
+template <bool Obstacles, class T, int D>
+__device__ void take_node(const NextGridArguments<T, D>& a, const Node<Obstacles, T, D>& node) {
+  NodeRow<T, D> row = update_node(a.update, node.there, node.local, node.sums(a));
+  if constexpr (Obstacles)
+    row.value = after_obstacles(a.contact, node.contact, node.touch,
+                                node_position(a.contact, node.contact.corner, node.local), row.value);
+  if (a.watched && goes_far(a.update, node.there, row)) atomicOr(&a.watched->lost, Drift::kLost);
+  a.update.updated[node.row()] = row;
+  if (a.emptied) NodeRows<T, D>::empty(a.emptied, node.row(), a.fixed);
 }
 
-// In strides of the grid, so that a pool that is mostly unused costs nothing.
+// In strides of the grid, so that a pool that is mostly unused costs nothing: of the slots, and of those of the margin,
+// those in use come first. Where the first node of a thread is, and which obstacle touches it, is found while P2G is at
+// work.
 template <bool Obstacles, class T, int D>
-__global__ void __launch_bounds__(kThreads) next_grid_kernel(const NextGridArguments<T, D> a) {
-  wait_for_kernel_before();
+__global__ void __launch_bounds__(kThreads) next_grid_kernel(const __grid_constant__ NextGridArguments<T, D> a) {
   constexpr int slots = kThreads / kBlockNodes<D>;  // at a time
-  const int first = int(blockIdx.x) * slots + int(threadIdx.x) / kBlockNodes<D>, stride = int(gridDim.x) * slots,
-            local = int(threadIdx.x) % kBlockNodes<D>;
+  const int first = int(blockIdx.x) * slots + int(threadIdx.x) / kBlockNodes<D>, stride = int(gridDim.x) * slots;
+  Node<Obstacles, T, D> node;
+  node.local = int(threadIdx.x) % kBlockNodes<D>;
+  if (first < a.update.max_blocks) {
+    node.find(a, first);
+    if (Obstacles && node.is_in_use()) node.find_obstacles(a);
+  }
+  wait_for_kernel_before();
   if (blockIdx.x == 0 && threadIdx.x == 0) {
-    *a.next_drift = a.drift->next(a.particles, a.strays_of_activation);
+    *a.next_drift = a.drift->next(a.particles);
     if (a.items_taken) *a.items_taken = 0;
   }
-  for (int slot = first; slot < a.near_blocks; slot += stride)
-    if (!take_node<Obstacles>(a, slot, local)) break;
-  for (int slot = a.near_blocks + first; slot < a.update.max_blocks; slot += stride)
-    if (!take_node<Obstacles>(a, slot, local)) break;
+  for (int slot = first; slot < a.update.max_blocks; slot += stride) {
+    if (slot != first) {
+      node.find(a, slot);
+      if (Obstacles && node.is_in_use() && node.sums(a).mass != T(0)) node.find_obstacles(a);
+    }
+    if (node.is_in_use())
+      take_node(a, node);
+    else if (slot < a.near_blocks)
+      slot += (a.near_blocks - 1 - slot) / stride * stride;  // the next one may be of the margin
+    else
+      break;
+  }
 }
 
 }  // namespace

@@ -22,7 +22,6 @@ struct NextGridArguments {
   Drift* watched = nullptr;    // told of nodes that go so far that particles may leave the active blocks; or null
   int* items_taken = nullptr;  // which becomes zero; or null
   int64_t particles = 0;
-  int strays_of_activation = kStraysOfActivation;
 };
 
 }  // namespace mpm

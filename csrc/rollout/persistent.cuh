@@ -30,7 +30,7 @@ struct NodeVelocities {
     if (node.mass == T(0)) return zero_vector<T, D>();
     Vector<T, D> v = update_node(update, there, local, node).value;
     if (!obstacles) return v;
-    const ContactSlot<T, D> s = contact_slot(contact, slot);
+    const ContactSlot<T, D> s = contact_slot(contact, there.scene, there.corner);
     return s.active ? after_obstacles(contact, s, contact.obstacles, node_position(contact, s.corner, local), v) : v;
   }
 };
@@ -42,7 +42,7 @@ using SharingShape = ScatterShape<S::Order, typename S::T, S::D, S::Plain, S::Li
 // What the threads of an item share beside its particles, sums and nodes.
 template <class S>
 struct ItemMemory {
-  static constexpr int D = S::D, most = kLeastItemParticles;
+  static constexpr int D = S::D, most = S::threads;
   using T = typename S::T;
   int slots[1 << D];
   SlotUpdate<T, D> there[1 << D];
@@ -64,7 +64,7 @@ class ItemStep {
   static constexpr int support_nodes = S::support * S::slab,
                        span = (D == 2 ? 0 : Order * width * width) + Order * width + Order + 1;
   static constexpr int strays_at_once = (int(S::shared_bytes / sizeof(NodeValue<T, D>)) - tile_nodes) / span;
-  static_assert(threads >= kLeastItemParticles && S::batch >= kLeastItemParticles && strays_at_once > 0);
+  static_assert(threads >= persistent_item<D>(kMostPersistentParticles) && S::batch >= threads && strays_at_once > 0);
 
   const Source& source;
   const Task& task;
@@ -352,7 +352,7 @@ class CountingBarrier {
 };
 
 template <class Source, class Task, class T, int D>
-__global__ void __launch_bounds__(ItemStep<Source, Task>::threads)
+__global__ void __launch_bounds__(ItemStep<Source, Task>::threads, kItemsOfProcessor<D>)
     persistent_kernel(const __grid_constant__ Source source, const __grid_constant__ Task task,
                       const __grid_constant__ PersistentLoop<T, D> a) {
   using Step = ItemStep<Source, Task>;

@@ -360,6 +360,8 @@ struct Substeps {
     drifts = empty_int(in.x, {2, sizeof(Drift) / sizeof(int)});
     torch::stable::zero_(drifts);
     p2g.drifted = true;
+    advance.loads_ahead = true;
+    for (LawUpdateArguments<T, D>& law : laws) law.runs_beside = true;
     next.particles = in.x.size(0);
     next.obstacles = obstacles && !impulse.defined();  // whose impulses want the velocities before contact
     const int64_t most = std::min<int64_t>(update.block_count, INT32_MAX / kBlockNodes<D> - activation.max_blocks);
@@ -413,7 +415,8 @@ struct Substeps {
     if (!may_move_late() || !in.resident || in.n < kLeastPersistentSteps + 2) return false;
     if (!next.emptied || has(in.impulse)) return false;
     const bool few = in.grows ? in.max_blocks == update.block_count : in.max_blocks <= kMostPersistentBlocks;
-    return few && P > 0 && P <= kMostPersistentParticles && calls[0].law->kernels<T, D>().persistent;
+    const int64_t most = in.grows ? kMostPersistentParticles : kMostPersistentParticles / 2;
+    return few && P > 0 && P <= most && calls[0].law->kernels<T, D>().persistent;
   }
 
   void forget_stress() {

@@ -299,6 +299,7 @@ Results substeps(MPM_SUBSTEPS_PARAMETERS) {
     int64_t step = 0;
 #if CUDART_VERSION >= 13000
     if (s.persists() && !is_recorded(stream)) {
+      s.activation.most_of_item = persistent_item<D>(in.x.size(0));
       take(0, false, stream);
       const Particles<T> in_place = buffers(0);
       s.read(from, in_place.F);

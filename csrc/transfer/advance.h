@@ -49,6 +49,9 @@ struct G2PAdvanceArguments {
   // On CUDA: particles may be in other active blocks than they were activated in, and where they go now is added here.
   Drift* drift = nullptr;
   GivingBack<T> own;  // on CUDA
+  // On CUDA: whether the kernel before writes nothing that this one reads but the nodes, so that it can begin to load
+  // all else meanwhile.
+  bool loads_ahead = false;
 };
 
 constexpr int64_t kMostLateParticles = 1 << 18;

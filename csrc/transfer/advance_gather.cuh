@@ -37,6 +37,7 @@ struct AdvanceGather {
   T dt, moment_scale, gradient_scale;  // from cells
   T lost;
   Drift* drift;
+  bool loads_ahead;
 
   explicit AdvanceGather(const G2PAdvanceArguments<T, D>& a)
       : topology(a.gather.topology),
@@ -54,7 +55,8 @@ struct AdvanceGather {
         moment_scale(T(a.gather.moment_scale * double(topology.geometry.dx))),
         gradient_scale(topology.geometry.inverse_dx),
         lost(T(a.gather.lost)),
-        drift(a.drift) {}
+        drift(a.drift),
+        loads_ahead(a.loads_ahead) {}
 
   __device__ Loaded load(int p, int scene) const {
     Loaded l = at(read_vector(position, p), scene);

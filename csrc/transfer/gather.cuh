@@ -289,7 +289,8 @@ class Follower {
 // leave_out(p) for a particle outside. Where it drifts, particles may be in other active blocks than those of the
 // activation, write(...) returns where they go, and there is a drift to add that to. Where it has `Others`, that many
 // channels of the nodes `others` have a support of their own, the last argument of compute(...). Where it tells whether
-// it is due, particles are in the order of items, but for one activation.
+// it is due, particles are in the order of items, but for one activation. Where it may load ahead, it tells whether the
+// kernel before writes nodes alone.
 template <class Task>
 constexpr bool may_drift = requires { requires Task::drifts; };
 template <class Task>
@@ -297,6 +298,14 @@ constexpr int kOthers = 0;
 template <class Task>
   requires requires { Task::Others; }
 constexpr int kOthers<Task> = Task::Others;
+template <class Task>
+constexpr bool may_load_ahead =
+    requires(const Task& task) { task.loads_ahead; } && !requires(const Task& task) { task.is_due(); };
+template <class Task>
+__device__ bool loads_ahead(const Task& task) {
+  if constexpr (may_load_ahead<Task>) return task.loads_ahead;
+  return false;
+}
 template <class Task>
 using FollowerOf = Follower<Task::Order, typename Task::T, Task::D>;
 
@@ -330,6 +339,7 @@ __device__ void gather_in_memory_order(const Task& task, const Schedule<const in
   using T = typename Task::T;
   constexpr int D = Task::D;
   const Topology<T, D>& t = task.topology;
+  wait_for_kernel_before();
   const int64_t stride = int64_t(gridDim.x) * kGatherThreads;
 #pragma unroll 1
   for (int64_t i = int64_t(blockIdx.x) * kGatherThreads + threadIdx.x; i < t.particles; i += stride) {
@@ -423,14 +433,17 @@ __device__ void gather_by_items(const Task& task, const Schedule<const int>& sch
     if (threadIdx.x < 1 << D) slots[threadIdx.x] = schedule.neighbours[(item.x << D) + threadIdx.x];
     if (may_drift<Task> && threadIdx.x == 32) home.template set<Task::Order>(t, base_block);
     if (may_drift<Task> && threadIdx.x == 64) strays.count = 0;
-    __syncthreads();
     const unsigned active = may_drift<Task> ? FollowerOf<Task>::active_blocks(t, item.x) : 0;
+    typename Task::Loaded loaded;
+    if constexpr (may_load_ahead<Task>) loaded = task.load(p, scene);
+    __syncthreads();
+    wait_for_kernel_before();
     load_tile<Quads, Task::Order, T, K, D>(task.nodes, slots, tile);
     if constexpr (others > 0) load_tile<Quads, Task::Order, T, others, D>(task.others, slots, others_tile);
     __syncthreads();
 #pragma unroll 1
-    for (; k < end; k += kGatherThreads) {
-      const auto loaded = task.load(p, scene);
+    for (const int first = k; k < end; k += kGatherThreads) {
+      if (!may_load_ahead<Task> || k != first) loaded = task.load(p, scene);
       const Vector<T, D> x_next = read_vector(task.position, p_next);
       const int p_after = particle_at(k + 2 * kGatherThreads);
       int base[D], corner = 0;
@@ -458,6 +471,7 @@ __device__ void gather_by_items(const Task& task, const Schedule<const int>& sch
     }
     if constexpr (may_drift<Task>) gather_strays<Quads>(task, schedule, strays, begin, home, active, follower);
   }
+  wait_for_kernel_before();
   const int64_t stride = int64_t(gridDim.x) * kGatherThreads;
   for (int64_t i = t.offsets[t.max_blocks] + int64_t(blockIdx.x) * kGatherThreads + threadIdx.x; i < t.particles;
        i += stride)
@@ -466,7 +480,7 @@ __device__ void gather_by_items(const Task& task, const Schedule<const int>& sch
 
 template <bool Quads, class Task>
 __global__ void __launch_bounds__(kGatherThreads, kResident<Task>) gather_kernel(const Task task) {
-  wait_for_kernel_before();
+  if (!loads_ahead(task)) wait_for_kernel_before();
   const Schedule<const int> schedule = schedule_of(task.topology);
   FollowerOf<Task> follower;
   if constexpr (requires { task.is_due(); }) {

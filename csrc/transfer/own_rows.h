@@ -12,10 +12,9 @@ namespace mpm {
 struct OwnRows {
   int rows = 0;                  // of a copy; 0 where nobody owns the particles
   const Drift* drift = nullptr;  // tells whether there is a new activation; null where there is in any case
-  int strays_of_activation = kStraysOfActivation;
 
   bool is_mostly_idle() const { return drift != nullptr; }
-  MPM_HD bool is_due(int64_t particles) const { return !drift || !drift->lasts(particles, strays_of_activation); }
+  MPM_HD bool is_due(int64_t particles) const { return !drift || !drift->lasts(particles); }
   // Of a row of either copy.
   MPM_HD int place(int row) const { return row >= rows ? row - rows : row; }
   MPM_HD int in_other_copy(int row, int place) const { return row >= rows ? place : place + rows; }
