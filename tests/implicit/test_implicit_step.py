@@ -303,7 +303,8 @@ def test_scenes_are_solved_as_alone(device):
     for b, state in enumerate(states):
         alone = mpm.Grid(grid.dx, grid.lower, grid.upper)
         own = mpm.Step(alone, mpm.NeoHookean(E=float(E[b]), nu=0.3), walls="sticky", integrator=Implicit(1e-10))
-        assert relative_error(after.x[together.scene == b], own(state, float(dt[b])).x) < 1e-9
+        # Of the stiffest one a tolerance of 1e-10 leaves 4e-9: on CUDA sums have no order, and one takes a step more.
+        assert relative_error(after.x[together.scene == b], own(state, float(dt[b])).x) < 1e-8
         assert abs(int(own.solve_report.iterations[0]) - int(report.iterations[b])) <= 1
 
 
