@@ -34,7 +34,8 @@ void with_team(int64_t, const Work& work) {
 }
 
 // Makes the graphs of a thread, and keeps the latest one that is replayed. The next one is mostly the same but for its
-// pointers, and to change these takes a third of the time of a new one. Its stream is its own, since torch's default
+// pointers, and to change these takes a third of the time of a new one. Some with loops are kept, too: to destroy one,
+// even one that has ended, takes until the device has nothing to do. Its stream is its own, since torch's default
 // stream records nothing.
 class Recorder {
  public:
@@ -100,7 +101,8 @@ class Recorder {
     cudaGraphExec_t executable = nullptr;
     check(cudaGraphInstantiate(&executable, graph, 0));
     const cudaError_t launched = cudaGraphLaunch(executable, stream);
-    check(cudaGraphExecDestroy(executable));  // when it has ended
+    if (loops_.size() >= kMostLoops) forget_loops();
+    loops_.push_back(executable);
     check(launched);
   }
 #endif
@@ -113,6 +115,7 @@ class Recorder {
     check(cudaGetDevice(&device));
     if (stream_ && device == device_) return;
     forget();
+    forget_loops();
     if (stream_) check(cudaStreamDestroy(std::exchange(stream_, nullptr)));
     check(cudaStreamCreateWithFlags(&stream_, cudaStreamNonBlocking));
     device_ = device;
@@ -141,10 +144,16 @@ class Recorder {
     if (executable_) cudaGraphExecDestroy(executable_);
     executable_ = nullptr;
   }
+  void forget_loops() {
+    for (cudaGraphExec_t loop : loops_) cudaGraphExecDestroy(loop);
+    loops_.clear();
+  }
 
   int device_ = -1;
   cudaStream_t stream_ = nullptr;
   cudaGraphExec_t executable_ = nullptr;
+  static constexpr size_t kMostLoops = 32;
+  std::vector<cudaGraphExec_t> loops_;
   std::vector<int> shape_;
 };
 
