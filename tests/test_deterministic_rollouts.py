@@ -43,6 +43,12 @@ def test_more_particles_than_a_cluster_takes(dim, device):
     assert_repeats(make(dim), state.replace(v=state.v + jet[:, None] * along), 30, 5e-4, 1e-3)
 
 
+@pytest.mark.parametrize("high", [0.6, 0.65])
+def test_crowded_blocks(high, dim, device):
+    """The first run of a grid knows less of how many blocks there will be than the others."""
+    assert_repeats(make(dim), few.crowd(dim, device, high), 30, 5e-4, 1e-3)
+
+
 @pytest.mark.parametrize(
     ("law", "cells"), [("neo_hookean", 0.15), ("neo_hookean", 0.6), ("sand", 0.15), ("fluid", 0.15)]
 )

@@ -26,6 +26,13 @@ def body(dim, device="cpu", speed=3.0, **options):
     return state.replace(v=state.v + along).to(device)
 
 
+def crowd(dim, device, high):
+    """64 particles a cell."""
+    state = block_state(dim, dx=0.025 if dim == 3 else 0.005, high=high)
+    assert 13000 < len(state) < 2**15
+    return state.replace(v=state.v + torch.tensor([3.0, -1.0, 1.5][:dim], dtype=F64)).to(device)
+
+
 @pytest.mark.parametrize("law", LAWS)
 def test_laws(law, dim, device):
     end, expected = both(make(dim, law), make(dim, law), body(dim, device), N, DT)
@@ -59,9 +66,7 @@ def test_more_particles_than_a_cluster_takes(transfer, dim, device):
 @pytest.mark.parametrize("high", [0.6, 0.65])
 def test_crowded_blocks(high, dim, device):
     """Of which an item has more than in steps of single kernels, once a call knows how few blocks there are."""
-    state = block_state(dim, dx=0.025 if dim == 3 else 0.005, high=high)
-    state = state.replace(v=state.v + torch.tensor([3.0, -1.0, 1.5][:dim], dtype=F64)).to(device)
-    assert 13000 < len(state) < 2**15
+    state = crowd(dim, device, high)
     step, single = make(dim, max_blocks=None), make(dim)
     with torch.no_grad():
         half, _ = both(step, single, state, 20, 5e-4)

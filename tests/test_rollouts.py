@@ -387,10 +387,13 @@ def test_problems_are_those_of_single_steps(device):
     assert all(torch.equal(a, b) for a, b in zip(*failures, strict=True))
 
 
-def test_no_particles(device):
-    step = mpm.Step(box(), mpm.VonMises(E=1e4, nu=0.3, yield_stress=1.0), gravity=(0.0, -1.0, 0.0))
+@pytest.mark.parametrize("obstacles", [[], [mpm.Sphere((0.5,) * 3, 0.3, velocity=(1.0, 0.0, 0.0), end=2e-3)]])
+def test_no_particles(obstacles, device):
+    law = mpm.VonMises(E=1e4, nu=0.3, yield_stress=1.0)
+    step = mpm.Step(box(), law, gravity=(0.0, -1.0, 0.0), boundaries=obstacles)
     with torch.no_grad():
         end = mpm.rollout(step, blob(device, count=0), 3, 1e-3)
+        step.check(end)
     assert len(end) == 0 and end.time == 1e-3 + 1e-3 + 1e-3
 
 

@@ -64,8 +64,10 @@ __global__ void __launch_bounds__(kThreads) next_grid_kernel(const __grid_consta
   const int first = int(blockIdx.x) * slots + int(threadIdx.x) / kBlockNodes<D>, stride = int(gridDim.x) * slots;
   Node<Obstacles, T, D> node;
   node.local = int(threadIdx.x) % kBlockNodes<D>;
-  if (first < a.update.max_blocks) {
-    node.find(a, first);
+  int found = -1;
+  if (a.particles > 0 && first < a.update.max_blocks) {  // without particles the kernel before is the activation
+    found = first;
+    node.find(a, found);
     if (Obstacles && node.is_in_use()) node.find_obstacles(a);
   }
   wait_for_kernel_before();
@@ -74,7 +76,7 @@ __global__ void __launch_bounds__(kThreads) next_grid_kernel(const __grid_consta
     if (a.items_taken) *a.items_taken = 0;
   }
   for (int slot = first; slot < a.update.max_blocks; slot += stride) {
-    if (slot != first) {
+    if (slot != found) {
       node.find(a, slot);
       if (Obstacles && node.is_in_use() && node.sums(a).mass != T(0)) node.find_obstacles(a);
     }

@@ -2,6 +2,7 @@
 
 #include <cstdlib>
 #include <memory>
+#include <mutex>
 #include <type_traits>
 #include <utility>
 #include <vector>
@@ -34,8 +35,7 @@ void with_team(int64_t, const Work& work) {
 }
 
 // Makes the graphs of a thread, and keeps the latest one that is replayed. The next one is mostly the same but for its
-// pointers, and to change these takes a third of the time of a new one. Some with loops are kept, too: to destroy one,
-// even one that has ended, takes until the device has nothing to do. Its stream is its own, since torch's default
+// pointers, and to change these takes a third of the time of a new one. Its stream is its own, since torch's default
 // stream records nothing.
 class Recorder {
  public:
@@ -101,8 +101,7 @@ class Recorder {
     cudaGraphExec_t executable = nullptr;
     check(cudaGraphInstantiate(&executable, graph, 0));
     const cudaError_t launched = cudaGraphLaunch(executable, stream);
-    if (loops_.size() >= kMostLoops) forget_loops();
-    loops_.push_back(executable);
+    forget_later(executable);
     check(launched);
   }
 #endif
@@ -115,7 +114,6 @@ class Recorder {
     check(cudaGetDevice(&device));
     if (stream_ && device == device_) return;
     forget();
-    forget_loops();
     if (stream_) check(cudaStreamDestroy(std::exchange(stream_, nullptr)));
     check(cudaStreamCreateWithFlags(&stream_, cudaStreamNonBlocking));
     device_ = device;
@@ -144,16 +142,24 @@ class Recorder {
     if (executable_) cudaGraphExecDestroy(executable_);
     executable_ = nullptr;
   }
-  void forget_loops() {
-    for (cudaGraphExec_t loop : loops_) cudaGraphExecDestroy(loop);
-    loops_.clear();
+  // To destroy a graph with a loop, even one that has ended, takes until the device has nothing to do, so those of all
+  // threads are destroyed once there are some.
+  static void forget_later(cudaGraphExec_t loop) {
+    constexpr size_t most = 32;
+    static std::mutex mutex;
+    static std::vector<cudaGraphExec_t>* const kept = new std::vector<cudaGraphExec_t>;  // as the recorder, has no end
+    std::vector<cudaGraphExec_t> old;
+    {
+      const std::lock_guard<std::mutex> lock(mutex);
+      if (kept->size() >= most) old.swap(*kept);
+      kept->push_back(loop);
+    }
+    for (cudaGraphExec_t one : old) cudaGraphExecDestroy(one);
   }
 
   int device_ = -1;
   cudaStream_t stream_ = nullptr;
   cudaGraphExec_t executable_ = nullptr;
-  static constexpr size_t kMostLoops = 32;
-  std::vector<cudaGraphExec_t> loops_;
   std::vector<int> shape_;
 };
 

@@ -415,7 +415,9 @@ struct Substeps {
     if (!may_move_late() || !in.resident || in.n < kLeastPersistentSteps + 2) return false;
     if (!next.emptied || has(in.impulse)) return false;
     const bool few = in.grows ? in.max_blocks == update.block_count : in.max_blocks <= kMostPersistentBlocks;
-    const int64_t most = in.grows ? kMostPersistentParticles : kMostPersistentParticles / 2;
+    // Of deterministic grids this must not depend on how far a pool has grown that was not meant for it.
+    const bool many = in.grows && !in.lattice.deterministic();
+    const int64_t most = many ? kMostPersistentParticles : kMostPersistentParticles / 2;
     return few && P > 0 && P <= most && calls[0].law->kernels<T, D>().persistent;
   }
 
