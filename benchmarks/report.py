@@ -94,10 +94,32 @@ def as_run(results: list[dict[str, Any]]) -> str:
             "Substeps of one call of `rollout` (the neo-Hookean cube), and scenes by `torch-mpm run` with their files",
             "(benchmarks/speed/rollouts.py).",
             *("", common.table(header, rows), "", *notes, ""),
+            *beside_peers(results),
             "One scene of any size; dotted lines: particles per second.",
             *("", "![time per substep over particles](benchmarks/results/rollouts.png)"),
         ]
     )
+
+
+def beside_peers(results: list[dict[str, Any]]) -> list[str]:
+    """Lines on what took steps of the same cubes, and on Warp's step launched from Python beside scenes."""
+
+    def rows(key: str) -> list[tuple[Any, ...]]:
+        return [
+            (result["environment"]["device"], r["name"], r["particles"], r["us"], r["times"])
+            for result in results
+            for r in result.get(key, ())
+        ]
+
+    peers = common.table(("device", "a step", "particles", "us", "a rollout is so many times as fast"), rows("peers"))
+    header = ("device", "scene", "particles of Warp's step", "us", "the scene is so many times as fast")
+    return [
+        "Steps of the same cube by peers, Warp by CUDA graphs on a GPU:",
+        *("", peers, ""),
+        "Warp's step launched from Python, of a neo-Hookean cube with about as many particles as a scene, which has",
+        "laws, obstacles, heat and output of its own:",
+        *("", common.table(header, rows("plain")), ""),
+    ]
 
 
 def training(results: list[dict[str, Any]]) -> str:
