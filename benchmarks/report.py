@@ -20,7 +20,7 @@ from .accuracy.limits import tables as limit_tables
 from .accuracy.runout import PUBLISHED, published, slopes
 from .speed import network_steps, roofline, scaling
 from .speed import training as speed_of_training
-from .speed.rollouts import row_of_steps
+from .speed.rollouts import row_beside, row_of_steps
 from .speed.training_scripts import PROJECTS
 from .stability.adversarial import summary as rollouts
 from .stability.heat import cell as heat_cell
@@ -105,11 +105,7 @@ def beside_peers(results: list[dict[str, Any]]) -> list[str]:
     """Lines on what took steps of the same cubes, and on Warp's step launched from Python beside scenes."""
 
     def rows(key: str) -> list[tuple[Any, ...]]:
-        return [
-            (result["environment"]["device"], r["name"], r["particles"], r["us"], r["times"])
-            for result in results
-            for r in result.get(key, ())
-        ]
+        return [(result["environment"]["device"], *row_beside(r)) for result in results for r in result.get(key, ())]
 
     peers = common.table(("device", "a step", "particles", "us", "a rollout is so many times as fast"), rows("peers"))
     header = ("device", "scene", "particles of Warp's step", "us", "the scene is so many times as fast")

@@ -170,8 +170,8 @@ def plain_programs(device: str, scenes: list[dict[str, Any]]) -> Iterator[dict[s
 def measure(device: str, quick: bool = False) -> dict[str, Any]:
     common.use_all_cores()
     samples = 1 if quick else 5
-    result: dict[str, Any] = {"environment": common.environment(device)}
-    result |= {"scenes": [], "rollouts": [], "peers": [], "plain": []}
+    parts: dict[str, list[Any]] = {name: [] for name in ("scenes", "rollouts", "peers", "plain")}
+    result: dict[str, Any] = {"environment": common.environment(device), **parts}
     sides = SIDES[device][:2] if quick else SIDES[device]
     for side in sides:
         s = setup(work.make(side), device)
@@ -205,6 +205,11 @@ def row_of_steps(r: dict[str, Any]) -> tuple[Any, ...]:
     return r["name"], r["particles"], r["steps"], r["us"], r["rate"] * 1e-6
 
 
+def row_beside(r: dict[str, Any]) -> tuple[Any, ...]:
+    """Of a peer's step."""
+    return r["name"], r["particles"], r["us"], r["times"]
+
+
 def text(result: dict[str, Any]) -> str:
     """Tables of a result in Markdown."""
     header = ("", "particles", "substeps", "us per substep", "M particles/s")
@@ -215,7 +220,7 @@ def text(result: dict[str, Any]) -> str:
     if rows := [(r["name"], r["particles"], r["us"], r["rate"] * 1e-6, r["times"]) for r in result.get("peers", ())]:
         header = ("a step", "particles", "us", "M particles/s", "rollout so many times as fast")
         lines += [common.table(header, rows), ""]
-    if rows := [(r["name"], r["particles"], r["us"], r["times"]) for r in result.get("plain", ())]:
+    if rows := [row_beside(r) for r in result.get("plain", ())]:
         header = ("scene", "particles of Warp's plain step", "us", "scene so many times as fast")
         lines += [common.table(header, rows), ""]
     return "\n".join(lines)

@@ -19,7 +19,7 @@ __device__ bool goes_far(const GridUpdateArguments<T, D>& a, const SlotUpdate<T,
 }
 
 // A node of a slot, and what is known of it before P2G is done.
-template <bool Obstacles, class T, int D>
+template <class T, int D>
 struct Node {
   int slot, local;
   SlotUpdate<T, D> there;
@@ -45,7 +45,7 @@ struct Node {
 };
 
 template <bool Obstacles, class T, int D>
-__device__ void take_node(const NextGridArguments<T, D>& a, const Node<Obstacles, T, D>& node) {
+__device__ void take_node(const NextGridArguments<T, D>& a, const Node<T, D>& node) {
   NodeRow<T, D> row = update_node(a.update, node.there, node.local, node.sums(a));
   if constexpr (Obstacles)
     row.value = after_obstacles(a.contact, node.contact, node.touch,
@@ -62,7 +62,7 @@ template <bool Obstacles, class T, int D>
 __global__ void __launch_bounds__(kThreads) next_grid_kernel(const __grid_constant__ NextGridArguments<T, D> a) {
   constexpr int slots = kThreads / kBlockNodes<D>;  // at a time
   const int first = int(blockIdx.x) * slots + int(threadIdx.x) / kBlockNodes<D>, stride = int(gridDim.x) * slots;
-  Node<Obstacles, T, D> node;
+  Node<T, D> node;
   node.local = int(threadIdx.x) % kBlockNodes<D>;
   int found = -1;
   if (a.particles > 0 && first < a.update.max_blocks) {  // without particles the kernel before is the activation
@@ -81,7 +81,7 @@ __global__ void __launch_bounds__(kThreads) next_grid_kernel(const __grid_consta
       if (Obstacles && node.is_in_use() && node.sums(a).mass != T(0)) node.find_obstacles(a);
     }
     if (node.is_in_use())
-      take_node(a, node);
+      take_node<Obstacles>(a, node);
     else if (slot < a.near_blocks)
       slot += (a.near_blocks - 1 - slot) / stride * stride;  // the next one may be of the margin
     else
