@@ -4,6 +4,7 @@ from typing import TYPE_CHECKING, Any
 
 from . import _library as _library
 from . import containers, laws, ops, particle_operations, seed
+from .adaptive import Arrival, rollout_to
 from .boundaries import SDF, Box, Capsule, Plane, Revolved, Sphere, Walls
 from .cfl import stable_dt
 from .checkpoints import Checkpoints
@@ -44,6 +45,7 @@ if TYPE_CHECKING:
 __all__ = [
     *laws.__all__,
     "SDF",
+    "Arrival",
     "Blocks",
     "Box",
     "Capsule",
@@ -84,6 +86,7 @@ __all__ = [
     "polar",
     "quartic_return_map",
     "rollout",
+    "rollout_to",
     "scatter",
     "seed",
     "stable_dt",

@@ -42,13 +42,18 @@ class ActivationRecord:
         blocks = grid.activate(x, scene, before, ids)
         status = without_transforms(blocks.status)
         grid.watch(status)
-        if before is None or not is_captured(x):
+        self.follow(before, status)
+        return blocks
+
+    def follow(self, before: Tensor | None, status: Tensor) -> None:
+        """Take the status of activations that went on from one before, which replays of a graph find there again."""
+        if before is None or not is_captured(status):
             self.status = status
-            return blocks
+            return
         with torch.inference_mode(), outside_transforms():  # in which any tensor may be written to
             before.copy_(status)
+        self.status = before
         remember(self._replayed, before)
-        return blocks
 
     @contextlib.contextmanager
     def passing_graphs(self) -> Iterator[None]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import collections
 import contextlib
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -108,21 +108,29 @@ def replayed(step: Step, state: State, n: int, dt: float) -> State:
         state = state.replace(time=_time_tensor(state))
     if n > 0:
         state, n = step(state, dt), n - 1
-    graph: _Replays | None = None
+    replays = n if n >= LEAST_STEPS else 0
+    state = replay_all(step, lambda state: step(state, dt), state, replays, CHUNK)
+    for _ in range(n - replays):
+        state = step(state, dt)
+    return state.replace(time=time)
+
+
+def replay_all(step: Step, function: Callable[[State], State], state: State, times: int, most: int) -> State:
+    """`function`, applied so many times, as replays of a graph; of `most` of them where nobody looks meanwhile whether
+    the pool must grow. One activation of the step must be before."""
+    graph: Replays | None = None
     with step._activations.passing_graphs():
-        while n >= LEAST_STEPS:
-            count = min(n, CHUNK) if step.grid.grows else n
+        while times > 0:
+            count = min(times, most) if step.grid.grows else times
             step.grid.wait()
             blocks = step.grid.pool(state.x, state.scene)
             if graph is None or graph.blocks != blocks:
-                graph = _Replays(step, state, dt, blocks)
+                graph = Replays(function, state, blocks)
             graph.replay(count)
-            state, n = graph.state, n - count
+            state, times = graph.state, times - count
             assert step.status is not None
             step.grid.watch(step.status)
-    for _ in range(n):
-        state = step(state, dt)
-    return state.replace(time=time)
+    return state
 
 
 class _Latest(threading.local):
@@ -136,10 +144,16 @@ class _Latest(threading.local):
 _LATEST = _Latest()
 
 
-class _Replays:
-    """A graph of one step that leaves its state where it has found it."""
+class Replays:
+    """A graph of a function state -> state, of one step or of some, that leaves its state where it has found it.
 
-    def __init__(self, step: Step, state: State, dt: float, blocks: int) -> None:
+    Args:
+        function: what is recorded; it must not wait for the device.
+        state: the state before the first replay; `Replays.state` is that after the last one.
+        blocks: of the pool of its activations.
+    """
+
+    def __init__(self, function: Callable[[State], State], state: State, blocks: int) -> None:
         self.blocks = blocks
         self.state = state.map(_copied)
         impulse = None if state.impulse is None else _copied(state.impulse)
@@ -154,13 +168,13 @@ class _Replays:
             # Other threads may go on meanwhile.
             pool = None if latest is None else latest.pool()
             self._graph.capture_begin(pool, capture_error_mode="thread_local")
-            self._record(step, dt)
+            self._record(function)
         now.wait_stream(aside)
         _LATEST.captures[place] = aside, self._graph
 
-    def _record(self, step: Step, dt: float) -> None:
+    def _record(self, function: Callable[[State], State]) -> None:
         try:
-            before, after = _tensors(self.state), _tensors(step(self.state, dt))
+            before, after = _tensors(self.state), _tensors(function(self.state))
             changed = [name for name, value in after.items() if value is not before[name]]
             _copy_all([before[name] for name in changed], [after[name] for name in changed])
         except BaseException:

@@ -385,7 +385,7 @@ def _substeps(step: Step, state: State, n: int, dt: float | Tensor, records: boo
         *(not with_gradient, with_gradient and records),
         *(state.impulse, scene_dt, scene_time, *grid.packed),
     )
-    record.status = status
+    record.follow(record.status, status)
     grid.watch(status)
     if status.device.type == "cpu":  # where the op has let the pool grow, or stopped
         grid.follow(int(status[0, 0] if grid.grows else status[0, 7]))
