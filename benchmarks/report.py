@@ -20,7 +20,7 @@ from .accuracy.limits import tables as limit_tables
 from .accuracy.runout import PUBLISHED, published, slopes
 from .speed import network_steps, roofline, scaling
 from .speed import training as speed_of_training
-from .speed.rollouts import row_beside, row_of_steps
+from .speed.rollouts import row_beside, row_of_peer, row_of_steps
 from .speed.training_scripts import PROJECTS
 from .stability.adversarial import summary as rollouts
 from .stability.heat import cell as heat_cell
@@ -104,17 +104,19 @@ def as_run(results: list[dict[str, Any]]) -> str:
 def beside_peers(results: list[dict[str, Any]]) -> list[str]:
     """Lines on what took steps of the same cubes, and on Warp's step launched from Python beside scenes."""
 
-    def rows(key: str) -> list[tuple[Any, ...]]:
-        return [(result["environment"]["device"], *row_beside(r)) for result in results for r in result.get(key, ())]
+    def rows(key: str, row: Callable[[dict[str, Any]], tuple[Any, ...]]) -> list[tuple[Any, ...]]:
+        return [(result["environment"]["device"], *row(r)) for result in results for r in result.get(key, ())]
 
-    peers = common.table(("device", "a step", "particles", "us", "a rollout is so many times as fast"), rows("peers"))
+    header = ("device", "a step", "of", "particles", "us", "a rollout is so many times as fast")
+    peers = common.table(header, rows("peers", row_of_peer))
     header = ("device", "scene", "particles of Warp's step", "us", "the scene is so many times as fast")
     return [
-        "Steps of the same cube by peers, Warp by CUDA graphs on a GPU:",
+        "Steps of the same work by peers, in plain standard use: Warp by CUDA graphs on a GPU, scenes of a batch",
+        "side by side in one dense grid:",
         *("", peers, ""),
         "Warp's step launched from Python, of a neo-Hookean cube with about as many particles as a scene, which has",
         "laws, obstacles, heat and output of its own:",
-        *("", common.table(header, rows("plain")), ""),
+        *("", common.table(header, rows("plain", row_beside)), ""),
     ]
 
 

@@ -29,7 +29,7 @@ def warp_program(w: work.Work, device: str) -> Program:
 
     wp.config.quiet = True
     wp.init()
-    n = w.n
+    nx, ny, nz = w.cells
     inv, mass, volume = float(w.n), w.mass, w.volume
     mu, lam, gravity, dt = MU, LAM, GRAVITY, DT
 
@@ -67,13 +67,14 @@ def warp_program(w: work.Work, device: str) -> Program:
                     wp.atomic_add(node_mass, i0 + i, j0 + j, k0 + k, N * mass)
 
     @wp.kernel(enable_backward=False)
-    def update(
-        momentum: wp.array(dtype=wp.vec3, ndim=3), node_mass: wp.array(dtype=float, ndim=3), n: int, fall: float
-    ):  # type: ignore[no-untyped-def]
+    def update(  # type: ignore[no-untyped-def]
+        momentum: wp.array(dtype=wp.vec3, ndim=3), node_mass: wp.array(dtype=float, ndim=3),
+        nx: int, ny: int, nz: int, fall: float,
+    ):  # fmt: skip
         i, j, k = wp.tid()
         if node_mass[i, j, k] > 0.0:
             u = momentum[i, j, k] / node_mass[i, j, k] - wp.vec3(0.0, fall, 0.0)
-            if i < 3 or j < 3 or k < 3 or i >= n - 3 or j >= n - 3 or k >= n - 3:
+            if i < 3 or j < 3 or k < 3 or i >= nx - 3 or j >= ny - 3 or k >= nz - 3:
                 u = wp.vec3(0.0, 0.0, 0.0)
             momentum[i, j, k] = u
 
@@ -105,14 +106,14 @@ def warp_program(w: work.Work, device: str) -> Program:
     C = wp.zeros(P, dtype=wp.mat33, device=device)
     eyes = np.tile(np.eye(3, dtype=np.float32), (P, 1, 1))
     F = wp.array(eyes, dtype=wp.mat33, device=device)
-    momentum = wp.zeros((n, n, n), dtype=wp.vec3, device=device)
-    node_mass = wp.zeros((n, n, n), dtype=float, device=device)
+    momentum = wp.zeros((nx, ny, nz), dtype=wp.vec3, device=device)
+    node_mass = wp.zeros((nx, ny, nz), dtype=float, device=device)
 
     def launch() -> None:
         momentum.zero_()
         node_mass.zero_()
         wp.launch(p2g, P, [x, v, C, F, momentum, node_mass, inv, dt, mass, volume, mu, lam], device=device)
-        wp.launch(update, (n, n, n), [momentum, node_mass, n, dt * gravity], device=device)
+        wp.launch(update, (nx, ny, nz), [momentum, node_mass, nx, ny, nz, dt * gravity], device=device)
         wp.launch(g2p, P, [x, v, C, momentum, inv, dt], device=device)
 
     step = launch
@@ -138,12 +139,12 @@ def taichi_program(w: work.Work, device: str) -> Program:
 
     options = {"arch": ti.cpu} if device == "cpu" else {"arch": ti.cuda, "device_memory_GB": 8}
     ti.init(**options, offline_cache=False, log_level=ti.WARN)
-    n, P = w.n, w.particles
-    dx, inv, mass, volume = 1 / n, float(n), w.mass, w.volume
+    cells, P = w.cells, w.particles
+    dx, inv, mass, volume = 1 / w.n, float(w.n), w.mass, w.volume
     mu, lam, gravity, dt = MU, LAM, GRAVITY, DT
     x, v = ti.Vector.field(3, ti.f32, P), ti.Vector.field(3, ti.f32, P)
     C, F = ti.Matrix.field(3, 3, ti.f32, P), ti.Matrix.field(3, 3, ti.f32, P)
-    velocity, node_mass = ti.Vector.field(3, ti.f32, (n, n, n)), ti.field(ti.f32, (n, n, n))
+    velocity, node_mass = ti.Vector.field(3, ti.f32, cells), ti.field(ti.f32, cells)
 
     @ti.kernel
     def start():  # type: ignore[no-untyped-def]
@@ -174,7 +175,7 @@ def taichi_program(w: work.Work, device: str) -> Program:
             if node_mass[i] > 0:
                 velocity[i] /= node_mass[i]
                 velocity[i][1] -= dt * gravity
-                if any(i < 3) or any(i >= n - 3):
+                if any(i < 3) or any(i >= ti.Vector(cells) - 3):
                     velocity[i] = ti.zero(velocity[i])
         ti.loop_config(block_dim=128)
         for p in x:
@@ -206,11 +207,10 @@ def is_installed(peer: str) -> bool:
 
 
 def measure(
-    peer: str, side: int, device: str, samples: int, steps: int, save: str | None = None, launches: bool = False
+    peer: str, w: work.Work, device: str, samples: int, steps: int, save: str | None = None, launches: bool = False
 ) -> dict[str, Any]:
     """Median and least time of one step, in samples of several steps that are synchronised together."""
     program, module = PEERS[peer]
-    w = work.make(side)
     step, synchronize, result = program(w, device)
     if launches:
         step = getattr(step, "launch", step)
@@ -243,6 +243,8 @@ def main() -> None:
     parser.add_argument("peer", choices=sorted(PEERS))
     parser.add_argument("--device", default="cpu", choices=["cpu", "cuda"])
     parser.add_argument("--sides", type=int, nargs="+", default=[64], help="particles along a side of the cube")
+    parser.add_argument("--scenes", type=int, default=1, help="such cubes, a power of two, side by side in one domain")
+    parser.add_argument("--domain", type=int, default=1, help="unit cubes along a side of the domain of one cube")
     parser.add_argument("--samples", type=int, default=7)
     parser.add_argument("--steps", type=int, default=10, help="steps in a sample, and before the first")
     parser.add_argument("--save", help="file for x and v of the first size after the first steps (.npz)")
@@ -250,8 +252,10 @@ def main() -> None:
     arguments = parser.parse_args()
     for i, side in enumerate(arguments.sides):
         save = arguments.save if i == 0 else None
+        w = work.make(side)
+        w = w.side_by_side(arguments.scenes) if arguments.scenes > 1 else w.in_domain(arguments.domain)
         result = measure(
-            arguments.peer, side, arguments.device, arguments.samples, arguments.steps, save, arguments.launches
+            arguments.peer, w, arguments.device, arguments.samples, arguments.steps, save, arguments.launches
         )
         print(json.dumps(result), flush=True)
 

@@ -32,11 +32,13 @@ from . import peers, scaling, work
 from .step import Setup, run_peer, setup
 
 SCENES = {"cpu": ("demo", "batch"), "cuda": ("demo", "batch", "sand_column", "sand_drum", "spinner", "melt")}
-SIDES = {"cpu": (4, 10, 22, 46, 64), "cuda": (4, 10, 22, 46, 100, 200)}
+SIDES = {"cpu": (4, 10, 22, 46, 64, 100, 200), "cuda": (4, 10, 22, 46, 100, 200, 464)}
 BATCHES = {"cpu": ((64, 512),), "cuda": ((4096, 512), (1024, 2197))}
 """Scenes, and particles of each."""
 DOMAINS = {"cpu": (1, 4), "cuda": (1, 8, 16)}
-"""Cells along a side of the domain, in those of the cube of a million (CPU: of 262144) particles."""
+"""Cells along a side of the domain, in those of its cube."""
+DOMAIN_SIDE = {"cpu": 64, "cuda": 100}
+"""Of that cube."""
 LAWS: dict[str, Callable[[], mpm.Material]] = {
     "fixed corotated": lambda: mpm.FixedCorotated(mu=work.MU, lam=work.LAM),
     "quartic sand": lambda: mpm.QuarticSand(mu=work.MU, lam=work.LAM),
@@ -46,8 +48,8 @@ LAWS: dict[str, Callable[[], mpm.Material]] = {
 LAW_SIDES = {"cpu": (64,), "cuda": (100, 200)}
 DETERMINISTIC = {"cpu": (), "cuda": (22, 46, 100)}
 """Sides of the cubes, some of SIDES, whose results are bit-identical from run to run; on a CPU all are."""
-PEER_SIDES = {"cpu": (64,), "cuda": (22, 100, 200)}
-"""Of the cubes that peers take too, some of SIDES."""
+PEER_SIDES = {"cpu": (10, 64), "cuda": (4, 22, 46, 100, 200)}
+"""Of the cubes that peers take too, some of SIDES. The batches and domains above are theirs too."""
 SECONDS = 0.5
 """Of steps in one measurement, about."""
 
@@ -94,9 +96,14 @@ def beside_a_busy_process(s: Setup, samples: int) -> dict[str, Any]:
         busy.wait()
 
 
+def side_of(particles: int) -> int:
+    """Of a cube."""
+    return round(particles ** (1 / 3))
+
+
 def batched(scenes: int, particles: int, device: str) -> Setup:
     """Many scenes of one small cube each."""
-    w = work.make(round(particles ** (1 / 3)))
+    w = work.make(side_of(particles))
     one = setup(w, device)
     grid = mpm.Grid(dx=1 / w.n, lower=(0, 0, 0), upper=(1, 1, 1), scenes=scenes)
     scene = torch.arange(scenes, dtype=torch.int32, device=device).repeat_interleave(w.particles)
@@ -110,6 +117,10 @@ def in_domain(side: int, times: int, device: str, deterministic: bool = False) -
     s = setup(work.make(side), device)
     grid = mpm.Grid(dx=s.grid.dx, lower=(0, 0, 0), upper=(times, times, times), deterministic=deterministic)
     return Setup(s.state, mpm.Step(grid, s.step.law, gravity=s.step.gravity, walls="sticky"))
+
+
+def name_of_domain(times: int, side: int) -> str:
+    return f"domain of {times * work.cells_of(side)}^3 cells"
 
 
 def made_of(law: mpm.Material, side: int, device: str) -> Setup:
@@ -147,13 +158,19 @@ def scenes(names: tuple[str, ...], device: str) -> Iterator[dict[str, Any]]:
 
 
 def of_peers(device: str, rollouts: list[dict[str, Any]]) -> Iterator[dict[str, Any]]:
-    """Their least times of a step, and how many times as fast a rollout of the same cube is."""
-    ours = {r["particles"]: r["us"] for r in rollouts if r["name"] == "one scene"}
+    """Their least times of a step, and how many times as fast a rollout of the same work is."""
+    ours = {(r["name"], r["particles"]): r["us"] for r in rollouts}
+    programs = [("one scene", PEER_SIDES[device], [])]
+    for scenes, particles in BATCHES[device]:
+        programs.append((f"{scenes} scenes", [side_of(particles)], ["--scenes", str(scenes)]))
+    for times in DOMAINS[device][1:]:
+        programs.append((name_of_domain(times, DOMAIN_SIDE[device]), [DOMAIN_SIDE[device]], ["--domain", str(times)]))
     for peer in filter(peers.is_installed, peers.PEERS):
-        for r in run_peer(peer, device, PEER_SIDES[device], 7):
-            us = 1e3 * r["fastest_ms"]
-            name, count = f"{peer} {r['version']}", r["particles"]
-            yield {"name": name, "particles": count, "us": us, "rate": count / us * 1e6, "times": us / ours[count]}
+        for work_name, sides, options in programs:
+            for r in run_peer(peer, device, sides, 7, *options):
+                us, count = 1e3 * r["fastest_ms"], r["particles"]
+                row = {"name": f"{peer} {r['version']}", "work": work_name, "particles": count, "us": us}
+                yield {**row, "rate": count / us * 1e6, "times": us / ours[work_name, count]}
 
 
 def plain_programs(device: str, scenes: list[dict[str, Any]]) -> Iterator[dict[str, Any]]:
@@ -161,7 +178,7 @@ def plain_programs(device: str, scenes: list[dict[str, Any]]) -> Iterator[dict[s
     scene has, and how many times as fast the scene is as run, with its laws, obstacles, heat and output."""
     if device != "cuda" or not peers.is_installed("warp"):
         return
-    sides = [round(scene["particles"] ** (1 / 3)) for scene in scenes]
+    sides = [side_of(scene["particles"]) for scene in scenes]
     for scene, r in zip(scenes, run_peer("warp", device, sides, 7, "--launches", steps=200), strict=True):
         us = 1e3 * r["fastest_ms"]
         yield {"name": scene["name"], "particles": r["particles"], "us": us, "times": us / scene["us"]}
@@ -181,7 +198,6 @@ def measure(device: str, quick: bool = False) -> dict[str, Any]:
         result["rollouts"].append({"name": "one scene, deterministic", **row})
     if device == "cpu":
         result["rollouts"].append({"name": "beside a busy process", **beside_a_busy_process(s, samples)})
-    result["peers"] += () if quick else of_peers(device, result["rollouts"])
     for side in sides[-1:] if quick else LAW_SIDES[device]:
         for name, law in LAWS.items():
             row = per_step(made_of(law(), side, device), device, samples)
@@ -189,11 +205,11 @@ def measure(device: str, quick: bool = False) -> dict[str, Any]:
     for count, particles in [(4, 64)] if quick else BATCHES[device]:
         row = per_step(batched(count, particles, device), device, samples)
         result["rollouts"].append({"name": f"{count} scenes", **row})
-    largest = 10 if quick else 100 if device == "cuda" else 64
+    cube = 10 if quick else DOMAIN_SIDE[device]
     for times in DOMAINS[device]:
-        s = in_domain(largest, times, device)
-        row = per_step(s, device, samples)
-        result["rollouts"].append({"name": f"domain of {round(times / s.grid.dx)}^3 cells", **row})
+        row = per_step(in_domain(cube, times, device), device, samples)
+        result["rollouts"].append({"name": name_of_domain(times, cube), **row})
+    result["peers"] += () if quick else of_peers(device, result["rollouts"])
     s, dt = on_its_way("demo", device, frames=1 if quick else 6)
     result["rollouts"].append({"name": "demo, one call", **per_step(s, device, samples, dt)})
     result["scenes"] += scenes(() if quick else SCENES[device], device)
@@ -205,8 +221,12 @@ def row_of_steps(r: dict[str, Any]) -> tuple[Any, ...]:
     return r["name"], r["particles"], r["steps"], r["us"], r["rate"] * 1e-6
 
 
+def row_of_peer(r: dict[str, Any]) -> tuple[Any, ...]:
+    return r["name"], r.get("work", "one scene"), r["particles"], r["us"], r["times"]
+
+
 def row_beside(r: dict[str, Any]) -> tuple[Any, ...]:
-    """Of a peer's step."""
+    """Of Warp's step beside a scene."""
     return r["name"], r["particles"], r["us"], r["times"]
 
 
@@ -217,8 +237,8 @@ def text(result: dict[str, Any]) -> str:
     lines = ["# Speed of what is run", "", common.describe(result["environment"]), "", common.table(header, rows), ""]
     rows = [(*row_of_steps(r), r["seconds"]) for r in result["scenes"]]
     lines += [common.table((*header, "simulation, s"), rows), ""]
-    if rows := [(r["name"], r["particles"], r["us"], r["rate"] * 1e-6, r["times"]) for r in result.get("peers", ())]:
-        header = ("a step", "particles", "us", "M particles/s", "rollout so many times as fast")
+    if rows := [row_of_peer(r) for r in result.get("peers", ())]:
+        header = ("a step", "of", "particles", "us", "rollout so many times as fast")
         lines += [common.table(header, rows), ""]
     if rows := [row_beside(r) for r in result.get("plain", ())]:
         header = ("scene", "particles of Warp's plain step", "us", "scene so many times as fast")

@@ -20,12 +20,14 @@ MARGIN = 8
 
 @dataclasses.dataclass(frozen=True)
 class Work:
-    """Positions x and velocities v [P, 3] [m, m/s], cells per axis n, mass [kg] and volume [m³] of one particle."""
+    """Positions x and velocities v [P, 3] [m, m/s], n cells along a unit cube, mass [kg] and volume [m³] of one
+    particle, and how many unit cubes the domain is along each axis."""
 
     n: int
     x: np.ndarray
     v: np.ndarray
     volume: float
+    cubes: tuple[int, int, int] = (1, 1, 1)
 
     @property
     def mass(self) -> float:
@@ -35,10 +37,34 @@ class Work:
     def particles(self) -> int:
         return len(self.x)
 
+    @property
+    def cells(self) -> tuple[int, int, int]:
+        a, b, c = self.cubes
+        return self.n * a, self.n * b, self.n * c
+
+    def in_domain(self, times: int) -> Work:
+        """In a domain that is so many times as large along each axis."""
+        return dataclasses.replace(self, cubes=(times, times, times))
+
+    def side_by_side(self, scenes: int) -> Work:
+        """As many of these cubes, a power of two, in one domain: what a program without batches makes of scenes."""
+        cubes = [1, 1, 1]
+        while np.prod(cubes) < scenes:
+            cubes[int(np.argmin(cubes))] *= 2
+        places = np.stack(np.meshgrid(*map(np.arange, cubes), indexing="ij"), -1).reshape(-1, 1, 3)
+        x = (places.astype(np.float32) + self.x).reshape(-1, 3)
+        v = np.tile(self.v, (len(places), 1))
+        return dataclasses.replace(self, x=x, v=v, cubes=(cubes[0], cubes[1], cubes[2]))
+
+
+def cells_of(side: int) -> int:
+    """Along the unit cube."""
+    return side // 2 + 2 * MARGIN
+
 
 def make(side: int) -> Work:
     """The cube with side³ particles."""
-    n = side // 2 + 2 * MARGIN
+    n = cells_of(side)
     lattice = np.stack(np.meshgrid(*[np.arange(side, dtype=np.float32)] * 3, indexing="ij"), -1).reshape(-1, 3)
     jitter = np.random.default_rng(0).random(lattice.shape, dtype=np.float32)
     x = ((MARGIN + 0.5 * (lattice + 0.1 + 0.8 * jitter)) / n).astype(np.float32)
