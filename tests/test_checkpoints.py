@@ -10,6 +10,8 @@ from torch import nn
 from torch.utils.checkpoint import checkpoint as torch_checkpoint
 
 import torch_mpm as mpm
+from benchmarks.speed import checkpoints as study
+from benchmarks.speed import memory
 from torch_mpm import checkpoints
 from torch_mpm.implicit import Implicit
 
@@ -284,7 +286,25 @@ def test_an_estimate_of_memory_is_what_autograd_keeps(device):
 
 def test_an_estimate_of_a_rollout_in_one_op(device):
     step, state = make("one op", device)
-    words = str(mpm.estimate_rollout(step, state, 20, DT, checkpoint=5))
+    estimate = mpm.estimate_rollout(step, state, 20, DT, checkpoint=5)
+    assert estimate.per_particle * len(state) == pytest.approx(estimate.memory)
+    words = str(estimate)
     assert "4 kept states, 40 steps with those taken again" in words
     assert mpm.estimate_rollout(step, state, 20, DT, truncate=5).steps == 15 + 2 * 5
     assert mpm.estimate_rollout(step, state, 0, DT).steps == 0
+
+
+@pytest.mark.parametrize("kept", [None, 8, mpm.Checkpoints(memory=5e8)])
+def test_an_estimate_of_a_rollout_in_one_op_is_what_the_allocator_gives(kept, device):
+    """From above: of nodes it counts the most that may be kept."""
+    if device == "cpu":
+        pytest.skip("what an op holds inside is not seen on the CPU")
+    step, state = study.setup("compiled", 24, device)
+    estimate = mpm.estimate_rollout(step, state, 40, DT, kept)
+
+    def run():
+        v = state.v.clone().requires_grad_()
+        torch.autograd.grad(mpm.rollout(step, state.replace(v=v), 40, DT, kept).x.sum(), v)
+
+    run()
+    assert 0.4 < memory.of_cuda(run) / estimate.memory < 1.3

@@ -32,6 +32,7 @@ class RolloutEstimate:
         seconds: run time [s], as that of a few steps tells.
         kept_states: states that are kept at a time at most.
         steps: steps that are taken, with those that are taken again.
+        particles: of the state.
     """
 
     memory: int
@@ -39,12 +40,18 @@ class RolloutEstimate:
     seconds: float
     kept_states: int
     steps: int
+    particles: int
+
+    @property
+    def per_particle(self) -> float:
+        """Of the memory, what each particle takes; zero where there is none [bytes]."""
+        return self.memory / self.particles if self.particles else 0.0
 
     def __str__(self) -> str:
         host = f" and {_words(self.host_memory)} on the host" if self.host_memory else ""
         return (
-            f"{_words(self.memory)}{host}, {self.seconds:.3g} s: {self.kept_states} kept states, {self.steps} steps "
-            "with those taken again"
+            f"{_words(self.memory)} ({_words(self.per_particle)} a particle){host}, {self.seconds:.3g} s: "
+            f"{self.kept_states} kept states, {self.steps} steps with those taken again"
         )
 
 
@@ -116,9 +123,9 @@ def _estimate(
 
     once, twice = (seconds(work, start.x.device) / trial for work in (forward, both))
     if n == 0:
-        return RolloutEstimate(0, 0, prefix * once, 0, prefix)
+        return RolloutEstimate(0, 0, prefix * once, 0, prefix, len(start))
     if kept is None and (keeps_all or not in_op):
-        return RolloutEstimate(of_state + n * of_step, 0, prefix * once + n * twice, 1, prefix + n)
+        return RolloutEstimate(of_state + n * of_step, 0, prefix * once + n * twice, 1, prefix + n, len(start))
     if kept is None:
         kept = Checkpoints(every=min(steps_of_a_call(start, n), n))
     states, again, held = kept.kept(n), kept.repetitions(n), min(kept.every or 1, n)
@@ -133,6 +140,7 @@ def _estimate(
         spent,
         states,
         prefix + n + again,
+        len(start),
     )
 
 
