@@ -5,7 +5,7 @@ import pytest
 import test_few_particles as few
 import test_many_particles as many
 import torch
-from test_rollouts import tensors
+from test_rollouts import TRANSFERS, tensors
 from test_small_scenes import F64, LAWS, assert_same, both, joined
 
 import torch_mpm as mpm
@@ -59,19 +59,20 @@ def test_many_particles(law, cells, dim, device):
 
 
 @pytest.mark.parametrize("kernel", ["quadratic", "cubic"])
-@pytest.mark.parametrize("transfer", ["apic", "pic"])
+@pytest.mark.parametrize("transfer", TRANSFERS)
 def test_a_mixture_beside_an_obstacle(transfer, kernel, dim, device):
     state = few.body(dim, device)
     material = (state.x[:, 0] > state.x[:, 0].mean()).int()
     laws = mpm.Mixture([LAWS["neo_hookean"](), LAWS["fluid"]()])
     ball = mpm.Sphere((0.6, 0.2, 0.5)[:dim], 0.2, friction=0.3, velocity=(-2.0, 1.0, 0.0)[:dim])
-    step = make(dim, laws, transfer=transfer, boundaries=[ball], grid={"kernel": kernel})
+    step = make(dim, laws, boundaries=[ball], grid={"kernel": kernel}, **TRANSFERS[transfer])
     assert_repeats(step, state.replace(material=material), N, DT, 1e-3)
 
 
-def test_scenes(dim, device):
+@pytest.mark.parametrize("flip", [0.0, 0.95])
+def test_scenes(flip, dim, device):
     state = joined([few.body(dim), None, few.body(dim, low=0.4)], device)
-    assert_repeats(make(dim, scenes=3), state, N, DT)
+    assert_repeats(make(dim, scenes=3, flip=flip), state, N, DT)
 
 
 def test_masses_of_many_sizes(dim, device):

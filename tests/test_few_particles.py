@@ -4,7 +4,7 @@ the domain, against single steps in float64. The particles cross several cells, 
 import pytest
 import torch
 from helpers import relative_error
-from test_rollouts import LAWS_HERE, assert_equal, one_by_one
+from test_rollouts import LAWS_HERE, TRANSFERS, assert_equal, one_by_one
 from test_small_scenes import F64, LAWS, assert_same, both, joined
 from test_step import block_state
 
@@ -51,14 +51,14 @@ def test_all_laws_in_float32(law, dim, device):
         assert_equal(end, one_by_one(make(dim, law), state, 20, 2e-4))
 
 
-@pytest.mark.parametrize("transfer", ["apic", "pic"])
+@pytest.mark.parametrize("transfer", TRANSFERS)
 def test_more_particles_than_a_cluster_takes(transfer, dim, device):
     """And a jet in them, so that many particles of an item stray at once."""
     state = body(dim, device, low=0.2, high=0.75 if dim == 3 else 0.78)
     assert 3000 < len(state) < 2**14
     jet = (state.x[:, 0] > 0.4) & (state.x[:, 0] < 0.5)
     state = state.replace(v=state.v + jet[:, None] * torch.tensor([0.0, 25.0, 0.0][:dim], dtype=F64, device=device))
-    options = {"transfer": transfer, "walls": "sticky"}
+    options = {"walls": "sticky", **TRANSFERS[transfer]}
     end, expected = both(make(dim, **options), make(dim, **options), state, 30, 5e-4)
     assert_same(end, expected, 1e-3)
 
@@ -97,8 +97,9 @@ def test_a_domain_whose_blocks_all_have_room(dim, device):
 
 
 @pytest.mark.parametrize("n", [1, 2, 9, 10, 11, 12])
-def test_numbers_of_steps(n, dim, device):
-    end, expected = both(make(dim), make(dim), body(dim, device), n, DT)
+@pytest.mark.parametrize("flip", [0.0, 0.95])
+def test_numbers_of_steps(n, flip, dim, device):
+    end, expected = both(make(dim, flip=flip), make(dim, flip=flip), body(dim, device), n, DT)
     assert_same(end, expected, 1e-4)
 
 

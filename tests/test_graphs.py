@@ -36,14 +36,14 @@ def awaited(dim: int, device: str) -> tuple[mpm.Step, mpm.State]:
 
 
 def mixed(dim: int, device: str) -> tuple[mpm.Step, mpm.State]:
-    """FLIP, a law that reads a temperature from a table, and an obstacle that moves."""
+    """FLIP and impulses on mirrors, a law that reads a temperature from a table, and an obstacle that moves."""
     soft = mpm.NeoHookean(E=mpm.Table([280.0, 320.0], [2e4, 1e4]), nu=0.3)
     ball = mpm.Sphere((0.5,) * dim, 0.15, velocity=(0.0, 4.0, 0.0)[:dim])
     laws = mpm.Mixture([soft, LAWS_HERE["sand"]()])
-    step = mpm.Step(box(dim), laws, walls="slip", transfer="apic", flip=0.7, boundaries=[ball])
+    step = mpm.Step(box(dim), laws, walls="mirror", transfer="apic", flip=0.7, boundaries=[ball])
     state = blob(device, dim, material=torch.arange(300, dtype=torch.int32) % 2)
     step = step.to(device)
-    return step, state.replace(temperature=300 + 40 * state.x[:, 0])
+    return step, step.with_impulses(state.replace(temperature=300 + 40 * state.x[:, 0]))
 
 
 @pytest.mark.cuda

@@ -82,8 +82,10 @@ def test_a_jet(dim, device):
 
 
 @pytest.mark.parametrize("n", [3, 4, 5, 6, 17, 18])
-def test_numbers_of_steps(n, dim, device):
-    end, expected = both(make(dim, device), make(dim, device), body(dim, device), n, dt_of(dim, device))
+@pytest.mark.parametrize("flip", [0.0, 0.95])
+def test_numbers_of_steps(n, flip, dim, device):
+    step, single = make(dim, device, flip=flip), make(dim, device, flip=flip)
+    end, expected = both(step, single, body(dim, device), n, dt_of(dim, device))
     assert_same(end, expected, CLOSE)
 
 

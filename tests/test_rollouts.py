@@ -61,6 +61,11 @@ def blob(device: str, dim: int = 3, count: int = 300, dtype: torch.dtype = F64, 
     return state.to(device, dtype)
 
 
+def touched(kind: str, dim: int) -> mpm.Walls:
+    """Walls that the blob is in."""
+    return mpm.Walls(kind, lower=(0.3125,) * dim, upper=(0.6875,) * dim)
+
+
 def box(dim: int = 3, dx: float = 0.0625, **options) -> mpm.Grid:
     return mpm.Grid(dx=dx, lower=(0.0,) * dim, upper=(1.0,) * dim, **options)
 
@@ -102,12 +107,25 @@ LAWS_HERE = {
 }
 
 
+TRANSFERS = {
+    "apic": {},
+    "pic": {"transfer": "pic"},
+    "flip": {"transfer": "flip"},
+    "apic, 0.95 flip": {"flip": 0.95},
+    "pic, 0.5 flip": {"transfer": "pic", "flip": 0.5},
+}
+SOME_TRANSFERS = ("apic", "apic, 0.95 flip")
+WALLS = ("slip", "sticky", "separate", "mirror")
+
+
 @pytest.mark.parametrize("law", LAWS_HERE)
 @pytest.mark.parametrize("n", [1, 2, 5, 15])
+@pytest.mark.parametrize("transfer", SOME_TRANSFERS)
 @pytest.mark.parametrize("dtype", [torch.float32, F64])
-def test_laws(law, n, dim, dtype, device):
+def test_laws(law, n, transfer, dim, dtype, device):
     """On CUDA the law of a step in float32 is part of P2G, and from 14 steps on some are replayed."""
-    step = mpm.Step(box(dim), LAWS_HERE[law](), gravity=(0.0, -9.8, 0.0)[:dim], walls="separate")
+    options = {"gravity": (0.0, -9.8, 0.0)[:dim], "walls": "separate", **TRANSFERS[transfer]}
+    step = mpm.Step(box(dim), LAWS_HERE[law](), **options)
     state = blob(device, dim, dtype=dtype)
     state.x[5] = -3.0  # and outside the grid the law acts, too
     assert in_one_op(step, state)
@@ -120,15 +138,16 @@ def test_laws(law, n, dim, dtype, device):
             assert float((value[5] - tensors(expected)[name][5]).abs().max()) <= float(rounding), name
 
 
-@pytest.mark.parametrize("transfer", ["apic", "pic"])
+@pytest.mark.parametrize("transfer", TRANSFERS)
 @pytest.mark.parametrize("form", ["mls", "gradient"])
 @pytest.mark.parametrize("kernel", ["quadratic", "cubic"])
+@pytest.mark.parametrize("walls", WALLS)
 @pytest.mark.parametrize("dtype", [torch.float32, F64])
-def test_transfers(transfer, form, kernel, dtype, device):
-    step = mpm.Step(
-        box(kernel=kernel), mpm.NeoHookean(E=1e4, nu=0.3), transfer=transfer, stress_form=form, walls="slip"
-    )
+def test_transfers(transfer, form, kernel, walls, dtype, device):
+    options = {"stress_form": form, "walls": touched(walls, 3), **TRANSFERS[transfer]}
+    step = mpm.Step(box(kernel=kernel), mpm.NeoHookean(E=1e4, nu=0.3), (0.0, -9.8, 0.0), **options)
     state = blob(device, dtype=dtype)
+    assert in_one_op(step, state)
     with torch.no_grad():
         assert_equal(mpm.rollout(step, state, 4, 1e-4), one_by_one(step, state, 4, 1e-4))
 
@@ -136,12 +155,13 @@ def test_transfers(transfer, form, kernel, dtype, device):
 @pytest.mark.parametrize("cells", [0.003, 0.06, 1.6])
 @pytest.mark.parametrize("kernel", ["quadratic", "cubic"])
 @pytest.mark.parametrize("shuffled", [False, True])
+@pytest.mark.parametrize("transfer", SOME_TRANSFERS)
 @pytest.mark.parametrize("dtype", [torch.float32, F64])
-def test_particles_leave_the_blocks_they_were_found_in(dim, device, cells, kernel, shuffled, dtype):
+def test_particles_leave_the_blocks_they_were_found_in(dim, device, cells, kernel, shuffled, transfer, dtype):
     """`cells` per step at which a cloud moves and parts: some stay in the blocks of the first step, some go to others
     that are active, or to others yet. On CUDA blocks are not found anew in every step."""
     n, dt = 40 if cells < 1 else 6, 1e-4
-    step = mpm.Step(box(dim, dx=1 / 64, kernel=kernel), LAWS_HERE["sand"](), walls="slip")
+    step = mpm.Step(box(dim, dx=1 / 64, kernel=kernel), LAWS_HERE["sand"](), walls="slip", **TRANSFERS[transfer])
     state = blob(device, dim, 3000, dtype=dtype)
     v = state.v * 0.2 + torch.tensor([1.0, -0.6, 0.3][:dim], dtype=dtype, device=device)
     state = step.prepare(state.replace(v=v * (cells * step.grid.dx / dt)))
@@ -153,7 +173,7 @@ def test_particles_leave_the_blocks_they_were_found_in(dim, device, cells, kerne
     assert_equal(end, expected)
 
 
-def streams(dim: int, device: str) -> tuple[mpm.Step, mpm.State]:
+def streams(dim: int, device: str, transfer: str = "apic") -> tuple[mpm.Step, mpm.State]:
     """Two scenes of a mixture in no order, each of which flows through many blocks, in part out of the domain; with
     parameters of particles, and an obstacle that moves."""
     g = torch.Generator().manual_seed(8)
@@ -163,7 +183,7 @@ def streams(dim: int, device: str) -> tuple[mpm.Step, mpm.State]:
     laws = mpm.Mixture([mpm.NeoHookean(E=stiffness, nu=0.3), *others])
     ball = mpm.Sphere((0.5,) * dim, 0.1, velocity=(0.0, 4.0, 0.0)[:dim])
     grid = box(dim, dx=1 / 32, scenes=2, max_blocks=2 * 10**dim)  # on CUDA no pool grows within a call
-    step = mpm.Step(grid, laws, boundaries=[ball])
+    step = mpm.Step(grid, laws, boundaries=[ball], **TRANSFERS[transfer])
     state, scene = blob(device, dim, count), torch.randint(0, 2, (count,), generator=g).int().to(device)
     there = torch.tensor([1.0, -0.6, 0.3][:dim], dtype=F64, device=device) * (1 - 2 * scene)[:, None]
     state.x[7] = -3.0
@@ -178,11 +198,12 @@ def streams(dim: int, device: str) -> tuple[mpm.Step, mpm.State]:
 
 
 @torch.no_grad()
-def test_particles_that_flow_through_many_blocks(dim, device):
+@pytest.mark.parametrize("transfer", TRANSFERS)
+def test_particles_that_flow_through_many_blocks(transfer, dim, device):
     """On the CPU the op moves them about in memory, and nobody sees it."""
-    step, state = streams(dim, device)
+    step, state = streams(dim, device, transfer)
     assert in_one_op(step, state)
-    again, _ = streams(dim, device)
+    again, _ = streams(dim, device, transfer)
     end, expected = mpm.rollout(step, state, 40, 1e-4), one_by_one(again, state, 40, 1e-4)
     assert float((expected.x - state.x).norm(dim=1).median()) > 8 * step.grid.dx
     assert_equal(end, expected)
@@ -191,11 +212,12 @@ def test_particles_that_flow_through_many_blocks(dim, device):
 
 @torch.no_grad()
 @pytest.mark.parametrize("law", ["neo_hookean", "sand", "mixture"])
-def test_threads_change_nothing(dim, law):
+@pytest.mark.parametrize("transfer", SOME_TRANSFERS)
+def test_threads_change_nothing(dim, law, transfer):
     if law == "mixture":
-        step, state = streams(dim, "cpu")
+        step, state = streams(dim, "cpu", transfer)
     else:
-        step = mpm.Step(box(dim, dx=1 / 32), LAWS_HERE[law](), walls="slip")
+        step = mpm.Step(box(dim, dx=1 / 32), LAWS_HERE[law](), walls="slip", **TRANSFERS[transfer])
         state = step.prepare(blob("cpu", dim, 3000, dtype=torch.float32))
         state = state.replace(v=200 * state.v)
     ends = []
@@ -212,11 +234,12 @@ def test_threads_change_nothing(dim, law):
 
 
 @pytest.mark.parametrize("walls", ["mirror", None])
-def test_scenes_whose_particles_leave_the_domain(dim, device, walls):
+@pytest.mark.parametrize("transfer", SOME_TRANSFERS)
+def test_scenes_whose_particles_leave_the_domain(dim, device, walls, transfer):
     """A batch in which one scene is empty and particles of others leave the domain at different steps, or are lost,
     around an obstacle that moves."""
     ball = mpm.Sphere((0.5,) * dim, 0.15, velocity=(0.0, 4.0, 0.0)[:dim], end=0.01)
-    options = {"walls": walls, "boundaries": [ball]}
+    options = {"walls": walls, "boundaries": [ball], **TRANSFERS[transfer]}
     step = mpm.Step(box(dim, scenes=3), mpm.NeoHookean(E=1e3, nu=0.3), **options)
     scene = torch.randint(0, 2, (400,), generator=torch.Generator().manual_seed(2)).int() * 2
     state = blob(device, dim, 400, scene=scene)
@@ -250,11 +273,12 @@ def mixture() -> mpm.Mixture:
     return mpm.Mixture([LAWS_HERE[name]() for name in names])
 
 
-def test_mixtures(dim, device):
+@pytest.mark.parametrize("transfer", TRANSFERS)
+def test_mixtures(transfer, dim, device):
     laws = mixture()
     state = blob(device, dim, 400, material=torch.randint(0, 7, (400,), dtype=torch.int32))
     state = state.replace(material=state.material.int(), ids=torch.randperm(400).to(device))
-    step = mpm.Step(box(dim), laws, gravity=(0.0, -9.8, 0.0)[:dim], walls="sticky")
+    step = mpm.Step(box(dim), laws, gravity=(0.0, -9.8, 0.0)[:dim], walls="sticky", **TRANSFERS[transfer])
     assert in_one_op(step, state)
     with torch.no_grad():
         for start in (state, step.prepare(state).sorted(step.grid)):
@@ -289,7 +313,8 @@ def test_materials_that_no_step_has_checked_are_checked_after_a_sort(device):
 
 
 @pytest.mark.parametrize("n", [6, 40])
-def test_batches_with_obstacles_and_parameters_of_scenes_and_particles(n, dim, device):
+@pytest.mark.parametrize("transfer", SOME_TRANSFERS)
+def test_batches_with_obstacles_and_parameters_of_scenes_and_particles(n, transfer, dim, device):
     """Some nodes are in several obstacles, which act one after another."""
     scenes = 3
     state = blob(device, dim, scene=torch.arange(300, dtype=torch.int32) % scenes)
@@ -303,7 +328,8 @@ def test_batches_with_obstacles_and_parameters_of_scenes_and_particles(n, dim, d
         mpm.Plane((0.0, 0.35, 0.0)[:dim], (0.0, 1.0, 0.0)[:dim], kind="separate", end=3e-4),
     ]
     gravity = torch.randn(scenes, dim, dtype=F64, device=device)
-    step = mpm.Step(box(dim, scenes=scenes), law.to(device), gravity, boundaries=obstacles, walls="slip")
+    options = {"boundaries": obstacles, "walls": "slip", **TRANSFERS[transfer]}
+    step = mpm.Step(box(dim, scenes=scenes), law.to(device), gravity, **options)
     assert in_one_op(step, state)
     with torch.no_grad():
         assert_equal(mpm.rollout(step, state, n, 1e-4), one_by_one(step, state, n, 1e-4))
@@ -334,13 +360,14 @@ def flying(device: str) -> tuple[mpm.State, float]:
     return state.replace(x=0.5 + 0.1 * (state.x - 0.5), v=60 * (state.x - 0.5)), 2e-3
 
 
-def test_the_pool_grows_inside_the_op():
+@pytest.mark.parametrize("transfer", SOME_TRANSFERS)
+def test_the_pool_grows_inside_the_op(transfer):
     state, dt = flying("cpu")
     grid, other = box(dx=1 / 64), box(dx=1 / 64)
-    law = mpm.NeoHookean(E=1.0, nu=0.3)
+    law, options = mpm.NeoHookean(E=1.0, nu=0.3), TRANSFERS[transfer]
     with torch.no_grad():
-        end = mpm.rollout(mpm.Step(grid, law), state, 8, dt)
-        assert_equal(end, one_by_one(mpm.Step(other, law), state, 8, dt))
+        end = mpm.rollout(mpm.Step(grid, law, **options), state, 8, dt)
+        assert_equal(end, one_by_one(mpm.Step(other, law, **options), state, 8, dt))
     assert grid.max_blocks >= grid.activate(end.x).wanted > 2 * grid.activate(state.x).wanted
 
 
@@ -388,9 +415,10 @@ def test_problems_are_those_of_single_steps(device):
 
 
 @pytest.mark.parametrize("obstacles", [[], [mpm.Sphere((0.5,) * 3, 0.3, velocity=(1.0, 0.0, 0.0), end=2e-3)]])
-def test_no_particles(obstacles, device):
+@pytest.mark.parametrize("transfer", SOME_TRANSFERS)
+def test_no_particles(obstacles, transfer, device):
     law = mpm.VonMises(E=1e4, nu=0.3, yield_stress=1.0)
-    step = mpm.Step(box(), law, gravity=(0.0, -1.0, 0.0), boundaries=obstacles)
+    step = mpm.Step(box(), law, gravity=(0.0, -1.0, 0.0), boundaries=obstacles, **TRANSFERS[transfer])
     with torch.no_grad():
         end = mpm.rollout(step, blob(device, count=0), 3, 1e-3)
         step.check(end)
@@ -402,9 +430,10 @@ def test_no_particles(obstacles, device):
 
 def test_reasons_to_step_from_python(device):
     state, law = blob(device), mpm.NeoHookean(E=1e4, nu=0.3)
+    bouncing = mpm.Step(box(), law, walls="mirror", flip=0.5)
     reasons = {
         "a tensor": (mpm.Step(box(), law), state, torch.tensor(1e-4, device=device)),
-        "FLIP": (mpm.Step(box(), law, flip=0.5), state, 1e-4),
+        "FLIP keeps a share of the impulses on mirrors": (bouncing, bouncing.with_impulses(state), 1e-4),
         "on_grid": (mpm.Step(box(), law, on_grid=lambda b, v, m, dt: v), state, 1e-4),
         "CustomLaw": (mpm.Step(box(), lambda F: F), state, 1e-4),
         "QuarticSand": (mpm.Step(box(), mpm.QuarticSand(E=1e4, nu=0.3, hardening=(0.6, 0.1, 0.2, 0.1))), state, 1e-4),
@@ -461,23 +490,24 @@ def test_hooks_are_called_for_every_step(device):
     assert len(called) == 3
 
 
-def each_scene(device: str, dtype: torch.dtype = F64) -> tuple[mpm.Step, mpm.State]:
+def each_scene(device: str, dtype: torch.dtype = F64, transfer: str = "apic") -> tuple[mpm.Step, mpm.State]:
     """Three scenes, with an obstacle that moves and one that comes."""
     ball = mpm.Sphere((0.5, 0.2), 0.2, velocity=(0.0, 2.0), friction=0.2)
     late = mpm.Box((0.3, 0.5), (0.2, 0.2), start=2.5 * DT, kind="sticky")
     law = mpm.HerschelBulkley(E=1e4, nu=0.3, yield_stress=10.0, consistency=5.0, exponent=0.7)
-    step = mpm.Step(box(2, scenes=3), law, (0.5, -9.8), "separate", [ball, late])
+    step = mpm.Step(box(2, scenes=3), law, (0.5, -9.8), "separate", [ball, late], **TRANSFERS[transfer])
     scene = (torch.arange(300) % 3).int().to(device)
     state = blob(device, 2, dtype=dtype).replace(scene=scene)
     return step, step.with_impulses(step.prepare(state))
 
 
+@pytest.mark.parametrize("transfer", TRANSFERS)
 @pytest.mark.parametrize("dtype", [torch.float32, F64])
-def test_scenes_with_time_steps_and_clocks_of_their_own(device, dtype):
+def test_scenes_with_time_steps_and_clocks_of_their_own(device, dtype, transfer):
     """One is paused, and one has a dt that is refused."""
     for values in ([1.0, 0.5, 0.7], [1.0, 0.0, 0.5], [1.0, -1.0, 0.5]):
         dt = DT * torch.tensor(values, dtype=dtype, device=device)
-        (step, state), (again, _) = each_scene(device, dtype), each_scene(device, dtype)
+        (step, state), (again, _) = each_scene(device, dtype, transfer), each_scene(device, dtype, transfer)
         assert step.explain(state, dt) == "all steps in one op"
         with torch.no_grad():
             end, expected = mpm.rollout(step, state, 9, dt), one_by_one(again, state, 9, dt)
@@ -554,10 +584,10 @@ def test_the_raw_op(device):
         None,
         *grid.packed,
     )
-    call = (*particles, *law, 2, 1e-4, True, True, 0, *rest)
+    call = (*particles, *law, 2, 1e-4, True, 0.0, True, 0, *rest)
     checks = ("test_schema", "test_faketensor", "test_aot_dispatch_dynamic")
-    for apic, wants_C in ((True, True), (False, True), (False, False)):
-        given = (*call[:18], apic, wants_C, *call[20:])
+    for how in ((True, 0.0, True), (True, 0.9, True), (False, 1.0, True), (False, 0.0, False)):
+        given = (*call[:18], *how, *call[21:])
         torch.library.opcheck(torch.ops.torch_mpm.substeps.default, given, test_utils=checks)
     for wrong, place, message in (
         ("sand", 12, "law must be one of"),
@@ -565,23 +595,26 @@ def test_the_raw_op(device):
         ([scalar], 14, "parameters and history must have those of all laws"),
         (0, 16, "n must be 1 to 65536"),
         (-1.0, 17, "dt must be positive"),
+        (1.5, 19, "flip must be between 0 and 1"),
     ):
         with pytest.raises(RuntimeError, match=message):
             torch.ops.torch_mpm.substeps(*call[:place], wrong, *call[place + 1 :])
 
 
 @pytest.mark.parametrize(("law", "scenes"), [("neo_hookean", 1), ("sand", 8), ("fluid", 8)])
-def test_ten_deterministic_runs_are_the_same_to_the_last_bit(law, scenes, device):
+@pytest.mark.parametrize("transfer", SOME_TRANSFERS)
+def test_ten_deterministic_runs_are_the_same_to_the_last_bit(law, scenes, transfer, device):
     """Ends without gradients and with, and the gradients; scenes of a batch stay on a multiprocessor where they can."""
     one = blob(device, count=150, dtype=torch.float32)
     scene = torch.arange(scenes, dtype=torch.int32, device=device)
     state = mpm.State.concatenate([one.replace(scene=scene[k].expand(len(one))) for k in range(scenes)])
     grid = box(deterministic=True, scenes=scenes)
+    options = {"gravity": (0, -9.8, 0), "walls": "slip", **TRANSFERS[transfer]}
 
     def run(with_gradient: bool) -> list[Tensor]:
         start = state.replace(v=state.v.clone().requires_grad_(with_gradient))
         with torch.set_grad_enabled(with_gradient):
-            end = mpm.rollout(mpm.Step(grid, LAWS_HERE[law](), gravity=(0, -9.8, 0), walls="slip"), start, 10, DT)
+            end = mpm.rollout(mpm.Step(grid, LAWS_HERE[law](), **options), start, 10, DT)
         results = [*tensors(end).values()]
         if with_gradient:
             results += torch.autograd.grad(end.x.square().sum() + end.v.sum(), [start.v])

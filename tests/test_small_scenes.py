@@ -59,12 +59,13 @@ def assert_same(end, expected, bound=2e-5):
 
 @pytest.mark.parametrize("deterministic", [False, True])
 @pytest.mark.parametrize("law", LAWS)
-def test_scenes_of_several_sizes(law, dim, deterministic, device):
+@pytest.mark.parametrize("flip", [0.0, 0.95])
+def test_scenes_of_several_sizes(law, flip, dim, deterministic, device):
     lows = (0.3, 0.5, None, 0.2, 0.59)
     blocks = [low and block_state(dim, low=low, high=low + 0.15 + 0.1 * (k % 2)) for k, low in enumerate(lows)]
     state = joined(blocks, device)
     grid = {"deterministic": deterministic}
-    step, single = make(dim, 5, law, grid=grid), make(dim, 5, law, grid=grid)
+    step, single = (make(dim, 5, law, flip=flip, grid=grid) for _ in range(2))
     end, expected = both(step, single, state)
     step.check(end)
     assert_same(end, expected, 2e-4 if law == "sand" else 2e-5)

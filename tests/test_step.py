@@ -2,9 +2,11 @@
 
 import pytest
 import torch
-from helpers import random_particles, relative_error
+from helpers import TOLERANCE, random_particles, relative_error
 
 import torch_mpm as mpm
+from torch_mpm.reference import grid_update as grid_reference
+from torch_mpm.reference import transfer as reference
 
 
 def block_state(dim, device="cpu", dtype=torch.float64, scene=None, low=0.3, high=0.6, spin=0.5, dx=0.1):
@@ -83,6 +85,31 @@ def test_free_fall_is_exact(device, dim):
     expected = start.x + n * dt * start.v + dt**2 * n * (n + 1) / 2 * gravity.to(device)
     torch.testing.assert_close(end.x, expected, rtol=1e-12, atol=1e-13)
     assert end.time == pytest.approx(n * dt)
+
+
+@pytest.mark.parametrize("options", [{"transfer": "flip"}, {"flip": 0.95}, {"transfer": "pic", "flip": 0.5}], ids=str)
+@pytest.mark.parametrize("walls", [None, "sticky", "mirror"])
+def test_flip_is_the_reference(device, dim, kernel, options, walls):
+    """(1 − flip) v_pic + flip (v + Σ N_i (v_i − v_i before the forces)); a mirror acts on both v_i."""
+    gravity, dt = torch.linspace(-9.8, 1.0, dim, dtype=torch.float64, device=device), 1e-3
+    step = make_step(dim, gravity=gravity, walls=walls, grid={"kernel": kernel}, **options)
+    state = step.prepare(block_state(dim, device, low=0.0, spin=4.0))
+    state = state.replace(C=state.x[:, :, None] * state.v[:, None], F=(1 + 0.1 * state.x[:, :1, None]) * state.F)
+    end, blocks = step(state, dt), step.grid.activate(state.x)
+    C = state.C if step.transfer == "apic" else None
+    faces = [] if walls is None else step.walls.faces(step.grid)
+    momentum = state.x, state.mass, state.v, C
+    forced = reference.p2g(blocks, *momentum, step.law.stress(state), state.volume, dt)
+    after = grid_reference.grid_update(blocks, forced, gravity, dt, faces)[:, 1:]
+    mirrors = faces if walls == "mirror" else []
+    free = reference.p2g(blocks, *momentum)
+    before = grid_reference.grid_update(blocks, free, faces=mirrors)[:, 1:]
+    pic, change = (reference.gather(blocks, state.x, v, 1.0)[0] for v in (after, after - before))
+    share = options.get("flip", 1.0)
+    assert (
+        relative_error(end.v, (1 - share) * pic + share * (state.v + change)) < TOLERANCE["conservation"][torch.float64]
+    )
+    assert float(change.norm() / state.v.norm()) > 1e-2
 
 
 @pytest.mark.parametrize("transfer,flip", [("apic", 0.0), ("pic", 0.0), ("apic", 0.9), ("flip", 1.0)])

@@ -66,7 +66,7 @@ def rollout(
         every: steps from one call of the hook to the next.
         norms: records the norm of the gradient at states on the way; see `GradientNorms`.
 
-    A `Step` of compiled laws without heat, FLIP and functions of the user's takes all steps in one op, or some, with
+    A `Step` of compiled laws without heat and functions of the user's takes all steps in one op, or some, with
     the results of single steps; `Step.explain` tells. On CUDA they are the same to the last bit, but for float32
     without gradients, which like all of a CPU rounds differently; the status does not count blocks that are there only
     between two activations. Its gradients take the steps again from kept states, those of every `checkpoint` steps,
@@ -183,8 +183,8 @@ def obstacle_to_substeps(step: Step, state: State, dt: float | Tensor) -> str | 
         return "it calls on_grid"
     if step.on_particles is not None:
         return "it calls on_particles"
-    if step.transfer == "flip" or step.flip:
-        return "its transfer is FLIP"
+    if step._flip_share and state.impulse is not None and has_mirrors(step):
+        return "FLIP keeps a share of the impulses on mirrors"
     for part in laws:
         if not isinstance(part, CompiledLaw) or not part.is_all_of_its_update() or type(part).forward is not _FORWARD:
             return f"{type(part).__name__} is more than a compiled law"
@@ -259,7 +259,7 @@ def pool_of_call(step: Step, state: State, n: int) -> tuple[int, int] | None:
     room = len(state) // PARTICLES_PER_BLOCK if len(state) >= MANY_PARTICLES else 0
     if room >= grid.block_count or takes_few_blocks(step, state, n):
         return grid.block_count, LONG_CHUNK
-    passes = grid.deterministic or has_mirrors(step)
+    passes = grid.deterministic or has_mirrors(step) or step._flip_share > 0
     if grid.max_blocks is not None and room >= ROOMY * grid.max_blocks and not passes:
         return room, ROOMY_CHUNK
     return None
@@ -275,8 +275,8 @@ def takes_few_blocks(step: Step, state: State, n: int) -> bool:
     grid = step.grid
     if grid.block_count > FEW_BLOCKS:
         return False
-    form = (step.transfer, step.stress_form, grid.kernel, has_mirrors(step))
-    if form != ("apic", "mls", "quadratic", False) or state.impulse is not None or n < LEAST_PERSISTENT:
+    form = (step.transfer, step._flip_share, step.stress_form, grid.kernel, has_mirrors(step))
+    if form != ("apic", 0, "mls", "quadratic", False) or state.impulse is not None or n < LEAST_PERSISTENT:
         return False
     if state.x.dtype != torch.float32 or not isinstance(step.law, CompiledLaw) or len(state) > MOST_PERSISTENT:
         return False
@@ -377,7 +377,7 @@ def _substeps(step: Step, state: State, n: int, dt: float | Tensor, records: boo
         *(state.x, state.v, state.mass, state.volume, state.C, state.F, state.J),
         *(calls.history, state.scene, state.ids, calls.material, record.status),
         *(calls.names, calls.options, calls.parameters, calls.variables),
-        *(int(n), number, apic, apic or step.law.viscous, STRESS_FORMS[step.stress_form]),
+        *(int(n), number, apic, step._flip_share, apic or step.law.viscous, STRESS_FORMS[step.stress_form]),
         _gravity(step, state.x),
         *wall_arguments(step.walls, grid),
         *obstacle_arguments(step.boundaries.entries, state.x, grid.scenes),

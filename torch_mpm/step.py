@@ -207,7 +207,7 @@ class Step(TensorModule):
             blocks, state.x, velocity, dt, **deformed, affine=keeps_C or self.heat is not None, stress_form=form
         )
         if self._flip_share:  # positions move with the grid all the same, so that FLIP's noise does not reach them
-            v, impulse = self._blend_flip(blocks, state, affine, velocity, v, impulse)
+            v, impulse = self._blend_flip(blocks, state, affine, v, impulse)
         changes: dict[str, Any] = {**fields, "F": F, "J": J}
         if state.impulse is not None and impulse is not None:
             changes["impulse"] = state.impulse + impulse
@@ -281,11 +281,10 @@ class Step(TensorModule):
         blocks: Blocks,
         state: State,
         affine: Tensor | None,
-        velocity: Tensor,
         v: Tensor,
         impulse: Tensor | None,
     ) -> tuple[Tensor, Tensor | None]:
-        """(1 − flip) v_pic + flip (v_p + Σ N_i (v_i − v_i before the forces)) (Zhu and Bridson 2005).
+        """(1 − flip) v_pic + flip (v_p + v_pic − Σ N_i v_i), with v_i before the forces (Zhu and Bridson 2005).
 
         FLIP's share of the particles knows no mirrors but by the change of the velocities, so that of what these take
         before the forces it keeps its own.
@@ -293,11 +292,11 @@ class Step(TensorModule):
         # P2G of the step has the impulse of the stress in it already, which is part of the change.
         mirrors = None if self.walls is None else self.walls.mirrors()
         nodes = p2g(blocks, state.x, state.mass, state.v, affine)
-        change, _, _ = gather(blocks, state.x, velocity - grid_update(blocks, nodes, walls=mirrors))
+        before, _, _ = gather(blocks, state.x, grid_update(blocks, nodes, walls=mirrors))
         if impulse is not None and mirrors is not None:
             on_faces = self._flip_share * wall_impulses(blocks, nodes, walls=mirrors)
             impulse = impulse - torch.nn.functional.pad(on_faces, (0, 0, impulse.shape[1] - on_faces.shape[1], 0))
-        return (1 - self._flip_share) * v + self._flip_share * (state.v + change), impulse
+        return torch.add(v, state.v - before, alpha=self._flip_share), impulse
 
     def gravity_like(self, x: Tensor) -> Tensor | None:
         """Gravity as a tensor [D] or [B, D] of the dtype and on the device of x."""

@@ -29,4 +29,11 @@ Walls<T, D> walls(const std::vector<int64_t>& kind, const std::vector<double>& p
   return w;
 }
 
+// The mirrors alone, all other faces open.
+template <class T, int D>
+Walls<T, D> mirrors(Walls<T, D> w) {
+  for (int face = 0; face < 2 * D; face++) w.node[face] = face % 2 ? INT_MAX : INT_MIN;
+  return w;
+}
+
 }  // namespace mpm

@@ -26,6 +26,22 @@ void accumulate(const AccumulateArguments<T, D>& a) {
 }
 
 template <class T, int D>
+void add_scaled(const AddScaledArguments<T, D>& a) {
+  const T share = T(a.share), zero = T(0);
+  const int64_t to_stride = a.to.stride[0], first_stride = a.first.stride[0], second_stride = a.second.stride[0];
+  parallel_ranges(a.count, kGrain, [&](int64_t begin, int64_t end) {
+    for (int i = 0; i < D; i++) {
+      T* const to = a.to.pointer + i * a.to.stride[1];
+      const T* const first = a.first.pointer ? a.first.pointer + i * a.first.stride[1] : &zero;
+      const T* const second = a.second.pointer + i * a.second.stride[1];
+#pragma GCC ivdep
+      for (int64_t p = begin; p < end; p++)
+        to[p * to_stride] = first[p * first_stride] + share * second[p * second_stride];
+    }
+  });
+}
+
+template <class T, int D>
 void accumulate_slots(const AccumulateSlotsArguments<T, D>& a) {
   for (int64_t slot = 0; slot < a.max_blocks; slot++) {
     const int64_t block = a.block[slot];
@@ -35,6 +51,7 @@ void accumulate_slots(const AccumulateSlotsArguments<T, D>& a) {
 }
 
 MPM_INSTANTIATE(accumulate, AccumulateArguments)
+MPM_INSTANTIATE(add_scaled, AddScaledArguments)
 MPM_INSTANTIATE(accumulate_slots, AccumulateSlotsArguments)
 
 }  // namespace TORCH_MPM_ISA

@@ -1,6 +1,6 @@
 #include "rollout/accumulate.h"
 
-#include "cuda/launch.cuh"
+#include "cuda/chain.cuh"
 
 namespace mpm::cuda {
 namespace {
@@ -15,6 +15,19 @@ __global__ void __launch_bounds__(kThreads) accumulate_kernel(const AccumulateAr
   const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   for (int k = 0; k < a.addends; k++)
     if (i < a.addend[k].size) a.addend[k].sum[i] += a.addend[k].term[i];
+}
+
+template <class T, int D>
+__global__ void __launch_bounds__(kThreads) add_scaled_kernel(const AddScaledArguments<T, D> a) {
+  wait_for_kernel_before();
+  const int64_t p = int64_t(blockIdx.x) * kThreads + threadIdx.x;
+  if (p >= a.count) return;
+#pragma unroll
+  for (int i = 0; i < D; i++) {
+    const T first = a.first.pointer ? a.first.pointer[p * a.first.stride[0] + i * a.first.stride[1]] : T(0);
+    const T second = a.second.pointer[p * a.second.stride[0] + i * a.second.stride[1]];
+    a.to.pointer[p * a.to.stride[0] + i * a.to.stride[1]] = first + T(a.share) * second;
+  }
 }
 
 template <class T, int D>
@@ -34,11 +47,17 @@ void accumulate(const AccumulateArguments<T, D>& a, Stream stream) {
 }
 
 template <class T, int D>
+void add_scaled(const AddScaledArguments<T, D>& a, Stream stream) {
+  if (a.count > 0) launch_in_chain(add_scaled_kernel<T, D>, blocks_for(a.count), kThreads, 0, stream, a);
+}
+
+template <class T, int D>
 void accumulate_slots(const AccumulateSlotsArguments<T, D>& a, Stream stream) {
   if (a.max_blocks > 0) launch(accumulate_slots_kernel<T, D>, blocks_for(a.max_blocks), kThreads, 0, stream, a);
 }
 
 MPM_INSTANTIATE(accumulate, AccumulateArguments)
+MPM_INSTANTIATE(add_scaled, AddScaledArguments)
 MPM_INSTANTIATE(accumulate_slots, AccumulateSlotsArguments)
 
 }  // namespace mpm::cuda

@@ -1,8 +1,8 @@
 #pragma once
 
-#include <cstdint>
+#include "common/fields.h"
 
-// Sums of adjoints over many steps.
+// Sums over many steps, and of what FLIP blends.
 namespace mpm {
 
 constexpr int kMostAddends = 8;
@@ -23,6 +23,15 @@ struct AccumulateArguments {
     addend[addends++] = {sum, term, size};
     longest = longest > size ? longest : size;
   }
+};
+
+// to = first + share * second, [count, D]; `to` may be one of them. An absent first is zero.
+template <class T, int D>
+struct AddScaledArguments {
+  int64_t count = 0;
+  Field<T> to;
+  Field<const T> first, second;
+  double share = 1;
 };
 
 // Values of slots [max_blocks, D] to sums of the blocks [block_count, D] that the slots have.

@@ -11,6 +11,7 @@
 #define MPM_ROLLOUT_KERNELS(PLAIN, ORDERED, SIZE) \
   PLAIN(survey, SurveyArguments)                  \
   PLAIN(accumulate, AccumulateArguments)          \
+  PLAIN(add_scaled, AddScaledArguments)           \
   PLAIN(accumulate_slots, AccumulateSlotsArguments)
 MPM_BACKEND_KERNELS(MPM_ROLLOUT_KERNELS)
 

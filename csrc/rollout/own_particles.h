@@ -71,10 +71,11 @@ class OwnParticles {
 
   // Whether an activation may serve several substeps of a call. Where it does, G2P and the next P2G are one pass. Not
   // of deterministic grids: how long it lasts depends on all scenes, and on it how the sums of each are rounded. Nor
-  // where gradients go through a pool that does not grow: they need room for the blocks of every substep.
+  // where gradients go through a pool that does not grow: they need room for the blocks of every substep. Nor with
+  // FLIP, whose velocities before the forces are those of particles that a pass has not left in memory.
   static bool may_last(const SubstepsInputs& in) {
     return in.lattice.order() == 2 && in.n > kLeastLastingSteps && !in.lattice.deterministic() &&
-           (in.grows || in.resident);
+           (in.grows || in.resident) && in.flip == 0;
   }
 
   // One substep, of which so many follow; false as `Substeps::activate`.
@@ -96,6 +97,7 @@ class OwnParticles {
 
   double farthest() const;
   void find_laws();
+  void keep_velocities();
   bool begin(const int* status_before, int* status, int64_t following);
   void go_on(const int* status_before, int* status);
   bool pays(int64_t following);
@@ -129,6 +131,7 @@ class OwnParticles {
   const SubstepsInputs& in_;
   backend::Stream stream_;
   OwnField<T> mass_, volume_;
+  OwnField<T> kept_;                     // of FLIP
   std::vector<OwnField<T>> parameters_;  // that particles have
   OwnField<int> scene_, material_, origin_;
   std::vector<ChunkLaw<T, D>> laws_;
@@ -162,6 +165,7 @@ OwnParticles<T, D>::OwnParticles(Substeps<T, D>& steps, const Tensor& packed_his
   mass_ = {like, s_.p2g.mass, {P}};
   volume_ = {like, s_.p2g.volume, {P}};
   if (s_.columns > 0) history = OwnField<T>(packed_history);
+  if (s_.flips()) kept_ = OwnField<T>(s_.kept);
   if (has(in_.scene)) scene_ = {like, field<const int>(*in_.scene), {P}};
   if (has(in_.material)) material_ = {like, field<const int>(*in_.material), {P}};
   s_.forget_stress();
@@ -253,12 +257,20 @@ bool OwnParticles<T, D>::begin(const int* status_before, int* status, int64_t fo
   drift_ = {};
   s_.activation.next_drift = tries_ ? &drift_ : nullptr;
   if (!s_.activate(status_before, status, stream_)) return false;
+  if (s_.flips()) keep_velocities();
   s_.clear_nodes(stream_);
   passes_ = 0;
   if (tries_ && drift_.lost != 0) patience_ = kActivationsOfPatience;  // no room for the blocks around
   tries_ = tries_ && drift_.lost == 0;
   give_to_nodes(tries_ || pays(following));
   return true;
+}
+
+template <class T, int D>
+void OwnParticles<T, D>::keep_velocities() {
+  set_p2g();
+  s_.keep_velocities(a_.p2g, kept_.next(false), stream_);
+  kept_.go(false);
 }
 
 // G2P, laws and P2G, while an activation lasts.
@@ -323,6 +335,7 @@ void OwnParticles<T, D>::give_to_nodes(bool rearranges) {
   });
   if (!rearranges) return;
   origin_.go(true);
+  if (s_.flips()) kept_.go(true);
   if (has(in_.scene)) scene_.go(true);
   if (has(in_.material)) material_.go(true);
   rearranged_ = true;
@@ -338,6 +351,7 @@ void OwnParticles<T, D>::find_rows(bool rearranges) {
     if (read || rearranges) f.rows(rows_, row, changes || rearranges, rearranges);
   });
   if (viscous_ && C.now().pointer) C.rows(rows_, R::C, false, false);
+  if (rearranges && s_.flips()) kept_.rows(rows_, -1, true, true);
   if (rearranges) origin_.rows(numbers_, kOriginRow, true, true);
   if (has(in_.scene)) scene_.rows(numbers_, kSceneRow, rearranges, true);
   if (has(in_.material)) material_.rows(numbers_, kMaterialRow, rearranges, true);
@@ -419,6 +433,7 @@ void OwnParticles<T, D>::advance() {
   } else {
     set_advance();
     backend::g2p_advance(in_.lattice.order(), s_.advance, stream_);
+    if (s_.flips()) s_.add_flip(kept_.now(), stream_);
   }
   v.go(false);
   x.go(false);

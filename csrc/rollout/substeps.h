@@ -16,31 +16,32 @@
 // do them, in buffers that belong to the call. What the ops of rollouts share.
 namespace mpm {
 
-#define MPM_SUBSTEPS_SCHEMA                                                                                        \
-  "Tensor x, Tensor v, Tensor mass, Tensor volume, Tensor? C, Tensor? F, Tensor? J, Tensor[] history, Tensor? "    \
-  "scene, Tensor? ids, Tensor? material, Tensor? previous_status, str laws, int[] options, Tensor[] parameters, "  \
-  "int[] variables, int n, float dt, bool apic, bool wants_C, int stress_form, Tensor? gravity, " MPM_WALLS_SCHEMA \
-  ", Tensor? obstacles, Tensor? data, int[] shape, int[] sizes, int[] contact, int[] obstacle_scene, "             \
-  "float[] start, float[] end, float time, int scenes, int max_blocks, bool grows, bool resident, bool records, "  \
-  "Tensor? "                                                                                                       \
+#define MPM_SUBSTEPS_SCHEMA                                                                                       \
+  "Tensor x, Tensor v, Tensor mass, Tensor volume, Tensor? C, Tensor? F, Tensor? J, Tensor[] history, Tensor? "   \
+  "scene, Tensor? ids, Tensor? material, Tensor? previous_status, str laws, int[] options, Tensor[] parameters, " \
+  "int[] variables, int n, float dt, bool apic, float flip, bool wants_C, int stress_form, Tensor? "              \
+  "gravity, " MPM_WALLS_SCHEMA                                                                                    \
+  ", Tensor? obstacles, Tensor? data, int[] shape, int[] sizes, int[] contact, int[] obstacle_scene, "            \
+  "float[] start, float[] end, float time, int scenes, int max_blocks, bool grows, bool resident, bool records, " \
+  "Tensor? "                                                                                                      \
   "impulse, Tensor? scene_dt, Tensor? scene_time, " MPM_LATTICE_SCHEMA
 #define MPM_SUBSTEPS_PARAMETERS                                                                                        \
   const Tensor &x, const Tensor &v, const Tensor &mass, const Tensor &volume, const OptionalTensor &C,                 \
       const OptionalTensor &F, const OptionalTensor &J, const Tensors &history, const OptionalTensor &scene,           \
       const OptionalTensor &ids, const OptionalTensor &material, const OptionalTensor &previous_status,                \
       std::string laws, std::vector<int64_t> options, const Tensors &parameters, std::vector<int64_t> variables,       \
-      int64_t n, double dt, bool apic, bool wants_C, int64_t stress_form, const OptionalTensor &gravity,               \
+      int64_t n, double dt, bool apic, double flip, bool wants_C, int64_t stress_form, const OptionalTensor &gravity,  \
       std::vector<int64_t> wall_kind, std::vector<double> wall_plane, std::vector<double> wall_friction,               \
       const OptionalTensor &obstacle_table, const OptionalTensor &obstacle_data, std::vector<int64_t> shape,           \
       std::vector<int64_t> sizes, std::vector<int64_t> contact_kind, std::vector<int64_t> obstacle_scene,              \
       std::vector<double> start, std::vector<double> end, double time, int64_t scenes, int64_t max_blocks, bool grows, \
       bool resident, bool records, const OptionalTensor &impulse, const OptionalTensor &scene_dt,                      \
       const OptionalTensor &scene_time, const std::vector<double>&lattice, const std::vector<int64_t>&layout
-#define MPM_SUBSTEPS_ARGUMENTS                                                                                         \
-  x, v, mass, volume, C, F, J, history, scene, ids, material, previous_status, laws, options, parameters, variables,   \
-      n, dt, apic, wants_C, stress_form, gravity, wall_kind, wall_plane, wall_friction, obstacle_table, obstacle_data, \
-      shape, sizes, contact_kind, obstacle_scene, start, end, time, scenes, max_blocks, grows, resident, records,      \
-      impulse, scene_dt, scene_time, PackedLattice(lattice, layout)
+#define MPM_SUBSTEPS_ARGUMENTS                                                                                       \
+  x, v, mass, volume, C, F, J, history, scene, ids, material, previous_status, laws, options, parameters, variables, \
+      n, dt, apic, flip, wants_C, stress_form, gravity, wall_kind, wall_plane, wall_friction, obstacle_table,        \
+      obstacle_data, shape, sizes, contact_kind, obstacle_scene, start, end, time, scenes, max_blocks, grows,        \
+      resident, records, impulse, scene_dt, scene_time, PackedLattice(lattice, layout)
 
 // The arguments of a call.
 struct SubstepsInputs {
@@ -54,7 +55,9 @@ struct SubstepsInputs {
   std::vector<int64_t> variables;
   int64_t n;
   double dt;
-  bool apic, wants_C;
+  bool apic;
+  double flip;
+  bool wants_C;
   int64_t stress_form;
   OptionalTensor gravity;
   std::vector<int64_t> wall_kind;
@@ -268,6 +271,7 @@ struct Substeps {
   NextGridArguments<T, D> next;   // of these; its update and contact are those here
   Tensor impulse, impulse_slots;  // on obstacles and walls so far; where someone asks, see `add_impulses_to`
   bool obstacles = false, fused = false;
+  Tensor kept;                   // of FLIP, see `keep_velocities`
   LateDeformation<T, D> late;    // of P2G, where a G2P leaves F and J to the next one
   Settling<T, D> settling;       // of P2G, where the call owns its particles
   bool nodes_are_clear = false;  // when a step begins
@@ -315,6 +319,46 @@ struct Substeps {
     advance.J_next = p.J;
   }
 
+  bool flips() const { return in.flip > 0; }
+
+  // What FLIP adds its share of to the velocities of G2P: those of the particles less those of the nodes before the
+  // forces. Takes the nodes of the pool, which P2G has not yet.
+  void keep_velocities(const P2GArguments<T, D>& particles, const Field<T>& to, backend::Stream stream) {
+    clear_nodes(stream);
+    const GridUpdateArguments<T, D> before =
+        find_nodes_before(particles, static_cast<T*>(pool.nodes.data_ptr()), update.updated, stream);
+    nodes_are_clear = false;
+    GatherArguments<T, D> g = advance.gather;
+    g.x = particles.x;
+    g.value = to;
+    g.moment = {};
+    g.nodes = {before.updated->value.e, 1 + D, D};
+    backend::gather(in.lattice.order(), g, stream);
+    backend::add_scaled(AddScaledArguments<T, D>{in.x.size(0), to, particles.velocity, constant(to), -1}, stream);
+  }
+
+  // The nodes, zero on entry, and their velocities before the forces and all boundaries but the mirrors; gives the
+  // update between the two.
+  GridUpdateArguments<T, D> find_nodes_before(P2GArguments<T, D> particles, T* nodes, NodeRow<T, D>* updated,
+                                              backend::Stream stream) const {
+    particles.stress = {};
+    particles.nodes = {nodes, 1 + D, 1 + D};
+    backend::p2g(in.lattice.order(), particles, stream);
+    GridUpdateArguments<T, D> a = update;
+    a.gravity = nullptr;
+    a.walls = mirrors(update.walls);
+    a.nodes = reinterpret_cast<const NodeRow<T, D>*>(nodes);
+    a.updated = updated;
+    backend::grid_update(a, stream);
+    return a;
+  }
+
+  // After G2P.
+  void add_flip(const Field<const T>& velocities, backend::Stream stream) {
+    const Field<T>& v = advance.gather.value;
+    backend::add_scaled(AddScaledArguments<T, D>{in.x.size(0), v, constant(v), velocities, in.flip}, stream);
+  }
+
   // Finds the active blocks; false where the pool has no room for them and must not grow. On CUDA nobody waits for the
   // answer: the status tells.
   bool activate(const int* previous_status, int* status, backend::Stream stream) {
@@ -353,9 +397,10 @@ struct Substeps {
   }
 
   // On CUDA an activation may serve several substeps: blocks around those with particles are active too, and G2P tells
-  // when they no longer suffice. Not where sums have an order, which is that of whole blocks.
+  // when they no longer suffice. Not where sums have an order, which is that of whole blocks, and not of FLIP, whose
+  // second P2G and whose gather look in the blocks of the activation alone.
   void let_activations_last(backend::Stream stream) {
-    if (MPM_BACKEND == MPM_BACKEND_IS_cpu || (in.lattice.deterministic() && !sums_are_fixed())) return;
+    if (MPM_BACKEND == MPM_BACKEND_IS_cpu || (in.lattice.deterministic() && !sums_are_fixed()) || flips()) return;
     if (sums_are_fixed()) fix_sums(stream);
     drifts = empty_int(in.x, {2, sizeof(Drift) / sizeof(int)});
     torch::stable::zero_(drifts);
@@ -431,7 +476,7 @@ struct Substeps {
     const int64_t P = in.x.size(0);
     if (!in.resident || in.n < kLeastResidentSteps || P > kMostResidentParticles<D> * in.scenes) return false;
     if (!calls[0].law->kernels<T, D>().resident || calls.size() > 1 || has(in.material)) return false;
-    if (in.lattice.order() != 2 || p2g.form != StressForm::mls || has(in.impulse) || update.walls.mirrored)
+    if (in.lattice.order() != 2 || p2g.form != StressForm::mls || has(in.impulse) || update.walls.mirrored || flips())
       return false;
     if (P == 0 || activation.geometry.blocks_per_scene > kMostResidentBlocks) return false;
     return (in.lattice.deterministic() && !sums_are_fixed()) || resident_pays<D>(P, in.scenes);
@@ -459,10 +504,12 @@ struct Substeps {
   }
 
   void move(backend::Stream stream) {
+    if (flips()) keep_velocities(p2g, field<T>(kept), stream);
     for (size_t k = 0; k < laws.size() && !fused; k++) calls[k].law->kernels<T, D>().update(laws[k], stream);
     move_grid(stream);
     end_time(stream);
     backend::g2p_advance(in.lattice.order(), advance, stream);
+    if (flips()) add_flip(field<const T>(kept), stream);
   }
 
   // The time after a step, on the CPU and of scenes with clocks of their own.
@@ -556,6 +603,7 @@ Substeps<T, D>::Substeps(const SubstepsInputs& inputs) : in(inputs) {
   const int64_t P = x.size(0);
   STD_TORCH_CHECK(in.n > 0 && in.n <= kMostSteps, "n must be 1 to ", kMostSteps, ", got ", in.n);
   STD_TORCH_CHECK(in.dt > 0 && std::isfinite(in.dt), "dt must be positive and finite, got ", in.dt);
+  STD_TORCH_CHECK(in.flip >= 0 && in.flip <= 1, "flip must be between 0 and 1, got ", in.flip);
   STD_TORCH_CHECK(in.wants_C || !in.apic, "apic needs wants_C");
   calls = law_calls(in.laws, in.options, in.parameters, in.history, in.variables, D);
   check_material(in.material, calls.size(), x);
@@ -563,6 +611,7 @@ Substeps<T, D>::Substeps(const SubstepsInputs& inputs) : in(inputs) {
   if (has(in.previous_status))
     previous_status = int_pointer(*in.previous_status, "previous_status", x, {1 + in.scenes, kStatusSize});
   stress = empty_particles(x, {P, D, D});
+  kept = result(x, flips(), {P, D});
   if (has(in.material)) torch::stable::zero_(stress);  // of particles without a law
   for (size_t k = 0; k < calls.size(); k++) {
     const LawInfo& info = calls[k].law->info;

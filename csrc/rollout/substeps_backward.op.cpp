@@ -35,10 +35,13 @@ class SubstepsBackward {
     update_ = empty(in_.x, {rows, 1 + D});
     if (s_.obstacles) contact_ = empty(in_.x, {rows, 1 + D});
     if (gravity.defined()) change_ = empty(in_.x, {slots, D});
+    if (s_.flips()) before_ = empty(in_.x, {3, rows, 1 + D});
     for (int64_t i = in_.n - 1; i >= 0; i--) {
       check_room(r_.return_to(i));
+      if (s_.flips()) keep_adjoint(adjoints);
       leave_advance(i, adjoints);
       leave_grid(i, adjoints, gravity);
+      if (s_.flips()) leave_kept(adjoints);
       leave_laws(adjoints);
     }
   }
@@ -56,19 +59,19 @@ class SubstepsBackward {
   AdvanceBackwardArguments<T, D> advance(int64_t i, Adjoints& adjoints) const;
   PositionGradientArguments<T, D> motion(const Adjoints& adjoints) const;
   void leave_grid(int64_t i, Adjoints& adjoints, const Tensor& gravity);
+  void keep_adjoint(const Adjoints& adjoints);
+  void leave_kept(Adjoints& adjoints);
   void leave_laws(Adjoints& adjoints);
 
-  // What laws that change deformation or history give beside the adjoints of these.
-  void add_terms(Adjoints& adjoints) {
+  // To each of these sums a term of the same strides, where there is one.
+  void add_terms(std::initializer_list<std::pair<Tensor, Tensor>> sums) {
     AccumulateArguments<T, D> a;
-    const auto add = [&](const Tensor& sum, const Tensor& term) {
-      if (!term.defined()) return;
+    for (const auto& [sum, term] : sums) {
+      if (!term.defined()) continue;
       int64_t size = 1;  // with the gaps between rows
       for (int64_t i = 0; i < sum.dim(); i++) size += (sum.size(i) - 1) * sum.stride(i);
       a.add(static_cast<T*>(sum.data_ptr()), static_cast<const T*>(term.data_ptr()), size);
-    };
-    add(adjoints.F, F_term_);
-    add(adjoints.parameters, parameters_term_);
+    }
     backend::accumulate(a, stream_);
   }
 
@@ -91,6 +94,9 @@ class SubstepsBackward {
   // Adjoints on the nodes [N, 1 + D], of their motion in some steps, before contact and before the grid update; and of
   // the velocity change by gravity, by slots.
   Tensor motion_, contact_, update_, change_;
+  // With FLIP: the nodes before the forces, the adjoints of their velocities, and these [3, N, 1 + D]; and of particles
+  // the adjoint of what is subtracted from G2P, and what the first of these nodes give to those of v and C.
+  Tensor before_, kept_, v_term_, C_term_;
 };
 
 template <class T, int D>
@@ -113,6 +119,11 @@ void SubstepsBackward<T, D>::make_terms(int64_t needs) {
   const int64_t P = x.size(0);
   stress_ = empty_particles(x, {P, D, D});
   if (!mls_) gradient_ = empty_particles(x, {P, D, D});
+  if (s_.flips()) {
+    kept_ = empty_particles(x, {P, D});
+    v_term_ = empty_particles(x, {P, D});
+    if (in_.apic) C_term_ = empty_particles(x, {P, D, D});
+  }
   bool history = false, changing = false;
   for (const LawCall& call : s_.calls) {
     const LawInfo& info = call.law->info;
@@ -241,6 +252,51 @@ void SubstepsBackward<T, D>::leave_grid(int64_t i, Adjoints& adjoints, const Ten
   if (!s_.p2g.affine.pointer) torch::stable::zero_(adjoints.C);  // which the position gradient has read
 }
 
+// Of the velocities of the nodes before the forces, of which FLIP's share is subtracted from G2P.
+template <class T, int D>
+void SubstepsBackward<T, D>::keep_adjoint(const Adjoints& adjoints) {
+  const Field<const T> v = field<const T>(adjoints.v);
+  backend::add_scaled(AddScaledArguments<T, D>{in_.x.size(0), field<T>(kept_), {}, v, -in_.flip}, stream_);
+}
+
+// Through FLIP's share: what is kept of the velocity of a particle, and of those of the nodes before the forces. The
+// rest of its change is in the adjoint of G2P.
+template <class T, int D>
+void SubstepsBackward<T, D>::leave_kept(Adjoints& adjoints) {
+  const int64_t order = in_.lattice.order(), size = before_.stride(0);
+  Tensor sums = torch::stable::narrow(before_, 0, 0, 2);
+  backend::clear(sums, stream_);
+  T* const nodes = static_cast<T*>(before_.data_ptr());
+  T *const grad = nodes + size, *const updated = grad + size;
+  GridUpdateBackwardArguments<T, D> update;
+  update.forward = s_.find_nodes_before(s_.p2g, nodes, reinterpret_cast<NodeRow<T, D>*>(updated), stream_);
+  PositionGradientArguments<T, D> motion = this->motion(adjoints);
+  motion.value = field<const T>(kept_);
+  motion.moment = motion.gradient = {};
+  motion.nodes = {updated + 1, 1 + D, D};
+  ScatterArguments<T, D> scatter{motion.topology,     motion.x, motion.value, {}, {}, 1, s_.p2g.deterministic,
+                                 {grad + 1, 1 + D, D}};
+  backend::scatter(order, scatter, stream_);
+  update.grad_updated = reinterpret_cast<const NodeRow<T, D>*>(grad);
+  update.grad_nodes = static_cast<NodeRow<T, D>*>(update_.data_ptr());
+  backend::grid_update_backward(update, stream_);
+
+  P2GBackwardArguments<T, D> p2g;
+  p2g.forward = s_.p2g;
+  p2g.forward.stress = {};
+  p2g.motion = motion;
+  p2g.grad_nodes = {reinterpret_cast<const T*>(update.grad_nodes), 1 + D, 1 + D};
+  p2g.x = field<T>(adjoints.x);
+  p2g.mass = field<T>(adjoints.mass);
+  p2g.velocity = field<T>(v_term_);
+  if (s_.p2g.affine.pointer) p2g.affine = field<T>(C_term_);
+  p2g.adds = true;
+  backend::p2g_backward(order, p2g, stream_);
+  add_terms({{adjoints.v, v_term_}, {adjoints.C, s_.p2g.affine.pointer ? C_term_ : Tensor()}});
+  const Field<T> v = field<T>(adjoints.v);
+  backend::add_scaled(AddScaledArguments<T, D>{in_.x.size(0), v, constant(v), motion.value, -1}, stream_);
+}
+
 // From F after the laws, their stress and history to F and history before. A law changes the adjoints of what it maps
 // where they stand, and adds to those of what it only reads.
 template <class T, int D>
@@ -267,7 +323,8 @@ void SubstepsBackward<T, D>::leave_laws(Adjoints& adjoints) {
     parameter += int64_t(call.parameters.size());
     call.law->template kernels<T, D>().update_backward(a, stream_);
   }
-  if (F_term_.defined() || parameters_term_.defined()) add_terms(adjoints);
+  if (F_term_.defined() || parameters_term_.defined())
+    add_terms({{adjoints.F, F_term_}, {adjoints.parameters, parameters_term_}});
 }
 
 // Zero where there is no gradient.

@@ -1,7 +1,7 @@
 """The ops behind `torch_mpm.rollout`: n steps in one call, and their adjoint. Fake kernels and autograd.
 
     torch.ops.torch_mpm.substeps(x, v, mass, volume, C, F, J, history, scene, ids, material, previous_status, laws,
-        options, parameters, variables, n, dt, apic, wants_C, stress_form, gravity, wall_kind, wall_plane,
+        options, parameters, variables, n, dt, apic, flip, wants_C, stress_form, gravity, wall_kind, wall_plane,
         wall_friction, obstacles, data, shape, sizes, contact, obstacle_scene, start, end, time, scenes,
         max_blocks, grows, resident, records, impulse, scene_dt, scene_time, lattice, layout)
         -> (x, v, C, F, J, history, status, impulse, time, record)
@@ -10,12 +10,14 @@ Particles and their history are those of `State`, the grid's arguments those of 
 `laws` are names of `LAWS` parted by commas, law k for the particles of material k; their options, parameters and
 history variables follow one another, `variables` of the latter for each law. The time step dt [s] is part of the
 parameters of laws that flow in time. Results that a call does not have are None; `history` has the entries of all laws
-side by side, [P, m]. The impulses on obstacles and walls are added to `impulse`, where it is given. Scenes with clocks
-of their own have the time steps dt times `scene_dt` and begin at `scene_time`, both [B]. With `grows` the pool follows
-the scene on the CPU; otherwise the op stops there where it is full, and the status tells. On CUDA nothing is waited
-for. With `resident` batches of small scenes may go another way there, each on a multiprocessor of its own; gradients
-take it as any other, whose sums may round differently. With `records` everything that the adjoint reads is kept in
-`record`, bytes of no other use, and no step is taken again; not where impulses are counted, or the pool had to grow.
+side by side, [P, m]. The impulses on obstacles and walls are added to `impulse`, where it is given. With `flip` that
+share of the velocities of particles, less those of the nodes before the forces, is added to what G2P gives. Scenes with
+clocks of their own have the time steps dt times `scene_dt` and begin at `scene_time`, both [B]. With `grows` the pool
+follows the scene on the CPU; otherwise the op stops there where it is full, and the status tells. On CUDA nothing is
+waited for. With `resident` batches of small scenes may go another way there, each on a multiprocessor of its own;
+gradients take it as any other, whose sums may round differently. With `records` everything that the adjoint reads is
+kept in `record`, bytes of no other use, and no step is taken again; not where impulses are counted, or the pool had to
+grow.
 
 Differentiable once, with respect to x, v, mass, volume, C, F, J, history, parameters, gravity and impulse. Autograd
 keeps the arguments of a call and the record, mostly none: 2 D + 2 D² numbers per particle of a solid (24 in 3-D) and
