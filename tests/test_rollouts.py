@@ -536,11 +536,49 @@ def test_a_clock_of_each_scene_with_one_time_step(device):
     torch.testing.assert_close(end.time, expected.time)
     assert_equal(end.replace(time=0.0), expected.replace(time=0.0))
     for dt, reason in (
-        (torch.tensor([DT], dtype=F64, device=device), "dt is a tensor, but not one of each scene in float64"),
-        (torch.full((3,), DT, dtype=torch.float32, device=device), "dt is a tensor, but not one of each scene"),
+        (torch.full((3,), DT, dtype=torch.float32, device=device), "dt is a tensor, but not in float64"),
         (torch.full((3,), DT, dtype=F64, device=device, requires_grad=True), "dt requires a gradient"),
     ):
         assert reason in step.explain(state, dt)
+
+
+@pytest.mark.parametrize("shape", [(), (1,)], ids=str)
+@pytest.mark.parametrize("paused", [False, True])
+def test_one_tensor_for_all_scenes(device, shape, paused):
+    dt = torch.full(shape, 0.0 if paused else DT, dtype=F64, device=device)
+    (step, state), (again, _) = each_scene(device), each_scene(device)
+    for _ in range(2):  # the second from a time that is such a tensor
+        assert in_one_op(step, state) and step.explain(state, dt) == "all steps in one op"
+        with torch.no_grad():
+            end, expected = mpm.rollout(step, state, 5, dt), one_by_one(again, state, 5, dt)
+        assert end.time.shape == expected.time.shape == shape
+        torch.testing.assert_close(end.time, expected.time)
+        assert_equal(end.replace(time=0.0), expected.replace(time=0.0))
+        state = end
+    again.law, again.grid = mpm.NeoHookean(E=1e4, nu=0.3), box()  # of one scene
+    alone = blob(device).replace(time=torch.zeros(shape, dtype=F64, device=device))
+    assert again.explain(alone, dt) == "all steps in one op"
+
+
+@pytest.mark.parametrize("gradient", [False, True])
+def test_a_call_of_the_op_by_training_code(device, gradient):
+    """With the arguments that `rollout` would give, some of them exchanged."""
+    step = mpm.Step(box(), mpm.NeoHookean(E=1e4, nu=0.3), gravity=(0.0, -9.8, 0.0), walls="separate")
+    state = blob(device)
+    faster = (2 * state.v).requires_grad_(gradient)
+    with torch.set_grad_enabled(gradient):
+        arguments = mpm.substeps_arguments(step, state.replace(v=faster), 7, DT)
+        x, v, *rest = torch.ops.torch_mpm.substeps(**arguments)
+        expected = mpm.rollout(step, state.replace(v=faster), 7, DT)
+        pairs = [(x, expected.x), (v, expected.v), (rest[1], expected.F)]
+        if gradient:
+            pairs += [tuple(torch.autograd.grad(t.square().sum(), faster)[0] for t in (x, expected.x))]
+    for found, other in pairs:
+        assert float((found - other).abs().max() / other.abs().max()) < TOLERANCE["rollout"][F64]
+    names = [a.name for a in torch.ops.torch_mpm.substeps.default._schema.arguments]
+    assert list(arguments) == names
+    with pytest.raises(ValueError, match="substeps` can take, got one of which it calls on_grid"):
+        mpm.substeps_arguments(mpm.Step(box(), step.law, on_grid=lambda b, v, m, dt: v), state, 7, DT)
 
 
 def test_a_law_with_its_own_update_is_not_replaced(device):

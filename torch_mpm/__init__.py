@@ -35,7 +35,7 @@ from .ops import (
 from .parameters import PerMaterial, Table
 from .recording import Frames, frames
 from .rollout_estimate import RolloutEstimate, estimate_rollout
-from .rollouts import rollout
+from .rollouts import rollout, substeps_arguments
 from .state import State
 from .step import Step
 
@@ -90,6 +90,7 @@ __all__ = [
     "scatter",
     "seed",
     "stable_dt",
+    "substeps_arguments",
     "svd3",
 ]
 

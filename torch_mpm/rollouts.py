@@ -26,6 +26,7 @@ from .ops.arguments import split_dt
 from .ops.autograd import dispatch
 from .ops.contact import MAX_OBSTACLES, fusible, obstacle_arguments
 from .ops.grid_update import per_scene, wall_arguments
+from .ops.substeps import ARGUMENTS
 from .ops.transfer import STRESS_FORMS
 from .parameters import Overlay, has_hooks
 from .pause import paused
@@ -168,8 +169,8 @@ def obstacle_to_substeps(step: Step, state: State, dt: float | Tensor) -> str | 
     for name, value in (("dt", dt), ("the time of the state", state.time)):
         if isinstance(value, Tensor) and value.requires_grad and torch.is_grad_enabled():
             return f"{name} requires a gradient"
-        if isinstance(value, Tensor) and (value.shape != (step.grid.scenes,) or value.dtype != x.dtype):
-            return f"{name} is a tensor, but not one of each scene in {str(x.dtype).removeprefix('torch.')}"
+        if isinstance(value, Tensor) and value.dtype != x.dtype:
+            return f"{name} is a tensor, but not in {str(x.dtype).removeprefix('torch.')}"
     transformed = torch._C._are_functorch_transforms_active() or forward_ad._current_level >= 0
     if torch.compiler.is_compiling() or is_traced(x) or is_captured(x) or transformed:
         return "it is compiled, captured or transformed"
@@ -357,41 +358,78 @@ def _clocks(state: State, dt: float | Tensor, scenes: int) -> tuple[float, Tenso
         return number, None, None
 
     def each(value: float | Tensor) -> Tensor:
-        return (value if isinstance(value, Tensor) else state.x.new_full((scenes,), value)).contiguous()
+        given = value.reshape(-1) if isinstance(value, Tensor) else state.x.new_full((1,), value)
+        return given.expand(scenes).contiguous()
 
     return 1.0, each(dt), each(state.time)
 
 
-def _substeps(step: Step, state: State, n: int, dt: float | Tensor, records: bool, blocks: int | None) -> State:
-    """`substeps` of a prepared state, where no scene is paused."""
-    grid, record = step.grid, step._activations
+def substeps_arguments(
+    step: Step, state: State, n: int, dt: float | Tensor, records: bool = False, blocks: int | None = None
+) -> dict[str, Any]:
+    """The arguments of `torch.ops.torch_mpm.substeps` by name, for training code that calls the op itself.
+
+    The op knows no paused scenes: each entry of a tensor dt must be positive. `Step.check` does not see its steps; its
+    status is the one after them, for which `previous_status` is the one before.
+
+    Args:
+        step, state, n, dt: as `rollout`; n at most 65536.
+        records: whether the op keeps what gradients need, or its backward pass takes the steps again.
+        blocks: for which the pool has room; None for as many as the grid has now, which on CUDA must be enough for all
+            steps.
+
+    Raises:
+        ValueError: where the op cannot take the steps, and why.
+    """
+    if (reason := obstacle_to_substeps(step, state, dt)) is not None:
+        raise ValueError(f"step must be one that `substeps` can take, got one of which {reason}")
+    return _arguments(step, step.prepare(state), n, dt, records, blocks)[0]
+
+
+def _arguments(
+    step: Step, state: State, n: int, dt: float | Tensor, records: bool, blocks: int | None
+) -> tuple[dict[str, Any], list[list[str]]]:
+    """Those of the op, in its order, and the names of the history of each law; of a prepared state."""
+    grid = step.grid
     number, scene_dt, scene_time = _clocks(state, dt, grid.scenes)
     pool = grid.pool(state.x, state.scene)
-    max_blocks = pool if blocks is None else max(pool, blocks)
     given: Any = Overlay(state, dt=dt)
     calls = law_calls(step.law, given)
     apic = step.transfer == "apic"
     with_gradient = wants_gradient(step, state)
-    x, v, C, F, J, history, status, impulse, time, _ = dispatch(
-        torch.ops.torch_mpm.substeps,
+    arguments = (
         *(state.x, state.v, state.mass, state.volume, state.C, state.F, state.J),
-        *(calls.history, state.scene, state.ids, calls.material, record.status),
+        *(calls.history, state.scene, state.ids, calls.material, step._activations.status),
         *(calls.names, calls.options, calls.parameters, calls.variables),
         *(int(n), number, apic, step._flip_share, apic or step.law.viscous, STRESS_FORMS[step.stress_form]),
         _gravity(step, state.x),
         *wall_arguments(step.walls, grid),
         *obstacle_arguments(step.boundaries.entries, state.x, grid.scenes),
-        *(0.0 if scene_time is not None else float(state.time), grid.scenes, max_blocks, grid.grows),
-        *(not with_gradient, with_gradient and records),
+        *(0.0 if scene_time is not None else float(state.time), grid.scenes),
+        *(pool if blocks is None else max(pool, blocks), grid.grows, not with_gradient, with_gradient and records),
         *(state.impulse, scene_dt, scene_time, *grid.packed),
     )
+    return dict(zip(ARGUMENTS, arguments, strict=True)), calls.history_names
+
+
+def _substeps(step: Step, state: State, n: int, dt: float | Tensor, records: bool, blocks: int | None) -> State:
+    """`substeps` of a prepared state, where no scene is paused."""
+    grid, record = step.grid, step._activations
+    arguments, history_names = _arguments(step, state, n, dt, records, blocks)
+    x, v, C, F, J, history, status, impulse, time, _ = dispatch(torch.ops.torch_mpm.substeps, *arguments.values())
     record.follow(record.status, status)
     grid.watch(status)
     if status.device.type == "cpu":  # where the op has let the pool grow, or stopped
         grid.follow(int(status[0, 0] if grid.grows else status[0, 7]))
-    extra = _history(state, calls.history_names, history)
-    time = time_after(state.time, dt, n) if scene_time is None else time.detach()
-    return state.replace(x=x, v=v, C=C, F=F, J=J, extra=extra, time=time, impulse=impulse)
+    extra = _history(state, history_names, history)
+    now = time_after(state.time, dt, n) if time is None else _in_shape(time.detach(), state.time, dt)
+    return state.replace(x=x, v=v, C=C, F=F, J=J, extra=extra, time=now, impulse=impulse)
+
+
+def _in_shape(times: Tensor, time: float | Tensor, dt: float | Tensor) -> Tensor:
+    """Times of each scene as the sum of a time and dt has them: one where all have the same."""
+    shape = torch.broadcast_shapes(*(t.shape for t in (time, dt) if isinstance(t, Tensor)))
+    return times if times.shape == shape else times[:1].reshape(shape)
 
 
 def _gravity(step: Step, x: Tensor) -> Tensor | None:

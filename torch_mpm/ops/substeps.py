@@ -6,6 +6,8 @@
         max_blocks, grows, resident, records, impulse, scene_dt, scene_time, lattice, layout)
         -> (x, v, C, F, J, history, status, impulse, time, record)
 
+`torch_mpm.substeps_arguments(step, state, n, dt)` makes the arguments; docs/training.md has a call.
+
 Particles and their history are those of `State`, the grid's arguments those of `activate`, `grid_update` and `contact`.
 `laws` are names of `LAWS` parted by commas, law k for the particles of material k; their options, parameters and
 history variables follow one another, `variables` of the latter for each law. The time step dt [s] is part of the
@@ -51,6 +53,8 @@ MASS, VOLUME, PARAMETERS, GRAVITY = 1, 2, 4, 8
 """Bits of `needs` in csrc/rollout/substeps_backward.op.cpp."""
 
 _SCHEMA = {a.name: str(a.type) for a in torch.ops.torch_mpm.substeps.default._schema.arguments}
+ARGUMENTS = tuple(_SCHEMA)
+"""Names of the arguments of `substeps`."""
 _TENSORS = [name for name, kind in _SCHEMA.items() if kind in ("Tensor", "Optional[Tensor]")]
 _ADJOINTS = ("x", "v", "C", "F", "J", "history", "mass", "volume", "parameters", "gravity")
 
@@ -63,7 +67,7 @@ def _fake(
     x: Tensor, v: Tensor, mass: Tensor, volume: Tensor, C: Any, F: Any, J: Any, history: list[Tensor], *rest: Any
 ) -> tuple[Tensor | None, ...]:
     P, D = sizes(x, "x", 2)
-    given = dict(zip(list(_SCHEMA)[8:], rest, strict=True))
+    given = dict(zip(ARGUMENTS[8:], rest, strict=True))
     wants_C, scenes, impulse = given["wants_C"], given["scenes"], given["impulse"]
     return (
         soa_empty(x, (P, D)),
