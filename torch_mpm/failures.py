@@ -204,6 +204,24 @@ def unsolved_steps(unsolved: Tensor, residual: Tensor) -> dict[str, Problem]:
     }
 
 
+def _full_grid(grid: Grid, peak: int, when: str, comes_first: bool) -> str:
+    """A sentence about a grid that had no room for the most active blocks, `peak`; "" where it had.
+
+    A pool that grows may be larger by now: there the status alone remembers, if this `comes_first` of all problems.
+    """
+    if grid.grows and comes_first:
+        return (
+            f"up to {peak} blocks were active, more than the pool of the grid had room for in some steps{when}: it "
+            f"follows the scene between calls, so take fewer steps in a call, or pass max_blocks={peak + peak // 2}"
+        )
+    if grid.grows or grid.max_blocks is None or peak <= grid.max_blocks:
+        return ""
+    return (
+        f"{peak} blocks were active but the grid has max_blocks={grid.max_blocks}{when}: "
+        "pass a larger max_blocks, or None to let it grow"
+    )
+
+
 def raise_failures(failures: Failures, statuses: Iterable[Tensor], grid: Grid) -> None:
     """Raise one error for all problems of scenes, particles without a scene and a full grid; synchronises.
 
@@ -223,12 +241,10 @@ def raise_failures(failures: Failures, statuses: Iterable[Tensor], grid: Grid) -
                 f"{outside + lost} particles have a scene id outside the {grid.scenes} scenes of the grid, first at "
                 f"step {step}: give each particle a scene from 0 to {grid.scenes - 1}"
             )
-        if grid.max_blocks is not None and peak > grid.max_blocks:
-            when = "" if outside + lost > 0 or any(row[6] >= 0 for row in scenes) else f", first at step {step}"
-            full = (
-                f"{peak} blocks were active but the grid has max_blocks={grid.max_blocks}{when}: "
-                "pass a larger max_blocks, or None to let it grow"
-            )
+        of_particles = outside + lost > 0 or any(row[6] >= 0 for row in scenes)
+        comes_first = step >= 0 and outside + lost == 0 and all(row[6] != step for row in scenes)
+        when = "" if of_particles else f", first at step {step}"
+        full = full or _full_grid(grid, peak, when, comes_first)
     if sentences:
         raise SimulationError("\n".join(sentences + [full] * bool(full)), failures)
     if full:
