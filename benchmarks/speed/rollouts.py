@@ -35,7 +35,7 @@ SCENES = {"cpu": ("demo", "batch"), "cuda": ("demo", "batch", "sand_column", "sa
 SIDES = {"cpu": (4, 10, 22, 46, 64, 100, 200), "cuda": (4, 10, 22, 46, 100, 200, 464)}
 BATCHES = {"cpu": ((64, 512),), "cuda": ((4096, 512), (1024, 2197))}
 """Scenes, and particles of each."""
-DOMAINS = {"cpu": (1, 4), "cuda": (1, 8, 16)}
+DOMAINS = {"cpu": (1, 4, 32), "cuda": (1, 8, 16)}
 """Cells along a side of the domain, in those of its cube."""
 DOMAIN_SIDE = {"cpu": 64, "cuda": 100}
 """Of that cube."""
@@ -49,7 +49,9 @@ LAW_SIDES = {"cpu": (64,), "cuda": (100, 200)}
 DETERMINISTIC = {"cpu": (), "cuda": (22, 46, 100)}
 """Sides of the cubes, some of SIDES, whose results are bit-identical from run to run; on a CPU all are."""
 PEER_SIDES = {"cpu": (10, 64), "cuda": (4, 22, 46, 100, 200)}
-"""Of the cubes that peers take too, some of SIDES. The batches and domains above are theirs too."""
+"""Of the cubes that peers take too, some of SIDES. The batches above are theirs too."""
+PEER_DOMAINS = {"cpu": (4,), "cuda": (8, 16)}
+"""Of DOMAINS, those of which a dense grid fits into memory."""
 SECONDS = 0.5
 """Of steps in one measurement, about."""
 
@@ -163,7 +165,7 @@ def of_peers(device: str, rollouts: list[dict[str, Any]]) -> Iterator[dict[str, 
     programs = [("one scene", PEER_SIDES[device], [])]
     for scenes, particles in BATCHES[device]:
         programs.append((f"{scenes} scenes", [side_of(particles)], ["--scenes", str(scenes)]))
-    for times in DOMAINS[device][1:]:
+    for times in PEER_DOMAINS[device]:
         programs.append((name_of_domain(times, DOMAIN_SIDE[device]), [DOMAIN_SIDE[device]], ["--domain", str(times)]))
     for peer in filter(peers.is_installed, peers.PEERS):
         for work_name, sides, options in programs:

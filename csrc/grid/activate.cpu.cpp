@@ -6,14 +6,14 @@
 #include "grid/status.h"
 
 // Finds the active blocks, numbers them in the order of the table, groups the particles by base block with a stable
-// counting sort, and writes the schedule. Every result is the same for any number of threads.
+// counting sort, and writes the schedule. Every result is the same for any number of threads. What it costs follows the
+// particles: of the table only tiles with active blocks are looked at.
 namespace mpm::cpu {
 inline namespace TORCH_MPM_ISA {
 
 using W = ActivateWorkspace;
 
-constexpr int64_t kWorthThreads =
-    8192;  // items of particles or of the table below which threads cost more than they give
+constexpr int64_t kWorthThreads = 8192;  // particles or slots below which threads cost more than they give
 
 // Calls f(part, begin, end) for `parts` nearly equal parts of [0, count), in parallel.
 template <class F>
@@ -53,6 +53,17 @@ struct Activation {
   }
 
   int64_t* totals(int slice) const { return w.totals + slice * W::kTotals; }
+  int* count(int slice) const { return w.count + int64_t(slice) * a.max_blocks; }
+
+  // visit(first particle, particles) for the runs of a slice.
+  template <class F>
+  void for_runs(int slice, int64_t begin, int64_t end, const F& visit) const {
+    const int64_t runs = totals(slice)[W::kRuns];
+    for (int64_t r = 0; r < runs; r++) {
+      const int first = w.run[begin + r];
+      visit(first, (r + 1 < runs ? w.run[begin + r + 1] : int(end)) - first);
+    }
+  }
 
   // Replaces an entry of the totals by the sum over the slices before; returns the sum over all.
   int64_t scan(int which) const {
@@ -157,16 +168,22 @@ MPM_HD unsigned touched_blocks_of_cell(int cell) {
   return touched_blocks<Order, D>(local);
 }
 
-// Particles of each base block in a slice, and the blocks they touch. Particles that follow each other are mostly of
-// one base block: such runs are counted, and later placed, together.
-template <int Order, class T, int D>
-void count_particles(const Activation<T, D>& s, int slice, int64_t begin, int64_t end) {
-  int* count = s.w.count + slice * s.table_size;
-  uint8_t* touched = s.w.touched + slice * s.table_size;
+// Entries of the table while its active blocks are not numbered: all bits are set where nothing is known; bit o is
+// clear if particles of the block touch its neighbour o, and kActive if those of another one touch the block.
+constexpr int kActive = 1 << 8;
+
+// Of an entry where bits are cleared.
+template <class T, int D>
+void mark_tile(const Activation<T, D>& s, int64_t entry) {
+  __atomic_fetch_or(s.w.marked + entry / kTile / 64, 1ull << entry / kTile % 64, __ATOMIC_RELAXED);
+}
+
+// Particles that follow each other are mostly of one base block: such runs are counted, and later placed, together.
+// `Marks` what they touch in the table.
+template <int Order, bool Marks, class T, int D>
+void find_runs(const Activation<T, D>& s, int slice, int64_t begin, int64_t end) {
   uint8_t touched_of[kBlockNodes<D>];
   for (int cell = 0; cell < kBlockNodes<D>; cell++) touched_of[cell] = uint8_t(touched_blocks_of_cell<Order, D>(cell));
-  __builtin_memset(count, 0, sizeof(int) * s.table_size);
-  __builtin_memset(touched, 0, s.table_size);
   int64_t dropped = 0, runs = 0;
   for (int64_t p = begin; p < end;) {
     s.w.run[begin + runs++] = int(p);
@@ -176,63 +193,73 @@ void count_particles(const Activation<T, D>& s, int slice, int64_t begin, int64_
     for (; p < end && s.w.key[p] == key; p++) blocks |= key < 0 ? 0 : touched_of[s.w.cell[p]];
     if (key < 0) {
       dropped += p - first;
-    } else {
-      count[key] += int(p - first);
-      touched[key] |= uint8_t(blocks);
+    } else if (Marks) {
+      const int before = __atomic_load_n(s.a.table + key, __ATOMIC_RELAXED);
+      if (!(before & int(blocks))) continue;
+      if (before == -1) mark_tile(s, key);
+      __atomic_fetch_and(s.a.table + key, ~int(blocks), __ATOMIC_RELAXED);
     }
   }
   s.totals(slice)[W::kDropped] = dropped;
   s.totals(slice)[W::kRuns] = runs;
 }
 
-// Sets the table to 1 at each block that the particles of base blocks [begin, end) touch.
+// Takes out of the table what the activation before has put there: the blocks at the beginning of `block`.
 template <class T, int D>
-void mark_touched(const Activation<T, D>& s, int64_t begin, int64_t end) {
-  const auto touched_from = [&]<class Blocks>(int64_t base_block) {  // of one base block, or of eight in a row
-    Blocks blocks = 0;
-    for (int k = 0; k < s.w.slices; k++) {
-      Blocks of_slice;
-      __builtin_memcpy(&of_slice, s.w.touched + k * s.table_size + base_block, sizeof(Blocks));
-      blocks |= of_slice;
-    }
-    return blocks;
-  };
-  for (int64_t base_block = begin; base_block < end; base_block++) {
-    if (base_block + 8 <= end &&
-        !touched_from.template operator()<uint64_t>(base_block)) {  // most base blocks have no particles
-      base_block += 7;
-      continue;
-    }
-    const unsigned blocks = touched_from.template operator()<uint8_t>(base_block);
-    for (int o = 0; o < kColours<D>; o++)
-      if (blocks >> o & 1) __atomic_store_n(s.a.table + base_block + s.neighbour[o], 1, __ATOMIC_RELAXED);
-  }
+void take_back(const Activation<T, D>& s) {
+  const ActivateArguments<T, D>& a = s.a;
+  for (int64_t slot = 0; slot < a.slots() && a.block[slot] >= 0; slot++) a.table[a.block[slot]] = -1;
 }
 
-// Numbers the active blocks in the order of the table; returns how many there are.
+// Numbers the active blocks in the order of the table, and takes the marks off the tiles; returns how many there are.
+// Particles touch no block before their own one, so that everything is known of an entry when its turn comes.
 template <class T, int D>
 int64_t number_blocks(const Activation<T, D>& s) {
   const ActivateArguments<T, D>& a = s.a;
-  for_parts(s.w.slices, s.table_size, [&](int, int64_t begin, int64_t end) {
-    for (int64_t b = begin; b < end; b++) a.table[b] = 0;
-  });
-  for_parts(s.w.slices, s.table_size, [&](int, int64_t begin, int64_t end) { mark_touched(s, begin, end); });
-  for_parts(s.w.slices, s.table_size, [&](int slice, int64_t begin, int64_t end) {
-    int64_t active = 0;
-    for (int64_t b = begin; b < end; b++) active += a.table[b];
-    s.totals(slice)[W::kActive] = active;
-  });
-  const int64_t wanted = s.scan(W::kActive);
-  for_parts(s.w.slices, s.table_size, [&](int slice, int64_t begin, int64_t end) {
-    int64_t next = s.totals(slice)[W::kActive];
-    for (int64_t b = begin; b < end; b++) {
-      const bool given = a.table[b] && next < a.max_blocks;
-      next += a.table[b];
-      a.table[b] = given ? int(next - 1) : -1;
-      if (given) a.block[next - 1] = int(b);
+  int64_t next = 0;
+  const auto number = [&](int64_t b) {
+    const unsigned known = unsigned(~a.table[b]);
+    if (!known) return;
+    for (int o = 1; o < kColours<D>; o++) {
+      if (!(known >> o & 1)) continue;
+      const int64_t other = b + s.neighbour[o];
+      if (a.table[other] == -1) mark_tile(s, other);
+      a.table[other] &= ~kActive;
     }
+    const bool given = next < a.max_blocks;
+    a.table[b] = given ? int(next) : -1;
+    if (given) a.block[next] = int(b);
+    next++;
+  };
+  constexpr int kRow = 16;  // entries that are looked at together
+  for (int64_t word = 0; word < s.w.words; word++)
+    while (s.w.marked[word]) {
+      const int64_t begin = (word * 64 + __builtin_ctzll(s.w.marked[word])) * kTile;
+      const int64_t end = begin + kTile < s.table_size ? begin + kTile : s.table_size;
+      for (int64_t b = begin; b < end; b += kRow) {
+        const int count = end - b < kRow ? int(end - b) : kRow;
+        int all = -1;
+        if (count == kRow)
+          for (int k = 0; k < kRow; k++) all &= a.table[b + k];
+        if (count == kRow && all == -1) continue;
+        for (int k = 0; k < count; k++) number(b + k);
+      }
+      s.w.marked[word] &= s.w.marked[word] - 1;
+    }
+  return next;
+}
+
+// Particles of each slot in a slice; the keys of runs become slots.
+template <class T, int D>
+void count_particles(const Activation<T, D>& s, int slice, int64_t begin, int64_t end, int64_t slots) {
+  int* count = s.count(slice);
+  __builtin_memset(count, 0, sizeof(int) * slots);
+  s.for_runs(slice, begin, end, [&](int first, int particles) {
+    int& key = s.w.key[first];
+    if (key < 0) return;
+    key = s.a.table[key];
+    count[key] += particles;
   });
-  return wanted;
 }
 
 // After an overflow: particles that touch a block without a slot are not transferred.
@@ -254,7 +281,7 @@ int64_t place_slots(const Activation<T, D>& s, int64_t slots) {
   for_parts(s.w.slices, slots, [&](int slice, int64_t begin, int64_t end) {
     int64_t particles = 0;
     for (int64_t slot = begin; slot < end; slot++)
-      for (int k = 0; k < s.w.slices; k++) particles += s.w.count[k * s.table_size + a.block[slot]];
+      for (int k = 0; k < s.w.slices; k++) particles += s.count(k)[slot];
     s.totals(slice)[W::kParticles] = particles;
   });
   const int64_t transferred = s.scan(W::kParticles);
@@ -263,7 +290,7 @@ int64_t place_slots(const Activation<T, D>& s, int64_t slots) {
     for (int64_t slot = begin; slot < end; slot++) {
       a.offsets[slot] = next;
       for (int k = 0; k < s.w.slices; k++) {
-        int& count = s.w.count[k * s.table_size + a.block[slot]];
+        int& count = s.count(k)[slot];
         const int n = count;
         count = next;
         next += n;
@@ -278,21 +305,19 @@ int64_t place_slots(const Activation<T, D>& s, int64_t slots) {
 // Writes the index; `outside` is where the slice puts the particles that are not transferred.
 template <class T, int D>
 void fill_index(const Activation<T, D>& s, int slice, int64_t begin, int64_t end, int64_t outside) {
-  int* next = s.w.count + slice * s.table_size;
-  const int64_t runs = s.totals(slice)[W::kRuns];
-  for (int64_t r = 0; r < runs; r++) {
-    const int first = s.w.run[begin + r], count = (r + 1 < runs ? s.w.run[begin + r + 1] : int(end)) - first;
-    const int key = s.w.key[first];
-    const int64_t place = key < 0 ? outside : next[key];
+  int* next = s.count(slice);
+  s.for_runs(slice, begin, end, [&](int first, int count) {
+    const int slot = s.w.key[first];
+    const int64_t place = slot < 0 ? outside : next[slot];
     int* index = s.a.index + place;
     for (int i = 0; i < count; i++) index[i] = first + i;
-    if (key < 0) {
+    if (slot < 0) {
       outside += count;
     } else {
       __builtin_memcpy(s.w.cell_at + place, s.w.cell + first, count);
-      next[key] += count;
+      next[slot] += count;
     }
-  }
+  });
 }
 
 // Lists the base blocks by colour and the chunks of each; returns the number of chunks.
@@ -416,17 +441,23 @@ void write_status(const Activation<T, D>& s, int64_t wanted, int64_t transferred
 template <int Order, class T, int D>
 void activate(const ActivateArguments<T, D>& a) {
   const Activation<T, D> s(a);
+  if (a.fresh)  // the table has no block yet
+    __builtin_memset(s.w.marked, 0, sizeof(uint64_t) * s.w.words);
+  else
+    take_back(s);
   for_parts(s.w.slices, a.particles, [&](int slice, int64_t begin, int64_t end) {
     classify_slice<Order>(s, begin, end);
-    count_particles<Order>(s, slice, begin, end);
+    find_runs<Order, true>(s, slice, begin, end);
   });
   const int64_t wanted = number_blocks(s);
-  if (wanted > a.max_blocks)
-    for_parts(s.w.slices, a.particles, [&](int slice, int64_t begin, int64_t end) {
-      drop_particles_without_slot<Order>(s, begin, end);
-      count_particles<Order>(s, slice, begin, end);
-    });
   const int64_t slots = wanted < a.max_blocks ? wanted : a.max_blocks;
+  for_parts(s.w.slices, a.particles, [&](int slice, int64_t begin, int64_t end) {
+    if (wanted > slots) {
+      drop_particles_without_slot<Order>(s, begin, end);
+      find_runs<Order, false>(s, slice, begin, end);
+    }
+    count_particles(s, slice, begin, end, slots);
+  });
   const int64_t transferred = place_slots(s, slots);
   s.scan(W::kDropped);
   for_parts(s.w.slices, a.particles, [&](int slice, int64_t begin, int64_t end) {

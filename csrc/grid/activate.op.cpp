@@ -1,7 +1,38 @@
 #include "grid/activate.op.h"
 
+#if MPM_BACKEND == MPM_BACKEND_IS_cpu
+#include <cstring>
+
+#include "cpu/ones.h"
+#endif
+
 // Finds the blocks that particles touch and groups the particles by the block of their base node.
 namespace mpm {
+
+#if MPM_BACKEND == MPM_BACKEND_IS_cpu
+Tensor new_table(const Tensor& like, int64_t entries) {
+  const int64_t bytes = entries * int64_t(sizeof(int));
+  if (void* const data = bytes < cpu::kOnes ? nullptr : cpu::take_ones(bytes))
+    return torch::stable::from_blob(data, Shape{entries}, Shape{1}, like.device(), ScalarType::Int,
+                                    [bytes](void* data) { cpu::give_back_ones(data, bytes); });
+  Tensor table = empty_int(like, {entries});
+  empty_table(table);
+  return table;
+}
+
+void empty_table(Tensor& table) {
+  constexpr int64_t grain = 1 << 16;  // entries that one thread sets sooner than it calls others
+  cpu::parallel_for(
+      table.numel(), grain,
+      [](void* data, int64_t begin, int64_t end) {
+        std::memset(static_cast<int*>(data) + begin, 0xff, size_t(end - begin) * sizeof(int));
+      },
+      table.data_ptr());
+}
+#else
+Tensor new_table(const Tensor& like, int64_t entries) { return empty_int(like, {entries}); }
+#endif
+
 namespace {
 
 std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> activate(

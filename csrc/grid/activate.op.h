@@ -33,16 +33,22 @@ ActivateArguments<T, D> activate_arguments(const PackedLattice& packed, const Te
   return a;
 }
 
+// A table for new activations. On the CPU no block has a slot yet, for which of a large table nothing is written.
+Tensor new_table(const Tensor& like, int64_t entries);
+
+// On the CPU, of a table in other memory.
+void empty_table(Tensor& table);
+
 // The results of an activation but for its status, and its work space.
 struct ActivationTensors {
   Tensor table, block, offsets, index, schedule, workspace;
 
-  // For the arguments' number of blocks, by allocate(shape).
+  // For the arguments' number of blocks, all but the table by allocate(shape).
   template <class T, int D, class Allocate>
-  void lay_out(ActivateArguments<T, D>& a, const Allocate& allocate) {
+  void lay_out(ActivateArguments<T, D>& a, const Tensor& given_table, const Allocate& allocate) {
     const int64_t slots = a.slots();
     a.schedule_size = schedule_size<D>(slots, a.particles);
-    table = allocate({a.scenes * a.geometry.blocks_per_scene});
+    table = given_table;
     block = allocate({slots});
     offsets = allocate({slots + 1});
     index = allocate({a.particles});
@@ -50,13 +56,18 @@ struct ActivationTensors {
   }
 
   template <class T, int D>
+  static int64_t table_size(const ActivateArguments<T, D>& a) {
+    return int64_t(a.scenes) * a.geometry.blocks_per_scene;
+  }
+
+  template <class T, int D>
   void make(const Tensor& x, ActivateArguments<T, D>& a, backend::Stream stream) {
-    lay_out(a, [&](const Shape& shape) { return empty_int(x, shape); });
+    lay_out(a, new_table(x, table_size(a)), [&](const Shape& shape) { return empty_int(x, shape); });
     a.workspace_size = backend::activate_workspace(a, stream);
     use(a, empty(x, {a.workspace_size}, ScalarType::Byte));
   }
 
-  // The arguments write here from now on.
+  // The arguments write here from now on, at first into a table without blocks.
   template <class T, int D>
   void use(ActivateArguments<T, D>& a, const Tensor& memory) {
     workspace = memory;

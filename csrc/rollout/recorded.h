@@ -270,7 +270,10 @@ bool Recorded<T, D>::take() {
   if (keeps_grids_) backend::clear(nodes_, stream_);
   for (int64_t i = 0; i < in_.n; i++) {
     steps.nodes_are_clear = keeps_grids_;
-    if (keeps_grids_) use(grid(i));
+    if (keeps_grids_) {
+      use(grid(i));
+      if constexpr (MPM_BACKEND == MPM_BACKEND_IS_cpu) empty_table(steps.pool.active.table);
+    }
     read(i);
     set_time(i);
     if (!activate(i)) return false;

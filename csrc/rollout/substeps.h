@@ -149,7 +149,7 @@ struct Pool {
   template <class Ints, class Numbers>
   void lay_out(const Tensor& given, ActivateArguments<T, D>& a, bool obstacles, const Ints& ints,
                const Numbers& numbers) {
-    active.lay_out(a, ints);
+    active.lay_out(a, ints({ActivationTensors::table_size(a)}), ints);
     nodes = given;
     updated = numbers(nodes_shape(a));
     if (obstacles) velocity = numbers(nodes_shape(a));
