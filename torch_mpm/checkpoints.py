@@ -16,6 +16,7 @@ from torch.utils import _pytree
 from .activation_record import aside
 from .errors import check_count, check_flag, check_number
 from .grid import same_pools
+from .recompute import called_again
 from .state import State
 
 Advance = Callable[[State, int, int], State]
@@ -132,8 +133,6 @@ def recomputed(advance: Advance, state: State, count: int, first: int, step: Any
 
     A second time the steps find the pools of the first one, and do not count for `check` of the step.
     """
-    from torch.utils.checkpoint import checkpoint  # whose first call imports for seconds
-
     leaves, layout = _pytree.tree_flatten(state)
     again, pools = False, list[int]()
 
@@ -147,7 +146,7 @@ def recomputed(advance: Advance, state: State, count: int, first: int, step: Any
             again = True
             return advance(given, count, first)
 
-    result: State = checkpoint(steps, *leaves, use_reentrant=False)
+    result: State = called_again(steps, *leaves)
     return result
 
 

@@ -1,0 +1,145 @@
+"""Functions that the backward pass calls again instead of keeping what their gradient needs.
+
+As `torch.utils.checkpoint` does without reentrance, whose first call imports compilers for seconds: what autograd would
+keep of the function is a place, and the first place that is asked for in a backward pass has the function called again
+and all of them filled. So gradients of all orders pass, also to tensors that are not among the arguments.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import uuid
+import weakref
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+
+def called_again(function: Callable[..., Any], *tensors: Tensor) -> Any:
+    """`function(*tensors)`, of which autograd keeps the arguments alone.
+
+    The function is called again with the random numbers, the autocast and the default device of the first time.
+
+    Raises:
+        RuntimeError: in the backward pass, where the function does something else the second time.
+    """
+    if not torch.is_grad_enabled():
+        return function(*tensors)
+    call = _Call(function, tensors)
+    with torch.autograd.graph.saved_tensors_hooks(call.pack, call.unpack):
+        return function(*tensors)
+
+
+class _Arguments(torch.autograd.Function):
+    """A node of no graph, which keeps tensors as autograd does: around an outer function that is called again, too."""
+
+    @staticmethod
+    def forward(anchor: Tensor, *tensors: Tensor) -> Tensor:
+        return anchor.clone()
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor, ...], output: Tensor) -> None:
+        ctx.save_for_backward(*inputs[1:])
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Any) -> Any:
+        raise AssertionError("nothing follows from this node")
+
+    @staticmethod
+    def jvp(ctx: Any, *tangents: Any) -> Tensor:
+        return torch.zeros(0)
+
+
+class _Place:
+    """In the place of a tensor that autograd keeps, and what it is in backward passes that have called again."""
+
+    def __init__(self, t: Tensor) -> None:
+        self.kind = _kind(t)
+        self.values: dict[int, Tensor] = {}
+
+
+class _AllFound(Exception):
+    """All places are filled: the rest of the function need not be called."""
+
+
+class _Call:
+    def __init__(self, function: Callable[..., Any], tensors: Sequence[Tensor]) -> None:
+        self._function = function
+        self._arguments: Any = _Arguments.apply(torch.empty(0, requires_grad=True), *tensors).grad_fn
+        self._places: list[weakref.ref[_Place]] = []
+        self._around = _surroundings({t.device for t in tensors})
+
+    def pack(self, t: Tensor) -> _Place:
+        place = _Place(t)
+        self._places.append(weakref.ref(place))  # such that a tensor goes with what would have used it
+        return place
+
+    def unpack(self, place: _Place) -> Tensor:
+        backward: int = torch._C._current_graph_task_id()
+        if backward == -1:  # somebody looks at a node
+            backward = uuid.uuid4().int
+        if backward not in place.values:
+            self._call_again(backward)
+        return place.values.pop(backward)
+
+    def _call_again(self, backward: int) -> None:
+        found = 0
+
+        def fill(t: Tensor) -> Tensor:
+            nonlocal found
+            t = t.detach() if t.requires_grad else t
+            if found < len(self._places):
+                place = self._places[found]()
+                if place is not None:
+                    if place.kind != _kind(t):
+                        raise RuntimeError(f"{CHANGED}: {_told(place.kind)} the first time, then {_told(_kind(t))}")
+                    place.values[backward] = t
+                found += 1
+                if found == len(self._places):
+                    raise _AllFound
+            return t
+
+        arguments = self._arguments.saved_tensors
+        hooks = torch.autograd.graph.saved_tensors_hooks(fill, lambda t: t)
+        with contextlib.suppress(_AllFound), self._around(), torch.enable_grad(), hooks:
+            self._function(*arguments)
+        if found < len(self._places):
+            raise RuntimeError(f"{CHANGED}: {len(self._places)} tensors the first time, then {found}")
+
+
+CHANGED = "what the backward pass calls again must keep the same tensors for it"
+
+
+def _kind(t: Tensor) -> tuple[Any, ...]:
+    return t.shape, t.dtype, t.device
+
+
+def _told(kind: tuple[Any, ...]) -> str:
+    return f"{list(kind[0])} {kind[1]} on {kind[2]}"
+
+
+def _surroundings(devices: set[torch.device]) -> Callable[[], contextlib.AbstractContextManager[None]]:
+    """The random numbers, autocast and default device of now, to go back to later."""
+    cuda = [device for device in devices if device.type == "cuda"]
+    random = torch.get_rng_state(), {device: torch.cuda.get_rng_state(device) for device in cuda}
+    kinds = {kind for kind in {"cpu", *(d.type for d in devices)} if torch.amp.is_autocast_available(kind)}
+    cast = [(kind, torch.get_autocast_dtype(kind), torch.is_autocast_enabled(kind)) for kind in kinds]
+    caches = torch.is_autocast_cache_enabled()
+    default = torch.get_default_device()
+
+    @contextlib.contextmanager
+    def around() -> Iterator[None]:
+        with contextlib.ExitStack() as stack:
+            stack.enter_context(torch.random.fork_rng(cuda))
+            torch.set_rng_state(random[0])
+            for device, kept in random[1].items():
+                torch.cuda.set_rng_state(kept, device)
+            for kind, dtype, enabled in cast:
+                stack.enter_context(torch.autocast(kind, dtype, enabled, caches))
+            if torch.get_default_device() != default:  # a mode costs in each operation
+                stack.enter_context(default)
+            yield
+
+    return around
