@@ -6,6 +6,7 @@ from . import _library as _library
 from . import containers, laws, ops, particle_operations, seed
 from .adaptive import Arrival, rollout_to
 from .boundaries import SDF, Box, Capsule, Plane, Revolved, Sphere, Walls
+from .captured_steps import captured
 from .cfl import stable_dt
 from .checkpoints import Checkpoints
 from .data.trajectory import Trajectory
@@ -13,7 +14,6 @@ from .environments import Environments
 from .errors import DamagedFileError, GridOverflowError, SimulationError
 from .failures import Failures
 from .gradient_norms import GradientNorms
-from .graphs import captured
 from .grid import Blocks, Grid
 from .heat import Heat
 from .heat import boundaries as heat_boundaries

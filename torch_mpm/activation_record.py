@@ -133,3 +133,34 @@ def aside(step: Any, x: Tensor) -> Iterator[None]:
     finally:
         for owner, name, value in kept:
             setattr(owner, name, value)
+
+
+COUNTS = ("unsolved", "residual")
+"""Attributes of heat that its steps add to."""
+
+
+@contextlib.contextmanager
+def uncounted(step: torch.nn.Module) -> Iterator[None]:
+    """Where explicit steps leave nothing behind in what they tell of the steps so far; but unlike after `aside`, that
+    has its tensors then, in which the steps of graphs go on."""
+    modules: list[Any] = [m for m in step.modules() if hasattr(m, "_activations")]
+    places: list[tuple[Any, str]] = [(m._activations, name) for m in modules for name in ("status", "refused")]
+    places += [(m, name) for m in modules for name in COUNTS if hasattr(m, name)]
+    tensors = [(owner, name, getattr(owner, name)) for owner, name in places]
+    with torch.inference_mode(), outside_transforms():
+        before = [None if t is None else t.clone() for _, _, t in tensors]
+        replayed = [(t, t.clone()) for m in modules for t in m._activations._replayed]
+    try:
+        yield
+    finally:
+        with torch.inference_mode(), outside_transforms():
+            for (owner, name, t), values in zip(tensors, before, strict=True):
+                if t is not None:
+                    t.copy_(values)
+                    setattr(owner, name, t)
+                elif (made := getattr(owner, name)) is not None:
+                    made.zero_()
+                    if name == "status":
+                        made.copy_(torch.tensor(NO_PROBLEM, dtype=torch.int32, device="cpu"))
+            for t, values in replayed:
+                t.copy_(values)

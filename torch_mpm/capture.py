@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import collections
 import contextlib
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from typing import Any
 
 import torch
@@ -75,6 +76,76 @@ class GraphCache:
         if captured:
             remember(self._captured, value)
         return value
+
+
+class Same:
+    """A thing as a part of a key, by identity; the key keeps it, so that no other thing gets its place in memory."""
+
+    def __init__(self, thing: Any) -> None:
+        self._thing = thing
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Same) and self._thing is other._thing
+
+    def __hash__(self) -> int:
+        return id(self._thing)
+
+
+class Recordings:
+    """What was recorded in CUDA graphs, by key; those that were not used for longest go. They share memory, so that one
+    spoils what another has left there. Neither copies nor pickles: a copy of a step begins without.
+
+    Attributes:
+        most: how many are kept.
+        latest: whose results are in the memory; None where they are spoilt.
+        unseen: calls since a device was asked how many blocks are active.
+    """
+
+    most = 8
+
+    def __init__(self) -> None:
+        self.latest: Any = None
+        self.unseen = 0
+        self._kept: collections.OrderedDict[Hashable, Any] = collections.OrderedDict()
+        self._contents: dict[str, list[Tensor]] = {}
+        self._latest_content: dict[str, tuple[Tensor | None, int | None, Tensor]] = {}
+
+    def __reduce__(self) -> tuple[type[Recordings], tuple[()]]:
+        return Recordings, ()
+
+    def __len__(self) -> int:
+        return len(self._kept)
+
+    def get(self, key: Hashable) -> Any:
+        """What was kept under a key, or None."""
+        if key in self._kept:
+            self._kept.move_to_end(key)
+        return self._kept.get(key)
+
+    def keep(self, key: Hashable, recording: Any) -> None:
+        self._kept[key] = recording
+        self._kept.move_to_end(key)
+        if len(self._kept) > self.most:
+            self._kept.popitem(last=False)
+
+    def some(self) -> Any:
+        """One of those that are kept, or None."""
+        return next(iter(self._kept.values()), None)
+
+    def same_content(self, name: str, t: Tensor) -> Tensor:
+        """A tensor with the entries of t, the same one for the same entries: for what is kept of it by identity. Waits
+        for the device where t is another tensor than the last time."""
+        given, before, content = self._latest_content.get(name, (None, None, t))
+        now = version(t)
+        if t is given and now is not None and now == before:
+            return content
+        known = self._contents.setdefault(name, [])
+        alike = [c for c in known if (c.shape, c.device) == (t.shape, t.device) and torch.equal(c, t)]
+        content = alike[0] if alike else t.detach().clone()
+        if not alike:
+            known[:] = [*known[1 - self.most :], content]
+        self._latest_content[name] = t, now, content
+        return content
 
 
 def _same(a: tuple[Any, ...], b: tuple[Any, ...]) -> bool:

@@ -222,6 +222,11 @@ class Grid(Lattice):
         self._pending = torch.cuda.Event()
         self._pending.record(torch.cuda.current_stream(status.device))
 
+    @property
+    def watches(self) -> bool:
+        """Whether a device was asked, by `watch`, and the pool does not follow yet what it told."""
+        return self._pending is not None
+
     def wait(self) -> None:
         """Wait for what `watch` has asked a device for, so that the next activation has room for what it told."""
         if self._pending is not None:
@@ -249,6 +254,17 @@ def same_pools(sizes: list[int]) -> Iterator[None]:
         for grid, latest in _POOLS.before.items():
             grid.max_blocks = max(grid.max_blocks or 0, latest or 0)
         _POOLS.replayed, _POOLS.before = outer, before
+
+
+@contextlib.contextmanager
+def own_pools() -> Iterator[None]:
+    """Where `same_pools` around it neither writes down nor gives the sizes of pools."""
+    replayed, recordings = _POOLS.replayed, _POOLS.recordings
+    _POOLS.replayed, _POOLS.recordings = None, []
+    try:
+        yield
+    finally:
+        _POOLS.replayed, _POOLS.recordings = replayed, recordings
 
 
 def check_grid(grid: Any) -> None:

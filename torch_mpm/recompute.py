@@ -49,7 +49,7 @@ class _Arguments(torch.autograd.Function):
 
     @staticmethod
     def jvp(ctx: Any, *tangents: Any) -> Tensor:
-        return torch.zeros(0)
+        return torch.zeros(0, device="cpu")
 
 
 class _Place:
@@ -67,7 +67,7 @@ class _AllFound(Exception):
 class _Call:
     def __init__(self, function: Callable[..., Any], tensors: Sequence[Tensor]) -> None:
         self._function = function
-        self._arguments: Any = _Arguments.apply(torch.empty(0, requires_grad=True), *tensors).grad_fn
+        self._arguments: Any = _Arguments.apply(torch.empty(0, device="cpu", requires_grad=True), *tensors).grad_fn
         self._places: list[weakref.ref[_Place]] = []
         self._around = _surroundings({t.device for t in tensors})
 

@@ -39,11 +39,12 @@ def frames(
     *,
     prefix: int = 0,
     truncate: int | None = None,
+    graph: int | None = None,
 ) -> Frames:
     """A `rollout` that keeps some fields of every so many steps, and lets a hook act there.
 
     Args:
-        step, state, n, dt, checkpoint, prefix, truncate: as `rollout`.
+        step, state, n, dt, checkpoint, prefix, truncate, graph: as `rollout`.
         every: steps from one frame to the next.
         fields: names of fields of `State` or of `state.extra`.
         hook: called as `hook(state, k)` before step k = 0, every, 2 every, ..., after the frame of that step is kept.
@@ -75,7 +76,7 @@ def frames(
         return None if hook is None else hook(state, k)
 
     Parts(n, hook=hook)  # which refuses what is no hook
-    options: dict[str, Any] = {"prefix": prefix, "truncate": truncate}
+    options: dict[str, Any] = {"prefix": prefix, "truncate": truncate, "graph": graph}
     end = rollout(step, state, n, dt, checkpoint, hook=seen, every=every, **options)
     if n % every == 0:
         keep(end)

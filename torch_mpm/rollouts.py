@@ -16,6 +16,7 @@ from .anomaly import begin, detecting, watch
 from .boundaries import Obstacle
 from .boundaries.obstacles import motion_tensors
 from .capture import is_captured, is_traced
+from .captured_steps import in_graphs, obstacle_to_graphs
 from .checkpoints import Checkpoints, as_checkpoints, binomial, fitting, in_segments, offloaded
 from .errors import check_count, shape_of
 from .gradient_norms import GradientNorms
@@ -48,6 +49,7 @@ def rollout(
     hook: Hook | None = None,
     every: int = 1,
     norms: GradientNorms | None = None,
+    graph: int | None = None,
 ) -> State:
     """The state n steps later.
 
@@ -66,6 +68,12 @@ def rollout(
             loss, or return another state of as many particles. Where a hook acts a state is kept.
         every: steps from one call of the hook to the next.
         norms: records the norm of the gradient at states on the way; see `GradientNorms`.
+        graph: steps from Python, on CUDA, are replays of CUDA graphs of so many of them, functions of the user's among
+            them, and in the backward pass of these and of a graph of their gradients: for networks in a step, whose
+            kernels take the host longer than the device. The state of every `graph` steps is kept, and its steps are
+            taken again. See `captured` for what is recorded, and when anew; the step keeps the graphs for the next
+            rollout. It must be a `Step` or another module. On the CPU, and where `Step.explain` tells of an obstacle,
+            steps are taken as without.
 
     A `Step` of compiled laws without heat and functions of the user's takes all steps in one op, or some, with
     the results of single steps; `Step.explain` tells. On CUDA they are the same to the last bit, but for float32
@@ -86,8 +94,10 @@ def rollout(
         raise TypeError(f"step must be a Step or a function (state, dt) -> state, got {shape_of(step)}")
     check_count("n", n)
     kept = as_checkpoints(checkpoint)
+    if graph is not None:
+        check_count("graph", graph, 1)
     if truncate is None and hook is None and norms is None and prefix == 0 and every == 1 and every is not True:
-        return _taken(step, state, n, dt, kept)
+        return _taken(step, state, n, dt, kept, graph=graph)
     parts = Parts(n, prefix, truncate, hook, every, norms)
     if isinstance(step, Step):
         state = step.prepare(state)
@@ -95,7 +105,7 @@ def rollout(
         kept = resolved(kept, step, state, n - parts.first_with_gradient(), dt) or EVERYTHING
     grid = step.grid if isinstance(step, Step) else None
     scales = (1, 1.0, dt) if grid is None else (grid.scenes, grid.dx, dt)
-    return parts.run(lambda state, count, k: _taken(step, state, count, dt, kept, k), state, scales)
+    return parts.run(lambda state, count, k: _taken(step, state, count, dt, kept, k, graph), state, scales)
 
 
 def _taken(
@@ -105,8 +115,9 @@ def _taken(
     dt: float | Tensor,
     kept: Checkpoints | None = None,
     first: int = 0,
+    graph: int | None = None,
 ) -> State:
-    """The state n steps later, of which the first is step `first` of a rollout."""
+    """The state n steps later, of which the first is step `first` of a rollout, if possible by graphs of so many."""
     if kept is not None and not torch.is_grad_enabled():
         kept = None
     keeps_all = False
@@ -119,7 +130,11 @@ def _taken(
         return replayed(step, state, n, dt)  # type: ignore[arg-type]
     grid = step.grid if isinstance(step, Step) else None
 
+    by_graphs = graph is not None and obstacle_to_graphs(step, state, dt) is None and len(state) > 0
+
     def single(state: State, count: int, begins: int) -> State:
+        if by_graphs:
+            return in_graphs(step, state, count, dt, graph)  # type: ignore[arg-type]
         for k in range(first + begins, first + begins + count):
             mark = begin() if detecting() else None
             before, state = state, step(state, dt)

@@ -428,7 +428,8 @@ class Step(TensorModule):
         raise_failures(self.failures(state), self._activations.all(), self.grid)
 
     def explain(self, state: State, dt: float | Tensor = 1.0, speed: float | None = None) -> str:
-        """How `rollout` takes steps from a state: many in one op, from a CUDA graph or from Python, and why.
+        """How `rollout` takes steps from a state: many in one op, from a CUDA graph or from Python, and why; and of the
+        last whether its `graph` would replay some.
 
         Args:
             state: the particles.
@@ -442,16 +443,21 @@ class Step(TensorModule):
         return way if speed is None else f"{way}; {compare(self, state, speed)}"
 
     def _way(self, state: State, dt: float | Tensor) -> str:
-        from .graphs import obstacle_to_replays  # which needs a Step, as these do
+        from .captured_steps import obstacle_to_graphs  # which needs a Step, as these do
+        from .graphs import obstacle_to_replays
         from .rollouts import obstacle_to_substeps, wants_gradient
 
         reason = obstacle_to_substeps(self, state, dt)
         if reason is not None:
-            no_graph = obstacle_to_replays(self, state, dt)
-            if no_graph is None:
+            no_replays = obstacle_to_replays(self, state, dt)
+            if no_replays is None:
                 return f"from a CUDA graph of one step, because {reason}"
-            also = f"; not from a CUDA graph, because {no_graph}" if state.x.is_cuda and no_graph != reason else ""
-            return f"step by step, because {reason}{also}"
+            if not state.x.is_cuda:
+                return f"step by step, because {reason}"
+            no_graph = obstacle_to_graphs(self, state, dt)
+            also = f"; not from a CUDA graph, because {no_replays}" if no_replays != reason else ""
+            asked = "rollout(graph=...) replays some" if no_graph is None else f"nor with graph=..., because {no_graph}"
+            return f"step by step, because {reason}{also}; {asked}"
         return f"all steps {'between two kept states ' if wants_gradient(self, state) else ''}in one op"
 
     def reset(self) -> None:

@@ -1,4 +1,4 @@
-"""Steps with a network as their law: one by one, compiled, and from a CUDA graph. A part of `training`."""
+"""Steps with a network as their law: one by one, compiled, and from CUDA graphs. A part of `training`."""
 
 from __future__ import annotations
 
@@ -72,6 +72,7 @@ def rows(cells: Sequence[int], device: str, samples: int, backend: str) -> Itera
     ways[f"torch.compile, {backend}"] = lambda: eager(_compiled(step, backend))
     if device == "cuda":
         ways["captured"] = lambda: mpm.captured(step, state, DT, STEPS)
+        ways["rollout(graph=4)"] = lambda: lambda state: mpm.rollout(step, state, STEPS, DT, graph=STEPS // 2)
     reference = gradients(eager(step), step, state)
     for name, make in ways.items():
         row: dict[str, Any] = {"name": name, "particles": len(state), "steps": STEPS}

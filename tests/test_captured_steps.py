@@ -1,0 +1,415 @@
+"""Steps and gradients from graphs against the same steps from Python.
+
+On the CPU there are no graphs: something in their place calls the function again, with results in the same memory.
+"""
+
+import contextlib
+import copy
+import pickle
+
+import pytest
+import torch
+from test_graphs import network
+from test_rollouts import F64, assert_equal, blob, box, one_by_one
+from torch import nn
+
+import torch_mpm as mpm
+from torch_mpm import captured_steps
+from torch_mpm.activation_record import uncounted
+from torch_mpm.capture import Recordings
+
+DT = 2e-4
+
+
+class Repeated(captured_steps.Graphs):
+    """What a replay does: arguments and results have their places, and a backward pass spoils what it has read."""
+
+    def record(self, beside):
+        with uncounted(self._steps.step), torch.random.fork_rng([]):
+            ends = self._steps(*self.read)
+        self.follows = [t.requires_grad for t in ends]
+        self._ends = [torch.empty_like(t, requires_grad=False) for t in ends]
+        self._grads = [torch.empty_like(t) for t in ends if t.requires_grad]
+        self._found = [torch.empty_like(t) for t in self.read]
+        Repeated.spoilt = self
+
+    def forward(self, given):
+        with torch.no_grad():
+            captured_steps.copy_all(self.read, given)
+        hooks = torch.autograd.graph.saved_tensors_hooks(lambda t: t, lambda t: t)
+        with hooks, torch.set_grad_enabled(any(t.requires_grad for t in self.read)):
+            self._now = self._steps(*self.read)
+        Repeated.spoilt = None
+        with torch.no_grad():
+            captured_steps.copy_all(self._ends, self._now)
+        return self._ends
+
+    def backward(self, grads):
+        assert Repeated.spoilt is not self
+        self._take(grads)
+        found = self._gradients(self._now, self._grads)
+        with torch.no_grad():
+            kept = [None if t is None else to.copy_(t) for to, t in zip(self._found, found, strict=True)]
+        Repeated.spoilt = self
+        return kept
+
+
+@pytest.fixture
+def recorded(device, monkeypatch):
+    """The recordings that are made from here on."""
+    made = []
+    base = captured_steps.Graphs if device == "cuda" else Repeated
+
+    class Counted(base):
+        def record(self, beside):
+            super().record(beside)
+            made.append(self)
+
+    monkeypatch.setattr(captured_steps, "Graphs", Counted)
+    if device == "cpu":
+        monkeypatch.setattr(captured_steps, "has_graphs", lambda device: True)
+        monkeypatch.setattr(captured_steps, "_aside", lambda device: contextlib.nullcontext())
+    return made
+
+
+class Wind(nn.Module):
+    """On the nodes."""
+
+    def __init__(self):
+        super().__init__()
+        torch.manual_seed(6)
+        self.layer = nn.Linear(2, 2)
+
+    def forward(self, blocks, velocity, mass, dt):
+        return velocity + dt * 50 * self.layer(blocks.node_positions(velocity.dtype)).tanh()
+
+
+class Control(nn.Module):
+    """On the particles, by the time."""
+
+    def __init__(self):
+        super().__init__()
+        torch.manual_seed(7)
+        self.layer = nn.Linear(1, 2)
+
+    def forward(self, state, dt):
+        time = state.time if isinstance(state.time, torch.Tensor) else torch.full_like(state.x[0, 0], state.time)
+        return state.replace(v=state.v + 30 * dt * self.layer(1e3 * time.reshape(1)).sin())
+
+
+def learned(device):
+    return mpm.Step(box(2, deterministic=True), network(2, device), gravity=(0.0, -9.8), walls="slip"), blob(device, 2)
+
+
+def blown(device):
+    law = mpm.NeoHookean(E=torch.tensor(1e4, dtype=F64, requires_grad=True), nu=0.3)
+    return mpm.Step(box(2, deterministic=True), law, on_grid=Wind().double()).to(device), blob(device, 2)
+
+
+def driven(device):
+    ball = mpm.Sphere((0.5, 0.2), 0.15, velocity=(0.0, 4.0))
+    step = mpm.Step(box(2, deterministic=True), network(2, device), on_particles=Control().double(), boundaries=[ball])
+    return step.to(device), blob(device, 2).replace(time=0.01)
+
+
+def remembering(device):
+    """A law from Python with history, FLIP, and impulses on the walls."""
+
+    def law(F, strength):
+        tau = (1e3 + 1e2 * strength)[:, None, None] * (F @ F.mT - torch.eye(2, dtype=F.dtype, device=F.device))
+        return F, tau, strength + 10 * (F - F.mT)[:, 0, 1].square()
+
+    custom = mpm.laws.CustomLaw(law, history={"strength": ()})
+    step = mpm.Step(box(2, deterministic=True), custom, walls="separate", flip=0.6)
+    state = blob(device, 2)
+    return step, step.with_impulses(state.replace(v=5 * state.v))
+
+
+def warm(device):
+    """No function of the user's, but two gradients of heat."""
+    grid = box(2, deterministic=True)
+    conductivity = torch.tensor(5.0, dtype=F64, requires_grad=True)
+    plate = mpm.heat_boundaries.Convection(mpm.heat_boundaries.FreeSurface(), coefficient=30.0, ambient=400.0)
+    heat = mpm.Heat(grid, conductivity=conductivity, specific_heat=800.0, boundaries=[plate], tolerance=1e-13)
+    law = mpm.NeoHookean(E=mpm.Table([280.0, 320.0], [2e4, 1e4]), nu=0.3)
+    state = blob(device, 2)
+    step = mpm.Step(grid, law, gravity=(0.0, -9.8), walls="slip", heat=heat).to(device)
+    return step, state.replace(temperature=300 + 40 * state.x[:, 0])
+
+
+def mixed(device):
+    laws = mpm.Mixture([mpm.laws.CustomLaw(network(2, device)), mpm.NeoHookean(E=1e4, nu=0.3)])
+    state = blob(device, 2, material=torch.arange(300, dtype=torch.int32) % 2)
+    return mpm.Step(box(2, deterministic=True), laws, transfer="pic"), state
+
+
+MAKERS = [learned, blown, driven, remembering, warm, mixed]
+
+
+def trained(step, state, n, take):
+    """The end, and gradients by what the start and the step have."""
+    v = state.v.detach().clone().requires_grad_()
+    end = take(step, state.replace(v=v), n, DT)
+    loss = end.x.square().sum() + 1e-2 * end.v.square().sum()
+    loss = loss if end.temperature is None else loss + 1e-3 * end.temperature.square().sum()
+    loss = loss if end.impulse is None else loss + end.impulse.sum()
+    leaves = [v, *(t for t in (*step.parameters(), *step.buffers()) if t.requires_grad)]
+    return end.detach(), torch.autograd.grad(loss, leaves)
+
+
+def assert_alike(found, expected, tolerance=1e-12):
+    (end, grads), (other, expected_grads) = found, expected
+    assert end.time == pytest.approx(other.time, rel=1e-15)
+    assert_equal(end.replace(time=0.0), other.replace(time=0.0))
+    for grad, expected_grad in zip(grads, expected_grads, strict=True):
+        assert float(expected_grad.abs().max()) > 0
+        assert float((grad - expected_grad).abs().max()) < tolerance * float(expected_grad.abs().max())
+
+
+def in_graphs_of(graph, **options):
+    return lambda step, state, n, dt: mpm.rollout(step, state, n, dt, graph=graph, **options)
+
+
+# ---- rollouts
+
+
+@pytest.mark.parametrize("make", MAKERS)
+def test_values_and_gradients_are_those_of_single_steps(make, device, recorded):
+    """Of three segments and a rest, in a loop that changes state and parameters; the status counts each step once."""
+    step, state = make(device)
+    again = make(device)[0]
+    for k in range(3):
+        assert_alike(trained(step, state, 11, in_graphs_of(3)), trained(again, state, 11, one_by_one))
+        state = state.replace(v=0.9 * state.v)
+        with torch.no_grad():
+            for s in (step, again):
+                for p in (t for t in (*s.parameters(), *s.buffers()) if t.requires_grad):
+                    p.mul_(0.9)
+        assert int(step.status[0, 5]) == int(again.status[0, 5]) == 11 * (k + 1)
+    assert len(recorded) == 2
+    with torch.no_grad():
+        assert_equal(mpm.rollout(step, state, 7, DT, graph=3), one_by_one(again, state, 7, DT))
+    if make is not warm:  # which has no function of the user's
+        assert len(recorded) == 4
+    step.check()
+    assert str(step.failures()) == str(again.failures())
+
+
+def slowed(state, k):
+    return state.replace(v=0.99 * state.v)
+
+
+@pytest.mark.parametrize(
+    "options", [{"checkpoint": 5}, {"checkpoint": mpm.Checkpoints(states=3)}, {"every": 4, "hook": slowed}]
+)
+def test_with_checkpoints_and_hooks(options, device, recorded):
+    step, state = learned(device)
+    again = learned(device)[0]
+    take = lambda step, state, n, dt: mpm.rollout(step, state, n, dt, **options)  # noqa: E731
+    assert_alike(trained(step, state, 13, in_graphs_of(2, **options)), trained(again, state, 13, take))
+    assert recorded
+    assert int(step.status[0, 5]) == int(again.status[0, 5]) == 13
+
+
+def test_frames_pass_it_on(device, recorded):
+    step, state = learned(device)
+    with torch.no_grad():
+        found = mpm.frames(step, state, 6, DT, every=2, graph=2)
+        expected = mpm.frames(learned(device)[0], state, 6, DT, every=2)
+    assert len(recorded) == 1
+    assert float((found.fields["x"] - expected.fields["x"]).abs().max()) < 1e-14
+
+
+def test_random_numbers_are_those_of_the_first_time(device, recorded):
+    """Dropout falls on the same particles in the backward pass, and the generator is left where steps from Python leave
+    it."""
+    found = []
+    for take in (in_graphs_of(3), one_by_one):
+        step, state = learned(device)
+        step.law.function.layers.append(nn.Dropout(0.5))
+        torch.manual_seed(11)
+        found.append(trained(step, state, 7, take) + (torch.rand(3, device=device),))
+    assert_alike(found[0][:2], found[1][:2])
+    assert torch.equal(found[0][2], found[1][2])
+
+
+def test_a_backward_pass_after_other_calls(device, recorded):
+    """Whose graphs have another state, and other particles, by then."""
+    step, state = learned(device)
+    starts = [state.replace(v=(k * state.v).requires_grad_()) for k in (1.0, 3.0)]
+    ends = [mpm.rollout(step, start, 4, DT, graph=4) for start in starts]
+    mpm.rollout(step, blob(device, 2, 100), 4, DT, graph=4)
+    for start, end in zip(starts, ends, strict=True):
+        expected = one_by_one(learned(device)[0], start, 4, DT)
+        for _ in range(2):  # and it may be gone through twice
+            grad = torch.autograd.grad(end.v.square().sum(), start.v, retain_graph=True)[0]
+            reference = torch.autograd.grad(expected.v.square().sum(), start.v, retain_graph=True)[0]
+            assert float((grad - reference).abs().max()) < 1e-12 * float(reference.abs().max())
+
+
+def test_on_the_cpu_steps_are_taken_as_without():
+    step, state = learned("cpu")
+    assert_alike(trained(step, state, 5, in_graphs_of(2)), trained(step, state, 5, one_by_one), 1e-14)
+    assert "_recordings" not in vars(step)
+    assert step.explain(state, DT).startswith("step by step, because")
+    with pytest.raises(ValueError, match="graph must be at least 1"):
+        mpm.rollout(step, state, 5, DT, graph=0)
+
+
+# ---- what is recorded, and when
+
+
+def test_another_kind_is_recorded(device, recorded):
+    step, state = learned(device)
+    advance = mpm.captured(step, None, DT, 2)
+    assert not recorded
+    made = 0
+
+    def check(state, new):
+        nonlocal made
+        assert_alike(
+            trained(step, state, 2, lambda s, state, n, dt: advance(state)), trained(step, state, 2, one_by_one)
+        )
+        made += new
+        assert len(recorded) == made
+
+    check(state, 1)
+    check(state.replace(x=state.x + 0.01), 0)
+    check(blob(device, 2, 200), 1)
+    check(state, 0)
+    check(state.replace(extra={"mark": torch.ones(300, device=device)}), 1)
+    with torch.no_grad():
+        assert_equal(advance(state), one_by_one(step, state, 2, DT))
+    made += 1
+    check(state, 0)
+    step.flip = 0.5
+    check(state, 1)
+    step.gravity = torch.tensor([1.0, 0.0], dtype=F64, device=device)
+    check(state, 1)
+    step.gravity.mul_(2)  # and this is read anew
+    check(state, 0)
+    step.law = network(2, device).requires_grad_(True)
+    check(state, 1)
+    step.eval()
+    check(state, 1)
+    step.walls = "sticky"
+    check(state, 1)
+
+
+def test_the_latest_recordings_are_kept(device, recorded):
+    step, _ = learned(device)
+    advance = mpm.captured(step, None, DT)
+    states = [blob(device, 2, 20 + k) for k in range(Recordings.most + 1)]
+    with torch.no_grad():
+        for state in (*states, states[-1], states[1], states[0]):
+            advance(state)
+        assert len(recorded) == len(states) + 1
+        assert_equal(advance(states[0]), one_by_one(step, states[0], 1, DT))
+
+
+def test_a_copy_of_a_step_begins_without(device, recorded):
+    step, state = blown(device)
+    with torch.no_grad():
+        expected = mpm.rollout(step, state, 4, DT, graph=2)
+        for other in (copy.deepcopy(step), pickle.loads(pickle.dumps(step))):
+            before = len(recorded)
+            assert_equal(mpm.rollout(other, state, 4, DT, graph=2), expected)
+            assert len(recorded) == before + 1
+    assert step.explain(state, DT)
+
+
+def test_materials_and_order_by_content(device, recorded):
+    """Where steps keep indices that follow from them: other tensors of the same content are no other kind."""
+    step, state = mixed(device)
+    again = mixed(device)[0]
+    swapped = 1 - state.material
+    with torch.no_grad():
+        for material, made in ((state.material, 1), (state.material.clone(), 1), (swapped, 2), (state.material, 2)):
+            given = state.replace(material=material)
+            end = mpm.rollout(step, given, 4, DT, graph=2)
+            assert_equal(end, one_by_one(again, given, 4, DT))
+            assert len(recorded) == made and end.material is material
+    stiff = torch.linspace(1e3, 1e4, 300, dtype=F64, device=device)
+    step, again = (
+        mpm.Step(box(2, deterministic=True), mpm.NeoHookean(E=stiff, nu=0.3), on_grid=lambda b, v, m, dt: 0.99 * v)
+        for _ in range(2)
+    )
+    state = blob(device, 2)
+    orders = [torch.arange(300, device=device), torch.arange(300, device=device).flip(0)]
+    with torch.no_grad():
+        for ids in (*orders, orders[0]):
+            given = state.replace(ids=ids)
+            assert_equal(mpm.rollout(step, given, 4, DT, graph=2), one_by_one(again, given, 4, DT))
+        step.law.E.mul_(2)  # of which steps keep a copy
+        again.law.E = step.law.E.clone()
+        assert_equal(mpm.rollout(step, given, 4, DT, graph=2), one_by_one(again, given, 4, DT))
+
+
+def test_the_pool_follows_the_scene(device, recorded):
+    """Matter that flies apart wants more blocks than it began with, in a training loop too."""
+    found = []
+    for take in (in_graphs_of(8), one_by_one):
+        step, state = learned(device)
+        step.walls, step.grid = None, box(2, 0.02, deterministic=True)
+        first = step(state.replace(x=0.5 + 0.3 * (state.x - 0.5)), DT).detach()
+        first = first.replace(v=70 * (first.x - 0.5))
+        before = step.grid.max_blocks
+        found.append(trained(step, first, 192, take))
+        step.check()
+        assert step.grid.max_blocks > before
+    assert_alike(*found, tolerance=1e-9)
+    assert len(recorded) > 1
+
+
+# ---- what does not go into a graph
+
+
+def test_gradients_that_would_be_lost_are_refused(device, recorded):
+    weight = torch.ones((), dtype=F64, device=device, requires_grad=True)
+    made = 2 * weight
+    state = blob(device, 2)
+    for used, named in ((weight, r"one of shape \[\]"), (made, "a result of MulBackward0")):
+        step = mpm.Step(box(2), mpm.NeoHookean(E=1e4, nu=0.3), on_grid=lambda b, v, m, dt, w=used: v * w)
+        with pytest.raises(ValueError, match=f"must be a parameter or buffer of the step .* got {named}"):
+            mpm.rollout(step, state, 4, DT, graph=2)
+        with torch.no_grad():  # where there is none to lose
+            mpm.rollout(step, state, 4, DT, graph=2)
+
+
+def test_what_is_wrong(device, recorded):
+    step, state = learned(device)
+    with pytest.raises(TypeError, match="step must be a Step or another module"):
+        mpm.captured(lambda state, dt: state, state, DT)
+    with pytest.raises(TypeError, match="state"):
+        mpm.captured(step, None, DT)(state.x)
+    with pytest.raises(ValueError, match="n must be at least 1"):
+        mpm.captured(step, state, DT, 0)
+    advance = mpm.captured(step, state, DT, 2)
+    v = state.v.clone().requires_grad_()
+    grad = torch.autograd.grad(advance(state.replace(v=v)).v.square().sum(), v, create_graph=True)[0]
+    with pytest.raises(RuntimeError, match="once_differentiable"):
+        grad.sum().backward()
+
+
+@pytest.mark.filterwarnings("ignore:Anomaly Detection")
+def test_obstacles(device, recorded):
+    step, state = learned(device)
+    why = captured_steps.obstacle_to_graphs
+    assert why(step, state, DT) is None
+    assert why(lambda state, dt: state, state, DT) == "it is no module"
+    assert why(step, state, torch.tensor(DT)) == "dt is a tensor"
+    with torch.autograd.detect_anomaly():
+        assert "anomaly" in why(step, state, DT)
+    slow = mpm.Step(box(2), mpm.NeoHookean(E=1e4, nu=0.3), integrator="implicit")
+    assert why(slow, state, DT) == "an implicit step waits for its solve"
+    hot = warm(device)[0]
+    hot.heat.method = "multigrid"
+    assert "multigrid" in why(hot, state, DT)
+    step.law.register_forward_hook(lambda *arguments: None)
+    assert why(step, state, DT) == "there are hooks"
+    with torch.no_grad():  # and such steps are taken all the same
+        assert_equal(mpm.rollout(step, state, 3, DT, graph=2), one_by_one(learned(device)[0], state, 3, DT))
+    assert not recorded
+    if device == "cuda":
+        assert "nor with graph=..., because there are hooks" in step.explain(state, DT)
+        assert "rollout(graph=...) replays some" in learned(device)[0].explain(state, DT)
