@@ -5,7 +5,9 @@ On the CPU there are no graphs: something in their place calls the function agai
 
 import contextlib
 import copy
+import gc
 import pickle
+import weakref
 
 import pytest
 import torch
@@ -343,6 +345,38 @@ def test_materials_and_order_by_content(device, recorded):
         step.law.E.mul_(2)  # of which steps keep a copy
         again.law.E = step.law.E.clone()
         assert_equal(mpm.rollout(step, given, 4, DT, graph=2), one_by_one(again, given, 4, DT))
+
+
+def test_states_are_not_kept(device, recorded):
+    """Nor what they follow from, as a first rollout of a long training would."""
+    step, state = learned(device)
+    v = state.v.clone().requires_grad_()
+    middle = mpm.rollout(step, state.replace(v=v), 2, DT)
+    end = mpm.rollout(step, middle, 5, DT, graph=2)
+    torch.autograd.grad(end.x.sum(), v)
+    kept = [weakref.ref(t) for t in (v, middle.x, middle.F, end.x)]
+    del v, middle, end
+    gc.collect()
+    assert recorded and not any(ref() is not None for ref in kept)
+
+
+def test_under_autocast_and_without_gradients_for_good(device, recorded):
+    """Of which graphs are others: half precision is that of the call, and tensors of inference mode stay there."""
+    step, state = mixed(device)
+    step, state = step.float(), state.to(dtype=torch.float32)
+    with torch.inference_mode():
+        mpm.rollout(step, state, 2, DT, graph=2)
+    again = mpm.Step(box(2, deterministic=True), step.law, transfer="pic")
+    plain, expected_plain = (trained(s, state, 4, take) for s, take in ((step, in_graphs_of(2)), (again, one_by_one)))
+    with torch.autocast(device, torch.bfloat16):
+        half, expected = (trained(s, state, 4, take) for s, take in ((step, in_graphs_of(2)), (again, one_by_one)))
+    assert len(recorded) == 3
+    # With casts of weights that are kept, autograd sums up gradients of the steps in half precision.
+    for found, reference, tolerance in ((plain, expected_plain, 1e-5), (half, expected, 1e-2)):
+        error = float((found[0].v - reference[0].v).abs().max())
+        assert error < 0.1 * float((half[0].v - plain[0].v).abs().max())
+        for grad, expected_grad in zip(found[1], reference[1], strict=True):
+            assert float((grad - expected_grad).abs().max()) < tolerance * float(expected_grad.abs().max())
 
 
 def test_the_pool_follows_the_scene(device, recorded):

@@ -141,9 +141,11 @@ class Recordings:
             return content
         known = self._contents.setdefault(name, [])
         alike = [c for c in known if (c.shape, c.device) == (t.shape, t.device) and torch.equal(c, t)]
-        content = alike[0] if alike else t.detach().clone()
         if not alike:
-            known[:] = [*known[1 - self.most :], content]
+            with torch.inference_mode(False):  # such that autograd may keep it later
+                alike = [t.detach().clone()]
+            known[:] = [*known[1 - self.most :], *alike]
+        content = alike[0]
         self._latest_content[name] = t, now, content
         return content
 

@@ -299,6 +299,7 @@ class _Steps:
         given = dict(zip(self.names, tensors, strict=True))
         own = {name.removeprefix("step."): given.pop(name) for name in self.names if name.startswith("step.")}
         state = begin = _with(self._like, given)
+        self._like = begin.detach()  # so that the first state may go, and what it follows from
         for _ in range(self._n):
             state = torch.func.functional_call(self.step, own, (state, self._dt))
         before, after = tensors_of(begin), tensors_of(state)
@@ -443,7 +444,8 @@ class Graphs:
         if not outputs:
             return [None] * len(self.read)
         wanted = [t for t in self.read if t.requires_grad]
-        found = iter(torch.autograd.grad(outputs, wanted, grads, allow_unused=True))
+        with torch.autocast(self._device.type, enabled=False):  # as backward passes are taken
+            found = iter(torch.autograd.grad(outputs, wanted, grads, allow_unused=True))
         return [next(found) if t.requires_grad else None for t in self.read]
 
     def record(self, beside: Graphs | None) -> None:
