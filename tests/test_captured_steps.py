@@ -38,8 +38,7 @@ class Repeated(captured_steps.Graphs):
     def forward(self, given):
         with torch.no_grad():
             captured_steps.copy_all(self.read, given)
-        hooks = torch.autograd.graph.saved_tensors_hooks(lambda t: t, lambda t: t)
-        with hooks, torch.set_grad_enabled(any(t.requires_grad for t in self.read)):
+        with captured_steps.no_hooks(), torch.set_grad_enabled(any(t.requires_grad for t in self.read)):
             self._now = self._steps(*self.read)
         Repeated.spoilt = None
         with torch.no_grad():
@@ -115,16 +114,16 @@ def driven(device):
 
 
 def remembering(device):
-    """A law from Python with history, FLIP, and impulses on the walls."""
+    """A law from Python with history, FLIP, and impulses on a ball."""
 
     def law(F, strength):
         tau = (1e3 + 1e2 * strength)[:, None, None] * (F @ F.mT - torch.eye(2, dtype=F.dtype, device=F.device))
         return F, tau, strength + 10 * (F - F.mT)[:, 0, 1].square()
 
     custom = mpm.laws.CustomLaw(law, history={"strength": ()})
-    step = mpm.Step(box(2, deterministic=True), custom, walls="separate", flip=0.6)
-    state = blob(device, 2)
-    return step, step.with_impulses(state.replace(v=5 * state.v))
+    ball = mpm.Sphere((0.5, 0.5), 0.15, friction=0.2)
+    step = mpm.Step(box(2, deterministic=True), custom, walls="separate", flip=0.6, boundaries=[ball])
+    return step, step.with_impulses(blob(device, 2))
 
 
 def warm(device):
@@ -145,7 +144,20 @@ def mixed(device):
     return mpm.Step(box(2, deterministic=True), laws, transfer="pic"), state
 
 
-MAKERS = [learned, blown, driven, remembering, warm, mixed]
+def energetic(device):
+    """A law that is the derivative of an energy, by a transform."""
+
+    def law(F):
+        by_F = torch.func.grad(lambda F: 1e3 * (F.mT @ F).diagonal(dim1=1, dim2=2).sum(1).sub(2).square().sum())(F)
+        return by_F @ F.mT
+
+    state = blob(device, 2)
+    F = 0.05 * torch.randn(300, 2, 2, dtype=F64, generator=torch.Generator().manual_seed(1))
+    step = mpm.Step(box(2, deterministic=True), law, gravity=torch.tensor([0.0, -9.8], dtype=F64).requires_grad_())
+    return step.to(device), state.replace(F=F.to(device) + torch.eye(2, dtype=F64, device=device))
+
+
+MAKERS = [energetic, learned, blown, driven, remembering, warm, mixed]
 
 
 def trained(step, state, n, take):

@@ -379,8 +379,7 @@ class _Recording:
             stack.enter_context(own_pools())
             stack.enter_context(torch.inference_mode(False))
             stack.enter_context(torch.set_grad_enabled(with_gradients))
-            # What is kept for gradients is none of what a checkpoint around the rollout counts, or moves to the host.
-            stack.enter_context(torch.autograd.graph.saved_tensors_hooks(lambda t: t, lambda t: t))
+            stack.enter_context(no_hooks())
             # A cache of casts would keep parameters as they were.
             casts, dtype = _autocast(device)
             stack.enter_context(torch.autocast(device.type, dtype, casts, cache_enabled=False))
@@ -399,6 +398,13 @@ class _Recording:
                 recordings.unseen = 0
             grid.watch(status)
         recordings.unseen += 1
+
+
+def no_hooks() -> contextlib.AbstractContextManager[Any]:
+    """Where what autograd keeps is none of what a checkpoint around a rollout counts, or moves to the host."""
+    if torch._C._autograd._top_saved_tensors_default_hooks(True) is None:
+        return contextlib.nullcontext()  # as transforms want it
+    return torch.autograd.graph.saved_tensors_hooks(lambda t: t, lambda t: t)
 
 
 class Graphs:
