@@ -103,7 +103,7 @@ def learned(device):
 
 
 def blown(device):
-    law = mpm.NeoHookean(E=torch.tensor(1e4, dtype=F64, requires_grad=True), nu=0.3)
+    law = mpm.NeoHookean(E=torch.tensor(1e4, dtype=F64, device=device, requires_grad=True), nu=0.3)
     return mpm.Step(box(2, deterministic=True), law, on_grid=Wind().double()).to(device), blob(device, 2)
 
 
@@ -412,11 +412,10 @@ def test_the_pool_follows_the_scene(device, recorded):
 
 def test_gradients_that_would_be_lost_are_refused(device, recorded):
     weight = torch.ones((), dtype=F64, device=device, requires_grad=True)
-    made = 2 * weight
     state = blob(device, 2)
-    for used, named in ((weight, r"one of shape \[\]"), (made, "a result of MulBackward0")):
+    for used in (weight, 2 * weight):
         step = mpm.Step(box(2), mpm.NeoHookean(E=1e4, nu=0.3), on_grid=lambda b, v, m, dt, w=used: v * w)
-        with pytest.raises(ValueError, match=f"must be a parameter or buffer of the step .* got {named}"):
+        with pytest.raises(ValueError, match=r"must be a parameter or buffer of the step .* got one of shape \[\]"):
             mpm.rollout(step, state, 4, DT, graph=2)
         with torch.no_grad():  # where there is none to lose
             mpm.rollout(step, state, 4, DT, graph=2)

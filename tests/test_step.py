@@ -75,6 +75,19 @@ def test_momentum_is_conserved(device, dim, options):
         assert float((end[1] - start[1]).abs().max()) < 1e-12 * scale
 
 
+@pytest.mark.parametrize("many", [False, True])
+def test_a_step_that_was_moved_goes_on(device, many):
+    """What it has told of the steps before comes along."""
+    step = make_step(2)
+    state = block_state(2)
+    with torch.no_grad():
+        state = step(state, 1e-3)
+        step, state = step.to(device), state.to(device)
+        state = mpm.rollout(step, state, 5, 1e-3) if many else step(state, 1e-3)
+    assert state.x.device.type == step.status.device.type == torch.device(device).type
+    assert int(step.status[0, 5]) == (6 if many else 2)
+
+
 def test_free_fall_is_exact(device, dim):
     """Symplectic Euler under gravity alone: x = x0 + n dt v0 + g dt² n (n + 1) / 2 for a rigid translation."""
     gravity = torch.linspace(-9.8, 1.0, dim, dtype=torch.float64)

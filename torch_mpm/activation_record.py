@@ -38,12 +38,18 @@ class ActivationRecord:
         """As `Grid.activate`; `max_blocks` of the grid follows."""
         if is_exported():
             return grid.activate(x, scene, None, ids)
-        before = self.status
+        before = self.status_for(x)
         blocks = grid.activate(x, scene, before, ids)
         status = without_transforms(blocks.status)
         grid.watch(status)
         self.follow(before, status)
         return blocks
+
+    def status_for(self, x: Tensor) -> Tensor | None:
+        """The status so far, on the device of a tensor: a step may have been moved."""
+        if self.status is not None and self.status.device != x.device:
+            self.status = self.status.to(x.device)
+        return self.status
 
     def follow(self, before: Tensor | None, status: Tensor) -> None:
         """Take the status of activations that went on from one before, which replays of a graph find there again."""

@@ -264,7 +264,7 @@ class Captured:
         known.follow(prepared, self._recordings.unseen)
         recording = self._recordings.get((kinds, around, known.key, known.pools()))
         if recording is None:
-            steps = _Steps(self._step, self._dt, self._n, prepared.replace(**fixed), list(inputs))
+            steps = _Steps(self._step, self._dt, self._n, prepared, fixed, list(inputs))
             recording = _Recording(steps, inputs, wanted, self._recordings)
             known.look()
             self._recordings.keep((kinds, around, known.key, known.pools()), recording)
@@ -284,21 +284,26 @@ def _with(state: State, tensors: Mapping[str, Any]) -> State:
 class _Steps:
     """Steps as a function of tensors to tensors: those of the state, and those of the step that may have gradients.
 
-    Attributes:
+    Args:
+        fixed: fields that are no arguments, and the same tensors in each call.
         names: of the arguments.
+
+    Attributes:
         changed: of the results; dropped: fields that are None after the steps. Known after a call.
     """
 
-    def __init__(self, step: nn.Module, dt: float, n: int, like: State, names: list[str]) -> None:
+    def __init__(
+        self, step: nn.Module, dt: float, n: int, like: State, fixed: Mapping[str, Any], names: list[str]
+    ) -> None:
         self.step, self.names, self.device = step, names, like.x.device
         self.changed: list[str] = []
         self.dropped: list[str] = []
-        self._dt, self._n, self._like = dt, n, like
+        self._dt, self._n, self._like, self._fixed = dt, n, like, fixed
 
     def __call__(self, *tensors: Tensor) -> tuple[Tensor, ...]:
         given = dict(zip(self.names, tensors, strict=True))
         own = {name.removeprefix("step."): given.pop(name) for name in self.names if name.startswith("step.")}
-        state = begin = _with(self._like, given)
+        state = begin = _with(self._like, given).replace(**self._fixed)
         self._like = begin.detach()  # so that the first state may go, and what it follows from
         for _ in range(self._n):
             state = torch.func.functional_call(self.step, own, (state, self._dt))
@@ -435,9 +440,8 @@ class Graphs:
             ValueError: where gradients would pass to something that is no argument, whose replays would lose them.
         """
         with _aside(self._device):
-            mark: int = torch._C._autograd._get_sequence_nr()
             ends = self._steps(*self.read)
-            if other := next(_others(ends, self.read, mark), None):
+            if other := next(_others(ends, self.read), None):
                 raise ValueError(
                     "a tensor that requires a gradient must be a parameter or buffer of the step or a field of the "
                     f"state to take part in steps from CUDA graphs, got {other}: make the function that reads it a "
@@ -488,8 +492,8 @@ class Graphs:
         copy_all([to for to, _ in there], [grad for _, grad in there])
 
 
-def _others(ends: Sequence[Tensor], read: Sequence[Tensor], mark: int) -> Iterator[str]:
-    """In words, tensors beside those that are read to which gradients of operations since a mark would pass."""
+def _others(ends: Sequence[Tensor], read: Sequence[Tensor]) -> Iterator[str]:
+    """In words, the leaves beside the tensors that are read to which gradients of results would pass."""
     waiting: list[Any] = [t.grad_fn for t in ends if t.grad_fn is not None]
     known = set[Any]()
     while waiting:
@@ -497,13 +501,9 @@ def _others(ends: Sequence[Tensor], read: Sequence[Tensor], mark: int) -> Iterat
         if node in known:
             continue
         known.add(node)
-        if node.name().endswith("AccumulateGrad"):
-            if not any(node.variable is t for t in read):
-                yield f"one of shape {list(node.variable.shape)}"
-        elif node._sequence_nr() < mark:
-            yield f"a result of {node.name()}"
-        else:
-            waiting += [parent for parent, _ in node.next_functions if parent is not None]
+        if node.name().endswith("AccumulateGrad") and not any(node.variable is t for t in read):
+            yield f"one of shape {list(node.variable.shape)}"
+        waiting += [parent for parent, _ in node.next_functions if parent is not None]
 
 
 class _Streams(threading.local):

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.utils import _pytree
 
-from .activation_record import aside
+from .activation_record import aside, uncounted
 from .errors import check_count, check_flag, check_number
 from .grid import same_pools
 from .recompute import called_again
@@ -142,6 +142,8 @@ def recomputed(advance: Advance, state: State, count: int, first: int, step: Any
         with contextlib.ExitStack() as stack:
             stack.enter_context(same_pools(pools))
             if again:
+                if isinstance(step, torch.nn.Module):  # whose graphs write to the tensors that `aside` puts away
+                    stack.enter_context(uncounted(step))
                 stack.enter_context(aside(step, given.x))
             again = True
             return advance(given, count, first)

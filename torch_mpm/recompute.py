@@ -67,7 +67,8 @@ class _AllFound(Exception):
 class _Call:
     def __init__(self, function: Callable[..., Any], tensors: Sequence[Tensor]) -> None:
         self._function = function
-        self._arguments: Any = _Arguments.apply(torch.empty(0, device="cpu", requires_grad=True), *tensors).grad_fn
+        # The result, since its node gives up what it keeps where nothing but Python holds it.
+        self._arguments = _Arguments.apply(torch.empty(0, device="cpu", requires_grad=True), *tensors)
         self._places: list[weakref.ref[_Place]] = []
         self._around = _surroundings({t.device for t in tensors})
 
@@ -101,7 +102,7 @@ class _Call:
                     raise _AllFound
             return t
 
-        arguments = self._arguments.saved_tensors
+        arguments = self._arguments.grad_fn.saved_tensors
         hooks = torch.autograd.graph.saved_tensors_hooks(fill, lambda t: t)
         with contextlib.suppress(_AllFound), self._around(), torch.enable_grad(), hooks:
             self._function(*arguments)

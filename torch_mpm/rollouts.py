@@ -414,7 +414,7 @@ def _arguments(
     with_gradient = wants_gradient(step, state)
     arguments = (
         *(state.x, state.v, state.mass, state.volume, state.C, state.F, state.J),
-        *(calls.history, state.scene, state.ids, calls.material, step._activations.status),
+        *(calls.history, state.scene, state.ids, calls.material, step._activations.status_for(state.x)),
         *(calls.names, calls.options, calls.parameters, calls.variables),
         *(int(n), number, apic, step._flip_share, apic or step.law.viscous, STRESS_FORMS[step.stress_form]),
         _gravity(step, state.x),
