@@ -393,6 +393,8 @@ class _Recording:
                 for _ in range(TRIALS):
                     self.graphs.try_out()
             self.graphs.record(None if kept is None else kept.graphs)
+        # Which the graphs read, and mixtures give up for those of other particles.
+        self._indices = [m.indices for m in steps.step.modules() if isinstance(m, Mixture)]
         parts = [m for m in steps.step.modules() if isinstance(m, Step)]
         self._statuses = [(part.grid, part.status) for part in parts if part.status is not None]
 

@@ -31,6 +31,9 @@ class Mixture(Material):
     Args:
         laws: at least one; functions and modules F -> τ as by `CustomLaw`.
 
+    Attributes:
+        indices: the particles of each law, int64, for the latest `state.material`.
+
     Raises:
         TypeError: for what is no law.
         ValueError: without laws, or in use without state.material or with an id outside 0 .. len(laws) − 1.
@@ -49,7 +52,7 @@ class Mixture(Material):
         self.viscous = any(law.viscous for law in parts)
         self._material: Tensor | None = None
         self._checked: Tensor | None = None
-        self._indices: list[Tensor] = []
+        self.indices: list[Tensor] = []
 
     def update(self, state: State) -> tuple[dict[str, Tensor], Tensor]:
         changes: dict[str, Tensor] = {}
@@ -177,9 +180,9 @@ class Mixture(Material):
         material = self.check_material(state)
         if material is not self._material:
             indices = ((material == k).nonzero().squeeze(1) for k in range(len(self.laws)))
-            self._indices = [without_transforms(index) for index in indices]
+            self.indices = [without_transforms(index) for index in indices]
             self._material = material
-        return self._indices
+        return self.indices
 
     def _parts(self, state: State) -> list[tuple[Any, Any]]:
         indices = self._particles(state)
