@@ -121,6 +121,12 @@ def in_domain(side: int, times: int, device: str, deterministic: bool = False) -
     return Setup(s.state, mpm.Step(grid, s.step.law, gravity=s.step.gravity, walls="sticky"))
 
 
+def flipped(side: int, device: str) -> Setup:
+    """The cube with FLIP."""
+    s = setup(work.make(side), device)
+    return Setup(s.state, mpm.Step(s.grid, s.step.law, gravity=s.step.gravity, walls="sticky", flip=0.95))
+
+
 def name_of_domain(times: int, side: int) -> str:
     return f"domain of {times * work.cells_of(side)}^3 cells"
 
@@ -199,11 +205,14 @@ def measure(device: str, quick: bool = False) -> dict[str, Any]:
         row = per_step(in_domain(side, 1, device, deterministic=True), device, samples)
         result["rollouts"].append({"name": "one scene, deterministic", **row})
     if device == "cpu":
+        s = setup(work.make(sides[-1] if quick else PEER_SIDES[device][-1]), device)
         result["rollouts"].append({"name": "beside a busy process", **beside_a_busy_process(s, samples)})
     for side in sides[-1:] if quick else LAW_SIDES[device]:
         for name, law in LAWS.items():
             row = per_step(made_of(law(), side, device), device, samples)
             result["rollouts"].append({"name": name, **row})
+        row = per_step(flipped(side, device), device, samples)
+        result["rollouts"].append({"name": "FLIP", **row})
     for count, particles in [(4, 64)] if quick else BATCHES[device]:
         row = per_step(batched(count, particles, device), device, samples)
         result["rollouts"].append({"name": f"{count} scenes", **row})
