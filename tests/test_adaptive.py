@@ -187,6 +187,27 @@ def test_scenes_that_cannot_arrive_keep_nobody(device):
         arrival = mpm.rollout_to(step_of(2, STIFFNESS, scenes=3, device=device), batch(device, 2), 0.2, most=16)
     assert arrival.arrived.tolist() == [True, False, False]
     assert int(arrival.substeps.max()) == 16
+    with torch.no_grad():
+        arrival = mpm.rollout_to(step_of(2, STIFFNESS, scenes=3, device=device), batch(device, 2), 0.2, most=37)
+    assert int(arrival.substeps.max()) == 37
+
+
+def test_clocks_are_not_set_back(device):
+    step, state = step_of(2, STIFFNESS, scenes=3, device=device), batch(device, 2)
+    late = torch.tensor([0.0, 5.0, 0.0], dtype=F64, device=device)
+    with torch.no_grad():
+        assert mpm.rollout_to(step_of(2, 1e3), blob(device, 2, F64).replace(time=2.0), 1.0).state.time == 2.0
+        assert mpm.rollout_to(step, state.replace(time=late), 0.01).state.time.tolist() == [0.01, 5.0, 0.01]
+
+
+def test_times_that_are_not_finite(device):
+    step, state = step_of(2, STIFFNESS, scenes=3, device=device), batch(device, 2)
+    time = torch.tensor([math.inf, math.nan, 0.01], dtype=F64, device=device)
+    with torch.no_grad():
+        arrival = mpm.rollout_to(step, state, time)
+    assert arrival.arrived.tolist() == [False, False, True]
+    assert arrival.state.time.tolist() == [0.0, 0.0, 0.01]
+    step.check(arrival.state)
 
 
 def test_limits_that_shrink_are_told(device):

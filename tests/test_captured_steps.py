@@ -69,7 +69,7 @@ def recorded(device, monkeypatch):
     monkeypatch.setattr(captured_steps, "Graphs", Counted)
     if device == "cpu":
         monkeypatch.setattr(captured_steps, "has_graphs", lambda device: True)
-        monkeypatch.setattr(captured_steps, "_aside", lambda device: contextlib.nullcontext())
+        monkeypatch.setattr(captured_steps, "_on_own_stream", lambda device: contextlib.nullcontext())
     return made
 
 
@@ -407,7 +407,112 @@ def test_the_pool_follows_the_scene(device, recorded):
     assert len(recorded) > 1
 
 
+class OwnStep(mpm.Step):
+    pass
+
+
+class OwnLaw(mpm.NeoHookean):
+    pass
+
+
+class Target(nn.Module):
+    """Of the user's, with a tensor that is no buffer."""
+
+    def __init__(self, device):
+        super().__init__()
+        self.wind = torch.tensor([1.0, 0.0], dtype=F64, device=device)
+
+    def forward(self, blocks, velocity, mass, dt):
+        return velocity + dt * self.wind
+
+
+ASSIGNED = {
+    "gravity": lambda step: setattr(step, "gravity", (3.0, 0.0)),
+    "flip": lambda step: setattr(step, "flip", 0.5),
+    "form": lambda step: setattr(step, "stress_form", "gradient"),
+    "walls": lambda step: setattr(step.walls, "kind", ("sticky", "sticky")),
+    "modulus": lambda step: setattr(step.law, "E", 5e4),
+    "ball": lambda step: setattr(step.boundaries[0], "velocity", (0.0, -9.0)),
+    "tensor": lambda step: setattr(step.on_grid, "wind", -step.on_grid.wind),
+}
+
+
+@pytest.mark.parametrize("what", ASSIGNED)
+def test_what_is_assigned_is_recorded_anew(what, device, recorded):
+    """Of classes made of the library's too, of objects that it keeps, and tensors of the user's."""
+
+    def make():
+        ball = mpm.Sphere((0.5, 0.2), 0.15, velocity=(0.0, 4.0))
+        law = OwnLaw(E=1e4, nu=0.3)
+        walls = mpm.Walls("slip", lower=(0.4, 0.0), upper=(1.0, 1.0))
+        options = {"walls": walls, "boundaries": [ball], "on_grid": Target(device)}
+        return OwnStep(box(2, deterministic=True), law, (0.0, -9.8), **options)
+
+    step, again, state = make(), make(), blob(device, 2)
+    with torch.no_grad():
+        mpm.rollout(step, state, 4, DT, graph=2)
+        before = one_by_one(again, state, 4, DT)
+        for one in (step, again):
+            ASSIGNED[what](one)
+        end, expected = mpm.rollout(step, state, 4, DT, graph=2), one_by_one(again, state, 4, DT)
+    assert len(recorded) == 2
+    assert_equal(end, expected)
+    assert float((expected.v - before.v).abs().max()) > 1e-4
+
+
+class Twice(nn.Module):
+    """Two steps, and a time and a history of its own."""
+
+    def __init__(self, step, starts_over):
+        super().__init__()
+        self.step, self.starts_over = step, starts_over
+        self.norm = nn.BatchNorm1d(2).double()
+
+    def forward(self, state, dt):
+        self.norm(state.v)
+        state = self.step(self.step(state, dt), dt)
+        return state.replace(extra={}, time=0.0) if self.starts_over else state
+
+
+@pytest.mark.parametrize("starts_over", [False, True])
+def test_a_module_of_the_users_says_what_time_it_is(device, recorded, starts_over):
+    """And may drop a history; what it writes to buffers are its calls alone."""
+    module, again = (Twice(blown(device)[0], starts_over).to(device) for _ in range(2))
+    state = blob(device, 2).replace(extra={"mark": torch.ones(300, dtype=F64, device=device)})
+    with torch.no_grad():
+        end, expected = mpm.rollout(module, state, 4, DT, graph=2), one_by_one(again, state, 4, DT)
+    torch.testing.assert_close(torch.as_tensor(end.time).double().cpu(), torch.as_tensor(expected.time).double().cpu())
+    assert end.extra.keys() == expected.extra.keys()
+    assert int(module.norm.num_batches_tracked) == int(again.norm.num_batches_tracked) == 4
+    assert_equal(end.replace(time=0.0), expected.replace(time=0.0))
+
+
+def test_a_step_that_was_moved_is_recorded(device, recorded):
+    """After steps on the CPU."""
+    step, state = blown("cpu")
+    with torch.no_grad():
+        state = step(state, DT)
+        step, state = step.to(device), state.to(device)
+        mpm.rollout(step, state, 4, DT, graph=2)
+    assert step.status.device.type == torch.device(device).type and int(step.status[0, 5]) == 5
+
+
 # ---- what does not go into a graph
+
+
+def test_hooks_and_tensors_elsewhere_are_refused(device, recorded):
+    step, state = blown(device)
+    advance = mpm.captured(step, state, DT, n=2)
+    hook = step.law.register_forward_hook(lambda module, args, result: None)
+    with pytest.raises(ValueError, match="step must have no hooks"):
+        advance(state)
+    hook.remove()
+    advance(state)
+    step.register_buffer("elsewhere", torch.ones((), device="meta"))
+    with pytest.raises(ValueError, match="step must be on the device of the state"):
+        mpm.captured(step, state, DT, n=2)
+    if device == "cuda":
+        assert "a tensor of it is on meta" in step.explain(state, DT)
 
 
 def test_gradients_that_would_be_lost_are_refused(device, recorded):

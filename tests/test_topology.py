@@ -2,6 +2,8 @@
 
 import dataclasses
 import resource
+import subprocess
+import sys
 
 import pytest
 import torch
@@ -171,3 +173,20 @@ def test_a_domain_of_4096_cells_along_each_axis():
     assert torch.equal(blocks.table[active], torch.arange(len(active), dtype=torch.int32))
     assert bool((blocks.table[active - 1].clamp_max(0) == (active - 1 == active.roll(1)).int() - 1).all())
     assert float((end.x - state.x).norm(dim=1).min()) > 0.1
+
+
+def test_a_large_domain_after_descriptors_were_closed():
+    """As daemons do: another file may have the number of that which large tables are mapped from."""
+    program = """
+import os, tempfile, torch, torch_mpm as mpm
+def blocks():
+    grid = mpm.Grid(dx=1 / 64, lower=(0,) * 3, upper=(16,) * 3)
+    x = 8 + torch.rand(50, 3, generator=torch.Generator().manual_seed(0))
+    found = grid.activate(x)
+    return int((found.table >= 0).sum()), found.wanted
+first = blocks()
+os.closerange(3, 256)
+files = [tempfile.TemporaryFile() for _ in range(20)]
+assert first == blocks(), (first, blocks())
+"""
+    subprocess.run([sys.executable, "-c", program], check=True)

@@ -145,28 +145,43 @@ COUNTS = ("unsolved", "residual")
 """Attributes of heat that its steps add to."""
 
 
+def counts_of(step: torch.nn.Module) -> list[tuple[Any, str, Tensor | None]]:
+    """Where explicit steps keep what they tell of the steps so far: owner, attribute and tensor."""
+    modules: list[Any] = [m for m in step.modules() if hasattr(m, "_activations")]
+    places: list[tuple[Any, str]] = [(m._activations, name) for m in modules for name in ("status", "refused")]
+    places += [(m, name) for m in modules for name in COUNTS if hasattr(m, name)]
+    return [(owner, name, getattr(owner, name)) for owner, name in places]
+
+
 @contextlib.contextmanager
 def uncounted(step: torch.nn.Module) -> Iterator[None]:
     """Where explicit steps leave nothing behind in what they tell of the steps so far; but unlike after `aside`, that
     has its tensors then, in which the steps of graphs go on."""
     modules: list[Any] = [m for m in step.modules() if hasattr(m, "_activations")]
-    places: list[tuple[Any, str]] = [(m._activations, name) for m in modules for name in ("status", "refused")]
-    places += [(m, name) for m in modules for name in COUNTS if hasattr(m, name)]
-    tensors = [(owner, name, getattr(owner, name)) for owner, name in places]
+    tensors = counts_of(step)
+    written = [t for m in modules for t in m._activations._replayed] + buffers_of_users(step)
     with torch.inference_mode(), outside_transforms():
         before = [None if t is None else t.clone() for _, _, t in tensors]
-        replayed = [(t, t.clone()) for m in modules for t in m._activations._replayed]
+        replayed = [(t, t.clone()) for t in written]
     try:
         yield
     finally:
         with torch.inference_mode(), outside_transforms():
             for (owner, name, t), values in zip(tensors, before, strict=True):
-                if t is not None:
-                    t.copy_(values)
-                    setattr(owner, name, t)
+                if t is not None and values is not None:
+                    made = getattr(owner, name)
+                    now = t if made is None or made.device == t.device else made  # the step may have been moved
+                    now.copy_(values)
+                    setattr(owner, name, now)
                 elif (made := getattr(owner, name)) is not None:
                     made.zero_()
                     if name == "status":
                         made.copy_(torch.tensor(NO_PROBLEM, dtype=torch.int32, device="cpu"))
             for t, values in replayed:
                 t.copy_(values)
+
+
+def buffers_of_users(step: torch.nn.Module) -> list[Tensor]:
+    """What modules of the user's may write in each call, as batch normalisation does."""
+    own = [m for m in step.modules() if not any(b.__module__.startswith("torch_mpm.") for b in type(m).__mro__)]
+    return [t for m in own for t in m._buffers.values() if t is not None and not t.requires_grad]

@@ -31,7 +31,7 @@ class Arrival(NamedTuple):
     """What `rollout_to` returns; figures of each scene [B] on the device of the particles."""
 
     state: State
-    """Its time is a number if all scenes have arrived at one, else a tensor [B]."""
+    """Its time is a number if all scenes have come to one, else a tensor [B]."""
     arrived: Tensor
     """Whether a scene is at its time, bool. One stays behind whose limit is zero, as that of a particle without mass
     is, or that has taken `most` substeps."""
@@ -64,7 +64,7 @@ def rollout_to(
         step: what moves the particles; with `every` > 1 in one op per segment where `rollout` can do so.
         state: the particles; its time is a number, or a tensor [B].
         time: the time of their end [s], a number, or a tensor of shape [], [1] or [B]. Scenes that are later already
-            stand still.
+            stand still, and so do those whose entry is not finite, which do not arrive.
         cfl: share of the limit, positive and finite; see `stable_dt`.
         longest: the longest dt that is wanted [s].
         every: substeps from one choice of dt to the next. With one, dt is chosen for every substep.
@@ -111,7 +111,8 @@ class Clocks:
     def look(self) -> int:
         """The most substeps that a scene may still take; waits for the device."""
         self.state = self._at_its_time(self.state)
-        return int(self._left(self._limit(self.state)).clamp(max=self.most).amax())
+        left = torch.minimum(self._left(self._limit(self.state)), self.most - self.substeps)
+        return int(left.amax()) if len(left) else 0
 
     def advance(self, segments: int, n: int, checkpoint: int | Checkpoints | None) -> None:
         """Some segments of n substeps each."""
@@ -155,7 +156,7 @@ class Clocks:
         state = self._at_its_time(self.state)
         self._limit(state)
         arrived = self.now >= self.end
-        if not isinstance(self._end, Tensor) and bool(arrived.all()):
+        if not isinstance(self._end, Tensor) and bool((self.now == self.end).all()):
             state = state.replace(time=float(self._end))
         return Arrival(state, arrived, self.substeps, self.largest_cfl)
 
@@ -176,7 +177,7 @@ class Clocks:
         """Substeps until the end of each scene, in float64; zero for those that have arrived or cannot."""
         dt, span = (self.cfl * limit).clamp(max=self.longest), self.end - self.now
         left = torch.ceil(span / dt * (1 - ROUNDING)).clamp(min=1)
-        return torch.where((span > 0) & (dt > 0) & (self.substeps < self.most), left, 0.0)
+        return torch.where((span > 0) & span.isfinite() & (dt > 0) & (self.substeps < self.most), left, 0.0)
 
 
 def _per_scene(name: str, time: float | Tensor, scenes: int, like: Tensor) -> Tensor:

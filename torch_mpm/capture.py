@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import collections
 import contextlib
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Iterator
 from typing import Any
 
 import torch
@@ -106,9 +106,23 @@ class Recordings:
     def __init__(self) -> None:
         self.latest: Any = None
         self.unseen = 0
+        self._done: torch.cuda.Event | None = None  # the latest replay
         self._kept: collections.OrderedDict[Hashable, Any] = collections.OrderedDict()
         self._contents: dict[str, list[Tensor]] = {}
         self._latest_content: dict[str, tuple[Tensor | None, int | None, Tensor]] = {}
+
+    @contextlib.contextmanager
+    def in_turn(self, device: torch.device) -> Iterator[None]:
+        """Where graphs are replayed, after those that were replayed on other streams."""
+        if device.type != "cuda":
+            yield
+            return
+        stream = torch.cuda.current_stream(device)
+        if self._done is not None:
+            stream.wait_event(self._done)
+        yield
+        self._done = torch.cuda.Event()
+        self._done.record(stream)
 
     def __reduce__(self) -> tuple[type[Recordings], tuple[()]]:
         return Recordings, ()

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
-from .activation_record import uncounted
+from .activation_record import counts_of, uncounted
 from .anomaly import detecting
 from .boundaries import Walls
 from .capture import Recordings, Same, version
@@ -66,8 +66,6 @@ def captured(step: nn.Module, state: State | None, dt: float, n: int = 1) -> Cap
     if not isinstance(step, nn.Module):
         raise TypeError(f"step must be a Step or another module (state, dt) -> state, got {shape_of(step)}")
     check_count("n", n, 1)
-    if any(has_hooks(module) for module in step.modules()):
-        raise ValueError("step must have no hooks, nor any of its parts: a graph would not call them")
     result = Captured(step, dt, int(n), Recordings())
     if state is not None:
         result.record(state)
@@ -94,6 +92,8 @@ def obstacle_to_graphs(step: Any, state: State, dt: float | Tensor) -> str | Non
         return "anomaly detection looks at every step"
     if any(has_hooks(module) for module in step.modules()):
         return "there are hooks"
+    if (place := another_device(step, state.x.device)) is not None:
+        return f"a tensor of it is on {place}, the particles on {state.x.device}"
     steps = [module for module in step.modules() if isinstance(module, Step)]
     if any(part.integrator is not None for part in steps):
         return "an implicit step waits for its solve"
@@ -118,6 +118,11 @@ def in_graphs(step: nn.Module, state: State, n: int, dt: float, most: int) -> St
 
 def has_graphs(device: torch.device) -> bool:
     return device.type == "cuda"
+
+
+def another_device(step: nn.Module, device: torch.device) -> torch.device | None:
+    """Of a parameter or buffer of a step, whose value would go into a graph as a number; None where there is none."""
+    return next((t.device for t in (*step.parameters(), *step.buffers()) if t.device != device), None)
 
 
 # ---- what a recording depends on
@@ -169,25 +174,38 @@ _NUMBERS = (bool, int, float, str, torch.dtype, torch.device)
 
 
 def _told(module: nn.Module) -> Hashable:
-    """A module as a part of a key. Of those of the library all that may be assigned; what users keep in theirs may
-    change in each call, as a counter does."""
-    of_library = type(module).__module__.startswith("torch_mpm.")
+    """A module as a part of a key. Of those of the library, and of classes made of them, all that may be assigned; of
+    the user's own modules the tensors, but not the numbers, which may change in each call as a counter does."""
+    classes = type(module).__mro__
+    plain, of_library = _is_of_library(classes[0]), any(map(_is_of_library, classes))
     tensors = [(name, t) for name, t in (*module._parameters.items(), *module._buffers.items()) if t is not None]
     read = [
         (name, Same(t), t.data_ptr(), version(t) if of_library and not isinstance(module, Step) else None)
         for name, t in tensors
         if not t.requires_grad
     ]
-    values = [(name, _value(value)) for name, value in vars(module).items()] if of_library else []
+
+    def attribute(value: Any) -> Hashable:
+        if isinstance(value, Tensor):
+            return None if plain else Same(value)  # the library keeps what follows from others
+        return _value(value) if of_library else None
+
+    values = [(name, attribute(value)) for name, value in vars(module).items()]
     told = tuple((name, value) for name, value in values if value is not None)
-    return Same(module), module.training, tuple(read), told
+    return Same(module), module.training, has_hooks(module), tuple(read), told
+
+
+def _is_of_library(kind: type) -> bool:
+    return kind.__module__.startswith("torch_mpm.")
 
 
 def _value(value: Any) -> Hashable:
-    """An attribute of a module of the library as a part of a key; None for what steps keep there themselves."""
+    """An attribute of a module as a part of a key; None for what steps keep there themselves."""
     if isinstance(value, _NUMBERS):
         return value
-    if isinstance(value, (Grid, Walls)) or callable(value):
+    if isinstance(value, Walls):  # whose kinds and friction may be assigned
+        return Same(value), repr(value)
+    if isinstance(value, Grid) or callable(value):
         return Same(value)
     if isinstance(value, (list, tuple)) and not any(isinstance(part, Tensor) for part in value):
         return tuple(part if isinstance(part, _NUMBERS) else Same(part) for part in value)
@@ -196,6 +214,12 @@ def _value(value: Any) -> Hashable:
 
 def _autocast(device: torch.device) -> tuple[bool, torch.dtype]:
     return torch.is_autocast_enabled(device.type), torch.get_autocast_dtype(device.type)
+
+
+def _surroundings(device: torch.device) -> Hashable:
+    """Settings of torch that decide what a recording computes."""
+    precision = torch.get_float32_matmul_precision(), torch.are_deterministic_algorithms_enabled()
+    return torch.is_grad_enabled(), _autocast(device), precision
 
 
 # ---- calls
@@ -234,9 +258,20 @@ class Captured:
                 ends = call.forward(given)
         recording.watch(self._recordings)
         results: dict[str, Any] = dict(zip(recording.steps.changed, ends, strict=True))
-        if not isinstance(state.time, Tensor):
+        if isinstance(self._step, Step) and not isinstance(state.time, Tensor):
             results["time"] = time_after(state.time, self._dt, self._n)
-        return _with(prepared, results | dict.fromkeys(recording.steps.dropped))
+        return _with(prepared, results | recording.steps.dropped)
+
+    def _check(self, device: torch.device) -> None:
+        """That the step can be recorded now.
+
+        Raises:
+            ValueError: for a step with hooks, or with a tensor on another device.
+        """
+        if any(has_hooks(module) for module in self._step.modules()):
+            raise ValueError("step must have no hooks, nor any of its parts: a graph would not call them")
+        if (place := another_device(self._step, device)) is not None:
+            raise ValueError(f"step must be on the device of the state, {device}, got a tensor on {place}")
 
     def _prepared(self, state: State) -> State:
         """With the fields that steps need, and its time as a tensor."""
@@ -260,10 +295,11 @@ class Captured:
             wanted = {name for name in wanted if inputs[name].is_floating_point()}
         kinds = frozenset((name, t.shape, t.dtype, t.device, name in wanted) for name, t in inputs.items())
         contents = tuple((name, Same(t)) for name, t in fixed.items())
-        around = self._n, self._dt, torch.is_grad_enabled(), _autocast(prepared.x.device), contents
+        around = self._n, self._dt, _surroundings(prepared.x.device), contents
         known.follow(prepared, self._recordings.unseen)
         recording = self._recordings.get((kinds, around, known.key, known.pools()))
         if recording is None:
+            self._check(prepared.x.device)
             steps = _Steps(self._step, self._dt, self._n, prepared, fixed, list(inputs))
             recording = _Recording(steps, inputs, wanted, self._recordings)
             known.look()
@@ -278,7 +314,8 @@ _MOVED = ("x", "v", "C", "F", "J", "temperature", "impulse")
 def _with(state: State, tensors: Mapping[str, Any]) -> State:
     extra = {name.removeprefix("extra."): value for name, value in tensors.items() if name.startswith("extra.")}
     fields: dict[str, Any] = {name: value for name, value in tensors.items() if not name.startswith("extra.")}
-    return state.replace(**fields, extra={**state.extra, **extra})
+    kept = {name: value for name, value in {**state.extra, **extra}.items() if value is not None}
+    return state.replace(**fields, extra=kept)
 
 
 class _Steps:
@@ -289,7 +326,8 @@ class _Steps:
         names: of the arguments.
 
     Attributes:
-        changed: of the results; dropped: fields that are None after the steps. Known after a call.
+        changed: of the results; dropped: fields that are no tensors after the steps: None, or a time that is a number.
+            Known after a call.
     """
 
     def __init__(
@@ -297,7 +335,7 @@ class _Steps:
     ) -> None:
         self.step, self.names, self.device = step, names, like.x.device
         self.changed: list[str] = []
-        self.dropped: list[str] = []
+        self.dropped: dict[str, float | None] = {}
         self._dt, self._n, self._like, self._fixed = dt, n, like, fixed
 
     def __call__(self, *tensors: Tensor) -> tuple[Tensor, ...]:
@@ -309,7 +347,10 @@ class _Steps:
             state = torch.func.functional_call(self.step, own, (state, self._dt))
         before, after = tensors_of(begin), tensors_of(state)
         results = {name: t for name, t in after.items() if t is not before.get(name)}
-        self.changed, self.dropped = list(results), [name for name in before if name not in after]
+        self.changed = list(results)
+        self.dropped = {name: None for name in before if name not in after}
+        if "time" in self.dropped:
+            self.dropped["time"] = float(state.time)
         return tuple(results.values())
 
 
@@ -322,17 +363,19 @@ class _Call:
 
     def forward(self, given: Sequence[Tensor]) -> list[Tensor]:
         self._recordings.latest = self
-        return [t.clone() for t in self.recording.graphs.forward(given)]
+        with self._recordings.in_turn(self.recording.steps.device):
+            return [t.clone() for t in self.recording.graphs.forward(given)]
 
     def gradients(self, given: Sequence[Tensor], grads: Sequence[Tensor | None]) -> list[Tensor | None]:
         """By the arguments; None where there is none."""
         graphs = self.recording.graphs
-        if self._recordings.latest is not self:
-            with uncounted(self._step), self._same_random_numbers():
-                graphs.forward(given)
-        self._recordings.latest = None  # the backward pass makes use of the memory of what it has read
-        # The next replay writes over its gradients.
-        return [None if grad is None else grad.clone() for grad in graphs.backward(grads)]
+        with self._recordings.in_turn(self.recording.steps.device):
+            if self._recordings.latest is not self:
+                with uncounted(self._step), self._same_random_numbers():
+                    graphs.forward(given)
+            self._recordings.latest = None  # the backward pass makes use of the memory of what it has read
+            # The next replay writes over its gradients.
+            return [None if grad is None else grad.clone() for grad in graphs.backward(grads)]
 
     @contextlib.contextmanager
     def _same_random_numbers(self) -> Iterator[None]:
@@ -395,6 +438,7 @@ class _Recording:
             self.graphs.record(None if kept is None else kept.graphs)
         # Which the graphs read, and mixtures give up for those of other particles.
         self._indices = [m.indices for m in steps.step.modules() if isinstance(m, Mixture)]
+        self._counts = [count for _, _, count in counts_of(steps.step)]  # to which they write
         parts = [m for m in steps.step.modules() if isinstance(m, Step)]
         self._statuses = [(part.grid, part.status) for part in parts if part.status is not None]
 
@@ -441,7 +485,7 @@ class Graphs:
         Raises:
             ValueError: where gradients would pass to something that is no argument, whose replays would lose them.
         """
-        with _aside(self._device):
+        with _on_own_stream(self._device):
             ends = self._steps(*self.read)
             if other := next(_others(ends, self.read), None):
                 raise ValueError(
@@ -519,7 +563,7 @@ _STREAMS = _Streams()
 
 
 @contextlib.contextmanager
-def _aside(device: torch.device) -> Iterator[None]:
+def _on_own_stream(device: torch.device) -> Iterator[None]:
     """On the stream of graphs, between what is before and after."""
     now, stream = torch.cuda.current_stream(device), _STREAMS.of(device)
     stream.wait_stream(now)
@@ -532,7 +576,7 @@ def _aside(device: torch.device) -> Iterator[None]:
 def _into(graph: torch.cuda.CUDAGraph, beside: torch.cuda.CUDAGraph | None, device: torch.device) -> Iterator[None]:
     """Where operations go into a graph that has its memory with another one. Other threads may go on meanwhile."""
     torch.cuda.synchronize(device)
-    with _aside(device):
+    with _on_own_stream(device):
         graph.capture_begin(None if beside is None else beside.pool(), capture_error_mode="thread_local")
         try:
             yield

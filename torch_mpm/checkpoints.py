@@ -141,10 +141,9 @@ def recomputed(advance: Advance, state: State, count: int, first: int, step: Any
         given = _pytree.tree_unflatten(tensors, layout)
         with contextlib.ExitStack() as stack:
             stack.enter_context(same_pools(pools))
-            if again:
-                if isinstance(step, torch.nn.Module):  # whose graphs write to the tensors that `aside` puts away
-                    stack.enter_context(uncounted(step))
-                stack.enter_context(aside(step, given.x))
+            if again:  # graphs write to the tensors that `aside` would put away
+                from_graphs = isinstance(step, torch.nn.Module) and "_recordings" in vars(step)
+                stack.enter_context(uncounted(step) if from_graphs else aside(step, given.x))
             again = True
             return advance(given, count, first)
 

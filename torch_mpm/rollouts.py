@@ -396,6 +396,7 @@ def substeps_arguments(
     Raises:
         ValueError: where the op cannot take the steps, and why.
     """
+    check_count("n", n, 1)
     if (reason := obstacle_to_substeps(step, state, dt)) is not None:
         raise ValueError(f"step must be one that `substeps` can take, got one of which {reason}")
     return _arguments(step, step.prepare(state), n, dt, records, blocks)[0]
@@ -444,7 +445,7 @@ def _substeps(step: Step, state: State, n: int, dt: float | Tensor, records: boo
 def _in_shape(times: Tensor, time: float | Tensor, dt: float | Tensor) -> Tensor:
     """Times of each scene as the sum of a time and dt has them: one where all have the same."""
     shape = torch.broadcast_shapes(*(t.shape for t in (time, dt) if isinstance(t, Tensor)))
-    return times if times.shape == shape else times[:1].reshape(shape)
+    return times if times.shape == shape or not len(times) else times[:1].reshape(shape)
 
 
 def _gravity(step: Step, x: Tensor) -> Tensor | None:

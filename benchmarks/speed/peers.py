@@ -250,6 +250,8 @@ def main() -> None:
     parser.add_argument("--save", help="file for x and v of the first size after the first steps (.npz)")
     parser.add_argument("--launches", action="store_true", help="from Python, where Warp would replay a CUDA graph")
     arguments = parser.parse_args()
+    if arguments.scenes > 1 and arguments.domain > 1:
+        parser.error("--scenes makes a domain of its own: give no --domain")
     for i, side in enumerate(arguments.sides):
         save = arguments.save if i == 0 else None
         w = work.make(side)

@@ -2,6 +2,7 @@
 
 #include <sys/mman.h>
 #ifdef __linux__
+#include <sys/stat.h>
 #include <unistd.h>
 #endif
 
@@ -15,28 +16,43 @@ namespace {
 // Of the file: a mapping of each piece costs some microseconds, and a process may have 65530 of them.
 constexpr int64_t kPiece = 16 << 20;
 
-// The file, which nobody writes any more; -1 where there is none.
-int make_file() {
-  const int file = memfd_create("torch_mpm", MFD_CLOEXEC);
-  if (file < 0) return -1;
-  if (ftruncate(file, kPiece) == 0) {
-    void* const p = mmap(nullptr, kPiece, PROT_READ | PROT_WRITE, MAP_SHARED, file, 0);
+// The file, which nobody writes any more. A process may close the descriptors that it does not know, and another file
+// gets the number then.
+class OnesFile {
+ public:
+  OnesFile() : descriptor_(memfd_create("torch_mpm", MFD_CLOEXEC)) {
+    if (descriptor_ < 0) return;
+    void* const p = ftruncate(descriptor_, kPiece) == 0
+                        ? mmap(nullptr, kPiece, PROT_READ | PROT_WRITE, MAP_SHARED, descriptor_, 0)
+                        : MAP_FAILED;
     if (p != MAP_FAILED) {
       std::memset(p, 0xff, kPiece);
       munmap(p, kPiece);
-      return file;
+      made_ = fstat(descriptor_, &identity_) == 0;
     }
+    if (!made_) close(descriptor_);
   }
-  close(file);
-  return -1;
-}
+
+  // -1 where there is none, or no longer.
+  int descriptor() const {
+    struct stat now;
+    if (!made_ || fstat(descriptor_, &now) != 0) return -1;
+    return now.st_dev == identity_.st_dev && now.st_ino == identity_.st_ino ? descriptor_ : -1;
+  }
+
+ private:
+  int descriptor_;
+  bool made_ = false;
+  struct stat identity_{};
+};
 #endif
 
 }  // namespace
 
 void* take_ones([[maybe_unused]] int64_t bytes) {
 #ifdef __linux__
-  static const int file = make_file();
+  static const OnesFile ones;
+  const int file = ones.descriptor();
   if (file < 0) return nullptr;
   constexpr int protection = PROT_READ | PROT_WRITE, flags = MAP_PRIVATE | MAP_NORESERVE;
   void* const all = mmap(nullptr, size_t(bytes), protection, flags | MAP_ANONYMOUS, -1, 0);

@@ -657,6 +657,7 @@ Substeps<T, D>::Substeps(const SubstepsInputs& inputs) : in(inputs) {
   if (has(in.impulse)) {
     check_shape(*in.impulse, "impulse", impulse_shape());
     check_type(*in.impulse, "impulse", ScalarType::Double, x);
+    STD_TORCH_CHECK(!flips() || !update.walls.mirrored, "impulses on mirrors are not counted with flip, got ", in.flip);
   }
   advance.gather.moment_scale = in.lattice.inverse_inertia();
   advance.gather.lost = NAN;
