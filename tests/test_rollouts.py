@@ -271,13 +271,14 @@ def test_a_full_pool_is_reported_by_the_call_that_fills_it(device):
 @pytest.mark.parametrize("dtype", [torch.float32, F64])
 def test_a_pool_that_was_too_small_for_some_steps_is_told_when_it_has_grown(device, dtype):
     """On CUDA it grows between calls; on the CPU within them, so that there is nothing to tell."""
-    step = mpm.Step(box(2, dx=0.01), mpm.NeoHookean(E=1e3, nu=0.3), transfer="pic")
+    step = mpm.Step(box(2, dx=0.005), mpm.NeoHookean(E=1e3, nu=0.3), transfer="pic")
     state = blob(device, 2, 200, dtype=dtype)
-    state = state.replace(x=0.45 + 0.1 * state.x, v=300 * (state.x - 0.5))
+    state = state.replace(x=0.45 + 0.1 * state.x, v=1000 * (state.x - 0.5))
     with torch.no_grad():
-        for _ in range(4):
-            state = mpm.rollout(step, state, 60, 2e-5)
+        state = mpm.rollout(step, state, 60, 2e-5)  # by 0.24 m at most
+        for _ in range(3):
             step.grid.wait()
+            state = step(state.replace(v=torch.zeros_like(state.v)), 2e-5)
     if device == "cpu":
         return step.check(state)
     assert step.grid.max_blocks > int(step.status[0, 7])

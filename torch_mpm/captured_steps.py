@@ -66,6 +66,7 @@ def captured(step: nn.Module, state: State | None, dt: float, n: int = 1) -> Cap
     if not isinstance(step, nn.Module):
         raise TypeError(f"step must be a Step or another module (state, dt) -> state, got {shape_of(step)}")
     check_count("n", n, 1)
+    refuse_hooks(step)
     result = Captured(step, dt, int(n), Recordings())
     if state is not None:
         result.record(state)
@@ -114,6 +115,11 @@ def in_graphs(step: nn.Module, state: State, n: int, dt: float, most: int) -> St
         state = Captured(step, dt, count, recordings).after(state, known, alike=True)
         n -= count
     return state
+
+
+def refuse_hooks(step: nn.Module) -> None:
+    if any(has_hooks(module) for module in step.modules()):
+        raise ValueError("step must have no hooks, nor any of its parts: a graph would not call them")
 
 
 def has_graphs(device: torch.device) -> bool:
@@ -268,8 +274,7 @@ class Captured:
         Raises:
             ValueError: for a step with hooks, or with a tensor on another device.
         """
-        if any(has_hooks(module) for module in self._step.modules()):
-            raise ValueError("step must have no hooks, nor any of its parts: a graph would not call them")
+        refuse_hooks(self._step)
         if (place := another_device(self._step, device)) is not None:
             raise ValueError(f"step must be on the device of the state, {device}, got a tensor on {place}")
 

@@ -231,7 +231,7 @@ MANY_PARTICLES, PARTICLES_PER_BLOCK = 2**18, 32
 the nodes of a block do."""
 ROOMY, ROOMY_CHUNK = 3, 256
 """A pool with room for so many times the blocks of one that follows the scene, and steps of a call with it: four times
-as many as with the other."""
+as many as with the other; and twice as many again where it has room for twice as many."""
 KEPT_BYTES = {"cpu": 2**24, "cuda": 2**29}
 """What the backward pass of one op may hold of its steps, even where sqrt(n) steps need less: what the caches of a CPU
 hold, and so much that kernels on CUDA hide the time of Python."""
@@ -276,9 +276,8 @@ def pool_of_call(step: Step, state: State, n: int) -> tuple[int, int] | None:
     if room >= grid.block_count or takes_few_blocks(step, state, n):
         return grid.block_count, LONG_CHUNK
     passes = grid.deterministic or has_mirrors(step) or step._flip_share > 0
-    if grid.max_blocks is not None and room >= ROOMY * grid.max_blocks and not passes:
-        return room, ROOMY_CHUNK
-    return None
+    times = 0 if grid.max_blocks is None or passes else room // (ROOMY * grid.max_blocks)
+    return (room, ROOMY_CHUNK * min(times, 2)) if times else None
 
 
 def has_mirrors(step: Step) -> bool:

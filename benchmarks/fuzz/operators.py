@@ -220,7 +220,7 @@ class _Calls:
         who = (self.scene, ids, material, self.blocks.status)
         laws = ("neo_hookean,von_mises,weakly_compressible", [0, 0, 0])
         counts = [len(LAWS[name].parameters) for name in laws[0].split(",")]
-        how = ([ones] * sum(counts), [0, 1, 0], 3, 1e-3, True, 0.9, True, 0, self.normal(2, D), *self.walls)
+        how = ([ones] * sum(counts), [0, 1, 0], 3, 1e-3, True, 0.0, True, 0, self.normal(2, D), *self.walls)
         impulse = self.normal(2, 6 + 2 * D, D + (1 if D == 2 else 3)).double()
         end = (*self.obstacles, 0.1, 2, 40, True, False, False, impulse, self.dt, self.uniform(2), *self.lattice.packed)
         look = (*fields[:5], self.F, *self.uniform(4, P), self.scene, 50.0, 2.0, True, 0.1, self.lattice.upper, 2)

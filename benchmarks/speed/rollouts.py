@@ -4,7 +4,8 @@
     python -m benchmarks.speed.rollouts --device cuda      # either takes about a minute
     python -m benchmarks.speed.rollouts --out DIRECTORY
 
-Scenes: `torch_mpm.scene.run` with its files; time of the simulation. The others are the neo-Hookean cube of
+Scenes: `torch_mpm.scene.run` with its files; time of the simulation, for the first with that in which its kernels are
+loaded. The others are the neo-Hookean cube of
 `benchmarks/speed/work.py`, steps of one call of `torch_mpm.rollout`, wall clock, synchronised once. Warp and Taichi
 take steps of the same cube where they are installed (`pip install torch-mpm[bench]`), Warp's also launched one by one
 from Python beside each scene. The figure has every device that has results in DIRECTORY.
@@ -197,6 +198,7 @@ def measure(device: str, quick: bool = False) -> dict[str, Any]:
     samples = 1 if quick else 5
     parts: dict[str, list[Any]] = {name: [] for name in ("scenes", "rollouts", "peers", "plain")}
     result: dict[str, Any] = {"environment": common.environment(device), **parts}
+    result["scenes"] += scenes(() if quick else SCENES[device], device)  # first, as in a process of their own
     sides = SIDES[device][:2] if quick else SIDES[device]
     for side in sides:
         s = setup(work.make(side), device)
@@ -223,7 +225,6 @@ def measure(device: str, quick: bool = False) -> dict[str, Any]:
     result["peers"] += () if quick else of_peers(device, result["rollouts"])
     s, dt = on_its_way("demo", device, frames=1 if quick else 6)
     result["rollouts"].append({"name": "demo, one call", **per_step(s, device, samples, dt)})
-    result["scenes"] += scenes(() if quick else SCENES[device], device)
     result["plain"] += () if quick else plain_programs(device, result["scenes"])
     return result
 
