@@ -11,15 +11,25 @@ namespace mpm {
 namespace {
 
 #if MPM_BACKEND == MPM_BACKEND_IS_cpu
+// Of a type that the pool has memory for, else 0.
 int64_t element_size(ScalarType type) {
   switch (type) {
     case ScalarType::Double:
+    case ScalarType::Long:
       return 8;
     case ScalarType::Float:
     case ScalarType::Int:
       return 4;
+    case ScalarType::Half:
+    case ScalarType::BFloat16:
+    case ScalarType::Short:
+      return 2;
+    case ScalarType::Byte:
+    case ScalarType::Char:
+    case ScalarType::Bool:
+      return 1;
     default:
-      return 1;  // Byte and Bool
+      return 0;
   }
 }
 
@@ -30,7 +40,7 @@ Tensor empty_in_pool(const Tensor& like, const Shape& shape, const Shape& stride
     if (shape[i] == 0) return {};
     last += (shape[i] - 1) * strides[i];
   }
-  const int64_t bytes = (last + 1) * element_size(type);
+  const int64_t bytes = (last + 1) * element_size(type);  // zero of other types
   cpu::Buffer* buffer = bytes < cpu::kPooled ? nullptr : cpu::take(bytes);
   if (!buffer) return {};
   return torch::stable::from_blob(buffer->data, shape, strides, like.device(), type,

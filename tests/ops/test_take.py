@@ -35,6 +35,23 @@ def test_takes_as_indexing_does(index, particles, device):
         assert taken.numel() == 0 or taken.stride(0) == 1
 
 
+def test_takes_many(device):
+    """More than the pool of the CPU has small pieces of memory for."""
+    numbers = torch.arange(1_200_000, device=device)
+    given = [
+        numbers << 20,
+        numbers.double(),
+        numbers.float(),
+        numbers.int(),
+        numbers.short(),
+        numbers.half(),
+        numbers > 9,
+    ]
+    places = numbers.flip(0)
+    for field, taken in zip(given, OP(given, places), strict=True):
+        assert torch.equal(taken, field.flip(0)), field.dtype
+
+
 def test_particles_that_do_not_exist_have_zeros(device):
     given = fields(7, device)
     places = torch.tensor([3, -1, 7, 2**31, -(2**63)], device=device)
