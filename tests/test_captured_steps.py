@@ -372,6 +372,22 @@ def test_states_are_not_kept(device, recorded):
     assert recorded and not any(ref() is not None for ref in kept)
 
 
+def test_graphs_go_with_their_step(device, recorded):
+    """At once: a loop over steps must not keep the memory of their graphs until somebody looks for cycles."""
+    step, state = blown(device)
+    with torch.no_grad():
+        mpm.rollout(step, state, 4, DT, graph=2)
+    kept = [weakref.ref(graphs) for graphs in recorded]
+    recorded.clear()
+    gc.collect()
+    gc.disable()
+    try:
+        del step
+        assert kept and not any(ref() is not None for ref in kept)
+    finally:
+        gc.enable()
+
+
 def test_under_autocast_and_without_gradients_for_good(device, recorded):
     """Of which graphs are others: half precision is that of the call, and tensors of inference mode stay there."""
     step, state = mixed(device)

@@ -97,7 +97,7 @@ class Recordings:
 
     Attributes:
         most: how many are kept.
-        latest: whose results are in the memory; None where they are spoilt.
+        latest: the mark of the call whose results are in the memory; None where they are spoilt.
         unseen: calls since a device was asked how many blocks are active.
     """
 

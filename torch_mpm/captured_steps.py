@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import threading
+import weakref
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from typing import Any
 
@@ -152,7 +153,8 @@ class _Parts:
         step = self._step
         named = [*step.named_parameters(), *step.named_buffers()]
         self.own = {f"step.{name}": t for name, t in named if t.requires_grad}
-        self.key = tuple(_told(module) for module in step.modules())
+        # Not by the step, which keeps its recordings: it could only go with them where somebody looks for cycles.
+        self.key = tuple((None if m is step else Same(m), *_told(m)) for m in step.modules())
         self.steps = [module for module in step.modules() if isinstance(module, Step)]
         self.mixes = any(isinstance(module, Mixture) for module in step.modules())
         self._sizes = {t.numel() for _, t in named if not t.requires_grad}
@@ -179,9 +181,10 @@ class _Parts:
 _NUMBERS = (bool, int, float, str, torch.dtype, torch.device)
 
 
-def _told(module: nn.Module) -> Hashable:
-    """A module as a part of a key. Of those of the library, and of classes made of them, all that may be assigned; of
-    the user's own modules the tensors, but not the numbers, which may change in each call as a counter does."""
+def _told(module: nn.Module) -> tuple[Hashable, ...]:
+    """A module by its content as a part of a key. Of those of the library, and of classes made of them, all that may be
+    assigned; of the user's own modules the tensors, but not the numbers, which may change in each call as a counter
+    does."""
     classes = type(module).__mro__
     plain, of_library = _is_of_library(classes[0]), any(map(_is_of_library, classes))
     tensors = [(name, t) for name, t in (*module._parameters.items(), *module._buffers.items()) if t is not None]
@@ -198,7 +201,7 @@ def _told(module: nn.Module) -> Hashable:
 
     values = [(name, attribute(value)) for name, value in vars(module).items()]
     told = tuple((name, value) for name, value in values if value is not None)
-    return Same(module), module.training, has_hooks(module), tuple(read), told
+    return module.training, has_hooks(module), tuple(read), told
 
 
 def _is_of_library(kind: type) -> bool:
@@ -338,10 +341,16 @@ class _Steps:
     def __init__(
         self, step: nn.Module, dt: float, n: int, like: State, fixed: Mapping[str, Any], names: list[str]
     ) -> None:
-        self.step, self.names, self.device = step, names, like.x.device
+        self._step, self.names, self.device = weakref.ref(step), names, like.x.device
         self.changed: list[str] = []
         self.dropped: dict[str, float | None] = {}
         self._dt, self._n, self._like, self._fixed = dt, n, like, fixed
+
+    @property
+    def step(self) -> nn.Module:
+        step = self._step()
+        assert step is not None, "its recordings go with a step"
+        return step
 
     def __call__(self, *tensors: Tensor) -> tuple[Tensor, ...]:
         given = dict(zip(self.names, tensors, strict=True))
@@ -364,10 +373,11 @@ class _Call:
 
     def __init__(self, step: nn.Module, recordings: Recordings, recording: _Recording) -> None:
         self._step, self._recordings, self.recording = step, recordings, recording
+        self._mark = object()  # of this call in the recordings, which must not keep it
         self._random = _random_numbers(recording.steps.device) if recording.wanted else None
 
     def forward(self, given: Sequence[Tensor]) -> list[Tensor]:
-        self._recordings.latest = self
+        self._recordings.latest = self._mark
         with self._recordings.in_turn(self.recording.steps.device):
             return [t.clone() for t in self.recording.graphs.forward(given)]
 
@@ -375,7 +385,7 @@ class _Call:
         """By the arguments; None where there is none."""
         graphs = self.recording.graphs
         with self._recordings.in_turn(self.recording.steps.device):
-            if self._recordings.latest is not self:
+            if self._recordings.latest is not self._mark:
                 with uncounted(self._step), self._same_random_numbers():
                     graphs.forward(given)
             self._recordings.latest = None  # the backward pass makes use of the memory of what it has read
