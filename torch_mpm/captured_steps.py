@@ -6,7 +6,7 @@ import contextlib
 import functools
 import threading
 import weakref
-from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -15,13 +15,13 @@ from torch.autograd.function import once_differentiable
 
 from .activation_record import counts_of, uncounted
 from .anomaly import detecting
-from .boundaries import Walls
-from .capture import Recordings, Same, version
+from .capture import Recordings, Same
 from .errors import check_count, shape_of
 from .graphs import copied, copy_all, tensors_of, time_after, time_tensor
-from .grid import Grid, own_pools
+from .grid import own_pools
 from .laws.mixture import Mixture
 from .parameters import has_hooks
+from .recording_keys import StepKey, autocast_of, surroundings
 from .state import State, check_state
 from .step import Step
 
@@ -110,7 +110,7 @@ def in_graphs(step: nn.Module, state: State, n: int, dt: float, most: int) -> St
     What they read is kept for the backward pass, which replays the steps of all but the latest graph again.
     """
     recordings = step.__dict__.setdefault("_recordings", Recordings())
-    known = _Parts(step)
+    known = StepKey(step)
     while n > 0:
         count = min(n, most)
         state = Captured(step, dt, count, recordings).after(state, known, alike=True)
@@ -132,105 +132,6 @@ def another_device(step: nn.Module, device: torch.device) -> torch.device | None
     return next((t.device for t in (*step.parameters(), *step.buffers()) if t.device != device), None)
 
 
-# ---- what a recording depends on
-
-
-class _Parts:
-    """What is known of a step while nobody changes it.
-
-    Attributes:
-        own: its tensors that require gradients, by "step." and their name.
-        key: what a recording has of it beside those.
-        steps: those in it.
-    """
-
-    def __init__(self, step: nn.Module) -> None:
-        self._step = step
-        self.look()
-
-    def look(self) -> None:
-        """Again: the first steps make some of what steps keep."""
-        step = self._step
-        named = [*step.named_parameters(), *step.named_buffers()]
-        self.own = {f"step.{name}": t for name, t in named if t.requires_grad}
-        # Not by the step, which keeps its recordings: it could only go with them where somebody looks for cycles.
-        self.key = tuple((None if m is step else Same(m), *_told(m)) for m in step.modules())
-        self.steps = [module for module in step.modules() if isinstance(module, Step)]
-        self.mixes = any(isinstance(module, Mixture) for module in step.modules())
-        self._sizes = {t.numel() for _, t in named if not t.requires_grad}
-
-    def by_content(self, state: State) -> list[str]:
-        """Fields of which steps keep what follows from them, as indices, while they are the same."""
-        names = ["material"] if self.mixes and state.material is not None else []
-        return [*names, "ids"] if state.ids is not None and len(state) in self._sizes else names
-
-    def pools(self) -> Hashable:
-        """Of the grids, as large as they are now."""
-        return tuple(step.grid.max_blocks for step in self.steps)
-
-    def follow(self, state: State, unseen: int) -> None:
-        """Let pools of grids that grow follow what was told of calls before. The host waits where that was so many
-        calls ago that the scene may have grown out of them, but not for the latest call, which the device works at."""
-        for grid in {step.grid: None for step in self.steps if step.grid.grows}:
-            if unseen > 1:
-                grid.wait()
-            if grid.max_blocks is not None or isinstance(self._step, Step):
-                grid.pool(state.x, state.scene)
-
-
-_NUMBERS = (bool, int, float, str, torch.dtype, torch.device)
-
-
-def _told(module: nn.Module) -> tuple[Hashable, ...]:
-    """A module by its content as a part of a key. Of those of the library, and of classes made of them, all that may be
-    assigned; of the user's own modules the tensors, but not the numbers, which may change in each call as a counter
-    does."""
-    classes = type(module).__mro__
-    plain, of_library = _is_of_library(classes[0]), any(map(_is_of_library, classes))
-    tensors = [(name, t) for name, t in (*module._parameters.items(), *module._buffers.items()) if t is not None]
-    read = [
-        (name, Same(t), t.data_ptr(), version(t) if of_library and not isinstance(module, Step) else None)
-        for name, t in tensors
-        if not t.requires_grad
-    ]
-
-    def attribute(value: Any) -> Hashable:
-        if isinstance(value, Tensor):
-            return None if plain else Same(value)  # the library keeps what follows from others
-        return _value(value) if of_library else None
-
-    values = [(name, attribute(value)) for name, value in vars(module).items()]
-    told = tuple((name, value) for name, value in values if value is not None)
-    return module.training, has_hooks(module), tuple(read), told
-
-
-def _is_of_library(kind: type) -> bool:
-    return kind.__module__.startswith("torch_mpm.")
-
-
-def _value(value: Any) -> Hashable:
-    """An attribute of a module as a part of a key; None for what steps keep there themselves."""
-    if isinstance(value, _NUMBERS):
-        return value
-    if isinstance(value, Walls):  # whose kinds and friction may be assigned
-        return Same(value), repr(value)
-    if isinstance(value, Grid) or callable(value):
-        return Same(value)
-    if isinstance(value, (list, tuple)) and not any(isinstance(part, Tensor) for part in value):
-        return tuple(part if isinstance(part, _NUMBERS) else Same(part) for part in value)
-    return None
-
-
-def _autocast(device: torch.device) -> tuple[bool, torch.dtype]:
-    return torch.is_autocast_enabled(device.type), torch.get_autocast_dtype(device.type)
-
-
-def _surroundings(device: torch.device) -> Hashable:
-    """Settings of torch that decide what a recording computes."""
-    precision = torch.get_float32_matmul_precision(), torch.are_deterministic_algorithms_enabled()
-    return torch.is_grad_enabled(), _autocast(device), precision
-
-
 # ---- calls
 
 
@@ -241,14 +142,14 @@ class Captured:
         self._step, self._dt, self._n, self._recordings = step, dt, n, recordings
 
     def __call__(self, state: State) -> State:
-        return self.after(state, _Parts(self._step))
+        return self.after(state, StepKey(self._step))
 
     def record(self, state: State) -> None:
         """For a kind of states, in the grad mode and autocast of now."""
-        known = _Parts(self._step)
+        known = StepKey(self._step)
         self._recording(self._prepared(state), known, False)
 
-    def after(self, state: State, known: _Parts, alike: bool = False) -> State:
+    def after(self, state: State, known: StepKey, alike: bool = False) -> State:
         """The state n steps later.
 
         Args:
@@ -293,7 +194,7 @@ class Captured:
             state = state.replace(C=state.x.new_zeros(*state.x.shape, state.x.shape[1]))  # as after the first step
         return state.replace(time=time_tensor(state))
 
-    def _recording(self, prepared: State, known: _Parts, alike: bool) -> tuple[_Recording, list[Tensor]]:
+    def _recording(self, prepared: State, known: StepKey, alike: bool) -> tuple[_Recording, list[Tensor]]:
         """The recording that serves a state, made where there is none, and what it reads."""
         inputs = tensors_of(prepared) | known.own
         fixed = {name: self._recordings.same_content(name, inputs.pop(name)) for name in known.by_content(prepared)}
@@ -303,7 +204,7 @@ class Captured:
             wanted = {name for name in wanted if inputs[name].is_floating_point()}
         kinds = frozenset((name, t.shape, t.dtype, t.device, name in wanted) for name, t in inputs.items())
         contents = tuple((name, Same(t)) for name, t in fixed.items())
-        around = self._n, self._dt, _surroundings(prepared.x.device), contents
+        around = self._n, self._dt, surroundings(prepared.x.device), contents
         known.follow(prepared, self._recordings.unseen)
         recording = self._recordings.get((kinds, around, known.key, known.pools()))
         if recording is None:
@@ -444,7 +345,7 @@ class _Recording:
             stack.enter_context(torch.set_grad_enabled(with_gradients))
             stack.enter_context(no_hooks())
             # A cache of casts would keep parameters as they were.
-            casts, dtype = _autocast(device)
+            casts, dtype = autocast_of(device)
             stack.enter_context(torch.autocast(device.type, dtype, casts, cache_enabled=False))
             self.graphs = Graphs(steps, [inputs[name] for name in names], [name in wanted for name in names])
             with uncounted(steps.step), torch.random.fork_rng([device] if device.type == "cuda" else []):
