@@ -21,6 +21,7 @@ Tensor new_table(const Tensor& like, int64_t entries) {
 }
 
 void empty_table(Tensor& table) {
+  if (table.numel() == 0) return;     // whose memory may be none
   constexpr int64_t grain = 1 << 16;  // entries that one thread sets sooner than it calls others
   cpu::parallel_for(
       table.numel(), grain,
