@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .capture import is_captured, is_exported, outside_transforms, remember, without_transforms
+from .capture import is_captured, is_exported, is_of_library, outside_transforms, remember, without_transforms
 from .failures import Problem, problems_of_status, refused_steps
 from .grid import Blocks, Grid
 
@@ -128,7 +128,7 @@ def aside(step: Any, x: Tensor) -> Iterator[None]:
         step: a module, whose parts are meant too, or a function, which has no records.
         x: a tensor on the device of the particles.
     """
-    modules = [m for m in step.modules() if hasattr(m, "_activations")] if isinstance(step, torch.nn.Module) else []
+    modules = _recorders(step) if isinstance(step, torch.nn.Module) else []
     integrators = [i for m in modules if (i := getattr(m, "integrator", None)) is not None]
     kept = [(m, name, getattr(m, name)) for m in (*modules, *integrators) for name in RECORDS if hasattr(m, name)]
     for owner, name, _ in kept:
@@ -145,9 +145,13 @@ COUNTS = ("unsolved", "residual")
 """Attributes of heat that its steps add to."""
 
 
+def _recorders(step: torch.nn.Module) -> list[Any]:
+    return [m for m in step.modules() if hasattr(m, "_activations")]
+
+
 def counts_of(step: torch.nn.Module) -> list[tuple[Any, str, Tensor | None]]:
     """Where explicit steps keep what they tell of the steps so far: owner, attribute and tensor."""
-    modules: list[Any] = [m for m in step.modules() if hasattr(m, "_activations")]
+    modules = _recorders(step)
     places: list[tuple[Any, str]] = [(m._activations, name) for m in modules for name in ("status", "refused")]
     places += [(m, name) for m in modules for name in COUNTS if hasattr(m, name)]
     return [(owner, name, getattr(owner, name)) for owner, name in places]
@@ -157,9 +161,8 @@ def counts_of(step: torch.nn.Module) -> list[tuple[Any, str, Tensor | None]]:
 def uncounted(step: torch.nn.Module) -> Iterator[None]:
     """Where explicit steps leave nothing behind in what they tell of the steps so far; but unlike after `aside`, that
     has its tensors then, in which the steps of graphs go on."""
-    modules: list[Any] = [m for m in step.modules() if hasattr(m, "_activations")]
     tensors = counts_of(step)
-    written = [t for m in modules for t in m._activations._replayed] + buffers_of_users(step)
+    written = [t for m in _recorders(step) for t in m._activations._replayed] + buffers_of_users(step)
     with torch.inference_mode(), outside_transforms():
         before = [None if t is None else t.clone() for _, _, t in tensors]
         replayed = [(t, t.clone()) for t in written]
@@ -183,5 +186,5 @@ def uncounted(step: torch.nn.Module) -> Iterator[None]:
 
 def buffers_of_users(step: torch.nn.Module) -> list[Tensor]:
     """What modules of the user's may write in each call, as batch normalisation does."""
-    own = [m for m in step.modules() if not any(b.__module__.startswith("torch_mpm.") for b in type(m).__mro__)]
+    own = [m for m in step.modules() if not any(map(is_of_library, type(m).__mro__))]
     return [t for m in own for t in m._buffers.values() if t is not None and not t.requires_grad]

@@ -116,7 +116,7 @@ class Clocks:
 
     def advance(self, segments: int, n: int, checkpoint: int | Checkpoints | None) -> None:
         """Some segments of n substeps each."""
-        if segments < LEAST_REPLAYS + 1 or self._obstacle_to_replays() is not None:
+        if segments < LEAST_REPLAYS + 1 or not self._replays():
             for _ in range(segments):
                 state, dt = self._next(self.state, n)
                 self.state = rollout(self.step, state, n, dt, checkpoint)
@@ -129,14 +129,12 @@ class Clocks:
         # The first one makes what steps keep.
         self.state = replay_all(self.step, segment, segment(self.state), segments - 1, max(CHUNK // n, 1))
 
-    def _obstacle_to_replays(self) -> str | None:
-        """Why segments are not replays of a CUDA graph; None where they are."""
-        state = self.state
-        if not state.x.is_cuda:
-            return "there are no graphs on the CPU"
-        if wants_gradient(self.step, state):
-            return "it is differentiated"
-        return obstacle_to_substeps(self.step, state, self._dt.to(state.x.dtype))
+    def _replays(self) -> bool:
+        """Whether segments are replays of a CUDA graph."""
+        step, state = self.step, self.state
+        if not state.x.is_cuda or wants_gradient(step, state):
+            return False
+        return obstacle_to_substeps(step, state, self._dt.to(state.x.dtype)) is None
 
     @torch.no_grad()
     def _next(self, state: State, n: int) -> tuple[State, Tensor]:

@@ -26,6 +26,20 @@ def is_exported() -> bool:
     return torch.compiler.is_exporting()
 
 
+def is_transformed() -> bool:
+    """Whether a transform of torch.func, or forward differentiation, runs the code."""
+    return torch._C._are_functorch_transforms_active() or torch.autograd.forward_ad._current_level >= 0
+
+
+NUMBERS = (bool, int, float, str, torch.dtype, torch.device)
+"""Types of what a graph has by value."""
+
+
+def is_of_library(kind: type) -> bool:
+    """Whether a class is one of torch_mpm itself."""
+    return kind.__module__.startswith("torch_mpm.")
+
+
 def without_transforms(t: Tensor) -> Tensor:
     """The plain tensor below the levels of torch.func.grad and its like, which may be kept when they have ended."""
     if torch.compiler.is_compiling():

@@ -15,7 +15,7 @@ from torch.autograd.function import once_differentiable
 
 from .activation_record import counts_of, uncounted
 from .anomaly import detecting
-from .capture import Recordings, Same
+from .capture import Recordings, Same, is_captured, is_transformed
 from .errors import check_count, shape_of
 from .graphs import copied, copy_all, tensors_of, time_after, time_tensor
 from .grid import own_pools
@@ -86,9 +86,9 @@ def obstacle_to_graphs(step: Any, state: State, dt: float | Tensor) -> str | Non
         return "it is no module"
     if isinstance(dt, Tensor):
         return "dt is a tensor"
-    if torch.compiler.is_compiling() or (state.x.is_cuda and torch.cuda.is_current_stream_capturing()):
+    if torch.compiler.is_compiling() or is_captured(state.x):
         return "it is compiled or captured"
-    if torch._C._are_functorch_transforms_active() or torch.autograd.forward_ad._current_level >= 0:
+    if is_transformed():
         return "it is transformed"
     if detecting():
         return "anomaly detection looks at every step"

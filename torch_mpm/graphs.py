@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from .activation_record import ActivationRecord
-from .capture import GraphCache, Recordings
+from .capture import NUMBERS, GraphCache, Recordings, is_captured, is_of_library, is_transformed
 from .errors import shape_of
 from .grid import Grid
 from .laws.custom import CustomLaw
@@ -43,9 +43,9 @@ def obstacle_to_replays(step: Any, state: State, dt: float | Tensor) -> str | No
         return "there are no graphs on the CPU"
     if isinstance(dt, Tensor) or isinstance(state.time, Tensor):
         return "dt or the time of the state is a tensor"
-    if torch.compiler.is_compiling() or torch.cuda.is_current_stream_capturing():
+    if torch.compiler.is_compiling() or is_captured(state.x):
         return "it is compiled or captured"
-    if torch._C._are_functorch_transforms_active() or torch.autograd.forward_ad._current_level >= 0:
+    if is_transformed():
         return "it is transformed"
     if torch.is_grad_enabled() and any(t.requires_grad for t in (*tensors_of(state).values(), *_all_of(step))):
         return "it is differentiated"
@@ -60,14 +60,13 @@ def obstacle_to_replays(step: Any, state: State, dt: float | Tensor) -> str | No
     return _foreign(step, state.x.device, [])
 
 
-_NUMBERS = (type(None), bool, int, float, str, torch.dtype, torch.device)
 _OWN = (GraphCache, Recordings, ActivationRecord, Grid)
 """Made for graphs."""
 
 
 def _foreign(part: Any, device: torch.device, seen: list[Any]) -> str | None:
     """What a step, or a part of it, has of the user's, or on another device; None for nothing."""
-    if isinstance(part, _NUMBERS) or type(part) in _OWN or any(part is known for known in seen):
+    if part is None or isinstance(part, NUMBERS) or type(part) in _OWN or any(part is known for known in seen):
         return None
     if isinstance(part, Tensor):
         return None if part.device == device else f"a tensor of it is on {part.device}, the particles on {device}"
@@ -84,7 +83,7 @@ def _foreign(part: Any, device: torch.device, seen: list[Any]) -> str | None:
 
 
 def _is_known(part: Any) -> bool:
-    known = type(part).__module__.startswith("torch_mpm.") or type(part) in (nn.ModuleList, nn.ModuleDict)
+    known = is_of_library(type(part)) or type(part) in (nn.ModuleList, nn.ModuleDict)
     return known and not isinstance(part, CustomLaw)
 
 

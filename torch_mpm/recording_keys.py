@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from .boundaries import Walls
-from .capture import Same, version
+from .capture import NUMBERS, Same, is_of_library, version
 from .grid import Grid
 from .laws.mixture import Mixture
 from .parameters import has_hooks
@@ -60,15 +60,12 @@ class StepKey:
                 grid.pool(state.x, state.scene)
 
 
-_NUMBERS = (bool, int, float, str, torch.dtype, torch.device)
-
-
 def content_of(module: nn.Module) -> tuple[Hashable, ...]:
     """A module by its content as a part of a key. Of those of the library, and of classes made of them, all that may be
     assigned; of the user's own modules the tensors, but not the numbers, which may change in each call as a counter
     does."""
     classes = type(module).__mro__
-    plain, of_library = _is_of_library(classes[0]), any(map(_is_of_library, classes))
+    plain, of_library = is_of_library(classes[0]), any(map(is_of_library, classes))
     tensors = [(name, t) for name, t in (*module._parameters.items(), *module._buffers.items()) if t is not None]
     read = [
         (name, Same(t), t.data_ptr(), version(t) if of_library and not isinstance(module, Step) else None)
@@ -86,20 +83,16 @@ def content_of(module: nn.Module) -> tuple[Hashable, ...]:
     return module.training, has_hooks(module), tuple(read), told
 
 
-def _is_of_library(kind: type) -> bool:
-    return kind.__module__.startswith("torch_mpm.")
-
-
 def _value(value: Any) -> Hashable:
     """An attribute of a module as a part of a key; None for what steps keep there themselves."""
-    if isinstance(value, _NUMBERS):
+    if isinstance(value, NUMBERS):
         return value
     if isinstance(value, Walls):  # whose kinds and friction may be assigned
         return Same(value), repr(value)
     if isinstance(value, Grid) or callable(value):
         return Same(value)
     if isinstance(value, (list, tuple)) and not any(isinstance(part, Tensor) for part in value):
-        return tuple(part if isinstance(part, _NUMBERS) else Same(part) for part in value)
+        return tuple(part if isinstance(part, NUMBERS) else Same(part) for part in value)
     return None
 
 

@@ -10,12 +10,11 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.autograd import forward_ad
 
 from .anomaly import begin, detecting, watch
 from .boundaries import Obstacle
 from .boundaries.obstacles import motion_tensors
-from .capture import is_captured, is_traced
+from .capture import is_captured, is_traced, is_transformed
 from .captured_steps import in_graphs, obstacle_to_graphs
 from .checkpoints import Checkpoints, as_checkpoints, binomial, fitting, in_segments, offloaded
 from .errors import check_count, shape_of
@@ -186,8 +185,7 @@ def obstacle_to_substeps(step: Step, state: State, dt: float | Tensor) -> str | 
             return f"{name} requires a gradient"
         if isinstance(value, Tensor) and value.dtype != x.dtype:
             return f"{name} is a tensor, but not in {str(x.dtype).removeprefix('torch.')}"
-    transformed = torch._C._are_functorch_transforms_active() or forward_ad._current_level >= 0
-    if torch.compiler.is_compiling() or is_traced(x) or is_captured(x) or transformed:
+    if torch.compiler.is_compiling() or is_traced(x) or is_captured(x) or is_transformed():
         return "it is compiled, captured or transformed"
     if detecting():
         return "anomaly detection looks at every step"
