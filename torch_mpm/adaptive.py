@@ -11,7 +11,7 @@ from torch import Tensor
 from .checkpoints import Checkpoints
 from .errors import NUMBER_OR_TENSOR, check_count, check_number, shape_of
 from .graphs import CHUNK, replay_all
-from .rollouts import in_chunks, obstacle_to_substeps, rollout, wants_gradient
+from .rollouts import follows_paths, in_chunks, obstacle_to_substeps, rollout, wants_gradient
 from .state import State
 from .step import Step
 
@@ -132,7 +132,7 @@ class Clocks:
     def _replays(self) -> bool:
         """Whether segments are replays of a CUDA graph."""
         step, state = self.step, self.state
-        if not state.x.is_cuda or wants_gradient(step, state):
+        if not state.x.is_cuda or follows_paths(step) or wants_gradient(step, state):
             return False
         return obstacle_to_substeps(step, state, self._dt.to(state.x.dtype)) is None
 

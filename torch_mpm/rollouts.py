@@ -21,7 +21,7 @@ from .errors import check_count, shape_of
 from .gradient_norms import GradientNorms
 from .graphs import CHUNK, LEAST_STEPS, obstacle_to_replays, replayed, time_after
 from .laws import CompiledLaw
-from .laws.calls import law_calls, laws_of
+from .laws.calls import law_calls, laws_of, passive
 from .ops.arguments import split_dt
 from .ops.autograd import dispatch
 from .ops.contact import MAX_OBSTACLES, fusible, obstacle_arguments
@@ -177,7 +177,7 @@ def obstacle_to_substeps(step: Step, state: State, dt: float | Tensor) -> str | 
     """Why `substeps` cannot take the steps from a state; None where it can."""
     check_state(state)
     x, law = state.x, step.law
-    laws = laws_of(law)
+    laws = [passive(part) for part in laws_of(law)]
     if type(step) is not Step:
         return f"{type(step).__name__} may do more than a Step"
     for name, value in (("dt", dt), ("the time of the state", state.time)):
@@ -205,15 +205,12 @@ def obstacle_to_substeps(step: Step, state: State, dt: float | Tensor) -> str | 
     if any(has_hooks(module) for module in (step, *law.modules())):
         return "there are hooks"
     boundaries = step.boundaries.entries
-    if not all(isinstance(b, Obstacle) and fusible(b, state.time) for b in boundaries):
+    if not all(isinstance(b, Obstacle) and fusible(b, state.time, paths=True) for b in boundaries):
         return "a boundary acts by torch operations"
     if len(boundaries) > MAX_OBSTACLES:
         return f"there are more than {MAX_OBSTACLES} obstacles"
-    if torch.is_grad_enabled():
-        if any(t.requires_grad for b in boundaries for t in motion_tensors(b)):
-            return "an obstacle requires a gradient"
-        if any(part.has_functions for part in laws):
-            return "a parameter is a function, which may have a gradient"
+    if torch.is_grad_enabled() and any(part.has_functions for part in laws):
+        return "a parameter is a function, which may have a gradient"
     return None
 
 
@@ -230,6 +227,8 @@ the nodes of a block do."""
 ROOMY, ROOMY_CHUNK = 3, 256
 """A pool with room for so many times the blocks of one that follows the scene, and steps of a call with it: four times
 as many as with the other; and twice as many again where it has room for twice as many."""
+TABLE_BYTES = 2**26
+"""What obstacles on paths may take in a call, where they have a table for each of its steps."""
 KEPT_BYTES = {"cpu": 2**24, "cuda": 2**29}
 """What the backward pass of one op may hold of its steps, even where sqrt(n) steps need less: what the caches of a CPU
 hold, and so much that kernels on CUDA hide the time of Python."""
@@ -241,12 +240,13 @@ def in_chunks(
     """The state n steps later, by calls of one op; `obstacle_to_substeps` must be None. The op takes steps again where
     it may not keep all that their gradient needs."""
     chunk = CHUNK if step.grid.grows and state.x.is_cuda else MOST_STEPS
+    most_of_paths = _most_steps_of_paths(step, state)
     with_gradient = wants_gradient(step, state)
 
     def advance(state: State, count: int, first: int = 0) -> State:
         while count > 0:
             blocks, most = (None if with_gradient else pool_of_call(step, state, count)) or (None, chunk)
-            now = min(count, most)
+            now = min(count, most, most_of_paths)
             state, count = substeps(step, state, now, dt, keeps_all, blocks), count - now
         return state
 
@@ -257,6 +257,14 @@ def in_chunks(
         return binomial(advance, step.prepare(state), n, kept.states, step)
     with offloaded(state) if kept is not None and kept.offload else contextlib.nullcontext():
         return advance(state, n)
+
+
+def _most_steps_of_paths(step: Step, state: State) -> int:
+    """Steps of a call whose obstacles have a table of at most `TABLE_BYTES` for each."""
+    if not follows_paths(step):
+        return MOST_STEPS
+    numbers = 24 * len(step.boundaries.entries) * step.grid.scenes  # of a step, at most
+    return max(TABLE_BYTES // (numbers * state.x.element_size()), 1)
 
 
 def pool_of_call(step: Step, state: State, n: int) -> tuple[int, int] | None:
@@ -309,7 +317,19 @@ def items_of_step(dim: int, blocks: int, particles: int) -> float:
 
 def wants_gradient(step: Step, state: State) -> bool:
     """Whether `substeps` is differentiated."""
-    return torch.is_grad_enabled() and any(t.requires_grad for t in _differentiable(step, state))
+    if not torch.is_grad_enabled():
+        return False
+    paths = (b.centre_at(state.time, state.x) for b in _obstacles(step) if b.follows_path)
+    return any(t.requires_grad for t in (*_differentiable(step, state), *paths))
+
+
+def follows_paths(step: Step) -> bool:
+    """Whether the position of an obstacle is a function of time."""
+    return any(b.follows_path for b in _obstacles(step))
+
+
+def _obstacles(step: Step) -> list[Obstacle]:
+    return [b for b in step.boundaries.entries if isinstance(b, Obstacle)]
 
 
 def steps_of_a_call(state: State, n: int) -> int:
@@ -343,7 +363,8 @@ def _differentiable(step: Step, state: State) -> list[Tensor]:
         state.impulse,
     )
     gravity = [step.gravity] if isinstance(step.gravity, Tensor) else []
-    return [*(t for t in fields if t is not None), *gravity, *step.law.parameters(), *step.law.buffers()]
+    obstacles = [t for b in _obstacles(step) for t in motion_tensors(b)]
+    return [*(t for t in fields if t is not None), *gravity, *step.law.parameters(), *step.law.buffers(), *obstacles]
 
 
 def substeps(
@@ -376,6 +397,14 @@ def _clocks(state: State, dt: float | Tensor, scenes: int) -> tuple[float, Tenso
     return 1.0, each(dt), each(state.time)
 
 
+def _times(state: State, n: int, number: float, scene_dt: Tensor | None, scene_time: Tensor | None) -> Tensor:
+    """When the steps of a call begin, float64 [n] or [n, B] [s]; of what `_clocks` gives."""
+    count = torch.arange(n, dtype=torch.float64, device=state.x.device)
+    if scene_dt is None or scene_time is None:
+        return float(state.time) + count * number
+    return (scene_time.double() + count[:, None] * scene_dt.double()).detach()
+
+
 def substeps_arguments(
     step: Step, state: State, n: int, dt: float | Tensor, records: bool = False, blocks: int | None = None
 ) -> dict[str, Any]:
@@ -405,6 +434,7 @@ def _arguments(
     """Those of the op, in its order, and the names of the history of each law; of a prepared state."""
     grid = step.grid
     number, scene_dt, scene_time = _clocks(state, dt, grid.scenes)
+    times = _times(state, n, number, scene_dt, scene_time) if follows_paths(step) else None
     pool = grid.pool(state.x, state.scene)
     given: Any = Overlay(state, dt=dt)
     calls = law_calls(step.law, given)
@@ -417,7 +447,7 @@ def _arguments(
         *(int(n), number, apic, step._flip_share, apic or step.law.viscous, STRESS_FORMS[step.stress_form]),
         _gravity(step, state.x),
         *wall_arguments(step.walls, grid),
-        *obstacle_arguments(step.boundaries.entries, state.x, grid.scenes),
+        *obstacle_arguments(step.boundaries.entries, state.x, grid.scenes, times),
         *(0.0 if scene_time is not None else float(state.time), grid.scenes),
         *(pool if blocks is None else max(pool, blocks), grid.grows, not with_gradient, with_gradient and records),
         *(state.impulse, scene_dt, scene_time, *grid.packed),

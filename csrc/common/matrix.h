@@ -118,6 +118,14 @@ MPM_HD Vector<T, D> operator*(const Matrix<T, D>& a, const Vector<T, D>& b) {
 }
 
 template <class T, int D>
+MPM_HD Matrix<T, D> outer(const Vector<T, D>& a, const Vector<T, D>& b) {
+  Matrix<T, D> r;
+  MPM_UNROLL for (int i = 0; i < D; i++) MPM_UNROLL
+    for (int j = 0; j < D; j++) r[i][j] = a[i] * b[j];
+  return r;
+}
+
+template <class T, int D>
 MPM_HD Matrix<T, D> transpose(const Matrix<T, D>& a) {
   Matrix<T, D> r;
   MPM_UNROLL for (int i = 0; i < D; i++) MPM_UNROLL

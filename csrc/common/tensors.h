@@ -34,11 +34,13 @@ inline std::string text(const Shape& shape) {
   return "[" + s + "]";
 }
 
-inline std::string shape_of(const Tensor& t) {
+inline Shape sizes_of(const Tensor& t) {
   Shape shape(t.dim());
   for (size_t i = 0; i < shape.size(); i++) shape[i] = t.size(int64_t(i));
-  return text(shape);
+  return shape;
 }
+
+inline std::string shape_of(const Tensor& t) { return text(sizes_of(t)); }
 
 // As Python calls it.
 inline const char* name_of(ScalarType type) {

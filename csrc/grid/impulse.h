@@ -3,6 +3,7 @@
 #include <cstdint>
 
 #include "grid/lattice_node.h"
+#include "grid/slot_sums.h"
 
 // The impulse that the material gives a boundary: at each node that a wall or obstacle slows down, mass times the
 // velocity that it takes. Of each boundary of each scene there are D numbers, the sum of these [N s], and then that of
@@ -22,11 +23,15 @@ struct ImpulseArguments {
   int64_t scene_stride = 0;      // numbers from a scene to the next
   double* sum = nullptr;         // what they are added to, of the first scene
   const double* grad = nullptr;  // its adjoint, in the same places; backward only
-  // [max_blocks + scenes, boundaries, kImpulse], a work space for sums whose order is that of the slots; null on CUDA
-  // where they need none.
+  // [max_blocks, boundaries, kImpulse], a work space for sums whose order is that of the slots; null on CUDA where they
+  // need none.
   double* slots = nullptr;
 
   int numbers() const { return boundaries * kImpulse<D>; }
+  // Of what slots have left there.
+  SlotSums<double> slot_sums(int max_blocks, int blocks_per_scene, const int* block) const {
+    return {max_blocks, blocks_per_scene, block, scenes, numbers(), true, slots, sum, scene_stride};
+  }
 };
 
 // For adjoints where impulses have none.

@@ -24,7 +24,7 @@ ImpulseArguments<D> impulse_arguments(const PackedLattice& lattice, const Tensor
   a.scene_stride = sums.size(1) * kImpulse<D>;
   a.sum = static_cast<double*>(sums.data_ptr()) + first * kImpulse<D>;
   if (!sums.is_cpu() && !lattice.deterministic()) return a;
-  if (!slots.defined()) slots = empty(sums, {max_blocks + a.scenes, a.numbers()});
+  if (!slots.defined()) slots = empty(sums, {max_blocks, a.numbers()});
   a.slots = static_cast<double*>(slots.data_ptr());
   return a;
 }

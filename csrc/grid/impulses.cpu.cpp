@@ -2,7 +2,7 @@
 
 #include <algorithm>
 
-#include "cpu/parallel.h"
+#include "cpu/slot_sums.h"
 
 namespace mpm::cpu {
 inline namespace TORCH_MPM_ISA {
@@ -22,15 +22,7 @@ void add_up(const Geometry<T, D>& geometry, int max_blocks, const int* block, co
         std::copy_n(sum.e, kImpulse<D>, a.slots + slot * numbers + boundary * kImpulse<D>);
       });
   });
-  double* const sums = a.slots + int64_t(max_blocks) * numbers;
-  std::fill_n(sums, int64_t(a.scenes) * numbers, 0.0);
-  for (int64_t slot = 0; slot < max_blocks; slot++) {
-    const int scene = block[slot] < 0 ? -1 : block[slot] / geometry.blocks_per_scene;
-    if (scene < 0 || scene >= a.scenes) continue;
-    for (int i = 0; i < numbers; i++) sums[int64_t(scene) * numbers + i] += a.slots[slot * numbers + i];
-  }
-  for (int64_t scene = 0; scene < a.scenes; scene++)
-    for (int i = 0; i < numbers; i++) a.sum[scene * a.scene_stride + i] += sums[scene * numbers + i];
+  mpm::cpu::add_up(a.slot_sums(max_blocks, geometry.blocks_per_scene, block));
 }
 
 }  // namespace

@@ -1,6 +1,6 @@
 #include "grid/impulses.h"
 
-#include "cuda/launch.cuh"
+#include "cuda/slot_sums.cuh"
 #include "grid/slot_lanes.cuh"
 
 namespace mpm::cuda {
@@ -77,42 +77,6 @@ __global__ void __launch_bounds__(kThreads) contact_impulses_backward_kernel(con
   slot_contact_backward<kSlotLanes>(a.contact, int(slot), lane, SumLanes(), ImpulsesOfNodes<T, D>{a});
 }
 
-// The numbers of the slots of a scene added up in a fixed order: a thread block has a scene, whose slots are
-// neighbours, since slots are in the order of their blocks and unused ones come last.
-constexpr int kRows = 32, kColumns = 32;
-
-template <int D>
-__global__ void __launch_bounds__(kRows* kColumns)
-    add_up_kernel(const ImpulseArguments<D> a, const int* block, int max_blocks, int blocks_per_scene) {
-  __shared__ double sums[kRows][kColumns];
-  const int scene = blockIdx.x, row = threadIdx.x / kColumns, numbers = a.boundaries * kImpulse<D>;
-  const auto first_from = [&](int64_t least) {  // slot whose block is `least` or a later one
-    int begin = 0, end = max_blocks;
-    while (begin < end) {
-      const int middle = (begin + end) / 2;
-      if (block[middle] >= 0 && block[middle] < least)
-        begin = middle + 1;
-      else
-        end = middle;
-    }
-    return begin;
-  };
-  const int begin = first_from(int64_t(scene) * blocks_per_scene), end = first_from((scene + 1ll) * blocks_per_scene);
-  for (int first = 0; first < numbers; first += kColumns) {
-    const int column = first + int(threadIdx.x % kColumns);
-    double sum = 0;
-    for (int slot = begin + row; column < numbers && slot < end; slot += kRows)
-      sum += a.slots[int64_t(slot) * numbers + column];
-    sums[row][threadIdx.x % kColumns] = sum;
-    __syncthreads();
-    if (row == 0 && column < numbers) {
-      for (int other = 1; other < kRows; other++) sum += sums[other][threadIdx.x];
-      a.sum[scene * a.scene_stride + column] += sum;
-    }
-    __syncthreads();
-  }
-}
-
 unsigned blocks_for(int64_t max_blocks) { return unsigned((max_blocks * kSlotLanes + kThreads - 1) / kThreads); }
 
 // Launches `kernel`, and adds up what it has left for each slot.
@@ -122,9 +86,7 @@ void run(Kernel* kernel, const Arguments& arguments, const ImpulseArguments<D>& 
   if (max_blocks == 0 || a.scenes == 0) return;
   if (a.slots) check(cudaMemsetAsync(a.slots, 0, size_t(max_blocks) * size_t(a.numbers()) * sizeof(double), stream));
   launch(kernel, blocks_for(max_blocks), kThreads, 0, stream, arguments);
-  if (a.slots)
-    launch(add_up_kernel<D>, unsigned(a.scenes), kRows * kColumns, 0, stream, a, block, max_blocks,
-           geometry.blocks_per_scene);
+  if (a.slots) add_up(a.slot_sums(max_blocks, geometry.blocks_per_scene, block), stream);
 }
 
 }  // namespace

@@ -47,6 +47,9 @@ struct ContactArguments {
   ObstacleKind kind[kMaxObstacles];
   const ObstacleRow<T, D>* row = nullptr;  // [rows, obstacles]; one row for all scenes, or one per scene
   int rows = 0;
+  // From there to the rows of the next substep of a call, where each has its own, with the obstacles as they are then;
+  // else zero.
+  int64_t rows_of_step = 0;
   // Of a revolved shape, corners (distance from the axis, position along it), anticlockwise; of a sampled one, the
   // first node of the samples [D], their distance, numbers of them along each axis [D], and the samples, the last axis
   // fastest.
@@ -54,9 +57,10 @@ struct ContactArguments {
   const T* scene_time = nullptr;  // [times], one for all scenes or one per scene; or null
   int times = 0;
   double time = 0;  // where scene_time is null, or
-  // the times of the substeps of a call, on the device; activations are counted with this substep's, and before the
-  // call (or null).
+  // the times of the substeps of a call, on the device.
   const double* step_time = nullptr;
+  // Where a kernel has to find out which substep of a call it is in: counted with this substep's, and before the call
+  // (or null).
   const int *activations = nullptr, *activations_before = nullptr;
   const T* velocity = nullptr;  // node i at velocity + i * stride
   const T* grad = nullptr;      // likewise; backward only
@@ -111,12 +115,16 @@ struct ObstaclePose {
   Matrix<S, D> rotation;  // world = centre + rotation body
 };
 
-// Many substeps of one call cannot tell a kernel that a graph replays what time it is: it counts activations.
+// Many substeps of one call cannot tell a kernel that a graph replays which of them it is in: it counts activations.
+template <class T, int D>
+MPM_HD int step_of_call(const ContactArguments<T, D>& a) {
+  return *a.activations - 1 - (a.activations_before ? *a.activations_before : 0);
+}
+
 template <class T, int D>
 MPM_HD double contact_time(const ContactArguments<T, D>& a, int scene) {
   if (a.scene_time) return double(a.scene_time[a.times == 1 ? 0 : scene]);
-  if (!a.step_time) return a.time;
-  return a.step_time[*a.activations - 1 - (a.activations_before ? *a.activations_before : 0)];
+  return a.step_time ? a.step_time[step_of_call(a)] : a.time;
 }
 
 template <class S, class T, int D>
@@ -131,7 +139,7 @@ MPM_HD ObstaclePose<S, D> obstacle_pose(const ContactArguments<T, D>& a, const O
   p.row = &row;
   p.data = a.data + kind.first_number;
   p.numbers = kind.numbers;
-  const S elapsed = lift<S>(T(time - kind.start));
+  const S elapsed = lift<S>(a.rows_of_step ? T(0) : T(time - kind.start));
   MPM_UNROLL for (int i = 0; i < D; i++)
     p.centre[i] = row.position[i] + row.velocity[i] * elapsed;
   p.rotation = rotation_matrix(row.angular_velocity, elapsed) * rotation_matrix(row.rotation, S(1));
@@ -336,10 +344,10 @@ MPM_HD Vector<T, D> after_contact(const ObstaclePose<T, D>& o, const Touch<T, D>
 // What the nodes of a slot share.
 template <class T, int D>
 struct ContactSlot {
-  bool active;
-  int scene;
-  int corner[D];                 // lattice index of the first node
-  const ObstacleRow<T, D>* row;  // the obstacles of its scene
+  bool active = false;
+  int scene = 0;
+  int corner[D] = {};                      // lattice index of the first node
+  const ObstacleRow<T, D>* row = nullptr;  // the obstacles of its scene
 };
 
 // Of an active block of a scene, with the lattice index of its first node.
@@ -349,6 +357,7 @@ MPM_HD ContactSlot<T, D> contact_slot(const ContactArguments<T, D>& a, int scene
   s.scene = scene;
   s.active = (a.rows == 1 || scene < a.rows) && (!a.scene_time || a.times == 1 || scene < a.times);
   s.row = a.row + (a.rows == 1 ? 0 : int64_t(scene) * a.obstacles);
+  if (a.rows_of_step && a.activations) s.row += step_of_call(a) * a.rows_of_step;
   MPM_UNROLL for (int i = 0; i < D; i++)
     s.corner[i] = corner[i];
   return s;
@@ -357,7 +366,7 @@ MPM_HD ContactSlot<T, D> contact_slot(const ContactArguments<T, D>& a, int scene
 template <class T, int D>
 MPM_HD ContactSlot<T, D> contact_slot(const ContactArguments<T, D>& a, int slot) {
   const int index = a.block[slot];
-  if (index < 0) return {false};
+  if (index < 0) return {};
   int corner[D];
   const int scene = block_coordinates(a.geometry, index, corner);
   MPM_UNROLL for (int i = 0; i < D; i++)

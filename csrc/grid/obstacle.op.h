@@ -19,9 +19,11 @@ namespace mpm {
       std::vector<double> end, const OptionalTensor &scene_time, double time
 #define MPM_OBSTACLES_ARGUMENTS obstacles, data, shape, sizes, contact_kind, scene, start, end, scene_time, time
 
-// What does not depend on the activation; `like` has the dtype and device of the nodes.
+// What does not depend on the activation; `like` has the dtype and device of the nodes. A call of many steps may have
+// obstacles for each of them.
 template <class T, int D>
-ContactArguments<T, D> obstacle_arguments(const Tensor& like, const PackedLattice& packed, MPM_OBSTACLES_PARAMETERS) {
+ContactArguments<T, D> obstacle_arguments(const Tensor& like, const PackedLattice& packed, MPM_OBSTACLES_PARAMETERS,
+                                          int64_t steps = 0) {
   ContactArguments<T, D> a;
   a.geometry = packed.geometry<T, D>();
   a.dx = packed.dx();
@@ -34,15 +36,20 @@ ContactArguments<T, D> obstacle_arguments(const Tensor& like, const PackedLattic
   a.rounding = 16 * std::numeric_limits<T>::epsilon() * largest;
   constexpr int64_t width = ObstacleRow<T, D>::width;
   static_assert(sizeof(ObstacleRow<T, D>) == width * sizeof(T));
-  check_rank(obstacles, "obstacles", 3);
+  const bool of_steps = steps > 0 && obstacles.dim() == 4;
+  if (!of_steps) check_rank(obstacles, "obstacles", 3);
   check_like(obstacles, "obstacles", like);
-  STD_TORCH_CHECK(obstacles.is_contiguous() && obstacles.size(0) > 0 && obstacles.size(0) <= INT32_MAX &&
-                      obstacles.size(1) <= kMaxObstacles && obstacles.size(2) == width,
+  STD_TORCH_CHECK(!of_steps || obstacles.size(0) == steps, "obstacles must be given once or for each of ", steps,
+                  " steps, got shape ", shape_of(obstacles));
+  const int64_t first = of_steps ? 1 : 0, rows = obstacles.size(first), obstacles_of_row = obstacles.size(first + 1);
+  STD_TORCH_CHECK(obstacles.is_contiguous() && rows > 0 && rows <= INT32_MAX && obstacles_of_row <= kMaxObstacles &&
+                      obstacles.size(first + 2) == width,
                   "obstacles must be contiguous with shape [1 or B, at most ", kMaxObstacles, ", ", width, "], got ",
                   shape_of(obstacles));
   a.row = static_cast<const ObstacleRow<T, D>*>(obstacles.data_ptr());
-  a.rows = int(obstacles.size(0));
-  a.obstacles = int(obstacles.size(1));
+  a.rows = int(rows);
+  a.obstacles = int(obstacles_of_row);
+  if (of_steps) a.rows_of_step = rows * obstacles_of_row;
   const size_t count = size_t(a.obstacles);
   const auto check_entries = [&](const auto& list, const char* name) {
     STD_TORCH_CHECK(list.size() == count, name, " must have an entry per obstacle, ", count, ", got ", list.size());

@@ -18,7 +18,7 @@ struct InvariantKernels;
 
 struct InvariantLaw {
   static constexpr bool viscous = false, plastic = false, twice_differentiable = true, optional_history = false,
-                        twice_differentiable_energy = true, in_2d = true, has_tangent = true;
+                        twice_differentiable_energy = true, in_2d = true, has_tangent = true, additive = false;
   static constexpr auto history = no_history;
   static constexpr auto options = no_options;
   static constexpr bool memory_bound = true;

@@ -32,6 +32,8 @@ struct LawLoops {
   }
 
   static void update(const LawUpdateArguments<T, D>& a, void*) {
+    if constexpr (Law::additive)
+      if (a.adds) return by_groups<kBytes>(a.law, [&](const auto& at) { Kernels::update(a, Adding(at)); });
     by_groups<kBytes>(a.law, [&](const auto& at) { Kernels::update(a, at); });
   }
   static void update_backward(const LawBackwardArguments<T, D>& a, void*) {

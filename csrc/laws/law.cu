@@ -13,15 +13,16 @@ namespace mpm::cuda {
 template <class Law, class T>
 constexpr int kUpdateBlocks = sizeof(T) == 4 ? Law::gpu_update_blocks : (Law::gpu_update_blocks + 1) / 2;
 
-template <class Law, class T, int D>
+template <class Law, bool Adds, class T, int D>
 __global__ void __launch_bounds__(Law::gpu_threads, kUpdateBlocks<Law, T>)
     law_update_kernel(const LawUpdateArguments<T, D> a) {
   if (a.runs_beside)
     let_next_kernel_begin();
   else
     wait_for_kernel_before();
+  using At = std::conditional_t<Adds, Adding<One<T>>, One<T>>;
   const int64_t p = int64_t(blockIdx.x) * Law::gpu_threads + threadIdx.x;
-  if (p < a.law.particles && a.law.members.has(p)) Law::template Kernels<Law>::update(a, One<T>{p});
+  if (p < a.law.particles && a.law.members.has(p)) Law::template Kernels<Law>::update(a, At(One<T>{p}));
   wait_for_kernel_before();  // since the next one waits for this alone
 }
 
@@ -241,11 +242,12 @@ struct SettlingSource : LawMomentumSource<Law, T, D, true> {
   }
 };
 
-// Of float alone: in double the kernels would take all registers.
+// Of float alone: in double the kernels would take all registers. And of laws that are all of a material.
 template <class Law, class T, int D>
 struct FusedLaunch {};
 
 template <class Law, int D>
+  requires(!Law::additive)
 struct FusedLaunch<Law, float, D> {
   static void p2g(const LawUpdateArguments<float, D>& law, const LateDeformation<float, D>& late,
                   const P2GArguments<float, D>& a, const Settling<float, D>& settling, void* stream) {
@@ -284,7 +286,9 @@ struct LawLaunches : FusedLaunch<Law, T, D> {
   }
 
   static void update(const LawUpdateArguments<T, D>& a, void* stream) {
-    in_chain(law_update_kernel<Law, T, D>, a, stream);
+    if constexpr (Law::additive)
+      if (a.adds) return in_chain(law_update_kernel<Law, true, T, D>, a, stream);
+    in_chain(law_update_kernel<Law, false, T, D>, a, stream);
   }
   static void update_backward(const LawBackwardArguments<T, D>& a, void* stream) {
     if constexpr (kChangesNothing<Law>)

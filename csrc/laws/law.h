@@ -12,6 +12,7 @@
 //   field                       what of the deformation it reads and moves: F, or the volume ratio J alone;
 //   viscous                     whether its stress reads the velocity gradient C;
 //   plastic                     whether it changes the deformation, or history, that it is given;
+//   additive                    whether it is part of a material beside another law, to whose stress its own is added;
 // and, written for any scalar (a number, a pack of numbers, a dual number), the functions that one of two forms asks
 // for: laws of strain invariants (laws/invariants.h), which need no decomposition, or laws of principal strains
 // (laws/principal_law.h). Their derivatives come from dual numbers. A law may bring kernel bodies of its own
@@ -81,6 +82,7 @@ struct LawUpdateArguments {
   LawArguments<T, D> law;
   Field<T> state;         // absent for laws that do not change it
   Field<T> stress;        // [P, D, D]
+  bool adds = false;      // to the stress that is there; of additive laws
   Field<T> history;       // [P, m], absent without history
   Field<T> dissipated;    // [P], absent where not wanted
   Field<T> multiplier;    // [P], length of the plastic increment of the Hencky strains; absent where not wanted

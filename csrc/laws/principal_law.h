@@ -26,7 +26,7 @@ struct PrincipalLaw {
   static constexpr bool viscous = false, plastic = false, twice_differentiable = false, optional_history = false,
                         in_2d = true;
   static constexpr bool twice_differentiable_energy = false;  // history counts as constant
-  static constexpr bool has_tangent = true;
+  static constexpr bool has_tangent = true, additive = false;
   static constexpr auto history = no_history;
   static constexpr auto options = no_options;
   static constexpr bool memory_bound = false;

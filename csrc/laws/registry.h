@@ -16,7 +16,7 @@ struct LawInfo {
   const char* name = "";
   Deformation field = Deformation::gradient;
   bool viscous = false, plastic = false, optional_history = false, twice_differentiable = false,
-       twice_differentiable_energy = false, has_tangent = false, in_2d = true;
+       twice_differentiable_energy = false, has_tangent = false, in_2d = true, additive = false;
   std::vector<Quantity> parameters, history;
   std::vector<const char*> options;
 
@@ -91,6 +91,7 @@ LawInfo info_of() {
           Law::twice_differentiable_energy,
           Law::has_tangent,
           Law::in_2d,
+          Law::additive,
           {Law::parameters.begin(), Law::parameters.end()},
           {Law::history.begin(), Law::history.end()},
           {Law::options.begin(), Law::options.end()}};
@@ -102,6 +103,7 @@ void fill_kernels(LawEntry& entry) {
   static_assert(kParameters<Law> <= kMostParameters && kHistory<Law> <= kMostHistory);
   static_assert(kChangesNothing<Law> || (!Law::viscous && Law::field == Deformation::gradient),
                 "rollout/substeps_backward.op.cpp has no term for it");
+  static_assert(!Law::additive || kChangesNothing<Law>, "only what changes nothing can be beside another law");
   if constexpr (D == 3 || Law::in_2d) {
     using K = Kernels<Law, T, D>;
     LawKernels<T, D>& kernels = entry.template kernels<T, D>();

@@ -54,6 +54,7 @@ std::string law_as_json(const LawInfo& info) {
          ", \"twice_differentiable\": " + flag(info.twice_differentiable) +
          ", \"twice_differentiable_energy\": " + flag(info.twice_differentiable_energy) +
          ", \"has_tangent\": " + flag(info.has_tangent) + ", \"in_2d\": " + flag(info.in_2d) +
+         ", \"additive\": " + flag(info.additive) +
          ", \"parameters\": " + json_list(info.parameters, quantity_as_json) +
          ", \"history\": " + json_list(info.history, quantity_as_json) +
          ", \"options\": " + json_list(info.options, [](const char* o) { return std::string("\"") + o + "\""; }) + "}";

@@ -4,6 +4,7 @@
 
 #include "common/instantiate.h"
 #include "cpu/parallel.h"
+#include "cpu/slot_sums.h"
 
 namespace mpm::cpu {
 inline namespace TORCH_MPM_ISA {
@@ -50,9 +51,15 @@ void accumulate_slots(const AccumulateSlotsArguments<T, D>& a) {
   }
 }
 
+template <class T, int D>
+void sum_slots(const SumSlotsArguments<T, D>& a) {
+  add_up(a.sums);
+}
+
 MPM_INSTANTIATE(accumulate, AccumulateArguments)
 MPM_INSTANTIATE(add_scaled, AddScaledArguments)
 MPM_INSTANTIATE(accumulate_slots, AccumulateSlotsArguments)
+MPM_INSTANTIATE(sum_slots, SumSlotsArguments)
 
 }  // namespace TORCH_MPM_ISA
 }  // namespace mpm::cpu

@@ -1,6 +1,7 @@
 #include "rollout/accumulate.h"
 
 #include "cuda/chain.cuh"
+#include "cuda/slot_sums.cuh"
 
 namespace mpm::cuda {
 namespace {
@@ -56,8 +57,14 @@ void accumulate_slots(const AccumulateSlotsArguments<T, D>& a, Stream stream) {
   if (a.max_blocks > 0) launch(accumulate_slots_kernel<T, D>, blocks_for(a.max_blocks), kThreads, 0, stream, a);
 }
 
+template <class T, int D>
+void sum_slots(const SumSlotsArguments<T, D>& a, Stream stream) {
+  add_up(a.sums, stream);
+}
+
 MPM_INSTANTIATE(accumulate, AccumulateArguments)
 MPM_INSTANTIATE(add_scaled, AddScaledArguments)
 MPM_INSTANTIATE(accumulate_slots, AccumulateSlotsArguments)
+MPM_INSTANTIATE(sum_slots, SumSlotsArguments)
 
 }  // namespace mpm::cuda

@@ -1,6 +1,7 @@
 #pragma once
 
 #include "common/fields.h"
+#include "grid/slot_sums.h"
 
 // Sums over many steps, and of what FLIP blends.
 namespace mpm {
@@ -41,6 +42,12 @@ struct AccumulateSlotsArguments {
   const int* block = nullptr;  // [max_blocks] block of a slot, -1 where unused
   const T* value = nullptr;
   T* sum = nullptr;
+};
+
+// Of numbers of any meaning.
+template <class T, int D>
+struct SumSlotsArguments {
+  SlotSums<T> sums;
 };
 
 }  // namespace mpm

@@ -87,13 +87,13 @@ class Copies {
     bool mixed = false;
     for (int i = 1; material && i < count_; i++) mixed |= material[i] != material[0];
     const int only = material && !mixed ? material[0] : -1;
-    if (mixed || (material && (only < 0 || only >= a_.law_count))) {  // some may have no law
+    if (mixed || (material && (only < 0 || only >= a_.material_count))) {  // some may have no law
       for (int k = 0; k < D * D; k++) __builtin_memset(row(R::stress + k), 0, count_ * sizeof(T));
     }
     for (int k = 0; k < a_.law_count; k++) {
-      if (material && !mixed && k != only) continue;
+      if (material && !mixed && a_.laws[k].material != only) continue;
       LawUpdateArguments<T, D> law = here(a_.laws[k]);
-      if (mixed) law.law.members = {material, 1, k};
+      if (mixed) law.law.members = {material, 1, a_.laws[k].material};
       a_.laws[k].update(law, nullptr);
     }
   }

@@ -8,11 +8,12 @@
 #include "rollout/resident.h"
 #include "rollout/survey.h"
 
-#define MPM_ROLLOUT_KERNELS(PLAIN, ORDERED, SIZE) \
-  PLAIN(survey, SurveyArguments)                  \
-  PLAIN(accumulate, AccumulateArguments)          \
-  PLAIN(add_scaled, AddScaledArguments)           \
-  PLAIN(accumulate_slots, AccumulateSlotsArguments)
+#define MPM_ROLLOUT_KERNELS(PLAIN, ORDERED, SIZE)   \
+  PLAIN(survey, SurveyArguments)                    \
+  PLAIN(accumulate, AccumulateArguments)            \
+  PLAIN(add_scaled, AddScaledArguments)             \
+  PLAIN(accumulate_slots, AccumulateSlotsArguments) \
+  PLAIN(sum_slots, SumSlotsArguments)
 MPM_BACKEND_KERNELS(MPM_ROLLOUT_KERNELS)
 
 #if MPM_BACKEND == MPM_BACKEND_IS_cpu

@@ -21,11 +21,11 @@ void scalar_of(const LawKernels<T, D>& kernels, const LawArguments<T, D>& law, L
 }
 
 template <class T, int D>
-void figures_of(const FiguresInputs& in, const LawCall& call, int number, Figures& out, backend::Stream stream) {
+void figures_of(const FiguresInputs& in, const LawCall& call, Figures& out, backend::Stream stream) {
   const LawKernels<T, D>& kernels = kernels_of<T, D>(*call.law);
   LawUpdateArguments<T, D> a;
   const OptionalTensor C = call.law->info.viscous ? in.C : OptionalTensor{};
-  a.law = law_arguments<T, D>(call, number, in.x, in.F, in.J, C, in.scene, in.material);
+  a.law = law_arguments<T, D>(call, in.x, in.F, in.J, C, in.scene, in.material);
   a.stress = field<T>(out.stress);
   Tensor mapped, moved;  // deformation and history after the return map
   if (call.law->info.plastic) a.state = field<T>(mapped = empty_particles(in.x, {in.x.size(0), D, D}));
@@ -51,7 +51,8 @@ std::tuple<Tensor, Tensor, Tensor> law_figures(const Tensor& x, const OptionalTe
   check_positions(x);
   const int64_t P = x.size(0), D = x.size(1);
   const std::vector<LawCall> calls = law_calls(laws, options, parameters, history, variables, D);
-  check_material(material, calls.size(), x);
+  check_material(material, calls, x);
+  for (const LawCall& call : calls) STD_TORCH_CHECK(!call.adds, "laws must be one of each material, got ", laws);
   const FiguresInputs in{x, C, F, J, scene, material};
   Figures out{empty_particles(x, {P, D, D}), empty_particles(x, {P}), energy ? empty_particles(x, {P}) : Tensor()};
   const DeviceScope device(x);
@@ -63,7 +64,7 @@ std::tuple<Tensor, Tensor, Tensor> law_figures(const Tensor& x, const OptionalTe
     input<T>(C, "C", x, {P, Dim, Dim});  // also where no law reads it
     input<T>(F, "F", x, {P, Dim, Dim});
     input<T>(J, "J", x, {P});
-    for (size_t k = 0; k < calls.size(); k++) figures_of<T, Dim>(in, calls[k], int(k), out, device.stream());
+    for (const LawCall& call : calls) figures_of<T, Dim>(in, call, out, device.stream());
   });
   return {out.stress, out.stiffness, out.energy};
 }

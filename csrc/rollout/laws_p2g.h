@@ -33,6 +33,7 @@ struct ChunkLaw {
   void (*update)(const LawUpdateArguments<T, D>&, void* stream) = nullptr;
   LawUpdateArguments<T, D> arguments;  // of which the parameters that particles share are used
   bool gradient = false, viscous = false, plastic = false;
+  int material = 0;
   int history[kMostHistory], parameters[kMostParameters];  // their rows, -1 where there are none
   bool matrix[kMostHistory] = {};
 };
@@ -54,7 +55,7 @@ struct LawsP2GArguments {
   int number_count = 0;
   bool has_material = false, has_C = false;
   const ChunkLaw<T, D>* laws = nullptr;
-  int law_count = 0;
+  int law_count = 0, material_count = 0;
   // Whether particle i of the index goes to place i; index and schedule are written anew then.
   bool rearranges = false;
   int *index = nullptr, *schedule = nullptr;

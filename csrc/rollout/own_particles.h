@@ -176,6 +176,7 @@ OwnParticles<T, D>::OwnParticles(Substeps<T, D>& steps, const Tensor& packed_his
   a_.has_material = has(in_.material);
   a_.laws = laws_.data();
   a_.law_count = int(laws_.size());
+  a_.material_count = s_.calls.back().material + 1;
   a_.copy_size = (R::rest + int64_t(s_.columns + parameters_.size())) * kCopyLine;
   copies_ = empty(like, {cpu::thread_count(), a_.copy_size});
   a_.copies = static_cast<T*>(copies_.data_ptr());
@@ -203,6 +204,7 @@ void OwnParticles<T, D>::find_laws() {
     law.viscous = info.viscous;
     viscous_ |= info.viscous;
     law.plastic = info.plastic;
+    law.material = call.material;
     (law.gradient ? reads_F_ : reads_J_) = true;
     int row = R::rest + int(call.first_column);
     for (int i = 0; i < kMostHistory; i++) {

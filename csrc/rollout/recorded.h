@@ -148,9 +148,12 @@ class Recorded {
     steps.p2g.stress = constant(stress[i]);
   }
 
-  // Of obstacles. On CUDA the statuses count it.
+  // Of obstacles. On CUDA the statuses count the steps.
   void set_time(int64_t i) {
-    if (MPM_BACKEND == MPM_BACKEND_IS_cpu) steps.contact.time = time_[i];
+    if (MPM_BACKEND == MPM_BACKEND_IS_cpu) {
+      steps.contact.time = time_[i];
+      steps.contact.row = first_row_ + i * steps.contact.rows_of_step;
+    }
     if (scene_times_.defined()) steps.contact.scene_time = scene_time(i);
   }
 
@@ -186,6 +189,7 @@ class Recorded {
   Tensor first_history_, memory_, workspace_, scene_times_;
   Particles<const T> first_;
   std::vector<double> time_;
+  const ObstacleRow<T, D>* first_row_;
   bool goes_on_;  // from a status before
   bool keeps_grids_ = false, taken_ = false;
   Arena grids_;  // from the first one on
@@ -196,7 +200,12 @@ class Recorded {
 
 template <class T, int D>
 Recorded<T, D>::Recorded(const SubstepsInputs& in, const OptionalTensor& memory, backend::Stream stream)
-    : steps(in), in_(in), stream_(stream), time_{in.time}, goes_on_(has(memory) || steps.previous_status) {
+    : steps(in),
+      in_(in),
+      stream_(stream),
+      time_{in.time},
+      first_row_(steps.contact.row),
+      goes_on_(has(memory) || steps.previous_status) {
   while (int64_t(time_.size()) < in.n) time_.push_back(time_.back() + in.dt);
   first_history_ = packed_history(in.x, in.history, steps.columns);
   first_ = given_particles<T, D>(in, first_history_);

@@ -76,13 +76,13 @@ constexpr int64_t kMostSteps = 1 << 16;  // of one call, which nothing interrupt
 // Fewer particles are faster by kernels of their own: those that find nothing to do cost more than half of the bytes.
 constexpr int64_t kLeastMergedSteps = 4, kLeastMergedParticles = 1 << 18;
 
-// The words of a list that commas part.
-inline std::vector<std::string> words(const std::string& list) {
+// The parts of a list between commas or other marks.
+inline std::vector<std::string> parts(const std::string& list, char mark) {
   std::vector<std::string> result;
   for (size_t begin = 0; begin <= list.size();) {
-    const size_t comma = std::min(list.find(',', begin), list.size());
-    result.push_back(list.substr(begin, comma - begin));
-    begin = comma + 1;
+    const size_t end = std::min(list.find(mark, begin), list.size());
+    result.push_back(list.substr(begin, end - begin));
+    begin = end + 1;
   }
   return result;
 }
@@ -90,41 +90,52 @@ inline std::vector<std::string> words(const std::string& list) {
 // As a growing grid does in torch_mpm/grid.py.
 inline int64_t with_headroom(int64_t blocks) { return blocks + blocks / 2 + 16; }
 
-// The laws of a mixture, or a single one, with their places in the lists of parameters and history.
+// The laws of a mixture, or of a single material, with their places in the lists of parameters and history.
 struct LawCall {
   LawEntry* law;
+  int material;
+  bool adds;  // to the stress of another law of the material
   int64_t options;
   Tensors parameters, history;
   int64_t first_column;  // of the history of all laws
 };
 
-// `variables` are the numbers of history tensors: a law may go without.
+// The materials are parted by commas, and their laws by '+'. `variables` are the numbers of history tensors: a law may
+// go without.
 inline std::vector<LawCall> law_calls(const std::string& names, const std::vector<int64_t>& options,
                                       const Tensors& parameters, const Tensors& history,
                                       const std::vector<int64_t>& variables, int64_t dim) {
-  const std::vector<std::string> list = words(names);
-  STD_TORCH_CHECK(options.size() == list.size(), "options must have an entry per law, ", list.size(), ", got ",
-                  options.size());
-  STD_TORCH_CHECK(variables.size() == list.size(), "variables must have an entry per law, ", list.size(), ", got ",
-                  variables.size());
   std::vector<LawCall> calls;
+  for (const std::string& material : parts(names, ',')) {
+    const int number = calls.empty() ? 0 : calls.back().material + 1;
+    for (const std::string& name : parts(material, '+')) {
+      const bool adds = !calls.empty() && calls.back().material == number;
+      calls.push_back({&law_of(name), number, adds, 0, {}, {}, 0});
+      STD_TORCH_CHECK(!adds || calls.back().law->info.additive, "a law after '+' must be one that is added, got ",
+                      name);
+    }
+  }
+  STD_TORCH_CHECK(options.size() == calls.size(), "options must have an entry per law, ", calls.size(), ", got ",
+                  options.size());
+  STD_TORCH_CHECK(variables.size() == calls.size(), "variables must have an entry per law, ", calls.size(), ", got ",
+                  variables.size());
   size_t parameter = 0, variable = 0;
   int64_t column = 0;
-  for (size_t k = 0; k < list.size(); k++) {
-    LawEntry& law = law_of(list[k]);
-    const size_t count = law.info.parameters.size();
+  for (size_t k = 0; k < calls.size(); k++) {
+    LawCall& call = calls[k];
+    const size_t count = call.law->info.parameters.size();
     STD_TORCH_CHECK(variables[k] >= 0, "variables must not be negative, got ", variables[k]);
     const size_t end = parameter + count, last = variable + size_t(variables[k]);
     STD_TORCH_CHECK(end <= parameters.size() && last <= history.size(),
                     "parameters and history must have those of all laws one after another, got ", parameters.size(),
                     " and ", history.size(), " tensors");
-    LawCall call{&law, options[k], {}, {}, column};
+    call.options = options[k];
+    call.first_column = column;
     call.parameters = {parameters.begin() + parameter, parameters.begin() + end};
     call.history = {history.begin() + variable, history.begin() + last};
     parameter = end;
     variable = last;
-    column += history_size(law.info, call.history, dim);
-    calls.push_back(call);
+    column += history_size(call.law->info, call.history, dim);
   }
   STD_TORCH_CHECK(parameter == parameters.size() && variable == history.size(),
                   "parameters and history must be those of all laws, ", parameter, " and ", variable, " tensors, got ",
@@ -217,9 +228,9 @@ Field<T> variable(const Field<T>& history, int64_t first, bool matrix) {
   return f;
 }
 
-// The law of each particle, where there are several.
-inline void check_material(const OptionalTensor& material, size_t laws, const Tensor& x) {
-  STD_TORCH_CHECK(has(material) || laws == 1, "several laws need material");
+// The material of each particle, where there are several.
+inline void check_material(const OptionalTensor& material, const std::vector<LawCall>& calls, const Tensor& x) {
+  STD_TORCH_CHECK(has(material) || calls.back().material == 0, "several laws need material");
   if (!has(material)) return;
   check_shape(*material, "material", {x.size(0)});
   check_type(*material, "material", ScalarType::Int, x);
@@ -227,16 +238,15 @@ inline void check_material(const OptionalTensor& material, size_t laws, const Te
 
 // The arguments of a law for its own particles.
 template <class T, int D>
-LawArguments<T, D> law_arguments(const LawCall& call, int number, const Tensor& x, const OptionalTensor& F,
-                                 const OptionalTensor& J, const OptionalTensor& C, const OptionalTensor& scene,
-                                 const OptionalTensor& material) {
+LawArguments<T, D> law_arguments(const LawCall& call, const Tensor& x, const OptionalTensor& F, const OptionalTensor& J,
+                                 const OptionalTensor& C, const OptionalTensor& scene, const OptionalTensor& material) {
   const LawInfo& info = call.law->info;
   const char* const name = info.field == Deformation::gradient ? "F" : "J";
   const OptionalTensor& state = info.field == Deformation::gradient ? F : J;
   STD_TORCH_CHECK(has(state), "the law ", info.name, " needs ", name);
   check_shape(*state, name, shape_of_state(info, x.size(0), D));
   auto a = arguments<T, D>(info, *state, C, call.parameters, call.history, scene, call.options);
-  if (has(material)) a.members = {static_cast<const int*>(material->data_ptr()), material->stride(0), number};
+  if (has(material)) a.members = {static_cast<const int*>(material->data_ptr()), material->stride(0), call.material};
   return a;
 }
 
@@ -282,10 +292,12 @@ struct Substeps {
 
   // What the next substep reads, and where the laws put the deformation gradients after their return maps.
   void read(const Particles<const T>& p, const Field<T>& mapped) {
+    bool maps = false;  // whether F of the material has changed before an added law reads it
     for (size_t k = 0; k < laws.size(); k++) {
       const LawInfo& info = calls[k].law->info;
       LawUpdateArguments<T, D>& a = laws[k];
-      a.law.state = info.field == Deformation::gradient ? p.F : p.J;
+      maps = a.adds ? maps : info.plastic;
+      a.law.state = info.field == Deformation::volume_ratio ? p.J : a.adds && maps ? constant(mapped) : p.F;
       if (info.viscous) a.law.C = p.C;
       if (info.plastic) a.state = mapped;
       set_history(a.law, calls[k], p.history, calls[k].first_column);
@@ -406,7 +418,7 @@ struct Substeps {
     torch::stable::zero_(drifts);
     p2g.drifted = true;
     advance.loads_ahead = true;
-    for (LawUpdateArguments<T, D>& law : laws) law.runs_beside = true;
+    for (LawUpdateArguments<T, D>& law : laws) law.runs_beside = !law.adds;
     next.particles = in.x.size(0);
     next.obstacles = obstacles && !impulse.defined();  // whose impulses want the velocities before contact
     const int64_t most = std::min<int64_t>(update.block_count, INT32_MAX / kBlockNodes<D> - activation.max_blocks);
@@ -495,10 +507,11 @@ struct Substeps {
   // The time of obstacles, added up as single steps do: by a device itself, where the host may not be there.
   void count_time([[maybe_unused]] const int* status_before, [[maybe_unused]] backend::Stream stream) {
 #if MPM_BACKEND == MPM_BACKEND_IS_cuda
-    if (!obstacles || has(in.scene_time)) return;
+    if (!obstacles) return;
+    if (status_before) contact.activations_before = status_before + kActivations;
+    if (has(in.scene_time)) return;
     step_time = empty(in.x, {in.n}, ScalarType::Double);
     contact.step_time = static_cast<const double*>(step_time.data_ptr());
-    if (status_before) contact.activations_before = status_before + kActivations;
     backend::add_up_times(static_cast<double*>(step_time.data_ptr()), in.time, in.dt, in.n, stream);
 #endif
   }
@@ -514,7 +527,7 @@ struct Substeps {
 
   // The time after a step, on the CPU and of scenes with clocks of their own.
   void end_time(backend::Stream stream) {
-    if (MPM_BACKEND == MPM_BACKEND_IS_cpu) contact.time += in.dt;
+    if (MPM_BACKEND == MPM_BACKEND_IS_cpu) contact.time += in.dt, contact.row += contact.rows_of_step;
     if (scene_time.defined()) add_dt(static_cast<T*>(scene_time.data_ptr()), stream);
   }
 
@@ -606,7 +619,7 @@ Substeps<T, D>::Substeps(const SubstepsInputs& inputs) : in(inputs) {
   STD_TORCH_CHECK(in.flip >= 0 && in.flip <= 1, "flip must be between 0 and 1, got ", in.flip);
   STD_TORCH_CHECK(in.wants_C || !in.apic, "apic needs wants_C");
   calls = law_calls(in.laws, in.options, in.parameters, in.history, in.variables, D);
-  check_material(in.material, calls.size(), x);
+  check_material(in.material, calls, x);
   activation = activate_arguments<T, D>(in.lattice, x, in.scene, in.ids, in.scenes, in.max_blocks);
   if (has(in.previous_status))
     previous_status = int_pointer(*in.previous_status, "previous_status", x, {1 + in.scenes, kStatusSize});
@@ -618,7 +631,8 @@ Substeps<T, D>::Substeps(const SubstepsInputs& inputs) : in(inputs) {
     STD_TORCH_CHECK(in.wants_C || !info.viscous, "the viscous law ", info.name, " needs wants_C");
     kernels_of<T, D>(*calls[k].law);
     LawUpdateArguments<T, D> a;
-    a.law = law_arguments<T, D>(calls[k], int(k), x, in.F, in.J, {}, in.scene, in.material);
+    a.law = law_arguments<T, D>(calls[k], x, in.F, in.J, {}, in.scene, in.material);
+    a.adds = calls[k].adds;
     a.stress = field<T>(stress);
     laws.push_back(a);
     plastic |= info.plastic;
@@ -643,7 +657,7 @@ Substeps<T, D>::Substeps(const SubstepsInputs& inputs) : in(inputs) {
   STD_TORCH_CHECK(!obstacles || has(in.obstacle_data), "obstacles need data");
   if (obstacles)
     contact = obstacle_arguments<T, D>(x, in.lattice, *in.obstacle_table, in.obstacle_data.value(), in.shape, in.sizes,
-                                       in.contact_kind, in.obstacle_scene, in.start, in.end, {}, in.time);
+                                       in.contact_kind, in.obstacle_scene, in.start, in.end, {}, in.time, in.n);
   STD_TORCH_CHECK(has(in.scene_dt) == has(in.scene_time), "scene_dt must be given with scene_time");
   if (has(in.scene_dt)) {
     for (const auto& [tensor, name] : {std::pair(*in.scene_dt, "scene_dt"), std::pair(*in.scene_time, "scene_time")}) {
@@ -670,7 +684,7 @@ void Substeps<T, D>::make_pool(backend::Stream stream) {
   pool.make(in.x, activation, apart, stream);
   if (largest_mass.defined()) pool.nodes = empty(in.x, Pool<T, D>::nodes_shape(activation), ScalarType::Long);
   if (impulse.defined() && (MPM_BACKEND == MPM_BACKEND_IS_cpu || in.lattice.deterministic()))
-    impulse_slots = empty(in.x, {activation.slots() + in.scenes, impulse_shape()[1] * kImpulse<D>}, ScalarType::Double);
+    impulse_slots = empty(in.x, {activation.slots(), impulse_shape()[1] * kImpulse<D>}, ScalarType::Double);
   use_pool();
   if (drifts.defined() && !update.walls.mirrored) {
     backend::clear(pool.nodes, stream);

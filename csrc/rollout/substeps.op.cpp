@@ -13,9 +13,7 @@ namespace mpm {
 namespace {
 
 Tensor copy_of(const Tensor& t) {
-  Shape shape(t.dim());
-  for (size_t i = 0; i < shape.size(); i++) shape[i] = t.size(int64_t(i));
-  Tensor copy = empty(t, shape);
+  Tensor copy = empty(t, sizes_of(t));
   torch::stable::copy_(copy, t);
   return copy;
 }
@@ -29,9 +27,10 @@ void give_clocks(const Substeps<T, D>& s, Arguments& a) {
   a.scene_dt = static_cast<const T*>(s.in.scene_dt->data_ptr());
 }
 
-// Substeps after the activation of the first one, of particles that move in place.
+// n substeps, after the activation of the first one, of particles that move in place. That one follows so many substeps
+// of the call, and begins at a time.
 template <class T, int D>
-void take_resident(Substeps<T, D>& s, int64_t n, double time, const int* activated, int* status,
+void take_resident(Substeps<T, D>& s, int64_t n, int64_t after, double time, const int* activated, int* status,
                    backend::Stream stream) {
   const SubstepsInputs& in = s.in;
   const int64_t P = in.x.size(0), rows = (P + 64 * in.scenes) * kMostResidentRow;
@@ -43,6 +42,8 @@ void take_resident(Substeps<T, D>& s, int64_t n, double time, const int* activat
   backend::clear(trouble, stream);
   int* const first = static_cast<int*>(trouble.data_ptr());
   ResidentArguments<T, D> a{s.p2g, s.advance, s.update, s.contact, s.obstacles, int(in.scenes), n, time, in.dt};
+  a.contact.activations = nullptr;
+  a.contact.row += after * a.contact.rows_of_step;
   give_clocks(s, a);
   a.rows = static_cast<char*>(row_memory.data_ptr());
   a.blocks = static_cast<char*>(block_memory.data_ptr());
@@ -75,6 +76,8 @@ bool take_persistent(Substeps<T, D>& s, int* activated, int* status, backend::St
   a.steps = int(in.n - 2);
   if (s.contact.step_time) a.step_time = s.contact.step_time + 1;
   a.contact.step_time = nullptr;
+  a.contact.activations = nullptr;
+  a.contact.row += a.contact.rows_of_step;
   give_clocks(s, a);
   Tensor steps_so_far = empty_int(in.x, {1}), arrived = empty(in.x, {2}, ScalarType::Long);
   backend::clear(steps_so_far, stream);
@@ -122,9 +125,7 @@ std::optional<Results> take_recorded(const SubstepsInputs& in, backend::Stream s
   const auto copy = [&](bool wanted, const auto& record, auto view) {
     if (!wanted) return Tensor();
     const Tensor from = (record.*view)(last);
-    Shape shape(from.dim());
-    for (size_t i = 0; i < shape.size(); i++) shape[i] = from.size(int64_t(i));
-    Tensor to = empty_particles(in.x, shape);
+    Tensor to = empty_particles(in.x, sizes_of(from));
     torch::stable::copy_(to, from);
     return to;
   };
@@ -262,9 +263,9 @@ Results substeps(MPM_SUBSTEPS_PARAMETERS) {
       double last_time = time;
       for (int64_t k = 1; k < n; k++) last_time += dt;
       s.activate(before, activated, stream);
-      take_resident(s, n - 1, time, activated, now, stream);
+      take_resident(s, n - 1, 0, time, activated, now, stream);
       s.activate(now, activated, stream);
-      take_resident(s, 1, last_time, activated, now, stream);
+      take_resident(s, 1, n - 1, last_time, activated, now, stream);
       return;
     }
     if (n > 1) s.let_activations_last(stream);

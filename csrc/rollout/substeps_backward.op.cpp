@@ -14,7 +14,13 @@ struct Adjoints {
 };
 
 // Bits of `needs`, in the order of the returned tensors after those of the state.
-enum Need : int64_t { kMass = 1, kVolume = 2, kParameters_ = 4, kGravity = 8 };
+enum Need : int64_t { kMass = 1, kVolume = 2, kParameters_ = 4, kGravity = 8, kObstacles = 16 };
+
+// Sums over the grid, undefined where they are not wanted: of gravity by blocks of the domain, and of the table of
+// obstacles.
+struct GridSums {
+  Tensor gravity, obstacles;
+};
 
 template <class T, int D>
 class SubstepsBackward {
@@ -27,20 +33,21 @@ class SubstepsBackward {
   int64_t blocks() const { return s_.update.block_count; }
 
   // The adjoints of the state at the end become those of the state at the beginning, and the others are added up.
-  void run(Adjoints& adjoints, const Tensor& gravity) {
+  void run(Adjoints& adjoints, const GridSums& sums) {
     if (!recorded_) check_room(r_.take());
     const int64_t slots = s_.activation.slots(), rows = slots * kBlockNodes<D>;
     motions_ = std::clamp<int64_t>(kCleared / std::max<int64_t>(rows * (1 + D) * int64_t(sizeof(T)), 1), 1, in_.n);
     motion_ = empty(in_.x, {motions_, rows, 1 + D});
     update_ = empty(in_.x, {rows, 1 + D});
     if (s_.obstacles) contact_ = empty(in_.x, {rows, 1 + D});
-    if (gravity.defined()) change_ = empty(in_.x, {slots, D});
+    if (sums.gravity.defined()) change_ = empty(in_.x, {slots, D});
+    if (sums.obstacles.defined()) row_grad_ = empty(in_.x, {slots, s_.contact.obstacles, ObstacleRow<T, D>::width});
     if (s_.flips()) before_ = empty(in_.x, {3, rows, 1 + D});
     for (int64_t i = in_.n - 1; i >= 0; i--) {
       check_room(r_.return_to(i));
       if (s_.flips()) keep_adjoint(adjoints);
       leave_advance(i, adjoints);
-      leave_grid(i, adjoints, gravity);
+      leave_grid(i, adjoints, sums);
       if (s_.flips()) leave_kept(adjoints);
       leave_laws(adjoints);
     }
@@ -58,7 +65,8 @@ class SubstepsBackward {
   void leave_advance(int64_t i, Adjoints& adjoints);
   AdvanceBackwardArguments<T, D> advance(int64_t i, Adjoints& adjoints) const;
   PositionGradientArguments<T, D> motion(const Adjoints& adjoints) const;
-  void leave_grid(int64_t i, Adjoints& adjoints, const Tensor& gravity);
+  void leave_grid(int64_t i, Adjoints& adjoints, const GridSums& sums);
+  void leave_obstacles(int64_t i, const T* nodes, const GridSums& sums);
   void keep_adjoint(const Adjoints& adjoints);
   void leave_kept(Adjoints& adjoints);
   void leave_laws(Adjoints& adjoints);
@@ -94,6 +102,7 @@ class SubstepsBackward {
   // Adjoints on the nodes [N, 1 + D], of their motion in some steps, before contact and before the grid update; and of
   // the velocity change by gravity, by slots.
   Tensor motion_, contact_, update_, change_;
+  Tensor row_grad_;  // of the table of obstacles, by slots
   // With FLIP: the nodes before the forces, the adjoints of their velocities, and these [3, N, 1 + D]; and of particles
   // the adjoint of what is subtracted from G2P, and what the first of these nodes give to those of v and C.
   Tensor before_, kept_, v_term_, C_term_;
@@ -203,26 +212,40 @@ PositionGradientArguments<T, D> SubstepsBackward<T, D>::motion(const Adjoints& a
   return a;
 }
 
+// From the adjoints of the nodes after contact to those before, and to that of the table.
+template <class T, int D>
+void SubstepsBackward<T, D>::leave_obstacles(int64_t i, const T* nodes, const GridSums& sums) {
+  ContactArguments<T, D> contact = s_.contact;
+  contact.grad = nodes + 1;
+  contact.grad_stride = 1 + D;
+  contact.result = static_cast<T*>(contact_.data_ptr());
+  if (row_grad_.defined()) contact.row_grad = static_cast<T*>(row_grad_.data_ptr());
+  if (has(grad_impulse_)) {
+    const T* const mass = reinterpret_cast<const T*>(s_.update.updated);
+    backend::contact_impulses_backward(
+        ContactImpulsesArguments<T, D>{contact, mass, 1 + D, impulses(0, int64_t(in_.shape.size()))}, stream_);
+  } else {
+    backend::contact_backward(contact, stream_);
+  }
+  if (!row_grad_.defined()) return;
+  const int columns = contact.obstacles * ObstacleRow<T, D>::width;
+  T* const sum = static_cast<T*>(sums.obstacles.data_ptr()) + i * contact.rows_of_step * ObstacleRow<T, D>::width;
+  backend::sum_slots(SumSlotsArguments<T, D>{{contact.max_blocks, s_.update.geometry.blocks_per_scene, contact.block,
+                                              contact.rows, columns, contact.rows > 1, contact.row_grad, sum, columns}},
+                     stream_);
+}
+
 // Through obstacles, grid update and P2G.
 template <class T, int D>
-void SubstepsBackward<T, D>::leave_grid(int64_t i, Adjoints& adjoints, const Tensor& gravity) {
+void SubstepsBackward<T, D>::leave_grid(int64_t i, Adjoints& adjoints, const GridSums& sums) {
+  const Tensor& gravity = sums.gravity;
   T* const nodes = motion_of(i);
   GridUpdateBackwardArguments<T, D> update;
   update.forward = s_.update;
   update.grad_updated = reinterpret_cast<const NodeRow<T, D>*>(nodes);
   if (s_.obstacles) {
-    ContactArguments<T, D> contact = s_.contact;
-    contact.grad = nodes + 1;
-    contact.grad_stride = 1 + D;
-    contact.result = static_cast<T*>(contact_.data_ptr());
-    if (has(grad_impulse_)) {
-      const T* const mass = reinterpret_cast<const T*>(s_.update.updated);
-      backend::contact_impulses_backward(
-          ContactImpulsesArguments<T, D>{contact, mass, 1 + D, impulses(0, int64_t(in_.shape.size()))}, stream_);
-    } else {
-      backend::contact_backward(contact, stream_);
-    }
-    update.grad_updated = reinterpret_cast<const NodeRow<T, D>*>(contact.result);
+    leave_obstacles(i, nodes, sums);
+    update.grad_updated = static_cast<const NodeRow<T, D>*>(contact_.data_ptr());
   }
   update.grad_nodes = static_cast<NodeRow<T, D>*>(update_.data_ptr());
   if (gravity.defined()) update.change = static_cast<Vector<T, D>*>(change_.data_ptr());
@@ -297,12 +320,12 @@ void SubstepsBackward<T, D>::leave_kept(Adjoints& adjoints) {
   backend::add_scaled(AddScaledArguments<T, D>{in_.x.size(0), v, constant(v), motion.value, -1}, stream_);
 }
 
-// From F after the laws, their stress and history to F and history before. A law changes the adjoints of what it maps
-// where they stand, and adds to those of what it only reads.
+// From F after the laws, their stress and history to F and history before, the last law first. A law changes the
+// adjoints of what it maps where they stand, and adds to those of what it only reads.
 template <class T, int D>
 void SubstepsBackward<T, D>::leave_laws(Adjoints& adjoints) {
-  int64_t parameter = 0;
-  for (size_t k = 0; k < s_.calls.size(); k++) {
+  int64_t parameter = int64_t(in_.parameters.size());
+  for (size_t k = s_.calls.size(); k-- > 0;) {
     const LawCall& call = s_.calls[k];
     const LawInfo& info = call.law->info;
     LawBackwardArguments<T, D> a;
@@ -318,9 +341,9 @@ void SubstepsBackward<T, D>::leave_laws(Adjoints& adjoints) {
       a.grad_history = variable<const T, D>(field<const T>(adjoints.history), call.first_column, false);
       a.history = variable<T, D>(field<T>(adjoints.history), call.first_column, false);
     }
+    parameter -= int64_t(call.parameters.size());
     if (adjoints.parameters.defined())
       a.parameters = variable<T, D>(field<T>(a.adds ? adjoints.parameters : parameters_term_), parameter, false);
-    parameter += int64_t(call.parameters.size());
     call.law->template kernels<T, D>().update_backward(a, stream_);
   }
   if (F_term_.defined() || parameters_term_.defined())
@@ -334,22 +357,22 @@ void set(Tensor& adjoint, const OptionalTensor& grad, const char* name, const Te
     torch::stable::zero_(adjoint);
     return;
   }
-  Shape shape(adjoint.dim());
-  for (size_t i = 0; i < shape.size(); i++) shape[i] = adjoint.size(int64_t(i));
-  check_shape(*grad, name, shape);
+  check_shape(*grad, name, sizes_of(adjoint));
   check_like(*grad, name, x);
   torch::stable::copy_(adjoint, *grad);
 }
 
-std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> substeps_backward(
-    const OptionalTensor& grad_x, const OptionalTensor& grad_v, const OptionalTensor& grad_C,
-    const OptionalTensor& grad_F, const OptionalTensor& grad_J, const OptionalTensor& grad_history,
-    const OptionalTensor& grad_impulse, int64_t needs, const OptionalTensor& record, MPM_SUBSTEPS_PARAMETERS) {
+using Gradients = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
+
+Gradients substeps_backward(const OptionalTensor& grad_x, const OptionalTensor& grad_v, const OptionalTensor& grad_C,
+                            const OptionalTensor& grad_F, const OptionalTensor& grad_J,
+                            const OptionalTensor& grad_history, const OptionalTensor& grad_impulse, int64_t needs,
+                            const OptionalTensor& record, MPM_SUBSTEPS_PARAMETERS) {
   const SubstepsInputs in{MPM_SUBSTEPS_ARGUMENTS};
   check_positions(x);
   const int64_t P = x.size(0);
   Adjoints adjoints;
-  Tensor gravity_sum;
+  GridSums sums;
   const DeviceScope device(x);
   dispatch(x, [&]<class T, int D>() {
     SubstepsBackward<T, D> backward(in, grad_impulse, record, needs, device.stream());
@@ -369,12 +392,13 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tenso
     set(adjoints.J, grad_J, "grad_J", x);
     set(adjoints.history, grad_history, "grad_history", x);
     for (Tensor* sum : {&adjoints.mass, &adjoints.volume, &adjoints.parameters}) set(*sum, {}, "", x);
-    if ((needs & kGravity) && has(gravity)) gravity_sum = zeros(x, {backward.blocks(), D});
-    if (P > 0) with_team(P * n, [&] { backward.run(adjoints, gravity_sum); });
+    if ((needs & kGravity) && has(gravity)) sums.gravity = zeros(x, {backward.blocks(), D});
+    if ((needs & kObstacles) && has(obstacle_table)) sums.obstacles = zeros(x, sizes_of(*obstacle_table));
+    if (P > 0) with_team(P * n, [&] { backward.run(adjoints, sums); });
   });
   if (!has(C)) adjoints.C = Tensor();
-  return {adjoints.x,       adjoints.v,    adjoints.C,      adjoints.F,          adjoints.J,
-          adjoints.history, adjoints.mass, adjoints.volume, adjoints.parameters, gravity_sum};
+  return {adjoints.x,    adjoints.v,      adjoints.C,          adjoints.F,   adjoints.J,    adjoints.history,
+          adjoints.mass, adjoints.volume, adjoints.parameters, sums.gravity, sums.obstacles};
 }
 
 }  // namespace
@@ -386,7 +410,7 @@ STABLE_TORCH_LIBRARY_FRAGMENT(torch_mpm, m) {
       "substeps_backward(Tensor? grad_x, Tensor? grad_v, Tensor? grad_C, Tensor? grad_F, Tensor? grad_J, "
       "Tensor? grad_history, Tensor? grad_impulse, int needs, Tensor? record, " MPM_SUBSTEPS_SCHEMA
       ") -> (Tensor x, Tensor v, Tensor C, Tensor F, Tensor J, Tensor history, Tensor mass, Tensor volume, "
-      "Tensor parameters, Tensor gravity)");
+      "Tensor parameters, Tensor gravity, Tensor obstacles)");
 }
 #endif
 

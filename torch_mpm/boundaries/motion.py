@@ -110,11 +110,29 @@ class RigidMotion(SceneParameters):
 
     def _path(self, time: float | Tensor, like: Tensor) -> tuple[Tensor, Tensor]:
         """Centre and its velocity where the position is a function of time."""
-        assert callable(self.position)
         if not isinstance(time, Tensor):
             time = torch.full((), time, dtype=like.dtype, device=like.device)
-        centre, velocity, *_ = torch.func.jvp(self.position, (time,), (torch.ones_like(time),))
+        centre, velocity = self._moved(time)
         return centre.to(like.dtype), velocity.to(like.dtype)
+
+    def path_over(self, times: Tensor, like: Tensor) -> tuple[Tensor, Tensor]:
+        """Centre and its velocity at many times [n] or [n, B]: [n, D] or [n, B, D], with the dtype of `like`.
+
+        A function of time is called once for all of them if it can be mapped over them, else for one after another.
+        """
+        try:
+            centre, velocity = torch.vmap(self._moved)(times)
+        except (
+            Exception
+        ):  # what a function may raise that looks at the value of a time; if it is wrong, it raises again
+            both = [self._moved(time) for time in times.unbind()]
+            centre, velocity = (torch.stack(list(values)) for values in zip(*both, strict=True))
+        return centre.to(like.dtype), velocity.to(like.dtype)
+
+    def _moved(self, time: Tensor) -> tuple[Tensor, Tensor]:
+        assert callable(self.position)
+        centre, velocity, *_ = torch.func.jvp(self.position, (time,), (torch.ones_like(time),))
+        return centre, velocity
 
     def _elapsed(self, time: float | Tensor, like: Tensor) -> float | Tensor:
         """Time since `start`, [] or [B]."""

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from ..errors import check_vector, shape_of
+from ..ops.law import law_energy, law_stiffness, law_update, law_wave_modulus
 from ..particle_operations import of_particles
 from .custom import as_law
 from .material import Material
@@ -19,6 +20,8 @@ __all__ = ["Active"]
 
 ACTIVATION = "activation"
 """Key of `State.extra` with the active stress of each particle [P] [Pa]."""
+FIBRE = "fibre"
+"""Name of the compiled law, csrc/laws/fibre.h."""
 
 
 class Active(Material):
@@ -28,7 +31,8 @@ class Active(Material):
     actuation F A Fᵀ of ChainQueen (Hu et al. 2019) with A = a d dᵀ.
 
     The activation a [P] [Pa] is `state.extra["activation"]`, zero where it was not set: a > 0 contracts. A controller
-    sets it in `Step(on_particles=)` for each step, or a hook of `rollout` now and then; gradients pass to it.
+    sets it in `Step(on_particles=)` for each step, or a hook of `rollout` now and then; gradients pass to it. Steps
+    between two hooks are taken in one op where the law is compiled.
 
     Args:
         law: any law that moves F; a function or module F -> Kirchhoff stress too.
@@ -60,21 +64,20 @@ class Active(Material):
 
     def update(self, state: State) -> tuple[dict[str, Tensor], Tensor]:
         fields, stress = self.law(state)
-        fibre = self._fibre(state, fields.get("F", state.F))
-        return fields, stress + self._activation(state)[:, None, None] * fibre[:, :, None] * fibre[:, None, :]
+        F = fields.get("F", state.F)
+        return fields, stress + law_update(FIBRE, F, self.fibre_parameters(state)).stress
 
     def initial(self, name: str, state: State) -> Tensor:
         return torch.zeros_like(state.mass) if name == ACTIVATION else self.law.initial(name, state)
 
     def energy_density(self, state: State) -> Tensor:
-        square = self._fibre(state, state.F).square().sum(1)
-        return self.law.energy_density(state) + self._activation(state) * (square - 1) / 2
+        return self.law.energy_density(state) + law_energy(*self._fibre(state))
 
     def stiffness(self, state: State) -> Tensor:
-        return self.law.stiffness(state) + 2 * self._stretched(state)
+        return self.law.stiffness(state) + law_stiffness(*self._fibre(state))
 
     def wave_modulus(self, state: State) -> Tensor:
-        return self.law.wave_modulus(state) + self._stretched(state)
+        return self.law.wave_modulus(state) + law_wave_modulus(*self._fibre(state))
 
     def viscosity(self, state: State) -> Tensor | None:
         return self.law.viscosity(state)
@@ -82,17 +85,19 @@ class Active(Material):
     def invalid(self, state: State) -> Tensor:
         return self.law.invalid(state)
 
-    def _stretched(self, state: State) -> Tensor:
-        """|a| |F d|² [P] [Pa], which bounds the second variation of the active energy."""
-        return self._activation(state).abs() * self._fibre(state, state.F).square().sum(1)
-
-    def _fibre(self, state: State, F: Tensor | None) -> Tensor:
-        """F d [P, D]."""
-        assert F is not None
+    def fibre_parameters(self, state: State) -> list[Tensor]:
+        """Those of the compiled law `FIBRE`: activation, and three entries of the direction, [] or [P]."""
         if self._everywhere and self.direction.device != state.x.device:
             self.direction = self.direction.to(state.x.device)
-        direction = of_particles("direction", self.direction, state, tuple(state.x.shape)).to(F.dtype)
-        return (F * direction[..., None, :]).sum(-1)
+        activation, x = self._activation(state), state.x
+        direction = of_particles("direction", self.direction, state, tuple(x.shape)).to(x.dtype)
+        entries = list(direction.unbind(-1))
+        return [activation, *entries, *(x.new_zeros(()) for _ in range(3 - len(entries)))]
+
+    def _fibre(self, state: State) -> tuple[str, Tensor, list[Tensor]]:
+        """What the ops of a law take."""
+        assert state.F is not None
+        return FIBRE, state.F, self.fibre_parameters(state)
 
     def _activation(self, state: State) -> Tensor:
         if ACTIVATION not in state.extra:

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 from torch import Tensor
 
+from .active import FIBRE, Active
 from .compiled import CompiledLaw
 from .material import Material
 from .mixture import Mixture
@@ -15,20 +16,17 @@ class LawCalls(NamedTuple):
     """Arguments of ops that call laws."""
 
     names: str
-    """Of the compiled laws, with commas."""
+    """Of the compiled laws: commas between materials, a plus before what is added to the stress of a material."""
     options: list[int]
+    """Of each law; likewise the numbers of its history tensors."""
+    variables: list[int]
     parameters: list[Tensor]
     """Of all laws, one after another; likewise the history."""
     history: list[Tensor]
     history_names: list[list[str]]
-    """Of each law."""
+    """Of each material."""
     material: Tensor | None
-    """The law of each particle; None for a single law."""
-
-    @property
-    def variables(self) -> list[int]:
-        """Numbers of history tensors of the laws."""
-        return [len(names) for names in self.history_names]
+    """The material of each particle; None for a single one."""
 
 
 def laws_of(law: Material) -> list[Material]:
@@ -36,19 +34,34 @@ def laws_of(law: Material) -> list[Material]:
     return list(law.laws) if type(law) is Mixture else [law]  # type: ignore[arg-type]
 
 
+def passive(law: Material) -> Material:
+    """A law without its muscles."""
+    return law.law if type(law) is Active else law
+
+
 def law_calls(law: Material, state: Any) -> LawCalls:
-    """The calls of compiled laws for a state, which may have a time step `dt`.
+    """The calls of compiled laws for a state, which may have a time step `dt`; some may be `Active`.
 
     Raises:
         ValueError: where the state has no material, or one that the mixture does not have, as `Mixture.check_material`.
     """
-    laws: list[CompiledLaw] = laws_of(law)  # type: ignore[assignment]
+    laws = laws_of(law)
     material = law.check_material(state) if isinstance(law, Mixture) else None
-    return LawCalls(
-        ",".join(part._name(state) for part in laws),
-        [part.option_bits() for part in laws],
-        [parameter for part in laws for parameter in part._arguments(state)[1]],
-        [variable for part in laws for variable in part._history(state)],
-        [part.history_names() for part in laws],
-        material if len(laws) > 1 else None,
-    )
+    names: list[str] = []
+    calls = LawCalls("", [], [], [], [], [], material if len(laws) > 1 else None)
+    for part in laws:
+        own: CompiledLaw = passive(part)  # type: ignore[assignment]
+        names.append(own._name(state))
+        _add(calls, own.option_bits(), own._arguments(state)[1], own._history(state))
+        calls.history_names.append(own.history_names())
+        if isinstance(part, Active):
+            names[-1] += f"+{FIBRE}"
+            _add(calls, 0, part.fibre_parameters(state), [])
+    return calls._replace(names=",".join(names))
+
+
+def _add(calls: LawCalls, options: int, parameters: list[Tensor], history: list[Tensor]) -> None:
+    calls.options.append(options)
+    calls.variables.append(len(history))
+    calls.parameters.extend(parameters)
+    calls.history.extend(history)

@@ -7,14 +7,13 @@ all scenes or one per scene, of the nodes' dtype:
 
 with A = 1 angle in 2-D and a vector of A = 3 in 3-D. What an obstacle does not have is zero. Shapes of many numbers
 have them one after another in a second tensor: the corners of a revolved shape (distance from the axis, position along
-it), the samples of a sampled one (lower corner, spacing, numbers along the axes, values).
+it), the samples of a sampled one (lower corner, spacing, numbers along the axes, values). `obstacle_tables` makes both.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -28,40 +27,21 @@ from ..topology import Topology
 from .arguments import check_list, differentiate, refuse_vmap, sizes
 from .autograd import dispatch, register_autograd, save_with_topology, saved_with_topology
 from .grid_update import CONTACT_KINDS, CONTACT_NAMES, sum_by_scene_of_blocks
+from .obstacle_tables import KERNEL_SHAPES, size_of_data, tables, tables_over
 
 MAX_OBSTACLES = 16  # of one call, csrc/grid/obstacle.h
 
 
-class KernelShape(NamedTuple):
-    """How the kernel calls a shape, the name of the shape's parameter in the column of directions and sizes, and those
-    of its other parameters."""
-
-    number: int
-    extent: str | None
-    others: tuple[str, ...] = ()
-
-
-KERNEL_SHAPES: dict[type[shapes.Shape], KernelShape] = {
-    shapes.Plane: KernelShape(0, "normal"),
-    shapes.Sphere: KernelShape(1, None, ("radius",)),
-    shapes.Box: KernelShape(2, "size"),
-    shapes.Capsule: KernelShape(3, "half_axis", ("radius",)),
-    shapes.Revolved: KernelShape(4, "axis", ("outline",)),
-    shapes.Cylinder: KernelShape(4, "axis", ("outline",)),
-    shapes.Sampled: KernelShape(5, None, ("values", "lower", "spacing")),
-}
-
-
-def fusible(obstacle: Any, time: float | Tensor) -> bool:
+def fusible(obstacle: Any, time: float | Tensor, paths: bool = False) -> bool:
     """Whether `contact` takes an obstacle: a shape that the kernel knows, moving at constant rates, without hooks.
 
     A position as a function of time, and a time that requires grad, need `Obstacle.apply`; so does any subclass with a
-    `forward` or an `apply` of its own.
+    `forward` or an `apply` of its own. With `paths`, whether `substeps` does, where such a position may be, too.
     """
     kind = type(obstacle)
     if not isinstance(obstacle, Obstacle) or kind.forward is not Obstacle.forward or kind.apply is not Obstacle.apply:
         return False
-    if type(obstacle.shape) not in KERNEL_SHAPES or obstacle.follows_path:
+    if type(obstacle.shape) not in KERNEL_SHAPES or (obstacle.follows_path and not paths):
         return False
     if has_hooks(obstacle):
         return False
@@ -119,13 +99,20 @@ def present(obstacles: Sequence[Obstacle], scene_time: Tensor | None, number: fl
     return obstacles if scene_time is not None else [o for o in obstacles if o.start <= number < o.end]
 
 
-def obstacle_arguments(group: Sequence[Obstacle], like: Tensor, scenes: int) -> tuple[Any, ...]:
-    """Up to `MAX_OBSTACLES` obstacles as the ops take them; their tables are None where there are none."""
-    tables = _tables(group, like, scenes) if group else (None, None)
+def obstacle_arguments(
+    group: Sequence[Obstacle], like: Tensor, scenes: int, times: Tensor | None = None
+) -> tuple[Any, ...]:
+    """Up to `MAX_OBSTACLES` obstacles as the ops take them; their tables are None where there are none.
+
+    With times [n] or [n, B] [s] the parameters are those at each of these, and some may follow a path.
+    """
+    table: tuple[Tensor | None, Tensor | None] = (None, None)
+    if group:
+        table = tables(group, like, scenes) if times is None else tables_over(group, like, scenes, times)
     return (
-        *tables,
+        *table,
         [KERNEL_SHAPES[type(o.shape)].number for o in group],
-        [_size(o.shape) for o in group],
+        [size_of_data(o.shape) for o in group],
         [CONTACT_KINDS[o.kind] for o in group],
         [-1 if o.scene is None else o.scene for o in group],
         [o.start for o in group],
@@ -146,82 +133,6 @@ def time_arguments(time: float | Tensor, like: Tensor, scenes: int) -> tuple[Ten
 
 def packed_rows(velocity: Tensor) -> Tensor:
     return velocity if velocity.stride(1) == 1 else velocity.contiguous()
-
-
-# ---- the tables of parameters
-
-
-def _values(obstacle: Obstacle) -> tuple[Any, ...]:
-    """The numbers and tensors of an obstacle that go into the tables."""
-    motion = (obstacle.friction, obstacle.position, obstacle.velocity, obstacle.rotation, obstacle.angular_velocity)
-    shape = obstacle.shape
-    kind = KERNEL_SHAPES[type(shape)]
-    extent = None if kind.extent is None else getattr(shape, kind.extent, None)
-    return (*motion, extent, *(getattr(shape, name) for name in kind.others))
-
-
-def _size(shape: shapes.Shape) -> int:
-    """The length of `_data`, without making it at every step."""
-    if isinstance(shape, shapes.Revolved):
-        return 2 * len(shape.outline)
-    return 2 * shape.values.dim() + 1 + shape.values.numel() if isinstance(shape, shapes.Sampled) else 0
-
-
-def _data(shape: shapes.Shape, like: Tensor) -> Tensor:
-    """The numbers of a shape beside its row of the table [n]."""
-    if isinstance(shape, shapes.Revolved):
-        return shape.parameter("outline", like, (len(shape.outline), 2)).reshape(-1)
-    return shape.data(like) if isinstance(shape, shapes.Sampled) else like.new_zeros(0)
-
-
-def _tables(obstacles: Sequence[Obstacle], like: Tensor, scenes: int) -> tuple[Tensor, Tensor]:
-    """Parameters [1 or B, K, width] and data [n] of the shapes; kept while nothing has changed."""
-    if torch.compiler.is_compiling() or type(like) not in (Tensor, torch.nn.Parameter):
-        return _build(obstacles, like, scenes)
-    key: list[Any] = [like.dtype, like.device, scenes]
-    for value in (v for o in obstacles for v in (o, o.shape, *_values(o))):
-        if isinstance(value, Tensor) and value.requires_grad and torch.is_grad_enabled():
-            return _build(obstacles, like, scenes)
-        key += [value, value._version if isinstance(value, Tensor) else None]
-    tables: tuple[Tensor, Tensor] = obstacles[0].kept_table.get(
-        tuple(key), lambda: _build(obstacles, like, scenes), like
-    )
-    return tables
-
-
-def _build(obstacles: Sequence[Obstacle], like: Tensor, scenes: int) -> tuple[Tensor, Tensor]:
-    rows = [_row(o, like) for o in obstacles]
-    count = max(row.shape[0] for row in rows)
-    if count not in (1, scenes) or any(row.shape[0] not in (1, count) for row in rows):
-        raise ValueError(f"parameters of obstacles must be given once or per scene, B = {scenes}, got {count} of them")
-    table = torch.stack([row.expand(count, -1) for row in rows], 1).contiguous()
-    return table, torch.cat([_data(o.shape, like) for o in obstacles])
-
-
-def _row(obstacle: Obstacle, like: Tensor) -> Tensor:
-    """[1 or B, width]; what an obstacle does not have is zero."""
-    vector, shape = (like.shape[1],), obstacle.shape
-    turn = () if like.shape[1] == 2 else (3,)
-    motion: dict[str, tuple[int, ...]] = {
-        "friction": (), "position": vector, "velocity": vector, "rotation": turn, "angular_velocity": turn,
-    }  # fmt: skip
-    parts = [_part(obstacle, name, like, size) for name, size in motion.items()]
-    extent = KERNEL_SHAPES[type(shape)].extent
-    if extent == "axis" and getattr(shape, "axis", None) is None:
-        parts.append(torch.eye(like.shape[1], dtype=like.dtype, device=like.device)[1:2])
-    else:
-        parts.append(_part(shape, extent, like, vector))
-    parts.append(_part(shape, "radius", like, ()))
-    count = max(part.shape[0] for part in parts)
-    return torch.cat([part.expand(count, -1) for part in parts], 1)
-
-
-def _part(owner: Obstacle | shapes.Shape, name: str | None, like: Tensor, shape: tuple[int, ...]) -> Tensor:
-    """A parameter [1 or B, n]."""
-    if name is None or getattr(owner, name, None) is None:
-        return like.new_zeros(1, math.prod(shape))
-    value = owner.parameter(name, like, shape)
-    return value.reshape(1 if value.dim() == len(shape) else value.shape[0], -1)
 
 
 # ---- fake kernels and autograd

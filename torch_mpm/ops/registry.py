@@ -57,6 +57,7 @@ class LawInfo:
         twice_differentiable, twice_differentiable_energy: whether its stress, and its energy, has second derivatives.
         has_tangent: whether it has `law_tangent`, which implicit steps need.
         in_2d: whether it exists in two dimensions.
+        additive: whether it is part of a material beside another law, to whose stress its own is added.
         parameters, history: in the order of the ops.
         options: names of the bits of `options`.
     """
@@ -70,6 +71,7 @@ class LawInfo:
     twice_differentiable_energy: bool
     has_tangent: bool
     in_2d: bool
+    additive: bool
     parameters: tuple[Quantity, ...]
     history: tuple[Quantity, ...]
     options: tuple[str, ...]

@@ -9,8 +9,10 @@
 `torch_mpm.substeps_arguments(step, state, n, dt)` makes the arguments; docs/training.md has a call.
 
 Particles and their history are those of `State`, the grid's arguments those of `activate`, `grid_update` and `contact`.
-`laws` are names of `LAWS` parted by commas, law k for the particles of material k; their options, parameters and
-history variables follow one another, `variables` of the latter for each law. The time step dt [s] is part of the
+`laws` are names of `LAWS`, for the particles of each material one, with commas between them, and perhaps more after a
+plus whose stress is added; their options, parameters and history variables follow one another, `variables` of the
+latter for each law. `obstacles` is the table of `contact`, or one for each substep [n, 1 or B, K, width] with positions
+at its time. The time step dt [s] is part of the
 parameters of laws that flow in time. Results that a call does not have are None; `history` has the entries of all laws
 side by side, [P, m]. The impulses on obstacles and walls are added to `impulse`, where it is given. With `flip` that
 share of the velocities of particles, less those of the nodes before the forces, is added to what G2P gives. Scenes with
@@ -21,20 +23,20 @@ gradients take it as any other, whose sums may round differently. With `records`
 kept in `record`, bytes of no other use, and no step is taken again; not where impulses are counted, or the pool had to
 grow.
 
-Differentiable once, with respect to x, v, mass, volume, C, F, J, history, parameters, gravity and impulse. Autograd
-keeps the arguments of a call and the record, mostly none: 2 D + 2 D² numbers per particle of a solid (24 in 3-D) and
-its history.
+Differentiable once, with respect to x, v, mass, volume, C, F, J, history, parameters, gravity, obstacles and impulse.
+Autograd keeps the arguments of a call and the record, mostly none: 2 D + 2 D² numbers per particle of a solid (24 in
+3-D) and its history.
 
     torch.ops.torch_mpm.substeps_backward(grad_x, grad_v, grad_C, grad_F, grad_J, grad_history, grad_impulse, needs,
-        record, *arguments of substeps) -> (x, v, C, F, J, history, mass, volume, parameters, gravity)
+        record, *arguments of substeps) -> (x, v, C, F, J, history, mass, volume, parameters, gravity, obstacles)
 
 takes the steps again, where there is no record, and then goes back through them; a record must be that of `substeps`,
 whose contents are not checked. Meanwhile it holds what each step has read: of a solid 2 D + 3 D² numbers per particle
 and step (33 in 3-D), D² more where a law is plastic, and the history; and the grid of each step where that is at most
 half as much. The adjoints are [P, ...],
 those of the parameters [P, number of parameters] and that of gravity, over the time step, a sum for each block of the
-grids of all scenes [B * blocks, D]. Of the last four the bits of `needs` (`MASS`, `VOLUME`, `PARAMETERS`, `GRAVITY`)
-tell which are wanted.
+grids of all scenes [B * blocks, D]. Of the last five the bits of `needs` (`MASS`, `VOLUME`, `PARAMETERS`, `GRAVITY`,
+`OBSTACLES`) tell which are wanted.
 """
 
 from __future__ import annotations
@@ -49,14 +51,14 @@ from .arguments import refuse_vmap, sizes, soa_empty
 from .autograd import dispatch, register_autograd
 from .law import _entries, _of_history, _of_parameters
 
-MASS, VOLUME, PARAMETERS, GRAVITY = 1, 2, 4, 8
+MASS, VOLUME, PARAMETERS, GRAVITY, OBSTACLES = 1, 2, 4, 8, 16
 """Bits of `needs` in csrc/rollout/substeps_backward.op.cpp."""
 
 _SCHEMA = {a.name: str(a.type) for a in torch.ops.torch_mpm.substeps.default._schema.arguments}
 ARGUMENTS = tuple(_SCHEMA)
 """Names of the arguments of `substeps`."""
 _TENSORS = [name for name, kind in _SCHEMA.items() if kind in ("Tensor", "Optional[Tensor]")]
-_ADJOINTS = ("x", "v", "C", "F", "J", "history", "mass", "volume", "parameters", "gravity")
+_ADJOINTS = ("x", "v", "C", "F", "J", "history", "mass", "volume", "parameters", "gravity", "obstacles")
 
 
 # ---- fake kernels: shapes and strides only
@@ -101,6 +103,7 @@ def _backward_fake(grad_x, grad_v, grad_C, grad_F, grad_J, grad_history, grad_im
         soa_empty(x, (P,)) if needs & VOLUME else None,
         soa_empty(x, (P, len(given["parameters"]))) if needs & PARAMETERS else None,
         x.new_empty(blocks, D) if needs & GRAVITY and given["gravity"] is not None else None,
+        torch.empty_like(given["obstacles"]) if needs & OBSTACLES and given["obstacles"] is not None else None,
     )
 
 
@@ -123,7 +126,7 @@ def _backward(ctx: Any, *grads: Any) -> Any:
     given = ctx.given | tensors | {"history": history, "parameters": parameters}
     wanted = dict(zip(_SCHEMA, ctx.needs_input_grad, strict=True))
     needs = MASS * wanted["mass"] + VOLUME * wanted["volume"] + GRAVITY * wanted["gravity"]
-    needs += PARAMETERS * any(wanted["parameters"])
+    needs += PARAMETERS * any(wanted["parameters"]) + OBSTACLES * wanted["obstacles"]
     by_impulse = None if grads[7] is None else grads[7].contiguous()
     arguments = (given[name] for name in _SCHEMA)
     adjoints = dispatch(torch.ops.torch_mpm.substeps_backward, *grads[:6], by_impulse, needs, record, *arguments)

@@ -1,0 +1,139 @@
+"""Obstacles as the ops take them: tables of their parameters, once or at each of many times."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from .. import shapes
+from ..boundaries.obstacles import Obstacle
+from ..errors import shape_of
+
+
+class KernelShape(NamedTuple):
+    """How the kernel calls a shape, the name of the shape's parameter in the column of directions and sizes, and those
+    of its other parameters."""
+
+    number: int
+    extent: str | None
+    others: tuple[str, ...] = ()
+
+
+KERNEL_SHAPES: dict[type[shapes.Shape], KernelShape] = {
+    shapes.Plane: KernelShape(0, "normal"),
+    shapes.Sphere: KernelShape(1, None, ("radius",)),
+    shapes.Box: KernelShape(2, "size"),
+    shapes.Capsule: KernelShape(3, "half_axis", ("radius",)),
+    shapes.Revolved: KernelShape(4, "axis", ("outline",)),
+    shapes.Cylinder: KernelShape(4, "axis", ("outline",)),
+    shapes.Sampled: KernelShape(5, None, ("values", "lower", "spacing")),
+}
+
+
+def size_of_data(shape: shapes.Shape) -> int:
+    """Numbers of a shape beside its row of the table, without making them at every step."""
+    if isinstance(shape, shapes.Revolved):
+        return 2 * len(shape.outline)
+    return 2 * shape.values.dim() + 1 + shape.values.numel() if isinstance(shape, shapes.Sampled) else 0
+
+
+def _data(shape: shapes.Shape, like: Tensor) -> Tensor:
+    """The numbers of a shape beside its row of the table [n]."""
+    if isinstance(shape, shapes.Revolved):
+        return shape.parameter("outline", like, (len(shape.outline), 2)).reshape(-1)
+    return shape.data(like) if isinstance(shape, shapes.Sampled) else like.new_zeros(0)
+
+
+def tables(obstacles: Sequence[Obstacle], like: Tensor, scenes: int) -> tuple[Tensor, Tensor]:
+    """Parameters [1 or B, K, width] and data [n] of the shapes; kept while nothing has changed."""
+    if torch.compiler.is_compiling() or type(like) not in (Tensor, torch.nn.Parameter):
+        return _build(obstacles, like, scenes)
+    key: list[Any] = [like.dtype, like.device, scenes]
+    for value in (v for o in obstacles for v in (o, o.shape, *_values(o))):
+        if isinstance(value, Tensor) and value.requires_grad and torch.is_grad_enabled():
+            return _build(obstacles, like, scenes)
+        key += [value, value._version if isinstance(value, Tensor) else None]
+    kept: tuple[Tensor, Tensor] = obstacles[0].kept_table.get(tuple(key), lambda: _build(obstacles, like, scenes), like)
+    return kept
+
+
+def tables_over(obstacles: Sequence[Obstacle], like: Tensor, scenes: int, times: Tensor) -> tuple[Tensor, Tensor]:
+    """Parameters at times [n] or [n, B] [s], with the positions then, [n, 1 or B, K, width]; and data as `tables`."""
+    rows = [_row_over(o, like, times) for o in obstacles]
+    count = _count([row.shape[1] for row in rows], scenes)
+    table = torch.stack([row.expand(-1, count, -1) for row in rows], 2).contiguous()
+    return table, torch.cat([_data(o.shape, like) for o in obstacles])
+
+
+def _values(obstacle: Obstacle) -> tuple[Any, ...]:
+    """The numbers and tensors of an obstacle that go into the tables."""
+    motion = (obstacle.friction, obstacle.position, obstacle.velocity, obstacle.rotation, obstacle.angular_velocity)
+    shape = obstacle.shape
+    kind = KERNEL_SHAPES[type(shape)]
+    extent = None if kind.extent is None else getattr(shape, kind.extent, None)
+    return (*motion, extent, *(getattr(shape, name) for name in kind.others))
+
+
+def _build(obstacles: Sequence[Obstacle], like: Tensor, scenes: int) -> tuple[Tensor, Tensor]:
+    rows = [_joined(_parts(o, like)) for o in obstacles]
+    count = _count([row.shape[0] for row in rows], scenes)
+    table = torch.stack([row.expand(count, -1) for row in rows], 1).contiguous()
+    return table, torch.cat([_data(o.shape, like) for o in obstacles])
+
+
+def _count(counts: Sequence[int], scenes: int) -> int:
+    """Rows of a table whose obstacles have so many each."""
+    count = max(counts)
+    if count not in (1, scenes) or any(own not in (1, count) for own in counts):
+        raise ValueError(f"parameters of obstacles must be given once or per scene, B = {scenes}, got {count} of them")
+    return count
+
+
+def _parts(obstacle: Obstacle, like: Tensor) -> dict[str, Tensor]:
+    """The columns of its row by name, [1 or B, n] each; zero where it has none, or where a path has its position."""
+    vector, shape = (like.shape[1],), obstacle.shape
+    turn = () if like.shape[1] == 2 else (3,)
+    motion: dict[str, tuple[int, ...]] = {
+        "friction": (), "position": vector, "velocity": vector, "rotation": turn, "angular_velocity": turn,
+    }  # fmt: skip
+    absent = "position" if obstacle.follows_path else None
+    parts = {name: _part(obstacle, None if name == absent else name, like, size) for name, size in motion.items()}
+    extent = KERNEL_SHAPES[type(shape)].extent
+    if extent == "axis" and getattr(shape, "axis", None) is None:
+        parts["extent"] = torch.eye(like.shape[1], dtype=like.dtype, device=like.device)[1:2]
+    else:
+        parts["extent"] = _part(shape, extent, like, vector)
+    return parts | {"radius": _part(shape, "radius", like, ())}
+
+
+def _part(owner: Obstacle | shapes.Shape, name: str | None, like: Tensor, shape: tuple[int, ...]) -> Tensor:
+    """A parameter [1 or B, n]."""
+    if name is None or getattr(owner, name, None) is None:
+        return like.new_zeros(1, math.prod(shape))
+    value = owner.parameter(name, like, shape)
+    return value.reshape(1 if value.dim() == len(shape) else value.shape[0], -1)
+
+
+def _joined(parts: dict[str, Tensor]) -> Tensor:
+    """Columns [..., 1 or B, n] as one row [..., 1 or B, width]."""
+    shape = torch.broadcast_shapes(*(part.shape[:-1] for part in parts.values()))
+    return torch.cat([part.expand(*shape, -1) for part in parts.values()], -1)
+
+
+def _row_over(obstacle: Obstacle, like: Tensor, times: Tensor) -> Tensor:
+    """[n, 1 or B, width] at times [n] or [n, B]."""
+    parts = {name: part[None] for name, part in _parts(obstacle, like).items()}
+    if obstacle.follows_path:
+        centre, velocity = obstacle.path_over(times.to(like.dtype), like)
+        if centre.dim() not in (2, 3) or centre.shape[-1] != like.shape[1]:
+            expected = f"must return [{like.shape[1]}] or [B, {like.shape[1]}]"
+            raise ValueError(f"position {expected} at a time, got {shape_of(centre[0])}")
+        parts["position"], parts["velocity"] = (t if t.dim() == 3 else t[:, None] for t in (centre, velocity))
+    else:
+        elapsed = (times - obstacle.start).to(like.dtype)
+        parts["position"] = parts["position"] + parts["velocity"] * elapsed.reshape(len(times), -1, 1)
+    return _joined(parts)
