@@ -18,7 +18,6 @@ from test_rollouts import (
     box,
     each_scene,
     flying,
-    in_one_op,
     mixture,
     one_by_one,
     tensors,
@@ -165,9 +164,9 @@ def test_mixtures(deterministic, transfer, dim, device):
     material = torch.randint(0, 7, (400,), dtype=torch.int32, device=device)
     state = moving(step, blob(device, dim, 400)).replace(material=material, ids=torch.randperm(400).to(device))
     for start in (state, state.sorted(step.grid)):
-        expected = gradients(single(), step, start)
-        assert_same(gradients(in_op(2), step, start), expected, "rollout")
-        assert_same(gradients(in_op(ALL), step, start), expected, "rollout")
+        expected, tolerance = gradients(single(), step, start), "rollout with FLIP" if "flip" in transfer else "rollout"
+        assert_same(gradients(in_op(2), step, start), expected, tolerance)
+        assert_same(gradients(in_op(ALL), step, start), expected, tolerance)
 
 
 def batch(dim: int, device: str, transfer: str = "apic") -> tuple[mpm.Step, mpm.State]:
@@ -416,22 +415,6 @@ def test_a_second_derivative_is_refused(device):
     assert bool(second(one_by_one).isfinite().all())
     by_function = second(lambda step, *rest: mpm.rollout(lambda state, dt: step(state, dt), *rest))
     torch.testing.assert_close(by_function, second(one_by_one))
-
-
-def test_gradients_of_obstacles_come_from_single_steps(device):
-    position = torch.tensor((0.5, 0.3), dtype=F64, device=device, requires_grad=True)
-    ball = mpm.Sphere(position, 0.2, kind="slip")
-    step, state = mpm.Step(box(2), mpm.NeoHookean(E=1e4, nu=0.3), boundaries=[ball]), blob(device, 2)
-    assert "an obstacle requires a gradient" in step.explain(state, DT)
-    found = [
-        torch.autograd.grad(loss(end), position)[0]
-        for end in (mpm.rollout(step, state, 4, DT), mpm.rollout(step, state, 4, DT, 2), one_by_one(step, state, 4, DT))
-    ]
-    assert float(found[0].norm()) > 0
-    torch.testing.assert_close(found[0], found[2])
-    torch.testing.assert_close(found[1], found[2])
-    with torch.no_grad():
-        assert in_one_op(step, state)
 
 
 @pytest.mark.parametrize("transfer", SOME_TRANSFERS)

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 from . import _library as _library
 from . import containers, laws, ops, particle_operations, seed
 from .adaptive import Arrival, rollout_to
-from .boundaries import SDF, Box, Capsule, Plane, Revolved, Sphere, Walls
+from .boundaries import SDF, Box, Capsule, Plane, Revolved, Sphere, Walls, Waypoints
 from .captured_steps import captured
 from .cfl import stable_dt
 from .checkpoints import Checkpoints
@@ -70,6 +70,7 @@ __all__ = [
     "Table",
     "Trajectory",
     "Walls",
+    "Waypoints",
     "advance",
     "captured",
     "estimate_rollout",

@@ -166,7 +166,8 @@ def operated(operation: ParticleOperation, state: State, dt: float | Tensor) -> 
 
 
 def of_particles(name: str, value: Any, state: State, shape: tuple[int, ...]) -> Any:
-    """A number as it is, or a tensor [], `shape[1:]`, or `shape` = [P, ...], the last in the order of the state.
+    """A number as it is, or a tensor [], `shape[1:]`, or `shape` = [P, ...], the last in the order of the state; of a
+    part of a state as the whole has it.
 
     Raises:
         ValueError: for another shape, or a tensor on another device.
@@ -175,10 +176,11 @@ def of_particles(name: str, value: Any, state: State, shape: tuple[int, ...]) ->
         return value
     if value.device != state.x.device:
         raise ValueError(f"{name} must be on the device of the particles, {state.x.device}, got {value.device}")
-    if tuple(value.shape) == shape:
+    whole = (getattr(state, "particles", shape[0]), *shape[1:])
+    if tuple(value.shape) == whole:
         return value if state.ids is None else value.index_select(0, state.ids)
     if tuple(value.shape) not in ((), shape[1:]):
-        raise ValueError(f"{name} must have shape {list(shape[1:])} or {list(shape)}, got {shape_of(value)}")
+        raise ValueError(f"{name} must have shape {list(shape[1:])} or {list(whole)}, got {shape_of(value)}")
     return value
 
 

@@ -32,14 +32,18 @@ class StepKey:
 
     def look(self) -> None:
         """Again: the first steps make some of what steps keep."""
-        step = self._step
-        named = [*step.named_parameters(), *step.named_buffers()]
-        self.own = {f"step.{name}": t for name, t in named if t.requires_grad}
+        step, modules = self._step, dict(self._step.named_modules())  # once: a device may be waiting
+        named: dict[int, tuple[str, Tensor]] = {}  # each tensor by its first name
+        for place, module in modules.items():
+            for name, t in (*module._parameters.items(), *module._buffers.items()):
+                if t is not None:
+                    named.setdefault(id(t), (f"step.{place}.{name}" if place else f"step.{name}", t))
+        self.own = {name: t for name, t in named.values() if t.requires_grad}
         # Not by the step, which keeps its recordings: it could only go with them where somebody looks for cycles.
-        self.key = tuple((None if m is step else Same(m), *content_of(m)) for m in step.modules())
-        self.steps = [module for module in step.modules() if isinstance(module, Step)]
-        self.mixes = any(isinstance(module, Mixture) for module in step.modules())
-        self._sizes = {t.numel() for _, t in named if not t.requires_grad}
+        self.key = tuple((None if m is step else Same(m), *content_of(m)) for m in modules.values())
+        self.steps = [module for module in modules.values() if isinstance(module, Step)]
+        self.mixes = any(isinstance(module, Mixture) for module in modules.values())
+        self._sizes = {t.numel() for _, t in named.values() if not t.requires_grad}
 
     def by_content(self, state: State) -> list[str]:
         """Fields of which steps keep what follows from them, as indices, while they are the same."""
@@ -60,6 +64,10 @@ class StepKey:
                 grid.pool(state.x, state.scene)
 
 
+_EVERY = frozenset(vars(nn.Module()))
+"""Attributes of every module."""
+
+
 def content_of(module: nn.Module) -> tuple[Hashable, ...]:
     """A module by its content as a part of a key. Of those of the library, and of classes made of them, all that may be
     assigned; of the user's own modules the tensors, but not the numbers, which may change in each call as a counter
@@ -78,7 +86,7 @@ def content_of(module: nn.Module) -> tuple[Hashable, ...]:
             return None if plain else Same(value)  # the library keeps what follows from others
         return _value(value) if of_library else None
 
-    values = [(name, attribute(value)) for name, value in vars(module).items()]
+    values = [(name, attribute(value)) for name, value in vars(module).items() if name not in _EVERY]
     told = tuple((name, value) for name, value in values if value is not None)
     return module.training, has_hooks(module), tuple(read), told
 

@@ -22,18 +22,20 @@ from .gradient_norms import GradientNorms
 from .graphs import CHUNK, LEAST_STEPS, obstacle_to_replays, replayed, time_after
 from .laws import CompiledLaw
 from .laws.calls import law_calls, laws_of, passive
-from .ops.arguments import split_dt
 from .ops.autograd import dispatch
 from .ops.contact import MAX_OBSTACLES, fusible, obstacle_arguments
 from .ops.grid_update import per_scene, wall_arguments
+from .ops.obstacle_tables import path_requires_grad, row_width
 from .ops.substeps import ARGUMENTS
 from .ops.transfer import STRESS_FORMS
+from .orders import in_no_order, put_back
 from .parameters import Overlay, has_hooks
 from .pause import paused
 from .rollout_parts import Hook, Parts
 from .state import State, check_state
 from .step import Step
 from .step_cost import state_bytes, step_bytes
+from .step_times import StepTimes, clocks
 
 
 def rollout(
@@ -74,9 +76,10 @@ def rollout(
             rollout. It must be a `Step` or another module. On the CPU, and where `Step.explain` tells of an obstacle,
             steps are taken as without.
 
-    A `Step` of compiled laws without heat and functions of the user's takes all steps in one op, or some, with
-    the results of single steps; `Step.explain` tells. On CUDA they are the same to the last bit, but for float32
-    without gradients, which like all of a CPU rounds differently; the status does not count blocks that are there only
+    A `Step` of compiled laws without heat and functions of the user's takes all steps in one op, or some, with the
+    results of single steps; `Step.explain` tells. On CUDA they are the same to the last bit, but for float32 without
+    gradients, which like all of a CPU rounds differently, and for many particles that nobody has sorted (`state.ids` is
+    None), which are sorted for 64 steps and more, and put back; the status does not count blocks that are there only
     between two activations. Its gradients take the steps again from kept states, those of every `checkpoint` steps,
     sqrt(n) of them by default and more where states are small. A kept state of a solid has 2 D + 2 D² numbers per
     particle (24 in 3-D, 96 bytes in float32) and its history; while the backward pass goes through `checkpoint` steps,
@@ -239,9 +242,13 @@ def in_chunks(
 ) -> State:
     """The state n steps later, by calls of one op; `obstacle_to_substeps` must be None. The op takes steps again where
     it may not keep all that their gradient needs."""
+    if in_no_order(state, n) and not sorts_itself(step, state, n, dt):
+        given = step.prepare(state)
+        start = step.sorted(given)
+        return put_back(in_chunks(step, start, n, dt, kept, keeps_all), start, given)
     chunk = CHUNK if step.grid.grows and state.x.is_cuda else MOST_STEPS
-    most_of_paths = _most_steps_of_paths(step, state)
-    with_gradient = wants_gradient(step, state)
+    most_of_paths = _most_steps_of_paths(step, state, dt)
+    with_gradient = wants_gradient(step, state, n, dt)
 
     def advance(state: State, count: int, first: int = 0) -> State:
         while count > 0:
@@ -259,11 +266,26 @@ def in_chunks(
         return advance(state, n)
 
 
-def _most_steps_of_paths(step: Step, state: State) -> int:
+def sorts_itself(step: Step, state: State, n: int, dt: float | Tensor) -> bool:
+    """Whether the op puts particles into an order of its own on CUDA (`Substeps::merges`)."""
+    one = isinstance(step.law, CompiledLaw) and state.scene is None and len(state) >= MANY_PARTICLES
+    return one and _is_usual(step, state) and not wants_gradient(step, state, n, dt)
+
+
+def _is_usual(step: Step, state: State) -> bool:
+    """Whether steps are of the form that kernels of many phases are for."""
+    form = (step.transfer, step._flip_share, step.stress_form, step.grid.kernel, has_mirrors(step))
+    return form == ("apic", 0, "mls", "quadratic", False) and state.impulse is None and state.x.dtype == torch.float32
+
+
+def _most_steps_of_paths(step: Step, state: State, dt: float | Tensor) -> int:
     """Steps of a call whose obstacles have a table of at most `TABLE_BYTES` for each."""
     if not follows_paths(step):
         return MOST_STEPS
-    numbers = 24 * len(step.boundaries.entries) * step.grid.scenes  # of a step, at most
+    obstacles, scenes = _obstacles(step), step.grid.scenes
+    tensors = (dt, state.time, *(t for b in obstacles for t in motion_tensors(b)))
+    rows = scenes if any(isinstance(t, Tensor) and t.dim() > 0 and len(t) == scenes for t in tensors) else 1
+    numbers = row_width(state.x.shape[1]) * len(obstacles) * rows
     return max(TABLE_BYTES // (numbers * state.x.element_size()), 1)
 
 
@@ -296,10 +318,9 @@ def takes_few_blocks(step: Step, state: State, n: int) -> bool:
     grid = step.grid
     if grid.block_count > FEW_BLOCKS:
         return False
-    form = (step.transfer, step._flip_share, step.stress_form, grid.kernel, has_mirrors(step))
-    if form != ("apic", 0, "mls", "quadratic", False) or state.impulse is not None or n < LEAST_PERSISTENT:
+    if not _is_usual(step, state) or n < LEAST_PERSISTENT:
         return False
-    if state.x.dtype != torch.float32 or not isinstance(step.law, CompiledLaw) or len(state) > MOST_PERSISTENT:
+    if not isinstance(step.law, CompiledLaw) or len(state) > MOST_PERSISTENT:
         return False
     if grid.deterministic or grid.max_blocks is None:
         return grid.deterministic and len(state) <= MOST_PERSISTENT // 2
@@ -315,12 +336,16 @@ def items_of_step(dim: int, blocks: int, particles: int) -> float:
     return 0.5 * active + particles / (1.25 * most)
 
 
-def wants_gradient(step: Step, state: State) -> bool:
-    """Whether `substeps` is differentiated."""
+def wants_gradient(step: Step, state: State, n: int = 1, dt: float | Tensor = 1.0) -> bool:
+    """Whether `substeps` is differentiated. Functions of time are asked at the first and the last of n steps."""
     if not torch.is_grad_enabled():
         return False
-    paths = (b.centre_at(state.time, state.x) for b in _obstacles(step) if b.follows_path)
-    return any(t.requires_grad for t in (*_differentiable(step, state), *paths))
+    if any(t.requires_grad for t in _differentiable(step, state)):
+        return True
+    if not follows_paths(step):
+        return False
+    times = StepTimes.of(state, n, dt, step.grid.scenes)
+    return any(path_requires_grad(b, state.x, times) for b in _obstacles(step) if b.follows_path)
 
 
 def follows_paths(step: Step) -> bool:
@@ -384,27 +409,6 @@ def substeps(
     return paused(advanced, step._activations, step.prepare(state), dt, step.grid.scenes, n)
 
 
-def _clocks(state: State, dt: float | Tensor, scenes: int) -> tuple[float, Tensor | None, Tensor | None]:
-    """The time step [s] as a number, or times that and a time for each scene [B]."""
-    number, scene_dt = split_dt(dt, scenes, state.x)
-    if scene_dt is None and not isinstance(state.time, Tensor):
-        return number, None, None
-
-    def each(value: float | Tensor) -> Tensor:
-        given = value.reshape(-1) if isinstance(value, Tensor) else state.x.new_full((1,), value)
-        return given.expand(scenes).contiguous()
-
-    return 1.0, each(dt), each(state.time)
-
-
-def _times(state: State, n: int, number: float, scene_dt: Tensor | None, scene_time: Tensor | None) -> Tensor:
-    """When the steps of a call begin, float64 [n] or [n, B] [s]; of what `_clocks` gives."""
-    count = torch.arange(n, dtype=torch.float64, device=state.x.device)
-    if scene_dt is None or scene_time is None:
-        return float(state.time) + count * number
-    return (scene_time.double() + count[:, None] * scene_dt.double()).detach()
-
-
 def substeps_arguments(
     step: Step, state: State, n: int, dt: float | Tensor, records: bool = False, blocks: int | None = None
 ) -> dict[str, Any]:
@@ -433,13 +437,13 @@ def _arguments(
 ) -> tuple[dict[str, Any], list[list[str]]]:
     """Those of the op, in its order, and the names of the history of each law; of a prepared state."""
     grid = step.grid
-    number, scene_dt, scene_time = _clocks(state, dt, grid.scenes)
-    times = _times(state, n, number, scene_dt, scene_time) if follows_paths(step) else None
+    number, scene_dt, scene_time = clocks(state, dt, grid.scenes)
+    times = StepTimes.of(state, n, dt, grid.scenes) if follows_paths(step) else None
     pool = grid.pool(state.x, state.scene)
     given: Any = Overlay(state, dt=dt)
     calls = law_calls(step.law, given)
     apic = step.transfer == "apic"
-    with_gradient = wants_gradient(step, state)
+    with_gradient = wants_gradient(step, state, n, dt)
     arguments = (
         *(state.x, state.v, state.mass, state.volume, state.C, state.F, state.J),
         *(calls.history, state.scene, state.ids, calls.material, step._activations.status_for(state.x)),

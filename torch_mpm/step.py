@@ -458,7 +458,7 @@ class Step(TensorModule):
             also = f"; not from a CUDA graph, because {no_replays}" if no_replays != reason else ""
             asked = "rollout(graph=...) replays some" if no_graph is None else f"nor with graph=..., because {no_graph}"
             return f"step by step, because {reason}{also}; {asked}"
-        return f"all steps {'between two kept states ' if wants_gradient(self, state) else ''}in one op"
+        return f"all steps {'between two kept states ' if wants_gradient(self, state, dt=dt) else ''}in one op"
 
     def reset(self) -> None:
         """Forget the status of the steps so far."""

@@ -1,27 +1,30 @@
 #pragma once
 
-#include "cpu/parallel.h"
+#include "common/host_device.h"
 #include "grid/slot_sums.h"
 
 namespace mpm::cpu {
 inline namespace TORCH_MPM_ISA {
 
-// In the order of the slots, whatever the number of threads.
+// In the order of the slots, of which any may be unused: those of one row that follow each other in float64.
 template <class Value>
 void add_up(const SlotSums<Value>& a) {
   constexpr int most = 16;  // columns at a time
-  parallel_ranges(a.rows, 1, [&](int64_t begin, int64_t end) {
-    for (int row = int(begin); row < int(end); row++) {
-      const SlotRange slots = slots_of_row(a, row);
-      for (int first = 0; first < a.columns; first += most) {
-        const int columns = a.columns - first < most ? a.columns - first : most;
-        Value sums[most] = {};
-        for (int64_t slot = slots.begin; slot < slots.end; slot++)
-          for (int c = 0; c < columns; c++) sums[c] += a.value[slot * a.columns + first + c];
-        for (int c = 0; c < columns; c++) a.sum[row * a.row_stride + first + c] += sums[c];
-      }
+  const auto row_of = [&](int64_t slot) {
+    const int row = a.block[slot] < 0 ? -1 : a.by_scene ? a.block[slot] / a.blocks_per_scene : 0;
+    return row < a.rows ? row : -1;
+  };
+  for (int64_t begin = 0, end; begin < a.max_blocks; begin = end) {
+    const int row = row_of(begin);
+    for (end = begin + 1; end < a.max_blocks && row_of(end) == row;) end++;
+    for (int first = 0; row >= 0 && first < a.columns; first += most) {
+      const int columns = a.columns - first < most ? a.columns - first : most;
+      double sums[most] = {};
+      for (int64_t slot = begin; slot < end; slot++)
+        for (int c = 0; c < columns; c++) sums[c] += double(a.value[slot * a.columns + first + c]);
+      for (int c = 0; c < columns; c++) a.sum[row * a.row_stride + first + c] += Value(sums[c]);
     }
-  });
+  }
 }
 
 }  // namespace TORCH_MPM_ISA

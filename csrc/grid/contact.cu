@@ -8,7 +8,7 @@ namespace {
 constexpr int kThreads = 128;
 
 template <bool Backward, class T, int D>
-__global__ void __launch_bounds__(kThreads) contact_kernel(const ContactArguments<T, D> a) {
+__global__ void __launch_bounds__(kThreads) contact_kernel(const __grid_constant__ ContactArguments<T, D> a) {
   const int64_t thread = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   const int64_t slot = thread / kSlotLanes;
   if (slot >= a.max_blocks) return;

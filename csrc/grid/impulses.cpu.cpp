@@ -2,6 +2,7 @@
 
 #include <algorithm>
 
+#include "cpu/parallel.h"
 #include "cpu/slot_sums.h"
 
 namespace mpm::cpu {
@@ -12,8 +13,8 @@ constexpr int64_t kGrain = 64;  // slots below which a range is not split
 
 // Each slot has numbers of its own; they are added up in the order of the slots, whatever the number of threads.
 template <class T, int D, class SlotImpulses>
-void add_up(const Geometry<T, D>& geometry, int max_blocks, const int* block, const ImpulseArguments<D>& a,
-            const SlotImpulses& slot_impulses) {
+void add_up_impulses(const Geometry<T, D>& geometry, int max_blocks, const int* block, const ImpulseArguments<D>& a,
+                     const SlotImpulses& slot_impulses) {
   const int numbers = a.numbers();
   parallel_ranges(max_blocks, kGrain, [&](int64_t begin, int64_t end) {
     std::fill(a.slots + begin * numbers, a.slots + end * numbers, 0.0);
@@ -22,21 +23,21 @@ void add_up(const Geometry<T, D>& geometry, int max_blocks, const int* block, co
         std::copy_n(sum.e, kImpulse<D>, a.slots + slot * numbers + boundary * kImpulse<D>);
       });
   });
-  mpm::cpu::add_up(a.slot_sums(max_blocks, geometry.blocks_per_scene, block));
+  add_up(a.slot_sums(max_blocks, geometry.blocks_per_scene, block));
 }
 
 }  // namespace
 
 template <class T, int D>
 void wall_impulses(const WallImpulsesArguments<T, D>& a) {
-  add_up(a.update.geometry, a.update.max_blocks, a.update.block, a.impulse,
-         [&](int slot, auto&& put) { slot_wall_impulses<1>(a, slot, 0, put); });
+  add_up_impulses(a.update.geometry, a.update.max_blocks, a.update.block, a.impulse,
+                  [&](int slot, auto&& put) { slot_wall_impulses<1>(a, slot, 0, put); });
 }
 
 template <class T, int D>
 void contact_impulses(const ContactImpulsesArguments<T, D>& a) {
-  add_up(a.contact.geometry, a.contact.max_blocks, a.contact.block, a.impulse,
-         [&](int slot, auto&& put) { slot_contact_impulses<1>(a, slot, 0, put); });
+  add_up_impulses(a.contact.geometry, a.contact.max_blocks, a.contact.block, a.impulse,
+                  [&](int slot, auto&& put) { slot_contact_impulses<1>(a, slot, 0, put); });
 }
 
 template <class T, int D>

@@ -45,7 +45,8 @@ __global__ void __launch_bounds__(kThreads) wall_impulses_kernel(const WallImpul
 }
 
 template <class T, int D>
-__global__ void __launch_bounds__(kThreads) contact_impulses_kernel(const ContactImpulsesArguments<T, D> a) {
+__global__ void __launch_bounds__(kThreads)
+    contact_impulses_kernel(const __grid_constant__ ContactImpulsesArguments<T, D> a) {
   const auto [slot, lane] = place();
   if (slot >= a.contact.max_blocks) return;
   slot_contact_impulses<kSlotLanes>(
@@ -71,7 +72,8 @@ __global__ void __launch_bounds__(kThreads) wall_impulses_backward_kernel(const 
 }
 
 template <class T, int D>
-__global__ void __launch_bounds__(kThreads) contact_impulses_backward_kernel(const ContactImpulsesArguments<T, D> a) {
+__global__ void __launch_bounds__(kThreads)
+    contact_impulses_backward_kernel(const __grid_constant__ ContactImpulsesArguments<T, D> a) {
   const auto [slot, lane] = place();
   if (slot >= a.contact.max_blocks) return;
   slot_contact_backward<kSlotLanes>(a.contact, int(slot), lane, SumLanes(), ImpulsesOfNodes<T, D>{a});

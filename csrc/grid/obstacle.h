@@ -13,7 +13,7 @@ namespace mpm {
 
 enum class ObstacleShape : int { plane = 0, sphere = 1, box = 2, capsule = 3, revolved = 4, sampled = 5 };
 
-constexpr int kMaxObstacles = 16;  // of one call
+constexpr int kMaxObstacles = 64;  // of one call
 
 // What differs between the obstacles of a call, but not between scenes.
 struct ObstacleKind {
@@ -47,9 +47,9 @@ struct ContactArguments {
   ObstacleKind kind[kMaxObstacles];
   const ObstacleRow<T, D>* row = nullptr;  // [rows, obstacles]; one row for all scenes, or one per scene
   int rows = 0;
-  // From there to the rows of the next substep of a call, where each has its own, with the obstacles as they are then;
-  // else zero.
-  int64_t rows_of_step = 0;
+  // From there to the rows of the next substep of a call, where each has its own, with the positions of then; else
+  // zero.
+  int64_t step_stride = 0;
   // Of a revolved shape, corners (distance from the axis, position along it), anticlockwise; of a sampled one, the
   // first node of the samples [D], their distance, numbers of them along each axis [D], and the samples, the last axis
   // fastest.
@@ -139,9 +139,9 @@ MPM_HD ObstaclePose<S, D> obstacle_pose(const ContactArguments<T, D>& a, const O
   p.row = &row;
   p.data = a.data + kind.first_number;
   p.numbers = kind.numbers;
-  const S elapsed = lift<S>(a.rows_of_step ? T(0) : T(time - kind.start));
+  const S elapsed = lift<S>(T(time - kind.start)), moved = a.step_stride ? S(T(0)) : elapsed;
   MPM_UNROLL for (int i = 0; i < D; i++)
-    p.centre[i] = row.position[i] + row.velocity[i] * elapsed;
+    p.centre[i] = row.position[i] + row.velocity[i] * moved;
   p.rotation = rotation_matrix(row.angular_velocity, elapsed) * rotation_matrix(row.rotation, S(1));
   return p;
 }
@@ -357,7 +357,7 @@ MPM_HD ContactSlot<T, D> contact_slot(const ContactArguments<T, D>& a, int scene
   s.scene = scene;
   s.active = (a.rows == 1 || scene < a.rows) && (!a.scene_time || a.times == 1 || scene < a.times);
   s.row = a.row + (a.rows == 1 ? 0 : int64_t(scene) * a.obstacles);
-  if (a.rows_of_step && a.activations) s.row += step_of_call(a) * a.rows_of_step;
+  if (a.step_stride && a.activations) s.row += step_of_call(a) * a.step_stride;
   MPM_UNROLL for (int i = 0; i < D; i++)
     s.corner[i] = corner[i];
   return s;

@@ -44,12 +44,12 @@ ContactArguments<T, D> obstacle_arguments(const Tensor& like, const PackedLattic
   const int64_t first = of_steps ? 1 : 0, rows = obstacles.size(first), obstacles_of_row = obstacles.size(first + 1);
   STD_TORCH_CHECK(obstacles.is_contiguous() && rows > 0 && rows <= INT32_MAX && obstacles_of_row <= kMaxObstacles &&
                       obstacles.size(first + 2) == width,
-                  "obstacles must be contiguous with shape [1 or B, at most ", kMaxObstacles, ", ", width, "], got ",
-                  shape_of(obstacles));
+                  "obstacles must be contiguous with shape ", of_steps ? "[n, 1 or B" : "[1 or B", ", at most ",
+                  kMaxObstacles, ", ", width, "], got ", shape_of(obstacles));
   a.row = static_cast<const ObstacleRow<T, D>*>(obstacles.data_ptr());
   a.rows = int(rows);
   a.obstacles = int(obstacles_of_row);
-  if (of_steps) a.rows_of_step = rows * obstacles_of_row;
+  if (of_steps) a.step_stride = rows * obstacles_of_row;
   const size_t count = size_t(a.obstacles);
   const auto check_entries = [&](const auto& list, const char* name) {
     STD_TORCH_CHECK(list.size() == count, name, " must have an entry per obstacle, ", count, ", got ", list.size());

@@ -74,10 +74,11 @@ struct FibreKernels {
     return s;
   }
 
-  // Whether the solid has a stress.
+  // Whether the solid may have a stress. An activation that is not finite is not hidden.
   template <class V, int D>
   MPM_HD static MaskOf<V> is_valid_at(const FibreState<V, D>& s) {
-    return is_valid(determinant(s.F), sum_of_entries(s.stress()));
+    const V J = determinant(s.F);
+    return is_valid(J, J);
   }
 
   // A state with derivatives along a direction; an absent part of it is zero.

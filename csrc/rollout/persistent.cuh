@@ -400,7 +400,7 @@ __global__ void __launch_bounds__(ItemStep<Source, Task>::threads, kItemsOfProce
       item.scatter(a.nodes[step % 3]);
     });
     if (threadIdx.x == 0 && a.step_time) contact.time = a.step_time[step];
-    if (threadIdx.x == 0 && a.obstacles) contact.row = a.contact.row + step * a.contact.rows_of_step;
+    if (threadIdx.x == 0 && a.obstacles) contact.row = a.contact.row + step * a.contact.step_stride;
     if (!lasts(barrier.wait())) break;
 
     if (keeps) item.keep();

@@ -152,7 +152,7 @@ class Recorded {
   void set_time(int64_t i) {
     if (MPM_BACKEND == MPM_BACKEND_IS_cpu) {
       steps.contact.time = time_[i];
-      steps.contact.row = first_row_ + i * steps.contact.rows_of_step;
+      steps.contact.row = first_row_ + i * steps.contact.step_stride;
     }
     if (scene_times_.defined()) steps.contact.scene_time = scene_time(i);
   }

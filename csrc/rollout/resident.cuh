@@ -558,7 +558,7 @@ __device__ __forceinline__ int64_t run_scene(Step& s, int64_t step) {
     const auto loaded = s.load_first();
     s.update_nodes();
     s.move_particles(loaded);
-    if (threadIdx.x == 0) s.contact.time += s.a.dt, s.contact.row += s.contact.rows_of_step;
+    if (threadIdx.x == 0) s.contact.time += s.a.dt, s.contact.row += s.contact.step_stride;
     move_clock(s.a, s.scene, 1);
     __syncthreads();
   }

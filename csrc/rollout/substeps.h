@@ -527,7 +527,7 @@ struct Substeps {
 
   // The time after a step, on the CPU and of scenes with clocks of their own.
   void end_time(backend::Stream stream) {
-    if (MPM_BACKEND == MPM_BACKEND_IS_cpu) contact.time += in.dt, contact.row += contact.rows_of_step;
+    if (MPM_BACKEND == MPM_BACKEND_IS_cpu) contact.time += in.dt, contact.row += contact.step_stride;
     if (scene_time.defined()) add_dt(static_cast<T*>(scene_time.data_ptr()), stream);
   }
 

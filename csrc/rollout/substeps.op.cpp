@@ -43,7 +43,7 @@ void take_resident(Substeps<T, D>& s, int64_t n, int64_t after, double time, con
   int* const first = static_cast<int*>(trouble.data_ptr());
   ResidentArguments<T, D> a{s.p2g, s.advance, s.update, s.contact, s.obstacles, int(in.scenes), n, time, in.dt};
   a.contact.activations = nullptr;
-  a.contact.row += after * a.contact.rows_of_step;
+  a.contact.row += after * a.contact.step_stride;
   give_clocks(s, a);
   a.rows = static_cast<char*>(row_memory.data_ptr());
   a.blocks = static_cast<char*>(block_memory.data_ptr());
@@ -77,7 +77,7 @@ bool take_persistent(Substeps<T, D>& s, int* activated, int* status, backend::St
   if (s.contact.step_time) a.step_time = s.contact.step_time + 1;
   a.contact.step_time = nullptr;
   a.contact.activations = nullptr;
-  a.contact.row += a.contact.rows_of_step;
+  a.contact.row += a.contact.step_stride;
   give_clocks(s, a);
   Tensor steps_so_far = empty_int(in.x, {1}), arrived = empty(in.x, {2}, ScalarType::Long);
   backend::clear(steps_so_far, stream);

@@ -229,7 +229,7 @@ void SubstepsBackward<T, D>::leave_obstacles(int64_t i, const T* nodes, const Gr
   }
   if (!row_grad_.defined()) return;
   const int columns = contact.obstacles * ObstacleRow<T, D>::width;
-  T* const sum = static_cast<T*>(sums.obstacles.data_ptr()) + i * contact.rows_of_step * ObstacleRow<T, D>::width;
+  T* const sum = static_cast<T*>(sums.obstacles.data_ptr()) + i * contact.step_stride * ObstacleRow<T, D>::width;
   backend::sum_slots(SumSlotsArguments<T, D>{{contact.max_blocks, s_.update.geometry.blocks_per_scene, contact.block,
                                               contact.rows, columns, contact.rows > 1, contact.row_grad, sum, columns}},
                      stream_);

@@ -15,7 +15,7 @@ __device__ void raise(double* place, double value) {
 
 // Neighbours in memory are mostly of one scene: a warp of one writes once.
 template <class T, int D>
-__global__ void __launch_bounds__(kThreads) survey_kernel(const SurveyArguments<T, D> a) {
+__global__ void __launch_bounds__(kThreads) survey_kernel(const __grid_constant__ SurveyArguments<T, D> a) {
   const int64_t p = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   const int scene = scene_of(a, p < a.particles ? p : a.particles - 1);
   double rate = 0, speed = 0;

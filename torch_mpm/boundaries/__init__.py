@@ -19,6 +19,7 @@ from .list import BoundaryList, call_boundary
 from .motion import Pose, rotation_matrix
 from .obstacles import SDF, Box, Capsule, Obstacle, Plane, Revolved, Sphere
 from .walls import CONTACTS, LEAST_BETWEEN_MIRRORS, WALL_KINDS, Face, Walls
+from .waypoints import Waypoints
 
 __all__ = [
     "CONTACTS",
@@ -35,6 +36,7 @@ __all__ = [
     "Revolved",
     "Sphere",
     "Walls",
+    "Waypoints",
     "call_boundary",
     "rotation_matrix",
 ]

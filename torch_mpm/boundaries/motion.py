@@ -118,13 +118,15 @@ class RigidMotion(SceneParameters):
     def path_over(self, times: Tensor, like: Tensor) -> tuple[Tensor, Tensor]:
         """Centre and its velocity at many times [n] or [n, B]: [n, D] or [n, B, D], with the dtype of `like`.
 
-        A function of time is called once for all of them if it can be mapped over them, else for one after another.
+        A function of time is called once for all of them if it can be mapped over them (torch.vmap), else for one after
+        another.
         """
         try:
             centre, velocity = torch.vmap(self._moved)(times)
-        except (
-            Exception
-        ):  # what a function may raise that looks at the value of a time; if it is wrong, it raises again
+        except torch.OutOfMemoryError:
+            raise
+        except (RuntimeError, TypeError, ValueError, NotImplementedError):
+            # As of functions that look at the value of a time. One that is wrong raises again.
             both = [self._moved(time) for time in times.unbind()]
             centre, velocity = (torch.stack(list(values)) for values in zip(*both, strict=True))
         return centre.to(like.dtype), velocity.to(like.dtype)

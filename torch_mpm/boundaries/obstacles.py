@@ -84,7 +84,7 @@ class Obstacle(RigidMotion):
         self.shape, self.kind, self.friction = shape, kind, friction
         self.end, self.scene = float(end), scene
         self.kept_table = GraphCache()
-        """Kept by `torch_mpm.ops.contact` for a list of obstacles that begins with this one."""
+        """Kept by `torch_mpm.ops.obstacle_tables` for a list of obstacles that begins with this one."""
 
     def __setattr__(self, name: str, value: Any) -> None:
         if isinstance(getattr(type(self), name, None), property):

@@ -47,21 +47,24 @@ def law_calls(law: Material, state: Any) -> LawCalls:
     """
     laws = laws_of(law)
     material = law.check_material(state) if isinstance(law, Mixture) else None
-    names: list[str] = []
-    calls = LawCalls("", [], [], [], [], [], material if len(laws) > 1 else None)
+    names, history_names = [], []
+    lists = options, variables, parameters, history = [], [], [], []  # type: ignore[var-annotated]
     for part in laws:
         own: CompiledLaw = passive(part)  # type: ignore[assignment]
         names.append(own._name(state))
-        _add(calls, own.option_bits(), own._arguments(state)[1], own._history(state))
-        calls.history_names.append(own.history_names())
+        _add(lists, own.option_bits(), own._arguments(state)[1], own._history(state))
+        history_names.append(own.history_names())
         if isinstance(part, Active):
             names[-1] += f"+{FIBRE}"
-            _add(calls, 0, part.fibre_parameters(state), [])
-    return calls._replace(names=",".join(names))
+            _add(lists, 0, part.fibre_parameters(state), [])
+    return LawCalls(
+        ",".join(names), options, variables, parameters, history, history_names, material if len(laws) > 1 else None
+    )
 
 
-def _add(calls: LawCalls, options: int, parameters: list[Tensor], history: list[Tensor]) -> None:
-    calls.options.append(options)
-    calls.variables.append(len(history))
-    calls.parameters.extend(parameters)
-    calls.history.extend(history)
+def _add(lists: Any, bits: int, own_parameters: list[Tensor], own_history: list[Tensor]) -> None:
+    options, variables, parameters, history = lists
+    options.append(bits)
+    variables.append(len(own_history))
+    parameters.extend(own_parameters)
+    history.extend(own_history)

@@ -23,13 +23,14 @@ from ..boundaries import Obstacle
 from ..errors import NUMBER_OR_TENSOR, check_like, check_real, shape_of
 from ..grid import Blocks, check_blocks
 from ..parameters import has_hooks
+from ..step_times import StepTimes
 from ..topology import Topology
 from .arguments import check_list, differentiate, refuse_vmap, sizes
 from .autograd import dispatch, register_autograd, save_with_topology, saved_with_topology
 from .grid_update import CONTACT_KINDS, CONTACT_NAMES, sum_by_scene_of_blocks
 from .obstacle_tables import KERNEL_SHAPES, size_of_data, tables, tables_over
 
-MAX_OBSTACLES = 16  # of one call, csrc/grid/obstacle.h
+MAX_OBSTACLES = 64  # of one call, csrc/grid/obstacle.h
 
 
 def fusible(obstacle: Any, time: float | Tensor, paths: bool = False) -> bool:
@@ -100,11 +101,11 @@ def present(obstacles: Sequence[Obstacle], scene_time: Tensor | None, number: fl
 
 
 def obstacle_arguments(
-    group: Sequence[Obstacle], like: Tensor, scenes: int, times: Tensor | None = None
+    group: Sequence[Obstacle], like: Tensor, scenes: int, times: StepTimes | None = None
 ) -> tuple[Any, ...]:
     """Up to `MAX_OBSTACLES` obstacles as the ops take them; their tables are None where there are none.
 
-    With times [n] or [n, B] [s] the parameters are those at each of these, and some may follow a path.
+    With times the parameters are those at each of these, and some may follow a path.
     """
     table: tuple[Tensor | None, Tensor | None] = (None, None)
     if group:

@@ -8,10 +8,12 @@ from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn import functional as F
 
 from .. import shapes
 from ..boundaries.obstacles import Obstacle
 from ..errors import shape_of
+from ..step_times import StepTimes
 
 
 class KernelShape(NamedTuple):
@@ -61,8 +63,8 @@ def tables(obstacles: Sequence[Obstacle], like: Tensor, scenes: int) -> tuple[Te
     return kept
 
 
-def tables_over(obstacles: Sequence[Obstacle], like: Tensor, scenes: int, times: Tensor) -> tuple[Tensor, Tensor]:
-    """Parameters at times [n] or [n, B] [s], with the positions then, [n, 1 or B, K, width]; and data as `tables`."""
+def tables_over(obstacles: Sequence[Obstacle], like: Tensor, scenes: int, times: StepTimes) -> tuple[Tensor, Tensor]:
+    """Parameters at many times, with the positions then, [n, 1 or B, K, width]; and data as `tables`."""
     rows = [_row_over(o, like, times) for o in obstacles]
     count = _count([row.shape[1] for row in rows], scenes)
     table = torch.stack([row.expand(-1, count, -1) for row in rows], 2).contiguous()
@@ -124,16 +126,44 @@ def _joined(parts: dict[str, Tensor]) -> Tensor:
     return torch.cat([part.expand(*shape, -1) for part in parts.values()], -1)
 
 
-def _row_over(obstacle: Obstacle, like: Tensor, times: Tensor) -> Tensor:
-    """[n, 1 or B, width] at times [n] or [n, B]."""
+def _row_over(obstacle: Obstacle, like: Tensor, times: StepTimes) -> Tensor:
+    """[n, 1 or B, width]."""
     parts = {name: part[None] for name, part in _parts(obstacle, like).items()}
     if obstacle.follows_path:
-        centre, velocity = obstacle.path_over(times.to(like.dtype), like)
-        if centre.dim() not in (2, 3) or centre.shape[-1] != like.shape[1]:
-            expected = f"must return [{like.shape[1]}] or [B, {like.shape[1]}]"
-            raise ValueError(f"position {expected} at a time, got {shape_of(centre[0])}")
-        parts["position"], parts["velocity"] = (t if t.dim() == 3 else t[:, None] for t in (centre, velocity))
+        parts["position"], parts["velocity"] = _path_over(obstacle, like, times)
     else:
-        elapsed = (times - obstacle.start).to(like.dtype)
-        parts["position"] = parts["position"] + parts["velocity"] * elapsed.reshape(len(times), -1, 1)
+        elapsed = (times.tensor - obstacle.start).to(like.dtype)
+        parts["position"] = parts["position"] + parts["velocity"] * elapsed.reshape(len(elapsed), -1, 1)
     return _joined(parts)
+
+
+def _path_over(obstacle: Obstacle, like: Tensor, times: StepTimes) -> tuple[Tensor, Tensor]:
+    """Positions and velocities [n, 1 or B, D]. Where the host knows the time, a function is asked for times at which
+    the obstacle is there, as in single steps; zero for others."""
+    n, dim, there = len(times.tensor), like.shape[1], times.between(obstacle.start, obstacle.end)
+    if len(there.tensor) == 0:
+        return like.new_zeros(n, 1, dim), like.new_zeros(n, 1, dim)
+    centre, velocity = obstacle.path_over(there.tensor.to(like.dtype), like)
+    if centre.dim() not in (2, 3) or centre.shape[-1] != dim:
+        raise ValueError(f"position must return [{dim}] or [B, {dim}] at a time, got {shape_of(centre[0])}")
+    before = 0
+    if times.numbers is not None and there.numbers is not None:
+        before = times.numbers.index(there.numbers[0])
+    around = (0, 0, 0, 0, before, n - before - len(there.tensor))
+    return F.pad(_rows(centre), around), F.pad(_rows(velocity), around)
+
+
+def _rows(values: Tensor) -> Tensor:
+    """[n, D] or [n, B, D] as [n, 1 or B, D]."""
+    return values if values.dim() == 3 else values[:, None]
+
+
+def path_requires_grad(obstacle: Obstacle, like: Tensor, times: StepTimes) -> bool:
+    """Whether the first or the last of the positions on a path does."""
+    there = times.between(obstacle.start, obstacle.end).tensor.to(like.dtype)
+    return any(obstacle.centre_at(time, like).requires_grad for time in (*there[:1], *there[-1:]))
+
+
+def row_width(dim: int) -> int:
+    """Numbers of a row of the table, csrc/grid/obstacle.h."""
+    return 3 * dim + 2 * (1 if dim == 2 else 3) + 2

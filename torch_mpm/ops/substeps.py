@@ -11,17 +11,16 @@
 Particles and their history are those of `State`, the grid's arguments those of `activate`, `grid_update` and `contact`.
 `laws` are names of `LAWS`, for the particles of each material one, with commas between them, and perhaps more after a
 plus whose stress is added; their options, parameters and history variables follow one another, `variables` of the
-latter for each law. `obstacles` is the table of `contact`, or one for each substep [n, 1 or B, K, width] with positions
-at its time. The time step dt [s] is part of the
-parameters of laws that flow in time. Results that a call does not have are None; `history` has the entries of all laws
-side by side, [P, m]. The impulses on obstacles and walls are added to `impulse`, where it is given. With `flip` that
-share of the velocities of particles, less those of the nodes before the forces, is added to what G2P gives. Scenes with
-clocks of their own have the time steps dt times `scene_dt` and begin at `scene_time`, both [B]. With `grows` the pool
-follows the scene on the CPU; otherwise the op stops there where it is full, and the status tells. On CUDA nothing is
-waited for. With `resident` batches of small scenes may go another way there, each on a multiprocessor of its own;
-gradients take it as any other, whose sums may round differently. With `records` everything that the adjoint reads is
-kept in `record`, bytes of no other use, and no step is taken again; not where impulses are counted, or the pool had to
-grow.
+latter for each law. The time step dt [s] is part of the parameters of laws that flow in time. `obstacles` is the table
+of `contact`, or one for each substep [n, 1 or B, K, width] with the positions then. Results that a call does not have
+are None; `history` has the entries of all laws side by side, [P, m]. The impulses on obstacles and walls are added to
+`impulse`, where it is given. With `flip` that share of the velocities of particles, less those of the nodes before the
+forces, is added to what G2P gives. Scenes with clocks of their own have the time steps dt times `scene_dt` and begin at
+`scene_time`, both [B]. With `grows` the pool follows the scene on the CPU; otherwise the op stops there where it is
+full, and the status tells. On CUDA nothing is waited for. With `resident` batches of small scenes may go another way
+there, each on a multiprocessor of its own; gradients take it as any other, whose sums may round differently. With
+`records` everything that the adjoint reads is kept in `record`, bytes of no other use, and no step is taken again; not
+where impulses are counted, or the pool had to grow.
 
 Differentiable once, with respect to x, v, mass, volume, C, F, J, history, parameters, gravity, obstacles and impulse.
 Autograd keeps the arguments of a call and the record, mostly none: 2 D + 2 D² numbers per particle of a solid (24 in
@@ -33,10 +32,9 @@ Autograd keeps the arguments of a call and the record, mostly none: 2 D + 2 D² 
 takes the steps again, where there is no record, and then goes back through them; a record must be that of `substeps`,
 whose contents are not checked. Meanwhile it holds what each step has read: of a solid 2 D + 3 D² numbers per particle
 and step (33 in 3-D), D² more where a law is plastic, and the history; and the grid of each step where that is at most
-half as much. The adjoints are [P, ...],
-those of the parameters [P, number of parameters] and that of gravity, over the time step, a sum for each block of the
-grids of all scenes [B * blocks, D]. Of the last five the bits of `needs` (`MASS`, `VOLUME`, `PARAMETERS`, `GRAVITY`,
-`OBSTACLES`) tell which are wanted.
+half as much. The adjoints are [P, ...], those of the parameters [P, number of parameters] and that of gravity, over the
+time step, a sum for each block of the grids of all scenes [B * blocks, D]. Of the last five the bits of `needs`
+(`MASS`, `VOLUME`, `PARAMETERS`, `GRAVITY`, `OBSTACLES`) tell which are wanted.
 """
 
 from __future__ import annotations

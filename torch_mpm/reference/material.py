@@ -67,7 +67,20 @@ def _viscous_fluid_energy(J: Tensor, C: Tensor | None, K: Tensor, gamma: Tensor,
     return _fluid_energy(J, C, K, gamma, dim)
 
 
+def _fibre_stress(F: Tensor, C: Tensor | None, a: Tensor, *direction: Tensor, dim: int) -> Tensor:
+    stretched = F @ torch.stack(direction[:dim], 1)[:, :, None]
+    return a[:, None, None] * (stretched @ stretched.mT)
+
+
+def _fibre_energy(F: Tensor, C: Tensor | None, a: Tensor, *direction: Tensor, dim: int) -> Tensor:
+    stretched = F @ torch.stack(direction[:dim], 1)[:, :, None]
+    return a / 2 * (stretched.square().sum((1, 2)) - 1)
+
+
 LAWS = {
+    "fibre": Law(
+        ("activation", "direction_x", "direction_y", "direction_z"), True, False, _fibre_stress, _fibre_energy
+    ),
     "neo_hookean": Law(("mu", "lam"), True, False, _neo_hookean_stress, _neo_hookean_energy),
     "weakly_compressible": Law(("bulk_modulus", "gamma"), False, False, _fluid_stress, _fluid_energy),
     "viscous_fluid": Law(

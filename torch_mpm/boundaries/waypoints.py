@@ -1,0 +1,61 @@
+"""Paths through given points: for an obstacle that a controller or a table moves."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+from ..errors import check_numbers, shape_of
+
+
+class Waypoints(nn.Module):
+    """A path through points at given times, straight in between; it stands still before the first and from the last on.
+
+        path = torch.nn.Parameter(points)  # [K, D]
+        hand = torch_mpm.Sphere(torch_mpm.Waypoints(times, path), radius=0.1)
+
+    Args:
+        time: K increasing numbers [s], two or more; or a tensor [K].
+        position: of each [m], a tensor [K, D] that may require grad, or K lists of D numbers.
+
+    Raises:
+        ValueError: for times that do not increase, numbers that are not finite, or different lengths.
+    """
+
+    time: Tensor
+    position: Tensor
+
+    def __init__(self, time: Sequence[float] | Tensor, position: Sequence[Sequence[float]] | Tensor) -> None:
+        super().__init__()
+        if not isinstance(time, Tensor):
+            time = torch.tensor(check_numbers("time", time), dtype=torch.float64, device="cpu")
+        if not isinstance(position, Tensor):
+            rows = [check_numbers(f"position[{k}]", row) for k, row in enumerate(position)]
+            if len({len(row) for row in rows}) > 1:
+                raise ValueError(f"position must have D numbers for each time, got {[len(row) for row in rows]}")
+            position = torch.tensor(rows, dtype=torch.float64, device="cpu")
+        if time.dim() != 1 or len(time) < 2 or position.dim() != 2 or len(position) != len(time):
+            raise ValueError(
+                "time and position must have shapes [K] and [K, D], K at least 2, "
+                f"got {shape_of(time)} and {shape_of(position)}"
+            )
+        if not bool((time.diff() > 0).all() and time.isfinite().all()):
+            raise ValueError(f"time must increase, got {time.tolist()}")
+        if not bool(position.detach().isfinite().all()):
+            raise ValueError(f"position must be finite, got {position.tolist()}")
+        self.register_buffer("time", time)
+        if isinstance(position, nn.Parameter):
+            self.position = position
+        else:
+            self.register_buffer("position", position)
+
+    def forward(self, time: Tensor) -> Tensor:
+        """The position at times [] or [B], [D] or [B, D]."""
+        knots, points = self.time.to(time), self.position.to(time.device)
+        now = time[..., None]  # an index of one entry, which can be mapped
+        left = ((now.detach()[..., None] >= knots).sum(-1) - 1).clamp(0, len(knots) - 2)
+        begin, end = knots[left], knots[left + 1]
+        share = torch.where((now >= begin) & (now < end), (now - begin) / (end - begin), (now >= end).to(now.dtype))
+        return torch.lerp(points[left], points[left + 1], share[..., None].to(points.dtype)).squeeze(-2)

@@ -1,0 +1,58 @@
+"""When the steps of a call begin."""
+
+from __future__ import annotations
+
+import itertools
+from typing import TYPE_CHECKING, NamedTuple
+
+import torch
+from torch import Tensor
+
+from .ops.arguments import split_dt
+
+if TYPE_CHECKING:
+    from .state import State
+
+
+def clocks(state: State, dt: float | Tensor, scenes: int) -> tuple[float, Tensor | None, Tensor | None]:
+    """The time step [s] as a number, or times that and a time for each scene [B]."""
+    number, scene_dt = split_dt(dt, scenes, state.x)
+    if scene_dt is None and not isinstance(state.time, Tensor):
+        return number, None, None
+
+    def each(value: float | Tensor) -> Tensor:
+        given = value.reshape(-1) if isinstance(value, Tensor) else state.x.new_full((1,), value)
+        return given.expand(scenes).contiguous()
+
+    return 1.0, each(dt), each(state.time)
+
+
+class StepTimes(NamedTuple):
+    """The times [s] at which n steps begin."""
+
+    tensor: Tensor
+    """[n] in float64, or [n, B] in the dtype of the particles where scenes have clocks of their own."""
+    numbers: list[float] | None
+    """The same where all scenes have one time, which the host knows."""
+
+    @classmethod
+    @torch.no_grad()
+    def of(cls, state: State, n: int, dt: float | Tensor, scenes: int) -> StepTimes:
+        """Added up as single steps do."""
+        number, scene_dt, scene_time = clocks(state, dt, scenes)
+        if scene_dt is None or scene_time is None:
+            count = torch.arange(n, dtype=torch.float64, device=state.x.device)
+            numbers = itertools.accumulate(itertools.repeat(number, n - 1), initial=float(state.time))
+            return cls(float(state.time) + count * number, list(numbers))
+        times = [scene_time]
+        for _ in range(n - 1):
+            times.append(times[-1] + scene_dt)
+        return cls(torch.stack(times), None)
+
+    def between(self, start: float, end: float) -> StepTimes:
+        """Those in [start, end), where the host knows; else all."""
+        if self.numbers is None:
+            return self
+        first = next((k for k, time in enumerate(self.numbers) if time >= start), len(self.numbers))
+        last = next((k for k, time in enumerate(self.numbers) if time >= end), len(self.numbers))
+        return StepTimes(self.tensor[first:last], self.numbers[first:last])
