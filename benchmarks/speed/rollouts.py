@@ -76,9 +76,9 @@ def least(device: str, program: Callable[[], object], samples: int) -> float:
     return min(times)
 
 
-def per_step(s: Setup, device: str, samples: int, dt: float = work.DT) -> dict[str, Any]:
-    """Least time of a substep of a rollout."""
-    state = s.state.sorted(s.grid)
+def per_step(s: Setup, device: str, samples: int, dt: float = work.DT, ordered: bool = True) -> dict[str, Any]:
+    """Least time of a substep of a rollout, of particles that were sorted before if they are to be `ordered`."""
+    state = s.state.sorted(s.grid) if ordered else s.state
 
     def rolled(steps: int) -> Callable[[], object]:
         return lambda: mpm.rollout(s.step, state, steps, dt)
@@ -127,6 +127,46 @@ def flipped(side: int, device: str) -> Setup:
     """The cube with FLIP."""
     s = setup(work.make(side), device)
     return Setup(s.state, mpm.Step(s.grid, s.step.law, gravity=s.step.gravity, walls="sticky", flip=0.95))
+
+
+def of_two_materials(side: int, device: str) -> Setup:
+    """The cube, half of it a fluid."""
+    s = setup(work.make(side), device)
+    x = s.state.x[:, 1]
+    law = mpm.Mixture([s.step.law, LAWS["fluid"]()])
+    step = mpm.Step(s.grid, law, gravity=s.step.gravity, walls="sticky")
+    return Setup(step.prepare(s.state.replace(material=(x > x.mean()).int())), step)
+
+
+def in_no_order(side: int, device: str) -> Setup:
+    """The same, whose particles nobody has sorted."""
+    s = of_two_materials(side, device)
+    return Setup(s.state.select(torch.randperm(len(s.state)).to(device)), s.step)
+
+
+def with_muscles(side: int, device: str) -> Setup:
+    """The cube with an activation of each particle."""
+    s = setup(work.make(side), device)
+    step = mpm.Step(s.grid, mpm.Active(s.step.law, (0.0, 1.0, 0.0)), gravity=s.step.gravity, walls="sticky")
+    state = step.prepare(s.state)
+    return Setup(state.replace(extra={"activation": 1e-3 * work.MU * torch.rand_like(state.mass)}), step)
+
+
+def beside_a_path(side: int, device: str) -> Setup:
+    """The cube and a ball that swings in it."""
+    s = setup(work.make(side), device)
+    middle, width = s.state.x.mean(0), s.state.x.std(0).mean()
+    way = lambda t: middle + width * torch.stack([torch.sin(1000 * t), 0 * t, 0 * t], -1)  # noqa: E731
+    ball = mpm.Sphere(way, float(width) / 2)
+    return Setup(s.state, mpm.Step(s.grid, s.step.law, gravity=s.step.gravity, walls="sticky", boundaries=[ball]))
+
+
+OTHERS: dict[str, Callable[[int, str], Setup]] = {
+    "two materials": of_two_materials,
+    "two materials, in no order": in_no_order,
+    "muscles": with_muscles,
+    "an obstacle on a path": beside_a_path,
+}
 
 
 def name_of_domain(times: int, side: int) -> str:
@@ -215,6 +255,10 @@ def measure(device: str, quick: bool = False) -> dict[str, Any]:
             result["rollouts"].append({"name": name, **row})
         row = per_step(flipped(side, device), device, samples)
         result["rollouts"].append({"name": "FLIP", **row})
+    for name, make in OTHERS.items():
+        s = make(sides[-1] if quick else LAW_SIDES[device][0], device)
+        row = per_step(s, device, samples, ordered=make is not in_no_order)
+        result["rollouts"].append({"name": name, **row})
     for count, particles in [(4, 64)] if quick else BATCHES[device]:
         row = per_step(batched(count, particles, device), device, samples)
         result["rollouts"].append({"name": f"{count} scenes", **row})
