@@ -20,7 +20,7 @@ from .checkpoints import Checkpoints, as_checkpoints, binomial, fitting, in_segm
 from .errors import check_count, shape_of
 from .gradient_norms import GradientNorms
 from .graphs import CHUNK, LEAST_STEPS, obstacle_to_replays, replayed, time_after
-from .laws import CompiledLaw
+from .laws import CompiledLaw, Mixture
 from .laws.calls import law_calls, laws_of, passive
 from .ops.autograd import dispatch
 from .ops.contact import MAX_OBSTACLES, fusible, obstacle_arguments
@@ -244,6 +244,8 @@ def in_chunks(
     it may not keep all that their gradient needs."""
     if in_no_order(state, n) and not sorts_itself(step, state, n, dt):
         given = step.prepare(state)
+        if isinstance(step.law, Mixture):
+            step.law.check_material(given)  # once, before there are other tensors of it
         start = step.sorted(given)
         return put_back(in_chunks(step, start, n, dt, kept, keeps_all), start, given)
     chunk = CHUNK if step.grid.grows and state.x.is_cuda else MOST_STEPS

@@ -156,7 +156,7 @@ def beside_a_path(side: int, device: str) -> Setup:
     """The cube and a ball that swings in it."""
     s = setup(work.make(side), device)
     middle, width = s.state.x.mean(0), s.state.x.std(0).mean()
-    way = lambda t: middle + width * torch.stack([torch.sin(1000 * t), 0 * t, 0 * t], -1)  # noqa: E731
+    way = lambda t: middle + width * torch.stack([torch.sin(20 * t), 0 * t, 0 * t], -1)  # noqa: E731
     ball = mpm.Sphere(way, float(width) / 2)
     return Setup(s.state, mpm.Step(s.grid, s.step.law, gravity=s.step.gravity, walls="sticky", boundaries=[ball]))
 
