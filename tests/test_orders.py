@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from helpers import OpNames
 from test_rollout_gradients import assert_same, gradients, moving
 from test_rollouts import F64, LAWS_HERE, TRANSFERS, assert_equal, blob, box, one_by_one
 from torch import Tensor
@@ -61,6 +62,18 @@ def test_the_order_comes_back(transfer, dtype, dim, device, sorts):
     for name in ("mass", "volume", "material", "scene"):  # the same tensors, of which caches know
         assert getattr(end, name) is getattr(state, name)
     assert end.extra["own"] is state.extra["own"] and end.extra["activation"] is state.extra["activation"]
+
+
+@torch.no_grad()
+def test_materials_are_checked_once(device):
+    """To check them is to wait for the device."""
+    step, state = case(3, device)
+    end = mpm.rollout(step, state, 9, DT)
+    with OpNames() as names:
+        mpm.rollout(step, state, 9, DT)
+        mpm.rollout(step, end, 9, DT)
+        step(state, DT)
+    assert "aten.all.default" not in names.seen and "torch_mpm.substeps.default" in names.seen
 
 
 @torch.no_grad()

@@ -245,9 +245,12 @@ def in_chunks(
     if in_no_order(state, n) and not sorts_itself(step, state, n, dt):
         given = step.prepare(state)
         if isinstance(step.law, Mixture):
-            step.law.check_material(given)  # once, before there are other tensors of it
+            step.law.check_material(given)
         start = step.sorted(given)
-        return put_back(in_chunks(step, start, n, dt, kept, keeps_all), start, given)
+        end = put_back(in_chunks(step, start, n, dt, kept, keeps_all), start, given)
+        if isinstance(step.law, Mixture):  # which knows of the latest materials alone that they were checked
+            step.law.reordered(start.material, given.material)
+        return end
     chunk = CHUNK if step.grid.grows and state.x.is_cuda else MOST_STEPS
     most_of_paths = _most_steps_of_paths(step, state, dt)
     with_gradient = wants_gradient(step, state, n, dt)
