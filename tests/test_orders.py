@@ -8,7 +8,7 @@ from test_rollouts import F64, LAWS_HERE, TRANSFERS, assert_equal, blob, box, on
 from torch import Tensor
 
 import torch_mpm as mpm
-from torch_mpm import orders
+from torch_mpm import orders, rollouts
 
 DT = 1e-4
 
@@ -62,6 +62,18 @@ def test_the_order_comes_back(transfer, dtype, dim, device, sorts):
     for name in ("mass", "volume", "material", "scene"):  # the same tensors, of which caches know
         assert getattr(end, name) is getattr(state, name)
     assert end.extra["own"] is state.extra["own"] and end.extra["activation"] is state.extra["activation"]
+
+
+@torch.no_grad()
+def test_particles_are_sorted_again(monkeypatch, dim, device, sorts):
+    step, state = case(dim, device)
+    monkeypatch.setattr(rollouts, "STEPS_IN_ORDER", 5)
+    end = mpm.rollout(step, state, 12, DT)
+    assert len(sorts) == 3 and end.ids is None and end.mass is state.mass and end.material is state.material
+    assert_equal(end, one_by_one(step, state, 12, DT))
+    with OpNames() as names:
+        mpm.rollout(step, state, 12, DT)
+    assert "aten.all.default" not in names.seen
 
 
 @torch.no_grad()

@@ -13,6 +13,8 @@ from .state import PARTICLE_FIELDS, State, _take_all
 LEAST_STEPS, LEAST_PARTICLES = 64, 2**15
 """For which a sort and its way back, together some four steps, are worth it: of particles in no order a step takes up
 to five times as long on a GPU."""
+STEPS_IN_ORDER = 1024
+"""After which they are sorted again."""
 
 
 def in_no_order(state: State, n: int) -> bool:

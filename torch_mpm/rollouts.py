@@ -28,7 +28,7 @@ from .ops.grid_update import per_scene, wall_arguments
 from .ops.obstacle_tables import path_requires_grad, row_width
 from .ops.substeps import ARGUMENTS
 from .ops.transfer import STRESS_FORMS
-from .orders import in_no_order, put_back
+from .orders import STEPS_IN_ORDER, in_no_order, put_back
 from .parameters import Overlay, has_hooks
 from .pause import paused
 from .rollout_parts import Hook, Parts
@@ -243,14 +243,7 @@ def in_chunks(
     """The state n steps later, by calls of one op; `obstacle_to_substeps` must be None. The op takes steps again where
     it may not keep all that their gradient needs."""
     if in_no_order(state, n) and not sorts_itself(step, state, n, dt):
-        given = step.prepare(state)
-        if isinstance(step.law, Mixture):
-            step.law.check_material(given)
-        start = step.sorted(given)
-        end = put_back(in_chunks(step, start, n, dt, kept, keeps_all), start, given)
-        if isinstance(step.law, Mixture):  # which knows of the latest materials alone that they were checked
-            step.law.reordered(start.material, given.material)
-        return end
+        return _in_order(step, step.prepare(state), n, dt, kept, keeps_all)
     chunk = CHUNK if step.grid.grows and state.x.is_cuda else MOST_STEPS
     most_of_paths = _most_steps_of_paths(step, state, dt)
     with_gradient = wants_gradient(step, state, n, dt)
@@ -269,6 +262,20 @@ def in_chunks(
         return binomial(advance, step.prepare(state), n, kept.states, step)
     with offloaded(state) if kept is not None and kept.offload else contextlib.nullcontext():
         return advance(state, n)
+
+
+def _in_order(step: Step, given: State, n: int, dt: float | Tensor, kept: Checkpoints | None, keeps_all: bool) -> State:
+    """`in_chunks` of particles that are sorted now and then, and put back."""
+    most = n if wants_gradient(step, given, n, dt) else STEPS_IN_ORDER
+    if isinstance(step.law, Mixture):
+        step.law.check_material(given)
+    end = given
+    for first in range(0, n, most):
+        start = step.sorted(end)
+        end = in_chunks(step, start, min(most, n - first), dt, kept, keeps_all)
+    if isinstance(step.law, Mixture):  # which knows of the latest materials alone that they were checked
+        step.law.reordered(start.material, given.material)
+    return put_back(end, start, given)
 
 
 def sorts_itself(step: Step, state: State, n: int, dt: float | Tensor) -> bool:
