@@ -457,7 +457,7 @@ def test_reasons_to_step_from_python(device):
         "CustomLaw": (mpm.Step(box(), lambda F: F), state, 1e-4),
         "QuarticSand": (mpm.Step(box(), mpm.QuarticSand(E=1e4, nu=0.3, hardening=(0.6, 0.1, 0.2, 0.1))), state, 1e-4),
         "the time of the state requires a gradient": (
-            mpm.Step(box(), law),
+            mpm.Step(box(), law, boundaries=[mpm.Sphere((0.5,) * 3, 0.1, end=1.0)]),
             state.replace(time=torch.zeros(1, dtype=F64, device=device, requires_grad=True)),
             1e-4,
         ),

@@ -35,7 +35,7 @@ from .rollout_parts import Hook, Parts
 from .state import State, check_state
 from .step import Step
 from .step_cost import state_bytes, step_bytes
-from .step_times import StepTimes, clocks
+from .step_times import StepTimes, clocks, requires_grad
 
 
 def rollout(
@@ -184,8 +184,8 @@ def obstacle_to_substeps(step: Step, state: State, dt: float | Tensor) -> str | 
     if type(step) is not Step:
         return f"{type(step).__name__} may do more than a Step"
     for name, value in (("dt", dt), ("the time of the state", state.time)):
-        if isinstance(value, Tensor) and value.requires_grad and torch.is_grad_enabled():
-            return f"{name} requires a gradient"
+        if requires_grad(value) and (step._flip_share or step.boundaries.reads_time):
+            return f"{name} requires a gradient, with FLIP or boundaries that may read the time"
         if isinstance(value, Tensor) and value.dtype != x.dtype:
             return f"{name} is a tensor, but not in {str(x.dtype).removeprefix('torch.')}"
     if torch.compiler.is_compiling() or is_traced(x) or is_captured(x) or is_transformed():
@@ -208,7 +208,7 @@ def obstacle_to_substeps(step: Step, state: State, dt: float | Tensor) -> str | 
     if any(has_hooks(module) for module in (step, *law.modules())):
         return "there are hooks"
     boundaries = step.boundaries.entries
-    if not all(isinstance(b, Obstacle) and fusible(b, state.time, paths=True) for b in boundaries):
+    if not all(isinstance(b, Obstacle) and fusible(b, 0.0, paths=True) for b in boundaries):
         return "a boundary acts by torch operations"
     if len(boundaries) > MAX_OBSTACLES:
         return f"there are more than {MAX_OBSTACLES} obstacles"
@@ -352,7 +352,7 @@ def wants_gradient(step: Step, state: State, n: int = 1, dt: float | Tensor = 1.
     """Whether `substeps` is differentiated. Functions of time are asked at the first and the last of n steps."""
     if not torch.is_grad_enabled():
         return False
-    if any(t.requires_grad for t in _differentiable(step, state)):
+    if requires_grad(dt) or any(t.requires_grad for t in _differentiable(step, state)):
         return True
     if not follows_paths(step):
         return False
@@ -482,6 +482,9 @@ def _substeps(step: Step, state: State, n: int, dt: float | Tensor, records: boo
         grid.follow(int(status[0, 0] if grid.grows else status[0, 7]))
     extra = _history(state, history_names, history)
     now = time_after(state.time, dt, n) if time is None else _in_shape(time.detach(), state.time, dt)
+    if requires_grad(dt) or requires_grad(state.time):
+        known: Any = state.time + n * dt
+        now = now + (known - known.detach())  # which has the gradient
     return state.replace(x=x, v=v, C=C, F=F, J=J, extra=extra, time=now, impulse=impulse)
 
 

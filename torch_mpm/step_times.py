@@ -24,7 +24,12 @@ def clocks(state: State, dt: float | Tensor, scenes: int) -> tuple[float, Tensor
         given = value.reshape(-1) if isinstance(value, Tensor) else state.x.new_full((1,), value)
         return given.expand(scenes).contiguous()
 
-    return 1.0, each(dt), each(state.time)
+    return 1.0, each(dt), each(state.time).detach()
+
+
+def requires_grad(value: float | Tensor) -> bool:
+    """Whether a time or time step has a gradient now."""
+    return isinstance(value, Tensor) and value.requires_grad and torch.is_grad_enabled()
 
 
 class StepTimes(NamedTuple):

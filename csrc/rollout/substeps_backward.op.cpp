@@ -10,11 +10,13 @@ namespace {
 
 // Per particle; undefined where there is none.
 struct Adjoints {
-  Tensor x, v, C, F, J, history, mass, volume, parameters;  // the last [P, n], of all laws
+  Tensor x, v, C, F, J, history, mass, volume;
+  Tensor parameters;  // [P, n], of all laws
+  Tensor dt;          // [P], by the product dt * scene_dt, but for gravity
 };
 
 // Bits of `needs`, in the order of the returned tensors after those of the state.
-enum Need : int64_t { kMass = 1, kVolume = 2, kParameters_ = 4, kGravity = 8, kObstacles = 16 };
+enum Need : int64_t { kMass = 1, kVolume = 2, kParameters_ = 4, kGravity = 8, kObstacles = 16, kTimeStep = 32 };
 
 // Sums over the grid, undefined where they are not wanted: of gravity by blocks of the domain, and of the table of
 // obstacles.
@@ -50,6 +52,7 @@ class SubstepsBackward {
       leave_grid(i, adjoints, sums);
       if (s_.flips()) leave_kept(adjoints);
       leave_laws(adjoints);
+      if (adjoints.dt.defined()) add_terms({{adjoints.dt, motion_dt_}, {adjoints.dt, stress_dt_}});
     }
   }
 
@@ -96,6 +99,7 @@ class SubstepsBackward {
   Substeps<T, D>& s_;
   bool mls_;  // F and J move with the affine field
   Tensor stress_, F_term_, parameters_term_;
+  Tensor motion_dt_, stress_dt_;  // of the end of a step, and of P2G [P]
   Tensor gradient_;  // the velocity gradient that moves F and J where that is not the affine field, or its adjoint
   static constexpr int64_t kCleared = 1 << 26;  // bytes at once: a pass of memory costs a launch, too
   int64_t motions_ = 1;
@@ -128,6 +132,8 @@ void SubstepsBackward<T, D>::make_terms(int64_t needs) {
   const int64_t P = x.size(0);
   stress_ = empty_particles(x, {P, D, D});
   if (!mls_) gradient_ = empty_particles(x, {P, D, D});
+  motion_dt_ = result(x, needs & kTimeStep, {P});
+  stress_dt_ = result(x, needs & kTimeStep, {P});
   if (s_.flips()) {
     kept_ = empty_particles(x, {P, D});
     v_term_ = empty_particles(x, {P, D});
@@ -193,6 +199,7 @@ AdvanceBackwardArguments<T, D> SubstepsBackward<T, D>::advance(int64_t i, Adjoin
   a.adds_affine = mls_;
   a.F = field<T>(adjoints.F);
   a.J = field<T>(adjoints.J);
+  a.dt = field<T>(motion_dt_);
   return a;
 }
 
@@ -270,6 +277,7 @@ void SubstepsBackward<T, D>::leave_grid(int64_t i, Adjoints& adjoints, const Gri
   if (s_.p2g.affine.pointer) p2g.affine = field<T>(adjoints.C);
   p2g.stress = field<T>(stress_);
   p2g.volume = field<T>(adjoints.volume);
+  p2g.dt = field<T>(stress_dt_);
   p2g.adds = true;
   backend::p2g_backward(in_.lattice.order(), p2g, stream_);
   if (!s_.p2g.affine.pointer) torch::stable::zero_(adjoints.C);  // which the position gradient has read
@@ -362,7 +370,8 @@ void set(Tensor& adjoint, const OptionalTensor& grad, const char* name, const Te
   torch::stable::copy_(adjoint, *grad);
 }
 
-using Gradients = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
+using Gradients =
+    std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
 
 Gradients substeps_backward(const OptionalTensor& grad_x, const OptionalTensor& grad_v, const OptionalTensor& grad_C,
                             const OptionalTensor& grad_F, const OptionalTensor& grad_J,
@@ -385,20 +394,21 @@ Gradients substeps_backward(const OptionalTensor& grad_x, const OptionalTensor& 
     adjoints.mass = result(x, needs & kMass, {P});
     adjoints.volume = result(x, needs & kVolume, {P});
     adjoints.parameters = result(x, needs & kParameters_, {P, int64_t(parameters.size())});
+    adjoints.dt = result(x, needs & kTimeStep, {P});
     set(adjoints.x, grad_x, "grad_x", x);
     set(adjoints.v, grad_v, "grad_v", x);
     set(adjoints.C, grad_C, "grad_C", x);
     set(adjoints.F, grad_F, "grad_F", x);
     set(adjoints.J, grad_J, "grad_J", x);
     set(adjoints.history, grad_history, "grad_history", x);
-    for (Tensor* sum : {&adjoints.mass, &adjoints.volume, &adjoints.parameters}) set(*sum, {}, "", x);
+    for (Tensor* sum : {&adjoints.mass, &adjoints.volume, &adjoints.parameters, &adjoints.dt}) set(*sum, {}, "", x);
     if ((needs & kGravity) && has(gravity)) sums.gravity = zeros(x, {backward.blocks(), D});
     if ((needs & kObstacles) && has(obstacle_table)) sums.obstacles = zeros(x, sizes_of(*obstacle_table));
     if (P > 0) with_team(P * n, [&] { backward.run(adjoints, sums); });
   });
   if (!has(C)) adjoints.C = Tensor();
-  return {adjoints.x,    adjoints.v,      adjoints.C,          adjoints.F,   adjoints.J,    adjoints.history,
-          adjoints.mass, adjoints.volume, adjoints.parameters, sums.gravity, sums.obstacles};
+  return {adjoints.x,    adjoints.v,      adjoints.C,          adjoints.F,   adjoints.J,     adjoints.history,
+          adjoints.mass, adjoints.volume, adjoints.parameters, sums.gravity, sums.obstacles, adjoints.dt};
 }
 
 }  // namespace
@@ -410,7 +420,7 @@ STABLE_TORCH_LIBRARY_FRAGMENT(torch_mpm, m) {
       "substeps_backward(Tensor? grad_x, Tensor? grad_v, Tensor? grad_C, Tensor? grad_F, Tensor? grad_J, "
       "Tensor? grad_history, Tensor? grad_impulse, int needs, Tensor? record, " MPM_SUBSTEPS_SCHEMA
       ") -> (Tensor x, Tensor v, Tensor C, Tensor F, Tensor J, Tensor history, Tensor mass, Tensor volume, "
-      "Tensor parameters, Tensor gravity, Tensor obstacles)");
+      "Tensor parameters, Tensor gravity, Tensor obstacles, Tensor dt)");
 }
 #endif
 

@@ -22,19 +22,21 @@ there, each on a multiprocessor of its own; gradients take it as any other, whos
 `records` everything that the adjoint reads is kept in `record`, bytes of no other use, and no step is taken again; not
 where impulses are counted, or the pool had to grow.
 
-Differentiable once, with respect to x, v, mass, volume, C, F, J, history, parameters, gravity, obstacles and impulse.
-Autograd keeps the arguments of a call and the record, mostly none: 2 D + 2 D² numbers per particle of a solid (24 in
-3-D) and its history.
+Differentiable once, with respect to x, v, mass, volume, C, F, J, history, parameters, gravity, obstacles, impulse and
+scene_dt, the last without flip and but for what obstacles know of the time. Autograd keeps the arguments of a call and
+the record, mostly none: 2 D + 2 D² numbers per particle of a solid (24 in 3-D) and its history.
 
     torch.ops.torch_mpm.substeps_backward(grad_x, grad_v, grad_C, grad_F, grad_J, grad_history, grad_impulse, needs,
-        record, *arguments of substeps) -> (x, v, C, F, J, history, mass, volume, parameters, gravity, obstacles)
+        record, *arguments of substeps)
+        -> (x, v, C, F, J, history, mass, volume, parameters, gravity, obstacles, dt)
 
 takes the steps again, where there is no record, and then goes back through them; a record must be that of `substeps`,
 whose contents are not checked. Meanwhile it holds what each step has read: of a solid 2 D + 3 D² numbers per particle
 and step (33 in 3-D), D² more where a law is plastic, and the history; and the grid of each step where that is at most
 half as much. The adjoints are [P, ...], those of the parameters [P, number of parameters] and that of gravity, over the
-time step, a sum for each block of the grids of all scenes [B * blocks, D]. Of the last five the bits of `needs`
-(`MASS`, `VOLUME`, `PARAMETERS`, `GRAVITY`, `OBSTACLES`) tell which are wanted.
+time step, a sum for each block of the grids of all scenes [B * blocks, D]; that of the time step, but for gravity, is
+[P]. Of the last six the bits of `needs` (`MASS`, `VOLUME`, `PARAMETERS`, `GRAVITY`, `OBSTACLES`, `TIME_STEP`) tell
+which are wanted.
 """
 
 from __future__ import annotations
@@ -45,18 +47,18 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .arguments import refuse_vmap, sizes, soa_empty
+from .arguments import refuse_vmap, sizes, soa_empty, sum_by_scene
 from .autograd import dispatch, register_autograd
 from .law import _entries, _of_history, _of_parameters
 
-MASS, VOLUME, PARAMETERS, GRAVITY, OBSTACLES = 1, 2, 4, 8, 16
+MASS, VOLUME, PARAMETERS, GRAVITY, OBSTACLES, TIME_STEP = 1, 2, 4, 8, 16, 32
 """Bits of `needs` in csrc/rollout/substeps_backward.op.cpp."""
 
 _SCHEMA = {a.name: str(a.type) for a in torch.ops.torch_mpm.substeps.default._schema.arguments}
 ARGUMENTS = tuple(_SCHEMA)
 """Names of the arguments of `substeps`."""
 _TENSORS = [name for name, kind in _SCHEMA.items() if kind in ("Tensor", "Optional[Tensor]")]
-_ADJOINTS = ("x", "v", "C", "F", "J", "history", "mass", "volume", "parameters", "gravity", "obstacles")
+_ADJOINTS = ("x", "v", "C", "F", "J", "history", "mass", "volume", "parameters", "gravity", "obstacles", "dt")
 
 
 # ---- fake kernels: shapes and strides only
@@ -102,6 +104,7 @@ def _backward_fake(grad_x, grad_v, grad_C, grad_F, grad_J, grad_history, grad_im
         soa_empty(x, (P, len(given["parameters"]))) if needs & PARAMETERS else None,
         x.new_empty(blocks, D) if needs & GRAVITY and given["gravity"] is not None else None,
         torch.empty_like(given["obstacles"]) if needs & OBSTACLES and given["obstacles"] is not None else None,
+        soa_empty(x, (P,)) if needs & TIME_STEP else None,
     )
 
 
@@ -123,7 +126,9 @@ def _backward(ctx: Any, *grads: Any) -> Any:
     history, parameters = rest[: ctx.variables], rest[ctx.variables :]
     given = ctx.given | tensors | {"history": history, "parameters": parameters}
     wanted = dict(zip(_SCHEMA, ctx.needs_input_grad, strict=True))
-    needs = MASS * wanted["mass"] + VOLUME * wanted["volume"] + GRAVITY * wanted["gravity"]
+    wants_dt = wanted["scene_dt"]
+    needs = MASS * wanted["mass"] + VOLUME * wanted["volume"] + GRAVITY * (wanted["gravity"] or wants_dt)
+    needs += TIME_STEP * wants_dt
     needs += PARAMETERS * any(wanted["parameters"]) + OBSTACLES * wanted["obstacles"]
     by_impulse = None if grads[7] is None else grads[7].contiguous()
     arguments = (given[name] for name in _SCHEMA)
@@ -131,10 +136,17 @@ def _backward(ctx: Any, *grads: Any) -> Any:
     found = dict(zip(_ADJOINTS, adjoints, strict=True)) | {"impulse": grads[7]}
     found["history"] = _of_history(found["history"], history, wanted["history"])
     found["parameters"] = _of_parameters(found["parameters"], parameters, wanted["parameters"], given["scene"])
-    if wanted["gravity"]:
+    by_dt = found.pop("dt")
+    if wants_dt:
+        sums = sum_by_scene(by_dt, given["scene"], given["scenes"])  # of one scene where nobody says which
+        found["scene_dt"] = given["dt"] * torch.cat([sums, sums.new_zeros(given["scenes"] - len(sums))])
+    if found["gravity"] is not None:
         scenes, dim = given["gravity"].shape
         dt = given["dt"] if given["scene_dt"] is None else given["dt"] * given["scene_dt"][:, None]
-        found["gravity"] = dt * found["gravity"].reshape(scenes, math.prod(given["layout"][2:]), dim).sum(1)
+        change = found["gravity"].reshape(scenes, math.prod(given["layout"][2:]), dim).sum(1)  # of velocities, over dt
+        found["gravity"] = dt * change
+        if wants_dt:
+            found["scene_dt"] = found["scene_dt"] + given["dt"] * (given["gravity"] * change).sum(1)
     lists = ("history", "parameters")
     return tuple(found.get(name) if name in lists or wanted[name] is True else None for name in _SCHEMA)
 
