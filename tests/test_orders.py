@@ -121,6 +121,17 @@ def test_scenes_that_pause_and_clocks_of_scenes(device):
 
 
 @torch.no_grad()
+def test_a_time_is_reached(device, sorts, monkeypatch):
+    step, state = case(3, device)
+    arrival = mpm.rollout_to(step, state, 1e-3, every=3)
+    assert sorts == [state] and arrival.state.ids is None and arrival.state.mass is state.mass
+    monkeypatch.setattr(orders, "LEAST_PARTICLES", 1000)
+    expected = mpm.rollout_to(step, state, 1e-3, every=3)
+    assert torch.equal(arrival.substeps, expected.substeps)
+    assert_equal(arrival.state, expected.state)
+
+
+@torch.no_grad()
 def test_a_hook_sees_the_order_that_was_given(device, sorts):
     step, state = case(3, device)
     seen: list[Tensor] = []

@@ -11,6 +11,7 @@ from torch import Tensor
 from .checkpoints import Checkpoints
 from .errors import NUMBER_OR_TENSOR, check_count, check_number, shape_of
 from .graphs import CHUNK, replay_all
+from .orders import in_no_order, put_back, put_in_order
 from .rollouts import follows_paths, in_chunks, obstacle_to_substeps, rollout, wants_gradient
 from .state import State
 from .step import Step
@@ -85,11 +86,15 @@ def rollout_to(
     check_number("longest", longest, "positive", lambda v: v > 0)
     check_count("every", every, 1)
     check_count("most", most, 1)
-    clocks = Clocks(step, step.prepare(state), time, cfl, longest, most)
+    given = step.prepare(state)
+    unsorted = in_no_order(given, most)
+    start = put_in_order(step, given) if unsorted else given
+    clocks = Clocks(step, start, time, cfl, longest, most)
     while (left := clocks.look()) > 0:
         segments = min(max(left // every, 1), MOST_SEGMENTS)
         clocks.advance(segments, min(left, every), checkpoint)
-    return clocks.arrival()
+    arrival = clocks.arrival()
+    return arrival._replace(state=put_back(step, arrival.state, start, given)) if unsorted else arrival
 
 
 class Clocks:

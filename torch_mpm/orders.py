@@ -8,7 +8,9 @@ import torch
 from torch import Tensor
 
 from .capture import is_captured
+from .laws import Mixture
 from .state import PARTICLE_FIELDS, State, _take_all
+from .step import Step
 
 LEAST_STEPS, LEAST_PARTICLES = 64, 2**15
 """For which a sort and its way back, together some four steps, are worth it: of particles in no order a step takes up
@@ -27,8 +29,17 @@ def wants_order(x: Tensor) -> bool:
     return x.is_cuda and not is_captured(x)
 
 
-def put_back(end: State, start: State, given: State) -> State:
+def put_in_order(step: Step, state: State) -> State:
+    """Sorted, with materials that are known to be checked."""
+    if isinstance(step.law, Mixture):
+        step.law.check_material(state)
+    return step.sorted(state)
+
+
+def put_back(step: Step, end: State, start: State, given: State) -> State:
     """A state in the order of `given`, which was sorted to `start`, from which steps led to `end`. Differentiable."""
+    if isinstance(step.law, Mixture):  # which knows of the latest materials alone that they were checked
+        step.law.reordered(start.material, given.material)
     ids, before, own = start.ids, _tensors(start), _tensors(given)
     assert ids is not None
     found = {name: own.get(name) for name in _tensors(end)}  # what steps leave as it is

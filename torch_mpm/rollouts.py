@@ -20,7 +20,7 @@ from .checkpoints import Checkpoints, as_checkpoints, binomial, fitting, in_segm
 from .errors import check_count, shape_of
 from .gradient_norms import GradientNorms
 from .graphs import CHUNK, LEAST_STEPS, obstacle_to_replays, replayed, time_after
-from .laws import CompiledLaw, Mixture
+from .laws import CompiledLaw
 from .laws.calls import law_calls, laws_of, passive
 from .ops.autograd import dispatch
 from .ops.contact import MAX_OBSTACLES, fusible, obstacle_arguments
@@ -28,7 +28,7 @@ from .ops.grid_update import per_scene, wall_arguments
 from .ops.obstacle_tables import path_requires_grad, row_width
 from .ops.substeps import ARGUMENTS
 from .ops.transfer import STRESS_FORMS
-from .orders import STEPS_IN_ORDER, in_no_order, put_back
+from .orders import STEPS_IN_ORDER, in_no_order, put_back, put_in_order
 from .parameters import Overlay, has_hooks
 from .pause import paused
 from .rollout_parts import Hook, Parts
@@ -267,15 +267,11 @@ def in_chunks(
 def _in_order(step: Step, given: State, n: int, dt: float | Tensor, kept: Checkpoints | None, keeps_all: bool) -> State:
     """`in_chunks` of particles that are sorted now and then, and put back."""
     most = n if wants_gradient(step, given, n, dt) else STEPS_IN_ORDER
-    if isinstance(step.law, Mixture):
-        step.law.check_material(given)
     end = given
     for first in range(0, n, most):
-        start = step.sorted(end)
+        start = put_in_order(step, end)
         end = in_chunks(step, start, min(most, n - first), dt, kept, keeps_all)
-    if isinstance(step.law, Mixture):  # which knows of the latest materials alone that they were checked
-        step.law.reordered(start.material, given.material)
-    return put_back(end, start, given)
+    return put_back(step, end, start, given)
 
 
 def sorts_itself(step: Step, state: State, n: int, dt: float | Tensor) -> bool:
