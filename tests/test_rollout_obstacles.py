@@ -1,6 +1,9 @@
 """Obstacles that follow paths, and gradients of obstacles, in rollouts in one op: against single steps, whose obstacles
 are torch operations, and against finite differences."""
 
+import subprocess
+import sys
+
 import pytest
 import torch
 from helpers import TOLERANCE
@@ -215,7 +218,7 @@ def test_a_path_is_asked_where_the_obstacle_is(clocks, device):
     expected = one_by_one(step, state, 10, DT)
     asked.clear()
     assert_equal(mpm.rollout(step, state, 10, DT).replace(time=0.0), expected.replace(time=0.0))
-    assert len(asked) == 1
+    assert len(asked) == 2  # once to differentiate it
 
 
 def test_a_path_has_no_gradient_where_the_obstacle_is_not(device):
@@ -241,6 +244,26 @@ def test_clocks_of_float32_are_those_of_single_steps(device):
     end, expected = mpm.rollout(step, state, 400, dt), one_by_one(step, state, 400, dt)
     assert torch.equal(end.time, expected.time)
     assert float((end.v - expected.v).abs().max()) < 1e-3 * float(expected.v.abs().max())
+
+
+PROGRAM = """
+import sys, torch, torch_mpm as mpm
+grid = mpm.Grid(dx=0.1, lower=(0, 0), upper=(1, 1))
+path = lambda t: torch.stack([0.5 + t, 0.2 + 0 * t], -1)
+for place in ((0.5, 0.2), path):
+    step = mpm.Step(grid, mpm.Active(mpm.NeoHookean(E=1e4, nu=0.3), (1.0, 0.0)), boundaries=[mpm.Sphere(place, 0.1)])
+    state = mpm.State.at_rest(mpm.seed.box((0.3, 0.3), (0.6, 0.6), grid, per_cell=4), dtype=torch.float64)
+    v = state.v.clone().requires_grad_()
+    for dt in (1e-4, torch.tensor(1e-4, dtype=torch.float64)):
+        mpm.rollout(step, state.replace(v=v), 5, dt).x.sum().backward()
+print([name for name in ("sympy", "torch._dynamo") if name in sys.modules])
+"""
+
+
+def test_no_compiler_is_imported():
+    """Which takes two seconds: torch.broadcast_shapes and forward derivatives do so."""
+    done = subprocess.run([sys.executable, "-c", PROGRAM], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
 
 
 # ---- gradients

@@ -486,7 +486,7 @@ def _substeps(step: Step, state: State, n: int, dt: float | Tensor, records: boo
 
 def _in_shape(times: Tensor, time: float | Tensor, dt: float | Tensor) -> Tensor:
     """Times of each scene as the sum of a time and dt has them: one where all have the same."""
-    shape = torch.broadcast_shapes(*(t.shape for t in (time, dt) if isinstance(t, Tensor)))
+    shape = max((tuple(t.shape) for t in (time, dt) if isinstance(t, Tensor)), key=lambda s: (len(s), s))
     return times if times.shape == shape or not len(times) else times[:1].reshape(shape)
 
 

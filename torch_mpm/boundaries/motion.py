@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from ..errors import shape_of
 from ..per_scene import SceneParameters, Value, finite, floats, per_node
 from ..vectors import norm, transform
 
@@ -116,20 +117,43 @@ class RigidMotion(SceneParameters):
         return centre.to(like.dtype), velocity.to(like.dtype)
 
     def path_over(self, times: Tensor, like: Tensor) -> tuple[Tensor, Tensor]:
-        """Centre and its velocity at many times [n] or [n, B]: [n, D] or [n, B, D], with the dtype of `like`.
+        """Centre and its velocity at many times [n] or [n, B]: [n, 1 or B, D], with the dtype of `like`.
 
-        A function of time is called once for all of them if it can be mapped over them (torch.vmap), else for one after
-        another.
+        A function of time is called for all of them at once if it can be mapped over them (torch.vmap), else for one
+        after another; twice, once to differentiate it.
         """
+        centre = self._mapped(times)
+        if centre.dim() not in (2, 3) or centre.shape[-1] != like.shape[1]:
+            expected = f"[{like.shape[1]}] or [B, {like.shape[1]}]"
+            raise ValueError(f"position must return {expected} at a time, got {shape_of(centre[0])}")
+        velocity = self._rates(times, centre)
+        return tuple(t.to(like.dtype).reshape(len(times), -1, like.shape[1]) for t in (centre, velocity))  # type: ignore[return-value]
+
+    def _mapped(self, times: Tensor) -> Tensor:
+        assert callable(self.position)
         try:
-            centre, velocity = torch.vmap(self._moved)(times)
+            return torch.vmap(self.position)(times)
         except torch.OutOfMemoryError:
             raise
         except (RuntimeError, TypeError, ValueError, NotImplementedError):
             # As of functions that look at the value of a time. One that is wrong raises again.
-            both = [self._moved(time) for time in times.unbind()]
-            centre, velocity = (torch.stack(list(values)) for values in zip(*both, strict=True))
-        return centre.to(like.dtype), velocity.to(like.dtype)
+            return torch.stack([self.position(time) for time in times.unbind()])
+
+    def _rates(self, times: Tensor, centre: Tensor) -> Tensor:
+        """Derivatives of centres by their times. Backward, where a time has one centre: forward mode imports compilers,
+        which takes a second."""
+        if centre.dim() > times.dim() + 1:
+            return torch.stack([self._moved(time)[1] for time in times.unbind()])
+        trained = centre.requires_grad
+        with torch.inference_mode(False), torch.enable_grad():
+            leaf = times.detach().clone().requires_grad_()
+            again = self._mapped(leaf)
+            rates = [torch.zeros_like(leaf) for _ in again.unbind(-1)]
+            for k, part in enumerate(again.unbind(-1)):
+                if part.requires_grad:
+                    (rate,) = torch.autograd.grad(part.sum(), leaf, None, True, trained, allow_unused=True)
+                    rates[k] = rates[k] if rate is None else rate
+        return torch.stack(rates, -1)
 
     def _moved(self, time: Tensor) -> tuple[Tensor, Tensor]:
         assert callable(self.position)

@@ -12,7 +12,6 @@ from torch.nn import functional as F
 
 from .. import shapes
 from ..boundaries.obstacles import Obstacle
-from ..errors import shape_of
 from ..step_times import StepTimes
 
 
@@ -122,7 +121,8 @@ def _part(owner: Obstacle | shapes.Shape, name: str | None, like: Tensor, shape:
 
 def _joined(parts: dict[str, Tensor]) -> Tensor:
     """Columns [..., 1 or B, n] as one row [..., 1 or B, width]."""
-    shape = torch.broadcast_shapes(*(part.shape[:-1] for part in parts.values()))
+    # By hand: torch.broadcast_shapes imports sympy, which takes two seconds.
+    shape = [max(sizes) for sizes in zip(*(part.shape[:-1] for part in parts.values()), strict=True)]
     return torch.cat([part.expand(*shape, -1) for part in parts.values()], -1)
 
 
@@ -144,24 +144,17 @@ def _path_over(obstacle: Obstacle, like: Tensor, times: StepTimes) -> tuple[Tens
     if len(there.tensor) == 0:
         return like.new_zeros(n, 1, dim), like.new_zeros(n, 1, dim)
     centre, velocity = obstacle.path_over(there.tensor.to(like.dtype), like)
-    if centre.dim() not in (2, 3) or centre.shape[-1] != dim:
-        raise ValueError(f"position must return [{dim}] or [B, {dim}] at a time, got {shape_of(centre[0])}")
     before = 0
     if times.numbers is not None and there.numbers is not None:
         before = times.numbers.index(there.numbers[0])
     around = (0, 0, 0, 0, before, n - before - len(there.tensor))
-    return F.pad(_rows(centre), around), F.pad(_rows(velocity), around)
-
-
-def _rows(values: Tensor) -> Tensor:
-    """[n, D] or [n, B, D] as [n, 1 or B, D]."""
-    return values if values.dim() == 3 else values[:, None]
+    return F.pad(centre, around), F.pad(velocity, around)
 
 
 def path_requires_grad(obstacle: Obstacle, like: Tensor, times: StepTimes) -> bool:
     """Whether the first or the last of the positions on a path does."""
     there = times.between(obstacle.start, obstacle.end).tensor.to(like.dtype)
-    return any(obstacle.centre_at(time, like).requires_grad for time in (*there[:1], *there[-1:]))
+    return any(obstacle.position(time).requires_grad for time in (*there[:1], *there[-1:]))
 
 
 def row_width(dim: int) -> int:
