@@ -4,10 +4,10 @@
     python -m benchmarks.speed.rollouts --device cuda      # either takes about a minute
     python -m benchmarks.speed.rollouts --out DIRECTORY
 
-Scenes: `torch_mpm.scene.run` with its files, a process each; time of the simulation. The others are the neo-Hookean cube of
-`benchmarks/speed/work.py`, steps of one call of `torch_mpm.rollout`, wall clock, synchronised once. Warp and Taichi
-take steps of the same cube where they are installed (`pip install torch-mpm[bench]`), Warp's also launched one by one
-from Python beside each scene. The figure has every device that has results in DIRECTORY.
+Scenes: `torch_mpm.scene.run` with its files, a process each; time of the simulation. The others are the neo-Hookean
+cube of `benchmarks/speed/work.py`, steps of one call of `torch_mpm.rollout`, wall clock, synchronised once. Warp and
+Taichi take steps of the same cube where they are installed (`pip install torch-mpm[bench]`), Warp's also launched one
+by one from Python beside each scene. The figure has every device that has results in DIRECTORY.
 """
 
 from __future__ import annotations
