@@ -106,6 +106,12 @@ def side_of(particles: int) -> int:
     return round(particles ** (1 / 3))
 
 
+def changed(s: Setup, **options: Any) -> mpm.Step:
+    """The step of a cube with some options of its own."""
+    same = {"grid": s.grid, "law": s.step.law, "gravity": s.step.gravity, "walls": "sticky"}
+    return mpm.Step(**same | options)
+
+
 def batched(scenes: int, particles: int, device: str) -> Setup:
     """Many scenes of one small cube each."""
     w = work.make(side_of(particles))
@@ -113,7 +119,7 @@ def batched(scenes: int, particles: int, device: str) -> Setup:
     grid = mpm.Grid(dx=1 / w.n, lower=(0, 0, 0), upper=(1, 1, 1), scenes=scenes)
     scene = torch.arange(scenes, dtype=torch.int32, device=device).repeat_interleave(w.particles)
     state = one.state.select(torch.arange(w.particles, device=device).repeat(scenes)).replace(scene=scene)
-    step = mpm.Step(grid, one.step.law, gravity=one.step.gravity, walls="sticky")
+    step = changed(one, grid=grid)
     return Setup(step.prepare(state), step)
 
 
@@ -121,21 +127,20 @@ def in_domain(side: int, times: int, device: str, deterministic: bool = False) -
     """The cube in a domain that is so many times as large along each axis."""
     s = setup(work.make(side), device)
     grid = mpm.Grid(dx=s.grid.dx, lower=(0, 0, 0), upper=(times, times, times), deterministic=deterministic)
-    return Setup(s.state, mpm.Step(grid, s.step.law, gravity=s.step.gravity, walls="sticky"))
+    return Setup(s.state, changed(s, grid=grid))
 
 
 def flipped(side: int, device: str) -> Setup:
     """The cube with FLIP."""
     s = setup(work.make(side), device)
-    return Setup(s.state, mpm.Step(s.grid, s.step.law, gravity=s.step.gravity, walls="sticky", flip=0.95))
+    return Setup(s.state, changed(s, flip=0.95))
 
 
 def of_two_materials(side: int, device: str) -> Setup:
     """The cube, half of it a fluid."""
     s = setup(work.make(side), device)
     x = s.state.x[:, 1]
-    law = mpm.Mixture([s.step.law, LAWS["fluid"]()])
-    step = mpm.Step(s.grid, law, gravity=s.step.gravity, walls="sticky")
+    step = changed(s, law=mpm.Mixture([s.step.law, LAWS["fluid"]()]))
     return Setup(step.prepare(s.state.replace(material=(x > x.mean()).int())), step)
 
 
@@ -148,7 +153,7 @@ def in_no_order(side: int, device: str) -> Setup:
 def with_muscles(side: int, device: str) -> Setup:
     """The cube with an activation of each particle."""
     s = setup(work.make(side), device)
-    step = mpm.Step(s.grid, mpm.Active(s.step.law, (0.0, 1.0, 0.0)), gravity=s.step.gravity, walls="sticky")
+    step = changed(s, law=mpm.Active(s.step.law, (0.0, 1.0, 0.0)))
     state = step.prepare(s.state)
     return Setup(state.replace(extra={"activation": 1e-3 * work.MU * torch.rand_like(state.mass)}), step)
 
@@ -158,8 +163,7 @@ def beside_a_path(side: int, device: str) -> Setup:
     s = setup(work.make(side), device)
     middle, width = s.state.x.mean(0), s.state.x.std(0).mean()
     way = lambda t: middle + width * torch.stack([torch.sin(20 * t), 0 * t, 0 * t], -1)  # noqa: E731
-    ball = mpm.Sphere(way, float(width) / 2)
-    return Setup(s.state, mpm.Step(s.grid, s.step.law, gravity=s.step.gravity, walls="sticky", boundaries=[ball]))
+    return Setup(s.state, changed(s, boundaries=[mpm.Sphere(way, float(width) / 2)]))
 
 
 OTHERS: dict[str, Callable[[int, str], Setup]] = {
@@ -177,7 +181,7 @@ def name_of_domain(times: int, side: int) -> str:
 def made_of(law: mpm.Material, side: int, device: str) -> Setup:
     """The cube of another material."""
     s = setup(work.make(side), device)
-    step = mpm.Step(s.grid, law, gravity=s.step.gravity, walls="sticky")
+    step = changed(s, law=law)
     return Setup(step.prepare(s.state.replace(C=None, F=None)), step)
 
 
