@@ -27,6 +27,18 @@ def _knots(name: str, given: Sequence[float] | Tensor) -> Tensor:
     return torch.tensor(check_numbers(f"{name} of a table", given), dtype=torch.float64)
 
 
+def check_knots(name: str, knots: Tensor, of_values: str, values: Tensor) -> None:
+    """That knots [K] increase, and values at them are finite.
+
+    Raises:
+        ValueError: where they do not.
+    """
+    if not bool((knots.diff() > 0).all() and knots.isfinite().all()):
+        raise ValueError(f"{name} must increase, got {knots.tolist()}")
+    if not bool(values.detach().isfinite().all()):
+        raise ValueError(f"{of_values} must be finite, got {values.tolist()}")
+
+
 class Table(nn.Module):
     """Piecewise linear function of temperature, constant beyond its ends; differentiable by temperature and values.
 
@@ -50,16 +62,10 @@ class Table(nn.Module):
                 "temperature and value of a table must be lists of one length, 2 or more, "
                 f"got {shape_of(knots)} and {shape_of(values)}"
             )
-        if not bool((knots.diff() > 0).all() and knots.isfinite().all()):
-            raise ValueError(f"temperature of a table must increase, got {knots.tolist()}")
-        if not bool(values.detach().isfinite().all()):
-            raise ValueError(f"value of a table must be finite, got {values.tolist()}")
+        check_knots("temperature of a table", knots, "value of a table", values)
         self._kept = GraphCache()
-        self.register_buffer("temperature", knots)
-        if isinstance(values, nn.Parameter):
-            self.value = values
-        else:
-            self.register_buffer("value", values)
+        store(self, "temperature", knots)
+        store(self, "value", values)
 
     def forward(self, temperature: Tensor) -> Tensor:
         """Values at temperatures of any shape."""

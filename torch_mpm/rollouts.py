@@ -25,7 +25,7 @@ from .laws.calls import law_calls, laws_of, passive
 from .ops.autograd import dispatch
 from .ops.contact import MAX_OBSTACLES, fusible, obstacle_arguments
 from .ops.grid_update import per_scene, wall_arguments
-from .ops.obstacle_tables import path_requires_grad, row_width
+from .ops.obstacle_tables import numbers_of_a_step, path_requires_grad
 from .ops.substeps import ARGUMENTS
 from .ops.transfer import STRESS_FORMS
 from .orders import STEPS_IN_ORDER, in_no_order, put_back, put_in_order
@@ -290,10 +290,8 @@ def _most_steps_of_paths(step: Step, state: State, dt: float | Tensor) -> int:
     """Steps of a call whose obstacles have a table of at most `TABLE_BYTES` for each."""
     if not follows_paths(step):
         return MOST_STEPS
-    obstacles, scenes = _obstacles(step), step.grid.scenes
-    tensors = (dt, state.time, *(t for b in obstacles for t in motion_tensors(b)))
-    rows = scenes if any(isinstance(t, Tensor) and t.dim() > 0 and len(t) == scenes for t in tensors) else 1
-    numbers = row_width(state.x.shape[1]) * len(obstacles) * rows
+    clocks_of_scenes = isinstance(dt, Tensor) or isinstance(state.time, Tensor)
+    numbers = numbers_of_a_step(_obstacles(step), state.x, step.grid.scenes if clocks_of_scenes else 1)
     return max(TABLE_BYTES // (numbers * state.x.element_size()), 1)
 
 
@@ -348,12 +346,17 @@ def wants_gradient(step: Step, state: State, n: int = 1, dt: float | Tensor = 1.
     """Whether `substeps` is differentiated. Functions of time are asked at the first and the last of n steps."""
     if not torch.is_grad_enabled():
         return False
-    if requires_grad(dt) or any(t.requires_grad for t in _differentiable(step, state)):
+    if _differentiates(step, state, dt):
         return True
     if not follows_paths(step):
         return False
     times = StepTimes.of(state, n, dt, step.grid.scenes)
     return any(path_requires_grad(b, state.x, times) for b in _obstacles(step) if b.follows_path)
+
+
+def _differentiates(step: Step, state: State, dt: float | Tensor) -> bool:
+    """The same, whatever functions of time return."""
+    return requires_grad(dt) or any(t.requires_grad for t in _differentiable(step, state))
 
 
 def follows_paths(step: Step) -> bool:
@@ -451,7 +454,9 @@ def _arguments(
     given: Any = Overlay(state, dt=dt)
     calls = law_calls(step.law, given)
     apic = step.transfer == "apic"
-    with_gradient = wants_gradient(step, state, n, dt)
+    table, *others = obstacle_arguments(step.boundaries.entries, state.x, grid.scenes, times)
+    of_table = table is not None and table.requires_grad
+    with_gradient = torch.is_grad_enabled() and (of_table or _differentiates(step, state, dt))
     arguments = (
         *(state.x, state.v, state.mass, state.volume, state.C, state.F, state.J),
         *(calls.history, state.scene, state.ids, calls.material, step._activations.status_for(state.x)),
@@ -459,7 +464,7 @@ def _arguments(
         *(int(n), number, apic, step._flip_share, apic or step.law.viscous, STRESS_FORMS[step.stress_form]),
         _gravity(step, state.x),
         *wall_arguments(step.walls, grid),
-        *obstacle_arguments(step.boundaries.entries, state.x, grid.scenes, times),
+        *(table, *others),
         *(0.0 if scene_time is not None else float(state.time), grid.scenes),
         *(pool if blocks is None else max(pool, blocks), grid.grows, not with_gradient, with_gradient and records),
         *(state.impulse, scene_dt, scene_time, *grid.packed),

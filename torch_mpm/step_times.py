@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from bisect import bisect_left
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch
@@ -54,10 +55,8 @@ class StepTimes(NamedTuple):
             times.append(times[-1] + scene_dt)
         return cls(torch.stack(times), None)
 
-    def between(self, start: float, end: float) -> StepTimes:
-        """Those in [start, end), where the host knows; else all."""
+    def within(self, start: float, end: float) -> slice:
+        """The steps that begin in [start, end), where the host knows; else all."""
         if self.numbers is None:
-            return self
-        first = next((k for k, time in enumerate(self.numbers) if time >= start), len(self.numbers))
-        last = next((k for k, time in enumerate(self.numbers) if time >= end), len(self.numbers))
-        return StepTimes(self.tensor[first:last], self.numbers[first:last])
+            return slice(0, len(self.tensor))
+        return slice(bisect_left(self.numbers, start), bisect_left(self.numbers, end))

@@ -44,7 +44,7 @@ struct AccumulateSlotsArguments {
   T* sum = nullptr;
 };
 
-// Of numbers of any meaning.
+// Sums over slots, as a call asks the backend for them.
 template <class T, int D>
 struct SumSlotsArguments {
   SlotSums<T> sums;

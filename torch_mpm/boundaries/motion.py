@@ -126,8 +126,8 @@ class RigidMotion(SceneParameters):
         if centre.dim() not in (2, 3) or centre.shape[-1] != like.shape[1]:
             expected = f"[{like.shape[1]}] or [B, {like.shape[1]}]"
             raise ValueError(f"position must return {expected} at a time, got {shape_of(centre[0])}")
-        velocity = self._rates(times, centre)
-        return tuple(t.to(like.dtype).reshape(len(times), -1, like.shape[1]) for t in (centre, velocity))  # type: ignore[return-value]
+        shape = len(times), -1, like.shape[1]
+        return centre.to(like.dtype).reshape(shape), self._rates(times, centre).to(like.dtype).reshape(shape)
 
     def _mapped(self, times: Tensor) -> Tensor:
         assert callable(self.position)

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from ..errors import check_numbers, shape_of
+from ..parameters import check_knots, store
 
 
 class Waypoints(nn.Module):
@@ -41,15 +42,9 @@ class Waypoints(nn.Module):
                 "time and position must have shapes [K] and [K, D], K at least 2, "
                 f"got {shape_of(time)} and {shape_of(position)}"
             )
-        if not bool((time.diff() > 0).all() and time.isfinite().all()):
-            raise ValueError(f"time must increase, got {time.tolist()}")
-        if not bool(position.detach().isfinite().all()):
-            raise ValueError(f"position must be finite, got {position.tolist()}")
+        check_knots("time", time, "position", position)
         self.register_buffer("time", time)
-        if isinstance(position, nn.Parameter):
-            self.position = position
-        else:
-            self.register_buffer("position", position)
+        store(self, "position", position)
 
     def forward(self, time: Tensor) -> Tensor:
         """The position at times [] or [B], [D] or [B, D]."""

@@ -47,24 +47,23 @@ def law_calls(law: Material, state: Any) -> LawCalls:
     """
     laws = laws_of(law)
     material = law.check_material(state) if isinstance(law, Mixture) else None
-    names, history_names = [], []
-    lists = options, variables, parameters, history = [], [], [], []  # type: ignore[var-annotated]
+    names: list[str] = []
+    each: list[tuple[int, list[Tensor], list[Tensor]]] = []  # of the laws: options, parameters, history
+    history_names: list[list[str]] = []
     for part in laws:
         own: CompiledLaw = passive(part)  # type: ignore[assignment]
         names.append(own._name(state))
-        _add(lists, own.option_bits(), own._arguments(state)[1], own._history(state))
+        each.append((own.option_bits(), own._arguments(state)[1], own._history(state)))
         history_names.append(own.history_names())
         if isinstance(part, Active):
             names[-1] += f"+{FIBRE}"
-            _add(lists, 0, part.fibre_parameters(state), [])
+            each.append((0, part.fibre_parameters(state), []))
     return LawCalls(
-        ",".join(names), options, variables, parameters, history, history_names, material if len(laws) > 1 else None
+        ",".join(names),
+        [options for options, _, _ in each],
+        [len(history) for _, _, history in each],
+        [parameter for _, parameters, _ in each for parameter in parameters],
+        [variable for _, _, history in each for variable in history],
+        history_names,
+        material if len(laws) > 1 else None,
     )
-
-
-def _add(lists: Any, bits: int, own_parameters: list[Tensor], own_history: list[Tensor]) -> None:
-    options, variables, parameters, history = lists
-    options.append(bits)
-    variables.append(len(own_history))
-    parameters.extend(own_parameters)
-    history.extend(own_history)

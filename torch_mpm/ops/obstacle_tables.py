@@ -140,23 +140,22 @@ def _row_over(obstacle: Obstacle, like: Tensor, times: StepTimes) -> Tensor:
 def _path_over(obstacle: Obstacle, like: Tensor, times: StepTimes) -> tuple[Tensor, Tensor]:
     """Positions and velocities [n, 1 or B, D]. Where the host knows the time, a function is asked for times at which
     the obstacle is there, as in single steps; zero for others."""
-    n, dim, there = len(times.tensor), like.shape[1], times.between(obstacle.start, obstacle.end)
-    if len(there.tensor) == 0:
-        return like.new_zeros(n, 1, dim), like.new_zeros(n, 1, dim)
-    centre, velocity = obstacle.path_over(there.tensor.to(like.dtype), like)
-    before = 0
-    if times.numbers is not None and there.numbers is not None:
-        before = times.numbers.index(there.numbers[0])
-    around = (0, 0, 0, 0, before, n - before - len(there.tensor))
+    n, there = len(times.tensor), times.within(obstacle.start, obstacle.end)
+    moments = times.tensor[there].to(like.dtype)
+    if len(moments) == 0:
+        return like.new_zeros(n, 1, like.shape[1]), like.new_zeros(n, 1, like.shape[1])
+    centre, velocity = obstacle.path_over(moments, like)
+    around = (0, 0, 0, 0, there.start, n - there.stop)
     return F.pad(centre, around), F.pad(velocity, around)
 
 
 def path_requires_grad(obstacle: Obstacle, like: Tensor, times: StepTimes) -> bool:
     """Whether the first or the last of the positions on a path does."""
-    there = times.between(obstacle.start, obstacle.end).tensor.to(like.dtype)
+    there = times.tensor[times.within(obstacle.start, obstacle.end)].to(like.dtype)
     return any(obstacle.position(time).requires_grad for time in (*there[:1], *there[-1:]))
 
 
-def row_width(dim: int) -> int:
-    """Numbers of a row of the table, csrc/grid/obstacle.h."""
-    return 3 * dim + 2 * (1 if dim == 2 else 3) + 2
+def numbers_of_a_step(obstacles: Sequence[Obstacle], like: Tensor, least_rows: int) -> int:
+    """Of a table, with so many rows for each obstacle or those that its parameters have."""
+    shapes_of_rows = [_joined(_parts(o, like)).shape for o in obstacles]
+    return sum(width for _, width in shapes_of_rows) * max(least_rows, *(rows for rows, _ in shapes_of_rows))
