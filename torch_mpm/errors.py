@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import numbers
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -123,25 +122,6 @@ def check_numbers(name: str, value: Any, expected: str = "numbers") -> tuple[flo
     if isinstance(values, str) or not isinstance(values, Sequence):
         raise TypeError(f"{name} must be {expected}, got {_described(value)}")
     return tuple(float(check_number(name, a)) for a in values)
-
-
-def check_file(path: str | Path, kind: str) -> None:
-    """Raise for a file that is not there, is a folder, or cannot be read.
-
-    Raises:
-        OSError: FileNotFoundError, IsADirectoryError or PermissionError, with the path.
-    """
-    path = Path(path)
-    try:
-        if path.is_dir():
-            raise IsADirectoryError(f"{kind} file {path} is a folder")
-        path.open("rb").close()
-    except FileNotFoundError:
-        raise FileNotFoundError(f"{kind} file {path} does not exist") from None
-    except IsADirectoryError:
-        raise
-    except (OSError, ValueError) as error:  # ValueError: a null character in the name
-        raise PermissionError(f"{kind} file {path} cannot be read: {error}") from None
 
 
 def check_vector(name: str, value: Any, dim: int | None = None) -> tuple[float, ...]:

@@ -28,12 +28,12 @@ from .errors import (
     check_count,
     check_device,
     check_dtype,
-    check_file,
     check_number,
     check_vector,
     default_dtype,
     shape_of,
 )
+from .files import check_file
 from .shapes import Shape
 
 Vector = Sequence[float] | Tensor

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from .errors import check_file
+from .files import check_file
 
 Array = npt.NDArray[Any]
 

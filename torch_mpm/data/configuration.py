@@ -35,7 +35,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, ValidationError
 
-from ..errors import check_file
+from ..files import check_file
 from ..scene import Scene, SceneError, schema
 from ..scene.explain import explain
 from ..scene.scene import override, parsed

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from .. import boundaries, memory, seed
-from ..errors import check_file
+from ..files import check_file
 from ..grid import Grid
 from . import heat, schema
 from .places import obstacle, region

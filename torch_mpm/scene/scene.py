@@ -11,6 +11,7 @@ from typing import Any
 import torch
 from pydantic import PrivateAttr, ValidationError
 
+from ..files import read_text
 from ..seed import on_host
 from . import check, partial, schema
 from .build import Built, build
@@ -187,13 +188,13 @@ def parsed(path: Path) -> tuple[str, dict[str, Any]]:
         SceneError: for what is wrong in the file, with its name.
         FileNotFoundError: when there is no such file.
     """
-    if not path.exists():
-        raise FileNotFoundError(f"scene file {path} does not exist")
     try:
-        text = path.read_text(encoding="utf-8")
+        text = read_text(path, "scene")
         return text, tomllib.loads(text)
+    except FileNotFoundError:
+        raise
     except OSError as error:
-        raise SceneError([f"cannot be read: {error.strerror}"], str(path)) from None
+        raise SceneError([str(error)]) from None
     except (ValueError, RecursionError) as error:
         raise SceneError([f"not a TOML file: {error}"], str(path)) from None
 

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+from ...files import read_text
 from .simulator import MPM_Simulator_WARP
 
 MATERIAL: dict[str, Any] = {"material": "jelly", "grid_lim": 2.0, "n_grid": 50, "nu": 0.4, "E": 1e5, "density": 200.0}
@@ -68,7 +69,7 @@ def decode_param_json(
     Raises:
         ValueError: for a Poisson's ratio outside [0, 0.5], or a box of material parameters that lacks one.
     """
-    given = json.loads(Path(json_file).read_text())
+    given = json.loads(read_text(json_file, "configuration"))
 
     def part(defaults: Mapping[str, Any]) -> dict[str, Any]:
         return {name: given.get(name, value) for name, value in defaults.items()}
