@@ -16,6 +16,32 @@ def is_captured(x: Tensor) -> bool:
     return x.is_cuda and not torch.compiler.is_compiling() and torch.cuda.is_current_stream_capturing()
 
 
+@contextlib.contextmanager
+def capturing(graph: torch.cuda.CUDAGraph, pool: Any, device: torch.device) -> Iterator[None]:
+    """Capture the work of the current stream into a graph whose memory comes from a pool; other threads may go on.
+
+    Args:
+        graph: an empty graph.
+        pool: the pool of another graph, or None for a new one.
+        device: device of the stream.
+
+    A capture that fails leaves the allocator as it was.
+    """
+    pool = torch.cuda.graph_pool_handle() if pool is None else pool
+    graph.capture_begin(pool, capture_error_mode="thread_local")
+    try:
+        yield
+        graph.capture_end()
+    except BaseException:
+        with contextlib.suppress(RuntimeError):  # the error that is raised says why the capture failed
+            graph.capture_end()
+        # In torch before 2.12 the allocator stays in a capture whose end failed, and reads the graph at every later
+        # allocation, even when the graph is gone (pytorch #180395). Later versions refuse to end it again.
+        with contextlib.suppress(RuntimeError):
+            torch._C._cuda_endAllocateToPool(device.index, pool)
+        raise
+
+
 def is_traced(x: Tensor) -> bool:
     """Whether a compiler or a fake tensor stands for values, which cannot be read."""
     return torch.compiler.is_compiling() or is_exported() or isinstance(x, torch._subclasses.FakeTensor)
@@ -134,9 +160,11 @@ class Recordings:
         stream = torch.cuda.current_stream(device)
         if self._done is not None:
             stream.wait_event(self._done)
-        yield
-        self._done = torch.cuda.Event()
-        self._done.record(stream)
+        try:
+            yield
+        finally:
+            self._done = torch.cuda.Event()
+            self._done.record(stream)
 
     def __reduce__(self) -> tuple[type[Recordings], tuple[()]]:
         return Recordings, ()

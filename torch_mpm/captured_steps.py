@@ -15,7 +15,7 @@ from torch.autograd.function import once_differentiable
 
 from .activation_record import counts_of, uncounted
 from .anomaly import detecting
-from .capture import Recordings, Same, is_captured, is_transformed
+from .capture import Recordings, Same, capturing, is_captured, is_transformed
 from .errors import check_count, shape_of
 from .graphs import copied, copy_all, tensors_of, time_after, time_tensor
 from .grid import own_pools
@@ -480,24 +480,23 @@ _STREAMS = _Streams()
 
 @contextlib.contextmanager
 def _on_own_stream(device: torch.device) -> Iterator[None]:
-    """On the stream of graphs, between what is before and after."""
+    """The stream of graphs as the current one, in order with the work before and after.
+
+    The current stream waits on every way out, an exception included: memory of its tensors goes back to its allocator
+    then, and would be given out again while kernels of the other stream still read it.
+    """
     now, stream = torch.cuda.current_stream(device), _STREAMS.of(device)
     stream.wait_stream(now)
-    with torch.cuda.stream(stream):
-        yield
-    now.wait_stream(stream)
+    try:
+        with torch.cuda.stream(stream):
+            yield
+    finally:
+        now.wait_stream(stream)
 
 
 @contextlib.contextmanager
 def _into(graph: torch.cuda.CUDAGraph, beside: torch.cuda.CUDAGraph | None, device: torch.device) -> Iterator[None]:
-    """Where operations go into a graph that has its memory with another one. Other threads may go on meanwhile."""
+    """Operations go into a graph that has its memory with another one."""
     torch.cuda.synchronize(device)
-    with _on_own_stream(device):
-        graph.capture_begin(None if beside is None else beside.pool(), capture_error_mode="thread_local")
-        try:
-            yield
-        except BaseException:
-            with contextlib.suppress(RuntimeError):  # the capture has failed, as what is raised says
-                graph.capture_end()
-            raise
-        graph.capture_end()
+    with _on_own_stream(device), capturing(graph, None if beside is None else beside.pool(), device):
+        yield

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import collections
-import contextlib
 import threading
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -12,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from .activation_record import ActivationRecord
-from .capture import NUMBERS, GraphCache, Recordings, is_captured, is_of_library, is_transformed
+from .capture import NUMBERS, GraphCache, Recordings, capturing, is_captured, is_of_library, is_transformed
 from .errors import shape_of
 from .grid import Grid
 from .laws.custom import CustomLaw
@@ -160,24 +159,17 @@ class Replays:
         place = device, now.cuda_stream
         aside, latest = _LATEST.captures.get(place) or (torch.cuda.Stream(device), None)
         aside.wait_stream(now)
-        with torch.cuda.stream(aside):
-            # Other threads may go on meanwhile.
-            pool = None if latest is None else latest.pool()
-            self._graph.capture_begin(pool, capture_error_mode="thread_local")
-            self._record(function)
-        now.wait_stream(aside)
+        try:
+            with torch.cuda.stream(aside), capturing(self._graph, None if latest is None else latest.pool(), device):
+                self._record(function)
+        finally:
+            now.wait_stream(aside)
         _LATEST.captures[place] = aside, self._graph
 
     def _record(self, function: Callable[[State], State]) -> None:
-        try:
-            before, after = tensors_of(self.state), tensors_of(function(self.state))
-            changed = [name for name, value in after.items() if value is not before[name]]
-            copy_all([before[name] for name in changed], [after[name] for name in changed])
-        except BaseException:
-            with contextlib.suppress(RuntimeError):  # the capture has failed, as what is raised says
-                self._graph.capture_end()
-            raise
-        self._graph.capture_end()
+        before, after = tensors_of(self.state), tensors_of(function(self.state))
+        changed = [name for name, value in after.items() if value is not before[name]]
+        copy_all([before[name] for name in changed], [after[name] for name in changed])
 
     def replay(self, times: int) -> None:
         for _ in range(times):

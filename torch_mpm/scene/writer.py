@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import queue
 import threading
 import time
@@ -59,11 +60,15 @@ def _pinned(t: Tensor) -> Tensor:
     return torch.empty(t.shape, dtype=t.dtype, device="cpu", pin_memory=True)
 
 
+_stream_of = functools.cache(torch.cuda.Stream)
+"""The stream of a device for copies of checkpoints: one alone, since torch hands out 32 streams in turn, and work of
+another thread on a stream that is captured would go into its graph."""
+
+
 def _copied(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """Tensors that a device has made, in host memory: on a stream of their own, so that this thread alone waits."""
     device = next(iter(tensors.values())).device
-    cuda = device.type == "cuda"
-    with torch.cuda.stream(torch.cuda.Stream(device)) if cuda else contextlib.nullcontext():
+    with torch.cuda.stream(_stream_of(device)) if device.type == "cuda" else contextlib.nullcontext():
         return {name: t.cpu() for name, t in tensors.items()}
 
 

@@ -1,0 +1,79 @@
+"""Errors while CUDA graphs are recorded: streams and the allocator are left as after a success."""
+
+import contextlib
+
+import pytest
+import torch
+
+import torch_mpm as mpm
+from torch_mpm import captured_steps
+from torch_mpm.graphs import Replays
+
+F64 = torch.float64
+CYCLES = 200_000_000  # of a kernel that runs for a tenth of a second
+
+
+def still_busy(stream: torch.cuda.Stream) -> torch.cuda.Event:
+    """An event behind a kernel that runs for some time."""
+    with torch.cuda.stream(stream):
+        torch.cuda._sleep(CYCLES)
+        event = torch.cuda.Event()
+        event.record()
+    return event
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("fails", [False, True])
+def test_the_current_stream_waits_for_the_stream_of_graphs(fails):
+    device = torch.device("cuda", torch.cuda.current_device())
+    with contextlib.suppress(ZeroDivisionError), captured_steps._on_own_stream(device):
+        end = still_busy(torch.cuda.current_stream())
+        if fails:
+            raise ZeroDivisionError
+    torch.cuda.current_stream().synchronize()
+    assert end.query()
+
+
+class Waiting(torch.nn.Module):
+    """A step that waits for the device in its last call alone, which is the recorded one."""
+
+    def __init__(self, step: mpm.Step, calls: int) -> None:
+        super().__init__()
+        self.step, self.calls = step, calls
+
+    def forward(self, state: mpm.State, dt: float) -> mpm.State:
+        self.calls -= 1
+        if self.calls == 0:
+            torch.cuda.synchronize()
+        return self.step(state, dt)
+
+
+def blob() -> tuple[mpm.Step, mpm.State]:
+    grid = mpm.Grid(dx=0.1, lower=(0, 0), upper=(1, 1))
+    points = mpm.seed.box((0.3, 0.3), (0.6, 0.6), grid, per_cell=4, dtype=F64)
+    state = mpm.State.at_rest(points, 1000.0, device="cuda", dtype=F64)
+    return mpm.Step(grid, mpm.NeoHookean(E=1e4, nu=0.3)), state
+
+
+@pytest.mark.cuda
+def test_the_allocator_ends_a_failed_capture():
+    """An allocator that stays in the capture refuses to give up memory, and reads a graph that is gone."""
+    step, state = blob()
+    with torch.no_grad():
+        with pytest.raises(RuntimeError):
+            mpm.captured(Waiting(step, captured_steps.TRIALS + 1), state, 1e-4)
+        torch.cuda.empty_cache()
+        end = mpm.captured(step, state, 1e-4, n=2)(state)
+        assert torch.equal(end.x, step(step(state, 1e-4), 1e-4).x)
+
+
+@pytest.mark.cuda
+def test_replays_that_cannot_be_recorded():
+    step, state = blob()
+    with torch.no_grad():
+        state = step(state, 1e-4)
+        waiting = Waiting(step, 1)
+        with pytest.raises(RuntimeError):
+            Replays(lambda state: waiting(state, 1e-4), state, step.grid.pool(state.x, None))
+        torch.cuda.empty_cache()
+        assert torch.isfinite(mpm.rollout(step, state, 20, 1e-4).x).all()
