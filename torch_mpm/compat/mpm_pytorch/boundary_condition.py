@@ -13,10 +13,9 @@ from ...particle_operations import Hold, Push, Timed
 from ...state import State
 from ..node_conditions import stopping_plane, surface_margin
 from ..selections import Rotation, in_box, in_cylinder
-from .mpm_solver import MPMSolver
+from .mpm_solver import RESET_STEPS, MPMSolver
 
 Numbers = Sequence[float]
-RESET_STEPS = 15
 CUBOID_END, FOREVER = 1e3, 999.0
 
 

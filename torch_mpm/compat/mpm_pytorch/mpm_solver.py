@@ -15,9 +15,12 @@ from ...particle_operations import Operations
 from ...step import Step
 from ..given_stress import GivenStress, clamped, stepped
 from ..node_conditions import NodeDamping
+from .call_times import CallTimes, is_recomputed
 
 LARGEST_ENTRY = 2.0
 """To which entries of F are clamped."""
+RESET_STEPS = 15
+"""Steps for which a cuboid with `reset` stops its nodes after its end."""
 
 
 class MPMSolver:
@@ -28,6 +31,9 @@ class MPMSolver:
 
     Every particle has the volume prod(size)/P and the density rho. Gradients pass to all five tensors, which may be
     float32 or float64.
+
+    The solver counts its own `time`, at which conditions act. A call that `torch.utils.checkpoint` recomputes has the
+    time of the first call, and leaves that of the solver as it is.
 
     Args:
         init_pos: positions [P, 3] [m] by which boundary conditions choose particles.
@@ -76,6 +82,7 @@ class MPMSolver:
         self.pre_particle_process: list[Any] = []
         self.post_grid_process: list[Any] = []
         self.displacement: Tensor | None = None
+        self._times = CallTimes()
         self.step = Step(
             Grid(self.dx, (0.0,) * 3, (1.0,) * 3), GivenStress(), gravity=tuple(gravity), stress_form="gradient"
         )
@@ -87,13 +94,13 @@ class MPMSolver:
         self.time = 0.0
 
     def __call__(
-        self, x: Tensor, v: Tensor, C: Tensor, F: Tensor, stress: Tensor
+        self, x: Tensor, v: Tensor, C: Tensor, F: Tensor, stress: Tensor, time: float | None = None
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """`p2g2p`"""
-        return self.p2g2p(x, v, C, F, stress)
+        return self.p2g2p(x, v, C, F, stress, time)
 
     def p2g2p(
-        self, x: Tensor, v: Tensor, C: Tensor, F: Tensor, stress: Tensor
+        self, x: Tensor, v: Tensor, C: Tensor, F: Tensor, stress: Tensor, time: float | None = None
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """The particles a time step later.
 
@@ -103,22 +110,50 @@ class MPMSolver:
             C: affine velocity field [P, 3, 3] [1/s].
             F: deformation gradient [P, 3, 3].
             stress: Kirchhoff stress [P, 3, 3] [Pa].
+            time: at the start of the step [s]; by default that of the solver, or of the call that is recomputed.
 
         Returns:
             x, v, C and F.
+
+        Raises:
+            TypeError, ValueError: for a wrong argument.
+            RuntimeError: for a call in a backward pass whose time is not known, and whose conditions depend on it.
         """
         check_like("x", x, x, (self.n_particles, 3), "[P, 3]")
+        recomputed = is_recomputed()
+        if time is None:
+            time = self._recomputed_time((x, v, C, F)) if recomputed else self.time
+        else:
+            check_number("time", time)
+        if not recomputed:
+            self._times.record((x, v, C, F), time)
+            self.time = time + self.dt
         self._set_boundaries()
         self.displacement = None
         volume = self._volume.to(x)
         mass = volume * (self.p_mass / self.vol)
-        state = stepped(self.step, x, v, C, F, stress, mass, volume, self.time, self.dt)
-        self.time += self.dt
+        state = stepped(self.step, x, v, C, F, stress, mass, volume, time, self.dt)
         assert state.C is not None and state.F is not None
         # Weights are those of the positions before they are displaced, as in MPM-PyTorch.
         after = state.x if self.displacement is None else state.x + self.displacement
         after = clamped(after, self.clip_bound, 1 - self.clip_bound)
-        return after, state.v, state.C, clamped(state.F, -LARGEST_ENTRY, LARGEST_ENTRY)
+        result = after, state.v, state.C, clamped(state.F, -LARGEST_ENTRY, LARGEST_ENTRY)
+        if recomputed:
+            self._times.record(result, time + self.dt)
+        return result
+
+    def _recomputed_time(self, arguments: tuple[Tensor, ...]) -> float:
+        """The time of the call that is recomputed; that of the solver where no condition depends on it."""
+        known = self._times.of(arguments)
+        times = known or {0.0, self.time}
+        first, last = min(times), max(times)
+        conditions = [*self.pre_particle_process, *self.post_grid_process]
+        if first < last and any(_may_change(c, first, last, self.dt) for c in conditions):
+            raise RuntimeError(
+                "the solver was called in a backward pass with tensors of no single earlier call, and conditions "
+                f"depend on the time (found the times {sorted(known)}): give time=, or call reset() before each pass"
+            )
+        return last
 
     def _set_boundaries(self) -> None:
         """Give the step what was added to the lists since the last one."""
@@ -130,3 +165,11 @@ class MPMSolver:
         self.step.on_particles = Operations(operations) if operations else None
         damping = [NodeDamping(self.damping)] if self.damping < 1 else []
         self.step.boundaries = [*damping, *nodes]  # type: ignore[assignment]
+
+
+def _may_change(condition: Any, first: float, last: float, dt: float) -> bool:
+    """Whether a condition may begin or end between two times."""
+    if not (hasattr(condition, "start") and hasattr(condition, "end")):
+        return True  # a function of the user
+    ends = (condition.end, condition.end + RESET_STEPS * dt)
+    return first < condition.start <= last or any(first <= end <= last for end in ends)
