@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import collections
 import contextlib
 import functools
 import threading
@@ -423,12 +424,14 @@ class Graphs:
     def record(self, beside: Graphs | None) -> None:
         """Make the graphs, in the memory of others where there are some."""
         self._forward, self._backward = torch.cuda.CUDAGraph(), torch.cuda.CUDAGraph()
-        with _into(self._forward, None if beside is None else beside._forward, self._device):
+        self._memory: _GraphMemory = _GraphMemory(self._device) if beside is None else beside._memory
+        with _into(self._forward, self._memory.pool, self._device):
             ends = self._steps(*self.read)
+        self._memory.owned_by(self._forward)
         self.follows = [t.requires_grad for t in ends]
         self._grads = [torch.zeros_like(t) for t in ends if t.requires_grad]
         if self._grads:
-            with _into(self._backward, self._forward, self._device):
+            with _into(self._backward, self._memory.pool, self._device):
                 self._found = self._gradients(ends, self._grads)
         self._ends = [t.detach() for t in ends]
 
@@ -469,13 +472,44 @@ def _others(ends: Sequence[Tensor], read: Sequence[Tensor]) -> Iterator[str]:
 
 
 class _Streams(threading.local):
-    """The stream of a thread for each device on which graphs are captured: libraries keep memory for each stream."""
+    """The stream of a thread for each device on which graphs are captured: libraries keep memory for each stream.
+
+    Attributes:
+        of: the stream of a device.
+        unused: graphs that are not replayed any more, each of which holds memory for later ones of its device.
+    """
 
     def __init__(self) -> None:
         self.of: Callable[[torch.device], torch.cuda.Stream] = functools.cache(torch.cuda.Stream)
+        self.unused: dict[torch.device, list[torch.cuda.CUDAGraph]] = collections.defaultdict(list)
 
 
 _STREAMS = _Streams()
+
+
+class _GraphMemory:
+    """Memory that graphs share: that of graphs which are gone, where there is some.
+
+    The allocator keeps the memory of a graph that is gone until it is short of memory, and other processes cannot have
+    it. So the last user of the memory leaves one graph behind, whose memory the next recording takes.
+    """
+
+    def __init__(self, device: torch.device) -> None:
+        self._unused = _STREAMS.unused[device]
+        self._owner: torch.cuda.CUDAGraph | None = None
+        if self._unused:
+            self.owned_by(self._unused.pop())
+
+    @property
+    def pool(self) -> Any:
+        """Identity of the memory; None before the first graph."""
+        return None if self._owner is None else self._owner.pool()
+
+    def owned_by(self, graph: torch.cuda.CUDAGraph) -> None:
+        """Name the graph that holds the memory, unless there is one."""
+        if self._owner is None:
+            self._owner = graph
+            weakref.finalize(self, self._unused.append, graph).atexit = False
 
 
 @contextlib.contextmanager
@@ -495,8 +529,8 @@ def _on_own_stream(device: torch.device) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _into(graph: torch.cuda.CUDAGraph, beside: torch.cuda.CUDAGraph | None, device: torch.device) -> Iterator[None]:
-    """Operations go into a graph that has its memory with another one."""
+def _into(graph: torch.cuda.CUDAGraph, pool: Any, device: torch.device) -> Iterator[None]:
+    """Operations go into a graph with the memory of a pool, None for new memory."""
     torch.cuda.synchronize(device)
-    with _on_own_stream(device), capturing(graph, None if beside is None else beside.pool(), device):
+    with _on_own_stream(device), capturing(graph, pool, device):
         yield
