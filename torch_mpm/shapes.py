@@ -430,7 +430,8 @@ class Sampled(Shape):
 
     Args:
         values: signed distances [m], negative inside, positive on the border: [X, Y] or [X, Y, Z], at least 2 of each.
-            Steeper ones than distances are flattened, which keeps their zero level.
+            Values that are steeper than distances are divided by their largest slope from node to node of a cell, which
+            keeps their zero level.
         lower: the first node in the coordinates of the shape [m], D numbers.
         spacing: distance of the nodes [m].
 
@@ -450,8 +451,7 @@ class Sampled(Shape):
             raise ValueError("values must be finite")
         if any(bool((values.select(axis, end) <= 0).any()) for axis in range(values.dim()) for end in (0, -1)):
             raise ValueError("values must be positive on the border of the lattice: enlarge it")
-        slopes = (float(values.diff(dim=axis).abs().max()) / self.spacing for axis in range(values.dim()))
-        self.values = values / max(1.0, math.hypot(*slopes))
+        self.values = values / max(1.0, _steepest(values) / self.spacing)
 
     @classmethod
     def of(cls, shape: Shape, lower: Sequence[float], upper: Sequence[float], spacing: float) -> Sampled:
@@ -500,6 +500,21 @@ class Sampled(Shape):
 
 
 # ---- geometry
+
+
+def _steepest(values: Tensor) -> float:
+    """Largest slope between two nodes of one cell of a lattice of unit spacing; at most 1 where values are distances.
+
+    The interpolant of these values has at most this slope along each axis, on which the kernel relies (csrc/grid/
+    obstacle.h).
+    """
+    most = 0.0
+    for step in itertools.product((-1, 0, 1), repeat=values.dim()):
+        if step > (0,) * values.dim():  # one of each pair of opposite steps
+            starts = tuple(slice(max(0, -s), n - max(0, s)) for s, n in zip(step, values.shape, strict=True))
+            ends = tuple(slice(max(0, s), n - max(0, -s)) for s, n in zip(step, values.shape, strict=True))
+            most = max(most, float((values[ends] - values[starts]).abs().max()) / math.hypot(*step))
+    return most
 
 
 def ball_volume(dim: int, radius: float) -> float:

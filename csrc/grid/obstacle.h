@@ -306,14 +306,16 @@ MPM_HD Touch<S, D> touch(const ContactArguments<T, D>& a, const ObstaclePose<S, 
 }
 
 // Whether an obstacle may touch a node of the block whose first node is at `first`. Distances change by no more than
-// the way from a point to another.
+// the way from a point to another; samples of distances do so between the nodes of their lattice, so that the slope of
+// their multilinear interpolant is at most 1 along each axis.
 template <class T, int D>
 MPM_HD bool near_block(const ContactArguments<T, D>& a, const ObstaclePose<T, D>& o, const Vector<T, D>& first) {
   const T half = T(0.5 * (kBlockWidth - 1) * a.dx);
   Vector<T, D> arm, normal;
   MPM_UNROLL for (int i = 0; i < D; i++)
     arm[i] = first[i] + half - o.centre[i];
-  const T reach = std::sqrt(T(D)) * half * T(1.001) + a.rounding;
+  const T slope = o.shape == ObstacleShape::sampled ? std::sqrt(T(D)) : T(1);
+  const T reach = slope * std::sqrt(T(D)) * half * T(1.001) + a.rounding;
   return surface(o, transpose(o.rotation) * arm, normal) <= reach;
 }
 

@@ -35,11 +35,10 @@ def obstacle(dim: int, spacing: float = 0.05, kind: str = "separate", **options)
 
 @pytest.mark.parametrize("spacing", [0.05, 0.025, 0.0125])
 def test_samples_are_as_far_off_as_the_spacing_says(spacing, dim):
-    """Second order: h²/8 times the curvatures, which are below 2/0.2² here, in units of the steepest slope."""
+    """Second order: h²/8 times the curvatures, which are below 2/0.2² here."""
     x = 0.8 * (torch.rand(2000, dim, dtype=torch.float64) - 0.5)
     shape = sampled(dim, spacing)
-    steepest = float((ellipsoid(x) / shape.surface(x)[0]).median())  # samples are flattened by a factor
-    error = (shape.surface(x)[0] * steepest - ellipsoid(x)).abs()
+    error = (shape.surface(x)[0] - ellipsoid(x)).abs()
     away = x.norm(dim=1) > 0.1  # at the centre the distance has a kink
     assert float(error[away].max()) < 3 * spacing**2
     normal = shape.surface(x)[1]
@@ -47,6 +46,38 @@ def test_samples_are_as_far_off_as_the_spacing_says(spacing, dim):
     (gradient,) = torch.autograd.grad(ellipsoid(x).sum(), x)
     turn = (normal - gradient / gradient.norm(dim=1, keepdim=True)).norm(dim=1)
     assert float(turn[away].max()) < 12 * spacing
+
+
+TURNED = (0.6, -0.8, 0.5)
+EXACT = {
+    "sphere": lambda dim: shapes.Sphere(0.2),
+    "box": lambda dim: shapes.Box((0.3, 0.5, 0.4)[:dim]),
+    "capsule": lambda dim: shapes.Capsule((0.1, 0.12, -0.07)[:dim], 0.13),
+    "revolved": lambda dim: shapes.Revolved(((0.0, -0.2), (0.2, -0.1), (0.05, 0.0), (0.2, 0.2)), TURNED[:dim]),
+    "sdf": lambda dim: shapes.SDF(lambda x: x.norm(dim=1) - 0.2),
+    "sampled": lambda dim: shapes.Sampled.of(shapes.Sphere(0.2), (-0.5,) * dim, (0.5,) * dim, 0.025),
+}
+
+
+@pytest.mark.parametrize("name", EXACT)
+def test_distances_are_sampled_as_they_are(name, dim):
+    """At the nodes to rounding, between them within half a diagonal of a cell: no distance is flattened."""
+    exact, spacing = EXACT[name](dim), 0.05
+    shape = shapes.Sampled.of(exact, (-0.5,) * dim, (0.5,) * dim, spacing)
+    nodes = spacing * torch.randint(-10, 11, (200, dim), generator=torch.Generator().manual_seed(1)).double()
+    torch.testing.assert_close(shape.signed_distance(nodes), exact.signed_distance(nodes), rtol=1e-9, atol=1e-12)
+    x = torch.rand(2000, dim, dtype=torch.float64, generator=torch.Generator().manual_seed(2)) - 0.5
+    error = (shape.signed_distance(x) - exact.signed_distance(x)).abs()
+    assert float(error.max()) < 0.5 * dim**0.5 * spacing and float(error.median()) < 0.03 * spacing
+
+
+def test_values_steeper_than_distances_are_flattened(dim):
+    """By their slope, here along the diagonals: |x| + |y| (+ |z|) - 0.3 is steeper than a distance by √D."""
+    steep = shapes.SDF(lambda x: x.abs().sum(1) - 0.3)
+    flat = shapes.Sampled.of(steep, (-0.5,) * dim, (0.5,) * dim, 0.05)
+    x = 0.05 * torch.tensor([[3, 5, -2], [1, -1, 3]], dtype=torch.float64)[:, :dim]
+    ratio = steep.signed_distance(x) / flat.signed_distance(x)
+    torch.testing.assert_close(ratio, torch.full_like(ratio, dim**0.5), rtol=1e-9, atol=0)
 
 
 @pytest.mark.parametrize("kind", ["sticky", "slip", "separate"])
@@ -60,10 +91,20 @@ def test_the_kernel_does_what_torch_operations_do(kind, dim, device):
     torch.testing.assert_close(found, expected, rtol=1e-12, atol=1e-12)
 
 
-def test_no_node_inside_is_missed_by_the_test_of_blocks(dim, device):
-    """Samples far steeper than a distance: blocks are left out by their distance."""
-    blocks, positions, velocity = nodes(dim, device)
-    steep = shapes.Sampled.of(shapes.SDF(lambda x: 100 * ellipsoid(x)), (-0.5,) * dim, (0.5,) * dim, 0.05)
+STEEP = {
+    "values far steeper than a distance": (shapes.SDF(lambda x: 100 * ellipsoid(x)), 0.05),
+    "an interpolant that is steeper than its values": (shapes.Sphere(0.1), 0.5),
+}
+
+
+@pytest.mark.parametrize("name", STEEP)
+def test_no_node_inside_is_missed_by_the_test_of_blocks(name, dim, device):
+    """Blocks are left out by their distance; within a cell the slope may reach √D."""
+    grid = mpm.Grid(dx=0.02, lower=(0.0,) * dim, upper=(1.0,) * dim)
+    blocks = grid.activate(mpm.seed.box((0.3,) * dim, (0.7,) * dim, grid, 1, dtype=torch.float64, device=device).x)
+    positions = blocks.node_positions(torch.float64)
+    velocity = torch.ones_like(positions)
+    steep = shapes.Sampled.of(STEEP[name][0], (-0.5,) * dim, (0.5,) * dim, STEEP[name][1])
     body = mpm.boundaries.Obstacle(steep, (0.5,) * dim, "sticky")
     inside = body.contains(positions, None, 0.0) & blocks.active_nodes()
     found = contact(blocks, velocity, [body], 0.0)
