@@ -7,6 +7,7 @@ import contextlib
 from collections.abc import Callable, Hashable, Iterator
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -92,8 +93,74 @@ def remember(kept: list[Any], value: Any) -> None:
         kept.append(value)
 
 
+COMPARED = 2**16
+"""Entries of a tensor on the CPU whose contents are always compared; beyond it, those of at most as many entries as the
+tensors that a step computes with have."""
+
+
+class Remembered:
+    """A tensor as it was at a time, to find out whether it has been changed since.
+
+    Contents are compared on the CPU. A write by any way is seen there: in place, by `.data`, by an array that shares
+    the memory. On another device, and of tensors on the CPU with more than `most` entries, the version counter and the
+    address are compared, which takes no synchronisation: writes through `.data` and by others that share the memory
+    change neither.
+    """
+
+    def __init__(self, t: Tensor, most: int = COMPARED) -> None:
+        self._tensor, self._version, self._contents = t, None, None
+        if torch.compiler.is_compiling():
+            return
+        self._version = version(t), _address(t)
+        if _is_plain(t) and t.is_cpu and t.numel() <= most:
+            with torch.inference_mode(False):
+                self._contents = t.detach().clone()
+
+    def is_now(self, t: Any) -> bool:
+        """Whether a value is that tensor, unchanged."""
+        if t is not self._tensor or torch.compiler.is_compiling():
+            return t is self._tensor
+        if self._contents is not None:
+            return self._contents.shape == t.shape and torch.equal(self._contents, t)
+        return self._version == (version(t), _address(t))
+
+
+def _is_plain(t: Tensor) -> bool:
+    """Whether a tensor has memory of its own that can be read: no wrapper of a transform, no subclass."""
+    plain = type(t) in (Tensor, torch.nn.Parameter) and t.layout == torch.strided
+    return plain and not torch._C._functorch.is_functorch_wrapped_tensor(t)
+
+
+def _address(t: Tensor) -> int:
+    return t.data_ptr() if _is_plain(t) else 0
+
+
+def as_remembered(value: Any, most: int = COMPARED) -> Any:
+    """A value as a part of a key: tensors as `Remembered`; lists, tuples and arrays as tuples; others as they are."""
+    if isinstance(value, Tensor):
+        return Remembered(value, most)
+    if isinstance(value, np.ndarray):
+        value = value.tolist()
+    return tuple(as_remembered(part, most) for part in value) if isinstance(value, (list, tuple)) else value
+
+
+def is_same(known: Any, value: Any) -> bool:
+    """Whether a value is still what `as_remembered` made a part of a key of."""
+    if isinstance(known, Remembered):
+        return known.is_now(value)
+    if isinstance(value, Tensor):
+        return False
+    if isinstance(value, np.ndarray):
+        value = value.tolist()
+    if not isinstance(value, (list, tuple)):
+        return known is value or bool(known == value)
+    same_length = isinstance(known, tuple) and len(known) == len(value)
+    return same_length and all(is_same(a, b) for a, b in zip(known, value, strict=True))
+
+
 class GraphCache:
-    """The latest value by key: tensors on the device that no step waits for, made again when the key changes.
+    """The latest value by key: tensors on the device that no step waits for, made again when the key changes, or what
+    is in its lists, arrays and tensors (see `Remembered`).
 
     A value that a CUDA graph has captured is kept for its replays, also when the key has changed since.
     """
@@ -103,15 +170,15 @@ class GraphCache:
         self._captured: list[Any] = []
 
     def get(self, key: tuple[Any, ...], make: Callable[[], Any], like: Tensor) -> Any:
-        """The value of a key, of numbers and tensors (these by identity), for work on the device of `like`."""
+        """The value of a key, of numbers, tensors and lists of these, for work on the device of `like`."""
         captured = is_captured(like)
-        if self._latest is None or not _same(self._latest[0], key):
+        if self._latest is None or not is_same(self._latest[0], key):
             with torch.inference_mode(False):  # such that a later step may differentiate through it
                 made = make()
             # What is made in a graph has its value in replays only, in a transform of torch.func belongs to that.
             if captured or torch._C._are_functorch_transforms_active():
                 return made
-            self._latest = (key, made)
+            self._latest = (as_remembered(key, max(COMPARED, like.numel())), made)
         value = self._latest[1]
         if captured:
             remember(self._captured, value)
@@ -204,18 +271,3 @@ class Recordings:
         content = alike[0]
         self._latest_content[name] = t, now, content
         return content
-
-
-def _same(a: tuple[Any, ...], b: tuple[Any, ...]) -> bool:
-    """Equality of nested tuples, tensors by identity."""
-    if len(a) != len(b):
-        return False
-    for s, t in zip(a, b, strict=True):
-        if s is t:
-            continue
-        if isinstance(s, tuple) and isinstance(t, tuple):
-            if not _same(s, t):
-                return False
-        elif isinstance(s, Tensor) or isinstance(t, Tensor) or s != t:
-            return False
-    return True

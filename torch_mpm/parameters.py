@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor, nn
 
-from .capture import GraphCache, is_traced, version
+from .capture import GraphCache, is_traced
 from .errors import check_numbers, check_real, shape_of
 from .ops.arguments import per_parameter
 
@@ -87,8 +87,7 @@ class Table(nn.Module):
 
         if is_traced(temperature) or own[1].requires_grad:
             return make()
-        key = *own, *map(version, own), temperature.dtype, temperature.device
-        return self._kept.get(key, make, temperature)
+        return self._kept.get((*own, temperature.dtype, temperature.device), make, temperature)
 
 
 class PerMaterial(nn.Module):

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Hashable
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -99,8 +100,10 @@ def _value(value: Any) -> Hashable:
         return Same(value), repr(value)
     if isinstance(value, Grid) or callable(value):
         return Same(value)
+    if isinstance(value, np.ndarray):
+        value = value.tolist()
     if isinstance(value, (list, tuple)) and not any(isinstance(part, Tensor) for part in value):
-        return tuple(part if isinstance(part, NUMBERS) else Same(part) for part in value)
+        return tuple(_value(part) if isinstance(part, (*NUMBERS, list, tuple)) else Same(part) for part in value)
     return None
 
 

@@ -82,7 +82,8 @@ class Walls:
 
     def faces(self, grid: _Box) -> tuple[Face, ...]:
         """The 2 D faces: lower and upper of the first axis, then of the next."""
-        key = (self.kind, self.friction, self.lower, self.upper, grid.dx, grid.lower, grid.upper)
+        own = tuple(map(_frozen, (self.kind, self.friction, self.lower, self.upper)))
+        key = (*own, grid.dx, grid.lower, grid.upper)
         if self._faces[0] != key:
             self._faces = (key, self._resolve(grid))
         return self._faces[1]

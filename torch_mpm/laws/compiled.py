@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from numbers import Real
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import torch
 from torch import Tensor, nn
 
-from ..capture import GraphCache, is_traced, version
+from ..capture import GraphCache, is_traced
 from ..errors import check_number, shape_of
 from ..ops.arguments import refuse_batched, soa_empty
 from ..ops.implicit import add_deviator
@@ -64,6 +65,14 @@ class CompiledLaw(Material):
         super().__init__()
         self._kept_parameters, self._kept_scalars = GraphCache(), GraphCache()
         self._functions = False
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        """Tensors in the place of numbers are buffers, as those of the constructor are."""
+        if isinstance(value, Tensor) and name in vars(self):
+            del vars(self)[name]
+            self._store(name, value)
+        else:
+            super().__setattr__(name, value)
 
     @staticmethod
     def _describe(target: Any) -> None:
@@ -254,11 +263,11 @@ class CompiledLaw(Material):
         tensors = [t for t in (*self._parameters.values(), *self._buffers.values()) if t is not None]
         if torch.compiler.is_compiling() or any(t.requires_grad for t in tensors):
             return self._convert(state)
-        numbers = [value for value in vars(self).values() if isinstance(value, float)]
+        numbers = [value for value in vars(self).values() if isinstance(value, Real)]
         x, order = state.x, None
         if tensors and any(t.numel() == getattr(state, "particles", x.shape[0]) for t in tensors):
             order = state.ids  # of what differs by particle
-        key = (x.dtype, x.device, order, *numbers, *((t, version(t)) for t in tensors))
+        key = (x.dtype, x.device, order, *numbers, *tensors)
         return self._kept_parameters.get(key, lambda: self._convert(state), x)
 
     def _at_temperature(self, state: State) -> CompiledLaw:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor, nn
 
-from ..capture import without_transforms
+from ..capture import Remembered, without_transforms
 from ..errors import shape_of
 from ..ops.arguments import soa_empty
 from ..ops.implicit import tangent_entries
@@ -25,8 +25,9 @@ __all__ = ["Mixture"]
 class Mixture(Material):
     """Several laws in one state: law k for the particles with state.material = k.
 
-    The particles of each law are found once per `state.material` tensor, which synchronises with the device; replace
-    the tensor rather than write into it. Per-particle parameters of the laws have shape [P] for the whole state.
+    The particles of each law are found once per `state.material` tensor, which synchronises with the device, and again
+    when it has been written to (on CUDA as far as its version counter shows). Per-particle parameters of the laws have
+    shape [P] for the whole state.
 
     Args:
         laws: at least one; functions and modules F -> τ as by `CustomLaw`.
@@ -50,8 +51,8 @@ class Mixture(Material):
         self.state_fields = tuple(sorted({field for law in parts for field in law.state_fields}))
         self.extra_fields = tuple(sorted({field for law in parts for field in law.extra_fields}))
         self.viscous = any(law.viscous for law in parts)
-        self._material: Tensor | None = None
-        self._checked: Tensor | None = None
+        self._material: Remembered | None = None
+        self._checked: Remembered | None = None
         self.indices: list[Tensor] = []
 
     def update(self, state: State) -> tuple[dict[str, Tensor], Tensor]:
@@ -162,31 +163,35 @@ class Mixture(Material):
         material = state.material
         if material is None:
             raise ValueError("a Mixture needs state.material, int32 [P]")
-        if material is not self._material and material is not self._checked:
+        if not (_is_still(self._material, material) or _is_still(self._checked, material)):
             if material.numel() and not bool(((material >= 0) & (material < len(self.laws))).all()):
                 raise ValueError(
                     f"state.material must be in 0 .. {len(self.laws) - 1}, got {material.unique().tolist()}"
                 )
-            self._checked = material
+            self._checked = Remembered(material, material.numel())
         return material
 
     def reordered(self, before: Tensor | None, after: Tensor | None) -> None:
         """Take a state.material for checked that has the entries of another, in any order, if that one was checked."""
-        if before is not None and (before is self._material or before is self._checked):
-            self._checked = after
+        if after is not None and (_is_still(self._material, before) or _is_still(self._checked, before)):
+            self._checked = Remembered(after, after.numel())
 
     def _particles(self, state: Any) -> list[Tensor]:
         """Those of each law, int64."""
         material = self.check_material(state)
-        if material is not self._material:
+        if not _is_still(self._material, material):
             indices = ((material == k).nonzero().squeeze(1) for k in range(len(self.laws)))
             self.indices = [without_transforms(index) for index in indices]
-            self._material = material
+            self._material = Remembered(material, material.numel())
         return self.indices
 
     def _parts(self, state: State) -> list[tuple[Any, Any]]:
         indices = self._particles(state)
         return [(_Part(state, index), law) for index, law in zip(indices, self.laws, strict=True) if len(index)]
+
+
+def _is_still(known: Remembered | None, material: Tensor | None) -> bool:
+    return known is not None and known.is_now(material)
 
 
 OF_SCENES = ("dt", "time", "impulse")

@@ -141,8 +141,7 @@ class QuarticSand(SolidLaw):
         """α of the friction angle, kept from call to call while that has not changed and requires no gradient."""
         if torch.compiler.is_compiling() or angle.requires_grad or HARDENING in self.extra_fields:
             return friction_alpha(angle, dim)
-        key = (angle, angle._version, dim)
-        return self._kept_slope.get(key, lambda: friction_alpha(angle, dim), angle)
+        return self._kept_slope.get((angle, dim), lambda: friction_alpha(angle, dim), angle)
 
     def _hardening(self, state: State) -> Tensor:
         q = state.extra.get(HARDENING)

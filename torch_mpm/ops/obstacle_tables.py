@@ -53,12 +53,11 @@ def tables(obstacles: Sequence[Obstacle], like: Tensor, scenes: int) -> tuple[Te
     """Parameters [1 or B, K, width] and data [n] of the shapes; kept while nothing has changed."""
     if torch.compiler.is_compiling() or type(like) not in (Tensor, torch.nn.Parameter):
         return _build(obstacles, like, scenes)
-    key: list[Any] = [like.dtype, like.device, scenes]
-    for value in (v for o in obstacles for v in (o, o.shape, *_values(o))):
-        if isinstance(value, Tensor) and value.requires_grad and torch.is_grad_enabled():
-            return _build(obstacles, like, scenes)
-        key += [value, value._version if isinstance(value, Tensor) else None]
-    kept: tuple[Tensor, Tensor] = obstacles[0].kept_table.get(tuple(key), lambda: _build(obstacles, like, scenes), like)
+    values = [v for o in obstacles for v in (o, o.shape, *_values(o))]
+    if torch.is_grad_enabled() and any(isinstance(v, Tensor) and v.requires_grad for v in values):
+        return _build(obstacles, like, scenes)
+    key = like.dtype, like.device, scenes, *values
+    kept: tuple[Tensor, Tensor] = obstacles[0].kept_table.get(key, lambda: _build(obstacles, like, scenes), like)
     return kept
 
 
