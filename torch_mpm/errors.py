@@ -118,6 +118,8 @@ def check_device(device: Any) -> None:
 
 def check_numbers(name: str, value: Any, expected: str = "numbers") -> tuple[float, ...]:
     """Finite numbers, from a list or an array of one dimension."""
+    if isinstance(value, Tensor) and value.requires_grad:
+        raise ValueError(f"{name} must be {expected}, got a tensor that requires grad, which numbers have not")
     values = value.tolist() if hasattr(value, "tolist") else value
     if isinstance(values, str) or not isinstance(values, Sequence):
         raise TypeError(f"{name} must be {expected}, got {_described(value)}")

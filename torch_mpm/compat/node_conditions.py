@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
 
 from ..boundaries import Box, Obstacle, Plane
+from ..parameters import TensorModule
+from .gradients import Numbers
 
 
 def surface_margin(dtype: torch.dtype, extent: float) -> float:
@@ -20,7 +21,7 @@ def surface_margin(dtype: torch.dtype, extent: float) -> float:
 
 
 def stopping_plane(
-    point: Sequence[float], normal: Sequence[float], margin: float, start: float, end: float, kind: str = "sticky"
+    point: Numbers, normal: Numbers, margin: float, start: float, end: float, kind: str = "sticky"
 ) -> Plane:
     """Acts on the nodes behind a plane, but for those within a margin [m] behind it."""
     size = math.sqrt(sum(n * n for n in normal))
@@ -31,15 +32,20 @@ def stopping_plane(
 
 
 def moving_cuboid(
-    point: Sequence[float], half: Sequence[float], velocity: Sequence[float], margin: float, start: float, end: float
+    point: Numbers,
+    half: Numbers,
+    velocity: Numbers,
+    margin: float,
+    start: float,
+    end: float,
 ) -> Obstacle:
     """Gives its velocity to the nodes inside, and moves with it from `start` on; those within a margin [m] of its faces
     are outside."""
     size = [2 * (float(h) - margin) for h in half]
     if min(size) <= 0:
         raise ValueError(f"size must be more than {margin:.3g} m on every axis, got {list(half)}")
-    moves = any(v != 0 for v in velocity)
-    return Box(list(point), size, "sticky", velocity=list(velocity) if moves else None, start=start, end=end)
+    moving = velocity if isinstance(velocity, Tensor) or any(velocity) else None
+    return Box(list(point), size, "sticky", velocity=moving, start=start, end=end)
 
 
 def outer_planes(lower: float, upper: float, dim: int, start: float, end: float) -> list[Obstacle]:
@@ -54,17 +60,17 @@ def outer_planes(lower: float, upper: float, dim: int, start: float, end: float)
     return planes
 
 
-class NodeDamping(nn.Module):
-    """Multiplies the velocity of all nodes in every step."""
+class NodeDamping(TensorModule):
+    """Multiplies the velocity of all nodes in every step by a number, or a tensor [] that may require grad, up to 1."""
 
     reads_time = False
 
-    def __init__(self, scale: float) -> None:
-        super().__init__()
-        self.scale = float(scale)
+    def __init__(self, scale: float | Tensor) -> None:
+        self.scale = scale
 
     def forward(self, velocity: Tensor, positions: Tensor, scene: Tensor | None, time: float, dt: float) -> Tensor:
-        return self.scale * velocity
+        scale = self.scale.clamp(max=1) if isinstance(self.scale, Tensor) else min(self.scale, 1.0)
+        return scale * velocity
 
 
 class FreezeOutside(nn.Module):

@@ -3,78 +3,75 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
 from ..particle_operations import Timed
 from ..state import State
+from .gradients import Numbers
 
 
 class Rotation(Timed):
     """Turns particles about an axis n through a point and moves them along it: v = ω (x − p) × n + s n.
 
     Args:
-        point, normal: of the axis.
-        rotation: ω [rad/s], about −n.
-        translation: s [m/s]
+        point, normal: of the axis: three numbers, or tensors [3] that may require grad.
+        rotation: ω [rad/s], about −n: a number, or a tensor [] that may require grad.
+        translation: s [m/s], likewise.
         start, end, particles: see `Timed`.
     """
 
     def __init__(
         self,
-        point: Sequence[float],
-        normal: Sequence[float],
-        rotation: float,
-        translation: float,
+        point: Numbers,
+        normal: Numbers,
+        rotation: float | Tensor,
+        translation: float | Tensor,
         start: float,
         end: float,
         particles: Tensor,
     ) -> None:
         super().__init__(start, end, particles)
-        self.point, self.axis = (small_vector(v, particles.device) for v in (point, unitsmall_vector(normal)))
+        self.point, self.normal = (small_vector(v, particles.device) for v in (point, normal))
+        if not 0 < float(self.normal.detach().norm()) < math.inf:
+            raise ValueError(f"normal must have a positive length, got {self.normal.tolist()}")
         self.rotation, self.translation = rotation, translation
 
     def forward(self, state: State, dt: float | Tensor) -> State:
         acting = self.acting(state)
         if acting is False:
             return state
-        point, axis = self.point.to(state.x.dtype), self.axis.to(state.x.dtype)
+        normal = self.normal / self.normal.norm()
+        point, axis = self.point.to(state.x.dtype), normal.to(state.x.dtype)
         v = self.rotation * torch.linalg.cross(state.x - point, axis.expand_as(state.x)) + self.translation * axis
         return state.replace(v=torch.where(acting[:, None], v, state.v))  # type: ignore[index]
 
 
-def unitsmall_vector(v: Sequence[float]) -> list[float]:
-    """A vector of length one.
-
-    Raises:
-        ValueError: for the zero vector.
-    """
-    length = math.sqrt(sum(float(a) ** 2 for a in v))
-    if not 0 < length < math.inf:
-        raise ValueError(f"normal must have a positive length, got {list(v)}")
-    return [float(a) / length for a in v]
-
-
-def in_box(x: Tensor, point: Sequence[float], size: Sequence[float]) -> Tensor:
+def in_box(x: Tensor, point: Numbers, size: Numbers) -> Tensor:
     """Which positions are in a box of half edges `size` about a point, bool [P]."""
     centre, half = small_vector(point, x.device).to(x.dtype), small_vector(size, x.device).to(x.dtype)
     return ((x.detach() - centre).abs() < half).all(1)
 
 
 def in_cylinder(
-    x: Tensor, point: Sequence[float], normal: Sequence[float], half_height_and_radius: Sequence[float]
+    x: Tensor,
+    point: Numbers,
+    normal: Numbers,
+    half_height_and_radius: Numbers,
 ) -> Tensor:
     """Which positions are in a cylinder, bool [P]."""
-    offset = x.detach() - small_vector(point, x.device).to(x.dtype)
-    axis = small_vector(unitsmall_vector(normal), x.device).to(x.dtype)
+    offset = x.detach() - small_vector(point, x.device).detach().to(x.dtype)
+    direction = small_vector(normal, x.device).detach()
+    axis = (direction / direction.norm()).to(x.dtype)
     height = (offset * axis).sum(1)
     radius = (offset - height[:, None] * axis).norm(dim=1)
     half_height, largest = half_height_and_radius
     return (height.abs() < half_height) & (radius < largest)
 
 
-def small_vector(v: Sequence[float], device: torch.device) -> Tensor:
-    """Numbers on a device, float64."""
+def small_vector(v: Numbers, device: torch.device) -> Tensor:
+    """Numbers on a device, float64; a tensor keeps its gradient."""
+    if isinstance(v, Tensor):
+        return v.to(device, torch.float64)
     return torch.tensor([float(a) for a in v], dtype=torch.float64, device=device)

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from .gradients import refuse_grad
+
 _NEEDED = object()
 
 
@@ -12,7 +14,7 @@ def setting(configuration: Any, name: str, default: Any = _NEEDED) -> Any:
     """A value of a configuration.
 
     Raises:
-        ValueError: where it is missing and has no default.
+        ValueError: where it is missing and has no default, or requires grad.
     """
     if isinstance(configuration, Mapping):
         value = configuration.get(name, default)
@@ -20,4 +22,5 @@ def setting(configuration: Any, name: str, default: Any = _NEEDED) -> Any:
         value = getattr(configuration, name, default)
     if value is _NEEDED:
         raise ValueError(f"the configuration must have {name}")
+    refuse_grad("values of a configuration are copied; assign what it makes, such as law.log_E", **{name: value})
     return value

@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+import inspect
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from ...boundaries import Plane
+from ...parameters import TensorModule
 from ...particle_operations import Hold, Push, Timed
 from ...state import State
+from ..gradients import Numbers, refuse_grad, vector
+from ..keys import check_keys
 from ..node_conditions import stopping_plane, surface_margin
 from ..selections import Rotation, in_box, in_cylinder
 from .mpm_solver import RESET_STEPS, MPMSolver
 
-Numbers = Sequence[float]
 CUBOID_END, FOREVER = 1e3, 999.0
 
 
@@ -26,13 +29,16 @@ def set_boundary_conditions(model: MPMSolver, bc_params: Iterable[Mapping[str, A
     surface_collider and sdf_collider.
 
     Raises:
-        TypeError: for an unknown type, or a missing or unknown argument.
+        TypeError: for an unknown type, or a missing argument.
+        ValueError: for an unknown key, or a gradient that an argument cannot have.
     """
     for condition in bc_params or ():
         given = dict(condition)
         kind = given.pop("type", None)
         if kind not in CONDITIONS:
             raise TypeError(f"type of a boundary condition must be one of {sorted(CONDITIONS)}, got {kind!r}")
+        keys = list(inspect.signature(CONDITIONS[kind]).parameters)[1:]
+        check_keys(f"a boundary condition {kind}", given, [key for key in keys if key != "dt"])
         if kind == "particle_impulse":
             given["dt"] = model.dt
         if kind == "cuboid":
@@ -53,6 +59,8 @@ def set_velocity_on_cuboid(
 
     With `reset` they are at rest before, and for 15 steps after that.
     """
+    refuse_grad("it selects nodes", point=point, size=size, start_time=start_time, end_time=end_time)
+    velocity = vector("velocity", velocity, model.init_pos)
     model.post_grid_process.append(NodeVelocity(point, size, velocity, start_time, end_time, reset))
 
 
@@ -71,6 +79,8 @@ def add_surface_collider(
     """
     if surface not in ("sticky", "slip", "collide"):
         raise TypeError(f"surface must be 'sticky', 'slip' or 'collide', got {surface!r}")
+    refuse_grad("it selects nodes", point=point, normal=normal, start_time=start_time, end_time=end_time)
+    refuse_grad("it has no effect", friction=friction)
     margin = surface_margin(model.init_pos.dtype, 1.0)
     kind = "sticky" if surface == "sticky" else "slip"
     plane = stopping_plane(point, normal, margin, start_time, end_time, kind)
@@ -84,7 +94,7 @@ def add_sdf_collider(
     over dt to their velocity."""
     if dim not in (0, 1, 2):
         raise ValueError(f"dim must be 0, 1 or 2, got {dim}")
-
+    refuse_grad("it is a number of the condition", bound=bound, start_time=start_time, end_time=end_time)
     model.pre_particle_process.append(Projection(model, bound, dim, start_time, end_time))
 
 
@@ -98,8 +108,10 @@ def add_impulse_on_particles(
     start_time: float = 0.0,
 ) -> None:
     """A force [N] on each particle that starts in a box of half edges `size`, for num_dt steps."""
+    refuse_grad("it selects particles", dt=dt, point=point, size=size, num_dt=num_dt, start_time=start_time)
     inside = in_box(model.init_pos, point, size)
-    scaled = [f * dt / model.dt for f in force]  # the velocity changes by `dt` of the argument
+    given, share = vector("force", force, model.init_pos), dt / model.dt  # v changes by `dt` of the argument
+    scaled = given * share if isinstance(given, Tensor) else [f * share for f in given]
     model.pre_particle_process.append(Push(scaled, start_time, start_time + num_dt * model.dt, inside))
 
 
@@ -107,8 +119,10 @@ def enforce_particle_velocity_translation(
     model: MPMSolver, point: Numbers, size: Numbers, velocity: Numbers, start_time: float, end_time: float
 ) -> None:
     """Velocity of the particles that start in a box of half edges `size`."""
+    refuse_grad("it selects particles", point=point, size=size, start_time=start_time, end_time=end_time)
     inside = in_box(model.init_pos, point, size)
-    model.pre_particle_process.append(Hold(velocity, start_time, end_time, inside))
+    moving = vector("velocity", velocity, model.init_pos)
+    model.pre_particle_process.append(Hold(moving, start_time, end_time, inside))
 
 
 def enforce_particle_velocity_rotation(
@@ -123,6 +137,9 @@ def enforce_particle_velocity_rotation(
 ) -> None:
     """Turn the particles that start in a cylinder about its axis, at −rotation_scale [rad/s] about `normal`, and move
     them along it at translation_scale [m/s]. (MPM-PyTorch's own raises an error when it is called.)"""
+    selecting = {"half_height_and_radius": half_height_and_radius, "start_time": start_time, "end_time": end_time}
+    refuse_grad("it selects particles", **selecting)
+    point, normal = vector("point", point, model.init_pos), vector("normal", normal, model.init_pos)
     inside = in_cylinder(model.init_pos, point, normal, half_height_and_radius)
     turning = Rotation(point, normal, rotation_scale, translation_scale, start_time, end_time, inside)
     model.pre_particle_process.append(turning)
@@ -156,12 +173,12 @@ class Projection(Timed):
         return state.replace(v=state.v + shift / dt)
 
 
-class NodeVelocity(nn.Module):
+class NodeVelocity(TensorModule):
     """What `set_velocity_on_cuboid` does."""
 
     def __init__(self, point: Numbers, size: Numbers, velocity: Numbers, start: float, end: float, reset: bool) -> None:
-        super().__init__()
-        self.point, self.size, self.velocity = ([float(a) for a in v] for v in (point, size, velocity))
+        self.point, self.size = ([float(a) for a in v] for v in (point, size))
+        self.velocity = velocity
         self.start, self.end, self.reset = start, end, reset
 
     def forward(self, velocity: Tensor, positions: Tensor, scene: Tensor | None, time: float, dt: float) -> Tensor:

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from .. import constitutive
+from ..gradients import refuse_grad
 
 __all__ = [
     "CorotatedElasticity",
@@ -24,13 +25,19 @@ __all__ = [
 
 
 class _Model(nn.Module):
-    """A model with buffers `log_E` [1] and `nu` [1], for which a call may give others, [] or [P]."""
+    """A model with buffers `log_E` [1] and `nu` [1], for which a call may give others, [] or [P].
+
+    Arguments must not require grad: assign a tensor that does to the attribute of the model.
+    """
 
     log_E: Tensor
     nu: Tensor
 
     def __init__(self, E: float = 2e6, nu: float = 0.4, **others: float) -> None:
         super().__init__()
+        refuse_grad("a model copies its arguments; give log_E in the call, or assign model.log_E", E=E)
+        for name, value in {"nu": nu, **others}.items():
+            refuse_grad(f"a model copies its arguments; assign model.{name}", **{name: value})
         for name, value in {"nu": nu, **others}.items():
             self.register_buffer(name, torch.tensor([float(value)]))
         self.register_buffer("log_E", torch.tensor([float(E)]).log())

@@ -14,6 +14,7 @@ from ...grid import Grid
 from ...particle_operations import Operations
 from ...step import Step
 from ..given_stress import GivenStress, clamped, stepped
+from ..gradients import Numbers, refuse_grad, vector
 from ..node_conditions import NodeDamping
 from .call_times import CallTimes, is_recomputed
 
@@ -36,11 +37,11 @@ class MPMSolver:
     time of the first call, and leaves that of the solver as it is.
 
     Args:
-        init_pos: positions [P, 3] [m] by which boundary conditions choose particles.
-        rho: density [kg/m³].
+        init_pos: positions [P, 3] [m] by which boundary conditions choose particles; this has no gradient.
+        rho: density [kg/m³]: a number, or a tensor [] or [P] that may require grad.
         num_grids: cells along each axis.
         dt: time step [s].
-        gravity: [m/s²]
+        gravity: [m/s²]: three numbers, or a tensor [3] that may require grad.
         clip_bound: distance that positions keep from the faces of the cube, in cells.
         damping: factor of all node velocities in each step, in [0, 1].
         center: not used.
@@ -55,10 +56,10 @@ class MPMSolver:
     def __init__(
         self,
         init_pos: Tensor,
-        rho: float = 1000.0,
+        rho: float | Tensor = 1000.0,
         num_grids: int = 25,
         dt: float = 3e-4,
-        gravity: Sequence[float] = (0.0, 0.0, -9.8),
+        gravity: Numbers = (0.0, 0.0, -9.8),
         clip_bound: float = 0.5,
         damping: float = 1.0,
         center: Sequence[float] = (0.5, 0.5, 0.5),
@@ -68,6 +69,7 @@ class MPMSolver:
     ) -> None:
         if not isinstance(init_pos, Tensor) or init_pos.dim() != 2 or init_pos.shape[1] != 3:
             raise ValueError(f"init_pos must have shape [P, 3], got {shape_of(init_pos)}")
+        refuse_grad("it is a number of the solver", center=center, size=size)
         self.init_pos = init_pos.detach().to(device=device)
         self.device = self.init_pos.device
         self.n_particles = len(init_pos)
@@ -84,7 +86,10 @@ class MPMSolver:
         self.displacement: Tensor | None = None
         self._times = CallTimes()
         self.step = Step(
-            Grid(self.dx, (0.0,) * 3, (1.0,) * 3), GivenStress(), gravity=tuple(gravity), stress_form="gradient"
+            Grid(self.dx, (0.0,) * 3, (1.0,) * 3),
+            GivenStress(),
+            gravity=vector("gravity", gravity, self.init_pos),
+            stress_form="gradient",
         )
         self._acting: tuple[list[Any], list[Any]] | None = None
         self._volume = torch.full((self.n_particles,), self.vol, dtype=torch.float64, device=self.device)

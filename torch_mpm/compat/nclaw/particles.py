@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..gradients import refuse_grad
 from ..settings import setting
 
 if TYPE_CHECKING:
@@ -55,12 +56,14 @@ class MPMStatics:
         self.enabled = _by_section(self.enabled, sections, [int(a <= step < b) for a, b in spans])
 
 
-def _by_section(like: Tensor, sections: Sequence[int], values: Sequence[float]) -> Tensor:
+def _by_section(like: Tensor, sections: Sequence[int], values: Sequence[float | Tensor]) -> Tensor:
+    """Values [P] of sections with a value each, a number or a tensor [] that may require grad."""
     if len(sections) != len(values) or sum(sections) != len(like):
         raise ValueError(f"sections must add up to {len(like)} with one value each, got {list(sections)}")
-    return (
-        torch.cat([like.new_full((n,), value) for n, value in zip(sections, values, strict=True)]) if values else like
-    )
+    if not values:
+        return like
+    parts = (torch.as_tensor(value, dtype=like.dtype, device=like.device).reshape(-1) for value in values)
+    return torch.cat([part.expand(n) for n, part in zip(sections, parts, strict=True)])
 
 
 class MPMState:
@@ -126,6 +129,8 @@ class MPMInitData:
     ind_vel: np.ndarray | None = None
 
     def __post_init__(self) -> None:
+        names = ("pos", "lin_vel", "ang_vel", "center", "ind_vel")
+        refuse_grad("arrays have no gradient; pass tensors to the simulator", **{n: getattr(self, n) for n in names})
         if self.center is None:
             self.center = np.asarray(self.pos).mean(0)
 
@@ -168,14 +173,17 @@ class MPMInitData:
 
     def set_lin_vel(self, value: Sequence[float]) -> None:
         """[m/s]"""
+        refuse_grad("arrays have no gradient; pass tensors to the simulator", lin_vel=value)
         self.lin_vel = np.array(value, float)
 
     def set_ang_vel(self, value: Sequence[float]) -> None:
         """[rad/s]"""
+        refuse_grad("arrays have no gradient; pass tensors to the simulator", ang_vel=value)
         self.ang_vel = np.array(value, float)
 
     def set_ind_vel(self, ind_vel: np.ndarray) -> None:
         """[P, 3] [m/s]"""
+        refuse_grad("arrays have no gradient; pass tensors to the simulator", ind_vel=ind_vel)
         self.ind_vel = np.array(ind_vel, float)
 
     def velocity(self) -> np.ndarray:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -12,9 +11,11 @@ from torch import Tensor, nn
 from ...boundaries import Walls
 from ...errors import check_count, check_number, shape_of
 from ...grid import Blocks, Grid
+from ...parameters import TensorModule
 from ...state import State
 from ...step import Step
 from ..given_stress import GivenStress, clamped, stepped
+from ..gradients import Numbers, refuse_grad, vector
 from ..settings import setting
 from .particles import MPMInitData, MPMState, MPMStateInitializer, MPMStatics, MPMStaticsInitializer
 
@@ -42,7 +43,7 @@ class MPMModel:
         num_grids: cells along each axis of the unit cube.
         dt: time step [s].
         bound: nodes with an index below it, or above num_grids − bound, have no velocity out of the cube.
-        gravity: [m/s²]
+        gravity: [m/s²]: three numbers, or a tensor [3] that may require grad.
         eps: added to the mass of a node [kg], which makes light nodes slow.
         device: of the particles that it makes.
     """
@@ -52,14 +53,15 @@ class MPMModel:
         num_grids: int,
         dt: float,
         bound: int,
-        gravity: Sequence[float],
+        gravity: Numbers,
         eps: float = 0.0,
         device: torch.device | str | None = None,
     ) -> None:
         self.num_grids = check_count("num_grids", num_grids, 1)
         self.dt = float(check_number("dt", dt, "positive and finite", lambda v: 0 < v < math.inf))
         self.bound, self.dx, self.device = check_count("bound", bound), 1 / num_grids, device
-        self.gravity, self.eps = tuple(float(g) for g in gravity), float(eps)
+        refuse_grad("it is a number of the model", eps=eps)
+        self.gravity, self.eps = vector("gravity", gravity, torch.empty(0, device=device)), float(eps)
         lower, upper = (bound - 1) * self.dx, (num_grids - bound + 1) * self.dx
         step = Step(Grid(self.dx, (0.0,) * 3, (1.0,) * 3), GivenStress(), on_particles=self._present)
         if eps == 0:
@@ -95,17 +97,16 @@ class MPMModel:
         return MPMStatics(shape, self.device)
 
 
-class HeavyNodes(nn.Module):
+class HeavyNodes(TensorModule):
     """Node velocities of NCLaw's grid step from those of a step without gravity and walls.
 
     Args:
         eps: [kg], see `MPMModel`.
-        gravity: [m/s²]
+        gravity: [m/s²]: three numbers, or a tensor [3] that may require grad.
         lower, upper: planes beyond which no node moves outwards [m].
     """
 
-    def __init__(self, eps: float, gravity: Sequence[float], lower: float, upper: float) -> None:
-        super().__init__()
+    def __init__(self, eps: float, gravity: Numbers, lower: float, upper: float) -> None:
         self.eps, self.gravity, self.lower, self.upper = eps, gravity, lower, upper
 
     def forward(self, blocks: Blocks, velocity: Tensor, mass: Tensor, dt: float) -> Tensor:
@@ -196,10 +197,20 @@ class MPMCacheDiffSim(MPMSim):
 
 
 class MPMForwardSim(MPMSim):
-    """`x, v, C, F = sim(statics, state)`, which also become those of the state."""
+    """`x, v, C, F = sim(statics, state)`, which also become those of the state, without gradients.
 
-    @torch.no_grad()
+    Raises:
+        ValueError: for a tensor that requires grad, where gradients are enabled.
+    """
+
     def forward(self, statics: MPMStatics, state: MPMState) -> Particles:
+        if torch.is_grad_enabled():
+            given = {**vars(state.particle), "vol": statics.vol, "rho": statics.rho, "clip_bound": statics.clip_bound}
+            refuse_grad("MPMForwardSim has no gradients; use MPMDiffSim, or torch.no_grad()", **given)
+        with torch.no_grad():
+            return self._forward(statics, state)
+
+    def _forward(self, statics: MPMStatics, state: MPMState) -> Particles:
         after = self.model.advance(statics, *state.to_torch())
         state.from_torch(*after)
         return after

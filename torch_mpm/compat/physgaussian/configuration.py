@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import json
+import warnings
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 from ...files import read_text
+from ..keys import check_keys, check_needed
+from .parameters import BOX, BOX_UNSUPPORTED, UNSUPPORTED
 from .simulator import MPM_Simulator_WARP
 
 MATERIAL: dict[str, Any] = {"material": "jelly", "grid_lim": 2.0, "n_grid": 50, "nu": 0.4, "E": 1e5, "density": 200.0}
@@ -29,6 +32,21 @@ CAMERA: dict[str, Any] = {
     **{"default_camera_index": 0, "show_hint": False, "init_azimuthm": None, "init_elevation": None},
     **{"init_radius": None, "delta_a": None, "delta_e": None, "delta_r": None, "move_camera": False},
 }
+OTHER_TIMES = "MotionPhysics has it: give substep_dt, frame_dt and frame_num"
+OTHER_KEYS = {
+    **UNSUPPORTED,
+    **{"substep_perframe": OTHER_TIMES, "total_time": OTHER_TIMES},
+    "opt_frame_dt": "PhysFlow has it for its optimisation: give frame_dt",
+    "fix_ground": "PIXIE has it: give a boundary condition",
+}
+"""Keys of descendants that change the simulation."""
+NOT_OF_THE_SIMULATION = (
+    *("prompt", "lr", "line", "reduction", "downsample_scale", "bbox_2d"),  # MotionPhysics, PhysFlow
+    *("init_roll", "delta_roll", "k_smoothing_neighbors", "nn_distance_threshold", "out_of_bound_check_freq"),  # PIXIE
+    *("export_gaussians_to_ply", "only_handle_largest_cluster", "to_original_coord", "z_shift_value"),
+)
+"""Keys of descendants for their training, preparation and pictures."""
+A_BOX = "a box of additional_material_params"
 CONDITIONS: dict[str, tuple[str, tuple[str, ...], tuple[str, ...]]] = {
     "bounding_box": ("add_bounding_box", (), ()),
     "cuboid": ("set_velocity_on_cuboid", ("point", "size", "velocity"), ("start_time", "end_time", "reset")),
@@ -55,6 +73,11 @@ CONDITIONS: dict[str, tuple[str, tuple[str, ...], tuple[str, ...]]] = {
     ),
 }
 """Of each type in a configuration the method of the simulator, the keys that it must have and those that it may."""
+OTHER_CONDITIONS = {
+    "add_constant_force": "MotionPhysics has it: use particle_impulse with num_dt",
+    "release_particles_sequentially_size": "PhysFlow has it: use release_particles_sequentially",
+}
+"""Types of descendants."""
 
 
 def decode_param_json(
@@ -62,14 +85,18 @@ def decode_param_json(
 ) -> tuple[dict[str, Any], Any, dict[str, Any], dict[str, Any], dict[str, Any]]:
     """The parts of a configuration with their defaults.
 
+    Keys of descendants for their training and pictures are left out with a warning.
+
     Returns:
         Parameters of `set_parameters_dict`; the list of boundary conditions; substep_dt, frame_dt [s] and frame_num;
         parameters of the preparation of Gaussians, and of the camera, which torch_mpm does not use.
 
     Raises:
-        ValueError: for a Poisson's ratio outside [0, 0.5], or a box of material parameters that lacks one.
+        ValueError: for an unknown key, a key of a descendant that changes the simulation, a Poisson's ratio outside
+            [0, 0.5], or a box of material parameters that lacks one.
     """
     given = json.loads(read_text(json_file, "configuration"))
+    _check_configuration(given)
 
     def part(defaults: Mapping[str, Any]) -> dict[str, Any]:
         return {name: given.get(name, value) for name, value in defaults.items()}
@@ -78,11 +105,13 @@ def decode_param_json(
     if not 0 <= material["nu"] <= 0.5:
         raise ValueError(f"nu must be between 0 and 0.5, got {material['nu']}")
     for box in material.get("additional_material_params", []):
-        _need("a box of additional_material_params", box, ("point", "size", "E", "nu"))
+        check_keys(A_BOX, box, BOX, BOX_UNSUPPORTED)
+        check_needed(A_BOX, box, ("point", "size", "E", "nu"))
         box.setdefault("density", material["density"])
     preprocessing = part(PREPROCESSING)
     if preprocessing["particle_filling"] is not None:
         filling = {"n_grid": 4 * material["n_grid"], **FILLING}
+        check_keys("particle_filling", preprocessing["particle_filling"], filling)
         preprocessing["particle_filling"] = filling | preprocessing["particle_filling"]
     return material, given.get("boundary_conditions", {}), part(TIME), preprocessing, part(CAMERA)
 
@@ -94,14 +123,18 @@ def set_boundary_conditions(
 
     Raises:
         TypeError: for an unknown type.
-        ValueError: for a missing key.
+        ValueError: for a missing or unknown key, or a type of a descendant.
     """
     for condition in bc_params:
+        check_needed("a boundary condition", condition, ("type",))
         kind = condition["type"]
+        if kind in OTHER_CONDITIONS:
+            raise ValueError(f"boundary condition {kind} is not supported: {OTHER_CONDITIONS[kind]}")
         if kind not in CONDITIONS:
             raise TypeError(f"type of a boundary condition must be one of {sorted(CONDITIONS)}, got {kind!r}")
         method, needed, optional = CONDITIONS[kind]
-        _need(f"a boundary condition {kind}", condition, needed)
+        check_keys(f"a boundary condition {kind}", condition, ("type", *needed, *optional))
+        check_needed(f"a boundary condition {kind}", condition, needed)
         arguments = {name: condition[name] for name in (*needed, *optional) if name in condition}
         if kind == "particle_impulse":
             arguments["dt"] = time_params["substep_dt"]
@@ -110,6 +143,9 @@ def set_boundary_conditions(
         getattr(mpm_solver, method)(**arguments)
 
 
-def _need(what: str, given: Mapping[str, Any], names: Iterable[str]) -> None:
-    if missing := [name for name in names if name not in given]:
-        raise ValueError(f"{what} must have {', '.join(missing)}, got {sorted(given)}")
+def _check_configuration(given: Mapping[str, Any]) -> None:
+    known = (*MATERIAL, *MATERIAL_OPTIONS, *TIME, *PREPROCESSING, *CAMERA, "boundary_conditions")
+    left_out = sorted(set(given) & set(NOT_OF_THE_SIMULATION))
+    if left_out:
+        warnings.warn(f"keys of the configuration that have no effect: {', '.join(left_out)}", stacklevel=3)
+    check_keys("the configuration", (name for name in given if name not in left_out), known, OTHER_KEYS)

@@ -9,15 +9,14 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from ...errors import shape_of
 from ...laws import FixedCorotated, Material, QuarticSand, isotropic
 from ...parameters import evaluate, store
 from ...vectors import norm
+from .parameters import check_gradients, check_material
 
 if TYPE_CHECKING:
     from ...state import State
 
-MATERIALS = ("jelly", "metal", "sand", "foam", "snow", "plasticine")
 LEAST_STRETCH = 0.01
 """Below which a stretch counts as this one in logarithms."""
 NORM_OFFSET = 1e-6
@@ -64,23 +63,23 @@ class Metal(StretchPlasticity):
 
     Args:
         E, nu, yield_stress: [Pa], -, [Pa]: numbers or tensors [] or [P].
-        xi: ξ, where it hardens; 0 if it does not.
+        xi: ξ, where it hardens, likewise; 0 if it does not.
     """
 
     extra_fields = ("yield_stress",)
     xi: Any
 
-    def __init__(self, E: Any, nu: Any, yield_stress: Any, xi: float = 0.0) -> None:
+    def __init__(self, E: Any, nu: Any, yield_stress: Any, xi: Any = 0.0) -> None:
         super().__init__(E, nu, yield_stress=yield_stress, xi=xi)
 
     def update(self, state: State) -> tuple[dict[str, Tensor], Tensor]:
         assert state.F is not None
         mu, lam = self._moduli(state)
-        limit = state.extra["yield_stress"][:, None]
+        limit, xi = state.extra["yield_stress"][:, None], self._column("xi", state)
 
         def flow(sigma: Tensor) -> tuple[Tensor, Tensor, Tensor]:
             mapped, excess = _von_mises(sigma, mu, limit)
-            return mapped, _stretched_hencky(mapped, mu, lam), limit + 2 * mu * self.xi * excess
+            return mapped, _stretched_hencky(mapped, mu, lam), limit + 2 * mu * xi * excess
 
         F, stress, limit = isotropic(state.F, flow)
         return {"F": F, "yield_stress": limit[:, 0]}, stress
@@ -91,19 +90,20 @@ class Foam(StretchPlasticity):
 
     Args:
         E, nu, yield_stress: [Pa], -, [Pa]: numbers or tensors [] or [P].
-        plastic_viscosity: [Pa s]
+        plastic_viscosity: [Pa s], likewise.
     """
 
     rate_dependent = True
     plastic_viscosity: Any
 
-    def __init__(self, E: Any, nu: Any, yield_stress: Any, plastic_viscosity: float = 0.0) -> None:
+    def __init__(self, E: Any, nu: Any, yield_stress: Any, plastic_viscosity: Any = 0.0) -> None:
         super().__init__(E, nu, yield_stress=yield_stress, plastic_viscosity=plastic_viscosity)
 
     def update(self, state: State) -> tuple[dict[str, Tensor], Tensor]:
         assert state.F is not None
         mu, lam = self._moduli(state)
         limit = math.sqrt(2 / 3) * self._column("yield_stress", state)
+        viscosity = self._column("plastic_viscosity", state)
         dt = getattr(state, "dt", 0.0)  # outside of a step nothing flows
 
         def flow(sigma: Tensor) -> tuple[Tensor, Tensor]:
@@ -112,7 +112,7 @@ class Foam(StretchPlasticity):
             trial = 2 * mu * size
             flows = (trial > limit) & (size > 0)
             fluidity = 2 * mu * clamped.square().mean(1, keepdim=True) * dt
-            kept = trial - (trial - limit) * fluidity / (fluidity + self.plastic_viscosity).clamp_min(1e-30)
+            kept = trial - (trial - limit) * fluidity / (fluidity + viscosity).clamp_min(1e-30)
             share = torch.where(flows, kept, 1) / torch.where(flows, trial, 1)
             mapped = torch.where(flows, (mean + share * deviator).exp(), sigma)
             return mapped, _stretched_hencky(mapped, mu, lam)
@@ -129,7 +129,7 @@ class Plasticine(StretchPlasticity):
 
     Args:
         E, nu, yield_stress: [Pa], -, [Pa]: numbers or tensors [] or [P].
-        softening: [Pa]
+        softening: [Pa], likewise.
         xi: hardening of the yield stress as for `Metal`; 0 for none.
     """
 
@@ -137,24 +137,25 @@ class Plasticine(StretchPlasticity):
     softening: Any
     xi: Any
 
-    def __init__(self, E: Any, nu: Any, yield_stress: Any, softening: float = 0.1, xi: float = 0.0) -> None:
+    def __init__(self, E: Any, nu: Any, yield_stress: Any, softening: Any = 0.1, xi: Any = 0.0) -> None:
         super().__init__(E, nu, yield_stress=yield_stress, softening=softening, xi=xi)
 
     def update(self, state: State) -> tuple[dict[str, Tensor], Tensor]:
         assert state.F is not None
         limit, intact = state.extra["yield_stress"][:, None], state.extra["intact"][:, None]
         full_mu, full_lam = self._moduli(state)
+        softening, xi = (self._column(name, state) for name in ("softening", "xi"))
 
         def flow(sigma: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
             whole = (intact > 0) & (limit > 0)
             mapped, excess = _von_mises(sigma, full_mu, torch.where(whole, limit, torch.inf))
             size = norm(_deviator(sigma)[2])[:, None]
-            softened = limit - self.softening * excess * size / (size + NORM_OFFSET)
+            softened = limit - softening * excess * size / (size + NORM_OFFSET)
             left = torch.where((softened > 0) | (excess == 0), intact, 0)
             mu, lam = full_mu * left, full_lam * left
             J = mapped.prod(1, keepdim=True)
             tau = 2 * mu * (mapped - 1) * mapped + lam * J * (J - 1)
-            return mapped, tau, softened + 2 * mu * self.xi * excess, left
+            return mapped, tau, softened + 2 * mu * xi * excess, left
 
         F, stress, limit, left = isotropic(state.F, flow)
         return {"F": F, "yield_stress": limit[:, 0], "intact": left[:, 0]}, stress
@@ -190,32 +191,28 @@ def law_of(parameters: Mapping[str, Any]) -> Material:
     """The law of the parameters that a simulator was given, under the names of `set_parameters_dict`.
 
     Raises:
-        ValueError, TypeError: for snow, which has no stress there, or an unknown material.
+        ValueError, TypeError: for snow, which has no stress there, an unknown material, or one that lacks a parameter.
     """
     kind = parameters.get("material", "jelly")
     if isinstance(kind, Material):
+        check_gradients(parameters, (), "a law")
         return kind
-    if kind not in MATERIALS:
-        raise TypeError(f"material must be one of {list(MATERIALS)} or a torch_mpm.Material, got {_said(kind)}")
     if kind == "snow":
         raise ValueError(
             "material 'snow' has no stress in the simulator that this class stands for: its particles fly apart. Pass "
             "a law instead, such as material=torch_mpm.Snow(E=1.4e5, nu=0.2)"
         )
-    E, nu = parameters.get("E", 0.0), parameters.get("nu", 0.0)
+    check_material(kind, parameters)
+    E, nu = parameters["E"], parameters["nu"]
     if kind == "jelly":
         return FixedCorotated(E=E, nu=nu)
     if kind == "sand":
-        angle = math.radians(parameters.get("friction_angle", 25.0))
+        angle = math.pi / 180 * parameters.get("friction_angle", 25.0)
         return QuarticSand(E=E, nu=nu, friction_angle=angle, energy="hencky")
-    limit = parameters.get("yield_stress", 0.0)
-    xi = float(parameters.get("xi", 0.0)) if parameters.get("hardening", 0) == 1 else 0.0
+    limit = parameters["yield_stress"]
+    xi = parameters.get("xi", 0.0) if parameters.get("hardening", 0) == 1 else 0.0
     if kind == "metal":
         return Metal(E, nu, limit, xi)
     if kind == "foam":
-        return Foam(E, nu, limit, float(parameters.get("plastic_viscosity", 0.0)))
-    return Plasticine(E, nu, limit, float(parameters.get("softening", 0.1)), xi)
-
-
-def _said(kind: Any) -> str:
-    return repr(kind) if isinstance(kind, str) else shape_of(kind)
+        return Foam(E, nu, limit, parameters.get("plastic_viscosity", 0.0))
+    return Plasticine(E, nu, limit, parameters.get("softening", 0.1), xi)

@@ -3,34 +3,40 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
 from ...particle_operations import Timed
 from ...state import State
+from ..gradients import Numbers
 from ..selections import in_box
 
 LAYERS = 50
 """Of a sequential release."""
 
 
-class DampedAffine(Timed):
-    """RPIC: the symmetric part of C less a share; without C, which is PIC, for a negative share."""
+class WithoutAffine(Timed):
+    """PIC: no C."""
 
-    def __init__(self, share: float) -> None:
+    def forward(self, state: State, dt: float | Tensor) -> State:
+        assert state.C is not None
+        return state.replace(C=torch.zeros_like(state.C))
+
+
+class DampedAffine(Timed):
+    """RPIC: the symmetric part of C less a share, a number or a tensor [] that may require grad."""
+
+    def __init__(self, share: float | Tensor) -> None:
         super().__init__()
         self.share = share
 
     def forward(self, state: State, dt: float | Tensor) -> State:
         assert state.C is not None
-        if self.share < 0:
-            return state.replace(C=torch.zeros_like(state.C))
         return state.replace(C=state.C - self.share / 2 * (state.C + state.C.mT))
 
 
-def release_times(x: Tensor, normal: Sequence[float], start: float, end: float, end_time: float) -> Tensor:
+def release_times(x: Tensor, normal: Numbers, start: float, end: float, end_time: float) -> Tensor:
     """When each particle is let go [P] [s]; at once where it is in no layer.
 
     Layer k of n holds the particles nearer to `end` than (n − k)/n of the way from `start` until (k + 1)/n of the time,

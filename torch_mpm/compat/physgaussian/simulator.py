@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -14,15 +14,18 @@ from ...boundaries import Obstacle
 from ...errors import check_count, check_like, check_number, shape_of
 from ...grid import Grid
 from ...laws import Material
-from ...particle_operations import Hold, Operations, Push
+from ...particle_operations import Hold, Operations, Push, Timed
 from ...rollouts import rollout
 from ...state import State, identity_deformation
 from ...step import Step
+from ..gradients import Numbers, refuse_grad, vector
+from ..keys import check_keys, check_needed
 from ..node_conditions import FreezeOutside, NodeDamping, moving_cuboid, outer_planes, stopping_plane, surface_margin
 from ..selections import Rotation, in_box, in_cylinder
 from .exchange import Exchange
 from .materials import law_of
-from .particles import DampedAffine, release_times
+from .parameters import BOX, BOX_UNSUPPORTED, KNOWN, UNSUPPORTED, WITHOUT_EFFECT, checked
+from .particles import DampedAffine, WithoutAffine, release_times
 from .surfaces import Cut
 
 PADDING = 3
@@ -31,15 +34,14 @@ RESET_STEPS = 15
 """Steps for which a cuboid with `reset` holds all nodes after its end."""
 FOREVER = 999.0
 
-Numbers = Sequence[float]
-
 
 class MPM_Simulator_WARP(Exchange):
     """Explicit MPM on the cube [0, grid_lim]³ with forces by the gradient of quadratic B-splines and APIC.
 
     Substeps asked for with `p2g2p` are taken together when something is read or changed, in one op where that is
-    possible. Gradients pass from the exports to whatever tensors were given: positions, velocities, E, nu,
-    yield_stress, density. Tensors stay in their dtype, float32 or float64, and on their device.
+    possible. Gradients pass from the exports to the tensors that were given: positions, velocities, parameters, forces
+    and velocities of conditions. An argument that has no gradient, such as the size of a box, must not require grad.
+    Tensors stay in their dtype, float32 or float64, and on their device.
 
     Args:
         n_particles: not used before data are loaded.
@@ -59,10 +61,12 @@ class MPM_Simulator_WARP(Exchange):
     ) -> None:
         """Forget everything but the size of the grid."""
         self.n_particles = n_particles
-        self.parameters: dict[str, Any] = {"n_grid": n_grid, "grid_lim": grid_lim}
+        size = {"n_grid": n_grid, "grid_lim": grid_lim}
+        self.parameters: dict[str, Any] = {name: checked(name, value, torch.empty(0)) for name, value in size.items()}
         self._state: State | None = None
         self._step: Step | None = None
         self._law: Material | None = None
+        self._moduli: dict[str, Any] | None = None  # E and nu of the last finalize_mu_lam
         self._covariance: Tensor | None = None
         self._damping: NodeDamping | None = None
         self._nodes: list[Any] = []
@@ -125,48 +129,60 @@ class MPM_Simulator_WARP(Exchange):
 
         Args:
             kwargs: material ("jelly", "metal", "sand", "foam", "plasticine", or a `torch_mpm.Material`), E [Pa], nu,
-                density [kg/m³], yield_stress [Pa] (numbers, or tensors [] or [P] that may require grad), hardening (1
-                for on), xi, friction_angle [degrees], softening, plastic_viscosity, g (three numbers [m/s²]),
-                rpic_damping, grid_v_damping_scale, n_grid, grid_lim, and additional_material_params: boxes with point,
-                size, E, nu and density. Other keys are kept and not used.
+                density [kg/m³], yield_stress [Pa], xi, friction_angle [degrees], softening [Pa] and plastic_viscosity
+                [Pa s] (numbers, or tensors [] or [P]), rpic_damping and grid_v_damping_scale (numbers, or tensors []),
+                g (three numbers or a tensor [3] [m/s²]), hardening (1 for on), n_grid, grid_lim, and
+                additional_material_params: boxes with point, size, E, nu and density. All tensors but n_grid, grid_lim,
+                hardening, point and size may require grad. pic_damping and opacity_threshold have no effect.
 
         E and nu act from the next `finalize_mu_lam` on.
+
+        Raises:
+            TypeError, ValueError: for an unknown key, a value of a wrong type, shape or range, or a gradient that a
+                value cannot have.
         """
         given = dict(kwargs or {})
         state = self._flushed()
+        check_keys("set_parameters_dict", given, (*KNOWN, *WITHOUT_EFFECT), UNSUPPORTED)
         extra = given.pop("additional_material_params", [])
-        self.parameters.update(given)
-        if "g" in given and isinstance(given["g"], (int, float)):
-            raise TypeError(f"g must be three numbers, got {given['g']}")
+        self.parameters |= {name: checked(name, value, state.x) for name, value in given.items()}
         for box in extra:
             self._set_in_box(state, box)
         if extra or "density" in given:
-            density = self._of_particles("density", self.parameters.get("density", 0.0), state)
-            self._state = state.replace(mass=density * state.volume)
+            self._state = state.replace(mass=self._of_particles("density", state) * state.volume)
         if "yield_stress" in given and "yield_stress" in state.extra:
-            limit = self._of_particles("yield_stress", given["yield_stress"], state)
+            limit = self._of_particles("yield_stress", state)
             self._state = self._loaded().replace(extra={**state.extra, "yield_stress": limit})
-        scale = float(self.parameters.get("grid_v_damping_scale", 1.0))
-        self._damping, self._step = NodeDamping(scale) if scale < 1 else None, None
+        scale = self.parameters.get("grid_v_damping_scale", 1.0)
+        damps = isinstance(scale, Tensor) or scale < 1
+        self._damping, self._law, self._step = NodeDamping(scale) if damps else None, None, None
 
     def _set_in_box(self, state: State, box: Mapping[str, Any]) -> None:
         """E, nu and density of the particles in a box."""
+        what = "a box of additional_material_params"
+        check_keys(what, box, BOX, BOX_UNSUPPORTED)
+        check_needed(what, box, BOX)
+        refuse_grad("it selects particles", point=box["point"], size=box["size"])
         inside = in_box(state.x, box["point"], box["size"])
         for name in ("E", "nu", "density"):
-            before = self._of_particles(name, self.parameters.get(name, 0.0), state)
-            self.parameters[name] = torch.where(inside, self._of_particles(name, box[name], state), before)
+            value = torch.as_tensor(checked(name, box[name], state.x), dtype=state.x.dtype, device=state.x.device)
+            self.parameters[name] = torch.where(inside, value, self._of_particles(name, state))
 
-    def _of_particles(self, name: str, value: Any, state: State) -> Tensor:
-        value = torch.as_tensor(value, dtype=state.x.dtype, device=state.x.device)
-        if tuple(value.shape) not in ((), (1,), (len(state),)):
-            raise ValueError(
-                f"{name} must be a number, or have shape [] or [P] = [{len(state)}], got {shape_of(value)}"
-            )
+    def _of_particles(self, name: str, state: State) -> Tensor:
+        """A parameter [P]."""
+        if name not in self.parameters:
+            raise ValueError(f"{name} of all particles must be given before that of particles in a box")
+        value = torch.as_tensor(self.parameters[name], dtype=state.x.dtype, device=state.x.device)
         return value.expand(len(state))
 
     def finalize_mu_lam(self, device: torch.device | str | None = None) -> None:
-        """Make the material of E and nu as they are now."""
+        """Make the material of E and nu as they are now.
+
+        Raises:
+            TypeError, ValueError: for a material that is unknown, or that lacks a parameter.
+        """
         self._flushed()
+        self._moduli = {name: self.parameters[name] for name in ("E", "nu") if name in self.parameters}
         self._law, self._step = law_of(self.parameters), None
 
     def reset_densities_and_update_masses(
@@ -191,6 +207,8 @@ class MPM_Simulator_WARP(Exchange):
         A surface that slips, separates or has friction is `add_boundary(torch_mpm.Plane(...))`. "cut" is that
         simulator's own, with heights that are fixed.
         """
+        refuse_grad("it selects nodes", point=point, normal=normal, start_time=start_time, end_time=end_time)
+        refuse_grad("it has no effect", friction=friction)
         if surface == "sticky" and friction != 0:
             raise ValueError(f"friction must be 0 on sticky surfaces, got {friction}")
         if surface == "cut":
@@ -217,12 +235,15 @@ class MPM_Simulator_WARP(Exchange):
 
         With `reset` 1 all nodes of the grid are at rest before `start_time`, and for 15 steps after `end_time`.
         """
-        self.add_boundary(moving_cuboid(point, size, velocity, self._margin, start_time, end_time))
+        refuse_grad("it selects nodes", point=point, size=size, start_time=start_time, end_time=end_time)
+        moving = vector("velocity", velocity, self._flushed().x)
+        self.add_boundary(moving_cuboid(point, size, moving, self._margin, start_time, end_time))
         if reset == 1:
             self.add_boundary(FreezeOutside(start_time, end_time, RESET_STEPS))
 
     def add_bounding_box(self, start_time: float = 0.0, end_time: float = FOREVER) -> None:
         """Let nothing out of the domain: no node within 3 of a face moves outwards."""
+        refuse_grad("it selects nodes", start_time=start_time, end_time=end_time)
         n, dx = self.parameters["n_grid"], self._dx
         for plane in outer_planes((PADDING - 1) * dx, (n - PADDING) * dx, 3, start_time, end_time):
             self.add_boundary(plane)
@@ -243,8 +264,10 @@ class MPM_Simulator_WARP(Exchange):
         device: torch.device | str | None = None,
     ) -> None:
         """A force [N] on each particle that is now in a box of half edges `size`, for num_dt steps of dt."""
-        inside = in_box(self._flushed().x, point, size)
-        self._pushes.append(Push(force, start_time, start_time + dt * num_dt, inside))
+        refuse_grad("it selects particles", dt=dt, point=point, size=size, num_dt=num_dt, start_time=start_time)
+        x = self._flushed().x
+        inside = in_box(x, point, size)
+        self._pushes.append(Push(vector("force", force, x), start_time, start_time + dt * num_dt, inside))
         self._step = None
 
     def enforce_particle_velocity_translation(
@@ -257,7 +280,9 @@ class MPM_Simulator_WARP(Exchange):
         device: torch.device | str | None = None,
     ) -> None:
         """Velocity of the particles that are now in a box of half edges `size`."""
-        self._hold(Hold(velocity, start_time, end_time, in_box(self._flushed().x, point, size)))
+        refuse_grad("it selects particles", point=point, size=size, start_time=start_time, end_time=end_time)
+        x = self._flushed().x
+        self._hold(Hold(vector("velocity", velocity, x), start_time, end_time, in_box(x, point, size)))
 
     def enforce_particle_velocity_rotation(
         self,
@@ -272,7 +297,11 @@ class MPM_Simulator_WARP(Exchange):
     ) -> None:
         """Turn the particles that are now in a cylinder about its axis, at −rotation_scale [rad/s] about `normal`, and
         move them along it at translation_scale [m/s]."""
-        inside = in_cylinder(self._flushed().x, point, normal, half_height_and_radius)
+        selecting = {"half_height_and_radius": half_height_and_radius, "start_time": start_time, "end_time": end_time}
+        refuse_grad("it selects particles", **selecting)
+        x = self._flushed().x
+        point, normal = vector("point", point, x), vector("normal", normal, x)
+        inside = in_cylinder(x, point, normal, half_height_and_radius)
         self._hold(Rotation(point, normal, rotation_scale, translation_scale, start_time, end_time, inside))
 
     def release_particles_sequentially(
@@ -286,6 +315,10 @@ class MPM_Simulator_WARP(Exchange):
     ) -> None:
         """Hold the particles between two positions on an axis at rest, and let them go layer by layer, those at
         `end_position` last. There are 50 layers, whatever num_layers says: so does the simulator."""
+        times = {"start_time": start_time, "end_time": end_time, "num_layers": num_layers}
+        refuse_grad(
+            "it selects particles", normal=normal, start_position=start_position, end_position=end_position, **times
+        )
         x = self._flushed().x
         self._hold(Hold((0.0, 0.0, 0.0), start_time, release_times(x, normal, start_position, end_position, end_time)))
 
@@ -317,8 +350,10 @@ class MPM_Simulator_WARP(Exchange):
 
     def _check_ready(self) -> None:
         self._loaded()
-        if self._law is None:
+        if self._moduli is None:
             raise ValueError("the material is not known: call set_parameters_dict and finalize_mu_lam before p2g2p")
+        if self._law is None:
+            self._law = law_of(self.parameters | self._moduli)
         if "density" not in self.parameters:
             raise ValueError("the particles have no mass: give density in set_parameters_dict")
 
@@ -352,12 +387,11 @@ class MPM_Simulator_WARP(Exchange):
 
     def _made_step(self) -> Step:
         assert self._law is not None
-        gravity, damping = self.parameters.get("g"), float(self.parameters.get("rpic_damping", 0.0))
-        operations = [*self._pushes, *self._holds, *([DampedAffine(damping)] if damping != 0 else [])]
+        operations = [*self._pushes, *self._holds, *_affine(self.parameters.get("rpic_damping", 0.0))]
         return Step(
             Grid(self._dx, (0.0,) * 3, (float(self.parameters["grid_lim"]),) * 3),
             self._law,
-            gravity=None if gravity is None else tuple(float(g) for g in gravity),
+            gravity=self.parameters.get("g"),
             stress_form="gradient",
             on_particles=Operations(operations) if operations else None,
         )
@@ -369,6 +403,14 @@ class MPM_Simulator_WARP(Exchange):
     @property
     def _dx(self) -> float:
         return float(self.parameters["grid_lim"]) / int(self.parameters["n_grid"])
+
+
+def _affine(damping: float | Tensor) -> list[Timed]:
+    """What `rpic_damping` does to C."""
+    if isinstance(damping, Tensor) and damping.requires_grad:
+        return [DampedAffine(damping)]
+    share = float(damping)
+    return [] if share == 0 else [WithoutAffine() if share < 0 else DampedAffine(share)]
 
 
 def _acts(boundary: Any, first: float, last: float, dt: float) -> bool:

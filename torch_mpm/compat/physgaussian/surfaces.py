@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import torch
 from torch import Tensor, nn
 
+from ..gradients import Numbers
 from ..node_conditions import stopping_plane
 
 LOW, HIGH = 0.4, 0.53
@@ -17,9 +16,7 @@ KEPT = 0.3
 class Cut(nn.Module):
     """Stops the nodes behind a plane, but for those between two heights z, which keep 0.3 of v_x and v_z."""
 
-    def __init__(
-        self, point: Sequence[float], normal: Sequence[float], margin: float, start: float, end: float
-    ) -> None:
+    def __init__(self, point: Numbers, normal: Numbers, margin: float, start: float, end: float) -> None:
         super().__init__()
         self.plane = stopping_plane(point, normal, margin, start, end)
 

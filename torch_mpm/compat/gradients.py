@@ -1,0 +1,54 @@
+"""Arguments that may require grad: they keep their gradient, or are refused by name."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ..errors import check_vector
+
+Numbers = Sequence[float] | Tensor
+"""Numbers, or a tensor of them."""
+
+
+def requires_grad(value: Any) -> bool:
+    """Whether a tensor, or one in a list, requires grad."""
+    if isinstance(value, (list, tuple)):
+        return any(requires_grad(part) for part in value)
+    return isinstance(value, Tensor) and value.requires_grad
+
+
+def refuse_grad(reason: str, **arguments: Any) -> None:
+    """Check that no argument requires grad.
+
+    Raises:
+        ValueError: with the name of an argument, and why it has no gradient.
+    """
+    for name, value in arguments.items():
+        if requires_grad(value):
+            raise ValueError(f"{name} must not require grad: {reason}")
+
+
+def vector(name: str, value: Any, like: Tensor) -> tuple[float, ...] | Tensor:
+    """Three numbers, or a tensor [3] in the dtype and on the device of another tensor where one requires grad.
+
+    Raises:
+        TypeError, ValueError: for anything else.
+    """
+    if not requires_grad(value):
+        single = isinstance(value, (list, tuple))
+        return check_vector(name, [_number(part) for part in value] if single else value, 3)
+    if not isinstance(value, Tensor):
+        value = torch.stack([torch.as_tensor(part, dtype=like.dtype, device=like.device) for part in value])
+    if tuple(value.shape) != (3,):
+        raise ValueError(f"{name} must have 3 numbers, got {list(value.shape)}")
+    result: Tensor = value.to(like)
+    return result
+
+
+def _number(value: Any) -> Any:
+    """A tensor [] as a number."""
+    return value.item() if isinstance(value, Tensor) and value.numel() == 1 else value

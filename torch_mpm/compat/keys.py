@@ -1,0 +1,42 @@
+"""Keys of dictionaries in the conventions of other simulators."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Collection, Iterable, Mapping
+from typing import Any
+
+
+def check_keys(
+    what: str, given: Iterable[Any], known: Collection[str], unsupported: Mapping[str, str] | None = None
+) -> None:
+    """Check that all keys are known.
+
+    Args:
+        what: the dictionary in words.
+        given: its keys.
+        known: keys that it may have.
+        unsupported: keys of related simulators, with what to do instead.
+
+    Raises:
+        ValueError: for other keys, with the nearest known one of each.
+    """
+    problems = []
+    for key in given:
+        if unsupported and key in unsupported:
+            problems.append(f"{key!r} is not supported: {unsupported[key]}")
+        elif key not in known:
+            (nearest,) = difflib.get_close_matches(str(key), known, 1, 0.0)
+            problems.append(f"{key!r} is unknown, the nearest known key is {nearest!r}")
+    if problems:
+        raise ValueError(f"{what} must have known keys: {'; '.join(problems)}")
+
+
+def check_needed(what: str, given: Mapping[str, Any], needed: Iterable[str]) -> None:
+    """Check that no key is missing.
+
+    Raises:
+        ValueError: with the missing keys.
+    """
+    if missing := [name for name in needed if name not in given]:
+        raise ValueError(f"{what} must have {', '.join(missing)}, got {sorted(given)}")
