@@ -41,11 +41,12 @@ def step_of(dim: int, E, scenes: int = 1, device: str = "cpu", dtype: torch.dtyp
 
 
 def one_by_one(step: mpm.Step, state: mpm.State, end: float, cfl: float, every: int) -> tuple[mpm.State, int]:
-    """A scene alone: `every` equal steps with a dt of the limit, until the rest is as short."""
-    now, taken = float(state.time), 0
+    """A scene alone: `every` equal steps with a dt of the limit, or the one before, until the rest is as short."""
+    now, taken, bound = float(state.time), 0, 0.0
     while now < end:
         limit = cfl * float(step.stable_dt(state, cfl=1.0).double())
-        left = max(math.ceil((end - now) / limit * (1 - 1e-9)), 1)
+        bound = bound if limit / 2 <= bound <= limit else limit
+        left = max(math.ceil((end - now) / bound * (1 - 1e-9)), 1)
         n = min(left, every)
         dt = (end - now) / left
         for _ in range(n):
@@ -72,20 +73,70 @@ def test_one_scene_is_that_of_single_steps(dim, every, dtype, device):
         assert error(getattr(arrival.state, name), getattr(expected, name)) < TOLERANCE["rollout"][dtype], name
 
 
-def test_scenes_of_a_batch_are_as_alone_where_dt_is_chosen_each_substep(dim, device):
-    """Each with a number of substeps of its own, while the others stand still."""
+@pytest.mark.parametrize("every", [1, 5, 16, 64])
+def test_scenes_of_a_batch_are_those_of_single_steps(every, dim, device):
+    """Each with substeps of its own, while the others pause."""
     step = step_of(dim, STIFFNESS, scenes=3, device=device)
     with torch.no_grad():
-        arrival = mpm.rollout_to(step, batch(device, dim), END, every=1)
+        arrival = mpm.rollout_to(step, batch(device, dim), END, every=every)
         parts = arrival.state.split()
         for k, E in enumerate(STIFFNESS):
-            expected, taken = one_by_one(step_of(dim, E), blob(device, dim, F64), END, 0.5, 1)
+            expected, taken = one_by_one(step_of(dim, E), blob(device, dim, F64), END, 0.5, every)
             assert int(arrival.substeps[k]) == taken
             for name in ("x", "v", "F", "C"):
                 assert error(getattr(parts[k], name), getattr(expected, name)) < 1e-9, (k, name)
     substeps = arrival.substeps.tolist()
     assert substeps[2] > 4 * substeps[0]
-    assert 0.3 < float(arrival.largest_cfl.min()) and float(arrival.largest_cfl.max()) < 0.6
+    assert 0.3 < float(arrival.largest_cfl.min()) and float(arrival.largest_cfl.max()) < (0.6 if every == 1 else 0.8)
+
+
+KINDS = {
+    "op": {},
+    "several transfers": {"transfer": "flip"},
+    "sand": {"law": mpm.QuarticSand},
+    "single steps": {"on_grid": lambda blocks, velocity, mass, dt: velocity},
+    "obstacle": {"boundaries": [mpm.Sphere((0.4, 0.1), 0.2, velocity=(0.5, 0.5))]},
+    "path": {"boundaries": [mpm.Sphere(lambda t: torch.stack([0.4 + 0.5 * t, 0.1 + 0.5 * t], -1), 0.2)]},
+}
+"""Of steps: those of one op, and others."""
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("limits", [{}, {"most": 21}, {"longest": 2e-3, "every": 7}])
+def test_a_scene_does_not_depend_on_the_scenes_beside_it(kind, limits, device):
+    """Bit by bit on deterministic grids, where it begins and ends at times of its own, too."""
+    times = torch.tensor([0.0, 0.02, 0.01], dtype=F64), torch.tensor([0.05, 0.03, 0.06], dtype=F64)
+    start, end = (t.to(device) for t in times)
+    step = step_of(2, STIFFNESS, scenes=3, device=device, **KINDS[kind])
+    step.grid = box(2, scenes=3, deterministic=True)
+    with torch.no_grad():
+        together = mpm.rollout_to(step, batch(device, 2).replace(time=start), end, **limits)
+        for k, E in enumerate(STIFFNESS):
+            alone = step_of(2, (E,), device=device, **KINDS[kind])
+            alone.grid = box(2, deterministic=True)
+            state = blob(device, 2, F64).replace(time=start[k : k + 1])
+            expected = mpm.rollout_to(alone, state, end[k : k + 1], **limits)
+            assert together.substeps[k] == expected.substeps[0]
+            assert together.arrived[k] == expected.arrived[0]
+            assert together.largest_cfl[k] == expected.largest_cfl[0]
+            one = together.state.split()[k]
+            for name in ("x", "v", "C", "F", "time"):
+                a, b = getattr(one, name), getattr(expected.state, name)
+                assert a is None or torch.equal(a, b), (k, name)
+
+
+def test_gradients_of_a_scene_do_not_depend_on_the_scenes_beside_it(device):
+    def gradient(E: tuple[float, ...]) -> Tensor:
+        step = step_of(2, E, scenes=len(E), device=device)
+        step.grid = box(2, scenes=len(E), deterministic=True)
+        state = mpm.State.concatenate([blob(device, 2, F64, count=12)] * len(E), scene=True)
+        v = state.v.clone().requires_grad_()
+        arrival = mpm.rollout_to(step, state.replace(v=v), END, every=4)
+        return torch.autograd.grad(arrival.state.x.square().sum() + arrival.state.v.square().sum(), v)[0]
+
+    together = gradient(STIFFNESS)
+    for k, E in enumerate(STIFFNESS):
+        assert error(together[12 * k : 12 * (k + 1)], gradient((E,))) < 1e-11
 
 
 @pytest.mark.parametrize("law", [mpm.NeoHookean, mpm.FixedCorotated, mpm.QuarticSand])
@@ -240,6 +291,23 @@ def test_a_scene_that_is_lost_arrives_and_is_told(device):
         arrival = mpm.rollout_to(step, state, END)
     assert bool(arrival.arrived.all())
     assert step.failures(arrival.state).failed.tolist() == [True, False, False]
+
+
+def test_calls_that_follow_one_another_keep_their_dt(device):
+    """Of scenes whose limits change by less than half, at ends that are no multiples of it."""
+    step, state = step_of(2, STIFFNESS, scenes=3, device=device, gravity=None), batch(device, 2)
+    bounds, dt = [], None
+    with torch.no_grad():
+        for k in range(12):
+            arrival = mpm.rollout_to(step, state, 0.01 * (k + 1) + 0.003 * (k % 2), previous=dt)
+            state, dt = arrival.state, arrival.dt
+            bounds.append(dt)
+    assert bool(arrival.arrived.all())
+    bounds = torch.stack(bounds)
+    assert bool((bounds.diff(dim=0) <= 0).all()) and bool((bounds[-1] > 0.5 * bounds[0]).all())
+    assert bool((bounds[-1] == bounds[-3]).all())
+    with pytest.raises(ValueError, match=r"previous must be a number or have shape .* \[3\], got \[2\]"):
+        mpm.rollout_to(step, state, 1.0, previous=dt[:2])
 
 
 def test_longest_step(device):

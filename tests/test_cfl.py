@@ -222,3 +222,82 @@ def test_moving_obstacles_and_particles_without_a_scene(device):
     state = mpm.State.at_rest(points, dtype=torch.float64)
     scene = torch.full((len(state),), 5, dtype=torch.int32, device=device)
     assert bool((step.stable_dt(state.replace(scene=scene)) > 0).all())
+
+
+def strained(law: mpm.Material, device: str) -> tuple[mpm.Step, mpm.State]:
+    """A free particle with a strain of some ten percent, which nothing damps."""
+    grid = mpm.Grid(dx=0.1, lower=(0.0, 0.0), upper=(1.0, 1.0))
+    F = torch.tensor([[[1.15, -0.03], [-0.22, 1.06]]], dtype=torch.float64)
+    ones = torch.ones(1, dtype=torch.float64)
+    state = mpm.State(x=torch.full((1, 2), 0.53, dtype=torch.float64), v=torch.zeros(1, 2, dtype=torch.float64),
+                      mass=1e-3 * ones, volume=1e-6 * ones, F=F)  # fmt: skip
+    step = mpm.Step(grid, law)
+    return step, step.prepare(state.to(device))
+
+
+def energy(step: mpm.Step, state: mpm.State) -> float:
+    affine = 0.0 if state.C is None else state.C.square().sum((1, 2)) / step.grid.inverse_inertia
+    kinetic = 0.5 * (state.mass * (state.v.square().sum(1) + affine)).sum()
+    return float(kinetic + step.law.energy(state).sum())
+
+
+LAWS_OF_SOLIDS = (mpm.NeoHookean, mpm.Hencky, mpm.FixedCorotated)
+
+
+@pytest.mark.parametrize("law", LAWS_OF_SOLIDS)
+@pytest.mark.parametrize("every", [1, 2, 4, 16])
+def test_a_dt_that_stays_feeds_no_energy_into_oscillations(law, every, device):
+    """A dt that followed the limit would raise it to 2 to 15 times its value."""
+    step, state = strained(law(E=1e4, nu=0.3), device)
+    first, means, dt = energy(step, state), [], None
+    with torch.no_grad():
+        for _ in range(4):
+            energies = []
+            for _ in range(150):
+                dt = step.stable_dt(state, previous=dt)
+                state = mpm.rollout(step, state, every, dt)
+                energies.append(energy(step, state) / first)
+            means.append(sum(energies) / len(energies))
+    assert means == pytest.approx([means[0]] * 4, rel=0.03)
+
+
+@pytest.mark.parametrize("law", LAWS_OF_SOLIDS)
+@pytest.mark.parametrize("every", [1, 16])
+def test_rollout_to_feeds_no_energy_into_oscillations(law, every, device):
+    step, state = strained(law(E=1e4, nu=0.3), device)
+    dt = float(step.stable_dt(state))
+    with torch.no_grad():
+        end = mpm.rollout_to(step, state, (400 if every == 1 else 3000) * dt, every=every)
+    assert 0.5 < energy(step, end.state) / energy(step, state) < 2
+    assert float(end.largest_cfl) < 0.8
+
+
+def test_calls_of_rollout_to_feed_no_energy_into_oscillations(device):
+    step, state = strained(mpm.NeoHookean(E=1e4, nu=0.3), device)
+    first, interval, previous, energies = energy(step, state), 16 * float(step.stable_dt(state)), None, []
+    with torch.no_grad():
+        for k in range(1, 81):
+            end = mpm.rollout_to(step, state, k * interval, every=1, previous=previous)
+            state, previous = end.state, end.dt
+            energies.append(energy(step, state) / first)
+    assert sum(energies[40:]) == pytest.approx(sum(energies[:40]), rel=0.1)
+
+
+def test_a_previous_dt_stays_between_half_of_the_limit_and_the_limit(device):
+    """Each scene by itself; numbers and tensors."""
+    step = mpm.Step(mpm.Grid(dx=0.1, lower=(0.0,) * 2, upper=(1.0,) * 2, scenes=4), mpm.NeoHookean(E=1e4, nu=0.3))
+    state = mpm.State.concatenate([strained(step.law, device)[1]] * 4, scene=True)
+    limit = step.stable_dt(state)
+    shares = torch.tensor([0.49, 0.51, 0.99, 1.01], dtype=torch.float64, device=device)
+    for stable_dt in (step.stable_dt, lambda state, **given: mpm.stable_dt(step.grid, step.law, state, 0.5, **given)):
+        assert torch.equal(
+            stable_dt(state, previous=shares * limit), torch.where(shares.gt(0.5) & shares.lt(1), shares, 1) * limit
+        )
+        for previous in (0.6 * float(limit[0]), 0.6 * limit[0], 0.6 * limit[:1]):
+            assert stable_dt(state, previous=previous).tolist() == [0.6 * float(limit[0])] * 4
+        for previous in (0.0, -1.0, math.nan, math.inf):
+            assert torch.equal(stable_dt(state, previous=previous), limit)
+        with pytest.raises(ValueError, match=r"previous must be a number or have shape .* \[B\] = \[4\], got \[3\]"):
+            stable_dt(state, previous=limit[:3])
+        with pytest.raises(TypeError, match="previous must be a number or a tensor"):
+            stable_dt(state, previous="long")

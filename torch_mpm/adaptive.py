@@ -8,6 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from .cfl import chosen_dt
 from .checkpoints import Checkpoints
 from .errors import NUMBER_OR_TENSOR, check_count, check_number, shape_of
 from .graphs import CHUNK, replay_all
@@ -41,6 +42,9 @@ class Arrival(NamedTuple):
     largest_cfl: Tensor
     """Largest share of the stability limit that the dt of a segment was at its beginning or end, float64; above 1 the
     limit has become smaller than dt within a segment."""
+    dt: Tensor
+    """What the latest substeps of a scene were as long as, or a little less, so that equal ones end at its time [s],
+    float64; to be the `previous` of the next call. Zero without substeps."""
 
 
 def rollout_to(
@@ -53,13 +57,18 @@ def rollout_to(
     every: int = SEGMENT,
     most: int = MOST_SUBSTEPS,
     checkpoint: int | Checkpoints | None = None,
+    previous: float | Tensor | None = None,
 ) -> Arrival:
     """Take every scene to a time, in substeps of its own length and number.
 
-    Every so many substeps each scene has a new dt: `cfl` of the limit of `Step.stable_dt` in its present state, or a
-    little less, so that equal substeps end at its time. Scenes that have arrived stand still, as paused ones do. All
-    of this is computed where the particles are. The host waits when it asks how many substeps are left: at the
-    beginning, after 64 segments at most, and before the last one.
+    The dt of a scene is `cfl` of the limit of `Step.stable_dt`, or a little less, so that equal substeps end at its
+    time. Every so many substeps the limit is computed anew, and a dt that is below this share of it or above half of
+    that stays: one that followed the limit would feed energy into particles that oscillate (docs/limitations.md). The
+    substeps of a scene depend on its own limit alone, so its result does not depend on the scenes beside it; on grids
+    that are not `deterministic`, up to rounding. A scene with no more than `every` substeps left pauses until all
+    others have as few, and its last ones follow in one segment without a new choice. All of this is computed where the
+    particles are. The host waits when it reads how many substeps are left: at the beginning, after 64 segments at most,
+    and before the last ones.
 
     Args:
         step: what moves the particles; with `every` > 1 in one op per segment where `rollout` can do so.
@@ -68,12 +77,14 @@ def rollout_to(
             stand still, and so do those whose entry is not finite, which do not arrive.
         cfl: share of the limit, positive and finite; see `stable_dt`.
         longest: the longest dt that is wanted [s].
-        every: substeps from one choice of dt to the next. With one, dt is chosen for every substep.
+        every: substeps from one choice of dt to the next. With one, dt is chosen before every substep.
         most: substeps of a scene at most.
         checkpoint: as of `rollout`, for each segment.
+        previous: dt of the substep before [s], a number, or a tensor [], [1] or [B], where calls follow one another:
+            `arrival.dt` of the call before. None, or zero, for none.
 
     Returns:
-        The state, and of each scene whether it has arrived, its substeps and its largest CFL number.
+        The state, and of each scene whether it has arrived, its substeps, its largest CFL number and its latest dt.
 
     Differentiable as `rollout` with these dt, which are constants for autograd.
 
@@ -89,10 +100,10 @@ def rollout_to(
     given = step.prepare(state)
     unsorted = in_no_order(given, most)
     start = put_in_order(step, given) if unsorted else given
-    clocks = Clocks(step, start, time, cfl, longest, most)
-    while (left := clocks.look()) > 0:
-        segments = min(max(left // every, 1), MOST_SEGMENTS)
-        clocks.advance(segments, min(left, every), checkpoint)
+    clocks = Clocks(step, start, time, cfl, longest, most, previous)
+    while (counts := clocks.look()) and counts[-1] > every:
+        clocks.advance(min((counts[-1] - 1) // every, MOST_SEGMENTS), every, checkpoint)
+    clocks.finish(counts, checkpoint)
     arrival = clocks.arrival()
     return arrival._replace(state=put_back(step, arrival.state, start, given)) if unsorted else arrival
 
@@ -103,24 +114,35 @@ class Clocks:
     Graphs read and write the tensors, so each stays the same.
     """
 
-    def __init__(self, step: Step, state: State, time: float | Tensor, cfl: float, longest: float, most: int) -> None:
+    def __init__(
+        self,
+        step: Step,
+        state: State,
+        time: float | Tensor,
+        cfl: float,
+        longest: float,
+        most: int,
+        previous: float | Tensor | None,
+    ) -> None:
         self.step, self.state, self.cfl, self.longest, self.most = step, state, cfl, longest, most
         self.end = _per_scene("time", time, step.grid.scenes, state.x)
         self.now = _per_scene("the time of the state", state.time, step.grid.scenes, state.x)
         self.substeps = torch.zeros_like(self.now, dtype=torch.int64)
         self.largest_cfl = torch.zeros_like(self.now)
         self._end = time
+        self._bound = _per_scene("previous", 0.0 if previous is None else previous, step.grid.scenes, state.x)
         self._dt = torch.zeros_like(self.now)
+        self._left = torch.zeros_like(self.substeps)  # substeps until the end, of `most` at most
 
     @torch.no_grad()
-    def look(self) -> int:
-        """The most substeps that a scene may still take; waits for the device."""
+    def look(self) -> list[int]:
+        """The different numbers of substeps that scenes have left, in ascending order; waits for the device."""
         self.state = self._at_its_time(self.state)
-        left = torch.minimum(self._left(self._limit(self.state)), self.most - self.substeps)
-        return int(left.amax()) if len(left) else 0
+        self._choose(self.state)
+        return [count for count in self._left.unique().tolist() if count > 0]
 
     def advance(self, segments: int, n: int, checkpoint: int | Checkpoints | None) -> None:
-        """Some segments of n substeps each."""
+        """Some segments of n substeps each, of the scenes that have more of them left."""
         if segments < LEAST_REPLAYS + 1 or not self._replays():
             for _ in range(segments):
                 state, dt = self._next(self.state, n)
@@ -134,6 +156,15 @@ class Clocks:
         # The first one makes what steps keep.
         self.state = replay_all(self.step, segment, segment(self.state), segments - 1, max(CHUNK // n, 1))
 
+    def finish(self, counts: list[int], checkpoint: int | Checkpoints | None) -> None:
+        """The last substeps of each scene, which `look` has counted."""
+        taken = 0
+        for count in counts:
+            dt = torch.where(self._left >= count, self._dt, 0.0).to(self.state.x.dtype)
+            self.state = rollout(self.step, self.state, count - taken, dt, checkpoint)
+            taken = count
+        self._take(self._left)
+
     def _replays(self) -> bool:
         """Whether segments are replays of a CUDA graph."""
         step, state = self.step, self.state
@@ -143,16 +174,20 @@ class Clocks:
 
     @torch.no_grad()
     def _next(self, state: State, n: int) -> tuple[State, Tensor]:
-        """The state at its time, and dt of its next n substeps: zero for scenes that have arrived."""
+        """The state at its time, and dt of its next n substeps: zero for scenes that have no more than n left."""
         state = self._at_its_time(state)
-        limit = self._limit(state)
-        left = self._left(limit)
-        moves = left > 0
-        self._dt.copy_(torch.where(moves, (self.end - self.now) / left.clamp(min=n), 0.0))
-        self.now.copy_(torch.where(moves & (left <= n), self.end, self.now + n * self._dt))
-        self.substeps += n * moves
-        self._count_cfl(limit)
-        return state, self._dt.to(state.x.dtype, copy=True)
+        self._choose(state)
+        moves = self._left > n
+        self._take(torch.where(moves, n, 0))
+        return state, torch.where(moves, self._dt, 0.0).to(state.x.dtype)
+
+    @torch.no_grad()
+    def _take(self, count: Tensor) -> None:
+        """Count so many substeps of each scene."""
+        span = self.end - self.now
+        arrives = (count > 0) & (count * self._dt >= span * (1 - ROUNDING))
+        self.now.copy_(torch.where(arrives, self.end, self.now + count * self._dt))
+        self.substeps += count
 
     @torch.no_grad()
     def arrival(self) -> Arrival:
@@ -161,26 +196,32 @@ class Clocks:
         arrived = self.now >= self.end
         if not isinstance(self._end, Tensor) and bool((self.now == self.end).all()):
             state = state.replace(time=float(self._end))
-        return Arrival(state, arrived, self.substeps, self.largest_cfl)
+        return Arrival(state, arrived, self.substeps, self.largest_cfl, self._bound)
 
     def _at_its_time(self, state: State) -> State:
-        return state.replace(time=self.now.to(state.x.dtype, copy=True))
+        return state.replace(time=self.now.clone())
 
     def _limit(self, state: State) -> Tensor:
-        """The longest stable dt of each scene, which the dt before was a share of."""
+        """The longest stable dt of each scene, of which the dt before is a share."""
         limit = 1 / self.step.survey(state, judge=False).rate
-        self._count_cfl(limit)
+        self._count_cfl(limit, self.substeps > 0)
         return limit
 
-    def _count_cfl(self, limit: Tensor) -> None:
-        share = torch.nan_to_num(self._dt / limit, nan=0.0)
+    def _count_cfl(self, limit: Tensor, moves: Tensor) -> None:
+        share = torch.where(moves, torch.nan_to_num(self._dt / limit, nan=0.0), 0.0)
         self.largest_cfl.copy_(torch.maximum(self.largest_cfl, share))
 
-    def _left(self, limit: Tensor) -> Tensor:
-        """Substeps until the end of each scene, in float64; zero for those that have arrived or cannot."""
-        dt, span = (self.cfl * limit).clamp(max=self.longest), self.end - self.now
-        left = torch.ceil(span / dt * (1 - ROUNDING)).clamp(min=1)
-        return torch.where((span > 0) & span.isfinite() & (dt > 0) & (self.substeps < self.most), left, 0.0)
+    def _choose(self, state: State) -> None:
+        """dt and the substeps until its end of each scene; none for those that have arrived or cannot."""
+        limit, span = self._limit(state), self.end - self.now
+        longest = (self.cfl * limit).clamp(max=self.longest)
+        bound = chosen_dt(longest, self._bound)
+        left = torch.ceil(span / bound * (1 - ROUNDING)).clamp(min=1)
+        moves = (span > 0) & span.isfinite() & (longest > 0) & (self.substeps < self.most)
+        self._bound.copy_(torch.where(moves, bound, self._bound))
+        self._dt.copy_(torch.where(moves, span / left, self._dt))
+        self._left.copy_(torch.where(moves, torch.minimum(left, self.most - self.substeps), 0.0))
+        self._count_cfl(limit, moves)
 
 
 def _per_scene(name: str, time: float | Tensor, scenes: int, like: Tensor) -> Tensor:

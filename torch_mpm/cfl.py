@@ -39,7 +39,7 @@ import torch
 from torch import Tensor
 
 from .boundaries import Obstacle
-from .errors import check_number
+from .errors import NUMBER_OR_TENSOR, check_number, check_real, shape_of
 from .grid import Grid, check_grid
 from .laws.calls import law_calls, laws_of
 from .laws.compiled import CompiledLaw
@@ -78,11 +78,16 @@ def stable_dt(
     transfer: str = "apic",
     stress_form: str = "mls",
     speed: Tensor | None = None,
+    previous: float | Tensor | None = None,
 ) -> Tensor:
     """Estimate of the largest stable time step of each scene, times `cfl`, without synchronising with the device.
 
-    With cfl = 1 and dt taken anew at every step no rollout of the stability benchmark turned a particle inside out;
-    keep 0.5, the default of `Step.stable_dt`, where dt is taken less often or something else acts on the grid.
+    With cfl = 1 and dt computed before every step no rollout of the stability benchmark turned a particle inside out;
+    keep 0.5, the default of `Step.stable_dt`, where dt is computed less often or something else acts on the grid.
+
+    The limit oscillates with the strain of the particles. A dt that follows it feeds energy into particles that nothing
+    damps, such as lone ones (docs/limitations.md). Therefore pass the dt of the step before as `previous`: it stays
+    while it is between half of the result without it and that result.
 
     Args:
         grid: the lattice.
@@ -93,13 +98,14 @@ def stable_dt(
         transfer: "apic"; anything else is limited as "pic" is.
         stress_form: "mls" or "gradient".
         speed: of the obstacles near each particle [P] [m/s], or None; `Step.stable_dt` gives it.
+        previous: dt of the step before [s], a number or a tensor [], [1] or [B]; None for none.
 
     Returns:
         dt [B] [s], constant for autograd; inf for a scene without particles, or without stress, stiffness,
         viscosity and speed. A particle without mass makes it zero; one that is not finite is left out.
 
     Raises:
-        ValueError: for a cfl that is not positive and finite, or an unknown stress form.
+        TypeError, ValueError: for a cfl that is not positive and finite, an unknown stress form, or a wrong `previous`.
     """
     check_grid(grid)
     check_state(state)
@@ -108,7 +114,27 @@ def stable_dt(
     if stress_form not in ("mls", "gradient"):
         raise ValueError(f"stress_form must be 'gradient' or 'mls', got {stress_form!r}")
     found = look(grid, law, state, figures_of(law, state, False), transfer, stress_form, speed)
-    return (cfl / found.rate).to(state.x.dtype)
+    return chosen_dt(cfl / found.rate, previous).to(state.x.dtype)
+
+
+def chosen_dt(longest: Tensor, previous: float | Tensor | None) -> Tensor:
+    """The dt of each scene [B]: the previous one while it is between half of the longest and that, else the longest.
+
+    Raises:
+        TypeError, ValueError: for a wrong `previous`.
+    """
+    if previous is None:
+        return longest
+    scenes = len(longest)
+    if not isinstance(previous, Tensor):
+        previous = longest.new_full((1,), float(check_real("previous", previous, NUMBER_OR_TENSOR)))
+    if previous.dim() > 1 or previous.numel() not in (1, scenes):
+        raise ValueError(
+            f"previous must be a number or have shape [], [1] or [B] = [{scenes}], got {shape_of(previous)}"
+        )
+    if previous.device != longest.device:
+        raise ValueError(f"previous must be on the device of x, {longest.device}, got {previous.device}")
+    return torch.where((longest / 2 <= previous) & (previous <= longest), previous, longest)
 
 
 @torch.no_grad()

@@ -12,7 +12,7 @@ from torch import Tensor
 from .activation_record import ActivationRecord
 from .boundaries import BoundaryList, Obstacle, Walls
 from .capture import GraphCache
-from .cfl import Figures, figures_of, look
+from .cfl import Figures, chosen_dt, figures_of, look
 from .errors import check_number, check_vector, shape_of
 from .failures import Failures, problems_of_state, raise_failures
 from .grid import Blocks, Grid, check_grid
@@ -337,15 +337,19 @@ class Step(TensorModule):
             self.law.reordered(state.material, ordered.material)
         return ordered
 
-    def stable_dt(self, state: State, cfl: float = 0.5) -> Tensor:
+    def stable_dt(self, state: State, cfl: float = 0.5, previous: float | Tensor | None = None) -> Tensor:
         """Largest stable time step of each scene [s], [B], times `cfl`; see `torch_mpm.cfl.stable_dt`.
+
+        Before every step, or every few, call it with the dt of the step before:
+        `dt = step.stable_dt(state, previous=dt)`, which keeps that dt while the limit allows it and is less than twice
+        as long.
 
         Moving obstacles count; what `on_grid` and other boundaries do to the velocities is not known. This is the limit
         of explicit steps, which implicit ones may exceed; with explicit materials, that of these alone, which they may
         not.
         """
         check_number("cfl", cfl, "positive and finite", lambda v: 0 < v < math.inf)
-        return (cfl / self.survey(state, judge=False).rate).to(state.x.dtype)
+        return chosen_dt(cfl / self.survey(state, judge=False).rate, previous).to(state.x.dtype)
 
     @torch.no_grad()
     def figures(self, state: State, judge: bool = True) -> Figures:
