@@ -201,14 +201,11 @@ def test_values_out_of_range(name, form):
 
 @pytest.mark.parametrize("name", ["friction_angle", "plastic_viscosity", "softening", "xi"])
 def test_parameters_change_between_substeps(name):
-    """A value that is given after `finalize_mu_lam` acts from then on, as one that was given before; E and nu do not."""
-    values = {
-        "friction_angle": (20.0, 40.0),
-        "plastic_viscosity": (1.0, 50.0),
-        "softening": (1.0, 9e3),
-        "xi": (0.0, 3.0),
-    }
-    kind = {"friction_angle": "sand", "plastic_viscosity": "foam", "softening": "plasticine", "xi": "metal"}[name]
+    """A value that is given after `finalize_mu_lam` acts from then on, as one from before; E and nu do not."""
+    kind, first, last = {
+        **{"friction_angle": ("sand", 20.0, 40.0), "plastic_viscosity": ("foam", 1.0, 50.0)},
+        **{"softening": ("plasticine", 1.0, 9e3), "xi": ("metal", 0.0, 3.0)},
+    }[name]
     common = {"material": kind, "E": 1e5, "nu": 0.3, "density": 500.0, "yield_stress": 100.0, "hardening": 1}
 
     def moved(before, later):
@@ -221,7 +218,6 @@ def test_parameters_change_between_substeps(name):
             one.p2g2p(k, 1e-3)
         return one.export_particle_x_to_torch()
 
-    first, last = values[name]
     assert torch.equal(moved(first, last), moved(last, None))
     assert not torch.equal(moved(first, last), moved(first, None))
 
