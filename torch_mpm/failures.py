@@ -197,7 +197,7 @@ def unsolved_steps(unsolved: Tensor, residual: Tensor) -> dict[str, Problem]:
         "implicit": Problem(
             unsolved,
             "implicit steps missed their tolerance",
-            "reduce dt, or raise max_iterations or tolerance of the integrator",
+            "reduce dt, or raise max_iterations, max_cg_iterations or tolerance of the integrator",
             size=residual,
             size_in_words="a residual of {:.3g} m/s was left",
         )

@@ -21,7 +21,7 @@ class TwoScenes:
 
     def energy(self, v):
         energy = v.double().square().sum(1)
-        return energy, energy
+        return energy, energy, energy
 
     def gain(self, v, residual, trial, change):
         return change

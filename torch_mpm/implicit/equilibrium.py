@@ -17,7 +17,8 @@ def equilibrium(step: Step, state: State, dt: float) -> State:
     """The state at rest under gravity, walls and obstacles: one implicit step, so long that inertia is nothing.
 
     The shape functions are those of the given positions, so that the displacements may be any (total Lagrangian on the
-    lattice). A body that nothing holds falls as far as it does in dt.
+    lattice). A body that nothing holds falls as far as it does in dt. A body one particle thick has no bending
+    stiffness, so that the solve of one that is held at one end does not converge.
 
     Args:
         step: with `integrator="implicit"`; static loads want a tolerance of 1e-6 or less.
@@ -26,8 +27,8 @@ def equilibrium(step: Step, state: State, dt: float) -> State:
             stiffness.
 
     Returns:
-        The particles where they come to rest, of velocity zero, at the time of `state`. `step.solve_report` tells
-        whether the solve converged.
+        The particles where they come to rest, of velocity zero, at the time of `state`. `step.solve_report` has
+        whether the solve converged, which `step.check` raises an error for.
 
     Raises:
         ValueError: for an explicit step, one with heat or explicit materials, or a dt that is not positive.

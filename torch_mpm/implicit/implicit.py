@@ -34,7 +34,8 @@ class ImplicitReport(NamedTuple):
     """How the latest step was solved; tensors [B] on the device of the particles."""
 
     converged: Tensor
-    """bool: whether the residual came down to its tolerance, or to rounding."""
+    """bool: whether the residual came down to its tolerance, or to rounding, and the error to a tenth of the motion, by
+    the energy that Newton's method expects to gain."""
     residual: Tensor
     """√(g · B⁻¹ g / Σ m) [m/s] of what is left of the gradient g of the energy, with the node blocks B; float64."""
     iterations: Tensor

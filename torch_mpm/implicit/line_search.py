@@ -15,19 +15,24 @@ SUFFICIENT = 1e-4
 """Share of the decrease that the slope promises, which a step must bring (Nocedal and Wright 2006, section 3.1)."""
 ROUNDING = 32
 """Units in the last place by which sums of energies may be wrong."""
-MOST_HALVINGS = 30
+MOST_HALVINGS = 60
+"""Where a body resists only once it has moved, as a cable across its span does, the first step of a static load is as
+long as the body would fall."""
 
 
 class Point(NamedTuple):
-    """Velocities [N, D], and their energy and its size, `ImplicitSystem.energy` [B]."""
+    """Velocities [N, D], and what `ImplicitSystem.energy` returns for them, [B] each: their energy, its size, and that
+    of its rounding."""
 
     v: Tensor
     energy: Tensor
     size: Tensor
+    rounded: Tensor
 
 
 def starting_point(system: ImplicitSystem, bounds: NodeBounds | None) -> tuple[Point, Tensor]:
-    """Where the search begins, and the velocities whose residual the tolerance is relative to.
+    """Where the search begins, the `reference` of the energies from there on, and the velocities whose residual the
+    tolerance is relative to.
 
     These are v* within bounds or no motion, whichever has less energy; where both have none, a share of v* that has
     one. The search begins there, or at the velocities before gravity where these have less energy still, as they do in
@@ -42,9 +47,11 @@ def starting_point(system: ImplicitSystem, bounds: NodeBounds | None) -> tuple[P
         part = _point(system, bounds, share * system.start)
         plain = _lower(system, plain, part._replace(energy=torch.where(lost, part.energy, torch.inf)))
         lost = ~plain.energy.isfinite()
-    if system.before_gravity is None:
-        return plain, plain.v
-    return _lower(system, plain, _point(system, bounds, system.before_gravity)), plain.v
+    begun = plain
+    if system.before_gravity is not None:
+        begun = _lower(system, plain, _point(system, bounds, system.before_gravity))
+    system.reference = begun.v
+    return Point(begun.v, *system.energy(begun.v)), plain.v
 
 
 def _point(system: ImplicitSystem, bounds: NodeBounds | None, v: Tensor) -> Point:
@@ -122,11 +129,13 @@ class Search:
         """The point after the shares of the step that are next, and where its energy is low enough."""
         system, start, friction = self._system, self._start, self._contact.friction
         v = self._moved()
+        changed = system.node_sum(v != start.v) > 0  # a step below rounding helps no more than one of no length
+        self._share = torch.where(changed, self._share, 0.0)
         point = Point(v, *system.energy(v))
         gain = system.gain(start.v, self._residual, v, point.energy - start.energy)
         if friction is not None:
             gain = gain + system.node_sum(friction.gain(v))
         slope = system.node_sum(self._contact.gradient * (v - start.v))
-        rounding = ROUNDING * torch.finfo(v.dtype).eps * (start.size + point.size)
+        rounding = ROUNDING * torch.finfo(v.dtype).eps * (start.rounded + point.rounded)
         enough = gain <= SUFFICIENT * slope + rounding
         return point, (enough & point.energy.isfinite() & (slope <= 0)) | (self._share == 0)

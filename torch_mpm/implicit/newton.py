@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from ..ops import implicit_cg
-from ..ops.implicit import NEGATIVE_CURVATURE
+from ..ops.implicit import CONVERGED, NEGATIVE_CURVATURE
 from .bounds import NodeBounds
 from .contact import Contact, Limit, contact_at
 from .gmres import gmres
@@ -26,6 +26,13 @@ KEPT = 0.01
 """Share of the first residual from which the preconditioner stays: so little changes any more."""
 SYMMETRIC = 1e-3
 """Skew part of the tangents, relative to the rest, up to which they count as symmetric."""
+ERROR_OF_MOTION = 0.1
+"""Most of the error of the velocities, as √(g · H⁻¹ g), relative to the root of the energy that takes part in the
+motion, with which a scene may count as converged: the energy is then right to 1%. A residual may be small because dt is
+long, or because all that is left is smooth."""
+UNRESOLVED = 128
+"""Units in the last place of the elastic energy that the gradient of the displacement of a step would have if all of it
+were strain: the energy of a motion below that is lost in the rounding of the Hessian, whose solves then say nothing."""
 SETTLED, OLDEST = 0.3, 5
 """Where renewing friction has raised the residual, it is kept until the share of the residual is left that does not
 follow from its change; for this many iterations at most."""
@@ -66,9 +73,9 @@ def minimise(system: ImplicitSystem, bounds: NodeBounds | None, options: Options
 
     The host waits for the device once per iteration, to learn whether the last step has lowered the energy of all
     scenes and whether all are done; where it has not, once for each halving and once more. A scene is done when its
-    residual is `tolerance` times that of v*, or of the size of rounding; or when no step lowers its energy. Projected
-    Newton of Bertsekas (1982): components at a bound that the gradient holds there are left out of the linear solve,
-    and steps are clamped.
+    residual is `tolerance` times that of v*, or of the size of rounding, and the energy that Newton's method expects to
+    gain is small beside that of the motion; or when no step lowers its energy. Projected Newton of Bertsekas (1982):
+    components at a bound that the gradient holds there are left out of the linear solve, and steps are clamped.
     """
     return _Newton(system, bounds, options).minimum()
 
@@ -132,6 +139,8 @@ class _Newton:
         self._previous: Tensor | None = None
         self._forcing: Tensor | None = None
         self._stalled = self._indefinite = self._whole = torch.zeros(scenes, dtype=torch.bool, device=device)
+        # Twice the energy that the last step of each scene was to gain where nothing bends its way, [J].
+        self._expected = torch.full_like(self._begun.energy, torch.inf)
         self._lag = _Lag(scenes, device)
 
     def minimum(self) -> Minimum:
@@ -154,9 +163,10 @@ class _Newton:
                 next_look = self._look(after)
             now, look = after, next_look
         # No step lowers the energy where what is left to gain is less than its rounding.
-        v, energy, size = now.point
-        rounding = ROUNDING * torch.finfo(v.dtype).eps * size
-        small = now.small | (self._stalled & (now.residual.square() * self._total_mass <= rounding))
+        v, energy, _, rounded = now.point
+        rounding = ROUNDING * torch.finfo(v.dtype).eps * rounded
+        stuck = self._stalled & (now.residual.square() * self._total_mass <= rounding)
+        small = now.small | (stuck & self._near(now.point, now.contact))
         small = small & now.residual.isfinite() & energy.isfinite()
         v = _with_momentum(self._system, self._bounds, v, self._total_mass)
         return Minimum(v, now.contact.free, small, now.residual, self._iterations, self._cg_iterations)
@@ -179,13 +189,23 @@ class _Newton:
         floor = _rounding(system, inverse, v, self._wave, self._momentum, self._total_mass)
         # One iteration at least: a smooth load may be smaller than the rounding of stresses, which averages out.
         target = torch.maximum(self._options.tolerance * first, torch.where(self._iterations > 0, floor, 0))
-        small = residual <= target
+        small = (residual <= target) & self._near(point, contact)
         done = self._stalled | small
         exact = ~self._indefinite & ((residual <= NEAR * first) | (self._iterations >= PATIENCE))
         kept = done | (residual <= KEPT * first)
         rest = {"inverse": inverse, "change": change, "residual": residual, "target": target}
         flags = {"small": small, "done": done, "exact": exact, "kept": kept}
         return _Iterate(point, elastic, convex, diagonal, contact, **rest, **flags)
+
+    def _near(self, point: Point, contact: Contact) -> Tensor:
+        """Scenes whose error is small beside their motion, bool [B]: by the last step, which was no shorter than what
+        is left, or by the mass of the nodes, which the Hessian exceeds."""
+        system, mass, v = self._system, self._system.mass[:, None], point.v
+        by_mass = system.node_sum(contact.gradient.square() / torch.where(mass > 0, mass, 1))
+        size = torch.maximum(point.size, torch.where(self._begun.energy.isfinite(), self._begun.size, 0))
+        most = 2 * ERROR_OF_MOTION**2 * size
+        resolved = size >= UNRESOLVED * torch.finfo(v.dtype).eps * system.unrotated(v)
+        return (by_mass <= most) | ((self._expected <= most) & resolved)
 
     def _first_residual(self, point: Point, diagonal: Tensor, residual: Tensor) -> Tensor:
         """What the tolerance is relative to [m/s], [B]: a good start saves work, and does not ask for more accuracy."""
@@ -215,7 +235,12 @@ class _Newton:
         system, bounds, most, v = self._system, self._bounds, self._options.max_cg_iterations, now.point.v
         self._forcing = _forcing(now.residual, self._previous, self._forcing, now.target)
         self._previous = now.residual
-        relative = torch.where(now.done, 1.0, self._forcing).to(v.dtype)
+        # What rounding leaves of a residual must not end a solve before what is smooth in it is found.
+        assert self._first is not None
+        tight = (LOOSEST * self._first / torch.where(now.residual > 0, now.residual, 1)).clamp_max(0.5)
+        reached = now.residual <= now.target
+        forcing = torch.where(reached, torch.minimum(self._forcing, tight), self._forcing).clamp_min(TIGHTEST)
+        relative = torch.where(now.done, 1.0, forcing).to(v.dtype)
         tangent = _tangent(system, v, now.convex, now.exact, look.all_exact, look.none_exact)
         now.convex = None
         skew = system.skew(v) if system.flows else None
@@ -232,14 +257,21 @@ class _Newton:
         )
         self._indefinite = solve.state == NEGATIVE_CURVATURE
         steepest = system.of_nodes(self._indefinite & (solve.iterations == 0))
-        direction = torch.where(steepest, -change, solve.solution)
+        direction, solved = torch.where(steepest, -change, solve.solution), solve.state == CONVERGED
         self._cg_iterations += solve.iterations
         if skew is not None and bool(self._whole.any()):
             unprojected = tangent if look.all_exact else system.tangent(v, projected=False)
             derivative = _free_derivative(system, bounds, unprojected, skew, model, across)
-            step, more = _not_symmetric(system, derivative, inverse, change, model, self._whole, relative, most)
+            step, more, solved_too = _not_symmetric(
+                system, derivative, inverse, change, model, self._whole, relative, most
+            )
             direction = torch.where(system.of_nodes(self._whole), step, direction)
+            solved = torch.where(self._whole, solved_too, solved)
             self._cg_iterations += more
+        expected = -system.node_sum(model.gradient * direction)
+        counts = reached | (now.target <= self._options.tolerance * self._first)
+        expected = torch.where(solved & (forcing <= tight) & counts & (expected >= 0), expected, torch.inf)
+        self._expected = torch.where(now.done, self._expected, expected)
         self._iterations += (~now.done).int()
         self._lag.still = torch.zeros_like(now.done)
         return Search(system, bounds, model, now.elastic, now.point, direction, now.done)
@@ -309,13 +341,14 @@ def _not_symmetric(
     scenes: Tensor,
     relative: Tensor,
     most: int,
-) -> tuple[Tensor, Tensor]:
-    """Newton steps with the whole derivative in some scenes, bool [B], or −B⁻¹ g where they do not descend; and the
-    iterations that they took."""
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Newton steps with the whole derivative in some scenes, bool [B], or −B⁻¹ g where they do not descend; the
+    iterations that they took, and where they are solved and descend."""
     right = torch.where(system.of_nodes(scenes), -model.gradient, 0)
     solve = gmres(system, derivative, inverse, right, relative, most)
     descends = system.node_sum(model.gradient * solve.solution) < 0
-    return torch.where(system.of_nodes(descends), solve.solution, -change), solve.iterations
+    step = torch.where(system.of_nodes(descends), solve.solution, -change)
+    return step, solve.iterations, solve.converged & descends
 
 
 class _Lag:

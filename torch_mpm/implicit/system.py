@@ -42,6 +42,8 @@ class ImplicitSystem:
         flows: whether the stress is that after the return map of the trial deformation; no energy has it then.
         before_gravity: velocities of the nodes before gravity [N, D] [m/s], None without gravity: a place to start.
         mirrors: to whose symmetric velocities the system is restricted, None for all.
+        reference: node velocities whose kinetic term is subtracted from `energy` [N, D] [m/s], v* by default. Near them
+            no digits are lost to that of a v* that is far away, as in a static load in one long step.
         volume: of the particles that have an energy, zero for the others [P] [m³].
     """
 
@@ -55,6 +57,7 @@ class ImplicitSystem:
     flows: bool = False
     before_gravity: Tensor | None = None
     mirrors: Mirrors | None = None
+    reference: Tensor | None = None
     _trial: tuple[Tensor, Any] | None = None
 
     def __post_init__(self) -> None:
@@ -72,7 +75,7 @@ class ImplicitSystem:
 
     def forget(self) -> None:
         """Let go of what only the search for the minimum reads."""
-        self._trial = self.before_gravity = None
+        self._trial = self.before_gravity = self.reference = None
         self.__dict__.pop("stiffness", None)
 
     @functools.cached_property
@@ -106,19 +109,31 @@ class ImplicitSystem:
             self._trial = v, trial
         return trial
 
-    def energy(self, v: Tensor) -> tuple[Tensor, Tensor]:
-        """E of each scene, float64 [B] [J], infinite where a particle has none; and a size, of which E has an error of
-        some units in the last place: E, and the work of stresses V √(2 K ψ) and momenta on strains and velocities that
-        are rounded.
+    def energy(self, v: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """E of each scene less the kinetic term of `reference`, float64 [B] [J], infinite where a particle has none;
+        and two sizes of it, float64 [B] [J].
+
+        The first size is the energy that takes part in the motion: kinetic, stored, and the work of the momenta. Of the
+        second one E has an error of some units in the last place: of these energies, and the work of stresses
+        V √(2 K ψ) and momenta on strains and velocities that are rounded.
         """
         stored = self.law.trial_energy(self.trial(v), self.state)
         stored = torch.where(self.volume > 0, self.volume * stored, 0).double()
-        strained = stored.abs() + (2 * self.stiffness * stored.abs()).sqrt()
-        mass, change = self.mass[:, None].double(), (v - self.start).double()
-        kinetic = 0.5 * self.node_sum(mass * change * change)
-        moved = self.node_sum(mass * change.abs() * v.abs())
-        total, size = self.particle_sum(torch.stack([stored, strained], 1)).unbind(1)
-        return kinetic + total, kinetic + moved + size
+        strained = (2 * self.stiffness * stored.abs()).sqrt()
+        mass, new, start = self.mass[:, None].double(), v.double(), self.start.double()
+        change, moved = new - start, self.node_sum(mass * (new - start).abs() * new.abs())
+        reference = start if self.reference is None else self.reference.double()
+        kinetic = 0.5 * mass * (new - reference) * (change + (reference - start))
+        parts = torch.stack([stored, stored.abs(), strained], 1)
+        total, size, rounded = self.particle_sum(parts).unbind(1)
+        size = size + moved + 0.5 * self.node_sum(mass * new * new)
+        return self.node_sum(kinetic) + total, size, size + rounded + self.node_sum(kinetic.abs())
+
+    def unrotated(self, v: Tensor) -> Tensor:
+        """Σ V K |dt L(v)|², float64 [B] [J]: twice the elastic energy of the displacement of a step, or more, if none
+        of its gradient were rotation."""
+        gradient = self.trial(v).C.double() * (self.step[:, None, None] if isinstance(self.step, Tensor) else self.step)
+        return self.particle_sum((self.stiffness * gradient.square().sum((1, 2)))[:, None])[:, 0]
 
     def gain(self, v: Tensor, residual: Tensor, trial: Tensor, change: Tensor) -> Tensor:
         """What a step from v, where the residual is given, to a trial adds to E, float64 [B] [J]: the change of E, or
