@@ -149,6 +149,7 @@ def look(
     obstacles: Sequence[Obstacle] = (),
 ) -> Survey:
     """`survey` of a state that has all fields, of which the law has given figures."""
+    grid.check_resolution(state.x.dtype)
     bound = GRADIENT_BOUND[stress_form, grid.kernel] / grid.dx**2
     return survey(
         grid,

@@ -178,10 +178,13 @@ def _draw_with_a_bar(folder: Path, scene: Any) -> list[Path]:
 
 
 def _check(options: argparse.Namespace) -> None:
+    from . import resolution
     from .scene import Scene
 
     scene = Scene.load(options.scene, options.overrides)
     built = scene.build("cpu")
+    if unresolved := resolution.problem(built.grid, built.state.x.dtype):
+        print(f"{options.scene}: warning: grid: {unresolved}", file=sys.stderr)
     print(
         f"{options.scene}: good, {built.particles} particles in {len(built.scenes)} scene(s), {scene.frames + 1} frames"
     )

@@ -39,6 +39,10 @@ class GridOverflowError(SimulationError):
     """More blocks are active than the grid has room for."""
 
 
+class PrecisionWarning(UserWarning):
+    """Numbers of the chosen dtype are too coarse for what is computed with them."""
+
+
 class DamagedFileError(ValueError):
     """A file of a run is damaged, was changed by another program, or is of another kind."""
 

@@ -12,6 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from . import resolution
 from .capture import is_captured, is_traced, outside_transforms
 from .errors import (
     GridOverflowError,
@@ -49,7 +50,8 @@ class Grid(Lattice):
     Args:
         dx: node distance [m].
         lower, upper: corners of the domain [m], 2 or 3 numbers. Particles between them have their whole support; a
-            particle more than a cell outside is left out of the transfers and reported.
+            particle more than a cell outside is left out of the transfers and reported. Far from zero, choose an
+            origin near the bodies (`torch_mpm.seed`) and give all coordinates relative to it.
         scenes: number of scenes B in a batch; each has the whole lattice to itself.
         kernel: "quadratic" or "cubic" B-spline.
         max_blocks: blocks in the pool; rollouts take memory for blocks around those, too, half as many again on CUDA
@@ -58,8 +60,12 @@ class Grid(Lattice):
         deterministic: bit-identical results from run to run on CUDA too (the CPU always is). A pool that has grown with
             a scene is part of what a run begins with: give each run a grid of its own.
 
+    The first use with positions of a dtype warns (`PrecisionWarning`) where their rounding exceeds dx / 1000, and
+    raises ValueError where it exceeds dx / 16.
+
     Raises:
-        TypeError, ValueError: for a wrong argument, or a lattice of 2^31 blocks or more.
+        TypeError, ValueError: for a wrong argument, a lattice of 2^31 blocks or more, or a domain so far from zero that
+            not even float64 resolves dx.
     """
 
     def __init__(
@@ -100,6 +106,8 @@ class Grid(Lattice):
             raise ValueError(f"max_blocks must be between 0 and {self._most_blocks} blocks, got {max_blocks}")
         self.max_blocks = max_blocks
         self._grows = max_blocks is None
+        self._resolved: set[torch.dtype] = set()
+        self.check_resolution(torch.float64)
         self._pending: torch.cuda.Event | None = None
         self._on_host: Tensor | None = None
 
@@ -129,6 +137,7 @@ class Grid(Lattice):
 
         Raises:
             ValueError, TypeError: for wrong shapes, dtypes or devices.
+            ValueError: where positions of this dtype do not resolve the cells (`check_resolution`).
             GridOverflowError: on the CPU, where a fixed `max_blocks` is too small. On CUDA the status tells
                 (`Step.check`).
         """
@@ -143,6 +152,24 @@ class Grid(Lattice):
         return blocks
 
     @property
+    def reach(self) -> float:
+        """Largest absolute coordinate of the domain [m]."""
+        return max(map(abs, (*self.lower, *self.upper)))
+
+    def check_resolution(self, dtype: torch.dtype) -> None:
+        """Report a domain whose cells positions of a dtype do not resolve, once for each dtype.
+
+        Warns:
+            PrecisionWarning: where positions are rounded by more than dx / 1000.
+
+        Raises:
+            ValueError: where they are rounded by more than dx / 16.
+        """
+        if dtype not in self._resolved:
+            resolution.check(self, dtype)
+            self._resolved.add(dtype)
+
+    @property
     def grows(self) -> bool:
         """Whether `max_blocks` follows the scene."""
         return self._grows
@@ -150,6 +177,8 @@ class Grid(Lattice):
     def pool(self, x: Tensor, scene: Tensor | None) -> int:
         """The blocks of the pool of the next activation."""
         compiling = torch.compiler.is_compiling()
+        if not compiling:
+            self.check_resolution(x.dtype)
         if not compiling and _POOLS.replayed is not None:
             _POOLS.before.setdefault(self, self.max_blocks)
             self.max_blocks = next(_POOLS.replayed, self.max_blocks)

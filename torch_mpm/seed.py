@@ -5,6 +5,9 @@ particles in a grid cell, and returns :class:`Points`. ``method="lattice"`` plac
 spacing ``dx / per_cell**(1/D)``, stretched to fit the bounding box of the shape; ``method="poisson"`` draws a
 Poisson-disk sample of the same mean density, without a preferred direction; ``method="jittered"`` moves each point of
 the lattice at random within its cell, which is faster. All depend on their arguments alone.
+
+``origin`` is for bodies far from the zero of their coordinates, such as those of maps: shapes and files are read in
+these coordinates in float64, and points are stored relative to the origin, so that float32 resolves them.
 """
 
 from __future__ import annotations
@@ -63,14 +66,44 @@ CHUNK = 2**18
 
 @dataclass(frozen=True)
 class Points:
-    """Positions ``x`` [P, D] [m], rest volumes ``volume`` [P] [m^3] ([m^2] in 2-D), ``scene`` int32 [P] or None."""
+    """Positions ``x`` [P, D] [m], rest volumes ``volume`` [P] [m^3] ([m^2] in 2-D), ``scene`` int32 [P] or None.
+
+    ``exact`` are x and volume in float64 where `x` and `volume` are roundings of these, otherwise None.
+    """
 
     x: Tensor
     volume: Tensor
     scene: Tensor | None = None
+    exact: tuple[Tensor, Tensor] | None = None
 
     def __len__(self) -> int:
         return self.x.shape[0]
+
+    def values_for(self, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
+        """Positions and volumes to be cast to a dtype: for float64 those of `exact`, unless `x` has changed since."""
+        if self.exact is None or dtype == self.x.dtype:
+            return self.x, self.volume
+        x, volume = self.exact
+        return _unrounded(self.x, x), _unrounded(self.volume, volume)
+
+
+def _unrounded(rounded: Tensor, exact: Tensor) -> Tensor:
+    """The exact values of those that are still their roundings, float64."""
+    if exact.shape != rounded.shape:
+        return rounded.double()
+    exact = exact.to(rounded.device)
+    return torch.where(exact.to(rounded.dtype) == rounded, exact, rounded.double())
+
+
+def _points(
+    x: Tensor, volume: Tensor, origin: Vector | None, dtype: torch.dtype | None, device: torch.device | str | None
+) -> Points:
+    """Points relative to an origin from those in float64 on the CPU, in a dtype and on a device."""
+    dtype, device = dtype or default_dtype(), torch.get_default_device() if device is None else device
+    if origin is not None:
+        x = x - _vector("origin", origin, x.shape[1])
+    rounded = x.to(device=device, dtype=dtype), volume.to(device=device, dtype=dtype)
+    return Points(*rounded, exact=None if dtype == x.dtype else (x, volume))
 
 
 class Region:
@@ -175,6 +208,7 @@ def fill(
     method: str = "lattice",
     seed: int = 0,
     count: int | None = None,
+    origin: Vector | None = None,
     dtype: torch.dtype | None = None,
     device: torch.device | str | None = None,
 ) -> Points:
@@ -188,7 +222,9 @@ def fill(
         seed: seed of what is random.
         count: exact number of points, instead of per_cell: the spacing is the widest tried that gives so many, and of
             what is too much a random choice is left out.
-        dtype, device: of the result; by default torch's (float32 where that is a half).
+        origin: coordinates [m], D numbers, that the points are relative to; None for the zero of those of the shape.
+        dtype, device: of the result; by default torch's (float32 where that is a half). A state in float64 has the
+            points without the rounding of float32, see `Points`.
 
     Raises:
         ValueError: for an unknown method, a shape too small to hold a point, or more points than memory holds.
@@ -198,14 +234,13 @@ def fill(
         raise TypeError(f"shape must be a shape of torch_mpm.seed, got {shape_of(shape)} without {missing[0]}")
     check_dtype(dtype)
     check_device(device)
-    dtype, device = dtype or default_dtype(), torch.get_default_device() if device is None else device
     with on_host():
         if count is None:
             x = _points_in(shape, _spacing(grid, per_cell, len(shape.lower)), method, seed)
         else:
             x = _exactly(check_count("count", count, 1), shape, method, seed)
         volume = torch.full((len(x),), shape.volume / len(x), dtype=torch.float64)
-    return Points(x.to(device=device, dtype=dtype), volume.to(device=device, dtype=dtype))
+    return _points(x, volume, origin, dtype, device)
 
 
 def _spacing(grid: Any, per_cell: float, dim: int) -> float:
@@ -366,13 +401,14 @@ def file(
     path: str | Path,
     volume: float | None = None,
     *,
+    origin: Vector | None = None,
     dtype: torch.dtype | None = None,
     device: torch.device | str | None = None,
 ) -> Points:
     """Points from a file: .npy [P, D], .npz with ``x`` [P, D] and perhaps ``volume`` [P], or .csv.
 
     The first line of a .csv names the columns x, y, (z,) (volume). ``volume`` is the total volume [m^3], shared evenly;
-    needed where the file has no volumes.
+    needed where the file has no volumes. ``origin``, ``dtype`` and ``device`` as in :func:`fill`.
 
     Raises:
         OSError: when there is no such file, or it cannot be read.
@@ -392,8 +428,7 @@ def file(
         raise ValueError(f"volumes in {path} must be positive with shape [{len(x)}], got {list(volumes.shape)}")
     if not bool(torch.isfinite(x).all() and torch.isfinite(volumes).all()):
         raise ValueError(f"points in {path} must be finite")
-    dtype, device = dtype or default_dtype(), torch.get_default_device() if device is None else device
-    return Points(x.to(device=device, dtype=dtype), volumes.to(device=device, dtype=dtype))
+    return _points(x, volumes, origin, dtype, device)
 
 
 def _read_points(path: Path) -> tuple[Tensor, Tensor | None]:

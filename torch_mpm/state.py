@@ -6,7 +6,7 @@ import dataclasses
 import itertools
 import math
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -28,9 +28,7 @@ from .errors import (
 from .grid import Grid, check_grid
 from .ops.arguments import refuse_batched, soa_empty
 from .ops.autograd import dispatch, is_recorded
-
-if TYPE_CHECKING:
-    from .seed import Points
+from .seed import Points
 
 
 class Time:
@@ -131,7 +129,8 @@ class State:
         """Undeformed particles.
 
         Args:
-            points: positions [m], rest volumes [m³] and perhaps scenes, as the functions of `torch_mpm.seed` give them.
+            points: positions [m], rest volumes [m³] and perhaps scenes, as the functions of `torch_mpm.seed` give them;
+                a state in float64 has them as they were before their rounding to another dtype.
             density: [kg/m³]; a number or [P].
             velocity: [m/s]; D numbers, or a tensor [D] or [P, D]; None for zero.
             dtype: float32 or float64; torch's default if None, or float32 where that is a half.
@@ -141,16 +140,17 @@ class State:
             TypeError, ValueError: for a density that is not positive and finite, numbers as velocity that are not
                 finite, or wrong shapes.
         """
-        if not isinstance(getattr(points, "x", None), Tensor):
+        if not isinstance(points, Points):
             raise TypeError(f"points must be what torch_mpm.seed gives, got {shape_of(points)}")
         P, D = points.x.shape
         density = _checked_density(density, P)
         check_dtype(dtype)
         check_device(device)
         dtype = dtype or default_dtype()
-        x = _as_soa(points.x.to(device=device, dtype=dtype))
-        volume = points.volume.to(device=x.device, dtype=dtype)
-        mass = (points.volume.to(x.device) * density).to(dtype)
+        x, given_volume = points.values_for(dtype)
+        x = _as_soa(x.to(device=device, dtype=dtype))
+        volume = given_volume.to(device=x.device, dtype=dtype)
+        mass = (given_volume.to(x.device) * density).to(dtype)
         v = soa_empty(x, (P, D)).zero_()
         if velocity is not None:
             v = v + _given_velocity(velocity, P, D).to(device=x.device, dtype=dtype)

@@ -9,6 +9,7 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
+from . import resolution
 from .activation_record import ActivationRecord
 from .boundaries import BoundaryList, Obstacle, Walls
 from .capture import GraphCache
@@ -421,6 +422,9 @@ class Step(TensorModule):
 
         What CUDA graphs replay is among them, if the step had been taken once before it was captured.
 
+        Warns:
+            PrecisionWarning: where the positions of the state do not resolve the cells, see `Grid`.
+
         Raises:
             SimulationError: that names each scene (up to a dozen of a kind), when and how many, and has `failures`: if
                 a particle left the grid or is not finite, if heat was not solved, if an entry of a tensor dt was
@@ -430,6 +434,8 @@ class Step(TensorModule):
             GridOverflowError: if more blocks were active than the grid has room for, and nothing else is wrong.
         """
         raise_failures(self.failures(state), self._activations.all(), self.grid)
+        if state is not None:
+            resolution.check(self.grid, state.x.dtype)
 
     def explain(self, state: State, dt: float | Tensor = 1.0, speed: float | None = None) -> str:
         """How `rollout` takes steps from a state: many in one op, from a CUDA graph or from Python, and why; and of the

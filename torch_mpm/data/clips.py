@@ -21,7 +21,8 @@ class Clip:
     """A scene as a whole.
 
     Attributes:
-        position: [T, N, D] (m), NaN for particles that are not there yet.
+        position: [T, N, D] (m), NaN for particles that are not there yet; relative to the origin of the run, so that
+            float32 resolves it.
         fields: what colours particles, by name: [T, N, ...] or [N].
         interval: time from frame to frame [s].
     """
@@ -58,10 +59,14 @@ class Source:
             names = self.trajectory.names("scene") if named else ["run"]
             self.scenes = {name or f"scene {k}": k for k, name in enumerate(names)}
             self.title = str(self.trajectory.attributes.get("title", ""))
-            position = self.trajectory["position"]
+            position = self._positions()
             self.bounds = (np.nanmin(position, (0, 1)), np.nanmax(position, (0, 1)))
         if not self.scenes:
             raise DatasetError(f"{self.path} has no valid scene yet")
+
+    def _positions(self) -> Array:
+        """Of a run, relative to its origin."""
+        return self.trajectory["position"] - self.trajectory.attributes.get("origin", 0)
 
     def _split(self, scene_id: int) -> str:
         return self.dataset.record.split_of(scene_id)
@@ -78,7 +83,7 @@ class Source:
     def _of_run(self, number: int) -> Clip:
         data = self.trajectory
         rows = data["scene"] == number if "scene" in data.file else slice(None)
-        position = data["position"]
+        position = self._positions()
         names = [name for name in (*data.fields, "material", "mass") if name not in COLORLESS]
         fields = {"speed": np.linalg.norm(data["velocity"], axis=2)} | {name: data[name] for name in names}
         picked = {

@@ -52,6 +52,7 @@ ABSENT = {
     "fps": "give [dataset] frames and interval instead",
     "seed": "give [dataset] seed instead",
     "scene": "the scenes of a data set are samples of one distribution",
+    "origin": "give all coordinates relative to it instead, as models learn from positions in float32",
     "emitter": "the scenes of a data set have all their particles from the start; use bodies",
     "output": "give [dataset] fields instead",
     "render": "export a scene and draw it instead",

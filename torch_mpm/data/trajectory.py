@@ -17,7 +17,7 @@ from __future__ import annotations
 import math
 import os
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
@@ -61,7 +61,7 @@ class Layout:
     scalars: Mapping[str, tuple[tuple[int, ...], str]]
     statics: Mapping[str, Array] = field(default_factory=dict)
     names: Mapping[str, list[str]] = field(default_factory=dict)
-    attributes: Mapping[str, str | int | float] = field(default_factory=dict)
+    attributes: Mapping[str, str | int | float | Sequence[float]] = field(default_factory=dict)
 
     @property
     def bytes(self) -> int:

@@ -42,6 +42,7 @@ class Renderer:
         azimuth, elevation: direction of the camera in degrees (3-D), around and above the horizontal plane.
         view: (lower [D], upper [D]) to frame instead of the bounds.
         exaggeration: scale of heights over that of lengths (2-D); particles stay round.
+        origin: coordinates [m], D numbers, to which all others are relative: the axes show theirs (2-D).
         ground: draw the ground at the lower face of the bounds (3-D).
         backend: "vtk", "software" (3-D without OpenGL, plainer), or "auto": VTK, and where VTK finds no OpenGL
             a logged warning and "software". The attribute `backend` tells which it became; 2-D is "matplotlib".
@@ -69,6 +70,7 @@ class Renderer:
         elevation: float = 18.0,
         view: tuple[npt.ArrayLike, npt.ArrayLike] | None = None,
         exaggeration: float = 1.0,
+        origin: npt.ArrayLike | None = None,
         ground: bool = True,
         backend: str = "auto",
     ) -> None:
@@ -93,7 +95,8 @@ class Renderer:
             raise ValueError(f"backend must be 'auto', 'vtk' or 'software', got {backend!r}")
         if self.dim == 2:
             self.backend = "matplotlib"
-            self.scene = Scene2D(frame, self.resolution, self.has_scale, exaggeration)
+            zero = None if origin is None else vector("origin", origin, 2)
+            self.scene = Scene2D(frame, self.resolution, self.has_scale, exaggeration, zero)
         else:
             self.backend = _choose(backend)
             fill = (1 - 1.7 * scale_width(self.resolution) if color_by else 0.92, 0.86)

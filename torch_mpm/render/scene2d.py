@@ -19,12 +19,17 @@ class Scene2D:
     """One figure that is drawn again for every frame; `to_pixels` gives where a point [m] lands in the picture."""
 
     def __init__(
-        self, bounds: tuple[Array, Array], resolution: tuple[int, int], scale: bool, exaggeration: float = 1.0
+        self,
+        bounds: tuple[Array, Array],
+        resolution: tuple[int, int],
+        scale: bool,
+        exaggeration: float = 1.0,
+        origin: Array | None = None,
     ) -> None:
         self.figure, self.size = figure(resolution), font_size(resolution)
         self.resolution = resolution
         lower, upper = bounds
-        left = 5 * self.size * DPI / 72 / resolution[0]
+        left = (5 if origin is None else 8) * self.size * DPI / 72 / resolution[0]
         width = 0.97 - left - (scale_width(resolution) if scale else 0)
         line = self.size * DPI / 72 / resolution[1]  # share of the height that a line of text takes
         bottom, top = max(0.11, 3.8 * line), max(0.11, 2.6 * line)
@@ -37,6 +42,8 @@ class Scene2D:
         self.axes.set_xlabel("x [m]", size=1.05 * self.size, color=INK)
         self.axes.set_ylabel("y [m]", size=1.05 * self.size, color=INK)
         self.axes.tick_params(labelsize=self.size, colors=INK)
+        if origin is not None:
+            self._label_in_coordinates(origin)
         for spine in self.axes.spines.values():
             spine.set_color("#9aa0a8")
         bar_height = max(fitted[1], 0.3)
@@ -49,6 +56,12 @@ class Scene2D:
         self.stamp = self.axes.set_title("", loc="right", size=1.1 * self.size, color=INK)
         self.figure.canvas.draw()
         self.pixels_per_metre = fitted[0] * resolution[0] / (upper[0] - lower[0])
+
+    def _label_in_coordinates(self, origin: Array) -> None:
+        """Numbers of the axes in coordinates to which those of the picture are relative."""
+        for axis, zero in zip((self.axes.xaxis, self.axes.yaxis), origin, strict=True):
+            axis.set_major_formatter(lambda at, _, zero=zero: f"{at + zero:.10g}")
+            axis.set_major_locator(require("matplotlib.ticker").MaxNLocator(nbins=5))
 
     def to_pixels(self, points: Array) -> Array:
         """Pixel coordinates (column, row) [N, 2] of points [N, 2]."""

@@ -98,7 +98,11 @@ def build(scene: Any, device: torch.device) -> Built:
     entries = scene.entries()
     problems = check.problems(scene, entries)
     problems += [p for entry in entries for p in check.file_problems(entry, scene.folder) if p not in problems]
-    placed = [_placed(scene, entry, problems) for entry in entries]
+    if any(problem.startswith("origin") for problem in problems):
+        raise SceneError(problems)
+    origin, scene = scene.origin, scene.relative()
+    entries = scene.entries()
+    placed = [_placed(scene, origin, entry, problems) for entry in entries]
     if problems:
         raise SceneError(list(dict.fromkeys(problems)))
     words = scene.grid
@@ -301,8 +305,11 @@ Placed = list[tuple[str, Any, seed.Points, "seed.Region | None"]]
 """(key, words, particles, region) of the bodies of a scene."""
 
 
-def _placed(scene: Any, entry: Any, problems: list[str]) -> Placed:
-    """The bodies in which nothing is wrong; what their particles show to be wrong is added to the problems."""
+def _placed(scene: Any, origin: Sequence[float] | None, entry: Any, problems: list[str]) -> Placed:
+    """The bodies in which nothing is wrong; what their particles show to be wrong is added to the problems.
+
+    The coordinates of the scene are relative to its origin in those of files and messages.
+    """
     if any(problem.startswith("grid") or ".per_cell: " in problem for problem in problems):
         return []  # without a lattice, or with too many particles for the memory
     placed = []
@@ -310,15 +317,15 @@ def _placed(scene: Any, entry: Any, problems: list[str]) -> Placed:
         if not _is_good(key, problems):
             continue
         try:
-            points, shape = _seeded(scene, body, (scene.seed if entry.seed is None else entry.seed) + k)
+            points, shape = _seeded(scene, origin, body, (scene.seed if entry.seed is None else entry.seed) + k)
         except (ValueError, OSError) as error:
             problems.append(f"{key}{check.called(body)}: {error}")
             continue
         file = isinstance(body, schema.MeshBody)  # other shapes were checked before
-        found = list(check.bounds_problems(key, body, shape, scene.grid)) if file and shape is not None else []
+        found = list(check.bounds_problems(key, body, shape, scene.grid, origin)) if file and shape is not None else []
         if not found and not check.inside(scene.grid, points.x):
             lower, upper = points.x.amin(0), points.x.amax(0)
-            found = [check.outside(f"{key}{check.called(body)}", lower, upper, scene.grid)]
+            found = [check.outside(f"{key}{check.called(body)}", lower, upper, scene.grid, origin)]
         problems += found
         placed.append((key + check.called(body), body, points, shape))
     problems += _overlaps(placed, [o for o in entry.keyed("obstacle") if _is_good(o[0], problems)])
@@ -329,9 +336,11 @@ def _is_good(key: str, problems: list[str]) -> bool:
     return not any(problem.startswith((f"{key}.", f"{key}:", f"{key} ")) for problem in problems)
 
 
-def _seeded(scene: Any, body: Any, number: int) -> tuple[seed.Points, seed.Region | None]:
+def _seeded(
+    scene: Any, origin: Sequence[float] | None, body: Any, number: int
+) -> tuple[seed.Points, seed.Region | None]:
     if isinstance(body, schema.PointsBody):
-        points = seed.file(scene.folder / body.file, body.volume, dtype=torch.float64)
+        points = seed.file(scene.folder / body.file, body.volume, origin=origin, dtype=torch.float64)
         if points.x.shape[1] != scene.dim:
             raise ValueError(f"{body.file} has points in {points.x.shape[1]}-D, and the scene is in {scene.dim}-D")
         return points, None

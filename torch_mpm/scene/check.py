@@ -13,11 +13,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .. import boundaries, memory, seed
+from .. import boundaries, memory, resolution, seed
 from ..files import check_file
 from ..grid import Grid
 from . import heat, schema
-from .places import obstacle, region
+from .places import obstacle, region, relative
 
 PARTICLE_BYTES = 400
 """Memory that a particle takes at least while a scene is built and simulated."""
@@ -29,7 +29,7 @@ PIXELS = range(16, 16385)
 
 def problems(scene: Any, entries: Sequence[Any]) -> list[str]:
     """One line for each mistake, beginning with its key."""
-    found = [*_grid_problems(scene.grid, len(entries)), *_time_problems(scene), *render_problems(scene)]
+    found = [*_grid_problems(scene, len(entries)), *_time_problems(scene), *render_problems(scene)]
     for entry in entries:
         found += _material_problems(entry)
     found += heat.problems(scene, entries)
@@ -60,18 +60,27 @@ def file_problems(entry: Any, folder: Path) -> Iterator[str]:
 # ---- words
 
 
-def _grid_problems(grid: schema.Grid | None, scenes: int) -> Iterator[str]:
+def _grid_problems(scene: Any, scenes: int) -> Iterator[str]:
+    grid: schema.Grid | None = scene.grid
     if grid is None:
         return
     found = list(_corner_problems(grid))
+    if scene.origin is not None and len(scene.origin) != len(grid.lower):
+        found.append(f"origin: must have {len(grid.lower)} numbers like grid.lower, got {scene.origin}")
     yield from found
+    if found:
+        return
+    if scene.origin is not None:
+        grid = relative(grid, scene.origin)
     try:
-        lattice = None if found else Grid(grid.dx, grid.lower, grid.upper, scenes, grid.kernel)
+        lattice = Grid(grid.dx, grid.lower, grid.upper, scenes, grid.kernel)
     except ValueError as error:
         yield f"grid: {error}"
         return
+    if scene.precision is not None and (problem := resolution.refused(lattice, getattr(torch, scene.precision))):
+        yield f"grid: {problem}"
     try:
-        if lattice is not None and grid.walls is not None:
+        if grid.walls is not None:
             boundaries.Walls(grid.walls, friction=grid.friction).faces(lattice)
     except ValueError as error:
         yield f"grid.walls: {error}"
@@ -169,24 +178,33 @@ def _dimension_problems(key: str, item: Any, dim: int) -> Iterator[str]:
 # ---- places
 
 
-def bounds_problems(key: str, item: Any, shape: seed.Region, grid: schema.Grid) -> Iterator[str]:
-    """A region that reaches out of the domain by more than its outermost particles keep away from its surface."""
+def bounds_problems(
+    key: str, item: Any, shape: seed.Region, grid: schema.Grid, origin: Sequence[float] | None = None
+) -> Iterator[str]:
+    """A region that reaches out of the domain by more than its outermost particles keep away from its surface.
+
+    With an `origin` the coordinates are relative to it, and messages have those of the file.
+    """
     slack = 0.5 * _spacing(item, grid)
     if not inside(grid, torch.stack([shape.lower + slack, shape.upper - slack])):
-        yield outside(f"{key}{called(item)}", shape.lower, shape.upper, grid)
+        yield outside(f"{key}{called(item)}", shape.lower, shape.upper, grid, origin)
 
 
 def inside(grid: schema.Grid, x: Tensor) -> bool:
     """Whether all points [..., D] lie in the domain."""
     lower, upper = (torch.tensor(v, dtype=torch.float64) for v in (grid.lower, grid.upper))
-    rounding = 1e-9 * (upper - lower)
+    rounding = 1e-9 * (upper - lower) + 1e-15 * torch.maximum(lower.abs(), upper.abs())
     return bool(((x >= lower - rounding) & (x <= upper + rounding)).all())
 
 
-def outside(path: str, lower: Tensor, upper: Tensor, grid: schema.Grid) -> str:
+def outside(path: str, lower: Tensor, upper: Tensor, grid: schema.Grid, origin: Sequence[float] | None = None) -> str:
+    ends = [
+        _numbers([float(a) + b for a, b in zip(corner, origin or (0.0,) * len(grid.lower), strict=True)])
+        for corner in (lower, upper, grid.lower, grid.upper)
+    ]
     return (
-        f"{path}: reaches from {_numbers(lower)} to {_numbers(upper)}, outside the domain "
-        f"{_numbers(grid.lower)} to {_numbers(grid.upper)}; move the body or enlarge grid.lower, grid.upper"
+        f"{path}: reaches from {ends[0]} to {ends[1]}, outside the domain {ends[2]} to {ends[3]}; "
+        "move the body or enlarge grid.lower, grid.upper"
     )
 
 
@@ -271,5 +289,7 @@ def called(item: Any) -> str:
     return f" ({item.name})" if item.name else ""
 
 
-def _numbers(values: Any) -> str:
-    return "[" + ", ".join(f"{float(v):.4g}" for v in values) + "]"
+def _numbers(values: Sequence[float]) -> str:
+    """Four digits, or where they are far from zero as many as tell places apart."""
+    digits = 4 if max(map(abs, values)) < 1e4 else 10
+    return "[" + ", ".join(f"{v:.{digits}g}" for v in values) + "]"

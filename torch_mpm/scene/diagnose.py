@@ -40,8 +40,9 @@ class SceneFailure(SimulationError):
 
 
 @torch.no_grad()
-def wrong(step: Step, state: State) -> tuple[int, str] | None:
-    """Row of the first particle that is not finite, outside the grid or inverted, and what is wrong with it."""
+def wrong(step: Step, state: State, origin: Sequence[float] | None = None) -> tuple[int, str] | None:
+    """Row of the first particle that is not finite, outside the grid or inverted, and what is wrong with it; in
+    coordinates to which those of the state are relative by an origin."""
     grid = step.grid
     lower, upper = (torch.tensor(a, dtype=state.x.dtype, device=state.x.device) for a in (grid.lower, grid.upper))
     finite_v = state.v.isfinite().all(1)
@@ -56,14 +57,16 @@ def wrong(step: Step, state: State) -> tuple[int, str] | None:
     for bad, name in checks:
         rows = bad.nonzero()
         if len(rows):
-            return int(rows[0]), _described(step, state, int(rows[0]), name)
+            return int(rows[0]), _described(step, state, int(rows[0]), name, origin)
     return None
 
 
-def _described(step: Step, state: State, row: int, name: str) -> str:
+def _described(step: Step, state: State, row: int, name: str, origin: Sequence[float] | None) -> str:
     value = {"velocity": state.v, "position": state.x}.get(name)
     if value is not None:
         numbers = [f"{v:.4g}" for v in value[row].tolist()]
+        if name == "position" and origin is not None:
+            numbers = [f"{v + zero:.10g}" for v, zero in zip(value[row].tolist(), origin, strict=True)]
         if not bool(value[row].isfinite().all()):
             return f"its {name} is not finite: [{', '.join(numbers)}]"
         return f"it left the domain, at [{', '.join(numbers)}] m"
@@ -80,8 +83,16 @@ def _described(step: Step, state: State, row: int, name: str) -> str:
 
 
 @torch.no_grad()
-def replay(step: Step, state: State, dt: float, steps: int, first_step: int, scenes: Sequence[str]) -> Failure | None:
-    """Take ``steps`` steps from a good state and report the first particle that goes wrong."""
+def replay(
+    step: Step,
+    state: State,
+    dt: float,
+    steps: int,
+    first_step: int,
+    scenes: Sequence[str],
+    origin: Sequence[float] | None = None,
+) -> Failure | None:
+    """Take ``steps`` steps from a good state and report the first particle that goes wrong, as `wrong` does."""
     for k in range(steps):
         good, limit = state, float(step.stable_dt(state, 1.0).min())
         step.reset()
@@ -89,7 +100,7 @@ def replay(step: Step, state: State, dt: float, steps: int, first_step: int, sce
             state = step(state, dt)
         except SimulationError:
             break
-        found = wrong(step, state)
+        found = wrong(step, state, origin)
         if found is not None:
             row, quantity = found
             scene = scenes[int(state.scene[row])] if state.scene is not None else ""

@@ -15,7 +15,7 @@ LISTS = {"body": schema.AnyBody, "obstacle": schema.AnyObstacle, "emitter": sche
 
 def problems(words: dict[str, Any]) -> list[str]:
     """One line for each mistake that can be found in spite of the others; none for a part that could not be read."""
-    names = ("grid", "duration", "fps", "render", "gravity")
+    names = ("grid", "origin", "duration", "fps", "render", "gravity", "precision")
     scene = schema.SceneData.model_construct(**{name: _field(name, words) for name in names})
     heat = words.get("heat")
     scene.heat = None if heat is None else _piece(schema.Heat, heat) or schema.Heat()

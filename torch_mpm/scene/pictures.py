@@ -76,6 +76,9 @@ class _Artist:
     def __init__(self, scene: Scene, words: schema.Render, trajectory: Trajectory) -> None:
         from ..render import Renderer
 
+        origin, scene = scene.origin, scene.relative()
+        self.zero = np.zeros(scene.dim) if origin is None else np.array(origin)
+        words = scene.render or words
         self.scene, self.words = scene, words
         self.entries = scene.entries()
         self.columns = math.ceil(math.sqrt(len(self.entries)))
@@ -96,6 +99,7 @@ class _Artist:
                 elevation=words.elevation,
                 view=words.view,
                 exaggeration=words.exaggeration,
+                origin=origin,
             )
             for entry in self.entries
         ]
@@ -121,7 +125,7 @@ class _Artist:
         rows = frame["scene"] == k if "scene" in frame else slice(None)
         overlays = list(_ritter(self.scene, self.words.ritter, time)) if self.words.ritter else []
         return self.renderers[k].frame(
-            frame["position"][rows],
+            frame["position"][rows] - self.zero,
             self._values(frame)[rows],
             obstacles=shapes,
             overlays=overlays,

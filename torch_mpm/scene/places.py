@@ -3,13 +3,48 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from decimal import Decimal
 from pathlib import Path
 from typing import Any
+
+from pydantic import BaseModel
 
 from .. import boundaries, seed, shapes
 from ..boundaries import Obstacle
 from ..shapes import Shape
 from . import schema
+
+PLACES = ("lower", "upper", "center", "a", "b", "offset", "view")
+"""Keys of coordinates [m]; `dam` is one along x."""
+
+
+def relative(words: Any, origin: Sequence[float]) -> Any:
+    """Words of a scene, or a part of them, with all coordinates less an origin.
+
+    The differences are those of the decimal numbers: a scene far from zero is the same as one near it to the last bit.
+    """
+    if isinstance(words, list):
+        return [relative(item, origin) for item in words]
+    if isinstance(words, dict):
+        return {key: relative(value, origin) for key, value in words.items()}
+    if not isinstance(words, BaseModel):
+        return words
+    changes = {name: _changed(name, value, origin) for name, value in words if value is not None}
+    return words.model_copy(update=changes)
+
+
+def _changed(name: str, value: Any, origin: Sequence[float]) -> Any:
+    if name == "dam":
+        return _less((value,), origin[:1])[0]
+    return _less(value, origin) if name in PLACES else relative(value, origin)
+
+
+def _less(value: Any, origin: Sequence[float]) -> Any:
+    """A place, or a tuple of places, relative to an origin."""
+    if isinstance(value[0], tuple):
+        return tuple(_less(place, origin) for place in value)
+    return tuple(float(Decimal(repr(a)) - Decimal(repr(b))) for a, b in zip(value, origin, strict=True))
 
 
 def region(body: schema.Body, folder: Path | None) -> seed.Region | None:

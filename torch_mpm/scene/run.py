@@ -156,6 +156,8 @@ class Simulation:
         self._survey: list[list[float]] | None = None  # rates, speeds and wrong particles of the present state
         self._copier = Copier()
         self._shown: Shown | None = None  # of the present state, at the end of a frame
+        origin = scene.origin
+        self._origin = None if origin is None else torch.tensor(origin, dtype=torch.float64, device=self.state.x.device)
 
     # -- output
 
@@ -163,7 +165,8 @@ class Simulation:
         """What the trajectory of this scene holds."""
         dim, dtype = self.scene.dim, str(self.state.x.numpy(force=True).dtype)
         vector = ((dim,), dtype)
-        columns: dict[str, tuple[tuple[int, ...], str]] = {"position": vector, "velocity": vector}
+        place = vector if self.scene.origin is None else ((dim,), "<f8")
+        columns: dict[str, tuple[tuple[int, ...], str]] = {"position": place, "velocity": vector}
         columns |= {name: ((dim,) * fields.RANKS[name], dtype) for name in self.scene.trajectory_fields}
         number = ((), "f8")
         scalars = dict.fromkeys(("time", "kinetic_energy", "elastic_energy", "potential_energy", "cfl"), number)
@@ -185,6 +188,7 @@ class Simulation:
                 "scene": source or self.scene.model_dump_json(),
                 "fingerprint": fingerprint,
                 "seed": self.scene.seed,
+                **({} if self.scene.origin is None else {"origin": self.scene.origin}),
                 "precision": self.scene.precision,
                 "device": str(self.state.x.device),
                 **versions(),
@@ -245,7 +249,7 @@ class Simulation:
         laws = len(self.step.law.laws) if isinstance(self.step.law, Mixture) else 1
         if state.material is not None and count and not 0 <= state.material.min() <= state.material.max() < laws:
             return "has materials that the scene lacks"
-        bad = wrong(self.step, state)
+        bad = wrong(self.step, state, self.scene.origin)
         return f"has a particle that is not meaningful: {bad[1]}" if bad else ""
 
     def run(self, writer: FrameWriter, progress: Progress | None, stop: Callable[[], bool]) -> None:
@@ -317,9 +321,13 @@ class Simulation:
         for name in ("position", "velocity", *self.scene.trajectory_fields):
             value = figures.stress if name == "stress" else fields.field(self.step, given, name)
             assert value is not None, name  # `build` refuses fields that no material has
-            values[name] = value
+            values[name] = self._in_coordinates(value) if name == "position" else value
         kept = dict(zip(values, _take_all(list(values.values()), order), strict=True))
         return self._copier.begin(kept), energies(self.step, state, figures)
+
+    def _in_coordinates(self, x: Tensor) -> Tensor:
+        """Positions in the coordinates of the scene file; in float64 where they are relative to an origin."""
+        return x if self._origin is None else x.double() + self._origin
 
     def _law_figures(self, state: State) -> Figures:
         return self.step.figures(fields.with_C(state) if self.step.law.viscous else state)
@@ -396,7 +404,7 @@ class Simulation:
                 raise SimulationError("dt is above the limit")
             if any(row[PROBLEM] >= 0 for row in moved.status) or self.step.heat is not None:
                 self.step.check()
-            bad = wrong(self.step, moved.state) if any(moved.survey[2]) else None
+            bad = wrong(self.step, moved.state, self.scene.origin) if any(moved.survey[2]) else None
             if bad is None:
                 self._survey, self.state, self._shown = moved.survey, moved.state, moved.shown
                 return True
@@ -406,7 +414,7 @@ class Simulation:
         if steps > SEGMENT:
             self.step.reset()
             return False
-        failure = replay(self.step, good, dt, steps, self.totals.substeps, self.built.scenes)
+        failure = replay(self.step, good, dt, steps, self.totals.substeps, self.built.scenes, self.scene.origin)
         if failure is not None:
             self.state = failure.good
         raise SceneFailure(str(failure or message), failure)

@@ -17,6 +17,7 @@ from . import check, partial, schema
 from .build import Built, build
 from .entry import ResolvedEntry
 from .explain import SceneError, explain
+from .places import relative
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -143,13 +144,21 @@ class Scene(schema.SceneData):
             return [ResolvedEntry.resolved(self)]
         return [ResolvedEntry.resolved(entry, self, k) for k, entry in enumerate(self.scene)]
 
+    def relative(self) -> Scene:
+        """The same scene with all coordinates relative to its origin, which is its own zero then."""
+        if self.origin is None:
+            return self
+        moved: Scene = relative(self, self.origin).model_copy(update={"origin": None})
+        return moved
+
     def fingerprint(self) -> str:
         """Hash of everything that determines the trajectory, files included.
 
         Raises:
             SceneError: for a file that cannot be read.
         """
-        digest = hashlib.sha256(self.model_dump_json(exclude=COSMETIC).encode())
+        absent = {"origin"} if self.origin is None else set()  # as in files of versions without this key
+        digest = hashlib.sha256(self.model_dump_json(exclude=COSMETIC | absent).encode())
         digest.update(json.dumps(self.trajectory_fields).encode())
         entries = self.entries()
         problems = [p for entry in entries for p in check.file_problems(entry, self.folder)]

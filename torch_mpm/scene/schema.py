@@ -588,6 +588,9 @@ class SceneData(Content):
 
     title: str = ""
     """title of the pictures"""
+    origin: Vector | None = None
+    """coordinates that positions are stored relative to [m]: for scenes far from zero, such as those in coordinates of
+    maps. All coordinates of this file and of the outputs stay as they are; potential energy is zero at the origin"""
     grid: Grid
     """the domain"""
     duration: Positive
