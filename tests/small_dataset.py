@@ -1,6 +1,9 @@
 """A small data set in the layout of `torch-mpm generate`, from numbers instead of a simulation."""
 
+import json
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -8,6 +11,7 @@ from torch_mpm.data.folder import DatasetRecord
 from torch_mpm.data.packing import prepare_scene
 from torch_mpm.data.shard import shard_path
 from torch_mpm.data.shard_writer import ShardWriter
+from torch_mpm.data.whole_files import CHECKSUM, write_record
 
 SPLITS = {"train": (0, 5), "valid": (5, 2), "test": (7, 3)}
 FRAMES, PER_SHARD, FAILED = 12, 4, 3
@@ -74,3 +78,10 @@ def make_dataset(folder: Path, dim: int = 2, shards: int = 3, **changes: object)
     for index in range(shards):
         write_shard(folder, index, dim, made.frames)
     return folder
+
+
+def forge(path: Path, change: Callable[[dict[str, Any]], Any]) -> None:
+    """Change the words of a record, with a checksum that fits them."""
+    words = json.loads(path.read_text())
+    change(words)
+    write_record(path, {name: value for name, value in words.items() if name != CHECKSUM})

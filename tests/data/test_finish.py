@@ -1,6 +1,8 @@
 """Statistics of a data set against numpy, and what `verify` finds."""
 
+import itertools
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -112,6 +114,22 @@ def fill(name, value, part=...):
     return change
 
 
+@pytest.mark.parametrize(
+    ("place", "name"),
+    [("sum", "velocity"), ("squares", "velocity"), ("sum", "acceleration"), ("squares", "acceleration")],
+)
+def test_sums_that_are_not_those_of_the_scene(folder, tmp_path, place, name):
+    """With a checksum that fits: `verify` computes the sums anew."""
+    copy = shutil.copytree(folder, tmp_path / "copy")
+
+    def change(words):
+        words["scenes"][0]["motion"][name][place][1] *= 1 + 1e-6
+
+    datasets.forge(record_path(shard_path(copy, 0)), change)
+    problems = list(verify(copy))
+    assert len(problems) == 1 and "scene 0 has other statistics than its record says" in problems[0]
+
+
 def lifted(arrays, attributes):
     words = json.loads(attributes["scene"])
     attributes["scene"] = json.dumps({k: v for k, v in words.items() if k != "obstacle"})
@@ -129,8 +147,6 @@ def lifted(arrays, attributes):
     ],
 )
 def test_what_is_wrong_with_a_scene(folder, tmp_path, change, message):
-    import shutil
-
     copy = shutil.copytree(folder, tmp_path / "copy")
     assert list(verify(copy)) == []
     changed(copy, change)

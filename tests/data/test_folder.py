@@ -113,10 +113,85 @@ def test_nothing_yet(tmp_path):
         metadata(empty)
 
 
-@pytest.mark.parametrize("change", [{"format": 9}, {"frames": 0}, {"lower": [0.0]}, {"other": 1}, {"splits": [1]}])
+CHANGES = [{"format": 9}, {"frames": 0}, {"lower": [0.0]}, {"other": 1}, {"splits": [1]}, {"splits": {"a": [-1, 3]}}]
+
+
+@pytest.mark.parametrize("change", CHANGES)
 def test_a_damaged_record(tmp_path, change):
     path = datasets.make_dataset(tmp_path / "set", shards=0)
-    words = json.loads((path / "dataset.json").read_text())
-    (path / "dataset.json").write_text(json.dumps({**words, **change}))
+    datasets.forge(path / "dataset.json", lambda words: words.update(change))
     with pytest.raises(DamagedFileError):
         DatasetFolder(path)
+
+
+@pytest.mark.parametrize("name", ["../out", "/tmp/out", "a/b", "..", "", "a\0", "train\n", "..\\out"])
+@pytest.mark.parametrize("key", ["splits", "fields"])
+def test_names_that_lead_out_of_the_folder(tmp_path, name, key):
+    """A split of a data set from elsewhere names the files of exports."""
+    path = datasets.make_dataset(tmp_path / "set")
+    value = {name: [0, 10]} if key == "splits" else ["position", name]
+    datasets.forge(path / "dataset.json", lambda words: words.update({key: value}))
+    with pytest.raises(DamagedFileError, match="is no name of a split or a field"):
+        DatasetFolder(path)
+
+
+@pytest.mark.parametrize("name", ["dataset.json", "shards", "shards/shard_00001.h5", "shards/shard_00001.json"])
+def test_links_that_lead_out_of_the_folder(tmp_path, name):
+    path = datasets.make_dataset(tmp_path / "set")
+    inside, outside = path / name, tmp_path / "outside"
+    inside.rename(outside)
+    inside.symlink_to(outside)
+    with pytest.raises(DamagedFileError, match="is a link to a place outside"):
+        DatasetFolder(path).check()
+
+
+def test_a_folder_may_be_a_link(tmp_path):
+    path = datasets.make_dataset(tmp_path / "set")
+    (tmp_path / "link").symlink_to(path)
+    data = DatasetFolder(tmp_path / "link")
+    data.check()
+    np.testing.assert_array_equal(data.scene(5)["position"], datasets.arrays(5)["position"])
+
+
+@pytest.mark.parametrize("record", ["dataset.json", "shards/shard_00000.json"])
+def test_records_have_checksums(tmp_path, record):
+    path = datasets.make_dataset(tmp_path / "set")
+    text = (path / record).read_text()
+    digits = [k for k, letter in enumerate(text) if letter.isdigit()]
+    for k in digits[:: max(1, len(digits) // 40)]:
+        other = "1" if text[k] != "1" else "2"
+        (path / record).write_text(text[:k] + other + text[k + 1 :])
+        with pytest.raises(DamagedFileError):
+            DatasetFolder(path).scenes()
+
+
+def test_records_of_before_are_read(tmp_path):
+    """Records of older versions have no checksums."""
+    path = datasets.make_dataset(tmp_path / "set")
+    for record, version in [(path / "dataset.json", 1)] + [(p, 2) for p in (path / "shards").glob("*.json")]:
+        words = json.loads(record.read_text())
+        words.pop("checksum")
+        for scene in words.get("scenes", []):
+            scene.pop("digests")
+        record.write_text(json.dumps({**words, "format": version}))
+    data = DatasetFolder(path)
+    np.testing.assert_array_equal(data.scene(5)["particle_type"], datasets.arrays(5)["particle_type"])
+
+
+def test_flipped_bits_are_not_read(tmp_path):
+    """Every array of a scene, compressed or not, is that which was written, or an error."""
+    path = datasets.make_dataset(tmp_path / "set", shards=1)
+    file, expected = shard_path(path, 0), datasets.arrays(0)
+    data, found = file.read_bytes(), 0
+    for place in range(len(data) // 7, len(data), len(data) // 211):
+        file.write_bytes(data[:place] + bytes([data[place] ^ 16]) + data[place + 1 :])
+        folder = DatasetFolder(path)
+        try:
+            scene = folder.scene(0)
+            for name, values in expected.items():
+                np.testing.assert_array_equal(scene[name], values)
+        except DamagedFileError:
+            found += 1
+        finally:
+            folder.close()
+    assert found > 20

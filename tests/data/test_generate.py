@@ -15,6 +15,7 @@ import torch
 pytest.importorskip("pydantic")
 pytest.importorskip("h5py")
 
+import small_dataset as datasets
 from generated import assert_same, configuration, decoded, start
 from helpers import command
 
@@ -141,16 +142,13 @@ def test_another_configuration_is_refused(copy):
 
 
 def test_another_device_is_refused(copy):
-    record = json.loads((copy / "dataset.json").read_text())
-    (copy / "dataset.json").write_text(json.dumps({**record, "device": "cuda"}))
+    datasets.forge(copy / "dataset.json", lambda words: words.update(device="cuda"))
     with pytest.raises(OutputError, match="begun on cuda, and process 0 of 1 would go on with it on cpu"):
         generate(configuration(), copy, device="cpu")
 
 
 def test_another_version_is_refused(copy):
-    record = json.loads((copy / "dataset.json").read_text())
-    record["versions"]["torch_mpm"] = "0.0.1"
-    (copy / "dataset.json").write_text(json.dumps(record))
+    datasets.forge(copy / "dataset.json", lambda words: words["versions"].update(torch_mpm="0.0.1"))
     with pytest.raises(OutputError, match=r"begun with torch_mpm 0\.0\.1, and this is"):
         generate(configuration(), copy, device="cpu")
 

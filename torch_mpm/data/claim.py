@@ -17,9 +17,9 @@ from typing import IO, Any
 from ..errors import DamagedFileError
 from ..scene.folder import OutputError
 from ..scene.folder import output_errors as folder_errors
-from .folder import DATASET, DatasetRecord
+from .folder import DATASET, LINKED, DatasetRecord
 from .shard import Shard, ShardRecord, record_path, shard_path
-from .whole_files import write_whole
+from .whole_files import check_inside, write_whole
 from .workers import Worker
 
 CONFIGURATION, LOCK = "config.toml", "lock"
@@ -45,7 +45,7 @@ class Claim:
 
     Raises:
         OutputError: for a folder that holds something else, or that cannot be written.
-        DamagedFileError: for a damaged dataset.json.
+        DamagedFileError: for a damaged dataset.json, and where links lead out of the folder.
     """
 
     def __init__(self, folder: Path, record: DatasetRecord, text: str, worker: Worker) -> None:
@@ -60,6 +60,8 @@ class Claim:
         with output_errors(self.folder):
             self._refuse_others()
             (self.folder / "shards").mkdir(parents=True, exist_ok=True)
+            for name in ("shards", LOCK):
+                check_inside(self.folder, self.folder / name, LINKED)
             self._lock = open(self.folder / LOCK, "a+b")
             try:
                 self._locked(TABLE, wait=True)
@@ -134,6 +136,8 @@ class Claim:
         if (shard, check) in self._whole:
             return True
         path = shard_path(self.folder, shard)
+        for own in (path, record_path(path)):
+            check_inside(self.folder, own, LINKED)
         try:
             record = ShardRecord.read(record_path(path))
             good = path.stat().st_size == record.bytes

@@ -42,6 +42,7 @@ from ..scene.scene import override, parsed
 from . import distribution
 from .content_checks import shape_problems, value_problems
 from .distribution import Words
+from .whole_files import NAME
 
 FORMAT = 2
 """Raised where the same configuration would give other scenes."""
@@ -62,7 +63,7 @@ PARTICLE_TYPES = {"weakly_compressible": 5, "quartic_sand": 6}
 """DeepMind's codes by law: water and sand; whatever else is goop."""
 GOOP = 7
 
-Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$")]
+Name = Annotated[str, Field(pattern=f"^{NAME.pattern}$")]
 Code = Annotated[int, Field(ge=0, le=8)]
 
 

@@ -14,8 +14,10 @@ from .folder import DatasetFolder, DatasetRecord
 from .metadata import metadata, write_metadata
 from .packing import content_hash
 from .shard import REMEDY, SceneRecord, Shard, ShardRecord, StoredScene, record_path, shard_path
-from .statistics import BOUNDARY
+from .statistics import BOUNDARY, Motion, motion_sums
 
+STATISTICS = 1e-9
+"""Relative difference of sums of a scene that is rounding."""
 GAIN = 0.05
 """Of its mechanical energy above that of rest on the floor, a scene may gain no more than this share."""
 
@@ -111,6 +113,8 @@ def _scene_problems(stored: StoredScene, told: SceneRecord, record: DatasetRecor
     arrays = {name: stored[name] for name in stored.names}
     if content_hash(arrays) != told.hash:
         yield "has another hash than its record says"
+    if stored.attributes.get("failure", told.failure) != told.failure:
+        yield "has another failure in its record than in its file"
     if bool(stored.attributes.get("valid")) != told.valid or bool(arrays) != told.valid:
         yield "is valid in its record or in its file, but not in both"
     if not told.valid or not arrays:
@@ -123,6 +127,10 @@ def _scene_problems(stored: StoredScene, told: SceneRecord, record: DatasetRecor
     if broken:
         yield f"has numbers that are not finite in {', '.join(broken)}"
         return
+    if not _same_motion(motion_sums(arrays["position"], arrays.get("particle_type")), told.motion):
+        yield "has other statistics than its record says"
+    if stored.particles != told.particles:
+        yield f"has {stored.particles} particles, not {told.particles} as its record says"
     free = arrays.get("particle_type", np.zeros(stored.particles)) != BOUNDARY
     x = arrays["position"][:, free]
     slack = record.dx
@@ -131,6 +139,21 @@ def _scene_problems(stored: StoredScene, told: SceneRecord, record: DatasetRecor
     gain = energy_gain(stored, arrays, record)
     if gain is not None and gain > GAIN:
         yield f"gains {gain:.1%} of its energy"
+
+
+def _same_motion(found: Motion, told: Motion | None) -> bool:
+    """Whether sums agree: those of a device add up in another order, by far less than `STATISTICS`."""
+    if told is None:
+        return False
+    for a, b in ((found.velocity, told.velocity), (found.acceleration, told.acceleration)):
+        scale = np.sqrt(np.maximum(np.array(a.squares) * a.count, 1e-300))  # bounds |sum|, by Cauchy and Schwarz
+        if a.count != b.count or len(a.sum) != len(b.sum) or len(a.squares) != len(b.squares):
+            return False
+        if not np.all(np.abs(np.subtract(a.sum, b.sum)) <= STATISTICS * scale):
+            return False
+        if not np.allclose(a.squares, b.squares, rtol=STATISTICS, atol=0):
+            return False
+    return True
 
 
 def energy_gain(stored: StoredScene, arrays: Any, record: DatasetRecord) -> float | None:

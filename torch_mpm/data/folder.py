@@ -16,12 +16,17 @@ import numpy as np
 from ..errors import DamagedFileError
 from .shard import Array, SceneRecord, Shard, ShardRecord, StoredScene, record_path, shard_path
 from .statistics import Motion, Sums
-from .whole_files import write_whole
+from .whole_files import NAME, check_inside, check_record, write_record
 
-FORMAT = 1
+FORMAT = 2
+FORMAT_WITHOUT_CHECKSUM = 1
+"""Of records that were written before records had checksums."""
 DATASET = "dataset.json"
 MOST_OPEN = 32
 """Shards, and scenes of them, that a reader keeps open."""
+
+
+LINKED = "copy what it links to into the folder, or link the folder as a whole"
 
 
 class DatasetError(ValueError):
@@ -88,8 +93,7 @@ class DatasetRecord:
 
     def write(self, folder: Path) -> None:
         """Write it; it appears when it is whole and on the disk."""
-        text = json.dumps({"format": FORMAT, **asdict(self)}, indent=1, allow_nan=False)
-        write_whole(folder / DATASET, text.encode())
+        write_record(folder / DATASET, {"format": FORMAT, **asdict(self)})
 
     @classmethod
     def read(cls, folder: Path) -> DatasetRecord:
@@ -101,10 +105,14 @@ class DatasetRecord:
         path, remedy = folder / DATASET, "restore it, or generate the data set again"
         if not path.is_file():
             raise FileNotFoundError(f"there is no data set in {folder}: it has no {DATASET}")
+        check_inside(folder, path, LINKED)
         try:
             words = json.loads(path.read_bytes())
-            if words.pop("format") != FORMAT:
+            if words["format"] not in (FORMAT, FORMAT_WITHOUT_CHECKSUM):
                 raise DamagedFileError(path, "is not of this version of torch_mpm", remedy)
+            if words["format"] == FORMAT:
+                check_record(words, path, remedy)
+            words.pop("format")
             words.pop("connectivity_radius", None)  # of some folders; it was never set
             for name in ("seed", "scenes_per_shard", "frames"):
                 words[name] = int(words[name])
@@ -117,6 +125,10 @@ class DatasetRecord:
             record = cls(**words)
             if not 2 <= len(record.lower) == len(record.upper) <= 3 or min(record.frames, record.scenes_per_shard) < 1:
                 raise ValueError("its numbers make no sense")
+            if wrong := [n for n in (*record.splits, *record.fields) if not NAME.fullmatch(n)]:
+                raise ValueError(f"{wrong[0]!r} is no name of a split or a field")
+            if any(first < 0 or count < 0 for first, count in record.splits.values()):
+                raise ValueError("a split has a negative number of scenes")
         except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
             if isinstance(error, DamagedFileError):
                 raise
@@ -146,7 +158,14 @@ class DatasetFolder:
         self._cache = _OpenFiles()
 
     def _record(self, shard: int) -> ShardRecord:
-        return ShardRecord.read(record_path(shard_path(self.path, shard)))
+        return ShardRecord.read(record_path(self._shard_path(shard)))
+
+    def _shard_path(self, shard: int) -> Path:
+        """The file of a shard, which like its record must be in this folder."""
+        path = shard_path(self.path, shard)
+        for own in (path, record_path(path)):
+            check_inside(self.path, own, LINKED)
+        return path
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_cache": _OpenFiles()}
@@ -168,7 +187,7 @@ class DatasetFolder:
         """A valid scene, open for reading."""
         if scene_id not in self._scenes or not self._scenes[scene_id][1].valid:
             raise MissingError(f"{self.path} has no finished and valid scene {scene_id}")
-        return self._cache.scene(shard_path(self.path, self._scenes[scene_id][0]), scene_id)
+        return self._cache.scene(self._shard_path(self._scenes[scene_id][0]), scene_id)
 
     def motion(self, split: str | None = None) -> Motion:
         """Sums of the valid scenes of a split, or of all."""
@@ -182,7 +201,7 @@ class DatasetFolder:
             DamagedFileError: for one that has changed since it was written.
         """
         for index in self.finished:
-            Shard(shard_path(self.path, index), check=True).close()
+            Shard(self._shard_path(index), check=True).close()
 
     def close(self) -> None:
         """Close its files; reading opens them again."""

@@ -157,7 +157,8 @@ def packed(values: Array) -> Compressed:
 # ---- one scene
 
 
-def _digest(values: Array) -> bytes:
+def array_digest(values: Array) -> bytes:
+    """SHA-256 of the numbers of an array."""
     return hashlib.sha256(np.ascontiguousarray(values).data).digest()
 
 
@@ -167,7 +168,7 @@ def content_hash(arrays: Mapping[str, Array | Compressed]) -> str:
     for name in sorted(arrays):
         values = arrays[name]
         digest.update(f"{name} {values.dtype.str} {values.shape} ".encode())
-        digest.update(values.digest if isinstance(values, Compressed) else _digest(values))
+        digest.update(values.digest if isinstance(values, Compressed) else array_digest(values))
     return digest.hexdigest()
 
 
@@ -179,6 +180,12 @@ class PreparedScene:
     particles: int
     hash: str
     motion: Motion | None
+
+    @property
+    def digests(self) -> dict[str, str]:
+        """Digests of the arrays that are not compressed, whose bytes nothing else protects."""
+        plain = {name: values for name, values in self.arrays.items() if not isinstance(values, Compressed)}
+        return {name: array_digest(values).hex() for name, values in plain.items()}
 
 
 def prepare_scene(

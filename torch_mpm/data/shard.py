@@ -11,8 +11,8 @@ dimension, such as ``particle_type`` [N], are stored as they are. A scene that f
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -22,12 +22,15 @@ import numpy.typing as npt
 
 from ..errors import DamagedFileError
 from .hdf5 import h5py_module, storage_problem
+from .packing import array_digest
 from .statistics import Motion, Sums
-from .whole_files import file_hash, write_whole
+from .whole_files import check_record, file_hash, write_record
 
 Array = npt.NDArray[Any]
 
-FORMAT = 2
+FORMAT = 3
+FORMAT_WITHOUT_CHECKSUM = 2
+"""Of records that were written before records had checksums."""
 REMEDY = "remove it and its .json, and generate again"
 
 
@@ -50,7 +53,10 @@ def scene_name(scene_id: int) -> str:
 
 @dataclass(frozen=True)
 class SceneRecord:
-    """What the record of a shard says about a scene; ``motion`` is None for one that failed."""
+    """What the record of a shard says about a scene; ``motion`` is None for one that failed.
+
+    ``digests`` are those of the arrays that are stored as they are, by name: HDF5 has none for them.
+    """
 
     id: int
     valid: bool
@@ -59,6 +65,7 @@ class SceneRecord:
     attempts: int
     failure: str
     motion: Motion | None
+    digests: dict[str, str] = field(default_factory=dict)
 
     @classmethod
     def of(cls, words: dict[str, Any]) -> SceneRecord:
@@ -71,6 +78,7 @@ class SceneRecord:
             attempts=int(words["attempts"]),
             failure=str(words["failure"]),
             motion=_motion(words["motion"]),
+            digests={str(name): str(digest) for name, digest in words.get("digests", {}).items()},
         )
 
 
@@ -84,8 +92,7 @@ class ShardRecord:
 
     def write(self, path: Path) -> None:
         """Write it to a file, which appears when it is whole and on the disk."""
-        text = json.dumps({"format": FORMAT, **asdict(self)}, indent=1, allow_nan=False)
-        write_whole(path, text.encode())
+        write_record(path, {"format": FORMAT, **asdict(self)})
 
     @classmethod
     def read(cls, path: Path) -> ShardRecord:
@@ -97,8 +104,10 @@ class ShardRecord:
         data = path.read_bytes()
         try:
             words = json.loads(data)
-            if words["format"] != FORMAT:
+            if words["format"] not in (FORMAT, FORMAT_WITHOUT_CHECKSUM):
                 raise DamagedFileError(path, "is not of this version of torch_mpm", REMEDY)
+            if words["format"] == FORMAT:
+                check_record(words, path, REMEDY)
             scenes = [SceneRecord.of(s) for s in words["scenes"]]
             record = cls(int(words["bytes"]), str(words["sha256"]), scenes)
         except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
@@ -126,8 +135,8 @@ class StoredScene:
         frames, particles, dim: T, N and D; 0 for a scene that failed.
     """
 
-    def __init__(self, path: Path, group: Any) -> None:
-        self.path, self._group, self._name = path, group, group.name[1:]
+    def __init__(self, path: Path, group: Any, digests: Mapping[str, str]) -> None:
+        self.path, self._group, self._name, self._digests = path, group, group.name[1:], digests
         problem, self.attributes = _scene_problem(group, path.stat().st_size)
         if problem:
             raise DamagedFileError(path, f"{group.name[1:]} {problem}", REMEDY)
@@ -174,6 +183,8 @@ class StoredScene:
         try:
             if name in self._group:
                 values: Array = self._group[name][part]
+                if part is ... and name in self._digests and array_digest(values).hex() != self._digests[name]:
+                    raise ValueError("its checksum is wrong")
                 return values
         except (OSError, RuntimeError, ValueError, KeyError) as error:
             raise DamagedFileError(self.path, f"{self._name}/{name} cannot be read ({error})", REMEDY) from None
@@ -239,7 +250,8 @@ class Shard:
             group = None
         if not isinstance(group, h5py.Group):
             raise DamagedFileError(self.path, f"lacks {name}", REMEDY)
-        return StoredScene(self.path, group)
+        digests = next(told.digests for told in self.record.scenes if told.id == scene_id)
+        return StoredScene(self.path, group, digests)
 
     def __iter__(self) -> Iterator[StoredScene]:
         return (self.scene(scene_id) for scene_id in self.ids)

@@ -81,6 +81,7 @@ class ShardWriter:
             int(attributes.get("attempts", 1)),
             str(attributes.get("failure", "")),
             scene.motion,
+            scene.digests,
         )
         self._scenes.append(record)
 
@@ -105,7 +106,10 @@ class ShardWriter:
 
 
 def _new_group(parent: Any, name: str) -> Any:
-    return h5py_module().h5g.create(parent, name.encode())
+    h5py = h5py_module()
+    properties = h5py.h5p.create(h5py.h5p.GROUP_CREATE)
+    properties.set_obj_track_times(False)  # equal runs write equal files
+    return h5py.h5g.create(parent, name.encode(), gcpl=properties)
 
 
 def _write_attribute(group: Any, name: str, value: str | int | float) -> None:

@@ -3,10 +3,19 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import os
+import re
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
+from ..errors import DamagedFileError
+
+NAME = re.compile(r"[A-Za-z0-9_-]+")
+"""Names that may become a part of a path."""
+CHECKSUM = "checksum"
 PART_BYTES = 2**25
 """Of a file that is hashed in parts."""
 MOST_HASHERS = 4
@@ -29,6 +38,37 @@ def write_whole(path: Path, data: bytes) -> None:
     except BaseException:
         building.unlink(missing_ok=True)
         raise
+
+
+def checksum(values: Mapping[str, Any]) -> str:
+    """SHA-256 of values as JSON, whatever their order."""
+    return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
+
+
+def write_record(path: Path, values: Mapping[str, Any]) -> None:
+    """Write values as JSON with their checksum, in a file that appears when it is whole; OSError as `write_whole`."""
+    plain = json.loads(json.dumps(values, allow_nan=False))  # tuples as lists, as they come back
+    write_whole(path, json.dumps({**plain, CHECKSUM: checksum(plain)}, indent=1).encode())
+
+
+def check_record(values: dict[str, Any], path: Path, remedy: str) -> None:
+    """Compare the values of a record with their checksum, which is taken out of them.
+
+    Raises:
+        DamagedFileError: with ``remedy``, where they differ.
+    """
+    if values.pop(CHECKSUM, None) != checksum(values):
+        raise DamagedFileError(path, "is damaged or was changed: its checksum is wrong", remedy)
+
+
+def check_inside(folder: Path, path: Path, remedy: str) -> None:
+    """Refuse a path in a folder that links lead out of it.
+
+    Raises:
+        DamagedFileError: with ``remedy``.
+    """
+    if not path.resolve().is_relative_to(folder.resolve()):
+        raise DamagedFileError(path, f"is a link to a place outside of {folder}", remedy)
 
 
 def building_path(path: Path) -> Path:

@@ -5,9 +5,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import fcntl
-import hashlib
 import json
-import os
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,6 +13,7 @@ from typing import Any
 
 from ..data.hdf5 import h5py_module
 from ..data.trajectory import COMPLETE, PARTIAL, Layout, Trajectory, create
+from ..data.whole_files import check_inside, check_record, write_record
 from ..errors import DamagedFileError
 from .scene import Scene
 
@@ -34,6 +33,7 @@ def claim(folder: Path, fingerprint: str, resume: bool) -> None:
     # A lock, and a file that was being built when a run was killed, are nothing yet.
     if not folder.exists() or all(p.name == LOCK or p.suffix == ".building" for p in folder.iterdir()):
         return
+    _check_links(folder)
     if not (folder / RUN).is_file():
         raise OutputError(f"{folder} holds files that are not a run of torch_mpm; choose an empty or a new folder")
     if read_run(folder)["fingerprint"] != fingerprint:
@@ -46,6 +46,16 @@ def claim(folder: Path, fingerprint: str, resume: bool) -> None:
         )
 
 
+def _check_links(folder: Path) -> None:
+    """Refuse a folder of which a file or a folder is elsewhere: what is received may not name what is read or written.
+
+    Raises:
+        DamagedFileError: for such a link.
+    """
+    for path in folder.iterdir():
+        check_inside(folder, path, REMEDY)
+
+
 @contextlib.contextmanager
 def locked(folder: Path) -> Iterator[None]:
     """Keep other processes out of a folder, which is made. The lock ends with this process, however it ends.
@@ -54,8 +64,10 @@ def locked(folder: Path) -> Iterator[None]:
 
     Raises:
         OutputError: when another process runs in the folder.
+        DamagedFileError: where links lead out of the folder.
     """
     folder.mkdir(parents=True, exist_ok=True)
+    _check_links(folder)
     with open(folder / LOCK, "w") as handle:
         try:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -73,7 +85,7 @@ def prepare(folder: Path, scene: Scene, layout: Layout, fingerprint: str) -> Non
     """The record and the empty trajectory of a run, where they are not there yet."""
     if not (folder / RUN).exists():
         words = json.loads(scene.model_dump_json())
-        _write_run(folder, {"fingerprint": fingerprint, "scene": words, "folder": str(scene.folder.resolve())})
+        write_record(folder / RUN, {"fingerprint": fingerprint, "scene": words, "folder": str(scene.folder.resolve())})
     if not (folder / PARTIAL).exists():
         (folder / CHECKPOINT).unlink(missing_ok=True)
         free = shutil.disk_usage(folder).free
@@ -103,19 +115,6 @@ def output_errors(folder: Path, kept: str = KEPT) -> Iterator[None]:
 # ---- run.json
 
 
-def _write_run(folder: Path, values: dict[str, Any]) -> None:
-    building = (folder / RUN).with_suffix(".building")
-    try:
-        with open(building, "w") as handle:
-            handle.write(json.dumps({**values, "checksum": _checksum(values)}, indent=1))
-            handle.flush()
-            os.fsync(handle.fileno())
-        building.replace(folder / RUN)
-    except BaseException:
-        building.unlink(missing_ok=True)
-        raise
-
-
 def read_run(folder: Path) -> dict[str, Any]:
     """The record of a run: its ``fingerprint``, ``scene``, ``folder`` (of the scene file), and ``summary`` at its end.
 
@@ -127,16 +126,13 @@ def read_run(folder: Path) -> dict[str, Any]:
         values = json.loads(path.read_bytes())
     except (ValueError, RecursionError) as error:
         raise DamagedFileError(path, f"is damaged ({error})", REMEDY) from None
-    if not isinstance(values, dict) or values.pop("checksum", None) != _checksum(values):
-        raise DamagedFileError(path, "is damaged or was changed: its checksum is wrong", REMEDY)
+    if not isinstance(values, dict):
+        raise DamagedFileError(path, "is no record of a run", REMEDY)
+    check_record(values, path, REMEDY)
     missing = [name for name in ("fingerprint", "scene", "folder") if name not in values]
     if missing:
         raise DamagedFileError(path, f"lacks {', '.join(missing)}", REMEDY)
     return values
-
-
-def _checksum(values: dict[str, Any]) -> str:
-    return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
 
 
 def record_summary(folder: Path, summary: dict[str, Any]) -> None:
@@ -146,7 +142,7 @@ def record_summary(folder: Path, summary: dict[str, Any]) -> None:
         OutputError: when the disk is full.
     """
     with output_errors(folder):
-        _write_run(folder, {**read_run(folder), "summary": summary})
+        write_record(folder / RUN, {**read_run(folder), "summary": summary})
 
 
 def load_run(folder: str | Path, overrides: list[str] | None = None) -> Scene:
@@ -159,6 +155,7 @@ def load_run(folder: str | Path, overrides: list[str] | None = None) -> Scene:
     folder = Path(folder)
     if not (folder / RUN).is_file():
         raise FileNotFoundError(f"there is no run in {folder}")
+    _check_links(folder)
     h5py_module()
     record = read_run(folder)
     with Trajectory(folder) as trajectory:
