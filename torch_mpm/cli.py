@@ -32,7 +32,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 TOLD = (
     "SceneError", "OutputError", "DamagedFileError", "SimulationError", "Interrupted", "RenderError", "WorkerError",
-    "IncompleteError", "VerifyError", "DatasetError", "MissingError",
+    "IncompleteError", "VerifyError", "DatasetError", "MissingError", "FailedScenesError",
 )  # fmt: skip
 
 

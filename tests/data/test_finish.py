@@ -1,6 +1,5 @@
 """Statistics of a data set against numpy, and what `verify` finds."""
 
-import itertools
 import json
 import shutil
 

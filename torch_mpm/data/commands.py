@@ -6,6 +6,8 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+from .failures import MOST_FAILED, check_failures, reasons
+
 
 class VerifyError(ValueError):
     """A data set in which something is wrong."""
@@ -26,6 +28,7 @@ def add(commands: Any) -> None:
     generate.add_argument("-o", "--out", type=Path, help="folder of the data set")
     generate.add_argument("--device", default="auto", help='"auto", "cpu", "cuda" or "cuda:1"; default: %(default)s')
     generate.add_argument("--check", action="store_true", help="check finished shards, and make damaged ones anew")
+    _failures_argument(generate)
     generate.add_argument("--quiet", action="store_true", help="no progress bar")
     set_argument(generate, "dataset.splits={train=100}")
     generate.set_defaults(command=_generate)
@@ -36,7 +39,20 @@ def add(commands: Any) -> None:
 
     verify = commands.add_parser("verify", help="check all files and scenes of a data set")
     verify.add_argument("folder", type=Path, help="folder of the data set")
+    _failures_argument(verify)
     verify.set_defaults(command=_verify)
+
+
+def _failures_argument(parser: argparse.ArgumentParser) -> None:
+    text = "share of the scenes that may fail before the command does; default: %(default)s"
+    parser.add_argument("--most-failed", type=_share, default=MOST_FAILED, metavar="SHARE", help=text)
+
+
+def _share(text: str) -> float:
+    value = float(text)
+    if not 0 <= value <= 1:
+        raise argparse.ArgumentTypeError(f"must be within 0 and 1, got {text}")
+    return value
 
 
 def set_argument(parser: argparse.ArgumentParser, example: str) -> None:
@@ -48,6 +64,7 @@ def set_argument(parser: argparse.ArgumentParser, example: str) -> None:
 def _generate(options: argparse.Namespace) -> None:
     from ..scene import SceneError
     from .configuration import Configuration, presets
+    from .folder import DatasetFolder
     from .generate import generate
 
     if options.preset == "list":
@@ -78,6 +95,10 @@ def _generate(options: argparse.Namespace) -> None:
         f"{done['scenes']} scenes in {done['seconds']:.1f} s ({rate:.3g} per second), of which simulation "
         f"{done['simulating']:.1f} s; {done['failed']} failed"
     )
+    dataset = DatasetFolder(options.out)
+    scenes = dataset.attempted()
+    print("".join(f"{line}\n" for line in reasons(scenes)), end="")
+    check_failures(scenes, options.most_failed)
     rest = f"complete; torch-mpm finalize {options.out} writes its metadata"
     print(f"{options.out} is {rest if done['complete'] else 'not complete: other processes work in it, or are to'}")
 
@@ -98,7 +119,10 @@ def _verify(options: argparse.Namespace) -> None:
     if problems:
         raise VerifyError("\n".join(problems))
     dataset = DatasetFolder(options.folder)
-    print(f"{options.folder}: good, {len(dataset.scenes())} of {len(dataset.attempted())} scenes are valid")
+    scenes = dataset.attempted()
+    check_failures(scenes, options.most_failed)
+    print(f"{options.folder}: good, {len(dataset.scenes())} of {len(scenes)} scenes are valid")
+    print("".join(f"{line}\n" for line in reasons(scenes)), end="")
 
 
 class _Bar:

@@ -265,6 +265,10 @@ def _checked(words: Words) -> Dataset:
     if grid is None:
         Scene(**{key: value for key, value in words.items() if key not in (*VARIED, "dataset")})
         raise SceneError(["grid: missing"])
+    names = words.get("material", {})
+    if unknown := [name for name in dataset.particle_type if name not in names]:
+        expected = f"takes names of materials, {', '.join(names)}"
+        raise SceneError([f"dataset.particle_type.{name}: {expected}" for name in unknown])
     if "temperature" in dataset.fields and "heat" not in words:
         raise SceneError(["dataset.fields: temperature needs a [heat] table"])
     if not sum(dataset.splits.values()):

@@ -172,6 +172,24 @@ def _choice_problems(words: Words, path: str) -> Iterator[str]:
         yield f"{path}.weights: takes {len(items)} numbers that are not negative and not all zero, got {weights!r}"
 
 
+def narrowed(words: Any, path: str = "") -> Iterator[tuple[str, Any]]:
+    """Words in which one choice has one of its entries alone, for every entry of every choice, with its key."""
+    if isinstance(words, list):
+        for k, item in enumerate(words):
+            for key, other in narrowed(item, f"{path}[{k}]"):
+                yield key, [*words[:k], other, *words[k + 1 :]]
+    elif isinstance(words, dict):
+        for key, value in words.items():
+            place = f"{path}.{key}" if path else key
+            if key == CHOICE:
+                rest = {name: kept for name, kept in words.items() if name != WEIGHTS}
+                for k, item in enumerate(value):
+                    yield f"{place}[{k}]", {**rest, CHOICE: [item]}
+                    yield from ((at, {**rest, CHOICE: [one]}) for at, one in narrowed(item, f"{place}[{k}]"))
+            elif key != WEIGHTS:
+                yield from ((at, {**words, key: other}) for at, other in narrowed(value, place))
+
+
 def found(words: Any, path: str = "") -> Iterator[str]:
     """The keys of all distributions in words."""
     if isinstance(words, dict):

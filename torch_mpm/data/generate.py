@@ -10,19 +10,22 @@ from __future__ import annotations
 import json
 import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
-from ..scene import SceneError
+from ..scene import SceneError, check
 from ..scene.run import versions
 from .claim import Claim, output_errors
 from .configuration import Configuration
+from .content_checks import LISTS
+from .distribution import narrowed
 from .folder import DatasetRecord
 from .packing import PreparedScene, prepare_scene
 from .sampling import NoRoom, content
@@ -78,23 +81,41 @@ def generate(
 
 
 def check_samples(configuration: Configuration, count: int = 3) -> None:
-    """Draw the first scenes.
+    """Draw one scene for each entry of each choice, and the first scenes.
 
     Raises:
-        SceneError: where all of them are wrong, or have no room; others fail alone.
+        SceneError: for entries of choices of which no scene can be made, and where all of the first scenes are wrong,
+            or have no room; others fail alone.
     """
-    ids, failed, wrong = range(min(count, configuration.scenes)), 0, []
-    for scene_id in ids:
-        try:
-            configuration.scene(content(configuration, scene_id))
-        except NoRoom as error:
-            failed += 1
-            wrong.append(str(error))
-        except SceneError as error:
-            failed += 1
-            wrong += [f"scene {scene_id}: {p}" for p in error.problems]
-    if failed == len(ids):
-        raise SceneError(wrong, configuration.source)
+    once = {key: [{**item, "count": 1} for item in configuration.words.get(key, [])] for key in LISTS}
+    entries = narrowed({**configuration.words, **once})  # with bodies that few scenes have
+    found = {key: _problems(replace(configuration, words=words), 0, room=False) for key, words in entries}
+    if any(found.values()):
+        raise SceneError(_told_once(found), configuration.source)
+    found = {f"scene {k}": _problems(configuration, k) for k in range(min(count, configuration.scenes))}
+    if all(found.values()):
+        raise SceneError(_told_once(found), configuration.source)
+
+
+def _problems(configuration: Configuration, scene_id: int, room: bool = True) -> list[str]:
+    """What is wrong with a scene; where it has no room, too, if `room`."""
+    try:
+        scene = configuration.scene(content(configuration, scene_id))
+        return check.problems(scene, scene.entries())
+    except NoRoom as error:
+        return [str(error)] if room else []
+    except SceneError as error:
+        return error.problems
+
+
+def _told_once(found: Mapping[str, Sequence[str]]) -> list[str]:
+    """Lines for the problems of several scenes: of one line where all have it, else of one for each."""
+    lines: dict[str, None] = {}
+    for place, problems in found.items():
+        for problem in problems:
+            everywhere = len(found) > 1 and all(problem in others for others in found.values())
+            lines[problem if everywhere else f"{place}: {problem}"] = None
+    return list(lines)
 
 
 def record_of(configuration: Configuration, device: torch.device) -> DatasetRecord:

@@ -1,0 +1,51 @@
+"""Scenes that failed: their reasons, counted, and whether a data set has too many of them."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Iterable
+
+from .shard import SceneRecord
+
+MOST_FAILED = 0.25
+"""Share of the scenes that may fail before a data set counts as failed."""
+MOST_REASONS = 5
+"""Reasons that are listed."""
+
+
+class FailedScenesError(ValueError):
+    """A data set without a valid scene, or in which too many scenes have failed."""
+
+
+def reasons(scenes: Iterable[SceneRecord]) -> list[str]:
+    """One line for each reason for which scenes failed, the most frequent first, with the number of its scenes.
+
+    Reasons that differ in numbers alone are one; the line has the first of them.
+    """
+    counts: Counter[str] = Counter()
+    examples: dict[str, str] = {}
+    for scene in scenes:
+        if not scene.valid:
+            kind = re.sub(r"[-+]?\d+(\.\d+)?(e[-+]?\d+)?", "#", scene.failure)
+            counts[kind] += 1
+            examples.setdefault(kind, scene.failure or "no reason is recorded")
+    lines = [f"{count} failed: {examples[kind]}" for kind, count in counts.most_common(MOST_REASONS)]
+    rest = sum(counts.values()) - sum(count for _, count in counts.most_common(MOST_REASONS))
+    return [*lines, *([f"{rest} failed for other reasons"] if rest else [])]
+
+
+def check_failures(scenes: list[SceneRecord], most: float = MOST_FAILED) -> None:
+    """Raise where no scene is valid, or a larger share than `most` has failed.
+
+    Args:
+        scenes: those that were attempted.
+        most: share of them, within 0 and 1.
+
+    Raises:
+        FailedScenesError: with the reasons.
+    """
+    failed = sum(not scene.valid for scene in scenes)
+    if scenes and (failed == len(scenes) or failed > most * len(scenes)):
+        limit = "no scene is valid" if failed == len(scenes) else f"more than {most:.0%} of the scenes failed"
+        raise FailedScenesError("\n".join([f"{failed} of {len(scenes)} scenes failed: {limit}", *reasons(scenes)]))
