@@ -15,7 +15,9 @@ pytest.importorskip("google_crc32c")
 from torch_mpm import data  # noqa: E402
 from torch_mpm.data.exports import common, lagrangebench  # noqa: E402
 from torch_mpm.data.folder import DatasetFolder  # noqa: E402
+from torch_mpm.data.packing import prepare_scene  # noqa: E402
 from torch_mpm.data.shard import record_path, shard_path  # noqa: E402
+from torch_mpm.data.shard_writer import ShardWriter  # noqa: E402
 from torch_mpm.errors import DamagedFileError  # noqa: E402
 
 IDS = {"train": [0, 1, 2, 4], "valid": [5, 6], "test": [7, 8, 9]}
@@ -89,7 +91,7 @@ def test_gns_with_a_material(source, tmp_path):
     folder = data.export_gns(source, tmp_path / "gns", material="friction_angle")
     given = expected(source, "valid")
     *_, material = list(gns_samples(folder / "valid.npz"))[-1]
-    np.testing.assert_allclose(material, given[-1]["friction_angle"])
+    np.testing.assert_allclose(material, np.tan(np.radians(given[-1]["friction_angle"])), rtol=1e-6)
     dim = dim_of(source)
     for block in ("train", "rollout"):
         words = metadata_of(folder)[block]
@@ -125,7 +127,9 @@ def test_lagrangebench_reads_it(source, tmp_path):
             for key, given in zip(keys, expected(source, split), strict=True):
                 position, kind = file[key]["position"][2:9], file[key]["particle_type"][:]
                 np.testing.assert_array_equal(position, given["position"][2:9])
-                np.testing.assert_array_equal(kind, np.where(given["particle_type"] == 3, 1, 0))
+                codes = np.full(9, -1)
+                codes[[datasets.WATER, datasets.SAND, datasets.BOUNDARY]] = [0, 4, 1]
+                np.testing.assert_array_equal(kind, codes[given["particle_type"]])
                 pad = words["num_particles_max"] - len(kind) + 1
                 assert pad >= 1 and file[key]["position"].compression == "gzip"
     dim = dim_of(source)
@@ -138,7 +142,8 @@ def test_lagrangebench_codes():
     position = np.zeros((3, 4, 2), "f4")
     position[:, 1, 0] = position[:, 3, 0] = [0, 1, 2]
     scene = common.ExportedScene(0, position, np.array([3, 3, 0, 7]), None)
-    assert lagrangebench._types(scene).tolist() == [1, 2, 3, 0]
+    assert lagrangebench._types(scene, {7: 0}).tolist() == [1, 2, 3, 0]
+    assert lagrangebench._types(scene, {5: 0, 7: 4}).tolist() == [1, 2, 3, 4]
 
 
 # ---- DeepMind, PhysicsNeMo
@@ -194,9 +199,10 @@ def test_checksums_are_those_of_tensorflow(flat, tmp_path):
 # ---- NeuralMPM
 
 
-def test_neuralmpm_reads_it(source, tmp_path):
+def test_neuralmpm_reads_it(source, tmp_path, caplog):
     """The steps of its NMPMParser."""
     folder = data.export_neuralmpm(source, tmp_path / "WaterRamps")
+    assert ("NeuralMPM reads scenes in 2-D alone" in caplog.text) == (dim_of(source) == 3)
     for split in IDS:
         files = sorted((folder / split).glob("*.h5"))
         assert [int(p.name.split("_")[-1].split(".")[0]) for p in files] == list(range(len(IDS[split])))
@@ -227,14 +233,17 @@ def well_sample(file, sample, first, steps):
             assert data.attrs["time_varying"] and data.attrs["sample_varying"] and all(data.attrs["dim_varying"])
             fields[name] = torch.as_tensor(data[(sample, slice(first, first + steps, 1))])
             assert fields[name].shape == (steps, *size, *[len(axes)] * order)
+    scalars = {}
     for name in file["scalars"].attrs["field_names"]:
-        raise AssertionError(name)
+        data = file["scalars"][name]
+        assert data.attrs["sample_varying"] and not data.attrs["time_varying"]
+        scalars[str(name)] = float(torch.as_tensor(data[(sample,)]))
     closed = {}
     for wall in file["boundary_conditions"].values():
         (axis,) = wall.attrs["associated_dims"]
         assert wall.attrs["bc_type"] == "WALL"
         closed[str(axis)] = bool(wall["mask"][0] and wall["mask"][-1])
-    return fields, closed
+    return fields, closed, scalars
 
 
 def test_the_well_reads_it(source, tmp_path):
@@ -245,7 +254,8 @@ def test_the_well_reads_it(source, tmp_path):
             assert file.attrs["n_trajectories"] == len(IDS[split]) and file.attrs["n_spatial_dims"] == dim
             assert file["dimensions"]["time"].shape == (FRAMES,)
             for k, given in enumerate(expected(source, split)):
-                fields, closed = well_sample(file, k, 3, 5)
+                fields, closed, scalars = well_sample(file, k, 3, 5)
+                assert scalars == {"gravity_x": 0.0, "gravity_y": pytest.approx(-9.8)}
                 assert closed == dict.fromkeys("xyz"[:dim], True)
                 free = given["particle_type"] != 3
                 mass = fields["density"].double().sum(tuple(range(1, dim + 1))) * 0.1**dim
@@ -259,6 +269,96 @@ def test_the_well_reads_it(source, tmp_path):
                 assert statistics["mean"]["density"] == pytest.approx(density.mean())
                 assert statistics["std_delta"]["density"] == pytest.approx(np.diff(density, axis=1).std(), rel=1e-6)
                 assert len(statistics["mean_delta"]["velocity"]) == dim
+
+
+def with_words(source, words):
+    """The scenes of a data set with other scene files."""
+    data = DatasetFolder(source)
+    shutil.rmtree(source / "shards")
+    (source / "shards").mkdir()
+    dim = data.record.dim
+    for index in range(3):
+        ids = range(4 * index, min(4 * index + 4, 10))
+        with ShardWriter(shard_path(source, index)) as writer:
+            for k in ids:
+                valid = k != datasets.FAILED
+                scene = prepare_scene(datasets.arrays(k, dim) if valid else {})
+                attributes = {**datasets.scene_attributes(k, valid), "scene": json.dumps(words(k))}
+                writer.add(k, scene, attributes)
+            writer.finish()
+
+
+def test_the_well_has_obstacles_and_scalars(tmp_path):
+    """A ball that moves to the right, and a floor; each scene with a material of its own."""
+    source = datasets.make_dataset(tmp_path / "set")
+
+    def words(k):
+        ball = {"shape": "sphere", "center": [0.3, 1.0], "radius": 0.2, "velocity": [20.0, 0.0]}
+        floor = {"shape": "box", "center": [0.5, 0.075], "size": [1.0, 0.15]}
+        sand = {"law": "quartic_sand", "E": 1e6 + k, "friction_angle": 30.0 + k, "cohesive": True}
+        return {"gravity": [0.0, -9.8], "material": {"sand": sand}, "obstacle": [ball, floor]}
+
+    with_words(source, words)
+    folder = data.export_well(source, tmp_path / "out", dx=0.1)
+    x, y = (0.1 * (np.arange(n) + 0.5) for n in (10, 20))
+    with h5py.File(folder / "data" / "valid" / "numbers.hdf5") as file:
+        for k, number in enumerate(IDS["valid"]):
+            fields, _, scalars = well_sample(file, k, 0, FRAMES)
+            assert scalars == {
+                "gravity_x": 0.0, "gravity_y": pytest.approx(-9.8), "sand_E": pytest.approx(1e6 + number),
+                "sand_friction_angle": 30.0 + number,
+            }  # fmt: skip
+            for t in (0, 5, 11):
+                away = (x[:, None] - 0.3 - 20 * 0.0025 * t) ** 2 + (y - 1.0) ** 2
+                expected = (away <= 0.2**2) | (y <= 0.15)
+                clear = abs(away - 0.2**2) > 1e-9
+                np.testing.assert_array_equal(fields["obstacle"][t].numpy()[clear], expected[clear])
+    assert json.loads((folder / "stats.yaml").read_text())["std"]["obstacle"] > 0.1
+
+
+@pytest.mark.parametrize("export", [data.export_lagrangebench, data.export_neuralmpm])
+def test_further_fields(flat, tmp_path, export):
+    folder = export(flat, tmp_path / "out", fields=["velocity", "mass"])
+    given = datasets.arrays(IDS["valid"][0])
+    if export is data.export_lagrangebench:
+        with h5py.File(folder / "valid.h5") as file:
+            found = {name: file["00000"][name][()] for name in ("velocity", "mass")}
+    else:
+        free = given["particle_type"] != datasets.BOUNDARY
+        given = {"velocity": given["velocity"][:, free], "mass": given["mass"][free]}
+        with h5py.File(folder / "valid" / "sim_0.h5") as file:
+            found = {name: file[name][()] for name in ("velocity", "mass")}
+    for name in found:
+        np.testing.assert_array_equal(found[name], given[name])
+
+
+def test_features_and_context_of_tfrecords(flat, tmp_path):
+    pytest.importorskip("tfrecord")
+    from tfrecord.torch.dataset import TFRecordDataset
+
+    folder = data.export_tfrecord(flat, tmp_path / "out", fields=["velocity"], context=True)
+    assert metadata_of(folder)["context_mean"] == pytest.approx([0.0, -9.8])
+    assert metadata_of(folder)["context_std"] == [0.0, 0.0]
+    kinds = {name: "byte" for name in ("position", "step_context", "velocity")}
+    path, context = str(folder / "valid.tfrecord"), {"key": "int", "particle_type": "byte"}
+    for (_, frames), given in zip(
+        TFRecordDataset(path, None, context, sequence_description=kinds), expected(flat, "valid"), strict=True
+    ):
+        for name in ("position", "velocity"):
+            values = np.stack([np.frombuffer(frame, np.float32) for frame in frames[name]])
+            np.testing.assert_array_equal(values.reshape(given[name].shape), given[name])
+        steps = np.stack([np.frombuffer(frame, np.float32) for frame in frames["step_context"]])
+        np.testing.assert_allclose(steps, np.tile([0.0, -9.8], (FRAMES, 1)), rtol=1e-6)
+
+
+@pytest.mark.parametrize("export", [data.export_lagrangebench, data.export_neuralmpm, data.export_tfrecord])
+def test_fields_that_are_not_there(flat, tmp_path, export):
+    with pytest.raises(ValueError, match=r"fields must be of .*velocity.*, got 'stress', which scene 0 does not have"):
+        export(flat, tmp_path / "out", fields=["stress"])
+    assert list(tmp_path.iterdir()) == []
+    if export is data.export_tfrecord:
+        with pytest.raises(ValueError, match=r"fields must be arrays \[T, N, ...\], got 'mass'"):
+            export(flat, tmp_path / "out", fields=["mass"])
 
 
 # ---- for people

@@ -11,6 +11,7 @@ from .folder import DATASET, DatasetError
 
 FORMATS = ("gns", "lagrangebench", "neuralmpm", "ply", "tfrecord", "vtk", "well")
 OF_RUNS = ("vtk", "ply")
+WITH_FIELDS = ("lagrangebench", "neuralmpm", "tfrecord")
 
 
 def is_dataset(folder: Path) -> bool:
@@ -38,6 +39,10 @@ def add_export_options(parser: argparse.ArgumentParser) -> None:
         parser.add_argument(f"--{name}", dest="formats", action="append_const", const=name, help=f"--format {name}")
     parser.add_argument("-o", "--out", type=Path, help="folder to make; by default one named after the format in DIR")
     parser.add_argument("--material", metavar="NAME", help="gns: array [N] of the scenes for the material column")
+    parser.add_argument(
+        "--fields", type=_words, default=(), metavar="stress,F", help="lagrangebench, neuralmpm, tfrecord: more arrays"
+    )
+    parser.add_argument("--context", action="store_true", help="tfrecord: gravity as step_context of every frame")
     parser.add_argument("--dx", type=float, help="well: size of a cell [m]")
     _scenes_option(parser, "vtk, ply: scenes; the first by default")
 
@@ -51,6 +56,10 @@ def add_render_options(parser: argparse.ArgumentParser) -> None:
 
 def _scenes_option(parser: argparse.ArgumentParser, text: str) -> None:
     parser.add_argument("--scenes", type=_numbers, metavar="0,5,7", help=text)
+
+
+def _words(text: str) -> list[str]:
+    return [word.strip() for word in text.split(",")]
 
 
 def _numbers(text: str) -> list[int]:
@@ -72,6 +81,8 @@ def export(options: argparse.Namespace) -> None:
     for name in formats:
         more: dict[str, Any] = {"material": options.material} if name == "gns" else {}
         more |= {"dx": options.dx} if name == "well" else {}
+        more |= {"fields": options.fields} if name in WITH_FIELDS else {}
+        more |= {"context": options.context} if name == "tfrecord" else {}
         more |= {"scenes": options.scenes} if name in OF_RUNS else {}
         write = getattr(data, f"export_scenes_{name}" if name in OF_RUNS else f"export_{name}")
         print(write(options.run, options.out, **more))

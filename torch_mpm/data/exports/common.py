@@ -7,7 +7,7 @@ import errno
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -71,6 +71,19 @@ class Export:
             if kind.min() < 0 or kind.max() >= PARTICLE_TYPES:
                 raise DatasetError(f"particle_type must be within 0 and {PARTICLE_TYPES - 1}, got {kind.max()}")
             yield ExportedScene(number, position, kind, stored)
+
+
+def fields_of(scene: ExportedScene, names: Sequence[str]) -> dict[str, Array]:
+    """Further arrays of a scene, [T, N, ...] or [N].
+
+    Raises:
+        DatasetError: for one that is not there.
+    """
+    for name in names:
+        if name not in scene.arrays:
+            known = ", ".join(n for n in scene.arrays.names if n not in ("position", "particle_type"))
+            raise DatasetError(f"fields must be of {known}, got {name!r}, which scene {scene.id} does not have")
+    return {name: scene.arrays[name] for name in names}
 
 
 def exported_ids(dataset: DatasetFolder, split: str) -> list[int]:

@@ -9,6 +9,9 @@ import numpy as np
 from ..folder import DatasetError, DatasetFolder
 from .common import Export, ExportedScene, exporting
 
+ANGLES = ("friction_angle",)
+"""Parameters that data sets hold in degrees."""
+
 
 def export_gns(dataset: str | Path | DatasetFolder, out: str | Path | None = None, material: str | None = None) -> Path:
     """Write a data set for geoelements/gns.
@@ -21,7 +24,8 @@ def export_gns(dataset: str | Path | DatasetFolder, out: str | Path | None = Non
         dataset: folder of the data set.
         out: folder to make; ``gns`` in that of the data set by default.
         material: name of an array [N] of every scene, such as "friction_angle", that becomes the material column;
-            ``metadata.json`` then counts it among the features of a node.
+            ``metadata.json`` then counts it among the features of a node. Angles become their tangent, as gns
+            documents its column.
 
     Returns:
         The folder.
@@ -53,4 +57,5 @@ def _entry(scene: ExportedScene, material: str | None) -> tuple[np.ndarray, ...]
         return scene.position, kind
     if material not in scene.arrays or scene.arrays.shape(material) != kind.shape:
         raise DatasetError(f"material must be the name of an array [N] of every scene, got {material!r}")
-    return scene.position, kind, scene.arrays[material].astype(np.float32)
+    values = scene.arrays[material].astype(np.float32)
+    return scene.position, kind, np.tan(np.radians(values)) if material in ANGLES else values

@@ -2,25 +2,34 @@
 
 from __future__ import annotations
 
+import logging
+from collections.abc import Sequence
 from pathlib import Path
 
 from ..folder import DatasetFolder
 from ..hdf5 import h5py_module
-from .common import exporting
+from .common import exporting, fields_of
+
+log = logging.getLogger(__name__)
 
 
-def export_neuralmpm(dataset: str | Path | DatasetFolder, out: str | Path | None = None) -> Path:
+def export_neuralmpm(
+    dataset: str | Path | DatasetFolder, out: str | Path | None = None, fields: Sequence[str] = ()
+) -> Path:
     """Write a data set for NeuralMPM.
 
     ``train/sim_0.h5`` and so on have ``particles`` [T, N, D], ``boundary`` [T, M, D] and ``types`` [N].
 
     Its parsers take material, bounds, interval and length from the name of the folder, so give ``out`` the name of one
     of its data sets (``WaterRamps``, ``Sand``, ``Goop``, ...) and generate with that set's numbers, or write a parser.
+    Its models are two-dimensional: a warning recalls that they cannot read a data set in 3-D.
 
-    Args, returns and errors as :func:`export_gns`, without ``material``.
+    Args, returns and errors as :func:`export_lagrangebench`.
     """
     h5py = h5py_module()
     with exporting(dataset, out, "neuralmpm") as export:
+        if export.dataset.record.dim != 2:
+            log.warning("NeuralMPM reads scenes in 2-D alone; those of this data set are in 3-D")
         for split in export.dataset.record.splits:
             folder = export.folder / split
             folder.mkdir()
@@ -32,4 +41,7 @@ def export_neuralmpm(dataset: str | Path | DatasetFolder, out: str | Path | None
                         options = {"compression": "gzip", "compression_opts": 1} if values.size else {}
                         file.create_dataset(name, data=values, **options)
                     file.create_dataset("types", data=scene.particle_type[free].astype("i8"))
+                    for name, rows in fields_of(scene, fields).items():
+                        values = rows[:, free] if rows.ndim > 1 else rows[free]
+                        file.create_dataset(name, data=values)
     return export.target

@@ -9,19 +9,24 @@ from __future__ import annotations
 
 import logging
 import struct
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
 
-from ..folder import DatasetFolder
-from .common import ExportedScene, exported_ids, exporting
+from ..folder import DatasetError, DatasetFolder
+from .common import Array, ExportedScene, exported_ids, exporting, fields_of
 
 log = logging.getLogger(__name__)
 
 
-def export_tfrecord(dataset: str | Path | DatasetFolder, out: str | Path | None = None) -> Path:
+def export_tfrecord(
+    dataset: str | Path | DatasetFolder,
+    out: str | Path | None = None,
+    fields: Sequence[str] = (),
+    context: bool = False,
+) -> Path:
     """Write a data set for DeepMind's reader and PhysicsNeMo: ``train.tfrecord``, ``valid.tfrecord``, ...
 
     A record has the context ``key`` (number in the split) and ``particle_type`` (int64 bytes), and one entry of
@@ -29,11 +34,20 @@ def export_tfrecord(dataset: str | Path | DatasetFolder, out: str | Path | None 
     recalls, and needs ``num_node_types=9`` for sand and goop. There is no ``.tfindex``: with one, it would begin
     at a random record, another one in each process.
 
-    Args, returns and errors as :func:`export_gns`, without ``material``; ImportError without google-crc32c (extra
-    ``data``).
+    Args:
+        dataset: folder of the data set.
+        out: folder to make; ``tfrecord`` in that of the data set by default.
+        fields: further arrays [T, N, ...] of the scenes to write as features of every frame, float32 bytes, such as
+            "stress"; readers that do not name them skip them.
+        context: whether every frame has ``step_context`` (float32 bytes), the gravity [D] of the scene; metadata.json
+            then has ``context_mean`` and ``context_std``, from which DeepMind's reader knows of it.
+
+    Returns and errors as :func:`export_gns`; DatasetError also for a field that is not there; ImportError without
+    google-crc32c (extra ``data``).
     """
     checksum = _crc32c()
-    with exporting(dataset, out, "tfrecord") as export:
+    source = dataset if isinstance(dataset, DatasetFolder) else DatasetFolder(dataset)
+    with exporting(source, out, "tfrecord", more=_context_statistics(source) if context else None) as export:
         record = export.dataset.record
         if len(set(zip(record.lower, record.upper, strict=True))) > 1:
             log.warning("PhysicsNeMo takes the bounds of the first axis for all axes; those of this data set differ")
@@ -42,8 +56,29 @@ def export_tfrecord(dataset: str | Path | DatasetFolder, out: str | Path | None 
                 continue
             with open(export.folder / f"{split}.tfrecord", "wb") as file:
                 for k, scene in enumerate(export.scenes(split)):
-                    _write_record(file, _sequence_example(k, scene), checksum)
+                    frames = _frames(scene, fields, _gravity(source, scene.id) if context else None)
+                    _write_record(file, _sequence_example(k, scene.particle_type, frames), checksum)
     return export.target
+
+
+def _gravity(dataset: DatasetFolder, number: int) -> Array:
+    """Gravity of a scene [D] [m/s^2]."""
+    return np.array(dataset.scene(number).words.get("gravity") or [0.0] * dataset.record.dim, np.float32)
+
+
+def _context_statistics(dataset: DatasetFolder) -> dict[str, list[float]]:
+    """Of the context, over all scenes."""
+    values = np.stack([_gravity(dataset, scene.id) for scene in dataset.scenes()]).astype(np.float64)
+    return {"context_mean": values.mean(0).tolist(), "context_std": values.std(0).tolist()}
+
+
+def _frames(scene: ExportedScene, fields: Sequence[str], context: Array | None) -> dict[str, Array]:
+    """Features of every frame, by name: arrays [T, ...]."""
+    more = fields_of(scene, fields)
+    if flat := [name for name, values in more.items() if len(values.shape) < 2]:
+        raise DatasetError(f"fields must be arrays [T, N, ...], got {flat[0]!r}")
+    steps = {} if context is None else {"step_context": np.tile(context, (len(scene.position), 1))}
+    return {"position": scene.position, **more, **steps}
 
 
 def _crc32c() -> Any:
@@ -95,8 +130,11 @@ def _feature_list(features: Iterable[bytes]) -> bytes:
     return b"".join(_field(1, feature) for feature in features)
 
 
-def _sequence_example(key: int, scene: ExportedScene) -> bytes:
-    types = _bytes_feature(scene.particle_type.astype("<i8").tobytes())
+def _sequence_example(key: int, particle_type: Array, frames: Mapping[str, Array]) -> bytes:
+    types = _bytes_feature(particle_type.astype("<i8").tobytes())
     context = _map({"key": _int_feature(key), "particle_type": types})
-    frames = _feature_list(_bytes_feature(np.asarray(frame, "<f4").tobytes()) for frame in scene.position)
-    return _field(1, context) + _field(2, _map({"position": frames}))
+    lists = {
+        name: _feature_list(_bytes_feature(np.asarray(frame, "<f4").tobytes()) for frame in values)
+        for name, values in frames.items()
+    }
+    return _field(1, context) + _field(2, _map(lists))

@@ -12,6 +12,7 @@ import torch
 
 from ..folder import DatasetFolder, velocity_of
 from ..hdf5 import h5py_module
+from ..obstacle_fields import obstacle_mask, obstacles_of
 from ..rasterise import cell_centres, rasterise
 from ..statistics import Sums
 from .common import Array, Export, ExportedScene, exported_ids, exporting
@@ -21,6 +22,9 @@ AXES = ("x", "y", "z")
 
 def export_well(dataset: str | Path | DatasetFolder, out: str | Path | None = None, dx: float | None = None) -> Path:
     """Write density and velocity on a uniform grid, for models on grids: ``data/train/NAME.hdf5``, ``stats.yaml``.
+
+    A data set with obstacles has a field ``obstacle`` too, 1 in cells whose centre is inside one. Gravity and the
+    numbers of materials that every scene has are scalars, such as ``gravity_y`` and ``sand_friction_angle``.
 
     Args:
         dataset: folder of the data set.
@@ -46,8 +50,8 @@ def export_well(dataset: str | Path | DatasetFolder, out: str | Path | None = No
 class _Statistics:
     """Of the fields and of their changes from frame to frame, over all cells."""
 
-    def __init__(self, dim: int) -> None:
-        self.sums = {name: [Sums.zero(n), Sums.zero(n)] for name, n in (("density", 1), ("velocity", dim))}
+    def __init__(self, orders: dict[str, int], dim: int) -> None:
+        self.sums = {name: [Sums.zero(dim**order) for _ in range(2)] for name, order in orders.items()}
 
     def add(self, fields: dict[str, Array]) -> None:
         for name, values in fields.items():
@@ -68,7 +72,8 @@ class _Statistics:
 
 def _write(export: Export, split: str, name: str, dx: float) -> _Statistics:
     record, count = export.dataset.record, len(exported_ids(export.dataset, split))
-    statistics = _Statistics(record.dim)
+    orders = {"density": 0, "velocity": 1} | ({"obstacle": 0} if _has_obstacles(export) else {})
+    statistics = _Statistics(orders, record.dim)
     folder = export.folder / "data" / split
     folder.mkdir(parents=True)
     with h5py_module().File(folder / f"{name}.hdf5", "w") as file:
@@ -76,9 +81,14 @@ def _write(export: Export, split: str, name: str, dx: float) -> _Statistics:
             {"dataset_name": name, "grid_type": "cartesian", "n_spatial_dims": record.dim, "n_trajectories": count}
         )
         file.attrs["simulation_parameters"] = _names([])
-        fields = _layout(file, export, dx, count)
+        fields = _layout(file, export, orders, dx, count)
+        _write_scalars(file, export, split)
         for k, scene in enumerate(export.scenes(split)):
             values = _fields(scene, export, dx)
+            if "obstacle" in orders:
+                times = record.frame_interval * np.arange(record.frames)
+                centres = cell_centres(record.lower, record.upper, dx)
+                values["obstacle"] = obstacle_mask(obstacles_of(scene.arrays.words), centres, times)
             statistics.add(values)
             for field, data in values.items():
                 fields[field][k] = data
@@ -89,7 +99,33 @@ def _names(names: list[str]) -> Array:
     return np.array(names, dtype=h5py_module().string_dtype())
 
 
-def _layout(file: Any, export: Export, dx: float, count: int) -> dict[str, Any]:
+def _has_obstacles(export: Export) -> bool:
+    return any(export.dataset.scene(scene.id).words.get("obstacle") for scene in export.dataset.scenes())
+
+
+def _write_scalars(file: Any, export: Export, split: str) -> None:
+    """What every scene of the data set has as a number, of the scenes of a split."""
+    shared = set.intersection(*(set(_scalars(export, scene.id)) for scene in export.dataset.scenes()))
+    scenes = [_scalars(export, k) for k in exported_ids(export.dataset, split)]
+    group, names = file.create_group("scalars"), [name for name in scenes[0] if name in shared]
+    group.attrs["field_names"] = _names(names)
+    for name in names:
+        data = group.create_dataset(name, data=np.array([scene[name] for scene in scenes], np.float32))
+        data.attrs.update({"sample_varying": True, "time_varying": False})
+
+
+def _scalars(export: Export, number: int) -> dict[str, float]:
+    """Gravity and the numbers of the materials of a scene."""
+    words = export.dataset.scene(number).words
+    gravity = words.get("gravity") or [0.0] * export.dataset.record.dim
+    found = {f"gravity_{axis}": float(value) for axis, value in zip(AXES, gravity, strict=False)}
+    for material, values in words.get("material", {}).items():
+        numbers = {key: v for key, v in values.items() if isinstance(v, (int, float)) and not isinstance(v, bool)}
+        found |= {f"{material}_{key}": float(value) for key, value in numbers.items()}
+    return found
+
+
+def _layout(file: Any, export: Export, orders: dict[str, int], dx: float, count: int) -> dict[str, Any]:
     """All of a file but the numbers of its fields; returns the arrays that these are written to."""
     record = export.dataset.record
     axes, centres = list(AXES[: record.dim]), cell_centres(record.lower, record.upper, dx)
@@ -106,13 +142,13 @@ def _layout(file: Any, export: Export, dx: float, count: int) -> dict[str, Any]:
         ends = np.zeros(len(coordinates), bool)
         ends[[0, -1]] = True
         wall.create_dataset("mask", data=ends)
-    file.create_group("scalars").attrs["field_names"] = _names([])
     shape = (count, record.frames, *(len(c) for c in centres))
     arrays = {}
-    for order, name in enumerate(("density", "velocity", "")):
+    for order in range(3):
         group = file.create_group(f"t{order}_fields")
-        group.attrs["field_names"] = _names([name] if name else [])
-        if name:
+        names = [name for name, own in orders.items() if own == order]
+        group.attrs["field_names"] = _names(names)
+        for name in names:
             full = shape + (record.dim,) * order
             chunk = (1, 1, *full[2:])
             data = group.create_dataset(name, full, "f4", chunks=chunk, compression="gzip", compression_opts=1)
