@@ -294,7 +294,7 @@ def test_the_well_has_obstacles_and_scalars(tmp_path):
 
     def words(k):
         ball = {"shape": "sphere", "center": [0.3, 1.0], "radius": 0.2, "velocity": [20.0, 0.0]}
-        floor = {"shape": "box", "center": [0.5, 0.075], "size": [1.0, 0.15]}
+        floor = {"shape": "box", "center": [0.5, 0.09], "size": [1.0, 0.18]}
         sand = {"law": "quartic_sand", "E": 1e6 + k, "friction_angle": 30.0 + k, "cohesive": True}
         return {"gravity": [0.0, -9.8], "material": {"sand": sand}, "obstacle": [ball, floor]}
 
@@ -310,7 +310,7 @@ def test_the_well_has_obstacles_and_scalars(tmp_path):
             }  # fmt: skip
             for t in (0, 5, 11):
                 away = (x[:, None] - 0.3 - 20 * 0.0025 * t) ** 2 + (y - 1.0) ** 2
-                expected = (away <= 0.2**2) | (y <= 0.15)
+                expected = (away <= 0.2**2) | (y <= 0.18)
                 clear = abs(away - 0.2**2) > 1e-9
                 np.testing.assert_array_equal(fields["obstacle"][t].numpy()[clear], expected[clear])
     assert json.loads((folder / "stats.yaml").read_text())["std"]["obstacle"] > 0.1
