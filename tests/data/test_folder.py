@@ -113,7 +113,17 @@ def test_nothing_yet(tmp_path):
         metadata(empty)
 
 
-CHANGES = [{"format": 9}, {"frames": 0}, {"lower": [0.0]}, {"other": 1}, {"splits": [1]}, {"splits": {"a": [-1, 3]}}]
+CHANGES = [
+    {"format": 9},
+    {"frames": 0},
+    {"lower": [0.0]},
+    {"other": 1},
+    {"splits": [1]},
+    {"splits": {"a": [-1, 3]}},
+    {"added": [["train", 3, 5]]},
+    {"added": [["dev", 12, 5]]},
+    {"added": [["train", 12]]},
+]
 
 
 @pytest.mark.parametrize("change", CHANGES)

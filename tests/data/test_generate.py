@@ -21,7 +21,7 @@ from helpers import command
 
 from torch_mpm.data import batch
 from torch_mpm.data.finish import IncompleteError, finalize, verify
-from torch_mpm.data.folder import DatasetFolder
+from torch_mpm.data.folder import DatasetError, DatasetFolder, MissingError
 from torch_mpm.data.generate import check_samples, generate
 from torch_mpm.data.packing import prepare_scene
 from torch_mpm.data.sampling import content
@@ -139,6 +139,38 @@ def test_another_configuration_is_refused(copy):
     (copy / "dataset.json").unlink()
     with pytest.raises(OutputError, match="no data set"):
         generate(configuration(), copy, device="cpu")
+
+
+def test_a_data_set_is_extended(whole, copy):
+    """Scenes that are there stay as they are to the last byte; new ones are those of their ids."""
+    before = {p.name: p.read_bytes() for p in (copy / "shards").iterdir()}
+    for _ in range(2):  # the second time there is nothing left to do
+        done = generate(configuration(), copy, device="cpu", extend={"train": 8})
+        assert done["complete"] and {n: (copy / "shards" / n).read_bytes() for n in before} == before
+    data = DatasetFolder(copy)
+    assert [s.id for s in data.attempted("train")] == [0, 1, 2, 3, 4, 8, 9, 10]
+    assert [s.id for s in data.attempted("test")] == [5, 6] and data.record.split_of(10) == "train"
+    assert data.record.scenes == 10 and data.record.shards == 6 and list(verify(copy)) == []
+    assert finalize(copy)["statistics_of"] == "train"
+    longer = generate(configuration(), copy, device="cpu", extend={"test": 3, "train": 9})
+    assert longer["scenes"] == 2 and [s.id for s in DatasetFolder(copy).attempted("test")] == [5, 6, 12]
+    expected = content(configuration(), 9)
+    assert json.loads(decoded(copy)["scene_0000009"][1]["scene"])["seed"] == expected["seed"]
+    again = generate(configuration(), copy, device="cpu")  # without `extend`, the folder as it is now
+    assert again["complete"] and again["scenes"] == 0
+    with pytest.raises(DatasetError, match="the split 'train' has 9 scenes, got a total of 5"):
+        generate(configuration(), copy, device="cpu", extend={"train": 5})
+    with pytest.raises(MissingError, match="one of train, test, got 'dev'"):
+        generate(configuration(), copy, device="cpu", extend={"dev": 5})
+    with pytest.raises(OutputError, match=r"another configuration .* --extend"):
+        generate(configuration(dataset__splits={"train": 9, "test": 3}), copy, device="cpu")
+
+
+def test_an_extended_data_set_is_one_that_was_extended_at_once(copy, tmp_path):
+    generate(configuration(), copy, device="cpu", extend={"train": 7})
+    other = tmp_path / "other"
+    generate(configuration(), other, device="cpu", extend={"train": 7})
+    assert_same(copy, other)
 
 
 def test_another_device_is_refused(copy):

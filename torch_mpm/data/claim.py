@@ -10,7 +10,7 @@ import contextlib
 import errno
 import fcntl
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import IO, Any
 
@@ -39,18 +39,22 @@ class Claim:
 
     Args:
         folder: made where it does not exist.
-        record: what it holds, or shall hold.
+        record: what it holds, or shall hold. `record` of the claim is that of the folder, which may have been extended.
+        extend: total number of scenes by the name of a split, where the folder shall have more.
         text: of the configuration.
         worker: this process.
 
     Raises:
         OutputError: for a folder that holds something else, or that cannot be written.
         DamagedFileError: for a damaged dataset.json, and where links lead out of the folder.
+        MissingError, DatasetError: for `extend` with a split that is not there, or with fewer scenes than there are.
     """
 
-    def __init__(self, folder: Path, record: DatasetRecord, text: str, worker: Worker) -> None:
+    def __init__(
+        self, folder: Path, record: DatasetRecord, text: str, worker: Worker, extend: Mapping[str, int] | None = None
+    ) -> None:
         self.folder, self.record, self.worker = folder, record, worker
-        self._text, self._whole = text, set[tuple[int, bool]]()
+        self._text, self._whole, self._extend = text, set[tuple[int, bool]](), extend or {}
         self._lock: IO[Any] | None = None
         self._locks = True
 
@@ -66,8 +70,13 @@ class Claim:
             try:
                 self._locked(TABLE, wait=True)
                 self._refuse_others()
-                if not (self.folder / DATASET).exists():
+                if (self.folder / DATASET).exists():
+                    self.record = DatasetRecord.read(self.folder)
+                else:
                     write_whole(self.folder / CONFIGURATION, self._text.encode())
+                    self.record.write(self.folder)
+                if (extended := self.record.extended(self._extend)) != self.record:
+                    self.record = extended
                     self.record.write(self.folder)
                 self._unlock(TABLE)
             except BaseException:
@@ -93,7 +102,8 @@ class Claim:
         if found.configuration != self.record.configuration:
             raise OutputError(
                 f"{self.folder} holds the data set of another configuration ({found.configuration[:12]}, this is "
-                f"{self.record.configuration[:12]}); choose another folder, or remove it first"
+                f"{self.record.configuration[:12]}); choose another folder, or remove it first. To add scenes, "
+                "use --extend SPLIT=N with the configuration as it was"
             )
         ours, theirs = (r.versions.get("torch_mpm") for r in (self.record, found))
         if theirs != ours:
@@ -155,8 +165,7 @@ class Claim:
 
     def finished_scenes(self) -> int:
         """Number of the scenes in finished shards."""
-        size, total = self.record.scenes_per_shard, self.record.scenes
-        return sum(min(size, total - k * size) for k in self.finished())
+        return sum(len(self.record.ids(k)) for k in self.finished())
 
     def _clean(self, shard: int) -> None:
         """Remove what is left of a shard that is not whole."""

@@ -28,6 +28,10 @@ def add(commands: Any) -> None:
     generate.add_argument("-o", "--out", type=Path, help="folder of the data set")
     generate.add_argument("--device", default="auto", help='"auto", "cpu", "cuda" or "cuda:1"; default: %(default)s')
     generate.add_argument("--check", action="store_true", help="check finished shards, and make damaged ones anew")
+    generate.add_argument(
+        "--extend", type=_total, action="append", default=[], metavar="SPLIT=N",
+        help="give a split N scenes in all where the folder has fewer; those that are there stay; may be repeated",
+    )  # fmt: skip
     _failures_argument(generate)
     generate.add_argument("--quiet", action="store_true", help="no progress bar")
     set_argument(generate, "dataset.splits={train=100}")
@@ -46,6 +50,13 @@ def add(commands: Any) -> None:
 def _failures_argument(parser: argparse.ArgumentParser) -> None:
     text = "share of the scenes that may fail before the command does; default: %(default)s"
     parser.add_argument("--most-failed", type=_share, default=MOST_FAILED, metavar="SHARE", help=text)
+
+
+def _total(text: str) -> tuple[str, int]:
+    name, equals, number = text.partition("=")
+    if not equals or not number.isascii() or not number.isdigit() or len(number) > 12:
+        raise argparse.ArgumentTypeError(f"takes a split and a number of scenes, such as train=2000, got {text!r}")
+    return name, int(number)
 
 
 def _share(text: str) -> float:
@@ -86,6 +97,7 @@ def _generate(options: argparse.Namespace) -> None:
             device=options.device,
             check=options.check,
             progress=None if bar is None else bar.show,
+            extend=dict(options.extend),
         )
     finally:
         if bar is not None:

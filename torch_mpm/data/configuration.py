@@ -179,16 +179,6 @@ class Configuration:
             first += count
         return found
 
-    @property
-    def shards(self) -> int:
-        """Number of shards."""
-        return -(-self.scenes // self.dataset.scenes_per_shard)
-
-    def ids(self, shard: int) -> range:
-        """The scenes of a shard."""
-        size = self.dataset.scenes_per_shard
-        return range(shard * size, min((shard + 1) * size, self.scenes))
-
     def scene_words(self, *contents: Words) -> Words:
         """The scene file of one content, or of the batch of several, as `torch_mpm.data.sampling` draws them."""
         dataset = self.dataset

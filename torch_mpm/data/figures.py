@@ -22,11 +22,11 @@ def summary(dataset: str | Path | DatasetFolder) -> dict[str, Any]:
     """Numbers about a data set, from its records alone: scenes, failures and particles of each split, statistics."""
     data = dataset if isinstance(dataset, DatasetFolder) else DatasetFolder(dataset)
     words: dict[str, Any] = {}
-    for split, (_, count) in data.record.splits.items():
+    for split in data.record.splits:
         attempted, valid = data.attempted(split), data.scenes(split)
         particles = [scene.particles for scene in valid]
         words[split] = {
-            "scenes": count,
+            "scenes": data.record.count(split),
             "finished": len(attempted),
             "failed": len(attempted) - len(valid),
             "tried again": sum(scene.attempts > 1 for scene in attempted),
@@ -113,7 +113,7 @@ def _draw_outcomes(axes: Any, data: DatasetFolder) -> None:
         heights = np.array([sum(map(belongs, data.attempted(split))) for split in splits])
         axes.bar(splits, heights, bottom=bottom, label=f"{name}: {heights.sum()}", color=color)
         bottom += heights
-    missing = np.array([data.record.splits[split][1] for split in splits]) - bottom
+    missing = np.array([data.record.count(split) for split in splits]) - bottom
     axes.bar(splits, missing, bottom=bottom, label=f"not finished: {missing.sum():.0f}", color="#dddddd")
     axes.set(ylabel="scenes")
     axes.legend()

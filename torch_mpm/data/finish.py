@@ -68,14 +68,8 @@ def _check_files(dataset: DatasetFolder) -> None:
             raise DamagedFileError(path, f"is beyond the {record.shards} shards of the data set", REMEDY)
         if not path.is_file() or path.stat().st_size != told.bytes:
             raise DamagedFileError(path, "is gone, or not as long as its record says", REMEDY)
-        if [scene.id for scene in told.scenes] != _expected(record, index):
+        if [scene.id for scene in told.scenes] != record.ids(index):
             raise DamagedFileError(path, "has other scenes than those of its number", REMEDY)
-
-
-def _expected(record: DatasetRecord, index: int) -> list[int]:
-    """Ids of the scenes of a shard."""
-    first = index * record.scenes_per_shard
-    return list(range(first, min(first + record.scenes_per_shard, record.scenes)))
 
 
 def verify(folder: str | Path) -> Iterator[str]:
@@ -100,7 +94,7 @@ def verify(folder: str | Path) -> Iterator[str]:
 
 
 def _shard_problems(shard: Shard, record: DatasetRecord, index: int) -> Iterator[str]:
-    expected = _expected(record, index)
+    expected = record.ids(index)
     if shard.ids != expected:
         yield f"{shard.path}: has the scenes {shard.ids}, not {expected[0]} to {expected[-1]}"
     for told in shard.record.scenes:

@@ -7,7 +7,8 @@ import json
 import os
 import re
 from collections import OrderedDict
-from dataclasses import asdict, dataclass, field
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -47,6 +48,7 @@ class DatasetRecord:
     Attributes:
         configuration: hash of all that decides the content.
         splits: first scene id and number of scenes of each split.
+        added: name of a split, first scene id and number of scenes that it was extended by, in the order of the ids.
         frames: T of every scene, the first frame included; ``frame_interval`` [s] apart.
         lower, upper: bounds of the domain [D] (m).
         dx: distance of the nodes of the grid [m].
@@ -67,6 +69,7 @@ class DatasetRecord:
     title: str = ""
     device: str = ""
     versions: dict[str, str] = field(default_factory=dict)
+    added: tuple[tuple[str, int, int], ...] = ()
 
     @property
     def dim(self) -> int:
@@ -75,18 +78,54 @@ class DatasetRecord:
     @property
     def scenes(self) -> int:
         """Of all splits."""
-        return sum(count for _, count in self.splits.values())
+        return sum(count for _, _, count in self.ranges)
+
+    @property
+    def ranges(self) -> list[tuple[str, int, int]]:
+        """Name of the split, first id and number of all ranges of scenes, by id."""
+        return [*((name, first, count) for name, (first, count) in self.splits.items()), *self.added]
 
     @property
     def shards(self) -> int:
-        return -(-self.scenes // self.scenes_per_shard)
+        end = max((first + count for _, first, count in self.ranges), default=0)
+        return -(-end // self.scenes_per_shard)
+
+    def ids(self, shard: int) -> list[int]:
+        """Ids of the scenes of a shard."""
+        begin, end = shard * self.scenes_per_shard, (shard + 1) * self.scenes_per_shard
+        return [k for _, first, count in self.ranges for k in range(max(first, begin), min(first + count, end))]
+
+    def count(self, split: str) -> int:
+        """Number of scenes of a split."""
+        return sum(count for name, _, count in self.ranges if name == split)
+
+    def extended(self, totals: Mapping[str, int]) -> DatasetRecord:
+        """The record with more scenes, which are in shards of their own.
+
+        Args:
+            totals: number of scenes by the name of a split, in all; no less than there are.
+
+        Raises:
+            MissingError: for a split that is not there.
+            DatasetError: for fewer scenes than there are.
+        """
+        record = self
+        for split, total in totals.items():
+            if split not in self.splits:
+                raise MissingError(f"split must be one of {', '.join(self.splits)}, got {split!r}")
+            if total < (there := record.count(split)):
+                raise DatasetError(f"the split {split!r} has {there} scenes, got a total of {total}")
+            if total > there:
+                new = (split, record.shards * self.scenes_per_shard, total - there)
+                record = replace(record, added=(*record.added, new))
+        return record
 
     def split_of(self, scene_id: int) -> str:
         """
         Raises:
             MissingError: for a scene of no split.
         """
-        for name, (first, count) in self.splits.items():
+        for name, first, count in self.ranges:
             if first <= scene_id < first + count:
                 return name
         raise MissingError(f"the data set has no scene {scene_id}")
@@ -122,13 +161,15 @@ class DatasetRecord:
                 words[name] = tuple(map(float, words[name]))
             words["fields"] = tuple(map(str, words["fields"]))
             words["splits"] = {str(n): (int(first), int(count)) for n, (first, count) in words["splits"].items()}
+            words["added"] = tuple((str(n), int(first), int(count)) for n, first, count in words.get("added", ()))
             record = cls(**words)
             if not 2 <= len(record.lower) == len(record.upper) <= 3 or min(record.frames, record.scenes_per_shard) < 1:
                 raise ValueError("its numbers make no sense")
             if wrong := [n for n in (*record.splits, *record.fields) if not NAME.fullmatch(n)]:
                 raise ValueError(f"{wrong[0]!r} is no name of a split or a field")
-            if any(first < 0 or count < 0 for first, count in record.splits.values()):
-                raise ValueError("a split has a negative number of scenes")
+            ends = [0, *(first + count for _, first, count in record.ranges)]
+            if any(n not in record.splits or f < e or c < 0 for (n, f, c), e in zip(record.ranges, ends, strict=False)):
+                raise ValueError("its splits overlap, or have a negative number of scenes")
         except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
             if isinstance(error, DamagedFileError):
                 raise
@@ -180,8 +221,8 @@ class DatasetFolder:
             return [self._scenes[k][1] for k in sorted(self._scenes)]
         if split not in self.record.splits:
             raise MissingError(f"split must be one of {', '.join(self.record.splits)}, got {split!r}")
-        first, count = self.record.splits[split]
-        return [self._scenes[k][1] for k in sorted(self._scenes) if first <= k < first + count]
+        own = [range(first, first + count) for name, first, count in self.record.ranges if name == split]
+        return [self._scenes[k][1] for k in sorted(self._scenes) if any(k in ids for ids in own)]
 
     def scene(self, scene_id: int) -> StoredScene:
         """A valid scene, open for reading."""

@@ -46,6 +46,7 @@ def generate(
     device: str = "auto",
     check: bool = False,
     progress: Progress | None = None,
+    extend: Mapping[str, int] | None = None,
 ) -> dict[str, Any]:
     """Generate what is missing of a data set, together with the other processes that do so.
 
@@ -56,6 +57,8 @@ def generate(
         check: compare shards that are there with their checksums, and make damaged ones anew.
         progress: called with a dictionary of figures while frames are computed: scenes and those that failed so far,
             frames of all scenes so far, and those that were missing at the start.
+        extend: total number of scenes by the name of a split, where the folder shall have more than it has. The new
+            ones have ids and shards of their own; the scenes that are there stay as they are.
 
     Returns:
         A summary: of this process the scenes, those of them that failed, and seconds; and whether the data set is
@@ -64,6 +67,7 @@ def generate(
     Raises:
         WorkerError: for a process without a device or a sensible rank.
         SceneError: for a configuration of which no scene can be made.
+        MissingError, DatasetError: for `extend` with a split that is not there, or with fewer scenes than there are.
         OutputError: for a folder that holds something else, or a full disk.
         SimulationError: where the device has no memory for the scenes of a shard.
     """
@@ -72,11 +76,11 @@ def generate(
     check_samples(configuration)
     folder = Path(out)
     record = record_of(configuration, chosen)
-    with Claim(folder, record, configuration.text, one) as claim:
+    with Claim(folder, record, configuration.text, one, extend) as claim:
         line = _Line(configuration, claim, chosen, progress)
         with output_errors(folder):
             line.run(check)
-        complete = len(claim.finished()) == record.shards
+        complete = len(claim.finished()) == claim.record.shards
     return {**line.totals, "seconds": time.perf_counter() - begin, "complete": complete}
 
 
@@ -185,7 +189,7 @@ class _Line:
 
     def _draw(self, shard: int) -> Drawn:
         """Beside what the device is doing, on a stream of its own."""
-        ids = self.configuration.ids(shard)
+        ids = self.claim.record.ids(shard)
         if self.device.type == "cpu":
             return draw(self.configuration, ids, self.device)
         torch.cuda.set_device(self.device)
