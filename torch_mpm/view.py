@@ -13,6 +13,7 @@ from .data.clips import Source
 from .data.trajectory import Array
 from .render.cloud import rest_spacing
 from .render.colors import PALETTES, QUANTITIES, Quantity, map_colors, palette_colors, value_range
+from .view_server import viser_server
 
 PLAYED_FPS = 30
 COUNTED = ("particle_type", *PALETTES)
@@ -32,16 +33,13 @@ class Viewer:
 
     Raises:
         FileNotFoundError, DatasetError: as `Source`.
+        ValueError, OSError: for a port or an address that cannot be listened at.
         ImportError: when viser is missing (extra ``view``).
     """
 
     def __init__(self, path: str | Path, port: int = 8080, host: str = "127.0.0.1") -> None:
-        try:
-            import viser
-        except ImportError as error:
-            raise ImportError("the viewer needs viser: pip install torch-mpm[view]") from error
         self.source = Source(path)
-        self._server: Any = viser.ViserServer(host=host, port=port, verbose=False)
+        self._server: Any = viser_server(host, port)
         self.url = f"http://{host}:{self._server.get_port()}"
         self._lock, self._stop = threading.Lock(), threading.Event()
         first = next(iter(self.source.scenes))

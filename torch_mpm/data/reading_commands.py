@@ -7,6 +7,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+from ..view_server import MOST_PORT
 from .folder import DATASET, DatasetError
 
 FORMATS = ("gns", "lagrangebench", "neuralmpm", "ply", "tfrecord", "vtk", "well")
@@ -27,7 +28,7 @@ def add(commands: Any) -> None:
 
     view = commands.add_parser("view", help="look at a run or a data set in the browser")
     view.add_argument("folder", type=Path, help="folder of a run or of a data set")
-    view.add_argument("--port", type=int, default=8080, help="default: %(default)s")
+    view.add_argument("--port", type=_port, default=8080, help="default: %(default)s")
     view.add_argument("--host", default="127.0.0.1", help="address to listen at; default: %(default)s")
     view.set_defaults(command=_view)
 
@@ -56,6 +57,12 @@ def add_render_options(parser: argparse.ArgumentParser) -> None:
 
 def _scenes_option(parser: argparse.ArgumentParser, text: str) -> None:
     parser.add_argument("--scenes", type=_numbers, metavar="0,5,7", help=text)
+
+
+def _port(text: str) -> int:
+    if not (text.isascii() and text.isdigit() and len(text) <= 5 and int(text) <= MOST_PORT):
+        raise argparse.ArgumentTypeError(f"takes a port within 0 and {MOST_PORT}, got {text!r}")
+    return int(text)
 
 
 def _words(text: str) -> list[str]:

@@ -1,0 +1,90 @@
+"""The server of the viewer: an address that can be listened at, and pages of its own alone."""
+
+from __future__ import annotations
+
+import errno
+import http
+import ipaddress
+import socket
+from collections.abc import Callable
+from typing import Any
+from unittest import mock
+from urllib.parse import urlsplit
+
+MOST_PORT = 65535
+
+
+def viser_server(host: str, port: int) -> Any:
+    """A viser server that pages of other sites cannot read from.
+
+    Args:
+        host: address to listen at.
+        port: to listen at; the next that is free where it is taken.
+
+    Raises:
+        ValueError: for a port that is none.
+        OSError: for an address that is not of this machine, or a port that may not be listened at.
+        ImportError: when viser is missing (extra ``view``).
+    """
+    try:
+        import viser
+        import websockets.asyncio.server as sockets
+    except ImportError as error:
+        raise ImportError("the viewer needs viser: pip install torch-mpm[view]") from error
+    _check_address(host, port)
+    # viser takes no function for the check of requests, so that of websockets is given one while viser calls it.
+    with mock.patch.object(sockets, "serve", _guarded(sockets.serve, host)):
+        return viser.ViserServer(host=host, port=port, verbose=False)
+
+
+def _check_address(host: str, port: int) -> None:
+    """viser waits without an end for a server that cannot begin."""
+    if not 0 <= port <= MOST_PORT:
+        raise ValueError(f"port must be within 0 and {MOST_PORT}, got {port}")
+    try:
+        family, *_, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+        with socket.socket(family, socket.SOCK_STREAM) as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            probe.bind(address)
+    except (OSError, UnicodeError) as error:
+        if getattr(error, "errno", None) != errno.EADDRINUSE:
+            raise OSError(f"host: cannot listen at {host!r}, port {port}: {error}") from None
+
+
+def _guarded(serve: Callable[..., Any], host: str) -> Callable[..., Any]:
+    """`serve` of websockets that refuses connections from pages of other sites."""
+
+    def guarded(handler: Any, *arguments: Any, process_request: Any = None, **options: Any) -> Any:
+        def checked(connection: Any, request: Any) -> Any:
+            upgrade = request.headers.get("Upgrade", "").lower() == "websocket"
+            if upgrade and not is_own_page(request.headers.get("Origin"), request.headers.get("Host"), host):
+                return connection.respond(http.HTTPStatus.FORBIDDEN, "pages of other sites may not connect\n")
+            return None if process_request is None else process_request(connection, request)
+
+        return serve(handler, *arguments, process_request=checked, **options)
+
+    return guarded
+
+
+def is_own_page(origin: str | None, asked: str | None, host: str) -> bool:
+    """Whether a connection comes from a page of the server, or from a program that is no browser.
+
+    Args:
+        origin: header of the request: the site of the page; None for a program.
+        asked: header of the request: host and port that were connected to.
+        host: address that the server listens at. Names of other sites may lead to a loopback address, so there the
+            names of this machine alone count.
+    """
+    if origin is None:
+        return True
+    page = urlsplit(origin)
+    if page.scheme not in ("http", "https") or page.netloc != asked:
+        return False
+    return not _is_loopback(host) or _is_loopback(page.hostname or "")
+
+
+def _is_loopback(name: str) -> bool:
+    try:
+        return name == "localhost" or ipaddress.ip_address(name).is_loopback
+    except ValueError:
+        return False
