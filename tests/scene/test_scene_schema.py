@@ -41,7 +41,7 @@ BOX = {"shape": "box", "lower": (0.1, 0.1), "upper": (0.3, 0.3), "material": "je
         ({"fps": 0}, "fps: should be greater than 0, got 0; takes: frames per second"),
         ({"obstacle": [{"shape": "box", "center": (0, 0), "size": (1, 1), "contact": "sticki"}]},
          "obstacle[0].contact: takes one of 'slip', 'sticky', 'separate', got 'sticki'; did you mean 'sticky'?"),
-        ({"output": {"fields": ["strain"]}}, "output.fields[0]: takes one of 'F', 'J', 'C', 'stress', 'temperature', 'liquid', got"),
+        ({"output": {"fields": ["strain"]}}, "output.fields[0]: takes one of 'F', 'J', 'C', 'stress', 'cauchy_stress', 'kirchhoff_stress', "),
         ({"scene": [{"graviti": (0, 1)}]}, "scene[0].graviti: unknown key; did you mean 'gravity'?"),
     ],
 )  # fmt: skip

@@ -9,11 +9,12 @@ import numpy as np
 
 from ..render.colors import scalar_of
 from .folder import DATASET, DatasetError, DatasetFolder
-from .pictures import field_values
+from .pictures import drawn_in, field_values
+from .stress import TENSORS, drawn_stress
 from .trajectory import Array, Trajectory
 
-COLORLESS = ("F", "C", "momentum", "position", "velocity")
-"""Arrays of particles that are no colours."""
+COLORLESS = ("F", "C", "momentum", "position", "velocity", "von_mises_stress", *TENSORS)
+"""Arrays of particles that are no colours, or that have a name of their own as colours."""
 
 
 @dataclass(frozen=True)
@@ -78,17 +79,21 @@ class Source:
     def _of_dataset(self, scene_id: int) -> Clip:
         scene, interval = self.dataset.scene(scene_id), self.dataset.record.frame_interval
         names = ["speed", *(name for name in scene.names if name not in COLORLESS)]
-        return Clip(scene["position"], {name: field_values(scene, name, interval) for name in names}, interval)
+        fields = {name: field_values(scene, name, interval) for name in names}
+        if (stress := drawn_in(scene)) is not None:
+            fields[stress.label] = stress.values(scene)
+        return Clip(scene["position"], fields, interval)
 
     def _of_run(self, number: int) -> Clip:
         data = self.trajectory
         rows = data["scene"] == number if "scene" in data.file else slice(None)
         position = self._positions()
         names = [name for name in (*data.fields, "material", "mass") if name not in COLORLESS]
-        fields = {"speed": np.linalg.norm(data["velocity"], axis=2)} | {name: data[name] for name in names}
-        picked = {
-            name: (v[:, rows] if name in data.fields or name == "speed" else v[rows]) for name, v in fields.items()
-        }
+        moving = {"speed": np.linalg.norm(data["velocity"], axis=2)}
+        if (stress := drawn_stress(data.fields, data.measures, position.shape[2])) is not None:
+            moving[stress.label] = stress.values(data)
+        fields = moving | {name: data[name] for name in names}
+        picked = {name: v[:, rows] if name in moving or name in data.fields else v[rows] for name, v in fields.items()}
         times = data["time"]
         interval = float(np.diff(times).mean()) if len(times) > 1 else 1.0
         return Clip(position[:, rows], picked, interval)

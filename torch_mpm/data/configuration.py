@@ -42,6 +42,7 @@ from ..scene.scene import override, parsed
 from . import distribution
 from .content_checks import shape_problems, value_problems
 from .distribution import Words
+from .stress import MEASURES
 from .whole_files import NAME
 
 FORMAT = 2
@@ -76,8 +77,8 @@ class Dataset(schema.Model):
     """frames of a scene, the first among them"""
     interval: schema.Positive
     """time from frame to frame [s]"""
-    fields: list[Literal["velocity", "F", "J", "C", "stress", "temperature", "liquid"]] = Field(default_factory=list)
-    """what is stored beside positions"""
+    fields: list[Literal["velocity"] | schema.StoredField] = Field(default_factory=list)
+    """what is stored beside positions; stress is another name of cauchy_stress"""
     seed: Annotated[int, Field(ge=0)] = 0
     """seed of the data set"""
     particles: Annotated[int, Field(ge=1)] | None = None
@@ -261,6 +262,8 @@ def _checked(words: Words) -> Dataset:
         raise SceneError([f"dataset.particle_type.{name}: {expected}" for name in unknown])
     if "temperature" in dataset.fields and "heat" not in words:
         raise SceneError(["dataset.fields: temperature needs a [heat] table"])
+    if "out_of_plane_stress" in dataset.fields and len(grid.lower) == 3:
+        raise SceneError(["dataset.fields: out_of_plane_stress is for 2-D; in 3-D the stress has all components"])
     if not sum(dataset.splits.values()):
         raise SceneError([f"dataset.splits: has no scenes, got {dataset.splits}"])
     return dataset
@@ -268,7 +271,8 @@ def _checked(words: Words) -> Dataset:
 
 def _hash(words: Words, folder: Path) -> str:
     kept = {key: value for key, value in words.items() if key not in COSMETIC}
-    digest = hashlib.sha256(f"{FORMAT} {json.dumps(kept)}".encode())
+    measure = MEASURES["stress"] if "stress" in words["dataset"].get("fields", []) else ""  # once another one
+    digest = hashlib.sha256(f"{FORMAT} {measure}{json.dumps(kept)}".encode())
     for key, name in _files(words.get("body"), "body"):
         try:
             check_file(folder / name, "shape")

@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
 
+from .stress import CAUCHY, explicit_name
 from .trajectory import Array, Trajectory, find
 
 
 def export_vtk(run: str | Path, out: str | Path | None = None) -> Path:
-    """Write every frame as ``frame_00000.vtu`` with all its fields (stress as 3 x 3), and ``run.pvd`` with their times.
+    """Write every frame as ``frame_00000.vtu`` with all its fields, and ``run.pvd`` with their times.
+
+    Stresses have their measure in their name: ``cauchy_stress``, ``kirchhoff_stress``. Tensors are 3 x 3. In 2-D F_zz
+    is one, and σ_zz is that of ``out_of_plane_stress``, NaN where the trajectory has none.
 
     Args:
         run: run folder or trajectory file.
@@ -29,7 +33,7 @@ def export_vtk(run: str | Path, out: str | Path | None = None) -> Path:
     """
     folder = _folder(run, out, "vtk")
     with Trajectory(run) as trajectory:
-        return write_vtk(trajectory, folder)
+        return write_vtk(trajectory, folder, trajectory.measures)
 
 
 def export_ply(run: str | Path, out: str | Path | None = None) -> Path:
@@ -42,14 +46,24 @@ def export_ply(run: str | Path, out: str | Path | None = None) -> Path:
         return write_ply(trajectory, folder)
 
 
-def write_vtk(frames: Iterable[dict[str, Array]], folder: Path) -> Path:
-    """Write frames, as :meth:`Trajectory.frame` gives them, into a folder; returns ``run.pvd``."""
+def write_vtk(frames: Iterable[dict[str, Array]], folder: Path, measures: Mapping[str, str]) -> Path:
+    """Write frames, as :meth:`Trajectory.frame` gives them, into a folder; returns ``run.pvd``.
+
+    Args:
+        frames: arrays by name.
+        folder: where to write.
+        measures: of each stress, "Cauchy" or "Kirchhoff".
+    """
     collection = ElementTree.Element("VTKFile", type="Collection", version="0.1")
     listing = ElementTree.SubElement(collection, "Collection")
     for k, frame in enumerate(frames):
         name = f"frame_{k:05d}.vtu"
         count = len(frame["position"])
-        data = {key: _three_dimensional(value) for key, value in _per_particle(frame).items()}
+        fields = _per_particle(frame)
+        data = {key: _three_dimensional(value) for key, value in fields.items() if key not in measures}
+        data |= {explicit_name(key, measure): _stress(key, measure, fields) for key, measure in measures.items()}
+        if "F" in fields:
+            data["F"] = _three_dimensional(fields["F"], 1.0)
         cells = [("vertex", np.arange(count)[:, None])]
         _write(folder / name, _mesh(frame["position"], cells, {**data, "id": np.arange(count)}), {})
         ElementTree.SubElement(listing, "DataSet", timestep=f"{float(frame['time']):.9g}", file=name)
@@ -103,7 +117,21 @@ def _per_particle(frame: dict[str, Array]) -> dict[str, Array]:
     return {name: value for name, value in fields.items() if name not in ("position", "momentum")}
 
 
-def _three_dimensional(value: Array) -> Array:
-    """[P, 2] and [P, 2, 2] padded with zeros, since both formats have three dimensions; tensors as rows of 9."""
+def _three_dimensional(value: Array, last: Array | float = 0.0) -> Array:
+    """[P, 2] and [P, 2, 2] padded with zeros, since both formats have three dimensions; tensors as rows of 9.
+
+    Args:
+        value: [P, ...].
+        last: entry zz of tensors in 2-D, [P] or a number.
+    """
     padding = [(0, 0)] + [(0, 3 - n) for n in value.shape[1:]]
-    return np.pad(value, padding).reshape(len(value), *([-1] if value.ndim > 1 else []))
+    whole = np.pad(value, padding)
+    if value.shape[1:] == (2, 2):
+        whole[:, 2, 2] = last
+    return whole.reshape(len(value), *([-1] if value.ndim > 1 else []))
+
+
+def _stress(name: str, measure: str, fields: Mapping[str, Array]) -> Array:
+    """A stress, with its out-of-plane component where that is known."""
+    known = measure == CAUCHY and "out_of_plane_stress" in fields
+    return _three_dimensional(fields[name], fields["out_of_plane_stress"] if known else np.nan)

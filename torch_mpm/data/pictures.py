@@ -13,6 +13,7 @@ import numpy as np
 
 from .folder import DatasetError, DatasetFolder, velocity_of
 from .shard import Array, StoredScene
+from .stress import DrawnStress, drawn_stress
 
 SHEET, VIDEO = "sheet.png", "scenes.mp4"
 SHOWN = 6
@@ -38,7 +39,8 @@ def draw_scenes(
         dataset: folder of the data set.
         out: folder, made where it does not exist; ``pictures`` in that of the data set by default.
         scenes: ids; the first six valid scenes by default.
-        color_by: "speed", "particle_type", "material", or a field of the scenes such as "stress" or "temperature".
+        color_by: "speed", "particle_type", "material", "stress" (von Mises), or a field of the scenes such as
+            "pressure" or "temperature".
         frames: pictures of a scene on the sheet, from its first frame to its last.
         width: of sheet and video in pixels.
         video: make the video, in real time and at 60 frames per second at most.
@@ -90,11 +92,13 @@ class _Artist:
 
     def __init__(self, data: DatasetFolder, ids: Sequence[int], color_by: str, width: int) -> None:
         from ..render import Renderer
+        from ..render.colors import QUANTITIES
 
         record = data.record
         self.interval, self.ids = record.frame_interval, list(ids)
         self.stored = [data.scene(number) for number in ids]
         self.values = [field_values(scene, color_by, self.interval) for scene in self.stored]
+        stress = drawn_in(self.stored[0]) if color_by == "stress" else None
         self.words = [scene.words for scene in self.stored]
         self.bounds = (record.lower, record.upper)
         palette = color_by in ("material", "particle_type")
@@ -104,8 +108,10 @@ class _Artist:
             Renderer(
                 self.bounds,
                 (width, height),
-                "material" if palette else color_by,
+                "material" if palette else stress.label if stress else color_by,
                 None if palette else self._limits(color_by),
+                QUANTITIES["stress"].cmap if stress else None,
+                unit="Pa" if stress else None,
                 gravity=_gravity(words, record.dim),
                 materials=_material_names(scene) if color_by == "material" else (),
             )
@@ -150,12 +156,19 @@ def field_values(scene: StoredScene, name: str, interval: float) -> Array:
     """
     if name == "speed":
         return np.linalg.norm(velocity_of(scene, interval), axis=2)
+    if name == "stress" and (stress := drawn_in(scene)) is not None:
+        return stress.values(scene)
     if name not in scene:
         raise DatasetError(f"color_by must be speed or one of {', '.join(sorted(scene.names))}, got {name!r}")
     trailing = len(scene.shape(name)) - (2 if scene.shape(name)[:2] == (scene.frames, scene.particles) else 1)
-    if trailing and name != "stress":
+    if trailing:
         raise DatasetError(f"color_by must be one number per particle, or stress, got {name!r}")
     return scene[name]
+
+
+def drawn_in(scene: StoredScene) -> DrawnStress | None:
+    """The von Mises stress that pictures of a scene show."""
+    return drawn_stress(scene.names, scene.measures, scene.dim)
 
 
 def _material_names(scene: StoredScene) -> list[str]:

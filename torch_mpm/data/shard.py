@@ -5,7 +5,8 @@ does not count.
 
 Layout: one group ``scene_0000000`` per scene, by its id in the data set. ``position`` [T, N, D] and other fields of
 every frame are compressed in chunks of some frames, so that a window of frames is read without the rest. Arrays of one
-dimension, such as ``particle_type`` [N], are stored as they are. A scene that failed has attributes and no arrays.
+dimension, such as ``particle_type`` [N], are stored as they are. Stresses have an attribute ``measure``, "Cauchy" or
+"Kirchhoff" (without it, ``stress`` is the Kirchhoff stress). A scene that failed has attributes and no arrays.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from ..errors import DamagedFileError
 from .hdf5 import h5py_module, storage_problem
 from .packing import array_digest
 from .statistics import Motion, Sums
+from .stress import MEASURES, measure_of
 from .whole_files import check_record, file_hash, write_record
 
 Array = npt.NDArray[Any]
@@ -156,6 +158,17 @@ class StoredScene:
     def names(self) -> list[str]:
         """Of its arrays."""
         return list(self._group)
+
+    @property
+    def measures(self) -> dict[str, str]:
+        """Measure of each stress, "Cauchy" or "Kirchhoff"; the latter for "stress" without the attribute `measure`."""
+        return {name: measure_of(name, self._measure(name)) for name in self.names if name in MEASURES}
+
+    def _measure(self, name: str) -> Any:
+        try:
+            return self._group[name].attrs.get("measure")
+        except (OSError, RuntimeError, ValueError, KeyError) as error:
+            raise DamagedFileError(self.path, f"{self._name}/{name} cannot be read ({error})", REMEDY) from None
 
     def shape(self, name: str) -> tuple[int, ...]:
         shape: tuple[int, ...] = self._group[name].shape

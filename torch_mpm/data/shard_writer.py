@@ -13,6 +13,7 @@ import numpy as np
 from .hdf5 import QuietFile, h5py_module
 from .packing import GZIP_LEVEL, Array, Compressed, PreparedScene
 from .shard import FORMAT, SceneRecord, ShardRecord, record_path, scene_name
+from .stress import MEASURES
 from .whole_files import appear, building_path, file_hash
 
 Attributes = Mapping[str, str | int | float]
@@ -144,4 +145,7 @@ def _new_dataset(
         properties.set_shuffle()
         properties.set_deflate(GZIP_LEVEL)
     space = h5py.h5s.create_simple(shape)
-    return h5py.h5d.create(group, name.encode(), h5py.h5t.py_create(dtype), space, dcpl=properties)
+    data = h5py.h5d.create(group, name.encode(), h5py.h5t.py_create(dtype), space, dcpl=properties)
+    if name in MEASURES:
+        _write_attribute(data, "measure", MEASURES[name])
+    return data

@@ -7,6 +7,7 @@ counted, and a disk that is too small is noticed before the run starts. Until it
 frame has a checksum: damaged data raise DamagedFileError where they are read.
 
 Layout: ``position``, ``velocity`` and the fields asked for are [T, N, ...], particle n being the one with id n;
+stresses have an attribute ``measure``, "Cauchy" or "Kirchhoff" (without it, ``stress`` is the Kirchhoff stress);
 ``mass``, ``volume``, ``material``, ``scene`` are [N]; ``time``, ``particles``, ``substeps``, the energies and
 ``momentum`` are [T] or [T, D]; ``frames_written`` is [1]; ``checksum`` [T, K] is the CRC-32 of each frame of the K
 arrays that its attribute ``names`` lists. Particles that an emitter has not yet released are NaN.
@@ -28,6 +29,7 @@ import numpy.typing as npt
 
 from ..errors import DamagedFileError
 from .hdf5 import SparseFile, h5py_module, open_sealed, seal
+from .stress import MEASURES, measure_of
 
 Array = npt.NDArray[Any]
 
@@ -38,7 +40,8 @@ STATICS = ("mass", "volume", "material", "scene")
 COUNTERS = ("frames_written", "checksum")
 
 UNITS = {
-    "position": "m", "velocity": "m/s", "F": "1", "J": "1", "stress": "Pa", "C": "1/s", "temperature": "K",
+    "position": "m", "velocity": "m/s", "F": "1", "J": "1", "C": "1/s", "temperature": "K",
+    **dict.fromkeys(MEASURES, "Pa"),
     "liquid": "1", "heat": "J", "mass": "kg", "volume": "m^3",
     "material": "index into attribute names", "scene": "index into attribute names",
     "time": "s", "particles": "1", "substeps": "1", "kinetic_energy": "J", "elastic_energy": "J",
@@ -121,6 +124,8 @@ def _metadata(image: SparseFile, layout: Layout) -> dict[str, int]:
         _reserve(h5py, out, "checksum", (layout.frames, len(columns)), "u4")
         for name, data in out.items():
             data.attrs["unit"] = UNITS.get(name, "")
+            if name in MEASURES:
+                data.attrs["measure"] = MEASURES[name]
         for name, names in {**layout.names, "checksum": columns}.items():
             out[name].attrs["names"] = names
         out.attrs.update({"format": FORMAT, **layout.attributes})
@@ -276,6 +281,12 @@ class Trajectory:
     def names(self, name: str) -> list[str]:
         """Names that the indices of ``material`` or ``scene`` stand for."""
         return [str(n) for n in self.file[name].attrs["names"]]
+
+    @property
+    def measures(self) -> dict[str, str]:
+        """Measure of each stress, "Cauchy" or "Kirchhoff"; the latter for "stress" without the attribute `measure`."""
+        stresses = [name for name in self.fields if name in MEASURES]
+        return {name: measure_of(name, self.file[name].attrs.get("measure")) for name in stresses}
 
     def frame(self, k: int) -> dict[str, Array]:
         """All of frame ``k``: the fields and constants of its particles, and its scalars."""

@@ -67,6 +67,12 @@ class Active(Material):
         F = fields.get("F", state.F)
         return fields, stress + law_update(FIBRE, F, self.fibre_parameters(state)).stress
 
+    def out_of_plane_stress(self, state: State) -> Tensor:
+        return self.law.out_of_plane_stress(state)  # fibres are in the plane
+
+    def volume_ratio(self, state: State) -> Tensor:
+        return self.law.volume_ratio(state)
+
     def initial(self, name: str, state: State) -> Tensor:
         return torch.zeros_like(state.mass) if name == ACTIVATION else self.law.initial(name, state)
 

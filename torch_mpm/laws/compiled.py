@@ -40,6 +40,8 @@ if TYPE_CHECKING:
     from ..state import State
 
 
+PLASTIC_VOLUME = "log_plastic_volume"
+"""History of laws whose plastic flow changes the volume: ln J_p."""
 FIGURES = ("stress", "stiffness", "energy_density")
 """What a survey asks of a law."""
 
@@ -112,6 +114,30 @@ class CompiledLaw(Material):
         if result.dissipated is not None:
             fields["dissipated"] = result.dissipated
         return fields, result.stress
+
+    def out_of_plane_stress(self, state: State) -> Tensor:
+        """τ_zz [P] [Pa] of plane strain: ∂ψ/∂ln F_zz at F_zz = 1, since plastic flow in 2-D stays in the plane."""
+        if self.state_fields == ("J",):  # beside the pressure a fluid has a deviator in the plane alone
+            return self.stress(state).diagonal(dim1=1, dim2=2).mean(1)
+        mapped = self.return_map(state)
+        law, moduli, options = self._elastic_law(state, mapped.history)
+        F = torch.nn.functional.pad(mapped.state, (0, 1, 0, 1))
+        F[:, 2, 2] = 1
+        return law_update(law, F, moduli, scene=state.scene, options=options).stress[:, 2, 2]
+
+    def _elastic_law(self, state: State, history: Sequence[Tensor]) -> tuple[str, list[Tensor], Sequence[str]]:
+        """A compiled law with the elastic energy of this one in 2-D and 3-D: its name, parameters and options."""
+        _, parameters = self._arguments(state)
+        if self.elastic_name is None:
+            return self.name, parameters, ()
+        return self.elastic_name, self._elastic_moduli(state, parameters, history), ()
+
+    def volume_ratio(self, state: State) -> Tensor:
+        """J or det F [P], times the plastic volume ratio where the law keeps one."""
+        elastic = super().volume_ratio(state)
+        if PLASTIC_VOLUME not in self.extra_fields:
+            return elastic
+        return elastic * self._history(state)[self.history_names().index(PLASTIC_VOLUME)].exp()
 
     def energy_density(self, state: State) -> Tensor:
         """Elastic energy per rest volume [P] [J/m³] after the return map."""

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor, nn
 
+from ..vectors import determinant
 from .tangent import differentiated_stiffness
 
 if TYPE_CHECKING:
@@ -51,6 +52,26 @@ class Material(nn.Module):
     def stress(self, state: State) -> Tensor:
         """Kirchhoff stress τ [P, D, D] [Pa]."""
         return self.update(state)[1]
+
+    def out_of_plane_stress(self, state: State) -> Tensor:
+        """τ_zz [P] [Pa] of a 2-D state, which is in plane strain (F_zz = 1); of the state after the return map, as
+        `stress`.
+
+        Raises:
+            NotImplementedError: for a law that gives the stress in the plane alone.
+        """
+        raise NotImplementedError(
+            f"{type(self).__name__} has no out-of-plane stress, which pressure and von Mises stress need in 2-D: "
+            "define out_of_plane_stress(state)"
+        )
+
+    def volume_ratio(self, state: State) -> Tensor:
+        """Volume over rest volume [P], by which the Kirchhoff stress is that of Cauchy: J, or det F."""
+        if self.state_fields == ("J",):
+            assert state.J is not None
+            return state.J
+        assert state.F is not None
+        return determinant(state.F)
 
     def energy_density(self, state: State) -> Tensor:
         """Elastic energy per rest volume [P] [J/m³]; infinite where the law has no meaning."""

@@ -73,6 +73,12 @@ class Mixture(Material):
     def stress(self, state: State) -> Tensor:
         return self._collect(state, lambda law, part: law.stress(part), (state.x.shape[1],) * 2)
 
+    def out_of_plane_stress(self, state: State) -> Tensor:
+        return self._collect(state, lambda law, part: law.out_of_plane_stress(part))
+
+    def volume_ratio(self, state: State) -> Tensor:
+        return self._collect(state, lambda law, part: law.volume_ratio(part))
+
     def initial(self, name: str, state: State) -> Tensor:
         return next(law.initial(name, state) for law in self.laws if name in law.extra_fields)  # type: ignore[operator]
 

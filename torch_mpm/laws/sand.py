@@ -123,6 +123,9 @@ class QuarticSand(SolidLaw):
         slope = self._slope(self._friction_angle(friction, state), F.shape[1])
         return F, [mu, lam, slope, cohesion, smallest]
 
+    def _elastic_law(self, state: State, history: Sequence[Tensor]) -> tuple[str, list[Tensor], Sequence[str]]:
+        return law_name(self.energy_form, "radial", 3), self._arguments(state)[1], ("elastic",)
+
     def _name(self, state: State) -> str:
         return law_name(self.energy_form, self.flow, state.x.shape[1])
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -12,6 +12,9 @@ from ..ops.arguments import per_parameter
 from ..ops.law import law_energy
 from ..parameters import Value
 from .compiled import SolidLaw
+
+if TYPE_CHECKING:
+    from ..state import State
 
 __all__ = [
     "CamClay",
@@ -169,6 +172,10 @@ class Viscoelastic(SolidLaw):
     name = "viscoelastic"
     branch_modulus: Any
     relaxation_time: Any
+
+    def _elastic_law(self, state: State, history: Sequence[Tensor]) -> tuple[str, list[Tensor], Sequence[str]]:
+        """That of the solid; the stress of the branch is a deviator in the plane."""
+        return "neo_hookean", self._arguments(state)[1][:2], ()
 
     def __init__(
         self,

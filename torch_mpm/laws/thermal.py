@@ -52,6 +52,16 @@ class ThermalExpansion(Material):
         expanded = self._stretched(state, fields.get("J"), fields.get("F"), 1.0)
         return fields | expanded, stress
 
+    def out_of_plane_stress(self, state: State) -> Tensor:
+        """τ_zz [P] [Pa] of a body that expands in the plane alone; one that expands in three directions, and has
+        α (1 + ν) here, has E α θ less, with its linear expansion α."""
+        return self.law.out_of_plane_stress(self._elastic(state))
+
+    def volume_ratio(self, state: State) -> Tensor:
+        elastic = self._elastic(state)
+        before, after = (Material.volume_ratio(self, part) for part in (elastic, state))
+        return self.law.volume_ratio(elastic) * (after / before)
+
     def initial(self, name: str, state: State) -> Tensor:
         return self.law.initial(name, state)
 
@@ -127,6 +137,13 @@ class Melting(Material):
             changes["dissipated"] = torch.where(self._flows(state), 0, fields["dissipated"])
         (stress,) = pointwise("melting_stress", state.x.shape[1], solid, liquid, fraction, self.coherency)
         return changes, stress
+
+    def out_of_plane_stress(self, state: State) -> Tensor:
+        return self._mixed(state, lambda law, part: law.out_of_plane_stress(part))
+
+    def volume_ratio(self, state: State) -> Tensor:
+        part = self._consistent(state)
+        return torch.where(self._flows(state), part.J, self.solid.volume_ratio(part))
 
     def initial(self, name: str, state: State) -> Tensor:
         return self.solid.initial(name, state)

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from ..data.stress import von_mises
 from .requires import require
 from .shapes import Array
 
@@ -33,6 +34,8 @@ class Quantity:
 QUANTITIES = {
     "speed": Quantity("speed", "m/s", "Spectral_r", from_zero=True),
     "stress": Quantity("von Mises stress", "Pa", "plasma", from_zero=True),
+    "von_mises_stress": Quantity("von Mises stress", "Pa", "plasma", from_zero=True),
+    "pressure": Quantity("pressure", "Pa", "viridis"),
     "temperature": Quantity("temperature", "K", "coolwarm"),
     "liquid": Quantity("liquid fraction", "", "viridis"),
     "material": Quantity("material", "", ""),
@@ -46,24 +49,14 @@ def numpy_of(value: Any) -> Array:
     return np.asarray(value)
 
 
-def von_mises(stress: Array) -> Array:
-    """Von Mises stress [P], sqrt(3/2 dev:dev), of stress tensors [P, D, D]."""
-    trace = np.trace(stress, axis1=1, axis2=2)
-    dev = stress - trace[:, None, None] / 3 * np.eye(stress.shape[1])
-    square = np.sum(dev * dev, axis=(1, 2))
-    if stress.shape[1] == 2:  # plane strain without out-of-plane stress: dev has a third diagonal entry -trace/3
-        square = square + (trace / 3) ** 2
-    return np.sqrt(1.5 * square)
-
-
 def scalar_of(color_by: str, values: Array, count: int) -> Array:
-    """One number per particle [P]: velocities [P, D] become speeds, stress tensors [P, D, D] von Mises stresses."""
+    """One number per particle [P]: velocities [P, D] become speeds, stress tensors [P, 3, 3] von Mises stresses."""
     if color_by == "speed" and values.ndim == 2:
         values = np.linalg.norm(values, axis=1)
-    elif color_by == "stress" and values.ndim == 3:
+    elif color_by == "stress" and values.shape[1:] == (3, 3):
         values = von_mises(values)
     if values.shape != (count,):
-        also = {"speed": " or [P, D]", "stress": " or [P, D, D]"}.get(color_by, "")
+        also = {"speed": " or [P, D]", "stress": " or [P, 3, 3] (with σ_zz in 2-D)"}.get(color_by, "")
         raise ValueError(f"scalars must have shape [P]{also} with P = {count} for {color_by}, got {list(values.shape)}")
     return values
 

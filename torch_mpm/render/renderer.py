@@ -30,8 +30,8 @@ class Renderer:
     Args:
         bounds: (lower [D], upper [D]) of the domain in metres; D = 2 or 3. It is drawn as a box and framed.
         resolution: (width, height) in pixels.
-        color_by: "speed" [m/s], "stress" [Pa], "temperature" [K], "material", "layer", any other label for a scalar
-            of your own (then give `unit`), or None for one colour.
+        color_by: "speed" [m/s], "stress" (von Mises) or "pressure" [Pa], "temperature" [K], "material", "layer", any
+            other label for a scalar of your own (then give `unit`), or None for one colour.
         range: (lo, hi) of the colour scale in that unit. None takes each frame's own, which flickers in a video.
         cmap: a matplotlib colour map name; None takes the quantity's own.
         unit: unit shown on the scale; None takes the quantity's own.
@@ -119,8 +119,9 @@ class Renderer:
 
         Args:
             x: positions [P, D] in metres, torch or numpy. Particles that are not finite are left out and logged.
-            scalars: [P] for the colour; velocities [P, D] will do for "speed", stresses [P, D, D] for "stress"
-                (von Mises), numbers for "material" and "layer". Not finite: grey.
+            scalars: [P] for the colour; velocities [P, D] will do for "speed", stresses [P, 3, 3] for "stress"
+                (von Mises; in 2-D with the out-of-plane component), numbers for "material" and "layer". Not finite:
+                grey.
             obstacles: shapes of `torch_mpm.render.shapes` at their poses at this time.
             overlays: (points [N, D] in metres, colour, label) polylines over the picture.
             time: seconds, written into the picture.

@@ -29,7 +29,12 @@ PIXELS = range(16, 16385)
 
 def problems(scene: Any, entries: Sequence[Any]) -> list[str]:
     """One line for each mistake, beginning with its key."""
-    found = [*_grid_problems(scene, len(entries)), *_time_problems(scene), *render_problems(scene)]
+    found = [
+        *_grid_problems(scene, len(entries)),
+        *_time_problems(scene),
+        *render_problems(scene),
+        *output_problems(scene),
+    ]
     for entry in entries:
         found += _material_problems(entry)
     found += heat.problems(scene, entries)
@@ -113,6 +118,12 @@ def _material_problems(entry: Any) -> Iterator[str]:
                 yield f"{key}.material: there is no material {item.material!r}; known: {known}"
     if not entry.body and not entry.emitter:
         yield f"{entry.path}body: the scene has no matter; give it a [[body]] or an [[emitter]]"
+
+
+def output_problems(scene: Any) -> Iterator[str]:
+    """Fields that no trajectory of the scene can have."""
+    if scene.grid is not None and len(scene.grid.lower) == 3 and "out_of_plane_stress" in scene.output.fields:
+        yield "output.fields: out_of_plane_stress is for 2-D scenes; in 3-D the stress has all components"
 
 
 def render_problems(scene: Any) -> Iterator[str]:

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from ..data.stress import DrawnStress, drawn_stress
 from ..data.trajectory import Array, Trajectory
 from . import check, schema
 from .explain import SceneError
@@ -66,7 +67,9 @@ def _problems(scene: Scene, words: schema.Render, trajectory: Trajectory) -> Ite
     dim = trajectory.file["position"].shape[2]
     if scene.dim != dim:
         yield f"grid.lower: the trajectory has {dim} dimensions, got {scene.grid.lower}"
-    if words.color_by in RANKS and words.color_by not in trajectory.fields:
+    if words.color_by == "stress" and drawn_stress(trajectory.fields, trajectory.measures, dim) is None:
+        yield "render.color_by: the trajectory has no 'stress'; simulate with 'von_mises_stress' in output.fields"
+    elif words.color_by in RANKS and words.color_by not in (*trajectory.fields, "stress"):
         yield f"render.color_by: the trajectory has no {words.color_by!r}; simulate with it in output.fields"
 
 
@@ -75,6 +78,7 @@ class _Artist:
 
     def __init__(self, scene: Scene, words: schema.Render, trajectory: Trajectory) -> None:
         from ..render import Renderer
+        from ..render.colors import QUANTITIES
 
         origin, scene = scene.origin, scene.relative()
         self.zero = np.zeros(scene.dim) if origin is None else np.array(origin)
@@ -84,14 +88,19 @@ class _Artist:
         self.columns = math.ceil(math.sqrt(len(self.entries)))
         self.names = trajectory.names("material")
         self.layers = _layers(trajectory, scene, words.layers) if words.color_by == "layer" else None
+        self.stress: DrawnStress | None = None
+        if words.color_by == "stress":
+            self.stress = drawn_stress(trajectory.fields, trajectory.measures, scene.dim)
         width, height = words.resolution
         limits = words.range or self._limits(trajectory)
         self.renderers = [
             Renderer(
                 (scene.grid.lower, scene.grid.upper),
                 (width // self.columns, height // self.columns),
-                words.color_by,
+                self.stress.label if self.stress else words.color_by,
                 limits,
+                QUANTITIES["stress"].cmap if self.stress else None,
+                unit="Pa" if self.stress else None,
                 gravity=entry.gravity if scene.dim == 3 else None,
                 style=words.style,
                 materials=self.names,
@@ -136,6 +145,8 @@ class _Artist:
     def _values(self, frame: dict[str, Array]) -> Array:
         if self.layers is not None:
             return self.layers[: len(frame["position"])]
+        if self.stress is not None:
+            return self.stress.values(frame)
         return frame["velocity" if self.words.color_by == "speed" else self.words.color_by]
 
     def _limits(self, trajectory: Trajectory) -> tuple[float, float] | None:

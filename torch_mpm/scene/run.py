@@ -319,7 +319,7 @@ class Simulation:
         order = torch.empty_like(places).scatter_(0, given.ids, places)
         values = {}
         for name in ("position", "velocity", *self.scene.trajectory_fields):
-            value = figures.stress if name == "stress" else fields.field(self.step, given, name)
+            value = fields.field(self.step, given, name, figures.stress)
             assert value is not None, name  # `build` refuses fields that no material has
             values[name] = self._in_coordinates(value) if name == "position" else value
         kept = dict(zip(values, _take_all(list(values.values()), order), strict=True))

@@ -6,17 +6,19 @@ import hashlib
 import json
 import sys
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import torch
 from pydantic import PrivateAttr, ValidationError
 
+from ..data.stress import MEASURES
 from ..files import read_text
 from ..seed import on_host
 from . import check, partial, schema
 from .build import Built, build
 from .entry import ResolvedEntry
 from .explain import SceneError, explain
+from .fields import RANKS
 from .places import relative
 
 if sys.version_info >= (3, 11):
@@ -118,10 +120,13 @@ class Scene(schema.SceneData):
     def trajectory_fields(self) -> list[str]:
         """Fields of the trajectory beside position and velocity: those asked for, and what the other outputs need."""
         drawn = self.render.color_by if self.render else ""
-        needed = {name for name in ("stress", "temperature", "liquid") if name == drawn}
-        needed |= {"stress"} if self.output.vtk else set()
-        names = ("F", "J", "C", "stress", "temperature", "liquid")
-        return [name for name in names if name in {*self.output.fields, *needed}]
+        needed = {"stress": "von_mises_stress"}.get(drawn, drawn)
+        names = {*self.output.fields, *([needed] if needed in RANKS else [])}
+        if self.output.vtk and "cauchy_stress" not in names:
+            names.add("stress")
+        if self.output.vtk and self.dim == 2:
+            names.add("out_of_plane_stress")
+        return [name for name in get_args(schema.StoredField) if name in names]
 
     def torch_device(self) -> torch.device:
         """Raises SceneError for a device that does not exist."""
@@ -159,7 +164,9 @@ class Scene(schema.SceneData):
         """
         absent = {"origin"} if self.origin is None else set()  # as in files of versions without this key
         digest = hashlib.sha256(self.model_dump_json(exclude=COSMETIC | absent).encode())
-        digest.update(json.dumps(self.trajectory_fields).encode())
+        names = self.trajectory_fields
+        digest.update(json.dumps(names).encode())
+        digest.update(MEASURES["stress"].encode() if "stress" in names else b"")  # which was another one once
         entries = self.entries()
         problems = [p for entry in entries for p in check.file_problems(entry, self.folder)]
         if problems:

@@ -507,13 +507,19 @@ class Heat(Model):
 # ---- outputs
 
 
+StoredField = Literal[
+    "F", "J", "C", "stress", "cauchy_stress", "kirchhoff_stress", "out_of_plane_stress", "von_mises_stress", "pressure",
+    "temperature", "liquid",
+]  # fmt: skip
+
+
 class Output(Model):
     """What is stored in addition to position and velocity, and in which other formats."""
 
-    fields: list[Literal["F", "J", "C", "stress", "temperature", "liquid"]] = []
-    """additional fields of the trajectory"""
+    fields: list[StoredField] = []
+    """additional fields of the trajectory; stress is another name of cauchy_stress"""
     vtk: bool = False
-    """write a VTK file per frame, with stress"""
+    """write a VTK file per frame, with the Cauchy stress"""
     ply: bool = False
     """write a PLY point cloud per frame"""
 
@@ -530,8 +536,9 @@ class Ritter(Model):
 class Render(Model):
     """Pictures (PNG) and video (MP4)."""
 
-    color_by: Literal["speed", "stress", "material", "temperature", "liquid", "layer"] = "speed"
-    """what the colours show; layer: the height at the start, or for emitted particles the time"""
+    color_by: Literal["speed", "stress", "pressure", "material", "temperature", "liquid", "layer"] = "speed"
+    """what the colours show; stress: the von Mises stress; layer: the height at the start, or for emitted particles
+    the time"""
     layers: Annotated[int, Field(ge=1)] = 8
     """number of layers with colours of their own"""
     range: tuple[float, float] | None = None

@@ -17,7 +17,7 @@ from .common import new_folder
 def export_scenes_vtk(
     dataset: str | Path | DatasetFolder, out: str | Path | None = None, scenes: Sequence[int] | None = None
 ) -> Path:
-    """Write scenes as ``scene_0000000/frame_00000.vtu``, ..., and ``run.pvd``, with all their fields.
+    """Write scenes as ``scene_0000000/frame_00000.vtu``, ..., and ``run.pvd``, with all their fields as `export_vtk`.
 
     Args:
         dataset: folder of the data set.
@@ -33,14 +33,14 @@ def export_scenes_vtk(
         DamagedFileError: for a scene that is damaged.
         ImportError: when meshio is missing (extra ``data``).
     """
-    return _export(dataset, out, scenes, "vtk", write_vtk)
+    return _export(dataset, out, scenes, "vtk", lambda scene, frames, path: write_vtk(frames, path, scene.measures))
 
 
 def export_scenes_ply(
     dataset: str | Path | DatasetFolder, out: str | Path | None = None, scenes: Sequence[int] | None = None
 ) -> Path:
     """Write scenes as point clouds ``scene_0000000/frame_00000.ply``; all else as :func:`export_scenes_vtk`."""
-    return _export(dataset, out, scenes, "ply", write_ply)
+    return _export(dataset, out, scenes, "ply", lambda scene, frames, path: write_ply(frames, path))
 
 
 def _export(
@@ -48,7 +48,7 @@ def _export(
     out: str | Path | None,
     scenes: Sequence[int] | None,
     name: str,
-    write: Callable[[Iterable[dict[str, Array]], Path], Any],
+    write: Callable[[StoredScene, Iterable[dict[str, Array]], Path], Any],
 ) -> Path:
     dataset = source if isinstance(source, DatasetFolder) else DatasetFolder(source)
     target = dataset.path / name if out is None else Path(out)
@@ -57,7 +57,7 @@ def _export(
     with new_folder(target) as folder:
         for number, scene in stored.items():
             (folder / scene_name(number)).mkdir()
-            write(scene_frames(scene, dataset.record.frame_interval), folder / scene_name(number))
+            write(scene, scene_frames(scene, dataset.record.frame_interval), folder / scene_name(number))
     return target
 
 
