@@ -13,6 +13,7 @@ import h5py
 from generated import configuration
 from helpers import disc
 
+from torch_mpm import data
 from torch_mpm.data import trajectory
 from torch_mpm.data.configuration import FORMAT, Configuration
 from torch_mpm.data.export import export_vtk
@@ -70,14 +71,14 @@ def test_vtk_names_the_measure_and_is_complete(run):
     folder = export_vtk(run).parent
     with Trajectory(run) as read:
         frame = read.frame(len(read) - 1)
-    data = meshio.read(sorted(folder.glob("*.vtu"))[-1]).point_data
+    point_data = meshio.read(sorted(folder.glob("*.vtu"))[-1]).point_data
     expected = by_hand(frame["F"])
-    assert "stress" not in data
-    sigma = data["cauchy_stress"].reshape(-1, 3, 3)
+    assert "stress" not in point_data
+    sigma = point_data["cauchy_stress"].reshape(-1, 3, 3)
     np.testing.assert_allclose(sigma[:, :2, :2], expected["stress"], rtol=1e-9, atol=1e-8)
     np.testing.assert_allclose(sigma[:, 2, 2], expected["out_of_plane_stress"], rtol=1e-9, atol=1e-8)
-    assert (sigma[:, 2, :2] == 0).all() and np.isnan(data["kirchhoff_stress"].reshape(-1, 3, 3)[:, 2, 2]).all()
-    assert (data["F"].reshape(-1, 3, 3)[:, 2] == [0, 0, 1]).all()
+    assert (sigma[:, 2, :2] == 0).all() and np.isnan(point_data["kirchhoff_stress"].reshape(-1, 3, 3)[:, 2, 2]).all()
+    assert (point_data["F"].reshape(-1, 3, 3)[:, 2] == [0, 0, 1]).all()
 
 
 def test_a_scene_with_vtk_stores_what_vtk_needs():
@@ -145,8 +146,8 @@ def test_old_trajectories_have_the_kirchhoff_stress(old):
         assert drawn.label == "in-plane von Mises Kirchhoff stress"
         np.testing.assert_allclose(drawn.values(read.frame(0)), np.sqrt(3) * np.sqrt(8))
     meshio = pytest.importorskip("meshio")
-    data = meshio.read(export_vtk(old).parent / "frame_00000.vtu").point_data
-    assert "kirchhoff_stress" in data and "stress" not in data and "cauchy_stress" not in data
+    point_data = meshio.read(export_vtk(old).parent / "frame_00000.vtu").point_data
+    assert "kirchhoff_stress" in point_data and not {"stress", "cauchy_stress"} & set(point_data)
 
 
 # ---- data sets
@@ -163,6 +164,8 @@ def test_a_data_set_names_its_measures(tmp_path):
     np.testing.assert_array_equal(scene["stress"], scene["cauchy_stress"])
     whole = von_mises(scene["stress"].astype(float), scene["out_of_plane_stress"])
     np.testing.assert_allclose(scene["von_mises_stress"], whole, rtol=1e-3, atol=1e-2)
+    with h5py.File(data.export_lagrangebench(folder, tmp_path / "graphs", fields=["stress"]) / "train.h5") as file:
+        np.testing.assert_array_equal(file["00000"]["cauchy_stress"][()], scene["stress"])
     pytest.importorskip("meshio")
     made_files = export_scenes_vtk(folder, tmp_path / "vtk")
     text = (made_files / "scene_0000000" / "frame_00000.vtu").read_bytes()

@@ -18,6 +18,7 @@ import numpy.typing as npt
 from ..folder import DatasetError, DatasetFolder
 from ..metadata import metadata, write_metadata
 from ..statistics import BOUNDARY
+from ..stress import explicit_name
 
 Array = npt.NDArray[Any]
 
@@ -74,7 +75,7 @@ class Export:
 
 
 def fields_of(scene: ExportedScene, names: Sequence[str]) -> dict[str, Array]:
-    """Further arrays of a scene, [T, N, ...] or [N].
+    """Further arrays of a scene, [T, N, ...] or [N]; stresses have their measure in their name.
 
     Raises:
         DatasetError: for one that is not there.
@@ -83,7 +84,8 @@ def fields_of(scene: ExportedScene, names: Sequence[str]) -> dict[str, Array]:
         if name not in scene.arrays:
             known = ", ".join(n for n in scene.arrays.names if n not in ("position", "particle_type"))
             raise DatasetError(f"fields must be of {known}, got {name!r}, which scene {scene.id} does not have")
-    return {name: scene.arrays[name] for name in names}
+    measures = scene.arrays.measures
+    return {explicit_name(name, measures.get(name, "")): scene.arrays[name] for name in names}
 
 
 def exported_ids(dataset: DatasetFolder, split: str) -> list[int]:

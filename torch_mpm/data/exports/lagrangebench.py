@@ -28,7 +28,8 @@ def export_lagrangebench(
     Args:
         dataset: folder of the data set.
         out: folder to make; ``lagrangebench`` in that of the data set by default.
-        fields: further arrays of the scenes to write beside the positions, such as "stress"; its loader skips them.
+        fields: further arrays of the scenes to write beside the positions, such as "stress", which is written as
+            ``cauchy_stress``; its loader skips them.
 
     Returns and errors as :func:`export_gns`; DatasetError also for a field that is not there.
     """

@@ -38,7 +38,7 @@ def export_tfrecord(
         dataset: folder of the data set.
         out: folder to make; ``tfrecord`` in that of the data set by default.
         fields: further arrays [T, N, ...] of the scenes to write as features of every frame, float32 bytes, such as
-            "stress"; readers that do not name them skip them.
+            "stress", which is written as ``cauchy_stress``; readers that do not name them skip them.
         context: whether every frame has ``step_context`` (float32 bytes), the gravity [D] of the scene; metadata.json
             then has ``context_mean`` and ``context_std``, from which DeepMind's reader knows of it.
 
