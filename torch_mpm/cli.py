@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
+import signal
 import sys
+import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 from .data import commands as data_sets
@@ -16,10 +20,17 @@ from .data.commands import set_argument
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line; returns the exit status: 0, 1 for a problem (described on stderr), 130 when interrupted."""
+    """Run the command line.
+
+    Returns:
+        The exit status: 0, 1 for a problem (described on stderr), 130 after Ctrl-C, 143 after SIGTERM.
+    """
     options = _parser().parse_args(arguments)
     try:
-        options.command(options)
+        with termination_raises():
+            options.command(options)
+    except Terminated:
+        return _told("terminated", 143)
     except KeyboardInterrupt:
         return _told("interrupted", 130)
     except (ValueError, OSError, ImportError, RuntimeError, MemoryError, KeyError) as error:
@@ -28,6 +39,27 @@ def main(arguments: Sequence[str] | None = None) -> int:
             raise
         return _told(message, 130 if type(error).__name__ == "Interrupted" else 1)
     return 0
+
+
+class Terminated(KeyboardInterrupt):
+    """SIGTERM, as an exception: what is being written is removed on the way out."""
+
+
+@contextlib.contextmanager
+def termination_raises() -> Iterator[None]:
+    """SIGTERM raises `Terminated` in the main thread; elsewhere it ends the process as before."""
+
+    def end(number: int, frame: FrameType | None) -> None:
+        raise Terminated
+
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    previous = signal.signal(signal.SIGTERM, end)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, previous)
 
 
 TOLD = (
@@ -117,7 +149,10 @@ def _run(options: argparse.Namespace) -> None:
         raise
     if bar is not None:
         bar.close()
-    seconds = summary["seconds"]
+    seconds = summary.setdefault("seconds", {})
+    if "total" in seconds:  # nothing of an earlier run is missing
+        print(f"{options.out} holds the complete run of this scene")
+        return
     files = {"trajectory": options.out / "trajectory.h5"}
     for name, make in _outputs(scene, options):
         since = time.perf_counter()
@@ -125,7 +160,10 @@ def _run(options: argparse.Namespace) -> None:
         seconds[name] = time.perf_counter() - since
     seconds["total"] = time.perf_counter() - begin
     _write_summary(options.out, summary)
-    _print_summary(summary, files)
+    if "frames" in summary:
+        _print_summary(summary, files)
+    else:
+        print(f"{options.out} holds the complete run of this scene, whose summary was lost by a kill")
 
 
 def _require_outputs(scene: Any) -> None:

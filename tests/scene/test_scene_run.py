@@ -159,9 +159,10 @@ def test_folders_that_hold_something_else_are_refused(tmp_path):
         scene.run(tmp_path / "notes" / "mine.txt")
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "run.building").write_text("{")  # what a kill at the very start may leave
-    scene.run(tmp_path / "out")
+    summary = scene.run(tmp_path / "out")
     with pytest.raises(OutputError, match="holds the complete run of this scene"):
-        scene.run(tmp_path / "out", resume=True)
+        scene.run(tmp_path / "out")
+    assert scene.run(tmp_path / "out", resume=True) == json.loads(json.dumps(summary))
     with pytest.raises(OutputError, match="holds the run of another scene"):
         Scene(**disc(device="cpu", duration=0.04)).run(tmp_path / "out", resume=True)
     assert (tmp_path / "notes" / "mine.txt").read_text() == "keep"

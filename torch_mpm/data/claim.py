@@ -19,7 +19,7 @@ from ..scene.folder import OutputError
 from ..scene.folder import output_errors as folder_errors
 from .folder import DATASET, LINKED, DatasetRecord
 from .shard import Shard, ShardRecord, record_path, shard_path
-from .whole_files import check_inside, write_whole
+from .whole_files import check_inside, remove_leftovers, write_whole
 from .workers import Worker
 
 CONFIGURATION, LOCK = "config.toml", "lock"
@@ -70,6 +70,8 @@ class Claim:
             try:
                 self._locked(TABLE, wait=True)
                 self._refuse_others()
+                for own in (self.folder, self.folder / "shards"):
+                    remove_leftovers(own)
                 if (self.folder / DATASET).exists():
                     self.record = DatasetRecord.read(self.folder)
                 else:

@@ -12,6 +12,7 @@ import numpy as np
 
 from .stress import CAUCHY, explicit_name
 from .trajectory import Array, Trajectory, find
+from .whole_files import building_path, remove_leftovers
 
 
 def export_vtk(run: str | Path, out: str | Path | None = None) -> Path:
@@ -85,6 +86,7 @@ def write_ply(frames: Iterable[dict[str, Array]], folder: Path) -> Path:
 def _folder(run: str | Path, out: str | Path | None, name: str) -> Path:
     folder = find(run).parent / name if out is None else Path(out)
     folder.mkdir(parents=True, exist_ok=True)
+    remove_leftovers(folder)
     return folder
 
 
@@ -102,7 +104,7 @@ def _mesh(position: Array, cells: list[Any], data: dict[str, Array]) -> Any:
 
 def _write(path: Path, mesh: Any, options: dict[str, Any]) -> None:
     """Write a file that appears only when it is complete."""
-    building = path.with_name(f".{path.name}")
+    building = building_path(path)
     try:
         meshio_module().write(building, mesh, file_format=path.suffix[1:], **options)
         os.replace(building, path)

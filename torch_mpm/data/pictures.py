@@ -14,6 +14,7 @@ import numpy as np
 from .folder import DatasetError, DatasetFolder, velocity_of
 from .shard import Array, StoredScene
 from .stress import DrawnStress, drawn_stress
+from .whole_files import remove_leftovers
 
 SHEET, VIDEO = "sheet.png", "scenes.mp4"
 SHOWN = 6
@@ -63,6 +64,7 @@ def draw_scenes(
         raise DatasetError(f"{data.path} has no valid scene yet")
     target = data.path / "pictures" if out is None else Path(out)
     target.mkdir(parents=True, exist_ok=True)
+    remove_leftovers(target)
     length, interval = data.record.frames, data.record.frame_interval
     with contextlib.ExitStack() as stack:
         columns = max(1, frames)

@@ -6,6 +6,8 @@ import hashlib
 import json
 import os
 import re
+import shutil
+import socket
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -15,6 +17,8 @@ from ..errors import DamagedFileError
 
 NAME = re.compile(r"[A-Za-z0-9_-]+")
 """Names that may become a part of a path."""
+LEFTOVER = re.compile(r"\.(?P<machine>\w+)-(?P<process>\d{1,18})\.building(\.\w+)?$")
+"""End of the name of what is not whole yet."""
 CHECKSUM = "checksum"
 PART_BYTES = 2**25
 """Of a file that is hashed in parts."""
@@ -71,9 +75,40 @@ def check_inside(folder: Path, path: Path, remedy: str) -> None:
         raise DamagedFileError(path, f"is a link to a place outside of {folder}", remedy)
 
 
-def building_path(path: Path) -> Path:
-    """What a file is called that is not whole yet."""
-    return path.with_name(f".{path.name}.{os.getpid()}.building")
+def building_path(path: Path, suffix: str = "") -> Path:
+    """Name of a file or folder of this process that is not whole yet.
+
+    Args:
+        path: name of the whole file.
+        suffix: end of the name, for programs that read the format from it.
+    """
+    return path.with_name(f".{path.name}.{_machine()}-{os.getpid()}.building{suffix}")
+
+
+def remove_leftovers(folder: Path) -> None:
+    """Remove the files and folders that processes of this machine, which are gone, have left unfinished in a folder."""
+    for path in folder.glob(".*.building*"):
+        found = LEFTOVER.search(path.name)
+        if found is None or found["machine"] != _machine() or _runs(int(found["process"])):
+            continue
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            path.unlink(missing_ok=True)
+
+
+def _machine() -> str:
+    return re.sub(r"\W", "_", socket.gethostname())
+
+
+def _runs(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except (PermissionError, OverflowError):  # of another user; no process has such a number
+        return True
+    return True
 
 
 def appear(building: Path, path: Path) -> None:

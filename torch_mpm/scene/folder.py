@@ -56,6 +56,18 @@ def _check_links(folder: Path) -> None:
         check_inside(folder, path, REMEDY)
 
 
+def finished(folder: Path, fingerprint: str) -> dict[str, Any] | None:
+    """Summary of a complete run of a scene; None where there is none. Empty where a kill kept it from being written.
+
+    Raises:
+        DamagedFileError: for a damaged record.
+    """
+    if not (folder / RUN).is_file() or not (folder / COMPLETE).exists():
+        return None
+    record = read_run(folder)
+    return record.get("summary", {}) if record["fingerprint"] == fingerprint else None
+
+
 @contextlib.contextmanager
 def locked(folder: Path) -> Iterator[None]:
     """Keep other processes out of a folder, which is made. The lock ends with this process, however it ends.

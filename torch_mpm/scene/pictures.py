@@ -12,6 +12,7 @@ import numpy as np
 
 from ..data.stress import DrawnStress, drawn_stress
 from ..data.trajectory import Array, Trajectory
+from ..data.whole_files import remove_leftovers
 from . import check, schema
 from .explain import SceneError
 from .fields import RANKS
@@ -39,6 +40,8 @@ def draw(folder: str | Path, scene: Scene, progress: Any = None) -> list[Path]:
     words = scene.render or schema.Render()
     target = Path(folder) / FOLDER
     target.mkdir(exist_ok=True)
+    for own in (Path(folder), target):
+        remove_leftovers(own)
     with Trajectory(folder) as trajectory:
         if not len(trajectory):
             raise FileNotFoundError(f"{trajectory.path} has no frames yet")

@@ -25,7 +25,7 @@ from ..state import State, _take_all
 from . import checkpoint, fields, heap
 from .build import Built
 from .diagnose import SceneFailure, replay, wrong
-from .folder import CHECKPOINT, LAST_GOOD, claim, locked, output_errors, prepare, record_summary
+from .folder import CHECKPOINT, LAST_GOOD, claim, finished, locked, output_errors, prepare, record_summary
 from .process import prompt_turns, stop_signals
 from .scene import Scene
 from .writer import Copier, Copies, Frame, FrameWriter
@@ -73,7 +73,7 @@ def run(
     Args:
         scene: what to simulate.
         out: folder, made where it does not exist.
-        resume: go on with an unfinished run of the same scene.
+        resume: go on with an unfinished run of the same scene; of a complete one, return its summary.
         source: text of the scene file, kept in the trajectory; the words of the scene by default.
         progress: called after each frame with a dictionary of its figures.
 
@@ -91,6 +91,8 @@ def run(
     folder = Path(out)
     h5py_module()
     fingerprint = scene.fingerprint()
+    if resume and (summary := finished(folder, fingerprint)) is not None:
+        return summary
     with output_errors(folder):
         claim(folder, fingerprint, resume)
     simulation = Simulation(scene, scene.build())

@@ -6,7 +6,6 @@ import contextlib
 import errno
 import os
 import shutil
-import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +18,7 @@ from ..folder import DatasetError, DatasetFolder
 from ..metadata import metadata, write_metadata
 from ..statistics import BOUNDARY
 from ..stress import explicit_name
+from ..whole_files import building_path, remove_leftovers
 
 Array = npt.NDArray[Any]
 
@@ -139,12 +139,14 @@ def new_folder(target: Path) -> Iterator[Path]:
     if target.exists():
         raise FileExistsError(errno.EEXIST, "exists already; remove it, or choose another folder", str(target))
     target.parent.mkdir(parents=True, exist_ok=True)
-    building = Path(tempfile.mkdtemp(prefix=f".{target.name}.", suffix=".building", dir=target.parent))
+    remove_leftovers(target.parent)
+    building = building_path(target)
+    shutil.rmtree(building, ignore_errors=True)
+    building.mkdir()
     try:
         yield building
         for path in [*building.rglob("*"), building]:
             _sync(path)
-        building.chmod(0o777 & ~_umask())  # mkdtemp makes private folders
         building.rename(target)
         _sync(target.parent)
     finally:
@@ -157,9 +159,3 @@ def _sync(path: Path) -> None:
         os.fsync(handle)
     finally:
         os.close(handle)
-
-
-def _umask() -> int:
-    umask = os.umask(0)
-    os.umask(umask)
-    return umask
