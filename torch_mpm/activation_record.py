@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from .capture import is_captured, is_exported, is_of_library, outside_transforms, remember, without_transforms
-from .failures import Problem, problems_of_status, refused_steps
+from .failures import Problem, contradicted_poses, problems_of_status, refused_steps
 from .grid import Blocks, Grid
 
 NO_PROBLEM = (0, 0, -1, 0, -1, 0, -1, 0)
@@ -27,11 +27,14 @@ class ActivationRecord:
         status: int32 [1 + B, 8], see csrc/grid/status.h; None before the first activation.
         refused: steps of each scene whose entry of a tensor dt could not be taken, int32 [B]; None before the first
             tensor dt.
+        contradicted: obstacles of each scene, added up over calls, whose pose is not where their velocity has led,
+            int32 [B]; None before the first one that could be.
     """
 
     def __init__(self) -> None:
         self.status: Tensor | None = None
         self.refused: Tensor | None = None
+        self.contradicted: Tensor | None = None
         self._replayed: list[Tensor] = []
 
     def activate(self, grid: Grid, x: Tensor, scene: Tensor | None, ids: Tensor | None = None) -> Blocks:
@@ -80,7 +83,18 @@ class ActivationRecord:
         problems = problems_of_status(self.all(), grid)
         if self.refused is not None:
             problems["dt"] = refused_steps(self.refused)
+        if self.contradicted is not None:
+            problems["pose"] = contradicted_poses(self.contradicted)
         return problems
+
+    @torch.no_grad()
+    def contradict(self, scenes: Tensor, count: int) -> None:
+        """Count an obstacle whose pose is not where its velocity has led, in scenes of a bool [] or [B]."""
+        if self.contradicted is None or self.contradicted.device != scenes.device:
+            with outside_transforms(), torch.inference_mode(False):
+                self.contradicted = torch.zeros(count, dtype=torch.int32, device=scenes.device)
+        with outside_transforms():
+            self.contradicted += without_transforms(scenes)
 
     @torch.no_grad()
     def refuse(self, entries: Tensor, scenes: int, steps: int = 1) -> None:
@@ -100,6 +114,7 @@ class ActivationRecord:
         self.status = None
         if self.refused is not None:  # and CUDA graphs may write to it
             self.refused.zero_()
+        self.contradicted = None
         with torch.inference_mode():
             for kept in self._replayed:
                 kept.copy_(torch.tensor(NO_PROBLEM, dtype=torch.int32, device="cpu"))
@@ -108,6 +123,8 @@ class ActivationRecord:
         """Problems of scenes, bool [B], and those that are counted of all scenes together."""
         if self.refused is not None:
             self.refused.masked_fill_(scenes, 0)
+        if self.contradicted is not None:
+            self.contradicted.masked_fill_(scenes, 0)
         with torch.inference_mode():
             for status in self.all():
                 status[1:].masked_fill_(scenes[:, None], 0)

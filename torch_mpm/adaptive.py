@@ -8,6 +8,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from .boundaries.control import control_step
+from .boundaries.motion import PACE
 from .cfl import chosen_dt
 from .checkpoints import Checkpoints
 from .errors import NUMBER_OR_TENSOR, check_count, check_number, shape_of
@@ -101,10 +103,12 @@ def rollout_to(
     unsorted = in_no_order(given, most)
     start = put_in_order(step, given) if unsorted else given
     clocks = Clocks(step, start, time, cfl, longest, most, previous)
-    while (counts := clocks.look()) and counts[-1] > every:
-        clocks.advance(min((counts[-1] - 1) // every, MOST_SEGMENTS), every, checkpoint)
-    clocks.finish(counts, checkpoint)
-    arrival = clocks.arrival()
+    with control_step(step, start, most, PACE, clocks.seconds) as left:
+        while (counts := clocks.look()) and counts[-1] > every:
+            clocks.advance(min((counts[-1] - 1) // every, MOST_SEGMENTS), every, checkpoint)
+        clocks.finish(counts, checkpoint)
+        arrival = clocks.arrival()
+        arrival = arrival._replace(state=left(arrival.state))
     return arrival._replace(state=put_back(step, arrival.state, start, given)) if unsorted else arrival
 
 
@@ -129,6 +133,10 @@ class Clocks:
         self.now = _per_scene("the time of the state", state.time, step.grid.scenes, state.x)
         self.substeps = torch.zeros_like(self.now, dtype=torch.int64)
         self.largest_cfl = torch.zeros_like(self.now)
+        self.seconds: float | Tensor = (self.end - self.now).clamp(min=0)
+        """That are left at the beginning."""
+        if not isinstance(time, Tensor) and not isinstance(state.time, Tensor):
+            self.seconds = max(time - state.time, 0.0)
         self._end = time
         self._bound = _per_scene("previous", 0.0 if previous is None else previous, step.grid.scenes, state.x)
         self._dt = torch.zeros_like(self.now)

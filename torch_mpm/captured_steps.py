@@ -16,6 +16,7 @@ from torch.autograd.function import once_differentiable
 
 from .activation_record import counts_of, uncounted
 from .anomaly import detecting
+from .boundaries.control import control_step
 from .capture import Recordings, Same, capturing, is_captured, is_transformed
 from .errors import check_count, shape_of
 from .graphs import copied, copy_all, tensors_of, time_after, time_tensor
@@ -143,7 +144,9 @@ class Captured:
         self._step, self._dt, self._n, self._recordings = step, dt, n, recordings
 
     def __call__(self, state: State) -> State:
-        return self.after(state, StepKey(self._step))
+        check_state(state)
+        with control_step(self._step, state, self._n, self._dt) as left:
+            return left(self.after(state, StepKey(self._step)))
 
     def record(self, state: State) -> None:
         """For a kind of states, in the grad mode and autocast of now."""

@@ -14,6 +14,7 @@ from torch import Tensor
 from torch.utils import _pytree
 
 from .activation_record import aside, uncounted
+from .boundaries.control import motions_of
 from .errors import check_count, check_flag, check_number
 from .grid import same_pools
 from .recompute import called_again
@@ -131,9 +132,11 @@ def in_segments(advance: Advance, state: State, n: int, checkpoints: Checkpoints
 def recomputed(advance: Advance, state: State, count: int, first: int, step: Any) -> State:
     """`advance(state, count, first)`, of which the backward pass keeps the arguments and takes the steps again.
 
-    A second time the steps find the pools of the first one, and do not count for `check` of the step.
+    A second time the steps find the pools and the motions of obstacles of the first one, and do not count for `check`
+    of the step.
     """
     leaves, layout = _pytree.tree_flatten(state)
+    motions = motions_of(step)
     again, pools = False, list[int]()
 
     def steps(*tensors: Tensor) -> State:
@@ -142,6 +145,7 @@ def recomputed(advance: Advance, state: State, count: int, first: int, step: Any
         with contextlib.ExitStack() as stack:
             stack.enter_context(same_pools(pools))
             if again:  # graphs write to the tensors that `aside` would put away
+                stack.enter_context(motions())
                 from_graphs = isinstance(step, torch.nn.Module) and "_recordings" in vars(step)
                 stack.enter_context(uncounted(step) if from_graphs else aside(step, given.x))
             again = True

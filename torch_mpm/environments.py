@@ -2,8 +2,8 @@
 
     envs = mpm.Environments(step, [scene() for _ in range(1024)])    # step.grid.scenes = 1024
     for k in range(steps):
-        paddle.position = policy(envs.observe("x"))                  # [B, D], read at the next call
-        envs.advance(20, dt=1e-4)
+        paddle.position = policy(envs.observe("x"))                  # [B, D], where it is after the next call
+        envs.advance(20, dt=1e-4)                                    # in which it moves there, and pushes
         force = envs.forces()[paddle].linear                         # [B, D] [N], the mean over these 20 steps
         envs.freeze()                                                # scenes that went wrong stand still from here on
         envs.reset(envs.frozen | done(force))                        # bool [B] on the device: as they were at first
@@ -48,12 +48,14 @@ class Environments:
         room: rows of each scene R; None for the largest number of particles of a state.
 
     Attributes:
-        state: of all scenes, whose fields `reset` overwrites: clone what shall stay. It may be replaced by one of as
-            many particles, with another velocity say. Absent particles have no volume, and a mass of one.
+        state: of all scenes, whose fields `reset` overwrites where they require no gradient: clone what shall stay. It
+            may be replaced by one of as many particles, with another velocity say. Absent particles have no volume, and
+            a mass of one.
         time: of each scene since it began [B] [s], float64.
         frozen: scenes that stand still until they are reset, bool [B].
 
-    Without gradients: use `rollout` for these.
+    Differentiable as `rollout`, from call to call, by what the step and the states have that requires a gradient. The
+    memory grows with each call until `detach`: without a loss, advance under `torch.no_grad()`.
 
     Raises:
         TypeError, ValueError: for another number of states than the grid has scenes, or a state without room.
@@ -83,7 +85,6 @@ class Environments:
     def __len__(self) -> int:
         return self.step.grid.scenes
 
-    @torch.no_grad()
     def pack(self, states: Sequence[State]) -> State:
         """Scenes as `reset` takes them many times: n states of one scene each, R rows for each, `scene` 0 or -1.
 
@@ -97,7 +98,7 @@ class Environments:
                                  f"got {len(state)}")  # fmt: skip
             if isinstance(state.time, Tensor) and state.time.numel() > 1:
                 raise ValueError(f"states[{k}] must be of one scene, got {state.time.numel()}")
-            rows.append(_in_room(state.detach().replace(impulse=None, ids=None, time=0.0), self.room))
+            rows.append(_in_room(state.replace(impulse=None, ids=None, time=0.0), self.room))
         packed = State.concatenate(rows)
         return self._with_fields(packed)
 
@@ -126,9 +127,12 @@ class Environments:
 
     # -- running
 
-    @torch.no_grad()
     def advance(self, n: int, dt: float | Tensor) -> None:
-        """Take n steps of dt [s], a number or a tensor [B]; see `rollout`. Frozen scenes stand still."""
+        """Take n steps of dt [s], a number or a tensor [B]; see `rollout`. Frozen scenes stand still.
+
+        An obstacle moves to a pose that was assigned since the call before, and reaches it at the end of this one; see
+        `Obstacle`.
+        """
         state = self.state
         if self.step.reads_time:
             state = state.replace(time=self.time.to(state.x.dtype))
@@ -145,7 +149,12 @@ class Environments:
         """Scenes with any problem since they began, bool [B] on the device; see `Step.failures`."""
         return self.step.failures(self.state).failed
 
-    @torch.no_grad()
+    def detach(self) -> None:
+        """Cut the gradient here: later losses have none from the steps so far, whose memory is free."""
+        self.state, self.time = self.state.detach(), self.time.detach()
+        if self._before is not None:
+            self._before = self._before[0].detach(), self._before[1].detach()
+
     def freeze(self, which: Any = None) -> None:
         """Let scenes stand still until they are reset: those of a bool [B] or of indices; None for all that failed.
 
@@ -157,9 +166,11 @@ class Environments:
         self.state = self.state.replace(scene=self.state.scene.masked_fill(absent, ABSENT))  # type: ignore[union-attr]
         self._froze = True
 
-    @torch.no_grad()
     def reset(self, which: Any, states: State | Sequence[State] | None = None) -> None:
         """Replace scenes by others, where they stand; the rest stays as it is, bit by bit. Clocks begin anew.
+
+        In these scenes obstacles are placed: the next call of `advance` begins with them at their poses of then, to
+        which they do not move. Gradients do not pass through a scene that was replaced, and pass through the others.
 
         Args:
             which: bool [B], which may be on the device, or indices of scenes.
@@ -180,18 +191,26 @@ class Environments:
         count = len(self) if index is None else len(index)
         if len(given) != count * self.room:
             raise ValueError(f"states must be {count}, one for each scene to reset, got {len(given) // self.room}")
-        for _, old, new in _pairs(self.state, self._placed(given, index)):
-            rows = self._rows(old)
-            if index is None:
-                torch.where(mask.reshape(-1, *(1,) * (rows.dim() - 1)), self._rows(new), rows, out=rows)
+        changes: dict[str, Tensor] = {}
+        for name, old, new in _pairs(self.state, self._placed(given, index)):
+            rows, with_gradient = self._rows(old), old.requires_grad or new.requires_grad
+            of_mask = mask.reshape(-1, *(1,) * (rows.dim() - 1))
+            if with_gradient:
+                new = self._rows(new) if index is None else rows.index_copy(0, index, self._rows(new))
+                changes[name] = torch.where(of_mask, new, rows).flatten(0, 1)
+            elif index is None:
+                torch.where(of_mask, self._rows(new), rows, out=rows)
             else:
                 rows.index_copy_(0, index, self._rows(new))
+        extra = {name: changes.pop(name, value) for name, value in self.state.extra.items()}
+        self.state = self.state.replace(**changes, extra=extra)
         self._begin_anew(mask)
 
     def _begin_anew(self, mask: Tensor) -> None:
         """Clocks, impulses and records of scenes."""
         self.time = torch.where(mask, 0.0, self.time)
         self.frozen = self.frozen & ~mask
+        self.state = self.state.with_poses({key: left.without(mask) for key, left in self.state.poses.items()})
         if self.state.impulse is not None:
             self.state = self.state.replace(impulse=self.state.impulse.masked_fill(mask[:, None, None], 0.0))
         if self._before is not None:
@@ -271,7 +290,7 @@ class Environments:
         rows = torch.arange(k * self.room, (k + 1) * self.room, device=self.time.device)
         rows = rows[self.state.volume[rows] != 0]
         impulse = None if self.state.impulse is None else self.state.impulse[k : k + 1].clone()
-        one = self.state.replace(impulse=None).select(rows)
+        one = self.state.replace(impulse=None).select(rows).with_poses({})
         return one.replace(scene=None, time=float(self.time[k]), impulse=impulse)
 
     # -- files

@@ -78,6 +78,7 @@ class Failures:
             "not_finite": particles whose position is NaN or infinite,
             "outside": particles that left the grid,
             "dt": steps whose entry of a tensor dt was negative or NaN,
+            "pose": obstacles whose pose was assigned, but is not the one that their velocity has led to,
             "heat_data", "heat": solves of heat without a result, or that missed their tolerance,
             and of the state given "mass", "volume", "velocity" and "deformation".
     """
@@ -169,6 +170,15 @@ def refused_steps(count: Tensor) -> Problem:
         count,
         "steps had a dt that was negative or NaN, so that the scene was paused",
         "give each scene a dt that is positive, or zero to pause it",
+    )
+
+
+def contradicted_poses(count: Tensor) -> Problem:
+    """Obstacles of each scene [B], added up over calls, that were elsewhere than their velocity has led them."""
+    return Problem(
+        count,
+        "obstacles were assigned a pose while they have a velocity, but are not where it has led them",
+        "set their velocity and angular_velocity to None, or move them by Obstacle.place",
     )
 
 

@@ -14,6 +14,8 @@ from .errors import check_count, shape_of
 from .gradient_norms import GradientNorms
 from .state import FIELDS, State
 
+Control = Callable[[State, int], contextlib.AbstractContextManager[Callable[[State], State]]]
+"""A control step of so many steps from a state, see `torch_mpm.boundaries.control`."""
 Hook = Callable[[State, int], "State | None"]
 """Called with a state and the number of steps before it; may return another state to go on from."""
 
@@ -54,13 +56,14 @@ class Parts:
             return set()
         return set(range(self.n - self.truncate, self.first_with_gradient(), -self.truncate))
 
-    def run(self, advance: Callable[[State, int, int], State], state: State, scales: Any) -> State:
+    def run(self, advance: Callable[[State, int, int], State], state: State, scales: Any, control: Control) -> State:
         """The state n steps later.
 
         Args:
             advance: (state, count, k) to the state so many steps later, of which the first is step k.
             state: the state of the start.
             scales: of the gradient norms, see `GradientNorms.start`.
+            control: (state, count) to the control step of so many steps, those from one call of the hook to the next.
         """
         prefix, cuts = self.first_with_gradient(), self.cuts()
         acting = set() if self.hook is None else set(range(0, self.n, self.every))
@@ -68,25 +71,30 @@ class Parts:
         if self.norms is not None:
             self.norms.start(sorted(seen), *scales)
         stops = sorted({0, prefix, self.n} | cuts | acting | seen)
-        began = state
-        for k, end in zip(stops, [*stops[1:], self.n], strict=True):
-            with torch.no_grad() if k < prefix else contextlib.nullcontext():
-                if k in acting:
-                    acted = self._acted(state, k)
-                    if acted is not state and k in cuts:
-                        raise ValueError(
-                            f"hook must not return a state before step {k}, where truncate={self.truncate} cuts the "
-                            f"gradient, of what it returned too: choose truncate and every={self.every} such that "
-                            "n - truncate, n - 2 truncate, ... are no multiples of every"
-                        )
-                    if acted is not state:
-                        began = state = acted
-                if k in cuts:
-                    began = state = _cut(state, began)
-                if k in seen:
-                    assert self.norms is not None
-                    state = self.norms.watched(state, k)
-                state = advance(state, end - k, k) if end > k else state
+        began, control_steps = state, _ControlSteps(control, sorted({0, self.n} | acting))
+        with control_steps:
+            for k, end in zip(stops, [*stops[1:], self.n], strict=True):
+                mode = torch.no_grad if k < prefix else contextlib.nullcontext
+                state = control_steps.left(state, k)
+                with mode():
+                    if k in acting:
+                        acted = self._acted(state, k)
+                        if acted is not state and k in cuts:
+                            raise ValueError(
+                                f"hook must not return a state before step {k}, where truncate={self.truncate} cuts "
+                                f"the gradient, of what it returned too: choose truncate and every={self.every} such "
+                                "that n - truncate, n - 2 truncate, ... are no multiples of every"
+                            )
+                        if acted is not state:
+                            began = state = acted
+                    if k in cuts:
+                        began = state = _cut(state, began)
+                    if k in seen:
+                        assert self.norms is not None
+                        state = self.norms.watched(state, k)
+                control_steps.begin(state, k)
+                with mode():
+                    state = advance(state, end - k, k) if end > k else state
         return state
 
     def _acted(self, state: State, k: int) -> State:
@@ -97,6 +105,28 @@ class Parts:
         if not isinstance(result, State) or len(result) != len(state):
             raise TypeError(f"hook must return None or a State of {len(state)} particles, got {shape_of(result)}")
         return result
+
+
+class _ControlSteps(contextlib.ExitStack):
+    """One control step after another, which begin and end before some steps."""
+
+    def __init__(self, control: Control, bounds: list[int]) -> None:
+        super().__init__()
+        self._control, self._bounds = control, bounds
+        self._left: Callable[[State], State] | None = None
+
+    def left(self, state: State, k: int) -> State:
+        """The state before step k, where a control step may end."""
+        if k in self._bounds and self._left is not None:
+            state, self._left = self._left(state), None
+            self.close()
+        return state
+
+    def begin(self, state: State, k: int) -> None:
+        """Begin the control step before step k, if one begins there."""
+        if k in self._bounds and k < self._bounds[-1]:
+            count = next(bound for bound in self._bounds if bound > k) - k
+            self._left = self.enter_context(self._control(state, count))
 
 
 def _cut(state: State, began: State) -> State:

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from .anomaly import begin, detecting, watch
 from .boundaries import Obstacle
+from .boundaries.control import control_step
 from .boundaries.obstacles import motion_tensors
 from .capture import is_captured, is_traced, is_transformed
 from .captured_steps import in_graphs, obstacle_to_graphs
@@ -99,7 +100,9 @@ def rollout(
     if graph is not None:
         check_count("graph", graph, 1)
     if truncate is None and hook is None and norms is None and prefix == 0 and every == 1 and every is not True:
-        return _taken(step, state, n, dt, kept, graph=graph)
+        check_state(state)
+        with control_step(step, state, n, dt) as left:
+            return left(_taken(step, state, n, dt, kept, graph=graph))
     parts = Parts(n, prefix, truncate, hook, every, norms)
     if isinstance(step, Step):
         state = step.prepare(state)
@@ -107,7 +110,11 @@ def rollout(
         kept = resolved(kept, step, state, n - parts.first_with_gradient(), dt) or EVERYTHING
     grid = step.grid if isinstance(step, Step) else None
     scales = (1, 1.0, dt) if grid is None else (grid.scenes, grid.dx, dt)
-    return parts.run(lambda state, count, k: _taken(step, state, count, dt, kept, k, graph), state, scales)
+
+    def advance(state: State, count: int, k: int) -> State:
+        return _taken(step, state, count, dt, kept, k, graph)
+
+    return parts.run(advance, state, scales, lambda state, count: control_step(step, state, count, dt))
 
 
 def _taken(

@@ -6,7 +6,7 @@ import dataclasses
 import itertools
 import math
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -29,6 +29,9 @@ from .grid import Grid, check_grid
 from .ops.arguments import refuse_batched, soa_empty
 from .ops.autograd import dispatch, is_recorded
 from .seed import Points
+
+if TYPE_CHECKING:
+    from .boundaries.control import Poses
 
 
 class Time:
@@ -165,7 +168,27 @@ class State:
         if "time" not in changes:
             changes["time"] = self.time
         kept = {name: self.__dict__[name] for name in FIELDS if name not in changes}
-        return State(**kept, **changes)  # `dataclasses.replace` takes 5 µs more
+        state = State(**kept, **changes)  # `dataclasses.replace` takes 5 µs more
+        if "_poses" in self.__dict__:
+            state.__dict__["_poses"] = self.__dict__["_poses"]
+        return state
+
+    @property
+    def poses(self) -> Poses:
+        """Where steps have left their obstacles, see `torch_mpm.boundaries.control`; of no state that was made anew, or
+        read from a file or a pickle."""
+        poses: Poses = self.__dict__.get("_poses", {})
+        return poses
+
+    def with_poses(self, poses: Poses) -> State:
+        """A copy with its obstacles elsewhere."""
+        state: State = object.__new__(State)
+        state.__dict__.update(self.__dict__)
+        state.__dict__["_poses"] = poses
+        return state
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in self.__dict__.items() if name != "_poses"}
 
     def map(self, function: Callable[[Tensor], Tensor]) -> State:
         """A copy with a function applied to every per-particle tensor, absent fields staying None."""
@@ -186,6 +209,8 @@ class State:
         state = state.map(lambda t: t.to(device=device, dtype=dtype if t.is_floating_point() else None))
         if isinstance(self.time, Tensor):
             state.time = self.time.to(device=device, dtype=dtype)
+        if self.poses:
+            state = state.with_poses({key: left.to(state.x.device) for key, left in self.poses.items()})
         return state if self.impulse is None else state.replace(impulse=self.impulse.to(state.x.device))
 
     def detach(self) -> State:
@@ -195,6 +220,8 @@ class State:
             state.time = self.time.detach()
         if self.impulse is not None:
             state.impulse = self.impulse.detach()
+        if self.poses:
+            state = state.with_poses({key: left.map(Tensor.detach) for key, left in self.poses.items()})
         return state
 
     def select(self, particles: Tensor) -> State:
@@ -232,7 +259,7 @@ class State:
             scenes: number of scenes; None for one more than the largest, or as many as the time has.
 
         Returns:
-            States of one scene, in the order of the particles; differentiable.
+            States of one scene, in the order of the particles; differentiable. Obstacles are placed anew in them.
         """
         (count,) = _scene_counts([self], None if scenes is None else [scenes])
         of_particle = _scene_of(self)
@@ -241,7 +268,7 @@ class State:
             parts = [part.replace(time=self.time[k : k + 1]) for k, part in enumerate(parts)]
         if self.impulse is not None:
             parts = [part.replace(impulse=self.impulse[k : k + 1]) for k, part in enumerate(parts)]
-        return [State.concatenate([part.replace(scene=None)]) for part in parts]
+        return [State.concatenate([part.replace(scene=None).with_poses({})]) for part in parts]
 
     @staticmethod
     def concatenate(states: Sequence[State], scene: bool = False, scenes: Sequence[int] | None = None) -> State:
@@ -251,7 +278,8 @@ class State:
             states: of one dimension, dtype and device. C, F and J that only some have are made as a step makes them:
                 zero, identity, one.
             scene: False packs parts of one batch, whose scenes stay as they are. True packs batches: the scenes of each
-                state follow those of the states before it, and each keeps its time and its impulses.
+                state follow those of the states before it, and each keeps its time and its impulses. Obstacles are
+                placed anew (see `Obstacle.place`).
             scenes: with scene=True, how many scenes each state holds. None counts those of its time [B], or else one
                 more than its largest scene, which synchronises with the device.
 
@@ -278,7 +306,9 @@ class State:
         keys = dict.fromkeys(key for s in states for key in s.extra)
         joined: dict[str, Any] = {name: _joined(name, states) for name in PARTICLE_FIELDS}
         extra = {key: _as_soa(torch.cat([_extra(key, s, k, states) for k, s in enumerate(states)])) for key in keys}
-        return State(**joined, extra=extra, time=time, impulse=impulse)
+        state = State(**joined, extra=extra, time=time, impulse=impulse)
+        poses = next((s.poses for s in states if s.poses), None)
+        return state if poses is None or scene else state.with_poses(poses)
 
 
 FIELDS = tuple(f.name for f in dataclasses.fields(State))

@@ -12,6 +12,7 @@ from torch import Tensor
 from . import resolution
 from .activation_record import ActivationRecord
 from .boundaries import BoundaryList, Obstacle, Walls
+from .boundaries.control import control_step
 from .capture import GraphCache
 from .cfl import Figures, chosen_dt, figures_of, look
 from .errors import check_number, check_vector, shape_of
@@ -168,7 +169,11 @@ class Step(TensorModule):
             ValueError, TypeError: for wrong shapes, dtypes or devices, or a number dt that is not positive.
             GridOverflowError: on the CPU, where a grid of fixed `max_blocks` is full.
         """
-        return paused(self._advanced, self._activations, self.prepare(state), dt, self.grid.scenes)
+        state = self.prepare(state)
+        if torch.compiler.is_compiling():
+            return paused(self._advanced, self._activations, state, dt, self.grid.scenes)
+        with control_step(self, state, 1, dt) as left:
+            return left(paused(self._advanced, self._activations, state, dt, self.grid.scenes))
 
     def _advanced(self, state: State, dt: float | Tensor) -> State:
         """A prepared state one step later."""

@@ -18,6 +18,27 @@ def unit(v: Tensor) -> Tensor:
     return torch.where(length > 0, v / torch.where(length > 0, length, 1), 0)
 
 
+def composed(a: Tensor, b: Tensor) -> Tensor:
+    """Rotation vector [..., 3] [rad] of the rotation by b and then by a, of an angle of at most π; by quaternions.
+
+    Twice differentiable where the angle is below π.
+    """
+    (p, u), (q, v) = _quaternion(a), _quaternion(b)
+    scalar = p * q - (u * v).sum(-1, keepdim=True)
+    vector = p * v + q * u + torch.linalg.cross(*torch.broadcast_tensors(u, v))
+    scalar, vector = scalar.abs(), torch.where(scalar < 0, -vector, vector)
+    half = norm(vector)[..., None]
+    small = half < 1e-9  # where atan2(half, scalar)/half is 1 to rounding, as scalar is
+    return 2 * vector * torch.where(small, 1.0, torch.atan2(half, scalar) / torch.where(small, 1.0, half))
+
+
+def _quaternion(turn: Tensor) -> tuple[Tensor, Tensor]:
+    """Scalar [..., 1] and vector [..., 3] of a rotation vector."""
+    half = 0.5 * norm(turn)[..., None]
+    share = torch.where(half > 0, half.sin() / torch.where(half > 0, half, 1), 1)
+    return half.cos(), 0.5 * share * turn
+
+
 def transform(matrix: Tensor, v: Tensor) -> Tensor:
     """Matrix [D, D] or [N, D, D] times vectors [N, D]."""
     return v @ matrix.mT if matrix.dim() == 2 else (matrix @ v[..., None])[..., 0]

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -12,8 +14,10 @@ from ..errors import shape_of
 from ..per_scene import SceneParameters, Value, finite, floats, per_node
 from ..vectors import norm, transform
 
-Path = Callable[[Tensor], Tensor]
-"""A position as a function of time, [] or [B] to [D] or [B, D]."""
+Path = Callable[[Tensor], "Tensor | Sequence[Any] | np.ndarray"]
+"""A position as a function of time, [] or [B] to [D] or [B, D]: a tensor, an array, or D numbers or tensors."""
+PACE = 1e-4
+"""Time over which a path without a derivative is differenced where no step says one [s]."""
 
 
 class Pose(NamedTuple):
@@ -26,9 +30,11 @@ class Pose(NamedTuple):
 class RigidMotion(SceneParameters):
     """A body that moves and turns at constant rates from time `start` on, or along a path.
 
+    While a call of a step lasts, `control` may be another motion that takes its place; see `boundaries.control`.
+
     Args:
         position: of its centre at time `start` [m]: D numbers, a tensor [D] or [B, D], or a function of the time, a
-            tensor [] or [B], that returns such a tensor.
+            tensor [] or [B], that returns one of these, see `Path`.
         velocity: of its centre [m/s]: D numbers, or a tensor [D] or [B, D]; None where position is a function.
         rotation: orientation at time `start` [rad]: an angle (2-D) or a rotation vector (3-D), about the centre.
         angular_velocity: [rad/s], in the same forms.
@@ -52,16 +58,27 @@ class RigidMotion(SceneParameters):
         self.rotation = finite("rotation", rotation)
         self.angular_velocity = finite("angular_velocity", angular_velocity)
         self.start = float(start)
+        self.end = math.inf
+        self.pace: float | Tensor = PACE
+        """Length of the steps [s], over which a path is differenced; not beyond `end`."""
+
+    @property
+    def motion(self) -> RigidMotion:
+        """How it moves now: as its attributes say, or as `control` does."""
+        control = self._modules.get("control")
+        return self if control is None else control  # type: ignore[return-value]
 
     @property
     def follows_path(self) -> bool:
         """Whether the position is a function of time."""
-        return not isinstance(self.position, Tensor) and callable(self.position)
+        position = self.motion.position
+        return not isinstance(position, Tensor) and callable(position)
 
     @property
     def moves(self) -> bool:
         """Whether its surface ever has a velocity."""
-        return self.follows_path or self.velocity is not None or self.angular_velocity is not None
+        motion = self.motion
+        return self.follows_path or motion.velocity is not None or motion.angular_velocity is not None
 
     def pose(self, time: float | Tensor, like: Tensor | None = None) -> Pose:
         """Centre and rotation at a time [s], a number or a tensor [] or [B]; with the dtype and device of `like`."""
@@ -73,39 +90,41 @@ class RigidMotion(SceneParameters):
 
     def centre_at(self, time: float | Tensor, like: Tensor) -> Tensor:
         """[D] or [B, D]."""
+        motion = self.motion
         if self.follows_path:
-            return self._path(time, like)[0]
-        position = self.parameter("position", like, (_length(self.position),))
-        if self.velocity is None:
+            return motion._path(time, like)[0]
+        position = motion.parameter("position", like, (_length(motion.position),))
+        if motion.velocity is None:
             return position
-        return position + self.parameter("velocity", like, position.shape[-1:]) * _column(self._elapsed(time, like), 1)
+        velocity = motion.parameter("velocity", like, position.shape[-1:])
+        return position + velocity * _column(self._elapsed(time, like), 1)
 
     def rotation_at(self, time: float | Tensor, like: Tensor, dim: int) -> Tensor | None:
         """[D, D] or [B, D, D]; None where the body never turns."""
         shape = () if dim == 2 else (3,)
-        rotation = None
-        if self.rotation is not None:
-            rotation = rotation_matrix(self.parameter("rotation", like, shape), dim)
-        if self.angular_velocity is not None:
-            rate = self.parameter("angular_velocity", like, shape)
+        rotation, motion = None, self.motion
+        if motion.rotation is not None:
+            rotation = rotation_matrix(motion.parameter("rotation", like, shape), dim)
+        if motion.angular_velocity is not None:
+            rate = motion.parameter("angular_velocity", like, shape)
             turn = rotation_matrix(rate * _column(self._elapsed(time, like), len(shape)), dim)
             rotation = turn if rotation is None else turn @ rotation
         return rotation
 
     def velocity_at(self, arm: Tensor, scene: Tensor | None, time: float | Tensor) -> Tensor | None:
         """Velocity of the body's matter [N, D] at points `arm` [N, D] away from the centre; None at rest."""
-        result = None
+        result, motion = None, self.motion
         if self.follows_path:
-            result = per_node(self._path(time, arm)[1], 1, scene)
-        elif self.velocity is not None:
-            result = self.at_nodes("velocity", arm, arm.shape[1:], scene)
-        if self.angular_velocity is None:
+            result = per_node(motion._path(time, arm)[1], 1, scene)
+        elif motion.velocity is not None:
+            result = motion.at_nodes("velocity", arm, arm.shape[1:], scene)
+        if motion.angular_velocity is None:
             return result
         if arm.shape[1] == 2:
-            rate = self.at_nodes("angular_velocity", arm, (), scene)[..., None]
+            rate = motion.at_nodes("angular_velocity", arm, (), scene)[..., None]
             swirl = rate * torch.stack([-arm[:, 1], arm[:, 0]], 1)
         else:
-            rate = self.at_nodes("angular_velocity", arm, (3,), scene)
+            rate = motion.at_nodes("angular_velocity", arm, (3,), scene)
             swirl = torch.linalg.cross(rate.expand_as(arm), arm)
         return swirl if result is None else result + swirl
 
@@ -120,34 +139,49 @@ class RigidMotion(SceneParameters):
         """Centre and its velocity at many times [n] or [n, B]: [n, 1 or B, D], with the dtype of `like`.
 
         A function of time is called for all of them at once if it can be mapped over them (torch.vmap), else for one
-        after another; twice, once to differentiate it.
+        after another; three times, once to differentiate it and once to difference it.
         """
         centre = self._mapped(times)
         if centre.dim() not in (2, 3) or centre.shape[-1] != like.shape[1]:
             expected = f"[{like.shape[1]}] or [B, {like.shape[1]}]"
             raise ValueError(f"position must return {expected} at a time, got {shape_of(centre[0])}")
         shape = len(times), -1, like.shape[1]
-        return centre.to(like.dtype).reshape(shape), self._rates(times, centre).to(like.dtype).reshape(shape)
+        rates = self._differenced(self._mapped, times, centre, self._rates(times, centre))
+        return centre.to(like.dtype).reshape(shape), rates.to(like.dtype).reshape(shape)
+
+    def at(self, time: Tensor) -> Tensor:
+        """The position that a function of time returns, as a tensor.
+
+        Raises:
+            TypeError: for a result that is neither a tensor nor numbers.
+        """
+        assert callable(self.motion.position)
+        value = self.motion.position(time)
+        return value if isinstance(value, Tensor) else _as_position(value, time)
 
     def _mapped(self, times: Tensor) -> Tensor:
-        assert callable(self.position)
         try:
-            return torch.vmap(self.position)(times)
+            return torch.vmap(self.at)(times)
         except torch.OutOfMemoryError:
             raise
         except (RuntimeError, TypeError, ValueError, NotImplementedError):
             # As of functions that look at the value of a time. One that is wrong raises again.
-            return torch.stack([self.position(time) for time in times.unbind()])
+            return torch.stack([self.at(time) for time in times.unbind()])
 
     def _rates(self, times: Tensor, centre: Tensor) -> Tensor:
-        """Derivatives of centres by their times. Backward, where a time has one centre: forward mode imports compilers,
-        which takes a second."""
+        """Derivatives of centres by their times, zero where they have none. Backward, where a time has one centre:
+        forward mode imports compilers, which takes a second."""
         if centre.dim() > times.dim() + 1:
-            return torch.stack([self._moved(time)[1] for time in times.unbind()])
+            return torch.stack([self._derivative(time)[1] for time in times.unbind()])
         trained = centre.requires_grad
         with torch.inference_mode(False), torch.enable_grad():
             leaf = times.detach().clone().requires_grad_()
-            again = self._mapped(leaf)
+            try:
+                again = self._mapped(leaf)
+            except torch.OutOfMemoryError:
+                raise
+            except (RuntimeError, TypeError):  # as of functions of NumPy, which have no derivative
+                return torch.zeros_like(centre)
             rates = [torch.zeros_like(leaf) for _ in again.unbind(-1)]
             for k, part in enumerate(again.unbind(-1)):
                 if part.requires_grad:
@@ -156,13 +190,43 @@ class RigidMotion(SceneParameters):
         return torch.stack(rates, -1)
 
     def _moved(self, time: Tensor) -> tuple[Tensor, Tensor]:
-        assert callable(self.position)
-        centre, velocity, *_ = torch.func.jvp(self.position, (time,), (torch.ones_like(time),))
-        return centre, velocity
+        """Position on the path and its velocity."""
+        centre, rate = self._derivative(time)
+        return centre, self._differenced(self.at, time, centre, rate)
+
+    def _derivative(self, time: Tensor) -> tuple[Tensor, Tensor]:
+        """Position on the path and its derivative, zero where it has none."""
+        try:
+            centre, rate, *_ = torch.func.jvp(self.at, (time,), (torch.ones_like(time),))
+        except torch.OutOfMemoryError:
+            raise
+        except (RuntimeError, TypeError, ValueError):  # as of functions of NumPy. One that is wrong raises again.
+            centre = self.at(time)
+            rate = torch.zeros_like(centre)
+        return centre, rate
+
+    def _differenced(self, path: Callable[[Tensor], Tensor], times: Tensor, centre: Tensor, rate: Tensor) -> Tensor:
+        """The derivative of a path, or its difference over a step where the derivative is zero: a path of numbers has
+        none. Where a path rests both are zero."""
+        resolution = 4 * torch.finfo(times.dtype).eps * times.abs()
+        later = torch.maximum(times + self.pace, times + resolution).clamp(max=self.end)
+        seconds = torch.where(later > times, later - times, 1)
+        difference = (path(later) - centre) / seconds.reshape(*seconds.shape, *(1,) * (centre.dim() - times.dim()))
+        return torch.where((rate == 0) & difference.isfinite(), difference, rate)
 
     def _elapsed(self, time: float | Tensor, like: Tensor) -> float | Tensor:
         """Time since `start`, [] or [B]."""
         return (time - self.start).to(like.dtype) if isinstance(time, Tensor) else time - self.start
+
+
+def _as_position(value: Any, time: Tensor) -> Tensor:
+    """Numbers, or a mixture of numbers and tensors [] or [B], as a position [D] or [B, D]."""
+    if isinstance(value, (list, tuple)) and any(isinstance(part, Tensor) for part in value):
+        parts = [part if isinstance(part, Tensor) else torch.full_like(time, float(part)) for part in value]
+        return torch.stack(torch.broadcast_tensors(*parts), -1)
+    if isinstance(value, (list, tuple, np.ndarray)):
+        return torch.as_tensor(np.asarray(value, dtype=np.float64), device=time.device)
+    raise TypeError(f"position must return a tensor, an array or numbers at a time, got {shape_of(value)}")
 
 
 def to_body(rotation: Tensor | None, arm: Tensor) -> Tensor:

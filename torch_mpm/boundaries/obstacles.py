@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+import uuid
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -12,12 +13,16 @@ from torch import Tensor
 from .. import shapes
 from ..capture import GraphCache
 from ..errors import check_count, check_number, shape_of
-from ..per_scene import Value, per_node
+from ..per_scene import Value, finite, per_node
 from ..shapes import Shape
 from ..vectors import transform
 from .contact import contact_change
-from .motion import Path, RigidMotion, to_body
+from .motion import Path, Pose, RigidMotion, to_body
 from .walls import CONTACTS
+
+if TYPE_CHECKING:
+    from ..state import State
+    from .control import Course
 
 
 class Obstacle(RigidMotion):
@@ -34,22 +39,39 @@ class Obstacle(RigidMotion):
     Args:
         shape: see `torch_mpm.shapes`.
         position: centre (or a point of the plane) at time `start` [m]: D numbers, a tensor [D] or [B, D], or a function
-            of the time, a tensor [] or [B], that returns such a tensor.
+            of the time, a tensor [] or [B], that returns one of these, an array, or D numbers or tensors [] or [B].
         kind: "sticky", "slip" or "separate".
         friction: Coulomb coefficient ≥ 0: a number, or a tensor [] or [B].
-        velocity: velocity of the centre [m/s], constant: D numbers, or a tensor [D] or [B, D]. Not with a function as
-            position, whose derivative by time is the velocity.
+        velocity: velocity of the centre [m/s]: D numbers, or a tensor [D] or [B, D]. Not with a function as position,
+            whose derivative by time is the velocity; where the derivative is zero, as of functions of numbers, its
+            difference over a step.
         rotation: orientation at time `start` [rad]: an angle (2-D) or a rotation vector (3-D), about the centre.
         angular_velocity: constant [rad/s], in the same forms.
         start, end: the obstacle acts while start ≤ time < end [s].
         scene: it acts only in this scene of a batch; None for all.
 
+    All of these may be assigned between control steps: one is a call of a step, of `rollout`, `rollout_to` or
+    `Environments.advance`, or the steps from one call of a hook to the next. A state stores where its steps have left
+    each obstacle (`pose_in`). From there the obstacle goes on in the next control step:
+
+    - Without a velocity, an assigned `position` is where the centre is at the end of the control step. It moves there
+      at the constant velocity of the change, which pushes, and then rests. So for `rotation` without an
+      `angular_velocity`: it turns by the shortest turn.
+    - An assigned `velocity` acts from where the centre is. A `position` that is assigned while a velocity is given is
+      where the centre is at the beginning of the control step. It must be where it was left, within 1% of the way of
+      the control step: otherwise the call raises on the CPU, and `Step.check` on CUDA. So for rotations.
+    - In the first steps of a state that was made anew or read from a file, in scenes that `Environments.reset` has
+      replaced, and after `place`, it is at its pose at once and pushes nothing on its way there.
+
+    In a `rollout` of a function that is no module, each step is a control step. A step that was compiled by
+    `torch.compile`, or captured in a CUDA graph by hand, places its obstacles: give them a velocity there.
+
     Tensors may require grad: the gradient of the node velocities goes to position, velocity, rotation,
-    angular_velocity, friction and the directions of the shape, through the normal and the surface velocity. Which nodes
-    are inside is not differentiable, so radius and size have no gradient and refuse tensors that require one. An
-    obstacle is a module: its tensors are buffers, or parameters where they are given as `nn.Parameter`. Nothing here
-    synchronises with the device. The obstacles of a `Step` whose shapes the kernel knows act in it, see
-    `torch_mpm.ops.contact`; the others by the torch operations here.
+    angular_velocity, friction and the directions of the shape, through the normal and the surface velocity; where a
+    pose was assigned, to the poses before and after the change. Which nodes are inside is not differentiable, so radius
+    and size have no gradient and refuse tensors that require one. An obstacle is a module: its tensors are buffers, or
+    parameters where they are given as `nn.Parameter`. Nothing here synchronises with the device. Obstacles of a `Step`
+    whose shapes the kernel knows act in it, see `torch_mpm.ops.contact`; the others by the torch operations here.
 
     Raises:
         TypeError, ValueError: for a wrong argument; shapes of tensors are checked at the first use.
@@ -85,12 +107,55 @@ class Obstacle(RigidMotion):
         self.end, self.scene = float(end), scene
         self.kept_table = GraphCache()
         """Kept by `torch_mpm.ops.obstacle_tables` for a list of obstacles that begins with this one."""
+        self.key = uuid.uuid4().hex
+        """Of what a state stores about the obstacle; a copy has the same."""
+        self.placements = 0
+        """How often it was placed."""
+        self.course: Course | None = None
+        """Of the control step that goes on, see `boundaries.control`."""
 
     def __setattr__(self, name: str, value: Any) -> None:
         if isinstance(getattr(type(self), name, None), property):
             object.__setattr__(self, name, value)
         else:
             super().__setattr__(name, value)
+
+    # -- control
+
+    def place(self, position: Value | Path | None = None, rotation: Value | None = None) -> None:
+        """Put the obstacle somewhere at once: it pushes nothing on its way there.
+
+        Between control steps; in all scenes. (`Environments.reset` does so for the scenes that it resets.)
+
+        Args:
+            position, rotation: as for the constructor; None for those of now. With a velocity they are those at time
+                `start`.
+
+        Raises:
+            TypeError, ValueError: for numbers that are not finite.
+        """
+        if position is not None:
+            self.position = position if callable(position) else finite("position", position)
+        if rotation is not None:
+            self.rotation = finite("rotation", rotation)
+        self.placements += 1
+
+    def pose_in(self, state: State) -> Pose:
+        """Where a state has left the obstacle, in the dtype of its particles; its pose at the time of the state if no
+        step has moved the state yet."""
+        left = state.poses.get(self.key)
+        motion = self if left is None or left.placements != self.placements else left.motion
+        return motion.pose(state.time, state.x)
+
+    def follow(self, course: Course | None, pace: float | Tensor) -> None:
+        """Begin a control step with steps of `pace` [s]; None for its end."""
+        vars(self)["course"], vars(self)["pace"] = course, pace  # not among the buffers
+        control = None if course is None else course.during
+        if control is None:
+            self._modules.pop("control", None)
+        else:
+            vars(control)["pace"] = pace
+            self._modules["control"] = control
 
     # -- interface of boundaries, which `apply` takes as `forward` does
 

@@ -29,6 +29,7 @@ from torch import Tensor, nn
 
 from ..activation_record import ActivationRecord
 from ..boundaries import BoundaryList
+from ..boundaries.control import control_step
 from ..capture import outside_transforms, without_transforms
 from ..errors import check_like, check_number
 from ..failures import Failures, Problem, raise_failures, unsolved_heat
@@ -189,7 +190,11 @@ class Heat(nn.Module):
             ValueError, TypeError: for a state without temperature, wrong shapes, dtypes or devices, or a number dt that
                 is not positive.
         """
-        return paused(self._advanced, self._activations, self.prepare(state), dt, self.grid.scenes)
+        state = self.prepare(state)
+        if torch.compiler.is_compiling():
+            return paused(self._advanced, self._activations, state, dt, self.grid.scenes)
+        with control_step(self, state, 1, dt) as left:
+            return left(paused(self._advanced, self._activations, state, dt, self.grid.scenes))
 
     def _advanced(self, state: State, dt: float | Tensor) -> State:
         """A prepared state one step later."""

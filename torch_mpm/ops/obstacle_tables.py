@@ -12,6 +12,7 @@ from torch.nn import functional as F
 
 from .. import shapes
 from ..boundaries.obstacles import Obstacle
+from ..per_scene import SceneParameters
 from ..step_times import StepTimes
 
 
@@ -71,8 +72,8 @@ def tables_over(obstacles: Sequence[Obstacle], like: Tensor, scenes: int, times:
 
 def _values(obstacle: Obstacle) -> tuple[Any, ...]:
     """The numbers and tensors of an obstacle that go into the tables."""
-    motion = (obstacle.friction, obstacle.position, obstacle.velocity, obstacle.rotation, obstacle.angular_velocity)
-    shape = obstacle.shape
+    moved, shape = obstacle.motion, obstacle.shape
+    motion = (obstacle.friction, moved.position, moved.velocity, moved.rotation, moved.angular_velocity)
     kind = KERNEL_SHAPES[type(shape)]
     extent = None if kind.extent is None else getattr(shape, kind.extent, None)
     return (*motion, extent, *(getattr(shape, name) for name in kind.others))
@@ -97,11 +98,11 @@ def _parts(obstacle: Obstacle, like: Tensor) -> dict[str, Tensor]:
     """The columns of its row by name, [1 or B, n] each; zero where it has none, or where a path has its position."""
     vector, shape = (like.shape[1],), obstacle.shape
     turn = () if like.shape[1] == 2 else (3,)
-    motion: dict[str, tuple[int, ...]] = {
-        "friction": (), "position": vector, "velocity": vector, "rotation": turn, "angular_velocity": turn,
-    }  # fmt: skip
+    motion = {"position": vector, "velocity": vector, "rotation": turn, "angular_velocity": turn}
     absent = "position" if obstacle.follows_path else None
-    parts = {name: _part(obstacle, None if name == absent else name, like, size) for name, size in motion.items()}
+    parts = {"friction": _part(obstacle, "friction", like, ())}
+    for name, size in motion.items():
+        parts[name] = _part(obstacle.motion, None if name == absent else name, like, size)
     extent = KERNEL_SHAPES[type(shape)].extent
     if extent == "axis" and getattr(shape, "axis", None) is None:
         parts["extent"] = torch.eye(like.shape[1], dtype=like.dtype, device=like.device)[1:2]
@@ -110,7 +111,7 @@ def _parts(obstacle: Obstacle, like: Tensor) -> dict[str, Tensor]:
     return parts | {"radius": _part(shape, "radius", like, ())}
 
 
-def _part(owner: Obstacle | shapes.Shape, name: str | None, like: Tensor, shape: tuple[int, ...]) -> Tensor:
+def _part(owner: SceneParameters, name: str | None, like: Tensor, shape: tuple[int, ...]) -> Tensor:
     """A parameter [1 or B, n]."""
     if name is None or getattr(owner, name, None) is None:
         return like.new_zeros(1, math.prod(shape))
@@ -143,7 +144,7 @@ def _path_over(obstacle: Obstacle, like: Tensor, times: StepTimes) -> tuple[Tens
     moments = times.tensor[there].to(like.dtype)
     if len(moments) == 0:
         return like.new_zeros(n, 1, like.shape[1]), like.new_zeros(n, 1, like.shape[1])
-    centre, velocity = obstacle.path_over(moments, like)
+    centre, velocity = obstacle.motion.path_over(moments, like)
     around = (0, 0, 0, 0, there.start, n - there.stop)
     return F.pad(centre, around), F.pad(velocity, around)
 
@@ -151,7 +152,7 @@ def _path_over(obstacle: Obstacle, like: Tensor, times: StepTimes) -> tuple[Tens
 def path_requires_grad(obstacle: Obstacle, like: Tensor, times: StepTimes) -> bool:
     """Whether the first or the last of the positions on a path does."""
     there = times.tensor[times.within(obstacle.start, obstacle.end)].to(like.dtype)
-    return any(obstacle.position(time).requires_grad for time in (*there[:1], *there[-1:]))
+    return any(obstacle.at(time).requires_grad for time in (*there[:1], *there[-1:]))
 
 
 def numbers_of_a_step(obstacles: Sequence[Obstacle], like: Tensor, least_rows: int) -> int:

@@ -1,0 +1,534 @@
+"""Obstacles whose pose or velocity is assigned between calls: they move there, and push what is in their way."""
+
+import pickle
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from helpers import relative_error
+from torch import Tensor
+
+import torch_mpm as mpm
+from torch_mpm import heat_boundaries, shapes
+
+F64 = torch.float64
+DT, N, V = 5e-4, 20, 1.0
+LAW = mpm.NeoHookean(E=5e4, nu=0.3)
+
+
+def grid_of(dim: int = 2, scenes: int = 1, dx: float = 0.05) -> mpm.Grid:
+    return mpm.Grid(dx, (0.0,) * dim, (1.4, 0.8, 0.6)[:dim], scenes=scenes, deterministic=True)
+
+
+def block(dim: int = 2, device: str = "cpu", dx: float = 0.05) -> mpm.State:
+    points = mpm.seed.box((0.42, 0.1, 0.2)[:dim], (0.6, 0.4, 0.4)[:dim], dx, per_cell=2**dim)
+    return mpm.State.at_rest(points, 1000.0, dtype=F64, device=device)
+
+
+def box(position: Any, dim: int = 2, **given: Any) -> mpm.Box:
+    return mpm.Box(position, (0.1, 0.6, 0.6)[:dim], **given)
+
+
+def start(dim: int = 2, device: str = "cpu") -> Tensor:
+    return torch.tensor((0.35, 0.25, 0.3)[:dim], dtype=F64, device=device)
+
+
+def at(k: int, dim: int = 2, device: str = "cpu") -> Tensor:
+    """Where a paddle is at the end of call k, at changing speeds."""
+    return start(dim, device) + torch.tensor(
+        [V * N * DT * (k + 0.2 * (k % 2)), 0.002 * k * (k - 2), 0.001 * k][:dim], dtype=F64, device=device
+    )
+
+
+def along(poses: list[Tensor]) -> mpm.Waypoints:
+    """The path that a paddle takes which is at each pose at the end of a call."""
+    times = torch.arange(len(poses), dtype=F64, device=poses[0].device) * N * DT
+    return mpm.Waypoints(times, torch.stack(poses))
+
+
+def step_with(paddle: Any, dim: int = 2, scenes: int = 1, **options: Any) -> mpm.Step:
+    return mpm.Step(grid_of(dim, scenes), LAW, walls="separate", boundaries=[paddle], **options)
+
+
+def assert_alike(a: mpm.State, b: mpm.State, tolerance: float = 1e-9) -> None:
+    for name in ("x", "v", "F"):
+        assert relative_error(getattr(a, name), getattr(b, name)) < tolerance, name
+    assert float(b.v.abs().max()) > 0.2  # which was pushed
+
+
+# ---- one clear motion, however it is given
+
+Run = Callable[[mpm.Step, mpm.Box, mpm.State, list[Tensor]], mpm.State]
+
+
+def by_rollouts(step: mpm.Step, paddle: mpm.Box, state: mpm.State, poses: list[Tensor]) -> mpm.State:
+    for pose in poses:
+        paddle.position = pose
+        state = mpm.rollout(step, state, N, DT)
+    return state
+
+
+def by_numbers(step: mpm.Step, paddle: mpm.Box, state: mpm.State, poses: list[Tensor]) -> mpm.State:
+    for k, pose in enumerate(poses):
+        paddle.position = (tuple, list, np.array)[k % 3](pose.tolist())
+        state = mpm.rollout(step, state, N, DT)
+    return state
+
+
+def in_place(step: mpm.Step, paddle: mpm.Box, state: mpm.State, poses: list[Tensor]) -> mpm.State:
+    paddle.position = poses[0].clone()
+    for pose in poses:
+        paddle.position.copy_(pose)
+        state = mpm.rollout(step, state, N, DT)
+    return state
+
+
+def by_environments(step: mpm.Step, paddle: mpm.Box, state: mpm.State, poses: list[Tensor]) -> mpm.State:
+    envs = mpm.Environments(step, [state])
+    for pose in poses:
+        paddle.position = pose[None]
+        envs.advance(N, DT)
+    return envs.scene(0)
+
+
+def by_hooks(step: mpm.Step, paddle: mpm.Box, state: mpm.State, poses: list[Tensor]) -> mpm.State:
+    def control(state: mpm.State, k: int) -> None:
+        paddle.position = poses[k // N]
+
+    return mpm.frames(step, state, N * len(poses), DT, every=N, hook=control, truncate=7).end
+
+
+def by_norms(step: mpm.Step, paddle: mpm.Box, state: mpm.State, poses: list[Tensor]) -> mpm.State:
+    for pose in poses:
+        paddle.position = pose
+        state = mpm.rollout(step, state, N, DT, prefix=3, truncate=5)
+    return state
+
+
+def in_a_module(step: mpm.Step, paddle: mpm.Box, state: mpm.State, poses: list[Tensor]) -> mpm.State:
+    class Outer(torch.nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.step = step
+
+        def forward(self, state: mpm.State, dt: float) -> mpm.State:
+            return self.step(state, dt)
+
+    return by_rollouts(Outer(), paddle, state, poses)
+
+
+def by_graphs(step: mpm.Step, paddle: mpm.Box, state: mpm.State, poses: list[Tensor]) -> mpm.State:
+    step.on_grid = Nothing()
+    for pose in poses:
+        paddle.position = pose
+        state = mpm.rollout(step, state, N, DT, graph=8)
+    return state
+
+
+class Nothing(torch.nn.Module):
+    def forward(self, blocks: mpm.Blocks, velocity: Tensor, mass: Tensor, dt: float) -> Tensor:
+        return velocity
+
+
+WAYS = {
+    "rollouts": by_rollouts, "numbers": by_numbers, "in place": in_place, "environments": by_environments,
+    "hooks": by_hooks, "parts": by_norms, "a module": in_a_module, "graphs": by_graphs,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("dim", [2, 3])
+def test_assigned_positions_push_as_a_path_does(way, dim, device):
+    poses = [at(k, dim, device) for k in range(4)]
+    paddle = box(start(dim, device), dim)
+    end = WAYS[way](step_with(paddle, dim), paddle, block(dim, device), poses)
+    path = along([start(dim, device), *poses])
+    expected = mpm.rollout(step_with(box(path, dim), dim), block(dim, device), N * len(poses), DT)
+    assert_alike(end, expected)
+    assert float(end.v[:, 0].mean()) > 0.5
+
+
+def test_single_steps_push(device):
+    """Each of which is a control step; a controller in `on_particles` is one step late."""
+    n, speed = 120, torch.tensor([V, 0.1], dtype=F64, device=device)
+    paddle = box(start(device=device))
+    step, state = step_with(paddle), block(device=device)
+    for k in range(n):
+        paddle.position = start(device=device) + k * DT * speed  # of which the first is where it is placed
+        state = step(state, DT)
+    times = torch.tensor([DT, n * DT], dtype=F64, device=device)
+    path = mpm.Waypoints(times, torch.stack([start(device=device), start(device=device) + (n - 1) * DT * speed]))
+    expected = mpm.rollout(step_with(box(path)), block(device=device), n, DT)
+    assert_alike(state, expected)
+
+    late = box(start(device=device))
+
+    def control(state: mpm.State, dt: float) -> mpm.State:
+        late.position = start(device=device) + (state.time + dt) * speed
+        return state
+
+    pushed = mpm.rollout(step_with(late, on_particles=control), block(device=device), n, DT)
+    assert relative_error(pushed.v, expected.v) < 0.05
+
+
+def test_a_time_to_reach(device):
+    """Every scene is where it should be at its time, in substeps of its own."""
+    paddle, given = box(start(device=device)), box(start(device=device), velocity=(V, 0.0))
+    step, state = step_with(paddle), block(device=device)
+    state = mpm.rollout_to(step, state, 1e-9).state
+    paddle.position = start(device=device) + torch.tensor([V * 0.02, 0.0], dtype=F64, device=device)
+    end = mpm.rollout_to(step, state.replace(time=0.0), 0.02, longest=2e-4, cfl=0.1)
+    expected = mpm.rollout_to(step_with(given), block(device=device), 0.02, longest=2e-4, cfl=0.1)
+    assert end.arrived.all() and torch.equal(end.substeps, expected.substeps)
+    assert_alike(end.state, expected.state, 1e-6)
+    torch.testing.assert_close(paddle.pose_in(end.state).centre, paddle.position)
+
+
+PATHS = {
+    "tensor of numbers": lambda t: torch.tensor([0.35 + V * float(t), 0.25], dtype=F64),
+    "tuple": lambda t: (0.35 + V * float(t), 0.25),
+    "list": lambda t: [0.35 + V * float(t), 0.25],
+    "array": lambda t: np.array([0.35 + V * float(t), 0.25]),
+    "function of NumPy": lambda t: np.array([0.35, 0.25]) + np.array([V, 0.0]) * np.asarray(t.cpu()),
+    "numbers and tensors": lambda t: [0.35 + V * t, 0.25],
+    "tensors and a number that moves": lambda t: torch.stack(
+        [torch.tensor(0.35 + V * float(t), dtype=F64, device=t.device), 0.25 + 0 * t]
+    ),
+}
+
+
+@pytest.mark.parametrize("run", ["rollout", "steps", "torch operations"])
+@pytest.mark.parametrize("path", PATHS)
+def test_paths_without_a_derivative_are_differenced(path, run, device):
+    n = 60
+    form = (lambda p: p) if path != "tensor of numbers" else (lambda p: lambda t: p(t).to(t.device))
+    position = form(PATHS[path])
+    paddle = box(position) if run != "torch operations" else mpm.SDF(shapes.Box((0.1, 0.6)).signed_distance, position)
+    reference = box((0.35, 0.25), velocity=(V, 0.0))
+    if run == "torch operations":
+        reference = mpm.SDF(shapes.Box((0.1, 0.6)).signed_distance, (0.35, 0.25), velocity=(V, 0.0))
+    ends = []
+    for boundary in (paddle, reference):
+        step, state = step_with(boundary), block(device=device)
+        if run == "steps":
+            for _ in range(n):
+                state = step(state, DT)
+        else:
+            state = mpm.rollout(step, state, n, DT)
+        ends.append(state)
+    assert_alike(*ends, 1e-8)
+
+
+def test_a_path_that_returns_no_position():
+    step = step_with(box(lambda t: "here"))
+    with pytest.raises(TypeError, match="position must return a tensor, an array or numbers at a time, got str"):
+        mpm.rollout(step, block(), 2, DT)
+
+
+# ---- rotations
+
+
+@pytest.mark.parametrize("form", ["tensor", "numbers", "scenes"])
+@pytest.mark.parametrize("dim", [2, 3])
+def test_assigned_rotations_turn(dim, form, device):
+    """The velocity is that of the turn from one orientation to the next, about the centre."""
+    turns = [0.1, 0.25] if dim == 2 else [[0.1, -0.2, 0.3], [0.25, -0.1, 0.2]]
+    first, second = (torch.tensor(t, dtype=F64, device=device) for t in turns)
+    if form == "scenes":
+        first, second = first[None], second[None]
+    paddle = box(start(dim, device), dim, kind="sticky", rotation=first)
+    if form == "numbers":
+        paddle.rotation = turns[0] if dim == 2 else tuple(turns[0])
+    step = step_with(paddle, dim)
+    state = mpm.rollout(step, block(dim, device), N, DT)
+    paddle.rotation = second if form != "numbers" else turns[1]
+    end = mpm.rollout(step, state, N, DT)
+
+    before, after = (mpm.Box((0.0,) * dim, (1.0,) * dim, rotation=t).pose(0.0) for t in turns)
+    turn = after.rotation @ before.rotation.mT
+    rate = skew_of(turn) / (N * DT)
+    if dim == 2:
+        assert float(rate) == pytest.approx((turns[1] - turns[0]) / (N * DT))
+    given = box(
+        start(dim, device), dim, kind="sticky", rotation=turns[0], angular_velocity=rate.to(device), start=N * DT
+    )
+    expected = mpm.rollout(step_with(given, dim), state.with_poses({}), N, DT)
+    assert_alike(end, expected)
+    found = paddle.pose_in(end).rotation.reshape(dim, dim)
+    torch.testing.assert_close(found.cpu(), after.rotation, rtol=1e-9, atol=1e-9)
+
+
+def skew_of(turn: Tensor) -> Tensor:
+    """The angle, or the rotation vector, of a rotation matrix, from its eigenvalues."""
+    if turn.shape[0] == 2:
+        return torch.atan2(turn[1, 0], turn[0, 0])
+    values, vectors = torch.linalg.eig(turn)
+    logarithm = (vectors @ torch.diag(values.log()) @ torch.linalg.inv(vectors)).real
+    return torch.stack([logarithm[2, 1], logarithm[0, 2], logarithm[1, 0]])
+
+
+def test_the_shortest_turn(device):
+    paddle = box(start(device=device), rotation=3.1)
+    step = step_with(paddle)
+    state = mpm.rollout(step, block(device=device), 1, DT)
+    paddle.rotation = 3.1 - 2 * np.pi + 0.1
+    with mpm.boundaries.control.control_step(step, state, 1, DT):
+        rate = float(paddle.motion.angular_velocity)
+    assert rate == pytest.approx(0.1 / DT)
+    nearly = torch.tensor([[0.0, 0.0, 3.0], [3.0, 0.5, -0.4]], dtype=F64)
+    for a in nearly:
+        for b in -0.9 * nearly:
+            found = mpm.vectors.composed(a, b)
+            expected, got = (mpm.boundaries.motion.rotation_matrix(v, 3) for v in (a, found))
+            expected = expected @ mpm.boundaries.motion.rotation_matrix(b, 3)
+            torch.testing.assert_close(got, expected, rtol=1e-12, atol=1e-12)
+    assert torch.autograd.gradcheck(
+        mpm.vectors.composed, (nearly[0].requires_grad_(), nearly[1].clone().requires_grad_())
+    )
+    zero, b = torch.zeros(3, dtype=F64, requires_grad=True), torch.tensor([0.1, 0.2, -0.3], dtype=F64)
+    for other in (-0.5 * zero, b + zero):
+        assert torch.autograd.gradcheck(
+            lambda a, other=other: mpm.vectors.composed(a, other.detach() + 0.1 * a), (zero,)
+        )
+
+
+# ---- momentum, scenes, time steps
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_impulses_are_the_change_of_momentum(dim, device):
+    paddle = box(start(dim, device), dim, rotation=0.0 if dim == 2 else (0.0, 0.0, 0.0))
+    step = mpm.Step(grid_of(dim), LAW, boundaries=[paddle])
+    state = step.with_impulses(block(dim, device))
+    for k in range(4):
+        paddle.position = at(k, dim, device)
+        paddle.rotation = 0.02 * k if dim == 2 else (0.0, 0.01 * k, 0.02 * k)
+        state = mpm.rollout(step, state, N, DT)
+    momentum = (state.mass[:, None] * state.v).sum(0)
+    assert float(momentum[0]) > 5.0
+    torch.testing.assert_close(-step.impulses(state)[paddle].linear[0], momentum, rtol=1e-11, atol=1e-11)
+
+
+def test_scenes_move_at_their_own_speed(device):
+    """And a scene that was reset has its obstacle where the attributes say, which pushes nothing on its way there."""
+    speeds = torch.tensor([0.0, 0.5, 1.0], dtype=F64, device=device)
+    home = start(device=device).repeat(3, 1)
+    paddle = box(home)
+    envs = mpm.Environments(step_with(paddle, scenes=3), [block(device=device)] * 3)
+    single = box(start(device=device))
+    alone = mpm.Environments(step_with(single), [block(device=device)])
+    for k in range(4):
+        if k == 2:
+            envs.reset([2])
+        paddle.position = home + k * N * DT * speeds[:, None] * torch.tensor([1.0, 0.0], dtype=F64, device=device)
+        single.position = paddle.position[1:2].clone()
+        envs.advance(N, DT)
+        alone.advance(N, DT)
+        if k == 2:  # at rest, at a place that touches the block
+            resting = mpm.rollout(step_with(box(paddle.position[2].clone())), block(device=device), N, DT)
+            torch.testing.assert_close(envs.scene(2).v, resting.v, rtol=1e-9, atol=1e-9)
+    assert_alike(envs.scene(1), alone.scene(0))
+    assert float(envs.scene(0).v.abs().max()) < 1e-9
+
+
+@pytest.mark.parametrize("form", ["[B]", "[1]", "[]"])
+def test_a_time_step_of_each_scene(form, device):
+    """A paused scene has its obstacle wait, and go on to its pose later."""
+    scenes = 2 if form == "[B]" else 1
+    values = {"[B]": [DT, 0.5 * DT], "[1]": [0.5 * DT], "[]": 0.5 * DT}[form]
+    dt = torch.tensor(values, dtype=F64, device=device)
+    target = start(device=device) + torch.tensor([0.02, 0.0], dtype=F64, device=device)
+    paddle = box(start(device=device).repeat(scenes, 1))
+    envs = mpm.Environments(step_with(paddle, scenes=scenes), [block(device=device)] * scenes)
+    envs.advance(N, dt)
+    paddle.position = target.repeat(scenes, 1)
+    envs.advance(N, dt * torch.tensor([1.0, 0.0], dtype=F64, device=device)[:scenes] if scenes == 2 else dt)
+    if scenes == 2:
+        torch.testing.assert_close(paddle.pose_in(envs.state).centre, torch.stack([target, start(device=device)]))
+        envs.advance(N, dt)
+    torch.testing.assert_close(paddle.pose_in(envs.state).centre, paddle.position)
+    slow = box(start(device=device))
+    step = step_with(slow)
+    state = mpm.rollout(step, block(device=device), N, 0.5 * DT)
+    slow.position = target
+    expected = mpm.rollout(step, state, N, 0.5 * DT)
+    assert_alike(envs.scene(scenes - 1), expected)
+
+
+def test_a_call_depends_on_its_arguments_alone(device):
+    """Candidates from one state; a state that was never moved; a copy, and one that was read."""
+    paddle = box(start(device=device))
+    step = step_with(paddle)
+    state = mpm.rollout(step, block(device=device), N, DT)
+    ends = []
+    for far in (0.02, 0.01, 0.02):
+        paddle.position = start(device=device) + torch.tensor([far, 0.0], dtype=F64, device=device)
+        ends.append(mpm.rollout(step, state, N, DT))
+    assert torch.equal(ends[0].x, ends[2].x) and not torch.equal(ends[0].x, ends[1].x)
+    for like in (state.replace(v=state.v + 0), state.detach(), state.to(device), step.sorted(state).restored()):
+        torch.testing.assert_close(mpm.rollout(step, like, N, DT).v, ends[0].v, rtol=1e-9, atol=1e-9)
+    placed = mpm.rollout(step_with(box(paddle.position.clone())), state, N, DT)
+    for anew in (state.with_poses({}), pickle.loads(pickle.dumps(state)), state.split(1)[0]):
+        torch.testing.assert_close(mpm.rollout(step, anew, N, DT).v, placed.v, rtol=1e-9, atol=1e-9)
+    assert not torch.allclose(placed.v, ends[0].v)
+    with torch.inference_mode():
+        torch.testing.assert_close(mpm.rollout(step, state, N, DT).v, ends[0].v, rtol=1e-9, atol=1e-9)
+
+
+def test_an_obstacle_is_placed_without_a_push(device):
+    paddle = box(start(device=device), rotation=0.1)
+    step = step_with(paddle)
+    state = mpm.rollout(step, block(device=device), N, DT)
+    paddle.place((0.36, 0.25), 0.2)
+    placed = mpm.rollout(step, state, N, DT)
+    expected = mpm.rollout(step_with(box((0.36, 0.25), rotation=0.2)), state.with_poses({}), N, DT)
+    torch.testing.assert_close(placed.v, expected.v, rtol=1e-12, atol=1e-12)
+    with pytest.raises(ValueError, match="position must be finite"):
+        paddle.place((np.nan, 0.0))
+
+
+# ---- velocities that are given
+
+
+def test_an_assigned_velocity_goes_on_from_where_the_obstacle_is(device):
+    """As a path with kinks does, at clocks that are not zero."""
+    paddle = box((0.35, 0.25), velocity=(V, 0.0))
+    step, state = step_with(paddle), block(device=device)
+    speeds = [(V, 0.0), (0.5 * V, 0.2), None, (0.8 * V, 0.0)]
+    poses = [start(device=device)]
+    for speed in speeds:
+        paddle.velocity = speed if speed is None else torch.tensor(speed, dtype=F64, device=device)
+        state = mpm.rollout(step, state, N, DT)
+        poses.append(poses[-1] + N * DT * torch.tensor(speed or (0.0, 0.0), dtype=F64, device=device))
+        torch.testing.assert_close(paddle.pose_in(state).centre, poses[-1])
+    expected = mpm.rollout(step_with(box(along(poses))), block(device=device), N * len(speeds), DT)
+    assert_alike(state, expected)
+
+
+def test_velocities_that_agree_with_the_change_of_the_pose(device):
+    paddle = box(start(device=device), velocity=(V, 0.0))
+    step, state = step_with(paddle), block(device=device)
+    for k in range(4):
+        paddle.position = start(device=device) + torch.tensor([V * k * N * DT, 0.0], dtype=F64, device=device)
+        state = mpm.rollout(step, state, N, DT)
+    step.check(state)
+    expected = mpm.rollout(step_with(box((0.35, 0.25), velocity=(V, 0.0))), block(device=device), 4 * N, DT)
+    assert_alike(state, expected)
+
+
+@pytest.mark.parametrize("given", ["velocity", "angular velocity", "path", "scenes"])
+def test_a_velocity_that_contradicts_the_change_of_the_pose_is_reported(given, device):
+    scenes = 2 if given == "scenes" else 1
+    paddle = box(start(device=device).repeat(scenes, 1), rotation=0.0)
+    step = step_with(paddle, scenes=scenes)
+    states = [block(device=device)] * scenes
+    state = mpm.rollout(step, mpm.State.concatenate(states, scene=True), N, DT)
+    if given == "angular velocity":
+        paddle.angular_velocity, paddle.rotation = 0.0, 0.1
+    elif given == "path":
+        paddle.position = lambda t: torch.stack([0.4 + V * t, 0.25 + 0 * t])
+    else:
+        paddle.velocity = torch.zeros(2, dtype=F64, device=device)
+        paddle.position = paddle.position + torch.tensor([[0.0, 0.0], [0.02, 0.0]], dtype=F64, device=device)[-scenes:]
+    place = r" in scenes \[1\]" if given == "scenes" else ".*"
+    if device == "cpu":
+        with pytest.raises(ValueError, match=rf"obstacle 0 \(Box\) is not where its velocity has led it{place}: a pos"):
+            mpm.rollout(step, state, N, DT)
+    else:
+        state = mpm.rollout(step, state, N, DT)
+        assert step.failures().failed.tolist() == [False, True][-scenes:]
+        with pytest.raises(mpm.SimulationError, match="obstacles were assigned a pose while they have a velocity"):
+            step.check(state)
+        step.forget_failures(torch.ones(scenes, dtype=torch.bool, device=device))
+        step.check(state)
+    paddle.place()
+    mpm.rollout(step, state, N, DT)
+
+
+# ---- gradients
+
+
+def pushed(step: Any, paddle: mpm.Box, state: mpm.State, poses: Tensor, **options: Any) -> Tensor:
+    for pose in poses:
+        paddle.position = pose
+        state = mpm.rollout(step, state, 8, DT, **options)
+    return (state.x[:, 0] * state.v[:, 0]).sum() + state.v.square().sum()
+
+
+@pytest.mark.parametrize("options", [{}, {"checkpoint": 3}, {"checkpoint": mpm.Checkpoints(states=2)}], ids=str)
+@pytest.mark.parametrize("way", ["op", "python"])
+def test_gradients_of_poses_are_those_of_finite_differences(way, options, device):
+    """Through the velocity of the change, too; also where another pose has been assigned before the backward pass."""
+    aside = torch.tensor([-0.0113, 0.0077], dtype=F64, device=device)  # so that no face is on a node
+    paddle = box(start(device=device) + aside, kind="sticky")
+    on_grid = None if way == "op" else lambda blocks, velocity, mass, dt: velocity
+    step, state = step_with(paddle, on_grid=on_grid), block(device=device)
+    poses = torch.stack([at(k, device=device) + aside for k in range(3)]).requires_grad_()
+    loss = pushed(step, paddle, state, poses, **options)
+    paddle.position = (9.0, 9.0)
+    (gradient,) = torch.autograd.grad(loss, poses)
+    h = 1e-7
+    with torch.no_grad():
+        for k, axis in ((0, 0), (1, 0), (2, 0), (2, 1)):
+            shift = torch.zeros_like(poses)
+            shift[k, axis] = h
+            high, low = (pushed(step, paddle, state, poses + sign * shift) for sign in (1, -1))
+            difference = float(high - low) / (2 * h)
+            assert float(gradient[k, axis]) == pytest.approx(difference, rel=2e-5, abs=1e-3)
+    assert float(gradient[1:, 0].abs().min()) > 1.0
+
+
+def test_gradients_of_rotations(device):
+    state = block(3, device)
+    first = torch.tensor([0.1, -0.1, 0.2], dtype=F64, device=device)
+    step = step_with(paddle := box(start(3, device), 3, kind="sticky", rotation=first), 3)
+    before = mpm.rollout(step, state, 4, DT)
+    angle = torch.tensor([0.12, -0.1, 0.25], dtype=F64, device=device, requires_grad=True)
+
+    def loss(angle: Tensor) -> Tensor:
+        paddle.rotation = angle
+        end = mpm.rollout(step, before, 4, DT)
+        return (end.v[:, 1] * end.x[:, 0]).sum()
+
+    (gradient,) = torch.autograd.grad(loss(angle), angle)
+    h = 1e-6 * torch.eye(3, dtype=F64, device=device)
+    with torch.no_grad():
+        differences = torch.stack([(loss(angle + e) - loss(angle - e)) / 2e-6 for e in h])
+    torch.testing.assert_close(gradient, differences, rtol=1e-5, atol=1e-6)
+
+
+# ---- heat, implicit steps
+
+
+def test_held_regions_follow(device):
+    """A ball that is held at a temperature, alone and beside the boundaries of the step."""
+    grid = grid_of()
+    ends = []
+    for moved in (True, False):
+        path = along([start(device=device)] + [at(k, device=device) for k in range(3)])
+        ball = mpm.Sphere(start(device=device) if moved else path, 0.15)
+        held = mpm.Heat(grid, 10.0, 100.0, [heat_boundaries.Fixed(ball, 50.0)])
+        step = mpm.Step(grid, LAW, heat=held)
+        state = block(device=device)
+        state = state.replace(temperature=torch.zeros_like(state.mass))
+        for k in range(3):
+            ball.position = at(k, device=device) if moved else path
+            state = mpm.rollout(step, state, N, DT)
+        ends.append(state.temperature)
+    assert float(ends[1].max()) > 10
+    torch.testing.assert_close(ends[0], ends[1], rtol=1e-6, atol=1e-6)
+
+
+def test_implicit_steps_are_pushed(device):
+    poses = [at(k, device=device) for k in range(3)]
+    paddle = box(start(device=device), kind="sticky")
+    step = step_with(paddle, integrator="implicit")
+    state = block(device=device)
+    for pose in poses:
+        paddle.position = pose
+        state = mpm.rollout(step, state, 4, 5 * DT)
+    given = box(along([start(device=device), *poses]), kind="sticky")
+    expected = mpm.rollout(step_with(given, integrator="implicit"), block(device=device), 12, 5 * DT)
+    assert_alike(state, expected, 1e-6)

@@ -1,0 +1,413 @@
+"""Control steps: how obstacles move whose pose or velocity was assigned between two calls of a step.
+
+A control step is one call of a step, of `rollout` or of `Environments.advance`, or the steps between two hooks. A state
+stores where steps have left their obstacles, so that a call is a function of its arguments. From there an obstacle
+moves to an assigned pose at constant rates, and reaches it at the end of the call. No function here synchronises.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import math
+from collections.abc import Callable, Iterator, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from ..capture import as_remembered, is_captured, is_same, is_traced
+from ..vectors import composed, norm
+from .motion import PACE, RigidMotion
+
+if TYPE_CHECKING:
+    from ..state import State
+    from .obstacles import Obstacle
+
+ASSIGNED = ("position", "velocity", "rotation", "angular_velocity")
+SLACK = 0.01
+"""Of the way of a control step, by which a pose may differ from the one that a given velocity has led to."""
+
+
+class Left(NamedTuple):
+    """Where a state has left an obstacle.
+
+    Attributes:
+        given: the attributes of the obstacle, in a form that shows whether they have changed.
+        placements: how often it was placed.
+        motion: how it moves from here on.
+        own: whether that is what its attributes say.
+        arrives: whether it may still be on its way to an assigned pose, in a scene that was paused.
+        known: scenes in which it was left, bool [B]; in others it is placed. None for all.
+    """
+
+    given: tuple[Any, ...]
+    placements: int
+    motion: RigidMotion
+    own: bool = True
+    arrives: bool = False
+    known: Tensor | None = None
+
+    def map(self, function: Callable[[Tensor], Tensor]) -> Left:
+        """With other tensors in the motion."""
+        values = (getattr(self.motion, name) for name in ASSIGNED)
+        return self._replace(motion=_motion([function(v) if isinstance(v, Tensor) else v for v in values], self.motion))
+
+    def to(self, device: torch.device) -> Left:
+        """On another device."""
+        left = self.map(lambda t: t.to(device))
+        return left if self.known is None else left._replace(known=self.known.to(device))
+
+    def without(self, scenes: Tensor) -> Left:
+        """Placed in some scenes, bool [B]."""
+        return self._replace(known=~scenes if self.known is None else self.known & ~scenes)
+
+
+Poses = dict[str, Left]
+"""By `Obstacle.key`."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Course:
+    """An obstacle in a control step.
+
+    Attributes:
+        during: how it moves; None for its attributes.
+        after: where it is left.
+        contradicts: scenes in which its pose is not the one that its velocity led to, bool [] or [B]; None for none.
+    """
+
+    during: RigidMotion | None
+    after: Left
+    contradicts: Tensor | None = None
+
+
+class Span(NamedTuple):
+    """When a control step begins and how long it is [s]: numbers, or tensors [] or [B]."""
+
+    begin: float | Tensor
+    seconds: float | Tensor
+    device: torch.device
+
+
+@contextlib.contextmanager
+def control_step(
+    step: Any, state: State, n: int, dt: float | Tensor, seconds: float | Tensor | None = None
+) -> Iterator[Callable[[State], State]]:
+    """Where obstacles move as they do in n steps from a state; gives a function that the state after them passes.
+
+    A step inside another control step is one of its own for obstacles whose attributes were assigned meanwhile, as by
+    `on_particles`, and for no others.
+
+    Args:
+        step: a `Step`, or a module that has some. The steps of another function are control steps each.
+        state: the state at the beginning.
+        n, dt: as `rollout`.
+        seconds: how long the steps take, where that is not n dt.
+
+    Raises:
+        ValueError: on the CPU, where a velocity contradicts the change of a pose. On CUDA the status counts it.
+    """
+    obstacles = obstacles_of(step)
+    if not obstacles or n == 0 or torch.compiler.is_compiling() or is_traced(state.x) or is_captured(state.x):
+        yield _unchanged
+        return
+    inside = [o for o in obstacles if o.course is not None]
+    if inside:
+        span = Span(state.time, dt, state.x.device)
+        changed = [o for o in inside if not _is_as_given(o, o.course.after)]  # type: ignore[union-attr]
+        for obstacle in changed:
+            assert obstacle.course is not None
+            obstacle.follow(course_of(obstacle, _underway(obstacle.course), span), dt)
+        for obstacle in inside:
+            if obstacle.pace is not dt:
+                obstacle.follow(obstacle.course, dt)
+        yield _unchanged
+        for obstacle in changed:
+            assert obstacle.course is not None
+            after = obstacle.course.after
+            obstacle.follow(Course(None if after.own else after.motion, after), dt)
+        return
+    span = Span(state.time, n * dt if seconds is None else seconds, state.x.device)
+    poses = state.poses
+    courses = [course_of(o, poses.get(o.key), span) for o in obstacles]
+    _report(step, obstacles, courses)
+    try:
+        for obstacle, course in zip(obstacles, courses, strict=True):
+            obstacle.follow(course, dt)
+        yield lambda state: _leave(state, obstacles)
+    finally:
+        for obstacle in obstacles:
+            obstacle.follow(None, PACE)
+
+
+def motions_of(step: Any) -> Callable[[], contextlib.AbstractContextManager[None]]:
+    """Makes a context in which obstacles move as they do now, for a backward pass that recomputes the steps."""
+    now = [(o, _Motions(o)) for o in obstacles_of(step)]
+
+    @contextlib.contextmanager
+    def again() -> Iterator[None]:
+        before = [(o, _Motions(o)) for o, _ in now]
+        for obstacle, motions in now:
+            motions.give(obstacle)
+        try:
+            yield
+        finally:
+            for obstacle, motions in before:
+                motions.give(obstacle)
+
+    return again
+
+
+class _Motions:
+    """The attributes of an obstacle and its control step, to go back to."""
+
+    def __init__(self, obstacle: Obstacle) -> None:
+        self._plain = {name: vars(obstacle)[name] for name in (*ASSIGNED, "course", "pace") if name in vars(obstacle)}
+        self._stored = {name: dict(vars(obstacle)[name]) for name in ("_parameters", "_buffers", "_modules")}
+
+    def give(self, obstacle: Obstacle) -> None:
+        for name in ASSIGNED:
+            vars(obstacle).pop(name, None)
+        vars(obstacle).update(self._plain)
+        for name, values in self._stored.items():
+            vars(obstacle)[name].clear()
+            vars(obstacle)[name].update(values)
+
+
+def obstacles_of(step: Any) -> list[Obstacle]:
+    """Those of a `Step` and of its heat, or of a module that has some."""
+    from ..step import Step
+    from .obstacles import Obstacle
+
+    if not isinstance(step, torch.nn.Module):
+        return []
+    if isinstance(step, Step) and step.heat is None and all(isinstance(b, Obstacle) for b in step.boundaries.entries):
+        return list(step.boundaries.entries)
+    return [m for m in step.modules() if isinstance(m, Obstacle)]
+
+
+def _unchanged(state: State) -> State:
+    return state
+
+
+def _underway(course: Course) -> Left:
+    """Where an obstacle is left in the middle of a control step."""
+    if course.during is None:
+        return course.after
+    return course.after._replace(motion=course.during, own=False, arrives=False)
+
+
+def _leave(state: State, obstacles: Sequence[Obstacle]) -> State:
+    """A state that stores where its obstacles are."""
+    poses = dict(state.poses)
+    for obstacle in obstacles:
+        assert obstacle.course is not None
+        poses[obstacle.key] = obstacle.course.after
+    same = len(poses) == len(state.poses) and all(poses[key] is left for key, left in state.poses.items())
+    return state if same else state.with_poses(poses)
+
+
+def _report(step: Any, obstacles: Sequence[Obstacle], courses: Sequence[Course]) -> None:
+    """Raise on the CPU, or count, velocities that contradict the change of a pose."""
+    for k, course in enumerate(courses):
+        wrong = course.contradicts
+        if wrong is None:
+            continue
+        if not wrong.is_cpu:
+            _count(step, wrong)
+        elif bool(wrong.any()):
+            scenes = f" in scenes {wrong.nonzero().flatten().tolist()}" if wrong.dim() else ""
+            name = type(obstacles[k]).__name__
+            raise ValueError(
+                f"obstacle {k} ({name}) is not where its velocity has led it{scenes}: a position or rotation that is "
+                "assigned while a velocity is given is the pose at the beginning of the call. Set "
+                "velocity and angular_velocity to None, and it moves to an assigned pose with the velocity of the "
+                "change; or use `Obstacle.place`, which moves it at once and pushes nothing"
+            )
+
+
+def _count(step: Any, wrong: Tensor) -> None:
+    for module in step.modules():
+        record = getattr(module, "_activations", None)
+        if record is not None and hasattr(module, "integrator"):
+            record.contradict(wrong, module.grid.scenes)
+
+
+# ---- one obstacle
+
+
+def course_of(obstacle: Obstacle, left: Left | None, span: Span) -> Course:
+    """How an obstacle moves in a control step, from where a state has left it; None for nowhere."""
+    if left is None or left.placements != obstacle.placements:
+        return Course(None, _at_attributes(obstacle))
+    same = [is_same(known, getattr(obstacle, name)) for known, name in zip(left.given, ASSIGNED, strict=True)]
+    if all(same) and not left.arrives and (left.own or left.known is None):
+        return Course(None if left.own else left.motion, left)
+    centre = _part(("position", "velocity"), obstacle, left, span, same[:2])
+    rotation = _part(("rotation", "angular_velocity"), obstacle, left, span, same[2:])
+    during = _motion([*centre.during, *rotation.during], obstacle)
+    after = _motion([*centre.after, *rotation.after], obstacle)
+    own, arrives = centre.own and rotation.own, centre.arrives or rotation.arrives
+    wrong = [part.contradicts for part in (centre, rotation) if part.contradicts is not None]
+    left = Left(_given(obstacle), obstacle.placements, after, own, arrives)
+    return Course(during, left, None if not wrong else wrong[0] if len(wrong) == 1 else wrong[0] | wrong[1])
+
+
+def _at_attributes(obstacle: Obstacle) -> Left:
+    values = [_copy(getattr(obstacle, name)) for name in ASSIGNED]
+    return Left(_given(obstacle), obstacle.placements, _motion(values, obstacle))
+
+
+def _motion(values: Sequence[Any], like: RigidMotion) -> RigidMotion:
+    position, velocity, rotation, angular_velocity = values
+    motion = RigidMotion(position, None if callable(position) else velocity, rotation, angular_velocity, like.start)
+    motion.end = like.end
+    return motion
+
+
+def _given(obstacle: Obstacle) -> tuple[Any, ...]:
+    return tuple(as_remembered(getattr(obstacle, name)) for name in ASSIGNED)
+
+
+def _is_as_given(obstacle: Obstacle, left: Left) -> bool:
+    return all(is_same(known, getattr(obstacle, name)) for known, name in zip(left.given, ASSIGNED, strict=True))
+
+
+def _copy(value: Any) -> Any:
+    """A value that stays as it is when tensors are written to; differentiable."""
+    return value.clone() if isinstance(value, Tensor) else value
+
+
+class _Part(NamedTuple):
+    """The centre or the rotation of an obstacle: its pose at `start` and its rate, in a control step and after it.
+
+    `own` says whether the latter are the attributes; `arrives` and `contradicts` are as in `Left` and `Course`.
+    """
+
+    during: tuple[Any, Any]
+    after: tuple[Any, Any]
+    own: bool = True
+    arrives: bool = False
+    contradicts: Tensor | None = None
+
+
+def _part(names: tuple[str, str], obstacle: Obstacle, left: Left, span: Span, same: Sequence[bool]) -> _Part:
+    """A pose and its rate by their names."""
+    own = _copy(getattr(obstacle, names[0])), _copy(getattr(obstacle, names[1]))
+    before = getattr(left.motion, names[0]), getattr(left.motion, names[1])
+    if all(value is None for value in (*own, *before)):
+        return _Part(own, own)
+    changes = _Changes(names[0] == "rotation", left, span, obstacle.start)
+    if all(same) and not left.arrives:
+        return _Part(own, own) if left.own else changes.of_known(_Part(before, before, False), own)
+    if callable(own[0]):
+        return _Part(own, own, contradicts=changes.jump(obstacle.centre_at(span.begin, changes.like), None))
+    if same[0] and not left.arrives:
+        pair = changes.backwards(changes.pose(), own[1]), own[1]
+        return changes.of_known(_Part(pair, pair, False), own)
+    if own[1] is None:
+        return changes.of_known(changes.to(own[0]), own)
+    pair = changes.backwards(changes.value(own[0]), own[1]), own[1]
+    return changes.of_known(_Part(pair, pair, False, contradicts=changes.jump(changes.value(own[0]), own[1])), own)
+
+
+class _Changes:
+    """Arithmetic of the poses of one obstacle in a control step, in float64.
+
+    Centres [D] or [B, D]; angles [] or [B]; rotation vectors [3] or [B, 3].
+
+    Args:
+        turns: whether of rotations.
+        left: where the obstacle was left.
+        span: the control step.
+        start: time at which a pose is given, and from which its rate counts [s].
+    """
+
+    def __init__(self, turns: bool, left: Left, span: Span, start: float) -> None:
+        self._left, self._span = left, span
+        self.like = torch.empty(0, dtype=torch.float64, device=span.device)
+        self._elapsed, self._seconds = self._time(span.begin) - start, self._time(span.seconds)
+        self._centre = left.motion.centre_at(span.begin, self.like)
+        dim = self._centre.shape[-1]
+        self._turns, self._rank = turns, 0 if turns and dim == 2 else 1
+        self._zero = torch.zeros((dim,) * self._rank, dtype=torch.float64, device=span.device)
+
+    def value(self, value: Any) -> Tensor:
+        """A pose or a rate as a tensor; None for zero."""
+        if value is None:
+            return self._zero
+        given = value if isinstance(value, Tensor) else torch.tensor(value, dtype=torch.float64, device="cpu")
+        return given.to(self.like)
+
+    def pose(self) -> Tensor:
+        """Where the obstacle was left."""
+        if not self._turns:
+            return self._centre
+        motion = self._left.motion
+        turn = self._times(self.value(motion.angular_velocity), self._elapsed)
+        return self._moved(self.value(motion.rotation), turn)
+
+    def backwards(self, pose: Tensor, rate: Any) -> Tensor:
+        """The pose at `start` of one at the beginning of the control step."""
+        return pose if rate is None else self._moved(pose, self._times(self.value(rate), -self._elapsed))
+
+    def to(self, target: Any) -> _Part:
+        """Uniformly to a pose, which is reached at the end."""
+        pose, end = self.pose(), self.value(target)
+        lasts = self._seconds > 0
+        share = torch.where(lasts, 1 / torch.where(lasts, self._seconds, 1.0), 0.0)
+        rate = self._times(self._way(pose, end), share)
+        during = self.backwards(pose, rate), rate
+        if not isinstance(self._span.seconds, Tensor):
+            return _Part(during, (target, None))
+        return _Part(during, (torch.where(self._column(lasts), end, pose), None), False, True)
+
+    def jump(self, pose: Tensor, rate: Any) -> Tensor:
+        """Scenes in which a pose is not the one in which the obstacle was left, bool [] or [B]."""
+        before = self.pose()
+        way = self._size(self._times(self.value(rate), self._seconds))
+        rounding = 64 * torch.finfo(torch.float32).eps * (self._size(pose) + self._size(before))
+        jumps = self._size(self._way(before, pose)) > SLACK * way + rounding
+        return jumps if self._left.known is None else jumps & self._left.known
+
+    def of_known(self, part: _Part, own: tuple[Any, Any]) -> _Part:
+        """A part in the scenes in which the obstacle was left; in others it is placed as its attributes say."""
+        known = self._left.known
+        if known is None:
+            return part
+
+        def pair(values: tuple[Any, Any]) -> tuple[Any, Any]:
+            pose, rate = (
+                torch.where(self._column(known), self.value(a), self.value(b)) for a, b in zip(values, own, strict=True)
+            )
+            return pose, rate
+
+        return part._replace(during=pair(part.during), after=part.after if part.own else pair(part.after))
+
+    def _time(self, time: float | Tensor) -> Tensor:
+        if isinstance(time, Tensor):
+            return time.to(self.like)
+        return torch.full((), time, dtype=torch.float64, device=self.like.device)
+
+    def _column(self, per_scene: Tensor) -> Tensor:
+        """[] or [B] as a factor of poses."""
+        return per_scene[..., None] if self._rank and per_scene.dim() else per_scene
+
+    def _times(self, rate: Tensor, time: Tensor) -> Tensor:
+        return rate * self._column(time)
+
+    def _moved(self, pose: Tensor, way: Tensor) -> Tensor:
+        return composed(way, pose) if self._turns and self._rank else pose + way
+
+    def _way(self, begin: Tensor, end: Tensor) -> Tensor:
+        """From one pose to another; of rotations the shortest."""
+        if not self._turns:
+            return end - begin
+        if self._rank:
+            return composed(end, -begin)
+        way = end - begin
+        return way - 2 * math.pi * (way / (2 * math.pi)).round()
+
+    def _size(self, way: Tensor) -> Tensor:
+        return norm(way) if self._rank else way.abs()
