@@ -176,7 +176,8 @@ class Capsule(Region):
 class Mesh(Region):
     """The inside of a closed triangle mesh: a file that trimesh reads (.obj, .ply, .stl, ...) or a ``trimesh.Trimesh``.
 
-    The mesh is scaled about its origin, then moved by ``offset`` [m]. Raises ValueError for a mesh that is not closed.
+    The mesh is scaled about its origin, then moved by ``offset`` [m]; see `torch_mpm.shapes.Mesh` for what is inside,
+    what is repaired, and what is refused.
     """
 
     def __init__(self, source: str | Path | Any, scale: float = 1.0, offset: Vector = (0.0, 0.0, 0.0)):

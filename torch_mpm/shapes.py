@@ -22,6 +22,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -31,7 +32,11 @@ import torch
 from torch import Tensor
 
 from . import surface_mesh
+from .capture import is_traced, is_transformed
 from .errors import check_number, check_vector, shape_of
+from .meshes import closed
+from .meshes.index import MeshIndex
+from .meshes.nearest import nearest_on_triangles
 from .ops.autograd import graph_at_once
 from .ops.pointwise import fuses, pointwise
 from .per_scene import SceneParameters, Value, constant, direction, extent, floats
@@ -39,7 +44,9 @@ from .surface_mesh import Array, SurfaceMesh
 from .vectors import norm, unit
 
 PAIRS = 2**20
-"""Pairs of a point and a triangle that are looked at together, which bounds the memory."""
+"""Pairs of a point and a triangle that are compared at once, which bounds the memory."""
+UNLIKE = 1e-3
+"""Share by which the volume inside a mesh differs from that by its normals where this is reported."""
 
 
 class Shape(SceneParameters):
@@ -329,13 +336,19 @@ class Cylinder(Revolved):
 
 
 class Mesh(Shape):
-    """The inside of a closed triangle mesh, scaled about its origin.
+    """The inside of a closed triangle mesh, scaled about its origin: where its winding number is not zero.
+
+    So parts may overlap, and each may be inside out; a part inside another that is turned against it is a cavity.
+    Files with textures or normals have several vertices at a position, which are merged. On the CPU points are looked
+    up in search trees. On other devices, and where torch traces or transforms a function, every point is compared with
+    every triangle: for few of them.
 
     Args:
-        source: a file that trimesh reads (.obj, .ply, .stl, ...) or a `trimesh.Trimesh`.
+        source: a file that trimesh reads (.obj, .ply, .stl, .glb, ...) or a `trimesh.Trimesh`.
         scale: factor on its coordinates.
 
-    Every point is compared with every triangle: for filling and for drawing, and as an obstacle of few triangles.
+    Attributes:
+        changes: what was changed to close the mesh (see `torch_mpm.meshes.closed.load`), in sentences.
 
     Raises:
         ImportError: without trimesh.
@@ -346,33 +359,57 @@ class Mesh(Shape):
     name = "mesh"
 
     def __init__(self, source: str | Path | Any, scale: float = 1.0) -> None:
-        mesh = surface_mesh.load(source)
         scale = float(check_number("scale", scale, "positive", lambda v: 0 < v < math.inf))
-        self.vertices = torch.tensor(mesh.vertices, dtype=torch.float64, device="cpu") * scale
-        self.faces = torch.tensor(mesh.faces, dtype=torch.int64, device="cpu")
-        volume = abs(float(mesh.volume)) * scale * scale * scale
-        self._volume = check_number(f"the volume of mesh {source}", volume, "positive", lambda v: 0 < v < math.inf)
+        vertices, faces, self.changes = closed.load(source)
+        self.vertices, self.faces = torch.from_numpy(vertices * scale), torch.from_numpy(faces)
+        self._index = MeshIndex(self.vertices, self.faces)
+        signed, filled = self._index.volumes
+        check_number(f"the volume of mesh {source}", filled, "positive", lambda v: 0 < v < math.inf)
+        if abs(filled - abs(signed)) > UNLIKE * filled:
+            warnings.warn(
+                f"mesh {source}: parts overlap or are inside out one against another: the volume inside is "
+                f"{filled:.4g} m³, which bodies get, and that by the normals {abs(signed):.4g} m³",
+                stacklevel=2,
+            )
 
     def surface(self, x: Tensor, scene: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        corners = self._corners(x)
-        nearest = torch.cat([_nearest_on_triangles(part, corners) for part in self._chunks(x)])
+        index, corners = self._searched(x), self._corners(x)
+        if index is not None:
+            nearest = nearest_on_triangles(x, corners[index.nearest(x)])
+        else:
+            nearest = torch.cat([_nearest_of_all(part, corners) for part in self._chunks(x)])
         offset = x - nearest
         side = torch.where(self.contains(x.detach()), -1, 1).to(x.dtype)
         return side * norm(offset), side[:, None] * unit(offset)
 
     def contains(self, x: Tensor) -> Tensor:
         """Where the winding number is above 1/2 (Jacobson et al. 2013; angles: Van Oosterom and Strackee 1983)."""
+        if (index := self._searched(x)) is not None:
+            return index.inside(x)
         corners = self._corners(x)
         return torch.cat([_winding_number(part, corners).abs() > 0.5 for part in self._chunks(x)])
 
     def volume(self, dim: int, scene: int = 0) -> float:
-        return self._volume
+        """Of the places inside [m³], exact where parts do not overlap, else to 1e-4."""
+        return self._current_index().volumes[1]
 
     def bounds(self, dim: int, scene: int = 0) -> tuple[Tensor, Tensor]:
         return self.vertices.cpu().amin(0), self.vertices.cpu().amax(0)
 
     def mesh(self, lower: Array, upper: Array, scene: int = 0) -> list[SurfaceMesh]:
         return [SurfaceMesh(self.vertices.cpu().numpy(), self.faces.cpu().numpy())]
+
+    def _searched(self, x: Tensor) -> MeshIndex | None:
+        """The search trees for points; None where each is compared with every triangle."""
+        hidden = x.device.type != "cpu" or is_traced(x) or is_transformed()
+        return None if hidden else self._current_index()
+
+    def _current_index(self) -> MeshIndex:
+        """Made anew where the vertices or triangles have changed."""
+        vertices, faces = self.vertices.detach().to("cpu", torch.float64), self.faces.cpu()
+        if not self._index.describes(vertices, faces):
+            self._index = MeshIndex(vertices, faces)
+        return self._index
 
     def _corners(self, like: Tensor) -> Tensor:
         """[T, 3, 3]"""
@@ -554,22 +591,11 @@ def _winding_number(x: Tensor, corners: Tensor) -> Tensor:
     return torch.atan2(determinant, denominator).sum(1) / (2 * math.pi)
 
 
-def _nearest_on_triangles(x: Tensor, corners: Tensor) -> Tensor:
+def _nearest_of_all(x: Tensor, corners: Tensor) -> Tensor:
     """The point of triangles [T, 3, 3] that is nearest to each of the points [N, 3], [N, 3]."""
-    start = corners[None]  # [1, T, 3 corners, 3]
-    edge = corners.roll(-1, 1)[None] - start
-    arm = x[:, None, None] - start
-    along = (arm * edge).sum(-1) / (edge * edge).sum(-1)
-    on_edges = start + along.clamp(0, 1)[..., None] * edge
-    normal = torch.linalg.cross(edge[:, :, 0], edge[:, :, 1])
-    height = (arm[:, :, 0] * normal).sum(-1, keepdim=True) / (normal * normal).sum(-1, keepdim=True)
-    on_plane = x[:, None] - height * normal
-    left = (torch.linalg.cross(edge.expand_as(arm), arm) * normal[:, :, None]).sum(-1) >= 0  # of each edge, from above
-    candidates = torch.cat([on_edges, on_plane[:, :, None]], 2)
-    squared = (x[:, None, None] - candidates).square().sum(-1)
-    squared = torch.where(torch.cat([torch.ones_like(left), left.all(2, keepdim=True)], 2), squared, torch.inf)
-    nearest = squared.flatten(1).argmin(1)
-    return candidates.flatten(1, 2)[torch.arange(len(x), device=x.device), nearest]
+    candidates = nearest_on_triangles(x[:, None], corners[None])
+    nearest = (x[:, None] - candidates).square().sum(-1).argmin(1)
+    return candidates[torch.arange(len(x), device=x.device), nearest]
 
 
 def _with_gradient(function: Callable[[Tensor], Tensor], points: Tensor) -> tuple[Tensor, Tensor]:

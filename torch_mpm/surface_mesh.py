@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-
-from .files import check_file
 
 Array = npt.NDArray[Any]
 
@@ -84,37 +81,3 @@ def frame_of(axis: Array) -> Array:
     u = np.cross(axis, helper)
     u /= np.linalg.norm(u)
     return np.stack([u, axis, np.cross(u, axis)], axis=1)
-
-
-def load(source: str | Path | Any) -> Any:
-    """A closed `trimesh.Trimesh`, as it is or from a file that trimesh reads (.obj, .ply, .stl, ...).
-
-    Raises:
-        ImportError: without trimesh.
-        OSError: for a file that cannot be read.
-        ValueError: for a file without triangles, or a mesh that is not closed.
-    """
-    try:
-        import trimesh
-    except ImportError as error:
-        raise ImportError("a mesh shape needs trimesh: pip install torch-mpm[mesh]") from error
-    mesh: Any = source
-    if not isinstance(source, trimesh.Trimesh):
-        check_file(source, "mesh")
-        try:
-            mesh = trimesh.load(source, force="mesh")
-        except Exception as error:  # readers of many formats raise anything
-            raise ValueError(f"mesh file {source} cannot be read: {type(error).__name__}: {error}") from error
-        if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
-            raise ValueError(f"mesh file {source} holds no triangles")
-    if not mesh.is_watertight:
-        raise ValueError(
-            f"mesh {source} is not closed: {_open_edges(mesh)} of its edges do not join two triangles; "
-            "close the holes (trimesh.repair.fill_holes, or a modelling program) before filling it"
-        )
-    return mesh
-
-
-def _open_edges(mesh: Any) -> int:
-    _, uses = np.unique(mesh.edges_sorted, axis=0, return_counts=True)
-    return int((uses != 2).sum())

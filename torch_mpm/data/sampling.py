@@ -17,9 +17,10 @@ import torch
 from pydantic import TypeAdapter, ValidationError
 from torch import Tensor
 
+from .. import shapes
 from ..scene import schema
 from ..scene.places import obstacle, region
-from ..seed import Mesh, Region
+from ..seed import Region
 from .configuration import Configuration
 from .distribution import Words, sample
 
@@ -140,7 +141,7 @@ class _Places:
         try:
             body = _BODY.validate_python(words)
             if isinstance(body, schema.MeshBody):
-                return Mesh(_mesh(self.configuration.folder / body.file), body.scale, body.offset)
+                return Region(_mesh(self.configuration.folder / body.file, body.scale), body.offset)
             found = region(body, None)
         except (ValidationError, ValueError, TypeError, OSError):
             return None
@@ -169,10 +170,8 @@ class _Places:
 
 
 @functools.lru_cache(maxsize=64)
-def _mesh(path: Path) -> Any:
-    import trimesh
-
-    return trimesh.load(path, force="mesh")
+def _mesh(path: Path, scale: float) -> shapes.Mesh:
+    return shapes.Mesh(path, scale)
 
 
 def _probes(body: Region, spacing: float) -> tuple[Tensor, float]:

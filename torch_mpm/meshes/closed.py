@@ -1,0 +1,203 @@
+"""Reading and repair of closed triangle meshes."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..files import check_file
+from ..surface_mesh import Array
+
+MERGED = 1e-5
+"""Distance within which vertices on open edges are merged, in diagonals of the mesh."""
+NAMED = 3
+"""Open edges whose places a message has."""
+
+
+class ClosedMesh(NamedTuple):
+    """Vertices float64 [V, 3], triangles int64 [T, 3] that pass each edge as often in one direction as in the other,
+    and what was changed to make it so, for people.
+    """
+
+    vertices: Array
+    faces: Array
+    changes: tuple[str, ...]
+
+
+def load(source: str | Path | Any) -> ClosedMesh:
+    """A closed mesh, from a file that trimesh reads (.obj, .ply, .stl, .glb, ...) or of a `trimesh.Trimesh`.
+
+    Where it is open, vertices at the same position are merged, as files with textures or normals need; then vertices
+    on open edges that are within `MERGED` of each other. Where triangles of one part are turned against each other,
+    those with less of its area are turned. Only the first change, which loses nothing, does not warn.
+
+    Raises:
+        ImportError: without trimesh, or without scipy for the last two changes.
+        OSError: for a file that cannot be read.
+        ValueError: for a file without triangles, coordinates that are not finite, or a mesh that is not closed.
+    """
+    vertices, faces = triangles(source)
+    changes = []
+    if len(_open_edges(faces)):
+        vertices, faces, merged = _merge_equal(vertices, faces)
+        changes += [f"{merged} vertices at positions of others were merged"] if merged else []
+    if len(_open_edges(faces)):
+        vertices, faces, merged, distance = _merge_near(vertices, faces)
+        if merged:
+            changes.append(f"{merged} vertices on open edges within {distance:.3g} m of others were merged")
+            _warn(source, changes[-1])
+    if len(edges := _open_edges(faces)):
+        raise ValueError(
+            f"mesh {source} is not closed: {len(edges)} of its edges do not join two triangles, "
+            f"{_places(vertices[edges])}; "
+            "close the holes (trimesh.repair.fill_holes, or a modelling program) before filling it"
+        )
+    faces, turned = _turned_alike(source, vertices, faces)
+    if turned:
+        changes.append(f"{turned} of {len(faces)} triangles that were inside out were turned")
+        _warn(source, changes[-1])
+    return ClosedMesh(vertices, faces, tuple(changes))
+
+
+def triangles(source: str | Path | Any) -> tuple[Array, Array]:
+    """Vertices float64 [V, 3] and triangles int64 [T, 3] of a file or a `trimesh.Trimesh`, open or closed.
+
+    Raises:
+        ImportError, OSError, ValueError: as `load`.
+    """
+    try:
+        import trimesh
+    except ImportError as error:
+        raise ImportError("a mesh shape needs trimesh: pip install torch-mpm[mesh]") from error
+    mesh: Any = source
+    if not isinstance(source, trimesh.Trimesh):
+        check_file(source, "mesh")
+        try:
+            mesh = trimesh.load(source, force="mesh", resolver=_resolver(source))
+        except Exception as error:  # readers of many formats raise anything
+            raise ValueError(f"mesh file {source} cannot be read: {type(error).__name__}: {error}") from error
+        if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
+            raise ValueError(f"mesh file {source} holds no triangles")
+    vertices, faces = np.array(mesh.vertices, dtype=np.float64), np.array(mesh.faces, dtype=np.int64)
+    if len(faces) == 0:
+        raise ValueError(f"mesh {source} holds no triangles")
+    if not np.isfinite(vertices).all():
+        raise ValueError(f"vertices of mesh {source} must be finite")
+    return vertices, _without_points(faces)
+
+
+def edge_uses(faces: Array) -> tuple[Array, Array, Array]:
+    """Edges of triangles: int64 [E, 2], the lower index first; which edge each triangle's sides [3 T] are; and +1 where
+    a side passes its edge from the lower index, else −1.
+
+    Sides of a triangle follow each other, from corner k to corner k + 1.
+    """
+    sides = np.stack([faces, np.roll(faces, -1, axis=1)], 2).reshape(-1, 2)
+    edges, which = np.unique(np.sort(sides, axis=1), axis=0, return_inverse=True)
+    return edges, which.reshape(-1), np.where(sides[:, 0] < sides[:, 1], 1, -1)
+
+
+def _resolver(path: str | Path) -> Any:
+    """Of the files that a mesh file names, regular ones alone."""
+    from trimesh.resolvers import FilePathResolver
+
+    class Resolver(FilePathResolver):
+        def get(self, name: str) -> bytes:
+            check_file(Path(self.parent, name.strip()), "mesh")
+            found: bytes = super().get(name)
+            return found
+
+    return Resolver(str(path))
+
+
+def _without_points(faces: Array) -> Array:
+    """Triangles with three different vertices."""
+    return faces[(faces != np.roll(faces, 1, axis=1)).all(1)]
+
+
+def _open_edges(faces: Array) -> Array:
+    """Edges int64 [E, 2] of an odd number of triangles."""
+    edges, which, _ = edge_uses(faces)
+    return edges[np.bincount(which, minlength=len(edges)) % 2 == 1]
+
+
+def _merge_equal(vertices: Array, faces: Array) -> tuple[Array, Array, int]:
+    kept, which = np.unique(vertices + 0.0, axis=0, return_inverse=True)  # -0 is 0
+    return kept, _without_points(which.reshape(-1)[faces]), len(vertices) - len(kept)
+
+
+def _merge_near(vertices: Array, faces: Array) -> tuple[Array, Array, int, float]:
+    """Vertices on open edges take the place of one that is near; also how many did, and what is near [m]."""
+    scipy = _scipy()
+    own = np.unique(_open_edges(faces))
+    distance = MERGED * float(np.linalg.norm(vertices.max(0) - vertices.min(0)))
+    pairs = scipy.spatial.cKDTree(vertices[own]).query_pairs(distance, output_type="ndarray")
+    _, part = _parts(len(own), pairs)
+    _, first, inverse = np.unique(part, return_index=True, return_inverse=True)
+    place = np.arange(len(vertices))
+    place[own] = own[first[inverse.reshape(-1)]]
+    return vertices, _without_points(place[faces]), int((place[own] != own).sum()), distance
+
+
+def _turned_alike(source: Any, vertices: Array, faces: Array) -> tuple[Array, int]:
+    """Triangles that pass each edge as often in one direction as in the other, and how many were turned for it.
+
+    Triangles that share an edge with one other depend on each other. Both ways of each triangle are nodes of a graph,
+    in which those that go together are joined.
+    """
+    edges, which, sign = edge_uses(faces)
+    if not np.bincount(which, sign, len(edges)).any():
+        return faces, 0
+    uses = np.bincount(which, minlength=len(edges))
+    order = np.argsort(which, kind="stable")
+    pairs = order[uses[which[order]] == 2].reshape(-1, 2)
+    a, b = (pairs // 3).T
+    count, alike = len(faces), sign[pairs[:, 0]] != sign[pairs[:, 1]]
+    ends = np.where(alike, b, b + count), np.where(alike, b + count, b)
+    joined = np.stack([np.concatenate([a, a + count]), np.concatenate(ends)], 1)
+    parts, part = _parts(2 * count, joined)
+    corners = vertices[faces]
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    weight = np.bincount(part[:count], area, parts)
+    turn = weight[part[count:]] > weight[part[:count]]
+    tied = weight[part[count:]] == weight[part[:count]]
+    turn |= tied & (part[count:] < part[:count])
+    faces = np.where(turn[:, None], faces[:, ::-1], faces)
+    edges, which, sign = edge_uses(faces)
+    wrong = edges[np.bincount(which, sign, len(edges)) != 0]
+    if len(wrong):
+        raise ValueError(
+            f"the triangles of mesh {source} have no common outside: {len(wrong)} of its edges are passed twice in one "
+            f"direction however they are turned, {_places(vertices[wrong])}; it is one-sided, or parts of it touch"
+        )
+    return faces, int(turn.sum())
+
+
+def _parts(count: int, pairs: Array) -> tuple[int, Array]:
+    """How many connected parts a graph of `count` nodes has, and the part of each node."""
+    sparse = _scipy().sparse
+    graph = sparse.coo_matrix((np.ones(len(pairs), dtype=np.int8), (pairs[:, 0], pairs[:, 1])), (count, count))
+    parts, part = sparse.csgraph.connected_components(graph, directed=False)
+    return int(parts), part
+
+
+def _scipy() -> Any:
+    try:
+        import scipy.sparse.csgraph
+        import scipy.spatial
+    except ImportError as error:
+        raise ImportError("the repair of a mesh needs scipy: pip install torch-mpm[mesh]") from error
+    return scipy
+
+
+def _places(edges: Array) -> str:
+    """Where some edges [E, 2, 3] are, in words."""
+    middles = [f"({x:.6g}, {y:.6g}, {z:.6g})" for x, y, z in edges.mean(1)[:NAMED].tolist()]
+    return f"near {', '.join(middles)}{' and elsewhere' if len(edges) > NAMED else ''}"
+
+
+def _warn(source: Any, change: str) -> None:
+    warnings.warn(f"mesh {source}: {change}", stacklevel=4)
