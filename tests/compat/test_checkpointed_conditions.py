@@ -117,7 +117,7 @@ def test_times_that_cannot_be_told_apart(ends):
     run().backward()
     solver.time = 1.0
     if ends == 0.5:
-        with pytest.raises(RuntimeError, match=r"found the times \[0.0, 1.0\].*give time=, or call reset\(\)"):
+        with pytest.raises(RuntimeError, match=r"found \[0.0, 1.0\] s.*give time=, or call reset\(\)"):
             run().backward()
     else:
         run().backward()
@@ -126,6 +126,16 @@ def test_times_that_cannot_be_told_apart(ends):
     made_anew = made({**CONDITIONS["translation"], "start_time": 0.0, "end_time": 0.5}, "cpu")
     checkpoint(made_anew, x, v, C, F, stress, 0.2, use_reentrant=True)[0].sum().backward()
     assert made_anew.time == pytest.approx(0.2 + DT)
+
+
+@pytest.mark.parametrize("reentrant", [True, False])
+def test_conditions_stay_until_the_backward_pass(reentrant):
+    solver = made(CONDITIONS["translation"], "cpu")
+    x, v, C, F = start("cpu")
+    loss = checkpoint(solver, x, v, C, F, torch.zeros_like(F), use_reentrant=reentrant)[0].sum()
+    set_boundary_conditions(solver, [CONDITIONS["surface"]])
+    with pytest.raises(RuntimeError, match="conditions of the solver must stay as they are until the backward pass"):
+        loss.backward()
 
 
 def test_memory_of_times_does_not_grow():

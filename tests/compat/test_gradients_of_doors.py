@@ -176,6 +176,41 @@ def test_places_of_boxes_have_no_gradient(key):
         simulated("cpu", {"additional_material_params": [box]})
 
 
+STARTS = {
+    "tensor_x": lambda x: x.tolist(),
+    "tensor_volume": lambda x: [1e-4] * len(x),
+    "tensor_cov": lambda x: (0.1 + x.repeat(1, 2)).tolist(),
+    "x": lambda x: x.tolist(),
+    "v": lambda x: motion(x).tolist(),
+    "F": lambda x: (torch.eye(3, dtype=x.dtype) + 0.05 * torch.sin(9 * x[:, :, None] * x[:, None])).tolist(),
+    "C": lambda x: torch.sin(9 * x[:, :, None] * x[:, None] + x[:, None]).tolist(),
+    "all_particle_densities": lambda x: [500.0] * len(x),
+}
+
+
+@pytest.mark.parametrize("name", STARTS)
+def test_tensors_of_the_start(name, device):
+    x = cube("cpu")
+
+    def loss(value):
+        solver = MPM_Simulator_WARP(10)
+        given = {"tensor_x": x.to(device), "tensor_volume": torch.full_like(x[:, 0], 1e-4, device=device)}
+        solver.load_initial_data_from_torch(**given | ({name: value} if name.startswith("tensor") else {}), n_grid=N)
+        if name != "v":
+            solver.import_particle_v_from_torch(motion(x).to(device))
+        if len(name) == 1:
+            getattr(solver, f"import_particle_{name}_from_torch")(value)
+        solver.set_parameters_dict(COMMON | {"g": [0.0, 0.0, -9.8]})
+        if name == "all_particle_densities":
+            solver.reset_densities_and_update_masses(value)
+        solver.finalize_mu_lam()
+        for k in range(6):
+            solver.p2g2p(k, DT)
+        return loss_of(solver.export_particle_x_to_torch()) + 0.1 * solver.export_particle_cov_to_torch().square().sum()
+
+    compared(loss, STARTS[name](x), device)
+
+
 # ---- MPM-PyTorch
 
 
@@ -230,6 +265,21 @@ def test_arguments_of_conditions_of_the_solver(kind, name, device):
     value = torch.tensor(arguments[name], dtype=torch.float64, device=device, requires_grad=True)
     with pytest.raises((TypeError, ValueError), match=f"^{name} must"):
         loss(value)
+
+
+@pytest.mark.parametrize("name", ["x", "v", "C", "F", "stress"])
+def test_tensors_of_a_call(name, device):
+    x = cube(device)
+    shear = torch.sin(9 * x[:, :, None] * x[:, None])
+    tensors = {"x": x, "v": motion(x), "C": shear, "F": shear + torch.eye(3, dtype=x.dtype, device=device)}
+    tensors["stress"] = 1e4 * (shear + shear.mT)
+
+    def loss(value):
+        solver = mpm_pytorch.MPMSolver(x, dt=DT, num_grids=N, size=(0.2, 0.2, 0.2))
+        after = solver(*(tensors | {name: value}).values())
+        return loss_of(after[0]) + sum(1e-3 * part.square().sum() for part in after[1:])
+
+    compared(loss, tensors[name].tolist(), device)
 
 
 @pytest.mark.parametrize("name", ["E", "nu", "sigma_y", "friction_angle", "cohesion"])

@@ -136,6 +136,11 @@ def test_conditions(kind):
         set_boundary_conditions(solver(), [condition(kind) | {"strat_time": 0.0}], {"substep_dt": 1e-4})
 
 
+def test_impulses_need_the_time_step():
+    with pytest.raises(ValueError, match="time_params must have substep_dt, got"):
+        set_boundary_conditions(solver(), [{"type": "particle_impulse", "force": [0, 0, 1]}], {"frame_dt": 1e-2})
+
+
 @pytest.mark.parametrize("kind", configuration.OTHER_CONDITIONS)
 def test_conditions_of_descendants(kind):
     with pytest.raises(ValueError, match=f"boundary condition {kind} is not supported"):

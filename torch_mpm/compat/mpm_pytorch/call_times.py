@@ -15,6 +15,8 @@ from torch.multiprocessing.reductions import StorageWeakRef
 
 from ...capture import is_traced, version
 
+Moment = tuple[float, int]
+"""Time [s], and how often the conditions had changed."""
 LEAST_ENTRIES = 256
 """Entries from which on those of freed storages are removed."""
 
@@ -25,30 +27,30 @@ def is_recomputed() -> bool:
 
 
 class CallTimes:
-    """Times [s] at which storages were arguments of calls."""
+    """Moments at which storages were arguments of calls."""
 
     def __init__(self) -> None:
-        self._entries: dict[int, tuple[StorageWeakRef, int, frozenset[float]]] = {}
+        self._entries: dict[int, tuple[StorageWeakRef, int, frozenset[Moment]]] = {}
         self._limit = LEAST_ENTRIES
 
-    def record(self, tensors: Iterable[Tensor], time: float) -> None:
-        """Store the time of a call that has these arguments."""
+    def record(self, tensors: Iterable[Tensor], moment: Moment) -> None:
+        """Store the moment of a call that has these arguments."""
         for t in tensors:
             if not _has_storage(t):
                 continue
             storage = StorageWeakRef(t.untyped_storage())
             before = self._of(storage.cdata, t._version)
-            self._entries[storage.cdata] = storage, t._version, before | {time}
+            self._entries[storage.cdata] = storage, t._version, before | {moment}
         if len(self._entries) > self._limit:
             self._entries = {k: e for k, e in self._entries.items() if not e[0].expired()}
             self._limit = max(2 * len(self._entries), LEAST_ENTRIES)
 
-    def of(self, tensors: Iterable[Tensor]) -> frozenset[float]:
-        """Times at which all of these tensors that are known were arguments; empty where none is known."""
-        known = [times for t in tensors if _has_storage(t) and (times := self._of(_key(t), t._version))]
+    def of(self, tensors: Iterable[Tensor]) -> frozenset[Moment]:
+        """Moments at which all of these tensors that are known were arguments; empty where none is known."""
+        known = [found for t in tensors if _has_storage(t) and (found := self._of(_key(t), t._version))]
         return frozenset.intersection(*known) if known else frozenset()
 
-    def _of(self, key: int, version: int) -> frozenset[float]:
+    def _of(self, key: int, version: int) -> frozenset[Moment]:
         entry = self._entries.get(key)
         return entry[2] if entry is not None and entry[1] == version else frozenset()
 

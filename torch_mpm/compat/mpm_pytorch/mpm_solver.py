@@ -92,6 +92,7 @@ class MPMSolver:
             stress_form="gradient",
         )
         self._acting: tuple[list[Any], list[Any]] | None = None
+        self._changes = 0  # of the lists of conditions
         self._volume = torch.full((self.n_particles,), self.vol, dtype=torch.float64, device=self.device)
 
     def reset(self) -> None:
@@ -122,18 +123,19 @@ class MPMSolver:
 
         Raises:
             TypeError, ValueError: for a wrong argument.
-            RuntimeError: for a call in a backward pass whose time is not known, and whose conditions depend on it.
+            RuntimeError: for a call in a backward pass whose time is not known, and whose conditions depend on it, or
+                whose conditions have changed since.
         """
         check_like("x", x, x, (self.n_particles, 3), "[P, 3]")
+        self._set_boundaries()
         recomputed = is_recomputed()
         if time is None:
             time = self._recomputed_time((x, v, C, F)) if recomputed else self.time
         else:
             check_number("time", time)
         if not recomputed:
-            self._times.record((x, v, C, F), time)
+            self._times.record((x, v, C, F), (time, self._changes))
             self.time = time + self.dt
-        self._set_boundaries()
         self.displacement = None
         volume = self._volume.to(x)
         mass = volume * (self.p_mass / self.vol)
@@ -144,19 +146,22 @@ class MPMSolver:
         after = clamped(after, self.clip_bound, 1 - self.clip_bound)
         result = after, state.v, state.C, clamped(state.F, -LARGEST_ENTRY, LARGEST_ENTRY)
         if recomputed:
-            self._times.record(result, time + self.dt)
+            self._times.record(result, (time + self.dt, self._changes))
         return result
 
     def _recomputed_time(self, arguments: tuple[Tensor, ...]) -> float:
         """The time of the call that is recomputed; that of the solver where no condition depends on it."""
         known = self._times.of(arguments)
-        times = known or {0.0, self.time}
+        if known and all(changes != self._changes for _, changes in known):
+            raise RuntimeError("conditions of the solver must stay as they are until the backward pass of a checkpoint")
+        times = {time for time, _ in known} or {0.0, self.time}
         first, last = min(times), max(times)
         conditions = [*self.pre_particle_process, *self.post_grid_process]
         if first < last and any(_may_change(c, first, last, self.dt) for c in conditions):
+            found = sorted({time for time, _ in known})
             raise RuntimeError(
                 "the solver was called in a backward pass with tensors of no single earlier call, and conditions "
-                f"depend on the time (found the times {sorted(known)}): give time=, or call reset() before each pass"
+                f"depend on the time (found {found} s): give time=, or call reset() before each pass"
             )
         return last
 
@@ -165,7 +170,7 @@ class MPMSolver:
         lists = (list(self.pre_particle_process), list(self.post_grid_process))
         if self._acting == lists:
             return
-        self._acting = lists
+        self._acting, self._changes = lists, self._changes + 1
         operations, nodes = lists
         self.step.on_particles = Operations(operations) if operations else None
         damping = [NodeDamping(self.damping)] if self.damping < 1 else []

@@ -137,6 +137,7 @@ def set_boundary_conditions(
         check_needed(f"a boundary condition {kind}", condition, needed)
         arguments = {name: condition[name] for name in (*needed, *optional) if name in condition}
         if kind == "particle_impulse":
+            check_needed("time_params", time_params, ("substep_dt",))
             arguments["dt"] = time_params["substep_dt"]
         if kind == "cuboid":
             arguments.setdefault("end_time", 1e3)
