@@ -154,11 +154,11 @@ class MPMSolver:
         known = self._times.of(arguments)
         if known and all(changes != self._changes for _, changes in known):
             raise RuntimeError("conditions of the solver must stay as they are until the backward pass of a checkpoint")
-        times = {time for time, _ in known} or {0.0, self.time}
+        found = sorted({time for time, changes in known if changes == self._changes})
+        times = found or [0.0, self.time]
         first, last = min(times), max(times)
         conditions = [*self.pre_particle_process, *self.post_grid_process]
         if first < last and any(_may_change(c, first, last, self.dt) for c in conditions):
-            found = sorted({time for time, _ in known})
             raise RuntimeError(
                 "the solver was called in a backward pass with tensors of no single earlier call, and conditions "
                 f"depend on the time (found {found} s): give time=, or call reset() before each pass"
