@@ -134,11 +134,13 @@ def _scene_arguments(parser: argparse.ArgumentParser, optional: bool = False) ->
 def _run(options: argparse.Namespace) -> None:
     from .scene import Scene
     from .scene.diagnose import SceneFailure
+    from .scene.folder import finished
     from .scene.run import Interrupted, run
 
     begin = time.perf_counter()
     scene = Scene.load(options.scene, options.overrides)
     _require_outputs(scene)
+    complete = options.resume and finished(options.out, scene.fingerprint()) is not None
     bar = None if options.quiet else _Bar()
     source = options.scene.read_text(encoding="utf-8")
     try:
@@ -150,11 +152,12 @@ def _run(options: argparse.Namespace) -> None:
     if bar is not None:
         bar.close()
     seconds = summary.setdefault("seconds", {})
-    if "total" in seconds:  # nothing of an earlier run is missing
+    files = {"trajectory": options.out / "trajectory.h5"}
+    missing = [(name, make) for name, make in _outputs(scene, options) if name not in seconds]
+    if complete and not missing:
         print(f"{options.out} holds the complete run of this scene")
         return
-    files = {"trajectory": options.out / "trajectory.h5"}
-    for name, make in _outputs(scene, options):
+    for name, make in missing:
         since = time.perf_counter()
         files |= make()
         seconds[name] = time.perf_counter() - since

@@ -1,6 +1,7 @@
 """The command line, as a user calls it."""
 
 import json
+import shutil
 import signal
 import subprocess
 import sys
@@ -13,6 +14,7 @@ pytest.importorskip("h5py")
 
 from torch_mpm import Trajectory
 from torch_mpm.cli import main
+from torch_mpm.data.whole_files import write_record
 
 
 @pytest.fixture
@@ -63,6 +65,27 @@ def test_pictures_and_video(scene, tmp_path, capsys):
         assert [name, str(tmp_path / "out" / place)] in told
     assert main(["render", str(tmp_path / "out"), "--set", "render.color_by=material"]) == 0
     assert capsys.readouterr().out.strip().endswith("video.mp4")
+
+
+def test_a_complete_run_is_resumed(scene, tmp_path, capsys):
+    """What a kill after the simulation has kept from being made is made; then there is a line and nothing else."""
+    pytest.importorskip("meshio")
+    out = tmp_path / "out"
+    run = ["run", str(scene), "-o", str(out), "--set", "output.vtk=true", "--quiet", "--resume"]
+    assert main(run) == 0
+    assert (out / "vtk" / "run.pvd").exists() and "particles lost" in capsys.readouterr().out
+    files = {p: p.stat().st_mtime_ns for p in out.rglob("*") if p.is_file() and p.name != "run.lock"}
+    assert main(run) == 0
+    assert capsys.readouterr().out == f"{out} holds the complete run of this scene\n"
+    assert {p: p.stat().st_mtime_ns for p in files} == files
+    record = {name: value for name, value in json.loads((out / "run.json").read_text()).items() if name != "checksum"}
+    record["summary"]["seconds"].pop("VTK")  # a kill before the end of the outputs
+    write_record(out / "run.json", record)
+    shutil.rmtree(out / "vtk")
+    assert main(run) == 0 and (out / "vtk" / "run.pvd").exists()
+    write_record(out / "run.json", {name: value for name, value in record.items() if name != "summary"})
+    assert main(run) == 0 and "whose summary was lost by a kill" in capsys.readouterr().out
+    assert main(run[:-1]) == 1 and "holds the complete run of this scene" in capsys.readouterr().err
 
 
 def test_check_tells_good_from_bad(scene, capsys):

@@ -46,7 +46,7 @@ def draw_statistics(dataset: str | Path | DatasetFolder, out: str | Path | None 
         out: the picture; ``statistics.png`` in the folder of the data set by default.
 
     Raises:
-        DatasetError: for a data set without a valid scene.
+        DatasetError: for a data set without a valid scene, or a picture that is no PNG file.
         DamagedFileError: for a scene that is damaged.
         ImportError: when matplotlib is missing (extra ``render``).
     """
@@ -58,6 +58,8 @@ def draw_statistics(dataset: str | Path | DatasetFolder, out: str | Path | None 
     if not valid:
         raise DatasetError(f"{data.path} has no valid scene yet")
     target = data.path / "statistics.png" if out is None else Path(out)
+    if target.suffix.lower() != ".png":
+        raise DatasetError(f"out must be the name of a PNG file, NAME.png, got {str(target)!r}")
     chosen = np.unique(np.linspace(0, len(valid) - 1, SAMPLED).round().astype(int))
     scenes = [data.scene(valid[k].id) for k in chosen if valid[k].particles]
     picture = figure(RESOLUTION)
