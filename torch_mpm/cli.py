@@ -221,14 +221,15 @@ def _draw_with_a_bar(folder: Path, scene: Any) -> list[Path]:
 def _check(options: argparse.Namespace) -> None:
     from . import resolution
     from .scene import Scene
+    from .scene.substeps import check_substeps
 
     scene = Scene.load(options.scene, options.overrides)
     built = scene.build("cpu")
     if unresolved := resolution.problem(built.grid, built.state.x.dtype):
         print(f"{options.scene}: warning: grid: {unresolved}", file=sys.stderr)
-    print(
-        f"{options.scene}: good, {built.particles} particles in {len(built.scenes)} scene(s), {scene.frames + 1} frames"
-    )
+    substeps = check_substeps(scene, built)
+    contents = f"{built.particles} particles in {len(built.scenes)} scene(s), {scene.frames + 1} frames"
+    print(f"{options.scene}: good, {contents}, about {substeps} substeps")
 
 
 def _info(options: argparse.Namespace) -> None:

@@ -8,6 +8,8 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor
 
@@ -435,16 +437,19 @@ def _across(direction: Tensor) -> Tensor:
 
 
 def _overlaps(placed: Placed, obstacles: Sequence[tuple[str, Any]]) -> Iterator[str]:
-    """Bodies within each other, and within obstacles that are there from the start."""
+    """Bodies within each other, and within obstacles that are there from the start; the first other body of each."""
+    meet = _boxes_meet(placed)
     seen = set()
     for i, (key, _, points, _) in enumerate(placed):
-        for j, (other, _, _, shape) in enumerate(placed):
-            if i == j or shape is None or (j, i) in seen or _apart(points, shape):
+        for j in meet[i].nonzero()[0].tolist():
+            other, _, _, shape = placed[j]
+            if i == j or shape is None or (j, i) in seen:
                 continue
             inside = int(shape.inside(points.x).sum())
             if inside:
                 seen.add((i, j))
                 yield f"{key}: overlaps {other}, {inside} of its particles are inside it; move one of them"
+                break
     for path, words in obstacles:
         if words.start > 0:
             continue
@@ -456,12 +461,21 @@ def _overlaps(placed: Placed, obstacles: Sequence[tuple[str, Any]]) -> Iterator[
                 yield f"{key}: {inside} of its particles are inside {where}; move one of them"
 
 
-def _apart(points: seed.Points, shape: seed.Region) -> bool:
-    """Whether the boxes around points, of which there are some, and a shape have no point in common."""
-    lower, upper = (v.tolist() for v in points.x.aminmax(dim=0))
-    return any(
-        a > d or b < c for a, b, c, d in zip(lower, upper, shape.lower.tolist(), shape.upper.tolist(), strict=True)
-    )
+def _boxes_meet(placed: Placed) -> npt.NDArray[Any]:
+    """Whether the box around the points of body i and that around the shape of body j meet, bool [n, n].
+
+    Without a shape, a body has no box.
+    """
+    dim = placed[0][2].x.shape[1] if placed else 2
+    nowhere = torch.full((dim,), torch.nan, dtype=torch.float64)
+    lower, upper, a, b = np.empty((4, len(placed), dim))
+    for k, (_, _, points, shape) in enumerate(placed):
+        lower[k], upper[k] = (end.numpy() for end in points.x.aminmax(dim=0))
+        a[k], b[k] = (nowhere, nowhere) if shape is None else (shape.lower, shape.upper)
+    meet = np.ones((len(placed), len(placed)), bool)
+    for axis in range(dim):  # comparisons with NaN are false
+        meet &= (lower[:, None, axis] <= b[None, :, axis]) & (upper[:, None, axis] >= a[None, :, axis])
+    return meet
 
 
 def _gravity(entries: Sequence[Any], dtype: torch.dtype, device: torch.device) -> Tensor | None:

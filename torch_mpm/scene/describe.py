@@ -14,6 +14,7 @@ from ..state import PARTICLE_FIELDS, State
 from .build import Built
 from .run import Simulation, joined
 from .scene import Scene
+from .substeps import time_step
 
 TRIAL_STEPS = 3
 
@@ -25,8 +26,7 @@ def describe(scene: Scene, built: Built) -> dict[str, Any]:
     stability limit of the first state asks for.
     """
     state = _halfway(built)
-    dt = float(built.step.stable_dt(state, scene.cfl).min()) if scene.dt is None else scene.dt
-    substeps = max(scene.frames, round(scene.duration / dt))
+    dt, substeps = time_step(scene, built, state)
     after, seconds = _trial(built, state, dt)
     materials = {m.name: m.words.law for m in built.materials}
     return {
@@ -45,7 +45,7 @@ def describe(scene: Scene, built: Built) -> dict[str, Any]:
         "bytes per particle": sum(_bytes_of(after).values()),
         "frames": scene.frames + 1,
         "time step [s]": dt,
-        "substeps": substeps,
+        "substeps": round(substeps),
         "estimated run time [s]": seconds * substeps,
         "trajectory [MB]": Simulation(scene, built).layout("", "").bytes / 1e6,
     }

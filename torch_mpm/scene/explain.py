@@ -12,6 +12,11 @@ from pydantic import BaseModel, ValidationError
 
 from .schema import SceneData
 
+MOST_LINES = 20
+"""Problems in the message of an error."""
+MOST_LETTERS = 1000
+"""Of a problem in the message: values of files may be long."""
+
 
 class SceneError(ValueError):
     """A scene that cannot be simulated. ``problems`` has one line for each thing that is wrong."""
@@ -19,7 +24,15 @@ class SceneError(ValueError):
     def __init__(self, problems: Sequence[str], source: str = "") -> None:
         self.problems = list(problems)
         head = f"{source}: " if source else ""
-        super().__init__("\n".join(f"{head}{problem}" for problem in self.problems))
+        lines = [f"{head}{_shortened(problem)}" for problem in self.problems[:MOST_LINES]]
+        rest = len(self.problems) - len(lines)
+        super().__init__("\n".join([*lines, *([f"{head}and {rest} more problems"] if rest else [])]))
+
+
+def _shortened(line: str) -> str:
+    if len(line) <= MOST_LETTERS:
+        return line
+    return f"{line[: MOST_LETTERS // 2]} [{len(line) - MOST_LETTERS} letters] {line[-MOST_LETTERS // 2 :]}"
 
 
 def explain(error: ValidationError, root: type[BaseModel] = SceneData) -> list[str]:

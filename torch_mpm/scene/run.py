@@ -28,6 +28,7 @@ from .diagnose import SceneFailure, replay, wrong
 from .folder import CHECKPOINT, LAST_GOOD, claim, finished, locked, output_errors, prepare, record_summary
 from .process import prompt_turns, stop_signals
 from .scene import Scene
+from .substeps import check_substeps
 from .writer import Copier, Copies, Frame, FrameWriter
 
 SEGMENT = 32
@@ -95,7 +96,9 @@ def run(
         return summary
     with output_errors(folder):
         claim(folder, fingerprint, resume)
-    simulation = Simulation(scene, scene.build())
+    built = scene.build()
+    check_substeps(scene, built)
+    simulation = Simulation(scene, built)
     layout = simulation.layout(source, fingerprint)
     with stop_signals() as stop, prompt_turns(), output_errors(folder), locked(folder), torch.no_grad():
         claim(folder, fingerprint, resume)  # again: another process may have been here before the lock

@@ -1,0 +1,75 @@
+"""Scenes that would never end are refused before the first substep, by the key that makes them so."""
+
+import pytest
+from helpers import FILE
+
+pytest.importorskip("pydantic")
+pytest.importorskip("h5py")
+
+from torch_mpm.cli import main
+from torch_mpm.scene import Scene, SceneError
+
+
+@pytest.mark.parametrize("command", ["check", "run"])
+@pytest.mark.parametrize(
+    ("override", "key"),
+    [
+        ("dt=1e-12", "dt"),
+        ("dt=1e-300", "dt"),
+        ("cfl=1e-9", "cfl"),
+        ("material.jelly.E=1e30", "cfl"),
+        ("grid.dx=1e-9", ""),
+        ("fps=1e300", "duration"),
+    ],
+)
+def test_scenes_that_would_never_end(tmp_path, capsys, command, override, key):
+    scene = tmp_path / "scene.toml"
+    scene.write_text(FILE.format(duration=0.04))
+    where = ["-o", str(tmp_path / "out"), "--quiet"] if command == "run" else []
+    assert main([command, str(scene), *where, "--set", override]) == 1
+    message = capsys.readouterr().err
+    assert f"{key}:" in message and not (tmp_path / "out").exists(), message
+
+
+def test_the_number_of_substeps_is_told(tmp_path, capsys):
+    scene = tmp_path / "scene.toml"
+    scene.write_text(FILE.format(duration=0.04))
+    assert main(["check", str(scene), "--set", "dt=1e-5"]) == 0
+    assert "about 4000 substeps" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("together", [False, True])
+def test_many_bodies(together):
+    """A thousand bodies, apart or all in one place: each is compared with its neighbours alone, and told of once."""
+    n, side = 1000, 32
+    bodies = [
+        {
+            "shape": "sphere",
+            "center": [0.5, 0.5] if together else [(k % side + 0.5) / side, (k // side + 0.5) / side],
+            "radius": 0.3 / side,
+            "material": "jelly",
+        }
+        for k in range(n)
+    ]
+    scene = Scene.from_words(
+        {
+            "duration": 0.01,
+            "fps": 100,
+            "grid": {"lower": [0.0, 0.0], "upper": [1.0, 1.0], "dx": 1 / (2 * side)},
+            "material": {"jelly": {"law": "neo_hookean", "E": 1e4, "nu": 0.3}},
+            "body": bodies,
+        }
+    )
+    if not together:
+        assert scene.build("cpu").particles >= n
+        return
+    with pytest.raises(SceneError) as error:
+        scene.build("cpu")
+    assert n / 2 - 1 <= len(error.value.problems) <= n
+    lines = str(error.value).splitlines()
+    assert len(lines) == 21 and lines[-1].endswith("more problems") and "overlaps body[" in lines[0]
+
+
+def test_long_values_are_shortened():
+    error = SceneError(["title: " + 10_000 * "x"], "a.toml")
+    assert str(error).startswith("a.toml: title: xxx") and len(str(error)) < 1100

@@ -1,0 +1,35 @@
+"""How many substeps a scene takes, before they are taken."""
+
+from __future__ import annotations
+
+import math
+
+from ..state import State
+from .build import Built
+from .explain import SceneError
+from .scene import Scene
+
+MOST_SUBSTEPS = 10**9
+"""Substeps of a scene: more take months."""
+
+
+def check_substeps(scene: Scene, built: Built) -> int:
+    """About how many substeps a scene takes.
+
+    Raises:
+        SceneError: for more than `MOST_SUBSTEPS`, which would never end.
+    """
+    dt, substeps = time_step(scene, built, built.state)
+    if substeps <= MOST_SUBSTEPS:
+        return round(substeps)
+    key = "cfl" if scene.dt is None else "dt"
+    raise SceneError(
+        [f"{key}: about {substeps:.2g} substeps of {dt:.2g} s would be taken, and {MOST_SUBSTEPS:.0e} are allowed"],
+        scene.source,
+    )
+
+
+def time_step(scene: Scene, built: Built, state: State) -> tuple[float, float]:
+    """Time step [s] in a state, and number of substeps of the scene with it; infinite where there is no step."""
+    dt = float(built.step.stable_dt(state, scene.cfl).min()) if scene.dt is None else scene.dt
+    return dt, max(float(scene.frames), scene.duration / dt if dt > 0 else math.inf)
