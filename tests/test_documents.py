@@ -11,7 +11,7 @@ DOCS = Path(__file__).parent.parent / "docs"
 
 
 @pytest.mark.filterwarnings("ignore:Anomaly Detection")
-@pytest.mark.parametrize("name", ["training.md"])
+@pytest.mark.parametrize("name", ["training.md", "recipes.md"])
 def test_programs_of_a_document(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     text = (DOCS / name).read_text()
     module = types.ModuleType("document")  # which compilers look for
