@@ -141,11 +141,17 @@ def as_remembered(value: Any, most: int = COMPARED) -> Any:
         return Remembered(value, most)
     if isinstance(value, np.ndarray):
         value = value.tolist()
-    return tuple(as_remembered(part, most) for part in value) if isinstance(value, (list, tuple)) else value
+    if not isinstance(value, (list, tuple)):
+        return value
+    parts = tuple(as_remembered(part, most) for part in value)
+    unchanged = isinstance(value, tuple) and all(a is b for a, b in zip(parts, value, strict=True))
+    return value if unchanged else parts  # which `is_same` knows at once
 
 
 def is_same(known: Any, value: Any) -> bool:
     """Whether a value is still what `as_remembered` made a part of a key of."""
+    if known is value:  # no tensor, list or array
+        return True
     if isinstance(known, Remembered):
         return known.is_now(value)
     if isinstance(value, Tensor):

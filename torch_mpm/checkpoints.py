@@ -141,7 +141,7 @@ def recomputed(advance: Advance, state: State, count: int, first: int, step: Any
 
     def steps(*tensors: Tensor) -> State:
         nonlocal again
-        given = _pytree.tree_unflatten(tensors, layout)
+        given = _pytree.tree_unflatten(tensors, layout).with_poses(state.poses)
         with contextlib.ExitStack() as stack:
             stack.enter_context(same_pools(pools))
             if again:  # graphs write to the tensors that `aside` would put away

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import math
 from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -17,6 +18,7 @@ import torch
 from torch import Tensor
 
 from ..capture import as_remembered, is_captured, is_same, is_traced
+from ..per_scene import finite
 from ..vectors import composed, norm
 from .motion import PACE, RigidMotion
 
@@ -35,23 +37,32 @@ class Left(NamedTuple):
     Attributes:
         given: the attributes of the obstacle, in a form that shows whether they have changed.
         placements: how often it was placed.
-        motion: how it moves from here on.
-        own: whether that is what its attributes say.
+        values: the attributes then, which later writes do not change; and `start` and `end`.
+        moves: how it moves from here on; None for as the attributes say.
         arrives: whether it may still be on its way to an assigned pose, in a scene that was paused.
         known: scenes in which it was left, bool [B]; in others it is placed. None for all.
     """
 
     given: tuple[Any, ...]
     placements: int
-    motion: RigidMotion
-    own: bool = True
+    values: tuple[Any, ...]
+    moves: RigidMotion | None = None
     arrives: bool = False
     known: Tensor | None = None
 
+    @property
+    def motion(self) -> RigidMotion:
+        """How it moves from here on."""
+        return _motion(self.values) if self.moves is None else self.moves
+
     def map(self, function: Callable[[Tensor], Tensor]) -> Left:
-        """With other tensors in the motion."""
-        values = (getattr(self.motion, name) for name in ASSIGNED)
-        return self._replace(motion=_motion([function(v) if isinstance(v, Tensor) else v for v in values], self.motion))
+        """With other tensors."""
+
+        def mapped(values: Sequence[Any]) -> tuple[Any, ...]:
+            return tuple(function(v) if isinstance(v, Tensor) else v for v in values)
+
+        moves = None if self.moves is None else _motion(mapped(_values(self.moves)))
+        return self._replace(values=mapped(self.values), moves=moves)
 
     def to(self, device: torch.device) -> Left:
         """On another device."""
@@ -83,18 +94,21 @@ class Course:
 
 
 class Span(NamedTuple):
-    """When a control step begins and how long it is [s]: numbers, or tensors [] or [B]."""
+    """When a control step begins, how long it is, and each of its steps [s]: numbers, or tensors [] or [B]."""
 
     begin: float | Tensor
     seconds: float | Tensor
-    device: torch.device
+    pace: float | Tensor
 
 
-@contextlib.contextmanager
+Leave = Callable[[Any], Any]
+"""What the state after a control step passes, so that it stores where its obstacles are."""
+
+
 def control_step(
     step: Any, state: State, n: int, dt: float | Tensor, seconds: float | Tensor | None = None
-) -> Iterator[Callable[[State], State]]:
-    """Where obstacles move as they do in n steps from a state; gives a function that the state after them passes.
+) -> contextlib.AbstractContextManager[Leave]:
+    """A context in which obstacles move as they do in n steps from a state.
 
     A step inside another control step is one of its own for obstacles whose attributes were assigned meanwhile, as by
     `on_particles`, and for no others.
@@ -108,33 +122,53 @@ def control_step(
     Raises:
         ValueError: on the CPU, where a velocity contradicts the change of a pose. On CUDA the status counts it.
     """
-    obstacles = obstacles_of(step)
-    if not obstacles or n == 0 or torch.compiler.is_compiling() or is_traced(state.x) or is_captured(state.x):
-        yield _unchanged
-        return
-    inside = [o for o in obstacles if o.course is not None]
-    if inside:
-        span = Span(state.time, dt, state.x.device)
-        changed = [o for o in inside if not _is_as_given(o, o.course.after)]  # type: ignore[union-attr]
-        for obstacle in changed:
-            assert obstacle.course is not None
-            obstacle.follow(course_of(obstacle, _underway(obstacle.course), span), dt)
-        for obstacle in inside:
-            if obstacle.pace is not dt:
-                obstacle.follow(obstacle.course, dt)
-        yield _unchanged
-        for obstacle in changed:
-            assert obstacle.course is not None
-            after = obstacle.course.after
-            obstacle.follow(Course(None if after.own else after.motion, after), dt)
-        return
-    span = Span(state.time, n * dt if seconds is None else seconds, state.x.device)
-    poses = state.poses
-    courses = [course_of(o, poses.get(o.key), span) for o in obstacles]
+    obstacles = [] if n == 0 or torch.compiler.is_compiling() else obstacles_of(step)
+    if not obstacles or is_traced(state.x) or is_captured(state.x) or _nothing_new(obstacles, state.poses):
+        return contextlib.nullcontext(_unchanged)
+    if any(o.course is not None for o in obstacles):
+        return _inside(obstacles, state, dt)
+    return _control_step(step, obstacles, state, Span(state.time, n * dt if seconds is None else seconds, dt))
+
+
+def _nothing_new(obstacles: Sequence[Obstacle], poses: Poses) -> bool:
+    """Whether no obstacle follows a path or has another motion than in the steps before: all move as they are."""
+    for obstacle in obstacles:
+        course: Course | None = vars(obstacle)["course"]
+        left = poses.get(obstacle.key) if course is None else course.after
+        if left is None or (course is None and (left.moves is not None or left.arrives)):
+            return False
+        if "position" in obstacle._modules or callable(vars(obstacle).get("position")):
+            return False
+        if not _is_as_left(obstacle, left):
+            return False
+    return True
+
+
+@contextlib.contextmanager
+def _inside(obstacles: Sequence[Obstacle], state: State, dt: float | Tensor) -> Iterator[Leave]:
+    """A step inside a control step."""
+    inside, span = [o for o in obstacles if o.course is not None], Span(state.time, dt, dt)
+    changed = [o for o in inside if not _is_as_left(o, o.course.after)]  # type: ignore[union-attr]
+    for obstacle in changed:
+        assert obstacle.course is not None
+        obstacle.follow(course_of(obstacle, _underway(obstacle.course), span, state.x.device), dt)
+    for obstacle in inside:
+        if obstacle.pace is not dt:
+            obstacle.follow(obstacle.course, dt)
+    yield _unchanged
+    for obstacle in changed:
+        assert obstacle.course is not None
+        after = obstacle.course.after
+        obstacle.follow(Course(after.moves, after), dt)
+
+
+@contextlib.contextmanager
+def _control_step(step: Any, obstacles: Sequence[Obstacle], state: State, span: Span) -> Iterator[Leave]:
+    courses = [course_of(o, state.poses.get(o.key), span, state.x.device) for o in obstacles]
     _report(step, obstacles, courses)
     try:
         for obstacle, course in zip(obstacles, courses, strict=True):
-            obstacle.follow(course, dt)
+            obstacle.follow(course, span.pace)
         yield lambda state: _leave(state, obstacles)
     finally:
         for obstacle in obstacles:
@@ -175,16 +209,23 @@ class _Motions:
             vars(obstacle)[name].update(values)
 
 
-def obstacles_of(step: Any) -> list[Obstacle]:
+def obstacles_of(step: Any) -> Sequence[Obstacle]:
     """Those of a `Step` and of its heat, or of a module that has some."""
-    from ..step import Step
-    from .obstacles import Obstacle
-
+    Step, Obstacle = _classes()
     if not isinstance(step, torch.nn.Module):
         return []
     if isinstance(step, Step) and step.heat is None and all(isinstance(b, Obstacle) for b in step.boundaries.entries):
-        return list(step.boundaries.entries)
+        return step.boundaries.entries
     return [m for m in step.modules() if isinstance(m, Obstacle)]
+
+
+@functools.cache
+def _classes() -> tuple[Any, Any]:
+    """Which import this module."""
+    from ..step import Step
+    from .obstacles import Obstacle
+
+    return Step, Obstacle
 
 
 def _unchanged(state: State) -> State:
@@ -195,7 +236,7 @@ def _underway(course: Course) -> Left:
     """Where an obstacle is left in the middle of a control step."""
     if course.during is None:
         return course.after
-    return course.after._replace(motion=course.during, own=False, arrives=False)
+    return course.after._replace(moves=course.during, arrives=False)
 
 
 def _leave(state: State, obstacles: Sequence[Obstacle]) -> State:
@@ -237,46 +278,72 @@ def _count(step: Any, wrong: Tensor) -> None:
 # ---- one obstacle
 
 
-def course_of(obstacle: Obstacle, left: Left | None, span: Span) -> Course:
+def course_of(obstacle: Obstacle, left: Left | None, span: Span, device: torch.device) -> Course:
     """How an obstacle moves in a control step, from where a state has left it; None for nowhere."""
     if left is None or left.placements != obstacle.placements:
-        return Course(None, _at_attributes(obstacle))
-    same = [is_same(known, getattr(obstacle, name)) for known, name in zip(left.given, ASSIGNED, strict=True)]
-    if all(same) and not left.arrives and (left.own or left.known is None):
-        return Course(None if left.own else left.motion, left)
-    centre = _part(("position", "velocity"), obstacle, left, span, same[:2])
-    rotation = _part(("rotation", "angular_velocity"), obstacle, left, span, same[2:])
-    during = _motion([*centre.during, *rotation.during], obstacle)
-    after = _motion([*centre.after, *rotation.after], obstacle)
+        return Course(None, _left_at(obstacle))
+    same = _sameness(obstacle, left)
+    if all(same) and not left.arrives and (left.moves is None or left.known is None):
+        return Course(left.moves, left)
+    centre = _part(("position", "velocity"), obstacle, left, span, device, same[:2])
+    rotation = _part(("rotation", "angular_velocity"), obstacle, left, span, device, same[2:])
+    frame = obstacle.start, obstacle.end
+    during = _motion((*centre.during, *rotation.during, *frame))
     own, arrives = centre.own and rotation.own, centre.arrives or rotation.arrives
+    after = None if own else _motion((*centre.after, *rotation.after, *frame))
     wrong = [part.contradicts for part in (centre, rotation) if part.contradicts is not None]
-    left = Left(_given(obstacle), obstacle.placements, after, own, arrives)
-    return Course(during, left, None if not wrong else wrong[0] if len(wrong) == 1 else wrong[0] | wrong[1])
+    contradicts = None if not wrong else wrong[0] if len(wrong) == 1 else wrong[0] | wrong[1]
+    return Course(during, _left_at(obstacle)._replace(moves=after, arrives=arrives), contradicts)
 
 
-def _at_attributes(obstacle: Obstacle) -> Left:
-    values = [_copy(getattr(obstacle, name)) for name in ASSIGNED]
-    return Left(_given(obstacle), obstacle.placements, _motion(values, obstacle))
+def _left_at(obstacle: Obstacle) -> Left:
+    """An obstacle that is where its attributes say."""
+    values = _assigned(obstacle)
+    copies = tuple(_copy(name, value) for name, value in zip(ASSIGNED, values, strict=True))
+    given = tuple(as_remembered(value) for value in values)
+    return Left(given, obstacle.placements, (*copies, obstacle.start, obstacle.end))
 
 
-def _motion(values: Sequence[Any], like: RigidMotion) -> RigidMotion:
-    position, velocity, rotation, angular_velocity = values
-    motion = RigidMotion(position, None if callable(position) else velocity, rotation, angular_velocity, like.start)
-    motion.end = like.end
+def _values(motion: RigidMotion) -> tuple[Any, ...]:
+    return *_assigned(motion), motion.start, motion.end
+
+
+def _motion(values: Sequence[Any]) -> RigidMotion:
+    position, velocity, rotation, angular_velocity, start, end = values
+    motion = RigidMotion(position, None if callable(position) else velocity, rotation, angular_velocity, start)
+    motion.end = end
     return motion
 
 
-def _given(obstacle: Obstacle) -> tuple[Any, ...]:
-    return tuple(as_remembered(getattr(obstacle, name)) for name in ASSIGNED)
+def _assigned(motion: RigidMotion) -> tuple[Any, ...]:
+    """The attributes by which it moves. Found by hand: `getattr` of a buffer takes a microsecond."""
+    plain, buffers, parameters = vars(motion), motion._buffers, motion._parameters
+    return tuple(
+        plain[name]
+        if name in plain
+        else buffers[name]
+        if name in buffers
+        else parameters[name]
+        if name in parameters
+        else motion._modules[name]
+        for name in ASSIGNED
+    )
 
 
-def _is_as_given(obstacle: Obstacle, left: Left) -> bool:
-    return all(is_same(known, getattr(obstacle, name)) for known, name in zip(left.given, ASSIGNED, strict=True))
+def _sameness(obstacle: Obstacle, left: Left) -> list[bool]:
+    """Whether each attribute is as it was."""
+    return [is_same(known, value) for known, value in zip(left.given, _assigned(obstacle), strict=True)]
 
 
-def _copy(value: Any) -> Any:
-    """A value that stays as it is when tensors are written to; differentiable."""
-    return value.clone() if isinstance(value, Tensor) else value
+def _is_as_left(obstacle: Obstacle, left: Left) -> bool:
+    return left.placements == obstacle.placements and all(_sameness(obstacle, left))
+
+
+def _copy(name: str, value: Any) -> Any:
+    """A value that stays as it is when tensors and lists are written to; differentiable."""
+    if isinstance(value, Tensor):
+        return value.clone()
+    return value if value is None or isinstance(value, (tuple, float)) or callable(value) else finite(name, value)
 
 
 class _Part(NamedTuple):
@@ -292,15 +359,17 @@ class _Part(NamedTuple):
     contradicts: Tensor | None = None
 
 
-def _part(names: tuple[str, str], obstacle: Obstacle, left: Left, span: Span, same: Sequence[bool]) -> _Part:
+def _part(
+    names: tuple[str, str], obstacle: Obstacle, left: Left, span: Span, device: torch.device, same: Sequence[bool]
+) -> _Part:
     """A pose and its rate by their names."""
-    own = _copy(getattr(obstacle, names[0])), _copy(getattr(obstacle, names[1]))
+    own = _copy(names[0], getattr(obstacle, names[0])), _copy(names[1], getattr(obstacle, names[1]))
     before = getattr(left.motion, names[0]), getattr(left.motion, names[1])
     if all(value is None for value in (*own, *before)):
         return _Part(own, own)
-    changes = _Changes(names[0] == "rotation", left, span, obstacle.start)
+    changes = _Changes(names[0] == "rotation", left, span, obstacle.start, device)
     if all(same) and not left.arrives:
-        return _Part(own, own) if left.own else changes.of_known(_Part(before, before, False), own)
+        return _Part(own, own) if left.moves is None else changes.of_known(_Part(before, before, False), own)
     if callable(own[0]):
         return _Part(own, own, contradicts=changes.jump(obstacle.centre_at(span.begin, changes.like), None))
     if same[0] and not left.arrives:
@@ -322,16 +391,17 @@ class _Changes:
         left: where the obstacle was left.
         span: the control step.
         start: time at which a pose is given, and from which its rate counts [s].
+        device: of the particles.
     """
 
-    def __init__(self, turns: bool, left: Left, span: Span, start: float) -> None:
+    def __init__(self, turns: bool, left: Left, span: Span, start: float, device: torch.device) -> None:
         self._left, self._span = left, span
-        self.like = torch.empty(0, dtype=torch.float64, device=span.device)
+        self.like = torch.empty(0, dtype=torch.float64, device=device)
         self._elapsed, self._seconds = self._time(span.begin) - start, self._time(span.seconds)
         self._centre = left.motion.centre_at(span.begin, self.like)
         dim = self._centre.shape[-1]
         self._turns, self._rank = turns, 0 if turns and dim == 2 else 1
-        self._zero = torch.zeros((dim,) * self._rank, dtype=torch.float64, device=span.device)
+        self._zero = torch.zeros((dim,) * self._rank, dtype=torch.float64, device=device)
 
     def value(self, value: Any) -> Tensor:
         """A pose or a rate as a tensor; None for zero."""

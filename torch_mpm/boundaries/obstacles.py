@@ -144,7 +144,8 @@ class Obstacle(RigidMotion):
         """Where a state has left the obstacle, in the dtype of its particles; its pose at the time of the state if no
         step has moved the state yet."""
         left = state.poses.get(self.key)
-        motion = self if left is None or left.placements != self.placements else left.motion
+        placed = left is None or left.placements != self.placements
+        motion = self if placed or left is None else left.motion
         return motion.pose(state.time, state.x)
 
     def follow(self, course: Course | None, pace: float | Tensor) -> None:
