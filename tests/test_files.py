@@ -76,6 +76,7 @@ READERS = {
     "points.npy": seed.file,
     "points.npz": seed.file,
     "points.csv": seed.file,
+    "points.ply": seed.file,
     "body.obj": _mesh,
     "body.stl": _mesh,
     "fingerprint.obj": _body,

@@ -13,20 +13,18 @@ these coordinates in float64, and points are stored relative to the origin, so t
 from __future__ import annotations
 
 import contextlib
-import csv
 import functools
 import itertools
 import math
-import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from . import memory, shapes
+from . import memory, point_files, shapes
 from .errors import (
     check_count,
     check_device,
@@ -36,7 +34,6 @@ from .errors import (
     default_dtype,
     shape_of,
 )
-from .files import check_file
 from .shapes import Shape
 
 Vector = Sequence[float] | Tensor
@@ -402,14 +399,17 @@ def file(
     path: str | Path,
     volume: float | None = None,
     *,
+    dim: int | None = None,
     origin: Vector | None = None,
     dtype: torch.dtype | None = None,
     device: torch.device | str | None = None,
 ) -> Points:
-    """Points from a file: .npy [P, D], .npz with ``x`` [P, D] and perhaps ``volume`` [P], or .csv.
+    """Points from a file: .npy, .npz, .csv, .tsv, .txt or .ply.
 
-    The first line of a .csv names the columns x, y, (z,) (volume). ``volume`` is the total volume [m^3], shared evenly;
-    needed where the file has no volumes. ``origin``, ``dtype`` and ``device`` as in :func:`fill`.
+    `torch_mpm.point_files.read` describes the formats, and returns other properties of a .ply too, such as colours.
+
+    ``volume`` is the total volume [m^3], shared evenly; needed where the file has no volumes. ``dim`` is the number of
+    coordinates, by default those in the file. ``origin``, ``dtype`` and ``device`` as in :func:`fill`.
 
     Raises:
         OSError: when there is no such file, or it cannot be read.
@@ -417,10 +417,13 @@ def file(
     """
     check_dtype(dtype)
     check_device(device)
-    with on_host():
-        x, volumes = _read_points(Path(path))
-    if x.dim() != 2 or x.shape[1] not in (2, 3) or len(x) == 0:
-        raise ValueError(f"points in {path} must have shape [P, 2] or [P, 3] with P > 0, got {list(x.shape)}")
+    if dim not in (None, 2, 3):
+        raise ValueError(f"dim must be 2, 3 or None, got {dim}")
+    read = point_files.read(path, dim)
+    x, volumes = torch.from_numpy(read.x), None if read.volume is None else torch.from_numpy(read.volume)
+    if x.dim() != 2 or x.shape[1] not in ((2, 3) if dim is None else (dim,)) or len(x) == 0:
+        expected = "[P, 2] or [P, 3]" if dim is None else f"[P, {dim}]"
+        raise ValueError(f"points in {path} must have shape {expected} with P > 0, got {list(x.shape)}")
     if volume is not None:
         volumes = torch.full_like(x[:, 0], _positive("volume", volume) / len(x))
     if volumes is None:
@@ -430,61 +433,3 @@ def file(
     if not bool(torch.isfinite(x).all() and torch.isfinite(volumes).all()):
         raise ValueError(f"points in {path} must be finite")
     return _points(x, volumes, origin, dtype, device)
-
-
-def _read_points(path: Path) -> tuple[Tensor, Tensor | None]:
-    check_file(path, "points")
-    readers = {".npy": _read_npy, ".npz": _read_npz, ".csv": _read_csv}
-    if path.suffix not in readers:
-        raise ValueError(f"points file must end in .npy, .npz or .csv, got {path}")
-    try:
-        return readers[path.suffix](path)
-    except Exception as error:  # damaged archives and tables raise many kinds
-        raise ValueError(f"points file {path} cannot be read: {error}") from error
-
-
-def _read_npy(path: Path) -> tuple[Tensor, Tensor | None]:
-    with path.open("rb") as handle:
-        return _read_array(handle, path.stat().st_size), None
-
-
-def _read_npz(path: Path) -> tuple[Tensor, Tensor | None]:
-    with zipfile.ZipFile(path) as archive:
-        sizes = {item.filename.removesuffix(".npy"): item.file_size for item in archive.infolist()}
-        if "x" not in sizes:
-            raise ValueError(f"it must hold an array 'x' of positions, got {sorted(sizes)}")
-        arrays = {}
-        for name in {"x", "volume"} & sizes.keys():
-            with archive.open(name + ".npy") as handle:
-                arrays[name] = _read_array(handle, sizes[name])
-    return arrays["x"], arrays.get("volume")
-
-
-def _read_array(handle: IO[bytes], size: int) -> Tensor:
-    """The array of a .npy file of ``size`` bytes; nothing is allocated for one that says it is larger."""
-    import numpy as np
-
-    read_header = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
-    version = np.lib.format.read_magic(handle)
-    if version not in read_header:
-        raise ValueError(f"format {version} is not known")
-    shape, fortran, dtype = read_header[version](handle)
-    count = math.prod(shape)
-    if dtype.kind not in "fiu":
-        raise ValueError(f"it must hold numbers, got an array of {dtype}")
-    if count * dtype.itemsize > min(size, memory.available() / 4):
-        raise ValueError(f"its array {list(shape)} is larger than its {size} bytes, or than the free memory")
-    values = np.frombuffer(handle.read(count * dtype.itemsize), dtype, count).astype(np.float64)
-    return torch.from_numpy(values.reshape(shape, order="F" if fortran else "C").copy())
-
-
-def _read_csv(path: Path) -> tuple[Tensor, Tensor | None]:
-    with path.open(newline="") as handle:
-        rows = csv.DictReader(handle)
-        names = rows.fieldnames or []
-        axes = [name for name in ("x", "y", "z") if name in names]
-        if axes[:2] != ["x", "y"]:
-            raise ValueError(f"its first line must name the columns x, y, (z,) (volume), got {names}")
-        table = [[float(row[name]) for name in [*axes, *(["volume"] if "volume" in names else [])]] for row in rows]
-    values = torch.tensor(table, dtype=torch.float64).reshape(len(table), -1)
-    return values[:, : len(axes)], values[:, len(axes)] if "volume" in names else None

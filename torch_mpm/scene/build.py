@@ -342,10 +342,8 @@ def _seeded(
     scene: Any, origin: Sequence[float] | None, body: Any, number: int
 ) -> tuple[seed.Points, seed.Region | None]:
     if isinstance(body, schema.PointsBody):
-        points = seed.file(scene.folder / body.file, body.volume, origin=origin, dtype=torch.float64)
-        if points.x.shape[1] != scene.dim:
-            raise ValueError(f"{body.file} has points in {points.x.shape[1]}-D, and the scene is in {scene.dim}-D")
-        return points, None
+        options = {"dim": scene.dim, "origin": origin, "dtype": torch.float64}
+        return seed.file(scene.folder / body.file, body.volume, **options), None
     shape = region(body, scene.folder)
     assert shape is not None
     options = {"method": body.seeding, "seed": number, "count": body.particles, "dtype": torch.float64}

@@ -339,7 +339,7 @@ class PointsBody(Body):
     shape: Literal["points"] = "points"
     """kind of shape"""
     file: str
-    """.npy, .npz (x, volume) or .csv (x, y, z, volume) file, relative to the scene file"""
+    """.npy, .npz (x, volume), .csv, .tsv, .txt (x, y, z, volume) or .ply file, relative to the scene file"""
     volume: Positive | None = None
     """total volume [m^3], needed if the file has no volumes"""
 

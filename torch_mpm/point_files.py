@@ -1,0 +1,269 @@
+"""Files of points: NumPy arrays, tables of numbers, and PLY."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+import re
+import zipfile
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import IO, Any, NamedTuple
+
+import numpy as np
+
+from . import memory
+from .files import check_file
+from .surface_mesh import Array
+
+FAMILIES = ("", "points?", "positions?", "coordinates?", "coords?", "pos")
+"""First words of the names of coordinates, the preferred ones first: x, Points:0, position_x, ..."""
+VOLUME = re.compile(r"(particle[ _])?vol(ume)?")
+COMMENTS = ("#", "%", "//")
+PLY_TYPES = {
+    **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
+    **{"float": "f4", "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2"},
+    **{"int32": "i4", "uint32": "u4", "float32": "f4", "float64": "f8"},
+}
+PLY_ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
+
+
+class PointFile(NamedTuple):
+    """Positions float64 [P, D] [m], volumes float64 [P] [m³] or None, and other properties of a .ply by name [P]."""
+
+    x: Array
+    volume: Array | None
+    fields: dict[str, Array]
+
+
+def read(path: str | Path, dim: int | None = None) -> PointFile:
+    """Points of a file, by the end of its name.
+
+    - .npy: positions [P, D].
+    - .npz: positions ``x`` [P, D] and perhaps volumes ``volume`` [P].
+    - .csv, .tsv, .txt: rows of numbers that are separated by commas, semicolons, tabs or spaces; lines that begin with
+      #, % or // are comments. Names of the columns may stand in a first line, a comment or not: x, y, (z,) (volume) in
+      any case and order, among others; also Points:0, position_x and the like, with the unit [m]. Without names the
+      columns are the positions, then perhaps the volume: three columns are x, y, z, but x, y, volume with ``dim`` 2.
+    - .ply: the properties x, y, z and perhaps volume of its vertices, ASCII or binary.
+
+    Args:
+        path: the file.
+        dim: number of coordinates; None for those in the file. Where it is 2, a z that is the same everywhere is left
+            out.
+
+    Raises:
+        OSError: for a file that cannot be read.
+        ValueError: for an unknown format, or other contents.
+    """
+    path = Path(path)
+    check_file(path, "points")
+    readers: dict[str, Callable[[Path, int | None], PointFile]] = {
+        **{".npy": _read_npy, ".npz": _read_npz, ".ply": _read_ply},
+        **{end: _read_table for end in (".csv", ".tsv", ".txt")},
+    }
+    if path.suffix.lower() not in readers:
+        raise ValueError(f"points file must end in {', '.join(readers)}, got {path}")
+    try:
+        found = readers[path.suffix.lower()](path, dim)
+    except Exception as error:  # damaged archives and tables raise many kinds
+        raise ValueError(f"points file {path} cannot be read: {error}") from error
+    if dim == 2 and found.x.ndim == 2 and found.x.shape[1] == 3 and (found.x[:, 2] == found.x[:1, 2]).all():
+        found = found._replace(x=found.x[:, :2])
+    return found
+
+
+# ---- NumPy
+
+
+def _read_npy(path: Path, dim: int | None) -> PointFile:
+    with path.open("rb") as handle:
+        return PointFile(_array(handle, path.stat().st_size), None, {})
+
+
+def _read_npz(path: Path, dim: int | None) -> PointFile:
+    with zipfile.ZipFile(path) as archive:
+        sizes = {item.filename.removesuffix(".npy"): item.file_size for item in archive.infolist()}
+        if "x" not in sizes:
+            raise ValueError(f"it must hold an array 'x' of positions, got {sorted(sizes)}")
+        arrays = {}
+        for name in {"x", "volume"} & sizes.keys():
+            with archive.open(name + ".npy") as handle:
+                arrays[name] = _array(handle, sizes[name])
+    return PointFile(arrays["x"], arrays.get("volume"), {})
+
+
+def _array(handle: IO[bytes], size: int) -> Array:
+    """The array of a .npy file of ``size`` bytes; nothing is allocated for one that says it is larger."""
+    read_header = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+    version = np.lib.format.read_magic(handle)
+    if version not in read_header:
+        raise ValueError(f"format {version} is not known")
+    shape, fortran, dtype = read_header[version](handle)
+    count = math.prod(shape)
+    if dtype.kind not in "fiu":
+        raise ValueError(f"it must hold numbers, got an array of {dtype}")
+    if count * dtype.itemsize > min(size, memory.available() / 4):
+        raise ValueError(f"its array {list(shape)} is larger than its {size} bytes, or than the free memory")
+    values = np.frombuffer(handle.read(count * dtype.itemsize), dtype, count).astype(np.float64)
+    return values.reshape(shape, order="F" if fortran else "C").copy()
+
+
+# ---- tables
+
+
+def _read_table(path: Path, dim: int | None) -> PointFile:
+    lines = path.read_text(encoding="utf-8-sig").splitlines()
+    names, first = _header(lines)
+    if first == len(lines):
+        raise ValueError("it has no rows of numbers")
+    separator = _separator(lines[first])
+    axes, volume = _named(names) if names else _unnamed(len(_cells(lines[first], separator)), dim)
+    rows = (line.partition("#")[0] for line in lines[first:] if not line.lstrip().startswith(COMMENTS))
+    options: dict[str, Any] = {"delimiter": separator, "comments": None, "quotechar": '"', "ndmin": 2}
+    # Without names, all rows are checked for the same number of columns.
+    values = np.loadtxt(rows, usecols=axes + volume if names else None, **options)
+    return PointFile(values[:, : len(axes)], values[:, -1] if volume else None, {})
+
+
+def _header(lines: Sequence[str]) -> tuple[list[str], int]:
+    """Names of columns, none where there are not any, and the index of the first row of numbers."""
+    names: list[str] = []
+    remark: list[str] = []
+    for index, line in enumerate(lines):
+        text = line.strip()
+        comment = text.startswith(COMMENTS)
+        text = text.lstrip("#%/ ") if comment else text
+        cells = _cells(text, _separator(text))
+        columns = [column for axis in _coordinates(cells) for column in axis]
+        if comment:
+            remark = cells if columns and columns == list(range(columns[0], columns[-1] + 1)) else remark
+        elif columns and not names:
+            names = cells
+        elif cells:
+            if not all(map(_is_number, cells)):
+                raise ValueError(
+                    f"its first line must be numbers or name the columns x, y, (z,) (volume), got {cells}; "
+                    "names such as Points:0 and position_x will do too"
+                )
+            if names and len(names) != len(cells):
+                raise ValueError(f"it names {len(names)} columns {names}, and has {len(cells)} numbers in a row")
+            return names or (remark if len(remark) == len(cells) else []), index
+    return names, len(lines)
+
+
+def _separator(line: str) -> str | None:
+    """Between the cells of a line; None for spaces."""
+    return next((mark for mark in ";\t," if mark in line), None)
+
+
+def _cells(line: str, separator: str | None) -> list[str]:
+    text = line.partition("#")[0].strip()
+    cells = next(csv.reader([text], delimiter=separator, skipinitialspace=True), []) if separator else text.split()
+    return [cell.strip().strip("\"'") for cell in cells]
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True
+
+
+def _words_and_unit(name: str) -> tuple[str, str]:
+    """A name such as "Position_X [m]" in lower case, and its unit."""
+    found = re.fullmatch(r"(.*?)\s*[\[(]([^\W\d][^\])]*)[\])]", name.lower())
+    return (found[1], found[2].strip()) if found else (name.lower(), "")
+
+
+def _coordinates(names: Sequence[str]) -> list[list[int]]:
+    """Columns that have the names of x, y and perhaps z; empty where there are no such names."""
+    texts = [_words_and_unit(name)[0] for name in names]
+    for family in FAMILIES:
+        found = []
+        for axis, letter in enumerate("xyz"):
+            form = rf"{family}[ _.:]?({letter}|{axis}|\[{axis}\])" if family else letter
+            found.append([k for k, text in enumerate(texts) if re.fullmatch(form, text)])
+        if found[0] and found[1]:
+            return [columns for columns in found if columns]
+    return []
+
+
+def _named(names: Sequence[str]) -> tuple[list[int], list[int]]:
+    """Columns of the coordinates, and of the volume where there is one."""
+    found = _coordinates(names)
+    axes = [columns[0] for columns in found]
+    volume = [k for k, name in enumerate(names) if VOLUME.fullmatch(_words_and_unit(name)[0])]
+    if any(len(columns) > 1 for columns in (*found, volume)):
+        raise ValueError(f"a coordinate or the volume has two columns in {list(names)}")
+    for columns, units in ((axes, ("", "m")), (volume, ("", "m^3", "m3", "m³", "m^2", "m2", "m²"))):
+        for k in columns:
+            if _words_and_unit(names[k])[1] not in units:
+                raise ValueError(f"the column {names[k]!r} must be in {units[1]}")
+    return axes, volume
+
+
+def _unnamed(count: int, dim: int | None) -> tuple[list[int], list[int]]:
+    """The same of a table without names."""
+    allowed = (2, 3, 4) if dim is None else (dim, dim + 1)
+    if count not in allowed:
+        raise ValueError(
+            f"its rows have {count} numbers without names, not {' or '.join(map(str, allowed))}: name the columns in a "
+            "first line, such as x,y,z,volume"
+        )
+    axes = min(count, 3 if dim is None else dim)
+    return list(range(axes)), list(range(axes, count))
+
+
+# ---- PLY
+
+
+def _read_ply(path: Path, dim: int | None) -> PointFile:
+    with path.open("rb") as handle:
+        order, count, names, dtype = _ply_header(handle)
+        size = path.stat().st_size - handle.tell()
+        least = 2 * len(names) - 1 if order == "=" else dtype.itemsize  # bytes of a row
+        if count * least > size:
+            raise ValueError(f"its {count} vertices do not fit in its {size} bytes")
+        if order == "=":
+            text = io.TextIOWrapper(handle, encoding="ascii")
+            values = np.loadtxt(text, max_rows=count, ndmin=2, usecols=range(len(names)))
+            fields = {name: values[:, k] for k, name in enumerate(names)}
+        else:
+            rows = np.frombuffer(handle.read(count * dtype.itemsize), dtype, count)
+            fields = {name: rows[name].astype(rows[name].dtype.newbyteorder("=")) for name in names}
+    if len(fields["x"]) != count:
+        raise ValueError(f"it has {len(fields['x'])} of its {count} vertices")
+    x = np.stack([fields.pop(axis).astype(np.float64) for axis in "xyz"], 1)
+    volume = fields.pop("volume", None)
+    return PointFile(x, None if volume is None else volume.astype(np.float64), fields)
+
+
+def _ply_header(handle: IO[bytes]) -> tuple[str, int, list[str], np.dtype[Any]]:
+    """Byte order ("=" for ASCII), number of vertices, the names of their properties, and a row of them."""
+    if handle.readline(80).strip() != b"ply":
+        raise ValueError("it does not begin with 'ply'")
+    order, elements, count, properties = "", 0, 0, []
+    while (words := handle.readline(2**12).decode("ascii").split()) != ["end_header"]:
+        match words:
+            case ["format", name, _] if name in PLY_ORDERS:
+                order = PLY_ORDERS[name]
+            case ["element", name, number]:
+                elements += 1
+                if elements == 1 and name != "vertex":
+                    raise ValueError(f"its first element must be vertex, got {name}")
+                count = int(number) if elements == 1 else count
+            case ["property", kind, name] if kind in PLY_TYPES:
+                properties += [(name, order + PLY_TYPES[kind])] if elements == 1 else []
+            case ["property", "list", _, _, _] if elements > 1:
+                pass
+            case ["comment" | "obj_info", *_]:
+                pass
+            case _:
+                raise ValueError(f"its header has an unknown line: {' '.join(words)!r}")
+    names = [name for name, _ in properties]
+    if not order or not {"x", "y", "z"} <= set(names):
+        raise ValueError(f"its vertices must have the properties x, y and z, got {names}")
+    return order, count, names, np.dtype(properties)
