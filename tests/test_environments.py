@@ -1,5 +1,6 @@
 """Scenes side by side: each with its own size, clock and end; replaced where they stand."""
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -337,3 +338,79 @@ def test_scenes_are_named_by_masks_or_whole_numbers(device):
     envs.count_impulses()
     with pytest.raises(ValueError, match="impulses must be counted"):
         envs.forces()
+
+
+# ---- gradients
+
+
+def controlled(device: str) -> tuple[mpm.Environments, mpm.Sphere]:
+    """Two scenes with a paddle in front of the block."""
+    paddle = mpm.Sphere(torch.tensor([[0.13, 0.4]] * 2, dtype=F64, device=device), 0.12, kind="sticky")
+    step = step_of(2, device, boundaries=[paddle])
+    return mpm.Environments(step, [one(0, device), one(0, device)]), paddle
+
+
+def reward(envs: mpm.Environments) -> Tensor:
+    return (envs.observe("v")[..., 0] * envs.observe("x")[..., 0]).sum(1)
+
+
+@pytest.mark.parametrize("action", ["position", "velocity", "gravity", "state", "law", "dt"])
+def test_gradients_pass_through_calls(action, device):
+    """As those of finite differences, through three calls, and beside another part of the loss."""
+    shift = {"position": 0.02, "velocity": 1.5, "gravity": 3.0, "state": 0.5, "law": 1e4, "dt": DT}[action]
+    scenes = (2,) if action in ("law", "dt") else (2, 2)
+
+    def total(a: Tensor) -> Tensor:
+        envs, paddle = controlled(device)
+        step, dt = envs.step, DT
+        home = paddle.position
+        if action == "state":
+            states = [one(0, device).replace(v=one(0, device).v + a[k]) for k in range(2)]
+            envs = mpm.Environments(step, states)
+        elif action == "law":
+            step.law.E = a
+        elif action == "dt":
+            dt = a
+        for k in range(3):
+            if action == "position":
+                paddle.position = home + (k + 1) * a
+            elif action == "velocity":
+                paddle.velocity = (k + 1) * a
+            elif action == "gravity":
+                step.gravity = (k + 1) * a
+            envs.advance(4, dt)
+        return reward(envs).sum() + 1e-3 * a.square().sum()
+
+    a = shift * (1 + 0.1 * torch.arange(float(np.prod(scenes)), dtype=F64, device=device).reshape(scenes))
+    a.requires_grad_()
+    (gradient,) = torch.autograd.grad(total(a), a)
+    with torch.no_grad():
+        for k in range(a.numel()):
+            e = torch.zeros_like(a).flatten()
+            e[k] = h = 1e-6 * shift
+            e = e.reshape(a.shape)
+            difference = float(total(a + e) - total(a - e)) / (2 * h)
+            assert float(gradient.flatten()[k]) == pytest.approx(difference, rel=1e-4, abs=1e-7 / shift), k
+    assert float((gradient - 2e-3 * a).abs().max()) > 1e-3 / shift
+
+
+def test_a_reset_cuts_the_gradient_of_its_scenes(device):
+    """And those of the others pass; `detach` cuts all."""
+    envs, paddle = controlled(device)
+    a = torch.full((2, 2), 0.02, dtype=F64, device=device, requires_grad=True)
+    envs.advance(2, DT)
+    paddle.position = paddle.position + a
+    envs.advance(4, DT)
+    mask = torch.tensor([False, True], device=device)
+    (whole,) = torch.autograd.grad(reward(envs).sum(), a, retain_graph=True)
+    envs.reset(mask)
+    paddle.position = paddle.position.detach()
+    envs.advance(4, DT)
+    (gradient,) = torch.autograd.grad(reward(envs).sum(), a, retain_graph=True)
+    assert (whole != 0).any(1).all() and (gradient[0] != 0).any() and (gradient[1] == 0).all()
+    envs.reset([0], [one(0, device).replace(v=one(0, device).v * a[0, 0])])
+    (gradient,) = torch.autograd.grad(envs.observe("v").sum(), a, retain_graph=True)
+    assert float(gradient[0, 0]) == pytest.approx(float(one(0, device).v.sum()))
+    envs.detach()
+    envs.advance(2, DT)
+    assert not envs.state.x.requires_grad and not envs.time.requires_grad

@@ -48,7 +48,7 @@ class Environments:
         room: rows of each scene R; None for the largest number of particles of a state.
 
     Attributes:
-        state: of all scenes, whose fields `reset` overwrites where they require no gradient: clone what shall stay. It
+        state: of all scenes, whose fields `reset` overwrites where none requires a gradient: clone what shall stay. It
             may be replaced by one of as many particles, with another velocity say. Absent particles have no volume, and
             a mass of one.
         time: of each scene since it began [B] [s], float64.
@@ -192,10 +192,12 @@ class Environments:
         if len(given) != count * self.room:
             raise ValueError(f"states must be {count}, one for each scene to reset, got {len(given) // self.room}")
         changes: dict[str, Tensor] = {}
-        for name, old, new in _pairs(self.state, self._placed(given, index)):
-            rows, with_gradient = self._rows(old), old.requires_grad or new.requires_grad
+        pairs = _pairs(self.state, self._placed(given, index))
+        in_graph = any(t.requires_grad for _, *both in pairs for t in both)  # which saves fields as they are
+        for name, old, new in pairs:
+            rows = self._rows(old)
             of_mask = mask.reshape(-1, *(1,) * (rows.dim() - 1))
-            if with_gradient:
+            if in_graph:
                 new = self._rows(new) if index is None else rows.index_copy(0, index, self._rows(new))
                 changes[name] = torch.where(of_mask, new, rows).flatten(0, 1)
             elif index is None:
