@@ -236,6 +236,8 @@ def _per_scene(name: str, time: float | Tensor, scenes: int, like: Tensor) -> Te
     """A time of each scene in float64 [B], on the device of a tensor."""
     if not isinstance(time, Tensor):
         return like.new_full((scenes,), check_number(name, time, kinds=NUMBER_OR_TENSOR), dtype=torch.float64)
+    if time.requires_grad and torch.is_grad_enabled():
+        raise ValueError(f"{name} must not require grad: the dt of rollout_to are constants")
     if time.dim() > 1 or time.numel() not in (1, scenes):
         raise ValueError(f"{name} must be a number or have shape [], [1] or [B] = [{scenes}], got {shape_of(time)}")
     if time.device != like.device:

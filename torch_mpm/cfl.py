@@ -82,6 +82,8 @@ def stable_dt(
 ) -> Tensor:
     """Estimate of the largest stable time step of each scene, times `cfl`, without synchronising with the device.
 
+    It has no gradient: a dt is a constant of the steps that it is chosen for.
+
     With cfl = 1 and dt computed before every step no rollout of the stability benchmark turned a particle inside out;
     keep 0.5, the default of `Step.stable_dt`, where dt is computed less often or something else acts on the grid.
 

@@ -55,7 +55,10 @@ class Table(nn.Module):
 
     def __init__(self, temperature: Sequence[float] | Tensor, value: Sequence[float] | Tensor) -> None:
         super().__init__()
-        knots = _knots("temperature", temperature).detach().double()
+        knots = _knots("temperature", temperature)
+        if knots.requires_grad:
+            raise ValueError("temperature of a table must not require grad: only its values are differentiable")
+        knots = knots.double()
         values = _knots("value", value)
         if knots.dim() != 1 or len(knots) < 2 or values.shape != knots.shape:
             raise ValueError(

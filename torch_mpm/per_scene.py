@@ -57,6 +57,8 @@ class SceneParameters(TensorModule):
 
     def _constant(self, name: str, value: Any, like: Tensor) -> Tensor:
         """Numbers as a tensor; copied to a device once, so that later steps do not wait and can be captured."""
+        if isinstance(value, (list, tuple)) and any(isinstance(part, Tensor) for part in value):
+            raise TypeError(f"{name} must be numbers or one tensor, got tensors in a list: stack them (torch.stack)")
         if torch.compiler.is_compiling() or type(like) not in (Tensor, torch.nn.Parameter):
             return torch.tensor(value, dtype=like.dtype, device=like.device)
         kept = self._constants.setdefault((name, like.device, like.dtype), GraphCache())

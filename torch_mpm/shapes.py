@@ -483,7 +483,9 @@ class Sampled(Shape):
             raise ValueError(f"values must be a tensor [X, Y] or [X, Y, Z] of 2 or more each, got {shape_of(values)}")
         self.lower = check_vector("lower", lower, values.dim())
         self.spacing = float(check_number("spacing", spacing, "positive", lambda v: 0 < v < math.inf))
-        values = values.detach().to("cpu", torch.float64)
+        if values.requires_grad:
+            raise ValueError("values must not require grad: which nodes are inside is not differentiable")
+        values = values.to("cpu", torch.float64)
         if not bool(values.isfinite().all()):
             raise ValueError("values must be finite")
         if any(bool((values.select(axis, end) <= 0).any()) for axis in range(values.dim()) for end in (0, -1)):

@@ -471,6 +471,8 @@ def _no_motion(x: Tensor) -> Tensor:
 def _given_velocity(velocity: Any, P: int, D: int) -> Tensor:
     """[D] or [P, D]."""
     if not isinstance(velocity, Tensor):
+        if isinstance(velocity, (list, tuple)) and any(isinstance(part, Tensor) for part in velocity):
+            raise TypeError("velocity must be numbers or one tensor, got tensors in a list: stack them (torch.stack)")
         try:
             velocity = torch.as_tensor(velocity, dtype=torch.float64, device="cpu")
         except (TypeError, ValueError, OverflowError, RuntimeError) as error:

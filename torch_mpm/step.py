@@ -350,9 +350,9 @@ class Step(TensorModule):
         `dt = step.stable_dt(state, previous=dt)`, which keeps that dt while the limit allows it and is less than twice
         as long.
 
-        Moving obstacles count; what `on_grid` and other boundaries do to the velocities is not known. This is the limit
-        of explicit steps, which implicit ones may exceed; with explicit materials, that of these alone, which they may
-        not.
+        It has no gradient. Moving obstacles count; what `on_grid` and other boundaries do to the velocities is not
+        known. This is the limit of explicit steps, which implicit ones may exceed; with explicit materials, that of
+        these alone, which they may not.
         """
         check_number("cfl", cfl, "positive and finite", lambda v: 0 < v < math.inf)
         return chosen_dt(cfl / self.survey(state, judge=False).rate, previous).to(state.x.dtype)
