@@ -240,3 +240,10 @@ def test_a_shape_that_is_smaller_than_its_volume_says():
     box.volume = 1e6
     with pytest.raises(ValueError, match=r"takes less than 200 points.*is its volume right"):
         seed.fill(box, 0.1, count=200)
+
+
+def test_progress_of_filling(monkeypatch):
+    monkeypatch.setattr(seed, "CHUNK", 100)
+    reports = []
+    points = seed.box((0, 0), (1, 1), 0.1, per_cell=2.25, progress=lambda done, count: reports.append((done, count)))
+    assert reports == [(100, 225), (200, 225), (225, 225)] and len(points) == 225

@@ -16,7 +16,7 @@ import contextlib
 import functools
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -37,6 +37,7 @@ from .errors import (
 from .shapes import Shape
 
 Vector = Sequence[float] | Tensor
+Progress = Callable[[int, int], None] | None
 
 # Measured for _poisson_disk: a sample of least distance r has (_POISSON_SPACING * r)^-D points per unit of volume,
 # within 0.2 %.
@@ -206,6 +207,7 @@ def fill(
     method: str = "lattice",
     seed: int = 0,
     count: int | None = None,
+    progress: Progress = None,
     origin: Vector | None = None,
     dtype: torch.dtype | None = None,
     device: torch.device | str | None = None,
@@ -220,6 +222,8 @@ def fill(
         seed: seed of what is random.
         count: exact number of points, instead of per_cell: the spacing is the widest tried that gives so many, and of
             what is too much a random choice is left out.
+        progress: called after every 2^18 points with the number of points that were compared with the shape so far, and
+            of all.
         origin: coordinates [m], D numbers, that the points are relative to; None for the zero of those of the shape.
         dtype, device: of the result; by default torch's (float32 where that is a half). A state in float64 has the
             points without the rounding of float32, see `Points`.
@@ -234,9 +238,9 @@ def fill(
     check_device(device)
     with on_host():
         if count is None:
-            x = _points_in(shape, _spacing(grid, per_cell, len(shape.lower)), method, seed)
+            x = _points_in(shape, _spacing(grid, per_cell, len(shape.lower)), method, seed, progress)
         else:
-            x = _exactly(check_count("count", count, 1), shape, method, seed)
+            x = _exactly(check_count("count", count, 1), shape, method, seed, progress)
         volume = torch.full((len(x),), shape.volume / len(x), dtype=torch.float64)
     return _points(x, volume, origin, dtype, device)
 
@@ -251,14 +255,14 @@ CLOSER, ATTEMPTS = 0.98, 100
 """Factor on the spacing until there are as many points as were asked for, and how often it is tried."""
 
 
-def _exactly(count: int, shape: Region, method: str, seed: int) -> Tensor:
+def _exactly(count: int, shape: Region, method: str, seed: int, progress: Progress) -> Tensor:
     """So many points [count, D], float64, on the CPU."""
     spacing = (shape.volume / count) ** (1 / len(shape.lower))
     x = torch.empty(0)
     for _ in range(ATTEMPTS):
         if method == "poisson" or math.prod(_cells(shape.lower, shape.upper, spacing)) >= count:
             with contextlib.suppress(_TooSmall):
-                x = _points_in(shape, spacing, method, seed)
+                x = _points_in(shape, spacing, method, seed, progress)
         if len(x) >= count:
             break
         spacing *= CLOSER
@@ -273,7 +277,7 @@ class _TooSmall(ValueError):
     """A shape between whose points there is more room than it has."""
 
 
-def _points_in(shape: Region, spacing: float, method: str, seed: int) -> Tensor:
+def _points_in(shape: Region, spacing: float, method: str, seed: int, progress: Progress) -> Tensor:
     """[P, D], float64, on the CPU."""
     _check_size(shape, spacing, method)
     if method == "lattice":
@@ -284,7 +288,12 @@ def _points_in(shape: Region, spacing: float, method: str, seed: int) -> Tensor:
         x = _poisson_disk(shape.lower, shape.upper, spacing, seed)
     else:
         raise ValueError(f'method must be "lattice", "jittered" or "poisson", got {method!r}')
-    x = x[shape.inside(x)]
+    kept: list[Tensor] = []
+    for number, part in enumerate(x.split(CHUNK)):
+        kept.append(part[shape.inside(part)])
+        if progress is not None:
+            progress(number * CHUNK + len(part), len(x))
+    x = torch.cat(kept)
     if len(x) == 0:
         raise _TooSmall(
             f"the shape is too small for its particles: spacing {spacing:g} m; use a finer grid or a larger per_cell"

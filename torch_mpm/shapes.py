@@ -34,7 +34,7 @@ from torch import Tensor
 from . import surface_mesh
 from .capture import is_traced, is_transformed
 from .errors import check_number, check_vector, shape_of
-from .meshes import closed
+from .meshes import closed, terrain
 from .meshes.index import MeshIndex
 from .meshes.nearest import nearest_on_triangles
 from .ops.autograd import graph_at_once
@@ -360,17 +360,22 @@ class Mesh(Shape):
 
     def __init__(self, source: str | Path | Any, scale: float = 1.0) -> None:
         scale = float(check_number("scale", scale, "positive", lambda v: 0 < v < math.inf))
-        vertices, faces, self.changes = closed.load(source)
-        self.vertices, self.faces = torch.from_numpy(vertices * scale), torch.from_numpy(faces)
-        self._index = MeshIndex(self.vertices, self.faces)
-        signed, filled = self._index.volumes
-        check_number(f"the volume of mesh {source}", filled, "positive", lambda v: 0 < v < math.inf)
+        vertices, faces, changes = closed.load(source)
+        signed, filled = self._set(source, closed.ClosedMesh(vertices * scale, faces, changes))
         if abs(filled - abs(signed)) > UNLIKE * filled:
             warnings.warn(
                 f"mesh {source}: parts overlap or are inside out one against another: the volume inside is "
                 f"{filled:.4g} m³, which bodies get, and that by the normals {abs(signed):.4g} m³",
                 stacklevel=2,
             )
+
+    def _set(self, source: Any, mesh: closed.ClosedMesh) -> tuple[float, float]:
+        """Take the vertices and triangles, and return the volume by the normals and that inside [m³]."""
+        self.vertices, self.faces = torch.from_numpy(mesh.vertices), torch.from_numpy(mesh.faces)
+        self.changes, self._index = mesh.changes, MeshIndex(self.vertices, self.faces)
+        signed, filled = self._index.volumes
+        check_number(f"the volume of {self.name} {source}", filled, "positive", lambda v: 0 < v < math.inf)
+        return signed, filled
 
     def surface(self, x: Tensor, scene: Tensor | None = None) -> tuple[Tensor, Tensor]:
         index, corners = self._searched(x), self._corners(x)
@@ -417,6 +422,60 @@ class Mesh(Shape):
 
     def _chunks(self, x: Tensor) -> Sequence[Tensor]:
         return x.split(max(1, PAIRS // len(self.faces)))
+
+
+class Terrain(Mesh):
+    """The ground below an open height surface, or the space above it; 3-D only.
+
+    Vertical sides and a flat face close it. As an obstacle it should reach 3 cells beyond the domain, or
+    `Sampled.of(terrain, lower, upper, spacing)` acts in the kernel, for corners outside of the closed body.
+
+    Args:
+        source: heights [X, Y] [m] at the nodes of a horizontal lattice, a tensor or an array; or an open surface, a
+            file that trimesh reads or a `trimesh.Trimesh`, of which no part is vertical or above another.
+        level: coordinate of the flat face [m]. Where it is below the whole surface, the body is the ground; where it is
+            above, the space over the ground.
+        lower: the first node of the lattice of heights [m], 2 numbers.
+        spacing: distance of the nodes of heights [m].
+        axis: the vertical axis, 0, 1 or 2. The lattice of heights lies along the other two, in their order.
+        scale: factor on the coordinates of a file, before `level` counts.
+
+    Raises:
+        ImportError, OSError: as `Mesh`.
+        TypeError, ValueError: for other arguments, a level between the heights, or several heights over a place.
+    """
+
+    name = "terrain"
+
+    def __init__(
+        self,
+        source: Tensor | Array | str | Path | Any,
+        level: float,
+        lower: Sequence[float] | None = None,
+        spacing: float | None = None,
+        axis: int = 2,
+        scale: float = 1.0,
+    ) -> None:
+        level = float(check_number("level", level))
+        scale = float(check_number("scale", scale, "positive", lambda v: 0 < v < math.inf))
+        if axis not in (0, 1, 2):
+            raise ValueError(f"axis must be 0, 1 or 2, got {axis}")
+        if isinstance(source, Tensor | np.ndarray):
+            heights = torch.as_tensor(source).detach().to("cpu", torch.float64)
+            if heights.dim() != 2 or min(heights.shape) < 2 or not bool(heights.isfinite().all()):
+                raise ValueError(f"heights must be finite numbers [X, Y], 2 or more each, got {shape_of(heights)}")
+            if lower is None or spacing is None:
+                raise ValueError("heights need the first node of their lattice, lower, and its spacing")
+            step = float(check_number("spacing", spacing, "positive", lambda v: 0 < v < math.inf))
+            name: Any = "heights"
+            surface = terrain.on_lattice(heights.numpy(), check_vector("lower", lower, 2), step, axis)
+        else:
+            if lower is not None or spacing is not None:
+                raise ValueError("lower and spacing belong to heights on a lattice, not to a mesh")
+            name, surface = source, closed.triangles(source)
+        signed, filled = self._set(name, terrain.closed_to(name, surface[0] * scale, surface[1], level, axis))
+        if abs(filled - abs(signed)) > UNLIKE * filled:
+            raise ValueError(f"terrain {name} has several heights over a place: parts of it lie above each other")
 
 
 class SDF(Shape):

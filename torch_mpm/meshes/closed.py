@@ -42,17 +42,17 @@ def load(source: str | Path | Any) -> ClosedMesh:
     vertices, faces = triangles(source)
     changes = []
     if len(_open_edges(faces)):
-        vertices, faces, merged = _merge_equal(vertices, faces)
+        vertices, faces, merged = merged_equal(vertices, faces)
         changes += [f"{merged} vertices at positions of others were merged"] if merged else []
     if len(_open_edges(faces)):
-        vertices, faces, merged, distance = _merge_near(vertices, faces)
+        vertices, faces, merged, distance = _merged_near(vertices, faces)
         if merged:
             changes.append(f"{merged} vertices on open edges within {distance:.3g} m of others were merged")
             _warn(source, changes[-1])
     if len(edges := _open_edges(faces)):
         raise ValueError(
             f"mesh {source} is not closed: {len(edges)} of its edges do not join two triangles, "
-            f"{_places(vertices[edges])}; "
+            f"{places(vertices[edges])}; "
             "close the holes (trimesh.repair.fill_holes, or a modelling program) before filling it"
         )
     faces, turned = _turned_alike(source, vertices, faces)
@@ -124,12 +124,13 @@ def _open_edges(faces: Array) -> Array:
     return edges[np.bincount(which, minlength=len(edges)) % 2 == 1]
 
 
-def _merge_equal(vertices: Array, faces: Array) -> tuple[Array, Array, int]:
+def merged_equal(vertices: Array, faces: Array) -> tuple[Array, Array, int]:
+    """Vertices and triangles without vertices at the position of another one, and how many there were."""
     kept, which = np.unique(vertices + 0.0, axis=0, return_inverse=True)  # -0 is 0
     return kept, _without_points(which.reshape(-1)[faces]), len(vertices) - len(kept)
 
 
-def _merge_near(vertices: Array, faces: Array) -> tuple[Array, Array, int, float]:
+def _merged_near(vertices: Array, faces: Array) -> tuple[Array, Array, int, float]:
     """Vertices on open edges take the place of one that is near; also how many did, and what is near [m]."""
     scipy = _scipy()
     own = np.unique(_open_edges(faces))
@@ -171,7 +172,7 @@ def _turned_alike(source: Any, vertices: Array, faces: Array) -> tuple[Array, in
     if len(wrong):
         raise ValueError(
             f"the triangles of mesh {source} have no common outside: {len(wrong)} of its edges are passed twice in one "
-            f"direction however they are turned, {_places(vertices[wrong])}; it is one-sided, or parts of it touch"
+            f"direction however they are turned, {places(vertices[wrong])}; it is one-sided, or parts of it touch"
         )
     return faces, int(turn.sum())
 
@@ -193,8 +194,8 @@ def _scipy() -> Any:
     return scipy
 
 
-def _places(edges: Array) -> str:
-    """Where some edges [E, 2, 3] are, in words."""
+def places(edges: Array) -> str:
+    """Where some edges [E, 2, 3] or triangles [E, 3, 3] are, in words."""
     middles = [f"({x:.6g}, {y:.6g}, {z:.6g})" for x, y, z in edges.mean(1)[:NAMED].tolist()]
     return f"near {', '.join(middles)}{' and elsewhere' if len(edges) > NAMED else ''}"
 
