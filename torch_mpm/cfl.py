@@ -45,6 +45,7 @@ from .laws.calls import law_calls, laws_of
 from .laws.compiled import CompiledLaw
 from .laws.custom import as_law
 from .laws.material import Material
+from .ops.arguments import check_choice
 from .ops.survey import Survey, law_figures, survey
 from .state import State, check_state
 
@@ -97,7 +98,7 @@ def stable_dt(
         state: the particles.
         cfl: fraction of the limit, positive and finite. The limit holds for the current state, which a step may
             stiffen.
-        transfer: "apic"; anything else is limited as "pic" is.
+        transfer: "apic", "pic" or "flip".
         stress_form: "mls" or "gradient".
         speed: of the obstacles near each particle [P] [m/s], or None; `Step.stable_dt` gives it.
         previous: dt of the step before [s], a number or a tensor [], [1] or [B]; None for none.
@@ -107,14 +108,18 @@ def stable_dt(
         viscosity and speed. A particle without mass makes it zero; one that is not finite is left out.
 
     Raises:
-        TypeError, ValueError: for a cfl that is not positive and finite, an unknown stress form, or a wrong `previous`.
+        TypeError, ValueError: for a cfl that is not positive and finite, an unknown transfer or stress form, or a wrong
+            `previous`.
     """
     check_grid(grid)
     check_state(state)
     law = as_law("law", law)
     check_number("cfl", cfl, "positive and finite", lambda v: 0 < v < math.inf)
+    check_choice("transfer", transfer, ("apic", "pic", "flip"))
     if stress_form not in ("mls", "gradient"):
         raise ValueError(f"stress_form must be 'gradient' or 'mls', got {stress_form!r}")
+    law.check_parameters(len(state), grid.scenes)
+    state = state.of_scenes(grid.scenes)
     found = look(grid, law, state, figures_of(law, state, False), transfer, stress_form, speed)
     return chosen_dt(cfl / found.rate, previous).to(state.x.dtype)
 

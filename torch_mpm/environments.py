@@ -25,6 +25,7 @@ from torch import Tensor
 
 from .errors import check_count, shape_of
 from .impulses import Impulses
+from .ops.arguments import split_dt
 from .pause import standing
 from .rollouts import rollout
 from .state import PARTICLE_FIELDS, State, check_state
@@ -69,7 +70,9 @@ class Environments:
             raise ValueError(f"states must be a list of the {step.grid.scenes} scenes of the grid, got {count}")
         if step.grid.scenes == 0:
             raise ValueError("states must have at least one scene, got none")
-        for state in states:
+        for k, state in enumerate(states):
+            if not isinstance(state, State):
+                raise TypeError(f"states[{k}] must be a State, got {shape_of(state)}")
             check_state(state)
         self.step = step
         self.room = max(len(s) for s in states) if room is None else check_count("room", room)
@@ -133,7 +136,9 @@ class Environments:
         An obstacle moves to a pose that was assigned since the call before, and reaches it at the end of this one; see
         `Obstacle`.
         """
+        check_count("n", n)
         state = self.state
+        split_dt(dt, len(self), state.x)  # which checks it
         if self.step.reads_time:
             state = state.replace(time=self.time.to(state.x.dtype))
         elapsed = dt.double() if isinstance(dt, Tensor) else torch.full_like(self.time, dt)

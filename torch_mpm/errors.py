@@ -155,6 +155,14 @@ def check_positions(x: Tensor, dim: int, scene: Tensor | None, scenes: int) -> N
     check_index("scene", scene, x)
 
 
+def check_particles(x: Tensor, blocks: Any) -> None:
+    """The positions of the particles for which blocks were activated, as far as their number tells."""
+    check_positions(x, blocks.grid.dim, blocks.scene, blocks.grid.scenes)
+    if x.shape[0] != blocks.index.shape[0]:
+        expected = f"[P, D] = [{blocks.index.shape[0]}, {blocks.grid.dim}]"
+        raise ValueError(f"x must have the shape of the positions that were activated, {expected}, got {shape_of(x)}")
+
+
 def check_index(name: str, index: Tensor | None, x: Tensor, dtype: torch.dtype = torch.int32, of: str = "x") -> None:
     """Check an optional whole number of each particle [P] against a particle tensor that messages call `of`."""
     if index is None:
@@ -167,9 +175,12 @@ def check_index(name: str, index: Tensor | None, x: Tensor, dtype: torch.dtype =
         raise ValueError(f"{name} must be on the device of {of}, {x.device}, got {index.device}")
 
 
-def check_like(name: str, value: Tensor | None, x: Tensor, shape: tuple[int, ...], symbols: str) -> None:
-    """Check an optional floating tensor against x; `symbols` names its shape in the message."""
-    if value is None:
+def check_like(
+    name: str, value: Tensor | None, x: Tensor, shape: tuple[int, ...], symbols: str, needed: bool = False
+) -> None:
+    """Check a floating tensor against x, which may be absent unless it is `needed`; `symbols` names its shape in the
+    message."""
+    if value is None and not needed:
         return
     if not isinstance(value, Tensor) or value.shape != shape:
         raise ValueError(f"{name} must have shape {symbols} = {list(shape)}, got {shape_of(value)}")

@@ -27,6 +27,8 @@ from .errors import (
 from .topology import BLOCK_WIDTH, PADDING, Lattice, Topology
 
 INT32_MAX = 2**31 - 1
+STATUS_SIZE = 8
+"""Numbers of a row of a status, csrc/grid/status.h."""
 KERNEL_ORDERS = {"quadratic": 2, "cubic": 3}
 
 
@@ -143,6 +145,8 @@ class Grid(Lattice):
         """
         check_positions(x, self.dim, scene, self.scenes)
         check_index("ids", ids, x, torch.int64)
+        if previous is not None:
+            _check_status(previous, self.scenes)
         max_blocks = self.pool(x, scene)
         blocks = self._activate(x, scene, previous, max_blocks, ids)
         if x.device.type == "cpu" and not is_traced(x):
@@ -294,6 +298,14 @@ def own_pools() -> Iterator[None]:
         yield
     finally:
         _POOLS.replayed, _POOLS.recordings = replayed, recordings
+
+
+def _check_status(status: Any, scenes: int) -> None:
+    if not isinstance(status, Tensor) or status.shape != (1 + scenes, STATUS_SIZE):
+        expected = f"[1 + B, {STATUS_SIZE}] = [{1 + scenes}, {STATUS_SIZE}]"
+        raise ValueError(f"previous must have shape {expected}, got {shape_of(status)}")
+    if status.dtype != torch.int32:
+        raise TypeError(f"previous must be int32, got {status.dtype}")
 
 
 def check_grid(grid: Any) -> None:

@@ -49,6 +49,8 @@ def after_boundaries(
             scene = None if state.scene is None else blocks.node_scene()
             nodes = (blocks.node_positions(state.x.dtype), scene)
         before, boundary = velocity, group[0]
+        if isinstance(boundary, Obstacle):
+            boundary.check_scenes(blocks.grid.dim, blocks.grid.scenes)
         with full_precision(before) if isinstance(boundary, Obstacle) else contextlib.nullcontext():
             velocity = from_half(call_boundary(boundary, before, *nodes, time, dt), nodes[0])
         if mass is not None:

@@ -128,6 +128,29 @@ class PerMaterial(nn.Module):
         return result
 
 
+def check_length(name: str, value: Any, particles: int, scenes: int | None) -> None:
+    """Check the shape of a parameter of B scenes, if it is a tensor or has some; where B is not known, any number of
+    entries passes for [B].
+
+    Raises:
+        ValueError: for a shape that is not [], [1], [B] or [P].
+    """
+    if isinstance(value, PerMaterial):
+        for k, one in enumerate(value.values()):
+            check_length(f"{name} of material {k}", one, particles, scenes)
+    if not isinstance(value, Tensor) or needs_no_scenes(value, particles):
+        return
+    if value.dim() == 1 and (value.shape[0] == scenes or (scenes is None and value.shape[0] > 0)):
+        return
+    batch = "" if scenes is None else f" with B = {scenes}"
+    raise ValueError(f"{name} must have shape [], [1], [B] or [P] = [{particles}], got {shape_of(value)}{batch}")
+
+
+def needs_no_scenes(value: Tensor, particles: int) -> bool:
+    """Whether a parameter is the same for all particles or one of each, [P], which it also is where P = B."""
+    return value.dim() == 0 or (value.dim() == 1 and value.shape[0] in (1, particles))
+
+
 def evaluate(name: str, value: Value, state: State) -> float | Tensor:
     """A parameter as a number, a tensor of one element, or [P] in the particle order of the state.
 
@@ -147,16 +170,16 @@ def evaluate(name: str, value: Value, state: State) -> float | Tensor:
                 f"{name} as a function of temperature must return shape [P] = [{P}], got {shape_of(result)}"
             )
         return result.to(state.x.dtype)
+    particles = getattr(state, "particles", P)
+    if not needs_no_scenes(value, particles):
+        check_length(name, value, particles, state.scenes)
     value = value.to(state.x.dtype)
     if value.numel() == 1:
         return value.reshape(())
     if value.device != state.x.device:
         raise ValueError(f"{name} must be on the device of x, {state.x.device}, got {value.device}")
-    particles = getattr(state, "particles", P)
     if value.shape == (particles,):
         return value if state.ids is None else value.index_select(0, state.ids)
-    if value.dim() != 1 or state.scene is None:
-        raise ValueError(f"{name} must have shape [], [1], [B] or [P] = [{particles}], got {shape_of(value)}")
     return per_parameter(value, state.scene, P)
 
 

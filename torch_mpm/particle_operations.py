@@ -174,6 +174,8 @@ def of_particles(name: str, value: Any, state: State, shape: tuple[int, ...]) ->
     """
     if not isinstance(value, Tensor):
         return value
+    if value.is_complex():
+        raise TypeError(f"{name} must have a real dtype, got {value.dtype}")
     if value.device != state.x.device:
         raise ValueError(f"{name} must be on the device of the particles, {state.x.device}, got {value.device}")
     whole = (getattr(state, "particles", shape[0]), *shape[1:])

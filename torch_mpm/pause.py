@@ -26,6 +26,7 @@ def paused(
     for each of the steps that `advanced` takes."""
     if not isinstance(dt, Tensor):
         return advanced(state, dt)
+    split_dt(dt, scenes, state.x)  # which checks it
     if _all_move(dt):
         record.counts(scenes, dt.device)  # that a compiled step finds it
         return advanced(state, dt)
@@ -53,11 +54,7 @@ def split_paused(dt: Tensor, state: State, scenes: int) -> tuple[Tensor, Tensor,
     Returns:
         dt in its shape; which particles move, bool [P]; and which entries of dt were negative or NaN, in the shape of
         dt.
-
-    Raises:
-        ValueError: for a wrong shape or device.
     """
-    split_dt(dt, scenes, state.x)
     moving, refused = dt > 0, ~(dt >= 0)
     if dt.numel() <= 1:  # also the particles of a batch without scenes, which no step moves
         particles = moving.reshape(-1)[:1].expand(len(state)) if dt.numel() else dt.new_zeros(len(state)).bool()

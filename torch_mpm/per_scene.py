@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence, Set
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -20,6 +20,9 @@ class SceneParameters(TensorModule):
     """A module whose parameters are numbers or tensors, one for all scenes or one per scene."""
 
     _constants: dict[tuple[str, torch.device, torch.dtype], GraphCache]
+
+    RANKS: ClassVar[dict[str, int | None]] = {}
+    """Dimensions of a value of each parameter that may be given per scene; None for that of an angle."""
 
     def __new__(cls, *arguments: Any, **named: Any) -> Any:
         module = super().__new__(cls, *arguments, **named)
@@ -39,9 +42,27 @@ class SceneParameters(TensorModule):
         if not (per_scene or value.dim() == len(shape)) or tuple(value.shape)[value.dim() - len(shape) :] != shape:
             alternatives = f"{list(shape)} or {['B', *shape]}".replace("'", "")
             raise ValueError(f"{name} must have shape {alternatives}, got {shape_of(value)}")
+        if value.is_complex() or value.dtype == torch.bool:
+            raise TypeError(f"{name} must have a real dtype, got {value.dtype}")
         if value.device != like.device:
             raise ValueError(f"{name} must be on the device of the nodes, {like.device}, got {value.device}")
         return value.to(like.dtype)
+
+    def check_scenes(self, dim: int, scenes: int) -> None:
+        """Check the parameters that are given per scene, for a batch of B scenes in D dimensions.
+
+        Raises:
+            ValueError: for another number of values than one or B.
+        """
+        for name, given in self.RANKS.items():
+            value, rank = getattr(self, name, None), (0 if dim == 2 else 1) if given is None else given
+            if isinstance(value, Tensor) and value.dim() == rank + 1 and value.shape[0] not in (1, scenes):
+                batch = ["B", *value.shape[1:]]
+                raise ValueError(
+                    f"{name} must be given once or per scene, {batch} with B = {scenes}, got {shape_of(value)}".replace(
+                        "'", ""
+                    )
+                )
 
     def at_nodes(self, name: str, like: Tensor, shape: tuple[int, ...], scene: Tensor | None) -> Tensor:
         """A parameter as a tensor of `shape`, or one per node [N, *shape] where it differs from scene to scene."""
@@ -70,9 +91,11 @@ def per_node(value: Tensor, rank: int, scene: Tensor | None) -> Tensor:
     """A value of `rank` dimensions as it is, or one per scene as one per node."""
     if value.dim() == rank:
         return value
+    if scene is None and value.shape[0] != 1:
+        raise ValueError(f"a value per scene must have one entry where there is one scene, got {shape_of(value)}")
     if scene is None or value.shape[0] == 1:
         return value[0]
-    return value.index_select(0, scene.clamp_min(0))
+    return value.index_select(0, scene.clamp(0, value.shape[0] - 1))
 
 
 # ---- checks of what is given; tensors are kept as they are, and their values are not read
@@ -80,6 +103,8 @@ def per_node(value: Tensor, rank: int, scene: Tensor | None) -> Tensor:
 
 def floats(name: str, value: Any) -> tuple[float, ...]:
     """A number or a sequence of them."""
+    if isinstance(value, (Mapping, Set)):
+        raise TypeError(f"{name} must be numbers in an order, got {type(value).__name__}")
     values = value if hasattr(value, "__len__") and not isinstance(value, (str, type)) else (value,)
     return tuple(float(check_number(name, a, "a number", lambda v: True)) for a in values)
 

@@ -12,7 +12,7 @@ from .checkpoints import Checkpoints
 from .errors import check_count, shape_of
 from .rollout_parts import Hook, Parts
 from .rollouts import rollout
-from .state import State
+from .state import State, check_state
 from .step import Step
 
 
@@ -57,6 +57,7 @@ def frames(
     Raises:
         TypeError, ValueError: as `rollout`; for a field that the state lacks, or another result of the hook.
     """
+    check_state(state)
     check_count("n", n)
     check_count("every", every, 1)
     if isinstance(step, Step):
@@ -88,7 +89,7 @@ def _checked(fields: Sequence[str], state: State) -> Sequence[str]:
     if isinstance(fields, str) or not isinstance(fields, (list, tuple)):
         raise TypeError(f"fields must be a list of names, got {shape_of(fields)}")
     for name in fields:
-        if not isinstance(_field(state, name), Tensor):
+        if not isinstance(name, str) or not isinstance(_field(state, name), Tensor):
             present = [k for k, v in {**vars(state), **state.extra}.items() if isinstance(v, Tensor) and k[0] != "_"]
             raise ValueError(f"fields must be names of fields that the state has, {', '.join(present)}, got {name!r}")
     return fields

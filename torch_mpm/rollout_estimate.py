@@ -11,7 +11,7 @@ from torch import Tensor
 
 from .activation_record import aside
 from .checkpoints import Checkpoints, as_checkpoints
-from .errors import check_count
+from .errors import check_count, shape_of
 from .rollout_parts import Parts
 from .rollouts import EVERYTHING, bytes_kept, obstacle_to_substeps, resolved, rollout, steps_of_a_call
 from .state import State
@@ -77,6 +77,8 @@ def estimate_rollout(
     Raises:
         TypeError, ValueError: as `rollout`.
     """
+    if not callable(step):
+        raise TypeError(f"step must be a Step or a function (state, dt) -> state, got {shape_of(step)}")
     check_count("n", n)
     parts, kept = Parts(n, prefix, truncate), as_checkpoints(checkpoint)
     first = parts.first_with_gradient()

@@ -18,11 +18,12 @@ from .boundaries.obstacles import motion_tensors
 from .capture import is_captured, is_traced, is_transformed
 from .captured_steps import in_graphs, obstacle_to_graphs
 from .checkpoints import Checkpoints, as_checkpoints, binomial, fitting, in_segments, offloaded
-from .errors import check_count, shape_of
+from .errors import check_count, check_flag, shape_of
 from .gradient_norms import GradientNorms
 from .graphs import CHUNK, LEAST_STEPS, obstacle_to_replays, replayed, time_after
 from .laws import CompiledLaw
 from .laws.calls import law_calls, laws_of, passive
+from .ops.arguments import split_dt
 from .ops.autograd import dispatch
 from .ops.contact import MAX_OBSTACLES, fusible, obstacle_arguments
 from .ops.grid_update import per_scene, wall_arguments
@@ -106,6 +107,7 @@ def rollout(
     parts = Parts(n, prefix, truncate, hook, every, norms)
     if isinstance(step, Step):
         state = step.prepare(state)
+        split_dt(dt, step.grid.scenes, state.x)  # which checks it
     if kept is not None and kept.memory is not None and torch.is_grad_enabled():  # the same for all parts
         kept = resolved(kept, step, state, n - parts.first_with_gradient(), dt) or EVERYTHING
     grid = step.grid if isinstance(step, Step) else None
@@ -444,7 +446,12 @@ def substeps_arguments(
     Raises:
         ValueError: where the op cannot take the steps, and why.
     """
+    if not isinstance(step, Step):
+        raise TypeError(f"step must be a Step, got {shape_of(step)}")
     check_count("n", n, 1)
+    check_flag("records", records)
+    if blocks is not None:
+        check_count("blocks", blocks)
     if (reason := obstacle_to_substeps(step, state, dt)) is not None:
         raise ValueError(f"step must be one that `substeps` can take, got one of which {reason}")
     return _arguments(step, step.prepare(state), n, dt, records, blocks)[0]
@@ -458,6 +465,7 @@ def _arguments(
     number, scene_dt, scene_time = clocks(state, dt, grid.scenes)
     times = StepTimes.of(state, n, dt, grid.scenes) if follows_paths(step) else None
     pool = grid.pool(state.x, state.scene)
+    step.law.check_parameters(len(state), grid.scenes)
     given: Any = Overlay(state, dt=dt)
     calls = law_calls(step.law, given)
     apic = step.transfer == "apic"

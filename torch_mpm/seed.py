@@ -16,6 +16,7 @@ import contextlib
 import functools
 import itertools
 import math
+import numbers
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -236,6 +237,8 @@ def fill(
         raise TypeError(f"shape must be a shape of torch_mpm.seed, got {shape_of(shape)} without {missing[0]}")
     check_dtype(dtype)
     check_device(device)
+    if isinstance(seed, bool) or not isinstance(seed, numbers.Integral) or not -(2**63) <= seed < 2**64:
+        raise ValueError(f"seed must be a whole number of at most 64 bits, got {seed!r}")
     with on_host():
         if count is None:
             x = _points_in(shape, _spacing(grid, per_cell, len(shape.lower)), method, seed, progress)

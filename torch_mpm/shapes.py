@@ -25,7 +25,7 @@ import math
 import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -105,6 +105,7 @@ class Plane(Shape):
     """
 
     name = "plane"
+    RANKS: ClassVar = {"normal": 1}
 
     def __init__(self, normal: Value) -> None:
         self.normal = direction("normal", normal)
@@ -134,6 +135,7 @@ class Sphere(Shape):
     """
 
     name = "sphere"
+    RANKS: ClassVar = {"radius": 0}
 
     def __init__(self, radius: float | Tensor) -> None:
         self.radius = extent("radius", radius)
@@ -165,6 +167,7 @@ class Box(Shape):
     """
 
     name = "box"
+    RANKS: ClassVar = {"size": 1}
 
     def __init__(self, size: Value) -> None:
         self.size = extent("size", size)
@@ -211,6 +214,7 @@ class Capsule(Shape):
     """
 
     name = "capsule"
+    RANKS: ClassVar = {"half_axis": 1, "radius": 0}
 
     def __init__(self, half_axis: Value, radius: float | Tensor) -> None:
         self.half_axis, self.radius = constant("half_axis", half_axis), extent("radius", radius)
@@ -257,6 +261,7 @@ class Revolved(Shape):
     """
 
     name = "revolved"
+    RANKS: ClassVar = {"axis": 1}
 
     def __init__(self, outline: Sequence[Sequence[float]] | Tensor, axis: Value | None = None) -> None:
         self.outline = extent("outline", outline) if isinstance(outline, Tensor) else _anticlockwise(outline)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
+from .capture import is_captured, is_traced, version
 from .errors import (
     FLOATING,
     NUMBER_OR_TENSOR,
@@ -21,7 +22,6 @@ from .errors import (
     check_index,
     check_like,
     check_number,
-    check_real,
     default_dtype,
     shape_of,
 )
@@ -51,7 +51,7 @@ class Time:
             number = torch.compiler.is_compiling() and time.dim() == 0 and time.dtype == torch.float64
             kept = (time,) if number and time.device.type == "cpu" and not time.requires_grad else time
         else:
-            seconds = float(check_real("time", time, "a number or a tensor [B]"))
+            seconds = float(check_number("time", time, kinds="a number or a tensor [B]"))
             kept = (torch.scalar_tensor(seconds, dtype=torch.float64, device="cpu"),)
         state.__dict__["_time"] = kept
 
@@ -99,17 +99,19 @@ class State:
     time: float | Tensor = Time()  # type: ignore[assignment]
     impulse: Tensor | None = None
 
+    _counted = None  # scenes, and the tensor and its version for which they are known; no field
+
     def __post_init__(self) -> None:
         if not isinstance(self.x, Tensor) or self.x.dim() != 2 or self.x.shape[1] not in (2, 3):
             raise ValueError(f"x must have shape [P, 2] or [P, 3], got {shape_of(self.x)}")
         if self.x.dtype not in FLOATING:
             raise TypeError(f"x must be float32 or float64, got {self.x.dtype}")
         P, D = self.x.shape
-        check_like("v", self.v, self.x, (P, D), "[P, D]")
+        check_like("v", self.v, self.x, (P, D), "[P, D]", needed=True)
         check_like("C", self.C, self.x, (P, D, D), "[P, D, D]")
         check_like("F", self.F, self.x, (P, D, D), "[P, D, D]")
         for name in ("mass", "volume", "J", "temperature"):
-            check_like(name, getattr(self, name), self.x, (P,), "[P]")
+            check_like(name, getattr(self, name), self.x, (P,), "[P]", needed=name in ("mass", "volume"))
         for name, dtype in (("scene", torch.int32), ("material", torch.int32), ("ids", torch.int64)):
             check_index(name, getattr(self, name), self.x, dtype)
         if self.impulse is not None:
@@ -163,6 +165,36 @@ class State:
     def __len__(self) -> int:
         return self.x.shape[0]
 
+    @property
+    def scenes(self) -> int | None:
+        """Number of scenes B that parameters [B] are given for, without particles or with them.
+
+        That of the grid of the step that prepared the state or returned it. Of another state it is that of a time [B]
+        or of the impulse, or else one more than the largest scene, for which the device is read once. None where that
+        cannot be read: in compiled code, and while a CUDA graph is captured.
+        """
+        if torch.compiler.is_compiling():
+            return None
+        scene = self.scene
+        now = None if scene is None else version(scene)
+        if self._counted is None or self._counted[0] is not scene or self._counted[1] != now:
+            self._counted = scene, now, _count_scenes(self)
+        return self._counted[2]
+
+    def of_scenes(self, scenes: int) -> State:
+        """The same state, known to be one of a grid of B scenes.
+
+        Raises:
+            TypeError, ValueError: for what is no number of scenes, or a time of another number of them.
+        """
+        check_count("scenes", scenes)
+        time = self.__dict__["_time"]
+        if isinstance(time, Tensor) and (time.dim() > 1 or (time.dim() == 1 and len(time) not in (1, scenes))):
+            raise ValueError(f"time must be a number or have shape [], [1] or [B] = [{scenes}], got {shape_of(time)}")
+        if not torch.compiler.is_compiling():
+            self._counted = self.scene, None if self.scene is None else version(self.scene), scenes
+        return self
+
     def replace(self, **changes: Any) -> State:
         """A copy with some fields changed."""
         if "time" not in changes:
@@ -171,6 +203,8 @@ class State:
         state = State(**kept, **changes)  # `dataclasses.replace` takes 5 µs more
         if "_poses" in self.__dict__:
             state.__dict__["_poses"] = self.__dict__["_poses"]
+        if not torch.compiler.is_compiling():
+            state._counted = self._counted
         return state
 
     @property
@@ -188,7 +222,7 @@ class State:
         return state
 
     def __getstate__(self) -> dict[str, Any]:
-        return {name: value for name, value in self.__dict__.items() if name != "_poses"}
+        return {name: value for name, value in self.__dict__.items() if name not in ("_poses", "_counted")}
 
     def map(self, function: Callable[[Tensor], Tensor]) -> State:
         """A copy with a function applied to every per-particle tensor, absent fields staying None."""
@@ -199,7 +233,8 @@ class State:
         names = [name for name in PARTICLE_FIELDS if getattr(self, name) is not None]
         results = iter(function([*(getattr(self, name) for name in names), *self.extra.values()]))
         changes: dict[str, Any] = {name: next(results) for name in names}
-        return self.replace(**changes, extra={name: next(results) for name in self.extra})
+        state = self.replace(**changes, extra={name: next(results) for name in self.extra})
+        return state if self._counted is None or self._counted[2] is None else state.of_scenes(self._counted[2])
 
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> State:
         """Move to a device, and floating tensors to a dtype."""
@@ -234,6 +269,8 @@ class State:
             raise ValueError(f"particles must be an index tensor of shape [Q], got {shape_of(particles)}")
         if particles.dtype not in (torch.int32, torch.int64):
             raise TypeError(f"particles must be int32 or int64, got {particles.dtype}")
+        if particles.device != self.x.device:
+            raise ValueError(f"particles must be on the device of x, {self.x.device}, got {particles.device}")
         return self.map(lambda t: _take(t, particles))
 
     def sorted(self, grid: Grid) -> State:
@@ -322,6 +359,19 @@ def check_state(state: Any) -> None:
     if not torch.compiler.is_compiling() and torch._C._are_functorch_transforms_active():
         for name in ("x", "v", "mass", "F"):
             refuse_batched(f"state.{name}", getattr(state, name))
+
+
+def _count_scenes(state: State) -> int | None:
+    """Number of scenes of a state that no step has prepared, see `State.scenes`."""
+    if isinstance(state.time, Tensor) and state.time.numel() > 1:
+        return state.time.numel()
+    if state.impulse is not None:
+        return state.impulse.shape[0]
+    if state.scene is None:
+        return 1
+    if is_traced(state.scene) or is_captured(state.scene):
+        return None
+    return max(int(state.scene.max()) + 1, 1) if len(state) else 1
 
 
 def _check_impulse(impulse: Any, x: Tensor) -> None:

@@ -27,7 +27,7 @@ from .laws.material import Material
 from .laws.mixture import Mixture
 from .node_contact import after_boundaries
 from .ops import Survey, fusible, g2p, g2p_advance, gather, grid_update, p2g, wall_impulses
-from .ops.arguments import check_choice
+from .ops.arguments import check_choice, split_dt
 from .ops.contact import MAX_OBSTACLES
 from .ops.transfer import STRESS_FORMS
 from .parameters import Overlay, TensorModule
@@ -190,6 +190,7 @@ class Step(TensorModule):
     def _moved(self, state: State, dt: float | Tensor) -> State:
         """A prepared state one step later, without what acts on the particles before."""
         grid, law, scene = self.grid, self.law, state.scene
+        law.check_parameters(len(state), grid.scenes)
         blocks = self._activations.activate(grid, state.x, scene, state.ids)
         form, affine = self.stress_form, state.C if self.transfer == "apic" else None
         fields, stress = law(Overlay(state, dt=dt) if self._rate_dependent else state)
@@ -236,7 +237,7 @@ class Step(TensorModule):
             changes["extra"] = {**state.extra, **{name: law.initial(name, state) for name in missing}}
         if state.impulse is not None:
             check_impulse(self, state)
-        state = state.replace(**changes) if changes else state
+        state = (state.replace(**changes) if changes else state).of_scenes(self.grid.scenes)
         return state if self.heat is None else self.heat.prepare(state)
 
     def update_grid(
@@ -322,6 +323,7 @@ class Step(TensorModule):
 
         Read them with `impulses`. A state whose `impulse` is None counts none, and pays nothing.
         """
+        check_state(state)
         return state.replace(impulse=no_impulse(self, state.x))
 
     def impulses(self, state: State) -> Impulses:
@@ -360,8 +362,11 @@ class Step(TensorModule):
     @torch.no_grad()
     def figures(self, state: State, judge: bool = True) -> Figures:
         """Stress, stiffness and, with `judge`, energy density of the law."""
+        check_state(state)
         with full_precision(state.x):
-            return figures_of(self.law, self.prepare(state), judge)
+            state = self.prepare(state)
+            self.law.check_parameters(len(state), self.grid.scenes)
+            return figures_of(self.law, state, judge)
 
     @torch.no_grad()
     def survey(self, state: State, judge: bool = True, figures: Figures | None = None) -> Survey:
@@ -372,6 +377,7 @@ class Step(TensorModule):
             judge: whether the energy of the law is asked for too, which tells where the law has no meaning.
             figures: what `figures` gives for the state, where that is known.
         """
+        check_state(state)
         moving = [b for b in self.boundaries.entries if isinstance(b, Obstacle) and b.moves]
         fused = [b for b in moving if fusible(b, state.time)][:MAX_OBSTACLES]
         others = [b for b in moving if not any(b is kept for kept in fused)]
@@ -384,7 +390,7 @@ class Step(TensorModule):
 
         with full_precision(state.x):
             state = self.prepare(state)
-            survey = found(self.law, state, figures or figures_of(self.law, state, judge))
+            survey = found(self.law, state, figures or self.figures(state, judge))
             if self.integrator is not None and self.integrator.explicit:
                 law, part = self.integrator.unsolved(self.law, state)
                 survey = survey._replace(rate=found(law, part, figures_of(law, part, False)).rate)
@@ -454,6 +460,8 @@ class Step(TensorModule):
         Raises:
             TypeError, ValueError, NotImplementedError: as `torch_mpm.implicit.compare`, for a speed.
         """
+        check_state(state)
+        split_dt(dt, self.grid.scenes, state.x)
         way = self._way(state, dt)
         return way if speed is None else f"{way}; {compare(self, state, speed)}"
 

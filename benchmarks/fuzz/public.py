@@ -11,6 +11,7 @@ import torch
 import torch_mpm as mpm
 from benchmarks.fuzz.mutations import refuses
 from torch_mpm import heat_boundaries, seed
+from torch_mpm.implicit import Implicit
 
 Call = tuple[Callable[..., Any], dict[str, Any]]
 E, NU = 1e4, 0.3
@@ -38,8 +39,8 @@ class _World:
         return self.grid.activate(self.x)
 
     def batch(self) -> tuple[mpm.Grid, mpm.State]:
-        grid = mpm.Grid(0.25, (0.0, 0.0), (1.0, 1.0), scenes=2, max_blocks=18)
-        return grid, self.state.replace(scene=(torch.arange(POINTS) % 2).int())
+        grid = mpm.Grid(0.25, (0.0, 0.0), (1.0, 1.0), scenes=3, max_blocks=27)
+        return grid, self.state.replace(scene=(torch.arange(POINTS) % 3).int())
 
     def heat(self) -> mpm.Heat:
         return mpm.Heat(self.grid, conductivity=1.0, specific_heat=1.0)
@@ -47,7 +48,219 @@ class _World:
 
 def calls() -> dict[str, Callable[[], Call]]:
     """By name: a function that makes (what to call, arguments by name)."""
-    return {**_grids_and_states(), **_steps(), **_laws(), **_boundaries(), **_heat(), **_seed(), **_ops()}
+    single = {**_grids_and_states(), **_steps(), **_laws(), **_boundaries(), **_heat(), **_seed(), **_ops()}
+    return {**single, **_rollouts(), **_particles(), **_batches()}
+
+
+LARGEST = 32
+"""Of a number of steps, rows or scenes."""
+
+
+def _limited(function: Callable[..., Any]) -> Callable[..., Any]:
+    """A function that refuses numbers for which it would take longer than this program has."""
+
+    def called(**arguments: Any) -> Any:
+        for name in ("n", "most", "room", "scenes", "blocks"):
+            value = arguments.get(name)
+            if isinstance(value, (int, float)) and value > LARGEST:
+                raise mpm.SimulationError(f"{name} is too large for this program")
+        return function(**arguments)
+
+    return called
+
+
+def _rollouts() -> dict[str, Callable[[], Call]]:
+    def taken(function: Callable[..., Any], /, **given: Any) -> Callable[[], Call]:
+        """With a step of a batch and its state, as far as the function takes them."""
+
+        def make() -> Call:
+            w = _World()
+            grid, state = w.batch()
+            step = mpm.Step(grid, w.law, walls="slip", gravity=(0.0, -9.8))
+            return _limited(function), dict(step=step, state=state, **given)
+
+        return make
+
+    def environments() -> Call:
+        w = _World()
+        step = mpm.Step(w.batch()[0], w.law)
+        return _limited(mpm.Environments), dict(step=step, states=[w.state, w.state, w.state], room=POINTS + 2)
+
+    def advanced() -> Call:
+        function, given = environments()
+        return _limited(function(**given).advance), dict(n=2, dt=torch.tensor([1e-4, 2e-4, 2e-4]))
+
+    def method(name: str, /, **given: Any) -> Callable[[], Call]:
+        def make() -> Call:
+            w = _World()
+            return getattr(mpm.Step(w.batch()[0], w.law), name), dict(state=w.batch()[1], **given)
+
+        return make
+
+    def implicit() -> Call:
+        def use(**arguments: Any) -> Any:
+            w = _World()
+            return mpm.Step(w.grid, w.law, integrator=Implicit(**arguments))(w.state, 1e-4)
+
+        limits = dict(tolerance=1e-4, max_iterations=5, max_cg_iterations=50, adjoint_tolerance=1e-8)
+        return use, dict(**limits, plasticity="after", explicit=())
+
+    several = dict(n=2, dt=torch.tensor([1e-4, 2e-4, 2e-4]))
+    return {
+        "rollout of a batch": taken(mpm.rollout, **several, checkpoint=2, hook=lambda state, k: None, every=1),
+        "rollout with norms": taken(mpm.rollout, n=2, dt=1e-4, norms=mpm.GradientNorms(), graph=2),
+        "rollout_to": taken(mpm.rollout_to, time=2e-4, cfl=0.5, longest=1e-3, every=2, most=8, checkpoint=2),
+        "frames": taken(mpm.frames, n=2, dt=1e-4, every=1, fields=("x", "F"), prefix=1, truncate=1),
+        "estimate_rollout": taken(mpm.estimate_rollout, n=2, dt=1e-4, checkpoint=1, prefix=0, truncate=1),
+        "substeps_arguments": taken(mpm.substeps_arguments, n=2, dt=1e-4, records=True, blocks=27),
+        "Environments": environments,
+        "Environments.advance": advanced,
+        "Checkpoints": lambda: (mpm.Checkpoints, dict(every=2, offload=False)),
+        "GradientNorms": lambda: (mpm.GradientNorms, dict(every=2)),
+        "Step.stable_dt": method("stable_dt", cfl=0.5),
+        "Step.explain": method("explain", dt=1e-4),
+        "Step.failures": method("failures"),
+        "Step.with_impulses": method("with_impulses"),
+        "Implicit": implicit,
+    }
+
+
+def _particles() -> dict[str, Callable[[], Call]]:
+    """What acts on particles, and what joins and parts states."""
+
+    def acting(kind: Callable[..., Any], /, **given: Any) -> Callable[[], Call]:
+        def use(**arguments: Any) -> Any:
+            w = _World()
+            return mpm.Step(w.grid, w.law, on_particles=kind(**arguments))(w.state, 1e-4)
+
+        when = dict(start=torch.zeros(POINTS), end=1.0, particles=torch.ones(POINTS, dtype=torch.bool))
+        return lambda: (use, dict(given, **when))
+
+    def waypoints() -> Call:
+        def use(**arguments: Any) -> Any:
+            w = _World()
+            hand = mpm.Sphere(mpm.Waypoints(**arguments), 0.1)
+            return mpm.rollout(mpm.Step(w.grid, w.law, boundaries=[hand]), w.state, 2, 1e-4)
+
+        return use, dict(time=[0.0, 1.0, 2.0], position=torch.full((3, 2), 0.5))
+
+    operations = mpm.particle_operations
+    return {
+        "Push": acting(operations.Push, force=torch.zeros(POINTS, 2)),
+        "Hold": acting(operations.Hold, velocity=(0.0, 1.0)),
+        "Present": acting(operations.Present),
+        "Waypoints": waypoints,
+        "State.split": lambda: (_limited(_World().batch()[1].split), dict(scenes=3)),
+        "State.of_scenes": lambda: (_World().batch()[1].of_scenes, dict(scenes=3)),
+    }
+
+
+def _batches() -> dict[str, Callable[[], Call]]:
+    """Parameters as tensors, per scene or per particle, in steps of a batch of three scenes."""
+    of_scenes, of_particles = torch.tensor([1.0, 2.0, 2.0]), torch.linspace(1.0, 2.0, POINTS)
+
+    def stepped(law: Callable[..., mpm.Material], /, **given: Any) -> Callable[[], Call]:
+        def use(**arguments: Any) -> Any:
+            w = _World()
+            grid, state = w.batch()
+            state = state.replace(material=(torch.arange(POINTS) % 2).int(), extra={"liquid": 0.5 * state.mass})
+            return mpm.Step(grid, law(**arguments))(state, 1e-5)
+
+        return lambda: (use, {name: v.clone() if isinstance(v, torch.Tensor) else v for name, v in given.items()})
+
+    def mixed(**arguments: Any) -> mpm.Material:
+        """Of which only the first law has particles."""
+        return mpm.Mixture([mpm.NeoHookean(E=E, nu=NU), mpm.Hencky(E=E, nu=NU), mpm.FixedCorotated(**arguments)])
+
+    def molten(**arguments: Any) -> mpm.Material:
+        return mpm.Melting(mpm.NeoHookean(E=E, nu=NU), mpm.WeaklyCompressible(**arguments))
+
+    def obstructed(obstacle: Callable[..., Any], /, **given: Any) -> Callable[[], Call]:
+        def use(**arguments: Any) -> Any:
+            w = _World()
+            grid, state = w.batch()
+            return mpm.Step(grid, w.law, boundaries=[obstacle(**arguments)])(state, 1e-4)
+
+        motion = dict(velocity=torch.zeros(3, 2), friction=0.1 * of_scenes, rotation=0.1 * of_scenes, scene=1)
+        return lambda: (use, dict(position=torch.full((3, 2), 0.5), **given, **motion))
+
+    def heated(heat: Callable[..., Any], /, **given: Any) -> Callable[[], Call]:
+        def use(**arguments: Any) -> Any:
+            grid, state = _World().batch()
+            return heat(grid, **arguments)(state, 1e-3)
+
+        return lambda: (use, dict(given))
+
+    def bounded(boundary: Callable[..., Any], /, **given: Any) -> Callable[[], Call]:
+        def heat(grid: mpm.Grid, **arguments: Any) -> mpm.Heat:
+            return mpm.Heat(grid, 1.0, 1.0, boundaries=[boundary(**arguments)])
+
+        return heated(heat, **given)
+
+    def by_gravity() -> Call:
+        w = _World()
+        grid, state = w.batch()
+        return (lambda gravity: mpm.Step(grid, w.law, gravity=gravity)(state, 1e-4)), dict(gravity=torch.zeros(3, 2))
+
+    def distance(x: torch.Tensor) -> torch.Tensor:
+        return x.norm(dim=-1) - 0.1
+
+    moduli = dict(E=E * of_scenes, nu=NU)
+    b, ball = heat_boundaries, mpm.Sphere((0.5, 0.5), 0.3)
+    place = torch.full((7, 2), 0.5)
+    surface = b.Surface(place, 0.1, torch.tensor([0, 1, 1, 2, 2, 2, 2], dtype=torch.int32))
+    return {
+        "NeoHookean of a batch": stepped(mpm.NeoHookean, **moduli),
+        "Hencky of Lamé parameters of a batch": stepped(mpm.Hencky, mu=E * of_scenes, lam=E * of_particles),
+        "FixedCorotated of a batch": stepped(mpm.FixedCorotated, **moduli),
+        "WeaklyCompressible of a batch": stepped(
+            mpm.WeaklyCompressible, bulk_modulus=E * of_scenes, gamma=7 * of_particles, viscosity=0.1 * of_scenes
+        ),
+        "VonMises of a batch": stepped(mpm.VonMises, **moduli, yield_stress=10 * of_particles, hardening=of_scenes),
+        "HerschelBulkley of a batch": stepped(
+            mpm.HerschelBulkley, **moduli, yield_stress=10 * of_scenes, consistency=of_particles, exponent=of_scenes
+        ),
+        "Viscoelastic of a batch": stepped(
+            mpm.Viscoelastic, **moduli, branch_modulus=E * of_particles, relaxation_time=of_scenes
+        ),
+        "Snow of a batch": stepped(
+            mpm.Snow, **moduli, critical_compression=0.02 * of_scenes, critical_stretch=0.01 * of_particles,
+            hardening=10 * of_scenes,
+        ),
+        "CamClay of a batch": stepped(
+            mpm.CamClay, **moduli, critical_slope=of_scenes, consolidation=10 * of_particles, hardening=5 * of_scenes,
+            cohesion=0.1 * of_scenes,
+        ),
+        "QuarticSand of a batch": stepped(
+            mpm.QuarticSand, **moduli, friction_angle=0.3 * of_particles, cohesion=0.01 * of_scenes
+        ),
+        "Active of a batch": stepped(
+            mpm.Active, law=mpm.NeoHookean(E=E, nu=NU), direction=torch.ones(POINTS, 2)
+        ),
+        "ThermalExpansion of a batch": stepped(
+            mpm.ThermalExpansion, law=mpm.NeoHookean(E=E, nu=NU), coefficient=1e-5 * of_scenes
+        ),
+        "Mixture of a batch": stepped(mixed, mu=E * of_scenes, lam=E * of_particles),
+        "Melting of a batch": stepped(molten, bulk_modulus=E * of_scenes, gamma=7 * of_particles),
+        "gravity of a batch": by_gravity,
+        "Plane of a batch": obstructed(mpm.Plane, normal=torch.ones(3, 2)),
+        "Sphere of a batch": obstructed(mpm.Sphere, radius=0.1 * of_scenes),
+        "Box of a batch": obstructed(mpm.Box, size=0.1 * torch.ones(3, 2)),
+        "Capsule of a batch": obstructed(mpm.Capsule, half_axis=0.1 * torch.ones(3, 2), radius=0.1 * of_scenes),
+        "SDF of a batch": obstructed(mpm.SDF, distance=distance),
+        "Heat of a batch": heated(
+            mpm.Heat, conductivity=of_scenes, specific_heat=of_particles, melting_point=of_scenes,
+            latent_heat=of_particles,
+        ),
+        "Flux of a batch": bounded(b.Flux, surface=surface, flux=torch.ones(7)),
+        "Convection of a batch": bounded(
+            b.Convection, surface=b.FreeSurface(), coefficient=of_scenes, ambient=of_scenes
+        ),
+        "Radiation of a batch": bounded(b.Radiation, surface=surface, emissivity=0.1 * of_scenes, ambient=of_scenes),
+        "Fixed of a batch": bounded(b.Fixed, region=ball, temperature=of_scenes),
+        "FixedSurface of a batch": bounded(b.FixedSurface, region=ball, temperature=of_scenes),
+        "Source of a batch": bounded(b.Source, power=of_particles),
+    }  # fmt: skip
 
 
 def _grids_and_states() -> dict[str, Callable[[], Call]]:
@@ -109,7 +322,7 @@ def _steps() -> dict[str, Callable[[], Call]]:
     def batch() -> Call:
         w = _World()
         grid, state = w.batch()
-        return mpm.Step(grid, w.law, gravity=torch.zeros(2, 2)), dict(state=state, dt=torch.tensor([1e-4, 2e-4]))
+        return mpm.Step(grid, w.law, gravity=torch.zeros(3, 2)), dict(state=state, dt=torch.tensor([1e-4, 2e-4, 2e-4]))
 
     def state_fields() -> Call:
         w = _World()
@@ -298,11 +511,14 @@ def _ops() -> dict[str, Callable[[], Call]]:
         w = _World()
         scene = torch.zeros(POINTS, dtype=torch.int32)
         parameters = [w.one, torch.ones(()), w.one, torch.ones(1)]
-        given = dict(law="von_mises", state=w.matrix, parameters=parameters, history=[w.one], scene=scene, dim=2)
+        given = dict(
+            law="von_mises", state=w.matrix, parameters=parameters, history=[w.one], scene=scene, dim=2, scenes=1
+        )
         return lambda: (getattr(mpm.ops, name), given | further)
 
     w = _World()
-    sand: dict[str, Any] = dict(mu=1.0, lam=w.one, scene=torch.zeros(POINTS, dtype=torch.int32), energy="unilateral")
+    scene = torch.zeros(POINTS, dtype=torch.int32)
+    sand: dict[str, Any] = dict(mu=1.0, lam=w.one, scene=scene, energy="unilateral", scenes=1)
     plastic = dict(friction_angle=0.5, apex="zero", flow="exact", cohesion=0.1, volume_correction=w.one, details=True)
     moving = dict(x=w.x, v=w.x, dt=0.1, C=w.matrix, F=w.matrix, J=w.one, scene=sand["scene"], scenes=2)
     return {
@@ -328,4 +544,8 @@ def _ops() -> dict[str, Callable[[], Call]]:
         "law_energy": of_law("law_energy"),
         "law_stiffness": of_law("law_stiffness"),
         "law_wave_modulus": of_law("law_wave_modulus"),
+        "law_energy_gradient": of_law("law_energy_gradient"),
+        "law_tangent": of_law("law_tangent", before=w.matrix, weight=w.one, projected=True),
+        "wall_impulses": on_blocks("wall_impulses"),
+        "contact_impulses": on_blocks("contact_impulses", mass=torch.ones(9 * 16)),
     }

@@ -22,6 +22,7 @@ template <class T, int D>
 ContactArguments<T, D> contact_arguments(MPM_CONTACT_PARAMETERS) {
   const PackedTopology blocks(topology, lattice, layout);
   auto a = obstacle_arguments<T, D>(velocity, blocks, MPM_OBSTACLES_ARGUMENTS);
+  check_scenes(a, blocks.scenes<T, D>(velocity));
   a.max_blocks = blocks.max_blocks<D>();
   a.block = blocks.block_pointer(velocity);
   const auto v = node_input<T>(velocity, "velocity", velocity, blocks.node_count<D>());
@@ -70,9 +71,7 @@ ContactImpulsesArguments<T, D> impulses_arguments(int64_t& scenes, const Tensor&
   check_like(mass, "mass", velocity);
   a.mass = static_cast<const T*>(mass.data_ptr());
   a.mass_stride = mass.stride(0);
-  int64_t table_size;
-  PackedTopology(topology, lattice, layout).table_pointer(velocity, table_size);
-  scenes = std::min<int64_t>(INT32_MAX, table_size) / a.contact.geometry.blocks_per_scene;
+  scenes = PackedTopology(topology, lattice, layout).scenes<T, D>(velocity);
   return a;
 }
 

@@ -58,14 +58,10 @@ GridUpdateArguments<T, D> grid_update_arguments(MPM_GRID_UPDATE_PARAMETERS) {
   a.nodes = rows<T, D>(nodes, "nodes", nodes);
   int64_t table_size;
   a.table = blocks.table_pointer(nodes, table_size);
-  a.block_count = int(std::min<int64_t>(INT32_MAX, table_size));
-  if (has(gravity)) {
-    check_rank(*gravity, "gravity", 2);
-    const int64_t scenes = gravity->size(0);
-    a.gravity = scene_values<T>(gravity, "gravity", nodes, {scenes, D});
-    a.scene_dt = scene_values<T>(scene_dt, "scene_dt", nodes, {scenes});
-    a.block_count = int(std::min<int64_t>(a.block_count, scenes * a.geometry.blocks_per_scene));
-  }
+  const int64_t scenes = blocks.scenes<T, D>(nodes);
+  a.block_count = int(table_size);
+  a.gravity = scene_values<T>(gravity, "gravity", nodes, {scenes, D});
+  a.scene_dt = scene_values<T>(scene_dt, "scene_dt", nodes, {scenes});
   a.dt = dt;
   a.walls = walls<T, D>(wall_kind, wall_plane, wall_friction, blocks);
   return a;

@@ -89,4 +89,13 @@ ContactArguments<T, D> obstacle_arguments(const Tensor& like, const PackedLattic
   return a;
 }
 
+// Their parameters and times are given once or for each scene.
+template <class T, int D>
+void check_scenes(const ContactArguments<T, D>& a, int64_t scenes) {
+  STD_TORCH_CHECK(a.rows == 1 || a.rows == scenes, "obstacles must have one row or a row per scene, B = ", scenes,
+                  ", got ", a.rows);
+  STD_TORCH_CHECK(!a.scene_time || a.times == 1 || a.times == scenes,
+                  "scene_time must have one entry or an entry per scene, B = ", scenes, ", got ", a.times);
+}
+
 }  // namespace mpm

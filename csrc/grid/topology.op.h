@@ -90,6 +90,17 @@ class PackedTopology : public PackedLattice {
     return int_pointer(table(), "table", like, {size});
   }
 
+  // Scenes of the table.
+  template <class T, int D>
+  int64_t scenes(const Tensor& like) const {
+    int64_t size;
+    table_pointer(like, size);
+    const int64_t per_scene = geometry<T, D>().blocks_per_scene;
+    STD_TORCH_CHECK(size % per_scene == 0 && size <= INT32_MAX, "table must have shape [B * ", per_scene, "], got ",
+                    shape_of(table()));
+    return size / per_scene;
+  }
+
   // The topology of the particles at x. Sizes are checked; of the contents, which only `activate` may write, no more
   // than costs nothing: on the CPU, that no slot has a block beyond the table, which may be that of fewer scenes.
   template <class T, int D>

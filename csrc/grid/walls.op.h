@@ -1,5 +1,7 @@
 #pragma once
 
+#include <cmath>
+
 #include "grid/grid_update.h"
 #include "grid/topology.op.h"
 
@@ -24,6 +26,9 @@ Walls<T, D> walls(const std::vector<int64_t>& kind, const std::vector<double>& p
     const int64_t k = kind.empty() ? int64_t(Contact::open) : kind[face];
     STD_TORCH_CHECK(k >= int64_t(Contact::open) && k <= int64_t(Contact::mirror), "wall_kind must be 0 to 4, got ", k);
     const bool open = k == int64_t(Contact::open);
+    STD_TORCH_CHECK(open || std::isfinite(plane[face]), "wall_plane must be finite, got ", plane[face]);
+    STD_TORCH_CHECK(open || (friction[face] >= 0 && std::isfinite(friction[face])),
+                    "wall_friction must be finite and not negative, got ", friction[face]);
     w.set(face, Contact(k), open ? 0 : friction[face], open ? 0 : plane[face], lattice.dx(), lattice.lower()[face / 2]);
   }
   return w;

@@ -38,6 +38,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> heat_cg(
   STD_TORCH_CHECK(method == 0 || method == 1, "method must be 0 (conjugate gradients) or 1 (Chebyshev), got ", method);
   STD_TORCH_CHECK(max_iterations >= 0 && max_iterations <= INT32_MAX, "max_iterations must be 0 to 2^31 - 1, got ",
                   max_iterations);
+  STD_TORCH_CHECK(heat_capacity.defined(), "heat_capacity must be a tensor, got None");
   Tensor increment, iterations, residual, converged;
   const DeviceScope device(x);
   dispatch(x, [&]<class T, int D>() {

@@ -22,13 +22,46 @@ const LawKernels<T, D>& kernels_of(LawEntry& law) {
   return law.kernels<T, D>();
 }
 
+// The scenes that parameters may be given for: B where the call knows it; otherwise any number above the largest scene
+// of the particles. On CUDA that one is not known without waiting for the device (see `load_parameter`).
+class ParameterScenes {
+ public:
+  ParameterScenes(const OptionalTensor& scene, int64_t scenes) : scene_(scene), scenes_(scenes) {}
+
+  bool fit(int64_t entries) {
+    if (!has(scene_)) return false;
+    if (scenes_ >= 0 || !scene_->is_cpu()) return scenes_ >= 0 ? entries == scenes_ : entries > 0;
+    if (least_ < 0) least_ = std::max<int64_t>(largest() + 1, 1);
+    return entries >= least_;
+  }
+
+  std::string text() const {
+    if (!has(scene_)) return "[B] (with scene)";
+    if (scenes_ >= 0) return "[B] = [" + std::to_string(scenes_) + "]";
+    return least_ < 0 ? "[B]" : "[B], B at least " + std::to_string(least_) + ",";
+  }
+
+ private:
+  int largest() const {
+    const int* const id = static_cast<const int*>(scene_->data_ptr());
+    const int64_t count = scene_->size(0), stride = scene_->stride(0);
+    int most = -1;
+    for (int64_t p = 0; p < count; p++) most = std::max(most, id[p * stride]);
+    return most;
+  }
+
+  const OptionalTensor& scene_;
+  int64_t scenes_;      // negative where they are not known
+  int64_t least_ = -1;  // of the particles, where it is known
+};
+
 template <class T>
 Parameter<T> parameter(const Tensor& t, const std::string& name, const Tensor& state, int64_t particles,
-                       bool has_scene) {
+                       ParameterScenes& scenes) {
   check_like(t, name.c_str(), state);
   const bool uniform = t.dim() <= 1 && t.numel() == 1, per_particle = t.dim() == 1 && t.size(0) == particles;
-  STD_TORCH_CHECK(uniform || per_particle || (t.dim() == 1 && has_scene && t.size(0) > 0), name,
-                  " must be a scalar or have shape [1], [B] (with scene) or [P] = [", particles, "], got ",
+  STD_TORCH_CHECK(uniform || per_particle || (t.dim() == 1 && scenes.fit(t.size(0))), name,
+                  " must be a scalar or have shape [1], ", scenes.text(), " or [P] = [", particles, "], got ",
                   shape_of(t));
   const T* pointer = static_cast<const T*>(t.data_ptr());
   if (uniform) return {pointer, 0, 0};
@@ -64,10 +97,11 @@ inline int64_t history_size(const LawInfo& law, const Tensors& history, int64_t 
   return size;
 }
 
+// `scenes` is the number of scenes of the batch, where the call knows it.
 template <class T, int D>
 LawArguments<T, D> arguments(const LawInfo& law, const Tensor& state, const OptionalTensor& C,
                              const Tensors& parameters, const Tensors& history, const OptionalTensor& scene,
-                             int64_t options = 0) {
+                             int64_t options = 0, int64_t scenes = -1) {
   const int64_t P = state.size(0);
   LawArguments<T, D> a;
   a.particles = P;
@@ -80,8 +114,9 @@ LawArguments<T, D> arguments(const LawInfo& law, const Tensor& state, const Opti
   a.options = int(options);
   check_number(parameters, "parameters", law.parameters.size(), law);
   check_number(history, "history", law.history.size(), law, law.optional_history);
+  ParameterScenes of_parameters(scene, scenes);
   for (size_t k = 0; k < parameters.size(); k++)
-    a.parameters[k] = parameter<T>(parameters[k], element("parameters", int(k)), state, P, has(scene));
+    a.parameters[k] = parameter<T>(parameters[k], element("parameters", int(k)), state, P, of_parameters);
   for (size_t k = 0; k < history.size(); k++)
     a.history[k] = input<T>(history[k], element("history", int(k)).c_str(), state,
                             law.history[k].matrix ? Shape{P, D, D} : Shape{P});

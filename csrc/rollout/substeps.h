@@ -239,13 +239,14 @@ inline void check_material(const OptionalTensor& material, const std::vector<Law
 // The arguments of a law for its own particles.
 template <class T, int D>
 LawArguments<T, D> law_arguments(const LawCall& call, const Tensor& x, const OptionalTensor& F, const OptionalTensor& J,
-                                 const OptionalTensor& C, const OptionalTensor& scene, const OptionalTensor& material) {
+                                 const OptionalTensor& C, const OptionalTensor& scene, const OptionalTensor& material,
+                                 int64_t scenes = -1) {
   const LawInfo& info = call.law->info;
   const char* const name = info.field == Deformation::gradient ? "F" : "J";
   const OptionalTensor& state = info.field == Deformation::gradient ? F : J;
   STD_TORCH_CHECK(has(state), "the law ", info.name, " needs ", name);
   check_shape(*state, name, shape_of_state(info, x.size(0), D));
-  auto a = arguments<T, D>(info, *state, C, call.parameters, call.history, scene, call.options);
+  auto a = arguments<T, D>(info, *state, C, call.parameters, call.history, scene, call.options, scenes);
   if (has(material)) a.members = {static_cast<const int*>(material->data_ptr()), material->stride(0), call.material};
   return a;
 }
@@ -631,7 +632,7 @@ Substeps<T, D>::Substeps(const SubstepsInputs& inputs) : in(inputs) {
     STD_TORCH_CHECK(in.wants_C || !info.viscous, "the viscous law ", info.name, " needs wants_C");
     kernels_of<T, D>(*calls[k].law);
     LawUpdateArguments<T, D> a;
-    a.law = law_arguments<T, D>(calls[k], x, in.F, in.J, {}, in.scene, in.material);
+    a.law = law_arguments<T, D>(calls[k], x, in.F, in.J, {}, in.scene, in.material, in.scenes);
     a.adds = calls[k].adds;
     a.stress = field<T>(stress);
     laws.push_back(a);
@@ -658,6 +659,7 @@ Substeps<T, D>::Substeps(const SubstepsInputs& inputs) : in(inputs) {
   if (obstacles)
     contact = obstacle_arguments<T, D>(x, in.lattice, *in.obstacle_table, in.obstacle_data.value(), in.shape, in.sizes,
                                        in.contact_kind, in.obstacle_scene, in.start, in.end, {}, in.time, in.n);
+  if (obstacles) check_scenes(contact, in.scenes);
   STD_TORCH_CHECK(has(in.scene_dt) == has(in.scene_time), "scene_dt must be given with scene_time");
   if (has(in.scene_dt)) {
     for (const auto& [tensor, name] : {std::pair(*in.scene_dt, "scene_dt"), std::pair(*in.scene_time, "scene_time")}) {

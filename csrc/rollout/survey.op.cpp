@@ -48,6 +48,7 @@ Tensor survey(const Tensor& x, const Tensor& v, const Tensor& mass, const Tensor
       STD_TORCH_CHECK(has(obstacle_data), "obstacles need data");
       a.contact = obstacle_arguments<T, D>(x, packed, *obstacle_table, obstacle_data.value(), shape, sizes,
                                            contact_kind, scene, start, end, scene_time, time);
+      check_scenes(a.contact, scenes);
       a.contact.rounding = T(reach);
     }
     a.result = static_cast<double*>(result.data_ptr());

@@ -497,10 +497,21 @@ def test_bad_arguments() -> None:
 
 
 def test_scene_ids_out_of_range_do_not_read_outside(device: str) -> None:
-    F = 1.1 * torch.eye(3, device=device).repeat(3, 1, 1)
-    scene = torch.tensor([0, 2**30, -5], dtype=torch.int32, device=device)
-    stress = mpm.NeoHookean(E=torch.tensor([1.0, 2.0], device=device), nu=0.3).stress(state_of(F, scene=scene))
-    assert torch.equal(stress[1], stress[0]) and torch.equal(stress[2], stress[0])
+    """An absent particle, of a negative scene, does no harm. A scene without a value is an error; where nothing waits
+    for the device, its particles are invalid."""
+    F = 1.1 * torch.eye(3, device=device).repeat(4, 1, 1)
+    E, law = torch.tensor([1.0, 2.0], device=device), mpm.NeoHookean(E=torch.tensor([1.0, 2.0], device=device), nu=0.3)
+    scene = torch.tensor([0, 1, -5, -(2**31)], dtype=torch.int32, device=device)
+    stress = law.stress(state_of(F, scene=scene))
+    assert torch.equal(stress[2], stress[0]) and torch.equal(stress[3], stress[0])
+    beyond = scene.where(scene != 1, 2**30)
+    with pytest.raises(ValueError, match=r"^E must have shape .*got \[2\]"):
+        law.stress(state_of(F, scene=beyond))
+    if device == "cpu":
+        with pytest.raises(ValueError, match=r"^mu must have .* got \[2\] with B at least 1073741825$"):
+            ops.law_energy("neo_hookean", F, [E, E], scene=beyond)
+    else:
+        assert ops.law_energy("neo_hookean", F, [E, E], scene=beyond).isfinite().tolist() == [True, False, True, True]
 
 
 def test_a_module_in_place_of_a_law(device: str) -> None:

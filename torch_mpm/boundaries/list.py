@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, MutableSequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, MutableSequence
 from typing import Any
 
 from torch import Tensor, nn
@@ -22,7 +22,7 @@ class BoundaryList(nn.Module, MutableSequence[Any]):
 
     def __init__(self, boundaries: Iterable[Any] = ()) -> None:
         super().__init__()
-        if not isinstance(boundaries, Iterable) or isinstance(boundaries, str):
+        if not isinstance(boundaries, Iterable) or isinstance(boundaries, (str, Mapping)):
             raise TypeError(f"boundaries must be a list of obstacles, got {shape_of(boundaries)}: put it in a list")
         self._keep(list(boundaries))
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import torch
@@ -40,6 +40,8 @@ class RigidMotion(SceneParameters):
         angular_velocity: [rad/s], in the same forms.
         start: [s]
     """
+
+    RANKS: ClassVar = {"position": 1, "velocity": 1, "rotation": None, "angular_velocity": None}
 
     def __init__(
         self,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import uuid
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -76,6 +76,8 @@ class Obstacle(RigidMotion):
     Raises:
         TypeError, ValueError: for a wrong argument; shapes of tensors are checked at the first use.
     """
+
+    RANKS: ClassVar = {**RigidMotion.RANKS, "friction": 0}
 
     def __init__(
         self,
@@ -228,6 +230,12 @@ class Obstacle(RigidMotion):
             raise ValueError(f"position must have {dim} numbers per point, got {shape_of(centre)}")
         arm = positions - per_node(centre, 1, scene)
         return arm, None if turn is None else per_node(turn, 2, scene)
+
+    def check_scenes(self, dim: int, scenes: int) -> None:
+        super().check_scenes(dim, scenes)
+        self.shape.check_scenes(dim, scenes)
+        if self.scene is not None and self.scene >= scenes:
+            raise ValueError(f"scene must be below B = {scenes}, got {self.scene}")
 
     # -- as a region
 

@@ -32,6 +32,8 @@ class Waypoints(nn.Module):
         super().__init__()
         if not isinstance(time, Tensor):
             time = torch.tensor(check_numbers("time", time), dtype=torch.float64, device="cpu")
+        if not isinstance(position, (Tensor, list, tuple)) and not hasattr(position, "__array__"):
+            raise TypeError(f"position must be a tensor [K, D] or K lists of D numbers, got {shape_of(position)}")
         if not isinstance(position, Tensor):
             rows = [check_numbers(f"position[{k}]", row) for k, row in enumerate(position)]
             if len({len(row) for row in rows}) > 1:
@@ -42,6 +44,10 @@ class Waypoints(nn.Module):
                 "time and position must have shapes [K] and [K, D], K at least 2, "
                 f"got {shape_of(time)} and {shape_of(position)}"
             )
+        if not position.is_floating_point():
+            raise TypeError(f"position must be a floating tensor, got {position.dtype}")
+        if time.is_meta or position.is_meta:
+            raise ValueError("time and position must have values, got tensors on the device meta")
         check_knots("time", time, "position", position)
         self.register_buffer("time", time)
         store(self, "position", position)

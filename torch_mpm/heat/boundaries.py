@@ -23,7 +23,7 @@ from ..grid import Blocks
 from ..laws.compiled import check_value
 from ..ops import scatter
 from ..ops.pointwise import pointwise
-from ..parameters import TensorModule, Value, evaluate
+from ..parameters import TensorModule, Value, evaluate, needs_no_scenes
 from ..per_scene import per_node
 from ..topology import PADDING
 
@@ -89,14 +89,19 @@ class HeatNodes:
         """Scene of each node, int32 [N]; None for one scene."""
         return None if self.state.scene is None else self.blocks.node_scene()
 
-    def per_node(self, value: Timed) -> Number:
-        """A number, or a tensor [], [B] or [N], or a function of the time that returns one, as a number or [N]."""
+    def per_node(self, value: Timed, name: str = "") -> Number:
+        """A number, or a tensor [], [1], [B] or [N], or a function of the time that returns one, as a number or [N].
+
+        Raises:
+            ValueError: for another shape, with the name of the value.
+        """
         value = _at(value, self.time)
         if not isinstance(value, Tensor) or value.shape == self.theta.shape:
             return value.to(self.theta) if isinstance(value, Tensor) else value
         scenes = self.blocks.grid.scenes
         if value.shape not in ((), (1,), (scenes,)):
-            raise ValueError(f"a value at nodes must have shape [], [B] = [{scenes}] or [N], got {shape_of(value)}")
+            what = f"{name}, a value at nodes," if name else "a value at nodes"
+            raise ValueError(f"{what} must have shape [], [1], [B] = [{scenes}] or [N], got {shape_of(value)}")
         return per_node(value.to(self.theta), 0, self.scene())
 
     def add_source(self, power: Tensor) -> None:
@@ -172,11 +177,13 @@ class Surface(TensorModule):
     def __init__(self, points: Tensor, area: Number, scene: Tensor | None = None) -> None:
         if not isinstance(points, Tensor) or points.dim() != 2 or points.shape[1] not in (2, 3):
             raise ValueError(f"points must have shape [S, 2] or [S, 3], got {shape_of(points)}")
+        if not points.is_floating_point():
+            raise TypeError(f"points must be a floating tensor, got {points.dtype}")
         if callable(area) and not isinstance(area, Tensor):
             raise TypeError(f"area must be {NUMBER_OR_TENSOR}, got {shape_of(area)}")
         if isinstance(area, Tensor) and area.shape not in ((), points.shape[:1]):
             raise ValueError(f"area must be a number or have shape [S] = [{points.shape[0]}], got {shape_of(area)}")
-        if not bool(points.detach().isfinite().all()):
+        if points.is_meta or not bool(points.detach().isfinite().all()):
             raise ValueError("points must be finite, and some are NaN or infinite")
         self.area: Number = _checked("area", area, "not negative", lambda v: v >= 0)  # type: ignore[assignment]
         if scene is not None and (not isinstance(scene, Tensor) or scene.shape != points.shape[:1]):
@@ -185,10 +192,15 @@ class Surface(TensorModule):
             raise TypeError(f"scene must be int32, got {scene.dtype}")
         self.points, self.scene = points, scene
 
-    def integrate(self, nodes: HeatNodes, density: Timed) -> Tensor:
-        """∫ N_i density dA [N] of a density per area: a number, a tensor [] or [S], or a function of the time."""
-        density = _at(density, nodes.time)
+    def integrate(self, nodes: HeatNodes, density: Timed, name: str = "density") -> Tensor:
+        """∫ N_i density dA [N] of a density per area: a number, a tensor [], [1], [S] or, of points with scenes,
+        [B], or a function of the time.
+
+        Raises:
+            ValueError: for another shape, with the name of the density.
+        """
         points = self.points.to(nodes.theta)
+        density = self._of_points(_at(density, nodes.time), nodes.blocks.grid.scenes, name)
         rows, weight = node_weights(nodes.blocks, points, self.scene)
         weight = weight * (nodes.heat_capacity.detach()[rows] > 0)
         total = weight.sum(1, keepdim=True)
@@ -196,6 +208,17 @@ class Surface(TensorModule):
         amount = (torch.ones_like(points[:, 0]) * self.area * density).to(points)
         given = amount[:, None] * weight
         return torch.zeros_like(nodes.theta).index_add(0, rows.reshape(-1), given.reshape(-1))
+
+    def _of_points(self, density: Number, scenes: int, name: str) -> Number:
+        """A density that is the same for all points, or one for each of them, [S]."""
+        if not isinstance(density, Tensor) or needs_no_scenes(density, len(self.points)):
+            return density
+        if self.scene is None or density.shape != (scenes,):
+            batch = "" if self.scene is None else f", [B] = [{scenes}]"
+            raise ValueError(
+                f"{name} must have shape [], [1]{batch} or [S] = [{len(self.points)}], got {shape_of(density)}"
+            )
+        return density.index_select(0, self.scene.clamp(0, scenes - 1))
 
 
 class FreeSurface(TensorModule):
@@ -205,9 +228,14 @@ class FreeSurface(TensorModule):
     V/dx per node like that of the disorder. A side that touches an obstacle counts too.
     """
 
-    def integrate(self, nodes: HeatNodes, density: Timed) -> Tensor:
-        """∫ N_i density dA [N] of a density per area: a number, a tensor [], [B] or [N], or a function of the time."""
-        return nodes.free_area * nodes.per_node(density)
+    def integrate(self, nodes: HeatNodes, density: Timed, name: str = "density") -> Tensor:
+        """∫ N_i density dA [N] of a density per area: a number, a tensor [], [1], [B] or [N], or a function of
+        the time.
+
+        Raises:
+            ValueError: for another shape, with the name of the density.
+        """
+        return nodes.free_area * nodes.per_node(density, name)
 
 
 def node_weights(blocks: Blocks, x: Tensor, scene: Tensor | None) -> tuple[Tensor, Tensor]:
@@ -245,7 +273,7 @@ class Flux(Term):
 
     Args:
         surface: a `Surface` or a `FreeSurface`.
-        flux: η [W/m²], positive into the body: a number, a tensor per point or scene, or a function of the time.
+        flux: η [W/m²], positive into the body: a number, a tensor [], [B] or per point [S], or a function of the time.
 
     Raises:
         ValueError: for a flux that is not finite.
@@ -257,7 +285,7 @@ class Flux(Term):
         self.surface, self.flux = _surface(surface), _checked("flux", flux)
 
     def apply(self, nodes: HeatNodes) -> None:  # type: ignore[override]
-        nodes.add_source(self.surface.integrate(nodes, self.flux))
+        nodes.add_source(self.surface.integrate(nodes, self.flux, "flux"))
 
 
 class Convection(Term):
@@ -265,7 +293,7 @@ class Convection(Term):
 
     Args:
         surface: a `Surface` or a `FreeSurface`.
-        coefficient: [W/(m² K)], not negative: a number, a tensor per point or scene, or a function of the time.
+        coefficient: [W/(m² K)], not negative: a number, a tensor [], [B] or per point [S], or a function of the time.
         ambient: temperature of the fluid [K]: a number, a tensor [] or [B], or a function of the time.
 
     Raises:
@@ -279,7 +307,8 @@ class Convection(Term):
         self.coefficient = _checked("coefficient", coefficient, "not negative", lambda v: v >= 0)
 
     def apply(self, nodes: HeatNodes) -> None:  # type: ignore[override]
-        nodes.add_exchange(self.surface.integrate(nodes, self.coefficient), nodes.per_node(self.ambient))
+        coefficient = self.surface.integrate(nodes, self.coefficient, "coefficient")
+        nodes.add_exchange(coefficient, nodes.per_node(self.ambient, "ambient"))
 
 
 class Radiation(Term):
@@ -287,7 +316,7 @@ class Radiation(Term):
 
     Args:
         surface: a `Surface` or a `FreeSurface`.
-        emissivity: ε in [0, 1]: a number, a tensor per point or scene, or a function of the time.
+        emissivity: ε in [0, 1]: a number, a tensor [], [B] or per point [S], or a function of the time.
         ambient: temperature of the surroundings [K], relative to the reference as all temperatures, which `Heat` needs
             to know in kelvin: a number, a tensor [] or [B], or a function of the time.
 
@@ -302,7 +331,8 @@ class Radiation(Term):
         self.emissivity = _checked("emissivity", emissivity, "between 0 and 1", lambda v: (v >= 0) & (v <= 1))
 
     def apply(self, nodes: HeatNodes) -> None:  # type: ignore[override]
-        emitting, ambient = self.surface.integrate(nodes, self.emissivity), nodes.per_node(self.ambient)
+        emitting = self.surface.integrate(nodes, self.emissivity, "emissivity")
+        ambient = nodes.per_node(self.ambient, "ambient")
         linear = pointwise(
             *("heat_radiation", nodes.blocks.grid.dim),
             *(emitting, STEFAN_BOLTZMANN, nodes.theta, ambient, nodes.reference),
@@ -328,19 +358,20 @@ class Fixed(Term):
     timed = ("region", "temperature")
 
     def __init__(self, region: Obstacle | Callable[[Tensor], Tensor], temperature: Timed) -> None:
-        if not callable(region):
+        if not callable(region) or isinstance(region, type):
             raise TypeError(f"region must be an obstacle or a function of positions [N, D], got {shape_of(region)}")
         self.region, self.temperature = region, _checked("temperature", temperature)
 
     def apply(self, nodes: HeatNodes) -> None:  # type: ignore[override]
         positions = nodes.blocks.node_positions(nodes.theta.dtype)
         if isinstance(self.region, Obstacle):
+            self.region.check_scenes(nodes.blocks.grid.dim, nodes.blocks.grid.scenes)
             where = self.region.contains(positions, nodes.scene(), nodes.time)
         else:
             where = self.region(positions)
             if not isinstance(where, Tensor) or where.shape != nodes.theta.shape or where.dtype != torch.bool:
                 raise ValueError(f"region must return bool [N] = {list(nodes.theta.shape)}, got {shape_of(where)}")
-        nodes.hold(where & (nodes.heat_capacity > 0), nodes.per_node(self.temperature))
+        nodes.hold(where & (nodes.heat_capacity > 0), nodes.per_node(self.temperature, "temperature"))
 
 
 class FixedSurface(Term):
@@ -372,9 +403,10 @@ class FixedSurface(Term):
 
     def apply(self, nodes: HeatNodes) -> None:  # type: ignore[override]
         width, state = self.WIDTH * nodes.blocks.grid.dx, nodes.state
+        self.region.check_scenes(nodes.blocks.grid.dim, nodes.blocks.grid.scenes)
         distance = self.region.signed_distance(state.x, state.scene, nodes.time).to(state.x)
         share, rate = pointwise("heat_layer", nodes.blocks.grid.dim, distance, width)
-        nodes.add_layer(share, rate, nodes.per_node(self.temperature))
+        nodes.add_layer(share, rate, nodes.per_node(self.temperature, "temperature"))
 
 
 class Source(Term):
@@ -413,6 +445,10 @@ def _checked(name: str, value: Timed, expected: str = "", holds: Callable[[Any],
     """A number or tensor of which all is finite and holds; a function of the time is not asked."""
     expected = f"{expected} and finite" if expected else "finite"
     if isinstance(value, Tensor):
+        if value.is_complex() or value.dtype == torch.bool:
+            raise TypeError(f"{name} must have a real dtype, got {value.dtype}")
+        if value.is_meta:
+            raise ValueError(f"{name} must have values, got a tensor on the device meta")
         if not bool((holds(value.detach()) & value.detach().isfinite()).all()):
             raise ValueError(f"{name} must be {expected}, got {value}")
         return value

@@ -40,7 +40,7 @@ from ..ops import gather, heat_cg, scatter
 from ..ops.arguments import check_choice, per_particle
 from ..ops.heat import METHODS
 from ..ops.pointwise import pointwise
-from ..parameters import Value, evaluate, needed_temperature, store
+from ..parameters import Value, check_length, evaluate, needed_temperature, store
 from ..pause import paused
 from ..state import State, check_state
 from ..vectors import determinant
@@ -168,6 +168,7 @@ class Heat(nn.Module):
             ValueError: for a state without temperature, or fields of a wrong shape.
         """
         check_state(state)
+        state = state.of_scenes(self.grid.scenes)
         temperature = needed_temperature(state)
         extra = dict(state.extra)
         if self.affine and GRADIENT not in extra:
@@ -218,6 +219,7 @@ class Heat(nn.Module):
             velocity_gradient: ∇v [P, D, D] [1/s] that the particles move with; None at rest.
             dissipated: energy that the law turned into heat in this step, per rest volume [P] [J/m³], or None.
         """
+        self._check_parameters(len(state))
         theta, gradient = needed_temperature(state), state.extra.get(GRADIENT) if self.affine else None
         step = dt if not isinstance(dt, Tensor) else per_particle(dt.reshape(-1).to(theta), state.scene, len(theta))
         motion: Tensor | float = 0.0 if velocity_gradient is None else velocity_gradient
@@ -246,6 +248,11 @@ class Heat(nn.Module):
         if self.melts:
             theta, extra[LIQUID] = self._melt(state, specific_heat, theta, extra[LIQUID])
         return {"temperature": theta, "extra": extra} if extra else {"temperature": theta}
+
+    def _check_parameters(self, particles: int) -> None:
+        melting = ("melting_point", "latent_heat") if self.melts else ()
+        for name in ("conductivity", "specific_heat", *melting):
+            check_length(name, getattr(self, name), particles, self.grid.scenes)
 
     def _solve(self, nodes: HeatNodes, dt: float | Tensor) -> Tensor:
         """Change of the temperature of the nodes in the step [N]."""

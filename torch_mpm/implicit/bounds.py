@@ -142,7 +142,7 @@ def node_bounds(
     if obstacles and any(f.kind == "mirror" for f in faces):
         positions, sign = reflected_inside(faces, positions)
     for number, obstacle in enumerate(obstacles):
-        _add_obstacle(bounds, obstacle, number, positions, sign, scene, time)
+        _add_obstacle(bounds, obstacle, number, positions, sign, scene, blocks.grid.scenes, time)
     return bounds
 
 
@@ -184,12 +184,14 @@ def _add_obstacle(
     positions: Tensor,
     sign: Tensor | None,
     scene: Tensor | None,
+    scenes: int,
     time: float | Tensor,
 ) -> None:
     if not isinstance(obstacle, Obstacle):
         raise NotImplementedError(
             f"an implicit step takes obstacles alone as boundaries, got {type(obstacle).__name__}"
         )
+    obstacle.check_scenes(positions.shape[1], scenes)
     contact = obstacle.contact_at(positions, scene, time)
     if contact is None:
         return

@@ -23,7 +23,7 @@ from ..ops.arguments import per_particle, sum_by_scene
 from ..parameters import Overlay
 from .mirrors import Mirrors
 
-READ = ("x", "mass", "volume", "F", "J", "scene", "ids", "material", "temperature", "time", "dt", "particles")
+READ = ("x", "mass", "volume", "F", "J", "scene", "ids", "material", "temperature", "time", "dt", "particles", "scenes")
 """What laws may read of a state: velocities are those of the nodes."""
 
 

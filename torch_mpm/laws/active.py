@@ -73,6 +73,12 @@ class Active(Material):
     def volume_ratio(self, state: State) -> Tensor:
         return self.law.volume_ratio(state)
 
+    def check_parameters(self, particles: int, scenes: int | None) -> None:
+        self.law.check_parameters(particles, scenes)
+        if self.direction.dim() != 1 and (self.direction.dim() != 2 or len(self.direction) != particles):
+            found = shape_of(self.direction)
+            raise ValueError(f"direction must have shape [D] or [P, D] with P = {particles}, got {found}")
+
     def initial(self, name: str, state: State) -> Tensor:
         return torch.zeros_like(state.mass) if name == ACTIVATION else self.law.initial(name, state)
 

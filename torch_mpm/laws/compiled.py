@@ -31,7 +31,7 @@ from ..ops.law import (
     option_bits,
 )
 from ..ops.registry import LAWS
-from ..parameters import Overlay, PerMaterial, Value, evaluate
+from ..parameters import Overlay, PerMaterial, Value, check_length, evaluate, needs_no_scenes
 from ..vectors import product
 from .flowing import flowing_skew, flowing_stress, flowing_tangent
 from .material import Material
@@ -42,6 +42,8 @@ if TYPE_CHECKING:
 
 PLASTIC_VOLUME = "log_plastic_volume"
 """History of laws whose plastic flow changes the volume: ln J_p."""
+ARGUMENTS = {"eta": "viscosity"}
+"""Names of arguments that are stored under another name."""
 FIGURES = ("stress", "stiffness", "energy_density")
 """What a survey asks of a law."""
 
@@ -102,6 +104,7 @@ class CompiledLaw(Material):
             state.x.shape[1],
             self._options(),
             details,
+            self._scenes(state, parameters),
         )
 
     def update(self, state: State) -> tuple[dict[str, Tensor], Tensor]:
@@ -123,7 +126,8 @@ class CompiledLaw(Material):
         law, moduli, options = self._elastic_law(state, mapped.history)
         F = torch.nn.functional.pad(mapped.state, (0, 1, 0, 1))
         F[:, 2, 2] = 1
-        return law_update(law, F, moduli, scene=state.scene, options=options).stress[:, 2, 2]
+        scenes = self._scenes(state, moduli)
+        return law_update(law, F, moduli, scene=state.scene, options=options, scenes=scenes).stress[:, 2, 2]
 
     def _elastic_law(self, state: State, history: Sequence[Tensor]) -> tuple[str, list[Tensor], Sequence[str]]:
         """A compiled law with the elastic energy of this one in 2-D and 3-D: its name, parameters and options."""
@@ -141,11 +145,11 @@ class CompiledLaw(Material):
 
     def energy_density(self, state: State) -> Tensor:
         """Elastic energy per rest volume [P] [J/m³] after the return map."""
-        name, deformation, parameters, history, scene, dim = self._of_the_ops(state)
+        name, deformation, parameters, history, scene, dim, scenes = self._of_the_ops(state)
         if LAWS[self.name].plastic or history:
             moved = self.return_map(state)
             deformation, history = moved.state, moved.history
-        return law_energy(name, deformation, parameters, history, scene, dim)
+        return law_energy(name, deformation, parameters, history, scene, dim, scenes)
 
     def trial_energy(self, state: Any, before: Any) -> Tensor:
         energy = law_energy(*self._of_the_ops(state))
@@ -166,9 +170,11 @@ class CompiledLaw(Material):
     def trial_tangent(self, state: Any, before: Any, weight: Tensor, projected: bool, flows: bool = False) -> Tensor:
         if flows and LAWS[self.name].plastic:
             return flowing_tangent(self, state, before, weight, projected)
-        name, deformation, parameters, history, scene, dim = self._of_the_ops(state)
+        name, deformation, parameters, history, scene, dim, scenes = self._of_the_ops(state)
         before_field = getattr(before, self.state_fields[0])
-        tangent = law_tangent(name, deformation, before_field, weight, parameters, history, scene, dim, projected)
+        tangent = law_tangent(
+            *(name, deformation, before_field, weight, parameters, history, scene, dim, projected, scenes)
+        )
         viscosity = self.viscosity(before)
         if viscosity is not None:  # of a fluid, whose frames are the identity: 2 η dev sym L
             add_deviator(tangent, dim, 2 * viscosity * torch.where(weight > 0, weight / state.step, 0))
@@ -179,11 +185,11 @@ class CompiledLaw(Material):
 
     def _energy_gradient(self, state: Any) -> Tensor:
         """∂ψ/∂F or ∂ψ/∂J of the state itself, which can be differentiated once more."""
-        name, deformation, parameters, history, scene, dim = self._of_the_ops(state)
+        name, deformation, parameters, history, scene, dim, scenes = self._of_the_ops(state)
         if self.elastic_name is None:
-            return law_energy_gradient(name, deformation, parameters, history, scene, dim)
+            return law_energy_gradient(name, deformation, parameters, history, scene, dim, scenes)
         moduli = self._elastic_moduli(state, parameters, history)
-        return law_energy_gradient(self.elastic_name, deformation, moduli, (), scene, dim)
+        return law_energy_gradient(self.elastic_name, deformation, moduli, (), scene, dim, scenes)
 
     def _elastic_moduli(self, state: Any, parameters: list[Tensor], history: Sequence[Tensor]) -> list[Tensor]:
         """μ and λ with which the law `elastic_name` has the energy of this one."""
@@ -191,14 +197,24 @@ class CompiledLaw(Material):
 
     def _viscous_stress(self, state: Any, before: Any) -> Tensor:
         """What the velocity gradient of a step adds to the stress, at the volume before it [P, D, D] [Pa]."""
-        name, J, parameters, history, scene, dim = self._of_the_ops(before)
-        moving, still = (law_update(name, J, parameters, history, C, scene, dim).stress for C in (state.C, None))
+        name, J, parameters, history, scene, dim, scenes = self._of_the_ops(before)
+        moving, still = (
+            law_update(name, J, parameters, history, C, scene, dim, scenes=scenes).stress for C in (state.C, None)
+        )
         return moving - still
 
-    def _of_the_ops(self, state: Any) -> tuple[str, Tensor, list[Tensor], Sequence[Tensor], Tensor | None, int]:
-        """What the ops of energy and moduli take: law, state, parameters, history, scene and dimension."""
+    def _of_the_ops(
+        self, state: Any
+    ) -> tuple[str, Tensor, list[Tensor], Sequence[Tensor], Tensor | None, int, int | None]:
+        """What the ops of energy and moduli take: law, state, parameters, history, scene, dimension and scenes."""
         deformation, parameters = self._arguments(state)
-        return self._name(state), deformation, parameters, self._history(state), state.scene, state.x.shape[1]
+        batch = state.scene, state.x.shape[1], self._scenes(state, parameters)
+        return self._name(state), deformation, parameters, self._history(state), *batch
+
+    def _scenes(self, state: State, parameters: Sequence[Tensor]) -> int | None:
+        """Number of scenes, where a parameter is per scene."""
+        P = state.x.shape[0]
+        return None if all(needs_no_scenes(p, P) for p in parameters) else state.scenes
 
     def wave_modulus(self, state: State) -> Tensor:
         """Upper bound of rest density times squared wave speed after the return map [P] [Pa]; exact at rest."""
@@ -278,6 +294,15 @@ class CompiledLaw(Material):
             parameters = [*parameters, dt.to(**like) if isinstance(dt, Tensor) else torch.full((), dt, **like)]
         return deformation, parameters
 
+    def check_parameters(self, particles: int, scenes: int | None) -> None:
+        for name, value in self._stored().items():
+            if isinstance(value, (Tensor, PerMaterial)):
+                check_length(ARGUMENTS.get(name, name), value, particles, scenes)
+
+    def _stored(self) -> dict[str, Any]:
+        """All attributes, by the names under which parameters are stored."""
+        return {**vars(self), **self._parameters, **self._buffers, **self._modules}
+
     def _parameters_of(self, state: State) -> list[Tensor]:
         """Parameters in the dtype, on the device and in the particle order of the state.
 
@@ -286,12 +311,15 @@ class CompiledLaw(Material):
         if self._functions:
             in_order: Any = Overlay(state, ids=None)  # which evaluated parameters already are
             return self._at_temperature(state)._convert(in_order)
-        tensors = [t for t in (*self._parameters.values(), *self._buffers.values()) if t is not None]
+        tensors = [value for value in self._stored().values() if isinstance(value, Tensor)]
+        x, order = state.x, None
+        particles = getattr(state, "particles", x.shape[0])
+        if not all(needs_no_scenes(t, particles) for t in tensors):
+            self.check_parameters(particles, state.scenes)
         if torch.compiler.is_compiling() or any(t.requires_grad for t in tensors):
             return self._convert(state)
         numbers = [value for value in vars(self).values() if isinstance(value, Real)]
-        x, order = state.x, None
-        if tensors and any(t.numel() == getattr(state, "particles", x.shape[0]) for t in tensors):
+        if any(t.numel() == particles for t in tensors):
             order = state.ids  # of what differs by particle
         key = (x.dtype, x.device, order, *numbers, *tensors)
         return self._kept_parameters.get(key, lambda: self._convert(state), x)
@@ -300,10 +328,9 @@ class CompiledLaw(Material):
         """The law with its parameters at the temperature of each particle, in the order of the state."""
         law: CompiledLaw = object.__new__(type(self))
         law.__dict__ = {**self.__dict__, "_parameters": {}, "_buffers": {}, "_modules": {}}
-        stored = {**vars(self), **self._parameters, **self._buffers, **self._modules}
-        for name, value in stored.items():
+        for name, value in self._stored().items():
             if isinstance(value, Tensor) or (callable(value) and not name.startswith("_")):
-                law.__dict__[name] = evaluate(name, value, state)
+                law.__dict__[name] = evaluate(ARGUMENTS.get(name, name), value, state)
         return law
 
     def _convert(self, state: State) -> list[Tensor]:
@@ -386,6 +413,8 @@ def check_value(name: str, value: Value, expected: str, holds: Callable[[Any], A
             raise ValueError(
                 f"{name} must be a number or a floating tensor of shape [], [1], [B] or [P], got {shape_of(value)}"
             )
+        if value.is_meta:
+            raise ValueError(f"{name} must have values, got a tensor on the device meta")
         if not bool((holds(value.detach()) & (value.detach().isfinite() | infinite)).all()):
             raise ValueError(f"{name} must be {expected}, got {value}")
         return value

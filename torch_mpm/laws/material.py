@@ -49,6 +49,15 @@ class Material(nn.Module):
         """One of `extra_fields` before the first step: zero, [P] unless the law says otherwise."""
         return torch.zeros_like(state.mass)
 
+    def check_parameters(self, particles: int, scenes: int | None) -> None:
+        """Check the tensors of the law, and of the laws inside it, for a state of P particles and B scenes.
+
+        A step calls it before it calls the law. Here nothing is checked.
+
+        Raises:
+            ValueError: for one whose shape is not [], [1], [B] or [P], or another that its argument may have.
+        """
+
     def stress(self, state: State) -> Tensor:
         """Kirchhoff stress τ [P, D, D] [Pa]."""
         return self.update(state)[1]

@@ -79,6 +79,10 @@ class Mixture(Material):
     def volume_ratio(self, state: State) -> Tensor:
         return self._collect(state, lambda law, part: law.volume_ratio(part))
 
+    def check_parameters(self, particles: int, scenes: int | None) -> None:
+        for law in self.laws:
+            law.check_parameters(particles, scenes)  # type: ignore[operator]
+
     def initial(self, name: str, state: State) -> Tensor:
         return next(law.initial(name, state) for law in self.laws if name in law.extra_fields)  # type: ignore[operator]
 

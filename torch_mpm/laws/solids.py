@@ -240,7 +240,7 @@ class Snow(SolidLaw):
         stretches = state.x.new_ones(P, D)
         stretches[:, 0] = 2
         unit = [mu.new_ones(()), mu.new_zeros(()), *rest]
-        factor = law_energy(self.name, torch.diag_embed(stretches), unit, history, state.scene)
+        factor = law_energy(self.name, torch.diag_embed(stretches), unit, history, state.scene, D, state.scenes)
         return [factor * per_parameter(modulus, state.scene, P) for modulus in (mu, lam)]
 
 

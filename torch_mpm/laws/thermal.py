@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ..errors import check_number
 from ..ops.pointwise import pointwise
-from ..parameters import Overlay, Value, evaluate, needed_temperature, store
+from ..parameters import Overlay, Value, check_length, evaluate, needed_temperature, store
 from .compiled import check_value
 from .custom import as_law
 from .material import Material
@@ -46,6 +46,10 @@ class ThermalExpansion(Material):
         self.state_fields, self.extra_fields = law.state_fields, law.extra_fields
         self.viscous = law.viscous
         store(self, "coefficient", check_value("coefficient", coefficient, "finite", lambda v: v == v))
+
+    def check_parameters(self, particles: int, scenes: int | None) -> None:
+        self.law.check_parameters(particles, scenes)
+        check_length("coefficient", self.coefficient, particles, scenes)
 
     def update(self, state: State) -> tuple[dict[str, Tensor], Tensor]:
         fields, stress = self.law(self._elastic(state))
@@ -127,6 +131,10 @@ class Melting(Material):
         self.solid, self.liquid, self.coherency = solid, liquid, float(coherency)
         self.extra_fields = solid.extra_fields
         self.viscous = solid.viscous or liquid.viscous
+
+    def check_parameters(self, particles: int, scenes: int | None) -> None:
+        for law in (self.solid, self.liquid):
+            law.check_parameters(particles, scenes)
 
     def update(self, state: State) -> tuple[dict[str, Tensor], Tensor]:
         fraction, part = self._fraction(state), self._consistent(state)

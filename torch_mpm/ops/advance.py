@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..errors import check_like, shape_of
+from ..errors import check_count, check_index, check_like, shape_of
 from .arguments import differentiate, per_particle, refuse_vmap, sizes, soa_empty, split_dt, sum_by_scene
 from .autograd import dispatch, register_autograd
 
@@ -45,13 +45,16 @@ def advance(
     if not isinstance(x, Tensor) or x.dim() != 2 or x.shape[1] not in (2, 3):
         raise ValueError(f"x must have shape [P, 2] or [P, 3], got {shape_of(x)}")
     P, D = x.shape
-    check_like("v", v, x, (P, D), "[P, D]")
+    check_like("v", v, x, (P, D), "[P, D]", needed=True)
     check_like("C", C, x, (P, D, D), "[P, D, D]")
     check_like("F", F, x, (P, D, D), "[P, D, D]")
     check_like("J", J, x, (P,), "[P]")
     if C is None and (F is not None or J is not None):
         raise ValueError("F and J need C")
-    number, scene_dt = split_dt(dt, scenes, x)
+    check_index("scene", scene, x)
+    number, scene_dt = split_dt(dt, check_count("scenes", scenes), x)
+    if scene is None and scene_dt is not None and len(scene_dt) > 1:
+        raise ValueError(f"scene must be given, int32 [P], for a dt of {len(scene_dt)} scenes")
     return dispatch(torch.ops.torch_mpm.advance, x, v, C, F, J, scene, scene_dt, number)
 
 

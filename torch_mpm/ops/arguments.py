@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ..capture import is_traced
 from ..errors import LARGEST, REAL, check_like, shape_of
 
 
@@ -31,17 +32,19 @@ def split_dt(dt: float | Tensor, scenes: int, x: Tensor) -> tuple[float, Tensor 
         return float(dt), None
     if dt.dim() > 1 or (dt.dim() == 1 and dt.shape[0] not in (1, scenes)):
         raise ValueError(f"dt must be a number or have shape [], [1] or [B] = [{scenes}], got {shape_of(dt)}")
+    if not dt.is_floating_point():
+        raise TypeError(f"dt must be a number or a floating tensor, got {dt.dtype}")
     if dt.device != x.device:
         raise ValueError(f"dt must be on the device of x, {x.device}, got {dt.device}")
     return 1.0, dt.to(x.dtype).expand(scenes)
 
 
 def per_particle(value: Tensor, scene: Tensor | None, particles: int) -> Tensor:
-    """A per-scene tensor [B, ...] as one row per particle; that of absent particles, of scene -1, has no meaning."""
+    """A per-scene tensor [B, ...] as one row per particle; that of a particle of no scene has no meaning."""
     if value.shape[0] == 1:
         return value.expand(particles, *value.shape[1:])
     assert scene is not None
-    return value.index_select(0, scene.clamp(min=0))
+    return value.index_select(0, scene.clamp(0, value.shape[0] - 1))
 
 
 def per_parameter(value: Tensor, scene: Tensor | None, particles: int) -> Tensor:
@@ -52,11 +55,20 @@ def per_parameter(value: Tensor, scene: Tensor | None, particles: int) -> Tensor
 
 
 def sum_by_scene(value: Tensor, scene: Tensor | None, scenes: int) -> Tensor:
-    """Sum of a per-particle tensor [P, ...] over the particles of each scene, [B, ...]."""
+    """Sum of a per-particle tensor [P, ...] over the particles of each scene, [B, ...]; not of those of no scene."""
     if scene is None:
         return value.sum(0, keepdim=True)
-    value = torch.where((scene >= 0).reshape(-1, *(1,) * (value.dim() - 1)), value, 0)  # absent particles
-    return value.new_zeros(scenes, *value.shape[1:]).index_add_(0, scene.clamp(min=0), value)
+    known = (scene >= 0) & (scene < scenes)
+    value = torch.where(known.reshape(-1, *(1,) * (value.dim() - 1)), value, 0)
+    return value.new_zeros(scenes, *value.shape[1:]).index_add_(0, torch.where(known, scene, 0), value)
+
+
+def count_scenes(scene: Tensor) -> int | None:
+    """One more than the largest scene of a particle, at least 1; None where that is not known without waiting for a
+    device, or not at all."""
+    if not scene.is_cpu or is_traced(scene):
+        return None
+    return max(int(scene.max()) + 1, 1) if scene.numel() else 1
 
 
 def soa_empty(like: Tensor, shape: Sequence[int]) -> Tensor:
@@ -122,14 +134,18 @@ def check_choice(name: str, value: object, choices: Iterable[str]) -> None:
         raise ValueError(f"{name} must be one of {sorted(choices)}, got {value!r}")
 
 
-def check_parameter(name: str, value: Tensor, state: Tensor, scene: Tensor | None) -> None:
-    """Check a parameter of a law: uniform, per scene or per particle."""
+def check_parameter(name: str, value: Tensor, state: Tensor, scene: Tensor | None, scenes: int | None = None) -> None:
+    """Check a parameter of a law: uniform, per scene or per particle, which it also is where P = B."""
     P = state.shape[0]
     if not isinstance(value, Tensor):
         raise TypeError(f"{name} must be a tensor, got {type(value).__name__}")
-    if value.dim() > 1 or (value.numel() not in (1, P) and (scene is None or value.numel() == 0)):
-        expected = f"[], [1] or [P] = [{P}]" + (" without scene" if scene is None else ", or [B]")
-        raise ValueError(f"{name} must have shape {expected}, got {shape_of(value)}")
+    if value.dim() > 1 or value.numel() not in (1, P):
+        least = None if scene is None or scenes is not None else count_scenes(scene)
+        wrong = value.numel() != scenes if scenes is not None else value.numel() < (least or 1)
+        if value.dim() > 1 or scene is None or wrong:
+            batch = " without scene" if scene is None else ", or [B]"
+            known = f" with B = {scenes}" if scenes is not None else f" with B at least {least}" if least else ""
+            raise ValueError(f"{name} must have shape [], [1] or [P] = [{P}]{batch}, got {shape_of(value)}{known}")
     if value.dtype != state.dtype or value.device != state.device:
         check_like(name, value, state, tuple(value.shape), "")
 

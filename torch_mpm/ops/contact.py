@@ -20,7 +20,7 @@ from torch import Tensor
 
 from .. import shapes
 from ..boundaries import Obstacle
-from ..errors import NUMBER_OR_TENSOR, check_like, check_real, shape_of
+from ..errors import FLOATING, NUMBER_OR_TENSOR, check_like, check_number, shape_of
 from ..grid import Blocks, check_blocks
 from ..parameters import has_hooks
 from ..step_times import StepTimes
@@ -89,6 +89,8 @@ def check_contact(blocks: Blocks, velocity: Tensor, obstacles: Sequence[Obstacle
     nodes = [blocks.node_count, blocks.grid.dim]
     if not isinstance(velocity, Tensor) or list(velocity.shape) != nodes:
         raise ValueError(f"velocity must have shape [N, D] = {nodes}, got {shape_of(velocity)}")
+    if velocity.dtype not in FLOATING:
+        raise TypeError(f"velocity must be float32 or float64, got {velocity.dtype}")
     for k, obstacle in enumerate(check_list("obstacles", obstacles)):
         if not isinstance(obstacle, Obstacle) or type(obstacle.shape) not in KERNEL_SHAPES:
             expected = ", ".join(shape.name for shape in KERNEL_SHAPES)
@@ -124,7 +126,7 @@ def obstacle_arguments(
 def time_arguments(time: float | Tensor, like: Tensor, scenes: int) -> tuple[Tensor | None, float]:
     """A time [s] as the ops take it: a tensor [1 or B], or a number."""
     if not isinstance(time, Tensor):
-        return None, float(check_real("time", time, NUMBER_OR_TENSOR))
+        return None, float(check_number("time", time, kinds=NUMBER_OR_TENSOR))
     if time.dim() > 1 or time.numel() not in (1, scenes):
         raise ValueError(f"time must be a number or have shape [] or [B] = [{scenes}], got {shape_of(time)}")
     scene_time = time.detach().reshape(-1).to(like.dtype).contiguous()

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..errors import check_like, check_positions
+from ..errors import check_flag, check_like, check_particles
 from ..grid import Blocks, check_blocks
 from ..topology import Topology
 from .arguments import check_choice, refuse_vmap, sizes, soa_empty, split_dt, sum_by_scene
@@ -48,11 +48,12 @@ def g2p_advance(
     """
     check_blocks(blocks)
     grid = blocks.grid
-    check_positions(x, grid.dim, blocks.scene, grid.scenes)
+    check_particles(x, blocks)
     P, D = x.shape
     check_like("F", F, x, (P, D, D), "[P, D, D]")
     check_like("J", J, x, (P,), "[P]")
     check_choice("stress_form", stress_form, STRESS_FORMS)
+    affine = check_flag("affine", affine)
     velocity = _check_nodes("velocity", velocity, blocks, x, D)
     number, scene_dt = split_dt(dt, grid.scenes, x)
     return dispatch(

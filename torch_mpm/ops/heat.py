@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from ..errors import NUMBER_OR_TENSOR, check_like, check_number, check_positions, shape_of
+from ..errors import NUMBER_OR_TENSOR, check_like, check_number, check_particles, shape_of
 from ..grid import Blocks, check_blocks
 from ..topology import PackedTopology, Topology
 from .arguments import check_choice, refuse_vmap, split_dt
@@ -94,13 +94,15 @@ def heat_cg(
     """
     check_blocks(blocks)
     grid = blocks.grid
-    check_positions(x, grid.dim, blocks.scene, grid.scenes)
+    check_particles(x, blocks)
     P, N = x.shape[0], blocks.node_count
-    check_like("conductance", conductance, x, (P,), "[P]")
+    check_like("conductance", conductance, x, (P,), "[P]", needed=True)
     for name, value in (("heat_capacity", heat_capacity), ("theta", theta), ("source", source), ("exchange", exchange)):
-        check_like(name, value, x, (N,), "[N]")
+        check_like(name, value, x, (N,), "[N]", needed=name in ("heat_capacity", "theta"))
     if fixed is not None and (not isinstance(fixed, Tensor) or fixed.shape != (N,) or fixed.dtype != torch.bool):
         raise ValueError(f"fixed must be a bool tensor of shape [N] = [{N}], got {shape_of(fixed)}")
+    if fixed is not None and fixed.device != x.device:
+        raise ValueError(f"fixed must be on the device of x, {x.device}, got {fixed.device}")
     number, scene_dt = split_dt(dt, grid.scenes, x)
     least, scene_tolerance = _per_scene("tolerance", tolerance, grid.scenes, x)
     most, scene_limit = _per_scene("max_iterations", max_iterations, grid.scenes, x)
@@ -156,8 +158,8 @@ def heat_operator(blocks: Blocks, x: Tensor, conductance: Tensor, nodes: Tensor 
     H u is differentiable with respect to every tensor, twice in eager mode; the diagonal is not.
     """
     check_blocks(blocks)
-    check_positions(x, blocks.grid.dim, blocks.scene, blocks.grid.scenes)
-    check_like("conductance", conductance, x, (x.shape[0],), "[P]")
+    check_particles(x, blocks)
+    check_like("conductance", conductance, x, (x.shape[0],), "[P]", needed=True)
     check_like("nodes", nodes, x, (blocks.node_count,), "[N]")
     return dispatch(torch.ops.torch_mpm.heat_operator, x, conductance, nodes, *blocks.packed)
 

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from ..errors import check_count, check_like, check_positions, shape_of
+from ..errors import check_count, check_like, check_particles, shape_of
 from ..grid import Blocks, check_blocks
 from ..topology import Topology
 from .arguments import check_choice, refuse_vmap, sizes
@@ -193,7 +193,7 @@ def _triangle(dim: int) -> tuple[list[int], list[int]]:
 
 def _check(blocks: Blocks, x: Tensor, tangent: Tensor, stress_form: str) -> None:
     check_blocks(blocks)
-    check_positions(x, blocks.grid.dim, blocks.scene, blocks.grid.scenes)
+    check_particles(x, blocks)
     check_choice("stress_form", stress_form, STRESS_FORMS)
     if not isinstance(tangent, Tensor):
         raise TypeError(f"tangent must be a tensor, got {shape_of(tangent)}")

@@ -97,7 +97,7 @@ def contact_impulses(
     Differentiable with respect to velocity, mass and what `contact` is with respect to, twice in eager mode.
     """
     check_contact(blocks, velocity, obstacles)
-    check_like("mass", mass, velocity, (velocity.shape[0],), "[N]")
+    check_like("mass", mass, velocity, (velocity.shape[0],), "[N]", needed=True)
     scene_time, number = time_arguments(time, velocity, blocks.grid.scenes)
     there = present(obstacles, scene_time, number)
     shape = (blocks.grid.scenes, len(obstacles), impulse_size(blocks.grid.dim))

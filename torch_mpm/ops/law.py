@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from ..errors import FLOATING, check_index, check_like, shape_of
+from ..errors import FLOATING, check_count, check_flag, check_index, check_like, shape_of
 from .arguments import check_choice, check_parameter, check_tensors, refuse_vmap, sizes, soa_empty, sum_by_scene
 from .autograd import dispatch, register_autograd
 from .implicit import tangent_entries
@@ -58,6 +58,7 @@ def law_update(
     dim: int | None = None,
     options: Sequence[str] = (),
     details: bool | int = False,
+    scenes: int | None = None,
 ) -> LawUpdate:
     """Return map and Kirchhoff stress of a compiled law.
 
@@ -71,6 +72,8 @@ def law_update(
         dim: D; needed where the state is J.
         options: names of switches of the law.
         details: whether dissipated energy, multiplier, branch and convergence are wanted too; or some of them, as bits.
+        scenes: number of scenes B of parameters [B]. None for any number that is above the largest scene; on CUDA that
+            one is not known, and a particle of a scene without an entry is invalid.
 
     A state that is not finite, of det F ≤ 0 or J ≤ 0, or with a stress that overflows, is returned as it is with its
     history, and has zero stress and no derivatives.
@@ -82,10 +85,12 @@ def law_update(
     Raises:
         ValueError, TypeError: for an unknown law or option, or wrong shapes, dtypes or devices.
     """
-    dim = _check(law, state, parameters, history, scene, dim)
+    dim = _check(law, state, parameters, history, scene, dim, scenes)
     if C is not None and not LAWS[law].viscous:
         raise ValueError(f"{law} has no viscosity: C must be None")
     check_like("C", C, state, (state.shape[0], dim, dim), "[P, D, D]")
+    if not isinstance(details, int):
+        raise TypeError(f"details must be True, False or bits, got {details!r}")
     bits = option_bits(law, options) if options else 0
     wanted = (DISSIPATED | MULTIPLIER | BRANCH if details else 0) if isinstance(details, bool) else details
     mapped, stress, moved, dissipated, multiplier, code = dispatch(
@@ -118,12 +123,13 @@ def law_energy(
     history: Tensors = (),
     scene: Tensor | None = None,
     dim: int | None = None,
+    scenes: int | None = None,
 ) -> Tensor:
     """Elastic energy per rest volume ψ [P] [J/m³] of the state itself; infinite where `law_update` has no stress.
 
     Arguments as `law_update`; differentiable as that is.
     """
-    dim = _check(law, state, parameters, history, scene, dim)
+    dim = _check(law, state, parameters, history, scene, dim, scenes)
     return dispatch(torch.ops.torch_mpm.law_energy, state, parameters, history, scene, law, dim)
 
 
@@ -134,12 +140,13 @@ def law_stiffness(
     history: Tensors = (),
     scene: Tensor | None = None,
     dim: int | None = None,
+    scenes: int | None = None,
 ) -> Tensor:
     """Upper bound [P] [Pa] of the elastic tangent modulus over all velocity gradients of unit norm, after the map.
 
     Zero where the stress is; not differentiable. Arguments as `law_update`.
     """
-    dim = _check(law, state, parameters, history, scene, dim)
+    dim = _check(law, state, parameters, history, scene, dim, scenes)
     return torch.ops.torch_mpm.law_stiffness(state, parameters, history, scene, law, dim)
 
 
@@ -150,12 +157,13 @@ def law_wave_modulus(
     history: Tensors = (),
     scene: Tensor | None = None,
     dim: int | None = None,
+    scenes: int | None = None,
 ) -> Tensor:
     """ρ₀ c² [P] [Pa] of the fastest elastic plane wave in the material after the map, or an upper bound.
 
     Zero where the stress is; not differentiable. Arguments as `law_update`.
     """
-    dim = _check(law, state, parameters, history, scene, dim)
+    dim = _check(law, state, parameters, history, scene, dim, scenes)
     return torch.ops.torch_mpm.law_wave_modulus(state, parameters, history, scene, law, dim)
 
 
@@ -166,13 +174,14 @@ def law_energy_gradient(
     history: Tensors = (),
     scene: Tensor | None = None,
     dim: int | None = None,
+    scenes: int | None = None,
 ) -> Tensor:
     """∂ψ/∂F [P, D, D] or ∂ψ/∂J [P] [Pa] of the state itself, without a return map; zero where ψ is infinite.
 
     Arguments as `law_update`. Differentiable with respect to state and parameters where the law says that its energy is
     twice differentiable.
     """
-    dim = _check(law, state, parameters, history, scene, dim)
+    dim = _check(law, state, parameters, history, scene, dim, scenes)
     by_state, _, _ = dispatch(
         torch.ops.torch_mpm.law_energy_backward,
         *(torch.ones_like(state[:, 0, 0] if state.dim() == 3 else state), state, parameters, history, scene),
@@ -191,6 +200,7 @@ def law_tangent(
     scene: Tensor | None = None,
     dim: int | None = None,
     projected: bool = True,
+    scenes: int | None = None,
 ) -> Tensor:
     """Second derivative of the energy of each particle by velocity gradients L, in the form of csrc/laws/tangent.h.
 
@@ -202,7 +212,8 @@ def law_tangent(
         state: trial F [P, D, D], or J [P].
         before: F₀ or J₀, from which the trial moves; of the same shape.
         weight: factor [P]: dt² V for the Hessian of an implicit step.
-        parameters, history, scene, dim: as `law_update` takes them. History counts as constant, and nothing flows.
+        parameters, history, scene, dim, scenes: as `law_update` takes them. History counts as constant, and nothing
+            flows.
         projected: whether negative eigenvalues are left out.
 
     Raises:
@@ -211,27 +222,36 @@ def law_tangent(
 
     Not differentiable.
     """
-    dim = _check(law, state, parameters, history, scene, dim)
+    dim = _check(law, state, parameters, history, scene, dim, scenes)
     if not LAWS[law].has_tangent:
         raise NotImplementedError(f"the law {law} has no tangent, which an implicit step needs")
-    check_like("before", before, state, tuple(state.shape), "as the state")
-    check_like("weight", weight, state, tuple(state.shape[:1]), "[P]")
+    check_like("before", before, state, tuple(state.shape), "as the state", needed=True)
+    check_like("weight", weight, state, tuple(state.shape[:1]), "[P]", needed=True)
+    projected = check_flag("projected", projected)
     return dispatch(
         torch.ops.torch_mpm.law_tangent, state, before, weight, parameters, history, scene, law, dim, projected
     )
 
 
 def _check(
-    law: str, state: Tensor, parameters: Tensors, history: Tensors, scene: Tensor | None, dim: int | None
+    law: str,
+    state: Tensor,
+    parameters: Tensors,
+    history: Tensors,
+    scene: Tensor | None,
+    dim: int | None,
+    scenes: int | None,
 ) -> int:
     """Check what all ops share; return the dimension."""
     check_choice("law", law, LAWS)
     info = LAWS[law]
     dim = _check_state(info, state, dim)
     check_index("scene", scene, state, of="the state")
+    if scenes is not None:
+        check_count("scenes", scenes)
     check_tensors(law, "parameters", info.parameters, parameters)
     for quantity, value in zip(info.parameters, parameters, strict=True):
-        check_parameter(quantity.name, value, state, scene)
+        check_parameter(quantity.name, value, state, scene, scenes)
     if history or not info.optional_history:
         check_tensors(law, "history variables", info.history, history)
     for quantity, value in zip(info.history, history, strict=False):
@@ -249,11 +269,13 @@ def _check_state(info: LawInfo, state: Tensor, dim: int | None) -> int:
     if info.field == "F":
         if state.dim() != 3 or state.shape[1:] not in ((2, 2), (3, 3)):
             raise ValueError(f"F must have shape [P, 3, 3] or [P, 2, 2], got {shape_of(state)}")
+        if dim is not None and dim != state.shape[1]:
+            raise ValueError(f"dim must be that of F, {state.shape[1]}, or None, got {dim!r}")
         dim = state.shape[1]
     elif state.dim() != 1:
         raise ValueError(f"J must have shape [P], got {shape_of(state)}")
     if dim is None or dim not in ((2, 3) if info.in_2d else (3,)):
-        raise ValueError(f"dim must be {'2 or 3' if info.in_2d else '3'}, got {dim}")
+        raise ValueError(f"dim must be {'2 or 3' if info.in_2d else '3'}, got {dim!r}")
     return dim
 
 

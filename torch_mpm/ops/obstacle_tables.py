@@ -64,6 +64,7 @@ def tables(obstacles: Sequence[Obstacle], like: Tensor, scenes: int) -> tuple[Te
 
 def tables_over(obstacles: Sequence[Obstacle], like: Tensor, scenes: int, times: StepTimes) -> tuple[Tensor, Tensor]:
     """Parameters at many times, with the positions then, [n, 1 or B, K, width]; and data as `tables`."""
+    _check_scenes(obstacles, like, scenes)
     rows = [_row_over(o, like, times) for o in obstacles]
     count = _count([row.shape[1] for row in rows], scenes)
     table = torch.stack([row.expand(-1, count, -1) for row in rows], 2).contiguous()
@@ -80,10 +81,16 @@ def _values(obstacle: Obstacle) -> tuple[Any, ...]:
 
 
 def _build(obstacles: Sequence[Obstacle], like: Tensor, scenes: int) -> tuple[Tensor, Tensor]:
+    _check_scenes(obstacles, like, scenes)
     rows = [_joined(_parts(o, like)) for o in obstacles]
     count = _count([row.shape[0] for row in rows], scenes)
     table = torch.stack([row.expand(count, -1) for row in rows], 1).contiguous()
     return table, torch.cat([_data(o.shape, like) for o in obstacles])
+
+
+def _check_scenes(obstacles: Sequence[Obstacle], like: Tensor, scenes: int) -> None:
+    for obstacle in obstacles:
+        obstacle.check_scenes(like.shape[1], scenes)
 
 
 def _count(counts: Sequence[int], scenes: int) -> int:

@@ -8,7 +8,16 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ..errors import FLOATING, NUMBER_OR_TENSOR, check_flag, check_index, check_like, check_number, check_real, shape_of
+from ..errors import (
+    FLOATING,
+    NUMBER_OR_TENSOR,
+    check_count,
+    check_flag,
+    check_index,
+    check_like,
+    check_number,
+    shape_of,
+)
 from .arguments import check_choice, check_parameter
 from .law import APEX, BRANCH, ELASTIC, INVALID, NOT_CONVERGED, law_energy, law_stiffness, law_update
 from .law import PLASTIC as CONE
@@ -72,6 +81,7 @@ def quartic_return_map(
     flow: str = "radial",
     cohesion: Value | None = None,
     volume_correction: Tensor | None = None,
+    scenes: int | None = None,
 ) -> ReturnMap:
     """Drucker-Prager return map of sand in Hencky strains, with its stress: one decomposition of F.
 
@@ -103,6 +113,7 @@ def quartic_return_map(
             and v_c grows by log det of the trial F. Torn sand, v_c > 0, has neither stress nor cohesion until
             compression has closed the gap: the map sees h + v_c/D, is at the apex while its trace is not negative, and
             gives v_c back to F once it is. With apex="keep" F keeps the volume itself, and v_c stays zero.
+        scenes: number of scenes B, as of `law_update`.
 
     Returns:
         A `ReturnMap`. A trial F that is not finite or of det F ≤ 0 is returned as it is, with zero stress.
@@ -124,24 +135,25 @@ def quartic_return_map(
         raise ValueError(f"apex='keep' needs energy='unilateral', got {energy!r}")
     if flow not in ("radial", "exact"):
         raise ValueError(f"flow must be 'radial' or 'exact', got {flow!r}")
-    _check_deformation(F, scene, energy)
+    _check_deformation(F, scene, energy, scenes)
     check_like("volume_correction", volume_correction, F, (F.shape[0],), "[P]")
     _check_number("friction_angle", friction_angle, ANGLE, most=math.pi / 2)
     _check_number("alpha", alpha, "finite and not negative")
     _check_number("cohesion", cohesion, "finite and not negative")
     if alpha is None:
-        alpha = friction_alpha(_parameter("friction_angle", friction_angle, F, scene), F.shape[1])
+        alpha = friction_alpha(_parameter("friction_angle", friction_angle, F, scene, scenes), F.shape[1])
     given = (("mu", mu), ("lam", lam), ("alpha", alpha), ("cohesion", 0.0 if cohesion is None else cohesion))
-    parameters = [_parameter(n, v, F, scene) for n, v in given]
+    parameters = [_parameter(n, v, F, scene, scenes) for n, v in given]
     history = () if volume_correction is None else (volume_correction,)
     result = law_update(
         law_name(energy, flow, F.shape[1]),
         F,
-        [*parameters, _parameter("smallest_strain", 0.0, F, scene)],
+        [*parameters, _parameter("smallest_strain", 0.0, F, scene, scenes)],
         history,
         scene=scene,
         options=["keep_apex"] if apex == "keep" else [],
         details=True if check_flag("details", details) else BRANCH,
+        scenes=scenes,
     )
     assert result.branch is not None and result.converged is not None
     return ReturnMap(
@@ -170,21 +182,35 @@ def friction_alpha(angle: Tensor, dim: int) -> Tensor:
     return sine / math.sqrt(2) if dim == 2 else math.sqrt(2 / 3) * 2 * sine / (3 - sine)
 
 
-def quartic_stress(F: Tensor, mu: Value, lam: Value, scene: Tensor | None = None, energy: str = "unilateral") -> Tensor:
+def quartic_stress(
+    F: Tensor,
+    mu: Value,
+    lam: Value,
+    scene: Tensor | None = None,
+    energy: str = "unilateral",
+    scenes: int | None = None,
+) -> Tensor:
     """Kirchhoff stress τ [P, D, D] [Pa] of F itself, without plasticity. Arguments as `quartic_return_map`.
 
     Differentiable once with respect to F, mu and lam.
     """
-    parameters = _elastic(F, mu, lam, scene, energy)
-    return law_update(f"sand_{energy}", F, parameters, scene=scene, options=["elastic"]).stress
+    parameters = _elastic(F, mu, lam, scene, energy, scenes)
+    return law_update(f"sand_{energy}", F, parameters, scene=scene, options=["elastic"], scenes=scenes).stress
 
 
-def quartic_energy(F: Tensor, mu: Value, lam: Value, scene: Tensor | None = None, energy: str = "unilateral") -> Tensor:
+def quartic_energy(
+    F: Tensor,
+    mu: Value,
+    lam: Value,
+    scene: Tensor | None = None,
+    energy: str = "unilateral",
+    scenes: int | None = None,
+) -> Tensor:
     """Elastic energy per rest volume [P] [J/m³] of F itself; infinite where det F ≤ 0 or F is not finite.
 
     Arguments as `quartic_return_map`; differentiable with respect to F, mu and lam, twice in eager mode.
     """
-    return law_energy(f"sand_{energy}", F, _elastic(F, mu, lam, scene, energy), scene=scene)
+    return law_energy(f"sand_{energy}", F, _elastic(F, mu, lam, scene, energy, scenes), scene=scene, scenes=scenes)
 
 
 def quartic_stiffness(
@@ -194,6 +220,7 @@ def quartic_stiffness(
     scene: Tensor | None = None,
     energy: str = "unilateral",
     smallest_strain: float = 0.0,
+    scenes: int | None = None,
 ) -> Tensor:
     """Upper bound [P] [Pa] of the elastic tangent modulus over all velocity gradients of unit norm.
 
@@ -201,26 +228,34 @@ def quartic_stiffness(
     `smallest_strain` count as that. Zero where det F ≤ 0 or F is not finite. Other arguments as `quartic_return_map`;
     not differentiable.
     """
-    parameters = _elastic(F, mu, lam, scene, energy, smallest_strain)
-    return law_stiffness(f"sand_{energy}", F, parameters, scene=scene)
+    parameters = _elastic(F, mu, lam, scene, energy, scenes, smallest_strain)
+    return law_stiffness(f"sand_{energy}", F, parameters, scene=scene, scenes=scenes)
 
 
 def _elastic(
-    F: Tensor, mu: Value, lam: Value, scene: Tensor | None, energy: str, smallest_strain: float = 0.0
+    F: Tensor,
+    mu: Value,
+    lam: Value,
+    scene: Tensor | None,
+    energy: str,
+    scenes: int | None,
+    smallest_strain: float = 0.0,
 ) -> list[Tensor]:
     """Parameters of a law of sand for what needs no yield surface."""
-    _check_deformation(F, scene, energy)
+    _check_deformation(F, scene, energy, scenes)
     values = (("mu", mu), ("lam", lam), ("alpha", 0.0), ("cohesion", 0.0), ("smallest_strain", smallest_strain))
-    return [_parameter(name, value, F, scene) for name, value in values]
+    return [_parameter(name, value, F, scene, scenes) for name, value in values]
 
 
-def _check_deformation(F: Tensor, scene: Tensor | None, energy: str) -> None:
+def _check_deformation(F: Tensor, scene: Tensor | None, energy: str, scenes: int | None = None) -> None:
     check_choice("energy", energy, ENERGIES)
     if not isinstance(F, Tensor) or F.dim() != 3 or F.shape[1:] not in ((2, 2), (3, 3)):
         raise ValueError(f"F must have shape [P, 3, 3] or [P, 2, 2], got {shape_of(F)}")
     if F.dtype not in FLOATING:
         raise TypeError(f"F must be float32 or float64, got {F.dtype}")
     check_index("scene", scene, F, of="F")
+    if scenes is not None:
+        check_count("scenes", scenes)
 
 
 def _check_number(name: str, value: Value | None, expected: str, most: float = math.inf) -> None:
@@ -229,12 +264,12 @@ def _check_number(name: str, value: Value | None, expected: str, most: float = m
         check_number(name, value, expected, lambda v: 0 <= v < most, NUMBER_OR_TENSOR)
 
 
-def _parameter(name: str, value: Value | None, F: Tensor, scene: Tensor | None) -> Tensor:
+def _parameter(name: str, value: Value | None, F: Tensor, scene: Tensor | None, scenes: int | None) -> Tensor:
     if not isinstance(value, Tensor):
-        check_real(name, value, NUMBER_OR_TENSOR)
+        check_number(name, value, kinds=NUMBER_OR_TENSOR)
         number = float(value)  # type: ignore[arg-type]
         return torch.full((), number, dtype=F.dtype, device=F.device)  # not a copy from the host, which graphs refuse
-    check_parameter(name, value, F, scene)
+    check_parameter(name, value, F, scene, scenes)
     return value
 
 
@@ -261,6 +296,7 @@ def _composed(
     apex: str,
     details: bool,
 ) -> tuple[Tensor, ...]:
+    _check_deformation(F, scene, energy)
     if F.dim() == 3:
         check_like("volume", volume, F, (F.shape[0],), "[P]")
     r = quartic_return_map(

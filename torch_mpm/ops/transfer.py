@@ -12,7 +12,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ..errors import check_like, check_positions, shape_of
+from ..errors import check_flag, check_like, check_number, check_particles, shape_of
 from ..grid import Blocks, check_blocks
 from ..topology import Topology
 from . import composed
@@ -59,10 +59,10 @@ def p2g(
     Differentiable with respect to every floating tensor, twice in eager mode.
     """
     check_blocks(blocks)
-    check_positions(x, blocks.grid.dim, blocks.scene, blocks.grid.scenes)
+    check_particles(x, blocks)
     P, D = x.shape
-    check_like("mass", mass, x, (P,), "[P]")
-    check_like("v", v, x, (P, D), "[P, D]")
+    check_like("mass", mass, x, (P,), "[P]", needed=True)
+    check_like("v", v, x, (P, D), "[P, D]", needed=True)
     check_like("C", C, x, (P, D, D), "[P, D, D]")
     check_like("stress", stress, x, (P, D, D), "[P, D, D]")
     check_like("volume", volume, x, (P,), "[P]")
@@ -104,9 +104,10 @@ def g2p(
     Differentiable with respect to x and velocity, twice in eager mode.
     """
     check_blocks(blocks)
-    check_positions(x, blocks.grid.dim, blocks.scene, blocks.grid.scenes)
+    check_particles(x, blocks)
     velocity = _check_nodes("velocity", velocity, blocks, x, blocks.grid.dim)
-    return dispatch(torch.ops.torch_mpm.g2p, x, velocity, affine, gradient, *blocks.packed)
+    wanted = check_flag("affine", affine), check_flag("gradient", gradient)
+    return dispatch(torch.ops.torch_mpm.g2p, x, velocity, *wanted, *blocks.packed)
 
 
 def scatter(
@@ -136,7 +137,7 @@ def scatter(
     Differentiable with respect to every tensor, twice in eager mode.
     """
     check_blocks(blocks)
-    check_positions(x, blocks.grid.dim, blocks.scene, blocks.grid.scenes)
+    check_particles(x, blocks)
     P, D = x.shape
     if not isinstance(value, Tensor) or value.dim() != 2:
         raise ValueError(f"value must have shape [P, K] = [{P}, K], got {shape_of(value)}")
@@ -144,6 +145,7 @@ def scatter(
     check_like("value", value, x, (P, K), "[P, K]")
     check_like("moment", moment, x, (P, K, D), "[P, K, D]")
     check_like("gradient", gradient, x, (P, K, D), "[P, K, D]")
+    check_number("moment_scale", moment_scale)
     return dispatch(torch.ops.torch_mpm.scatter, x, value, moment, gradient, moment_scale, *blocks.packed)
 
 
@@ -169,9 +171,11 @@ def gather(
     Differentiable with respect to x and nodes, twice in eager mode.
     """
     check_blocks(blocks)
-    check_positions(x, blocks.grid.dim, blocks.scene, blocks.grid.scenes)
+    check_particles(x, blocks)
     nodes = _check_nodes("nodes", nodes, blocks, x, None)
-    return dispatch(torch.ops.torch_mpm.gather, x, nodes, moment_scale, moment, gradient, *blocks.packed)
+    check_number("moment_scale", moment_scale)
+    wanted = check_flag("moment", moment), check_flag("gradient", gradient)
+    return dispatch(torch.ops.torch_mpm.gather, x, nodes, moment_scale, *wanted, *blocks.packed)
 
 
 def _check_nodes(name: str, nodes: Tensor, blocks: Blocks, x: Tensor, channels: int | None) -> Tensor:
