@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from .boundaries import Walls
+from .boundaries.motion import RigidMotion
 from .capture import NUMBERS, Same, is_of_library, version
 from .grid import Grid
 from .laws.mixture import Mixture
@@ -41,7 +42,10 @@ class StepKey:
                     named.setdefault(id(t), (f"step.{place}.{name}" if place else f"step.{name}", t))
         self.own = {name: t for name, t in named.values() if t.requires_grad}
         # Not by the step, which keeps its recordings: it could only go with them where somebody looks for cycles.
-        self.key = tuple((None if m is step else Same(m), *content_of(m)) for m in modules.values())
+        # Nor by the motions of obstacles in a control step, each of which has its own.
+        self.key = tuple(
+            (None if m is step or type(m) is RigidMotion else Same(m), *content_of(m)) for m in modules.values()
+        )
         self.steps = [module for module in modules.values() if isinstance(module, Step)]
         self.mixes = any(isinstance(module, Mixture) for module in modules.values())
         self._sizes = {t.numel() for _, t in named.values() if not t.requires_grad}

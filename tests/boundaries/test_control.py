@@ -333,6 +333,42 @@ def test_scenes_move_at_their_own_speed(device):
     assert float(envs.scene(0).v.abs().max()) < 1e-9
 
 
+def test_a_scene_moves_again_after_its_reset(device):
+    """Its obstacle is placed once: a pose that is assigned some calls later is reached by a motion."""
+    home, away = start(device=device).repeat(2, 1), torch.tensor([0.02, 0.0], dtype=F64, device=device)
+    paddle = box(home)
+    envs = mpm.Environments(step_with(paddle, scenes=2), [block(device=device)] * 2)
+    envs.advance(N, DT)
+    envs.reset([1])
+    envs.advance(N, DT)
+    paddle.position = home + away
+    envs.advance(N, DT)
+    assert_alike(envs.scene(1), envs.scene(0))
+
+
+def test_transforms_and_compiled_steps(device):
+    """The gradient of torch.func is that of autograd; what is compiled runs, also from a state that steps have left."""
+    paddle = box(start(device=device), kind="sticky")
+    step, state = step_with(paddle), block(device=device)
+    before = mpm.rollout(step, state, 4, DT)
+
+    def loss(position: Tensor) -> Tensor:
+        paddle.position = position
+        end = step(step(before, DT), DT)
+        return (end.v[:, 0] * end.x[:, 0]).sum()
+
+    target = start(device=device) + torch.tensor([0.001, 0.0], dtype=F64, device=device)
+    expected = torch.autograd.grad(loss(leaf := target.clone().requires_grad_()), leaf)[0]
+    assert float(expected.abs().max()) > 1e-3
+    torch.testing.assert_close(torch.func.grad(loss)(target), expected)
+    paddle.position = target
+    fixed = step_with(box(start(device=device)))
+    fixed.grid = mpm.Grid(0.05, (0.0, 0.0), (1.4, 0.8), max_blocks=54)
+    left = fixed(state, DT)
+    compiled = torch.compile(fixed, backend="eager", fullgraph=True)
+    torch.testing.assert_close(compiled(left, DT).v, fixed(left, DT).v)
+
+
 @pytest.mark.parametrize("form", ["[B]", "[1]", "[]"])
 def test_a_time_step_of_each_scene(form, device):
     """A paused scene has its obstacle wait, and go on to its pose later."""

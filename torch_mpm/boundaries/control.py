@@ -135,7 +135,7 @@ def _nothing_new(obstacles: Sequence[Obstacle], poses: Poses) -> bool:
     for obstacle in obstacles:
         course: Course | None = vars(obstacle)["course"]
         left = poses.get(obstacle.key) if course is None else course.after
-        if left is None or (course is None and (left.moves is not None or left.arrives)):
+        if left is None or left.known is not None or (course is None and (left.moves is not None or left.arrives)):
             return False
         if "position" in obstacle._modules or callable(vars(obstacle).get("position")):
             return False
@@ -284,7 +284,7 @@ def course_of(obstacle: Obstacle, left: Left | None, span: Span, device: torch.d
         return Course(None, _left_at(obstacle))
     same = _sameness(obstacle, left)
     if all(same) and not left.arrives and (left.moves is None or left.known is None):
-        return Course(left.moves, left)
+        return Course(left.moves, left if left.known is None else left._replace(known=None))
     centre = _part(("position", "velocity"), obstacle, left, span, device, same[:2])
     rotation = _part(("rotation", "angular_velocity"), obstacle, left, span, device, same[2:])
     frame = obstacle.start, obstacle.end
