@@ -285,15 +285,18 @@ def course_of(obstacle: Obstacle, left: Left | None, span: Span, device: torch.d
     same = _sameness(obstacle, left)
     if all(same) and not left.arrives and (left.moves is None or left.known is None):
         return Course(left.moves, left if left.known is None else left._replace(known=None))
-    centre = _part(("position", "velocity"), obstacle, left, span, device, same[:2])
-    rotation = _part(("rotation", "angular_velocity"), obstacle, left, span, device, same[2:])
+    later = _left_at(obstacle)
+    changes = _Changes(left, span, obstacle.start, device)
+    centre, rotation = (
+        _part(turns, obstacle, later, changes, same[2 * turns : 2 * turns + 2]) for turns in (False, True)
+    )
     frame = obstacle.start, obstacle.end
     during = _motion((*centre.during, *rotation.during, *frame))
     own, arrives = centre.own and rotation.own, centre.arrives or rotation.arrives
     after = None if own else _motion((*centre.after, *rotation.after, *frame))
     wrong = [part.contradicts for part in (centre, rotation) if part.contradicts is not None]
     contradicts = None if not wrong else wrong[0] if len(wrong) == 1 else wrong[0] | wrong[1]
-    return Course(during, _left_at(obstacle)._replace(moves=after, arrives=arrives), contradicts)
+    return Course(during, later._replace(moves=after, arrives=arrives), contradicts)
 
 
 def _left_at(obstacle: Obstacle) -> Left:
@@ -309,9 +312,15 @@ def _values(motion: RigidMotion) -> tuple[Any, ...]:
 
 
 def _motion(values: Sequence[Any]) -> RigidMotion:
-    position, velocity, rotation, angular_velocity, start, end = values
-    motion = RigidMotion(position, None if callable(position) else velocity, rotation, angular_velocity, start)
-    motion.end = end
+    """The motion of values that `_values` returns; by hand, since attributes of modules take microseconds each."""
+    *assigned, start, end = values
+    motion = RigidMotion.__new__(RigidMotion)
+    for name, value in zip(ASSIGNED, assigned, strict=True):
+        of_modules = motion._modules if isinstance(value, torch.nn.Module) else vars(motion)
+        (motion._buffers if isinstance(value, Tensor) else of_modules)[name] = value
+    vars(motion).update(start=start, end=end, pace=PACE)
+    if callable(assigned[0]):
+        vars(motion)["velocity"] = None
     return motion
 
 
@@ -359,20 +368,17 @@ class _Part(NamedTuple):
     contradicts: Tensor | None = None
 
 
-def _part(
-    names: tuple[str, str], obstacle: Obstacle, left: Left, span: Span, device: torch.device, same: Sequence[bool]
-) -> _Part:
-    """A pose and its rate by their names."""
-    own = _copy(names[0], getattr(obstacle, names[0])), _copy(names[1], getattr(obstacle, names[1]))
-    before = getattr(left.motion, names[0]), getattr(left.motion, names[1])
+def _part(turns: bool, obstacle: Obstacle, later: Left, changes: _Changes, same: Sequence[bool]) -> _Part:
+    """The centre, or the rotation."""
+    own, before = later.values[2 * turns : 2 * turns + 2], _values(changes.before)[2 * turns : 2 * turns + 2]
     if all(value is None for value in (*own, *before)):
         return _Part(own, own)
-    changes = _Changes(names[0] == "rotation", left, span, obstacle.start, device)
-    if all(same) and not left.arrives:
-        return _Part(own, own) if left.moves is None else changes.of_known(_Part(before, before, False), own)
+    changes.turns, arrives = turns, changes.left.arrives
+    if all(same) and not arrives:
+        return _Part(own, own) if changes.left.moves is None else changes.of_known(_Part(before, before, False), own)
     if callable(own[0]):
-        return _Part(own, own, contradicts=changes.jump(obstacle.centre_at(span.begin, changes.like), None))
-    if same[0] and not left.arrives:
+        return _Part(own, own, contradicts=changes.jump(changes.on_path(obstacle), None))
+    if same[0] and not arrives:
         pair = changes.backwards(changes.pose(), own[1]), own[1]
         return changes.of_known(_Part(pair, pair, False), own)
     if own[1] is None:
@@ -387,36 +393,44 @@ class _Changes:
     Centres [D] or [B, D]; angles [] or [B]; rotation vectors [3] or [B, 3].
 
     Args:
-        turns: whether of rotations.
         left: where the obstacle was left.
         span: the control step.
         start: time at which a pose is given, and from which its rate counts [s].
         device: of the particles.
+
+    Attributes:
+        before: how the obstacle has moved.
+        turns: whether rotations are meant, or centres.
     """
 
-    def __init__(self, turns: bool, left: Left, span: Span, start: float, device: torch.device) -> None:
-        self._left, self._span = left, span
+    def __init__(self, left: Left, span: Span, start: float, device: torch.device) -> None:
+        self.left, self._span, self.before, self.turns = left, span, left.motion, False
         self.like = torch.empty(0, dtype=torch.float64, device=device)
         self._elapsed, self._seconds = self._time(span.begin) - start, self._time(span.seconds)
-        self._centre = left.motion.centre_at(span.begin, self.like)
-        dim = self._centre.shape[-1]
-        self._turns, self._rank = turns, 0 if turns and dim == 2 else 1
-        self._zero = torch.zeros((dim,) * self._rank, dtype=torch.float64, device=device)
+        self._centre = self.before.centre_at(span.begin, self.like)
+        self._dim = self._centre.shape[-1]
+
+    @property
+    def _rank(self) -> int:
+        return 0 if self.turns and self._dim == 2 else 1
 
     def value(self, value: Any) -> Tensor:
         """A pose or a rate as a tensor; None for zero."""
         if value is None:
-            return self._zero
+            return self.like.new_zeros((self._dim,) * self._rank)
         given = value if isinstance(value, Tensor) else torch.tensor(value, dtype=torch.float64, device="cpu")
         return given.to(self.like)
 
     def pose(self) -> Tensor:
         """Where the obstacle was left."""
-        if not self._turns:
+        if not self.turns:
             return self._centre
-        motion = self._left.motion
-        turn = self._times(self.value(motion.angular_velocity), self._elapsed)
-        return self._moved(self.value(motion.rotation), turn)
+        turn = self._times(self.value(self.before.angular_velocity), self._elapsed)
+        return self._moved(self.value(self.before.rotation), turn)
+
+    def on_path(self, obstacle: Obstacle) -> Tensor:
+        """Where the path of an obstacle begins."""
+        return _motion(_values(obstacle)).centre_at(self._span.begin, self.like)
 
     def backwards(self, pose: Tensor, rate: Any) -> Tensor:
         """The pose at `start` of one at the beginning of the control step."""
@@ -439,11 +453,11 @@ class _Changes:
         way = self._size(self._times(self.value(rate), self._seconds))
         rounding = 64 * torch.finfo(torch.float32).eps * (self._size(pose) + self._size(before))
         jumps = self._size(self._way(before, pose)) > SLACK * way + rounding
-        return jumps if self._left.known is None else jumps & self._left.known
+        return jumps if self.left.known is None else jumps & self.left.known
 
     def of_known(self, part: _Part, own: tuple[Any, Any]) -> _Part:
         """A part in the scenes in which the obstacle was left; in others it is placed as its attributes say."""
-        known = self._left.known
+        known = self.left.known
         if known is None:
             return part
 
@@ -468,11 +482,11 @@ class _Changes:
         return rate * self._column(time)
 
     def _moved(self, pose: Tensor, way: Tensor) -> Tensor:
-        return composed(way, pose) if self._turns and self._rank else pose + way
+        return composed(way, pose) if self.turns and self._rank else pose + way
 
     def _way(self, begin: Tensor, end: Tensor) -> Tensor:
         """From one pose to another; of rotations the shortest."""
-        if not self._turns:
+        if not self.turns:
             return end - begin
         if self._rank:
             return composed(end, -begin)
