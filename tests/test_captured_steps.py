@@ -209,6 +209,28 @@ def test_values_and_gradients_are_those_of_single_steps(make, device, recorded):
     assert str(step.failures()) == str(again.failures())
 
 
+@pytest.mark.parametrize("wanted", [True, False])
+def test_assigned_poses(wanted, device, recorded):
+    """Obstacles move to them as in single steps, with gradients by poses; these need no other recording."""
+    home = torch.tensor([0.5, 0.2], dtype=F64, device=device)
+    ball = mpm.Sphere(home, 0.15, "sticky")
+    step = mpm.Step(box(2, deterministic=True), network(2, device), boundaries=[ball]).to(device)
+    before = mpm.rollout(step, blob(device, 2), 4, DT)
+    for k in range(3):
+        found = []
+        for graph in (3, None):
+            ball.position = (home + torch.tensor([0.0, 1e-3 * (k + 1)], dtype=F64, device=device)).requires_grad_(
+                wanted
+            )
+            with torch.set_grad_enabled(wanted):
+                end = mpm.rollout(step, before, 3, DT, graph=graph)
+            grads = torch.autograd.grad(end.v.square().sum(), ball.position) if wanted else ()
+            torch.testing.assert_close(ball.pose_in(end).centre, ball.position.detach())
+            found.append((end.detach(), grads))
+        assert_alike(*found)
+    assert len(recorded) == (1 if wanted else 3)
+
+
 def slowed(state, k):
     return state.replace(v=0.99 * state.v)
 

@@ -16,7 +16,7 @@ from torch.autograd.function import once_differentiable
 
 from .activation_record import counts_of, uncounted
 from .anomaly import detecting
-from .boundaries.control import control_step
+from .boundaries.control import control_step, steady
 from .capture import Recordings, Same, capturing, is_captured, is_transformed
 from .errors import check_count, shape_of
 from .graphs import copied, copy_all, tensors_of, time_after, time_tensor
@@ -262,8 +262,9 @@ class _Steps:
         own = {name.removeprefix("step."): given.pop(name) for name in self.names if name.startswith("step.")}
         state = begin = _with(self._like, given).replace(**self._fixed)
         self._like = begin.detach()  # so that the first state may go, and what it follows from
-        for _ in range(self._n):
-            state = torch.func.functional_call(self.step, own, (state, self._dt))
+        with steady():
+            for _ in range(self._n):
+                state = torch.func.functional_call(self.step, own, (state, self._dt))
         before, after = tensors_of(begin), tensors_of(state)
         results = {name: t for name, t in after.items() if t is not before.get(name)}
         self.changed = list(results)

@@ -11,6 +11,7 @@ import contextlib
 import dataclasses
 import functools
 import math
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -101,6 +102,23 @@ class Span(NamedTuple):
     pace: float | Tensor
 
 
+class _Thread(threading.local):
+    steady = False
+
+
+_THREAD = _Thread()
+
+
+@contextlib.contextmanager
+def steady() -> Iterator[None]:
+    """Where steps inside a control step assign no obstacle, and other tensors may stand in the place of its own."""
+    before, _THREAD.steady = _THREAD.steady, True
+    try:
+        yield
+    finally:
+        _THREAD.steady = before
+
+
 Leave = Callable[[Any], Any]
 """What the state after a control step passes, so that it stores where its obstacles are."""
 
@@ -122,7 +140,7 @@ def control_step(
     Raises:
         ValueError: on the CPU, where a velocity contradicts the change of a pose. On CUDA the status counts it.
     """
-    obstacles = [] if n == 0 or torch.compiler.is_compiling() else obstacles_of(step)
+    obstacles = [] if n == 0 or torch.compiler.is_compiling() or _THREAD.steady else obstacles_of(step)
     if not obstacles or is_traced(state.x) or is_captured(state.x) or _nothing_new(obstacles, state.poses):
         return contextlib.nullcontext(_unchanged)
     if any(o.course is not None for o in obstacles):
