@@ -21,13 +21,13 @@ KINDS = {
 }
 
 
-def check_file(path: str | Path, kind: str, largest: int = LARGEST) -> None:
+def check_file(path: str | Path, kind: str, largest: int | None = LARGEST) -> None:
     """Raise for a path that is no regular file, that cannot be read, or that is too large. Links are followed.
 
     Args:
         path: the file.
         kind: what it holds, for messages, such as "mesh".
-        largest: size [bytes]; a larger `TORCH_MPM_LARGEST_FILE` in the environment counts instead.
+        largest: size [bytes], None for any; a larger `TORCH_MPM_LARGEST_FILE` in the environment counts instead.
 
     Raises:
         OSError: with the path; FileNotFoundError, IsADirectoryError and PermissionError among them.
@@ -45,7 +45,7 @@ def check_file(path: str | Path, kind: str, largest: int = LARGEST) -> None:
     if not stat.S_ISREG(status.st_mode):
         found = KINDS.get(stat.S_IFMT(status.st_mode), "of another kind")
         raise OSError(f"{kind} file {path} is {found}, not a regular file")
-    if status.st_size > (limit := max(largest, _raised_limit())):
+    if largest is not None and status.st_size > (limit := max(largest, _raised_limit())):
         raise OSError(
             f"{kind} file {path} is too large: {status.st_size} bytes, where {limit} are allowed; "
             f"the environment variable {VARIABLE} raises the limit"

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from ..errors import DamagedFileError
+from ..files import check_file
 
 Extents = Sequence[tuple[int, int]]
 """Parts of a file: (offset, length) [bytes]."""
@@ -178,6 +179,7 @@ def seal(handle: BinaryIO, extents: Extents) -> None:
 
 def check_seal(path: Path, remedy: str) -> None:
     """Raise DamagedFileError with ``remedy`` unless the parts under the seal of a file are as they were written."""
+    check_file(path, "HDF5", largest=None)
     with open(path, "rb") as handle:
         size = handle.seek(0, os.SEEK_END)
         handle.seek(max(0, size - FOOTER.size))

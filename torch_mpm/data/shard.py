@@ -22,6 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..errors import DamagedFileError
+from ..files import check_file
 from .hdf5 import h5py_module, storage_problem
 from .packing import array_digest
 from .statistics import Motion, Sums
@@ -103,6 +104,7 @@ class ShardRecord:
             FileNotFoundError: for a shard that is not finished.
             DamagedFileError: for a file that is no record.
         """
+        check_file(path, "shard")
         data = path.read_bytes()
         try:
             words = json.loads(data)

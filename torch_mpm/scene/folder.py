@@ -15,6 +15,7 @@ from ..data.hdf5 import h5py_module
 from ..data.trajectory import COMPLETE, PARTIAL, Layout, Trajectory, create
 from ..data.whole_files import check_inside, check_record, write_record
 from ..errors import DamagedFileError
+from ..files import check_file
 from .scene import Scene
 
 RUN, CHECKPOINT, LAST_GOOD, LOCK = "run.json", "checkpoint.h5", "last_good.h5", "run.lock"
@@ -132,8 +133,10 @@ def read_run(folder: Path) -> dict[str, Any]:
 
     Raises:
         DamagedFileError: for a record that is not as it was written.
+        OSError: for a record that cannot be read.
     """
     path = folder / RUN
+    check_file(path, "run")
     try:
         values = json.loads(path.read_bytes())
     except (ValueError, RecursionError) as error:
