@@ -56,7 +56,7 @@ template <class T>
 struct Parameter {
   const T* pointer = nullptr;
   int64_t stride = 0;  // elements from particle to particle, or from scene to scene
-  int64_t scenes = 0;  // entries where it is per scene, 0 otherwise
+  int64_t scenes = 0;  // where it is per scene: scenes that have one; 0 otherwise
 };
 
 template <class T, int D>
@@ -161,15 +161,15 @@ constexpr int kHistoryLength = kHistory<Law> > 0 ? kHistory<Law> : 1;
 constexpr std::array<Quantity, 0> no_history = {};
 constexpr std::array<const char*, 0> no_options = {};
 
-// A parameter of the particles `at`. A scene id out of range takes that of scene 0: such a particle is not transferred
-// anyway.
+// A parameter of the particles `at`. An absent particle, of a negative scene, has that of scene 0. A particle of a
+// scene without one has NaN.
 template <class At, class T, int D>
 MPM_HD typename At::Value load_parameter(const At& at, const LawArguments<T, D>& a, int k) {
   const Parameter<T>& parameter = a.parameters[k];
   if (parameter.scenes) {
     return at.each([&](int64_t p) {
       const int id = a.scene[p * a.scene_stride];
-      return parameter.pointer[(id >= 0 && id < parameter.scenes ? id : 0) * parameter.stride];
+      return id < parameter.scenes ? parameter.pointer[(id > 0 ? id : 0) * parameter.stride] : T(NAN);
     });
   }
   return at.load_shared(parameter.pointer, parameter.stride);

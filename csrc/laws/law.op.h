@@ -97,6 +97,17 @@ inline int64_t history_size(const LawInfo& law, const Tensors& history, int64_t 
   return size;
 }
 
+// Where nobody knows how many scenes there are, a scene that some parameter has no entry for has none for the elastic
+// moduli either, which come first: without a modulus a particle is invalid, without a yield stress it is elastic.
+template <class T, int D>
+void limit_scenes(LawArguments<T, D>& a, size_t count) {
+  int64_t entries = 0;
+  for (size_t k = 0; k < count; k++)
+    if (const int64_t own = a.parameters[k].scenes) entries = entries ? std::min(entries, own) : own;
+  for (size_t k = 0; k < std::min<size_t>(count, 2); k++)
+    if (Parameter<T>& modulus = a.parameters[k]; modulus.stride == 0 || modulus.scenes) modulus.scenes = entries;
+}
+
 // `scenes` is the number of scenes of the batch, where the call knows it.
 template <class T, int D>
 LawArguments<T, D> arguments(const LawInfo& law, const Tensor& state, const OptionalTensor& C,
@@ -117,6 +128,7 @@ LawArguments<T, D> arguments(const LawInfo& law, const Tensor& state, const Opti
   ParameterScenes of_parameters(scene, scenes);
   for (size_t k = 0; k < parameters.size(); k++)
     a.parameters[k] = parameter<T>(parameters[k], element("parameters", int(k)), state, P, of_parameters);
+  if (scenes < 0 && !state.is_cpu()) limit_scenes(a, parameters.size());
   for (size_t k = 0; k < history.size(); k++)
     a.history[k] = input<T>(history[k], element("history", int(k)).c_str(), state,
                             law.history[k].matrix ? Shape{P, D, D} : Shape{P});
