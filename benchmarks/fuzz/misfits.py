@@ -77,7 +77,12 @@ FITTING: tuple[tuple[str, str, str, str], ...] = (
         "numbers that no memory depends on; the functions that call the ops have checked them",
     ),
     ("ops[.]law_.*", "parameters", ".*(axis 0|one dimension more)", "uniform, or of more scenes than have particles"),
-    ("ops[.]quartic.*", "mu|lam|alpha|cohesion", "axis 0", "uniform, or of more scenes than have particles"),
+    (
+        "ops[.]quartic.*",
+        "mu|lam|alpha|cohesion",
+        "axis 0|one dimension more",
+        "uniform, or of more scenes than have particles",
+    ),
     ("(ops[.])?(svd3|polar)", "F", "axis 0|dimension.* more|float64|on meta", "any number of matrices"),
     ("(ops[.])?(svd3|polar)", "F", "axis [12]", "matrices in 2-D and 3-D"),
     ("ops[.]take", "fields|particles", ".*", "any tensors, any rows"),
@@ -100,6 +105,8 @@ FITTING: tuple[tuple[str, str, str, str], ...] = (
     ("Step.failures", "state", "None", "optional"),
     ("Waypoints", "position", "a list", "as many lists of numbers"),
     (".* of a batch", "rotation|radius|friction|angular_velocity", "a list", "a number per scene"),
+    ("grid_update|wall_impulses", "gravity", "one dimension more", "[B, D] of one scene"),
+    ("ops[.]implicit_cg", "images", "axis 0", "any number of images"),
     ("PerMaterial", "values", ".*", "any values of any number; a law or a Heat that gets them checks them"),
     ("(Sphere|Plane|Box|Capsule|SDF|Revolved)", "radius|angular_velocity", "a list", "a list of one scene"),
 )
