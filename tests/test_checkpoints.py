@@ -308,3 +308,23 @@ def test_an_estimate_of_a_rollout_in_one_op_is_what_the_allocator_gives(kept, de
 
     run()
     assert 0.4 < memory.of_cuda(run) / estimate.memory < 1.3
+
+
+@pytest.mark.parametrize("kept", [2, mpm.Checkpoints(states=2), 1])
+@pytest.mark.parametrize("law", ["elastic", "history"])
+def test_compiled_steps_that_were_never_called(kept, law, device):
+    """What a step makes at its first call, and keeps, is no part of what is called again."""
+    torch._dynamo.reset()
+    laws = {"elastic": mpm.NeoHookean(E=1e4, nu=0.3), "history": mpm.VonMises(E=1e4, nu=0.3, yield_stress=10.0)}
+    grid = mpm.Grid(dx=0.1, lower=(0.0, 0.0), upper=(1.0, 1.0), max_blocks=25)
+    points = mpm.seed.box((0.3, 0.3), (0.5, 0.5), grid, per_cell=4)
+    state = mpm.State.at_rest(points, dtype=torch.float64, velocity=(3.0, 1.0)).to(device)
+
+    def gradient(compiled: bool, kept):
+        step = mpm.Step(grid, laws[law], gravity=(0.0, -9.8))
+        step = torch.compile(step, backend="aot_eager") if compiled else step
+        v = state.v.clone().requires_grad_()
+        end = mpm.rollout(step, state.replace(v=v), 5, 1e-3, kept)
+        return torch.autograd.grad(end.x.sum() + end.v.square().sum(), v)[0]
+
+    torch.testing.assert_close(gradient(True, kept), gradient(False, None), rtol=1e-9, atol=1e-9)

@@ -315,3 +315,51 @@ def batch(scenes, device, law=None, **options):
 def first_of(state, scene):
     """Index of the first particle of a scene in `batch`."""
     return 36 * scene
+
+
+FIELDS = ("x", "v", "C", "F")
+
+
+WAYS = {"rollout": lambda step, state: mpm.rollout(step, state, 3, 1e-4), "step": lambda step, state: step(state, 1e-4)}
+
+
+@pytest.mark.parametrize("field", FIELDS)
+@pytest.mark.parametrize("way", WAYS)
+def test_what_is_nan_in_the_first_state_is_named(field, way, device):
+    """Not the time step, which is blamed in other scenes."""
+    step, state = batch(3, device, mpm.VonMises(E=1e4, nu=0.3, yield_stress=100.0))
+    state = step.prepare(state)
+    state = state.replace(C=torch.zeros_like(state.F), ids=torch.arange(len(state), device=device) + 1000)
+    bad = first_of(state, 1) + 7
+    value = getattr(state, field).clone()
+    value[bad] = torch.nan
+    state = state.replace(**{field: value})
+    with torch.no_grad():
+        end = WAYS[way](step, state)
+    with pytest.raises(mpm.SimulationError) as error:
+        step.check(end)
+    where = f"1 in scene 1 (lowest index {bad}, id {bad + 1000})"
+    assert f"had {field} that is NaN or infinite in the state before the first step: {where}" in str(error.value)
+    assert "time step" not in str(error.value)
+    step.reset()
+    with torch.no_grad():
+        step(batch(3, device)[1], 1e-4)
+        later = step(state, 1e-4)
+    with pytest.raises(mpm.SimulationError, match=r"time step was (probably )?too large"):
+        step.check(later)
+
+
+def test_what_nothing_reads_may_be_nan(device):
+    step, state = batch(2, device)
+    state.extra["label"] = torch.full_like(state.mass, torch.nan)
+    with torch.no_grad():
+        step.check(step(state, 1e-4))
+
+
+def test_a_state_before_any_step_is_not_the_fault_of_the_time_step(device):
+    step, state = batch(2, device)
+    state.v[3] = torch.nan
+    with pytest.raises(
+        mpm.SimulationError, match=r"a velocity that is NaN or infinite: .*: give each particle a finite velocity"
+    ):
+        step.check(state)

@@ -127,3 +127,12 @@ def test_info_says_that_the_cuda_library_is_missing(tmp_path: Path) -> None:
     result = run_python(tmp_path, "import json; from torch_mpm.info import info; print(json.dumps(info()['cuda']))")
     assert json.loads(result.stdout)["usable"] is False, result.stderr
     assert "built without its CUDA library" in json.loads(result.stdout)["reason"]
+
+
+def test_old_names_of_modules_are_the_same_modules() -> None:
+    program = (
+        "import torch_mpm; import torch_mpm.heat_boundaries as old; import torch_mpm.heat.boundaries as new; "
+        "from torch_mpm.heat_boundaries import Flux; assert old is new is torch_mpm.heat_boundaries; "
+        "assert Flux is new.Flux"
+    )
+    subprocess.run([sys.executable, "-c", program], check=True)

@@ -111,3 +111,21 @@ def test_wrong_arguments():
         mpm.frames(step, state, 2, DT, hook=1)
     with pytest.raises(TypeError, match="hook must return None or a State of 300 particles"):
         mpm.frames(step, state, 2, DT, hook=lambda state, k: state.x)
+
+
+@pytest.mark.parametrize("dt", [1e-3, torch.tensor(1e-3), torch.tensor([1e-3]), torch.tensor([1e-3, 2e-3])])
+@pytest.mark.parametrize("time", [0.5, torch.tensor([0.5]), torch.tensor([0.5, 0.25])])
+@pytest.mark.parametrize("n", [0, 4])
+def test_times_of_frames(dt, time, n, device):
+    """Of the start too, which may be a number where dt is a tensor."""
+    dt, time = (t.to(device) if isinstance(t, torch.Tensor) else t for t in (dt, time))
+    step = mpm.Step(box(2, scenes=2), mpm.NeoHookean(E=1e4, nu=0.3))
+    state = mpm.State.concatenate([blob(device, 2, 20)] * 2, scene=True).replace(time=time)
+    with torch.no_grad():
+        found = mpm.frames(step, state, n, dt, every=2)
+    start, length = (torch.as_tensor(t, dtype=F64, device=device) for t in (time, dt))
+    expected = [start + k * length for k in range(0, n + 1, 2)] if n else [start]
+    shape = torch.broadcast_shapes(start.shape, length.shape) if n else start.shape
+    assert found.time.dtype == F64 and found.time.shape == (len(expected), *shape)
+    torch.testing.assert_close(found.time, torch.stack([t.expand(shape) for t in expected]).to(found.time.device))
+    assert torch.equal(found.time[-1].cpu(), torch.as_tensor(found.end.time, dtype=F64).cpu())

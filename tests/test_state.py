@@ -131,3 +131,45 @@ def test_time_of_every_scene_in_a_checkpoint(tmp_path):
     checkpoint.save(tmp_path / "state.h5", checkpoint.tensors_of(state), {"time": 0.0})
     loaded, _ = checkpoint.load(tmp_path / "state.h5")
     assert torch.equal(loaded.time, state.time) and torch.equal(loaded.x, state.x)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [(torch.float64,), ("cpu", torch.float64), (None, torch.float64), (torch.zeros(3, dtype=torch.float64),)],
+    ids=["dtype", "device and dtype", "no device", "tensor"],
+)
+def test_to_takes_what_a_module_does(arguments):
+    """Whole numbers keep their dtype, clocks and impulses are float64."""
+    P = 4
+    state = mpm.State(
+        x=torch.rand(P, 2), v=torch.rand(P, 2), mass=torch.ones(P), volume=torch.ones(P), F=torch.rand(P, 2, 2),
+        scene=torch.zeros(P, dtype=torch.int32), ids=torch.arange(P), material=torch.zeros(P, dtype=torch.int32),
+        extra={"strain": torch.rand(P), "count": torch.arange(P)}, time=torch.tensor([0.1]),
+        impulse=torch.zeros(1, 4, 3, dtype=torch.float64),
+    )  # fmt: skip
+    module = torch.nn.Module()
+    for name in ("x", "v", "mass", "volume", "F", "scene", "ids", "material"):
+        module.register_buffer(name, getattr(state, name))
+    for name, value in state.extra.items():
+        module.register_buffer(f"extra_{name}", value)
+    module.to(*arguments)
+    moved = state.to(*arguments)
+    for name in ("x", "v", "mass", "volume", "F", "scene", "ids", "material"):
+        assert (
+            torch.equal(getattr(moved, name), getattr(module, name))
+            and getattr(moved, name).dtype == getattr(module, name).dtype
+        )
+    for name, value in moved.extra.items():
+        assert value.dtype == getattr(module, f"extra_{name}").dtype
+    assert moved.time.dtype == moved.impulse.dtype == torch.float64
+    assert moved.to(torch.float32).x.dtype == torch.float32 and moved.to(torch.float32).time.dtype == torch.float64
+
+
+def test_a_time_of_an_earlier_version_is_read(tmp_path):
+    """Its tensors were in the dtype of the particles."""
+    state = mpm.State(x=torch.rand(3, 2), v=torch.rand(3, 2), mass=torch.ones(3), volume=torch.ones(3))
+    state.__dict__["_time"] = torch.tensor([0.1, 0.2])
+    torch.save(state, tmp_path / "state.pt")
+    read = torch.load(tmp_path / "state.pt", weights_only=True)
+    assert read.time.dtype == torch.float64 and read.time.tolist() == torch.tensor([0.1, 0.2]).double().tolist()
+    assert mpm.State.concatenate([read.replace(time=0.25)]).time == 0.25

@@ -10,6 +10,8 @@ from typing import Any
 
 import torch
 
+from . import signals
+
 DIRECTORY = Path(__file__).parent / "lib"
 CPU_LIBRARY = DIRECTORY / "libtorch_mpm_cpu.so"
 CUDA_LIBRARY = DIRECTORY / "libtorch_mpm_cuda.so"
@@ -18,12 +20,13 @@ cuda_error: str | None = None
 """Why the CUDA library is not in use, or None if it is loaded."""
 
 
-def _load(path: Path) -> str | None:
+def _load(path: Path, backend: str) -> str | None:
     """Register the ops of a library; return why it cannot be loaded."""
     try:
         torch.ops.load_library(os.fspath(path))
     except OSError as error:
         return str(error.__cause__ or error)  # torch wraps the loader's message in one that leaves the reason out
+    signals.watch(ctypes.CDLL(os.fspath(path)), backend)
     return None
 
 
@@ -40,7 +43,7 @@ def _load_cpu() -> None:
             f"torch_mpm is not built: {CPU_LIBRARY} does not exist. Run `make build` in the source tree, "
             "or install the package with `pip install .`"
         )
-    if reason := _load(CPU_LIBRARY):
+    if reason := _load(CPU_LIBRARY, "cpu"):
         raise ImportError(
             f"torch_mpm cannot load {CPU_LIBRARY} with torch {torch.__version__} (2.11 or newer is needed): {reason}"
         )
@@ -52,7 +55,7 @@ def _load_cuda() -> str | None:
         return "torch_mpm was built without its CUDA library (build with TORCH_MPM_CUDA=1 where nvcc is installed)"
     if torch.version.cuda is None:
         return f"torch {torch.__version__} was built without CUDA"
-    return _load(CUDA_LIBRARY)
+    return _load(CUDA_LIBRARY, "cuda")
 
 
 _load_cpu()

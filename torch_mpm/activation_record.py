@@ -3,15 +3,28 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 from collections.abc import Iterator
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
-from .capture import is_captured, is_exported, is_of_library, outside_transforms, remember, without_transforms
-from .failures import Problem, contradicted_poses, problems_of_status, refused_steps
+from .capture import (
+    is_captured,
+    is_exported,
+    is_of_library,
+    is_traced,
+    is_transformed,
+    outside_transforms,
+    remember,
+    without_transforms,
+)
+from .failures import Problem, contradicted_poses, problems_of_first_state, problems_of_status, refused_steps
 from .grid import Blocks, Grid
+
+if TYPE_CHECKING:
+    from .state import State
 
 NO_PROBLEM = (0, 0, -1, 0, -1, 0, -1, 0)
 """A row of the status before the first activation (csrc/grid/status.h)."""
@@ -25,6 +38,7 @@ class ActivationRecord:
 
     Attributes:
         status: int32 [1 + B, 8], see csrc/grid/status.h; None before the first activation.
+        given: what was NaN or infinite in the first state, by field.
         refused: steps of each scene whose entry of a tensor dt could not be taken, int32 [B]; None before the first
             tensor dt.
         contradicted: obstacles of each scene, added up over calls, whose pose is not where their velocity has led,
@@ -35,7 +49,14 @@ class ActivationRecord:
         self.status: Tensor | None = None
         self.refused: Tensor | None = None
         self.contradicted: Tensor | None = None
+        self.given: dict[str, Problem] = {}
         self._replayed: list[Tensor] = []
+
+    @torch.no_grad()
+    def begin(self, state: State, scenes: int) -> None:
+        """Before a step from a state: look at the first one."""
+        if self.status is None and not (is_traced(state.x) or is_captured(state.x) or is_transformed()):
+            self.given = problems_of_first_state(state, scenes)
 
     def activate(self, grid: Grid, x: Tensor, scene: Tensor | None, ids: Tensor | None = None) -> Blocks:
         """As `Grid.activate`; `max_blocks` of the grid follows."""
@@ -111,7 +132,7 @@ class ActivationRecord:
         return self.refused
 
     def reset(self) -> None:
-        self.status = None
+        self.status, self.given = None, {}
         if self.refused is not None:  # and CUDA graphs may write to it
             self.refused.zero_()
         self.contradicted = None
@@ -125,6 +146,8 @@ class ActivationRecord:
             self.refused.masked_fill_(scenes, 0)
         if self.contradicted is not None:
             self.contradicted.masked_fill_(scenes, 0)
+        for name, problem in self.given.items():
+            self.given[name] = dataclasses.replace(problem, count=problem.count.masked_fill(scenes, 0))
         with torch.inference_mode():
             for status in self.all():
                 status[1:].masked_fill_(scenes[:, None], 0)

@@ -19,13 +19,14 @@ from .anomaly import detecting
 from .boundaries.control import control_step, steady
 from .capture import Recordings, Same, capturing, is_captured, is_transformed
 from .errors import check_count, shape_of
-from .graphs import copied, copy_all, tensors_of, time_after, time_tensor
+from .graphs import WorkInFlight, copied, copy_all, tensors_of, time_tensor
 from .grid import own_pools
 from .laws.mixture import Mixture
 from .parameters import has_hooks
 from .recording_keys import StepKey, autocast_of, surroundings
 from .state import State, check_state
 from .step import Step
+from .step_times import time_after
 
 TRIALS = 3
 """Times that steps are taken from Python before they are recorded, as torch does: compilers of code of the user's look
@@ -47,9 +48,9 @@ def captured(step: nn.Module, state: State | None, dt: float, n: int = 1) -> Cap
     state and parameters before and after of each one.
 
     Parameters and buffers are read anew in each call. Code, and numbers of modules of the user's, are those of the
-    recording, which calls the step some times; `state.time` is a tensor there, so that obstacles look at the time in
-    the precision of the particles. The graphs read and write the same memory in each call: a backward pass that comes
-    after another call takes the steps of its own once more. `rollout(graph=n)` makes segments of such graphs.
+    recording, which calls the step some times; `state.time` is a tensor there. The graphs read and write the same
+    memory in each call: a backward pass that comes after another call takes the steps of its own once more.
+    `rollout(graph=n)` makes segments of such graphs.
 
     Args:
         step: a `Step`, or another module (state, dt) -> state; no hooks.
@@ -113,9 +114,11 @@ def in_graphs(step: nn.Module, state: State, n: int, dt: float, most: int) -> St
     """
     recordings = step.__dict__.setdefault("_recordings", Recordings())
     known = StepKey(step)
+    in_flight = WorkInFlight(state.x, most)
     while n > 0:
         count = min(n, most)
         state = Captured(step, dt, count, recordings).after(state, known, alike=True)
+        in_flight.launched()
         n -= count
     return state
 

@@ -140,7 +140,7 @@ class Environments:
         state = self.state
         split_dt(dt, len(self), state.x)  # which checks it
         if self.step.reads_time:
-            state = state.replace(time=self.time.to(state.x.dtype))
+            state = state.replace(time=self.time)
         elapsed = dt.double() if isinstance(dt, Tensor) else torch.full_like(self.time, dt)
         elapsed = torch.where(self.frozen | ~(elapsed > 0), 0.0, n * elapsed)
         impulse = state.impulse

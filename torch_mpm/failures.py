@@ -10,14 +10,15 @@ import torch
 from torch import Tensor
 
 from .errors import GridOverflowError, SimulationError
+from .state import PARTICLE_FIELDS, State
 
 if TYPE_CHECKING:
     from .grid import Grid
     from .laws.material import Material
-    from .state import State
 
 NAMED = 12
 """Scenes that a message names of each kind of problem."""
+LOST = "not_finite"
 CONSEQUENCES = ("velocity", "deformation")
 """Kinds that a message leaves out where a scene has another problem, of which they mostly are consequences."""
 CHECK_DT = "the time step was probably too large; compare dt with step.stable_dt(state)"
@@ -74,6 +75,8 @@ class Failures:
 
     Attributes:
         failed: whether a scene has any problem, bool [B] on the device of the particles.
+        given: by field, what was NaN or infinite in the first state that the step got; no problems by themselves, but
+            the cause of later ones.
         problems: each kind that was looked for:
             "not_finite": particles whose position is NaN or infinite,
             "outside": particles that left the grid,
@@ -85,25 +88,42 @@ class Failures:
 
     failed: Tensor
     problems: dict[str, Problem]
+    given: dict[str, Problem] = dataclasses.field(default_factory=dict)
 
     @staticmethod
-    def of(problems: dict[str, Problem], scenes: int) -> Failures:
+    def of(problems: dict[str, Problem], scenes: int, given: dict[str, Problem] | None = None) -> Failures:
         """Failures of B scenes, on the device of the problems."""
         device = next((problem.count.device for problem in problems.values()), "cpu")
         failed = torch.zeros(scenes, dtype=torch.bool, device=device)
         for problem in problems.values():
             failed = failed | (problem.count > 0)
-        return Failures(failed, problems)
+        return Failures(failed, problems, given or {})
 
     def sentences(self) -> list[str]:
         """One for each kind of problem found; synchronises."""
-        others, told = [False] * len(self.failed), []
+        told, explained = self._of_given()
+        others = list(explained)
         for kind, problem in sorted(self.problems.items(), key=lambda item: item[0] in CONSEQUENCES):
-            sentence = problem.told(others if kind in CONSEQUENCES else [False] * len(others))
+            without = others if kind in CONSEQUENCES else explained if kind == LOST else [False] * len(others)
+            sentence = problem.told(without)
             if sentence:
                 told.append(sentence)
                 others = [a or count > 0 for a, count in zip(others, problem.count.tolist(), strict=True)]
         return told
+
+    def _of_given(self) -> tuple[list[str], list[bool]]:
+        """Sentences about the first state, in scenes that went wrong as by a large time step; and which it explains."""
+        fine = [True] * len(self.failed)
+        for kind in (LOST, *CONSEQUENCES):
+            if kind in self.problems:
+                fine = [a and count == 0 for a, count in zip(fine, self.problems[kind].count.tolist(), strict=True)]
+        told, explained = list[str](), [False] * len(fine)
+        for problem in self.given.values():
+            if sentence := problem.told(fine):
+                told.append(sentence)
+                counts = problem.count.tolist()
+                explained = [a or (count > 0 and not b) for a, count, b in zip(explained, counts, fine, strict=True)]
+        return told, explained
 
 
 def problems_of_status(statuses: Iterable[Tensor], grid: Grid) -> dict[str, Problem]:
@@ -116,30 +136,53 @@ def problems_of_status(statuses: Iterable[Tensor], grid: Grid) -> dict[str, Prob
     first_id, outside, first_outside, lost, first_lost, _, step, lost_id = rows.unbind(1)
     domain = f"particles left the grid [{grid.lower}, {grid.upper}]"
     return {
-        "not_finite": Problem(
-            lost, "particles have a position that is NaN or infinite", CHECK_DT, first_lost, lost_id, step
-        ),
+        LOST: Problem(lost, "particles have a position that is NaN or infinite", CHECK_DT, first_lost, lost_id, step),
         "outside": Problem(
             outside, domain, "enlarge the domain, add walls, or reduce dt", first_outside, first_id, step
         ),
     }
 
 
-def problems_of_state(law: Material, state: State, scenes: int) -> dict[str, Problem]:
-    """Problems of a state that has all fields that the law needs."""
+def problem_of_particles(state: State, scenes: int, bad: Tensor, what: str, advice: str) -> Problem:
+    """The problem of the particles of a mask, bool [P], in each scene."""
+    index = torch.arange(len(state), device=bad.device)
+    scene = torch.zeros_like(index) if state.scene is None else state.scene.long()
+    bad = bad & (scene >= 0) & (scene < scenes)
+    scene = torch.where(bad, scene, scenes)  # the rest goes to a scene that is cut off
+    count = index.new_zeros(scenes + 1).index_add_(0, scene, bad.long())[:-1]
+    first = index.new_full((scenes + 1,), len(state)).scatter_reduce_(0, scene, index, "amin")[:-1]
+    first = torch.where(count > 0, first, -1)
+    identity = first
+    if state.ids is not None and len(state):
+        identity = torch.where(count > 0, state.ids[first.clamp_min(0)], -1)
+    return Problem(count, f"particles {what}", advice, first, identity)
+
+
+def problems_of_first_state(state: State, scenes: int) -> dict[str, Problem]:
+    """What is NaN or infinite in the state that a step gets first, by field. A device is not waited for."""
+    problems = {}
+    fields = {name: getattr(state, name) for name in PARTICLE_FIELDS} | state.extra
+    for name, value in fields.items():
+        if value is None or not value.is_floating_point():
+            continue
+        nothing = 0 * value.detach()  # or NaN
+        bad = ~(nothing.flatten(1).sum(1) if nothing.dim() > 1 else nothing).eq(0)
+        if bad.device.type != "cpu" or bool(bad.any()):
+            problems[name] = problem_of_particles(
+                state,
+                scenes,
+                bad,
+                f"had {name} that is NaN or infinite in the state before the first step",
+                "give each particle finite values",
+            )
+    return problems
+
+
+def problems_of_state(law: Material, state: State, scenes: int, taken: bool = True) -> dict[str, Problem]:
+    """Problems of a state that has all fields that the law needs, before or after steps were taken."""
 
     def problem(bad: Tensor, what: str, advice: str) -> Problem:
-        index = torch.arange(len(state), device=bad.device)
-        scene = torch.zeros_like(index) if state.scene is None else state.scene.long()
-        bad = bad & (scene >= 0) & (scene < scenes)
-        scene = torch.where(bad, scene, scenes)  # the rest goes to a scene that is cut off
-        count = index.new_zeros(scenes + 1).index_add_(0, scene, bad.long())[:-1]
-        first = index.new_full((scenes + 1,), len(state)).scatter_reduce_(0, scene, index, "amin")[:-1]
-        first = torch.where(count > 0, first, -1)
-        identity = first
-        if state.ids is not None and len(state):
-            identity = torch.where(count > 0, state.ids[first.clamp_min(0)], -1)
-        return Problem(count, f"particles {what}", advice, first, identity)
+        return problem_of_particles(state, scenes, bad, what, advice)
 
     def not_positive(value: Tensor) -> Tensor:
         return ~((value > 0) & (value < torch.inf))
@@ -155,11 +198,17 @@ def problems_of_state(law: Material, state: State, scenes: int) -> dict[str, Pro
             "have a rest volume that is not positive and finite",
             "give each particle its volume without deformation",
         ),
-        "velocity": problem(~state.v.isfinite().all(1), "have a velocity that is NaN or infinite", CHECK_DT),
+        "velocity": problem(
+            ~state.v.isfinite().all(1),
+            "have a velocity that is NaN or infinite",
+            CHECK_DT if taken else "give each particle a finite velocity",
+        ),
         "deformation": problem(
             law.invalid(state),
             "are inverted or not finite",
-            "the time step was too large or the load crushed the material; compare dt with step.stable_dt(state)",
+            "the time step was too large or the load crushed the material; compare dt with step.stable_dt(state)"
+            if taken
+            else "give each particle a deformation that its law has a meaning for",
         ),
     }
 

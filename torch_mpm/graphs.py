@@ -18,18 +18,15 @@ from .laws.custom import CustomLaw
 from .parameters import has_hooks
 from .state import FIELDS, State, check_state
 from .step import Step
+from .step_times import time_after
 
 LEAST_STEPS = 6
 """For which a step is recorded: that takes the host as long as one or two steps."""
+PIECE, PIECES, LEAST_PARTICLES = 2**25, 4, 2**13
+"""Particles times steps of a piece of work, the pieces in flight, and the particles that take no less time than fewer
+(csrc/common/signals.op.cpp)."""
 CHUNK = 64
 """Steps between two looks at how many blocks are active, where the pool follows the scene on CUDA."""
-
-
-def time_after(time: float | Tensor, dt: float | Tensor, n: int) -> float | Tensor:
-    """The time n steps later, rounded as single steps do."""
-    for _ in range(n):
-        time = time + dt
-    return time
 
 
 def obstacle_to_replays(step: Any, state: State, dt: float | Tensor) -> str | None:
@@ -54,8 +51,6 @@ def obstacle_to_replays(step: Any, state: State, dt: float | Tensor) -> str | No
         return "an implicit step waits for its solve"
     if step.heat is not None and step.heat.method == "multigrid":
         return "multigrid does all of its iterations in a graph"
-    if state.x.dtype != torch.float64 and step.boundaries.reads_time:
-        return f"obstacles would look at a time in {str(state.x.dtype).removeprefix('torch.')}"
     return _foreign(step, state.x.device, [])
 
 
@@ -114,6 +109,7 @@ def replay_all(step: Step, function: Callable[[State], State], state: State, tim
     """`function`, applied so many times, as replays of a graph; of `most` of them where nobody looks meanwhile whether
     the pool must grow. One activation of the step must be before."""
     graph: Replays | None = None
+    in_flight = WorkInFlight(state.x)
     with step._activations.passing_graphs():
         while times > 0:
             count = min(times, most) if step.grid.grows else times
@@ -121,7 +117,7 @@ def replay_all(step: Step, function: Callable[[State], State], state: State, tim
             blocks = step.grid.pool(state.x, state.scene)
             if graph is None or graph.blocks != blocks:
                 graph = Replays(function, state, blocks)
-            graph.replay(count)
+            graph.replay(count, in_flight)
             state, times = graph.state, times - count
             assert step.status is not None
             step.grid.watch(step.status)
@@ -137,6 +133,32 @@ class _Latest(threading.local):
 
 
 _LATEST = _Latest()
+
+
+class WorkInFlight:
+    """Steps of graphs that the device has still to take: a fraction of a second, since nothing interrupts them and the
+    next wait for the device would hold a signal back.
+
+    Args:
+        x: the positions of the particles.
+        steps: of a graph.
+    """
+
+    def __init__(self, x: Tensor, steps: int = 1) -> None:
+        self._launches = max(PIECE // (max(len(x), LEAST_PARTICLES) * steps), 1)
+        self._since, self._marks = 0, collections.deque[torch.cuda.Event]()
+
+    def launched(self) -> None:
+        """After a launch on the current stream: wait where too much is in flight."""
+        self._since += 1
+        if self._since < self._launches:
+            return
+        self._since = 0
+        mark = torch.cuda.Event()
+        mark.record()
+        self._marks.append(mark)
+        if len(self._marks) > PIECES:
+            self._marks.popleft().synchronize()
 
 
 class Replays:
@@ -171,9 +193,10 @@ class Replays:
         changed = [name for name, value in after.items() if value is not before[name]]
         copy_all([before[name] for name in changed], [after[name] for name in changed])
 
-    def replay(self, times: int) -> None:
+    def replay(self, times: int, in_flight: WorkInFlight) -> None:
         for _ in range(times):
             self._graph.replay()
+            in_flight.launched()
 
 
 def copy_all(to: Sequence[Tensor], of: Sequence[Tensor]) -> None:

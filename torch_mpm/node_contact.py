@@ -16,6 +16,7 @@ from .ops.contact import MAX_OBSTACLES
 from .ops.impulses import impulse_of_nodes
 from .precision import from_half, full_precision
 from .state import State
+from .step_times import time_like
 
 
 def after_boundaries(
@@ -49,10 +50,12 @@ def after_boundaries(
             scene = None if state.scene is None else blocks.node_scene()
             nodes = (blocks.node_positions(state.x.dtype), scene)
         before, boundary = velocity, group[0]
+        own = isinstance(boundary, Obstacle)
         if isinstance(boundary, Obstacle):
             boundary.check_scenes(blocks.grid.dim, blocks.grid.scenes)
-        with full_precision(before) if isinstance(boundary, Obstacle) else contextlib.nullcontext():
-            velocity = from_half(call_boundary(boundary, before, *nodes, time, dt), nodes[0])
+        now = time if own else time_like(time, velocity)
+        with full_precision(before) if own else contextlib.nullcontext():
+            velocity = from_half(call_boundary(boundary, before, *nodes, now, dt), nodes[0])
         if mass is not None:
             # Where there is no mass a boundary of the user's may give any velocity.
             momentum = mass[:, None] * torch.where(mass[:, None] != 0, before - velocity, 0)

@@ -24,6 +24,7 @@ from .errors import check_number, check_vector, shape_of
 from .ops.arguments import per_particle
 from .parameters import TensorModule
 from .state import State
+from .step_times import time_like
 
 ParticleOperation = Callable[[State, "float | Tensor"], "State | tuple[State, Tensor]"]
 Time = float | Tensor
@@ -200,7 +201,7 @@ class _Numbers:
         """[D] or [P, D]"""
         x = state.x
         if callable(value):
-            value = value(state.time)
+            value = value(time_like(state.time, state.x))
         if not isinstance(value, Tensor):
             numbers = check_vector(name, value, x.shape[1])
             key = (numbers, x.dtype, x.device)

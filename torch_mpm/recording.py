@@ -20,7 +20,8 @@ class Frames(NamedTuple):
     """What `frames` kept: T = n // every + 1 frames, that of the start first."""
 
     time: Tensor
-    """Times [T] or, where dt is a tensor, [T, B] [s]; float64 on the CPU for numbers."""
+    """Times of the frames [s], float64: [T], on the CPU where they are numbers; [T, 1] or [T, B] where dt or the time
+    of the state has shape [1] or [B]."""
     fields: dict[str, Tensor]
     """Of each field asked for the values [T, P, ...] in the order of the particles of the state."""
     end: State
@@ -81,8 +82,17 @@ def frames(
     end = rollout(step, state, n, dt, checkpoint, hook=seen, every=every, **options)
     if n % every == 0:
         keep(end)
-    time = torch.stack(times) if isinstance(times[0], Tensor) else torch.tensor(times, dtype=torch.float64)
-    return Frames(time, {name: torch.stack(values) for name, values in kept.items()}, end)
+    return Frames(_stacked(times), {name: torch.stack(values) for name, values in kept.items()}, end)
+
+
+def _stacked(times: Sequence[float | Tensor]) -> Tensor:
+    """Times in one tensor; the first ones may be numbers where later ones are tensors."""
+    tensors = [t for t in times if isinstance(t, Tensor)]
+    if not tensors:
+        return torch.tensor(times, dtype=torch.float64)
+    longest = max(tensors, key=lambda t: (t.dim(), t.numel()))
+    rows = [t if isinstance(t, Tensor) else longest.new_full((), t) for t in times]
+    return torch.stack([row.to(longest.device).expand(longest.shape) for row in rows])
 
 
 def _checked(fields: Sequence[str], state: State) -> Sequence[str]:

@@ -20,7 +20,7 @@ from .captured_steps import in_graphs, obstacle_to_graphs
 from .checkpoints import Checkpoints, as_checkpoints, binomial, fitting, in_segments, offloaded
 from .errors import check_count, check_flag, shape_of
 from .gradient_norms import GradientNorms
-from .graphs import CHUNK, LEAST_STEPS, obstacle_to_replays, replayed, time_after
+from .graphs import CHUNK, LEAST_STEPS, obstacle_to_replays, replayed
 from .laws import CompiledLaw
 from .laws.calls import law_calls, laws_of, passive
 from .ops.arguments import split_dt
@@ -34,10 +34,11 @@ from .orders import STEPS_IN_ORDER, in_no_order, put_back, put_in_order
 from .parameters import Overlay, has_hooks
 from .pause import paused
 from .rollout_parts import Hook, Parts
+from .signals import interruptible
 from .state import State, check_state
 from .step import Step
 from .step_cost import state_bytes, step_bytes
-from .step_times import StepTimes, clocks, requires_grad
+from .step_times import StepTimes, clocks, requires_grad, time_after
 
 
 def rollout(
@@ -153,6 +154,8 @@ def _taken(
                 watch(before, state, mark, k, grid)
         return state
 
+    if kept is not None and n > 0 and _begins_to_keep(step):
+        state, first, n = single(state, 1, 0), first + 1, n - 1
     if kept is None or n == 0:
         return single(state, n, 0)
     if isinstance(step, Step):
@@ -160,6 +163,16 @@ def _taken(
     if kept.states is not None:
         return binomial(single, state, n, kept.states, step)
     return in_segments(single, state, n, kept, step)
+
+
+def _begins_to_keep(step: Any) -> bool:
+    """Whether a compiled step has never been called. What it makes at the first call, and keeps, is an argument of the
+    code that is compiled for later ones: called again, that would keep other tensors for the backward pass."""
+    if not isinstance(step, torch.nn.Module):
+        return False
+    modules = list(step.modules())
+    compiled = any(hasattr(m, "_orig_mod") or m._compiled_call_impl is not None for m in modules)
+    return compiled and any(isinstance(m, Step) and m.status is None for m in modules)
 
 
 PADDING = 87 * 64
@@ -195,8 +208,8 @@ def obstacle_to_substeps(step: Step, state: State, dt: float | Tensor) -> str | 
     for name, value in (("dt", dt), ("the time of the state", state.time)):
         if requires_grad(value) and (step._flip_share or step.boundaries.reads_time):
             return f"{name} requires a gradient, with FLIP or boundaries that may read the time"
-        if isinstance(value, Tensor) and value.dtype != x.dtype:
-            return f"{name} is a tensor, but not in {str(x.dtype).removeprefix('torch.')}"
+    if isinstance(dt, Tensor) and dt.dtype != x.dtype:
+        return f"dt is a tensor, but not in {str(x.dtype).removeprefix('torch.')}"
     if torch.compiler.is_compiling() or is_traced(x) or is_captured(x) or is_transformed():
         return "it is compiled, captured or transformed"
     if detecting():
@@ -231,6 +244,9 @@ LEAST_PERSISTENT, MOST_PERSISTENT = 10, 2**15
 """Steps and particles of a call that one kernel takes on CUDA, csrc/rollout/persistent.h."""
 FEW_BLOCKS, FEW_ITEMS = 2**12, {2: 250, 3: 140}
 """Of a domain, and of work in a step, for which about one wave of thread blocks is enough."""
+WORK_OF_A_CALL, LEAST_STEPS_OF_A_CALL, LEAST_PARTICLES = 2**28, 512, 2**13
+"""Particles times steps of a call on CUDA that may be one kernel, which nothing interrupts: about a quarter of a second
+on an H100. A call of fewer steps would cost more, and fewer particles take no less time."""
 LONG_CHUNK = 1024
 """Steps of a call whose pool has room for all blocks of the domain."""
 MANY_PARTICLES, PARTICLES_PER_BLOCK = 2**18, 32
@@ -253,7 +269,7 @@ def in_chunks(
     it may not keep all that their gradient needs."""
     if in_no_order(state, n) and not sorts_itself(step, state, n, dt):
         return _in_order(step, step.prepare(state), n, dt, kept, keeps_all)
-    chunk = CHUNK if step.grid.grows and state.x.is_cuda else MOST_STEPS
+    chunk = most_steps_of_a_call(step, state)
     most_of_paths = _most_steps_of_paths(step, state, dt)
     with_gradient = wants_gradient(step, state, n, dt)
 
@@ -271,6 +287,15 @@ def in_chunks(
         return binomial(advance, step.prepare(state), n, kept.states, step)
     with offloaded(state) if kept is not None and kept.offload else contextlib.nullcontext():
         return advance(state, n)
+
+
+def most_steps_of_a_call(step: Step, state: State) -> int:
+    """Of one op whose pool follows the scene, or has `max_blocks`."""
+    if not state.x.is_cuda:
+        return MOST_STEPS
+    if step.grid.grows:
+        return CHUNK
+    return min(max(WORK_OF_A_CALL // max(len(state), LEAST_PARTICLES), LEAST_STEPS_OF_A_CALL), MOST_STEPS)
 
 
 def _in_order(step: Step, given: State, n: int, dt: float | Tensor, kept: Checkpoints | None, keeps_all: bool) -> State:
@@ -490,8 +515,11 @@ def _arguments(
 def _substeps(step: Step, state: State, n: int, dt: float | Tensor, records: bool, blocks: int | None) -> State:
     """`substeps` of a prepared state, where no scene is paused."""
     grid, record = step.grid, step._activations
+    record.begin(state, grid.scenes)
     arguments, history_names = _arguments(step, state, n, dt, records, blocks)
-    x, v, C, F, J, history, status, impulse, time, _ = dispatch(torch.ops.torch_mpm.substeps, *arguments.values())
+    x, v, C, F, J, history, status, impulse, time, _ = interruptible(
+        dispatch, torch.ops.torch_mpm.substeps, *arguments.values()
+    )
     record.follow(record.status, status)
     grid.watch(status)
     if status.device.type == "cpu":  # where the op has let the pool grow, or stopped
@@ -499,7 +527,7 @@ def _substeps(step: Step, state: State, n: int, dt: float | Tensor, records: boo
     extra = _history(state, history_names, history)
     now = time_after(state.time, dt, n) if time is None else _in_shape(time.detach(), state.time, dt)
     if requires_grad(dt) or requires_grad(state.time):
-        known: Any = state.time + n * dt
+        known: Any = state.time + n * (dt.double() if isinstance(dt, Tensor) else dt)
         now = now + (known - known.detach())  # which has the gradient
     return state.replace(x=x, v=v, C=C, F=F, J=J, extra=extra, time=now, impulse=impulse)
 

@@ -35,7 +35,10 @@ if TYPE_CHECKING:
 
 
 class Time:
-    """`State.time`. A number is kept as (tensor [],), because compiled code takes Python numbers for constants."""
+    """`State.time`. A number is kept as (tensor [],), because compiled code takes Python numbers for constants.
+
+    A tensor is kept in float64: steps added up in float32 would be another time than their sum.
+    """
 
     def __get__(self, state: State | None, owner: type) -> float | Tensor:
         if state is None:
@@ -48,6 +51,9 @@ class Time:
     def __set__(self, state: State, time: float | Tensor) -> None:
         kept: Tensor | tuple[Tensor]
         if isinstance(time, Tensor):
+            if time.is_complex() or time.dtype == torch.bool:
+                raise TypeError(f"time must be a number or a real tensor, got {time.dtype}")
+            time = time.double()
             number = torch.compiler.is_compiling() and time.dim() == 0 and time.dtype == torch.float64
             kept = (time,) if number and time.device.type == "cpu" and not time.requires_grad else time
         else:
@@ -75,7 +81,8 @@ class State:
         material: law of each particle, int32 [P], for a `Mixture`.
         temperature: relative to a reference [P] [K].
         extra: further per-particle tensors [P, ...] that follow a reordering.
-        time: simulated time [s]: a number, or a tensor [B] once dt is a tensor. Code compiled by `torch.compile` sees a
+        time: simulated time [s]: a number, or a tensor [B] once dt is a tensor, which is kept in float64 whatever the
+            dtype of x is. Code compiled by `torch.compile` sees a
             number as a tensor [] of float64 on the CPU, so that it serves every time.
         impulse: of the material on each boundary of the step and then on each face of the domain, added up over steps
             [B, K + 2 D, D + 1 or 3] [N s, N m s], float64; see `torch_mpm.impulses`.
@@ -165,6 +172,12 @@ class State:
     def __len__(self) -> int:
         return self.x.shape[0]
 
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Of a copy or a file, whose time may be of an earlier version, in float32."""
+        time = state.pop("_time")
+        self.__dict__.update(state)
+        self.time = time if isinstance(time, Tensor) else time[0].item()
+
     @property
     def scenes(self) -> int | None:
         """Number of scenes B that parameters [B] are given for, without particles or with them.
@@ -236,17 +249,44 @@ class State:
         state = self.replace(**changes, extra={name: next(results) for name in self.extra})
         return state if self._counted is None or self._counted[2] is None else state.of_scenes(self._counted[2])
 
-    def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> State:
-        """Move to a device, and floating tensors to a dtype."""
+    def to(
+        self,
+        device: torch.device | str | torch.dtype | Tensor | None = None,
+        dtype: torch.dtype | None = None,
+        non_blocking: bool = False,
+    ) -> State:
+        """Move to a device, and floating tensors of the particles to a dtype; as `torch.nn.Module.to`.
+
+        `scene`, `ids`, `material` and whole numbers in `extra` keep their dtype, `time` and `impulse` stay in float64.
+
+        Args:
+            device: a device or its name; or a dtype alone; or a tensor, whose device and dtype are taken.
+            dtype: float32 or float64.
+            non_blocking: as of `torch.Tensor.to`.
+
+        Raises:
+            TypeError, ValueError: for anything else.
+        """
+        if isinstance(device, (torch.dtype, Tensor)):
+            if dtype is not None:
+                raise TypeError(f"dtype must be given once, got {shape_of(device)} and {dtype}")
+            given = device
+            device, dtype = (given.device, given.dtype) if isinstance(given, Tensor) else (None, given)
         check_device(device)
         check_dtype(dtype)
-        state = self.replace(impulse=None)  # which is on the device of x, and in float64
-        state = state.map(lambda t: t.to(device=device, dtype=dtype if t.is_floating_point() else None))
+        check_flag("non_blocking", non_blocking)
+
+        def moved(t: Tensor, dtype: torch.dtype | None = None) -> Tensor:
+            return t.to(device=device, dtype=dtype, non_blocking=non_blocking)
+
+        state = self.replace(impulse=None).map(lambda t: moved(t, dtype if t.is_floating_point() else None))
         if isinstance(self.time, Tensor):
-            state.time = self.time.to(device=device, dtype=dtype)
+            state.time = moved(self.time)
         if self.poses:
             state = state.with_poses({key: left.to(state.x.device) for key, left in self.poses.items()})
-        return state if self.impulse is None else state.replace(impulse=self.impulse.to(state.x.device))
+        if self.impulse is not None:
+            state.impulse = moved(self.impulse)
+        return state
 
     def detach(self) -> State:
         """The same values outside the autograd graph."""
@@ -438,7 +478,7 @@ def _times_of_scenes(states: Sequence[State], counts: Sequence[int]) -> float | 
     if not any(isinstance(t, Tensor) for t in times) and len(set(times)) == 1:
         return times[0]
     x = states[0].x
-    rows = [torch.as_tensor(t, dtype=x.dtype, device=x.device).reshape(-1) for t in times]
+    rows = [torch.as_tensor(t, dtype=torch.float64, device=x.device).reshape(-1) for t in times]
     return torch.cat([row.expand(count) for row, count in zip(rows, counts, strict=True)])
 
 
@@ -449,7 +489,7 @@ def _one_time(states: Sequence[State]) -> float | Tensor:
         if other is first:
             continue
         if isinstance(first, Tensor) or isinstance(other, Tensor):
-            a, b = (torch.as_tensor(t, dtype=x.dtype, device=x.device) for t in (first, other))
+            a, b = (torch.as_tensor(t, dtype=torch.float64, device=x.device) for t in (first, other))
             same = bool((a == b).all())
         else:
             same = first == other

@@ -35,6 +35,7 @@ from .particle_operations import ParticleOperation, operated
 from .pause import paused, standing
 from .precision import from_half, full_precision
 from .state import State, check_state, identity_deformation
+from .step_times import time_after
 
 TRANSFERS = ("apic", "pic", "flip")
 
@@ -191,6 +192,7 @@ class Step(TensorModule):
         """A prepared state one step later, without what acts on the particles before."""
         grid, law, scene = self.grid, self.law, state.scene
         law.check_parameters(len(state), grid.scenes)
+        self._activations.begin(state, grid.scenes)
         blocks = self._activations.activate(grid, state.x, scene, state.ids)
         form, affine = self.stress_form, state.C if self.transfer == "apic" else None
         fields, stress = law(Overlay(state, dt=dt) if self._rate_dependent else state)
@@ -222,7 +224,7 @@ class Step(TensorModule):
             motion = C if form == "mls" else g2p(blocks, state.x, velocity, affine=False, gradient=True)[2]
             with full_precision(state.x):
                 changes |= self.heat.update(blocks, state, dt, motion, dissipated)
-        return state.replace(x=x, v=v, C=C if keeps_C else None, time=state.time + dt, **changes)
+        return state.replace(x=x, v=v, C=C if keeps_C else None, time=time_after(state.time, dt), **changes)
 
     def prepare(self, state: State) -> State:
         """Give a state the fields that this step needs and that it lacks."""
@@ -425,8 +427,9 @@ class Step(TensorModule):
         if self.integrator is not None:
             problems |= self.integrator.problems()
         if state is not None:
-            problems |= problems_of_state(self.law, self.prepare(state), self.grid.scenes)
-        return Failures.of(problems, self.grid.scenes)
+            taken = self.status is not None
+            problems |= problems_of_state(self.law, self.prepare(state), self.grid.scenes, taken)
+        return Failures.of(problems, self.grid.scenes, self._activations.given)
 
     def check(self, state: State | None = None) -> None:
         """Read the status of all steps so far, and look at a state if one is given; synchronises with the device.

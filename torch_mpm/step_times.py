@@ -16,16 +16,28 @@ if TYPE_CHECKING:
 
 
 def clocks(state: State, dt: float | Tensor, scenes: int) -> tuple[float, Tensor | None, Tensor | None]:
-    """The time step [s] as a number, or times that and a time for each scene [B]."""
+    """The time step [s] as a number, or times that and a time in float64 for each scene [B]."""
     number, scene_dt = split_dt(dt, scenes, state.x)
     if scene_dt is None and not isinstance(state.time, Tensor):
         return number, None, None
+    each_dt = state.x.new_ones(scenes) if scene_dt is None else scene_dt.contiguous()
+    time = state.time
+    if not isinstance(time, Tensor):
+        time = state.x.new_full((1,), time, dtype=torch.float64)
+    return number, each_dt, time.detach().reshape(-1).expand(scenes).contiguous()
 
-    def each(value: float | Tensor) -> Tensor:
-        given = value.reshape(-1) if isinstance(value, Tensor) else state.x.new_full((1,), value)
-        return given.expand(scenes).contiguous()
 
-    return 1.0, each(dt), each(state.time).detach()
+def time_after(time: float | Tensor, dt: float | Tensor, n: int = 1) -> float | Tensor:
+    """The time n steps later, in float64 and rounded as single steps do."""
+    dt = dt.double() if isinstance(dt, Tensor) else dt
+    for _ in range(n):
+        time = time + dt
+    return time
+
+
+def time_like(time: float | Tensor, like: Tensor) -> float | Tensor:
+    """A time as functions of the user's get it: a number, or a tensor with the dtype of `like`."""
+    return time.to(like.dtype) if isinstance(time, Tensor) else time
 
 
 def requires_grad(value: float | Tensor) -> bool:
@@ -37,7 +49,7 @@ class StepTimes(NamedTuple):
     """The times [s] at which n steps begin."""
 
     tensor: Tensor
-    """[n] in float64, or [n, B] in the dtype of the particles where scenes have clocks of their own."""
+    """[n] or, where scenes have clocks of their own, [n, B], in float64."""
     numbers: list[float] | None
     """The same where all scenes have one time, which the host knows."""
 
@@ -52,7 +64,7 @@ class StepTimes(NamedTuple):
             return cls(float(state.time) + count * number, list(numbers))
         times = [scene_time]
         for _ in range(n - 1):
-            times.append(times[-1] + scene_dt)
+            times.append(times[-1] + number * scene_dt.double())
         return cls(torch.stack(times), None)
 
     def within(self, start: float, end: float) -> slice:

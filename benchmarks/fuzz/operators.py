@@ -98,7 +98,7 @@ class _Calls:
         data[8 + D + 1 : 8 + 2 * D + 1] = 2.0  # samples along each axis
         sizes = [0, 0, 0, 0, 8, 2 * D + 1 + 2**D]
         kinds = ([0, 1, 2, 3, 4, 5], sizes, [1, 2, 3, 2, 3, 1], [-1, -1, 0, 1, -1, -1], [0.0] * 6, [float("inf")] * 6)
-        obstacles = (velocity, table, data, *kinds, self.uniform(2), 0.1, *top)
+        obstacles = (velocity, table, data, *kinds, self.uniform(2).double(), 0.1, *top)
         self.walls, self.obstacles = walls, obstacles[1 : -len(top) - 2]
         width, mass = D + (1 if D == 2 else 3), self.uniform(self.N)
         return [
@@ -222,7 +222,8 @@ class _Calls:
         counts = [len(LAWS[name].parameters) for name in laws[0].split(",")]
         how = ([ones] * sum(counts), [0, 1, 0], 3, 1e-3, True, 0.0, True, 0, self.normal(2, D), *self.walls)
         impulse = self.normal(2, 6 + 2 * D, D + (1 if D == 2 else 3)).double()
-        end = (*self.obstacles, 0.1, 2, 40, True, False, False, impulse, self.dt, self.uniform(2), *self.lattice.packed)
+        clocks = self.dt, self.uniform(2).double()
+        end = (*self.obstacles, 0.1, 2, 40, True, False, False, impulse, *clocks, *self.lattice.packed)
         look = (*fields[:5], self.F, *self.uniform(4, P), self.scene, 50.0, 2.0, True, 0.1, self.lattice.upper, 2)
         call = (*fields, 0.5 + self.uniform(P), [self.uniform(P)], *who, *laws, *how, *end)
         figures = (self.x, *call[4:7], call[7], self.scene, material, *laws, how[0], how[1], True)
@@ -231,7 +232,7 @@ class _Calls:
             ("substeps", call),
             ("substeps_backward", (*grads, torch.ones_like(impulse), 15, None, *call)),
             ("law_figures", figures),
-            ("survey", (*look, *self.obstacles, self.uniform(2), 0.1, *self.lattice.packed)),
+            ("survey", (*look, *self.obstacles, self.uniform(2).double(), 0.1, *self.lattice.packed)),
         ]
 
     def sand(self) -> list[tuple[str, tuple[Any, ...]]]:

@@ -54,7 +54,7 @@ struct ContactArguments {
   // first node of the samples [D], their distance, numbers of them along each axis [D], and the samples, the last axis
   // fastest.
   const T* data = nullptr;
-  const T* scene_time = nullptr;  // [times], one for all scenes or one per scene; or null
+  const double* scene_time = nullptr;  // [times], one for all scenes or one per scene; or null
   int times = 0;
   double time = 0;  // where scene_time is null, or
   // the times of the substeps of a call, on the device.
@@ -123,7 +123,7 @@ MPM_HD int step_of_call(const ContactArguments<T, D>& a) {
 
 template <class T, int D>
 MPM_HD double contact_time(const ContactArguments<T, D>& a, int scene) {
-  if (a.scene_time) return double(a.scene_time[a.times == 1 ? 0 : scene]);
+  if (a.scene_time) return a.scene_time[a.times == 1 ? 0 : scene];
   return a.step_time ? a.step_time[step_of_call(a)] : a.time;
 }
 

@@ -80,10 +80,10 @@ ContactArguments<T, D> obstacle_arguments(const Tensor& like, const PackedLattic
   a.time = time;
   if (has(scene_time)) {
     check_rank(*scene_time, "scene_time", 1);
-    check_like(*scene_time, "scene_time", like);
+    check_type(*scene_time, "scene_time", ScalarType::Double, like);
     STD_TORCH_CHECK(scene_time->is_contiguous() && scene_time->size(0) > 0 && scene_time->size(0) <= INT32_MAX,
                     "scene_time must be contiguous with shape [1 or B], got ", shape_of(*scene_time));
-    a.scene_time = static_cast<const T*>(scene_time->data_ptr());
+    a.scene_time = static_cast<const double*>(scene_time->data_ptr());
     a.times = int(scene_time->size(0));
   }
   return a;

@@ -27,6 +27,11 @@ void accumulate(const AccumulateArguments<T, D>& a) {
 }
 
 template <class T, int D>
+void advance_clocks(const AdvanceClocksArguments<T, D>& a) {
+  for (int64_t b = 0; b < a.scenes; b++) a.time[b] += a.dt * double(a.scene_dt[b]);
+}
+
+template <class T, int D>
 void add_scaled(const AddScaledArguments<T, D>& a) {
   const T share = T(a.share), zero = T(0);
   const int64_t to_stride = a.to.stride[0], first_stride = a.first.stride[0], second_stride = a.second.stride[0];
@@ -57,6 +62,7 @@ void sum_slots(const SumSlotsArguments<T, D>& a) {
 }
 
 MPM_INSTANTIATE(accumulate, AccumulateArguments)
+MPM_INSTANTIATE(advance_clocks, AdvanceClocksArguments)
 MPM_INSTANTIATE(add_scaled, AddScaledArguments)
 MPM_INSTANTIATE(accumulate_slots, AccumulateSlotsArguments)
 MPM_INSTANTIATE(sum_slots, SumSlotsArguments)

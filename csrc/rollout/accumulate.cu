@@ -19,6 +19,12 @@ __global__ void __launch_bounds__(kThreads) accumulate_kernel(const AccumulateAr
 }
 
 template <class T, int D>
+__global__ void __launch_bounds__(kThreads) advance_clocks_kernel(const AdvanceClocksArguments<T, D> a) {
+  const int64_t b = int64_t(blockIdx.x) * kThreads + threadIdx.x;
+  if (b < a.scenes) a.time[b] += a.dt * double(a.scene_dt[b]);
+}
+
+template <class T, int D>
 __global__ void __launch_bounds__(kThreads) add_scaled_kernel(const AddScaledArguments<T, D> a) {
   wait_for_kernel_before();
   const int64_t p = int64_t(blockIdx.x) * kThreads + threadIdx.x;
@@ -48,6 +54,11 @@ void accumulate(const AccumulateArguments<T, D>& a, Stream stream) {
 }
 
 template <class T, int D>
+void advance_clocks(const AdvanceClocksArguments<T, D>& a, Stream stream) {
+  if (a.scenes > 0) launch(advance_clocks_kernel<T, D>, blocks_for(a.scenes), kThreads, 0, stream, a);
+}
+
+template <class T, int D>
 void add_scaled(const AddScaledArguments<T, D>& a, Stream stream) {
   if (a.count > 0) launch_in_chain(add_scaled_kernel<T, D>, blocks_for(a.count), kThreads, 0, stream, a);
 }
@@ -63,6 +74,7 @@ void sum_slots(const SumSlotsArguments<T, D>& a, Stream stream) {
 }
 
 MPM_INSTANTIATE(accumulate, AccumulateArguments)
+MPM_INSTANTIATE(advance_clocks, AdvanceClocksArguments)
 MPM_INSTANTIATE(add_scaled, AddScaledArguments)
 MPM_INSTANTIATE(accumulate_slots, AccumulateSlotsArguments)
 MPM_INSTANTIATE(sum_slots, SumSlotsArguments)

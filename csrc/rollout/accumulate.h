@@ -26,6 +26,15 @@ struct AccumulateArguments {
   }
 };
 
+// The clocks of scenes with time steps dt * scene_dt go on by one, in double precision for particles of every type.
+template <class T, int D>
+struct AdvanceClocksArguments {
+  double* time = nullptr;       // [scenes]
+  const T* scene_dt = nullptr;  // [scenes]
+  double dt = 0;
+  int64_t scenes = 0;
+};
+
 // to = first + share * second, [count, D]; `to` may be one of them. An absent first is zero.
 template <class T, int D>
 struct AddScaledArguments {

@@ -11,6 +11,7 @@
 #define MPM_ROLLOUT_KERNELS(PLAIN, ORDERED, SIZE)   \
   PLAIN(survey, SurveyArguments)                    \
   PLAIN(accumulate, AccumulateArguments)            \
+  PLAIN(advance_clocks, AdvanceClocksArguments)     \
   PLAIN(add_scaled, AddScaledArguments)             \
   PLAIN(accumulate_slots, AccumulateSlotsArguments) \
   PLAIN(sum_slots, SumSlotsArguments)

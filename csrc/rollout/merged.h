@@ -1,5 +1,6 @@
 #pragma once
 
+#include "common/signals.h"
 #include "rollout/replay.h"
 #include "rollout/substeps.h"
 
@@ -72,11 +73,12 @@ void Merged<T, D>::take_all(const Particles<const T>& given, const int* before) 
   const int64_t last = s_.in.n - 1;
   int64_t step = 1;
   go_on(step++, false, stream_);
-  step += 2 * replay((last - step) / 2, stream_, [&](backend::Stream on) {
-            go_on(step, false, on);
-            go_on(step + 1, false, on);
-          });
-  for (; step <= last; step++) go_on(step, step == last, stream_);
+  const auto two = [&](backend::Stream on) { go_on(step, false, on), go_on(step + 1, false, on); };
+  step += 2 * replay((last - step) / 2, stream_, two, [&] { after_substeps(rows_, 2, stream_); });
+  for (; step <= last; step++) {
+    go_on(step, step == last, stream_);
+    after_substeps(rows_, 1, stream_);
+  }
   end();
 }
 

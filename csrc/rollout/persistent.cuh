@@ -420,7 +420,7 @@ __global__ void __launch_bounds__(ItemStep<Source, Task>::threads, kItemsOfProce
     if (ahead && more) continue;
     more = lasts(barrier.wait()) && more;
     if (blockIdx.x == 0 && a.scene_time)
-      for (int b = threadIdx.x; b < t.scenes; b += threads) a.scene_time[b] += a.scene_dt[b];
+      for (int b = threadIdx.x; b < t.scenes; b += threads) a.scene_time[b] += a.update.dt * double(a.scene_dt[b]);
   }
   for (T* nodes : a.nodes) used.empty(nodes, source.nodes.fixed, blocks);
   if (blockIdx.x == 0) write_persistent_status(a, t.scenes, step - first);

@@ -38,7 +38,7 @@ struct PersistentLoop {
   T* nodes[3] = {};                       // P2G fills one, G2P reads it, and another is emptied
   int steps = 0;                          // to be taken by all launches together
   const double* step_time = nullptr;      // [steps] where obstacles act and scenes have no time of their own
-  T* scene_time = nullptr;                // [scenes], goes on with each substep
+  double* scene_time = nullptr;           // [scenes], goes on with each substep
   const T* scene_dt = nullptr;            // [scenes]
   int* steps_so_far = nullptr;            // zeroed before a call
   unsigned long long* arrived = nullptr;  // thread blocks at barriers, two words zeroed before each launch

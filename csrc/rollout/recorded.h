@@ -1,5 +1,6 @@
 #pragma once
 
+#include "common/signals.h"
 #include "rollout/substeps.h"
 
 // n steps with what their adjoint reads of each: the particles, and the active blocks and nodes where these take less
@@ -113,9 +114,9 @@ class Recorded {
 
   // Of scenes with clocks of their own, after all steps.
   Tensor scene_time_after() const {
-    Tensor after = empty(in_.x, {in_.scenes});
+    Tensor after = empty(in_.x, {in_.scenes}, ScalarType::Double);
     torch::stable::copy_(after, torch::stable::select(scene_times_, 0, in_.n - 1));
-    steps.add_dt(static_cast<T*>(after.data_ptr()), stream_);
+    steps.advance_clocks(static_cast<double*>(after.data_ptr()), stream_);
     return after;
   }
 
@@ -171,16 +172,16 @@ class Recorded {
     }
   }
 
-  T* scene_time(int64_t i) const { return static_cast<T*>(scene_times_.data_ptr()) + i * in_.scenes; }
+  double* scene_time(int64_t i) const { return static_cast<double*>(scene_times_.data_ptr()) + i * in_.scenes; }
 
   // The times of each scene at all steps.
   void make_scene_times() {
-    scene_times_ = empty(in_.x, {in_.n, in_.scenes});
+    scene_times_ = empty(in_.x, {in_.n, in_.scenes}, ScalarType::Double);
     steps.contact.times = int(in_.scenes);
     for (int64_t i = 0; i < in_.n; i++) {
       Tensor now = torch::stable::select(scene_times_, 0, i);
       torch::stable::copy_(now, i == 0 ? *in_.scene_time : torch::stable::select(scene_times_, 0, i - 1));
-      if (i > 0) steps.add_dt(scene_time(i), stream_);
+      if (i > 0) steps.advance_clocks(scene_time(i), stream_);
     }
   }
 
@@ -290,6 +291,7 @@ bool Recorded<T, D>::take() {
     steps.write({x[i], v[i], C[i], F[i], J[i], history[i]});
     if (has(in_.material)) keep_others(i);
     steps.move(stream_);
+    after_substeps(in_.x.size(0), 1, stream_);
   }
   return taken_ = true;
 }

@@ -171,13 +171,16 @@ inline bool is_recorded(cudaStream_t stream) {
 }
 
 // How often `work(stream)` was replayed: `times`, or never where a recording would not pay or the stream is recorded
-// itself. It must be kernels, copies and memory that is set, alone.
-template <class Work>
-int64_t replay(int64_t times, cudaStream_t stream, const Work& work) {
+// itself. It must be kernels, copies and memory that is set, alone. `launched()` is called after each replay.
+template <class Work, class Launched>
+int64_t replay(int64_t times, cudaStream_t stream, const Work& work, const Launched& launched) {
   if (times < kLeastReplays || is_recorded(stream)) return 0;
   Recorder& recorder = Recorder::of_this_thread();
   recorder.record(work);
-  for (int64_t k = 0; k < times; k++) recorder.launch(stream);
+  for (int64_t k = 0; k < times; k++) {
+    recorder.launch(stream);
+    launched();
+  }
   return times;
 }
 

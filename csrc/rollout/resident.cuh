@@ -514,7 +514,7 @@ __device__ void leave_out_tail(const Source& source, const Task& task, int64_t s
 template <class T, int D>
 __device__ void move_clock(const ResidentArguments<T, D>& a, int scene, int64_t steps) {
   if (threadIdx.x > 0 || !a.scene_time) return;
-  for (int64_t step = 0; step < steps; step++) a.scene_time[scene] += a.scene_dt[scene];
+  for (int64_t step = 0; step < steps; step++) a.scene_time[scene] += a.dt * double(a.scene_dt[scene]);
 }
 
 // First slot of the blocks from one of the table on; unused slots come last.

@@ -48,11 +48,11 @@ struct ResidentArguments {
   bool obstacles = false;
   int scenes = 1;
   int64_t steps = 0;
-  double time = 0, dt = 0;      // of obstacles, where scenes have no time of their own
-  T* scene_time = nullptr;      // [scenes], goes on with each substep
-  const T* scene_dt = nullptr;  // [scenes]
-  char* rows = nullptr;         // for scenes that shared memory does not hold, or not any more
-  char* blocks = nullptr;       // [spare_blocks], for those that reach more blocks
+  double time = 0, dt = 0;       // of obstacles, where scenes have no time of their own
+  double* scene_time = nullptr;  // [scenes], goes on with each substep
+  const T* scene_dt = nullptr;   // [scenes]
+  char* rows = nullptr;          // for scenes that shared memory does not hold, or not any more
+  char* blocks = nullptr;        // [spare_blocks], for those that reach more blocks
   int spare_blocks = 0;
   int* blocks_taken = nullptr;      // of these, zero before the call
   SceneTrouble* trouble = nullptr;  // [scenes]

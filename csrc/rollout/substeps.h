@@ -529,20 +529,19 @@ struct Substeps {
   // The time after a step, on the CPU and of scenes with clocks of their own.
   void end_time(backend::Stream stream) {
     if (MPM_BACKEND == MPM_BACKEND_IS_cpu) contact.time += in.dt, contact.row += contact.step_stride;
-    if (scene_time.defined()) add_dt(static_cast<T*>(scene_time.data_ptr()), stream);
+    if (scene_time.defined()) advance_clocks(static_cast<double*>(scene_time.data_ptr()), stream);
   }
 
   // Scenes with time steps and clocks of their own begin at `times`, which goes on with them.
   void count_scene_times(const Tensor& times) {
     scene_time = times;
-    contact.scene_time = static_cast<const T*>(times.data_ptr());
+    contact.scene_time = static_cast<const double*>(times.data_ptr());
     contact.times = int(in.scenes);
   }
 
-  void add_dt(T* times, backend::Stream stream) const {
-    AccumulateArguments<T, D> a;
-    a.add(times, static_cast<const T*>(in.scene_dt->data_ptr()), in.scenes);
-    backend::accumulate(a, stream);
+  void advance_clocks(double* times, backend::Stream stream) const {
+    const T* const scene_dt = static_cast<const T*>(in.scene_dt->data_ptr());
+    backend::advance_clocks(AdvanceClocksArguments<T, D>{times, scene_dt, in.dt, in.scenes}, stream);
   }
 
   // From a stress that is there, or that P2G computes, to the velocities of the nodes.
@@ -662,9 +661,11 @@ Substeps<T, D>::Substeps(const SubstepsInputs& inputs) : in(inputs) {
   if (obstacles) check_scenes(contact, in.scenes);
   STD_TORCH_CHECK(has(in.scene_dt) == has(in.scene_time), "scene_dt must be given with scene_time");
   if (has(in.scene_dt)) {
-    for (const auto& [tensor, name] : {std::pair(*in.scene_dt, "scene_dt"), std::pair(*in.scene_time, "scene_time")}) {
+    const auto type = x.scalar_type();
+    for (const auto& [tensor, name, expected] :
+         {std::tuple(*in.scene_dt, "scene_dt", type), std::tuple(*in.scene_time, "scene_time", ScalarType::Double)}) {
       check_shape(tensor, name, {in.scenes});
-      check_like(tensor, name, x);
+      check_type(tensor, name, expected, x);
       STD_TORCH_CHECK(tensor.is_contiguous(), name, " must be contiguous");
     }
     p2g.scene_dt = advance.scene_dt = field<const T>(*in.scene_dt);

@@ -1,5 +1,6 @@
 #include <atomic>
 
+#include "common/signals.h"
 #include "rollout/recorded.h"
 #include "rollout/replay.h"
 #if MPM_BACKEND == MPM_BACKEND_IS_cpu
@@ -23,7 +24,7 @@ Tensor copy_of(const Tensor& t) {
 template <class T, int D, class Arguments>
 void give_clocks(const Substeps<T, D>& s, Arguments& a) {
   if (!s.scene_time.defined()) return;
-  a.scene_time = static_cast<T*>(s.scene_time.data_ptr());
+  a.scene_time = static_cast<double*>(s.scene_time.data_ptr());
   a.scene_dt = static_cast<const T*>(s.in.scene_dt->data_ptr());
 }
 
@@ -185,6 +186,7 @@ Results take_steps(const SubstepsInputs& in, backend::Stream stream) {
       if (!particles.step(before, now, in.n - 1 - step)) break;  // and the status tells
       before = now;
       step++;
+      after_substeps(in.x.size(0), 1, stream);
     }
     particles.give_back();
   });
@@ -266,6 +268,7 @@ Results substeps(MPM_SUBSTEPS_PARAMETERS) {
       take_resident(s, n - 1, 0, time, activated, now, stream);
       s.activate(now, activated, stream);
       take_resident(s, 1, n - 1, last_time, activated, now, stream);
+      after_substeps(P, n, stream);
       return;
     }
     if (n > 1) s.let_activations_last(stream);
@@ -310,6 +313,7 @@ Results substeps(MPM_SUBSTEPS_PARAMETERS) {
       if (take_persistent(s, static_cast<int*>(status[1].data_ptr()), static_cast<int*>(status[0].data_ptr()),
                           stream)) {
         take(last = 1, true, stream);
+        after_substeps(P, n, stream);
         return;
       }
     }
@@ -317,9 +321,11 @@ Results substeps(MPM_SUBSTEPS_PARAMETERS) {
     while (step < n) {
       last = int(step % 2);
       take(last, step + 1 == n, stream);
-      if (++step == 2)
-        step +=
-            2 * replay((n - step - 1) / 2, stream, [&](backend::Stream on) { take(0, false, on), take(1, false, on); });
+      after_substeps(P, 1, stream);
+      if (++step == 2) {
+        const auto two = [&](backend::Stream on) { take(0, false, on), take(1, false, on); };
+        step += 2 * replay((n - step - 1) / 2, stream, two, [&] { after_substeps(P, 2, stream); });
+      }
     }
   });
   return {x_[last], v_, C_, F_[last], J_[last], history_, status[last], impulse_, time_, Tensor()};

@@ -53,6 +53,7 @@ class SubstepsBackward {
       if (s_.flips()) leave_kept(adjoints);
       leave_laws(adjoints);
       if (adjoints.dt.defined()) add_terms({{adjoints.dt, motion_dt_}, {adjoints.dt, stress_dt_}});
+      after_substeps(in_.x.size(0), 1, stream_);
     }
   }
 

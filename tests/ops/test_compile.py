@@ -137,11 +137,21 @@ def test_inductor_compiles_a_step(device):
 
 
 def test_the_time_of_a_state_is_what_was_given(device):
-    """Numbers stay numbers, tensors the same tensors, through copies, moves and steps."""
+    """Numbers stay numbers, tensors in float64 the same tensors, through copies, moves and steps."""
     step, state, _ = make_step("fixed dt", device)
     assert isinstance(state.time, float) and state.time == DT
     assert step(state, 2 * DT).time == DT + 2 * DT and state.replace(time=3).time == 3.0
-    for time in (torch.zeros((), dtype=torch.float64), torch.ones(1, device=device)):
+    for time in (torch.zeros((), dtype=torch.float64), torch.ones(1, dtype=torch.float64, device=device)):
         given = state.replace(time=time)
         assert given.time is time and given.replace(x=state.x).time is time and given.detach().time.shape == time.shape
     assert state.to(dtype=torch.float32).time == DT
+
+
+def test_second_derivatives_of_a_compiled_step_are_refused(device):
+    """By torch, whose compiled code has first derivatives alone."""
+    step, state, dt = make_step("fixed dt", device)
+    v = state.v.clone().requires_grad_()
+    end = torch.compile(step, backend="aot_eager")(state.replace(v=v), dt)
+    with pytest.raises(RuntimeError):
+        (gradient,) = torch.autograd.grad(end.x.pow(3).sum() + end.v.pow(3).sum(), v, create_graph=True)
+        torch.autograd.grad(gradient.square().sum(), v)

@@ -135,7 +135,7 @@ class RigidMotion(SceneParameters):
         """Centre and its velocity where the position is a function of time."""
         if not isinstance(time, Tensor):
             time = torch.full((), time, dtype=like.dtype, device=like.device)
-        centre, velocity = self._moved(time)
+        centre, velocity = self._moved(time.to(like.dtype))
         return centre.to(like.dtype), velocity.to(like.dtype)
 
     def path_over(self, times: Tensor, like: Tensor) -> tuple[Tensor, Tensor]:

@@ -25,6 +25,7 @@ from ..ops import scatter
 from ..ops.pointwise import pointwise
 from ..parameters import TensorModule, Value, evaluate, needs_no_scenes
 from ..per_scene import per_node
+from ..step_times import time_like
 from ..topology import PADDING
 
 if TYPE_CHECKING:
@@ -95,7 +96,7 @@ class HeatNodes:
         Raises:
             ValueError: for another shape, with the name of the value.
         """
-        value = _at(value, self.time)
+        value = _at(value, time_like(self.time, self.theta))
         if not isinstance(value, Tensor) or value.shape == self.theta.shape:
             return value.to(self.theta) if isinstance(value, Tensor) else value
         scenes = self.blocks.grid.scenes
@@ -200,7 +201,7 @@ class Surface(TensorModule):
             ValueError: for another shape, with the name of the density.
         """
         points = self.points.to(nodes.theta)
-        density = self._of_points(_at(density, nodes.time), nodes.blocks.grid.scenes, name)
+        density = self._of_points(_at(density, time_like(nodes.time, nodes.theta)), nodes.blocks.grid.scenes, name)
         rows, weight = node_weights(nodes.blocks, points, self.scene)
         weight = weight * (nodes.heat_capacity.detach()[rows] > 0)
         total = weight.sum(1, keepdim=True)

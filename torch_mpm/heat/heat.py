@@ -43,6 +43,7 @@ from ..ops.pointwise import pointwise
 from ..parameters import Value, check_length, evaluate, needed_temperature, store
 from ..pause import paused
 from ..state import State, check_state
+from ..step_times import time_after
 from ..vectors import determinant
 from .boundaries import FixedSurface, HeatNodes
 
@@ -200,7 +201,7 @@ class Heat(nn.Module):
     def _advanced(self, state: State, dt: float | Tensor) -> State:
         """A prepared state one step later."""
         blocks = self._activations.activate(self.grid, state.x, state.scene, state.ids)
-        return state.replace(**self.update(blocks, state, dt), time=state.time + dt)
+        return state.replace(**self.update(blocks, state, dt), time=time_after(state.time, dt))
 
     def update(
         self,

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from .. import shapes
 from ..boundaries import Obstacle
-from ..errors import FLOATING, NUMBER_OR_TENSOR, check_like, check_number, shape_of
+from ..errors import FLOATING, NUMBER_OR_TENSOR, check_number, shape_of
 from ..grid import Blocks, check_blocks
 from ..parameters import has_hooks
 from ..step_times import StepTimes
@@ -124,13 +124,14 @@ def obstacle_arguments(
 
 
 def time_arguments(time: float | Tensor, like: Tensor, scenes: int) -> tuple[Tensor | None, float]:
-    """A time [s] as the ops take it: a tensor [1 or B], or a number."""
+    """A time [s] as the ops take it: a tensor [1 or B] in float64, or a number."""
     if not isinstance(time, Tensor):
         return None, float(check_number("time", time, kinds=NUMBER_OR_TENSOR))
     if time.dim() > 1 or time.numel() not in (1, scenes):
         raise ValueError(f"time must be a number or have shape [] or [B] = [{scenes}], got {shape_of(time)}")
-    scene_time = time.detach().reshape(-1).to(like.dtype).contiguous()
-    check_like("time", scene_time, like, tuple(scene_time.shape), "")
+    scene_time = time.detach().reshape(-1).double().contiguous()
+    if scene_time.device != like.device:
+        raise ValueError(f"time must be on {like.device}, got {scene_time.device}")
     return scene_time, 0.0
 
 

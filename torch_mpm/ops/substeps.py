@@ -15,12 +15,16 @@ latter for each law. The time step dt [s] is part of the parameters of laws that
 of `contact`, or one for each substep [n, 1 or B, K, width] with the positions then. Results that a call does not have
 are None; `history` has the entries of all laws side by side, [P, m]. The impulses on obstacles and walls are added to
 `impulse`, where it is given. With `flip` that share of the velocities of particles, less those of the nodes before the
-forces, is added to what G2P gives. Scenes with clocks of their own have the time steps dt times `scene_dt` and begin at
-`scene_time`, both [B]. With `grows` the pool follows the scene on the CPU; otherwise the op stops there where it is
-full, and the status tells. On CUDA nothing is waited for. With `resident` batches of small scenes may go another way
-there, each on a multiprocessor of its own; gradients take it as any other, whose sums may round differently. With
-`records` everything that the adjoint reads is kept in `record`, bytes of no other use, and no step is taken again; not
-where impulses are counted, or the pool had to grow.
+forces, is added to what G2P gives. Scenes with clocks of their own have the time steps dt times `scene_dt` and
+begin at `scene_time`, both [B], the latter in float64. With `grows` the pool follows the scene on the CPU; otherwise
+the op stops there where it is full, and the status tells. On CUDA nothing is waited for but that the device is less
+than a fraction of a second behind. With `resident` batches of small scenes may go another way there, each on a
+multiprocessor of its own; gradients take it as any other, whose sums may round differently. With `records` everything
+that the adjoint reads is kept in `record`, bytes of no other use, and no step is taken again; not where impulses are
+counted, or the pool had to grow.
+
+Several times a second both ops run the handlers of signals, on the main thread. Where one of them raises, the op ends
+with a RuntimeError and without a result; `torch_mpm.rollout` raises what the handler has raised.
 
 Differentiable once, with respect to x, v, mass, volume, C, F, J, history, parameters, gravity, obstacles, impulse and
 scene_dt, the last without flip and but for what obstacles know of the time. Autograd keeps the arguments of a call and
@@ -47,6 +51,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ..signals import interruptible
 from .arguments import refuse_vmap, sizes, soa_empty, sum_by_scene
 from .autograd import dispatch, register_autograd
 from .law import _entries, _of_history, _of_parameters
@@ -80,7 +85,7 @@ def _fake(
         soa_empty(x, (P, _entries(history))) if history else None,
         x.new_empty((1 + scenes, 8), dtype=torch.int32),
         None if impulse is None else impulse.new_empty(impulse.shape),
-        None if given["scene_time"] is None else x.new_empty(scenes),
+        None if given["scene_time"] is None else x.new_empty(scenes, dtype=torch.float64),
         _fake_record(x) if given["records"] and impulse is None else None,
     )
 
@@ -132,7 +137,8 @@ def _backward(ctx: Any, *grads: Any) -> Any:
     needs += PARAMETERS * any(wanted["parameters"]) + OBSTACLES * wanted["obstacles"]
     by_impulse = None if grads[7] is None else grads[7].contiguous()
     arguments = (given[name] for name in _SCHEMA)
-    adjoints = dispatch(torch.ops.torch_mpm.substeps_backward, *grads[:6], by_impulse, needs, record, *arguments)
+    op = torch.ops.torch_mpm.substeps_backward
+    adjoints = interruptible(dispatch, op, *grads[:6], by_impulse, needs, record, *arguments)
     found = dict(zip(_ADJOINTS, adjoints, strict=True)) | {"impulse": grads[7]}
     found["history"] = _of_history(found["history"], history, wanted["history"])
     found["parameters"] = _of_parameters(found["parameters"], parameters, wanted["parameters"], given["scene"])
