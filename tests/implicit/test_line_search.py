@@ -6,7 +6,6 @@ from test_implicit_gradients import inputs
 
 import torch_mpm as mpm
 from torch_mpm.implicit import Implicit, implicit, newton
-from torch_mpm.implicit.contact import Contact
 from torch_mpm.implicit.line_search import Point, Search
 
 
@@ -31,10 +30,8 @@ class TwoScenes:
 def test_a_scene_that_no_step_helps_stays_where_it_was(wrong):
     """Beside one whose fourth halving is the first that helps."""
     system, v = TwoScenes(), torch.tensor([[1.0], [5.0]], dtype=torch.float64)
-    gradient, step = 2 * v, torch.tensor([[-24.0], [wrong]], dtype=torch.float64)
-    done = torch.zeros(2, dtype=torch.bool)
-    contact = Contact(torch.ones_like(v, dtype=torch.bool), gradient)
-    search = Search(system, None, contact, gradient, Point(v, *system.energy(v)), step, done)
+    end = v + torch.tensor([[-24.0], [wrong]], dtype=torch.float64)
+    search = Search(system, None, None, 2 * v, Point(v, *system.energy(v)), end, torch.zeros(2, dtype=torch.bool))
     assert search.too_long()
     search.shorten()
     assert not search.too_long()

@@ -33,6 +33,8 @@ class NodeBounds:
         friction: Coulomb's coefficient of the surface that bounds a component [N, D], negative where it presses down on
             the component from above, zero where none does; None without friction.
         surface: velocity of the surface that rubs a node, in its axes [N, D] [m/s]; with friction alone.
+        crossable: whether there may be bounds that a step can cross, or friction: the components that are held are then
+            a part of what a step must find.
         owner: what bounds a component, int32 [N, D]: the number of an obstacle, or that of a face after them; -1 for
             nothing. None where nobody asks.
     """
@@ -43,12 +45,15 @@ class NodeBounds:
     friction: Tensor | None = None
     surface: Tensor | None = None
     owner: Tensor | None = None
+    crossable: bool = False
 
     def detached(self) -> NodeBounds:
         """The same, detached."""
         rest = (self.mirror, self.friction, self.surface)
         mirror, friction, surface = (None if t is None else t.detach() for t in rest)
-        return NodeBounds(self.lower.detach(), self.upper.detach(), mirror, friction, surface, self.owner)
+        return NodeBounds(
+            self.lower.detach(), self.upper.detach(), mirror, friction, surface, self.owner, self.crossable
+        )
 
     def moves(self) -> bool:
         """Whether a gradient is wanted of where the surfaces are and how they move."""
@@ -64,6 +69,13 @@ class NodeBounds:
     def clamped(self, v: Tensor) -> Tensor:
         """The nearest velocities within the bounds."""
         return self.turned(self.turned(v).clamp(self.lower, self.upper))
+
+    def change(self, before: Tensor, after: Tensor) -> Tensor:
+        """Difference of velocities [N, D], without the rounding of components that stay where they are held."""
+        difference = self.turned(after - before)
+        held = (self.lower.isfinite() | self.upper.isfinite()).any(-1, keepdim=True)
+        stays = held & (difference.abs() <= rounding_of(torch.maximum(before.abs(), after.abs())))
+        return torch.where(held, self.turned(torch.where(stays, 0, difference)), after - before)
 
     def free(self, v: Tensor, gradient: Tensor) -> Tensor:
         """Components in the axes of the nodes that may move, bool [N, D]: not at a bound, or with a gradient of the
@@ -131,7 +143,9 @@ def node_bounds(
     lower = torch.full_like(positions, -math.inf)
     bounds = NodeBounds(lower, torch.full_like(positions, math.inf))
     faces = () if walls is None else walls.faces(blocks.grid)
-    if any(f.friction != 0 for f in faces) or any(rubs(o) for o in obstacles):
+    rough = any(f.friction != 0 for f in faces) or any(rubs(o) for o in obstacles)
+    bounds.crossable = rough or any(getattr(s, "kind", "") == "separate" for s in (*faces, *obstacles))
+    if rough:
         bounds.friction, bounds.surface = torch.zeros_like(lower), torch.zeros_like(lower)
     if owners:
         bounds.owner = torch.full(positions.shape, -1, dtype=torch.int32, device=positions.device)

@@ -5,10 +5,9 @@ Friction at a node adds to the energy of a step what it would dissipate,
     D(v) = c |u_T − s_T|,   c = Σ μ λ,
 
 with the components T of its velocity u that no bound holds, the velocity s of the surface, and the impulses λ with
-which the bounds hold the others: the gradient of the energy there. c counts as constant while E + D is minimised, and
-follows the gradient from iterate to iterate (lagged friction, as in Li et al. 2020), so that the residual is that of
-Coulomb's law itself. D is not smoothed: a node at rest on its surface sticks, as an equality, while the gradient along
-it is at most c, and a step that would turn the motion of a node round ends at rest.
+which the bounds hold the others: the gradient of the energy there. D is not smoothed: a node at rest on its surface
+sticks, as an equality, while the gradient along it is at most c. The residual is that of Coulomb's law, with the c of
+the iterate itself; a step of Newton's method has that of its end (`contact_model`).
 """
 
 from __future__ import annotations
@@ -29,9 +28,28 @@ class Limit:
     size: Tensor
     along: Tensor
 
-    def renewed(self, by: Limit, where: Tensor) -> Limit:
-        """Another one for some nodes, bool [N, 1]."""
-        return Limit(torch.where(where, by.size, self.size), torch.where(where, by.along, self.along))
+    def slope(self, bounds: NodeBounds, v: Tensor) -> Tensor:
+        """∂D/∂v [N, D] [kg m/s] of nodes that move at velocities v [N, D] [m/s]."""
+        return bounds.turned(self.size * _unit(self._relative(bounds, v))[0])
+
+    def excess(self, bounds: NodeBounds, start: Tensor, end: Tensor) -> Tensor:
+        """What D gains from velocities to others beyond its slope [N] [J]; without cancellation where nodes go on."""
+        direction, _ = _unit(self._relative(bounds, start))
+        relative = self._relative(bounds, end)
+        along, speed = (direction * relative).sum(1, keepdim=True), relative.norm(dim=1, keepdim=True)
+        across = (relative - along * direction).square().sum(1, keepdim=True)
+        forward, both = along > 0, speed + along
+        return (self.size * torch.where(forward, across / torch.where(forward, both, 1), speed - along))[:, 0]
+
+    def _relative(self, bounds: NodeBounds, v: Tensor) -> Tensor:
+        assert bounds.surface is not None
+        return torch.where(self.along, bounds.turned(v) - bounds.surface, 0)
+
+
+def _unit(vectors: Tensor) -> tuple[Tensor, Tensor]:
+    """Vectors [N, D] with the length one or zero, and their lengths [N, 1]."""
+    length = vectors.norm(dim=1, keepdim=True)
+    return vectors / torch.where(length > 0, length, 1), length
 
 
 @dataclasses.dataclass
@@ -56,21 +74,8 @@ class Friction:
         """The gradient of D by the velocities of nodes that do not stick [N, D] [kg m/s]."""
         return self.bounds.turned(torch.where(self.sticks, 0, self.limit.size) * self.direction)
 
-    def gain(self, v: Tensor) -> Tensor:
-        """D at other velocities, less D here, with the same limit [N] [J]."""
-        there = self._relative_of(v).norm(dim=1)
-        return self.limit.size[:, 0] * (there - self.relative.norm(dim=1))
-
-    def clamped(self, v: Tensor) -> Tensor:
-        """Velocities after a step: at rest on the surface where they have turned round."""
-        relative = self._relative_of(v)
-        turned = (relative * self.direction).sum(1, keepdim=True) <= 0
-        u = torch.where(self.limit.along & turned, self._surface(), self.bounds.turned(v))
-        return torch.where((self.limit.along & turned).any(1, keepdim=True), self.bounds.turned(u), v)
-
-    def curvature(self, starting: Tensor | None = None) -> Tensor | None:
-        """Second derivative of D [N, D, D] [kg]: c/|u| across the motion, as if nodes that start to move had speeds
-        `starting` [N, 1] [m/s]; without these for nodes that do move alone.
+    def curvature(self) -> Tensor | None:
+        """Second derivative of D [N, D, D] [kg]: c/|u| across the motion of nodes that move.
 
         None in 2-D, where there is no direction across.
         """
@@ -78,7 +83,6 @@ class Friction:
         if dim == 2:
             return None
         speed = self.relative.norm(dim=1, keepdim=True)
-        speed = speed if starting is None else torch.where(speed > 0, speed, starting)
         modulus = torch.where(self.sticks | (speed == 0), 0, self.limit.size / torch.where(speed > 0, speed, 1))
         across = (
             torch.diag_embed(self.limit.along.to(modulus.dtype)) - self.direction[:, :, None] * self.direction[:, None]
@@ -93,13 +97,6 @@ class Friction:
         return self.bounds.turned(
             torch.where(pressed & ~self.sticks & self.limit.along.any(1, keepdim=True), friction, 0)
         )
-
-    def _surface(self) -> Tensor:
-        assert self.bounds.surface is not None
-        return self.bounds.surface
-
-    def _relative_of(self, v: Tensor) -> Tensor:
-        return torch.where(self.limit.along, self.bounds.turned(v) - self._surface(), 0)
 
 
 @dataclasses.dataclass
@@ -131,18 +128,16 @@ class Contact:
         return bounds.turned(torch.where(holds, u - torch.where(holds, given, 0), 0))
 
 
-def contact_at(
-    system: ImplicitSystem, bounds: NodeBounds | None, v: Tensor, gradient: Tensor, limit: Limit | None = None
-) -> Contact:
+def contact_at(system: ImplicitSystem, bounds: NodeBounds | None, v: Tensor, gradient: Tensor) -> Contact:
     """Contact at node velocities v [N, D] [m/s], from the gradient of the energy there [N, D] [kg m/s]; differentiable
-    by that gradient and by the bounds. The limit of friction is that of the gradient, or as given."""
+    by that gradient and by the bounds."""
     massive = (system.mass > 0)[:, None].expand_as(v)
     if bounds is None:
         return Contact(massive, gradient)
     free = massive & bounds.free(v, gradient)
     if bounds.friction is None:
         return Contact(free, bounds.kept(gradient, free))
-    friction = _friction(bounds, v, gradient, free, _limit(bounds, gradient, free) if limit is None else limit)
+    friction = _friction(bounds, v, gradient, free, _limit(bounds, gradient, free))
     free = free & ~(friction.limit.along & friction.sticks)
     return Contact(free, bounds.kept(gradient + friction.force(), free), friction)
 

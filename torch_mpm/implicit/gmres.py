@@ -62,7 +62,7 @@ def gmres(
         begun = solving
         for _ in range(min(DIRECTIONS, most - start)):
             iterations += solving.int()
-            residual = torch.where(solving, cycle.add(product(cycle.direction())), residual)
+            residual = torch.where(solving, cycle.add(product(cycle.direction()), solving), residual)
             solving = solving & (residual > target)
             if not bool(solving.any()):
                 break
@@ -105,8 +105,8 @@ class _Cycle:
         self._directions.append(self._duals[-1] if self._precondition is None else self._precondition(self._basis[-1]))
         return self._directions[-1]
 
-    def add(self, w: Tensor) -> Tensor:
-        """Take in the product of the last direction; the residual that is left [B]."""
+    def add(self, w: Tensor, solving: Tensor) -> Tensor:
+        """Take in the product of the last direction, for scenes that go on, bool [B]; the residual that is left [B]."""
         H, system, k = self._H, self._system, len(self._directions) - 1
         w = torch.where(self._counts, w, 0)
         for j in range(k + 1):
@@ -117,8 +117,9 @@ class _Cycle:
         self._duals.append(dual)
         # Scenes that are done have columns of zeros, which the pseudo-inverse bears.
         part, goal = H[:, : k + 2, : k + 1], self._goal[:, : k + 2, None]
-        self._weights = (torch.linalg.pinv(part) @ goal)[:, :, 0]
-        return (part @ self._weights[:, :, None] - goal)[:, :, 0].norm(dim=1)
+        weights = (torch.linalg.pinv(part) @ goal)[:, :, 0]
+        self._weights = torch.where(solving[:, None], weights, torch.nn.functional.pad(self._weights, (0, 1)))
+        return (part @ weights[:, :, None] - goal)[:, :, 0].norm(dim=1)
 
     def solution(self) -> Tensor:
         pairs = zip(self._weights.unbind(1), self._directions, strict=True)

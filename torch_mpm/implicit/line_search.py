@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from .bounds import NodeBounds
-from .contact import Contact
+from .contact import Limit
 from .system import ImplicitSystem
 
 SUFFICIENT = 1e-4
@@ -73,10 +73,10 @@ class Search:
 
     Args:
         system, bounds: whose velocities they are.
-        contact: at the start, with the limits of friction that count.
-        residual: gradient of the energy there [N, D] [kg m/s].
+        limit: of friction, that of the end of the step; None without friction.
+        residual: gradient of the energy at the start [N, D] [kg m/s].
         start: where the step begins.
-        step: [N, D] [m/s].
+        end: of the whole step [N, D] [m/s].
         done: scenes that stay where they are, bool [B].
 
     Attributes:
@@ -88,14 +88,17 @@ class Search:
         self,
         system: ImplicitSystem,
         bounds: NodeBounds | None,
-        contact: Contact,
+        limit: Limit | None,
         residual: Tensor,
         start: Point,
-        step: Tensor,
+        end: Tensor,
         done: Tensor,
     ) -> None:
-        self._system, self._bounds, self._contact, self._residual = system, bounds, contact, residual
-        self._start, self._step = start, step
+        self._system, self._bounds, self._limit, self._residual = system, bounds, limit, residual
+        self._start, self._end = start, end
+        self._rubbed = residual
+        if limit is not None and bounds is not None:
+            self._rubbed = residual + limit.slope(bounds, start.v)
         self._share = torch.where(done, 0.0, 1.0).double()
         self.point, self.enough = self._tried()
 
@@ -120,22 +123,24 @@ class Search:
         return self._share > 0
 
     def _moved(self) -> Tensor:
-        v = self._start.v + self._system.of_nodes(self._share).to(self._step.dtype) * self._step
-        friction = self._contact.friction
-        v = v if friction is None else friction.clamped(v)
+        share = self._system.of_nodes(self._share).to(self._end.dtype)
+        v = torch.where(share == 1, self._end, self._start.v + share * (self._end - self._start.v))
         return v if self._bounds is None else self._bounds.clamped(v)
 
     def _tried(self) -> tuple[Point, Tensor]:
         """The point after the shares of the step that are next, and where its energy is low enough."""
-        system, start, friction = self._system, self._start, self._contact.friction
+        system, start = self._system, self._start
         v = self._moved()
         changed = system.node_sum(v != start.v) > 0  # a step below rounding helps no more than one of no length
         self._share = torch.where(changed, self._share, 0.0)
         point = Point(v, *system.energy(v))
         gain = system.gain(start.v, self._residual, v, point.energy - start.energy)
-        if friction is not None:
-            gain = gain + system.node_sum(friction.gain(v))
-        slope = system.node_sum(self._contact.gradient * (v - start.v))
+        change = v - start.v if self._bounds is None else self._bounds.change(start.v, v)
+        slope = system.node_sum(self._rubbed * change)
+        if self._limit is not None and self._bounds is not None:
+            excess = system.node_sum(self._limit.excess(self._bounds, start.v, v))
+            gain = gain + system.node_sum((self._rubbed - self._residual) * change) + excess
+            slope = slope + excess
         rounding = ROUNDING * torch.finfo(v.dtype).eps * (start.rounded + point.rounded)
         enough = gain <= SUFFICIENT * slope + rounding
         return point, (enough & point.energy.isfinite() & (slope <= 0)) | (self._share == 0)

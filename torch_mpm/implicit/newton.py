@@ -3,23 +3,20 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from ..ops import implicit_cg
-from ..ops.implicit import CONVERGED, NEGATIVE_CURVATURE
 from .bounds import NodeBounds
-from .contact import Contact, Limit, contact_at
-from .gmres import gmres
+from .contact import Contact, contact_at
 from .line_search import ROUNDING, Point, Search, starting_point
 from .preconditioner import preconditioned, times
+from .quadratic_model import TIGHTEST, QuadraticModel, Tangents
 from .system import ImplicitSystem
 
-LOOSEST, TIGHTEST = 0.1, 1e-12
-"""Relative tolerances of conjugate gradients within Newton's method."""
+LOOSEST = 0.1
+"""Relative tolerance of linear solves within Newton's method."""
 NEAR, PATIENCE = 0.05, 6
 """Share of the first residual, and number of iterations, from which the Hessian is not projected any more."""
 KEPT = 0.01
@@ -30,12 +27,12 @@ ERROR_OF_MOTION = 0.1
 """Most of the error of the velocities, as √(g · H⁻¹ g), relative to the root of the energy that takes part in the
 motion, with which a scene may count as converged: the energy is then right to 1%. A residual may be small because dt is
 long, or because all that is left is smooth."""
+ERROR_OF_PLACE = 1e-3
+"""Share of dx that the error may move the material in a step, if it is small beside the motion to v*, too: where
+rounding hides the strains of a stiff body, its motion is right nevertheless."""
 UNRESOLVED = 128
 """Units in the last place of the elastic energy that the gradient of the displacement of a step would have if all of it
 were strain: the energy of a motion below that is lost in the rounding of the Hessian, whose solves then say nothing."""
-SETTLED, OLDEST = 0.3, 5
-"""Where renewing friction has raised the residual, it is kept until the share of the residual is left that does not
-follow from its change; for this many iterations at most."""
 
 
 @dataclasses.dataclass
@@ -72,10 +69,10 @@ def minimise(system: ImplicitSystem, bounds: NodeBounds | None, options: Options
     """The node velocities of least energy within bounds, for each scene apart.
 
     The host waits for the device once per iteration, to learn whether the last step has lowered the energy of all
-    scenes and whether all are done; where it has not, once for each halving and once more. A scene is done when its
-    residual is `tolerance` times that of v*, or of the size of rounding, and the energy that Newton's method expects to
-    gain is small beside that of the motion; or when no step lowers its energy. Projected Newton of Bertsekas (1982):
-    components at a bound that the gradient holds there are left out of the linear solve, and steps are clamped.
+    scenes and whether all are done; where it has not, once for each halving and once more; and where a step may cross
+    bounds, or with friction, once per linear solve. A scene is done when its residual is `tolerance` times that of v*,
+    or of the size of rounding, and the energy that Newton's method expects to gain is small beside that of the motion;
+    or when no step lowers its energy. Contact and friction are a part of the quadratic model of a step.
     """
     return _Newton(system, bounds, options).minimum()
 
@@ -138,10 +135,10 @@ class _Newton:
         self._first: Tensor | None = None
         self._previous: Tensor | None = None
         self._forcing: Tensor | None = None
-        self._stalled = self._indefinite = self._whole = torch.zeros(scenes, dtype=torch.bool, device=device)
+        none = torch.zeros(scenes, dtype=torch.bool, device=device)
+        self._stalled = self._indefinite = self._whole = self._still = none
         # Twice the energy that the last step of each scene was to gain where nothing bends its way, [J].
         self._expected = torch.full_like(self._begun.energy, torch.inf)
-        self._lag = _Lag(scenes, device)
 
     def minimum(self) -> Minimum:
         """Where the method ends."""
@@ -198,14 +195,17 @@ class _Newton:
         return _Iterate(point, elastic, convex, diagonal, contact, **rest, **flags)
 
     def _near(self, point: Point, contact: Contact) -> Tensor:
-        """Scenes whose error is small beside their motion, bool [B]: by the last step, which was no shorter than what
-        is left, or by the mass of the nodes, which the Hessian exceeds."""
+        """Scenes whose error is small beside their motion, or beside that of v* and dx, bool [B]: by the last step,
+        which was no shorter than what is left, or by the mass of the nodes, which the Hessian exceeds."""
         system, mass, v = self._system, self._system.mass[:, None], point.v
         by_mass = system.node_sum(contact.gradient.square() / torch.where(mass > 0, mass, 1))
         size = torch.maximum(point.size, torch.where(self._begun.energy.isfinite(), self._begun.size, 0))
         most = 2 * ERROR_OF_MOTION**2 * size
         resolved = size >= UNRESOLVED * torch.finfo(v.dtype).eps * system.unrotated(v)
-        return (by_mass <= most) | ((self._expected <= most) & resolved)
+        change = (system.node_sum(mass * (v - system.start).square()) / self._total_mass).sqrt()
+        cell = system.blocks.grid.dx / torch.as_tensor(system.dt, device=v.device).double()
+        harmless = self._total_mass * torch.minimum(ERROR_OF_MOTION * change, ERROR_OF_PLACE * cell).square()
+        return (by_mass <= most) | ((self._expected <= most) & resolved) | (self._expected <= harmless)
 
     def _first_residual(self, point: Point, diagonal: Tensor, residual: Tensor) -> Tensor:
         """What the tolerance is relative to [m/s], [B]: a good start saves work, and does not ask for more accuracy."""
@@ -227,12 +227,12 @@ class _Newton:
     def _shorten(self, search: Search, now: _Iterate) -> None:
         """Shorten steps from an iterate that are too long."""
         search.shorten()
-        self._lag.still = ~(search.moved() | now.done)
-        self._stalled = self._stalled | (self._lag.still & self._lag.renewed & ~self._whole)
+        self._still = ~(search.moved() | now.done)
+        self._stalled = self._stalled | (self._still & ~self._whole)
 
     def _step(self, now: _Iterate, look: _Look) -> Search:
         """The search along the direction of Newton's method."""
-        system, bounds, most, v = self._system, self._bounds, self._options.max_cg_iterations, now.point.v
+        system, bounds, v = self._system, self._bounds, now.point.v
         self._forcing = _forcing(now.residual, self._previous, self._forcing, now.target)
         self._previous = now.residual
         # What rounding leaves of a residual must not end a solve before what is smooth in it is found.
@@ -241,55 +241,39 @@ class _Newton:
         reached = now.residual <= now.target
         forcing = torch.where(reached, torch.minimum(self._forcing, tight), self._forcing).clamp_min(TIGHTEST)
         relative = torch.where(now.done, 1.0, forcing).to(v.dtype)
-        tangent = _tangent(system, v, now.convex, now.exact, look.all_exact, look.none_exact)
-        now.convex = None
-        skew = system.skew(v) if system.flows else None
-        self._whole = torch.zeros_like(now.done)
-        if skew is not None:
-            self._whole = skewed(system, skew, tangent, SYMMETRIC) & ~(now.done | self._lag.still)
-        model, across, inverse, change = self._rubbed(now)
-        right = torch.where(system.of_nodes(now.done | self._whole), 0, -model.gradient)
-        solve = implicit_cg(
-            *(system.blocks, system.state.x, right, system.mass, inverse, tangent, relative, most, system.stress_form),
-            local=across,
-            images=system.images,
-            held=None if bounds is None else bounds.held_normals(model.free),
+        model = QuadraticModel(
+            *(system, bounds, v, now.elastic, now.diagonal, self._tangents(now, look), self._total_mass),
+            self._options.max_cg_iterations,
         )
-        self._indefinite = solve.state == NEGATIVE_CURVATURE
-        steepest = system.of_nodes(self._indefinite & (solve.iterations == 0))
-        direction, solved = torch.where(steepest, -change, solve.solution), solve.state == CONVERGED
-        self._cg_iterations += solve.iterations
-        if skew is not None and bool(self._whole.any()):
-            unprojected = tangent if look.all_exact else system.tangent(v, projected=False)
-            derivative = _free_derivative(system, bounds, unprojected, skew, model, across)
-            step, more, solved_too = _not_symmetric(
-                system, derivative, inverse, change, model, self._whole, relative, most
-            )
-            direction = torch.where(system.of_nodes(self._whole), step, direction)
-            solved = torch.where(self._whole, solved_too, solved)
-            self._cg_iterations += more
-        expected = -system.node_sum(model.gradient * direction)
+        if bounds is not None and bounds.crossable:
+            minimum = model.minimum(now.residual, relative, now.target, now.done)
+        else:
+            minimum = model.solved(now.contact, now.inverse, relative, now.done)
+        self._indefinite = minimum.indefinite
+        self._cg_iterations += minimum.iterations
+        expected = model.gain(minimum.v, now.elastic, minimum.limit)
         counts = reached | (now.target <= self._options.tolerance * self._first)
-        expected = torch.where(solved & (forcing <= tight) & counts & (expected >= 0), expected, torch.inf)
+        expected = torch.where(minimum.found & (forcing <= tight) & counts & (expected >= 0), expected, torch.inf)
         self._expected = torch.where(now.done, self._expected, expected)
         self._iterations += (~now.done).int()
-        self._lag.still = torch.zeros_like(now.done)
-        return Search(system, bounds, model, now.elastic, now.point, direction, now.done)
+        self._still = torch.zeros_like(now.done)
+        return Search(system, bounds, minimum.limit, now.elastic, now.point, minimum.v, now.done)
 
-    def _rubbed(self, now: _Iterate) -> tuple[Contact, Tensor | None, Tensor, Tensor]:
-        """Contact with the limits of friction of this step, the second derivative of friction, B⁻¹ with it, and its
-        product with the gradient."""
-        contact = now.contact
-        if contact.friction is None:
-            return contact, None, now.inverse, now.change
-        system, bounds, total_mass = self._system, self._bounds, self._total_mass
-        model = self._lag.contact(
-            *(system, bounds, now.point.v, now.elastic, now.diagonal, contact, now.residual, total_mass)
-        )
-        across = None if model.friction is None else model.friction.curvature(now.change.norm(dim=1, keepdim=True))
-        blocks = now.diagonal if across is None else now.diagonal + across
-        inverse, change, _ = preconditioned(system, bounds, blocks, model, total_mass)
-        return model, across, inverse, change
+    def _tangents(self, now: _Iterate, look: _Look) -> Tangents:
+        """Of the particles at an iterate, not projected in scenes that are exact; of what is not symmetric, too."""
+        system, v = self._system, now.point.v
+        tangent = _tangent(system, v, now.convex, now.exact, look.all_exact, look.none_exact)
+        now.convex = None
+        self._whole = torch.zeros_like(now.done)
+        if not system.flows:
+            return Tangents(tangent, self._whole)
+        skew = system.skew(v)
+        self._whole = skewed(system, skew, tangent, SYMMETRIC) & ~(now.done | self._still)
+        if not bool(self._whole.any()):
+            return Tangents(tangent, self._whole)
+        here = system.of_particles(self._whole)
+        whole = tangent if look.all_exact else torch.where(here, system.tangent(v, projected=False), tangent)
+        return Tangents(tangent, self._whole, whole, torch.where(here[:, :, None], skew, 0))
 
 
 def _tangent(
@@ -312,83 +296,6 @@ def skewed(system: ImplicitSystem, skew: Tensor, tangent: Tensor, share: float |
     sizes = torch.stack([skew.square().sum((1, 2)), moduli.square().sum(1)], 1).double()
     skew_size, size = system.particle_sum(sizes).unbind(1)
     return skew_size > share**2 * size
-
-
-def _free_derivative(
-    system: ImplicitSystem,
-    bounds: NodeBounds | None,
-    tangent: Tensor,
-    skew: Tensor,
-    model: Contact,
-    across: Tensor | None,
-) -> Callable[[Tensor], Tensor]:
-    """The derivative of the residual with that of friction, of what is free."""
-    derivative = system.derivative(tangent, skew)
-
-    def product(d: Tensor) -> Tensor:
-        result = derivative(d) if across is None else derivative(d) + times(across, d)
-        return result if bounds is None else bounds.kept(result, model.free)
-
-    return product
-
-
-def _not_symmetric(
-    system: ImplicitSystem,
-    derivative: Callable[[Tensor], Tensor],
-    inverse: Tensor,
-    change: Tensor,
-    model: Contact,
-    scenes: Tensor,
-    relative: Tensor,
-    most: int,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Newton steps with the whole derivative in some scenes, bool [B], or −B⁻¹ g where they do not descend; the
-    iterations that they took, and where they are solved and descend."""
-    right = torch.where(system.of_nodes(scenes), -model.gradient, 0)
-    solve = gmres(system, derivative, inverse, right, relative, most)
-    descends = system.node_sum(model.gradient * solve.solution) < 0
-    step = torch.where(system.of_nodes(descends), solve.solution, -change)
-    return step, solve.iterations, solve.converged & descends
-
-
-class _Lag:
-    """The limits of friction that Newton's method works with, those of an earlier iterate in some scenes.
-
-    Attributes:
-        renewed: scenes whose limits are those of this iterate, bool [B].
-        still: scenes that the step before did not move, bool [B].
-    """
-
-    def __init__(self, scenes: int, device: torch.device) -> None:
-        self.renewed = torch.ones(scenes, dtype=torch.bool, device=device)
-        self.still = self._careful = ~self.renewed
-        self._age = torch.zeros(scenes, dtype=torch.int32, device=device)
-        self._limit: Limit | None = None
-        self._residual: Tensor | None = None
-
-    def contact(
-        self,
-        system: ImplicitSystem,
-        bounds: NodeBounds | None,
-        v: Tensor,
-        elastic: Tensor,
-        blocks: Tensor,
-        now: Contact,
-        residual: Tensor,
-        total_mass: Tensor,
-    ) -> Contact:
-        """Contact with the limits of friction to go on with, of contact with those of this iterate."""
-        assert now.friction is not None
-        if self._limit is None or self._residual is None:
-            self._limit, self._residual = now.friction.limit, residual
-            return now
-        self._careful = self._careful | (residual > self._residual)
-        before = contact_at(system, bounds, v, elastic, self._limit)
-        left = preconditioned(system, bounds, blocks, before, total_mass)[2]
-        self.renewed = self.still | ~self._careful | (self._age >= OLDEST) | ~(left > SETTLED * residual)
-        self._age = torch.where(self.renewed, 0, self._age + 1)
-        self._limit, self._residual = self._limit.renewed(now.friction.limit, system.of_nodes(self.renewed)), residual
-        return contact_at(system, bounds, v, elastic, self._limit)
 
 
 def _with_momentum(system: ImplicitSystem, bounds: NodeBounds | None, v: Tensor, total_mass: Tensor) -> Tensor:
@@ -427,7 +334,7 @@ def _rounding(
     speed = system.node_sum(system.mass[:, None] * v.square()) / total_mass
     cells = speed * (torch.as_tensor(system.dt, device=v.device).double() / system.blocks.grid.dx).square()
     moved = system.node_sum(momentum * times(inverse, momentum)).clamp_min(0) / total_mass
-    return 4 * torch.finfo(v.dtype).eps * (wave * (1 + cells) + moved).sqrt()
+    return 2 * torch.finfo(v.dtype).eps * (wave * (1 + cells) + moved).sqrt()
 
 
 def _wave_speed_squared(system: ImplicitSystem, total_mass: Tensor) -> Tensor:
