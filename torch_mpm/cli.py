@@ -23,7 +23,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line.
 
     Returns:
-        The exit status: 0, 1 for a problem (described on stderr), 130 after Ctrl-C, 143 after SIGTERM.
+        The exit status: 0, 1 for a problem (described on stderr), 130 after Ctrl-C, and 143 after SIGTERM; a run, which
+        ends with a whole frame, has 130 after both.
     """
     options = _parser().parse_args(arguments)
     try:
@@ -153,7 +154,7 @@ def _run(options: argparse.Namespace) -> None:
         bar.close()
     seconds = summary.setdefault("seconds", {})
     files = {"trajectory": options.out / "trajectory.h5"}
-    missing = [(name, make) for name, make in _outputs(scene, options) if name not in seconds]
+    missing = [(n, make) for n, make in _outputs(scene, options) if n not in seconds or not _is_there(n, options.out)]
     if complete and not missing:
         print(f"{options.out} holds the complete run of this scene")
         return
@@ -196,6 +197,11 @@ def _outputs(scene: Any, options: argparse.Namespace) -> list[tuple[str, Callabl
     if scene.output.ply:
         outputs.append(("PLY", lambda: {"PLY": export.export_ply(options.out)}))
     return outputs
+
+
+def _is_there(name: str, out: Path) -> bool:
+    """Whether the files of an output are."""
+    return (out / {"pictures": "frames", "VTK": "vtk/run.pvd", "PLY": "ply"}[name]).exists()
 
 
 def _draw(folder: Path, scene: Any, quiet: bool) -> dict[str, Path]:

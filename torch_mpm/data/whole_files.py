@@ -98,7 +98,12 @@ def remove_leftovers(folder: Path) -> None:
 
 
 def _machine() -> str:
-    return re.sub(r"\W", "_", socket.gethostname())
+    """Name of what numbers processes: a container numbers its own, and may share the name of its host."""
+    try:
+        space = os.stat("/proc/self/ns/pid").st_ino
+    except OSError:
+        space = 0
+    return re.sub(r"\W", "_", f"{socket.gethostname()}_{space}")
 
 
 def _runs(process: int) -> bool:

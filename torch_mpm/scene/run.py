@@ -74,7 +74,8 @@ def run(
     Args:
         scene: what to simulate.
         out: folder, made where it does not exist.
-        resume: go on with an unfinished run of the same scene; of a complete one, return its summary.
+        resume: go on with an unfinished run of the same scene; of a complete one, return its summary, which is empty
+            where a kill has kept it from being written.
         source: text of the scene file, kept in the trajectory; the words of the scene by default.
         progress: called after each frame with a dictionary of its figures.
 

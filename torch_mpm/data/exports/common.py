@@ -6,7 +6,7 @@ import contextlib
 import errno
 import os
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -98,11 +98,12 @@ def exporting(
     out: str | Path | None,
     name: str,
     material: bool = False,
-    more: Mapping[str, Any] | None = None,
+    more: Callable[[DatasetFolder], Mapping[str, Any]] = lambda dataset: {},
 ) -> Iterator[Export]:
     """An export into ``out``, by default the folder ``name`` of the data set, which appears when the block has ended.
 
-    Every shard is compared with its checksum first. ``metadata.json`` is written at the end, with ``more`` in it.
+    Every shard is compared with its checksum first. ``metadata.json`` is written at the end, with the words that
+    ``more`` makes of the data set.
 
     Raises:
         FileExistsError: when ``out`` is there already.
@@ -112,12 +113,12 @@ def exporting(
     """
     dataset = source if isinstance(source, DatasetFolder) else DatasetFolder(source)
     target = dataset.path / name if out is None else Path(out)
-    words = {**metadata(dataset, material=material), **(more or {})}
+    words = metadata(dataset, material=material)
     dataset.check()
     with new_folder(target) as folder:
         _require_room(dataset, folder)
         yield Export(dataset, folder, target)
-        write_metadata(folder, words)
+        write_metadata(folder, {**words, **more(dataset)})
 
 
 def _require_room(dataset: DatasetFolder, folder: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -33,14 +34,18 @@ def export_lagrangebench(
 
     Returns and errors as :func:`export_gns`; DatasetError also for a field that is not there.
     """
-    source = dataset if isinstance(dataset, DatasetFolder) else DatasetFolder(dataset)
-    codes = _codes(source)
-    words = {"write_every": 1, "dx": particle_spacing(source), "solver": "MPM", "case": source.record.title}
-    more = {**words, "particle_types": {str(kind): code for kind, code in codes.items()}}
-    with exporting(source, out, "lagrangebench", more=more) as export:
-        for split in source.record.splits:
+    with exporting(dataset, out, "lagrangebench", more=_words) as export:
+        codes = _codes(export.dataset)
+        for split in export.dataset.record.splits:
             _write(export, split, codes, fields)
     return export.target
+
+
+def _words(dataset: DatasetFolder) -> dict[str, Any]:
+    """What its metadata has beside that of others."""
+    types = {str(kind): code for kind, code in _codes(dataset).items()}
+    words = {"write_every": 1, "dx": particle_spacing(dataset), "solver": "MPM", "case": dataset.record.title}
+    return {**words, "particle_types": types}
 
 
 def _codes(dataset: DatasetFolder) -> dict[int, int]:

@@ -46,9 +46,9 @@ def export_tfrecord(
     google-crc32c (extra ``data``).
     """
     checksum = _crc32c()
-    source = dataset if isinstance(dataset, DatasetFolder) else DatasetFolder(dataset)
-    with exporting(source, out, "tfrecord", more=_context_statistics(source) if context else None) as export:
-        record = export.dataset.record
+    more: dict[str, Any] = {"more": _context_statistics} if context else {}
+    with exporting(dataset, out, "tfrecord", **more) as export:
+        source, record = export.dataset, export.dataset.record
         if len(set(zip(record.lower, record.upper, strict=True))) > 1:
             log.warning("PhysicsNeMo takes the bounds of the first axis for all axes; those of this data set differ")
         for split in record.splits:

@@ -38,10 +38,15 @@ def export_well(dataset: str | Path | DatasetFolder, out: str | Path | None = No
     with exporting(dataset, out, "well") as export:
         record = export.dataset.record
         name = re.sub(r"\W+", "_", record.title).strip("_").lower() or "torch_mpm"
+        scalars = {scene.id: _scalars(export, scene.id) for scene in export.dataset.scenes()}
+        shared = set.intersection(*map(set, scalars.values()))
+        kept = {number: {n: v for n, v in values.items() if n in shared} for number, values in scalars.items()}
+        solid = any(export.dataset.scene(number).words.get("obstacle") for number in scalars)
+        orders = {"density": 0, "velocity": 1} | ({"obstacle": 0} if solid else {})
         statistics: dict[str, _Statistics] = {}
         for split in record.splits:
             if exported_ids(export.dataset, split):
-                statistics[split] = _write(export, split, name, dx or 2 * record.dx)
+                statistics[split] = _write(export, split, name, dx or 2 * record.dx, orders, kept)
         chosen = statistics.get("train") or next(iter(statistics.values()))
         (export.folder / "stats.yaml").write_text(json.dumps(chosen.words(), indent=1))  # JSON is YAML
     return export.target
@@ -70,9 +75,11 @@ class _Statistics:
         }
 
 
-def _write(export: Export, split: str, name: str, dx: float) -> _Statistics:
+def _write(
+    export: Export, split: str, name: str, dx: float, orders: dict[str, int], scalars: dict[int, dict[str, float]]
+) -> _Statistics:
+    """The file of a split, with fields of these orders and these scalars of its scenes."""
     record, count = export.dataset.record, len(exported_ids(export.dataset, split))
-    orders = {"density": 0, "velocity": 1} | ({"obstacle": 0} if _has_obstacles(export) else {})
     statistics = _Statistics(orders, record.dim)
     folder = export.folder / "data" / split
     folder.mkdir(parents=True)
@@ -82,7 +89,7 @@ def _write(export: Export, split: str, name: str, dx: float) -> _Statistics:
         )
         file.attrs["simulation_parameters"] = _names([])
         fields = _layout(file, export, orders, dx, count)
-        _write_scalars(file, export, split)
+        _write_scalars(file, [scalars[number] for number in exported_ids(export.dataset, split)])
         for k, scene in enumerate(export.scenes(split)):
             values = _fields(scene, export, dx)
             if "obstacle" in orders:
@@ -99,15 +106,8 @@ def _names(names: list[str]) -> Array:
     return np.array(names, dtype=h5py_module().string_dtype())
 
 
-def _has_obstacles(export: Export) -> bool:
-    return any(export.dataset.scene(scene.id).words.get("obstacle") for scene in export.dataset.scenes())
-
-
-def _write_scalars(file: Any, export: Export, split: str) -> None:
-    """What every scene of the data set has as a number, of the scenes of a split."""
-    shared = set.intersection(*(set(_scalars(export, scene.id)) for scene in export.dataset.scenes()))
-    scenes = [_scalars(export, k) for k in exported_ids(export.dataset, split)]
-    group, names = file.create_group("scalars"), [name for name in scenes[0] if name in shared]
+def _write_scalars(file: Any, scenes: list[dict[str, float]]) -> None:
+    group, names = file.create_group("scalars"), list(scenes[0])
     group.attrs["field_names"] = _names(names)
     for name in names:
         data = group.create_dataset(name, data=np.array([scene[name] for scene in scenes], np.float32))
