@@ -56,9 +56,10 @@ def arrays(scene_id: int, dim: int = 2, frames: int = FRAMES) -> dict[str, np.nd
     }
 
 
-def scene_attributes(scene_id: int, valid: bool = True) -> dict[str, str | int | float]:
+def scene_attributes(scene_id: int, valid: bool = True, dim: int = 2) -> dict[str, str | int | float]:
+    scene = json.dumps({"gravity": [0.0, -9.8, 0.0][:dim]})
     words = {"valid": int(valid), "attempts": 1 if valid else 3, "failure": "" if valid else "it left the domain"}
-    return {**words, "seed": 1, "scene": '{"gravity": [0.0, -9.8]}', "materials": '["water", "sand"]', "dt": 1e-4}
+    return {**words, "seed": 1, "scene": scene, "materials": '["water", "sand"]', "dt": 1e-4}
 
 
 def write_shard(folder: Path, index: int, dim: int = 2, frames: int = FRAMES) -> None:
@@ -66,7 +67,7 @@ def write_shard(folder: Path, index: int, dim: int = 2, frames: int = FRAMES) ->
     with ShardWriter(shard_path(folder, index), {"shard": index}) as writer:
         for k in ids:
             scene = prepare_scene(arrays(k, dim, frames) if k != FAILED else {})
-            writer.add(k, scene, scene_attributes(k, k != FAILED))
+            writer.add(k, scene, scene_attributes(k, k != FAILED, dim))
         writer.finish()
 
 

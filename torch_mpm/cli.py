@@ -14,6 +14,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
+from . import memory, optional
 from .data import commands as data_sets
 from .data import reading_commands as reading
 from .data.commands import set_argument
@@ -71,8 +72,9 @@ TOLD = (
 
 def _message(error: Exception) -> str | None:
     """What to tell the user. None for errors that are defects of torch_mpm, whose traceback should be seen."""
-    if isinstance(error, MemoryError) or "allocate memory" in str(error) or "out of memory" in str(error):
-        return "out of memory; make grid.dx larger or per_cell smaller, or ask for fewer fields and pictures"
+    if memory.is_short(error):
+        remedy = "make grid.dx larger or per_cell smaller, or ask for fewer fields, scenes and pictures"
+        return f"out of memory: {memory.shortage(error)}; {remedy}"
     if isinstance(error, OSError) and error.strerror and error.filename is not None:
         return f"{error.filename}: {error.strerror}"
     names = {kind.__name__ for kind in type(error).__mro__}
@@ -279,11 +281,7 @@ def _export(options: argparse.Namespace) -> None:
 
 
 def _tqdm() -> Any:
-    try:
-        from tqdm import tqdm
-    except ImportError as error:
-        raise ImportError("the progress bar needs tqdm: pip install torch-mpm[scene], or use --quiet") from error
-    return tqdm
+    return optional.load("tqdm", "the progress bar, which --quiet leaves out", "scene").tqdm
 
 
 class _Bar:

@@ -1,9 +1,14 @@
-"""Memory that this machine has left for large results."""
+"""Memory that this process may still take, and errors of those who found too little of it."""
 
 from __future__ import annotations
 
+import errno
 import math
+import re
+import resource
 from pathlib import Path
+
+import torch
 
 LIMITS = (
     ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory.current"),
@@ -12,9 +17,69 @@ LIMITS = (
 """Files with the limit of a container (cgroup versions 2 and 1) and what it uses."""
 
 
+SHORTAGE = re.compile(
+    r"(allocate|allocation|out of|not enough|insufficient) .{0,40}memory|memory allocation failed|bad_alloc|"
+    r"failed to map segment|can't allocate|unable to allocate|can't start new thread|cannot allocate",
+    re.IGNORECASE,
+)
+"""What libraries say where memory is short: C, the dynamic linker, C++, NumPy, torch, HDF5, Python."""
+WANTED = re.compile(r"you tried to allocate (\d+) bytes")
+"""In torch's message."""
+
+
 def available() -> float:
     """Memory that can be allocated without swapping [bytes]; infinite where the system does not say."""
-    return min(_of_machine(), *(_of_container(*files) for files in LIMITS))
+    return min(_of_machine(), _of_process(), *(_of_container(*files) for files in LIMITS))
+
+
+def in_words(size: float) -> str:
+    """A number of bytes with its unit."""
+    power = min(int(math.log10(max(size, 1)) / 3), 3)
+    return f"{size / 1000**power:.3g} {('bytes', 'kB', 'MB', 'GB')[power]}"
+
+
+def is_short(error: BaseException | None) -> bool:
+    """Whether an error, or one that it came from, says that memory could not be had."""
+    seen: set[int] = set()
+    while error is not None and id(error) not in seen:
+        seen.add(id(error))
+        if isinstance(error, (MemoryError, torch.OutOfMemoryError)) or SHORTAGE.search(str(error)):
+            return True
+        if isinstance(error, OSError) and error.errno == errno.ENOMEM:
+            return True
+        error = error.__cause__ or error.__context__
+    return False
+
+
+def shortage(error: BaseException) -> str:
+    """What was wanted according to an error for which `is_short`, and how much there is, in one line."""
+    text = " ".join(str(error).split())
+    wanted = WANTED.search(text)
+    text = f"{in_words(int(wanted[1]))} were wanted" if wanted else text
+    free, limit = available(), _limit()
+    there = f"{in_words(free)} are free" if math.isfinite(free) else ""
+    there += f" of the {in_words(limit)} of address space that this process may take (ulimit -v)" if limit else ""
+    return "; ".join(part for part in (text[:400], there) if part)
+
+
+def require(size: float, purpose: str) -> None:
+    """Raise MemoryError where fewer bytes are available than something is known to take."""
+    if (free := available()) < size:
+        raise MemoryError(f"{purpose} takes about {in_words(size)}, and {in_words(free)} are available")
+
+
+def _limit() -> int:
+    """Limit of the address space [bytes]; 0 for none."""
+    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+    return 0 if limit == resource.RLIM_INFINITY else limit
+
+
+def _of_process() -> float:
+    try:
+        taken = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+        return max(0, limit - taken) if (limit := _limit()) else math.inf
+    except (OSError, ValueError):
+        return math.inf
 
 
 def _of_machine() -> float:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Callable
 
 import torch
@@ -12,6 +11,7 @@ from torch import Tensor
 from .activation_record import aside
 from .checkpoints import Checkpoints, as_checkpoints
 from .errors import check_count, shape_of
+from .memory import in_words
 from .rollout_parts import Parts
 from .rollouts import EVERYTHING, bytes_kept, obstacle_to_substeps, resolved, rollout, steps_of_a_call
 from .state import State
@@ -48,9 +48,9 @@ class RolloutEstimate:
         return self.memory / self.particles if self.particles else 0.0
 
     def __str__(self) -> str:
-        host = f" and {_words(self.host_memory)} on the host" if self.host_memory else ""
+        host = f" and {in_words(self.host_memory)} on the host" if self.host_memory else ""
         return (
-            f"{_words(self.memory)} ({_words(self.per_particle)} a particle){host}, {self.seconds:.3g} s: "
+            f"{in_words(self.memory)} ({in_words(self.per_particle)} a particle){host}, {self.seconds:.3g} s: "
             f"{self.kept_states} kept states, {self.steps} steps with those taken again"
         )
 
@@ -144,8 +144,3 @@ def _estimate(
         prefix + n + again,
         len(start),
     )
-
-
-def _words(size: float) -> str:
-    power = min(int(math.log10(max(size, 1)) / 3), 3)
-    return f"{size / 1000**power:.3g} {('bytes', 'kB', 'MB', 'GB')[power]}"

@@ -314,7 +314,7 @@ def _check_size(shape: Region, spacing: float, method: str) -> None:
     if points > MOST:
         room = f"{MOST} can be numbered"
     elif cells * CELL_BYTES > FEW_BYTES and cells * CELL_BYTES > (free := memory.available()):
-        room = f"filling it takes {cells * CELL_BYTES / 1e9:.3g} GB, and {free / 1e9:.3g} GB are free"
+        room = f"filling it takes {memory.in_words(cells * CELL_BYTES)}, and {memory.in_words(free)} are free"
     else:
         return
     raise ValueError(

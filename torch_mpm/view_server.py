@@ -11,6 +11,8 @@ from typing import Any
 from unittest import mock
 from urllib.parse import urlsplit
 
+from . import optional
+
 MOST_PORT = 65535
 
 
@@ -26,11 +28,8 @@ def viser_server(host: str, port: int) -> Any:
         OSError: for an address that is not of this machine, or a port that may not be listened at.
         ImportError: when viser is missing (extra ``view``).
     """
-    try:
-        import viser
-        import websockets.asyncio.server as sockets
-    except ImportError as error:
-        raise ImportError("the viewer needs viser: pip install torch-mpm[view]") from error
+    viser = optional.load("viser", "the viewer", "view")
+    sockets = optional.load("websockets.asyncio.server", "the viewer", "view")
     _check_address(host, port)
     # viser takes no function for the check of requests, so that of websockets is given one while viser calls it.
     with mock.patch.object(sockets, "serve", _guarded(sockets.serve, host)):

@@ -123,6 +123,12 @@ CHANGES = [
     {"added": [["train", 3, 5]]},
     {"added": [["dev", 12, 5]]},
     {"added": [["train", 12]]},
+    {"dx": 0.0},
+    {"frame_interval": -0.1},
+    {"frames": 10**400},
+    {"upper": [0.0, 2.0]},
+    {"splits": {"train": [0, 10**12]}},
+    {"scenes_per_shard": 10**12},
 ]
 
 

@@ -429,7 +429,7 @@ def test_the_command_line(whole, tmp_path, capsys):
     assert "7 of 7 scenes are valid" in capsys.readouterr().out
     record_path(shard_path(tmp_path / "set", 2)).unlink()
     assert main(["finalize", str(tmp_path / "set")]) == 1 and main(["verify", str(tmp_path / "set")]) == 1
-    assert "lacks 1 of 4 shards (2)" in capsys.readouterr().err
+    assert "lacks 1 of 4 shards (shard_00002)" in capsys.readouterr().err
     assert main(["generate", "-o", str(tmp_path / "other")]) == 1
     assert "takes a configuration or --preset" in capsys.readouterr().err
     assert (os.environ.get("RANK") is None) and (tmp_path / "set" / "config.toml").read_text() == json_to_toml()

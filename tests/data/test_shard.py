@@ -13,7 +13,7 @@ import pytest
 
 h5py = pytest.importorskip("h5py")
 
-from small_dataset import write_shard  # noqa: E402
+from small_dataset import forge, write_shard  # noqa: E402
 
 from torch_mpm.data import whole_files  # noqa: E402
 from torch_mpm.data.packing import content_hash, prepare_scene  # noqa: E402
@@ -282,13 +282,42 @@ def a_group(file, tmp_path):
     file["scene_0000000"].create_group("foreign")
 
 
+def one_particle_less(file, tmp_path):
+    values = file["scene_0000000/particle_type"][:-1]
+    del file["scene_0000000/particle_type"]
+    file["scene_0000000"]["particle_type"] = values
+
+
+def other_bytes(file, tmp_path):
+    values = file["scene_0000000/mass"][:].astype(">f4")
+    del file["scene_0000000/mass"]
+    file["scene_0000000"]["mass"] = values
+
+
+def no_arrays(file, tmp_path):
+    for name in list(file["scene_0000000"]):
+        del file["scene_0000000"][name]
+
+
+def no_material(file, tmp_path):
+    file["scene_0000000"].attrs["scene"] = '{"material": [1]}'
+
+
+def no_gravity(file, tmp_path):
+    file["scene_0000000"].attrs["scene"] = '{"gravity": [1, "a"]}'
+
+
 def strange_attribute(file, tmp_path):
     file["scene_0000000"].attrs["where"] = file["scene_0000000"].ref
 
 
-@pytest.mark.parametrize(
-    "attack", [external, soft, raw, virtual, bomb, references, other_filter, a_group, strange_attribute]
-)
+ATTACKS = [
+    *(external, soft, raw, virtual, bomb, references, other_filter, a_group, strange_attribute),
+    *(one_particle_less, other_bytes, no_arrays, no_material, no_gravity),
+]
+
+
+@pytest.mark.parametrize("attack", ATTACKS)
 def test_foreign_content_is_refused(path, tmp_path, attack):
     with ShardWriter(path) as writer:
         writer.add(0, prepare_scene(arrays(0)), VALID)
@@ -303,3 +332,40 @@ def test_foreign_content_is_refused(path, tmp_path, attack):
 
 def test_the_record_is_strict_json(written):
     json.loads(record_path(written).read_text(), parse_constant=pytest.fail)
+
+
+def test_a_file_is_blamed_only_where_it_has_changed(written, monkeypatch):
+    """An error of HDF5 for a file with its checksum is one of memory, or of something else than the file."""
+    words = "Can't synchronously read data ({})"
+    for reason, kind, message in (
+        ("memory allocation failed for data chunk", MemoryError, "position cannot be read, .*memory allocation failed"),
+        ("inflate() failed", DamagedFileError, "though its checksum is right; another program"),
+    ):
+        with Shard(written) as read, monkeypatch.context() as patch:
+            scene = read.scene(3)
+
+            def fails(self, part, reason=reason):
+                raise OSError(words.format(reason))
+
+            patch.setattr(h5py.Dataset, "__getitem__", fails)
+            with pytest.raises(kind, match=message) as told:
+                scene.window("position", 0, 5)
+            assert "remove it" not in str(told.value)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda scene: scene["motion"]["velocity"]["sum"].pop(),
+        lambda scene: scene["motion"]["velocity"].update(sum=[0.0, "x"]),
+        lambda scene: scene["motion"]["acceleration"].update(count=10**400),
+        lambda scene: scene.update(particles=-1),
+        lambda scene: scene.update(id=1.5),
+        lambda scene: scene.update(attempts=[]),
+    ],
+)
+def test_numbers_of_records_that_are_none(written, change):
+    """With a checksum that fits."""
+    forge(record_path(written), lambda words: change(words["scenes"][0]))
+    with pytest.raises(DamagedFileError, match="is no record of a shard"):
+        ShardRecord.read(record_path(written))

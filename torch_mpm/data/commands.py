@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+from .. import optional
 from .failures import MOST_FAILED, check_failures, reasons
 
 
@@ -141,11 +142,7 @@ class _Bar:
     """Progress of a process: frames of scenes, their rate and the time left, if it makes all that is missing."""
 
     def __init__(self) -> None:
-        try:
-            from tqdm import tqdm
-        except ImportError as error:
-            raise ImportError("the progress bar needs tqdm: pip install torch-mpm[scene], or use --quiet") from error
-        self._make = tqdm
+        self._make = optional.load("tqdm", "the progress bar, which --quiet leaves out", "scene").tqdm
         self._bar: Any = None
 
     def show(self, figures: dict[str, Any]) -> None:

@@ -42,6 +42,7 @@ from ..scene.scene import override, parsed
 from . import distribution
 from .content_checks import shape_problems, value_problems
 from .distribution import Words
+from .folder import MOST_SHARDS
 from .stress import MEASURES
 from .whole_files import NAME
 
@@ -85,7 +86,7 @@ class Dataset(schema.Model):
     """exact number of particles of a scene, shared by its bodies by their volumes; by default per_cell decides"""
     gap: schema.NotNegative | None = None
     """least distance of bodies from each other and from obstacles [m]; by default grid.dx"""
-    scenes_per_shard: Annotated[int, Field(ge=1)] = 16
+    scenes_per_shard: Annotated[int, Field(ge=1, le=MOST_SHARDS)] = 16
     """scenes of a file, which are simulated together; as many as the device holds are fastest"""
     attempts: Annotated[int, Field(ge=1, le=10)] = 3
     """how often a scene is tried, each time with half of the time step, before it is recorded as failed"""
@@ -264,6 +265,9 @@ def _checked(words: Words) -> Dataset:
         raise SceneError(["dataset.fields: temperature needs a [heat] table"])
     if "out_of_plane_stress" in dataset.fields and len(grid.lower) == 3:
         raise SceneError(["dataset.fields: out_of_plane_stress is for 2-D; in 3-D the stress has all components"])
+    if (shards := -(-sum(dataset.splits.values()) // dataset.scenes_per_shard)) > MOST_SHARDS:
+        most = f"{MOST_SHARDS} are allowed; have fewer scenes, or more scenes_per_shard"
+        raise SceneError([f"dataset.splits: {shards} shards would be made, and {most}"])
     if not sum(dataset.splits.values()):
         raise SceneError([f"dataset.splits: has no scenes, got {dataset.splits}"])
     return dataset

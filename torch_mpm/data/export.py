@@ -10,6 +10,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
+from .. import optional
 from .stress import CAUCHY, explicit_name
 from .trajectory import Array, Trajectory, find
 from .whole_files import building_path, remove_leftovers
@@ -91,11 +92,7 @@ def _folder(run: str | Path, out: str | Path | None, name: str) -> Path:
 
 
 def meshio_module() -> Any:
-    try:
-        import meshio
-    except ImportError as error:
-        raise ImportError("VTK and PLY files need meshio: pip install torch-mpm[data]") from error
-    return meshio
+    return optional.load("meshio", "VTK and PLY files", "data")
 
 
 def _mesh(position: Array, cells: list[Any], data: dict[str, Array]) -> Any:

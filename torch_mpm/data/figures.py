@@ -43,7 +43,7 @@ def draw_statistics(dataset: str | Path | DatasetFolder, out: str | Path | None 
 
     Args:
         dataset: folder of the data set.
-        out: the picture; ``statistics.png`` in the folder of the data set by default.
+        out: the picture, whose folder is made; ``statistics.png`` in the folder of the data set by default.
 
     Raises:
         DatasetError: for a data set without a valid scene, or a picture that is no PNG file.
@@ -76,6 +76,7 @@ def draw_statistics(dataset: str | Path | DatasetFolder, out: str | Path | None 
     picture.suptitle(f"{data.record.title or data.path.name}: {len(valid)} scenes, {len(scenes)} of them read")
     picture.tight_layout()
     picture.canvas.draw()
+    target.parent.mkdir(parents=True, exist_ok=True)
     write_png(target, np.ascontiguousarray(np.asarray(picture.canvas.buffer_rgba())[..., :3]))
     return target
 
@@ -91,8 +92,15 @@ def _sample(values: Array, most: int = 20_000) -> Array:
 
 def _histogram(axes: Any, values: Array, label: str, log: bool = False) -> None:
     top = float(np.percentile(values, 99.5)) if values.size else 1.0
-    axes.hist(values[values <= top] if top > 0 else values, bins=50, color="#0072B2", log=log)
+    axes.hist(values[values <= top], bins=_edges(np.array([0.0, top]), 50), color="#0072B2", log=log)
     axes.set(xlabel=label, ylabel="particles and frames", title=f"99.5% are below {top:.3g}")
+
+
+def _edges(values: Array, bins: int) -> Array:
+    """Edges of bins from the least value to the largest, wider than rounding where these are nearly the same."""
+    lower, upper = float(values.min()), float(values.max())
+    margin = max(0.0, 1e-6 * max(abs(lower), abs(upper), 1e-30) - (upper - lower))
+    return np.linspace(lower - margin, upper + margin, bins + 1)
 
 
 def _draw_counts(axes: Any, data: DatasetFolder) -> None:
@@ -144,7 +152,7 @@ def _draw_parameters(axes: Sequence[Any], scenes: list[StoredScene]) -> None:
     varied = {name: values for name, values in found.items() if len(set(values)) > 1}
     names = sorted(varied, key=lambda name: -len(set(varied[name])))[:MOST_PARAMETERS]
     for place, name in zip(axes, names, strict=False):
-        place.hist(varied[name], bins=20, color="#CC79A7")
+        place.hist(varied[name], bins=_edges(np.array(varied[name]), 20), color="#CC79A7")
         place.set(xlabel=name, ylabel="scenes")
     for place in axes[len(names) :]:
         place.set_axis_off()

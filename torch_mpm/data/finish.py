@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -10,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import DamagedFileError
-from .folder import DatasetFolder, DatasetRecord
+from .folder import DatasetFolder, DatasetRecord, finished_shards
 from .metadata import metadata, write_metadata
 from .packing import content_hash
 from .shard import REMEDY, SceneRecord, Shard, ShardRecord, StoredScene, record_path, shard_path
@@ -37,12 +36,8 @@ def finalize(folder: str | Path) -> dict[str, Any]:
         FileNotFoundError, DamagedFileError: as `DatasetFolder`.
     """
     dataset = DatasetFolder(folder)
-    missing = sorted(set(range(dataset.record.shards)) - set(dataset.finished))
-    if missing:
-        named = ", ".join(map(str, missing[:10])) + (", ..." if len(missing) > 10 else "")
-        raise IncompleteError(
-            f"{folder} lacks {len(missing)} of {dataset.record.shards} shards ({named}); generate them"
-        )
+    if missing := dataset.record.missing(dataset.finished):
+        raise IncompleteError(f"{folder} lacks {missing}; generate them")
     _check_files(dataset)
     if not dataset.scenes():
         raise IncompleteError(f"{folder} has no valid scene: {dataset.attempted()[0].failure}")
@@ -81,14 +76,18 @@ def verify(folder: str | Path) -> Iterator[str]:
     Raises:
         FileNotFoundError, DamagedFileError: for a folder without a readable ``dataset.json``.
     """
-    record = DatasetRecord.read(Path(folder))
-    for index in range(record.shards):
+    record, finished = DatasetRecord.read(Path(folder)), finished_shards(Path(folder))
+    if missing := record.missing(finished):
+        yield f"{folder}: {missing} are not there or not finished; generate them"
+    for index in finished:
+        if index >= record.shards:
+            continue
         path = shard_path(Path(folder), index)
         try:
             with Shard(path, check=True) as shard:
                 yield from _shard_problems(shard, record, index)
         except FileNotFoundError:
-            yield f"{path}: is not there or not finished; generate again"
+            yield f"{path}: is not there; generate again"
         except DamagedFileError as error:
             yield f"{error} (--check does so for all damaged shards)"
 
@@ -96,11 +95,14 @@ def verify(folder: str | Path) -> Iterator[str]:
 def _shard_problems(shard: Shard, record: DatasetRecord, index: int) -> Iterator[str]:
     expected = record.ids(index)
     if shard.ids != expected:
-        yield f"{shard.path}: has the scenes {shard.ids}, not {expected[0]} to {expected[-1]}"
+        yield f"{shard.path}: has the scenes {shard.ids!s:.100}, not {expected[0]} to {expected[-1]}"
     for told in shard.record.scenes:
-        stored = shard.scene(told.id)
-        for problem in _scene_problems(stored, told, record):
-            yield f"{shard.path}: scene {told.id} {problem}"
+        try:
+            problems = list(_scene_problems(shard.scene(told.id), told, record))
+        except DamagedFileError as error:
+            yield f"{error} (--check does so for all damaged shards)"
+        else:
+            yield from (f"{shard.path}: scene {told.id} {problem}" for problem in problems)
 
 
 def _scene_problems(stored: StoredScene, told: SceneRecord, record: DatasetRecord) -> Iterator[str]:
@@ -109,9 +111,7 @@ def _scene_problems(stored: StoredScene, told: SceneRecord, record: DatasetRecor
         yield "has another hash than its record says"
     if stored.attributes.get("failure", told.failure) != told.failure:
         yield "has another failure in its record than in its file"
-    if bool(stored.attributes.get("valid")) != told.valid or bool(arrays) != told.valid:
-        yield "is valid in its record or in its file, but not in both"
-    if not told.valid or not arrays:
+    if not told.valid:
         return
     if lacking := [name for name in record.fields if name not in arrays]:
         yield f"lacks {', '.join(lacking)}"
@@ -123,8 +123,6 @@ def _scene_problems(stored: StoredScene, told: SceneRecord, record: DatasetRecor
         return
     if not _same_motion(motion_sums(arrays["position"], arrays.get("particle_type")), told.motion):
         yield "has other statistics than its record says"
-    if stored.particles != told.particles:
-        yield f"has {stored.particles} particles, not {told.particles} as its record says"
     free = arrays.get("particle_type", np.zeros(stored.particles)) != BOUNDARY
     x = arrays["position"][:, free]
     slack = record.dx
@@ -157,12 +155,12 @@ def energy_gain(stored: StoredScene, arrays: Any, record: DatasetRecord) -> floa
     A body starts without elastic energy, so that its mechanical energy can only fall. Heights are those above the
     floor, the lowest corner of the domain. Without velocities those between frames are taken.
     """
-    words = json.loads(stored.attributes["scene"])
+    words = stored.words
     if "heat" in words or any("velocity" in o or "spin" in o for o in words.get("obstacle", [])):
         return None
     gravity = np.array(words.get("gravity") or [0.0] * record.dim)
     floor = np.where(gravity < 0, record.lower, record.upper)
-    x, mass = arrays["position"].astype(np.float64), arrays["mass"].astype(np.float64)
+    x, mass = arrays["position"].astype(np.float64), arrays.get("mass", np.ones(stored.particles)).astype(np.float64)
     if "velocity" in arrays:
         v = arrays["velocity"].astype(np.float64)
     else:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import functools
+import itertools
 import json
+import math
 import os
 import re
 from collections import OrderedDict
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -15,14 +17,16 @@ from typing import Any
 import numpy as np
 
 from ..errors import DamagedFileError
-from .shard import Array, SceneRecord, Shard, ShardRecord, StoredScene, record_path, shard_path
+from .shard import REMEDY, Array, SceneRecord, Shard, ShardRecord, StoredScene, record_path, scene_name, shard_path
 from .statistics import Motion, Sums
-from .whole_files import NAME, check_inside, check_record, write_record
+from .whole_files import NAME, check_inside, check_record, count, write_record
 
 FORMAT = 2
 FORMAT_WITHOUT_CHECKSUM = 1
 """Of records that were written before records had checksums."""
 DATASET = "dataset.json"
+MOST_SHARDS = 10**6
+"""Of a data set, and scenes of a shard."""
 MOST_OPEN = 32
 """Shards, and scenes of them, that a reader keeps open."""
 
@@ -95,6 +99,14 @@ class DatasetRecord:
         begin, end = shard * self.scenes_per_shard, (shard + 1) * self.scenes_per_shard
         return [k for _, first, count in self.ranges for k in range(max(first, begin), min(first + count, end))]
 
+    def missing(self, finished: Sequence[int]) -> str:
+        """Which shards are not among those that are finished, in words; "" for none."""
+        there = {index for index in finished if index < self.shards}
+        number = self.shards - len(there)
+        first = itertools.islice((f"shard_{k:05d}" for k in range(self.shards) if k not in there), 10)
+        named = ", ".join(first) + (", ..." if number > 10 else "")
+        return f"{number} of {self.shards} shards ({named})" if number else ""
+
     def count(self, split: str) -> int:
         """Number of scenes of a split."""
         return sum(count for name, _, count in self.ranges if name == split)
@@ -107,7 +119,7 @@ class DatasetRecord:
 
         Raises:
             MissingError: for a split that is not there.
-            DatasetError: for fewer scenes than there are.
+            DatasetError: for fewer scenes than there are, or more shards than `MOST_SHARDS`.
         """
         record = self
         for split, total in totals.items():
@@ -118,6 +130,8 @@ class DatasetRecord:
             if total > there:
                 new = (split, record.shards * self.scenes_per_shard, total - there)
                 record = replace(record, added=(*record.added, new))
+        if record.shards > MOST_SHARDS:
+            raise DatasetError(f"{record.shards} shards would be made, and at most {MOST_SHARDS} are allowed")
         return record
 
     def split_of(self, scene_id: int) -> str:
@@ -125,8 +139,8 @@ class DatasetRecord:
         Raises:
             MissingError: for a scene of no split.
         """
-        for name, first, count in self.ranges:
-            if first <= scene_id < first + count:
+        for name, first, of in self.ranges:
+            if first <= scene_id < first + of:
                 return name
         raise MissingError(f"the data set has no scene {scene_id}")
 
@@ -153,28 +167,41 @@ class DatasetRecord:
                 check_record(words, path, remedy)
             words.pop("format")
             words.pop("connectivity_radius", None)  # of some folders; it was never set
-            for name in ("seed", "scenes_per_shard", "frames"):
-                words[name] = int(words[name])
+            words["seed"] = int(words["seed"])
+            for name in ("scenes_per_shard", "frames"):
+                words[name] = count(words[name], 1)
             for name in ("frame_interval", "dx"):
                 words[name] = float(words[name])
             for name in ("lower", "upper"):
                 words[name] = tuple(map(float, words[name]))
             words["fields"] = tuple(map(str, words["fields"]))
-            words["splits"] = {str(n): (int(first), int(count)) for n, (first, count) in words["splits"].items()}
-            words["added"] = tuple((str(n), int(first), int(count)) for n, first, count in words.get("added", ()))
+            words["splits"] = {str(n): (count(first), count(of)) for n, (first, of) in words["splits"].items()}
+            words["added"] = tuple((str(n), count(first), count(of)) for n, first, of in words.get("added", ()))
             record = cls(**words)
-            if not 2 <= len(record.lower) == len(record.upper) <= 3 or min(record.frames, record.scenes_per_shard) < 1:
+            sizes = [
+                record.dx,
+                record.frame_interval,
+                *(b - a for a, b in zip(record.lower, record.upper, strict=True)),
+            ]
+            few = max(record.shards, record.scenes_per_shard) <= MOST_SHARDS
+            if not (few and 2 <= record.dim <= 3 and all(0 < size < math.inf for size in sizes)):
                 raise ValueError("its numbers make no sense")
             if wrong := [n for n in (*record.splits, *record.fields) if not NAME.fullmatch(n)]:
                 raise ValueError(f"{wrong[0]!r} is no name of a split or a field")
             ends = [0, *(first + count for _, first, count in record.ranges)]
             if any(n not in record.splits or f < e or c < 0 for (n, f, c), e in zip(record.ranges, ends, strict=False)):
                 raise ValueError("its splits overlap, or have a negative number of scenes")
-        except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
+        except (ValueError, TypeError, KeyError, AttributeError, RecursionError, OverflowError) as error:
             if isinstance(error, DamagedFileError):
                 raise
             raise DamagedFileError(path, f"is no record of a data set ({error})", remedy) from None
         return record
+
+
+def finished_shards(folder: Path) -> list[int]:
+    """Numbers of the shards of a folder that have a record."""
+    names = (path.name for path in (folder / "shards").glob("shard_*.json"))
+    return sorted(int(match[1]) for name in names if (match := re.fullmatch(r"shard_(\d{5,9})\.json", name)))
 
 
 class DatasetFolder:
@@ -192,9 +219,7 @@ class DatasetFolder:
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
         self.record = DatasetRecord.read(self.path)
-        files = [p.name for p in (self.path / "shards").glob("shard_*.json")]
-        matches = [re.fullmatch(r"shard_(\d{5,})\.json", name) for name in sorted(files)]
-        self.finished = [int(m[1]) for m in matches if m]
+        self.finished = finished_shards(self.path)
         self._scenes = {s.id: (k, s) for k in self.finished for s in self._record(k).scenes}
         self._cache = _OpenFiles()
 
@@ -228,7 +253,7 @@ class DatasetFolder:
         """A valid scene, open for reading."""
         if scene_id not in self._scenes or not self._scenes[scene_id][1].valid:
             raise MissingError(f"{self.path} has no finished and valid scene {scene_id}")
-        return self._cache.scene(self._shard_path(self._scenes[scene_id][0]), scene_id)
+        return self._cache.scene(self._shard_path(self._scenes[scene_id][0]), scene_id, self.record)
 
     def motion(self, split: str | None = None) -> Motion:
         """Sums of the valid scenes of a split, or of all."""
@@ -265,12 +290,17 @@ class _OpenFiles:
         self._shards: OrderedDict[Path, Shard] = OrderedDict()
         self._scenes: OrderedDict[int, StoredScene] = OrderedDict()
 
-    def scene(self, path: Path, scene_id: int) -> StoredScene:
+    def scene(self, path: Path, scene_id: int, record: DatasetRecord) -> StoredScene:
         if self._process != os.getpid():  # files of the parent are left to it
             self.__init__()  # type: ignore[misc]
         shard = self._shard(path)
         if scene_id not in self._scenes:
-            self._scenes[scene_id] = shard.scene(scene_id)
+            self._scenes[scene_id] = scene = shard.scene(scene_id)
+            if missing := [name for name in record.fields if name not in scene.names]:
+                raise DamagedFileError(path, f"{scene_name(scene_id)} lacks {', '.join(missing)}", REMEDY)
+            if (scene.frames, scene.dim) != (record.frames, record.dim):
+                found = f"{scene.frames} frames in {scene.dim}-D, not {record.frames} in {record.dim}-D"
+                raise DamagedFileError(path, f"{scene_name(scene_id)} has {found}", REMEDY)
         self._scenes.move_to_end(scene_id)
         while len(self._scenes) > MOST_OPEN:
             self._scenes.popitem(last=False)

@@ -14,10 +14,11 @@ import json
 import math
 import os
 import struct
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
 
+from .. import memory, optional
 from ..errors import DamagedFileError
 from ..files import check_file
 
@@ -32,11 +33,7 @@ MOST_EXPANSION = 1032
 
 
 def h5py_module() -> Any:
-    try:
-        import h5py
-    except ImportError as error:
-        raise ImportError("trajectories need h5py: pip install torch-mpm[data]") from error
-    return h5py
+    return optional.load("h5py", "trajectories", "data")
 
 
 class _File:
@@ -211,6 +208,26 @@ def _digest(handle: BinaryIO, extents: Extents, text: bytes) -> bytes:
 
 # ---- reading
 
+READ_ERRORS = (OSError, RuntimeError, ValueError, KeyError, TypeError, MemoryError)
+"""Errors of h5py where a file cannot be read."""
+INTACT = "another program has made it, or its disk or the memory of this machine is at fault"
+
+
+def unreadable(path: Path, problem: str, error: BaseException, remedy: str, intact: Callable[[], bool]) -> Exception:
+    """The error to raise where HDF5 fails to read a file: the file is blamed only where it is not as it was written.
+
+    Args:
+        problem: what cannot be read, in words.
+        error: of h5py.
+        remedy: for a damaged file.
+        intact: whether the file has its checksum.
+    """
+    if not intact():
+        return DamagedFileError(path, f"{problem} ({error})", remedy)
+    if memory.is_short(error):
+        return MemoryError(f"{path}: {problem}, {memory.shortage(error)}")
+    return DamagedFileError(path, f"{problem} ({error}), though its checksum is right", INTACT)
+
 
 def open_sealed(path: Path, remedy: str, in_memory: bool = False) -> Any:
     """The h5py.File of a sealed file, all of whose data are its own; ``in_memory`` leaves no file open.
@@ -224,8 +241,8 @@ def open_sealed(path: Path, remedy: str, in_memory: bool = False) -> Any:
     check_seal(path, remedy)
     try:
         file = h5py.File(io.BytesIO(path.read_bytes()) if in_memory else path, "r")
-    except (OSError, RuntimeError, ValueError, KeyError) as error:
-        raise DamagedFileError(path, f"is not an HDF5 file ({error})", remedy) from None
+    except READ_ERRORS as error:  # below a seal that was right
+        raise unreadable(path, "is not an HDF5 file", error, remedy, lambda: True) from None
     problem = _foreign(h5py, file, path.stat().st_size)
     if problem:
         file.close()
@@ -249,7 +266,9 @@ def _foreign(h5py: Any, file: Any, size: int) -> str:
             if data.nbytes and (offset is None or offset + data.nbytes > size):
                 return f"{name!r} is larger than the file"
         dict(file.attrs)
-    except (OSError, RuntimeError, ValueError, KeyError, TypeError) as error:
+    except READ_ERRORS as error:
+        if memory.is_short(error):
+            raise
         return f"it cannot be read ({error})"
     return ""
 

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from .. import optional
 from .statistics import Motion, motion_sums
 
 Array = npt.NDArray[Any]
@@ -29,11 +30,7 @@ PIECE_BYTES = 2**20
 
 def isal_zlib_module() -> Any:
     """A zlib that is some ten times as fast, and compresses a tenth less."""
-    try:
-        from isal import isal_zlib
-    except ImportError as error:
-        raise ImportError("data sets need isal: pip install torch-mpm[data]") from error
-    return isal_zlib
+    return optional.load("isal.isal_zlib", "data sets", "data")
 
 
 # ---- one array

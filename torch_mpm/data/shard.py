@@ -11,8 +11,10 @@ dimension, such as ``particle_type`` [N], are stored as they are. Stresses have 
 
 from __future__ import annotations
 
+import functools
 import json
-from collections.abc import Iterator, Mapping
+import math
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from types import TracebackType
@@ -23,11 +25,11 @@ import numpy.typing as npt
 
 from ..errors import DamagedFileError
 from ..files import check_file
-from .hdf5 import h5py_module, storage_problem
+from .hdf5 import READ_ERRORS, h5py_module, storage_problem, unreadable
 from .packing import array_digest
 from .statistics import Motion, Sums
 from .stress import MEASURES, measure_of
-from .whole_files import check_record, file_hash, write_record
+from .whole_files import check_record, count, file_hash, write_record
 
 Array = npt.NDArray[Any]
 
@@ -74,11 +76,11 @@ class SceneRecord:
     def of(cls, words: dict[str, Any]) -> SceneRecord:
         """From the words of a record; what they lack is a KeyError."""
         return cls(
-            id=int(words["id"]),
-            valid=bool(words["valid"]),
-            particles=int(words["particles"]),
+            id=count(words["id"]),
+            valid=bool(count(words["valid"] + 0)),
+            particles=count(words["particles"]),
             hash=str(words["hash"]),
-            attempts=int(words["attempts"]),
+            attempts=count(words["attempts"]),
             failure=str(words["failure"]),
             motion=_motion(words["motion"]),
             digests={str(name): str(digest) for name, digest in words.get("digests", {}).items()},
@@ -113,8 +115,8 @@ class ShardRecord:
             if words["format"] == FORMAT:
                 check_record(words, path, REMEDY)
             scenes = [SceneRecord.of(s) for s in words["scenes"]]
-            record = cls(int(words["bytes"]), str(words["sha256"]), scenes)
-        except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
+            record = cls(count(words["bytes"]), str(words["sha256"]), scenes)
+        except (ValueError, TypeError, KeyError, AttributeError, RecursionError, OverflowError) as error:
             if isinstance(error, DamagedFileError):
                 raise
             raise DamagedFileError(path, f"is no record of a shard ({error})", REMEDY) from None
@@ -124,8 +126,16 @@ class ShardRecord:
 def _motion(words: dict[str, Any] | None) -> Motion | None:
     if words is None:
         return None
-    sums = {n: Sums(int(s["count"]), tuple(s["sum"]), tuple(s["squares"])) for n, s in words.items()}
+    sums = {n: Sums(count(s["count"]), _numbers(s["sum"]), _numbers(s["squares"])) for n, s in words.items()}
     return Motion(**sums)
+
+
+def _numbers(values: Any) -> tuple[float, ...]:
+    """Finite numbers, two or three."""
+    numbers = tuple(map(float, values))
+    if not 2 <= len(numbers) <= 3 or not all(map(math.isfinite, numbers)):
+        raise ValueError(f"sums must be 2 or 3 numbers, got {values!r}")
+    return numbers
 
 
 # ---- reading
@@ -139,15 +149,29 @@ class StoredScene:
         frames, particles, dim: T, N and D; 0 for a scene that failed.
     """
 
-    def __init__(self, path: Path, group: Any, digests: Mapping[str, str]) -> None:
-        self.path, self._group, self._name, self._digests = path, group, group.name[1:], digests
-        problem, self.attributes = _scene_problem(group, path.stat().st_size)
-        if problem:
-            raise DamagedFileError(path, f"{group.name[1:]} {problem}", REMEDY)
-        shape: tuple[int, ...] = group["position"].shape if "position" in group else (0, 0, 0)
+    def __init__(self, path: Path, group: Any, told: SceneRecord, intact: Callable[[], bool]) -> None:
+        self.path, self._group, self._name, self._digests = path, group, group.name[1:], told.digests
+        self._intact = intact
+        try:
+            problem, self.attributes = _scene_problem(group, path.stat().st_size)
+        except READ_ERRORS as error:
+            raise unreadable(path, f"{self._name} cannot be read", error, REMEDY, intact) from None
+        shape: tuple[int, ...] = (0, 0, 0)
+        if not problem and "position" in group:
+            shape = group["position"].shape
         self.frames, self.particles, self.dim = shape
+        if problem := problem or self._difference(told) or _words_problem(self.words, self.dim):
+            raise DamagedFileError(path, f"{group.name[1:]} {problem}", REMEDY)
 
-    @property
+    def _difference(self, told: SceneRecord) -> str:
+        """What the record of the scene says otherwise; "" for nothing."""
+        if not bool(len(self._group)) == bool(self.attributes.get("valid", told.valid)) == told.valid:
+            return "is valid in its record or in its file, but not in both"
+        if self.particles != told.particles:
+            return f"has {self.particles} particles, not {told.particles} as its record says"
+        return ""
+
+    @functools.cached_property
     def words(self) -> dict[str, Any]:
         """The scene file of the scene; nothing where its attributes do not say it."""
         try:
@@ -169,8 +193,8 @@ class StoredScene:
     def _measure(self, name: str) -> Any:
         try:
             return self._group[name].attrs.get("measure")
-        except (OSError, RuntimeError, ValueError, KeyError) as error:
-            raise DamagedFileError(self.path, f"{self._name}/{name} cannot be read ({error})", REMEDY) from None
+        except READ_ERRORS as error:
+            raise unreadable(self.path, f"{self._name}/{name} cannot be read", error, REMEDY, self._intact) from None
 
     def shape(self, name: str) -> tuple[int, ...]:
         shape: tuple[int, ...] = self._group[name].shape
@@ -198,11 +222,11 @@ class StoredScene:
         try:
             if name in self._group:
                 values: Array = self._group[name][part]
-                if part is ... and name in self._digests and array_digest(values).hex() != self._digests[name]:
-                    raise ValueError("its checksum is wrong")
-                return values
-        except (OSError, RuntimeError, ValueError, KeyError) as error:
-            raise DamagedFileError(self.path, f"{self._name}/{name} cannot be read ({error})", REMEDY) from None
+                if part is not ... or name not in self._digests or array_digest(values).hex() == self._digests[name]:
+                    return values
+                raise DamagedFileError(self.path, f"{self._name}/{name}: its checksum is wrong", REMEDY)
+        except READ_ERRORS as error:
+            raise unreadable(self.path, f"{self._name}/{name} cannot be read", error, REMEDY, self._intact) from None
         raise KeyError(f"{self._name} of {self.path} has no {name!r}")
 
 
@@ -226,12 +250,12 @@ class Shard:
         self.record = ShardRecord.read(record_path(self.path))
         if self.path.stat().st_size != self.record.bytes:
             raise DamagedFileError(self.path, "is not as long as its record says", REMEDY)
-        if check and file_hash(self.path) != self.record.sha256:
+        if check and not self._intact():
             raise DamagedFileError(self.path, "is damaged: its checksum is wrong", REMEDY)
         try:
             self._file = h5py.File(self.path, "r")
-        except (OSError, RuntimeError, ValueError, KeyError) as error:
-            raise DamagedFileError(self.path, f"is not an HDF5 file ({error})", REMEDY) from None
+        except READ_ERRORS as error:
+            raise unreadable(self.path, "is not an HDF5 file", error, REMEDY, self._intact) from None
 
     def __enter__(self) -> Shard:
         return self
@@ -243,6 +267,10 @@ class Shard:
 
     def close(self) -> None:
         self._file.close()
+
+    def _intact(self) -> bool:
+        """Whether the file has its checksum, for which all of it is read."""
+        return file_hash(self.path) == self.record.sha256
 
     @property
     def ids(self) -> list[int]:
@@ -261,35 +289,60 @@ class Shard:
         try:
             hard = isinstance(self._file.get(name, getlink=True), h5py.HardLink)
             group = self._file[name] if hard else None
-        except (OSError, RuntimeError, ValueError, KeyError):
-            group = None
+        except READ_ERRORS as error:
+            raise unreadable(self.path, f"{name} cannot be read", error, REMEDY, self._intact) from None
         if not isinstance(group, h5py.Group):
             raise DamagedFileError(self.path, f"lacks {name}", REMEDY)
-        digests = next(told.digests for told in self.record.scenes if told.id == scene_id)
-        return StoredScene(self.path, group, digests)
+        told = next(told for told in self.record.scenes if told.id == scene_id)
+        return StoredScene(self.path, group, told, self._intact)
 
     def __iter__(self) -> Iterator[StoredScene]:
         return (self.scene(scene_id) for scene_id in self.ids)
 
 
+STORED = ("<f4", "<f8", "|i1", "|u1", "<i2", "<i4", "<i8")
+"""Types of the numbers of arrays."""
+
+
+def _is_positions(data: Any) -> bool:
+    return data.ndim == 3 and data.dtype.kind == "f" and data.shape[2] in (2, 3)
+
+
+def _words_problem(words: dict[str, Any], dim: int) -> str:
+    """What in the scene file of a scene is not as a scene file has it; "" for nothing."""
+    gravity = words.get("gravity") or [0.0] * dim
+    numbers = isinstance(gravity, list) and all(isinstance(v, (int, float)) and math.isfinite(v) for v in gravity)
+    if not numbers or (dim and len(gravity) != dim):
+        return f"has a scene file whose gravity is {gravity!r:.100}"
+    for key, kind in (("material", dict), ("body", list), ("obstacle", list)):
+        things = words.get(key) or kind()
+        if not isinstance(things, kind):
+            return f"has a scene file whose {key} is no {kind.__name__}"
+        if not all(isinstance(v, dict) for v in (things.values() if isinstance(things, dict) else things)):
+            return f"has a scene file with a {key} that is no table"
+    return ""
+
+
 def _scene_problem(group: Any, size: int) -> tuple[str, dict[str, Any]]:
-    """What keeps a group from being a scene, "" for nothing, and its attributes."""
+    """What keeps a group from being a scene, "" for nothing, and its attributes; the errors of h5py."""
     h5py = h5py_module()
-    try:
-        for name in group:
-            hard = isinstance(group.get(name, getlink=True), h5py.HardLink)
-            data = group[name] if hard else None
-            if not isinstance(data, h5py.Dataset) or data.dtype.kind not in "fiu":
-                return f"has {name!r}, which is no array of numbers", {}
-            if problem := storage_problem(h5py, data, size):
-                return f"has {name!r}, {problem}", {}
-        attributes = dict(group.attrs)
-        if not all(isinstance(v, (str, np.integer, np.floating)) for v in attributes.values()):
-            return "has attributes that are neither text nor numbers", {}
-        if "position" in group and group["position"].ndim != 3:
-            return "has positions that are not [T, N, D]", {}
-        if len(group) and "position" not in group:
-            return "has no positions", {}
-    except (OSError, RuntimeError, ValueError, KeyError, TypeError) as error:
-        return f"cannot be read ({error})", {}
+    for name in group:
+        hard = isinstance(group.get(name, getlink=True), h5py.HardLink)
+        data = group[name] if hard else None
+        if not isinstance(data, h5py.Dataset) or data.dtype.kind not in "fiu":
+            return f"has {name!r}, which is no array of numbers", {}
+        if problem := storage_problem(h5py, data, size):
+            return f"has {name!r}, {problem}", {}
+    attributes = dict(group.attrs)
+    if not all(isinstance(v, (str, np.integer, np.floating)) for v in attributes.values()):
+        return "has attributes that are neither text nor numbers", {}
+    if len(group) and ("position" not in group or not _is_positions(group["position"])):
+        return "has no positions [T, N, 2 or 3]", {}
+    for name in group:
+        frames, particles, _ = group["position"].shape
+        shape, kind = group[name].shape, group[name].dtype
+        if shape[:2] != (frames, particles) and shape != (particles,):
+            return f"has {name!r} of shape {list(shape)}, which is neither [T, N, ...] nor [N]", {}
+        if kind.str not in STORED or (name == "particle_type" and (kind.kind != "i" or len(shape) != 1)):
+            return f"has {name!r} of type {kind} and shape {list(shape)}", {}
     return "", {name: v if isinstance(v, str) else v.item() for name, v in attributes.items()}

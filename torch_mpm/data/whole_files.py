@@ -20,6 +20,8 @@ NAME = re.compile(r"[A-Za-z0-9_-]+")
 LEFTOVER = re.compile(r"\.(?P<machine>\w+)-(?P<process>\d{1,18})\.building(\.\w+)?$")
 """End of the name of what is not whole yet."""
 CHECKSUM = "checksum"
+MOST = 2**53
+"""Of the whole numbers in records: larger ones are no numbers of anything."""
 PART_BYTES = 2**25
 """Of a file that is hashed in parts."""
 MOST_HASHERS = 4
@@ -63,6 +65,13 @@ def check_record(values: dict[str, Any], path: Path, remedy: str) -> None:
     """
     if values.pop(CHECKSUM, None) != checksum(values):
         raise DamagedFileError(path, "is damaged or was changed: its checksum is wrong", remedy)
+
+
+def count(value: Any, least: int = 0) -> int:
+    """A whole number of a record, at most `MOST`; anything else is a ValueError."""
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not least <= value <= MOST or value % 1:
+        raise ValueError(f"a number must be whole and within {least} and {MOST}, got {value!r:.100}")
+    return int(value)
 
 
 def check_inside(folder: Path, path: Path, remedy: str) -> None:

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from .. import optional
 from ..files import check_file
 from ..surface_mesh import Array
 
@@ -68,10 +69,7 @@ def triangles(source: str | Path | Any) -> tuple[Array, Array]:
     Raises:
         ImportError, OSError, ValueError: as `load`.
     """
-    try:
-        import trimesh
-    except ImportError as error:
-        raise ImportError("a mesh shape needs trimesh: pip install torch-mpm[mesh]") from error
+    trimesh = optional.load("trimesh", "a mesh shape", "mesh")
     mesh: Any = source
     if not isinstance(source, trimesh.Trimesh):
         check_file(source, "mesh")
@@ -84,6 +82,8 @@ def triangles(source: str | Path | Any) -> tuple[Array, Array]:
     vertices, faces = np.array(mesh.vertices, dtype=np.float64), np.array(mesh.faces, dtype=np.int64)
     if len(faces) == 0:
         raise ValueError(f"mesh {source} holds no triangles")
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise ValueError(f"a triangle of mesh {source} has corner {faces.max()}, and there are {len(vertices)} corners")
     if not np.isfinite(vertices).all():
         raise ValueError(f"vertices of mesh {source} must be finite")
     return vertices, _without_points(faces)
@@ -186,12 +186,9 @@ def _parts(count: int, pairs: Array) -> tuple[int, Array]:
 
 
 def _scipy() -> Any:
-    try:
-        import scipy.sparse.csgraph
-        import scipy.spatial
-    except ImportError as error:
-        raise ImportError("the repair of a mesh needs scipy: pip install torch-mpm[mesh]") from error
-    return scipy
+    for module in ("scipy.sparse.csgraph", "scipy.spatial"):
+        optional.load(module, "the repair of a mesh", "mesh")
+    return optional.load("scipy", "the repair of a mesh", "mesh")
 
 
 def places(edges: Array) -> str:

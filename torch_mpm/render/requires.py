@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
-import importlib
+import sys
 from typing import Any
+
+from .. import memory, optional
+
+SIZES = {"vtk": 1.5e9}
+"""Address space that the import of a package takes [bytes]: VTK crashes where it gets less."""
 
 
 class RenderError(RuntimeError):
@@ -11,11 +16,12 @@ class RenderError(RuntimeError):
 
 
 def require(module: str) -> Any:
-    """Import `module` or say which extra brings it. Raises ImportError."""
-    try:
-        return importlib.import_module(module)
-    except ImportError as error:
-        raise ImportError(
-            f"pictures need the package {module.partition('.')[0]!r}, which is not installed: "
-            "pip install torch-mpm[render]"
-        ) from error
+    """Import `module` or say which extra brings it.
+
+    Raises:
+        ImportError, MemoryError: as `torch_mpm.optional.load`.
+    """
+    package = module.partition(".")[0]
+    if package in SIZES and package not in sys.modules:
+        memory.require(SIZES[package], f"the import of {package} for pictures")
+    return optional.load(module, "pictures", "render")

@@ -2,8 +2,10 @@
 
 try:
     import pydantic as _pydantic  # noqa: F401
-except ImportError as error:
-    raise ImportError("scene files need pydantic: pip install torch-mpm[scene]") from error
+except (ImportError, MemoryError):
+    from ..optional import load as _load
+
+    _load("pydantic", "scene files", "scene")  # raises with the reason
 
 from .explain import SceneError
 from .scene import Scene

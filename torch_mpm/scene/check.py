@@ -263,7 +263,7 @@ def _size_problems(scene: Any, entries: Sequence[Any]) -> Iterator[str]:
     room = (
         f"{seed.MOST} can be numbered"
         if total > seed.MOST
-        else f"they take {total * PARTICLE_BYTES / 1e9:.3g} GB, and {free / 1e9:.3g} GB are free"
+        else f"they take {memory.in_words(total * PARTICLE_BYTES)}, and {memory.in_words(free)} are free"
     )
     key = max(counts, key=lambda name: counts[name]).partition("|")[2]
     yield (

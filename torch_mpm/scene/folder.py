@@ -16,6 +16,7 @@ from ..data.trajectory import COMPLETE, PARTIAL, Layout, Trajectory, create
 from ..data.whole_files import check_inside, check_record, write_record
 from ..errors import DamagedFileError
 from ..files import check_file
+from ..memory import in_words
 from .scene import Scene
 
 RUN, CHECKPOINT, LAST_GOOD, LOCK = "run.json", "checkpoint.h5", "last_good.h5", "run.lock"
@@ -104,7 +105,7 @@ def prepare(folder: Path, scene: Scene, layout: Layout, fingerprint: str) -> Non
         free = shutil.disk_usage(folder).free
         if layout.bytes > free:
             raise OutputError(
-                f"the trajectory needs {layout.bytes / 1e9:.2f} GB in {folder}, where {free / 1e9:.2f} GB are free; "
+                f"the trajectory needs {in_words(layout.bytes)} in {folder}, where {in_words(free)} are free; "
                 "free some space, lower fps or leave out output.fields"
             )
         create(folder / PARTIAL, layout)

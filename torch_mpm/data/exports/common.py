@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ...memory import in_words
 from ..folder import DatasetError, DatasetFolder
 from ..metadata import metadata, write_metadata
 from ..statistics import BOUNDARY
@@ -55,17 +56,12 @@ class Export:
         """The valid scenes of a split that have particles, by id.
 
         Raises:
-            DatasetError: for a scene that loaders could not read: another number of frames, no or unknown types.
+            DatasetError: for a scene that loaders could not read: no or unknown types.
             DamagedFileError: for a scene that is damaged.
         """
         for number in exported_ids(self.dataset, split):
             stored = self.dataset.scene(number)
             position = np.ascontiguousarray(stored["position"], np.float32)
-            if len(position) != self.dataset.record.frames:
-                raise DatasetError(
-                    f"scene {number} must have the {self.dataset.record.frames} frames of the data set, "
-                    f"got {len(position)}"
-                )
             if "particle_type" not in stored:
                 raise DatasetError(f"scene {number} must have particle_type [N]")
             kind = stored["particle_type"]
@@ -126,7 +122,7 @@ def _require_room(dataset: DatasetFolder, folder: Path) -> None:
     wanted = 4 * particles * dataset.record.frames * dataset.record.dim
     free = shutil.disk_usage(folder).free
     if wanted > free:
-        room = f"the positions need {wanted / 1e9:.2f} GB, and {free / 1e9:.2f} GB are free"
+        room = f"the positions need {in_words(wanted)}, and {in_words(free)} are free"
         raise OSError(errno.ENOSPC, room, str(folder.parent))
 
 

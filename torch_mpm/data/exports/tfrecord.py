@@ -15,6 +15,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
+from ... import optional
 from ..folder import DatasetError, DatasetFolder
 from .common import Array, ExportedScene, exported_ids, exporting, fields_of
 
@@ -82,11 +83,7 @@ def _frames(scene: ExportedScene, fields: Sequence[str], context: Array | None) 
 
 
 def _crc32c() -> Any:
-    try:
-        from google_crc32c import value
-    except ImportError as error:
-        raise ImportError("TFRecord files need google-crc32c: pip install torch-mpm[data]") from error
-    return value
+    return optional.load("google_crc32c", "TFRecord files", "data").value
 
 
 def _write_record(file: BinaryIO, data: bytes, checksum: Any) -> None:

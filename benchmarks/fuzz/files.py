@@ -1,0 +1,274 @@
+"""Command lines, files from elsewhere, damaged data sets and limits of memory: no command trusts any of them.
+
+    python -m benchmarks.fuzz.files --lines 600 --inputs 200 --shards 100 --records 1000 --memory 500 --seed 0
+
+Counts crashes, tracebacks, calls that do not end, success that is none, messages that nobody can read, and whatever is
+written outside of the folder that a command is given; the exit status is 1 if there is any. A fault is printed with
+the number of its case and all that the command printed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import io
+import os
+import random
+import re
+import shutil
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from torch_mpm import Trajectory, cli
+
+from .. import common as benchmark
+from . import command_lines, common, forged_shards, hostile_inputs, mutated_records
+
+COLUMNS = ("crash", "traceback", "wrong exit status 0", "time limit", "unclear message", "written outside")
+MOST_LETTERS, MOST_LINES = 24_000, 60
+"""Of a message: more is not read."""
+UNCLEAR = re.compile(r"^torch-mpm: ?(['\"]?[\w.]*['\"]?)?$|Error\b.*object at 0x", re.MULTILINE)
+"""Messages that say nothing: none at all, or a single word."""
+SCENE = """
+device = "cpu"
+gravity = [0.0, -10.0]
+duration = 0.02
+fps = 100
+output.fields = ["F"]
+grid = {lower = [0.0, 0.0], upper = [1.0, 1.0], dx = 0.1, walls = "separate"}
+material.jelly = {law = "neo_hookean", E = 1e4}
+[[body]]
+shape = "sphere"
+center = [0.5, 0.5]
+radius = 0.15
+material = "jelly"
+[[obstacle]]
+shape = "sphere"
+center = [0.5, 0.1]
+radius = 0.1
+[[emitter]]
+center = [0.8, 0.8]
+radius = 0.06
+velocity = [-1.0, 0.0]
+material = "jelly"
+"""
+SET = """
+device = "cpu"
+gravity = [0.0, -10.0]
+grid = {lower = [0.0, 0.0], upper = [1.0, 1.0], dx = 0.1, walls = "separate"}
+[dataset]
+splits = {train = 2, test = 1}
+frames = 4
+interval = 0.005
+scenes_per_shard = 2
+fields = ["velocity", "F", "stress"]
+[material.jelly]
+law = "neo_hookean"
+E = {log_uniform = [1e4, 1e5]}
+[[body]]
+count = {integers = [1, 2]}
+material = "jelly"
+center = {in_box = [[0.2, 0.4], [0.8, 0.8]]}
+choice = [{shape = "sphere", radius = 0.12}]
+[[obstacle]]
+shape = "sphere"
+center = [0.5, 0.15]
+radius = 0.1
+"""
+
+
+class Fuzz:
+    """The cases of all parts, in one temporary folder.
+
+    ``inputs`` hold a scene, a configuration, a run and a data set, ``out`` is what commands write, ``here`` is the
+    folder that they start in.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.good = folder, folder / "good"
+        self.case, self.here = folder / "case", folder / "here"
+        self.inputs, self.out = self.case / "in", self.case / "out"
+        for made in (self.good, self.here):
+            made.mkdir()
+        (self.good / "scene.toml").write_text(SCENE)
+        (self.good / "set.toml").write_text(SET)
+        self._succeed("run", self.good / "scene.toml", "-o", self.good / "run", "--quiet")
+        self._succeed("generate", self.good / "set.toml", "-o", self.good / "set", "--quiet")
+        self._succeed("finalize", self.good / "set")
+        hostile_inputs.prepare(self.good)
+        self._warm()
+        self.around = self._outside()
+
+    def _succeed(self, *arguments: object) -> None:
+        """In this process, so that the children find everything imported."""
+        printed = io.StringIO()
+        with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed):
+            status = cli.main([str(a) for a in arguments])
+        if status:
+            raise RuntimeError(f"{arguments} ended with exit status {status}: {printed.getvalue()}")
+
+    def _warm(self) -> None:
+        """Import what the commands need: a child would do so in each case."""
+        made = self.folder / "warm"
+        for arguments in (
+            ["stats", self.good / "set", "-o", made / "x.png"],
+            ["render", self.good / "set", "-o", made / "pictures", "--no-video"],
+            *(["export", self.good / "set", "-o", made / name, "--format", name] for name in command_lines.FORMATS[:4]),
+        ):
+            self._succeed(*arguments)
+        shutil.rmtree(made)
+
+    def _outside(self) -> dict[str, tuple[int, int]]:
+        """Sizes and times of all files that no command may change."""
+        places = [p for top in (self.good, self.here) for p in (top, *top.rglob("*"))] + list(self.folder.iterdir())
+        return {str(p): (s.st_size, s.st_mtime_ns) for p in places if p != self.case and (s := p.lstat())}
+
+    @contextlib.contextmanager
+    def prepared(self) -> Iterator[None]:
+        """Fresh inputs for a case, removed after it."""
+        shutil.copytree(self.good, self.inputs, symlinks=True)
+        try:
+            yield
+        finally:
+            shutil.rmtree(self.case)
+
+    def faults(self, arguments: Iterable[object], must_fail: bool = False, **limits: Any) -> Iterator[str]:
+        """Run a command in a child process; yields what is wrong with how it ends."""
+        words = [str(a) for a in arguments]
+
+        def work() -> int:
+            os.chdir(self.here)
+            return cli.main(words)
+
+        outcome = common.run(work, must_fail=must_fail, **{"seconds": 60.0, **limits})
+        found = [] if outcome.kind == "ok" else [outcome.kind]
+        if outcome.kind == "ok" and outcome.status == 0:
+            found += self._false_success(words)
+        elif outcome.kind == "ok":
+            lines = outcome.text.splitlines()
+            if len(outcome.text) > MOST_LETTERS or len(lines) > MOST_LINES or UNCLEAR.search(outcome.text):
+                found.append("unclear message")
+        if self._outside() != self.around:
+            found.append("written outside")
+            self.around = self._outside()
+        if found:
+            print(f"{[w if len(w) < 100 else w[:100] + '...' for w in words]}: {outcome.text[-3000:]!s}", flush=True)
+        yield from found
+
+    def _false_success(self, words: list[str]) -> Iterator[str]:
+        """Exit status 0 of a command whose result is not there, or is none."""
+        if words[0] == "run":
+            with Trajectory(Path(words[words.index("-o") + 1])) as read:
+                if not (read.complete and all(np.isfinite(frame["position"]).all() for frame in read)):
+                    yield "wrong exit status 0"
+        elif words[0] in ("export", "render", "stats") and "-o" in words:
+            made = Path(words[words.index("-o") + 1])
+            if not made.exists() or (made.is_dir() and not any(made.iterdir())):
+                yield "wrong exit status 0"
+
+    # -- parts: each yields the faults of one case
+
+    def line(self, rng: random.Random) -> Iterator[str]:
+        with self.prepared():
+            yield from self.faults(command_lines.random_line(rng, self.inputs, self.out), memory=2 << 30)
+
+    def input(self, rng: random.Random) -> Iterator[str]:
+        with self.prepared():
+            command, what = hostile_inputs.hostile(self.inputs, self.out, rng)
+            found = list(self.faults(command, memory=2 << 30))
+            if found:
+                print(f"  {what}", flush=True)
+            yield from found
+
+    def shard(self, rng: random.Random) -> Iterator[str]:
+        with self.prepared():
+            what, wrong = forged_shards.forge(self.inputs / "set", rng)
+            yield from self._read_set(what, wrong, rng)
+
+    def record(self, rng: random.Random) -> Iterator[str]:
+        with self.prepared():
+            what, wrong = mutated_records.mutate(self.inputs, rng)
+            if what.startswith("run"):
+                run = self.inputs / "run"
+                resume = ["run", self.inputs / "scene.toml", "-o", run, "--resume", "--quiet"]
+                command = rng.choice([["render", run], ["export", run], resume])
+                found = list(self.faults(command, wrong and command[0] != "export"))  # which needs no record
+                if found:
+                    print(f"  {what}", flush=True)
+                yield from found
+            else:
+                yield from self._read_set(what, wrong, rng)
+
+    def _read_set(self, what: str, wrong: bool, rng: random.Random) -> Iterator[str]:
+        """`verify`, which must see whatever is ``wrong``, and another command that reads the data set."""
+        folder = self.inputs / "set"
+        found = list(self.faults(["verify", folder], wrong, memory=2 << 30))
+        others: list[list[Any]] = [
+            ["stats", folder, "-o", self.out / "x.png"],
+            ["finalize", folder],
+            ["render", folder, "-o", self.out, "--no-video"],
+            ["generate", self.inputs / "set.toml", "-o", folder, "--quiet"],
+            ["generate", self.inputs / "set.toml", "-o", folder, "--quiet", "--extend", "train=3"],
+            *(["export", folder, "-o", self.out, "--format", name] for name in command_lines.FORMATS),
+        ]
+        found += list(self.faults(rng.choice(others), memory=2 << 30))
+        if found:
+            print(f"  {what}", flush=True)
+        yield from found
+
+
+def fuzz(folder: Path, counts: dict[str, int], seed: int) -> list[dict[str, Any]]:
+    """A row of counts for each part: ``counts`` says how many cases of each."""
+    program = Fuzz(folder)
+    parts: dict[str, Callable[[random.Random], Iterator[str]]] = {
+        "lines": program.line, "inputs": program.input, "shards": program.shard, "records": program.record,
+    }  # fmt: skip
+    rows = []
+    for part, work in parts.items():
+        faults: Counter[str] = Counter()
+        begin = time.monotonic()
+        for number in range(counts[part]):
+            found = list(work(random.Random(f"{seed} {part} {number}")))
+            if found:
+                print(f"{part} {number}: {', '.join(sorted(set(found)))}\n", flush=True)
+            faults.update(found)
+        seconds = time.monotonic() - begin
+        rows.append({"part": part, "cases": counts[part], **{c: faults[c] for c in COLUMNS}, "seconds": seconds})
+    return rows
+
+
+COUNTS = {"lines": 600, "inputs": 200, "shards": 100, "records": 1000}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    for part, count in COUNTS.items():
+        parser.add_argument(f"--{part}", type=int, default=count)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--out", type=Path, default=benchmark.RESULTS)
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)  # before the first fork
+    folder = Path(tempfile.mkdtemp())  # a TemporaryDirectory would be removed by the first child that ends
+    try:
+        rows = fuzz(folder, {part: getattr(arguments, part) for part in COUNTS}, arguments.seed)
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+    names = ("part", "cases", *COLUMNS, "seconds")
+    table = benchmark.table(names, [[row[name] for name in names] for row in rows])
+    print(table)
+    result = {"environment": benchmark.environment(), "seed": arguments.seed, "rows": rows}
+    text = f"# Fuzzed files\n\n{benchmark.describe(result['environment'])}\n\nseed {arguments.seed}\n\n{table}"
+    benchmark.write(arguments.out, "fuzz_files", result, text)
+    sys.exit(any(row[column] for row in rows for column in COLUMNS))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,105 @@
+"""Errors of memory are recognised in whatever words they come, and say what was wanted."""
+
+import errno
+import os
+import sys
+
+import numpy as np
+import pytest
+import torch
+
+from torch_mpm import cli, memory, optional
+
+
+def raised(work):
+    with pytest.raises(Exception) as info:
+        work()
+    return info.value
+
+
+SHORT = [
+    MemoryError(),
+    OSError(errno.ENOMEM, os.strerror(errno.ENOMEM)),
+    OSError("Can't synchronously read data (memory allocation failed for data chunk)"),
+    OSError("Unable to synchronously open file (unable to allocate memory block)"),
+    RuntimeError("std::bad_alloc"),
+    RuntimeError("can't start new thread"),
+    ImportError("libvtkCommonCore.so: failed to map segment from shared object"),
+    ImportError("libhdf5.so: cannot allocate memory"),
+    torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB."),
+]
+OTHERS = [
+    ValueError("E must be positive"),
+    OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)),
+    OSError("Can't synchronously read data (inflate() failed)"),
+    ImportError("libGL.so.1: cannot open shared object file"),
+    None,
+]
+
+
+@pytest.mark.parametrize("error", SHORT, ids=str)
+def test_errors_of_memory(error):
+    assert memory.is_short(error)
+    other = ValueError("the scene cannot be read")
+    other.__cause__ = error
+    assert memory.is_short(other)
+
+
+@pytest.mark.parametrize("error", OTHERS, ids=str)
+def test_other_errors(error):
+    assert not memory.is_short(error)
+
+
+def test_errors_of_numpy_and_torch_say_what_was_wanted():
+    of_torch = raised(lambda: torch.empty(2**60, dtype=torch.int8))
+    of_numpy = raised(lambda: np.empty(2**60, np.int8))
+    assert memory.is_short(of_torch) and memory.shortage(of_torch).startswith("1.15e+09 GB were wanted; ")
+    assert memory.is_short(of_numpy) and "Unable to allocate 1.00 EiB" in memory.shortage(of_numpy)
+
+
+def test_the_limit_of_the_process_counts(monkeypatch):
+    taken = memory.available
+    limit = 2**60
+    monkeypatch.setattr(memory.resource, "getrlimit", lambda kind: (limit, limit))
+    assert taken() < 2**60
+    limit = 2**20  # below what is taken
+    assert memory.available() == 0
+    with pytest.raises(MemoryError, match=r"a picture takes about 1\.5 GB, and 0 bytes are available"):
+        memory.require(1.5e9, "a picture")
+    assert "of the 1.05 MB of address space that this process may take" in memory.shortage(MemoryError())
+
+
+@pytest.mark.parametrize(
+    ("error", "kind", "message"),
+    [
+        (ModuleNotFoundError("No module named 'foreign'", name="foreign"), ImportError, r"not installed: pip install"),
+        (ModuleNotFoundError("No module named 'other'", name="other"), ImportError, "is installed and cannot be"),
+        (
+            ImportError("libx.so: cannot open shared object file"),
+            ImportError,
+            "is installed and cannot be imported: libx",
+        ),
+        (ImportError("libx.so: failed to map segment from shared object"), MemoryError, "too little memory to import"),
+        (MemoryError(), MemoryError, "too little memory to import"),
+        (OSError(errno.ENOMEM, os.strerror(errno.ENOMEM)), MemoryError, "too little memory to import"),
+    ],
+)
+def test_an_installed_package_is_not_called_missing(monkeypatch, error, kind, message):
+    class Finder:
+        @staticmethod
+        def find_spec(name, path=None, target=None):
+            if name == "foreign":
+                raise error
+
+    monkeypatch.setattr(sys, "meta_path", [Finder, *sys.meta_path])
+    with pytest.raises(kind, match=message):
+        optional.load("foreign.part", "pictures", "render")
+
+
+def test_the_command_line_says_what_was_wanted(monkeypatch, capsys):
+    def command(options):
+        torch.empty(2**60, dtype=torch.int8)
+
+    monkeypatch.setattr(cli, "_schema", command)
+    assert cli.main(["schema"]) == 1
+    assert capsys.readouterr().err.startswith("torch-mpm: out of memory: 1.15e+09 GB were wanted; ")

@@ -1,0 +1,33 @@
+"""Packages of the extras, which may be missing."""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any
+
+from . import memory
+
+
+def load(module: str, purpose: str, extra: str) -> Any:
+    """Import a module of an optional package.
+
+    Args:
+        module: such as "scipy.spatial".
+        purpose: what needs it, such as "the repair of a mesh".
+        extra: of torch_mpm that brings it.
+
+    Raises:
+        ImportError: for a package that is not installed, or one that is and cannot be imported, with the reason.
+        MemoryError: where there is too little memory to import it.
+    """
+    package = module.partition(".")[0]
+    try:
+        return importlib.import_module(module)
+    except (ImportError, OSError, MemoryError, RuntimeError) as error:
+        if memory.is_short(error):
+            raise MemoryError(f"{purpose}: too little memory to import {package} ({error})") from error
+        if isinstance(error, ModuleNotFoundError) and (error.name or "").partition(".")[0] == package:
+            raise ImportError(
+                f"{purpose}: the package {package} is not installed: pip install torch-mpm[{extra}]"
+            ) from error
+        raise ImportError(f"{purpose}: the package {package} is installed and cannot be imported: {error}") from error
