@@ -447,25 +447,25 @@ def raw_arguments(device: str) -> list:
     grid = box(2, scenes=2, max_blocks=64, deterministic=True)
     ball = [mpm.Sphere((0.5, 0.4), 0.1)]
     laws = ("von_mises,neo_hookean", [0, 0], [scalar, scalar, 0.01 * scalar, scalar, scalar, 0.5 * scalar], [1, 0])
-    particles = (state.x, state.v, state.mass, state.volume, 0.1 * F.to(device), F.to(device), None, [state.mass * 0])
+    particles = (state.x, state.v, state.mass, state.volume, 0.1 * F.to(device), F.to(device), None, 1e-9 * state.x)
     how = (3, DT, True, 0.9, True, 0, torch.randn(2, D, generator=g, dtype=F64).to(device))
     walls = wall_arguments(mpm.Walls("slip"), grid)
     obstacles = obstacle_arguments(ball, state.x, 2)
     impulse = torch.randn(2, 5, 3, generator=g, dtype=F64).to(device)
     rest = (*walls, *obstacles, 0.0, 2, 64, False, False, False, impulse, None, None, *grid.packed)
-    return [*particles, scene, None, material, None, *laws, *how, *rest]
+    return [*particles, [state.mass * 0], scene, None, material, None, *laws, *how, *rest]
 
 
 def test_the_raw_ops(device):
     call = raw_arguments(device)
-    wanted = (0, 1, 2, 3, 4, 5, 22, 40)
+    wanted = (0, 1, 2, 3, 4, 5, 23, 41)
     given = [t.clone().requires_grad_() if i in wanted else t for i, t in enumerate(call)]
     torch.library.opcheck(torch.ops.torch_mpm.substeps.default, tuple(given), raise_exception=True)
-    recorded = (*given[:39], True, None, *given[41:])
+    recorded = (*given[:40], True, None, *given[42:])
     checks = ("test_schema", "test_faketensor")  # others compare bytes that nobody has written
     torch.library.opcheck(torch.ops.torch_mpm.substeps.default, recorded, test_utils=checks, raise_exception=True)
     grads = [torch.randn_like(t) for t in torch.ops.torch_mpm.substeps(*call)[:6] if t is not None]
-    adjoint = (*grads[:4], None, grads[4], torch.ones_like(call[40]), 15, None, *call)
+    adjoint = (*grads[:4], None, grads[4], torch.ones_like(call[41]), 15, None, *call)
     torch.library.opcheck(torch.ops.torch_mpm.substeps_backward.default, adjoint, raise_exception=True)
     with pytest.raises(RuntimeError, match=r"grad_x must have shape \[40, 2\]"):
         torch.ops.torch_mpm.substeps_backward(grads[0][:3], *adjoint[1:])

@@ -615,7 +615,7 @@ def test_the_raw_op(device):
     x, scalar = state.x, torch.tensor(2e3, dtype=F64, device=device)
     eye = torch.eye(3, dtype=F64, device=device).repeat(40, 1, 1)
     grid = box(max_blocks=64)
-    particles = (x, state.v, state.mass, state.volume, None, eye, None, [state.mass * 0], None, None, None, None)
+    particles = (x, state.v, state.mass, state.volume, None, eye, None, 1e-9 * x, [state.mass * 0], *[None] * 4)
     law = ("von_mises", [0], [scalar, scalar, 0.01 * scalar, scalar], [1])
     rest = (
         None,
@@ -644,15 +644,16 @@ def test_the_raw_op(device):
     call = (*particles, *law, 2, 1e-4, True, 0.0, True, 0, *rest)
     checks = ("test_schema", "test_faketensor", "test_aot_dispatch_dynamic")
     for how in ((True, 0.0, True), (True, 0.9, True), (False, 1.0, True), (False, 0.0, False)):
-        given = (*call[:18], *how, *call[21:])
+        given = (*call[:19], *how, *call[22:])
         torch.library.opcheck(torch.ops.torch_mpm.substeps.default, given, test_utils=checks)
     for wrong, place, message in (
-        ("sand", 12, "law must be one of"),
-        ([0, 0], 13, "options must have an entry per law"),
-        ([scalar], 14, "parameters and history must have those of all laws"),
-        (0, 16, "n must be 1 to 65536"),
-        (-1.0, 17, "dt must be positive"),
-        (1.5, 19, "flip must be between 0 and 1"),
+        ("sand", 13, "law must be one of"),
+        ([0, 0], 14, "options must have an entry per law"),
+        ([scalar], 15, "parameters and history must have those of all laws"),
+        (0, 17, "n must be 1 to 65536"),
+        (-1.0, 18, "dt must be positive"),
+        (1.5, 20, "flip must be between 0 and 1"),
+        (x[:3], 7, r"residual must have shape \[40, 3\]"),
     ):
         with pytest.raises(RuntimeError, match=message):
             torch.ops.torch_mpm.substeps(*call[:place], wrong, *call[place + 1 :])

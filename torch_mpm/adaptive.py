@@ -99,7 +99,7 @@ def rollout_to(
     check_number("longest", longest, "positive", lambda v: v > 0)
     check_count("every", every, 1)
     check_count("most", most, 1)
-    given = step.prepare(state)
+    given = _compensated(step, step.prepare(state), cfl, longest)
     unsorted = in_no_order(given, most)
     start = put_in_order(step, given) if unsorted else given
     clocks = Clocks(step, start, time, cfl, longest, most, previous)
@@ -110,6 +110,14 @@ def rollout_to(
         arrival = clocks.arrival()
         arrival = arrival._replace(state=left(arrival.state))
     return arrival._replace(state=put_back(step, arrival.state, start, given)) if unsorted else arrival
+
+
+def _compensated(step: Step, state: State, cfl: float, longest: float) -> State:
+    """With the residual of positions where the first substeps need it; waits for the device, as `Clocks.look` does."""
+    if step.compensated is None and state.x_residual is None:
+        limit = step.stable_dt(state, cfl)
+        longest = min(longest, float(torch.where(limit > 0, limit, math.inf).amin())) if len(limit) else longest
+    return step.with_residual(state, longest)
 
 
 class Clocks:

@@ -197,6 +197,8 @@ class Captured:
         step = self._step
         prepare = getattr(step, "prepare", None)
         state = state if prepare is None else prepare(state)
+        if isinstance(step, Step):
+            state = step.with_residual(state, self._dt)
         if isinstance(step, Step) and state.C is None and (step.transfer == "apic" or step.law.viscous):
             state = state.replace(C=state.x.new_zeros(*state.x.shape, state.x.shape[1]))  # as after the first step
         return state.replace(time=time_tensor(state))
@@ -224,7 +226,7 @@ class Captured:
 
 
 _MOVED = ("x", "v", "C", "F", "J", "temperature", "impulse")
-"""Fields that steps change."""
+"""Fields that steps change, and that have gradients."""
 
 
 def _with(state: State, tensors: Mapping[str, Any]) -> State:

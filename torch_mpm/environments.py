@@ -367,6 +367,8 @@ def _pairs(state: State, given: State) -> list[tuple[str, Tensor, Tensor]]:
     """The fields of two states of the same kind by name."""
     if (given.x.dtype, given.x.device) != (state.x.dtype, state.x.device):
         raise ValueError(f"states must be {state.x.dtype} on {state.x.device}, got {given.x.dtype} on {given.x.device}")
+    if (state.x_residual is None) != (given.x_residual is None):  # which steps add where they need it
+        given = given.replace(x_residual=None if state.x_residual is None else torch.zeros_like(given.x))
     old, new = ({name: getattr(s, name) for name in PARTICLE_FIELDS} | s.extra for s in (state, given))
     for name in dict.fromkeys([*old, *new]):
         if (old.get(name) is None) != (new.get(name) is None):

@@ -15,6 +15,7 @@ from torch import Tensor
 from . import resolution
 from .capture import is_captured, is_traced, outside_transforms
 from .errors import (
+    FLOATING,
     GridOverflowError,
     check_count,
     check_flag,
@@ -65,6 +66,10 @@ class Grid(Lattice):
     The first use with positions of a dtype warns (`PrecisionWarning`) where their rounding exceeds dx / 1000, and
     raises ValueError where it exceeds dx / 16.
 
+    Attributes:
+        reach: largest absolute coordinate of the domain [m].
+        extent: length of its longest side [m].
+
     Raises:
         TypeError, ValueError: for a wrong argument, a lattice of 2^31 blocks or more, or a domain so far from zero that
             not even float64 resolves dx.
@@ -108,6 +113,9 @@ class Grid(Lattice):
             raise ValueError(f"max_blocks must be between 0 and {self._most_blocks} blocks, got {max_blocks}")
         self.max_blocks = max_blocks
         self._grows = max_blocks is None
+        self.reach = max(map(abs, (*corner, *self.upper)))
+        self.extent = max(b - a for a, b in zip(corner, self.upper, strict=True))
+        self._rounding = {dtype: resolution.rounding(self.reach, dtype) for dtype in FLOATING}
         self._resolved: set[torch.dtype] = set()
         self.check_resolution(torch.float64)
         self._pending: torch.cuda.Event | None = None
@@ -155,10 +163,9 @@ class Grid(Lattice):
                 blocks = self._activate(x, scene, previous, self.follow(wanted), ids)
         return blocks
 
-    @property
-    def reach(self) -> float:
-        """Largest absolute coordinate of the domain [m]."""
-        return max(map(abs, (*self.lower, *self.upper)))
+    def rounding(self, dtype: torch.dtype) -> float:
+        """Largest error with which positions of a dtype in the domain are stored [m]."""
+        return self._rounding[dtype]
 
     def check_resolution(self, dtype: torch.dtype) -> None:
         """Report a domain whose cells positions of a dtype do not resolve, once for each dtype.

@@ -130,6 +130,9 @@ def _taken(
     graph: int | None = None,
 ) -> State:
     """The state n steps later, of which the first is step `first` of a rollout, if possible by graphs of so many."""
+    if isinstance(step, Step):
+        check_state(state)
+        state = step.with_residual(state, dt)
     if kept is not None and not torch.is_grad_enabled():
         kept = None
     keeps_all = False
@@ -479,7 +482,7 @@ def substeps_arguments(
         check_count("blocks", blocks)
     if (reason := obstacle_to_substeps(step, state, dt)) is not None:
         raise ValueError(f"step must be one that `substeps` can take, got one of which {reason}")
-    return _arguments(step, step.prepare(state), n, dt, records, blocks)[0]
+    return _arguments(step, step.with_residual(step.prepare(state), dt), n, dt, records, blocks)[0]
 
 
 def _arguments(
@@ -499,6 +502,7 @@ def _arguments(
     with_gradient = torch.is_grad_enabled() and (of_table or _differentiates(step, state, dt))
     arguments = (
         *(state.x, state.v, state.mass, state.volume, state.C, state.F, state.J),
+        None if state.x_residual is None else state.x_residual.detach(),
         *(calls.history, state.scene, state.ids, calls.material, step._activations.status_for(state.x)),
         *(calls.names, calls.options, calls.parameters, calls.variables),
         *(int(n), number, apic, step._flip_share, apic or step.law.viscous, STRESS_FORMS[step.stress_form]),
@@ -517,7 +521,7 @@ def _substeps(step: Step, state: State, n: int, dt: float | Tensor, records: boo
     grid, record = step.grid, step._activations
     record.begin(state, grid.scenes)
     arguments, history_names = _arguments(step, state, n, dt, records, blocks)
-    x, v, C, F, J, history, status, impulse, time, _ = interruptible(
+    x, v, C, F, J, history, status, impulse, time, residual, _ = interruptible(
         dispatch, torch.ops.torch_mpm.substeps, *arguments.values()
     )
     record.follow(record.status, status)
@@ -529,7 +533,8 @@ def _substeps(step: Step, state: State, n: int, dt: float | Tensor, records: boo
     if requires_grad(dt) or requires_grad(state.time):
         known: Any = state.time + n * (dt.double() if isinstance(dt, Tensor) else dt)
         now = now + (known - known.detach())  # which has the gradient
-    return state.replace(x=x, v=v, C=C, F=F, J=J, extra=extra, time=now, impulse=impulse)
+    residual = None if residual is None else residual.detach()
+    return state.replace(x=x, v=v, C=C, F=F, J=J, extra=extra, time=now, impulse=impulse, x_residual=residual)
 
 
 def _in_shape(times: Tensor, time: float | Tensor, dt: float | Tensor) -> Tensor:

@@ -86,6 +86,8 @@ class State:
             number as a tensor [] of float64 on the CPU, so that it serves every time.
         impulse: of the material on each boundary of the step and then on each face of the domain, added up over steps
             [B, K + 2 D, D + 1 or 3] [N s, N m s], float64; see `torch_mpm.impulses`.
+        x_residual: what rounding has left out of the positions [P, D] [m]: a particle is at x + x_residual. None where
+            positions are not compensated; see `Step(compensated=)`. Constant for autograd.
 
     All floating tensors of the particles have one dtype and device. Any strides work; those that the ops return keep
     the particle index contiguous, which is fastest.
@@ -105,6 +107,7 @@ class State:
     extra: dict[str, Tensor] = dataclasses.field(default_factory=dict)
     time: float | Tensor = Time()  # type: ignore[assignment]
     impulse: Tensor | None = None
+    x_residual: Tensor | None = None
 
     _counted = None  # scenes, and the tensor and its version for which they are known; no field
 
@@ -115,6 +118,7 @@ class State:
             raise TypeError(f"x must be float32 or float64, got {self.x.dtype}")
         P, D = self.x.shape
         check_like("v", self.v, self.x, (P, D), "[P, D]", needed=True)
+        check_like("x_residual", self.x_residual, self.x, (P, D), "[P, D]")
         check_like("C", self.C, self.x, (P, D, D), "[P, D, D]")
         check_like("F", self.F, self.x, (P, D, D), "[P, D, D]")
         for name in ("mass", "volume", "J", "temperature"):
@@ -173,9 +177,9 @@ class State:
         return self.x.shape[0]
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Of a copy or a file, whose time may be of an earlier version, in float32."""
+        """Of a copy or a file, which may be of an earlier version, with a time in float32."""
         time = state.pop("_time")
-        self.__dict__.update(state)
+        self.__dict__.update({"x_residual": None} | state)  # which earlier versions lack
         self.time = time if isinstance(time, Tensor) else time[0].item()
 
     @property
@@ -258,6 +262,7 @@ class State:
         """Move to a device, and floating tensors of the particles to a dtype; as `torch.nn.Module.to`.
 
         `scene`, `ids`, `material` and whole numbers in `extra` keep their dtype, `time` and `impulse` stay in float64.
+        Positions in float64 include `x_residual`.
 
         Args:
             device: a device or its name; or a dtype alone; or a tensor, whose device and dtype are taken.
@@ -279,7 +284,12 @@ class State:
         def moved(t: Tensor, dtype: torch.dtype | None = None) -> Tensor:
             return t.to(device=device, dtype=dtype, non_blocking=non_blocking)
 
-        state = self.replace(impulse=None).map(lambda t: moved(t, dtype if t.is_floating_point() else None))
+        positions: dict[str, Tensor | None] = {"x_residual": self.x_residual}
+        if self.x_residual is not None and dtype not in (None, self.x.dtype):
+            positions = _rounded(self.x, self.x_residual, dtype)
+        state = self.replace(impulse=None, x_residual=None)
+        state = state.map(lambda t: moved(t, dtype if t.is_floating_point() else None))
+        state = state.replace(**{name: None if t is None else moved(t) for name, t in positions.items()})
         if isinstance(self.time, Tensor):
             state.time = moved(self.time)
         if self.poses:
@@ -352,8 +362,8 @@ class State:
         """Pack several states into one; differentiable.
 
         Args:
-            states: of one dimension, dtype and device. C, F and J that only some have are made as a step makes them:
-                zero, identity, one.
+            states: of one dimension, dtype and device. C, F, J and x_residual that only some have are made as a step
+                makes them: zero, identity, one, zero.
             scene: False packs parts of one batch, whose scenes stay as they are. True packs batches: the scenes of each
                 state follow those of the states before it, and each keeps its time and its impulses. Obstacles are
                 placed anew (see `Obstacle.place`).
@@ -533,7 +543,12 @@ def _joined(name: str, states: Sequence[State]) -> Tensor | None:
     values = [getattr(s, name) for s in states]
     if all(v is None for v in values):
         return None
-    make = {"C": _no_motion, "F": identity_deformation, "J": lambda x: torch.ones_like(x[:, 0])}.get(name)
+    make = {
+        "C": _no_motion,
+        "F": identity_deformation,
+        "J": lambda x: torch.ones_like(x[:, 0]),
+        "x_residual": torch.zeros_like,
+    }.get(name)
     if make is not None:
         values = [make(s.x.detach()) if v is None else v for s, v in zip(states, values, strict=True)]
     lacks = next((k for k, v in enumerate(values) if v is None), None)
@@ -551,6 +566,15 @@ def _extra(key: str, state: State, number: int, states: Sequence[State]) -> Tens
             "the states"
         )
     return state.extra[key]
+
+
+def _rounded(x: Tensor, residual: Tensor, dtype: torch.dtype) -> dict[str, Tensor | None]:
+    """Compensated positions in another dtype, with their residual in float32."""
+    exact = x.double() + residual
+    if dtype == torch.float64:
+        return {"x": exact, "x_residual": None}
+    rounded = exact.to(dtype)
+    return {"x": rounded, "x_residual": (exact - rounded).detach().to(dtype)}
 
 
 def _no_motion(x: Tensor) -> Tensor:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
@@ -13,9 +14,9 @@ from . import resolution
 from .activation_record import ActivationRecord
 from .boundaries import BoundaryList, Obstacle, Walls
 from .boundaries.control import control_step
-from .capture import GraphCache
+from .capture import GraphCache, is_captured, is_traced, is_transformed
 from .cfl import Figures, chosen_dt, figures_of, look
-from .errors import check_number, check_vector, shape_of
+from .errors import REAL, PrecisionWarning, check_flag, check_number, check_vector, shape_of
 from .failures import Failures, problems_of_state, raise_failures
 from .grid import Blocks, Grid, check_grid
 from .heat.heat import Heat
@@ -26,9 +27,10 @@ from .laws.custom import as_law
 from .laws.material import Material
 from .laws.mixture import Mixture
 from .node_contact import after_boundaries
-from .ops import Survey, fusible, g2p, g2p_advance, gather, grid_update, p2g, wall_impulses
-from .ops.arguments import check_choice, split_dt
+from .ops import Survey, fusible, g2p, gather, grid_update, p2g, wall_impulses
+from .ops.arguments import check_choice, soa_empty, split_dt
 from .ops.contact import MAX_OBSTACLES
+from .ops.g2p_advance import g2p_advance_compensated
 from .ops.transfer import STRESS_FORMS
 from .parameters import Overlay, TensorModule
 from .particle_operations import ParticleOperation, operated
@@ -72,6 +74,11 @@ class Step(TensorModule):
             [P]: particles that are not enabled take no part in the step and stay as they are. The time is that of the
             start of the step, and the number of particles stays.
         heat: conduction of heat in the same particles, see `Heat`; the state then needs a temperature.
+        compensated: whether what rounding leaves out of the positions is carried on (`State.x_residual`, compensated
+            summation), so that slow motion in small steps is not lost. None decides by the lattice, the dtype and dt:
+            where rounding may change the motion of a step by more than a thousandth at 1 m/s, or at the length of the
+            domain in a second where that is less. A state that has a residual keeps it. A tensor dt on CUDA is read
+            once, at the first such step, and later ones count as alike.
         integrator: "explicit"; or "implicit" or an `Implicit`, which solves for the node velocities with the forces at
             the end of the step (backward Euler), so that stiffness does not limit dt.
 
@@ -96,6 +103,9 @@ class Step(TensorModule):
     heat: Heat | None
     on_particles: ParticleOperation | None
     integrator: Implicit | None
+    compensated: bool | None = None
+    _warned = False
+    _read_dt: float | None = None
 
     def __init__(
         self,
@@ -111,6 +121,7 @@ class Step(TensorModule):
         heat: Heat | None = None,
         on_particles: ParticleOperation | None = None,
         integrator: str | Implicit = "explicit",
+        compensated: bool | None = None,
     ) -> None:
         super().__init__()
         self.grid = grid
@@ -125,6 +136,7 @@ class Step(TensorModule):
         self.heat = heat
         self.on_particles = on_particles
         self.integrator = integrator  # type: ignore[assignment]
+        self.compensated = compensated
         self._activations = ActivationRecord()
         self._kept_gravity = GraphCache()
 
@@ -170,7 +182,7 @@ class Step(TensorModule):
             ValueError, TypeError: for wrong shapes, dtypes or devices, or a number dt that is not positive.
             GridOverflowError: on the CPU, where a grid of fixed `max_blocks` is full.
         """
-        state = self.prepare(state)
+        state = self.with_residual(self.prepare(state), dt)
         if torch.compiler.is_compiling():
             return paused(self._advanced, self._activations, state, dt, self.grid.scenes)
         with control_step(self, state, 1, dt) as left:
@@ -212,12 +224,15 @@ class Step(TensorModule):
             velocity = from_half(self.on_grid(blocks, velocity, nodes[:, 0], dt), nodes)
         deformed = {name: fields.get(name, getattr(state, name)) for name in ("F", "J")}
         keeps_C = self.transfer == "apic" or law.viscous
-        x, v, C, F, J = g2p_advance(
-            blocks, state.x, velocity, dt, **deformed, affine=keeps_C or self.heat is not None, stress_form=form
+        x, v, C, F, J, residual = g2p_advance_compensated(
+            *(blocks, state.x, state.x_residual, velocity, dt),
+            **deformed,
+            affine=keeps_C or self.heat is not None,
+            stress_form=form,
         )
         if self._flip_share:  # positions move with the grid all the same, so that FLIP's noise does not reach them
             v, impulse = self._blend_flip(blocks, state, affine, v, impulse)
-        changes: dict[str, Any] = {**fields, "F": F, "J": J}
+        changes: dict[str, Any] = {**fields, "F": F, "J": J, "x_residual": residual}
         if state.impulse is not None and impulse is not None:
             changes["impulse"] = state.impulse + impulse
         if self.heat is not None:
@@ -241,6 +256,51 @@ class Step(TensorModule):
             check_impulse(self, state)
         state = (state.replace(**changes) if changes else state).of_scenes(self.grid.scenes)
         return state if self.heat is None else self.heat.prepare(state)
+
+    def with_residual(self, state: State, dt: float | Tensor) -> State:
+        """A state whose positions are compensated from here on where steps of dt [s] need it, see `compensated`.
+
+        Warns:
+            PrecisionWarning: where they would need it and `compensated` is False.
+        """
+        if self.compensated is False:
+            self._check_motion(state, dt)
+            return state if state.x_residual is None else state.replace(x_residual=None)
+        if state.x_residual is not None or not (self.compensated or self._loses_motion(state, dt)):
+            return state
+        return state.replace(x_residual=soa_empty(state.x, state.x.shape).zero_())
+
+    def _loses_motion(self, state: State, dt: float | Tensor) -> bool:
+        number = self._least_dt(dt) if isinstance(dt, Tensor) else dt
+        if not isinstance(number, REAL):
+            return False  # which the step refuses
+        return resolution.loses_motion(self.grid, state.x.dtype, number)
+
+    def _least_dt(self, dt: Tensor) -> float:
+        """The smallest positive entry [s]; infinite where there is none, or it is not known without its values."""
+        cuda = dt.device.type == "cuda"
+        if cuda and self._read_dt is not None:
+            return self._read_dt
+        if is_traced(dt) or is_captured(dt) or is_transformed():
+            return math.inf
+        values = dt.detach()
+        least = float(torch.where(values > 0, values, math.inf).amin()) if values.numel() else math.inf
+        if cuda:  # which has waited
+            self._read_dt = least
+        return least
+
+    def _check_motion(self, state: State, dt: float | Tensor) -> None:
+        """Warn of steps whose motion is lost, once for each step."""
+        if self._warned or torch.compiler.is_compiling() or not self._loses_motion(state, dt):
+            return
+        self._warned = True
+        warnings.warn(
+            f"rounding of positions in {str(state.x.dtype).removeprefix('torch.')} changes the motion in steps of "
+            f"dt = {dt} s, and what is slower than half a unit in the last place of a coordinate does not move: pass "
+            "Step(compensated=True) or None, or use float64",
+            PrecisionWarning,
+            stacklevel=4,
+        )
 
     def update_grid(
         self, blocks: Blocks, nodes: Tensor, state: Any, dt: float | Tensor
@@ -466,6 +526,8 @@ class Step(TensorModule):
         check_state(state)
         split_dt(dt, self.grid.scenes, state.x)
         way = self._way(state, dt)
+        if self.with_residual(state, dt).x_residual is not None:
+            way += ", with compensated positions"
         return way if speed is None else f"{way}; {compare(self, state, speed)}"
 
     def _way(self, state: State, dt: float | Tensor) -> str:
@@ -533,6 +595,8 @@ def _argument(step: Step, name: str, value: Any) -> Any:
         raise TypeError(f"on_grid must be a function, a module or None, got {shape_of(value)}")
     if name == "on_particles" and value is not None and not callable(value):
         raise TypeError(f"on_particles must be a function, a module or None, got {shape_of(value)}")
+    if name == "compensated" and value is not None:
+        return check_flag("compensated", value)
     if name == "integrator" and value is not None:
         integrator = as_integrator(value)
         check_explicit_materials(integrator, step.law)

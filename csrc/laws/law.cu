@@ -236,6 +236,8 @@ struct SettlingSource : LawMomentumSource<Law, T, D, true> {
     store_vector<D>(at, settling.x, read_vector(Base::position, p));
     store_scalar(at, settling.mass, m.mass);
     store_scalar(at, settling.volume, m.volume);
+    if (settling.residual.pointer)
+      store_vector<D>(at, settling.residual, load_vector<D>(One<T>{p}, settling.residual_before));
     settling.origin[to] = settling.given ? p : settling.origin[p];
     settling.index[place] = to;
     if (place == 0) *settling.copy = to >= settling.rows;

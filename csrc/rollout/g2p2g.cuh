@@ -251,7 +251,7 @@ class G2P2G {
     source.fetch(p, changes);
     auto particle = source.fields.read_at_rest(p, dt_);
     const Motion<T, D> motion = task.motion(gather(x));
-    const Vector<T, D> to = advance_position(x, motion.velocity, dt_);
+    const Vector<T, D> to = task.advanced(p, p, x, motion.velocity, dt_);
 #pragma unroll
     for (int i = 0; i < D; i++) task.x_next.at(p, i) = to[i];
     particle.velocity = motion.velocity;

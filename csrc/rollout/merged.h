@@ -27,7 +27,7 @@ class Merged {
   int* const status_[2];
   const backend::Stream stream_;
   const int rows_;  // of a copy
-  Tensor x_, F_, J_, history_, mass_, volume_, origin_, copy_, items_taken_, nowhere_;
+  Tensor x_, F_, J_, residual_, history_, mass_, volume_, origin_, copy_, items_taken_, nowhere_;
   Particles<T> own_;
 
   int* status(int64_t step) { return status_[(s_.in.n - 1 - step) % 2]; }  // the last one is the first of the two
@@ -54,6 +54,7 @@ Merged<T, D>::Merged(Substeps<T, D>& s, const Particles<T>& results, Tensor stat
   x_ = empty_particles(in.x, {both, D});
   F_ = result(in.x, has(in.F), {both, D, D});
   J_ = result(in.x, has(in.J), {both});
+  residual_ = result(in.x, has(in.residual), {both, D});
   history_ = result(in.x, s.columns > 0, {both, s.columns});
   mass_ = empty_particles(in.x, {both});
   volume_ = empty_particles(in.x, {both});
@@ -63,7 +64,7 @@ Merged<T, D>::Merged(Substeps<T, D>& s, const Particles<T>& results, Tensor stat
   nowhere_ = empty_int(in.x, {int64_t(sizeof(Drift) / sizeof(int))});
   torch::stable::zero_(copy_);
   torch::stable::zero_(nowhere_);
-  own_ = {field<T>(x_), results.v, results.C, field<T>(F_), field<T>(J_), field<T>(history_)};
+  own_ = {field<T>(x_), results.v, results.C, field<T>(F_), field<T>(J_), field<T>(residual_), field<T>(history_)};
 }
 
 template <class T, int D>
@@ -94,6 +95,8 @@ void Merged<T, D>::begin(const Particles<const T>& given, const int* before) {
   settling.x = own_.x;
   settling.mass = field<T>(mass_);
   settling.volume = field<T>(volume_);
+  settling.residual = own_.residual;
+  settling.residual_before = given.residual;
   settling.origin = static_cast<int*>(origin_.data_ptr());
   settling.copy = static_cast<int*>(copy_.data_ptr());
   settling.index = s_.activation.index;
@@ -113,6 +116,7 @@ void Merged<T, D>::use_own() {
   s_.p2g.mass = field<const T>(mass_);
   s_.p2g.volume = field<const T>(volume_);
   s_.settling.given = false;
+  s_.settling.residual_before = own.residual;
   ActivateArguments<T, D>& activation = s_.activation;
   activation.origin = s_.settling.origin;
   activation.copy = s_.settling.copy;
@@ -162,6 +166,7 @@ void Merged<T, D>::end() {
   a.own.drift = nullptr;
   a.drift = nowhere();
   a.x_next = results_.x;
+  a.residual_next = results_.residual;
   a.F = constant(own_.F);
   a.J = constant(own_.J);
   a.F_next = results_.F;

@@ -65,7 +65,7 @@ class OwnField {
 template <class T, int D>
 class OwnParticles {
  public:
-  OwnField<T> x, v, C, F, J, history;
+  OwnField<T> x, v, C, F, J, residual, history;
 
   OwnParticles(Substeps<T, D>& steps, const Tensor& packed_history, backend::Stream stream);
 
@@ -120,6 +120,7 @@ class OwnParticles {
     visit(x, -1, false, false);
     if (gradient) visit(F, R::F, reads_F_, s_.plastic);
     if (ratio) visit(J, R::J, reads_J_, false);
+    if (has(in_.residual)) visit(residual, -1, false, false);
     visit(mass_, -1, false, false);
     visit(volume_, -1, false, false);
     if (s_.columns > 0) visit(history, R::rest, true, true);
@@ -162,6 +163,7 @@ OwnParticles<T, D>::OwnParticles(Substeps<T, D>& steps, const Tensor& packed_his
   C = {like, given.C, {P, D, D}};
   F = {like, given.F, {P, D, D}};
   J = {like, given.J, {P}};
+  residual = {like, given.residual, {P, D}};
   mass_ = {like, s_.p2g.mass, {P}};
   volume_ = {like, s_.p2g.volume, {P}};
   if (s_.columns > 0) history = OwnField<T>(packed_history);
@@ -400,11 +402,13 @@ void OwnParticles<T, D>::set_advance() {
   a.gather.x = x.now();
   a.F = F.now();
   a.J = J.now();
+  a.residual = residual.now();
   a.gather.value = v.next(false);
   a.x_next = x.next(false);
   if (in_.wants_C) a.gather.moment = C.next(false);
   if (has(in_.F)) a.F_next = F.next(false);
   if (has(in_.J)) a.J_next = J.next(false);
+  if (has(in_.residual)) a.residual_next = residual.next(false);
 }
 
 // G2P of the substep before, and laws and P2G of this one if it follows.
@@ -442,6 +446,7 @@ void OwnParticles<T, D>::advance() {
   if (in_.wants_C) C.go(false);
   if (has(in_.F)) F.go(false);
   if (has(in_.J)) J.go(false);
+  if (has(in_.residual)) residual.go(false);
 }
 
 template <class T, int D>
@@ -453,6 +458,7 @@ void OwnParticles<T, D>::give_back() {
     if (in_.wants_C) visit(C);
     if (has(in_.F)) visit(F);
     if (has(in_.J)) visit(J);
+    if (has(in_.residual)) visit(residual);
     if (s_.columns > 0) visit(history);
   };
   each([&](OwnField<T>& f) { f.rows(rows_, 0, true, true); });

@@ -84,7 +84,7 @@ template <class T, int D>
 class Recorded {
  public:
   Substeps<T, D> steps;
-  Record<T> x, v, C, F, J, history, stress;
+  Record<T> x, v, C, F, J, residual, history, stress;
   Record<T> mapped;  // F after the return maps
 
   // In `memory`, from an earlier `take`, or in its own.
@@ -104,7 +104,8 @@ class Recorded {
   Particles<const T> state(int64_t i) const {
     if (i == 0) return first_;
     const int64_t k = i - 1;
-    return {constant(x[k]), constant(v[k]), constant(C[k]), constant(F[k]), constant(J[k]), constant(history[k])};
+    return {constant(x[k]), constant(v[k]),        constant(C[k]),      constant(F[k]),
+            constant(J[k]), constant(residual[k]), constant(history[k])};
   }
   int* status(int64_t i) const { return status_ + (i + 1) * (1 + in_.scenes) * kStatusSize; }  // -1: before all
   Tensor status_tensor(int64_t i) const {
@@ -254,6 +255,7 @@ void Recorded<T, D>::lay_out(Arena& arena) {
   if (mls || in_.wants_C) C = Record<T>(arena, given, n, D, D);
   if (has(in_.F)) F = Record<T>(arena, given, n, D, D);
   if (has(in_.J)) J = Record<T>(arena, given, n);
+  if (has(in_.residual)) residual = Record<T>(arena, given, n, D);
   if (steps.columns > 0) history = Record<T>(arena, given, n, steps.columns);
   stress = Record<T>(arena, given, n, D, D);
   if (steps.plastic) mapped = Record<T>(arena, given, n, D, D);
@@ -288,7 +290,7 @@ bool Recorded<T, D>::take() {
     set_time(i);
     if (!activate(i)) return false;
     if (!memory().defined()) keeps_grids_ = steps.nodes_are_clear = false;  // the one pool that has grown serves all
-    steps.write({x[i], v[i], C[i], F[i], J[i], history[i]});
+    steps.write({x[i], v[i], C[i], F[i], J[i], residual[i], history[i]});
     if (has(in_.material)) keep_others(i);
     steps.move(stream_);
     after_substeps(in_.x.size(0), 1, stream_);

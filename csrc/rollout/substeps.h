@@ -16,37 +16,39 @@
 // do them, in buffers that belong to the call. What the ops of rollouts share.
 namespace mpm {
 
-#define MPM_SUBSTEPS_SCHEMA                                                                                       \
-  "Tensor x, Tensor v, Tensor mass, Tensor volume, Tensor? C, Tensor? F, Tensor? J, Tensor[] history, Tensor? "   \
-  "scene, Tensor? ids, Tensor? material, Tensor? previous_status, str laws, int[] options, Tensor[] parameters, " \
-  "int[] variables, int n, float dt, bool apic, float flip, bool wants_C, int stress_form, Tensor? "              \
-  "gravity, " MPM_WALLS_SCHEMA                                                                                    \
-  ", Tensor? obstacles, Tensor? data, int[] shape, int[] sizes, int[] contact, int[] obstacle_scene, "            \
-  "float[] start, float[] end, float time, int scenes, int max_blocks, bool grows, bool resident, bool records, " \
-  "Tensor? "                                                                                                      \
+#define MPM_SUBSTEPS_SCHEMA                                                                                            \
+  "Tensor x, Tensor v, Tensor mass, Tensor volume, Tensor? C, Tensor? F, Tensor? J, Tensor? residual, "                \
+  "Tensor[] history, Tensor? scene, Tensor? ids, Tensor? material, Tensor? previous_status, str laws, int[] options, " \
+  "Tensor[] parameters, "                                                                                              \
+  "int[] variables, int n, float dt, bool apic, float flip, bool wants_C, int stress_form, Tensor? "                   \
+  "gravity, " MPM_WALLS_SCHEMA                                                                                         \
+  ", Tensor? obstacles, Tensor? data, int[] shape, int[] sizes, int[] contact, int[] obstacle_scene, "                 \
+  "float[] start, float[] end, float time, int scenes, int max_blocks, bool grows, bool resident, bool records, "      \
+  "Tensor? "                                                                                                           \
   "impulse, Tensor? scene_dt, Tensor? scene_time, " MPM_LATTICE_SCHEMA
-#define MPM_SUBSTEPS_PARAMETERS                                                                                        \
-  const Tensor &x, const Tensor &v, const Tensor &mass, const Tensor &volume, const OptionalTensor &C,                 \
-      const OptionalTensor &F, const OptionalTensor &J, const Tensors &history, const OptionalTensor &scene,           \
-      const OptionalTensor &ids, const OptionalTensor &material, const OptionalTensor &previous_status,                \
-      std::string laws, std::vector<int64_t> options, const Tensors &parameters, std::vector<int64_t> variables,       \
-      int64_t n, double dt, bool apic, double flip, bool wants_C, int64_t stress_form, const OptionalTensor &gravity,  \
-      std::vector<int64_t> wall_kind, std::vector<double> wall_plane, std::vector<double> wall_friction,               \
-      const OptionalTensor &obstacle_table, const OptionalTensor &obstacle_data, std::vector<int64_t> shape,           \
-      std::vector<int64_t> sizes, std::vector<int64_t> contact_kind, std::vector<int64_t> obstacle_scene,              \
-      std::vector<double> start, std::vector<double> end, double time, int64_t scenes, int64_t max_blocks, bool grows, \
-      bool resident, bool records, const OptionalTensor &impulse, const OptionalTensor &scene_dt,                      \
-      const OptionalTensor &scene_time, const std::vector<double>&lattice, const std::vector<int64_t>&layout
-#define MPM_SUBSTEPS_ARGUMENTS                                                                                       \
-  x, v, mass, volume, C, F, J, history, scene, ids, material, previous_status, laws, options, parameters, variables, \
-      n, dt, apic, flip, wants_C, stress_form, gravity, wall_kind, wall_plane, wall_friction, obstacle_table,        \
-      obstacle_data, shape, sizes, contact_kind, obstacle_scene, start, end, time, scenes, max_blocks, grows,        \
-      resident, records, impulse, scene_dt, scene_time, PackedLattice(lattice, layout)
+#define MPM_SUBSTEPS_PARAMETERS                                                                                      \
+  const Tensor &x, const Tensor &v, const Tensor &mass, const Tensor &volume, const OptionalTensor &C,               \
+      const OptionalTensor &F, const OptionalTensor &J, const OptionalTensor &residual, const Tensors &history,      \
+      const OptionalTensor &scene, const OptionalTensor &ids, const OptionalTensor &material,                        \
+      const OptionalTensor &previous_status, std::string laws, std::vector<int64_t> options,                         \
+      const Tensors &parameters, std::vector<int64_t> variables, int64_t n, double dt, bool apic, double flip,       \
+      bool wants_C, int64_t stress_form, const OptionalTensor &gravity, std::vector<int64_t> wall_kind,              \
+      std::vector<double> wall_plane, std::vector<double> wall_friction, const OptionalTensor &obstacle_table,       \
+      const OptionalTensor &obstacle_data, std::vector<int64_t> shape, std::vector<int64_t> sizes,                   \
+      std::vector<int64_t> contact_kind, std::vector<int64_t> obstacle_scene, std::vector<double> start,             \
+      std::vector<double> end, double time, int64_t scenes, int64_t max_blocks, bool grows, bool resident,           \
+      bool records, const OptionalTensor &impulse, const OptionalTensor &scene_dt, const OptionalTensor &scene_time, \
+      const std::vector<double>&lattice, const std::vector<int64_t>&layout
+#define MPM_SUBSTEPS_ARGUMENTS                                                                                         \
+  x, v, mass, volume, C, F, J, residual, history, scene, ids, material, previous_status, laws, options, parameters,    \
+      variables, n, dt, apic, flip, wants_C, stress_form, gravity, wall_kind, wall_plane, wall_friction,               \
+      obstacle_table, obstacle_data, shape, sizes, contact_kind, obstacle_scene, start, end, time, scenes, max_blocks, \
+      grows, resident, records, impulse, scene_dt, scene_time, PackedLattice(lattice, layout)
 
 // The arguments of a call.
 struct SubstepsInputs {
   Tensor x, v, mass, volume;
-  OptionalTensor C, F, J;
+  OptionalTensor C, F, J, residual;
   Tensors history;
   OptionalTensor scene, ids, material, previous_status;
   std::string laws;
@@ -188,21 +190,27 @@ Topology<T, D> topology_of(const ActivateArguments<T, D>& a) {
 // Where the fields of the particles are; absent where a simulation has none.
 template <class T>
 struct Particles {
-  Field<T> x, v, C, F, J;
+  Field<T> x, v, C, F, J, residual;
   Field<T> history;  // [P, m], the entries of all laws
 };
 
 template <class T>
 Particles<const T> constant(const Particles<T>& p) {
-  return {constant(p.x), constant(p.v), constant(p.C), constant(p.F), constant(p.J), constant(p.history)};
+  return {constant(p.x), constant(p.v),        constant(p.C),      constant(p.F),
+          constant(p.J), constant(p.residual), constant(p.history)};
 }
 
 template <class T, int D>
 Particles<const T> given_particles(const SubstepsInputs& in, const Tensor& history) {
   const Tensor& x = in.x;
   const int64_t P = x.size(0);
-  return {input<T>(x, "x", x, {P, D}),       input<T>(in.v, "v", x, {P, D}), input<T>(in.C, "C", x, {P, D, D}),
-          input<T>(in.F, "F", x, {P, D, D}), input<T>(in.J, "J", x, {P}),    field<const T>(history)};
+  return {input<T>(x, "x", x, {P, D}),
+          input<T>(in.v, "v", x, {P, D}),
+          input<T>(in.C, "C", x, {P, D, D}),
+          input<T>(in.F, "F", x, {P, D, D}),
+          input<T>(in.J, "J", x, {P}),
+          input<T>(in.residual, "residual", x, {P, D}),
+          field<const T>(history)};
 }
 
 // The history of all laws side by side, [P, m].
@@ -308,6 +316,7 @@ struct Substeps {
     p2g.affine = in.apic ? p.C : Field<const T>{};
     advance.F = plastic ? constant(mapped) : p.F;
     advance.J = p.J;
+    advance.residual = p.residual;
   }
 
   // In place of what read() and write() say of F and J: P2G moves them into those of `p` if a G2P `has_left` that, and
@@ -330,6 +339,7 @@ struct Substeps {
     advance.x_next = p.x;
     advance.F_next = p.F;
     advance.J_next = p.J;
+    advance.residual_next = p.residual;
   }
 
   bool flips() const { return in.flip > 0; }

@@ -112,7 +112,7 @@ bool take_persistent(Substeps<T, D>& s, int* activated, int* status, backend::St
 }
 #endif
 
-using Results = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
+using Results = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
 
 // Everything that the adjoint reads is kept. Nothing where there is no room, and it has to be told when that was.
 template <class T, int D>
@@ -140,6 +140,7 @@ std::optional<Results> take_recorded(const SubstepsInputs& in, backend::Stream s
                  status,
                  Tensor(),
                  has(in.scene_time) ? r.scene_time_after() : Tensor(),
+                 copy(has(in.residual), r.residual, &R::vector),
                  r.memory()};
 }
 
@@ -164,6 +165,7 @@ Results no_step(const SubstepsInputs& in, const Tensor& history, const Tensor& s
           status,
           impulse,
           time,
+          copy(in.residual, has(in.residual), {P, D}),
           Tensor()};
 }
 
@@ -200,6 +202,7 @@ Results take_steps(const SubstepsInputs& in, backend::Stream stream) {
           status[last],
           impulse,
           time,
+          particles.residual.tensor(),
           Tensor()};
 }
 
@@ -224,6 +227,7 @@ Results substeps(MPM_SUBSTEPS_PARAMETERS) {
   Tensor F_[] = {result(x, has(F), {P, D_, D_}), Tensor()};
   Tensor J_[] = {result(x, has(J), {P}), Tensor()};
   Tensor v_ = empty_particles(x, {P, D_}), C_ = result(x, wants_C, {P, D_, D_}), history_;
+  Tensor residual_ = result(x, has(residual), {P, D_});  // which G2P alone reads
   Tensor status[] = {empty_int(x, {1 + scenes, kStatusSize}), empty_int(x, {1 + scenes, kStatusSize})};
   Tensor impulse_, time_;
   int last = 0;  // of the two buffers, that of the last step
@@ -232,6 +236,7 @@ Results substeps(MPM_SUBSTEPS_PARAMETERS) {
     torch::stable::copy_(v_, v);
     if (has(F)) torch::stable::copy_(F_[0], *F);
     if (has(J)) torch::stable::copy_(J_[0], *J);
+    if (has(residual)) torch::stable::copy_(residual_, *residual);
     if (wants_C) has(C) ? torch::stable::copy_(C_, *C) : torch::stable::zero_(C_);
   };
   dispatch(x, [&]<class T, int D>() {
@@ -242,7 +247,8 @@ Results substeps(MPM_SUBSTEPS_PARAMETERS) {
 
     Particles<const T> from = given_particles<T, D>(in, history_);
     const auto buffers = [&](int k) -> Particles<T> {
-      return {field<T>(x_[k]), field<T>(v_), field<T>(C_), field<T>(F_[k]), field<T>(J_[k]), field<T>(history_)};
+      return {field<T>(x_[k]), field<T>(v_),        field<T>(C_),      field<T>(F_[k]),
+              field<T>(J_[k]), field<T>(residual_), field<T>(history_)};
     };
     if (has(impulse)) {
       impulse_ = copy_of(*impulse);
@@ -328,7 +334,7 @@ Results substeps(MPM_SUBSTEPS_PARAMETERS) {
       }
     }
   });
-  return {x_[last], v_, C_, F_[last], J_[last], history_, status[last], impulse_, time_, Tensor()};
+  return {x_[last], v_, C_, F_[last], J_[last], history_, status[last], impulse_, time_, residual_, Tensor()};
 #endif
 }
 
@@ -339,7 +345,7 @@ Results substeps(MPM_SUBSTEPS_PARAMETERS) {
 STABLE_TORCH_LIBRARY_FRAGMENT(torch_mpm, m) {
   m.def("substeps(" MPM_SUBSTEPS_SCHEMA
         ") -> (Tensor x, Tensor v, Tensor C, Tensor F, Tensor J, Tensor history, Tensor status, Tensor "
-        "impulse, Tensor time, Tensor record)");
+        "impulse, Tensor time, Tensor residual, Tensor record)");
 }
 #endif
 

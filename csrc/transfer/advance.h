@@ -6,6 +6,8 @@
 
 // The end of a symplectic Euler step, with the velocity and the affine field just gathered:
 //   x ← x + dt v,   F ← (I + dt C) F,   J ← J (1 + dt tr C).
+// Compensated positions carry the residual that rounding has left out of x, so that motion below half a unit in the
+// last place of x is not lost.
 namespace mpm {
 
 template <class T, int D>
@@ -41,10 +43,11 @@ template <class T, int D>
 struct G2PAdvanceArguments {
   GatherArguments<T, D> gather;  // of the node velocities; value is v, moment C (may be absent), gradient unused
   Field<const T> F, J;           // may be absent
+  Field<const T> residual;       // of x, [P, D]; absent where positions are not compensated
   Field<const T> scene_dt;       // [scenes] or absent
   double dt = 0;
   StressForm form = StressForm::mls;
-  Field<T> x_next, F_next, J_next;
+  Field<T> x_next, F_next, J_next, residual_next;
   bool late = false;  // F and J are left to P2G, where there is a LateDeformation; on CUDA
   // On CUDA: particles may be in other active blocks than they were activated in, and where they go now is added here.
   Drift* drift = nullptr;
@@ -71,6 +74,20 @@ inline namespace TORCH_MPM_ISA {
 template <class T, int D>
 MPM_HD Vector<T, D> advance_position(const Vector<T, D>& x, const Vector<T, D>& v, const T& dt) {
   return x + dt * v;
+}
+
+// The compensated position; `residual` becomes that of the result, exactly (TwoSum: Knuth 1969).
+template <class T, int D>
+MPM_HD Vector<T, D> advance_position(const Vector<T, D>& x, const Vector<T, D>& v, const T& dt,
+                                     Vector<T, D>& residual) {
+  Vector<T, D> next;
+  MPM_UNROLL for (int i = 0; i < D; i++) {
+    const T move = residual[i] + dt * v[i];
+    next[i] = x[i] + move;
+    const T moved = next[i] - x[i];
+    residual[i] = (x[i] - (next[i] - moved)) + (move - moved);
+  }
+  return next;
 }
 
 template <class T, int D>

@@ -10,19 +10,21 @@ inline namespace TORCH_MPM_ISA {
 // The fields of the particles, by rows.
 template <class T, int D>
 struct AdvancedRows {
-  FieldRows<const T, D> x;
+  FieldRows<const T, D> x, residual;
   FieldRows<const T, D * D> F;
   FieldRows<const T, 1> J;
-  FieldRows<T, D> v, x_next;
+  FieldRows<T, D> v, x_next, residual_next;
   FieldRows<T, D * D> affine, F_next;
   FieldRows<T, 1> J_next;
 
   explicit AdvancedRows(const G2PAdvanceArguments<T, D>& a)
       : x(a.gather.x),
+        residual(a.residual),
         F(a.F, D),
         J(a.J),
         v(a.gather.value),
         x_next(a.x_next),
+        residual_next(a.residual_next),
         affine(a.gather.moment, D),
         F_next(a.F_next, D),
         J_next(a.J_next) {}
@@ -51,7 +53,7 @@ struct AdvancedRows {
 // What a step changes of a pack of particles.
 template <class P, int D>
 struct Advanced {
-  Vector<P, D> x, v;
+  Vector<P, D> x, v, residual;
   Matrix<P, D> affine, F;
   P J;
 };
@@ -61,6 +63,8 @@ template <class P, int D, class T, class G>
 MPM_HD void read(Advanced<P, D>& p, const AdvancedRows<T, D>& rows, const G& g) {
   MPM_UNROLL for (int i = 0; i < D; i++)
     p.x[i] = load_row(rows.x.row[i], rows.x.stride, g);
+  MPM_UNROLL for (int i = 0; i < D; i++)
+    p.residual[i] = rows.residual ? load_row(rows.residual.row[i], rows.residual.stride, g) : P(0);
   MPM_UNROLL for (int k = 0; k < D * D; k++)
     p.F[k / D][k % D] = rows.F ? load_row(rows.F.row[k], rows.F.stride, g) : P(0);
   p.J = rows.J ? load_row(rows.J.row[0], rows.J.stride, g) : P(0);
@@ -78,6 +82,8 @@ template <class P, int D, class T, class G>
 MPM_HD void write_moved(const Advanced<P, D>& p, const AdvancedRows<T, D>& rows, const G& g) {
   MPM_UNROLL for (int i = 0; i < D; i++)
     store_row(p.x[i], rows.x_next.row[i], rows.x_next.stride, g);
+  if (rows.residual) MPM_UNROLL
+    for (int i = 0; i < D; i++) store_row(p.residual[i], rows.residual_next.row[i], rows.residual_next.stride, g);
   if (rows.F) MPM_UNROLL
     for (int k = 0; k < D * D; k++) store_row(p.F[k / D][k % D], rows.F_next.row[k], rows.F_next.stride, g);
   if (rows.J) store_row(p.J, rows.J_next.row[0], rows.J_next.stride, g);
@@ -92,7 +98,7 @@ MPM_HD void write(const Advanced<P, D>& p, const AdvancedRows<T, D>& rows, const
 // By the velocity of the particles and its gradient L.
 template <class P, int D, class T>
 MPM_HD void end_step(Advanced<P, D>& p, const Matrix<P, D>& L, const P& dt, const AdvancedRows<T, D>& rows) {
-  p.x = advance_position(p.x, p.v, dt);
+  p.x = rows.residual ? advance_position(p.x, p.v, dt, p.residual) : advance_position(p.x, p.v, dt);
   if (rows.F) p.F = advance_deformation(p.F, L, dt);
   if (rows.J) p.J = advance_volume_ratio(p.J, L, dt);
 }
@@ -143,6 +149,7 @@ void leave_outside(const G2PAdvanceArguments<T, D>& a) {
     for (int i = 0; i < D; i++) {
       at(a.gather.value, p, i) = rest;
       at(a.x_next, p, i) = x[i];
+      if (a.residual.pointer) at(a.residual_next, p, i) = at(a.residual, p, i);
       for (int j = 0; j < D; j++) {
         if (a.gather.moment.pointer) at(a.gather.moment, p, i, j) = rest;
         if (a.F.pointer) at(a.F_next, p, i, j) = at(a.F, p, i, j);

@@ -27,10 +27,10 @@ struct AdvanceGather {
   using Result = Sums<Shape>;
   Topology<T, D> topology;
   NodeField<const T> nodes;
-  Columns<const T, D> position;
+  Columns<const T, D> position, residual;
   Columns<const T, D * D> F;
   Columns<const T, 1> J;
-  Columns<T, D> x_next, velocity;
+  Columns<T, D> x_next, velocity, residual_next;
   Columns<T, D * D> affine, F_next;
   Columns<T, 1> J_next;
   Field<const T> scene_dt;
@@ -43,10 +43,12 @@ struct AdvanceGather {
       : topology(a.gather.topology),
         nodes(a.gather.nodes),
         position(a.gather.x),
+        residual(a.residual),
         F(a.F, D),
         J(a.J),
         x_next(a.x_next),
         velocity(a.gather.value),
+        residual_next(a.residual_next),
         affine(a.gather.moment, D),
         F_next(a.F_next, D),
         J_next(a.J_next),
@@ -112,7 +114,7 @@ struct AdvanceGather {
         affine.write(of_motion, i * D + j, m.affine[i][j]);
       }
     }
-    const mpm::Vector<T, D> x = advance_position(l.x, m.velocity, l.dt);
+    const mpm::Vector<T, D> x = advanced(p, to, l.x, m.velocity, l.dt);
 #pragma unroll
     for (int i = 0; i < D; i++) x_next.at(to, i) = x[i];
     if constexpr (!Moves) return x;
@@ -124,6 +126,16 @@ struct AdvanceGather {
     J_next.write(to, 0, advance_volume_ratio(l.J, L, l.dt));
     return x;
   }
+  // The position. Residuals are loaded here, where no other registers are in use, as most scenes have none.
+  __device__ mpm::Vector<T, D> advanced(int p, int to, const mpm::Vector<T, D>& x, const mpm::Vector<T, D>& v,
+                                        const T& time_step) const {
+    if (!residual.present()) return advance_position(x, v, time_step);
+    mpm::Vector<T, D> rest = read_vector(residual, p);
+    const mpm::Vector<T, D> next = advance_position(x, v, time_step, rest);
+#pragma unroll
+    for (int i = 0; i < D; i++) residual_next.at(to, i) = rest[i];
+    return next;
+  }
   __device__ void leave_out(int p) const { leave_out(p, p, p); }
   __device__ void leave_out(int p, int of_motion, int to) const {
     const mpm::Vector<T, D> x = read_vector(position, p);
@@ -132,6 +144,7 @@ struct AdvanceGather {
     for (int i = 0; i < D; i++) {
       velocity.at(of_motion, i) = rest;
       x_next.at(to, i) = x[i];
+      if (residual.present()) residual_next.at(to, i) = residual.at(p, i);
     }
 #pragma unroll
     for (int k = 0; k < D * D; k++) {

@@ -12,7 +12,8 @@ void g2p_advance_with(const G2PAdvanceArguments<T, D>& a) {
   const Geometry<T, D>& geometry = in.topology.geometry;
   const P scale(in.moment_scale * double(geometry.dx)), inverse_dx(geometry.inverse_dx);
   const AdvancedRows<T, D> rows(a);
-  const bool direct = unit_stride(in.x, a.F, a.J, in.value, a.x_next, in.moment, a.F_next, a.J_next);
+  const bool direct =
+      unit_stride(in.x, a.residual, a.F, a.J, in.value, a.x_next, a.residual_next, in.moment, a.F_next, a.J_next);
   const auto advance = [&](const Chunk& chunk, int scene, const Motion<Gradient, T, D>& motion) {
     const P dt(time_step(a.scene_dt, a.dt, scene));
     int by_cell[kChunk];

@@ -24,7 +24,8 @@ struct OwnRows {
 template <class T, int D>
 struct Settling : OwnRows {
   bool given = false;                     // whether they are in given tensors
-  Field<T> x, mass, volume;               // of both copies, as all fields are
+  Field<T> x, mass, volume, residual;     // of both copies, as all fields are; no residual where there is none
+  Field<const T> residual_before;         // where they move from
   int* origin = nullptr;                  // the places in the given tensors
   int *copy = nullptr, *index = nullptr;  // which copy the particles are in; their rows, in the order of items
 };

@@ -127,7 +127,7 @@ def test_opcheck(device, dim, kernel):
     x, v, C, F, J = (t.clone().requires_grad_() for t in (p.x, p.v, p.C, p.stress, p.volume))
     velocity = node_velocity(blocks, x).requires_grad_()
     checks = {
-        ops.g2p_advance.default: (x, velocity, F, J, dt, 1.0, True, 0, *blocks.packed),
+        ops.g2p_advance.default: (x, velocity, F, J, 1e-9 * p.x, dt, 1.0, True, 0, *blocks.packed),
         ops.advance.default: (x, v, C, F, J, p.scene, dt, 1.0),
         ops.advance_backward.default: (x, F, J, x, v, C, F, J, p.scene, dt, 1.0, 31),
     }

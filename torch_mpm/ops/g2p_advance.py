@@ -46,40 +46,59 @@ def g2p_advance(
 
     Differentiable with respect to every floating tensor, twice in eager mode.
     """
+    return g2p_advance_compensated(blocks, x, None, velocity, dt, F, J, affine, stress_form)[:5]
+
+
+def g2p_advance_compensated(
+    blocks: Blocks,
+    x: Tensor,
+    residual: Tensor | None,
+    velocity: Tensor,
+    dt: float | Tensor,
+    F: Tensor | None = None,
+    J: Tensor | None = None,
+    affine: bool = True,
+    stress_form: str = "mls",
+) -> tuple[Tensor, Tensor, Tensor | None, Tensor | None, Tensor | None, Tensor | None]:
+    """`g2p_advance` with the residual [P, D] [m] that rounding has left out of x, which is constant for autograd; it
+    returns that of the new positions last. None does not compensate positions."""
     check_blocks(blocks)
     grid = blocks.grid
     check_particles(x, blocks)
     P, D = x.shape
+    check_like("residual", residual, x, (P, D), "[P, D]")
     check_like("F", F, x, (P, D, D), "[P, D, D]")
     check_like("J", J, x, (P,), "[P]")
     check_choice("stress_form", stress_form, STRESS_FORMS)
     affine = check_flag("affine", affine)
     velocity = _check_nodes("velocity", velocity, blocks, x, D)
     number, scene_dt = split_dt(dt, grid.scenes, x)
-    return dispatch(
+    residual = None if residual is None else residual.detach()
+    *advanced, rest = dispatch(
         torch.ops.torch_mpm.g2p_advance,
-        *(x, velocity, F, J, scene_dt, number, affine, STRESS_FORMS[stress_form], *blocks.packed),
+        *(x, velocity, F, J, residual, scene_dt, number, affine, STRESS_FORMS[stress_form], *blocks.packed),
     )
+    return (*advanced, None if rest is None else rest.detach())
 
 
 @torch.library.register_fake("torch_mpm::g2p_advance")
-def _fake(x, velocity, F, J, scene_dt, dt, affine, stress_form, *topology):
+def _fake(x, velocity, F, J, residual, scene_dt, dt, affine, stress_form, *topology):
     P, D = sizes(x, "x", 2)
-    shapes = ((P, D), (P, D), (P, D, D), (P, D, D), (P,))
-    present = (True, True, affine, F is not None, J is not None)
+    shapes = ((P, D), (P, D), (P, D, D), (P, D, D), (P,), (P, D))
+    present = (True, True, affine, F is not None, J is not None, residual is not None)
     return tuple(soa_empty(x, shape) if here else None for shape, here in zip(shapes, present, strict=True))
 
 
 def _setup(ctx: Any, inputs: Any, output: Any) -> None:
-    x, velocity, F, J, scene_dt, dt, affine, stress_form, *topology = inputs
-    _, v, C, _, _ = output
+    x, velocity, F, J, _, scene_dt, dt, affine, stress_form, *topology = inputs
+    _, v, C, _, _, _ = output
     # The backward pass reads v and C, which the next step keeps alive anyway.
     save_with_topology(ctx, (x, velocity, F, J, scene_dt, v, C), topology, dt=dt, affine=affine, mls=stress_form == 0)
 
 
-def _backward(ctx, grad_x, grad_v, grad_C, grad_F, grad_J):
+def _backward(ctx, grad_x, grad_v, grad_C, grad_F, grad_J, _grad_residual):
     (x, velocity, F, J, scene_dt, v, C), topology = saved_with_topology(ctx)
-    need_x, need_velocity, need_F, need_J, need_dt = ctx.needs_input_grad[:5]
+    need_x, need_velocity, need_F, need_J, _, need_dt = ctx.needs_input_grad[:6]
     need_nodes, moves = need_x or need_velocity, F is not None or J is not None
     blocks = Topology.unpack(*topology)
     scale = blocks.grid.inverse_inertia
@@ -111,7 +130,7 @@ def _backward(ctx, grad_x, grad_v, grad_C, grad_F, grad_J):
             grad_velocity = dispatch(torch.ops.torch_mpm.scatter, x, grad_v, moment, gradient, scale, *topology)
     if need_dt:
         grad_dt = ctx.dt * sum_by_scene(grad_dt, scene, scene_dt.shape[0])
-    grads = zip((grad_x, grad_velocity, grad_F, grad_J, grad_dt), ctx.needs_input_grad[:5], strict=True)
+    grads = zip((grad_x, grad_velocity, grad_F, grad_J, None, grad_dt), ctx.needs_input_grad[:6], strict=True)
     return (*(g if needed else None for g, needed in grads),) + (None,) * 6
 
 

@@ -1,10 +1,10 @@
 """The ops behind `torch_mpm.rollout`: n steps in one call, and their adjoint. Fake kernels and autograd.
 
-    torch.ops.torch_mpm.substeps(x, v, mass, volume, C, F, J, history, scene, ids, material, previous_status, laws,
-        options, parameters, variables, n, dt, apic, flip, wants_C, stress_form, gravity, wall_kind, wall_plane,
+    torch.ops.torch_mpm.substeps(x, v, mass, volume, C, F, J, residual, history, scene, ids, material, previous_status,
+        laws, options, parameters, variables, n, dt, apic, flip, wants_C, stress_form, gravity, wall_kind, wall_plane,
         wall_friction, obstacles, data, shape, sizes, contact, obstacle_scene, start, end, time, scenes,
         max_blocks, grows, resident, records, impulse, scene_dt, scene_time, lattice, layout)
-        -> (x, v, C, F, J, history, status, impulse, time, record)
+        -> (x, v, C, F, J, history, status, impulse, time, residual, record)
 
 `torch_mpm.substeps_arguments(step, state, n, dt)` makes the arguments; docs/training.md has a call.
 
@@ -21,7 +21,7 @@ the op stops there where it is full, and the status tells. On CUDA nothing is wa
 than a fraction of a second behind. With `resident` batches of small scenes may go another way there, each on a
 multiprocessor of its own; gradients take it as any other, whose sums may round differently. With `records` everything
 that the adjoint reads is kept in `record`, bytes of no other use, and no step is taken again; not where impulses are
-counted, or the pool had to grow.
+counted, or the pool had to grow. `residual` is `State.x_residual`; without it positions are not compensated.
 
 Several times a second both ops run the handlers of signals, on the main thread. Where one of them raises, the op ends
 with a RuntimeError and without a result; `torch_mpm.rollout` raises what the handler has raised.
@@ -71,10 +71,19 @@ _ADJOINTS = ("x", "v", "C", "F", "J", "history", "mass", "volume", "parameters",
 
 @torch.library.register_fake("torch_mpm::substeps")
 def _fake(
-    x: Tensor, v: Tensor, mass: Tensor, volume: Tensor, C: Any, F: Any, J: Any, history: list[Tensor], *rest: Any
+    x: Tensor,
+    v: Tensor,
+    mass: Tensor,
+    volume: Tensor,
+    C: Any,
+    F: Any,
+    J: Any,
+    residual: Any,
+    history: list[Tensor],
+    *rest: Any,
 ) -> tuple[Tensor | None, ...]:
     P, D = sizes(x, "x", 2)
-    given = dict(zip(ARGUMENTS[8:], rest, strict=True))
+    given = dict(zip(ARGUMENTS[9:], rest, strict=True))
     wants_C, scenes, impulse = given["wants_C"], given["scenes"], given["impulse"]
     return (
         soa_empty(x, (P, D)),
@@ -86,6 +95,7 @@ def _fake(
         x.new_empty((1 + scenes, 8), dtype=torch.int32),
         None if impulse is None else impulse.new_empty(impulse.shape),
         None if given["scene_time"] is None else x.new_empty(scenes, dtype=torch.float64),
+        None if residual is None else soa_empty(x, (P, D)),
         _fake_record(x) if given["records"] and impulse is None else None,
     )
 

@@ -9,7 +9,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..resolution import rounding
 from ..state import PARTICLE_FIELDS, State
 from .build import Built
 from .run import Simulation, joined
@@ -35,7 +34,7 @@ def describe(scene: Scene, built: Built) -> dict[str, Any]:
         "scenes": len(built.scenes),
         "device": str(state.x.device),
         "precision": scene.precision,
-        "rounding of positions [dx]": rounding(built.grid.reach, state.x.dtype) / built.grid.dx,
+        "rounding of positions [dx]": built.grid.rounding(state.x.dtype) / built.grid.dx,
         "particles": built.particles,
         "mass [kg]": float(built.statics()["mass"].double().sum()),
         "materials": materials,
