@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import collections
 import contextlib
+import copy
 from collections.abc import Callable, Hashable, Iterator
 from typing import Any
 
@@ -115,6 +116,16 @@ class Remembered:
         if _is_plain(t) and t.is_cpu and t.numel() <= most:
             with torch.inference_mode(False):
                 self._contents = t.detach().clone()
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Remembered:
+        """Of the copy of the tensor, if that was copied before; else of the tensor itself."""
+        t = memo.get(id(self._tensor))
+        if t is None:
+            return self
+        remembered = copy.copy(self)
+        remembered._tensor = t
+        remembered._version = (version(t), _address(t)) if self.is_now(self._tensor) else None
+        return remembered
 
     def is_now(self, t: Any) -> bool:
         """Whether a value is that tensor, unchanged."""

@@ -44,8 +44,9 @@ def captured(step: nn.Module, state: State | None, dt: float, n: int = 1) -> Cap
     A state of another kind (fields, shapes, dtypes, those that require gradients), another grad mode or autocast, a
     larger pool of a grid without `max_blocks`, numbers, tensors and parts of the step that were assigned: for each of
     them the first call records, which takes as long as a few rollouts of so many steps; the latest 8 recordings are
-    kept. They share memory: as much as the largest one needs, with gradients what autograd keeps of n steps, and the
-    state and parameters before and after of each one.
+    kept. So a pose of an obstacle that is assigned between two calls (see `Obstacle`) makes the next one record anew:
+    give the obstacle a path, or call `rollout`. Recordings share memory: as much as the largest one needs, with
+    gradients what autograd keeps of n steps, and the state and parameters before and after of each one.
 
     Parameters and buffers are read anew in each call. Code, and numbers of modules of the user's, are those of the
     recording, which calls the step some times; `state.time` is a tensor there. The graphs read and write the same

@@ -136,7 +136,7 @@ def recomputed(advance: Advance, state: State, count: int, first: int, step: Any
     of the step.
     """
     leaves, layout = _pytree.tree_flatten(state)
-    motions = motions_of(step)
+    motions = motions_of(step, state)
     again, pools = False, list[int]()
 
     def steps(*tensors: Tensor) -> State:

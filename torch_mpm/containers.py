@@ -4,19 +4,38 @@ TensorDict."""
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 from torch.utils import _pytree
 from torch.utils.data._utils.collate import default_collate_fn_map
 
+from .capture import is_traced
 from .state import FIELDS, State
+
+if TYPE_CHECKING:
+    from .boundaries.control import Poses
 
 TENSORS = sorted((name for name in FIELDS if name not in ("extra", "time")), reverse=True)
 """A name comes before those that it begins with, which `torch.export` needs to tell `v` from `volume`."""
-Layout = tuple[tuple[str, ...], tuple[str, ...], "float | None"]
-"""Names of the fields and of the entries of `extra` that are leaves, and the time where it is a number."""
+
+
+class Kept:
+    """What goes with a layout, but takes no part in comparisons: poses of states of one layout may be any."""
+
+    def __init__(self, poses: Poses) -> None:
+        self.poses = poses
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Kept)
+
+    def __hash__(self) -> int:
+        return hash(Kept)
+
+
+Layout = tuple[tuple[str, ...], tuple[str, ...], "float | None", Kept]
+"""Names of the fields and of the entries of `extra` that are leaves, the time where it is a number, and the poses."""
 
 
 def _flatten(state: State) -> tuple[list[Any], Layout]:
@@ -27,19 +46,21 @@ def _flatten(state: State) -> tuple[list[Any], Layout]:
         state.extra[name] for name in sorted(state.extra, reverse=True)
     ]
     number = None if isinstance(time, Tensor) else time
-    return (leaves if number is not None else [*leaves, time]), (names, tuple(state.extra), number)
+    # Of what is traced, each run has another state.
+    kept = Kept({} if is_traced(state.x) else state.poses)
+    return (leaves if number is not None else [*leaves, time]), (names, tuple(state.extra), number, kept)
 
 
 def _flatten_with_keys(state: State) -> tuple[list[tuple[Any, Any]], Layout]:
     leaves, layout = _flatten(state)
-    names, extra, time = layout
+    names, extra, time, _ = layout
     keys = [*names, *(f"extra.{name}" for name in sorted(extra, reverse=True)), *(["time"] if time is None else [])]
     return [(_pytree.GetAttrKey(key), leaf) for key, leaf in zip(keys, leaves, strict=True)], layout
 
 
 def _unflatten(leaves: Any, layout: Layout) -> State:
     """A state of any leaves, which a function of the tree may have made: nothing is checked."""
-    names, extra, time = layout
+    names, extra, time, beside = layout
     values = list(leaves)
     state: State = object.__new__(State)
     state.__dict__.update(dict.fromkeys(TENSORS))
@@ -50,6 +71,8 @@ def _unflatten(leaves: Any, layout: Layout) -> State:
         state.__dict__["_time"] = values[-1]
     else:
         state.time = time
+    if beside.poses:
+        state.__dict__["_poses"] = beside.poses
     return state
 
 
@@ -96,8 +119,8 @@ def register() -> None:
         _flatten,
         _unflatten,
         serialized_type_name="torch_mpm.State",
-        to_dumpable_context=list,
-        from_dumpable_context=lambda read: (tuple(read[0]), tuple(read[1]), read[2]),  # lists of a file
+        to_dumpable_context=lambda layout: list(layout[:3]),
+        from_dumpable_context=lambda read: (tuple(read[0]), tuple(read[1]), read[2], Kept({})),  # lists of a file
         flatten_with_keys_fn=_flatten_with_keys,
     )
     torch.serialization.add_safe_globals([State])

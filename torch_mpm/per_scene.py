@@ -81,10 +81,20 @@ class SceneParameters(TensorModule):
         if isinstance(value, (list, tuple)) and any(isinstance(part, Tensor) for part in value):
             raise TypeError(f"{name} must be numbers or one tensor, got tensors in a list: stack them (torch.stack)")
         if torch.compiler.is_compiling() or type(like) not in (Tensor, torch.nn.Parameter):
-            return torch.tensor(value, dtype=like.dtype, device=like.device)
+            return filled(value, like)
         kept = self._constants.setdefault((name, like.device, like.dtype), GraphCache())
-        result: Tensor = kept.get((value,), lambda: torch.tensor(value, dtype=like.dtype, device=like.device), like)
+        result: Tensor = kept.get((value,), lambda: filled(value, like), like)
         return result
+
+
+def filled(value: Any, like: Tensor) -> Tensor:
+    """Numbers as a tensor with the dtype and device of `like`. A few are filled in on a device, which does not wait for
+    it as a copy from the host does."""
+    numbers = value if isinstance(value, (tuple, list)) else (value,)
+    if like.is_cpu or not 0 < len(numbers) <= 3 or not all(isinstance(a, (int, float)) for a in numbers):
+        return torch.tensor(value, dtype=like.dtype, device=like.device)
+    entries = [torch.full((), a, dtype=like.dtype, device=like.device) for a in numbers]
+    return entries[0] if numbers is not value else torch.stack(entries)
 
 
 def per_node(value: Tensor, rank: int, scene: Tensor | None) -> Tensor:

@@ -91,7 +91,10 @@ def content_of(module: nn.Module) -> tuple[Hashable, ...]:
             return None if plain else Same(value)  # the library keeps what follows from others
         return _value(value) if of_library else None
 
-    values = [(name, attribute(value)) for name, value in vars(module).items() if name not in _EVERY]
+    # The length of steps, over which paths are differenced, is another in a control step than outside.
+    unread = isinstance(module, RigidMotion) and not module.follows_path
+    left_out = _EVERY | {"pace"} if unread else _EVERY
+    values = [(name, attribute(value)) for name, value in vars(module).items() if name not in left_out]
     told = tuple((name, value) for name, value in values if value is not None)
     return module.training, has_hooks(module), tuple(read), told
 

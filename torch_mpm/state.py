@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import itertools
 import math
@@ -108,10 +109,14 @@ class State:
     time: float | Tensor = Time()  # type: ignore[assignment]
     impulse: Tensor | None = None
     x_residual: Tensor | None = None
+    _poses: dataclasses.InitVar[Poses | None] = None
+    """An argument that is no field, so that `dataclasses.replace` passes it on."""
 
     _counted = None  # scenes, and the tensor and its version for which they are known; no field
 
-    def __post_init__(self) -> None:
+    def __post_init__(self, _poses: Poses | None) -> None:
+        if _poses:
+            self.__dict__["_poses"] = _poses
         if not isinstance(self.x, Tensor) or self.x.dim() != 2 or self.x.shape[1] not in (2, 3):
             raise ValueError(f"x must have shape [P, 2] or [P, 3], got {shape_of(self.x)}")
         if self.x.dtype not in FLOATING:
@@ -226,8 +231,11 @@ class State:
 
     @property
     def poses(self) -> Poses:
-        """Where steps have left their obstacles, see `torch_mpm.boundaries.control`; of no state that was made anew, or
-        read from a file or a pickle."""
+        """Where steps have left their obstacles, see `torch_mpm.boundaries.control`; of no state that was made anew.
+
+        Copies of a state have them, also those of `dataclasses.replace`, `copy` and functions of pytrees. Files,
+        pickles and TensorDicts do not.
+        """
         poses: Poses = self.__dict__.get("_poses", {})
         return poses
 
@@ -236,6 +244,17 @@ class State:
         state: State = object.__new__(State)
         state.__dict__.update(self.__dict__)
         state.__dict__["_poses"] = poses
+        return state
+
+    def __copy__(self) -> State:
+        return self.with_poses(self.poses)
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> State:
+        state: State = object.__new__(State)
+        memo[id(self)] = state
+        state.__dict__.update(copy.deepcopy(self.__getstate__(), memo))
+        if self.poses:
+            state.__dict__["_poses"] = {key: left.copied(memo) for key, left in self.poses.items()}
         return state
 
     def __getstate__(self) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from torch import Tensor
 from . import resolution
 from .activation_record import ActivationRecord
 from .boundaries import BoundaryList, Obstacle, Walls
-from .boundaries.control import control_step
+from .boundaries.control import control_step, motions_now
 from .boundaries.thickness import warn_of_thin_walls
 from .capture import GraphCache, is_captured, is_traced, is_transformed
 from .cfl import Figures, chosen_dt, figures_of, look
@@ -193,13 +193,14 @@ class Step(TensorModule):
         """A prepared state one step later."""
         if self.on_particles is None:
             return self._moved(state, dt)
-        before = state
+        before, as_now = state, motions_now(self, state)
         state, enabled = operated(self.on_particles, state, dt)
         state = self.prepare(state)  # of which a function may have made another
-        if enabled is None:
-            return self._moved(state, dt)
-        absent = state.replace(mass=torch.where(enabled, state.mass, 0), volume=torch.where(enabled, state.volume, 0))
-        return standing(before, self._moved(absent, dt), enabled)
+        with as_now():
+            if enabled is None:
+                return self._moved(state, dt)
+            mass, volume = torch.where(enabled, state.mass, 0), torch.where(enabled, state.volume, 0)
+            return standing(before, self._moved(state.replace(mass=mass, volume=volume), dt), enabled)
 
     def _moved(self, state: State, dt: float | Tensor) -> State:
         """A prepared state one step later, without what acts on the particles before."""

@@ -1,5 +1,8 @@
 """Obstacles whose pose or velocity is assigned between calls: they move there, and push what is in their way."""
 
+import copy
+import dataclasses
+import gc
 import pickle
 from collections.abc import Callable
 from typing import Any
@@ -9,9 +12,12 @@ import pytest
 import torch
 from helpers import relative_error
 from torch import Tensor
+from torch.utils import _pytree
 
 import torch_mpm as mpm
 from torch_mpm import heat_boundaries, shapes
+from torch_mpm.boundaries import control
+from torch_mpm.recording_keys import StepKey
 
 F64 = torch.float64
 DT, N, V = 5e-4, 20, 1.0
@@ -227,6 +233,25 @@ def test_a_path_that_returns_no_position():
         mpm.rollout(step, block(), 2, DT)
 
 
+def test_paths_that_refuse_what_stands_for_a_time():
+    """Such a path is differenced; only its position is computed where its velocity is not needed."""
+    times = []
+
+    def path(t: Tensor) -> Tensor:
+        if t.requires_grad or torch._C._functorch.is_functorch_wrapped_tensor(t):
+            raise ValueError("a number is needed")
+        times.append(float(t))
+        return torch.stack([0.35 + V * t, 0.25 + 0 * t])
+
+    ends = [
+        mpm.rollout(step_with(paddle), block(), N, DT) for paddle in (box(path), box((0.35, 0.25), velocity=(V, 0.0)))
+    ]
+    assert_alike(*ends, 1e-8)
+    times.clear()
+    box(path).pose(0.1)
+    assert times == [0.1]
+
+
 # ---- rotations
 
 
@@ -393,6 +418,64 @@ def test_a_time_step_of_each_scene(form, device):
     assert_alike(envs.scene(scenes - 1), expected)
 
 
+COPIES = {
+    "replace": lambda s: s.replace(v=s.v + 0), "dataclasses": lambda s: dataclasses.replace(s, v=s.v + 0),
+    "detach": lambda s: s.detach(), "copy": copy.copy, "deepcopy": copy.deepcopy,
+    "tree": lambda s: _pytree.tree_map(lambda t: t.clone(), s),
+    "two trees": lambda s: _pytree.tree_map(lambda a, b: 0.5 * (a + b), s, s.with_poses({})),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("of", COPIES)
+def test_copies_of_a_state_know_their_obstacles(of, device):
+    """A paddle with a velocity has moved away from its position, which has not been assigned."""
+    paddle = box(start(device=device), velocity=(V, 0.0))
+    step = step_with(paddle)
+    state = mpm.rollout(step, block(device=device), N, DT)
+    like = COPIES[of](state)
+    assert list(like.poses) == [paddle.key]
+    assert_alike(mpm.rollout(step, like, N, DT), mpm.rollout(step, state, N, DT))
+
+
+def test_copies_of_environments_know_their_obstacles(device):
+    paddle = box(start(device=device)[None])
+    envs = mpm.Environments(step_with(paddle), [block(device=device)])
+    envs.advance(N, DT)
+    again = copy.deepcopy(envs)
+    for each in (envs, again):
+        (own,) = each.step.boundaries.entries
+        assert list(each.state.poses) == [own.key]
+        own.position = own.position + torch.tensor([0.02, 0.0], dtype=F64, device=device)
+        each.advance(N, DT)
+    assert_alike(again.state, envs.state)
+
+
+@pytest.mark.parametrize("made", [copy.copy, copy.deepcopy, lambda o: pickle.loads(pickle.dumps(o))])
+def test_a_copy_beside_an_obstacle_is_one_of_its_own(made):
+    first = box((0.2, 0.25), velocity=(0.01, 0.0))
+    second = made(first)
+    second.position = (1.0, 0.25)
+    step, state = mpm.Step(grid_of(), LAW, walls="separate", boundaries=[first, second]), block()
+    for _ in range(2):
+        state = mpm.rollout(step, state, N, DT)
+    for paddle, x in ((first, 0.2), (second, 1.0)):
+        expected = torch.tensor([x + 0.01 * 2 * N * DT, 0.25], dtype=F64)
+        torch.testing.assert_close(paddle.pose_in(state).centre, expected)
+    assert float(state.v.abs().max()) < 1e-9  # as of a paddle that went from one to the other
+
+
+def test_states_forget_obstacles_that_are_gone():
+    """And no others: a step without an obstacle leaves it where it is."""
+    paddle, state = box((0.35, 0.25)), block()
+    step = step_with(paddle)
+    state = mpm.rollout(step, state, 2, DT)
+    for _ in range(2):
+        state = step_with(box((1.2, 0.25)))(state, DT)
+        gc.collect()
+    state = step_with(box((1.2, 0.25)))(state, DT)
+    assert len(state.poses) == 2 and paddle.key in state.poses
+
+
 def test_a_call_depends_on_its_arguments_alone(device):
     """Candidates from one state; a state that was never moved; a copy, and one that was read."""
     paddle = box(start(device=device))
@@ -403,7 +486,8 @@ def test_a_call_depends_on_its_arguments_alone(device):
         paddle.position = start(device=device) + torch.tensor([far, 0.0], dtype=F64, device=device)
         ends.append(mpm.rollout(step, state, N, DT))
     assert torch.equal(ends[0].x, ends[2].x) and not torch.equal(ends[0].x, ends[1].x)
-    for like in (state.replace(v=state.v + 0), state.detach(), state.to(device), step.sorted(state).restored()):
+    for like in (*COPIES.values(), lambda s: s.to(device), lambda s: step.sorted(s).restored()):
+        like = like(state)
         torch.testing.assert_close(mpm.rollout(step, like, N, DT).v, ends[0].v, rtol=1e-9, atol=1e-9)
     placed = mpm.rollout(step_with(box(paddle.position.clone())), state, N, DT)
     for anew in (state.with_poses({}), pickle.loads(pickle.dumps(state)), state.split(1)[0]):
@@ -483,6 +567,146 @@ def test_a_velocity_that_contradicts_the_change_of_the_pose_is_reported(given, d
     mpm.rollout(step, state, N, DT)
 
 
+# ---- assignments inside a step
+
+
+@pytest.mark.parametrize("rollout", [True, False])
+@pytest.mark.parametrize("assign", ["assigned", "in place", "placed"])
+def test_an_assignment_inside_a_step_acts_in_the_next_one(assign, rollout, device):
+    """The obstacle waits, sweeps during the next step, and rests; one that is placed jumps."""
+    paddle, seen = box(torch.tensor([0.2, 0.25], dtype=F64, device=device)), []
+    target = torch.tensor([0.3, 0.25], dtype=F64, device=device)
+    clock = [0.0]
+
+    def act(state: mpm.State, dt: float) -> mpm.State:
+        clock[0] = state.time
+        if len(seen) == 2:
+            if assign == "assigned":
+                paddle.position = target
+            elif assign == "in place":
+                paddle.position.copy_(target)
+            else:
+                paddle.place(target)
+        return state
+
+    def look(blocks: mpm.Blocks, velocity: Tensor, mass: Tensor, dt: float) -> Tensor:
+        speed = paddle.velocity_at(torch.zeros_like(velocity[:1]), None, clock[0])
+        centre = paddle.centre_at(clock[0], velocity)
+        seen.append((float(centre[0]), 0.0 if speed is None else float(speed.reshape(-1)[0])))
+        return velocity
+
+    step, state = step_with(paddle, on_particles=act, on_grid=look), block(device=device)
+    if rollout:
+        mpm.rollout(step, state, 5, DT)
+    else:
+        for _ in range(5):
+            state = step(state, DT)
+    moves = [0.2, 0.2, 0.2, 0.2, 0.3] if assign != "placed" else [0.2, 0.2, 0.2, 0.3, 0.3]
+    assert [x for x, _ in seen] == pytest.approx(moves)
+    assert [v for _, v in seen] == pytest.approx([0.0, 0.0, 0.0, 0.1 / DT if assign != "placed" else 0.0, 0.0])
+
+
+@pytest.mark.parametrize("rollout", [True, False])
+def test_a_contradiction_inside_a_call_is_reported(rollout, device):
+    paddle = box(start(device=device), velocity=(0.0, 0.0))
+
+    def act(state: mpm.State, dt: float) -> mpm.State:
+        paddle.position = start(device=device) + (0.02 if state.time > 1.5 * DT else 0.0)
+        return state
+
+    step, state = step_with(paddle, on_particles=act), block(device=device)
+
+    def run(state: mpm.State) -> None:
+        if rollout:
+            mpm.rollout(step, state, 5, DT)
+        else:
+            for _ in range(5):
+                state = step(state, DT)
+
+    if device == "cpu":
+        with pytest.raises(ValueError, match="is not where its velocity has led it"):
+            run(state)
+        assert paddle.course is None and paddle.motion is paddle
+    else:
+        run(state)
+        assert step.failures().failed.tolist() == [True]
+
+
+def test_a_step_that_fails_inside_a_call_leaves_its_obstacles():
+    """It may be taken again, as with another time step."""
+    paddle = box((0.35, 0.25))
+    fails = [False]
+
+    def on_grid(blocks: mpm.Blocks, velocity: Tensor, mass: Tensor, dt: float) -> Tensor:
+        if fails[0]:
+            raise ArithmeticError
+        return velocity
+
+    class Twice(torch.nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.step = step_with(paddle, on_grid=on_grid)
+
+        def forward(self, state: mpm.State, dt: float) -> mpm.State:
+            paddle.position = (paddle.position[0] + 0.001, 0.25)
+            if fails[0]:
+                with pytest.raises(ArithmeticError):
+                    self.step(state, 2 * dt)
+                fails[0] = False
+            return self.step(state, dt)
+
+    ends = []
+    for trial in (False, True):
+        paddle.place((0.35, 0.25))
+        state = mpm.rollout(step := Twice(), block(), 2, DT)
+        paddle.position, fails[0] = (0.36, 0.25), trial
+        ends.append(mpm.rollout(step, state, 3, DT))
+    assert_alike(*ends, 1e-12)
+
+
+def test_keys_of_steps_from_graphs_do_not_depend_on_calls():
+    """So that steps with an obstacle at rest are recorded once."""
+    step, state = step_with(box((0.35, 0.25))), block()
+    keys = [StepKey(step).key]
+    for _ in range(3):
+        with control.control_step(step, state, N, DT) as left:
+            keys.append(StepKey(step).key)
+            state = left(state)
+    assert all(key == keys[0] for key in keys)
+    step.boundaries.entries[0].position = lambda t: torch.stack([0.35 + V * t, 0.25 + 0 * t])
+    with control.control_step(step, block(), N, DT):
+        assert StepKey(step).key != keys[0]
+
+
+def test_contradictions_are_counted_of_heat_too(device):
+    """Also of heat that is stepped alone."""
+    heat = mpm.Heat(grid_of(), 10.0, 100.0)
+    step = mpm.Step(grid_of(), LAW, heat=mpm.Heat(grid_of(), 10.0, 100.0))
+    for module in (heat, step):
+        state = block(device=device)
+        module(state.replace(temperature=torch.zeros_like(state.mass)), DT)
+        module.check()
+        control._count(module, torch.tensor([True], device=device))
+        with pytest.raises(mpm.SimulationError, match="obstacles were assigned a pose while they have a velocity"):
+            module.check()
+        module.reset()
+        module.check()
+
+
+@pytest.mark.cuda
+def test_numbers_do_not_wait_for_the_device():
+    paddle = box((0.35, 0.25))
+    step, state = step_with(paddle), block(device="cuda")
+    for k, mode in enumerate(("default", "error", "error")):
+        torch.cuda.set_sync_debug_mode(mode)
+        try:
+            paddle.position = (0.35 + 0.001 * k, 0.25)
+            with control.control_step(step, state, N, DT) as left:
+                state = left(state)
+        finally:
+            torch.cuda.set_sync_debug_mode("default")
+
+
 # ---- gradients
 
 
@@ -514,6 +738,41 @@ def test_gradients_of_poses_are_those_of_finite_differences(way, options, device
             difference = float(high - low) / (2 * h)
             assert float(gradient[k, axis]) == pytest.approx(difference, rel=2e-5, abs=1e-3)
     assert float(gradient[1:, 0].abs().min()) > 1.0
+
+
+@pytest.mark.parametrize("way", ["calls", "inside"])
+def test_gradients_after_poses_were_written_in_place(way, device):
+    """A backward pass that computes steps again finds the poses of their time, and what was assigned inside a call."""
+
+    def gradient(write: bool, **options: Any) -> Tensor:
+        paddle = box(start(device=device), velocity=torch.zeros(2, dtype=F64, device=device))
+        poses = [start(device=device), start(device=device) + torch.tensor([0.02, 0.0], dtype=F64, device=device)]
+        v = block(device=device).v.requires_grad_()
+        state = block(device=device).replace(v=v)
+
+        def assign(pose: Tensor) -> None:
+            paddle.velocity = None
+            if write:
+                paddle.position.copy_(pose)
+            else:
+                paddle.position = pose.clone()
+
+        def act(state: mpm.State, dt: float) -> mpm.State:
+            if way == "inside":
+                assign(poses[0] + (poses[1] - poses[0]) * min(state.time / (N * DT), 1.0))
+            return state
+
+        step = step_with(paddle, on_particles=act)
+        for pose in (poses[0], *poses, poses[0]):
+            if way == "calls":
+                assign(pose)
+            state = mpm.rollout(step, state, N, DT, **options)
+        paddle.position.copy_(poses[0] - 0.1)
+        return torch.autograd.grad((state.x.square()).sum(), v)[0]
+
+    expected = gradient(False)
+    for write in (False, True):
+        assert relative_error(gradient(write, checkpoint=7), expected) < 1e-12
 
 
 def test_gradients_of_rotations(device):

@@ -8,18 +8,20 @@ moves to an assigned pose at constant rates, and reaches it at the end of the ca
 from __future__ import annotations
 
 import contextlib
+import copy
 import dataclasses
 import functools
 import math
 import threading
-from collections.abc import Callable, Iterator, Sequence
+import weakref
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from ..capture import as_remembered, is_captured, is_same, is_traced
-from ..per_scene import finite
+from ..capture import Remembered, as_remembered, is_captured, is_same, is_traced
+from ..per_scene import filled, finite
 from ..vectors import composed, norm
 from .motion import PACE, RigidMotion
 
@@ -70,12 +72,20 @@ class Left(NamedTuple):
         left = self.map(lambda t: t.to(device))
         return left if self.known is None else left._replace(known=self.known.to(device))
 
+    def copied(self, memo: dict[int, Any]) -> Left:
+        """Of a deep copy, in which an obstacle may have been copied before, too."""
+        given = tuple(
+            copy.deepcopy(value, memo) if isinstance(value, Remembered) else memo.get(id(value), value)
+            for value in self.given
+        )
+        return self._replace(given=given)
+
     def without(self, scenes: Tensor) -> Left:
         """Placed in some scenes, bool [B]."""
         return self._replace(known=~scenes if self.known is None else self.known & ~scenes)
 
 
-Poses = dict[str, Left]
+Poses = dict[weakref.ref[Any], Left]
 """By `Obstacle.key`."""
 
 
@@ -141,11 +151,23 @@ def control_step(
         ValueError: on the CPU, where a velocity contradicts the change of a pose. On CUDA the status counts it.
     """
     obstacles = [] if n == 0 or torch.compiler.is_compiling() or _THREAD.steady else obstacles_of(step)
-    if not obstacles or is_traced(state.x) or is_captured(state.x) or _nothing_new(obstacles, state.poses):
+    if not obstacles or is_traced(state.x) or is_captured(state.x):
+        return contextlib.nullcontext(_unchanged)
+    _tell_apart(obstacles)
+    if _nothing_new(obstacles, state.poses):
         return contextlib.nullcontext(_unchanged)
     if any(o.course is not None for o in obstacles):
-        return _inside(obstacles, state, dt)
+        return _inside(step, obstacles, state, dt)
     return _control_step(step, obstacles, state, Span(state.time, n * dt if seconds is None else seconds, dt))
+
+
+def _tell_apart(obstacles: Sequence[Obstacle]) -> None:
+    """Make copies beside those that they were copied from obstacles of their own."""
+    known = set()
+    for obstacle in obstacles if len(obstacles) > 1 else ():
+        if obstacle.identity in known:
+            obstacle.identify()
+        known.add(obstacle.identity)
 
 
 def _nothing_new(obstacles: Sequence[Obstacle], poses: Poses) -> bool:
@@ -163,27 +185,56 @@ def _nothing_new(obstacles: Sequence[Obstacle], poses: Poses) -> bool:
 
 
 @contextlib.contextmanager
-def _inside(obstacles: Sequence[Obstacle], state: State, dt: float | Tensor) -> Iterator[Leave]:
-    """A step inside a control step."""
-    inside, span = [o for o in obstacles if o.course is not None], Span(state.time, dt, dt)
-    changed = [o for o in inside if not _is_as_left(o, o.course.after)]  # type: ignore[union-attr]
-    for obstacle in changed:
-        assert obstacle.course is not None
-        obstacle.follow(course_of(obstacle, _underway(obstacle.course), span, state.x.device), dt)
-    for obstacle in inside:
-        if obstacle.pace is not dt:
-            obstacle.follow(obstacle.course, dt)
-    yield _unchanged
-    for obstacle in changed:
-        assert obstacle.course is not None
-        after = obstacle.course.after
-        obstacle.follow(Course(after.moves, after), dt)
+def _inside(step: Any, obstacles: Sequence[Obstacle], state: State, dt: float | Tensor) -> Iterator[Leave]:
+    """A step inside a control step. One that fails leaves obstacles as they were before it."""
+    span = Span(state.time, dt, dt)
+    before = [(o, o.course) for o in obstacles if o.course is not None]
+    changed = {
+        k: course_of(o, _underway(o.course), span, state.x.device)
+        for k, o in enumerate(obstacles)
+        if o.course is not None and not _is_as_left(o, o.course.after)
+    }
+    _report(step, obstacles, changed)
+    try:
+        for k, course in changed.items():
+            obstacles[k].follow(course, dt)
+        for obstacle, _ in before:
+            if obstacle.pace is not dt:
+                obstacle.follow(obstacle.course, dt)
+        yield _unchanged
+    except BaseException:
+        for obstacle, was in before:
+            obstacle.follow(was, dt)
+        raise
+    for k, course in changed.items():
+        obstacles[k].follow(Course(course.after.moves, course.after), dt)
+
+
+def motions_now(step: Any, state: State) -> Callable[[], contextlib.AbstractContextManager[None]]:
+    """Makes a context in which obstacles whose attributes have been assigned meanwhile, inside a step, move as they do
+    now: that acts in the next control step."""
+    fixed = _THREAD.steady or is_traced(state.x) or is_captured(state.x)
+    now = [] if fixed else [(o, _left_at(o)) for o in obstacles_of(step) if o.motion is o]
+
+    @contextlib.contextmanager
+    def held() -> Iterator[None]:
+        changed = [(o, left.motion) for o, left in now if not _is_as_left(o, left)]
+        for obstacle, motion in changed:
+            vars(motion)["pace"] = obstacle.pace
+            obstacle._modules["control"] = motion
+        try:
+            yield
+        finally:
+            for obstacle, _ in changed:
+                obstacle._modules.pop("control", None)
+
+    return held
 
 
 @contextlib.contextmanager
 def _control_step(step: Any, obstacles: Sequence[Obstacle], state: State, span: Span) -> Iterator[Leave]:
     courses = [course_of(o, state.poses.get(o.key), span, state.x.device) for o in obstacles]
-    _report(step, obstacles, courses)
+    _report(step, obstacles, dict(enumerate(courses)))
     try:
         for obstacle, course in zip(obstacles, courses, strict=True):
             obstacle.follow(course, span.pace)
@@ -193,9 +244,10 @@ def _control_step(step: Any, obstacles: Sequence[Obstacle], state: State, span: 
             obstacle.follow(None, PACE)
 
 
-def motions_of(step: Any) -> Callable[[], contextlib.AbstractContextManager[None]]:
-    """Makes a context in which obstacles move as they do now, for a backward pass that recomputes the steps."""
-    now = [(o, _Motions(o)) for o in obstacles_of(step)]
+def motions_of(step: Any, state: State) -> Callable[[], contextlib.AbstractContextManager[None]]:
+    """Makes a context in which obstacles move as they do now in steps from a state, for a backward pass that recomputes
+    these steps."""
+    now = [(o, _Motions(o).stored(o, state.poses)) for o in obstacles_of(step)]
 
     @contextlib.contextmanager
     def again() -> Iterator[None]:
@@ -217,6 +269,24 @@ class _Motions:
     def __init__(self, obstacle: Obstacle) -> None:
         self._plain = {name: vars(obstacle)[name] for name in (*ASSIGNED, "course", "pace") if name in vars(obstacle)}
         self._stored = {name: dict(vars(obstacle)[name]) for name in ("_parameters", "_buffers", "_modules")}
+
+    def stored(self, obstacle: Obstacle, poses: Poses) -> _Motions:
+        """With tensors of their own, which later writes do not change. What was the same as where the obstacle was left
+        still is."""
+        course: Course | None = self._plain["course"]
+        left = poses.get(obstacle.key) if course is None else course.after
+        same = [] if left is None else _sameness(obstacle, left)
+        for name in ("_parameters", "_buffers"):
+            self._stored[name] = {key: None if t is None else t.clone() for key, t in self._stored[name].items()}
+        if left is not None:
+            values = [next((d[n] for d in (self._plain, *self._stored.values()) if n in d), None) for n in ASSIGNED]
+            given = tuple(
+                as_remembered(value) if known else before
+                for known, value, before in zip(same, values, left.given, strict=True)
+            )
+            during = None if course is None else course.during
+            self._plain["course"] = Course(during, left._replace(given=given))
+        return self
 
     def give(self, obstacle: Obstacle) -> None:
         for name in ASSIGNED:
@@ -259,17 +329,17 @@ def _underway(course: Course) -> Left:
 
 def _leave(state: State, obstacles: Sequence[Obstacle]) -> State:
     """A state that stores where its obstacles are."""
-    poses = dict(state.poses)
+    poses = {key: left for key, left in state.poses.items() if key() is not None}
     for obstacle in obstacles:
         assert obstacle.course is not None
         poses[obstacle.key] = obstacle.course.after
-    same = len(poses) == len(state.poses) and all(poses[key] is left for key, left in state.poses.items())
+    same = len(poses) == len(state.poses) and all(state.poses.get(key) is left for key, left in poses.items())
     return state if same else state.with_poses(poses)
 
 
-def _report(step: Any, obstacles: Sequence[Obstacle], courses: Sequence[Course]) -> None:
-    """Raise on the CPU, or count, velocities that contradict the change of a pose."""
-    for k, course in enumerate(courses):
+def _report(step: Any, obstacles: Sequence[Obstacle], courses: Mapping[int, Course]) -> None:
+    """Raise on the CPU, or count, velocities that contradict the change of a pose, by the number of the obstacle."""
+    for k, course in courses.items():
         wrong = course.contradicts
         if wrong is None:
             continue
@@ -289,7 +359,7 @@ def _report(step: Any, obstacles: Sequence[Obstacle], courses: Sequence[Course])
 def _count(step: Any, wrong: Tensor) -> None:
     for module in step.modules():
         record = getattr(module, "_activations", None)
-        if record is not None and hasattr(module, "integrator"):
+        if record is not None and hasattr(module, "grid"):  # a `Step` or a `Heat`
             record.contradict(wrong, module.grid.scenes)
 
 
@@ -436,8 +506,7 @@ class _Changes:
         """A pose or a rate as a tensor; None for zero."""
         if value is None:
             return self.like.new_zeros((self._dim,) * self._rank)
-        given = value if isinstance(value, Tensor) else torch.tensor(value, dtype=torch.float64, device="cpu")
-        return given.to(self.like)
+        return value.to(self.like) if isinstance(value, Tensor) else filled(value, self.like)
 
     def pose(self) -> Tensor:
         """Where the obstacle was left."""

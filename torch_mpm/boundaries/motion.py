@@ -20,6 +20,9 @@ Path = Callable[[Tensor], "Tensor | Sequence[Any] | np.ndarray"]
 PACE = 1e-4
 """Time over which a path without a derivative is differenced where no step says one [s]."""
 
+REFUSALS = RuntimeError, TypeError, ValueError
+"""What functions of numbers raise where a transform of torch stands for the time."""
+
 
 class Pose(NamedTuple):
     """Where a body is: world = centre + rotation @ body."""
@@ -95,7 +98,7 @@ class RigidMotion(SceneParameters):
         """[D] or [B, D]."""
         motion = self.motion
         if self.follows_path:
-            return motion._path(time, like)[0]
+            return motion.at(_as_time(time, like)).to(like.dtype)
         position = motion.parameter("position", like, (_length(motion.position),))
         if motion.velocity is None:
             return position
@@ -133,9 +136,7 @@ class RigidMotion(SceneParameters):
 
     def _path(self, time: float | Tensor, like: Tensor) -> tuple[Tensor, Tensor]:
         """Centre and its velocity where the position is a function of time."""
-        if not isinstance(time, Tensor):
-            time = torch.full((), time, dtype=like.dtype, device=like.device)
-        centre, velocity = self._moved(time.to(like.dtype))
+        centre, velocity = self._moved(_as_time(time, like))
         return centre.to(like.dtype), velocity.to(like.dtype)
 
     def path_over(self, times: Tensor, like: Tensor) -> tuple[Tensor, Tensor]:
@@ -167,8 +168,7 @@ class RigidMotion(SceneParameters):
             return torch.vmap(self.at)(times)
         except torch.OutOfMemoryError:
             raise
-        except (RuntimeError, TypeError, ValueError, NotImplementedError):
-            # As of functions that look at the value of a time. One that is wrong raises again.
+        except REFUSALS:  # as of functions that look at the value of a time. One that is wrong raises again.
             return torch.stack([self.at(time) for time in times.unbind()])
 
     def _rates(self, times: Tensor, centre: Tensor) -> Tensor:
@@ -183,7 +183,7 @@ class RigidMotion(SceneParameters):
                 again = self._mapped(leaf)
             except torch.OutOfMemoryError:
                 raise
-            except (RuntimeError, TypeError):  # as of functions of NumPy, which have no derivative
+            except REFUSALS:  # as of functions of NumPy, which have no derivative
                 return torch.zeros_like(centre)
             rates = [torch.zeros_like(leaf) for _ in again.unbind(-1)]
             for k, part in enumerate(again.unbind(-1)):
@@ -203,7 +203,7 @@ class RigidMotion(SceneParameters):
             centre, rate, *_ = torch.func.jvp(self.at, (time,), (torch.ones_like(time),))
         except torch.OutOfMemoryError:
             raise
-        except (RuntimeError, TypeError, ValueError):  # as of functions of NumPy. One that is wrong raises again.
+        except REFUSALS:  # as of functions of NumPy. One that is wrong raises again.
             centre = self.at(time)
             rate = torch.zeros_like(centre)
         return centre, rate
@@ -256,6 +256,13 @@ def rotation_matrix(angle: Tensor, dim: int) -> Tensor:
     s = torch.where(half > 0, turned.sin() / turned, 1)
     first, second = s * half.cos(), 0.5 * s * s
     return torch.eye(3, dtype=angle.dtype, device=angle.device) + first * cross + second * (cross @ cross)
+
+
+def _as_time(time: float | Tensor, like: Tensor) -> Tensor:
+    """A time [] or [B] with the dtype of `like`."""
+    if isinstance(time, Tensor):
+        return time.to(like.dtype)
+    return torch.full((), time, dtype=like.dtype, device=like.device)
 
 
 def _column(time: float | Tensor, rank: int) -> float | Tensor:

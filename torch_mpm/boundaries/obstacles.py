@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import uuid
+import weakref
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -23,6 +24,24 @@ from .walls import CONTACTS
 if TYPE_CHECKING:
     from ..state import State
     from .control import Course
+
+
+class Identity:
+    """What an obstacle has in common with its copies, also with those of a pickle, one for each name."""
+
+    _known: ClassVar[weakref.WeakValueDictionary[str, Identity]] = weakref.WeakValueDictionary()
+
+    def __new__(cls, name: str) -> Identity:
+        identity = cls._known.get(name)
+        if identity is None:
+            identity = cls._known[name] = super().__new__(cls)
+            identity.name = name
+        return identity
+
+    name: str
+
+    def __reduce__(self) -> tuple[type[Identity], tuple[str]]:
+        return Identity, (self.name,)
 
 
 class Obstacle(RigidMotion):
@@ -111,8 +130,7 @@ class Obstacle(RigidMotion):
         self.end, self.scene = float(end), scene
         self.kept_table = GraphCache()
         """Kept by `torch_mpm.ops.obstacle_tables` for a list of obstacles that begins with this one."""
-        self.key = uuid.uuid4().hex
-        """Of what a state stores about the obstacle; a copy has the same."""
+        self.identify()
         self.placements = 0
         """How often it was placed."""
         self.course: Course | None = None
@@ -125,6 +143,15 @@ class Obstacle(RigidMotion):
             super().__setattr__(name, value)
 
     # -- control
+
+    @property
+    def key(self) -> weakref.ref[Identity]:
+        """Of what a state stores about the obstacle; dead once the obstacle and its copies are gone."""
+        return weakref.ref(self.identity)
+
+    def identify(self) -> None:
+        """Make it another obstacle than those that it was copied from."""
+        self.identity = Identity(uuid.uuid4().hex)
 
     def place(self, position: Value | Path | None = None, rotation: Value | None = None) -> None:
         """Put the obstacle somewhere at once: it pushes nothing on its way there.
