@@ -11,7 +11,7 @@ from .cfl import stable_dt
 from .checkpoints import Checkpoints
 from .data.trajectory import Trajectory
 from .environments import Environments
-from .errors import DamagedFileError, GridOverflowError, PrecisionWarning, SimulationError, ThinWallWarning
+from .errors import DamagedFileError, GridOverflowError, PrecisionWarning, SimulationError
 from .failures import Failures
 from .gradient_norms import GradientNorms
 from .grid import Blocks, Grid
@@ -69,7 +69,6 @@ __all__ = [
     "State",
     "Step",
     "Table",
-    "ThinWallWarning",
     "Trajectory",
     "Walls",
     "Waypoints",

@@ -43,10 +43,6 @@ class PrecisionWarning(UserWarning):
     """Numbers of the chosen dtype are too coarse for what is computed with them."""
 
 
-class ThinWallWarning(UserWarning):
-    """A wall is so thin that material on one side moves the nodes on the other."""
-
-
 class DamagedFileError(ValueError):
     """A file of a run is damaged, was changed by another program, or is of another kind."""
 

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from .boundaries import Obstacle, Walls, call_boundary
-from .boundaries.solid import SolidNodes, after_contact, moved_to_surface
-from .grid import Blocks, Grid
+from .boundaries.solid import SolidNodes, after_contact
+from .grid import Blocks
 from .ops import contact, contact_impulses, fusible
 from .ops.contact import MAX_OBSTACLES, is_solid
 from .ops.impulses import impulse_of_nodes
@@ -67,20 +67,6 @@ def after_boundaries(
             momenta = [mass[:, None] * torch.where(mass[:, None] != 0, -change, 0) for change in changes]
             impulses.append(torch.stack([impulse_of_nodes(blocks, momentum) for momentum in momenta], 1))
     return velocity, impulses
-
-
-def project(boundaries: Sequence[Any], walls: Walls | None, grid: Grid, state: State) -> tuple[Tensor, Tensor]:
-    """Positions of particles [P, D] [m], those inside obstacles moved to the nearest point of free space, and which of
-    them have moved, bool [P]."""
-    obstacles = [boundary for boundary in boundaries if is_solid(boundary)]
-    x = state.x.detach()
-    if not obstacles or len(x) == 0:
-        return x, torch.zeros_like(x[:, 0], dtype=torch.bool)
-    faces = () if walls is None else walls.faces(grid)
-    with full_precision(x):
-        return moved_to_surface(
-            SolidNodes(obstacles, [None] * len(obstacles), x, state.scene, state.time, grid.dx, faces)
-        )
 
 
 def _after_solid(

@@ -491,7 +491,7 @@ class Mesh(Shape):
 class Terrain(Mesh):
     """The ground below an open height surface, or the space above it; 3-D only.
 
-    Vertical sides and a flat face close it. As an obstacle it should reach 3 cells beyond open faces of the domain, or
+    Vertical sides and a flat face close it. As an obstacle it should reach 3 cells beyond the domain, or
     `Sampled.of(terrain, lower, upper, spacing)` acts in the kernel, for corners outside of the closed body.
 
     Args:
@@ -564,7 +564,7 @@ class SDF(Shape):
         if self.normal is not None:
             distance, normal = self.distance(x), self.normal(x)
         else:
-            distance, normal = with_gradient(self.distance, x)
+            distance, normal = _with_gradient(self.distance, x)
         self._check(distance, normal, x)
         return distance, unit(normal)
 
@@ -728,7 +728,7 @@ def _nearest_of_all(x: Tensor, corners: Tensor) -> Tensor:
     return candidates[torch.arange(len(x), device=x.device), nearest]
 
 
-def with_gradient(function: Callable[[Tensor], Tensor], points: Tensor) -> tuple[Tensor, Tensor]:
+def _with_gradient(function: Callable[[Tensor], Tensor], points: Tensor) -> tuple[Tensor, Tensor]:
     """Values [N] of a function of points [N, D], each of its own point, and their gradients; differentiable."""
     if torch.compiler.is_compiling() or torch._C._autograd._top_saved_tensors_default_hooks(False) is None:
         values, pull_back, *_ = torch.func.vjp(function, points)

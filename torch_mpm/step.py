@@ -14,7 +14,6 @@ from . import resolution
 from .activation_record import ActivationRecord
 from .boundaries import BoundaryList, Obstacle, Walls
 from .boundaries.control import control_step, motions_now
-from .boundaries.thickness import warn_of_thin_walls
 from .capture import GraphCache, is_captured, is_traced, is_transformed
 from .cfl import Figures, chosen_dt, figures_of, look
 from .errors import REAL, PrecisionWarning, check_flag, check_number, check_vector, shape_of
@@ -27,7 +26,7 @@ from .impulses import Impulses, check_impulse, impulses_of, no_impulse
 from .laws.custom import as_law
 from .laws.material import Material
 from .laws.mixture import Mixture
-from .node_contact import after_boundaries, project
+from .node_contact import after_boundaries
 from .ops import Survey, fusible, g2p, gather, grid_update, p2g, wall_impulses
 from .ops.arguments import check_choice, soa_empty, split_dt
 from .ops.contact import MAX_OBSTACLES
@@ -382,27 +381,6 @@ class Step(TensorModule):
 
         return self._kept_gravity.get((gravity, x.dtype, x.device), make, x)
 
-    def project(self, state: State) -> tuple[State, Tensor]:
-        """A state whose particles inside obstacles are moved to the nearest point of free space, and how many of each
-        scene were.
-
-        Particles may be found inside after seeding, or where an obstacle appears. They are pushed out slowly, with
-        stress, or not at all where they are deep; a particle that was moved keeps all else that it has. Obstacles are
-        where they are at `state.time`; those on which hooks or an `apply` of their own act are left alone. Without
-        gradient; nothing here synchronises with a GPU.
-
-        Returns:
-            The state, and the numbers of particles that were moved, int64 [B].
-        """
-        check_state(state)
-        x, moved = project(self.boundaries.entries, self.walls, self.grid, state)
-        scenes = self.grid.scenes
-        if state.scene is None:
-            return state.replace(x=x), moved.sum().expand(scenes).clone()
-        count = torch.zeros(scenes, dtype=torch.int64, device=x.device)
-        count.index_add_(0, state.scene.clamp(0, scenes - 1).long(), moved.long())
-        return state.replace(x=x), count
-
     def with_impulses(self, state: State) -> State:
         """A state that counts impulses: from here on steps add up what the material gives boundaries and walls.
 
@@ -521,7 +499,6 @@ class Step(TensorModule):
 
         Warns:
             PrecisionWarning: where the positions of the state do not resolve the cells, see `Grid`.
-            ThinWallWarning: for boxes and revolved shapes that are thinner than 4 dx.
 
         Raises:
             SimulationError: that names each scene (up to a dozen of a kind), when and how many, and has `failures`: if
@@ -534,7 +511,6 @@ class Step(TensorModule):
         raise_failures(self.failures(state), self._activations.all(), self.grid)
         if state is not None:
             resolution.check(self.grid, state.x.dtype)
-        warn_of_thin_walls(self.boundaries.entries, self.grid.dx)
 
     def explain(self, state: State, dt: float | Tensor = 1.0, speed: float | None = None) -> str:
         """How `rollout` takes steps from a state: many in one op, from a CUDA graph or from Python, and why; and of the

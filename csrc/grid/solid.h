@@ -275,7 +275,7 @@ class SolidAt {
       face.depth = T(0) - face.height;
       if (pose.shape == ObstacleShape::sampled && face.height > a_.rounding && face.height <= reach_)
         add_seen_by_neighbours(face, pose);
-      if (!(face.height <= seam_ / 2) || !(face.depth <= deepest) || beyond > reach_) continue;
+      if (!(face.height <= a_.rounding) || !(face.depth <= deepest) || beyond > reach_) continue;
       face.normal = pose.rotation * own;
       if (!(dot(face.normal, face.normal) > T(0.5))) continue;
       if (pose.shape == ObstacleShape::sampled) add_joining(face, pose);
@@ -292,22 +292,14 @@ class SolidAt {
     nearest.flat = false;
     for (int i = 0; i < kLeaning; i++) {
       V normal;
-      const T height = height_of(pose, -1, seen_from(pose, first, nearest.normal, away, i), normal);
-      nearest.flat = nearest.flat || (height >= T(0) && dot(normal, nearest.normal) < T(kSame));
+      const T height = height_of(pose, -1, first + away * leaning(nearest.normal, i), normal);
+      nearest.flat = nearest.flat || (height >= T(-0.02) * away && dot(normal, nearest.normal) < T(kSame));
     }
     for (int i = 0; nearest.flat && i < kLeaning; i++)
-      add_plane(nearest, pose, seen_from(pose, first, nearest.normal, away, i));
+      add_plane(nearest, pose, first + away * leaning(nearest.normal, i), T(-0.02) * away);
     bool may_be_covered = a_.obstacles > 1;
     for (int face = 0; face < 2 * D; face++) may_be_covered = may_be_covered || a_.wall_kind[face] != Contact::open;
     if (may_be_covered && !is_free(first, nearest.normal)) add_seen_by_neighbours(nearest, pose);
-  }
-
-  // A point around a point of the surface; one behind a face is moved before it.
-  MPM_HD_CALL V seen_from(const ObstaclePose<T, D>& pose, const V& first, const V& axis, const T& away, int i) const {
-    const V at = first + away * leaning(axis, i);
-    V normal;
-    const T height = height_of(pose, -1, at, normal);
-    return height < T(0) ? at + (T(0.3) * away - height) * normal : at;
   }
 
   MPM_HD_CALL void add_seen_by_neighbours(const Face<T, D>& nearest, const ObstaclePose<T, D>& pose) {
@@ -315,28 +307,31 @@ class SolidAt {
     for (int i = 1; i < count; i++) {
       V way;
       for (int j = 0, rest = i; j < D; j++, rest /= 3) way[j] = T(rest % 3 == 2 ? -1 : rest % 3);
-      add_plane(nearest, pose, node_ + reach_ * (pose.rotation * way));
+      add_plane(nearest, pose, node_ + reach_ * (pose.rotation * way), T(0));
     }
   }
 
-  // The plane that a point outside the shape sees.
-  MPM_HD_CALL void add_plane(const Face<T, D>& nearest, const ObstaclePose<T, D>& pose, const V& at) {
+  // The plane that a point sees, which is to be no lower than `least` above the shape.
+  MPM_HD_CALL void add_plane(const Face<T, D>& nearest, const ObstaclePose<T, D>& pose, const V& at, const T& least) {
     Face<T, D> face{nearest.obstacle, -1, true, at, {}, T(0), T(0)};
     face.height = height_of(pose, -1, face.at, face.normal);
     face.depth = T(0) - (face.height + dot(face.normal, node_ + T(-1) * face.at));
-    if (!(face.height >= T(0)) || !(dot(face.normal, face.normal) > T(0.5))) return;
+    if (!(face.height >= least) || !(dot(face.normal, face.normal) > T(0.5))) return;
     if (!(face.depth >= T(0) - seam_) || face.depth > reach_) return;
     for (int j = 0; j < faces_.count; j++)
       if (faces_.e[j].obstacle == face.obstacle && dot(faces_.e[j].normal, face.normal) > T(kSame)) return;
     faces_.add(face);
   }
 
-  // A unit vector, and directions at 55° to it, evenly around.
-  static constexpr int kLeaning = D == 2 ? 3 : 7;
+  // A unit vector, and directions at 25° and 55° to it, evenly around.
+  static constexpr int kLeaning = D == 2 ? 5 : 13;
   MPM_HD_CALL static V leaning(const V& axis, int i) {
     if (i == 0) return axis;
-    const T c = T(0.57357643635104616), s = T(0.81915204428899180);
-    const int k = i - 1;
+    constexpr int around = (kLeaning - 1) / 2;
+    const bool far = i > around;
+    const T c = far ? T(0.57357643635104616) : T(0.90630778703664994),
+            s = far ? T(0.81915204428899180) : T(0.42261826174069944);
+    const int k = (i - 1) % around;
     if constexpr (D == 2) {
       const T side = k ? s : T(0) - s;
       return {{c * axis[0] - side * axis[1], c * axis[1] + side * axis[0]}};
@@ -376,7 +371,7 @@ class SolidAt {
         return false;
       foot.at = node_, foot.step = zero_vector<T, D>();
       for (int i = 0; i < foot.count; i++) {
-        if (share[i] < T(0) - (foot.count > 1 ? seam_ / 2 : a_.rounding)) return false;
+        if (share[i] < T(0) - seam_ / 2) return false;
         foot.at = foot.at + share[i] * normal[i];
         foot.step = foot.step + ones[i] * normal[i];
       }

@@ -52,9 +52,7 @@ class Obstacle(RigidMotion):
 
     At a node inside, the velocity relative to the surface there loses all of itself ("sticky"), its normal component
     ("slip"), or its normal component where it points into the body ("separate"). Coulomb friction then lowers the
-    tangential speed by `friction` times the normal velocity that was stopped. In an inner edge or corner the node meets
-    all faces that join there, and obstacles of a step act as one solid (docs/concepts.md). `forward` is that of the
-    obstacle alone. A vibrating body needs more friction to
+    tangential speed by `friction` times the normal velocity that was stopped. A vibrating body needs more friction to
     stick than a rigid one (docs/limitations.md).
 
     Args:
@@ -433,8 +431,8 @@ class Capsule(Obstacle):
 class Revolved(Obstacle):
     """A polygon turned about an axis: a cone, a tube, a funnel, an hourglass, a drum.
 
-    In 2-D, the polygon and its mirror image. A wall should be at least 4 cells thick, and reach 3 cells beyond an open
-    face of the domain where it meets one: nodes outside carry momentum too.
+    In 2-D, the polygon and its mirror image. A wall should be at least 4 cells thick, and reach 3 cells beyond the
+    domain where it meets one of its faces: nodes outside carry momentum too.
 
     Args:
         outline: corners of the polygon, K pairs of distance from the axis (≥ 0) and position along it [m], counted from

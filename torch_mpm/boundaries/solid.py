@@ -29,8 +29,6 @@ SEAM = 0.1
 MOST_FACES, MOST_AT_ONCE = 12, 6
 """Faces that a node looks at, the nearest ones; and where values may not be looked at, so that absent ones cost as much
 as others."""
-PASSES = 3
-"""Passes that move a point to a surface: those from deep inside several obstacles may need more than one."""
 SAME = 0.94
 """Cosine between normals that count as one, of shapes that are known by their distance alone."""
 
@@ -152,7 +150,6 @@ class Meeting:
         face: number of it, −1 for the whole surface [n, D].
         at: where its normal is read [n, D, D].
         walls: which walls a node is at, bool [n, 2 D].
-        foot: the nearest point of free space, where one was found [n, D] [m]; NaN elsewhere.
         solid: these nodes.
     """
 
@@ -163,7 +160,6 @@ class Meeting:
     face: Tensor
     at: Tensor
     walls: Tensor
-    foot: Tensor
     solid: SolidNodes
 
     def constraints(self) -> Constraints:
@@ -242,28 +238,9 @@ def find_surfaces(solid: SolidNodes) -> Meeting | None:
                 return None
             solid, inside, x, distance = solid.chosen(rows), inside[rows], x[rows], distance[rows]
             sign, walls = sign[rows], walls[rows]
-        owner, face, at, foot = _feet(solid, x, distance)
+        owner, face, at = _feet(solid, x, distance)
         owner = torch.where(inside[:, None], owner, -1)
-        return Meeting(rows, x, sign, owner, face, at, walls, foot, solid)
-
-
-def moved_to_surface(solid: SolidNodes) -> tuple[Tensor, Tensor]:
-    """Positions [N, D] [m], those inside obstacles moved to the nearest point of free space, and which have moved, bool
-    [N]. Without gradient."""
-    x = solid.positions.detach()
-    moved = torch.zeros_like(x[:, 0], dtype=torch.bool)
-    for _ in range(PASSES):
-        inside = (solid.distances(x) < -solid.rounding).any(1)
-        if not _may_be(inside):
-            break
-        meeting = find_surfaces(dataclasses.replace(solid, positions=x))
-        if meeting is None:
-            break
-        whole = _nearest_foot(meeting.solid, meeting.position, meeting.owner[:, 0])
-        foot = torch.where(meeting.foot.isnan(), whole, meeting.foot)
-        foot = foot if meeting.nodes is None else x.index_copy(0, meeting.nodes, foot)
-        x, moved = torch.where(inside[:, None], foot, x), moved | inside
-    return x, moved
+        return Meeting(rows, x, sign, owner, face, at, walls, solid)
 
 
 def _is_closed(face: Face) -> bool:
@@ -344,7 +321,7 @@ def _faces_near(solid: SolidNodes, x: Tensor, distance: Tensor) -> _Candidates:
         alone = found.height.shape[1] == 1
         for f in range(found.height.shape[1]):
             height, normal = found.height[:, f], found.normal[:, f]
-            sees = near & (height <= solid.seam / 2) & (-height <= solid.reach) & (found.beyond[:, f] <= solid.reach)
+            sees = near & (height <= solid.rounding) & (-height <= solid.reach) & (found.beyond[:, f] <= solid.reach)
             sees = sees & ((normal * normal).sum(1) > 0.5)
             add(k, -1 if alone else f, found.flat, x, height, normal, torch.where(sees, -height, torch.inf))
     owner, face, flat = (torch.stack(part).to(x.device) for part in parts[:3])
@@ -367,13 +344,8 @@ def _add_distance(solid: SolidNodes, k: int, x: Tensor, acts: Tensor, add: Any) 
     planes = []
     for lean in _leaning(normal):
         at = first + away * lean
-        above, toward = obstacle.surface_at(at, solid.scene, solid.time)
-        behind = above < 0
-        if _may_be(sees & behind):  # it sees the face that it is behind, from before it
-            at = torch.where(behind[:, None], at + (0.3 * away - above)[:, None] * toward, at)
-            above, toward = obstacle.surface_at(at, solid.scene, solid.time)
-        planes.append((at, above, toward))
-    free = [plane[1] >= 0 for plane in planes]
+        planes.append((at, *obstacle.surface_at(at, solid.scene, solid.time)))
+    free = [plane[1] >= -0.02 * away for plane in planes]
     differs = [there & ((plane[2] * normal).sum(1) < SAME) for there, plane in zip(free, planes, strict=True)]
     joins = torch.stack(differs).any(0)
     wanted = [there & joins for there in free]
@@ -399,17 +371,16 @@ def _add_distance(solid: SolidNodes, k: int, x: Tensor, acts: Tensor, add: Any) 
         add(k, -1, True, at, above, toward, torch.where(own, depth, torch.inf))
 
 
-def _may_be(mask: Tensor) -> bool:
-    """Whether a mask [N] is anywhere set, where looking is free."""
-    return torch.compiler.is_compiling() or mask.device.type != "cpu" or bool(mask.any())
-
-
 def _leaning(axis: Tensor) -> list[Tensor]:
-    """Unit vectors [N, D], and directions at 55° to them, evenly around."""
-    half, root = math.cos(math.radians(55)), math.sin(math.radians(55))
+    """Unit vectors [N, D], and directions at 25° and 55° to them, evenly around."""
+    return [axis, *(lean for angle in (25.0, 55.0) for lean in _around(axis, math.radians(angle)))]
+
+
+def _around(axis: Tensor, angle: float) -> list[Tensor]:
+    half, root = math.cos(angle), math.sin(angle)
     if axis.shape[1] == 2:
         turned = torch.stack([-axis[:, 1], axis[:, 0]], 1)
-        return [axis, half * axis - root * turned, half * axis + root * turned]
+        return [half * axis - root * turned, half * axis + root * turned]
     x, y, z = axis.unbind(1)
     sign = torch.where(z < 0, -1, 1).to(axis.dtype)
     f = -1 / (sign + z)
@@ -417,15 +388,14 @@ def _leaning(axis: Tensor) -> list[Tensor]:
     u = torch.stack([1 + sign * x * x * f, sign * g, -sign * x], 1)
     w = torch.stack([g, sign + y * y * f, -y], 1)
     turns = [(1.0, 0.0), (0.5, math.sqrt(0.75)), (-0.5, math.sqrt(0.75))]
-    return [axis, *(half * axis + turn * (c * u + s * w) for turn in (root, -root) for c, s in turns)]
+    return [half * axis + turn * (c * u + s * w) for turn in (root, -root) for c, s in turns]
 
 
 # ---- feet
 
 
-def _feet(solid: SolidNodes, x: Tensor, distance: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Owner and number [n, D] of the faces that nodes meet, where their normals are read [n, D, D], and their feet
-    [n, D]."""
+def _feet(solid: SolidNodes, x: Tensor, distance: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Owner and number [n, D] of the faces that nodes meet, and where their normals are read [n, D, D]."""
     dim = x.shape[1]
     around = distance.masked_fill(distance > solid.rounding, -torch.inf).argmax(1)
     owner = torch.full((len(x), dim), -1, device=x.device)
@@ -433,7 +403,7 @@ def _feet(solid: SolidNodes, x: Tensor, distance: Tensor) -> tuple[Tensor, Tenso
     face = torch.full_like(owner, -1)
     at = x[:, None].expand(-1, dim, -1).clone()
     if not _may_join(solid.obstacles) and not solid.faces:
-        return owner, face, at, torch.full_like(x, torch.nan)
+        return owner, face, at
     skips = x.device.type == "cpu" and not torch.compiler.is_compiling()
     faces = _faces_near(solid, x, distance).nearest(MOST_FACES if skips else MOST_AT_ONCE)
     best = _Best(solid, faces, x)
@@ -449,19 +419,7 @@ def _feet(solid: SolidNodes, x: Tensor, distance: Tensor) -> tuple[Tensor, Tenso
     wide = member[:, :, None].expand(-1, -1, dim)
     several = (found.sum(1) > 1)[:, None, None]
     at = torch.where(several, best.at[:, None], at)
-    foot = torch.where(has, best.at, torch.nan)
-    return owner, face, torch.where(planes[:, :, None], faces.at.gather(1, wide), at), foot
-
-
-def _nearest_foot(solid: SolidNodes, x: Tensor, around: Tensor) -> Tensor:
-    """The point of the surface of one obstacle of each node, int64 [n], that is nearest to it [n, D]."""
-    foot = x
-    for k, obstacle in enumerate(solid.obstacles):
-        own = around == k
-        if _may_be(own):
-            distance, normal = obstacle.surface_at(x, solid.scene, solid.time)
-            foot = torch.where(own[:, None], x - distance[:, None] * normal, foot)
-    return foot
+    return owner, face, torch.where(planes[:, :, None], faces.at.gather(1, wide), at)
 
 
 class _Best:
@@ -493,11 +451,11 @@ class _Best:
         depth = self.faces.depth[:, list(members)].amax(1)
         depth = (depth / self.unit + 0.5).floor()
         wanted = depth.isfinite() & (depth <= self.depth)
-        if not _may_be(wanted):
+        if not torch.compiler.is_compiling() and wanted.device.type == "cpu" and not bool(wanted.any()):
             return
         found, at, step = self._solve(members)
         found = found & wanted
-        if not _may_be(found):
+        if not torch.compiler.is_compiling() and wanted.device.type == "cpu" and not bool(found.any()):
             return
         found = found & self._is_exposed(members, at, step)
         kind, friction = self.kinds[:, list(members)].amin(1), self.frictions[:, list(members)].amax(1)
@@ -517,7 +475,7 @@ class _Best:
         flat = faces.flat[:, member]
         for k, obstacle in enumerate(solid.obstacles):
             own = ~flat & (faces.owner[:, member] == k)
-            if not _may_be(own):
+            if not torch.compiler.is_compiling() and own.device.type == "cpu" and not bool(own.any()):
                 continue
             above, toward = obstacle.height_of_face(at, faces.face[:, member], solid.scene, solid.time)
             height, normal = torch.where(own, above, height), torch.where(own[:, None], toward, normal)
@@ -538,8 +496,7 @@ class _Best:
             gram = torch.where(independent[:, None, None], gram, eye)
             both = torch.linalg.solve_ex(gram, torch.stack([rest, torch.ones_like(rest)], 2))[0]
             share, ones = both.unbind(2)
-            slack = self.solid.seam / 2 if count > 1 else self.solid.rounding
-            found = found & independent & (share >= -slack).all(1)
+            found = found & independent & (share >= -self.solid.seam / 2).all(1)
             at = self.x + (share[:, :, None] * normal).sum(1)
             step = (ones[:, :, None] * normal).sum(1)
         return found, at, step

@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -25,10 +25,8 @@ from ..ops import scatter
 from ..ops.pointwise import pointwise
 from ..parameters import TensorModule, Value, evaluate, needs_no_scenes
 from ..per_scene import per_node
-from ..shapes import with_gradient
 from ..step_times import time_like
 from ..topology import PADDING
-from ..vectors import unit
 
 if TYPE_CHECKING:
     from ..state import State
@@ -59,7 +57,6 @@ class HeatNodes:
         fixed: nodes whose temperature is held at `held` [N] [K], bool [N], or None.
         share: of their conductivity that particles are left with [P], or None for all.
         layers: what replaces the rest, see `add_layer`.
-        held_surfaces: the obstacles of all `FixedSurface` of the step, in their order.
     """
 
     blocks: Blocks
@@ -75,7 +72,6 @@ class HeatNodes:
     held: Tensor | None = None
     share: Tensor | None = None
     layers: list[tuple[Tensor, Number]] = dataclasses.field(default_factory=list)
-    held_surfaces: Sequence[Obstacle] = ()
 
     @property
     def time(self) -> float | Tensor:
@@ -89,20 +85,6 @@ class HeatNodes:
         nothing, gradient = pointwise("surface_normals", dim, self.volume)
         (area,) = pointwise("length", dim, scatter(self.blocks, self.state.x, nothing, gradient=gradient))
         return area
-
-    @functools.cached_property
-    def feet_on_held_surfaces(self) -> list[Tensor]:
-        """The points of each of `held_surfaces` that are nearest to the particles [P, D] [m]; without gradient."""
-        x = self.state.x.detach()
-
-        def foot(region: Obstacle) -> Tensor:
-            def distance(points: Tensor) -> Tensor:
-                return region.signed_distance(points, self.state.scene, self.time)
-
-            away, gradient = with_gradient(distance, x)
-            return (x - away[:, None] * unit(gradient)).detach()
-
-        return [foot(region) for region in self.held_surfaces]
 
     def scene(self) -> Tensor | None:
         """Scene of each node, int32 [N]; None for one scene."""
@@ -400,8 +382,7 @@ class FixedSurface(Term):
     the heat κ (s'/a) (temperature − θ) per volume with the surface itself. That is what ∇ · (s κ ∇θ) lacks where θ is
     linear, and on average over the layer for any θ. So the layer does not show in the temperature, which meets that of
     the surface within 0.02 dx wherever it lies between the nodes, and within 0.1 dx where a gap of 0.5 dx is between it
-    and the matter. Matter inside the obstacle is held as at the surface. Several such regions are one: where the
-    nearest point of a region lies on another one, as at the seam of two boxes, it is no surface.
+    and the matter. Matter inside the obstacle is held as at the surface.
 
     Args:
         region: an obstacle of `torch_mpm.boundaries`, wherever it moves.
@@ -425,29 +406,8 @@ class FixedSurface(Term):
         width, state = self.WIDTH * nodes.blocks.grid.dx, nodes.state
         self.region.check_scenes(nodes.blocks.grid.dim, nodes.blocks.grid.scenes)
         distance = self.region.signed_distance(state.x, state.scene, nodes.time).to(state.x)
-        covered = self._covered(nodes, distance)
-        if covered is not None:
-            distance = torch.where(covered, 2 * width, distance)
         share, rate = pointwise("heat_layer", nodes.blocks.grid.dim, distance, width)
         nodes.add_layer(share, rate, nodes.per_node(self.temperature, "temperature"))
-
-    def _covered(self, nodes: HeatNodes, distance: Tensor) -> Tensor | None:
-        """Particles outside whose nearest point of the region lies on or in another held one, bool [P]. Where the
-        nearest points of two regions are one, that of the first counts. None where there is no other region."""
-        regions = list(nodes.held_surfaces)
-        if len(regions) < 2:
-            return None
-        mine = next(k for k, region in enumerate(regions) if region is self.region)
-        feet, scene, time = nodes.feet_on_held_surfaces, nodes.state.scene, nodes.time
-        with torch.no_grad():
-            near = 1e-4 * nodes.blocks.grid.dx
-            covered = torch.zeros_like(distance, dtype=torch.bool)
-            for k, region in enumerate(regions):
-                if k != mine:
-                    same = (feet[k] - feet[mine]).norm(dim=1) <= near
-                    on = region.signed_distance(feet[mine], scene, time) <= near
-                    covered |= on & ~same if mine < k else on
-        return covered & (distance > 0)
 
 
 class Source(Term):
