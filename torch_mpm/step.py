@@ -314,7 +314,7 @@ class Step(TensorModule):
         on_boundaries: list[Tensor] = []
         if boundaries := self.boundaries.entries:
             asked = nodes[:, 0] if state.impulse is not None else None
-            velocity, on_boundaries = after_boundaries(blocks, velocity, boundaries, state, dt, asked, self.walls)
+            velocity, on_boundaries = after_boundaries(blocks, velocity, boundaries, state, dt, asked)
         if state.impulse is not None:
             impulse = torch.cat([*on_boundaries, wall_impulses(blocks, nodes, gravity, dt, self.walls)], 1)
         return velocity, impulse

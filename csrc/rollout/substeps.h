@@ -665,12 +665,10 @@ Substeps<T, D>::Substeps(const SubstepsInputs& inputs) : in(inputs) {
   }
   obstacles = has(in.obstacle_table);
   STD_TORCH_CHECK(!obstacles || has(in.obstacle_data), "obstacles need data");
-  if (obstacles) {
+  if (obstacles)
     contact = obstacle_arguments<T, D>(x, in.lattice, *in.obstacle_table, in.obstacle_data.value(), in.shape, in.sizes,
                                        in.contact_kind, in.obstacle_scene, in.start, in.end, {}, in.time, in.n);
-    set_walls(contact, in.wall_kind, in.wall_plane);
-    check_scenes(contact, in.scenes);
-  }
+  if (obstacles) check_scenes(contact, in.scenes);
   STD_TORCH_CHECK(has(in.scene_dt) == has(in.scene_time), "scene_dt must be given with scene_time");
   if (has(in.scene_dt)) {
     const auto type = x.scalar_type();
