@@ -35,7 +35,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _told("terminated", 143)
     except KeyboardInterrupt:
         return _told("interrupted", 130)
-    except (ValueError, OSError, ImportError, RuntimeError, MemoryError, KeyError) as error:
+    except Exception as error:
         message = _message(error)
         if message is None:
             raise
@@ -70,10 +70,14 @@ TOLD = (
 )  # fmt: skip
 
 
+NOTHING = 2**22
+"""Memory with which anything may fail, in whatever words [bytes]."""
+
+
 def _message(error: Exception) -> str | None:
     """What to tell the user. None for errors that are defects of torch_mpm, whose traceback should be seen."""
-    if memory.is_short(error):
-        remedy = "make grid.dx larger or per_cell smaller, or ask for fewer fields, scenes and pictures"
+    if memory.is_short(error) or memory.available() < NOTHING:  # Python loses errors for want of memory
+        remedy = "have a larger grid.dx, a smaller per_cell, or fewer fields and pictures; or free some memory"
         return f"out of memory: {memory.shortage(error)}; {remedy}"
     if isinstance(error, OSError) and error.strerror and error.filename is not None:
         return f"{error.filename}: {error.strerror}"
@@ -82,7 +86,8 @@ def _message(error: Exception) -> str | None:
 
 
 def _told(message: str, status: int) -> int:
-    print(f"torch-mpm: {message}", file=sys.stderr)
+    shown = "".join(c if c.isprintable() or c in "\n\t" else ascii(c)[1:-1] for c in message)  # of file names
+    print(f"torch-mpm: {shown}", file=sys.stderr)
     return status
 
 
@@ -264,6 +269,7 @@ def _render(options: argparse.Namespace) -> None:
     if reading.is_dataset(options.run):
         reading.render(options)
         return
+    reading.require_a_run(options)
     from .scene.folder import load_run
 
     for path in _draw(options.run, load_run(options.run, options.overrides), quiet=False).values():

@@ -12,10 +12,12 @@ from __future__ import annotations
 import argparse
 import contextlib
 import io
+import json
 import os
 import random
 import re
 import shutil
+import subprocess
 import sys
 import tempfile
 import time
@@ -60,6 +62,19 @@ radius = 0.06
 velocity = [-1.0, 0.0]
 material = "jelly"
 """
+SOLID = """
+device = "cpu"
+duration = 0.01
+fps = 100
+grid = {lower = [0.0, 0.0, 0.0], upper = [1.0, 1.0, 1.0], dx = 0.2}
+material.jelly = {law = "neo_hookean", E = 1e4}
+render = {resolution = [160, 120], video = false}
+[[body]]
+shape = "box"
+lower = [0.3, 0.3, 0.3]
+upper = [0.7, 0.7, 0.7]
+material = "jelly"
+"""
 SET = """
 device = "cpu"
 gravity = [0.0, -10.0]
@@ -99,6 +114,7 @@ class Fuzz:
         for made in (self.good, self.here):
             made.mkdir()
         (self.good / "scene.toml").write_text(SCENE)
+        (self.good / "solid.toml").write_text(SOLID)
         (self.good / "set.toml").write_text(SET)
         self._succeed("run", self.good / "scene.toml", "-o", self.good / "run", "--quiet")
         self._succeed("generate", self.good / "set.toml", "-o", self.good / "set", "--quiet")
@@ -224,6 +240,19 @@ class Fuzz:
             print(f"  {what}", flush=True)
         yield from found
 
+    def limited(self, count: int, seed: int) -> Iterator[list[str]]:
+        """The faults of commands below limits of memory, in a process that has imported nothing but torch_mpm."""
+        words = [sys.executable, "-m", "benchmarks.fuzz.memory_limits", str(self.folder), str(count), str(seed)]
+        with subprocess.Popen(words, cwd=benchmark.ROOT, stdout=subprocess.PIPE, text=True) as process:
+            assert process.stdout is not None
+            for line in process.stdout:
+                found = json.loads(line)
+                if found["fault"]:
+                    print(f"{found['command']} with {found['memory'] / 1e6:.1f} MB: {found['text']}", flush=True)
+                yield [found["fault"]] if found["fault"] else []
+        if process.returncode:
+            raise RuntimeError(f"{words} ended with exit status {process.returncode}")
+
 
 def fuzz(folder: Path, counts: dict[str, int], seed: int) -> list[dict[str, Any]]:
     """A row of counts for each part: ``counts`` says how many cases of each."""
@@ -232,20 +261,21 @@ def fuzz(folder: Path, counts: dict[str, int], seed: int) -> list[dict[str, Any]
         "lines": program.line, "inputs": program.input, "shards": program.shard, "records": program.record,
     }  # fmt: skip
     rows = []
-    for part, work in parts.items():
+    for part, count in counts.items():
         faults: Counter[str] = Counter()
         begin = time.monotonic()
-        for number in range(counts[part]):
-            found = list(work(random.Random(f"{seed} {part} {number}")))
+        generators = (random.Random(f"{seed} {part} {number}") for number in range(count))
+        cases = program.limited(count, seed) if part == "memory" else map(list, map(parts[part], generators))
+        for number, found in enumerate(cases):
             if found:
                 print(f"{part} {number}: {', '.join(sorted(set(found)))}\n", flush=True)
             faults.update(found)
         seconds = time.monotonic() - begin
-        rows.append({"part": part, "cases": counts[part], **{c: faults[c] for c in COLUMNS}, "seconds": seconds})
+        rows.append({"part": part, "cases": count, **{c: faults[c] for c in COLUMNS}, "seconds": seconds})
     return rows
 
 
-COUNTS = {"lines": 600, "inputs": 200, "shards": 100, "records": 1000}
+COUNTS = {"lines": 600, "inputs": 200, "shards": 100, "records": 1000, "memory": 500}
 
 
 def main() -> None:

@@ -75,7 +75,15 @@ def test_words_around_distributions_stay():
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        ({"uniform": [2, 1]}, "x.uniform: takes two numbers, the lower one first, got [2, 1]"),
+        (
+            {"uniform": [2, 1]},
+            "x.uniform: takes two numbers, the lower one first and their difference finite, got [2, 1]",
+        ),
+        ({"uniform": [-1e308, 1e308]}, "x.uniform: takes two numbers"),
+        ({"integers": [0, 2**63]}, "x.integers: takes two whole numbers of at most 64 bits"),
+        ({"in_box": [[-1e308, 0], [1e308, 1]]}, "x.in_box: takes a lower and an upper corner"),
+        ({"choose": [1, 2]}, "x.choose: unknown key; did you mean 'choice'?"),
+        ({"shape": "box", "choose": [{"a": 1}]}, "x.choose: unknown key; did you mean 'choice'?"),
         ({"uniform": 3}, "x.uniform: takes two numbers"),
         ({"uniform": [0, math.inf]}, "x.uniform: takes two numbers"),
         ({"log_uniform": [0, 1]}, "x.log_uniform: takes two positive numbers"),

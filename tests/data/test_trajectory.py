@@ -1,5 +1,7 @@
 """Trajectory files: whole frames only, readable by plain h5py at every moment, and the exports made from them."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -8,6 +10,7 @@ h5py = pytest.importorskip("h5py")
 from torch_mpm.data import trajectory  # noqa: E402
 from torch_mpm.data.export import export_ply, export_vtk  # noqa: E402
 from torch_mpm.data.trajectory import COMPLETE, PARTIAL, Layout, Trajectory, TrajectoryWriter, create  # noqa: E402
+from torch_mpm.errors import DamagedFileError  # noqa: E402
 
 FRAMES, PARTICLES = 4, 5
 
@@ -127,6 +130,37 @@ def test_missing_things(tmp_path, monkeypatch):
     (tmp_path / COMPLETE).touch()
     with pytest.raises(ImportError, match=r"pip install torch-mpm\[data\]"):
         Trajectory(tmp_path)
+
+
+@pytest.mark.parametrize("reads", ["arrays", "frames", "ply", "vtk"])
+def test_flipped_bits_are_not_read(tmp_path, layout, reads):
+    """Whatever is read is what was written, or an error: metadata, arrays, numbers of frames, checksums."""
+    layout = dataclasses.replace(layout, attributes={"title": "test", "seed": 3})
+    create(tmp_path / PARTIAL, layout)
+    writer = TrajectoryWriter(tmp_path / PARTIAL)
+    for k in range(FRAMES):
+        writer.write(k, frame(k))
+    writer.close()
+    file, found = tmp_path / COMPLETE, 0
+    data = file.read_bytes()
+    with h5py.File(file) as read:
+        counter = read["frames_written"].id.get_offset()
+    exports = {"ply": export_ply, "vtk": export_vtk}
+    for place in [counter, *range(0, len(data), len(data) // (150 if reads in ("arrays", "frames") else 12))]:
+        file.write_bytes(data[:place] + bytes([data[place] ^ 4]) + data[place + 1 :])
+        try:
+            if reads in exports:
+                exports[reads](tmp_path, tmp_path / f"{reads}{place}")
+                continue
+            with Trajectory(tmp_path) as read:
+                assert len(read) == FRAMES
+                arrays = [{name: read[name][k] for name in read.columns} for k in range(FRAMES)]
+                for k, got in enumerate(arrays if reads == "arrays" else read):
+                    for name, value in frame(k).items():
+                        np.testing.assert_array_equal(got[name], value)
+        except DamagedFileError:
+            found += 1
+    assert found > (30 if reads in ("arrays", "frames") else 3)
 
 
 def test_vtk_holds_the_stress(written):

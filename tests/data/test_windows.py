@@ -141,3 +141,24 @@ def test_what_cannot_be(path, windows):
     state = WindowStream(windows, 2, seed=1).state_dict()
     with pytest.raises(ValueError, match="another seed, batch_size"):
         WindowStream(windows, 3, seed=2).load_state_dict(state)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "kind", "message"),
+    [
+        (
+            {"fields": ["friction_angle"]},
+            KeyError,
+            "fields must be .*position, velocity, got 'friction_angle'; arrays .N",
+        ),
+        ({"fields": ["speed"]}, KeyError, "fields must be .*, got 'speed'"),
+        ({"fields": "position"}, TypeError, "fields must be a list of names, got 'position'"),
+        ({"constants": "mass"}, TypeError, "constants must be a list of names, got 'mass'"),
+        ({"constants": [3]}, TypeError, "constants must be a list of names"),
+        ({"constants": ["velocity"]}, KeyError, "constants must be arrays .N. .*friction_angle.*, got 'velocity'"),
+        ({"constants": ["speed"]}, KeyError, "constants must be arrays .N. .*, got 'speed'"),
+    ],
+)
+def test_names_of_arrays_that_are_not_there(path, arguments, kind, message):
+    with pytest.raises(kind, match=message):
+        WindowDataset(path, "train", 7, **arguments)[0]

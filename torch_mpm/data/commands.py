@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 from pathlib import Path
 from typing import Any
 
@@ -61,9 +62,12 @@ def _total(text: str) -> tuple[str, int]:
 
 
 def _share(text: str) -> float:
-    value = float(text)
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
     if not 0 <= value <= 1:
-        raise argparse.ArgumentTypeError(f"must be within 0 and 1, got {text}")
+        raise argparse.ArgumentTypeError(f"takes a share within 0 and 1, got {text!r}")
     return value
 
 

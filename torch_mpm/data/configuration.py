@@ -37,7 +37,7 @@ from pydantic import Field, ValidationError
 
 from ..files import check_file
 from ..scene import Scene, SceneError, schema
-from ..scene.explain import explain
+from ..scene.explain import explain, text_problems
 from ..scene.scene import override, parsed
 from . import distribution
 from .content_checks import shape_problems, value_problems
@@ -231,6 +231,7 @@ def _checked(words: Words) -> Dataset:
         SceneError: for what is wrong.
     """
     problems = [f"{key}: is not for data sets; {remedy}" for key, remedy in ABSENT.items() if key in words]
+    problems += text_problems(words)
     misshapen = list(shape_problems(words))
     problems += misshapen
     dataset = None

@@ -6,9 +6,11 @@ import datetime
 from collections.abc import Iterator
 from typing import Any
 
-from .distribution import CHOICE, Words, is_distribution
+from .distribution import CHOICE, Words, is_distribution, is_number
 
 LISTS = ("body", "obstacle")
+VECTORS = ("center", "size", "axis", "lower", "upper", "a", "b", "velocity", "normal")
+"""Keys of bodies and obstacles with a number for each axis."""
 
 
 def shape_problems(words: Words) -> Iterator[str]:
@@ -46,6 +48,7 @@ def value_problems(words: Words, particles: bool, obstacles: bool) -> Iterator[s
                     f"{key}[{k}].count: takes a whole number that is not negative, integers of such or a choice of "
                     f"them, got {item['count']!r}"
                 )
+    yield from _vector_problems(words)
     for k, item in enumerate(words.get("body", [])):
         if particles and "points" in _values(item, "shape"):
             yield f"body[{k}].shape: points have a number of their own; leave out dataset.particles or the body"
@@ -55,6 +58,19 @@ def value_problems(words: Words, particles: bool, obstacles: bool) -> Iterator[s
                 f"obstacle[{k}]: start and end are not for obstacles that are in the data as particles; "
                 "leave them out, or set dataset.obstacles = false"
             )
+
+
+def _vector_problems(words: Words) -> Iterator[str]:
+    for key in LISTS:
+        for k, item in enumerate(words.get(key, [])):
+            for name in VECTORS:
+                for value in _values(item, name):
+                    one = is_distribution(value) and value.keys().isdisjoint({"in_box", "direction"})
+                    if one or is_number(value):
+                        yield (
+                            f"{key}[{k}].{name}: takes a number or distribution for each axis, "
+                            f"such as [0.2, {{ uniform = [0.1, 0.3] }}], got {value!r}"
+                        )
 
 
 def _is_table(item: Any) -> bool:

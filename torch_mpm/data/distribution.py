@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import difflib
 import math
+import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -39,7 +40,9 @@ class Kind:
 
 
 def is_number(value: Any) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+    if isinstance(value, int):
+        return not isinstance(value, bool) and abs(value) < sys.float_info.max
+    return isinstance(value, float) and math.isfinite(value)
 
 
 def _pair(value: Any) -> bool:
@@ -50,7 +53,7 @@ def _box(value: Any, dim: int) -> bool:
     if not isinstance(value, list) or len(value) != 2:
         return False
     points = all(isinstance(p, list) and len(p) == dim and all(map(is_number, p)) for p in value)
-    return points and all(a <= b for a, b in zip(*value, strict=True))
+    return points and all(a <= b and math.isfinite(b - a) for a, b in zip(*value, strict=True))
 
 
 def _length(value: Any) -> bool:
@@ -69,8 +72,8 @@ def _direction(length: Any, rng: np.random.Generator, dim: int) -> list[float]:
 
 KINDS = {
     "uniform": Kind(
-        "two numbers, the lower one first",
-        lambda v, dim: _pair(v) and v[0] <= v[1],
+        "two numbers, the lower one first and their difference finite",
+        lambda v, dim: _pair(v) and v[0] <= v[1] and math.isfinite(v[1] - v[0]),
         lambda v, rng, dim: float(rng.uniform(*v)),
     ),
     "log_uniform": Kind(
@@ -84,8 +87,8 @@ KINDS = {
         lambda v, rng, dim: float(rng.normal(*v)),
     ),
     "integers": Kind(
-        "two whole numbers, the lower one first",
-        lambda v, dim: _pair(v) and all(isinstance(a, int) for a in v) and v[0] <= v[1],
+        "two whole numbers of at most 64 bits, the lower one first",
+        lambda v, dim: _pair(v) and all(isinstance(a, int) and abs(a) < 2**63 for a in v) and v[0] <= v[1],
         lambda v, rng, dim: int(rng.integers(v[0], v[1], endpoint=True)),
     ),
     "in_box": Kind(
@@ -153,6 +156,10 @@ def problems(words: Any, path: str, dim: int) -> Iterator[str]:
         elif len(words) == 1 and (near := difflib.get_close_matches(str(*words), [CHOICE, *KINDS], 1, 0.7)):
             if near[0] not in words:
                 yield f"{path}: unknown distribution {next(iter(words))!r}; did you mean {near[0]!r}?"
+        elif CHOICE not in words:  # which may stand beside other keys
+            lists = [str(key) for key, value in words.items() if isinstance(value, list)]
+            for key in difflib.get_close_matches(CHOICE, lists, 1, 0.6):
+                yield f"{path}.{key}: unknown key; did you mean {CHOICE!r}?"
         for key, value in words.items():
             if key != WEIGHTS:
                 yield from problems(value, f"{path}.{key}" if path else key, dim)

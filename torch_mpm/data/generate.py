@@ -107,7 +107,7 @@ def _problems(configuration: Configuration, scene_id: int, room: bool = True) ->
         scene = configuration.scene(content(configuration, scene_id))
         return check.problems(scene, scene.entries())
     except NoRoom as error:
-        return [str(error)] if room else []
+        return [str(error).removeprefix(f"scene {scene_id}: ")] if room else []
     except SceneError as error:
         return error.problems
 

@@ -13,6 +13,8 @@ from .folder import DATASET, DatasetError
 FORMATS = ("gns", "lagrangebench", "neuralmpm", "ply", "tfrecord", "vtk", "well")
 OF_RUNS = ("vtk", "ply")
 WITH_FIELDS = ("lagrangebench", "neuralmpm", "tfrecord")
+OPTIONS = {"material": ("gns",), "fields": WITH_FIELDS, "context": ("tfrecord",), "dx": ("well",), "scenes": OF_RUNS}
+"""Formats that an option of the export of a data set is for."""
 
 
 def is_dataset(folder: Path) -> bool:
@@ -50,7 +52,7 @@ def add_export_options(parser: argparse.ArgumentParser) -> None:
 
 def add_render_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-o", "--out", type=Path, help="data set: folder of the pictures; DIR/pictures by default")
-    parser.add_argument("--color-by", default="speed", metavar="FIELD", help="data set: default: %(default)s")
+    parser.add_argument("--color-by", metavar="FIELD", help="data set: speed by default")
     parser.add_argument("--no-video", action="store_true", help="data set: the contact sheet alone")
     _scenes_option(parser, "data set: scenes; the first six by default")
 
@@ -85,14 +87,25 @@ def export(options: argparse.Namespace) -> None:
         raise DatasetError(f"export takes --format with one of {', '.join(FORMATS)}")
     if options.out is not None and len(formats) > 1:
         raise DatasetError("export takes -o with one format only")
+    for option in _given(options, *OPTIONS):
+        if formats.keys().isdisjoint(OPTIONS[option]):
+            raise DatasetError(f"--{option} is for --format {' or '.join(OPTIONS[option])}, got {', '.join(formats)}")
     for name in formats:
-        more: dict[str, Any] = {"material": options.material} if name == "gns" else {}
-        more |= {"dx": options.dx} if name == "well" else {}
-        more |= {"fields": options.fields} if name in WITH_FIELDS else {}
-        more |= {"context": options.context} if name == "tfrecord" else {}
-        more |= {"scenes": options.scenes} if name in OF_RUNS else {}
+        more = {option: getattr(options, option) for option, of in OPTIONS.items() if name in of}
         write = getattr(data, f"export_scenes_{name}" if name in OF_RUNS else f"export_{name}")
         print(write(options.run, options.out, **more))
+
+
+def _given(options: argparse.Namespace, *names: str) -> list[str]:
+    """Options that the command line has."""
+    return [name for name in names if getattr(options, name) not in (None, False, ())]
+
+
+def require_a_run(options: argparse.Namespace) -> None:
+    """Refuse the options of `render` that are for data sets."""
+    for name in _given(options, "out", "color_by", "no_video", "scenes"):
+        option = "-o" if name == "out" else f"--{name.replace('_', '-')}"
+        raise DatasetError(f"{options.run}: {option} is for data sets; of a run --set render.video=false and the like")
 
 
 def export_run(options: argparse.Namespace) -> None:
@@ -103,6 +116,8 @@ def export_run(options: argparse.Namespace) -> None:
     wrong = [name for name in formats if name not in OF_RUNS]
     if wrong:
         raise DatasetError(f"{options.run}: --format {wrong[0]} is for data sets; of a run {' or '.join(OF_RUNS)}")
+    if given := _given(options, *OPTIONS):
+        raise DatasetError(f"{options.run}: --{given[0]} is for data sets, and this is a run")
     for name in formats:
         print({"vtk": export_vtk, "ply": export_ply}[name](options.run, options.out))
 
@@ -113,7 +128,8 @@ def render(options: argparse.Namespace) -> None:
 
     if options.overrides:
         raise DatasetError("render of a data set takes --color-by, --scenes and --no-video in place of --set")
-    made = draw_scenes(options.run, options.out, options.scenes, options.color_by, video=not options.no_video)
+    color_by = options.color_by or "speed"
+    made = draw_scenes(options.run, options.out, options.scenes, color_by, video=not options.no_video)
     print("\n".join(map(str, made)))
 
 

@@ -220,6 +220,8 @@ class Trajectory:
             problem = _problem(self.file)
         except (KeyError, TypeError, ValueError, IndexError) as error:  # attributes of another kind
             problem = f"is no trajectory: {error}"
+        if not problem and self.path.name == COMPLETE and len(self) < len(self.file["time"]):
+            problem = f"says that {len(self)} of its {len(self.file['time'])} frames are written, and was complete"
         if problem:
             self.file.close()
             raise DamagedFileError(self.path, problem, self._remedy)

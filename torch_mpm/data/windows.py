@@ -18,7 +18,8 @@ from torch import Tensor
 from torch.utils.data import DataLoader, Dataset, IterableDataset, get_worker_info
 
 from ..errors import check_count
-from .folder import DatasetFolder
+from .folder import DatasetFolder, MissingError
+from .shard import StoredScene
 
 Item = dict[str, Tensor]
 Collate = Callable[[Sequence[Item]], Item]
@@ -31,12 +32,14 @@ class WindowDataset(Dataset[Item]):
         dataset: folder of the data set.
         split: name of the split.
         frames: T of a window, such as 7 for five velocities, the present and the next position.
-        fields: arrays [frames, N, ...] of the scenes to read.
-        constants: arrays [N] of the scenes to read.
+        fields: arrays [frames, N, ...] of the data set to read.
+        constants: arrays [N] of the scenes to read, such as "particle_type", "mass" or "friction_angle". Batches of
+            `OnlineStream` have all of them.
 
     Raises:
         FileNotFoundError, DamagedFileError: as :class:`DatasetFolder`; the second also where damaged frames are read.
-        KeyError: for a split that is not there, or, where a window is read, for such an array.
+        KeyError: for a split or a field that is not there, or, where a window is read, for such a constant.
+        TypeError: for fields or constants that are no list of names.
         ValueError: for windows longer than the scenes.
 
     Works in workers of a data loader, forked or spawned.
@@ -54,7 +57,14 @@ class WindowDataset(Dataset[Item]):
         length = self.dataset.record.frames
         if not 1 <= check_count("frames", frames) <= length:
             raise ValueError(f"frames must be within 1 and {length}, the frames of a scene, got {frames}")
-        self.frames, self.fields, self.constants = frames, tuple(fields), tuple(constants)
+        self.frames = frames
+        self.fields, self.constants = _names("fields", fields), _names("constants", constants)
+        for name in self.fields:
+            if name not in (known := self.dataset.record.fields):
+                raise MissingError(
+                    f"fields must be arrays [frames, N, ...] of the data set, {', '.join(known)}, got {name!r}; "
+                    "arrays [N] belong in constants"
+                )
         self.scene_ids = [scene.id for scene in self.dataset.scenes(split)]
         self.windows_per_scene = length - frames + 1
 
@@ -67,8 +77,22 @@ class WindowDataset(Dataset[Item]):
         place, first = divmod(int(index) % len(self), self.windows_per_scene)
         scene = self.dataset.scene(self.scene_ids[place])
         item = {name: particles_first(scene.window(name, first, self.frames)) for name in self.fields}
-        item |= {name: torch.from_numpy(scene[name]) for name in self.constants}
+        item |= {name: torch.from_numpy(_constant(scene, name)) for name in self.constants}
         return item | {"scene_id": torch.tensor(self.scene_ids[place]), "first": torch.tensor(first)}
+
+
+def _names(argument: str, names: Sequence[str]) -> tuple[str, ...]:
+    if isinstance(names, str) or not all(isinstance(name, str) for name in names):
+        raise TypeError(f"{argument} must be a list of names, got {names!r}")
+    return tuple(names)
+
+
+def _constant(scene: StoredScene, name: str) -> Any:
+    """An array [N] of a scene; MissingError for one that is not there or changes from frame to frame."""
+    if name not in scene or len(scene.shape(name)) > 1:
+        known = [known for known in scene.names if len(scene.shape(known)) == 1]
+        raise MissingError(f"constants must be arrays [N] of the scenes, {', '.join(known)}, got {name!r}")
+    return scene[name]
 
 
 def particles_first(window: Any) -> Tensor:

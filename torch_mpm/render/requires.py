@@ -7,8 +7,8 @@ from typing import Any
 
 from .. import memory, optional
 
-SIZES = {"vtk": 1.5e9}
-"""Address space that the import of a package takes [bytes]: VTK crashes where it gets less."""
+SIZES = {"vtk": 7e8, "vtkmodules": 7e8, "matplotlib": 2e8}
+"""Memory that the import of a package takes at most [bytes]: VTK and kiwisolver end the process where it fails."""
 
 
 class RenderError(RuntimeError):

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from pydantic import BaseModel
 from torch import Tensor
 
 from .. import boundaries, memory, resolution, seed
@@ -37,6 +38,7 @@ def problems(scene: Any, entries: Sequence[Any]) -> list[str]:
     ]
     for entry in entries:
         found += _material_problems(entry)
+    found += _range_problems(scene)
     found += heat.problems(scene, entries)
     if scene.grid is not None:
         dim = len(scene.grid.lower)
@@ -102,6 +104,31 @@ def _corner_problems(grid: schema.Grid) -> Iterator[str]:
     nodes = [(b - a) / grid.dx for a, b in zip(grid.lower, grid.upper, strict=False)]
     if max(nodes) > NODES:
         yield f"grid.dx: the domain has {max(nodes):.2g} nodes along an axis; make dx larger or the domain smaller"
+
+
+def _range_problems(scene: Any) -> Iterator[str]:
+    """Numbers of the file that the precision of the simulation cannot hold."""
+    if scene.precision is None:
+        return
+    largest = torch.finfo(getattr(torch, scene.precision)).max
+    for name in ("gravity", "material", "body", "obstacle", "emitter", "heat", "scene"):
+        for key, value in _numbers_in(getattr(scene, name, None), name):
+            if abs(value) > largest:
+                yield f"{key}: must be at most {largest:.3g}, the largest number in {scene.precision}, got {value:g}"
+
+
+def _numbers_in(words: Any, key: str) -> Iterator[tuple[str, float]]:
+    """(key, value) of all numbers of a part of a scene."""
+    if isinstance(words, BaseModel):
+        words = {name: value for name, value in words if name not in ("seed", "particles")}
+    if isinstance(words, dict):
+        for name, value in words.items():
+            yield from _numbers_in(value, f"{key}.{name}")
+    elif isinstance(words, (list, tuple)):
+        for k, value in enumerate(words):
+            yield from _numbers_in(value, key if isinstance(value, (int, float)) else f"{key}[{k}]")
+    elif isinstance(words, (int, float)):
+        yield key, words
 
 
 def _time_problems(scene: Any) -> Iterator[str]:

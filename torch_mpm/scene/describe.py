@@ -13,7 +13,7 @@ from ..state import PARTICLE_FIELDS, State
 from .build import Built
 from .run import Simulation, joined
 from .scene import Scene
-from .substeps import time_step
+from .substeps import check_substeps, time_step
 
 TRIAL_STEPS = 3
 
@@ -24,6 +24,7 @@ def describe(scene: Scene, built: Built) -> dict[str, Any]:
     The run time is that of a few substeps with half of what emitters bring, times the number of substeps that the
     stability limit of the first state asks for.
     """
+    check_substeps(scene, built)
     state = _halfway(built)
     dt, substeps = time_step(scene, built, state)
     after, seconds = _trial(built, state, dt)

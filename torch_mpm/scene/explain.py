@@ -35,6 +35,20 @@ def _shortened(line: str) -> str:
     return f"{line[: MOST_LETTERS // 2]} [{len(line) - MOST_LETTERS} letters] {line[-MOST_LETTERS // 2 :]}"
 
 
+def text_problems(words: Any, path: str = "") -> Iterator[str]:
+    """One line for each text, or name of a key, that no file can hold: with a null character or a lone surrogate."""
+    if isinstance(words, dict):
+        for key, value in words.items():
+            place = f"{path}.{key}" if path else str(key)
+            yield from text_problems(str(key), f"{ascii(place)[1:-1]} (a key)")
+            yield from text_problems(value, place)
+    elif isinstance(words, (list, tuple)):
+        for k, item in enumerate(words):
+            yield from text_problems(item, f"{path}[{k}]")
+    elif isinstance(words, str) and ("\0" in words or any("\ud800" <= letter <= "\udfff" for letter in words)):
+        yield f"{path}: has letters that no file can hold, got {words!a}"
+
+
 def explain(error: ValidationError, root: type[BaseModel] = SceneData) -> list[str]:
     """One line per problem of a validation against ``root``."""
     return [_line(item, root) for item in error.errors(include_url=False)]
@@ -58,6 +72,8 @@ def _line(item: Any, root: type[BaseModel]) -> str:
     takes = f"; takes: {description}" if description else ""
     if kind == "missing":
         return f"{path}: missing{takes}"
+    if kind == "string_pattern_mismatch":
+        return f"{path}: takes {description}, got {given!r}"
     message = item["msg"][0].lower() + item["msg"][1:]
     return f"{path}: {message.removeprefix('input ')}, got {given!r}{takes}"
 
@@ -83,7 +99,7 @@ def _locate(loc: Sequence[int | str], root: type[BaseModel]) -> tuple[type[BaseM
             model = annotation
             if field is None:
                 continue
-            annotation, description = _plain(field.annotation), field.description or ""
+            annotation, description = _plain(field.annotation), " ".join((field.description or "").split())
         elif typing.get_origin(annotation) is dict:
             path += f".{entry}"
             annotation = _plain(typing.get_args(annotation)[1])

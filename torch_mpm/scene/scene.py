@@ -17,7 +17,7 @@ from ..seed import on_host
 from . import check, partial, schema
 from .build import Built, build
 from .entry import ResolvedEntry
-from .explain import SceneError, explain
+from .explain import SceneError, explain, text_problems
 from .fields import RANKS
 from .places import relative
 
@@ -49,6 +49,8 @@ class Scene(schema.SceneData):
     _source: str = PrivateAttr(default="")
 
     def __init__(self, **words: Any) -> None:
+        if problems := list(text_problems(words)):
+            raise SceneError(problems)
         try:
             super().__init__(**words)
         except ValidationError as error:

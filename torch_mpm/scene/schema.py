@@ -614,7 +614,7 @@ class SceneData(Content):
     """share of FLIP that the transfer is blended with"""
     precision: Literal["float32", "float64"] = "float32"
     """floating-point type of the simulation"""
-    device: str = "auto"
+    device: Annotated[str, Field(pattern=r"^(auto|cpu|cuda(:[0-9]{1,3})?)$")] = "auto"
     """"cpu", "cuda", "cuda:1", ... or "auto": a GPU if there is one"""
     seed: Annotated[int, Field(ge=0)] = 0
     """seed of all random numbers"""

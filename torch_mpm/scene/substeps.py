@@ -23,10 +23,9 @@ def check_substeps(scene: Scene, built: Built) -> int:
     if substeps <= MOST_SUBSTEPS:
         return round(substeps)
     key = "cfl" if scene.dt is None else "dt"
-    raise SceneError(
-        [f"{key}: about {substeps:.2g} substeps of {dt:.2g} s would be taken, and {MOST_SUBSTEPS:.0e} are allowed"],
-        scene.source,
-    )
+    speed = float(built.state.v.double().norm(dim=1).amax()) if len(built.state) else 0.0
+    many = f"about {substeps:.2g} substeps of {dt:.2g} s would be taken, and {MOST_SUBSTEPS:.0e} are allowed"
+    raise SceneError([f"{key}: {many}; particles start with up to {speed:.3g} m/s"], scene.source)
 
 
 def time_step(scene: Scene, built: Built, state: State) -> tuple[float, float]:

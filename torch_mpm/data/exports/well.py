@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from ..folder import DatasetFolder, velocity_of
+from ..folder import DatasetError, DatasetFolder, velocity_of
 from ..hdf5 import h5py_module
 from ..obstacle_fields import obstacle_mask, obstacles_of
 from ..rasterise import cell_centres, rasterise
@@ -31,12 +32,15 @@ def export_well(dataset: str | Path | DatasetFolder, out: str | Path | None = No
         out: folder to make; ``well`` in that of the data set by default.
         dx: size of a cell [m]; twice that of the simulation by default, about 16 particles a cell in 2-D.
 
-    Returns and errors as :func:`export_gns`; ValueError also for a dx that is not positive.
+    Returns and errors as :func:`export_gns`; DatasetError also for a dx that is not positive.
     """
-    if dx is not None and not dx > 0:
-        raise ValueError(f"dx must be positive, got {dx}")
+    if dx is not None and not 0 < dx < math.inf:
+        raise DatasetError(f"dx must be positive and finite, got {dx}")
     with exporting(dataset, out, "well") as export:
         record = export.dataset.record
+        side = min(b - a for a, b in zip(record.lower, record.upper, strict=True))
+        if dx is not None and dx > side:
+            raise DatasetError(f"dx must be at most {side:g}, the shortest side of the domain, got {dx:g}")
         name = re.sub(r"\W+", "_", record.title).strip("_").lower() or "torch_mpm"
         scalars = {scene.id: _scalars(export, scene.id) for scene in export.dataset.scenes()}
         shared = set.intersection(*map(set, scalars.values()))

@@ -1,0 +1,27 @@
+"""The fuzz program of command lines, foreign files, damaged data sets and limits of memory, in short and long."""
+
+import json
+import os
+import subprocess
+import sys
+
+import pytest
+
+from benchmarks import common
+
+for package in ("h5py", "isal", "matplotlib", "meshio", "pydantic", "trimesh"):
+    pytest.importorskip(package)
+
+SHORT = {"lines": 20, "inputs": 15, "shards": 10, "records": 15, "memory": 5}
+LONG = {"lines": 600, "inputs": 200, "shards": 100, "records": 1000, "memory": 500}
+
+
+@pytest.mark.parametrize("counts", [SHORT, pytest.param(LONG, marks=pytest.mark.slow)], ids=["short", "long"])
+def test_no_command_trusts_what_it_is_given(tmp_path, counts):
+    options = [word for part, count in counts.items() for word in (f"--{part}", str(count))]
+    command = [sys.executable, "-m", "benchmarks.fuzz.files", "--seed", "1", "--out", str(tmp_path), *options]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}  # a process with more threads cannot fork
+    done = subprocess.run(command, cwd=common.ROOT, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+    rows = json.loads((tmp_path / "fuzz_files.json").read_text())["rows"]
+    assert {row["part"]: row["cases"] for row in rows} == counts
