@@ -1,13 +1,15 @@
 """Graphs that are recorded, dropped or fail: streams, allocator and memory are left as they were."""
 
 import contextlib
+import os
+import subprocess
+import sys
 
 import pytest
 import torch
 
 import torch_mpm as mpm
 from torch_mpm import captured_steps
-from torch_mpm.graphs import Replays
 
 F64 = torch.float64
 CYCLES = 200_000_000  # of a kernel that runs for a tenth of a second
@@ -34,20 +36,6 @@ def test_the_current_stream_waits_for_the_stream_of_graphs(fails):
     assert end.query()
 
 
-class Waiting(torch.nn.Module):
-    """A step that waits for the device in its last call alone, which is the recorded one."""
-
-    def __init__(self, step: mpm.Step, calls: int) -> None:
-        super().__init__()
-        self.step, self.calls = step, calls
-
-    def forward(self, state: mpm.State, dt: float) -> mpm.State:
-        self.calls -= 1
-        if self.calls == 0:
-            torch.cuda.synchronize()
-        return self.step(state, dt)
-
-
 def blob() -> tuple[mpm.Step, mpm.State]:
     grid = mpm.Grid(dx=0.1, lower=(0, 0), upper=(1, 1))
     points = mpm.seed.box((0.3, 0.3), (0.6, 0.6), grid, per_cell=4, dtype=F64)
@@ -55,28 +43,50 @@ def blob() -> tuple[mpm.Step, mpm.State]:
     return mpm.Step(grid, mpm.NeoHookean(E=1e4, nu=0.3)), state
 
 
+# A step that waits for the device in its last call alone, which is the recorded one. In processes of their own: torch
+# 2.11 leaves its random numbers in a capture whose end failed.
+FAILURE = """
+import torch
+import torch_mpm as mpm
+from test_capture_errors import blob
+from torch_mpm import captured_steps
+
+class Waiting(torch.nn.Module):
+    def __init__(self, step, calls):
+        super().__init__()
+        self.step, self.calls = step, calls
+
+    def forward(self, state, dt):
+        self.calls -= 1
+        if self.calls == 0:
+            torch.cuda.synchronize()
+        return self.step(state, dt)
+
+step, state = blob()
+torch.set_grad_enabled(False)
+state = step(state, 1e-4)
+try:
+    {failure}
+except RuntimeError:
+    pass
+else:
+    raise AssertionError("a capture that waits fails")
+torch.cuda.empty_cache()  # refused by an allocator that stays in the capture
+assert torch.isfinite(mpm.rollout(step, state, 20, 1e-4).x).all()
+"""
+FAILURES = {
+    "captured": "mpm.captured(Waiting(step, captured_steps.TRIALS + 1), state, 1e-4)",
+    "replays": "Replays(lambda s, w=Waiting(step, 1): w(s, 1e-4), state, step.grid.pool(state.x, None))",
+}
+
+
 @pytest.mark.cuda
-def test_the_allocator_ends_a_failed_capture():
+@pytest.mark.parametrize("failure", FAILURES)
+def test_the_allocator_ends_a_failed_capture(failure):
     """An allocator that stays in the capture refuses to give up memory, and reads a graph that is gone."""
-    step, state = blob()
-    with torch.no_grad():
-        with pytest.raises(RuntimeError):
-            mpm.captured(Waiting(step, captured_steps.TRIALS + 1), state, 1e-4)
-        torch.cuda.empty_cache()
-        end = mpm.captured(step, state, 1e-4, n=2)(state)
-        assert torch.equal(end.x, step(step(state, 1e-4), 1e-4).x)
-
-
-@pytest.mark.cuda
-def test_replays_that_cannot_be_recorded():
-    step, state = blob()
-    with torch.no_grad():
-        state = step(state, 1e-4)
-        waiting = Waiting(step, 1)
-        with pytest.raises(RuntimeError):
-            Replays(lambda state: waiting(state, 1e-4), state, step.grid.pool(state.x, None))
-        torch.cuda.empty_cache()
-        assert torch.isfinite(mpm.rollout(step, state, 20, 1e-4).x).all()
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    program = FAILURE.format(failure=FAILURES[failure])
+    subprocess.run([sys.executable, "-c", program], env=environment, check=True)
 
 
 @pytest.mark.cuda

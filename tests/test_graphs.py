@@ -198,8 +198,6 @@ def test_what_does_not_go_into_a_graph():
     step, state = heated(2, "cuda")
     step.heat.method = "multigrid"
     assert "multigrid" in step.explain(state, DT)
-    step, state = mixed(2, "cuda")
-    assert "a time in float32" in step.explain(state.to(dtype=torch.float32), DT)
     law = network(2, "cuda")
     law.register_forward_hook(lambda *arguments: None)
     with pytest.raises(ValueError, match="must have no hooks"):

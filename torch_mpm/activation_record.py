@@ -52,11 +52,11 @@ class ActivationRecord:
         self.given: dict[str, Problem] = {}
         self._replayed: list[Tensor] = []
 
-    @torch.no_grad()
     def begin(self, state: State, scenes: int) -> None:
         """Before a step from a state: look at the first one."""
         if self.status is None and not (is_traced(state.x) or is_captured(state.x) or is_transformed()):
-            self.given = problems_of_first_state(state, scenes)
+            with torch.no_grad():  # not as a decorator, which an export would keep
+                self.given = problems_of_first_state(state, scenes)
 
     def activate(self, grid: Grid, x: Tensor, scene: Tensor | None, ids: Tensor | None = None) -> Blocks:
         """As `Grid.activate`; `max_blocks` of the grid follows."""

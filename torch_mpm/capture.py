@@ -30,8 +30,8 @@ def capturing(graph: torch.cuda.CUDAGraph, pool: Any, device: torch.device) -> I
     A capture that fails leaves the allocator as it was.
     """
     pool = torch.cuda.graph_pool_handle() if pool is None else pool
-    graph.capture_begin(pool, capture_error_mode="thread_local")
     try:
+        graph.capture_begin(pool, capture_error_mode="thread_local")
         yield
         graph.capture_end()
     except BaseException:

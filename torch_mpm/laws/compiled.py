@@ -295,9 +295,12 @@ class CompiledLaw(Material):
         return deformation, parameters
 
     def check_parameters(self, particles: int, scenes: int | None) -> None:
-        for name, value in self._stored().items():
-            if isinstance(value, (Tensor, PerMaterial)):
-                check_length(ARGUMENTS.get(name, name), value, particles, scenes)
+        # Compilers of torch 2.11 cannot take the attributes of a module together.
+        compiling = torch.compiler.is_compiling()
+        for kept in (self._parameters, self._buffers) if compiling else (self._stored(),):
+            for name, value in kept.items():
+                if isinstance(value, (Tensor, PerMaterial)):
+                    check_length(ARGUMENTS.get(name, name), value, particles, scenes)
 
     def _stored(self) -> dict[str, Any]:
         """All attributes, by the names under which parameters are stored."""
