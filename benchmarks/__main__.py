@@ -28,6 +28,7 @@ PROGRAMS = (
     "benchmarks.accuracy.precision",
     "benchmarks.accuracy.convergence",
     "benchmarks.accuracy.heat",
+    "benchmarks.accuracy.heat_fronts",
     "benchmarks.accuracy.svd",
     "benchmarks.accuracy.sand",
     "benchmarks.accuracy.sand_gradient",

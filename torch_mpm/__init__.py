@@ -11,7 +11,7 @@ from .cfl import stable_dt
 from .checkpoints import Checkpoints
 from .data.trajectory import Trajectory
 from .environments import Environments
-from .errors import DamagedFileError, GridOverflowError, PrecisionWarning, SimulationError
+from .errors import DamagedFileError, FrontWarning, GridOverflowError, PrecisionWarning, SimulationError
 from .failures import Failures
 from .gradient_norms import GradientNorms
 from .grid import Blocks, Grid
@@ -56,6 +56,7 @@ __all__ = [
     "Frames",
     "GradientNorms",
     "Grid",
+    "FrontWarning",
     "GridOverflowError",
     "Heat",
     "HeatSolve",

@@ -43,6 +43,10 @@ class PrecisionWarning(UserWarning):
     """Numbers of the chosen dtype are too coarse for what is computed with them."""
 
 
+class FrontWarning(UserWarning):
+    """Steps are too long for the fronts between phases, which lag behind."""
+
+
 class DamagedFileError(ValueError):
     """A file of a run is damaged, was changed by another program, or is of another kind."""
 

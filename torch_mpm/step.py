@@ -499,6 +499,7 @@ class Step(TensorModule):
 
         Warns:
             PrecisionWarning: where the positions of the state do not resolve the cells, see `Grid`.
+            FrontWarning: where steps were so long that fronts between phases lag behind, see `Heat`.
 
         Raises:
             SimulationError: that names each scene (up to a dozen of a kind), when and how many, and has `failures`: if
@@ -509,6 +510,8 @@ class Step(TensorModule):
             GridOverflowError: if more blocks were active than the grid has room for, and nothing else is wrong.
         """
         raise_failures(self.failures(state), self._activations.all(), self.grid)
+        if self.heat is not None:
+            self.heat.fronts.warn()
         if state is not None:
             resolution.check(self.grid, state.x.dtype)
 

@@ -5,6 +5,7 @@ from pathlib import Path
 from helpers import result, run_quick
 
 from benchmarks import report
+from benchmarks.accuracy.heat_fronts import root
 
 
 def test_heat_benchmark(tmp_path: Path) -> None:
@@ -17,3 +18,12 @@ def test_heat_benchmark(tmp_path: Path) -> None:
     assert errors["held walls", "hybrid"] < 0.5 * errors["held walls", "flip"]
     assert found["float32"]["relative to 300 K"] < 0.05 < found["float32"]["absolute"]
     assert "melting front, St = 1" in report.heat(found)
+
+
+def test_fronts_and_held_surfaces(tmp_path: Path) -> None:
+    assert abs(root(1.0, 0.0) - 0.6200626) < 1e-6 and abs(root(0.1, 0.0) - 0.2200163) < 1e-6
+    assert abs(root(1.7, -0.4) - 0.5625) < 1e-4
+    run_quick("benchmarks.accuracy.heat_fronts", tmp_path)
+    found = result(tmp_path, "heat_fronts.json")
+    assert all(0 < row["lengths"] < 0.5 for row in found["fronts"])
+    assert all(row["most"] < 0.05 for row in found["surfaces"])

@@ -416,7 +416,10 @@ def test_messages(dim):
         ((velocity[:-1], [ball], 0.0), r"velocity must have shape \[N, D\]"),
         ((velocity, [ball], torch.zeros(2, dtype=torch.float64)), r"time must be a number or have shape"),
         ((velocity, [mpm.Sphere((0.5,) * (5 - dim), 0.2)], 0.0), "position must have shape"),
-        ((velocity, [mpm.Sphere(torch.zeros(2, dim), 0.2)], 0.0), r"position must be given once or per scene, \[B, [23]\] with B = 3, got \[2, [23]\]"),
+        (
+            (velocity, [mpm.Sphere(torch.zeros(2, dim), 0.2)], 0.0),
+            r"position must be given once .* with B = 3, got \[2, ",
+        ),
     ]:
         with pytest.raises(ValueError, match=message):
             contact(blocks, *arguments)

@@ -575,3 +575,26 @@ def test_empty_state_and_far_surface(device):
     assert len(heat(none, 1.0)) == 0
     assert float(heat(state, 1.0).temperature.abs().max()) == 0
     heat.check()
+
+
+@pytest.mark.parametrize("reach", [0.0, 1e-12, 1e-9, 1e-6, 1e-3])
+@pytest.mark.parametrize("boundary", ["flux", "convection"])
+def test_heat_goes_into_no_node_that_has_next_to_no_matter(boundary, reach):
+    """Particles that reach just into the support of a node: a bar with a flux at one end and a held one has the
+    temperature that it has where they do not."""
+    ends = []
+    for place in (reach, -reach - 1e-3):
+        dx = 1 / 12
+        bar = mpm.State.at_rest(mpm.seed.box((0, 0), (1, 2 * dx), dx, per_cell=4, dtype=FLOAT), 1.0, dtype=FLOAT)
+        shift = (0.75 + place) * dx
+        bar = bar.replace(x=bar.x + torch.tensor([shift, 0.0], dtype=FLOAT), temperature=bar.x[:, 0].clone())
+        heights = (torch.arange(4, dtype=FLOAT) + 0.5) * dx / 2
+        tip = Surface(torch.stack([torch.full_like(heights, 1 + shift), heights], 1), dx / 2)
+        heated = Flux(tip, 1.0) if boundary == "flux" else Convection(tip, 1e3, 1.0)
+        grid = mpm.Grid(dx, (-0.5, -0.5), (1.5, 0.5))
+        terms = [FixedSurface(mpm.Plane((shift, 0.0), (1.0, 0.0)), 0.0), heated]
+        heat = mpm.Heat(grid, 1.0, 1.0, terms, transfer="apic", tolerance=1e-10)
+        with torch.no_grad():
+            ends.append(mpm.rollout(heat, bar, 6, 10.0).temperature)
+        heat.check()
+    torch.testing.assert_close(*ends, rtol=0, atol=0.01)

@@ -1,6 +1,7 @@
 """Surfaces that are held at a temperature: where they seem to lie, orders of convergence, gradients, bad input."""
 
 import math
+import warnings
 
 import pytest
 import torch
@@ -8,7 +9,9 @@ from helpers import relative_error
 from test_heat import FLOAT, block, check_gradients, random_like
 
 import torch_mpm as mpm
+from benchmarks.accuracy.heat_fronts import between_surfaces, lag
 from torch_mpm.heat.boundaries import FixedSurface, Flux, HeatNodes, Surface
+from torch_mpm.heat.fronts import LAG, LEAST_LAG
 from torch_mpm.ops import heat_operator, scatter
 
 
@@ -200,4 +203,48 @@ def test_bad_input():
     heat = mpm.Heat(mpm.Grid(1 / 8, (-0.5, -0.5), (1.5, 0.5)), 1.0, 1.0, [held])
     heat(state, 0.1)
     with pytest.raises(mpm.SimulationError, match="not finite"):
+        heat.check()
+
+
+@pytest.mark.parametrize("place", [0.0, 0.13, 0.25, 0.5, 0.75])
+@pytest.mark.parametrize("per_cell,transfer,least,most", [(4, "hybrid", 0.0, 0.042), (1, "hybrid", 0.05, 0.23),
+                                                          (4, "flip", 0.5, 1.2)])  # fmt: skip
+def test_linear_temperature_between_held_surfaces(place, per_cell, transfer, least, most):
+    """The largest error is what the temperature changes over a share of dx, the same on every lattice: order one."""
+    errors = [between_surfaces(n, place, per_cell=per_cell, transfer=transfer) for n in (10, 20)]
+    assert all(least < error < most for error in errors) and abs(errors[0] / errors[1] - 1) < 0.6
+
+
+@pytest.mark.parametrize("stefan,solid", [(0.2, -0.4), (1.7, -0.4), (5.0, -0.4), (1.7, -1.0)])
+@pytest.mark.parametrize("number,n", [(0.5, 10), (4.0, 20), (25.0, 40)])
+def test_lag_of_a_front_of_two_phases(stefan, solid, number, n):
+    """Against Neumann's solution: no more than 0.1 dx + 0.45 √(κ dt/(ρ C)), and not ahead by more than 0.1 dx."""
+    assert -0.1 < lag(stefan, solid, n, number) < LEAST_LAG + LAG * math.sqrt(number)
+
+
+def test_steps_that_are_too_long_for_a_front_are_reported(device):
+    """By name, with the scene and the diffusion number; heat that changes no phase may take any step."""
+    dx = 1 / 8
+    state, distance = bar(dx)
+    batch = mpm.State.concatenate([state.to(device)] * 2, scene=True)
+    theta = torch.cat([-1 - distance, torch.full_like(distance, -0.5)]).to(device)
+    grid = mpm.Grid(dx, (-0.5, -0.5), (1.5, 0.5), scenes=2)
+    heat = mpm.Heat(grid, 1.0, 1.0, [wall(0.0, 0.0)], melting_point=-0.5, latent_heat=3.0)
+    step = mpm.Step(grid, mpm.NeoHookean(E=1.0, nu=0.3), heat=heat, integrator="implicit")
+    for number, warned in ((0.5, False), (9.0, True)):
+        for checked in (heat, step):
+            heat.reset()
+            after = heat(batch.replace(temperature=theta), torch.tensor([1e-9, number * dx**2], device=device))
+            melted = after.extra["liquid"].split(len(distance))
+            assert not melted[0].any() and melted[1].any()
+            with warnings.catch_warnings(record=True) as caught:
+                warnings.simplefilter("always")
+                checked.check()
+            found = [str(w.message) for w in caught if w.category is mpm.FrontWarning]
+            assert bool(found) == warned
+            if warned:
+                assert "the first of which is 1, lag behind by up to 1.5 dx" in found[0] and "of 9;" in found[0]
+    heat.forget(torch.tensor([False, True], device=device))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
         heat.check()

@@ -1,0 +1,74 @@
+"""How far fronts between phases may lag behind, by the diffusion numbers of the particles that change theirs."""
+
+from __future__ import annotations
+
+import math
+import warnings
+
+import torch
+from torch import Tensor
+
+from ..capture import outside_transforms, without_transforms
+from ..errors import FrontWarning
+
+LARGEST = 1.0
+"""Diffusion number of particles that change their phase, above which a front is reported."""
+LAG, LEAST_LAG = 0.45, 0.1
+"""Lag of a front in lengths of conduction in a step √(κ dt/(ρ C)), and what it may lag in cells even in short steps
+(benchmarks/results/heat_fronts.md)."""
+
+
+class FrontRecord:
+    """The largest diffusion number so far, r = κ dt/(ρ C dx²), of particles that changed their liquid fraction.
+
+    Attributes:
+        largest: of each scene, float64 [B] on the device of the particles; None before the first step.
+    """
+
+    def __init__(self) -> None:
+        self.largest: Tensor | None = None
+
+    @torch.no_grad()
+    def add(self, number: Tensor, before: Tensor, after: Tensor, scene: Tensor | None, scenes: int) -> None:
+        """Count one step, of particles with the given diffusion numbers and liquid fractions [P]."""
+        number, before, after = (without_transforms(t.detach()) for t in (number, before, after))
+        with outside_transforms():
+            if self.largest is None or self.largest.device != number.device or len(self.largest) != scenes:
+                with torch.inference_mode(False):
+                    self.largest = torch.zeros(scenes, dtype=torch.float64, device=number.device)
+            if not scenes or not len(number):
+                return
+            melts = torch.where(before != after, number, 0).double()
+            rows = torch.zeros_like(before, dtype=torch.int64) if scene is None else scene.long().clamp(0, scenes - 1)
+            self.largest.scatter_reduce_(0, rows, melts, "amax")
+
+    def warn(self) -> None:
+        """Warn of fronts that steps were too long for; waits for the device.
+
+        Warns:
+            FrontWarning: by scene and diffusion number.
+        """
+        if self.largest is None:
+            return
+        numbers = self.largest.tolist()
+        scenes = [b for b, r in enumerate(numbers) if r > LARGEST]
+        if scenes:
+            r = max(numbers)
+            where = "" if len(numbers) == 1 else f" in {len(scenes)} scenes, the first of which is {scenes[0]},"
+            warnings.warn(
+                f"fronts between phases{where} lag behind by up to {LEAST_LAG + LAG * math.sqrt(r):.2g} dx: particles "
+                f"changed their phase at a diffusion number of {r:.3g}; reduce dt to a diffusion number of {LARGEST:g} "
+                "or less",
+                FrontWarning,
+                stacklevel=3,
+            )
+
+    def reset(self) -> None:
+        """Forget the steps so far."""
+        if self.largest is not None:
+            self.largest.zero_()
+
+    def forget(self, scenes: Tensor) -> None:
+        """Forget those of scenes, bool [B]."""
+        if self.largest is not None:
+            self.largest.masked_fill_(scenes, 0)
