@@ -83,7 +83,7 @@ class _Calls:
             ("scatter", (x, v, C, stress, 2.0, *top)),
             ("gather", (x, rows, 2.0, True, True, *top)),
             ("g2p", (x, velocity, True, True, *top)),
-            ("g2p_advance", (x, velocity, self.F, J, self.dt, 0.1, True, 1, *top)),
+            ("g2p_advance", (x, velocity, self.F, J, None, self.dt, 0.1, True, 1, *top)),
             ("position_gradient", (x, v, C, stress, velocity, 2.0, *top)),
             ("advance", moving),
             ("advance_backward", (v, C, mass, *moving, 31)),
@@ -225,8 +225,8 @@ class _Calls:
         clocks = self.dt, self.uniform(2).double()
         end = (*self.obstacles, 0.1, 2, 40, True, False, False, impulse, *clocks, *self.lattice.packed)
         look = (*fields[:5], self.F, *self.uniform(4, P), self.scene, 50.0, 2.0, True, 0.1, self.lattice.upper, 2)
-        call = (*fields, 0.5 + self.uniform(P), [self.uniform(P)], *who, *laws, *how, *end)
-        figures = (self.x, *call[4:7], call[7], self.scene, material, *laws, how[0], how[1], True)
+        call = (*fields, 0.5 + self.uniform(P), None, [self.uniform(P)], *who, *laws, *how, *end)
+        figures = (self.x, *call[4:7], call[8], self.scene, material, *laws, how[0], how[1], True)
         grads = [self.normal(*t.shape) for t in torch.ops.torch_mpm.substeps(*call)[:6]]
         return [
             ("substeps", call),

@@ -295,16 +295,18 @@ class CompiledLaw(Material):
         return deformation, parameters
 
     def check_parameters(self, particles: int, scenes: int | None) -> None:
-        # Compilers of torch 2.11 cannot take the attributes of a module together.
-        compiling = torch.compiler.is_compiling()
-        for kept in (self._parameters, self._buffers) if compiling else (self._stored(),):
-            for name, value in kept.items():
-                if isinstance(value, (Tensor, PerMaterial)):
-                    check_length(ARGUMENTS.get(name, name), value, particles, scenes)
+        for name, value in self._stored().items():
+            if isinstance(value, (Tensor, PerMaterial)):
+                check_length(ARGUMENTS.get(name, name), value, particles, scenes)
 
     def _stored(self) -> dict[str, Any]:
-        """All attributes, by the names under which parameters are stored."""
-        return {**vars(self), **self._parameters, **self._buffers, **self._modules}
+        """All attributes, by the names under which parameters are stored; in compiled code those that are registered,
+        since compilers of torch 2.11 cannot take the others together."""
+        registered: dict[str, Any] = {}
+        for kept in (self._parameters, self._buffers, self._modules):
+            for name, value in kept.items():
+                registered[name] = value
+        return registered if torch.compiler.is_compiling() else {**vars(self), **registered}
 
     def _parameters_of(self, state: State) -> list[Tensor]:
         """Parameters in the dtype, on the device and in the particle order of the state.
