@@ -136,12 +136,12 @@ def recomputed(advance: Advance, state: State, count: int, first: int, step: Any
     of the step.
     """
     leaves, layout = _pytree.tree_flatten(state)
-    motions = motions_of(step, state)
+    motions, poses = motions_of(step, state), state.poses  # a state that is kept would keep the graph before it
     again, pools = False, list[int]()
 
     def steps(*tensors: Tensor) -> State:
         nonlocal again
-        given = _pytree.tree_unflatten(tensors, layout).with_poses(state.poses)
+        given = _pytree.tree_unflatten(tensors, layout).with_poses(poses)
         with contextlib.ExitStack() as stack:
             stack.enter_context(same_pools(pools))
             if again:  # graphs write to the tensors that `aside` would put away

@@ -38,7 +38,7 @@ import numpy as np
 import torch
 
 import torch_mpm as mpm
-from torch_mpm.implicit import Implicit, newton
+from torch_mpm.implicit import Implicit, quadratic_model
 from torch_mpm.ops.implicit import CONVERGED, NEGATIVE_CURVATURE, SOLVING, ImplicitSolve
 
 from ..common import one_thread
@@ -150,7 +150,7 @@ def first_system(case: Case) -> System:
         raise Enough
 
     step, state, dt = case.made()
-    with mock.patch.object(newton, "implicit_cg", keep), torch.no_grad(), contextlib.suppress(Enough):
+    with mock.patch.object(quadratic_model, "implicit_cg", keep), torch.no_grad(), contextlib.suppress(Enough):
         step(state, dt)
     return found[0]
 
@@ -180,7 +180,7 @@ def steps(quick: bool) -> list[dict[str, Any]]:
         for name in NAMES:
             work = Work(name)
             step, state, dt = case.made()
-            with mock.patch.object(newton, "implicit_cg", work), torch.no_grad():
+            with mock.patch.object(quadratic_model, "implicit_cg", work), torch.no_grad():
                 end = step(state, dt).x
             report = step.solve_report
             assert report is not None

@@ -14,7 +14,7 @@ from benchmarks.fuzz import calls, misfits, public
 
 RESULTS = (
     "Arrival", "Blocks", "DamagedFileError", "Failures", "Frames", "GridOverflowError", "HeatSolve", "Material",
-    "PrecisionWarning", "RolloutEstimate", "SimulationError", "Trajectory",
+    "FrontWarning", "PrecisionWarning", "RolloutEstimate", "SimulationError", "Trajectory",
 )  # fmt: skip
 """What functions return or raise, and a base class."""
 CUDA_ALONE = ("captured",)

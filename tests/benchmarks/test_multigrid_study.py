@@ -9,7 +9,7 @@ from scipy.sparse.linalg import spsolve
 
 from benchmarks.implicit.multigrid import NAMES, Case, Work, counts, first_system
 from benchmarks.implicit.preconditioners import assembled, iterations, preconditioner
-from torch_mpm.implicit import newton
+from torch_mpm.implicit import quadratic_model
 from torch_mpm.ops import implicit_apply
 
 
@@ -35,7 +35,7 @@ def test_assembled_matrix(case):
         raise InterruptedError
 
     step, state, dt = case.made()
-    with mock.patch.object(newton, "implicit_cg", keep), torch.no_grad(), pytest.raises(InterruptedError):
+    with mock.patch.object(quadratic_model, "implicit_cg", keep), torch.no_grad(), pytest.raises(InterruptedError):
         step(state, dt)
     assert len(seen[0].b) < len(seen[0].lattice) * case.dim  # some are held
 
@@ -45,7 +45,7 @@ def test_steps_with_node_blocks_are_those_of_the_library():
     with torch.no_grad():
         own = step(state, dt).x
         work = Work("blocks")
-        with mock.patch.object(newton, "implicit_cg", work):
+        with mock.patch.object(quadratic_model, "implicit_cg", work):
             other = step(state, dt).x
     torch.testing.assert_close(other - state.x, own - state.x, rtol=1e-6, atol=1e-15)
     step(state, dt)

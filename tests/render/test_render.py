@@ -377,7 +377,7 @@ def test_no_opengl_is_said_and_drawn_in_software(monkeypatch, caplog):
 
 
 def test_missing_package_names_the_extra():
-    with pytest.raises(ImportError, match=r"'no_such_package'.*pip install torch-mpm\[render\]"):
+    with pytest.raises(ImportError, match=r"no_such_package.*pip install torch-mpm\[render\]"):
         requires.require("no_such_package.part")
 
 
