@@ -50,6 +50,7 @@ import torch
 import torch_mpm as mpm
 from test_capture_errors import blob
 from torch_mpm import captured_steps
+from torch_mpm.graphs import Replays
 
 class Waiting(torch.nn.Module):
     def __init__(self, step, calls):
