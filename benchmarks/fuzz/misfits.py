@@ -68,7 +68,7 @@ NUMBERS = "time|dt|start|end|moment_scale|numbers|adjoint_tolerance|.*tolerance|
 REAL = r"torch\.(float16|float64|int64|bool)"
 FITTING: tuple[tuple[str, str, str, str], ...] = (
     (".*", OPTIONAL, "None", "optional"),
-    ("ops[.].*", ".*", "on meta", "an op of which an argument is on meta is a fake one"),
+    ("ops[.].*", ".*", "on meta", "an argument on meta makes a fake call"),
     ("ops[.].*", "|".join(FLAGS), "= .*|None|complex", "torch makes a bool of it"),
     (
         "ops[.].*",

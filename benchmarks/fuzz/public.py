@@ -169,7 +169,7 @@ def _batches() -> dict[str, Callable[[], Call]]:
         return lambda: (use, {name: v.clone() if isinstance(v, torch.Tensor) else v for name, v in given.items()})
 
     def mixed(**arguments: Any) -> mpm.Material:
-        """Of which only the first law has particles."""
+        """A mixture whose first law alone has particles."""
         return mpm.Mixture([mpm.NeoHookean(E=E, nu=NU), mpm.Hencky(E=E, nu=NU), mpm.FixedCorotated(**arguments)])
 
     def molten(**arguments: Any) -> mpm.Material:

@@ -12,8 +12,8 @@ void check_signals();
 
 #if MPM_BACKEND == MPM_BACKEND_IS_cuda
 
-// Counts work of so many particles and substeps on a stream, and waits for earlier work of this thread where too much
-// is in flight: nothing interrupts what is launched, so that a device has a fraction of a second of it at most.
+// Counts the particles times substeps that are launched on a stream. Waits for earlier work of this thread where too
+// much is in flight: launched work cannot be interrupted, so a device holds at most a fraction of a second of it.
 void limit_work_in_flight(int64_t particles, int64_t substeps, cudaStream_t stream);
 
 #endif

@@ -97,8 +97,8 @@ inline int64_t history_size(const LawInfo& law, const Tensors& history, int64_t 
   return size;
 }
 
-// Where nobody knows how many scenes there are, a scene that some parameter has no entry for has none for the elastic
-// moduli either, which come first: without a modulus a particle is invalid, without a yield stress it is elastic.
+// Where the number of scenes is unknown, the shortest parameter limits the entries of the elastic moduli, which come
+// first: a particle without a modulus is invalid, and one without a yield stress alone would be elastic.
 template <class T, int D>
 void limit_scenes(LawArguments<T, D>& a, size_t count) {
   int64_t entries = 0;

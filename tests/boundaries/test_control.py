@@ -157,12 +157,12 @@ def test_assigned_positions_push_as_a_path_does(way, dim, device):
 
 
 def test_single_steps_push(device):
-    """Each of which is a control step; a controller in `on_particles` is one step late."""
+    """A single step is a control step. A controller in `on_particles` acts one step late."""
     n, speed = 120, torch.tensor([V, 0.1], dtype=F64, device=device)
     paddle = box(start(device=device))
     step, state = step_with(paddle), block(device=device)
     for k in range(n):
-        paddle.position = start(device=device) + k * DT * speed  # of which the first is where it is placed
+        paddle.position = start(device=device) + k * DT * speed  # the first assignment places it
         state = step(state, DT)
     times = torch.tensor([DT, n * DT], dtype=F64, device=device)
     path = mpm.Waypoints(times, torch.stack([start(device=device), start(device=device) + (n - 1) * DT * speed]))
@@ -633,7 +633,7 @@ def test_a_contradiction_inside_a_call_is_reported(rollout, device):
 
 
 def test_a_step_that_fails_inside_a_call_leaves_its_obstacles():
-    """It may be taken again, as with another time step."""
+    """The step may be repeated, for example with another time step."""
     paddle = box((0.35, 0.25))
     fails = [False]
 

@@ -33,7 +33,7 @@ def obj(path, form):
 
 
 def flat(jitter=0.0):
-    """A cube whose triangles share no vertex, each of which is off by up to `jitter` [m]."""
+    """A cube whose triangles share no vertex. Each vertex is displaced by up to `jitter` [m]."""
     cube = box((SIDE,) * 3)
     corners = cube.triangles.reshape(-1, 3) + np.random.default_rng(0).uniform(-jitter, jitter, (36, 3))
     return trimesh.Trimesh(
