@@ -178,6 +178,14 @@ def command(*arguments, **options):
     return subprocess.Popen(line, env=env, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **options)
 
 
+def scene_command(folder: Path, name: str, override: str) -> list[str]:
+    """Arguments of `check` or `run` with a small scene file in a folder, one key of which is overridden."""
+    scene = folder / "scene.toml"
+    scene.write_text(FILE.format(duration=0.04))
+    where = ["-o", str(folder / "out"), "--quiet"] if name == "run" else []
+    return [name, str(scene), *where, "--set", override]
+
+
 # ---- examples and benchmark programs
 
 

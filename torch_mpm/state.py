@@ -27,7 +27,7 @@ from .errors import (
     shape_of,
 )
 from .grid import Grid, check_grid
-from .ops.arguments import refuse_batched, soa_empty
+from .ops.arguments import refuse_batched, scenes_up_to, soa_empty
 from .ops.autograd import dispatch, is_recorded
 from .seed import Points
 
@@ -440,7 +440,7 @@ def _count_scenes(state: State) -> int | None:
         return 1
     if is_traced(state.scene) or is_captured(state.scene):
         return None
-    return max(int(state.scene.max()) + 1, 1) if len(state) else 1
+    return scenes_up_to(state.scene)
 
 
 def _check_impulse(impulse: Any, x: Tensor) -> None:

@@ -11,13 +11,19 @@ import ctypes
 import os
 import resource
 import select
+import shutil
 import signal
 import sys
 import tempfile
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
+
+import torch
+
+from .. import common as benchmark
 
 FAULTS = ("crash", "traceback", "wrong exit status 0", "time limit")
 TRACEBACK = "Traceback (most recent call last)"
@@ -83,3 +89,45 @@ def _child(work: Callable[[], int], output: int, memory: int) -> None:
     sys.stdout.flush()
     sys.stderr.flush()
     ctypes.CDLL(None).exit(status)
+
+
+# ---- programs
+
+Row = dict[str, Any]
+"""A part of a program: its name, cases and seconds, and the number of its faults by kind."""
+
+
+def report(
+    fuzz: Callable[[Path, dict[str, int], int], list[Row]],
+    counts: dict[str, int],
+    seed: int,
+    columns: Sequence[str],
+    title: str,
+    name: str,
+    out: Path,
+) -> bool:
+    """Run the parts of a program in a temporary folder, print their table and write it as a result.
+
+    Args:
+        fuzz: function of the folder, the counts and the seed that returns a row of each part.
+        counts: number of cases by part.
+        seed: of the cases.
+        columns: kinds of faults.
+        title, name: of the result, and of its file in the folder `out`.
+
+    Returns:
+        Whether there is a fault.
+    """
+    torch.set_num_threads(1)  # before the first fork
+    folder = Path(tempfile.mkdtemp())  # a TemporaryDirectory would be removed by the first child that ends
+    try:
+        rows = fuzz(folder, counts, seed)
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+    names = ("part", "cases", *columns, "seconds")
+    table = benchmark.table(names, [[row[name] for name in names] for row in rows])
+    print(table)
+    result = {"environment": benchmark.environment(), "seed": seed, "rows": rows}
+    text = f"# {title}\n\n{benchmark.describe(result['environment'])}\n\nseed {seed}\n\n{table}"
+    benchmark.write(out, name, result, text)
+    return any(row[column] for row in rows for column in columns)

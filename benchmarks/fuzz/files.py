@@ -2,9 +2,9 @@
 
     python -m benchmarks.fuzz.files --lines 600 --inputs 200 --shards 100 --records 1000 --memory 500 --seed 0
 
-Counts crashes, tracebacks, calls that do not end, success that is none, messages that nobody can read, and whatever is
-written outside of the folder that a command is given; the exit status is 1 if there is any. A fault is printed with
-the number of its case and all that the command printed.
+Faults are crashes, tracebacks, calls that do not end, false success, unclear messages, and files outside of the folder
+that a command is given. The exit status is 1 if there is a fault. A fault is printed with the number of its case and
+the output of the command.
 """
 
 from __future__ import annotations
@@ -19,7 +19,6 @@ import re
 import shutil
 import subprocess
 import sys
-import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
@@ -27,7 +26,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from torch_mpm import Trajectory, cli
 
@@ -285,19 +283,8 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, default=benchmark.RESULTS)
     arguments = parser.parse_args()
-    torch.set_num_threads(1)  # before the first fork
-    folder = Path(tempfile.mkdtemp())  # a TemporaryDirectory would be removed by the first child that ends
-    try:
-        rows = fuzz(folder, {part: getattr(arguments, part) for part in COUNTS}, arguments.seed)
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
-    names = ("part", "cases", *COLUMNS, "seconds")
-    table = benchmark.table(names, [[row[name] for name in names] for row in rows])
-    print(table)
-    result = {"environment": benchmark.environment(), "seed": arguments.seed, "rows": rows}
-    text = f"# Fuzzed files\n\n{benchmark.describe(result['environment'])}\n\nseed {arguments.seed}\n\n{table}"
-    benchmark.write(arguments.out, "fuzz_files", result, text)
-    sys.exit(any(row[column] for row in rows for column in COLUMNS))
+    counts = {part: getattr(arguments, part) for part in COUNTS}
+    sys.exit(common.report(fuzz, counts, arguments.seed, COLUMNS, "Fuzzed files", "fuzz_files", arguments.out))
 
 
 if __name__ == "__main__":

@@ -18,14 +18,11 @@ import resource
 import shutil
 import signal
 import sys
-import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
-
-import torch
 
 from torch_mpm import Trajectory, cli
 from torch_mpm.scene import writer
@@ -230,20 +227,8 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, default=benchmark.RESULTS)
     arguments = parser.parse_args()
-    torch.set_num_threads(1)  # before the first fork
     counts = {part: getattr(arguments, part) for part in ("mutations", "kills", "disks", "corrupt")}
-    folder = Path(tempfile.mkdtemp())  # a TemporaryDirectory would be removed by the first child that ends
-    try:
-        rows = fuzz(folder, counts, arguments.seed)
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
-    names = ("part", "cases", *COLUMNS, "seconds")
-    table = benchmark.table(names, [[row[name] for name in names] for row in rows])
-    print(table)
-    result = {"environment": benchmark.environment(), "seed": arguments.seed, "rows": rows}
-    text = f"# Fuzzed runs\n\n{benchmark.describe(result['environment'])}\n\nseed {arguments.seed}\n\n{table}"
-    benchmark.write(arguments.out, "fuzz_runs", result, text)
-    sys.exit(any(row[column] for row in rows for column in COLUMNS))
+    sys.exit(common.report(fuzz, counts, arguments.seed, COLUMNS, "Fuzzed runs", "fuzz_runs", arguments.out))
 
 
 if __name__ == "__main__":

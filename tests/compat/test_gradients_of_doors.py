@@ -45,6 +45,16 @@ def compared(function, value, device):
     assert float(difference) != 0
 
 
+def compared_or_refused(loss, name, value, differentiable, device):
+    """A tensor that requires a gradient gets it, or an error that names the argument."""
+    if differentiable:
+        compared(loss, value, device)
+        return
+    given = torch.tensor(value, dtype=torch.float64, device=device, requires_grad=True)
+    with pytest.raises((TypeError, ValueError), match=f"^{name} must"):
+        loss(given)
+
+
 def loss_of(x):
     return ((x - 0.5) ** 2 * torch.arange(1.0, 4.0, dtype=x.dtype, device=x.device)).sum()
 
@@ -129,12 +139,7 @@ def test_arguments_of_conditions(method, name, device):
     def loss(value):
         return simulated(device, {}, lambda solver: getattr(solver, method)(**arguments | {name: value}))
 
-    if name in differentiable:
-        compared(loss, arguments[name], device)
-        return
-    value = torch.tensor(arguments[name], dtype=torch.float64, device=device, requires_grad=True)
-    with pytest.raises((TypeError, ValueError), match=f"^{name} must"):
-        loss(value)
+    compared_or_refused(loss, name, arguments[name], name in differentiable, device)
 
 
 def test_vectors_of_single_tensors(device):
@@ -259,12 +264,7 @@ def test_arguments_of_conditions_of_the_solver(kind, name, device):
     def loss(value):
         return stepped(device, None, [{"type": kind, **arguments, name: value}])
 
-    if name in differentiable:
-        compared(loss, arguments[name], device)
-        return
-    value = torch.tensor(arguments[name], dtype=torch.float64, device=device, requires_grad=True)
-    with pytest.raises((TypeError, ValueError), match=f"^{name} must"):
-        loss(value)
+    compared_or_refused(loss, name, arguments[name], name in differentiable, device)
 
 
 @pytest.mark.parametrize("name", ["x", "v", "C", "F", "stress"])

@@ -1,7 +1,7 @@
 """Scenes that would never end are refused before the first substep, by the key that makes them so."""
 
 import pytest
-from helpers import FILE
+from helpers import FILE, scene_command
 
 pytest.importorskip("pydantic")
 pytest.importorskip("h5py")
@@ -23,10 +23,7 @@ from torch_mpm.scene import Scene, SceneError
     ],
 )
 def test_scenes_that_would_never_end(tmp_path, capsys, command, override, key):
-    scene = tmp_path / "scene.toml"
-    scene.write_text(FILE.format(duration=0.04))
-    where = ["-o", str(tmp_path / "out"), "--quiet"] if command == "run" else []
-    assert main([command, str(scene), *where, "--set", override]) == 1
+    assert main(scene_command(tmp_path, command, override)) == 1
     message = capsys.readouterr().err
     assert f"{key}:" in message and not (tmp_path / "out").exists(), message
 

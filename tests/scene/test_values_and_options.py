@@ -1,7 +1,7 @@
 """Values that no simulation can hold, and options of the command line that would have no effect, are errors."""
 
 import pytest
-from helpers import FILE
+from helpers import FILE, scene_command
 
 pytest.importorskip("pydantic")
 pytest.importorskip("h5py")
@@ -29,10 +29,7 @@ from torch_mpm.cli import main
 )
 def test_values_that_no_simulation_can_hold(tmp_path, capsys, command, override, message):
     """In `check` as in `run`."""
-    scene = tmp_path / "scene.toml"
-    scene.write_text(FILE.format(duration=0.04))
-    where = ["-o", str(tmp_path / "out"), "--quiet"] if command == "run" else []
-    assert main([command, str(scene), *where, "--set", override]) == 1
+    assert main(scene_command(tmp_path, command, override)) == 1
     told = capsys.readouterr().err
     assert message in told and len(told.splitlines()) <= 3, told
     assert not (tmp_path / "out").exists()

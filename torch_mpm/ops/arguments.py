@@ -68,6 +68,11 @@ def count_scenes(scene: Tensor) -> int | None:
     device, or not at all."""
     if not scene.is_cpu or is_traced(scene):
         return None
+    return scenes_up_to(scene)
+
+
+def scenes_up_to(scene: Tensor) -> int:
+    """One more than the largest scene of a particle, at least 1; waits for the device."""
     return max(int(scene.max()) + 1, 1) if scene.numel() else 1
 
 

@@ -34,16 +34,17 @@ def export_lagrangebench(
 
     Returns and errors as :func:`export_gns`; DatasetError also for a field that is not there.
     """
-    with exporting(dataset, out, "lagrangebench", more=_words) as export:
-        codes = _codes(export.dataset)
+    codes: dict[int, int] = {}
+    with exporting(dataset, out, "lagrangebench", more=lambda dataset: _words(dataset, codes)) as export:
+        codes |= _codes(export.dataset)
         for split in export.dataset.record.splits:
             _write(export, split, codes, fields)
     return export.target
 
 
-def _words(dataset: DatasetFolder) -> dict[str, Any]:
+def _words(dataset: DatasetFolder, codes: dict[int, int]) -> dict[str, Any]:
     """What its metadata has beside that of others."""
-    types = {str(kind): code for kind, code in _codes(dataset).items()}
+    types = {str(kind): code for kind, code in codes.items()}
     words = {"write_every": 1, "dx": particle_spacing(dataset), "solver": "MPM", "case": dataset.record.title}
     return {**words, "particle_types": types}
 
