@@ -46,6 +46,14 @@ def seeded() -> None:
     torch.manual_seed(0)
 
 
+@pytest.fixture(autouse=True)
+def no_compiled_code() -> None:
+    """Code that earlier tests compiled counts towards the limit of recompilations, beyond which a test fails."""
+    dynamo = sys.modules.get("torch._dynamo")
+    if dynamo is not None:
+        dynamo.reset()
+
+
 @pytest.fixture
 def one_thread() -> Iterator[None]:
     """For scenes so small that threads would wait for each other most of the time."""

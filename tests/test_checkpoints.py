@@ -314,7 +314,6 @@ def test_an_estimate_of_a_rollout_in_one_op_is_what_the_allocator_gives(kept, de
 @pytest.mark.parametrize("law", ["elastic", "history"])
 def test_compiled_steps_that_were_never_called(kept, law, device):
     """What a step makes at its first call, and keeps, is no part of what is called again."""
-    torch._dynamo.reset()
     laws = {"elastic": mpm.NeoHookean(E=1e4, nu=0.3), "history": mpm.VonMises(E=1e4, nu=0.3, yield_stress=10.0)}
     grid = mpm.Grid(dx=0.1, lower=(0.0, 0.0), upper=(1.0, 1.0), max_blocks=25)
     points = mpm.seed.box((0.3, 0.3), (0.5, 0.5), grid, per_cell=4)

@@ -43,7 +43,7 @@ def test_slower_row_is_printed_with_a_mark(tmp_path: Path, capsys: pytest.Captur
 
 @pytest.mark.parametrize(
     ("pattern", "program"),
-    [("speed_*", step), ("laws_*", laws), ("rollouts_*", rollouts), ("heat_[!s]*", heat), ("svd_[!a]*", svd)],
+    [("speed_*", step), ("laws_*", laws), ("rollouts_*", rollouts), ("heat_[!fs]*", heat), ("svd_[!a]*", svd)],
 )
 def test_rows_of_the_committed_results_have_names_of_their_own(pattern: str, program: Any) -> None:
     for found in common.read(common.RESULTS, f"{pattern}.json"):

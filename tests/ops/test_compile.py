@@ -47,7 +47,6 @@ def law_of(name, device):
 
 @pytest.fixture(autouse=True)
 def fresh_compiler():
-    torch._dynamo.reset()
     torch._dynamo.utils.counters.clear()
 
 
