@@ -39,6 +39,9 @@ UNSTEADY_SEGMENT = {"cpu": SEGMENT, "cuda": 64}
 """While it is not; where it was passed, the substeps are taken again in the shortest ones."""
 STEADY = 1.02
 """The limit is, where it has become smaller by no larger factor over a segment."""
+LIMITS = 8
+"""Segments of whose limits the smallest counts: a dt that followed that of the moment would feed energy into particles
+that oscillate (docs/limitations.md)."""
 BLOCKS_WANTED, PROBLEM = 0, 6
 """Columns of the status: blocks that were wanted at most; step of the first problem, -1 for none."""
 
@@ -58,6 +61,7 @@ class Totals:
     largest_cfl: float = 0.0
     smallest_dt: float = math.inf
     segment: int = SEGMENT  # substeps of the next one, at most
+    limits: list[float] = field(default_factory=list)  # of dt in the latest `LIMITS` segments [s]
     first: dict[str, Any] = field(default_factory=dict)
 
 
@@ -383,7 +387,8 @@ class Simulation:
                 f"{scene + ', ' if scene else ''}step {self.totals.substeps}: dt = {self.scene.dt:g} s is above the "
                 f"stability limit {limit:.3g} s; use dt = {0.5 * limit:.2g}, or leave dt out and set cfl = 0.5."
             )
-        wanted = self.scene.dt or self.scene.cfl * limit
+        self.totals.limits = [*self.totals.limits, limit][-LIMITS:]
+        wanted = self.scene.dt or self.scene.cfl * min(self.totals.limits)
         count = max(1, math.ceil(span / wanted * (1 - 1e-9))) if math.isfinite(wanted) else 1
         return span / count, count
 
