@@ -35,6 +35,7 @@ PROGRAMS = (
     "benchmarks.accuracy.ritter",
     "benchmarks.accuracy.runout",
     "benchmarks.accuracy.limits",
+    "benchmarks.accuracy.locking",
     "benchmarks.accuracy.rollout_gradients",
     "benchmarks.stability.stable_dt",
     "benchmarks.stability.law_dt",

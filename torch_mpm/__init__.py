@@ -11,7 +11,14 @@ from .cfl import stable_dt
 from .checkpoints import Checkpoints
 from .data.trajectory import Trajectory
 from .environments import Environments
-from .errors import DamagedFileError, FrontWarning, GridOverflowError, PrecisionWarning, SimulationError
+from .errors import (
+    DamagedFileError,
+    FrontWarning,
+    GridOverflowError,
+    LockingWarning,
+    PrecisionWarning,
+    SimulationError,
+)
 from .failures import Failures
 from .gradient_norms import GradientNorms
 from .grid import Blocks, Grid
@@ -58,6 +65,7 @@ __all__ = [
     "Grid",
     "FrontWarning",
     "GridOverflowError",
+    "LockingWarning",
     "Heat",
     "HeatSolve",
     "PerMaterial",

@@ -9,6 +9,7 @@ import signal
 import sys
 import threading
 import time
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from types import FrameType
@@ -29,7 +30,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     options = _parser().parse_args(arguments)
     try:
-        with termination_raises():
+        with termination_raises(), warnings_in_lines():
             options.command(options)
     except Terminated:
         return _told("terminated", 143)
@@ -62,6 +63,22 @@ def termination_raises() -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGTERM, previous)
+
+
+@contextlib.contextmanager
+def warnings_in_lines() -> Iterator[None]:
+    """A warning of torch_mpm is one line without a place in the code, as errors are."""
+    usual = warnings.formatwarning
+
+    def line(message: Warning | str, category: type[Warning], *place: Any, **words: Any) -> str:
+        own = category.__module__.startswith(__package__ or "")
+        return f"torch-mpm: warning: {message}\n" if own else usual(message, category, *place, **words)
+
+    warnings.formatwarning = line
+    try:
+        yield
+    finally:
+        warnings.formatwarning = usual
 
 
 TOLD = (

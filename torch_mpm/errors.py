@@ -47,6 +47,10 @@ class FrontWarning(UserWarning):
     """Steps are too long for the fronts between phases, which lag behind."""
 
 
+class LockingWarning(UserWarning):
+    """A nearly incompressible body bends too little on the lattice."""
+
+
 class DamagedFileError(ValueError):
     """A file of a run is damaged, was changed by another program, or is of another kind."""
 

@@ -10,7 +10,7 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
-from . import resolution
+from . import locking, resolution
 from .activation_record import ActivationRecord
 from .boundaries import BoundaryList, Obstacle, Walls
 from .boundaries.control import control_step, motions_now
@@ -139,6 +139,7 @@ class Step(TensorModule):
         self.compensated = compensated
         self._activations = ActivationRecord()
         self._kept_gravity = GraphCache()
+        locking.warn(self.law, self.grid.kernel, devices=False)
 
     def __setattr__(self, name: str, value: Any) -> None:
         """Arguments in any form, checked and converted."""
@@ -500,6 +501,7 @@ class Step(TensorModule):
         Warns:
             PrecisionWarning: where the positions of the state do not resolve the cells, see `Grid`.
             FrontWarning: where steps were so long that fronts between phases lag behind, see `Heat`.
+            LockingWarning: where an elastic law is nearly incompressible. A new step warns of values on the CPU.
 
         Raises:
             SimulationError: that names each scene (up to a dozen of a kind), when and how many, and has `failures`: if
@@ -512,6 +514,7 @@ class Step(TensorModule):
         raise_failures(self.failures(state), self._activations.all(), self.grid)
         if self.heat is not None:
             self.heat.fronts.warn()
+        locking.warn(self.law, self.grid.kernel)
         if state is not None:
             resolution.check(self.grid, state.x.dtype)
 

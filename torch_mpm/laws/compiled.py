@@ -361,7 +361,11 @@ class CompiledLaw(Material):
 
 
 class SolidLaw(CompiledLaw):
-    """A compiled law with two elastic moduli, given as Young's modulus and Poisson's ratio or as Lamé parameters."""
+    """A compiled law with two elastic moduli, given as Young's modulus and Poisson's ratio or as Lamé parameters.
+
+    Attributes:
+        engineering: whether they are Young's modulus and Poisson's ratio.
+    """
 
     E: Any  # numbers, buffers or nn.Parameters
     nu: Any
@@ -384,7 +388,7 @@ class SolidLaw(CompiledLaw):
         elif mu is not None and lam is not None:
             self._store("mu", check_value("mu", mu, "finite and not negative", lambda v: v >= 0))
             self._store("lam", check_value("lam", lam, "finite", lambda v: v == v))
-        self._engineering = E is not None
+        self.engineering = E is not None
 
     def values(self) -> Sequence[Value]:
         """μ and λ [Pa], then the other parameters of the law in its order, without the time step."""
@@ -392,7 +396,7 @@ class SolidLaw(CompiledLaw):
         return *self._lame(), *others
 
     def _lame(self) -> tuple[Any, Any]:
-        if not self._engineering:
+        if not self.engineering:
             return self.mu, self.lam
         E, nu = self.E, self.nu
         factors = 0.5 / (1 + nu), nu / ((1 + nu) * (1 - 2 * nu))
