@@ -11,8 +11,8 @@ import weakref
 
 import pytest
 import torch
-from test_graphs import network
-from test_rollouts import F64, assert_equal, blob, box, one_by_one
+from cases.networks import network
+from cases.rollouts import F64, assert_equal, blob, box, one_by_one
 from torch import nn
 
 import torch_mpm as mpm

@@ -4,8 +4,8 @@ import math
 
 import pytest
 import torch
+from cases.steps import block_state, make_step
 from helpers import relative_error
-from test_step import block_state, make_step
 from torch import nn
 from torch.utils.checkpoint import checkpoint as torch_checkpoint
 

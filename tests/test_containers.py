@@ -4,7 +4,7 @@ import io
 
 import pytest
 import torch
-from test_step import block_state, make_step
+from cases.steps import block_state, make_step
 from torch.utils import _pytree
 from torch.utils.data import DataLoader, Dataset
 

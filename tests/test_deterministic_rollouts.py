@@ -2,11 +2,11 @@
 and single steps in float64 to rounding, whatever kernels take them."""
 
 import pytest
-import test_few_particles as few
-import test_many_particles as many
 import torch
-from test_rollouts import TRANSFERS, tensors
-from test_small_scenes import F64, LAWS, assert_same, both, joined
+from cases import few_particles as few
+from cases import many_particles as many
+from cases.rollouts import TRANSFERS, tensors
+from cases.small_scenes import F64, LAWS, assert_same, both, joined
 
 import torch_mpm as mpm
 

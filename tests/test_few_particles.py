@@ -3,10 +3,10 @@ the domain, against single steps in float64. The particles cross several cells, 
 
 import pytest
 import torch
+from cases.few_particles import body, crowd
+from cases.rollouts import LAWS_HERE, TRANSFERS, assert_equal, one_by_one
+from cases.small_scenes import F64, LAWS, assert_same, both, joined
 from helpers import relative_error
-from test_rollouts import LAWS_HERE, TRANSFERS, assert_equal, one_by_one
-from test_small_scenes import F64, LAWS, assert_same, both, joined
-from test_step import block_state
 
 import torch_mpm as mpm
 from torch_mpm.rollouts import takes_few_blocks
@@ -18,19 +18,6 @@ def make(dim, law="neo_hookean", scenes=1, max_blocks=220, **options):
     grid = mpm.Grid(0.05 if dim == 3 else 0.02, (0,) * dim, (1,) * dim, scenes=scenes, max_blocks=max_blocks)
     options = {"gravity": (0.0, -9.8, 0.0)[:dim], "walls": "separate", **options}
     return mpm.Step(grid, (LAWS | LAWS_HERE)[law](), **options)
-
-
-def body(dim, device="cpu", speed=3.0, **options):
-    state = block_state(dim, dx=0.05 if dim == 3 else 0.02, **options)
-    along = torch.tensor([speed, -0.3 * speed, 0.5 * speed][:dim], dtype=F64)
-    return state.replace(v=state.v + along).to(device)
-
-
-def crowd(dim, device, high):
-    """64 particles a cell."""
-    state = block_state(dim, dx=0.025 if dim == 3 else 0.005, high=high)
-    assert 13000 < len(state) < 2**15
-    return state.replace(v=state.v + torch.tensor([3.0, -1.0, 1.5][:dim], dtype=F64)).to(device)
 
 
 @pytest.mark.parametrize("law", LAWS)

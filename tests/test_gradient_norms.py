@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from test_step import block_state, make_step
+from cases.steps import block_state, make_step
 
 import torch_mpm as mpm
 

@@ -4,7 +4,8 @@ import gc
 
 import pytest
 import torch
-from test_rollouts import F64, LAWS_HERE, assert_equal, blob, box, one_by_one, tensors
+from cases.networks import network
+from cases.rollouts import F64, LAWS_HERE, assert_equal, blob, box, one_by_one, tensors
 
 import torch_mpm as mpm
 
@@ -110,23 +111,6 @@ def test_functions_of_the_users_are_called_in_every_step():
     wanted = state.v.clone().requires_grad_()
     end = mpm.rollout(step, state.replace(v=wanted), 12, DT)
     assert torch.autograd.grad(end.v.square().sum(), wanted)[0].abs().max() > 0
-
-
-def network(dim: int, device: str) -> torch.nn.Module:
-    torch.manual_seed(5)
-    layers = torch.nn.Sequential(torch.nn.Linear(dim * dim, 16), torch.nn.Tanh(), torch.nn.Linear(16, dim * dim))
-
-    class Law(torch.nn.Module):
-        def __init__(self) -> None:
-            super().__init__()
-            self.layers = layers
-
-        def forward(self, F):
-            eye = torch.eye(dim, dtype=F.dtype, device=F.device)
-            tau = 1e3 * (F @ F.mT - eye) + 1e2 * self.layers((F - eye).flatten(1)).view_as(F)
-            return 0.5 * (tau + tau.mT)
-
-    return Law().to(device, F64)
 
 
 @pytest.mark.cuda

@@ -2,8 +2,8 @@
 
 import pytest
 import torch
+from cases.impulses import DT, F64, GRAVITY, LAWS, WALLS, cloud, grid_of, obstacles, one_by_one
 from helpers import TOLERANCE, relative_error
-from test_impulses import DT, F64, GRAVITY, LAWS, WALLS, cloud, grid_of, obstacles, one_by_one
 from torch import Tensor
 
 import torch_mpm as mpm

@@ -2,8 +2,8 @@
 
 import pytest
 import torch
+from cases.rollouts import LAWS_HERE, assert_equal, blob, box, one_by_one, tensors
 from combinations import F64
-from test_rollouts import LAWS_HERE, assert_equal, blob, box, one_by_one, tensors
 
 import torch_mpm as mpm
 

@@ -4,43 +4,23 @@ several cells. On a CPU there are fewer."""
 
 import pytest
 import torch
+from cases.many_particles import N, body, cell, dt_of
+from cases.rollouts import LAWS_HERE, assert_equal, one_by_one
+from cases.small_scenes import F64, LAWS, assert_same, both
 from helpers import relative_error
-from test_rollouts import LAWS_HERE, assert_equal, one_by_one
-from test_small_scenes import F64, LAWS, assert_same, both
-from test_step import block_state
 
 import torch_mpm as mpm
 
-CELLS = {"cpu": {2: 64, 3: 24}, "cuda": {2: 528, 3: 72}}
-N = 24
 CLOSE = 5e-4
 """Affine fields divide rounding errors of velocities by a small cell. Where a bound is larger, single steps
 in float32 differ as much from those in float64: of jets and fast bodies, whose velocities are larger; beside an
 obstacle, which a node is in or not."""
 
 
-def cell(dim, device):
-    return 1 / CELLS[device][dim]
-
-
-def dt_of(dim, device):
-    """In which a wave goes less than a third of a cell."""
-    return 0.08 * cell(dim, device)
-
-
 def make(dim, device, law="neo_hookean", **options):
     grid = mpm.Grid(cell(dim, device), (0,) * dim, (1,) * dim)
     options = {"gravity": (0.0, -9.8, 0.0)[:dim], "walls": "separate", **options}
     return mpm.Step(grid, (LAWS | LAWS_HERE)[law](), **options)
-
-
-def body(dim, device, cells=0.15):
-    """That goes so many cells a step, in a random order."""
-    state = block_state(dim, low=0.25, high=0.75, dx=cell(dim, device), spin=5.0)
-    assert device == "cpu" or len(state) >= 2**18
-    along = torch.tensor([1.0, -0.4, 0.6][:dim], dtype=F64) * cells * cell(dim, device) / dt_of(dim, device)
-    order = torch.randperm(len(state), generator=torch.Generator().manual_seed(2))
-    return state.replace(v=state.v + along).select(order).to(device)
 
 
 @pytest.mark.parametrize("law", LAWS)

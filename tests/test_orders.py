@@ -2,9 +2,9 @@
 
 import pytest
 import torch
+from cases.rollout_gradients import assert_same, gradients, moving
+from cases.rollouts import F64, LAWS_HERE, TRANSFERS, assert_equal, blob, box, one_by_one
 from helpers import OpNames
-from test_rollout_gradients import assert_same, gradients, moving
-from test_rollouts import F64, LAWS_HERE, TRANSFERS, assert_equal, blob, box, one_by_one
 from torch import Tensor
 
 import torch_mpm as mpm

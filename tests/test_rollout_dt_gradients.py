@@ -2,8 +2,8 @@
 
 import pytest
 import torch
-from test_rollout_gradients import assert_same, loss, moving
-from test_rollouts import F64, LAWS_HERE, blob, box, one_by_one
+from cases.rollout_gradients import assert_same, loss, moving
+from cases.rollouts import F64, LAWS_HERE, blob, box, one_by_one
 from torch import Tensor
 
 import torch_mpm as mpm

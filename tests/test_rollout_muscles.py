@@ -4,8 +4,8 @@ from collections.abc import Callable
 
 import pytest
 import torch
-from test_rollout_gradients import assert_same, gradients, in_op, moving, single, with_gradients
-from test_rollouts import LAWS_HERE, SOME_TRANSFERS, TRANSFERS, assert_equal, blob, box, in_one_op, one_by_one
+from cases.rollout_gradients import assert_same, gradients, in_op, moving, single, with_gradients
+from cases.rollouts import LAWS_HERE, SOME_TRANSFERS, TRANSFERS, assert_equal, blob, box, in_one_op, one_by_one
 from torch import Tensor
 
 import torch_mpm as mpm

@@ -6,9 +6,8 @@ import sys
 
 import pytest
 import torch
-from helpers import TOLERANCE
-from test_rollout_gradients import assert_same, gradients, in_op, moving, single
-from test_rollouts import (
+from cases.rollout_gradients import assert_same, gradients, in_op, moving, single
+from cases.rollouts import (
     SOME_TRANSFERS,
     TRANSFERS,
     assert_equal,
@@ -17,6 +16,7 @@ from test_rollouts import (
     in_one_op,
     one_by_one,
 )
+from helpers import TOLERANCE
 from torch import Tensor
 
 import torch_mpm as mpm

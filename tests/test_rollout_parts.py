@@ -2,8 +2,8 @@
 
 import pytest
 import torch
+from cases.steps import block_state, make_step
 from helpers import relative_error
-from test_step import block_state, make_step
 
 import torch_mpm as mpm
 

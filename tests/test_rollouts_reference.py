@@ -2,8 +2,8 @@
 
 import pytest
 import torch
+from cases.steps import block_state
 from helpers import TOLERANCE, relative_error
-from test_step import block_state
 from torch import Tensor
 
 import torch_mpm as mpm

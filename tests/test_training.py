@@ -5,8 +5,8 @@ import io
 import pytest
 import torch
 import torch.multiprocessing as mp
+from cases.steps import block_state, make_step
 from helpers import relative_error
-from test_step import block_state, make_step
 from torch import nn
 from torch.nn.parallel import DistributedDataParallel
 

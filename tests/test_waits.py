@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from test_rollouts import blob, box
+from cases.rollouts import blob, box
 
 import torch_mpm as mpm
 

@@ -4,8 +4,8 @@ import math
 
 import pytest
 import torch
+from cases.heat_cg import check_replay, heat
 from helpers import relative_error
-from test_heat_cg import check_replay, heat
 
 from torch_mpm.reference import heat as reference
 

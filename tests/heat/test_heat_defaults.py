@@ -4,7 +4,7 @@ import contextlib
 
 import pytest
 import torch
-from test_heat import FLOAT, block, grid_around, random_like
+from cases.heat import FLOAT, block, grid_around, random_like
 
 import torch_mpm as mpm
 from torch_mpm.heat.boundaries import Convection, Fixed, FixedSurface, Flux, FreeSurface, Radiation, Source, Surface

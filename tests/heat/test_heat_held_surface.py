@@ -5,8 +5,8 @@ import warnings
 
 import pytest
 import torch
+from cases.heat import FLOAT, block, check_gradients, random_like
 from helpers import relative_error
-from test_heat import FLOAT, block, check_gradients, random_like
 
 import torch_mpm as mpm
 from benchmarks.accuracy.heat_fronts import between_surfaces, lag

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 import torch
+from cases.heat import FLOAT, block, grid_around
 from helpers import relative_error
-from test_heat import FLOAT, block, grid_around
 
 import torch_mpm as mpm
 from torch_mpm.parameters import evaluate

@@ -4,8 +4,8 @@ import itertools
 
 import pytest
 import torch
+from cases.heat_cg import Heat, dense_increment, dense_operator, heat, op_arguments
 from helpers import relative_error
-from test_heat_cg import Heat, dense_increment, dense_operator, heat, op_arguments
 from torch import Tensor
 
 import torch_mpm as mpm

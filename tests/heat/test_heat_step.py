@@ -6,8 +6,8 @@ import math
 
 import pytest
 import torch
+from cases.heat import FLOAT, block, grid_around, random_like
 from helpers import relative_error
-from test_heat import FLOAT, block, grid_around, random_like
 
 import torch_mpm as mpm
 from benchmarks import common, report

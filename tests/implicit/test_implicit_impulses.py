@@ -2,9 +2,9 @@
 
 import pytest
 import torch
+from cases.implicit_gradients import NAMES, TIGHT, inputs
+from cases.implicit_obstacles import check, obstacle, parameters
 from helpers import relative_error
-from test_implicit_gradients import NAMES, TIGHT, inputs
-from test_implicit_obstacle_gradients import check, obstacle, parameters
 
 import torch_mpm as mpm
 from torch_mpm.implicit import Implicit

@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from test_implicit_gradients import inputs
+from cases.implicit_gradients import inputs
 
 import torch_mpm as mpm
 from torch_mpm.implicit import Implicit, implicit, newton

@@ -4,8 +4,8 @@ import math
 
 import pytest
 import torch
+from cases.plasticity import data, error, random_states, rotations, state_of, to
 from helpers import TOLERANCE
-from test_plasticity import data, error, random_states, rotations, state_of, to
 
 import torch_mpm as mpm
 from torch_mpm.ops import law_energy, law_update

@@ -1,0 +1,1 @@
+"""Scenes, laws and comparisons that several test modules share, by subject."""

@@ -1,0 +1,56 @@
+"""Scenes of obstacles and walls that take impulses."""
+
+import torch
+from torch import Tensor
+
+import torch_mpm as mpm
+
+F64 = torch.float64
+DT, STEPS = 1e-3, 8
+WALLS = {
+    "none": None,
+    "separate": mpm.Walls("separate"),
+    "friction": mpm.Walls("separate", friction=0.3),
+    "sticky": mpm.Walls("sticky"),
+    "slip": mpm.Walls("slip"),
+    "mirror": mpm.Walls("mirror"),
+}
+LAWS = {
+    "elastic": lambda: mpm.NeoHookean(E=1e4, nu=0.3),
+    "sand": lambda: mpm.QuarticSand(E=1e5, nu=0.3, friction_angle=0.6),
+    "fluid": lambda: mpm.WeaklyCompressible(1e4, viscosity=1.0),
+    "custom": lambda: mpm.CustomLaw(lambda F: 1e3 * (F @ F.mT - torch.eye(F.shape[1]).to(F)), stiffness=1e4),
+}
+GRAVITY = (1.0, -9.8, 0.5)
+
+
+def obstacles(dim: int, in_torch: bool = False) -> list:
+    """Several that overlap, of all kinds, some of which come or go."""
+    at = (0.5, 0.25, 0.5)[:dim]
+    turning = 3.0 if dim == 2 else (1.0, -2.0, 3.0)
+    ball = mpm.Sphere(at, 0.15, friction=0.2, velocity=(0.1, 0.2, -0.1)[:dim], angular_velocity=turning)
+    box = mpm.Box(at, (0.4, 0.2, 0.3)[:dim], kind="slip", start=2.5 * DT)
+    plane = mpm.Plane((0.5, 0.1, 0.5)[:dim], (0.3, 1.0, 0.2)[:dim], kind="sticky", end=4.5 * DT)
+    blob = mpm.SDF(lambda x: x.norm(dim=1) - 0.12, (0.3, 0.3, 0.4)[:dim], friction=0.4)
+    return [ball, *([blob] if in_torch else []), box, plane]
+
+
+def cloud(dim: int, device: str = "cpu", scenes: int = 1, count: int = 120, dtype: torch.dtype = F64) -> mpm.State:
+    g = torch.Generator().manual_seed(4)
+    P = count * scenes
+    x = 0.05 + 0.9 * torch.rand(P, dim, generator=g, dtype=F64)
+    v = 3 * torch.randn(P, dim, generator=g, dtype=F64)
+    mass, C = 0.1 + torch.rand(P, generator=g, dtype=F64), torch.randn(P, dim, dim, generator=g, dtype=F64)
+    scene = None if scenes == 1 else torch.arange(P, dtype=torch.int32) % scenes
+    state = mpm.State(x=x, v=v, mass=mass, volume=torch.full((P,), 1e-3, dtype=F64), C=C, scene=scene)
+    return state.to(device, dtype)
+
+
+def grid_of(dim: int, **options) -> mpm.Grid:
+    return mpm.Grid(0.1, (0.0,) * dim, (1.0,) * dim, **options)
+
+
+def one_by_one(step: mpm.Step, state: mpm.State, n: int = STEPS, dt: float | Tensor = DT) -> mpm.State:
+    for _ in range(n):
+        state = step(state, dt)
+    return state
