@@ -104,9 +104,22 @@ def slug(name: str) -> str:
 def write(directory: Path, name: str, result: dict[str, Any], text: str) -> None:
     """Write a result as `name`.json for programs and `name`.md for readers."""
     directory.mkdir(parents=True, exist_ok=True)
-    (directory / f"{name}.json").write_text(json.dumps(result, indent=1) + "\n")
+    (directory / f"{name}.json").write_text(compact(result) + "\n")
     (directory / f"{name}.md").write_text(text.rstrip() + "\n")
     print(f"wrote {directory / name}.json and .md")
+
+
+def compact(value: Any, indent: str = "") -> str:
+    """JSON of a value with every innermost list or dictionary on one line."""
+    items = list(value.values() if isinstance(value, dict) else value) if isinstance(value, (dict, list, tuple)) else []
+    if not any(isinstance(item, (dict, list, tuple)) for item in items):
+        return json.dumps(value)
+    inner = indent + " "
+    lines = [inner + compact(item, inner) for item in items]
+    if isinstance(value, dict):
+        lines = [inner + json.dumps(str(key)) + ": " + compact(item, inner) for key, item in value.items()]
+    opening, closing = "{}" if isinstance(value, dict) else "[]"
+    return opening + "\n" + ",\n".join(lines) + "\n" + indent + closing
 
 
 def read(directory: Path, pattern: str) -> list[dict[str, Any]]:

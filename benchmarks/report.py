@@ -350,7 +350,7 @@ def adversarial(result: dict[str, Any]) -> str:
         "error before its sign was lost, which a law of finite energy cannot prevent. Energy: above 1.1 times the "
         "initial one in a closed system without FLIP."
     )
-    parts = [intro, rollouts(result["rows"], "law")]
+    parts = [intro, rollouts(result, "law")]
     return "\n\n".join([*parts, f"- {common.describe(result['environment'])}"])
 
 

@@ -54,6 +54,8 @@ SEGMENT = 32
 """Steps between two reorderings."""
 ASPECTS = (0.5, 0.8, 1.2, 2.0, 3.0, 5.0, 7.0, 10.0)
 ANGLES = tuple(range(20, 51, 2))
+FIGURES = {"planar": ("planar", "slab"), "axisymmetric": ("axisymmetric",)}
+"""Shapes of the columns in each figure."""
 PUBLISHED = {
     "planar": ("Lube et al. 2005", 2.3, (1.2, 1.0), (1.9, 2 / 3)),
     "discs": ("Staron and Hinch 2005, 2-D discs", 2.0, (2.5, 1.0), (3.25, 0.7)),
@@ -402,7 +404,7 @@ def fitted_exponent(rows: Sequence[dict[str, Any]]) -> float:
 
 
 def standing(case: Case, angles: Sequence[float], duration: float, device: str) -> dict[str, Any]:
-    """Displacement of heaps with flanks of given angles, and the steepest that stands; `cells` is their height."""
+    """The steepest of some heaps that stands and the least steep that fails; `cells` is their height."""
     height = case.cells * DX
     states = []
     for angle in angles:
@@ -415,14 +417,11 @@ def standing(case: Case, angles: Sequence[float], duration: float, device: str) 
     reach = 1.3 * height / math.tan(math.radians(min(angles)))
     state, _, steps = simulate(case, states, [height] * len(angles), reach, duration, device)
     moved = (state.restored().x.double().cpu() - starts).norm(dim=1).split([len(s) for s in states])
-    displacement = [float(d.mean()) / height for d in moved]
-    failed = [d > 0.02 for d in displacement]
+    failed = [float(d.mean()) > 0.02 * height for d in moved]
     print(f"standing slopes, {case.name}: {steps} steps in {time.perf_counter() - begin:.1f} s", flush=True)
     return {
         "case": dataclasses.asdict(case),
         "name": case.name,
-        "angles": list(angles),
-        "displacement": displacement,
         "steepest": max((angle for angle, f in zip(angles, failed, strict=True) if not f), default=math.nan),
         "least failing": min((angle for angle, f in zip(angles, failed, strict=True) if f), default=math.nan),
     }
@@ -460,12 +459,28 @@ def measure(device: str, quick: bool, only: str) -> dict[str, Any]:
         return [case for case in among if re.search(only, f"{kind} {case.name}")]
 
     with torch.no_grad():
-        return {
+        found = {
             "environment": common.environment(device),
             "variants": [collapse(c, (VARIED,), duration, device) for c in chosen("variant", variants)],
             "collapse": [collapse(c, aspects, duration, device) for c in chosen("column", cases)],
             "standing": [standing(c, angles, standing_duration, device) for c in chosen("slope", slopes)],
         }
+    return reduced(found)
+
+
+def drawn(result: dict[str, Any], shapes: Sequence[str]) -> list[dict[str, Any]]:
+    """Cases of some shapes in a figure; the deposits are those of the last."""
+    return [case for case in result["collapse"] if case["case"]["shape"] in shapes]
+
+
+def reduced(result: dict[str, Any]) -> dict[str, Any]:
+    """A result with the profiles of the figure only."""
+    last = [drawn(result, shapes)[-1:] for shapes in FIGURES.values()]
+    for case in (*result["collapse"], *result["variants"]):
+        if [case] not in last:
+            for row in case["rows"]:
+                row.pop("profile", None)
+    return result
 
 
 # ---- report
@@ -477,7 +492,7 @@ def added(old: dict[str, Any], new: dict[str, Any]) -> dict[str, Any]:
     for part in ("collapse", "standing", "variants"):
         cases = {entry["name"]: entry for entry in (*old[part], *new[part])}
         result[part] = list(cases.values())
-    return result
+    return reduced(result)
 
 
 def published(shape: str, a: float) -> float:
@@ -537,16 +552,16 @@ def plot(result: dict[str, Any], path: Path) -> None:
 
     figure, axes = plt.subplots(2, 2, figsize=(13, 9))
     a = np.geomspace(0.4, 12, 100)
-    for row, (title, shapes, sources) in zip(
+    for row, (title, sources) in zip(
         axes,
-        (("planar", ("planar", "slab"), ("planar", "discs")), ("axisymmetric", ("axisymmetric",), ("axisymmetric",))),
+        (("planar", ("planar", "discs")), ("axisymmetric", ("axisymmetric",))),
         strict=True,
     ):
         for source, line in zip(sources, ("-", "--"), strict=False):
             row[0].loglog(
                 a, [published(source, v) for v in a], color="gray", linestyle=line, label=PUBLISHED[source][0]
             )
-        cases = [c for c in result["collapse"] if c["case"]["shape"] in shapes]
+        cases = drawn(result, FIGURES[title])
         for case in cases:
             row[0].loglog(
                 [r["a"] for r in case["rows"]],

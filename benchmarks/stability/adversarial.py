@@ -14,6 +14,7 @@ import math
 import random
 import sys
 import time
+from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -33,7 +34,7 @@ GAIN = 1.1
 """Largest energy of a closed system over its first one that counts as kept."""
 
 DESCRIBED = ("number", "motion", "law", "dim", "kernel", "transfer", "flip", "stress_form", "mach")
-"""What a result tells of a case, whose number gives the rest."""
+"""Fields of a case in a result; its number determines the others."""
 
 LAWS: dict[str, Callable[[float, float], mpm.Material]] = {
     **SOLIDS,  # type: ignore[dict-item]
@@ -254,16 +255,25 @@ COUNTS: dict[str, Callable[[dict[str, Any]], bool]] = {
 }
 
 
-def summary(rows: Sequence[dict[str, Any]], key: str) -> str:
-    """A table of rollouts that went wrong, by motion or law, for each cfl; what never happened is left out."""
-    cfls = sorted({row["cfl"] for row in rows}, reverse=True)
+def reduced(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Rollouts by motion and by law, numbers of them per cfl, and the rows of those that failed."""
+    first = [row for row in rows if row["cfl"] == CFL[0]]
+    return {
+        "rollouts": {key: dict(Counter(row[key] for row in first)) for key in ("motion", "law")},
+        "rows": [row for row in rows if any(f(row) for f in COUNTS.values())],
+    }
+
+
+def summary(result: dict[str, Any], key: str) -> str:
+    """A table of rollouts that failed, by motion or law, for each cfl; failures that never occurred are omitted."""
+    rows, rollouts = result["rows"], result["rollouts"][key]
     seen = {name: f for name, f in COUNTS.items() if name == "inverted" or any(map(f, rows))}
-    header = [key, "rollouts", *(f"{name}, {cfl:g}" for cfl in cfls for name in seen)]
+    header = [key, "rollouts", *(f"{name}, {cfl:g}" for cfl in CFL for name in seen)]
     lines = []
-    for value in [*dict.fromkeys(row[key] for row in rows), "all"]:
+    for value, number in [*rollouts.items(), ("all", sum(rollouts.values()))]:
         mine = [row for row in rows if value in (row[key], "all")]
-        counts = [sum(f(row) for row in mine if row["cfl"] == cfl) for cfl in cfls for f in seen.values()]
-        lines.append([value, len(mine) // len(cfls), *counts])
+        counts = [sum(f(row) for row in mine if row["cfl"] == cfl) for cfl in CFL for f in seen.values()]
+        lines.append([value, number, *counts])
     return common.table(header, lines)
 
 
@@ -275,12 +285,12 @@ def text(result: dict[str, Any]) -> str:
         f"which the energy of a closed system rose above {GAIN:g} of the first (without FLIP), and in which a particle",
         "had been flattened to rounding before it lost its sign, which a law of finite energy cannot prevent.",
         "",
-        summary(result["rows"], "motion"),
+        summary(result, "motion"),
         "",
-        summary(result["rows"], "law"),
+        summary(result, "law"),
     ]
     keys = (*DESCRIBED, "cfl", "step", "gain")
-    wrong = [[row[k] for k in keys] for row in result["rows"] if any(f(row) for f in COUNTS.values())]
+    wrong = [[row[k] for k in keys] for row in result["rows"]]
     return "\n".join([*lines, "", "## What went wrong", "", common.table(keys, wrong)])
 
 
@@ -294,9 +304,9 @@ def main() -> None:
     count, begin = 10 if arguments.quick else arguments.count, time.perf_counter()
     result: dict[str, Any] = {"environment": common.environment(), "steps": 30 if arguments.quick else STEPS}
     cases = [Case.make(number) for number in range(count)]
-    result["rows"] = [run(case, cfl, result["steps"]) for cfl in CFL for case in cases]
+    result |= reduced([run(case, cfl, result["steps"]) for cfl in CFL for case in cases])
     result["seconds"] = time.perf_counter() - begin
-    print(summary(result["rows"], "motion"))
+    print(summary(result, "motion"))
     common.write(arguments.out, "adversarial", result, text(result))
     sys.exit(any(row["cfl"] == 1 and (row["inverted"] or row["not finite"]) for row in result["rows"]))
 

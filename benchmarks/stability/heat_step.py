@@ -180,12 +180,14 @@ def excess(row: dict[str, Any]) -> float:
 
 
 def summary(rows: Iterable[dict[str, Any]]) -> dict[str, Any]:
-    """How many cases there are, and the worst of each body, transfer and diffusion number."""
-    groups: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
-    for row in rows:
-        groups.setdefault(tuple(row[name] for name in (*BODY, "transfer", "number")), []).append(row)
-    worst = [max(group, key=excess) for group in groups.values()]
-    return {"cases": sum(len(group) for group in groups.values()), "rows": worst}
+    """Number of cases, and the worst of each body and transfer and of each transfer and diffusion number."""
+    rows = list(rows)
+    worst: dict[tuple[Any, ...], int] = {}
+    for k, row in enumerate(rows):
+        for names in ((*BODY, "transfer"), ("transfer", "number")):
+            group = tuple(row[name] for name in names)
+            worst[group] = max(worst.get(group, k), k, key=lambda i: excess(rows[i]))
+    return {"cases": len(rows), "rows": [rows[k] for k in sorted(set(worst.values()))]}
 
 
 def largest(rows: Iterable[dict[str, Any]]) -> str:

@@ -8,7 +8,6 @@ estimate is that of the state before.
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import itertools
 import json
 import sys
@@ -23,6 +22,9 @@ import torch_mpm as mpm
 
 from .. import common
 from .stable_dt import LAWS, Case, measure, ratio
+
+VARIED = ("law", "dim", "E", "nu", "stretch")
+"""Fields of a case that differ."""
 
 
 def all_cases(quick: bool) -> list[Case]:
@@ -100,7 +102,7 @@ def spread(cases: list[dict[str, Any]]) -> float:
 
 
 def case_of(row: dict[str, Any]) -> Case:
-    return Case(**{field.name: row[field.name] for field in dataclasses.fields(Case)})
+    return Case(**{name: row[name] for name in VARIED})
 
 
 def main() -> None:
@@ -120,10 +122,11 @@ def main() -> None:
         again = [c for c in result["cases"] if c["stable"] < 1]
         measured = measure([case_of(c) for c in again], arguments.device)
         for c, new in zip(again, measured, strict=True):
-            c.update(new)
+            c["stable"] = new["stable"]
         result["again"] = common.environment(arguments.device)
     else:
-        result["cases"] = measure(all_cases(arguments.quick), arguments.device)
+        cases = all_cases(arguments.quick)
+        result["cases"] = [{key: row[key] for key in (*VARIED, "stable")} for row in measure(cases, arguments.device)]
         result["seconds"] = time.perf_counter() - begin
     for c in result["cases"]:
         c["elliptic"] = elliptic(case_of(c))

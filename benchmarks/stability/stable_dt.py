@@ -47,6 +47,11 @@ LAWS: dict[str, Callable[[Tensor, Tensor], mpm.Material]] = {
 """Laws of Young's modulus and Poisson's ratio; the other parameters so that large strains yield."""
 
 
+MATERIAL = ("dim", "E", "nu", "stretch", "stable")
+SETTING = ("layout", "transfer", "stress_form", "kernel", "nu", "stretch", "stable")
+"""Fields of the rows of a result."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Case:
     """Stretch s < 1 is F = s I, s > 1 is F = diag(s, ...) of unit determinant; layouts are those of `positions`."""
@@ -86,8 +91,8 @@ def positions(dim: int, layout: str, dx: float, generator: torch.Generator) -> t
     return x, per_axis**-dim
 
 
-def stable(cases: Sequence[Case], factors: Tensor, steps: int = STEPS, device: str = "cpu") -> tuple[Tensor, Tensor]:
-    """Which multiples of the estimate [cases, K] are stable, and the estimates [cases] [s]; cases of one setting."""
+def stable(cases: Sequence[Case], factors: Tensor, steps: int = STEPS, device: str = "cpu") -> Tensor:
+    """Stability of multiples of the estimate, bool [cases, K]; cases of one setting."""
     first, (count, tries) = cases[0], factors.shape
     dim, scenes = first.dim, count * tries
     grid = mpm.Grid(1 / CELLS[dim], (0,) * dim, (1,) * dim, scenes=scenes, kernel=first.kernel)
@@ -120,7 +125,7 @@ def stable(cases: Sequence[Case], factors: Tensor, steps: int = STEPS, device: s
     for _ in range(steps):
         state = step(state, estimate * factors.flatten().to(device))
         largest = torch.maximum(largest, size(state, grid))
-    return (largest < GROWTH * start).view(count, tries).cpu(), estimate.view(count, tries)[:, 0].cpu()
+    return (largest < GROWTH * start).view(count, tries).cpu()
 
 
 def size(state: mpm.State, grid: mpm.Grid) -> Tensor:
@@ -135,35 +140,34 @@ def size(state: mpm.State, grid: mpm.Grid) -> Tensor:
 
 @torch.no_grad()
 def measure(cases: Sequence[Case], device: str = "cpu") -> list[dict[str, Any]]:
-    """Of each case: the estimate [s], and the multiples of it between which the limit lies (0, 0: unstable at any)."""
+    """The limit of each case, "stable", in multiples of the estimate: lower end of a bracket; 0: unstable at any dt."""
     results = []
     for setting, group in itertools.groupby(cases, key=lambda c: c.setting):
         batch = list(group)
-        low, high, estimate = bracket(batch, torch.tensor(COARSE, dtype=torch.float64).repeat(len(batch), 1), device)
+        low, high = bracket(batch, torch.tensor(COARSE, dtype=torch.float64).repeat(len(batch), 1), device)
         never = torch.zeros(len(batch), dtype=torch.bool)
         if failed := (low == 0).nonzero().flatten().tolist():
             tenth = torch.full((len(failed), 1), 0.1, dtype=torch.float64)
-            never[failed] = ~stable([batch[i] for i in failed], tenth, 30 * STEPS, device)[0][:, 0]
+            never[failed] = ~stable([batch[i] for i in failed], tenth, 30 * STEPS, device)[:, 0]
         between = torch.linspace(0, 1, 9, dtype=torch.float64)[1:-1]
-        low, high, _ = bracket(batch, low[:, None] + (high - low)[:, None] * between, device, low, high)
-        low, high = low.where(~never, 0), high.where(~never, 0)
-        for c, dt, a, b in zip(batch, estimate.tolist(), low.tolist(), high.tolist(), strict=True):
-            results.append({**dataclasses.asdict(c), "estimate": dt, "stable": a, "unstable": b})
+        low, _ = bracket(batch, low[:, None] + (high - low)[:, None] * between, device, low, high)
+        low = low.where(~never, 0)
+        results += [{**dataclasses.asdict(c), "stable": limit} for c, limit in zip(batch, low.tolist(), strict=True)]
         print(*setting, f"{len(batch)} cases", flush=True)
     return results
 
 
 def bracket(
     cases: Sequence[Case], factors: Tensor, device: str, low: Tensor | None = None, high: Tensor | None = None
-) -> tuple[Tensor, Tensor, Tensor]:
+) -> tuple[Tensor, Tensor]:
     """The largest multiple up to which all are stable, and the next; `low` is known to be and `high` not to be."""
-    good, estimate = stable(cases, factors, STEPS, device)
+    good = stable(cases, factors, STEPS, device)
     low = factors.new_zeros(len(cases)) if low is None else low
     high = 2 * factors[:, -1] if high is None else high
     ladder = torch.cat([low[:, None], factors, high[:, None]], 1)
     passed = good.int().cumprod(1).sum(1)
     row = torch.arange(len(cases))
-    return ladder[row, passed], ladder[row, passed + 1], estimate
+    return ladder[row, passed], ladder[row, passed + 1]
 
 
 def all_cases(quick: bool) -> tuple[list[Case], list[Case]]:
@@ -189,7 +193,8 @@ def all_cases(quick: bool) -> tuple[list[Case], list[Case]]:
 def text(result: dict[str, Any]) -> str:
     materials, settings = result["materials"], result["settings"]
     buckling = [c["stable"] for c in settings if crowded(c)]
-    limited = [c["stable"] for c in materials + settings if c["stable"] > 0 and not crowded(c)]
+    others = materials + [c for c in settings if not crowded(c)]
+    limited = [c["stable"] for c in others if c["stable"] > 0]
     hopeless = sum(c["stable"] == 0 for c in materials + settings)
     lines = [
         "# Largest stable time step",
@@ -244,7 +249,8 @@ def main() -> None:
     begin = time.perf_counter()
     materials, settings = all_cases(arguments.quick)
     result: dict[str, Any] = {"environment": common.environment()}
-    result["materials"], result["settings"] = measure(materials), measure(settings)
+    result["materials"] = [{key: row[key] for key in MATERIAL} for row in measure(materials)]
+    result["settings"] = [{key: row[key] for key in SETTING} for row in measure(settings)]
     result["seconds"] = time.perf_counter() - begin
     print(text(result))
     common.write(arguments.out, "stability", result, text(result))
