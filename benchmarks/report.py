@@ -1,9 +1,8 @@
 """The tables and figures of the documents, from the result files: `python -m benchmarks.report [--write]`.
 
-Prints the tables; with --write, puts them between the lines `<!-- benchmarks -->` and `<!-- /benchmarks -->` of
-docs/measured.md, which has all of them, of README.md, which has one of speed and one of accuracy, of docs/implicit.md,
-and of the pages for users of other projects, and draws the figures of several devices beside the results. Each program
-draws its other figures itself.
+Prints the tables. With --write, inserts them between the lines `<!-- benchmarks -->` and `<!-- /benchmarks -->` of
+docs/measured.md (all tables), README.md (one of speed and one of accuracy), docs/implicit.md and the pages for users of
+other projects, and draws the figures of several devices beside the results. Each program draws its other figures.
 """
 
 from __future__ import annotations
@@ -36,19 +35,19 @@ BOTH = ("step, forward and backward", "step, forward and backward, CUDA graph")
 
 
 def speed(results: list[dict[str, Any]]) -> str:
-    """Whole steps beside the peers, with where they were measured, and the parts beside the memory."""
+    """Whole steps compared with the peers, with the environments, and the parts compared with the memory."""
     notes = [f"- {common.describe(result['environment'])}" for result in results]
     figure = (
-        "The bytes that a part must move, over its time. The line is a copy of a tensor that is in no cache, which "
-        "writes half of its bytes: parts that mostly read, or on the CPU find some of their data in the cache, may "
-        "pass it. Marks, in results that have them, are the faster of a copy and a read of as many bytes as the part."
+        "The bytes that a part must move, over its time. The line is a copy of an uncached tensor, which writes half "
+        "of its bytes: parts that mostly read, or on the CPU find some of their data in the cache, may exceed it. "
+        "Marks, in results that have them, are the faster of a copy and a read of as many bytes as the part."
     )
     picture = "![bytes per second of each part, and of a copy](benchmarks/results/roofline.png)"
     return "\n".join([speed_table(results), "", *notes, "", figure, "", picture])
 
 
 def speed_table(results: list[dict[str, Any]]) -> str:
-    """Whole steps beside the peers, and the rates of the transfers."""
+    """Whole steps compared with the peers, and the rates of the transfers."""
     rows = []
     for result in results:
         for entry in result["sizes"]:
@@ -81,7 +80,7 @@ def speed_table(results: list[dict[str, Any]]) -> str:
 
 
 def as_run(results: list[dict[str, Any]]) -> str:
-    """Example scenes and rollouts as people run them."""
+    """Example scenes and rollouts as users run them."""
     notes = [f"- {common.describe(result['environment'])}" for result in results]
     rows = [
         (result["environment"]["device"], *row_of_steps(r), r.get("seconds"))
@@ -95,33 +94,33 @@ def as_run(results: list[dict[str, Any]]) -> str:
             "(benchmarks/speed/rollouts.py).",
             *("", common.table(header, rows), "", *notes, ""),
             *beside_peers(results),
-            "One scene of any size; dotted lines: particles per second.",
+            "One scene; dotted lines: particles per second.",
             *("", "![time per substep over particles](benchmarks/results/rollouts.png)"),
         ]
     )
 
 
 def beside_peers(results: list[dict[str, Any]]) -> list[str]:
-    """Lines on what took steps of the same cubes, and on Warp's step launched from Python beside scenes."""
+    """Tables of peers that step the same cubes, and of scenes compared with Warp's step launched from Python."""
 
     def rows(key: str, row: Callable[[dict[str, Any]], tuple[Any, ...]]) -> list[tuple[Any, ...]]:
         return [(result["environment"]["device"], *row(r)) for result in results for r in result.get(key, ())]
 
-    header = ("device", "a step", "of", "particles", "us", "a rollout is so many times as fast")
+    header = ("device", "a step", "of", "particles", "us", "speed-up by a rollout")
     peers = common.table(header, rows("peers", row_of_peer))
-    header = ("device", "scene", "particles of Warp's step", "us", "the scene is so many times as fast")
+    header = ("device", "scene", "particles of Warp's step", "us", "speed-up by the scene")
     return [
         "Steps of the same work by peers, in plain standard use: Warp by CUDA graphs on a GPU, scenes of a batch",
         "side by side in one dense grid:",
         *("", peers, ""),
         "Warp's step launched from Python, of a neo-Hookean cube with about as many particles as a scene, which has",
-        "laws, obstacles, heat and output of its own:",
+        "additional laws, obstacles, heat and output:",
         *("", common.table(header, rows("plain", row_beside)), ""),
     ]
 
 
 def training(results: list[dict[str, Any]]) -> str:
-    """Gradients through rollouts, beside peers, and steps with networks."""
+    """Gradients through rollouts, compared with peers, and steps with networks."""
 
     def rows(part: Callable[[dict[str, Any]], Iterable[tuple[Any, ...]]]) -> Iterator[tuple[Any, ...]]:
         return ((result["environment"]["device"], *row) for result in results for row in part(result))
@@ -131,10 +130,10 @@ def training(results: list[dict[str, Any]]) -> str:
     networks = rows(lambda result: network_steps.table_rows(result["networks"]))
     parts = [
         "The gradient of a rollout of the neo-Hookean cube by the velocities at its start "
-        "(benchmarks/speed/training.py), by how many steps the backward pass holds at a time:",
+        "(benchmarks/speed/training.py), by the number of steps that the backward pass holds at a time:",
         common.table(("device", *speed_of_training.HELD), held),
         peers_of_training(results, list(PROJECTS)),
-        f"Steps with a network as their law, {network_steps.STEPS} in a row:",
+        f"{network_steps.STEPS} consecutive steps with a network as their law:",
         common.table(("device", *network_steps.HEADER), networks),
         "\n".join(notes),
     ]
@@ -152,14 +151,14 @@ def peers_of_training(results: list[dict[str, Any]], projects: Sequence[str]) ->
     intro = (
         "A fixed corotated cube in a rollout, in a script of another project, and by the algorithm of that project "
         "(benchmarks/speed/training_scripts.py), with the gradient by the velocities at the start; columns with x are "
-        "multiples of the rollout of the same work. Warp, by which the algorithms of NCLaw and PhysGaussian run, has "
-        "one thread on CPUs."
+        "multiples of the rollout of the same work. The algorithms of NCLaw and PhysGaussian use Warp, which has one "
+        "thread on CPUs."
     )
     return "\n\n".join([intro, common.table(("device", *speed_of_training.BESIDE), rows)])
 
 
 def migrating(directory: Path) -> dict[Path, str]:
-    """What the pages for other projects' users say of speed and memory."""
+    """Speed and memory in the pages for users of other projects."""
     results = common.read(directory, "training_*.json")
     notes = "\n".join(f"- {common.describe(result['environment'])}" for result in results)
     pages = {f"{page}.md": [peers_of_training(results, [project]), notes] for page, project in
@@ -168,7 +167,7 @@ def migrating(directory: Path) -> dict[Path, str]:
 
 
 def implicit_costs(results: list[dict[str, Any]]) -> str:
-    """What implicit steps cost on the devices where that was measured."""
+    """Measured costs of implicit steps on each device."""
     parts = []
     for result in results:
         parts.append(f"{common.describe(result['environment'])}:")
@@ -234,7 +233,7 @@ def dam_break(result: dict[str, Any]) -> str:
         "benchmarks/accuracy/ritter.py): largest distance between the fronts of some depths and Ritter's, relative to "
         "the distance of his dry front, for t √(g/h0) from "
         f"{result['judged']:g} to {result['cases'][0]['duration']:g}; and the position of the foremost particle at the "
-        "end. 9 particles per cell and mirror walls unless said otherwise."
+        "end. 9 particles per cell and mirror walls unless stated otherwise."
     )
     figure = "![depth, fronts over time, errors over dx](benchmarks/results/ritter.png)"
     return "\n".join(
@@ -289,7 +288,7 @@ def stability_laws(result: dict[str, Any]) -> str:
 
 
 def runout(result: dict[str, Any]) -> str:
-    """Collapse of columns of sand beside published measurements, and the steepest slopes that stand."""
+    """Collapse of columns of sand compared with published measurements, and the steepest stable slopes."""
     aspects = [row["a"] for row in result["collapse"][0]["rows"]]
     lines = []
     for source, (name, *_) in PUBLISHED.items():
@@ -333,10 +332,10 @@ def collapse(result: dict[str, Any]) -> str:
 
 
 def limits(result: dict[str, Any]) -> str:
-    """What the method loses."""
+    """Losses of the method."""
     intro = (
         "A disc that spins freely, a disc that bounces off a wall, blocks on an incline of 30°, and the gradient of "
-        "R = U Vᵀ through `svd3` (benchmarks/accuracy/limits.py); what follows from them: docs/limitations.md."
+        "R = U Vᵀ through `svd3` (benchmarks/accuracy/limits.py); consequences: docs/limitations.md."
     )
     return "\n\n".join([intro, *limit_tables(result).values(), f"- {common.describe(result['environment'])}"])
 
@@ -346,7 +345,7 @@ def adversarial(result: dict[str, Any]) -> str:
     intro = (
         f"Random rollouts of {result['steps']} steps that are meant to invert particles, at up to three times the "
         "speed of sound (benchmarks/stability/adversarial.py), with dt = `step.stable_dt(state, cfl)` computed anew at "
-        "every step: how many of them went wrong, by cfl. Flattened: the stretch of a particle fell below rounding "
+        "every step: number of failures, by cfl. Flattened: the stretch of a particle fell below rounding "
         "error before its sign was lost, which a law of finite energy cannot prevent. Energy: above 1.1 times the "
         "initial one in a closed system without FLIP."
     )
@@ -443,8 +442,8 @@ def heat(result: dict[str, Any]) -> str:
         "Relative error on the finest lattice, with the order over all in brackets (benchmarks/accuracy/heat.py): RMS "
         "of the temperature, position of the melting front; time of the hybrid [s]. 200 steps with a diffusion number "
         f"r = 1e-5 around 300 K in float32 lose {lost['relative to 300 K']:.1%} of the change, with temperatures "
-        "relative to 300 K. Errors of the front below 1e-3 change sign with dx, so that an order fitted to them says "
-        "little."
+        "relative to 300 K. Errors of the front below 1e-3 change sign with dx, so that an order fitted to them has "
+        "little meaning."
     )
     header = ("problem", "r", "n", "run time [s]", *(f"{t}, cubic" if k == "cubic" else t for k, t in forms))
     figure = "![error over dx and over run time](benchmarks/results/heat.png)"
@@ -468,7 +467,7 @@ def heat_solve(result: dict[str, Any]) -> str:
 
 
 def heat_step(result: dict[str, Any]) -> str:
-    """What a whole heat step can grow by."""
+    """Growth of a whole heat step."""
     intro = (
         f"The larger of ρ − 1 and ‖A‖ − 1, with the spectral radius ρ and the energy norm of a whole heat step A, "
         f"transfer there and back and exact solve, in {result['cases']} cases: jumps of κ or ρ C by up to 1e8, "
@@ -479,7 +478,7 @@ def heat_step(result: dict[str, Any]) -> str:
 
 
 def heat_speed(results: list[dict[str, Any]]) -> str:
-    """Times of the heat solve beside transfers and assembled matrices."""
+    """Times of the heat solve compared with transfers and assembled matrices."""
     header = ("device", "particles", "scalar P2G [ms]", "G2P [ms]", "iteration [ms]", "peer", "peer's time")
     rows = []
     for result in results:
@@ -509,7 +508,7 @@ def heat_speed(results: list[dict[str, Any]]) -> str:
 
 
 def accuracy(directory: Path) -> str:
-    """One error of each part of the library, as far as there are results."""
+    """One error of each part of the library that has results."""
     parts = {
         "convergence": _motion_errors,
         "ritter": _front_errors,
@@ -525,10 +524,9 @@ def accuracy(directory: Path) -> str:
             result = json.loads(file.read_text())
             for *row, seconds in part(result):
                 rows.append([*row, seconds and f"{seconds:.3g} s, {result['environment']['device']}"])
-    header = ("what", "compared with", "error", "order in dx", "run time")
+    header = ("quantity", "compared with", "error", "order in dx", "run time")
     intro = (
-        "Errors are relative unless said otherwise: of a solution those at the finest lattice, of a function the "
-        "largest found."
+        "Errors are relative unless stated otherwise: on the finest lattice (solutions), or the largest (functions)."
     )
     return "\n".join([intro, "", common.table(header, rows)])
 
@@ -591,7 +589,7 @@ def sections(directory: Path) -> dict[str, str]:
     found = {}
     for pattern, title, section in (
         ("speed_*.json", "Speed", speed),
-        ("rollouts_*.json", "Speed of what is run", as_run),
+        ("rollouts_*.json", "Speed of rollouts and scenes", as_run),
         ("training_*.json", "Training", training),
         ("datasets_*.json", "Data sets", data_sets),
         ("svd_*_*.json", "Small matrices and sand", small_matrices),
@@ -609,7 +607,7 @@ def sections(directory: Path) -> dict[str, str]:
         ("stability", "Stability", stability),
         ("stability_laws", "Stability of every law", stability_laws),
         ("adversarial", "Stability of random rollouts", adversarial),
-        ("limits", "What the method loses", limits),
+        ("limits", "Losses of the method", limits),
         ("svd_accuracy", "Singular values", svd_accuracy),
         ("sand_accuracy", "Sand: return map", sand_accuracy),
         ("sand_gradient", "Sand: gradients", sand_gradient),

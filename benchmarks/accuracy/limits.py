@@ -1,4 +1,4 @@
-"""What the method loses, small and measured: `python -m benchmarks.accuracy.limits`.
+"""Losses of the method, measured on small problems: `python -m benchmarks.accuracy.limits`.
 
 - Transfers: an elastic disc spins freely for 2000 steps; its momentum, angular momentum and energy at the end.
 - Restitution: an elastic disc bounces off a wall without gravity; its energy afterwards.
@@ -161,7 +161,7 @@ def tables(result: dict[str, Any]) -> dict[str, str]:
 
 
 def text(result: dict[str, Any]) -> str:
-    lines = ["# What the method loses", "", common.describe(result["environment"]), ""]
+    lines = ["# Losses of the method", "", common.describe(result["environment"]), ""]
     lines += [(__doc__ or "").split("\n\n", 1)[1].strip()]
     lines += [f"\n## {title}\n\n{table}" for title, table in tables(result).items()]
     return "\n".join(lines)

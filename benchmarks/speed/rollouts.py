@@ -308,7 +308,14 @@ def text(result: dict[str, Any]) -> str:
     """Tables of a result in Markdown."""
     header = ("", "particles", "substeps", "us per substep", "M particles/s")
     rows = [row_of_steps(r) for r in result["rollouts"]]
-    lines = ["# Speed of what is run", "", common.describe(result["environment"]), "", common.table(header, rows), ""]
+    lines = [
+        "# Speed of rollouts and scenes",
+        "",
+        common.describe(result["environment"]),
+        "",
+        common.table(header, rows),
+        "",
+    ]
     rows = [(*row_of_steps(r), r["seconds"]) for r in result["scenes"]]
     lines += [common.table((*header, "simulation, s"), rows), ""]
     if rows := [row_of_peer(r) for r in result.get("peers", ())]:
