@@ -22,11 +22,12 @@ from .capture import (
 )
 from .failures import Problem, contradicted_poses, problems_of_first_state, problems_of_status, refused_steps
 from .grid import Blocks, Grid
+from .topology import COUNTS_OF_PROBLEMS, FIRST_PROBLEMS, Status
 
 if TYPE_CHECKING:
     from .state import State
 
-NO_PROBLEM = (0, 0, -1, 0, -1, 0, -1, 0)
+NO_PROBLEM = tuple(-1 if column in FIRST_PROBLEMS else 0 for column in Status)
 """A row of the status before the first activation (csrc/grid/status.h)."""
 
 
@@ -151,9 +152,11 @@ class ActivationRecord:
         with torch.inference_mode():
             for status in self.all():
                 status[1:].masked_fill_(scenes[:, None], 0)
-                status[1:, 2:7:2].masked_fill_(scenes[:, None], -1)  # as NO_PROBLEM
-                status[0, 1:4:2].masked_fill_(scenes.any(), 0)
-                status[0, 2:7:2].masked_fill_(scenes.any(), -1)
+                for column in COUNTS_OF_PROBLEMS:
+                    status[0, column].masked_fill_(scenes.any(), 0)
+                for column in FIRST_PROBLEMS:
+                    status[1:, column].masked_fill_(scenes, -1)
+                    status[0, column].masked_fill_(scenes.any(), -1)
 
 
 RECORDS = ("_activations", "unsolved", "residual", "_unsolved", "_residual", "report", "adjoint_converged")

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from .errors import GridOverflowError, SimulationError
 from .state import PARTICLE_FIELDS, State
+from .topology import SceneStatus, Status
 
 if TYPE_CHECKING:
     from .grid import Grid
@@ -130,15 +131,29 @@ def problems_of_status(statuses: Iterable[Tensor], grid: Grid) -> dict[str, Prob
     """Problems of scenes in status tensors [1 + B, 8] of `activate`; of each scene the first one counts."""
     rows: Tensor | None = None
     for status in statuses:
-        rows = status[1:] if rows is None else torch.where(rows[:, 6:7] >= 0, rows, status[1:])
+        known = status[1:] if rows is None else rows
+        rows = torch.where(known[:, Status.PROBLEM_ACTIVATION, None] >= 0, known, status[1:])
     if rows is None:
         return {}
-    first_id, outside, first_outside, lost, first_lost, _, step, lost_id = rows.unbind(1)
+    column = rows.unbind(1)
+    step = column[Status.PROBLEM_ACTIVATION]
     domain = f"particles left the grid [{grid.lower}, {grid.upper}]"
     return {
-        LOST: Problem(lost, "particles have a position that is NaN or infinite", CHECK_DT, first_lost, lost_id, step),
+        LOST: Problem(
+            column[Status.NON_FINITE_COUNT],
+            "particles have a position that is NaN or infinite",
+            CHECK_DT,
+            column[Status.NON_FINITE_FIRST],
+            column[SceneStatus.NON_FINITE_ID],
+            step,
+        ),
         "outside": Problem(
-            outside, domain, "enlarge the domain, add walls, or reduce dt", first_outside, first_id, step
+            column[Status.OUTSIDE_COUNT],
+            domain,
+            "enlarge the domain, add walls, or reduce dt",
+            column[Status.OUTSIDE_FIRST],
+            column[SceneStatus.OUTSIDE_ID],
+            step,
         ),
     }
 

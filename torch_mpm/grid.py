@@ -25,7 +25,7 @@ from .errors import (
     check_vector,
     shape_of,
 )
-from .topology import BLOCK_WIDTH, PADDING, Lattice, Topology
+from .topology import BLOCK_WIDTH, PADDING, Lattice, Status, Topology
 
 INT32_MAX = 2**31 - 1
 STATUS_SIZE = 8
@@ -349,4 +349,4 @@ class Blocks(Topology):
     @property
     def wanted(self) -> int:
         """Active blocks that this activation wanted, which may be more than it got; synchronises."""
-        return int(self.status[0, 7])
+        return int(self.status[0, Status.BLOCKS_NOW])

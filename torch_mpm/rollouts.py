@@ -39,6 +39,7 @@ from .state import State, check_state
 from .step import Step
 from .step_cost import state_bytes, step_bytes
 from .step_times import StepTimes, clocks, requires_grad, time_after
+from .topology import Status
 
 
 def rollout(
@@ -527,7 +528,7 @@ def _substeps(step: Step, state: State, n: int, dt: float | Tensor, records: boo
     record.follow(record.status, status)
     grid.watch(status)
     if status.device.type == "cpu":  # where the op has let the pool grow, or stopped
-        grid.follow(int(status[0, 0] if grid.grows else status[0, 7]))
+        grid.follow(int(status[0, Status.BLOCKS_WANTED if grid.grows else Status.BLOCKS_NOW]))
     extra = _history(state, history_names, history)
     now = time_after(state.time, dt, n) if time is None else _in_shape(time.detach(), state.time, dt)
     if requires_grad(dt) or requires_grad(state.time):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import enum
 import math
 from collections.abc import Sequence
 
@@ -18,6 +19,31 @@ BLOCK_WIDTH = 4
 PackedLattice = tuple[list[float], list[int]]
 PackedTopology = tuple[list[Tensor], list[float], list[int]]
 """The trailing arguments of an op: `Tensor[] topology, float[] lattice, int[] layout` (csrc/grid/topology.op.h)."""
+
+
+class Status(enum.IntEnum):
+    """Columns of the status of activations, int32 [1 + B, 8]: row 0 is that of all scenes (csrc/grid/status.h)."""
+
+    BLOCKS_WANTED = 0
+    OUTSIDE_COUNT = 1
+    OUTSIDE_FIRST = 2
+    NON_FINITE_COUNT = 3
+    NON_FINITE_FIRST = 4
+    ACTIVATIONS = 5
+    PROBLEM_ACTIVATION = 6
+    BLOCKS_NOW = 7
+
+
+class SceneStatus(enum.IntEnum):
+    """Columns that have another meaning in the rows of scenes."""
+
+    OUTSIDE_ID = 0
+    NON_FINITE_ID = 7
+
+
+COUNTS_OF_PROBLEMS = (Status.OUTSIDE_COUNT, Status.NON_FINITE_COUNT)
+FIRST_PROBLEMS = (Status.OUTSIDE_FIRST, Status.NON_FINITE_FIRST, Status.PROBLEM_ACTIVATION)
+"""Columns that are -1 where there is no problem."""
 
 
 class Lattice:

@@ -15,14 +15,13 @@ from ..rollouts import rollout
 from ..scene import fields, heap
 from ..scene.build import Built
 from ..state import State, _take_all
+from ..topology import Status
 from .recording import Array, Recorded, Recording
 
 LOOK = 8
 """Frames between two looks at the stability limit and the validity of the particles, and between two reorderings."""
 MOST_SUBSTEPS = 100_000
 """Of a frame; a scene that needs more fails."""
-BLOCKS_WANTED = 0
-"""Column of the status: blocks that were wanted at most."""
 
 Told = Callable[[int], None]
 """What is called with the number of each frame."""
@@ -182,7 +181,7 @@ def _had_room(built: Built) -> bool:
     grid, status = built.grid, built.step.status
     if status is None or grid.max_blocks is None or not grid.grows:
         return True
-    wanted = int(status[0, BLOCKS_WANTED])
+    wanted = int(status[0, Status.BLOCKS_WANTED])
     if wanted <= grid.max_blocks:
         return True
     grid.follow(wanted)

@@ -22,6 +22,7 @@ from ..errors import DamagedFileError, SimulationError
 from ..laws import Mixture
 from ..rollouts import rollout
 from ..state import State, _take_all
+from ..topology import Status
 from . import checkpoint, fields, heap
 from .build import Built
 from .diagnose import SceneFailure, replay, wrong
@@ -42,8 +43,6 @@ STEADY = 1.02
 LIMITS = 8
 """Segments of whose limits the smallest counts: a dt that followed that of the moment would feed energy into particles
 that oscillate (docs/limitations.md)."""
-BLOCKS_WANTED, PROBLEM = 0, 6
-"""Columns of the status: blocks that were wanted at most; step of the first problem, -1 for none."""
 
 Progress = Callable[[dict[str, Any]], None]
 
@@ -413,7 +412,7 @@ class Simulation:
             moved = self._moved(segment, meanwhile)
             if steps > SEGMENT and not dt * max(moved.survey[0], default=0.0) <= 1:
                 raise SimulationError("dt is above the limit")
-            if any(row[PROBLEM] >= 0 for row in moved.status) or self.step.heat is not None:
+            if any(row[Status.PROBLEM_ACTIVATION] >= 0 for row in moved.status) or self.step.heat is not None:
                 self.step.check()
             bad = wrong(self.step, moved.state, self.scene.origin) if any(moved.survey[2]) else None
             if bad is None:
@@ -456,9 +455,10 @@ class Simulation:
         grid = self.step.grid
         if not status or not grid.grows or room is None:
             return False
-        wanted = int(status[0][BLOCKS_WANTED])
+        wanted = int(status[0][Status.BLOCKS_WANTED])
         grid.follow(wanted)
-        return wanted > room and status[0][PROBLEM] >= 0  # no problem where calls of the rollout had more room
+        # Calls of the rollout that had more room have no problem.
+        return wanted > room and status[0][Status.PROBLEM_ACTIVATION] >= 0
 
     def _emit(self, until: float) -> None:
         """Add the layers that are due."""
