@@ -109,7 +109,7 @@ containers.register()
 
 
 def __getattr__(name: str) -> Any:
-    """`Scene` needs the extra `scene`, so it is imported where it is used."""
+    """`Scene` needs the extra `scene`, so it is imported on first use."""
     if name == "Scene":
         from .scene import Scene
 

@@ -17,21 +17,21 @@ CPU_LIBRARY = DIRECTORY / "libtorch_mpm_cpu.so"
 CUDA_LIBRARY = DIRECTORY / "libtorch_mpm_cuda.so"
 
 cuda_error: str | None = None
-"""Why the CUDA library is not in use, or None if it is loaded."""
+"""Reason why the CUDA library is not in use, or None if it is loaded."""
 
 
 def _load(path: Path, backend: str) -> str | None:
-    """Register the ops of a library; return why it cannot be loaded."""
+    """Register the ops of a library; return the reason why it cannot be loaded, or None."""
     try:
         torch.ops.load_library(os.fspath(path))
     except OSError as error:
-        return str(error.__cause__ or error)  # torch wraps the loader's message in one that leaves the reason out
+        return str(error.__cause__ or error)  # torch wraps the loader's message in one that omits the reason.
     signals.watch(ctypes.CDLL(os.fspath(path)), backend)
     return None
 
 
 def listed(function: str) -> Any:
-    """What a function of the CPU library without arguments says of it in JSON."""
+    """JSON returned by a function of the CPU library without arguments."""
     text = getattr(ctypes.CDLL(os.fspath(CPU_LIBRARY)), function)
     text.restype = ctypes.c_char_p
     return json.loads(text())

@@ -1,4 +1,4 @@
-"""What the activations of one user of a grid have told, for `check` and `failures`."""
+"""Error status accumulated over the activations of one user of a grid, for `check` and `failures`."""
 
 from __future__ import annotations
 
@@ -28,22 +28,23 @@ if TYPE_CHECKING:
     from .state import State
 
 NO_PROBLEM = tuple(-1 if column in FIRST_PROBLEMS else 0 for column in Status)
-"""A row of the status before the first activation (csrc/grid/status.h)."""
+"""Row of the status before the first activation (csrc/grid/status.h)."""
 
 
 class ActivationRecord:
-    """The status of all activations of one user of a grid, also of those that CUDA graphs replay.
+    """Status of all activations of one user of a grid, including those replayed by CUDA graphs.
 
-    A replay reads and writes the tensors of the capture. So captured activations go on in the tensor that they found,
-    which is kept; the first activation of all should not be a captured one, or each replay forgets those before.
+    A replay reads and writes the tensors of the capture. Captured activations therefore continue in the tensor that
+    they found, which is stored. The first activation of all should not be captured: otherwise each replay discards
+    earlier ones.
 
     Attributes:
         status: int32 [1 + B, 8], see csrc/grid/status.h; None before the first activation.
-        given: what was NaN or infinite in the first state, by field.
-        refused: steps of each scene whose entry of a tensor dt could not be taken, int32 [B]; None before the first
+        given: entries of the first state that were NaN or infinite, by field.
+        refused: number of steps of each scene with an invalid entry of a tensor dt, int32 [B]; None before the first
             tensor dt.
-        contradicted: obstacles of each scene, added up over calls, whose pose is not where their velocity has led,
-            int32 [B]; None before the first one that could be.
+        contradicted: number of obstacles of each scene, accumulated over calls, whose pose differs from the result of
+            their velocity, int32 [B]; None before the first one that could.
     """
 
     def __init__(self) -> None:
@@ -54,13 +55,13 @@ class ActivationRecord:
         self._replayed: list[Tensor] = []
 
     def begin(self, state: State, scenes: int) -> None:
-        """Before a step from a state: look at the first one."""
+        """Check the first state, before a step from it."""
         if self.status is None and not (is_traced(state.x) or is_captured(state.x) or is_transformed()):
-            with torch.no_grad():  # not as a decorator, which an export would keep
+            with torch.no_grad():  # A decorator would be stored by an export.
                 self.given = problems_of_first_state(state, scenes)
 
     def activate(self, grid: Grid, x: Tensor, scene: Tensor | None, ids: Tensor | None = None) -> Blocks:
-        """As `Grid.activate`; `max_blocks` of the grid follows."""
+        """As `Grid.activate`; updates `max_blocks` of the grid."""
         if is_exported():
             return grid.activate(x, scene, None, ids)
         before = self.status_for(x)
@@ -71,24 +72,24 @@ class ActivationRecord:
         return blocks
 
     def status_for(self, x: Tensor) -> Tensor | None:
-        """The status so far, on the device of a tensor: a step may have been moved."""
+        """Status so far, on the device of a tensor: a step may have been moved."""
         if self.status is not None and self.status.device != x.device:
             self.status = self.status.to(x.device)
         return self.status
 
     def follow(self, before: Tensor | None, status: Tensor) -> None:
-        """Take the status of activations that went on from one before, which replays of a graph find there again."""
+        """Store the status of activations that continued an earlier one, where replays of a graph find it."""
         if before is None or not is_captured(status):
             self.status = status
             return
-        with torch.inference_mode(), outside_transforms():  # in which any tensor may be written to
+        with torch.inference_mode(), outside_transforms():  # Any tensor may be written to there.
             before.copy_(status)
         self.status = before
         remember(self._replayed, before)
 
     @contextlib.contextmanager
     def passing_graphs(self) -> Iterator[None]:
-        """Graphs that are captured meanwhile are not replayed afterwards: then the latest status is all they tell."""
+        """Graphs captured inside are not replayed afterwards: the record keeps the latest status only."""
         known = list(self._replayed)
         try:
             yield
@@ -96,12 +97,12 @@ class ActivationRecord:
             self._replayed = known
 
     def all(self) -> list[Tensor]:
-        """The latest status, and those that graphs go on with."""
+        """The latest status, and the statuses that graphs continue."""
         latest = [] if self.status is None else [self.status]
         return latest + [kept for kept in self._replayed if kept is not self.status]
 
     def problems(self, grid: Grid) -> dict[str, Problem]:
-        """What these steps tell about scenes, without synchronising."""
+        """Problems of scenes in these steps, without synchronisation."""
         problems = problems_of_status(self.all(), grid)
         if self.refused is not None:
             problems["dt"] = refused_steps(self.refused)
@@ -111,7 +112,7 @@ class ActivationRecord:
 
     @torch.no_grad()
     def contradict(self, scenes: Tensor, count: int) -> None:
-        """Count an obstacle whose pose is not where its velocity has led, in scenes of a bool [] or [B]."""
+        """Count an obstacle whose pose differs from the result of its velocity, in scenes given by a bool [] or [B]."""
         if self.contradicted is None or self.contradicted.device != scenes.device:
             with outside_transforms(), torch.inference_mode(False):
                 self.contradicted = torch.zeros(count, dtype=torch.int32, device=scenes.device)
@@ -120,13 +121,13 @@ class ActivationRecord:
 
     @torch.no_grad()
     def refuse(self, entries: Tensor, scenes: int, steps: int = 1) -> None:
-        """Count entries of a tensor dt that could not be taken in some steps: bool of shape [], [1] or [B]."""
+        """Count invalid entries of a tensor dt: bool of shape [], [1] or [B]."""
         refused = self.counts(scenes, entries.device)
         with outside_transforms():
             refused += steps * without_transforms(entries)
 
     def counts(self, scenes: int, device: torch.device) -> Tensor:
-        """`refused`, made at the first tensor dt."""
+        """`refused`, allocated at the first tensor dt."""
         if self.refused is None or self.refused.device != device:
             with outside_transforms(), torch.inference_mode(False):
                 self.refused = torch.zeros(scenes, dtype=torch.int32, device=device)
@@ -134,7 +135,7 @@ class ActivationRecord:
 
     def reset(self) -> None:
         self.status, self.given = None, {}
-        if self.refused is not None:  # and CUDA graphs may write to it
+        if self.refused is not None:  # CUDA graphs may write to it.
             self.refused.zero_()
         self.contradicted = None
         with torch.inference_mode():
@@ -142,7 +143,7 @@ class ActivationRecord:
                 kept.copy_(torch.tensor(NO_PROBLEM, dtype=torch.int32, device="cpu"))
 
     def forget(self, scenes: Tensor) -> None:
-        """Problems of scenes, bool [B], and those that are counted of all scenes together."""
+        """Problems per scene, bool [B], and problems counted over all scenes."""
         if self.refused is not None:
             self.refused.masked_fill_(scenes, 0)
         if self.contradicted is not None:
@@ -160,15 +161,15 @@ class ActivationRecord:
 
 
 RECORDS = ("_activations", "unsolved", "residual", "_unsolved", "_residual", "report", "adjoint_converged")
-"""Attributes in which steps, heat and integrators keep what became of them."""
+"""Attributes in which steps, heat and integrators record results."""
 
 
 @contextlib.contextmanager
 def aside(step: Any, x: Tensor) -> Iterator[None]:
-    """Where steps leave nothing behind: not in what they tell of the steps so far, nor in random numbers.
+    """Context in which steps leave no trace: neither in their records nor in the random number generators.
 
     Args:
-        step: a module, whose parts are meant too, or a function, which has no records.
+        step: a module, including its parts, or a function, which has no records.
         x: a tensor on the device of the particles.
     """
     modules = _recorders(step) if isinstance(step, torch.nn.Module) else []
@@ -193,7 +194,7 @@ def _recorders(step: torch.nn.Module) -> list[Any]:
 
 
 def counts_of(step: torch.nn.Module) -> list[tuple[Any, str, Tensor | None]]:
-    """Where explicit steps keep what they tell of the steps so far: owner, attribute and tensor."""
+    """Storage of the records of explicit steps: owner, attribute and tensor."""
     modules = _recorders(step)
     places: list[tuple[Any, str]] = [(m._activations, name) for m in modules for name in ("status", "refused")]
     places += [(m, name) for m in modules for name in COUNTS if hasattr(m, name)]
@@ -202,8 +203,9 @@ def counts_of(step: torch.nn.Module) -> list[tuple[Any, str, Tensor | None]]:
 
 @contextlib.contextmanager
 def uncounted(step: torch.nn.Module) -> Iterator[None]:
-    """Where explicit steps leave nothing behind in what they tell of the steps so far; but unlike after `aside`, that
-    has its tensors then, in which the steps of graphs go on."""
+    """Context in which explicit steps leave no trace in their records. Unlike after `aside`, the tensors of the records
+    exist afterwards, and the steps of graphs continue in them.
+    """
     tensors = counts_of(step)
     written = [t for m in _recorders(step) for t in m._activations._replayed] + buffers_of_users(step)
     with torch.inference_mode(), outside_transforms():
@@ -216,7 +218,7 @@ def uncounted(step: torch.nn.Module) -> Iterator[None]:
             for (owner, name, t), values in zip(tensors, before, strict=True):
                 if t is not None and values is not None:
                     made = getattr(owner, name)
-                    now = t if made is None or made.device == t.device else made  # the step may have been moved
+                    now = t if made is None or made.device == t.device else made  # The step may have been moved.
                     now.copy_(values)
                     setattr(owner, name, now)
                 elif (made := getattr(owner, name)) is not None:
@@ -228,6 +230,6 @@ def uncounted(step: torch.nn.Module) -> Iterator[None]:
 
 
 def buffers_of_users(step: torch.nn.Module) -> list[Tensor]:
-    """What modules of the user's may write in each call, as batch normalisation does."""
+    """Buffers that user modules may write in each call, as batch normalisation does."""
     own = [m for m in step.modules() if not any(map(is_of_library, type(m).__mro__))]
     return [t for m in own for t in m._buffers.values() if t is not None and not t.requires_grad]

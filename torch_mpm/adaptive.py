@@ -1,4 +1,4 @@
-"""Time steps that the stability limit of each scene decides, without the host."""
+"""Time steps chosen on the device from the stability limit of each scene."""
 
 from __future__ import annotations
 
@@ -22,31 +22,34 @@ from .step import Step
 SEGMENT = 16
 """Substeps between two choices of dt."""
 MOST_SEGMENTS = 64
-"""Before the host asks again how many substeps are left."""
+"""Segments before the host queries the number of remaining substeps."""
 MOST_SUBSTEPS = 2**16
-"""Of a scene in a call: one whose limit shrinks without end must not keep all others."""
+"""Substeps of a scene in a call: a scene whose limit shrinks without bound must not delay the others."""
 LEAST_REPLAYS = 3
-"""Segments for which one is recorded."""
+"""Number of segments from which recording a graph pays."""
 ROUNDING = 1e-9
-"""Of a number of substeps, that one more is not taken for it."""
+"""Tolerance in the number of substeps, below which no additional one is computed."""
 
 
 class Arrival(NamedTuple):
-    """What `rollout_to` returns; figures of each scene [B] on the device of the particles."""
+    """Result of `rollout_to`; values per scene [B] on the device of the particles."""
 
     state: State
-    """Its time is a number if all scenes have come to one, else a tensor [B]."""
+    """Final state. Its time is a number if all scenes have the same time, otherwise a tensor [B]."""
     arrived: Tensor
-    """Whether a scene is at its time, bool. One stays behind whose limit is zero, as that of a particle without mass
-    is, or that has taken `most` substeps."""
+    """Whether a scene reached its time, bool. A scene does not reach it if its limit is zero, such as that of a
+    particle without mass, or after `most` substeps.
+    """
     substeps: Tensor
-    """That a scene has taken, int64."""
+    """Number of substeps of a scene, int64."""
     largest_cfl: Tensor
-    """Largest share of the stability limit that the dt of a segment was at its beginning or end, float64; above 1 the
-    limit has become smaller than dt within a segment."""
+    """Largest ratio of dt to the stability limit at the beginning or end of a segment, float64. A value above 1 means
+    that the limit fell below dt within a segment.
+    """
     dt: Tensor
-    """What the latest substeps of a scene were as long as, or a little less, so that equal ones end at its time [s],
-    float64; to be the `previous` of the next call. Zero without substeps."""
+    """Length of the latest substeps of a scene [s], or slightly less, so that equal substeps end at its time, float64.
+    Pass it as `previous` to the next call. Zero without substeps.
+    """
 
 
 def rollout_to(
@@ -61,37 +64,40 @@ def rollout_to(
     checkpoint: int | Checkpoints | None = None,
     previous: float | Tensor | None = None,
 ) -> Arrival:
-    """Take every scene to a time, in substeps of its own length and number.
+    """Advance every scene to a given time, in substeps of its own length and number.
 
-    The dt of a scene is `cfl` of the limit of `Step.stable_dt`, or a little less, so that equal substeps end at its
-    time. Every so many substeps the limit is computed anew, and a dt that is below this share of it or above half of
-    that stays: one that followed the limit would feed energy into particles that oscillate (docs/limitations.md). The
-    substeps of a scene depend on its own limit alone, so its result does not depend on the scenes beside it; on grids
-    that are not `deterministic`, up to rounding. A scene with no more than `every` substeps left pauses until all
-    others have as few, and its last ones follow in one segment without a new choice. All of this is computed where the
-    particles are. The host waits when it reads how many substeps are left: at the beginning, after 64 segments at most,
-    and before the last ones.
+    The dt of a scene is `cfl` times the limit of `Step.stable_dt`, or slightly less, so that equal substeps end at its
+    time. The limit is recomputed every `every` substeps. A previous dt between half of this share of the limit and the
+    whole is kept: a dt that followed the limit would feed energy into oscillating particles (docs/limitations.md).
+
+    The substeps of a scene depend on its own limit only, so its result does not depend on other scenes; on grids that
+    are not `deterministic`, up to rounding. A scene with at most `every` remaining substeps pauses until all others
+    have as few; the last substeps of all scenes follow in one segment without a new choice.
+
+    All of this is computed on the device of the particles. The host waits when it reads the number of remaining
+    substeps: at the beginning, after at most 64 segments, and before the last ones.
 
     Args:
-        step: what moves the particles; with `every` > 1 in one op per segment where `rollout` can do so.
+        step: the step; with `every` > 1 in one op per segment where `rollout` can do so.
         state: the particles; its time is a number, or a tensor [B].
-        time: the time of their end [s], a number, or a tensor of shape [], [1] or [B]. Scenes that are later already
-            stand still, and so do those whose entry is not finite, which do not arrive.
+        time: final time [s], a number, or a tensor of shape [], [1] or [B]. Scenes that are already later are not
+            advanced. Scenes with an entry that is not finite are not advanced and do not arrive.
         cfl: share of the limit, positive and finite; see `stable_dt`.
-        longest: the longest dt that is wanted [s].
-        every: substeps from one choice of dt to the next. With one, dt is chosen before every substep.
-        most: substeps of a scene at most.
-        checkpoint: as of `rollout`, for each segment.
-        previous: dt of the substep before [s], a number, or a tensor [], [1] or [B], where calls follow one another:
-            `arrival.dt` of the call before. None, or zero, for none.
+        longest: upper bound of dt [s].
+        every: substeps between two choices of dt. With 1, dt is chosen before every substep.
+        most: maximum number of substeps of a scene.
+        checkpoint: as in `rollout`, for each segment.
+        previous: dt of the previous substep [s], a number, or a tensor [], [1] or [B], for consecutive calls:
+            `arrival.dt` of the previous call. None, or zero, for none.
 
     Returns:
-        The state, and of each scene whether it has arrived, its substeps, its largest CFL number and its latest dt.
+        The state, and for each scene whether it has arrived, its number of substeps, its largest CFL number and its
+        latest dt.
 
     Differentiable as `rollout` with these dt, which are constants for autograd.
 
     Raises:
-        TypeError, ValueError: for a wrong argument, or what `rollout` raises.
+        TypeError, ValueError: for a wrong argument, or as `rollout`.
     """
     if not isinstance(step, Step):
         raise TypeError(f"step must be a Step, whose stability limit is known, got {shape_of(step)}")
@@ -113,7 +119,9 @@ def rollout_to(
 
 
 def _compensated(step: Step, state: State, cfl: float, longest: float) -> State:
-    """With the residual of positions where the first substeps need it; waits for the device, as `Clocks.look` does."""
+    """State with the residual of positions where the first substeps need it; waits for the device, as `Clocks.look`
+    does.
+    """
     if step.compensated is None and state.x_residual is None:
         limit = step.stable_dt(state, cfl)
         longest = min(longest, float(torch.where(limit > 0, limit, math.inf).amin())) if len(limit) else longest
@@ -121,9 +129,9 @@ def _compensated(step: Step, state: State, cfl: float, longest: float) -> State:
 
 
 class Clocks:
-    """A state whose scenes have times and time steps of their own, float64 [B]: a float32 clock would not arrive.
+    """State with times and time steps per scene, float64 [B]: a float32 clock would not reach its end.
 
-    Graphs read and write the tensors, so each stays the same.
+    Graphs read and write the tensors, so their addresses do not change.
     """
 
     def __init__(
@@ -142,23 +150,23 @@ class Clocks:
         self.substeps = torch.zeros_like(self.now, dtype=torch.int64)
         self.largest_cfl = torch.zeros_like(self.now)
         self.seconds: float | Tensor = (self.end - self.now).clamp(min=0)
-        """That are left at the beginning."""
+        """Remaining substeps at the beginning."""
         if not isinstance(time, Tensor) and not isinstance(state.time, Tensor):
             self.seconds = max(time - state.time, 0.0)
         self._end = time
         self._bound = _per_scene("previous", 0.0 if previous is None else previous, step.grid.scenes, state.x)
         self._dt = torch.zeros_like(self.now)
-        self._left = torch.zeros_like(self.substeps)  # substeps until the end, of `most` at most
+        self._left = torch.zeros_like(self.substeps)  # Substeps until the end, at most `most`.
 
     @torch.no_grad()
     def look(self) -> list[int]:
-        """The different numbers of substeps that scenes have left, in ascending order; waits for the device."""
+        """Distinct numbers of remaining substeps of the scenes, in ascending order; waits for the device."""
         self.state = self._at_its_time(self.state)
         self._choose(self.state)
         return [count for count in self._left.unique().tolist() if count > 0]
 
     def advance(self, segments: int, n: int, checkpoint: int | Checkpoints | None) -> None:
-        """Some segments of n substeps each, of the scenes that have more of them left."""
+        """Segments of n substeps each, for scenes with more than n remaining substeps."""
         if segments < LEAST_REPLAYS + 1 or not self._replays():
             for _ in range(segments):
                 state, dt = self._next(self.state, n)
@@ -169,11 +177,11 @@ class Clocks:
             state, dt = self._next(state, n)
             return in_chunks(self.step, state, n, dt)
 
-        # The first one makes what steps keep.
+        # The first one allocates the records of steps.
         self.state = replay_all(self.step, segment, segment(self.state), segments - 1, max(CHUNK // n, 1))
 
     def finish(self, counts: list[int], checkpoint: int | Checkpoints | None) -> None:
-        """The last substeps of each scene, which `look` has counted."""
+        """Last substeps of each scene, as counted by `look`."""
         taken = 0
         for count in counts:
             dt = torch.where(self._left >= count, self._dt, 0.0).to(self.state.x.dtype)
@@ -190,7 +198,7 @@ class Clocks:
 
     @torch.no_grad()
     def _next(self, state: State, n: int) -> tuple[State, Tensor]:
-        """The state at its time, and dt of its next n substeps: zero for scenes that have no more than n left."""
+        """State at its time, and dt of its next n substeps: zero for scenes with at most n remaining."""
         state = self._at_its_time(state)
         self._choose(state)
         moves = self._left > n
@@ -199,7 +207,7 @@ class Clocks:
 
     @torch.no_grad()
     def _take(self, count: Tensor) -> None:
-        """Count so many substeps of each scene."""
+        """Count n substeps of each scene."""
         span = self.end - self.now
         arrives = (count > 0) & (count * self._dt >= span * (1 - ROUNDING))
         self.now.copy_(torch.where(arrives, self.end, self.now + count * self._dt))
@@ -218,7 +226,7 @@ class Clocks:
         return state.replace(time=self.now.clone())
 
     def _limit(self, state: State) -> Tensor:
-        """The longest stable dt of each scene, of which the dt before is a share."""
+        """Longest stable dt of each scene, of which the previous dt is a share."""
         limit = 1 / self.step.survey(state, judge=False).rate
         self._count_cfl(limit, self.substeps > 0)
         return limit
@@ -228,7 +236,7 @@ class Clocks:
         self.largest_cfl.copy_(torch.maximum(self.largest_cfl, share))
 
     def _choose(self, state: State) -> None:
-        """dt and the substeps until its end of each scene; none for those that have arrived or cannot."""
+        """dt and number of substeps until its end for each scene; zero for scenes that have arrived or cannot."""
         limit, span = self._limit(state), self.end - self.now
         longest = (self.cfl * limit).clamp(max=self.longest)
         bound = chosen_dt(longest, self._bound)
@@ -241,7 +249,7 @@ class Clocks:
 
 
 def _per_scene(name: str, time: float | Tensor, scenes: int, like: Tensor) -> Tensor:
-    """A time of each scene in float64 [B], on the device of a tensor."""
+    """Time of each scene in float64 [B], on the device of a tensor."""
     if not isinstance(time, Tensor):
         return like.new_full((scenes,), check_number(name, time, kinds=NUMBER_OR_TENSOR), dtype=torch.float64)
     if time.requires_grad and torch.is_grad_enabled():

@@ -1,4 +1,4 @@
-"""Anomaly detection of autograd with substep and scene: which operation made the first NaN of a gradient, and where."""
+"""Anomaly detection of autograd with substep and scene: operation and place of the first NaN in a gradient."""
 
 from __future__ import annotations
 
@@ -14,25 +14,25 @@ from .state import State
 
 
 def detecting() -> bool:
-    """Whether the user has asked for it, by `torch.autograd.set_detect_anomaly` or `detect_anomaly`."""
+    """Whether `torch.autograd.set_detect_anomaly` or `detect_anomaly` is active."""
     asked = not torch.compiler.is_compiling() and torch.is_anomaly_enabled()
     return asked and torch.is_anomaly_check_nan_enabled() and torch.is_grad_enabled()
 
 
 def begin() -> int:
-    """A mark in the order of operations, for `watch`."""
+    """Mark in the order of operations, for `watch`."""
     number: int = torch._C._autograd._get_sequence_nr()
     return number
 
 
 def watch(before: State, after: State, mark: int, substep: int, grid: Grid | None) -> None:
-    """Make each operation since a mark, from one state to the next, say where it was if its gradient is NaN.
+    """Make every operation since a mark, between two states, report its place if its gradient is NaN.
 
     Args:
         before, after: states before and after the step.
-        mark: what `begin` told before the step.
+        mark: result of `begin` before the step.
         substep: number of the step.
-        grid: of the step, to find the scenes of nodes.
+        grid: grid of the step, which gives the scenes of nodes.
     """
     place = _Place(substep, before.detach(), grid)
     waiting = [t.grad_fn for t in _tensors(after) if t.grad_fn is not None]
@@ -58,7 +58,7 @@ class _Place:
     grid: Grid | None
 
     def scenes(self, gradient: Tensor) -> str:
-        """In words, those of the rows with NaN."""
+        """Names of the scenes of rows with NaN."""
         rows = gradient.isnan().flatten(1).any(1) if gradient.dim() > 1 else gradient.isnan()
         if (self.grid is not None and self.grid.scenes == 1) or self.state.scene is None:
             of_rows = torch.zeros_like(rows, dtype=torch.int32)

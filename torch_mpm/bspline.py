@@ -23,5 +23,5 @@ def bspline_derivative(distance: Tensor, order: int) -> Tensor:
 
 
 def base_node(cells: Tensor, order: int) -> Tensor:
-    """Index of the first node of the support, int64, of positions in cells from node 0."""
+    """Index of the first node of the support, int64, for positions in cells from node 0."""
     return torch.floor(cells - (0.5 if order == 2 else 1.0)).long()

@@ -1,4 +1,4 @@
-"""What outlives a call: tensors that CUDA graphs may read, and none that belongs to a transform of torch.func."""
+"""Objects that outlive a call: tensors that CUDA graphs may read, but no tensors of torch.func transforms."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from torch import Tensor
 
 
 def is_captured(x: Tensor) -> bool:
-    """Whether what is done with a tensor goes into a CUDA graph."""
+    """Whether operations on a tensor are recorded by a CUDA graph."""
     return x.is_cuda and not torch.compiler.is_compiling() and torch.cuda.is_current_stream_capturing()
 
 
 @contextlib.contextmanager
 def capturing(graph: torch.cuda.CUDAGraph, pool: Any, device: torch.device) -> Iterator[None]:
-    """Capture the work of the current stream into a graph whose memory comes from a pool; other threads may go on.
+    """Capture the work of the current stream into a graph with memory from a pool; other threads continue.
 
     Args:
         graph: an empty graph.
         pool: the pool of another graph, or None for a new one.
         device: device of the stream.
 
-    A capture that fails leaves the allocator as it was.
+    A failed capture leaves the allocator unchanged.
     """
     pool = torch.cuda.graph_pool_handle() if pool is None else pool
     try:
@@ -35,7 +35,7 @@ def capturing(graph: torch.cuda.CUDAGraph, pool: Any, device: torch.device) -> I
         yield
         graph.capture_end()
     except BaseException:
-        with contextlib.suppress(RuntimeError):  # the error that is raised says why the capture failed
+        with contextlib.suppress(RuntimeError):  # The original exception states why the capture failed.
             graph.capture_end()
         # In torch before 2.12 the allocator stays in a capture whose end failed, and reads the graph at every later
         # allocation, even when the graph is gone (pytorch #180395). Later versions refuse to end it again.
@@ -45,12 +45,12 @@ def capturing(graph: torch.cuda.CUDAGraph, pool: Any, device: torch.device) -> I
 
 
 def is_traced(x: Tensor) -> bool:
-    """Whether a compiler or a fake tensor stands for values, which cannot be read."""
+    """Whether values are those of a compiler or a fake tensor, which cannot be read."""
     return torch.compiler.is_compiling() or is_exported() or isinstance(x, torch._subclasses.FakeTensor)
 
 
 def is_exported() -> bool:
-    """Whether `torch.export` runs the code: what it writes to outlives the export, but not the values."""
+    """Whether `torch.export` runs the code: written tensors outlive the export, but their values do not."""
     return torch.compiler.is_exporting()
 
 
@@ -60,16 +60,16 @@ def is_transformed() -> bool:
 
 
 NUMBERS = (bool, int, float, str, torch.dtype, torch.device)
-"""Types of what a graph has by value."""
+"""Types that a graph stores by value."""
 
 
 def is_of_library(kind: type) -> bool:
-    """Whether a class is one of torch_mpm itself."""
+    """Whether a class belongs to torch_mpm."""
     return kind.__module__.startswith("torch_mpm.")
 
 
 def without_transforms(t: Tensor) -> Tensor:
-    """The plain tensor below the levels of torch.func.grad and its like, which may be kept when they have ended."""
+    """Plain tensor below the levels of torch.func.grad and similar transforms, which may be stored after they end."""
     if torch.compiler.is_compiling():
         return t
     while torch._C._functorch.is_gradtrackingtensor(t):
@@ -78,34 +78,35 @@ def without_transforms(t: Tensor) -> Tensor:
 
 
 def outside_transforms() -> contextlib.AbstractContextManager[Any]:
-    """Where what is kept may be written to, which a transform of torch.func forbids."""
+    """Context in which stored tensors may be written to, which a transform of torch.func forbids."""
     active = not torch.compiler.is_compiling() and torch._C._are_functorch_transforms_active()
     return torch._C._DisableFuncTorch() if active else contextlib.nullcontext()
 
 
 def version(t: Tensor) -> int | None:
-    """Of the values of a tensor, which count what is written to it; None for those that do not."""
+    """Version counter of a tensor, which counts writes; None for tensors without one."""
     return None if t.is_inference() else t._version
 
 
 def remember(kept: list[Any], value: Any) -> None:
-    """Keep a value, by identity, that a graph reads or writes."""
+    """Store a value, by identity, that a graph reads or writes."""
     if not any(value is known for known in kept):
         kept.append(value)
 
 
 COMPARED = 2**16
-"""Entries of a tensor on the CPU whose contents are always compared; beyond it, those of at most as many entries as the
-tensors that a step computes with have."""
+"""Number of entries up to which tensors on the CPU are always compared by content. Larger tensors are compared if they
+have no more entries than the tensors that a step computes with.
+"""
 
 
 class Remembered:
-    """A tensor as it was at a time, to find out whether it has been changed since.
+    """Tensor at a point in time, to detect later changes.
 
-    Contents are compared on the CPU. A write by any way is seen there: in place, by `.data`, by an array that shares
-    the memory. On another device, and of tensors on the CPU with more than `most` entries, the version counter and the
-    address are compared, which takes no synchronisation: writes through `.data` and by others that share the memory
-    change neither.
+    On the CPU contents are compared. This detects every write: in place, by `.data`, by an array that shares the
+    memory. On other devices, and for tensors on the CPU with more than `most` entries, the version counter and the
+    address are compared, without synchronisation. Writes through `.data` and by other owners of the memory change
+    neither.
     """
 
     def __init__(self, t: Tensor, most: int = COMPARED) -> None:
@@ -118,7 +119,7 @@ class Remembered:
                 self._contents = t.detach().clone()
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Remembered:
-        """Of the copy of the tensor, if that was copied before; else of the tensor itself."""
+        """Version of the copy of the tensor if it was copied before, otherwise of the tensor itself."""
         t = memo.get(id(self._tensor))
         if t is None:
             return self
@@ -137,7 +138,7 @@ class Remembered:
 
 
 def _is_plain(t: Tensor) -> bool:
-    """Whether a tensor has memory of its own that can be read: no wrapper of a transform, no subclass."""
+    """Whether a tensor has readable memory: neither a wrapper of a transform nor a subclass."""
     plain = type(t) in (Tensor, torch.nn.Parameter) and t.layout == torch.strided
     return plain and not torch._C._functorch.is_functorch_wrapped_tensor(t)
 
@@ -147,7 +148,7 @@ def _address(t: Tensor) -> int:
 
 
 def as_remembered(value: Any, most: int = COMPARED) -> Any:
-    """A value as a part of a key: tensors as `Remembered`; lists, tuples and arrays as tuples; others as they are."""
+    """Value as a part of a key: tensors as `Remembered`; lists, tuples and arrays as tuples; others unchanged."""
     if isinstance(value, Tensor):
         return Remembered(value, most)
     if isinstance(value, np.ndarray):
@@ -156,12 +157,12 @@ def as_remembered(value: Any, most: int = COMPARED) -> Any:
         return value
     parts = tuple(as_remembered(part, most) for part in value)
     unchanged = isinstance(value, tuple) and all(a is b for a, b in zip(parts, value, strict=True))
-    return value if unchanged else parts  # which `is_same` knows at once
+    return value if unchanged else parts  # `is_same` recognises these at once.
 
 
 def is_same(known: Any, value: Any) -> bool:
-    """Whether a value is still what `as_remembered` made a part of a key of."""
-    if known is value:  # no tensor, list or array
+    """Whether a value still equals the part of a key that `as_remembered` made of it."""
+    if known is value:  # Neither a tensor nor a list or array.
         return True
     if isinstance(known, Remembered):
         return known.is_now(value)
@@ -176,10 +177,10 @@ def is_same(known: Any, value: Any) -> bool:
 
 
 class GraphCache:
-    """The latest value by key: tensors on the device that no step waits for, made again when the key changes, or what
-    is in its lists, arrays and tensors (see `Remembered`).
+    """Latest value by key: tensors on the device, computed without waiting for it. A value is recomputed when the key
+    changes, or the contents of its lists, arrays and tensors (see `Remembered`).
 
-    A value that a CUDA graph has captured is kept for its replays, also when the key has changed since.
+    A value captured by a CUDA graph is kept for its replays, also after the key has changed.
     """
 
     def __init__(self) -> None:
@@ -187,12 +188,13 @@ class GraphCache:
         self._captured: list[Any] = []
 
     def get(self, key: tuple[Any, ...], make: Callable[[], Any], like: Tensor) -> Any:
-        """The value of a key, of numbers, tensors and lists of these, for work on the device of `like`."""
+        """Value of a key, made of numbers, tensors and lists of these, for work on the device of `like`."""
         captured = is_captured(like)
         if self._latest is None or not is_same(self._latest[0], key):
-            with torch.inference_mode(False):  # such that a later step may differentiate through it
+            with torch.inference_mode(False):  # A later step may then differentiate through it.
                 made = make()
-            # What is made in a graph has its value in replays only, in a transform of torch.func belongs to that.
+            # A value computed inside a graph exists in replays only; one inside a transform of torch.func belongs to
+            # the transform.
             if captured or torch._C._are_functorch_transforms_active():
                 return made
             self._latest = (as_remembered(key, max(COMPARED, like.numel())), made)
@@ -203,7 +205,7 @@ class GraphCache:
 
 
 class Same:
-    """A thing as a part of a key, by identity; the key keeps it, so that no other thing gets its place in memory."""
+    """Object as a part of a key, by identity; the key holds a reference, so that its address is not reused."""
 
     def __init__(self, thing: Any) -> None:
         self._thing = thing
@@ -216,13 +218,13 @@ class Same:
 
 
 class Recordings:
-    """What was recorded in CUDA graphs, by key; those that were not used for longest go. They share memory, so that one
-    spoils what another has left there. Neither copies nor pickles: a copy of a step begins without.
+    """Recorded CUDA graphs by key, with eviction of the least recently used. They share memory, so that each overwrites
+    the results of the others. Neither copied nor pickled: a copy of a step begins without recordings.
 
     Attributes:
-        most: how many are kept.
-        latest: the mark of the call whose results are in the memory; None where they are spoilt.
-        unseen: calls since a device was asked how many blocks are active.
+        most: maximum number of recordings.
+        latest: mark of the call whose results are in the memory; None where they are overwritten.
+        unseen: calls since the last query of the number of active blocks.
     """
 
     most = 8
@@ -230,14 +232,14 @@ class Recordings:
     def __init__(self) -> None:
         self.latest: Any = None
         self.unseen = 0
-        self._done: torch.cuda.Event | None = None  # the latest replay
+        self._done: torch.cuda.Event | None = None  # The latest replay.
         self._kept: collections.OrderedDict[Hashable, Any] = collections.OrderedDict()
         self._contents: dict[str, list[Tensor]] = {}
         self._latest_content: dict[str, tuple[Tensor | None, int | None, Tensor]] = {}
 
     @contextlib.contextmanager
     def in_turn(self, device: torch.device) -> Iterator[None]:
-        """Where graphs are replayed, after those that were replayed on other streams."""
+        """Stream for replays, after those that were replayed on other streams."""
         if device.type != "cuda":
             yield
             return
@@ -257,7 +259,7 @@ class Recordings:
         return len(self._kept)
 
     def get(self, key: Hashable) -> Any:
-        """What was kept under a key, or None."""
+        """The recording of a key, or None."""
         if key in self._kept:
             self._kept.move_to_end(key)
         return self._kept.get(key)
@@ -269,12 +271,13 @@ class Recordings:
             self._kept.popitem(last=False)
 
     def some(self) -> Any:
-        """One of those that are kept, or None."""
+        """One of the recordings, or None."""
         return next(iter(self._kept.values()), None)
 
     def same_content(self, name: str, t: Tensor) -> Tensor:
-        """A tensor with the entries of t, the same one for the same entries: for what is kept of it by identity. Waits
-        for the device where t is another tensor than the last time."""
+        """Tensor with the entries of t, the same object for the same entries: for caches by identity. Waits for the
+        device where t is another tensor than in the previous call.
+        """
         given, before, content = self._latest_content.get(name, (None, None, t))
         now = version(t)
         if t is given and now is not None and now == before:
@@ -282,7 +285,7 @@ class Recordings:
         known = self._contents.setdefault(name, [])
         alike = [c for c in known if (c.shape, c.device) == (t.shape, t.device) and torch.equal(c, t)]
         if not alike:
-            with torch.inference_mode(False):  # such that autograd may keep it later
+            with torch.inference_mode(False):  # Autograd may then store it later.
                 alike = [t.detach().clone()]
             known[:] = [*known[1 - self.most :], *alike]
         content = alike[0]

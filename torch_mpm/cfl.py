@@ -7,25 +7,26 @@ the tangent stiffness or the viscous matrix on the grid and M the lumped mass, a
 
     λ_e = max_p a_p V_p Λ/(m_p dx²)   and   λ_v = max_p 2 η_p V_p Λ/(m_p dx²).
 
-A mode of these eigenvalues, of which one particle round trip keeps the part s of the grid velocity (0 ≤ s ≤ 1), is
+A mode of these eigenvalues, of whose grid velocity one particle round trip retains the fraction s (0 ≤ s ≤ 1), is
 advanced by v ← s v − dt λ_e u − dt λ_v v, u ← u + dt v, which is stable while
 
     dt² λ_e / 2 + dt λ_v ≤ 1 + s.
 
-With APIC the stiffest modes are kept whole: a mode of y λ, y ≤ 1, has s ≥ y, and y = 1 is the worst case, so s = 1
+With APIC the stiffest modes are retained fully: a mode of y λ, y ≤ 1, has s ≥ y, and y = 1 is the worst case, so s = 1
 gives the limit; it is dx/c with ρ c² = a for the quadratic MLS form. PIC and FLIP may lose the stiffest modes: s = 0.
-An isolated particle reaches the limit (tests/test_cfl.py). Speed is added so that none moves by more than dx in a step.
+An isolated particle reaches the limit (tests/test_cfl.py). Speed is added so that no particle moves by more than dx in
+a step.
 
-That is the linear limit. A step must not turn a particle inside out either: it multiplies F by I + dt ∇v, or J by
-1 + dt tr ∇v, so that changes of more than one in a step change the sign. With the velocity v_p + C_p (x_i − x_p) and
-the stress τ_p of each particle on the nodes, the bound on |∇v| above gives, for particles that are alike,
+That is the linear limit. A step must not invert a particle either: it multiplies F by I + dt ∇v, or J by 1 + dt tr ∇v,
+so that changes of more than one in a step change the sign. With the velocity v_p + C_p (x_i − x_p) and the stress τ_p
+of each particle on the nodes, the bound on |∇v| above gives, for similar particles,
 
     |∇v| ≤ g + dt h,   g² = Λ |v_p|²/dx² + |C_p|²,   h = |τ_p| V_p Λ/(m_p dx²),
 
-and |tr ∇v| at most √D times that. dt (g + dt h) may be a half: no stretch and no volume loses more than half of itself
-in a step, else the pressure of a fluid would rise by orders of magnitude at once. Speeds are those of particles and of
-the obstacles near them; two bodies that meet have both. Near rest and below a third of the speed of sound (fluids: a
-fifth) this is no limit. It is a bound where neighbours are alike, and was measured where they are not
+and |tr ∇v| at most √D times that. dt (g + dt h) may be a half: no stretch and no volume decreases by more than half in
+a step; otherwise the pressure of a fluid would rise by orders of magnitude at once. Speeds are those of particles and
+of the obstacles near them; two colliding bodies have both. Near rest and below a third of the speed of sound (fluids: a
+fifth) this is no limit. It is a bound for similar neighbours, and was measured for others
 (benchmarks/stability/adversarial.py).
 """
 
@@ -60,14 +61,14 @@ GRADIENT_BOUND = {
 
 
 class Figures(NamedTuple):
-    """What a law says of particles for a survey."""
+    """Values of a law at the particles, for a survey."""
 
     stress: Tensor
     """Kirchhoff stress [P, D, D] [Pa]."""
     stiffness: Tensor
     """Tangent modulus [P] [Pa]."""
     energy: Tensor | None
-    """Energy density [P] [J/m³], where it is asked for."""
+    """Energy density [P] [J/m³], where requested."""
 
 
 @torch.no_grad()
@@ -85,12 +86,12 @@ def stable_dt(
 
     It has no gradient: a dt is a constant of the steps that it is chosen for.
 
-    With cfl = 1 and dt computed before every step no rollout of the stability benchmark turned a particle inside out;
-    keep 0.5, the default of `Step.stable_dt`, where dt is computed less often or something else acts on the grid.
+    With cfl = 1 and dt computed before every step no rollout of the stability benchmark inverted a particle. Use 0.5,
+    the default of `Step.stable_dt`, where dt is computed less often or user code acts on the grid.
 
-    The limit oscillates with the strain of the particles. A dt that follows it feeds energy into particles that nothing
-    damps, such as lone ones (docs/limitations.md). Therefore pass the dt of the step before as `previous`: it stays
-    while it is between half of the result without it and that result.
+    The limit oscillates with the strain of the particles. A dt that follows it feeds energy into undamped particles,
+    such as isolated ones (docs/limitations.md). Therefore pass the previous dt as `previous`: it is returned while it
+    is between half of the result without it and that result.
 
     Args:
         grid: the lattice.
@@ -100,12 +101,12 @@ def stable_dt(
             stiffen.
         transfer: "apic", "pic" or "flip".
         stress_form: "mls" or "gradient".
-        speed: of the obstacles near each particle [P] [m/s], or None; `Step.stable_dt` gives it.
-        previous: dt of the step before [s], a number or a tensor [], [1] or [B]; None for none.
+        speed: speed of the obstacles near each particle [P] [m/s], or None; `Step.stable_dt` gives it.
+        previous: dt of the previous step [s], a number or a tensor [], [1] or [B]; None for none.
 
     Returns:
-        dt [B] [s], constant for autograd; inf for a scene without particles, or without stress, stiffness,
-        viscosity and speed. A particle without mass makes it zero; one that is not finite is left out.
+        dt [B] [s], constant for autograd; inf for a scene without particles, or without stress, stiffness, viscosity
+        and speed. A particle without mass makes it zero; particles that are not finite are ignored.
 
     Raises:
         TypeError, ValueError: for a cfl that is not positive and finite, an unknown transfer or stress form, or a wrong
@@ -125,7 +126,8 @@ def stable_dt(
 
 
 def chosen_dt(longest: Tensor, previous: float | Tensor | None) -> Tensor:
-    """The dt of each scene [B]: the previous one while it is between half of the longest and that, else the longest.
+    """dt of each scene [B]: the previous one while it is between half of the longest and the longest, otherwise the
+    longest.
 
     Raises:
         TypeError, ValueError: for a wrong `previous`.
@@ -155,7 +157,7 @@ def look(
     speed: Tensor | None = None,
     obstacles: Sequence[Obstacle] = (),
 ) -> Survey:
-    """`survey` of a state that has all fields, of which the law has given figures."""
+    """`survey` of a state that has all fields, with the values of the law."""
     grid.check_resolution(state.x.dtype)
     bound = GRADIENT_BOUND[stress_form, grid.kernel] / grid.dx**2
     return survey(
@@ -170,7 +172,7 @@ def look(
         energy=figures.energy,
         speed=speed,
         obstacles=obstacles,
-        reach=2 * math.sqrt(grid.dim) * grid.dx,  # of a particle's nodes
+        reach=2 * math.sqrt(grid.dim) * grid.dx,  # largest distance of a particle's nodes
     )
 
 

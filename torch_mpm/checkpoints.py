@@ -1,4 +1,4 @@
-"""What a rollout keeps of its states for the backward pass, which takes the steps between them again."""
+"""States stored for the backward pass of a rollout; the steps in between are recomputed."""
 
 from __future__ import annotations
 
@@ -21,27 +21,27 @@ from .recompute import called_again
 from .state import State
 
 Advance = Callable[[State, int, int], State]
-"""(state, count, k) to the state so many steps later, the first of which is step k."""
+"""Function of (state, count, k) that returns the state `count` steps later; the first of them is step k."""
 
 CONSTANT = ("mass", "volume", "scene", "ids", "material")
-"""Fields that steps leave as they are."""
+"""Fields that steps do not change."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Checkpoints:
-    """Which states of a rollout are kept: exactly one of `every`, `states` and `memory` says it.
+    """States of a rollout to store for the backward pass. Set exactly one of `every`, `states` and `memory`.
 
     Attributes:
-        every: the state of every so many steps is kept, and its steps are taken again once. Memory: n/every states and
-            what `every` steps need.
-        states: at most so many states are kept at a time, 2 or more, where taking steps again costs least (binomial
-            checkpoints, Griewank and Walther 2000). Memory: so many states, and what one step needs; with s states and
-            r repetitions of each step at most, n ≤ (s + r)!/(s! r!).
-        memory: [bytes]. Where all steps fit, none is taken again, as long as no grid has to grow on the CPU; else the
-            largest `every` that fits, or as many `states` where none does. A step from Python is taken aside once, to
-            measure it.
-        offload: whether kept states wait in the memory of the host, as far as they are on a CUDA device; `memory` then
-            is that of the steps which are taken again. Not with `states`.
+        every: stores the state of every `every` steps; each step is recomputed once. Memory: n/every states and the
+            memory of `every` steps.
+        states: stores at most `states` states at a time, 2 or more, placed so that recomputation costs least (binomial
+            checkpoints, Griewank and Walther 2000). Memory: these states and the memory of one step; with s states and
+            at most r repetitions of each step, n ≤ (s + r)!/(s! r!).
+        memory: limit [bytes]. Where all steps fit, none is recomputed, as long as no grid has to grow on the CPU.
+            Otherwise the largest `every` that fits is used, or the number of `states` that fits where no `every` does.
+            A step launched from Python is run once without effect, to measure it.
+        offload: whether stored states on a CUDA device are moved to host memory; `memory` is then that of the
+            recomputed steps. Not with `states`.
 
     Raises:
         TypeError, ValueError: for a wrong number, or none or two of them.
@@ -67,14 +67,14 @@ class Checkpoints:
             raise ValueError("offload must be False with states: with every or memory, states may wait on the host")
 
     def repetitions(self, n: int) -> int:
-        """Steps that the backward pass of n steps takes again."""
+        """Number of steps that the backward pass of n steps recomputes."""
         if self.every is not None:
             return n
         assert self.states is not None
         return _evaluations(n, min(self.states, n)) - n
 
     def kept(self, n: int) -> int:
-        """States that are kept at a time at most."""
+        """Maximum number of states stored at a time."""
         return -(-n // self.every) if self.every is not None else min(self.states or 0, n)
 
 
@@ -82,7 +82,7 @@ def as_checkpoints(checkpoint: int | Checkpoints | None) -> Checkpoints | None:
     """The argument of `rollout`.
 
     Raises:
-        TypeError, ValueError: for anything else than a whole number from 1 on, `Checkpoints` or None.
+        TypeError, ValueError: unless it is a positive integer, `Checkpoints` or None.
     """
     if checkpoint is None or isinstance(checkpoint, Checkpoints):
         return checkpoint
@@ -90,7 +90,7 @@ def as_checkpoints(checkpoint: int | Checkpoints | None) -> Checkpoints | None:
 
 
 def fitting(memory: float, n: int, state_bytes: int, step_bytes: int, offload: bool = False) -> Checkpoints | None:
-    """The checkpoints of n steps with the least work that need no more than some memory [bytes]; None for no need.
+    """Checkpoints of n steps with the least work within a limit of memory [bytes]; None where none are needed.
 
     Raises:
         ValueError: where two states and a step need more.
@@ -102,7 +102,7 @@ def fitting(memory: float, n: int, state_bytes: int, step_bytes: int, offload: b
     def needed(every: int) -> int:
         return -(-n // every) * on_device + every * step_bytes
 
-    # All of them take each step again once, and with more steps between kept states calls are fewer.
+    # All of them recompute each step once, and more steps between stored states mean fewer calls.
     best = n if on_device == 0 else max(round(math.sqrt(n * on_device / max(step_bytes, 1))), 1)
     smallest = 1 if on_device == 0 else min(best, n)
     if needed(smallest) <= memory:
@@ -117,11 +117,11 @@ def fitting(memory: float, n: int, state_bytes: int, step_bytes: int, offload: b
     return Checkpoints(states=min(states, n))
 
 
-# ---- every so many steps
+# ---- every n-th step
 
 
 def in_segments(advance: Advance, state: State, n: int, checkpoints: Checkpoints, step: Any) -> State:
-    """The state n steps later; of every so many steps only the first state is kept for the backward pass."""
+    """The state n steps later; only the first state of each segment is stored for the backward pass."""
     assert checkpoints.every is not None
     with offloaded(state) if checkpoints.offload else contextlib.nullcontext():
         for first in range(0, n, checkpoints.every):
@@ -130,13 +130,13 @@ def in_segments(advance: Advance, state: State, n: int, checkpoints: Checkpoints
 
 
 def recomputed(advance: Advance, state: State, count: int, first: int, step: Any) -> State:
-    """`advance(state, count, first)`, of which the backward pass keeps the arguments and takes the steps again.
+    """`advance(state, count, first)` whose arguments are stored; the backward pass recomputes its steps.
 
-    A second time the steps find the pools and the motions of obstacles of the first one, and do not count for `check`
-    of the step.
+    The recomputed steps use the pools and the motions of obstacles of the first computation, and are not counted for
+    `check` of the step.
     """
     leaves, layout = _pytree.tree_flatten(state)
-    motions, poses = motions_of(step, state), state.poses  # a state that is kept would keep the graph before it
+    motions, poses = motions_of(step, state), state.poses  # A stored state would keep the preceding graph alive.
     again, pools = False, list[int]()
 
     def steps(*tensors: Tensor) -> State:
@@ -144,7 +144,7 @@ def recomputed(advance: Advance, state: State, count: int, first: int, step: Any
         given = _pytree.tree_unflatten(tensors, layout).with_poses(poses)
         with contextlib.ExitStack() as stack:
             stack.enter_context(same_pools(pools))
-            if again:  # graphs write to the tensors that `aside` would put away
+            if again:  # Graphs write to the tensors that `aside` would replace.
                 stack.enter_context(motions())
                 from_graphs = isinstance(step, torch.nn.Module) and "_recordings" in vars(step)
                 stack.enter_context(uncounted(step) if from_graphs else aside(step, given.x))
@@ -156,14 +156,15 @@ def recomputed(advance: Advance, state: State, count: int, first: int, step: Any
 
 
 def contexts() -> tuple[contextlib.AbstractContextManager[None], contextlib.AbstractContextManager[None]]:
-    """For `torch.utils.checkpoint.checkpoint(..., use_reentrant=False, context_fn=contexts)` around steps: on grids
-    without `max_blocks`, steps that are taken again find pools of the size they had. `rollout` sees to that itself."""
+    """Contexts for `torch.utils.checkpoint.checkpoint(..., use_reentrant=False, context_fn=contexts)` around steps: on
+    grids without `max_blocks`, recomputed steps find pools of their original size. `rollout` does this itself.
+    """
     sizes = list[int]()
     return same_pools(sizes), _EachTime(sizes)
 
 
 class _EachTime(contextlib.AbstractContextManager[None]):
-    """`same_pools` as often as a graph is gone back through."""
+    """`same_pools` for each backward pass through the graph."""
 
     def __init__(self, sizes: list[int]) -> None:
         self._sizes = sizes
@@ -180,10 +181,11 @@ class _EachTime(contextlib.AbstractContextManager[None]):
 
 
 def binomial(advance: Advance, state: State, n: int, states: int, step: Any) -> State:
-    """The state n steps later, with at most so many states kept at a time; n is 1 or more.
+    """The state n steps later, with at most `states` states stored at a time; n is 1 or more.
 
-    The first part of a rollout is taken again from its first state, with as many states, once the rest of it is done
-    with one less; Griewank and Walther 2000 say where to part them (algorithm 799, "revolve").
+    The first part of a rollout is recomputed from its first state, with as many states, after the backward pass of the
+    rest, which uses one state less; Griewank and Walther 2000 give the position of the split (algorithm 799,
+    "revolve").
     """
 
     def part_of(first: int, count: int, states: int) -> Advance:
@@ -200,7 +202,7 @@ def binomial(advance: Advance, state: State, n: int, states: int, step: Any) -> 
 
 
 def _reach(states: int, repetitions: int) -> int:
-    """Steps that so many states and repetitions of each step serve."""
+    """Maximum number of steps for given numbers of states and of repetitions of each step."""
     return math.comb(states + repetitions, states) if states >= 0 and repetitions >= 0 else 0
 
 
@@ -214,7 +216,7 @@ def _split(n: int, states: int) -> int:
 
 @functools.lru_cache(maxsize=1 << 16)
 def _evaluations(n: int, states: int) -> int:
-    """Steps that a rollout and its backward pass take."""
+    """Number of steps that a rollout and its backward pass compute."""
     taken = 1
     while n > 1:
         part = _split(n, states)
@@ -228,9 +230,10 @@ def _evaluations(n: int, states: int) -> int:
 
 @contextlib.contextmanager
 def offloaded(state: State) -> Iterator[None]:
-    """Where tensors of particles on a CUDA device that autograd keeps wait in pinned memory of the host.
+    """Context in which particle tensors on a CUDA device that autograd stores are moved to pinned host memory.
 
-    Fields that steps leave as they are stay, since all kept states share them. Copies take their turn on the stream.
+    Fields that steps do not change stay on the device, since all stored states share them. Copies are queued on the
+    stream.
     """
     shared = {t.untyped_storage().data_ptr() for name in CONSTANT if (t := getattr(state, name)) is not None}
     P = len(state)
@@ -239,7 +242,7 @@ def offloaded(state: State) -> Iterator[None]:
         moves = t.is_cuda and t.is_floating_point() and t.dim() > 0 and t.shape[0] == P
         if not moves or t.untyped_storage().data_ptr() in shared:
             return t.device, t
-        t = t.contiguous() if 0 in t.stride() else t  # one that was expanded
+        t = t.contiguous() if 0 in t.stride() else t  # An expanded tensor.
         there = torch.empty_strided(t.shape, t.stride(), dtype=t.dtype, device="cpu", pin_memory=True)
         return t.device, there.copy_(t.detach(), non_blocking=True)
 

@@ -45,12 +45,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 class Terminated(KeyboardInterrupt):
-    """SIGTERM, as an exception: what is being written is removed on the way out."""
+    """SIGTERM as an exception: incomplete files are removed during unwinding."""
 
 
 @contextlib.contextmanager
 def termination_raises() -> Iterator[None]:
-    """SIGTERM raises `Terminated` in the main thread; elsewhere it ends the process as before."""
+    """SIGTERM raises `Terminated` in the main thread; in other threads it ends the process as by default."""
 
     def end(number: int, frame: FrameType | None) -> None:
         raise Terminated
@@ -67,7 +67,7 @@ def termination_raises() -> Iterator[None]:
 
 @contextlib.contextmanager
 def warnings_in_lines() -> Iterator[None]:
-    """A warning of torch_mpm is one line without a place in the code, as errors are."""
+    """Warnings of torch_mpm are one line without a source location, as errors are."""
     usual = warnings.formatwarning
 
     def line(message: Warning | str, category: type[Warning], *place: Any, **words: Any) -> str:
@@ -88,12 +88,12 @@ TOLD = (
 
 
 NOTHING = 2**22
-"""Memory with which anything may fail, in whatever words [bytes]."""
+"""Memory below which anything may fail, with any message [bytes]."""
 
 
 def _message(error: Exception) -> str | None:
-    """What to tell the user. None for errors that are defects of torch_mpm, whose traceback should be seen."""
-    if memory.is_short(error) or memory.available() < NOTHING:  # Python loses errors for want of memory
+    """Message for the user. None for defects of torch_mpm, whose traceback should be visible."""
+    if memory.is_short(error) or memory.available() < NOTHING:  # Python may lose exceptions when memory is exhausted.
         remedy = "have a larger grid.dx, a smaller per_cell, or fewer fields and pictures; or free some memory"
         return f"out of memory: {memory.shortage(error)}; {remedy}"
     if isinstance(error, OSError) and error.strerror and error.filename is not None:
@@ -103,7 +103,7 @@ def _message(error: Exception) -> str | None:
 
 
 def _told(message: str, status: int) -> int:
-    shown = "".join(c if c.isprintable() or c in "\n\t" else ascii(c)[1:-1] for c in message)  # of file names
+    shown = "".join(c if c.isprintable() or c in "\n\t" else ascii(c)[1:-1] for c in message)  # Errors of file names.
     print(f"torch-mpm: {shown}", file=sys.stderr)
     return status
 
@@ -195,7 +195,7 @@ def _run(options: argparse.Namespace) -> None:
 
 
 def _require_outputs(scene: Any) -> None:
-    """Raise ImportError for a missing package before the simulation rather than after it."""
+    """Raise ImportError for a missing package before the simulation instead of after it."""
     if scene.render is not None:
         from . import render
         from .render.requires import require
@@ -210,7 +210,7 @@ def _require_outputs(scene: Any) -> None:
 
 
 def _outputs(scene: Any, options: argparse.Namespace) -> list[tuple[str, Callable[[], dict[str, Path]]]]:
-    """What the scene asks for beside its trajectory: names, and functions that make it and return where it is."""
+    """Outputs of the scene beside its trajectory: names, and functions that write them and return their paths."""
     from .data import export
 
     outputs: list[tuple[str, Callable[[], dict[str, Path]]]] = []
@@ -224,12 +224,12 @@ def _outputs(scene: Any, options: argparse.Namespace) -> list[tuple[str, Callabl
 
 
 def _is_there(name: str, out: Path) -> bool:
-    """Whether the files of an output are."""
+    """Whether the files of an output exist."""
     return (out / {"pictures": "frames", "VTK": "vtk/run.pvd", "PLY": "ply"}[name]).exists()
 
 
 def _draw(folder: Path, scene: Any, quiet: bool) -> dict[str, Path]:
-    """Draw a run; returns where its pictures and its video are."""
+    """Draw a run; returns the paths of its pictures and its video."""
     from .scene.pictures import draw
 
     made = draw(folder, scene) if quiet else _draw_with_a_bar(folder, scene)
@@ -300,7 +300,7 @@ def _export(options: argparse.Namespace) -> None:
         reading.export_run(options)
 
 
-# ---- telling
+# ---- messages
 
 
 def _tqdm() -> Any:
@@ -308,7 +308,7 @@ def _tqdm() -> Any:
 
 
 class _Bar:
-    """Progress bar of a run; knows the number of frames from the first report."""
+    """Progress bar of a run; the first report gives the number of frames."""
 
     def __init__(self) -> None:
         self._make = _tqdm()

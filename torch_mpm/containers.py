@@ -1,5 +1,4 @@
-"""A `State` where torch expects its own containers: as a pytree, in files, in the batches of a `DataLoader`, and as a
-TensorDict."""
+"""`State` in containers of torch: as a pytree, in files, in the batches of a `DataLoader`, and as a TensorDict."""
 
 from __future__ import annotations
 
@@ -18,11 +17,11 @@ if TYPE_CHECKING:
     from .boundaries.control import Poses
 
 TENSORS = sorted((name for name in FIELDS if name not in ("extra", "time")), reverse=True)
-"""A name comes before those that it begins with, which `torch.export` needs to tell `v` from `volume`."""
+"""Sort key: a name comes before its prefixes, which `torch.export` needs to distinguish `v` from `volume`."""
 
 
 class Kept:
-    """What goes with a layout, but takes no part in comparisons: poses of states of one layout may be any."""
+    """Data that belongs to a layout, but takes no part in comparisons: states of one layout may have any poses."""
 
     def __init__(self, poses: Poses) -> None:
         self.poses = poses
@@ -39,14 +38,14 @@ Layout = tuple[tuple[str, ...], tuple[str, ...], "float | None", Kept]
 
 
 def _flatten(state: State) -> tuple[list[Any], Layout]:
-    """The tensors of a state are leaves, absent fields are not."""
+    """The tensors of a state are leaves; absent fields are not."""
     names = tuple(name for name in TENSORS if getattr(state, name) is not None)
     time = state.time
     leaves = [getattr(state, name) for name in names] + [
         state.extra[name] for name in sorted(state.extra, reverse=True)
     ]
     number = None if isinstance(time, Tensor) else time
-    # Of what is traced, each run has another state.
+    # Traced states differ in each run.
     kept = Kept({} if is_traced(state.x) else state.poses)
     return (leaves if number is not None else [*leaves, time]), (names, tuple(state.extra), number, kept)
 
@@ -59,7 +58,7 @@ def _flatten_with_keys(state: State) -> tuple[list[tuple[Any, Any]], Layout]:
 
 
 def _unflatten(leaves: Any, layout: Layout) -> State:
-    """A state of any leaves, which a function of the tree may have made: nothing is checked."""
+    """State of any leaves, as a function of the tree may have made: nothing is checked."""
     names, extra, time, beside = layout
     values = list(leaves)
     state: State = object.__new__(State)
@@ -82,9 +81,10 @@ def _collate(batch: Sequence[State], *, collate_fn_map: dict[type, Callable[...,
 
 
 def to_tensordict(state: State) -> Any:
-    """The fields of a state as a TensorDict of no batch size, those of `extra` nested; needs the package tensordict.
+    """Fields of a state as a TensorDict without batch size, those of `extra` nested; needs the package tensordict.
 
-    Absent fields are left out, and a time that is a number is no tensor there. Tensors are the same, with their graphs.
+    Absent fields are omitted, and a time that is a number is not a tensor there. The tensors are shared, with their
+    graphs.
 
     Raises:
         ModuleNotFoundError: without the package.
@@ -101,7 +101,7 @@ def to_tensordict(state: State) -> Any:
 
 
 def from_tensordict(fields: Any) -> State:
-    """The state of a TensorDict as `to_tensordict` makes it; what else is there is an unknown field.
+    """State of a TensorDict made by `to_tensordict`; anything else in it is an unknown field.
 
     Raises:
         TypeError, ValueError: as `State`.
@@ -113,14 +113,14 @@ def from_tensordict(fields: Any) -> State:
 
 
 def register() -> None:
-    """Make `State` known to torch: its pytrees, `torch.load(weights_only=True)` and `default_collate`."""
+    """Register `State` in torch: pytrees, `torch.load(weights_only=True)` and `default_collate`."""
     _pytree.register_pytree_node(
         State,
         _flatten,
         _unflatten,
         serialized_type_name="torch_mpm.State",
         to_dumpable_context=lambda layout: list(layout[:3]),
-        from_dumpable_context=lambda read: (tuple(read[0]), tuple(read[1]), read[2], Kept({})),  # lists of a file
+        from_dumpable_context=lambda read: (tuple(read[0]), tuple(read[1]), read[2], Kept({})),  # Lists of a file.
         flatten_with_keys_fn=_flatten_with_keys,
     )
     torch.serialization.add_safe_globals([State])

@@ -1,4 +1,4 @@
-"""A batch as environments: scenes side by side, each with a clock of its own, and each of which may be replaced.
+"""Batch as environments: scenes side by side, each with a separate clock, and each replaceable.
 
     envs = mpm.Environments(step, [scene() for _ in range(1024)])    # step.grid.scenes = 1024
     for k in range(steps):
@@ -8,10 +8,10 @@
         envs.freeze()                                                # scenes that went wrong stand still from here on
         envs.reset(envs.frozen | done(force))                        # bool [B] on the device: as they were at first
 
-The particles of scene b have the rows [b R, (b + 1) R) of the state. Those of them that a scene does not need are
-absent: their `scene` is -1, they take part in nothing, and cost little. So a scene may be replaced by one of another
-size where it stands, without a new allocation and without waiting for the device. The step may differ between scenes
-by parameters, gravity and poses of obstacles per scene [B], and by obstacles that are in one scene alone.
+The particles of scene b have the rows [b R, (b + 1) R) of the state. Unused rows are absent particles: their `scene` is
+-1, they take part in nothing, and cost little. So a scene may be replaced in place by one of another size, without an
+allocation and without waiting for the device. Parameters, gravity and poses of obstacles may differ between scenes [B],
+and an obstacle may be in one scene only.
 """
 
 from __future__ import annotations
@@ -32,31 +32,31 @@ from .state import PARTICLE_FIELDS, State, check_state
 from .step import Step
 
 ABSENT = -1
-"""`State.scene` of a particle that is not there (csrc/grid/activate.h)."""
+"""`State.scene` of an absent particle (csrc/grid/activate.h)."""
 
 
 FROZEN = "frozen rows"
-"""Of a file: whether the scene of each row is frozen."""
+"""Name in a file: whether the scene of each row is frozen."""
 
 
 class Environments:
     """B scenes in one state.
 
     Args:
-        step: of a grid of B scenes.
-        states: that of each scene, B states of one scene each; they may differ in size, and have the fields that any
-            of them has. What they share with the caller is copied.
+        step: step of a grid of B scenes.
+        states: initial states, B states of one scene each. They may differ in size, and get the union of their fields.
+            Tensors shared with the caller are copied.
         room: rows of each scene R; None for the largest number of particles of a state.
 
     Attributes:
-        state: of all scenes, whose fields `reset` overwrites where none requires a gradient: clone what shall stay. It
-            may be replaced by one of as many particles, with another velocity say. Absent particles have no volume, and
-            a mass of one.
-        time: of each scene since it began [B] [s], float64.
-        frozen: scenes that stand still until they are reset, bool [B].
+        state: all scenes. `reset` overwrites its fields where none requires a gradient: clone a state that must stay.
+            It may be replaced by one with the same number of particles, such as with another velocity. Absent particles
+            have no volume, and a mass of one.
+        time: time of each scene since it began [B] [s], float64.
+        frozen: scenes that are not advanced until they are reset, bool [B].
 
-    Differentiable as `rollout`, from call to call, by what the step and the states have that requires a gradient. The
-    memory grows with each call until `detach`: without a loss, advance under `torch.no_grad()`.
+    Differentiable as `rollout`, from call to call, by everything in the step and the states that requires a gradient.
+    The memory grows with each call until `detach`: without a loss, advance under `torch.no_grad()`.
 
     Raises:
         TypeError, ValueError: for another number of states than the grid has scenes, or a state without room.
@@ -77,19 +77,19 @@ class Environments:
         self.step = step
         self.room = max(len(s) for s in states) if room is None else check_count("room", room)
         self.first = self.pack(states)
-        """The scenes as `reset` makes them where it is given no others."""
+        """The scenes that `reset` uses by default."""
         self.state = self._placed(self.first.map(torch.clone))
         device = self.state.x.device
         self.time = torch.zeros(step.grid.scenes, dtype=torch.float64, device=device)
         self.frozen = torch.zeros(step.grid.scenes, dtype=torch.bool, device=device)
-        self._froze = False  # whether a scene was ever frozen, whose laws go on all the same
+        self._froze = False  # Whether a scene was ever frozen; its laws are evaluated all the same.
         self._before: tuple[Tensor, Tensor] | None = None
 
     def __len__(self) -> int:
         return self.step.grid.scenes
 
     def pack(self, states: Sequence[State]) -> State:
-        """Scenes as `reset` takes them many times: n states of one scene each, R rows for each, `scene` 0 or -1.
+        """Scenes for repeated use by `reset`: n states of one scene each, R rows for each, `scene` 0 or -1.
 
         Raises:
             TypeError, ValueError: for a state of several scenes or without room, or of another dtype or device.
@@ -106,14 +106,14 @@ class Environments:
         return self._with_fields(packed)
 
     def _with_fields(self, state: State) -> State:
-        """The fields that steps make and keep, so that those of a scene are those of the others.
+        """Add the fields that steps create and store, so that all scenes have the same fields.
 
-        Scenes are prepared side by side, as the first ones of the grid, since what a step makes may come from a grid.
+        Scenes are prepared side by side, as the first ones of the grid, since fields of a step may depend on a grid.
         """
         present, B = state.scene, len(self) * self.room
         groups = [state.select(rows) for rows in torch.arange(len(state), device=state.x.device).split(B)]
         state = State.concatenate([self.step.prepare(self._placed(group)) for group in groups])
-        made = {name: value.nan_to_num(nan=0.0) for name, value in state.extra.items()}  # of absent particles
+        made = {name: value.nan_to_num(nan=0.0) for name, value in state.extra.items()}  # Absent particles.
         keeps_C = self.step.transfer == "apic" or self.step.law.viscous
         C = state.C if keeps_C else None
         if keeps_C and C is None:
@@ -121,7 +121,7 @@ class Environments:
         return state.replace(scene=present, C=C, extra=made)
 
     def _placed(self, packed: State, index: Tensor | None = None) -> State:
-        """Packed scenes with the number of each, or those of an index [n], as the scene of its particles."""
+        """Packed scenes with their numbers, or those of an index [n], as the scene of their particles."""
         own = torch.arange(len(self), dtype=torch.int32, device=packed.x.device)
         own = own[: len(packed) // self.room] if index is None else own[index]
         own = own[:, None].expand(-1, self.room).reshape(-1)
@@ -131,14 +131,14 @@ class Environments:
     # -- running
 
     def advance(self, n: int, dt: float | Tensor) -> None:
-        """Take n steps of dt [s], a number or a tensor [B]; see `rollout`. Frozen scenes stand still.
+        """Compute n steps of dt [s], a number or a tensor [B]; see `rollout`. Frozen scenes are not advanced.
 
-        An obstacle moves to a pose that was assigned since the call before, and reaches it at the end of this one; see
-        `Obstacle`.
+        An obstacle moves to a pose that was assigned since the previous call, and reaches it at the end of this one;
+        see `Obstacle`.
         """
         check_count("n", n)
         state = self.state
-        split_dt(dt, len(self), state.x)  # which checks it
+        split_dt(dt, len(self), state.x)  # checks dt
         if self.step.reads_time:
             state = state.replace(time=self.time)
         elapsed = dt.double() if isinstance(dt, Tensor) else torch.full_like(self.time, dt)
@@ -155,16 +155,16 @@ class Environments:
         return self.step.failures(self.state).failed
 
     def detach(self) -> None:
-        """Cut the gradient here: later losses have none from the steps so far, whose memory is free."""
+        """Cut the gradient here: later losses have no gradient from previous steps, whose memory is freed."""
         self.state, self.time = self.state.detach(), self.time.detach()
         if self._before is not None:
             self._before = self._before[0].detach(), self._before[1].detach()
 
     def freeze(self, which: Any = None) -> None:
-        """Let scenes stand still until they are reset: those of a bool [B] or of indices; None for all that failed.
+        """Freeze scenes until they are reset: those of a bool [B] or of indices; None for all that failed.
 
-        Their particles take part in nothing and cost little. They keep their positions and deformations, and lose
-        their velocities.
+        Their particles take part in nothing and cost little. They keep their positions and deformations, and lose their
+        velocities.
         """
         self.frozen = self.frozen | (self.failed if which is None else self._mask(self._which(which)))
         absent = self.frozen.repeat_interleave(self.room)
@@ -172,15 +172,15 @@ class Environments:
         self._froze = True
 
     def reset(self, which: Any, states: State | Sequence[State] | None = None) -> None:
-        """Replace scenes by others, where they stand; the rest stays as it is, bit by bit. Clocks begin anew.
+        """Replace scenes in place; the others are unchanged, bit by bit. Clocks restart.
 
-        In these scenes obstacles are placed: the next call of `advance` begins with them at their poses of then, to
-        which they do not move. Gradients do not pass through a scene that was replaced, and pass through the others.
+        In these scenes obstacles are placed: the next call of `advance` begins with them at their present poses,
+        without a motion to them. Gradients end at replaced scenes, and pass through the others.
 
         Args:
             which: bool [B], which may be on the device, or indices of scenes.
-            states: None for those of the beginning. A list, or what `pack` has made of one, of a state for each index
-                in turn; with a mask, of one for each of the B scenes, of which those of the mask are taken.
+            states: None for the initial states. Otherwise a list, or the result of `pack` of one, with a state for each
+                index in turn; with a mask, one for each of the B scenes, of which those of the mask are used.
 
         Raises:
             TypeError, ValueError: for states without room, or another number of them.
@@ -198,7 +198,8 @@ class Environments:
             raise ValueError(f"states must be {count}, one for each scene to reset, got {len(given) // self.room}")
         changes: dict[str, Tensor] = {}
         pairs = _pairs(self.state, self._placed(given, index))
-        in_graph = any(t.requires_grad for _, *both in pairs for t in both)  # which saves fields as they are
+        # Autograd saves fields without copying them.
+        in_graph = any(t.requires_grad for _, *both in pairs for t in both)
         for name, old, new in pairs:
             rows = self._rows(old)
             of_mask = mask.reshape(-1, *(1,) * (rows.dim() - 1))
@@ -226,7 +227,7 @@ class Environments:
         self.step.forget_failures(mask)
 
     def _which(self, which: Any) -> Tensor:
-        """Scenes as a mask bool [B] or as indices int64 [n] on the device, where numbers go without waiting for it."""
+        """Scenes as a mask bool [B] or as indices int64 [n] on the device, without waiting for it."""
         which = which if isinstance(which, Tensor) else torch.as_tensor(which, device="cpu")
         if which.dtype == torch.bool:
             if which.shape != self.time.shape:
@@ -251,19 +252,19 @@ class Environments:
 
     @property
     def present(self) -> Tensor:
-        """Which rows are particles that are there, bool [B, R]; none of a frozen scene."""
+        """Rows of present particles, bool [B, R]; none of a frozen scene."""
         return torch.ne(self._rows(self.state.scene), ABSENT)
 
     def observe(self, name: str, padded: bool = True) -> Tensor:
-        """A field of the particles, of `State` or `state.extra`.
+        """Field of the particles, of `State` or `state.extra`.
 
         Args:
-            name: of the field.
+            name: name of the field.
             padded: [B, R, ...] with zero for absent particles, see `present`; or packed [P, ...], scene after scene,
                 which waits for the device.
 
         Raises:
-            ValueError: where there is no such field.
+            ValueError: for an unknown field.
         """
         value = self.state.extra.get(name, getattr(self.state, name, None) if name in PARTICLE_FIELDS else None)
         if value is None:
@@ -274,14 +275,14 @@ class Environments:
         return torch.where(self.present.reshape(*rows.shape[:2], *(1,) * (rows.dim() - 2)), rows, 0)
 
     def count_impulses(self) -> None:
-        """From here on count the impulses of the material on boundaries and walls; see `torch_mpm.impulses`."""
+        """Count the impulses of the material on boundaries and walls from now on; see `torch_mpm.impulses`."""
         self.state, self._before = self.step.with_impulses(self.state), None
 
     def forces(self) -> Impulses:
         """Mean force [N] and torque [N m] on boundaries and walls over the latest `advance`; zero in frozen scenes.
 
         Raises:
-            ValueError: where impulses are not counted, or nothing has been advanced since they are.
+            ValueError: where impulses are not counted, or no step was computed since they are.
         """
         if self._before is None:
             raise ValueError("impulses must be counted (count_impulses) when scenes are advanced, got none")
@@ -303,7 +304,7 @@ class Environments:
     # -- files
 
     def save(self, path: str | Path, k: int | None = None) -> None:
-        """All scenes, or scene k alone, in an HDF5 file with checksums; needs h5py."""
+        """Write all scenes, or scene k only, to an HDF5 file with checksums; needs h5py."""
         from .scene.checkpoint import save, tensors_of
 
         if k is None:
@@ -316,7 +317,7 @@ class Environments:
 
     @torch.no_grad()
     def load(self, path: str | Path, k: int | None = None) -> None:
-        """What `save` wrote: all scenes, of as many rows; or one, which takes the place of scene k.
+        """Read a file of `save`: all scenes, with equal numbers of rows; or one, which replaces scene k.
 
         Raises:
             DamagedFileError: for a file that is damaged or holds something else.
@@ -348,7 +349,7 @@ class Environments:
 
 
 def _in_room(state: State, room: int) -> State:
-    """With absent particles at the end, which stand where the first one does."""
+    """State with absent particles at the end, at the position of the first particle."""
     count = len(state)
     if count == 0:
         raise ValueError("states must have at least one particle each, got none")
@@ -364,10 +365,10 @@ def _in_room(state: State, room: int) -> State:
 
 
 def _pairs(state: State, given: State) -> list[tuple[str, Tensor, Tensor]]:
-    """The fields of two states of the same kind by name."""
+    """Fields of two states of the same form by name."""
     if (given.x.dtype, given.x.device) != (state.x.dtype, state.x.device):
         raise ValueError(f"states must be {state.x.dtype} on {state.x.device}, got {given.x.dtype} on {given.x.device}")
-    if (state.x_residual is None) != (given.x_residual is None):  # which steps add where they need it
+    if (state.x_residual is None) != (given.x_residual is None):  # Steps add these where needed.
         given = given.replace(x_residual=None if state.x_residual is None else torch.zeros_like(given.x))
     old, new = ({name: getattr(s, name) for name in PARTICLE_FIELDS} | s.extra for s in (state, given))
     for name in dict.fromkeys([*old, *new]):
@@ -384,5 +385,5 @@ def _pairs(state: State, given: State) -> list[tuple[str, Tensor, Tensor]]:
 
 
 def _rows_of(index: Tensor, room: int) -> Tensor:
-    """The rows of scenes [n] as one index [n R]."""
+    """Rows of scenes [n] as one index [n R]."""
     return (index[:, None] * room + torch.arange(room, device=index.device)).reshape(-1)

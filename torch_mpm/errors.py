@@ -1,4 +1,4 @@
-"""Errors with a message that says what to do, and the checks of arguments that many functions share."""
+"""Errors with messages that state a remedy, and the checks of arguments that many functions share."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ LARGEST = {dtype: torch.finfo(dtype).max for dtype in FLOATING}
 
 
 def default_dtype() -> torch.dtype:
-    """torch's default dtype, or float32 if that is a half precision, too coarse for positions."""
+    """Default dtype of torch, or float32 if that is a half precision, too coarse for positions."""
     dtype = torch.get_default_dtype()
     return dtype if dtype in FLOATING else torch.float32
 
 
 class SimulationError(RuntimeError):
-    """The state of a simulation is no longer meaningful: a particle left the grid, is not finite, or is inverted.
+    """Invalid state of a simulation: a particle left the grid, is not finite, or is inverted.
 
     Attributes:
-        failures: `Failures` of the scenes, as `Step.failures` gives them; None where they are not known.
+        failures: `Failures` of the scenes, as returned by `Step.failures`; None where unknown.
     """
 
     def __init__(self, message: str, failures: Failures | None = None) -> None:
@@ -36,11 +36,11 @@ class SimulationError(RuntimeError):
 
 
 class GridOverflowError(SimulationError):
-    """More blocks are active than the grid has room for."""
+    """More active blocks than `max_blocks` of the grid."""
 
 
 class PrecisionWarning(UserWarning):
-    """Numbers of the chosen dtype are too coarse for what is computed with them."""
+    """The precision of the chosen dtype is too coarse for the computation."""
 
 
 class FrontWarning(UserWarning):
@@ -52,7 +52,7 @@ class LockingWarning(UserWarning):
 
 
 class DamagedFileError(ValueError):
-    """A file of a run is damaged, was changed by another program, or is of another kind."""
+    """File of a run that is damaged, was changed by another program, or is of another kind."""
 
     def __init__(self, path: object, problem: str, remedy: str) -> None:
         super().__init__(f"{path}: {problem}; {remedy}")
@@ -70,7 +70,7 @@ NUMBER_OR_TENSOR = "a number or a tensor"
 
 
 def check_real(name: str, value: Any, kinds: str = "a number") -> float:
-    """A number that a float can hold, infinity and NaN among them; `kinds` says in words what else there may be."""
+    """A number that a float can hold, including infinity and NaN; `kinds` describes other accepted types."""
     if not isinstance(value, REAL):
         raise TypeError(f"{name} must be {kinds}, got {_described(value)}")
     if isinstance(value, int) and abs(value) > LARGEST[torch.float64]:
@@ -85,14 +85,14 @@ def check_number(
     holds: Callable[[float], bool] = math.isfinite,
     kinds: str = "a number",
 ) -> float:
-    """A number for which `holds` is true; `expected` describes it in words."""
+    """A number for which `holds` is true; `expected` describes it."""
     if not holds(check_real(name, value, kinds)):
         raise ValueError(f"{name} must be {expected}, got {value}")
     return value
 
 
 def check_count(name: str, value: Any, least: int = 0) -> int:
-    """A whole number, not a bool."""
+    """An integer, not a bool."""
     if isinstance(value, bool) or not isinstance(value, (numbers.Integral, torch.SymInt)):
         raise TypeError(f"{name} must be a whole number, got {_described(value)}")
     if value < least:
@@ -117,7 +117,7 @@ def check_dtype(dtype: Any) -> None:
 
 
 def check_device(device: Any) -> None:
-    """A device, or None; torch decides which ones are valid."""
+    """A device, or None; torch decides which devices are valid."""
     if device is None or isinstance(device, torch.device):
         return
     if isinstance(device, bool) or not isinstance(device, (str, int)):
@@ -164,7 +164,7 @@ def check_positions(x: Tensor, dim: int, scene: Tensor | None, scenes: int) -> N
 
 
 def check_particles(x: Tensor, blocks: Any) -> None:
-    """The positions of the particles for which blocks were activated, as far as their number tells."""
+    """Check that positions belong to the particles of an activation, as far as their number shows."""
     check_positions(x, blocks.grid.dim, blocks.scene, blocks.grid.scenes)
     if x.shape[0] != blocks.index.shape[0]:
         expected = f"[P, D] = [{blocks.index.shape[0]}, {blocks.grid.dim}]"
@@ -172,7 +172,7 @@ def check_particles(x: Tensor, blocks: Any) -> None:
 
 
 def check_index(name: str, index: Tensor | None, x: Tensor, dtype: torch.dtype = torch.int32, of: str = "x") -> None:
-    """Check an optional whole number of each particle [P] against a particle tensor that messages call `of`."""
+    """Check an optional integer per particle [P] against a particle tensor that messages call `of`."""
     if index is None:
         return
     if not isinstance(index, Tensor) or index.shape != x.shape[:1]:
@@ -187,7 +187,8 @@ def check_like(
     name: str, value: Tensor | None, x: Tensor, shape: tuple[int, ...], symbols: str, needed: bool = False
 ) -> None:
     """Check a floating tensor against x, which may be absent unless it is `needed`; `symbols` names its shape in the
-    message."""
+    message.
+    """
     if value is None and not needed:
         return
     if not isinstance(value, Tensor) or value.shape != shape:

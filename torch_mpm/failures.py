@@ -1,4 +1,4 @@
-"""What went wrong in which scene: recorded on the device without waiting for it, and described in words."""
+"""Failures of scenes: recorded on the device without waiting for it, and described in words."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ if TYPE_CHECKING:
     from .laws.material import Material
 
 NAMED = 12
-"""Scenes that a message names of each kind of problem."""
+"""Number of scenes that a message names for each kind of problem."""
 LOST = "not_finite"
 CONSEQUENCES = ("velocity", "deformation")
-"""Kinds that a message leaves out where a scene has another problem, of which they mostly are consequences."""
+"""Kinds that a message omits where a scene has another problem, since they mostly are consequences of it."""
 CHECK_DT = "the time step was probably too large; compare dt with step.stable_dt(state)"
 
 
@@ -30,13 +30,13 @@ class Problem:
     """One kind of problem in each of B scenes; tensors [B] on the device of the particles.
 
     Attributes:
-        count: how many: particles when it was found first; steps so far for "dt", solves so far for "heat". 0 for none.
-        what, advice: words for the problem and for what to do.
-        first: lowest index of these particles then, -1 for none; None for what is not about particles.
-        id: id of that particle, its index where the state had no ids.
-        step: in which step it was found first, counted from 0, -1 for none; None where this is not known.
-        size: how large the worst one is, and
-        size_in_words: a format for it.
+        count: number: of particles when first found; of steps so far for "dt", of solves so far for "heat". 0 for none.
+        what, advice: description of the problem and of the remedy.
+        first: lowest index of these particles, -1 for none; None for problems that do not concern particles.
+        id: id of that particle, or its index where the state had no ids.
+        step: step in which it was first found, counted from 0, -1 for none; None where unknown.
+        size: size of the worst one.
+        size_in_words: format of the size.
     """
 
     count: Tensor
@@ -49,7 +49,7 @@ class Problem:
     size_in_words: str = ""
 
     def told(self, others: Sequence[bool]) -> str:
-        """A sentence about the scenes that have it, but not about `others`; "" for none. Synchronises."""
+        """Sentence about the affected scenes, except `others`; "" for none. Synchronises."""
         counts = self.count.tolist()
         scenes = [b for b, count in enumerate(counts) if count and not others[b]]
         if not scenes:
@@ -72,19 +72,19 @@ class Problem:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Failures:
-    """Which scenes went wrong, and how.
+    """Failed scenes and their problems.
 
     Attributes:
         failed: whether a scene has any problem, bool [B] on the device of the particles.
-        given: by field, what was NaN or infinite in the first state that the step got; no problems by themselves, but
-            the cause of later ones.
-        problems: each kind that was looked for:
+        given: NaN or infinite entries of the first state of the step, by field; not problems themselves, but the cause
+            of later ones.
+        problems: each kind that was checked:
             "not_finite": particles whose position is NaN or infinite,
             "outside": particles that left the grid,
             "dt": steps whose entry of a tensor dt was negative or NaN,
-            "pose": obstacles whose pose was assigned, but is not the one that their velocity has led to,
+            "pose": obstacles with an assigned pose that differs from the result of their velocity,
             "heat_data", "heat": solves of heat without a result, or that missed their tolerance,
-            and of the state given "mass", "volume", "velocity" and "deformation".
+            and in the given state "mass", "volume", "velocity" and "deformation".
     """
 
     failed: Tensor
@@ -101,7 +101,7 @@ class Failures:
         return Failures(failed, problems, given or {})
 
     def sentences(self) -> list[str]:
-        """One for each kind of problem found; synchronises."""
+        """A sentence for each kind of problem found; synchronises."""
         told, explained = self._of_given()
         others = list(explained)
         for kind, problem in sorted(self.problems.items(), key=lambda item: item[0] in CONSEQUENCES):
@@ -113,7 +113,9 @@ class Failures:
         return told
 
     def _of_given(self) -> tuple[list[str], list[bool]]:
-        """Sentences about the first state, in scenes that went wrong as by a large time step; and which it explains."""
+        """Sentences about the first state, in scenes with failures like those of a large time step; and the kinds it
+        explains.
+        """
         fine = [True] * len(self.failed)
         for kind in (LOST, *CONSEQUENCES):
             if kind in self.problems:
@@ -128,7 +130,7 @@ class Failures:
 
 
 def problems_of_status(statuses: Iterable[Tensor], grid: Grid) -> dict[str, Problem]:
-    """Problems of scenes in status tensors [1 + B, 8] of `activate`; of each scene the first one counts."""
+    """Problems of scenes in status tensors [1 + B, 8] of `activate`; the first one of each scene counts."""
     rows: Tensor | None = None
     for status in statuses:
         known = status[1:] if rows is None else rows
@@ -159,11 +161,11 @@ def problems_of_status(statuses: Iterable[Tensor], grid: Grid) -> dict[str, Prob
 
 
 def problem_of_particles(state: State, scenes: int, bad: Tensor, what: str, advice: str) -> Problem:
-    """The problem of the particles of a mask, bool [P], in each scene."""
+    """Problem of the particles of a mask, bool [P], in each scene."""
     index = torch.arange(len(state), device=bad.device)
     scene = torch.zeros_like(index) if state.scene is None else state.scene.long()
     bad = bad & (scene >= 0) & (scene < scenes)
-    scene = torch.where(bad, scene, scenes)  # the rest goes to a scene that is cut off
+    scene = torch.where(bad, scene, scenes)  # Other entries go to an extra scene, which is cut off.
     count = index.new_zeros(scenes + 1).index_add_(0, scene, bad.long())[:-1]
     first = index.new_full((scenes + 1,), len(state)).scatter_reduce_(0, scene, index, "amin")[:-1]
     first = torch.where(count > 0, first, -1)
@@ -174,13 +176,13 @@ def problem_of_particles(state: State, scenes: int, bad: Tensor, what: str, advi
 
 
 def problems_of_first_state(state: State, scenes: int) -> dict[str, Problem]:
-    """What is NaN or infinite in the state that a step gets first, by field. A device is not waited for."""
+    """NaN or infinite entries of the first state of a step, by field. Does not wait for the device."""
     problems = {}
     fields = {name: getattr(state, name) for name in PARTICLE_FIELDS} | state.extra
     for name, value in fields.items():
         if value is None or not value.is_floating_point():
             continue
-        nothing = 0 * value.detach()  # or NaN
+        nothing = 0 * value.detach()  # Also NaN.
         bad = ~(nothing.flatten(1).sum(1) if nothing.dim() > 1 else nothing).eq(0)
         if bad.device.type != "cpu" or bool(bad.any()):
             problems[name] = problem_of_particles(
@@ -194,7 +196,7 @@ def problems_of_first_state(state: State, scenes: int) -> dict[str, Problem]:
 
 
 def problems_of_state(law: Material, state: State, scenes: int, taken: bool = True) -> dict[str, Problem]:
-    """Problems of a state that has all fields that the law needs, before or after steps were taken."""
+    """Problems of a state that has all fields that the law needs, before or after steps."""
 
     def problem(bad: Tensor, what: str, advice: str) -> Problem:
         return problem_of_particles(state, scenes, bad, what, advice)
@@ -229,7 +231,7 @@ def problems_of_state(law: Material, state: State, scenes: int, taken: bool = Tr
 
 
 def refused_steps(count: Tensor) -> Problem:
-    """Steps of each scene [B] whose dt could not be taken."""
+    """Number of steps of each scene [B] with an invalid dt."""
     return Problem(
         count,
         "steps had a dt that was negative or NaN, so that the scene was paused",
@@ -238,7 +240,9 @@ def refused_steps(count: Tensor) -> Problem:
 
 
 def contradicted_poses(count: Tensor) -> Problem:
-    """Obstacles of each scene [B], added up over calls, that were elsewhere than their velocity has led them."""
+    """Number of obstacles of each scene [B], accumulated over calls, with a pose that differs from the result of their
+    velocity.
+    """
     return Problem(
         count,
         "obstacles were assigned a pose while they have a velocity, but are not where it has led them",
@@ -279,9 +283,9 @@ def unsolved_steps(unsolved: Tensor, residual: Tensor) -> dict[str, Problem]:
 
 
 def _full_grid(grid: Grid, peak: int, when: str, comes_first: bool) -> str:
-    """A sentence about a grid that had no room for the most active blocks, `peak`; "" where it had.
+    """Sentence about a grid with too few blocks for the largest number of active blocks, `peak`; "" otherwise.
 
-    A pool that grows may be larger by now: there the status alone remembers, if this `comes_first` of all problems.
+    A pool that grows may be larger by now: then the status alone records it, if this `comes_first` of all problems.
     """
     if grid.grows and comes_first:
         return (
@@ -304,11 +308,11 @@ def raise_failures(failures: Failures, statuses: Iterable[Tensor], grid: Grid) -
         GridOverflowError: where a full grid is the only problem.
     """
     sentences, full = failures.sentences(), ""
-    for status in statuses:  # of which the later ones go on from the others
+    for status in statuses:  # The later ones continue from the others.
         total, *scenes = status.tolist()
         peak, outside, _, lost, _, _, step, _ = total
         for row in scenes:
-            if row[6] == step:  # found in the same activation, so counted there too
+            if row[6] == step:  # Found in the same activation, so counted there too.
                 outside, lost = outside - row[1], lost - row[3]
         if outside + lost > 0:
             sentences.append(

@@ -1,4 +1,4 @@
-"""Checks of the files that users name: regular files of a bounded size, so that nothing is read without an end."""
+"""Checks of the files that users name: regular files of a bounded size, so that no read is unbounded."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ KINDS = {
 
 
 def check_file(path: str | Path, kind: str, largest: int | None = LARGEST) -> None:
-    """Raise for a path that is no regular file, that cannot be read, or that is too large. Links are followed.
+    """Raise unless a path is a readable regular file of bounded size. Links are followed.
 
     Args:
         path: the file.
-        kind: what it holds, for messages, such as "mesh".
-        largest: size [bytes], None for any; a larger `TORCH_MPM_LARGEST_FILE` in the environment counts instead.
+        kind: its content, for messages, such as "mesh".
+        largest: maximum size [bytes], None for any; a larger `TORCH_MPM_LARGEST_FILE` in the environment overrides it.
 
     Raises:
-        OSError: with the path; FileNotFoundError, IsADirectoryError and PermissionError among them.
+        OSError: with the path; also as FileNotFoundError, IsADirectoryError or PermissionError.
     """
     try:
         status = os.stat(path)
@@ -38,7 +38,7 @@ def check_file(path: str | Path, kind: str, largest: int | None = LARGEST) -> No
             open(path, "rb").close()
     except FileNotFoundError:
         raise FileNotFoundError(f"{kind} file {path} does not exist") from None
-    except (OSError, ValueError) as error:  # ValueError: a null character in the name
+    except (OSError, ValueError) as error:  # ValueError: a null character in the name.
         raise PermissionError(f"{kind} file {path} cannot be read: {error}") from None
     if stat.S_ISDIR(status.st_mode):
         raise IsADirectoryError(f"{kind} file {path} is a folder")
@@ -57,7 +57,7 @@ def read_text(path: str | Path, kind: str) -> str:
 
     Raises:
         OSError: as `check_file`.
-        UnicodeDecodeError: for a file that is no UTF-8.
+        UnicodeDecodeError: for a file that is not UTF-8.
     """
     check_file(path, kind, LARGEST_TEXT)
     return Path(path).read_text(encoding="utf-8")

@@ -1,4 +1,4 @@
-"""Norms of the gradients inside a rollout, for each scene: whether they grow or vanish, and where to cut them."""
+"""Norms of the gradients inside a rollout, for each scene: their growth or decay, and where to truncate them."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ MOVED = ("x", "v", "C", "F", "J", "temperature")
 
 
 class GradientNorms:
-    """A record of the gradient of the loss by the states of a rollout: `rollout(..., norms=GradientNorms())`.
+    """Record of the gradient of the loss by the states of a rollout: `rollout(..., norms=GradientNorms())`.
 
     Args:
-        every: steps from one recorded state to the next. A rollout keeps every recorded state.
+        every: steps between two recorded states. A rollout stores every recorded state.
 
-    The backward pass fills it, without waiting for a device; the next rollout with it begins anew. A norm is NaN for
-    what needs no gradient, zero where no gradient has come, and infinite for a gradient that is not finite.
+    The backward pass fills it, without waiting for the device; the next rollout with it starts a new record. A norm is
+    NaN for fields that need no gradient, zero for those without one, and infinite for a gradient that is not finite.
 
     Raises:
-        TypeError, ValueError: for an `every` that is no whole number from 1 on.
+        TypeError, ValueError: unless `every` is a positive integer.
     """
 
     def __init__(self, every: int = 1) -> None:
@@ -37,14 +37,14 @@ class GradientNorms:
         self._units: dict[str, Any] = {}
         self._scenes = 1
 
-    # ---- what a rollout does
+    # ---- in a rollout
 
     def points(self, first: int, n: int) -> list[int]:
-        """The steps whose states are recorded, and n for the end."""
+        """Steps whose states are recorded, and n for the end."""
         return [*range(first, n, self.every), n]
 
     def start(self, steps: Sequence[int], scenes: int, dx: float, dt: float | Tensor) -> None:
-        """Begin a record.
+        """Start a record.
 
         Args:
             steps: numbers of steps before the recorded states.
@@ -55,8 +55,8 @@ class GradientNorms:
         self._steps, self._scenes, self._fields = list(steps), scenes, {}
         rate: Any
         if not isinstance(dt, Tensor):
-            rate = 1 / dt if dt else 0.0  # which the step refuses
-        else:  # of which paused scenes have zero
+            rate = 1 / dt if dt else 0.0  # The step refuses it.
+        else:  # Paused scenes have zero.
             rate = torch.where(dt > 0, 1 / dt.double(), 0).detach().reshape(-1)
         self._units = {"x": dx, "v": dx * rate, "C": rate}
 
@@ -75,12 +75,13 @@ class GradientNorms:
 
             @torch.no_grad()
             def record(grad: Tensor | None) -> None:
-                if grad is None:  # of an output among others that have one
+                if grad is None:  # An output without a gradient among others with one.
                     return
                 squares = grad.double().square().reshape(len(grad), math.prod(grad.shape[1:])).sum(1)
                 norms[row] = sum_by_scene(squares, scene, self._scenes).sqrt().nan_to_num(math.inf, posinf=math.inf)
 
-            if t.is_leaf or k == self._steps[0]:  # the user's, with whom hooks would stay, and who may use it elsewhere
+            # A user's tensor, which would keep the hooks and may be used elsewhere.
+            if t.is_leaf or k == self._steps[0]:
                 t = t.view_as(t)
             t.register_hook(record)
             return t
@@ -89,7 +90,7 @@ class GradientNorms:
         history = {name: t if t.is_leaf else watch(name, t) for name, t in state.extra.items()}
         return state.replace(**changes, extra=history)
 
-    # ---- what it tells
+    # ---- results
 
     @property
     def steps(self) -> list[int]:
@@ -98,15 +99,15 @@ class GradientNorms:
 
     @property
     def fields(self) -> dict[str, Tensor]:
-        """Norm of the gradient by each field of the states [K, B], in units of the loss over those of the field."""
+        """Norm of the gradient by each field of the states [K, B], in units of the loss per unit of the field."""
         return self._fields
 
     def total(self) -> Tensor:
         """Root of the sum of squares over x, v, C, F, J, temperature and history [K, B], in units of the loss.
 
-        They are made comparable by what a step can change: of x a node distance, of v a node distance over a time step,
-        of C one over a time step, of all others one. NaN where a field that has a gradient elsewhere needs none, as at
-        the start.
+        Fields are scaled by the possible change in a step: x by a node distance, v by a node distance per time step, C
+        by one per time step, all others by one. NaN where a field that has a gradient elsewhere needs none, as at the
+        start.
         """
         if not self._fields:
             return torch.full((len(self._steps), self._scenes), torch.nan, dtype=torch.float64, device="cpu")
@@ -114,15 +115,16 @@ class GradientNorms:
         return scaled.square().sum(0).sqrt()
 
     def truncation(self, growth: float = 100.0) -> int | None:
-        """A `truncate` for such rollouts: steps back from the end after which gradients tell little.
+        """Value of `truncate` for such rollouts: steps back from the end beyond which gradients carry little
+        information.
 
         Args:
-            growth: above 1. A gradient that is so much larger than at the end comes of chaos more than of the cause;
-                one that stays so much smaller from there on adds nothing.
+            growth: above 1. A gradient larger by this factor than at the end results from chaos; gradients that stay
+                smaller by this factor contribute nothing.
 
         Returns:
-            The number of steps back from the end to the first such state in any scene, at least 1; None where all
-            recorded gradients are within the bounds. Synchronises.
+            Number of steps back from the end to the first such state in any scene, at least 1; None where all recorded
+            gradients are within the bounds. Synchronises.
 
         Raises:
             ValueError: for a `growth` of 1 or less, or before a backward pass.
@@ -137,11 +139,11 @@ class GradientNorms:
 
 
 def _length(norms: Tensor, steps: Sequence[int], growth: float) -> int | None:
-    """Steps back from the end to the first state whose gradient is too large, or stays too small."""
+    """Steps back from the end to the first state with a gradient that is too large, or stays too small."""
     back = [(steps[-1] - k, v) for k, v in zip(steps, norms.tolist(), strict=True) if v == v][::-1]
     reference = next((v for _, v in back if v > 0), 0.0)
     lengths = [length for length, v in back if v > growth * reference][:1]
-    tail = 0  # of gradients that stay small
+    tail = 0  # Gradients that stay small.
     while tail < len(back) and back[len(back) - 1 - tail][1] * growth < reference:
         tail += 1
     lengths += [length for length, _ in back[len(back) - tail :]][:1]

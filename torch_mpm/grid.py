@@ -1,4 +1,4 @@
-"""The node lattice of a simulation, and its blocks that particles touch."""
+"""Node lattice of a simulation, and its active blocks."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ from .topology import BLOCK_WIDTH, PADDING, Lattice, Status, Topology
 
 INT32_MAX = 2**31 - 1
 STATUS_SIZE = 8
-"""Numbers of a row of a status, csrc/grid/status.h."""
+"""Numbers per row of a status, csrc/grid/status.h."""
 KERNEL_ORDERS = {"quadratic": 2, "cubic": 3}
 
 
 class _Pools(threading.local):
-    """In a thread: sizes of pools that `same_pools` replays, the lists that it writes, and what grids had before."""
+    """Per thread: sizes of pools that `same_pools` replays, the lists that it writes, and previous sizes of grids."""
 
     def __init__(self) -> None:
         self.replayed: Iterator[int] | None = None
@@ -48,20 +48,20 @@ _POOLS = _Pools()
 class Grid(Lattice):
     """A regular lattice with node i of an axis at `lower + (i - 3) dx`, shared by all scenes of a batch.
 
-    Memory is taken only for blocks of 4^D nodes that particles touch, from a pool of `max_blocks` blocks.
+    Memory is allocated only for active blocks of 4^D nodes, from a pool of `max_blocks` blocks.
 
     Args:
         dx: node distance [m].
         lower, upper: corners of the domain [m], 2 or 3 numbers. Particles between them have their whole support; a
-            particle more than a cell outside is left out of the transfers and reported. Far from zero, choose an
+            particle more than a cell outside is excluded from the transfers and reported. Far from zero, choose an
             origin near the bodies (`torch_mpm.seed`) and give all coordinates relative to it.
-        scenes: number of scenes B in a batch; each has the whole lattice to itself.
+        scenes: number of scenes B in a batch; each has a separate lattice.
         kernel: "quadratic" or "cubic" B-spline.
-        max_blocks: blocks in the pool; rollouts take memory for blocks around those, too, half as many again on CUDA
-            and twice as many on the CPU. None measures it from the positions of the first activation, and lets it grow
-            with the scene: at once on the CPU; on CUDA, without synchronising, when less than a quarter is left.
+        max_blocks: blocks in the pool; rollouts also allocate memory for surrounding blocks, half as many again on CUDA
+            and twice as many on the CPU. None measures it from the positions of the first activation, and grows with
+            the scene: at once on the CPU; on CUDA, without synchronising, when less than a quarter is left.
         deterministic: bit-identical results from run to run on CUDA too (the CPU always is). A pool that has grown with
-            a scene is part of what a run begins with: give each run a grid of its own.
+            a scene affects later runs: give each run a separate grid.
 
     The first use with positions of a dtype warns (`PrecisionWarning`) where their rounding exceeds dx / 1000, and
     raises ValueError where it exceeds dx / 16.
@@ -72,7 +72,7 @@ class Grid(Lattice):
 
     Raises:
         TypeError, ValueError: for a wrong argument, a lattice of 2^31 blocks or more, or a domain so far from zero that
-            not even float64 resolves dx.
+            even float64 does not resolve dx.
     """
 
     def __init__(
@@ -122,7 +122,7 @@ class Grid(Lattice):
         self._on_host: Tensor | None = None
 
     def __getstate__(self) -> dict[str, Any]:
-        """For copies: without what is on its way from the device, which neither copies nor pickles."""
+        """State for copies, without pending transfers from the device, which can be neither copied nor pickled."""
         return {**self.__dict__, "_pending": None, "_on_host": None}
 
     def __repr__(self) -> str:
@@ -134,21 +134,21 @@ class Grid(Lattice):
     def activate(
         self, x: Tensor, scene: Tensor | None = None, previous: Tensor | None = None, ids: Tensor | None = None
     ) -> Blocks:
-        """Find the blocks that particles touch.
+        """Find the active blocks.
 
         Args:
             x: positions [P, D] [m], float32 or float64.
             scene: scene of each particle, int32 [P]; None where the grid has one scene.
-            previous: status of the activation before, to be carried on.
+            previous: status of the previous activation, to be continued.
             ids: identity of each particle, int64 [P], for the status; None for its index.
 
         Returns:
-            The active blocks. On CUDA nothing is synchronised, except at the very first call without `max_blocks`.
+            The active blocks. On CUDA there is no synchronisation, except in the first call without `max_blocks`.
 
         Raises:
             ValueError, TypeError: for wrong shapes, dtypes or devices.
             ValueError: where positions of this dtype do not resolve the cells (`check_resolution`).
-            GridOverflowError: on the CPU, where a fixed `max_blocks` is too small. On CUDA the status tells
+            GridOverflowError: on the CPU, where a fixed `max_blocks` is too small. On CUDA the status records it
                 (`Step.check`).
         """
         check_positions(x, self.dim, scene, self.scenes)
@@ -164,7 +164,7 @@ class Grid(Lattice):
         return blocks
 
     def rounding(self, dtype: torch.dtype) -> float:
-        """Largest error with which positions of a dtype in the domain are stored [m]."""
+        """Largest rounding error of positions of a dtype in the domain [m]."""
         return self._rounding[dtype]
 
     def check_resolution(self, dtype: torch.dtype) -> None:
@@ -182,11 +182,11 @@ class Grid(Lattice):
 
     @property
     def grows(self) -> bool:
-        """Whether `max_blocks` follows the scene."""
+        """Whether `max_blocks` adapts to the scene."""
         return self._grows
 
     def pool(self, x: Tensor, scene: Tensor | None) -> int:
-        """The blocks of the pool of the next activation."""
+        """Number of blocks in the pool of the next activation."""
         compiling = torch.compiler.is_compiling()
         if not compiling:
             self.check_resolution(x.dtype)
@@ -202,7 +202,7 @@ class Grid(Lattice):
         return self.max_blocks
 
     def follow(self, wanted: int) -> int:
-        """The blocks of a pool that has room for as many as an activation on the CPU wanted.
+        """Number of blocks of a pool large enough for an activation on the CPU.
 
         Raises:
             GridOverflowError: where `max_blocks` is fixed and too small.
@@ -226,7 +226,7 @@ class Grid(Lattice):
         return Blocks(self, table, block, offsets, index, schedule, scene, status)
 
     def _grow(self, x: Tensor, scene: Tensor | None) -> None:
-        """Keep `max_blocks` ahead of the blocks wanted; reads the device only at the first call."""
+        """Increase `max_blocks` ahead of the required blocks; reads the device only in the first call."""
         if self.max_blocks is None:
             if is_traced(x):
                 raise ValueError(
@@ -235,9 +235,10 @@ class Grid(Lattice):
             wanted = self._activate(x, scene, None, 0).wanted
             self.max_blocks = min(_with_headroom(wanted), self._most_blocks)
         elif (
-            not torch.compiler.is_compiling()  # first: a compiled step would keep hold of an event that goes
+            # This comes first: a compiled step would hold a reference to a temporary event.
+            not torch.compiler.is_compiling()
             and self._pending is not None
-            and not is_captured(x)  # a query would break the capture
+            and not is_captured(x)  # A query would break the capture.
             and self._pending.query()
         ):
             assert self._on_host is not None
@@ -247,14 +248,14 @@ class Grid(Lattice):
             self._pending = None
 
     def watch(self, status: Tensor) -> None:
-        """Let `max_blocks` follow `status`, an activation's, without waiting for the device."""
-        # As in `_grow`, a compiled step must not come to the event.
+        """Adapt `max_blocks` to the `status` of an activation, without waiting for the device."""
+        # As in `_grow`, a compiled step must not access the event.
         if is_traced(status) or not self._grows or self._pending is not None or status.device.type != "cuda":
             return
         if is_captured(status):
             return
         if self._on_host is None:
-            with torch.inference_mode(False):  # such that a later step may write to it
+            with torch.inference_mode(False):  # A later step may then write to it.
                 shape = status.shape[1:]
                 self._on_host = torch.empty(shape, dtype=status.dtype, device="cpu", pin_memory=True)
         with outside_transforms():
@@ -264,20 +265,20 @@ class Grid(Lattice):
 
     @property
     def watches(self) -> bool:
-        """Whether a device was asked, by `watch`, and the pool does not follow yet what it told."""
+        """Whether a block count requested by `watch` is still pending."""
         return self._pending is not None
 
     def wait(self) -> None:
-        """Wait for what `watch` has asked a device for, so that the next activation has room for what it told."""
+        """Wait for the block count requested by `watch`, so that the next activation has enough blocks."""
         if self._pending is not None:
             self._pending.synchronize()
 
 
 @contextlib.contextmanager
 def same_pools(sizes: list[int]) -> Iterator[None]:
-    """Where the pools of all activations get the sizes in a list, or are written into it where it is empty.
+    """Context in which the pools of all activations get the sizes in a list, or are appended to it where it is empty.
 
-    So steps that the backward pass takes again find pools of the size they had, whatever came later.
+    Recomputed steps of the backward pass thus find pools of the original size, whatever came later.
     """
     if not sizes:
         _POOLS.recordings.append(sizes)
@@ -298,7 +299,7 @@ def same_pools(sizes: list[int]) -> Iterator[None]:
 
 @contextlib.contextmanager
 def own_pools() -> Iterator[None]:
-    """Where `same_pools` around it neither writes down nor gives the sizes of pools."""
+    """Context in which an enclosing `same_pools` neither records nor sets the sizes of pools."""
     replayed, recordings = _POOLS.replayed, _POOLS.recordings
     _POOLS.replayed, _POOLS.recordings = None, []
     try:
@@ -331,13 +332,13 @@ def _with_headroom(blocks: int) -> int:
 
 @dataclasses.dataclass(eq=False)
 class Blocks(Topology):
-    """The active blocks of one activation: N = max_blocks * 4^D node rows, of which those of unused blocks stay zero.
+    """Active blocks of one activation: N = max_blocks * 4^D node rows; rows of unused blocks stay zero.
 
     Attributes:
         grid: the grid that was activated.
         table: slot of every block of every scene, int32 [B * blocks], -1 where inactive.
         block: table index of every slot, int32 [max_blocks], -1 where unused.
-        offsets, index: particles `index[offsets[s]:offsets[s + 1]]` have their base node in the block of slot s, int32.
+        offsets, index: int32; particles `index[offsets[s]:offsets[s + 1]]` have their base node in the block of slot s.
         schedule: order of work of the kernels.
         scene: the scene of each particle, or None.
         status: int32 [1 + B, 8], see csrc/grid/status.h; `Step.check` and `Step.failures` read it.
@@ -348,5 +349,5 @@ class Blocks(Topology):
 
     @property
     def wanted(self) -> int:
-        """Active blocks that this activation wanted, which may be more than it got; synchronises."""
+        """Number of active blocks that this activation needed, which may exceed the pool; synchronises."""
         return int(self.status[0, Status.BLOCKS_NOW])

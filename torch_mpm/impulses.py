@@ -7,10 +7,10 @@
     on["-y"].about((0.5, 0.2))                    # on the lower face of the axis y, moment about a point [N m s]
     force = (on - step.impulses(state)) / (100 * 1e-4)    # mean forces [N] and torques [N m] of an interval
 
-They are exact: what boundaries and walls take and what gravity gives is the change of the momentum of the particles, to
-rounding, in implicit steps to the tolerance of the solve; so too for the angular momentum, where explicit steps and the
-transfer keep it. They are read where the boundaries act, between P2G and G2P, so that `on_grid`, which acts after them,
-is not among them. Differentiable like any field of the state.
+Impulses are exact: those on boundaries and walls and that of gravity balance the change of the momentum of the
+particles, to rounding, in implicit steps to the tolerance of the solve. The same holds for the angular momentum, where
+explicit steps and the transfer conserve it. They are computed where the boundaries act, between P2G and G2P; `on_grid`,
+which acts later, is not included. Differentiable like any field of the state.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ FACES = ("-x", "+x", "-y", "+y", "-z", "+z")
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Impulse:
-    """That of the material on one boundary of each scene.
+    """Impulse of the material on one boundary of each scene.
 
     Attributes:
         linear: [B, D] [N s].
@@ -58,7 +58,7 @@ class Impulse:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Impulses:
-    """Those on all boundaries of a step and all faces of the domain.
+    """Impulses on all boundaries of a step and all faces of the domain.
 
     Attributes:
         values: [B, K + 2 D, D + 1 or 3] [N s, N m s], see `State.impulse`.
@@ -69,7 +69,8 @@ class Impulses:
     boundaries: tuple[Any, ...]
 
     def __getitem__(self, boundary: Any) -> Impulse:
-        """On a boundary of the step, by itself or its number; on a face of the domain, by a name of `FACES`.
+        """Impulse on a boundary of the step, given by itself or its number; or on a face of the domain, given by a name
+        of `FACES`.
 
         Raises:
             KeyError: where there is no such boundary.
@@ -79,7 +80,7 @@ class Impulses:
         return Impulse(values[:, :dim], values[:, dim] if dim == 2 else values[:, dim:])
 
     def __sub__(self, earlier: Impulses) -> Impulses:
-        """Those from an earlier state on."""
+        """Impulses since an earlier state."""
         return Impulses(self.values - earlier.values, self.boundaries)
 
     def __truediv__(self, seconds: float | Tensor) -> Impulses:
@@ -89,7 +90,7 @@ class Impulses:
 
     @property
     def total(self) -> Tensor:
-        """Of all boundaries and faces together, linear [B, D] [N s]."""
+        """Sum over all boundaries and faces, linear [B, D] [N s]."""
         return self.values[..., : self._dim].sum(1)
 
     @property
@@ -112,7 +113,7 @@ class Impulses:
 
 
 def no_impulse(step: Step, x: Tensor) -> Tensor:
-    """The impulses of a state that begins to count them."""
+    """Impulses of a state at the start of the count."""
     return torch.zeros(_shape(step), dtype=torch.float64, device=x.device)
 
 

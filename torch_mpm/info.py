@@ -1,4 +1,4 @@
-"""What this installation of torch_mpm was built from and which devices it can use."""
+"""Build configuration and usable devices of this installation of torch_mpm."""
 
 from __future__ import annotations
 

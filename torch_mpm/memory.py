@@ -1,4 +1,4 @@
-"""Memory that this process may still take, and errors of those who found too little of it."""
+"""Memory available to this process, and errors of exhausted memory."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ LIMITS = (
     ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory.current"),
     ("/sys/fs/cgroup/memory/memory.limit_in_bytes", "/sys/fs/cgroup/memory/memory.usage_in_bytes"),
 )
-"""Files with the limit of a container (cgroup versions 2 and 1) and what it uses."""
+"""Files with the limit of a container (cgroup versions 2 and 1) and its usage."""
 
 
 SHORTAGE = re.compile(
@@ -22,13 +22,13 @@ SHORTAGE = re.compile(
     r"failed to map segment|can't allocate|unable to allocate|can't start new thread|cannot allocate",
     re.IGNORECASE,
 )
-"""What libraries say where memory is short: C, the dynamic linker, C++, NumPy, torch, HDF5, Python."""
+"""Messages of exhausted memory: C, the dynamic linker, C++, NumPy, torch, HDF5, Python."""
 WANTED = re.compile(r"you tried to allocate (\d+) bytes")
-"""In torch's message."""
+"""Pattern in torch's message."""
 
 
 def available() -> float:
-    """Memory that can be allocated without swapping [bytes]; infinite where the system does not say."""
+    """Memory that can be allocated without swapping [bytes]; infinite where unknown."""
     return min(_of_machine(), _of_process(), *(_of_container(*files) for files in LIMITS))
 
 
@@ -39,7 +39,7 @@ def in_words(size: float) -> str:
 
 
 def is_short(error: BaseException | None) -> bool:
-    """Whether an error, or one that it came from, says that memory could not be had."""
+    """Whether an error, or one of its causes, reports exhausted memory."""
     seen: set[int] = set()
     while error is not None and id(error) not in seen:
         seen.add(id(error))
@@ -52,7 +52,7 @@ def is_short(error: BaseException | None) -> bool:
 
 
 def shortage(error: BaseException) -> str:
-    """What was wanted according to an error for which `is_short`, and how much there is, in one line."""
+    """Requested and available memory in one line, for an error for which `is_short`."""
     text = " ".join(str(error).split())
     wanted = WANTED.search(text)
     text = f"{in_words(int(wanted[1]))} were wanted" if wanted else text
@@ -63,7 +63,7 @@ def shortage(error: BaseException) -> str:
 
 
 def require(size: float, purpose: str) -> None:
-    """Raise MemoryError where fewer bytes are available than something is known to take."""
+    """Raise MemoryError where less memory is available than the known requirement."""
     if (free := available()) < size:
         raise MemoryError(f"{purpose} takes about {in_words(size)}, and {in_words(free)} are available")
 
@@ -93,5 +93,5 @@ def _of_machine() -> float:
 def _of_container(limit: str, used: str) -> float:
     try:
         return float(Path(limit).read_text()) - float(Path(used).read_text())
-    except (OSError, ValueError):  # no container, or the word "max"
+    except (OSError, ValueError):  # No container, or the word "max".
         return math.inf

@@ -13,12 +13,12 @@ def load(module: str, purpose: str, extra: str) -> Any:
 
     Args:
         module: such as "scipy.spatial".
-        purpose: what needs it, such as "the repair of a mesh".
-        extra: of torch_mpm that brings it.
+        purpose: the feature that needs it, such as "the repair of a mesh".
+        extra: the extra of torch_mpm that installs it.
 
     Raises:
-        ImportError: for a package that is not installed, or one that is and cannot be imported, with the reason.
-        MemoryError: where there is too little memory to import it.
+        ImportError: for a package that is not installed, or cannot be imported, with the reason.
+        MemoryError: where memory is insufficient to import it.
     """
     package = module.partition(".")[0]
     try:

@@ -1,4 +1,4 @@
-"""Rollouts of particles that lie in memory in no order: sorted before many steps, and put back after them."""
+"""Rollouts of unsorted particles: sorted before many steps, and restored to their order afterwards."""
 
 from __future__ import annotations
 
@@ -13,36 +13,39 @@ from .state import PARTICLE_FIELDS, State, _take_all
 from .step import Step
 
 LEAST_STEPS, LEAST_PARTICLES = 64, 2**15
-"""For which a sort and its way back, together some four steps, are worth it: of particles in no order a step takes up
-to five times as long on a GPU."""
+"""Number of steps from which a sort and its inverse pay; both cost about four steps, and a step of unsorted particles
+takes up to five times as long on a GPU.
+"""
 STEPS_IN_ORDER = 1024
-"""After which they are sorted again."""
+"""Number of steps after which particles are sorted again."""
 
 
 def in_no_order(state: State, n: int) -> bool:
-    """Whether nobody has sorted particles whose n steps may gain by it. Who has (`ids`) does so again in time."""
+    """Whether n steps may gain from a sort, for particles that the user has not sorted. A user who has (`ids`) sorts
+    again in time.
+    """
     return state.ids is None and n >= LEAST_STEPS and len(state) >= LEAST_PARTICLES and wants_order(state.x)
 
 
 def wants_order(x: Tensor) -> bool:
-    """Whether ops do not see to it themselves, as on the CPU."""
+    """Whether ops do not sort by themselves, as they do on the CPU."""
     return x.is_cuda and not is_captured(x)
 
 
 def put_in_order(step: Step, state: State) -> State:
-    """Sorted, with materials that are known to be checked."""
+    """Sorted state, with materials marked as checked."""
     if isinstance(step.law, Mixture):
         step.law.check_material(state)
     return step.sorted(state)
 
 
 def put_back(step: Step, end: State, start: State, given: State) -> State:
-    """A state in the order of `given`, which was sorted to `start`, from which steps led to `end`. Differentiable."""
-    if isinstance(step.law, Mixture):  # which knows of the latest materials alone that they were checked
+    """State in the order of `given`, which was sorted to `start`, from which steps led to `end`. Differentiable."""
+    if isinstance(step.law, Mixture):  # Only the latest materials are known to be checked.
         step.law.reordered(start.material, given.material)
     ids, before, own = start.ids, _tensors(start), _tensors(given)
     assert ids is not None
-    found = {name: own.get(name) for name in _tensors(end)}  # what steps leave as it is
+    found = {name: own.get(name) for name in _tensors(end)}  # Fields that steps do not change.
     moved = {name: t for name, t in _tensors(end).items() if t is not None and t is not before.get(name)}
     place = torch.empty_like(ids).scatter_(0, ids, torch.arange(len(ids), device=ids.device))
     found |= dict(zip(moved, _take_all(list(moved.values()), place), strict=True))
@@ -51,6 +54,6 @@ def put_back(step: Step, end: State, start: State, given: State) -> State:
 
 
 def _tensors(state: State) -> dict[Any, Tensor | None]:
-    """The fields of the particles by name, those of `extra` by (name,)."""
+    """Fields of the particles by name, those of `extra` by (name,)."""
     extra = {(name,): value for name, value in state.extra.items()}
     return {name: getattr(state, name) for name in PARTICLE_FIELDS} | extra

@@ -16,22 +16,23 @@ if TYPE_CHECKING:
     from .state import State
 
 Value = float | Tensor | Callable[[Tensor], Tensor]
-"""A parameter: a number; a tensor [], [1], [B] or [P]; a function of the temperature [P] [K] that returns [P], or a
-`PerMaterial` of these."""
+"""Parameter: a number; a tensor [], [1], [B] or [P]; a function of the temperature [P] [K] that returns [P], or a
+`PerMaterial` of these.
+"""
 
 
 def _knots(name: str, given: Sequence[float] | Tensor) -> Tensor:
-    """Numbers as a tensor on the default device, as modules have their tensors."""
+    """Numbers as a tensor on the default device, as modules store their tensors."""
     if isinstance(given, Tensor):
         return given
     return torch.tensor(check_numbers(f"{name} of a table", given), dtype=torch.float64)
 
 
 def check_knots(name: str, knots: Tensor, of_values: str, values: Tensor) -> None:
-    """That knots [K] increase, and values at them are finite.
+    """Check that knots [K] increase and values at them are finite.
 
     Raises:
-        ValueError: where they do not.
+        ValueError: otherwise.
     """
     if not bool((knots.diff() > 0).all() and knots.isfinite().all()):
         raise ValueError(f"{name} must increase, got {knots.tolist()}")
@@ -80,8 +81,7 @@ class Table(nn.Module):
         return torch.lerp(values[left], values[left + 1], share)
 
     def _like(self, temperature: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Knots, the widths between them and values in the dtype and on the device of temperatures, kept from call to
-        call."""
+        """Knots, intervals and values in the dtype and on the device of temperatures, cached between calls."""
         own = self.temperature, self.value
 
         def make() -> tuple[Tensor, Tensor, Tensor]:
@@ -94,7 +94,7 @@ class Table(nn.Module):
 
 
 class PerMaterial(nn.Module):
-    """A `Value` for each law of a `Mixture`: number k for the particles with state.material = k.
+    """A `Value` for each law of a `Mixture`: value k for the particles with state.material = k.
 
     Args:
         values: numbers, tensors, or functions of temperature, as many as there are laws.
@@ -111,11 +111,11 @@ class PerMaterial(nn.Module):
             store(self, f"value{k}", value)
 
     def values(self) -> list[Value]:
-        """The values, one per material."""
+        """Values, one per material."""
         return [getattr(self, f"value{k}") for k in range(self.count)]
 
     def of(self, name: str, state: State) -> Tensor:
-        """[P], zero for an unknown material.
+        """Values [P], zero for an unknown material.
 
         Raises:
             ValueError: for a state without material.
@@ -129,8 +129,8 @@ class PerMaterial(nn.Module):
 
 
 def check_length(name: str, value: Any, particles: int, scenes: int | None) -> None:
-    """Check the shape of a parameter of B scenes, if it is a tensor or has some; where B is not known, any number of
-    entries passes for [B].
+    """Check the shape of a parameter of B scenes, if it is a tensor or has a shape; where B is unknown, any number of
+    entries is accepted for [B].
 
     Raises:
         ValueError: for a shape that is not [], [1], [B] or [P].
@@ -147,7 +147,9 @@ def check_length(name: str, value: Any, particles: int, scenes: int | None) -> N
 
 
 def needs_no_scenes(value: Tensor, particles: int) -> bool:
-    """Whether a parameter is the same for all particles or one of each, [P], which it also is where P = B."""
+    """Whether a parameter is the same for all particles, or given per particle, [P], which is also assumed where P =
+    B.
+    """
     return value.dim() == 0 or (value.dim() == 1 and value.shape[0] in (1, particles))
 
 
@@ -155,7 +157,7 @@ def evaluate(name: str, value: Value, state: State) -> float | Tensor:
     """A parameter as a number, a tensor of one element, or [P] in the particle order of the state.
 
     Raises:
-        ValueError: where a tensor or what a function returns has another shape, or is on another device.
+        ValueError: where a tensor or the result of a function has another shape, or is on another device.
     """
     P = state.x.shape[0]
     if isinstance(value, PerMaterial):
@@ -187,7 +189,7 @@ def needed_temperature(state: State) -> Tensor:
     """The temperature of a state [P] [K].
 
     Raises:
-        ValueError: where there is none.
+        ValueError: where the state has none.
     """
     temperature: Tensor | None = state.temperature
     if temperature is None:
@@ -196,7 +198,7 @@ def needed_temperature(state: State) -> Tensor:
 
 
 class Overlay:
-    """A state, or part of one, seen with some fields replaced."""
+    """State, or part of one, with some fields replaced."""
 
     def __init__(self, state: Any, **changes: Any) -> None:
         self.__dict__.update(changes)
@@ -207,7 +209,7 @@ class Overlay:
 
 
 def store(module: nn.Module, name: str, value: Any) -> None:
-    """Keep a parameter as number, buffer, nn.Parameter or module, so that `.to` moves it and optimizers find it."""
+    """Store a parameter as number, buffer, nn.Parameter or module, so that `.to` moves it and optimizers find it."""
     if isinstance(value, nn.Parameter):
         module.register_parameter(name, value)
     elif isinstance(value, Tensor):
@@ -217,17 +219,17 @@ def store(module: nn.Module, name: str, value: Any) -> None:
 
 
 def has_hooks(module: nn.Module) -> bool:
-    """Whether something else happens where a module is called."""
+    """Whether hooks run when a module is called."""
     return bool(
         module._forward_hooks or module._forward_pre_hooks or module._backward_hooks or module._backward_pre_hooks
     )
 
 
 class TensorModule(nn.Module):
-    """A module whose tensors are buffers, so that `.to` moves them and a `state_dict` has them.
+    """Module with tensors as buffers, so that `.to` moves them and a `state_dict` contains them.
 
-    Any attribute may be assigned again as something else: a number, a tensor, an nn.Parameter, a module. A subclass
-    need not call `super().__init__`.
+    Any attribute may be reassigned with another type: a number, a tensor, an nn.Parameter, a module. A subclass need
+    not call `super().__init__`.
     """
 
     def __new__(cls, *arguments: Any, **named: Any) -> Any:

@@ -1,6 +1,6 @@
-"""What acts on the particles before they go to the grid: impulses, prescribed velocities, particles that come and go.
+"""Operations on particles before P2G: impulses, prescribed velocities, particles that appear and disappear.
 
-`Step(on_particles=...)` takes one of these, `Operations` for several, or any function or module (state, dt) -> state:
+`Step(on_particles=...)` accepts one of these, `Operations` for several, or any function or module (state, dt) -> state:
 
     def wind(state, dt):
         return state.replace(v=state.v + dt * acceleration)
@@ -28,17 +28,17 @@ from .step_times import time_like
 
 ParticleOperation = Callable[[State, "float | Tensor"], "State | tuple[State, Tensor]"]
 Time = float | Tensor
-"""[s]: a number, or a tensor [] or [P]."""
+"""Time [s]: a number, or a tensor [] or [P]."""
 Vector = Sequence[float] | Tensor | Callable[[float | Tensor], Tensor]
-"""D numbers, a tensor [D] or [P, D], or a function of the time of the state [s] that returns one of these."""
+"""Vector: D numbers, a tensor [D] or [P, D], or a function of the time of the state [s] that returns one of these."""
 
 
 class Timed(TensorModule):
-    """Something that acts on some particles while start ≤ time < end.
+    """Operation on some particles while start ≤ time < end.
 
     Args:
-        start, end: [s]: numbers, or tensors [] or [P].
-        particles: bool [P], the particles that it acts on; None for all.
+        start, end: times [s]: numbers, or tensors [] or [P].
+        particles: bool [P], the affected particles; None for all.
 
     Raises:
         TypeError, ValueError: for a wrong argument; shapes of tensors are checked in use.
@@ -54,7 +54,7 @@ class Timed(TensorModule):
         self.start, self.end, self.particles = start, end, particles
 
     def acting(self, state: State) -> bool | Tensor:
-        """Which particles it acts on now: True or False for all, or bool [] or [P]."""
+        """Particles affected now: True or False for all, or bool [] or [P]."""
         now = self._now(state)
         if self.particles is None or now is False:
             return now
@@ -74,7 +74,7 @@ class Push(Timed):
     """A force on each particle: v ← v + dt f/m.
 
     Args:
-        force: on each particle [N]; see `Vector`.
+        force: force on each particle [N]; see `Vector`.
         start, end, particles: see `Timed`.
     """
 
@@ -93,7 +93,7 @@ class Push(Timed):
 
 
 class Hold(Timed):
-    """A prescribed velocity. `end` as a tensor [P] lets particles go one after another.
+    """Prescribed velocity. `end` as a tensor [P] releases particles one after another.
 
     Args:
         velocity: [m/s]; see `Vector`.
@@ -114,10 +114,10 @@ class Hold(Timed):
 
 
 class Present(Timed):
-    """Particles that are there while start ≤ time < end only, and wait where they are before and after.
+    """Particles that are present only while start ≤ time < end, and stay in place before and after.
 
     Args:
-        start, end, particles: see `Timed`; those that are not among `particles` are always there.
+        start, end, particles: see `Timed`; particles that are not among `particles` are always present.
     """
 
     def forward(self, state: State, dt: float | Tensor) -> State | tuple[State, Tensor]:
@@ -131,7 +131,7 @@ class Present(Timed):
 
 
 class Operations(nn.ModuleList):
-    """Several operations, one after another; a particle is enabled where all of them leave it so.
+    """Several operations, one after another; a particle is enabled if all of them leave it enabled.
 
     Args:
         operations: modules (state, dt) -> state, or (state, enabled).
@@ -147,7 +147,7 @@ class Operations(nn.ModuleList):
 
 
 def operated(operation: ParticleOperation, state: State, dt: float | Tensor) -> tuple[State, Tensor | None]:
-    """What an operation on the particles makes of a state, and which particles it leaves enabled; None for all.
+    """State returned by an operation on the particles, and enabled particles; None for all.
 
     Raises:
         TypeError, ValueError: for another result.
@@ -167,8 +167,8 @@ def operated(operation: ParticleOperation, state: State, dt: float | Tensor) -> 
 
 
 def of_particles(name: str, value: Any, state: State, shape: tuple[int, ...]) -> Any:
-    """A number as it is, or a tensor [], `shape[1:]`, or `shape` = [P, ...], the last in the order of the state; of a
-    part of a state as the whole has it.
+    """A number unchanged, or a tensor [], `shape[1:]`, or `shape` = [P, ...], the last in the order of the state; for a
+    part of a state in the form of the whole.
 
     Raises:
         ValueError: for another shape, or a tensor on another device.

@@ -22,13 +22,14 @@ def paused(
     scenes: int,
     steps: int = 1,
 ) -> State:
-    """`advanced(state, dt)`, but for the scenes that a tensor dt pauses; `record` counts the entries it refuses, once
-    for each of the steps that `advanced` takes."""
+    """`advanced(state, dt)` with scenes paused by a tensor dt; `record` counts its invalid entries, once for each of
+    the steps that `advanced` computes.
+    """
     if not isinstance(dt, Tensor):
         return advanced(state, dt)
-    split_dt(dt, scenes, state.x)  # which checks it
+    split_dt(dt, scenes, state.x)  # checks dt
     if _all_move(dt):
-        record.counts(scenes, dt.device)  # that a compiled step finds it
+        record.counts(scenes, dt.device)  # A compiled step then finds it.
         return advanced(state, dt)
     dt, moving, refused = split_paused(dt, state, scenes)
     record.refuse(refused, scenes, steps)
@@ -39,7 +40,7 @@ def paused(
 
 
 def _all_move(dt: Tensor) -> bool:
-    """Whether no scene is paused, where that is known without waiting for a device."""
+    """Whether no scene is paused, where this is known without waiting for a device."""
     return dt.device.type == "cpu" and not is_traced(dt) and bool((dt > 0).all())
 
 
@@ -52,11 +53,10 @@ def split_paused(dt: Tensor, state: State, scenes: int) -> tuple[Tensor, Tensor,
         scenes: B.
 
     Returns:
-        dt in its shape; which particles move, bool [P]; and which entries of dt were negative or NaN, in the shape of
-        dt.
+        dt in its shape; moving particles, bool [P]; and negative or NaN entries of dt, bool in the shape of dt.
     """
     moving, refused = dt > 0, ~(dt >= 0)
-    if dt.numel() <= 1:  # also the particles of a batch without scenes, which no step moves
+    if dt.numel() <= 1:  # This includes the particles of a batch without scenes, which no step moves.
         particles = moving.reshape(-1)[:1].expand(len(state)) if dt.numel() else dt.new_zeros(len(state)).bool()
     else:
         assert state.scene is not None
@@ -65,9 +65,9 @@ def split_paused(dt: Tensor, state: State, scenes: int) -> tuple[Tensor, Tensor,
 
 
 def standing(before: State, after: State, moving: Tensor) -> State:
-    """The state after a step with every field as before it for the particles that do not move; differentiable.
+    """State after a step with every field unchanged for the particles that do not move; differentiable.
 
-    Fields that the step has made, such as C at the first one, are zero there.
+    Fields that the step has added, such as C in the first one, are zero there.
     """
 
     def field(old: Tensor | None, new: Any) -> Any:

@@ -17,12 +17,12 @@ Value = float | Sequence[float] | Tensor
 
 
 class SceneParameters(TensorModule):
-    """A module whose parameters are numbers or tensors, one for all scenes or one per scene."""
+    """Module whose parameters are numbers or tensors, one for all scenes or one per scene."""
 
     _constants: dict[tuple[str, torch.device, torch.dtype], GraphCache]
 
     RANKS: ClassVar[dict[str, int | None]] = {}
-    """Dimensions of a value of each parameter that may be given per scene; None for that of an angle."""
+    """Number of dimensions of a value of each parameter that may be given per scene; None for that of an angle."""
 
     def __new__(cls, *arguments: Any, **named: Any) -> Any:
         module = super().__new__(cls, *arguments, **named)
@@ -77,7 +77,7 @@ class SceneParameters(TensorModule):
         return value if value.dim() == rank else value[scene if len(value) > 1 else 0]
 
     def _constant(self, name: str, value: Any, like: Tensor) -> Tensor:
-        """Numbers as a tensor; copied to a device once, so that later steps do not wait and can be captured."""
+        """Numbers as a tensor; copied to a device once, so that later steps neither wait nor prevent capture."""
         if isinstance(value, (list, tuple)) and any(isinstance(part, Tensor) for part in value):
             raise TypeError(f"{name} must be numbers or one tensor, got tensors in a list: stack them (torch.stack)")
         if torch.compiler.is_compiling() or type(like) not in (Tensor, torch.nn.Parameter):
@@ -88,8 +88,9 @@ class SceneParameters(TensorModule):
 
 
 def filled(value: Any, like: Tensor) -> Tensor:
-    """Numbers as a tensor with the dtype and device of `like`. A few are filled in on a device, which does not wait for
-    it as a copy from the host does."""
+    """Numbers as a tensor with the dtype and device of `like`. Few numbers are filled in on the device, which does not
+    wait for it as a copy from the host does.
+    """
     numbers = value if isinstance(value, (tuple, list)) else (value,)
     if like.is_cpu or not 0 < len(numbers) <= 3 or not all(isinstance(a, (int, float)) for a in numbers):
         return torch.tensor(value, dtype=like.dtype, device=like.device)
@@ -98,7 +99,7 @@ def filled(value: Any, like: Tensor) -> Tensor:
 
 
 def per_node(value: Tensor, rank: int, scene: Tensor | None) -> Tensor:
-    """A value of `rank` dimensions as it is, or one per scene as one per node."""
+    """A value of `rank` dimensions unchanged, or values per scene as values per node."""
     if value.dim() == rank:
         return value
     if scene is None and value.shape[0] != 1:
@@ -108,7 +109,7 @@ def per_node(value: Tensor, rank: int, scene: Tensor | None) -> Tensor:
     return value.index_select(0, scene.clamp(0, value.shape[0] - 1))
 
 
-# ---- checks of what is given; tensors are kept as they are, and their values are not read
+# ---- checks of arguments; tensors are stored unchanged, and their values are not read
 
 
 def floats(name: str, value: Any) -> tuple[float, ...]:
@@ -120,7 +121,7 @@ def floats(name: str, value: Any) -> tuple[float, ...]:
 
 
 def finite(name: str, value: Any) -> Any:
-    """Numbers checked and made immutable; None as it is."""
+    """Numbers, checked and made immutable; None unchanged."""
     if value is None or isinstance(value, Tensor):
         return value
     numbers = floats(name, value)
@@ -130,21 +131,21 @@ def finite(name: str, value: Any) -> Any:
 
 
 def constant(name: str, value: Any) -> Any:
-    """Neither None nor a function."""
+    """Whether a value is neither None nor a function."""
     if value is None or callable(value):
         raise TypeError(f"{name} must be numbers or a tensor, got {shape_of(value)}")
     return finite(name, value)
 
 
 def direction(name: str, value: Any) -> Any:
-    """Numbers of which not all are zero."""
+    """Numbers that are not all zero."""
     if not isinstance(constant(name, value), Tensor) and not any(floats(name, value)):
         raise ValueError(f"{name} must not be zero, got {value}")
     return finite(name, value)
 
 
 def extent(name: str, value: Any) -> Any:
-    """Lengths, not negative and without a gradient."""
+    """Lengths, non-negative and without gradient."""
     value = constant(name, value)
     if isinstance(value, Tensor):
         if value.requires_grad:

@@ -18,7 +18,7 @@ from .files import check_file
 from .surface_mesh import Array
 
 FAMILIES = ("", "points?", "positions?", "coordinates?", "coords?", "pos")
-"""First words of the names of coordinates, the preferred ones first: x, Points:0, position_x, ..."""
+"""Prefixes of the names of coordinates, in order of preference: x, Points:0, position_x, ..."""
 VOLUME = re.compile(r"(particle[ _])?vol(ume)?")
 COMMENTS = ("#", "%", "//")
 PLY_TYPES = {
@@ -42,16 +42,15 @@ def read(path: str | Path, dim: int | None = None) -> PointFile:
 
     - .npy: positions [P, D].
     - .npz: positions ``x`` [P, D] and perhaps volumes ``volume`` [P].
-    - .csv, .tsv, .txt: rows of numbers that are separated by commas, semicolons, tabs or spaces; lines that begin with
-      #, % or // are comments. Names of the columns may stand in a first line, a comment or not: x, y, (z,) (volume) in
-      any case and order, among others; also Points:0, position_x and the like, with the unit [m]. Without names the
-      columns are the positions, then perhaps the volume: three columns are x, y, z, but x, y, volume with ``dim`` 2.
+    - .csv, .tsv, .txt: rows of numbers separated by commas, semicolons, tabs or spaces; lines that begin with #, % or
+      // are comments. Names of the columns may stand in a first line, a comment or not: x, y, (z,) (volume) in any case
+      and order, among others; also Points:0, position_x and the like, with the unit [m]. Without names the columns are
+      the positions, then perhaps the volume: three columns are x, y, z, but x, y, volume with ``dim`` 2.
     - .ply: the properties x, y, z and perhaps volume of its vertices, ASCII or binary.
 
     Args:
         path: the file.
-        dim: number of coordinates; None for those in the file. Where it is 2, a z that is the same everywhere is left
-            out.
+        dim: number of coordinates; None for those in the file. Where it is 2, a constant z is dropped.
 
     Raises:
         OSError: for a file that cannot be read.
@@ -67,7 +66,7 @@ def read(path: str | Path, dim: int | None = None) -> PointFile:
         raise ValueError(f"points file must end in {', '.join(readers)}, got {path}")
     try:
         found = readers[path.suffix.lower()](path, dim)
-    except Exception as error:  # damaged archives and tables raise many kinds
+    except Exception as error:  # Damaged archives and tables raise many kinds of errors.
         raise ValueError(f"points file {path} cannot be read: {error}") from error
     if dim == 2 and found.x.ndim == 2 and found.x.shape[1] == 3 and (found.x[:, 2] == found.x[:1, 2]).all():
         found = found._replace(x=found.x[:, :2])
@@ -95,7 +94,7 @@ def _read_npz(path: Path, dim: int | None) -> PointFile:
 
 
 def _array(handle: IO[bytes], size: int) -> Array:
-    """The array of a .npy file of ``size`` bytes; nothing is allocated for one that says it is larger."""
+    """Array of a .npy file of ``size`` bytes; nothing is allocated for a header that declares more."""
     read_header = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
     version = np.lib.format.read_magic(handle)
     if version not in read_header:
@@ -128,7 +127,7 @@ def _read_table(path: Path, dim: int | None) -> PointFile:
 
 
 def _header(lines: Sequence[str]) -> tuple[list[str], int]:
-    """Names of columns, none where there are not any, and the index of the first row of numbers."""
+    """Names of columns, or none, and the index of the first row of numbers."""
     names: list[str] = []
     remark: list[str] = []
     for index, line in enumerate(lines):
@@ -154,7 +153,7 @@ def _header(lines: Sequence[str]) -> tuple[list[str], int]:
 
 
 def _separator(line: str) -> str | None:
-    """Between the cells of a line; None for spaces."""
+    """Separator of the cells of a line; None for spaces."""
     return next((mark for mark in ";\t," if mark in line), None)
 
 
@@ -179,7 +178,7 @@ def _words_and_unit(name: str) -> tuple[str, str]:
 
 
 def _coordinates(names: Sequence[str]) -> list[list[int]]:
-    """Columns that have the names of x, y and perhaps z; empty where there are no such names."""
+    """Columns with the names of x, y and perhaps z; empty where there are no such names."""
     texts = [_words_and_unit(name)[0] for name in names]
     for family in FAMILIES:
         found = []
@@ -206,7 +205,7 @@ def _named(names: Sequence[str]) -> tuple[list[int], list[int]]:
 
 
 def _unnamed(count: int, dim: int | None) -> tuple[list[int], list[int]]:
-    """The same of a table without names."""
+    """Columns of a table without names."""
     allowed = (2, 3, 4) if dim is None else (dim, dim + 1)
     if count not in allowed:
         raise ValueError(
@@ -224,7 +223,7 @@ def _read_ply(path: Path, dim: int | None) -> PointFile:
     with path.open("rb") as handle:
         order, count, names, dtype = _ply_header(handle)
         size = path.stat().st_size - handle.tell()
-        least = 2 * len(names) - 1 if order == "=" else dtype.itemsize  # bytes of a row
+        least = 2 * len(names) - 1 if order == "=" else dtype.itemsize  # Bytes of a row.
         if count * least > size:
             raise ValueError(f"its {count} vertices do not fit in its {size} bytes")
         if order == "=":

@@ -1,4 +1,4 @@
-"""Physics in the precision of the state, also where `torch.autocast` surrounds it for the networks of a user."""
+"""Physics in the precision of the state, also where `torch.autocast` is active for the networks of a user."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ HALVES = (torch.float16, torch.bfloat16)
 
 
 def full_precision(like: Tensor) -> contextlib.AbstractContextManager[Any]:
-    """Where autocast does not act on the device of `like`."""
+    """Context in which autocast is off on the device of `like`."""
     device = like.device.type
     if not torch.is_autocast_enabled(device):
         return contextlib.nullcontext()
@@ -20,5 +20,5 @@ def full_precision(like: Tensor) -> contextlib.AbstractContextManager[Any]:
 
 
 def from_half(value: Any, like: Tensor) -> Any:
-    """What a function of a user returned, in the dtype of `like` where it is a half, as autocast makes it."""
+    """Result of a user function, in the dtype of `like` where it is a half precision, as under autocast."""
     return value.to(like.dtype) if isinstance(value, Tensor) and value.dtype in HALVES else value

@@ -1,8 +1,8 @@
-"""Functions that the backward pass calls again instead of keeping what their gradient needs.
+"""Functions that the backward pass calls again instead of storing the inputs of their gradient.
 
-As `torch.utils.checkpoint` does without reentrance, whose first call imports compilers for seconds: what autograd would
-keep of the function is a place, and the first place that is asked for in a backward pass has the function called again
-and all of them filled. So gradients of all orders pass, also to tensors that are not among the arguments.
+As `torch.utils.checkpoint` without reentrance, whose first call imports compilers for seconds. Autograd stores
+placeholders of the tensors of the function. The first placeholder that is read in a backward pass causes a second call
+of the function, which fills all of them. So gradients of all orders pass, also to tensors that are not arguments.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from torch import Tensor
 
 
 def called_again(function: Callable[..., Any], *tensors: Tensor) -> Any:
-    """`function(*tensors)`, of which autograd keeps the arguments alone.
+    """`function(*tensors)` of which autograd stores the arguments only.
 
-    The function is called again with the random numbers, the autocast and the default device of the first time.
+    The function is called again with the original random numbers, autocast and default device.
 
     Raises:
-        RuntimeError: in the backward pass, where the function does something else the second time.
+        RuntimeError: in the backward pass, where the second call does something else.
     """
     if not torch.is_grad_enabled():
         return function(*tensors)
@@ -33,7 +33,9 @@ def called_again(function: Callable[..., Any], *tensors: Tensor) -> Any:
 
 
 class _Arguments(torch.autograd.Function):
-    """A node of no graph, which keeps tensors as autograd does: around an outer function that is called again, too."""
+    """Node outside any graph, which stores tensors as autograd does, also inside an outer function that is called
+    again.
+    """
 
     @staticmethod
     def forward(anchor: Tensor, *tensors: Tensor) -> Tensor:
@@ -53,7 +55,7 @@ class _Arguments(torch.autograd.Function):
 
 
 class _Place:
-    """In the place of a tensor that autograd keeps, and what it is in backward passes that have called again."""
+    """Placeholder of a tensor that autograd stores, and its value in backward passes that have called again."""
 
     def __init__(self, t: Tensor) -> None:
         self.kind = _kind(t)
@@ -61,25 +63,25 @@ class _Place:
 
 
 class _AllFound(Exception):
-    """All places are filled: the rest of the function need not be called."""
+    """Raised when all placeholders are filled: the rest of the function need not be called."""
 
 
 class _Call:
     def __init__(self, function: Callable[..., Any], tensors: Sequence[Tensor]) -> None:
         self._function = function
-        # The result, since its node gives up what it keeps where nothing but Python holds it.
+        # The result, since its node releases its stored tensors when only Python holds it.
         self._arguments = _Arguments.apply(torch.empty(0, device="cpu", requires_grad=True), *tensors)
         self._places: list[weakref.ref[_Place]] = []
         self._around = _surroundings({t.device for t in tensors})
 
     def pack(self, t: Tensor) -> _Place:
         place = _Place(t)
-        self._places.append(weakref.ref(place))  # such that a tensor goes with what would have used it
+        self._places.append(weakref.ref(place))  # A tensor is then released with its user.
         return place
 
     def unpack(self, place: _Place) -> Tensor:
         backward: int = torch._C._current_graph_task_id()
-        if backward == -1:  # somebody looks at a node
+        if backward == -1:  # A caller inspects a node.
             backward = uuid.uuid4().int
         if backward not in place.values:
             self._call_again(backward)
@@ -122,7 +124,7 @@ def _told(kind: tuple[Any, ...]) -> str:
 
 
 def _surroundings(devices: set[torch.device]) -> Callable[[], contextlib.AbstractContextManager[None]]:
-    """The random numbers, autocast and default device of now, to go back to later."""
+    """Random numbers, autocast and default device at present, to be restored later."""
     cuda = [device for device in devices if device.type == "cuda"]
     random = torch.get_rng_state(), {device: torch.cuda.get_rng_state(device) for device in cuda}
     kinds = {kind for kind in {"cpu", *(d.type for d in devices)} if torch.amp.is_autocast_available(kind)}
@@ -139,7 +141,7 @@ def _surroundings(devices: set[torch.device]) -> Callable[[], contextlib.Abstrac
                 torch.cuda.set_rng_state(kept, device)
             for kind, dtype, enabled in cast:
                 stack.enter_context(torch.autocast(kind, dtype, enabled, caches))
-            if torch.get_default_device() != default:  # a mode costs in each operation
+            if torch.get_default_device() != default:  # A mode slows down each operation.
                 stack.enter_context(default)
             yield
 

@@ -1,4 +1,4 @@
-"""Many steps in a row with what happens on the way: states that are kept, and what acts between steps."""
+"""Frames of many steps: stored states, and hooks between steps."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from .step import Step
 
 
 class Frames(NamedTuple):
-    """What `frames` kept: T = n // every + 1 frames, that of the start first."""
+    """Result of `frames`: T = n // every + 1 frames, beginning with the start."""
 
     time: Tensor
     """Times of the frames [s], float64: [T], on the CPU where they are numbers; [T, 1] or [T, B] where dt or the time
     of the state has shape [1] or [B]."""
     fields: dict[str, Tensor]
-    """Of each field asked for the values [T, P, ...] in the order of the particles of the state."""
+    """Values [T, P, ...] of each requested field, in the order of the particles of the state."""
     end: State
-    """The state after all n steps."""
+    """State after all n steps."""
 
 
 def frames(
@@ -42,16 +42,16 @@ def frames(
     truncate: int | None = None,
     graph: int | None = None,
 ) -> Frames:
-    """A `rollout` that keeps some fields of every so many steps, and lets a hook act there.
+    """A `rollout` that stores some fields of every n-th step, and lets a hook act there.
 
     Args:
         step, state, n, dt, checkpoint, prefix, truncate, graph: as `rollout`.
-        every: steps from one frame to the next.
+        every: steps between two frames.
         fields: names of fields of `State` or of `state.extra`.
-        hook: called as `hook(state, k)` before step k = 0, every, 2 every, ..., after the frame of that step is kept.
-            It may return another state of as many particles, to push them with a control of that time, or set
-            gravity or obstacles of the step; None leaves the state as it is. For a loss on the way it may read the
-            state, and gradients pass.
+        hook: called as `hook(state, k)` before step k = 0, every, 2 every, ..., after the frame of that step is stored.
+            It may return another state with as many particles, for example for a control, or set gravity or obstacles
+            of the step; None leaves the state unchanged. For an intermediate loss it may read the state, and gradients
+            pass.
 
     Differentiable as `rollout`. The steps between two frames are one call of an op where `rollout` can do so.
 
@@ -77,7 +77,7 @@ def frames(
         keep(state)
         return None if hook is None else hook(state, k)
 
-    Parts(n, hook=hook)  # which refuses what is no hook
+    Parts(n, hook=hook)  # `rollout` refuses a hook that is not callable.
     options: dict[str, Any] = {"prefix": prefix, "truncate": truncate, "graph": graph}
     end = rollout(step, state, n, dt, checkpoint, hook=seen, every=every, **options)
     if n % every == 0:
@@ -86,7 +86,7 @@ def frames(
 
 
 def _stacked(times: Sequence[float | Tensor]) -> Tensor:
-    """Times in one tensor; the first ones may be numbers where later ones are tensors."""
+    """Times in one tensor; the first may be numbers where later ones are tensors."""
     tensors = [t for t in times if isinstance(t, Tensor)]
     if not tensors:
         return torch.tensor(times, dtype=torch.float64)

@@ -1,4 +1,4 @@
-"""What steps from CUDA graphs depend on: keys by which their recordings are found again."""
+"""Keys of CUDA graph recordings: the properties of a step that a recording depends on."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from .step import Step
 
 
 class StepKey:
-    """What is known of a step while nobody changes it, as far as a recording depends on it.
+    """Properties of an unchanged step that a recording depends on.
 
     Attributes:
         own: its tensors that require gradients, by "step." and their name.
-        key: what a recording has of it beside those.
-        steps: those in it.
+        key: other parts of the key of a recording.
+        steps: the steps in it.
     """
 
     def __init__(self, step: nn.Module) -> None:
@@ -33,16 +33,15 @@ class StepKey:
         self.look()
 
     def look(self) -> None:
-        """Again: the first steps make some of what steps keep."""
-        step, modules = self._step, dict(self._step.named_modules())  # once: a device may be waiting
-        named: dict[int, tuple[str, Tensor]] = {}  # each tensor by its first name
+        """Recomputed: the first steps create some of the stored values."""
+        step, modules = self._step, dict(self._step.named_modules())  # Once, since a device may be waiting.
+        named: dict[int, tuple[str, Tensor]] = {}  # Each tensor by its first name.
         for place, module in modules.items():
             for name, t in (*module._parameters.items(), *module._buffers.items()):
                 if t is not None:
                     named.setdefault(id(t), (f"step.{place}.{name}" if place else f"step.{name}", t))
         self.own = {name: t for name, t in named.values() if t.requires_grad}
-        # Not by the step, which keeps its recordings: it could only go with them where somebody looks for cycles.
-        # Nor by the motions of obstacles in a control step, each of which has its own.
+        # The key does not hold the step, which owns its recordings: a cycle would delay their release.
         self.key = tuple(
             (None if m is step or type(m) is RigidMotion else Same(m), *content_of(m)) for m in modules.values()
         )
@@ -51,17 +50,18 @@ class StepKey:
         self._sizes = {t.numel() for _, t in named.values() if not t.requires_grad}
 
     def by_content(self, state: State) -> list[str]:
-        """Fields of which steps keep what follows from them, as indices, while they are the same."""
+        """Fields from which steps derive cached values, such as indices, while they are the same."""
         names = ["material"] if self.mixes and state.material is not None else []
         return [*names, "ids"] if state.ids is not None and len(state) in self._sizes else names
 
     def pools(self) -> Hashable:
-        """Of the grids, as large as they are now."""
+        """Sizes of the grids at present."""
         return tuple(step.grid.max_blocks for step in self.steps)
 
     def follow(self, state: State, unseen: int) -> None:
-        """Let pools of grids that grow follow what was told of calls before. The host waits where that was so many
-        calls ago that the scene may have grown out of them, but not for the latest call, which the device works at."""
+        """Adapt pools of growing grids to the block counts of earlier calls. The host waits for a count so old that the
+        scene may have outgrown it, but not for the latest call, which the device is computing.
+        """
         for grid in {step.grid: None for step in self.steps if step.grid.grows}:
             if unseen > 1:
                 grid.wait()
@@ -74,9 +74,10 @@ _EVERY = frozenset(vars(nn.Module()))
 
 
 def content_of(module: nn.Module) -> tuple[Hashable, ...]:
-    """A module by its content as a part of a key. Of those of the library, and of classes made of them, all that may be
-    assigned; of the user's own modules the tensors, but not the numbers, which may change in each call as a counter
-    does."""
+    """Module as a part of a key, by content. Modules of the library and derived classes contribute everything that can
+    be assigned. User modules contribute their tensors, but not their numbers, which may change in each call, such as a
+    counter.
+    """
     classes = type(module).__mro__
     plain, of_library = is_of_library(classes[0]), any(map(is_of_library, classes))
     tensors = [(name, t) for name, t in (*module._parameters.items(), *module._buffers.items()) if t is not None]
@@ -88,10 +89,10 @@ def content_of(module: nn.Module) -> tuple[Hashable, ...]:
 
     def attribute(value: Any) -> Hashable:
         if isinstance(value, Tensor):
-            return None if plain else Same(value)  # the library keeps what follows from others
+            return None if plain else Same(value)  # The library derives this from other attributes.
         return _value(value) if of_library else None
 
-    # The length of steps, over which paths are differenced, is another in a control step than outside.
+    # The length of steps, over which paths are differenced, differs between a control step and outside.
     unread = isinstance(module, RigidMotion) and not module.follows_path
     left_out = _EVERY | {"pace"} if unread else _EVERY
     values = [(name, attribute(value)) for name, value in vars(module).items() if name not in left_out]
@@ -100,10 +101,10 @@ def content_of(module: nn.Module) -> tuple[Hashable, ...]:
 
 
 def _value(value: Any) -> Hashable:
-    """An attribute of a module as a part of a key; None for what steps keep there themselves."""
+    """Attribute of a module as a part of a key; None for values that steps store there."""
     if isinstance(value, NUMBERS):
         return value
-    if isinstance(value, Walls):  # whose kinds and friction may be assigned
+    if isinstance(value, Walls):  # Their kinds and friction may be assigned.
         return Same(value), repr(value)
     if isinstance(value, Grid) or callable(value):
         return Same(value)
@@ -119,6 +120,6 @@ def autocast_of(device: torch.device) -> tuple[bool, torch.dtype]:
 
 
 def surroundings(device: torch.device) -> Hashable:
-    """Settings of torch that decide what a recording computes."""
+    """Settings of torch that affect a recording."""
     precision = torch.get_float32_matmul_precision(), torch.are_deterministic_algorithms_enabled()
     return torch.is_grad_enabled(), autocast_of(device), precision

@@ -3,9 +3,9 @@
 A floating-point number x is stored to half a unit in its last place: up to 3e-8 m at 1 m and 0.25 m at 5000 km in
 float32. Near the nodes that is an error of the weights of the transfers, which an origin near the bodies avoids.
 
-In each step it is an error of the motion x + dt v, too: what is slower than half a unit over dt does not move at all
-(0.3 m/s in steps of 1e-7 s, 1 m from zero), and ten times as fast it may be wrong by a tenth. Compensated positions
-carry the rounding of a step on to the next one (`State.x_residual`).
+In each step it is an error of the motion x + dt v, too: motion slower than half a unit over dt vanishes (0.3 m/s in
+steps of 1e-7 s, 1 m from zero), and motion ten times as fast may be wrong by a tenth. Compensated positions carry the
+rounding of a step on to the next one (`State.x_residual`).
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ RESOLVED = 1e-3
 REFUSED = 1 / 16
 """Rounding [dx] above which a grid is refused: fewer than 8 stored positions per cell."""
 CARRIED = 1e-3
-"""Error of the motion of a step, relative to it, from which on positions are compensated."""
+"""Relative error of the motion of a step from which on positions are compensated."""
 DIGITS = {torch.float32: 24, torch.float64: 53}
 """Binary digits of a number."""
 
@@ -40,7 +40,7 @@ def loses_motion(grid: Grid, dtype: torch.dtype, dt: float) -> bool:
     """Whether rounding changes the motion in steps of dt [s] by more than a thousandth, at a speed of 1 m/s or, where
     that is less, of the length of the domain in a second.
 
-    The speed is a choice: what is known without looking at the particles is the lattice, the dtype and dt.
+    The speed is a choice: without reading the particles only the lattice, the dtype and dt are known.
     """
     return grid.rounding(dtype) > CARRIED * min(1.0, grid.extent) * dt
 
@@ -60,7 +60,7 @@ def problem(grid: Grid, dtype: torch.dtype) -> str:
 
 
 def refused(grid: Grid, dtype: torch.dtype) -> str:
-    """The same where a cell has fewer than 8 positions; "" where it has more."""
+    """Sentence about a grid with fewer than 8 positions per cell; "" where there are more."""
     return problem(grid, dtype) if grid.rounding(dtype) > REFUSED * grid.dx else ""
 
 

@@ -1,4 +1,4 @@
-"""What a rollout and its backward pass will take, before they start."""
+"""Estimated memory and time of a rollout and its backward pass."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ from .step import Step
 from .step_cost import differentiable, seconds
 
 TRIAL = 4
-"""Steps that are taken to measure their time."""
+"""Number of steps of the measurement."""
 
 
 @dataclasses.dataclass(frozen=True)
 class RolloutEstimate:
-    """Of a rollout with gradients and its backward pass.
+    """Estimate of a rollout with gradients and its backward pass.
 
     Attributes:
-        memory: of kept states and of the steps that the backward pass holds at a time, on the device [bytes].
-        host_memory: of kept states that wait on the host [bytes].
-        seconds: run time [s], as that of a few steps tells.
-        kept_states: states that are kept at a time at most.
-        steps: steps that are taken, with those that are taken again.
-        particles: of the state.
+        memory: memory of stored states and of the steps that the backward pass holds at a time, on the device [bytes].
+        host_memory: memory of stored states that are offloaded to the host [bytes].
+        seconds: run time [s], extrapolated from a few steps.
+        kept_states: maximum number of states stored at a time.
+        steps: number of computed steps, including recomputed ones.
+        particles: number of particles of the state.
     """
 
     memory: int
@@ -44,7 +44,7 @@ class RolloutEstimate:
 
     @property
     def per_particle(self) -> float:
-        """Of the memory, what each particle takes; zero where there is none [bytes]."""
+        """Memory per particle; zero without particles [bytes]."""
         return self.memory / self.particles if self.particles else 0.0
 
     def __str__(self) -> str:
@@ -65,11 +65,10 @@ def estimate_rollout(
     prefix: int = 0,
     truncate: int | None = None,
 ) -> RolloutEstimate:
-    """What `rollout` with these arguments, and the backward pass of a loss of its end, will take.
+    """Memory and time of `rollout` with these arguments and of the backward pass of a loss of its end.
 
-    It takes a few steps three times, and three times more with their backward pass, which `Step.check` does not see.
-    The memory is that of the largest scene to come if `state` is it: pools that grow on the way are not foreseen.
-    Functions of the user's are called.
+    It computes a few steps three times, and three times more with their backward pass, invisibly for `Step.check`. The
+    memory is that of the given state: pools that grow during the rollout are not foreseen. User functions are called.
 
     Args:
         step, state, n, dt, checkpoint, prefix, truncate: as `rollout`.
@@ -100,11 +99,11 @@ def _estimate(
     kept: Checkpoints | None,
     keeps_all: bool,
 ) -> RolloutEstimate:
-    """Of n steps with gradients after so many without."""
+    """Estimate of n steps with gradients after a number of steps without."""
     in_op = isinstance(step, Step) and obstacle_to_substeps(step, start, dt) is None
     of_state, of_step = bytes_kept(step, start, dt)
     trial = max(min(n, TRIAL), 1)
-    calls = trial if kept is not None and kept.states is not None else 1  # between kept states
+    calls = trial if kept is not None and kept.states is not None else 1  # Between stored states.
 
     def taken() -> State:
         state = start
@@ -132,7 +131,7 @@ def _estimate(
         kept = Checkpoints(every=min(steps_of_a_call(start, n), n))
     states, again, held = kept.kept(n), kept.repetitions(n), min(kept.every or 1, n)
     extra = again
-    if in_op:  # which takes its own steps again in any case: the time of both ways has them
+    if in_op:  # The op recomputes its own steps in any case: the time of both ways includes them.
         extra, again = (0, n) if kept.every is not None else (again, again + n)
     spent = prefix * once + n * twice + extra * once
     on_host = kept.offload and start.x.is_cuda

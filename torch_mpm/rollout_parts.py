@@ -1,4 +1,4 @@
-"""Rollouts in parts: hooks between steps, a beginning without gradients, gradients that are cut, and their norms."""
+"""Parts of rollouts: hooks between steps, a prefix without gradients, truncated gradients, and their norms."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from .gradient_norms import GradientNorms
 from .state import FIELDS, State
 
 Control = Callable[[State, int], contextlib.AbstractContextManager[Callable[[State], State]]]
-"""A control step of so many steps from a state, see `torch_mpm.boundaries.control`."""
+"""Control step of n steps from a state, see `torch_mpm.boundaries.control`."""
 Hook = Callable[[State, int], "State | None"]
-"""Called with a state and the number of steps before it; may return another state to go on from."""
+"""Called with a state and the number of steps before it; may return another state to continue from."""
 
 
 @dataclasses.dataclass
 class Parts:
-    """What happens between the n steps of a rollout; see `rollout` for the arguments.
+    """Actions between the n steps of a rollout; see `rollout` for the arguments.
 
     Raises:
-        TypeError, ValueError: for a wrong one.
+        TypeError, ValueError: for a wrong argument.
     """
 
     n: int
@@ -46,7 +46,7 @@ class Parts:
             raise TypeError(f"norms must be GradientNorms or None, got {shape_of(self.norms)}")
 
     def first_with_gradient(self) -> int:
-        """The first step that a gradient may reach: without a hook the loss knows the end alone."""
+        """First step that a gradient may reach: without a hook the loss depends on the end only."""
         prefix = min(self.prefix, self.n)
         return prefix if self.truncate is None or self.hook is not None else max(prefix, self.n - self.truncate)
 
@@ -60,10 +60,12 @@ class Parts:
         """The state n steps later.
 
         Args:
-            advance: (state, count, k) to the state so many steps later, of which the first is step k.
-            state: the state of the start.
-            scales: of the gradient norms, see `GradientNorms.start`.
-            control: (state, count) to the control step of so many steps, those from one call of the hook to the next.
+            advance: function of (state, count, k) that returns the state `count` steps later; the first of them is step
+                k.
+            state: the initial state.
+            scales: scales of the gradient norms, see `GradientNorms.start`.
+            control: function of (state, count) that returns the control step of `count` steps between two calls of the
+                hook.
         """
         prefix, cuts = self.first_with_gradient(), self.cuts()
         acting = set() if self.hook is None else set(range(0, self.n, self.every))
@@ -108,7 +110,7 @@ class Parts:
 
 
 class _ControlSteps(contextlib.ExitStack):
-    """One control step after another, which begin and end before some steps."""
+    """Consecutive control steps, which begin and end before some steps."""
 
     def __init__(self, control: Control, bounds: list[int]) -> None:
         super().__init__()
@@ -116,21 +118,23 @@ class _ControlSteps(contextlib.ExitStack):
         self._left: Callable[[State], State] | None = None
 
     def left(self, state: State, k: int) -> State:
-        """The state before step k, where a control step may end."""
+        """State before step k, where a control step may end."""
         if k in self._bounds and self._left is not None:
             state, self._left = self._left(state), None
             self.close()
         return state
 
     def begin(self, state: State, k: int) -> None:
-        """Begin the control step before step k, if one begins there."""
+        """Begin the control step before step k, if there is one."""
         if k in self._bounds and k < self._bounds[-1]:
             count = next(bound for bound in self._bounds if bound > k) - k
             self._left = self.enter_context(self._control(state, count))
 
 
 def _cut(state: State, began: State) -> State:
-    """A state without the gradient of what steps have changed in it; what is the same as in `began` keeps its own."""
+    """State without the gradient of fields that steps have changed; fields that are the same as in `began` keep
+    theirs.
+    """
 
     def changed(name: str) -> Any:
         value = getattr(state, name)

@@ -6,7 +6,7 @@ spacing ``dx / per_cell**(1/D)``, stretched to fit the bounding box of the shape
 Poisson-disk sample of the same mean density, without a preferred direction; ``method="jittered"`` moves each point of
 the lattice at random within its cell, which is faster. All depend on their arguments alone.
 
-``origin`` is for bodies far from the zero of their coordinates, such as those of maps: shapes and files are read in
+``origin`` is for bodies far from the zero of their coordinates, such as map coordinates: shapes and files are read in
 these coordinates in float64, and points are stored relative to the origin, so that float32 resolves them.
 """
 
@@ -45,22 +45,24 @@ Progress = Callable[[int, int], None] | None
 _POISSON_SPACING = {2: 1.245, 3: 1.147}
 _POISSON_TRIALS = 12
 HOST = torch.device("cpu")
-"""Shapes and points are made here, whatever torch's default device, and moved when they are whole."""
+"""Shapes and points are created on the CPU, for any default device of torch, and moved when complete."""
 
 
 def on_host() -> Any:
-    """A context in which tensors are made on the CPU; none where they are anyway, as it would slow down each call."""
+    """Context in which tensors are created on the CPU; no context where this is the default, as it would slow down each
+    call.
+    """
     return contextlib.nullcontext() if torch.get_default_device() == HOST else HOST
 
 
 MOST = 2**31 - 1
-"""Particles that can be numbered."""
+"""Maximum number of particles."""
 CELL_BYTES = 150
-"""Memory per point of a lattice, or per cell of a Poisson-disk sample, while a shape is filled."""
+"""Memory per point of a lattice, or per cell of a Poisson-disk sample, while a shape is filled [bytes]."""
 FEW_BYTES = 2**26
-"""Memory that is there without asking how much there is."""
+"""Memory that is assumed to be available without a query [bytes]."""
 CHUNK = 2**18
-"""Points that a shape is asked for at once."""
+"""Number of points that a shape is evaluated at together."""
 
 
 @dataclass(frozen=True)
@@ -87,7 +89,7 @@ class Points:
 
 
 def _unrounded(rounded: Tensor, exact: Tensor) -> Tensor:
-    """The exact values of those that are still their roundings, float64."""
+    """Exact values of the entries that still equal their rounding, float64."""
     if exact.shape != rounded.shape:
         return rounded.double()
     exact = exact.to(rounded.device)
@@ -106,11 +108,11 @@ def _points(
 
 
 class Region:
-    """A shape at a place, to be filled.
+    """Shape at a position, to be filled.
 
     Args:
         shape: see `torch_mpm.shapes`; its volume and bounds must be known.
-        position: of its origin [m], D numbers.
+        position: position of its origin [m], D numbers.
 
     Attributes:
         lower, upper: corners [D] [m] of its bounding box, float64.
@@ -124,7 +126,7 @@ class Region:
         self.volume = shape.volume(len(self.position))
 
     def inside(self, x: Tensor) -> Tensor:
-        """Which points [P, D] are inside or on the surface, bool [P]."""
+        """Whether points [P, D] are inside or on the surface, bool [P]."""
         return torch.cat([self.shape.contains(part - self.position) for part in x.split(CHUNK)])
 
 
@@ -139,12 +141,12 @@ class Box(Region):
         self._size = [q - p for p, q in zip(a, b, strict=True)]
         middle = [0.5 * (p + q) for p, q in zip(a, b, strict=True)]
         corners = torch.tensor([a, b, middle], dtype=torch.float64, device="cpu")
-        self.lower, self.upper, self.position = corners.unbind()  # as given, not rounded
+        self.lower, self.upper, self.position = corners.unbind()  # As given, not rounded.
         self.volume = math.prod(self._size)
 
     @functools.cached_property
     def shape(self) -> Shape:  # type: ignore[override]
-        """Made when it is asked for: most boxes that are tried for a scene do not come so far."""
+        """Created on first use: most boxes that are drawn for a scene are rejected before."""
         return shapes.Box(self._size)
 
 
@@ -175,8 +177,8 @@ class Capsule(Region):
 class Mesh(Region):
     """The inside of a closed triangle mesh: a file that trimesh reads (.obj, .ply, .stl, ...) or a ``trimesh.Trimesh``.
 
-    The mesh is scaled about its origin, then moved by ``offset`` [m]; see `torch_mpm.shapes.Mesh` for what is inside,
-    what is repaired, and what is refused.
+    The mesh is scaled about its origin, then moved by ``offset`` [m]; see `torch_mpm.shapes.Mesh` for the definition of
+    inside, repairs, and refused meshes.
     """
 
     def __init__(self, source: str | Path | Any, scale: float = 1.0, offset: Vector = (0.0, 0.0, 0.0)):
@@ -192,7 +194,7 @@ def _positive(name: str, value: float) -> float:
 
 
 def _segment(a: Vector, b: Vector, radius: float) -> tuple[Tensor, Tensor]:
-    """Middle of a segment, and half of it."""
+    """Middle of a segment, and half of its vector."""
     first = _vector("a", a)
     _positive("radius", radius)
     last = _vector("b", b, len(first))
@@ -220,18 +222,18 @@ def fill(
         grid: a grid or its node spacing dx [m].
         per_cell: mean number of particles in a cell of volume dx^D.
         method: "lattice", "jittered" or "poisson".
-        seed: seed of what is random.
-        count: exact number of points, instead of per_cell: the spacing is the widest tried that gives so many, and of
-            what is too much a random choice is left out.
-        progress: called after every 2^18 points with the number of points that were compared with the shape so far, and
-            of all.
+        seed: seed of the random numbers.
+        count: exact number of points, instead of per_cell: the spacing is the widest tried one with enough points, and
+            a random choice of the excess is dropped.
+        progress: called after every 2^18 points with the number of points compared with the shape so far, and the
+            total.
         origin: coordinates [m], D numbers, that the points are relative to; None for the zero of those of the shape.
         dtype, device: of the result; by default torch's (float32 where that is a half). A state in float64 has the
             points without the rounding of float32, see `Points`.
 
     Raises:
-        ValueError: for an unknown method, a shape too small to hold a point, or more points than memory holds.
-        TypeError: for a shape without a property of a `Region`, or a count that is no whole number.
+        ValueError: for an unknown method, a shape too small to hold a point, or more points than fit in memory.
+        TypeError: for a shape without a property of a `Region`, or a count that is not an integer.
     """
     if missing := [name for name in ("lower", "upper", "volume", "inside") if not hasattr(shape, name)]:
         raise TypeError(f"shape must be a shape of torch_mpm.seed, got {shape_of(shape)} without {missing[0]}")
@@ -255,11 +257,11 @@ def _spacing(grid: Any, per_cell: float, dim: int) -> float:
 
 
 CLOSER, ATTEMPTS = 0.98, 100
-"""Factor on the spacing until there are as many points as were asked for, and how often it is tried."""
+"""Factor on the spacing until there are enough points, and the maximum number of attempts."""
 
 
 def _exactly(count: int, shape: Region, method: str, seed: int, progress: Progress) -> Tensor:
-    """So many points [count, D], float64, on the CPU."""
+    """Exactly `count` points [count, D], float64, on the CPU."""
     spacing = (shape.volume / count) ** (1 / len(shape.lower))
     x = torch.empty(0)
     for _ in range(ATTEMPTS):
@@ -277,7 +279,7 @@ def _exactly(count: int, shape: Region, method: str, seed: int, progress: Progre
 
 
 class _TooSmall(ValueError):
-    """A shape between whose points there is more room than it has."""
+    """Shape with more space between its points than it has."""
 
 
 def _points_in(shape: Region, spacing: float, method: str, seed: int, progress: Progress) -> Tensor:
@@ -305,7 +307,7 @@ def _points_in(shape: Region, spacing: float, method: str, seed: int, progress: 
 
 
 def _check_size(shape: Region, spacing: float, method: str) -> None:
-    """Raise ValueError before the points of a shape's bounding box fill the memory."""
+    """Raise ValueError before the points of a shape's bounding box exhaust the memory."""
     sides = ((shape.upper - shape.lower).double() / spacing).clamp(min=1).tolist()
     points = math.prod(sides)
     cells = points
@@ -324,7 +326,7 @@ def _check_size(shape: Region, spacing: float, method: str) -> None:
 
 
 def _lattice(lower: Tensor, upper: Tensor, spacing: float, jitter: torch.Generator | None = None) -> Tensor:
-    """Centres of equal cells that tile the box, as near to ``spacing`` as a whole number per axis allows.
+    """Centres of equal cells that tile the box, as close to ``spacing`` as an integer number per axis allows.
 
     With a generator, random points of the cells instead.
     """
@@ -356,7 +358,7 @@ def _poisson_disk(lower: Tensor, upper: Tensor, spacing: float, seed: int) -> Te
     taken = torch.full((math.prod(shape), dim), math.inf, dtype=torch.float64)
     strides = torch.tensor([math.prod(shape[k + 1 :]) for k in range(dim)])
     offsets = torch.cartesian_prod(*[torch.arange(-2, 3)] * dim)
-    offsets = offsets[offsets.square().sum(1).argsort(stable=True)]  # the nearest reject most darts
+    offsets = offsets[offsets.square().sum(1).argsort(stable=True)]  # The nearest reject most darts.
     neighbours = (offsets @ strides).split(3**dim)
     index = torch.cartesian_prod(*[torch.arange(2, n - 2) for n in shape])
     phases = [index[(index % 3 == torch.tensor(phase)).all(1)] for phase in itertools.product(range(3), repeat=dim)]
