@@ -1,7 +1,7 @@
-"""Shapes: what bodies are filled from, what obstacles and held surfaces are made of, and what is drawn of them.
+"""Shapes of bodies, obstacles, held surfaces and pictures.
 
-A shape is described in its own coordinates; an `Obstacle` gives it a pose, a `seed.Region` a place. A shape of one's
-own is a subclass of `Shape` with a `surface`:
+A shape has local coordinates; an `Obstacle` adds a pose, a `seed.Region` a position. A user shape is a subclass of
+`Shape` with a `surface`:
 
     class Torus(Shape):
         name = "torus"
@@ -14,8 +14,8 @@ own is a subclass of `Shape` with a `surface`:
             radial = unit(x[:, ::2]) * u[:, :1]
             return norm(across) - self.radius, torch.stack([radial[:, 0], u[:, 1], radial[:, 1]], 1)
 
-`Obstacle(Torus(0.3, 0.1), position)` is an obstacle, in torch operations; `torch_mpm.ops.contact` says which shapes act
-in a kernel.
+`Obstacle(Torus(0.3, 0.1), position)` is an obstacle, in torch operations; `torch_mpm.ops.contact` lists the shapes that
+act in a kernel.
 """
 
 from __future__ import annotations
@@ -44,26 +44,26 @@ from .surface_mesh import Array, SurfaceMesh
 from .vectors import norm, unit
 
 PAIRS = 2**20
-"""Pairs of a point and a triangle that are compared at once, which bounds the memory."""
+"""Number of point-triangle pairs that are compared at once, which bounds the memory."""
 UNLIKE = 1e-3
-"""Share by which the volume inside a mesh differs from that by its normals where this is reported."""
+"""Relative difference between the volume inside a mesh and that by its normals from which on it is reported."""
 
 
 class Shape(SceneParameters):
-    """A closed region. The base of all shapes, of which only `surface` must be defined.
+    """Closed region. Base class of all shapes; only `surface` must be defined.
 
-    Parameters are numbers or tensors, one for all scenes or one per scene of a batch; `scene` says which.
+    Parameters are numbers or tensors, one for all scenes or one per scene of a batch; `scene` selects them.
     """
 
     name: str = "shape"
-    """As in a scene file."""
+    """Name in scene files."""
 
     def surface(self, x: Tensor, scene: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Signed distance [N] [m], negative inside, and unit normal out of the shape [N, D], of points x [N, D] [m].
 
         Differentiable. The distance is true near the surface on both sides, and away from it where the shape allows.
         The normal is the gradient of the distance inside, where contact uses it; where it is zero (as at the centre of
-        a sphere), contact leaves a node alone.
+        a sphere), contact does not act on a node.
 
         Args:
             x: points in the coordinates of the shape.
@@ -76,11 +76,11 @@ class Shape(SceneParameters):
         return self.surface(x, scene)[0]
 
     def contains(self, x: Tensor) -> Tensor:
-        """Which points x [N, D] [m] are inside or on the surface, bool [N]."""
+        """Whether points x [N, D] [m] are inside or on the surface, bool [N]."""
         return self.signed_distance(x) <= 0
 
     def volume(self, dim: int, scene: int = 0) -> float:
-        """[m³], in 2-D [m²]."""
+        """Volume [m³], in 2-D area [m²]."""
         raise NotImplementedError(f"the volume of a {self.name} is not known")
 
     def bounds(self, dim: int, scene: int = 0) -> tuple[Tensor, Tensor]:
@@ -88,17 +88,17 @@ class Shape(SceneParameters):
         raise NotImplementedError(f"the bounds of a {self.name} are not known")
 
     def mesh(self, lower: Array, upper: Array, scene: int = 0) -> list[SurfaceMesh] | None:
-        """The surface in pieces, or None where it is only known by its distance.
+        """Surface as a mesh, or None where only its distance is known.
 
         Args:
-            lower, upper: corners [D] [m] of the region of interest, in which an infinite shape is cut off.
-            scene: whose parameters.
+            lower, upper: corners [D] [m] of the region of interest, to which an infinite shape is clipped.
+            scene: index of the scene of the parameters.
         """
         return None
 
 
 class Plane(Shape):
-    """A half-space: everything behind a plane through the origin.
+    """Half-space behind a plane through the origin.
 
     Args:
         normal: direction out of the half-space: D numbers, or a tensor [D] or [B, D]; of any length but zero.
@@ -188,11 +188,11 @@ class Box(Shape):
         return (self._depth(x, None) <= 0).all(1)
 
     def _depth(self, x: Tensor, scene: Tensor | None) -> Tensor:
-        """How far points are behind the faces of each axis [N, D] [m], negative inside."""
+        """Distances of points behind the faces of each axis [N, D] [m], negative inside."""
         return x.abs() - 0.5 * self.at_nodes("size", x, x.shape[1:], scene)
 
     def _distance(self, depth: Tensor) -> Tensor:
-        """By the depth behind the faces."""
+        """Normal by the distances behind the faces."""
         return norm(depth.clamp_min(0)) + depth.amax(1).clamp_max(0)
 
     def volume(self, dim: int, scene: int = 0) -> float:
@@ -230,7 +230,7 @@ class Capsule(Shape):
         return norm(offset) - self.at_nodes("radius", offset, (), scene)
 
     def _offset(self, x: Tensor, scene: Tensor | None) -> Tensor:
-        """Of points from the nearest ones of the segment [N, D] [m]."""
+        """Vectors from the nearest points of the segment to points [N, D] [m]."""
         axis = self.at_nodes("half_axis", x, x.shape[1:], scene)
         squared = (axis * axis).sum(-1, keepdim=True)
         along = (x * axis).sum(1, keepdim=True) / torch.where(squared > 0, squared, 1)
@@ -252,11 +252,12 @@ class Capsule(Shape):
 
 
 class Revolved(Shape):
-    """A polygon turned about an axis: a cone, a tube, a funnel, an hourglass, a drum. In 2-D, it and its mirror image.
+    """Polygon revolved about an axis: a cone, a tube, a funnel, an hourglass, a drum. In 2-D, the polygon and its
+    mirror image.
 
     Args:
-        outline: corners of the polygon, K pairs of distance from the axis (≥ 0) and position along it [m], counted from
-            the origin; not crossing itself. As a tensor [K, 2], anticlockwise.
+        outline: corners of the polygon, K pairs of distance from the axis (≥ 0) and position along it [m] from the
+            origin; without self-intersections. As a tensor [K, 2], anticlockwise.
         axis: direction of the axis: D numbers, or a tensor [D] or [B, D]; y by default.
     """
 
@@ -341,19 +342,19 @@ class Cylinder(Revolved):
 
 
 class Mesh(Shape):
-    """The inside of a closed triangle mesh, scaled about its origin: where its winding number is not zero.
+    """Inside of a closed triangle mesh, scaled about its origin: points of non-zero winding number.
 
-    So parts may overlap, and each may be inside out; a part inside another that is turned against it is a cavity.
-    Files with textures or normals have several vertices at a position, which are merged. On the CPU points are looked
-    up in search trees. On other devices, and where torch traces or transforms a function, every point is compared with
-    every triangle: for few of them.
+    So parts may overlap, and each may be inside out; a part of opposite orientation inside another is a cavity. Files
+    with textures or normals have several vertices at a position, which are merged. On the CPU search trees are used. On
+    other devices, and where torch traces or transforms a function, every point is compared with every triangle, which
+    suits small meshes only.
 
     Args:
         source: a file that trimesh reads (.obj, .ply, .stl, .glb, ...) or a `trimesh.Trimesh`.
         scale: factor on its coordinates.
 
     Attributes:
-        changes: what was changed to close the mesh (see `torch_mpm.meshes.closed.load`), in sentences.
+        changes: sentences on the repairs that closed the mesh (see `torch_mpm.meshes.closed.load`).
 
     Raises:
         ImportError: without trimesh.
@@ -375,7 +376,7 @@ class Mesh(Shape):
             )
 
     def _set(self, source: Any, mesh: closed.ClosedMesh) -> tuple[float, float]:
-        """Take the vertices and triangles, and return the volume by the normals and that inside [m³]."""
+        """Set the vertices and triangles, and return the volume by the normals and the volume inside [m³]."""
         self.vertices, self.faces = torch.from_numpy(mesh.vertices), torch.from_numpy(mesh.faces)
         self.changes, self._index = mesh.changes, MeshIndex(self.vertices, self.faces)
         signed, filled = self._index.volumes
@@ -393,14 +394,14 @@ class Mesh(Shape):
         return side * norm(offset), side[:, None] * unit(offset)
 
     def contains(self, x: Tensor) -> Tensor:
-        """Where the winding number is above 1/2 (Jacobson et al. 2013; angles: Van Oosterom and Strackee 1983)."""
+        """Whether the winding number is above 1/2 (Jacobson et al. 2013; angles: Van Oosterom and Strackee 1983)."""
         if (index := self._searched(x)) is not None:
             return index.inside(x)
         corners = self._corners(x)
         return torch.cat([_winding_number(part, corners).abs() > 0.5 for part in self._chunks(x)])
 
     def volume(self, dim: int, scene: int = 0) -> float:
-        """Of the places inside [m³], exact where parts do not overlap, else to 1e-4."""
+        """Volume inside [m³], exact where parts do not overlap, otherwise to 1e-4."""
         return self._current_index().volumes[1]
 
     def bounds(self, dim: int, scene: int = 0) -> tuple[Tensor, Tensor]:
@@ -410,12 +411,12 @@ class Mesh(Shape):
         return [SurfaceMesh(self.vertices.cpu().numpy(), self.faces.cpu().numpy())]
 
     def _searched(self, x: Tensor) -> MeshIndex | None:
-        """The search trees for points; None where each is compared with every triangle."""
+        """Search trees for points; None where each is compared with every triangle."""
         hidden = x.device.type != "cpu" or is_traced(x) or is_transformed()
         return None if hidden else self._current_index()
 
     def _current_index(self) -> MeshIndex:
-        """Made anew where the vertices or triangles have changed."""
+        """Rebuilt where the vertices or triangles have changed."""
         vertices, faces = self.vertices.detach().to("cpu", torch.float64), self.faces.cpu()
         if not self._index.describes(vertices, faces):
             self._index = MeshIndex(vertices, faces)
@@ -430,24 +431,24 @@ class Mesh(Shape):
 
 
 class Terrain(Mesh):
-    """The ground below an open height surface, or the space above it; 3-D only.
+    """Ground below an open height surface, or space above it; 3-D only.
 
-    Vertical sides and a flat face close it. As an obstacle it should reach 3 cells beyond the domain, or
-    `Sampled.of(terrain, lower, upper, spacing)` acts in the kernel, for corners outside of the closed body.
+    Vertical sides and a flat face close it. As an obstacle it should extend 3 cells beyond the domain.
+    `Sampled.of(terrain, lower, upper, spacing)`, with corners outside the closed body, acts in the kernel.
 
     Args:
         source: heights [X, Y] [m] at the nodes of a horizontal lattice, a tensor or an array; or an open surface, a
-            file that trimesh reads or a `trimesh.Trimesh`, of which no part is vertical or above another.
+            file that trimesh reads or a `trimesh.Trimesh`, without vertical or overhanging parts.
         level: coordinate of the flat face [m]. Where it is below the whole surface, the body is the ground; where it is
             above, the space over the ground.
         lower: the first node of the lattice of heights [m], 2 numbers.
         spacing: distance of the nodes of heights [m].
         axis: the vertical axis, 0, 1 or 2. The lattice of heights lies along the other two, in their order.
-        scale: factor on the coordinates of a file, before `level` counts.
+        scale: factor on the coordinates of a file, applied before `level`.
 
     Raises:
         ImportError, OSError: as `Mesh`.
-        TypeError, ValueError: for other arguments, a level between the heights, or several heights over a place.
+        TypeError, ValueError: for other arguments, a level between the heights, or several heights at one position.
     """
 
     name = "terrain"
@@ -484,7 +485,7 @@ class Terrain(Mesh):
 
 
 class SDF(Shape):
-    """Any shape, from its signed distance.
+    """Shape given by its signed distance.
 
     Args:
         distance: function of points [N, D] [m] that returns distances [N] [m], negative inside. Torch operations; it
@@ -524,20 +525,20 @@ class SDF(Shape):
 
 
 class Sampled(Shape):
-    """Any shape, from its signed distance at the nodes of a lattice, multilinear between them.
+    """Shape given by its signed distance at the nodes of a lattice, multilinear between them.
 
-    An obstacle of it acts in the kernel, where those of `SDF` and `Mesh` act by torch operations: `Sampled.of` makes it
-    of them. Its surface is off by some spacing²/(8 radius) where the surface is curved, and edges are rounded.
+    Its obstacles act in the kernel, while those of `SDF` and `Mesh` act by torch operations; `Sampled.of` converts
+    them. The error of a curved surface is about spacing²/(8 radius), and edges are rounded.
 
     Args:
         values: signed distances [m], negative inside, positive on the border: [X, Y] or [X, Y, Z], at least 2 of each.
-            Values that are steeper than distances are divided by their largest slope from node to node of a cell, which
-            keeps their zero level.
+            Values that are steeper than distances are divided by their largest slope between nodes of a cell, which
+            preserves their zero level.
         lower: the first node in the coordinates of the shape [m], D numbers.
         spacing: distance of the nodes [m].
 
     Raises:
-        TypeError, ValueError: for values that are no such tensor, not finite, or not positive on the border.
+        TypeError, ValueError: for values of another type or shape, not finite, or not positive on the border.
     """
 
     name = "sampled"
@@ -558,7 +559,7 @@ class Sampled(Shape):
 
     @classmethod
     def of(cls, shape: Shape, lower: Sequence[float], upper: Sequence[float], spacing: float) -> Sampled:
-        """A shape sampled between two corners [m] of a box around it."""
+        """Sample a shape between two corners [m] of a box around it."""
         first, last = check_vector("lower", lower), check_vector("upper", upper, len(lower))
         counts = [max(2, math.ceil((b - a) / spacing - 1e-9) + 1) for a, b in zip(first, last, strict=True)]
         axes = [a + spacing * torch.arange(n, dtype=torch.float64) for a, n in zip(first, counts, strict=True)]
@@ -567,14 +568,14 @@ class Sampled(Shape):
 
     @classmethod
     def from_data(cls, data: Tensor, dim: int) -> Sampled:
-        """The inverse of `data`."""
+        """Inverse of `data`."""
         shape = cls.__new__(cls)
         shape.lower, shape.spacing = tuple(data[:dim].tolist()), float(data[dim])
         shape.values = data[2 * dim + 1 :].reshape([int(n) for n in data[dim + 1 : 2 * dim + 1]])
         return shape
 
     def data(self, like: Tensor) -> Tensor:
-        """Lower corner, spacing, numbers of nodes and values [n], as the kernel takes them."""
+        """Lower corner, spacing, numbers of nodes and values [n], as arguments of the kernel."""
         numbers = [*self.lower, self.spacing, *self.values.shape]
         return torch.cat([self.values.new_tensor(numbers), self.values.reshape(-1)]).to(like)
 
@@ -613,7 +614,7 @@ def _steepest(values: Tensor) -> float:
     """
     most = 0.0
     for step in itertools.product((-1, 0, 1), repeat=values.dim()):
-        if step > (0,) * values.dim():  # one of each pair of opposite steps
+        if step > (0,) * values.dim():  # One of each pair of opposite steps.
             starts = tuple(slice(max(0, -s), n - max(0, s)) for s, n in zip(step, values.shape, strict=True))
             ends = tuple(slice(max(0, s), n - max(0, -s)) for s, n in zip(step, values.shape, strict=True))
             most = max(most, float((values[ends] - values[starts]).abs().max()) / math.hypot(*step))
@@ -630,7 +631,7 @@ def _around_origin(upper: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _anticlockwise(outline: Any) -> tuple[tuple[float, ...], ...]:
-    """A polygon around the axis, checked."""
+    """Polygon around the axis, checked."""
     if not isinstance(outline, Sequence):
         raise TypeError(f"outline must be at least 3 pairs, got {shape_of(outline)}")
     corners = tuple(floats("outline", corner) for corner in outline)
@@ -643,13 +644,13 @@ def _anticlockwise(outline: Any) -> tuple[tuple[float, ...], ...]:
 
 
 def _polygon_area(corners: Sequence[Sequence[float]]) -> float:
-    """Positive if anticlockwise."""
+    """Signed area, positive if anticlockwise."""
     edges = zip(corners, [*corners[1:], corners[0]], strict=True)
     return 0.5 * sum(a[0] * b[1] - b[0] * a[1] for a, b in edges)
 
 
 def _winding_number(x: Tensor, corners: Tensor) -> Tensor:
-    """Of triangles [T, 3, 3] around points [N, 3], [N]."""
+    """Solid angles of triangles [T, 3, 3] from points [N, 3], [N]."""
     a, b, c = (corners[None, :, k] - x[:, None] for k in range(3))
     la, lb, lc = a.norm(dim=-1), b.norm(dim=-1), c.norm(dim=-1)
     determinant = (a * torch.linalg.cross(b, c)).sum(-1)
@@ -658,18 +659,20 @@ def _winding_number(x: Tensor, corners: Tensor) -> Tensor:
 
 
 def _nearest_of_all(x: Tensor, corners: Tensor) -> Tensor:
-    """The point of triangles [T, 3, 3] that is nearest to each of the points [N, 3], [N, 3]."""
+    """Nearest point of triangles [T, 3, 3] to each of the points [N, 3], [N, 3]."""
     candidates = nearest_on_triangles(x[:, None], corners[None])
     nearest = (x[:, None] - candidates).square().sum(-1).argmin(1)
     return candidates[torch.arange(len(x), device=x.device), nearest]
 
 
 def _with_gradient(function: Callable[[Tensor], Tensor], points: Tensor) -> tuple[Tensor, Tensor]:
-    """Values [N] of a function of points [N, D], each of its own point, and their gradients; differentiable."""
+    """Values [N] of a function of points [N, D], each depending on its own point, and their gradients;
+    differentiable.
+    """
     if torch.compiler.is_compiling() or torch._C._autograd._top_saved_tensors_default_hooks(False) is None:
         values, pull_back, *_ = torch.func.vjp(function, points)
         return values, pull_back(torch.ones_like(values))[0]
-    # torch.func refuses the hooks of checkpointing, which would compute its steps again for a gradient taken in them.
+    # torch.func refuses the hooks of checkpointing, which would recompute its steps for a gradient taken in them.
     differentiable = torch.is_grad_enabled()
     with torch.enable_grad(), graph_at_once():
         leaf = points.view_as(points)

@@ -1,7 +1,7 @@
-"""Signals during ops of many substeps: their handlers run between the substeps, and end the op where they raise.
+"""Signals during ops of many substeps: their handlers run between the substeps, and an exception ends the op.
 
-Python runs the handlers of signals on its main thread, between its own instructions. An op that takes long resumes the
-generator here several times a second for that (csrc/common/signals.h).
+Python runs the handlers of signals on its main thread, between its own instructions. A long op therefore resumes the
+generator of this module several times a second (csrc/common/signals.h).
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Any
 
 
 class _Raised(threading.local):
-    """What a handler has raised while an op of this thread was at work."""
+    """Exception of a handler that ran during an op of this thread."""
 
     error: BaseException | None = None
 
@@ -22,9 +22,9 @@ _RAISED = _Raised()
 
 
 def _run_handlers() -> Iterator[int]:
-    """Each `next` runs the handlers of the signals that have come, and returns whether one of them has raised.
+    """Generator that runs the handlers of pending signals at each `next`, and yields whether one of them has raised.
 
-    A generator, because Python runs handlers where code begins or is resumed: a function would raise before it came to
+    A generator, because Python runs handlers where code begins or is resumed: a function would raise before it entered
     its `try`.
     """
     raised = 0
@@ -45,17 +45,17 @@ _CALLBACK = ctypes.CFUNCTYPE(ctypes.c_int)(_HANDLERS.__next__)
 
 
 def watch(library: ctypes.CDLL, backend: str) -> None:
-    """From now on the ops of a library run handlers; those of a library from earlier sources hold signals back."""
+    """Let the ops of a library run handlers from now on; libraries of earlier sources delay signals."""
     run_handlers = getattr(library, f"torch_mpm_run_handlers_{backend}", None)
     if run_handlers is not None:
         run_handlers(_CALLBACK)
 
 
 def interruptible(call: Any, *arguments: Any) -> Any:
-    """`call(*arguments)`, an op that checks signals.
+    """`call(*arguments)` of an op that checks signals.
 
     Raises:
-        BaseException: what the handler of a signal has raised meanwhile, such as KeyboardInterrupt.
+        BaseException: raised by the handler of a signal during the call, such as KeyboardInterrupt.
     """
     _RAISED.error = None
     try:

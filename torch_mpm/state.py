@@ -1,4 +1,4 @@
-"""The state of a simulation: tensors packed over particles and scenes."""
+"""State of a simulation: tensors packed over particles and scenes."""
 
 from __future__ import annotations
 
@@ -36,14 +36,15 @@ if TYPE_CHECKING:
 
 
 class Time:
-    """`State.time`. A number is kept as (tensor [],), because compiled code takes Python numbers for constants.
+    """Descriptor of `State.time`. A number is stored as (tensor [],), because compiled code treats Python numbers as
+    constants.
 
-    A tensor is kept in float64: steps added up in float32 would be another time than their sum.
+    A tensor is stored in float64: the sum of steps in float32 would differ from the time.
     """
 
     def __get__(self, state: State | None, owner: type) -> float | Tensor:
         if state is None:
-            return 0.0  # of a new state
+            return 0.0  # Of a new state.
         time: Tensor | tuple[Tensor] = state.__dict__["_time"]
         if isinstance(time, Tensor):
             return time
@@ -65,7 +66,7 @@ class Time:
 
 @dataclasses.dataclass(eq=False)
 class State:
-    """Particles of all scenes of a batch, packed. A field that a simulation does not use is None.
+    """Particles of all scenes of a batch, packed. Unused fields are None.
 
     Attributes:
         x: positions [P, D] [m].
@@ -76,22 +77,22 @@ class State:
         F: deformation gradient [P, D, D]; for laws that need only its determinant,
         J: volume ratio [P].
         scene: scene of each particle, int32 [P]; None for one scene. A particle of scene -1 is absent: it takes part in
-            nothing, and stays where it is without a velocity.
+            nothing, and keeps its position without a velocity.
         ids: stable identity of each particle, int64 [P], set once particles are reordered; 0 .. P − 1 in some order
             where parameters are given per particle.
         material: law of each particle, int32 [P], for a `Mixture`.
         temperature: relative to a reference [P] [K].
         extra: further per-particle tensors [P, ...] that follow a reordering.
-        time: simulated time [s]: a number, or a tensor [B] once dt is a tensor, which is kept in float64 whatever the
-            dtype of x is. Code compiled by `torch.compile` sees a
-            number as a tensor [] of float64 on the CPU, so that it serves every time.
-        impulse: of the material on each boundary of the step and then on each face of the domain, added up over steps
-            [B, K + 2 D, D + 1 or 3] [N s, N m s], float64; see `torch_mpm.impulses`.
-        x_residual: what rounding has left out of the positions [P, D] [m]: a particle is at x + x_residual. None where
+        time: simulated time [s]: a number, or a tensor [B] once dt is a tensor, stored in float64 for any dtype of x.
+            Code compiled by `torch.compile` receives a number as a tensor [] of float64 on the CPU, so that it is valid
+            for every time.
+        impulse: impulse of the material on each boundary of the step and then on each face of the domain, accumulated
+            over steps [B, K + 2 D, D + 1 or 3] [N s, N m s], float64; see `torch_mpm.impulses`.
+        x_residual: accumulated rounding error of the positions [P, D] [m]: a particle is at x + x_residual. None where
             positions are not compensated; see `Step(compensated=)`. Constant for autograd.
 
-    All floating tensors of the particles have one dtype and device. Any strides work; those that the ops return keep
-    the particle index contiguous, which is fastest.
+    All floating tensors of the particles have one dtype and device. Any strides work; the particle index of results of
+    ops is contiguous, which is fastest.
     """
 
     x: Tensor
@@ -110,9 +111,9 @@ class State:
     impulse: Tensor | None = None
     x_residual: Tensor | None = None
     _poses: dataclasses.InitVar[Poses | None] = None
-    """An argument that is no field, so that `dataclasses.replace` passes it on."""
+    """An unknown argument is not a field, so that `dataclasses.replace` passes it on."""
 
-    _counted = None  # scenes, and the tensor and its version for which they are known; no field
+    _counted = None  # Scenes, and the tensor and its version for which they are known; not a field.
 
     def __post_init__(self, _poses: Poses | None) -> None:
         if _poses:
@@ -150,12 +151,12 @@ class State:
         """Undeformed particles.
 
         Args:
-            points: positions [m], rest volumes [m³] and perhaps scenes, as the functions of `torch_mpm.seed` give them;
-                a state in float64 has them as they were before their rounding to another dtype.
+            points: positions [m], rest volumes [m³] and perhaps scenes, as returned by the functions of
+                `torch_mpm.seed`; a state in float64 stores them without their rounding to another dtype.
             density: [kg/m³]; a number or [P].
             velocity: [m/s]; D numbers, or a tensor [D] or [P, D]; None for zero.
             dtype: float32 or float64; torch's default if None, or float32 where that is a half.
-            device: the points' if None.
+            device: that of the points if None.
 
         Raises:
             TypeError, ValueError: for a density that is not positive and finite, numbers as velocity that are not
@@ -182,17 +183,17 @@ class State:
         return self.x.shape[0]
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Of a copy or a file, which may be of an earlier version, with a time in float32."""
+        """Restore from a copy or a file, which may be of an earlier version, with a time in float32."""
         time = state.pop("_time")
-        self.__dict__.update({"x_residual": None} | state)  # which earlier versions lack
+        self.__dict__.update({"x_residual": None} | state)  # Fields that earlier versions lack.
         self.time = time if isinstance(time, Tensor) else time[0].item()
 
     @property
     def scenes(self) -> int | None:
-        """Number of scenes B that parameters [B] are given for, without particles or with them.
+        """Number of scenes B for parameters [B], including scenes without particles.
 
-        That of the grid of the step that prepared the state or returned it. Of another state it is that of a time [B]
-        or of the impulse, or else one more than the largest scene, for which the device is read once. None where that
+        It is that of the grid of the step that prepared or returned the state. For other states it is that of a time
+        [B] or of the impulse, or else the largest scene plus one, for which the device is read once. None where it
         cannot be read: in compiled code, and while a CUDA graph is captured.
         """
         if torch.compiler.is_compiling():
@@ -204,10 +205,10 @@ class State:
         return self._counted[2]
 
     def of_scenes(self, scenes: int) -> State:
-        """The same state, known to be one of a grid of B scenes.
+        """The same state, marked as one of a grid of B scenes.
 
         Raises:
-            TypeError, ValueError: for what is no number of scenes, or a time of another number of them.
+            TypeError, ValueError: for an invalid number of scenes, or a time of another number of them.
         """
         check_count("scenes", scenes)
         time = self.__dict__["_time"]
@@ -222,7 +223,7 @@ class State:
         if "time" not in changes:
             changes["time"] = self.time
         kept = {name: self.__dict__[name] for name in FIELDS if name not in changes}
-        state = State(**kept, **changes)  # `dataclasses.replace` takes 5 µs more
+        state = State(**kept, **changes)  # `dataclasses.replace` takes 5 µs more.
         if "_poses" in self.__dict__:
             state.__dict__["_poses"] = self.__dict__["_poses"]
         if not torch.compiler.is_compiling():
@@ -231,7 +232,7 @@ class State:
 
     @property
     def poses(self) -> Poses:
-        """Where steps have left their obstacles, see `torch_mpm.boundaries.control`; of no state that was made anew.
+        """Poses of obstacles after the latest step, see `torch_mpm.boundaries.control`; None for a newly made state.
 
         Copies of a state have them, also those of `dataclasses.replace`, `copy` and functions of pytrees. Files,
         pickles and TensorDicts do not.
@@ -240,7 +241,7 @@ class State:
         return poses
 
     def with_poses(self, poses: Poses) -> State:
-        """A copy with its obstacles elsewhere."""
+        """Copy with other poses of its obstacles."""
         state: State = object.__new__(State)
         state.__dict__.update(self.__dict__)
         state.__dict__["_poses"] = poses
@@ -261,11 +262,11 @@ class State:
         return {name: value for name, value in self.__dict__.items() if name not in ("_poses", "_counted")}
 
     def map(self, function: Callable[[Tensor], Tensor]) -> State:
-        """A copy with a function applied to every per-particle tensor, absent fields staying None."""
+        """Copy with a function applied to every per-particle tensor; absent fields stay None."""
         return self._map_all(lambda fields: [function(t) for t in fields])
 
     def _map_all(self, function: Callable[[list[Tensor]], list[Tensor]]) -> State:
-        """The same with a function of all of them."""
+        """The same with a function of all tensors together."""
         names = [name for name in PARTICLE_FIELDS if getattr(self, name) is not None]
         results = iter(function([*(getattr(self, name) for name in names), *self.extra.values()]))
         changes: dict[str, Any] = {name: next(results) for name in names}
@@ -280,16 +281,16 @@ class State:
     ) -> State:
         """Move to a device, and floating tensors of the particles to a dtype; as `torch.nn.Module.to`.
 
-        `scene`, `ids`, `material` and whole numbers in `extra` keep their dtype, `time` and `impulse` stay in float64.
+        `scene`, `ids`, `material` and integers in `extra` keep their dtype, `time` and `impulse` stay in float64.
         Positions in float64 include `x_residual`.
 
         Args:
-            device: a device or its name; or a dtype alone; or a tensor, whose device and dtype are taken.
+            device: a device or its name; or a dtype; or a tensor that gives device and dtype.
             dtype: float32 or float64.
-            non_blocking: as of `torch.Tensor.to`.
+            non_blocking: as in `torch.Tensor.to`.
 
         Raises:
-            TypeError, ValueError: for anything else.
+            TypeError, ValueError: for other arguments.
         """
         if isinstance(device, (torch.dtype, Tensor)):
             if dtype is not None:
@@ -332,7 +333,7 @@ class State:
         """The particles of an index tensor, int64 or int32 [Q], in that order; differentiable.
 
         `ids` go with their particles. A law with parameters per particle needs those of the Q particles in the order of
-        `ids`, and ids 0 .. Q − 1, which `State.concatenate([state])` makes.
+        `ids`, and ids 0 .. Q − 1, as from `State.concatenate([state])`.
         """
         if not isinstance(particles, Tensor) or particles.dim() != 1 or particles.layout != torch.strided:
             raise ValueError(f"particles must be an index tensor of shape [Q], got {shape_of(particles)}")
@@ -343,9 +344,10 @@ class State:
         return self.map(lambda t: _take(t, particles))
 
     def sorted(self, grid: Grid) -> State:
-        """Reorder by grid block and cell: neighbours in space become neighbours in memory. `ids` remember the order.
+        """Reorder by grid block and cell: neighbours in space become neighbours in memory. `ids` record the original
+        order.
 
-        Reordering now and then keeps long simulations fast; results differ only by rounding. Differentiable.
+        Occasional reordering keeps long simulations fast; results differ only by rounding. Differentiable.
         """
         check_grid(grid)
         ids = torch.arange(len(self), device=self.x.device) if self.ids is None else self.ids
@@ -355,14 +357,14 @@ class State:
         return state._map_all(lambda fields: _take_all(fields, order))
 
     def restored(self) -> State:
-        """In the order of `ids`, that is in the order before any `sorted`. Differentiable."""
+        """State in the order of `ids`, the order before any `sorted`. Differentiable."""
         return self if self.ids is None else self.select(torch.argsort(self.ids))
 
     def split(self, scenes: int | None = None) -> list[State]:
-        """A state for each scene of a batch, the inverse of `concatenate(states, scene=True)`; synchronises.
+        """States of the scenes of a batch, the inverse of `concatenate(states, scene=True)`; synchronises.
 
         Args:
-            scenes: number of scenes; None for one more than the largest, or as many as the time has.
+            scenes: number of scenes; None for the largest plus one, or the number of entries of the time.
 
         Returns:
             States of one scene, in the order of the particles; differentiable. Obstacles are placed anew in them.
@@ -381,20 +383,21 @@ class State:
         """Pack several states into one; differentiable.
 
         Args:
-            states: of one dimension, dtype and device. C, F, J and x_residual that only some have are made as a step
-                makes them: zero, identity, one, zero.
-            scene: False packs parts of one batch, whose scenes stay as they are. True packs batches: the scenes of each
-                state follow those of the states before it, and each keeps its time and its impulses. Obstacles are
-                placed anew (see `Obstacle.place`).
-            scenes: with scene=True, how many scenes each state holds. None counts those of its time [B], or else one
-                more than its largest scene, which synchronises with the device.
+            states: states of one dimension, dtype and device. Where only some have C, F, J or x_residual, the others
+                get the initial values of a step: zero, identity, one, zero.
+            scene: False packs parts of one batch with unchanged scenes. True packs batches: the scenes of each state
+                follow those of the previous states, and each keeps its time and its impulses. Obstacles are placed anew
+                (see `Obstacle.place`).
+            scenes: with scene=True, number of scenes of each state. None uses that of its time [B], or else its largest
+                scene plus one, which synchronises with the device.
 
         Returns:
-            A state with ids 0 .. P − 1 where one of the states has ids, such that `restored` gives the states one after
-            another, each in its own restored order. Parameters [P] are then those of the states, joined alike.
+            A state with ids 0 .. P − 1 where one of the states has ids, such that `restored` returns the states one
+            after another, each in its own restored order. Parameters [P] are then the concatenated parameters of the
+            states.
 
         Raises:
-            TypeError: for anything but a list of states.
+            TypeError: unless the argument is a list of states.
             ValueError: for an empty list; states of one batch at different times or with different impulses; another
                 field that is present in some states only; counts that do not fit.
         """
@@ -419,7 +422,7 @@ class State:
 
 FIELDS = tuple(f.name for f in dataclasses.fields(State))
 PARTICLE_FIELDS = tuple(name for name in FIELDS if name not in ("extra", "time", "impulse"))
-"""Fields with a row for each particle, beside those in `extra`."""
+"""Fields with a row per particle, beside those in `extra`."""
 
 
 def check_state(state: Any) -> None:
@@ -431,7 +434,7 @@ def check_state(state: Any) -> None:
 
 
 def _count_scenes(state: State) -> int | None:
-    """Number of scenes of a state that no step has prepared, see `State.scenes`."""
+    """Number of scenes of a state that was not prepared by a step, see `State.scenes`."""
     if isinstance(state.time, Tensor) and state.time.numel() > 1:
         return state.time.numel()
     if state.impulse is not None:
@@ -458,12 +461,12 @@ def _check_impulse(impulse: Any, x: Tensor) -> None:
 
 
 def _shifted(scene: Tensor, first: int) -> Tensor:
-    """Scenes as those that follow others; absent particles, of scene -1, stay absent."""
+    """Scene indices shifted behind those of other states; absent particles, of scene -1, stay absent."""
     return torch.where(scene < 0, scene, scene + first)
 
 
 def _checked(states: Sequence[State]) -> list[State]:
-    """The states as a list, after checking what they must have in common."""
+    """The states as a list, after a check of their common properties."""
     if not isinstance(states, (list, tuple)):
         raise TypeError(f"states must be a list of State, got {shape_of(states)}")
     if wrong := [s for s in states if not isinstance(s, State)]:
@@ -502,7 +505,7 @@ def _scene_counts(states: Sequence[State], given: Sequence[int] | None) -> list[
 
 
 def _times_of_scenes(states: Sequence[State], counts: Sequence[int]) -> float | Tensor:
-    """A number where it is the same for all, else [B]."""
+    """A number where it is the same for all, otherwise [B]."""
     times = [s.time for s in states]
     if not any(isinstance(t, Tensor) for t in times) and len(set(times)) == 1:
         return times[0]
@@ -512,7 +515,7 @@ def _times_of_scenes(states: Sequence[State], counts: Sequence[int]) -> float | 
 
 
 def _one_time(states: Sequence[State]) -> float | Tensor:
-    """The time of states that are parts of one batch."""
+    """Time of states that are parts of one batch."""
     first, x = states[0].time, states[0].x
     for other in (s.time for s in states[1:]):
         if other is first:
@@ -543,7 +546,7 @@ def _impulses_of_scenes(states: Sequence[State], counts: Sequence[int]) -> Tenso
 
 
 def _one_impulse(states: Sequence[State]) -> Tensor | None:
-    """That of the parts of one batch that have one."""
+    """Impulse of the parts of one batch that have one."""
     found = [s.impulse for s in states if s.impulse is not None]
     for other in found[1:]:
         if other is not found[0] and not torch.equal(other, found[0]):
@@ -552,13 +555,13 @@ def _one_impulse(states: Sequence[State]) -> Tensor | None:
 
 
 def _rank(state: State) -> Tensor:
-    """Place of each particle in the restored order of its state, int64 [P]."""
+    """Index of each particle in the restored order of its state, int64 [P]."""
     places = torch.arange(len(state), device=state.x.device)
     return places if state.ids is None else torch.empty_like(places).scatter_(0, torch.argsort(state.ids), places)
 
 
 def _joined(name: str, states: Sequence[State]) -> Tensor | None:
-    """A field of all states, made where a step would make it; None where no state has it."""
+    """A field of all states, with the initial values of a step where absent; None where no state has it."""
     values = [getattr(s, name) for s in states]
     if all(v is None for v in values):
         return None
@@ -631,7 +634,7 @@ def _checked_density(density: float | Tensor, particles: int) -> float | Tensor:
 
 
 def _as_soa(t: Tensor) -> Tensor:
-    """The same values with the particle index contiguous."""
+    """Same values with a contiguous particle index."""
     if t.dim() == 1:
         return t.contiguous()
     axes = (*range(1, t.dim()), 0)
@@ -639,15 +642,15 @@ def _as_soa(t: Tensor) -> Tensor:
 
 
 def _take(t: Tensor, particles: Tensor) -> Tensor:
-    """Rows of a [P, ...] tensor with the particle index contiguous."""
+    """Rows of a [P, ...] tensor with a contiguous particle index."""
     if t.dim() == 1:
         return t.index_select(0, particles)
-    taken = t.flatten(1).mT.index_select(1, particles).mT  # ten times faster than `index_select` of [P, ...]
+    taken = t.flatten(1).mT.index_select(1, particles).mT  # Ten times faster than `index_select` of [P, ...].
     return taken if t.dim() == 2 else taken.view(particles.shape[0], *t.shape[1:])
 
 
 def _take_all(fields: Sequence[Tensor], particles: Tensor) -> list[Tensor]:
-    """The same of many tensors in one call, for particles that are known to exist."""
+    """Rows of many tensors in one call, for particles that are known to exist."""
     if is_recorded(*fields) or any(t.element_size() > 8 or t.layout != torch.strided for t in fields):
         return [_take(t, particles) for t in fields]
     taken: list[Tensor] = dispatch(torch.ops.torch_mpm.take, fields, particles)

@@ -1,4 +1,4 @@
-"""What a step costs, measured by taking one aside: memory for the backward pass, and time."""
+"""Measured cost of a step: memory for the backward pass, and time."""
 
 from __future__ import annotations
 
@@ -18,13 +18,15 @@ StepFunction = Callable[[State, "float | Tensor"], State]
 
 
 def state_bytes(state: State) -> int:
-    """Of the tensors that steps change [bytes]."""
+    """Size of the tensors that steps change [bytes]."""
     fields = [getattr(state, f.name) for f in dataclasses.fields(state) if f.name not in (*CONSTANT, "extra")]
     return sum(_bytes(t) for t in [*fields, *state.extra.values()] if isinstance(t, Tensor))
 
 
 def step_bytes(step: StepFunction, state: State, dt: float | Tensor) -> int:
-    """What autograd keeps of one step from Python, its state among it, beside what all steps share [bytes]."""
+    """Memory that autograd stores for one step from Python, including its state, without what all steps share
+    [bytes].
+    """
     start = differentiable(state)
     parameters = [*step.parameters(), *step.buffers()] if isinstance(step, torch.nn.Module) else []
     constants = [t for name in CONSTANT if (t := getattr(start, name)) is not None]
@@ -44,13 +46,13 @@ def step_bytes(step: StepFunction, state: State, dt: float | Tensor) -> int:
 
 
 def differentiable(state: State) -> State:
-    """A state of its own whose positions and velocities, and what follows from them, have gradients."""
+    """Separate state whose positions, velocities and dependent fields have gradients."""
     state = state.detach()
     return state.replace(x=state.x.clone().requires_grad_(), v=state.v.clone().requires_grad_())
 
 
 def seconds(work: Callable[[], Any], device: torch.device) -> float:
-    """Least time of two calls after a first one [s]."""
+    """Minimum time of two calls after a first one [s]."""
     work()
     times = []
     for _ in range(2):

@@ -1,4 +1,4 @@
-"""When the steps of a call begin."""
+"""Start times of the steps of a call."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 def clocks(state: State, dt: float | Tensor, scenes: int) -> tuple[float, Tensor | None, Tensor | None]:
-    """The time step [s] as a number, or times that and a time in float64 for each scene [B]."""
+    """Time step [s] as a number, or time steps and times in float64 for each scene [B]."""
     number, scene_dt = split_dt(dt, scenes, state.x)
     if scene_dt is None and not isinstance(state.time, Tensor):
         return number, None, None
@@ -28,7 +28,7 @@ def clocks(state: State, dt: float | Tensor, scenes: int) -> tuple[float, Tensor
 
 
 def time_after(time: float | Tensor, dt: float | Tensor, n: int = 1) -> float | Tensor:
-    """The time n steps later, in float64 and rounded as single steps do."""
+    """Time n steps later, in float64 and rounded as in single steps."""
     dt = dt.double() if isinstance(dt, Tensor) else dt
     for _ in range(n):
         time = time + dt
@@ -36,27 +36,27 @@ def time_after(time: float | Tensor, dt: float | Tensor, n: int = 1) -> float | 
 
 
 def time_like(time: float | Tensor, like: Tensor) -> float | Tensor:
-    """A time as functions of the user's get it: a number, or a tensor with the dtype of `like`."""
+    """Time as an argument of user functions: a number, or a tensor with the dtype of `like`."""
     return time.to(like.dtype) if isinstance(time, Tensor) else time
 
 
 def requires_grad(value: float | Tensor) -> bool:
-    """Whether a time or time step has a gradient now."""
+    """Whether a time or time step has a gradient at present."""
     return isinstance(value, Tensor) and value.requires_grad and torch.is_grad_enabled()
 
 
 class StepTimes(NamedTuple):
-    """The times [s] at which n steps begin."""
+    """Start times [s] of n steps."""
 
     tensor: Tensor
-    """[n] or, where scenes have clocks of their own, [n, B], in float64."""
+    """Times [n] or, where scenes have separate clocks, [n, B], in float64."""
     numbers: list[float] | None
-    """The same where all scenes have one time, which the host knows."""
+    """Times as numbers where all scenes have one time, which the host knows."""
 
     @classmethod
     @torch.no_grad()
     def of(cls, state: State, n: int, dt: float | Tensor, scenes: int) -> StepTimes:
-        """Added up as single steps do."""
+        """Accumulated as in single steps."""
         number, scene_dt, scene_time = clocks(state, dt, scenes)
         if scene_dt is None or scene_time is None:
             count = torch.arange(n, dtype=torch.float64, device=state.x.device)
@@ -68,7 +68,7 @@ class StepTimes(NamedTuple):
         return cls(torch.stack(times), None)
 
     def within(self, start: float, end: float) -> slice:
-        """The steps that begin in [start, end), where the host knows; else all."""
+        """Steps that begin in [start, end), where the host knows; otherwise all."""
         if self.numbers is None:
             return slice(0, len(self.tensor))
         return slice(bisect_left(self.numbers, start), bisect_left(self.numbers, end))

@@ -10,7 +10,7 @@ import numpy.typing as npt
 Array = npt.NDArray[Any]
 
 TURNS = 64
-"""Sides of a surface of revolution."""
+"""Number of sides of a surface of revolution."""
 
 
 class SurfaceMesh(NamedTuple):
@@ -21,7 +21,7 @@ class SurfaceMesh(NamedTuple):
 
 
 def plate(middle: Array, normal: Array, size: float) -> SurfaceMesh:
-    """A square of side `size` [m] around `middle`, whose visible side looks along `normal`; a thick line in 2-D."""
+    """Square of side `size` [m] around `middle`, with its visible side along `normal`; a thick line in 2-D."""
     frame = frame_of(normal / np.linalg.norm(normal))
     if len(middle) == 2:
         thick = 0.01 * size
@@ -54,14 +54,14 @@ def capsule(half_length: float, radius: float, axis: Array) -> SurfaceMesh:
 
 
 def ring(outline: Array, axis: Array) -> list[SurfaceMesh]:
-    """The closed polygon (radius, height) [K, 2] turned around `axis` [D]; in 2-D itself and its mirror image."""
+    """Closed polygon (radius, height) [K, 2] revolved about `axis` [D]; in 2-D the polygon and its mirror image."""
     if len(axis) == 3:
         return [revolved(np.concatenate([outline, outline[:1]]), axis)]
     return [SurfaceMesh(outline * [side, 1.0] @ frame_of(axis).T, None) for side in (1.0, -1.0)]
 
 
 def revolved(profile: Array, axis: Array) -> SurfaceMesh:
-    """The profile (radius, height) [K, 2] turned about the unit vector `axis` [3], without edges on the axis."""
+    """Profile (radius, height) [K, 2] revolved about the unit vector `axis` [3], without edges on the axis."""
     phi = 2 * np.pi * np.arange(TURNS) / TURNS
     radius, height = profile[:, 0][:, None], profile[:, 1][:, None]
     v = np.stack([radius * np.cos(phi), height + 0 * phi, radius * np.sin(phi)], axis=-1).reshape(-1, 3)
@@ -74,7 +74,7 @@ def revolved(profile: Array, axis: Array) -> SurfaceMesh:
 
 
 def frame_of(axis: Array) -> Array:
-    """A rotation [D, D] that takes the y axis to the unit vector `axis` [D]."""
+    """Rotation [D, D] of the y axis to the unit vector `axis` [D]."""
     if len(axis) == 2:
         return np.stack([np.array([axis[1], -axis[0]]), axis], axis=1)
     helper = np.eye(3)[int(np.argmin(np.abs(axis)))]

@@ -1,4 +1,4 @@
-"""The lattice of nodes and its active blocks, as the ops take them."""
+"""Lattice of nodes and its active blocks, as arguments of the ops."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ BLOCK_WIDTH = 4
 
 PackedLattice = tuple[list[float], list[int]]
 PackedTopology = tuple[list[Tensor], list[float], list[int]]
-"""The trailing arguments of an op: `Tensor[] topology, float[] lattice, int[] layout` (csrc/grid/topology.op.h)."""
+"""Trailing arguments of an op: `Tensor[] topology, float[] lattice, int[] layout` (csrc/grid/topology.op.h)."""
 
 
 class Status(enum.IntEnum):
@@ -47,13 +47,13 @@ FIRST_PROBLEMS = (Status.OUTSIDE_FIRST, Status.NON_FINITE_FIRST, Status.PROBLEM_
 
 
 class Lattice:
-    """Nodes at `lower + (i - PADDING) dx` along each axis, in blocks of 4^D: what the ops know of a `Grid`.
+    """Nodes at `lower + (i - PADDING) dx` along each axis, in blocks of 4^D: the part of a `Grid` that the ops need.
 
     Args:
         dx: node distance [m].
         lower: lower corner of the domain [m], D numbers.
-        blocks: blocks along each axis.
-        order: of the B-spline, 2 or 3.
+        blocks: number of blocks along each axis.
+        order: order of the B-spline, 2 or 3.
         deterministic: whether sums over particles are bit-identical from run to run on CUDA too.
     """
 
@@ -74,15 +74,15 @@ class Lattice:
 
 @dataclasses.dataclass(eq=False)
 class Topology:
-    """Which blocks of a lattice are active, and which particles lie in each.
+    """Active blocks of a lattice, and the particles in each.
 
-    A node tensor has N = max_blocks * 4^D rows, of which those of unused blocks stay zero.
+    A node tensor has N = max_blocks * 4^D rows; rows of unused blocks stay zero.
 
     Attributes:
         grid: the lattice.
         table: slot of every block of every scene, int32 [B * blocks], -1 where inactive.
         block: table index of every slot, int32 [max_blocks], -1 where unused.
-        offsets, index: particles `index[offsets[s]:offsets[s + 1]]` have their base node in the block of slot s, int32.
+        offsets, index: int32; particles `index[offsets[s]:offsets[s + 1]]` have their base node in the block of slot s.
         schedule: order of work of the kernels.
         scene: scene of each particle, int32 [P], or None for one scene.
     """
@@ -101,7 +101,7 @@ class Topology:
 
     @classmethod
     def unpack(cls, topology: Sequence[Tensor], lattice: Sequence[float], layout: Sequence[int]) -> Topology:
-        """The inverse of `packed`.
+        """Inverse of `packed`.
 
         Raises:
             ValueError: for lists of a wrong length.
@@ -133,11 +133,11 @@ class Topology:
         return self.block.shape[0] * self.grid.nodes_per_block
 
     def particle_scene(self) -> Tensor | None:
-        """`scene` with all ids in range. A particle whose scene there is not is not transferred; any will do."""
+        """`scene` clamped to valid ids. Particles of unknown scenes are not transferred, so any id will do."""
         return None if self.scene is None else self.scene.clamp(0, self.scenes - 1)
 
     def active_nodes(self) -> Tensor:
-        """Which node rows belong to an active block, bool [N]."""
+        """Whether node rows belong to an active block, bool [N]."""
         return (self.block >= 0).repeat_interleave(self.grid.nodes_per_block)
 
     def block_scene(self) -> Tensor:
@@ -161,7 +161,7 @@ class Topology:
 
         Args:
             node: lattice indices, int64 [..., D].
-            scene: int32 or int64, of the first axes of `node`; None for the first scene.
+            scene: int32 or int64, with the shape of the first axes of `node`; None for the first scene.
 
         Returns:
             int64 [...], -1 where no block is active.

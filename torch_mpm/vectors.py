@@ -19,7 +19,7 @@ def unit(v: Tensor) -> Tensor:
 
 
 def composed(a: Tensor, b: Tensor) -> Tensor:
-    """Rotation vector [..., 3] [rad] of the rotation by b and then by a, of an angle of at most π; by quaternions.
+    """Rotation vector [..., 3] [rad] of the rotation by b followed by a, with an angle of at most π; by quaternions.
 
     Twice differentiable where the angle is below π.
     """
@@ -28,7 +28,7 @@ def composed(a: Tensor, b: Tensor) -> Tensor:
     vector = p * v + q * u + torch.linalg.cross(*torch.broadcast_tensors(u, v))
     scalar, vector = scalar.abs(), torch.where(scalar < 0, -vector, vector)
     half = norm(vector)[..., None]
-    small = half < 1e-9  # where atan2(half, scalar)/half is 1 to rounding, as scalar is
+    small = half < 1e-9  # Here atan2(half, scalar)/half is 1 to rounding, as scalar is.
     return 2 * vector * torch.where(small, 1.0, torch.atan2(half, scalar) / torch.where(small, 1.0, half))
 
 
@@ -45,7 +45,7 @@ def transform(matrix: Tensor, v: Tensor) -> Tensor:
 
 
 def product(A: Tensor, B: Tensor) -> Tensor:
-    """Product of small matrices [P, D, K] and [P, K, E], many of them, for which batched library calls are slow."""
+    """Product of small matrices [P, D, K] and [P, K, E], for large P, for which batched library calls are slow."""
     result = A[:, :, 0, None] * B[:, 0, None, :]
     for k in range(1, A.shape[2]):
         result = torch.addcmul(result, A[:, :, k, None], B[:, k, None, :])

@@ -17,7 +17,7 @@ from .view_server import viser_server
 
 PLAYED_FPS = 30
 COUNTED = ("particle_type", *PALETTES)
-"""Fields whose numbers stand for kinds."""
+"""Fields whose numbers are categories."""
 
 
 class Viewer:
@@ -25,8 +25,8 @@ class Viewer:
 
     Args:
         path: folder of a run or of a data set.
-        port: to listen at; the next that is free where it is taken.
-        host: address to listen at; by default this machine alone can connect.
+        port: port to listen at; the next free one where it is in use.
+        host: address to listen at; by default only this machine can connect.
 
     Attributes:
         url: the page.
@@ -92,7 +92,7 @@ class Viewer:
         with self._lock:
             self.clip = clip
             self._measure()
-        self._color.options = tuple(clip.fields)  # of which this scene may have others
+        self._color.options = tuple(clip.fields)  # This scene may lack the previous field.
         self._frame.max = max(1, len(clip.position) - 1)
         self._frame.value = 0
         self.show()
@@ -105,7 +105,7 @@ class Viewer:
         self._ranges: dict[str, tuple[float, float]] = {}
 
     def show(self) -> None:
-        """Put the chosen frame on the page."""
+        """Show the chosen frame."""
         with self._lock:
             frame = min(self._frame.value, len(self.clip.position) - 1)
             name = self._color.value if self._color.value in self.clip.fields else "speed"
@@ -144,7 +144,7 @@ class Viewer:
         return np.pad(x, [(0, 0), (0, 3 - x.shape[1])]).astype(np.float32)
 
     def _play(self) -> None:
-        """Move the slider while the box is ticked: in real time, and frames are left out where they are too many."""
+        """Move the slider while the box is ticked, in real time; frames are skipped where there are too many."""
         since = time.perf_counter()
         position = 0.0
         while not self._stop.wait(1 / PLAYED_FPS):
@@ -153,7 +153,7 @@ class Viewer:
             if not self._playing.value:
                 position = float(self._frame.value)
                 continue
-            if int(position) != self._frame.value:  # moved by hand
+            if int(position) != self._frame.value:  # Moved by hand.
                 position = float(self._frame.value)
             frames = len(self.clip.position)
             position = following_frame(position, passed, self._speed.value, self.clip.interval, frames)
@@ -162,7 +162,7 @@ class Viewer:
 
 
 def following_frame(position: float, seconds: float, speed: float, interval: float, frames: int) -> float:
-    """The place in a clip some seconds later, at a multiple ``speed`` of real time; the clip begins anew at its end."""
+    """Position in a clip some seconds later, at a multiple ``speed`` of real time; the clip restarts at its end."""
     return (position + seconds * speed / interval) % frames if frames > 1 else 0.0
 
 

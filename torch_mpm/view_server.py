@@ -1,4 +1,4 @@
-"""The server of the viewer: an address that can be listened at, and pages of its own alone."""
+"""Server of the viewer: checks of its address, and access for its own pages only."""
 
 from __future__ import annotations
 
@@ -17,27 +17,27 @@ MOST_PORT = 65535
 
 
 def viser_server(host: str, port: int) -> Any:
-    """A viser server that pages of other sites cannot read from.
+    """A viser server that rejects pages of other sites.
 
     Args:
         host: address to listen at.
-        port: to listen at; the next that is free where it is taken.
+        port: port to listen at; the next free one where it is in use.
 
     Raises:
-        ValueError: for a port that is none.
+        ValueError: for an invalid port.
         OSError: for an address that is not of this machine, or a port that may not be listened at.
         ImportError: when viser is missing (extra ``view``).
     """
     viser = optional.load("viser", "the viewer", "view")
     sockets = optional.load("websockets.asyncio.server", "the viewer", "view")
     _check_address(host, port)
-    # viser takes no function for the check of requests, so that of websockets is given one while viser calls it.
+    # viser has no argument for a check of requests, so the `serve` of websockets is replaced while viser calls it.
     with mock.patch.object(sockets, "serve", _guarded(sockets.serve, host)):
         return viser.ViserServer(host=host, port=port, verbose=False)
 
 
 def _check_address(host: str, port: int) -> None:
-    """viser waits without an end for a server that cannot begin."""
+    """Raise instead of waiting for a server that cannot start, as viser does without limit."""
     if not 0 <= port <= MOST_PORT:
         raise ValueError(f"port must be within 0 and {MOST_PORT}, got {port}")
     try:
@@ -51,7 +51,7 @@ def _check_address(host: str, port: int) -> None:
 
 
 def _guarded(serve: Callable[..., Any], host: str) -> Callable[..., Any]:
-    """`serve` of websockets that refuses connections from pages of other sites."""
+    """`serve` of websockets that rejects connections from pages of other sites."""
 
     def guarded(handler: Any, *arguments: Any, process_request: Any = None, **options: Any) -> Any:
         def checked(connection: Any, request: Any) -> Any:
@@ -66,13 +66,13 @@ def _guarded(serve: Callable[..., Any], host: str) -> Callable[..., Any]:
 
 
 def is_own_page(origin: str | None, asked: str | None, host: str) -> bool:
-    """Whether a connection comes from a page of the server, or from a program that is no browser.
+    """Whether a connection comes from a page of the server, or from a program other than a browser.
 
     Args:
         origin: header of the request: the site of the page; None for a program.
-        asked: header of the request: host and port that were connected to.
-        host: address that the server listens at. Names of other sites may lead to a loopback address, so there the
-            names of this machine alone count.
+        asked: header of the request: host and port of the connection.
+        host: address that the server listens at. Names of other sites may resolve to a loopback address, so only the
+            names of this machine are accepted there.
     """
     if origin is None:
         return True

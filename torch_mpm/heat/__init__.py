@@ -1,4 +1,4 @@
-"""Heat in particles: the implicit step on the nodes, and what acts at surfaces."""
+"""Heat in particles: the implicit step on the nodes, and boundary terms."""
 
 from .heat import Heat, HeatBoundary, present_volume
 

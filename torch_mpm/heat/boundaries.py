@@ -1,8 +1,9 @@
-"""What heats and cools a body beside conduction: flux, convection, radiation, held temperatures, sources.
+"""Boundary terms and sources of heat: flux, convection, radiation, held temperatures, sources.
 
 Without any of these a body is insulated. Each acts on the nodes of an implicit step through `HeatNodes`; anything with
-a method `apply(nodes)` can stand in the list of a `Heat`. Quantities of a surface are joined to the nodes by points x_s
-with areas A_s (`Surface`), h_i = Σ_s A_s η_s N_i(x_s), or by the free surface of the particles (`FreeSurface`).
+a method `apply(nodes)` can stand in the list of a `Heat`. Quantities of a surface are distributed to the nodes by
+points x_s with areas A_s (`Surface`), h_i = Σ_s A_s η_s N_i(x_s), or by the free surface of the particles
+(`FreeSurface`).
 """
 
 from __future__ import annotations
@@ -37,7 +38,8 @@ STEFAN_BOLTZMANN = 5.670374419e-8
 
 LIGHT = 1e-3
 """Heat capacity of a node, relative to the largest around a point of a surface, below which it gets less than its
-weight: heat that goes into next to nothing would make it hotter than the solve can bear."""
+weight: heat into nearly empty nodes would make them hotter than the solve can bear.
+"""
 
 Number = float | Tensor
 Timed = Number | Callable[[float | Tensor], Number]
@@ -46,7 +48,7 @@ Timed = Number | Callable[[float | Tensor], Number]
 
 @dataclasses.dataclass
 class HeatNodes:
-    """The nodes of one implicit step, to which boundary terms add their part.
+    """Nodes of one implicit step, to which boundary terms contribute.
 
     Attributes:
         blocks: active blocks of the particles.
@@ -59,8 +61,8 @@ class HeatNodes:
         source: heat into the nodes [N] [W], or None.
         exchange: derivative of the heat that leaves them by their temperature [N] [W/K], or None.
         fixed: nodes whose temperature is held at `held` [N] [K], bool [N], or None.
-        share: of their conductivity that particles are left with [P], or None for all.
-        layers: what replaces the rest, see `add_layer`.
+        share: remaining fraction of the conductivity of particles [P], or None for all of it.
+        layers: exchange that replaces the rest, see `add_layer`.
     """
 
     blocks: Blocks
@@ -79,7 +81,7 @@ class HeatNodes:
 
     @property
     def time(self) -> float | Tensor:
-        """[s]"""
+        """Time of the step [s]."""
         return self.state.time
 
     @functools.cached_property
@@ -110,23 +112,23 @@ class HeatNodes:
         return per_node(value.to(self.theta), 0, self.scene())
 
     def add_source(self, power: Tensor) -> None:
-        """Heat [N] [W] that goes into the nodes."""
+        """Add heat [N] [W] into the nodes."""
         self.source = power if self.source is None else self.source + power
 
     def add_exchange(self, coefficient: Tensor, ambient: Number) -> None:
-        """Heat coefficient (ambient − θ) with coefficient [N] [W/K], taken at the end of the step."""
+        """Add heat coefficient (ambient − θ) with coefficient [N] [W/K], evaluated at the end of the step."""
         self.add_linear(coefficient, coefficient * ambient)
 
     def add_linear(self, coefficient: Tensor, power: Tensor) -> None:
-        """Heat power − coefficient θ [N] [W], taken at the end of the step."""
-        if self.exchange is not None and self.source is not None:  # in one kernel
+        """Add heat power − coefficient θ [N] [W], evaluated at the end of the step."""
+        if self.exchange is not None and self.source is not None:  # Both in one kernel.
             self.exchange, self.source = torch._foreach_add([self.exchange, self.source], [coefficient, power])
             return
         self.exchange = coefficient if self.exchange is None else self.exchange + coefficient
         self.add_source(power)
 
     def hold(self, where: Tensor, temperature: Number) -> None:
-        """Keep nodes, bool [N], at a temperature [K]; those held before stay as they are."""
+        """Hold nodes, bool [N], at a temperature [K]; nodes that are already held are unchanged."""
         value = torch.where(where, torch.zeros_like(self.theta) + temperature, 0)
         if self.fixed is None or self.held is None:
             self.fixed, self.held = where, value
@@ -135,12 +137,12 @@ class HeatNodes:
             self.fixed = self.fixed | where
 
     def add_layer(self, share: Tensor, rate: Tensor, temperature: Number) -> None:
-        """Let particles conduct with a share [P] of their conductivity, and exchange κ V rate (temperature − θ).
+        """Reduce the conductivity of particles to a share [P], and add the exchange κ V rate (temperature − θ).
 
         Args:
             share: s [P] of the distance a from a surface.
             rate: s'/a [P] [1/m²]. Where layers overlap, s is the product of their shares.
-            temperature: of the surface [K], a number or [N].
+            temperature: temperature of the surface [K], a number or [N].
         """
         before = self.share
         self.layers = [(other * share, value) for other, value in self.layers]
@@ -148,9 +150,9 @@ class HeatNodes:
         self.share = share if before is None else before * share
 
     def left_conductance(self) -> Tensor:
-        """κ V of the particles [P] without what layers replace; adds their exchange.
+        """κ V of the particles [P] without the share that layers replace; adds their exchange.
 
-        What is left gets negative where a layer exchanges more (csrc/pointwise/heat.h); H + X stays positive.
+        The remaining share becomes negative where a layer exchanges more (csrc/pointwise/heat.h); H + X stays positive.
         """
         if self.share is None:
             return self.conductance
@@ -165,19 +167,19 @@ class HeatNodes:
 
 
 class Surface(TensorModule):
-    """Points that stand for a surface.
+    """Points that represent a surface.
 
     Args:
         points: x_s [S, D] [m].
         area: A_s [m²] (m in 2-D): a number for each of them, or [S].
         scene: scene of each point, int32 [S]; None where the grid has one scene.
 
-    A point gives to the nodes around it that have matter, in proportion to N_i(x_s), all of what it has, and less to
-    those with next to none; a point with no matter around it gives nothing. Points stay where they are: replace
-    `points` between steps if the surface moves.
+    A point distributes its heat in proportion to N_i(x_s) to the surrounding nodes with matter, and less to nearly
+    empty nodes; a point without matter around it contributes nothing. Points do not move: replace `points` between
+    steps if the surface moves.
 
     Raises:
-        ValueError: for wrong shapes, points that are not finite, or an area that is not or is negative.
+        ValueError: for wrong shapes, points that are not finite, or an area that is not finite or is negative.
     """
 
     def __init__(self, points: Tensor, area: Number, scene: Tensor | None = None) -> None:
@@ -218,7 +220,7 @@ class Surface(TensorModule):
         return torch.zeros_like(nodes.theta).index_add(0, rows.reshape(-1), given.reshape(-1))
 
     def _of_points(self, density: Number, scenes: int, name: str) -> Number:
-        """A density that is the same for all points, or one for each of them, [S]."""
+        """A density that is the same for all points, or one per point, [S]."""
         if not isinstance(density, Tensor) or needs_no_scenes(density, len(self.points)):
             return density
         if self.scene is None or density.shape != (scenes,):
@@ -230,10 +232,10 @@ class Surface(TensorModule):
 
 
 class FreeSurface(TensorModule):
-    """The surface of the particles wherever it is now: the area of a node is |Σ_p V_p ∇N_i(x_p)| = |∮ N_i n dA|.
+    """Present surface of the particles: the area of a node is |Σ_p V_p ∇N_i(x_p)| = |∮ N_i n dA|.
 
-    Exact for a flat surface of evenly spread particles; disorder inside a body adds area that is not there, a share of
-    V/dx per node like that of the disorder. A side that touches an obstacle counts too.
+    Exact for a flat surface of evenly spread particles. Disorder inside a body adds a spurious area per node, a share
+    of V/dx similar to that of the disorder. A side that touches an obstacle counts too.
     """
 
     def integrate(self, nodes: HeatNodes, density: Timed, name: str = "density") -> Tensor:
@@ -261,17 +263,17 @@ def node_weights(blocks: Blocks, x: Tensor, scene: Tensor | None) -> tuple[Tenso
 
 
 class Term(TensorModule):
-    """What adds to the nodes by `apply(nodes)`, a module with the tensors and parameters of its arguments.
+    """Boundary term with `apply(nodes)`, a module with the tensors and parameters of its arguments.
 
     Attributes:
-        timed: names of those that may be functions of the time, or obstacles that move.
+        timed: names of arguments that may be functions of the time, or obstacles that move.
     """
 
     timed: tuple[str, ...] = ()
 
     @property
     def reads_time(self) -> bool:
-        """Whether it looks at the time."""
+        """Whether it depends on the time."""
         values = (getattr(self, name) for name in self.timed)
         return any(getattr(value, "reads_time", callable(value)) for value in values)
 
@@ -352,11 +354,11 @@ class Fixed(Term):
     """Nodes that are held at a temperature (Dirichlet).
 
     Args:
-        region: an obstacle of `torch_mpm.boundaries`, of which the nodes inside are held, wherever it moves; or a
-            function of node positions [N, D] [m] that returns bool [N]. The surface is resolved to one node distance.
-            Where it lies on nodes, matter beside it sees it 0.17 dx farther away (cubic kernel 0.36 dx; 0.16 and 0.29
-            where matter reaches into the region), because splines smooth the bend of the temperature there; between
-            nodes, or where matter does not quite reach it, many times farther. See `FixedSurface`.
+        region: an obstacle of `torch_mpm.boundaries`, moving or not, whose inside nodes are held; or a function of node
+            positions [N, D] [m] that returns bool [N]. The surface is resolved to one node distance. Where it lies on
+            nodes, it appears 0.17 dx farther away from adjacent matter (cubic kernel 0.36 dx; 0.16 and 0.29 where
+            matter extends into the region), because splines smooth the kink of the temperature there; between nodes, or
+            where matter does not quite reach it, many times farther. See `FixedSurface`.
         temperature: [K]: a number, a tensor [] or [B], or a function of the time.
 
     Raises:
@@ -383,29 +385,29 @@ class Fixed(Term):
 
 
 class FixedSurface(Term):
-    """The surface of an obstacle that is held at a temperature (Dirichlet), wherever it lies between the nodes.
+    """Surface of an obstacle that is held at a temperature (Dirichlet), for any position between the nodes.
 
     Matter at a distance a < w from it conducts with the share s = 1 − (1 − a²/w²)³ of its conductivity, and exchanges
-    the heat κ (s'/a) (temperature − θ) per volume with the surface itself. That is what ∇ · (s κ ∇θ) lacks where θ is
-    linear, and on average over the layer for any θ. So the layer hardly shows in the temperature. Its error is of first
-    order in dx with a small factor: a steady linear temperature is wrong by no more than it changes over 0.042 dx with
-    4 or 9 particles per cell, 0.22 dx with one, wherever the surface lies between the nodes; in the mean it meets that
-    of the surface within 0.02 dx, and within 0.1 dx where a gap of 0.5 dx is between it and the matter. With FLIP it is
-    1.2 dx, because nothing smooths the particles (benchmarks/results/heat_fronts.md). Matter inside the obstacle is
-    held as at the surface.
+    the heat κ (s'/a) (temperature − θ) per volume with the surface itself. This exchange equals the missing part of ∇ ·
+    (s κ ∇θ) where θ is linear, and on average over the layer for any θ. So the layer hardly affects the temperature.
+    Its error is of first order in dx with a small factor: the error of a steady linear temperature is at most its
+    change over 0.042 dx with 4 or 9 particles per cell, 0.22 dx with one, for any position of the surface between the
+    nodes. In the mean it matches that of the surface within 0.02 dx, and within 0.1 dx with a gap of 0.5 dx to the
+    matter. With FLIP the error is 1.2 dx, because nothing smooths the particles (benchmarks/results/heat_fronts.md).
+    Matter inside the obstacle is held as at the surface.
 
     Args:
         region: an obstacle of `torch_mpm.boundaries`, wherever it moves.
         temperature: [K]: a number, a tensor [] or [B], or a function of the time.
 
     Raises:
-        ValueError: for a region that is no obstacle, or a temperature that is not finite.
+        ValueError: for a region that is not an obstacle, or a temperature that is not finite.
     """
 
     timed = ("region", "temperature")
 
     WIDTH = 2.0
-    """w in dx: below 1.5 the rows of particles show."""
+    """w in dx: below 1.5 the rows of particles become visible."""
 
     def __init__(self, region: Obstacle, temperature: Timed) -> None:
         if not isinstance(region, Obstacle):
@@ -445,7 +447,7 @@ def _surface(surface: Any) -> Surface | FreeSurface:
 
 
 def _at(value: Timed, time: float | Tensor) -> Number:
-    """A number or a tensor, given or what a function of the time returns."""
+    """A number or a tensor, given or returned by a function of the time."""
     if isinstance(value, (float, Tensor)):
         return value
     value = value(time) if callable(value) else value
@@ -453,7 +455,7 @@ def _at(value: Timed, time: float | Tensor) -> Number:
 
 
 def _checked(name: str, value: Timed, expected: str = "", holds: Callable[[Any], Any] = lambda v: v == v) -> Timed:
-    """A number or tensor of which all is finite and holds; a function of the time is not asked."""
+    """A number or tensor that is finite and for which the condition holds; a function of the time is not evaluated."""
     expected = f"{expected} and finite" if expected else "finite"
     if isinstance(value, Tensor):
         if value.is_complex() or value.dtype == torch.bool:

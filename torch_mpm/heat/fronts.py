@@ -1,4 +1,4 @@
-"""How far fronts between phases may lag behind, by the diffusion numbers of the particles that change theirs."""
+"""Lag of fronts between phases, by the diffusion numbers of the particles that change their phase."""
 
 from __future__ import annotations
 
@@ -14,12 +14,13 @@ from ..errors import FrontWarning
 LARGEST = 1.0
 """Diffusion number of particles that change their phase, above which a front is reported."""
 LAG, LEAST_LAG = 0.45, 0.1
-"""Lag of a front in lengths of conduction in a step √(κ dt/(ρ C)), and what it may lag in cells even in short steps
-(benchmarks/results/heat_fronts.md)."""
+"""Lag of a front in conduction lengths of a step √(κ dt/(ρ C)), and its lag in cells in short steps
+(benchmarks/results/heat_fronts.md).
+"""
 
 
 class FrontRecord:
-    """The largest diffusion number so far, r = κ dt/(ρ C dx²), of particles that changed their liquid fraction.
+    """Largest diffusion number so far, r = κ dt/(ρ C dx²), of particles that changed their liquid fraction.
 
     Attributes:
         largest: of each scene, float64 [B] on the device of the particles; None before the first step.
@@ -43,7 +44,7 @@ class FrontRecord:
             self.largest.scatter_reduce_(0, rows, melts, "amax")
 
     def warn(self) -> None:
-        """Warn of fronts that steps were too long for; waits for the device.
+        """Warn of fronts with too long steps; waits for the device.
 
         Warns:
             FrontWarning: by scene and diffusion number.
@@ -64,11 +65,11 @@ class FrontRecord:
             )
 
     def reset(self) -> None:
-        """Forget the steps so far."""
+        """Discard the record."""
         if self.largest is not None:
             self.largest.zero_()
 
     def forget(self, scenes: Tensor) -> None:
-        """Forget those of scenes, bool [B]."""
+        """Discard the record of scenes, bool [B]."""
         if self.largest is not None:
             self.largest.masked_fill_(scenes, 0)

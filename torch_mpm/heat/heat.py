@@ -9,13 +9,13 @@ particles
 
 where θ̄_i is the average of the particles with weights β_p m_p C_p instead of m_p C_p. β = 0 is FLIP; β = 1 is APIC, or
 PIC without g. PIC and APIC diffuse by the transfer alone, PIC with a diffusion number of 0.25 in every step; FLIP keeps
-whatever noise the grid does not see. The hybrid has β_p = min(1, 4 r) with the diffusion number r = κ dt/(ρ C dx²):
-what the transfer smooths, conduction smooths too, and what does not conduct takes no part in it.
+noise that the grid cannot represent. The hybrid has β_p = min(1, 4 r) with the diffusion number r = κ dt/(ρ C dx²): the
+transfer smooths only where conduction does, and insulators take no part in it.
 
-Heat is conserved exactly. At rest and without heat from outside, a step is symmetric with the energy
-Σ_p m_p C_p (θ_p² + D |g_p|²) = Σ_pi N_i m_p C_p f_pi², f_pi = θ_p + g_p · (x_i − x_p), and has eigenvalues between 0
-and 1, for any β_p in [0, 1], κ, C and dt: conduction takes from what f and the nodes share, the blend from the rest,
-because variances about a node with the weights β_p m_p C_p are at most those with m_p C_p.
+Heat is conserved exactly. At rest and without heat from outside, a step is symmetric with the energy Σ_p m_p C_p (θ_p²
++ D |g_p|²) = Σ_pi N_i m_p C_p f_pi², f_pi = θ_p + g_p · (x_i − x_p), and has eigenvalues between 0 and 1, for any β_p
+in [0, 1], κ, C and dt: conduction dissipates the part that f and the nodes share, the blend the rest, because variances
+about a node with the weights β_p m_p C_p are at most those with m_p C_p.
 """
 
 from __future__ import annotations
@@ -50,15 +50,15 @@ from .fronts import FrontRecord
 
 TRANSFERS = ("hybrid", "apic", "flip", "pic")
 NEGLIGIBLE = 1e-12
-"""Residual [K] that a solve may always leave: 1e6 of them are a microkelvin, and far less underflows in float32."""
+"""Residual [K] that a solve may always leave: 1e6 of them are a microkelvin; far smaller ones underflow in float32."""
 SWEEPS = 4
-"""Of averaging the gradient that a state starts with: steps then conduct within 2% as with that of the exact field."""
+"""Number of averages of the initial gradient: steps then conduct within 2% of the exact field."""
 GRADIENT = "temperature_gradient"
-"""Key of `State.extra` under which the hybrid and APIC keep the temperature gradient g_p [P, D] [K/m]."""
+"""Key of `State.extra` of the temperature gradient g_p [P, D] [K/m] of the hybrid and APIC."""
 
 
 class HeatBoundary(Protocol):
-    """What adds to the nodes of a heat step; see `torch_mpm.heat_boundaries`."""
+    """Term of a heat step; see `torch_mpm.heat_boundaries`."""
 
     def apply(self, nodes: HeatNodes) -> None: ...
 
@@ -72,31 +72,30 @@ class Heat(nn.Module):
             temperature [P] (a `Table`, a network, any torch code), taken at the beginning of the step.
         specific_heat: C [J/(kg K)], positive; a `Value`.
         boundaries: terms of `torch_mpm.heat_boundaries`; none for an insulated body.
-        transfer: "hybrid", "apic", "flip" or "pic"; see above. "hybrid" and "apic" keep the temperature gradient in
-            state.extra["temperature_gradient"] [P, D] [K/m]. Where the caller does not give it, it starts as that of
-            the nodes (`prepare`), so that the first steps conduct as later ones do.
-        melting_point: θ_m [K], relative to the reference; a `Value`, infinite for what does not melt.
-        latent_heat: L [J/kg], positive; a `Value`. With it the liquid mass fraction of each particle is kept in
-            state.extra["liquid"] [P]; a particle stays at the melting point while it takes up or gives off L
-            (enthalpy buffer, Stomakhin et al. 2014). It starts from the temperature where the caller does not give it.
-            The solve of a step has no latent heat in it, so that a front in a body whose solid is colder than the
-            melting point lags behind: by up to 0.1 dx, and 0.45 √(κ dt/(ρ C)), whatever dx is. `check` warns of fronts
-            that move at diffusion numbers κ dt/(ρ C dx²) above 1.
+        transfer: "hybrid", "apic", "flip" or "pic"; see above. "hybrid" and "apic" store the temperature gradient in
+            state.extra["temperature_gradient"] [P, D] [K/m]. By default it starts as that of the nodes (`prepare`), so
+            that the first steps conduct as later ones do.
+        melting_point: θ_m [K], relative to the reference; a `Value`, infinite for materials that do not melt.
+        latent_heat: L [J/kg], positive; a `Value`. With it the liquid mass fraction of each particle is stored in
+            state.extra["liquid"] [P]; a particle stays at the melting point while it absorbs or releases L (enthalpy
+            buffer, Stomakhin et al. 2014). Its default follows from the temperature. The solve of a step has no latent
+            heat, so that a front in a body whose solid is colder than the melting point lags behind: by up to 0.1 dx,
+            plus 0.45 √(κ dt/(ρ C)) for any dx. `check` warns of fronts that move at diffusion numbers κ dt/(ρ C dx²)
+            above 1.
         plastic_heating: share of the energy dissipated by the law that becomes heat (Taylor and Quinney 1934), in
             [0, 1].
-        reference: absolute temperature that state.temperature is relative to [K], finite; only radiation asks for it.
-            Temperatures are best kept relative to one in their middle: float32 then resolves small changes.
+        reference: absolute temperature to which state.temperature is relative [K], finite; only radiation needs it. Use
+            a reference in the middle of the temperatures: float32 then resolves small changes.
         tolerance: residual of each solve relative to its first, in (0, 1). The error of the change in a step is at most
             1 + 4 r times as large relative to it, with the largest diffusion number r, both as mass-weighted RMS.
-        max_iterations: of each solve.
-        method: of `heat_cg`: "cg", or "multigrid" for steps with diffusion numbers from about 1e3.
+        max_iterations: maximum number of iterations of each solve.
+        method: method of `heat_cg`: "cg", or "multigrid" for steps with diffusion numbers from about 1e3.
 
     Differentiable with respect to temperatures, positions, masses, volumes, dt and all parameters.
 
     Raises:
-        TypeError, ValueError: for a wrong argument. Values of tensors are checked here, and not again when they are
-            changed or trained; a function that returns a negative conductivity makes the scene fail, which `check`
-            reports.
+        TypeError, ValueError: for a wrong argument. Values of tensors are checked here only, not when they are changed
+            or trained; a scene fails where a function returns a negative conductivity, which `check` reports.
     """
 
     boundaries: BoundaryList
@@ -161,14 +160,14 @@ class Heat(nn.Module):
 
     @property
     def affine(self) -> bool:
-        """Whether particles keep a temperature gradient."""
+        """Whether particles store a temperature gradient."""
         return self.transfer in ("hybrid", "apic")
 
     def prepare(self, state: State) -> State:
-        """Give a state the fields that this needs and that it lacks.
+        """Add missing fields to a state.
 
-        The gradient is that of the node temperatures, to which the particles with their gradients are averaged again:
-        it approaches the one with which neighbours agree best about the nodes between them. Differentiable.
+        The gradient is that of the node temperatures, recomputed from particles with their gradients: it approaches the
+        gradient with which neighbours agree best at the nodes between them. Differentiable.
 
         Raises:
             ValueError: for a state without temperature, or fields of a wrong shape.
@@ -186,7 +185,7 @@ class Heat(nn.Module):
         return state if extra.keys() == state.extra.keys() else state.replace(extra=extra)
 
     def forward(self, state: State, dt: float | Tensor) -> State:
-        """The state of a body at rest one step later.
+        """State of a body at rest one step later.
 
         Args:
             state: with a temperature.
@@ -204,7 +203,7 @@ class Heat(nn.Module):
             return left(paused(self._advanced, self._activations, state, dt, self.grid.scenes))
 
     def _advanced(self, state: State, dt: float | Tensor) -> State:
-        """A prepared state one step later."""
+        """Prepared state one step later."""
         blocks = self._activations.activate(self.grid, state.x, state.scene, state.ids)
         return state.replace(**self.update(blocks, state, dt), time=time_after(state.time, dt))
 
@@ -221,7 +220,7 @@ class Heat(nn.Module):
         Args:
             blocks: active blocks of the state's positions.
             state: prepared.
-            dt: as for `forward`; what becomes of the particles of a paused scene has no meaning.
+            dt: as for `forward`; the results of particles of a paused scene have no meaning.
             velocity_gradient: ∇v [P, D, D] [1/s] that the particles move with; None at rest.
             dissipated: energy that the law turned into heat in this step, per rest volume [P] [J/m³], or None.
         """
@@ -264,7 +263,7 @@ class Heat(nn.Module):
             check_length(name, getattr(self, name), particles, self.grid.scenes)
 
     def _solve(self, nodes: HeatNodes, dt: float | Tensor) -> Tensor:
-        """Change of the temperature of the nodes in the step [N]."""
+        """Change of the node temperatures in the step [N]."""
         conductance = nodes.left_conductance()
         start = nodes.theta
         if nodes.fixed is not None and nodes.held is not None:
@@ -276,7 +275,7 @@ class Heat(nn.Module):
         )  # fmt: skip
         solved = solve.converged
         if isinstance(dt, Tensor):
-            solved = solved | (dt.detach() == 0)  # a scene that is paused has nothing to solve
+            solved = solved | (dt.detach() == 0)  # A paused scene has nothing to solve.
         self._record(solved, solve.residual)
         return solve.increment if start is nodes.theta else solve.increment + (start - nodes.theta)
 
@@ -291,7 +290,9 @@ class Heat(nn.Module):
         motion: Tensor | float,
         step: Tensor | float,
     ) -> tuple[Tensor, Tensor | None]:
-        """Temperature and gradient of the particles, as at the top of this file; the gradient moves with the matter."""
+        """Temperature and gradient of the particles, as at the top of this file; the gradient is transported with the
+        matter.
+        """
         varies, affine = isinstance(blend, Tensor), gradient is not None
         channels = torch.stack([increment, smooth], 1) if varies else (increment + blend * smooth)[:, None]
         scale = self.grid.inverse_inertia
@@ -304,9 +305,9 @@ class Heat(nn.Module):
         return after[0], after[1] if affine else None
 
     def _gradient(self, state: State, temperature: Tensor) -> Tensor:
-        """The temperature gradient of particles that know none [P, D] [K/m]; zero where they do not conduct.
+        """Initial temperature gradient of particles [P, D] [K/m]; zero where they do not conduct.
 
-        Weights κ V are those of θ̄_i, β_p m_p C_p, in small steps: an insulator does not count for what touches it.
+        Weights κ V equal those of θ̄_i, β_p m_p C_p, in small steps: an insulator has no weight for its neighbours.
         """
         blocks = self.grid.activate(state.x, state.scene)
         weight = evaluate("conductivity", self.conductivity, state) * present_volume(state)
@@ -321,7 +322,7 @@ class Heat(nn.Module):
         return torch.where(weight[:, None] > 0, gradient, 0)
 
     def _liquid(self, state: State) -> Tensor:
-        """Liquid fraction [P]: that of the state, or by its temperature."""
+        """Liquid fraction [P]: that of the state, or a function of its temperature."""
         if LIQUID in state.extra:
             return state.extra[LIQUID]
         temperature = needed_temperature(state)
@@ -330,7 +331,9 @@ class Heat(nn.Module):
     def _melt(
         self, state: State, specific_heat: Tensor | float, theta: Tensor, liquid: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Temperature and liquid fraction with the excess over the melting point in the latent heat, or out of it."""
+        """Temperature and liquid fraction with the excess over the melting point moved into the latent heat, or out of
+        it.
+        """
         melting_point = evaluate("melting_point", self.melting_point, state)
         latent_heat = evaluate("latent_heat", self.latent_heat, state)
         theta, liquid = pointwise("heat_melt", self.grid.dim, theta, liquid, melting_point, specific_heat, latent_heat)
@@ -339,7 +342,7 @@ class Heat(nn.Module):
     def heat_content(self, state: State) -> Tensor:
         """m (C θ + L f) of each particle [P] [J], relative to the solid at the reference temperature.
 
-        With a specific heat that depends on temperature this is no energy.
+        With a specific heat that depends on temperature this is not an energy.
         """
         content = evaluate("specific_heat", self.specific_heat, state) * needed_temperature(state)
         if self.melts:
@@ -348,7 +351,7 @@ class Heat(nn.Module):
 
     @torch.no_grad()
     def _record(self, converged: Tensor, residual: Tensor) -> None:
-        """Keep what `check` reports, on the device."""
+        """Store the values that `check` reports, on the device."""
         converged, residual = without_transforms(converged), without_transforms(residual)
         with outside_transforms():
             if self.unsolved is None or self.residual is None or self.unsolved.device != converged.device:
@@ -359,13 +362,13 @@ class Heat(nn.Module):
             torch.maximum(self.residual, torch.where(converged, self.residual, residual), out=self.residual)
 
     def problems(self) -> dict[str, Problem]:
-        """What became of the solves so far, by kind as in `Failures`, without synchronising."""
+        """Failures of the solves so far, by kind as in `Failures`, without synchronising."""
         if self.unsolved is None or self.residual is None:
             return {}
         return unsolved_heat(self.unsolved, self.residual, self.max_iterations)
 
     def check(self) -> None:
-        """Read what became of the solves so far; synchronises with the device.
+        """Check the solves so far; synchronises with the device.
 
         Warns:
             FrontWarning: where steps were so long that fronts between phases lag behind.
@@ -373,7 +376,7 @@ class Heat(nn.Module):
         Raises:
             SimulationError: for scenes in which a solve missed its tolerance, or data were not finite; for particles
                 that left the grid or are not finite; for entries of a tensor dt that were negative or NaN.
-            GridOverflowError: if more blocks were active than the grid has room for, and nothing else is wrong.
+            GridOverflowError: if more blocks were active than the grid has room for, and there is no other error.
         """
         if self.unsolved is None:
             return
@@ -382,15 +385,15 @@ class Heat(nn.Module):
         self.fronts.warn()
 
     def reset(self) -> None:
-        """Forget what became of the solves so far."""
+        """Discard the record of the solves so far."""
         self._activations.reset()
         self.fronts.reset()
         for kept in (self.unsolved, self.residual):
-            if kept is not None:  # and CUDA graphs may write to it
+            if kept is not None:  # CUDA graphs may write to it.
                 kept.zero_()
 
     def forget(self, scenes: Tensor) -> None:
-        """Forget that of scenes, bool [B] on the device of the particles."""
+        """Discard the record of scenes, bool [B] on the device of the particles."""
         self._activations.forget(scenes)
         self.fronts.forget(scenes)
         for kept in (self.unsolved, self.residual):
@@ -401,8 +404,9 @@ class Heat(nn.Module):
 def _averages(
     blocks: Blocks, x: Tensor, weights: Sequence[Tensor], theta: Tensor, gradient: Tensor | None
 ) -> tuple[list[Tensor], list[Tensor]]:
-    """Σ_p N_i w_p and the averages Σ_p N_i w_p (θ_p + g_p · (x_i − x_p)) / Σ_p N_i w_p on the nodes, [N] each, of one
-    weight [P], or of two, of which the second is given by its share in the first."""
+    """Σ_p N_i w_p and the averages Σ_p N_i w_p (θ_p + g_p · (x_i − x_p)) / Σ_p N_i w_p on the nodes, [N] each, for one
+    weight [P], or for two, the second given by its share in the first.
+    """
     count, dim = len(weights), blocks.grid.dim
     share, wanted = weights[1] if count == 2 else 0.0, (0,) if gradient is None else (0, 1)
     known = theta, 0.0 if gradient is None else gradient
@@ -413,7 +417,7 @@ def _averages(
 
 
 def _deformation(state: State) -> tuple[Tensor | float, Tensor | float]:
-    """J and F, of which one is the number one, as the other tells the volume."""
+    """J and F; one of them is the number one, as the other determines the volume."""
     if state.J is not None:
         return state.J, 1.0
     return 1.0, 1.0 if state.F is None else state.F

@@ -1,1 +1,1 @@
-"""Closed triangle meshes: reading and repair, which places are inside, the nearest triangle, terrain."""
+"""Closed triangle meshes: reading and repair, points inside, nearest triangle, terrain."""

@@ -15,12 +15,12 @@ from ..surface_mesh import Array
 MERGED = 1e-5
 """Distance within which vertices on open edges are merged, in diagonals of the mesh."""
 NAMED = 3
-"""Open edges whose places a message has."""
+"""Number of open edges whose positions a message lists."""
 
 
 class ClosedMesh(NamedTuple):
-    """Vertices float64 [V, 3], triangles int64 [T, 3] that pass each edge as often in one direction as in the other,
-    and what was changed to make it so, for people.
+    """Vertices float64 [V, 3], triangles int64 [T, 3] that traverse each edge equally often in both directions, and
+    sentences on the repairs.
     """
 
     vertices: Array
@@ -31,9 +31,9 @@ class ClosedMesh(NamedTuple):
 def load(source: str | Path | Any) -> ClosedMesh:
     """A closed mesh, from a file that trimesh reads (.obj, .ply, .stl, .glb, ...) or of a `trimesh.Trimesh`.
 
-    Where it is open, vertices at the same position are merged, as files with textures or normals need; then vertices
-    on open edges that are within `MERGED` of each other. Where triangles of one part are turned against each other,
-    those with less of its area are turned. Only the first change, which loses nothing, does not warn.
+    Where it is open, vertices at the same position are merged, as files with textures or normals need; then vertices on
+    open edges within `MERGED` of each other. Where triangles of one part have opposite orientations, those with the
+    smaller total area are reversed. All changes except the first, which is lossless, warn.
 
     Raises:
         ImportError: without trimesh, or without scipy for the last two changes.
@@ -75,7 +75,7 @@ def triangles(source: str | Path | Any) -> tuple[Array, Array]:
         check_file(source, "mesh")
         try:
             mesh = trimesh.load(source, force="mesh", resolver=_resolver(source))
-        except Exception as error:  # readers of many formats raise anything
+        except Exception as error:  # Readers of many formats raise any kind of exception.
             raise ValueError(f"mesh file {source} cannot be read: {type(error).__name__}: {error}") from error
         if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
             raise ValueError(f"mesh file {source} holds no triangles")
@@ -90,8 +90,8 @@ def triangles(source: str | Path | Any) -> tuple[Array, Array]:
 
 
 def edge_uses(faces: Array) -> tuple[Array, Array, Array]:
-    """Edges of triangles: int64 [E, 2], the lower index first; which edge each triangle's sides [3 T] are; and +1 where
-    a side passes its edge from the lower index, else −1.
+    """Edges of triangles: int64 [E, 2], the lower index first; the edge of each side of the triangles [3 T]; and +1
+    where a side traverses its edge from the lower index, otherwise −1.
 
     Sides of a triangle follow each other, from corner k to corner k + 1.
     """
@@ -101,7 +101,7 @@ def edge_uses(faces: Array) -> tuple[Array, Array, Array]:
 
 
 def _resolver(path: str | Path) -> Any:
-    """Of the files that a mesh file names, regular ones alone."""
+    """Open a file named in a mesh file, if it is a regular file."""
     from trimesh.resolvers import FilePathResolver
 
     class Resolver(FilePathResolver):
@@ -125,13 +125,13 @@ def _open_edges(faces: Array) -> Array:
 
 
 def merged_equal(vertices: Array, faces: Array) -> tuple[Array, Array, int]:
-    """Vertices and triangles without vertices at the position of another one, and how many there were."""
-    kept, which = np.unique(vertices + 0.0, axis=0, return_inverse=True)  # -0 is 0
+    """Merge vertices at the same position; returns vertices, triangles and the number of merged vertices."""
+    kept, which = np.unique(vertices + 0.0, axis=0, return_inverse=True)  # -0 equals 0.
     return kept, _without_points(which.reshape(-1)[faces]), len(vertices) - len(kept)
 
 
 def _merged_near(vertices: Array, faces: Array) -> tuple[Array, Array, int, float]:
-    """Vertices on open edges take the place of one that is near; also how many did, and what is near [m]."""
+    """Merge vertices on open edges with near ones; also returns their number and the tolerance [m]."""
     scipy = _scipy()
     own = np.unique(_open_edges(faces))
     distance = MERGED * float(np.linalg.norm(vertices.max(0) - vertices.min(0)))
@@ -144,10 +144,10 @@ def _merged_near(vertices: Array, faces: Array) -> tuple[Array, Array, int, floa
 
 
 def _turned_alike(source: Any, vertices: Array, faces: Array) -> tuple[Array, int]:
-    """Triangles that pass each edge as often in one direction as in the other, and how many were turned for it.
+    """Triangles that traverse each edge equally often in both directions, and the number of reversed ones.
 
-    Triangles that share an edge with one other depend on each other. Both ways of each triangle are nodes of a graph,
-    in which those that go together are joined.
+    Triangles that share an edge with one other depend on each other. Both orientations of each triangle are nodes of a
+    graph, in which compatible ones are joined.
     """
     edges, which, sign = edge_uses(faces)
     if not np.bincount(which, sign, len(edges)).any():
@@ -178,7 +178,7 @@ def _turned_alike(source: Any, vertices: Array, faces: Array) -> tuple[Array, in
 
 
 def _parts(count: int, pairs: Array) -> tuple[int, Array]:
-    """How many connected parts a graph of `count` nodes has, and the part of each node."""
+    """Number of connected parts of a graph of `count` nodes, and the part of each node."""
     sparse = _scipy().sparse
     graph = sparse.coo_matrix((np.ones(len(pairs), dtype=np.int8), (pairs[:, 0], pairs[:, 1])), (count, count))
     parts, part = sparse.csgraph.connected_components(graph, directed=False)
@@ -192,7 +192,7 @@ def _scipy() -> Any:
 
 
 def places(edges: Array) -> str:
-    """Where some edges [E, 2, 3] or triangles [E, 3, 3] are, in words."""
+    """Positions of some edges [E, 2, 3] or triangles [E, 3, 3], in words."""
     middles = [f"({x:.6g}, {y:.6g}, {z:.6g})" for x, y, z in edges.mean(1)[:NAMED].tolist()]
     return f"near {', '.join(middles)}{' and elsewhere' if len(edges) > NAMED else ''}"
 

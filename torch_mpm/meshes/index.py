@@ -1,4 +1,4 @@
-"""What is computed once for a closed mesh: which triangles are above a place, which one is nearest, its volumes."""
+"""Search structures of a closed mesh, computed once: triangles above a point, nearest triangle, volumes."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from .winding import Columns
 
 
 class MeshIndex:
-    """Search structures for the triangles of a closed mesh, made where they are first used.
+    """Search structures for the triangles of a closed mesh, built on first use.
 
     Args:
         vertices: float64 [V, 3] [m], on the CPU.
@@ -24,11 +24,11 @@ class MeshIndex:
         self.vertices, self.faces = vertices.clone(), faces.clone()
 
     def describes(self, vertices: Tensor, faces: Tensor) -> bool:
-        """Whether these are still the vertices and triangles."""
+        """Whether the vertices and triangles are unchanged."""
         return torch.equal(vertices, self.vertices) and torch.equal(faces, self.faces)
 
     def inside(self, x: Tensor) -> Tensor:
-        """Where the winding number is not zero, bool [N], of points [N, 3] [m] on the CPU."""
+        """Whether the winding number is not zero, bool [N], of points [N, 3] [m] on the CPU."""
         return torch.from_numpy(self._columns.winding(_numpy(x)) != 0)
 
     def nearest(self, x: Tensor) -> Tensor:

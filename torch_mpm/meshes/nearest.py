@@ -1,4 +1,4 @@
-"""The nearest triangle of a mesh: a tree of boxes, of which whole levels are visited at once."""
+"""Nearest triangle of a mesh: a tree of boxes, traversed level by level."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from torch import Tensor
 from ..surface_mesh import Array
 
 POINTS, PAIRS = 2**14, 2**18
-"""Points that are looked up together, and pairs of a point and a box, which bound the memory."""
+"""Number of points that are looked up together, and of point-box pairs, which bound the memory."""
 
 
 class Tree:
-    """A binary tree of boxes around triangles, which are sorted along a space-filling curve.
+    """Binary tree of boxes around triangles sorted along a space-filling curve.
 
     Args:
         corners: of the triangles, float64 [T, 3, 3] [m].
@@ -25,7 +25,7 @@ class Tree:
         self._order = np.append(order, np.full(leaves - len(order), order[-1]))
         self._corners = corners[self._order]
         boxes, inner = np.stack([self._corners.min(1), self._corners.max(1)], 1), self._corners.mean(1)
-        self._levels = [(boxes, inner)]  # boxes [N, 2, 3] and a point of the mesh in each [N, 3], from leaves to root
+        self._levels = [(boxes, inner)]  # Boxes [N, 2, 3] and a point of the mesh in each [N, 3], from leaves to root.
         while len(boxes) > 1:
             boxes, inner = _joined(boxes, inner)
             self._levels.append((boxes, inner))
@@ -33,7 +33,7 @@ class Tree:
 
     def nearest(self, x: Array) -> Array:
         """Index of the nearest triangle to each of the points [N, 3] [m], int64 [N]."""
-        order = np.argsort(_morton(x), kind="stable")  # neighbours visit the same boxes
+        order = np.argsort(_morton(x), kind="stable")  # Neighbours visit the same boxes.
         found = np.empty(len(x), dtype=np.int64)
         for first in range(0, len(x), POINTS):
             part = order[first : first + POINTS]
@@ -46,12 +46,12 @@ class Tree:
         while waiting:
             level, point, box = waiting.pop()
             boxes, inner = self._levels[level]
-            np.minimum.at(bound, point, _squared(x[point] - inner[box]) * (1 + 1e-9))  # no triangle farther counts
+            np.minimum.at(bound, point, _squared(x[point] - inner[box]) * (1 + 1e-9))  # Farther triangles are ignored.
             near = _squared_to_box(x[point], boxes[box]) <= bound[point]
             point, box = point[near], box[near]
             if level == len(self._levels) - 1:
                 squared = self._squared_to_triangle(x[point], box)
-                nearest = np.argsort(-squared, kind="stable")  # of several entries of a point the last one stays
+                nearest = np.argsort(-squared, kind="stable")  # The last of several entries of a point is stored.
                 nearest = nearest[squared[nearest] < least[point[nearest]]]
                 least[point[nearest]], found[point[nearest]] = squared[nearest], self._order[box[nearest]]
                 continue
@@ -67,7 +67,7 @@ class Tree:
 
 
 def nearest_on_triangles(x: Tensor, corners: Tensor) -> Tensor:
-    """The points of triangles [..., 3, 3] that are nearest to points [..., 3], [..., 3]; differentiable."""
+    """Nearest points of triangles [..., 3, 3] to points [..., 3], [..., 3]; differentiable."""
     edge = corners.roll(-1, -2) - corners
     arm = x[..., None, :] - corners
     squared = (edge * edge).sum(-1)
@@ -77,7 +77,7 @@ def nearest_on_triangles(x: Tensor, corners: Tensor) -> Tensor:
     area = (normal * normal).sum(-1, keepdim=True)
     height = (arm[..., 0, :] * normal).sum(-1, keepdim=True) / torch.where(area > 0, area, 1)
     on_plane = x - height * normal
-    left = (torch.linalg.cross(edge, arm) * normal[..., None, :]).sum(-1) >= 0  # of each edge, from above
+    left = (torch.linalg.cross(edge, arm) * normal[..., None, :]).sum(-1) >= 0  # Of each edge, from above.
     above = left.all(-1, keepdim=True) & (area > 0)
     distance = (x[..., None, :] - on_edges).square().sum(-1)
     nearest = distance.argmin(-1)[..., None, None].expand(*distance.shape[:-1], 1, 3)
@@ -85,7 +85,7 @@ def nearest_on_triangles(x: Tensor, corners: Tensor) -> Tensor:
 
 
 def _joined(boxes: Array, inner: Array) -> tuple[Array, Array]:
-    """Boxes [N, 2, 3] around pairs of boxes, and that point of the mesh in them that is more in the middle [N, 3]."""
+    """Boxes [N, 2, 3] around pairs of boxes, and the more central of their points of the mesh [N, 3]."""
     boxes, inner = boxes.reshape(-1, 2, 2, 3), inner.reshape(-1, 2, 3)
     around = np.stack([boxes[:, :, 0].min(1), boxes[:, :, 1].max(1)], 1)
     middle = np.square(inner - around.mean(1)[:, None]).sum(2).argmin(1)
@@ -102,7 +102,7 @@ def _squared(v: Array) -> Array:
 
 
 def _morton(x: Array) -> Array:
-    """Places of points [N, 3] on a space-filling curve, uint64 [N]: 21 bits of each coordinate in turn."""
+    """Positions of points [N, 3] on a space-filling curve, uint64 [N]: interleaved 21 bits of each coordinate."""
     lower, upper = x.min(0, initial=np.inf), x.max(0, initial=-np.inf)
     cell = ((x - lower) * ((2**21 - 1) / max(float((upper - lower).max()), 1e-300))).astype(np.uint64)
     for shift, mask in ((32, 0x1F00000000FFFF), (16, 0x1F0000FF0000FF), (8, 0x100F00F00F00F00F)):

@@ -21,10 +21,10 @@ def on_lattice(heights: Array, lower: tuple[float, ...], spacing: float, axis: i
 
 
 def closed_to(source: Any, vertices: Array, faces: Array, level: float, axis: int) -> ClosedMesh:
-    """The body between a surface that has one height over each place and a flat face, with vertical sides.
+    """Body between a surface with one height at each position and a flat face, with vertical sides.
 
     Args:
-        source: what messages call the surface.
+        source: name of the surface in messages.
         vertices, faces: of the surface, float64 [V, 3] [m] and int64 [T, 3].
         level: coordinate of the flat face [m], below the whole surface or above it.
         axis: the vertical axis.

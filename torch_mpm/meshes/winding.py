@@ -1,9 +1,9 @@
 """Winding numbers of a closed surface, by its crossings with vertical lines.
 
-The winding number of a place is the sum of the signs of all triangles above it, +1 where the normal points up. It is
-the generalised winding number (Jacobson et al. 2013) of a closed surface, a whole number, without its angles: a line
-meets few of the triangles. Lines that pass an edge or a vertex are decided by one rule for both of its triangles, so
-that the signs on a line sum up to zero whatever the rounding.
+The winding number of a point is the sum of the signs of all triangles above it, +1 where the normal points up. It is
+the generalised winding number (Jacobson et al. 2013) of a closed surface, an integer, without its angles: a line meets
+few of the triangles. One rule decides lines through an edge or a vertex for all of its triangles, so that the signs on
+a line sum to zero for any rounding.
 """
 
 from __future__ import annotations
@@ -16,15 +16,15 @@ import numpy as np
 from ..surface_mesh import Array
 
 PAIRS = 2**19
-"""Pairs of a line and a triangle that are computed together, which bounds the memory."""
+"""Number of line-triangle pairs that are computed together, which bounds the memory."""
 LAYERS = 16
-"""Layers of triangles above each other from which on there are fewer cells than triangles."""
+"""Number of stacked layers of triangles above which there are fewer cells than triangles."""
 FEW_LINES, MANY_LINES = 2**13, 2**18
-"""Lines on which parts that overlap are looked for, and on which their volume is integrated."""
+"""Number of lines on which overlapping parts are searched, and on which their volume is integrated."""
 
 
 class Crossings(NamedTuple):
-    """Where lines meet triangles: index of the line [M], height [M] [m], and sign [M]."""
+    """Crossings of lines and triangles: index of the line [M], height [M] [m], and sign [M]."""
 
     line: Array
     height: Array
@@ -36,13 +36,13 @@ class Columns:
 
     Args:
         vertices: float64 [V, 3] [m].
-        faces: int64 [T, 3], of which each edge is passed as often in one direction as in the other.
+        faces: int64 [T, 3], which traverse each edge equally often in both directions.
     """
 
     def __init__(self, vertices: Array, faces: Array) -> None:
         self._corners = vertices[faces]
         self.lower, self.upper = self._corners.min((0, 1)), self._corners.max((0, 1))
-        # An edge from its vertex of the lower index to that of the higher one, and whether the triangle passes it so.
+        # An edge from its vertex of lower index to that of higher index, and whether the triangle traverses it so.
         following = np.roll(faces, -1, axis=1)
         self._forward = np.where(faces < following, 1, -1).astype(np.int8)
         self._edges = np.stack(
@@ -66,7 +66,7 @@ class Columns:
         place = x[near]
         new = np.ones(len(near), dtype=bool)
         new[1:] = (place[1:, :2] != place[:-1, :2]).any(1)
-        line = np.cumsum(new) - 1  # points above each other share a line
+        line = np.cumsum(new) - 1  # Points above each other share a line.
         (begin,) = np.nonzero(new)
         begin = np.append(begin, len(near))
         for first, last, crossings in self._crossings(place[new, :2]):
@@ -74,17 +74,17 @@ class Columns:
             lines = np.concatenate([crossings.line + first, line[own]])
             heights = np.concatenate([crossings.height, place[own, 2]])
             signs = np.concatenate([crossings.sign, np.zeros(begin[last] - begin[first], dtype=np.int64)])
-            order = np.lexsort((-heights, lines))  # from above; the signs of a line sum up to zero
+            order = np.lexsort((-heights, lines))  # From above; the signs of a line sum to zero.
             sums = np.empty_like(signs)
             sums[order] = np.cumsum(signs[order])
             found[near[own]] = sums[len(crossings.sign) :]
         return found
 
     def volumes(self) -> tuple[float, float]:
-        """Volumes [m³] of the surface with its sign, ∫ w dx of the winding number w, and of the places where w ≠ 0.
+        """Signed volume [m³] of the surface, ∫ w dx of the winding number w, and volume of the region where w ≠ 0.
 
         The first is exact. Their difference is exactly zero for a surface whose parts neither overlap nor are inside
-        out one against another; else it is integrated on lines, to a relative error of about 1e-4.
+        out one against another; otherwise it is integrated on lines, to a relative error of about 1e-4.
         """
         a, b, c = (self._corners - 0.5 * (self.lower + self.upper)).transpose(1, 0, 2)
         signed = float((a * np.cross(b, c)).sum()) / 6
@@ -93,19 +93,19 @@ class Columns:
         return signed, abs(signed) + self._overlap(MANY_LINES, signed)
 
     def _overlap(self, lines: int, signed: float) -> float:
-        """∫ [w ≠ 0] − s w dx [m³], s the sign of the volume, on lines that are spread evenly (R2, Roberts 2018)."""
+        """∫ [w ≠ 0] − s w dx [m³], s the sign of the volume, on evenly spread lines (R2, Roberts 2018)."""
         spread = (0.5 + np.arange(1, lines + 1)[:, None] * [0.7548776662466927, 0.5698402909980532]) % 1
         extent = self.upper - self.lower
         total = 0.0
         for _, _, crossings in self._crossings(self.lower[:2] + spread * extent[:2]):
             order = np.lexsort((-crossings.height, crossings.line))
             height, winding = crossings.height[order], np.cumsum(crossings.sign[order])
-            excess = (winding != 0) - np.sign(signed) * winding  # zero below the last crossing of a line
+            excess = (winding != 0) - np.sign(signed) * winding  # Zero below the last crossing of a line.
             total += float((excess[:-1] * (height[:-1] - height[1:])).sum())
         return total * float(np.prod(extent[:2])) / lines
 
     def _cells(self) -> tuple[Array, Array]:
-        """CSR lists of the triangles of each cell: the first entry of each, and the indices of triangles."""
+        """CSR lists of the triangles of each cell: offsets, and indices of triangles."""
         cells, triangles = [], []
         low, high = self._corners[..., 1].min(1), self._corners[..., 1].max(1)
         row = self._row(low, -1)
@@ -149,12 +149,12 @@ class Columns:
         return self._index(0, x, side)
 
     def _index(self, axis: int, x: Array, side: int = 0) -> Array:
-        """Cell along an axis; a millionth of a cell further to one side, for rounding."""
+        """Cell along an axis, extended by a millionth of a cell to one side, for rounding."""
         cell = np.floor((x - self.lower[axis]) * self._per_cell[axis] + side * 1e-6)
         return np.clip(cell, 0, self._shape[axis] - 1).astype(np.int64)
 
     def _crossings(self, place: Array) -> Iterator[tuple[int, int, Crossings]]:
-        """Crossings of lines at places [L, 2], of the lines from a first to a last one, whose indices start anew."""
+        """Crossings of lines at positions [L, 2], for lines from a first to a last one, whose indices start at zero."""
         cell = self._index(1, place[:, 1]) * self._shape[0] + self._index(0, place[:, 0])
         many = self._first[cell + 1] - self._first[cell]
         for part in _parts(many):
@@ -166,17 +166,19 @@ class Columns:
             yield part.start, part.stop, Crossings(line - part.start, self._heights(triangle, place[line]), sign[met])
 
     def _signs(self, triangle: Array, place: Array) -> Array:
-        """Winding number of the outlines of triangles around places [M, 2], seen from above."""
+        """Winding number of the outlines of triangles around points [M, 2], seen from above."""
         start, end = self._edges[triangle, :, 0], self._edges[triangle, :, 1]
         x, y = place[:, :1], place[:, 1:]
         rises = (start[..., 1] <= y) & (y < end[..., 1])
         falls = (end[..., 1] <= y) & (y < start[..., 1])
         side = (end[..., 0] - start[..., 0]) * (y - start[..., 1]) - (end[..., 1] - start[..., 1]) * (x - start[..., 0])
-        turn = (rises & (side > 0)).astype(np.int64) - (falls & (side < 0))  # of the edge from its lower index
+        turn = (rises & (side > 0)).astype(np.int64) - (falls & (side < 0))  # Of the edge from its lower index.
         return (turn * self._forward[triangle]).sum(1)
 
     def _heights(self, triangle: Array, place: Array) -> Array:
-        """Of triangles at places within them [M] [m]; within their own range where they are vertical to rounding."""
+        """Heights of triangles at points inside them [M] [m]; bounded by their range where they are vertical to
+        rounding.
+        """
         corners = self._corners[triangle]
         normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         slope = ((place - corners[:, 0, :2]) * normal[:, :2]).sum(1)
@@ -186,7 +188,7 @@ class Columns:
 
 
 def _parts(many: Array) -> Iterator[slice]:
-    """Slices of items with about `PAIRS` entries each, where item k has many[k]; at least one item each."""
+    """Slices of items with about `PAIRS` entries each, where item k has many[k] entries; at least one item each."""
     ends = np.cumsum(many)
     first = 0
     while first < len(many):
@@ -198,7 +200,7 @@ def _parts(many: Array) -> Iterator[slice]:
 
 
 def _expanded(part: slice, many: Array) -> tuple[Array, Array]:
-    """Item and number within the item of each of the entries of items, of which item k has many[k]."""
+    """Item and number within the item of each entry, where item k has many[k] entries."""
     counts = many[part]
     item = np.repeat(np.arange(part.start, part.start + len(counts)), counts)
     return item, np.arange(len(item)) - np.repeat(np.cumsum(counts) - counts, counts)
