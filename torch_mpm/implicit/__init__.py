@@ -1,4 +1,4 @@
-"""Implicit steps: backward Euler on the velocities of the nodes."""
+"""Implicit steps: backward Euler on the node velocities."""
 
 from .comparison import Comparison, compare
 from .equilibrium import equilibrium

@@ -5,9 +5,9 @@ At the solution the free components of the residual vanish, g(v, θ) = 0, so tha
     v̄ · dv = −λ · ∂g/∂θ dθ   with   Jᵀ λ = v̄,   J = ∂g/∂v,
 
 where J is not projected: one linear solve, and one vector-Jacobian product of the residual. Without friction and flow
-inside the solve J is the Hessian of the energy. Held components have the velocity b(θ) of what holds them: their
-residual is v − b, and their λ is v̄ less Jᵀ applied to the λ of the free components. The memory does not depend on the
-iterations, and all of it is in the care of autograd.
+inside the solve J is the Hessian of the energy. Held components have the velocity b(θ) of their surface: their residual
+is v − b, and their λ is v̄ minus Jᵀ applied to the λ of the free components. The memory does not depend on the number
+of iterations, and autograd saves all of it.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ INNER = 1e-2
 def differentiable(
     owner: Implicit, system: ImplicitSystem, fixed: ImplicitSystem, bounds: NodeBounds | None, minimum: Minimum
 ) -> Tensor:
-    """The velocities of a minimum, with the derivatives that the residual gives them."""
+    """Velocities of a minimum, with the derivatives defined by the residual."""
     v = minimum.v.detach()
     gradient = system.residual(v)
     contact = contact_at(system, bounds, v, gradient)
@@ -47,7 +47,7 @@ def differentiable(
         residual, holds = residual + contact.missed(system, bounds, v), contact.holds(system)
     if not residual.requires_grad:
         return minimum.v
-    # Start is nothing that the derivative depends on; friction depends on the gradient.
+    # The derivative does not depend on start; friction depends on the gradient.
     pressing = None if contact.friction is None else gradient.detach()
     still = None if bounds is None else bounds.detached()
     parts = (fixed.blocks, fixed.state, fixed.mass, fixed.dt, fixed.mirrors, still, contact.free, pressing, holds)
@@ -58,7 +58,7 @@ def differentiable(
 
 
 class _Solution(torch.autograd.Function):
-    """v as a function of the residual that it makes zero. What the derivative J needs is saved, and J is not."""
+    """v as a function of the residual that it makes zero. The inputs of the derivative J are saved, but not J."""
 
     @staticmethod
     def forward(ctx, residual, v, owner, rest, *tensors):
@@ -85,15 +85,15 @@ class _Solution(torch.autograd.Function):
 class _Adjoint:
     """The linear solve Jᵀ λ = v̄ at a solution v, with the derivative J of the residual.
 
-    J is symmetric, and conjugate gradients solve it, but for flows that are not associated, and for what velocities do
-    to friction by way of the normal forces. GMRES solves for those scenes, preconditioned by conjugate gradients with
-    the projected tangents, so that its iterations are few and do not grow with the stiffness.
+    J is symmetric, and conjugate gradients solve it, except for flows that are not associated, and for the dependence
+    of friction on velocities through the normal forces. GMRES solves for those scenes, preconditioned by conjugate
+    gradients with the projected tangents, so that its iterations are few and do not grow with the stiffness.
 
     Args:
-        owner: whose tolerance and limit of iterations count.
-        system: at the solution.
-        bounds, free: of the nodes.
-        gradient: of the energy [N, D] [kg m/s], where there is friction.
+        owner: integrator with the tolerance and limit of iterations.
+        system: system at the solution.
+        bounds, free: bounds and free components of the nodes.
+        gradient: gradient of the energy [N, D] [kg m/s], where there is friction.
         v: the solution [N, D] [m/s].
     """
 
@@ -122,7 +122,7 @@ class _Adjoint:
         self._inverse = inverse_blocks(bounds, blocks if self._across is None else blocks + self._across, free)
 
     def solve(self, grad: Tensor) -> tuple[Tensor, Tensor]:
-        """λ of the free components [N, D], and the scenes whose solve converged, bool [B]."""
+        """λ of the free components [N, D], and convergence of the solve per scene, bool [B]."""
         right = self._kept(self._system.symmetric(grad))
         whole = self._system.of_nodes(self._not_symmetric())
         solve = self._symmetric(torch.where(whole, 0, right), self._tangent, self._relative)
@@ -142,7 +142,7 @@ class _Adjoint:
         return self._bounds.kept(self._system.symmetric(grad) - self._product(adjoint), holds)
 
     def _not_symmetric(self) -> Tensor:
-        """Scenes, bool [B]."""
+        """Mask of scenes, bool [B]."""
         result = torch.zeros_like(self._relative, dtype=torch.bool)
         if self._skew is not None:
             result = result | skewed(self._system, self._skew, self._tangent, self._relative)
@@ -151,7 +151,7 @@ class _Adjoint:
         return result
 
     def _symmetric(self, right: Tensor, tangent: Tensor, relative: Tensor) -> ImplicitSolve:
-        """The solve with the symmetric part of J, of given tangents."""
+        """Solve with the symmetric part of J, for given tangents."""
         system = self._system
         return implicit_cg(
             *(system.blocks, system.state.x, right, system.mass, self._inverse, tangent, relative, self._most),
@@ -159,7 +159,7 @@ class _Adjoint:
         )
 
     def _transposed(self, given: Tensor) -> Tensor:
-        """The free components of Jᵀ times free components."""
+        """Free components of Jᵀ times free components."""
         return self._kept(self._product(given))
 
     def _product(self, given: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""Which integrator is faster for slow motion, from what steps were measured to cost."""
+"""Comparison of integrators for slow motion, from measured costs of steps."""
 
 from __future__ import annotations
 
@@ -16,12 +16,13 @@ if TYPE_CHECKING:
     from ..step import Step
 
 MOVED = 0.05
-"""Share of dx by which material moves in an implicit step whose error is about 2%, as in a gripper that squeezes rubber
-(benchmarks/results/implicit_quasistatic_*.md)."""
+"""Displacement per implicit step as a share of dx with an error of about 2%, as in a gripper that squeezes rubber
+(benchmarks/results/implicit_quasistatic_*.md).
+"""
 
 
 class Cost(NamedTuple):
-    """Of a step [s]."""
+    """Costs of a step [s]."""
 
     fixed: float
     per_particle: float
@@ -39,24 +40,25 @@ IMPLICIT: Costs = {
     "cpu": {2: Cost(9e-3, 5e-6), 3: Cost(20e-3, 9e-6)},
     "cuda": {2: Cost(15e-3, 66e-9), 3: Cost(20e-3, 21e-9)},
 }
-"""By kind of device and dimension, explicit steps in one op. CPU: one thread (implicit_crossover_*.md of the results);
-an implicit step costs as much as a hundred explicit ones of as many particles; small ones, more. CUDA: an H200
-(rollouts_nvidia_h200.md, implicit_crossover_nvidia_h200.md, implicit_cost_nvidia_h200.md); an implicit step costs 150
-explicit ones of millions of particles in 3-D, 470 in 2-D, and a thousand of few, for which the host is what takes the
-time."""
+"""Costs by kind of device and dimension, explicit steps in one op. CPU: one thread (implicit_crossover_*.md of the
+results); an implicit step costs as much as a hundred explicit ones of as many particles; small ones, more. CUDA: an
+H200 (rollouts_nvidia_h200.md, implicit_crossover_nvidia_h200.md, implicit_cost_nvidia_h200.md); an implicit step costs
+150 explicit ones of millions of particles in 3-D, 470 in 2-D, and a thousand of few particles, where the host is the
+limit.
+"""
 
 
 class Comparison(NamedTuple):
     """Explicit and implicit steps for the same motion."""
 
     limit: float
-    """Length of explicit steps, half the stable one [s]."""
+    """Length of explicit steps, half of the stable one [s]."""
     length: float
-    """Length of implicit steps, with errors of some 2%, or shorter where explicit materials limit it [s]."""
+    """Length of implicit steps with errors of about 2%, or shorter where explicit materials limit it [s]."""
     faster: float
     """Time of the explicit steps over that of the implicit ones."""
     limited: bool = False
-    """Whether explicit materials limit the length of implicit steps, to half the stable one."""
+    """Whether explicit materials limit the length of implicit steps, to half of the stable one."""
 
     def __str__(self) -> str:
         why = "half the limit of the explicit materials" if self.limited else "errors of some 2%"
@@ -67,18 +69,18 @@ class Comparison(NamedTuple):
 
 
 def compare(step: Step, state: State, speed: float) -> Comparison:
-    """The integrators for motion whose elastic waves do not matter; where they do, explicit steps are faster.
+    """Compare the integrators for motion with irrelevant elastic waves; where they matter, explicit steps are faster.
 
-    Waits for the device. Costs are those of the kind of device that has the state.
+    Waits for the device. Costs are those of the device type of the state.
 
     Args:
-        step: with either integrator; its grid, law, boundaries and explicit materials count.
-        state: particles, whose number and stiffness count.
-        speed: of the motion [m/s], of moving boundaries too.
+        step: a step with either integrator; its grid, law, boundaries and explicit materials are used.
+        state: particles; their number and stiffness are used.
+        speed: speed of the motion [m/s], including moving boundaries.
 
     Raises:
         TypeError, ValueError: for a speed that is not positive and finite, or a state without particles or a stable dt.
-        NotImplementedError: for a law that implicit steps do not take.
+        NotImplementedError: for a law that implicit steps do not support.
     """
     check_number("speed", speed, "positive and finite", lambda v: 0 < v < math.inf)
     if not len(state):
@@ -99,7 +101,7 @@ def compare(step: Step, state: State, speed: float) -> Comparison:
 
 
 def _stable_dt(step: Step, state: State) -> tuple[float, float]:
-    """Half the stable length of explicit steps, and of implicit ones with their explicit materials [s]."""
+    """Half of the stable length of explicit steps, and of implicit ones with their explicit materials [s]."""
     given = float(step.stable_dt(state, cfl=0.5).double().min())
     if step.integrator is None or not step.integrator.explicit:
         return given, math.inf

@@ -1,13 +1,13 @@
-"""Which components of the node velocities may move, and what Coulomb friction does to them.
+"""Free components of the node velocities, and Coulomb friction on them.
 
-Friction at a node adds to the energy of a step what it would dissipate,
+Friction at a node adds its dissipation to the energy of a step,
 
     D(v) = c |u_T − s_T|,   c = Σ μ λ,
 
-with the components T of its velocity u that no bound holds, the velocity s of the surface, and the impulses λ with
+with the components T of its velocity u without an active bound, the velocity s of the surface, and the impulses λ with
 which the bounds hold the others: the gradient of the energy there. D is not smoothed: a node at rest on its surface
 sticks, as an equality, while the gradient along it is at most c. The residual is that of Coulomb's law, with the c of
-the iterate itself; a step of Newton's method has that of its end (`contact_model`).
+the iterate itself; a step of Newton's method uses the c of its end (`contact_model`).
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from .system import ImplicitSystem
 
 @dataclasses.dataclass
 class Limit:
-    """The friction that nodes can have, at most c [N, 1] [kg m/s] along T, bool [N, D], where c > 0."""
+    """Possible friction of nodes, at most c [N, 1] [kg m/s] along T, bool [N, D], where c > 0."""
 
     size: Tensor
     along: Tensor
@@ -33,7 +33,9 @@ class Limit:
         return bounds.turned(self.size * _unit(self._relative(bounds, v))[0])
 
     def excess(self, bounds: NodeBounds, start: Tensor, end: Tensor) -> Tensor:
-        """What D gains from velocities to others beyond its slope [N] [J]; without cancellation where nodes go on."""
+        """Increase of D between two velocities beyond its slope [N] [J]; without cancellation for nodes that move
+        on.
+        """
         direction, _ = _unit(self._relative(bounds, start))
         relative = self._relative(bounds, end)
         along, speed = (direction * relative).sum(1, keepdim=True), relative.norm(dim=1, keepdim=True)
@@ -54,13 +56,14 @@ def _unit(vectors: Tensor) -> tuple[Tensor, Tensor]:
 
 @dataclasses.dataclass
 class Friction:
-    """Friction of nodes at velocities v; in the axes of the nodes.
+    """Friction of nodes at velocities v, in the axes of the nodes.
 
     Attributes:
-        bounds: whose friction it is.
-        limit: how much it can be.
+        bounds: the bounds that exert it.
+        limit: its maximum.
         relative: u − s along T, exactly zero at rest [N, D] [m/s].
-        direction: of the motion, or where a node at rest is pulled from, of the pull [N, D]; of length one or zero.
+        direction: direction of the motion, or of the tangential load of a node at rest that begins to slip [N, D]; of
+            length one or zero.
         sticks: bool [N, 1].
     """
 
@@ -71,7 +74,7 @@ class Friction:
     sticks: Tensor
 
     def force(self) -> Tensor:
-        """The gradient of D by the velocities of nodes that do not stick [N, D] [kg m/s]."""
+        """Gradient of D by the velocities of nodes that do not stick [N, D] [kg m/s]."""
         return self.bounds.turned(torch.where(self.sticks, 0, self.limit.size) * self.direction)
 
     def curvature(self) -> Tensor | None:
@@ -101,12 +104,12 @@ class Friction:
 
 @dataclasses.dataclass
 class Contact:
-    """What bounds and friction make of velocities and the gradient of the energy there.
+    """Effect of bounds and friction on velocities and the gradient of the energy.
 
     Attributes:
-        free: components that the step is to find, in the axes of the nodes, bool [N, D].
-        gradient: of the energy and of friction, without the components that are not free [N, D] [kg m/s].
-        friction: None where there is none.
+        free: unknown components of the step, in the axes of the nodes, bool [N, D].
+        gradient: gradient of the energy and of friction, without the components that are not free [N, D] [kg m/s].
+        friction: None without friction.
     """
 
     free: Tensor
@@ -114,12 +117,13 @@ class Contact:
     friction: Friction | None = None
 
     def holds(self, system: ImplicitSystem) -> Tensor:
-        """Components that a bound or friction gives the velocity of the surface, bool [N, D]."""
+        """Components that a bound or friction holds at the velocity of the surface, bool [N, D]."""
         return ~self.free & (system.mass > 0)[:, None]
 
     def missed(self, system: ImplicitSystem, bounds: NodeBounds, v: Tensor) -> Tensor:
-        """How far held components of node velocities v are from the velocity that holds them [N, D] [m/s]: zero, but
-        its derivatives by the bounds are not."""
+        """Difference between held components of node velocities v and the velocity of their surface [N, D] [m/s]: zero,
+        but its derivatives by the bounds are not.
+        """
         u = bounds.turned(v)
         given = torch.where((u - bounds.lower).abs() <= (u - bounds.upper).abs(), bounds.lower, bounds.upper)
         if self.friction is not None and bounds.surface is not None:
@@ -130,7 +134,8 @@ class Contact:
 
 def contact_at(system: ImplicitSystem, bounds: NodeBounds | None, v: Tensor, gradient: Tensor) -> Contact:
     """Contact at node velocities v [N, D] [m/s], from the gradient of the energy there [N, D] [kg m/s]; differentiable
-    by that gradient and by the bounds."""
+    by that gradient and by the bounds.
+    """
     massive = (system.mass > 0)[:, None].expand_as(v)
     if bounds is None:
         return Contact(massive, gradient)
@@ -143,8 +148,9 @@ def contact_at(system: ImplicitSystem, bounds: NodeBounds | None, v: Tensor, gra
 
 
 def pressed(bounds: NodeBounds, gradient: Tensor, free: Tensor) -> Tensor:
-    """What each component that is not free, held by a gradient [N, D] [kg m/s], adds to the friction of its node: μ λ
-    [N, D] [kg m/s]."""
+    """Contribution of each component that is not free, held by a gradient [N, D] [kg m/s], to the friction of its node:
+    μ λ [N, D] [kg m/s].
+    """
     assert bounds.friction is not None
     return torch.where(free, 0, bounds.friction * bounds.turned(gradient)).clamp_min(0)
 

@@ -1,11 +1,11 @@
-"""Contact in the quadratic model of an implicit step: which components the model holds, and what friction does to it.
+"""Contact in the quadratic model of an implicit step: held components, and friction.
 
 Near the velocities of an iterate the energy has a quadratic model, whose minimum within bounds and with friction is
-found by the primal-dual active set strategy (Hintermüller, Ito and Kunisch 2003): solve with some components held,
-hold those that have crossed their bound, let go those that their bound would have to pull, and solve again. Friction
+found by the primal-dual active set strategy (Hintermüller, Ito and Kunisch 2003): solve with some components held, hold
+those that have crossed their bound, release those on which their bound would have to pull, and solve again. Friction
 has the limit c = Σ μ λ of the impulses λ with which bounds hold the node in the model. A node at rest on its surface
-sticks while what pulls it is at most c, and slips from there on along the pull. One that slips does so until its motion
-turns round, where it sticks.
+sticks while its tangential load is at most c; above c it slips along the load. A slipping node sticks again where its
+motion reverses.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ class ModelContact:
     """Contact at velocities of the nodes.
 
     Attributes:
-        v: the velocities, with the components that are held exactly where their surfaces hold them [N, D] [m/s].
+        v: the velocities; held components are exactly those of their surfaces [N, D] [m/s].
         free: the other components, in the axes of the nodes, bool [N, D].
-        limit: of friction; None without friction.
-        direction: in which nodes slip, in their axes, of length one or zero [N, D]; None without friction.
-        force: of friction on nodes that slip, as a part of the gradient [N, D] [kg m/s]; None without friction.
+        limit: limit of friction; None without friction.
+        direction: direction of slip, in the axes of the nodes, of length one or zero [N, D]; None without friction.
+        force: friction on slipping nodes, as a part of the gradient [N, D] [kg m/s]; None without friction.
         across: its derivative by the velocities across the motion [N, D, D] [kg]; None without friction and in 2-D.
     """
 
@@ -53,7 +53,7 @@ class ContactModel:
     """Contact with the quadratic model of the energy.
 
     Args:
-        system, bounds: whose nodes they are; no bounds without walls and obstacles.
+        system, bounds: system and bounds of the nodes; no bounds without walls and obstacles.
         blocks: node blocks of the Hessian [N, D, D] [kg].
     """
 
@@ -63,13 +63,14 @@ class ContactModel:
         self._stiffness = blocks.diagonal(dim1=1, dim2=2).mean(1, keepdim=True)
 
     def at(self, v: Tensor, gradient: Tensor, before: ModelContact | None = None, lets_go: bool = True) -> ModelContact:
-        """Contact at velocities [N, D] [m/s] where the model has a gradient [N, D] [kg m/s], after other contact, of
-        which nothing that is held is let go unless `lets_go`."""
+        """Contact at velocities [N, D] [m/s] with the gradient of the model [N, D] [kg m/s], after other contact. Held
+        components are released only with `lets_go`.
+        """
         bounds = self._bounds
         if bounds is None:
             return ModelContact(v, self._massive)
         u, slope, near = bounds.turned(v), bounds.turned(gradient), rounding_of(v)
-        low, high = u - bounds.lower, u - bounds.upper  # crossed where negative and positive
+        low, high = u - bounds.lower, u - bounds.upper  # Crossed where negative and positive.
         at_lower = (low < -near) | ((low <= near) & (slope > 0))
         at_upper = (high > near) | ((high >= -near) & (slope < 0))
         kept = torch.zeros_like(at_lower)
@@ -81,7 +82,7 @@ class ContactModel:
         target = torch.where(at_upper, bounds.upper, bounds.lower)
         if bounds.friction is None or bounds.surface is None:
             return ModelContact(_placed(bounds, v, u, held, target), self._massive & ~held)
-        # What crosses is pressed by as much as the stiffness of the node makes of it.
+        # The stiffness of the node converts the penetration to a normal force.
         press = slope - torch.where(held, self._stiffness * (u - target), 0)
         size = torch.where(held, bounds.friction * press, 0).clamp_min(0).sum(1, keepdim=True)
         limit = Limit(size, self._massive & ~held & (size > 0))
@@ -99,8 +100,9 @@ class ContactModel:
     def _slip(
         self, u: Tensor, slope: Tensor, limit: Limit, near: Tensor, before: Tensor | None
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Nodes that slip, bool [N, 1], in which direction, [N, D], and how fast, as it seems where they begin to,
-        [N, 1] [m/s]."""
+        """Slipping nodes, bool [N, 1], their direction, [N, D], and their speed, estimated where they begin to slip,
+        [N, 1] [m/s].
+        """
         assert self._bounds is not None and self._bounds.surface is not None
         surface = self._bounds.surface
         relative = torch.where(limit.along, u - surface, 0)
@@ -117,6 +119,7 @@ class ContactModel:
 
 
 def _placed(bounds: NodeBounds, v: Tensor, u: Tensor, held: Tensor, target: Tensor) -> Tensor:
-    """Velocities v, u in the axes of the nodes, whose held components are exactly those of their surfaces: what a
-    difference leaves of a node at rest would count as motion."""
+    """Velocities v, u in the axes of the nodes, whose held components are exactly those of their surfaces: a rounding
+    difference at a node at rest would count as motion.
+    """
     return torch.where(held.any(1, keepdim=True), bounds.turned(torch.where(held, target, u)), v)

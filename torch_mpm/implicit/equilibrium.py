@@ -1,4 +1,4 @@
-"""Static equilibrium: an implicit step that inertia does not hinder."""
+"""Static equilibrium: an implicit step without inertia."""
 
 from __future__ import annotations
 
@@ -14,21 +14,20 @@ if TYPE_CHECKING:
 
 
 def equilibrium(step: Step, state: State, dt: float) -> State:
-    """The state at rest under gravity, walls and obstacles: one implicit step, so long that inertia is nothing.
+    """State at rest under gravity, walls and obstacles: one implicit step, so long that inertia vanishes.
 
     The shape functions are those of the given positions, so that the displacements may be any (total Lagrangian on the
-    lattice). A body that nothing holds falls as far as it does in dt. A body one particle thick has no bending
-    stiffness, so that the solve of one that is held at one end does not converge.
+    lattice). A body without supports falls as far as it does in dt. A body one particle thick has no bending stiffness,
+    so that the solve of one that is held at one end does not converge.
 
     Args:
-        step: with `integrator="implicit"`; static loads want a tolerance of 1e-6 or less.
-        state: particles; their velocities do not count.
-        dt: [s], at least some hundred periods of the slowest vibration: inertia counts as 1/(ω dt)² beside the
-            stiffness.
+        step: a step with `integrator="implicit"`; static loads need a tolerance of 1e-6 or less.
+        state: particles; their velocities are ignored.
+        dt: [s], at least some hundred periods of the slowest vibration: the ratio of inertia to stiffness is 1/(ω dt)².
 
     Returns:
-        The particles where they come to rest, of velocity zero, at the time of `state`. `step.solve_report` has
-        whether the solve converged, which `step.check` raises an error for.
+        The particles in equilibrium, with velocity zero, at the time of `state`. `step.solve_report` states whether the
+        solve converged; `step.check` raises an error if not.
 
     Raises:
         ValueError: for an explicit step, one with heat or explicit materials, or a dt that is not positive.

@@ -1,8 +1,8 @@
-"""Materials that an implicit step integrates explicitly, and what is left to its solve.
+"""Materials that an implicit step integrates explicitly, and the remaining nodes of its solve.
 
 The stress of explicit materials at the start of a step acts on the momentum of the nodes, to which they add their mass.
-The solve has the particles of the other materials, the blocks that these touch, and of their nodes those with a weight
-for one of them; all other nodes move as in an explicit step.
+The solve includes the particles of the other materials, their active blocks, and the nodes with a weight for one of
+them; all other nodes move as in an explicit step.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ def checked_materials(explicit: Any) -> tuple[int, ...]:
     """Numbers of materials in order.
 
     Raises:
-        TypeError, ValueError: for what is no list of different numbers.
+        TypeError, ValueError: unless it is a list of distinct numbers.
     """
     if isinstance(explicit, str) or not isinstance(explicit, Sequence):
         raise TypeError(f"explicit must be a list of materials, numbers of laws of a Mixture, got {shape_of(explicit)}")
@@ -39,7 +39,7 @@ def solved_materials(law: Material, explicit: Sequence[int]) -> list[int]:
     """The materials of a law that are not explicit.
 
     Raises:
-        ValueError: for a law that is no Mixture, one that lacks an explicit material, or one that has no other.
+        ValueError: for a law that is not a Mixture, that lacks an explicit material, or that has no other.
     """
     if not isinstance(law, Mixture):
         raise ValueError(f"explicit names laws of a Mixture, got {list(explicit)} for a {type(law).__name__}")
@@ -55,13 +55,13 @@ def solved_materials(law: Material, explicit: Sequence[int]) -> list[int]:
 
 @dataclasses.dataclass
 class SolvedNodes:
-    """The nodes that the solve is for, among those of a step.
+    """Nodes of the solve, among those of a step.
 
     Attributes:
-        blocks: those that the particles of the solve touch, in a pool of their own size.
+        blocks: active blocks of the particles of the solve, in a separate pool.
         rows: nodes with a weight for one of these particles, in node tensors of the solve, int64 [K].
         rows_in_step: the same nodes in node tensors of the step, int64 [K].
-        chosen: which nodes of the step these are, bool [N].
+        chosen: mask of these nodes among those of the step, bool [N].
     """
 
     blocks: Blocks
@@ -70,17 +70,17 @@ class SolvedNodes:
     chosen: Tensor
 
     def taken(self, values: Tensor) -> Tensor:
-        """Values of the nodes of the step as a node tensor of the solve, zero for nodes that it is not for."""
+        """Values of the nodes of the step as a node tensor of the solve, zero for nodes outside the solve."""
         result = values.new_zeros(self.blocks.node_count, *values.shape[1:])
         return result.index_copy(0, self.rows, values.index_select(0, self.rows_in_step))
 
     def placed(self, solution: Tensor, others: Tensor) -> Tensor:
-        """A node tensor of the step: the solution, and the values of the other nodes."""
+        """Node tensor of the step: the solution, and the values of the other nodes."""
         return others.index_copy(0, self.rows_in_step, solution.index_select(0, self.rows))
 
 
 def solved_nodes(blocks: Blocks, particles: Any) -> SolvedNodes:
-    """The nodes of particles that are a part of those of a step, whose active blocks are given."""
+    """Nodes of a part of the particles of a step, whose active blocks are given."""
     step_grid = blocks.grid
     grid = Grid(
         *(step_grid.dx, step_grid.lower, step_grid.upper, step_grid.scenes, step_grid.kernel),

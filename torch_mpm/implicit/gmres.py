@@ -1,4 +1,4 @@
-"""Linear solves whose matrix is not symmetric: of plastic flows that are not associated, and adjoints with friction."""
+"""Linear solves with nonsymmetric matrices: plastic flows that are not associated, and adjoints with friction."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ from torch import Tensor
 from .system import ImplicitSystem
 
 DIRECTIONS = 40
-"""Iterations between two restarts: as many pairs of node tensors are kept."""
+"""Iterations between two restarts, and number of pairs of node tensors that are stored."""
 STUCK = 0.9
-"""Share of the residual that is left after as many iterations where more of them would take too long."""
+"""Reduction of the residual within as many iterations below which more would take too long."""
 
 
 class Solve(NamedTuple):
-    """What `gmres` found, scenes apart."""
+    """Result of `gmres`, per scene."""
 
     solution: Tensor
     """d [N, D] [m/s]."""
     iterations: Tensor
     """int32 [B]."""
     converged: Tensor
-    """bool [B]: whether the residual came down to its share, but for what rounding adds to it."""
+    """bool [B]: whether the residual reached its target, up to rounding."""
 
 
 def gmres(
@@ -36,20 +36,21 @@ def gmres(
     most: int,
     precondition: Callable[[Tensor], Tensor] | None = None,
 ) -> Solve:
-    """Solves J d = right by the restarted generalised minimal residual method (Saad and Schultz 1986), scenes apart.
+    """Solve J d = right by the restarted generalised minimal residual method (Saad and Schultz 1986), for each scene
+    separately.
 
-    The residual r is least as √(r · B⁻¹ r), the norm of Newton's method. The host waits for the device once per
-    iteration. A scene is given up where it is not finite, or restarts help no more.
+    The residual r is minimal in √(r · B⁻¹ r), the norm of Newton's method. The host waits for the device once per
+    iteration. A scene is abandoned where it is not finite, or restarts no longer help.
 
     Args:
-        system: whose nodes they are.
+        system: the system of the nodes.
         product: J times node velocities.
         inverse: B⁻¹ of the free components of the nodes [N, D, D] [1/kg]; the solution stays in its range.
         right: [N, D] [kg m/s].
-        relative: share of the residual that may be left, [B].
-        most: iterations.
-        precondition: the inverse of something like J, times [N, D] of the free components; B⁻¹ without it. It need not
-            be linear (Saad 1993).
+        relative: target of the residual, relative to the first, [B].
+        most: maximum number of iterations.
+        precondition: approximate inverse of J, times [N, D] of the free components; B⁻¹ by default. It need not be
+            linear (Saad 1993).
     """
     solution, left = torch.zeros_like(right), right
     iterations = torch.zeros(len(relative), dtype=torch.int32, device=right.device)
@@ -76,7 +77,7 @@ def gmres(
 
 
 class _Cycle:
-    """The iterations from one start: Arnoldi's method in the inner product of B⁻¹.
+    """Iterations from one start: Arnoldi's method in the inner product of B⁻¹.
 
     Attributes:
         first: residual at the start, float64 [B].
@@ -93,7 +94,7 @@ class _Cycle:
         q, dual, self.first = self._unit(left)
         finite = self.first.isfinite()
         self._counts = system.of_nodes(finite)
-        self._basis, self._duals = [q], [dual]  # orthonormal residuals, and B⁻¹ times these
+        self._basis, self._duals = [q], [dual]  # Orthonormal residuals, and B⁻¹ times these.
         self._directions: list[Tensor] = []
         self._H = torch.zeros(len(self.first), DIRECTIONS + 1, DIRECTIONS, dtype=torch.float64, device=left.device)
         self._goal = torch.zeros_like(self._H[:, :, 0])
@@ -101,12 +102,12 @@ class _Cycle:
         self._weights = self._goal[:, :0]
 
     def direction(self) -> Tensor:
-        """The next direction, of which the product is to be added."""
+        """Next direction, whose product is passed to `add`."""
         self._directions.append(self._duals[-1] if self._precondition is None else self._precondition(self._basis[-1]))
         return self._directions[-1]
 
     def add(self, w: Tensor, solving: Tensor) -> Tensor:
-        """Take in the product of the last direction, for scenes that go on, bool [B]; the residual that is left [B]."""
+        """Add the product of the last direction, for active scenes, bool [B]; returns the remaining residual [B]."""
         H, system, k = self._H, self._system, len(self._directions) - 1
         w = torch.where(self._counts, w, 0)
         for j in range(k + 1):
@@ -115,7 +116,7 @@ class _Cycle:
         q, dual, H[:, k + 1, k] = self._unit(w)
         self._basis.append(q)
         self._duals.append(dual)
-        # Scenes that are done have columns of zeros, which the pseudo-inverse bears.
+        # Scenes that are done have columns of zeros, which the pseudo-inverse allows.
         part, goal = H[:, : k + 2, : k + 1], self._goal[:, : k + 2, None]
         weights = (torch.linalg.pinv(part) @ goal)[:, :, 0]
         self._weights = torch.where(solving[:, None], weights, torch.nn.functional.pad(self._weights, (0, 1)))
@@ -126,7 +127,7 @@ class _Cycle:
         return torch.stack([self._system.of_nodes(y).to(z.dtype) * z for y, z in pairs]).sum(0)
 
     def _unit(self, r: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """A residual of length one, B⁻¹ times it, and its length before."""
+        """A residual of length one, B⁻¹ times it, and its original length."""
         z = (self._inverse * r[:, None, :]).sum(-1)
         size = self._system.node_sum(r * z).clamp_min(0).sqrt()
         size_of_nodes = self._system.of_nodes(size).to(r.dtype)

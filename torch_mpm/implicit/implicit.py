@@ -31,17 +31,18 @@ if TYPE_CHECKING:
 
 
 class ImplicitReport(NamedTuple):
-    """How the latest step was solved; tensors [B] on the device of the particles."""
+    """Report of the latest solve; tensors [B] on the device of the particles."""
 
     converged: Tensor
-    """bool: whether the residual came down to its tolerance, or to rounding, and the error to a tenth of the motion, by
-    the energy that Newton's method expects to gain."""
+    """bool: whether the residual reached its tolerance, or rounding, and the error a tenth of the motion, measured by
+    the predicted energy decrease of Newton's method.
+    """
     residual: Tensor
-    """√(g · B⁻¹ g / Σ m) [m/s] of what is left of the gradient g of the energy, with the node blocks B; float64."""
+    """√(g · B⁻¹ g / Σ m) [m/s] of the final gradient g of the energy, with the node blocks B; float64."""
     iterations: Tensor
-    """Of Newton's method, int32."""
+    """Iterations of Newton's method, int32."""
     cg_iterations: Tensor
-    """Of conjugate gradients and GMRES, in all of these, int32."""
+    """Iterations of conjugate gradients and GMRES, in total, int32."""
 
 
 PLASTICITY = ("after", "inside")
@@ -52,29 +53,29 @@ class Implicit:
 
     The node velocities minimise ½ Σ m |v − v*|² + Σ V ψ((I + dt L(v)) F) (Martin et al. 2011; Gast et al. 2015), scene
     by scene, by Newton's method with line search and conjugate gradients preconditioned by the blocks of the nodes. Any
-    dt is stable but for explicit materials. Walls and obstacles bound the velocities of their nodes in the solve, and
-    rub them. Laws with an elastic energy take part; where they are plastic the flow follows the solve, at the start of
-    the next step, or is a part of it.
+    dt is stable, except with explicit materials. Walls and obstacles bound the velocities of their nodes in the solve,
+    and exert friction. Laws with an elastic energy are supported; plastic flow follows the solve, at the start of the
+    next step, or is a part of it.
 
     Args:
-        tolerance: of the residual relative to that of v*, the velocities without elastic forces, in (0, 1).
-        max_iterations: of Newton's method in a step.
-        max_cg_iterations: of conjugate gradients in each of these.
-        adjoint_tolerance: relative, of the one linear solve of a backward pass; no less than 1e-5 in float32.
-        plasticity: "after": the solve sees the elastic stress of the trial deformation, and the flow follows. "inside":
-            it sees the stress after the flow, so that no more trial stress than the material bears acts on the motion.
-        explicit: materials, numbers of laws of the step's `Mixture`, that take no part in the solve: their stress at
-            the start of the step acts on the nodes, as in an explicit step, which limits dt (`Step.stable_dt`). For
-            soft materials beside stiff ones, such as a fluid beside rubber.
+        tolerance: tolerance of the residual relative to that of v*, the velocities without elastic forces, in (0, 1).
+        max_iterations: maximum number of Newton iterations in a step.
+        max_cg_iterations: maximum number of conjugate gradient iterations in each of these.
+        adjoint_tolerance: relative tolerance of the one linear solve of a backward pass; at least 1e-5 in float32.
+        plasticity: "after": the solve uses the elastic stress of the trial deformation, and the flow follows. "inside":
+            it uses the stress after the flow, so that the stress on the motion does not exceed the strength of the
+            material.
+        explicit: materials, numbers of laws of the step's `Mixture`, excluded from the solve: their stress at the start
+            of the step acts on the nodes, as in an explicit step, which limits dt (`Step.stable_dt`). For soft
+            materials beside stiff ones, such as a fluid beside rubber.
 
     Attributes:
         explicit: these materials, in order.
         report: `ImplicitReport` of the latest step, None before the first.
         adjoint_converged: bool [B], whether all solves of backward passes since the latest step converged; None before
-            the first. Where one did not, the gradients of that scene are NaN.
+            the first. Gradients of a scene are NaN where its solve did not converge.
 
-    A step takes a copy, so that one `Implicit` may be given to several steps: the reports are those of
-    `step.integrator`.
+    A step stores a copy, so that several steps may share one `Implicit`: the reports are those of `step.integrator`.
 
     Raises:
         TypeError, ValueError: for a wrong argument.
@@ -108,13 +109,13 @@ class Implicit:
     def velocities(
         self, step: Step, blocks: Blocks, state: Any, nodes: Tensor, dt: float | Tensor
     ) -> tuple[Tensor, Tensor | None]:
-        """The node velocities at the end of a step [N, D] [m/s], and the impulses on boundaries and walls where the
-        state counts them.
+        """Node velocities at the end of a step [N, D] [m/s], and the impulses on boundaries and walls where the state
+        counts them.
 
         Args:
-            step: whose law, gravity, walls and boundaries count.
+            step: the step with law, gravity, walls and boundaries.
             blocks: the active blocks.
-            state: particles after the return map.
+            state: the particles after the return map.
             nodes: mass and momentum before gravity [N, 1 + D] [kg, kg m/s], with the impulse of `explicit_stress`.
             dt: [s], a number or a tensor [], [1] or [B].
 
@@ -145,8 +146,9 @@ class Implicit:
         return velocity if images is None else images.followed(velocity, part.chosen), None
 
     def _solution(self, step: Step, system: ImplicitSystem, counts: bool = False) -> tuple[Tensor, Tensor | None]:
-        """The minimum of a system within what the walls and boundaries of a step allow, and the impulses on them if
-        these are counted; differentiable."""
+        """Minimum of a system within the bounds of the walls and boundaries of a step, and the impulses on them if
+        these are counted; differentiable.
+        """
         wants_gradient, boundaries = torch.is_grad_enabled(), step.boundaries.entries
         bounds = node_bounds(system.blocks, step.walls, boundaries, system.start, system.state.time, counts)
         with torch.no_grad():
@@ -160,32 +162,32 @@ class Implicit:
         return v, boundary_impulses(system, bounds, v, len(boundaries) + 2 * step.grid.dim)
 
     def solved(self, law: Material, state: Any) -> tuple[Material, Any]:
-        """The law and the particles of the solve: those of a step without its explicit materials."""
+        """Law and particles of the solve: those of a step without its explicit materials."""
         if not self.explicit:
             return law, state
         assert isinstance(law, Mixture)
         return law.only(state, solved_materials(law, self.explicit))
 
     def unsolved(self, law: Material, state: Any) -> tuple[Material, Any]:
-        """The law of the explicit materials and their particles."""
+        """Law of the explicit materials and their particles."""
         assert isinstance(law, Mixture)
         return law.only(state, self.explicit)
 
     def explicit_stress(self, law: Material, state: Any, stress: Tensor) -> Tensor | None:
-        """The stress of all particles [P, D, D] [Pa], zero for those of the solve; None without explicit materials."""
+        """Stress of all particles [P, D, D] [Pa], zero for those of the solve; None without explicit materials."""
         if not self.explicit:
             return None
         assert isinstance(law, Mixture)
         return stress.index_fill(0, law.particles_of(state, solved_materials(law, self.explicit)), 0)
 
     def record_adjoint(self, converged: Tensor) -> None:
-        """One solve of a backward pass, bool [B]."""
+        """Record one solve of a backward pass, bool [B]."""
         kept = None if self._adjoint_begins else self.adjoint_converged
         self.adjoint_converged = converged if kept is None else kept & converged
         self._adjoint_begins = False
 
     def _record(self, minimum: Minimum) -> None:
-        if torch._C._current_graph_task_id() == -1:  # not taken again in a backward pass
+        if torch._C._current_graph_task_id() == -1:  # Not recomputed in a backward pass.
             self._adjoint_begins = True
         self.report = ImplicitReport(minimum.converged, minimum.residual, minimum.iterations, minimum.cg_iterations)
         with outside_transforms(), torch.inference_mode(False):
@@ -204,29 +206,29 @@ class Implicit:
         return unsolved_steps(self._unsolved, self._residual)
 
     def fresh(self) -> Implicit:
-        """The same with no record."""
+        """Copy without records."""
         result = copy.copy(self)
         result.options = dataclasses.replace(self.options)
         result.reset()
         return result
 
     def reset(self) -> None:
-        """Forget the steps so far."""
+        """Discard the records of the steps so far."""
         self.report = self._unsolved = self._residual = self.adjoint_converged = None
 
     def forget(self, scenes: Tensor) -> None:
-        """Forget the steps of scenes, bool [B]."""
+        """Discard the records of scenes, bool [B]."""
         for kept in (self._unsolved, self._residual):
             if kept is not None:
                 kept.masked_fill_(scenes, 0)
 
 
 def check_implicit(step: Step, state: State) -> None:
-    """What an implicit step does not have yet.
+    """Raise for features that implicit steps do not support.
 
     Raises:
-        NotImplementedError: for impulses counted beside mirrors or explicit materials, and steps that are compiled,
-            captured or transformed.
+        NotImplementedError: for impulses counted beside mirrors or explicit materials, and for compiled, captured or
+            transformed steps.
     """
     if is_traced(state.x) or is_captured(state.x) or torch._C._are_functorch_transforms_active():
         raise NotImplementedError(
@@ -256,10 +258,10 @@ INTEGRATORS = ("explicit", "implicit")
 
 
 def as_integrator(value: Any) -> Implicit | None:
-    """The integrator of a step, its own and without a record; None for the explicit one.
+    """Integrator of a step, a copy without records; None for the explicit one.
 
     Raises:
-        TypeError, ValueError: for what is none.
+        TypeError, ValueError: for an invalid integrator.
     """
     if isinstance(value, Implicit):
         return value.fresh()

@@ -1,8 +1,8 @@
-"""The impulses of the material on obstacles and walls in an implicit step.
+"""Impulses of the material on obstacles and walls in an implicit step.
 
-At the solution the gradient of the energy is, at a node that is held or rubbed, what its surfaces give to its momentum:
-along the components that a surface bounds it is that surface's, and across them friction, of which each surface that
-presses has the share of its own limit.
+At the solution the gradient of the energy at a node with contact is the impulse of its surfaces. Along bounded
+components it belongs to the bounding surface; along the others it is friction, shared by the pressing surfaces in
+proportion to their limits.
 """
 
 from __future__ import annotations
@@ -17,17 +17,17 @@ from .system import ImplicitSystem
 
 
 def boundary_impulses(system: ImplicitSystem, bounds: NodeBounds | None, v: Tensor, surfaces: int) -> Tensor:
-    """The impulses that obstacles and faces take from nodes with the velocities of a solution.
+    """Impulses of nodes with the velocities of a solution on obstacles and faces.
 
     Args:
-        system: of the solve.
-        bounds: with the `owner` of each.
-        v: [N, D] [m/s].
-        surfaces: how many of these there are.
+        system: system of the solve.
+        bounds: bounds with the `owner` of each.
+        v: solution [N, D] [m/s].
+        surfaces: number of obstacles and faces.
 
     Returns:
-        [B, surfaces, D + 1 or 3] [N s, N m s], float64, exact to the tolerance of the solve. Differentiable by all that
-        the solution and the residual are.
+        [B, surfaces, D + 1 or 3] [N s, N m s], float64, exact to the tolerance of the solve. Differentiable by all
+        inputs of the solution and the residual.
     """
     if bounds is None or bounds.owner is None:
         return impulse_of_nodes(system.blocks, torch.zeros_like(v))[:, None].expand(-1, surfaces, -1)
@@ -42,12 +42,12 @@ def boundary_impulses(system: ImplicitSystem, bounds: NodeBounds | None, v: Tens
         held = held & ~limit.along
         shares = pressed(bounds, gradient, ~held) / torch.where(limit.size > 0, limit.size, 1)
     along = torch.diag_embed(torch.where(held, given, 0))
-    taken = -(along + shares[:, :, None] * across[:, None, :])  # [N, component, D], in the axes of the nodes
+    taken = -(along + shares[:, :, None] * across[:, None, :])  # Indices [N, component, D], in the axes of the nodes.
     parts = [bounds.turned(part) for part in taken.unbind(1)]
     return torch.stack([_taken_by(system, bounds.owner, parts, number) for number in range(surfaces)], 1)
 
 
 def _taken_by(system: ImplicitSystem, owner: Tensor, parts: list[Tensor], number: int) -> Tensor:
-    """What one surface takes, of parts of the momentum for each component of the nodes."""
+    """Impulse on one surface from the parts of the momentum of each component of the nodes."""
     own = [torch.where(owner[:, k, None] == number, part, 0) for k, part in enumerate(parts)]
     return impulse_of_nodes(system.blocks, torch.stack(own).sum(0))

@@ -1,4 +1,4 @@
-"""Where Newton's method begins, and how far it goes along its directions, for each scene apart."""
+"""Start of Newton's method and step lengths along its directions, for each scene separately."""
 
 from __future__ import annotations
 
@@ -12,17 +12,19 @@ from .contact import Limit
 from .system import ImplicitSystem
 
 SUFFICIENT = 1e-4
-"""Share of the decrease that the slope promises, which a step must bring (Nocedal and Wright 2006, section 3.1)."""
+"""Minimum decrease as a share of that predicted by the slope (Nocedal and Wright 2006, section 3.1)."""
 ROUNDING = 32
-"""Units in the last place by which sums of energies may be wrong."""
+"""Error of sums of energies in units in the last place."""
 MOST_HALVINGS = 60
-"""Where a body resists only once it has moved, as a cable across its span does, the first step of a static load is as
-long as the body would fall."""
+"""Maximum number of halvings of a step: where a body resists only after it has moved, as a cable across its span,
+the first step of a static load is as long as the body would fall.
+"""
 
 
 class Point(NamedTuple):
-    """Velocities [N, D], and what `ImplicitSystem.energy` returns for them, [B] each: their energy, its size, and that
-    of its rounding."""
+    """Velocities [N, D], and the results of `ImplicitSystem.energy` for them, [B] each: their energy, its size, and the
+    size of its rounding.
+    """
 
     v: Tensor
     energy: Tensor
@@ -31,11 +33,11 @@ class Point(NamedTuple):
 
 
 def starting_point(system: ImplicitSystem, bounds: NodeBounds | None) -> tuple[Point, Tensor]:
-    """Where the search begins, the `reference` of the energies from there on, and the velocities whose residual the
-    tolerance is relative to.
+    """Start of the iteration, the `reference` of later energies, and the velocities to whose residual the tolerance is
+    relative.
 
-    These are v* within bounds or no motion, whichever has less energy; where both have none, a share of v* that has
-    one. The search begins there, or at the velocities before gravity where these have less energy still, as they do in
+    These are v* within bounds or no motion, whichever has less energy; where neither has a finite energy, a share of v*
+    that has. The iteration begins there, or at the velocities before gravity where these have still less energy, as in
     a body that is held and moves slowly.
     """
     plain = _lower(system, _point(system, bounds, system.start), _point(system, bounds, torch.zeros_like(system.start)))
@@ -55,33 +57,33 @@ def starting_point(system: ImplicitSystem, bounds: NodeBounds | None) -> tuple[P
 
 
 def _point(system: ImplicitSystem, bounds: NodeBounds | None, v: Tensor) -> Point:
-    """The nearest velocities within bounds."""
+    """Nearest velocities within bounds."""
     v = v if bounds is None else bounds.clamped(v)
     return Point(v, *system.energy(v))
 
 
 def _lower(system: ImplicitSystem, a: Point, b: Point) -> Point:
-    """Of each scene the one of less energy."""
+    """For each scene the point of less energy."""
     lower = b.energy < torch.where(a.energy.isfinite(), a.energy, torch.inf)
     rest = (torch.where(lower, y, x) for x, y in zip(a[1:], b[1:], strict=True))
     return Point(torch.where(system.of_nodes(lower), b.v, a.v), *rest)
 
 
 class Search:
-    """The longest of the steps 1, ½, ¼ ... that lowers the energy of each scene enough, what friction dissipates
-    counted. It begins with the whole step, and the host does not wait for it until it asks what is `too_long`.
+    """Longest of the steps 1, ½, ¼ ... that decreases the energy of each scene sufficiently, including dissipation by
+    friction. It begins with the whole step; the host waits for it only in `too_long`.
 
     Args:
-        system, bounds: whose velocities they are.
-        limit: of friction, that of the end of the step; None without friction.
+        system, bounds: system and bounds of the velocities.
+        limit: limit of friction at the end of the step; None without friction.
         residual: gradient of the energy at the start [N, D] [kg m/s].
-        start: where the step begins.
-        end: of the whole step [N, D] [m/s].
-        done: scenes that stay where they are, bool [B].
+        start: start of the step.
+        end: end of the whole step [N, D] [m/s].
+        done: scenes that are not changed, bool [B].
 
     Attributes:
         point: after the step.
-        enough: scenes whose energy is low enough there, bool [B].
+        enough: scenes with a sufficient decrease, bool [B].
     """
 
     def __init__(
@@ -107,8 +109,9 @@ class Search:
         return not bool(self.enough.all())
 
     def shorten(self) -> None:
-        """Halve the steps of scenes where they are too long until none is. Scenes that no step helps stay where they
-        were."""
+        """Halve the steps of scenes where they are too long until none is. Scenes without an acceptable step are
+        unchanged.
+        """
         for _ in range(MOST_HALVINGS):
             self._share = torch.where(self.enough, self._share, self._share / 2)
             self.point, self.enough = self._tried()
@@ -119,7 +122,7 @@ class Search:
         self.point, self.enough = Point(v, *self._system.energy(v)), torch.ones_like(self.enough)
 
     def moved(self) -> Tensor:
-        """Scenes that are not where they were, bool [B]."""
+        """Scenes that have moved, bool [B]."""
         return self._share > 0
 
     def _moved(self) -> Tensor:
@@ -128,10 +131,10 @@ class Search:
         return v if self._bounds is None else self._bounds.clamped(v)
 
     def _tried(self) -> tuple[Point, Tensor]:
-        """The point after the shares of the step that are next, and where its energy is low enough."""
+        """Point after the next shares of the step, and scenes with a sufficient decrease."""
         system, start = self._system, self._start
         v = self._moved()
-        changed = system.node_sum(v != start.v) > 0  # a step below rounding helps no more than one of no length
+        changed = system.node_sum(v != start.v) > 0  # A step below rounding helps no more than one of zero length.
         self._share = torch.where(changed, self._share, 0.0)
         point = Point(v, *system.energy(v))
         gain = system.gain(start.v, self._residual, v, point.energy - start.energy)

@@ -1,8 +1,8 @@
 """Mirrors in the solve: velocities that are symmetric about the planes of mirrors.
 
-What a mirror stands for is the body together with its image. The velocities of a node and of its images are one, each
-reflected on its side, and the energy of an implicit step is a function of symmetric velocities alone. Gradients,
-products of the Hessian and node blocks are those of all nodes, projected on what is symmetric.
+A mirror represents the body together with its image. The velocities of a node and of its images are the same up to
+reflection, and the energy of an implicit step is a function of symmetric velocities only. Gradients, products of the
+Hessian and node blocks are those of all nodes, projected onto symmetric ones.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class Mirrors:
     groups: Tensor
 
     def symmetric(self, values: Tensor) -> Tensor:
-        """Vectors [N, D] or matrices [N, D, D] of nodes, projected on what is symmetric; differentiable."""
+        """Vectors [N, D] or matrices [N, D, D] of nodes, projected onto symmetric ones; differentiable."""
         rows, present, own = self._members()
         sign = self._signs(values.shape[1]).to(values)
         if values.dim() == 3:
@@ -52,8 +52,9 @@ class Mirrors:
         return _replaced(mass, rows, kept > 0, each / own)
 
     def followed(self, v: Tensor, chosen: Tensor) -> Tensor:
-        """Velocities of nodes [N, D], for the rest of each group those of its chosen ones, bool [N], which are
-        symmetric already; differentiable."""
+        """Velocities of nodes [N, D]; the others of each group get those of its chosen ones, bool [N], which are
+        symmetric already; differentiable.
+        """
         rows, present, own = self._members()
         kept = (present & chosen[rows]).to(v.dtype)[:, :, None] / own[:, :, None]
         sign, count = self._signs(v.shape[1]).to(v), kept.sum(1, keepdim=True)
@@ -61,14 +62,14 @@ class Mirrors:
         return _replaced(v, rows, present & ((kept == 0) & (count > 0))[:, :, 0], sign * mean / own[:, :, None])
 
     def _members(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Rows of the nodes of each group int64 [G, 2^D], which of them are there, and how often each row is."""
+        """Rows of the nodes of each group int64 [G, 2^D], which of them exist, and multiplicities of rows."""
         present = self.groups >= 0
         rows = torch.where(present, self.groups, self.groups[:, :1]).long()
         own = (rows[:, :, None] == rows[:, None, :]).logical_and_(present[:, None, :]).sum(-1)
         return rows, present, own
 
     def has(self, nodes: int) -> Tensor:
-        """Which of so many nodes have an image, bool [N]."""
+        """Whether each of n nodes has an image, bool [N]."""
         result = torch.zeros(nodes, dtype=torch.bool, device=self.groups.device)
         return result.index_fill_(0, self.groups.flatten().clamp_min(0).long(), True) if len(self.groups) else result
 
@@ -78,12 +79,12 @@ class Mirrors:
 
 
 def _replaced(values: Tensor, rows: Tensor, where: Tensor, parts: Tensor) -> Tensor:
-    """Values of nodes [N, ...], in the rows [G, n] of some entries, bool [G, n], sums of their parts [G, n, ...]."""
+    """Node tensor [N, ...] with the sums of parts [G, n, ...] in the rows [G, n] of entries, bool [G, n]."""
     return values.index_fill(0, rows[where], 0).index_add(0, rows[where], parts[where])
 
 
 def mirrors_of(blocks: Blocks, walls: Walls | None, mass: Tensor) -> Mirrors | None:
-    """Of walls that are mirrors alone, for nodes with masses [N]; None without any."""
+    """Mirrors of walls, for nodes with masses [N]; None without any."""
     if walls is None:
         return None
     own = torch.arange(len(mass), device=mass.device)
@@ -98,8 +99,9 @@ def mirrors_of(blocks: Blocks, walls: Walls | None, mass: Tensor) -> Mirrors | N
 
 
 def reflected_inside(faces: Sequence[Face], positions: Tensor) -> tuple[Tensor, Tensor]:
-    """Positions of nodes [N, D] [m], of those behind mirrors that of their images, and the signs of the axes of the
-    latter [N, D]."""
+    """Positions of nodes [N, D] [m], those of the images for nodes behind mirrors, and the signs of the axes of the
+    latter [N, D].
+    """
     positions, sign = positions.clone(), torch.ones_like(positions)
     for number, face in enumerate(faces):
         axis, above = divmod(number, 2)

@@ -1,4 +1,4 @@
-"""The minimum of an implicit step's energy: Newton's method with line search and conjugate gradients."""
+"""Minimum of an implicit step's energy: Newton's method with line search and conjugate gradients."""
 
 from __future__ import annotations
 
@@ -18,26 +18,29 @@ from .system import ImplicitSystem
 LOOSEST = 0.1
 """Relative tolerance of linear solves within Newton's method."""
 NEAR, PATIENCE = 0.05, 6
-"""Share of the first residual, and number of iterations, from which the Hessian is not projected any more."""
+"""Share of the first residual, and number of iterations, from which the Hessian is no longer projected."""
 KEPT = 0.01
-"""Share of the first residual from which the preconditioner stays: so little changes any more."""
+"""Share of the first residual from which the preconditioner is reused: changes are small there."""
 SYMMETRIC = 1e-3
-"""Skew part of the tangents, relative to the rest, up to which they count as symmetric."""
+"""Skew part of the tangents, relative to the rest, up to which they are treated as symmetric."""
 ERROR_OF_MOTION = 0.1
-"""Most of the error of the velocities, as √(g · H⁻¹ g), relative to the root of the energy that takes part in the
-motion, with which a scene may count as converged: the energy is then right to 1%. A residual may be small because dt is
-long, or because all that is left is smooth."""
+"""Maximum error of the velocities, as √(g · H⁻¹ g), relative to the square root of the energy of the motion, of a
+converged scene: the energy is then accurate to 1%. A residual may be small because dt is long, or because the remaining
+error is smooth.
+"""
 ERROR_OF_PLACE = 1e-3
-"""Share of dx that the error may move the material in a step, if it is small beside the motion to v*, too: where
-rounding hides the strains of a stiff body, its motion is right nevertheless."""
+"""Share of dx that the error may move the material in a step, if it is also small compared with the motion to v*: where
+rounding hides the strains of a stiff body, its motion is accurate nevertheless.
+"""
 UNRESOLVED = 128
 """Units in the last place of the elastic energy that the gradient of the displacement of a step would have if all of it
-were strain: the energy of a motion below that is lost in the rounding of the Hessian, whose solves then say nothing."""
+were strain: the energy of a smaller motion is lost in the rounding of the Hessian, whose solves are then meaningless.
+"""
 
 
 @dataclasses.dataclass
 class Options:
-    """Numbers of `Implicit`."""
+    """Settings of `Implicit`."""
 
     tolerance: float
     max_iterations: int
@@ -46,7 +49,7 @@ class Options:
 
 @dataclasses.dataclass
 class Minimum:
-    """Where Newton's method ended.
+    """Result of Newton's method.
 
     Attributes:
         v: node velocities [N, D] [m/s], finite.
@@ -66,31 +69,32 @@ class Minimum:
 
 @torch.no_grad()
 def minimise(system: ImplicitSystem, bounds: NodeBounds | None, options: Options) -> Minimum:
-    """The node velocities of least energy within bounds, for each scene apart.
+    """Node velocities of least energy within bounds, for each scene separately.
 
-    The host waits for the device once per iteration, to learn whether the last step has lowered the energy of all
-    scenes and whether all are done; where it has not, once for each halving and once more; and where a step may cross
-    bounds, or with friction, once per linear solve. A scene is done when its residual is `tolerance` times that of v*,
-    or of the size of rounding, and the energy that Newton's method expects to gain is small beside that of the motion;
-    or when no step lowers its energy. Contact and friction are a part of the quadratic model of a step.
+    The host waits for the device once per iteration, to read whether the last step has decreased the energy of all
+    scenes and whether all are done; otherwise once for each halving and once more; and where a step may cross bounds,
+    or with friction, once per linear solve. A scene is done when its residual is `tolerance` times that of v*, or of
+    the size of rounding, and the predicted energy decrease of Newton's method is small compared with the energy of the
+    motion; or when no step decreases its energy. Contact and friction are a part of the quadratic model of a step.
     """
     return _Newton(system, bounds, options).minimum()
 
 
 @dataclasses.dataclass
 class _Iterate:
-    """Node velocities and what the method asks of them; flags of scenes are bool [B].
+    """Node velocities and derived values of the method; flags of scenes are bool [B].
 
     Attributes:
-        elastic: gradient of the energy [N, D] [kg m/s].
-        convex: projected tangents of the particles [P, n], None where the node blocks are those of the iterate before.
+        elastic: gradient of the energy, without friction [N, D] [kg m/s].
+        convex: projected tangents of the particles [P, n], None where the node blocks are those of the previous
+            iterate.
         diagonal: node blocks of the Hessian [N, D, D] [kg].
         inverse, change, residual: `preconditioned`.
         target: residual that is small enough, float64 [B] [m/s].
         small: whether the residual is.
-        done: small, or no step lowers the energy.
+        done: small, or no step decreases the energy.
         exact: whether the Hessian is not projected.
-        kept: whether the node blocks are those of the next iterate too.
+        kept: whether the next iterate reuses the node blocks.
     """
 
     point: Point
@@ -109,18 +113,18 @@ class _Iterate:
 
 
 class _Look(NamedTuple):
-    """What the host learns of all scenes together."""
+    """Values that the host reads, for all scenes together."""
 
     finished: bool
     all_exact: bool
     none_exact: bool
     all_kept: bool
     lowered: bool
-    """Whether the step that led here lowers the energy enough."""
+    """Whether the step that led here decreases the energy sufficiently."""
 
 
 class _Newton:
-    """Newton's method for one system: what it knows from one iteration to the next."""
+    """Newton's method for one system, with its state between iterations."""
 
     def __init__(self, system: ImplicitSystem, bounds: NodeBounds | None, options: Options) -> None:
         self._system, self._bounds, self._options = system, bounds, options
@@ -137,16 +141,16 @@ class _Newton:
         self._forcing: Tensor | None = None
         none = torch.zeros(scenes, dtype=torch.bool, device=device)
         self._stalled = self._indefinite = self._whole = self._still = none
-        # Twice the energy that the last step of each scene was to gain where nothing bends its way, [J].
+        # Twice the predicted energy decrease of the last step of each scene, without contact, [J].
         self._expected = torch.full_like(self._begun.energy, torch.inf)
 
     def minimum(self) -> Minimum:
-        """Where the method ends."""
+        """Result."""
         now, careful = self._at(self._begun), False
         look = self._look(now)
         while not look.finished:
             search = self._step(now, look)
-            # Where one step was too long the next often is, and to compute an iterate there would be wasted.
+            # Where one step was too long the next often is, and computing an iterate there would be wasted.
             careful = careful and search.too_long()
             if careful:
                 self._shorten(search, now)
@@ -159,7 +163,7 @@ class _Newton:
                 after = self._at(search.point, now, look.all_kept)
                 next_look = self._look(after)
             now, look = after, next_look
-        # No step lowers the energy where what is left to gain is less than its rounding.
+        # No step decreases the energy where the remaining decrease is below its rounding.
         v, energy, _, rounded = now.point
         rounding = ROUNDING * torch.finfo(v.dtype).eps * rounded
         stuck = self._stalled & (now.residual.square() * self._total_mass <= rounding)
@@ -169,7 +173,7 @@ class _Newton:
         return Minimum(v, now.contact.free, small, now.residual, self._iterations, self._cg_iterations)
 
     def _at(self, point: Point, before: _Iterate | None = None, all_kept: bool = False) -> _Iterate:
-        """The iterate at a point, after another one whose node blocks may stay."""
+        """Iterate at a point, after another one whose node blocks may be reused."""
         system, bounds, v = self._system, self._bounds, point.v
         elastic = system.residual(v)
         convex: Tensor | None = None
@@ -184,7 +188,7 @@ class _Newton:
         inverse, change, residual = preconditioned(system, bounds, diagonal, contact, self._total_mass)
         first = self._first_residual(point, diagonal, residual)
         floor = _rounding(system, inverse, v, self._wave, self._momentum, self._total_mass)
-        # One iteration at least: a smooth load may be smaller than the rounding of stresses, which averages out.
+        # At least one iteration: a smooth load may be smaller than the rounding of stresses, which averages out.
         target = torch.maximum(self._options.tolerance * first, torch.where(self._iterations > 0, floor, 0))
         small = (residual <= target) & self._near(point, contact)
         done = self._stalled | small
@@ -195,8 +199,9 @@ class _Newton:
         return _Iterate(point, elastic, convex, diagonal, contact, **rest, **flags)
 
     def _near(self, point: Point, contact: Contact) -> Tensor:
-        """Scenes whose error is small beside their motion, or beside that of v* and dx, bool [B]: by the last step,
-        which was no shorter than what is left, or by the mass of the nodes, which the Hessian exceeds."""
+        """Scenes whose error is small compared with their motion, or with that of v* and dx, bool [B]: by the last
+        step, which was no shorter than the remaining error, or by the mass of the nodes, which the Hessian exceeds.
+        """
         system, mass, v = self._system, self._system.mass[:, None], point.v
         by_mass = system.node_sum(contact.gradient.square() / torch.where(mass > 0, mass, 1))
         size = torch.maximum(point.size, torch.where(self._begun.energy.isfinite(), self._begun.size, 0))
@@ -208,7 +213,7 @@ class _Newton:
         return (by_mass <= most) | ((self._expected <= most) & resolved) | (self._expected <= harmless)
 
     def _first_residual(self, point: Point, diagonal: Tensor, residual: Tensor) -> Tensor:
-        """What the tolerance is relative to [m/s], [B]: a good start saves work, and does not ask for more accuracy."""
+        """Reference of the tolerance [m/s], [B]: a good start saves work, but does not raise the accuracy."""
         if self._first is None:
             self._first = residual
             if self._plain is not point.v:
@@ -231,11 +236,11 @@ class _Newton:
         self._stalled = self._stalled | (self._still & ~self._whole)
 
     def _step(self, now: _Iterate, look: _Look) -> Search:
-        """The search along the direction of Newton's method."""
+        """Line search along the direction of Newton's method."""
         system, bounds, v = self._system, self._bounds, now.point.v
         self._forcing = _forcing(now.residual, self._previous, self._forcing, now.target)
         self._previous = now.residual
-        # What rounding leaves of a residual must not end a solve before what is smooth in it is found.
+        # Rounding of a residual must not end a solve before its smooth part is found.
         assert self._first is not None
         tight = (LOOSEST * self._first / torch.where(now.residual > 0, now.residual, 1)).clamp_max(0.5)
         reached = now.residual <= now.target
@@ -260,7 +265,9 @@ class _Newton:
         return Search(system, bounds, minimum.limit, now.elastic, now.point, minimum.v, now.done)
 
     def _tangents(self, now: _Iterate, look: _Look) -> Tangents:
-        """Of the particles at an iterate, not projected in scenes that are exact; of what is not symmetric, too."""
+        """Tangents of the particles at an iterate, not projected in scenes that are exact; also their nonsymmetric
+        part.
+        """
         system, v = self._system, now.point.v
         tangent = _tangent(system, v, now.convex, now.exact, look.all_exact, look.none_exact)
         now.convex = None
@@ -279,8 +286,9 @@ class _Newton:
 def _tangent(
     system: ImplicitSystem, v: Tensor, convex: Tensor | None, exact: Tensor, all_exact: bool, none_exact: bool
 ) -> Tensor:
-    """Tangents of the particles, not projected in scenes that are exact, bool [B], and with the projected ones if these
-    are known."""
+    """Tangents of the particles, not projected in scenes that are exact, bool [B], combined with the projected ones if
+    these are known.
+    """
     if all_exact:
         return system.tangent(v, projected=False)
     convex = system.tangent(v) if convex is None else convex
@@ -290,7 +298,7 @@ def _tangent(
 
 
 def skewed(system: ImplicitSystem, skew: Tensor, tangent: Tensor, share: float | Tensor) -> Tensor:
-    """Scenes where the skew parts of the tangents are more than a share of the rest, bool [B]."""
+    """Scenes where the skew parts of the tangents exceed a share of the rest, bool [B]."""
     dim = skew.shape[1]
     moduli = tangent[:, 2 * dim * dim :]
     sizes = torch.stack([skew.square().sum((1, 2)), moduli.square().sum(1)], 1).double()
@@ -299,8 +307,9 @@ def skewed(system: ImplicitSystem, skew: Tensor, tangent: Tensor, share: float |
 
 
 def _with_momentum(system: ImplicitSystem, bounds: NodeBounds | None, v: Tensor, total_mass: Tensor) -> Tensor:
-    """The velocities with the momentum of v* in scenes that nothing bounds: what an early end of the solve has left of
-    its error that is a translation, which has no elastic energy."""
+    """Velocities with the momentum of v* in scenes without bounds: an early end of the solve leaves an error that is a
+    translation, which has no elastic energy.
+    """
     missing = system.mass[:, None] * (system.start - v)
     change = torch.stack([system.node_sum(column) for column in missing.unbind(1)], 1) / total_mass[:, None]
     if bounds is not None:
@@ -314,8 +323,9 @@ def _with_momentum(system: ImplicitSystem, bounds: NodeBounds | None, v: Tensor,
 
 
 def _forcing(residual: Tensor, previous: Tensor | None, forcing: Tensor | None, target: Tensor) -> Tensor:
-    """Relative tolerances of the linear solves, that of the second choice of Eisenstat and Walker (1996): as tight as
-    Newton's method converges, and no tighter than what is left to do."""
+    """Relative tolerances of the linear solves, by the second choice of Eisenstat and Walker (1996): as tight as the
+    convergence of Newton's method, and no tighter than the remaining work.
+    """
     if previous is None or forcing is None:
         rate = torch.full_like(residual, LOOSEST)
     else:
@@ -329,8 +339,9 @@ def _forcing(residual: Tensor, previous: Tensor | None, forcing: Tensor | None, 
 def _rounding(
     system: ImplicitSystem, inverse: Tensor, v: Tensor, wave: Tensor, momentum: Tensor, total_mass: Tensor
 ) -> Tensor:
-    """The residual that rounding leaves [m/s], [B]: of momenta, and of stresses, where strains of the size of one unit
-    move waves of the given speed, and as much again for each cell that the material moves in the step."""
+    """Residual due to rounding [m/s], [B]: of momenta, and of stresses, where strains of one unit move waves of the
+    given speed, and as much again for each cell that the material moves in the step.
+    """
     speed = system.node_sum(system.mass[:, None] * v.square()) / total_mass
     cells = speed * (torch.as_tensor(system.dt, device=v.device).double() / system.blocks.grid.dx).square()
     moved = system.node_sum(momentum * times(inverse, momentum)).clamp_min(0) / total_mass

@@ -1,4 +1,4 @@
-"""The node blocks of the Hessian, whose inverses precondition linear solves and measure residuals."""
+"""Node blocks of the Hessian, whose inverses precondition linear solves and measure residuals."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def preconditioned(
 def inverse_blocks(bounds: NodeBounds | None, blocks: Tensor, free: Tensor) -> Tensor:
     """B⁻¹ of the free components of symmetric node blocks [N, D, D] [1/kg], zero for the others."""
     dtype, dim, blocks = blocks.dtype, blocks.shape[1], blocks.double()
-    # Rounding of stiff blocks may leave a negative eigenvalue, with which a residual could seem to be zero.
+    # Rounding of stiff blocks may leave a negative eigenvalue, with which a residual could appear to be zero.
     ridge = 16 * torch.finfo(dtype).eps * blocks.diagonal(dim1=1, dim2=2).sum(1)
     if bounds is not None:
         blocks = bounds.turned_blocks(blocks)
@@ -39,10 +39,10 @@ def inverse_blocks(bounds: NodeBounds | None, blocks: Tensor, free: Tensor) -> T
 
 
 def _inverse(diagonal: list[Tensor], above: dict[tuple[int, int], Tensor]) -> dict[tuple[int, int], Tensor]:
-    """Entries of the inverses of symmetric 2 × 2 or 3 × 3 matrices, from theirs on the diagonal and above it."""
+    """Entries of the inverses of symmetric 2 × 2 or 3 × 3 matrices, from their entries on and above the diagonal."""
     dim = len(diagonal)
     scale = [d.rsqrt() for d in diagonal]
-    unit = {(i, j): a * scale[i] * scale[j] for (i, j), a in above.items()}  # with ones on the diagonal
+    unit = {(i, j): a * scale[i] * scale[j] for (i, j), a in above.items()}  # With ones on the diagonal.
     if dim == 2:
         cofactors = {(0, 0): torch.ones_like(scale[0]), (0, 1): -unit[0, 1]}
         cofactors[1, 1] = cofactors[0, 0]

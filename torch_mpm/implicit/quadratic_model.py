@@ -1,4 +1,4 @@
-"""The quadratic model of the energy of an implicit step, and its minimum within bounds and with friction."""
+"""Quadratic model of the energy of an implicit step, and its minimum within bounds and with friction."""
 
 from __future__ import annotations
 
@@ -20,17 +20,19 @@ from .system import ImplicitSystem
 TIGHTEST = 1e-12
 """Relative tolerance of linear solves."""
 FREE_ROUNDS, MOST_ROUNDS = 8, 20
-"""Of linear solves with other components held: from the first number on nothing that is held is let go any more."""
+"""Numbers of linear solves with other components held: from the first number on no held component is released any
+more.
+"""
 
 
 class Tangents(NamedTuple):
     """Derivatives of the stresses of the particles.
 
     Attributes:
-        symmetric: as `implicit_cg` takes them [P, n].
-        scenes: those whose derivatives are not symmetric, bool [B].
+        symmetric: argument of `implicit_cg` [P, n].
+        scenes: scenes with nonsymmetric derivatives, bool [B].
         whole: the same, not projected in these scenes; None where there are none.
-        skew: what these scenes add to them [P, D, D]; None where there are none.
+        skew: nonsymmetric part in these scenes [P, D, D]; None where there are none.
     """
 
     symmetric: Tensor
@@ -40,14 +42,14 @@ class Tangents(NamedTuple):
 
 
 class ModelMinimum(NamedTuple):
-    """Where the gradient of the model, with friction, is small enough; scenes apart.
+    """Approximate minimum of the model, with friction; scenes separately.
 
     Attributes:
         v: velocities of the nodes [N, D] [m/s].
-        limit: of friction there; None without friction.
-        found: whether the gradient is as small as it was to be, bool [B].
+        limit: limit of friction there; None without friction.
+        found: whether the gradient reached its target, bool [B].
         indefinite: whether the model has no minimum, bool [B].
-        iterations: of linear solves, int32 [B].
+        iterations: iterations of linear solves, int32 [B].
     """
 
     v: Tensor
@@ -58,16 +60,16 @@ class ModelMinimum(NamedTuple):
 
 
 class QuadraticModel:
-    """The model about an iterate.
+    """Model about an iterate.
 
     Args:
-        system, bounds: whose energy it is of.
+        system, bounds: system and bounds of the energy.
         start: the iterate [N, D] [m/s].
-        gradient: of the energy there [N, D] [kg m/s].
+        gradient: gradient of the energy there [N, D] [kg m/s].
         blocks: node blocks of the Hessian [N, D, D] [kg].
-        tangents: of the particles.
-        total_mass: of the scenes [B] [kg].
-        most: iterations of a linear solve.
+        tangents: tangents of the particles.
+        total_mass: mass of the scenes [B] [kg].
+        most: maximum number of iterations of a linear solve.
     """
 
     def __init__(
@@ -90,13 +92,13 @@ class QuadraticModel:
         self._iterations = torch.zeros_like(tangents.scenes, dtype=torch.int32)
 
     def solved(self, contact: Contact, inverse: Tensor, relative: Tensor, done: Tensor) -> ModelMinimum:
-        """The minimum with the free components of given contact at the iterate, by one linear solve.
+        """Minimum with the free components of given contact at the iterate, by one linear solve.
 
         Args:
-            contact: without bounds that a step could cross, and without friction.
+            contact: contact without bounds that a step could cross, and without friction.
             inverse: B⁻¹ of the free components.
-            relative: share of the gradient that may be left, [B].
-            done: scenes that stay where they are, bool [B].
+            relative: target of the gradient, relative to the first, [B].
+            done: scenes that are not changed, bool [B].
         """
         right = torch.where(self._system.of_nodes(done), 0, -contact.gradient)
         held = None if self._bounds is None else self._bounds.held_normals(contact.free)
@@ -104,17 +106,17 @@ class QuadraticModel:
         return ModelMinimum(self._start + change, None, found, self._indefinite, self._iterations)
 
     def minimum(self, residual: Tensor, relative: Tensor, target: Tensor, done: Tensor) -> ModelMinimum:
-        """The minimum where a step may cross bounds, or with friction, by linear solves until the same components are
-        held; the host waits for the device once per solve.
+        """Minimum where a step may cross bounds, or with friction, by linear solves until the held components do not
+        change; the host waits for the device once per solve.
 
-        What is left of the gradient is no more than its share, and so little that the step lowers the energy of the
-        model by as much as that stands for.
+        The remaining gradient reaches its relative target, and is so small that the step realises the corresponding
+        energy decrease of the model.
 
         Args:
-            residual: of the iterate [B] [m/s].
-            relative: share of it that may be left, [B].
-            target: residual that is small enough in any case [B] [m/s].
-            done: scenes that stay where they are, bool [B].
+            residual: residual of the iterate [B] [m/s].
+            relative: relative target, [B].
+            target: absolute target of the residual [B] [m/s].
+            done: scenes that are not changed, bool [B].
         """
         system, bounds = self._system, self._bounds
         assert bounds is not None
@@ -149,8 +151,9 @@ class QuadraticModel:
         return ModelMinimum(v, contact.limit, found & ~self._indefinite, self._indefinite, self._iterations)
 
     def gain(self, end: Tensor, gradient: Tensor, limit: Limit | None) -> Tensor:
-        """What the way to velocities [N, D] [m/s] gains of energy with a constant gradient [N, D] [kg m/s], and of
-        friction, float64 [B] [J]."""
+        """Energy change on the way to velocities [N, D] [m/s] with a constant gradient [N, D] [kg m/s], and of
+        friction, float64 [B] [J].
+        """
         system, bounds, start = self._system, self._bounds, self._start
         if bounds is None:
             return -system.node_sum(gradient * (end - start))
@@ -174,8 +177,9 @@ class QuadraticModel:
         held: Tensor | None,
         across: Tensor | None,
     ) -> tuple[Tensor, Tensor]:
-        """The step whose product with the Hessian is `right` but for a share of it, or B⁻¹ times that where there is
-        none; and the scenes where it was found, bool [B]."""
+        """Step whose product with the Hessian is `right` up to a relative tolerance, or B⁻¹ times `right` where there
+        is none; and the scenes where it was found, bool [B].
+        """
         system, most, tangents = self._system, self._most, self._tangents
         whole = None if tangents.whole is None else system.of_nodes(tangents.scenes)
         own = right if whole is None else torch.where(whole, 0, right)
@@ -199,7 +203,7 @@ class QuadraticModel:
         return torch.where(whole, others, step), found
 
     def _of_free(self, free: Tensor, across: Tensor | None) -> Callable[[Tensor], Tensor]:
-        """The derivative of the residual with that of friction, of what is free."""
+        """Derivative of the residual with that of friction, for free components."""
 
         def product(d: Tensor) -> Tensor:
             result = self._product(d) if across is None else self._product(d) + times(across, d)

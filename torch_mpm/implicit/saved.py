@@ -1,7 +1,7 @@
-"""Objects that wait for the backward pass with their tensors in the care of autograd.
+"""Objects stored for the backward pass with their tensors saved by autograd.
 
-Tensors that a function keeps by itself are out of reach of checkpoints, which drop what autograd saves and compute it
-again, and of hooks, which move it to the host.
+Tensors that a function stores itself are out of reach of checkpoints, which drop and recompute tensors saved by
+autograd, and of hooks, which move them to the host.
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ from ..parameters import Overlay
 
 @dataclasses.dataclass(frozen=True)
 class _Place:
-    """Where a tensor was."""
+    """Placeholder of a tensor."""
 
     number: int
 
 
 def separated(value: Any) -> tuple[Any, list[Tensor]]:
-    """The value with places instead of its tensors, and the tensors, each once.
+    """Value with placeholders instead of its tensors, and the distinct tensors.
 
-    Looked through are lists, tuples, dicts, dataclasses and overlays; the lattice of a grid and laws stay as they are.
+    Lists, tuples, dicts, dataclasses and overlays are traversed; the lattice of a grid and laws are unchanged.
     """
     numbers: dict[int, int] = {}
     tensors: list[Tensor] = []
@@ -40,7 +40,7 @@ def separated(value: Any) -> tuple[Any, list[Tensor]]:
 
 
 def joined(value: Any, tensors: Sequence[Tensor]) -> Any:
-    """The inverse of `separated`."""
+    """Inverse of `separated`."""
     return _mapped(value, _Place, lambda place: tensors[place.number])
 
 

@@ -1,9 +1,9 @@
-"""The energy of an implicit step as a function of the node velocities, and its derivatives.
+"""Energy of an implicit step as a function of the node velocities, and its derivatives.
 
     E(v) = ½ Σ_i m_i |v_i − v*_i|² + Σ_p V_p ψ((I + dt L_p(v)) F_p),
 
 with v* the velocities after gravity. Its gradient is the residual of backward Euler: the scatter of an explicit step,
-with the stress of the trial deformation. The ops are differentiable, so that the residual is, by all that it reads.
+with the stress of the trial deformation. The ops are differentiable, so that the residual is too, by all of its inputs.
 """
 
 from __future__ import annotations
@@ -24,27 +24,29 @@ from ..parameters import Overlay
 from .mirrors import Mirrors
 
 READ = ("x", "mass", "volume", "F", "J", "scene", "ids", "material", "temperature", "time", "dt", "particles", "scenes")
-"""What laws may read of a state: velocities are those of the nodes."""
+"""Fields of a state that laws may read: velocities are those of the nodes."""
 
 
 @dataclasses.dataclass
 class ImplicitSystem:
-    """What a step asks of its nodes.
+    """Energy and residual of a step.
 
     Attributes:
         blocks: the active blocks.
         law: the material.
         state: particles after the return map.
-        mass: of the nodes [N] [kg].
+        mass: mass of the nodes [N] [kg].
         start: v* [N, D] [m/s].
         dt: [s], a number or a tensor [], [1] or [B].
         stress_form: "mls" or "gradient".
-        flows: whether the stress is that after the return map of the trial deformation; no energy has it then.
-        before_gravity: velocities of the nodes before gravity [N, D] [m/s], None without gravity: a place to start.
-        mirrors: to whose symmetric velocities the system is restricted, None for all.
-        reference: node velocities whose kinetic term is subtracted from `energy` [N, D] [m/s], v* by default. Near them
-            no digits are lost to that of a v* that is far away, as in a static load in one long step.
-        volume: of the particles that have an energy, zero for the others [P] [m³].
+        flows: whether the stress is that after the return map of the trial deformation; it is not the derivative of an
+            energy then.
+        before_gravity: velocities of the nodes before gravity [N, D] [m/s], None without gravity: a candidate for the
+            start.
+        mirrors: mirrors whose symmetric velocities are the unknowns, None without mirrors.
+        reference: node velocities whose kinetic term is subtracted from `energy` [N, D] [m/s], v* by default. It avoids
+            cancellation where v* is far away, as in a static load in one long step.
+        volume: volume of the particles that have an energy, zero for the others [P] [m³].
     """
 
     blocks: Blocks
@@ -74,7 +76,7 @@ class ImplicitSystem:
         self.slot_scene = slots.clamp_min(0).long()
 
     def forget(self) -> None:
-        """Let go of what only the search for the minimum reads."""
+        """Release tensors that only the search for the minimum reads."""
         self._trial = self.before_gravity = self.reference = None
         self.__dict__.pop("stiffness", None)
 
@@ -85,9 +87,9 @@ class ImplicitSystem:
             return torch.where(self.volume > 0, self.volume * self.law.stiffness(self.state), 0).double()
 
     def detached(self) -> ImplicitSystem:
-        """The same for no gradients, with no more of the state than laws may read."""
+        """Copy without gradients, with only the fields of the state that laws may read."""
 
-        def still(value: Any) -> Any:  # others stay the same objects, of which a mixture knows the materials
+        def still(value: Any) -> Any:  # Other objects stay the same: a mixture caches the materials of their tensors.
             return value.detach() if isinstance(value, Tensor) and value.requires_grad else value
 
         fields = {name: still(getattr(self.state, name)) for name in READ if hasattr(self.state, name)}
@@ -98,7 +100,7 @@ class ImplicitSystem:
         )
 
     def trial(self, v: Tensor) -> Any:
-        """The particles with the deformation to which node velocities bring them."""
+        """Particles with the trial deformation of node velocities."""
         if self._trial is not None and self._trial[0] is v:
             return self._trial[1]
         state, grid = self.state, self.blocks.grid
@@ -110,12 +112,12 @@ class ImplicitSystem:
         return trial
 
     def energy(self, v: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """E of each scene less the kinetic term of `reference`, float64 [B] [J], infinite where a particle has none;
-        and two sizes of it, float64 [B] [J].
+        """E of each scene minus the kinetic term of `reference`, float64 [B] [J], infinite where a particle has none;
+        and two magnitudes, float64 [B] [J].
 
-        The first size is the energy that takes part in the motion: kinetic, stored, and the work of the momenta. Of the
-        second one E has an error of some units in the last place: of these energies, and the work of stresses
-        V √(2 K ψ) and momenta on strains and velocities that are rounded.
+        The first is the energy of the motion: kinetic, stored, and the work of the momenta. The rounding error of E is
+        a few units in the last place of the second: these energies, and the work of stresses V √(2 K ψ) and momenta on
+        rounded strains and velocities.
         """
         stored = self.law.trial_energy(self.trial(v), self.state)
         stored = torch.where(self.volume > 0, self.volume * stored, 0).double()
@@ -130,14 +132,16 @@ class ImplicitSystem:
         return self.node_sum(kinetic) + total, size, size + rounded + self.node_sum(kinetic.abs())
 
     def unrotated(self, v: Tensor) -> Tensor:
-        """Σ V K |dt L(v)|², float64 [B] [J]: twice the elastic energy of the displacement of a step, or more, if none
-        of its gradient were rotation."""
+        """Σ V K |dt L(v)|², float64 [B] [J]: upper bound of twice the elastic energy of the displacement of a step,
+        reached if none of its gradient were rotation.
+        """
         gradient = self.trial(v).C.double() * (self.step[:, None, None] if isinstance(self.step, Tensor) else self.step)
         return self.particle_sum((self.stiffness * gradient.square().sum((1, 2)))[:, None])[:, 0]
 
     def gain(self, v: Tensor, residual: Tensor, trial: Tensor, change: Tensor) -> Tensor:
-        """What a step from v, where the residual is given, to a trial adds to E, float64 [B] [J]: the change of E, or
-        where plastic flow leaves no energy, the work of the residuals along the step by the trapezoidal rule."""
+        """Change of E in a step from v, whose residual is given, to a trial, float64 [B] [J]; with plastic flow, which
+        leaves no energy, the work of the residuals along the step by the trapezoidal rule.
+        """
         if not self.flows:
             return change
         work = self.node_sum(0.5 * (residual + self.residual(trial)) * (trial - v))
@@ -146,12 +150,12 @@ class ImplicitSystem:
     def residual(self, v: Tensor) -> Tensor:
         """∂E/∂v [N, D] [kg m/s]; differentiable by everything."""
         stress = self.law.trial_stress(self.trial(v), self.state, self.flows)
-        meant = (self.volume > 0)[:, None, None]  # the stress of others may be NaN
+        meant = (self.volume > 0)[:, None, None]  # The stress of others may be NaN.
         impulse = torch.where(meant, self.impulse_weight[:, None, None] * torch.where(meant, stress, 0), 0)
         return self.symmetric(self.mass[:, None] * (v - self.start) + self._scattered(impulse))
 
     def symmetric(self, values: Tensor) -> Tensor:
-        """Vectors or matrices of nodes as mirrors want them."""
+        """Vectors or matrices of nodes, projected as mirrors require."""
         return values if self.mirrors is None else self.mirrors.symmetric(values)
 
     def _motion(self, v: Tensor) -> tuple[Tensor, Tensor]:
@@ -169,16 +173,17 @@ class ImplicitSystem:
         return scatter(self.blocks, x, nothing, impulse if mls else None, None if mls else impulse, scale)
 
     def tangent(self, v: Tensor, projected: bool = True) -> Tensor:
-        """The tangents of the particles with their weights, as the ops of the Hessian take them [P, n]."""
+        """Tangents of the particles with their weights, as arguments of the ops of the Hessian [P, n]."""
         return self.law.trial_tangent(self.trial(v), self.state, self.tangent_weight, projected, self.flows)
 
     def skew(self, v: Tensor) -> Tensor:
-        """What flows that are not associated add to the tangents: skew matrices in their axes [P, D, D]."""
+        """Contribution of flows that are not associated to the tangents: skew matrices in their axes [P, D, D]."""
         return self.law.trial_skew(self.trial(v), self.tangent_weight)
 
     def derivative(self, tangent: Tensor, skew: Tensor | None) -> Callable[[Tensor], Tensor]:
-        """The derivative of the residual as a function of node velocities [N, D] -> [N, D]; that with −skew is its
-        transpose."""
+        """Derivative of the residual as a function of node velocities [N, D] -> [N, D]; with −skew it is the
+        transpose.
+        """
         dim = self.state.x.shape[1]
         U, B = (tangent[:, k * dim * dim : (k + 1) * dim * dim].unflatten(1, (dim, dim)) for k in (0, 1))
 
@@ -199,7 +204,7 @@ class ImplicitSystem:
 
     @property
     def images(self) -> Tensor | None:
-        """Of nodes, as `implicit_cg` takes them."""
+        """Node values as arguments of `implicit_cg`."""
         return None if self.mirrors is None else self.mirrors.groups
 
     # -- sums over scenes

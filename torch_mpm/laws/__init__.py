@@ -1,7 +1,7 @@
 """Constitutive laws: modules from the deformation of a state to its Kirchhoff stress.
 
-A law is a `Material`. Most are compiled (`CompiledLaw`); `CustomLaw` makes one of any module, `Mixture` combines
-several in one state. A new compiled law is a class in `solids` or `fluids`, named in the `__all__` of that module.
+A law is a `Material`. Most are compiled (`CompiledLaw`); `CustomLaw` wraps any module, `Mixture` combines several in
+one state. A new compiled law is a class in `solids` or `fluids`, named in the `__all__` of that module.
 """
 
 from . import active, custom, fluids, mixture, sand, solids, thermal

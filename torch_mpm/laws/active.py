@@ -1,4 +1,4 @@
-"""Muscles: a material that contracts along fibres as it is told to."""
+"""Muscles: a material that contracts along fibres under an activation."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ class Active(Material):
     That is the stress of the energy a (|F d|² − 1)/2 per rest volume, a spring along the fibre, for a constant a; the
     actuation F A Fᵀ of ChainQueen (Hu et al. 2019) with A = a d dᵀ.
 
-    The activation a [P] [Pa] is `state.extra["activation"]`, zero where it was not set: a > 0 contracts. A controller
-    sets it in `Step(on_particles=)` for each step, or a hook of `rollout` now and then; gradients pass to it. Steps
-    between two hooks are taken in one op where the law is compiled.
+    The activation a [P] [Pa] is `state.extra["activation"]`, zero by default; a > 0 contracts. A controller sets it in
+    `Step(on_particles=)` for each step, or a hook of `rollout` every n steps; gradients pass to it. Steps between two
+    hooks are computed in one op where the law is compiled.
 
     Args:
-        law: any law that moves F; a function or module F -> Kirchhoff stress too.
-        direction: of the fibres at rest, unit vectors d, or zero where there are none: D numbers, or a tensor [D] or
-            [P, D], in the order of `state.ids` where particles were reordered; it may require grad.
+        law: any law of F, also a function or module F -> Kirchhoff stress.
+        direction: direction of the fibres at rest, unit vectors d, or zero where there are none: D numbers, or a tensor
+            [D] or [P, D], in the order of `state.ids` where particles were reordered; it may require grad.
 
     Raises:
         TypeError, ValueError: for a law without F, or a direction of another shape.
@@ -50,7 +50,7 @@ class Active(Material):
         self.law = law = as_law("law", law)
         if "F" not in law.state_fields:
             raise ValueError(f"law must move F, of which fibres have their direction, got {type(law).__name__}")
-        self._everywhere = not isinstance(direction, Tensor)  # numbers are at home on any device
+        self._everywhere = not isinstance(direction, Tensor)  # Numbers are valid on any device.
         if not isinstance(direction, Tensor):
             direction = torch.tensor(check_vector("direction", direction), dtype=torch.float64, device="cpu")
         if direction.dim() not in (1, 2) or direction.shape[-1] not in (2, 3) or not direction.is_floating_point():
@@ -68,7 +68,7 @@ class Active(Material):
         return fields, stress + law_update(FIBRE, F, self.fibre_parameters(state)).stress
 
     def out_of_plane_stress(self, state: State) -> Tensor:
-        return self.law.out_of_plane_stress(state)  # fibres are in the plane
+        return self.law.out_of_plane_stress(state)  # Fibres are in the plane.
 
     def volume_ratio(self, state: State) -> Tensor:
         return self.law.volume_ratio(state)
@@ -98,7 +98,7 @@ class Active(Material):
         return self.law.invalid(state)
 
     def fibre_parameters(self, state: State) -> list[Tensor]:
-        """Those of the compiled law `FIBRE`: activation, and three entries of the direction, [] or [P]."""
+        """Parameters of the compiled law `FIBRE`: activation, and three entries of the direction, [] or [P]."""
         if self._everywhere and self.direction.device != state.x.device:
             self.direction = self.direction.to(state.x.device)
         activation, x = self._activation(state), state.x
@@ -107,7 +107,7 @@ class Active(Material):
         return [activation, *entries, *(x.new_zeros(()) for _ in range(3 - len(entries)))]
 
     def _fibre(self, state: State) -> tuple[str, Tensor, list[Tensor]]:
-        """What the ops of a law take."""
+        """Arguments of the ops of a law."""
         assert state.F is not None
         return FIBRE, state.F, self.fibre_parameters(state)
 

@@ -1,4 +1,4 @@
-"""Compiled laws, one or those of a mixture, as the ops take them that call laws by their names."""
+"""Compiled laws, one or those of a mixture, as arguments of ops that call laws by name."""
 
 from __future__ import annotations
 
@@ -16,21 +16,23 @@ class LawCalls(NamedTuple):
     """Arguments of ops that call laws."""
 
     names: str
-    """Of the compiled laws: commas between materials, a plus before what is added to the stress of a material."""
+    """Names of the compiled laws: commas between materials, a plus before a contribution to the stress of a
+    material.
+    """
     options: list[int]
-    """Of each law; likewise the numbers of its history tensors."""
+    """Number of parameters of each law; likewise the number of its history tensors."""
     variables: list[int]
     parameters: list[Tensor]
-    """Of all laws, one after another; likewise the history."""
+    """Parameters of all laws, one after another; likewise the history."""
     history: list[Tensor]
     history_names: list[list[str]]
-    """Of each material."""
+    """Options of each material."""
     material: Tensor | None
-    """The material of each particle; None for a single one."""
+    """Material of each particle; None for a single one."""
 
 
 def laws_of(law: Material) -> list[Material]:
-    """A law, or those of a plain mixture."""
+    """A law, or the laws of a plain mixture."""
     return list(law.laws) if type(law) is Mixture else [law]  # type: ignore[arg-type]
 
 
@@ -40,7 +42,7 @@ def passive(law: Material) -> Material:
 
 
 def law_calls(law: Material, state: Any) -> LawCalls:
-    """The calls of compiled laws for a state, which may have a time step `dt`; some may be `Active`.
+    """Calls of compiled laws for a state, which may have a time step `dt`; some may be `Active`.
 
     Raises:
         ValueError: where the state has no material, or one that the mixture does not have, as `Mixture.check_material`.
@@ -48,7 +50,7 @@ def law_calls(law: Material, state: Any) -> LawCalls:
     laws = laws_of(law)
     material = law.check_material(state) if isinstance(law, Mixture) else None
     names: list[str] = []
-    each: list[tuple[int, list[Tensor], list[Tensor]]] = []  # of the laws: options, parameters, history
+    each: list[tuple[int, list[Tensor], list[Tensor]]] = []  # Per law: options, parameters, history.
     history_names: list[list[str]] = []
     for part in laws:
         own: CompiledLaw = passive(part)  # type: ignore[assignment]

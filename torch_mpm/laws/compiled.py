@@ -1,4 +1,4 @@
-"""Laws of csrc/laws: their parameters, in whatever form they are given, and their call.
+"""Laws of csrc/laws: their parameters in all accepted forms, and their call.
 
 Parameters are numbers or tensors of shape [], [1], [B] (per scene) or [P] (per particle, in the order of `state.ids`
 where particles were reordered; also where P = B), and gradients pass to them. A parameter may also be a function of
@@ -45,21 +45,21 @@ PLASTIC_VOLUME = "log_plastic_volume"
 ARGUMENTS = {"eta": "viscosity"}
 """Names of arguments that are stored under another name."""
 FIGURES = ("stress", "stiffness", "energy_density")
-"""What a survey asks of a law."""
+"""Values of a law that a survey needs."""
 
 
 class CompiledLaw(Material):
-    """A law of csrc/laws; subclasses say which, and convert their arguments to its parameters.
+    """A law of csrc/laws; subclasses name it, and convert their arguments to its parameters.
 
     Its fields, history, parameters and their ranges are those of the compiled registry, `torch_mpm.ops.LAWS`. The
-    history is in state.extra, where a `Step` keeps it; what is absent counts as zero.
+    history is in state.extra, where a `Step` stores it; absent history counts as zero.
     """
 
     name: str
     elastic_name: ClassVar[str | None] = None
-    """Of a plastic law without second derivatives of its energy, the law of μ and λ that has this energy, and them."""
+    """For a plastic law without second derivatives of its energy: name of the law of μ and λ with this energy."""
     scene_defaults: ClassVar[dict[str, float]] = {}
-    """Density [kg/m³] and other values that a scene file takes for what it does not say."""
+    """Density [kg/m³] and other defaults in scene files."""
 
     def __init_subclass__(cls) -> None:
         if "name" in vars(cls):
@@ -71,7 +71,7 @@ class CompiledLaw(Material):
         self._functions = False
 
     def __setattr__(self, name: str, value: Any) -> None:
-        """Tensors in the place of numbers are buffers, as those of the constructor are."""
+        """Tensors that replace numbers become buffers, as those of the constructor."""
         if isinstance(value, Tensor) and name in vars(self):
             del vars(self)[name]
             self._store(name, value)
@@ -80,7 +80,7 @@ class CompiledLaw(Material):
 
     @staticmethod
     def _describe(target: Any) -> None:
-        """Set what a step asks a law from the registry, on a class or on one instance."""
+        """Set the attributes that a step reads from the registry, on a class or on one instance."""
         info = LAWS[target.name]
         target.state_fields = (info.field,)
         target.extra_fields = tuple(q.name for q in info.history)
@@ -91,7 +91,7 @@ class CompiledLaw(Material):
         return [getattr(self, p.name) for p in LAWS[self.name].parameters if p.name != "dt"]
 
     def return_map(self, state: State, details: bool | int = False) -> LawUpdate:
-        """The whole result of the law: with details also dissipated energy, multiplier, branches and convergence."""
+        """Complete result of the law: with details also dissipated energy, multiplier, branches and convergence."""
         deformation, parameters = self._arguments(state)
         C = state.C if self.viscous else None
         return law_update(
@@ -120,7 +120,7 @@ class CompiledLaw(Material):
 
     def out_of_plane_stress(self, state: State) -> Tensor:
         """τ_zz [P] [Pa] of plane strain: ∂ψ/∂ln F_zz at F_zz = 1, since plastic flow in 2-D stays in the plane."""
-        if self.state_fields == ("J",):  # beside the pressure a fluid has a deviator in the plane alone
+        if self.state_fields == ("J",):  # Beside the pressure a fluid has a deviator in the plane only.
             return self.stress(state).diagonal(dim1=1, dim2=2).mean(1)
         mapped = self.return_map(state)
         law, moduli, options = self._elastic_law(state, mapped.history)
@@ -130,14 +130,14 @@ class CompiledLaw(Material):
         return law_update(law, F, moduli, scene=state.scene, options=options, scenes=scenes).stress[:, 2, 2]
 
     def _elastic_law(self, state: State, history: Sequence[Tensor]) -> tuple[str, list[Tensor], Sequence[str]]:
-        """A compiled law with the elastic energy of this one in 2-D and 3-D: its name, parameters and options."""
+        """Compiled law with the elastic energy of this one in 2-D and 3-D: its name, parameters and options."""
         _, parameters = self._arguments(state)
         if self.elastic_name is None:
             return self.name, parameters, ()
         return self.elastic_name, self._elastic_moduli(state, parameters, history), ()
 
     def volume_ratio(self, state: State) -> Tensor:
-        """J or det F [P], times the plastic volume ratio where the law keeps one."""
+        """J or det F [P], times the plastic volume ratio where the law stores one."""
         elastic = super().volume_ratio(state)
         if PLASTIC_VOLUME not in self.extra_fields:
             return elastic
@@ -176,7 +176,7 @@ class CompiledLaw(Material):
             *(name, deformation, before_field, weight, parameters, history, scene, dim, projected, scenes)
         )
         viscosity = self.viscosity(before)
-        if viscosity is not None:  # of a fluid, whose frames are the identity: 2 η dev sym L
+        if viscosity is not None:  # For a fluid, whose frames are the identity: 2 η dev sym L.
             add_deviator(tangent, dim, 2 * viscosity * torch.where(weight > 0, weight / state.step, 0))
         return tangent
 
@@ -184,7 +184,7 @@ class CompiledLaw(Material):
         return flowing_skew(self, state, weight) if LAWS[self.name].plastic else super().trial_skew(state, weight)
 
     def _energy_gradient(self, state: Any) -> Tensor:
-        """∂ψ/∂F or ∂ψ/∂J of the state itself, which can be differentiated once more."""
+        """∂ψ/∂F or ∂ψ/∂J of the state itself, differentiable once more."""
         name, deformation, parameters, history, scene, dim, scenes = self._of_the_ops(state)
         if self.elastic_name is None:
             return law_energy_gradient(name, deformation, parameters, history, scene, dim, scenes)
@@ -196,7 +196,7 @@ class CompiledLaw(Material):
         return parameters[:2]
 
     def _viscous_stress(self, state: Any, before: Any) -> Tensor:
-        """What the velocity gradient of a step adds to the stress, at the volume before it [P, D, D] [Pa]."""
+        """Contribution of the velocity gradient of a step to the stress, at the volume before it [P, D, D] [Pa]."""
         name, J, parameters, history, scene, dim, scenes = self._of_the_ops(before)
         moving, still = (
             law_update(name, J, parameters, history, C, scene, dim, scenes=scenes).stress for C in (state.C, None)
@@ -206,13 +206,13 @@ class CompiledLaw(Material):
     def _of_the_ops(
         self, state: Any
     ) -> tuple[str, Tensor, list[Tensor], Sequence[Tensor], Tensor | None, int, int | None]:
-        """What the ops of energy and moduli take: law, state, parameters, history, scene, dimension and scenes."""
+        """Arguments of the ops of energy and moduli: law, state, parameters, history, scene, dimension and scenes."""
         deformation, parameters = self._arguments(state)
         batch = state.scene, state.x.shape[1], self._scenes(state, parameters)
         return self._name(state), deformation, parameters, self._history(state), *batch
 
     def _scenes(self, state: State, parameters: Sequence[Tensor]) -> int | None:
-        """Number of scenes, where a parameter is per scene."""
+        """Number of scenes, where a parameter is given per scene."""
         P = state.x.shape[0]
         return None if all(needs_no_scenes(p, P) for p in parameters) else state.scenes
 
@@ -228,25 +228,25 @@ class CompiledLaw(Material):
         return op(*self._of_the_ops(state))
 
     def _name(self, state: State) -> str:
-        """The compiled law, which may depend on the dimension."""
+        """Name of the compiled law, which may depend on the dimension."""
         return self.name
 
     def _options(self) -> Sequence[str]:
         return ()
 
     def history_names(self) -> list[str]:
-        """The history of the compiled law, in its order."""
+        """History of the compiled law, in its order."""
         return [q.name for q in LAWS[self.name].history if q.name in self.extra_fields] if self.extra_fields else []
 
     def _history(self, state: State) -> list[Tensor]:
         return [state.extra[n] if n in state.extra else self.initial(n, state) for n in self.history_names()]
 
     def is_all_of_its_update(self) -> bool:
-        """Whether `update` does what the compiled law does and nothing else, so that a kernel may take its place."""
+        """Whether `update` equals the compiled law, so that a kernel may replace it."""
         return self._updates_as_compiled()
 
     def figures_are_compiled(self) -> bool:
-        """Whether stress, stiffness and energy are those of the compiled law alone, which one op gives at once."""
+        """Whether stress, stiffness and energy are those of the compiled law alone, which one op computes together."""
         own = (getattr(type(self), name) is getattr(CompiledLaw, name) for name in FIGURES)
         return self._updates_as_compiled() and all(own)
 
@@ -259,7 +259,7 @@ class CompiledLaw(Material):
         return self._functions
 
     def option_bits(self) -> int:
-        """The options of the compiled law as its op takes them."""
+        """Options of the compiled law as arguments of its op."""
         return option_bits(self.name, self._options())
 
     def initial(self, name: str, state: State) -> Tensor:
@@ -269,12 +269,12 @@ class CompiledLaw(Material):
         return torch.zeros_like(state.mass)
 
     def _add(self, name: str, value: Value) -> None:
-        """Check a parameter of the law against its range and keep it."""
+        """Check a parameter of the law against its range and store it."""
         quantity = LAWS[self.name].parameter(name)
         self._store(name, check_value(name, value, quantity.expected, quantity.holds))
 
     def _store(self, name: str, value: Value) -> None:
-        """Keep a parameter as number, buffer, nn.Parameter or function, so that `.to` and optimizers find it."""
+        """Store a parameter as number, buffer, nn.Parameter or function, so that `.to` and optimizers find it."""
         if not isinstance(value, Tensor):
             setattr(self, name, value if callable(value) else float(value))
             self._functions = self._functions or callable(value)
@@ -300,8 +300,9 @@ class CompiledLaw(Material):
                 check_length(ARGUMENTS.get(name, name), value, particles, scenes)
 
     def _stored(self) -> dict[str, Any]:
-        """All attributes, by the names under which parameters are stored; in compiled code those that are registered,
-        since compilers of torch 2.11 cannot take the others together."""
+        """All attributes, by the names under which parameters are stored; in compiled code only registered ones, since
+        compilers of torch 2.11 do not support the others.
+        """
         registered: dict[str, Any] = {}
         for kept in (self._parameters, self._buffers, self._modules):
             for name, value in kept.items():
@@ -311,10 +312,10 @@ class CompiledLaw(Material):
     def _parameters_of(self, state: State) -> list[Tensor]:
         """Parameters in the dtype, on the device and in the particle order of the state.
 
-        Kept from call to call while nothing has changed and none requires grad.
+        Cached while nothing has changed and none requires grad.
         """
         if self._functions:
-            in_order: Any = Overlay(state, ids=None)  # which evaluated parameters already are
+            in_order: Any = Overlay(state, ids=None)  # Evaluated parameters have this form already.
             return self._at_temperature(state)._convert(in_order)
         tensors = [value for value in self._stored().values() if isinstance(value, Tensor)]
         x, order = state.x, None
@@ -325,7 +326,7 @@ class CompiledLaw(Material):
             return self._convert(state)
         numbers = [value for value in vars(self).values() if isinstance(value, Real)]
         if any(t.numel() == particles for t in tensors):
-            order = state.ids  # of what differs by particle
+            order = state.ids  # Only parameters that differ by particle.
         key = (x.dtype, x.device, order, *numbers, *tensors)
         return self._kept_parameters.get(key, lambda: self._convert(state), x)
 
@@ -350,9 +351,9 @@ class CompiledLaw(Material):
         return result
 
     def _scalars(self, numbers: list[float], x: Tensor) -> list[Tensor]:
-        """Numbers as tensors [] in the dtype and on the device of x, kept from call to call."""
+        """Numbers as tensors [] in the dtype and on the device of x, cached between calls."""
 
-        def make() -> list[Tensor]:  # no copies from the host, which graphs refuse
+        def make() -> list[Tensor]:  # No copies from the host, which graphs refuse.
             return [torch.full((), number, dtype=x.dtype, device=x.device) for number in numbers]
 
         if is_traced(x):
@@ -367,7 +368,7 @@ class SolidLaw(CompiledLaw):
         engineering: whether they are Young's modulus and Poisson's ratio.
     """
 
-    E: Any  # numbers, buffers or nn.Parameters
+    E: Any  # Numbers, buffers or nn.Parameters.
     nu: Any
     mu: Any
     lam: Any
@@ -400,14 +401,16 @@ class SolidLaw(CompiledLaw):
             return self.mu, self.lam
         E, nu = self.E, self.nu
         factors = 0.5 / (1 + nu), nu / ((1 + nu) * (1 - 2 * nu))
-        if isinstance(E, Tensor) and not isinstance(nu, Tensor):  # as E by temperature: in one kernel
+        if isinstance(E, Tensor) and not isinstance(nu, Tensor):  # For E as a function of temperature: in one kernel.
             mu, lam = torch._foreach_mul([E, E], factors)
             return mu, lam
         return E * factors[0], E * factors[1]
 
 
 def check_value(name: str, value: Value, expected: str, holds: Callable[[Any], Any], infinite: bool = False) -> Value:
-    """A value whose numbers hold, and are finite unless they may be infinite; a function is not asked."""
+    """A value whose numbers satisfy the condition, and are finite unless infinity is allowed; a function is not
+    evaluated.
+    """
     if isinstance(value, PerMaterial):
         for k, one in enumerate(value.values()):
             check_value(f"{name} of material {k}", one, expected, holds, infinite)

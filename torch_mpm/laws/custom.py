@@ -1,4 +1,4 @@
-"""A user's own laws, in ordinary torch code."""
+"""User laws in ordinary torch code."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ __all__ = ["CustomLaw", "CustomPrincipalLaw", "isotropic"]
 
 
 RESERVED = ("F", "J", "stress", "dissipated")
-"""Names of results of a law that are no history."""
+"""Names of results of a law that are not history."""
 
 
 class CustomLaw(Material):
@@ -29,20 +29,20 @@ class CustomLaw(Material):
 
     Args:
         function: called with the state field, and the history if there is one. It may return a pair (F, stress)
-            instead, with F what a plastic law makes of its argument; with history a tuple (F, stress, new history ...).
+            instead, with F after the flow of a plastic law; with history a tuple (F, stress, new history ...).
         state_field: "F", or "J" [P] for a law of the volume ratio alone.
-        stiffness: see `Material.stiffness`; a number, a tensor [P] or a function of the state. None takes it from the
-            function by automatic differentiation, each time that `stable_dt` asks.
-        history: variables that the law carries along in `state.extra`, by name: the shape of one for a particle, which
-            begins as zeros, or its value at the start, a tensor of that shape. The function is called with each of them
-            [P, ...], in this order, after the state field.
+        stiffness: see `Material.stiffness`; a number, a tensor [P] or a function of the state. None computes it from
+            the function by automatic differentiation, in each call of `stable_dt`.
+        history: variables that the law stores in `state.extra`, by name: the shape per particle, with zeros at the
+            start, or the initial value, a tensor of that shape. The function is called with each of them [P, ...], in
+            this order, after the state field.
 
     Under `torch.autocast` the function may return a half precision; it is cast to the dtype of the state, with
-    gradients, and all else is computed in that. A law that needs more (other fields, the time step) is a subclass of
-    `Material`.
+    gradients, and everything else is computed in that dtype. A law that needs more (other fields, the time step) is a
+    subclass of `Material`.
 
     Raises:
-        TypeError: for what is no function.
+        TypeError: unless `function` is callable.
         ValueError: for an unknown field, a number as stiffness that is negative or not finite, or in use for a result
             of another shape.
     """
@@ -101,7 +101,7 @@ class CustomLaw(Material):
 
 
 def _checked_history(history: Any) -> dict[str, Tensor]:
-    """The start of each history variable of a particle."""
+    """Initial value of each history variable of a particle."""
     if history is None:
         return {}
     if not isinstance(history, Mapping):
@@ -120,10 +120,10 @@ def _checked_history(history: Any) -> dict[str, Tensor]:
 
 
 def as_law(name: str, law: Any) -> Material:
-    """A material as it is; a function or module F [P, D, D] -> Kirchhoff stress as a `CustomLaw`.
+    """A material unchanged; a function or module F [P, D, D] -> Kirchhoff stress as a `CustomLaw`.
 
     Raises:
-        TypeError: for anything else.
+        TypeError: for other arguments.
     """
     if isinstance(law, Material):
         return law
@@ -137,21 +137,21 @@ def as_law(name: str, law: Any) -> Material:
 
 
 def check_function(function: Any) -> Any:
-    """The function of a custom law."""
+    """Function of a custom law."""
     if not callable(function):
         raise TypeError(f"function must be a function or module, got {shape_of(function)}")
     return function
 
 
 def check_stiffness(value: Any) -> Any:
-    """A stiffness that is given to a custom law."""
+    """Stiffness that was given to a custom law."""
     if value is not None and not isinstance(value, Tensor) and not callable(value):
         return float(check_number("stiffness", value, "finite and not negative", lambda v: 0 <= v < math.inf))
     return value
 
 
 def given_stiffness(value: Any, state: State) -> Tensor:
-    """[P]"""
+    """Values [P]."""
     value = value(state) if callable(value) else value
     return torch.as_tensor(value, dtype=state.x.dtype, device=state.x.device).expand(state.x.shape[0])
 
@@ -160,16 +160,16 @@ class CustomPrincipalLaw(Material):
     """A law from any module or function of the principal stretches, in ordinary torch code.
 
     Args:
-        function: called with the stretches σ [P, D], in no order that matters: it must treat them alike. Returns the
-            principal Kirchhoff stresses [P, D] [Pa], or a pair (stretches, stresses) where a plastic law changes σ.
-        stiffness: see `Material.stiffness`; a number, a tensor [P] or a function of the state. None takes it from the
-            function by automatic differentiation, each time that `stable_dt` asks.
+        function: called with the stretches σ [P, D] in any order: it must be symmetric in them. Returns the principal
+            Kirchhoff stresses [P, D] [Pa], or a pair (stretches, stresses) where a plastic law changes σ.
+        stiffness: see `Material.stiffness`; a number, a tensor [P] or a function of the state. None computes it from
+            the function by automatic differentiation, in each call of `stable_dt`.
 
-    It is `isotropic` of the function, whose gradient with respect to F holds at equal stretches. Particles with
-    det F ≤ 0 or F not finite have no stress, and the function sees them at rest.
+    It is `isotropic` of the function, whose gradient with respect to F is correct at equal stretches. Particles with
+    det F ≤ 0 or F not finite have no stress; the function receives σ = 1 for them.
 
     Raises:
-        TypeError: for what is no function.
+        TypeError: unless `function` is callable.
         ValueError: for a number as stiffness that is negative or not finite, or in use for a result of another shape.
     """
 

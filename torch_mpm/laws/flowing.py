@@ -2,7 +2,7 @@
 
 The Kirchhoff stress of the mapped state is as isotropic in the trial deformation as that of an elastic law, so that its
 derivative, the consistent tangent (Simo and Taylor 1985), has the form of csrc/laws/tangent.h with derivatives through
-the map. The step asks for velocity gradients that move F by dF = L F₀.
+the map. The step needs it for velocity gradients that change F by dF = L F₀.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ def flowing_stress(law: Material, state: Any, before: Any) -> Tensor:
     volume = determinant(state.F.detach())[:, None, None]
     valid = (volume > 0) & (volume < torch.inf)
     eye = torch.eye(state.F.shape[1], dtype=stress.dtype, device=stress.device)
-    inverse = torch.linalg.inv_ex(torch.where(valid, state.F, eye))[0]  # no NaN that a gradient could meet
+    inverse = torch.linalg.inv_ex(torch.where(valid, state.F, eye))[0]  # Gradients must not meet a NaN.
     return torch.where(valid, stress @ (before.F @ inverse).mT, 0)
 
 
 def flowing_tangent(law: Material, state: Any, before: Any, weight: Tensor, projected: bool) -> Tensor:
-    """The derivative of `flowing_stress` by L times a weight [P], as `torch_mpm.ops.law_tangent` has it [P, n].
+    """Derivative of `flowing_stress` by L times a weight [P], in the form of `torch_mpm.ops.law_tangent` [P, n].
 
-    Of a flow that is not associated, as that of sand, the symmetric part. Zero where it is not finite.
+    For a flow that is not associated, as that of sand, the symmetric part. Zero where it is not finite.
     """
     dim = state.x.shape[1]
     U, stretch, V = svd3(state.F)
@@ -53,8 +53,9 @@ def flowing_tangent(law: Material, state: Any, before: Any, weight: Tensor, proj
 
 
 def flowing_skew(law: Material, state: Any, weight: Tensor) -> Tensor:
-    """What is not symmetric in the derivative of `flowing_stress`: the skew part of the block between the stretches, in
-    the axes of the tangent, times a weight [P, D, D]. Zero where it is not finite."""
+    """Nonsymmetric part of the derivative of `flowing_stress`: the skew part of the block between the stretches, in the
+    axes of the tangent, times a weight [P, D, D]. Zero where it is not finite.
+    """
     stretch = svd3(state.F)[1]
     moduli, _ = _principal_derivatives(law, state, stretch, [])
     skew = 0.5 * weight[:, None, None] * (moduli - moduli.mT)
@@ -65,8 +66,9 @@ def flowing_skew(law: Material, state: Any, weight: Tensor) -> Tensor:
 def _principal_derivatives(
     law: Material, state: Any, stretch: Tensor, pairs: list[tuple[int, int]]
 ) -> tuple[Tensor, Tensor]:
-    """Derivatives of P = τ F⁻ᵀ at F = diag(σ) [Pa]: ∂Pᵢᵢ/∂Fⱼⱼ [P, D, D], and of pairs, ∂Pᵢⱼ/∂Fᵢⱼ and ∂Pᵢⱼ/∂Fⱼᵢ
-    [2, P, pairs], from those of τ, which hold at equal stretches too."""
+    """Derivatives of P = τ F⁻ᵀ at F = diag(σ) [Pa]: ∂Pᵢᵢ/∂Fⱼⱼ [P, D, D], and of pairs, ∂Pᵢⱼ/∂Fᵢⱼ and ∂Pᵢⱼ/∂Fⱼᵢ [2, P,
+    pairs], from those of τ, which are correct at equal stretches too.
+    """
     with torch.inference_mode(False), torch.enable_grad(), graph_at_once():
         F = torch.diag_embed(stretch.detach()).requires_grad_()
         moved: Any = Overlay(state, F=F)

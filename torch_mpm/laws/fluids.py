@@ -21,7 +21,7 @@ __all__ = ["WeaklyCompressible"]
 class WeaklyCompressible(CompiledLaw):
     """Fluid with Tait-Murnaghan pressure (Monaghan 1994): p = K/γ (J^−γ − 1), τ = −J p I + 2 J η dev(sym C).
 
-    It stores J and no F. γ = 1 is the linear law τ = K (J − 1) I. At rest the speed of sound is √(K/ρ).
+    It stores J instead of F. γ = 1 is the linear law τ = K (J − 1) I. At rest the speed of sound is √(K/ρ).
 
     Args:
         bulk_modulus: K [Pa], not negative.

@@ -21,20 +21,20 @@ def isotropic(F: Tensor, function: Callable[[Tensor], Any]) -> Any:
 
     Args:
         F: [P, D, D], float32 or float64.
-        function: called with the stretches σ [P, D], in no order that matters: it must treat them alike. Returns τ
-            [P, D]; or a tuple (s, τ) with s [P, D], the stretches after a return map; or (s, τ, others ...), which are
-            passed on. It may be called again in the backward pass. The smallest stretch has the sign of det F.
+        function: called with the stretches σ [P, D] in any order: it must be symmetric in them. Returns τ [P, D]; or a
+            tuple (s, τ) with s [P, D], the stretches after a return map; or (s, τ, others ...), which are passed on. It
+            may be called again in the backward pass. The smallest stretch has the sign of det F.
 
     Returns:
         U diag(τ) Uᵀ [P, D, D]; where the function returns a tuple, (U diag(s) Vᵀ, U diag(τ) Uᵀ, others ...).
 
-    The gradient with respect to F holds at equal stretches: differences of the function over a gap of at least the cube
-    root of the rounding error stand for its derivative there (relative error about 1e-10 in float64, 1e-5 in float32).
-    It is infinite or NaN only where two stretches add up to zero. Differentiable once; that an energy of the stretches
-    is differentiated inside the function, as by `torch.func.grad`, does not count.
+    The gradient with respect to F is correct at equal stretches: differences of the function over a gap of at least the
+    cube root of the rounding error approximate its derivative there (relative error about 1e-10 in float64, 1e-5 in
+    float32). It is infinite or NaN only where two stretches add up to zero. Differentiable once; the differentiation of
+    an energy of the stretches inside the function, as by `torch.func.grad`, does not count.
 
     Raises:
-        TypeError, ValueError: for a wrong argument, or another shape of what the function returns.
+        TypeError, ValueError: for a wrong argument, or a result of the function of another shape.
     """
     if not callable(function):
         raise TypeError(f"function must be a function or module, got {shape_of(function)}")
@@ -52,7 +52,7 @@ def isotropic(F: Tensor, function: Callable[[Tensor], Any]) -> Any:
 
 
 def _checked(result: Any, sigma: Tensor) -> tuple[Tensor, Tensor]:
-    """Stretches and stresses [P, D] of what a function of stretches returned."""
+    """Stretches and stresses [P, D] from the result of a function of stretches."""
     mapped, tau = result[:2] if isinstance(result, tuple) and len(result) > 1 else (sigma, result)
     mapped, tau = from_half(mapped, sigma), from_half(tau, sigma)
     for name, value in (("stretches", mapped), ("stresses", tau)):
@@ -64,7 +64,7 @@ def _checked(result: Any, sigma: Tensor) -> tuple[Tensor, Tensor]:
 class _IsotropicFunction(torch.autograd.Function):
     """U diag(mapped) Vᵀ and U diag(tau) Uᵀ for F = U diag(sigma) Vᵀ.
 
-    Its gradient of F is that of turning the principal axes; mapped and tau bring their own.
+    Its gradient by F is that of the rotation of the principal axes; mapped and tau have separate gradients.
     """
 
     @staticmethod
@@ -111,12 +111,12 @@ class _IsotropicFunction(torch.autograd.Function):
 
 
 def _once(gradient: Tensor, *others: Tensor) -> Tensor:
-    """A gradient that refuses to be differentiated; compiled code has no second derivatives of any function."""
+    """A gradient that cannot be differentiated; compiled code has no second derivatives of any function."""
     return gradient if torch.compiler.is_compiling() else _DifferentiatedOnce.apply(gradient, *others)
 
 
 class _DifferentiatedOnce(torch.autograd.Function):
-    """A gradient that depends on other tensors in a way that autograd does not see."""
+    """A gradient that depends on other tensors in a way unknown to autograd."""
 
     @staticmethod
     def forward(gradient: Tensor, *others: Tensor) -> Tensor:
@@ -137,7 +137,9 @@ class _DifferentiatedOnce(torch.autograd.Function):
 def _quotients(
     evaluate: Callable[[Tensor], tuple[Tensor, Tensor]], sigma: Tensor, mapped: Tensor, tau: Tensor, i: int, j: int
 ) -> tuple[Tensor, Tensor]:
-    """Differences of mapped stretches and stresses i and j over that of the stretches, which is widened where small."""
+    """Divided differences of mapped stretches and stresses i and j, over a gap of the stretches that is widened where
+    small.
+    """
     middle = (sigma[:, i] + sigma[:, j]) / 2
     least = torch.finfo(sigma.dtype).eps ** (1 / 3) * middle.abs()
     near = (sigma[:, i] - sigma[:, j]).abs() < least

@@ -1,4 +1,4 @@
-"""What a step asks a constitutive law."""
+"""Interface of a constitutive law."""
 
 from __future__ import annotations
 
@@ -46,16 +46,16 @@ class Material(nn.Module):
         raise NotImplementedError
 
     def initial(self, name: str, state: State) -> Tensor:
-        """One of `extra_fields` before the first step: zero, [P] unless the law says otherwise."""
+        """Initial value of one of `extra_fields`: zero, [P] unless the law defines another."""
         return torch.zeros_like(state.mass)
 
     def check_parameters(self, particles: int, scenes: int | None) -> None:
         """Check the tensors of the law, and of the laws inside it, for a state of P particles and B scenes.
 
-        A step calls it before it calls the law. Here nothing is checked.
+        A step calls it before the law. The base class checks nothing.
 
         Raises:
-            ValueError: for one whose shape is not [], [1], [B] or [P], or another that its argument may have.
+            ValueError: for a tensor whose shape is not [], [1], [B] or [P], or another valid shape of its argument.
         """
 
     def stress(self, state: State) -> Tensor:
@@ -63,11 +63,10 @@ class Material(nn.Module):
         return self.update(state)[1]
 
     def out_of_plane_stress(self, state: State) -> Tensor:
-        """τ_zz [P] [Pa] of a 2-D state, which is in plane strain (F_zz = 1); of the state after the return map, as
-        `stress`.
+        """τ_zz [P] [Pa] of a 2-D state in plane strain (F_zz = 1), after the return map, as `stress`.
 
         Raises:
-            NotImplementedError: for a law that gives the stress in the plane alone.
+            NotImplementedError: for a law that defines only the in-plane stress.
         """
         raise NotImplementedError(
             f"{type(self).__name__} has no out-of-plane stress, which pressure and von Mises stress need in 2-D: "
@@ -75,7 +74,7 @@ class Material(nn.Module):
         )
 
     def volume_ratio(self, state: State) -> Tensor:
-        """Volume over rest volume [P], by which the Kirchhoff stress is that of Cauchy: J, or det F."""
+        """Volume over rest volume [P], the ratio of Kirchhoff and Cauchy stress: J, or det F."""
         if self.state_fields == ("J",):
             assert state.J is not None
             return state.J
@@ -87,7 +86,7 @@ class Material(nn.Module):
         raise NotImplementedError(f"{type(self).__name__} has no energy")
 
     def trial_energy(self, state: Any, before: Any) -> Tensor:
-        """Energy per rest volume [P] [J/m³] that an implicit step minimises, of a trial state that does not flow.
+        """Energy per rest volume [P] [J/m³] that an implicit step minimises, for a trial state without flow.
 
         Args:
             state: with the trial F or J, and, of a viscous law, the velocity gradient of the step as C and dt of each
@@ -97,19 +96,21 @@ class Material(nn.Module):
         raise _not_implicit(self)
 
     def trial_stress(self, state: Any, before: Any, flows: bool = False) -> Tensor:
-        """dP F₀ᵀ: derivative of `trial_energy` by velocity gradients that move the deformation by dF = L F₀ or
-        dJ = J₀ tr L from that of `before` [P, D, D] [Pa]. The Kirchhoff stress where both states are one. With `flows`,
-        P is that of the stress after the return map of the trial state, and no energy need have it as its derivative.
+        """dP F₀ᵀ: derivative of `trial_energy` by velocity gradients that change the deformation by dF = L F₀ or dJ =
+        J₀ tr L from that of `before` [P, D, D] [Pa]. It equals the Kirchhoff stress where both states are the same.
+        With `flows`, P is the stress after the return map of the trial state, which need not be the derivative of an
+        energy.
         """
         raise _not_implicit(self)
 
     def trial_tangent(self, state: Any, before: Any, weight: Tensor, projected: bool, flows: bool = False) -> Tensor:
-        """Derivative of `trial_stress` as `torch_mpm.ops.law_tangent` has it, times a weight [P]."""
+        """Derivative of `trial_stress` in the form of `torch_mpm.ops.law_tangent`, times a weight [P]."""
         raise _not_implicit(self)
 
     def trial_skew(self, state: Any, weight: Tensor) -> Tensor:
-        """What is not symmetric in the derivative of `trial_stress` where the trial flows: the skew part of the block
-        between the stretches, in the axes of the tangent, times a weight [P, D, D]."""
+        """Nonsymmetric part of the derivative of `trial_stress` where the trial flows: the skew part of the block
+        between the stretches, in the axes of the tangent, times a weight [P, D, D].
+        """
         return state.x.new_zeros(state.x.shape[0], *(state.x.shape[1],) * 2)
 
     def energy(self, state: State) -> Tensor:
@@ -119,8 +120,8 @@ class Material(nn.Module):
     def stiffness(self, state: State) -> Tensor:
         """Upper bound of the tangent modulus over all velocity gradients of unit norm [P] [Pa]; limits the step.
 
-        By automatic differentiation of `update` here: D² backward passes, for laws in which each particle's stress
-        follows from its own state. Zero where it is not finite.
+        The base class uses automatic differentiation of `update`: D² backward passes, for laws in which the stress of a
+        particle depends on its own state only. Zero where it is not finite.
         """
         return differentiated_stiffness(self, state)
 
@@ -137,7 +138,7 @@ class Material(nn.Module):
         return None
 
     def invalid(self, state: State) -> Tensor:
-        """Particles where the law has no meaning, bool [P]: not finite, overflowed, or turned inside out (J ≤ 0)."""
+        """Particles without a meaningful state, bool [P]: not finite, overflowed, or inverted (J ≤ 0)."""
         return ~self.energy_density(state).isfinite()
 
 

@@ -36,7 +36,7 @@ class Mixture(Material):
         indices: the particles of each law, int64, for the latest `state.material`.
 
     Raises:
-        TypeError: for what is no law.
+        TypeError: unless every entry is a law.
         ValueError: without laws, or in use without state.material or with an id outside 0 .. len(laws) − 1.
     """
 
@@ -111,7 +111,7 @@ class Mixture(Material):
     def _collect_trial(
         self, state: Any, before: Any, shape: tuple[int, ...], function: Callable[[Any, Any, Any], Tensor]
     ) -> Tensor:
-        """As `_collect`, of each law with its particles in a trial state and before."""
+        """As `_collect`, for each law with its particles in a trial state and before."""
         result = soa_empty(state.x, (len(state.x), *shape)).zero_()
         for part, law in self._parts(state):
             result = result.index_copy(0, part.index, function(law, part, _Part(before, part.index)))
@@ -137,10 +137,10 @@ class Mixture(Material):
         return self._collect(state, viscosity)
 
     def _collect(self, state: State, function: Callable[[Any, Any], Tensor], shape: tuple[int, ...] = ()) -> Tensor:
-        """What a function says of each law and its particles, [P, *shape]."""
+        """Result of a function of each law and its particles, [P, *shape]."""
         material = self.check_material(state)
-        # On a GPU each law looks at all particles: that takes less time than to ask which are its own. Not where there
-        # may be gradients: what a law says of others may be NaN.
+        # On a GPU each law is evaluated for all particles, which takes less time than a selection of its own. This is
+        # not done where there may be gradients: values of a law for other particles may be NaN.
         whole = state.x.is_cuda and not torch.is_grad_enabled()
         parts = [(state, law) for law in self.laws] if whole else self._parts(state)
         result = state.x.new_zeros(len(state.x), *shape)
@@ -153,19 +153,20 @@ class Mixture(Material):
         return result
 
     def only(self, state: Any, laws: Sequence[int]) -> tuple[Material, Any]:
-        """Some of the laws as one, and their particles as a state of their own, whose fields are gathered when they are
-        asked for; differentiable."""
+        """Some of the laws as one, and their particles as a separate state, whose fields are gathered on access;
+        differentiable.
+        """
         part = _Part(state, self.particles_of(state, laws))
         return (self.laws[laws[0]] if len(laws) == 1 else self), part  # type: ignore[return-value]
 
     def particles_of(self, state: Any, laws: Sequence[int]) -> Tensor:
-        """The particles of some of the laws, int64 [Q], in the order of the state."""
+        """Particles of some of the laws, int64 [Q], in the order of the state."""
         indices = self._particles(state)
         found = [indices[k] for k in laws]
         return found[0] if len(found) == 1 else torch.cat(found).sort().values
 
     def check_material(self, state: State) -> Tensor:
-        """The law of each particle; synchronises with the device once per tensor.
+        """Law of each particle; synchronises with the device once per tensor.
 
         Raises:
             ValueError: without state.material, or with an id outside 0 .. len(laws) − 1.
@@ -182,12 +183,12 @@ class Mixture(Material):
         return material
 
     def reordered(self, before: Tensor | None, after: Tensor | None) -> None:
-        """Take a state.material for checked that has the entries of another, in any order, if that one was checked."""
+        """Mark a state.material as checked that has the entries of a checked one, in any order."""
         if after is not None and (_is_still(self._material, before) or _is_still(self._checked, before)):
             self._checked = Remembered(after, after.numel())
 
     def _particles(self, state: Any) -> list[Tensor]:
-        """Those of each law, int64."""
+        """Particles of each law, int64."""
         material = self.check_material(state)
         if not _is_still(self._material, material):
             indices = ((material == k).nonzero().squeeze(1) for k in range(len(self.laws)))
@@ -205,15 +206,15 @@ def _is_still(known: Remembered | None, material: Tensor | None) -> bool:
 
 
 OF_SCENES = ("dt", "time", "impulse")
-"""Fields without a row for each particle."""
+"""Fields without a row per particle."""
 
 
 class _Part:
-    """Some particles of a state: its fields, gathered when they are asked for."""
+    """Some particles of a state; fields are gathered on access."""
 
     def __init__(self, state: State, index: Tensor) -> None:
         self.index = index
-        self.particles = getattr(state, "particles", state.x.shape[0])  # of the whole state, also in a part of a part
+        self.particles = getattr(state, "particles", state.x.shape[0])  # Of the whole state, also in a part of a part.
         self.ids = index if state.ids is None else state.ids.index_select(0, index)
         self._state = state
 

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 __all__ = ["QuarticSand"]
 
 VOLUME, HARDENING = "volume_correction", "hardening"
-"""Keys of `State.extra` under which a law keeps v_c and q [P]."""
+"""Keys of `State.extra` of v_c and q [P]."""
 
 
 class QuarticSand(SolidLaw):
@@ -39,28 +39,29 @@ class QuarticSand(SolidLaw):
         friction_angle: [rad], in [0, π/2); 30° if None.
         energy: "unilateral", "full", "hencky" or "mixed".
         apex: "zero" or, with the unilateral energy, "keep".
-        smallest_strain: strain that the stiffness, and so `Step.stable_dt`, counts on at least. The quartic energies
-            have no stiffness at rest, so that without it the time step of sand at rest would be unlimited.
+        smallest_strain: minimum strain for which the stiffness, and so `Step.stable_dt`, is computed. The quartic
+            energies have no stiffness at rest, so that without it the time step of sand at rest would be unlimited.
         flow: "radial" or "exact". The radial flow mobilises less friction in plane strain: at a friction angle of 30°
-            and ν = 0.3 a Mohr-Coulomb angle of 32° (full), 31° (unilateral) or 29° (mixed), against 44°.
-        cohesion: Hencky strain that the sand bears on every axis, not negative. Beyond it, it flows under the tension
-            of that strain, or tears where there is a volume correction.
-        volume_correction: whether sand that was torn apart remembers the volume that it lost, and has neither stress
-            nor cohesion until that gap is closed (Tampubolon et al. 2017); in state.extra["volume_correction"] [P].
-        hardening: h0, h1, h2, h3 of the friction angle φ = h0 + (h1 q − h3) exp(−h2 q), each like mu, with φ in
-            [0, π/2) and h0, h1, h3 in [rad], in the place of friction_angle; Klár et al. 2016 use 35°, 9°, 0.2, 10°.
-            q is the sum of plastic multipliers, kept in state.extra["hardening"] [P].
+            and ν = 0.3 a Mohr-Coulomb angle of 32° (full), 31° (unilateral) or 29° (mixed), where the exact flow
+            mobilises 44°.
+        cohesion: Hencky strain in extension that the sand bears along every axis, not negative. Beyond it, it flows
+            under the tension of that strain, or tears with a volume correction.
+        volume_correction: whether torn sand stores the lost volume, and has neither stress nor cohesion until that gap
+            is closed (Tampubolon et al. 2017); in state.extra["volume_correction"] [P].
+        hardening: h0, h1, h2, h3 of the friction angle φ = h0 + (h1 q − h3) exp(−h2 q), each like mu, with φ in [0,
+            π/2) and h0, h1, h3 in [rad], instead of friction_angle; Klár et al. 2016 use 35°, 9°, 0.2, 10°. q is the
+            sum of plastic multipliers, stored in state.extra["hardening"] [P].
 
     With `dissipation` set, `update` returns "dissipated", the energy that plastic flow and tearing turn into heat [P]
     [J/m³]; see `ReturnMap`. Hardening stores none.
 
     Raises:
-        ValueError: for a value outside its range or an unknown option. Values are checked here, and not again when a
-            tensor is changed or trained.
+        ValueError: for a value outside its range or an unknown option. Values are checked here only, not when a tensor
+            is changed or trained.
     """
 
     name = "sand_unilateral"
-    friction_angle: Any  # numbers, buffers, nn.Parameters or functions of temperature
+    friction_angle: Any  # Numbers, buffers, nn.Parameters or functions of temperature.
     cohesion: Any
 
     def __init__(
@@ -133,7 +134,7 @@ class QuarticSand(SolidLaw):
         return ("keep_apex",) if self.apex == "keep" else ()
 
     def _friction_angle(self, constants: Sequence[Tensor], state: State) -> Tensor:
-        """As it is given, or [P] after hardening (Klár et al. 2016, equation 29)."""
+        """Unchanged, or [P] after hardening (Klár et al. 2016, equation 29)."""
         if HARDENING not in self.extra_fields:
             return constants[0]
         q = self._hardening(state)
@@ -141,7 +142,7 @@ class QuarticSand(SolidLaw):
         return h0 + (h1 * q - h3) * (-h2 * q).exp()
 
     def _slope(self, angle: Tensor, dim: int) -> Tensor:
-        """α of the friction angle, kept from call to call while that has not changed and requires no gradient."""
+        """α of the friction angle, cached while that has not changed and requires no gradient."""
         if torch.compiler.is_compiling() or angle.requires_grad or HARDENING in self.extra_fields:
             return friction_alpha(angle, dim)
         return self._kept_slope.get((angle, dim), lambda: friction_alpha(angle, dim), angle)

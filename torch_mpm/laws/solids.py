@@ -38,8 +38,8 @@ class NeoHookean(SolidLaw):
         lam: first Lamé parameter [Pa].
 
     Raises:
-        ValueError: for a value outside its range, or another combination of arguments. Values are checked here, and not
-            again when a tensor is changed or trained.
+        ValueError: for a value outside its range, or another combination of arguments. Values are checked here only,
+            not when a tensor is changed or trained.
     """
 
     name = "neo_hookean"
@@ -53,7 +53,7 @@ class FixedCorotated(SolidLaw):
         nu: Poisson's ratio in (−1, 0.5).
         mu, lam: Lamé parameters [Pa].
 
-    A deformation turned inside out (det F ≤ 0) has no stress and is reported, as with every law.
+    An inverted deformation (det F ≤ 0) has no stress and is reported, as with every law.
 
     Raises:
         ValueError: for a value outside its range, or another combination of arguments.
@@ -78,9 +78,9 @@ class Hencky(SolidLaw):
 class VonMises(SolidLaw):
     """J2 plasticity with linear isotropic hardening on Hencky elasticity (Simo 1992): √(3/2) |dev τ| ≤ σ_y + H ε̄.
 
-    State: state.extra["plastic_strain"], the equivalent plastic strain ε̄ (dε̄ = √(2/3) |dh_p|).
-    Dissipated is σ_y dε̄: of the plastic work (σ_y + H ε̄) dε̄ hardening stores ½ H ε̄², which is no part of
-    `energy_density`, the elastic energy.
+    State: state.extra["plastic_strain"], the equivalent plastic strain ε̄ (dε̄ = √(2/3) |dh_p|). Dissipated is σ_y dε̄:
+    of the plastic work (σ_y + H ε̄) dε̄ hardening stores ½ H ε̄², which is not part of `energy_density`, the elastic
+    energy.
 
     Args:
         E, nu or mu, lam: as for `FixedCorotated`.
@@ -152,11 +152,11 @@ class HerschelBulkley(SolidLaw):
 
 
 class Viscoelastic(SolidLaw):
-    """Viscoelastic solid that relaxes: neo-Hookean with a Maxwell branch beside it (Reese and Govindjee 1998).
+    """Viscoelastic solid that relaxes: neo-Hookean with a parallel Maxwell branch (Reese and Govindjee 1998).
 
     ψ = ψ_NH(F) + μ_v |dev h|² with the Hencky strains h of the elastic deformation F_e = F F_v⁻¹ of the branch, which
-    flows by dh/dt = −dev h/T: backward Euler over the time step with the exponential map. Fast loads meet the shear
-    modulus μ + μ_v, slow ones μ. Without a time step (`law.stress(state)` outside of a step) nothing flows.
+    flows by dh/dt = −dev h/T: backward Euler over the time step with the exponential map. The shear modulus is μ + μ_v
+    for fast loads and μ for slow ones. Without a time step (`law.stress(state)` outside of a step) nothing flows.
     State: state.extra["inverse_viscous_deformation"], F_v⁻¹ − 1 [P, D, D].
     Dissipated is τ_v · dh of the flow; `energy_density` counts both springs.
 
@@ -174,7 +174,7 @@ class Viscoelastic(SolidLaw):
     relaxation_time: Any
 
     def _elastic_law(self, state: State, history: Sequence[Tensor]) -> tuple[str, list[Tensor], Sequence[str]]:
-        """That of the solid; the stress of the branch is a deviator in the plane."""
+        """Out-of-plane stress of the solid; the stress of the branch is a deviator in the plane."""
         return "neo_hookean", self._arguments(state)[1][:2], ()
 
     def __init__(
@@ -196,9 +196,8 @@ class Snow(SolidLaw):
     """Snow (Stomakhin et al. 2013): fixed corotated elasticity with stretches clamped to [1 − θ_c, 1 + θ_s].
 
     Plastic compaction hardens it: μ and λ are multiplied by exp(ξ (1 − J_p)).
-    State: state.extra["log_plastic_volume"], ln J_p.
-    Dissipated is the plastic work less what hardening adds to the elastic energy, or zero where that is more: the model
-    is not consistent thermodynamically.
+    State: state.extra["log_plastic_volume"], ln J_p. Dissipated is the plastic work minus the energy that hardening
+    adds to the elastic energy, or zero where that is more: the model is not thermodynamically consistent.
 
     Args:
         E, nu or mu, lam: as for `FixedCorotated`, of fresh snow (1.4e5 Pa and 0.2 in the paper, density 400 kg/m³).
@@ -233,8 +232,9 @@ class Snow(SolidLaw):
         self._add("hardening", hardening)
 
     def _elastic_moduli(self, state: Any, parameters: list[Tensor], history: Sequence[Tensor]) -> list[Tensor]:
-        """μ and λ after hardening, whose factor is the energy that one of μ = 1 and λ = 0 has at the stretches 2, 1, 1:
-        that of the elastic law is 1 there."""
+        """μ and λ after hardening. The hardening factor is the energy with μ = 1 and λ = 0 at the stretches 2, 1, 1,
+        where that of the elastic law is 1.
+        """
         mu, lam, *rest = parameters
         P, D = state.x.shape
         stretches = state.x.new_ones(P, D)

@@ -1,4 +1,4 @@
-"""The stiffness of any law, by automatic differentiation of its stress."""
+"""Stiffness of any law, by automatic differentiation of its stress."""
 
 from __future__ import annotations
 
@@ -18,12 +18,13 @@ if TYPE_CHECKING:
 def differentiated_stiffness(law: Material, state: State) -> Tensor:
     """Upper bound, over velocity gradients G with |G| = 1, of |dτ/dF : G F| and of the second variation of the energy.
 
-    The tangent A = ∂τ/∂G, [D², D²] for each particle, is taken where the law leaves the deformation; the second
+    The tangent A = ∂τ/∂G, [D², D²] for each particle, is evaluated at the deformation after the law; the second
     variation is G : A G − tr(Gᵀ τ Gᵀ). The Schatten norm (Σ σᵢ⁸)^(1/8) of each of these matrices lies between its
     largest singular value and D^(1/4) ≤ 1.32 times that.
 
     Returns:
-        [P] [Pa], constant for autograd. Zero where it is not finite, as stress is that of a particle without meaning.
+        [P] [Pa], constant for autograd. Zero where it is not finite, as is the stress of a particle without a
+        meaningful state.
     """
     fields = [name for name in law.state_fields if name in ("F", "J") and getattr(state, name) is not None]
     with torch.inference_mode(False), torch.no_grad():

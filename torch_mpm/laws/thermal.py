@@ -1,4 +1,4 @@
-"""Materials that know their temperature: melting and freezing, thermal expansion."""
+"""Temperature-dependent materials: melting and freezing, thermal expansion."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ if TYPE_CHECKING:
 __all__ = ["Melting", "ThermalExpansion"]
 
 LIQUID = "liquid"
-"""Key of `State.extra` under which `Heat` keeps the liquid mass fraction [P] of a material that melts."""
+"""Key of `State.extra` of the liquid mass fraction [P], stored by `Heat` for a material that melts."""
 
 
 class ThermalExpansion(Material):
-    """A law in a body that expands isotropically with its temperature: F = F_e (1 + α θ), and the law sees F_e.
+    """Law of a body that expands isotropically with its temperature: F = F_e (1 + α θ), and the law receives F_e.
 
     The energy is that of F_e per rest volume. In 2-D the expansion is in the plane; a body in plane strain that expands
     in three directions has α (1 + ν) here (Timoshenko and Goodier 1970, section 150).
@@ -57,8 +57,9 @@ class ThermalExpansion(Material):
         return fields | expanded, stress
 
     def out_of_plane_stress(self, state: State) -> Tensor:
-        """τ_zz [P] [Pa] of a body that expands in the plane alone; one that expands in three directions, and has
-        α (1 + ν) here, has E α θ less, with its linear expansion α."""
+        """τ_zz [P] [Pa] of a body that expands in the plane only; a body that expands in three directions, and has α (1
+        + ν) here, has E α θ less, with its linear expansion α.
+        """
         return self.law.out_of_plane_stress(self._elastic(state))
 
     def volume_ratio(self, state: State) -> Tensor:
@@ -89,7 +90,7 @@ class ThermalExpansion(Material):
         return Overlay(state, **self._stretched(state, J, F, 0.0))
 
     def _stretched(self, state: State, J: Tensor | None, F: Tensor | None, expand: float) -> dict[str, Tensor]:
-        """J and F, those that are given, with the expansion, or without it where `expand` is zero."""
+        """J and F, where given, with the expansion, or without it where `expand` is zero."""
         given = {name: value for name, value in (("J", J), ("F", F)) if value is not None}
         if not given:
             return {}
@@ -102,16 +103,16 @@ class ThermalExpansion(Material):
 
 
 class Melting(Material):
-    """One law of a material that is solid and liquid: `Heat` tells the liquid fraction f of each particle.
+    """Law of a material that is solid and liquid: `Heat` provides the liquid fraction f of each particle.
 
     The stress is (1 − f) τ_solid(F) + f τ_liquid(J) while the solid is coherent, and τ_liquid from a fraction
-    `coherency` on, where the solid forgets its shear, F ← J^(1/D) 1. What freezes is a solid without shear at the
-    volume that it has. Continuous but for that collapse, which takes (1 − coherency) of the solid's stress.
+    `coherency` on, where the shear of the solid is reset, F ← J^(1/D) 1. Frozen material is a solid without shear at
+    its present volume. Continuous except for that collapse, which removes (1 − coherency) of the solid's stress.
 
     Args:
         solid: law of F, which may be plastic.
         liquid: law of J.
-        coherency: liquid fraction in (0, 1] at which the solid skeleton falls apart.
+        coherency: liquid fraction in (0, 1] at which the solid skeleton disintegrates.
 
     Raises:
         ValueError: for other laws or a coherency outside its range; in use for a state without a liquid fraction.
@@ -180,7 +181,7 @@ class Melting(Material):
         return torch.where(self._flows(state), self.liquid.invalid(part), self.solid.invalid(part))
 
     def _mixed(self, state: State, function: Callable[[Material, Any], Tensor]) -> Tensor:
-        """A scalar of the two laws, mixed as the stress is."""
+        """A scalar of the two laws, blended as the stress is."""
         fraction, flows, part = self._fraction(state), self._flows(state), self._consistent(state)
         solid, liquid = function(self.solid, part), function(self.liquid, part)
         return torch.where(flows, liquid, (1 - fraction) * solid + torch.where(fraction > 0, fraction * liquid, 0))
@@ -193,7 +194,7 @@ class Melting(Material):
         return fraction
 
     def _flows(self, state: State) -> Tensor:
-        """Which particles flow, bool [P]."""
+        """Whether particles flow, bool [P]."""
         return self._fraction(state) >= self.coherency
 
     def _consistent(self, state: State) -> Any:
