@@ -16,6 +16,7 @@ from types import FrameType
 from typing import Any
 
 from . import memory, optional
+from .alarms import alarm
 from .data import commands as data_sets
 from .data import reading_commands as reading
 from .data.commands import set_argument
@@ -28,9 +29,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         The exit status: 0, 1 for a problem (described on stderr), 130 after Ctrl-C, and 143 after SIGTERM; a run, which
         ends with a whole frame, has 130 after both.
     """
-    options = _parser().parse_args(arguments)
     try:
-        with termination_raises(), warnings_in_lines():
+        with signals_raise(), warnings_in_lines():
+            options = _parser().parse_args(arguments)
             options.command(options)
     except Terminated:
         return _told("terminated", 143)
@@ -48,21 +49,38 @@ class Terminated(KeyboardInterrupt):
     """SIGTERM as an exception: incomplete files are removed during unwinding."""
 
 
+AGAIN_SECONDS = 0.01
+"""After which what was raised in vain is raised again."""
+
+
 @contextlib.contextmanager
-def termination_raises() -> Iterator[None]:
-    """SIGTERM raises `Terminated` in the main thread; in other threads it ends the process as by default."""
+def signals_raise() -> Iterator[None]:
+    """SIGTERM raises `Terminated` in the main thread, as SIGINT raises KeyboardInterrupt; elsewhere both end the
+    process as before.
+
+    Python prints and drops what is raised in destructors and in callbacks of weak references. It is raised again then.
+    """
 
     def end(number: int, frame: FrameType | None) -> None:
         raise Terminated
 
+    def raise_again(dropped: sys.UnraisableHookArgs) -> None:
+        if issubclass(dropped.exc_type, KeyboardInterrupt):
+            raise_later(dropped.exc_type, AGAIN_SECONDS)
+        else:
+            hook(dropped)
+
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    previous = signal.signal(signal.SIGTERM, end)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, previous)
+    previous, hook = signal.signal(signal.SIGTERM, end), sys.unraisablehook
+    with alarm() as raise_later:
+        sys.unraisablehook = raise_again
+        try:
+            yield
+        finally:
+            sys.unraisablehook = hook
+            signal.signal(signal.SIGTERM, previous)
 
 
 @contextlib.contextmanager

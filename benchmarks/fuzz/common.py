@@ -7,7 +7,9 @@ Import what the cases need first, then fork: a case then costs milliseconds. The
 from __future__ import annotations
 
 import atexit
+import contextlib
 import ctypes
+import io
 import os
 import resource
 import select
@@ -15,13 +17,16 @@ import shutil
 import signal
 import sys
 import tempfile
+import time
 import traceback
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import torch
+
+from torch_mpm import cli
 
 from .. import common as benchmark
 
@@ -44,21 +49,82 @@ def run(work: Callable[[], int], *, must_fail: bool = False, seconds: float = 60
     With ``must_fail``, exit status 0 is a fault. After ``seconds`` the child is killed. It may allocate ``memory``
     bytes beyond what it starts with.
     """
-    with tempfile.TemporaryFile() as output:
+    with _Child(work, memory) as child:
+        ended = child.wait(seconds)
+        return child.outcome(ended, must_fail)
+
+
+def succeed(*arguments: object) -> None:
+    """Call `torch-mpm` in this process, whose children find imported what it needs.
+
+    Raises:
+        RuntimeError: for another exit status than 0.
+    """
+    printed = io.StringIO()
+    with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed):
+        status = cli.main([str(a) for a in arguments])
+    if status:
+        raise RuntimeError(f"{arguments} ended with exit status {status}: {printed.getvalue()}")
+
+
+def run_and_signal(
+    work: Callable[[], int], number: signal.Signals, delay: float, seconds: float
+) -> tuple[Outcome, float]:
+    """As `run`, with a signal ``delay`` seconds after ``work`` has begun.
+
+    Returns:
+        The outcome, which is "ok" if the signal itself has ended the child, and the time from the signal to the end
+        [s]: 0 for a child that has ended before.
+    """
+    with _Child(work, 4 << 30) as child:
+        child.wait_for_begin()
+        if child.wait(delay):
+            return child.outcome(True), 0.0
+        os.kill(child.pid, number)
+        begin = time.monotonic()
+        ended = child.wait(seconds)
+        late = time.monotonic() - begin
+        outcome = child.outcome(ended)
+    return replace(outcome, kind="ok") if ended and outcome.status == -number else outcome, late
+
+
+class _Child:
+    """A child process that calls ``work`` and ends; a context manager."""
+
+    def __init__(self, work: Callable[[], int], memory: int) -> None:
+        self._output = tempfile.TemporaryFile()
+        self._begun, begins = os.pipe()
         for stream in (sys.stdout, sys.stderr):
             stream.flush()  # or the child prints it again
-        pid = os.fork()
-        if pid == 0:
-            _child(work, output.fileno(), memory)
-        descriptor = os.pidfd_open(pid)
-        ended = bool(select.select([descriptor], [], [], seconds)[0])
-        os.close(descriptor)
+        self.pid = os.fork()
+        if self.pid == 0:
+            _child(work, self._output.fileno(), memory, begins)
+        os.close(begins)
+        self._descriptor = os.pidfd_open(self.pid)
+
+    def __enter__(self) -> _Child:
+        return self
+
+    def __exit__(self, *error: Any) -> None:
+        os.close(self._descriptor)
+        os.close(self._begun)
+        self._output.close()
+
+    def wait_for_begin(self) -> None:
+        os.read(self._begun, 1)
+
+    def wait(self, seconds: float) -> bool:
+        """Whether the child ends within some seconds."""
+        return bool(select.select([self._descriptor], [], [], seconds)[0])
+
+    def outcome(self, ended: bool, must_fail: bool = False) -> Outcome:
+        """How it ended. One that has not is killed."""
         if not ended:
-            os.kill(pid, signal.SIGKILL)
-        status = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
-        output.seek(0)
-        text = output.read().decode(errors="replace")
-    return Outcome(_kind(ended, status, text, must_fail), status, text)
+            os.kill(self.pid, signal.SIGKILL)
+        status = os.waitstatus_to_exitcode(os.waitpid(self.pid, 0)[1])
+        self._output.seek(0)
+        text = self._output.read().decode(errors="replace")
+        return Outcome(_kind(ended, status, text, must_fail), status, text)
 
 
 def _kind(ended: bool, status: int, text: str, must_fail: bool) -> str:
@@ -71,8 +137,13 @@ def _kind(ended: bool, status: int, text: str, must_fail: bool) -> str:
     return "wrong exit status 0" if must_fail and status == 0 else "ok"
 
 
-def _child(work: Callable[[], int], output: int, memory: int) -> None:
-    """Does not return. It ends as any process does: what libraries do at exit belongs to the case."""
+def _child(work: Callable[[], int], output: int, memory: int, begins: int) -> None:
+    """Does not return. It ends as any process does: what libraries do at exit belongs to the case.
+
+    Args:
+        output: file for all that it prints.
+        begins: pipe that it writes to when the work begins.
+    """
     status = 1
     try:
         os.dup2(output, 1)
@@ -80,7 +151,9 @@ def _child(work: Callable[[], int], output: int, memory: int) -> None:
         size = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
         resource.setrlimit(resource.RLIMIT_AS, (size + memory, size + memory))
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+        os.write(begins, b"1")
         status = work()
+        signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, signal.SIGTERM))  # the case is over
     except SystemExit as end:
         status = end.code if isinstance(end.code, int) else 1
     except BaseException:
@@ -105,6 +178,7 @@ def report(
     title: str,
     name: str,
     out: Path,
+    figures: Sequence[str] = (),
 ) -> bool:
     """Run the parts of a program in a temporary folder, print their table and write it as a result.
 
@@ -114,6 +188,7 @@ def report(
         seed: of the cases.
         columns: kinds of faults.
         title, name: of the result, and of its file in the folder `out`.
+        figures: further columns, which are no faults.
 
     Returns:
         Whether there is a fault.
@@ -124,7 +199,7 @@ def report(
         rows = fuzz(folder, counts, seed)
     finally:
         shutil.rmtree(folder, ignore_errors=True)
-    names = ("part", "cases", *columns, "seconds")
+    names = ("part", "cases", *columns, *figures, "seconds")
     table = benchmark.table(names, [[row[name] for name in names] for row in rows])
     print(table)
     result = {"environment": benchmark.environment(), "seed": seed, "rows": rows}

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import io
 import json
 import os
 import random
@@ -35,6 +34,8 @@ from . import command_lines, common, forged_shards, hostile_inputs, mutated_reco
 COLUMNS = ("crash", "traceback", "wrong exit status 0", "time limit", "unclear message", "written outside")
 MOST_LETTERS, MOST_LINES = 24_000, 60
 """Of a message: more is not read."""
+MANY_SUBSTEPS = 10**6
+"""Of a run that takes longer than the time limit, as it should."""
 UNCLEAR = re.compile(r"^torch-mpm: ?(['\"]?[\w.]*['\"]?)?$|Error\b.*object at 0x", re.MULTILINE)
 """Messages that say nothing: none at all, or a single word."""
 SCENE = """
@@ -114,20 +115,12 @@ class Fuzz:
         (self.good / "scene.toml").write_text(SCENE)
         (self.good / "solid.toml").write_text(SOLID)
         (self.good / "set.toml").write_text(SET)
-        self._succeed("run", self.good / "scene.toml", "-o", self.good / "run", "--quiet")
-        self._succeed("generate", self.good / "set.toml", "-o", self.good / "set", "--quiet")
-        self._succeed("finalize", self.good / "set")
+        common.succeed("run", self.good / "scene.toml", "-o", self.good / "run", "--quiet")
+        common.succeed("generate", self.good / "set.toml", "-o", self.good / "set", "--quiet")
+        common.succeed("finalize", self.good / "set")
         hostile_inputs.prepare(self.good)
         self._warm()
         self.around = self._outside()
-
-    def _succeed(self, *arguments: object) -> None:
-        """In this process, so that the children find everything imported."""
-        printed = io.StringIO()
-        with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed):
-            status = cli.main([str(a) for a in arguments])
-        if status:
-            raise RuntimeError(f"{arguments} ended with exit status {status}: {printed.getvalue()}")
 
     def _warm(self) -> None:
         """Import what the commands need: a child would do so in each case."""
@@ -137,7 +130,7 @@ class Fuzz:
             ["render", self.good / "set", "-o", made / "pictures", "--no-video"],
             *(["export", self.good / "set", "-o", made / name, "--format", name] for name in command_lines.FORMATS[:4]),
         ):
-            self._succeed(*arguments)
+            common.succeed(*arguments)
         shutil.rmtree(made)
 
     def _outside(self) -> dict[str, tuple[int, int]]:
@@ -163,7 +156,7 @@ class Fuzz:
             return cli.main(words)
 
         outcome = common.run(work, must_fail=must_fail, **{"seconds": 60.0, **limits})
-        found = [] if outcome.kind == "ok" else [outcome.kind]
+        found = [] if outcome.kind == "ok" or self._is_long(outcome, words) else [outcome.kind]
         if outcome.kind == "ok" and outcome.status == 0:
             found += self._false_success(words)
         elif outcome.kind == "ok":
@@ -176,6 +169,15 @@ class Fuzz:
         if found:
             print(f"{[w if len(w) < 100 else w[:100] + '...' for w in words]}: {outcome.text[-3000:]!s}", flush=True)
         yield from found
+
+    def _is_long(self, outcome: common.Outcome, words: list[str]) -> bool:
+        """Whether a run was ended for having more substeps than the time allows, which `check` counts for it."""
+        if outcome.kind != "time limit" or words[0] != "run":
+            return False
+        sets = [word for k, word in enumerate(words) if "--set" in words[max(0, k - 1) : k + 1]]
+        check = common.run(lambda: cli.main(["check", words[1], *sets]))
+        count = re.search(r"about (\S+) substeps", check.text)
+        return count is not None and float(count[1]) > MANY_SUBSTEPS
 
     def _false_success(self, words: list[str]) -> Iterator[str]:
         """Exit status 0 of a command whose result is not there, or is none."""

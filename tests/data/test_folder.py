@@ -129,6 +129,7 @@ CHANGES = [
     {"upper": [0.0, 2.0]},
     {"splits": {"train": [0, 10**12]}},
     {"scenes_per_shard": 10**12},
+    {"title": "\udcff"},
 ]
 
 
@@ -138,6 +139,18 @@ def test_a_damaged_record(tmp_path, change):
     datasets.forge(path / "dataset.json", lambda words: words.update(change))
     with pytest.raises(DamagedFileError):
         DatasetFolder(path)
+
+
+def test_sums_of_another_number_of_dimensions(tmp_path):
+    path = datasets.make_dataset(tmp_path / "set")
+
+    def change(words):
+        for sums in words["scenes"][1]["motion"].values():
+            sums.update(sum=[0.0] * 3, squares=[0.0] * 3)
+
+    datasets.forge(record_path(shard_path(path, 0)), change)
+    with pytest.raises(DamagedFileError, match=r"shard_00000\.json: has sums of another number of dimensions than 2"):
+        DatasetFolder(path).motion()
 
 
 @pytest.mark.parametrize("name", ["../out", "/tmp/out", "a/b", "..", "", "a\0", "train\n", "..\\out"])

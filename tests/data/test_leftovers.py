@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import threading
+import weakref
 
 import pytest
 
@@ -87,6 +88,24 @@ def test_termination_is_an_exception_of_commands(tmp_path, monkeypatch, capsys):
     assert main(["export", str(path), "--format", "gns"]) == 143
     assert "terminated" in capsys.readouterr().err and len(written[0]) == 1
     assert not (path / "gns").exists() and not list(path.glob(".*")) and signal.getsignal(signal.SIGTERM) is before
+
+
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_signals_that_python_drops_come_again(monkeypatch, capfd, number, status):
+    """As in callbacks of weak references, whose exceptions are printed alone."""
+
+    class Target:
+        pass
+
+    def command(options):
+        target = Target()
+        reference = weakref.ref(target, lambda _: signal.raise_signal(number))
+        del target
+        threading.Event().wait(20.0)
+        assert reference is None, "the signal was lost"
+
+    monkeypatch.setattr("torch_mpm.cli._schema", command)
+    assert main(["schema"]) == status and "Traceback" not in capfd.readouterr().err
 
 
 def test_commands_in_threads_leave_signals_alone(tmp_path):

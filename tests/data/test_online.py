@@ -2,6 +2,7 @@
 
 import itertools
 import threading
+import time
 
 import pytest
 import small_dataset as datasets
@@ -89,6 +90,25 @@ def test_the_next_round_is_simulated_while_this_one_is_trained_on():
     next(batches)
     assert second.wait(20)  # though the first round is not done with
     batches.close()
+
+
+def test_who_leaves_does_not_wait_for_the_next_round():
+    second, ended = threading.Event(), []
+
+    def simulate(ids):
+        if ids[0] == 3:
+            second.set()
+            end = time.monotonic() + 20
+            while time.monotonic() < end:
+                pass
+            ended.append(ids)
+        return numbers(ids)
+
+    batches = iter(stream(simulate=simulate))
+    next(batches)
+    second.wait()
+    batches.close()
+    assert not ended
 
 
 def test_what_goes_wrong_in_the_simulation_is_raised():

@@ -358,6 +358,8 @@ def test_a_file_is_blamed_only_where_it_has_changed(written, monkeypatch):
     [
         lambda scene: scene["motion"]["velocity"]["sum"].pop(),
         lambda scene: scene["motion"]["velocity"].update(sum=[0.0, "x"]),
+        lambda scene: scene["motion"]["velocity"]["squares"].append(1.0),
+        lambda scene: scene["motion"]["acceleration"].update(sum=[0.0] * 3, squares=[0.0] * 3),
         lambda scene: scene["motion"]["acceleration"].update(count=10**400),
         lambda scene: scene.update(particles=-1),
         lambda scene: scene.update(id=1.5),

@@ -438,6 +438,20 @@ def test_failed_video_leaves_the_old_one_whole(tmp_path):
     assert path.read_bytes() == b"old" and [p.name for p in tmp_path.iterdir()] == ["out.mp4"]
 
 
+def test_a_video_that_is_interrupted_at_its_end_leaves_nothing(tmp_path, monkeypatch):
+    waited = []
+
+    def interrupted(process, timeout=None):
+        waited.append(process)
+        monkeypatch.undo()
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt), render.VideoWriter(tmp_path / "out.mp4", 10) as video:
+        video.append(np.zeros((32, 32, 3), np.uint8))
+        monkeypatch.setattr(subprocess.Popen, "wait", interrupted)
+    assert list(tmp_path.iterdir()) == [] and waited[0].poll() is not None
+
+
 def test_killed_video_has_no_file_under_its_name(tmp_path):
     code = (
         "import os, signal, sys, numpy as np\n"

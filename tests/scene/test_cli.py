@@ -63,8 +63,27 @@ def test_pictures_and_video(scene, tmp_path, capsys):
     told = [line.split() for line in capsys.readouterr().out.splitlines()]
     for name, place in {"trajectory": "trajectory.h5", "pictures": "frames", "video": "video.mp4"}.items():
         assert [name, str(tmp_path / "out" / place)] in told
+    before = [path.read_bytes() for path in pictures]
     assert main(["render", str(tmp_path / "out"), "--set", "render.color_by=material"]) == 0
     assert capsys.readouterr().out.strip().endswith("video.mp4")
+    assert not any(path.read_bytes() == old for path, old in zip(pictures, before, strict=True))
+
+
+def test_pictures_of_a_drawing_that_was_killed_are_those_of_one_that_was_not(tmp_path):
+    """Particles are as large in a picture, whichever is drawn first; here their spacing changes with time."""
+    for package in ("matplotlib", "PIL", "imageio_ffmpeg"):
+        pytest.importorskip(package)
+    jet = "[[emitter]]\ncenter = [0.7, 0.8]\nradius = 0.06\nvelocity = [-1.0, 0.0]\nmaterial = 'jelly'\n"
+    path, out = tmp_path / "scene.toml", tmp_path / "out"
+    path.write_text(FILE.format(duration=0.04) + jet + "[render]\nresolution = [320, 240]\n")
+    assert main(["run", str(path), "-o", str(out), "--quiet"]) == 0
+    pictures = sorted((out / "frames").glob("*.png"))
+    before = {path.name: path.read_bytes() for path in pictures}
+    times = pictures[0].stat().st_mtime_ns
+    for picture in pictures[1:]:
+        picture.unlink()
+    assert main(["render", str(out)]) == 0
+    assert {path.name: path.read_bytes() for path in pictures} == before and pictures[0].stat().st_mtime_ns == times
 
 
 def test_a_complete_run_is_resumed(scene, tmp_path, capsys):

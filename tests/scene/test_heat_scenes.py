@@ -1,6 +1,7 @@
 """Scene files with heat: what they say, what comes out, and what they may not say."""
 
 import math
+import signal
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,6 @@ pytest.importorskip("h5py")
 
 from torch_mpm import Trajectory
 from torch_mpm.scene import Scene
-from torch_mpm.scene import run as module
 from torch_mpm.scene.explain import SceneError
 from torch_mpm.scene.run import Interrupted
 
@@ -84,18 +84,16 @@ def test_two_materials_and_a_batch(tmp_path):
     np.testing.assert_allclose(data["temperature"][-1][~of_inert], 310.0, atol=1e-2)
 
 
-def test_resumed_run_is_the_same(tmp_path, monkeypatch):
+def test_resumed_run_is_the_same(tmp_path):
     """Temperature, its gradient and the liquid fraction go through the checkpoint."""
     _, expected = simulate(tmp_path / "whole", wax())
-    check = module.Simulation._check_stop
 
-    def stop(self, asked):
-        check(self, lambda: self.frame == 2)
+    def interrupt(figures):
+        if figures["frame"] == 2:
+            signal.raise_signal(signal.SIGINT)
 
-    monkeypatch.setattr(module.Simulation, "_check_stop", stop)
     with pytest.raises(Interrupted):
-        Scene(**wax()).run(tmp_path / "cut")
-    monkeypatch.undo()
+        Scene(**wax()).run(tmp_path / "cut", progress=interrupt)
     _, resumed = simulate(tmp_path / "cut", wax(), resume=True)
     for name in ("temperature", "liquid", "position"):
         np.testing.assert_array_equal(resumed[name], expected[name])

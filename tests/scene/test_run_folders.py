@@ -16,7 +16,9 @@ import h5py
 
 from torch_mpm import Trajectory
 from torch_mpm.cli import main
+from torch_mpm.data.whole_files import write_record
 from torch_mpm.scene import Scene, checkpoint
+from torch_mpm.scene.folder import read_run
 from torch_mpm.scene.run import Interrupted
 
 FILES = ("run.json", "checkpoint.h5", "trajectory.partial.h5")
@@ -232,6 +234,24 @@ def test_a_forged_checkpoint_is_refused(scene, unfinished, capsys, change, messa
 def test_a_forged_trajectory_is_refused(scene, unfinished, capsys, change, message):
     forge(unfinished / "trajectory.partial.h5", change)
     assert message in told(capsys, "run", scene, "-o", unfinished, "--resume", "--quiet")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"scene": 3}, "has scene = 3"),
+        ({"folder": {}}, "has folder = {}"),
+        ({"fingerprint": 1.5}, "has fingerprint = 1.5"),
+        ({"summary": []}, "has summary = []"),
+        ({"summary": {}}, "has a summary that is none"),
+        ({"summary": {"frames": "x"}}, "has a summary that is none"),
+    ],
+)
+@pytest.mark.parametrize("name", ["render", "run"])
+def test_a_forged_record_is_refused(scene, unfinished, capsys, name, change, message):
+    write_record(unfinished / "run.json", {**read_run(unfinished), **change})
+    words = {"render": ["render", unfinished], "run": ["run", scene, "-o", unfinished, "--resume", "--quiet"]}
+    assert message in told(capsys, *words[name])
 
 
 # ---- one process in a folder

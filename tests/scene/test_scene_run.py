@@ -17,6 +17,8 @@ from helpers import FILE, command, disc
 pytest.importorskip("pydantic")
 pytest.importorskip("h5py")
 
+import h5py
+
 from torch_mpm import SimulationError, State, Trajectory
 from torch_mpm.scene import Scene, folder, heap, writer
 from torch_mpm.scene import run as module
@@ -227,6 +229,46 @@ def test_a_stop_signal_ends_after_a_whole_frame_and_resumes_bit_for_bit(tmp_path
             np.testing.assert_array_equal(read[name], whole[name])
     assert summary["substeps"] == whole["substeps"].sum()
     assert not list((tmp_path / "out").glob("*.building")) and not (tmp_path / "out" / "checkpoint.h5").exists()
+
+
+def test_a_stop_signal_ends_a_frame_that_takes_long(tmp_path):
+    scene = Scene(**disc(device="cpu", duration=1e4, fps=1e-3))
+    before = signal.signal(signal.SIGVTALRM, lambda *_: signal.raise_signal(signal.SIGTERM))
+    signal.setitimer(signal.ITIMER_VIRTUAL, 0.2)
+    try:
+        with pytest.raises(Interrupted, match="stopped after frame 0 of 10; add --resume"):
+            scene.run(tmp_path / "out")
+    finally:
+        signal.setitimer(signal.ITIMER_VIRTUAL, 0.0)
+        signal.signal(signal.SIGVTALRM, before)
+    _, record = load(tmp_path / "out" / "checkpoint.h5")
+    assert record["frame"] == 0
+
+
+def test_a_signal_after_the_last_frame_is_passed_on(tmp_path):
+    """To what comes after the run, such as drawing it."""
+    scene, came = Scene(**disc(device="cpu")), []
+
+    def interrupt(figures):
+        if figures["frame"] == figures["frames"]:
+            signal.raise_signal(signal.SIGTERM)
+
+    before = signal.signal(signal.SIGTERM, lambda number, _: came.append(number))
+    try:
+        scene.run(tmp_path / "out", progress=interrupt)
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    assert came == [signal.SIGTERM] and (tmp_path / "out" / "trajectory.h5").exists()
+
+
+def test_equal_runs_have_equal_files(tmp_path):
+    """HDF5 would store times, of one second each."""
+    for name in ("one", "other"):
+        Scene(**disc(device="cpu", duration=0.02)).run(tmp_path / name)
+    one, other = (tmp_path / name / "trajectory.h5" for name in ("one", "other"))
+    assert one.read_bytes() == other.read_bytes()
+    with h5py.File(one) as file:
+        assert not any(data.id.get_create_plist().get_obj_track_times() for data in file.values())
 
 
 def killed_and_resumed(tmp_path, kills, duration, delay):

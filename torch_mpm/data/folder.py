@@ -175,6 +175,8 @@ class DatasetRecord:
             for name in ("lower", "upper"):
                 words[name] = tuple(map(float, words[name]))
             words["fields"] = tuple(map(str, words["fields"]))
+            words["title"] = str(words.get("title", ""))
+            words["title"].encode()  # no lone surrogates, which no file can hold
             words["splits"] = {str(n): (count(first), count(of)) for n, (first, of) in words["splits"].items()}
             words["added"] = tuple((str(n), count(first), count(of)) for n, first, of in words.get("added", ()))
             record = cls(**words)
@@ -224,7 +226,11 @@ class DatasetFolder:
         self._cache = _OpenFiles()
 
     def _record(self, shard: int) -> ShardRecord:
-        return ShardRecord.read(record_path(self._shard_path(shard)))
+        path = record_path(self._shard_path(shard))
+        record = ShardRecord.read(path)
+        if any(len(s.motion.velocity.sum) != self.record.dim for s in record.scenes if s.motion):
+            raise DamagedFileError(path, f"has sums of another number of dimensions than {self.record.dim}", REMEDY)
+        return record
 
     def _shard_path(self, shard: int) -> Path:
         """The file of a shard, which like its record must be in this folder."""

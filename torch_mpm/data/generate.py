@@ -11,7 +11,7 @@ import json
 import os
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -32,10 +32,13 @@ from .sampling import NoRoom, content
 from .shard import shard_path
 from .shard_simulation import Drawn, Outcome, draw, simulate
 from .shard_writer import Attributes, ShardWriter
+from .stoppable import StoppableExecutor
 from .workers import take_device, worker
 
 MOST_PACKERS = 6
 """Threads that compress: enough for one GPU, and more take Python's lock from the one that simulates."""
+WRITING_SECONDS = 0.7
+"""Time that a shard has to be written where generation ends early; it is simulated again then."""
 Progress = Callable[[dict[str, Any]], None]
 
 
@@ -151,31 +154,42 @@ class _Line:
         self.configuration, self.claim, self.device, self.progress = configuration, claim, device, progress
         self.totals: dict[str, Any] = {"scenes": 0, "failed": 0, "simulating": 0.0, "waiting": 0.0}
         self._stream = torch.cuda.Stream(device) if device.type == "cuda" else None
+        self._written: Future[None] | None = None
         self._missing = claim.record.scenes - claim.finished_scenes()
 
     def run(self, check: bool) -> None:
         """All shards that nobody else takes."""
         with ExitStack() as stack:
-            self._drawer, self._writer = (stack.enter_context(ThreadPoolExecutor(1)) for _ in range(2))
+            self._drawer, self._writer = (
+                stack.enter_context(StoppableExecutor()),
+                stack.enter_context(ThreadPoolExecutor(1)),
+            )
             self._packers = stack.enter_context(ThreadPoolExecutor(min(len(os.sched_getaffinity(0)), MOST_PACKERS)))
+            stack.callback(self._stop)
             beside = None if self.device.type == "cpu" else self._packers  # a CPU simulates with all its cores
             shards = self.claim.unfinished(check)
             coming: tuple[int, Future[Drawn]] | None = self._next(shards)
-            written: Future[None] | None = None
             while coming is not None:
                 shard, drawn = coming[0], self._wait(coming[1])
                 coming = self._next(shards)
                 begin = time.perf_counter()
                 simulate(self.configuration, drawn, self.device, self._tell, beside)
                 self.totals["simulating"] += time.perf_counter() - begin
-                if written is not None:
-                    self._wait(written)
+                if self._written is not None:
+                    self._wait(self._written)
                 self.totals["scenes"] += len(drawn.outcomes)
                 self.totals["failed"] += sum(bool(o.failure) for o in drawn.outcomes)
-                written = self._writer.submit(self._write, shard, drawn.outcomes)
+                self._written = self._writer.submit(self._write, shard, drawn.outcomes)
                 del drawn
-            if written is not None:
-                self._wait(written)
+            if self._written is not None:
+                self._wait(self._written)
+
+    def _stop(self) -> None:
+        """End what is at work: after an error or a signal nobody needs it. A shard is kept if it is written soon."""
+        self._drawer.stop()
+        if self._written is not None:
+            wait([self._written], WRITING_SECONDS)
+        self._packers.shutdown(wait=False, cancel_futures=True)
 
     def _wait(self, future: Future[Any]) -> Any:
         begin = time.perf_counter()

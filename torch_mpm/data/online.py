@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,6 +14,7 @@ from torch import Tensor
 from torch.utils.data import IterableDataset, get_worker_info
 
 from ..errors import SimulationError, check_count
+from .stoppable import StoppableExecutor
 from .windows import Collate, Item, pack, rank_and_world
 
 Simulated = dict[str, Tensor]
@@ -92,7 +93,7 @@ class OnlineStream(IterableDataset[Item]):
             raise RuntimeError("OnlineStream must be used without workers of a data loader; it has a thread of its own")
         failed = 0
         stream = torch.cuda.Stream(self.device) if self.device.type == "cuda" else None
-        with ThreadPoolExecutor(1, "torch_mpm online") as pool:
+        with StoppableExecutor("torch_mpm online") as pool:
             rounds: deque[Future[_Round]] = deque()
             try:
                 while True:
@@ -109,7 +110,7 @@ class OnlineStream(IterableDataset[Item]):
                         yield from self._batches(made.arrived(), places)
                     self.round, self.taken = self.round + 1, 0
             finally:
-                pool.shutdown(cancel_futures=True)
+                pool.stop()
 
     def state_dict(self) -> dict[str, int]:
         """Where this stream stands; the round is simulated again after `load_state_dict`."""

@@ -127,7 +127,10 @@ def _motion(words: dict[str, Any] | None) -> Motion | None:
     if words is None:
         return None
     sums = {n: Sums(count(s["count"]), _numbers(s["sum"]), _numbers(s["squares"])) for n, s in words.items()}
-    return Motion(**sums)
+    motion = Motion(**sums)
+    if len(lengths := {len(v) for s in sums.values() for v in (s.sum, s.squares)}) != 1:
+        raise ValueError(f"sums must have one number of dimensions, got {sorted(lengths)}")
+    return motion
 
 
 def _numbers(values: Any) -> tuple[float, ...]:

@@ -138,6 +138,7 @@ def _reserve(h5py: Any, out: Any, name: str, shape: tuple[int, ...], dtype: str)
     properties.set_layout(h5py.h5d.CONTIGUOUS)
     properties.set_alloc_time(h5py.h5d.ALLOC_TIME_EARLY)
     properties.set_fill_time(h5py.h5d.FILL_TIME_NEVER)
+    properties.set_obj_track_times(False)  # equal runs write equal files
     space = h5py.h5s.create_simple(shape)
     h5py.h5d.create(out.id, name.encode(), h5py.h5t.py_create(np.dtype(dtype)), space, properties)
 

@@ -14,6 +14,9 @@ from ..data.whole_files import building_path
 from .requires import require
 from .shapes import Array
 
+NOTE = "torch_mpm"
+"""Key of the note in a file."""
+
 
 @contextmanager
 def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
@@ -35,17 +38,30 @@ def check_image(name: str, image: Array) -> Array:
     return image
 
 
-def write_png(path: str | os.PathLike[str], image: Array, width: int | None = None) -> None:
+def write_png(path: str | os.PathLike[str], image: Array, width: int | None = None, note: str = "") -> None:
     """Write `image` uint8 [H, W, 3] to `path`; a killed process leaves no part of it there.
 
-    `width` scales the picture to that many pixels and compresses harder: for a README, where size matters.
+    `width` scales the picture to that many pixels and compresses harder: for a README, where size matters. `note` is
+    kept in the file, for `note_of`.
     """
     pil = require("PIL.Image")
     picture = pil.fromarray(check_image("image", image))
     if width is not None:
         picture = picture.resize((width, round(picture.height * width / picture.width)), pil.Resampling.LANCZOS)
     with replacing(path) as temporary:
-        picture.save(temporary, compress_level=4 if width is None else 9)
+        notes = require("PIL.PngImagePlugin").PngInfo()
+        if note:
+            notes.add_text(NOTE, note)
+        picture.save(temporary, compress_level=4 if width is None else 9, pnginfo=notes)
+
+
+def note_of(path: str | os.PathLike[str]) -> str:
+    """The note that `write_png` has kept in a file; "" for none, and where there is no picture."""
+    try:
+        with require("PIL.Image").open(path) as picture:
+            return str(picture.info.get(NOTE, ""))
+    except Exception:  # whatever is wrong with the file
+        return ""
 
 
 def read_png(path: str | os.PathLike[str]) -> Array:

@@ -36,7 +36,8 @@ class Renderer:
         cmap: a matplotlib colour map name; None takes the quantity's own.
         unit: unit shown on the scale; None takes the quantity's own.
         gravity: [D] vector; its opposite is up. Default: up is y.
-        radius: particle radius [m]; None takes 0.6 (0.75 in 2-D) of the spacing of the first frame's particles.
+        radius: particle radius [m]; None takes 0.6 (0.75 in 2-D) of the spacing of the first frame's particles, or of
+            those that `fit_radius` is given.
         style: "particles" (spheres, discs in 2-D) or "surface" (3-D only: a smooth skin around the particles).
         materials: names of materials 0, 1, ... for the legend of color_by="material".
         azimuth, elevation: direction of the camera in degrees (3-D), around and above the horizontal plane.
@@ -137,7 +138,8 @@ class Renderer:
         if not finite.all():
             log.warning("%d of %d particles have no finite position and are not drawn", int((~finite).sum()), len(x))
         x, rgb = x[finite].astype(np.float64), rgb[finite]
-        radius = self._radius(x)
+        self.fit_radius(x)
+        radius = self.radius or 0.0
         stamp = "" if time is None else f"t = {time:.3f} s"
         if isinstance(self.scene, Scene2D):
             if limits is not None:
@@ -145,6 +147,13 @@ class Renderer:
             return self.scene.draw(x, rgb, radius, obstacles, overlays, self.names, title, stamp)
         image = self.scene.draw(x, rgb, radius, self.style, obstacles)
         return self._annotate(image, overlays, limits, title, stamp)
+
+    def fit_radius(self, x: Array) -> None:
+        """Choose the radius from particles [P, D], where it is neither given nor chosen yet; `frame` does so, too."""
+        x = x[np.isfinite(x).all(axis=1)]
+        if self.radius is None and len(x):
+            extent = float(np.max(self.bounds[1] - self.bounds[0]))
+            self.radius = (0.6 if self.dim == 3 else 0.75) * rest_spacing(x) or 0.02 * extent
 
     def project(self, points: npt.ArrayLike) -> Array:
         """Pixel coordinates (column, row) [N, 2] at which points [N, D] in metres appear."""
@@ -173,12 +182,6 @@ class Renderer:
             return palette_colors(values, PALETTES[self.color_by]), None
         limits = self.limits or value_range(values, self.quantity.from_zero)
         return map_colors(values, limits, self.cmap), limits
-
-    def _radius(self, x: Array) -> float:
-        if self.radius is None and len(x):
-            extent = float(np.max(self.bounds[1] - self.bounds[0]))
-            self.radius = (0.6 if self.dim == 3 else 0.75) * rest_spacing(x) or 0.02 * extent
-        return self.radius or 0.0
 
     def _annotate(
         self, image: Array, overlays: Sequence[Overlay], limits: tuple[float, float] | None, title: str, stamp: str

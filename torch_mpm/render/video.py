@@ -42,10 +42,14 @@ class VideoWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if kind is None:
-            self.close()
-        else:
+        if kind is not None:
             self._abandon(kind, error, trace)
+            return
+        try:
+            self.close()
+        except BaseException as interrupted:
+            self._abandon(type(interrupted), interrupted, None)
+            raise
 
     def append(self, frame: Array) -> None:
         """Add one frame, uint8 [H, W, 3]."""

@@ -6,6 +6,7 @@ import contextlib
 import errno
 import fcntl
 import json
+import math
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -20,6 +21,10 @@ from ..memory import in_words
 from .scene import Scene
 
 RUN, CHECKPOINT, LAST_GOOD, LOCK = "run.json", "checkpoint.h5", "last_good.h5", "run.lock"
+SUMMARY = "summary"
+KINDS = {"fingerprint": str, "scene": dict, "folder": str, SUMMARY: dict}
+"""Types of what a record of a run has; of the summary at its end alone."""
+SUMMARY_NUMBERS = ("frames", "particles", "substeps", "mass_drift", "largest_cfl", "particles_lost")
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 REMEDY = "choose another folder, or remove this one"
 
@@ -67,7 +72,7 @@ def finished(folder: Path, fingerprint: str) -> dict[str, Any] | None:
     if not (folder / RUN).is_file() or not (folder / COMPLETE).exists():
         return None
     record = read_run(folder)
-    return record.get("summary", {}) if record["fingerprint"] == fingerprint else None
+    return record.get(SUMMARY, {}) if record["fingerprint"] == fingerprint else None
 
 
 @contextlib.contextmanager
@@ -145,10 +150,24 @@ def read_run(folder: Path) -> dict[str, Any]:
     if not isinstance(values, dict):
         raise DamagedFileError(path, "is no record of a run", REMEDY)
     check_record(values, path, REMEDY)
-    missing = [name for name in ("fingerprint", "scene", "folder") if name not in values]
-    if missing:
+    if missing := [name for name in KINDS if name not in values and name != SUMMARY]:
         raise DamagedFileError(path, f"lacks {', '.join(missing)}", REMEDY)
+    if wrong := [name for name, kind in KINDS.items() if name in values and not isinstance(values[name], kind)]:
+        raise DamagedFileError(path, f"has {wrong[0]} = {values[wrong[0]]!r:.100}", REMEDY)
+    if SUMMARY in values and not _is_summary(values[SUMMARY]):
+        raise DamagedFileError(path, f"has a {SUMMARY} that is none", REMEDY)
     return values
+
+
+def _is_summary(words: dict[str, Any]) -> bool:
+    """Whether the numbers of a summary are there and are numbers; times alone where a kill has taken the rest."""
+    seconds, energy = words.get("seconds"), words.get("energy", {})
+    if not (isinstance(seconds, dict) and isinstance(energy, dict)):
+        return False
+    numbers = list(seconds.values())
+    if words.keys() != {"seconds"}:
+        numbers += [words.get(name) for name in SUMMARY_NUMBERS] + [energy.get(name) for name in ("first", "last")]
+    return all(isinstance(n, (int, float)) and math.isfinite(n) for n in numbers)
 
 
 def record_summary(folder: Path, summary: dict[str, Any]) -> None:
@@ -158,7 +177,7 @@ def record_summary(folder: Path, summary: dict[str, Any]) -> None:
         OutputError: when the disk is full.
     """
     with output_errors(folder):
-        write_record(folder / RUN, {**read_run(folder), "summary": summary})
+        write_record(folder / RUN, {**read_run(folder), SUMMARY: summary})
 
 
 def load_run(folder: str | Path, overrides: list[str] | None = None) -> Scene:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections.abc import Iterator
 from dataclasses import replace
@@ -27,7 +28,8 @@ SAMPLES = 8
 def draw(folder: str | Path, scene: Scene, progress: Any = None) -> list[Path]:
     """Draw the trajectory in ``folder`` as ``scene.render`` says: frames/00000.png, ..., and video.mp4.
 
-    Pictures that exist already are kept. Returns the files made; calls ``progress(frame, frames)`` after each picture.
+    Pictures that were drawn in the same way before are kept. Returns the files made; calls ``progress(frame, frames)``
+    after each picture.
 
     Raises:
         FileNotFoundError: when there is no trajectory, or no frame in it yet.
@@ -36,6 +38,7 @@ def draw(folder: str | Path, scene: Scene, progress: Any = None) -> list[Path]:
         ImportError: when a package of the extra ``render`` is missing.
     """
     from ..render import assemble_video, write_png
+    from ..render.images import note_of
 
     words = scene.render or schema.Render()
     target = Path(folder) / FOLDER
@@ -52,8 +55,8 @@ def draw(folder: str | Path, scene: Scene, progress: Any = None) -> list[Path]:
         paths = [target / f"{k:05d}.png" for k in numbers]
         artist = _Artist(scene, words, trajectory)
         for k, path in zip(numbers, paths, strict=True):
-            if not path.exists():
-                write_png(path, artist.picture(trajectory.frame(k)))
+            if note_of(path) != artist.way:
+                write_png(path, artist.picture(trajectory.frame(k)), note=artist.way)
             if progress is not None:
                 progress(k, len(trajectory))
         artist.close()
@@ -115,6 +118,26 @@ class _Artist:
             )
             for entry in self.entries
         ]
+        self._fit_radii(trajectory)
+        drawn = scene.model_dump_json(), limits, [renderer.radius for renderer in self.renderers]
+        self.way = hashlib.sha256(repr(drawn).encode()).hexdigest()
+        """Hash of everything that decides how a frame is drawn."""
+
+    def _fit_radii(self, trajectory: Trajectory) -> None:
+        """Radii from the first frame with particles, whichever picture is drawn first."""
+        missing = dict(enumerate(self.renderers))
+        for frame in trajectory:
+            for k, renderer in list(missing.items()):
+                x = self._positions(k, frame)
+                renderer.fit_radius(x)
+                if len(x):
+                    del missing[k]
+            if not missing:
+                return
+
+    def _positions(self, k: int, frame: dict[str, Array]) -> Array:
+        x: Array = frame["position"][_rows(k, frame)] - self.zero
+        return x
 
     def picture(self, frame: dict[str, Array]) -> Array:
         """One frame, all scenes of the batch side by side."""
@@ -134,11 +157,10 @@ class _Artist:
             for words in entry.obstacle
             for shape in obstacle_shapes(obstacle(words, None), time, bounds)
         ]
-        rows = frame["scene"] == k if "scene" in frame else slice(None)
         overlays = list(_ritter(self.scene, self.words.ritter, time)) if self.words.ritter else []
         return self.renderers[k].frame(
-            frame["position"][rows] - self.zero,
-            self._values(frame)[rows],
+            self._positions(k, frame),
+            self._values(frame)[_rows(k, frame)],
             obstacles=shapes,
             overlays=overlays,
             time=time,
@@ -166,6 +188,11 @@ class _Artist:
     def close(self) -> None:
         for renderer in self.renderers:
             renderer.close()
+
+
+def _rows(k: int, frame: dict[str, Array]) -> Any:
+    """The particles of a scene of the batch."""
+    return frame["scene"] == k if "scene" in frame else slice(None)
 
 
 def _layers(trajectory: Trajectory, scene: Scene, count: int) -> Array:

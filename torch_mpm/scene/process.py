@@ -5,32 +5,60 @@ from __future__ import annotations
 import contextlib
 import signal
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from types import FrameType
+from typing import Any
 
+from ..alarms import RaiseLater, alarm
+
+FRAME_SECONDS = 0.5
+"""Time that a frame has to end after a signal; what there is of it is dropped then."""
 SWITCH_SECONDS = 1e-4
 """After which a thread that is busy in Python lets another one go on."""
 
 
-@contextlib.contextmanager
-def stop_signals() -> Iterator[Callable[[], bool]]:
-    """SIGINT and SIGTERM ask to stop after the frame; a second SIGINT stops at once."""
-    asked: list[int] = []
+class StopSignals:
+    """SIGINT and SIGTERM ask to stop after the frame; a second SIGINT stops at once. A context manager.
 
-    def ask(number: int, frame: FrameType | None) -> None:
-        if asked and number == signal.SIGINT:
-            raise KeyboardInterrupt
-        asked.append(number)
+    A signal that comes too late for that, after the last frame, is sent again at the end.
 
-    try:
-        previous = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
-    except ValueError:  # not the main thread, which alone may handle signals
-        previous = {}
-    try:
-        yield lambda: bool(asked)
-    finally:
-        for number, handler in previous.items():
+    Attributes:
+        asked: number of the last signal that has come; 0 for none.
+    """
+
+    def __init__(self) -> None:
+        self.asked = 0
+        self._raise_later: RaiseLater | None = None
+        self._previous: dict[int, Any] = {}
+
+    def __enter__(self) -> StopSignals:
+        with contextlib.suppress(ValueError):  # not the main thread, which alone may handle signals
+            for number in (signal.SIGINT, signal.SIGTERM):
+                self._previous[number] = signal.signal(number, self._ask)
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *error: object) -> None:
+        for number, handler in self._previous.items():
             signal.signal(number, handler)
+        if self.asked and kind is None:
+            signal.raise_signal(self.asked)
+
+    @contextlib.contextmanager
+    def within_frames(self) -> Iterator[None]:
+        """A context in which a frame that takes longer than `FRAME_SECONDS` after a signal ends with a
+        KeyboardInterrupt."""
+        with alarm() as self._raise_later:
+            try:
+                yield
+            finally:
+                self._raise_later = None
+
+    def _ask(self, number: int, frame: FrameType | None) -> None:
+        if self.asked and number == signal.SIGINT:
+            raise KeyboardInterrupt
+        self.asked = number
+        if self._raise_later is not None:
+            self._raise_later(KeyboardInterrupt, FRAME_SECONDS)
 
 
 @contextlib.contextmanager

@@ -27,7 +27,7 @@ from . import checkpoint, fields, heap
 from .build import Built
 from .diagnose import SceneFailure, replay, wrong
 from .folder import CHECKPOINT, LAST_GOOD, claim, finished, locked, output_errors, prepare, record_summary
-from .process import prompt_turns, stop_signals
+from .process import StopSignals, prompt_turns
 from .scene import Scene
 from .substeps import check_substeps
 from .writer import Copier, Copies, Frame, FrameWriter
@@ -90,7 +90,7 @@ def run(
         OutputError: for a folder that holds something else or in which another process runs, or a full disk.
         DamagedFileError: for a run to be resumed whose files are damaged.
         SceneFailure: for a simulation that went wrong; the state before it is in ``last_good.h5``.
-        Interrupted: after Ctrl-C or SIGTERM, once the frame is whole.
+        Interrupted: after Ctrl-C or SIGTERM, once the frame is whole, or has taken too long to end.
     """
     begin = time.perf_counter()
     folder = Path(out)
@@ -104,12 +104,15 @@ def run(
     check_substeps(scene, built)
     simulation = Simulation(scene, built)
     layout = simulation.layout(source, fingerprint)
-    with stop_signals() as stop, prompt_turns(), output_errors(folder), locked(folder), torch.no_grad():
+    with StopSignals() as stop, prompt_turns(), output_errors(folder), locked(folder), torch.no_grad():
         claim(folder, fingerprint, resume)  # again: another process may have been here before the lock
         prepare(folder, scene, layout, fingerprint)
         writer = simulation.open(folder, layout)
         try:
-            simulation.run(writer, progress, stop)
+            with stop.within_frames():
+                simulation.run(writer, progress, stop)
+        except KeyboardInterrupt:
+            raise simulation.interrupted() from None
         except SceneFailure as failure:
             kept = _save_last_good(folder, simulation.state, failure)
             raise SceneFailure(f"{failure}\n{kept}", failure.failure) from None
@@ -261,7 +264,7 @@ class Simulation:
         bad = wrong(self.step, state, self.scene.origin)
         return f"has a particle that is not meaningful: {bad[1]}" if bad else ""
 
-    def run(self, writer: FrameWriter, progress: Progress | None, stop: Callable[[], bool]) -> None:
+    def run(self, writer: FrameWriter, progress: Progress | None, stop: StopSignals) -> None:
         """All frames that are missing. A device has its next substeps before the host hands over the last frame."""
         due: Frame | None = None
 
@@ -294,9 +297,14 @@ class Simulation:
         """Whether the host goes on while substeps are taken."""
         return self.state.x.is_cuda
 
-    def _check_stop(self, stop: Callable[[], bool]) -> None:
-        if self.frame < self.scene.frames and stop():
-            raise Interrupted(f"stopped after frame {self.frame} of {self.scene.frames}; add --resume to continue")
+    def _check_stop(self, stop: StopSignals) -> None:
+        if self.frame < self.scene.frames and stop.asked:
+            raise self.interrupted()
+
+    def interrupted(self) -> Interrupted:
+        """The error of a run that stops now."""
+        where = f"after frame {self.frame}" if self.frame >= 0 else "before the first frame"
+        return Interrupted(f"stopped {where} of {self.scene.frames}; add --resume to continue")
 
     def _complete(self, substeps: int, cfl: float, seconds: float) -> Frame:
         """The present state as the next frame, with all that must not change until it is handed over."""
