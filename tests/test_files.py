@@ -6,6 +6,7 @@ import socket
 import pytest
 
 from torch_mpm import seed
+from torch_mpm.errors import DamagedFileError
 from torch_mpm.files import LARGEST, LARGEST_TEXT, VARIABLE, check_file, read_text
 
 KINDS = {
@@ -14,6 +15,7 @@ KINDS = {
     "socket": "is a socket, not a regular file",
     "folder": "is a folder",
     "missing": "does not exist",
+    "empty": "is empty",
     "large": "is too large: .* bytes, where .* are allowed; .*TORCH_MPM_LARGEST_FILE raises the limit",
 }
 
@@ -30,6 +32,8 @@ def make(kind, path):
             bound.bind(str(path))
     elif kind == "folder":
         path.mkdir()
+    elif kind == "empty":
+        path.touch()
     elif kind == "large":
         with path.open("wb") as handle:
             handle.truncate(2**40)
@@ -109,11 +113,24 @@ READERS = {
 }
 
 
+RECORDS = ("trajectory.h5", "run.json", "shard-00000.json")
+
+
+@pytest.mark.parametrize("name", RECORDS)
+def test_a_record_that_is_empty_is_damaged(name, tmp_path):
+    pytest.importorskip("pydantic")
+    (tmp_path / name).touch()
+    with pytest.raises(DamagedFileError, match=name):
+        READERS[name](tmp_path / name)
+
+
 @pytest.mark.parametrize("name", READERS)
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_path_that_is_no_file_is_named(kind, name, tmp_path, monkeypatch):
     if kind == "large" and name.endswith("h5"):
         pytest.skip("trajectories have any size")
+    if kind == "empty" and name in RECORDS:
+        pytest.skip("records that are empty are damaged")
     if name.endswith("toml") or name.startswith(("fingerprint", "run")):
         pytest.importorskip("pydantic")
     monkeypatch.chdir(tmp_path)  # the path of a socket is short

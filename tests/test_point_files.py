@@ -121,7 +121,7 @@ def test_z_that_is_the_same_everywhere_is_left_out_in_two_dimensions(tmp_path):
         ("x [mm],y [mm]\n1,2\n", None, r"the column 'x \[mm\]' must be in m"),
         ("x,y,volume [l]\n1,2,3\n", None, r"the column 'volume \[l\]' must be in m\^3"),
         ("x,y,z\n", None, "no rows of numbers"),
-        ("", None, "no rows of numbers"),
+        ("\n", None, "no rows of numbers"),
     ],
 )
 def test_tables_that_are_refused(text, dim, message, tmp_path):
@@ -195,6 +195,7 @@ def test_ply_that_is_refused(form, tmp_path):
     for old, new, message in (
         (b"ply\n", b"plx\n", "does not begin with 'ply'"),
         (b"vertex 3", b"vertex 300000000000", "do not fit in its"),
+        (b"vertex 3", b"vertex 0", "it has no vertices"),
         (b"property double x\n", b"property double u\n", "must have the properties x, y and z, got"),
         (b"property double x\n", b"property list uchar int x\n", "unknown line: 'property list uchar int x'"),
         (b"property double x\n", b"property half x\n", "unknown line: 'property half x'"),

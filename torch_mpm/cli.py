@@ -16,10 +16,10 @@ from types import FrameType
 from typing import Any
 
 from . import memory, optional
-from .alarms import alarm
 from .data import commands as data_sets
 from .data import reading_commands as reading
-from .data.commands import set_argument
+from .data.commands import path_argument, set_argument
+from .interrupts import alarm
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -29,15 +29,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
         The exit status: 0, 1 for a problem (described on stderr), 130 after Ctrl-C, and 143 after SIGTERM; a run, which
         ends with a whole frame, has 130 after both.
     """
+    came: list[type[KeyboardInterrupt]] = []
     try:
-        with signals_raise(), warnings_in_lines():
+        with signals_raise(came), warnings_in_lines():
             options = _parser().parse_args(arguments)
             options.command(options)
-    except Terminated:
-        return _told("terminated", 143)
-    except KeyboardInterrupt:
-        return _told("interrupted", 130)
+    except KeyboardInterrupt as error:
+        return _ended(type(error))
     except Exception as error:
+        if came:  # a library has made an error of its own of it
+            return _ended(came[0])
         message = _message(error)
         if message is None:
             raise
@@ -49,20 +50,25 @@ class Terminated(KeyboardInterrupt):
     """SIGTERM as an exception: incomplete files are removed during unwinding."""
 
 
+def _ended(kind: type[KeyboardInterrupt]) -> int:
+    return _told("terminated", 143) if issubclass(kind, Terminated) else _told("interrupted", 130)
+
+
 AGAIN_SECONDS = 0.01
 """After which what was raised in vain is raised again."""
 
 
 @contextlib.contextmanager
-def signals_raise() -> Iterator[None]:
-    """SIGTERM raises `Terminated` in the main thread, as SIGINT raises KeyboardInterrupt; elsewhere both end the
-    process as before.
+def signals_raise(came: list[type[KeyboardInterrupt]]) -> Iterator[None]:
+    """SIGTERM raises `Terminated` in the main thread, and SIGINT KeyboardInterrupt; elsewhere both end the process as
+    before. What is raised is added to a list.
 
     Python prints and drops what is raised in destructors and in callbacks of weak references. It is raised again then.
     """
 
     def end(number: int, frame: FrameType | None) -> None:
-        raise Terminated
+        came.append(Terminated if number == signal.SIGTERM else KeyboardInterrupt)
+        raise came[-1]
 
     def raise_again(dropped: sys.UnraisableHookArgs) -> None:
         if issubclass(dropped.exc_type, KeyboardInterrupt):
@@ -73,14 +79,16 @@ def signals_raise() -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    previous, hook = signal.signal(signal.SIGTERM, end), sys.unraisablehook
+    numbers = [signal.SIGTERM, *([signal.SIGINT] if signal.getsignal(signal.SIGINT) != signal.SIG_IGN else [])]
+    previous, hook = {number: signal.signal(number, end) for number in numbers}, sys.unraisablehook
     with alarm() as raise_later:
         sys.unraisablehook = raise_again
         try:
             yield
         finally:
             sys.unraisablehook = hook
-            signal.signal(signal.SIGTERM, previous)
+            for number, handler in previous.items():
+                signal.signal(number, handler)
 
 
 @contextlib.contextmanager
@@ -132,7 +140,7 @@ def _parser() -> argparse.ArgumentParser:
 
     run = commands.add_parser("run", help="simulate a scene file")
     _scene_arguments(run)
-    run.add_argument("-o", "--out", required=True, type=Path, help="folder for the results")
+    run.add_argument("-o", "--out", required=True, type=path_argument, help="folder for the results")
     run.add_argument("--resume", action="store_true", help="continue an unfinished run")
     run.add_argument("--quiet", action="store_true", help="no progress bar")
     run.set_defaults(command=_run)
@@ -151,13 +159,13 @@ def _parser() -> argparse.ArgumentParser:
     schema.set_defaults(command=_schema)
 
     render = commands.add_parser("render", help="redraw the pictures and the video of a run; draw scenes of a data set")
-    render.add_argument("run", type=Path, help="folder of a run or of a data set")
+    render.add_argument("run", type=path_argument, help="folder of a run or of a data set")
     set_argument(render, "render.color_by=stress")
     reading.add_render_options(render)
     render.set_defaults(command=_render)
 
     export = commands.add_parser("export", help="convert a run or a data set for other programs")
-    export.add_argument("run", type=Path, help="folder of a run or of a data set")
+    export.add_argument("run", type=path_argument, help="folder of a run or of a data set")
     reading.add_export_options(export)
     export.set_defaults(command=_export)
 
@@ -167,7 +175,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _scene_arguments(parser: argparse.ArgumentParser, optional: bool = False) -> None:
-    parser.add_argument("scene", type=Path, help="scene file (TOML)", nargs="?" if optional else None)
+    parser.add_argument("scene", type=path_argument, help="scene file (TOML)", nargs="?" if optional else None)
     set_argument(parser, "grid.dx=0.01")
 
 

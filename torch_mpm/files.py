@@ -21,13 +21,14 @@ KINDS = {
 }
 
 
-def check_file(path: str | Path, kind: str, largest: int | None = LARGEST) -> None:
-    """Raise unless a path is a readable regular file of bounded size. Links are followed.
+def check_file(path: str | Path, kind: str, largest: int | None = LARGEST, may_be_empty: bool = False) -> None:
+    """Raise unless a path is a readable regular file of bounded size that is not empty. Links are followed.
 
     Args:
         path: the file.
         kind: its content, for messages, such as "mesh".
         largest: maximum size [bytes], None for any; a larger `TORCH_MPM_LARGEST_FILE` in the environment overrides it.
+        may_be_empty: accept an empty file, as for records, whose reader reports it as damaged.
 
     Raises:
         OSError: with the path; also as FileNotFoundError, IsADirectoryError or PermissionError.
@@ -45,6 +46,8 @@ def check_file(path: str | Path, kind: str, largest: int | None = LARGEST) -> No
     if not stat.S_ISREG(status.st_mode):
         found = KINDS.get(stat.S_IFMT(status.st_mode), "of another kind")
         raise OSError(f"{kind} file {path} is {found}, not a regular file")
+    if not (status.st_size or may_be_empty):
+        raise OSError(f"{kind} file {path} is empty")
     if largest is not None and status.st_size > (limit := max(largest, _raised_limit())):
         raise OSError(
             f"{kind} file {path} is too large: {status.st_size} bytes, where {limit} are allowed; "

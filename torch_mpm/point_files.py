@@ -226,6 +226,8 @@ def _read_ply(path: Path, dim: int | None) -> PointFile:
         least = 2 * len(names) - 1 if order == "=" else dtype.itemsize  # Bytes of a row.
         if count * least > size:
             raise ValueError(f"its {count} vertices do not fit in its {size} bytes")
+        if count == 0:
+            raise ValueError("it has no vertices")
         if order == "=":
             text = io.TextIOWrapper(handle, encoding="ascii")
             values = np.loadtxt(text, max_rows=count, ndmin=2, usecols=range(len(names)))

@@ -108,6 +108,17 @@ def test_signals_that_python_drops_come_again(monkeypatch, capfd, number, status
     assert main(["schema"]) == status and "Traceback" not in capfd.readouterr().err
 
 
+def test_signals_that_a_library_makes_another_error_of(monkeypatch, capsys):
+    def command(options):
+        try:
+            signal.raise_signal(signal.SIGTERM)
+        except KeyboardInterrupt:
+            raise ValueError("Invalid bounding box") from None  # as compiled code that was called with a list
+
+    monkeypatch.setattr("torch_mpm.cli._schema", command)
+    assert main(["schema"]) == 143 and capsys.readouterr().err == "torch-mpm: terminated\n"
+
+
 def test_commands_in_threads_leave_signals_alone(tmp_path):
     path, status = datasets.make_dataset(tmp_path / "set"), []
     thread = threading.Thread(target=lambda: status.append(main(["export", str(path), "--format", "gns"])))

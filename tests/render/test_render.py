@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes.util
 import math
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -450,6 +451,22 @@ def test_a_video_that_is_interrupted_at_its_end_leaves_nothing(tmp_path, monkeyp
         video.append(np.zeros((32, 32, 3), np.uint8))
         monkeypatch.setattr(subprocess.Popen, "wait", interrupted)
     assert list(tmp_path.iterdir()) == [] and waited[0].poll() is not None
+
+
+def test_a_video_that_is_interrupted_at_its_begin_leaves_nothing(tmp_path, monkeypatch):
+    """Also while its encoder starts, which nobody could end."""
+    started = []
+
+    class Interrupted(subprocess.Popen):
+        def __init__(self, *arguments, **options):
+            super().__init__(*arguments, **options)
+            started.append(self)
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(subprocess, "Popen", Interrupted)
+    with pytest.raises(KeyboardInterrupt), render.VideoWriter(tmp_path / "out.mp4", 10) as video:
+        video.append(np.zeros((32, 32, 3), np.uint8))
+    assert list(tmp_path.iterdir()) == [] and started[0].poll() is not None
 
 
 def test_killed_video_has_no_file_under_its_name(tmp_path):

@@ -1,5 +1,7 @@
 """Values that no simulation can hold, and options of the command line that would have no effect, are errors."""
 
+import shlex
+
 import pytest
 from helpers import FILE, scene_command
 
@@ -61,6 +63,19 @@ def folders(tmp_path):
         ("render run --color-by mass", "--color-by is for data sets"),
         ("export set --format well --dx nan", "dx must be positive and finite, got nan"),
         ("export set --format well --dx 1e300", "dx must be at most 1, the shortest side of the domain, got 1e+300"),
+        ("run scene.toml -o ''", "argument -o/--out: takes a path, got ''"),
+        ("generate scene.toml -o ' '", "argument -o/--out: takes a path, got ' '"),
+        ("export run --vtk -o ''", "argument -o/--out: takes a path, got ''"),
+        ("export set --format gns -o ''", "argument -o/--out: takes a path, got ''"),
+        ("render set --no-video -o ''", "argument -o/--out: takes a path, got ''"),
+        ("stats set -o ''", "argument -o/--out: takes a path, got ''"),
+        ("render ''", "argument run: takes a path, got ''"),
+        ("verify ''", "argument folder: takes a path, got ''"),
+        ("check ''", "argument scene: takes a path, got ''"),
+        ("export run --vtk -o scene.toml", "argument -o/--out: takes a folder, and scene.toml is a file"),
+        ("render set --no-video -o scene.toml", "argument -o/--out: takes a folder, and scene.toml is a file"),
+        ("render set --color-by ''", "color_by must be"),
+        ("export set --format vtk --scenes ''", "argument --scenes: takes numbers of scenes such as 0,5,7, got ''"),
         ("verify set --most-failed x", "takes a share within 0 and 1, got 'x'"),
     ],
 )
@@ -68,7 +83,7 @@ def test_options_without_effect(folders, capsys, monkeypatch, words, message):
     monkeypatch.chdir(folders)
     before = sorted(folders.rglob("*"))
     try:
-        status = main(words.split())
+        status = main(shlex.split(words))
     except SystemExit as end:
         status = end.code
     assert status and message in capsys.readouterr().err

@@ -23,11 +23,11 @@ def add(commands: Any) -> None:
         description="Simulate the scenes that a data set lacks. Any number of processes may work in one folder; "
         "RANK and WORLD_SIZE, SLURM_PROCID and SLURM_NTASKS or SLURM_ARRAY_TASK_ID and _COUNT share out the work.",
     )
-    generate.add_argument("config", type=Path, nargs="?", help="configuration (TOML)")
+    generate.add_argument("config", type=path_argument, nargs="?", help="configuration (TOML)")
     generate.add_argument(
         "--preset", metavar="NAME", help="a configuration that comes with torch_mpm; 'list' names them"
     )
-    generate.add_argument("-o", "--out", type=Path, help="folder of the data set")
+    generate.add_argument("-o", "--out", type=path_argument, help="folder of the data set")
     generate.add_argument("--device", default="auto", help='"auto", "cpu", "cuda" or "cuda:1"; default: %(default)s')
     generate.add_argument("--check", action="store_true", help="check finished shards, and make damaged ones anew")
     generate.add_argument(
@@ -40,11 +40,11 @@ def add(commands: Any) -> None:
     generate.set_defaults(command=_generate)
 
     finalize = commands.add_parser("finalize", help="merge the statistics of a complete data set into metadata.json")
-    finalize.add_argument("folder", type=Path, help="folder of the data set")
+    finalize.add_argument("folder", type=path_argument, help="folder of the data set")
     finalize.set_defaults(command=_finalize)
 
     verify = commands.add_parser("verify", help="check all files and scenes of a data set")
-    verify.add_argument("folder", type=Path, help="folder of the data set")
+    verify.add_argument("folder", type=path_argument, help="folder of the data set")
     _failures_argument(verify)
     verify.set_defaults(command=_verify)
 
@@ -69,6 +69,21 @@ def _share(text: str) -> float:
     if not 0 <= value <= 1:
         raise argparse.ArgumentTypeError(f"takes a share within 0 and 1, got {text!r}")
     return value
+
+
+def path_argument(text: str) -> Path:
+    """The type of arguments that are paths: an empty one would be the current folder."""
+    if not text.strip():
+        raise argparse.ArgumentTypeError(f"takes a path, got {text!r}")
+    return Path(text)
+
+
+def folder_argument(text: str) -> Path:
+    """The type of arguments that are folders, which may have to be made."""
+    path = path_argument(text)
+    if path.exists() and not path.is_dir():
+        raise argparse.ArgumentTypeError(f"takes a folder, and {path} is a file")
+    return path
 
 
 def set_argument(parser: argparse.ArgumentParser, example: str) -> None:

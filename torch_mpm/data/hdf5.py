@@ -176,7 +176,7 @@ def seal(handle: BinaryIO, extents: Extents) -> None:
 
 def check_seal(path: Path, remedy: str) -> None:
     """Raise DamagedFileError with ``remedy`` unless the parts under the seal of a file are as they were written."""
-    check_file(path, "HDF5", largest=None)
+    check_file(path, "HDF5", largest=None, may_be_empty=True)
     with open(path, "rb") as handle:
         size = handle.seek(0, os.SEEK_END)
         handle.seek(max(0, size - FOOTER.size))

@@ -63,14 +63,14 @@ def draw_scenes(
     if not chosen:
         raise DatasetError(f"{data.path} has no valid scene yet")
     target = data.path / "pictures" if out is None else Path(out)
-    target.mkdir(parents=True, exist_ok=True)
-    remove_leftovers(target)
     length, interval = data.record.frames, data.record.frame_interval
     with contextlib.ExitStack() as stack:
         columns = max(1, frames)
         artist = stack.enter_context(_Artist(data, chosen, color_by, max(160, width // columns)))
         times = np.linspace(0, length - 1, columns).round().astype(int)
         pictures = [artist.picture(scene, int(k)) for scene in range(len(chosen)) for k in times]
+        target.mkdir(parents=True, exist_ok=True)
+        remove_leftovers(target)
         write_png(target / SHEET, contact_sheet(pictures, columns, width))
     if not video:
         return [target / SHEET]

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from ..view_server import MOST_PORT
+from .commands import folder_argument, path_argument
 from .folder import DATASET, DatasetError
 
 FORMATS = ("gns", "lagrangebench", "neuralmpm", "ply", "tfrecord", "vtk", "well")
@@ -24,12 +25,12 @@ def is_dataset(folder: Path) -> bool:
 def add(commands: Any) -> None:
     """Add the commands that are for data sets alone, or for looking, to those of the command line."""
     stats = commands.add_parser("stats", help="draw what is in a data set: sizes, motions, energies, failures")
-    stats.add_argument("folder", type=Path, help="folder of the data set")
-    stats.add_argument("-o", "--out", type=Path, help="the picture; statistics.png in the folder by default")
+    stats.add_argument("folder", type=path_argument, help="folder of the data set")
+    stats.add_argument("-o", "--out", type=path_argument, help="the picture; statistics.png in the folder by default")
     stats.set_defaults(command=_stats)
 
     view = commands.add_parser("view", help="look at a run or a data set in the browser")
-    view.add_argument("folder", type=Path, help="folder of a run or of a data set")
+    view.add_argument("folder", type=path_argument, help="folder of a run or of a data set")
     view.add_argument("--port", type=_port, default=8080, help="default: %(default)s")
     view.add_argument("--host", default="127.0.0.1", help="address to listen at; default: %(default)s")
     view.set_defaults(command=_view)
@@ -40,7 +41,9 @@ def add_export_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--format", dest="formats", action="append", choices=FORMATS, metavar="FORMAT", help=help)
     for name in OF_RUNS:
         parser.add_argument(f"--{name}", dest="formats", action="append_const", const=name, help=f"--format {name}")
-    parser.add_argument("-o", "--out", type=Path, help="folder to make; by default one named after the format in DIR")
+    parser.add_argument(
+        "-o", "--out", type=folder_argument, help="folder to make; by default one named after the format in DIR"
+    )
     parser.add_argument("--material", metavar="NAME", help="gns: array [N] of the scenes for the material column")
     parser.add_argument(
         "--fields", type=_words, default=(), metavar="stress,F", help="lagrangebench, neuralmpm, tfrecord: more arrays"
@@ -51,7 +54,9 @@ def add_export_options(parser: argparse.ArgumentParser) -> None:
 
 
 def add_render_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("-o", "--out", type=Path, help="data set: folder of the pictures; DIR/pictures by default")
+    parser.add_argument(
+        "-o", "--out", type=folder_argument, help="data set: folder of the pictures; DIR/pictures by default"
+    )
     parser.add_argument("--color-by", metavar="FIELD", help="data set: speed by default")
     parser.add_argument("--no-video", action="store_true", help="data set: the contact sheet alone")
     _scenes_option(parser, "data set: scenes; the first six by default")
@@ -128,7 +133,7 @@ def render(options: argparse.Namespace) -> None:
 
     if options.overrides:
         raise DatasetError("render of a data set takes --color-by, --scenes and --no-video in place of --set")
-    color_by = options.color_by or "speed"
+    color_by = "speed" if options.color_by is None else options.color_by
     made = draw_scenes(options.run, options.out, options.scenes, color_by, video=not options.no_video)
     print("\n".join(map(str, made)))
 

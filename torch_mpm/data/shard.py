@@ -106,7 +106,7 @@ class ShardRecord:
             FileNotFoundError: for a shard that is not finished.
             DamagedFileError: for a file that is no record.
         """
-        check_file(path, "shard")
+        check_file(path, "shard", may_be_empty=True)
         data = path.read_bytes()
         try:
             words = json.loads(data)

@@ -12,6 +12,7 @@ from typing import IO
 
 import numpy as np
 
+from ..interrupts import held_signals
 from .images import check_image, read_png, replacing
 from .requires import RenderError, require
 from .shapes import Array
@@ -86,11 +87,9 @@ class VideoWriter:
         source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", f"{self.fps}", "-i", "-"]
         codec = ["-c:v", "libx264", "-pix_fmt", "yuv420p", "-crf", f"{self.quality}", "-preset", "medium"]
         command = [self._ffmpeg, "-y", "-loglevel", "error", *source, "-an", *codec, "-movflags", "+faststart"]
-        self._process = subprocess.Popen(
-            [*command, "-f", "mp4", str(temporary)],
-            stdin=subprocess.PIPE,
-            stderr=self._log,
-        )
+        words = [*command, "-f", "mp4", str(temporary)]
+        with held_signals():  # an encoder that nobody knows would go on
+            self._process = subprocess.Popen(words, stdin=subprocess.PIPE, stderr=self._log)
 
     def _failure(self) -> RenderError:
         assert self._process is not None and self._log is not None

@@ -142,7 +142,7 @@ def read_run(folder: Path) -> dict[str, Any]:
         OSError: for a record that cannot be read.
     """
     path = folder / RUN
-    check_file(path, "run")
+    check_file(path, "run", may_be_empty=True)
     try:
         values = json.loads(path.read_bytes())
     except (ValueError, RecursionError) as error:

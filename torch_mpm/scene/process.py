@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from types import FrameType
 from typing import Any
 
-from ..alarms import RaiseLater, alarm
+from ..interrupts import RaiseLater, alarm
 
 FRAME_SECONDS = 0.5
 """Time that a frame has to end after a signal; what there is of it is dropped then."""

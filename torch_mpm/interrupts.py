@@ -1,4 +1,4 @@
-"""Exceptions that come later in the main thread: where a handler of a signal cannot wait, nor start a thread."""
+"""Signals that wait for the end of what must not be cut off, and exceptions that come later in the main thread."""
 
 from __future__ import annotations
 
@@ -34,3 +34,20 @@ def alarm() -> Iterator[RaiseLater]:
         if previous:
             signal.setitimer(signal.ITIMER_REAL, 0.0)
             signal.signal(signal.SIGALRM, previous[0])
+
+
+@contextlib.contextmanager
+def held_signals() -> Iterator[None]:
+    """SIGINT and SIGTERM wait for the end of the context; in other threads than the main one nothing is changed."""
+    came: list[int] = []
+    previous: dict[int, Any] = {}
+    with contextlib.suppress(ValueError):  # not the main thread, which alone may handle signals
+        for number in (signal.SIGINT, signal.SIGTERM):
+            previous[number] = signal.signal(number, lambda number, _: came.append(number))
+    try:
+        yield
+    finally:
+        for held, handler in previous.items():
+            signal.signal(held, handler)
+        if came:
+            signal.raise_signal(came[0])
