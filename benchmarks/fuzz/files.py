@@ -25,11 +25,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import tomllib
 
 from torch_mpm import Trajectory, cli
+from torch_mpm.data.finish import verify
+from torch_mpm.data.folder import DatasetFolder
 
 from .. import common as benchmark
-from . import command_lines, common, forged_shards, hostile_inputs, mutated_records
+from . import command_lines, common, forged_shards, hostile_inputs, mutated_records, scene_mutations
 
 COLUMNS = ("crash", "traceback", "wrong exit status 0", "time limit", "unclear message", "written outside")
 MOST_LETTERS, MOST_LINES = 24_000, 60
@@ -97,6 +100,16 @@ shape = "sphere"
 center = [0.5, 0.15]
 radius = 0.1
 """
+CONFIGURED: list[Any] = [
+    *scene_mutations.NASTY,
+    *({"uniform": [0.1, 0.2]}, {"uniform": [1, 0]}, {"uniform": ["a", 1]}, {"uniform": []}, {"uniform": 3}),
+    *({"log_uniform": [-1.0, 1.0]}, {"normal": [0.5, -1.0]}, {"normal": [0.5, 0.01]}, {"integers": [0, 10**9]}),
+    *({"integers": [2, 1]}, {"integers": [0.5, 1.5]}, {"choice": []}, {"choice": [1, "x"]}, {"choice": {"a": 1}}),
+    *({"direction": 1.0}, {"in_box": [[0.4, 0.4], [0.6, 0.6]]}, {"in_box": [[0.6, 0.6], [0.4, 0.4]]}, {"in_box": 1}),
+    *({"uniform": [0, 1], "normal": [0, 1]}, {"train": 2}, {"train": -1}, {"../x": 2}, {"train": 0, "test": 1}),
+    *(["position"], ["F", "F"], ["velocity", "nope"], {"jelly": 5}, {"nope": 5}, {"jelly": 500}),
+]
+"""Values for configurations of data sets: distributions, right and wrong, splits, names of fields and types."""
 
 
 class Fuzz:
@@ -185,6 +198,10 @@ class Fuzz:
             with Trajectory(Path(words[words.index("-o") + 1])) as read:
                 if not (read.complete and all(np.isfinite(frame["position"]).all() for frame in read)):
                     yield "wrong exit status 0"
+        elif words[0] == "generate" and "-o" in words and "--check" not in words:
+            folder = Path(words[words.index("-o") + 1])
+            if not DatasetFolder(folder).scenes() or list(verify(folder)):
+                yield "wrong exit status 0"
         elif words[0] in ("export", "render", "stats") and "-o" in words:
             made = Path(words[words.index("-o") + 1])
             if not made.exists() or (made.is_dir() and not any(made.iterdir())):
@@ -202,6 +219,18 @@ class Fuzz:
             found = list(self.faults(command, memory=2 << 30))
             if found:
                 print(f"  {what}", flush=True)
+            yield from found
+
+    def configuration(self, rng: random.Random) -> Iterator[str]:
+        """A configuration of a data set with one to three mistakes."""
+        with self.prepared():
+            words = tomllib.loads(SET)
+            wrong = scene_mutations.mistakes(words, CONFIGURED, rng)
+            (self.inputs / "mutated.toml").write_text(text := scene_mutations.toml(words), errors="surrogateescape")
+            command = ["generate", self.inputs / "mutated.toml", "-o", self.out, "--quiet"]
+            found = list(self.faults(command, wrong, memory=2 << 30))
+            if found:
+                print(text[:3000], flush=True)
             yield from found
 
     def shard(self, rng: random.Random) -> Iterator[str]:
@@ -258,7 +287,8 @@ def fuzz(folder: Path, counts: dict[str, int], seed: int) -> list[dict[str, Any]
     """A row of counts for each part: ``counts`` says how many cases of each."""
     program = Fuzz(folder)
     parts: dict[str, Callable[[random.Random], Iterator[str]]] = {
-        "lines": program.line, "inputs": program.input, "shards": program.shard, "records": program.record,
+        "lines": program.line, "inputs": program.input, "configurations": program.configuration,
+        "shards": program.shard, "records": program.record,
     }  # fmt: skip
     rows = []
     for part, count in counts.items():
@@ -275,7 +305,7 @@ def fuzz(folder: Path, counts: dict[str, int], seed: int) -> list[dict[str, Any]
     return rows
 
 
-COUNTS = {"lines": 600, "inputs": 200, "shards": 100, "records": 1000, "memory": 500}
+COUNTS = {"lines": 600, "inputs": 200, "configurations": 400, "shards": 100, "records": 1000, "memory": 500}
 
 
 def main() -> None:

@@ -63,13 +63,23 @@ def prepare(folder: Path) -> None:
 
 def mutated(rng: random.Random) -> tuple[str, bool]:
     """Text of a scene file with one to three mistakes, and whether it cannot be right."""
-    words, wrong = copy.deepcopy(rng.choice(BASES)), False
+    words = copy.deepcopy(rng.choice(BASES))
+    wrong = mistakes(words, NASTY, rng)
+    text = toml(words)
+    if rng.random() < 0.1:
+        return text[: rng.randrange(len(text))] + rng.choice(("", "[" * 5000, "= =", "\x00", "\udcff")), False
+    return text, wrong
+
+
+def mistakes(words: dict[str, Any], values: list[Any], rng: random.Random) -> bool:
+    """Make one to three mistakes in the words of a file, with values among others; returns whether it must be refused,
+    for a key that nobody knows."""
+    wrong = False
     for _ in range(rng.randint(1, 3)):
-        places = list(_places(words))
-        holder, key = rng.choice(places)
+        holder, key = rng.choice(list(_places(words)))
         kind = rng.choice(("value", "value", "value", "scale", "delete", "unknown", "repeat"))
         if kind == "value":
-            holder[key] = copy.deepcopy(rng.choice(NASTY))
+            holder[key] = copy.deepcopy(rng.choice(values))
         elif kind == "scale" and isinstance(holder[key], float):
             holder[key] *= rng.choice((-1.0, 1e-6, 1e6, 1e12))
         elif kind == "delete":
@@ -79,10 +89,7 @@ def mutated(rng: random.Random) -> tuple[str, bool]:
         elif kind == "repeat" and isinstance(holder, list):
             holder.append(copy.deepcopy(holder[key]))
         wrong = "colour" in (words["grid"] if isinstance(words.get("grid"), dict) else {})
-    text = toml(words)
-    if rng.random() < 0.1:
-        return text[: rng.randrange(len(text))] + rng.choice(("", "[" * 5000, "= =", "\x00", "\udcff")), False
-    return text, wrong
+    return wrong
 
 
 def _places(words: Any) -> Iterator[tuple[Any, Any]]:

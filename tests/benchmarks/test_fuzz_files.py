@@ -12,8 +12,8 @@ from benchmarks import common
 for package in ("h5py", "isal", "matplotlib", "meshio", "pydantic", "trimesh"):
     pytest.importorskip(package)
 
-SHORT = {"lines": 20, "inputs": 15, "shards": 10, "records": 15, "memory": 5}
-LONG = {"lines": 600, "inputs": 200, "shards": 100, "records": 1000, "memory": 500}
+SHORT = {"lines": 20, "inputs": 15, "configurations": 10, "shards": 10, "records": 15, "memory": 5}
+LONG = {"lines": 600, "inputs": 200, "configurations": 400, "shards": 100, "records": 1000, "memory": 500}
 
 
 @pytest.mark.parametrize("counts", [SHORT, pytest.param(LONG, marks=pytest.mark.slow)], ids=["short", "long"])

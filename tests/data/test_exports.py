@@ -317,6 +317,55 @@ def test_the_well_has_obstacles_and_scalars(tmp_path):
     assert json.loads((folder / "stats.yaml").read_text())["std"]["obstacle"] > 0.1
 
 
+# ---- physics_jepa, which reads the files of The Well in its own way
+
+
+def jepa_samples(folder, split, frames):
+    """Its WellDatasetForJEPA: (context, target) [C, T, H, W] of windows that follow each other, and all scalars."""
+    for path in sorted((folder / "data" / split).rglob("*.hdf5")):
+        with h5py.File(path, "r", libver="latest", swmr=True) as file:
+            scalars = torch.tensor(np.array([file["scalars"][name][()] for name in file["scalars"]]))
+            fields = [data for k in range(3) for data in file[f"t{k}_fields"].values()]
+            scenes, length, height, width = next(iter(file["t0_fields"].values())).shape
+            for scene in range(scenes):
+                for first in range(0, length - 2 * frames + 1, frames):
+                    channels = []
+                    for field in fields:
+                        part = np.empty((2 * frames, height, width, *field.shape[4:]), field.dtype)
+                        field.read_direct(part, source_sel=np.s_[scene, first : first + 2 * frames])
+                        channels.append(part.reshape(2 * frames, height, width, -1))
+                    both = torch.from_numpy(np.concatenate(channels, -1)).permute(3, 0, 1, 2)
+                    yield scene, first, both[:, :frames], both[:, frames:], scalars
+
+
+def test_a_jepa_reads_it(tmp_path):
+    """Channels by name: density, obstacle, velocity; scenes differ in a number of their material."""
+    source = datasets.make_dataset(tmp_path / "set")
+    floor = {"shape": "box", "center": [0.5, 0.1], "size": [1.0, 0.2]}
+    with_words(
+        source,
+        lambda k: {"gravity": [0.0, -9.8], "material": {"sand": {"law": "x", "E": 1e6 + k}}, "obstacle": [floor]},
+    )
+    folder, frames = data.export_well(source, tmp_path / "out", dx=0.1), 3
+    for split in IDS:
+        samples, given = list(jepa_samples(folder, split, frames)), expected(source, split)
+        assert len(samples) == len(given) * (FRAMES // frames - 1)
+        for scene, first, context, target, scalars in samples:
+            assert context.shape == target.shape == (4, frames, 10, 20)
+            np.testing.assert_allclose(scalars[0], 0.0)  # gravity_x, gravity_y, sand_E
+            np.testing.assert_allclose(scalars[1], -9.8, rtol=1e-6)
+            np.testing.assert_array_equal(scalars[2], [1e6 + k for k in IDS[split]])
+            free, mass = given[scene]["particle_type"] != 3, given[scene]["mass"]
+            for start, window in ((first, context), (first + frames, target)):
+                density, obstacle, velocity = window[0].double(), window[1], window[2:].double()
+                np.testing.assert_allclose(density.sum((1, 2)) * 0.1**2, mass[free].sum(dtype="f8"), rtol=1e-5)
+                assert obstacle[:, :, :2].all() and not obstacle[:, :, 2:].any()
+                moved = given[scene]["velocity"][start : start + frames, free].astype("f8")
+                momentum = np.einsum("n,tnd->dt", mass[free].astype("f8"), moved)
+                found = (density * velocity).sum((2, 3)) * 0.1**2
+                np.testing.assert_allclose(found, momentum, atol=1e-5 * np.abs(momentum).max())
+
+
 @pytest.mark.parametrize("export", [data.export_lagrangebench, data.export_neuralmpm])
 def test_further_fields(flat, tmp_path, export):
     folder = export(flat, tmp_path / "out", fields=["velocity", "mass"])

@@ -344,6 +344,23 @@ def test_impossible_configurations_are_refused(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"center": [0.5, 0.1, 0.5]},
+        {"center": [0.5]},
+        {"shape": "box", "lower": [0.1] * 3, "upper": [0.2] * 3},
+        {"shape": "half_space", "point": [0.0] * 3, "normal": [0.0, 1.0, 0.0]},
+    ],
+)
+def test_an_obstacle_of_another_number_of_dimensions(changes):
+    obstacle = {"shape": "sphere", "radius": 0.1, **changes}
+    if "shape" in changes:
+        obstacle.pop("radius")
+    with pytest.raises(SceneError, match=r"^obstacle\[0\]\.\w+: "):
+        check_samples(configuration(obstacle=[obstacle]))
+
+
 def test_a_first_scene_that_is_wrong_fails_alone(monkeypatch):
     ball = {"shape": "sphere", "radius": 0.1, "material": "jelly", "center": [0.5, 0.5]}
     made, drawn = configuration(body=[ball]), content

@@ -12,11 +12,12 @@ import pytest
 pytest.importorskip("h5py")
 
 import small_dataset as datasets
+from helpers import scene_command
 
 from torch_mpm import cli
 from torch_mpm.cli import main
 from torch_mpm.data import export_gns
-from torch_mpm.data.whole_files import building_path, remove_leftovers, write_whole
+from torch_mpm.data.whole_files import LEFTOVER, building_path, remove_leftovers, write_whole
 
 
 def process_that_is_gone() -> int:
@@ -70,6 +71,42 @@ def test_the_next_call_removes_what_a_kill_has_left(tmp_path, monkeypatch, comma
         pytest.importorskip("meshio")
         assert main(["export", str(path), "--vtk"]) == 0
     assert not left.exists() and not list(path.rglob(".*building*"))
+
+
+@pytest.mark.parametrize("complete", [False, True])
+def test_a_run_that_is_resumed_removes_what_a_kill_has_left(tmp_path, monkeypatch, complete):
+    pytest.importorskip("pydantic")
+    words, out = scene_command(tmp_path, "run", "seed=1"), tmp_path / "out"
+    out.mkdir()
+    if complete:
+        assert main(words) == 0
+    names = ("checkpoint.h5", "trajectory.partial.h5", "run.json")
+    gone = process_that_is_gone()
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "getpid", lambda: gone)
+        left = [building_path(out / name) for name in names] + [out / "checkpoint.h5"] * complete
+    for path in left:
+        path.write_text("x")
+    assert main([*words, "--resume"]) == 0
+    assert sorted(p.name for p in out.iterdir()) == ["run.json", "run.lock", "trajectory.h5"]
+
+
+def test_files_of_a_run_are_those_of_a_process_while_they_are_written(tmp_path, monkeypatch):
+    """So that another one knows whether somebody finishes them."""
+    pytest.importorskip("pydantic")
+    words, seen, fsync = scene_command(tmp_path, "run", "seed=1"), [], os.fsync
+    monkeypatch.setattr("torch_mpm.scene.writer.CHECKPOINT_SECONDS", 0.0)
+
+    def synced(handle):
+        seen.extend(p.name for p in (tmp_path / "out").iterdir())
+        fsync(handle)
+
+    monkeypatch.setattr(os, "fsync", synced)
+    assert main(words) == 0
+    assert not [name for name in seen if name.endswith(".building") and not LEFTOVER.search(name)]
+    assert {building_path(tmp_path / "out" / name).name for name in ("trajectory.partial.h5", "checkpoint.h5")} <= {
+        *seen
+    }
 
 
 def test_termination_is_an_exception_of_commands(tmp_path, monkeypatch, capsys):

@@ -132,7 +132,9 @@ class _Places:
     def _obstacle(self, words: Words) -> Any:
         try:
             model = _OBSTACLE.validate_python(words)
-            return None if model.start > 0 else obstacle(model, None)
+            found = obstacle(model, None)
+            found.signed_distance(torch.zeros(1, self.configuration.dim, dtype=torch.float64), None, 0.0)
+            return None if model.start > 0 else found
         except (ValidationError, ValueError, TypeError):
             return None  # the checks of scene files explain it
 

@@ -30,6 +30,7 @@ import numpy.typing as npt
 from ..errors import DamagedFileError
 from .hdf5 import SparseFile, h5py_module, open_sealed, seal
 from .stress import MEASURES, measure_of
+from .whole_files import building_path
 
 Array = npt.NDArray[Any]
 
@@ -90,7 +91,7 @@ def create(path: Path, layout: Layout) -> None:
     """
     image = SparseFile()
     places = _metadata(image, layout)
-    building = path.with_suffix(".building")
+    building = building_path(path)
     try:
         with open(building, "w+b") as handle:
             fd, extents = handle.fileno(), image.extents()

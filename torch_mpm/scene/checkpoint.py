@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from ..data.hdf5 import h5py_module, open_sealed, seal
+from ..data.whole_files import building_path
 from ..errors import DamagedFileError
 from ..state import State, _as_soa
 
@@ -39,7 +40,7 @@ def save(path: Path, tensors: Host, record: dict[str, Any]) -> None:
         for name, tensor in tensors.items():
             out[name] = tensor.numpy()
         out.attrs["record"] = json.dumps(record)
-    building = path.with_suffix(".building")
+    building = building_path(path)
     try:
         with open(building, "w+b") as handle:
             handle.write(image.getbuffer())

@@ -18,6 +18,7 @@ from torch import Tensor
 from ..cfl import Figures
 from ..data.hdf5 import h5py_module
 from ..data.trajectory import PARTIAL, Layout, Trajectory, TrajectoryWriter
+from ..data.whole_files import remove_leftovers
 from ..errors import DamagedFileError, SimulationError
 from ..laws import Mixture
 from ..rollouts import rollout
@@ -97,6 +98,7 @@ def run(
     h5py_module()
     fingerprint = scene.fingerprint()
     if resume and (summary := finished(folder, fingerprint)) is not None:
+        _remove_rest(folder)
         return summary
     with output_errors(folder):
         claim(folder, fingerprint, resume)
@@ -106,6 +108,7 @@ def run(
     layout = simulation.layout(source, fingerprint)
     with StopSignals() as stop, prompt_turns(), output_errors(folder), locked(folder), torch.no_grad():
         claim(folder, fingerprint, resume)  # again: another process may have been here before the lock
+        remove_leftovers(folder)
         prepare(folder, scene, layout, fingerprint)
         writer = simulation.open(folder, layout)
         try:
@@ -120,8 +123,14 @@ def run(
             writer.close(finished=simulation.frame == scene.frames)
         summary = simulation.summary(writer, time.perf_counter() - begin)
         record_summary(folder, summary)
-        (folder / CHECKPOINT).unlink(missing_ok=True)
+        _remove_rest(folder)
     return summary
+
+
+def _remove_rest(folder: Path) -> None:
+    """Remove what a complete run needs no more, and what a kill has left."""
+    (folder / CHECKPOINT).unlink(missing_ok=True)
+    remove_leftovers(folder)
 
 
 class Shown(NamedTuple):
