@@ -26,8 +26,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line.
 
     Returns:
-        The exit status: 0, 1 for a problem (described on stderr), 130 after Ctrl-C, and 143 after SIGTERM; a run, which
-        ends with a whole frame, has 130 after both.
+        The exit status: 0, 1 for a problem (described on stderr), 130 after Ctrl-C, and 143 after SIGTERM. A run that
+        stops at a frame returns 130 after both.
     """
     came: list[type[KeyboardInterrupt]] = []
     try:
@@ -37,7 +37,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt as error:
         return _ended(type(error))
     except Exception as error:
-        if came:  # a library has made an error of its own of it
+        if came:  # a library has turned the exception of the signal into another one
             return _ended(came[0])
         message = _message(error)
         if message is None:
@@ -55,15 +55,15 @@ def _ended(kind: type[KeyboardInterrupt]) -> int:
 
 
 AGAIN_SECONDS = 0.01
-"""After which what was raised in vain is raised again."""
+"""Delay until an exception that Python has dropped is raised again [s]."""
 
 
 @contextlib.contextmanager
 def signals_raise(came: list[type[KeyboardInterrupt]]) -> Iterator[None]:
-    """SIGTERM raises `Terminated` in the main thread, and SIGINT KeyboardInterrupt; elsewhere both end the process as
-    before. What is raised is added to a list.
+    """SIGTERM raises `Terminated` in the main thread, and SIGINT KeyboardInterrupt. Other threads change nothing.
 
-    Python prints and drops what is raised in destructors and in callbacks of weak references. It is raised again then.
+    The classes raised are appended to `came`. Python drops exceptions in destructors and in callbacks of weak
+    references; they are raised again.
     """
 
     def end(number: int, frame: FrameType | None) -> None:

@@ -1,4 +1,4 @@
-"""Signals that wait for the end of what must not be cut off, and exceptions that come later in the main thread."""
+"""Signals that are deferred to the end of a block, and exceptions that are raised in the main thread after a delay."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from types import FrameType
 from typing import Any
 
 RaiseLater = Callable[[type[BaseException], float], None]
-"""A function of an exception and the time until it is raised [s]; it replaces the one before."""
+"""Function of an exception class and the delay until it is raised [s]; each call replaces the previous one."""
 
 
 @contextlib.contextmanager
 def alarm() -> Iterator[RaiseLater]:
-    """A function that raises an exception in the main thread after some time, unless the context has ended before.
+    """Return a function that raises an exception in the main thread after a delay, unless the context has ended.
 
-    The function is to be called in the main thread, in handlers of signals too. It uses SIGALRM.
+    The function uses SIGALRM. Call it in the main thread; signal handlers may call it, where threads cannot be started.
     """
     previous: list[Any] = []
 
@@ -38,7 +38,7 @@ def alarm() -> Iterator[RaiseLater]:
 
 @contextlib.contextmanager
 def held_signals() -> Iterator[None]:
-    """SIGINT and SIGTERM wait for the end of the context; in other threads than the main one nothing is changed."""
+    """Defer SIGINT and SIGTERM to the end of the context. Outside the main thread nothing changes."""
     came: list[int] = []
     previous: dict[int, Any] = {}
     with contextlib.suppress(ValueError):  # not the main thread, which alone may handle signals

@@ -72,14 +72,14 @@ def _share(text: str) -> float:
 
 
 def path_argument(text: str) -> Path:
-    """The type of arguments that are paths: an empty one would be the current folder."""
+    """Argument type of paths. An empty path is refused: it would be the current folder."""
     if not text.strip():
         raise argparse.ArgumentTypeError(f"takes a path, got {text!r}")
     return Path(text)
 
 
 def folder_argument(text: str) -> Path:
-    """The type of arguments that are folders, which may have to be made."""
+    """Argument type of output folders, which need not exist."""
     path = path_argument(text)
     if path.exists() and not path.is_dir():
         raise argparse.ArgumentTypeError(f"takes a folder, and {path} is a file")

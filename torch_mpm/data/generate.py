@@ -38,7 +38,7 @@ from .workers import take_device, worker
 MOST_PACKERS = 6
 """Threads that compress: enough for one GPU, and more take Python's lock from the one that simulates."""
 WRITING_SECONDS = 0.7
-"""Time that a shard has to be written where generation ends early; it is simulated again then."""
+"""Time limit for writing a shard when generation ends early [s]; a shard that takes longer is simulated again later."""
 Progress = Callable[[dict[str, Any]], None]
 
 
@@ -185,7 +185,7 @@ class _Line:
                 self._wait(self._written)
 
     def _stop(self) -> None:
-        """End what is at work: after an error or a signal nobody needs it. A shard is kept if it is written soon."""
+        """Stop drawing and packing after an error or a signal. A shard that is written in time is kept."""
         self._drawer.stop()
         if self._written is not None:
             wait([self._written], WRITING_SECONDS)

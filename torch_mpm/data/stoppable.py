@@ -1,4 +1,4 @@
-"""An executor whose work can be stopped, so that a program ends soon after Ctrl-C."""
+"""A single-thread executor whose running task can be stopped, so that a program ends soon after Ctrl-C."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from typing import Any
 
 
 class Stopped(BaseException):
-    """Raised in work that is stopped."""
+    """Raised inside a task that is stopped."""
 
 
 class StoppableExecutor(ThreadPoolExecutor):
-    """A thread for work that only computes: `stop` ends it between two instructions of Python, wherever it is."""
+    """One thread for tasks without side effects, which `stop` ends between two Python instructions."""
 
     def __init__(self, name: str = "") -> None:
         super().__init__(1, name)
@@ -25,7 +25,7 @@ class StoppableExecutor(ThreadPoolExecutor):
         return super().submit(self._work, work, *arguments, **options)
 
     def stop(self) -> None:
-        """Cancel the work that waits, and raise `Stopped` in the thread that works. Does not wait for it."""
+        """Cancel pending tasks and raise `Stopped` in the running one, without waiting for its end."""
         self.shutdown(wait=False, cancel_futures=True)
         with self._turn:
             if self._working is not None:
@@ -38,5 +38,5 @@ class StoppableExecutor(ThreadPoolExecutor):
         try:
             return work(*arguments, **options)
         finally:
-            with self._turn:  # `stop` raises here at the latest, where a future still takes it
+            with self._turn:  # the last place where `stop` can raise: the future still catches it
                 self._working = None

@@ -15,7 +15,7 @@ from .requires import require
 from .shapes import Array
 
 NOTE = "torch_mpm"
-"""Key of the note in a file."""
+"""Key of the note in a PNG file."""
 
 
 @contextmanager
@@ -56,7 +56,7 @@ def write_png(path: str | os.PathLike[str], image: Array, width: int | None = No
 
 
 def note_of(path: str | os.PathLike[str]) -> str:
-    """The note that `write_png` has kept in a file; "" for none, and where there is no picture."""
+    """Return the note that `write_png` stored in a file; "" for a file without one or without a picture."""
     try:
         with require("PIL.Image").open(path) as picture:
             return str(picture.info.get(NOTE, ""))

@@ -88,7 +88,7 @@ class VideoWriter:
         codec = ["-c:v", "libx264", "-pix_fmt", "yuv420p", "-crf", f"{self.quality}", "-preset", "medium"]
         command = [self._ffmpeg, "-y", "-loglevel", "error", *source, "-an", *codec, "-movflags", "+faststart"]
         words = [*command, "-f", "mp4", str(temporary)]
-        with held_signals():  # an encoder that nobody knows would go on
+        with held_signals():  # otherwise an encoder could start that is never stopped
             self._process = subprocess.Popen(words, stdin=subprocess.PIPE, stderr=self._log)
 
     def _failure(self) -> RenderError:

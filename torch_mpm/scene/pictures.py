@@ -124,7 +124,7 @@ class _Artist:
         """Hash of everything that decides how a frame is drawn."""
 
     def _fit_radii(self, trajectory: Trajectory) -> None:
-        """Radii from the first frame with particles, whichever picture is drawn first."""
+        """Set the radii from the first frame with particles, whichever picture is drawn first."""
         missing = dict(enumerate(self.renderers))
         for frame in trajectory:
             for k, renderer in list(missing.items()):

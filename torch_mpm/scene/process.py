@@ -12,18 +12,18 @@ from typing import Any
 from ..interrupts import RaiseLater, alarm
 
 FRAME_SECONDS = 0.5
-"""Time that a frame has to end after a signal; what there is of it is dropped then."""
+"""Time limit of the current frame after a signal [s]; a frame that takes longer is discarded."""
 SWITCH_SECONDS = 1e-4
 """After which a thread that is busy in Python lets another one go on."""
 
 
 class StopSignals:
-    """SIGINT and SIGTERM ask to stop after the frame; a second SIGINT stops at once. A context manager.
+    """Context manager in which SIGINT and SIGTERM request a stop after the frame; a second SIGINT stops at once.
 
-    A signal that comes too late for that, after the last frame, is sent again at the end.
+    A signal after the last frame is sent again at the end of the context.
 
     Attributes:
-        asked: number of the last signal that has come; 0 for none.
+        asked: number of the last signal; 0 for none.
     """
 
     def __init__(self) -> None:
@@ -45,8 +45,7 @@ class StopSignals:
 
     @contextlib.contextmanager
     def within_frames(self) -> Iterator[None]:
-        """A context in which a frame that takes longer than `FRAME_SECONDS` after a signal ends with a
-        KeyboardInterrupt."""
+        """Context in which a signal raises KeyboardInterrupt after `FRAME_SECONDS`, unless the frame ends before."""
         with alarm() as self._raise_later:
             try:
                 yield

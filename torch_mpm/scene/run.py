@@ -128,7 +128,7 @@ def run(
 
 
 def _remove_rest(folder: Path) -> None:
-    """Remove what a complete run needs no more, and what a kill has left."""
+    """Remove the checkpoint of a complete run and incomplete files of killed processes."""
     (folder / CHECKPOINT).unlink(missing_ok=True)
     remove_leftovers(folder)
 
