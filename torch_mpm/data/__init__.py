@@ -37,7 +37,7 @@ _MODULES = {
     "pad": "windows",
     "simulator": "scene_simulator",
 }
-"""Imported where they are used: `import torch_mpm` should not wait for them."""
+"""Imported on first use: `import torch_mpm` should not wait for them."""
 
 __all__ = ["Trajectory", *_MODULES]
 

@@ -1,4 +1,4 @@
-"""Scenes of a shard simulated together, with one time step, without waiting for the device on the way."""
+"""Scenes of a shard simulated together, with one time step, without waiting for the device."""
 
 from __future__ import annotations
 
@@ -19,22 +19,22 @@ from ..topology import Status
 from .recording import Array, Recorded, Recording
 
 LOOK = 8
-"""Frames between two looks at the stability limit and the validity of the particles, and between two reorderings."""
+"""Frames between two checks of the stability limit and the validity of the particles, and between two reorderings."""
 MOST_SUBSTEPS = 100_000
-"""Of a frame; a scene that needs more fails."""
+"""Maximum number of substeps of a frame; a scene that needs more fails."""
 
 Told = Callable[[int], None]
-"""What is called with the number of each frame."""
+"""Function that is called with the number of each frame."""
 
 
 def substeps(built: Built, interval: float, cfl: float, dt: float | None = None) -> list[float]:
-    """Substeps that each scene [B] needs from frame to frame, at the start and at the speed of a fall.
+    """Number of substeps that each scene [B] needs per frame, at the start and at the speed of a fall.
 
     Args:
         built: the scenes.
-        interval: time from frame to frame [s].
+        interval: time between two frames [s].
         cfl: share of the stability limit.
-        dt: the longest step that is wanted [s], instead of `cfl`.
+        dt: upper bound of the time step [s], instead of `cfl`.
     """
     if dt is not None:
         return [math.ceil(interval / dt * (1 - 1e-9))] * built.grid.scenes
@@ -43,7 +43,9 @@ def substeps(built: Built, interval: float, cfl: float, dt: float | None = None)
 
 
 def _falling(built: Built) -> State:
-    """The state with the speed that a fall through the domain adds, so that a step is short enough later too."""
+    """State with the additional speed of a fall through the domain, so that the time step is also small enough
+    later.
+    """
     state, grid = built.state, built.grid
     gravity = built.step.gravity_like(state.x)
     if gravity is None or not len(state):
@@ -66,7 +68,7 @@ def particles_of(built: Built) -> list[int]:
 
 
 def shapes_of(names: Sequence[str], dim: int) -> dict[str, tuple[int, ...]]:
-    """Shape per particle of fields by their names."""
+    """Shape per particle of fields by name."""
     return {name: (dim,) * (1 if name in ("position", "velocity") else fields.RANKS[name]) for name in names}
 
 
@@ -85,16 +87,16 @@ def simulate(
     """Simulate all scenes of a batch.
 
     Args:
-        built: the scenes; their step is used up.
-        names: fields to keep, as `torch_mpm.scene.fields` names them.
-        frames: T, the first among them.
-        interval: time from frame to frame [s].
-        count: substeps from frame to frame.
+        built: the scenes; their step is consumed.
+        names: fields to store, with the names of `torch_mpm.scene.fields`.
+        frames: T, including the first.
+        interval: time between two frames [s].
+        count: substeps per frame.
         told: called after each frame has been queued.
-        executor, packed, behind: of `Recording`.
+        executor, packed, behind: as in `Recording`.
 
     Returns:
-        The fields of each scene, and why it failed; "" for a scene that is good.
+        Fields of each scene, and the reason of its failure; "" for a valid scene.
     """
     _leave_room(built)
     while True:
@@ -114,7 +116,7 @@ def _run(
     built: Built, recording: Recording, names: Sequence[str], frames: int, interval: float, count: int,
     told: Told | None,
 ) -> Tensor:  # fmt: skip
-    """Queue all frames; returns what surveys found, float64 [looks, 3, B] on the device."""
+    """Queue all frames; returns the results of surveys, float64 [surveys, 3, B] on the device."""
     step, state, surveys = built.step, step_ready(built), []
     order = torch.argsort(state.ids)  # type: ignore[arg-type]
     for frame in range(frames):
@@ -134,21 +136,21 @@ def _run(
 
 
 def step_ready(built: Built) -> State:
-    """The first state, in a step that has not gone wrong yet."""
+    """First state, in a step without recorded failures."""
     built.step.reset()
     return built.step.prepare(built.state)
 
 
 def _field(built: Built, state: State, name: str) -> Tensor:
-    """A field of all particles, in whatever batch they are: what a material lacks follows from what it has."""
+    """Field of all particles of a batch: missing fields of a material follow from its other fields."""
     if name in ("F", "J"):
         return _deformation(built, state, name)
     value = fields.field(built.step, state, name)
-    return state.mass.new_zeros(len(state)) if value is None else value  # nothing has melted
+    return state.mass.new_zeros(len(state)) if value is None else value  # Nothing has melted.
 
 
 def _deformation(built: Built, state: State, name: str) -> Tensor:
-    """F, which is J^(1/D) I of a law that has J alone, or J, which is det F of one that has F alone."""
+    """F, which is J^(1/D) I for a law of J, or J, which is det F for a law of F."""
     law, dim = built.step.law, built.grid.dim
     laws: list[Any] = list(law.laws) if isinstance(law, Mixture) else [law]
     value: Tensor | None = getattr(state, name)
@@ -167,17 +169,17 @@ def _deformation(built: Built, state: State, name: str) -> Tensor:
     return torch.where(has.reshape(-1, *(1,) * (value.dim() - 1)), value, other)
 
 
-# ---- room for blocks
+# ---- number of blocks
 
 
 def _leave_room(built: Built) -> None:
-    """Blocks for bodies that come apart, so that a device has not to be asked on the way."""
+    """Number of blocks for bodies that disintegrate, so that the device need not be queried during the simulation."""
     if built.grid.grows and built.state.x.is_cuda:
         built.grid.follow(2 * built.grid.pool(built.state.x, built.state.scene))
 
 
 def _had_room(built: Built) -> bool:
-    """Whether all particles had nodes in all steps; otherwise the pool has room for them now."""
+    """Whether all particles had nodes in all steps; otherwise the pool is enlarged."""
     grid, status = built.grid, built.step.status
     if status is None or grid.max_blocks is None or not grid.grows:
         return True
@@ -188,11 +190,11 @@ def _had_room(built: Built) -> bool:
     return False
 
 
-# ---- what went wrong
+# ---- failures
 
 
 def _failures(built: Built, surveys: Tensor, dt: float, frames: int) -> list[str]:
-    """Why each scene failed; "" for one that is good. Waits for the device."""
+    """Reason of the failure of each scene; "" for a valid one. Waits for the device."""
     texts: list[list[str]] = [[] for _ in range(built.grid.scenes)]
     for problem in built.step.failures().problems.values():
         for scene, number in enumerate(problem.count.tolist()):

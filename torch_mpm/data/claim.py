@@ -1,7 +1,7 @@
-"""Who works where in the folder of a data set: one configuration per folder, one process at a time per shard.
+"""Access to the folder of a data set: one configuration per folder, one process at a time per shard.
 
-A process that works on a shard has locked its byte of the file ``lock``. The lock ends with the process, however it
-ends. File systems without locks do not exclude other processes; then each takes the shards of its own rank alone.
+A process locks the byte of its shard in the file ``lock``. The lock ends with the process, however it ends. File
+systems without locks do not exclude other processes; then each process generates the shards of its rank only.
 """
 
 from __future__ import annotations
@@ -25,29 +25,30 @@ from .workers import Worker
 CONFIGURATION, LOCK = "config.toml", "lock"
 NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP, errno.EINVAL)
 TABLE = 2**40
-"""Byte that is locked while the folder is claimed, beyond those of all shards."""
+"""Byte that is locked during the claim of the folder, beyond those of all shards."""
 
 
 def output_errors(folder: Path) -> contextlib.AbstractContextManager[None]:
-    """What keeps this process from writing in a folder, as an OutputError."""
+    """Errors that prevent this process from writing in a folder, as an OutputError."""
     kept = "The shards written so far are whole; free some space and generate again to go on"
     return folder_errors(folder, kept)
 
 
 class Claim:
-    """A folder that a process works in: ``with Claim(folder, record, text, worker) as claim``.
+    """Folder that a process works in: ``with Claim(folder, record, text, worker) as claim``.
 
     Args:
-        folder: made where it does not exist.
-        record: what it holds, or shall hold. `record` of the claim is that of the folder, which may have been extended.
-        extend: total number of scenes by the name of a split, where the folder shall have more.
-        text: of the configuration.
+        folder: created where it does not exist.
+        record: its present or future content. `record` of the claim is that of the folder, which may have been
+            extended.
+        extend: total number of scenes by the name of a split, to extend the folder.
+        text: text of the configuration.
         worker: this process.
 
     Raises:
-        OutputError: for a folder that holds something else, or that cannot be written.
-        DamagedFileError: for a damaged dataset.json, and where links lead out of the folder.
-        MissingError, DatasetError: for `extend` with a split that is not there, or with fewer scenes than there are.
+        OutputError: for a folder with other content, or that cannot be written.
+        DamagedFileError: for a damaged dataset.json, and for links out of the folder.
+        MissingError, DatasetError: for `extend` with an unknown split, or with fewer scenes than there are.
     """
 
     def __init__(
@@ -91,7 +92,7 @@ class Claim:
         self._lock.close()
 
     def _refuse_others(self) -> None:
-        """Raise for a folder that holds anything but this data set, or nothing."""
+        """Raise for a folder with anything else than this data set."""
         if not self.folder.exists():
             return
         if not (self.folder / DATASET).is_file():
@@ -123,10 +124,10 @@ class Claim:
     # -- shards
 
     def unfinished(self, check: bool = False) -> Iterator[int]:
-        """The shards that nobody has finished or works on, each locked when it comes; `release` it.
+        """Shards that are neither finished nor locked by another process, each locked when it is yielded; `release` it.
 
         Args:
-            check: compare finished shards with their checksums, and take those that are damaged.
+            check: compare finished shards with their checksums, and yield damaged ones.
         """
         count, rank, size = self.record.shards, self.worker.rank, self.worker.size
         own = range(rank, count, size)
@@ -134,7 +135,7 @@ class Claim:
         for k in [*own, *others]:
             if self.is_finished(k, check) or (k not in own and not self._locks) or not self._locked(k):
                 continue
-            if self.is_finished(k, check):  # meanwhile, by another process
+            if self.is_finished(k, check):  # Finished by another process in the meantime.
                 self.release(k)
                 continue
             self._clean(k)
@@ -144,7 +145,7 @@ class Claim:
         self._unlock(shard)
 
     def is_finished(self, shard: int, check: bool = False) -> bool:
-        """Whether a shard has a record, and a file of the length in it, or with `check` of the bytes."""
+        """Whether a shard has a record and a file of the length in it, or with `check` of the recorded bytes."""
         if (shard, check) in self._whole:
             return True
         path = shard_path(self.folder, shard)
@@ -170,7 +171,7 @@ class Claim:
         return sum(len(self.record.ids(k)) for k in self.finished())
 
     def _clean(self, shard: int) -> None:
-        """Remove what is left of a shard that is not whole."""
+        """Remove the remains of an incomplete shard."""
         path = shard_path(self.folder, shard)
         record_path(path).unlink(missing_ok=True)
         for name in (path.name, record_path(path).name):
@@ -178,7 +179,7 @@ class Claim:
                 building.unlink(missing_ok=True)
 
     def _locked(self, byte: int, wait: bool = False) -> bool:
-        """Lock a byte of the lock; returns whether that was possible."""
+        """Lock a byte of the lock; returns whether this succeeded."""
         assert self._lock is not None
         if not self._locks:
             return True

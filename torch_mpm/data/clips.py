@@ -1,4 +1,4 @@
-"""What a viewer plays: the scenes of a run or of a data set, each as a whole."""
+"""Clips of the viewer: the scenes of a run or of a data set, each read completely."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from .stress import TENSORS, drawn_stress
 from .trajectory import Array, Trajectory
 
 COLORLESS = ("F", "C", "momentum", "position", "velocity", "von_mises_stress", *TENSORS)
-"""Arrays of particles that are no colours, or that have a name of their own as colours."""
+"""Arrays of particles that are not colours, or that have a separate name as colours."""
 
 
 @dataclass(frozen=True)
 class Clip:
-    """A scene as a whole.
+    """Complete scene.
 
     Attributes:
-        position: [T, N, D] (m), NaN for particles that are not there yet; relative to the origin of the run, so that
+        position: [T, N, D] (m), NaN for particles that are not present yet; relative to the origin of the run, so that
             float32 resolves it.
-        fields: what colours particles, by name: [T, N, ...] or [N].
-        interval: time from frame to frame [s].
+        fields: colours of particles by name: [T, N, ...] or [N].
+        interval: time between two frames [s].
     """
 
     position: Array
@@ -40,10 +40,10 @@ class Clip:
 
 
 class Source:
-    """A run or a data set to look at: ``scenes`` are names to choose from, ``clip(name)`` one of them.
+    """Source of a run or a data set: ``scenes`` are its names, ``clip(name)`` one of them.
 
     Raises:
-        FileNotFoundError: for a folder that holds neither.
+        FileNotFoundError: for a folder with neither.
         DatasetError: for a data set without a valid scene.
     """
 
@@ -66,14 +66,14 @@ class Source:
             raise DatasetError(f"{self.path} has no valid scene yet")
 
     def _positions(self) -> Array:
-        """Of a run, relative to its origin."""
+        """Positions of a run, relative to its origin."""
         return self.trajectory["position"] - self.trajectory.attributes.get("origin", 0)
 
     def _split(self, scene_id: int) -> str:
         return self.dataset.record.split_of(scene_id)
 
     def clip(self, name: str) -> Clip:
-        """A scene, read as a whole."""
+        """Read a scene completely."""
         return self._of_dataset(self.scenes[name]) if hasattr(self, "dataset") else self._of_run(self.scenes[name])
 
     def _of_dataset(self, scene_id: int) -> Clip:

@@ -5,9 +5,9 @@
     frames = 321
     interval = 0.0025
 
-    [grid] ...                       # and all other keys of a scene file that the scenes share
+    [grid] ...                       # and all other shared keys of a scene file
 
-    [material.sand]                  # what differs between scenes: gravity, materials, bodies and obstacles
+    [material.sand]                  # may differ between scenes, as gravity, bodies and obstacles
     law = "quartic_sand"
     E = { log_uniform = [1e5, 1e6] }
 
@@ -18,8 +18,8 @@
     size = [{ uniform = [0.1, 0.3] }, 0.2]
     material = "sand"
 
-Bodies and obstacles have the keys of scene files, and `count`. In place of the corners of a box there may be its
-`center` and `size`, and in place of the ends of a capsule or a cylinder its `center` and its `axis` from end to end.
+Bodies and obstacles have the keys of scene files, and `count`. A box may have `center` and `size` instead of corners, a
+capsule or a cylinder `center` and `axis`, from end to end, instead of its ends.
 """
 
 from __future__ import annotations
@@ -47,9 +47,9 @@ from .stress import MEASURES
 from .whole_files import NAME
 
 FORMAT = 2
-"""Raised where the same configuration would give other scenes."""
+"""Version, increased whenever the same configuration would give other scenes."""
 VARIED = ("gravity", "material", "body", "obstacle")
-"""Keys of a scene file that may differ from scene to scene."""
+"""Keys of a scene file that may differ between scenes."""
 ABSENT = {
     "duration": "give [dataset] frames and interval instead",
     "fps": "give [dataset] frames and interval instead",
@@ -62,7 +62,7 @@ ABSENT = {
 }
 COSMETIC = ("title", "device")
 PARTICLE_TYPES = {"weakly_compressible": 5, "quartic_sand": 6}
-"""DeepMind's codes by law: water and sand; whatever else is goop."""
+"""DeepMind's codes by law: water and sand; all others are goop."""
 GOOP = 7
 
 Name = Annotated[str, Field(pattern=f"^{NAME.pattern}$")]
@@ -70,7 +70,7 @@ Code = Annotated[int, Field(ge=0, le=8)]
 
 
 class Dataset(schema.Model):
-    """What is generated of a distribution."""
+    """Table `[dataset]` of a configuration."""
 
     splits: Annotated[dict[Name, Annotated[int, Field(ge=0)]], Field(min_length=1)]
     """numbers of scenes by the name of a split, such as { train = 1000, valid = 30, test = 30 }"""
@@ -103,10 +103,10 @@ class Configuration:
     Attributes:
         words: all keys of the file.
         dataset: its table `[dataset]`.
-        text: the file as given, below comments with the overrides; or the words as JSON where there is no file.
-        folder: where names of files start.
+        text: the file unchanged, below comments with the overrides; or the words as JSON without a file.
+        folder: folder to which file names are relative.
         source: name of the file, for messages.
-        hash: of everything that determines the scenes; 64 hexadecimal digits.
+        hash: hash of everything that determines the scenes; 64 hexadecimal digits.
     """
 
     words: Words
@@ -125,7 +125,7 @@ class Configuration:
             overrides: as for `Scene.load`, such as ``dataset.frames=20``.
 
         Raises:
-            SceneError: with one line for each thing that is wrong.
+            SceneError: with one line for each problem.
             FileNotFoundError: when there is no such file.
         """
         path = Path(path)
@@ -148,7 +148,7 @@ class Configuration:
     def from_words(
         cls, words: Words, overrides: list[str] | None = None, folder: Path = Path(), source: str = "", text: str = ""
     ) -> Configuration:
-        """A configuration from nested dictionaries; arguments and errors as for `load`."""
+        """Configuration of nested dictionaries; arguments and errors as for `load`."""
         words = copy.deepcopy(words)
         try:
             for item in overrides or []:
@@ -182,7 +182,7 @@ class Configuration:
         return found
 
     def scene_words(self, *contents: Words) -> Words:
-        """The scene file of one content, or of the batch of several, as `torch_mpm.data.sampling` draws them."""
+        """Scene file of one content, or of the batch of several, as drawn by `torch_mpm.data.sampling`."""
         dataset = self.dataset
         time = {"duration": (dataset.frames - 1) * dataset.interval, "fps": 1 / dataset.interval}
         shared = {key: value for key, value in self.words.items() if key not in (*VARIED, "dataset")}
@@ -193,7 +193,7 @@ class Configuration:
         """The scene of `scene_words`.
 
         Raises:
-            SceneError: for what is wrong in them.
+            SceneError: for problems in them.
         """
         return Scene.from_words(self.scene_words(*contents), folder=self.folder, source=self.source)
 
@@ -225,10 +225,10 @@ def _presets() -> Any:
 
 
 def _checked(words: Words) -> Dataset:
-    """The table [dataset] of words in which nothing is wrong that can be seen without a sample.
+    """Table [dataset] of words without problems that are visible without a sample.
 
     Raises:
-        SceneError: for what is wrong.
+        SceneError: for problems.
     """
     problems = [f"{key}: is not for data sets; {remedy}" for key, remedy in ABSENT.items() if key in words]
     problems += text_problems(words)
@@ -247,7 +247,7 @@ def _checked(words: Words) -> Dataset:
     try:
         grid = schema.Grid(**words["grid"])
     except (ValidationError, KeyError, TypeError):
-        grid = None  # which the first sample will tell
+        grid = None  # The first sample will show it.
     if grid is not None:
         for key in VARIED:
             problems += distribution.problems(words.get(key), key, len(grid.lower))
@@ -276,7 +276,7 @@ def _checked(words: Words) -> Dataset:
 
 def _hash(words: Words, folder: Path) -> str:
     kept = {key: value for key, value in words.items() if key not in COSMETIC}
-    measure = MEASURES["stress"] if "stress" in words["dataset"].get("fields", []) else ""  # once another one
+    measure = MEASURES["stress"] if "stress" in words["dataset"].get("fields", []) else ""  # Only after another one.
     digest = hashlib.sha256(f"{FORMAT} {measure}{json.dumps(kept)}".encode())
     for key, name in _files(words.get("body"), "body"):
         try:

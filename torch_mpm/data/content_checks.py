@@ -1,4 +1,4 @@
-"""Checks of what differs between the scenes of a configuration, as far as they need no sample."""
+"""Checks of the differing parts of a configuration that need no sample."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from .distribution import CHOICE, Words, is_distribution, is_number
 
 LISTS = ("body", "obstacle")
 VECTORS = ("center", "size", "axis", "lower", "upper", "a", "b", "velocity", "normal")
-"""Keys of bodies and obstacles with a number for each axis."""
+"""Keys of bodies and obstacles with a number per axis."""
 
 
 def shape_problems(words: Words) -> Iterator[str]:
-    """One line for each body, obstacle or material that is no table, and for dates anywhere."""
+    """One line for each body, obstacle or material that is not a table, and for any date."""
     for key in LISTS:
         items = words.get(key, [])
         if not isinstance(items, list):
@@ -34,10 +34,10 @@ def shape_problems(words: Words) -> Iterator[str]:
 
 
 def value_problems(words: Words, particles: bool, obstacles: bool) -> Iterator[str]:
-    """One line for each value that data sets cannot have, of words without `shape_problems`.
+    """One line for each value that data sets do not support, for words without `shape_problems`.
 
     Args:
-        words: of the configuration.
+        words: words of the configuration.
         particles: whether the number of particles of a scene is given.
         obstacles: whether obstacles are in the data.
     """
@@ -74,12 +74,13 @@ def _vector_problems(words: Words) -> Iterator[str]:
 
 
 def _is_table(item: Any) -> bool:
-    """Whether words give a table, whichever of them is chosen."""
+    """Whether words give a table for every choice."""
     if not isinstance(item, dict):
         return False
     if CHOICE in item:
         choices = item[CHOICE]
-        return not isinstance(choices, list) or all(map(_is_table, choices))  # another check tells of no list
+        # Another check reports a value that is not a list.
+        return not isinstance(choices, list) or all(map(_is_table, choices))
     return not is_distribution(item)
 
 
@@ -95,7 +96,7 @@ def _is_count(count: Any) -> bool:
 
 
 def _values(item: Any, key: str) -> list[Any]:
-    """All values that a key of a table may have: its own, those of its choices and those of chosen tables."""
+    """All possible values of a key of a table: its own, those of its choices and those of chosen tables."""
     if not isinstance(item, dict):
         return []
     found = _chosen(item[key]) if key in item else []

@@ -7,12 +7,12 @@ A distribution is a table with one key, its name:
 | `{ uniform = [a, b] }` | a number between a and b |
 | `{ log_uniform = [a, b] }` | a number between a and b > a > 0, whose logarithm is uniform |
 | `{ normal = [mean, deviation] }` | a Gaussian number |
-| `{ integers = [a, b] }` | a whole number from a to b, both included |
-| `{ choice = [...], weights = [...] }` | one of any words, distributions among them; all alike without weights |
+| `{ integers = [a, b] }` | an integer from a to b, both included |
+| `{ choice = [...], weights = [...] }` | one of any words, also distributions; equal probabilities without weights |
 | `{ in_box = [[...], [...]] }` | a point of the box between two corners |
 | `{ direction = length }` | a vector of any direction; the length is a number or a distribution |
 
-`choice` beside other keys of a table adds the keys of the table that is chosen to them.
+`choice` beside other keys of a table adds the keys of the chosen table to them.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ CHOICE, WEIGHTS = "choice", "weights"
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of distribution: what it takes, in words and as a test of its argument, and a sample of it."""
+    """A kind of distribution: description and test of its argument, and its sampling function."""
 
     takes: str
     fits: Callable[[Any, int], bool]
@@ -105,7 +105,7 @@ KINDS = {
 
 
 def is_distribution(words: Any) -> bool:
-    """Whether words are a table with the name of a distribution, and nothing else but weights."""
+    """Whether words are a table with the name of a distribution and no other key but weights."""
     if not isinstance(words, dict) or not words:
         return False
     names = set(words) - ({WEIGHTS} if CHOICE in words else set())
@@ -113,11 +113,11 @@ def is_distribution(words: Any) -> bool:
 
 
 def sample(words: Any, rng: np.random.Generator, dim: int) -> Any:
-    """Words with a value in place of each distribution.
+    """Words with a sample in place of each distribution.
 
     Args:
         words: tables, lists and values without `problems`.
-        rng: what the sample depends on, with the words.
+        rng: random numbers; the sample depends on them and the words only.
         dim: dimension of the domain, that of random vectors.
     """
     if isinstance(words, list):
@@ -156,7 +156,7 @@ def problems(words: Any, path: str, dim: int) -> Iterator[str]:
         elif len(words) == 1 and (near := difflib.get_close_matches(str(*words), [CHOICE, *KINDS], 1, 0.7)):
             if near[0] not in words:
                 yield f"{path}: unknown distribution {next(iter(words))!r}; did you mean {near[0]!r}?"
-        elif CHOICE not in words:  # which may stand beside other keys
+        elif CHOICE not in words:  # This may be beside other keys.
             lists = [str(key) for key, value in words.items() if isinstance(value, list)]
             for key in difflib.get_close_matches(CHOICE, lists, 1, 0.6):
                 yield f"{path}.{key}: unknown key; did you mean {CHOICE!r}?"
@@ -180,7 +180,7 @@ def _choice_problems(words: Words, path: str) -> Iterator[str]:
 
 
 def narrowed(words: Any, path: str = "") -> Iterator[tuple[str, Any]]:
-    """Words in which one choice has one of its entries alone, for every entry of every choice, with its key."""
+    """Words in which one choice has only one of its entries, for every entry of every choice, with its key."""
     if isinstance(words, list):
         for k, item in enumerate(words):
             for key, other in narrowed(item, f"{path}[{k}]"):

@@ -49,12 +49,12 @@ def export_ply(run: str | Path, out: str | Path | None = None) -> Path:
 
 
 def write_vtk(frames: Iterable[dict[str, Array]], folder: Path, measures: Mapping[str, str]) -> Path:
-    """Write frames, as :meth:`Trajectory.frame` gives them, into a folder; returns ``run.pvd``.
+    """Write frames in the form of :meth:`Trajectory.frame` into a folder; returns ``run.pvd``.
 
     Args:
         frames: arrays by name.
-        folder: where to write.
-        measures: of each stress, "Cauchy" or "Kirchhoff".
+        folder: output folder.
+        measures: measure of each stress, "Cauchy" or "Kirchhoff".
     """
     collection = ElementTree.Element("VTKFile", type="Collection", version="0.1")
     listing = ElementTree.SubElement(collection, "Collection")
@@ -75,7 +75,7 @@ def write_vtk(frames: Iterable[dict[str, Array]], folder: Path, measures: Mappin
 
 
 def write_ply(frames: Iterable[dict[str, Array]], folder: Path) -> Path:
-    """Write frames, as :meth:`Trajectory.frame` gives them, into a folder, which is returned."""
+    """Write frames in the form of :meth:`Trajectory.frame` into a folder, which is returned."""
     for k, frame in enumerate(frames):
         velocity = _three_dimensional(frame["velocity"])
         data = {f"v{axis}": velocity[:, i] for i, axis in enumerate("xyz")}
@@ -131,6 +131,6 @@ def _three_dimensional(value: Array, last: Array | float = 0.0) -> Array:
 
 
 def _stress(name: str, measure: str, fields: Mapping[str, Array]) -> Array:
-    """A stress, with its out-of-plane component where that is known."""
+    """A stress, with its out-of-plane component where known."""
     known = measure == CAUCHY and "out_of_plane_stress" in fields
     return _three_dimensional(fields[name], fields["out_of_plane_stress"] if known else np.nan)

@@ -1,4 +1,4 @@
-"""Scenes that failed: their reasons, counted, and whether a data set has too many of them."""
+"""Failed scenes: counted reasons, and the decision whether a data set has too many of them."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ from collections.abc import Iterable
 from .shard import SceneRecord
 
 MOST_FAILED = 0.25
-"""Share of the scenes that may fail before a data set counts as failed."""
+"""Maximum share of failed scenes of a valid data set."""
 MOST_REASONS = 5
-"""Reasons that are listed."""
+"""Maximum number of listed reasons."""
 
 
 class FailedScenesError(ValueError):
-    """A data set without a valid scene, or in which too many scenes have failed."""
+    """A data set without a valid scene, or with too many failed scenes."""
 
 
 def reasons(scenes: Iterable[SceneRecord]) -> list[str]:
-    """One line for each reason for which scenes failed, the most frequent first, with the number of its scenes.
+    """One line for each reason of failures, the most frequent first, with its number of scenes.
 
-    Reasons that differ in numbers alone are one; the line has the first of them.
+    Reasons that differ only in numbers are merged; the line has the first of them.
     """
     counts: Counter[str] = Counter()
     examples: dict[str, str] = {}
@@ -39,8 +39,8 @@ def check_failures(scenes: list[SceneRecord], most: float = MOST_FAILED) -> None
     """Raise where no scene is valid, or a larger share than `most` has failed.
 
     Args:
-        scenes: those that were attempted.
-        most: share of them, within 0 and 1.
+        scenes: the attempted scenes.
+        most: maximum share of failed scenes, between 0 and 1.
 
     Raises:
         FailedScenesError: with the reasons.

@@ -1,4 +1,4 @@
-"""Figures that show what is in a data set: sizes, motions, energies, failures, and what was drawn."""
+"""Figures of the content of a data set: sizes, motions, energies, failures, and drawn values."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from .shard import Array, StoredScene
 from .statistics import BOUNDARY
 
 SAMPLED = 32
-"""Scenes that are read for motions and energies, at most."""
+"""Maximum number of scenes that are read for motions and energies."""
 RESOLUTION = (1500, 1100)
 MOST_PARAMETERS = 3
 
 
 def summary(dataset: str | Path | DatasetFolder) -> dict[str, Any]:
-    """Numbers about a data set, from its records alone: scenes, failures and particles of each split, statistics."""
+    """Summary of a data set, from its records only: scenes, failures and particles of each split, statistics."""
     data = dataset if isinstance(dataset, DatasetFolder) else DatasetFolder(dataset)
     words: dict[str, Any] = {}
     for split in data.record.splits:
@@ -43,10 +43,10 @@ def draw_statistics(dataset: str | Path | DatasetFolder, out: str | Path | None 
 
     Args:
         dataset: folder of the data set.
-        out: the picture, whose folder is made; ``statistics.png`` in the folder of the data set by default.
+        out: the picture, whose folder is created; ``statistics.png`` in the folder of the data set by default.
 
     Raises:
-        DatasetError: for a data set without a valid scene, or a picture that is no PNG file.
+        DatasetError: for a data set without a valid scene, or a picture that is not a PNG file.
         DamagedFileError: for a scene that is damaged.
         ImportError: when matplotlib is missing (extra ``render``).
     """
@@ -82,7 +82,7 @@ def draw_statistics(dataset: str | Path | DatasetFolder, out: str | Path | None 
 
 
 def _free(scene: StoredScene, values: Array) -> Array:
-    """Of the particles that do not move as prescribed."""
+    """Values of the particles without prescribed motion."""
     return values[:, scene["particle_type"] != BOUNDARY] if "particle_type" in scene else values
 
 
@@ -97,7 +97,7 @@ def _histogram(axes: Any, values: Array, label: str, log: bool = False) -> None:
 
 
 def _edges(values: Array, bins: int) -> Array:
-    """Edges of bins from the least value to the largest, wider than rounding where these are nearly the same."""
+    """Edges of bins from the smallest value to the largest, wider than rounding where these are nearly equal."""
     lower, upper = float(values.min()), float(values.max())
     margin = max(0.0, 1e-6 * max(abs(lower), abs(upper), 1e-30) - (upper - lower))
     return np.linspace(lower - margin, upper + margin, bins + 1)
@@ -112,7 +112,7 @@ def _draw_counts(axes: Any, data: DatasetFolder) -> None:
 
 
 def _draw_outcomes(axes: Any, data: DatasetFolder) -> None:
-    """Scenes of each split by what became of them."""
+    """Number of scenes of each split by outcome."""
     splits, bottom = list(data.record.splits), np.zeros(len(data.record.splits))
     kinds = {
         "valid": lambda s: s.valid and s.attempts == 1,
@@ -144,7 +144,7 @@ def _draw_energies(axes: Sequence[Any], scenes: list[StoredScene], velocities: l
 
 
 def _draw_parameters(axes: Sequence[Any], scenes: list[StoredScene]) -> None:
-    """What differs most often between the scenes, of the numbers of their materials and gravity."""
+    """Numeric parameters of materials and gravity that differ most often between the scenes."""
     found: dict[str, list[float]] = {}
     for scene in scenes:
         for name, value in _parameters(scene):

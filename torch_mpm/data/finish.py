@@ -1,4 +1,4 @@
-"""What follows a data set that is complete: its metadata, and a check of all that is in it."""
+"""Finalisation of a complete data set: its metadata, and a check of its content."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ from .shard import REMEDY, SceneRecord, Shard, ShardRecord, StoredScene, record_
 from .statistics import BOUNDARY, Motion, motion_sums
 
 STATISTICS = 1e-9
-"""Relative difference of sums of a scene that is rounding."""
+"""Relative difference of sums of a scene that is explained by rounding."""
 GAIN = 0.05
-"""Of its mechanical energy above that of rest on the floor, a scene may gain no more than this share."""
+"""Maximum relative gain of the mechanical energy of a scene above that of rest on the floor."""
 
 
 class IncompleteError(ValueError):
-    """A data set that lacks shards, or of which no scene is good."""
+    """A data set with missing shards, or without a valid scene."""
 
 
 def finalize(folder: str | Path) -> dict[str, Any]:
-    """Merge the statistics of all shards into ``metadata.json``; the same again gives the same file.
+    """Merge the statistics of all shards into ``metadata.json``; repeated calls write the same file.
 
     Returns:
-        What metadata.json says.
+        Content of metadata.json.
 
     Raises:
         IncompleteError: for a data set that is not complete.
@@ -50,10 +50,10 @@ def finalize(folder: str | Path) -> dict[str, Any]:
 
 
 def _check_files(dataset: DatasetFolder) -> None:
-    """Compare the finished shards with what they should be, without reading them.
+    """Check the list of finished shards, without reading them.
 
     Raises:
-        DamagedFileError: for one that is gone, of another size, of other scenes, or too much.
+        DamagedFileError: for a shard that is missing, of another size, of other scenes, or superfluous.
     """
     record = dataset.record
     for index in dataset.finished:
@@ -68,7 +68,7 @@ def _check_files(dataset: DatasetFolder) -> None:
 
 
 def verify(folder: str | Path) -> Iterator[str]:
-    """All that is wrong with the finished shards of a data set, one line each.
+    """All problems of the finished shards of a data set, one line each.
 
     Every file is compared with its checksum and every scene with its hash; the positions of a valid scene must be
     finite and in the domain, other fields finite, and its energy must not grow.
@@ -134,11 +134,12 @@ def _scene_problems(stored: StoredScene, told: SceneRecord, record: DatasetRecor
 
 
 def _same_motion(found: Motion, told: Motion | None) -> bool:
-    """Whether sums agree: those of a device add up in another order, by far less than `STATISTICS`."""
+    """Whether sums agree: those of a device are added in another order, with differences far below `STATISTICS`."""
     if told is None:
         return False
     for a, b in ((found.velocity, told.velocity), (found.acceleration, told.acceleration)):
-        scale = np.sqrt(np.maximum(np.array(a.squares) * a.count, 1e-300))  # bounds |sum|, by Cauchy and Schwarz
+        # Bound of |sum|, by the Cauchy-Schwarz inequality.
+        scale = np.sqrt(np.maximum(np.array(a.squares) * a.count, 1e-300))
         if a.count != b.count or len(a.sum) != len(b.sum) or len(a.squares) != len(b.squares):
             return False
         if not np.all(np.abs(np.subtract(a.sum, b.sum)) <= STATISTICS * scale):
@@ -149,11 +150,11 @@ def _same_motion(found: Motion, told: Motion | None) -> bool:
 
 
 def energy_gain(stored: StoredScene, arrays: Any, record: DatasetRecord) -> float | None:
-    """Largest gain of kinetic and potential energy over the first frame, as a share of it; None where energy may come
-    in: by moving obstacles or heat.
+    """Largest gain of kinetic and potential energy over the first frame, as a share of it; None where energy may enter:
+    by moving obstacles or heat.
 
-    A body starts without elastic energy, so that its mechanical energy can only fall. Heights are those above the
-    floor, the lowest corner of the domain. Without velocities those between frames are taken.
+    A body starts without elastic energy, so that its mechanical energy can only decrease. Heights are measured from the
+    floor, the lowest corner of the domain. Without stored velocities those between frames are used.
     """
     words = stored.words
     if "heat" in words or any("velocity" in o or "spin" in o for o in words.get("obstacle", [])):

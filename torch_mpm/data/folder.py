@@ -1,4 +1,4 @@
-"""The folder of a data set: what ``dataset.json`` says about it, and its finished scenes."""
+"""Folder of a data set: the content of ``dataset.json``, and its finished scenes."""
 
 from __future__ import annotations
 
@@ -23,40 +23,40 @@ from .whole_files import NAME, check_inside, check_record, count, write_record
 
 FORMAT = 2
 FORMAT_WITHOUT_CHECKSUM = 1
-"""Of records that were written before records had checksums."""
+"""Format of records that were written before records had checksums."""
 DATASET = "dataset.json"
 MOST_SHARDS = 10**6
-"""Of a data set, and scenes of a shard."""
+"""Limits of a data set, and of the scenes of a shard."""
 MOST_OPEN = 32
-"""Shards, and scenes of them, that a reader keeps open."""
+"""Number of shards, and of their scenes, that a reader keeps open."""
 
 
 LINKED = "copy what it links to into the folder, or link the folder as a whole"
 
 
 class DatasetError(ValueError):
-    """A data set does not have what is asked for."""
+    """The data set lacks the requested item."""
 
 
 class MissingError(KeyError):
-    """There is no such split or scene."""
+    """Unknown split or scene."""
 
     def __str__(self) -> str:
-        return str(self.args[0])  # KeyError would quote it
+        return str(self.args[0])  # KeyError would quote the message.
 
 
 @dataclass(frozen=True)
 class DatasetRecord:
-    """What ``dataset.json`` says, written once, before the first scene.
+    """Content of ``dataset.json``, written once, before the first scene.
 
     Attributes:
-        configuration: hash of all that decides the content.
+        configuration: hash of everything that determines the content.
         splits: first scene id and number of scenes of each split.
-        added: name of a split, first scene id and number of scenes that it was extended by, in the order of the ids.
-        frames: T of every scene, the first frame included; ``frame_interval`` [s] apart.
+        added: name of a split, first scene id and number of added scenes, in the order of the ids.
+        frames: T of every scene, including the first frame; ``frame_interval`` [s] apart.
         lower, upper: bounds of the domain [D] (m).
-        dx: distance of the nodes of the grid [m].
-        fields: arrays [T, N, ...] of every scene, ``position`` among them.
+        dx: node distance of the grid [m].
+        fields: arrays [T, N, ...] of every scene, including ``position``.
         device: "cpu" or "cuda", whose results differ by rounding.
     """
 
@@ -81,7 +81,7 @@ class DatasetRecord:
 
     @property
     def scenes(self) -> int:
-        """Of all splits."""
+        """Number of scenes of all splits."""
         return sum(count for _, _, count in self.ranges)
 
     @property
@@ -100,7 +100,7 @@ class DatasetRecord:
         return [k for _, first, count in self.ranges for k in range(max(first, begin), min(first + count, end))]
 
     def missing(self, finished: Sequence[int]) -> str:
-        """Which shards are not among those that are finished, in words; "" for none."""
+        """Missing shards in words; "" for none."""
         there = {index for index in finished if index < self.shards}
         number = self.shards - len(there)
         first = itertools.islice((f"shard_{k:05d}" for k in range(self.shards) if k not in there), 10)
@@ -112,13 +112,13 @@ class DatasetRecord:
         return sum(count for name, _, count in self.ranges if name == split)
 
     def extended(self, totals: Mapping[str, int]) -> DatasetRecord:
-        """The record with more scenes, which are in shards of their own.
+        """Record extended by more scenes, which are in separate shards.
 
         Args:
-            totals: number of scenes by the name of a split, in all; no less than there are.
+            totals: total number of scenes by the name of a split, not less than at present.
 
         Raises:
-            MissingError: for a split that is not there.
+            MissingError: for an unknown split.
             DatasetError: for fewer scenes than there are, or more shards than `MOST_SHARDS`.
         """
         record = self
@@ -145,15 +145,15 @@ class DatasetRecord:
         raise MissingError(f"the data set has no scene {scene_id}")
 
     def write(self, folder: Path) -> None:
-        """Write it; it appears when it is whole and on the disk."""
+        """Write the record; it appears when it is complete and on the disk."""
         write_record(folder / DATASET, {"format": FORMAT, **asdict(self)})
 
     @classmethod
     def read(cls, folder: Path) -> DatasetRecord:
         """
         Raises:
-            FileNotFoundError: for a folder that holds no data set.
-            DamagedFileError: for a file that is not as it was written.
+            FileNotFoundError: for a folder without a data set.
+            DamagedFileError: for a file that was changed.
         """
         path, remedy = folder / DATASET, "restore it, or generate the data set again"
         if not path.is_file():
@@ -166,7 +166,7 @@ class DatasetRecord:
             if words["format"] == FORMAT:
                 check_record(words, path, remedy)
             words.pop("format")
-            words.pop("connectivity_radius", None)  # of some folders; it was never set
+            words.pop("connectivity_radius", None)  # Present in some folders; it was never set.
             words["seed"] = int(words["seed"])
             for name in ("scenes_per_shard", "frames"):
                 words[name] = count(words[name], 1)
@@ -209,13 +209,13 @@ def finished_shards(folder: Path) -> list[int]:
 class DatasetFolder:
     """A data set on disk, finished or still growing: ``DatasetFolder("out/sand")``.
 
-    Scenes that failed and shards that are not finished do not appear in it. It opens files when they are read, in each
-    process its own, so that it can be copied to the workers of a data loader.
+    Failed scenes and unfinished shards are invisible. Files are opened when they are read, separately in each process,
+    so that the object can be copied to the workers of a data loader.
 
     Raises:
-        FileNotFoundError: for a folder that holds no data set.
-        DamagedFileError: for records that are damaged; later, where damaged scenes are read.
-        MissingError: a KeyError, of methods, for a split or a scene that is not there.
+        FileNotFoundError: for a folder without a data set.
+        DamagedFileError: for damaged records; later, where damaged scenes are read.
+        MissingError: a KeyError, in methods, for an unknown split or scene.
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -233,7 +233,7 @@ class DatasetFolder:
         return record
 
     def _shard_path(self, shard: int) -> Path:
-        """The file of a shard, which like its record must be in this folder."""
+        """File of a shard, which like its record must be in this folder."""
         path = shard_path(self.path, shard)
         for own in (path, record_path(path)):
             check_inside(self.path, own, LINKED)
@@ -247,7 +247,7 @@ class DatasetFolder:
         return [s for s in self.attempted(split) if s.valid]
 
     def attempted(self, split: str | None = None) -> list[SceneRecord]:
-        """The same with those that failed."""
+        """All scenes of a split, or of all splits, including failed ones."""
         if split is None:
             return [self._scenes[k][1] for k in sorted(self._scenes)]
         if split not in self.record.splits:
@@ -270,13 +270,13 @@ class DatasetFolder:
         """Compare all finished shards with their checksums.
 
         Raises:
-            DamagedFileError: for one that has changed since it was written.
+            DamagedFileError: for a shard that was changed.
         """
         for index in self.finished:
             Shard(self._shard_path(index), check=True).close()
 
     def close(self) -> None:
-        """Close its files; reading opens them again."""
+        """Close the files; they are opened again when read."""
         self._cache.close()
 
 
@@ -289,7 +289,7 @@ def velocity_of(scene: StoredScene, interval: float) -> Array:
 
 
 class _OpenFiles:
-    """The shards and scenes that this process has read last. A forked process starts with none."""
+    """Most recently read shards and scenes of this process. A forked process starts with none."""
 
     def __init__(self) -> None:
         self._process = os.getpid()
@@ -297,7 +297,7 @@ class _OpenFiles:
         self._scenes: OrderedDict[int, StoredScene] = OrderedDict()
 
     def scene(self, path: Path, scene_id: int, record: DatasetRecord) -> StoredScene:
-        if self._process != os.getpid():  # files of the parent are left to it
+        if self._process != os.getpid():  # Files of the parent remain open there.
             self.__init__()  # type: ignore[misc]
         shard = self._shard(path)
         if scene_id not in self._scenes:
@@ -317,7 +317,7 @@ class _OpenFiles:
             self._shards[path] = Shard(path)
         self._shards.move_to_end(path)
         while len(self._shards) > MOST_OPEN:
-            # Not closed here: HDF5 closes the file after the last of its scenes that somebody still reads.
+            # Not closed here: HDF5 closes the file after the last of its scenes in use.
             for scene_id in self._shards.popitem(last=False)[1].ids:
                 self._scenes.pop(scene_id, None)
         return self._shards[path]

@@ -1,8 +1,7 @@
-"""Generate a data set: shards that are drawn, simulated and written, each of these while the others go on.
+"""Generation of data sets: shards are drawn, simulated and written concurrently.
 
-What a shard holds follows from the configuration and the number of the shard alone: its scenes are always simulated
-together, with one time step, so it does not matter which process makes it, or when. (On GPUs that is exact where
-``grid.deterministic`` is set.)
+The content of a shard depends on the configuration and the number of the shard only: its scenes are always simulated
+together, with one time step, in any process and order. (On GPUs this is exact where ``grid.deterministic`` is set.)
 """
 
 from __future__ import annotations
@@ -51,28 +50,27 @@ def generate(
     progress: Progress | None = None,
     extend: Mapping[str, int] | None = None,
 ) -> dict[str, Any]:
-    """Generate what is missing of a data set, together with the other processes that do so.
+    """Generate the missing parts of a data set, together with other processes.
 
     Args:
-        configuration: what to generate.
-        out: folder, made where it does not exist.
+        configuration: the configuration.
+        out: folder, created where it does not exist.
         device: "auto", "cpu", "cuda" or "cuda:1"; see `torch_mpm.data.workers.take_device`.
-        check: compare shards that are there with their checksums, and make damaged ones anew.
-        progress: called with a dictionary of figures while frames are computed: scenes and those that failed so far,
-            frames of all scenes so far, and those that were missing at the start.
-        extend: total number of scenes by the name of a split, where the folder shall have more than it has. The new
-            ones have ids and shards of their own; the scenes that are there stay as they are.
+        check: compare existing shards with their checksums, and regenerate damaged ones.
+        progress: called with a dictionary of numbers while frames are computed: scenes and failed scenes so far, frames
+            of all scenes so far, and frames that were missing at the start.
+        extend: total number of scenes by the name of a split, to extend the folder. New scenes have separate ids and
+            shards; existing scenes are unchanged.
 
     Returns:
-        A summary: of this process the scenes, those of them that failed, and seconds; and whether the data set is
-        complete.
+        A summary: scenes, failed scenes and seconds of this process; and whether the data set is complete.
 
     Raises:
-        WorkerError: for a process without a device or a sensible rank.
-        SceneError: for a configuration of which no scene can be made.
-        MissingError, DatasetError: for `extend` with a split that is not there, or with fewer scenes than there are.
-        OutputError: for a folder that holds something else, or a full disk.
-        SimulationError: where the device has no memory for the scenes of a shard.
+        WorkerError: for a process without a device or a valid rank.
+        SceneError: for a configuration without possible scenes.
+        MissingError, DatasetError: for `extend` with an unknown split, or with fewer scenes than there are.
+        OutputError: for a folder with other content, or a full disk.
+        SimulationError: where the device memory is insufficient for the scenes of a shard.
     """
     begin, one = time.perf_counter(), worker()
     chosen = take_device(device, one)
@@ -91,11 +89,11 @@ def check_samples(configuration: Configuration, count: int = 3) -> None:
     """Draw one scene for each entry of each choice, and the first scenes.
 
     Raises:
-        SceneError: for entries of choices of which no scene can be made, and where all of the first scenes are wrong,
-            or have no room; others fail alone.
+        SceneError: for entries of choices without possible scenes, and where all of the first scenes are invalid or
+            have no space for their bodies; otherwise only the affected scenes fail.
     """
     once = {key: [{**item, "count": 1} for item in configuration.words.get(key, [])] for key in LISTS}
-    entries = narrowed({**configuration.words, **once})  # with bodies that few scenes have
+    entries = narrowed({**configuration.words, **once})  # With bodies that few scenes have.
     found = {key: _problems(replace(configuration, words=words), 0, room=False) for key, words in entries}
     if any(found.values()):
         raise SceneError(_told_once(found), configuration.source)
@@ -105,7 +103,7 @@ def check_samples(configuration: Configuration, count: int = 3) -> None:
 
 
 def _problems(configuration: Configuration, scene_id: int, room: bool = True) -> list[str]:
-    """What is wrong with a scene; where it has no room, too, if `room`."""
+    """Problem of a scene; with `room` also a lack of space."""
     try:
         scene = configuration.scene(content(configuration, scene_id))
         return check.problems(scene, scene.entries())
@@ -116,7 +114,7 @@ def _problems(configuration: Configuration, scene_id: int, room: bool = True) ->
 
 
 def _told_once(found: Mapping[str, Sequence[str]]) -> list[str]:
-    """Lines for the problems of several scenes: of one line where all have it, else of one for each."""
+    """Lines for the problems of several scenes: one line for a common problem, otherwise one per scene."""
     lines: dict[str, None] = {}
     for place, problems in found.items():
         for problem in problems:
@@ -126,7 +124,7 @@ def _told_once(found: Mapping[str, Sequence[str]]) -> list[str]:
 
 
 def record_of(configuration: Configuration, device: torch.device) -> DatasetRecord:
-    """What dataset.json says of a data set."""
+    """Record of a data set for dataset.json."""
     dataset, grid = configuration.dataset, configuration.words["grid"]
     return DatasetRecord(
         configuration=configuration.hash,
@@ -146,7 +144,7 @@ def record_of(configuration: Configuration, device: torch.device) -> DatasetReco
 
 
 class _Line:
-    """One shard is drawn, one simulated and one written at a time, each by a thread of its own."""
+    """Pipeline in which one shard is drawn, one simulated and one written at a time, each by a separate thread."""
 
     def __init__(
         self, configuration: Configuration, claim: Claim, device: torch.device, progress: Progress | None
@@ -158,7 +156,7 @@ class _Line:
         self._missing = claim.record.scenes - claim.finished_scenes()
 
     def run(self, check: bool) -> None:
-        """All shards that nobody else takes."""
+        """All shards that no other process generates."""
         with ExitStack() as stack:
             self._drawer, self._writer = (
                 stack.enter_context(StoppableExecutor()),
@@ -202,7 +200,7 @@ class _Line:
         return None if shard is None else (shard, self._drawer.submit(self._draw, shard))
 
     def _draw(self, shard: int) -> Drawn:
-        """Beside what the device is doing, on a stream of its own."""
+        """Concurrent with the work of the device, on a separate stream."""
         ids = self.claim.record.ids(shard)
         if self.device.type == "cpu":
             return draw(self.configuration, ids, self.device)
@@ -222,7 +220,7 @@ class _Line:
     # -- writing
 
     def _write(self, shard: int, outcomes: list[Outcome]) -> None:
-        """Compress the scenes of a shard and write it, beside what the device is doing."""
+        """Compress the scenes of a shard and write it, concurrently with the work of the device."""
         path = shard_path(self.claim.folder, shard)
         whole: Attributes = {"shard": shard, "device": _device_name(self.device), **versions()}
         with output_errors(self.claim.folder), ShardWriter(path, whole) as writer:

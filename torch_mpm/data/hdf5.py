@@ -1,9 +1,9 @@
-"""HDF5 files made safe: against a full disk, which HDF5 cannot handle, damaged bytes, and links to other files.
+"""Protection of HDF5 files against a full disk, which HDF5 cannot handle, damaged bytes, and links to other files.
 
-HDF5 crashes at exit after a write that failed, so it does not learn of one: it writes to memory, or to a file that
-keeps the error for itself. A *seal* at the end of a file holds the SHA-256 of the bytes that will not change; it is
-checked before HDF5 reads any of them, and HDF5 ignores what follows its own end. A seal tells damage, not forgery, so
-what a file holds is looked at as well.
+HDF5 crashes at exit after a failed write, so failures are hidden from it: it writes to memory, or to a file that stores
+the error. A *seal* at the end of a file holds the SHA-256 of the constant bytes; it is checked before HDF5 reads any of
+them, and HDF5 ignores data after its own end. A seal detects damage, not forgery, so the content of a file is checked
+too.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def h5py_module() -> Any:
 
 
 class _File:
-    """What h5py asks of a file, but for reading, writing and truncating: a size, and a place that moves."""
+    """File interface of h5py without reading, writing and truncating: size and position."""
 
     def __init__(self) -> None:
         self.size = self._at = 0
@@ -58,14 +58,14 @@ class _File:
         return bytes(buffer)
 
     def flush(self) -> None:
-        """Nothing waits."""
+        """Nothing is buffered."""
 
 
 class QuietFile(_File):
-    """A file on the disk for h5py; the first error in writing stays in ``error``, and what comes then is not written.
+    """File on the disk for h5py; the first write error is stored in ``error``, and later data is not written.
 
     Args:
-        path: of a file, which begins anew.
+        path: path of the file, which is truncated.
     """
 
     def __init__(self, path: Path) -> None:
@@ -99,10 +99,10 @@ class QuietFile(_File):
             self.error = self.error or error
 
     def sync(self) -> None:
-        """Return when all is on the disk.
+        """Wait until all data is on the disk.
 
         Raises:
-            OSError: for what could not be written.
+            OSError: for data that could not be written.
         """
         if self.error is None:
             os.fsync(self._descriptor)
@@ -114,7 +114,7 @@ class QuietFile(_File):
 
 
 class SparseFile(_File):
-    """A file in memory of which only the pages written to take room: h5py makes an HDF5 file of any size in it."""
+    """File in memory that allocates only written pages: h5py creates an HDF5 file of any size in it."""
 
     PAGE = 4096
 
@@ -141,7 +141,7 @@ class SparseFile(_File):
         self.size = size
 
     def extents(self) -> list[tuple[int, int]]:
-        """What was written, in order and without overlap."""
+        """Written data, in order and without overlap."""
         merged: list[tuple[int, int]] = []
         for offset, length in sorted(self._written):
             begin, size = merged[-1] if merged else (0, 0)
@@ -152,7 +152,9 @@ class SparseFile(_File):
         return merged
 
     def _parts(self, view: memoryview) -> list[tuple[int, int, memoryview]]:
-        """(page, offset in it, part of ``view``) from the present place on, which moves behind ``view``."""
+        """(page, offset in it, part of ``view``) from the present position on, which advances to the end of
+        ``view``.
+        """
         parts, done = [], 0
         while done < len(view):
             page, inside = divmod(self._at, self.PAGE)
@@ -214,13 +216,13 @@ INTACT = "another program has made it, or its disk or the memory of this machine
 
 
 def unreadable(path: Path, problem: str, error: BaseException, remedy: str, intact: Callable[[], bool]) -> Exception:
-    """The error to raise where HDF5 fails to read a file: the file is blamed only where it is not as it was written.
+    """Error to raise where HDF5 fails to read a file: DamagedFileError only where the file was changed.
 
     Args:
-        problem: what cannot be read, in words.
-        error: of h5py.
-        remedy: for a damaged file.
-        intact: whether the file has its checksum.
+        problem: description of the unreadable data.
+        error: error of h5py.
+        remedy: advice for a damaged file.
+        intact: whether the checksum of the file is correct.
     """
     if not intact():
         return DamagedFileError(path, f"{problem} ({error})", remedy)
@@ -230,10 +232,10 @@ def unreadable(path: Path, problem: str, error: BaseException, remedy: str, inta
 
 
 def open_sealed(path: Path, remedy: str, in_memory: bool = False) -> Any:
-    """The h5py.File of a sealed file, all of whose data are its own; ``in_memory`` leaves no file open.
+    """h5py.File of a sealed file without external data; ``in_memory`` leaves no file open.
 
     Raises:
-        DamagedFileError: with ``remedy``, what to do.
+        DamagedFileError: with ``remedy``.
         OSError: for a file that cannot be read.
         ImportError: when h5py is missing (extra ``data``).
     """
@@ -241,7 +243,7 @@ def open_sealed(path: Path, remedy: str, in_memory: bool = False) -> Any:
     check_seal(path, remedy)
     try:
         file = h5py.File(io.BytesIO(path.read_bytes()) if in_memory else path, "r")
-    except READ_ERRORS as error:  # below a seal that was right
+    except READ_ERRORS as error:  # Below a valid seal.
         raise unreadable(path, "is not an HDF5 file", error, remedy, lambda: True) from None
     problem = _foreign(h5py, file, path.stat().st_size)
     if problem:
@@ -251,7 +253,7 @@ def open_sealed(path: Path, remedy: str, in_memory: bool = False) -> Any:
 
 
 def _foreign(h5py: Any, file: Any, size: int) -> str:
-    """What in a file is not a plain array of numbers stored in it: links, external data, filters, groups."""
+    """Item of a file that is not a plain array of numbers stored in it: links, external data, filters, groups."""
     try:
         for name in file:
             if not isinstance(file.get(name, getlink=True), h5py.HardLink):
@@ -274,7 +276,9 @@ def _foreign(h5py: Any, file: Any, size: int) -> str:
 
 
 def storage_problem(h5py: Any, data: Any, size: int) -> str:
-    """Why the numbers of a dataset, plain or chunked, are not all in this file or could fill the memory; "" if not."""
+    """Reason why the numbers of a dataset, plain or chunked, are not all in this file or could fill the memory; "" if
+    none.
+    """
     properties = data.id.get_create_plist()
     filters = {properties.get_filter(k)[0] for k in range(properties.get_nfilters())}
     if properties.get_external_count() or not filters <= {h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_SHUFFLE}:

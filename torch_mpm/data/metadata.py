@@ -1,8 +1,8 @@
-"""``metadata.json`` beside a data set or an export, as the loaders of learned simulators read it.
+"""``metadata.json`` of a data set or an export, for the loaders of learned simulators.
 
-Two of its words have two meanings. ``sequence_length`` is the number of frames minus one for DeepMind's reader and
-PhysicsNeMo, and the number of frames for geoelements/gns; so it is the first at the top and the second in the blocks
-"train" and "rollout", which gns reads instead and the others ignore.
+``sequence_length`` has two meanings. It is the number of frames minus one for DeepMind's reader and PhysicsNeMo, and
+the number of frames for geoelements/gns; so the first is at the top level and the second in the blocks "train" and
+"rollout", which only gns reads.
 """
 
 from __future__ import annotations
@@ -17,18 +17,18 @@ from .whole_files import write_whole
 
 METADATA = "metadata.json"
 NEIGHBOURS = 20
-"""Particles within the connectivity radius, where a data set does not choose one."""
+"""Number of particles within the connectivity radius, where a data set does not define one."""
 GNS_VELOCITIES, GNS_EMBEDDING = 5, 16
-"""geoelements/gns: velocities that a node sees, and numbers that a particle type becomes."""
+"""geoelements/gns: number of velocities of a node, and numbers per particle type."""
 
 
 def metadata(dataset: DatasetFolder, split: str = "train", material: bool = False) -> dict[str, Any]:
-    """What ``metadata.json`` says about a data set.
+    """Content of ``metadata.json`` for a data set.
 
     Args:
-        dataset: with at least one valid scene.
-        split: whose statistics normalise; all scenes where there is no such split.
-        material: an export of geoelements/gns has a column of a material parameter.
+        dataset: a data set with at least one valid scene.
+        split: split of the statistics for normalisation; all scenes where there is no such split.
+        material: whether an export for geoelements/gns has a column of a material parameter.
 
     Raises:
         DatasetError: for a data set without a valid scene.
@@ -76,12 +76,12 @@ def particle_spacing(dataset: DatasetFolder) -> float:
 
 
 def connectivity_radius(dataset: DatasetFolder) -> float:
-    """The radius [m] that the data set chose, or the one within which ``NEIGHBOURS`` particles lie at rest."""
+    """Radius [m] of the data set, or the one within which ``NEIGHBOURS`` particles lie at rest."""
     dim = dataset.record.dim
     ball = math.pi if dim == 2 else 4 / 3 * math.pi
     return float(particle_spacing(dataset) * (NEIGHBOURS / ball) ** (1 / dim))
 
 
 def write_metadata(folder: Path, words: dict[str, Any]) -> None:
-    """Write ``metadata.json``; it appears when it is whole and on the disk."""
+    """Write ``metadata.json``; it appears when it is complete and on the disk."""
     write_whole(folder / METADATA, json.dumps(words, indent=1, allow_nan=False).encode())

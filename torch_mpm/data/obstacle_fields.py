@@ -19,10 +19,10 @@ _OBSTACLE: TypeAdapter[Any] = TypeAdapter(schema.AnyObstacle)
 
 
 def obstacles_of(words: dict[str, Any]) -> list[Obstacle]:
-    """The obstacles of a scene file.
+    """Obstacles of a scene file.
 
     Raises:
-        ValueError: for words that are no obstacle.
+        ValueError: for words that are not an obstacle.
     """
     try:
         return [obstacle(_OBSTACLE.validate_python(item), None) for item in words.get("obstacle", [])]
@@ -34,9 +34,9 @@ def obstacle_mask(obstacles: Sequence[Obstacle], centres: Sequence[Tensor], time
     """Cells whose centre is inside an obstacle.
 
     Args:
-        obstacles: of one scene.
+        obstacles: obstacles of one scene.
         centres: coordinates of the cells along each axis [m].
-        times: of the frames [T] [s].
+        times: times of the frames [T] [s].
 
     Returns:
         float32 [T, X, Y(, Z)], 1 inside and 0 outside.

@@ -1,6 +1,6 @@
-"""Particles of obstacles in the scenes of data sets, so that a learned simulator sees them: a layer below the surface.
+"""Particles of obstacles in the scenes of data sets, as input of learned simulators: a layer below the surface.
 
-They move as the obstacle does, have the particle type ``BOUNDARY`` and no mass, and are of no material (-1).
+They move with the obstacle, and have the particle type ``BOUNDARY``, no mass and no material (-1).
 """
 
 from __future__ import annotations
@@ -21,18 +21,18 @@ from .statistics import BOUNDARY
 LAYER = 1.5
 """Thickness of the layer, in distances of particles."""
 NEUTRAL = {"F": 1.0, "J": 1.0}
-"""Fields of what is not deformed: the identity, and one; the others are zero."""
+"""Fields of undeformed particles: identity, and one; the others are zero."""
 
 
 def add(arrays: Mapping[str, Array], words: Any, times: Array, spacing: float) -> dict[str, Array]:
-    """The arrays of a scene, which may have no particles yet, with the particles of its obstacles behind its own.
+    """Arrays of a scene, which may have no particles yet, followed by the particles of its obstacles.
 
-    What never moves has no particles outside of the domain.
+    Obstacles at rest have no particles outside the domain.
 
     Args:
-        arrays: of particles, as a shard has them.
-        words: of the scene, whose obstacles count.
-        times: of the frames [T] [s].
+        arrays: arrays of particles in the form of a shard.
+        words: words of the scene with the obstacles.
+        times: times of the frames [T] [s].
         spacing: distance of the particles [m].
     """
     found, grid = dict(arrays), words.grid
@@ -48,11 +48,11 @@ def add(arrays: Mapping[str, Array], words: Any, times: Array, spacing: float) -
 
 
 def _layer(body: Obstacle, spacing: float, lower: Any, upper: Any) -> Tensor | None:
-    """Points [n, D] of the layer in coordinates of the body; None where a body has no end and moves."""
+    """Points [n, D] of the layer in coordinates of the body; None for an infinite body that moves."""
     a, b = (torch.tensor(v, dtype=torch.float64) for v in (lower, upper))
     first, last = body.shape.bounds(len(a))
     still = not body.moves
-    if still:  # only what can be seen
+    if still:  # Only the visible part.
         pose = body.pose(0.0)
         corners = to_body(pose.rotation, torch.cartesian_prod(*torch.stack([a, b], 1)) - pose.centre)
         first, last = torch.maximum(first, corners.amin(0)), torch.minimum(last, corners.amax(0))

@@ -1,4 +1,4 @@
-"""Training windows of scenes that are simulated as they are needed, and never written to a disk."""
+"""Training windows of scenes that are simulated on demand, and never written to a disk."""
 
 from __future__ import annotations
 
@@ -18,43 +18,43 @@ from .stoppable import StoppableExecutor
 from .windows import Collate, Item, pack, rank_and_world
 
 Simulated = dict[str, Tensor]
-"""A scene: ``position`` and other fields [T, N, ...], and what does not change [N]."""
+"""Scene: ``position`` and other fields [T, N, ...], and constants [N]."""
 Simulate = Callable[[Sequence[int]], Sequence["Simulated | None"]]
-"""Simulates the scenes of some ids together, on any device; None for a scene that failed."""
+"""Function that simulates the scenes of some ids together, on any device; None for a failed scene."""
 MOST_FAILED_ROUNDS = 3
 ARGUMENTS = ("batch_size", "scenes", "frames", "passes", "first", "seed", "world")
-"""That decide what comes after a state."""
+"""Attributes that determine the following state."""
 
 
 class OnlineStream(IterableDataset[Item]):
-    """Batches of windows, without end, of scenes that are new in every round.
+    """Endless batches of windows, of new scenes in every round.
 
-    A round is some scenes that are simulated together; while its windows are trained on, in random order, the next is
-    simulated, on a CUDA stream of its own where the device is one. The batches are those of a `WindowStream`, on the
-    device of the simulation. Everything depends on the seed and the scene ids alone:
+    A round is a set of scenes that are simulated together; while the model trains on its windows, in random order, the
+    next round is simulated, on CUDA on a separate stream. The batches are those of a `WindowStream`, on the device of
+    the simulation. Everything depends on the seed and the scene ids only:
 
         stream = OnlineStream(simulator(configuration, "cuda"), batch_size=8, scenes=64)
         for batch in stream:
             ...
 
     Args:
-        simulate: simulates the scenes of some ids: :func:`torch_mpm.data.simulator`, or a function of your own.
-        batch_size: windows of a batch; what does not fill one is left out of a round.
+        simulate: function that simulates the scenes of some ids: :func:`torch_mpm.data.simulator`, or a user function.
+        batch_size: windows of a batch; an incomplete batch of a round is dropped.
         scenes: scenes of a round.
         frames: T of a window.
-        device: of the simulation; its thread works there, on CUDA on a stream of its own.
-        passes: how often the windows of a round are gone through.
-        first: id of the first scene, beyond those that a model is tested with.
-        seed: of the order.
-        ahead: rounds that are simulated ahead; 0 simulates when the windows are wanted.
-        collate: `pack`, `pad`, or a function of your own of a list of items.
-        rank, world: this process among those that train together; those of torch.distributed by default.
+        device: device of the simulation; its thread works there, on CUDA on a separate stream.
+        passes: number of passes through the windows of a round.
+        first: id of the first scene, beyond those of the test data.
+        seed: seed of the order.
+        ahead: rounds that are simulated ahead; 0 simulates on demand.
+        collate: `pack`, `pad`, or a user function of a list of items.
+        rank, world: rank and number of the training processes; those of torch.distributed by default.
 
     Raises:
-        SimulationError: where so many scenes have failed in each of three rounds in a row that there was no batch.
-        ValueError: for a round without a batch, or a rank that is not one.
+        SimulationError: where three consecutive rounds had no batch because of failed scenes.
+        ValueError: for a round without a batch, or an invalid rank.
 
-    It has a thread of its own in the place of workers; in a worker of a data loader it raises RuntimeError.
+    It uses a separate thread instead of workers; in a worker of a data loader it raises RuntimeError.
     """
 
     def __init__(
@@ -113,14 +113,14 @@ class OnlineStream(IterableDataset[Item]):
                 pool.stop()
 
     def state_dict(self) -> dict[str, int]:
-        """Where this stream stands; the round is simulated again after `load_state_dict`."""
+        """Position of this stream; the round is simulated again after `load_state_dict`."""
         return {"round": self.round, "taken": self.taken, **{name: getattr(self, name) for name in ARGUMENTS}}
 
     def load_state_dict(self, state: dict[str, int]) -> None:
-        """Go on where another stream of the same arguments stood.
+        """Continue at the position of another stream with the same arguments.
 
         Raises:
-            ValueError: for one of other arguments.
+            ValueError: for a stream with other arguments.
         """
         for name in ARGUMENTS:
             if state[name] != getattr(self, name):
@@ -128,7 +128,7 @@ class OnlineStream(IterableDataset[Item]):
         self.round, self.taken = check_count("round", state["round"]), check_count("taken", state["taken"])
 
     def _simulated(self, number: int, stream: torch.cuda.Stream | None) -> _Round:
-        """A round, in the thread of the simulation."""
+        """Simulate a round, in the thread of the simulation."""
         ids = self.scene_ids(number)
         if stream is None:
             return _Round(ids, _good(ids, self.simulate(ids)), None)
@@ -139,7 +139,7 @@ class OnlineStream(IterableDataset[Item]):
         return _Round(ids, scenes, ready)
 
     def _places(self, scenes: dict[int, Simulated]) -> list[tuple[int, int]]:
-        """Scene and first frame of all windows of a round; none where scenes that failed leave too few for a batch.
+        """Scene and first frame of all windows of a round; none where failed scenes leave too few for a batch.
 
         Raises:
             ValueError: where no scene has failed, and there are too few all the same.
@@ -181,14 +181,14 @@ def _is_field(value: Tensor, length: int) -> bool:
 
 @dataclass(frozen=True)
 class _Round:
-    """Scenes by their ids; ``ready`` comes behind the work of the simulation on CUDA."""
+    """Scenes by their ids; on CUDA ``ready`` is recorded after the work of the simulation."""
 
     ids: Sequence[int]
     scenes: dict[int, Simulated]
     ready: Any
 
     def arrived(self) -> dict[int, Simulated]:
-        """The scenes, for the current stream of the caller, which waits for them; the host does not."""
+        """Scenes for the current stream of the caller, which waits for them; the host does not."""
         values = [value for scene in self.scenes.values() for value in scene.values() if value.is_cuda]
         if self.ready is not None and values:
             stream = torch.cuda.current_stream(values[0].device)

@@ -1,7 +1,7 @@
-"""Arrays of scenes on their way into a shard: compressed, hashed and summed up, in whatever thread there is.
+"""Compression, hashing and statistics of arrays of scenes for a shard, in any thread.
 
-The rows of an array [T, ...] may come one after another, and are nowhere together; what a shard stores does not depend
-on how they come.
+The rows of an array [T, ...] may arrive one after another and need not be in memory together; the content of a shard
+does not depend on their order of arrival.
 """
 
 from __future__ import annotations
@@ -22,14 +22,16 @@ from .statistics import Motion, motion_sums
 Array = npt.NDArray[Any]
 
 CHUNK_BYTES = 2**17
-"""Of a chunk before compression, about: a window of some frames reads little more than itself."""
+"""Approximate size of a chunk before compression: a window of some frames reads little more than itself."""
 GZIP_LEVEL = 1
 PIECE_BYTES = 2**20
-"""Taken in at once, about: what stays in the cache, in few calls, each of which waits for Python's lock."""
+"""Approximate size of data processed at once: it fits in the cache, in few calls, each of which waits for Python's
+lock.
+"""
 
 
 def isal_zlib_module() -> Any:
-    """A zlib that is some ten times as fast, and compresses a tenth less."""
+    """A zlib implementation that is about ten times as fast, and compresses a tenth less."""
     return optional.load("isal.isal_zlib", "data sets", "data")
 
 
@@ -38,9 +40,9 @@ def isal_zlib_module() -> Any:
 
 @dataclass(frozen=True)
 class Compressed:
-    """An array as it lies in the file: chunks of ``chunk_frames`` rows, shuffled by bytes and compressed.
+    """Array in the form of the file: chunks of ``chunk_frames`` rows, shuffled by bytes and compressed.
 
-    The last chunk is filled up with zeros. ``digest`` is the SHA-256 of the numbers.
+    The last chunk is padded with zeros. ``digest`` is the SHA-256 of the numbers.
     """
 
     shape: tuple[int, ...]
@@ -51,19 +53,19 @@ class Compressed:
 
 
 def chunk_frames(shape: tuple[int, ...], dtype: npt.DTypeLike) -> int:
-    """Rows of the first axis that make a chunk."""
+    """Number of rows of the first axis per chunk."""
     row = math.prod(shape[1:]) * np.dtype(dtype).itemsize
     return max(1, min(shape[0], CHUNK_BYTES // max(row, 1)))
 
 
 class _Scratch(threading.local):
-    """Memory of a thread that is used again: what is new for each piece would be mapped page by page."""
+    """Reused memory of a thread: new memory for each piece would be mapped page by page."""
 
     def __init__(self) -> None:
         self._bytes = np.empty(0, np.uint8)
 
     def two(self, size: int) -> tuple[Array, Array]:
-        """Arrays of so many bytes, whose contents are left from before."""
+        """Arrays of a given size, with undefined contents."""
         second = -(-size // 64) * 64
         if len(self._bytes) < second + size:
             self._bytes = np.empty(second + size, np.uint8)
@@ -74,12 +76,12 @@ _scratch = _Scratch()
 
 
 class Packing:
-    """An array [T, ...] with at least one element that is compressed and hashed while its rows come.
+    """Array [T, ...] with at least one element that is compressed and hashed while its rows arrive.
 
-    Other threads run meanwhile, and one at a time may call `append`.
+    Other threads may run at the same time; one at a time may call `append`.
 
     Args:
-        shape, dtype: of the array.
+        shape, dtype: shape and dtype of the array.
     """
 
     def __init__(self, shape: tuple[int, ...], dtype: npt.DTypeLike) -> None:
@@ -92,7 +94,7 @@ class Packing:
         self._done = 0
 
     def append(self, rows: Array) -> None:
-        """Take in the next rows [k, ...], which may lie anywhere.
+        """Process the next rows [k, ...], with any strides.
 
         Raises:
             ValueError: for rows of another shape or type, or too many.
@@ -108,7 +110,7 @@ class Packing:
             rows = rows[count:]
 
     def _take(self, rows: Array) -> None:
-        """Hash and compress the whole chunks of what rested and some rows; of the last rows, all."""
+        """Hash and compress the complete chunks of remaining and new rows; with the last rows, all."""
         before, every = len(self._rest), self._chunk_frames
         count = before + len(rows)
         last = self._done + count == self.shape[0]
@@ -124,17 +126,17 @@ class Packing:
             self._compress(values[: chunks * every], planes[: values[: chunks * every].nbytes], chunks)
 
     def _compress(self, values: Array, planes: Array, chunks: int) -> None:
-        """Append chunks, shuffled by bytes; the values are used up."""
+        """Append chunks, shuffled by bytes; the values are overwritten."""
         size, pack = self.dtype.itemsize, isal_zlib_module().compress
         words = values.reshape(-1).view(f"<u{size}").reshape(chunks, -1)
         planes = planes.reshape(chunks, size, -1)
-        for k in range(size):  # faster than a transposition
+        for k in range(size):  # Faster than a transposition.
             np.copyto(planes[:, k], words, casting="unsafe")
             np.right_shift(words, 8, out=words)
         self._chunks += [pack(chunk, GZIP_LEVEL) for chunk in planes]
 
     def finish(self) -> Compressed:
-        """The whole array.
+        """Complete array.
 
         Raises:
             ValueError: where rows are missing.
@@ -145,7 +147,7 @@ class Packing:
 
 
 def packed(values: Array) -> Compressed:
-    """An array [T, ...] that is there."""
+    """Pack an existing array [T, ...]."""
     packing = Packing(values.shape, values.dtype)
     packing.append(values)
     return packing.finish()
@@ -160,7 +162,7 @@ def array_digest(values: Array) -> bytes:
 
 
 def content_hash(arrays: Mapping[str, Array | Compressed]) -> str:
-    """SHA-256 of the arrays of a scene: of their names, types, shapes and numbers, however they are stored."""
+    """SHA-256 of the arrays of a scene: of their names, types, shapes and numbers, for any storage."""
     digest = hashlib.sha256()
     for name in sorted(arrays):
         values = arrays[name]
@@ -171,7 +173,7 @@ def content_hash(arrays: Mapping[str, Array | Compressed]) -> str:
 
 @dataclass(frozen=True)
 class PreparedScene:
-    """A scene ready to be written: its arrays as they are stored, and what the record says about them."""
+    """Scene ready to be written: its arrays as stored, and its entries of the record."""
 
     arrays: Mapping[str, Array | Compressed]
     particles: int
@@ -180,7 +182,7 @@ class PreparedScene:
 
     @property
     def digests(self) -> dict[str, str]:
-        """Digests of the arrays that are not compressed, whose bytes nothing else protects."""
+        """Digests of the uncompressed arrays, whose bytes have no other protection."""
         plain = {name: values for name, values in self.arrays.items() if not isinstance(values, Compressed)}
         return {name: array_digest(values).hex() for name, values in plain.items()}
 
@@ -191,9 +193,9 @@ def prepare_scene(
     """Compress, hash and sum up a scene; may run in any thread, and needs no h5py.
 
     Args:
-        arrays: ``position`` [T, N, D] and the other arrays of the scene; none for a scene that failed.
-        before: those of its arrays that have been packed before.
-        motion: of its positions; needed where these have been packed.
+        arrays: ``position`` [T, N, D] and the other arrays of the scene; none for a failed scene.
+        before: arrays that have been packed before.
+        motion: sums of its positions; needed where these have been packed.
 
     Raises:
         ValueError: for positions that are not finite, or arrays without ``position``.

@@ -18,10 +18,10 @@ from .whole_files import remove_leftovers
 
 SHEET, VIDEO = "sheet.png", "scenes.mp4"
 SHOWN = 6
-"""Scenes that are drawn where none are asked for."""
+"""Number of scenes that are drawn by default."""
 MOST_FPS = 60
 SAMPLES = 8
-"""Frames of each scene that decide the colour scale."""
+"""Number of frames of each scene that determine the colour scale."""
 
 
 def draw_scenes(
@@ -38,20 +38,20 @@ def draw_scenes(
 
     Args:
         dataset: folder of the data set.
-        out: folder, made where it does not exist; ``pictures`` in that of the data set by default.
+        out: folder, created where it does not exist; ``pictures`` in that of the data set by default.
         scenes: ids; the first six valid scenes by default.
         color_by: "speed", "particle_type", "material", "stress" (von Mises), or a field of the scenes such as
             "pressure" or "temperature".
         frames: pictures of a scene on the sheet, from its first frame to its last.
         width: of sheet and video in pixels.
-        video: make the video, in real time and at 60 frames per second at most.
+        video: whether to make the video, in real time and at 60 frames per second at most.
         progress: called with the number of the frame and the number of frames of the video.
 
     Returns:
         The files made.
 
     Raises:
-        KeyError: for a scene that is not there, failed, or is not finished.
+        KeyError: for a scene that does not exist, failed, or is not finished.
         DatasetError: for a data set without a valid scene, or a field that scenes lack.
         DamagedFileError: for a scene that is damaged.
         ImportError: when a package of the extra ``render`` is missing.
@@ -151,7 +151,7 @@ class _Artist:
 
 
 def field_values(scene: StoredScene, name: str, interval: float) -> Array:
-    """What colours particles by the name of a field: [T, N, ...], or [N] for "particle_type" and other constants.
+    """Colours of particles by the name of a field: [T, N, ...], or [N] for "particle_type" and other constants.
 
     Raises:
         DatasetError: for a field that the scene lacks.
@@ -169,7 +169,7 @@ def field_values(scene: StoredScene, name: str, interval: float) -> Array:
 
 
 def drawn_in(scene: StoredScene) -> DrawnStress | None:
-    """The von Mises stress that pictures of a scene show."""
+    """Von Mises stress in pictures of a scene."""
     return drawn_stress(scene.names, scene.measures, scene.dim)
 
 

@@ -26,7 +26,7 @@ def rasterise(
 ) -> tuple[Tensor, Tensor]:
     """Density and velocity of the cells of a grid.
 
-    Quadratic B-splines about the centres of the cells; what reaches beyond the outermost cells is added to them, so
+    Quadratic B-splines about the centres of the cells; contributions beyond the outermost cells are added to these, so
     that the densities times the volume of a cell add up to the mass of the particles.
 
     Args:
@@ -65,7 +65,7 @@ def _fields(
 
 
 def _folded(dense: Tensor, axis: int, cells: int) -> Tensor:
-    """Only the cells of the domain along an axis, the outermost with what lies beyond them."""
+    """Only the cells of the domain along an axis, the outermost including the contributions beyond them."""
     inside = dense.narrow(axis, PADDING, cells).clone()
     inside.narrow(axis, 0, 1).add_(dense.narrow(axis, 0, PADDING).sum(axis, keepdim=True))
     beyond = PADDING + cells

@@ -1,4 +1,4 @@
-"""Frames of a batch on their way to host memory, as arrays or packed, while the device computes the next ones."""
+"""Transfer of the frames of a batch to host memory, as arrays or packed, while the device computes the next ones."""
 
 from __future__ import annotations
 
@@ -20,17 +20,18 @@ from .statistics import Motion, MotionSums
 
 Array = npt.NDArray[Any]
 SLAB_BYTES = 2**27
-"""Of the frames that are copied from a device at once, about."""
+"""Approximate size of the frames that are copied from a device at once."""
 LEAST_SLABS = 8
-"""Where arrays are packed: the last slab comes when the simulation has ended, and should be a small part of all."""
+"""The same where arrays are packed: the last slab arrives after the end of the simulation, and should be a small
+part.
+"""
 TASKS = 24
-"""Into which the scenes of a slab are divided for the threads of an executor: few, since each takes Python's lock."""
+"""Number of parts of a slab for the threads of an executor: few, since each needs Python's lock."""
 
 
 @dataclass(frozen=True)
 class Recorded:
-    """The fields [T, N, ...] of a scene, float32, each as an array or packed, and where these are packed on the way
-    sums of its motion."""
+    """Fields [T, N, ...] of a scene, float32, each as an array or packed, and in the latter case sums of its motion."""
 
     arrays: dict[str, Array]
     packed: dict[str, Compressed]
@@ -39,7 +40,7 @@ class Recorded:
 
 @dataclass(frozen=True)
 class _Slab:
-    """Some frames in host memory; `ready` comes behind their copies from a device."""
+    """Some frames in host memory; `ready` is recorded after their copies from a device."""
 
     first: int
     values: dict[str, Tensor]
@@ -49,17 +50,17 @@ class _Slab:
 class Recording:
     """Fields [T, N, ...] in float32 of each scene of a batch, filled frame by frame.
 
-    On CUDA, and with an executor, frames are gathered in slabs; on CUDA a stream of its own copies these to pinned
-    memory. A thread takes them from there, so that neither the device nor the host waits.
+    On CUDA, and with an executor, frames are collected in slabs; on CUDA a separate stream copies these to pinned
+    memory. A thread processes them, so that neither the device nor the host waits.
 
     Args:
         frames: T.
-        particles: N of each scene, whose particles follow one another.
-        shapes: of a field the shape per particle, by name; ``position`` is among them.
-        device: of the values.
-        executor: whose threads take slabs apart, scene by scene; without one it is done in one thread.
-        packed: of each scene whether it is packed on the way, from where it is; by default none is.
-        behind: of each scene the fields [T, n, ...] of particles that follow its own and are in no sums.
+        particles: N of each scene; particles are ordered by scene.
+        shapes: shape per particle of each field by name, including ``position``.
+        device: device of the values.
+        executor: its threads separate slabs, scene by scene; without one a single thread does.
+        packed: whether each scene is packed during the transfer, in place; by default none is.
+        behind: fields [T, n, ...] of additional particles of each scene, which are not part of sums.
     """
 
     def __init__(
@@ -99,7 +100,7 @@ class Recording:
             self._thread.start()
 
     def put(self, values: Mapping[str, Tensor]) -> None:
-        """The next frame: fields [P, ...] of the particles of all scenes, scene by scene."""
+        """Add the next frame: fields [P, ...] of the particles of all scenes, scene by scene."""
         if self._motion is not None:
             self._motion.add(values["position"])
         if self._thread is None:
@@ -120,10 +121,10 @@ class Recording:
             self._send()
 
     def finish(self) -> list[Recorded]:
-        """Wait for all frames; returns what there is of each scene.
+        """Wait for all frames; returns the data of each scene.
 
         Raises:
-            what went wrong on the way.
+            Exceptions of the transfer.
         """
         if self._thread is not None:
             if self._slab:
@@ -139,14 +140,14 @@ class Recording:
         ]
 
     def abandon(self) -> None:
-        """End the thread without waiting for what is right."""
+        """End the thread without waiting for results."""
         self._abandoned = True
         if self._thread is not None:
             self._jobs.put(None)
             self._thread.join()
 
     def _send(self) -> None:
-        """Hand on the slab, from a device behind what that is doing."""
+        """Pass on the slab, from a device after its present work."""
         count = (self._count - 1) % self._slab_frames + 1
         if self._stream is None:
             slab = _Slab(self._count - count, {name: slab[:count] for name, slab in self._slab.items()}, None)
@@ -171,7 +172,7 @@ class Recording:
     def _work(self) -> None:
         while (slab := self._jobs.get()) is not None:
             if self._error is not None or self._abandoned:
-                continue  # nobody wants the rest, but who puts it must not wait
+                continue  # The rest is discarded, but the producer must not wait.
             try:
                 if slab.ready is not None:
                     slab.ready.synchronize()
@@ -180,7 +181,7 @@ class Recording:
                 self._error = error
 
     def _take(self, first: int, values: Mapping[str, Array]) -> None:
-        """The next frames of all scenes. Returns when all are done, so that those of a scene come in order."""
+        """Add the next frames of all scenes. Returns when all are done, so that those of a scene arrive in order."""
 
         def take(scenes: Iterable[int]) -> None:
             for k in scenes:
@@ -198,4 +199,4 @@ class Recording:
             take(range(count))
         else:
             for _ in self._executor.map(take, [range(k, count, TASKS) for k in range(min(count, TASKS))]):
-                pass  # errors are raised here
+                pass  # Errors are raised here.

@@ -1,7 +1,7 @@
-"""Scenes drawn from a configuration. A scene depends on the hash of the configuration and its id, and on nothing else.
+"""Scenes drawn from a configuration. A scene depends only on the hash of the configuration and its id.
 
-Bodies are placed one after another. A body that would reach out of the domain or come nearer than the gap to another
-body or an obstacle is drawn anew; if that does not help, the whole scene is.
+Bodies are placed one after another. A body that extends beyond the domain or is nearer than the gap to another body or
+an obstacle is drawn again; if that does not help, the whole scene is.
 """
 
 from __future__ import annotations
@@ -25,29 +25,29 @@ from .configuration import Configuration
 from .distribution import Words, sample
 
 TRIES, RESTARTS = 100, 10
-"""How often a body is drawn anew, and how often the scene is."""
+"""Maximum number of draws of a body, and of the scene."""
 PROBES = 20_000
-"""Points of a body, at most, whose distance from the others is looked at."""
+"""Maximum number of points of a body for checks of distances."""
 
 _BODY: TypeAdapter[Any] = TypeAdapter(schema.AnyBody)
 _OBSTACLE: TypeAdapter[Any] = TypeAdapter(schema.AnyObstacle)
 
 
 class NoRoom(ValueError):
-    """A scene in which there is no room for a body."""
+    """A scene without space for a body."""
 
 
 def generator(configuration: Configuration, scene_id: int) -> np.random.Generator:
-    """The random numbers of a scene."""
+    """Random numbers of a scene."""
     entropy = np.random.SeedSequence([int(configuration.hash[:32], 16), scene_id])
     return np.random.Generator(np.random.Philox(entropy))
 
 
 def content(configuration: Configuration, scene_id: int) -> Words:
-    """What a scene has of its own, as a scene file says it: gravity, material, body, obstacle and seed.
+    """Content of a scene in the form of a scene file: gravity, material, body, obstacle and seed.
 
     Raises:
-        NoRoom: where no place was found for a body.
+        NoRoom: where no position was found for a body.
     """
     rng, dim, words, full = generator(configuration, scene_id), configuration.dim, configuration.words, ""
     for _ in range(RESTARTS):
@@ -70,7 +70,7 @@ def content(configuration: Configuration, scene_id: int) -> Words:
 
 
 def _repeated(items: Any, rng: np.random.Generator, dim: int) -> Iterator[tuple[int, Words]]:
-    """(number in the file, words without their count) of all bodies, or obstacles, that a scene shall have."""
+    """(number in the file, words without their count) of all bodies, or obstacles, of a scene."""
     for k, item in enumerate(items):
         count = sample(item.get("count", 1), rng, dim)
         for _ in range(int(count)):
@@ -79,11 +79,11 @@ def _repeated(items: Any, rng: np.random.Generator, dim: int) -> Iterator[tuple[
 
 ALONG_OBSTACLES = {"capsule": "axis"}
 ALONG = {"box": "size", "cylinder": "axis", **ALONG_OBSTACLES}
-"""From one end of a shape to the other, by the name of the shape."""
+"""Vectors between the ends of a shape, by the name of the shape."""
 
 
 def with_ends(words: Words, names: dict[str, str] = ALONG) -> Words:
-    """A shape with its ends, as scene files want them, in place of a center and what goes from one end to the other."""
+    """Shape with its ends, as in scene files, instead of a center and a vector between the ends."""
     along = names.get(words.get("shape", ""))
     if along is None or "center" not in words or along not in words:
         return words
@@ -91,14 +91,14 @@ def with_ends(words: Words, names: dict[str, str] = ALONG) -> Words:
     try:
         ends = [[c + sign * w for c, w in zip(center, whole, strict=True)] for sign in (-0.5, 0.5)]
     except (TypeError, ValueError):
-        return words  # which the checks of scene files explain
+        return words  # The checks of scene files explain these.
     first, last = ("lower", "upper") if along == "size" else ("a", "b")
     rest = {key: value for key, value in words.items() if key not in ("center", along)}
     return {**rest, first: ends[0], last: ends[1]}
 
 
 class _Places:
-    """The obstacles and bodies of a scene so far."""
+    """Obstacles and bodies of a scene so far."""
 
     def __init__(self, configuration: Configuration, obstacles: list[Words]) -> None:
         grid = configuration.words["grid"]
@@ -110,7 +110,7 @@ class _Places:
         self.placed: list[tuple[Words, Region | None]] = []
 
     def put(self, words: Words, rng: np.random.Generator) -> bool:
-        """Draw a body until it has room; returns whether it has."""
+        """Draw a body until there is space for it; returns whether there is."""
         for _ in range(TRIES):
             drawn = with_ends(sample(words, rng, self.configuration.dim))
             body = self._region(drawn)
@@ -136,10 +136,10 @@ class _Places:
             found.signed_distance(torch.zeros(1, self.configuration.dim, dtype=torch.float64), None, 0.0)
             return None if model.start > 0 else found
         except (ValidationError, ValueError, TypeError):
-            return None  # the checks of scene files explain it
+            return None  # The checks of scene files explain it.
 
     def _region(self, words: Words) -> Region | None:
-        """The region of a body; None for points, and for words that the checks of scene files will refuse."""
+        """Region of a body; None for points, and for words that the checks of scene files will refuse."""
         try:
             body = _BODY.validate_python(words)
             if isinstance(body, schema.MeshBody):
@@ -160,13 +160,13 @@ class _Places:
         if not near and not self.obstacles:
             return True
         probes, missed = _probes(body, 0.25 * self.dx)
-        least = self.gap + missed  # distances from a shape change by no more than one moves
+        least = self.gap + missed  # Distances from a shape change by no more than the displacement.
         if any(bool((other.shape.signed_distance(probes - other.position) < least).any()) for other in near):
             return False
         return not any(bool((o.signed_distance(probes, None, 0.0) < least).any()) for o in self.obstacles)
 
     def _boxes_meet(self, other: Region, lower: Sequence[float], upper: Sequence[float]) -> bool:
-        """Whether the box around a region comes nearer than the gap to the box around another."""
+        """Whether the box around a region is nearer than the gap to the box around another."""
         sides = zip(lower, upper, other.lower.tolist(), other.upper.tolist(), strict=True)
         return all(a - self.gap < d and c < b + self.gap for a, b, c, d in sides)
 
@@ -177,7 +177,7 @@ def _mesh(path: Path, scale: float) -> shapes.Mesh:
 
 
 def _probes(body: Region, spacing: float) -> tuple[Tensor, float]:
-    """Points [N, D] [m] all over a region and just outside, and a distance [m]: none of the region is further away."""
+    """Points [N, D] [m] all over a region and just outside, and a distance [m] within which all of the region is."""
     sides = (body.upper - body.lower).tolist()
     spacing = max(spacing, (math.prod(sides) / PROBES) ** (1 / len(sides)))
     axes = [
@@ -190,7 +190,7 @@ def _probes(body: Region, spacing: float) -> tuple[Tensor, float]:
 
 
 def divided(total: int, shares: Sequence[float]) -> list[int]:
-    """Whole numbers that add up to ``total``, as near to these shares of it as can be, and none of them zero."""
+    """Integers that add up to ``total``, as near as possible to these shares of it, and none of them zero."""
     if total < len(shares):
         raise NoRoom(f"dataset.particles: {total} particles are too few for {len(shares)} bodies")
     spare = total - len(shares)

@@ -1,4 +1,4 @@
-"""From a configuration to what an `OnlineStream` asks for: scenes of some ids, simulated together."""
+"""Simulation function of a configuration for `OnlineStream`: scenes of some ids, simulated together."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ def simulator(
 ) -> Callable[[Sequence[int]], list[dict[str, Tensor] | None]]:
     """A function that draws and simulates the scenes of some ids as `torch-mpm generate` does, shard by shard.
 
-    The ids of a shard give bit-identical numbers to that shard on the same device; ids beyond
-    ``configuration.scenes`` give scenes that are in no data set of that configuration.
+    The ids of a shard give bit-identical numbers to that shard on the same device; ids beyond ``configuration.scenes``
+    give scenes outside any data set of that configuration.
 
     Args:
-        configuration: of the data set.
-        device: where the scenes are simulated, and where their tensors are.
+        configuration: configuration of the data set.
+        device: device of the simulation and its tensors.
 
     Returns:
         A function of a sequence of ids. Its result is for each id a dictionary of ``position`` and the fields of the

@@ -1,7 +1,7 @@
-"""Shards: HDF5 files with the finished scenes of a data set, each beside a record that says what is in it.
+"""Shards: HDF5 files with the finished scenes of a data set, each with a record of its content.
 
-A shard appears under its name only when it is whole and on the disk, and its record after it: a shard without a record
-does not count.
+A shard appears under its name only when it is complete and on the disk, followed by its record: a shard without a
+record does not count.
 
 Layout: one group ``scene_0000000`` per scene, by its id in the data set. ``position`` [T, N, D] and other fields of
 every frame are compressed in chunks of some frames, so that a window of frames is read without the rest. Arrays of one
@@ -35,17 +35,17 @@ Array = npt.NDArray[Any]
 
 FORMAT = 3
 FORMAT_WITHOUT_CHECKSUM = 2
-"""Of records that were written before records had checksums."""
+"""Format of records that were written before records had checksums."""
 REMEDY = "remove it and its .json, and generate again"
 
 
 def shard_path(folder: str | Path, index: int) -> Path:
-    """Where shard ``index`` of the data set ``folder`` is."""
+    """Path of shard ``index`` of the data set ``folder``."""
     return Path(folder) / "shards" / f"shard_{index:05d}.h5"
 
 
 def record_path(shard: Path) -> Path:
-    """The record beside a shard."""
+    """Path of the record of a shard."""
     return shard.with_suffix(".json")
 
 
@@ -58,9 +58,9 @@ def scene_name(scene_id: int) -> str:
 
 @dataclass(frozen=True)
 class SceneRecord:
-    """What the record of a shard says about a scene; ``motion`` is None for one that failed.
+    """Record of a scene; ``motion`` is None for a failed one.
 
-    ``digests`` are those of the arrays that are stored as they are, by name: HDF5 has none for them.
+    ``digests`` are those of the uncompressed arrays, by name: HDF5 has none for them.
     """
 
     id: int
@@ -74,7 +74,7 @@ class SceneRecord:
 
     @classmethod
     def of(cls, words: dict[str, Any]) -> SceneRecord:
-        """From the words of a record; what they lack is a KeyError."""
+        """Read from the words of a record; missing ones are a KeyError."""
         return cls(
             id=count(words["id"]),
             valid=bool(count(words["valid"] + 0)),
@@ -89,22 +89,22 @@ class SceneRecord:
 
 @dataclass(frozen=True)
 class ShardRecord:
-    """What the record of a shard says: the size [bytes] and the `file_hash` of its file, and its scenes."""
+    """Record of a shard: the size [bytes] and the `file_hash` of its file, and its scenes."""
 
     bytes: int
     sha256: str
     scenes: list[SceneRecord]
 
     def write(self, path: Path) -> None:
-        """Write it to a file, which appears when it is whole and on the disk."""
+        """Write the record to a file, which appears when it is complete and on the disk."""
         write_record(path, {"format": FORMAT, **asdict(self)})
 
     @classmethod
     def read(cls, path: Path) -> ShardRecord:
         """
         Raises:
-            FileNotFoundError: for a shard that is not finished.
-            DamagedFileError: for a file that is no record.
+            FileNotFoundError: for an unfinished shard.
+            DamagedFileError: for a file that is not a record.
         """
         check_file(path, "shard", may_be_empty=True)
         data = path.read_bytes()
@@ -145,11 +145,11 @@ def _numbers(values: Any) -> tuple[float, ...]:
 
 
 class StoredScene:
-    """A scene of an open shard. ``scene["position"]`` reads an array, ``scene.window("position", k, 7)`` some frames.
+    """Scene of an open shard. ``scene["position"]`` reads an array, ``scene.window("position", k, 7)`` some frames.
 
     Attributes:
         attributes: texts and numbers about the scene.
-        frames, particles, dim: T, N and D; 0 for a scene that failed.
+        frames, particles, dim: T, N and D; 0 for a failed scene.
     """
 
     def __init__(self, path: Path, group: Any, told: SceneRecord, intact: Callable[[], bool]) -> None:
@@ -167,7 +167,7 @@ class StoredScene:
             raise DamagedFileError(path, f"{group.name[1:]} {problem}", REMEDY)
 
     def _difference(self, told: SceneRecord) -> str:
-        """What the record of the scene says otherwise; "" for nothing."""
+        """Difference from the record of the scene; "" for none."""
         if not bool(len(self._group)) == bool(self.attributes.get("valid", told.valid)) == told.valid:
             return "is valid in its record or in its file, but not in both"
         if self.particles != told.particles:
@@ -176,7 +176,7 @@ class StoredScene:
 
     @functools.cached_property
     def words(self) -> dict[str, Any]:
-        """The scene file of the scene; nothing where its attributes do not say it."""
+        """Scene file of the scene; empty where its attributes lack it."""
         try:
             words = json.loads(str(self.attributes.get("scene", "")))
         except (ValueError, RecursionError):
@@ -185,7 +185,7 @@ class StoredScene:
 
     @property
     def names(self) -> list[str]:
-        """Of its arrays."""
+        """Names of its arrays."""
         return list(self._group)
 
     @property
@@ -207,7 +207,7 @@ class StoredScene:
         return name in self._group
 
     def __getitem__(self, name: str) -> Array:
-        """All of an array. Raises KeyError for one that is not there, DamagedFileError for damaged bytes."""
+        """Complete array. Raises KeyError for a missing one, DamagedFileError for damaged bytes."""
         return self._read(name, ...)
 
     def window(self, name: str, first: int, frames: int) -> Array:
@@ -239,11 +239,11 @@ class Shard:
     Args:
         path: the .h5 file.
         check: compare the whole file with its record first, which reads all of it; otherwise only its size is compared,
-            and damage to compressed arrays is noticed where they are read.
+            and damage to compressed arrays is detected when they are read.
 
     Raises:
-        FileNotFoundError: for a shard that is not there or not finished.
-        DamagedFileError: for a file that is no shard or is damaged; later, where damaged scenes are read.
+        FileNotFoundError: for a missing or unfinished shard.
+        DamagedFileError: for a file that is not a shard or is damaged; later, where damaged scenes are read.
         ImportError: when h5py is missing (extra ``data``).
     """
 
@@ -272,19 +272,19 @@ class Shard:
         self._file.close()
 
     def _intact(self) -> bool:
-        """Whether the file has its checksum, for which all of it is read."""
+        """Whether the checksum of the file is correct, for which all of it is read."""
         return file_hash(self.path) == self.record.sha256
 
     @property
     def ids(self) -> list[int]:
-        """Numbers of its scenes, those that failed among them."""
+        """Ids of its scenes, including failed ones."""
         return [scene.id for scene in self.record.scenes]
 
     def scene(self, scene_id: int) -> StoredScene:
         """
         Raises:
-            KeyError: for a scene that is not in this shard.
-            DamagedFileError: for one that holds anything but plain arrays of its own.
+            KeyError: for a scene outside this shard.
+            DamagedFileError: for a scene with anything but plain internal arrays.
         """
         h5py, name = h5py_module(), scene_name(scene_id)
         if scene_id not in self.ids:
@@ -312,7 +312,7 @@ def _is_positions(data: Any) -> bool:
 
 
 def _words_problem(words: dict[str, Any], dim: int) -> str:
-    """What in the scene file of a scene is not as a scene file has it; "" for nothing."""
+    """Problem of the scene file of a scene; "" for none."""
     gravity = words.get("gravity") or [0.0] * dim
     numbers = isinstance(gravity, list) and all(isinstance(v, (int, float)) and math.isfinite(v) for v in gravity)
     if not numbers or (dim and len(gravity) != dim):
@@ -327,7 +327,7 @@ def _words_problem(words: dict[str, Any], dim: int) -> str:
 
 
 def _scene_problem(group: Any, size: int) -> tuple[str, dict[str, Any]]:
-    """What keeps a group from being a scene, "" for nothing, and its attributes; the errors of h5py."""
+    """Reason why a group is not a scene, "" for none, and its attributes; the errors of h5py."""
     h5py = h5py_module()
     for name in group:
         hard = isinstance(group.get(name, getlink=True), h5py.HardLink)

@@ -1,6 +1,7 @@
-"""The scenes of a shard: drawn, seeded and simulated together, and again with smaller time steps where they failed.
+"""Scenes of a shard: drawn, seeded and simulated together, and simulated again with smaller time steps where they
+failed.
 
-All of it follows from the configuration and the ids of the scenes.
+All of it depends on the configuration and the ids of the scenes only.
 """
 
 from __future__ import annotations
@@ -26,22 +27,22 @@ from .sampling import NoRoom, content
 from .statistics import Motion
 
 Told = Callable[[int, int], None]
-"""What is called with the number of scenes that are simulated and the number of the frame that has been queued."""
+"""Function that is called with the number of simulated scenes and the number of the queued frame."""
 
 
 @dataclass
 class Outcome:
-    """What became of a scene.
+    """Outcome of a scene.
 
     Attributes:
-        id: of the scene.
-        words: what it has of its own; None where nothing could be drawn.
-        failure: why it failed; "" for a scene that is good.
-        attempts: how often it was simulated.
-        dt, substeps: time step [s] and number of them per frame of the last attempt.
-        behind: arrays of the particles of its obstacles, where the data set wants these.
-        arrays: of a scene that is good, as a shard has them, but for those that are packed.
-        packed: those of its arrays that were packed while they came.
+        id: id of the scene.
+        words: its content; None where nothing could be drawn.
+        failure: reason of its failure; "" for a valid scene.
+        attempts: number of simulations.
+        dt, substeps: time step [s] and number of substeps per frame of the last attempt.
+        behind: arrays of the particles of its obstacles, where the data set includes these.
+        arrays: arrays of a valid scene in the form of a shard, except packed ones.
+        packed: arrays that were packed during the simulation.
         motion: sums of its motion.
         materials: words of its materials, in the order of their numbers.
     """
@@ -61,7 +62,7 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Drawn:
-    """Scenes that are ready to be simulated: what is known of all, and the batch of those that have not failed yet."""
+    """Scenes that are ready to be simulated: the outcomes of all, and the batch of those that have not failed yet."""
 
     outcomes: list[Outcome]
     built: Built | None
@@ -72,7 +73,7 @@ class Drawn:
 
 
 def draw(configuration: Configuration, ids: Iterable[int], device: torch.device) -> Drawn:
-    """Draw scenes and seed their particles. A scene without room, or that is no good scene, has failed."""
+    """Draw scenes and seed their particles. A scene without space for a body, or that is invalid, has failed."""
     outcomes = [Outcome(k) for k in ids]
     for outcome in outcomes:
         try:
@@ -88,7 +89,7 @@ def draw(configuration: Configuration, ids: Iterable[int], device: torch.device)
 
 
 def _add_obstacles(configuration: Configuration, outcome: Outcome, volume: Array) -> None:
-    """Arrays of the particles of obstacles, at the mean distance of those of the scene, which have these volumes."""
+    """Arrays of the particles of obstacles, at the mean distance of those of the scene, with the given volumes."""
     if outcome.words is None or not _wants_obstacles(configuration, outcome):
         return
     dataset, dim = configuration.dataset, configuration.dim
@@ -106,7 +107,7 @@ def _add_obstacles(configuration: Configuration, outcome: Outcome, volume: Array
 
 
 def _built(configuration: Configuration, outcomes: list[Outcome], device: torch.device) -> Built | None:
-    """The batch of all scenes that have not failed; those that cannot be built fail now."""
+    """Batch of all scenes that have not failed; scenes that cannot be built fail now."""
     alive = [o for o in outcomes if not o.failure]
     if not alive:
         return None
@@ -119,7 +120,7 @@ def _built(configuration: Configuration, outcomes: list[Outcome], device: torch.
             except SceneError as error:
                 outcome.failure = "; ".join(error.problems)
         if not any(o.failure for o in alive):
-            raise  # each is right, but not all together
+            raise  # Each is valid, but not all together.
         return _built(configuration, outcomes, device)
 
 
@@ -134,17 +135,17 @@ def simulate(
     told: Told | None = None,
     packers: Executor | None = None,
 ) -> None:
-    """Simulate what was drawn; its outcomes tell the rest.
+    """Simulate the drawn scenes; the results are in their outcomes.
 
     Args:
-        configuration: of the data set.
+        configuration: configuration of the data set.
         drawn: the scenes.
-        device: where they are simulated.
+        device: device of the simulation.
         told: called after each frame has been queued.
-        packers: that pack the scenes on the way.
+        packers: executor that packs the scenes during the simulation.
 
     Raises:
-        SimulationError: where the device has no memory for the scenes.
+        SimulationError: where the device memory is insufficient for the scenes.
     """
     dataset, built = configuration.dataset, drawn.built
     if built is None:
@@ -182,7 +183,7 @@ def _attempt(
     configuration: Configuration, outcomes: list[Outcome], built: Built, count: int, told: Told | None,
     packers: Executor | None,
 ) -> None:  # fmt: skip
-    """Simulate scenes and keep the arrays of those that are good."""
+    """Simulate scenes and store the arrays of valid ones."""
     dataset, statics = configuration.dataset, built.statics()
     names = ("position", *dataset.fields)
 
@@ -212,7 +213,7 @@ def _attempt(
 def _parameters(
     configuration: Configuration, materials: list[dict[str, Any]], number: npt.NDArray[Any]
 ) -> dict[str, Array]:
-    """Parameters [N] that differ between scenes, zero for particles of materials that have none of that name."""
+    """Parameters [N] that differ between scenes, zero for particles of materials without a parameter of that name."""
     arrays = {}
     for name in configuration.drawn_parameters:
         values = [m.get(name) for m in materials]
@@ -225,7 +226,7 @@ def _complete(
     configuration: Configuration, outcome: Outcome, recorded: Recorded, own: dict[str, Array], built: Built,
     index: int,
 ) -> None:  # fmt: skip
-    """Take over the arrays of a scene that is good: fields, types, materials and masses of its particles."""
+    """Store the arrays of a valid scene: fields, types, materials and masses of its particles."""
     first = [k for k, m in enumerate(built.materials) if m.scene == index]
     materials = [built.materials[k] for k in first]
     types = [configuration.particle_type(m) for m in materials]
@@ -248,5 +249,5 @@ def _complete(
 
 
 def _wants_obstacles(configuration: Configuration, outcome: Outcome) -> bool:
-    """Whether there are particles of obstacles in the arrays of a scene."""
+    """Whether the arrays of a scene include particles of obstacles."""
     return configuration.dataset.obstacles and outcome.words is not None and bool(outcome.words.get("obstacle"))

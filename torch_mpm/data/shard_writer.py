@@ -20,17 +20,17 @@ Attributes = Mapping[str, str | int | float]
 
 
 class ShardWriter:
-    """A shard that is being written, to which scenes are added in any order; :meth:`finish` makes it appear.
+    """Writer of a shard, to which scenes are added in any order; :meth:`finish` publishes it.
 
-    A context manager; without `finish`, nothing is left of it.
+    A context manager; without `finish`, nothing remains.
 
     Args:
-        path: where it is to be.
+        path: path of the shard.
         attributes: texts and numbers about the whole shard.
 
     Raises:
         ImportError: when h5py is missing (extra ``data``).
-        OSError: where no file can be made.
+        OSError: where no file can be created.
     """
 
     def __init__(self, path: Path, attributes: Attributes | None = None) -> None:
@@ -58,7 +58,7 @@ class ShardWriter:
 
         Args:
             scene_id: its number in the data set.
-            scene: from :func:`torch_mpm.data.packing.prepare_scene`.
+            scene: result of :func:`torch_mpm.data.packing.prepare_scene`.
             attributes: must have ``valid`` (0 or 1); ``attempts`` and ``failure`` also go into the record.
 
         Raises:
@@ -87,13 +87,13 @@ class ShardWriter:
         self._scenes.append(record)
 
     def finish(self) -> ShardRecord:
-        """Write the rest of the shard and then its record; each appears when it is whole and on the disk.
+        """Write the rest of the shard and then its record; each appears when it is complete and on the disk.
 
         Raises:
             OSError: for a full disk, among others.
         """
         self._file.close()
-        with ThreadPoolExecutor(1) as beside:  # a disk and a hash take about as long
+        with ThreadPoolExecutor(1) as beside:  # A disk and a hash take about as long.
             digest = beside.submit(file_hash, self._building)
             self._disk.sync()
         appear(self._building, self._path)
@@ -103,13 +103,13 @@ class ShardWriter:
         return record
 
 
-# ---- by the functions of HDF5 itself: those of h5py take twice as long, and Python's lock
+# ---- by the functions of HDF5 itself: those of h5py take twice as long, and hold Python's lock
 
 
 def _new_group(parent: Any, name: str) -> Any:
     h5py = h5py_module()
     properties = h5py.h5p.create(h5py.h5p.GROUP_CREATE)
-    properties.set_obj_track_times(False)  # equal runs write equal files
+    properties.set_obj_track_times(False)  # Equal runs write equal files.
     return h5py.h5g.create(parent, name.encode(), gcpl=properties)
 
 

@@ -1,4 +1,6 @@
-"""Statistics of motions, by which learned simulators normalise: sums of scenes, which add up to those of a split."""
+"""Statistics of motions, for the normalisation of learned simulators: sums of scenes, which add up to those of a
+split.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,7 @@ from torch import Tensor
 Array = npt.NDArray[Any]
 
 BOUNDARY = 3
-"""Particle type of what moves as prescribed; its motion is not to be learned, and is in no statistics."""
+"""Type of particles with prescribed motion, which is not to be learned, and excluded from statistics."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +35,7 @@ class Sums:
 
     @classmethod
     def of(cls, vectors: Array) -> Sums:
-        """Of vectors [D, ...]."""
+        """Sums of vectors [D, ...]."""
         axes = vectors.reshape(len(vectors), -1)
         squares = tuple(float(np.einsum("n,n->", axis, axis)) for axis in axes)
         return cls(axes.shape[1], tuple(axes.sum(1).tolist()), squares)
@@ -56,7 +58,7 @@ class Sums:
 
 @dataclass(frozen=True)
 class Motion:
-    """Statistics of a scene as learned simulators use them: first and second differences of positions per frame [m]."""
+    """Statistics of a scene for learned simulators: first and second differences of positions per frame [m]."""
 
     velocity: Sums
     acceleration: Sums
@@ -66,20 +68,20 @@ class Motion:
 
     @property
     def finite(self) -> bool:
-        """Whether all positions were."""
+        """Whether all positions were finite."""
         return all(math.isfinite(v) for s in (self.velocity, self.acceleration) for v in (*s.sum, *s.squares))
 
 
 class MotionSums:
-    """Sums of the motions of all particles while frames come, on the device of these. Positions count as they are
-    stored, in float32; each particle has sums of its own, so that they do not depend on what is simulated beside it.
+    """Sums of the motions of all particles as frames arrive, on their device. Positions are rounded to float32, as
+    stored; each particle has separate sums, so that they do not depend on other scenes of the batch.
     """
 
     def __init__(self) -> None:
         self._frames = 0
 
     def add(self, position: Tensor) -> None:
-        """The next frame [P, D] [m]."""
+        """Add the next frame [P, D] [m]."""
         x = position.float()
         if self._frames == 0:
             self._first, self._last = x.double(), x.double()
@@ -97,10 +99,10 @@ class MotionSums:
         self._frames += 1
 
     def of_scenes(self, ends: Sequence[int]) -> list[Motion]:
-        """Of each scene, whose particles lie between two ends. Waits for the device."""
+        """Statistics of each scene, given as a range of particles. Waits for the device."""
         steps = self._frames - 1
         sums = [self._last - self._first, *self._squares[:1], self._v - self._start, *self._squares[1:]]
-        rows = torch.stack(sums, 1).cpu().numpy()  # sums of differences are differences of ends
+        rows = torch.stack(sums, 1).cpu().numpy()  # Sums of differences are differences of ends.
         motions = []
         for first, end in itertools.pairwise(ends):
             count = end - first

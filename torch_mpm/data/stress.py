@@ -1,4 +1,4 @@
-"""Stresses in files: which measure an array has, and their invariants."""
+"""Stresses in files: measures of arrays, and invariants."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ TENSORS = ("stress", "cauchy_stress", "kirchhoff_stress")
 
 
 def measure_of(name: str, attribute: Any) -> str:
-    """The measure of an array of a file: its attribute, or that of files from before there was one."""
+    """Measure of an array of a file: its attribute, or that of older files without it."""
     return str(attribute) if attribute is not None else KIRCHHOFF if name == "stress" else MEASURES[name]
 
 
 def explicit_name(name: str, measure: str) -> str:
-    """The name of a field with its measure: that of "stress" is `cauchy_stress` or `kirchhoff_stress`."""
+    """Name of a field with its measure: "stress" becomes `cauchy_stress` or `kirchhoff_stress`."""
     return f"{measure.lower()}_stress" if name == "stress" else name
 
 
@@ -34,7 +34,7 @@ def von_mises(stress: Array, out_of_plane: Array | None = None) -> Array:
 
     Args:
         stress: [..., D, D].
-        out_of_plane: σ_zz [...] of plane strain in 2-D. Without it, the stress in 2-D is that in the plane: √3 times
+        out_of_plane: σ_zz [...] of plane strain in 2-D. Without it, the stress in 2-D is the in-plane stress: √3 times
             the largest shear stress there, the von Mises stress where σ_zz is the mean stress in the plane.
     """
     normal = np.moveaxis(np.diagonal(stress, axis1=-2, axis2=-1), -1, 0)
@@ -47,14 +47,14 @@ def von_mises(stress: Array, out_of_plane: Array | None = None) -> Array:
 
 
 class DrawnStress(NamedTuple):
-    """How pictures get a von Mises stress from the arrays of a file."""
+    """Computation of the von Mises stress of pictures from the arrays of a file."""
 
     name: str
-    """An array: the von Mises stress itself, or a tensor."""
+    """Array: the von Mises stress itself, or a tensor."""
     out_of_plane: str | None
-    """The array that completes a tensor in 2-D."""
+    """Array that completes a tensor in 2-D."""
     label: str
-    """What the picture shows, with the measure where it is not Cauchy's."""
+    """Label of the picture, with the measure where it is not Cauchy's."""
 
     def values(self, arrays: Any) -> Array:
         """Von Mises stress [..., P] of arrays by name."""
@@ -65,13 +65,13 @@ class DrawnStress(NamedTuple):
 
 
 def drawn_stress(names: Collection[str], measures: dict[str, str], dim: int) -> DrawnStress | None:
-    """The best there is among some arrays: that of Cauchy, with its out-of-plane component; None without a stress."""
+    """Best available stress among some arrays: Cauchy, with its out-of-plane component; None without a stress."""
     if "von_mises_stress" in names:
         return DrawnStress("von_mises_stress", None, "von Mises stress")
     tensors = [name for name in TENSORS if name in names]
     if not tensors:
         return None
-    name = min(tensors, key=lambda n: measures[n])  # Cauchy before Kirchhoff
+    name = min(tensors, key=lambda n: measures[n])  # Cauchy before Kirchhoff.
     measure = "" if measures[name] == CAUCHY else f"{measures[name]} "
     whole = not measure and "out_of_plane_stress" in names
     where = "in-plane " if dim == 2 and not whole else ""

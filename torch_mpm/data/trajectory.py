@@ -1,16 +1,16 @@
-"""Trajectories on disk: one HDF5 file that any HDF5 program reads, and that a kill at any moment cannot damage.
+"""Trajectories on disk: one HDF5 file, readable by any HDF5 program, that a kill at any moment cannot damage.
 
-All metadata and the room for all frames are written before the first frame; after that a frame is plain bytes at
-known offsets, followed by the number of whole frames. So the file is valid HDF5 at every moment, half a frame is never
-counted, and a disk that is too small is noticed before the run starts. Until it is complete the file is called
-``trajectory.partial.h5``. Its metadata and the arrays that do not change are sealed (:mod:`torch_mpm.hdf5`), and every
-frame has a checksum: damaged data raise DamagedFileError where they are read.
+All metadata and the space of all frames are written before the first frame; after that a frame is plain bytes at known
+offsets, followed by the number of complete frames. So the file is valid HDF5 at every moment, an incomplete frame is
+never counted, and a disk that is too small is detected before the run starts. Until it is complete the file is called
+``trajectory.partial.h5``. Its metadata and constant arrays are sealed (:mod:`torch_mpm.hdf5`), and every frame has a
+checksum: damaged data raise DamagedFileError when they are read.
 
-Layout: ``position``, ``velocity`` and the fields asked for are [T, N, ...], particle n being the one with id n;
-stresses have an attribute ``measure``, "Cauchy" or "Kirchhoff" (without it, ``stress`` is the Kirchhoff stress);
-``mass``, ``volume``, ``material``, ``scene`` are [N]; ``time``, ``particles``, ``substeps``, the energies and
-``momentum`` are [T] or [T, D]; ``frames_written`` is [1]; ``checksum`` [T, K] is the CRC-32 of each frame of the K
-arrays that its attribute ``names`` lists. Particles that an emitter has not yet released are NaN.
+Layout: ``position``, ``velocity`` and the requested fields are [T, N, ...], where particle n has id n; stresses have an
+attribute ``measure``, "Cauchy" or "Kirchhoff" (without it, ``stress`` is the Kirchhoff stress); ``mass``, ``volume``,
+``material``, ``scene`` are [N]; ``time``, ``particles``, ``substeps``, the energies and ``momentum`` are [T] or [T, D];
+``frames_written`` is [1]; ``checksum`` [T, K] is the CRC-32 of each frame of the K arrays that its attribute ``names``
+lists. Particles that are not yet emitted are NaN.
 """
 
 from __future__ import annotations
@@ -53,10 +53,10 @@ UNITS = {
 
 @dataclass(frozen=True)
 class Layout:
-    """What a trajectory holds.
+    """Content of a trajectory.
 
     ``fields`` per particle and frame and ``scalars`` per frame map a name to (trailing shape, dtype); ``statics`` [N]
-    are the arrays that do not change; ``attributes`` are texts and numbers about the whole file.
+    are the constant arrays; ``attributes`` are texts and numbers about the whole file.
     """
 
     frames: int
@@ -84,10 +84,11 @@ class Layout:
 
 
 def create(path: Path, layout: Layout) -> None:
-    """Write an empty trajectory with room for all its frames; the file appears under ``path`` only when it is whole.
+    """Write an empty trajectory with space for all its frames; the file appears under ``path`` only when it is
+    complete.
 
     Raises:
-        OSError: when the disk has no room (ENOSPC).
+        OSError: when the disk is full (ENOSPC).
     """
     image = SparseFile()
     places = _metadata(image, layout)
@@ -95,7 +96,7 @@ def create(path: Path, layout: Layout) -> None:
     try:
         with open(building, "w+b") as handle:
             fd, extents = handle.fileno(), image.extents()
-            os.posix_fallocate(fd, 0, image.size)  # the holes of the file get their room now, not in frame 90
+            os.posix_fallocate(fd, 0, image.size)  # The holes of the file are allocated now, not in frame 90.
             for offset, length in extents:
                 image.seek(offset)
                 _write_all(fd, np.frombuffer(image.read(length), np.uint8), offset)
@@ -111,7 +112,7 @@ def create(path: Path, layout: Layout) -> None:
 
 
 def _metadata(image: SparseFile, layout: Layout) -> dict[str, int]:
-    """Write all of a trajectory but its numbers; returns the offsets of the arrays [bytes]."""
+    """Write all of a trajectory except its numbers; returns the offsets of the arrays [bytes]."""
     h5py = h5py_module()
     columns = sorted([*layout.fields, *layout.scalars])
     with h5py.File(image, "w", libver="v110") as out:
@@ -134,7 +135,7 @@ def _metadata(image: SparseFile, layout: Layout) -> dict[str, int]:
 
 
 def _reserve(h5py: Any, out: Any, name: str, shape: tuple[int, ...], dtype: str) -> None:
-    """A contiguous dataset with a fixed place in the file; its frames are not filled in."""
+    """Contiguous dataset at a fixed position in the file; its frames are not filled in."""
     properties = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
     properties.set_layout(h5py.h5d.CONTIGUOUS)
     properties.set_alloc_time(h5py.h5d.ALLOC_TIME_EARLY)
@@ -145,10 +146,10 @@ def _reserve(h5py: Any, out: Any, name: str, shape: tuple[int, ...], dtype: str)
 
 
 class TrajectoryWriter:
-    """Writes frames of a trajectory that `create` made, or continues one from frame ``frames_written``.
+    """Writer of the frames of a trajectory created by `create`; continues from frame ``frames_written``.
 
     Raises:
-        DamagedFileError: for a file that is no whole trajectory.
+        DamagedFileError: for a file that is not a complete trajectory.
     """
 
     def __init__(self, path: Path) -> None:
@@ -185,7 +186,7 @@ class TrajectoryWriter:
         _write_all(self._fd, np.array([frames], np.int64), self._places["frames_written"][0])
 
     def rewind(self, frames: int) -> None:
-        """Forget the frames from number ``frames`` on."""
+        """Discard the frames from number ``frames`` on."""
         self._count(frames)
 
     def close(self) -> None:
@@ -207,11 +208,11 @@ class Trajectory:
     """A trajectory, complete or still growing: ``Trajectory("out/demo")`` or the path of an HDF5 file.
 
     ``trajectory["position"]`` is the array [frames, N, D] of the frames written so far, ``trajectory.frame(k)`` one
-    frame without the particles that are still to come. Works as a context manager.
+    frame without particles that are not yet emitted. Works as a context manager.
 
     Raises:
         FileNotFoundError: when there is no trajectory.
-        DamagedFileError: for a file that is no trajectory or is damaged; later, where damaged frames are read.
+        DamagedFileError: for a file that is not a trajectory or is damaged; later, where damaged frames are read.
         ImportError: when h5py is missing (extra ``data``).
     """
 
@@ -220,7 +221,7 @@ class Trajectory:
         self.file = open_sealed(self.path, self._remedy)
         try:
             problem = _problem(self.file)
-        except (KeyError, TypeError, ValueError, IndexError) as error:  # attributes of another kind
+        except (KeyError, TypeError, ValueError, IndexError) as error:  # Attributes of another kind.
             problem = f"is no trajectory: {error}"
         if not problem and self.path.name == COMPLETE and len(self) < len(self.file["time"]):
             problem = f"says that {len(self)} of its {len(self.file['time'])} frames are written, and was complete"
@@ -272,7 +273,7 @@ class Trajectory:
         return array
 
     def verify(self, frames: int) -> None:
-        """Read the first frames and raise DamagedFileError for one that has changed since it was written."""
+        """Read the first frames and raise DamagedFileError for one that was changed."""
         for k in range(frames):
             for name in self.columns:
                 self._check(name, k, self.file[name][k])
@@ -283,7 +284,7 @@ class Trajectory:
             raise DamagedFileError(self.path, f"{name} of frame {k} is damaged: its checksum is wrong", self._remedy)
 
     def names(self, name: str) -> list[str]:
-        """Names that the indices of ``material`` or ``scene`` stand for."""
+        """Names of the indices of ``material`` or ``scene``."""
         return [str(n) for n in self.file[name].attrs["names"]]
 
     @property
@@ -317,7 +318,7 @@ def find(path: str | Path) -> Path:
 
 
 def _problem(file: Any) -> str:
-    """Why a file of plain arrays is not a trajectory; "" if it is one."""
+    """Reason why a file of plain arrays is not a trajectory; "" if it is one."""
     if not np.array_equal(file.attrs.get("format"), FORMAT):
         return "is no trajectory of this version of torch_mpm"
     shapes = {name: data.shape for name, data in file.items()}

@@ -1,4 +1,4 @@
-"""Files that appear when they are whole and on the disk, and their hashes."""
+"""Files that appear when they are complete and on the disk, and their hashes."""
 
 from __future__ import annotations
 
@@ -16,23 +16,23 @@ from typing import Any
 from ..errors import DamagedFileError
 
 NAME = re.compile(r"[A-Za-z0-9_-]+")
-"""Names that may become a part of a path."""
+"""Names that are allowed in paths."""
 LEFTOVER = re.compile(r"\.(?P<machine>\w+)-(?P<process>\d{1,18})\.building(\.\w+)?$")
-"""End of the name of what is not whole yet."""
+"""Suffix of incomplete files."""
 CHECKSUM = "checksum"
 MOST = 2**53
-"""Of the whole numbers in records: larger ones are no numbers of anything."""
+"""Maximum of the integers in records."""
 PART_BYTES = 2**25
-"""Of a file that is hashed in parts."""
+"""Size of the parts of a hashed file."""
 MOST_HASHERS = 4
-"""Threads that hash a file."""
+"""Number of threads that hash a file."""
 
 
 def write_whole(path: Path, data: bytes) -> None:
-    """Write a file that appears when all of it is on the disk, and stays there.
+    """Write a file that appears when all of it is on the disk, durably.
 
     Raises:
-        OSError: when it cannot be written; nothing is left of it.
+        OSError: when it cannot be written; nothing remains of it.
     """
     building = building_path(path)
     try:
@@ -47,18 +47,20 @@ def write_whole(path: Path, data: bytes) -> None:
 
 
 def checksum(values: Mapping[str, Any]) -> str:
-    """SHA-256 of values as JSON, whatever their order."""
+    """SHA-256 of values as JSON, for any order of keys."""
     return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
 
 
 def write_record(path: Path, values: Mapping[str, Any]) -> None:
-    """Write values as JSON with their checksum, in a file that appears when it is whole; OSError as `write_whole`."""
-    plain = json.loads(json.dumps(values, allow_nan=False))  # tuples as lists, as they come back
+    """Write values as JSON with their checksum, in a file that appears when it is complete; OSError as
+    `write_whole`.
+    """
+    plain = json.loads(json.dumps(values, allow_nan=False))  # Tuples as lists, the form in which they are read.
     write_whole(path, json.dumps({**plain, CHECKSUM: checksum(plain)}, indent=1).encode())
 
 
 def check_record(values: dict[str, Any], path: Path, remedy: str) -> None:
-    """Compare the values of a record with their checksum, which is taken out of them.
+    """Compare the values of a record with their checksum, which is removed from them.
 
     Raises:
         DamagedFileError: with ``remedy``, where they differ.
@@ -68,14 +70,14 @@ def check_record(values: dict[str, Any], path: Path, remedy: str) -> None:
 
 
 def count(value: Any, least: int = 0) -> int:
-    """A whole number of a record, at most `MOST`; anything else is a ValueError."""
+    """Integer of a record, at most `MOST`; anything else is a ValueError."""
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not least <= value <= MOST or value % 1:
         raise ValueError(f"a number must be whole and within {least} and {MOST}, got {value!r:.100}")
     return int(value)
 
 
 def check_inside(folder: Path, path: Path, remedy: str) -> None:
-    """Refuse a path in a folder that links lead out of it.
+    """Refuse a path that leads out of a folder by links.
 
     Raises:
         DamagedFileError: with ``remedy``.
@@ -85,17 +87,17 @@ def check_inside(folder: Path, path: Path, remedy: str) -> None:
 
 
 def building_path(path: Path, suffix: str = "") -> Path:
-    """Name of a file or folder of this process that is not whole yet.
+    """Name of an incomplete file or folder of this process.
 
     Args:
-        path: name of the whole file.
-        suffix: end of the name, for programs that read the format from it.
+        path: name of the complete file.
+        suffix: end of the name, for programs that derive the format from it.
     """
     return path.with_name(f".{path.name}.{_machine()}-{os.getpid()}.building{suffix}")
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Remove the files and folders that processes of this machine, which are gone, have left unfinished in a folder."""
+    """Remove incomplete files and folders in a folder that ended processes of this machine have left."""
     for path in folder.glob(".*.building*"):
         found = LEFTOVER.search(path.name)
         if found is None or found["machine"] != _machine() or _runs(int(found["process"])):
@@ -107,7 +109,7 @@ def remove_leftovers(folder: Path) -> None:
 
 
 def _machine() -> str:
-    """Name of what numbers processes: a container numbers its own, and may share the name of its host."""
+    """Name of the process number space: a container has its own, and may share the name of its host."""
     try:
         space = os.stat("/proc/self/ns/pid").st_ino
     except OSError:
@@ -120,13 +122,13 @@ def _runs(process: int) -> bool:
         os.kill(process, 0)
     except ProcessLookupError:
         return False
-    except (PermissionError, OverflowError):  # of another user; no process has such a number
+    except (PermissionError, OverflowError):  # Process of another user; or no process has such a number.
         return True
     return True
 
 
 def appear(building: Path, path: Path) -> None:
-    """Give a file that is on the disk its name, for good."""
+    """Rename a file on the disk to its name, durably."""
     building.replace(path)
     folder = os.open(path.parent, os.O_RDONLY)
     try:
@@ -136,7 +138,7 @@ def appear(building: Path, path: Path) -> None:
 
 
 def file_hash(path: Path) -> str:
-    """SHA-256 of the SHA-256 of all parts of ``PART_BYTES`` of a file, which are hashed side by side."""
+    """SHA-256 of the SHA-256 of all parts of ``PART_BYTES`` of a file, which are hashed in parallel."""
 
     def part(first: int) -> bytes:
         digest = hashlib.sha256()

@@ -1,6 +1,6 @@
-"""Windows of frames for training: some frames in a row of one scene, and batches of them.
+"""Windows of frames for training: consecutive frames of one scene, and batches of them.
 
-An item is a dictionary: fields [N, T, ...] of the T frames of a window, particles first, what does not change [N], and
+An item is a dictionary: fields [N, T, ...] of the T frames of a window, particles first, constants [N], and
 ``scene_id`` and ``first``, the scene and its first frame. Batches are packed, [sum N, T, ...] with ``scene`` [sum N],
 or padded, [B, N, T, ...] with ``mask`` [B, N].
 """
@@ -26,7 +26,7 @@ Collate = Callable[[Sequence[Item]], Item]
 
 
 class WindowDataset(Dataset[Item]):
-    """All windows of the valid scenes of a split, read from the files when they are asked for.
+    """All windows of the valid scenes of a split, read from the files on access.
 
     Args:
         dataset: folder of the data set.
@@ -37,9 +37,9 @@ class WindowDataset(Dataset[Item]):
             `OnlineStream` have all of them.
 
     Raises:
-        FileNotFoundError, DamagedFileError: as :class:`DatasetFolder`; the second also where damaged frames are read.
-        KeyError: for a split or a field that is not there, or, where a window is read, for such a constant.
-        TypeError: for fields or constants that are no list of names.
+        FileNotFoundError, DamagedFileError: as :class:`DatasetFolder`; the second also when damaged frames are read.
+        KeyError: for an unknown split or field, or, when a window is read, for an unknown constant.
+        TypeError: for fields or constants that are not a list of names.
         ValueError: for windows longer than the scenes.
 
     Works in workers of a data loader, forked or spawned.
@@ -88,7 +88,7 @@ def _names(argument: str, names: Sequence[str]) -> tuple[str, ...]:
 
 
 def _constant(scene: StoredScene, name: str) -> Any:
-    """An array [N] of a scene; MissingError for one that is not there or changes from frame to frame."""
+    """Array [N] of a scene; MissingError for one that is missing or changes between frames."""
     if name not in scene or len(scene.shape(name)) > 1:
         known = [known for known in scene.names if len(scene.shape(known)) == 1]
         raise MissingError(f"constants must be arrays [N] of the scenes, {', '.join(known)}, got {name!r}")
@@ -104,7 +104,7 @@ def particles_first(window: Any) -> Tensor:
 
 
 def pack(items: Sequence[Item]) -> Item:
-    """Particles of all items behind one another: [sum N, ...], with ``scene`` int64 [sum N], the item of each particle.
+    """Concatenated particles of all items: [sum N, ...], with ``scene`` int64 [sum N], the item of each particle.
 
     ``scene_id`` and ``first`` are [B].
     """
@@ -117,7 +117,7 @@ def pack(items: Sequence[Item]) -> Item:
 
 
 def pad(items: Sequence[Item]) -> Item:
-    """Items of N particles at most, filled up with zeros: [B, N, ...], with ``mask`` [B, N], true where a particle is.
+    """Items padded with zeros to N particles: [B, N, ...], with ``mask`` [B, N], true where a particle is.
 
     ``scene_id`` and ``first`` are [B].
     """
@@ -152,7 +152,7 @@ def _columns(items: Sequence[Item]) -> Iterator[tuple[str, list[Tensor]]]:
 
 
 def rank_and_world() -> tuple[int, int]:
-    """Of torch.distributed where it is in use; (0, 1) otherwise."""
+    """Rank and number of processes of torch.distributed where it is in use; (0, 1) otherwise."""
     distributed = torch.distributed
     if distributed.is_available() and distributed.is_initialized():
         return distributed.get_rank(), distributed.get_world_size()
@@ -160,22 +160,22 @@ def rank_and_world() -> tuple[int, int]:
 
 
 class WindowStream(IterableDataset[Item]):
-    """Batches of windows, epoch after epoch without end, in an order that depends on the seed alone.
+    """Endless batches of windows, epoch after epoch, in an order that depends on the seed only.
 
-    Each rank has its share of every epoch, the same number of batches for each; what does not fill a batch on every
-    rank is left out of that epoch. Workers share the batches of their rank, in the same order for any number of them:
+    Each rank has its share of every epoch, with the same number of batches; windows that do not fill a batch on every
+    rank are dropped from that epoch. Workers share the batches of their rank, in the same order for any number of them:
 
         stream = WindowStream(WindowDataset("out/sand"), batch_size=8, seed=1)
         for batch in stream.loader(num_workers=2):
             ...
-            torch.save(stream.state_dict(), "order.pt")  # the batches that were taken, not those read ahead
+            torch.save(stream.state_dict(), "order.pt")  # the consumed batches, not those read ahead
 
     Args:
         windows: a map dataset, such as a `WindowDataset`.
         batch_size: windows of a batch.
-        seed: of the order; None leaves the windows in theirs.
-        collate: `pack`, `pad`, or a function of your own of a list of items.
-        rank, world: this process among those that train together; those of torch.distributed by default.
+        seed: seed of the order; None for the order of the windows.
+        collate: `pack`, `pad`, or a user function of a list of items.
+        rank, world: rank and number of the training processes; those of torch.distributed by default.
 
     Raises:
         ValueError: where there is no batch for every rank.
@@ -207,7 +207,7 @@ class WindowStream(IterableDataset[Item]):
         self._permutation: tuple[int, Any] = (-1, None)
 
     def __iter__(self) -> Iterator[Item]:
-        """The batches of this worker; where there are no workers they count as taken."""
+        """Batches of this worker; without workers they count as consumed."""
         info = get_worker_info()
         worker, workers = (info.id, info.num_workers) if info else (0, 1)
         for number in itertools.count(self.taken + worker, workers):
@@ -217,7 +217,7 @@ class WindowStream(IterableDataset[Item]):
             yield batch
 
     def loader(self, num_workers: int = 0, **options: Any) -> Iterator[Item]:
-        """The batches from the first that was not taken on, read by ``num_workers`` processes.
+        """Batches from the first unconsumed one on, read by ``num_workers`` processes.
 
         ``options`` are those of `torch.utils.data.DataLoader`, such as ``pin_memory`` and ``multiprocessing_context``.
         """
@@ -227,11 +227,11 @@ class WindowStream(IterableDataset[Item]):
             yield batch
 
     def state_dict(self) -> dict[str, Any]:
-        """Where this stream stands; goes on from there after `load_state_dict`, with any number of workers."""
+        """Position of this stream; `load_state_dict` continues from there, with any number of workers."""
         return {"taken": self.taken, **self._order()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on where another stream stood.
+        """Continue at the position of another stream.
 
         Raises:
             ValueError: for one of another order: data, seed, size of a batch or number of ranks.
@@ -245,7 +245,7 @@ class WindowStream(IterableDataset[Item]):
         return {"seed": self.seed, "batch_size": self.batch_size, "world": self.world, "length": self.length}
 
     def _indices(self, number: int) -> Any:
-        """The windows of batch ``number`` of this rank, counted over all epochs."""
+        """Windows of batch ``number`` of this rank, counted over all epochs."""
         epoch, batch = divmod(number, self.batches_per_epoch)
         first = (batch * self.world + self.rank) * self.batch_size
         return self._epoch(epoch)[first : first + self.batch_size]

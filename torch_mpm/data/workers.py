@@ -1,4 +1,4 @@
-"""Which of several processes this one is, and which device it takes: under python, torchrun or SLURM."""
+"""Rank and device of this process among several: under python, torchrun or SLURM."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ import torch
 
 
 class WorkerError(ValueError):
-    """A process that cannot take part: what its environment says makes no sense, or it has no device."""
+    """A process that cannot take part: its environment is contradictory, or it has no device."""
 
 
 @dataclass(frozen=True)
 class Worker:
     """One of ``size`` processes.
 
-    ``local`` is its number among the ``beside`` processes of its machine, of which there are 0 where that is unknown.
+    ``local`` is its number among the ``beside`` processes of its machine; ``beside`` is 0 where that is unknown.
     """
 
     rank: int = 0
@@ -27,12 +27,12 @@ class Worker:
 
 
 def worker(environment: Mapping[str, str] = os.environ) -> Worker:
-    """What the environment says: RANK, WORLD_SIZE, LOCAL_RANK and LOCAL_WORLD_SIZE (torchrun); SLURM_PROCID,
+    """Rank from the environment: RANK, WORLD_SIZE, LOCAL_RANK and LOCAL_WORLD_SIZE (torchrun); SLURM_PROCID,
     SLURM_NTASKS, SLURM_LOCALID and SLURM_NTASKS_PER_NODE (tasks), SLURM_ARRAY_TASK_ID, _MIN, _STEP and _COUNT (an
     array, of whose jobs each may have tasks).
 
     Raises:
-        WorkerError: for what is no number, or a rank that is not below the number of processes.
+        WorkerError: for a value that is not a number, or a rank that is not below the number of processes.
     """
 
     def number(name: str, default: int) -> int:
@@ -58,12 +58,12 @@ def worker(environment: Mapping[str, str] = os.environ) -> Worker:
 
 
 def take_device(name: str, one: Worker) -> torch.device:
-    """The device of a process, made the current one before anything is done on it.
+    """Device of a process, set as the current one before its first use.
 
     Args:
-        name: "cpu", "cuda", "cuda:1", ... or "auto": a GPU if torch finds one. Without a number, processes take the GPU
-            of their number on the machine, in turn where there are two, three, ... times as many; where each sees one
-            GPU alone, all take that.
+        name: "cpu", "cuda", "cuda:1", ... or "auto": a GPU if torch finds one. Without a number, a process uses the GPU
+            of its number on the machine, cyclically where there are two, three, ... times as many processes; where each
+            process has access to one GPU only, all use that.
         one: this process.
 
     Raises:

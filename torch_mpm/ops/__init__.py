@@ -1,9 +1,9 @@
-"""The Python faces of the ops: checks, fake kernels, autograd.
+"""Python wrappers of the ops: checks, fake kernels, autograd.
 
-The ops themselves, `torch.ops.torch_mpm.*`, check sizes, dtypes, devices and numbers as well, and raise RuntimeError.
-The last three arguments `topology`, `lattice` and `layout` are `Blocks.packed`. The index tensors in `topology` must be
-those of one call of `activate` with this lattice: their sizes are checked, but not their values, and others can make a
-kernel read or write outside of its tensors.
+The ops themselves, `torch.ops.torch_mpm.*`, also check sizes, dtypes, devices and numbers, and raise RuntimeError. The
+last three arguments `topology`, `lattice` and `layout` are `Blocks.packed`. The index tensors in `topology` must be
+those of one call of `activate` with this lattice: their sizes are checked, but not their values, and other tensors can
+make a kernel read or write outside its tensors.
 """
 
 from . import activation as activation

@@ -1,4 +1,4 @@
-"""The fake kernels of `activate`, `cell_order` and `take`, which `Grid.activate` and `State.sorted` call."""
+"""Fake kernels of `activate`, `cell_order` and `take`, which `Grid.activate` and `State.sorted` call."""
 
 from __future__ import annotations
 

@@ -22,7 +22,7 @@ def advance(
     scene: Tensor | None = None,
     scenes: int = 1,
 ) -> tuple[Tensor, Tensor | None, Tensor | None]:
-    """Move the particles, and deform them with the velocity gradient C.
+    """Update positions, and deformations with the velocity gradient C.
 
     Args:
         x: positions [P, D] [m].
@@ -114,7 +114,7 @@ def _double_backward(ctx, *grads):
     wanted = [bool(ctx.needs >> i & 1) and here for i, here in enumerate(present)]
 
     def adjoint(grad_x, grad_F, grad_J, v, C, F, J, scene_dt):
-        """`advance_particle_backward` of csrc/transfer/advance.h once more, in plain torch."""
+        """`advance_particle_backward` of csrc/transfer/advance.h in plain torch."""
         dt = torch.tensor(ctx.dt, dtype=x.dtype, device=x.device)
         dt = dt.expand(x.shape[0]) if scene_dt is None else dt * per_particle(scene_dt, scene, x.shape[0])
         step = dt[:, None, None]

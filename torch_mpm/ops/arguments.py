@@ -14,13 +14,13 @@ from ..errors import LARGEST, REAL, check_like, shape_of
 
 
 def split_dt(dt: float | Tensor, scenes: int, x: Tensor) -> tuple[float, Tensor | None]:
-    """A time step [s] as the ops take it: a number times an optional tensor [B].
+    """Time step [s] as an argument of ops: a number times an optional tensor [B].
 
     Args:
         dt: number, or tensor of shape [], [1] or [B].
 
     Raises:
-        TypeError: for anything else.
+        TypeError: for other types.
         ValueError: for a number that is not positive and finite in the dtype of x, or a wrong shape or device. Values
             of a tensor are not read, so that the device is not synchronised.
     """
@@ -40,7 +40,7 @@ def split_dt(dt: float | Tensor, scenes: int, x: Tensor) -> tuple[float, Tensor 
 
 
 def per_particle(value: Tensor, scene: Tensor | None, particles: int) -> Tensor:
-    """A per-scene tensor [B, ...] as one row per particle; that of a particle of no scene has no meaning."""
+    """A per-scene tensor [B, ...] as one row per particle; rows of particles without a scene have no meaning."""
     if value.shape[0] == 1:
         return value.expand(particles, *value.shape[1:])
     assert scene is not None
@@ -55,7 +55,7 @@ def per_parameter(value: Tensor, scene: Tensor | None, particles: int) -> Tensor
 
 
 def sum_by_scene(value: Tensor, scene: Tensor | None, scenes: int) -> Tensor:
-    """Sum of a per-particle tensor [P, ...] over the particles of each scene, [B, ...]; not of those of no scene."""
+    """Sum of a per-particle tensor [P, ...] over the particles of each scene, [B, ...]; without absent particles."""
     if scene is None:
         return value.sum(0, keepdim=True)
     known = (scene >= 0) & (scene < scenes)
@@ -64,22 +64,25 @@ def sum_by_scene(value: Tensor, scene: Tensor | None, scenes: int) -> Tensor:
 
 
 def count_scenes(scene: Tensor) -> int | None:
-    """One more than the largest scene of a particle, at least 1; None where that is not known without waiting for a
-    device, or not at all."""
+    """Largest scene of a particle plus one, at least 1; None where this is unknown without waiting for a device, or
+    unknown at all.
+    """
     if not scene.is_cpu or is_traced(scene):
         return None
     return scenes_up_to(scene)
 
 
 def scenes_up_to(scene: Tensor) -> int:
-    """One more than the largest scene of a particle, at least 1; waits for the device."""
+    """Largest scene of a particle plus one, at least 1; waits for the device."""
     return max(int(scene.max()) + 1, 1) if scene.numel() else 1
 
 
 def soa_empty(like: Tensor, shape: Sequence[int]) -> Tensor:
-    """An empty [P, ...] tensor with the particle index contiguous, as the ops return them (csrc/common/tensors.h)."""
+    """An empty [P, ...] tensor with a contiguous particle index, in the form of results of ops
+    (csrc/common/tensors.h).
+    """
     pitch = shape[0]
-    if like.device.type == "cpu":  # `particle_pitch` says why
+    if like.device.type == "cpu":  # `particle_pitch` gives the reason.
         lines = -(-shape[0] * like.element_size() // 64)
         pitch = ((lines + 40) // 64 * 64 + 23) * 64 // like.element_size()
     strides = [1]
@@ -98,7 +101,7 @@ def differentiate(
         return _pull_back(function, inputs, grad_outputs)
     differentiable = torch.is_grad_enabled()
     with torch.enable_grad():
-        # Aliases, because an input may itself depend on another one, which is not this composition's share.
+        # Aliases, because an input may depend on another one, whose share is not part of this composition.
         leaves = [t if t is None else t.view_as(t) if t.requires_grad else t.detach().requires_grad_() for t in inputs]
         outputs = function(*leaves)
         outputs = outputs if isinstance(outputs, tuple) else (outputs,)
@@ -140,7 +143,7 @@ def check_choice(name: str, value: object, choices: Iterable[str]) -> None:
 
 
 def check_parameter(name: str, value: Tensor, state: Tensor, scene: Tensor | None, scenes: int | None = None) -> None:
-    """Check a parameter of a law: uniform, per scene or per particle, which it also is where P = B."""
+    """Check a parameter of a law: uniform, per scene or per particle; per particle is assumed where P = B."""
     P = state.shape[0]
     if not isinstance(value, Tensor):
         raise TypeError(f"{name} must be a tensor, got {type(value).__name__}")
@@ -162,21 +165,21 @@ def check_list(name: str, values: Any) -> Sequence[Any]:
 
 
 def check_tensors(law: str, kind: str, quantities: Sequence[Any], values: Sequence[Tensor]) -> None:
-    """Check that as many tensors are given as a law has parameters or history variables."""
+    """Check the number of tensors against the parameters or history variables of a law."""
     if len(check_list(kind, values)) != len(quantities):
         names = [q.name for q in quantities]
         raise ValueError(f"{law} has the {kind} {', '.join(names) or 'none'}, got {len(values)} tensors")
 
 
 def sizes(t: Tensor, name: str, rank: int) -> torch.Size:
-    """The shape of an argument of a fake kernel, of a rank that the op itself checks."""
+    """Shape of an argument of a fake kernel; the op itself checks the rank."""
     if t.dim() != rank:
         raise ValueError(f"{name} must have {rank} dimensions, got shape {shape_of(t)}")
     return t.shape
 
 
 def refuse_vmap(name: str) -> None:
-    """Make `torch.vmap` over an op, and so `torch.func.jacrev` and `hessian`, say what to do instead."""
+    """Raise an error with the alternative in `torch.vmap` over an op, and so in `torch.func.jacrev` and `hessian`."""
 
     def vmap(info: Any, in_dims: Any, *args: Any, **kwargs: Any) -> Any:
         raise no_vmap(f"torch_mpm::{name}")
@@ -185,7 +188,7 @@ def refuse_vmap(name: str) -> None:
 
 
 def no_vmap(name: str) -> NotImplementedError:
-    """The error of what `torch.vmap` should not be used for."""
+    """Error for unsupported uses of `torch.vmap`."""
     return NotImplementedError(
         f"torch.vmap over {name} is not supported: pack the scenes into one call with `scene` and Grid(scenes=B), with "
         "parameters, gravity and dt of shape [B]; instead of torch.func.jacrev or hessian use those of "
@@ -194,7 +197,7 @@ def no_vmap(name: str) -> NotImplementedError:
 
 
 def refuse_batched(name: str, value: Any) -> None:
-    """Raise for a tensor that stands for many, inside `torch.vmap`."""
+    """Raise for a batched tensor inside `torch.vmap`."""
     if torch.compiler.is_compiling() or not isinstance(value, Tensor):
         return
     if torch._C._functorch.is_batchedtensor(value):

@@ -1,4 +1,4 @@
-"""How an op is recorded by autograd, with little work for the host: it has less to do than a small scene's kernels."""
+"""Recording of an op by autograd with little work for the host, which would exceed that of a small scene's kernels."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ _LIBRARY = torch.library.Library("torch_mpm", "IMPL")
 
 
 def dispatch(op: Any, *arguments: Any) -> Any:
-    """`op(*arguments)`, past the kernel of `register_autograd` where nothing requires grad or has a tangent."""
+    """`op(*arguments)`, without the kernel of `register_autograd` where nothing requires grad or has a tangent."""
     return op(*arguments) if _is_differentiated(*arguments) else _below_autograd(op, arguments)
 
 
 def is_recorded(*tensors: torch.Tensor) -> bool:
-    """Whether more than values is asked for: something is recorded, transformed or compiled."""
+    """Whether a call is recorded, transformed or compiled."""
     return _is_differentiated(*tensors) or _transformed()
 
 
 def _is_differentiated(*arguments: Any) -> bool:
-    """Whether something is recorded or has a tangent, or nobody knows yet."""
+    """Whether a call is recorded or has a tangent, or this is unknown yet."""
     return (
         torch.compiler.is_compiling()
         or forward_ad._current_level >= 0
@@ -41,8 +41,9 @@ def _below_autograd(op: Any, arguments: Sequence[Any]) -> Any:
 
 
 def graph_at_once() -> saved_tensors_hooks:
-    """Where a graph is recorded and gone back through at once: past the hooks of checkpoints, which would compute their
-    steps again for it, and those that move tensors to the host."""
+    """Context in which a graph is recorded and differentiated at once: without the hooks of checkpoints, which would
+    recompute their steps for it, and those that move tensors to the host.
+    """
     return saved_tensors_hooks(_same, _same)
 
 
@@ -53,14 +54,16 @@ def _same(t: torch.Tensor) -> torch.Tensor:
 def register_autograd(
     name: str, backward: Callable[..., Any], setup: Callable[[Any, tuple[Any, ...], Any], None] | None = None
 ) -> None:
-    """As `torch.library.register_autograd`, which reads the op's schema anew at every call: most of the time it takes.
+    """As `torch.library.register_autograd`, without its parsing of the op's schema at every call, which takes most of
+    its time.
 
-    The tensors of a `topology` are integers: they are passed on in their list, and `save_with_topology` keeps them.
+    The tensors of a `topology` are integers: they are passed on in their list, and `save_with_topology` stores them.
 
     Args:
-        name: of the op. No argument may have a default value.
-        backward: (ctx, *grads) to the gradients of all arguments; a list of them for a list of tensors.
-        setup: (ctx, inputs, output), or None where backward needs nothing.
+        name: name of the op. No argument may have a default value.
+        backward: function (ctx, *grads) that returns the gradients of all arguments; a list of them for a list of
+            tensors.
+        setup: function (ctx, inputs, output), or None where backward needs nothing.
     """
     op = getattr(torch.ops.torch_mpm, name).default
     lists = [i for i, a in enumerate(op._schema.arguments) if str(a.type) == "List[Tensor]" and a.name != "topology"]
@@ -83,8 +86,8 @@ def register_autograd(
         return None, *_flat(result if isinstance(result, tuple) else (result,), lists)
 
     methods = {"forward": staticmethod(forward), "backward": staticmethod(nested_backward)}
-    function: Any = type(f"torch_mpm_{name}", (torch.autograd.Function,), methods)  # its name stands in the graph
-    # `Function.apply` deals with the levels of torch.func first, which the dispatcher has done where it calls `kernel`.
+    function: Any = type(f"torch_mpm_{name}", (torch.autograd.Function,), methods)  # Name of the node in graphs.
+    # `Function.apply` handles the levels of torch.func first; the dispatcher has done so where it calls `kernel`.
     record = super(torch.autograd.Function, function).apply
 
     def kernel(*arguments: Any) -> Any:
@@ -104,7 +107,7 @@ def register_autograd(
 def save_with_topology(
     ctx: Any, tensors: Sequence[torch.Tensor | None], topology: PackedTopology, **attributes: Any
 ) -> None:
-    """Keep the tensors of an op and the topology that are its last three arguments for the backward pass."""
+    """Store the tensors of an op and the topology of its last three arguments for the backward pass."""
     ctx.save_for_backward(*tensors, *topology[0])
     ctx.topology = len(tensors), *topology[1:]
     for name, value in attributes.items():
@@ -112,14 +115,14 @@ def save_with_topology(
 
 
 def saved_with_topology(ctx: Any) -> tuple[list[Any], PackedTopology]:
-    """What `save_with_topology` kept."""
-    saved = list(ctx.saved_tensors)  # once: a checkpointed region unpacks a tensor only once
+    """Tensors stored by `save_with_topology`."""
+    saved = list(ctx.saved_tensors)  # Once: a checkpointed region unpacks a tensor only once.
     count, *lattice = ctx.topology
     return saved[:count], (saved[count:], *lattice)
 
 
 def _for_outer_levels(op: Any, arguments: Sequence[Any]) -> Any:
-    """Below autograd come the outer levels of torch.func, which record too: `Function.forward` switches that off."""
+    """Below autograd come the outer levels of torch.func, which record too: `Function.forward` disables that."""
     with torch.enable_grad(), forward_ad._set_fwd_grad_enabled(True):
         return _below_autograd(op, arguments)
 
@@ -135,14 +138,14 @@ def _refuse_tangents(name: str, arguments: Sequence[Any]) -> None:
 
 
 def _flat(arguments: tuple[Any, ...], lists: Sequence[int]) -> tuple[Any, ...]:
-    """The elements of the arguments `lists` among the others, as `autograd.Function` needs them."""
+    """Arguments with the elements of the lists `lists` among the others, as `autograd.Function` requires."""
     for i in reversed(lists):
         arguments = (*arguments[:i], *arguments[i], *arguments[i + 1 :])
     return arguments
 
 
 def _nested(flat: tuple[Any, ...], lists: Sequence[int], lengths: Sequence[int]) -> tuple[Any, ...]:
-    """The inverse of `_flat`."""
+    """Inverse of `_flat`."""
     for i, length in zip(lists, lengths, strict=True):
         flat = (*flat[:i], list(flat[i : i + length]), *flat[i + length :])
     return flat

@@ -1,4 +1,4 @@
-"""The trilinear form of the transfers in plain torch, of which the ops have no third derivative of their own."""
+"""Trilinear form of the transfers in plain torch, for third derivatives, which the ops do not have."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def trilinear_form(
 
     Args:
         blocks: active blocks of x.
-        x: positions [P, D] [m]; particles that are not transferred add nothing.
+        x: positions [P, D] [m]; particles that are not transferred contribute nothing.
         value, moment, gradient: a [P, K], B [P, K, D] and G [P, K, D] of the particles; the last two may be None.
         nodes: g [N, K].
         moment_scale: s.
@@ -30,13 +30,13 @@ def trilinear_form(
     grid = blocks.grid
     cells = (x - torch.tensor(grid.lower, dtype=x.dtype, device=x.device)) / grid.dx + PADDING
     finite = cells.detach().isfinite().all(1, keepdim=True)
-    cells = torch.where(finite, cells, -10)  # beyond the lattice
+    cells = torch.where(finite, cells, -10)  # Beyond the lattice.
     base = base_node(cells.detach().clamp(-10, 2**30), grid.order)
     steps = torch.arange(grid.order + 1, device=x.device)
     node = base[:, None] + torch.cartesian_prod(*[steps] * grid.dim).reshape(-1, grid.dim)
     rows = blocks.rows_at(node, blocks.particle_scene())
     inside = (rows >= 0).all(1)[:, None]
-    r = torch.where(inside[..., None], node - cells[:, None], 0.25)  # in cells
+    r = torch.where(inside[..., None], node - cells[:, None], 0.25)  # In cells.
     weights, slopes = bspline(r, grid.order), bspline_derivative(r, grid.order)
     weight = torch.where(inside, weights.prod(-1), 0)
     g = nodes[rows.clamp_min(0)]
@@ -60,7 +60,7 @@ def position_gradient(
     nodes: Tensor,
     moment_scale: float,
 ) -> Tensor:
-    """∂Φ/∂x [P, D], what the op of this name gives, differentiable to any order."""
+    """∂Φ/∂x [P, D], the result of the op of this name, differentiable to any order."""
     with torch.enable_grad():
         x = x if x.requires_grad else x.detach().requires_grad_()
         form = trilinear_form(blocks, x, value, moment, gradient, nodes, moment_scale)

@@ -1,4 +1,4 @@
-"""G2P and `advance` in one pass over the particles: Python face, fake kernel and autograd."""
+"""G2P and `advance` in one pass over the particles: Python wrapper, fake kernel and autograd."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def g2p_advance(
     affine: bool = True,
     stress_form: str = "mls",
 ) -> tuple[Tensor, Tensor, Tensor | None, Tensor | None, Tensor | None]:
-    """The end of a step: `g2p`, and `advance` with what it gave, but for rounding and particles outside, and faster.
+    """End of a step: `g2p` followed by `advance`, except for rounding and particles outside, and faster.
 
     Args:
         blocks: active blocks of these positions.
@@ -34,12 +34,12 @@ def g2p_advance(
         dt: time step [s]: a number, or a tensor of shape [], [1] or [B].
         F: deformation gradient [P, D, D], or None.
         J: volume ratio [P], or None.
-        affine: whether C is wanted.
-        stress_form: "mls" (F and J move with C) or "gradient" (with ∇v), as in `p2g`.
+        affine: whether to return C.
+        stress_form: "mls" (update of F and J with C) or "gradient" (with ∇v), as in `p2g`.
 
     Returns:
         x at the end of the step, v [m/s], C [1/s] or None, F and J at the end of the step (None where not given).
-        Particles outside the grid stay as they are, with v and C zero, or NaN where the position is not finite.
+        Particles outside the grid are unchanged, with v and C zero, or NaN where the position is not finite.
 
     Raises:
         ValueError, TypeError: for wrong shapes, dtypes, devices, or dt ≤ 0.
@@ -60,8 +60,9 @@ def g2p_advance_compensated(
     affine: bool = True,
     stress_form: str = "mls",
 ) -> tuple[Tensor, Tensor, Tensor | None, Tensor | None, Tensor | None, Tensor | None]:
-    """`g2p_advance` with the residual [P, D] [m] that rounding has left out of x, which is constant for autograd; it
-    returns that of the new positions last. None does not compensate positions."""
+    """`g2p_advance` with the accumulated rounding error of x [P, D] [m], which is constant for autograd; returns that
+    of the new positions last. None does not compensate positions.
+    """
     check_blocks(blocks)
     grid = blocks.grid
     check_particles(x, blocks)
@@ -92,7 +93,7 @@ def _fake(x, velocity, F, J, residual, scene_dt, dt, affine, stress_form, *topol
 def _setup(ctx: Any, inputs: Any, output: Any) -> None:
     x, velocity, F, J, _, scene_dt, dt, affine, stress_form, *topology = inputs
     _, v, C, _, _, _ = output
-    # The backward pass reads v and C, which the next step keeps alive anyway.
+    # The backward pass reads v and C, which the next step stores anyway.
     save_with_topology(ctx, (x, velocity, F, J, scene_dt, v, C), topology, dt=dt, affine=affine, mls=stress_form == 0)
 
 
@@ -102,7 +103,7 @@ def _backward(ctx, grad_x, grad_v, grad_C, grad_F, grad_J, _grad_residual):
     need_nodes, moves = need_x or need_velocity, F is not None or J is not None
     blocks = Topology.unpack(*topology)
     scale = blocks.grid.inverse_inertia
-    L = C if ctx.mls else None  # the velocity gradient that moved F and J
+    L = C if ctx.mls else None  # Velocity gradient that updated F and J.
     if moves and not (ctx.mls and ctx.affine):
         _, C, grad_v_field = dispatch(torch.ops.torch_mpm.gather, x, velocity, scale, ctx.mls, not ctx.mls, *topology)
         L = C if ctx.mls else grad_v_field

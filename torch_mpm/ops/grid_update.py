@@ -1,4 +1,4 @@
-"""Node momentum to node velocity with gravity and walls: Python face, fake kernels and autograd."""
+"""Node momentum to node velocity with gravity and walls: Python wrapper, fake kernels and autograd."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def check_nodes(blocks: Blocks, nodes: Tensor) -> None:
 def update_arguments(
     blocks: Blocks, nodes: Tensor, gravity: Tensor | None, dt: float | Tensor | None, walls: Walls | None
 ) -> tuple[Any, ...]:
-    """Gravity, dt and walls as the ops take them after the nodes."""
+    """Gravity, dt and walls as the arguments of ops after the nodes."""
     grid, number, scene_dt = blocks.grid, 0.0, None
     if gravity is not None:
         if dt is None:
@@ -77,7 +77,7 @@ def update_arguments(
 
 
 def wall_arguments(walls: Walls | None, grid: Any) -> tuple[list[int], list[float], list[float]]:
-    """Kind, plane [m] and friction of each face, as the ops take them."""
+    """Kind, plane [m] and friction of each face, as arguments of ops."""
     if walls is not None and not isinstance(walls, Walls):
         raise TypeError(f"walls must be Walls or None, got {type(walls).__name__}")
     faces = () if walls is None else walls.faces(grid)
@@ -123,11 +123,12 @@ def sum_by_scene_of_blocks(change: Tensor, blocks: Topology, scenes: int) -> Ten
 
 
 def register_update(name: str, composed: Callable[..., Tensor]) -> None:
-    """The adjoint of an op with the arguments of `grid_update`, first and second, and the fake kernel of the first.
+    """Register first and second derivatives of an op with the arguments of `grid_update`, and the fake kernel of the
+    first.
 
     Args:
-        name: of the op; that of its adjoint is NAME_backward.
-        composed: the op in torch operations, as `composed_grid_update`.
+        name: name of the op; its adjoint is NAME_backward.
+        composed: the op made of torch operations, as `composed_grid_update`.
     """
     adjoint_op = getattr(torch.ops.torch_mpm, f"{name}_backward")
 

@@ -1,4 +1,4 @@
-"""The grid update composed of torch operations, for its second derivatives."""
+"""Grid update made of torch operations, for its second derivatives."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def composed_grid_update(
 ) -> Tensor:
     """Node mass and velocity [N, 1 + D] from mass and momentum; see `grid_update` and `Walls.faces`.
 
-    `see(face, momentum)` is called with what a face takes from each node [N, D] [N s], perhaps several times.
+    `see(face, momentum)` is called with the impulse of each node on a face [N, D] [N s], possibly several times.
     """
     active = blocks.active_nodes()[:, None]
     mass, momentum = torch.where(active, nodes, 0).split([1, nodes.shape[1] - 1], 1)
@@ -49,7 +49,7 @@ def composed_grid_update(
 
 
 def _mirror(faces: Sequence[Face], blocks: Topology, rows: Tensor) -> Tensor:
-    """Rows of mass and momentum plus those of their images in every mirror and corner of mirrors."""
+    """Rows of mass and momentum plus those of the images in all mirrors and corners of mirrors."""
     result = rows
     for axes, image in images(faces, blocks):
         sign = torch.ones_like(rows[:1])
@@ -59,7 +59,7 @@ def _mirror(faces: Sequence[Face], blocks: Topology, rows: Tensor) -> Tensor:
 
 
 def images(faces: Sequence[Face], blocks: Topology) -> Iterator[tuple[tuple[int, ...], Tensor]]:
-    """For each set of axes that mirrors reflect, the row of each node's image, int64 [N], -1 for none."""
+    """Row of each node's image, int64 [N], -1 for none, for each set of axes that mirrors reflect."""
     node, scene = blocks.node_indices(), blocks.node_scene().clamp_min(0)
     distance, near = torch.zeros_like(node), torch.zeros_like(node, dtype=torch.bool)
     mirrored = []
@@ -81,12 +81,14 @@ def images(faces: Sequence[Face], blocks: Topology) -> Iterator[tuple[tuple[int,
 
 
 def _half_cells(blocks: Topology, node: Tensor, axis: int, plane: float) -> Tensor:
-    """Distance of lattice nodes from a mirror, twice that in cells."""
+    """Twice the distance of lattice nodes from a mirror, in cells."""
     return 2 * node[:, axis] - round(2 * ((plane - blocks.grid.lower[axis]) / blocks.grid.dx + PADDING))
 
 
 def _see_mirrors(faces: Sequence[Face], blocks: Topology, momentum: Tensor, see: See) -> None:
-    """Each component goes to the mirror along its axis, or else to the first that the node has an image in."""
+    """Each component is assigned to the mirror along its axis, or else to the first mirror in which the node has an
+    image.
+    """
     node = blocks.node_indices()
     near = {
         number: blocks.active_nodes() & (_half_cells(blocks, node, number // 2, face.plane).abs() <= 2 * MIRROR_REACH)

@@ -1,4 +1,4 @@
-"""The implicit heat step on the nodes: Python face, fake kernels and autograd of `heat_cg` and `heat_multigrid`."""
+"""Implicit heat step on the nodes: Python wrapper, fake kernels and autograd of `heat_cg` and `heat_multigrid`."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from .heat_multigrid import heat_multigrid
 from .heat_refinement import REDUCTION
 from .heat_refinement import refine as refinement
 
-METHODS = {"cg": 0, "chebyshev": 1, "multigrid": 2}  # the first two are HeatMethod of csrc/heat/solve.h
+METHODS = {"cg": 0, "chebyshev": 1, "multigrid": 2}  # The first two are HeatMethod of csrc/heat/solve.h.
 
 
 class HeatSolve(NamedTuple):
@@ -50,7 +50,7 @@ def heat_cg(
 
     Solves (M/dt + H + X) d = h − (H + X) θ for the increment d, with M the lumped heat capacity, X the exchange, h the
     source and H_ij = Σ_p κ_p V_p ∇Φ_i · ∇Φ_j, ∇Φ_i = D⁻¹ N_i (x_i − x_p) (Gao et al. 2018, supplement, equation 10).
-    Scenes are solved apart, each with its own time step, tolerance and iterations, and stop apart.
+    Scenes are solved separately, each with its own time step, tolerance and iterations, and stop separately.
 
     Args:
         blocks: active blocks of these positions.
@@ -60,32 +60,32 @@ def heat_cg(
         theta: temperature of the nodes θ [N] [K], relative to a reference.
         dt: time step [s]: a number, or a tensor of shape [], [1] or [B].
         source: heat into the nodes h [N] [W].
-        exchange: derivative of the heat that leaves a node by its temperature X ≥ 0 [N] [W/K] (Robin boundaries); the
-            ambient's share belongs to `source`.
+        exchange: derivative of the outgoing heat of a node by its temperature X ≥ 0 [N] [W/K] (Robin boundaries); the
+            contribution of the ambient temperature belongs to `source`.
         fixed: nodes that keep their temperature, bool [N].
-        tolerance: of dt sqrt(Σ r_i²/M_i / Σ M_i) [K], r the residual, which bounds the mass-weighted RMS error of d:
-            a number, or a tensor of shape [], [1] or [B].
-        max_iterations: a number, or an integer tensor of shape [], [1] or [B].
+        tolerance: tolerance of dt sqrt(Σ r_i²/M_i / Σ M_i) [K], r the residual, which bounds the mass-weighted RMS
+            error of d: a number, or a tensor of shape [], [1] or [B].
+        max_iterations: maximum number of iterations: a number, or an integer tensor of shape [], [1] or [B].
         method: "cg", conjugate gradients preconditioned by the diagonal, as one fused op. "chebyshev": Chebyshev
-            iteration needs no scalar products; how many iterations reach the tolerance is known before the first, from
-            the largest diffusion number r (Saad 2003, algorithm 12.1). They grow like √r without end: for r up to 100.
-            "multigrid": conjugate gradients preconditioned by a multigrid cycle (`torch_mpm.ops.heat_multigrid`): few
-            iterations whatever r and the lattice, each as long as some ten of "cg", after a start as long as some
+            iteration needs no scalar products; the number of iterations that reach the tolerance is known beforehand,
+            from the largest diffusion number r (Saad 2003, algorithm 12.1). It grows like √r without bound: for r up to
+            100. "multigrid": conjugate gradients preconditioned by a multigrid cycle (`torch_mpm.ops.heat_multigrid`):
+            few iterations for any r and lattice, each as long as about ten of "cg", after a set-up as long as about a
             hundred. Shorter than "cg" for r from 1e3 on the CPU; on CUDA, where it is hundreds of launches and "cg" is
-            one, on large lattices only (2-D from 400² nodes). The host waits once per iteration, except while a graph
-            is captured: that runs `max_iterations`, which then must be a number and should be small. Takes about 100
-            numbers per node (3-D: 300 while it starts).
-        adjoint_tolerance: of the backward solve, relative to the size of its right side.
-        relative_tolerance: a residual of this share of the first one will do too. The changes of many small steps add
-            up, so that a tolerance in kelvin alone stops too early there.
+            one, on large lattices only (2-D from 400² nodes). The host waits once per iteration, except during graph
+            capture: a graph runs `max_iterations`, which then must be a number and should be small. Needs about 100
+            numbers per node (3-D: 300 during set-up).
+        adjoint_tolerance: tolerance of the backward solve, relative to the size of its right side.
+        relative_tolerance: a residual of this share of the first one is also accepted. The changes of many small steps
+            add up, so that a tolerance in kelvin alone would stop too early.
         refine: float64 accuracy from float32 data: solves in float32 with residuals in float64 between them. The
             increment is then float64; `relative_tolerance` has no effect.
 
     Returns:
         HeatSolve(increment, iterations, residual, converged). The increment is zero on fixed nodes, on nodes without
-        heat capacity and outside the active blocks. A scene whose data are not finite, or whose time step is not
-        positive, stays as it is (increment zero, converged false) and leaves the others alone. A scene that is closed
-        (neither exchange nor fixed nodes) keeps its energy, Σ M d = dt Σ h, however early the solve ends.
+        heat capacity and outside the active blocks. A scene with data that are not finite, or with a time step that is
+        not positive, is unchanged (increment zero, converged false) and does not affect the others. A closed scene
+        (neither exchange nor fixed nodes) conserves its energy, Σ M d = dt Σ h, however early the solve ends.
 
     Raises:
         ValueError, TypeError: for wrong shapes, dtypes or devices, or numbers out of range.
@@ -141,7 +141,7 @@ def heat_cg(
 
 
 def heat_operator(blocks: Blocks, x: Tensor, conductance: Tensor, nodes: Tensor | None) -> Tensor:
-    """H u, the heat that flows out of each node at node values u; H as in `heat_cg`.
+    """Outgoing heat H u of each node at node values u; H as in `heat_cg`.
 
     Args:
         blocks: active blocks of these positions.
@@ -179,7 +179,7 @@ def _per_scene(name: str, value: float | Tensor, scenes: int, x: Tensor) -> tupl
     return 0.0, value.expand(scenes)
 
 
-# ---- `heat_multigrid` is made of ops, with the schema of `heat_cg`
+# ---- `heat_multigrid` consists of ops, with the schema of `heat_cg`
 
 _schema = str(torch.ops.torch_mpm.heat_cg.default._schema).partition("heat_cg")[2]
 torch.library.define("torch_mpm::heat_multigrid", _schema)
@@ -240,7 +240,7 @@ def _backward(ctx: Any, grad: Tensor, *_: Any) -> tuple[Any, ...]:
     rate = -adjoint * d
     if need_capacity or need_dt:
         scene = Topology.unpack(*topology).node_scene().long().clamp_min(0)
-        # Where dt is not positive, nothing is solved: both d and λ are zero.
+        # Where dt is not positive, no system is solved: both d and λ are zero.
         steps = ctx.dt if scene_dt is None else torch.where(scene_dt > 0, ctx.dt * scene_dt, 1)[scene]
         if need_capacity:
             grads[2] = rate / steps

@@ -1,11 +1,11 @@
 """Conjugate gradients with a multigrid V-cycle as preconditioner for the implicit heat step: `heat_multigrid`.
 
-It takes and returns what `heat_cg` does, and is made of ops. A coarse level is a lattice of twice the node distance, on
-which the nodes i of the finer one stand for particles, with conductance Σ_p N_i κ_p V_p and heat capacity M_i. So every
-level has the same operator, at an eighth (a quarter in 2-D) of the cost of a level above with as many nodes as cells.
-Splines of a coarse level are sums of those of the finer one (two-scale relation), by which values are prolonged, and
-restricted by the transpose. Smoothers are Chebyshev iterations of the fourth kind (Lottes 2023), of `Patches` on the
-finest level and of the diagonal on the others; the coarsest is solved by conjugate gradients.
+It has the arguments and results of `heat_cg`, and consists of ops. A coarse level is a lattice of twice the node
+distance, with the nodes i of the finer one as particles, with conductance Σ_p N_i κ_p V_p and heat capacity M_i. So
+every level has the same operator, at an eighth (a quarter in 2-D) of the cost of a level above with as many nodes as
+cells. Splines of a coarse level are sums of those of the finer one (two-scale relation), by which values are prolonged,
+and restricted by the transpose. Smoothers are Chebyshev iterations of the fourth kind (Lottes 2023), of `Patches` on
+the finest level and of the diagonal on the others; the coarsest is solved by conjugate gradients.
 """
 
 from __future__ import annotations
@@ -24,13 +24,15 @@ from ..topology import BLOCK_WIDTH, PADDING, Topology
 from .heat_patches import Patches, lattice_rows
 
 DEGREE, COARSE_DEGREE = 4, 2
-"""Of the smoother's polynomial, on the finest level and on the others."""
+"""Degrees of the smoother's polynomial, on the finest level and on the others."""
 COARSEST = 3
-"""Topology along the longest side of the domain at which coarsening ends: five cells."""
+"""Blocks along the longest side of the domain at which coarsening ends: five cells."""
 COARSE_REDUCTION, COARSE_ITERATIONS = 1e-2, 40
-"""Of the residual on the coarsest level, where conjugate gradients solve."""
+"""Relative tolerance and maximum number of iterations of conjugate gradients on the coarsest level."""
 POWER_ITERATIONS, MARGIN = 8, 1.1
-"""For the largest eigenvalue of each level; the smoother of degree 4 still converges a tenth beyond."""
+"""Number of power iterations for the largest eigenvalue of each level, and its margin; the smoother of degree 4 still
+converges a tenth beyond.
+"""
 
 
 class Scenes:
@@ -56,7 +58,8 @@ class Scenes:
 class Transfer:
     """Prolongation from a coarse level to a fine one, and its transpose.
 
-    The 4^D nodes of a fine block b take from the 4^D coarse nodes 2 b + 1 ... 2 b + 4, with the same weights in each.
+    The values at the 4^D nodes of a fine block b depend on the 4^D coarse nodes 2 b + 1 ... 2 b + 4, with the same
+    weights in each.
     """
 
     def __init__(self, fine: Topology, coarse: Topology, like: Tensor) -> None:
@@ -94,10 +97,10 @@ class Level:
     Attributes:
         x, conductance: quadrature points [P, D] [m] and their κ V [P].
         weight: M/dt + X [N].
-        free: which nodes are solved for, as 0 or 1 [N].
-        inverse: of the diagonal times the largest eigenvalue of diag(A)⁻¹ A, zero on the other nodes [N].
+        free: mask of the unknown nodes, as 0 or 1 [N].
+        inverse: inverse of the diagonal times the largest eigenvalue of diag(A)⁻¹ A, zero on the other nodes [N].
         patches: smoother instead of the diagonal, with `inverse` one over the largest eigenvalue; or None.
-        transfer: from the next level; None on the coarsest.
+        transfer: transfer from the next level; None on the coarsest.
     """
 
     blocks: Topology
@@ -114,7 +117,7 @@ class Level:
         return torch.ops.torch_mpm.heat_operator(self.x, self.conductance, u, *self.blocks.packed)
 
     def apply(self, u: Tensor) -> Tensor:
-        """A u on the free nodes, for u that is zero on the others; anything there."""
+        """A u on the free nodes, for u that is zero on the others; undefined there."""
         return torch.addcmul(self.product(u), self.weight, u)
 
     def precondition(self, r: Tensor) -> Tensor:
@@ -158,7 +161,7 @@ def _level(
 
 
 def _coarse_grid(fine: Topology) -> Grid:
-    """Grid of twice the node distance whose splines are sums of those of `fine`."""
+    """Grid of twice the node distance, whose splines are sums of those of `fine`."""
     grid = fine.grid
     shift = 0.5 if grid.order == 2 else 0.0
     lower = [a - shift * grid.dx for a in grid.lower]
@@ -168,10 +171,10 @@ def _coarse_grid(fine: Topology) -> Grid:
 
 
 def _coarsen(level: Level, weight: Tensor) -> Level:
-    """The next level; `weight` has M/dt + X, and what stands for held nodes."""
+    """Next level; `weight` includes M/dt + X, and a substitute for held nodes."""
     fine, given = level.blocks, level.conductance[:, None]
     conductance = torch.ops.torch_mpm.scatter(level.x, given, None, None, 1.0, *fine.packed)[:, 0].contiguous()
-    # Nodes without conductance are nowhere, and left out of the activation.
+    # Nodes without conductance are placed outside, and excluded from the activation.
     x = torch.where((conductance.abs() > 0)[:, None], fine.node_positions(level.x.dtype), torch.nan).T.contiguous().T
     grid = _coarse_grid(fine)
     scene = None if grid.scenes == 1 else fine.node_scene().clamp_min(0).int()
@@ -185,10 +188,10 @@ def _coarsen(level: Level, weight: Tensor) -> Level:
 def _levels(
     blocks: Topology, x: Tensor, conductance: Tensor, weight: Tensor, free: Tensor, held: Tensor, diagonal: Tensor
 ) -> list[Level]:
-    """From the finest to the coarsest; `diagonal` is that of the operator on the finest."""
+    """Levels from the finest to the coarsest; `diagonal` is that of the operator on the finest."""
     several = max(blocks.grid.blocks) > COARSEST
     levels = [_level(blocks, x, conductance, weight, free, diagonal, patches=several)]
-    # Held nodes weigh as much as conduction on the coarse levels, which do not know them.
+    # Held nodes have the weight of conduction on the coarse levels, which do not know them.
     weight = torch.where(held, diagonal, weight)
     while max(levels[-1].blocks.grid.blocks) > COARSEST:
         levels.append(_coarsen(levels[-1], weight))
@@ -237,8 +240,8 @@ def heat_multigrid(
     adjoint_tolerance: float,
     *topology: Any,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """What the op `heat_cg` takes and returns (csrc/heat/solve.h)."""
-    diagonal = torch.ops.torch_mpm.heat_operator(x, conductance, None, *topology)  # checks what it takes
+    """Arguments and results of the op `heat_cg` (csrc/heat/solve.h)."""
+    diagonal = torch.ops.torch_mpm.heat_operator(x, conductance, None, *topology)  # Checks its arguments.
     blocks = Topology.unpack(*topology)
     count = blocks.scenes
     for name, value in (("heat_capacity", heat_capacity), ("theta", theta), ("source", source), ("exchange", exchange)):
@@ -278,7 +281,7 @@ def heat_multigrid(
     capturing = is_captured(x)
 
     def unfinished() -> bool:
-        """A captured graph cannot ask; what has converged then stays as it is."""
+        """A captured graph cannot query this; converged scenes are then unchanged."""
         return capturing or bool(running.any())
 
     d = p = before = zero
@@ -291,7 +294,8 @@ def heat_multigrid(
         if not unfinished():
             break
         z = _cycle(levels, 0, r)
-        # Polak and Ribière's: the conjugate gradients of the coarsest level make the cycle depend on r a little.
+        # Polak and Ribière's formula: the conjugate gradients of the coarsest level make the cycle depend on r a
+        # little.
         beta = torch.where(running, scenes.sum(z * (r - before)) / product, 0)
         product = scenes.sum(r * z)
         p = z if k == 0 else torch.addcmul(z, scenes.spread(beta, x.dtype), p)

@@ -17,15 +17,15 @@ from .autograd import register_autograd
 class Patches:
     """z = Σ_o R_oᵀ W (R_o A R_oᵀ)⁻¹ W R_o r, o over the cells, R_o their 2^D nodes and W² one over the cells of a node.
 
-    Where only a corner of their supports has particles, splines nearly depend on each other: with its diagonal alone, A
-    has eigenvalues from 3e-4 at the edges of a block in 3-D, with the patches from 1e-2. (De Prenter et al. 2019 have
-    the same for elements that a boundary cuts.)
+    Where only a corner of their supports has particles, splines are nearly linearly dependent: with its diagonal only,
+    A has eigenvalues from 3e-4 at the edges of a block in 3-D, with the patches from 1e-2 (De Prenter et al. 2019 for
+    elements cut by a boundary).
 
     Args:
         blocks: active blocks of x.
         x, conductance: particles [P, D] [m] and κ V [P] of A = weight + H.
         weight: [N].
-        free: nodes that are solved for, bool [N]; z is zero on the others.
+        free: unknown nodes, bool [N]; z is zero on the others.
     """
 
     def __init__(self, blocks: Topology, x: Tensor, conductance: Tensor, weight: Tensor, free: Tensor) -> None:
@@ -49,7 +49,7 @@ class Patches:
         stencil[0] += weight
         matrix = torch.nn.functional.pad(stencil, (0, 1))[which, rows[:, first]]
         matrix = torch.where(inside[:, :, None] & inside[:, None, :], matrix, 0)
-        # More than the rounding of a singular matrix, as of a lonely particle.
+        # More than the rounding of a singular matrix, such as that of an isolated particle.
         rounding = 64 * torch.finfo(x.dtype).eps * matrix.diagonal(dim1=1, dim2=2)
         matrix = matrix + torch.diag_embed(torch.where(inside, rounding, 1))
         share = torch.nn.functional.pad(share, (0, 1))[rows]
@@ -60,7 +60,7 @@ class Patches:
 
 
 def lattice_rows(source: Topology, target: Topology, nodes: Callable[[Tensor], Tensor]) -> Tensor:
-    """Rows in `target` of lattice nodes that belong to each block of `source`; one past the last where inactive.
+    """Rows in `target` of the lattice nodes of each block of `source`; one past the last where inactive.
 
     `nodes` maps the block's coordinate along an axis [S] to node coordinates [S, 4] or [S, 4, K] along it.
 

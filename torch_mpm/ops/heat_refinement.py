@@ -1,4 +1,4 @@
-"""The heat step of float32 data to float64 accuracy: solves in float32, residuals in float64."""
+"""Heat step of float32 data to float64 accuracy: solves in float32, residuals in float64."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from ..grid import Blocks
 
 REFINEMENTS = 3
 REDUCTION = 1e-4
-"""Of the residual by one solve in float32."""
+"""Reduction of the residual by one solve in float32."""
 
 
 def refine(
@@ -29,7 +29,7 @@ def refine(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Iterative refinement (Wilkinson 1963), with dt and tolerance per scene [B].
 
-    `solve(r)` gives the increment of a right side in float32. The last correction is the one that autograd sees: its
+    `solve(r)` returns the increment of a right side in float32. Only the last correction is recorded by autograd: its
     right side is zero to rounding, but depends on every input as the residual does, so that one adjoint solve remains.
 
     Returns:

@@ -1,4 +1,4 @@
-"""The Hessian of an implicit step on the nodes: its product, its diagonal blocks, and the solve.
+"""Hessian of an implicit step on the nodes: its product, its diagonal blocks, and the solve.
 
     H = diag(m) + Σ_p (∇N)ᵀ T_p ∇N,
 
@@ -22,7 +22,7 @@ from .autograd import dispatch, register_autograd
 from .transfer import STRESS_FORMS
 
 SOLVING, CONVERGED, NEGATIVE_CURVATURE, NOT_FINITE = 0, 1, 2, 3
-"""States of a solve, as csrc/implicit/arguments.h has them."""
+"""States of a solve (csrc/implicit/arguments.h)."""
 
 
 def tangent_entries(dim: int) -> int:
@@ -45,8 +45,8 @@ def implicit_apply(
         blocks: active blocks of these positions.
         x: positions [P, D] [m].
         direction: [N, D] [m/s].
-        tangent: of the particles, `law_tangent` with the weights dt² V [P, n] [kg m²/m² per unit strain rate].
-        mass: of the nodes [N] [kg]; None for the product of the tangents alone.
+        tangent: tangents of the particles, `law_tangent` with the weights dt² V [P, n] [kg m²/m² per unit strain rate].
+        mass: mass of the nodes [N] [kg]; None for the product of the tangents alone.
         stress_form: "mls" or "gradient".
 
     Returns:
@@ -107,29 +107,29 @@ def implicit_cg(
     images: Tensor | None = None,
     held: Tensor | None = None,
 ) -> ImplicitSolve:
-    """Solves H d = rhs by conjugate gradients, preconditioned by node blocks; scenes apart, each with its own scalars.
+    """Solve H d = rhs by conjugate gradients, preconditioned by node blocks, for each scene separately.
 
-    On CUDA a graph of one iteration is repeated by the device until all scenes are done (built with CUDA 12 the host
-    looks once in eight iterations), so that the op cannot be captured in a graph.
+    On CUDA the device repeats a graph of one iteration until all scenes are done (built with CUDA 12 the host checks
+    once in eight iterations), so that the op cannot be captured in a graph.
 
     Args:
         blocks: active blocks of these positions.
         x: positions [P, D] [m].
         rhs: [N, D] [kg m/s].
-        mass: of the nodes [N] [kg].
+        mass: mass of the nodes [N] [kg].
         inverse: B⁻¹ of each node [N, D, D] [1/kg], symmetric and positive semi-definite. The solution stays in its
-            range: zero for a node that is held, and a projected block for one that may slide.
-        tangent: as `implicit_apply` takes it.
-        relative: a scene is done when √(r · B⁻¹ r) is this share of what it was at the start, [B].
-        max_iterations: of each scene.
+            range: zero for a held node, and a projected block for a sliding one.
+        tangent: as in `implicit_apply`.
+        relative: a scene is done when √(r · B⁻¹ r) is this share of its initial value, [B].
+        max_iterations: maximum number of iterations of each scene.
         stress_form: "mls" or "gradient".
-        local: what each node adds to its own part of H [N, D, D] [kg], symmetric; None for nothing.
-        images: rows of nodes that mirrors make one, int32 [G, 2^D]: entry k of a group is the node that the axes of the
-            bits of k reflect, -1 for none. A node is in one group at most. H is then the Hessian of symmetric
+        local: additional diagonal block of H of each node [N, D, D] [kg], symmetric; None for none.
+        images: rows of nodes that mirrors identify, int32 [G, 2^D]: entry k of a group is the node that the axes of the
+            bits of k reflect, -1 for none. A node is in at most one group. H is then the Hessian of symmetric
             velocities, and rhs and `inverse` must be symmetric, too. None without mirrors.
-        held: a direction in which each node is held, unit vectors [N, D], zero for none; symmetric as rhs where there
-            are images. Along it rhs and the range of `inverse` have nothing but rounding, and what holds a node is left
-            out of the residual. None where nodes are held along axes alone, in which `inverse` is exactly zero.
+        held: direction in which each node is held, unit vectors [N, D], zero for none; symmetric as rhs where there are
+            images. Along it rhs and the range of `inverse` are zero to rounding, and the reaction is excluded from the
+            residual. None where nodes are held along axes only, in which `inverse` is exactly zero.
 
     Raises:
         ValueError, TypeError: for wrong shapes, dtypes or devices.
@@ -170,7 +170,7 @@ def to_upper(matrices: Tensor) -> Tensor:
 
 
 def from_upper(upper: Tensor, dim: int) -> Tensor:
-    """The inverse of `to_upper`."""
+    """Inverse of `to_upper`."""
     i, j = _triangle(dim)
     place = {(a, b): k for k, (a, b) in enumerate(zip(i, j, strict=True))}
     entries = [upper[:, place[min(a, b), max(a, b)]] for a in range(dim) for b in range(dim)]
@@ -178,7 +178,7 @@ def from_upper(upper: Tensor, dim: int) -> Tensor:
 
 
 def add_deviator(tangent: Tensor, dim: int, modulus: Tensor) -> None:
-    """Adds modulus [P] times dev sym L to tangents [P, n] whose frames are the identity, in place."""
+    """Add modulus [P] times dev sym L to tangents [P, n] whose frames are the identity, in place."""
     first = 2 * dim * dim
     for k, (i, j) in enumerate(zip(*_triangle(dim), strict=True)):
         tangent[:, first + k] += modulus * ((1.0 if i == j else 0.0) - 1.0 / dim)

@@ -1,8 +1,8 @@
-"""Impulses of the material on walls and obstacles: Python faces, fake kernels and autograd.
+"""Impulses of the material on walls and obstacles: Python wrappers, fake kernels and autograd.
 
-An impulse is D numbers [N s], the sum over nodes of mass times the velocity that the boundary takes, and then its
-moment about the origin [N m s], one number in 2-D and a vector in 3-D. Impulses are float64 whatever the particles are,
-since they are sums over many steps.
+An impulse is D numbers [N s], the sum over nodes of mass times the velocity that the boundary removes, followed by its
+moment about the origin [N m s], one number in 2-D and a vector in 3-D. Impulses are float64 for any dtype of the
+particles, since they are sums over many steps.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def with_moment(position: Tensor, momentum: Tensor) -> Tensor:
 
 
 def impulse_of_nodes(blocks: Topology, momentum: Tensor) -> Tensor:
-    """The impulse that takes a momentum [N, D] [N s] from each node: [B, D + 1 or 3] [N s, N m s], float64."""
+    """Impulse that removes a momentum [N, D] [N s] from each node: [B, D + 1 or 3] [N s, N m s], float64."""
     rows = with_moment(blocks.node_positions(torch.float64), momentum.double())
     rows = torch.where(blocks.active_nodes()[:, None], rows, 0)
     slots = rows.unflatten(0, (blocks.block.shape[0], blocks.grid.nodes_per_block)).sum(1)
@@ -62,7 +62,7 @@ def wall_impulses(
 ) -> Tensor:
     """Impulses on the faces of the domain in a `grid_update` with the same arguments.
 
-    A mirror takes what nodes and their images, which both have a momentum, give each other.
+    The impulse on a mirror is that between nodes and their images, which both have a momentum.
 
     Returns:
         [B, 2 D, D + 1 or 3] [N s, N m s], float64; the lower and upper face of each axis in turn.
@@ -86,15 +86,15 @@ def contact_impulses(
     """Impulses on obstacles in a `contact` with the same arguments, but at most `MAX_OBSTACLES` obstacles.
 
     Args:
-        mass: of the nodes [N] [kg].
+        mass: mass of the nodes [N] [kg].
 
     Returns:
-        [B, K, D + 1 or 3] [N s, N m s], float64; zero for obstacles that are not there at the time.
+        [B, K, D + 1 or 3] [N s, N m s], float64; zero for obstacles that are absent at the time.
 
     Raises:
         ValueError, TypeError: as `contact`.
 
-    Differentiable with respect to velocity, mass and what `contact` is with respect to, twice in eager mode.
+    Differentiable with respect to velocity, mass and the differentiable arguments of `contact`, twice in eager mode.
     """
     check_contact(blocks, velocity, obstacles)
     check_like("mass", mass, velocity, (velocity.shape[0],), "[N]", needed=True)
@@ -146,7 +146,7 @@ def _contact_backward_fake(grad_impulse, wants_rows, mass, velocity, obstacles, 
 def _composed_wall_impulses(
     blocks: Topology, nodes: Tensor, gravity: Tensor | None, dt: float | Tensor | None, faces: Sequence[Face]
 ) -> Tensor:
-    """`wall_impulses` in torch operations, for second derivatives."""
+    """`wall_impulses` made of torch operations, for second derivatives."""
     taken = [torch.zeros_like(nodes[:, 1:])] * (2 * blocks.grid.dim)
 
     def see(face: int, momentum: Tensor) -> None:

@@ -1,4 +1,4 @@
-"""The compiled laws (csrc/laws): update with stress, energy and moduli; Python faces, fake kernels and autograd."""
+"""The compiled laws (csrc/laws): update with stress, energy and moduli; Python wrappers, fake kernels and autograd."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from .implicit import tangent_entries
 from .registry import LAWS, LawInfo
 
 ELASTIC, PLASTIC, APEX, INVALID = 0, 1, 2, 3
-"""Branches of an update. What reaches the apex of a yield surface flows too."""
+"""Branches of an update. States at the apex of a yield surface flow too."""
 NOT_CONVERGED = 4
 DISSIPATED, MULTIPLIER, BRANCH = 1, 2, 4
 """Bits of `details` in csrc/laws/law.op.cpp."""
@@ -29,16 +29,17 @@ class LawUpdate(NamedTuple):
     """Result of `law_update`."""
 
     state: Tensor
-    """F [P, D, D] after the return map, bitwise the trial one where elastic; J [P] of a fluid as it was given."""
+    """F [P, D, D] after the return map, bitwise the trial one where elastic; J [P] of a fluid, unchanged."""
     stress: Tensor
     """Kirchhoff stress τ [P, D, D] [Pa] of that state, stored as structure of arrays."""
     history: tuple[Tensor, ...]
-    """History variables after the update, each in the shape that it was given in."""
+    """History variables after the update, each in its original shape."""
     dissipated: Tensor | None
     """Energy that the map turns into heat, per rest volume [P] [J/m³], not negative. With details.
 
     The plastic work τ · (h − H) of the mapped stress on the plastic increment of the Hencky strains (backward Euler;
-    Simo and Hughes 1998), less what hardening stores, and what is lost at once (`ReturnMap` says it for sand).
+    Simo and Hughes 1998), minus the energy stored by hardening, plus the energy that is lost at once (see `ReturnMap`
+    for sand).
     """
     multiplier: Tensor | None
     """Length of the plastic increment of the Hencky strains, trial less mapped [P]. With details."""
@@ -63,24 +64,25 @@ def law_update(
     """Return map and Kirchhoff stress of a compiled law.
 
     Args:
-        law: a name in `torch_mpm.ops.LAWS`, which tells its parameters, history and options.
+        law: a name in `torch_mpm.ops.LAWS`, which lists its parameters, history and options.
         state: trial deformation gradient F [P, D, D], or the volume ratio J [P] of a fluid; float32 or float64.
-        parameters: of the law, in its order; each of shape [], [1], [B] (with `scene`) or [P] (also where P = B).
+        parameters: parameters of the law, in its order; each of shape [], [1], [B] (with `scene`) or [P] (also where P
+            = B).
         history: history variables of the law, [P] or [P, D, D] each.
         C: velocity gradient [P, D, D] [1/s] of a viscous law; None at rest.
         scene: scene of each particle, int32 [P].
         dim: D; needed where the state is J.
         options: names of switches of the law.
-        details: whether dissipated energy, multiplier, branch and convergence are wanted too; or some of them, as bits.
-        scenes: number of scenes B of parameters [B]. None for any number that is above the largest scene; on CUDA that
-            one is not known, and a particle of a scene without an entry is invalid.
+        details: whether to return dissipated energy, multiplier, branch and convergence too; or some of them, as bits.
+        scenes: number of scenes B of parameters [B]. None for any number above the largest scene; on CUDA that one is
+            unknown, and a particle of a scene without an entry is invalid.
 
-    A state that is not finite, of det F ≤ 0 or J ≤ 0, or with a stress that overflows, is returned as it is with its
-    history, and has zero stress and no derivatives.
+    A state that is not finite, of det F ≤ 0 or J ≤ 0, or with a stress that overflows, is returned unchanged with its
+    history, with zero stress and no derivatives.
 
     Differentiable: every floating result with respect to state, parameters, C and history; twice in eager mode where
-    the law says so. On a boundary between branches the derivative is that of one of them, at equal principal stretches
-    it is right.
+        the law supports it. On a boundary between branches the derivative is that of one of them; at equal principal
+        stretches it is correct.
 
     Raises:
         ValueError, TypeError: for an unknown law or option, or wrong shapes, dtypes or devices.
@@ -108,7 +110,7 @@ def law_update(
 
 
 def option_bits(law: str, options: Sequence[str]) -> int:
-    """The names of switches as the bits of the compiled law."""
+    """Names of options as the bits of the compiled law."""
     bits = 0
     for option in options:
         check_choice("an option", option, LAWS[law].options)
@@ -127,7 +129,7 @@ def law_energy(
 ) -> Tensor:
     """Elastic energy per rest volume ψ [P] [J/m³] of the state itself; infinite where `law_update` has no stress.
 
-    Arguments as `law_update`; differentiable as that is.
+    Arguments as `law_update`; differentiable in the same way.
     """
     dim = _check(law, state, parameters, history, scene, dim, scenes)
     return dispatch(torch.ops.torch_mpm.law_energy, state, parameters, history, scene, law, dim)
@@ -144,7 +146,7 @@ def law_stiffness(
 ) -> Tensor:
     """Upper bound [P] [Pa] of the elastic tangent modulus over all velocity gradients of unit norm, after the map.
 
-    Zero where the stress is; not differentiable. Arguments as `law_update`.
+    Zero where the stress is zero; not differentiable. Arguments as `law_update`.
     """
     dim = _check(law, state, parameters, history, scene, dim, scenes)
     return torch.ops.torch_mpm.law_stiffness(state, parameters, history, scene, law, dim)
@@ -161,7 +163,7 @@ def law_wave_modulus(
 ) -> Tensor:
     """ρ₀ c² [P] [Pa] of the fastest elastic plane wave in the material after the map, or an upper bound.
 
-    Zero where the stress is; not differentiable. Arguments as `law_update`.
+    Zero where the stress is zero; not differentiable. Arguments as `law_update`.
     """
     dim = _check(law, state, parameters, history, scene, dim, scenes)
     return torch.ops.torch_mpm.law_wave_modulus(state, parameters, history, scene, law, dim)
@@ -178,8 +180,8 @@ def law_energy_gradient(
 ) -> Tensor:
     """∂ψ/∂F [P, D, D] or ∂ψ/∂J [P] [Pa] of the state itself, without a return map; zero where ψ is infinite.
 
-    Arguments as `law_update`. Differentiable with respect to state and parameters where the law says that its energy is
-    twice differentiable.
+    Arguments as `law_update`. Differentiable with respect to state and parameters for laws with
+    `twice_differentiable_energy`.
     """
     dim = _check(law, state, parameters, history, scene, dim, scenes)
     by_state, _, _ = dispatch(
@@ -204,17 +206,16 @@ def law_tangent(
 ) -> Tensor:
     """Second derivative of the energy of each particle by velocity gradients L, in the form of csrc/laws/tangent.h.
 
-    A trial deformation F moves with dF = L F₀, or J with dJ = J₀ tr L; the second derivative maps L to dP F₀ᵀ. It is
-    kept in principal axes (Teran et al. 2005): [P, 30] in 3-D, [P, 13] in 2-D, zero where the law has no meaning.
+    A trial deformation F changes by dF = L F₀, or J by dJ = J₀ tr L; the second derivative maps L to dP F₀ᵀ. It is
+    stored in principal axes (Teran et al. 2005): [P, 30] in 3-D, [P, 13] in 2-D, zero for meaningless states.
 
     Args:
-        law: as `law_update` takes it.
+        law: as in `law_update`.
         state: trial F [P, D, D], or J [P].
-        before: F₀ or J₀, from which the trial moves; of the same shape.
+        before: F₀ or J₀, the start of the trial; of the same shape.
         weight: factor [P]: dt² V for the Hessian of an implicit step.
-        parameters, history, scene, dim, scenes: as `law_update` takes them. History counts as constant, and nothing
-            flows.
-        projected: whether negative eigenvalues are left out.
+        parameters, history, scene, dim, scenes: as in `law_update`. History is constant, and there is no flow.
+        projected: whether negative eigenvalues are removed.
 
     Raises:
         NotImplementedError: for a law without a tangent.
@@ -242,7 +243,7 @@ def _check(
     dim: int | None,
     scenes: int | None,
 ) -> int:
-    """Check what all ops share; return the dimension."""
+    """Checks shared by all ops; returns the dimension."""
     check_choice("law", law, LAWS)
     info = LAWS[law]
     dim = _check_state(info, state, dim)
@@ -280,7 +281,7 @@ def _check_state(info: LawInfo, state: Tensor, dim: int | None) -> int:
 
 
 def _split(columns: Tensor, history: Tensors) -> tuple[Tensor, ...]:
-    """The entries [P, m] of all history variables as one view each."""
+    """Entries [P, m] of all history variables, one view each."""
     result, first = [], 0
     for variable in history:
         if variable.dim() == 1:
@@ -390,10 +391,10 @@ def _of_history(grads: Tensor, history: Tensors, wanted: Sequence[bool]) -> list
 
 
 class _Saved:
-    """The tensors of a call in one order: state, C, scene, parameters, history."""
+    """Tensors of a call in one order: state, C, scene, parameters, history."""
 
     def __init__(self, ctx: Any) -> None:
-        self.state, self.C, self.scene, *rest = ctx.saved_tensors  # once: a checkpointed region unpacks it only once
+        self.state, self.C, self.scene, *rest = ctx.saved_tensors  # Once: a checkpointed region unpacks it only once.
         self.parameters, self.history = rest[: ctx.parameters], rest[ctx.parameters :]
 
 

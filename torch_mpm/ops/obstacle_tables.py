@@ -1,4 +1,4 @@
-"""Obstacles as the ops take them: tables of their parameters, once or at each of many times."""
+"""Obstacles as arguments of ops: tables of their parameters, once or at each of many times."""
 
 from __future__ import annotations
 
@@ -17,8 +17,9 @@ from ..step_times import StepTimes
 
 
 class KernelShape(NamedTuple):
-    """How the kernel calls a shape, the name of the shape's parameter in the column of directions and sizes, and those
-    of its other parameters."""
+    """Kernel number of a shape, the name of its parameter in the column of directions and sizes, and those of its other
+    parameters.
+    """
 
     number: int
     extent: str | None
@@ -37,21 +38,21 @@ KERNEL_SHAPES: dict[type[shapes.Shape], KernelShape] = {
 
 
 def size_of_data(shape: shapes.Shape) -> int:
-    """Numbers of a shape beside its row of the table, without making them at every step."""
+    """Number of data of a shape beside its row of the table, without computing them."""
     if isinstance(shape, shapes.Revolved):
         return 2 * len(shape.outline)
     return 2 * shape.values.dim() + 1 + shape.values.numel() if isinstance(shape, shapes.Sampled) else 0
 
 
 def _data(shape: shapes.Shape, like: Tensor) -> Tensor:
-    """The numbers of a shape beside its row of the table [n]."""
+    """Data of a shape beside its row of the table [n]."""
     if isinstance(shape, shapes.Revolved):
         return shape.parameter("outline", like, (len(shape.outline), 2)).reshape(-1)
     return shape.data(like) if isinstance(shape, shapes.Sampled) else like.new_zeros(0)
 
 
 def tables(obstacles: Sequence[Obstacle], like: Tensor, scenes: int) -> tuple[Tensor, Tensor]:
-    """Parameters [1 or B, K, width] and data [n] of the shapes; kept while nothing has changed."""
+    """Parameters [1 or B, K, width] and data [n] of the shapes; cached while nothing has changed."""
     if torch.compiler.is_compiling() or type(like) not in (Tensor, torch.nn.Parameter):
         return _build(obstacles, like, scenes)
     values = [v for o in obstacles for v in (o, o.shape, *_values(o))]
@@ -63,7 +64,7 @@ def tables(obstacles: Sequence[Obstacle], like: Tensor, scenes: int) -> tuple[Te
 
 
 def tables_over(obstacles: Sequence[Obstacle], like: Tensor, scenes: int, times: StepTimes) -> tuple[Tensor, Tensor]:
-    """Parameters at many times, with the positions then, [n, 1 or B, K, width]; and data as `tables`."""
+    """Parameters at many times, with the positions at each, [n, 1 or B, K, width]; and data as in `tables`."""
     _check_scenes(obstacles, like, scenes)
     rows = [_row_over(o, like, times) for o in obstacles]
     count = _count([row.shape[1] for row in rows], scenes)
@@ -72,7 +73,7 @@ def tables_over(obstacles: Sequence[Obstacle], like: Tensor, scenes: int, times:
 
 
 def _values(obstacle: Obstacle) -> tuple[Any, ...]:
-    """The numbers and tensors of an obstacle that go into the tables."""
+    """Numbers and tensors of an obstacle that enter the tables."""
     moved, shape = obstacle.motion, obstacle.shape
     motion = (obstacle.friction, moved.position, moved.velocity, moved.rotation, moved.angular_velocity)
     kind = KERNEL_SHAPES[type(shape)]
@@ -94,7 +95,7 @@ def _check_scenes(obstacles: Sequence[Obstacle], like: Tensor, scenes: int) -> N
 
 
 def _count(counts: Sequence[int], scenes: int) -> int:
-    """Rows of a table whose obstacles have so many each."""
+    """Rows of a table, with the given number of rows per obstacle."""
     count = max(counts)
     if count not in (1, scenes) or any(own not in (1, count) for own in counts):
         raise ValueError(f"parameters of obstacles must be given once or per scene, B = {scenes}, got {count} of them")
@@ -102,7 +103,7 @@ def _count(counts: Sequence[int], scenes: int) -> int:
 
 
 def _parts(obstacle: Obstacle, like: Tensor) -> dict[str, Tensor]:
-    """The columns of its row by name, [1 or B, n] each; zero where it has none, or where a path has its position."""
+    """Columns of its row by name, [1 or B, n] each; zero where it has none, or where a path gives its position."""
     vector, shape = (like.shape[1],), obstacle.shape
     turn = () if like.shape[1] == 2 else (3,)
     motion = {"position": vector, "velocity": vector, "rotation": turn, "angular_velocity": turn}
@@ -145,8 +146,9 @@ def _row_over(obstacle: Obstacle, like: Tensor, times: StepTimes) -> Tensor:
 
 
 def _path_over(obstacle: Obstacle, like: Tensor, times: StepTimes) -> tuple[Tensor, Tensor]:
-    """Positions and velocities [n, 1 or B, D]. Where the host knows the time, a function is asked for times at which
-    the obstacle is there, as in single steps; zero for others."""
+    """Positions and velocities [n, 1 or B, D]. Where the host knows the time, a function is evaluated at times at which
+    the obstacle is present, as in single steps; zero at others.
+    """
     n, there = len(times.tensor), times.within(obstacle.start, obstacle.end)
     moments = times.tensor[there].to(like.dtype)
     if len(moments) == 0:
@@ -157,12 +159,12 @@ def _path_over(obstacle: Obstacle, like: Tensor, times: StepTimes) -> tuple[Tens
 
 
 def path_requires_grad(obstacle: Obstacle, like: Tensor, times: StepTimes) -> bool:
-    """Whether the first or the last of the positions on a path does."""
+    """Whether the first or the last of the positions on a path requires grad."""
     there = times.tensor[times.within(obstacle.start, obstacle.end)].to(like.dtype)
     return any(obstacle.at(time).requires_grad for time in (*there[:1], *there[-1:]))
 
 
 def numbers_of_a_step(obstacles: Sequence[Obstacle], like: Tensor, least_rows: int) -> int:
-    """Of a table, with so many rows for each obstacle or those that its parameters have."""
+    """Number of entries of a table with `least_rows` rows per obstacle, or as many as its parameters have."""
     shapes_of_rows = [_joined(_parts(o, like)).shape for o in obstacles]
     return sum(width for _, width in shapes_of_rows) * max(least_rows, *(rows for rows, _ in shapes_of_rows))

@@ -1,4 +1,4 @@
-"""Functions of each particle or node alone (csrc/pointwise), fused: Python face, fake kernels and autograd."""
+"""Functions of each particle or node alone (csrc/pointwise), fused: Python wrapper, fake kernels and autograd."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ Places = list[int]
 
 @dataclasses.dataclass(frozen=True)
 class Function:
-    """What a function of csrc/pointwise says of itself.
+    """Description of a function of csrc/pointwise.
 
     Attributes:
-        name: as `pointwise` takes it.
-        arguments, results: entries of each in a row, (rows, columns): zero where it has none, -1 for D.
+        name: argument of `pointwise`.
+        arguments, results: shape of each in a row, (rows, columns): zero for a missing dimension, -1 for D.
     """
 
     name: str
@@ -41,12 +41,13 @@ def _read() -> dict[str, Function]:
 
 
 FUNCTIONS: dict[str, Function] = _read()
-"""Every function by its name."""
+"""All functions by name."""
 
 
 def fuses(*tensors: Tensor) -> bool:
-    """Whether `pointwise` may take the place of torch operations, which have every derivative and transform: where
-    nothing is recorded, transformed or compiled, and all tensors are float32, or all float64."""
+    """Whether `pointwise` may replace torch operations, which have all derivatives and transforms: where nothing is
+    recorded, transformed or compiled, and all tensors are float32, or all float64.
+    """
     return not (
         is_recorded(*tensors) or tensors[0].dtype not in FLOATING or any(t.dtype != tensors[0].dtype for t in tensors)
     )
@@ -56,13 +57,13 @@ def pointwise(function: str, dim: int, *arguments: Tensor | float, wanted: Seque
     """Results of a function of csrc/pointwise, one kernel for all rows.
 
     Args:
-        function: a name in `FUNCTIONS`, which tells its arguments; what they are stands with the function.
+        function: a name in `FUNCTIONS`, which lists its arguments; they are documented with the function.
         dim: D.
-        arguments: a tensor with a row for each particle or node, or without that dimension (of a scalar also [1]) one
-            for all, or a number. A number for a vector is each of its entries, for a matrix that many times the
-            identity. All tensors float32, or all float64, and one of them with rows; one [] may be on the CPU where
-            the others are not, as for torch's own operations.
-        wanted: numbers of the results to give; None for all.
+        arguments: a tensor with a row for each particle or node, or without that dimension (for a scalar also [1]) one
+            for all, or a number. A number represents a vector of equal entries, or a multiple of the identity matrix.
+            All tensors float32, or all float64, and one of them with rows; one [] may be on the CPU where the others
+            are not, as for torch's own operations.
+        wanted: indices of the results to return; None for all.
 
     Differentiable with respect to every tensor, twice.
 
@@ -80,7 +81,7 @@ def pointwise(function: str, dim: int, *arguments: Tensor | float, wanted: Seque
 
 
 def _beside(scalar: Tensor, device: torch.device | None) -> Tensor | float:
-    """A tensor [] for a call on a device: one that is on the CPU is a number there, so that graphs may capture it."""
+    """A tensor [] for a call on a device: one on the CPU becomes a number, so that graphs may capture the call."""
     if device is None or scalar.device == device:
         return scalar
     return scalar.to(device) if scalar.requires_grad or is_traced(scalar) or scalar.is_cuda else float(scalar)
@@ -90,7 +91,7 @@ def _beside(scalar: Tensor, device: torch.device | None) -> Tensor | float:
 
 
 def _rows(info: Function, tensors: Sequence[Tensor], places: Places) -> tuple[Any, Tensor]:
-    """Rows of a call, and a tensor that has them."""
+    """Number of rows of a call, and a tensor that has them."""
     ranks = [sum(size != 0 for size in info.arguments[k]) for k in places]
     given = [t for t, rank in zip(tensors, ranks, strict=True) if t.dim() == rank + 1]
     torch._check(bool(given), lambda: "one of tensors must have a row for each particle")
@@ -101,7 +102,7 @@ def _rows(info: Function, tensors: Sequence[Tensor], places: Places) -> tuple[An
 
 
 def row_shape(entries: tuple[int, int], rows: Any, dim: int) -> list[Any]:
-    """Shape of an argument or result with so many rows."""
+    """Shape of an argument or result with a number of rows."""
     return [rows, *(dim if size == -1 else size for size in entries if size != 0)]
 
 
@@ -159,7 +160,7 @@ def _backward(ctx: Any, *grads: Tensor | None) -> Any:
 
 
 def _placed(found: Sequence[Tensor], wanted: Places, tensors: Sequence[Tensor]) -> list[Tensor | None]:
-    """Gradients by rows as those of the tensors, of which some are for all rows."""
+    """Gradients by row as those of the tensors, some of which are shared by all rows."""
     result: list[Tensor | None] = [None] * len(tensors)
     for gradient, i in zip(found, wanted, strict=True):
         same = gradient.shape == tensors[i].shape

@@ -17,7 +17,7 @@ class Quantity:
         name, unit: the unit is "" for a pure number.
         low, high: ends of its range; infinite ends mean any finite number.
         with_low, with_high: whether a finite end is in the range.
-        matrix: of history, whether it has D by D entries per particle.
+        matrix: whether a history variable has D by D entries per particle.
     """
 
     name: str
@@ -47,17 +47,17 @@ class Quantity:
 
 @dataclasses.dataclass(frozen=True)
 class LawInfo:
-    """What a compiled law says of itself.
+    """Description of a compiled law.
 
     Attributes:
-        field: what of the deformation it reads and moves: "F" or "J".
+        field: field of the deformation that it reads and updates: "F" or "J".
         viscous: whether its stress reads C.
         plastic: whether it changes F.
         optional_history: whether it works without its history.
         twice_differentiable, twice_differentiable_energy: whether its stress, and its energy, has second derivatives.
         has_tangent: whether it has `law_tangent`, which implicit steps need.
         in_2d: whether it exists in two dimensions.
-        additive: whether it is part of a material beside another law, to whose stress its own is added.
+        additive: whether its stress is added to that of another law of the same material.
         parameters, history: in the order of the ops.
         options: names of the bits of `options`.
     """
@@ -100,4 +100,4 @@ def _read() -> dict[str, LawInfo]:
 
 
 LAWS: dict[str, LawInfo] = _read()
-"""Every compiled law by its name."""
+"""All compiled laws by name."""

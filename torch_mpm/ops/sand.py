@@ -1,4 +1,4 @@
-"""Sand: the return map of the quartic energies, stress, energy and stiffness, as faces of the laws sand_*."""
+"""Sand: the return map of the quartic energies, stress, energy and stiffness, as wrappers of the laws sand_*."""
 
 from __future__ import annotations
 
@@ -41,11 +41,11 @@ ENERGIES = ("unilateral", "full", "hencky", "mixed")
 Value = float | Tensor
 
 ANGLE = "in radians, in [0, π/2), such as 0.5236 for 30°"
-"""What a friction angle must be."""
+"""Condition on a friction angle."""
 
 
 class ReturnMap(NamedTuple):
-    """Result of `quartic_return_map`. The last three are None unless asked for."""
+    """Result of `quartic_return_map`. The last three are None unless requested."""
 
     F: Tensor
     """Projected deformation gradient [P, D, D]; bitwise the trial one where elastic."""
@@ -61,8 +61,8 @@ class ReturnMap(NamedTuple):
     """Energy that the map turns into heat, per rest volume [P] [J/m³], not negative. With details.
 
     It is the work of the mapped stress on the plastic increment, τ · (h − H) (backward Euler; Simo and Hughes 1998),
-    and the elastic energy that is lost at once: of sand that tears with a cohesion, and of the axes that are compressed
-    when a unilateral energy reaches the apex. Sand stores no energy by hardening.
+    and the elastic energy that is lost at once: by sand that tears with a cohesion, and by compressed axes when a
+    unilateral energy reaches the apex. Sand stores no energy by hardening.
     """
     volume_correction: Tensor | None
     """v_c [P] after the map. With a volume correction."""
@@ -85,7 +85,7 @@ def quartic_return_map(
 ) -> ReturnMap:
     """Drucker-Prager return map of sand in Hencky strains, with its stress: one decomposition of F.
 
-    The mean strain stays, except at the apex.
+    The mean strain does not change, except at the apex.
 
     Args:
         F: trial deformation gradient [P, 3, 3] or [P, 2, 2], float32 or float64.
@@ -98,30 +98,31 @@ def quartic_return_map(
         energy: "unilateral" or "full" quartic energy; "hencky", the quadratic one (Klár et al. 2016); "mixed": map of
             the full energy, stress of the unilateral one. With the unilateral energy and α > 1/√6 (36.87° in 3-D) there
             are directions without a yield surface: such states are elastic at any stretch.
-        apex: where the volume has grown, "zero" makes F a rotation; "keep" (unilateral energy only) keeps its volume
-            and removes what is compressed, which is continuous and free of stress as well.
+        apex: where the volume has grown, "zero" makes F a rotation; "keep" (unilateral energy only) preserves its
+            volume and removes compressive strains, which is continuous and free of stress too.
         details: also return the multiplier and the dissipated energy.
-        flow: "radial": the direction of the strain deviator stays too (Gao et al. 2018, supplement, eq. 28); "exact":
-            the plastic strain increment is along the deviator of the stress on the yield surface (eq. 25 to 27). They
-            are the same in 2-D and for the quadratic energy. In plane strain the exact flow mobilises more friction.
+        flow: "radial": the direction of the strain deviator does not change either (Gao et al. 2018, supplement, eq.
+            28); "exact": the plastic strain increment is along the deviator of the stress on the yield surface (eq. 25
+            to 27). Both are the same in 2-D and for the quadratic energy. In plane strain the exact flow mobilises more
+            friction.
         cohesion: Hencky strain c ≥ 0, like mu: the tension on every axis at the apex of the cone, h = c (1, 1, 1). The
             yield function is that of h − c. Its stress is the tensile strength, 4aμ c³ + 2aλ (D c)³ for the full
             energy and (2μ + D λ) c for the quadratic one; the unilateral energy has none in tension. Without a volume
             correction sand flows at the apex under that tension.
-        volume_correction: v_c [P], logarithm of the volume that was lost at the apex, zero at first and not negative
-            (Tampubolon et al. 2017). With it, what reaches the apex tears: F becomes a rotation whatever the cohesion,
-            and v_c grows by log det of the trial F. Torn sand, v_c > 0, has neither stress nor cohesion until
-            compression has closed the gap: the map sees h + v_c/D, is at the apex while its trace is not negative, and
-            gives v_c back to F once it is. With apex="keep" F keeps the volume itself, and v_c stays zero.
-        scenes: number of scenes B, as of `law_update`.
+        volume_correction: v_c [P], logarithm of the volume lost at the apex, zero at first and not negative (Tampubolon
+            et al. 2017). With it, sand at the apex tears: F becomes a rotation for any cohesion, and v_c grows by log
+            det of the trial F. Torn sand, v_c > 0, has neither stress nor cohesion until compression has closed the
+            gap: the map uses h + v_c/D, is at the apex while its trace is not negative, and returns v_c to F once it
+                is. With apex="keep" F keeps the volume itself, and v_c stays zero.
+        scenes: number of scenes B, as in `law_update`.
 
     Returns:
-        A `ReturnMap`. A trial F that is not finite or of det F ≤ 0 is returned as it is, with zero stress.
+        A `ReturnMap`. A trial F that is not finite or of det F ≤ 0 is returned unchanged, with zero stress.
 
     Differentiable once: every floating result with respect to F, mu, lam, the angle or α, cohesion and volume
-    correction, by implicit differentiation at the root and divided differences that hold at equal principal stretches.
-    On a boundary between branches the derivative is that of one of them. Of float32 arguments the gradient takes
-    strains and map in float64: it is right to rounding at the F that is given.
+    correction, by implicit differentiation at the root and divided differences, which are correct at equal principal
+    stretches. On a boundary between branches the derivative is that of one of them. The gradient of float32 arguments
+    computes strains and map in float64: it is exact to rounding at the given F.
 
     Raises:
         ValueError, TypeError: for an unknown option, a number out of range, or wrong shapes, dtypes or devices. Values
@@ -168,7 +169,7 @@ def quartic_return_map(
 
 
 def law_name(energy: str, flow: str, dim: int) -> str:
-    """The compiled law of an energy and a flow; for D = 2 and the quadratic energy the exact flow is the radial one."""
+    """Compiled law of an energy and a flow; for D = 2 and the quadratic energy the exact flow is the radial one."""
     exact = flow == "exact" and dim == 3 and energy != "hencky"
     return f"sand_{energy}_exact" if exact else f"sand_{energy}"
 
@@ -241,7 +242,7 @@ def _elastic(
     scenes: int | None,
     smallest_strain: float = 0.0,
 ) -> list[Tensor]:
-    """Parameters of a law of sand for what needs no yield surface."""
+    """Parameters of a law of sand for functions that need no yield surface."""
     _check_deformation(F, scene, energy, scenes)
     values = (("mu", mu), ("lam", lam), ("alpha", 0.0), ("cohesion", 0.0), ("smallest_strain", smallest_strain))
     return [_parameter(name, value, F, scene, scenes) for name, value in values]
@@ -259,7 +260,7 @@ def _check_deformation(F: Tensor, scene: Tensor | None, energy: str, scenes: int
 
 
 def _check_number(name: str, value: Value | None, expected: str, most: float = math.inf) -> None:
-    """A tensor is left alone: to read it would wait for its device."""
+    """A tensor is not checked: reading it would wait for its device."""
     if value is not None and not isinstance(value, Tensor):
         check_number(name, value, expected, lambda v: 0 <= v < most, NUMBER_OR_TENSOR)
 
@@ -268,12 +269,12 @@ def _parameter(name: str, value: Value | None, F: Tensor, scene: Tensor | None, 
     if not isinstance(value, Tensor):
         check_number(name, value, kinds=NUMBER_OR_TENSOR)
         number = float(value)  # type: ignore[arg-type]
-        return torch.full((), number, dtype=F.dtype, device=F.device)  # not a copy from the host, which graphs refuse
+        return torch.full((), number, dtype=F.dtype, device=F.device)  # Not a copy from the host, which graphs refuse.
     check_parameter(name, value, F, scene, scenes)
     return value
 
 
-# ---- torch.ops.torch_mpm.quartic_return_map, the name by which training code calls it
+# ---- torch.ops.torch_mpm.quartic_return_map, the name used by training code
 
 _LIBRARY = torch.library.Library("torch_mpm", "FRAGMENT")
 _LIBRARY.define(

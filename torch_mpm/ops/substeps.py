@@ -1,4 +1,4 @@
-"""The ops behind `torch_mpm.rollout`: n steps in one call, and their adjoint. Fake kernels and autograd.
+"""Ops behind `torch_mpm.rollout`: n steps in one call, and their adjoint. Fake kernels and autograd.
 
     torch.ops.torch_mpm.substeps(x, v, mass, volume, C, F, J, residual, history, scene, ids, material, previous_status,
         laws, options, parameters, variables, n, dt, apic, flip, wants_C, stress_form, gravity, wall_kind, wall_plane,
@@ -6,41 +6,41 @@
         max_blocks, grows, resident, records, impulse, scene_dt, scene_time, lattice, layout)
         -> (x, v, C, F, J, history, status, impulse, time, residual, record)
 
-`torch_mpm.substeps_arguments(step, state, n, dt)` makes the arguments; docs/training.md has a call.
+`torch_mpm.substeps_arguments(step, state, n, dt)` returns the arguments; docs/training.md has an example.
 
 Particles and their history are those of `State`, the grid's arguments those of `activate`, `grid_update` and `contact`.
-`laws` are names of `LAWS`, for the particles of each material one, with commas between them, and perhaps more after a
-plus whose stress is added; their options, parameters and history variables follow one another, `variables` of the
-latter for each law. The time step dt [s] is part of the parameters of laws that flow in time. `obstacles` is the table
-of `contact`, or one for each substep [n, 1 or B, K, width] with the positions then. Results that a call does not have
-are None; `history` has the entries of all laws side by side, [P, m]. The impulses on obstacles and walls are added to
-`impulse`, where it is given. With `flip` that share of the velocities of particles, less those of the nodes before the
-forces, is added to what G2P gives. Scenes with clocks of their own have the time steps dt times `scene_dt` and
-begin at `scene_time`, both [B], the latter in float64. With `grows` the pool follows the scene on the CPU; otherwise
-the op stops there where it is full, and the status tells. On CUDA nothing is waited for but that the device is less
-than a fraction of a second behind. With `resident` batches of small scenes may go another way there, each on a
-multiprocessor of its own; gradients take it as any other, whose sums may round differently. With `records` everything
-that the adjoint reads is kept in `record`, bytes of no other use, and no step is taken again; not where impulses are
-counted, or the pool had to grow. `residual` is `State.x_residual`; without it positions are not compensated.
+`laws` are names of `LAWS`, one per material, separated by commas, optionally followed by a plus and further laws whose
+stress is added; their options, parameters and history variables are concatenated, with `variables` history variables
+for each law. The time step dt [s] is one of the parameters of rate-dependent laws. `obstacles` is the table of
+`contact`, or one for each substep [n, 1 or B, K, width] with the positions at its time. Absent results are None;
+`history` has the entries of all laws side by side, [P, m]. The impulses on obstacles and walls are added to `impulse`,
+where it is given. With `flip` that share of the velocities of particles, minus those of the nodes before the forces, is
+added to the result of G2P. Scenes with separate clocks have the time steps dt times `scene_dt` and begin at
+`scene_time`, both [B], the latter in float64. With `grows` the pool grows with the scene on the CPU; otherwise the op
+stops on the CPU where it is full, and the status records it. On CUDA the host waits only to stay less than a fraction
+of a second ahead of the device. With `resident` batches of small scenes may be computed on CUDA by one thread block per
+scene; sums, also those of gradients, may then round differently. With `records` all inputs of the adjoint are stored in
+`record`, opaque bytes, and no step is recomputed, except where impulses are counted or the pool had to grow. `residual`
+is `State.x_residual`; without it positions are not compensated.
 
 Several times a second both ops run the handlers of signals, on the main thread. Where one of them raises, the op ends
-with a RuntimeError and without a result; `torch_mpm.rollout` raises what the handler has raised.
+with a RuntimeError and without a result; `torch_mpm.rollout` raises the exception of the handler.
 
 Differentiable once, with respect to x, v, mass, volume, C, F, J, history, parameters, gravity, obstacles, impulse and
-scene_dt, the last without flip and but for what obstacles know of the time. Autograd keeps the arguments of a call and
-the record, mostly none: 2 D + 2 D² numbers per particle of a solid (24 in 3-D) and its history.
+scene_dt, the last without flip and without the dependence of obstacles on the time. Autograd stores the arguments of a
+call and the record, if any: 2 D + 2 D² numbers per particle of a solid (24 in 3-D) and its history.
 
     torch.ops.torch_mpm.substeps_backward(grad_x, grad_v, grad_C, grad_F, grad_J, grad_history, grad_impulse, needs,
         record, *arguments of substeps)
         -> (x, v, C, F, J, history, mass, volume, parameters, gravity, obstacles, dt)
 
-takes the steps again, where there is no record, and then goes back through them; a record must be that of `substeps`,
-whose contents are not checked. Meanwhile it holds what each step has read: of a solid 2 D + 3 D² numbers per particle
-and step (33 in 3-D), D² more where a law is plastic, and the history; and the grid of each step where that is at most
-half as much. The adjoints are [P, ...], those of the parameters [P, number of parameters] and that of gravity, over the
-time step, a sum for each block of the grids of all scenes [B * blocks, D]; that of the time step, but for gravity, is
-[P]. Of the last six the bits of `needs` (`MASS`, `VOLUME`, `PARAMETERS`, `GRAVITY`, `OBSTACLES`, `TIME_STEP`) tell
-which are wanted.
+recomputes the steps, where there is no record, and then computes their adjoints in reverse order; a record must be that
+of `substeps`, and its contents are not checked. Meanwhile it stores the inputs of each step: for a solid 2 D + 3 D²
+numbers per particle and step (33 in 3-D), D² more where a law is plastic, and the history; and the grid of each step
+where that is at most half as much. The adjoints are [P, ...], those of the parameters [P, number of parameters] and
+that of gravity, over the time step, a sum for each block of the grids of all scenes [B * blocks, D]; that of the time
+step, but for gravity, is [P]. The bits of `needs` (`MASS`, `VOLUME`, `PARAMETERS`, `GRAVITY`, `OBSTACLES`, `TIME_STEP`)
+select among the last six.
 """
 
 from __future__ import annotations
@@ -127,7 +127,7 @@ def _backward_fake(grad_x, grad_v, grad_C, grad_F, grad_J, grad_history, grad_im
 
 
 def _setup(ctx: Any, inputs: Any, output: Any) -> None:
-    given = dict(zip(_SCHEMA, inputs, strict=True)) | {"previous_status": None}  # which the adjoint does not read
+    given = dict(zip(_SCHEMA, inputs, strict=True)) | {"previous_status": None}  # The adjoint does not read these.
     history, parameters = given["history"], given["parameters"]
     ctx.variables = len(history)
     ctx.set_materialize_grads(False)
@@ -136,7 +136,7 @@ def _setup(ctx: Any, inputs: Any, output: Any) -> None:
 
 
 def _backward(ctx: Any, *grads: Any) -> Any:
-    record, *saved = ctx.saved_tensors  # once: a checkpointed region unpacks a tensor only once
+    record, *saved = ctx.saved_tensors  # Once: a checkpointed region unpacks a tensor only once.
     tensors, rest = dict(zip(_TENSORS, saved, strict=False)), saved[len(_TENSORS) :]
     history, parameters = rest[: ctx.variables], rest[ctx.variables :]
     given = ctx.given | tensors | {"history": history, "parameters": parameters}
@@ -154,12 +154,12 @@ def _backward(ctx: Any, *grads: Any) -> Any:
     found["parameters"] = _of_parameters(found["parameters"], parameters, wanted["parameters"], given["scene"])
     by_dt = found.pop("dt")
     if wants_dt:
-        sums = sum_by_scene(by_dt, given["scene"], given["scenes"])  # of one scene where nobody says which
+        sums = sum_by_scene(by_dt, given["scene"], given["scenes"])  # One scene by default.
         found["scene_dt"] = given["dt"] * torch.cat([sums, sums.new_zeros(given["scenes"] - len(sums))])
     if found["gravity"] is not None:
         scenes, dim = given["gravity"].shape
         dt = given["dt"] if given["scene_dt"] is None else given["dt"] * given["scene_dt"][:, None]
-        change = found["gravity"].reshape(scenes, math.prod(given["layout"][2:]), dim).sum(1)  # of velocities, over dt
+        change = found["gravity"].reshape(scenes, math.prod(given["layout"][2:]), dim).sum(1)  # Of velocities, over dt.
         found["gravity"] = dt * change
         if wants_dt:
             found["scene_dt"] = found["scene_dt"] + given["dt"] * (given["gravity"] * change).sum(1)

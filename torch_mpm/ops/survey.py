@@ -1,4 +1,4 @@
-"""What a run asks of its particles between two steps, in one pass: Python face and fake kernel."""
+"""Survey of particles between two steps of a run, in one pass: Python wrapper and fake kernel."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ if TYPE_CHECKING:
 
 
 class Survey(NamedTuple):
-    """Figures of each scene, float64 [B] on the device of the particles; zero for a scene without particles."""
+    """Results per scene, float64 [B] on the device of the particles; zero for a scene without particles."""
 
     rate: Tensor
     """Largest 1/dt of the limits of `torch_mpm.cfl` [1/s]; infinite for a particle without mass."""
     speed: Tensor
     """Largest speed [m/s]."""
     wrong: Tensor
-    """Particles that are not finite, outside the domain, or, where their energy is given, that it is not finite."""
+    """Number of particles that are not finite, outside the domain, or whose energy, where given, is not finite."""
 
 
 def survey(
@@ -47,16 +47,16 @@ def survey(
 
     Args:
         grid: the lattice.
-        state: the particles; one of no scene counts in the scene next to its number.
+        state: the particles; a particle of an invalid scene counts in the nearest valid one.
         stress: Kirchhoff stress [P, D, D] [Pa].
         stiffness: tangent modulus [P] [Pa].
         bound: Λ/dx² of |∇v|² ≤ (Λ/dx²) |v|² [1/m²].
-        kept: 1 + s, where one particle round trip keeps the part s of a mode.
-        volumetric: whether the volume ratio alone follows the motion.
+        kept: 1 + s, where one particle round trip retains the fraction s of a mode.
+        volumetric: whether the deformation is the volume ratio only.
         viscosity: [P] [Pa s], or None.
-        energy: energy density [P] [J/m³], or None; not finite where the law has no meaning.
-        speed: of what moves near each particle [P] [m/s], or None.
-        obstacles: at most `MAX_OBSTACLES` for which `fusible` holds, whose speed within `reach` [m] counts too.
+        energy: energy density [P] [J/m³], or None; not finite for meaningless states.
+        speed: speed of moving boundaries near each particle [P] [m/s], or None.
+        obstacles: at most `MAX_OBSTACLES` for which `fusible` holds; their speed within `reach` [m] counts too.
 
     Raises:
         RuntimeError: for wrong shapes, dtypes or devices.
@@ -82,13 +82,13 @@ def law_figures(
     material: Tensor | None,
     energy: bool,
 ) -> tuple[Tensor, Tensor, Tensor | None]:
-    """What a survey asks of compiled laws, of all in one call; not differentiable.
+    """Values of compiled laws for a survey, all in one call; not differentiable.
 
     Args:
         state: the particles, with the fields that the laws read.
-        names, options, parameters, history, variables, material: `torch_mpm.laws.calls.LawCalls`. A particle of none of
-            the laws has zeros.
-        energy: whether the energy is asked for, of the state after the return map.
+        names, options, parameters, history, variables, material: `torch_mpm.laws.calls.LawCalls`. Particles of unknown
+            materials have zeros.
+        energy: whether to return the energy of the state after the return map.
 
     Returns:
         Kirchhoff stress [P, D, D], stiffness [P], energy density [P] or None [Pa].

@@ -40,8 +40,8 @@ def svd3(F: Tensor) -> SVD:
     Differentiable, also twice. The gradient of sigma always exists. Those of U and V are divided by the gap of two |σ|,
     and their rounding error with them (relative to the rest about eps |F|/gap): where two |σ| are equal up to rounding
     they are finite but wrong, where they are equal NaN or infinite, because singular vectors are not continuous there.
-    Use `polar` for the rotation, functions of F itself, or `CustomPrincipalLaw` for a law of the stretches; the other
-    laws bring gradients that hold there too.
+    Use `polar` for the rotation, functions of F itself, or `CustomPrincipalLaw` for a law of the stretches; the
+    gradients of the other laws are correct there too.
 
     Raises:
         ValueError, TypeError: for a wrong shape or dtype.
@@ -95,7 +95,7 @@ def _polar_fake(F: Tensor) -> tuple[Tensor, Tensor]:
     return soa_empty(F, shape), soa_empty(F, shape)
 
 
-# ---- autograd: in plain torch on the results, so that it can be differentiated again
+# ---- autograd: in plain torch on the results, so that it is differentiable again
 
 
 def _keep_output(ctx: Any, inputs: Any, output: Any) -> None:

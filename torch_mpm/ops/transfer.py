@@ -1,4 +1,4 @@
-"""P2G and G2P, and the channel-wise scatter and gather below them: Python faces, fake kernels and autograd.
+"""P2G and G2P, and the underlying channel-wise scatter and gather: Python wrappers, fake kernels and autograd.
 
 All of them are derivatives of one trilinear form of positions, particle values and node values,
 
@@ -51,7 +51,7 @@ def p2g(
         stress_form: "mls" or "gradient".
 
     Returns:
-        Node mass and momentum [N, 1 + D] [kg, kg m/s]. Particles outside the grid give nothing.
+        Node mass and momentum [N, 1 + D] [kg, kg m/s]. Particles outside the grid contribute nothing.
 
     Raises:
         ValueError, TypeError: for wrong shapes, dtypes, devices or values.
@@ -90,9 +90,10 @@ def g2p(
     Args:
         blocks: active blocks of these positions.
         x: positions [P, D] [m].
-        velocity: node velocities [N, D] [m/s]; rows may be apart (a view [:, 1:] of mass and velocity is fastest).
-        affine: whether C is wanted.
-        gradient: whether ∇v is wanted.
+        velocity: node velocities [N, D] [m/s]; rows need not be contiguous (a view [:, 1:] of mass and velocity is
+            fastest).
+        affine: whether to return C.
+        gradient: whether to return ∇v.
 
     Returns:
         v [P, D] [m/s], C [P, D, D] [1/s] or None, ∇v [P, D, D] [1/s] or None; for particles outside the grid zero, or
@@ -118,7 +119,7 @@ def scatter(
     gradient: Tensor | None = None,
     moment_scale: float = 1.0,
 ) -> Tensor:
-    """Any particle features to the nodes: Σ_p N_i (value_p + s moment_p (x_i − x_p)) + gradient_p ∇N_i.
+    """Scatter of particle features to the nodes: Σ_p N_i (value_p + s moment_p (x_i − x_p)) + gradient_p ∇N_i.
 
     Args:
         blocks: active blocks of these positions.
@@ -152,13 +153,13 @@ def scatter(
 def gather(
     blocks: Blocks, x: Tensor, nodes: Tensor, moment: bool = False, gradient: bool = False, moment_scale: float = 1.0
 ) -> tuple[Tensor, Tensor | None, Tensor | None]:
-    """Any node features to the particles: Σ_i N_i g_i, s Σ_i N_i g_i (x_i − x_p)ᵀ and Σ_i g_i ∇N_iᵀ.
+    """Gather of node features at the particles: Σ_i N_i g_i, s Σ_i N_i g_i (x_i − x_p)ᵀ and Σ_i g_i ∇N_iᵀ.
 
     Args:
         blocks: active blocks of these positions.
         x: positions [P, D] [m].
         nodes: features g [N, K], in any unit u.
-        moment, gradient: which sums are wanted.
+        moment, gradient: whether to return these sums.
         moment_scale: s; `grid.inverse_inertia` makes the moment the APIC affine field.
 
     Returns:
@@ -334,7 +335,7 @@ def _p2g_double_backward(ctx, *grads):
 
 
 def _composed_p2g_backward(inputs, dt, form, topology):
-    """`p2g_backward` from differentiable ops: `adjoint` of csrc/transfer/momentum.h once more, in plain torch."""
+    """`p2g_backward` made of differentiable ops: `adjoint` of csrc/transfer/momentum.h in plain torch."""
     grad, x, mass, v, C, stress, volume, scene_dt = inputs
     D = x.shape[1]
     mls = form == STRESS_FORMS["mls"]

@@ -1,4 +1,4 @@
-"""What all exports share: which scenes, checks of what loaders demand, a folder that appears when it is whole."""
+"""Common parts of exports: selection of scenes, checks of what loaders require, a folder that appears when complete."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ Array = npt.NDArray[Any]
 
 RIGID = 0
 PARTICLE_TYPES = 9
-"""Codes of particle types are smaller, in DeepMind's models and those after them."""
+"""Upper bound of the codes of particle types in DeepMind's models and their descendants."""
 
 
 @dataclass(frozen=True)
 class ExportedScene:
-    """A scene as exports write it: position [T, N, D] (m), particle_type [N], and the scene for whatever else."""
+    """Scene in the form of exports: position [T, N, D] (m), particle_type [N], and the scene for other arrays."""
 
     id: int
     position: Array
@@ -39,14 +39,14 @@ class ExportedScene:
 
     @property
     def boundary(self) -> Array:
-        """Which particles move as prescribed, bool [N]."""
+        """Whether particles have prescribed motion, bool [N]."""
         mask: Array = self.particle_type == BOUNDARY
         return mask
 
 
 @dataclass(frozen=True)
 class Export:
-    """An export that is being made in ``folder``, which becomes ``target``."""
+    """Export in progress in ``folder``, which becomes ``target``."""
 
     dataset: DatasetFolder
     folder: Path
@@ -56,7 +56,7 @@ class Export:
         """The valid scenes of a split that have particles, by id.
 
         Raises:
-            DatasetError: for a scene that loaders could not read: no or unknown types.
+            DatasetError: for a scene that loaders cannot read: without types or with unknown ones.
             DamagedFileError: for a scene that is damaged.
         """
         for number in exported_ids(self.dataset, split):
@@ -74,7 +74,7 @@ def fields_of(scene: ExportedScene, names: Sequence[str]) -> dict[str, Array]:
     """Further arrays of a scene, [T, N, ...] or [N]; stresses have their measure in their name.
 
     Raises:
-        DatasetError: for one that is not there.
+        DatasetError: for a missing array.
     """
     for name in names:
         if name not in scene.arrays:
@@ -96,14 +96,14 @@ def exporting(
     material: bool = False,
     more: Callable[[DatasetFolder], Mapping[str, Any]] = lambda dataset: {},
 ) -> Iterator[Export]:
-    """An export into ``out``, by default the folder ``name`` of the data set, which appears when the block has ended.
+    """Export into ``out``, by default the folder ``name`` of the data set, which appears at the end of the block.
 
     Every shard is compared with its checksum first. ``metadata.json`` is written at the end, with the words that
-    ``more`` makes of the data set.
+    ``more`` returns for the data set.
 
     Raises:
-        FileExistsError: when ``out`` is there already.
-        OSError: when the disk has no room for the data, uncompressed.
+        FileExistsError: when ``out`` exists already.
+        OSError: when the disk has no space for the uncompressed data.
         DatasetError: for a data set without a valid scene.
         DamagedFileError: for a data set that is damaged.
     """
@@ -128,10 +128,10 @@ def _require_room(dataset: DatasetFolder, folder: Path) -> None:
 
 @contextlib.contextmanager
 def new_folder(target: Path) -> Iterator[Path]:
-    """A folder beside ``target`` that takes its name when the block ends well, and vanishes when it does not.
+    """Folder beside ``target`` that is renamed to it when the block succeeds, and removed when it fails.
 
     Raises:
-        FileExistsError: when there is something of that name.
+        FileExistsError: when the name exists already.
     """
     if target.exists():
         raise FileExistsError(errno.EEXIST, "exists already; remove it, or choose another folder", str(target))

@@ -17,15 +17,15 @@ def export_gns(dataset: str | Path | DatasetFolder, out: str | Path | None = Non
     """Write a data set for geoelements/gns.
 
     Each split is one file with ``gns_data``, a one-dimensional array of (position float32 [T, N, D], particle type
-    int64 [N][, material float32 [N]]). The file is pickled, as its loader demands; a split is in memory as a whole,
-    in its loader too.
+    int64 [N][, material float32 [N]]). The file is pickled, as its loader requires; a complete split must fit in
+    memory, in the loader too.
 
     Args:
         dataset: folder of the data set.
-        out: folder to make; ``gns`` in that of the data set by default.
+        out: folder to create; ``gns`` in that of the data set by default.
         material: name of an array [N] of every scene, such as "friction_angle", that becomes the material column;
-            ``metadata.json`` then counts it among the features of a node. Angles become their tangent, as gns
-            documents its column.
+            ``metadata.json`` then includes it in the number of node features. Angles become their tangent, the
+            documented column of gns.
 
     Returns:
         The folder.
@@ -42,8 +42,8 @@ def export_gns(dataset: str | Path | DatasetFolder, out: str | Path | None = Non
 
 def _write(export: Export, split: str, material: str | None) -> None:
     scenes = [_entry(scene, material) for scene in export.scenes(split)]
-    # An array of tuples must be filled one by one: NumPy 2 refuses to make it of ragged ones, and would make a table
-    # of equal ones.
+    # An array of tuples must be filled one by one: NumPy 2 refuses to make it of ragged ones, and would make a table of
+    # equal ones.
     data = np.empty(len(scenes), dtype=object)
     for k, scene in enumerate(scenes):
         data[k] = scene

@@ -23,16 +23,16 @@ def export_lagrangebench(
     """Write a data set for LagrangeBench.
 
     Each split is one file with groups ``00000``, ``00001``, ... of ``position`` float32 [T, N, D] (gzip) and
-    ``particle_type`` int64 [N] in its codes: walls 1, walls that move 2, rigid bodies 3, and what flows 0 and, where
-    there are several materials, 4 to 8. ``metadata.json`` has the codes by particle type.
+    ``particle_type`` int64 [N] in its codes: walls 1, moving walls 2, rigid bodies 3, fluids 0 and, with several
+    materials, 4 to 8. ``metadata.json`` lists the codes by particle type.
 
     Args:
         dataset: folder of the data set.
-        out: folder to make; ``lagrangebench`` in that of the data set by default.
+        out: folder to create; ``lagrangebench`` in that of the data set by default.
         fields: further arrays of the scenes to write beside the positions, such as "stress", which is written as
             ``cauchy_stress``; its loader skips them.
 
-    Returns and errors as :func:`export_gns`; DatasetError also for a field that is not there.
+    Returns and errors as :func:`export_gns`; DatasetError also for a missing field.
     """
     codes: dict[int, int] = {}
     with exporting(dataset, out, "lagrangebench", more=lambda dataset: _words(dataset, codes)) as export:
@@ -43,7 +43,7 @@ def export_lagrangebench(
 
 
 def _words(dataset: DatasetFolder, codes: dict[int, int]) -> dict[str, Any]:
-    """What its metadata has beside that of others."""
+    """Additional entries of its metadata."""
     types = {str(kind): code for kind, code in codes.items()}
     words = {"write_every": 1, "dx": particle_spacing(dataset), "solver": "MPM", "case": dataset.record.title}
     return {**words, "particle_types": types}

@@ -20,9 +20,9 @@ def export_neuralmpm(
 
     ``train/sim_0.h5`` and so on have ``particles`` [T, N, D], ``boundary`` [T, M, D] and ``types`` [N].
 
-    Its parsers take material, bounds, interval and length from the name of the folder, so give ``out`` the name of one
-    of its data sets (``WaterRamps``, ``Sand``, ``Goop``, ...) and generate with that set's numbers, or write a parser.
-    Its models are two-dimensional: a warning recalls that they cannot read a data set in 3-D.
+    Its parsers derive material, bounds, interval and length from the name of the folder, so give ``out`` the name of
+    one of its data sets (``WaterRamps``, ``Sand``, ``Goop``, ...) and generate with the numbers of that set, or write a
+    parser. Its models are two-dimensional: a warning states that they cannot read a data set in 3-D.
 
     Args, returns and errors as :func:`export_lagrangebench`.
     """

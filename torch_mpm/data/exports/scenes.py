@@ -1,4 +1,4 @@
-"""Chosen scenes of a data set for programs that people look with: VTK for ParaView, PLY point clouds."""
+"""Chosen scenes of a data set for visualisation: VTK for ParaView, PLY point clouds."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ def export_scenes_vtk(
 
     Args:
         dataset: folder of the data set.
-        out: folder to make; ``vtk`` in that of the data set by default.
+        out: folder to create; ``vtk`` in that of the data set by default.
         scenes: ids; the first valid scene by default.
 
     Returns:
         The folder.
 
     Raises:
-        FileExistsError: when ``out`` is there already.
-        KeyError: for a scene that is not there, failed, or is not finished.
+        FileExistsError: when ``out`` exists already.
+        KeyError: for a scene that does not exist, failed, or is not finished.
         DamagedFileError: for a scene that is damaged.
         ImportError: when meshio is missing (extra ``data``).
     """
@@ -62,7 +62,7 @@ def _export(
 
 
 def scene_frames(scene: StoredScene, interval: float) -> Iterator[dict[str, Array]]:
-    """The frames of a scene as those of a trajectory: fields, what does not change, and time."""
+    """Frames of a scene in the form of a trajectory: fields, constants, and time."""
     arrays = {name: scene[name] for name in scene.names} | {"velocity": velocity_of(scene, interval)}
     moving = [name for name, a in arrays.items() if a.shape[:2] == (scene.frames, scene.particles)]
     fixed = {name: a for name, a in arrays.items() if a.shape == (scene.particles,)}

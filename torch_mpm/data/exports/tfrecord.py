@@ -1,8 +1,8 @@
-"""TFRecord files as of "Learning to Simulate" (Sanchez-Gonzalez et al. 2020), which PhysicsNeMo reads too.
+"""TFRecord files of "Learning to Simulate" (Sanchez-Gonzalez et al. 2020), which PhysicsNeMo reads too.
 
 A record is a ``tf.train.SequenceExample`` in the framing of TensorFlow: length, its checksum, bytes, their checksum
-(https://www.tensorflow.org/tutorials/load_data/tfrecord). The few kinds of protocol buffer fields that it needs are
-written here, so that neither TensorFlow nor a compiler of protocol buffers is wanted.
+(https://www.tensorflow.org/tutorials/load_data/tfrecord). The few required kinds of protocol buffer fields are written
+here, without TensorFlow or a compiler of protocol buffers.
 """
 
 from __future__ import annotations
@@ -31,20 +31,20 @@ def export_tfrecord(
     """Write a data set for DeepMind's reader and PhysicsNeMo: ``train.tfrecord``, ``valid.tfrecord``, ...
 
     A record has the context ``key`` (number in the split) and ``particle_type`` (int64 bytes), and one entry of
-    ``position`` (float32 bytes) per frame. PhysicsNeMo takes the bounds of the first axis for all, which a warning
-    recalls, and needs ``num_node_types=9`` for sand and goop. There is no ``.tfindex``: with one, it would begin
-    at a random record, another one in each process.
+    ``position`` (float32 bytes) per frame. PhysicsNeMo uses the bounds of the first axis for all axes, which a warning
+    states, and needs ``num_node_types=9`` for sand and goop. There is no ``.tfindex``: with one, PhysicsNeMo would
+    begin at a random record, different in each process.
 
     Args:
         dataset: folder of the data set.
-        out: folder to make; ``tfrecord`` in that of the data set by default.
+        out: folder to create; ``tfrecord`` in that of the data set by default.
         fields: further arrays [T, N, ...] of the scenes to write as features of every frame, float32 bytes, such as
-            "stress", which is written as ``cauchy_stress``; readers that do not name them skip them.
+            "stress", which is written as ``cauchy_stress``; readers skip fields that they do not name.
         context: whether every frame has ``step_context`` (float32 bytes), the gravity [D] of the scene; metadata.json
-            then has ``context_mean`` and ``context_std``, from which DeepMind's reader knows of it.
+            then has ``context_mean`` and ``context_std``, by which DeepMind's reader detects it.
 
-    Returns and errors as :func:`export_gns`; DatasetError also for a field that is not there; ImportError without
-    google-crc32c (extra ``data``).
+    Returns and errors as :func:`export_gns`; DatasetError also for a missing field; ImportError without google-crc32c
+    (extra ``data``).
     """
     checksum = _crc32c()
     more: dict[str, Any] = {"more": _context_statistics} if context else {}
@@ -68,7 +68,7 @@ def _gravity(dataset: DatasetFolder, number: int) -> Array:
 
 
 def _context_statistics(dataset: DatasetFolder) -> dict[str, list[float]]:
-    """Of the context, over all scenes."""
+    """Statistics of the context, over all scenes."""
     values = np.stack([_gravity(dataset, scene.id) for scene in dataset.scenes()]).astype(np.float64)
     return {"context_mean": values.mean(0).tolist(), "context_std": values.std(0).tolist()}
 

@@ -29,7 +29,7 @@ def export_well(dataset: str | Path | DatasetFolder, out: str | Path | None = No
 
     Args:
         dataset: folder of the data set.
-        out: folder to make; ``well`` in that of the data set by default.
+        out: folder to create; ``well`` in that of the data set by default.
         dx: size of a cell [m]; twice that of the simulation by default, about 16 particles a cell in 2-D.
 
     Returns and errors as :func:`export_gns`; DatasetError also for a dx that is not positive.
@@ -52,12 +52,12 @@ def export_well(dataset: str | Path | DatasetFolder, out: str | Path | None = No
             if exported_ids(export.dataset, split):
                 statistics[split] = _write(export, split, name, dx or 2 * record.dx, orders, kept)
         chosen = statistics.get("train") or next(iter(statistics.values()))
-        (export.folder / "stats.yaml").write_text(json.dumps(chosen.words(), indent=1))  # JSON is YAML
+        (export.folder / "stats.yaml").write_text(json.dumps(chosen.words(), indent=1))  # JSON is valid YAML.
     return export.target
 
 
 class _Statistics:
-    """Of the fields and of their changes from frame to frame, over all cells."""
+    """Statistics of the fields and of their changes between frames, over all cells."""
 
     def __init__(self, orders: dict[str, int], dim: int) -> None:
         self.sums = {name: [Sums.zero(dim**order) for _ in range(2)] for name, order in orders.items()}
@@ -119,7 +119,7 @@ def _write_scalars(file: Any, scenes: list[dict[str, float]]) -> None:
 
 
 def _scalars(export: Export, number: int) -> dict[str, float]:
-    """Gravity and the numbers of the materials of a scene."""
+    """Gravity and the numeric parameters of the materials of a scene."""
     words = export.dataset.scene(number).words
     gravity = words.get("gravity") or [0.0] * export.dataset.record.dim
     found = {f"gravity_{axis}": float(value) for axis, value in zip(AXES, gravity, strict=False)}
@@ -130,7 +130,7 @@ def _scalars(export: Export, number: int) -> dict[str, float]:
 
 
 def _layout(file: Any, export: Export, orders: dict[str, int], dx: float, count: int) -> dict[str, Any]:
-    """All of a file but the numbers of its fields; returns the arrays that these are written to."""
+    """All of a file except the numbers of its fields; returns the arrays that these are written to."""
     record = export.dataset.record
     axes, centres = list(AXES[: record.dim]), cell_centres(record.lower, record.upper, dx)
     varying = {"sample_varying": False, "time_varying": False}
@@ -162,7 +162,7 @@ def _layout(file: Any, export: Export, orders: dict[str, int], dx: float, count:
 
 
 def _fields(scene: ExportedScene, export: Export, dx: float) -> dict[str, Array]:
-    """Of all particles that are not a boundary."""
+    """Values of all particles that are not a boundary."""
     record, free = export.dataset.record, ~scene.boundary
     velocity, mass = velocity_of(scene.arrays, record.frame_interval), scene.arrays["mass"]
     x, v, m = (torch.from_numpy(a.astype(np.float32)) for a in (scene.position[:, free], velocity[:, free], mass[free]))
